@@ -1,0 +1,3 @@
+//! The program `cv`: arguments, files and reports.
+
+fn main() {}

@@ -1,0 +1,62 @@
+//! Keypoints, descriptor matches and point correspondences.
+
+use nalgebra::Point2;
+
+/// A detected point, in the spirit of `cv::KeyPoint`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Keypoint {
+    /// Sub-pixel position, pixel centres at integers.
+    pub position: Point2<f32>,
+    /// Strength by the detector's own measure; larger is stronger.
+    pub response: f32,
+    /// Standard deviation in pixels of the Gaussian scale the point was found at; 1 for single-scale detectors.
+    pub scale: f32,
+    /// Dominant orientation in radians, clockwise on screen from +x (y points down); 0 for upright features.
+    pub angle: f32,
+}
+
+impl Keypoint {
+    /// An upright point at scale 1.
+    pub fn new(x: f32, y: f32, response: f32) -> Self {
+        Self { position: Point2::new(x, y), response, scale: 1.0, angle: 0.0 }
+    }
+}
+
+/// A match between descriptor `query` of a first set and descriptor `train` of a second one (`cv::DMatch`).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DMatch {
+    /// Index in the first set.
+    pub query: u32,
+    /// Index in the second set.
+    pub train: u32,
+    /// Distance between the two descriptors by the matcher's measure; smaller is better.
+    pub distance: f32,
+    /// `distance` over the distance of the second-best candidate, in the same measure; 0 (sure) to 1 (ambiguous).
+    pub ratio: f32,
+}
+
+/// The same scene point seen at `a` in a first image and at `b` in a second one, in pixels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Correspondence {
+    /// Position in the first image.
+    pub a: Point2<f64>,
+    /// Position in the second image.
+    pub b: Point2<f64>,
+}
+
+impl Correspondence {
+    /// From coordinates `x1 y1 x2 y2`.
+    pub fn new(x1: f64, y1: f64, x2: f64, y2: f64) -> Self {
+        Self { a: Point2::new(x1, y1), b: Point2::new(x2, y2) }
+    }
+
+    /// The same pair with the images exchanged.
+    pub fn swapped(self) -> Self {
+        Self { a: self.b, b: self.a }
+    }
+
+    /// True where all four coordinates are finite.
+    pub fn is_finite(&self) -> bool {
+        [self.a.x, self.a.y, self.b.x, self.b.y].iter().all(|v| v.is_finite())
+    }
+}

@@ -1,0 +1,279 @@
+//! Owned images.
+
+use crate::{ImageView, ImageViewMut};
+
+/// A channel value of an image.
+///
+/// Implemented for the types images are made of here; the set is open, so that a caller may use its own.
+pub trait Sample: Copy + Default + PartialEq + Send + Sync + 'static {}
+impl Sample for bool {}
+impl Sample for u8 {}
+impl Sample for u16 {}
+impl Sample for i16 {}
+impl Sample for u32 {}
+impl Sample for i32 {}
+impl Sample for f32 {}
+impl Sample for f64 {}
+
+/// Why an image could not be made from a buffer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum ImageError {
+    /// The buffer does not hold `width × height × channels` samples.
+    #[error("a {width}×{height} image with {channels} channel(s) does not have {len} samples")]
+    WrongLength {
+        /// Samples in the buffer.
+        len: usize,
+        /// Asked width in pixels.
+        width: usize,
+        /// Asked height in pixels.
+        height: usize,
+        /// Channels per pixel.
+        channels: usize,
+    },
+    /// `width × height × channels` is more than memory can address.
+    #[error("a {width}×{height} image with {channels} channel(s) is larger than memory can address")]
+    TooLarge {
+        /// Asked width in pixels.
+        width: usize,
+        /// Asked height in pixels.
+        height: usize,
+        /// Channels per pixel.
+        channels: usize,
+    },
+}
+
+/// A dense image: `height` rows of `width` pixels of `C` interleaved channels of type `T`.
+///
+/// An image may be empty (`width` or `height` zero).
+#[derive(Debug, Clone, PartialEq)]
+pub struct Image<T, const C: usize> {
+    data: Vec<T>,
+    width: usize,
+    height: usize,
+}
+
+/// One channel of bytes, 0 to 255.
+pub type GrayU8 = Image<u8, 1>;
+/// One channel of `f32`, by convention 0 to 1.
+pub type GrayF32 = Image<f32, 1>;
+/// RGB bytes, 0 to 255, as stored in files (sRGB encoded).
+pub type RgbU8 = Image<u8, 3>;
+/// RGB of `f32`, by convention 0 to 1.
+pub type RgbF32 = Image<f32, 3>;
+/// True where a pixel belongs.
+pub type Mask = Image<bool, 1>;
+
+impl<T: Sample, const C: usize> Image<T, C> {
+    /// An image with every pixel equal to `fill`.
+    ///
+    /// # Panics
+    /// Where `width × height × C` overflows `usize`. Sizes that come from outside the process go through
+    /// [`Image::try_new`].
+    pub fn new(width: usize, height: usize, fill: [T; C]) -> Self {
+        match Self::try_new(width, height, fill) {
+            Ok(image) => image,
+            #[allow(clippy::panic)] // a documented precondition
+            Err(error) => panic!("{error}"),
+        }
+    }
+
+    /// As [`Image::new`], for sizes that are not to be trusted.
+    ///
+    /// # Errors
+    /// [`ImageError::TooLarge`] where the number of samples overflows `isize`.
+    pub fn try_new(width: usize, height: usize, fill: [T; C]) -> Result<Self, ImageError> {
+        let len = samples::<T, C>(width, height)?;
+        let data = match fill.first() {
+            Some(&first) if fill.iter().all(|&v| v == first) => vec![first; len],
+            _ => {
+                let mut data = Vec::with_capacity(len);
+                for _ in 0..width * height {
+                    data.extend_from_slice(&fill);
+                }
+                data
+            }
+        };
+        Ok(Self { data, width, height })
+    }
+
+    /// An image whose pixel at column `x` and row `y` is `f(x, y)`.
+    pub fn from_fn(width: usize, height: usize, mut f: impl FnMut(usize, usize) -> [T; C]) -> Self {
+        let mut image = Self::new(width, height, [T::default(); C]);
+        for y in 0..height {
+            for (x, pixel) in image.row_mut(y).chunks_exact_mut(C).enumerate() {
+                pixel.copy_from_slice(&f(x, y));
+            }
+        }
+        image
+    }
+
+    /// Takes over a buffer of `width × height × C` samples.
+    ///
+    /// # Errors
+    /// [`ImageError::WrongLength`] where the buffer has another length.
+    pub fn from_vec(width: usize, height: usize, data: Vec<T>) -> Result<Self, ImageError> {
+        if data.len() != samples::<T, C>(width, height)? {
+            return Err(ImageError::WrongLength { len: data.len(), width, height, channels: C });
+        }
+        Ok(Self { data, width, height })
+    }
+
+    /// Width in pixels.
+    #[inline]
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Height in pixels.
+    #[inline]
+    pub fn height(&self) -> usize {
+        self.height
+    }
+
+    /// Width and height in pixels.
+    #[inline]
+    pub fn size(&self) -> (usize, usize) {
+        (self.width, self.height)
+    }
+
+    /// True where there are no pixels.
+    #[inline]
+    pub fn is_empty(&self) -> bool {
+        self.data.is_empty()
+    }
+
+    /// All samples, row after row.
+    #[inline]
+    pub fn as_slice(&self) -> &[T] {
+        &self.data
+    }
+
+    /// All samples, row after row.
+    #[inline]
+    pub fn as_mut_slice(&mut self) -> &mut [T] {
+        &mut self.data
+    }
+
+    /// Gives the buffer back.
+    pub fn into_vec(self) -> Vec<T> {
+        self.data
+    }
+
+    /// All pixels, row after row.
+    pub fn pixels(&self) -> impl ExactSizeIterator<Item = [T; C]> + '_ {
+        let (pixels, _) = self.data.as_chunks::<C>();
+        pixels.iter().copied()
+    }
+
+    /// The samples of row `y`.
+    ///
+    /// # Panics
+    /// Where `y` is not below the height.
+    #[inline]
+    pub fn row(&self, y: usize) -> &[T] {
+        &self.data[y * self.width * C..(y + 1) * self.width * C]
+    }
+
+    /// The samples of row `y`.
+    ///
+    /// # Panics
+    /// Where `y` is not below the height.
+    #[inline]
+    pub fn row_mut(&mut self, y: usize) -> &mut [T] {
+        &mut self.data[y * self.width * C..(y + 1) * self.width * C]
+    }
+
+    /// The pixel at column `x`, row `y`.
+    ///
+    /// # Panics
+    /// Outside the image.
+    #[inline]
+    pub fn at(&self, x: usize, y: usize) -> [T; C] {
+        assert!(x < self.width, "column {x} of {}", self.width);
+        let start = (y * self.width + x) * C;
+        std::array::from_fn(|c| self.data[start + c])
+    }
+
+    /// The pixel at column `x`, row `y`, or `None` outside.
+    #[inline]
+    pub fn get(&self, x: usize, y: usize) -> Option<[T; C]> {
+        (x < self.width && y < self.height).then(|| self.at(x, y))
+    }
+
+    /// Overwrites the pixel at column `x`, row `y`.
+    ///
+    /// # Panics
+    /// Outside the image.
+    #[inline]
+    pub fn set(&mut self, x: usize, y: usize, pixel: [T; C]) {
+        assert!(x < self.width, "column {x} of {}", self.width);
+        let start = (y * self.width + x) * C;
+        self.data[start..start + C].copy_from_slice(&pixel);
+    }
+
+    /// A new image of `f(pixel)`.
+    pub fn map<U: Sample, const D: usize>(&self, mut f: impl FnMut([T; C]) -> [U; D]) -> Image<U, D> {
+        let mut data = Vec::with_capacity(self.width * self.height * D);
+        for pixel in self.pixels() {
+            data.extend_from_slice(&f(pixel));
+        }
+        Image { data, width: self.width, height: self.height }
+    }
+
+    /// The whole image, borrowed.
+    #[inline]
+    pub fn view(&self) -> ImageView<'_, T, C> {
+        ImageView::from_parts(&self.data, self.width, self.height, self.width * C)
+    }
+
+    /// The whole image, borrowed to write.
+    #[inline]
+    pub fn view_mut(&mut self) -> ImageViewMut<'_, T, C> {
+        ImageViewMut::from_parts(&mut self.data, self.width, self.height, self.width * C)
+    }
+}
+
+impl<'a, T: Sample, const C: usize> From<&'a Image<T, C>> for ImageView<'a, T, C> {
+    fn from(image: &'a Image<T, C>) -> Self {
+        image.view()
+    }
+}
+
+/// The number of samples of an image, or an error where that is more than can be allocated.
+fn samples<T, const C: usize>(width: usize, height: usize) -> Result<usize, ImageError> {
+    width
+        .checked_mul(height)
+        .and_then(|n| n.checked_mul(C))
+        .filter(|n| n.checked_mul(size_of::<T>().max(1)).is_some_and(|bytes| isize::try_from(bytes).is_ok()))
+        .ok_or(ImageError::TooLarge { width, height, channels: C })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_buffer_of_the_wrong_length_is_refused_with_the_numbers() {
+        let error = Image::<u8, 3>::from_vec(2, 2, vec![0; 11]).unwrap_err();
+        assert_eq!(error, ImageError::WrongLength { len: 11, width: 2, height: 2, channels: 3 });
+    }
+
+    #[test]
+    fn sizes_that_overflow_are_refused() {
+        for (w, h) in [(usize::MAX, 2), (usize::MAX / 2, 1), (1 << 40, 1 << 40)] {
+            assert!(matches!(Image::<f32, 3>::try_new(w, h, [0.0; 3]), Err(ImageError::TooLarge { .. })));
+        }
+    }
+
+    #[test]
+    fn unequal_fills_reach_every_pixel() {
+        let image = Image::<u8, 3>::new(3, 2, [1, 2, 3]);
+        assert!(image.pixels().all(|p| p == [1, 2, 3]) && image.pixels().len() == 6);
+    }
+
+    #[test]
+    fn empty_images_have_no_rows_to_trip_over() {
+        let image = Image::<u8, 1>::new(0, 5, [0]);
+        assert!(image.is_empty() && image.row(4).is_empty() && image.get(0, 0).is_none());
+    }
+}

@@ -1,0 +1,41 @@
+//! The vocabulary every other crate of the workspace speaks: images, cameras,
+//! poses, keypoints and matches. No input or output, no codecs, no thread pool.
+//!
+//! ```
+//! use cv_core::{Image, Point2};
+//!
+//! let mut grey = Image::<f32, 1>::new(4, 3, [0.0]);
+//! grey.set(2, 1, [1.0]);
+//! assert_eq!(grey.at(2, 1), [1.0]);
+//! assert_eq!(grey.view().crop(1, 1, 2, 2).map(|v| v.at(1, 0)), Some([1.0]));
+//!
+//! let camera = cv_core::Camera::pinhole(640, 480, 500.0, 500.0, 319.5, 239.5);
+//! let ray = camera.normalize(Point2::new(319.5, 239.5));
+//! assert!(ray.x.abs() < 1e-12 && ray.y.abs() < 1e-12);
+//! ```
+//!
+//! # Conventions
+//!
+//! * Pixel centres lie at integer coordinates; x points right, y points down; the
+//!   origin is the centre of the top-left pixel. An image of width `w` covers
+//!   `[-0.5, w - 0.5]` in x.
+//! * A camera frame has X right, Y down, Z forward. A [`Pose`] maps world to camera:
+//!   `x_cam = R x_world + t`.
+//! * Images are row-major with interleaved channels. Colour is RGB.
+//! * Disparity is `x_left − x_right` in pixels. Invalid disparity and depth are NaN.
+//! * Angles are radians.
+
+mod camera;
+mod features;
+mod image;
+mod pose;
+mod view;
+
+pub use camera::{Camera, CameraError, Distortion};
+pub use features::{Correspondence, DMatch, Keypoint};
+pub use image::{GrayF32, GrayU8, Image, ImageError, Mask, RgbF32, RgbU8, Sample};
+pub use pose::Pose;
+pub use view::{ImageView, ImageViewMut};
+
+pub use nalgebra;
+pub use nalgebra::{Matrix3, Matrix3x4, Point2, Point3, Rotation3, Vector2, Vector3};

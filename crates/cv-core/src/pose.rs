@@ -1,0 +1,107 @@
+//! Rigid motions.
+
+use nalgebra::{Matrix3x4, Point3, Rotation3, Vector3};
+
+/// A rigid motion from world to camera coordinates: `x_cam = R x_world + t`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pose {
+    /// R, world to camera.
+    pub rotation: Rotation3<f64>,
+    /// t, in the unit of the world.
+    pub translation: Vector3<f64>,
+}
+
+impl Pose {
+    /// The pose of a camera whose frame is the world's.
+    pub fn identity() -> Self {
+        Self { rotation: Rotation3::identity(), translation: Vector3::zeros() }
+    }
+
+    /// From R and t.
+    pub fn new(rotation: Rotation3<f64>, translation: Vector3<f64>) -> Self {
+        Self { rotation, translation }
+    }
+
+    /// A camera at `eye` (world) that looks at `target`, its image's down direction as near to `down` as can be.
+    ///
+    /// `None` where the looking direction is zero or parallel to `down`.
+    pub fn look_at(eye: Point3<f64>, target: Point3<f64>, down: Vector3<f64>) -> Option<Self> {
+        let z = (target - eye).try_normalize(1e-12)?;
+        let x = down.cross(&z).try_normalize(1e-12)?;
+        let y = z.cross(&x);
+        let rotation = Rotation3::from_basis_unchecked(&[x, y, z]).inverse();
+        Some(Self { rotation, translation: -(rotation * eye.coords) })
+    }
+
+    /// World to camera coordinates.
+    #[inline]
+    pub fn transform(&self, world: &Point3<f64>) -> Point3<f64> {
+        self.rotation * world + self.translation
+    }
+
+    /// The camera centre in the world, `−Rᵀ t`.
+    pub fn center(&self) -> Point3<f64> {
+        Point3::from(-(self.rotation.inverse() * self.translation))
+    }
+
+    /// Camera to world.
+    pub fn inverse(&self) -> Self {
+        let rotation = self.rotation.inverse();
+        Self { rotation, translation: -(rotation * self.translation) }
+    }
+
+    /// First `first`, then `self`.
+    pub fn compose(&self, first: &Self) -> Self {
+        Self {
+            rotation: self.rotation * first.rotation,
+            translation: self.rotation * first.translation + self.translation,
+        }
+    }
+
+    /// The motion from the camera frame of `a` to that of `b`: `x_b = R x_a + t`.
+    pub fn relative(a: &Self, b: &Self) -> Self {
+        b.compose(&a.inverse())
+    }
+
+    /// `[R | t]`, 3×4.
+    pub fn matrix(&self) -> Matrix3x4<f64> {
+        let mut m = Matrix3x4::zeros();
+        m.fixed_view_mut::<3, 3>(0, 0).copy_from(self.rotation.matrix());
+        m.fixed_view_mut::<3, 1>(0, 3).copy_from(&self.translation);
+        m
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    // f64 arithmetic on numbers of order one, a few operations deep.
+    const TOLERANCE: f64 = 1e-12;
+
+    #[test]
+    fn looking_at_a_point_puts_it_on_the_optical_axis_and_down_is_down() {
+        let pose = Pose::look_at(Point3::new(1.0, 2.0, 3.0), Point3::new(4.0, 2.0, 7.0), Vector3::y()).unwrap();
+        let seen = pose.transform(&Point3::new(4.0, 2.0, 7.0));
+        assert!((seen - Point3::new(0.0, 0.0, 5.0)).norm() < TOLERANCE);
+        assert!(pose.transform(&Point3::new(4.0, 3.0, 7.0)).y > 0.9);
+        assert!((pose.rotation.matrix().determinant() - 1.0).abs() < TOLERANCE);
+        assert!((pose.center() - Point3::new(1.0, 2.0, 3.0)).norm() < TOLERANCE);
+    }
+
+    #[test]
+    fn relative_motion_takes_one_frame_to_the_other() {
+        let a = Pose::new(Rotation3::from_euler_angles(0.1, 0.2, 0.3), Vector3::new(1.0, 0.0, 2.0));
+        let b = Pose::new(Rotation3::from_euler_angles(-0.3, 0.1, 0.0), Vector3::new(0.0, 1.0, -1.0));
+        let p = Point3::new(0.3, -0.7, 5.0);
+        let through = Pose::relative(&a, &b).transform(&a.transform(&p));
+        assert!((through - b.transform(&p)).norm() < TOLERANCE);
+    }
+
+    #[test]
+    fn no_direction_means_no_pose() {
+        let p = Point3::new(1.0, 1.0, 1.0);
+        assert!(Pose::look_at(p, p, Vector3::y()).is_none());
+        assert!(Pose::look_at(p, p + Vector3::y(), Vector3::y()).is_none());
+    }
+}

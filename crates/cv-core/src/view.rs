@@ -1,0 +1,197 @@
+//! Borrowed, strided windows into images.
+
+use crate::{Image, Sample};
+
+/// A borrowed window: rows of `width × C` samples, `stride` samples apart.
+#[derive(Debug, Clone, Copy)]
+pub struct ImageView<'a, T, const C: usize> {
+    data: &'a [T],
+    width: usize,
+    height: usize,
+    stride: usize,
+}
+
+impl<'a, T: Sample, const C: usize> ImageView<'a, T, C> {
+    pub(crate) fn from_parts(data: &'a [T], width: usize, height: usize, stride: usize) -> Self {
+        Self { data, width, height, stride }
+    }
+
+    /// A view over a caller's own buffer, rows `stride` samples apart.
+    ///
+    /// `None` where the buffer is too short for the last row, or `stride < width × C`.
+    pub fn from_slice(data: &'a [T], width: usize, height: usize, stride: usize) -> Option<Self> {
+        let row = width.checked_mul(C)?;
+        let needed = match height {
+            0 => 0,
+            _ => (height - 1).checked_mul(stride)?.checked_add(row)?,
+        };
+        (stride >= row && data.len() >= needed).then_some(Self { data, width, height, stride })
+    }
+
+    /// Width in pixels.
+    #[inline]
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Height in pixels.
+    #[inline]
+    pub fn height(&self) -> usize {
+        self.height
+    }
+
+    /// Width and height in pixels.
+    #[inline]
+    pub fn size(&self) -> (usize, usize) {
+        (self.width, self.height)
+    }
+
+    /// True where there are no pixels.
+    #[inline]
+    pub fn is_empty(&self) -> bool {
+        self.width == 0 || self.height == 0
+    }
+
+    /// The samples of row `y`.
+    ///
+    /// # Panics
+    /// Where `y` is not below the height.
+    #[inline]
+    pub fn row(&self, y: usize) -> &'a [T] {
+        assert!(y < self.height, "row {y} of {}", self.height);
+        &self.data[y * self.stride..y * self.stride + self.width * C]
+    }
+
+    /// The pixel at column `x`, row `y`.
+    ///
+    /// # Panics
+    /// Outside the view.
+    #[inline]
+    pub fn at(&self, x: usize, y: usize) -> [T; C] {
+        let row = self.row(y);
+        std::array::from_fn(|c| row[x * C + c])
+    }
+
+    /// The pixel at column `x`, row `y`, or `None` outside.
+    #[inline]
+    pub fn get(&self, x: usize, y: usize) -> Option<[T; C]> {
+        (x < self.width && y < self.height).then(|| self.at(x, y))
+    }
+
+    /// The window with top-left corner `(x, y)`, or `None` where it does not fit.
+    pub fn crop(&self, x: usize, y: usize, width: usize, height: usize) -> Option<Self> {
+        if x.checked_add(width)? > self.width || y.checked_add(height)? > self.height {
+            return None;
+        }
+        let start = (y * self.stride + x * C).min(self.data.len());
+        Some(Self { data: &self.data[start..], width, height, stride: self.stride })
+    }
+
+    /// A dense copy.
+    pub fn to_image(&self) -> Image<T, C> {
+        let mut image = Image::new(self.width, self.height, [T::default(); C]);
+        for y in 0..self.height {
+            image.row_mut(y).copy_from_slice(self.row(y));
+        }
+        image
+    }
+}
+
+/// A borrowed window to write to: rows of `width × C` samples, `stride` samples apart.
+#[derive(Debug)]
+pub struct ImageViewMut<'a, T, const C: usize> {
+    data: &'a mut [T],
+    width: usize,
+    height: usize,
+    stride: usize,
+}
+
+impl<'a, T: Sample, const C: usize> ImageViewMut<'a, T, C> {
+    pub(crate) fn from_parts(data: &'a mut [T], width: usize, height: usize, stride: usize) -> Self {
+        Self { data, width, height, stride }
+    }
+
+    /// Width in pixels.
+    #[inline]
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Height in pixels.
+    #[inline]
+    pub fn height(&self) -> usize {
+        self.height
+    }
+
+    /// The samples of row `y`.
+    ///
+    /// # Panics
+    /// Where `y` is not below the height.
+    #[inline]
+    pub fn row_mut(&mut self, y: usize) -> &mut [T] {
+        assert!(y < self.height, "row {y} of {}", self.height);
+        &mut self.data[y * self.stride..y * self.stride + self.width * C]
+    }
+
+    /// All rows from top to bottom.
+    pub fn rows_mut(&mut self) -> impl Iterator<Item = &mut [T]> {
+        let row = self.width * C;
+        self.data.chunks_mut(self.stride.max(1)).take(self.height).map(move |r| &mut r[..row])
+    }
+
+    /// The window with top-left corner `(x, y)`, or `None` where it does not fit.
+    pub fn crop(self, x: usize, y: usize, width: usize, height: usize) -> Option<Self> {
+        if x.checked_add(width)? > self.width || y.checked_add(height)? > self.height {
+            return None;
+        }
+        let start = (y * self.stride + x * C).min(self.data.len());
+        Some(Self { data: &mut self.data[start..], width, height, stride: self.stride })
+    }
+
+    /// Reborrows to read.
+    pub fn as_view(&self) -> ImageView<'_, T, C> {
+        ImageView::from_parts(self.data, self.width, self.height, self.stride)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn a_crop_shows_the_same_pixels(w in 1usize..9, h in 1usize..9, x in 0usize..9, y in 0usize..9, cw in 0usize..9, ch in 0usize..9) {
+            let image = Image::<u16, 2>::from_fn(w, h, |x, y| [x as u16, y as u16]);
+            match image.view().crop(x, y, cw, ch) {
+                None => prop_assert!(x + cw > w || y + ch > h),
+                Some(view) => {
+                    prop_assert!(x + cw <= w && y + ch <= h);
+                    for j in 0..ch {
+                        for i in 0..cw {
+                            prop_assert_eq!(view.at(i, j), [(x + i) as u16, (y + j) as u16]);
+                        }
+                    }
+                    prop_assert_eq!(view.to_image().size(), (cw, ch));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn writing_through_a_crop_leaves_the_rest() {
+        let mut image = Image::<u8, 1>::new(4, 3, [0]);
+        let mut window = image.view_mut().crop(1, 1, 2, 2).unwrap();
+        for row in window.rows_mut() {
+            row.fill(7);
+        }
+        assert_eq!(image.as_slice(), [0, 0, 0, 0, 0, 7, 7, 0, 0, 7, 7, 0]);
+    }
+
+    #[test]
+    fn slices_that_are_too_short_are_refused() {
+        assert!(ImageView::<u8, 1>::from_slice(&[0; 7], 3, 2, 5).is_none());
+        assert!(ImageView::<u8, 1>::from_slice(&[0; 8], 3, 2, 5).is_some());
+        assert!(ImageView::<u8, 1>::from_slice(&[0; 8], 3, 2, 2).is_none());
+    }
+}

@@ -1,0 +1,1 @@
+//! Corners, spacing, descriptors and matching.

@@ -1,0 +1,1 @@
+//! Homography, epipolar geometry, pose, triangulation, and the one RANSAC driver.

@@ -1,0 +1,1 @@
+//! Colour conversion, filtering, sampling, warping, pyramids, morphology and components.

@@ -1,0 +1,1 @@
+//! Reading and writing images, disparity and depth maps, clouds, cameras and matches.

@@ -1,0 +1,1 @@
+//! Dense and sparse linear algebra, polynomial roots and least squares for vision.

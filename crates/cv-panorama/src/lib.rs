@@ -1,0 +1,1 @@
+//! Projections, alignment, exposure, seams and blending of overlapping photographs.

@@ -1,0 +1,1 @@
+//! One call per job: segment, panorama, match, estimate, reconstruct, depth.

@@ -1,0 +1,1 @@
+//! Overlays, colour maps, plots and the self-contained HTML report.

@@ -1,0 +1,1 @@
+//! Gaussian and mixture colour models, posterior classification, mask clean-up and scores.

@@ -1,0 +1,1 @@
+//! Rectification, semi-global matching, disparity checks and depth.

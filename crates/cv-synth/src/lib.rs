@@ -1,0 +1,1 @@
+//! Ray-cast scenes with exact ground truth.
