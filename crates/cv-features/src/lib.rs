@@ -1,1 +1,51 @@
 //! Corners, spacing, descriptors and matching.
+//!
+//! From two grey images to tentative matches, the classical way:
+//!
+//! ```
+//! use cv_core::GrayF32;
+//! use cv_features::{anms, describe_patches, harris, match_descriptors, HarrisOptions, MatchOptions, PatchOptions};
+//!
+//! // A board of random grey squares, and the same board moved by (3, 2) pixels.
+//! let board = |dx: usize, dy: usize| {
+//!     GrayF32::from_fn(160, 120, |x, y| {
+//!         let cell = ((x + dx) / 9 * 31 + (y + dy) / 7 * 17) % 11;
+//!         [(cell * cell % 11) as f32 / 10.0]
+//!     })
+//! };
+//! let (a, b) = (board(0, 0), board(3, 2));
+//! let mut described = Vec::new();
+//! for image in [&a, &b] {
+//!     let corners = harris(image.view(), &HarrisOptions::default())?;
+//!     let spaced: Vec<_> = anms(&corners, 100, 0.9).into_iter().map(|i| corners[i]).collect();
+//!     described.push(describe_patches(image.view(), &spaced, &PatchOptions::default())?);
+//! }
+//! let options = MatchOptions { mutual: true, ..MatchOptions::default() };
+//! for m in match_descriptors(&described[0].descriptors, &described[1].descriptors, &options)? {
+//!     let (p, q) = (described[0].keypoints[m.query as usize], described[1].keypoints[m.train as usize]);
+//!     println!("{} -> {}, SSD {}", p.position, q.position, m.distance);
+//! }
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+//!
+//! # Conventions
+//!
+//! * Images are one channel of `f32`, by convention 0 to 1. A sample that is not finite is an error, never a NaN in a result.
+//! * Positions are sub-pixel with pixel centres at integers. Angles are radians, clockwise on screen from +x.
+//! * Every detector and descriptor returns what it dropped, with the reason, beside what it kept.
+//! * Results do not depend on the number of threads.
+
+mod anms;
+mod blur;
+mod descriptors;
+mod error;
+mod harris;
+mod matching;
+mod patch;
+
+pub use anms::{anms, suppression_radii};
+pub use descriptors::{Described, DescriptorKind, Descriptors, DropReason, Dropped};
+pub use error::FeatureError;
+pub use harris::{HarrisOptions, harris, harris_response};
+pub use matching::{MatchError, MatchOptions, RatioMeasure, match_descriptors};
+pub use patch::{PatchOptions, describe_patches};

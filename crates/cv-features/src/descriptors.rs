@@ -1,0 +1,124 @@
+//! Sets of descriptors that know what they are.
+
+use cv_core::Keypoint;
+
+/// What the numbers of a descriptor mean. Sets of different kinds are never compared.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum DescriptorKind {
+    /// 8×8 upright patches, zero mean and unit variance ([`describe_patches`](crate::describe_patches)).
+    Patch,
+}
+
+impl DescriptorKind {
+    /// Numbers in one descriptor.
+    pub fn dimension(self) -> usize {
+        match self {
+            Self::Patch => 64,
+        }
+    }
+}
+
+impl std::fmt::Display for DescriptorKind {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Patch => "8×8 patch",
+        })
+    }
+}
+
+/// Descriptors of one kind, one row of [`DescriptorKind::dimension`] numbers each.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Descriptors {
+    kind: DescriptorKind,
+    data: Vec<f32>,
+}
+
+impl Descriptors {
+    /// No descriptors.
+    pub fn new(kind: DescriptorKind) -> Self {
+        Self { kind, data: Vec::new() }
+    }
+
+    /// Takes over rows of numbers; `None` where the length is not a multiple of the kind's dimension.
+    pub fn from_vec(kind: DescriptorKind, data: Vec<f32>) -> Option<Self> {
+        data.len().is_multiple_of(kind.dimension()).then_some(Self { kind, data })
+    }
+
+    pub(crate) fn push(&mut self, row: &[f32]) {
+        debug_assert_eq!(row.len(), self.dimension());
+        self.data.extend_from_slice(row);
+    }
+
+    /// What the numbers mean.
+    pub fn kind(&self) -> DescriptorKind {
+        self.kind
+    }
+
+    /// Numbers in one descriptor.
+    pub fn dimension(&self) -> usize {
+        self.kind.dimension()
+    }
+
+    /// Number of descriptors.
+    pub fn len(&self) -> usize {
+        self.data.len() / self.dimension()
+    }
+
+    /// True where there are none.
+    pub fn is_empty(&self) -> bool {
+        self.data.is_empty()
+    }
+
+    /// Descriptor `i`.
+    ///
+    /// # Panics
+    /// Where there are not so many.
+    pub fn row(&self, i: usize) -> &[f32] {
+        &self.data[i * self.dimension()..(i + 1) * self.dimension()]
+    }
+
+    /// All numbers, row after row.
+    pub fn as_slice(&self) -> &[f32] {
+        &self.data
+    }
+}
+
+/// Why a keypoint got no descriptor.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum DropReason {
+    /// Its window leaves the image.
+    #[error("the window of ±{margin} px leaves the image")]
+    OutsideImage {
+        /// Pixels needed on each side.
+        margin: f32,
+    },
+    /// Its window is (nearly) one grey value: there is nothing to compare.
+    #[error("the window is flat: standard deviation {deviation}")]
+    Flat {
+        /// Standard deviation of the samples, in the image's unit.
+        deviation: f32,
+    },
+    /// The keypoint's position, scale or angle is not a finite number.
+    #[error("the keypoint is not finite")]
+    NotFinite,
+}
+
+/// A keypoint without a descriptor.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Dropped {
+    /// Index in the keypoints handed in.
+    pub index: usize,
+    /// Why.
+    pub reason: DropReason,
+}
+
+/// Keypoints with descriptors, and what became of the rest.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Described {
+    /// The keypoints that have a descriptor, in the order they came.
+    pub keypoints: Vec<Keypoint>,
+    /// Descriptor `i` belongs to keypoint `i`.
+    pub descriptors: Descriptors,
+    /// The keypoints without one. `keypoints.len() + dropped.len()` is the number handed in.
+    pub dropped: Vec<Dropped>,
+}

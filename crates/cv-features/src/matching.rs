@@ -1,0 +1,205 @@
+//! Nearest-neighbour matching of descriptors.
+
+use crate::descriptors::{DescriptorKind, Descriptors};
+use cv_core::DMatch;
+use rayon::prelude::*;
+
+/// Why two sets could not be matched.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum MatchError {
+    /// The sets hold different kinds of descriptors.
+    #[error("a set of {query} descriptors cannot be compared with one of {train} descriptors")]
+    KindsDiffer {
+        /// Kind of the first set.
+        query: DescriptorKind,
+        /// Kind of the second set.
+        train: DescriptorKind,
+    },
+    /// A set is empty.
+    #[error("there is nothing to match: {query} descriptors against {train}")]
+    Empty {
+        /// Descriptors in the first set.
+        query: usize,
+        /// Descriptors in the second set.
+        train: usize,
+    },
+    /// A set holds more descriptors than an index can count.
+    #[error("{got} descriptors are more than can be indexed (2³² − 1)")]
+    TooMany {
+        /// Descriptors in the set.
+        got: usize,
+    },
+    /// The ratio is not a number from 0 to 1.
+    #[error("the ratio {ratio} is not between 0 and 1")]
+    BadRatio {
+        /// The ratio.
+        ratio: f32,
+    },
+}
+
+/// In which measure the ratio of best to second-best is taken, and distances are reported.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum RatioMeasure {
+    /// Sum of squared differences. 0.66 here is 0.81 on distances.
+    #[default]
+    Ssd,
+    /// Euclidean distance, as in Lowe's paper and OpenCV's usual code.
+    Distance,
+}
+
+/// Settings of [`match_descriptors`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct MatchOptions {
+    /// A match stays where best / second-best is below this; `None` keeps all. 0 to 1; default 0.66 on SSD (Brown & Lowe's 0.8 on distances, squared
+    /// and rounded).
+    pub ratio: Option<f32>,
+    /// The measure of `ratio`, and of the distances returned. Default SSD.
+    pub measure: RatioMeasure,
+    /// Keep a match only where each is the other's nearest. Default off.
+    pub mutual: bool,
+}
+
+impl Default for MatchOptions {
+    fn default() -> Self {
+        Self { ratio: Some(0.66), measure: RatioMeasure::Ssd, mutual: false }
+    }
+}
+
+/// The nearest descriptor in `train` for each one in `query`, kept where the ratio test (and mutual check) passes, in the order of `query`.
+///
+/// Exact: every pair is compared. Of equally near descriptors the first counts as the best, so that a duplicate gives ratio 1. Where `train`
+/// has a single descriptor nothing can be said about ambiguity: the ratio is 1, and only `ratio: None` keeps such a match. O(query · train · dimension).
+///
+/// # Errors
+/// [`MatchError`] for kinds that differ, an empty set, a ratio out of range.
+pub fn match_descriptors(
+    query: &Descriptors,
+    train: &Descriptors,
+    options: &MatchOptions,
+) -> Result<Vec<DMatch>, MatchError> {
+    if query.kind() != train.kind() {
+        return Err(MatchError::KindsDiffer { query: query.kind(), train: train.kind() });
+    }
+    if query.is_empty() || train.is_empty() {
+        return Err(MatchError::Empty { query: query.len(), train: train.len() });
+    }
+    if let Some(got) = [query.len(), train.len()].into_iter().find(|&n| u32::try_from(n).is_err()) {
+        return Err(MatchError::TooMany { got });
+    }
+    if let Some(ratio) = options.ratio.filter(|r| !(0.0..=1.0).contains(r)) {
+        return Err(MatchError::BadRatio { ratio });
+    }
+    let forward = two_nearest(query, train);
+    let backward = options.mutual.then(|| two_nearest(train, query));
+    let mut matches = Vec::new();
+    for (i, two) in forward.iter().enumerate() {
+        if backward.as_ref().is_some_and(|b| b[two.best as usize].best as usize != i) {
+            continue;
+        }
+        let of_ssd = |v: f32| if options.measure == RatioMeasure::Ssd { v } else { v.sqrt() };
+        let (distance, second) = (of_ssd(two.ssd), of_ssd(two.second_ssd));
+        // Two exact copies are ambiguous, not 0/0.
+        let ratio = if second > 0.0 && second.is_finite() { distance / second } else { 1.0 };
+        if options.ratio.is_none_or(|limit| ratio < limit) {
+            matches.push(DMatch { query: i as u32, train: two.best, distance, ratio });
+        }
+    }
+    Ok(matches)
+}
+
+/// The nearest and second-nearest neighbour of a descriptor.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct TwoNearest {
+    best: u32,
+    ssd: f32,
+    /// Infinite where there is only one candidate.
+    second_ssd: f32,
+}
+
+fn two_nearest(query: &Descriptors, train: &Descriptors) -> Vec<TwoNearest> {
+    let dimension = query.dimension();
+    query
+        .as_slice()
+        .par_chunks(dimension)
+        .with_min_len(16)
+        .map(|q| {
+            let mut two = TwoNearest { best: 0, ssd: f32::INFINITY, second_ssd: f32::INFINITY };
+            for (j, t) in train.as_slice().chunks_exact(dimension).enumerate() {
+                let d = ssd(q, t);
+                if d < two.ssd {
+                    two = TwoNearest { best: j as u32, ssd: d, second_ssd: two.ssd };
+                } else if d < two.second_ssd {
+                    two.second_ssd = d;
+                }
+            }
+            two
+        })
+        .collect()
+}
+
+/// Sum of squared differences, over 16 running sums so that it vectorises.
+fn ssd(a: &[f32], b: &[f32]) -> f32 {
+    let mut sums = [0.0f32; 16];
+    for (a, b) in a.chunks_exact(16).zip(b.chunks_exact(16)) {
+        for i in 0..16 {
+            let d = a[i] - b[i];
+            sums[i] += d * d;
+        }
+    }
+    sums.iter().sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn set(rows: &[&[f32]]) -> Descriptors {
+        let mut data = Vec::new();
+        for row in rows {
+            let mut padded = [0.0; 64];
+            padded[..row.len()].copy_from_slice(row);
+            data.extend_from_slice(&padded);
+        }
+        Descriptors::from_vec(DescriptorKind::Patch, data).unwrap()
+    }
+
+    #[test]
+    fn ratio_and_mutual_tests_do_what_they_say() {
+        let a = set(&[&[0.0, 0.0], &[10.0, 0.0], &[0.2, 0.0]]);
+        let b = set(&[&[0.0, 1.0], &[0.0, 3.0], &[10.0, 1.0]]);
+        let all = MatchOptions { ratio: None, ..MatchOptions::default() };
+        let found = match_descriptors(&a, &b, &all).unwrap();
+        assert_eq!(found.iter().map(|m| (m.query, m.train)).collect::<Vec<_>>(), [(0, 0), (1, 2), (2, 0)]);
+        assert_eq!((found[0].distance, found[0].ratio), (1.0, 1.0 / 9.0));
+        let by_distance = MatchOptions { measure: RatioMeasure::Distance, ..all.clone() };
+        let found = match_descriptors(&a, &b, &by_distance).unwrap();
+        assert_eq!((found[0].distance, found[0].ratio), (1.0, 1.0 / 3.0));
+        let mutual = MatchOptions { mutual: true, ..all.clone() };
+        let found = match_descriptors(&a, &b, &mutual).unwrap();
+        assert_eq!(found.iter().map(|m| (m.query, m.train)).collect::<Vec<_>>(), [(0, 0), (1, 2)]);
+        let strict = MatchOptions { ratio: Some(0.05), ..MatchOptions::default() };
+        assert_eq!(match_descriptors(&a, &b, &strict).unwrap().len(), 1);
+    }
+
+    #[test]
+    fn duplicates_and_single_candidates_are_ambiguous() {
+        let a = set(&[&[1.0]]);
+        let twice = set(&[&[1.0], &[1.0]]);
+        assert_eq!(match_descriptors(&a, &twice, &MatchOptions::default()), Ok(vec![]));
+        assert_eq!(match_descriptors(&a, &a, &MatchOptions::default()), Ok(vec![]));
+        let all = MatchOptions { ratio: None, ..MatchOptions::default() };
+        let expected = DMatch { query: 0, train: 0, distance: 0.0, ratio: 1.0 };
+        assert_eq!(match_descriptors(&a, &twice, &all), Ok(vec![expected]));
+        assert_eq!(match_descriptors(&a, &a, &all), Ok(vec![expected]));
+    }
+
+    #[test]
+    fn what_cannot_be_matched_is_refused() {
+        let (a, none) = (set(&[&[1.0]]), set(&[]));
+        let options = MatchOptions::default();
+        assert_eq!(match_descriptors(&none, &a, &options), Err(MatchError::Empty { query: 0, train: 1 }));
+        assert_eq!(match_descriptors(&a, &none, &options), Err(MatchError::Empty { query: 1, train: 0 }));
+        let bad = MatchOptions { ratio: Some(f32::NAN), ..options };
+        assert!(matches!(match_descriptors(&a, &a, &bad), Err(MatchError::BadRatio { .. })));
+    }
+}
