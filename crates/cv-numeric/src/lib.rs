@@ -1,1 +1,25 @@
 //! Dense and sparse linear algebra, polynomial roots and least squares for vision.
+//!
+//! The only place of the workspace that talks to faer. Small matrices of fixed size stay with nalgebra or with closed
+//! forms, which are faster there.
+//!
+//! ```
+//! use cv_numeric::{svd3, smallest_eigenvector};
+//! use nalgebra::{Matrix3, Vector3};
+//!
+//! let m = Matrix3::from_diagonal(&Vector3::new(1.0, 5.0, 2.0));
+//! assert_eq!(svd3(&m)?.s, Vector3::new(5.0, 2.0, 1.0));
+//! assert!((smallest_eigenvector(&m)? - Vector3::x()).norm() < 1e-12);
+//! # Ok::<(), cv_numeric::LinearError>(())
+//! ```
+
+mod levenberg_marquardt;
+mod linear;
+mod robust_loss;
+
+pub use levenberg_marquardt::{LeastSquares, LmOptions, LmReport, NormalEquations, levenberg_marquardt};
+pub use linear::{
+    LinearError, Svd3, null_vector, smallest_eigenvector, solve_positive_definite, solve_positive_definite_dense, svd3,
+    symmetric_eigen,
+};
+pub use robust_loss::RobustLoss;

@@ -1,0 +1,255 @@
+//! Levenberg–Marquardt on normal equations.
+
+use nalgebra::allocator::Allocator;
+use nalgebra::{Cholesky, DefaultAllocator, Dim, OMatrix, OVector, U1};
+
+/// The second-order model of a cost around some parameters: `cost + 2 gᵀδ + δᵀHδ`, with `H = Σ w JᵀJ`, `g = Σ w Jᵀr`.
+#[derive(Debug, Clone)]
+pub struct NormalEquations<D: Dim>
+where
+    DefaultAllocator: Allocator<D, D> + Allocator<D>,
+{
+    /// `Σ ρ(r²)`.
+    pub cost: f64,
+    /// `Σ w JᵀJ`. Only the lower triangle is read.
+    pub hessian: OMatrix<f64, D, D>,
+    /// `Σ w Jᵀr`.
+    pub gradient: OVector<f64, D>,
+}
+
+impl<D: Dim> NormalEquations<D>
+where
+    DefaultAllocator: Allocator<D, D> + Allocator<D>,
+{
+    /// All zero.
+    pub fn zeros(dim: D) -> Self {
+        Self { cost: 0.0, hessian: OMatrix::zeros_generic(dim, dim), gradient: OVector::zeros_generic(dim, U1) }
+    }
+
+    /// Adds one scalar residual `r` with its derivative by the parameters and a weight.
+    #[inline]
+    pub fn add(&mut self, r: f64, jacobian: &OVector<f64, D>, weight: f64) {
+        let n = jacobian.len();
+        for j in 0..n {
+            let wj = weight * jacobian[j];
+            self.gradient[j] += wj * r;
+            for i in j..n {
+                self.hessian[(i, j)] += wj * jacobian[i];
+            }
+        }
+    }
+}
+
+/// A non-linear least-squares problem.
+///
+/// The parameters may live on a manifold: the solver only ever moves them by [`LeastSquares::step`].
+pub trait LeastSquares {
+    /// Number of degrees of freedom: `nalgebra::Const<N>` or `nalgebra::Dyn`.
+    type Dim: Dim;
+    /// Parameters.
+    type Params: Clone;
+
+    /// The number of degrees of freedom.
+    fn dim(&self) -> Self::Dim;
+
+    /// The cost `Σ ρ(r²)`; may be infinite or NaN, which the solver treats as a step not to take.
+    fn cost(&self, params: &Self::Params) -> f64;
+
+    /// Cost, gradient and Gauss–Newton Hessian.
+    fn linearize(&self, params: &Self::Params) -> NormalEquations<Self::Dim>
+    where
+        DefaultAllocator: Allocator<Self::Dim, Self::Dim> + Allocator<Self::Dim>;
+
+    /// `params` moved by `delta` in the tangent space used by [`LeastSquares::linearize`].
+    fn step(&self, params: &Self::Params, delta: &OVector<f64, Self::Dim>) -> Self::Params
+    where
+        DefaultAllocator: Allocator<Self::Dim>;
+}
+
+/// When [`levenberg_marquardt`] stops, and how it starts.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LmOptions {
+    /// Most linearisations. Default 25, where two-view problems have long converged.
+    pub max_iterations: usize,
+    /// Initial damping relative to the diagonal. Default 1e-3 (Marquardt 1963).
+    pub initial_damping: f64,
+    /// Stop where a step lowers the cost by less than this share. Default 1e-10.
+    pub cost_tolerance: f64,
+    /// Stop where the largest entry of a step is below this, in the parameters' unit. Default 1e-12.
+    pub step_tolerance: f64,
+}
+
+impl Default for LmOptions {
+    fn default() -> Self {
+        Self { max_iterations: 25, initial_damping: 1e-3, cost_tolerance: 1e-10, step_tolerance: 1e-12 }
+    }
+}
+
+/// What [`levenberg_marquardt`] found.
+#[derive(Debug, Clone)]
+pub struct LmReport<P> {
+    /// The best parameters met.
+    pub params: P,
+    /// Cost at the start.
+    pub initial_cost: f64,
+    /// Cost of `params`, never above `initial_cost`.
+    pub cost: f64,
+    /// Number of linearisations.
+    pub iterations: usize,
+    /// True where a tolerance was met; false where the iterations ran out or no step could be taken.
+    pub converged: bool,
+}
+
+/// Minimises `problem` from `initial` by Levenberg–Marquardt with Marquardt's diagonal scaling.
+///
+/// The result is never worse than the start. A start with a NaN cost is returned as it is.
+/// Each iteration costs one linearisation and one Cholesky factorisation of the Hessian, O(dim³).
+pub fn levenberg_marquardt<T: LeastSquares>(problem: &T, initial: T::Params, options: &LmOptions) -> LmReport<T::Params>
+where
+    DefaultAllocator: Allocator<T::Dim, T::Dim> + Allocator<T::Dim>,
+{
+    const MIN_DAMPING: f64 = 1e-12;
+    const MAX_DAMPING: f64 = 1e12;
+    let mut params = initial;
+    let mut model = problem.linearize(&params);
+    let initial_cost = model.cost;
+    let mut iterations = 1;
+    let mut damping = options.initial_damping;
+    let report = |params, cost, iterations, converged| LmReport { params, initial_cost, cost, iterations, converged };
+    if !initial_cost.is_finite() {
+        return report(params, initial_cost, iterations, false);
+    }
+    loop {
+        let dim = model.gradient.len();
+        // A diagonal of zeros (a parameter nothing depends on) still has to be damped.
+        let floor = 1e-12 * (0..dim).map(|i| model.hessian[(i, i)]).fold(0.0, f64::max);
+        let mut damped = model.hessian.clone();
+        for i in 0..dim {
+            damped[(i, i)] += damping * damped[(i, i)].max(floor);
+        }
+        let delta = match Cholesky::new(damped) {
+            Some(factor) => -factor.solve(&model.gradient),
+            None if damping < MAX_DAMPING && floor > 0.0 => {
+                damping = (damping * 10.0).max(1e-6);
+                continue;
+            }
+            None => return report(params, model.cost, iterations, floor == 0.0),
+        };
+        let step = delta.amax();
+        if step.is_nan() || step <= options.step_tolerance {
+            return report(params, model.cost, iterations, true);
+        }
+        let candidate = problem.step(&params, &delta);
+        let cost = problem.cost(&candidate);
+        if cost < model.cost {
+            let gain = model.cost - cost;
+            let done = gain < options.cost_tolerance * model.cost;
+            params = candidate;
+            if done || iterations >= options.max_iterations {
+                return report(params, cost, iterations, done);
+            }
+            model = problem.linearize(&params);
+            model.cost = cost;
+            iterations += 1;
+            damping = (damping * 0.1).max(MIN_DAMPING);
+        } else {
+            damping *= 10.0;
+            if damping > MAX_DAMPING {
+                return report(params, model.cost, iterations, true);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{Const, DVector, Dyn, Vector2};
+
+    /// Rosenbrock's valley as least squares: r = (1 − x, 10 (y − x²)), minimum 0 at (1, 1).
+    struct Rosenbrock;
+
+    impl LeastSquares for Rosenbrock {
+        type Dim = Const<2>;
+        type Params = Vector2<f64>;
+
+        fn dim(&self) -> Const<2> {
+            Const
+        }
+
+        fn cost(&self, p: &Vector2<f64>) -> f64 {
+            (1.0 - p.x).powi(2) + 100.0 * (p.y - p.x * p.x).powi(2)
+        }
+
+        fn linearize(&self, p: &Vector2<f64>) -> NormalEquations<Const<2>> {
+            let mut n = NormalEquations::zeros(Const);
+            n.add(1.0 - p.x, &Vector2::new(-1.0, 0.0), 1.0);
+            n.add(10.0 * (p.y - p.x * p.x), &Vector2::new(-20.0 * p.x, 10.0), 1.0);
+            n.cost = self.cost(p);
+            n
+        }
+
+        fn step(&self, p: &Vector2<f64>, d: &Vector2<f64>) -> Vector2<f64> {
+            p + d
+        }
+    }
+
+    #[test]
+    fn a_curved_valley_is_followed_to_its_end() {
+        let options = LmOptions { max_iterations: 100, ..LmOptions::default() };
+        let report = levenberg_marquardt(&Rosenbrock, Vector2::new(-1.2, 1.0), &options);
+        // Quadratic convergence to an exact zero: what is left is rounding.
+        assert!((report.params - Vector2::new(1.0, 1.0)).norm() < 1e-8, "{:?}", report.params);
+        assert!(report.converged && report.cost < 1e-16);
+    }
+
+    /// A line `a x + b` of run-time size with one parameter that nothing depends on.
+    struct Line(Vec<(f64, f64)>);
+
+    impl LeastSquares for Line {
+        type Dim = Dyn;
+        type Params = DVector<f64>;
+
+        fn dim(&self) -> Dyn {
+            Dyn(3)
+        }
+
+        fn cost(&self, p: &DVector<f64>) -> f64 {
+            self.0.iter().map(|&(x, y)| (p[0] * x + p[1] - y).powi(2)).sum()
+        }
+
+        fn linearize(&self, p: &DVector<f64>) -> NormalEquations<Dyn> {
+            let mut n = NormalEquations::zeros(self.dim());
+            for &(x, y) in &self.0 {
+                n.add(p[0] * x + p[1] - y, &DVector::from_vec(vec![x, 1.0, 0.0]), 1.0);
+            }
+            n.cost = self.cost(p);
+            n
+        }
+
+        fn step(&self, p: &DVector<f64>, d: &DVector<f64>) -> DVector<f64> {
+            p + d
+        }
+    }
+
+    #[test]
+    fn a_parameter_that_nothing_depends_on_stays_where_it_is() {
+        // By hand: the least-squares line through (0,1), (1,3), (2,4) is 1.5 x + 7/6.
+        let line = Line(vec![(0.0, 1.0), (1.0, 3.0), (2.0, 4.0)]);
+        let report = levenberg_marquardt(&line, DVector::from_vec(vec![0.0, 0.0, 5.0]), &LmOptions::default());
+        assert!((report.params[0] - 1.5).abs() < 1e-9 && (report.params[1] - 7.0 / 6.0).abs() < 1e-9);
+        assert_eq!(report.params[2], 5.0);
+    }
+
+    #[test]
+    fn a_start_that_is_not_a_number_is_returned() {
+        let report = levenberg_marquardt(&Rosenbrock, Vector2::new(f64::NAN, 1.0), &LmOptions::default());
+        assert!(report.params.x.is_nan() && !report.converged);
+    }
+
+    #[test]
+    fn no_data_means_no_step() {
+        let report = levenberg_marquardt(&Line(vec![]), DVector::from_vec(vec![1.0, 2.0, 3.0]), &LmOptions::default());
+        assert_eq!(report.params.as_slice(), [1.0, 2.0, 3.0]);
+    }
+}

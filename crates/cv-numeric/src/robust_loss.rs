@@ -1,0 +1,135 @@
+//! Robust losses for least squares.
+
+/// A loss ρ of the squared residual `s = r²`, with `ρ(s) ≈ s` near zero (Triggs et al., "Bundle Adjustment", 2000, §3.3).
+///
+/// `scale` is the residual, in its own unit, at which a loss starts to bend.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub enum RobustLoss {
+    /// `ρ(s) = s`: plain least squares.
+    #[default]
+    Trivial,
+    /// `s` up to `scale²`, then `2·scale·r − scale²`.
+    Huber {
+        /// Where the quadratic ends.
+        scale: f64,
+    },
+    /// `scale² ln(1 + s/scale²)`.
+    Cauchy {
+        /// Half weight at this residual.
+        scale: f64,
+    },
+    /// Tukey's biweight, `scale²/3 · (1 − (1 − s/scale²)³)`, constant from `scale` on.
+    Tukey {
+        /// Zero weight from this residual on.
+        scale: f64,
+    },
+    /// `min(s, scale²)`: least squares on the inliers.
+    Truncated {
+        /// Zero weight from this residual on.
+        scale: f64,
+    },
+    /// Geman and McClure's `scale² s / (scale² + s)`, which saturates at `scale²`.
+    GemanMcClure {
+        /// A quarter of the weight at this residual.
+        scale: f64,
+    },
+}
+
+impl RobustLoss {
+    /// ρ(s) of the squared residual `s ≥ 0`.
+    #[inline]
+    pub fn value(&self, s: f64) -> f64 {
+        match *self {
+            Self::Trivial => s,
+            Self::Huber { scale } => {
+                let k = scale * scale;
+                if s <= k { s } else { 2.0 * scale * s.sqrt() - k }
+            }
+            Self::Cauchy { scale } => {
+                let k = scale * scale;
+                k * (s / k).ln_1p()
+            }
+            Self::Tukey { scale } => {
+                let k = scale * scale;
+                let u = (1.0 - s / k).max(0.0);
+                k / 3.0 * (1.0 - u * u * u)
+            }
+            Self::Truncated { scale } => s.min(scale * scale),
+            Self::GemanMcClure { scale } => {
+                let k = scale * scale;
+                k * s / (k + s)
+            }
+        }
+    }
+
+    /// ρ'(s): the weight of a residual in iteratively reweighted least squares, 1 near zero.
+    #[inline]
+    pub fn weight(&self, s: f64) -> f64 {
+        match *self {
+            Self::Trivial => 1.0,
+            Self::Huber { scale } => {
+                if s <= scale * scale {
+                    1.0
+                } else {
+                    scale / s.sqrt()
+                }
+            }
+            Self::Cauchy { scale } => 1.0 / (1.0 + s / (scale * scale)),
+            Self::Tukey { scale } => {
+                let u = (1.0 - s / (scale * scale)).max(0.0);
+                u * u
+            }
+            Self::Truncated { scale } => {
+                if s < scale * scale {
+                    1.0
+                } else {
+                    0.0
+                }
+            }
+            Self::GemanMcClure { scale } => {
+                let u = 1.0 / (1.0 + s / (scale * scale));
+                u * u
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn losses(scale: f64) -> [RobustLoss; 6] {
+        [
+            RobustLoss::Trivial,
+            RobustLoss::Huber { scale },
+            RobustLoss::Cauchy { scale },
+            RobustLoss::Tukey { scale },
+            RobustLoss::Truncated { scale },
+            RobustLoss::GemanMcClure { scale },
+        ]
+    }
+
+    proptest! {
+        #[test]
+        fn the_weight_is_the_derivative(scale in 0.1..10.0f64, ratio in 0.0..3.0f64) {
+            // Away from the corner of the truncated loss, which has no derivative.
+            prop_assume!((ratio - 1.0).abs() > 1e-3);
+            let s = ratio * scale * scale;
+            let h = 1e-6 * scale * scale;
+            for loss in losses(scale) {
+                let numeric = (loss.value(s + h) - loss.value((s - h).max(0.0))) / (s + h - (s - h).max(0.0));
+                // A one-sided difference at s = 0 is off by h/2 times a second derivative of order 1/scale².
+                prop_assert!((numeric - loss.weight(s)).abs() < 1e-5, "{loss:?} at {s}");
+            }
+        }
+    }
+
+    #[test]
+    fn every_loss_is_the_squared_residual_near_zero() {
+        for loss in losses(2.0) {
+            // ρ''(0)·s/2 is at most s/scale² relative.
+            assert!((loss.value(1e-8) / 1e-8 - 1.0).abs() < 1e-7 && (loss.weight(0.0) - 1.0).abs() < 1e-12);
+        }
+    }
+}
