@@ -1,1 +1,22 @@
-//! Rectification, semi-global matching, disparity checks and depth.
+//! Stereo: from a rectified pair of images to disparity and depth.
+//!
+//! See [`StereoMatcher`] for an example.
+//!
+//! # Conventions
+//!
+//! Disparity is `x_left − x_right` in pixels, `f32`, NaN where there is none.
+
+mod census;
+mod error;
+mod fill;
+mod input;
+mod matcher;
+mod median;
+mod options;
+mod plain;
+mod speckle;
+
+pub use error::StereoError;
+pub use input::Intensity;
+pub use matcher::{DisparityMap, PixelState, StereoMatcher};
+pub use options::{Census, Paths, StereoOptions, Subpixel};

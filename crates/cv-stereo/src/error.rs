@@ -1,0 +1,72 @@
+//! What can be wrong with a stereo job.
+
+/// Why no disparity could be computed.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum StereoError {
+    /// The two images differ in size.
+    #[error("left image is {}×{} px, right image {}×{} px: both must have the same size", left.0, left.1, right.0, right.1)]
+    SizeMismatch {
+        /// Width and height of the left image.
+        left: (usize, usize),
+        /// Width and height of the right image.
+        right: (usize, usize),
+    },
+    /// The images are too small for the census window.
+    #[error("images of {width}×{height} px are smaller than the {window_width}×{window_height} matching window")]
+    TooSmall {
+        /// Image width in pixels.
+        width: usize,
+        /// Image height in pixels.
+        height: usize,
+        /// Width of the window.
+        window_width: usize,
+        /// Height of the window.
+        window_height: usize,
+    },
+    /// No disparity was asked for, or more than the matcher can number.
+    #[error("{disparities} disparities asked for; 1 to {max} are possible")]
+    Range {
+        /// Number of disparities asked for.
+        disparities: usize,
+        /// The most that can be asked for.
+        max: usize,
+    },
+    /// No pixel of the left image has a partner at any of the disparities.
+    #[error(
+        "disparities {min} to {max} px put every match outside images that are {width} px wide: the range must overlap −{width} to {width}"
+    )]
+    RangeOutsideImage {
+        /// Smallest disparity.
+        min: i64,
+        /// Largest disparity.
+        max: i64,
+        /// Image width in pixels.
+        width: usize,
+    },
+    /// A penalty or threshold is out of its range.
+    #[error("option {name} is {value}; it must be {allowed}")]
+    Option {
+        /// Name of the option.
+        name: &'static str,
+        /// Its value.
+        value: f64,
+        /// What would be accepted.
+        allowed: &'static str,
+    },
+    /// A float image holds NaN or infinite values.
+    #[error("{count} samples of the {side} image are NaN or infinite")]
+    NotFinite {
+        /// `left` or `right`.
+        side: &'static str,
+        /// How many samples.
+        count: usize,
+    },
+    /// The job needs more memory than allowed.
+    #[error("matching needs {needed} bytes and {allowed} are allowed")]
+    Memory {
+        /// Bytes needed by the smallest way to do the job.
+        needed: usize,
+        /// Bytes allowed by `max_memory`.
+        allowed: usize,
+    },
+}

@@ -1,0 +1,91 @@
+//! Any image to the 16-bit grey that the matcher works on.
+
+use cv_core::{ImageView, Sample};
+use rayon::prelude::*;
+
+/// A channel type the matcher takes.
+pub trait Intensity: Sample {
+    /// On a scale of 0 to 65535.
+    fn to_u16(self) -> u16;
+    /// False for NaN and infinities.
+    fn is_number(self) -> bool {
+        true
+    }
+}
+
+impl Intensity for u8 {
+    #[inline]
+    fn to_u16(self) -> u16 {
+        u16::from(self) * 257
+    }
+}
+
+impl Intensity for u16 {
+    #[inline]
+    fn to_u16(self) -> u16 {
+        self
+    }
+}
+
+/// From 0 to 1; what lies outside is clamped.
+impl Intensity for f32 {
+    #[inline]
+    fn to_u16(self) -> u16 {
+        (self.clamp(0.0, 1.0) * 65535.0 + 0.5) as u16
+    }
+    #[inline]
+    fn is_number(self) -> bool {
+        self.is_finite()
+    }
+}
+
+/// Grey of `view` into `out` (resized), Rec. 601 weights for three or more channels. Returns how many samples are no
+/// numbers.
+pub(crate) fn to_grey<T: Intensity, const C: usize>(view: ImageView<'_, T, C>, out: &mut Vec<u16>) -> usize {
+    let (width, height) = view.size();
+    out.resize(width * height, 0);
+    if out.is_empty() || C == 0 {
+        return 0;
+    }
+    out.par_chunks_mut(width)
+        .enumerate()
+        .map(|(y, row)| {
+            let samples = view.row(y);
+            for (pixel, grey) in samples.chunks_exact(C).zip(row) {
+                *grey = if C >= 3 {
+                    // The weights add up to 2¹⁶, so that a grey pixel keeps its value.
+                    let [r, g, b] = [pixel[0], pixel[1], pixel[2]].map(|v| u32::from(v.to_u16()));
+                    ((r * 19595 + g * 38470 + b * 7471 + 32768) >> 16) as u16
+                } else {
+                    pixel[0].to_u16()
+                };
+            }
+            samples.iter().filter(|v| !v.is_number()).count()
+        })
+        .sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cv_core::Image;
+
+    #[test]
+    fn grey_in_colour_is_the_same_grey() {
+        let grey = Image::<u8, 1>::from_fn(256, 1, |x, _| [x as u8]);
+        let rgb = grey.map(|[v]| [v; 3]);
+        let (mut a, mut b) = (Vec::new(), Vec::new());
+        to_grey(grey.view(), &mut a);
+        to_grey(rgb.view(), &mut b);
+        assert_eq!(a, b);
+        assert_eq!((a[0], a[255]), (0, 65535));
+    }
+
+    #[test]
+    fn what_is_not_a_number_is_counted() {
+        let image = Image::<f32, 1>::from_vec(2, 2, vec![0.5, f32::NAN, f32::INFINITY, 2.0]).unwrap();
+        let mut out = Vec::new();
+        assert_eq!(to_grey(image.view(), &mut out), 2);
+        assert_eq!((out[0], out[3]), (32768, 65535));
+    }
+}

@@ -1,0 +1,226 @@
+//! From a rectified pair to checked disparities.
+
+use crate::census::census;
+use crate::input::to_grey;
+use crate::plain::{Winner, match_plain};
+use crate::{Intensity, StereoError, StereoOptions, Subpixel, fill, median, speckle};
+use cv_core::{GrayF32, Image, ImageView, Sample};
+use rayon::prelude::*;
+
+/// How a pixel came by its disparity.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[repr(u8)]
+pub enum PixelState {
+    /// Matched and confirmed by every check.
+    #[default]
+    Matched,
+    /// Seen by the left camera only: something nearer hides it from the right one. Filled from the background.
+    Occluded,
+    /// Its match failed a check. Filled from around.
+    Mismatched,
+    /// Its match would lie outside the right image. Filled from around.
+    OutOfView,
+}
+
+impl Sample for PixelState {}
+
+/// Disparities of a left image.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DisparityMap {
+    /// `x_left − x_right` in px, NaN where there is none.
+    pub disparity: GrayF32,
+    /// Where each disparity comes from; all but [`PixelState::Matched`] are filled in, or NaN without filling.
+    pub state: Image<PixelState, 1>,
+}
+
+impl DisparityMap {
+    /// An empty map, to be handed to [`StereoMatcher::compute_into`].
+    pub fn empty() -> Self {
+        Self { disparity: GrayF32::new(0, 0, [0.0]), state: Image::new(0, 0, [PixelState::Matched]) }
+    }
+
+    /// Share of pixels with a disparity, filled ones included.
+    pub fn valid_fraction(&self) -> f64 {
+        let d = self.disparity.as_slice();
+        d.iter().filter(|v| v.is_finite()).count() as f64 / d.len().max(1) as f64
+    }
+
+    /// Share of pixels whose disparity was measured and passed every check.
+    pub fn matched_fraction(&self) -> f64 {
+        let s = self.state.as_slice();
+        s.iter().filter(|&&v| v == PixelState::Matched).count() as f64 / s.len().max(1) as f64
+    }
+}
+
+/// A semi-global matcher (Hirschmüller, PAMI 2008) that keeps its buffers between pairs.
+///
+/// ```
+/// use cv_core::Image;
+/// use cv_stereo::{StereoMatcher, StereoOptions};
+///
+/// // A textured wall seen 5 px further left by the right camera.
+/// let texture = |x: usize, y: usize| ((x * 7919 + y * 104_729 + (x * y) % 97 * 31) % 251) as u8;
+/// let left = Image::<u8, 1>::from_fn(64, 32, |x, y| [texture(x, y)]);
+/// let right = Image::<u8, 1>::from_fn(64, 32, |x, y| [texture(x + 5, y)]);
+/// let mut matcher = StereoMatcher::new(StereoOptions { disparities: 16, ..Default::default() })?;
+/// let map = matcher.compute(left.view(), right.view())?;
+/// assert!((map.disparity.at(30, 16)[0] - 5.0).abs() < 0.1);
+/// # Ok::<(), cv_stereo::StereoError>(())
+/// ```
+#[derive(Debug)]
+pub struct StereoMatcher {
+    options: StereoOptions,
+    grey: [Vec<u16>; 2],
+    census: [Vec<u64>; 2],
+    labels: Vec<u32>,
+    scratch: Vec<f32>,
+}
+
+impl StereoMatcher {
+    /// A matcher with these options.
+    ///
+    /// # Errors
+    /// [`StereoError::Range`] and [`StereoError::Option`] for options out of range.
+    pub fn new(options: StereoOptions) -> Result<Self, StereoError> {
+        options.validate()?;
+        Ok(Self {
+            options,
+            grey: Default::default(),
+            census: Default::default(),
+            labels: Vec::new(),
+            scratch: Vec::new(),
+        })
+    }
+
+    /// The options.
+    pub fn options(&self) -> &StereoOptions {
+        &self.options
+    }
+
+    /// Disparities of `left`. The images are rectified: a scene point has the same y in both.
+    ///
+    /// # Errors
+    /// [`StereoError`] where the images do not fit together or the disparities do not fit the images.
+    pub fn compute<T: Intensity, const C: usize>(
+        &mut self,
+        left: ImageView<'_, T, C>,
+        right: ImageView<'_, T, C>,
+    ) -> Result<DisparityMap, StereoError> {
+        let mut map = DisparityMap::empty();
+        self.compute_into(left, right, &mut map)?;
+        Ok(map)
+    }
+
+    /// As [`StereoMatcher::compute`], into a map of any size, whose memory is used again where it has the right one.
+    ///
+    /// # Errors
+    /// As [`StereoMatcher::compute`]; `map` is then unchanged.
+    pub fn compute_into<T: Intensity, const C: usize>(
+        &mut self,
+        left: ImageView<'_, T, C>,
+        right: ImageView<'_, T, C>,
+        map: &mut DisparityMap,
+    ) -> Result<(), StereoError> {
+        let (width, height) = left.size();
+        if left.size() != right.size() {
+            return Err(StereoError::SizeMismatch { left: left.size(), right: right.size() });
+        }
+        let (window_width, window_height) = self.options.census.size();
+        if width < window_width || height < window_height {
+            return Err(StereoError::TooSmall { width, height, window_width, window_height });
+        }
+        let min = i64::from(self.options.min_disparity);
+        let max = min + self.options.disparities as i64 - 1;
+        if min >= width as i64 || max <= -(width as i64) {
+            return Err(StereoError::RangeOutsideImage { min, max, width });
+        }
+        for (side, view, grey) in [("left", left, 0), ("right", right, 1)] {
+            let count = to_grey(view, &mut self.grey[grey]);
+            if count > 0 {
+                return Err(StereoError::NotFinite { side, count });
+            }
+        }
+        for (grey, bits) in self.grey.iter().zip(&mut self.census) {
+            census(grey, width, height, self.options.census, bits);
+        }
+        let (winners, right_index) =
+            match_plain(&self.options, &self.grey[0], &self.census[0], &self.census[1], width, height);
+        if map.disparity.size() != (width, height) {
+            map.disparity = GrayF32::new(width, height, [f32::NAN]);
+            map.state = Image::new(width, height, [PixelState::Matched]);
+        }
+        self.check(&winners, &right_index, map);
+        self.refine(map);
+        Ok(())
+    }
+
+    /// Uniqueness, view, left-right consistency; sub-pixel place of what passes.
+    fn check(&self, winners: &[Winner], right_index: &[u16], map: &mut DisparityMap) {
+        let width = map.disparity.width();
+        let options = &self.options;
+        map.disparity
+            .as_mut_slice()
+            .par_chunks_mut(width)
+            .zip(map.state.as_mut_slice().par_chunks_mut(width))
+            .zip(winners.par_chunks(width).zip(right_index.par_chunks(width)))
+            .for_each(|((disparity, state), (winners, right))| {
+                for (x, winner) in winners.iter().enumerate() {
+                    state[x] = judge(options, x, winner, right);
+                    disparity[x] = if state[x] == PixelState::Matched {
+                        let whole = options.min_disparity + i32::from(winner.index);
+                        whole as f32 + subpixel(options.subpixel, winner)
+                    } else {
+                        f32::NAN
+                    };
+                }
+            });
+    }
+
+    /// Speckles, holes, median.
+    fn refine(&mut self, map: &mut DisparityMap) {
+        let (width, height) = map.disparity.size();
+        let options = &self.options;
+        let disparity = map.disparity.as_mut_slice();
+        speckle::remove_speckles(disparity, width, options.speckle_size, options.speckle_range, &mut self.labels);
+        for (state, d) in map.state.as_mut_slice().iter_mut().zip(disparity.iter()) {
+            if *state == PixelState::Matched && d.is_nan() {
+                *state = PixelState::Mismatched;
+            }
+        }
+        if options.fill {
+            fill::fill_holes(disparity, map.state.as_slice(), width, height);
+        }
+        if options.median > 0 {
+            median::median(disparity, width, height, options.median, &mut self.scratch);
+            disparity.copy_from_slice(&self.scratch);
+        }
+    }
+}
+
+/// What the checks say of a pixel's winner.
+fn judge(options: &StereoOptions, x: usize, winner: &Winner, right: &[u16]) -> PixelState {
+    let xr = x as i64 - i64::from(options.min_disparity) - i64::from(winner.index);
+    let Some(&seen) = usize::try_from(xr).ok().and_then(|xr| right.get(xr)) else {
+        return PixelState::OutOfView;
+    };
+    if let Some(tolerance) = options.left_right
+        && seen.abs_diff(winner.index) > tolerance
+    {
+        // What the right camera sees there is nearer: it hides this pixel.
+        return if seen > winner.index { PixelState::Occluded } else { PixelState::Mismatched };
+    }
+    if u32::from(winner.second) * u32::from(100 - options.uniqueness) < u32::from(winner.cost) * 100 {
+        return PixelState::Mismatched;
+    }
+    PixelState::Matched
+}
+
+/// Offset of the minimum from the winning index, −0.5 to 0.5.
+fn subpixel(method: Subpixel, winner: &Winner) -> f32 {
+    if method == Subpixel::None || winner.below == u16::MAX || winner.above == u16::MAX {
+        return 0.0;
+    }
+    let [below, above, cost] = [winner.below, winner.above, winner.cost].map(f32::from);
+    let slope = below.max(above) - cost;
+    if slope > 0.0 { (below - above) / (2.0 * slope) } else { 0.0 }
+}

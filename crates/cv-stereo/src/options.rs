@@ -1,0 +1,145 @@
+//! What a caller can choose.
+
+use crate::StereoError;
+
+/// The neighbourhood a pixel is described by: one bit per neighbour, set where it is darker than the centre.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Census {
+    /// 5×5, 24 bits: finest detail, least support in weak texture.
+    Window5x5,
+    /// 7×7, 48 bits.
+    Window7x7,
+    /// 9×7, 62 bits: steadiest under noise, rounds off thin structures.
+    Window9x7,
+}
+
+impl Census {
+    /// Width and height of the window.
+    pub fn size(self) -> (usize, usize) {
+        match self {
+            Self::Window5x5 => (5, 5),
+            Self::Window7x7 => (7, 7),
+            Self::Window9x7 => (9, 7),
+        }
+    }
+
+    /// Number of neighbours compared.
+    pub fn bits(self) -> usize {
+        let (w, h) = self.size();
+        w * h - 1
+    }
+}
+
+/// Along how many directions costs are aggregated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Paths {
+    /// Horizontal and vertical, both ways: half the work, slightly streaky on slanted surfaces.
+    Four,
+    /// And both diagonals, both ways.
+    Eight,
+}
+
+/// How the disparity is placed between whole pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Subpixel {
+    /// Whole pixels.
+    None,
+    /// Two lines of equal slope through the aggregated costs around the minimum.
+    VFit,
+}
+
+/// Options of [`crate::StereoMatcher`]. Costs count census bits.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StereoOptions {
+    /// Smallest disparity in px; may be negative. Default 0 (points at infinity of a rectified pair).
+    pub min_disparity: i32,
+    /// Number of whole disparities tried, from `min_disparity` up; 1 to 4096, any number. Default 128.
+    pub disparities: usize,
+    /// Matching window. Default 5×5.
+    pub census: Census,
+    /// Penalty for a disparity step of one pixel between neighbours. Default 4 (Pandora's default for census 5×5).
+    pub p1: u8,
+    /// Penalty for a larger step where the image is smooth. Default 20 (likewise).
+    pub p2: u8,
+    /// What `p2` falls to across a strong edge of the image. Default 8.
+    pub p2_min: u8,
+    /// Grey levels (of 255) between neighbours at which `p2` has fallen half way to `p2_min`; 0 keeps `p2` everywhere.
+    /// Default 16.
+    pub p2_gradient: u8,
+    /// Directions of aggregation. Default eight.
+    pub paths: Paths,
+    /// A winner must be at least this many percent cheaper than any disparity not next to it; 0 to 99, 0 accepts all.
+    /// Default 0: the left-right check finds the same errors and loses fewer good pixels.
+    pub uniqueness: u8,
+    /// Largest difference in px between the disparities seen from left and from right; `None` skips the check.
+    /// Default 1 (OpenCV's `disp12MaxDiff` in its samples).
+    pub left_right: Option<u16>,
+    /// Connected patches of up to this many pixels are removed; 0 removes none. Default 100 (OpenCV's samples).
+    pub speckle_size: usize,
+    /// Neighbours that differ by no more than this many px belong to one patch. Default 2.
+    pub speckle_range: f32,
+    /// Sub-pixel placement. Default [`Subpixel::VFit`].
+    pub subpixel: Subpixel,
+    /// Radius in px of the median filter; 0 for none, 1 or 2. Default 1 (3×3).
+    pub median: usize,
+    /// Whether rejected pixels get a disparity from their surroundings (background side where occluded). They are told
+    /// apart by [`crate::PixelState`]. Default true.
+    pub fill: bool,
+}
+
+impl Default for StereoOptions {
+    fn default() -> Self {
+        Self {
+            min_disparity: 0,
+            disparities: 128,
+            census: Census::Window5x5,
+            p1: 4,
+            p2: 20,
+            p2_min: 8,
+            p2_gradient: 16,
+            paths: Paths::Eight,
+            uniqueness: 0,
+            left_right: Some(1),
+            speckle_size: 100,
+            speckle_range: 2.0,
+            subpixel: Subpixel::VFit,
+            median: 1,
+            fill: true,
+        }
+    }
+}
+
+/// More disparities than any rectified pair of photographs shows; keeps indices in 16 bits with room to spare.
+pub(crate) const MAX_DISPARITIES: usize = 4096;
+
+impl StereoOptions {
+    /// Checks the options by themselves, without an image.
+    ///
+    /// # Errors
+    /// [`StereoError::Range`] or [`StereoError::Option`] with the first value that is out of range.
+    pub fn validate(&self) -> Result<(), StereoError> {
+        if self.disparities == 0 || self.disparities > MAX_DISPARITIES {
+            return Err(StereoError::Range { disparities: self.disparities, max: MAX_DISPARITIES });
+        }
+        let bad = |name, value: f64, allowed| Err(StereoError::Option { name, value, allowed });
+        if self.p2_min < self.p1 {
+            return bad("p2_min", f64::from(self.p2_min), "at least p1");
+        }
+        if self.p2 < self.p2_min {
+            return bad("p2", f64::from(self.p2), "at least p2_min");
+        }
+        if usize::from(self.p2) + self.census.bits() > 254 {
+            return bad("p2", f64::from(self.p2), "at most 254 less the bits of the census window");
+        }
+        if self.uniqueness > 99 {
+            return bad("uniqueness", f64::from(self.uniqueness), "0 to 99");
+        }
+        if !(self.speckle_range >= 0.0 && self.speckle_range.is_finite()) {
+            return bad("speckle_range", f64::from(self.speckle_range), "a finite number, 0 or more");
+        }
+        if self.median > 2 {
+            return bad("median", self.median as f64, "0, 1 or 2");
+        }
+        Ok(())
+    }
+}
