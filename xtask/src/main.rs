@@ -1,3 +1,60 @@
-//! Chores of the workspace.
+//! Chores of the workspace. This file only routes: `cargo xtask --help` lists them.
 
-fn main() {}
+mod peers;
+mod real;
+
+use clap::{Parser, Subcommand};
+use std::{
+    path::{Path, PathBuf},
+    process::ExitCode,
+};
+
+#[derive(Parser)]
+#[command(name = "cargo xtask", about = "Chores of the workspace.")]
+struct Cli {
+    #[command(subcommand)]
+    chore: Chore,
+}
+
+#[derive(Subcommand)]
+enum Chore {
+    /// Run the pipelines on real photographs with known truth and hold each figure against its bar.
+    Real {
+        /// Only this job.
+        job: Option<String>,
+    },
+    /// Run other systems and ours on the same inputs, side by side.
+    Peers {
+        /// Only this job.
+        job: Option<String>,
+    },
+}
+
+fn main() -> ExitCode {
+    let result = match Cli::parse().chore {
+        Chore::Real { job } => real::run(job.as_deref()),
+        Chore::Peers { job } => peers::run(job.as_deref()),
+    };
+    match result {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::FAILURE,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// The root of the workspace.
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap_or(Path::new("."))
+}
+
+/// The folder with the real data: `CV_DATA_DIR`, else `../shared/data` beside the workspace, where it is there.
+fn data_dir() -> Option<PathBuf> {
+    let folder = match std::env::var_os("CV_DATA_DIR") {
+        Some(folder) => PathBuf::from(folder),
+        None => root().join("../shared/data"),
+    };
+    folder.is_dir().then_some(folder)
+}

@@ -1,3 +1,25 @@
-//! The program `cv`: arguments, files and reports.
+//! The program `cv`: arguments, files and reports. The work itself is done by `cv-pipeline`.
 
-fn main() {}
+mod commands;
+#[allow(dead_code, reason = "the commands that use the rest arrive with their pipelines")]
+mod common;
+
+use clap::Parser;
+use common::Globals;
+
+/// Classical computer vision: colour segmentation, panoramas, two-view reconstruction and stereo depth.
+#[derive(Parser)]
+#[command(name = "cv", version, propagate_version = true, arg_required_else_help = true, max_term_width = 100)]
+#[command(after_help = "Exit codes: 0 done; 1 the job could not be done (the reason is on stderr); 2 wrong usage.\n\
+    `cv COMMAND --help` shows examples of each command.")]
+struct Cli {
+    #[command(flatten)]
+    globals: Globals,
+    #[command(subcommand)]
+    command: commands::Command,
+}
+
+fn main() -> std::process::ExitCode {
+    let cli = Cli::parse();
+    common::run(&cli.globals, |context| cli.command.run(context))
+}

@@ -1,1 +1,32 @@
-//! One call per job: segment, panorama, match, estimate, reconstruct, depth.
+//! One call per job, in memory: photographs and options in, result and timings out.
+//!
+//! This crate joins the stages of the crates below it (`cv-features`, `cv-geometry`, `cv-stereo`, `cv-segment`,
+//! `cv-panorama`) into the jobs a person asks for. It reads and writes no files: `cv-cli` does that, and so can any
+//! other program.
+//!
+//! ```
+//! use cv_pipeline::{Progress, Silent, Stopwatch};
+//!
+//! fn job(progress: &dyn Progress) -> Vec<(&'static str, f64)> {
+//!     let mut watch = Stopwatch::new();
+//!     for row in 0..10 {
+//!         progress.report("detect", row + 1, 10);
+//!     }
+//!     watch.lap("detect");
+//!     watch.into_stages()
+//! }
+//! assert_eq!(job(&Silent)[0].0, "detect");
+//! ```
+//!
+//! # Conventions
+//!
+//! * One file per job, holding `XOptions` (with `Default`), `XResult` and one function.
+//! * Every result has `stages: Vec<(&'static str, f64)>`, stage names and their seconds from a [`Stopwatch`].
+//! * Every job takes `&dyn Progress`; pass [`&Silent`](Silent) where nobody watches.
+//! * The same input, options and seed give the same result at any number of threads.
+
+mod progress;
+mod stopwatch;
+
+pub use progress::{Progress, Silent};
+pub use stopwatch::Stopwatch;

@@ -1,0 +1,23 @@
+//! `cv completions`: scripts that complete the command line.
+
+use crate::common::{Context, Failure, Outcome, Run};
+use clap::CommandFactory;
+use clap_complete::Shell;
+
+/// Print a script that completes `cv` commands in a shell.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cv completions bash > ~/.local/share/bash-completion/completions/cv\n  \
+    cv completions fish > ~/.config/fish/completions/cv.fish")]
+pub(crate) struct Args {
+    /// The shell.
+    shell: Shell,
+}
+
+impl Run for Args {
+    fn run(self, _: &Context) -> Result<Outcome, Failure> {
+        let mut script = Vec::new();
+        clap_complete::generate(self.shell, &mut crate::Cli::command(), "cv", &mut script);
+        Ok(Outcome::default().text("script", script))
+    }
+}

@@ -1,0 +1,63 @@
+//! Other systems and ours on the same inputs, side by side.
+//!
+//! One file per job; its scripts and the pinned versions live in `peers/` at the root, whose `.venv` is made on the first
+//! run. Register a job with one line in `JOBS`; it returns whether ours meets its bars.
+
+use anyhow::{Context, Result, bail, ensure};
+use std::{
+    path::{Path, PathBuf},
+    process::Command,
+};
+
+/// A job: its name on the command line and what it does with the Python of the peers and the data folder.
+type Job = (&'static str, fn(&Path, &Path) -> Result<bool>);
+
+const JOBS: &[Job] = &[];
+
+/// Runs all jobs, or the one named; true where ours meets every bar.
+pub(crate) fn run(only: Option<&str>) -> Result<bool> {
+    let jobs: Vec<&Job> = JOBS.iter().filter(|(name, _)| only.is_none_or(|only| only == *name)).collect();
+    if jobs.is_empty() {
+        let names: Vec<&str> = JOBS.iter().map(|(name, _)| *name).collect();
+        bail!("there is no such job; try: {}", names.join(", "));
+    }
+    let Some(data) = crate::data_dir() else {
+        println!(
+            "peers: skipped, there is no data: set CV_DATA_DIR to the folder that holds it (see docs/real-data.md)"
+        );
+        return Ok(true);
+    };
+    let python = python()?;
+    let mut ok = true;
+    for (name, job) in jobs {
+        println!("== {name}");
+        ok &= job(&python, &data).with_context(|| (*name).to_owned())?;
+    }
+    Ok(ok)
+}
+
+/// The Python that has the peers: `CV_PEERS_PYTHON`, else that of `peers/.venv`, made where it is missing.
+fn python() -> Result<PathBuf> {
+    if let Some(python) = std::env::var_os("CV_PEERS_PYTHON") {
+        return Ok(python.into());
+    }
+    let folder = crate::root().join("peers");
+    let python = folder.join(".venv/bin/python");
+    let stamp = folder.join(".venv/requirements.txt");
+    let wanted = std::fs::read_to_string(folder.join("requirements.txt")).context("peers/requirements.txt")?;
+    if std::fs::read_to_string(&stamp).is_ok_and(|have| have == wanted) {
+        return Ok(python);
+    }
+    println!("making peers/.venv");
+    check(Command::new("python3").args(["-m", "venv"]).arg(folder.join(".venv")))?;
+    check(Command::new(&python).args(["-m", "pip", "install", "--quiet", "-r"]).arg(folder.join("requirements.txt")))?;
+    std::fs::write(stamp, wanted)?;
+    Ok(python)
+}
+
+/// Runs a program to its end; an error where it fails.
+pub(crate) fn check(command: &mut Command) -> Result<()> {
+    let status = command.status().with_context(|| format!("cannot start {command:?}"))?;
+    ensure!(status.success(), "{command:?} failed: {status}");
+    Ok(())
+}
