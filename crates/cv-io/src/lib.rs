@@ -1,1 +1,53 @@
 //! Reading and writing images, disparity and depth maps, clouds, cameras and matches.
+//!
+//! ```
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! # let folder = tempfile::tempdir()?;
+//! # let path = folder.path().join("red.png");
+//! let red = cv_core::RgbU8::new(4, 3, [255, 0, 0]);
+//! cv_io::write_png(&path, red.view())?;
+//! assert_eq!(cv_io::read_rgb(&path)?, red);
+//!
+//! let error = cv_io::read_rgb(folder.path().join("blue.png")).unwrap_err();
+//! assert!(error.to_string().contains("blue.png"));
+//! # Ok(()) }
+//! ```
+//!
+//! # Conventions
+//!
+//! * What a file is, its content says, not its name.
+//! * Every reader is given untrusted bytes: a lie in a header is an error before memory is asked for, and nothing panics.
+//! * Every writer is atomic ([`write_atomic`]): the whole file, or what was there before.
+//! * A failure says which file, why, and what to try ([`IoError`]); the same reasons without a path are [`FormatError`].
+//! * Unknown disparity and depth are NaN in memory, whatever the file's own sign for it.
+//!
+//! | what | where |
+//! |---|---|
+//! | pictures | [`read_rgb`], [`read_gray_u8`], [`read_mask`], [`read_image`], [`write_png`], [`write_jpeg`] |
+//! | maps of floats | [`pfm`], [`kitti`], [`depth_mm`], [`scaled`] |
+//! | arrays | [`npy`] |
+//! | clouds | [`ply`] |
+//! | matches | [`read_matches`], [`write_matches`] |
+
+mod depth_png;
+mod encode;
+mod error;
+mod exif_info;
+mod files;
+mod matches;
+pub mod npy;
+pub mod pfm;
+mod picture;
+pub mod ply;
+mod sniff;
+
+pub use depth_png::{depth_mm, kitti, scaled};
+pub use encode::{JpegPixels, PngPixels, encode_jpeg, encode_png, write_image, write_jpeg, write_png};
+pub use error::{FormatError, IoError};
+pub use exif_info::{ExifFocal, ExifInfo, FocalSource};
+pub use files::{MAX_FILE_BYTES, write_atomic, write_bytes};
+pub use matches::{Matches, parse_matches, read_matches, write_matches};
+pub use picture::{
+    DEFAULT_MAX_PIXELS, DynImage, Pixels, ReadOptions, decode_image, exif_focal, read_gray_u8, read_image,
+    read_image_info, read_image_with, read_mask, read_rgb,
+};

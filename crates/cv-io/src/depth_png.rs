@@ -1,0 +1,177 @@
+//! Disparity and depth in ordinary PNG files: KITTI's 1/256 px, 16-bit millimetres, Middlebury's scaled bytes.
+//!
+//! All three keep 0 for "unknown", which is NaN in memory.
+
+use std::path::Path;
+
+use cv_core::{GrayF32, Image, ImageView};
+
+use crate::{FormatError, IoError, Pixels, read_image, write_png};
+
+/// KITTI's 16-bit disparity PNG: `round(256 d)`, 0 = unknown.
+pub mod kitti {
+    use super::*;
+
+    /// Reads disparities in pixels.
+    ///
+    /// # Errors
+    /// [`IoError`]: as [`read_image`], or not a grey picture of 16 bits.
+    pub fn read(path: impl AsRef<Path>) -> Result<GrayF32, IoError> {
+        Ok(values(&read_16(path.as_ref())?, 1.0 / 256.0))
+    }
+
+    /// Writes disparities in pixels.
+    ///
+    /// Known values from 0 up to 1/512 are stored as the smallest one, 1/256, as KITTI's own tools do. Returns how many
+    /// known values lie outside 0 to 255.998 and had to be stored as unknown.
+    ///
+    /// # Errors
+    /// As [`write_png`].
+    pub fn write(path: impl AsRef<Path>, disparity: ImageView<'_, f32, 1>) -> Result<usize, IoError> {
+        write_16(path.as_ref(), disparity, 256.0)
+    }
+}
+
+/// 16-bit PNG of millimetres, 0 = unknown: what depth cameras, ScanNet and TUM-like tools exchange.
+pub mod depth_mm {
+    use super::*;
+
+    /// Reads depth in metres.
+    ///
+    /// # Errors
+    /// [`IoError`]: as [`read_image`], or not a grey picture of 16 bits.
+    pub fn read(path: impl AsRef<Path>) -> Result<GrayF32, IoError> {
+        Ok(values(&read_16(path.as_ref())?, 1.0 / 1000.0))
+    }
+
+    /// Writes depth in metres.
+    ///
+    /// Returns how many known values lie outside 0 to 65.535 m and had to be stored as unknown.
+    ///
+    /// # Errors
+    /// As [`write_png`].
+    pub fn write(path: impl AsRef<Path>, depth: ImageView<'_, f32, 1>) -> Result<usize, IoError> {
+        write_16(path.as_ref(), depth, 1000.0)
+    }
+}
+
+/// Grey PNG of 8 or 16 bits where `value / scale` is the disparity in pixels and 0 = unknown (Middlebury 2001 to 2006).
+pub mod scaled {
+    use super::*;
+
+    /// Reads disparities in pixels. `scale` is 4 for Middlebury's cones at quarter size, 256 for KITTI.
+    ///
+    /// # Errors
+    /// [`IoError`]: as [`read_image`], or a colour picture, or a scale that is not positive.
+    pub fn read(path: impl AsRef<Path>, scale: f64) -> Result<GrayF32, IoError> {
+        let path = path.as_ref();
+        let fail = |reason| IoError::reading(path, reason);
+        if !(scale > 0.0 && scale.is_finite()) {
+            return Err(fail(FormatError::corrupt("disparity PNG", format!("the scale {scale} is not positive"))));
+        }
+        match read_image(path)?.pixels {
+            Pixels::Gray16(image) => Ok(values(&image, 1.0 / scale)),
+            Pixels::Gray8(image) => Ok(values(&image, 1.0 / scale)),
+            // Some tools save grey as three equal channels.
+            Pixels::Rgb8(image) if image.pixels().all(|[r, g, b]| r == g && g == b) => {
+                Ok(values(&image.map(|[v, _, _]| [v]), 1.0 / scale))
+            }
+            _ => Err(fail(FormatError::unsupported("disparity PNG", "a colour picture"))),
+        }
+    }
+
+    /// Writes disparities as bytes, `round(scale d)`, at least 1 where known. Returns how many known values do not fit and
+    /// had to be stored as unknown.
+    ///
+    /// # Errors
+    /// As [`write_png`].
+    pub fn write(path: impl AsRef<Path>, disparity: ImageView<'_, f32, 1>, scale: f64) -> Result<usize, IoError> {
+        let (stored, lost) = stored(disparity, scale, f64::from(u8::MAX));
+        write_png(path, stored.map(|[v]| [v as u8]).view())?;
+        Ok(lost)
+    }
+}
+
+fn read_16(path: &Path) -> Result<Image<u16, 1>, IoError> {
+    match read_image(path)?.pixels {
+        Pixels::Gray16(image) => Ok(image),
+        Pixels::Gray8(_) => {
+            Err(IoError::reading(path, FormatError::unsupported("16-bit PNG", "a picture of 8 bits in its place")))
+        }
+        _ => Err(IoError::reading(path, FormatError::unsupported("16-bit PNG", "a colour picture in its place"))),
+    }
+}
+
+fn values<T: cv_core::Sample + Into<f64>>(image: &Image<T, 1>, scale: f64) -> GrayF32 {
+    image.map(|[v]| {
+        let v: f64 = v.into();
+        [if v == 0.0 { f32::NAN } else { (v * scale) as f32 }]
+    })
+}
+
+fn write_16(path: &Path, view: ImageView<'_, f32, 1>, scale: f64) -> Result<usize, IoError> {
+    let (stored, lost) = stored(view, scale, f64::from(u16::MAX));
+    write_png(path, stored.view())?;
+    Ok(lost)
+}
+
+/// `round(scale · v)` within 1 to `most`, 0 where unknown; and how many known values do not fit.
+fn stored(view: ImageView<'_, f32, 1>, scale: f64, most: f64) -> (Image<u16, 1>, usize) {
+    let mut image = Image::<u16, 1>::new(view.width(), view.height(), [0]);
+    let mut lost = 0;
+    for y in 0..view.height() {
+        for (out, &v) in image.row_mut(y).iter_mut().zip(view.row(y)) {
+            let scaled = (f64::from(v) * scale).round();
+            if v >= 0.0 && scaled <= most {
+                *out = scaled.max(1.0) as u16;
+            } else if !v.is_nan() {
+                lost += 1;
+            }
+        }
+    }
+    (image, lost)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::write_png;
+
+    #[test]
+    fn kitti_keeps_a_256th_and_counts_what_does_not_fit() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("d.png");
+        let known = [0.0f32, 1.0, 127.25, 255.0, 65535.0 / 256.0];
+        let mut data = known.to_vec();
+        data.extend([f32::NAN, -1.0, 256.0, f32::INFINITY, 1e9]);
+        let image = GrayF32::from_vec(10, 1, data).unwrap();
+        assert_eq!(kitti::write(&path, image.view()).unwrap(), 4);
+        let back = kitti::read(&path).unwrap();
+        // Half a step of 1/256, but a known zero is stored as one step.
+        assert!(known.iter().zip(back.row(0)).all(|(a, b)| (a - b).abs() <= 1.0 / 256.0));
+        assert_eq!(back.row(0)[1..4], known[1..4]);
+        assert!(back.row(0)[5..].iter().all(|v| v.is_nan()));
+        // The very numbers of the format's definition.
+        let Pixels::Gray16(raw) = read_image(&path).unwrap().pixels else { panic!("16 bits") };
+        assert_eq!(raw.row(0), [1, 256, 32576, 65280, 65535, 0, 0, 0, 0, 0]);
+    }
+
+    #[test]
+    fn millimetres_and_scaled_bytes() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("d.png");
+        let image = GrayF32::from_vec(4, 1, vec![0.5, 65.535, 65.6, f32::NAN]).unwrap();
+        assert_eq!(depth_mm::write(&path, image.view()).unwrap(), 1);
+        let back = depth_mm::read(&path).unwrap();
+        assert_eq!(back.row(0)[..2], [0.5, 65.535]);
+        assert!(back.row(0)[2].is_nan() && back.row(0)[3].is_nan());
+
+        write_png(&path, cv_core::GrayU8::from_vec(3, 1, vec![0, 4, 255]).unwrap().view()).unwrap();
+        let back = scaled::read(&path, 4.0).unwrap();
+        assert!(back.row(0)[0].is_nan() && back.row(0)[1..] == [1.0, 63.75]);
+        assert_eq!(scaled::write(&path, back.view(), 4.0).unwrap(), 0);
+        assert_eq!(scaled::read(&path, 4.0).unwrap().row(0)[1..], [1.0, 63.75]);
+        assert!(kitti::read(&path).unwrap_err().to_string().contains("8 bits"));
+        assert!(scaled::read(&path, 0.0).is_err() && scaled::read(&path, f64::NAN).is_err());
+    }
+}

@@ -1,0 +1,119 @@
+//! Writing pictures.
+
+use std::path::Path;
+
+use cv_core::ImageView;
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::{ExtendedColorType, ImageEncoder};
+
+use crate::files::write_bytes;
+use crate::{FormatError, IoError};
+
+/// What a PNG can hold here: views of 1, 3 or 4 channels of `u8` or `u16`, and masks.
+pub trait PngPixels: sealed::Sealed {
+    /// Width, height, colour type and the rows, big-endian, without padding.
+    #[doc(hidden)]
+    fn parts(&self) -> (usize, usize, ExtendedColorType, Vec<u8>);
+}
+
+mod sealed {
+    pub trait Sealed {}
+}
+
+macro_rules! png_pixels {
+    ($sample:ty, $channels:literal, $color:ident, $push:expr) => {
+        impl sealed::Sealed for ImageView<'_, $sample, $channels> {}
+        impl PngPixels for ImageView<'_, $sample, $channels> {
+            fn parts(&self) -> (usize, usize, ExtendedColorType, Vec<u8>) {
+                let mut bytes = Vec::with_capacity(self.width() * self.height() * $channels * size_of::<$sample>());
+                let push: fn(&mut Vec<u8>, &[$sample]) = $push;
+                (0..self.height()).for_each(|y| push(&mut bytes, self.row(y)));
+                (self.width(), self.height(), ExtendedColorType::$color, bytes)
+            }
+        }
+    };
+}
+
+png_pixels!(u8, 1, L8, |out, row| out.extend_from_slice(row));
+png_pixels!(u8, 3, Rgb8, |out, row| out.extend_from_slice(row));
+png_pixels!(u8, 4, Rgba8, |out, row| out.extend_from_slice(row));
+png_pixels!(bool, 1, L8, |out, row| out.extend(row.iter().map(|&v| if v { 255u8 } else { 0 })));
+// The encoder takes 16-bit samples in the machine's byte order.
+png_pixels!(u16, 1, L16, |out, row| out.extend(row.iter().flat_map(|v| v.to_ne_bytes())));
+png_pixels!(u16, 3, Rgb16, |out, row| out.extend(row.iter().flat_map(|v| v.to_ne_bytes())));
+
+/// The bytes of a PNG file.
+///
+/// # Errors
+/// [`FormatError::NotRepresentable`] for an empty picture or one whose sides exceed 2³¹ − 1.
+pub fn encode_png(view: impl PngPixels) -> Result<Vec<u8>, FormatError> {
+    let (width, height, color, pixels) = view.parts();
+    let side = |n: usize| u32::try_from(n).ok().filter(|&n| n > 0 && n <= i32::MAX as u32);
+    let (Some(w), Some(h)) = (side(width), side(height)) else {
+        return Err(FormatError::NotRepresentable { format: "PNG", what: format!("a picture of {width}×{height}") });
+    };
+    let mut bytes = Vec::new();
+    PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive)
+        .write_image(&pixels, w, h, color)
+        .map_err(|e| FormatError::corrupt("PNG", e.to_string()))?;
+    Ok(bytes)
+}
+
+/// Writes a PNG; masks as 0 and 255.
+///
+/// # Errors
+/// As [`encode_png`] and [`crate::write_atomic`].
+pub fn write_png(path: impl AsRef<Path>, view: impl PngPixels) -> Result<(), IoError> {
+    let path = path.as_ref();
+    write_bytes(path, &encode_png(view).map_err(|reason| IoError::writing(path, reason))?)
+}
+
+/// What a JPEG can hold here: views of 1 or 3 channels of bytes.
+pub trait JpegPixels: PngPixels {}
+impl JpegPixels for ImageView<'_, u8, 1> {}
+impl JpegPixels for ImageView<'_, u8, 3> {}
+
+/// The bytes of a JPEG file at `quality` 1 to 100 (95 keeps what an eye can see). Colour is not subsampled from 90 on.
+///
+/// # Errors
+/// [`FormatError::NotRepresentable`] for an empty picture or one with a side above 65535.
+pub fn encode_jpeg(view: impl JpegPixels, quality: u8) -> Result<Vec<u8>, FormatError> {
+    let (width, height, color, pixels) = view.parts();
+    let side = |n: usize| u16::try_from(n).ok().filter(|&n| n > 0);
+    let (Some(w), Some(h)) = (side(width), side(height)) else {
+        return Err(FormatError::NotRepresentable { format: "JPEG", what: format!("a picture of {width}×{height}") });
+    };
+    let color =
+        if color == ExtendedColorType::L8 { jpeg_encoder::ColorType::Luma } else { jpeg_encoder::ColorType::Rgb };
+    let mut bytes = Vec::new();
+    jpeg_encoder::Encoder::new(&mut bytes, quality.clamp(1, 100))
+        .encode(&pixels, w, h, color)
+        .map_err(|e| FormatError::corrupt("JPEG", e.to_string()))?;
+    Ok(bytes)
+}
+
+/// Writes a JPEG at quality 95.
+///
+/// # Errors
+/// As [`encode_jpeg`] and [`crate::write_atomic`].
+pub fn write_jpeg(path: impl AsRef<Path>, view: impl JpegPixels) -> Result<(), IoError> {
+    let path = path.as_ref();
+    write_bytes(path, &encode_jpeg(view, 95).map_err(|reason| IoError::writing(path, reason))?)
+}
+
+/// Writes a picture in the format that the file name's ending asks for: `.jpg` or `.jpeg`, or `.png`.
+///
+/// # Errors
+/// [`FormatError::Unsupported`] for another ending; else as [`write_png`] and [`write_jpeg`].
+pub fn write_image(path: impl AsRef<Path>, view: impl JpegPixels) -> Result<(), IoError> {
+    let path = path.as_ref();
+    let ending = path.extension().map(|e| e.to_string_lossy().to_lowercase());
+    match ending.as_deref() {
+        Some("png") => write_png(path, view),
+        Some("jpg" | "jpeg") => write_jpeg(path, view),
+        _ => Err(IoError::writing(
+            path,
+            FormatError::unsupported("the file name", "an ending other than .png, .jpg and .jpeg"),
+        )),
+    }
+}

@@ -1,0 +1,196 @@
+//! Whole files in, whole files out.
+
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Read, Write};
+use std::path::{Path, PathBuf};
+
+use crate::{FormatError, IoError};
+
+/// The largest file that is read into memory: 4 GiB, far above any photograph and below what would take a machine down.
+pub const MAX_FILE_BYTES: u64 = 4 << 30;
+
+/// The bytes of a file, of at most [`MAX_FILE_BYTES`].
+pub(crate) fn read_bytes(path: &Path) -> Result<Vec<u8>, IoError> {
+    let fail = |reason: FormatError| IoError::reading(path, reason);
+    let file = File::open(path).map_err(|e| fail(e.into()))?;
+    let metadata = file.metadata().map_err(|e| fail(e.into()))?;
+    if metadata.is_dir() {
+        return Err(fail(io::Error::new(io::ErrorKind::IsADirectory, "it is a folder").into()));
+    }
+    let mut bytes = Vec::new();
+    if metadata.is_file() {
+        if metadata.len() > MAX_FILE_BYTES {
+            return Err(fail(FormatError::TooManyBytes { bytes: metadata.len(), limit: MAX_FILE_BYTES }));
+        }
+        bytes.reserve_exact(metadata.len() as usize);
+    }
+    // A pipe or a growing file has no honest length: stop just past the limit.
+    file.take(MAX_FILE_BYTES + 1).read_to_end(&mut bytes).map_err(|e| fail(e.into()))?;
+    if bytes.len() as u64 > MAX_FILE_BYTES {
+        return Err(fail(FormatError::TooManyBytes { bytes: bytes.len() as u64, limit: MAX_FILE_BYTES }));
+    }
+    if bytes.is_empty() { Err(fail(FormatError::Empty)) } else { Ok(bytes) }
+}
+
+/// The text of a file; a leading byte order mark is dropped.
+pub(crate) fn read_text(path: &Path) -> Result<String, IoError> {
+    let text = String::from_utf8(read_bytes(path)?)
+        .map_err(|_| IoError::reading(path, FormatError::corrupt("text", "it is not UTF-8 text")))?;
+    Ok(match text.strip_prefix('\u{feff}') {
+        Some(rest) => rest.to_owned(),
+        None => text,
+    })
+}
+
+/// Writes a file whole or not at all.
+///
+/// The bytes go to a temporary file in the same folder, which takes the name `path` once `content` has succeeded;
+/// after a failure it is removed, and what was at `path` is untouched. Permissions are those of the file replaced, or
+/// what the umask gives. A symbolic link is followed; a device or a pipe is written to directly. The rename protects
+/// against a program that dies half-way, not against a power cut: nothing is flushed to the disk by force.
+///
+/// # Errors
+/// [`IoError`] with the path and the operating system's reason, or whatever `content` fails with.
+pub fn write_atomic<R: Into<FormatError>>(
+    path: impl AsRef<Path>,
+    content: impl FnOnce(&mut dyn Write) -> Result<(), R>,
+) -> Result<(), IoError> {
+    let path = path.as_ref();
+    write_atomic_inner(path, |sink| content(sink).map_err(Into::into)).map_err(|reason| IoError::writing(path, reason))
+}
+
+fn write_atomic_inner(
+    path: &Path,
+    content: impl FnOnce(&mut dyn Write) -> Result<(), FormatError>,
+) -> Result<(), FormatError> {
+    let target: PathBuf = if path.is_symlink() { fs::canonicalize(path)? } else { path.to_owned() };
+    let existing = fs::metadata(&target).ok();
+    if let Some(metadata) = &existing {
+        if metadata.is_dir() {
+            return Err(io::Error::new(io::ErrorKind::IsADirectory, "it is a folder").into());
+        }
+        if !metadata.is_file() {
+            let mut sink = BufWriter::new(File::options().write(true).open(&target)?);
+            content(&mut sink)?;
+            return Ok(sink.flush()?);
+        }
+    }
+    let folder = match target.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent,
+        _ => Path::new("."),
+    };
+    if !folder.is_dir() {
+        let reason = format!("the folder {} does not exist", folder.display());
+        return Err(io::Error::new(io::ErrorKind::NotFound, reason).into());
+    }
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(".cv-").suffix(".part");
+    // A temporary file is private by default; an output is as open as any other file the user makes.
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt;
+        builder.permissions(fs::Permissions::from_mode(0o666));
+    }
+    let mut temporary = builder.tempfile_in(folder)?;
+    let mut sink = BufWriter::with_capacity(1 << 18, temporary.as_file_mut());
+    content(&mut sink)?;
+    sink.flush()?;
+    drop(sink);
+    if let Some(metadata) = existing {
+        temporary.as_file().set_permissions(metadata.permissions())?;
+    }
+    temporary.persist(&target).map_err(|e| e.error)?;
+    Ok(())
+}
+
+/// [`write_atomic`] of bytes that are already there.
+///
+/// # Errors
+/// As [`write_atomic`].
+pub fn write_bytes(path: impl AsRef<Path>, bytes: &[u8]) -> Result<(), IoError> {
+    write_atomic(path, |sink| sink.write_all(bytes))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn names(folder: &Path) -> Vec<String> {
+        let mut names: Vec<_> =
+            fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn a_failure_half_way_leaves_the_old_file_and_nothing_else() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.txt");
+        write_bytes(&path, b"old").unwrap();
+        let error = write_atomic(&path, |sink| {
+            sink.write_all(&[7; 1 << 20])?;
+            Err::<(), io::Error>(io::Error::other("the well ran dry"))
+        })
+        .unwrap_err();
+        assert!(error.to_string().contains("the well ran dry") && error.to_string().contains("a.txt"), "{error}");
+        assert_eq!(fs::read(&path).unwrap(), b"old");
+        assert_eq!(names(folder.path()), ["a.txt"]);
+    }
+
+    #[test]
+    fn a_panic_half_way_leaves_no_part_behind() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.txt");
+        let result =
+            std::panic::catch_unwind(|| write_atomic(&path, |_| -> Result<(), io::Error> { panic!("on purpose") }));
+        assert!(result.is_err());
+        assert!(names(folder.path()).is_empty());
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn permissions_are_those_of_an_ordinary_file_and_survive_replacement() {
+        use std::os::unix::fs::PermissionsExt;
+        let folder = tempfile::tempdir().unwrap();
+        let plain = folder.path().join("plain");
+        fs::write(&plain, b"x").unwrap();
+        let ours = folder.path().join("ours");
+        write_bytes(&ours, b"x").unwrap();
+        let mode = |p: &Path| fs::metadata(p).unwrap().permissions().mode() & 0o777;
+        assert_eq!(mode(&ours), mode(&plain));
+        fs::set_permissions(&ours, fs::Permissions::from_mode(0o640)).unwrap();
+        write_bytes(&ours, b"y").unwrap();
+        assert_eq!((mode(&ours), fs::read(&ours).unwrap()), (0o640, b"y".to_vec()));
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_symbolic_link_stays_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let (real, link) = (folder.path().join("real"), folder.path().join("link"));
+        fs::write(&real, b"old").unwrap();
+        std::os::unix::fs::symlink(&real, &link).unwrap();
+        write_bytes(&link, b"new").unwrap();
+        assert!(link.is_symlink());
+        assert_eq!(fs::read(&real).unwrap(), b"new");
+    }
+
+    #[test]
+    fn a_missing_folder_and_a_folder_in_the_way_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let error = write_bytes(folder.path().join("no/such/a.txt"), b"x").unwrap_err().to_string();
+        assert!(error.contains("does not exist"), "{error}");
+        let error = write_bytes(folder.path(), b"x").unwrap_err().to_string();
+        assert!(error.contains("folder"), "{error}");
+        let error = read_bytes(folder.path()).unwrap_err().to_string();
+        assert!(error.contains("folder"), "{error}");
+    }
+
+    #[test]
+    fn an_empty_file_is_its_own_reason() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("empty.png");
+        fs::write(&path, b"").unwrap();
+        assert!(matches!(read_bytes(&path).unwrap_err().reason, FormatError::Empty));
+    }
+}

@@ -1,0 +1,148 @@
+//! Point correspondences as text: a row per match, `x1 y1 x2 y2` in pixels with an optional score, `#` to the end of a line is
+//! a comment. Pixel centres at integers.
+
+use std::fmt::Write as _;
+use std::path::Path;
+
+use cv_core::Correspondence;
+
+use crate::files::{read_text, write_bytes};
+use crate::{FormatError, IoError};
+
+/// The matches of a file.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Matches {
+    /// The pairs, in the order of the file.
+    pub pairs: Vec<Correspondence>,
+    /// One score per pair, where every row has one. What it means (a ratio, a distance, a confidence) is the writer's affair.
+    pub scores: Option<Vec<f64>>,
+}
+
+/// Parses the text of a matches file. Columns are parted by blanks, tabs, commas or semicolons.
+///
+/// Infinite and NaN coordinates are passed on as they are: what to do with them is the estimator's decision.
+///
+/// # Errors
+/// [`FormatError::Line`] for a row that is not four or five numbers, or where only some rows have a score.
+pub fn parse_matches(text: &str) -> Result<Matches, FormatError> {
+    let mut pairs = Vec::new();
+    let mut scores = Vec::new();
+    for (index, line) in text.lines().enumerate() {
+        let line_number = index + 1;
+        let content = line.split('#').next().unwrap_or("");
+        let mut row = [0.0f64; 5];
+        let mut columns = 0;
+        for word in content.split([' ', '\t', ',', ';', '\r']).filter(|w| !w.is_empty()) {
+            let Some(cell) = row.get_mut(columns) else {
+                return Err(FormatError::line(
+                    line_number,
+                    "more than five columns; expected x1 y1 x2 y2 and maybe a score",
+                ));
+            };
+            *cell = word
+                .parse()
+                .map_err(|_| FormatError::line(line_number, format!("“{}” is not a number", clip(word))))?;
+            columns += 1;
+        }
+        match columns {
+            0 => continue,
+            4 => {}
+            5 => scores.push(row[4]),
+            n => {
+                let reason = format!("{n} column(s); expected x1 y1 x2 y2 and maybe a score");
+                return Err(FormatError::line(line_number, reason));
+            }
+        }
+        pairs.push(Correspondence::new(row[0], row[1], row[2], row[3]));
+        if !scores.is_empty() && scores.len() != pairs.len() {
+            return Err(FormatError::line(line_number, "some rows have a score and some have none"));
+        }
+    }
+    let scores = (!scores.is_empty()).then_some(scores);
+    Ok(Matches { pairs, scores })
+}
+
+/// At most the first 40 characters.
+fn clip(word: &str) -> String {
+    word.chars().take(40).collect()
+}
+
+/// Reads a matches file; see [`parse_matches`].
+///
+/// # Errors
+/// [`IoError`]: cannot be read as text, or as [`parse_matches`].
+pub fn read_matches(path: impl AsRef<Path>) -> Result<Matches, IoError> {
+    let path = path.as_ref();
+    parse_matches(&read_text(path)?).map_err(|reason| IoError::reading(path, reason))
+}
+
+/// Writes a matches file. Every number is written with the digits that read back to the same value.
+///
+/// # Errors
+/// [`FormatError::NotRepresentable`] where there are not as many scores as pairs; else as [`crate::write_atomic`].
+pub fn write_matches(path: impl AsRef<Path>, pairs: &[Correspondence], scores: Option<&[f64]>) -> Result<(), IoError> {
+    let path = path.as_ref();
+    if let Some(scores) = scores.filter(|s| s.len() != pairs.len()) {
+        let what = format!("{} scores for {} pairs", scores.len(), pairs.len());
+        return Err(IoError::writing(path, FormatError::NotRepresentable { format: "a matches file", what }));
+    }
+    let mut text = String::from(match scores {
+        Some(_) => "# x1 y1 x2 y2 score (pixels, centres at integers)\n",
+        None => "# x1 y1 x2 y2 (pixels, centres at integers)\n",
+    });
+    for (i, pair) in pairs.iter().enumerate() {
+        let _ = write!(text, "{} {} {} {}", pair.a.x, pair.a.y, pair.b.x, pair.b.y);
+        if let Some(scores) = scores {
+            let _ = write!(text, " {}", scores[i]);
+        }
+        text.push('\n');
+    }
+    write_bytes(path, text.as_bytes())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn comments_blank_lines_and_separators() {
+        let read = parse_matches("# a header\r\n\r\n1 2 3 4 # tail\n5,6;7\t8\r\n").unwrap();
+        assert_eq!(read.pairs, [Correspondence::new(1.0, 2.0, 3.0, 4.0), Correspondence::new(5.0, 6.0, 7.0, 8.0)]);
+        assert_eq!(read.scores, None);
+        assert_eq!(parse_matches("1 2 3 4 0.5").unwrap().scores, Some(vec![0.5]));
+        assert_eq!(parse_matches("").unwrap(), Matches::default());
+    }
+
+    #[test]
+    fn bad_rows_are_named_by_their_line() {
+        for (text, line, word) in [
+            ("1 2 3 4\n1 2 3\n", 2, "3 column"),
+            ("\n\n1 2 x 4", 3, "“x”"),
+            ("1 2 3 4 5 6", 1, "more than five"),
+            ("1 2 3 4\n1 2 3 4 5", 2, "some rows"),
+            ("1 2 3 4 5\n1 2 3 4", 2, "some rows"),
+        ] {
+            match parse_matches(text).unwrap_err() {
+                FormatError::Line { line: l, reason } => {
+                    assert!(l == line && reason.contains(word), "{text:?}: {l} {reason}")
+                }
+                other => panic!("{other}"),
+            }
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn what_is_written_is_read(rows in prop::collection::vec(prop::array::uniform5(prop::num::f64::NORMAL | prop::num::f64::ZERO), 0..20), scored in any::<bool>()) {
+            let folder = tempfile::tempdir().unwrap();
+            let path = folder.path().join("m.txt");
+            let pairs: Vec<_> = rows.iter().map(|r| Correspondence::new(r[0], r[1], r[2], r[3])).collect();
+            let scores: Vec<_> = rows.iter().map(|r| r[4]).collect();
+            write_matches(&path, &pairs, scored.then_some(&scores)).unwrap();
+            let back = read_matches(&path).unwrap();
+            prop_assert_eq!(back.pairs, pairs);
+            prop_assert_eq!(back.scores, (scored && !scores.is_empty()).then_some(scores));
+        }
+    }
+}

@@ -1,0 +1,392 @@
+//! NumPy's array files, `.npy` versions 1 to 3.
+
+use std::path::Path;
+
+use cv_core::{GrayF32, Image, ImageView};
+
+use crate::files::{read_bytes, write_bytes};
+use crate::{FormatError, IoError};
+
+const NAME: &str = "npy";
+const MAGIC: &[u8] = b"\x93NUMPY";
+/// The most elements read: as many samples as the largest colour picture has.
+const MAX_ELEMENTS: u64 = 3 * crate::DEFAULT_MAX_PIXELS;
+
+/// The values of an array, in C order.
+#[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
+#[allow(missing_docs)] // each names its own type
+pub enum NpyData {
+    Bool(Vec<bool>),
+    U8(Vec<u8>),
+    I8(Vec<i8>),
+    U16(Vec<u16>),
+    I16(Vec<i16>),
+    U32(Vec<u32>),
+    I32(Vec<i32>),
+    U64(Vec<u64>),
+    I64(Vec<i64>),
+    F32(Vec<f32>),
+    F64(Vec<f64>),
+}
+
+/// An array and its shape.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NpyArray {
+    /// Sizes of the axes, slowest first. Empty for a single number.
+    pub shape: Vec<usize>,
+    /// The values, last axis fastest.
+    pub data: NpyData,
+}
+
+macro_rules! each {
+    ($data:expr, $v:ident => $body:expr) => {
+        match $data {
+            NpyData::Bool($v) => $body,
+            NpyData::U8($v) => $body,
+            NpyData::I8($v) => $body,
+            NpyData::U16($v) => $body,
+            NpyData::I16($v) => $body,
+            NpyData::U32($v) => $body,
+            NpyData::I32($v) => $body,
+            NpyData::U64($v) => $body,
+            NpyData::I64($v) => $body,
+            NpyData::F32($v) => $body,
+            NpyData::F64($v) => $body,
+        }
+    };
+}
+
+impl NpyArray {
+    /// An image as an array of height × width, and × channels where there are several.
+    pub fn from_view<const C: usize>(view: ImageView<'_, f32, C>) -> Self {
+        let mut shape = vec![view.height(), view.width()];
+        if C != 1 {
+            shape.push(C);
+        }
+        let data = (0..view.height()).flat_map(|y| view.row(y)).copied().collect();
+        Self { shape, data: NpyData::F32(data) }
+    }
+
+    /// A table of `f64` rows.
+    pub fn from_rows<const N: usize>(rows: &[[f64; N]]) -> Self {
+        Self { shape: vec![rows.len(), N], data: NpyData::F64(rows.as_flattened().to_vec()) }
+    }
+
+    /// The number of values.
+    pub fn len(&self) -> usize {
+        each!(&self.data, v => v.len())
+    }
+
+    /// True where there are no values.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// All values as `f64`; 64-bit integers beyond 2⁵³ are rounded.
+    pub fn to_f64(&self) -> Vec<f64> {
+        match &self.data {
+            NpyData::Bool(v) => v.iter().map(|&b| f64::from(u8::from(b))).collect(),
+            NpyData::U8(v) => v.iter().map(|&x| f64::from(x)).collect(),
+            NpyData::I8(v) => v.iter().map(|&x| f64::from(x)).collect(),
+            NpyData::U16(v) => v.iter().map(|&x| f64::from(x)).collect(),
+            NpyData::I16(v) => v.iter().map(|&x| f64::from(x)).collect(),
+            NpyData::U32(v) => v.iter().map(|&x| f64::from(x)).collect(),
+            NpyData::I32(v) => v.iter().map(|&x| f64::from(x)).collect(),
+            NpyData::U64(v) => v.iter().map(|&x| x as f64).collect(),
+            NpyData::I64(v) => v.iter().map(|&x| x as f64).collect(),
+            NpyData::F32(v) => v.iter().map(|&x| f64::from(x)).collect(),
+            NpyData::F64(v) => v.clone(),
+        }
+    }
+
+    /// The array as an image of one channel: height × width, or height × width × 1.
+    ///
+    /// # Errors
+    /// [`FormatError::Unsupported`] for another shape.
+    pub fn to_gray(&self) -> Result<GrayF32, FormatError> {
+        let (height, width) = match self.shape[..] {
+            [height, width] | [height, width, 1] => (height, width),
+            _ => {
+                return Err(FormatError::unsupported(
+                    NAME,
+                    format!("an array of shape {:?} as one channel", self.shape),
+                ));
+            }
+        };
+        let data = match &self.data {
+            NpyData::F32(v) => v.clone(),
+            _ => self.to_f64().into_iter().map(|v| v as f32).collect(),
+        };
+        Image::from_vec(width, height, data).map_err(|e| FormatError::corrupt(NAME, e.to_string()))
+    }
+}
+
+/// Decodes the bytes of an `.npy` file.
+///
+/// # Errors
+/// [`FormatError`]: not such a file, a dtype that is not a plain number, or fewer or more bytes than the shape takes.
+pub fn decode(bytes: &[u8]) -> Result<NpyArray, FormatError> {
+    let corrupt = |reason: &str| FormatError::corrupt(NAME, reason);
+    let cut = || FormatError::Truncated { format: NAME };
+    if !bytes.starts_with(MAGIC) {
+        return Err(FormatError::UnknownFormat { expected: "a NumPy array (.npy)" });
+    }
+    let (start, len) = match *bytes.get(6..12).ok_or_else(cut)? {
+        [1, _, a, b, _, _] => (10, usize::from(u16::from_le_bytes([a, b]))),
+        [2 | 3, _, a, b, c, d] => (12, u32::from_le_bytes([a, b, c, d]) as usize),
+        [major, minor, ..] => return Err(FormatError::unsupported(NAME, format!("version {major}.{minor}"))),
+        _ => return Err(cut()),
+    };
+    let header = bytes.get(start..).and_then(|b| b.get(..len)).ok_or_else(cut)?;
+    let header = std::str::from_utf8(header).map_err(|_| corrupt("the header is not text"))?;
+    let Header { dtype, fortran, shape } = parse_header(header).ok_or_else(|| corrupt("the header does not parse"))?;
+    let count =
+        shape.iter().try_fold(1u64, |n, &s| n.checked_mul(s as u64)).filter(|&n| n <= MAX_ELEMENTS).ok_or_else(
+            || FormatError::corrupt(NAME, format!("a shape of {shape:?} is more than {MAX_ELEMENTS} values")),
+        )? as usize;
+    let (big_endian, kind) = match dtype.split_at_checked(1) {
+        Some(("<" | "|" | "=", kind)) => (false, kind),
+        Some((">", kind)) => (true, kind),
+        _ => return Err(FormatError::unsupported(NAME, format!("the dtype {dtype}"))),
+    };
+    let body = &bytes[start + len..];
+    macro_rules! values {
+        ($variant:ident, $type:ty) => {{
+            const SIZE: usize = size_of::<$type>();
+            if body.len() < count * SIZE {
+                return Err(cut());
+            }
+            if body.len() > count * SIZE {
+                return Err(corrupt("more bytes than the shape takes"));
+            }
+            let cells = body.as_chunks::<SIZE>().0.iter();
+            let data: Vec<$type> = if big_endian {
+                cells.map(|&b| <$type>::from_be_bytes(b)).collect()
+            } else {
+                cells.map(|&b| <$type>::from_le_bytes(b)).collect()
+            };
+            NpyData::$variant(if fortran { to_c_order(&data, &shape) } else { data })
+        }};
+    }
+    let data = match kind {
+        "b1" => match values!(U8, u8) {
+            NpyData::U8(v) => NpyData::Bool(v.into_iter().map(|b| b != 0).collect()),
+            other => other,
+        },
+        "u1" => values!(U8, u8),
+        "i1" => values!(I8, i8),
+        "u2" => values!(U16, u16),
+        "i2" => values!(I16, i16),
+        "u4" => values!(U32, u32),
+        "i4" => values!(I32, i32),
+        "u8" => values!(U64, u64),
+        "i8" => values!(I64, i64),
+        "f4" => values!(F32, f32),
+        "f8" => values!(F64, f64),
+        _ => return Err(FormatError::unsupported(NAME, format!("the dtype {dtype}"))),
+    };
+    Ok(NpyArray { shape, data })
+}
+
+/// From first axis fastest to last axis fastest.
+fn to_c_order<T: Copy>(data: &[T], shape: &[usize]) -> Vec<T> {
+    let mut strides = Vec::with_capacity(shape.len());
+    let mut stride = 1;
+    for &size in shape {
+        strides.push(stride);
+        stride *= size;
+    }
+    let mut index = vec![0usize; shape.len()];
+    let mut at = 0;
+    let mut out = Vec::with_capacity(data.len());
+    while out.len() < data.len() {
+        out.push(data[at]);
+        for axis in (0..shape.len()).rev() {
+            index[axis] += 1;
+            at += strides[axis];
+            if index[axis] < shape[axis] {
+                break;
+            }
+            at -= strides[axis] * shape[axis];
+            index[axis] = 0;
+        }
+    }
+    out
+}
+
+struct Header {
+    dtype: String,
+    fortran: bool,
+    shape: Vec<usize>,
+}
+
+/// Parses `{'descr': '<f4', 'fortran_order': False, 'shape': (3, 4), }`, keys in any order.
+fn parse_header(text: &str) -> Option<Header> {
+    let inner = text.trim().strip_prefix('{')?.trim_end().strip_suffix('}')?;
+    let after = |key: &str| {
+        let at = inner.find(&format!("'{key}'")).or_else(|| inner.find(&format!("\"{key}\"")))?;
+        Some(inner[at + key.len() + 2..].trim_start().strip_prefix(':')?.trim_start())
+    };
+    let descr = after("descr")?;
+    let quote = descr.chars().next().filter(|c| matches!(c, '\'' | '"'))?;
+    let dtype = descr[1..].split(quote).next()?.to_owned();
+    let fortran = match after("fortran_order")? {
+        rest if rest.starts_with("True") => true,
+        rest if rest.starts_with("False") => false,
+        _ => return None,
+    };
+    let list = after("shape")?.strip_prefix('(')?.split(')').next()?;
+    let mut shape = Vec::new();
+    for word in list.split(',').map(str::trim).filter(|w| !w.is_empty()) {
+        // Python 2 wrote long integers as 3L.
+        shape.push(word.trim_end_matches('L').parse().ok()?);
+    }
+    (shape.len() <= 32).then_some(Header { dtype, fortran, shape })
+}
+
+/// Encodes an array, version 1.0, little-endian, C order.
+///
+/// # Errors
+/// [`FormatError::NotRepresentable`] where the values are not as many as the shape says.
+pub fn encode(array: &NpyArray) -> Result<Vec<u8>, FormatError> {
+    let count = array.shape.iter().try_fold(1usize, |n, &s| n.checked_mul(s));
+    if count != Some(array.len()) || array.shape.len() > 32 {
+        let what = format!("{} values in the shape {:?}", array.len(), array.shape);
+        return Err(FormatError::NotRepresentable { format: NAME, what });
+    }
+    let descr = match &array.data {
+        NpyData::Bool(_) => "|b1",
+        NpyData::U8(_) => "|u1",
+        NpyData::I8(_) => "|i1",
+        NpyData::U16(_) => "<u2",
+        NpyData::I16(_) => "<i2",
+        NpyData::U32(_) => "<u4",
+        NpyData::I32(_) => "<i4",
+        NpyData::U64(_) => "<u8",
+        NpyData::I64(_) => "<i8",
+        NpyData::F32(_) => "<f4",
+        NpyData::F64(_) => "<f8",
+    };
+    let mut shape = String::new();
+    for size in &array.shape {
+        shape.push_str(&format!("{size}, "));
+    }
+    // A tuple of one keeps its comma; longer ones lose the last.
+    let shape = if array.shape.len() == 1 { shape.trim_end() } else { shape.trim_end_matches(", ") };
+    let mut header = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({shape}), }}");
+    // The values begin at a multiple of 64 bytes, after a newline.
+    let padding = (64 - (10 + header.len() + 1) % 64) % 64;
+    header.extend(std::iter::repeat_n(' ', padding));
+    header.push('\n');
+    let mut bytes = Vec::with_capacity(10 + header.len() + array.len() * 8);
+    bytes.extend_from_slice(MAGIC);
+    bytes.extend_from_slice(&[1, 0]);
+    bytes.extend_from_slice(&(header.len() as u16).to_le_bytes());
+    bytes.extend_from_slice(header.as_bytes());
+    match &array.data {
+        NpyData::Bool(v) => bytes.extend(v.iter().map(|&b| u8::from(b))),
+        NpyData::U8(v) => bytes.extend_from_slice(v),
+        NpyData::I8(v) => bytes.extend(v.iter().flat_map(|x| x.to_le_bytes())),
+        NpyData::U16(v) => bytes.extend(v.iter().flat_map(|x| x.to_le_bytes())),
+        NpyData::I16(v) => bytes.extend(v.iter().flat_map(|x| x.to_le_bytes())),
+        NpyData::U32(v) => bytes.extend(v.iter().flat_map(|x| x.to_le_bytes())),
+        NpyData::I32(v) => bytes.extend(v.iter().flat_map(|x| x.to_le_bytes())),
+        NpyData::U64(v) => bytes.extend(v.iter().flat_map(|x| x.to_le_bytes())),
+        NpyData::I64(v) => bytes.extend(v.iter().flat_map(|x| x.to_le_bytes())),
+        NpyData::F32(v) => bytes.extend(v.iter().flat_map(|x| x.to_le_bytes())),
+        NpyData::F64(v) => bytes.extend(v.iter().flat_map(|x| x.to_le_bytes())),
+    }
+    Ok(bytes)
+}
+
+/// Reads an `.npy` file.
+///
+/// # Errors
+/// [`IoError`]: cannot be opened, or as [`decode`].
+pub fn read(path: impl AsRef<Path>) -> Result<NpyArray, IoError> {
+    let path = path.as_ref();
+    decode(&read_bytes(path)?).map_err(|reason| IoError::reading(path, reason))
+}
+
+/// Writes an `.npy` file.
+///
+/// # Errors
+/// As [`encode`] and [`crate::write_atomic`].
+pub fn write(path: impl AsRef<Path>, array: &NpyArray) -> Result<(), IoError> {
+    let path = path.as_ref();
+    write_bytes(path, &encode(array).map_err(|reason| IoError::writing(path, reason))?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    /// Bytes as NumPy 2 writes `np.array([[1, 2, 3], [4, 5, 6]], '>i2', order='F')`, from the format's definition.
+    fn fortran_big_endian(version: u8) -> Vec<u8> {
+        let header = "{'descr': '>i2', 'fortran_order': True, 'shape': (2, 3), }\n";
+        let mut file = MAGIC.to_vec();
+        file.extend([version, 0]);
+        match version {
+            1 => file.extend((header.len() as u16).to_le_bytes()),
+            _ => file.extend((header.len() as u32).to_le_bytes()),
+        }
+        file.extend(header.as_bytes());
+        [1i16, 4, 2, 5, 3, 6].iter().for_each(|v| file.extend(v.to_be_bytes()));
+        file
+    }
+
+    #[test]
+    fn fortran_order_and_big_endian_in_every_version() {
+        for version in 1..=3 {
+            let array = decode(&fortran_big_endian(version)).unwrap();
+            assert_eq!(array, NpyArray { shape: vec![2, 3], data: NpyData::I16(vec![1, 2, 3, 4, 5, 6]) });
+        }
+        assert!(matches!(decode(&fortran_big_endian(4)), Err(FormatError::Unsupported { .. })));
+    }
+
+    #[test]
+    fn lying_headers_are_refused() {
+        let good = fortran_big_endian(1);
+        assert!(matches!(decode(&good[..good.len() - 1]), Err(FormatError::Truncated { .. })));
+        let with = |from: &str, to: &str| {
+            let text = "{'descr': '>i2', 'fortran_order': True, 'shape': (2, 3), }\n".replace(from, to);
+            let mut file = MAGIC.to_vec();
+            file.extend([1, 0]);
+            file.extend((text.len() as u16).to_le_bytes());
+            file.extend(text.as_bytes());
+            file.extend([0; 12]);
+            decode(&file)
+        };
+        assert!(with("2, 3", "2, 3").is_ok());
+        for shape in ["1, 3", "9999999999, 9999999999", "99999999999", "3, -1", "2.0, 3"] {
+            assert!(with("2, 3", shape).is_err(), "{shape}");
+        }
+        for dtype in ["O", "<c16", "<U5", "<f2", ""] {
+            assert!(matches!(with(">i2", dtype), Err(FormatError::Unsupported { .. })), "{dtype}");
+        }
+        assert!(with("True", "1").is_err() && with("shape", "shpe").is_err());
+    }
+
+    proptest! {
+        #[test]
+        fn what_is_written_is_read(shape in prop::collection::vec(0usize..5, 0..4), seed in any::<u64>(), kind in 0..5) {
+            let count = shape.iter().product::<usize>();
+            let values: Vec<u64> = (0..count as u64).map(|i| (seed ^ i).wrapping_mul(0x9e37_79b9_7f4a_7c15)).collect();
+            let data = match kind {
+                0 => NpyData::Bool(values.iter().map(|v| v & 1 == 1).collect()),
+                1 => NpyData::I8(values.iter().map(|&v| v as i8).collect()),
+                2 => NpyData::U16(values.iter().map(|&v| v as u16).collect()),
+                3 => NpyData::F32(values.iter().map(|&v| v as f32).collect()),
+                _ => NpyData::F64(values.iter().map(|&v| v as f64).collect()),
+            };
+            let array = NpyArray { shape, data };
+            let bytes = encode(&array).unwrap();
+            prop_assert_eq!(&decode(&bytes).unwrap(), &array);
+            // Alignment of the values, as the format asks.
+            let header = usize::from(u16::from_le_bytes([bytes[8], bytes[9]]));
+            prop_assert_eq!((10 + header) % 64, 0);
+        }
+    }
+}

@@ -1,0 +1,210 @@
+//! Portable float maps: disparity, depth and flow as Middlebury and ETH3D publish them.
+//!
+//! The text header `Pf` (one channel) or `PF` (three), width, height and a scale whose sign tells the byte order (negative: little
+//! endian) and whose size is ignored, as by everyone; then rows of `f32` from the bottom up. Unknown values are +∞ in the file and NaN
+//! in memory.
+
+use std::io::Write;
+use std::path::Path;
+
+use cv_core::{GrayF32, Image, ImageView, RgbF32};
+
+use crate::files::read_bytes;
+use crate::{DEFAULT_MAX_PIXELS, FormatError, IoError, write_atomic};
+
+const NAME: &str = "PFM";
+
+/// A decoded map.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Pfm {
+    /// `Pf`.
+    Gray(GrayF32),
+    /// `PF`.
+    Rgb(RgbF32),
+}
+
+/// Decodes the bytes of a PFM file. Infinite values become NaN.
+///
+/// # Errors
+/// [`FormatError`] where the header does not parse, the samples are fewer or more than it promises, or it promises more than
+/// [`DEFAULT_MAX_PIXELS`].
+pub fn decode(bytes: &[u8]) -> Result<Pfm, FormatError> {
+    let corrupt = |reason: &str| FormatError::corrupt(NAME, reason);
+    let mut rest = bytes;
+    let channels = match token(&mut rest) {
+        Some("Pf") => 1,
+        Some("PF") => 3,
+        _ => return Err(FormatError::UnknownFormat { expected: "a PFM float map (Pf or PF)" }),
+    };
+    let mut side = || token(&mut rest).and_then(|t| t.parse::<u32>().ok());
+    let (Some(width), Some(height)) = (side(), side()) else {
+        return Err(corrupt("the width and height are not whole numbers"));
+    };
+    let (w, h) = (u64::from(width), u64::from(height));
+    if w * h > DEFAULT_MAX_PIXELS {
+        return Err(FormatError::TooManyPixels { width: w, height: h, limit: DEFAULT_MAX_PIXELS });
+    }
+    let scale = token(&mut rest)
+        .and_then(|t| t.parse::<f64>().ok())
+        .filter(|s| s.is_finite() && *s != 0.0)
+        .ok_or_else(|| corrupt("the scale is not a number other than zero"))?;
+    let needed = width as usize * height as usize * channels * 4;
+    // One white-space byte ends the header; files that went through Windows have two.
+    let samples = match rest {
+        [b'\r', b'\n', samples @ ..] if samples.len() == needed => samples,
+        [b'\n' | b' ' | b'\r' | b'\t', samples @ ..] => samples,
+        _ => rest,
+    };
+    if samples.len() < needed {
+        return Err(FormatError::Truncated { format: NAME });
+    }
+    if samples.len() > needed {
+        let extra = samples.len() - needed;
+        return Err(corrupt(&format!("{extra} bytes more than {width}×{height}×{channels} samples take")));
+    }
+    let row = width as usize * channels * 4;
+    let mut data = Vec::with_capacity(needed / 4);
+    let known = |v: f32| if v.is_infinite() { f32::NAN } else { v };
+    for line in samples.chunks_exact(row.max(1)).rev() {
+        let values = line.as_chunks::<4>().0.iter();
+        if scale < 0.0 {
+            data.extend(values.map(|&b| known(f32::from_le_bytes(b))));
+        } else {
+            data.extend(values.map(|&b| known(f32::from_be_bytes(b))));
+        }
+    }
+    let (w, h) = (width as usize, height as usize);
+    let wrong = |e: cv_core::ImageError| corrupt(&e.to_string());
+    Ok(match channels {
+        1 => Pfm::Gray(Image::from_vec(w, h, data).map_err(wrong)?),
+        _ => Pfm::Rgb(Image::from_vec(w, h, data).map_err(wrong)?),
+    })
+}
+
+/// The next word of the header, past white space.
+fn token<'a>(rest: &mut &'a [u8]) -> Option<&'a str> {
+    let start = rest.iter().position(|b| !b.is_ascii_whitespace())?;
+    let len = rest[start..].iter().take(32).position(u8::is_ascii_whitespace)?;
+    let word = std::str::from_utf8(&rest[start..start + len]).ok()?;
+    *rest = &rest[start + len..];
+    Some(word)
+}
+
+/// Encodes a map of one or three channels, little-endian; NaN becomes +∞.
+///
+/// # Errors
+/// [`FormatError::NotRepresentable`] where `C` is neither 1 nor 3.
+pub fn encode<const C: usize>(view: ImageView<'_, f32, C>, sink: &mut dyn Write) -> Result<(), FormatError> {
+    let kind = match C {
+        1 => "Pf",
+        3 => "PF",
+        _ => return Err(FormatError::NotRepresentable { format: NAME, what: format!("{C} channels") }),
+    };
+    write!(sink, "{kind}\n{} {}\n-1\n", view.width(), view.height())?;
+    let mut line = Vec::with_capacity(view.width() * C * 4);
+    for y in (0..view.height()).rev() {
+        line.clear();
+        for &v in view.row(y) {
+            line.extend_from_slice(&(if v.is_nan() { f32::INFINITY } else { v }).to_le_bytes());
+        }
+        sink.write_all(&line)?;
+    }
+    Ok(())
+}
+
+/// Reads a map of one channel.
+///
+/// # Errors
+/// [`IoError`]: cannot be opened, has three channels, or as [`decode`].
+pub fn read(path: impl AsRef<Path>) -> Result<GrayF32, IoError> {
+    let path = path.as_ref();
+    match decode(&read_bytes(path)?) {
+        Ok(Pfm::Gray(image)) => Ok(image),
+        Ok(Pfm::Rgb(_)) => {
+            Err(IoError::reading(path, FormatError::unsupported(NAME, "colour in the place of one channel")))
+        }
+        Err(reason) => Err(IoError::reading(path, reason)),
+    }
+}
+
+/// Reads a map of three channels.
+///
+/// # Errors
+/// [`IoError`]: cannot be opened, has one channel, or as [`decode`].
+pub fn read_rgb(path: impl AsRef<Path>) -> Result<RgbF32, IoError> {
+    let path = path.as_ref();
+    match decode(&read_bytes(path)?) {
+        Ok(Pfm::Rgb(image)) => Ok(image),
+        Ok(Pfm::Gray(_)) => {
+            Err(IoError::reading(path, FormatError::unsupported(NAME, "one channel in the place of colour")))
+        }
+        Err(reason) => Err(IoError::reading(path, reason)),
+    }
+}
+
+/// Writes a map; see [`encode`].
+///
+/// # Errors
+/// As [`encode`] and [`write_atomic`].
+pub fn write<const C: usize>(path: impl AsRef<Path>, view: ImageView<'_, f32, C>) -> Result<(), IoError> {
+    write_atomic(path, |sink| encode(view, sink))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn bytes_of<const C: usize>(view: ImageView<'_, f32, C>) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        encode(view, &mut bytes).unwrap();
+        bytes
+    }
+
+    #[test]
+    fn rows_run_upwards_and_the_sign_is_the_byte_order() {
+        let mut file = b"Pf\n2 2\n-1.0\n".to_vec();
+        [3.0f32, 4.0, 1.0, f32::INFINITY].iter().for_each(|v| file.extend(v.to_le_bytes()));
+        let mut big = b"Pf 2\n2\r\n0.0039\n".to_vec();
+        [3.0f32, 4.0, 1.0, f32::INFINITY].iter().for_each(|v| big.extend(v.to_be_bytes()));
+        for file in [file, big] {
+            let Pfm::Gray(image) = decode(&file).unwrap() else { panic!("one channel") };
+            assert_eq!((image.at(0, 0), image.at(0, 1), image.at(1, 1)), ([1.0], [3.0], [4.0]));
+            assert!(image.at(1, 0)[0].is_nan());
+        }
+    }
+
+    #[test]
+    fn lying_headers_are_refused() {
+        let truth = bytes_of(GrayF32::new(3, 2, [0.5]).view());
+        assert!(matches!(decode(&truth[..truth.len() - 1]), Err(FormatError::Truncated { .. })));
+        let mut longer = truth.clone();
+        longer.push(0);
+        assert!(matches!(decode(&longer), Err(FormatError::Corrupt { .. })));
+        for (header, what) in [
+            ("Pf\n4000000000 4000000000\n-1\n", "pixels"),
+            ("Pf\n-3 2\n-1\n", "whole numbers"),
+            ("Pf\n3 2\n0\n", "scale"),
+            ("Pf\n3 2\nnan\n", "scale"),
+            ("Pg\n3 2\n-1\n", "PFM"),
+            ("Pf\n", "whole numbers"),
+        ] {
+            let mut file = header.as_bytes().to_vec();
+            file.extend([0; 24]);
+            let error = decode(&file).unwrap_err().to_string();
+            assert!(error.contains(what), "{header:?}: {error}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn what_is_written_is_read(w in 0usize..7, h in 0usize..7, values in prop::collection::vec(prop::num::f32::ANY, 147)) {
+            let image = RgbF32::from_fn(w, h, |x, y| std::array::from_fn(|c| values[(y * w + x) * 3 + c]));
+            let Ok(Pfm::Rgb(back)) = decode(&bytes_of(image.view())) else { return Err(TestCaseError::fail("colour")) };
+            prop_assert_eq!(back.size(), image.size());
+            for (a, b) in image.as_slice().iter().zip(back.as_slice()) {
+                prop_assert!(a == b || (!a.is_finite() && b.is_nan()), "{} {}", a, b);
+            }
+        }
+    }
+}

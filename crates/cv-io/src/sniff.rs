@@ -1,0 +1,132 @@
+//! What a file is by its first bytes. File names are not trusted.
+
+use image::ImageFormat;
+
+use crate::FormatError;
+
+const PICTURES: &str = "a PNG, JPEG, TIFF, BMP, PNM, OpenEXR or Radiance HDR picture";
+
+/// The picture format of `bytes`, or an error that names what they are instead.
+pub(crate) fn picture_format(bytes: &[u8]) -> Result<ImageFormat, FormatError> {
+    if bytes.is_empty() {
+        return Err(FormatError::Empty);
+    }
+    let brand = (bytes.get(4..8) == Some(b"ftyp")).then(|| bytes.get(8..12)).flatten();
+    let other = match bytes {
+        _ if matches!(brand, Some(b"avif" | b"avis")) => Some(("AVIF", "this picture format")),
+        _ if matches!(brand, Some(b"heic" | b"heix" | b"hevc" | b"mif1" | b"msf1")) => {
+            Some(("HEIC", "this picture format"))
+        }
+        _ if brand == Some(b"crx ") => Some(("CR3", "a camera's raw data")),
+        _ if brand.is_some() => Some(("MP4", "a film")),
+        [b'I', b'I', b'*', 0, _, _, _, _, b'C', b'R', ..] => Some(("CR2", "a camera's raw data")),
+        [b'G', b'I', b'F', b'8', ..] => Some(("GIF", "this picture format")),
+        [b'R', b'I', b'F', b'F', _, _, _, _, b'W', b'E', b'B', b'P', ..] => Some(("WebP", "this picture format")),
+        [0xff, 0x0a, ..] | [0, 0, 0, 0x0c, b'J', b'X', b'L', b' ', ..] => Some(("JPEG XL", "this picture format")),
+        [0, 0, 0, 0x0c, b'j', b'P', ..] | [0xff, 0x4f, 0xff, 0x51, ..] => Some(("JPEG 2000", "this picture format")),
+        [b'8', b'B', b'P', b'S', ..] => Some(("PSD", "this picture format")),
+        [b'%', b'P', b'D', b'F', ..] => Some(("PDF", "a document")),
+        [b'P', b'F' | b'f', b'\n' | b'\r' | b' ', ..] => Some(("PFM", "a float map in the place of a picture")),
+        [0x93, b'N', b'U', b'M', b'P', b'Y', ..] => Some(("npy", "an array in the place of a picture")),
+        [b'P', b'K', 3, 4, ..] => Some(("ZIP or npz", "an archive in the place of a picture")),
+        [b'<', b's', b'v', b'g', ..] => Some(("SVG", "a vector drawing")),
+        _ => None,
+    };
+    if let Some((format, what)) = other {
+        return Err(FormatError::unsupported(format, what));
+    }
+    match bytes {
+        // Radiance files begin with either of two words.
+        [b'#', b'?', b'R', b'G', b'B', b'E', ..] => return Ok(ImageFormat::Hdr),
+        // BigTIFF: the same format with 64-bit offsets.
+        [b'I', b'I', b'+', 0, ..] | [b'M', b'M', 0, b'+', ..] => return Ok(ImageFormat::Tiff),
+        _ => {}
+    }
+    match image::guess_format(bytes) {
+        Ok(
+            format @ (ImageFormat::Png
+            | ImageFormat::Jpeg
+            | ImageFormat::Tiff
+            | ImageFormat::Bmp
+            | ImageFormat::Pnm
+            | ImageFormat::OpenExr
+            | ImageFormat::Hdr),
+        ) => Ok(format),
+        _ => Err(FormatError::UnknownFormat { expected: PICTURES }),
+    }
+}
+
+/// The name of a format as a person writes it.
+pub(crate) fn name(format: ImageFormat) -> &'static str {
+    match format {
+        ImageFormat::Png => "PNG",
+        ImageFormat::Jpeg => "JPEG",
+        ImageFormat::Tiff => "TIFF",
+        ImageFormat::Bmp => "BMP",
+        ImageFormat::Pnm => "PNM",
+        ImageFormat::OpenExr => "OpenEXR",
+        ImageFormat::Hdr => "Radiance HDR",
+        _ => "picture",
+    }
+}
+
+/// Cheap checks that a file can hold what its header promises, before anything is allocated for it.
+pub(crate) fn plausible(format: ImageFormat, bytes: &[u8], width: u64, height: u64) -> Result<(), FormatError> {
+    let name = name(format);
+    let len = bytes.len() as u64;
+    let possible = match format {
+        // Deflate packs at most 1032 to 1; the least a row takes is one bit a pixel.
+        ImageFormat::Png => len.saturating_mul(1032 * 8),
+        // Every 8×8 block of the first component costs at least one bit.
+        ImageFormat::Jpeg => len.saturating_mul(8 * 64 * 4),
+        _ => u64::MAX,
+    };
+    if width.saturating_mul(height) > possible {
+        return Err(FormatError::corrupt(
+            name,
+            format!("{len} bytes cannot hold the {width}×{height} pixels promised"),
+        ));
+    }
+    if format == ImageFormat::Jpeg && !jpeg_has_end(bytes) {
+        return Err(FormatError::Truncated { format: name });
+    }
+    Ok(())
+}
+
+/// True where the markers of a JPEG lead to its end-of-image marker.
+///
+/// The decoder fills what is missing with grey and says nothing.
+fn jpeg_has_end(bytes: &[u8]) -> bool {
+    // Inside the coded data this pair cannot occur.
+    if bytes.ends_with(&[0xff, 0xd9]) {
+        return true;
+    }
+    let mut at = 2;
+    let mut in_scan = false;
+    while at + 1 < bytes.len() {
+        if bytes[at] != 0xff {
+            if !in_scan {
+                // Stray bytes between segments: decoders skip them too.
+                at += 1;
+                continue;
+            }
+            match bytes[at..].iter().position(|&b| b == 0xff) {
+                Some(step) => at += step,
+                None => return false,
+            }
+            continue;
+        }
+        match bytes[at + 1] {
+            0xd9 => return true,
+            // Padding, an escaped 0xff, a restart.
+            0xff => at += 1,
+            0x00 | 0x01 | 0xd0..=0xd8 => at += 2,
+            marker => {
+                let Some(&[high, low]) = bytes.get(at + 2..at + 4) else { return false };
+                in_scan = marker == 0xda || (in_scan && marker == 0xdc);
+                at += 2 + usize::from(u16::from_be_bytes([high, low])).max(2);
+            }
+        }
+    }
+    false
+}
