@@ -2,6 +2,7 @@
 
 mod peers;
 mod real;
+mod tidy;
 
 use clap::{Parser, Subcommand};
 use std::{
@@ -18,6 +19,8 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Chore {
+    /// Check the rules of the workspace that no compiler checks.
+    Tidy,
     /// Run the pipelines on real photographs with known truth and hold each figure against its bar.
     Real {
         /// Only this job.
@@ -32,6 +35,7 @@ enum Chore {
 
 fn main() -> ExitCode {
     let result = match Cli::parse().chore {
+        Chore::Tidy => tidy::run(),
         Chore::Real { job } => real::run(job.as_deref()),
         Chore::Peers { job } => peers::run(job.as_deref()),
     };
