@@ -7,6 +7,10 @@ use cv_core::Keypoint;
 pub enum DescriptorKind {
     /// 8×8 upright patches, zero mean and unit variance ([`describe_patches`](crate::describe_patches)).
     Patch,
+    /// SIFT gradient histograms of unit length ([`sift`](crate::sift) with `root: false`).
+    Sift,
+    /// The square roots of SIFT histograms that sum to one ([`sift`](crate::sift)); unit length.
+    RootSift,
 }
 
 impl DescriptorKind {
@@ -14,6 +18,7 @@ impl DescriptorKind {
     pub fn dimension(self) -> usize {
         match self {
             Self::Patch => 64,
+            Self::Sift | Self::RootSift => 128,
         }
     }
 }
@@ -22,6 +27,8 @@ impl std::fmt::Display for DescriptorKind {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(match self {
             Self::Patch => "8×8 patch",
+            Self::Sift => "SIFT",
+            Self::RootSift => "rootSIFT",
         })
     }
 }
@@ -119,6 +126,8 @@ pub struct Described {
     pub keypoints: Vec<Keypoint>,
     /// Descriptor `i` belongs to keypoint `i`.
     pub descriptors: Descriptors,
-    /// The keypoints without one. `keypoints.len() + dropped.len()` is the number handed in.
+    /// The keypoints without one; `index` counts those handed in, or found.
     pub dropped: Vec<Dropped>,
+    /// Features left out only because there are more than the options allow. With this, everything handed in or found is accounted for.
+    pub beyond_limit: usize,
 }

@@ -38,10 +38,13 @@
 mod anms;
 mod blur;
 mod descriptors;
+mod dog;
 mod error;
 mod harris;
 mod matching;
 mod patch;
+mod sift;
+mod simd;
 
 pub use anms::{anms, suppression_radii};
 pub use descriptors::{Described, DescriptorKind, Descriptors, DropReason, Dropped};
@@ -49,3 +52,4 @@ pub use error::FeatureError;
 pub use harris::{HarrisOptions, harris, harris_response};
 pub use matching::{MatchError, MatchOptions, RatioMeasure, match_descriptors};
 pub use patch::{PatchOptions, describe_patches};
+pub use sift::{SiftOptions, sift};

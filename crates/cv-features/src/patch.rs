@@ -53,6 +53,7 @@ pub fn describe_patches(
         keypoints: Vec::with_capacity(keypoints.len()),
         descriptors: Descriptors::new(DescriptorKind::Patch),
         dropped: Vec::new(),
+        beyond_limit: 0,
     };
     for (index, (keypoint, patch)) in keypoints.iter().zip(patches).enumerate() {
         match patch {
