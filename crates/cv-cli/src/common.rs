@@ -1,6 +1,7 @@
 //! What all commands share: global arguments, failures and exit codes, progress, outputs, and the JSON object.
 
 use clap::{Args, value_parser};
+use cv_io::IoError;
 use cv_pipeline::Progress;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
@@ -134,9 +135,16 @@ impl Failure {
     }
 }
 
-/// Every error becomes a failure, its causes joined by colons where the error does not already name them.
-impl<E: std::error::Error> From<E> for Failure {
+/// Every error becomes a failure, its causes joined by colons where the error does not already name them. The hint of
+/// a file error becomes the advice.
+impl<E: std::error::Error + 'static> From<E> for Failure {
     fn from(error: E) -> Self {
+        let error: &(dyn std::error::Error + 'static) = &error;
+        if let Some(IoError { path, writing, reason }) = error.downcast_ref() {
+            let verb = if *writing { "write" } else { "read" };
+            let failure = Self::new(format!("cannot {verb} {}: {reason}", path.display()));
+            return Self { advice: reason.hint().map(str::to_owned), ..failure };
+        }
         let mut what = error.to_string();
         let mut source = error.source();
         while let Some(cause) = source {
@@ -199,7 +207,7 @@ impl Context {
         let html = html()?;
         create_dir(folder)?;
         let path = folder.join("report.html");
-        write_file(&path, html.as_bytes())?;
+        cv_io::write_bytes(&path, html.as_bytes())?;
         self.note(format!("report: {}", path.display()));
         Ok(())
     }
@@ -339,6 +347,7 @@ pub(crate) fn check_outputs(paths: &[&Path]) -> Result<(), Failure> {
             return Err(Failure::new(format!("cannot write {}: the folder is read-only", path.display()))
                 .advice("name an output in a folder of your own"));
         }
+        remove_stale(folder);
     }
     Ok(())
 }
@@ -352,37 +361,21 @@ fn folder_of(path: &Path) -> &Path {
 
 /// Makes a folder for outputs, and those above it.
 pub(crate) fn create_dir(path: &Path) -> Result<(), Failure> {
-    fs::create_dir_all(path).during(format!("cannot make the folder {}", path.display()))
+    fs::create_dir_all(path).during(format!("cannot make the folder {}", path.display()))?;
+    remove_stale(path);
+    Ok(())
 }
 
-/// Writes a file whole or not at all: to a hidden file beside it, which then takes its name.
-pub(crate) fn write_file(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
-    let folder = folder_of(path);
-    let name = path.file_name().unwrap_or_default().to_string_lossy();
-    remove_stale(folder);
-    let part = folder.join(format!(".{name}.{}{PART}", std::process::id()));
-    let write = || {
-        let mut file = fs::File::create(&part)?;
-        file.write_all(bytes)?;
-        file.sync_all()?;
-        fs::rename(&part, path)
-    };
-    write().inspect_err(|_| drop(fs::remove_file(&part))).during(format!("cannot write {}", path.display()))
-}
-
-/// How the hidden files end that become outputs.
-const PART: &str = ".cv-part";
-
-/// Removes hidden files that a run left behind which was killed while it wrote. A write takes seconds: an hour is safe.
+/// Removes what a run left behind that was killed while it wrote: `cv_io`'s temporary files. A write takes seconds, so
+/// one that is an hour old belongs to nobody.
 fn remove_stale(folder: &Path) {
     let Ok(entries) = fs::read_dir(folder) else { return };
     for entry in entries.flatten() {
         let name = entry.file_name();
-        let old = || {
-            let written = entry.metadata().and_then(|data| data.modified()).ok()?;
-            Some(SystemTime::now().duration_since(written).ok()? > Duration::from_secs(3600))
-        };
-        if name.to_string_lossy().starts_with('.') && name.to_string_lossy().ends_with(PART) && old() == Some(true) {
+        let ours = name.to_str().is_some_and(|name| name.starts_with(".cv-") && name.ends_with(".part"));
+        let age = || SystemTime::now().duration_since(entry.metadata().ok()?.modified().ok()?).ok();
+        if ours && age().is_some_and(|age| age > Duration::from_secs(3600)) {
+            // Not ours to worry about where it cannot be removed.
             let _ = fs::remove_file(entry.path());
         }
     }
@@ -471,27 +464,28 @@ mod tests {
     }
 
     #[test]
-    fn a_write_replaces_the_file_and_leaves_nothing_beside_it() {
+    fn only_old_leftovers_are_removed() {
         let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("out.txt");
-        for text in ["one", "two"] {
-            write_file(&path, text.as_bytes()).unwrap();
-            assert_eq!(fs::read_to_string(&path).unwrap(), text);
+        let [old, new, foreign] = [".cv-old.part", ".cv-new.part", ".x.part"].map(|name| folder.path().join(name));
+        for path in [&old, &new, &foreign] {
+            fs::write(path, "half").unwrap();
         }
-        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
+        for path in [&old, &foreign] {
+            let file = fs::File::options().write(true).open(path).unwrap();
+            file.set_modified(SystemTime::now() - Duration::from_secs(4000)).unwrap();
+        }
+        check_outputs(&[&folder.path().join("out.txt")]).unwrap();
+        assert!(!old.exists() && new.exists() && foreign.exists());
     }
 
     #[test]
-    fn only_old_leftovers_are_removed() {
-        let folder = tempfile::tempdir().unwrap();
-        let [old, new] = ["old", "new"].map(|name| folder.path().join(format!(".{name}.1{PART}")));
-        for path in [&old, &new] {
-            fs::write(path, "half").unwrap();
-        }
-        let file = fs::File::options().write(true).open(&old).unwrap();
-        file.set_modified(SystemTime::now() - Duration::from_secs(4000)).unwrap();
-        write_file(&folder.path().join("out.txt"), b"whole").unwrap();
-        assert!(!old.exists() && new.exists());
+    fn the_hint_of_a_file_error_is_the_advice() {
+        let failure: Failure = cv_io::read_rgb("no/such/picture.png").unwrap_err().into();
+        let text = failure.text();
+        assert!(
+            text.starts_with("error: cannot read no/such/picture.png: ") && text.contains("; try: check"),
+            "{text}"
+        );
     }
 
     #[test]

@@ -28,7 +28,7 @@
 //!         }
 //!         let result = cv_pipeline::shrink(image.view(), &options, context) // `&Context` is the `&dyn Progress`
 //!             .advice("take a larger photograph")?; // becomes "; try: take a larger photograph"
-//!         cv_io::write_png_rgb(&self.output, result.image.view())?; // whole or not at all
+//!         cv_io::write_png(&self.output, result.image.view())?; // whole or not at all
 //!         context.report(|| html_of(&result))?; // called and written only under --report DIR
 //!         Ok(Outcome::new(result.stages) // `seconds`, `threads` and `version` are added by the frame
 //!             .with("width", result.image.width())
