@@ -1,0 +1,99 @@
+//! What every command shares, seen from outside: usage, help, exit codes, stdout and stderr.
+
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
+
+mod support;
+
+use support::{cv, done, json, run};
+
+/// The names in the list of commands.
+fn commands() -> Vec<String> {
+    let help = done(&std::env::temp_dir(), &["--help"]).stdout;
+    let list = help.split("Commands:\n").nth(1).unwrap().split("\n\n").next().unwrap();
+    let names = list.lines().filter(|line| line.starts_with("  ") && !line.starts_with("   "));
+    names.map(|line| line.split_whitespace().next().unwrap().to_owned()).filter(|name| name != "help").collect()
+}
+
+/// The names of a command and of the commands inside it.
+fn commands_within(folder: &std::path::Path, name: &str) -> Vec<Vec<String>> {
+    let help = done(folder, &[name, "--help"]).stdout;
+    match help.split("Commands:\n").nth(1) {
+        None => vec![vec![name.to_owned()]],
+        Some(list) => list
+            .lines()
+            .take_while(|line| !line.is_empty())
+            .filter(|line| line.starts_with("  ") && !line.starts_with("   "))
+            .map(|line| line.split_whitespace().next().unwrap().to_owned())
+            .filter(|inner| inner != "help")
+            .map(|inner| vec![name.to_owned(), inner])
+            .collect(),
+    }
+}
+
+#[test]
+fn every_command_explains_itself_by_examples() {
+    let folder = tempfile::tempdir().unwrap();
+    for name in commands() {
+        for path in commands_within(folder.path(), &name) {
+            let mut args: Vec<&str> = path.iter().map(String::as_str).collect();
+            args.push("--help");
+            let help = done(folder.path(), &args).stdout;
+            let example = format!("cv {}", path.join(" "));
+            assert!(help.contains("Examples:"), "{path:?}: {help}");
+            let examples = help.split("Examples:").nth(1).unwrap();
+            assert!(examples.contains(&example), "{path:?}: {examples}");
+        }
+    }
+}
+
+#[test]
+fn wrong_usage_is_exit_code_2_and_leaves_stdout_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let cases: [&[&str]; 7] = [
+        &[],
+        &["no-such-command"],
+        &["--no-such-option"],
+        &["completions", "no-such-shell"],
+        &["completions", "bash", "--threads", "0"],
+        &["completions", "bash", "--threads", "two"],
+        &["completions", "bash", "--seed", "-1"],
+    ];
+    for args in cases {
+        let ran = run(folder.path(), args);
+        assert_eq!((ran.code, ran.stdout.as_str()), (Some(2), ""), "cv {args:?}: {ran:?}");
+        assert!(!ran.stderr.is_empty());
+    }
+    for name in commands() {
+        for path in commands_within(folder.path(), &name) {
+            let mut args: Vec<&str> = path.iter().map(String::as_str).collect();
+            args.push("--no-such-option");
+            let ran = run(folder.path(), &args);
+            assert_eq!((ran.code, ran.stdout.as_str()), (Some(2), ""), "cv {args:?}: {ran:?}");
+        }
+    }
+}
+
+#[test]
+fn the_thread_count_is_the_one_asked_for() {
+    let folder = tempfile::tempdir().unwrap();
+    for threads in [1, 3] {
+        let value = json(folder.path(), &["completions", "zsh", "--threads", &threads.to_string()]);
+        assert_eq!(value["threads"], threads);
+    }
+}
+
+#[test]
+fn a_closed_stdout_is_a_failure_and_not_a_crash() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut child = cv(folder.path())
+        .args(["completions", "bash"])
+        .stdout(std::process::Stdio::piped())
+        .stderr(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    drop(child.stdout.take());
+    let output = child.wait_with_output().unwrap();
+    // The script may have fitted into the pipe before it was closed: then the run was fine.
+    assert!(matches!(output.status.code(), Some(0 | 1)), "{output:?}");
+    assert!(!String::from_utf8_lossy(&output.stderr).contains("panicked"), "{output:?}");
+}

@@ -1,0 +1,131 @@
+//! What the black-box tests share: running the program and making files, good and bad.
+
+#![allow(dead_code, reason = "each test file uses its part")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
+
+use cv_core::{Image, RgbU8};
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::{Command, Output, Stdio},
+};
+
+/// The program, ready for arguments, in a folder.
+pub(crate) fn cv(folder: &Path) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cv"));
+    command.current_dir(folder).stdin(Stdio::null());
+    command
+}
+
+/// How a run ended.
+#[derive(Debug)]
+pub(crate) struct Ran {
+    pub(crate) code: Option<i32>,
+    pub(crate) stdout: String,
+    pub(crate) stderr: String,
+}
+
+/// Runs the program with arguments in a folder. Whatever it is given, it must not die of a bug.
+pub(crate) fn run(folder: &Path, args: &[&str]) -> Ran {
+    let Output { status, stdout, stderr } = cv(folder).args(args).output().unwrap();
+    let ran = Ran {
+        code: status.code(),
+        stdout: String::from_utf8(stdout).unwrap(),
+        stderr: String::from_utf8(stderr).unwrap(),
+    };
+    assert!(matches!(ran.code, Some(0..=2)), "cv {args:?}: {ran:?}");
+    assert!(!ran.stderr.contains("panicked") && !ran.stderr.contains("bug of its own"), "cv {args:?}: {ran:?}");
+    ran
+}
+
+/// A run that must succeed.
+pub(crate) fn done(folder: &Path, args: &[&str]) -> Ran {
+    let ran = run(folder, args);
+    assert_eq!(ran.code, Some(0), "cv {args:?}: {ran:?}");
+    ran
+}
+
+/// A run that must fail with exit code 1 and one line that says why.
+pub(crate) fn refused(folder: &Path, args: &[&str]) -> Ran {
+    let ran = run(folder, args);
+    assert_eq!(ran.code, Some(1), "cv {args:?}: {ran:?}");
+    assert_eq!(ran.stdout, "", "cv {args:?}");
+    let errors: Vec<&str> = ran.stderr.lines().filter(|line| line.starts_with("error: ")).collect();
+    assert_eq!(errors.len(), 1, "cv {args:?}: {ran:?}");
+    ran
+}
+
+/// A run that must succeed and print exactly one JSON object, with the keys every command has.
+pub(crate) fn json(folder: &Path, args: &[&str]) -> serde_json::Value {
+    let ran = done(folder, &[args, &["--json"]].concat());
+    let value: serde_json::Value = serde_json::from_str(&ran.stdout).unwrap_or_else(|e| panic!("{e}: {ran:?}"));
+    assert!(value["seconds"]["total"].as_f64().unwrap() > 0.0, "{value}");
+    assert!(value["threads"].as_u64().unwrap() > 0, "{value}");
+    assert_eq!(value["version"], env!("CARGO_PKG_VERSION"));
+    value
+}
+
+/// Names and bytes of all files below a folder, sorted.
+pub(crate) fn snapshot(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let mut files = Vec::new();
+    for entry in fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            files.extend(snapshot(&path));
+        } else {
+            files.push((path.clone(), fs::read(&path).unwrap()));
+        }
+    }
+    files.sort();
+    files
+}
+
+/// Files under image names that hold no image. Each must be refused.
+pub(crate) fn write_broken(folder: &Path, good: &RgbU8) -> Vec<String> {
+    let png = cv_io::encode_png(good.view()).unwrap();
+    let jpeg = cv_io::encode_jpeg(good.view(), 90).unwrap();
+    // 100,000 × 100,000 pixels by its header, no data: must be refused without asking for the memory.
+    let mut bomb = png[..33].to_vec();
+    bomb[16..24].copy_from_slice(&[0, 1, 0x86, 0xa0, 0, 1, 0x86, 0xa0]);
+    let files: [(&str, &[u8]); 8] = [
+        ("empty.png", b""),
+        ("empty.jpg", b""),
+        ("cut.png", &png[..png.len() / 2]),
+        ("head.png", &png[..20]),
+        ("head.jpg", &jpeg[..20]),
+        ("text.png", b"this is not a picture\n"),
+        ("zeros.jpg", &[0; 4096]),
+        ("bomb.png", &bomb),
+    ];
+    for (name, bytes) in files {
+        fs::write(folder.join(name), bytes).unwrap();
+    }
+    fs::create_dir(folder.join("folder.png")).unwrap();
+    files.iter().map(|(name, _)| (*name).to_owned()).chain(["missing.png".into(), "folder.png".into()]).collect()
+}
+
+/// The same picture in every dress that loses nothing. Each must give the same result as the plain PNG.
+pub(crate) fn write_dressed(folder: &Path, stem: &str, image: &RgbU8) -> Vec<String> {
+    let name = |ending: &str| format!("{stem}-{ending}");
+    let png = cv_io::encode_png(image.view()).unwrap();
+    let deep = image.map(|p| p.map(|v| u16::from(v) * 257));
+    let alpha: Image<u8, 4> = image.map(|[r, g, b]| [r, g, b, 255]);
+    fs::write(folder.join(name("plain.png")), &png).unwrap();
+    fs::write(folder.join(name("misnamed.jpg")), &png).unwrap();
+    fs::write(folder.join(name("nameless")), &png).unwrap();
+    cv_io::write_png(folder.join(name("deep.png")), deep.view()).unwrap();
+    cv_io::write_png(folder.join(name("alpha.png")), alpha.view()).unwrap();
+    let mut ppm = format!("P6\n{} {}\n255\n", image.width(), image.height()).into_bytes();
+    ppm.extend_from_slice(image.as_slice());
+    fs::write(folder.join(name("plain.ppm")), ppm).unwrap();
+    ["plain.png", "misnamed.jpg", "nameless", "deep.png", "alpha.png", "plain.ppm"].map(name).to_vec()
+}
+
+/// The picture as a CMYK JPEG, as print shops make them (Adobe's inverted inks).
+pub(crate) fn write_cmyk(path: &Path, image: &RgbU8) {
+    let inks: Vec<u8> = image.pixels().flat_map(|[r, g, b]| [255 - r, 255 - g, 255 - b, 0]).collect();
+    let mut bytes = Vec::new();
+    let (width, height) = (image.width() as u16, image.height() as u16);
+    jpeg_encoder::Encoder::new(&mut bytes, 95).encode(&inks, width, height, jpeg_encoder::ColorType::Cmyk).unwrap();
+    fs::write(path, bytes).unwrap();
+}
