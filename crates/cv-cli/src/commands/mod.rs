@@ -68,4 +68,5 @@ macro_rules! commands {
 
 commands! {
     Completions(completions),
+    Man(man),
 }

@@ -1,0 +1,38 @@
+//! `cv man`: the manual pages.
+
+use crate::common::{Context, Explain, Failure, Outcome, Run, create_dir};
+use clap::CommandFactory;
+use std::path::PathBuf;
+
+/// Write manual pages: cv.1 and one page per command.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  cv man --out ~/.local/share/man/man1")]
+pub(crate) struct Args {
+    /// The folder to write to; made where it is missing.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+}
+
+impl Run for Args {
+    fn run(self, _: &Context) -> Result<Outcome, Failure> {
+        create_dir(&self.out)?;
+        let mut root = crate::Cli::command().disable_help_subcommand(true);
+        root.build();
+        let mut pages = Vec::new();
+        collect(&root, &mut pages)?;
+        let count = pages.len();
+        for (name, page) in pages {
+            cv_io::write_bytes(self.out.join(name), &page)?;
+        }
+        Ok(Outcome::default().with("pages", count).summary(format!("{count} pages in {}", self.out.display())))
+    }
+}
+
+/// The page of a command and those of the commands inside it.
+fn collect(command: &clap::Command, pages: &mut Vec<(String, Vec<u8>)>) -> Result<(), Failure> {
+    let man = clap_mangen::Man::new(command.clone());
+    let mut page = Vec::new();
+    man.render(&mut page).during("cannot make the page")?;
+    pages.push((man.get_filename(), page));
+    command.get_subcommands().try_for_each(|inner| collect(inner, pages))
+}
