@@ -25,8 +25,13 @@
 //! * Every job takes `&dyn Progress`; pass [`&Silent`](Silent) where nobody watches.
 //! * The same input, options and seed give the same result at any number of threads.
 
+mod matching;
 mod progress;
 mod stopwatch;
 
+pub use matching::{
+    FeatureMethod, MatchingError, MatchingOptions, MatchingResult, PhotoFeatures, correspondences, extract_features,
+    match_features, match_photos,
+};
 pub use progress::{Progress, Silent};
 pub use stopwatch::Stopwatch;

@@ -1,0 +1,253 @@
+//! Features of photographs, and tentative matches between two of them.
+
+use crate::{Progress, Stopwatch};
+use cv_core::{Correspondence, DMatch, GrayF32, ImageView, Point2};
+use cv_features::{
+    Described, FeatureError, HarrisOptions, MatchError, MatchOptions, PatchOptions, SiftOptions, anms,
+    describe_patches, harris, match_descriptors, sift,
+};
+
+/// Which features to find.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum FeatureMethod {
+    /// Harris corners with upright 8×8 patches: fast, for neighbouring frames of a film or a slowly turned camera.
+    Harris,
+    /// rootSIFT: for photographs that turn, zoom, or change light or viewpoint.
+    #[default]
+    Sift,
+}
+
+/// Settings of [`extract_features`] and [`match_photos`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct MatchingOptions {
+    /// Which features. Default SIFT, which works on a stranger's photographs without knowing anything about them.
+    pub method: FeatureMethod,
+    /// Most features per photograph; `None` takes the method's default: 500 well-spread corners (Brown, Szeliski & Winder), or 8192 SIFT
+    /// features (COLMAP's).
+    pub max_features: Option<usize>,
+    /// Settings of the corners.
+    pub harris: HarrisOptions,
+    /// Robustness factor of the suppression. 0 to 1; default 0.9 (Brown, Szeliski & Winder).
+    pub anms_robust: f32,
+    /// Settings of the patches.
+    pub patch: PatchOptions,
+    /// Settings of SIFT.
+    pub sift: SiftOptions,
+    /// Largest ratio of the SSD of the best candidate to that of the second. 0 to 1; `None` keeps every nearest neighbour. Default 0.66, which is
+    /// 0.81 on distances.
+    pub ratio: Option<f32>,
+    /// Keep a match only where each feature is the other's nearest. Default true.
+    pub mutual: bool,
+}
+
+impl Default for MatchingOptions {
+    fn default() -> Self {
+        Self {
+            method: FeatureMethod::default(),
+            max_features: None,
+            harris: HarrisOptions::default(),
+            anms_robust: 0.9,
+            patch: PatchOptions::default(),
+            sift: SiftOptions::default(),
+            ratio: Some(0.66),
+            mutual: true,
+        }
+    }
+}
+
+/// The features of a photograph.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PhotoFeatures {
+    /// Keypoints, descriptors, and what was left out.
+    pub described: Described,
+    /// Points found before spacing and limits.
+    pub found: usize,
+}
+
+/// What [`match_photos`] found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MatchingResult {
+    /// The features of both photographs.
+    pub features: [PhotoFeatures; 2],
+    /// Matches by index of the features, in order of the first photograph's.
+    pub matches: Vec<DMatch>,
+    /// The same matches as positions in pixels.
+    pub pairs: Vec<Correspondence>,
+    /// Stage names and their seconds.
+    pub stages: Vec<(&'static str, f64)>,
+}
+
+/// Why photographs could not be matched.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum MatchingError {
+    /// A photograph cannot be looked at.
+    #[error("photograph {index}: {source}")]
+    Features {
+        /// 1 or 2.
+        index: usize,
+        /// Why.
+        source: FeatureError,
+    },
+    /// A photograph has no features to match.
+    #[error(
+        "photograph {index} has no features: {found} points found, {dropped} of them too near the border or on flat patches"
+    )]
+    NoFeatures {
+        /// 1 or 2.
+        index: usize,
+        /// Points found before description.
+        found: usize,
+        /// Points that could not be described.
+        dropped: usize,
+    },
+    /// The descriptors cannot be compared.
+    #[error(transparent)]
+    Match(#[from] MatchError),
+}
+
+/// Finds and describes the features of a photograph. Grey is Rec. 601 luma, 0 to 1.
+///
+/// # Errors
+/// [`FeatureError`] for a photograph smaller than the method's window and for options out of range. One without features is no error here.
+pub fn extract_features(photo: ImageView<'_, u8, 3>, options: &MatchingOptions) -> Result<PhotoFeatures, FeatureError> {
+    let grey = luma(photo);
+    match options.method {
+        FeatureMethod::Harris => {
+            let corners = harris(grey.view(), &options.harris)?;
+            let n = options.max_features.unwrap_or(500);
+            let spaced: Vec<_> = anms(&corners, n, options.anms_robust).into_iter().map(|i| corners[i]).collect();
+            let mut described = describe_patches(grey.view(), &spaced, &options.patch)?;
+            described.beyond_limit = corners.len() - spaced.len();
+            Ok(PhotoFeatures { described, found: corners.len() })
+        }
+        FeatureMethod::Sift => {
+            let mut settings = options.sift.clone();
+            if let Some(n) = options.max_features {
+                settings.max_features = n;
+            }
+            let described = sift(grey.view(), &settings)?;
+            let found = described.keypoints.len() + described.dropped.len() + described.beyond_limit;
+            Ok(PhotoFeatures { described, found })
+        }
+    }
+}
+
+/// Tentative matches between the features of two photographs.
+///
+/// # Errors
+/// [`MatchError`] where one has no features, or they are of different kinds.
+pub fn match_features(
+    a: &PhotoFeatures,
+    b: &PhotoFeatures,
+    options: &MatchingOptions,
+) -> Result<Vec<DMatch>, MatchError> {
+    let settings = MatchOptions { ratio: options.ratio, mutual: options.mutual, ..MatchOptions::default() };
+    match_descriptors(&a.described.descriptors, &b.described.descriptors, &settings)
+}
+
+/// The positions of matched features, in the order of `matches`.
+pub fn correspondences(a: &PhotoFeatures, b: &PhotoFeatures, matches: &[DMatch]) -> Vec<Correspondence> {
+    let at = |f: &PhotoFeatures, i: u32| -> Point2<f64> { f.described.keypoints[i as usize].position.cast() };
+    matches.iter().map(|m| Correspondence { a: at(a, m.query), b: at(b, m.train) }).collect()
+}
+
+/// Features of two photographs and the tentative matches between them.
+///
+/// # Errors
+/// [`MatchingError`] where a photograph is too small or has no features.
+pub fn match_photos(
+    a: ImageView<'_, u8, 3>,
+    b: ImageView<'_, u8, 3>,
+    options: &MatchingOptions,
+    progress: &dyn Progress,
+) -> Result<MatchingResult, MatchingError> {
+    let mut watch = Stopwatch::new();
+    let extract = |photo, index| {
+        progress.report("features", index - 1, 2);
+        let features = extract_features(photo, options).map_err(|source| MatchingError::Features { index, source })?;
+        if features.described.keypoints.is_empty() {
+            let dropped = features.described.dropped.len();
+            return Err(MatchingError::NoFeatures { index, found: features.found, dropped });
+        }
+        Ok(features)
+    };
+    let features = [extract(a, 1)?, extract(b, 2)?];
+    watch.lap("features");
+    progress.report("match", 0, 1);
+    let matches = match_features(&features[0], &features[1], options)?;
+    let pairs = correspondences(&features[0], &features[1], &matches);
+    watch.lap("match");
+    Ok(MatchingResult { features, matches, pairs, stages: watch.into_stages() })
+}
+
+/// Rec. 601 luma, 0 to 1, not rounded to bytes.
+fn luma(photo: ImageView<'_, u8, 3>) -> GrayF32 {
+    let (w, h) = photo.size();
+    let mut grey = GrayF32::new(w, h, [0.0]);
+    for y in 0..h {
+        for (o, p) in grey.row_mut(y).iter_mut().zip(photo.row(y).as_chunks::<3>().0) {
+            *o = (0.299 * f32::from(p[0]) + 0.587 * f32::from(p[1]) + 0.114 * f32::from(p[2])) * (1.0 / 255.0);
+        }
+    }
+    grey
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Silent;
+    use cv_core::RgbU8;
+
+    /// Coloured blobs of many sizes at places drawn from a fixed sequence.
+    fn blobs(shift: (f32, f32)) -> RgbU8 {
+        let mut state = 7u32;
+        let mut random = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (state >> 8) as f32 / (1 << 24) as f32
+        };
+        let spots: Vec<[f32; 4]> =
+            (0..400).map(|_| [random() * 240.0, random() * 180.0, 0.8 + 4.0 * random(), random() - 0.5]).collect();
+        RgbU8::from_fn(240, 180, |x, y| {
+            let (x, y) = (x as f32 - shift.0, y as f32 - shift.1);
+            let sum: f32 = spots
+                .iter()
+                .map(|s| s[3] * (-((x - s[0]).powi(2) + (y - s[1]).powi(2)) / (2.0 * s[2] * s[2])).exp())
+                .sum();
+            [(128.0 + 120.0 * sum) as u8; 3]
+        })
+    }
+
+    #[test]
+    fn both_methods_find_a_shift() {
+        let (a, b) = (blobs((0.0, 0.0)), blobs((6.5, -4.0)));
+        for method in [FeatureMethod::Harris, FeatureMethod::Sift] {
+            let options = MatchingOptions { method, ..MatchingOptions::default() };
+            let result = match_photos(a.view(), b.view(), &options, &Silent).unwrap();
+            let good = result
+                .pairs
+                .iter()
+                .filter(|p| (p.b.x - p.a.x - 6.5).abs() < 1.0 && (p.b.y - p.a.y + 4.0).abs() < 1.0)
+                .count();
+            // The images differ only by the shift and rounding to bytes; a pixel is what the top of a round blob may wander by that.
+            assert!(good >= 30 && good * 10 >= result.pairs.len() * 9, "{method:?}: {good} of {}", result.pairs.len());
+            assert_eq!(result.matches.len(), result.pairs.len());
+        }
+    }
+
+    #[test]
+    fn photographs_without_features_are_named() {
+        let flat = RgbU8::new(100, 80, [9; 3]);
+        let good = blobs((0.0, 0.0));
+        for method in [FeatureMethod::Harris, FeatureMethod::Sift] {
+            let options = MatchingOptions { method, ..MatchingOptions::default() };
+            let error = match_photos(good.view(), flat.view(), &options, &Silent).unwrap_err();
+            assert_eq!(error, MatchingError::NoFeatures { index: 2, found: 0, dropped: 0 });
+            let tiny = RgbU8::new(1, 1, [9; 3]);
+            let error = match_photos(tiny.view(), good.view(), &options, &Silent).unwrap_err();
+            assert!(matches!(
+                error,
+                MatchingError::Features { index: 1, source: FeatureError::ImageTooSmall { width: 1, height: 1, .. } }
+            ));
+        }
+    }
+}
