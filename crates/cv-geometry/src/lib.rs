@@ -1,1 +1,38 @@
 //! Homography, epipolar geometry, pose, triangulation, and the one RANSAC driver.
+//!
+//! Takes matches, never images. Robust estimators come in pairs with the plain solvers that they are made of:
+//!
+//! ```
+//! use cv_core::Correspondence;
+//! use cv_geometry::{RobustOptions, estimate_homography, homography_from_points};
+//!
+//! let corners = [(0.0, 0.0), (100.0, 0.0), (100.0, 100.0), (0.0, 100.0), (50.0, 20.0), (30.0, 70.0)];
+//! let matches = corners.map(|(x, y)| Correspondence::new(x, y, 2.0 * x + 5.0, 2.0 * y));
+//! let exact = homography_from_points(&matches)?;
+//! let robust = estimate_homography(&matches, &RobustOptions::homography())?;
+//! assert!((exact - robust.model).norm() < 1e-6 && (exact[(0, 0)] - 2.0).abs() < 1e-9);
+//! # Ok::<(), cv_geometry::EstimateError>(())
+//! ```
+//!
+//! # Conventions
+//!
+//! * A homography maps the first image to the second, `b ~ H a`, scaled to `H[2][2] = 1`.
+//! * Thresholds and residuals are in the unit of the matches, that is, pixels.
+//! * The same matches, options and seed give the same bytes on any number of threads and with any vector unit.
+
+mod error;
+mod homography;
+mod pairs;
+mod ransac;
+mod robust;
+
+pub use error::{Degeneracy, EstimateError};
+pub use homography::{
+    estimate_homography, homography_four_point, homography_from_points, homography_residual, refine_homography,
+};
+pub use pairs::{LANES, PairBlock};
+pub use ransac::{
+    Consensus, Estimator, Marginal, Msac, Prosac, RobustOptions, Sampler, Sampling, Score, Scorer, Scoring, Uniform,
+    ransac,
+};
+pub use robust::RobustModel;

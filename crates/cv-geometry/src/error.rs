@@ -1,0 +1,71 @@
+//! Why an estimate could not be made.
+
+/// A configuration of points that does not determine a model.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Degeneracy {
+    /// Too few different points.
+    Coincident,
+    /// The points lie on a line (or all but one do).
+    Collinear,
+    /// The points lie on a plane of the scene, or the camera only turned: a homography explains them all.
+    Planar,
+}
+
+impl std::fmt::Display for Degeneracy {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Coincident => "too few different points",
+            Self::Collinear => "the points lie on a line",
+            Self::Planar => "one homography explains all the points (a plane, or a camera that only turned)",
+        })
+    }
+}
+
+/// Why an estimate could not be made.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum EstimateError {
+    /// There are fewer matches than the model has need of.
+    #[error("{got} matches are too few: {needed} are needed")]
+    NotEnoughMatches {
+        /// Number of matches given.
+        got: usize,
+        /// Number needed.
+        needed: usize,
+    },
+    /// A coordinate is NaN, infinite or beyond 1e12.
+    #[error("match {index} has a coordinate that is not a number of any use")]
+    NotFinite {
+        /// Which match.
+        index: usize,
+    },
+    /// The input determines no model.
+    #[error("{kind}")]
+    Degenerate {
+        /// In which way.
+        kind: Degeneracy,
+    },
+    /// No model is supported by more matches than chance would give.
+    #[error(
+        "after {iterations} samples the best model fits {inliers} of {matches} matches; at least {needed} are needed"
+    )]
+    NoConsensus {
+        /// Matches that fit the best model.
+        inliers: usize,
+        /// Matches given.
+        matches: usize,
+        /// Matches that must fit.
+        needed: usize,
+        /// Samples drawn.
+        iterations: usize,
+    },
+    /// An option is out of range.
+    #[error("{name} must be {range}, not {value}")]
+    BadOption {
+        /// Name of the option.
+        name: &'static str,
+        /// The range it must be in.
+        range: &'static str,
+        /// The value given.
+        value: f64,
+    },
+}

@@ -1,0 +1,441 @@
+//! Homographies.
+
+mod dlt;
+mod four_point;
+mod refine;
+
+pub use dlt::homography_from_points;
+pub use four_point::homography_four_point;
+
+use crate::error::EstimateError;
+use crate::pairs::{LANES, PairBlock, PairSet, point_degeneracy};
+use crate::ransac::{Estimator, RobustOptions, Scorer, ransac};
+use crate::robust::RobustModel;
+use cv_core::{Correspondence, Matrix3, Point2};
+use refine::{TransferProblem, refine_transfer};
+
+/// The root mean square of the distances from `b` to `H a` and from `a` to `H⁻¹ b`, in pixels.
+///
+/// Infinite where `h` has no inverse or sends one of the points to infinity.
+pub fn homography_residual(h: &Matrix3<f64>, m: &Correspondence) -> f64 {
+    let Some(g) = h.try_inverse() else { return f64::INFINITY };
+    let map = |h: &Matrix3<f64>, p: Point2<f64>| Point2::from_homogeneous(h * p.to_homogeneous());
+    match (map(h, m.a), map(&g, m.b)) {
+        (Some(p), Some(q)) => (((p - m.b).norm_squared() + (q - m.a).norm_squared()) / 2.0).sqrt(),
+        _ => f64::INFINITY,
+    }
+}
+
+/// The homography between two images that share a plane or a camera centre, from matches of which many may be wrong.
+///
+/// RANSAC with local optimisation on the symmetric transfer error; the model is scaled to `H[2][2] = 1`.
+///
+/// ```
+/// use cv_core::Correspondence;
+/// use cv_geometry::{RobustOptions, estimate_homography};
+///
+/// // A shift by (10, 5), and one wrong match.
+/// let mut matches: Vec<_> = (0..20)
+///     .map(|i| (f64::from(i % 5) * 40.0, f64::from(i / 5) * 30.0))
+///     .map(|(x, y)| Correspondence::new(x, y, x + 10.0, y + 5.0))
+///     .collect();
+/// matches.push(Correspondence::new(50.0, 50.0, 300.0, 20.0));
+/// let found = estimate_homography(&matches, &RobustOptions::homography())?;
+/// assert_eq!(found.inliers, (0..20).collect::<Vec<_>>());
+/// assert!((found.model[(0, 2)] - 10.0).abs() < 1e-6);
+/// # Ok::<(), cv_geometry::EstimateError>(())
+/// ```
+///
+/// # Errors
+/// [`EstimateError`]: fewer than four matches, a coordinate that is not finite, coincident or collinear points, or no
+/// consensus of more than four matches (where there are more than four).
+pub fn estimate_homography(
+    matches: &[Correspondence],
+    options: &RobustOptions,
+) -> Result<RobustModel<Matrix3<f64>>, EstimateError> {
+    let set = PairSet::new(matches, 4)?;
+    let estimator = HomographyEstimator { set };
+    let found = ransac(&estimator, options);
+    let set = &estimator.set;
+    let degenerate = |kind| EstimateError::Degenerate { kind };
+    let found = match found {
+        Ok(found) => found,
+        Err(error @ EstimateError::NoConsensus { .. }) => {
+            // Say why, where the reason is in the input.
+            return Err(point_degeneracy(set.pairs.iter(), 4, 0.0).map_or(error, degenerate));
+        }
+        Err(error) => return Err(error),
+    };
+    let h = dlt::scaled(&(set.second.inverse_matrix() * found.model * set.first.matrix()));
+    let result = RobustModel::new(h, matches, options.threshold, found.iterations, homography_residual);
+    // Points that are on a line up to their own noise say nothing about the plane beside it.
+    let width = options.threshold / 3.0 * set.first.scale;
+    match point_degeneracy(result.inliers.iter().map(|&i| &set.pairs[i]), 4, width) {
+        Some(kind) => Err(degenerate(kind)),
+        None => Ok(result),
+    }
+}
+
+/// Refines a homography on all `matches` (which should be inliers) to the least symmetric transfer error, scaled to `H[2][2] = 1`.
+///
+/// # Errors
+/// [`EstimateError`] as for [`homography_from_points`].
+pub fn refine_homography(h: &Matrix3<f64>, matches: &[Correspondence]) -> Result<Matrix3<f64>, EstimateError> {
+    let set = PairSet::new(matches, 4)?;
+    let normalised = set.second.matrix() * h * set.first.inverse_matrix();
+    let problem = TransferProblem { pairs: &set.pairs, scorer: &AllIn, threshold: 1.0 };
+    let refined = refine_transfer(&problem, &normalised, 50).unwrap_or(normalised);
+    Ok(dlt::scaled(&(set.second.inverse_matrix() * refined * set.first.matrix())))
+}
+
+/// Plain least squares.
+struct AllIn;
+
+impl Scorer for AllIn {
+    fn loss(&self, u: f32) -> f32 {
+        u
+    }
+    fn weight(&self, _: f64) -> f64 {
+        1.0
+    }
+    fn cutoff(&self) -> f64 {
+        f64::INFINITY
+    }
+}
+
+struct HomographyEstimator {
+    set: PairSet,
+}
+
+/// H and its inverse, both positive where the points are.
+pub(crate) struct TransferKernel {
+    h: [f32; 9],
+    g: [f32; 9],
+}
+
+impl TransferKernel {
+    pub(crate) fn new(h: &Matrix3<f64>) -> Self {
+        // The adjugate, scaled so that G H = +I·positive: the front stays the front.
+        let g = Matrix3::from_columns(&[
+            h.row(1).transpose().cross(&h.row(2).transpose()),
+            h.row(2).transpose().cross(&h.row(0).transpose()),
+            h.row(0).transpose().cross(&h.row(1).transpose()),
+        ]);
+        let det = h[(0, 0)] * g[(0, 0)] + h[(0, 1)] * g[(1, 0)] + h[(0, 2)] * g[(2, 0)];
+        let s = 1.0 / h[(2, 2)];
+        let h = h * s;
+        let g = g / (det * s);
+        let rows = |m: &Matrix3<f64>| std::array::from_fn(|i| m[(i / 3, i % 3)] as f32);
+        Self { h: rows(&h), g: rows(&g) }
+    }
+
+    /// `(d₁² + d₂²) / 2`, infinite behind the camera.
+    #[inline(always)]
+    pub(crate) fn squared_residuals(&self, block: &PairBlock) -> [f32; LANES] {
+        let (h, g) = (&self.h, &self.g);
+        let mut out = [0f32; LANES];
+        for (i, d2) in out.iter_mut().enumerate() {
+            let (x, y, s, t) = (block.x1[i], block.y1[i], block.x2[i], block.y2[i]);
+            let wa = h[6] * x + h[7] * y + h[8];
+            let wb = g[6] * s + g[7] * t + g[8];
+            let (ia, ib) = (1.0 / wa, 1.0 / wb);
+            let p = (h[0] * x + h[1] * y + h[2]) * ia - s;
+            let q = (h[3] * x + h[4] * y + h[5]) * ia - t;
+            let m = (g[0] * s + g[1] * t + g[2]) * ib - x;
+            let n = (g[3] * s + g[4] * t + g[5]) * ib - y;
+            let sum = (p * p + q * q) + (m * m + n * n);
+            *d2 = if wa.min(wb) > 0.0 { 0.5 * sum } else { f32::INFINITY };
+        }
+        out
+    }
+}
+
+impl Estimator for HomographyEstimator {
+    type Model = Matrix3<f64>;
+    type Block = PairBlock;
+    type Kernel = TransferKernel;
+    const SAMPLE: usize = 4;
+
+    fn count(&self) -> usize {
+        self.set.pairs.len()
+    }
+
+    fn unit(&self) -> f64 {
+        self.set.first.scale
+    }
+
+    fn blocks(&self) -> &[PairBlock] {
+        &self.set.blocks
+    }
+
+    fn solve(&self, sample: &[u32], models: &mut Vec<Matrix3<f64>>) {
+        let pair = |i: usize| &self.set.pairs[sample[i] as usize];
+        let a = std::array::from_fn(|i| Point2::new(pair(i)[0], pair(i)[1]));
+        let b = std::array::from_fn(|i| Point2::new(pair(i)[2], pair(i)[3]));
+        models.extend(homography_four_point(&a, &b));
+    }
+
+    fn kernel(&self, model: &Matrix3<f64>) -> TransferKernel {
+        TransferKernel::new(model)
+    }
+
+    #[inline(always)]
+    fn squared_residuals(kernel: &TransferKernel, block: &PairBlock) -> [f32; LANES] {
+        kernel.squared_residuals(block)
+    }
+
+    fn refine<C: Scorer>(
+        &self,
+        model: &Matrix3<f64>,
+        scorer: &C,
+        threshold: f64,
+        iterations: usize,
+    ) -> Option<Matrix3<f64>> {
+        let problem = TransferProblem { pairs: &self.set.pairs, scorer, threshold };
+        refine_transfer(&problem, model, iterations)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::error::Degeneracy;
+    use cv_numeric::LeastSquares;
+    use nalgebra::SVector;
+    use proptest::prelude::*;
+    use rand_chacha::ChaCha8Rng;
+    use rand_chacha::rand_core::{Rng, SeedableRng};
+
+    fn uniform(rng: &mut ChaCha8Rng) -> f64 {
+        f64::from(rng.next_u32()) / 4294967296.0
+    }
+
+    fn gauss(rng: &mut ChaCha8Rng) -> f64 {
+        (0..12).map(|_| uniform(rng)).sum::<f64>() - 6.0
+    }
+
+    fn map(h: &Matrix3<f64>, x: f64, y: f64) -> (f64, f64) {
+        let q = h * Point2::new(x, y).to_homogeneous();
+        (q.x / q.z, q.y / q.z)
+    }
+
+    /// A homography as between two photographs of 640 × 480: turned, scaled, shifted, in perspective. H[2][2] = 1.
+    fn a_homography() -> impl Strategy<Value = Matrix3<f64>> {
+        (-3.0..3.0f64, 0.4..2.5f64, -0.3..0.3f64, -200.0..200.0f64, -200.0..200.0f64, -4e-4..4e-4f64, -4e-4..4e-4f64)
+            .prop_map(|(turn, scale, shear, tx, ty, px, py)| {
+                let (s, c) = turn.sin_cos();
+                Matrix3::new(
+                    scale * c,
+                    scale * (shear * c - s),
+                    tx,
+                    scale * s,
+                    scale * (shear * s + c),
+                    ty,
+                    px,
+                    py,
+                    1.0,
+                )
+            })
+    }
+
+    fn matches(h: &Matrix3<f64>, n: usize, noise: f64, rng: &mut ChaCha8Rng) -> Vec<Correspondence> {
+        (0..n)
+            .map(|_| {
+                let (x, y) = (640.0 * uniform(rng), 480.0 * uniform(rng));
+                let (u, v) = map(h, x, y);
+                Correspondence::new(
+                    x + noise * gauss(rng),
+                    y + noise * gauss(rng),
+                    u + noise * gauss(rng),
+                    v + noise * gauss(rng),
+                )
+            })
+            .collect()
+    }
+
+    /// The cost in f64, which the problem's own, with its f32 losses, is not precise enough for.
+    fn plain_cost(problem: &TransferProblem<'_, AllIn>, h: &Matrix3<f64>) -> f64 {
+        let residual = |p: &[f64; 4]| homography_residual(h, &Correspondence::new(p[0], p[1], p[2], p[3]));
+        problem.pairs.iter().map(|p| residual(p).powi(2)).sum()
+    }
+
+    /// Largest distance between the images of the corners of 640 × 480.
+    fn corner_error(a: &Matrix3<f64>, b: &Matrix3<f64>) -> f64 {
+        [(0.0, 0.0), (639.0, 0.0), (0.0, 479.0), (639.0, 479.0)]
+            .iter()
+            .map(|&(x, y)| {
+                let ((u, v), (s, t)) = (map(a, x, y), map(b, x, y));
+                (u - s).hypot(v - t)
+            })
+            .fold(0.0, f64::max)
+    }
+
+    proptest! {
+        #[test]
+        fn every_entry_comes_back_from_exact_points(h in a_homography(), n in 4usize..20, seed: u64) {
+            let m = matches(&h, n, 0.0, &mut ChaCha8Rng::seed_from_u64(seed));
+            // Four random points may be nearly collinear, which costs digits: judge well-spread ones only.
+            let a = [m[0].a, m[1].a, m[2].a, m[3].a];
+            let area = |i: usize, j: usize, k: usize| ((a[j] - a[i]).perp(&(a[k] - a[i]))).abs();
+            prop_assume!([area(0, 1, 2), area(0, 1, 3), area(0, 2, 3), area(1, 2, 3)].iter().all(|v| *v > 5000.0));
+            let found = homography_from_points(&m).unwrap();
+            prop_assert_eq!(found[(2, 2)], 1.0);
+            // Squaring in AᵀA leaves eight digits; the perspective terms are of order 1e-4 beside entries of order 100.
+            prop_assert!(corner_error(&found, &h) < 1e-4, "{}", corner_error(&found, &h));
+            for i in 0..9 {
+                let unit = if i < 6 { if i % 3 == 2 { 1e-4 } else { 1e-6 } } else { 1e-9 };
+                prop_assert!((found[(i / 3, i % 3)] - h[(i / 3, i % 3)]).abs() < unit, "{found} {h}");
+            }
+            let b = [m[0].b, m[1].b, m[2].b, m[3].b];
+            let minimal = homography_four_point(&a, &b).unwrap();
+            prop_assert!(corner_error(&minimal, &h) < 1e-6);
+        }
+
+        #[test]
+        fn half_wrong_matches_do_not_matter(h in a_homography(), seed: u64) {
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let mut m = matches(&h, 100, 0.3, &mut rng);
+            for _ in 0..100 {
+                m.push(Correspondence::new(640.0 * uniform(&mut rng), 480.0 * uniform(&mut rng), 640.0 * uniform(&mut rng), 480.0 * uniform(&mut rng)));
+            }
+            let found = estimate_homography(&m, &RobustOptions { seed, ..RobustOptions::homography() }).unwrap();
+            prop_assert_eq!(found.model[(2, 2)], 1.0);
+            // As good as least squares on the right matches alone, give or take the few wrong ones that happen to fit.
+            let oracle = refine_homography(&h, &m[..100]).unwrap();
+            prop_assert!(corner_error(&found.model, &h) < 2.0 * corner_error(&oracle, &h) + 0.5);
+            let right = found.inliers.iter().filter(|i| **i < 100).count();
+            // 3 px is ten standard deviations of the noise, before the map's own scale of at most 2.5.
+            prop_assert!(right >= 98 && found.inliers.len() <= right + 6, "{right} of {}", found.inliers.len());
+        }
+
+        #[test]
+        fn the_gradient_and_hessian_are_those_of_the_cost(h in a_homography(), seed: u64) {
+            let m = matches(&h, 12, 0.01, &mut ChaCha8Rng::seed_from_u64(seed));
+            let set = PairSet::new(&m, 4).unwrap();
+            let problem = TransferProblem { pairs: &set.pairs, scorer: &AllIn, threshold: 1.0 };
+            let start = set.second.matrix() * h * set.first.inverse_matrix();
+            let start = start / start[(2, 2)];
+            let start = problem.step(&start, &SVector::from([0.02, -0.01, 0.03, 0.01, 0.02, -0.03, 0.005, -0.004]));
+            prop_assume!(problem.cost(&start).is_finite() && problem.cost(&start) < 12.0);
+            let equations = problem.linearize(&start);
+            for i in 0..8 {
+                let step = 1e-6;
+                let mut d = SVector::<f64, 8>::zeros();
+                d[i] = step;
+                let numeric = (plain_cost(&problem, &problem.step(&start, &d)) - plain_cost(&problem, &problem.step(&start, &-d))) / (2.0 * step);
+                // The cost is Σ r² with r² = (d₁² + d₂²)/2, its gradient Σ (d₁ d₁' + d₂ d₂') = the accumulated one.
+                let size = equations.gradient.amax().max(1e-3);
+                prop_assert!((numeric - equations.gradient[i]).abs() < 1e-4 * size, "{i}: {numeric} {}", equations.gradient[i]);
+            }
+        }
+
+        #[test]
+        fn vector_residuals_are_the_plain_ones(h in a_homography(), seed: u64) {
+            let m = matches(&h, 40, 2.0, &mut ChaCha8Rng::seed_from_u64(seed));
+            let set = PairSet::new(&m, 4).unwrap();
+            let normalised = set.second.matrix() * h * set.first.inverse_matrix();
+            let kernel = TransferKernel::new(&normalised);
+            let mut fast: Vec<f32> = set.blocks.iter().flat_map(|b| kernel.squared_residuals(b)).collect();
+            fast.truncate(m.len());
+            let mut plain: Vec<f64> = m.iter().map(|m| homography_residual(&h, m).powi(2) * set.first.scale.powi(2)).collect();
+            // The blocks are shuffled.
+            fast.sort_by(f32::total_cmp);
+            plain.sort_by(f64::total_cmp);
+            for (f, p) in fast.iter().zip(plain) {
+                // Coordinates of order one in f32, up to a few units, magnified at most twentyfold by perspective.
+                prop_assert!((f64::from(*f).sqrt() - p.sqrt()).abs() < 2e-5, "{f} {p}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_known_homography_has_the_known_residual() {
+        let h = Matrix3::new(2.0, 0.0, 3.0, 0.0, 2.0, -1.0, 0.0, 0.0, 1.0);
+        // (1, 1) goes to (5, 1), 3-4-5 away from (8, 5), whose pre-image is 1.5-2-2.5 away.
+        let r = homography_residual(&h, &Correspondence::new(1.0, 1.0, 8.0, 5.0));
+        assert!((r - ((25.0 + 6.25) / 2.0f64).sqrt()).abs() < 1e-12);
+        assert_eq!(homography_residual(&Matrix3::zeros(), &Correspondence::new(1.0, 1.0, 8.0, 5.0)), f64::INFINITY);
+    }
+
+    #[test]
+    fn refinement_on_exact_points_finds_the_exact_entries() {
+        let h = Matrix3::new(1.1, 0.1, 20.0, -0.05, 0.9, -7.0, 2e-4, -1e-4, 1.0);
+        let m = matches(&h, 30, 0.0, &mut ChaCha8Rng::seed_from_u64(5));
+        let start = Matrix3::new(1.12, 0.1, 25.0, -0.05, 0.91, -5.0, 1.9e-4, -1e-4, 1.0);
+        let found = refine_homography(&start, &m).unwrap();
+        // Quadratic convergence until the cost falls by less than a millionth: its square root in the entries.
+        assert!(corner_error(&found, &h) < 1e-5 && (found - h).norm() < 1e-6, "{found}");
+    }
+
+    #[test]
+    fn mirrored_images_are_homographies_too() {
+        let h = Matrix3::new(-1.0, 0.0, 639.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0);
+        let m = matches(&h, 20, 0.0, &mut ChaCha8Rng::seed_from_u64(5));
+        let found = estimate_homography(&m, &RobustOptions::homography()).unwrap();
+        assert!(corner_error(&found.model, &h) < 1e-6);
+    }
+
+    #[test]
+    fn bad_input_gets_a_typed_answer() {
+        let options = RobustOptions::homography();
+        let get = |m: &[Correspondence]| estimate_homography(m, &options).map(|r| r.model);
+        let good = matches(&Matrix3::identity(), 20, 0.0, &mut ChaCha8Rng::seed_from_u64(1));
+        assert_eq!(get(&good[..3]), Err(EstimateError::NotEnoughMatches { got: 3, needed: 4 }));
+        assert_eq!(get(&[]), Err(EstimateError::NotEnoughMatches { got: 0, needed: 4 }));
+        let mut bad = good.clone();
+        bad[7].b.y = f64::NAN;
+        assert_eq!(get(&bad), Err(EstimateError::NotFinite { index: 7 }));
+        bad[7].b.y = f64::INFINITY;
+        assert_eq!(get(&bad), Err(EstimateError::NotFinite { index: 7 }));
+        // A wild but finite coordinate is just an outlier.
+        bad[7].b.y = 1e9;
+        assert!(corner_error(&get(&bad).unwrap(), &Matrix3::identity()) < 1e-3);
+        let same = vec![good[0]; 30];
+        assert_eq!(get(&same), Err(EstimateError::Degenerate { kind: Degeneracy::Coincident }));
+        assert_eq!(homography_from_points(&same), Err(EstimateError::Degenerate { kind: Degeneracy::Coincident }));
+        let line: Vec<_> = (0..30).map(f64::from).map(|i| Correspondence::new(i, 2.0 * i, i + 3.0, 2.0 * i)).collect();
+        assert!(
+            matches!(get(&line), Err(EstimateError::Degenerate { kind: Degeneracy::Collinear })),
+            "{:?}",
+            get(&line)
+        );
+        assert_eq!(homography_from_points(&line), Err(EstimateError::Degenerate { kind: Degeneracy::Collinear }));
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let noisy: Vec<_> =
+            line.iter().map(|m| Correspondence::new(m.a.x, m.a.y + 0.3 * gauss(&mut rng), m.b.x, m.b.y)).collect();
+        assert_eq!(get(&noisy), Err(EstimateError::Degenerate { kind: Degeneracy::Collinear }));
+        let repeated: Vec<_> = (0..30).map(|i| good[i % 3]).collect();
+        assert_eq!(get(&repeated), Err(EstimateError::Degenerate { kind: Degeneracy::Coincident }));
+        assert!(homography_from_points(&repeated).is_err());
+        for (threshold, confidence) in [(0.0, 0.99), (f64::NAN, 0.99), (3.0, 1.0), (3.0, f64::NAN)] {
+            let options = RobustOptions { threshold, confidence, ..options };
+            assert!(matches!(estimate_homography(&good, &options), Err(EstimateError::BadOption { .. })));
+        }
+    }
+
+    #[test]
+    fn the_same_seed_gives_the_same_bytes_on_one_thread_and_on_many() {
+        let h = Matrix3::new(1.1, 0.1, 20.0, -0.05, 0.9, -7.0, 2e-4, -1e-4, 1.0);
+        let mut rng = ChaCha8Rng::seed_from_u64(9);
+        // More than the number from which on threads are used.
+        let mut m = matches(&h, 5000, 0.5, &mut rng);
+        m.extend((0..5000).map(|_| {
+            Correspondence::new(
+                640.0 * uniform(&mut rng),
+                480.0 * uniform(&mut rng),
+                640.0 * uniform(&mut rng),
+                480.0 * uniform(&mut rng),
+            )
+        }));
+        let run = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| {
+                estimate_homography(&m, &RobustOptions { scoring: crate::Scoring::Msac, ..RobustOptions::homography() })
+                    .unwrap()
+            })
+        };
+        let (one, four) = (run(1), run(4));
+        assert_eq!(one.model.as_slice(), four.model.as_slice());
+        assert_eq!(one, four);
+    }
+}

@@ -1,0 +1,94 @@
+//! Options of the robust estimators.
+
+use crate::EstimateError;
+
+/// How the fit of a model to all matches is summed up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Scoring {
+    /// The squared residual, cut off at the threshold (MSAC, Torr & Zisserman 2000).
+    Msac,
+    /// A loss that averages over noise levels instead of trusting one threshold, in the spirit of MAGSAC++
+    /// (Barath et al. 2020).
+    #[default]
+    Marginal,
+}
+
+/// How samples are drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Sampling {
+    /// Every sample is equally likely.
+    #[default]
+    Uniform,
+    /// Matches come sorted, the best first, and samples grow from the top (PROSAC, Chum & Matas 2005).
+    Prosac,
+}
+
+/// Options of `estimate_homography`, `estimate_fundamental` and their siblings.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RobustOptions {
+    /// Largest error of an inlier, in the unit of the matches (pixels). Above 0. Default 3, the usual value for
+    /// homographies (OpenCV's `findHomography`); [`RobustOptions::fundamental`] has 1.
+    pub threshold: f64,
+    /// Probability with which a sample without outliers is drawn before the search stops, 0 to 1 exclusive. Default 0.999.
+    pub confidence: f64,
+    /// Fewest samples. Default 64.
+    pub min_iterations: usize,
+    /// Most samples. Default 10 000.
+    pub max_iterations: usize,
+    /// Seed of the random samples. Default 0.
+    pub seed: u64,
+    /// How models are compared. Default [`Scoring::Marginal`].
+    pub scoring: Scoring,
+    /// How samples are drawn. Default [`Sampling::Uniform`].
+    pub sampling: Sampling,
+}
+
+impl Default for RobustOptions {
+    fn default() -> Self {
+        Self {
+            threshold: 3.0,
+            confidence: 0.999,
+            min_iterations: 64,
+            max_iterations: 10_000,
+            seed: 0,
+            scoring: Scoring::default(),
+            sampling: Sampling::default(),
+        }
+    }
+}
+
+impl RobustOptions {
+    /// Defaults for homographies: threshold 3 px.
+    pub fn homography() -> Self {
+        Self::default()
+    }
+
+    /// Defaults for fundamental matrices: threshold 1 px.
+    pub fn fundamental() -> Self {
+        Self { threshold: 1.0, ..Self::default() }
+    }
+
+    pub(crate) fn check(&self) -> Result<(), EstimateError> {
+        let bad = |name, range, value| Err(EstimateError::BadOption { name, range, value });
+        if !(self.threshold > 0.0 && self.threshold.is_finite()) {
+            return bad("threshold", "above 0", self.threshold);
+        }
+        if !(self.confidence > 0.0 && self.confidence < 1.0) {
+            return bad("confidence", "between 0 and 1", self.confidence);
+        }
+        if self.max_iterations == 0 {
+            return bad("max_iterations", "at least 1", 0.0);
+        }
+        Ok(())
+    }
+
+    /// Samples needed where `inliers` of `n` matches are good: `log(1 − confidence) / log(1 − P(good sample))`.
+    pub(crate) fn needed(&self, inliers: usize, n: usize, sample: usize) -> usize {
+        // Without replacement.
+        let good: f64 = (0..sample).map(|i| inliers.saturating_sub(i) as f64 / (n - i).max(1) as f64).product();
+        let count = (1.0 - self.confidence).ln() / (-good).ln_1p();
+        // NaN and infinity (no good sample at all) end at the maximum.
+        let count = if count < self.max_iterations as f64 { count.ceil() as usize } else { self.max_iterations };
+        count.max(self.min_iterations).min(self.max_iterations)
+    }
+}

@@ -1,0 +1,39 @@
+//! What robust estimators return.
+
+use cv_core::Correspondence;
+
+/// A model and the matches that fit it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RobustModel<M> {
+    /// The model.
+    pub model: M,
+    /// Indices of the matches within the threshold, ascending.
+    pub inliers: Vec<usize>,
+    /// Root mean square residual of the inliers, in the unit of the matches; NaN without inliers.
+    pub rms: f64,
+    /// Samples drawn.
+    pub iterations: usize,
+}
+
+impl<M> RobustModel<M> {
+    /// With the inliers by `residual`.
+    pub(crate) fn new(
+        model: M,
+        matches: &[Correspondence],
+        threshold: f64,
+        iterations: usize,
+        residual: impl Fn(&M, &Correspondence) -> f64,
+    ) -> Self {
+        let mut inliers = Vec::new();
+        let mut sum = 0.0;
+        for (i, m) in matches.iter().enumerate() {
+            let r = residual(&model, m);
+            if r < threshold {
+                inliers.push(i);
+                sum += r * r;
+            }
+        }
+        let rms = (sum / inliers.len() as f64).sqrt();
+        Self { model, inliers, rms, iterations }
+    }
+}
