@@ -1,1 +1,55 @@
-//! Ray-cast scenes with exact ground truth.
+//! Ray-cast scenes with exact ground truth: pictures that could be photographs of a plain room, and what is true
+//! about them. For tests, measurements and the demonstration; no algorithm of the workspace depends on it.
+//!
+//! ```
+//! use cv_core::Camera;
+//! use cv_synth::{RenderOptions, Scene, stereo_pair};
+//!
+//! let scene = Scene::tabletop(7);
+//! let camera = Camera::from_focal(64, 48, 60.0);
+//! let pair = stereo_pair(&scene, &camera, &scene.viewpoint(), 0.06, &RenderOptions::default())?;
+//! let (depth, disparity) = (pair.left.depth.at(32, 40)[0], pair.disparity.at(32, 40)[0]);
+//! assert!((disparity - 60.0 * 0.06 / depth).abs() < 1e-6);
+//! # Ok::<(), cv_synth::SynthError>(())
+//! ```
+//!
+//! * Scenes: [`Scene::room`], [`Scene::tabletop`], [`Scene::ball`], [`Scene::poster_wall`], each laid out anew by its
+//!   seed; [`SceneBuilder`] for one's own.
+//! * One picture: [`render`] with a [`cv_core::Camera`] (distortion included), a pose and [`RenderOptions`].
+//! * Sets with their truth: [`stereo_pair`], [`homography_pair`], [`panorama_views`], [`two_view`], [`ball_photos`].
+//! * Further truth: [`Scene::correspondences`], [`Scene::visible_in_both`], [`Scene::point_at`], [`Scene::pixel_of`],
+//!   [`plane_homography`], [`rotation_homography`].
+//!
+//! # Conventions
+//!
+//! Those of `cv-core`: pixel centres at integers, y down, poses world to camera. Worlds are in metres with y down.
+//! Truth belongs to the ray through the pixel's centre; colours are means over the pixel's area. The same seeds give
+//! the same bytes at any number of threads.
+
+mod bvh;
+mod error;
+mod font;
+mod light;
+mod noise;
+mod poster;
+mod render;
+mod rng;
+mod scene;
+mod scenes;
+mod sensor;
+mod sets;
+mod shape;
+mod texture;
+mod truth;
+
+pub use error::SynthError;
+pub use poster::Poster;
+pub use render::{Rendered, render};
+pub use scene::{Scene, SceneBuilder};
+pub use sensor::{RenderOptions, encode_srgb};
+pub use sets::{
+    BallPhoto, HomographyPair, PanoramaOptions, PanoramaViews, StereoPair, TwoView, ball_photos, homography_pair,
+    panorama_views, stereo_pair, two_view,
+};
+pub use texture::{Rgb, Texture, srgb};
+pub use truth::{plane_homography, rotation_homography};

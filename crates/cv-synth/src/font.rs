@@ -1,0 +1,103 @@
+//! A stroke font of capitals and digits: letters as polylines, so that printed matter stays sharp at any size.
+
+use crate::noise::{edge, floor};
+use crate::rng::{hash2, unit};
+
+/// Strokes on a grid 4 wide and 6 high, origin at the top left.
+const GLYPHS: [&[&[(u8, u8)]]; 36] = [
+    &[&[(0, 6), (2, 0), (4, 6)], &[(1, 4), (3, 4)]],
+    &[&[(0, 0), (0, 6), (3, 6), (4, 5), (4, 4), (3, 3), (0, 3)], &[(0, 0), (3, 0), (4, 1), (4, 2), (3, 3)]],
+    &[&[(4, 1), (3, 0), (1, 0), (0, 1), (0, 5), (1, 6), (3, 6), (4, 5)]],
+    &[&[(0, 0), (0, 6), (2, 6), (4, 4), (4, 2), (2, 0), (0, 0)]],
+    &[&[(4, 0), (0, 0), (0, 6), (4, 6)], &[(0, 3), (3, 3)]],
+    &[&[(4, 0), (0, 0), (0, 6)], &[(0, 3), (3, 3)]],
+    &[&[(4, 1), (3, 0), (1, 0), (0, 1), (0, 5), (1, 6), (3, 6), (4, 5), (4, 3), (2, 3)]],
+    &[&[(0, 0), (0, 6)], &[(4, 0), (4, 6)], &[(0, 3), (4, 3)]],
+    &[&[(2, 0), (2, 6)]],
+    &[&[(4, 0), (4, 5), (3, 6), (1, 6), (0, 5)]],
+    &[&[(0, 0), (0, 6)], &[(4, 0), (0, 4)], &[(1, 3), (4, 6)]],
+    &[&[(0, 0), (0, 6), (4, 6)]],
+    &[&[(0, 6), (0, 0), (2, 3), (4, 0), (4, 6)]],
+    &[&[(0, 6), (0, 0), (4, 6), (4, 0)]],
+    &[&[(1, 0), (3, 0), (4, 1), (4, 5), (3, 6), (1, 6), (0, 5), (0, 1), (1, 0)]],
+    &[&[(0, 6), (0, 0), (3, 0), (4, 1), (4, 2), (3, 3), (0, 3)]],
+    &[&[(1, 0), (3, 0), (4, 1), (4, 5), (3, 6), (1, 6), (0, 5), (0, 1), (1, 0)], &[(2, 4), (4, 6)]],
+    &[&[(0, 6), (0, 0), (3, 0), (4, 1), (4, 2), (3, 3), (0, 3)], &[(2, 3), (4, 6)]],
+    &[&[(4, 1), (3, 0), (1, 0), (0, 1), (0, 2), (1, 3), (3, 3), (4, 4), (4, 5), (3, 6), (1, 6), (0, 5)]],
+    &[&[(0, 0), (4, 0)], &[(2, 0), (2, 6)]],
+    &[&[(0, 0), (0, 5), (1, 6), (3, 6), (4, 5), (4, 0)]],
+    &[&[(0, 0), (2, 6), (4, 0)]],
+    &[&[(0, 0), (1, 6), (2, 3), (3, 6), (4, 0)]],
+    &[&[(0, 0), (4, 6)], &[(4, 0), (0, 6)]],
+    &[&[(0, 0), (2, 3), (4, 0)], &[(2, 3), (2, 6)]],
+    &[&[(0, 0), (4, 0), (0, 6), (4, 6)]],
+    &[&[(1, 0), (3, 0), (4, 1), (4, 5), (3, 6), (1, 6), (0, 5), (0, 1), (1, 0)], &[(0, 5), (4, 1)]],
+    &[&[(0, 1), (2, 0), (2, 6)]],
+    &[&[(0, 1), (1, 0), (3, 0), (4, 1), (4, 2), (0, 6), (4, 6)]],
+    &[&[(0, 0), (4, 0), (2, 2), (4, 4), (4, 5), (3, 6), (1, 6), (0, 5)]],
+    &[&[(3, 6), (3, 0), (0, 4), (4, 4)]],
+    &[&[(4, 0), (0, 0), (0, 3), (3, 3), (4, 4), (4, 5), (3, 6), (0, 6)]],
+    &[&[(4, 0), (1, 1), (0, 3), (0, 5), (1, 6), (3, 6), (4, 5), (4, 4), (3, 3), (0, 3)]],
+    &[&[(0, 0), (4, 0), (1, 6)]],
+    &[&[
+        (1, 3),
+        (0, 2),
+        (0, 1),
+        (1, 0),
+        (3, 0),
+        (4, 1),
+        (4, 2),
+        (3, 3),
+        (1, 3),
+        (0, 4),
+        (0, 5),
+        (1, 6),
+        (3, 6),
+        (4, 5),
+        (4, 4),
+        (3, 3),
+    ]],
+    &[&[(0, 6), (3, 5), (4, 3), (4, 1), (3, 0), (1, 0), (0, 1), (0, 2), (1, 3), (4, 3)]],
+];
+
+/// Distance to the strokes of a glyph, in grid units.
+fn distance(glyph: usize, x: f32, y: f32) -> f32 {
+    let mut best = f32::INFINITY;
+    for stroke in GLYPHS[glyph % GLYPHS.len()] {
+        for pair in stroke.windows(2) {
+            let (ax, ay) = (f32::from(pair[0].0), f32::from(pair[0].1));
+            let (bx, by) = (f32::from(pair[1].0), f32::from(pair[1].1));
+            let (dx, dy) = (bx - ax, by - ay);
+            let t = (((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy)).clamp(0.0, 1.0);
+            let (ex, ey) = (x - ax - t * dx, y - ay - t * dy);
+            best = best.min(ex * ex + ey * ey);
+        }
+    }
+    best.sqrt()
+}
+
+/// Ink (0 to 1) at `(u, v)` metres into a block of running text with capitals `size` metres high.
+///
+/// Lines are `1.8 × size` apart and end raggedly before `line` metres. `weight` is the stroke's half width on the
+/// 4×6 grid: 0.4 is a regular face, 0.7 a bold one.
+pub(crate) fn text(u: f32, v: f32, size: f32, line: f32, weight: f32, seed: u32, width: f32) -> f32 {
+    let unit_length = size / 6.0;
+    let pitch = 5.6 * unit_length;
+    let (row, column) = (floor(v / (1.8 * size)), floor(u / pitch));
+    let columns = (line / pitch) as i32;
+    let ragged = (unit(hash2(row, -1, seed)) * 0.3 * columns as f32) as i32;
+    if u < 0.0 || v < 0.0 || column >= columns - ragged {
+        return 0.0;
+    }
+    let code = hash2(column, row, seed);
+    if code.is_multiple_of(6) && column > 0 {
+        return 0.0;
+    }
+    // Text too small to read is a grey.
+    if width > 2.5 * unit_length {
+        return 0.35 * weight;
+    }
+    let x = u / unit_length - column as f32 * 5.6 - 0.8;
+    let y = v / unit_length - row as f32 * 10.8 - 0.8;
+    edge(weight - distance(code as usize >> 3, x, y), width / unit_length)
+}

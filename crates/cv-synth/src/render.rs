@@ -1,0 +1,177 @@
+//! Pictures of scenes.
+
+use crate::error::SynthError;
+use crate::scene::{Hit, Scene};
+use crate::sensor::{self, RenderOptions};
+use crate::shape::Ray;
+use crate::texture::{Rgb, Texture};
+use cv_core::{Camera, GrayF32, Image, Mask, Point2, Pose, RgbF32, RgbU8};
+use nalgebra::{Matrix2, Point3, Vector3};
+use rayon::prelude::*;
+
+/// A picture and what is true about it. Truth is that of the ray through each pixel's centre.
+#[derive(Debug, Clone)]
+pub struct Rendered {
+    /// The picture as a camera would store it: with noise, sRGB encoded.
+    pub image: RgbU8,
+    /// The light behind it, linear, 1 = white: blur, exposure, white balance and vignetting applied, no noise, not
+    /// clipped.
+    pub linear: RgbF32,
+    /// Z in the camera frame in metres; NaN where there is nothing, or where the lens lets no ray in.
+    pub depth: GrayF32,
+    /// The number of the object (see [`Scene::object_id`]); 0 = none.
+    pub ids: Image<u32, 1>,
+    /// The camera it was taken with.
+    pub camera: Camera,
+    /// World to camera.
+    pub pose: Pose,
+}
+
+impl Rendered {
+    /// Where an object is.
+    pub fn mask(&self, object: u32) -> Mask {
+        self.ids.map(|[id]| [id == object])
+    }
+
+    /// The scene point a pixel's centre shows, in world coordinates; `None` outside or where there is nothing.
+    ///
+    /// As exact as the `f32` depth: 6e-8 of it. [`Scene::point_at`] is exact.
+    pub fn world_point(&self, x: usize, y: usize) -> Option<Point3<f64>> {
+        let z = f64::from(self.depth.get(x, y)?[0]);
+        let ray = self.camera.normalize(Point2::new(x as f64, y as f64));
+        let p = Point3::new(ray.x * z, ray.y * z, z);
+        (z > 0.0).then(|| self.pose.inverse().transform(&p))
+    }
+}
+
+/// Renders a view of a scene.
+///
+/// # Errors
+/// [`SynthError`] where the camera, its size or the pose make no sense.
+pub fn render(scene: &Scene, camera: &Camera, pose: &Pose, options: &RenderOptions) -> Result<Rendered, SynthError> {
+    let (width, height) = check(camera, pose)?;
+    let view = View { scene, camera: *camera, center: pose.center(), to_world: pose.inverse() };
+
+    // Truth: one ray per pixel centre.
+    let mut centers: Vec<Option<Hit>> = vec![None; width * height];
+    centers.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
+        for (x, hit) in row.iter_mut().enumerate() {
+            *hit = view.ray(Point2::new(x as f64, y as f64)).and_then(|ray| scene.hit(&ray));
+        }
+    });
+    let depth = Image::from_fn(width, height, |x, y| [centers[y * width + x].map_or(f32::NAN, |h| h.t as f32)]);
+    let ids = Image::from_fn(width, height, |x, y| [centers[y * width + x].map_or(0, |h| scene.prims[h.prim].object)]);
+
+    let mut linear = Image::new(width, height, [0.0; 3]);
+    let samples = options.samples.clamp(1, 8);
+    let prim = |x: usize, y: usize| centers[y.min(height - 1) * width + x.min(width - 1)].map(|h| h.prim);
+    scene.lighting();
+    linear.as_mut_slice().par_chunks_mut(3 * width).enumerate().for_each(|(y, row)| {
+        for (x, pixel) in row.chunks_exact_mut(3).enumerate() {
+            let here = prim(x, y);
+            let inside =
+                (y.saturating_sub(1)..=y + 1).all(|j| (x.saturating_sub(1)..=x + 1).all(|i| prim(i, j) == here));
+            let n = if inside { samples } else { 2 * samples };
+            pixel.copy_from_slice(&view.pixel(Point2::new(x as f64, y as f64), n));
+        }
+    });
+    let mut linear = sensor::blur(&linear, options.blur);
+    sensor::expose(&mut linear, options);
+    let image = sensor::develop(&linear, options);
+    Ok(Rendered { image, linear, depth, ids, camera: *camera, pose: *pose })
+}
+
+/// The size of a camera's picture, if it and the pose make sense.
+pub(crate) fn check(camera: &Camera, pose: &Pose) -> Result<(usize, usize), SynthError> {
+    camera.validate()?;
+    let (width, height) = (camera.width, camera.height);
+    if width == 0 || height == 0 || width.checked_mul(height).is_none_or(|n| n > u32::MAX as usize) {
+        return Err(SynthError::Size { width, height });
+    }
+    let finite = pose.rotation.matrix().iter().chain(pose.translation.iter()).all(|v| v.is_finite());
+    if finite { Ok((width, height)) } else { Err(SynthError::Pose) }
+}
+
+struct View<'a> {
+    scene: &'a Scene,
+    camera: Camera,
+    center: Point3<f64>,
+    to_world: Pose,
+}
+
+impl View<'_> {
+    /// The ray of normalised coordinates; its `t` is the depth.
+    #[inline]
+    fn through(&self, n: Point2<f64>) -> Ray {
+        Ray { origin: self.center, dir: self.to_world.rotation * Vector3::new(n.x, n.y, 1.0) }
+    }
+
+    fn ray(&self, pixel: Point2<f64>) -> Option<Ray> {
+        let n = self.camera.normalize(pixel);
+        n.x.is_finite().then(|| self.through(n))
+    }
+
+    /// The mean light over a pixel's area, by an `n` × `n` grid.
+    fn pixel(&self, center: Point2<f64>, n: usize) -> Rgb {
+        let middle = self.camera.normalize(center);
+        if !middle.x.is_finite() {
+            return [0.0; 3];
+        }
+        // Within a pixel the lens is as good as linear: its second derivative moves a ray by less than 1e-5 px.
+        let (_, jacobian) = self.camera.distortion.distort_with_jacobian(middle);
+        let inverse = jacobian.try_inverse().unwrap_or_else(Matrix2::identity);
+        let mut sum = [0.0; 3];
+        for j in 0..n {
+            for i in 0..n {
+                let offset = |k: usize| (k as f64 + 0.5) / n as f64 - 0.5;
+                let d = inverse * nalgebra::Vector2::new(offset(i) / self.camera.fx, offset(j) / self.camera.fy);
+                let color = self.color(&self.through(middle + d), 1.0 / n as f64);
+                (0..3).for_each(|c| sum[c] += color[c]);
+            }
+        }
+        sum.map(|c| c / (n * n) as f32)
+    }
+
+    /// The light along a ray; `share` is the side of the sample in pixels.
+    fn color(&self, ray: &Ray, share: f64) -> Rgb {
+        let lighting = self.scene.lighting();
+        let Some(hit) = self.scene.hit(ray) else {
+            return self.scene.ambient.map(|c| c * lighting.gain);
+        };
+        let prim = &self.scene.prims[hit.prim];
+        let surface = prim.shape.surface(ray, hit.t);
+        let length = ray.dir.norm();
+        let facing = -surface.normal.dot(&ray.dir) / length;
+        // The sample's width on the surface: the mean of its two sides, one of them stretched by the slant.
+        let slant = facing.abs().max(0.04);
+        let width = (hit.t * length * share / self.camera.fx / slant.sqrt()) as f32;
+        let color = self.scene.albedo(hit.prim, &surface, width);
+        if matches!(prim.texture, Texture::Emissive(_)) {
+            return color;
+        }
+        let mut light = lighting.maps[hit.prim].at(surface.s, surface.t, facing < 0.0);
+        let normal = if facing < 0.0 { -surface.normal } else { surface.normal };
+        for (center, radius) in &self.scene.blobs {
+            let d = center - surface.point;
+            let r2 = d.norm_squared();
+            if r2 < 40.0 * radius * radius && r2 > 1.0001 * radius * radius {
+                // The share of the sky a sphere hides (Quilez): cos · r² / d².
+                let hidden = (normal.dot(&d) / r2.sqrt()).max(0.0) * radius * radius / r2;
+                light = light.map(|c| c * (1.0 - hidden.min(0.9)) as f32);
+            }
+        }
+        let mut out: Rgb = std::array::from_fn(|c| color[c] * light[c]);
+        if prim.specular > 0.0 {
+            let eye = -ray.dir / length;
+            let fresnel = prim.specular + (1.0 - prim.specular) * 0.25 * (1.0 - facing.abs() as f32).powi(5);
+            for source in &self.scene.lights {
+                let toward = source.corner + (source.eu + source.ev) * 0.5 - surface.point;
+                let half = (toward.normalize() + eye).normalize();
+                let lobe = (normal.dot(&half).max(0.0) as f32).powf(prim.gloss);
+                let strength = fresnel * lobe * (prim.gloss + 2.0) / (8.0 * self.scene.lights.len() as f32);
+                (0..3).for_each(|c| out[c] += strength * light[c] * 0.5);
+            }
+        }
+        out.map(|c| c * lighting.gain)
+    }
+}

@@ -1,0 +1,372 @@
+//! Scenes: surfaces, lights, and the light that has settled on the surfaces.
+
+use crate::bvh::{Bvh, Item};
+use crate::light::{self, Map};
+use crate::shape::{Ray, Shape, Surface};
+use crate::texture::{Rgb, SurfacePoint, Texture};
+use cv_core::Pose;
+use nalgebra::{Point3, Rotation3, Vector3};
+use std::sync::{Arc, OnceLock};
+
+/// A surface of an object.
+#[derive(Debug, Clone)]
+pub(crate) struct Prim {
+    pub(crate) shape: Shape,
+    pub(crate) texture: Texture,
+    pub(crate) object: u32,
+    /// Share of the light mirrored, 0 to about 0.3, and the exponent of its lobe.
+    pub(crate) specular: f32,
+    pub(crate) gloss: f32,
+    pub(crate) two_sided: bool,
+}
+
+/// Six rectangles that are the faces of a box.
+#[derive(Debug, Clone, Copy)]
+struct Block {
+    first: usize,
+    center: Point3<f64>,
+    turn: Rotation3<f64>,
+    size: [f64; 3],
+}
+
+impl Block {
+    fn shifted(self, by: usize) -> Self {
+        Self { first: self.first + by, ..self }
+    }
+}
+
+/// The tree over all surfaces, boxes as wholes.
+fn tree(prims: &[Prim], blocks: &[Block]) -> Bvh {
+    let mut items = Vec::new();
+    let mut next = 0;
+    for block in blocks {
+        items.extend((next..block.first).map(|i| Item::Surface(i as u32, prims[i].shape)));
+        let axes = [0, 1, 2].map(|a| block.turn * Vector3::ith(a, 1.0));
+        items.push(Item::Block {
+            first: block.first as u32,
+            center: block.center,
+            axes,
+            half: block.size.map(|s| s / 2.0),
+        });
+        next = block.first + 6;
+    }
+    items.extend((next..prims.len()).map(|i| Item::Surface(i as u32, prims[i].shape)));
+    Bvh::new(items)
+}
+
+/// A rectangle that shines from its front.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Light {
+    pub(crate) corner: Point3<f64>,
+    pub(crate) eu: Vector3<f64>,
+    pub(crate) ev: Vector3<f64>,
+    pub(crate) radiance: Rgb,
+}
+
+/// Where a ray meets the scene.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Hit {
+    pub(crate) prim: usize,
+    pub(crate) t: f64,
+}
+
+/// Light on every surface, and the factor that exposes a picture of it well.
+#[derive(Debug)]
+pub(crate) struct Lighting {
+    pub(crate) maps: Vec<Map>,
+    pub(crate) gain: f32,
+}
+
+/// Textured surfaces under lights, in metres; X right, Y **down**, Z forward, the floor of the presets at y = 0.
+///
+/// Light is worked out on the first rendering and kept: diffuse direct light with soft shadows and one bounce.
+/// It depends on the scene only, so that every view sees the same.
+#[derive(Debug, Clone)]
+pub struct Scene {
+    pub(crate) prims: Vec<Prim>,
+    names: Vec<&'static str>,
+    pub(crate) lights: Vec<Light>,
+    pub(crate) ambient: Rgb,
+    blocks: Vec<Block>,
+    bvh: Bvh,
+    /// Spheres that darken what is near, for things that were put in after the light was worked out.
+    pub(crate) blobs: Vec<(Point3<f64>, f64)>,
+    viewpoint: Pose,
+    lighting: Arc<OnceLock<Lighting>>,
+}
+
+impl Scene {
+    /// A pose from which the scene is worth looking at.
+    pub fn viewpoint(&self) -> Pose {
+        self.viewpoint
+    }
+
+    /// The number that marks an object in [`crate::Rendered::ids`]; `None` where the scene has none of that name.
+    pub fn object_id(&self, name: &str) -> Option<u32> {
+        self.names.iter().position(|&n| n == name).map(|i| i as u32 + 1)
+    }
+
+    /// The names of all objects; the object at index `i` has the number `i + 1`.
+    pub fn object_names(&self) -> &[&'static str] {
+        &self.names
+    }
+
+    /// Distance in units of `direction` to the first surface from `origin`, and the number of the object there.
+    pub fn cast(&self, origin: &Point3<f64>, direction: &Vector3<f64>) -> Option<(f64, u32)> {
+        let hit = self.hit(&Ray { origin: *origin, dir: *direction })?;
+        Some((hit.t, self.prims[hit.prim].object))
+    }
+
+    /// True where nothing stands between two points; surfaces within a relative 1e-6 of the ends do not count.
+    pub fn sees(&self, from: &Point3<f64>, to: &Point3<f64>) -> bool {
+        !self.blocked(&Ray { origin: *from, dir: to - from }, 1e-6, 1.0 - 1e-6)
+    }
+
+    pub(crate) fn hit(&self, ray: &Ray) -> Option<Hit> {
+        let mut best = None;
+        self.bvh.walk(ray, f64::INFINITY, |item, far| match item.intersect(ray, 1e-9, far) {
+            Some((t, prim)) => {
+                best = Some(Hit { prim: prim as usize, t });
+                t
+            }
+            None => far,
+        });
+        best
+    }
+
+    pub(crate) fn blocked(&self, ray: &Ray, near: f64, far: f64) -> bool {
+        let mut found = false;
+        self.bvh.walk(ray, far, |item, far| {
+            if !found && item.intersect(ray, near, far).is_some() {
+                found = true;
+            }
+            if found { f64::NEG_INFINITY } else { far }
+        });
+        found
+    }
+
+    pub(crate) fn lighting(&self) -> &Lighting {
+        self.lighting.get_or_init(|| {
+            let maps = light::bake(self, 0);
+            let gain = light::gain(self, &maps);
+            Lighting { maps, gain }
+        })
+    }
+
+    /// Reflectance (or radiance) of a surface seen with a sample of `width` metres.
+    #[inline]
+    pub(crate) fn albedo(&self, prim: usize, surface: &Surface, width: f32) -> Rgb {
+        let Prim { shape, texture, .. } = &self.prims[prim];
+        let (u, v) = shape.extent();
+        texture.color(&SurfacePoint {
+            u: surface.s * u as f32,
+            v: surface.t * v as f32,
+            local: (surface.point - shape.center()).cast::<f32>().into(),
+            size: (u as f32, v as f32),
+            width,
+        })
+    }
+
+    /// The scene with more objects in it, the light on what was there kept but for soft contact shadows.
+    pub(crate) fn with(&self, more: SceneBuilder, blobs: Vec<(Point3<f64>, f64)>) -> Self {
+        let old = self.lighting();
+        let first = self.prims.len();
+        let shift = self.names.len() as u32;
+        let mut scene = self.clone();
+        scene.names.extend(more.names);
+        scene.prims.extend(more.prims.into_iter().map(|mut p| {
+            p.object += shift;
+            p
+        }));
+        scene.blocks.extend(more.blocks.into_iter().map(|b| b.shifted(first)));
+        scene.bvh = tree(&scene.prims, &scene.blocks);
+        scene.blobs = blobs;
+        let mut maps = old.maps.clone();
+        maps.extend(light::bake(&scene, first));
+        let lighting = OnceLock::new();
+        lighting.get_or_init(|| Lighting { maps, gain: old.gain });
+        scene.lighting = Arc::new(lighting);
+        scene
+    }
+}
+
+/// Puts a scene together; see the presets of [`Scene`] for ready ones.
+///
+/// ```
+/// use cv_synth::{SceneBuilder, Texture, srgb};
+/// use nalgebra::{Point3, Vector3};
+///
+/// let mut builder = SceneBuilder::new();
+/// builder.object("wall").rect(
+///     Point3::new(-2.0, -2.0, 3.0),
+///     Vector3::new(4.0, 0.0, 0.0),
+///     Vector3::new(0.0, 4.0, 0.0),
+///     Texture::Paint { color: srgb(0xC8B89A), seed: 1 },
+/// );
+/// let scene = builder.build(cv_core::Pose::identity());
+/// let (distance, object) = scene.cast(&Point3::origin(), &Vector3::z()).unwrap();
+/// assert!((distance - 3.0).abs() < 1e-12 && Some(object) == scene.object_id("wall"));
+/// ```
+#[derive(Debug, Clone)]
+pub struct SceneBuilder {
+    prims: Vec<Prim>,
+    blocks: Vec<Block>,
+    names: Vec<&'static str>,
+    lights: Vec<Light>,
+    ambient: Rgb,
+    specular: (f32, f32),
+    two_sided: bool,
+}
+
+impl Default for SceneBuilder {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl SceneBuilder {
+    /// Nothing but an even grey ambient light.
+    pub fn new() -> Self {
+        Self {
+            prims: Vec::new(),
+            blocks: Vec::new(),
+            names: Vec::new(),
+            lights: Vec::new(),
+            ambient: [0.25; 3],
+            specular: (0.0, 1.0),
+            two_sided: false,
+        }
+    }
+
+    /// Starts an object: surfaces added from here on belong to it, and are matt and one-sided until said otherwise.
+    pub fn object(&mut self, name: &'static str) -> &mut Self {
+        self.names.push(name);
+        self.specular = (0.0, 1.0);
+        self.two_sided = false;
+        self
+    }
+
+    /// Makes the following surfaces of the object shine: mirrored share (0 to 0.3) and exponent (10 to 200).
+    pub fn shiny(&mut self, share: f32, exponent: f32) -> &mut Self {
+        self.specular = (share, exponent);
+        self
+    }
+
+    /// Lights the backs of the following surfaces of the object too.
+    pub fn thin(&mut self) -> &mut Self {
+        self.two_sided = true;
+        self
+    }
+
+    /// The light that comes from nowhere in particular, as a radiance.
+    pub fn ambient(&mut self, radiance: Rgb) -> &mut Self {
+        self.ambient = radiance;
+        self
+    }
+
+    /// A rectangle `corner + s·u + t·v`, `s, t` from 0 to 1, that shines to the side from which `u` points right and
+    /// `v` down. It is not itself seen.
+    pub fn light(&mut self, corner: Point3<f64>, u: Vector3<f64>, v: Vector3<f64>, radiance: Rgb) -> &mut Self {
+        self.lights.push(Light { corner, eu: u, ev: v, radiance });
+        self
+    }
+
+    fn push(&mut self, shape: Shape, texture: Texture) -> &mut Self {
+        if self.names.is_empty() {
+            self.names.push("object");
+        }
+        self.prims.push(Prim {
+            shape,
+            texture,
+            object: self.names.len() as u32,
+            specular: self.specular.0,
+            gloss: self.specular.1,
+            two_sided: self.two_sided,
+        });
+        self
+    }
+
+    /// A rectangle with edges `u` and `v` (at right angles); its front is where `u` points right and `v` down.
+    pub fn rect(&mut self, corner: Point3<f64>, u: Vector3<f64>, v: Vector3<f64>, texture: Texture) -> &mut Self {
+        let size = (u.norm(), v.norm());
+        self.push(Shape::Rect { corner, eu: u / size.0, ev: v / size.1, size, round: false }, texture)
+    }
+
+    /// The ellipse inside [`SceneBuilder::rect`].
+    pub fn disc(&mut self, corner: Point3<f64>, u: Vector3<f64>, v: Vector3<f64>, texture: Texture) -> &mut Self {
+        let size = (u.norm(), v.norm());
+        self.push(Shape::Rect { corner, eu: u / size.0, ev: v / size.1, size, round: true }, texture)
+    }
+
+    /// A sphere.
+    pub fn sphere(&mut self, center: Point3<f64>, radius: f64, texture: Texture) -> &mut Self {
+        self.push(Shape::Sphere { center, radius }, texture)
+    }
+
+    /// The side of a cylinder or cone from `base` to `top`, open at the ends.
+    pub fn tube(&mut self, base: Point3<f64>, top: Point3<f64>, radii: (f64, f64), texture: Texture) -> &mut Self {
+        let d = top - base;
+        let length = d.norm();
+        self.push(Shape::Frustum { base, axis: d / length, length, radii }, texture)
+    }
+
+    /// A cylinder or cone with lids.
+    pub fn solid_tube(
+        &mut self,
+        base: Point3<f64>,
+        top: Point3<f64>,
+        radii: (f64, f64),
+        side: Texture,
+        lid: Texture,
+    ) -> &mut Self {
+        let (a, b) = crate::shape::complete(&(top - base).normalize());
+        for (p, r, flip) in [(base, radii.0, 1.0), (top, radii.1, -1.0)] {
+            let (u, v) = (a * (2.0 * r), b * (2.0 * r * flip));
+            self.disc(p - u / 2.0 - v / 2.0, u, v, lid.clone());
+        }
+        self.tube(base, top, radii, side)
+    }
+
+    /// A box of `size` (x, y, z) standing on `foot`, the middle of its underside, turned by `yaw` about the vertical.
+    ///
+    /// Textures: front and back (−z, +z), the two sides (±x), top and underside.
+    pub fn block(&mut self, foot: Point3<f64>, size: [f64; 3], yaw: f64, faces: [&Texture; 3]) -> &mut Self {
+        let turn = Rotation3::from_axis_angle(&Vector3::y_axis(), yaw);
+        self.tilted_block(foot - Vector3::y() * (0.5 * size[1]), size, turn, faces)
+    }
+
+    /// A box around `center`, turned by `turn`; textures as for [`SceneBuilder::block`].
+    pub fn tilted_block(
+        &mut self,
+        center: Point3<f64>,
+        size: [f64; 3],
+        turn: Rotation3<f64>,
+        faces: [&Texture; 3],
+    ) -> &mut Self {
+        let [x, y, z] = [0, 1, 2].map(|a| turn * Vector3::ith(a, size[a]));
+        let at = |a: f64, b: f64, c: f64| center + x * (0.5 * a) + y * (0.5 * b) + z * (0.5 * c);
+        let [front, side, top] = faces;
+        self.blocks.push(Block { first: self.prims.len(), center, turn, size });
+        self.rect(at(-1.0, -1.0, -1.0), x, y, front.clone());
+        self.rect(at(1.0, -1.0, 1.0), -x, y, front.clone());
+        self.rect(at(1.0, -1.0, -1.0), z, y, side.clone());
+        self.rect(at(-1.0, -1.0, 1.0), -z, y, side.clone());
+        self.rect(at(-1.0, -1.0, 1.0), x, -z, top.clone());
+        self.rect(at(-1.0, 1.0, -1.0), x, z, top.clone())
+    }
+
+    /// The scene, with the pose that [`Scene::viewpoint`] offers.
+    pub fn build(self, viewpoint: Pose) -> Scene {
+        Scene {
+            bvh: tree(&self.prims, &self.blocks),
+            prims: self.prims,
+            blocks: self.blocks,
+            names: self.names,
+            lights: self.lights,
+            ambient: self.ambient,
+            blobs: Vec::new(),
+            viewpoint,
+            lighting: Arc::new(OnceLock::new()),
+        }
+    }
+}

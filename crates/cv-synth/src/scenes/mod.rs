@@ -1,0 +1,10 @@
+//! Ready scenes, each laid out anew by its seed.
+
+mod furniture;
+mod person;
+mod room;
+mod small;
+mod wall;
+
+pub(crate) use person::{path, walker};
+pub(crate) use wall::Wall;

@@ -1,0 +1,100 @@
+//! What is where in which view.
+
+use crate::render::Rendered;
+use crate::scene::Scene;
+use crate::shape::Ray;
+use cv_core::{Camera, Correspondence, Image, Mask, Point2, Pose};
+use nalgebra::{Matrix3, Point3, Vector3};
+use rayon::prelude::*;
+
+impl Scene {
+    /// The point that a camera sees at a pixel, in world coordinates.
+    ///
+    /// `None` where there is nothing, or where the lens lets no ray in.
+    pub fn point_at(&self, camera: &Camera, pose: &Pose, pixel: Point2<f64>) -> Option<Point3<f64>> {
+        let n = camera.normalize(pixel);
+        let dir = pose.rotation.inverse() * Vector3::new(n.x, n.y, 1.0);
+        let ray = Ray { origin: pose.center(), dir };
+        let hit = self.hit(&ray).filter(|_| n.x.is_finite())?;
+        Some(ray.origin + ray.dir * hit.t)
+    }
+
+    /// The pixel at which a camera sees a point; `None` where something hides it or it falls outside the picture.
+    pub fn pixel_of(&self, camera: &Camera, pose: &Pose, point: &Point3<f64>) -> Option<Point2<f64>> {
+        let seen = pose.transform(point);
+        let pixel = camera.project(&seen)?;
+        let inside = |v: f64, n: usize| v >= -0.5 && v <= n as f64 - 0.5;
+        // A lens model that folds back beyond its range would put far points into the picture too.
+        let back = camera.normalize(pixel);
+        let unfolded = (back.x - seen.x / seen.z).hypot(back.y - seen.y / seen.z) < 1e-6;
+        let visible = unfolded && inside(pixel.x, camera.width) && inside(pixel.y, camera.height);
+        (visible && self.sees(point, &pose.center())).then_some(pixel)
+    }
+
+    /// Where view `b` sees what pixel `(x, y)` of view `a` shows, if it does.
+    fn transfer(&self, a: &Rendered, b: &Rendered, x: usize, y: usize) -> Option<Point2<f64>> {
+        let point = self.point_at(&a.camera, &a.pose, Point2::new(x as f64, y as f64))?;
+        self.pixel_of(&b.camera, &b.pose, &point)
+    }
+
+    /// The pixels of `a` whose centres `b` sees too: in its picture and not hidden.
+    pub fn visible_in_both(&self, a: &Rendered, b: &Rendered) -> Mask {
+        let (width, height) = a.depth.size();
+        let mut mask = Image::new(width, height, [false]);
+        mask.as_mut_slice().par_chunks_mut(width.max(1)).enumerate().for_each(|(y, row)| {
+            row.iter_mut().enumerate().for_each(|(x, m)| *m = self.transfer(a, b, x, y).is_some());
+        });
+        mask
+    }
+
+    /// Exact correspondences: every `step`-th pixel of `a` in both directions that `b` sees too.
+    pub fn correspondences(&self, a: &Rendered, b: &Rendered, step: usize) -> Vec<Correspondence> {
+        let (width, height) = a.depth.size();
+        let step = step.max(1);
+        let rows: Vec<usize> = (step / 2..height).step_by(step).collect();
+        rows.into_par_iter()
+            .flat_map_iter(|y| {
+                (step / 2..width).step_by(step).filter_map(move |x| {
+                    let to = self.transfer(a, b, x, y)?;
+                    Some(Correspondence { a: Point2::new(x as f64, y as f64), b: to })
+                })
+            })
+            .collect()
+    }
+}
+
+/// The homography from pixels of `a` to pixels of `b` by way of the plane through `point` (world) with `normal`.
+///
+/// Cameras without distortion; with it, it relates undistorted pixels. Hartley & Zisserman, 2nd ed., equation 13.2:
+/// `H = K_b (R + t nᵀ / d) K_a⁻¹` with the plane `nᵀ X = d` in the frame of `a`. Entry (3, 3) is 1.
+///
+/// `None` where the plane passes through the centre of `a`.
+pub fn plane_homography(
+    a: (&Camera, &Pose),
+    b: (&Camera, &Pose),
+    point: &Point3<f64>,
+    normal: &Vector3<f64>,
+) -> Option<Matrix3<f64>> {
+    let n = a.1.rotation * normal;
+    let d = n.dot(&a.1.transform(point).coords);
+    if d.abs() < 1e-12 {
+        return None;
+    }
+    let relative = Pose::relative(a.1, b.1);
+    let between = relative.rotation.matrix() + relative.translation * n.transpose() / d;
+    Some(normalised(b.0.matrix() * between * a.0.inverse_matrix()))
+}
+
+/// The homography from pixels of `a` to pixels of `b` between cameras with a common centre: `K_b R K_a⁻¹`.
+///
+/// Cameras without distortion; with it, it relates undistorted pixels. Entry (3, 3) is 1.
+pub fn rotation_homography(a: (&Camera, &Pose), b: (&Camera, &Pose)) -> Matrix3<f64> {
+    let relative = Pose::relative(a.1, b.1);
+    normalised(b.0.matrix() * relative.rotation.matrix() * a.0.inverse_matrix())
+}
+
+/// Scaled so that entry (3, 3) is 1, or to unit norm where that entry is as good as zero.
+fn normalised(h: Matrix3<f64>) -> Matrix3<f64> {
+    let norm = h.norm();
+    if h[(2, 2)].abs() > 1e-9 * norm { h / h[(2, 2)] } else { h / norm }
+}
