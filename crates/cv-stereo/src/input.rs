@@ -1,5 +1,6 @@
 //! Any image to the 16-bit grey that the matcher works on.
 
+use crate::census::{Grey, MARGIN};
 use cv_core::{ImageView, Sample};
 use rayon::prelude::*;
 
@@ -41,17 +42,20 @@ impl Intensity for f32 {
 
 /// Grey of `view` into `out` (resized), Rec. 601 weights for three or more channels. Returns how many samples are no
 /// numbers.
-pub(crate) fn to_grey<T: Intensity, const C: usize>(view: ImageView<'_, T, C>, out: &mut Vec<u16>) -> usize {
+pub(crate) fn to_grey<T: Intensity, const C: usize>(view: ImageView<'_, T, C>, out: &mut Grey) -> usize {
     let (width, height) = view.size();
-    out.resize(width * height, 0);
-    if out.is_empty() || C == 0 {
+    (out.width, out.height) = (width, height);
+    let stride = out.stride();
+    out.values.resize(stride * height, 0);
+    if view.is_empty() || C == 0 {
         return 0;
     }
-    out.par_chunks_mut(width)
+    out.values
+        .par_chunks_mut(stride)
         .enumerate()
         .map(|(y, row)| {
             let samples = view.row(y);
-            for (pixel, grey) in samples.chunks_exact(C).zip(row) {
+            for (pixel, grey) in samples.chunks_exact(C).zip(&mut row[MARGIN..MARGIN + width]) {
                 *grey = if C >= 3 {
                     // The weights add up to 2¹⁶, so that a grey pixel keeps its value.
                     let [r, g, b] = [pixel[0], pixel[1], pixel[2]].map(|v| u32::from(v.to_u16()));
@@ -60,6 +64,9 @@ pub(crate) fn to_grey<T: Intensity, const C: usize>(view: ImageView<'_, T, C>, o
                     pixel[0].to_u16()
                 };
             }
+            let (first, last) = (row[MARGIN], row[MARGIN + width - 1]);
+            row[..MARGIN].fill(first);
+            row[MARGIN + width..].fill(last);
             samples.iter().filter(|v| !v.is_number()).count()
         })
         .sum()
@@ -74,18 +81,18 @@ mod tests {
     fn grey_in_colour_is_the_same_grey() {
         let grey = Image::<u8, 1>::from_fn(256, 1, |x, _| [x as u8]);
         let rgb = grey.map(|[v]| [v; 3]);
-        let (mut a, mut b) = (Vec::new(), Vec::new());
+        let (mut a, mut b) = (Grey::default(), Grey::default());
         to_grey(grey.view(), &mut a);
         to_grey(rgb.view(), &mut b);
-        assert_eq!(a, b);
-        assert_eq!((a[0], a[255]), (0, 65535));
+        assert_eq!(a.values, b.values);
+        assert_eq!((a.values[MARGIN], a.values[MARGIN + 255]), (0, 65535));
     }
 
     #[test]
     fn what_is_not_a_number_is_counted() {
         let image = Image::<f32, 1>::from_vec(2, 2, vec![0.5, f32::NAN, f32::INFINITY, 2.0]).unwrap();
-        let mut out = Vec::new();
+        let mut out = Grey::default();
         assert_eq!(to_grey(image.view(), &mut out), 2);
-        assert_eq!((out[0], out[3]), (32768, 65535));
+        assert_eq!((out.values[MARGIN], out.values[out.stride() + MARGIN + 1]), (32768, 65535));
     }
 }

@@ -6,15 +6,20 @@
 //!
 //! Disparity is `x_left − x_right` in pixels, `f32`, NaN where there is none.
 
+mod aligned;
 mod census;
 mod error;
 mod fill;
 mod input;
+mod kernel;
 mod matcher;
 mod median;
 mod options;
+#[cfg(test)]
 mod plain;
+mod sgm;
 mod speckle;
+mod winner;
 
 pub use error::StereoError;
 pub use input::Intensity;

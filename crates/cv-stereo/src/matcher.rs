@@ -1,10 +1,13 @@
 //! From a rectified pair to checked disparities.
 
-use crate::census::census;
+use crate::census::{Grey, census, census_mirrored, planes};
 use crate::input::to_grey;
-use crate::plain::{Winner, match_plain};
-use crate::{Intensity, StereoError, StereoOptions, Subpixel, fill, median, speckle};
+use crate::kernel::Frame;
+use crate::sgm::{Aggregator, blocks};
+use crate::winner::{NO_SUM, Winner, outside_cost, p2_table};
+use crate::{Intensity, Paths, StereoError, StereoOptions, Subpixel, fill, median, speckle};
 use cv_core::{GrayF32, Image, ImageView, Sample};
+use fearless_simd::Level;
 use rayon::prelude::*;
 
 /// How a pixel came by its disparity.
@@ -70,8 +73,11 @@ impl DisparityMap {
 #[derive(Debug)]
 pub struct StereoMatcher {
     options: StereoOptions,
-    grey: [Vec<u16>; 2],
-    census: [Vec<u64>; 2],
+    level: Level,
+    grey: [Grey; 2],
+    grey8: Vec<u8>,
+    census: [Vec<Vec<u8>>; 2],
+    aggregator: Aggregator,
     labels: Vec<u32>,
     scratch: Vec<f32>,
 }
@@ -85,8 +91,11 @@ impl StereoMatcher {
         options.validate()?;
         Ok(Self {
             options,
+            level: Level::new(),
             grey: Default::default(),
+            grey8: Vec::new(),
             census: Default::default(),
+            aggregator: Aggregator::default(),
             labels: Vec::new(),
             scratch: Vec::new(),
         })
@@ -95,6 +104,18 @@ impl StereoMatcher {
     /// The options.
     pub fn options(&self) -> &StereoOptions {
         &self.options
+    }
+
+    /// Bytes that matching images of this size takes, outputs included: about one byte per pixel and disparity for the
+    /// sums, and forty per pixel.
+    pub fn memory(&self, width: usize, height: usize) -> usize {
+        let pixels = width.saturating_mul(height);
+        let blocks = blocks(self.options.disparities);
+        let planes = planes(self.options.census);
+        // Grey of both views in 16 bits, of one in 8; census; labels, scratch and outputs.
+        Aggregator::bytes(width, height, self.options.disparities)
+            .saturating_add(pixels.saturating_mul(5 + planes + 8 + 4 + 5))
+            .saturating_add(Frame::right_stride(width, blocks).saturating_mul(height).saturating_mul(planes))
     }
 
     /// Disparities of `left`. The images are rectified: a scene point has the same y in both.
@@ -134,35 +155,63 @@ impl StereoMatcher {
         if min >= width as i64 || max <= -(width as i64) {
             return Err(StereoError::RangeOutsideImage { min, max, width });
         }
+        if let Some(allowed) = self.options.max_memory {
+            let needed = self.memory(width, height);
+            if needed > allowed {
+                return Err(StereoError::Memory { needed, allowed });
+            }
+        }
         for (side, view, grey) in [("left", left, 0), ("right", right, 1)] {
             let count = to_grey(view, &mut self.grey[grey]);
             if count > 0 {
                 return Err(StereoError::NotFinite { side, count });
             }
         }
-        for (grey, bits) in self.grey.iter().zip(&mut self.census) {
-            census(grey, width, height, self.options.census, bits);
-        }
-        let (winners, right_index) =
-            match_plain(&self.options, &self.grey[0], &self.census[0], &self.census[1], width, height);
+        self.aggregate(width, height);
         if map.disparity.size() != (width, height) {
             map.disparity = GrayF32::new(width, height, [f32::NAN]);
             map.state = Image::new(width, height, [PixelState::Matched]);
         }
-        self.check(&winners, &right_index, map);
+        self.check(map);
         self.refine(map);
         Ok(())
     }
 
+    /// Costs and path sums; winners of both views.
+    fn aggregate(&mut self, width: usize, height: usize) {
+        let options = &self.options;
+        let blocks = blocks(options.disparities);
+        let min_disparity = i64::from(options.min_disparity);
+        let stride = Frame::right_stride(width, blocks);
+        census(self.level, &self.grey[0], options.census, &mut self.census[0]);
+        census_mirrored(self.level, &self.grey[1], options.census, min_disparity, stride, &mut self.census[1]);
+        self.grey[0].to_bytes(&mut self.grey8);
+        let frame = Frame {
+            width,
+            height,
+            min_disparity,
+            disparities: options.disparities,
+            blocks,
+            left: &self.census[0],
+            right: &self.census[1],
+            grey: &self.grey8,
+            p1: options.p1,
+            p2: &p2_table(options),
+            outside: outside_cost(options),
+        };
+        self.aggregator.run(self.level, &frame, options.paths == Paths::Eight);
+    }
+
     /// Uniqueness, view, left-right consistency; sub-pixel place of what passes.
-    fn check(&self, winners: &[Winner], right_index: &[u16], map: &mut DisparityMap) {
+    fn check(&self, map: &mut DisparityMap) {
         let width = map.disparity.width();
+        let Aggregator { winners, right, .. } = &self.aggregator;
         let options = &self.options;
         map.disparity
             .as_mut_slice()
             .par_chunks_mut(width)
             .zip(map.state.as_mut_slice().par_chunks_mut(width))
-            .zip(winners.par_chunks(width).zip(right_index.par_chunks(width)))
+            .zip(winners.par_chunks(width).zip(right.par_chunks(width)))
             .for_each(|((disparity, state), (winners, right))| {
                 for (x, winner) in winners.iter().enumerate() {
                     state[x] = judge(options, x, winner, right);
@@ -217,7 +266,7 @@ fn judge(options: &StereoOptions, x: usize, winner: &Winner, right: &[u16]) -> P
 
 /// Offset of the minimum from the winning index, −0.5 to 0.5.
 fn subpixel(method: Subpixel, winner: &Winner) -> f32 {
-    if method == Subpixel::None || winner.below == u16::MAX || winner.above == u16::MAX {
+    if method == Subpixel::None || winner.below == NO_SUM || winner.above == NO_SUM {
         return 0.0;
     }
     let [below, above, cost] = [winner.below, winner.above, winner.cost].map(f32::from);

@@ -85,6 +85,8 @@ pub struct StereoOptions {
     /// Whether rejected pixels get a disparity from their surroundings (background side where occluded). They are told
     /// apart by [`crate::PixelState`]. Default true.
     pub fill: bool,
+    /// Most bytes the matcher may hold; `None` sets no limit. Default `None`. See [`crate::StereoMatcher::memory`].
+    pub max_memory: Option<usize>,
 }
 
 impl Default for StereoOptions {
@@ -105,6 +107,7 @@ impl Default for StereoOptions {
             subpixel: Subpixel::VFit,
             median: 1,
             fill: true,
+            max_memory: None,
         }
     }
 }

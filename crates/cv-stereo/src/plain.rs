@@ -1,39 +1,7 @@
 //! Semi-global matching as it is written down, with whole volumes and no tricks: what the fast matcher must equal.
 
+use crate::winner::{NO_SUM, Winner, outside_cost, p2_table};
 use crate::{Paths, StereoOptions};
-
-/// The best disparity of one pixel, as an index from `min_disparity`, with the sums around it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(crate) struct Winner {
-    /// Index of the smallest sum, the first of equals.
-    pub(crate) index: u16,
-    /// The smallest sum.
-    pub(crate) cost: u16,
-    /// The smallest sum at indices not next to the winner; `u16::MAX` where there are none.
-    pub(crate) second: u16,
-    /// The sum one index below; `u16::MAX` at the end of the range.
-    pub(crate) below: u16,
-    /// The sum one index above; `u16::MAX` at the end of the range.
-    pub(crate) above: u16,
-}
-
-/// What a match outside the right image costs: as much as a neutral neighbourhood, half of whose bits differ by chance.
-pub(crate) fn outside_cost(options: &StereoOptions) -> u8 {
-    (options.census.bits() / 2) as u8
-}
-
-/// P2 by the absolute difference of neighbouring grey levels (0 to 255).
-pub(crate) fn p2_table(options: &StereoOptions) -> [u8; 256] {
-    let (low, high) = (u32::from(options.p2_min), u32::from(options.p2));
-    let half = u32::from(options.p2_gradient);
-    std::array::from_fn(|g| {
-        if half == 0 {
-            high as u8
-        } else {
-            (low + ((high - low) * half + (half + g as u32) / 2) / (half + g as u32)) as u8
-        }
-    })
-}
 
 /// Winners of the left image and indices of the right one's, row by row.
 pub(crate) fn match_plain(
@@ -59,9 +27,11 @@ pub(crate) fn match_plain(
         Paths::Four => &[(-1, 0), (0, -1), (1, 0), (0, 1)],
         Paths::Eight => &[(-1, 0), (-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1)],
     };
-    let mut sums = vec![0u16; width * height * n];
+    // Two halves, each of which saturates.
+    let mut halves = [vec![0u16; width * height * n], vec![0u16; width * height * n]];
     let mut path = vec![0u32; width * height * n];
-    for &(dx, dy) in directions {
+    for (number, &(dx, dy)) in directions.iter().enumerate() {
+        let sums = &mut halves[usize::from(number >= directions.len() / 2)];
         let rows: Vec<usize> = if dy > 0 { (0..height).rev().collect() } else { (0..height).collect() };
         let columns: Vec<usize> = if dx > 0 { (0..width).rev().collect() } else { (0..width).collect() };
         for &y in &rows {
@@ -74,7 +44,7 @@ pub(crate) fn match_plain(
                     }
                 } else {
                     let (px, py) = (px as usize, py as usize);
-                    let step = grey[y * width + x].abs_diff(grey[py * width + px]) >> 8;
+                    let step = (grey[y * width + x] >> 8).abs_diff(grey[py * width + px] >> 8);
                     let p2 = u32::from(table[usize::from(step)]);
                     let before: Vec<u32> = path[(py * width + px) * n..][..n].to_vec();
                     let least = before.iter().copied().min().unwrap_or(0);
@@ -90,22 +60,23 @@ pub(crate) fn match_plain(
                     }
                 }
                 for k in 0..n {
-                    sums[here + k] += path[here + k] as u16;
+                    sums[here + k] = (sums[here + k] + path[here + k] as u16).min(255);
                 }
             }
         }
     }
+    let sums: Vec<u16> = halves[0].iter().zip(&halves[1]).map(|(a, b)| a + b).collect();
     let mut winners = vec![Winner::default(); width * height];
-    let mut right_best = vec![(u16::MAX, 0u16); width * height];
+    let mut right_best = vec![(NO_SUM, 0u16); width * height];
     for y in 0..height {
         for x in 0..width {
             let s = &sums[(y * width + x) * n..][..n];
-            let at = |k: usize| s.get(k).copied().unwrap_or(u16::MAX);
-            let index = (0..n).min_by_key(|&k| (s[k], k)).unwrap_or(0);
-            let second = (0..n).filter(|k| k.abs_diff(index) > 1).map(at).min().unwrap_or(u16::MAX);
+            let at = |k: usize| s.get(k).copied().unwrap_or(NO_SUM);
+            let index = (0..n).min_by_key(|&k| (s[k], k)).filter(|&k| s[k] < NO_SUM).unwrap_or(0);
+            let second = (0..n).filter(|k| k.abs_diff(index) > 1).map(at).min().unwrap_or(NO_SUM);
             winners[y * width + x] = Winner {
                 index: index as u16,
-                cost: s[index],
+                cost: s[index].min(NO_SUM),
                 second,
                 below: at(index.wrapping_sub(1)),
                 above: at(index + 1),
@@ -114,10 +85,135 @@ pub(crate) fn match_plain(
                 let xr = x as i64 - i64::from(options.min_disparity) - k as i64;
                 if xr >= 0 && xr < width as i64 {
                     let best = &mut right_best[y * width + xr as usize];
-                    *best = (*best).min((sum, k as u16));
+                    if sum < best.0 {
+                        *best = (sum, k as u16);
+                    }
                 }
             }
         }
     }
     (winners, right_best.into_iter().map(|(_, k)| k).collect())
+}
+
+mod tests {
+    use super::*;
+    use crate::census::{Grey, MARGIN, census, census_mirrored};
+    use crate::kernel::Frame;
+    use crate::sgm::{Aggregator, blocks};
+    use crate::{Census, StereoOptions};
+    use fearless_simd::Level;
+    use proptest::prelude::*;
+
+    /// Every instruction set this machine has.
+    fn levels() -> Vec<Level> {
+        let best = Level::new();
+        let mut all = vec![Level::baseline()];
+        #[cfg(target_arch = "x86_64")]
+        {
+            all.extend(best.as_sse4_2().map(Level::Sse4_2));
+            all.extend(best.as_avx2().map(Level::Avx2));
+            all.extend(best.as_avx512().map(Level::Avx512));
+        }
+        all.push(best);
+        all
+    }
+
+    /// Census bits by definition.
+    fn census_plain(grey: &[u16], width: usize, height: usize, window: Census) -> Vec<u64> {
+        let (w, h) = window.size();
+        let at = |x: i64, y: i64| {
+            grey[y.clamp(0, height as i64 - 1) as usize * width + x.clamp(0, width as i64 - 1) as usize]
+        };
+        (0..width * height)
+            .map(|i| {
+                let (x, y) = ((i % width) as i64, (i / width) as i64);
+                let mut bits = 0;
+                let mut index = 0;
+                for dy in -(h as i64 / 2)..=h as i64 / 2 {
+                    for dx in -(w as i64 / 2)..=w as i64 / 2 {
+                        if (dx, dy) != (0, 0) {
+                            bits |= u64::from(at(x + dx, y + dy) < at(x, y)) << index;
+                            index += 1;
+                        }
+                    }
+                }
+                bits
+            })
+            .collect()
+    }
+
+    fn padded(values: &[u16], width: usize, height: usize) -> Grey {
+        let mut grey = Grey { values: Vec::new(), width, height };
+        for row in values.chunks_exact(width) {
+            grey.values.extend([row[0]; MARGIN]);
+            grey.values.extend_from_slice(row);
+            grey.values.extend([row[width - 1]; MARGIN]);
+        }
+        grey
+    }
+
+    fn options() -> impl Strategy<Value = StereoOptions> {
+        let window = prop_oneof![Just(Census::Window5x5), Just(Census::Window7x7), Just(Census::Window9x7)];
+        // Ranges below, at and above one block and one group; penalties that do and do not saturate.
+        let disparities = prop_oneof![1usize..70, Just(64), Just(128), 120usize..300];
+        (window, disparities, -40i32..40, 0u8..30, 0u8..60, 0u8..60, 0u8..40, any::<bool>()).prop_map(
+            |(census, disparities, min_disparity, p1, more, most, p2_gradient, eight)| StereoOptions {
+                census,
+                disparities,
+                min_disparity,
+                p1,
+                p2_min: p1 + more,
+                p2: p1 + more + most,
+                p2_gradient,
+                paths: if eight { Paths::Eight } else { Paths::Four },
+                ..Default::default()
+            },
+        )
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(48))]
+        #[test]
+        fn the_fast_matcher_is_the_plain_one_on_every_instruction_set(
+            options in options(),
+            width in 9usize..40,
+            height in 7usize..16,
+            seed in any::<u64>(),
+            levels_of_grey in prop_oneof![Just(2u16), Just(5), Just(200)],
+        ) {
+            options.validate().unwrap();
+            // A splitmix sequence: noise on the left, shifted noise on the right.
+            let noise = |i: usize| {
+                let mut z = seed.wrapping_add((i as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15));
+                z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+                ((z >> 40) as u16 % levels_of_grey) * (65535 / levels_of_grey)
+            };
+            let left: Vec<u16> = (0..width * height).map(noise).collect();
+            let right: Vec<u16> = (0..width * height).map(|i| noise(if i % 5 == 0 { i + 7 } else { i + 3 })).collect();
+            let bits = [&left, &right].map(|g| census_plain(g, width, height, options.census));
+            let expected = match_plain(&options, &left, &bits[0], &bits[1], width, height);
+
+            let grey = [padded(&left, width, height), padded(&right, width, height)];
+            let blocks = blocks(options.disparities);
+            let min_disparity = i64::from(options.min_disparity);
+            for level in levels() {
+                let (mut a, mut b, mut bytes) = (Vec::new(), Vec::new(), Vec::new());
+                census(level, &grey[0], options.census, &mut a);
+                census_mirrored(level, &grey[1], options.census, min_disparity, Frame::right_stride(width, blocks), &mut b);
+                grey[0].to_bytes(&mut bytes);
+                let frame = Frame {
+                    width, height, min_disparity, disparities: options.disparities, blocks,
+                    left: &a, right: &b, grey: &bytes,
+                    p1: options.p1, p2: &p2_table(&options), outside: outside_cost(&options),
+                };
+                let mut aggregator = Aggregator::default();
+                // Twice, so that what a frame leaves behind would show.
+                for _ in 0..2 {
+                    aggregator.run(level, &frame, options.paths == Paths::Eight);
+                    prop_assert_eq!(&aggregator.winners, &expected.0, "{:?}", level);
+                    prop_assert_eq!(&aggregator.right, &expected.1, "{:?}", level);
+                }
+            }
+        }
+    }
 }

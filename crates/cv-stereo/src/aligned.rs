@@ -1,0 +1,28 @@
+//! Buffers that start on a cache line.
+
+/// A reusable buffer of `T` whose first element lies on a cache line.
+#[derive(Debug, Default)]
+pub(crate) struct Aligned<T> {
+    data: Vec<T>,
+    start: usize,
+    len: usize,
+}
+
+const LINE: usize = 64;
+
+impl<T: Copy> Aligned<T> {
+    /// Makes the buffer `len` long. What it holds is unspecified where it was used before, else `fill`.
+    pub(crate) fn resize(&mut self, len: usize, fill: T) {
+        let needed = len + LINE / size_of::<T>();
+        if self.data.len() < needed {
+            // Never copies: the old contents are of no use.
+            self.data = vec![fill; needed];
+        }
+        self.start = self.data.as_ptr().align_offset(LINE).min(needed - len);
+        self.len = len;
+    }
+
+    pub(crate) fn as_mut_slice(&mut self) -> &mut [T] {
+        &mut self.data[self.start..self.start + self.len]
+    }
+}

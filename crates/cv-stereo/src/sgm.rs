@@ -1,0 +1,77 @@
+//! Semi-global aggregation (Hirschmüller, "Stereo processing by semiglobal matching and mutual information", PAMI 2008)
+//! in two sweeps that meet in the middle.
+//!
+//! One sweep goes down from the top left, the other up from the bottom right, at the same time on two cores. Until they
+//! meet each stores its sums; beyond, each adds the other's sums to its own and picks the winners there and then. So
+//! the volume of sums is written once and read once, costs are computed from the census bits where they are needed,
+//! and no two threads ever write to the same memory.
+
+use crate::aligned::Aligned;
+use crate::kernel::{BLOCK, Frame, Output, Sweep, sweep_rows};
+use crate::winner::Winner;
+use fearless_simd::{Level, dispatch};
+
+/// Buffers of the aggregation, kept between frames.
+#[derive(Debug, Default)]
+pub(crate) struct Aggregator {
+    sums: Aligned<u8>,
+    sweeps: [Sweep; 2],
+    pub(crate) winners: Vec<Winner>,
+    pub(crate) right: Vec<u16>,
+}
+
+/// Blocks that hold `disparities`.
+pub(crate) fn blocks(disparities: usize) -> usize {
+    disparities.div_ceil(BLOCK)
+}
+
+impl Aggregator {
+    /// Bytes for images of this size.
+    pub(crate) fn bytes(width: usize, height: usize, disparities: usize) -> usize {
+        let pixels = width.saturating_mul(height);
+        let blocks = blocks(disparities);
+        pixels
+            .saturating_mul(blocks * BLOCK + size_of::<Winner>() + size_of::<u16>())
+            .saturating_add(2 * Sweep::bytes(width, blocks))
+    }
+
+    /// Fills [`Aggregator::winners`] and [`Aggregator::right`].
+    pub(crate) fn run(&mut self, level: Level, frame: &Frame<'_>, eight: bool) {
+        let (width, height) = (frame.width, frame.height);
+        let depth = frame.blocks * BLOCK;
+        self.sums.resize(width * height * depth, 0);
+        self.winners.resize(width * height, Winner::default());
+        self.right.resize(width * height, 0);
+        let [down, up] = &mut self.sweeps;
+        // Rows of the upper half, swept first by `down` and last by `up`.
+        let top = height / 2;
+        let bottom = height - top;
+        let (sums_top, sums_bottom) = self.sums.as_mut_slice().split_at_mut(top * width * depth);
+        let (winners_top, winners_bottom) = self.winners.split_at_mut(top * width);
+        let (right_top, right_bottom) = self.right.split_at_mut(top * width);
+        let run = |sweep: &mut Sweep, first: usize, steps: usize, mut output: Output<'_>| {
+            dispatch!(level, simd => sweep_rows(simd, frame, sweep, first, steps, &mut output, eight));
+        };
+        rayon::join(
+            || {
+                down.start(frame, false);
+                run(down, 0, top, Output::Store(sums_top));
+            },
+            || {
+                up.start(frame, true);
+                run(up, 0, bottom, Output::Store(sums_bottom));
+            },
+        );
+        rayon::join(
+            || {
+                run(
+                    down,
+                    top,
+                    bottom,
+                    Output::Finish { other: sums_bottom, winners: winners_bottom, right: right_bottom },
+                )
+            },
+            || run(up, bottom, top, Output::Finish { other: sums_top, winners: winners_top, right: right_top }),
+        );
+    }
+}

@@ -1,0 +1,37 @@
+//! What aggregation hands to the checks, and the constants both aggregations share.
+
+use crate::StereoOptions;
+
+/// What stands for no sum: two saturated halves. A disparity that bad never wins.
+pub(crate) const NO_SUM: u16 = 510;
+
+/// The best disparity of one pixel, as an index from `min_disparity`, with the sums around it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) struct Winner {
+    /// Index of the smallest sum, the first of equals.
+    pub(crate) index: u16,
+    /// The smallest sum.
+    pub(crate) cost: u16,
+    /// The smallest sum at indices not next to the winner; [`NO_SUM`] where there are none.
+    pub(crate) second: u16,
+    /// The sum one index below; [`NO_SUM`] at the end of the range.
+    pub(crate) below: u16,
+    /// The sum one index above; [`NO_SUM`] at the end of the range.
+    pub(crate) above: u16,
+}
+
+/// What a match outside the right image costs: as much as a neighbourhood of which nothing is known, half of whose bits
+/// differ by chance.
+pub(crate) fn outside_cost(options: &StereoOptions) -> u8 {
+    (options.census.bits() / 2) as u8
+}
+
+/// P2 by the absolute difference of neighbouring grey values (0 to 255).
+pub(crate) fn p2_table(options: &StereoOptions) -> [u8; 256] {
+    let (low, high) = (u32::from(options.p2_min), u32::from(options.p2));
+    let half = u32::from(options.p2_gradient);
+    std::array::from_fn(|step| {
+        let step = step as u32;
+        if half == 0 { high as u8 } else { (low + ((high - low) * half + (half + step) / 2) / (half + step)) as u8 }
+    })
+}
