@@ -1,1 +1,46 @@
 //! Overlays, colour maps, plots and the self-contained HTML report.
+//!
+//! Everything here turns results into pictures ([`cv_core::RgbU8`]), SVG or HTML text in memory. Encoding pictures as PNG and
+//! writing files is the caller's part.
+//!
+//! ```
+//! use cv_core::GrayF32;
+//! use cv_report::{MapStyle, Note, Plot, Report, draw_map};
+//!
+//! let depth = GrayF32::from_fn(64, 48, |x, _| [1.0 + x as f32 / 16.0]);
+//! let picture = draw_map(depth.view(), &MapStyle::depth("m"));
+//! assert!(picture.width() > 64);
+//!
+//! let mut report = Report::new("Depth of a ramp");
+//! report.headline("valid", "100 %").section("Result").note(Note::Good, "Every pixel is known.");
+//! report.plot(&Plot::new("Depth", "metres", "pixels").histogram("", &[1.0, 2.0, 2.5], 10), "How far things are.");
+//! assert!(report.to_html().starts_with("<!doctype html>"));
+//! ```
+//!
+//! | what | where |
+//! |---|---|
+//! | drawing | [`Canvas`], [`colors`] |
+//! | maps of numbers | [`colorize`], [`color_bar`], [`draw_map`], [`draw_error_map`] |
+//! | features and geometry | [`draw_keypoints`], [`draw_matches`], [`draw_epipolar_lines`], [`tile_patches`] |
+//! | masks | [`overlay_mask`], [`overlay_comparison`] |
+//! | points and cameras | [`PointScene`], [`render_points`] |
+//! | pages | [`Report`], [`Figure`], [`Plot`] |
+
+mod base64;
+mod canvas;
+mod colormap;
+mod font;
+mod overlay;
+mod plot;
+mod report;
+mod viewer;
+
+pub use canvas::{Canvas, Color, colors};
+pub use colormap::{Colormap, MapStyle, absolute_difference, color_bar, colorize, draw_map, quantile_range};
+pub use overlay::{
+    MatchStyle, draw_epipolar_lines, draw_error_map, draw_keypoints, draw_matches, overlay_comparison, overlay_mask,
+    side_by_side, tile_patches,
+};
+pub use plot::Plot;
+pub use report::{Figure, Note, Report};
+pub use viewer::{PointScene, Viewpoint, camera_color, render_points};

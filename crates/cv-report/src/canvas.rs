@@ -1,0 +1,328 @@
+//! Anti-aliased drawing on an RGB picture.
+
+use cv_core::{ImageView, RgbU8};
+
+use crate::font;
+
+/// An RGB colour, as stored in pictures (sRGB).
+pub type Color = [u8; 3];
+
+/// Colours that stay apart for people with any colour vision (Okabe & Ito), and the greys.
+pub mod colors {
+    use super::Color;
+    /// Right, accepted.
+    pub const GREEN: Color = [0, 200, 110];
+    /// Wrong, rejected.
+    pub const RED: Color = [235, 60, 45];
+    /// A third kind.
+    pub const BLUE: Color = [40, 140, 255];
+    /// A warning, or the second of two series.
+    pub const ORANGE: Color = [240, 160, 20];
+    /// Marks on photographs.
+    pub const YELLOW: Color = [250, 225, 60];
+    /// Marks on dark grounds.
+    pub const CYAN: Color = [70, 200, 235];
+    /// A further series.
+    pub const MAGENTA: Color = [225, 90, 185];
+    /// Paper.
+    pub const WHITE: Color = [255, 255, 255];
+    /// Ink.
+    pub const BLACK: Color = [0, 0, 0];
+    /// What is unknown in a map.
+    pub const UNKNOWN: Color = [104, 104, 108];
+}
+
+/// A picture to draw on. Positions are pixels with centres at integers; whatever falls outside is cut off.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Canvas {
+    image: RgbU8,
+}
+
+impl Canvas {
+    /// A canvas of one colour.
+    ///
+    /// # Panics
+    /// Where `width × height × 3` overflows.
+    pub fn new(width: usize, height: usize, fill: Color) -> Self {
+        Self { image: RgbU8::new(width, height, fill) }
+    }
+
+    /// A copy of a colour picture.
+    pub fn from_rgb(view: ImageView<'_, u8, 3>) -> Self {
+        Self { image: view.to_image() }
+    }
+
+    /// A copy of a grey picture.
+    pub fn from_gray(view: ImageView<'_, u8, 1>) -> Self {
+        Self { image: view.to_image().map(|[v]| [v; 3]) }
+    }
+
+    /// Width in pixels.
+    pub fn width(&self) -> usize {
+        self.image.width()
+    }
+
+    /// Height in pixels.
+    pub fn height(&self) -> usize {
+        self.image.height()
+    }
+
+    /// The picture.
+    pub fn image(&self) -> &RgbU8 {
+        &self.image
+    }
+
+    /// The picture, taken out.
+    pub fn into_image(self) -> RgbU8 {
+        self.image
+    }
+
+    /// Halves the contrast towards `color` by `amount` (0 nothing, 1 all): a quiet ground for marks.
+    pub fn fade(&mut self, color: Color, amount: f32) {
+        let keep = ((1.0 - amount.clamp(0.0, 1.0)) * 256.0) as u32;
+        for pixel in self.image.as_mut_slice().as_chunks_mut::<3>().0 {
+            for (v, c) in pixel.iter_mut().zip(color) {
+                *v = ((u32::from(*v) * keep + u32::from(c) * (256 - keep)) >> 8) as u8;
+            }
+        }
+    }
+
+    /// Mixes `color` into one pixel by `alpha`, 0 to 1.
+    #[inline]
+    pub fn blend(&mut self, x: i64, y: i64, color: Color, alpha: f32) {
+        if x < 0 || y < 0 || x >= self.image.width() as i64 || y >= self.image.height() as i64 || alpha <= 0.0 {
+            return;
+        }
+        let (x, y) = (x as usize, y as usize);
+        let a = (alpha.min(1.0) * 256.0) as i32;
+        let old = self.image.at(x, y);
+        self.image.set(
+            x,
+            y,
+            std::array::from_fn(|c| (i32::from(old[c]) + (((i32::from(color[c]) - i32::from(old[c])) * a) >> 8)) as u8),
+        );
+    }
+
+    /// A straight line with round ends, `width` pixels thick.
+    pub fn line(&mut self, from: [f32; 2], to: [f32; 2], width: f32, color: Color) {
+        let radius = width.clamp(0.1, 1000.0) / 2.0;
+        let Some((a, b)) = self.clip(from, to, radius + 1.0) else { return };
+        // Thinner than a pixel: one pixel wide and paler.
+        let (radius, strength) = if radius < 0.5 { (0.5, radius * 2.0) } else { (radius, 1.0) };
+        for_each_near([a, b], radius + 1.0, |x, y, distance| {
+            self.blend(x, y, color, strength * (radius + 0.5 - distance).clamp(0.0, 1.0));
+        });
+    }
+
+    /// The part of a segment within `margin` of the canvas; `None` where there is none or it is not finite.
+    fn clip(&self, a: [f32; 2], b: [f32; 2], margin: f32) -> Option<([f32; 2], [f32; 2])> {
+        if ![a[0], a[1], b[0], b[1]].iter().all(|v| v.is_finite()) {
+            return None;
+        }
+        // Liang and Barsky, in f64: ends may be astronomically far away.
+        let (mut t0, mut t1) = (0.0f64, 1.0f64);
+        let size = [self.width() as f64, self.height() as f64];
+        let margin = f64::from(margin);
+        for axis in 0..2 {
+            let (p, d) = (f64::from(a[axis]), f64::from(b[axis]) - f64::from(a[axis]));
+            let (low, high) = (-margin - 0.5 - p, size[axis] - 0.5 + margin - p);
+            if d == 0.0 {
+                if low > 0.0 || high < 0.0 {
+                    return None;
+                }
+                continue;
+            }
+            let (enter, leave) = if d > 0.0 { (low / d, high / d) } else { (high / d, low / d) };
+            t0 = t0.max(enter);
+            t1 = t1.min(leave);
+        }
+        let at = |t: f64| [0, 1].map(|i| (f64::from(a[i]) + t * (f64::from(b[i]) - f64::from(a[i]))) as f32);
+        (t0 <= t1).then(|| (at(t0), at(t1)))
+    }
+
+    /// Lines from point to point.
+    pub fn polyline(&mut self, points: &[[f32; 2]], width: f32, color: Color) {
+        for pair in points.windows(2) {
+            self.line(pair[0], pair[1], width, color);
+        }
+    }
+
+    /// A ring of `width` pixels around `center`.
+    pub fn circle(&mut self, center: [f32; 2], radius: f32, width: f32, color: Color) {
+        let half = (width / 2.0).max(0.5);
+        self.radial(center, radius + half, |distance| half + 0.5 - (distance - radius).abs(), color);
+    }
+
+    /// A filled disc.
+    pub fn disc(&mut self, center: [f32; 2], radius: f32, color: Color) {
+        self.radial(center, radius, |distance| radius + 0.5 - distance, color);
+    }
+
+    fn radial(&mut self, center: [f32; 2], reach: f32, alpha: impl Fn(f32) -> f32, color: Color) {
+        let [cx, cy] = center;
+        if !(cx.is_finite() && cy.is_finite() && reach.is_finite()) {
+            return;
+        }
+        let reach = reach + 1.0;
+        let span =
+            |c: f32, size: usize| ((c - reach).floor().max(0.0) as i64, (c + reach).ceil().min(size as f32) as i64);
+        let ((x0, x1), (y0, y1)) = (span(cx, self.width()), span(cy, self.height()));
+        for y in y0..=y1 {
+            for x in x0..=x1 {
+                self.blend(x, y, color, alpha((x as f32 - cx).hypot(y as f32 - cy)).clamp(0.0, 1.0));
+            }
+        }
+    }
+
+    /// An upright cross whose arms are `radius` pixels long.
+    pub fn cross(&mut self, center: [f32; 2], radius: f32, width: f32, color: Color) {
+        let [x, y] = center;
+        self.line([x - radius, y], [x + radius, y], width, color);
+        self.line([x, y - radius], [x, y + radius], width, color);
+    }
+
+    /// A filled rectangle with its top-left pixel at `(x, y)`.
+    pub fn fill_rect(&mut self, x: i64, y: i64, width: usize, height: usize, color: Color) {
+        let span = |start: i64, len: usize, size: usize| {
+            let end = start.saturating_add(len as i64).clamp(0, size as i64) as usize;
+            (start.clamp(0, size as i64) as usize, end)
+        };
+        let ((x0, x1), (y0, y1)) = (span(x, width, self.width()), span(y, height, self.height()));
+        for y in y0..y1 {
+            for pixel in self.image.row_mut(y)[3 * x0..3 * x1].as_chunks_mut::<3>().0 {
+                *pixel = color;
+            }
+        }
+    }
+
+    /// The outline of a rectangle, one pixel wide.
+    pub fn rect(&mut self, x: i64, y: i64, width: usize, height: usize, color: Color) {
+        let (w, h) = (width as i64, height as i64);
+        self.fill_rect(x, y, width, 1, color);
+        self.fill_rect(x, y + h - 1, width, 1, color);
+        self.fill_rect(x, y, 1, height, color);
+        self.fill_rect(x + w - 1, y, 1, height, color);
+    }
+
+    /// Copies a picture with its top-left pixel to `(x, y)`.
+    pub fn paste(&mut self, view: ImageView<'_, u8, 3>, x: i64, y: i64) {
+        let left = x.clamp(0, self.width() as i64);
+        let right = x.saturating_add(view.width() as i64).clamp(left, self.width() as i64);
+        if left == right {
+            return;
+        }
+        for row in 0..view.height() {
+            let to = y.saturating_add(row as i64);
+            if to < 0 || to >= self.height() as i64 {
+                continue;
+            }
+            let from = (left - x) as usize;
+            let source = &view.row(row)[3 * from..3 * (from + (right - left) as usize)];
+            self.image.row_mut(to as usize)[3 * left as usize..3 * right as usize].copy_from_slice(source);
+        }
+    }
+
+    /// A line of text whose capitals are `size` pixels tall; `(x, y)` is the top left of the capitals.
+    pub fn text(&mut self, x: f32, y: f32, text: &str, size: f32, color: Color) {
+        font::draw(text, [x, y], size, font::weight(size), |x, y, alpha| self.blend(x, y, color, alpha));
+    }
+
+    /// Text with a rim of another colour, readable on any picture.
+    pub fn text_on_picture(&mut self, x: f32, y: f32, text: &str, size: f32, color: Color, rim: Color) {
+        let weight = font::weight(size);
+        font::draw(text, [x, y], size, weight * 2.2 + 1.5, |x, y, alpha| self.blend(x, y, rim, alpha * 0.75));
+        font::draw(text, [x, y], size, weight, |x, y, alpha| self.blend(x, y, color, alpha));
+    }
+
+    /// The width in pixels of [`Canvas::text`].
+    pub fn text_width(text: &str, size: f32) -> f32 {
+        font::width(text, size)
+    }
+}
+
+/// Calls `f(x, y, distance)` for every pixel within `reach` of a segment, once.
+pub(crate) fn for_each_near([a, b]: [[f32; 2]; 2], reach: f32, mut f: impl FnMut(i64, i64, f32)) {
+    let d = [b[0] - a[0], b[1] - a[1]];
+    let squared = d[0] * d[0] + d[1] * d[1];
+    // Walk along the longer axis; across it, only the pixels that can be near.
+    let (major, minor) = if d[0].abs() >= d[1].abs() { (0, 1) } else { (1, 0) };
+    let slope = if d[major] == 0.0 { 0.0 } else { d[minor] / d[major] };
+    let across = reach * (1.0 + slope * slope).sqrt();
+    let (low, high) = (a[major].min(b[major]), a[major].max(b[major]));
+    for m in (low - reach).ceil() as i64..=(high + reach).floor() as i64 {
+        let along = (m as f32).clamp(low, high);
+        // Beyond an end the band is that of the end point.
+        let middle = a[minor] + slope * (along - a[major]);
+        for n in (middle - across).ceil() as i64..=(middle + across).floor() as i64 {
+            let (x, y) = if major == 0 { (m, n) } else { (n, m) };
+            let p = [x as f32 - a[0], y as f32 - a[1]];
+            let t = if squared > 0.0 { ((p[0] * d[0] + p[1] * d[1]) / squared).clamp(0.0, 1.0) } else { 0.0 };
+            let distance = (p[0] - t * d[0]).hypot(p[1] - t * d[1]);
+            if distance <= reach {
+                f(x, y, distance);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn a_line_covers_its_pixels_and_no_others() {
+        let mut canvas = Canvas::new(20, 9, colors::BLACK);
+        canvas.line([3.0, 4.0], [15.0, 4.0], 1.0, colors::WHITE);
+        for x in 4..15 {
+            assert!(canvas.image().at(x, 4)[0] >= 254, "{x}");
+            assert_eq!((canvas.image().at(x, 2), canvas.image().at(x, 6)), ([0; 3], [0; 3]));
+        }
+        assert_eq!(canvas.image().at(1, 4), [0; 3]);
+        assert_eq!(canvas.image().at(18, 4), [0; 3]);
+    }
+
+    #[test]
+    fn a_disc_has_the_area_of_one() {
+        let mut canvas = Canvas::new(64, 64, colors::BLACK);
+        canvas.disc([31.3, 32.7], 20.0, colors::WHITE);
+        let sum: f64 = canvas.image().pixels().map(|p| f64::from(p[0]) / 255.0).sum();
+        let area = std::f64::consts::PI * 400.0;
+        // The rim is 126 pixels long; a linear ramp is off by far less than a tenth of a pixel on average.
+        assert!((sum - area).abs() < 12.6, "{sum} {area}");
+    }
+
+    #[test]
+    fn pasting_and_filling_are_cut_at_the_border() {
+        let stamp = RgbU8::new(4, 4, [9, 8, 7]);
+        for (x, y) in [(-2, -2), (8, 8), (-100, 3), (i64::MAX, i64::MAX), (i64::MIN, 0), (3, 3)] {
+            let mut canvas = Canvas::new(10, 10, colors::BLACK);
+            canvas.paste(stamp.view(), x, y);
+            let inside = |c: i64| (0..4).filter(|i| (0..10).contains(&c.saturating_add(*i))).count();
+            let count = canvas.image().pixels().filter(|p| *p == [9, 8, 7]).count();
+            assert_eq!(count, inside(x) * inside(y), "{x} {y}");
+            let mut canvas = Canvas::new(10, 10, colors::BLACK);
+            canvas.fill_rect(x, y, 4, 4, [9, 8, 7]);
+            assert_eq!(canvas.image().pixels().filter(|p| *p == [9, 8, 7]).count(), count, "{x} {y}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn nothing_outside_the_canvas_is_touched(
+            a in prop::array::uniform2(prop::num::f32::ANY), b in prop::array::uniform2(-50.0..50.0f32), r in 0.0..30.0f32,
+            w in 0usize..12, h in 0usize..12,
+        ) {
+            // Ends anywhere, NaN and infinity among them: no panic, and no endless walk.
+            let mut canvas = Canvas::new(w, h, colors::BLACK);
+            canvas.line(a, b, 2.0, colors::WHITE);
+            canvas.line(b, [b[1], b[0]], r, colors::WHITE);
+            canvas.circle(b, r, 2.0, colors::RED);
+            canvas.circle(a, r, 2.0, colors::RED);
+            canvas.disc(b, r, colors::RED);
+            canvas.cross(a, r, 1.0, colors::RED);
+            canvas.text(b[0], b[1], "Ag", r, colors::WHITE);
+            canvas.text(a[0], a[1], "Ag", 10.0, colors::WHITE);
+        }
+    }
+}

@@ -1,0 +1,235 @@
+//! Numbers to colours.
+
+use cv_core::{GrayF32, ImageView, RgbU8};
+
+use crate::canvas::{Canvas, Color, colors};
+
+/// A way from numbers to colours.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Colormap {
+    /// Turbo (Mikhailov 2019): low blue, high red. For depth: near blue, far red.
+    #[default]
+    Turbo,
+    /// Turbo the other way round. For disparity, so that near is blue as well.
+    TurboReversed,
+    /// Viridis: even in lightness, so that it survives a grey print. For costs, confidences and densities.
+    Viridis,
+    /// Magma: dark to light. For errors.
+    Magma,
+    /// Black to white.
+    Gray,
+}
+
+impl Colormap {
+    /// The colour at `t`, 0 to 1; [`colors::UNKNOWN`] for NaN.
+    pub fn color(self, t: f32) -> Color {
+        if t.is_nan() {
+            return colors::UNKNOWN;
+        }
+        let t = f64::from(t.clamp(0.0, 1.0));
+        let gradient = match self {
+            Self::Gray => return [(t * 255.0).round() as u8; 3],
+            Self::Turbo => return colorous::TURBO.eval_continuous(inside(t)).as_array(),
+            Self::TurboReversed => return colorous::TURBO.eval_continuous(inside(1.0 - t)).as_array(),
+            Self::Viridis => colorous::VIRIDIS,
+            Self::Magma => colorous::MAGMA,
+        };
+        gradient.eval_continuous(t).as_array()
+    }
+
+    /// 256 steps from low to high.
+    fn table(self) -> Vec<Color> {
+        (0..256).map(|i| self.color(i as f32 / 255.0)).collect()
+    }
+}
+
+/// Turbo's outermost ends are nearly black: leave them out, so that no known value looks like a hole.
+fn inside(t: f64) -> f64 {
+    0.06 + 0.90 * t
+}
+
+/// Colours a map. Values outside `range` take the colour of its end; NaN and infinity are [`colors::UNKNOWN`].
+pub fn colorize(map: ImageView<'_, f32, 1>, range: (f32, f32), colormap: Colormap) -> RgbU8 {
+    let table = colormap.table();
+    let scale = if range.1 > range.0 { 255.0 / (range.1 - range.0) } else { 0.0 };
+    let mut out = RgbU8::new(map.width(), map.height(), [0; 3]);
+    for y in 0..map.height() {
+        for (pixel, &v) in out.row_mut(y).as_chunks_mut::<3>().0.iter_mut().zip(map.row(y)) {
+            *pixel = if v.is_finite() { table[((v - range.0) * scale + 0.5) as u8 as usize] } else { colors::UNKNOWN };
+        }
+    }
+    out
+}
+
+/// The `low` and `high` quantiles (0 to 1) of the finite values; `None` where there are none.
+///
+/// A picture coloured from 0.01 to 0.99 is not ruled by a few wild values.
+pub fn quantile_range(map: ImageView<'_, f32, 1>, low: f64, high: f64) -> Option<(f32, f32)> {
+    let mut values: Vec<f32> = (0..map.height()).flat_map(|y| map.row(y)).copied().filter(|v| v.is_finite()).collect();
+    let last = values.len().checked_sub(1)?;
+    let mut at = |q: f64| {
+        let index = (q.clamp(0.0, 1.0) * last as f64).round() as usize;
+        *values.select_nth_unstable_by(index, f32::total_cmp).1
+    };
+    Some((at(low), at(high)))
+}
+
+/// Round numbers within `range`, about `count` of them, at distances of 1, 2 or 5 times a power of ten.
+pub(crate) fn ticks(range: (f64, f64), count: usize) -> Vec<f64> {
+    let span = range.1 - range.0;
+    if !(span.is_finite() && span > 0.0) || count == 0 {
+        return Vec::new();
+    }
+    let raw = span / count as f64;
+    let power = 10f64.powf(raw.log10().floor());
+    let step = power
+        * match raw / power {
+            r if r < 1.5 => 1.0,
+            r if r < 3.5 => 2.0,
+            r if r < 7.5 => 5.0,
+            _ => 10.0,
+        };
+    let (first, last) = ((range.0 / step - 1e-9).ceil(), (range.1 / step + 1e-9).floor());
+    if !(step > 0.0 && first.is_finite() && last - first < 1000.0) {
+        return Vec::new();
+    }
+    (0..=(last - first) as i64).map(|i| (first + i as f64) * step).map(|t| if t == 0.0 { 0.0 } else { t }).collect()
+}
+
+/// A number in as few digits as tell it from its neighbours at distance `step`.
+pub(crate) fn tick_label(value: f64, step: f64) -> String {
+    let decimals = (-step.abs().log10() - 1e-9).ceil().clamp(0.0, 9.0) as usize;
+    if value != 0.0 && (value.abs() >= 1e6 || value.abs() < 1e-4) {
+        format!("{value:.1e}")
+    } else {
+        format!("{value:.decimals$}")
+    }
+}
+
+/// A vertical colour bar with its scale, as tall as asked: low at the bottom, `label` (such as “depth (m)”) on top.
+pub fn color_bar(height: usize, range: (f32, f32), colormap: Colormap, label: &str) -> RgbU8 {
+    // Text grows with the picture, between the sizes that can be read and that do not shout.
+    let size = (height as f32 / 40.0).clamp(8.0, 22.0);
+    let bar = (size * 1.6).round();
+    let (top, bottom) = ((size * 2.6).round(), (size * 1.1).round());
+    let length = (height as f32 - top - bottom).max(1.0);
+    let range64 = (f64::from(range.0), f64::from(range.1));
+    let marks = ticks(range64, ((length / (size * 3.2)) as usize).clamp(2, 10));
+    let step = marks.windows(2).map(|w| w[1] - w[0]).next().unwrap_or(range64.1 - range64.0);
+    let labels: Vec<_> = marks.iter().map(|&t| tick_label(t, step)).collect();
+    let widest = labels.iter().map(|l| Canvas::text_width(l, size)).fold(0.0, f32::max);
+    let width = (size + bar + size * 0.9 + widest + size).max(Canvas::text_width(label, size) + 2.0 * size);
+    let mut canvas = Canvas::new(width.ceil() as usize, height, colors::WHITE);
+    let table = colormap.table();
+    for row in 0..length as usize {
+        let t = 1.0 - (row as f32 + 0.5) / length;
+        let color = table[(t * 255.0).round() as usize];
+        canvas.fill_rect(size as i64, top as i64 + row as i64, bar as usize, 1, color);
+    }
+    const INK: Color = [45, 48, 56];
+    for (mark, label) in marks.iter().zip(&labels) {
+        let t = ((mark - range64.0) / (range64.1 - range64.0)) as f32;
+        let y = top + (1.0 - t) * (length - 1.0);
+        let x = size + bar;
+        canvas.line([x + size * 0.15, y], [x + size * 0.5, y], 1.0, INK);
+        canvas.text(x + size * 0.9, y - size / 2.0, label, size, INK);
+    }
+    canvas.text(size, size * 0.8, label, size, INK);
+    canvas.into_image()
+}
+
+/// How a map becomes a picture.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct MapStyle {
+    /// Values of the two ends of the colours; `None` (default): the 1 % and 99 % quantiles.
+    pub range: Option<(f32, f32)>,
+    /// The colours. Default [`Colormap::Turbo`].
+    pub colormap: Colormap,
+    /// What the numbers are, with the unit. Default empty.
+    pub label: String,
+}
+
+impl MapStyle {
+    /// Depth: near blue, far red. `unit` may be empty.
+    pub fn depth(unit: &str) -> Self {
+        let label = if unit.is_empty() { "depth".to_owned() } else { format!("depth ({unit})") };
+        Self { label, ..Self::default() }
+    }
+
+    /// Disparity: near (large) blue, far (small) red.
+    pub fn disparity() -> Self {
+        Self { colormap: Colormap::TurboReversed, label: "disparity (px)".to_owned(), ..Self::default() }
+    }
+
+    /// The same with the ends given.
+    #[must_use]
+    pub fn with_range(self, low: f32, high: f32) -> Self {
+        Self { range: Some((low, high)), ..self }
+    }
+}
+
+/// A map in colours with a colour bar at its right.
+pub fn draw_map(map: ImageView<'_, f32, 1>, style: &MapStyle) -> RgbU8 {
+    let range = style.range.or_else(|| quantile_range(map, 0.01, 0.99)).unwrap_or((0.0, 1.0));
+    // One value only: give it a scale around it.
+    let range = if range.1 > range.0 { range } else { (range.0 - 0.5, range.0 + 0.5) };
+    let picture = colorize(map, range, style.colormap);
+    let bar = color_bar(picture.height().max(160), range, style.colormap, &style.label);
+    let mut canvas = Canvas::new(picture.width() + bar.width(), picture.height().max(bar.height()), colors::WHITE);
+    canvas.paste(picture.view(), 0, 0);
+    canvas.paste(bar.view(), picture.width() as i64, 0);
+    canvas.into_image()
+}
+
+/// The absolute difference of two maps; NaN where either is unknown.
+pub fn absolute_difference(a: ImageView<'_, f32, 1>, b: ImageView<'_, f32, 1>) -> GrayF32 {
+    GrayF32::from_fn(a.width().min(b.width()), a.height().min(b.height()), |x, y| {
+        [(a.at(x, y)[0] - b.at(x, y)[0]).abs()]
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn near_is_blue_and_far_is_red() {
+        let depth = GrayF32::from_vec(4, 1, vec![1.0, 9.0, f32::NAN, f32::INFINITY]).unwrap();
+        let picture = colorize(depth.view(), (1.0, 9.0), Colormap::Turbo);
+        let ([r, _, b], [far_r, _, far_b]) = (picture.at(0, 0), picture.at(1, 0));
+        assert!(b > r && far_r > far_b, "{:?} {:?}", picture.at(0, 0), picture.at(1, 0));
+        assert_eq!((picture.at(2, 0), picture.at(3, 0)), (colors::UNKNOWN, colors::UNKNOWN));
+        let disparity = colorize(depth.view(), (1.0, 9.0), Colormap::TurboReversed);
+        assert_eq!((disparity.at(1, 0), disparity.at(0, 0)), (picture.at(0, 0), picture.at(1, 0)));
+    }
+
+    #[test]
+    fn quantiles_are_those_of_the_finite_values() {
+        let mut values: Vec<f32> = (0..=100).map(|i| i as f32).rev().collect();
+        values.extend([f32::NAN, f32::INFINITY]);
+        let map = GrayF32::from_vec(103, 1, values).unwrap();
+        assert_eq!(quantile_range(map.view(), 0.01, 0.99), Some((1.0, 99.0)));
+        assert_eq!(quantile_range(GrayF32::new(3, 3, [f32::NAN]).view(), 0.0, 1.0), None);
+        assert_eq!(quantile_range(GrayF32::new(0, 0, [0.0]).view(), 0.0, 1.0), None);
+    }
+
+    #[test]
+    fn ticks_are_round_numbers_with_just_enough_digits() {
+        assert_eq!(ticks((0.0, 10.0), 5), [0.0, 2.0, 4.0, 6.0, 8.0, 10.0]);
+        assert_eq!(ticks((-0.31, 0.29), 6), [-0.3, -0.2, -0.1, 0.0, 0.1, 0.2].map(|v: f64| (v * 10.0).round() * 0.1));
+        assert!(ticks((3.0, 3.0), 5).is_empty() && ticks((0.0, f64::NAN), 5).is_empty());
+        assert_eq!(tick_label(0.25, 0.05), "0.25");
+        assert_eq!(tick_label(20.0, 10.0), "20");
+        assert_eq!(tick_label(-0.5, 0.5), "-0.5");
+    }
+
+    proptest! {
+        #[test]
+        fn any_map_makes_a_picture(w in 0usize..6, h in 0usize..6, values in prop::collection::vec(prop::num::f32::ANY, 36)) {
+            let map = GrayF32::from_fn(w, h, |x, y| [values[y * 6 + x]]);
+            let picture = draw_map(map.view(), &MapStyle::depth("m"));
+            prop_assert!(picture.width() > w && picture.height() >= h);
+        }
+    }
+}

@@ -1,0 +1,344 @@
+//! The field's usual pictures: keypoints, matches, epipolar lines, masks, patches.
+
+use cv_core::{Correspondence, ImageView, Keypoint, Matrix3, RgbU8};
+
+use crate::canvas::{Canvas, Color, colors};
+
+/// Line widths and marker sizes that suit a picture: 1 for one of about 1000 pixels.
+fn unit(width: usize, height: usize) -> f32 {
+    (width.max(height) as f32 / 1000.0).clamp(0.8, 4.0)
+}
+
+/// Marks keypoints: a small ring, larger for larger scales, with a spoke where they have an orientation.
+pub fn draw_keypoints(view: ImageView<'_, u8, 3>, keypoints: &[Keypoint], color: Color) -> RgbU8 {
+    let mut canvas = Canvas::from_rgb(view);
+    let u = unit(view.width(), view.height());
+    for point in keypoints {
+        let center = [point.position.x, point.position.y];
+        let radius = (3.0 * u).max(3.0 * point.scale.clamp(0.0, 100.0));
+        canvas.circle(center, radius, 2.6 * u, colors::BLACK);
+        canvas.circle(center, radius, 1.3 * u, color);
+        if point.angle != 0.0 && point.angle.is_finite() {
+            let end = [center[0] + radius * point.angle.cos(), center[1] + radius * point.angle.sin()];
+            canvas.line(center, end, 1.3 * u, color);
+        }
+    }
+    canvas.into_image()
+}
+
+/// Pictures in a row on white, `gap` pixels apart, centred vertically.
+pub fn side_by_side(views: &[ImageView<'_, u8, 3>], gap: usize) -> RgbU8 {
+    let (canvas, _) = row_of(views, gap);
+    canvas.into_image()
+}
+
+/// The row and the top-left corner of each picture in it.
+fn row_of(views: &[ImageView<'_, u8, 3>], gap: usize) -> (Canvas, Vec<[f32; 2]>) {
+    let height = views.iter().map(ImageView::height).max().unwrap_or(0);
+    let width = views.iter().map(ImageView::width).sum::<usize>() + gap * views.len().saturating_sub(1);
+    let mut canvas = Canvas::new(width, height, colors::WHITE);
+    let mut corners = Vec::with_capacity(views.len());
+    let mut x = 0;
+    for view in views {
+        let y = (height - view.height()) / 2;
+        canvas.paste(*view, x as i64, y as i64);
+        corners.push([x as f32, y as f32]);
+        x += view.width() + gap;
+    }
+    (canvas, corners)
+}
+
+/// Colours that differ from one index to the next, for things that have no meaning by colour.
+fn cycle(index: usize) -> Color {
+    // Steps of the golden angle around the hue circle, at full saturation and two lightnesses.
+    let hue = (index as f32 * 0.618_034).fract() * 6.0;
+    let value = if index.is_multiple_of(2) { 255.0 } else { 210.0 };
+    std::array::from_fn(|c| {
+        let d = (hue - [0.0, 2.0, 4.0][c]).rem_euclid(6.0);
+        let ramp = (d.min(6.0 - d) - 1.0).clamp(0.0, 1.0);
+        (value * (1.0 - 0.85 * ramp)) as u8
+    })
+}
+
+/// At most `limit` of `0..n`, evenly spread.
+fn spread(n: usize, limit: usize) -> impl Iterator<Item = usize> {
+    let shown = n.min(limit);
+    (0..shown).map(move |i| i * n / shown)
+}
+
+/// How matches are drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct MatchStyle {
+    /// At most this many lines per class, evenly spread over the list. Default 400: beyond, lines hide the pictures.
+    pub limit: usize,
+    /// Whether outliers are drawn. Default true.
+    pub outliers: bool,
+}
+
+impl Default for MatchStyle {
+    fn default() -> Self {
+        Self { limit: 400, outliers: true }
+    }
+}
+
+/// Two pictures side by side with a line per match: inliers green over outliers red, or each in a colour of its own where
+/// `inliers` is `None`. A pair beyond the end of `inliers` counts as an outlier.
+pub fn draw_matches(
+    a: ImageView<'_, u8, 3>,
+    b: ImageView<'_, u8, 3>,
+    pairs: &[Correspondence],
+    inliers: Option<&[bool]>,
+    style: &MatchStyle,
+) -> RgbU8 {
+    let (mut canvas, corners) = row_of(&[a, b], 0);
+    let u = unit(canvas.width() / 2, canvas.height());
+    let mut draw = |pair: &Correspondence, color: Color| {
+        let from = [pair.a.x as f32 + corners[0][0], pair.a.y as f32 + corners[0][1]];
+        let to = [pair.b.x as f32 + corners[1][0], pair.b.y as f32 + corners[1][1]];
+        canvas.line(from, to, 1.1 * u, color);
+        for end in [from, to] {
+            canvas.disc(end, 2.6 * u, colors::BLACK);
+            canvas.disc(end, 1.8 * u, color);
+        }
+    };
+    match inliers {
+        None => spread(pairs.len(), style.limit).for_each(|i| draw(&pairs[i], cycle(i))),
+        Some(inliers) => {
+            let is_inlier = |i: &usize| inliers.get(*i).copied().unwrap_or(false);
+            let (good, bad): (Vec<usize>, Vec<usize>) = (0..pairs.len()).partition(is_inlier);
+            if style.outliers {
+                spread(bad.len(), style.limit).for_each(|i| draw(&pairs[bad[i]], colors::RED));
+            }
+            spread(good.len(), style.limit).for_each(|i| draw(&pairs[good[i]], colors::GREEN));
+        }
+    }
+    canvas.into_image()
+}
+
+/// Two pictures side by side; up to `count` pairs, each with its epipolar lines in one colour: `F x_a` in the second picture
+/// and `Fᵀ x_b` in the first, where `x_bᵀ F x_a = 0`.
+pub fn draw_epipolar_lines(
+    a: ImageView<'_, u8, 3>,
+    b: ImageView<'_, u8, 3>,
+    fundamental: &Matrix3<f64>,
+    pairs: &[Correspondence],
+    count: usize,
+) -> RgbU8 {
+    let (mut left, mut right) = (Canvas::from_rgb(a), Canvas::from_rgb(b));
+    let u = unit(a.width(), a.height());
+    for (n, i) in spread(pairs.len(), count).enumerate() {
+        let pair = &pairs[i];
+        let color = cycle(n);
+        let (xa, xb) = (pair.a.to_homogeneous(), pair.b.to_homogeneous());
+        for (canvas, line, point) in
+            [(&mut left, fundamental.transpose() * xb, pair.a), (&mut right, fundamental * xa, pair.b)]
+        {
+            if let Some((from, to)) = across(line.x, line.y, line.z, canvas.width() as f64, canvas.height() as f64) {
+                canvas.line(from, to, 1.2 * u, color);
+            }
+            let center = [point.x as f32, point.y as f32];
+            canvas.disc(center, 4.6 * u, colors::BLACK);
+            canvas.disc(center, 3.6 * u, color);
+        }
+    }
+    let gap = (6.0 * u) as usize;
+    side_by_side(&[left.image().view(), right.image().view()], gap)
+}
+
+/// The ends of the line `a x + b y + c = 0` on the borders of a picture.
+fn across(a: f64, b: f64, c: f64, width: f64, height: f64) -> Option<([f32; 2], [f32; 2])> {
+    let norm = a.hypot(b);
+    if !(norm > 0.0 && norm.is_finite() && c.is_finite()) {
+        return None;
+    }
+    let (from, to) = if a.abs() < b.abs() {
+        ([0.0, -c / b], [width - 1.0, -(c + a * (width - 1.0)) / b])
+    } else {
+        ([-c / a, 0.0], [-(c + b * (height - 1.0)) / a, height - 1.0])
+    };
+    Some((from.map(|v| v as f32), to.map(|v| v as f32)))
+}
+
+/// A mask laid over a picture: `color` mixed in by `alpha` (0 to 1) where true, with a solid outline. Beyond the mask's size nothing
+/// is marked.
+pub fn overlay_mask(view: ImageView<'_, u8, 3>, mask: ImageView<'_, bool, 1>, color: Color, alpha: f32) -> RgbU8 {
+    let mut canvas = Canvas::from_rgb(view);
+    let reach = unit(view.width(), view.height()).round() as i64;
+    let on = |x: i64, y: i64| {
+        usize::try_from(x).ok().zip(usize::try_from(y).ok()).and_then(|(x, y)| mask.get(x, y)).is_some_and(|[m]| m)
+    };
+    for y in 0..view.height().min(mask.height()) as i64 {
+        for x in 0..view.width().min(mask.width()) as i64 {
+            if !on(x, y) {
+                continue;
+            }
+            let edge = (1..=reach).any(|d| !on(x - d, y) || !on(x + d, y) || !on(x, y - d) || !on(x, y + d));
+            canvas.blend(x, y, color, if edge { 1.0 } else { alpha });
+        }
+    }
+    canvas.into_image()
+}
+
+/// A mask against the truth: right green, invented red, missed blue, on the greyed picture.
+pub fn overlay_comparison(
+    view: ImageView<'_, u8, 3>,
+    mask: ImageView<'_, bool, 1>,
+    truth: ImageView<'_, bool, 1>,
+) -> RgbU8 {
+    let mut canvas = Canvas::from_rgb(view);
+    canvas.fade([128; 3], 0.25);
+    for y in 0..view.height() {
+        for x in 0..view.width() {
+            let color = match (mask.get(x, y) == Some([true]), truth.get(x, y) == Some([true])) {
+                (true, true) => colors::GREEN,
+                (true, false) => colors::RED,
+                (false, true) => colors::BLUE,
+                (false, false) => continue,
+            };
+            canvas.blend(x as i64, y as i64, color, 0.55);
+        }
+    }
+    canvas.into_image()
+}
+
+/// Square patches, such as descriptors, as enlarged tiles: `side × side` values each, row by row, every tile stretched to
+/// its own contrast.
+///
+/// Values beyond whole patches are left out. Returns an empty picture where `side` is 0 or there is no patch.
+pub fn tile_patches(values: &[f32], side: usize, columns: usize, zoom: usize) -> RgbU8 {
+    let area = side * side;
+    let (columns, zoom) = (columns.max(1), zoom.max(1));
+    let count = values.len().checked_div(area).unwrap_or(0);
+    if count == 0 {
+        return RgbU8::new(0, 0, [0; 3]);
+    }
+    let gap = (zoom * side / 12).max(2);
+    let cell = zoom * side + gap;
+    let used = columns.min(count);
+    let mut canvas = Canvas::new(used * cell + gap, count.div_ceil(columns) * cell + gap, [225, 227, 232]);
+    for (i, patch) in values.chunks_exact(area).enumerate() {
+        let finite = || patch.iter().copied().filter(|v| v.is_finite());
+        let (low, high) = (finite().fold(f32::INFINITY, f32::min), finite().fold(f32::NEG_INFINITY, f32::max));
+        let scale = if high > low { 1.0 / (high - low) } else { 0.0 };
+        let (left, top) = ((i % columns * cell + gap) as i64, (i / columns * cell + gap) as i64);
+        for (j, &v) in patch.iter().enumerate() {
+            let color = if v.is_finite() { [(255.0 * (v - low) * scale) as u8; 3] } else { colors::UNKNOWN };
+            let (x, y) = ((j % side * zoom) as i64, (j / side * zoom) as i64);
+            canvas.fill_rect(left + x, top + y, zoom, zoom, color);
+        }
+    }
+    canvas.into_image()
+}
+
+/// A disparity or depth map against the truth: grey ramp up to `limit`, then red to yellow; black where there is no truth, blue where
+/// the estimate is missing.
+///
+/// The boundary between grey and colour is the threshold of “bad” pixels (2 px for bad-2.0).
+pub fn draw_error_map(estimate: ImageView<'_, f32, 1>, truth: ImageView<'_, f32, 1>, limit: f32) -> RgbU8 {
+    let limit = if limit > 0.0 { limit } else { 1.0 };
+    RgbU8::from_fn(estimate.width().min(truth.width()), estimate.height().min(truth.height()), |x, y| {
+        let (e, [t]) = (estimate.at(x, y)[0], truth.at(x, y));
+        if !t.is_finite() {
+            return colors::BLACK;
+        }
+        if !e.is_finite() {
+            return [40, 90, 200];
+        }
+        let error = (e - t).abs() / limit;
+        if error <= 1.0 {
+            [(245.0 - 95.0 * error) as u8; 3]
+        } else {
+            // Twice the limit is red, eight times and more yellow.
+            let more = (error.log2() / 3.0).clamp(0.0, 1.0);
+            [205 + (more * 50.0) as u8, 30 + (more * 190.0) as u8, 30]
+        }
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cv_core::{Mask, Point2};
+    use proptest::prelude::*;
+
+    fn gray(w: usize, h: usize) -> RgbU8 {
+        RgbU8::new(w, h, [60; 3])
+    }
+
+    #[test]
+    fn inliers_are_green_and_outliers_red_where_they_lie() {
+        let (a, b) = (gray(40, 30), gray(50, 20));
+        let pairs = [Correspondence::new(10.0, 10.0, 20.0, 5.0), Correspondence::new(10.0, 25.0, 20.0, 15.0)];
+        let picture = draw_matches(a.view(), b.view(), &pairs, Some(&[true, false]), &MatchStyle::default());
+        assert_eq!(picture.size(), (90, 30));
+        // The second picture is centred: 5 pixels down, 40 to the right.
+        for (x, y, color) in
+            [(10, 10, colors::GREEN), (60, 10, colors::GREEN), (10, 25, colors::RED), (60, 20, colors::RED)]
+        {
+            let got = picture.at(x, y);
+            assert!((0..3).all(|c| got[c].abs_diff(color[c]) < 8), "{x} {y}: {got:?}");
+        }
+        let only = MatchStyle { outliers: false, ..MatchStyle::default() };
+        let picture = draw_matches(a.view(), b.view(), &pairs, Some(&[true, false]), &only);
+        assert_eq!(picture.at(10, 25), [60; 3]);
+    }
+
+    #[test]
+    fn epipolar_lines_of_a_sideways_motion_are_rows() {
+        // F of a translation along x: x_bᵀ [t]× x_a = 0 with t = (1, 0, 0), so y_a = y_b.
+        let f = Matrix3::new(0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0);
+        let a = gray(60, 40);
+        let pairs = [Correspondence::new(20.0, 12.0, 30.0, 12.0)];
+        let picture = draw_epipolar_lines(a.view(), a.view(), &f, &pairs, 5);
+        let marked = |x: usize, y: usize| picture.at(x, y) != [60; 3];
+        assert!((0..60).all(|x| marked(x, 12)));
+        let start = picture.width() - 60;
+        assert!((start..start + 60).all(|x| marked(x, 12)));
+        assert!(!marked(50, 20) && !marked(start + 50, 3));
+    }
+
+    #[test]
+    fn a_mask_shows_inside_and_rim() {
+        let mask = Mask::from_fn(20, 20, |x, y| [(5..15).contains(&x) && (5..15).contains(&y)]);
+        let picture = overlay_mask(gray(20, 20).view(), mask.view(), [255, 0, 0], 0.5);
+        assert_eq!(picture.at(5, 8), [255, 0, 0]);
+        assert_eq!(picture.at(2, 2), [60; 3]);
+        let [r, g, _] = picture.at(10, 10);
+        assert!(r.abs_diff(157) <= 2 && g.abs_diff(30) <= 2, "{r} {g}");
+    }
+
+    #[test]
+    fn errors_fall_into_their_classes() {
+        let estimate = cv_core::GrayF32::from_vec(4, 1, vec![1.0, 9.0, f32::NAN, 3.0]).unwrap();
+        let truth = cv_core::GrayF32::from_vec(4, 1, vec![1.5, 1.0, 2.0, f32::NAN]).unwrap();
+        let picture = draw_error_map(estimate.view(), truth.view(), 2.0);
+        let [r, g, b] = picture.at(0, 0);
+        assert!(r == g && g == b && r > 150);
+        assert!(picture.at(1, 0)[0] > 200 && picture.at(1, 0)[2] < 50);
+        assert!(picture.at(2, 0)[2] > 150 && picture.at(3, 0) == [0; 3]);
+    }
+
+    #[test]
+    fn tiles_are_counted_right() {
+        let picture = tile_patches(&[0.0, 1.0, 0.5, f32::NAN, 2.0, 2.0, 2.0, 2.0, 7.0], 2, 8, 4);
+        let cell = 4 * 2 + 2;
+        assert_eq!(picture.size(), (2 * cell + 2, cell + 2));
+        assert_eq!((picture.at(2, 2), picture.at(6, 2), picture.at(6, 6)), ([0; 3], [255; 3], colors::UNKNOWN));
+        assert!(tile_patches(&[], 8, 4, 2).is_empty() && tile_patches(&[1.0], 0, 4, 2).is_empty());
+    }
+
+    proptest! {
+        #[test]
+        fn wild_input_never_panics(values in prop::array::uniform9(prop::num::f64::ANY), w in 0usize..9, h in 0usize..9) {
+            let a = gray(w, h);
+            let pairs = [Correspondence::new(values[0], values[1], values[2], values[3])];
+            draw_matches(a.view(), a.view(), &pairs, None, &MatchStyle::default());
+            draw_epipolar_lines(a.view(), a.view(), &Matrix3::from_row_slice(&values), &pairs, 3);
+            let mut point = Keypoint::new(values[0] as f32, values[1] as f32, 0.0);
+            (point.scale, point.angle) = (values[2] as f32, values[3] as f32);
+            draw_keypoints(a.view(), &[point], colors::RED);
+            let p = Point2::new(1.0, 2.0);
+            draw_epipolar_lines(a.view(), a.view(), &Matrix3::identity(), &[Correspondence { a: p, b: p }], 0);
+        }
+    }
+}

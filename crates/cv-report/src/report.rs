@@ -1,0 +1,366 @@
+//! One self-contained HTML file: text, tables, pictures, plots and point clouds.
+
+use std::fmt::Write as _;
+
+use crate::base64;
+use crate::plot::Plot;
+use crate::viewer::PointScene;
+
+const STYLE: &str = include_str!("assets/report.css");
+const SCRIPT: &str = include_str!("assets/report.js");
+const VIEWER: &str = include_str!("assets/viewer.js");
+
+/// Makes text safe inside HTML and SVG, between tags and in quoted attributes.
+pub(crate) fn escape(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            '&' => out.push_str("&amp;"),
+            '<' => out.push_str("&lt;"),
+            '>' => out.push_str("&gt;"),
+            '"' => out.push_str("&quot;"),
+            '\'' => out.push_str("&#39;"),
+            // Control characters have no place in a document.
+            c if c.is_control() && !matches!(c, '\n' | '\t') => out.push('\u{fffd}'),
+            c => out.push(c),
+        }
+    }
+    out
+}
+
+/// A picture with its words.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Figure {
+    bytes: Vec<u8>,
+    alt: String,
+    caption: String,
+}
+
+impl Figure {
+    /// `bytes` are those of a PNG or JPEG file. `caption` is printed below the picture, and read out in its place.
+    pub fn new(bytes: Vec<u8>, caption: &str) -> Self {
+        Self { bytes, alt: caption.to_owned(), caption: caption.to_owned() }
+    }
+
+    /// With a description for those who cannot see the picture, other than its caption.
+    #[must_use]
+    pub fn alt(self, alt: &str) -> Self {
+        Self { alt: alt.to_owned(), ..self }
+    }
+
+    /// Width and height by the header of a PNG.
+    fn png_size(&self) -> Option<(u32, u32)> {
+        let header = self.bytes.get(..24)?;
+        header.starts_with(b"\x89PNG").then(|| {
+            let side = |at: usize| u32::from_be_bytes([header[at], header[at + 1], header[at + 2], header[at + 3]]);
+            (side(16), side(20))
+        })
+    }
+}
+
+/// How a note is meant.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Note {
+    /// It went well.
+    Good,
+    /// Something to know.
+    Info,
+    /// Something to be careful about.
+    Warning,
+    /// It could not be done.
+    Failure,
+}
+
+/// Builds a report from top to bottom; [`Report::to_html`] gives the file.
+///
+/// Everything handed in is text, never markup. The file needs no network and no other file.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Report {
+    title: String,
+    subtitle: String,
+    headline: Vec<(String, String)>,
+    sections: Vec<String>,
+    body: String,
+    figures: usize,
+    tables: usize,
+    has_viewer: bool,
+    footer: String,
+}
+
+impl Report {
+    /// An empty report.
+    pub fn new(title: &str) -> Self {
+        Self {
+            title: title.to_owned(),
+            subtitle: String::new(),
+            headline: Vec::new(),
+            sections: Vec::new(),
+            body: String::new(),
+            figures: 0,
+            tables: 0,
+            has_viewer: false,
+            footer: String::new(),
+        }
+    }
+
+    /// A line below the title, such as the names of the inputs.
+    pub fn subtitle(&mut self, text: &str) -> &mut Self {
+        self.subtitle = text.to_owned();
+        self
+    }
+
+    /// A line at the end, such as version and command.
+    pub fn footer(&mut self, text: &str) -> &mut Self {
+        self.footer = text.to_owned();
+        self
+    }
+
+    /// A figure of merit for the row of tiles at the top: what it is, and its value with the unit.
+    pub fn headline(&mut self, label: &str, value: &str) -> &mut Self {
+        self.headline.push((label.to_owned(), value.to_owned()));
+        self
+    }
+
+    /// Begins a section; it is listed in the contents.
+    pub fn section(&mut self, title: &str) -> &mut Self {
+        self.sections.push(title.to_owned());
+        let _ = write!(self.body, "<h2 id=\"s{}\">{}</h2>", self.sections.len(), escape(title));
+        self
+    }
+
+    /// A paragraph.
+    pub fn paragraph(&mut self, text: &str) -> &mut Self {
+        let _ = write!(self.body, "<p>{}</p>", escape(text));
+        self
+    }
+
+    /// A paragraph that stands out.
+    pub fn note(&mut self, kind: Note, text: &str) -> &mut Self {
+        let (class, word) = match kind {
+            Note::Good => ("good", "Good"),
+            Note::Info => ("info", "Note"),
+            Note::Warning => ("warning", "Careful"),
+            Note::Failure => ("failure", "Failed"),
+        };
+        let _ = write!(self.body, "<p class=\"note {class}\"><strong>{word}.</strong> {}</p>", escape(text));
+        self
+    }
+
+    /// A table of names and values.
+    pub fn facts<K: AsRef<str>, V: AsRef<str>>(&mut self, rows: &[(K, V)]) -> &mut Self {
+        self.body.push_str("<table class=\"facts\"><tbody>");
+        for (key, value) in rows {
+            let _ = write!(
+                self.body,
+                "<tr><th scope=\"row\">{}</th><td>{}</td></tr>",
+                escape(key.as_ref()),
+                escape(value.as_ref())
+            );
+        }
+        self.body.push_str("</tbody></table>");
+        self
+    }
+
+    /// A table with a head. Cells that read as numbers are set flush right.
+    pub fn table<S: AsRef<str>>(&mut self, caption: &str, head: &[&str], rows: &[Vec<S>]) -> &mut Self {
+        self.tables += 1;
+        let numeric = |column: usize| {
+            rows.iter().all(|r| r.get(column).is_none_or(|c| is_numeric(c.as_ref())))
+                && rows.iter().any(|r| r.get(column).is_some_and(|c| !c.as_ref().is_empty()))
+        };
+        let numeric: Vec<bool> = (0..head.len()).map(numeric).collect();
+        let class = |column: usize| if numeric.get(column) == Some(&true) { " class=\"n\"" } else { "" };
+        let _ = write!(
+            self.body,
+            "<div class=\"scroll\"><table><caption><b>Table {}.</b> {}</caption><thead><tr>",
+            self.tables,
+            escape(caption)
+        );
+        for (i, cell) in head.iter().enumerate() {
+            let _ = write!(self.body, "<th scope=\"col\"{}>{}</th>", class(i), escape(cell));
+        }
+        self.body.push_str("</tr></thead><tbody>");
+        for row in rows {
+            self.body.push_str("<tr>");
+            for (i, cell) in row.iter().enumerate() {
+                let _ = write!(self.body, "<td{}>{}</td>", class(i), escape(cell.as_ref()));
+            }
+            self.body.push_str("</tr>");
+        }
+        self.body.push_str("</tbody></table></div>");
+        self
+    }
+
+    /// A picture over the full width.
+    pub fn figure(&mut self, figure: Figure) -> &mut Self {
+        self.push_figure(&figure);
+        self
+    }
+
+    /// Pictures beside each other, as many in a row as fit.
+    pub fn figures(&mut self, figures: Vec<Figure>) -> &mut Self {
+        self.body.push_str("<div class=\"grid\">");
+        figures.iter().for_each(|f| self.push_figure(f));
+        self.body.push_str("</div>");
+        self
+    }
+
+    fn push_figure(&mut self, figure: &Figure) {
+        self.figures += 1;
+        let kind = if figure.bytes.starts_with(&[0xff, 0xd8]) { "jpeg" } else { "png" };
+        let size = match figure.png_size() {
+            Some((w, h)) => format!(" width=\"{w}\" height=\"{h}\""),
+            None => String::new(),
+        };
+        // Small pictures such as tiles are enlarged with their pixels kept square.
+        let class = if figure.png_size().is_some_and(|(w, _)| w < 320) { " class=\"small\"" } else { "" };
+        let _ = write!(
+            self.body,
+            "<figure{class}><img alt=\"{}\"{size} src=\"data:image/{kind};base64,{}\">",
+            escape(&figure.alt),
+            base64::encode(&figure.bytes)
+        );
+        self.push_caption(&figure.caption);
+        self.body.push_str("</figure>");
+    }
+
+    fn push_caption(&mut self, caption: &str) {
+        let _ = write!(self.body, "<figcaption><b>Figure {}.</b> {}</figcaption>", self.figures, escape(caption));
+    }
+
+    /// A plot.
+    pub fn plot(&mut self, plot: &Plot, caption: &str) -> &mut Self {
+        self.plots(&[(plot, caption)])
+    }
+
+    /// Plots beside each other.
+    pub fn plots(&mut self, plots: &[(&Plot, &str)]) -> &mut Self {
+        self.body.push_str("<div class=\"grid\">");
+        for (plot, caption) in plots {
+            self.figures += 1;
+            let _ = write!(self.body, "<figure>{}", plot.to_svg());
+            self.push_caption(caption);
+            self.body.push_str("</figure>");
+        }
+        self.body.push_str("</div>");
+        self
+    }
+
+    /// A cloud of points that can be turned, with cameras. `fallback` is a still picture (PNG or JPEG bytes) for paper and for
+    /// browsers without WebGL 2.
+    pub fn points(&mut self, scene: &PointScene, fallback: Option<Vec<u8>>, caption: &str) -> &mut Self {
+        self.figures += 1;
+        self.has_viewer = true;
+        let _ = write!(self.body, "<figure class=\"cloud\" data-scene=\"{}\">", escape(&scene.to_json()));
+        if let Some(bytes) = fallback {
+            let figure = Figure::new(bytes, caption);
+            let kind = if figure.bytes.starts_with(&[0xff, 0xd8]) { "jpeg" } else { "png" };
+            let _ = write!(
+                self.body,
+                "<img class=\"still\" alt=\"{}\" src=\"data:image/{kind};base64,{}\">",
+                escape(caption),
+                base64::encode(&figure.bytes)
+            );
+        }
+        self.push_caption(caption);
+        self.body.push_str("</figure>");
+        self
+    }
+
+    /// The file.
+    pub fn to_html(&self) -> String {
+        let mut html = String::with_capacity(self.body.len() + STYLE.len() + VIEWER.len() + 4096);
+        let _ = write!(
+            html,
+            "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
+             <meta name=\"viewport\" content=\"width=device-width,initial-scale=1\">\
+             <meta name=\"color-scheme\" content=\"light dark\"><title>{0}</title>\
+             <link rel=\"icon\" href=\"data:,\"><style>{STYLE}</style></head>\n<body><header><h1>{0}</h1>",
+            escape(&self.title)
+        );
+        if !self.subtitle.is_empty() {
+            let _ = write!(html, "<p class=\"subtitle\">{}</p>", escape(&self.subtitle));
+        }
+        if !self.headline.is_empty() {
+            html.push_str("<dl class=\"headline\">");
+            for (label, value) in &self.headline {
+                let _ = write!(html, "<div><dt>{}</dt><dd>{}</dd></div>", escape(label), escape(value));
+            }
+            html.push_str("</dl>");
+        }
+        html.push_str("</header>\n");
+        if self.sections.len() > 2 {
+            html.push_str("<nav aria-label=\"Contents\"><ol>");
+            for (i, title) in self.sections.iter().enumerate() {
+                let _ = write!(html, "<li><a href=\"#s{}\">{}</a></li>", i + 1, escape(title));
+            }
+            html.push_str("</ol></nav>\n");
+        }
+        let _ = write!(html, "<main>{}</main>\n<footer>{}</footer>\n", self.body, escape(&self.footer));
+        let _ = write!(html, "<script>{SCRIPT}</script>");
+        if self.has_viewer {
+            let _ = write!(html, "<script>{VIEWER}</script>");
+        }
+        html.push_str("</body></html>\n");
+        html
+    }
+}
+
+/// True for a number with at most a unit behind it, and for the dash that stands for none.
+fn is_numeric(cell: &str) -> bool {
+    let first = cell.split([' ', '%']).next().unwrap_or("");
+    let digits = first.replace([',', '\u{2009}', '×'], "").replace('−', "-");
+    matches!(cell, "" | "–" | "-" | "—") || digits.parse::<f64>().is_ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn text_is_never_markup() {
+        let mut report = Report::new("<script>alert(1)</script>");
+        report
+            .subtitle("a & b")
+            .headline("<b>", "\"1\"")
+            .section("s' <i>")
+            .paragraph("x < y\u{0}")
+            .note(Note::Warning, "<u>")
+            .facts(&[("k<", "v>")])
+            .table("c<", &["h<"], &[vec!["d<"]])
+            .figure(Figure::new(vec![1, 2, 3], "\" onload=\"alert(2)"))
+            .footer("<hr>");
+        let html = report.to_html();
+        let body = &html[html.find("<body>").unwrap()..html.find("<script>").unwrap()];
+        for bad in ["alert(1)<", "<i>", "<u>", "\" onload", "<hr>", "x < y", "\u{0}"] {
+            assert!(!body.contains(bad), "{bad}");
+        }
+        assert!(body.contains("x &lt; y") && body.contains("&quot; onload"));
+    }
+
+    #[test]
+    fn the_file_refers_to_nothing_outside_itself() {
+        let mut report = Report::new("t");
+        report.section("a").figure(Figure::new(b"\xff\xd8\xff".to_vec(), "c")).plot(&Plot::new("p", "x", "y"), "c");
+        let html = report.to_html();
+        // The namespace of SVG is a name, not an address.
+        let html = html.replace("http://www.w3.org/2000/svg", "");
+        for outside in ["http://", "https://", "url(", "@import", "src=\"/", "<link rel=\"stylesheet"] {
+            assert!(!html.contains(outside), "{outside}");
+        }
+        assert!(html.contains("data:image/jpeg;base64,/9j/"));
+    }
+
+    #[test]
+    fn figures_and_tables_are_numbered_in_order() {
+        let mut report = Report::new("t");
+        report.figures(vec![Figure::new(vec![0], "one"), Figure::new(vec![0], "two")]);
+        report.plot(&Plot::new("p", "x", "y"), "three");
+        report.table("first", &["a", "b"], &[vec!["x", "1.5 px"], vec!["y", "–"]]);
+        let html = report.to_html();
+        for text in ["Figure 1.</b> one", "Figure 2.</b> two", "Figure 3.</b> three", "Table 1.</b> first"] {
+            assert!(html.contains(text), "{text}");
+        }
+        assert!(html.contains("<td class=\"n\">1.5 px</td>") && html.contains("<td>x</td>"));
+    }
+}

@@ -1,0 +1,294 @@
+//! Point clouds and cameras: for the viewer inside the report, and as still pictures.
+
+use std::fmt::Write as _;
+
+use cv_core::{Camera, Point2, Point3, Pose, RgbU8};
+
+use crate::base64;
+use crate::canvas::{Canvas, Color, colors};
+
+/// Points and cameras in one world (X right, Y down, Z forward, as the first camera sees it).
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct PointScene {
+    points: Vec<[f32; 3]>,
+    colors: Vec<Color>,
+    frusta: Vec<Frustum>,
+    left_out: usize,
+}
+
+/// A camera's outline: its centre and the corners of its picture, in the world, at distance 1.
+#[derive(Debug, Clone, PartialEq)]
+struct Frustum {
+    center: Point3<f64>,
+    /// From the centre to the corners, top left first, clockwise; `z` along the axis is 1.
+    rays: [[f64; 3]; 4],
+    /// The direction of the optical axis.
+    axis: [f64; 3],
+    color: Color,
+}
+
+impl PointScene {
+    /// The most points kept; 16 bytes each in the file. A larger cloud is thinned evenly.
+    pub const MAX_POINTS: usize = 400_000;
+
+    /// A scene of points with a colour each (white where there are too few colours). Points that are not finite are left out.
+    pub fn new(points: &[[f32; 3]], colors: &[Color]) -> Self {
+        let usable: Vec<usize> = (0..points.len()).filter(|&i| points[i].iter().all(|v| v.is_finite())).collect();
+        let kept = usable.len().min(Self::MAX_POINTS);
+        let chosen = (0..kept).map(|i| usable[(i as u64 * usable.len() as u64 / kept as u64) as usize]);
+        let (points, colors) = chosen.map(|i| (points[i], colors.get(i).copied().unwrap_or([255; 3]))).unzip();
+        Self { points, colors, frusta: Vec::new(), left_out: usable.len() - kept }
+    }
+
+    /// Adds a camera.
+    pub fn camera(&mut self, camera: &Camera, pose: &Pose, color: Color) -> &mut Self {
+        let (w, h) = (camera.width as f64, camera.height as f64);
+        let corners = [(-0.5, -0.5), (w - 0.5, -0.5), (w - 0.5, h - 0.5), (-0.5, h - 0.5)];
+        let to_world = pose.rotation.inverse();
+        let ray = |(x, y): (f64, f64)| {
+            let n = camera.normalize(Point2::new(x, y));
+            // A corner the lens model cannot place: as a pinhole would.
+            let n = if n.coords.iter().all(|v| v.is_finite()) {
+                n
+            } else {
+                Point2::new((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
+            };
+            (to_world * nalgebra_vector(n)).into()
+        };
+        let rays: [[f64; 3]; 4] = corners.map(ray);
+        let axis: [f64; 3] = (to_world * cv_core::Vector3::z()).into();
+        let center = pose.center();
+        if rays.iter().flatten().chain(center.coords.iter()).all(|v| v.is_finite()) {
+            self.frusta.push(Frustum { center, rays, axis, color });
+        }
+        self
+    }
+
+    /// How many points were thinned out.
+    pub fn left_out(&self) -> usize {
+        self.left_out
+    }
+
+    /// The middle of the points (median by axis) and the distance from it that 90 % of them keep. Without points, of the cameras.
+    fn extent(&self) -> ([f32; 3], f32) {
+        let mut points = self.points.clone();
+        if points.is_empty() {
+            points = self.frusta.iter().map(|f| [f.center.x as f32, f.center.y as f32, f.center.z as f32]).collect();
+        }
+        if points.is_empty() {
+            return ([0.0; 3], 1.0);
+        }
+        let middle = points.len() / 2;
+        let center: [f32; 3] =
+            std::array::from_fn(|i| points.select_nth_unstable_by(middle, |a, b| a[i].total_cmp(&b[i])).1[i]);
+        let mut distances: Vec<f32> = points.iter().map(|&p| distance(p, center)).collect();
+        let most = (distances.len() * 9 / 10).min(distances.len() - 1);
+        let radius = *distances.select_nth_unstable_by(most, f32::total_cmp).1;
+        (center, if radius > 0.0 && radius.is_finite() { radius } else { 1.0 })
+    }
+
+    /// How far from its centre a camera's picture is drawn: a small part of the scene.
+    fn frustum_depth(&self) -> f32 {
+        let (center, radius) = self.extent();
+        let near = self
+            .frusta
+            .iter()
+            .map(|f| distance([f.center.x as f32, f.center.y as f32, f.center.z as f32], center))
+            .fold(f32::INFINITY, f32::min);
+        0.12 * radius.max(near.min(4.0 * radius))
+    }
+
+    /// The corners and the tip of every frustum as line segments with a colour.
+    fn segments(&self) -> Vec<([f32; 3], [f32; 3], Color)> {
+        let depth = f64::from(self.frustum_depth());
+        let mut out = Vec::new();
+        for f in &self.frusta {
+            let at = |ray: &[f64; 3]| {
+                [f.center.x + depth * ray[0], f.center.y + depth * ray[1], f.center.z + depth * ray[2]]
+                    .map(|v| v as f32)
+            };
+            let tip = [f.center.x as f32, f.center.y as f32, f.center.z as f32];
+            for i in 0..4 {
+                out.push((tip, at(&f.rays[i]), f.color));
+                out.push((at(&f.rays[i]), at(&f.rays[(i + 1) % 4]), f.color));
+            }
+        }
+        out
+    }
+
+    /// What the viewer's script reads: the box of the scene, the first camera, and the points as base64 of 16 bytes each
+    /// (x, y, z as little-endian `f32`; red, green, blue, 255), lines likewise.
+    pub(crate) fn to_json(&self) -> String {
+        let (center, radius) = self.extent();
+        let mut points = Vec::with_capacity(self.points.len() * 16);
+        let push = |bytes: &mut Vec<u8>, p: [f32; 3], c: Color| {
+            p.iter().for_each(|v| bytes.extend_from_slice(&v.to_le_bytes()));
+            bytes.extend_from_slice(&[c[0], c[1], c[2], 255]);
+        };
+        self.points.iter().zip(&self.colors).for_each(|(p, c)| push(&mut points, *p, *c));
+        let mut lines = Vec::new();
+        for (a, b, color) in self.segments() {
+            push(&mut lines, a, color);
+            push(&mut lines, b, color);
+        }
+        let mut json = format!("{{\"center\":[{},{},{}],\"radius\":{radius}", center[0], center[1], center[2]);
+        if let Some(f) = self.frusta.first() {
+            let _ = write!(json, ",\"eye\":[{},{},{}]", f.center.x as f32, f.center.y as f32, f.center.z as f32);
+        }
+        let _ = write!(
+            json,
+            ",\"count\":{},\"points\":\"{}\",\"lines\":\"{}\"}}",
+            self.points.len(),
+            base64::encode(&points),
+            base64::encode(&lines)
+        );
+        json
+    }
+}
+
+fn nalgebra_vector(n: Point2<f64>) -> cv_core::Vector3<f64> {
+    cv_core::Vector3::new(n.x, n.y, 1.0)
+}
+
+fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
+    (0..3).map(|i| (a[i] - b[i]) * (a[i] - b[i])).sum::<f32>().sqrt()
+}
+
+/// From where a still picture of a scene is taken.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Viewpoint {
+    /// From behind the first camera, a little above: what it saw, with depth.
+    Camera,
+    /// From above, forward up: a map.
+    Top,
+    /// From the right side.
+    Side,
+}
+
+/// A still picture of a scene on a dark ground, `width × height` pixels.
+pub fn render_points(scene: &PointScene, viewpoint: Viewpoint, width: usize, height: usize) -> RgbU8 {
+    const GROUND: Color = [20, 22, 28];
+    let mut canvas = Canvas::new(width, height, GROUND);
+    if width == 0 || height == 0 {
+        return canvas.into_image();
+    }
+    let (center, radius) = scene.extent();
+    let center = Point3::new(f64::from(center[0]), f64::from(center[1]), f64::from(center[2]));
+    let radius = f64::from(radius);
+    let (forward, up) = match (viewpoint, scene.frusta.first()) {
+        (Viewpoint::Top, _) => (cv_core::Vector3::y(), cv_core::Vector3::z()),
+        (Viewpoint::Side, _) => (-cv_core::Vector3::x(), -cv_core::Vector3::y()),
+        (Viewpoint::Camera, Some(f)) => {
+            let axis = cv_core::Vector3::from(f.axis);
+            (axis + cv_core::Vector3::y() * 0.35 + cv_core::Vector3::x() * 0.25, -cv_core::Vector3::y())
+        }
+        (Viewpoint::Camera, None) => (cv_core::Vector3::new(0.25, 0.35, 1.0), -cv_core::Vector3::y()),
+    };
+    let forward = forward.try_normalize(1e-9).unwrap_or_else(cv_core::Vector3::z);
+    // Everything that counts fits: the points' bulk and every camera.
+    let reach = scene
+        .frusta
+        .iter()
+        .map(|f| (f.center - center).norm() + f64::from(scene.frustum_depth()))
+        .fold(radius * 1.15, f64::max);
+    let (distance, focal) = match viewpoint {
+        Viewpoint::Camera => (2.6 * reach, 1.15),
+        // Far away: the picture of a plan.
+        Viewpoint::Top | Viewpoint::Side => (40.0 * reach, 19.0),
+    };
+    let eye = center - forward * distance;
+    let Some(pose) = Pose::look_at(eye, center, -up) else { return canvas.into_image() };
+    let scale = focal * width.min(height) as f64;
+    let project = |p: [f32; 3]| {
+        let q = pose.transform(&Point3::new(f64::from(p[0]), f64::from(p[1]), f64::from(p[2])));
+        (q.z > 0.05 * distance).then(|| {
+            let s = scale / q.z;
+            ([(q.x * s + width as f64 / 2.0) as f32, (q.y * s + height as f64 / 2.0) as f32], q.z as f32)
+        })
+    };
+    let size = (width.min(height) as f32 / 500.0).clamp(1.0, 3.0);
+    let side = (1.5 * size).round() as usize;
+    // Far points first, near ones over them.
+    let mut order: Vec<(f32, [f32; 2], Color)> =
+        scene.points.iter().zip(&scene.colors).filter_map(|(p, c)| project(*p).map(|(q, z)| (z, q, *c))).collect();
+    order.sort_by(|a, b| b.0.total_cmp(&a.0));
+    for (_, q, color) in order {
+        let corner = q.map(|v| (v - side as f32 / 2.0 + 0.5).floor() as i64);
+        canvas.fill_rect(corner[0], corner[1], side, side, color);
+    }
+    for (a, b, color) in scene.segments() {
+        if let (Some((a, _)), Some((b, _))) = (project(a), project(b)) {
+            canvas.line(a, b, 1.4 * size, color);
+        }
+    }
+    let name = match viewpoint {
+        Viewpoint::Camera => "",
+        Viewpoint::Top => "from above",
+        Viewpoint::Side => "from the side",
+    };
+    canvas.text(10.0 * size, 10.0 * size, name, 9.0 * size, [170, 176, 190]);
+    canvas.into_image()
+}
+
+/// Colours for cameras, in order.
+pub fn camera_color(index: usize) -> Color {
+    [colors::ORANGE, colors::CYAN, colors::MAGENTA, colors::GREEN, colors::YELLOW][index % 5]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cv_core::{Rotation3, Vector3};
+
+    #[test]
+    fn a_point_ahead_is_drawn_in_its_colour_and_wild_ones_are_left_out() {
+        let points = [[0.0, 0.0, 5.0], [f32::NAN, 0.0, 1.0], [0.0, f32::INFINITY, 0.0]];
+        let scene = PointScene::new(&points, &[[255, 0, 0]; 3]);
+        assert_eq!(scene.points.len(), 1);
+        for view in [Viewpoint::Camera, Viewpoint::Top, Viewpoint::Side] {
+            let picture = render_points(&scene, view, 101, 81);
+            assert!(picture.pixels().any(|p| p == [255, 0, 0]), "{view:?}");
+        }
+        assert!(render_points(&scene, Viewpoint::Top, 0, 0).is_empty());
+        assert!(!render_points(&PointScene::default(), Viewpoint::Camera, 20, 20).is_empty());
+    }
+
+    #[test]
+    fn above_is_up_and_right_is_right_in_the_map() {
+        // Most points around the origin, a few ahead on the right: in a map with forward up, those are upper right.
+        let mut points: Vec<_> =
+            (0..40).map(|i| [(i % 7) as f32 * 0.1 - 0.3, 0.0, (i % 5) as f32 * 0.1 - 0.2]).collect();
+        let mut ink = vec![[90, 90, 90]; 40];
+        points.extend([[1.0, 0.0, 1.0]; 6]);
+        ink.extend([[255, 0, 0]; 6]);
+        let scene = PointScene::new(&points, &ink);
+        let picture = render_points(&scene, Viewpoint::Top, 200, 200);
+        let red: Vec<_> = (0..200)
+            .flat_map(|y| (0..200).map(move |x| (x, y)))
+            .filter(|&(x, y)| picture.at(x, y) == [255, 0, 0])
+            .collect();
+        assert!(!red.is_empty() && red.iter().all(|&(x, y)| x > 100 && y < 100), "{red:?}");
+    }
+
+    #[test]
+    fn a_frustum_is_the_cameras_own() {
+        let camera = Camera::pinhole(200, 100, 100.0, 100.0, 99.5, 49.5);
+        let pose = Pose::new(Rotation3::identity(), Vector3::new(-1.0, 0.0, 0.0));
+        let mut scene = PointScene::new(&[[0.0, 0.0, 10.0]], &[]);
+        scene.camera(&camera, &pose, colors::ORANGE);
+        let f = &scene.frusta[0];
+        assert_eq!(f.center, Point3::new(1.0, 0.0, 0.0));
+        assert_eq!(f.rays[0], [-1.0, -0.5, 1.0]);
+        assert_eq!(f.rays[2], [1.0, 0.5, 1.0]);
+        assert_eq!(scene.segments().len(), 8);
+    }
+
+    #[test]
+    fn large_clouds_are_thinned_evenly() {
+        let n = PointScene::MAX_POINTS + 1000;
+        let points: Vec<_> = (0..n).map(|i| [i as f32, 0.0, 0.0]).collect();
+        let scene = PointScene::new(&points, &[]);
+        assert_eq!((scene.points.len(), scene.left_out()), (PointScene::MAX_POINTS, 1000));
+        assert!(scene.points.windows(2).all(|p| p[1][0] - p[0][0] <= 2.0));
+    }
+}
