@@ -29,12 +29,14 @@ mod camera;
 mod features;
 mod image;
 mod pose;
+mod rig;
 mod view;
 
 pub use camera::{Camera, CameraError, Distortion};
 pub use features::{Correspondence, DMatch, Keypoint};
 pub use image::{GrayF32, GrayU8, Image, ImageError, Mask, RgbF32, RgbU8, Sample};
 pub use pose::Pose;
+pub use rig::StereoRig;
 pub use view::{ImageView, ImageViewMut};
 
 pub use nalgebra;

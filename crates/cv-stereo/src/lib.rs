@@ -8,7 +8,9 @@
 
 mod aligned;
 mod census;
+mod depth;
 mod error;
+mod evaluate;
 mod fill;
 mod input;
 mod kernel;
@@ -21,7 +23,9 @@ mod sgm;
 mod speckle;
 mod winner;
 
+pub use depth::{CloudPoint, GeometryError, StereoGeometry};
 pub use error::StereoError;
+pub use evaluate::{BAD_THRESHOLDS, DisparityScores, EvaluateError, evaluate_disparity, non_occluded};
 pub use input::Intensity;
 pub use matcher::{DisparityMap, PixelState, StereoMatcher};
 pub use options::{Census, Paths, StereoOptions, Subpixel};

@@ -1,0 +1,22 @@
+//! Two cameras that are bolted together.
+
+use crate::{Camera, Pose};
+
+/// A stereo rig: two cameras and where the right one stands.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StereoRig {
+    /// The left (or upper) camera.
+    pub left: Camera,
+    /// The right (or lower) camera.
+    pub right: Camera,
+    /// Takes coordinates of the left camera's frame to the right one's: `x_right = R x_left + t`. The unit of `t` is the
+    /// unit of every depth computed with the rig.
+    pub right_from_left: Pose,
+}
+
+impl StereoRig {
+    /// Distance between the two camera centres, in the unit of the rig.
+    pub fn baseline(&self) -> f64 {
+        self.right_from_left.translation.norm()
+    }
+}
