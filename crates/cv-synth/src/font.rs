@@ -1,10 +1,10 @@
-//! A stroke font of capitals and digits: letters as polylines, so that printed matter stays sharp at any size.
+//! A stroke font of capitals: letters as polylines, so that printed matter stays sharp at any size.
 
 use crate::noise::{edge, floor};
-use crate::rng::{hash2, unit};
+use crate::rng::hash2;
 
 /// Strokes on a grid 4 wide and 6 high, origin at the top left.
-const GLYPHS: [&[&[(u8, u8)]]; 36] = [
+const GLYPHS: [&[&[(u8, u8)]]; 26] = [
     &[&[(0, 6), (2, 0), (4, 6)], &[(1, 4), (3, 4)]],
     &[&[(0, 0), (0, 6), (3, 6), (4, 5), (4, 4), (3, 3), (0, 3)], &[(0, 0), (3, 0), (4, 1), (4, 2), (3, 3)]],
     &[&[(4, 1), (3, 0), (1, 0), (0, 1), (0, 5), (1, 6), (3, 6), (4, 5)]],
@@ -31,33 +31,74 @@ const GLYPHS: [&[&[(u8, u8)]]; 36] = [
     &[&[(0, 0), (4, 6)], &[(4, 0), (0, 6)]],
     &[&[(0, 0), (2, 3), (4, 0)], &[(2, 3), (2, 6)]],
     &[&[(0, 0), (4, 0), (0, 6), (4, 6)]],
-    &[&[(1, 0), (3, 0), (4, 1), (4, 5), (3, 6), (1, 6), (0, 5), (0, 1), (1, 0)], &[(0, 5), (4, 1)]],
-    &[&[(0, 1), (2, 0), (2, 6)]],
-    &[&[(0, 1), (1, 0), (3, 0), (4, 1), (4, 2), (0, 6), (4, 6)]],
-    &[&[(0, 0), (4, 0), (2, 2), (4, 4), (4, 5), (3, 6), (1, 6), (0, 5)]],
-    &[&[(3, 6), (3, 0), (0, 4), (4, 4)]],
-    &[&[(4, 0), (0, 0), (0, 3), (3, 3), (4, 4), (4, 5), (3, 6), (0, 6)]],
-    &[&[(4, 0), (1, 1), (0, 3), (0, 5), (1, 6), (3, 6), (4, 5), (4, 4), (3, 3), (0, 3)]],
-    &[&[(0, 0), (4, 0), (1, 6)]],
-    &[&[
-        (1, 3),
-        (0, 2),
-        (0, 1),
-        (1, 0),
-        (3, 0),
-        (4, 1),
-        (4, 2),
-        (3, 3),
-        (1, 3),
-        (0, 4),
-        (0, 5),
-        (1, 6),
-        (3, 6),
-        (4, 5),
-        (4, 4),
-        (3, 3),
-    ]],
-    &[&[(0, 6), (3, 5), (4, 3), (4, 1), (3, 0), (1, 0), (0, 1), (0, 2), (1, 3), (4, 3)]],
+];
+
+/// What is printed on posters and books.
+const WORDS: [&str; 64] = [
+    "THE",
+    "OF",
+    "AND",
+    "A",
+    "IN",
+    "TO",
+    "AT",
+    "ON",
+    "BY",
+    "FOR",
+    "LIGHT",
+    "RIVER",
+    "NIGHT",
+    "MUSIC",
+    "SUMMER",
+    "GARDEN",
+    "CITY",
+    "NORTH",
+    "WINTER",
+    "OPEN",
+    "HOUSE",
+    "JAZZ",
+    "FIELD",
+    "STONE",
+    "PAPER",
+    "HARBOUR",
+    "MARKET",
+    "LETTERS",
+    "ISLAND",
+    "MAPS",
+    "TRAVEL",
+    "SONGS",
+    "HISTORY",
+    "QUIET",
+    "GLASS",
+    "ORCHARD",
+    "MOUNTAIN",
+    "BRIDGE",
+    "SEVEN",
+    "DAYS",
+    "WIND",
+    "COLOUR",
+    "FORM",
+    "LINE",
+    "EXHIBITION",
+    "THEATRE",
+    "SPRING",
+    "WALK",
+    "KITCHEN",
+    "BREAD",
+    "VOYAGE",
+    "CLOUDS",
+    "FOX",
+    "UNDER",
+    "OLD",
+    "NEW",
+    "PARK",
+    "DUST",
+    "VIOLIN",
+    "WHITE",
+    "BLUE",
+    "JOURNEY",
+    "HOME",
+    "AUTUMN",
 ];
 
 /// Distance to the strokes of a glyph, in grid units.
@@ -84,20 +125,30 @@ pub(crate) fn text(u: f32, v: f32, size: f32, line: f32, weight: f32, seed: u32,
     let unit_length = size / 6.0;
     let pitch = 5.6 * unit_length;
     let (row, column) = (floor(v / (1.8 * size)), floor(u / pitch));
-    let columns = (line / pitch) as i32;
-    let ragged = (unit(hash2(row, -1, seed)) * 0.3 * columns as f32) as i32;
-    if u < 0.0 || v < 0.0 || column >= columns - ragged {
+    if u < 0.0 || v < 0.0 || u > line {
         return 0.0;
     }
-    let code = hash2(column, row, seed);
-    if code.is_multiple_of(6) && column > 0 {
-        return 0.0;
-    }
+    // The word at this column; a line ends before the first word that does not fit, but has one at least.
+    let (mut start, mut count) = (0, 0);
+    let letter = loop {
+        let word = WORDS[hash2(count, row, seed) as usize % WORDS.len()].as_bytes();
+        let end = start + word.len() as i32;
+        if count > 0 && end as f32 * pitch > line {
+            return 0.0;
+        }
+        if column < end {
+            break word[(column - start) as usize];
+        }
+        if column == end {
+            return 0.0;
+        }
+        (start, count) = (end + 1, count + 1);
+    };
     // Text too small to read is a grey.
     if width > 2.5 * unit_length {
         return 0.35 * weight;
     }
     let x = u / unit_length - column as f32 * 5.6 - 0.8;
     let y = v / unit_length - row as f32 * 10.8 - 0.8;
-    edge(weight - distance(code as usize >> 3, x, y), width / unit_length)
+    edge(weight - distance(usize::from(letter.saturating_sub(b'A')), x, y), width / unit_length)
 }

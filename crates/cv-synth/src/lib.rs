@@ -51,5 +51,5 @@ pub use sets::{
     BallPhoto, HomographyPair, PanoramaOptions, PanoramaViews, StereoPair, TwoView, ball_photos, homography_pair,
     panorama_views, stereo_pair, two_view,
 };
-pub use texture::{Rgb, Texture, srgb};
+pub use texture::{Collage, Rgb, Texture, srgb};
 pub use truth::{plane_homography, rotation_homography};

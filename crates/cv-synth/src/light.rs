@@ -19,14 +19,14 @@ pub(crate) struct Map {
 
 /// Samples per light and side, and of the hemisphere.
 const LIGHT: usize = 4;
-const HEMISPHERE: usize = 6;
+const HEMISPHERE: usize = 5;
 
 impl Map {
     fn empty(shape: &Shape) -> Self {
         let (u, v) = shape.extent();
         // A shadow's edge is a few centimetres wide a metre from what throws it: finer grids show little more. Shadows
         // fall on wide surfaces; the light on slender ones changes little but from end to end.
-        let spacing = if u.min(v) < 0.3 { 0.08 } else { (u * v).sqrt().mul_add(0.012, 0.022).min(0.07) };
+        let spacing = if u.min(v) < 0.3 { 0.11 } else { (u * v).sqrt().mul_add(0.014, 0.026).min(0.09) };
         let count = |length: f64, least: usize| ((length / spacing).ceil() as usize).clamp(least, 160);
         let wraps = shape.wraps();
         Self { columns: count(u, if wraps { 10 } else { 2 }), rows: count(v, 2), wraps, front: vec![], back: vec![] }

@@ -1,6 +1,6 @@
 //! Gradient noise (Perlin 2002) whose fine octaves fade out where the sampling could not show them.
 
-use crate::rng::{hash2, hash3, unit};
+use crate::rng::{hash3, unit};
 
 /// `floor` without a library call.
 #[inline]
@@ -30,7 +30,12 @@ pub(crate) fn noise2(x: f32, y: f32, seed: u32) -> f32 {
     let (xi, yi) = (floor(x), floor(y));
     let (fx, fy) = (x - xi as f32, y - yi as f32);
     let (sx, sy) = (fade(fx), fade(fy));
-    let g = |dx: i32, dy: i32| gradient(hash2(xi + dx, yi + dy, seed), fx - dx as f32, fy - dy as f32);
+    // A lighter hash than `hash2`: only the top three bits are used.
+    let hash = |dx: i32, dy: i32| {
+        let h = seed ^ ((xi + dx) as u32).wrapping_mul(0x9E37_79B1) ^ ((yi + dy) as u32).wrapping_mul(0x85EB_CA77);
+        (h ^ (h >> 15)).wrapping_mul(0x2C1B_3C6D)
+    };
+    let g = |dx: i32, dy: i32| gradient(hash(dx, dy), fx - dx as f32, fy - dy as f32);
     let top = g(0, 0) + sx * (g(1, 0) - g(0, 0));
     let bottom = g(0, 1) + sx * (g(1, 1) - g(0, 1));
     1.6 * (top + sy * (bottom - top))
@@ -49,8 +54,8 @@ pub(crate) fn noise3(p: [f32; 3], seed: u32) -> f32 {
 /// How much of a pattern with `frequency` (per metre) a sample of `width` (metres) still shows: 1 to 0.
 #[inline]
 pub(crate) fn visible(frequency: f32, width: f32) -> f32 {
-    // Full up to a quarter period per sample, gone at three quarters.
-    (1.5 - 2.0 * frequency * width).clamp(0.0, 1.0)
+    // Full up to a fifth of a period per sample, gone at half of one.
+    ((0.5 - frequency * width) / 0.3).clamp(0.0, 1.0)
 }
 
 /// Octaves from `frequency` upwards, each with `gain` times the amplitude of the one before; about −1 to 1.

@@ -72,7 +72,10 @@ pub fn render(scene: &Scene, camera: &Camera, pose: &Pose, options: &RenderOptio
             let inside =
                 (y.saturating_sub(1)..=y + 1).all(|j| (x.saturating_sub(1)..=x + 1).all(|i| prim(i, j) == here));
             let n = if inside { samples } else { 2 * samples };
-            pixel.copy_from_slice(&view.pixel(Point2::new(x as f64, y as f64), n));
+            // Away from outlines all of the pixel shows what its middle does; a thing so thin that it lies between
+            // the pixels' middles is lost there.
+            let only = if inside { here } else { None };
+            pixel.copy_from_slice(&view.pixel(Point2::new(x as f64, y as f64), n, only));
         }
     });
     let mut linear = sensor::blur(&linear, options.blur);
@@ -112,7 +115,7 @@ impl View<'_> {
     }
 
     /// The mean light over a pixel's area, by an `n` × `n` grid.
-    fn pixel(&self, center: Point2<f64>, n: usize) -> Rgb {
+    fn pixel(&self, center: Point2<f64>, n: usize, only: Option<usize>) -> Rgb {
         let middle = self.camera.normalize(center);
         if !middle.x.is_finite() {
             return [0.0; 3];
@@ -125,17 +128,21 @@ impl View<'_> {
             for i in 0..n {
                 let offset = |k: usize| (k as f64 + 0.5) / n as f64 - 0.5;
                 let d = inverse * nalgebra::Vector2::new(offset(i) / self.camera.fx, offset(j) / self.camera.fy);
-                let color = self.color(&self.through(middle + d), 1.0 / n as f64);
+                let color = self.color(&self.through(middle + d), 1.0 / n as f64, only);
                 (0..3).for_each(|c| sum[c] += color[c]);
             }
         }
         sum.map(|c| c / (n * n) as f32)
     }
 
-    /// The light along a ray; `share` is the side of the sample in pixels.
-    fn color(&self, ray: &Ray, share: f64) -> Rgb {
+    /// The light along a ray; `share` is the side of the sample in pixels, `only` the surface that it meets if known.
+    fn color(&self, ray: &Ray, share: f64, only: Option<usize>) -> Rgb {
         let lighting = self.scene.lighting();
-        let Some(hit) = self.scene.hit(ray) else {
+        let known = only.and_then(|prim| {
+            let t = self.scene.prims[prim].shape.intersect(ray, 1e-9, f64::INFINITY)?;
+            Some(Hit { prim, t })
+        });
+        let Some(hit) = known.or_else(|| self.scene.hit(ray)) else {
             return self.scene.ambient.map(|c| c * lighting.gain);
         };
         let prim = &self.scene.prims[hit.prim];

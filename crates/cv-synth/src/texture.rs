@@ -69,7 +69,7 @@ pub enum Texture {
         /// Seed of the pattern.
         seed: u32,
     },
-    /// Rough plaster, concrete or stone: strong texture from half a metre down to millimetres.
+    /// Rough plaster, concrete or stone: weak clouds, strong grain from centimetres down to millimetres.
     Stone {
         /// Dark and light.
         colors: [Rgb; 2],
@@ -157,12 +157,7 @@ pub enum Texture {
     /// A printed poster that fills the surface.
     Poster(Arc<Poster>),
     /// A surface with posters stuck on it, all in one plane.
-    Collage {
-        /// What is behind the posters.
-        ground: Arc<Texture>,
-        /// Corner (u, v) and poster; later ones on top.
-        posters: Arc<Vec<((f32, f32), Poster)>>,
-    },
+    Collage(Arc<Collage>),
 }
 
 impl Texture {
@@ -186,8 +181,9 @@ impl Texture {
                 scale(*color, 1.0 + mottle + roller)
             }
             Self::Stone { colors, seed } => {
-                let t = fbm(u, v, 2.2, 8, 0.72, *seed, w);
-                mix(colors[0], colors[1], (0.5 + 0.42 * t).clamp(0.0, 1.0))
+                let cloud = 0.20 * fbm(u, v, 1.7, 4, 0.7, *seed, w);
+                let grain = 0.34 * fbm(u, v, 24.0, 6, 0.85, seed ^ 1, w);
+                mix(colors[0], colors[1], (0.5 + cloud + grain).clamp(0.0, 1.0))
             }
             Self::Wallpaper { ground, inks, cell, seed } => wallpaper(*ground, inks, *cell, *seed, p),
             Self::Bricks { colors, mortar, seed } => bricks(colors, *mortar, *seed, p),
@@ -212,22 +208,56 @@ impl Texture {
                 scale(*color, 1.0 + tone + dimples)
             }
             Self::Poster(poster) => poster.color(u, v, w),
-            Self::Collage { ground, posters } => {
-                let mut color = None;
-                for ((left, top), poster) in posters.iter() {
-                    let (x, y) = (u - left, v - top);
-                    let (width, height) = poster.size();
-                    if x > -0.02 && y > -0.02 && x < width + 0.02 && y < height + 0.02 {
-                        let cover = edge(x, w) * edge(width - x, w) * edge(y, w) * edge(height - y, w);
-                        if cover > 0.0 {
-                            let behind = color.unwrap_or_else(|| ground.color(p));
-                            color = Some(mix(behind, poster.color(x, y, w), cover));
-                        }
-                    }
+            Self::Collage(collage) => collage.color(p),
+        }
+    }
+}
+
+/// A ground with posters on it; see [`Texture::Collage`].
+#[derive(Debug, Clone)]
+pub struct Collage {
+    ground: Texture,
+    posters: Vec<((f32, f32), Poster)>,
+    /// For each metre along u from 0, the posters that may show there.
+    columns: Vec<Vec<usize>>,
+}
+
+impl Collage {
+    /// Corner (u, v) of each poster in metres from the surface's corner; later ones on top.
+    pub fn new(ground: Texture, posters: Vec<((f32, f32), Poster)>) -> Self {
+        let reach = |&((left, _), ref poster): &((f32, f32), Poster)| {
+            let column = |u: f32| u.clamp(0.0, 1e4) as usize;
+            (column(left - Self::RIM), column(left + poster.size().0 + Self::RIM))
+        };
+        let count = posters.iter().map(|p| reach(p).1 + 1).max().unwrap_or(0);
+        let mut columns = vec![Vec::new(); count];
+        for (i, poster) in posters.iter().enumerate() {
+            let (from, to) = reach(poster);
+            columns[from..=to].iter_mut().for_each(|c| c.push(i));
+        }
+        Self { ground, posters, columns }
+    }
+
+    /// Samples wider than twice this blur a poster's outline less than they should.
+    const RIM: f32 = 0.02;
+
+    fn color(&self, p: &SurfacePoint) -> Rgb {
+        let w = p.width;
+        let mut color = None;
+        for &i in self.columns.get(p.u.max(0.0) as usize).into_iter().flatten() {
+            let ((left, top), poster) = &self.posters[i];
+            let (x, y) = (p.u - left, p.v - top);
+            let (width, height) = poster.size();
+            let inset = x.min(y).min(width - x).min(height - y);
+            if inset > -Self::RIM {
+                let cover = edge(x, w) * edge(width - x, w) * edge(y, w) * edge(height - y, w);
+                if cover > 0.0 {
+                    let behind = if cover < 1.0 { color.unwrap_or_else(|| self.ground.color(p)) } else { [0.0; 3] };
+                    color = Some(mix(behind, poster.color(x, y, w), cover));
                 }
-                color.unwrap_or_else(|| ground.color(p))
             }
         }
+        color.unwrap_or_else(|| self.ground.color(p))
     }
 }
 
@@ -302,13 +332,17 @@ fn bricks(colors: &[Rgb; 2], mortar: Rgb, seed: u32, p: &SurfacePoint) -> Rgb {
 }
 
 fn wood(colors: &[Rgb; 2], seed: u32, u: f32, v: f32, w: f32) -> Rgb {
-    // Growth rings: a slow field, bent, sampled along its value; then pores as short streaks.
-    let bend = 0.35 * fbm(u * 0.35, v, 2.6, 3, 0.5, seed, w);
-    let rings = fbm(u * 0.12, v + 0.12 * bend, 26.0, 3, 0.7, seed ^ 1, w);
-    let pores = visible(420.0, w) * noise2(u * 22.0, v * 420.0, seed ^ 2).max(0.0);
-    let streak = 0.5 * fbm(u * 0.1, v, 110.0, 2, 0.7, seed ^ 3, w);
-    let t = 0.5 + 0.38 * rings + 0.22 * streak + 0.3 * bend;
-    scale(mix(colors[0], colors[1], t.clamp(0.0, 1.0)), 1.0 - 0.25 * pores)
+    // Growth rings: a slow slope across the board, bent; each ring darkens slowly and ends sharply.
+    let bend = fbm(u * 0.35, v, 2.2, 3, 0.5, seed, w);
+    let place = 34.0 * v + 2.4 * bend;
+    let phase = place - floor(place) as f32;
+    let ring = visible(34.0, w) * (phase * phase - 0.33);
+    // Fibres: streaks of every width down to the pores, a few centimetres long.
+    let fibre = fbm(u * 0.05, v, 55.0, 5, 0.8, seed ^ 3, w);
+    let cloud = fbm(u * 0.4, v, 7.0, 3, 0.6, seed ^ 4, w);
+    let t = 0.5 + 0.35 * ring + 0.20 * fibre + 0.22 * cloud + 0.15 * bend;
+    let pores = visible(500.0, w) * noise2(u * 24.0, v * 500.0, seed ^ 2).max(0.0);
+    scale(mix(colors[0], colors[1], t.clamp(0.0, 1.0)), 1.0 - 0.3 * pores)
 }
 
 fn planks(colors: &[Rgb; 2], plank: f32, seed: u32, p: &SurfacePoint) -> Rgb {

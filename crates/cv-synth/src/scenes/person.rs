@@ -56,10 +56,10 @@ pub(crate) fn walker(scene: &Scene, foot: Point3<f64>, yaw: f64, phase: f64, see
     scene.with(b, blobs)
 }
 
-/// Where the walker of view `i` of `n` is in the living room: across it, from right to left.
+/// Where the walker of view `i` of `n` is in the living room: across it, from left to right.
 pub(crate) fn path(i: usize, n: usize, seed: u64) -> (Point3<f64>, f64, f64) {
     let mut rng = Rng::new(seed, 6);
     let z = rng.range(4.9, 5.4);
     let f = (i as f64 + 0.5) / n.max(1) as f64;
-    (at(1.4 - 2.6 * f, 0.0, z + 0.2 * f), std::f64::consts::FRAC_PI_2, 0.7 + 2.1 * i as f64)
+    (at(-1.7 + 3.7 * f, 0.0, z + 0.2 * f), -std::f64::consts::FRAC_PI_2, 0.7 + 2.1 * i as f64)
 }

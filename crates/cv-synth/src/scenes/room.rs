@@ -38,8 +38,13 @@ fn shell(b: &mut SceneBuilder, rng: &mut Rng) {
     b.object("floor").shiny(0.05, 40.0);
     b.rect(at(-half, 0.0, length), v(width, 0.0, 0.0), v(0.0, 0.0, -length), floor);
     b.object("ceiling");
-    let plaster = Texture::Stone { colors: [srgb(0xC9C5BC), srgb(0xF2EFE8)], seed: rng.seed32() };
-    b.rect(at(-half, -height, 0.0), v(width, 0.0, 0.0), v(0.0, 0.0, length), plaster);
+    let boards = [srgb(0xB9A98D), srgb(0xE2D7C0)];
+    let ceiling = if rng.chance(0.5) {
+        Texture::Planks { colors: boards, plank: 0.14, seed: rng.seed32() }
+    } else {
+        Texture::Stone { colors: [srgb(0xA9A598), srgb(0xF6F3EC)], seed: rng.seed32() }
+    };
+    b.rect(at(-half, -height, 0.0), v(width, 0.0, 0.0), v(0.0, 0.0, length), ceiling);
     let first = rng.index(3);
     let mut wall = |name, corner, u, kind: usize, rng: &mut Rng| {
         let texture = wall_texture(kind % 3, rng);

@@ -59,10 +59,11 @@ impl Scene {
             b.tube(foot, foot + lean, (0.0036, 0.0036), Texture::Plain(cloth(rng)));
         }
         b.object("fruit").shiny(0.05, 40.0);
-        for _ in 0..4 {
+        for i in 0..4 {
             let r = rng.range(0.03, 0.042);
             let color = srgb(rng.pick([0xD9822B, 0xA4342A, 0x8FA63A, 0xD8B13A]));
-            let (x, z) = (rng.range(-0.1, 0.7), rng.range(-0.15, -0.02));
+            // Far enough apart that no two touch.
+            let (x, z) = (-0.1 + 0.2 * (f64::from(i) + rng.range(0.0, 0.55)), rng.range(-0.15, -0.02));
             b.sphere(at(x, -r, z), r, Texture::Ball { color, seed: rng.seed32() });
         }
         b.object("leaflet");
@@ -98,8 +99,11 @@ impl Scene {
         b.object("far wall").rect(at(-3.0, -2.6, 4.0), v(6.0, 0.0, 0.0), v(0.0, 2.6, 0.0), wall);
         let wall = wall_texture(0, rng);
         b.object("left wall").rect(at(-2.0, -2.6, -1.0), v(0.0, 0.0, 5.0), v(0.0, 2.6, 0.0), wall);
+        let kind = 1 + rng.index(2);
+        let wall = wall_texture(kind, rng);
+        b.object("right wall").rect(at(2.4, -2.6, 4.0), v(0.0, 0.0, -5.0), v(0.0, 2.6, 0.0), wall);
         b.light(at(0.6, -2.6, 0.8), v(-1.0, 0.0, 0.0), v(0.0, 0.0, -1.0), [12.0, 11.0, 9.4]);
-        b.light(at(3.0, -2.2, 2.6), v(0.0, 0.0, -1.6), v(0.0, 1.4, 0.0), [5.0, 5.4, 6.0]);
+        b.light(at(2.39, -2.2, 1.6), v(0.0, 0.0, -1.6), v(0.0, 1.4, 0.0), [5.0, 5.4, 6.0]);
         bookcase(&mut b, at(1.3, 0.0, 3.8), [1.5, 1.75, 0.3], 0.0, rng);
         framed(&mut b, at(-1.4, -1.9, 3.999), v(0.8, 0.0, 0.0), v(0.0, 1.0, 0.0), rng);
         chair(&mut b, at(-0.9, 0.0, 3.1), rng.range(2.4, 3.6), rng);
@@ -107,7 +111,7 @@ impl Scene {
             let size = [rng.range(0.3, 0.5), rng.range(0.25, 0.6), rng.range(0.25, 0.45)];
             package(&mut b, at(x, 0.0, z), size, rng.range(-0.6, 0.6), rng);
         }
-        plant(&mut b, at(2.0, 0.0, 2.9), 1.0, rng);
+        plant(&mut b, at(1.95, 0.0, 2.9), 1.0, rng);
         let turn = Rotation3::from_euler_angles(-0.25, rng.range(0.0, TAU), 0.05);
         let red = Texture::Fabric { colors: [srgb(0x9E3B2E), srgb(0x7E2E26)], seed: rng.seed32() };
         b.object("cushion").tilted_block(at(-0.35, -0.2, 3.3), [0.42, 0.4, 0.11], turn, [&red, &red, &red]);

@@ -4,7 +4,7 @@ use super::furniture::{at, v, wall_texture};
 use crate::poster::Poster;
 use crate::rng::Rng;
 use crate::scene::{Scene, SceneBuilder};
-use crate::texture::Texture;
+use crate::texture::{Collage, Texture};
 use cv_core::Pose;
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
@@ -45,13 +45,13 @@ impl Scene {
             }
             left += width + rng.range(0.04, 0.25);
         }
-        let wall = Texture::Collage { ground: Arc::new(ground), posters: Arc::new(posters) };
+        let wall = Texture::Collage(Arc::new(Collage::new(ground, posters)));
         let mut b = SceneBuilder::new();
         b.object("wall").shiny(0.015, 12.0);
         b.rect(at(-w, -h, Wall::Z), v(2.0 * w, 0.0, 0.0), v(0.0, 2.0 * h, 0.0), wall);
         b.ambient([0.55, 0.58, 0.62]);
-        let x = rng.range(-3.0, 3.0);
-        b.light(at(x + 0.8, -4.0, 0.2), v(-1.6, 0.0, 0.0), v(0.0, 0.8, -0.8), [9.0, 8.4, 7.6]);
+        let x = rng.range(-2.0, 2.0);
+        b.light(at(x + 0.8, -2.6, -0.4), v(-1.6, 0.0, 0.0), v(0.0, 1.2, -0.6), [11.0, 10.3, 9.4]);
         let pose = Pose::look_at(at(0.0, 0.0, 0.0), Wall::middle(), Vector3::y());
         b.build(pose.unwrap_or_else(Pose::identity))
     }
