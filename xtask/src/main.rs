@@ -1,5 +1,6 @@
 //! Chores of the workspace. This file only routes: `cargo xtask --help` lists them.
 
+mod fixtures;
 mod peers;
 mod real;
 mod tidy;
@@ -19,6 +20,8 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Chore {
+    /// Render the small inputs under fixtures/ anew (only to change them).
+    Fixtures,
     /// Check the rules of the workspace that no compiler checks.
     Tidy,
     /// Run the pipelines on real photographs with known truth and hold each figure against its bar.
@@ -35,6 +38,7 @@ enum Chore {
 
 fn main() -> ExitCode {
     let result = match Cli::parse().chore {
+        Chore::Fixtures => fixtures::run(),
         Chore::Tidy => tidy::run(),
         Chore::Real { job } => real::run(job.as_deref()),
         Chore::Peers { job } => peers::run(job.as_deref()),
