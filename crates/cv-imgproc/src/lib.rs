@@ -1,1 +1,58 @@
-//! Colour conversion, filtering, sampling, warping, pyramids, morphology and components.
+//! Image processing: colour conversion, filtering, sampling, warping, pyramids, morphology and components.
+//!
+//! ```
+//! use cv_core::{Matrix3, RgbU8};
+//! use cv_imgproc::{RemapOptions, gaussian_blur, gray_to_f32, rgb_to_gray, sobel, warp_perspective};
+//!
+//! let photo = RgbU8::from_fn(64, 48, |x, y| [4 * x as u8, 5 * y as u8, 128]);
+//! let gray = gray_to_f32(rgb_to_gray(photo.view()).view());
+//! let smooth = gaussian_blur(gray.view(), 1.5);
+//! let (dx, dy) = sobel(smooth.view());
+//! assert!(dx.at(32, 24)[0] > 0.0 && dy.at(32, 24)[0] > 0.0);
+//!
+//! // A homography takes source pixels to result pixels; the mask says where the result shows the source.
+//! let shift = Matrix3::new(1.0, 0.0, 10.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0);
+//! let (moved, mask) = warp_perspective(photo.view(), &shift, (64, 48), &RemapOptions::default())?;
+//! assert_eq!(moved.at(10, 0), photo.at(0, 0));
+//! assert!(!mask.at(9, 0)[0]);
+//! # Ok::<(), cv_imgproc::WarpError>(())
+//! ```
+//!
+//! # Conventions
+//!
+//! * Functions take views and return owned images. `f32` pictures are 0 to 1.
+//! * Filters mirror the border about the end samples (`dcb|abcd|cba`), as OpenCV's default does; medians repeat it.
+//! * Empty images give empty results. Where not said otherwise a NaN pixel spoils the results its neighbourhood enters, nothing else.
+//! * Rows are shared out between threads; results do not depend on their number, nor on the instruction set.
+
+mod color;
+mod components;
+mod gaussian;
+mod integral;
+mod median;
+mod morphology;
+mod pixel;
+mod pyramid;
+mod resize;
+mod rows;
+mod sample;
+mod simd;
+mod warp;
+
+pub use color::{
+    f32_to_u8, gray_to_f32, gray_to_rgb, hsv_to_rgb, linear_to_srgb, rgb_pixel_to_hsv, rgb_pixel_to_lab, rgb_to_f32,
+    rgb_to_gray, rgb_to_gray_f32, rgb_to_hsv, rgb_to_lab, srgb_to_linear, u8_to_f32,
+};
+pub use components::{
+    ComponentStats, Components, Connectivity, connected_components, fill_holes, largest_component,
+    remove_small_components,
+};
+pub use gaussian::{gaussian_blur, gaussian_half_kernel, separable_symmetric, sobel};
+pub use integral::{Integral, box_filter};
+pub use median::{median_filter_3x3, median_filter_5x5};
+pub use morphology::{StructuringElement, close, dilate, erode, open};
+pub use pixel::Pixel;
+pub use pyramid::{gaussian_pyramid, pyr_down, pyr_up};
+pub use resize::{resize, resize_area};
+pub use sample::{sample_bicubic, sample_bilinear};
+pub use warp::{Border, Interpolation, RemapOptions, WarpError, remap, undistort, warp_perspective, warp_with};

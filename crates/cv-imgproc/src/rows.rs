@@ -1,0 +1,118 @@
+//! Rows of an image in parallel, and the mirror at its borders.
+
+use cv_core::{Image, Sample};
+use rayon::prelude::*;
+
+/// Samples per task: a few tens of microseconds of work, against about one to hand a task over.
+const BAND: usize = 1 << 15;
+
+/// Calls `f(state, y, row)` for each row of `image`, bands of rows in parallel; `init` makes the state (buffers) of a band.
+pub(crate) fn for_rows_with<T: Sample, const C: usize, S>(
+    image: &mut Image<T, C>,
+    init: impl Fn() -> S + Sync,
+    f: impl Fn(&mut S, usize, &mut [T]) + Sync,
+) {
+    let stride = image.width() * C;
+    if image.is_empty() {
+        return;
+    }
+    let rows = (BAND / stride).max(1);
+    let band = |(i, band): (usize, &mut [T])| {
+        let mut state = init();
+        for (j, row) in band.chunks_exact_mut(stride).enumerate() {
+            f(&mut state, i * rows + j, row);
+        }
+    };
+    if image.height() <= rows {
+        band((0, image.as_mut_slice()));
+    } else {
+        image.as_mut_slice().par_chunks_mut(stride * rows).enumerate().for_each(band);
+    }
+}
+
+/// Calls `f(y, row)` for each row of `image`, bands of rows in parallel.
+pub(crate) fn for_rows<T: Sample, const C: usize>(image: &mut Image<T, C>, f: impl Fn(usize, &mut [T]) + Sync) {
+    for_rows_with(image, || (), |(), y, row| f(y, row));
+}
+
+/// As [`for_rows`] over two images of the same size at once.
+pub(crate) fn for_rows2<T: Sample, const C: usize, U: Sample, const D: usize>(
+    first: &mut Image<T, C>,
+    second: &mut Image<U, D>,
+    f: impl Fn(usize, &mut [T], &mut [U]) + Sync,
+) {
+    debug_assert_eq!(first.size(), second.size());
+    let (a, b) = (first.width() * C, second.width() * D);
+    if first.is_empty() {
+        return;
+    }
+    let rows = (BAND / a).max(1);
+    let band = |(i, (p, q)): (usize, (&mut [T], &mut [U]))| {
+        for (j, (p, q)) in p.chunks_exact_mut(a).zip(q.chunks_exact_mut(b)).enumerate() {
+            f(i * rows + j, p, q);
+        }
+    };
+    if first.height() <= rows {
+        band((0, (first.as_mut_slice(), second.as_mut_slice())));
+    } else {
+        let pairs = first.as_mut_slice().par_chunks_mut(a * rows).zip(second.as_mut_slice().par_chunks_mut(b * rows));
+        pairs.enumerate().for_each(band);
+    }
+}
+
+/// Index `i` of a line of `n > 0` samples mirrored about its end samples (`dcb|abcd|cba`, OpenCV's BORDER_REFLECT_101).
+#[inline]
+pub(crate) fn mirror(i: isize, n: usize) -> usize {
+    let n = n as isize;
+    if (0..n).contains(&i) {
+        return i as usize;
+    }
+    if n == 1 {
+        return 0;
+    }
+    let period = 2 * (n - 1);
+    let i = i.rem_euclid(period);
+    (if i < n { i } else { period - i }) as usize
+}
+
+/// Fills the `r` pixels of `C` samples on each side of the middle of `padded` with its mirror image.
+#[inline]
+pub(crate) fn mirror_ends<const C: usize>(padded: &mut [f32], r: usize) {
+    let w = padded.len() / C - 2 * r;
+    for k in 1..=r {
+        for (to, from) in [(r - k, mirror(-(k as isize), w)), (r + w - 1 + k, mirror((w - 1 + k) as isize, w))] {
+            for c in 0..C {
+                padded[to * C + c] = padded[(r + from) * C + c];
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn mirrors_as_often_as_it_takes() {
+        let seen: Vec<usize> = (-5..7).map(|i| mirror(i, 3)).collect();
+        assert_eq!(seen, [1, 0, 1, 2, 1, 0, 1, 2, 1, 0, 1, 2]);
+        assert_eq!((mirror(-3, 1), mirror(4, 1)), (0, 0));
+    }
+
+    #[test]
+    fn every_row_is_visited_once_with_its_own_number() {
+        for (w, h) in [(0, 3), (3, 0), (1, 1), (7, 5), (4000, 33), (1, 100_000), (70_000, 3)] {
+            let mut image = Image::<u32, 2>::new(w, h, [0; 2]);
+            let mut other = Image::<u32, 1>::new(w, h, [0]);
+            for_rows(&mut image, |y, row| row.iter_mut().for_each(|v| *v += 1 + y as u32));
+            for_rows2(&mut image, &mut other, |y, a, b| {
+                a.iter_mut().for_each(|v| *v += 1);
+                b.iter_mut().for_each(|v| *v += y as u32);
+            });
+            for y in 0..h {
+                assert!(image.row(y).iter().all(|&v| v == 2 + y as u32));
+                assert!(other.row(y).iter().all(|&v| v == y as u32));
+            }
+        }
+    }
+}

@@ -1,0 +1,152 @@
+//! Values between pixels.
+
+use crate::Pixel;
+use cv_core::ImageView;
+
+/// How far outside the outermost pixel centres a point may lie and still count as on them, in pixels: the rounding of a map of
+/// a few thousand pixels in `f32`.
+const SLACK: f64 = 1e-3;
+
+/// The base index and the fraction of a coordinate on a line of `n > 0` samples, or `None` outside `[0, n − 1]` (or NaN).
+#[inline(always)]
+pub(crate) fn split(v: f64, n: usize) -> Option<(usize, f32)> {
+    let last = (n - 1) as f64;
+    if !(v >= -SLACK && v <= last + SLACK) {
+        return None;
+    }
+    let v = v.clamp(0.0, last);
+    // The base of the last sample is the one before it, so that base + 1 exists.
+    let base = (v as usize).min(n.saturating_sub(2));
+    Some((base, (v - base as f64) as f32))
+}
+
+/// The value at `(x, y)` by bilinear interpolation, in the unit of the image.
+///
+/// `None` outside the rectangle of the outermost pixel centres, `[0, w − 1] × [0, h − 1]` (with a thousandth of a pixel of slack).
+#[inline]
+pub fn sample_bilinear<T: Pixel, const C: usize>(view: ImageView<'_, T, C>, x: f64, y: f64) -> Option<[f32; C]> {
+    if view.is_empty() {
+        return None;
+    }
+    let (ix, fx) = split(x, view.width())?;
+    let (iy, fy) = split(y, view.height())?;
+    Some(bilinear_at(view, ix, iy, fx, fy))
+}
+
+/// Bilinear interpolation from the base pixel `(ix, iy)` by the fractions `fx`, `fy`.
+#[inline(always)]
+pub(crate) fn bilinear_at<T: Pixel, const C: usize>(
+    view: ImageView<'_, T, C>,
+    ix: usize,
+    iy: usize,
+    fx: f32,
+    fy: f32,
+) -> [f32; C] {
+    let above = view.row(iy);
+    let below = view.row((iy + 1).min(view.height() - 1));
+    let right = (ix + 1).min(view.width() - 1) * C;
+    let left = ix * C;
+    let (a, b) = (&above[left..left + C], &above[right..right + C]);
+    let (c, d) = (&below[left..left + C], &below[right..right + C]);
+    std::array::from_fn(|i| {
+        let top = a[i].to_f32() + fx * (b[i].to_f32() - a[i].to_f32());
+        let bottom = c[i].to_f32() + fx * (d[i].to_f32() - c[i].to_f32());
+        top + fy * (bottom - top)
+    })
+}
+
+/// The value at `(x, y)` by bicubic convolution with Keys's kernel, `a = −½` (Keys 1981: exact for quadratics), in the unit of the image.
+///
+/// `None` outside `[0, w − 1] × [0, h − 1]`, as in [`sample_bilinear`]; the kernel's samples beyond the border repeat the outermost ones. Values may
+/// overshoot those of the image at edges.
+#[inline]
+pub fn sample_bicubic<T: Pixel, const C: usize>(view: ImageView<'_, T, C>, x: f64, y: f64) -> Option<[f32; C]> {
+    if view.is_empty() {
+        return None;
+    }
+    let (ix, fx) = split(x, view.width())?;
+    let (iy, fy) = split(y, view.height())?;
+    Some(bicubic_at(view, ix, iy, fx, fy))
+}
+
+/// The four weights of Keys's kernel for a fraction in 0 to 1.
+#[inline(always)]
+fn keys(t: f32) -> [f32; 4] {
+    let (t2, t3) = (t * t, t * t * t);
+    [0.5 * (-t3 + 2.0 * t2 - t), 0.5 * (3.0 * t3 - 5.0 * t2 + 2.0), 0.5 * (-3.0 * t3 + 4.0 * t2 + t), 0.5 * (t3 - t2)]
+}
+
+/// Bicubic interpolation from the base pixel `(ix, iy)` by the fractions `fx`, `fy`.
+#[inline(always)]
+pub(crate) fn bicubic_at<T: Pixel, const C: usize>(
+    view: ImageView<'_, T, C>,
+    ix: usize,
+    iy: usize,
+    fx: f32,
+    fy: f32,
+) -> [f32; C] {
+    let (wx, wy) = (keys(fx), keys(fy));
+    let columns: [usize; 4] = std::array::from_fn(|i| (ix + i).saturating_sub(1).min(view.width() - 1) * C);
+    let mut sum = [0.0; C];
+    for (j, wy) in wy.into_iter().enumerate() {
+        let row = view.row((iy + j).saturating_sub(1).min(view.height() - 1));
+        for (c, sum) in sum.iter_mut().enumerate() {
+            let along = columns.iter().zip(wx).map(|(x, wx)| wx * row[x + c].to_f32()).sum::<f32>();
+            *sum += wy * along;
+        }
+    }
+    sum
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cv_core::{GrayF32, GrayU8, Image};
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn a_plane_is_reproduced(x in 0.0f64..8.0, y in 0.0f64..5.0) {
+            let image = Image::<f32, 2>::from_fn(9, 6, |x, y| [3.0 * x as f32 - 2.0 * y as f32 + 1.0, (x * y) as f32]);
+            let expected = 3.0 * x - 2.0 * y + 1.0;
+            let got = sample_bilinear(image.view(), x, y).unwrap();
+            // Values up to 40: a few roundings of 2e-6.
+            prop_assert!((f64::from(got[0]) - expected).abs() < 1e-5 && (f64::from(got[1]) - x * y).abs() < 1e-5);
+            // Away from the border, where the kernel repeats samples, cubic convolution keeps planes and products too.
+            if (1.0..7.0).contains(&x) && (1.0..4.0).contains(&y) {
+                let got = sample_bicubic(image.view(), x, y).unwrap();
+                prop_assert!((f64::from(got[0]) - expected).abs() < 2e-5 && (f64::from(got[1]) - x * y).abs() < 2e-5);
+            }
+        }
+
+        #[test]
+        fn bicubic_keeps_parabolas(x in 1.0f64..7.0) {
+            let image = GrayF32::from_fn(9, 3, |x, _| [(x * x) as f32]);
+            prop_assert!((f64::from(sample_bicubic(image.view(), x, 1.0).unwrap()[0]) - x * x).abs() < 3e-5);
+        }
+    }
+
+    #[test]
+    fn pixels_are_kept_and_the_outside_is_none() {
+        let image = GrayU8::from_fn(4, 3, |x, y| [(10 * x + y) as u8]);
+        for y in 0..3 {
+            for x in 0..4 {
+                let expected = Some([(10 * x + y) as f32]);
+                assert_eq!(sample_bilinear(image.view(), x as f64, y as f64), expected);
+                assert_eq!(sample_bicubic(image.view(), x as f64, y as f64), expected);
+            }
+        }
+        for (x, y) in [(-0.01, 0.0), (3.01, 0.0), (0.0, 2.01), (f64::NAN, 0.0), (0.0, f64::INFINITY), (1e300, 0.0)] {
+            assert_eq!(sample_bilinear(image.view(), x, y), None);
+            assert_eq!(sample_bicubic(image.view(), x, y), None);
+        }
+    }
+
+    #[test]
+    fn a_single_pixel_has_one_value() {
+        let image = GrayU8::new(1, 1, [7]);
+        assert_eq!(sample_bilinear(image.view(), 0.0, 0.0), Some([7.0]));
+        assert_eq!(sample_bicubic(image.view(), 0.0, 0.0), Some([7.0]));
+        assert_eq!(sample_bilinear(GrayU8::new(0, 0, [0]).view(), 0.0, 0.0), None);
+    }
+}
