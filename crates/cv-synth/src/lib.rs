@@ -19,6 +19,8 @@
 //! * Sets with their truth: [`stereo_pair`], [`homography_pair`], [`panorama_views`], [`two_view`], [`ball_photos`].
 //! * Further truth: [`Scene::correspondences`], [`Scene::visible_in_both`], [`Scene::point_at`], [`Scene::pixel_of`],
 //!   [`plane_homography`], [`rotation_homography`].
+//! * Measures against it: [`homography_corner_error`], [`alignment_error`], [`rotation_error`], [`direction_error`],
+//!   [`depth_score`], [`MaskScore`].
 //!
 //! # Conventions
 //!
@@ -36,6 +38,7 @@ mod render;
 mod rng;
 mod scene;
 mod scenes;
+mod score;
 mod sensor;
 mod sets;
 mod shape;
@@ -46,6 +49,9 @@ pub use error::SynthError;
 pub use poster::Poster;
 pub use render::{Rendered, render};
 pub use scene::{Scene, SceneBuilder};
+pub use score::{
+    DepthScore, MaskScore, alignment_error, depth_score, direction_error, homography_corner_error, rotation_error,
+};
 pub use sensor::{RenderOptions, encode_srgb};
 pub use sets::{
     BallPhoto, HomographyPair, PanoramaOptions, PanoramaViews, StereoPair, TwoView, ball_photos, homography_pair,
