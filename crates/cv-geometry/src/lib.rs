@@ -21,12 +21,16 @@
 //! * The same matches, options and seed give the same bytes on any number of threads and with any vector unit.
 
 mod error;
+mod fundamental;
 mod homography;
 mod pairs;
 mod ransac;
 mod robust;
+#[cfg(test)]
+mod testing;
 
 pub use error::{Degeneracy, EstimateError};
+pub use fundamental::{estimate_fundamental, fundamental_eight_point, fundamental_seven_point, sampson};
 pub use homography::{
     estimate_homography, homography_four_point, homography_from_points, homography_residual, refine_homography,
 };

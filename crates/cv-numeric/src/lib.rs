@@ -15,11 +15,13 @@
 
 mod levenberg_marquardt;
 mod linear;
+mod polynomial;
 mod robust_loss;
 
 pub use levenberg_marquardt::{LeastSquares, LmOptions, LmReport, NormalEquations, levenberg_marquardt};
 pub use linear::{
-    LinearError, Svd3, null_vector, smallest_eigenvector, solve_positive_definite, solve_positive_definite_dense, svd3,
-    symmetric_eigen,
+    LinearError, Svd3, null_space, null_vector, smallest_eigenvector, solve_positive_definite,
+    solve_positive_definite_dense, svd3, symmetric_eigen,
 };
+pub use polynomial::{Roots, real_roots, real_roots_cubic, real_roots_quadratic, real_roots_quartic};
 pub use robust_loss::RobustLoss;

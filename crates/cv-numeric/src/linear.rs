@@ -281,6 +281,59 @@ pub fn solve_positive_definite_dense(m: &DMatrix<f64>, b: &DVector<f64>) -> Resu
     Ok(DVector::from_fn(n, |i, _| x[(i, 0)]))
 }
 
+/// A basis of the null space of an `R × C` matrix of full rank `R`, as `K = C − R` vectors of a full-rank, not orthogonal, basis.
+///
+/// Gauss–Jordan elimination, each row with its largest entry as the pivot; `None` where a pivot falls below `1e-9` of its
+/// row's largest entry: the rank is lower. About R²C multiplications, for the minimal solvers.
+#[inline]
+pub fn null_space<const R: usize, const C: usize, const K: usize>(mut rows: [[f64; C]; R]) -> Option<[[f64; C]; K]> {
+    const { assert!(R + K == C, "a full-rank R x C matrix has a null space of dimension C - R") };
+    const SINGULAR: f64 = 1e-9;
+    let mut pivots = [0usize; R];
+    let sizes: [f64; R] = std::array::from_fn(|r| rows[r].iter().fold(0.0f64, |m, v| m.max(v.abs())));
+    for r in 0..R {
+        // Pivot columns are zero in later rows.
+        let mut column = 0;
+        let mut largest = 0.0;
+        for (c, v) in rows[r].iter().enumerate() {
+            if v.abs() > largest {
+                (column, largest) = (c, v.abs());
+            }
+        }
+        // Also where the row holds NaN.
+        if largest.is_nan() || largest <= SINGULAR * sizes[r] {
+            return None;
+        }
+        pivots[r] = column;
+        let inverse = 1.0 / rows[r][column];
+        let mut pivot_row = rows[r];
+        for v in &mut pivot_row {
+            *v *= inverse;
+        }
+        pivot_row[column] = 1.0;
+        rows[r] = pivot_row;
+        for (other, row) in rows.iter_mut().enumerate() {
+            if other != r {
+                let factor = row[column];
+                for (v, p) in row.iter_mut().zip(&pivot_row) {
+                    *v -= factor * p;
+                }
+                row[column] = 0.0;
+            }
+        }
+    }
+    let mut basis = [[0.0; C]; K];
+    let mut free = (0..C).filter(|c| !pivots.contains(c));
+    for vector in &mut basis {
+        let column = free.next()?;
+        vector[column] = 1.0;
+        for (row, pivot) in rows.iter().zip(pivots) {
+            vector[pivot] = -row[column];
+        }
+    }
+    Some(basis)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -332,6 +385,29 @@ mod tests {
             let cosine: f64 = (0..9).map(|i| v[i] * exact[i]).sum::<f64>().abs();
             prop_assert!(1.0 - cosine < tolerance.max(1e-14), "{cosine}");
         }
+    }
+
+    proptest! {
+        #[test]
+        fn null_spaces_are_null(values in proptest::collection::vec(-1.0..1.0f64, 63)) {
+            let rows: [[f64; 9]; 7] = std::array::from_fn(|r| std::array::from_fn(|c| values[9 * r + c]));
+            let basis: [[f64; 9]; 2] = null_space(rows).unwrap();
+            for v in basis {
+                let size = v.iter().map(|x| x * x).sum::<f64>().sqrt();
+                for row in rows {
+                    // Rounding, magnified by the pivots' growth.
+                    prop_assert!(row.iter().zip(v).map(|(a, b)| a * b).sum::<f64>().abs() < 1e-10 * size);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_matrix_of_lower_rank_has_no_such_basis() {
+        assert!(null_space::<2, 3, 1>([[1.0, 2.0, 3.0], [2.0, 4.0, 6.0]]).is_none());
+        assert!(null_space::<2, 3, 1>([[1.0, 2.0, 3.0], [0.0; 3]]).is_none());
+        assert!(null_space::<1, 2, 1>([[f64::NAN, f64::NAN]]).is_none());
+        assert_eq!(null_space::<2, 3, 1>([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), Some([[1.0, 0.0, 0.0]]));
     }
 
     #[test]

@@ -25,6 +25,9 @@ pub trait Estimator: Sync {
     type Kernel;
     /// Size of a minimal sample.
     const SAMPLE: usize;
+    /// Local optimisation starts at a threshold widened by 2 to this power, and halves it: for models whose minimal
+    /// solutions are far off and whose loss has many local minima.
+    const WIDENINGS: u32 = 0;
 
     /// Number of data.
     fn count(&self) -> usize;
@@ -54,6 +57,13 @@ pub trait Estimator: Sync {
         threshold: f64,
         iterations: usize,
     ) -> Option<Self::Model>;
+
+    /// Appends models to try beside a new best `model`, made from `sample`, where that sample may be degenerate.
+    ///
+    /// `threshold` is in estimator units. By default, none.
+    fn alternatives(&self, model: &Self::Model, sample: &[u32], threshold: f64, models: &mut Vec<Self::Model>) {
+        let _ = (model, sample, threshold, models);
+    }
 }
 
 /// How well a model fits.
@@ -154,7 +164,14 @@ impl<'a, E: Estimator, C: Scorer> Judge<'a, E, C> {
 
     /// Local optimisation: `model` after refinement, where that lowered the loss below `score`'s.
     fn improve(&self, model: &mut E::Model, score: &mut Score, iterations: usize) {
-        if let Some(refined) = self.estimator.refine(model, self.scorer, self.threshold, iterations) {
+        let mut start = model.clone();
+        for k in (1..=E::WIDENINGS).rev() {
+            let wide = self.threshold * f64::from(1u32 << k);
+            if let Some(better) = self.estimator.refine(&start, self.scorer, wide, WIDE_STEPS) {
+                start = better;
+            }
+        }
+        if let Some(refined) = self.estimator.refine(&start, self.scorer, self.threshold, iterations) {
             let better = self.score(&refined, score.loss);
             if better.loss < score.loss {
                 *model = refined;
@@ -171,6 +188,7 @@ const PARALLEL_FROM: usize = 8192;
 /// Steps of a local optimisation inside the loop, and at the end.
 const LOCAL_STEPS: usize = 4;
 const FINAL_STEPS: usize = 20;
+const WIDE_STEPS: usize = 3;
 
 /// The loop.
 ///
@@ -205,14 +223,30 @@ fn search<E: Estimator, C: Scorer, S: Sampler>(
                     || None,
                     |a, b| match (&a, &b) {
                         // The earlier of two equals, as in one thread.
-                        (Some(x), Some(y)) if y.1.loss < x.1.loss => b,
+                        (Some(x), Some(y)) if y.score.loss < x.score.loss => b,
                         (None, _) => b,
                         _ => a,
                     },
                 )
         };
-        if let Some((mut model, mut score)) = winner {
+        if let Some(Winner { mut model, mut score, sample }) = winner {
+            models.clear();
+            estimator.alternatives(&model, &sample[..E::SAMPLE], judge.threshold, &mut models);
             judge.improve(&mut model, &mut score, LOCAL_STEPS);
+            // The best alternative is refined before it is compared: the model already was.
+            let mut other: Option<(E::Model, Score)> = None;
+            for candidate in models.drain(..) {
+                let s = judge.score(&candidate, other.as_ref().map_or(f32::INFINITY, |o| o.1.loss));
+                if other.as_ref().is_none_or(|o| s.loss < o.1.loss) {
+                    other = Some((candidate, s));
+                }
+            }
+            if let Some((mut candidate, mut s)) = other {
+                judge.improve(&mut candidate, &mut s, LOCAL_STEPS);
+                if s.loss < score.loss {
+                    (model, score) = (candidate, s);
+                }
+            }
             best = Some((model, score));
             needed = options.needed(score.inliers as usize, n, E::SAMPLE);
         }
@@ -222,13 +256,20 @@ fn search<E: Estimator, C: Scorer, S: Sampler>(
     Some(Consensus { model, score, iterations })
 }
 
+/// The best model of a batch.
+struct Winner<M> {
+    model: M,
+    score: Score,
+    sample: [u32; 8],
+}
+
 /// The model of least loss below `limit` of all samples; the earliest of equals.
 fn best_of<E: Estimator, C: Scorer>(
     judge: &Judge<'_, E, C>,
     samples: &[[u32; 8]],
     mut limit: f32,
     models: &mut Vec<E::Model>,
-) -> Option<(E::Model, Score)> {
+) -> Option<Winner<E::Model>> {
     let mut best = None;
     for sample in samples {
         models.clear();
@@ -237,7 +278,7 @@ fn best_of<E: Estimator, C: Scorer>(
             let score = judge.score(&model, limit);
             if score.loss < limit {
                 limit = score.loss;
-                best = Some((model, score));
+                best = Some(Winner { model, score, sample: *sample });
             }
         }
     }

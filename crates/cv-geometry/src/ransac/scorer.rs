@@ -31,13 +31,13 @@ impl Scorer for Msac {
     }
 }
 
-/// Tukey's biweight that ends at 1.5 times the threshold: a smooth loss close to the average of MSAC over noise levels
+/// Tukey's biweight that ends at 2.5 times the threshold: a smooth loss close to the average over noise levels
 /// that MAGSAC++ takes (Barath et al. 2020), without its table.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Marginal;
 
-/// The square of 1.5.
-const MARGINAL_CUTOFF: f32 = 2.25;
+/// The square of 2.5.
+const MARGINAL_CUTOFF: f32 = 6.25;
 
 impl Scorer for Marginal {
     #[inline(always)]

@@ -1,0 +1,333 @@
+//! Fundamental matrices.
+
+mod eight_point;
+mod plane;
+mod refine;
+mod seven_point;
+
+pub use eight_point::fundamental_eight_point;
+pub use seven_point::fundamental_seven_point;
+
+use crate::error::EstimateError;
+use crate::pairs::{LANES, PairBlock, PairSet, point_degeneracy};
+use crate::ransac::{Estimator, RobustOptions, Scorer, ransac};
+use crate::robust::RobustModel;
+use cv_core::{Correspondence, Matrix3, Point2, Vector3};
+use refine::{SampsonProblem, refine_sampson};
+
+/// Sampson's distance of a match from the epipolar geometry `bᵀ F a = 0`, in pixels: the first-order distance to the nearest
+/// pair of points that satisfies it (Hartley & Zisserman, §11.4.3).
+///
+/// NaN where both epipolar lines vanish (both points are epipoles).
+pub fn sampson(f: &Matrix3<f64>, m: &Correspondence) -> f64 {
+    let (a, b) = (m.a.to_homogeneous(), m.b.to_homogeneous());
+    let (l, k) = (f * a, f.transpose() * b);
+    b.dot(&l).abs() / (l.x * l.x + l.y * l.y + k.x * k.x + k.y * k.y).sqrt()
+}
+
+/// The fundamental matrix between two images of a rigid scene, from matches of which many may be wrong.
+///
+/// RANSAC over seven-point samples with local optimisation on the Sampson error, and with recovery from samples that lie on one
+/// plane (DEGENSAC, Chum, Werner & Matas 2005). `bᵀ F a = 0`; Frobenius norm 1, the largest entry positive.
+///
+/// # Errors
+/// [`EstimateError`]: fewer than eight matches, a coordinate that is not finite, coincident or collinear points, or no
+/// consensus of more than seven matches.
+pub fn estimate_fundamental(
+    matches: &[Correspondence],
+    options: &RobustOptions,
+) -> Result<RobustModel<Matrix3<f64>>, EstimateError> {
+    let set = PairSet::new(matches, 8)?;
+    let estimator = FundamentalEstimator { set };
+    let found = ransac(&estimator, options);
+    let set = &estimator.set;
+    let degenerate = |kind| EstimateError::Degenerate { kind };
+    let found = match found {
+        Ok(found) => found,
+        Err(error @ EstimateError::NoConsensus { .. }) => {
+            return Err(point_degeneracy(set.pairs.iter(), 8, 0.0).map_or(error, degenerate));
+        }
+        Err(error) => return Err(error),
+    };
+    let f = eight_point::unit(&(set.second.matrix().transpose() * found.model * set.first.matrix()));
+    let result = RobustModel::new(f, matches, options.threshold, found.iterations, sampson);
+    let width = options.threshold / 3.0 * set.first.scale;
+    match point_degeneracy(result.inliers.iter().map(|&i| &set.pairs[i]), 8, width) {
+        Some(kind) => Err(degenerate(kind)),
+        None => Ok(result),
+    }
+}
+
+struct FundamentalEstimator {
+    set: PairSet,
+}
+
+/// F in f32, row by row.
+pub(crate) struct SampsonKernel([f32; 9]);
+
+impl SampsonKernel {
+    pub(crate) fn new(f: &Matrix3<f64>) -> Self {
+        Self(std::array::from_fn(|i| f[(i / 3, i % 3)] as f32))
+    }
+
+    #[inline(always)]
+    pub(crate) fn squared_residuals(&self, block: &PairBlock) -> [f32; LANES] {
+        let f = &self.0;
+        let mut out = [0f32; LANES];
+        for (i, r2) in out.iter_mut().enumerate() {
+            let (x, y, s, t) = (block.x1[i], block.y1[i], block.x2[i], block.y2[i]);
+            let l0 = f[0] * x + f[1] * y + f[2];
+            let l1 = f[3] * x + f[4] * y + f[5];
+            let l2 = f[6] * x + f[7] * y + f[8];
+            let m0 = f[0] * s + f[3] * t + f[6];
+            let m1 = f[1] * s + f[4] * t + f[7];
+            let c = s * l0 + t * l1 + l2;
+            *r2 = c * c / ((l0 * l0 + l1 * l1) + (m0 * m0 + m1 * m1));
+        }
+        out
+    }
+}
+
+/// The epipole of the second image, `Fᵀ e = 0`: the longest cross product of two columns.
+#[inline]
+pub(crate) fn second_epipole(f: &Matrix3<f64>) -> Vector3<f64> {
+    let c = [f.column(0), f.column(1), f.column(2)];
+    let crosses = [c[0].cross(&c[1]), c[1].cross(&c[2]), c[2].cross(&c[0])];
+    let mut best = crosses[0];
+    for e in &crosses[1..] {
+        if e.norm_squared() > best.norm_squared() {
+            best = *e;
+        }
+    }
+    best
+}
+
+impl Estimator for FundamentalEstimator {
+    type Model = Matrix3<f64>;
+    type Block = PairBlock;
+    type Kernel = SampsonKernel;
+    const SAMPLE: usize = 7;
+    const WIDENINGS: u32 = 2;
+
+    fn count(&self) -> usize {
+        self.set.pairs.len()
+    }
+
+    fn unit(&self) -> f64 {
+        self.set.first.scale
+    }
+
+    fn blocks(&self) -> &[PairBlock] {
+        &self.set.blocks
+    }
+
+    fn solve(&self, sample: &[u32], models: &mut Vec<Matrix3<f64>>) {
+        let pair = |i: usize| &self.set.pairs[sample[i] as usize];
+        let a: [Point2<f64>; 7] = std::array::from_fn(|i| Point2::new(pair(i)[0], pair(i)[1]));
+        let b: [Point2<f64>; 7] = std::array::from_fn(|i| Point2::new(pair(i)[2], pair(i)[3]));
+        fundamental_seven_point(&a, &b, |f| {
+            // The two rays of a point that both cameras see lie on the same side of the base line (Chum, Werner & Matas,
+            // "Epipolar geometry estimation via RANSAC benefits from the oriented epipolar constraint", 2004).
+            let e = second_epipole(&f);
+            let side = |i: usize| (f * a[i].to_homogeneous()).dot(&e.cross(&b[i].to_homogeneous())) > 0.0;
+            let first = side(0);
+            if (1..7).all(|i| side(i) == first) {
+                models.push(f);
+            }
+        });
+    }
+
+    fn kernel(&self, model: &Matrix3<f64>) -> SampsonKernel {
+        SampsonKernel::new(model)
+    }
+
+    #[inline(always)]
+    fn squared_residuals(kernel: &SampsonKernel, block: &PairBlock) -> [f32; LANES] {
+        kernel.squared_residuals(block)
+    }
+
+    fn refine<C: Scorer>(
+        &self,
+        model: &Matrix3<f64>,
+        scorer: &C,
+        threshold: f64,
+        iterations: usize,
+    ) -> Option<Matrix3<f64>> {
+        let problem = SampsonProblem { pairs: &self.set.pairs, scorer, threshold };
+        refine_sampson(&problem, model, iterations)
+    }
+
+    fn alternatives(&self, model: &Matrix3<f64>, sample: &[u32], threshold: f64, models: &mut Vec<Matrix3<f64>>) {
+        plane::alternatives(&self.set.pairs, model, sample, threshold, models);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::error::Degeneracy;
+    use crate::testing::{TwoViews, cosine};
+    use cv_numeric::LeastSquares;
+    use proptest::prelude::*;
+
+    /// Plain least squares.
+    struct AllIn;
+
+    impl Scorer for AllIn {
+        fn loss(&self, u: f32) -> f32 {
+            u
+        }
+        fn weight(&self, _: f64) -> f64 {
+            1.0
+        }
+        fn cutoff(&self) -> f64 {
+            f64::INFINITY
+        }
+    }
+
+    fn points<const N: usize>(m: &[Correspondence]) -> ([Point2<f64>; N], [Point2<f64>; N]) {
+        (std::array::from_fn(|i| m[i].a), std::array::from_fn(|i| m[i].b))
+    }
+
+    proptest! {
+        #[test]
+        fn eight_exact_points_give_every_entry(seed: u64, n in 8usize..30) {
+            let views = TwoViews::random(seed);
+            let f = fundamental_eight_point(&views.matches(n, 0.0)).unwrap();
+            let truth = eight_point::unit(&views.fundamental());
+            // Random points are now and then nearly degenerate, which costs digits; entries are of order 1e-6 to 1.
+            prop_assert!(1.0 - cosine(&f, &truth) < 1e-9, "{f} {truth}");
+            prop_assert!((f.norm() - 1.0).abs() < 1e-12 && f.determinant().abs() < 1e-12);
+            prop_assert!((f - truth).norm() < 1e-4);
+        }
+
+        #[test]
+        fn one_of_the_seven_point_solutions_is_the_truth(seed: u64) {
+            let views = TwoViews::random(seed);
+            let m = views.normalised_matches(7, 0.0);
+            let (a, b) = points(&m);
+            let mut best = 0.0f64;
+            let mut count = 0;
+            fundamental_seven_point(&a, &b, |f| {
+                count += 1;
+                best = best.max(cosine(&f, &views.essential()));
+                assert!((f.norm() - 1.0).abs() < 1e-12);
+                // All three hold what they promise.
+                for m in &m {
+                    assert!(m.b.to_homogeneous().dot(&(f * m.a.to_homogeneous())).abs() < 1e-8);
+                }
+                assert!(f.determinant().abs() < 1e-9, "{}", f.determinant());
+            });
+            prop_assert!((1..=3).contains(&count));
+            prop_assert!(1.0 - best < 1e-6, "{best}");
+        }
+
+        #[test]
+        fn the_gradient_is_that_of_the_cost(seed: u64) {
+            let views = TwoViews::random(seed);
+            let pairs: Vec<[f64; 4]> = views.normalised_matches(15, 1e-3).iter().map(|m| [m.a.x, m.a.y, m.b.x, m.b.y]).collect();
+            let problem = SampsonProblem { pairs: &pairs, scorer: &AllIn, threshold: 1.0 };
+            let start = refine::RankTwo::new(&views.essential()).unwrap();
+            let start = problem.step(&start, &nalgebra::SVector::from([0.01, -0.02, 0.01, 0.02, 0.01, -0.01, 0.02]));
+            let gradient = problem.linearize(&start).gradient;
+            let cost = |f: &refine::RankTwo| {
+                let f = f.matrix();
+                pairs.iter().map(|p| sampson(&f, &Correspondence::new(p[0], p[1], p[2], p[3])).powi(2)).sum::<f64>()
+            };
+            for i in 0..7 {
+                let mut d = nalgebra::SVector::<f64, 7>::zeros();
+                d[i] = 1e-6;
+                let numeric = (cost(&problem.step(&start, &d)) - cost(&problem.step(&start, &-d))) / 2e-6;
+                // Central differences: h² truncation and rounding over h; the gradient is half the derivative of Σr².
+                prop_assert!((0.5 * numeric - gradient[i]).abs() < 1e-6 + 1e-4 * gradient.amax(), "{i} {numeric} {}", gradient[i]);
+            }
+        }
+
+        #[test]
+        fn vector_residuals_are_the_plain_ones(seed: u64) {
+            let views = TwoViews::random(seed);
+            let m = views.matches(40, 1.0);
+            let set = PairSet::new(&m, 8).unwrap();
+            let f = set.second.inverse_matrix().transpose() * views.fundamental() * set.first.inverse_matrix();
+            let kernel = SampsonKernel::new(&f.normalize());
+            let mut fast: Vec<f32> = set.blocks.iter().flat_map(|b| kernel.squared_residuals(b)).take(40).collect();
+            let mut plain: Vec<f64> = m.iter().map(|m| sampson(&views.fundamental(), m) * set.first.scale).collect();
+            fast.sort_by(f32::total_cmp);
+            plain.sort_by(f64::total_cmp);
+            for (f, p) in fast.iter().zip(plain) {
+                // Coordinates of order one in f32; the lines' normals may be a hundred times shorter than F.
+                prop_assert!((f64::from(*f).sqrt() - p).abs() < 1e-4, "{f} {p}");
+            }
+        }
+    }
+
+    #[test]
+    fn wrong_matches_do_not_matter() {
+        let mut errors = Vec::new();
+        let mut linear = Vec::new();
+        for seed in 0..40 {
+            let views = TwoViews::random(seed);
+            let mut m = views.matches(150, 0.3);
+            m.extend(views.wrong(100));
+            let found = estimate_fundamental(&m, &RobustOptions { seed, ..RobustOptions::fundamental() }).unwrap();
+            // The judge is exact points that were not used.
+            errors.push(views.exact_rms(&found.model));
+            linear.push(views.exact_rms(&fundamental_eight_point(&m[..150]).unwrap()));
+            let right = found.inliers.iter().filter(|i| **i < 150).count();
+            // 1 px is 3.3 standard deviations; a wrong match is that close to a line with a chance of about 2 in 480.
+            assert!(right >= 140 && found.inliers.len() - right <= 12, "{right} {}", found.inliers.len());
+        }
+        errors.sort_by(f64::total_cmp);
+        linear.sort_by(f64::total_cmp);
+        // Nearly as good as the linear method that is told which matches are right; never worse than the threshold.
+        assert!(errors[20] < 1.5 * linear[20] && errors[39] < 1.0, "{errors:?} {linear:?}");
+    }
+
+    #[test]
+    fn a_dominant_plane_does_not_win() {
+        let mut errors = Vec::new();
+        for seed in 0..20 {
+            let views = TwoViews::random(seed);
+            // Nine in ten of the right matches on one plane.
+            let mut m = views.planar_matches(180, 0.3);
+            m.extend(views.matches(20, 0.3));
+            m.extend(views.wrong(40));
+            let found = estimate_fundamental(&m, &RobustOptions { seed, ..RobustOptions::fundamental() }).unwrap();
+            errors.push(views.exact_rms(&found.model));
+        }
+        errors.sort_by(f64::total_cmp);
+        // Twenty points fix what the plane leaves open; a degenerate answer is off by tens of pixels. Now and then a few wrong
+        // matches agree on another epipole as well as the few right ones do.
+        assert!(errors[10] < 0.3 && errors[17] < 1.0, "{errors:?}");
+    }
+
+    #[test]
+    fn sampson_is_the_distance_for_a_sideways_pair() {
+        // Rectified: bᵀ F a = a.y − b.y; half of the difference moves each point: |Δy|/√2 in all.
+        let f = Matrix3::new(0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0);
+        let d = sampson(&f, &Correspondence::new(10.0, 7.0, 3.0, 10.0));
+        assert!((d - 3.0 / 2f64.sqrt()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn bad_input_gets_a_typed_answer() {
+        let views = TwoViews::random(1);
+        let get =
+            |m: &[Correspondence]| estimate_fundamental(m, &RobustOptions::fundamental()).map(|r| r.inliers.len());
+        let good = views.matches(30, 0.0);
+        assert_eq!(get(&good[..7]), Err(EstimateError::NotEnoughMatches { got: 7, needed: 8 }));
+        assert_eq!(get(&vec![good[0]; 30]), Err(EstimateError::Degenerate { kind: Degeneracy::Coincident }));
+        let repeated: Vec<_> = (0..30).map(|i| good[i % 6]).collect();
+        assert_eq!(get(&repeated), Err(EstimateError::Degenerate { kind: Degeneracy::Coincident }));
+        let line: Vec<_> = (0..30).map(f64::from).map(|i| Correspondence::new(i, 2.0 * i, i + 3.0, 2.0 * i)).collect();
+        assert_eq!(get(&line), Err(EstimateError::Degenerate { kind: Degeneracy::Collinear }));
+        let mut bad = good.clone();
+        bad[3].a.x = f64::NAN;
+        assert_eq!(get(&bad), Err(EstimateError::NotFinite { index: 3 }));
+        bad[3].a.x = 1e9;
+        assert_eq!(get(&bad), Ok(29));
+        let plane = views.planar_matches(30, 0.0);
+        assert_eq!(fundamental_eight_point(&plane), Err(EstimateError::Degenerate { kind: Degeneracy::Planar }));
+        assert_eq!(fundamental_eight_point(&plane[..8]), Err(EstimateError::Degenerate { kind: Degeneracy::Planar }));
+    }
+}

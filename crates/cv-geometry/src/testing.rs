@@ -1,0 +1,107 @@
+//! Two views of random points with a known pose, for tests.
+
+use cv_core::{Camera, Correspondence, Matrix3, Point3, Pose, Rotation3, Vector3};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng, SeedableRng};
+use std::cell::RefCell;
+
+/// Uniform in 0 to 1.
+pub(crate) fn uniform(rng: &mut ChaCha8Rng) -> f64 {
+    f64::from(rng.next_u32()) / 4294967296.0
+}
+
+/// Nearly normal, of unit variance: the sum of twelve uniform numbers.
+pub(crate) fn gauss(rng: &mut ChaCha8Rng) -> f64 {
+    (0..12).map(|_| uniform(rng)).sum::<f64>() - 6.0
+}
+
+/// |cos| of the angle between two matrices as vectors.
+pub(crate) fn cosine(a: &Matrix3<f64>, b: &Matrix3<f64>) -> f64 {
+    (a.dot(b) / (a.norm() * b.norm())).abs()
+}
+
+/// Two cameras of 640 × 480 that look at points between 4 and 12 units away.
+pub(crate) struct TwoViews {
+    pub(crate) camera: Camera,
+    /// First camera frame to second.
+    pub(crate) pose: Pose,
+    rng: RefCell<ChaCha8Rng>,
+}
+
+impl TwoViews {
+    /// A base line of one unit in a random direction, a rotation of up to 20 degrees.
+    pub(crate) fn random(seed: u64) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut vector = || Vector3::from_fn(|_, _| gauss(&mut rng)).normalize();
+        let (axis, direction) = (vector(), vector());
+        let angle = 0.35 * uniform(&mut rng);
+        let pose = Pose::new(Rotation3::new(axis * angle), direction);
+        Self { camera: Camera::from_focal(640, 480, 500.0), pose, rng: RefCell::new(rng) }
+    }
+
+    pub(crate) fn essential(&self) -> Matrix3<f64> {
+        self.pose.translation.cross_matrix() * self.pose.rotation.matrix()
+    }
+
+    pub(crate) fn fundamental(&self) -> Matrix3<f64> {
+        let k = self.camera.inverse_matrix();
+        k.transpose() * self.essential() * k
+    }
+
+    /// A point that both cameras see, on the plane `n·x = 1` where one is given, and what they see of it.
+    pub(crate) fn point(&self, plane: Option<Vector3<f64>>) -> (Point3<f64>, Correspondence) {
+        let rng = &mut *self.rng.borrow_mut();
+        loop {
+            let pixel = cv_core::Point2::new(640.0 * uniform(rng) - 0.5, 480.0 * uniform(rng) - 0.5);
+            let ray = self.camera.normalize(pixel).to_homogeneous();
+            let depth = match plane {
+                Some(n) => 1.0 / n.dot(&ray),
+                None => 4.0 + 8.0 * uniform(rng),
+            };
+            let point = Point3::from(ray * depth);
+            let Some(b) = self.camera.project(&self.pose.transform(&point)) else { continue };
+            if depth > 0.0 && (-0.5..639.5).contains(&b.x) && (-0.5..479.5).contains(&b.y) {
+                return (point, Correspondence { a: pixel, b });
+            }
+        }
+    }
+
+    fn noisy(&self, m: Correspondence, noise: f64) -> Correspondence {
+        let rng = &mut *self.rng.borrow_mut();
+        let mut n = || noise * gauss(rng);
+        Correspondence::new(m.a.x + n(), m.a.y + n(), m.b.x + n(), m.b.y + n())
+    }
+
+    /// Right matches in pixels.
+    pub(crate) fn matches(&self, n: usize, noise: f64) -> Vec<Correspondence> {
+        (0..n).map(|_| self.noisy(self.point(None).1, noise)).collect()
+    }
+
+    /// Right matches of points on one slanted plane.
+    pub(crate) fn planar_matches(&self, n: usize, noise: f64) -> Vec<Correspondence> {
+        let plane = Vector3::new(0.03, -0.02, 0.125);
+        (0..n).map(|_| self.noisy(self.point(Some(plane)).1, noise)).collect()
+    }
+
+    /// Wrong matches.
+    pub(crate) fn wrong(&self, n: usize) -> Vec<Correspondence> {
+        let rng = &mut *self.rng.borrow_mut();
+        let mut u = |size: f64| size * uniform(rng);
+        (0..n).map(|_| Correspondence::new(u(640.0), u(480.0), u(640.0), u(480.0))).collect()
+    }
+
+    /// Right matches in normalised coordinates, noise too.
+    pub(crate) fn normalised_matches(&self, n: usize, noise: f64) -> Vec<Correspondence> {
+        self.matches(n, noise * 500.0).iter().map(|m| self.normalise(m)).collect()
+    }
+
+    pub(crate) fn normalise(&self, m: &Correspondence) -> Correspondence {
+        Correspondence { a: self.camera.normalize(m.a), b: self.camera.normalize(m.b) }
+    }
+
+    /// Root mean square Sampson distance in pixels of fresh exact matches from `f`.
+    pub(crate) fn exact_rms(&self, f: &Matrix3<f64>) -> f64 {
+        let m = self.matches(100, 0.0);
+        (m.iter().map(|m| crate::sampson(f, m).powi(2)).sum::<f64>() / 100.0).sqrt()
+    }
+}

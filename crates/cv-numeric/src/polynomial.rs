@@ -1,0 +1,432 @@
+//! Real roots of polynomials.
+
+/// At most `N` real roots in ascending order.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Roots<const N: usize> {
+    values: [f64; N],
+    len: usize,
+}
+
+impl<const N: usize> Roots<N> {
+    const NONE: Self = Self { values: [0.0; N], len: 0 };
+
+    fn push(&mut self, root: f64) {
+        if root.is_finite() && self.len < N {
+            self.values[self.len] = root;
+            self.len += 1;
+        }
+    }
+
+    fn sorted(mut self) -> Self {
+        self.values[..self.len].sort_unstable_by(f64::total_cmp);
+        self
+    }
+}
+
+impl<const N: usize> std::ops::Deref for Roots<N> {
+    type Target = [f64];
+
+    fn deref(&self) -> &[f64] {
+        &self.values[..self.len]
+    }
+}
+
+/// Value and derivative of `Σ c[i] x^i`.
+#[inline]
+fn evaluate(c: &[f64], x: f64) -> (f64, f64) {
+    let (mut p, mut d) = (0.0, 0.0);
+    for &k in c.iter().rev() {
+        d = d * x + p;
+        p = p * x + k;
+    }
+    (p, d)
+}
+
+/// Up to two Newton steps, each kept only where it lowers the residual.
+#[inline]
+fn polish(c: &[f64], mut x: f64) -> f64 {
+    let (mut p, mut d) = evaluate(c, x);
+    for _ in 0..2 {
+        let next = x - p / d;
+        let (q, e) = evaluate(c, next);
+        // Also false for NaN, after a division by zero.
+        if q.abs() < p.abs() {
+            (x, p, d) = (next, q, e);
+        } else {
+            break;
+        }
+    }
+    x
+}
+
+/// Real roots of `c[0] + c[1] x + c[2] x²`, without cancellation. A double root comes twice.
+#[inline]
+pub fn real_roots_quadratic(c: [f64; 3]) -> Roots<2> {
+    let mut roots = Roots::NONE;
+    let discriminant = c[1] * c[1] - 4.0 * c[2] * c[0];
+    if discriminant >= 0.0 {
+        let q = -0.5 * (c[1] + discriminant.sqrt().copysign(c[1]));
+        // With a vanishing leading coefficient the first is infinite and left out.
+        roots.push(q / c[2]);
+        if q != 0.0 {
+            roots.push(c[0] / q);
+        } else {
+            roots.push(0.0);
+        }
+    }
+    roots.sorted()
+}
+
+/// Real roots of `c[0] + c[1] x + c[2] x² + c[3] x³`; lower degrees where leading coefficients vanish.
+///
+/// Cardano's or Viète's form (Press et al., Numerical Recipes, §5.6), then Newton steps. A double root may come twice or not
+/// at all: a rounding decides whether the curve touches the axis.
+#[inline]
+pub fn real_roots_cubic(c: [f64; 4]) -> Roots<3> {
+    let mut roots = Roots::NONE;
+    let largest = c.iter().fold(0.0f64, |m, v| m.max(v.abs()));
+    // The third root is then beyond 1e14 times the others' scale.
+    if c[3].abs() <= 1e-14 * largest {
+        if c[2].abs() <= 1e-14 * largest && c[1].abs() <= 1e-14 * largest {
+            return roots;
+        }
+        for &r in real_roots_quadratic([c[0], c[1], c[2]]).iter() {
+            roots.push(r);
+        }
+        return roots;
+    }
+    let (a2, a1, a0) = (c[2] / c[3], c[1] / c[3], c[0] / c[3]);
+    let shift = a2 / 3.0;
+    let q = (a2 * a2 - 3.0 * a1) / 9.0;
+    let r = (a2 * (2.0 * a2 * a2 - 9.0 * a1) + 27.0 * a0) / 54.0;
+    let q3 = q * q * q;
+    if r * r < q3 {
+        // Three real roots.
+        let root = q.sqrt();
+        let theta = (r / (root * q)).clamp(-1.0, 1.0).acos() / 3.0;
+        let (s, k) = theta.sin_cos();
+        let h = 3f64.sqrt() / 2.0;
+        // cos θ, cos(θ + 2π/3), cos(θ − 2π/3) from one sine and cosine.
+        for cosine in [k, -0.5 * k - h * s, -0.5 * k + h * s] {
+            roots.push(polish(&c, -2.0 * root * cosine - shift));
+        }
+    } else {
+        let a = -(r.abs() + (r * r - q3).sqrt()).cbrt().copysign(r);
+        let b = if a == 0.0 { 0.0 } else { q / a };
+        roots.push(polish(&c, a + b - shift));
+    }
+    roots.sorted()
+}
+
+/// Real roots of `Σ c[i] x^i` of degree four; lower degrees where leading coefficients vanish.
+///
+/// Ferrari's resolvent with the root that gives the largest square, then Newton steps. O(1).
+pub fn real_roots_quartic(c: [f64; 5]) -> Roots<4> {
+    let mut roots = Roots::NONE;
+    let largest = c.iter().fold(0.0f64, |m, v| m.max(v.abs()));
+    if c[4].abs() <= 1e-14 * largest {
+        for &r in real_roots_cubic([c[0], c[1], c[2], c[3]]).iter() {
+            roots.push(r);
+        }
+        return roots;
+    }
+    let (b, e, d, f) = (c[3] / c[4], c[2] / c[4], c[1] / c[4], c[0] / c[4]);
+    // Depressed: y⁴ + p y² + q y + r with x = y − b/4.
+    let b2 = b * b;
+    let p = e - 0.375 * b2;
+    let q = d - 0.5 * b * e + 0.125 * b2 * b;
+    let r = f - 0.25 * b * d + 0.0625 * b2 * e - 0.01171875 * b2 * b2;
+    let shift = -0.25 * b;
+    // (y² + p/2 + m)² = 2m y² − q y + (m² + m p + p²/4 − r), a square for a root m of the resolvent.
+    let resolvent = [-q * q, 2.0 * p * p - 8.0 * r, 8.0 * p, 8.0];
+    let m = real_roots_cubic(resolvent).last().copied().unwrap_or(0.0);
+    if m > 1e-14 * (p.abs() + r.abs().sqrt()) {
+        let s = (2.0 * m).sqrt();
+        let t = q / (2.0 * s);
+        for sign in [1.0, -1.0] {
+            // y² ∓ s y + p/2 + m ± t = 0.
+            for &y in real_roots_quadratic([0.5 * p + m + sign * t, -sign * s, 1.0]).iter() {
+                roots.push(polish(&c, y + shift));
+            }
+        }
+    } else {
+        // q vanishes: a quadratic in y².
+        for &y2 in real_roots_quadratic([r, p, 1.0]).iter().filter(|y2| **y2 >= 0.0) {
+            roots.push(polish(&c, y2.sqrt() + shift));
+            roots.push(polish(&c, -y2.sqrt() + shift));
+        }
+    }
+    roots.sorted()
+}
+
+/// A Sturm chain of a polynomial of degree below `N` (coefficients ascending).
+struct Sturm<const N: usize> {
+    /// `chain[0]` and `chain[1]` are the polynomial and its derivative, each scaled; then negated remainders.
+    chain: [[f64; N]; N],
+    degrees: [usize; N],
+    len: usize,
+    /// Where every remainder has just one degree less: `chain[i] = (a x + b) chain[i+1] − s chain[i+2]`.
+    quotients: Option<[[f64; 3]; N]>,
+}
+
+impl<const N: usize> Sturm<N> {
+    fn new(c: &[f64; N], degree: usize) -> Self {
+        let mut s = Self { chain: [[0.0; N]; N], degrees: [0; N], len: 2, quotients: None };
+        let mut quotients = [[0.0; 3]; N];
+        let mut regular = true;
+        for i in 0..=degree {
+            s.chain[0][i] = c[i] / c[degree].abs();
+        }
+        for i in 1..=degree {
+            s.chain[1][i - 1] = s.chain[0][i] * i as f64 / degree as f64;
+        }
+        s.degrees[0] = degree;
+        s.degrees[1] = degree - 1;
+        while s.degrees[s.len - 1] > 0 && s.len < N {
+            let (high, low) = (s.degrees[s.len - 2], s.degrees[s.len - 1]);
+            let divisor = s.chain[s.len - 1];
+            let mut rest = s.chain[s.len - 2];
+            let mut quotient = [0.0; 2];
+            for k in (0..=high - low).rev() {
+                let factor = rest[k + low] / divisor[low];
+                if k < 2 {
+                    quotient[k] = factor;
+                }
+                for i in 0..low {
+                    rest[k + i] -= factor * divisor[i];
+                }
+            }
+            // What is below this is rounding of the terms above: then the remainder is zero and the roots multiple.
+            let size = divisor[..=low].iter().fold(0.0f64, |m, v| m.max(v.abs()));
+            let mut next = low;
+            while next > 0 && rest[next - 1].abs() <= 1e-15 * size {
+                next -= 1;
+            }
+            if next == 0 {
+                break;
+            }
+            let lead = rest[next - 1].abs();
+            regular &= high == low + 1 && next == low;
+            quotients[s.len - 2] = [quotient[1], quotient[0], lead];
+            for (to, from) in s.chain[s.len].iter_mut().zip(&rest[..next]) {
+                *to = -from / lead;
+            }
+            s.degrees[s.len] = next - 1;
+            s.len += 1;
+        }
+        s.quotients = regular.then_some(quotients);
+        s
+    }
+
+    /// Number of sign changes of the chain at `x`.
+    #[inline]
+    fn changes(&self, x: f64) -> usize {
+        let mut count = 0;
+        let last = self.len - 1;
+        match &self.quotients {
+            Some(q) => {
+                let d = self.degrees[last];
+                let (mut below, mut here) = (0.0, evaluate(&self.chain[last][..=d], x).0);
+                for i in (0..last).rev() {
+                    // The last pair has no remainder below it unless the chain was cut short, where it is rounding.
+                    let up = if i + 1 == last {
+                        evaluate(&self.chain[i][..=self.degrees[i]], x).0
+                    } else {
+                        (q[i][0] * x + q[i][1]) * here - q[i][2] * below
+                    };
+                    count += usize::from((up < 0.0) != (here < 0.0));
+                    (below, here) = (here, up);
+                }
+            }
+            None => {
+                let mut before = evaluate(&self.chain[0][..=self.degrees[0]], x).0;
+                for i in 1..=last {
+                    let here = evaluate(&self.chain[i][..=self.degrees[i]], x).0;
+                    count += usize::from((here < 0.0) != (before < 0.0));
+                    before = here;
+                }
+            }
+        }
+        count
+    }
+}
+
+/// Real roots of `Σ c[i] x^i`, of degree `N − 1` or lower where leading coefficients vanish.
+///
+/// Sturm's theorem separates the roots, bracketed Newton steps find them (as in Nistér's five-point solver, 2004, §3.2.4).
+/// Roots closer than `1e-9` of their size may be returned as one, roots of even multiplicity as one or none.
+pub fn real_roots<const N: usize>(c: &[f64; N]) -> Roots<N> {
+    let mut roots = Roots::NONE;
+    let largest = c.iter().fold(0.0f64, |m, v| m.max(v.abs()));
+    let Some(degree) = c.iter().rposition(|v| v.abs() > 1e-15 * largest) else { return roots };
+    if degree == 0 || !largest.is_finite() {
+        return roots;
+    }
+    // Fujiwara's bound.
+    let mut bound = 0.0f64;
+    for (i, v) in c[..degree].iter().enumerate() {
+        bound = bound.max((v / c[degree]).abs().powf(1.0 / (degree - i) as f64));
+    }
+    let bound = 2.0 * bound + 1e-12;
+    if degree == 1 {
+        roots.push(-c[0] / c[1]);
+        return roots;
+    }
+    let sturm = Sturm::new(c, degree);
+    // Intervals with their counts of sign changes; each split halves one.
+    let mut stack = [(0.0, 0.0, 0usize, 0usize); 64];
+    stack[0] = (-bound, bound, sturm.changes(-bound), sturm.changes(bound));
+    let mut open = 1;
+    while open > 0 {
+        open -= 1;
+        let (low, high, at_low, at_high) = stack[open];
+        let count = at_low.saturating_sub(at_high);
+        if count == 0 {
+            continue;
+        }
+        let (p, q) = (evaluate(&c[..=degree], low).0, evaluate(&c[..=degree], high).0);
+        if count == 1 && (p < 0.0) != (q < 0.0) {
+            roots.push(bracketed(&c[..=degree], low, high, p < 0.0));
+            continue;
+        }
+        let middle = 0.5 * (low + high);
+        if high - low <= 1e-9 * (1.0 + middle.abs()) || open + 2 > stack.len() {
+            roots.push(polish(&c[..=degree], middle));
+            continue;
+        }
+        let at_middle = sturm.changes(middle);
+        stack[open] = (middle, high, at_middle, at_high);
+        stack[open + 1] = (low, middle, at_low, at_middle);
+        open += 2;
+    }
+    roots.sorted()
+}
+
+/// The root between `low` and `high`, where the polynomial changes its sign, by Newton steps with bisection as the fallback.
+fn bracketed(c: &[f64], mut low: f64, mut high: f64, rising: bool) -> f64 {
+    let mut x = 0.5 * (low + high);
+    let mut last = high - low;
+    for _ in 0..200 {
+        let (p, d) = evaluate(c, x);
+        if p == 0.0 {
+            break;
+        }
+        if (p < 0.0) == rising {
+            low = x;
+        } else {
+            high = x;
+        }
+        let newton = x - p / d;
+        // Newton where it stays inside and at least halves the step.
+        let next =
+            if newton > low && newton < high && 2.0 * (newton - x).abs() <= last { newton } else { 0.5 * (low + high) };
+        last = (next - x).abs();
+        x = next;
+        if last <= 4.0 * f64::EPSILON * x.abs() {
+            break;
+        }
+    }
+    x
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    /// Coefficients of `lead · Π (x − r)`, times `Π (x² + p)` for complex pairs.
+    fn expand<const N: usize>(real: &[f64], complex: &[f64], lead: f64) -> [f64; N] {
+        let mut c = vec![lead];
+        let times = |c: &[f64], factor: &[f64]| {
+            let mut out = vec![0.0; c.len() + factor.len() - 1];
+            for (i, a) in c.iter().enumerate() {
+                for (j, b) in factor.iter().enumerate() {
+                    out[i + j] += a * b;
+                }
+            }
+            out
+        };
+        for r in real {
+            c = times(&c, &[-r, 1.0]);
+        }
+        for p in complex {
+            c = times(&c, &[*p, 0.3, 1.0]);
+        }
+        c.resize(N, 0.0);
+        c.try_into().unwrap()
+    }
+
+    /// Well-separated roots, ascending.
+    fn separated(counts: &'static [usize]) -> impl Strategy<Value = Vec<f64>> {
+        (-3.0..-1.0f64, proptest::sample::select(counts))
+            .prop_flat_map(|(start, n)| (Just(start), proptest::collection::vec(0.2..1.5f64, n)))
+            .prop_map(|(start, gaps)| {
+                let next = |at: &mut f64, gap: &f64| {
+                    *at += gap;
+                    Some(*at)
+                };
+                gaps.iter().scan(start, next).collect()
+            })
+    }
+
+    fn close(found: &[f64], expected: &[f64], tolerance: f64) -> bool {
+        found.len() == expected.len()
+            && found.iter().zip(expected).all(|(a, b)| (a - b).abs() <= tolerance * (1.0 + b.abs()))
+    }
+
+    proptest! {
+        // Tolerances: an error of a coefficient moves a root by itself times its size over the product of the gaps, here at most
+        // 1e5 for degree ten and 1e3 for degree four.
+        #[test]
+        fn quadratics(roots in separated(&[0, 2]), lead in 0.01..100.0f64) {
+            let complex: &[f64] = if roots.is_empty() { &[1.0] } else { &[] };
+            prop_assert!(close(&real_roots_quadratic(expand(&roots, complex, -lead)), &roots, 1e-12));
+        }
+
+        #[test]
+        fn cubics(roots in separated(&[1, 3]), lead in 0.01..100.0f64) {
+            let complex: &[f64] = if roots.len() == 1 { &[0.7] } else { &[] };
+            let found = real_roots_cubic(expand(&roots, complex, lead));
+            prop_assert!(close(&found, &roots, 1e-11), "{found:?} {roots:?}");
+        }
+
+        #[test]
+        fn quartics(roots in separated(&[0, 2, 4]), lead in 0.01..100.0f64) {
+            let complex = &[0.7, 2.5][..(4 - roots.len()) / 2];
+            let found = real_roots_quartic(expand(&roots, complex, lead));
+            prop_assert!(close(&found, &roots, 1e-10), "{found:?} {roots:?}");
+        }
+
+        #[test]
+        fn degree_ten(roots in separated(&[0, 2, 4, 6, 8]), lead in 0.01..100.0f64) {
+            let complex = &[0.7, 2.5, 0.1, 5.0, 1.3][..(10 - roots.len()) / 2];
+            let found = real_roots::<11>(&expand(&roots, complex, lead));
+            prop_assert!(close(&found, &roots, 1e-7), "{found:?} {roots:?}");
+        }
+
+        #[test]
+        fn lower_degrees_pass_for_their_own(roots in separated(&[1, 2, 3, 4])) {
+            prop_assert!(close(&real_roots::<11>(&expand(&roots, &[], 1.0)), &roots, 1e-10));
+        }
+    }
+
+    #[test]
+    fn symmetric_polynomials_have_irregular_chains() {
+        // x¹⁰ − 1: the derivative divides all but the last term.
+        let mut c = [0.0; 11];
+        (c[0], c[10]) = (-1.0, 1.0);
+        assert!(close(&real_roots(&c), &[-1.0, 1.0], 1e-14));
+        // (x² − 1)(x² − 4), a quadratic in x².
+        assert!(close(&real_roots_quartic([4.0, 0.0, -5.0, 0.0, 1.0]), &[-2.0, -1.0, 1.0, 2.0], 1e-14));
+        assert!(close(&real_roots(&[4.0, 0.0, -5.0, 0.0, 1.0]), &[-2.0, -1.0, 1.0, 2.0], 1e-14));
+        assert!(close(&real_roots_cubic([0.0, -1.0, 0.0, 1.0]), &[-1.0, 0.0, 1.0], 1e-14));
+        assert!(close(&real_roots_cubic([-8.0, 0.0, 0.0, 1.0]), &[2.0], 1e-14));
+    }
+
+    #[test]
+    fn nothing_is_a_root_of_nothing() {
+        assert!(real_roots(&[0.0; 11]).is_empty() && real_roots(&[3.0, 0.0, 0.0]).is_empty());
+        assert!(real_roots(&[f64::NAN; 5]).is_empty() && real_roots_quartic([f64::NAN; 5]).is_empty());
+        assert!(real_roots_cubic([1.0, 0.0, 0.0, 0.0]).is_empty());
+    }
+}
