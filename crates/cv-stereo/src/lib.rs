@@ -19,6 +19,7 @@ mod median;
 mod options;
 #[cfg(test)]
 mod plain;
+mod rectify;
 mod sgm;
 mod speckle;
 mod winner;
@@ -29,3 +30,4 @@ pub use evaluate::{BAD_THRESHOLDS, DisparityScores, EvaluateError, evaluate_disp
 pub use input::Intensity;
 pub use matcher::{DisparityMap, PixelState, StereoMatcher};
 pub use options::{Census, Paths, StereoOptions, Subpixel};
+pub use rectify::{Rectification, RectifiedView, RectifyError, RectifyOptions};

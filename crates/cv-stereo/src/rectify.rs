@@ -1,0 +1,413 @@
+//! Rectification: turning both cameras, in thought, until their rows coincide.
+//!
+//! The common orientation has its x axis along the baseline and looks as nearly as possible where the two cameras look on
+//! average (Bouguet's way of splitting the rotation; Fusiello, Trucco & Verri, "A compact algorithm for rectification of
+//! stereo pairs", MVA 2000, for the axis).
+
+use crate::StereoGeometry;
+use cv_core::{Camera, CameraError, Distortion, Point2, Point3, Rotation3, StereoRig, Vector3};
+use nalgebra::{Matrix3, Matrix4};
+
+/// Options of [`Rectification::new`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RectifyOptions {
+    /// From 0, where both rectified images show the scene in every pixel, to 1, where they show every pixel of the
+    /// originals. Default 0 (OpenCV's usual choice).
+    pub alpha: f64,
+    /// Width and height of the rectified images in px; `None` for those of the left camera (exchanged where the rig is
+    /// vertical). Default `None`.
+    pub size: Option<(usize, usize)>,
+}
+
+impl Default for RectifyOptions {
+    fn default() -> Self {
+        Self { alpha: 0.0, size: None }
+    }
+}
+
+/// Why a rig cannot be rectified.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum RectifyError {
+    /// A camera is none.
+    #[error("the {side} camera: {error}")]
+    Camera {
+        /// `left` or `right`.
+        side: &'static str,
+        /// What is wrong with it.
+        error: CameraError,
+    },
+    /// The two cameras stand at the same place, or the translation is not finite.
+    #[error("the cameras are {baseline} apart: there is no parallax between them")]
+    NoBaseline {
+        /// Length of the translation.
+        baseline: f64,
+    },
+    /// The right camera stands left of the left one, or the lower one above.
+    #[error("the right camera stands {distance} to the {} of the left one: exchange the two", if *.vertical { "top" } else { "left" })]
+    Exchanged {
+        /// By how much, in the unit of the rig.
+        distance: f64,
+        /// Whether the rig is a vertical one.
+        vertical: bool,
+    },
+    /// The cameras stand one behind the other, or look apart, so that rectified ones would see something else.
+    #[error(
+        "camera {side} would have to turn by {degrees:.1}°, more than {limit}°, to look across the baseline: the rig is not a stereo rig"
+    )]
+    TooFarTurned {
+        /// `left` or `right`.
+        side: &'static str,
+        /// By how much it would have to turn.
+        degrees: f64,
+        /// The most that is done.
+        limit: f64,
+    },
+    /// The two cameras see nothing in common after rectification.
+    #[error("the rectified cameras have no field of view in common")]
+    NoOverlap,
+    /// An option is out of range.
+    #[error("option {name} is {value}; it must be {allowed}")]
+    Option {
+        /// Name of the option.
+        name: &'static str,
+        /// Its value.
+        value: f64,
+        /// What would be accepted.
+        allowed: &'static str,
+    },
+}
+
+/// The most a camera is turned: beyond, a plane image sensor would see the scene at a grazing angle.
+const MAX_TURN_DEGREES: f64 = 60.0;
+
+/// One view of a rectified rig.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RectifiedView {
+    /// The camera that took the original.
+    pub source: Camera,
+    /// The camera that would have taken the rectified image.
+    pub camera: Camera,
+    /// Takes directions from the source's frame to the rectified one.
+    pub rotation: Rotation3<f64>,
+}
+
+impl RectifiedView {
+    /// Where a pixel of the rectified image lies in the original; `None` where the original's camera does not look.
+    pub fn source_pixel(&self, pixel: Point2<f64>) -> Option<Point2<f64>> {
+        let n = self.camera.normalize(pixel);
+        let ray = self.rotation.inverse_transform_point(&Point3::new(n.x, n.y, 1.0));
+        let p = self.source.project(&ray)?;
+        // A distortion polynomial may fold rays from far outside back into the image.
+        let back = self.source.normalize(p);
+        let straight = Point2::new(ray.x / ray.z, ray.y / ray.z);
+        ((back - straight).norm() < 1e-6 * (1.0 + straight.coords.norm())).then_some(p)
+    }
+
+    /// Where a pixel of the original lies in the rectified image; `None` behind the rectified camera.
+    pub fn rectified_pixel(&self, pixel: Point2<f64>) -> Option<Point2<f64>> {
+        let n = self.source.normalize(pixel);
+        self.camera.project(&(self.rotation * Point3::new(n.x, n.y, 1.0)))
+    }
+}
+
+/// A rectified rig: both views, and what makes depth of their disparities.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rectification {
+    /// The left (or upper) view.
+    pub left: RectifiedView,
+    /// The right (or lower) view.
+    pub right: RectifiedView,
+    /// Makes depth of disparities, in the unit of the rig.
+    pub geometry: StereoGeometry,
+    /// True where one camera stands above the other. The rectified images are then turned by a quarter, so that rows
+    /// still coincide: their x axis points down in the scene.
+    pub vertical: bool,
+}
+
+impl Rectification {
+    /// Rectifies a rig.
+    ///
+    /// # Errors
+    /// [`RectifyError`] with the reason why it cannot be done.
+    pub fn new(rig: &StereoRig, options: &RectifyOptions) -> Result<Self, RectifyError> {
+        for (side, camera) in [("left", &rig.left), ("right", &rig.right)] {
+            camera.validate().map_err(|error| RectifyError::Camera { side, error })?;
+        }
+        if !(0.0..=1.0).contains(&options.alpha) {
+            return Err(RectifyError::Option { name: "alpha", value: options.alpha, allowed: "from 0 to 1" });
+        }
+        let relative = rig.right_from_left.rotation;
+        let baseline = rig.baseline();
+        // The right camera's centre in the left one's frame.
+        let centre = -(relative.inverse() * rig.right_from_left.translation);
+        let Some(x) = centre.try_normalize(1e-12).filter(|_| baseline.is_finite()) else {
+            return Err(RectifyError::NoBaseline { baseline });
+        };
+        let vertical = centre.y.abs() > centre.x.abs();
+        let along = if vertical { centre.y } else { centre.x };
+        if along < 0.0 {
+            return Err(RectifyError::Exchanged { distance: -along, vertical });
+        }
+        // Mean optical axis, made perpendicular to the baseline.
+        let axis_left = Vector3::z();
+        let axis_right = relative.inverse() * Vector3::z();
+        let turned = |side, degrees: f64| RectifyError::TooFarTurned { side, degrees, limit: MAX_TURN_DEGREES };
+        let mean = axis_left + axis_right;
+        let across = mean - x * x.dot(&mean);
+        let Some(z) = across.try_normalize(1e-9) else { return Err(turned("right", 90.0)) };
+        for (side, axis) in [("left", axis_left), ("right", axis_right)] {
+            let degrees = axis.angle(&z).to_degrees();
+            if degrees > MAX_TURN_DEGREES {
+                return Err(turned(side, degrees));
+            }
+        }
+        let y = z.cross(&x);
+        let to_common =
+            Rotation3::from_matrix_unchecked(Matrix3::from_rows(&[x.transpose(), y.transpose(), z.transpose()]));
+        let rotations = [to_common, to_common * relative.inverse()];
+
+        let native = (rig.left.width, rig.left.height);
+        let (width, height) = options.size.unwrap_or(if vertical { (native.1, native.0) } else { native });
+        if width == 0 || height == 0 {
+            return Err(RectifyError::Option { name: "size", value: 0.0, allowed: "at least 1×1 px" });
+        }
+        let fields = [field(&rig.left, &rotations[0]), field(&rig.right, &rotations[1])];
+        let camera = common_camera(fields, width, height, options.alpha)?;
+        let view = |source, rotation| RectifiedView { source, camera, rotation };
+        Ok(Self {
+            left: view(rig.left, rotations[0]),
+            right: view(rig.right, rotations[1]),
+            geometry: StereoGeometry { focal: camera.fx, cx: camera.cx, cy: camera.cy, baseline, offset: 0.0 },
+            vertical,
+        })
+    }
+
+    /// `Q` of [`StereoGeometry::q`].
+    pub fn q(&self) -> Matrix4<f64> {
+        self.geometry.q()
+    }
+
+    /// Share of the pixels of each rectified image that the originals show, left and right, on a grid of every fourth.
+    pub fn valid_area(&self) -> (f64, f64) {
+        let share = |view: &RectifiedView| {
+            let (w, h) = (view.camera.width, view.camera.height);
+            let (mut seen, mut all) = (0usize, 0usize);
+            for y in (0..h).step_by(4) {
+                for x in (0..w).step_by(4) {
+                    all += 1;
+                    seen += usize::from(view.source_pixel(Point2::new(x as f64, y as f64)).is_some_and(|p| {
+                        p.x >= 0.0
+                            && p.y >= 0.0
+                            && p.x <= view.source.width as f64 - 1.0
+                            && p.y <= view.source.height as f64 - 1.0
+                    }));
+                }
+            }
+            seen as f64 / all.max(1) as f64
+        };
+        (share(&self.left), share(&self.right))
+    }
+}
+
+/// A rectangle in normalised coordinates.
+#[derive(Debug, Clone, Copy)]
+struct Rect {
+    left: f64,
+    top: f64,
+    right: f64,
+    bottom: f64,
+}
+
+impl Rect {
+    fn size(&self) -> (f64, f64) {
+        (self.right - self.left, self.bottom - self.top)
+    }
+
+    fn middle(&self) -> (f64, f64) {
+        ((self.left + self.right) / 2.0, (self.top + self.bottom) / 2.0)
+    }
+}
+
+/// What a camera sees in the rectified frame: a rectangle inside its field of view, and one around it.
+fn field(camera: &Camera, rotation: &Rotation3<f64>) -> (Rect, Rect) {
+    // As many points per side as show the bend of a strong distortion.
+    const STEPS: usize = 64;
+    let (w, h) = (camera.width as f64 - 1.0, camera.height as f64 - 1.0);
+    let everything = f64::INFINITY;
+    let mut inner = Rect { left: -everything, top: -everything, right: everything, bottom: everything };
+    let mut outer = Rect { left: everything, top: everything, right: -everything, bottom: -everything };
+    // Where the middle of each side goes tells which side of the rectified image it bounds: a rig on its side turns.
+    let project = |x: f64, y: f64| {
+        let n = camera.normalize(Point2::new(x, y));
+        let ray = rotation * Point3::new(n.x, n.y, 1.0);
+        (ray.z > 1e-3).then(|| Point2::new(ray.x / ray.z, ray.y / ray.z))
+    };
+    let Some(middle) = project(w / 2.0, h / 2.0) else { return (inner, outer) };
+    for (from, to) in [((0.0, 0.0), (w, 0.0)), ((w, 0.0), (w, h)), ((w, h), (0.0, h)), ((0.0, h), (0.0, 0.0))] {
+        let side = project((from.0 + to.0) / 2.0, (from.1 + to.1) / 2.0).map(|p| p - middle);
+        for step in 0..=STEPS {
+            let t = step as f64 / STEPS as f64;
+            let Some(p) = project(from.0 + (to.0 - from.0) * t, from.1 + (to.1 - from.1) * t) else { continue };
+            outer.left = outer.left.min(p.x);
+            outer.right = outer.right.max(p.x);
+            outer.top = outer.top.min(p.y);
+            outer.bottom = outer.bottom.max(p.y);
+            match side {
+                Some(s) if s.x.abs() > s.y.abs() && s.x < 0.0 => inner.left = inner.left.max(p.x),
+                Some(s) if s.x.abs() > s.y.abs() => inner.right = inner.right.min(p.x),
+                Some(s) if s.y < 0.0 => inner.top = inner.top.max(p.y),
+                Some(_) => inner.bottom = inner.bottom.min(p.y),
+                None => {}
+            }
+        }
+    }
+    (inner, outer)
+}
+
+/// One camera for both views: between the largest that shows only what both see, and the smallest that shows all.
+fn common_camera(fields: [(Rect, Rect); 2], width: usize, height: usize, alpha: f64) -> Result<Camera, RectifyError> {
+    let [(inner_a, outer_a), (inner_b, outer_b)] = fields;
+    let inner = Rect {
+        left: inner_a.left.max(inner_b.left),
+        top: inner_a.top.max(inner_b.top),
+        right: inner_a.right.min(inner_b.right),
+        bottom: inner_a.bottom.min(inner_b.bottom),
+    };
+    let outer = Rect {
+        left: outer_a.left.min(outer_b.left),
+        top: outer_a.top.min(outer_b.top),
+        right: outer_a.right.max(outer_b.right),
+        bottom: outer_a.bottom.max(outer_b.bottom),
+    };
+    let sizes = [inner.size(), outer.size()];
+    if !sizes.iter().all(|s| s.0 > 0.0 && s.1 > 0.0 && s.0.is_finite() && s.1.is_finite()) {
+        return Err(RectifyError::NoOverlap);
+    }
+    // Pixel centres at the very corners.
+    let (w, h) = ((width as f64 - 1.0).max(1.0), (height as f64 - 1.0).max(1.0));
+    let tight = (w / sizes[0].0).max(h / sizes[0].1);
+    let wide = (w / sizes[1].0).min(h / sizes[1].1);
+    let focal = tight + (wide - tight) * alpha;
+    let (m0, m1) = (inner.middle(), outer.middle());
+    let middle = (m0.0 + (m1.0 - m0.0) * alpha, m0.1 + (m1.1 - m0.1) * alpha);
+    Ok(Camera {
+        width,
+        height,
+        fx: focal,
+        fy: focal,
+        cx: (width as f64 - 1.0) / 2.0 - focal * middle.0,
+        cy: (height as f64 - 1.0) / 2.0 - focal * middle.1,
+        distortion: Distortion::None,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cv_core::Pose;
+    use proptest::prelude::*;
+
+    fn rig(angles: (f64, f64, f64), centre: Vector3<f64>, k1: f64) -> StereoRig {
+        let mut left = Camera::pinhole(640, 480, 520.0, 515.0, 322.0, 236.0);
+        left.distortion = Distortion::BrownConrady { k1, k2: 0.05, p1: 0.001, p2: -0.001, k3: 0.0 };
+        let mut right = Camera::pinhole(640, 480, 530.0, 533.0, 310.0, 245.0);
+        right.distortion = Distortion::Radial { k1: k1 * 0.9, k2: 0.03 };
+        let rotation = Rotation3::from_euler_angles(angles.0, angles.1, angles.2);
+        StereoRig { left, right, right_from_left: Pose::new(rotation, -(rotation * centre)) }
+    }
+
+    proptest! {
+        #[test]
+        fn a_scene_point_has_the_same_row_and_the_disparity_its_depth_says(
+            angles in (-0.1..0.1f64, -0.1..0.1f64, -0.1..0.1f64),
+            offset in (-0.02..0.02f64, -0.02..0.02f64),
+            vertical in any::<bool>(),
+            alpha in 0.0..1.0f64,
+            k1 in -0.2..0.05f64,
+            p in (-0.4..0.4f64, -0.3..0.3f64, 2.0..6.0f64),
+        ) {
+            let centre = if vertical { Vector3::new(offset.0, 0.2, offset.1) } else { Vector3::new(0.2, offset.0, offset.1) };
+            let rig = rig(angles, centre, k1);
+            let rectified = Rectification::new(&rig, &RectifyOptions { alpha, size: None }).unwrap();
+            prop_assert_eq!(rectified.vertical, vertical);
+            let point = Point3::new(p.0, p.1, p.2);
+            let (Some(a), Some(b)) = (rig.left.project(&point), rig.right.project(&rig.right_from_left.transform(&point))) else {
+                return Ok(());
+            };
+            let a = rectified.left.rectified_pixel(a).unwrap();
+            let b = rectified.right.rectified_pixel(b).unwrap();
+            // Undistorting stops at 1e-13 of the focal length; a thousand pixels lose three digits more.
+            prop_assert!((a.y - b.y).abs() < 1e-8, "rows {} and {}", a.y, b.y);
+            let depth = (rectified.left.rotation * point).z;
+            prop_assert!((a.x - b.x - rectified.geometry.disparity(depth)).abs() < 1e-8);
+        }
+
+        #[test]
+        fn rectified_and_original_pixels_map_to_each_other(
+            angles in (-0.1..0.1f64, -0.1..0.1f64, -0.1..0.1f64), x in 100.0..540.0f64, y in 100.0..380.0f64,
+        ) {
+            let rig = rig(angles, Vector3::new(0.1, 0.0, 0.0), -0.1);
+            let rectified = Rectification::new(&rig, &RectifyOptions::default()).unwrap();
+            for view in [&rectified.left, &rectified.right] {
+                let there = view.rectified_pixel(Point2::new(x, y)).unwrap();
+                let back = view.source_pixel(there).unwrap();
+                prop_assert!((back - Point2::new(x, y)).norm() < 1e-8);
+            }
+        }
+    }
+
+    #[test]
+    fn alpha_0_leaves_no_hole_and_alpha_1_keeps_every_pixel() {
+        let rig = rig((0.02, -0.03, 0.01), Vector3::new(0.1, 0.005, -0.002), -0.15);
+        let tight = Rectification::new(&rig, &RectifyOptions::default()).unwrap();
+        assert_eq!(tight.valid_area(), (1.0, 1.0));
+        let wide = Rectification::new(&rig, &RectifyOptions { alpha: 1.0, size: None }).unwrap();
+        for view in [wide.left, wide.right] {
+            for corner in [(0.0, 0.0), (639.0, 0.0), (0.0, 479.0), (639.0, 479.0), (320.0, 0.0), (0.0, 240.0)] {
+                let p = view.rectified_pixel(Point2::new(corner.0, corner.1)).unwrap();
+                // Rounding at the very border.
+                assert!(p.x > -1e-9 && p.y > -1e-9 && p.x < 639.0 + 1e-9 && p.y < 479.0 + 1e-9, "{corner:?} to {p}");
+            }
+        }
+        assert!(wide.valid_area().0 < 0.99 && wide.geometry.focal < tight.geometry.focal);
+    }
+
+    #[test]
+    fn a_pair_that_is_rectified_stays_as_it_is() {
+        let camera = Camera::from_focal(320, 240, 300.0);
+        let pose = Pose::new(Rotation3::identity(), Vector3::new(-0.1, 0.0, 0.0));
+        let rig = StereoRig { left: camera, right: camera, right_from_left: pose };
+        let rectified = Rectification::new(&rig, &RectifyOptions::default()).unwrap();
+        let p = rectified.left.source_pixel(Point2::new(17.0, 200.0)).unwrap();
+        assert!((p - Point2::new(17.0, 200.0)).norm() < 1e-9);
+        assert!((rectified.geometry.baseline - 0.1).abs() < 1e-15 && (rectified.geometry.focal - 300.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn rigs_that_are_none_are_refused_with_the_reason() {
+        let refuse =
+            |angles, centre| Rectification::new(&rig(angles, centre, 0.0), &RectifyOptions::default()).unwrap_err();
+        assert!(matches!(refuse((0.0, 0.0, 0.0), Vector3::zeros()), RectifyError::NoBaseline { baseline: 0.0 }));
+        assert!(matches!(
+            refuse((0.0, 0.0, 0.0), Vector3::new(-0.2, 0.0, 0.0)),
+            RectifyError::Exchanged { vertical: false, .. }
+        ));
+        assert!(matches!(
+            refuse((0.0, 0.0, 0.0), Vector3::new(0.0, -0.2, 0.0)),
+            RectifyError::Exchanged { vertical: true, .. }
+        ));
+        assert!(matches!(refuse((0.0, 0.0, 0.0), Vector3::new(0.01, 0.0, 0.2)), RectifyError::TooFarTurned { .. }));
+        assert!(matches!(refuse((0.0, 2.6, 0.0), Vector3::new(0.2, 0.0, 0.0)), RectifyError::TooFarTurned { .. }));
+        let mut broken = rig((0.0, 0.0, 0.0), Vector3::new(0.2, 0.0, 0.0), 0.0);
+        broken.right.fx = f64::NAN;
+        assert!(matches!(
+            Rectification::new(&broken, &RectifyOptions::default()),
+            Err(RectifyError::Camera { side: "right", .. })
+        ));
+        let fine = rig((0.0, 0.0, 0.0), Vector3::new(0.2, 0.0, 0.0), 0.0);
+        assert!(matches!(
+            Rectification::new(&fine, &RectifyOptions { alpha: 1.5, size: None }),
+            Err(RectifyError::Option { name: "alpha", .. })
+        ));
+    }
+}
