@@ -25,10 +25,12 @@
 //! * Every job takes `&dyn Progress`; pass [`&Silent`](Silent) where nobody watches.
 //! * The same input, options and seed give the same result at any number of threads.
 
+mod depth;
 mod matching;
 mod progress;
 mod stopwatch;
 
+pub use depth::{DepthError, DepthOptions, DepthResult, depth};
 pub use matching::{
     FeatureMethod, MatchingError, MatchingOptions, MatchingResult, PhotoFeatures, correspondences, extract_features,
     match_features, match_photos,

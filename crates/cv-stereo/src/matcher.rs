@@ -42,6 +42,13 @@ impl DisparityMap {
         Self { disparity: GrayF32::new(0, 0, [0.0]), state: Image::new(0, 0, [PixelState::Matched]) }
     }
 
+    fn resize(&mut self, width: usize, height: usize) {
+        if self.disparity.size() != (width, height) {
+            self.disparity = GrayF32::new(width, height, [f32::NAN]);
+            self.state = Image::new(width, height, [PixelState::Matched]);
+        }
+    }
+
     /// Share of pixels with a disparity, filled ones included.
     pub fn valid_fraction(&self) -> f64 {
         let d = self.disparity.as_slice();
@@ -146,6 +153,22 @@ impl StereoMatcher {
         if left.size() != right.size() {
             return Err(StereoError::SizeMismatch { left: left.size(), right: right.size() });
         }
+        self.check_size(width, height)?;
+        for (side, view, grey) in [("left", left, 0), ("right", right, 1)] {
+            let count = to_grey(view, &mut self.grey[grey]);
+            if count > 0 {
+                return Err(StereoError::NotFinite { side, count });
+            }
+        }
+        self.aggregate(width, height);
+        map.resize(width, height);
+        self.check(map);
+        self.refine(map);
+        Ok(())
+    }
+
+    /// Refuses image sizes that these options cannot work on.
+    fn check_size(&self, width: usize, height: usize) -> Result<(), StereoError> {
         let (window_width, window_height) = self.options.census.size();
         if width < window_width || height < window_height {
             return Err(StereoError::TooSmall { width, height, window_width, window_height });
@@ -155,25 +178,22 @@ impl StereoMatcher {
         if min >= width as i64 || max <= -(width as i64) {
             return Err(StereoError::RangeOutsideImage { min, max, width });
         }
-        if let Some(allowed) = self.options.max_memory {
-            let needed = self.memory(width, height);
-            if needed > allowed {
-                return Err(StereoError::Memory { needed, allowed });
-            }
+        let needed = self.memory(width, height);
+        let allowed = self.options.max_memory.unwrap_or(isize::MAX as usize);
+        if needed > allowed {
+            return Err(StereoError::Memory { needed, allowed });
         }
-        for (side, view, grey) in [("left", left, 0), ("right", right, 1)] {
-            let count = to_grey(view, &mut self.grey[grey]);
-            if count > 0 {
-                return Err(StereoError::NotFinite { side, count });
-            }
-        }
-        self.aggregate(width, height);
-        if map.disparity.size() != (width, height) {
-            map.disparity = GrayF32::new(width, height, [f32::NAN]);
-            map.state = Image::new(width, height, [PixelState::Matched]);
-        }
-        self.check(map);
-        self.refine(map);
+        Ok(())
+    }
+
+    /// Asks for the memory that images of this size need, so that the first frame takes no longer than the next.
+    ///
+    /// # Errors
+    /// [`StereoError`] where the disparities do not fit the images, or the memory is more than allowed.
+    pub fn prepare(&mut self, width: usize, height: usize, map: &mut DisparityMap) -> Result<(), StereoError> {
+        self.check_size(width, height)?;
+        self.aggregator.prepare(width, height, self.options.disparities);
+        map.resize(width, height);
         Ok(())
     }
 

@@ -10,6 +10,7 @@ use crate::aligned::Aligned;
 use crate::kernel::{BLOCK, Frame, Output, Sweep, sweep_rows};
 use crate::winner::Winner;
 use fearless_simd::{Level, dispatch};
+use rayon::prelude::*;
 
 /// Buffers of the aggregation, kept between frames.
 #[derive(Debug, Default)]
@@ -35,13 +36,23 @@ impl Aggregator {
             .saturating_add(2 * Sweep::bytes(width, blocks))
     }
 
+    fn resize(&mut self, width: usize, height: usize, depth: usize) {
+        self.sums.resize(width * height * depth, 0);
+        self.winners.resize(width * height, Winner::default());
+        self.right.resize(width * height, 0);
+    }
+
+    /// Asks for the memory of a frame and touches every page of it.
+    pub(crate) fn prepare(&mut self, width: usize, height: usize, disparities: usize) {
+        self.resize(width, height, blocks(disparities) * BLOCK);
+        self.sums.as_mut_slice().par_chunks_mut(1 << 20).for_each(|part| part.fill(0));
+    }
+
     /// Fills [`Aggregator::winners`] and [`Aggregator::right`].
     pub(crate) fn run(&mut self, level: Level, frame: &Frame<'_>, eight: bool) {
         let (width, height) = (frame.width, frame.height);
         let depth = frame.blocks * BLOCK;
-        self.sums.resize(width * height * depth, 0);
-        self.winners.resize(width * height, Winner::default());
-        self.right.resize(width * height, 0);
+        self.resize(width, height, depth);
         let [down, up] = &mut self.sweeps;
         // Rows of the upper half, swept first by `down` and last by `up`.
         let top = height / 2;

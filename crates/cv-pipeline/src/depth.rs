@@ -1,0 +1,135 @@
+//! Depth from a rectified pair.
+
+use crate::{Progress, Stopwatch};
+use cv_core::{GrayF32, ImageView};
+use cv_stereo::{DisparityMap, GeometryError, Intensity, StereoError, StereoGeometry, StereoMatcher, StereoOptions};
+
+/// Settings of [`depth`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct DepthOptions {
+    /// Settings of the matcher.
+    pub stereo: StereoOptions,
+    /// Nearest and farthest depth kept, in the unit of the baseline. Default 0 to infinity: all.
+    pub range: (f32, f32),
+}
+
+impl Default for DepthOptions {
+    fn default() -> Self {
+        Self { stereo: StereoOptions::default(), range: (0.0, f32::INFINITY) }
+    }
+}
+
+/// What [`depth`] found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DepthResult {
+    /// Disparities of the left image, and where each comes from.
+    pub map: DisparityMap,
+    /// Depth of the left image in the unit of the baseline, NaN where unknown; `None` without a geometry.
+    pub depth: Option<GrayF32>,
+    /// Stage names and their seconds. `match` is the matcher from the grey images to checked disparities; `prepare` is
+    /// the memory it asks for beforehand.
+    pub stages: Vec<(&'static str, f64)>,
+}
+
+/// Why there is no depth.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum DepthError {
+    /// The pair cannot be matched.
+    #[error(transparent)]
+    Stereo(#[from] StereoError),
+    /// The geometry is none.
+    #[error(transparent)]
+    Geometry(#[from] GeometryError),
+    /// The range of depths is empty.
+    #[error("the depth range {near} to {far} is empty")]
+    Range {
+        /// Nearest depth kept.
+        near: f32,
+        /// Farthest depth kept.
+        far: f32,
+    },
+}
+
+/// Disparity of a rectified pair, and depth where its geometry is known.
+///
+/// # Errors
+/// [`DepthError`] where the images do not fit together, the disparities do not fit the images, or an option is out of
+/// range.
+pub fn depth<T: Intensity, const C: usize>(
+    left: ImageView<'_, T, C>,
+    right: ImageView<'_, T, C>,
+    geometry: Option<&StereoGeometry>,
+    options: &DepthOptions,
+    progress: &dyn Progress,
+) -> Result<DepthResult, DepthError> {
+    let (near, far) = options.range;
+    // NaN fails as well.
+    if near.partial_cmp(&far) != Some(std::cmp::Ordering::Less) {
+        return Err(DepthError::Range { near, far });
+    }
+    if let Some(geometry) = geometry {
+        geometry.validate()?;
+    }
+    let mut watch = Stopwatch::new();
+    let mut matcher = StereoMatcher::new(options.stereo.clone())?;
+    let mut map = DisparityMap::empty();
+    matcher.prepare(left.width(), left.height(), &mut map)?;
+    watch.lap("prepare");
+    progress.report("match", 0, 1);
+    matcher.compute_into(left, right, &mut map)?;
+    watch.lap("match");
+    progress.report("match", 1, 1);
+    let depth = geometry.map(|geometry| geometry.depth_map(map.disparity.view(), options.range));
+    watch.lap("depth");
+    Ok(DepthResult { map, depth, stages: watch.into_stages() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Silent;
+    use cv_core::{Camera, Image};
+    use cv_synth::{RenderOptions, Scene, stereo_pair};
+
+    #[test]
+    fn depth_of_a_generated_room() {
+        let scene = Scene::room(1);
+        let camera = Camera::from_focal(400, 300, 350.0);
+        let pair = stereo_pair(&scene, &camera, &scene.viewpoint(), 0.25, &RenderOptions::default()).unwrap();
+        let geometry = StereoGeometry::from_focal(400, 300, 350.0, 0.25).unwrap();
+        let options =
+            DepthOptions { stereo: StereoOptions { disparities: 64, ..Default::default() }, ..Default::default() };
+        let result =
+            depth(pair.left.image.view(), pair.right.image.view(), Some(&geometry), &options, &Silent).unwrap();
+        let depth = result.depth.unwrap();
+        let (mut good, mut all) = (0u32, 0u32);
+        for y in 0..300 {
+            for x in 0..400 {
+                let truth = pair.left.depth.at(x, y)[0];
+                if pair.visible.at(x, y)[0] && truth < 10.0 {
+                    all += 1;
+                    good += u32::from((depth.at(x, y)[0] - truth).abs() <= 0.05 * truth);
+                }
+            }
+        }
+        // The bar of the project: 95 % of the visible pixels within 5 %.
+        assert!(f64::from(good) >= 0.95 * f64::from(all), "{good} of {all}");
+    }
+
+    #[test]
+    fn what_makes_no_sense_is_an_error_with_the_numbers() {
+        let (a, b) = (Image::<u8, 1>::new(40, 30, [7]), Image::<u8, 1>::new(40, 31, [7]));
+        let run = |options: &DepthOptions| depth(a.view(), b.view(), None, options, &Silent).unwrap_err();
+        assert_eq!(
+            run(&DepthOptions::default()),
+            DepthError::Stereo(StereoError::SizeMismatch { left: (40, 30), right: (40, 31) })
+        );
+        let range = (3.0, 2.0);
+        assert_eq!(run(&DepthOptions { range, ..Default::default() }), DepthError::Range { near: 3.0, far: 2.0 });
+        let geometry = StereoGeometry { focal: -1.0, cx: 0.0, cy: 0.0, baseline: 1.0, offset: 0.0 };
+        assert!(matches!(
+            depth(a.view(), a.view(), Some(&geometry), &DepthOptions::default(), &Silent),
+            Err(DepthError::Geometry(GeometryError::NotPositive { .. }))
+        ));
+    }
+}
