@@ -77,13 +77,10 @@ impl Canvas {
         self.image
     }
 
-    /// Halves the contrast towards `color` by `amount` (0 nothing, 1 all): a quiet ground for marks.
-    pub fn fade(&mut self, color: Color, amount: f32) {
-        let keep = ((1.0 - amount.clamp(0.0, 1.0)) * 256.0) as u32;
+    /// Replaces every pixel by `f` of it.
+    pub fn map(&mut self, f: impl Fn(Color) -> Color) {
         for pixel in self.image.as_mut_slice().as_chunks_mut::<3>().0 {
-            for (v, c) in pixel.iter_mut().zip(color) {
-                *v = ((u32::from(*v) * keep + u32::from(c) * (256 - keep)) >> 8) as u8;
-            }
+            *pixel = f(*pixel);
         }
     }
 

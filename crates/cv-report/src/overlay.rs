@@ -9,15 +9,23 @@ fn unit(width: usize, height: usize) -> f32 {
     (width.max(height) as f32 / 1000.0).clamp(0.8, 4.0)
 }
 
+/// Takes most of the colour and some of the light out of a picture, so that marks on it stand out.
+fn quiet(canvas: &mut Canvas) {
+    canvas.map(|[r, g, b]| {
+        let luma = (u32::from(r) * 77 + u32::from(g) * 150 + u32::from(b) * 29) >> 8;
+        [r, g, b].map(|v| ((u32::from(v) + 3 * luma) * 45 / 256 + 20) as u8)
+    });
+}
+
 /// Marks keypoints: a small ring, larger for larger scales, with a spoke where they have an orientation.
 pub fn draw_keypoints(view: ImageView<'_, u8, 3>, keypoints: &[Keypoint], color: Color) -> RgbU8 {
     let mut canvas = Canvas::from_rgb(view);
     let u = unit(view.width(), view.height());
     for point in keypoints {
         let center = [point.position.x, point.position.y];
-        let radius = (3.0 * u).max(3.0 * point.scale.clamp(0.0, 100.0));
-        canvas.circle(center, radius, 2.6 * u, colors::BLACK);
-        canvas.circle(center, radius, 1.3 * u, color);
+        let radius = (3.6 * u).max(3.0 * point.scale.clamp(0.0, 100.0));
+        canvas.circle(center, radius, 3.4 * u, colors::BLACK);
+        canvas.circle(center, radius, 1.7 * u, color);
         if point.angle != 0.0 && point.angle.is_finite() {
             let end = [center[0] + radius * point.angle.cos(), center[1] + radius * point.angle.sin()];
             canvas.line(center, end, 1.3 * u, color);
@@ -81,7 +89,7 @@ impl Default for MatchStyle {
     }
 }
 
-/// Two pictures side by side with a line per match: inliers green over outliers red, or each in a colour of its own where
+/// Two pictures, greyed and side by side, with a line per match: inliers green over outliers red, or each in a colour of its own where
 /// `inliers` is `None`. A pair beyond the end of `inliers` counts as an outlier.
 pub fn draw_matches(
     a: ImageView<'_, u8, 3>,
@@ -91,14 +99,15 @@ pub fn draw_matches(
     style: &MatchStyle,
 ) -> RgbU8 {
     let (mut canvas, corners) = row_of(&[a, b], 0);
+    quiet(&mut canvas);
     let u = unit(canvas.width() / 2, canvas.height());
     let mut draw = |pair: &Correspondence, color: Color| {
         let from = [pair.a.x as f32 + corners[0][0], pair.a.y as f32 + corners[0][1]];
         let to = [pair.b.x as f32 + corners[1][0], pair.b.y as f32 + corners[1][1]];
-        canvas.line(from, to, 1.1 * u, color);
+        canvas.line(from, to, 1.3 * u, color);
         for end in [from, to] {
-            canvas.disc(end, 2.6 * u, colors::BLACK);
-            canvas.disc(end, 1.8 * u, color);
+            canvas.disc(end, 3.4 * u, colors::BLACK);
+            canvas.disc(end, 2.4 * u, color);
         }
     };
     match inliers {
@@ -115,7 +124,7 @@ pub fn draw_matches(
     canvas.into_image()
 }
 
-/// Two pictures side by side; up to `count` pairs, each with its epipolar lines in one colour: `F x_a` in the second picture
+/// Two pictures, greyed and side by side; up to `count` pairs, each with its epipolar lines in one colour: `F x_a` in the second picture
 /// and `Fᵀ x_b` in the first, where `x_bᵀ F x_a = 0`.
 pub fn draw_epipolar_lines(
     a: ImageView<'_, u8, 3>,
@@ -125,6 +134,8 @@ pub fn draw_epipolar_lines(
     count: usize,
 ) -> RgbU8 {
     let (mut left, mut right) = (Canvas::from_rgb(a), Canvas::from_rgb(b));
+    quiet(&mut left);
+    quiet(&mut right);
     let u = unit(a.width(), a.height());
     for (n, i) in spread(pairs.len(), count).enumerate() {
         let pair = &pairs[i];
@@ -134,7 +145,7 @@ pub fn draw_epipolar_lines(
             [(&mut left, fundamental.transpose() * xb, pair.a), (&mut right, fundamental * xa, pair.b)]
         {
             if let Some((from, to)) = across(line.x, line.y, line.z, canvas.width() as f64, canvas.height() as f64) {
-                canvas.line(from, to, 1.2 * u, color);
+                canvas.line(from, to, 1.8 * u, color);
             }
             let center = [point.x as f32, point.y as f32];
             canvas.disc(center, 4.6 * u, colors::BLACK);
@@ -186,7 +197,7 @@ pub fn overlay_comparison(
     truth: ImageView<'_, bool, 1>,
 ) -> RgbU8 {
     let mut canvas = Canvas::from_rgb(view);
-    canvas.fade([128; 3], 0.25);
+    quiet(&mut canvas);
     for y in 0..view.height() {
         for x in 0..view.width() {
             let color = match (mask.get(x, y) == Some([true]), truth.get(x, y) == Some([true])) {
@@ -280,7 +291,7 @@ mod tests {
         }
         let only = MatchStyle { outliers: false, ..MatchStyle::default() };
         let picture = draw_matches(a.view(), b.view(), &pairs, Some(&[true, false]), &only);
-        assert_eq!(picture.at(10, 25), [60; 3]);
+        assert_eq!(picture.at(10, 25), picture.at(2, 2));
     }
 
     #[test]
@@ -290,7 +301,7 @@ mod tests {
         let a = gray(60, 40);
         let pairs = [Correspondence::new(20.0, 12.0, 30.0, 12.0)];
         let picture = draw_epipolar_lines(a.view(), a.view(), &f, &pairs, 5);
-        let marked = |x: usize, y: usize| picture.at(x, y) != [60; 3];
+        let marked = |x: usize, y: usize| picture.at(x, y) != picture.at(2, 38);
         assert!((0..60).all(|x| marked(x, 12)));
         let start = picture.width() - 60;
         assert!((start..start + 60).all(|x| marked(x, 12)));

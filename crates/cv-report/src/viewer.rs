@@ -185,41 +185,32 @@ pub fn render_points(scene: &PointScene, viewpoint: Viewpoint, width: usize, hei
         (Viewpoint::Camera, None) => (cv_core::Vector3::new(0.25, 0.35, 1.0), -cv_core::Vector3::y()),
     };
     let forward = forward.try_normalize(1e-9).unwrap_or_else(cv_core::Vector3::z);
-    // Everything that counts fits: the points' bulk and every camera.
-    let reach = scene
-        .frusta
-        .iter()
-        .map(|f| (f.center - center).norm() + f64::from(scene.frustum_depth()))
-        .fold(radius * 1.15, f64::max);
-    let (distance, focal) = match viewpoint {
-        Viewpoint::Camera => (2.6 * reach, 1.15),
-        // Far away: the picture of a plan.
-        Viewpoint::Top | Viewpoint::Side => (40.0 * reach, 19.0),
-    };
+    // A plan is drawn from far away, where lines that are parallel look it.
+    let distance = if viewpoint == Viewpoint::Camera { 3.0 * radius } else { 60.0 * radius };
     let eye = center - forward * distance;
     let Some(pose) = Pose::look_at(eye, center, -up) else { return canvas.into_image() };
-    let scale = focal * width.min(height) as f64;
     let project = |p: [f32; 3]| {
         let q = pose.transform(&Point3::new(f64::from(p[0]), f64::from(p[1]), f64::from(p[2])));
-        (q.z > 0.05 * distance).then(|| {
-            let s = scale / q.z;
-            ([(q.x * s + width as f64 / 2.0) as f32, (q.y * s + height as f64 / 2.0) as f32], q.z as f32)
-        })
+        (q.z > 0.02 * distance).then(|| ([(q.x / q.z) as f32, (q.y / q.z) as f32], q.z as f32))
     };
-    let size = (width.min(height) as f32 / 500.0).clamp(1.0, 3.0);
-    let side = (1.5 * size).round() as usize;
     // Far points first, near ones over them.
     let mut order: Vec<(f32, [f32; 2], Color)> =
         scene.points.iter().zip(&scene.colors).filter_map(|(p, c)| project(*p).map(|(q, z)| (z, q, *c))).collect();
     order.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let lines: Vec<_> =
+        scene.segments().into_iter().filter_map(|(a, b, color)| Some((project(a)?.0, project(b)?.0, color))).collect();
+    let Some((middle, scale)) = fit(&order, &lines, width as f32, height as f32) else { return canvas.into_image() };
+    let place = |q: [f32; 2]| {
+        [(q[0] - middle[0]) * scale + width as f32 / 2.0, (q[1] - middle[1]) * scale + height as f32 / 2.0]
+    };
+    let size = (width.min(height) as f32 / 500.0).clamp(1.0, 3.0);
+    let side = (1.5 * size).round() as usize;
     for (_, q, color) in order {
-        let corner = q.map(|v| (v - side as f32 / 2.0 + 0.5).floor() as i64);
+        let corner = place(q).map(|v| (v - side as f32 / 2.0 + 0.5).floor() as i64);
         canvas.fill_rect(corner[0], corner[1], side, side, color);
     }
-    for (a, b, color) in scene.segments() {
-        if let (Some((a, _)), Some((b, _))) = (project(a), project(b)) {
-            canvas.line(a, b, 1.4 * size, color);
-        }
+    for (a, b, color) in lines {
+        canvas.line(place(a), place(b), 1.4 * size, color);
     }
     let name = match viewpoint {
         Viewpoint::Camera => "",
@@ -228,6 +219,34 @@ pub fn render_points(scene: &PointScene, viewpoint: Viewpoint, width: usize, hei
     };
     canvas.text(10.0 * size, 10.0 * size, name, 9.0 * size, [170, 176, 190]);
     canvas.into_image()
+}
+
+/// The middle and the scale that put the cameras and all but the outermost 2 % of the points inside the picture, with a margin.
+fn fit(
+    points: &[(f32, [f32; 2], Color)],
+    lines: &[([f32; 2], [f32; 2], Color)],
+    width: f32,
+    height: f32,
+) -> Option<([f32; 2], f32)> {
+    let mut low = [f32::INFINITY; 2];
+    let mut high = [f32::NEG_INFINITY; 2];
+    for axis in 0..2 {
+        let mut values: Vec<f32> = points.iter().map(|p| p.1[axis]).collect();
+        if !values.is_empty() {
+            values.sort_by(f32::total_cmp);
+            let skip = values.len() / 100;
+            (low[axis], high[axis]) = (values[skip], values[values.len() - 1 - skip]);
+        }
+        for v in lines.iter().flat_map(|l| [l.0[axis], l.1[axis]]) {
+            (low[axis], high[axis]) = (low[axis].min(v), high[axis].max(v));
+        }
+    }
+    let span = [high[0] - low[0], high[1] - low[1]];
+    if !(span[0] >= 0.0 && span[1] >= 0.0 && span.iter().all(|s| s.is_finite())) {
+        return None;
+    }
+    let scale = (0.9 * width / span[0].max(1e-6)).min(0.9 * height / span[1].max(1e-6));
+    Some(([(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0], scale))
 }
 
 /// Colours for cameras, in order.
