@@ -76,6 +76,14 @@ pub enum FormatError {
         /// The value.
         what: String,
     },
+    /// A needed entry is absent.
+    #[error("{format}: there is no {what}")]
+    Missing {
+        /// Name of the format.
+        format: &'static str,
+        /// Name of the entry.
+        what: String,
+    },
 }
 
 impl FormatError {
@@ -89,6 +97,10 @@ impl FormatError {
 
     pub(crate) fn line(line: usize, reason: impl Into<String>) -> Self {
         Self::Line { line, reason: reason.into() }
+    }
+
+    pub(crate) fn missing(format: &'static str, what: impl Into<String>) -> Self {
+        Self::Missing { format, what: what.into() }
     }
 
     /// What a person might try next, where there is something to say.

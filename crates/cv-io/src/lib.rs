@@ -25,10 +25,14 @@
 //! |---|---|
 //! | pictures | [`read_rgb`], [`read_gray_u8`], [`read_mask`], [`read_image`], [`write_png`], [`write_jpeg`] |
 //! | maps of floats | [`pfm`], [`kitti`], [`depth_mm`], [`scaled`] |
-//! | arrays | [`npy`] |
+//! | arrays | [`npy`], [`npz`] |
 //! | clouds | [`ply`] |
+//! | cameras and rigs | [`read_camera`], [`write_camera`], [`read_rig`], [`write_rig`] |
+//! | sparse models | [`colmap`] |
 //! | matches | [`read_matches`], [`write_matches`] |
 
+mod camera;
+pub mod colmap;
 mod depth_png;
 mod encode;
 mod error;
@@ -36,11 +40,13 @@ mod exif_info;
 mod files;
 mod matches;
 pub mod npy;
+pub mod npz;
 pub mod pfm;
 mod picture;
 pub mod ply;
 mod sniff;
 
+pub use camera::{RigFile, parse_camera, parse_rig, read_camera, read_rig, write_camera, write_rig};
 pub use depth_png::{depth_mm, kitti, scaled};
 pub use encode::{JpegPixels, PngPixels, encode_jpeg, encode_png, write_image, write_jpeg, write_png};
 pub use error::{FormatError, IoError};

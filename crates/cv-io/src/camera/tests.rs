@@ -1,0 +1,188 @@
+use super::*;
+use cv_core::{Distortion, Pose, Rotation3, Vector3};
+use proptest::prelude::*;
+
+/// As OpenCV 5's FileStorage writes it.
+const OPENCV: &str = "%YAML 1.2
+---
+calibration_time: now
+image_width: 640
+image_height: 480
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 532.79999999999995, 0., 342.5, 0., 532.89999999999998,
+       233.90000000000001, 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 5
+   cols: 1
+   dt: d
+   data: [ -0.28000000000000003, 0.040000000000000001, 0.001,
+       -0.00020000000000000001, 0.10000000000000001 ]
+avg_reprojection_error: .Nan
+";
+
+fn example() -> Camera {
+    Camera {
+        distortion: Distortion::BrownConrady { k1: -0.28, k2: 0.04, p1: 0.001, p2: -0.0002, k3: 0.1 },
+        ..Camera::pinhole(640, 480, 532.8, 532.9, 342.5, 233.9)
+    }
+}
+
+#[test]
+fn opencv_yaml_old_and_new() {
+    assert_eq!(parse_camera(OPENCV, None).unwrap(), example());
+    let old = OPENCV.replace("%YAML 1.2", "%YAML:1.0").replace("camera_matrix", "Camera_Matrix");
+    assert_eq!(parse_camera(&old, Some((1, 1))).unwrap(), example());
+}
+
+#[test]
+fn opencv_samples_without_a_size_take_the_pictures() {
+    let text = "%YAML:1.0\n---\nM1: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ 500., 0., 320., 0., 500., 240., 0., 0., 1. ]\n";
+    assert_eq!(parse_camera(text, Some((640, 480))).unwrap(), Camera::pinhole(640, 480, 500.0, 500.0, 320.0, 240.0));
+    assert!(parse_camera(text, None).unwrap_err().to_string().contains("picture size"));
+}
+
+#[test]
+fn ros_camera_info() {
+    let text = "image_width: 640\nimage_height: 480\ncamera_name: left\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: [500, 0, 320, 0, 501, 240, 0, 0, 1]\ndistortion_model: equidistant\ndistortion_coefficients:\n  rows: 1\n  cols: 4\n  data: [0.1, 0.2, 0.3, 0.4]\n";
+    let camera = parse_camera(text, None).unwrap();
+    assert_eq!(camera.distortion, Distortion::Fisheye { k1: 0.1, k2: 0.2, k3: 0.3, k4: 0.4 });
+    assert_eq!((camera.fx, camera.fy, camera.cx, camera.cy), (500.0, 501.0, 320.0, 240.0));
+}
+
+#[test]
+fn colmap_lines_lose_their_half_pixel() {
+    let expected = Camera {
+        distortion: Distortion::Radial { k1: -0.16196, k2: 0.0 },
+        ..Camera::pinhole(2832, 2128, 2973.319797, 2973.319797, 1415.5, 1063.5)
+    };
+    for text in [
+        "# world-to-camera poses by COLMAP (SIFT)\n# camera: SIMPLE_RADIAL 2832x2128 params 2973.319797 1416.000000 1064.000000 -0.161960 (pixel centres at +0.5)\n# name qw\nA.JPG 1 0 0 0\n",
+        "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 SIMPLE_RADIAL 2832 2128 2973.319797 1416 1064 -0.16196\n",
+        "SIMPLE_RADIAL 2832 2128 2973.319797 1416 1064 -0.16196",
+    ] {
+        assert_eq!(parse_camera(text, None).unwrap(), expected, "{text}");
+    }
+    let error = parse_camera("SIMPLE_RADIAL 2832 2128 2973.3 1416 1064", None).unwrap_err().to_string();
+    assert!(error.contains("3 parameters"), "{error}");
+    assert!(parse_camera("1 THIN_PRISM_FISHEYE 9 9 1 1 1 1 1 1 1 1 1 1 1 1", None).is_err());
+}
+
+#[test]
+fn bare_matrices() {
+    let k = "2905.88 0 1416 \n0 2905.88 1064\n0 0 1";
+    assert_eq!(
+        parse_camera(k, Some((2832, 2128))).unwrap(),
+        Camera::pinhole(2832, 2128, 2905.88, 2905.88, 1416.0, 1064.0)
+    );
+    assert!(parse_camera("[[1, 0, 2], [0, 1, 2], [0, 0, 1]]", Some((4, 4))).is_ok());
+    assert!(parse_camera("1 0.5 2 0 1 2 0 0 1", Some((4, 4))).unwrap_err().to_string().contains("skew"));
+    assert!(parse_camera("1 0 2 0 1 2 0 3 1", Some((4, 4))).is_err());
+    assert!(parse_camera("-1 0 2 0 1 2 0 0 1", Some((4, 4))).is_err());
+}
+
+#[test]
+fn a_stereo_rig_of_opencv() {
+    let matrix = |name: &str, rows: usize, cols: usize, data: &str| {
+        format!("{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: [ {data} ]\n")
+    };
+    let k = "500., 0., 320., 0., 500., 240., 0., 0., 1.";
+    let text = format!(
+        "%YAML:1.0\n---\n{}{}{}{}{}{}",
+        matrix("M1", 3, 3, k),
+        matrix("D1", 1, 14, "0.1, 0., 0., 0., 0., 0., 0., 0., 0., 0., 0., 0., 0., 0."),
+        matrix("M2", 3, 3, k),
+        matrix("D2", 1, 5, "0., 0., 0., 0., 0."),
+        matrix("R", 3, 3, "1., 0., 0., 0., 1., 0., 0., 0., 1."),
+        matrix("T", 3, 1, "-3.3, 0.1, 0.2")
+    );
+    let file = parse_rig(&text, Some((640, 480))).unwrap();
+    assert_eq!(file.rig.left.distortion, Distortion::BrownConrady { k1: 0.1, k2: 0.0, p1: 0.0, p2: 0.0, k3: 0.0 });
+    assert_eq!(file.rig.right.distortion, Distortion::None);
+    assert_eq!(file.rig.right_from_left, Pose::new(Rotation3::identity(), Vector3::new(-3.3, 0.1, 0.2)));
+    let rational = text.replace("0.1, 0., 0., 0., 0., 0., 0.", "0.1, 0., 0., 0., 0., 0.5, 0.");
+    assert!(parse_rig(&rational, Some((640, 480))).unwrap_err().to_string().contains("rational"));
+    let bent =
+        text.replace("data: [ 1., 0., 0., 0., 1., 0., 0., 0., 1. ]", "data: [ 2., 0., 0., 0., 1., 0., 0., 0., 1. ]");
+    assert!(parse_rig(&bent, Some((640, 480))).unwrap_err().to_string().contains("rotation"));
+    let missing = text.replace("T: !!", "Q: !!");
+    assert!(parse_rig(&missing, Some((640, 480))).unwrap_err().to_string().contains("no T"));
+}
+
+#[test]
+fn mistakes_are_named() {
+    let good = "schema: cv-camera/1\nwidth: 4\nheight: 3\nfx: 5\nfy: 5\ncx: 1.5\ncy: 1\n";
+    assert_eq!(parse_camera(good, None).unwrap(), Camera::pinhole(4, 3, 5.0, 5.0, 1.5, 1.0));
+    for (from, to, word) in [
+        ("fx: 5", "f: 5", "“f”"),
+        ("fx: 5\n", "", "fx"),
+        ("fx: 5", "fx: five", "fx is not a number"),
+        ("fx: 5", "fx: -5", "focal"),
+        ("fx: 5", "fx: .inf", "focal"),
+        ("cx: 1.5", "cx: .nan", "finite"),
+        ("width: 4", "width: 4.5", "width"),
+        ("width: 4", "width: 99999999999", "width"),
+        ("cv-camera/1", "cv-camera/9", "cv-camera/9"),
+        ("cy: 1\n", "cy: 1\ndistortion: radial\n", "0 coefficients"),
+        ("cy: 1\n", "cy: 1\ndistortion: odd\n", "“odd”"),
+        ("cy: 1\n", "cy: [1\n", "YAML"),
+    ] {
+        let text = good.replace(from, to);
+        let error = parse_camera(&text, None).unwrap_err().to_string();
+        assert!(error.contains(word), "{to:?}: {error}");
+    }
+    assert!(parse_camera(&good.replace("cy: 1\n", "cy: 1\nx-serial: 17\n"), None).is_ok());
+}
+
+#[test]
+fn hostile_yaml_is_refused_and_not_obeyed() {
+    let deep = format!("%YAML:1.0\n---\na: {}", "[".repeat(200_000));
+    let blocks = format!("%YAML:1.0\n---\n{}x", "- ".repeat(200_000));
+    let marks = format!("%YAML:1.0\n---\n{}x", "? ".repeat(200_000));
+    let laughs = "%YAML:1.0\n---\na: &a [x,x,x,x,x,x,x,x,x]\nb: &b [*a,*a,*a,*a,*a,*a,*a,*a,*a]\nc: &c [*b,*b,*b,*b,*b,*b,*b,*b,*b]\nd: &d [*c,*c,*c,*c,*c,*c,*c,*c,*c]\ne: &e [*d,*d,*d,*d,*d,*d,*d,*d,*d]\nK: [*e,*e,*e,*e,*e,*e,*e,*e,*e]\n";
+    let stairs: String = (0..3000).map(|i| format!("{}a:\n", " ".repeat(i))).collect();
+    for text in [&deep[..], &blocks, &marks, laughs, &stairs] {
+        assert!(parse_camera(text, None).is_err());
+    }
+}
+
+fn distortions() -> impl Strategy<Value = Distortion> {
+    let k = || prop::num::f64::NORMAL | prop::num::f64::ZERO;
+    prop_oneof![
+        Just(Distortion::None),
+        (k(), k()).prop_map(|(k1, k2)| Distortion::Radial { k1, k2 }),
+        (k(), k(), k(), k(), k()).prop_map(|(k1, k2, p1, p2, k3)| Distortion::BrownConrady { k1, k2, p1, p2, k3 }),
+        (k(), k(), k(), k()).prop_map(|(k1, k2, k3, k4)| Distortion::Fisheye { k1, k2, k3, k4 }),
+    ]
+}
+
+prop_compose! {
+    fn cameras()(w in 1usize..9000, h in 1usize..9000, f in 1e-3..1e6f64, a in 0.5..2.0f64, cx in -1e4..1e4f64, cy in -1e4..1e4f64, distortion in distortions()) -> Camera {
+        Camera { width: w, height: h, fx: f, fy: f * a, cx, cy, distortion }
+    }
+}
+
+proptest! {
+    #[test]
+    fn a_camera_reads_back_to_the_bit(camera in cameras(), note in ".*") {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("camera.yaml");
+        write_camera(&path, &camera, &[&note]).unwrap();
+        prop_assert_eq!(read_camera(&path, None).unwrap(), camera);
+    }
+
+    #[test]
+    fn a_rig_reads_back_to_the_bit(left in cameras(), right in cameras(), r in prop::array::uniform3(-3.0..3.0f64), t in prop::array::uniform3(-1e3..1e3f64), unit in ".*") {
+        let right_from_left = Pose::new(Rotation3::from_euler_angles(r[0], r[1], r[2]), Vector3::from(t));
+        let file = RigFile { rig: StereoRig { left, right, right_from_left }, unit: "squares".into() };
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rig.yaml");
+        write_rig(&path, &file, &["a note"]).unwrap();
+        prop_assert_eq!(read_rig(&path, None).unwrap(), file.clone());
+        // Any unit at all still gives a file that reads.
+        write_rig(&path, &RigFile { unit, ..file.clone() }, &[]).unwrap();
+        prop_assert_eq!(read_rig(&path, None).unwrap().rig, file.rig);
+    }
+}

@@ -1,0 +1,355 @@
+//! COLMAP's text models: `cameras.txt`, `images.txt`, `points3D.txt` in one folder.
+//!
+//! COLMAP puts the centre of the top-left pixel at (0.5, 0.5). Principal points and image points are brought to our convention, integers,
+//! when read, and back when written. Poses are world to camera in both.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::path::Path;
+use std::str::SplitWhitespace;
+
+use cv_core::nalgebra::{Quaternion, UnitQuaternion};
+use cv_core::{Camera, Point2, Point3, Pose, Vector3};
+
+use crate::camera::{model_parameters, parse_model};
+use crate::files::{read_text, write_bytes};
+use crate::{FormatError, IoError};
+
+const NAME: &str = "COLMAP text";
+const CENTER: f64 = 0.5;
+
+/// A sparse model.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Model {
+    /// Cameras by number.
+    pub cameras: BTreeMap<u32, Camera>,
+    /// Pictures by number.
+    pub images: BTreeMap<u32, ModelImage>,
+    /// Points by number.
+    pub points: BTreeMap<u64, ModelPoint>,
+}
+
+/// A registered picture.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ModelImage {
+    /// File name, relative to the pictures' folder.
+    pub name: String,
+    /// Number of its camera.
+    pub camera: u32,
+    /// World to camera.
+    pub pose: Pose,
+    /// Image points in pixels (centres at integers), and the scene point each belongs to, if any.
+    pub points: Vec<(Point2<f64>, Option<u64>)>,
+}
+
+/// A scene point.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ModelPoint {
+    /// Position in the world.
+    pub position: Point3<f64>,
+    /// RGB colour.
+    pub color: [u8; 3],
+    /// Mean reprojection error in pixels; negative or NaN where unknown.
+    pub error: f64,
+    /// Where it is seen: number of the picture, index of the point in it.
+    pub track: Vec<(u32, u32)>,
+}
+
+/// Words of a line, with errors that name what was expected.
+struct Words<'a>(SplitWhitespace<'a>, usize);
+
+impl<'a> Words<'a> {
+    fn next<T: std::str::FromStr>(&mut self, what: &str) -> Result<T, FormatError> {
+        let Self(words, line) = self;
+        let word = words.next().ok_or_else(|| FormatError::line(*line, format!("{what} is missing")))?;
+        word.parse().map_err(|_| FormatError::line(*line, format!("{what}: “{word:.40}” is not one")))
+    }
+
+    fn rest<T: std::str::FromStr>(&mut self, what: &str) -> Result<Vec<T>, FormatError> {
+        let line = self.1;
+        let parse = |w: &str| w.parse().map_err(|_| FormatError::line(line, format!("{what}: “{w:.40}” is not one")));
+        self.0.by_ref().map(parse).collect()
+    }
+}
+
+/// The lines that are not comments, with their numbers from 1. An empty line counts: `images.txt` has them.
+fn lines(text: &str) -> impl Iterator<Item = (usize, &str)> {
+    text.lines().enumerate().map(|(i, l)| (i + 1, l.trim())).filter(|(_, l)| !l.starts_with('#'))
+}
+
+/// Parses `cameras.txt`.
+///
+/// # Errors
+/// [`FormatError`] with the line, or for a camera model without an equal here.
+pub fn parse_cameras(text: &str) -> Result<BTreeMap<u32, Camera>, FormatError> {
+    let mut cameras = BTreeMap::new();
+    for (number, line) in lines(text).filter(|(_, l)| !l.is_empty()) {
+        let mut words = Words(line.split_whitespace(), number);
+        let id: u32 = words.next("a camera's number")?;
+        let model: String = words.next("a camera model")?;
+        let (width, height) = (words.next("the width")?, words.next("the height")?);
+        let camera = parse_model(&model, width, height, &words.rest("a parameter")?)?;
+        camera.validate().map_err(|e| FormatError::line(number, e.to_string()))?;
+        if cameras.insert(id, camera).is_some() {
+            return Err(FormatError::line(number, format!("camera {id} is there twice")));
+        }
+    }
+    Ok(cameras)
+}
+
+/// Parses `images.txt`.
+///
+/// # Errors
+/// [`FormatError::Line`].
+pub fn parse_images(text: &str) -> Result<BTreeMap<u32, ModelImage>, FormatError> {
+    let mut images = BTreeMap::new();
+    let mut rest = lines(text);
+    // Two lines a picture; the second may be empty, but blank lines before a first one are only that.
+    while let Some((number, line)) = rest.find(|(_, l)| !l.is_empty()) {
+        let mut words = Words(line.split_whitespace(), number);
+        let id: u32 = words.next("a picture's number")?;
+        let mut q = [0.0; 4];
+        for v in &mut q {
+            *v = words.next("a quaternion's part")?;
+        }
+        let mut t = [0.0; 3];
+        for v in &mut t {
+            *v = words.next("a translation's part")?;
+        }
+        let pose =
+            pose(q, t).ok_or_else(|| FormatError::line(number, "the pose is not finite, or its quaternion is zero"))?;
+        let camera = words.next("a camera's number")?;
+        // Names may hold blanks.
+        let name = words.rest::<String>("a name")?.join(" ");
+        if name.is_empty() {
+            return Err(FormatError::line(number, "the picture's name is missing"));
+        }
+        let mut points = Vec::new();
+        if let Some((number, line)) = rest.next() {
+            let mut words = Words(line.split_whitespace(), number);
+            while let Some(first) = words.0.next() {
+                let x: f64 =
+                    first.parse().map_err(|_| FormatError::line(number, format!("an x: “{first:.40}” is not one")))?;
+                let y: f64 = words.next("a y")?;
+                let point: i64 = words.next("a point's number")?;
+                points.push((Point2::new(x - CENTER, y - CENTER), u64::try_from(point).ok()));
+            }
+        }
+        if images.insert(id, ModelImage { name, camera, pose, points }).is_some() {
+            return Err(FormatError::line(number, format!("picture {id} is there twice")));
+        }
+    }
+    Ok(images)
+}
+
+/// The pose of COLMAP's quaternion (w first) and translation.
+fn pose(q: [f64; 4], t: [f64; 3]) -> Option<Pose> {
+    let quaternion = Quaternion::new(q[0], q[1], q[2], q[3]);
+    let fine = quaternion.norm() > 1e-9 && quaternion.norm().is_finite() && t.iter().all(|v| v.is_finite());
+    fine.then(|| Pose::new(UnitQuaternion::from_quaternion(quaternion).to_rotation_matrix(), Vector3::from(t)))
+}
+
+/// Parses `points3D.txt`.
+///
+/// # Errors
+/// [`FormatError::Line`].
+pub fn parse_points(text: &str) -> Result<BTreeMap<u64, ModelPoint>, FormatError> {
+    let mut points = BTreeMap::new();
+    for (number, line) in lines(text).filter(|(_, l)| !l.is_empty()) {
+        let mut words = Words(line.split_whitespace(), number);
+        let id: u64 = words.next("a point's number")?;
+        let position = Point3::new(words.next("an x")?, words.next("a y")?, words.next("a z")?);
+        let color = [words.next("a red")?, words.next("a green")?, words.next("a blue")?];
+        let error = words.next("an error")?;
+        let track: Vec<u32> = words.rest("a track's number")?;
+        let (pairs, []) = track.as_chunks::<2>() else {
+            return Err(FormatError::line(number, "the track has an odd count of numbers"));
+        };
+        let point = ModelPoint { position, color, error, track: pairs.iter().map(|&[i, p]| (i, p)).collect() };
+        if points.insert(id, point).is_some() {
+            return Err(FormatError::line(number, format!("point {id} is there twice")));
+        }
+    }
+    Ok(points)
+}
+
+/// Reads the model in a folder. `points3D.txt` may be absent: cameras and poses alone are a model too.
+///
+/// # Errors
+/// [`IoError`] for the file that cannot be read or parsed.
+pub fn read(folder: impl AsRef<Path>) -> Result<Model, IoError> {
+    let folder = folder.as_ref();
+    fn part<T>(path: &Path, parse: impl Fn(&str) -> Result<T, FormatError>) -> Result<T, IoError> {
+        parse(&read_text(path)?).map_err(|reason| IoError::reading(path, reason))
+    }
+    let points_path = folder.join("points3D.txt");
+    Ok(Model {
+        cameras: part(&folder.join("cameras.txt"), parse_cameras)?,
+        images: part(&folder.join("images.txt"), parse_images)?,
+        points: if points_path.exists() { part(&points_path, parse_points)? } else { BTreeMap::new() },
+    })
+}
+
+/// Writes a model into an existing folder: the three files COLMAP imports.
+///
+/// # Errors
+/// [`FormatError::NotRepresentable`] where a picture's camera, or a track's picture or point, is not in the model, or a name has
+/// a line break; else as [`crate::write_atomic`].
+pub fn write(folder: impl AsRef<Path>, model: &Model) -> Result<(), IoError> {
+    let folder = folder.as_ref();
+    check(model).map_err(|what| IoError::writing(folder, FormatError::NotRepresentable { format: NAME, what }))?;
+    let mut text = String::from("# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n");
+    for (id, camera) in &model.cameras {
+        let (name, parameters) = model_parameters(camera);
+        let _ = write!(text, "{id} {name} {} {}", camera.width, camera.height);
+        parameters.iter().for_each(|p| {
+            let _ = write!(text, " {p}");
+        });
+        text.push('\n');
+    }
+    write_bytes(folder.join("cameras.txt"), text.as_bytes())?;
+
+    let mut text =
+        String::from("# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n");
+    for (id, image) in &model.images {
+        let q = UnitQuaternion::from_rotation_matrix(&image.pose.rotation);
+        let t = image.pose.translation;
+        let _ = writeln!(
+            text,
+            "{id} {} {} {} {} {} {} {} {} {}",
+            q.w, q.i, q.j, q.k, t.x, t.y, t.z, image.camera, image.name
+        );
+        for (i, (at, point)) in image.points.iter().enumerate() {
+            let separator = if i == 0 { "" } else { " " };
+            let _ = write!(text, "{separator}{} {} ", at.x + CENTER, at.y + CENTER);
+            let _ = match point {
+                Some(id) => write!(text, "{id}"),
+                None => write!(text, "-1"),
+            };
+        }
+        text.push('\n');
+    }
+    write_bytes(folder.join("images.txt"), text.as_bytes())?;
+
+    let mut text = String::from("# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n");
+    for (id, point) in &model.points {
+        let (p, [r, g, b]) = (point.position, point.color);
+        let error = if point.error.is_finite() { point.error } else { -1.0 };
+        let _ = write!(text, "{id} {} {} {} {r} {g} {b} {error}", p.x, p.y, p.z);
+        point.track.iter().for_each(|(image, index)| {
+            let _ = write!(text, " {image} {index}");
+        });
+        text.push('\n');
+    }
+    write_bytes(folder.join("points3D.txt"), text.as_bytes())
+}
+
+fn check(model: &Model) -> Result<(), String> {
+    for (id, camera) in &model.cameras {
+        camera.validate().map_err(|e| format!("camera {id}: {e}"))?;
+    }
+    for (id, image) in &model.images {
+        if !model.cameras.contains_key(&image.camera) {
+            return Err(format!("picture {id}, whose camera {} is not there", image.camera));
+        }
+        // A name that is cut at other white space would come back as another one.
+        if image.name.is_empty() || image.name.split_whitespace().collect::<Vec<_>>().join(" ") != image.name {
+            return Err(format!("the name of picture {id}: {:?}", image.name));
+        }
+    }
+    for (id, point) in &model.points {
+        let seen =
+            |&(image, index): &(u32, u32)| model.images.get(&image).is_some_and(|i| (index as usize) < i.points.len());
+        if let Some((image, index)) = point.track.iter().find(|t| !seen(t)) {
+            return Err(format!("point {id}, seen as point {index} of picture {image}, which is not there"));
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cv_core::{Distortion, Rotation3};
+    use proptest::prelude::*;
+
+    const CAMERAS: &str = "# Camera list\n# Number of cameras: 2\n1 SIMPLE_RADIAL 3072 2304 2559.81 1536 1152 -0.0218531\n2 PINHOLE 3072 2304 2560.56 2560.56 1536 1152\n";
+    const IMAGES: &str = "# Image list\n1 0.851773 0.0165051 0.503764 -0.142941 -0.737434 1.02973 3.74354 1 P1180141.JPG\n2362.39 248.498 58396 1784.7 268.254 59027 1784.7 268.254 -1\n2 0.851773 0.0165051 0.503764 -0.142941 -0.737434 1.02973 3.74354 2 my photo.JPG\n\n";
+    const POINTS: &str = "# 3D points\n58396 1.67241 0.292931 0.609726 115 121 122 1.33927 1 0\n";
+
+    #[test]
+    fn the_examples_of_the_manual() {
+        let cameras = parse_cameras(CAMERAS).unwrap();
+        let expected = Camera {
+            distortion: Distortion::Radial { k1: -0.0218531, k2: 0.0 },
+            ..Camera::pinhole(3072, 2304, 2559.81, 2559.81, 1535.5, 1151.5)
+        };
+        assert_eq!(cameras[&1], expected);
+        let images = parse_images(IMAGES).unwrap();
+        assert_eq!((images.len(), &images[&2].name[..], images[&2].points.len()), (2, "my photo.JPG", 0));
+        let first = &images[&1];
+        assert_eq!(first.points[0], (Point2::new(2361.89, 247.998), Some(58396)));
+        assert_eq!(first.points[2].1, None);
+        // R of a quaternion by its definition: the first entry is 1 − 2(y² + z²), normalised.
+        let n = 0.851773f64.powi(2) + 0.0165051f64.powi(2) + 0.503764f64.powi(2) + 0.142941f64.powi(2);
+        let r00 = 1.0 - 2.0 * (0.503764f64.powi(2) + 0.142941f64.powi(2)) / n;
+        assert!((first.pose.rotation.matrix()[(0, 0)] - r00).abs() < 1e-12);
+        let points = parse_points(POINTS).unwrap();
+        assert_eq!((points[&58396].color, &points[&58396].track[..]), ([115, 121, 122], &[(1, 0)][..]));
+    }
+
+    #[test]
+    fn a_picture_without_its_second_line_and_no_final_newline() {
+        let text = IMAGES.trim_end();
+        assert_eq!(parse_images(text).unwrap().len(), 2);
+    }
+
+    #[test]
+    fn mistakes_are_named_by_line() {
+        for (text, line) in
+            [("1 1 0 0 0 0 0 0 1 a.jpg\n1 2\n", 2), ("# c\n1 0 0 0 0 0 0 0 1 a.jpg\n", 2), ("1 1 0 0 0 0 0 0 1\n", 1)]
+        {
+            assert!(matches!(parse_images(text), Err(FormatError::Line { line: l, .. }) if l == line), "{text}");
+        }
+        assert!(parse_points("1 0 0 0 1 1 256 0\n").is_err());
+        assert!(parse_points("1 0 0 0 1 1 1 0 5\n").is_err());
+        assert!(parse_cameras("1 PINHOLE 3 4 1 1 1\n").is_err());
+        assert!(parse_cameras("1 PINHOLE 3 4 1 1 1 1\n1 PINHOLE 3 4 1 1 1 1\n").is_err());
+    }
+
+    proptest! {
+        #[test]
+        fn a_model_reads_back(r in prop::array::uniform3(-3.0..3.0f64), t in prop::array::uniform3(-1e3..1e3f64), xy in prop::array::uniform2(0.0..4000.0f64), k in -0.5..0.5f64) {
+            let camera = Camera { distortion: Distortion::BrownConrady { k1: k, k2: 0.1, p1: 0.0, p2: 0.01, k3: k }, ..Camera::pinhole(4000, 3000, 2500.0, 2501.0, xy[0], xy[1]) };
+            let pose = Pose::new(Rotation3::from_euler_angles(r[0], r[1], r[2]), Vector3::from(t));
+            let image = ModelImage { name: "a b.jpg".into(), camera: 7, pose, points: vec![(Point2::new(xy[0], xy[1]), Some(9)), (Point2::new(1.0, 2.0), None)] };
+            let point = ModelPoint { position: Point3::from(t), color: [1, 2, 3], error: 0.5, track: vec![(3, 0)] };
+            let model = Model { cameras: [(7, camera)].into(), images: [(3, image.clone())].into(), points: [(9, point.clone())].into() };
+            let folder = tempfile::tempdir().unwrap();
+            write(folder.path(), &model).unwrap();
+            let back = read(folder.path()).unwrap();
+            prop_assert_eq!(&back.points[&9], &point);
+            let b = &back.images[&3];
+            prop_assert_eq!((&b.name, b.camera, b.points[1]), (&image.name, 7, image.points[1]));
+            // Half a pixel added and taken away costs the last bits of a number up to 4000; a rotation through a quaternion likewise.
+            prop_assert!((b.points[0].0 - image.points[0].0).norm() < 1e-11);
+            prop_assert!((b.pose.rotation.matrix() - pose.rotation.matrix()).norm() < 1e-13);
+            prop_assert_eq!(b.pose.translation, pose.translation);
+            let c = &back.cameras[&7];
+            prop_assert!((c.cx - camera.cx).abs() < 1e-11 && c.distortion == camera.distortion && c.fx == camera.fx);
+        }
+    }
+
+    #[test]
+    fn what_hangs_in_the_air_is_not_written() {
+        let folder = tempfile::tempdir().unwrap();
+        let image = ModelImage { name: "a".into(), camera: 1, pose: Pose::identity(), points: vec![] };
+        let mut model = Model { images: [(1, image)].into(), ..Model::default() };
+        assert!(write(folder.path(), &model).is_err());
+        model.cameras.insert(1, Camera::from_focal(4, 4, 4.0));
+        assert!(write(folder.path(), &model).is_ok());
+        let point = ModelPoint { position: Point3::origin(), color: [0; 3], error: f64::NAN, track: vec![(1, 0)] };
+        model.points.insert(1, point);
+        assert!(write(folder.path(), &model).unwrap_err().to_string().contains("point 1"));
+    }
+}

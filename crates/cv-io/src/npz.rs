@@ -1,0 +1,298 @@
+//! NumPy's archives of arrays, `.npz`: a ZIP of `.npy` files, stored or deflated.
+
+use std::path::Path;
+
+use crate::files::{MAX_FILE_BYTES, read_bytes, write_bytes};
+use crate::npy::{self, NpyArray};
+use crate::{FormatError, IoError};
+
+const NAME: &str = "npz";
+/// The most that one array, or all of them together, may unpack to.
+const MAX_UNPACKED: u64 = MAX_FILE_BYTES;
+/// More arrays than anyone names.
+const MAX_ENTRIES: usize = 10_000;
+
+/// Little-endian fields of a record.
+struct Fields<'a>(&'a [u8]);
+
+impl<'a> Fields<'a> {
+    /// The record that begins at `at`, or an error where the file is too short for `len` bytes of it.
+    fn at(bytes: &'a [u8], at: u64, len: usize) -> Result<Self, FormatError> {
+        let start = usize::try_from(at).ok();
+        start
+            .and_then(|start| bytes.get(start..start.checked_add(len)?))
+            .map(Self)
+            .ok_or(FormatError::Truncated { format: NAME })
+    }
+
+    fn u16(&self, at: usize) -> u16 {
+        u16::from_le_bytes([self.0[at], self.0[at + 1]])
+    }
+
+    fn u32(&self, at: usize) -> u32 {
+        u32::from_le_bytes([self.0[at], self.0[at + 1], self.0[at + 2], self.0[at + 3]])
+    }
+
+    fn u64(&self, at: usize) -> u64 {
+        u64::from(self.u32(at)) | u64::from(self.u32(at + 4)) << 32
+    }
+}
+
+/// One file inside the archive, by the central directory.
+struct Entry<'a> {
+    name: String,
+    method: u16,
+    crc: u32,
+    packed: u64,
+    unpacked: u64,
+    offset: u64,
+    archive: &'a [u8],
+}
+
+/// Decodes all arrays of an archive, by name (without `.npy`), in the order of the file.
+///
+/// # Errors
+/// [`FormatError`]: not an archive, encrypted or packed by another method than deflate, damaged (by its checksum), larger than
+/// [`MAX_FILE_BYTES`] when unpacked, or as [`npy::decode`].
+pub fn decode(bytes: &[u8]) -> Result<Vec<(String, NpyArray)>, FormatError> {
+    if !bytes.starts_with(b"PK") {
+        return Err(FormatError::UnknownFormat { expected: "a NumPy archive (.npz)" });
+    }
+    let entries = directory(bytes)?;
+    let total = entries.iter().fold(0u64, |sum, e| sum.saturating_add(e.unpacked));
+    if total > MAX_UNPACKED {
+        return Err(FormatError::TooManyBytes { bytes: total, limit: MAX_UNPACKED });
+    }
+    let arrays = entries.iter().map(|entry| {
+        let name = entry.name.strip_suffix(".npy").unwrap_or(&entry.name).to_owned();
+        Ok((name, npy::decode(&unpack(entry)?)?))
+    });
+    arrays.collect()
+}
+
+/// The entries of the central directory.
+fn directory(bytes: &[u8]) -> Result<Vec<Entry<'_>>, FormatError> {
+    // The record at the end, behind which a comment of up to 65535 bytes may stand.
+    let earliest = bytes.len().saturating_sub(22 + 65_535);
+    let end = bytes[earliest..]
+        .windows(4)
+        .rposition(|w| w == b"PK\x05\x06")
+        .map(|at| (at + earliest) as u64)
+        .ok_or(FormatError::Truncated { format: NAME })?;
+    let record = Fields::at(bytes, end, 22)?;
+    let (mut count, mut offset) = (u64::from(record.u16(10)), u64::from(record.u32(16)));
+    if count == 0xffff || offset == 0xffff_ffff {
+        // ZIP64: a locator before the record leads to one with wider fields.
+        let locator = Fields::at(bytes, end.wrapping_sub(20), 20)?;
+        let wide = Fields::at(bytes, locator.u64(8), 56)?;
+        if locator.0[..4] != *b"PK\x06\x07" || wide.0[..4] != *b"PK\x06\x06" {
+            return Err(FormatError::corrupt(NAME, "the ZIP64 directory is not where it should be"));
+        }
+        (count, offset) = (wide.u64(32), wide.u64(48));
+    }
+    if count > MAX_ENTRIES as u64 {
+        return Err(FormatError::corrupt(NAME, format!("{count} entries")));
+    }
+    let mut entries = Vec::new();
+    for _ in 0..count {
+        let header = Fields::at(bytes, offset, 46)?;
+        if header.0[..4] != *b"PK\x01\x02" {
+            return Err(FormatError::corrupt(NAME, "the directory does not parse"));
+        }
+        if header.u16(8) & 1 != 0 {
+            return Err(FormatError::unsupported(NAME, "encryption"));
+        }
+        let (name_len, extra_len, comment_len) =
+            (usize::from(header.u16(28)), usize::from(header.u16(30)), usize::from(header.u16(32)));
+        let tail = Fields::at(bytes, offset + 46, name_len + extra_len)?;
+        let mut entry = Entry {
+            name: String::from_utf8_lossy(&tail.0[..name_len]).into_owned(),
+            method: header.u16(10),
+            crc: header.u32(16),
+            packed: u64::from(header.u32(20)),
+            unpacked: u64::from(header.u32(24)),
+            offset: u64::from(header.u32(42)),
+            archive: bytes,
+        };
+        widen(&mut entry, &tail.0[name_len..])?;
+        entries.push(entry);
+        offset = offset.saturating_add((46 + name_len + extra_len + comment_len) as u64);
+    }
+    Ok(entries)
+}
+
+/// Takes the fields that did not fit into 32 bits from the ZIP64 extra field.
+fn widen(entry: &mut Entry<'_>, mut extra: &[u8]) -> Result<(), FormatError> {
+    while let [a, b, c, d, rest @ ..] = extra {
+        let (id, len) = (u16::from_le_bytes([*a, *b]), usize::from(u16::from_le_bytes([*c, *d])));
+        let body = rest.get(..len).ok_or(FormatError::Truncated { format: NAME })?;
+        if id == 1 {
+            let mut wide = body.as_chunks::<8>().0.iter().map(|v| u64::from_le_bytes(*v));
+            for field in [&mut entry.unpacked, &mut entry.packed, &mut entry.offset] {
+                if *field == 0xffff_ffff {
+                    *field = wide.next().ok_or(FormatError::Truncated { format: NAME })?;
+                }
+            }
+        }
+        extra = &rest[len..];
+    }
+    Ok(())
+}
+
+/// The bytes of an entry, checked against its checksum.
+fn unpack(entry: &Entry<'_>) -> Result<Vec<u8>, FormatError> {
+    let local = Fields::at(entry.archive, entry.offset, 30)?;
+    if local.0[..4] != *b"PK\x03\x04" {
+        return Err(FormatError::corrupt(NAME, format!("{}: no file where the directory says", entry.name)));
+    }
+    let start = entry.offset + 30 + u64::from(local.u16(26)) + u64::from(local.u16(28));
+    let packed = usize::try_from(entry.packed).map_err(|_| FormatError::Truncated { format: NAME })?;
+    let data = Fields::at(entry.archive, start, packed)?.0;
+    let bytes = match entry.method {
+        0 => data.to_vec(),
+        8 => {
+            // Deflate packs at most 1032 to 1: a header that promises more lies, and is not given the memory.
+            if entry.unpacked > 1032 * (entry.packed + 1) {
+                return Err(FormatError::corrupt(NAME, format!("{}: it cannot unpack to what it says", entry.name)));
+            }
+            let limit = usize::try_from(entry.unpacked).unwrap_or(usize::MAX);
+            miniz_oxide::inflate::decompress_to_vec_with_limit(data, limit)
+                .map_err(|e| FormatError::corrupt(NAME, format!("{}: {e}", entry.name)))?
+        }
+        method => return Err(FormatError::unsupported(NAME, format!("packing method {method}"))),
+    };
+    if bytes.len() as u64 != entry.unpacked || crc32fast::hash(&bytes) != entry.crc {
+        return Err(FormatError::corrupt(NAME, format!("{}: the checksum does not agree", entry.name)));
+    }
+    Ok(bytes)
+}
+
+/// Encodes arrays under names (without `.npy`), deflated where `compress`.
+///
+/// # Errors
+/// [`FormatError::NotRepresentable`] beyond 65534 arrays or 4 GiB, or as [`npy::encode`].
+pub fn encode(arrays: &[(&str, &NpyArray)], compress: bool) -> Result<Vec<u8>, FormatError> {
+    let too_large =
+        || FormatError::NotRepresentable { format: NAME, what: "more than 4 GiB or 65534 arrays".to_owned() };
+    let mut out = Vec::new();
+    let mut directory = Vec::new();
+    for (name, array) in arrays {
+        let name = format!("{name}.npy");
+        let plain = npy::encode(array)?;
+        let crc = crc32fast::hash(&plain);
+        let unpacked = u32::try_from(plain.len()).map_err(|_| too_large())?;
+        let (method, data) =
+            if compress { (8u16, miniz_oxide::deflate::compress_to_vec(&plain, 6)) } else { (0, plain) };
+        let packed = u32::try_from(data.len()).map_err(|_| too_large())?;
+        let offset = u32::try_from(out.len()).ok().filter(|v| *v < u32::MAX).ok_or_else(too_large)?;
+        let name_len = u16::try_from(name.len()).map_err(|_| too_large())?;
+        // Version 2.0; bit 11: the name is UTF-8; no time (1980-01-01), so that equal arrays give equal files.
+        let mut common = Vec::with_capacity(26);
+        for v in [20u16, 1 << 11, method, 0, 0x21] {
+            common.extend(v.to_le_bytes());
+        }
+        for v in [crc, packed, unpacked] {
+            common.extend(v.to_le_bytes());
+        }
+        common.extend(name_len.to_le_bytes());
+        common.extend([0, 0]);
+        out.extend(b"PK\x03\x04");
+        out.extend(&common);
+        out.extend(name.as_bytes());
+        out.extend(&data);
+        directory.extend(b"PK\x01\x02\x14\x00");
+        directory.extend(&common);
+        directory.extend([0; 10]);
+        directory.extend(offset.to_le_bytes());
+        directory.extend(name.as_bytes());
+    }
+    let count = u16::try_from(arrays.len()).ok().filter(|n| *n < u16::MAX).ok_or_else(too_large)?;
+    let start = u32::try_from(out.len()).ok().filter(|v| *v < u32::MAX).ok_or_else(too_large)?;
+    let size = u32::try_from(directory.len()).map_err(|_| too_large())?;
+    out.extend(&directory);
+    out.extend(b"PK\x05\x06\0\0\0\0");
+    out.extend(count.to_le_bytes());
+    out.extend(count.to_le_bytes());
+    out.extend(size.to_le_bytes());
+    out.extend(start.to_le_bytes());
+    out.extend([0, 0]);
+    Ok(out)
+}
+
+/// Reads an `.npz` file.
+///
+/// # Errors
+/// [`IoError`]: cannot be opened, or as [`decode`].
+pub fn read(path: impl AsRef<Path>) -> Result<Vec<(String, NpyArray)>, IoError> {
+    let path = path.as_ref();
+    decode(&read_bytes(path)?).map_err(|reason| IoError::reading(path, reason))
+}
+
+/// Writes an `.npz` file.
+///
+/// # Errors
+/// As [`encode`] and [`crate::write_atomic`].
+pub fn write(path: impl AsRef<Path>, arrays: &[(&str, &NpyArray)], compress: bool) -> Result<(), IoError> {
+    let path = path.as_ref();
+    write_bytes(path, &encode(arrays, compress).map_err(|reason| IoError::writing(path, reason))?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::npy::NpyData;
+    use proptest::prelude::*;
+
+    fn arrays() -> (NpyArray, NpyArray) {
+        let a = NpyArray { shape: vec![20, 50], data: NpyData::F32((0..1000).map(|i| (i / 7) as f32).collect()) };
+        let b = NpyArray { shape: vec![3], data: NpyData::I16(vec![-1, 0, 1]) };
+        (a, b)
+    }
+
+    #[test]
+    fn stored_and_deflated_read_back() {
+        let (a, b) = arrays();
+        for compress in [false, true] {
+            let bytes = encode(&[("disparity", &a), ("α", &b)], compress).unwrap();
+            assert_eq!(decode(&bytes).unwrap(), [("disparity".to_owned(), a.clone()), ("α".to_owned(), b.clone())]);
+        }
+        assert!(decode(&encode(&[], true).unwrap()).unwrap().is_empty());
+    }
+
+    #[test]
+    fn a_bit_flipped_in_the_data_is_noticed() {
+        let (a, b) = arrays();
+        for compress in [false, true] {
+            let good = encode(&[("a", &a), ("b", &b)], compress).unwrap();
+            let data = 30 + 5 + 10..30 + 5 + 200;
+            for at in data {
+                let mut bad = good.clone();
+                bad[at] ^= 0x10;
+                assert!(decode(&bad).is_err(), "byte {at}");
+            }
+        }
+    }
+
+    #[test]
+    fn promises_of_gigabytes_are_not_believed() {
+        let (a, _) = arrays();
+        let good = encode(&[("a", &a)], true).unwrap();
+        let at = good.windows(4).position(|w| w == b"PK\x01\x02").unwrap();
+        let mut bad = good;
+        bad[at + 24..at + 28].copy_from_slice(&0xfff0_0000u32.to_le_bytes());
+        assert!(decode(&bad).is_err());
+    }
+
+    proptest! {
+        #[test]
+        fn damage_never_panics(at in 0usize..2000, value: u8, cut in 0usize..2000, compress: bool) {
+            let (a, b) = arrays();
+            let mut bytes = encode(&[("a", &a), ("b", &b)], compress).unwrap();
+            let len = bytes.len();
+            bytes[at % len] = value;
+            let _ = decode(&bytes);
+            bytes.truncate(cut % len);
+            prop_assert!(decode(&bytes).is_err());
+        }
+    }
+}
