@@ -381,6 +381,17 @@ fn remove_stale(folder: &Path) {
     }
 }
 
+/// For `value_parser`: the name of a picture to write, whose ending says in which format. Wrong usage is told at once.
+pub(crate) fn picture_name(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    let ending = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+    if ["png", "jpg", "jpeg"].contains(&ending.as_str()) {
+        Ok(path)
+    } else {
+        Err("pictures are written as .png, .jpg or .jpeg".to_owned())
+    }
+}
+
 /// The image files among the arguments: a file stands for itself, a folder for the images in it, by name
 /// (`img2` before `img10`).
 pub(crate) fn expand_images(paths: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
