@@ -190,19 +190,3 @@ fn from_light(scene: &Scene, light: &Light, point: &Point3<f64>, normal: &Vector
     let share = (sum / ((LIGHT * LIGHT) as f64 * std::f64::consts::PI)) as f32;
     light.radiance.map(|c| c * share)
 }
-
-/// The factor that brings the mean of the lit surfaces to a middle grey.
-pub(crate) fn gain(scene: &Scene, maps: &[Map]) -> f32 {
-    let (mut sum, mut area) = (0.0f64, 0.0);
-    for (prim, map) in scene.prims.iter().zip(maps) {
-        if map.front.is_empty() {
-            continue;
-        }
-        let mean: f64 = map.front.iter().map(|c| f64::from(c[1])).sum::<f64>() / map.front.len() as f64;
-        // Small things count by their area: they are a small part of a picture.
-        sum += prim.shape.area() * mean;
-        area += prim.shape.area();
-    }
-    // A surface of reflectance 0.5 under mean light becomes 0.24, about 52 % of the sRGB range.
-    if sum > 0.0 { (0.48 * area / sum) as f32 } else { 1.0 }
-}

@@ -1,7 +1,7 @@
 //! Pictures of scenes.
 
 use crate::error::SynthError;
-use crate::scene::{Hit, Scene};
+use crate::scene::{Hit, Lighting, Scene};
 use crate::sensor::{self, RenderOptions};
 use crate::shape::Ray;
 use crate::texture::{Rgb, Texture};
@@ -50,7 +50,7 @@ impl Rendered {
 /// [`SynthError`] where the camera, its size or the pose make no sense.
 pub fn render(scene: &Scene, camera: &Camera, pose: &Pose, options: &RenderOptions) -> Result<Rendered, SynthError> {
     let (width, height) = check(camera, pose)?;
-    let view = View { scene, camera: *camera, center: pose.center(), to_world: pose.inverse() };
+    let view = View::new(scene, scene.lighting(), camera, pose);
 
     // Truth: one ray per pixel centre.
     let mut centers: Vec<Option<Hit>> = vec![None; width * height];
@@ -65,7 +65,6 @@ pub fn render(scene: &Scene, camera: &Camera, pose: &Pose, options: &RenderOptio
     let mut linear = Image::new(width, height, [0.0; 3]);
     let samples = options.samples.clamp(1, 8);
     let prim = |x: usize, y: usize| centers[y.min(height - 1) * width + x.min(width - 1)].map(|h| h.prim);
-    scene.lighting();
     linear.as_mut_slice().par_chunks_mut(3 * width).enumerate().for_each(|(y, row)| {
         for (x, pixel) in row.chunks_exact_mut(3).enumerate() {
             let here = prim(x, y);
@@ -95,14 +94,40 @@ pub(crate) fn check(camera: &Camera, pose: &Pose) -> Result<(usize, usize), Synt
     if finite { Ok((width, height)) } else { Err(SynthError::Pose) }
 }
 
+/// The exposure of a scene as a camera at its viewpoint would set it: the mean of the picture at a middle grey, unless
+/// that would burn out more than a fiftieth of it. Lamps and windows do not count.
+pub(crate) fn meter(scene: &Scene, lighting: &Lighting) -> f32 {
+    let camera = Camera::from_focal(40, 30, 33.0);
+    let view = View::new(scene, lighting, &camera, &scene.viewpoint());
+    let mut levels: Vec<f32> = (0..40 * 30)
+        .filter_map(|i| {
+            let ray = view.ray(Point2::new((i % 40) as f64, (i / 40) as f64))?;
+            let lamp = |hit: Hit| matches!(scene.prims[hit.prim].texture, Texture::Emissive(_));
+            let [r, g, b] = if scene.hit(&ray).is_some_and(lamp) { return None } else { view.color(&ray, 1.0, None) };
+            Some(0.2126 * r + 0.7152 * g + 0.0722 * b)
+        })
+        .collect();
+    levels.sort_by(f32::total_cmp);
+    let mean = levels.iter().sum::<f32>() / levels.len().max(1) as f32;
+    let bright = levels.get(levels.len() * 49 / 50).copied().unwrap_or(0.0);
+    // 0.19 linear is 47 % of the sRGB range.
+    let gain = (0.19 / mean).min(0.95 / bright);
+    if gain.is_finite() { gain } else { 1.0 }
+}
+
 struct View<'a> {
     scene: &'a Scene,
+    lighting: &'a Lighting,
     camera: Camera,
     center: Point3<f64>,
     to_world: Pose,
 }
 
-impl View<'_> {
+impl<'a> View<'a> {
+    fn new(scene: &'a Scene, lighting: &'a Lighting, camera: &Camera, pose: &Pose) -> Self {
+        Self { scene, lighting, camera: *camera, center: pose.center(), to_world: pose.inverse() }
+    }
+
     /// The ray of normalised coordinates; its `t` is the depth.
     #[inline]
     fn through(&self, n: Point2<f64>) -> Ray {
@@ -137,7 +162,7 @@ impl View<'_> {
 
     /// The light along a ray; `share` is the side of the sample in pixels, `only` the surface that it meets if known.
     fn color(&self, ray: &Ray, share: f64, only: Option<usize>) -> Rgb {
-        let lighting = self.scene.lighting();
+        let lighting = self.lighting;
         let known = only.and_then(|prim| {
             let t = self.scene.prims[prim].shape.intersect(ray, 1e-9, f64::INFINITY)?;
             Some(Hit { prim, t })

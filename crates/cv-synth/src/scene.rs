@@ -2,6 +2,7 @@
 
 use crate::bvh::{Bvh, Item};
 use crate::light::{self, Map};
+use crate::render::meter;
 use crate::shape::{Ray, Shape, Surface};
 use crate::texture::{Rgb, SurfacePoint, Texture};
 use cv_core::Pose;
@@ -148,8 +149,9 @@ impl Scene {
     pub(crate) fn lighting(&self) -> &Lighting {
         self.lighting.get_or_init(|| {
             let maps = light::bake(self, 0);
-            let gain = light::gain(self, &maps);
-            Lighting { maps, gain }
+            let mut lighting = Lighting { maps, gain: 1.0 };
+            lighting.gain = meter(self, &lighting);
+            lighting
         })
     }
 

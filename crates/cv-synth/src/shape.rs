@@ -166,14 +166,6 @@ impl Shape {
         !matches!(self, Self::Rect { .. })
     }
 
-    pub(crate) fn area(&self) -> f64 {
-        let (u, v) = self.extent();
-        match self {
-            Self::Sphere { radius, .. } => 4.0 * std::f64::consts::PI * radius * radius,
-            _ => u * v,
-        }
-    }
-
     pub(crate) fn center(&self) -> Point3<f64> {
         match self {
             Self::Rect { corner, eu, ev, size, .. } => corner + eu * (0.5 * size.0) + ev * (0.5 * size.1),

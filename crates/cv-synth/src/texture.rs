@@ -274,7 +274,7 @@ fn checker(x: f32, y: f32, w: f32) -> f32 {
 
 fn wallpaper(ground: Rgb, inks: &[Rgb; 3], cell: f32, seed: u32, p: &SurfacePoint) -> Rgb {
     let (u, v, w) = (p.u, p.v, p.width);
-    let grain = 0.05 * fbm(u, v, 60.0, 3, 0.8, seed ^ 11, w) + 0.04 * fbm(u, v, 1.1, 3, 0.6, seed ^ 12, w);
+    let grain = 0.07 * fbm(u, v, 11.0, 6, 0.85, seed ^ 11, w) + 0.04 * fbm(u, v, 1.1, 3, 0.6, seed ^ 12, w);
     let mut color = ground;
     let (cx, cy) = (floor(u / cell), floor(v / cell));
     for dy in -1..=1 {
@@ -341,8 +341,10 @@ fn wood(colors: &[Rgb; 2], seed: u32, u: f32, v: f32, w: f32) -> Rgb {
     let fibre = fbm(u * 0.05, v, 55.0, 5, 0.8, seed ^ 3, w);
     let cloud = fbm(u * 0.4, v, 7.0, 3, 0.6, seed ^ 4, w);
     let t = 0.5 + 0.35 * ring + 0.20 * fibre + 0.22 * cloud + 0.15 * bend;
-    let pores = visible(500.0, w) * noise2(u * 24.0, v * 500.0, seed ^ 2).max(0.0);
-    scale(mix(colors[0], colors[1], t.clamp(0.0, 1.0)), 1.0 - 0.3 * pores)
+    // Pores: short dark strokes, some clusters of them, and the flecks of the rays across.
+    let pores = visible(420.0, w) * noise2(u * 60.0, v * 420.0, seed ^ 2).max(0.0);
+    let flecks = 0.09 * fbm(u, v, 70.0, 4, 0.85, seed ^ 5, w);
+    scale(mix(colors[0], colors[1], t.clamp(0.0, 1.0)), (1.0 - 0.4 * pores) * (1.0 + flecks))
 }
 
 fn planks(colors: &[Rgb; 2], plank: f32, seed: u32, p: &SurfacePoint) -> Rgb {

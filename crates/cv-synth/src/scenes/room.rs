@@ -44,7 +44,8 @@ fn shell(b: &mut SceneBuilder, rng: &mut Rng) {
     } else {
         Texture::Stone { colors: [srgb(0xA9A598), srgb(0xF6F3EC)], seed: rng.seed32() }
     };
-    b.rect(at(-half, -height, 0.0), v(width, 0.0, 0.0), v(0.0, 0.0, length), ceiling);
+    // Boards along the room.
+    b.rect(at(half, -height, 0.0), v(0.0, 0.0, length), v(-width, 0.0, 0.0), ceiling);
     let first = rng.index(3);
     let mut wall = |name, corner, u, kind: usize, rng: &mut Rng| {
         let texture = wall_texture(kind % 3, rng);

@@ -15,7 +15,8 @@ impl Scene {
         let rng = &mut rng;
         let mut b = SceneBuilder::new();
         b.ambient([0.34, 0.35, 0.37]);
-        let top = wood(rng);
+        let light = rng.pick([[0x6B4526, 0xA87B4C], [0x9C7447, 0xD0AC7C], [0x8A5E36, 0xBE9160]]);
+        let top = Texture::Wood { colors: light.map(srgb), seed: rng.seed32() };
         b.object("table").shiny(0.06, 80.0);
         b.block(at(0.0, 0.04, 0.1), [2.6, 0.04, 1.5], 0.0, [&top, &top, &top]);
         let kind = rng.index(3);
