@@ -37,3 +37,12 @@ pub use matching::{
 };
 pub use progress::{Progress, Silent};
 pub use stopwatch::Stopwatch;
+
+/// What a caller of [`depth()`] needs of the stereo stage: its options and results, rectification, geometry and scores.
+pub mod stereo {
+    pub use cv_stereo::{
+        BAD_THRESHOLDS, Census, CloudPoint, DisparityMap, DisparityScores, EvaluateError, GeometryError, Intensity,
+        Paths, PixelState, Rectification, RectifiedView, RectifyError, RectifyOptions, StereoError, StereoGeometry,
+        StereoMatcher, StereoOptions, Subpixel, evaluate_disparity, non_occluded,
+    };
+}

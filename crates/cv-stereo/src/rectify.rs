@@ -5,7 +5,8 @@
 //! stereo pairs", MVA 2000, for the axis).
 
 use crate::StereoGeometry;
-use cv_core::{Camera, CameraError, Distortion, Point2, Point3, Rotation3, StereoRig, Vector3};
+use cv_core::{Camera, CameraError, Distortion, Image, ImageView, Mask, Point2, Point3, Rotation3, StereoRig, Vector3};
+use cv_imgproc::{Pixel, RemapOptions, warp_with};
 use nalgebra::{Matrix3, Matrix4};
 
 /// Options of [`Rectification::new`].
@@ -65,6 +66,22 @@ pub enum RectifyError {
     /// The two cameras see nothing in common after rectification.
     #[error("the rectified cameras have no field of view in common")]
     NoOverlap,
+    /// An image is not of the size its camera was calibrated for.
+    #[error("the image is {}×{} px, its camera was calibrated for {}×{} px", image.0, image.1, expected.0, expected.1)]
+    ImageSize {
+        /// Width and height of the image.
+        image: (usize, usize),
+        /// Width and height of the camera's images.
+        expected: (usize, usize),
+    },
+    /// The rectified image is larger than memory can address.
+    #[error("a rectified image of {width}×{height} px is larger than memory can address")]
+    TooLarge {
+        /// Width in px.
+        width: usize,
+        /// Height in px.
+        height: usize,
+    },
     /// An option is out of range.
     #[error("option {name} is {value}; it must be {allowed}")]
     Option {
@@ -96,11 +113,30 @@ impl RectifiedView {
     pub fn source_pixel(&self, pixel: Point2<f64>) -> Option<Point2<f64>> {
         let n = self.camera.normalize(pixel);
         let ray = self.rotation.inverse_transform_point(&Point3::new(n.x, n.y, 1.0));
-        let p = self.source.project(&ray)?;
-        // A distortion polynomial may fold rays from far outside back into the image.
-        let back = self.source.normalize(p);
-        let straight = Point2::new(ray.x / ray.z, ray.y / ray.z);
-        ((back - straight).norm() < 1e-6 * (1.0 + straight.coords.norm())).then_some(p)
+        if ray.z <= 0.0 {
+            return None;
+        }
+        let (d, j) = self.source.distortion.distort_with_jacobian(Point2::new(ray.x / ray.z, ray.y / ray.z));
+        // Beyond its turning point a distortion polynomial folds rays from far outside back into the image.
+        let sound = j.determinant() > 0.0 && j.trace() > 0.0;
+        sound.then(|| Point2::new(self.source.fx * d.x + self.source.cx, self.source.fy * d.y + self.source.cy))
+    }
+
+    /// The rectified image of an original, bilinear, and where it shows anything; black elsewhere.
+    ///
+    /// # Errors
+    /// [`RectifyError::ImageSize`] where the image is not of the camera's size.
+    pub fn apply<T: Pixel, const C: usize>(
+        &self,
+        image: ImageView<'_, T, C>,
+    ) -> Result<(Image<T, C>, Mask), RectifyError> {
+        let expected = (self.source.width, self.source.height);
+        if image.size() != expected {
+            return Err(RectifyError::ImageSize { image: image.size(), expected });
+        }
+        let size = (self.camera.width, self.camera.height);
+        warp_with(image, size, &RemapOptions::default(), |x, y| self.source_pixel(Point2::new(x as f64, y as f64)))
+            .map_err(|_| RectifyError::TooLarge { width: size.0, height: size.1 })
     }
 
     /// Where a pixel of the original lies in the rectified image; `None` behind the rectified camera.

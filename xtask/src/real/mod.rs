@@ -3,13 +3,15 @@
 //! One file per job. A job is a function from the data folder to its [`Check`]s; register it with one line in `JOBS`.
 //! A figure that is off its bar fails the run; so does an error. Jobs print what else a person wants to see.
 
+pub(crate) mod depth;
+
 use anyhow::{Result, bail};
 use std::{path::Path, time::Instant};
 
 /// A job: its name on the command line and what it does.
 type Job = (&'static str, fn(&Path) -> Result<Vec<Check>>);
 
-const JOBS: &[Job] = &[];
+const JOBS: &[Job] = &[("depth", depth::run)];
 
 /// A figure and the bar it is held against.
 #[derive(Debug, Clone, PartialEq)]
@@ -24,7 +26,6 @@ pub(crate) struct Check {
     pub(crate) ok: bool,
 }
 
-#[allow(dead_code, reason = "the jobs arrive with their pipelines")]
 impl Check {
     /// A figure that must not be larger than `bar`. NaN fails.
     pub(crate) fn at_most(name: impl Into<String>, figure: f64, bar: f64) -> Self {

@@ -67,6 +67,8 @@ macro_rules! commands {
 }
 
 commands! {
+    Depth(depth),
+    Eval(eval),
     Completions(completions),
     Man(man),
 }

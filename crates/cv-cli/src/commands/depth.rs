@@ -1,0 +1,363 @@
+//! `cv depth`: disparity, depth and a cloud from two photographs.
+
+use crate::common::{Context, Explain, Failure, Outcome, Run};
+use cv_core::{GrayF32, ImageView, RgbU8};
+use cv_io::ply::{Cloud, PlyEncoding};
+use cv_io::{DynImage, Pixels};
+use cv_pipeline::{DepthOptions, DepthResult, depth};
+use cv_report::{Figure, MapStyle, Note, PointScene, Report, Viewpoint, draw_map, render_points};
+use cv_pipeline::stereo::{
+    Census, CloudPoint, Intensity, Paths, PixelState, Rectification, RectifyOptions, StereoGeometry, StereoOptions,
+};
+use std::path::{Path, PathBuf};
+
+/// Compute disparity, and depth where the geometry is known, from a left and a right photograph.
+///
+/// Without --rig the photographs must be rectified: the same scene point lies in the same row of both. Disparity is the
+/// column in the left photograph minus that in the right one. Pixels that only the left camera sees are filled from their
+/// surroundings unless --no-fill is given.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cv depth left.png right.png -o disparity.pfm\n  \
+    cv depth left.png right.png -o d.pfm --focal 1000 --baseline 0.12 --depth depth.pfm --cloud cloud.ply\n  \
+    cv depth left.jpg right.jpg --rig rig.yaml -o disparity.png --depth depth.png --report out\n\n\
+    The ending of a file tells its format: .pfm (floats, +inf where unknown), .npy (floats, NaN), .png (disparity as KITTI's\n\
+    16-bit PNG, 256 steps a pixel; depth as 16-bit millimetres for a baseline in metres); 0 is unknown in both.")]
+pub(crate) struct Args {
+    /// The left photograph.
+    left: PathBuf,
+    /// The right photograph.
+    right: PathBuf,
+    /// Where to write the disparity: .pfm, .png or .npy.
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// Where to write the depth, in the unit of the baseline: .pfm, .png or .npy. Needs --rig, or --focal and --baseline.
+    #[arg(long, value_name = "FILE")]
+    depth: Option<PathBuf>,
+    /// Where to write a coloured point cloud, as PLY. Needs what --depth needs.
+    #[arg(long, value_name = "FILE")]
+    cloud: Option<PathBuf>,
+    /// Calibration of the rig, ours or OpenCV's YAML: the photographs are rectified first.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["focal", "baseline"])]
+    rig: Option<PathBuf>,
+    /// Number of disparities to try, in pixels.
+    #[arg(long, value_name = "N", default_value_t = 128)]
+    disparities: usize,
+    /// Smallest disparity to try, in pixels; may be negative.
+    #[arg(long, value_name = "PX", default_value_t = 0, allow_negative_numbers = true)]
+    min_disparity: i32,
+    /// Focal length of the rectified photographs in pixels.
+    #[arg(long, value_name = "PX", requires = "baseline")]
+    focal: Option<f64>,
+    /// Distance between the cameras; its unit is the unit of the depth.
+    #[arg(long, value_name = "B", requires = "focal")]
+    baseline: Option<f64>,
+    /// Right principal point minus left one, x, in pixels (doffs of Middlebury's calib.txt).
+    #[arg(long, value_name = "PX", default_value_t = 0.0, allow_negative_numbers = true, requires = "focal")]
+    offset: f64,
+    /// Nearest depth to keep.
+    #[arg(long, value_name = "Z", default_value_t = 0.0)]
+    near: f32,
+    /// Farthest depth to keep [default: all].
+    #[arg(long, value_name = "Z")]
+    far: Option<f32>,
+    /// Directions of cost aggregation: 8, or 4 for half the time.
+    #[arg(long, value_name = "4|8", default_value = "8", value_parser = ["4", "8"])]
+    paths: String,
+    /// Matching window: 5 (5×5), 7 (7×7) or 9 (9×7).
+    #[arg(long, value_name = "5|7|9", default_value = "5", value_parser = ["5", "7", "9"])]
+    census: String,
+    /// Penalty for a disparity step of one pixel, in bits of the window.
+    #[arg(long, value_name = "BITS")]
+    p1: Option<u8>,
+    /// Penalty for a larger step, in bits of the window.
+    #[arg(long, value_name = "BITS")]
+    p2: Option<u8>,
+    /// By how many percent the best match must beat the rest.
+    #[arg(long, value_name = "PERCENT")]
+    uniqueness: Option<u8>,
+    /// Remove patches of up to this many pixels; 0 for none.
+    #[arg(long, value_name = "PIXELS")]
+    speckle_size: Option<usize>,
+    /// Leave pixels without a match of their own unknown.
+    #[arg(long)]
+    no_fill: bool,
+}
+
+impl Run for Args {
+    fn outputs(&self) -> Vec<&Path> {
+        [Some(&self.output), self.depth.as_ref(), self.cloud.as_ref()].into_iter().flatten().map(|p| &**p).collect()
+    }
+
+    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+        for path in [Some(&self.output), self.depth.as_ref()].into_iter().flatten() {
+            map_format(path)?;
+        }
+        if (self.depth.is_some() || self.cloud.is_some()) && self.rig.is_none() && self.focal.is_none() {
+            return Err(Failure::usage("depth needs the geometry of the cameras")
+                .advice("give --focal and --baseline, or --rig"));
+        }
+        let left = cv_io::read_image(&self.left)?;
+        let right = cv_io::read_image(&self.right)?;
+        if left.size() != right.size() && self.rig.is_none() {
+            let ((lw, lh), (rw, rh)) = (left.size(), right.size());
+            return Err(Failure::new(format!(
+                "{} is {lw}×{lh} px, {} is {rw}×{rh} px: both must have the same size",
+                self.left.display(),
+                self.right.display()
+            )));
+        }
+        let options = self.options();
+        let job = match &self.rig {
+            Some(path) => {
+                let rig = cv_io::read_rig(path, Some(left.size()))?.rig;
+                let rectified = Rectification::new(&rig, &RectifyOptions::default())
+                    .during(path.display())
+                    .advice("check the calibration file")?;
+                rectified_job(left, right, &rectified, &options, context)?
+            }
+            None => {
+                let (width, height) = left.size();
+                let geometry = match (self.focal, self.baseline) {
+                    (Some(focal), Some(baseline)) => {
+                        let geometry = StereoGeometry::from_focal(width, height, focal, baseline)
+                            .map_err(|error| Failure::usage(error).advice("give positive numbers"))?;
+                        Some(StereoGeometry { offset: self.offset, ..geometry })
+                    }
+                    _ => None,
+                };
+                job(left, right, geometry, &options, context)?
+            }
+        };
+        let DepthResult { map, depth, .. } = &job.result;
+        if let Some(lost) = write_map(&self.output, map.disparity.view(), |path, map| cv_io::kitti::write(path, map))? {
+            context.warn(format!("{lost} disparities do not fit KITTI's range of 0 to 256 px and are stored as unknown"));
+        }
+        if let (Some(path), Some(depth)) = (&self.depth, depth)
+            && let Some(lost) = write_map(path, depth.view(), |path, map| cv_io::depth_mm::write(path, map))?
+        {
+            context.warn(format!("{lost} depths do not fit 0 to 65.535 m and are stored as unknown"));
+        }
+        let points = match (&job.geometry, depth) {
+            (Some(geometry), Some(depth)) if self.cloud.is_some() || context.wants_report() => {
+                geometry.cloud(depth.view(), job.left.view())
+            }
+            _ => Vec::new(),
+        };
+        if let Some(path) = &self.cloud {
+            let (positions, colors) = points.iter().map(|p| (p.position, p.color)).unzip();
+            cv_io::ply::write_cloud(path, &Cloud::colored(positions, colors), PlyEncoding::Binary)?;
+        }
+        context.report(|| report(&job, &points))?;
+        let (valid, matched) = (map.valid_fraction(), map.matched_fraction());
+        let (width, height) = map.disparity.size();
+        Ok(Outcome::new(job.result.stages.clone())
+            .with("width", width)
+            .with("height", height)
+            .with("valid_fraction", valid)
+            .with("matched_fraction", matched)
+            .with("disparities", options.stereo.disparities)
+            .with("min_disparity", options.stereo.min_disparity)
+            .summary(format!(
+                "{width}×{height} px, {:.1} % with a disparity, {:.1} % matched and confirmed",
+                100.0 * valid,
+                100.0 * matched
+            )))
+    }
+}
+
+impl Args {
+    fn options(&self) -> DepthOptions {
+        let default = StereoOptions::default();
+        DepthOptions {
+            stereo: StereoOptions {
+                min_disparity: self.min_disparity,
+                disparities: self.disparities,
+                census: match self.census.as_str() {
+                    "5" => Census::Window5x5,
+                    "7" => Census::Window7x7,
+                    _ => Census::Window9x7,
+                },
+                p1: self.p1.unwrap_or(default.p1),
+                p2: self.p2.unwrap_or(default.p2),
+                p2_min: default.p2_min.clamp(self.p1.unwrap_or(0), self.p2.unwrap_or(u8::MAX).max(self.p1.unwrap_or(0))),
+                paths: if self.paths == "4" { Paths::Four } else { Paths::Eight },
+                uniqueness: self.uniqueness.unwrap_or(default.uniqueness),
+                speckle_size: self.speckle_size.unwrap_or(default.speckle_size),
+                fill: !self.no_fill,
+                ..default
+            },
+            range: (self.near, self.far.unwrap_or(f32::INFINITY)),
+        }
+    }
+}
+
+/// A finished job with what the outputs need.
+struct Job {
+    left: RgbU8,
+    right: RgbU8,
+    geometry: Option<StereoGeometry>,
+    result: DepthResult,
+}
+
+/// Matches at the full depth of the files.
+fn job(
+    left: DynImage,
+    right: DynImage,
+    geometry: Option<StereoGeometry>,
+    options: &DepthOptions,
+    context: &Context,
+) -> Result<Job, Failure> {
+    let geometry_ref = geometry.as_ref();
+    let result = match (&left.pixels, &right.pixels) {
+        (Pixels::Gray8(a), Pixels::Gray8(b)) => matched(a.view(), b.view(), geometry_ref, options, context)?,
+        (Pixels::Gray16(a), Pixels::Gray16(b)) => matched(a.view(), b.view(), geometry_ref, options, context)?,
+        (Pixels::Rgb16(a), Pixels::Rgb16(b)) => matched(a.view(), b.view(), geometry_ref, options, context)?,
+        (Pixels::Rgb8(a), Pixels::Rgb8(b)) => matched(a.view(), b.view(), geometry_ref, options, context)?,
+        _ => {
+            let (a, b) = (left.clone().into_rgb8(), right.clone().into_rgb8());
+            matched(a.view(), b.view(), geometry_ref, options, context)?
+        }
+    };
+    Ok(Job { left: left.into_rgb8(), right: right.into_rgb8(), geometry, result })
+}
+
+/// Rectifies, then matches.
+fn rectified_job(
+    left: DynImage,
+    right: DynImage,
+    rectified: &Rectification,
+    options: &DepthOptions,
+    context: &Context,
+) -> Result<Job, Failure> {
+    let (left, _) = rectified.left.apply(left.into_rgb8().view()).advice("use the photographs the rig was calibrated for")?;
+    let (right, _) =
+        rectified.right.apply(right.into_rgb8().view()).advice("use the photographs the rig was calibrated for")?;
+    let result = matched(left.view(), right.view(), Some(&rectified.geometry), options, context)?;
+    Ok(Job { left, right, geometry: Some(rectified.geometry), result })
+}
+
+fn matched<T: Intensity, const C: usize>(
+    left: ImageView<'_, T, C>,
+    right: ImageView<'_, T, C>,
+    geometry: Option<&StereoGeometry>,
+    options: &DepthOptions,
+    context: &Context,
+) -> Result<DepthResult, Failure> {
+    depth(left, right, geometry, options, context).advice("see `cv depth --help` for the range of each option")
+}
+
+/// The formats a map can be written in.
+enum MapFormat {
+    Pfm,
+    Png,
+    Npy,
+}
+
+fn map_format(path: &Path) -> Result<MapFormat, Failure> {
+    match path.extension().unwrap_or_default().to_string_lossy().to_lowercase().as_str() {
+        "pfm" => Ok(MapFormat::Pfm),
+        "png" => Ok(MapFormat::Png),
+        "npy" => Ok(MapFormat::Npy),
+        _ => Err(Failure::usage(format!("{} does not tell a format by its ending", path.display()))
+            .advice("end it with .pfm, .png or .npy")),
+    }
+}
+
+/// Writes a map. `Some` count where values did not fit the format.
+fn write_map(
+    path: &Path,
+    map: ImageView<'_, f32, 1>,
+    png: impl FnOnce(&Path, ImageView<'_, f32, 1>) -> Result<usize, cv_io::IoError>,
+) -> Result<Option<usize>, Failure> {
+    match map_format(path)? {
+        MapFormat::Pfm => cv_io::pfm::write(path, map)?,
+        MapFormat::Npy => cv_io::npy::write(path, &cv_io::npy::NpyArray::from_view(map))?,
+        MapFormat::Png => return Ok(Some(png(path, map)?).filter(|&lost| lost > 0)),
+    }
+    Ok(None)
+}
+
+/// Where each disparity comes from, over the darkened photograph.
+fn draw_states(left: ImageView<'_, u8, 3>, states: ImageView<'_, PixelState, 1>) -> RgbU8 {
+    RgbU8::from_fn(states.width(), states.height(), |x, y| {
+        let pixel = left.at(x, y);
+        let tint = match states.at(x, y)[0] {
+            PixelState::Matched => return pixel,
+            PixelState::Occluded => [60u8, 110, 255],
+            PixelState::Mismatched => [255, 150, 40],
+            PixelState::OutOfView => [200, 60, 220],
+        };
+        std::array::from_fn(|c| ((u16::from(pixel[c]) + 3 * u16::from(tint[c])) / 4) as u8)
+    })
+}
+
+fn report(job: &Job, points: &[CloudPoint]) -> Result<String, Failure> {
+    let DepthResult { map, depth, stages } = &job.result;
+    let png = |image: &RgbU8| cv_io::encode_png(image.view());
+    let mut page = Report::new("Depth");
+    let (width, height) = map.disparity.size();
+    page.headline("size", &format!("{width}×{height}"))
+        .headline("with a disparity", &format!("{:.1} %", 100.0 * map.valid_fraction()))
+        .headline("matched and confirmed", &format!("{:.1} %", 100.0 * map.matched_fraction()));
+    page.section("Photographs").figures(vec![
+        Figure::new(png(&job.left)?, "Left photograph."),
+        Figure::new(png(&job.right)?, "Right photograph."),
+    ]);
+    page.section("Disparity").figures(vec![
+        Figure::new(
+            png(&draw_map(map.disparity.view(), &MapStyle::disparity()))?,
+            "Disparity: near (large) blue, far (small) red, unknown black.",
+        ),
+        Figure::new(
+            png(&draw_states(job.left.view(), map.state.view()))?,
+            "Filled pixels: blue hidden from the right camera, orange mismatched, violet outside the right photograph.",
+        ),
+    ]);
+    if let Some(depth) = depth {
+        page.section("Depth").figure(Figure::new(
+            png(&draw_map(depth.view(), &MapStyle::depth("")))?,
+            "Depth in the unit of the baseline: near blue, far red, unknown black.",
+        ));
+        let (positions, colors): (Vec<_>, Vec<_>) = points.iter().map(|p| (p.position, p.color)).unzip();
+        let scene = PointScene::new(&positions, &colors);
+        let still = png(&render_points(&scene, Viewpoint::Camera, 960, 640))?;
+        page.section("Cloud").points(&scene, Some(still), "The depth map in space.");
+    } else {
+        page.note(Note::Info, "No depth: the focal length and the baseline were not given.");
+    }
+    page.section("Time").facts(
+        &stages.iter().map(|(stage, seconds)| (*stage, format!("{:.1} ms", 1e3 * seconds))).collect::<Vec<_>>(),
+    );
+    Ok(page.to_html())
+}
+
+/// A map of any of the formats that truth and estimates come in: PFM, KITTI's PNG or (with `scale`) another one, NumPy's.
+pub(crate) fn read_map(path: &Path, scale: Option<f64>) -> Result<GrayF32, Failure> {
+    let map = match path.extension().unwrap_or_default().to_string_lossy().to_lowercase().as_str() {
+        "pfm" => cv_io::pfm::read(path)?,
+        "npy" => gray(path, cv_io::npy::read(path)?.to_gray())?,
+        "npz" => {
+            let arrays = cv_io::npz::read(path)?;
+            let [(_, array)] = arrays.as_slice() else {
+                return Err(Failure::new(format!("{} holds {} arrays, not one", path.display(), arrays.len())));
+            };
+            gray(path, array.to_gray())?
+        }
+        // Pictures, whatever they are called.
+        _ => {
+            return match scale {
+                Some(scale) => Ok(cv_io::scaled::read(path, scale)?),
+                None => Ok(cv_io::kitti::read(path).advice("for other pictures give the scale (--truth-scale)")?),
+            };
+        }
+    };
+    Ok(match scale {
+        Some(scale) => map.map(|[v]| [(f64::from(v) / scale) as f32]),
+        None => map,
+    })
+}
+
+fn gray(path: &Path, map: Result<GrayF32, cv_io::FormatError>) -> Result<GrayF32, Failure> {
+    map.during(format!("cannot read {}", path.display()))
+}

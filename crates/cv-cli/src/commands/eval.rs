@@ -1,0 +1,156 @@
+//! `cv eval`: results against the truth.
+
+use super::depth::read_map;
+use crate::common::{Context, Failure, Outcome, Run};
+use cv_core::Mask;
+use cv_report::{Figure, MapStyle, Report, draw_error_map, draw_map};
+use cv_pipeline::stereo::{BAD_THRESHOLDS, DisparityScores, evaluate_disparity, non_occluded};
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+
+/// Compare a result with the truth.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cv eval disparity --estimate disparity.pfm --truth truth.pfm")]
+pub(crate) struct Args {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum What {
+    Disparity(Disparity),
+}
+
+/// Score a disparity map: bad pixels, averages and quantiles, as Middlebury and KITTI count them.
+///
+/// A pixel without an estimate counts as bad; averages and quantiles are over pixels with one. Each figure comes over all
+/// pixels with known truth and, where --mask or --truth-right is given, over the non-occluded ones.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cv eval disparity --estimate disparity.pfm --truth disp0.pfm --mask mask0nocc.png\n  \
+    cv eval disparity --estimate d.pfm --truth disp2.png --truth-right disp6.png --truth-scale 4\n  \
+    cv eval disparity --estimate d.png --truth truth.npz --error error.png --json\n\n\
+    The ending of a file tells its format: .pfm, .npy, .npz (one array), else a picture: KITTI's 16-bit PNG without a scale,\n\
+    grey value / scale with one.")]
+struct Disparity {
+    /// The disparity map to score.
+    #[arg(long, value_name = "FILE")]
+    estimate: PathBuf,
+    /// What its values are to be divided by [default: 256 for pictures, 1 for floats].
+    #[arg(long, value_name = "S")]
+    estimate_scale: Option<f64>,
+    /// The true disparity; not finite, or 0 in pictures, where unknown.
+    #[arg(long, value_name = "FILE")]
+    truth: PathBuf,
+    /// What the true values are to be divided by [default: 256 for pictures, 1 for floats].
+    #[arg(long, value_name = "S")]
+    truth_scale: Option<f64>,
+    /// The true disparity of the right view: pixels that it confirms within 1 px are the non-occluded ones.
+    #[arg(long, value_name = "FILE", conflicts_with = "mask")]
+    truth_right: Option<PathBuf>,
+    /// Non-occluded pixels are white (255).
+    #[arg(long, value_name = "FILE")]
+    mask: Option<PathBuf>,
+    /// Where to write a picture of the errors: grey up to 2 px, red and yellow beyond, blue without an estimate.
+    #[arg(long, value_name = "PNG")]
+    error: Option<PathBuf>,
+}
+
+impl Run for Args {
+    fn outputs(&self) -> Vec<&Path> {
+        match &self.what {
+            What::Disparity(args) => args.error.iter().map(|p| &**p).collect(),
+        }
+    }
+
+    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+        match self.what {
+            What::Disparity(args) => args.run(context),
+        }
+    }
+}
+
+impl Disparity {
+    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+        for scale in [self.estimate_scale, self.truth_scale].into_iter().flatten() {
+            if !(scale.is_finite() && scale > 0.0) {
+                return Err(Failure::usage(format!("the scale {scale} is not a positive number")));
+            }
+        }
+        let estimate = read_map(&self.estimate, self.estimate_scale)?;
+        let truth = read_map(&self.truth, self.truth_scale)?;
+        let mask = match (&self.mask, &self.truth_right) {
+            (Some(path), _) => {
+                let grey = cv_io::read_gray_u8(path)?;
+                // Middlebury marks occluded pixels 128 and unknown ones 0.
+                Some(Mask::from_fn(grey.width(), grey.height(), |x, y| [grey.at(x, y)[0] == 255]))
+            }
+            (None, Some(path)) => Some(non_occluded(truth.view(), read_map(path, self.truth_scale)?.view())?),
+            (None, None) => None,
+        };
+        let all = evaluate_disparity(estimate.view(), truth.view(), None)?;
+        let visible = match &mask {
+            Some(mask) => Some(evaluate_disparity(estimate.view(), truth.view(), Some(mask.view()))?),
+            None => None,
+        };
+        let errors = || draw_error_map(estimate.view(), truth.view(), 2.0);
+        if let Some(path) = &self.error {
+            cv_io::write_png(path, errors().view())?;
+        }
+        context.report(|| {
+            let png = |image: cv_core::RgbU8| cv_io::encode_png(image.view());
+            let style = MapStyle::disparity();
+            let range = cv_report::quantile_range(truth.view(), 0.0, 1.0);
+            let style = range.map_or(style.clone(), |(low, high)| style.with_range(low, high));
+            let mut page = Report::new("Disparity against the truth");
+            page.headline("bad-2.0", &format!("{:.2} %", 100.0 * all.bad[2]))
+                .headline("average", &format!("{:.3} px", all.average))
+                .headline("density", &format!("{:.2} %", 100.0 * all.density));
+            page.section("Scores").table("", &HEAD, &rows(&all, visible.as_ref()));
+            page.section("Maps").figures(vec![
+                Figure::new(png(draw_map(estimate.view(), &style))?, "Estimate."),
+                Figure::new(png(draw_map(truth.view(), &style))?, "Truth."),
+                Figure::new(
+                    png(errors())?,
+                    "Errors: grey up to 2 px, red and yellow beyond, blue without an estimate, black without truth.",
+                ),
+            ]);
+            Ok(page.to_html())
+        })?;
+        let mut outcome = Outcome::default().with("all", object(&all));
+        if let Some(visible) = &visible {
+            outcome = outcome.with("non_occluded", object(visible));
+        }
+        let text: Vec<String> = std::iter::once(HEAD.map(str::to_owned).to_vec())
+            .chain(rows(&all, visible.as_ref()))
+            .map(|row| row.iter().map(|cell| format!("{cell:>13}")).collect())
+            .collect();
+        Ok(outcome.summary(text.join("\n")))
+    }
+}
+
+const HEAD: [&str; 12] =
+    ["pixels", "number", "density", "bad-0.5", "bad-1.0", "bad-2.0", "bad-4.0", "average", "RMS", "A50", "A90", "A95"];
+
+fn rows(all: &DisparityScores, visible: Option<&DisparityScores>) -> Vec<Vec<String>> {
+    let row = |name: &str, s: &DisparityScores| {
+        let percent = |v: f64| format!("{:.2} %", 100.0 * v);
+        let px = |v: f64| format!("{v:.3} px");
+        let mut cells = vec![name.to_owned(), s.pixels.to_string(), percent(s.density)];
+        cells.extend(s.bad.map(percent));
+        cells.extend([s.average, s.rms, s.a50, s.a90, s.a95].map(px));
+        cells
+    };
+    std::iter::once(row("all", all)).chain(visible.map(|s| row("non-occluded", s))).collect()
+}
+
+fn object(s: &DisparityScores) -> Value {
+    let shares = |values: &[f64; 4]| -> serde_json::Map<String, Value> {
+        BAD_THRESHOLDS.iter().zip(values).map(|(limit, v)| (format!("{limit:.1}"), json!(v))).collect()
+    };
+    json!({
+        "pixels": s.pixels, "density": s.density, "bad": shares(&s.bad), "bad_of_valid": shares(&s.bad_of_valid),
+        "average_px": s.average, "rms_px": s.rms, "a50_px": s.a50, "a90_px": s.a90, "a95_px": s.a95,
+    })
+}

@@ -1,0 +1,142 @@
+//! `depth` on Middlebury pairs, scored as `peers/stereo_opencv.py` and `peers/stereo_pandora.py` score others.
+
+use super::Check;
+use anyhow::{Result, ensure};
+use cv_core::{GrayF32, Mask};
+use cv_pipeline::stereo::{PixelState, StereoOptions, evaluate_disparity, non_occluded};
+use cv_pipeline::{DepthOptions, Silent, depth};
+use std::path::Path;
+
+/// A pair, its truth, and what others reach on it.
+pub(crate) struct Scene {
+    pub(crate) name: &'static str,
+    pub(crate) left: &'static str,
+    pub(crate) right: &'static str,
+    pub(crate) truth: &'static str,
+    pub(crate) truth_right: Option<&'static str>,
+    /// Divides the values of the truth; `None` for arrays.
+    pub(crate) scale: Option<f64>,
+    pub(crate) disparities: usize,
+    /// bad-1.0 and bad-2.0 in percent of Pandora.
+    pub(crate) pandora: (f64, f64),
+    /// bad-2.0 in percent of the best of OpenCV's matchers.
+    pub(crate) opencv: f64,
+}
+
+/// The pairs.
+pub(crate) const SCENES: [Scene; 4] = [
+    Scene {
+        name: "cones",
+        left: "cones/im2.png",
+        right: "cones/im6.png",
+        truth: "cones/disp2.png",
+        truth_right: Some("cones/disp6.png"),
+        scale: Some(4.0),
+        disparities: 64,
+        pandora: (4.67, 3.95),
+        opencv: 11.7,
+    },
+    Scene {
+        name: "teddy",
+        left: "teddy/im2.png",
+        right: "teddy/im6.png",
+        truth: "teddy/disp2.png",
+        truth_right: None,
+        scale: Some(4.0),
+        disparities: 64,
+        pandora: (15.51, 10.44),
+        opencv: 24.3,
+    },
+    Scene {
+        name: "cloth3",
+        left: "cloth3/view1.png",
+        right: "cloth3/view5.png",
+        truth: "cloth3/disp1.png",
+        truth_right: Some("cloth3/disp5.png"),
+        scale: Some(2.0),
+        disparities: 128,
+        pandora: (2.60, 2.06),
+        opencv: 12.8,
+    },
+    Scene {
+        name: "motorcycle",
+        left: "motorcycle/motorcycle_left.png",
+        right: "motorcycle/motorcycle_right.png",
+        truth: "motorcycle/motorcycle_disp.npz",
+        truth_right: None,
+        scale: None,
+        disparities: 128,
+        pandora: (12.05, 8.88),
+        opencv: 25.1,
+    },
+];
+
+/// What was scored of one pair.
+pub(crate) struct Scored {
+    /// bad-1.0 and bad-2.0 in percent, over non-occluded pixels where the right truth is known, else all.
+    pub(crate) bad: (f64, f64),
+    /// Share in percent of the same pixels that were matched and not filled, and bad-2.0 among those.
+    pub(crate) matched: (f64, f64),
+}
+
+/// Truth and the pixels that count.
+pub(crate) fn truth(folder: &Path, scene: &Scene) -> Result<(GrayF32, Mask)> {
+    let read = |name: &str| -> Result<GrayF32> {
+        let path = folder.join(name);
+        Ok(match scene.scale {
+            Some(scale) => cv_io::scaled::read(path, scale)?,
+            None => {
+                let arrays = cv_io::npz::read(&path)?;
+                ensure!(arrays.len() == 1, "{} holds {} arrays", path.display(), arrays.len());
+                arrays[0].1.to_gray()?
+            }
+        })
+    };
+    let left = read(scene.truth)?;
+    let mask = match scene.truth_right {
+        Some(right) => non_occluded(left.view(), read(right)?.view())?,
+        None => Mask::new(left.width(), left.height(), [true]),
+    };
+    Ok((left, mask))
+}
+
+/// Matches a pair with default options but for the range, and scores it.
+pub(crate) fn score(folder: &Path, scene: &Scene) -> Result<Scored> {
+    let (truth, mask) = truth(folder, scene)?;
+    let left = cv_io::read_rgb(folder.join(scene.left))?;
+    let right = cv_io::read_rgb(folder.join(scene.right))?;
+    let stereo = StereoOptions { disparities: scene.disparities, ..Default::default() };
+    let options = DepthOptions { stereo, ..Default::default() };
+    let map = depth(left.view(), right.view(), None, &options, &Silent)?.map;
+    let all = evaluate_disparity(map.disparity.view(), truth.view(), Some(mask.view()))?;
+    let matched = Mask::from_fn(mask.width(), mask.height(), |x, y| {
+        [mask.at(x, y)[0] && map.state.at(x, y)[0] == PixelState::Matched]
+    });
+    let sure = evaluate_disparity(map.disparity.view(), truth.view(), Some(matched.view()))?;
+    Ok(Scored {
+        bad: (100.0 * all.bad[1], 100.0 * all.bad[2]),
+        matched: (100.0 * sure.pixels as f64 / all.pixels as f64, 100.0 * sure.bad[2]),
+    })
+}
+
+pub(crate) fn run(data: &Path) -> Result<Vec<Check>> {
+    let folder = data.join("stereo");
+    let mut checks = Vec::new();
+    let mut sums = [0.0; 4];
+    for scene in &SCENES {
+        let Scored { bad, matched } = score(&folder, scene)?;
+        println!(
+            "{:11} bad-1.0 {:5.2} %  bad-2.0 {:5.2} %  matched {:.1} %, {:.2} % of those off by more than 2 px",
+            scene.name, bad.0, bad.1, matched.0, matched.1
+        );
+        checks.push(Check::at_most(format!("{} bad-2.0 %, 0.6 of OpenCV's", scene.name), bad.1, 0.6 * scene.opencv));
+        checks.push(Check::at_most(format!("{} bad-2.0 %, Pandora's", scene.name), bad.1, scene.pandora.1));
+        checks.push(Check::at_most(format!("{} bad-1.0 %, Pandora's", scene.name), bad.0, scene.pandora.0));
+        for (sum, value) in sums.iter_mut().zip([bad.0, scene.pandora.0, bad.1, scene.pandora.1]) {
+            *sum += value / SCENES.len() as f64;
+        }
+    }
+    checks.push(Check::at_most("mean bad-1.0 %, 0.9 of Pandora's", sums[0], 0.9 * sums[1]));
+    checks.push(Check::at_most("mean bad-2.0 %, 0.9 of Pandora's", sums[2], 0.9 * sums[3]));
+    Ok(checks)
+}
