@@ -1,0 +1,406 @@
+//! The canvas: which surface, how large, and where each photograph falls on it.
+
+use crate::align::{Alignment, CameraMotion};
+use crate::projection::{Projection, Surface};
+use crate::straighten::turn;
+use crate::view::View;
+use cv_core::{Matrix3, Point2, Vector3};
+use nalgebra::Rotation3;
+use std::f64::consts::{FRAC_PI_2, PI, TAU};
+
+/// Why there is no canvas for the panorama.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum LayoutError {
+    /// No photograph is placed.
+    #[error("there is no photograph to draw")]
+    Nothing,
+    /// The canvas would be too large.
+    #[error("the {} canvas would be {width:.0} x {height:.0} pixels, more than the limit of {max_pixels}", projection.name())]
+    TooLarge {
+        /// Width in pixels.
+        width: f64,
+        /// Height in pixels.
+        height: f64,
+        /// The limit.
+        max_pixels: usize,
+        /// The surface.
+        projection: Projection,
+    },
+    /// The photographs reach beyond what the surface can hold.
+    #[error("the photographs span {degrees:.0} degrees, more than the {} projection can hold", projection.name())]
+    TooWide {
+        /// Angle between the middle and the farthest point, doubled, in degrees.
+        degrees: f64,
+        /// The surface.
+        projection: Projection,
+    },
+}
+
+/// A photograph on the canvas.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Placement {
+    /// Index of the photograph.
+    pub(crate) photo: usize,
+    pub(crate) view: View,
+    /// Canvas pixels that the photograph may touch: left, top, right, bottom, the last two exclusive.
+    pub(crate) bounds: Bounds,
+    /// Surface coordinates of canvas pixel (0, 0). Differs by a full turn between two placements of one photograph.
+    pub(crate) origin: Point2<f64>,
+}
+
+/// A rectangle of canvas pixels, right and bottom exclusive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Bounds {
+    pub(crate) left: usize,
+    pub(crate) top: usize,
+    pub(crate) right: usize,
+    pub(crate) bottom: usize,
+}
+
+impl Bounds {
+    pub(crate) fn width(&self) -> usize {
+        self.right - self.left
+    }
+
+    pub(crate) fn height(&self) -> usize {
+        self.bottom - self.top
+    }
+
+    /// The common part; `None` where there is none.
+    pub(crate) fn intersection(&self, other: &Self) -> Option<Self> {
+        let b = Self {
+            left: self.left.max(other.left),
+            top: self.top.max(other.top),
+            right: self.right.min(other.right),
+            bottom: self.bottom.min(other.bottom),
+        };
+        (b.left < b.right && b.top < b.bottom).then_some(b)
+    }
+
+    /// Grown by `by` pixels to all sides, within a canvas.
+    pub(crate) fn grown(&self, by: usize, width: usize, height: usize) -> Self {
+        Self {
+            left: self.left.saturating_sub(by),
+            top: self.top.saturating_sub(by),
+            right: (self.right + by).min(width),
+            bottom: (self.bottom + by).min(height),
+        }
+    }
+}
+
+/// The canvas and everything on it.
+#[derive(Debug, Clone)]
+pub(crate) struct Layout {
+    pub(crate) surface: Surface,
+    pub(crate) width: usize,
+    pub(crate) height: usize,
+    /// A full turn: the right edge continues at the left one.
+    pub(crate) full_circle: bool,
+    pub(crate) placements: Vec<Placement>,
+}
+
+/// Half the angle up to which a plane is chosen: there it stretches lengths by 1/cos² = 2.
+const PLANE_HALF_ANGLE: f64 = 45.0 * PI / 180.0;
+/// Half the vertical angle up to which a cylinder is chosen.
+const CYLINDER_HALF_ANGLE: f64 = 50.0 * PI / 180.0;
+/// A plane tilts up or down with its photographs from this pitch on; below it stands upright and keeps verticals parallel.
+const UPRIGHT_PITCH: f64 = 25.0 * PI / 180.0;
+/// Samples along each side of a photograph when its outline is drawn.
+const PER_SIDE: usize = 64;
+
+/// Lays the canvas out.
+///
+/// `resolution` is the scale relative to the photographs (1: the median focal length in pixels is the pixels per radian).
+pub(crate) fn layout(
+    alignment: &Alignment,
+    projection: Projection,
+    resolution: f64,
+    max_pixels: usize,
+) -> Result<Layout, LayoutError> {
+    let views: Vec<(usize, View)> = alignment.used().map(|(i, v)| (i, *v)).collect();
+    let mut focals: Vec<f64> = views.iter().map(|(_, v)| (v.camera.fx * v.camera.fy).sqrt()).collect();
+    focals.sort_by(f64::total_cmp);
+    let Some(&focal) = focals.get(focals.len() / 2) else { return Err(LayoutError::Nothing) };
+    let scale = focal * resolution;
+    let flat = alignment.motion == CameraMotion::Homography;
+    let attempt = |projection| on_surface(&views, Surface { projection, scale }, flat, max_pixels);
+    match projection {
+        Projection::Auto if flat => attempt(Projection::Plane),
+        Projection::Auto => {
+            let (across, up) = extent(&views, scale);
+            if across <= 2.0 * PLANE_HALF_ANGLE && up <= PLANE_HALF_ANGLE {
+                if let Ok(plane) = attempt(Projection::Plane) {
+                    return Ok(plane);
+                }
+            }
+            if up <= CYLINDER_HALF_ANGLE {
+                if let Ok(cylinder) = attempt(Projection::Cylindrical) {
+                    return Ok(cylinder);
+                }
+            }
+            attempt(Projection::Spherical)
+        }
+        chosen => attempt(chosen),
+    }
+}
+
+/// Outline of a view on a surface with longitudes unrolled along it: left, top, right, bottom in surface pixels.
+struct Outline {
+    min: Point2<f64>,
+    max: Point2<f64>,
+}
+
+/// `None` where part of the border falls where the surface does not reach.
+fn outline(view: &View, surface: &Surface) -> Option<Outline> {
+    let axis = surface.forward(&view.ray(Point2::new(view.camera.cx, view.camera.cy))?)?;
+    let (mut min, mut max) = (axis, axis);
+    let mut border = view.border(PER_SIDE);
+    border.extend(border.first().copied());
+    let (mut first, mut last) = (None, axis.x);
+    for pixel in border {
+        let mut p = surface.forward(&view.ray(pixel)?)?;
+        if let Some(period) = surface.period() {
+            p.x -= ((p.x - last) / period).round() * period;
+        }
+        last = p.x;
+        first.get_or_insert(p.x);
+        min = Point2::new(min.x.min(p.x), min.y.min(p.y));
+        max = Point2::new(max.x.max(p.x), max.y.max(p.y));
+    }
+    if let (Some(period), Some(first)) = (surface.period(), first) {
+        // A border that goes once around the vertical has a pole inside.
+        if (last - first).abs() > 0.5 * period || max.x - min.x > 0.98 * period {
+            if surface.projection == Projection::Cylindrical {
+                return None;
+            }
+            (min.x, max.x) = (-0.5 * period, 0.5 * period);
+            for (sign, edge) in [(1.0, &mut max.y), (-1.0, &mut min.y)] {
+                if view.project(&Vector3::new(0.0, sign, 0.0)).is_some_and(|p| view.contains(p)) {
+                    *edge = sign * FRAC_PI_2 * surface.scale;
+                }
+            }
+        }
+    }
+    Some(Outline { min, max })
+}
+
+/// The horizontal angle that all views span together, and the largest vertical angle from the horizon.
+fn extent(views: &[(usize, View)], scale: f64) -> (f64, f64) {
+    let sphere = Surface { projection: Projection::Spherical, scale };
+    let outlines: Vec<Outline> = views.iter().filter_map(|(_, v)| outline(v, &sphere)).collect();
+    let up = outlines.iter().map(|o| o.max.y.max(-o.min.y)).fold(0.0, f64::max) / scale;
+    let (gap, _) = largest_gap(&outlines, TAU * scale);
+    (TAU - gap / scale, up)
+}
+
+/// The widest range of longitude that no outline covers, and the longitude of its middle.
+fn largest_gap(outlines: &[Outline], period: f64) -> (f64, f64) {
+    let wrap = |x: f64| x.rem_euclid(period);
+    let mut intervals: Vec<(f64, f64)> = outlines.iter().map(|o| (wrap(o.min.x), o.max.x - o.min.x)).collect();
+    intervals.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let mut best = (0.0, 0.0);
+    let Some(first) = intervals.first().copied() else { return (period, 0.0) };
+    // Twice around, so that what reaches over the start is seen.
+    let mut reach = first.0 + first.1;
+    for turn in 0..2 {
+        for &(start, length) in &intervals {
+            let start = start + f64::from(turn) * period;
+            if start - reach > best.0 {
+                best = (start - reach, 0.5 * (start + reach));
+            }
+            reach = reach.max(start + length);
+        }
+    }
+    best
+}
+
+fn on_surface(views: &[(usize, View)], surface: Surface, flat: bool, max_pixels: usize) -> Result<Layout, LayoutError> {
+    let too_wide = || {
+        let up = extent(views, surface.scale);
+        let degrees = up.0.max(2.0 * up.1).to_degrees();
+        LayoutError::TooWide { degrees, projection: surface.projection }
+    };
+    // The middle of the panorama goes to the Z axis.
+    let recentred = |m: Matrix3<f64>| -> Vec<(usize, View)> {
+        views.iter().map(|&(i, v)| (i, View { from_world: v.from_world * m.transpose(), ..v })).collect()
+    };
+    let mut full_circle = false;
+    let views = match surface.period() {
+        _ if flat => views.to_vec(),
+        None => {
+            let sphere = Surface { projection: Projection::Spherical, scale: 1.0 };
+            let outlines: Vec<Outline> = views.iter().filter_map(|(_, v)| outline(v, &sphere)).collect();
+            let (gap, middle) = largest_gap(&outlines, TAU);
+            if gap < PI {
+                return Err(too_wide());
+            }
+            let low = outlines.iter().map(|o| o.min.y).fold(f64::INFINITY, f64::min);
+            let high = outlines.iter().map(|o| o.max.y).fold(f64::NEG_INFINITY, f64::max);
+            let pitch = 0.5 * (low + high);
+            let level = turn(middle + PI);
+            let tilt = if pitch.abs() > UPRIGHT_PITCH {
+                Rotation3::from_axis_angle(&Vector3::x_axis(), pitch).into_inner()
+            } else {
+                Matrix3::identity()
+            };
+            recentred(tilt * level)
+        }
+        Some(period) => {
+            let outlines: Option<Vec<Outline>> = views.iter().map(|(_, v)| outline(v, &surface)).collect();
+            let outlines = outlines.ok_or_else(too_wide)?;
+            let (gap, middle) = largest_gap(&outlines, period);
+            full_circle = gap < 1.0;
+            // Around the whole horizon the middle stays where the views' own middle is.
+            if full_circle { views.to_vec() } else { recentred(turn(middle / surface.scale + PI)) }
+        }
+    };
+    let outlines: Option<Vec<Outline>> = views.iter().map(|(_, v)| outline(v, &surface)).collect();
+    let mut outlines = outlines.ok_or_else(too_wide)?;
+    if let Some(period) = surface.period() {
+        for o in &mut outlines {
+            // The outline starts at the axis' longitude in (−π, π]; the gap opposite to the middle is at ±π.
+            let middle = 0.5 * (o.min.x + o.max.x);
+            let shift = -(middle / period).round() * period;
+            o.min.x += shift;
+            o.max.x += shift;
+        }
+    }
+    let mut min = outlines
+        .iter()
+        .fold(Point2::new(f64::INFINITY, f64::INFINITY), |m, o| Point2::new(m.x.min(o.min.x), m.y.min(o.min.y)));
+    let mut max = outlines.iter().fold(Point2::new(f64::NEG_INFINITY, f64::NEG_INFINITY), |m, o| {
+        Point2::new(m.x.max(o.max.x), m.y.max(o.max.y))
+    });
+    let mut size = (max.x.floor() - min.x.ceil() + 1.0, max.y.floor() - min.y.ceil() + 1.0);
+    if let (true, Some(period)) = (full_circle, surface.period()) {
+        min.x = -0.5 * period;
+        max.x = 0.5 * period;
+        size.0 = period.round();
+    }
+    let (width, height) = (size.0.max(1.0), size.1.max(1.0));
+    if !(width * height <= max_pixels as f64) {
+        return Err(LayoutError::TooLarge { width, height, max_pixels, projection: surface.projection });
+    }
+    let (canvas_w, canvas_h) = (width as usize, height as usize);
+    let origin = Point2::new(min.x.ceil(), min.y.ceil());
+    let mut placements = Vec::new();
+    for ((photo, view), o) in views.iter().zip(&outlines) {
+        let turns: &[f64] = if full_circle { &[0.0, 1.0, -1.0] } else { &[0.0] };
+        for turns in turns {
+            let shift = turns * surface.period().unwrap_or(0.0);
+            let clamp = |v: f64, limit: usize| v.clamp(0.0, limit as f64) as usize;
+            // A pixel of slack for the curvature of the outline between its samples.
+            let bounds = Bounds {
+                left: clamp((o.min.x + shift - origin.x).floor() - 1.0, canvas_w),
+                top: clamp((o.min.y - origin.y).floor() - 1.0, canvas_h),
+                right: clamp((o.max.x + shift - origin.x).ceil() + 2.0, canvas_w),
+                bottom: clamp((o.max.y - origin.y).ceil() + 2.0, canvas_h),
+            };
+            if bounds.left < bounds.right && bounds.top < bounds.bottom {
+                placements.push(Placement {
+                    photo: *photo,
+                    view: *view,
+                    bounds,
+                    origin: origin - nalgebra::Vector2::new(shift, 0.0),
+                });
+            }
+        }
+    }
+    Ok(Layout { surface, width: canvas_w, height: canvas_h, full_circle, placements })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cv_core::Camera;
+
+    /// Photographs of 600 x 400 at focal length 500 (62 by 44 degrees), turned by these yaws and pitches.
+    fn alignment(turns: &[(f64, f64)]) -> Alignment {
+        let views = turns
+            .iter()
+            .map(|&(yaw, pitch)| {
+                let r = Rotation3::from_axis_angle(&Vector3::x_axis(), pitch)
+                    * Rotation3::from_axis_angle(&Vector3::y_axis(), -yaw);
+                Ok(View { camera: Camera::from_focal(600, 400, 500.0), from_world: r.into_inner() })
+            })
+            .collect();
+        Alignment {
+            views,
+            reference: 0,
+            motion: CameraMotion::Rotation,
+            pairs: Vec::new(),
+            rms_px: 0.0,
+            median_px: 0.0,
+        }
+    }
+
+    const MANY: usize = 100_000_000;
+
+    #[test]
+    fn the_surface_follows_the_field_of_view() {
+        let chosen =
+            |turns: &[(f64, f64)]| layout(&alignment(turns), Projection::Auto, 1.0, MANY).unwrap().surface.projection;
+        assert_eq!(chosen(&[(0.0, 0.0), (0.3, 0.0)]), Projection::Plane);
+        assert_eq!(chosen(&[(-0.7, 0.0), (0.0, 0.0), (0.7, 0.0)]), Projection::Cylindrical);
+        assert_eq!(chosen(&[(-0.7, 0.0), (0.0, 0.8), (0.7, 0.0)]), Projection::Spherical);
+    }
+
+    #[test]
+    fn a_canvas_holds_every_photograph_wherever_the_world_frame_points() {
+        for offset in [0.0, 2.0, 3.1, -3.0] {
+            let set = alignment(&[(offset, 0.0), (offset + 0.4, 0.05)]);
+            for projection in [Projection::Plane, Projection::Cylindrical, Projection::Spherical] {
+                let l = layout(&set, projection, 1.0, MANY).unwrap();
+                assert_eq!(l.placements.len(), 2);
+                for p in &l.placements {
+                    // Every pixel of the photograph's border lies within its bounds.
+                    for pixel in p.view.border(100) {
+                        let q = l.surface.forward(&p.view.ray(pixel).unwrap()).unwrap() - p.origin;
+                        assert!(
+                            q.x >= p.bounds.left as f64 - 1.0 && q.x <= p.bounds.right as f64,
+                            "{offset} {projection:?} {q}"
+                        );
+                        assert!(
+                            q.y >= p.bounds.top as f64 - 1.0 && q.y <= p.bounds.bottom as f64,
+                            "{offset} {projection:?} {q}"
+                        );
+                    }
+                }
+                // 62 degrees and 0.4 rad: 500 tan and 500 rad, both under 900 px.
+                assert!(l.width < 1100 && l.height < 600, "{projection:?} {} {}", l.width, l.height);
+            }
+        }
+    }
+
+    #[test]
+    fn a_full_circle_is_one_period_wide_and_photographs_over_the_cut_are_drawn_twice() {
+        let turns: Vec<_> = (0..10).map(|k| (f64::from(k) * TAU / 10.0, 0.0)).collect();
+        let l = layout(&alignment(&turns), Projection::Auto, 1.0, MANY).unwrap();
+        assert!(l.full_circle && l.surface.projection == Projection::Cylindrical);
+        assert_eq!(l.width, (TAU * 500.0_f64).round() as usize);
+        let covered: Vec<bool> =
+            (0..l.width).map(|x| l.placements.iter().any(|p| p.bounds.left <= x && x < p.bounds.right)).collect();
+        assert!(covered.iter().all(|c| *c));
+        assert!(l.placements.len() > 10);
+    }
+
+    #[test]
+    fn what_a_surface_cannot_hold_is_an_error_with_the_numbers() {
+        let wide = alignment(&[(-1.2, 0.0), (0.0, 0.0), (1.2, 0.0)]);
+        // 62 + 138 = 200 degrees.
+        match layout(&wide, Projection::Plane, 1.0, MANY) {
+            Err(LayoutError::TooWide { degrees, projection: Projection::Plane }) => {
+                assert!((degrees - 199.4).abs() < 1.0)
+            }
+            other => panic!("{other:?}"),
+        }
+        let nearly = alignment(&[(-1.0, 0.0), (1.0, 0.0)]);
+        assert!(
+            matches!(layout(&nearly, Projection::Plane, 1.0, MANY), Err(LayoutError::TooLarge { width, .. }) if width > 9000.0)
+        );
+        assert!(matches!(layout(&wide, Projection::Auto, 1.0, 1000), Err(LayoutError::TooLarge { .. })));
+        let straight_up = alignment(&[(0.0, 1.5), (0.5, 1.5)]);
+        assert!(matches!(layout(&straight_up, Projection::Cylindrical, 1.0, MANY), Err(LayoutError::TooWide { .. })));
+        assert!(layout(&straight_up, Projection::Auto, 1.0, MANY).is_ok());
+    }
+}

@@ -1,0 +1,347 @@
+//! Drawing a photograph onto the canvas.
+//!
+//! The three surfaces factor as `ray = (g(y)·ax(x), b(y), g(y)·az(x))` (see `projection`), so a canvas pixel's place in the photograph
+//! costs three multiply-adds per coordinate and one division.
+
+use crate::layout::{Bounds, Placement};
+use crate::projection::Surface;
+use crate::view::View;
+use cv_core::{Distortion, Image, ImageView, Matrix3, Point2};
+use rayon::prelude::*;
+
+/// How pixels between pixels are found.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Interpolation {
+    /// The four neighbours.
+    Bilinear,
+    /// The sixteen neighbours, Keys' cubic convolution (1981) with a = −0.5: sharper.
+    #[default]
+    Bicubic,
+}
+
+/// A piece of the canvas seen through one photograph: red, green, blue, and 255 where the photograph reaches (0 where its edge
+/// pixels were repeated instead).
+pub(crate) struct Warped {
+    pub(crate) bounds: Bounds,
+    pub(crate) pixels: Image<u8, 4>,
+}
+
+/// The photograph as seen in the canvas pixels `bounds`.
+pub(crate) fn warp(
+    photo: ImageView<'_, u8, 3>,
+    placement: &Placement,
+    surface: &Surface,
+    bounds: Bounds,
+    interpolation: Interpolation,
+) -> Warped {
+    let (width, height) = (bounds.width(), bounds.height());
+    let mut pixels = Image::<u8, 4>::new(width, height, [0; 4]);
+    if photo.is_empty() || pixels.is_empty() {
+        return Warped { bounds, pixels };
+    }
+    let map = Map::new(placement, surface, bounds);
+    pixels.as_mut_slice().par_chunks_mut(4 * width).enumerate().for_each_init(
+        || (vec![0.0_f32; width], vec![0.0_f32; width]),
+        |(us, vs), (y, row)| {
+            map.row(y, us, vs);
+            match interpolation {
+                Interpolation::Bilinear => sample_row(photo, us, vs, row, bilinear),
+                Interpolation::Bicubic => sample_row(photo, us, vs, row, bicubic),
+            }
+        },
+    );
+    Warped { bounds, pixels }
+}
+
+/// Canvas pixels to photograph pixels, row by row.
+pub(crate) struct Map {
+    /// Per column, the part of `M · ray` that depends on x.
+    columns: Vec<[f32; 3]>,
+    /// The middle column of M, times b(y) the part that depends on y.
+    middle: [f64; 3],
+    surface: Surface,
+    /// Surface y of the first row.
+    top: f64,
+    lens: Lens,
+}
+
+enum Lens {
+    /// M already ends in pixels.
+    None,
+    /// M ends in normalised coordinates; beyond `limit` (squared radius) no pixel of the photograph lies.
+    Radial { k1: f32, k2: f32, f: [f32; 2], c: [f32; 2], limit: f32 },
+    /// As above, by the camera's own functions.
+    Other { view: View, limit: f32 },
+}
+
+impl Map {
+    pub(crate) fn new(placement: &Placement, surface: &Surface, bounds: Bounds) -> Self {
+        let view = placement.view;
+        let camera = view.camera;
+        // How far from the axis the photograph's own border lies, with a margin for the border pixels' outer halves.
+        let limit = || {
+            let squared = view.border(64).into_iter().map(|p| camera.normalize(p).coords.norm_squared());
+            1.05 * squared.filter(|v| v.is_finite()).fold(0.0, f64::max) as f32
+        };
+        let (m, lens) = match camera.distortion {
+            Distortion::None => (camera.matrix() * view.from_world, Lens::None),
+            Distortion::Radial { k1, k2 } => {
+                let lens = Lens::Radial {
+                    k1: k1 as f32,
+                    k2: k2 as f32,
+                    f: [camera.fx as f32, camera.fy as f32],
+                    c: [camera.cx as f32, camera.cy as f32],
+                    limit: limit(),
+                };
+                (view.from_world, lens)
+            }
+            Distortion::BrownConrady { .. } | Distortion::Fisheye { .. } => {
+                (view.from_world, Lens::Other { view, limit: limit() })
+            }
+        };
+        // The overall size of M cancels; one keeps the single-precision numbers in the middle of their range.
+        let m: Matrix3<f64> = m / m.norm();
+        let columns = (bounds.left..bounds.right)
+            .map(|x| {
+                let (ax, az) = surface.column(x as f64 + placement.origin.x);
+                std::array::from_fn(|r| (m[(r, 0)] * ax + m[(r, 2)] * az) as f32)
+            })
+            .collect();
+        let middle = std::array::from_fn(|r| m[(r, 1)]);
+        Self { columns, middle, surface: *surface, top: bounds.top as f64 + placement.origin.y, lens }
+    }
+
+    /// Photograph coordinates of row `y` of the bounds. What lies behind the camera comes out far outside the photograph.
+    pub(crate) fn row(&self, y: usize, us: &mut [f32], vs: &mut [f32]) {
+        let (g, b) = self.surface.row(self.top + y as f64);
+        let g = g as f32;
+        let b: [f32; 3] = std::array::from_fn(|r| (self.middle[r] * b) as f32);
+        for ((c, u), v) in self.columns.iter().zip(us.iter_mut()).zip(vs.iter_mut()) {
+            // At and behind the camera's plane: far out in the direction in which the ray leaves.
+            let z = (g * c[2] + b[2]).max(1e-9);
+            let inverse = 1.0 / z;
+            *u = (g * c[0] + b[0]) * inverse;
+            *v = (g * c[1] + b[1]) * inverse;
+        }
+        match &self.lens {
+            Lens::None => {}
+            Lens::Radial { k1, k2, f, c, limit } => {
+                for (u, v) in us.iter_mut().zip(vs.iter_mut()) {
+                    let r2 = (*u * *u + *v * *v).max(1e-30);
+                    // Beyond the photograph the polynomial may fold back: hold it at the border.
+                    let r2_held = r2.min(*limit);
+                    let factor = (1.0 + r2_held * (k1 + k2 * r2_held)) * (r2_held / r2).sqrt();
+                    // A point that was held belongs to no pixel, however the corners of the photograph lie.
+                    let out = if r2 > *limit { 1e6 } else { 0.0 };
+                    *u = f[0] * factor * *u * (1.0 + out) + c[0];
+                    *v = f[1] * factor * *v * (1.0 + out) + c[1];
+                }
+            }
+            Lens::Other { view, limit } => {
+                for (u, v) in us.iter_mut().zip(vs.iter_mut()) {
+                    let r2 = *u * *u + *v * *v;
+                    if r2 <= *limit {
+                        let p = view.camera.denormalize(Point2::new(f64::from(*u), f64::from(*v)));
+                        (*u, *v) = (p.x as f32, p.y as f32);
+                    } else {
+                        (*u, *v) = (*u * 1e9, *v * 1e9);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Samples one row; coordinates outside the photograph take the nearest edge pixel and are marked as not reached.
+#[inline(always)]
+fn sample_row(
+    photo: ImageView<'_, u8, 3>,
+    us: &[f32],
+    vs: &[f32],
+    row: &mut [u8],
+    sample: impl Fn(&Source<'_>, f32, f32) -> [u8; 3],
+) {
+    let source = Source::new(photo);
+    let (right, bottom) = (source.right as f32 + 0.5, source.bottom as f32 + 0.5);
+    let (pixels, _) = row.as_chunks_mut::<4>();
+    for ((pixel, &u), &v) in pixels.iter_mut().zip(us).zip(vs) {
+        let inside = u >= -0.5 && v >= -0.5 && u <= right && v <= bottom;
+        // `max` first: it turns NaN into a number.
+        let (u, v) = (u.max(0.0).min(source.right as f32), v.max(0.0).min(source.bottom as f32));
+        let [r, g, b] = sample(&source, u, v);
+        *pixel = [r, g, b, if inside { 255 } else { 0 }];
+    }
+}
+
+/// The photograph with what every sample needs worked out once.
+struct Source<'a> {
+    photo: ImageView<'a, u8, 3>,
+    right: usize,
+    bottom: usize,
+}
+
+impl<'a> Source<'a> {
+    fn new(photo: ImageView<'a, u8, 3>) -> Self {
+        Self { photo, right: photo.width() - 1, bottom: photo.height() - 1 }
+    }
+
+    fn pixel(&self, x: isize, y: isize) -> [f32; 3] {
+        let x = x.clamp(0, self.right as isize) as usize;
+        let y = y.clamp(0, self.bottom as isize) as usize;
+        self.photo.at(x, y).map(f32::from)
+    }
+}
+
+fn round(v: f32) -> u8 {
+    // Saturates, as float-to-integer casts do.
+    (v + 0.5) as u8
+}
+
+#[inline(always)]
+fn bilinear(s: &Source<'_>, u: f32, v: f32) -> [u8; 3] {
+    let (x, y) = (u as usize, v as usize);
+    let (x1, y1) = ((x + 1).min(s.right), (y + 1).min(s.bottom));
+    let (fx, fy) = (u - x as f32, v - y as f32);
+    let (top, bottom) = (s.photo.row(y), s.photo.row(y1));
+    std::array::from_fn(|c| {
+        let (a, b) = (f32::from(top[3 * x + c]), f32::from(top[3 * x1 + c]));
+        let (d, e) = (f32::from(bottom[3 * x + c]), f32::from(bottom[3 * x1 + c]));
+        let (t, l) = (a + (b - a) * fx, d + (e - d) * fx);
+        round(t + (l - t) * fy)
+    })
+}
+
+/// Keys' weights with a = −0.5 for the pixels at −1, 0, 1, 2 from the floor.
+#[inline(always)]
+fn keys(t: f32) -> [f32; 4] {
+    let (t2, t3) = (t * t, t * t * t);
+    [0.5 * (-t3 + 2.0 * t2 - t), 0.5 * (3.0 * t3 - 5.0 * t2 + 2.0), 0.5 * (-3.0 * t3 + 4.0 * t2 + t), 0.5 * (t3 - t2)]
+}
+
+#[inline(always)]
+fn bicubic(s: &Source<'_>, u: f32, v: f32) -> [u8; 3] {
+    let (x, y) = (u as usize, v as usize);
+    let (wx, wy) = (keys(u - x as f32), keys(v - y as f32));
+    if x >= 1 && y >= 1 && x + 2 <= s.right && y + 2 <= s.bottom {
+        let start = 3 * (x - 1);
+        let mut sums = [0.0_f32; 12];
+        for (r, w) in wy.iter().enumerate() {
+            let row = &s.photo.row(y + r - 1)[start..start + 12];
+            for (sum, &p) in sums.iter_mut().zip(row) {
+                *sum += w * f32::from(p);
+            }
+        }
+        return std::array::from_fn(|c| {
+            round(wx[0] * sums[c] + wx[1] * sums[3 + c] + wx[2] * sums[6 + c] + wx[3] * sums[9 + c])
+        });
+    }
+    let (x, y) = (x as isize, y as isize);
+    let mut sum = [0.0_f32; 3];
+    for (r, wy) in wy.iter().enumerate() {
+        for (q, wx) in wx.iter().enumerate() {
+            let p = s.pixel(x + q as isize - 1, y + r as isize - 1);
+            for c in 0..3 {
+                sum[c] += wx * wy * p[c];
+            }
+        }
+    }
+    sum.map(round)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::projection::Projection;
+    use cv_core::{Camera, RgbU8, Vector3};
+    use nalgebra::Rotation3;
+
+    fn placement(camera: Camera, r: Rotation3<f64>, surface: &Surface, bounds: Bounds) -> Placement {
+        let _ = surface;
+        Placement {
+            photo: 0,
+            view: View { camera, from_world: r.into_inner() },
+            bounds,
+            origin: Point2::new(-60.0, -45.0),
+        }
+    }
+
+    /// A smooth picture whose value at any point is known: interpolation errors stay under a grey level.
+    fn wave(u: f64, v: f64) -> [f64; 3] {
+        [128.0 + 90.0 * (u * 0.05).sin(), 128.0 + 90.0 * (v * 0.06).cos(), 128.0 + 60.0 * ((u + v) * 0.03).sin()]
+    }
+
+    #[test]
+    fn every_surface_and_lens_shows_what_the_exact_projection_says() {
+        let photo = RgbU8::from_fn(121, 91, |x, y| wave(x as f64, y as f64).map(|v| v.round() as u8));
+        let bounds = Bounds { left: 3, top: 5, right: 118, bottom: 88 };
+        for distortion in [
+            Distortion::None,
+            Distortion::Radial { k1: -0.1, k2: 0.02 },
+            Distortion::BrownConrady { k1: 0.05, k2: 0.0, p1: 0.002, p2: -0.001, k3: 0.0 },
+        ] {
+            let camera = Camera { distortion, ..Camera::from_focal(121, 91, 110.0) };
+            for projection in [Projection::Plane, Projection::Cylindrical, Projection::Spherical] {
+                let surface = Surface { projection, scale: 110.0 };
+                let p = placement(camera, Rotation3::from_euler_angles(0.1, -0.15, 0.05), &surface, bounds);
+                for interpolation in [Interpolation::Bilinear, Interpolation::Bicubic] {
+                    let warped = warp(photo.view(), &p, &surface, bounds, interpolation);
+                    let mut seen = 0;
+                    for y in bounds.top..bounds.bottom {
+                        for x in bounds.left..bounds.right {
+                            let ray = surface.inverse(Point2::new(x as f64 + p.origin.x, y as f64 + p.origin.y));
+                            let q = p.view.project(&ray);
+                            let [r, g, b, a] = warped.pixels.at(x - bounds.left, y - bounds.top);
+                            let inside = q.is_some_and(|q| p.view.contains(q));
+                            // Single precision may tip a pixel within a thousandth of the outer edge, which is half a pixel away.
+                            if !inside {
+                                continue;
+                            }
+                            seen += 1;
+                            assert_eq!(a, 255);
+                            let q = q.unwrap();
+                            for (got, want) in [r, g, b].into_iter().zip(wave(q.x, q.y)) {
+                                // Half a level of rounding in the photograph, half in the result, curvature 90·0.06²/8 = 0.04
+                                // (more for repeated pixels at the border: one slope of 5.4 levels times nothing, as inside).
+                                assert!(
+                                    (f64::from(got) - want).abs() < 1.6,
+                                    "{projection:?} {distortion:?} {x} {y}: {got} {want}"
+                                );
+                            }
+                        }
+                    }
+                    assert!(seen > 5000, "{seen}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn what_the_photograph_does_not_reach_repeats_its_edge_and_says_so() {
+        let photo = RgbU8::new(20, 10, [9, 80, 200]);
+        let surface = Surface { projection: Projection::Spherical, scale: 20.0 };
+        let bounds = Bounds { left: 0, top: 0, right: 126, bottom: 90 };
+        for distortion in [
+            Distortion::None,
+            Distortion::Radial { k1: -0.3, k2: 0.0 },
+            Distortion::Fisheye { k1: 0.0, k2: 0.0, k3: 0.0, k4: 0.0 },
+        ] {
+            let camera = Camera { distortion, ..Camera::from_focal(20, 10, 20.0) };
+            let p = placement(camera, Rotation3::identity(), &surface, bounds);
+            let warped = warp(photo.view(), &p, &surface, bounds, Interpolation::Bicubic);
+            let mut reached = 0;
+            for y in 0..90 {
+                for x in 0..126 {
+                    let [r, g, b, a] = warped.pixels.at(x, y);
+                    assert_eq!([r, g, b], [9, 80, 200]);
+                    let ray: Vector3<f64> = surface.inverse(Point2::new(x as f64 - 60.0, y as f64 - 45.0));
+                    if a > 0 {
+                        reached += 1;
+                        assert!(ray.z > 0.5, "{distortion:?} {x} {y} {ray}");
+                    }
+                }
+            }
+            // The sphere's pixels are as large as the photograph's at the middle, larger than those at its sides.
+            assert!((150..=230).contains(&reached), "{distortion:?} {reached}");
+        }
+    }
+}
