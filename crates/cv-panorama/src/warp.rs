@@ -26,6 +26,17 @@ pub(crate) struct Warped {
     pub(crate) pixels: Image<u8, 4>,
 }
 
+/// What to multiply a photograph with: a factor per channel, and `exp(v₁ r² + v₂ r⁴)` with r = 1 at its corners.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Tone {
+    pub(crate) gain: [f32; 3],
+    pub(crate) vignetting: [f32; 2],
+}
+
+impl Tone {
+    pub(crate) const NEUTRAL: Self = Self { gain: [1.0; 3], vignetting: [0.0; 2] };
+}
+
 /// The photograph as seen in the canvas pixels `bounds`.
 pub(crate) fn warp(
     photo: ImageView<'_, u8, 3>,
@@ -33,6 +44,7 @@ pub(crate) fn warp(
     surface: &Surface,
     bounds: Bounds,
     interpolation: Interpolation,
+    tone: Tone,
 ) -> Warped {
     let (width, height) = (bounds.width(), bounds.height());
     let mut pixels = Image::<u8, 4>::new(width, height, [0; 4]);
@@ -45,8 +57,8 @@ pub(crate) fn warp(
         |(us, vs), (y, row)| {
             map.row(y, us, vs);
             match interpolation {
-                Interpolation::Bilinear => sample_row(photo, us, vs, row, bilinear),
-                Interpolation::Bicubic => sample_row(photo, us, vs, row, bicubic),
+                Interpolation::Bilinear => sample_row(photo, us, vs, row, tone, bilinear),
+                Interpolation::Bicubic => sample_row(photo, us, vs, row, tone, bicubic),
             }
         },
     );
@@ -159,17 +171,27 @@ fn sample_row(
     us: &[f32],
     vs: &[f32],
     row: &mut [u8],
-    sample: impl Fn(&Source<'_>, f32, f32) -> [u8; 3],
+    tone: Tone,
+    sample: impl Fn(&Source<'_>, f32, f32) -> [f32; 3],
 ) {
     let source = Source::new(photo);
-    let (right, bottom) = (source.right as f32 + 0.5, source.bottom as f32 + 0.5);
+    let (right, bottom) = (source.right as f32, source.bottom as f32);
+    let corner = 4.0 / ((right + 1.0).powi(2) + (bottom + 1.0).powi(2));
+    let flat = tone.vignetting == [0.0; 2];
     let (pixels, _) = row.as_chunks_mut::<4>();
     for ((pixel, &u), &v) in pixels.iter_mut().zip(us).zip(vs) {
-        let inside = u >= -0.5 && v >= -0.5 && u <= right && v <= bottom;
+        let inside = u >= -0.5 && v >= -0.5 && u <= right + 0.5 && v <= bottom + 0.5;
         // `max` first: it turns NaN into a number.
-        let (u, v) = (u.max(0.0).min(source.right as f32), v.max(0.0).min(source.bottom as f32));
+        let (u, v) = (u.max(0.0).min(right), v.max(0.0).min(bottom));
+        let mut gain = tone.gain;
+        if !flat {
+            let (x, y) = (u - 0.5 * right, v - 0.5 * bottom);
+            let r2 = corner * (x * x + y * y);
+            let lift = (r2 * (tone.vignetting[0] + r2 * tone.vignetting[1])).exp();
+            gain = gain.map(|g| g * lift);
+        }
         let [r, g, b] = sample(&source, u, v);
-        *pixel = [r, g, b, if inside { 255 } else { 0 }];
+        *pixel = [round(gain[0] * r), round(gain[1] * g), round(gain[2] * b), if inside { 255 } else { 0 }];
     }
 }
 
@@ -198,7 +220,7 @@ fn round(v: f32) -> u8 {
 }
 
 #[inline(always)]
-fn bilinear(s: &Source<'_>, u: f32, v: f32) -> [u8; 3] {
+fn bilinear(s: &Source<'_>, u: f32, v: f32) -> [f32; 3] {
     let (x, y) = (u as usize, v as usize);
     let (x1, y1) = ((x + 1).min(s.right), (y + 1).min(s.bottom));
     let (fx, fy) = (u - x as f32, v - y as f32);
@@ -207,7 +229,7 @@ fn bilinear(s: &Source<'_>, u: f32, v: f32) -> [u8; 3] {
         let (a, b) = (f32::from(top[3 * x + c]), f32::from(top[3 * x1 + c]));
         let (d, e) = (f32::from(bottom[3 * x + c]), f32::from(bottom[3 * x1 + c]));
         let (t, l) = (a + (b - a) * fx, d + (e - d) * fx);
-        round(t + (l - t) * fy)
+        t + (l - t) * fy
     })
 }
 
@@ -219,7 +241,7 @@ fn keys(t: f32) -> [f32; 4] {
 }
 
 #[inline(always)]
-fn bicubic(s: &Source<'_>, u: f32, v: f32) -> [u8; 3] {
+fn bicubic(s: &Source<'_>, u: f32, v: f32) -> [f32; 3] {
     let (x, y) = (u as usize, v as usize);
     let (wx, wy) = (keys(u - x as f32), keys(v - y as f32));
     if x >= 1 && y >= 1 && x + 2 <= s.right && y + 2 <= s.bottom {
@@ -232,7 +254,7 @@ fn bicubic(s: &Source<'_>, u: f32, v: f32) -> [u8; 3] {
             }
         }
         return std::array::from_fn(|c| {
-            round(wx[0] * sums[c] + wx[1] * sums[3 + c] + wx[2] * sums[6 + c] + wx[3] * sums[9 + c])
+            wx[0] * sums[c] + wx[1] * sums[3 + c] + wx[2] * sums[6 + c] + wx[3] * sums[9 + c]
         });
     }
     let (x, y) = (x as isize, y as isize);
@@ -245,7 +267,7 @@ fn bicubic(s: &Source<'_>, u: f32, v: f32) -> [u8; 3] {
             }
         }
     }
-    sum.map(round)
+    sum
 }
 
 #[cfg(test)]
@@ -284,7 +306,7 @@ mod tests {
                 let surface = Surface { projection, scale: 110.0 };
                 let p = placement(camera, Rotation3::from_euler_angles(0.1, -0.15, 0.05), &surface, bounds);
                 for interpolation in [Interpolation::Bilinear, Interpolation::Bicubic] {
-                    let warped = warp(photo.view(), &p, &surface, bounds, interpolation);
+                    let warped = warp(photo.view(), &p, &surface, bounds, interpolation, Tone::NEUTRAL);
                     let mut seen = 0;
                     for y in bounds.top..bounds.bottom {
                         for x in bounds.left..bounds.right {
@@ -327,7 +349,7 @@ mod tests {
         ] {
             let camera = Camera { distortion, ..Camera::from_focal(20, 10, 20.0) };
             let p = placement(camera, Rotation3::identity(), &surface, bounds);
-            let warped = warp(photo.view(), &p, &surface, bounds, Interpolation::Bicubic);
+            let warped = warp(photo.view(), &p, &surface, bounds, Interpolation::Bicubic, Tone::NEUTRAL);
             let mut reached = 0;
             for y in 0..90 {
                 for x in 0..126 {

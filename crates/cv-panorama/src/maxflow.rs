@@ -1,0 +1,406 @@
+//! Minimum cuts of four-connected pixel grids (Boykov & Kolmogorov 2004).
+
+/// Steps to the neighbours: right, left, down, up. Opposite directions differ in the last bit.
+const RIGHT: usize = 0;
+const DOWN: usize = 2;
+
+const FREE: u8 = 0;
+const SOURCE: u8 = 1;
+const SINK: u8 = 2;
+
+/// `parent` of a root: its terminal.
+const TERMINAL: u8 = 4;
+/// `parent` of a node that lost its way to a terminal.
+const ORPHAN: u8 = 5;
+
+/// A graph of `width × height` nodes with edges between four-neighbours and to two terminals.
+///
+/// Nodes that carry no capacity cost nothing, so that a region of any shape is cut in its bounding box.
+pub(crate) struct GridCut {
+    width: usize,
+    /// Of the padded grid: a border of one node without capacities spares every test for the edge.
+    stride: usize,
+    height: usize,
+    /// Residual capacity of each node's four outgoing arcs.
+    capacity: Vec<[i32; 4]>,
+    /// Residual capacity from the source (positive) or to the sink (negative).
+    terminal: Vec<i32>,
+    tree: Vec<u8>,
+    parent: Vec<u8>,
+    time: Vec<u32>,
+    distance: Vec<u32>,
+    active: std::collections::VecDeque<u32>,
+    is_active: Vec<bool>,
+    orphans: std::collections::VecDeque<u32>,
+    clock: u32,
+}
+
+impl GridCut {
+    pub(crate) fn new(width: usize, height: usize) -> Self {
+        let (stride, rows) = (width + 2, height + 2);
+        let n = stride * rows;
+        Self {
+            width,
+            stride,
+            height,
+            capacity: vec![[0; 4]; n],
+            terminal: vec![0; n],
+            tree: vec![FREE; n],
+            parent: vec![ORPHAN; n],
+            time: vec![0; n],
+            distance: vec![0; n],
+            active: std::collections::VecDeque::new(),
+            is_active: vec![false; n],
+            orphans: std::collections::VecDeque::new(),
+            clock: 0,
+        }
+    }
+
+    fn node(&self, x: usize, y: usize) -> usize {
+        debug_assert!(x < self.width && y < self.height);
+        (y + 1) * self.stride + x + 1
+    }
+
+    fn neighbour(&self, node: usize, direction: usize) -> usize {
+        match direction {
+            0 => node + 1,
+            1 => node - 1,
+            2 => node + self.stride,
+            _ => node - self.stride,
+        }
+    }
+
+    /// Adds costs of being cut from the source and from the sink (both at least 0): a node on the sink's side pays the first.
+    pub(crate) fn add_terminal(&mut self, x: usize, y: usize, source: i32, sink: i32) {
+        let node = self.node(x, y);
+        self.terminal[node] += source - sink;
+    }
+
+    /// Adds capacities between a pixel and its right neighbour: paid where this one is on the source's side and that one on the
+    /// sink's, and the other way round.
+    pub(crate) fn add_right(&mut self, x: usize, y: usize, forward: i32, backward: i32) {
+        self.add_edge(self.node(x, y), RIGHT, forward, backward);
+    }
+
+    /// As [`Self::add_right`], for the neighbour below.
+    pub(crate) fn add_down(&mut self, x: usize, y: usize, forward: i32, backward: i32) {
+        self.add_edge(self.node(x, y), DOWN, forward, backward);
+    }
+
+    fn add_edge(&mut self, node: usize, direction: usize, forward: i32, backward: i32) {
+        let other = self.neighbour(node, direction);
+        self.capacity[node][direction] += forward;
+        self.capacity[other][direction ^ 1] += backward;
+    }
+
+    /// After [`Self::solve`]: whether the pixel is on the sink's side of the cut. What could be on either is on the source's.
+    pub(crate) fn on_sink_side(&self, x: usize, y: usize) -> bool {
+        self.tree[self.node(x, y)] == SINK
+    }
+
+    /// Finds a minimum cut.
+    pub(crate) fn solve(&mut self) {
+        for node in 0..self.terminal.len() {
+            let t = self.terminal[node];
+            if t != 0 {
+                self.tree[node] = if t > 0 { SOURCE } else { SINK };
+                self.parent[node] = TERMINAL;
+                self.distance[node] = 1;
+                self.activate(node);
+            }
+        }
+        while let Some(node) = self.active.pop_front() {
+            let node = node as usize;
+            self.is_active[node] = false;
+            // A node stays at work until it meets the other tree no more.
+            while self.tree[node] != FREE {
+                let Some((s, direction)) = self.grow(node) else { break };
+                self.clock += 1;
+                self.augment(s, direction);
+                while let Some(orphan) = self.orphans.pop_front() {
+                    self.adopt(orphan as usize);
+                }
+            }
+        }
+    }
+
+    fn activate(&mut self, node: usize) {
+        if !std::mem::replace(&mut self.is_active[node], true) {
+            self.active.push_back(node as u32);
+        }
+    }
+
+    /// Whether flow can still pass along the tree edge between a node and its neighbour towards the leaves of that tree.
+    fn open(&self, tree: u8, node: usize, direction: usize, other: usize) -> bool {
+        if tree == SOURCE { self.capacity[node][direction] > 0 } else { self.capacity[other][direction ^ 1] > 0 }
+    }
+
+    /// Lets the node's tree take its free neighbours; returns an arc from the source's tree to the sink's where they touch.
+    fn grow(&mut self, node: usize) -> Option<(usize, usize)> {
+        let tree = self.tree[node];
+        for direction in 0..4 {
+            let other = self.neighbour(node, direction);
+            if !self.open(tree, node, direction, other) {
+                continue;
+            }
+            if self.tree[other] == FREE {
+                self.tree[other] = tree;
+                self.parent[other] = (direction ^ 1) as u8;
+                self.time[other] = self.time[node];
+                self.distance[other] = self.distance[node] + 1;
+                self.activate(other);
+            } else if self.tree[other] != tree {
+                return Some(if tree == SOURCE { (node, direction) } else { (other, direction ^ 1) });
+            } else if self.time[other] <= self.time[node] && self.distance[other] > self.distance[node] + 1 {
+                // A shorter way to the same terminal.
+                self.parent[other] = (direction ^ 1) as u8;
+                self.time[other] = self.time[node];
+                self.distance[other] = self.distance[node] + 1;
+            }
+        }
+        None
+    }
+
+    fn augment(&mut self, s: usize, direction: usize) {
+        let t = self.neighbour(s, direction);
+        let mut flow = self.capacity[s][direction];
+        let mut node = s;
+        while self.parent[node] != TERMINAL {
+            let d = self.parent[node] as usize;
+            let up = self.neighbour(node, d);
+            flow = flow.min(self.capacity[up][d ^ 1]);
+            node = up;
+        }
+        flow = flow.min(self.terminal[node]);
+        node = t;
+        while self.parent[node] != TERMINAL {
+            let d = self.parent[node] as usize;
+            flow = flow.min(self.capacity[node][d]);
+            node = self.neighbour(node, d);
+        }
+        flow = flow.min(-self.terminal[node]);
+
+        self.capacity[s][direction] -= flow;
+        self.capacity[t][direction ^ 1] += flow;
+        node = s;
+        while self.parent[node] != TERMINAL {
+            let d = self.parent[node] as usize;
+            let up = self.neighbour(node, d);
+            self.capacity[node][d] += flow;
+            self.capacity[up][d ^ 1] -= flow;
+            if self.capacity[up][d ^ 1] == 0 {
+                self.orphan(node);
+            }
+            node = up;
+        }
+        self.terminal[node] -= flow;
+        if self.terminal[node] == 0 {
+            self.orphan(node);
+        }
+        node = t;
+        while self.parent[node] != TERMINAL {
+            let d = self.parent[node] as usize;
+            let up = self.neighbour(node, d);
+            self.capacity[up][d ^ 1] += flow;
+            self.capacity[node][d] -= flow;
+            if self.capacity[node][d] == 0 {
+                self.orphan(node);
+            }
+            node = up;
+        }
+        self.terminal[node] += flow;
+        if self.terminal[node] == 0 {
+            self.orphan(node);
+        }
+    }
+
+    fn orphan(&mut self, node: usize) {
+        self.parent[node] = ORPHAN;
+        self.orphans.push_back(node as u32);
+    }
+
+    fn adopt(&mut self, node: usize) {
+        let tree = self.tree[node];
+        let mut best: Option<(u32, usize)> = None;
+        for direction in 0..4 {
+            let other = self.neighbour(node, direction);
+            // Flow runs from the other node to this one in the source's tree, the other way in the sink's.
+            let open = if tree == SOURCE {
+                self.capacity[other][direction ^ 1] > 0
+            } else {
+                self.capacity[node][direction] > 0
+            };
+            if !open || self.tree[other] != tree {
+                continue;
+            }
+            if let Some(distance) = self.distance_to_terminal(other)
+                && best.is_none_or(|(d, _)| distance < d)
+            {
+                best = Some((distance, direction));
+            }
+        }
+        if let Some((distance, direction)) = best {
+            self.parent[node] = direction as u8;
+            self.time[node] = self.clock;
+            self.distance[node] = distance + 1;
+            return;
+        }
+        self.tree[node] = FREE;
+        for direction in 0..4 {
+            let other = self.neighbour(node, direction);
+            if self.tree[other] != tree {
+                continue;
+            }
+            let open = if tree == SOURCE {
+                self.capacity[other][direction ^ 1] > 0
+            } else {
+                self.capacity[node][direction] > 0
+            };
+            if open {
+                self.activate(other);
+            }
+            if usize::from(self.parent[other]) == direction ^ 1 {
+                self.orphan(other);
+            }
+        }
+    }
+
+    /// Steps from a node to its tree's terminal, remembering them on the way; `None` where the way ends at an orphan.
+    fn distance_to_terminal(&mut self, start: usize) -> Option<u32> {
+        let (mut node, mut steps) = (start, 0);
+        let total = loop {
+            if self.time[node] == self.clock {
+                break steps + self.distance[node];
+            }
+            match self.parent[node] {
+                TERMINAL => {
+                    self.time[node] = self.clock;
+                    self.distance[node] = 1;
+                    break steps + 1;
+                }
+                ORPHAN => return None,
+                direction => {
+                    steps += 1;
+                    node = self.neighbour(node, usize::from(direction));
+                }
+            }
+        };
+        let (mut node, mut distance) = (start, total);
+        while self.time[node] != self.clock {
+            self.time[node] = self.clock;
+            self.distance[node] = distance;
+            distance -= 1;
+            node = self.neighbour(node, usize::from(self.parent[node]));
+        }
+        Some(total)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    /// Cost of a labelling (bit set: source side).
+    #[derive(Debug)]
+    struct Plain {
+        w: usize,
+        h: usize,
+        terminals: Vec<(i32, i32)>,
+        right: Vec<(i32, i32)>,
+        down: Vec<(i32, i32)>,
+    }
+
+    impl Plain {
+        fn cost(&self, source_side: impl Fn(usize, usize) -> bool) -> i32 {
+            let mut cost = 0;
+            let pay = |a: bool, b: bool, (forward, backward): (i32, i32)| match (a, b) {
+                (true, false) => forward,
+                (false, true) => backward,
+                _ => 0,
+            };
+            for y in 0..self.h {
+                for x in 0..self.w {
+                    let i = y * self.w + x;
+                    let own = source_side(x, y);
+                    cost += if own { self.terminals[i].1 } else { self.terminals[i].0 };
+                    if x + 1 < self.w {
+                        cost += pay(own, source_side(x + 1, y), self.right[i]);
+                    }
+                    if y + 1 < self.h {
+                        cost += pay(own, source_side(x, y + 1), self.down[i]);
+                    }
+                }
+            }
+            cost
+        }
+
+        fn cut(&self) -> GridCut {
+            let mut g = GridCut::new(self.w, self.h);
+            for y in 0..self.h {
+                for x in 0..self.w {
+                    let i = y * self.w + x;
+                    g.add_terminal(x, y, self.terminals[i].0, self.terminals[i].1);
+                    if x + 1 < self.w {
+                        g.add_right(x, y, self.right[i].0, self.right[i].1);
+                    }
+                    if y + 1 < self.h {
+                        g.add_down(x, y, self.down[i].0, self.down[i].1);
+                    }
+                }
+            }
+            g.solve();
+            g
+        }
+    }
+
+    fn problem() -> impl Strategy<Value = Plain> {
+        (1..5_usize, 1..4_usize).prop_flat_map(|(w, h)| {
+            let n = w * h;
+            let pairs = |limit: i32| proptest::collection::vec((0..limit, 0..limit), n);
+            (pairs(12), pairs(7), pairs(7)).prop_map(move |(terminals, right, down)| Plain {
+                w,
+                h,
+                terminals,
+                right,
+                down,
+            })
+        })
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(600))]
+        #[test]
+        fn no_labelling_costs_less_than_the_cut(p in problem()) {
+            let cut = p.cut();
+            let found = p.cost(|x, y| !cut.on_sink_side(x, y));
+            let least = (0..1_u32 << (p.w * p.h)).map(|bits| p.cost(|x, y| bits >> (y * p.w + x) & 1 == 1)).min().unwrap();
+            prop_assert_eq!(found, least);
+        }
+    }
+
+    #[test]
+    fn a_large_cut_runs_through_the_cheap_column() {
+        // Left column source, right column sink, every edge 10 but those over a winding line, 1 each.
+        let (w, h) = (60, 40);
+        let line = |y: usize| 20 + (y as f64 * 0.4).sin().mul_add(8.0, 0.0) as usize;
+        let mut g = GridCut::new(w, h);
+        for y in 0..h {
+            g.add_terminal(0, y, 1000, 0);
+            g.add_terminal(w - 1, y, 0, 1000);
+            for x in 0..w - 1 {
+                let c = if x == line(y) { 1 } else { 200 };
+                g.add_right(x, y, c, c);
+            }
+            for x in (0..w).filter(|_| y + 1 < h) {
+                g.add_down(x, y, 1, 1);
+            }
+        }
+        g.solve();
+        for y in 0..h {
+            for x in 0..w {
+                assert_eq!(g.on_sink_side(x, y), x > line(y), "{x} {y}");
+            }
+        }
+    }
+}

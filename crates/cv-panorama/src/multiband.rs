@@ -1,0 +1,308 @@
+//! Multi-band blending (Burt & Adelson 1983): low frequencies over a wide transition, high ones over a narrow one.
+//!
+//! Pixels are `[red, green, blue, weight]`, one vector register each. A piece's weight is one where the labels name it and zero
+//! elsewhere; its pyramid is blurred and halved along with the colours. Outside a photograph its edge pixels are repeated (see `warp`), so no
+//! band knows of a border and nothing dark bleeds in.
+
+use crate::layout::Bounds;
+use crate::seams::Labels;
+use crate::warp::Warped;
+use cv_core::{Image, RgbU8};
+use rayon::prelude::*;
+
+type Pixel = [f32; 4];
+
+/// A dense rectangle of pixels whose top-left corner lies at `(left, top)` of its level of the canvas.
+struct Level {
+    left: usize,
+    top: usize,
+    width: usize,
+    height: usize,
+    data: Vec<Pixel>,
+}
+
+impl Level {
+    fn new(left: usize, top: usize, width: usize, height: usize) -> Self {
+        Self { left, top, width, height, data: vec![[0.0; 4]; width * height] }
+    }
+
+    fn row(&self, y: usize) -> &[Pixel] {
+        &self.data[y * self.width..(y + 1) * self.width]
+    }
+}
+
+/// The canvas as a pyramid of weighted sums of bands.
+pub(crate) struct Blender {
+    levels: Vec<Level>,
+    width: usize,
+    height: usize,
+}
+
+impl Blender {
+    /// For a canvas of this size and `bands` bands above the residual.
+    pub(crate) fn new(width: usize, height: usize, bands: usize) -> Self {
+        let levels = (0..=bands).map(|l| Level::new(0, 0, width.div_ceil(1 << l), height.div_ceil(1 << l))).collect();
+        Self { levels, width, height }
+    }
+
+    /// Pixels around a label's own that its piece needs, so that its bands reach as far as they blend.
+    pub(crate) fn margin(bands: usize) -> usize {
+        2 << bands
+    }
+
+    /// The region to warp for a label whose pixels lie within `b`: grown by the margin, aligned with every level of the pyramid.
+    pub(crate) fn region(b: &Bounds, bands: usize, width: usize, height: usize) -> Bounds {
+        let unit = 1 << bands;
+        let grown = b.grown(Self::margin(bands), width, height);
+        Bounds {
+            left: grown.left / unit * unit,
+            top: grown.top / unit * unit,
+            right: grown.right.next_multiple_of(unit).min(width),
+            bottom: grown.bottom.next_multiple_of(unit).min(height),
+        }
+    }
+
+    /// Adds a piece where `labels` say `label`.
+    pub(crate) fn add(&mut self, piece: &Warped, labels: &Labels, label: u16) {
+        let b = piece.bounds;
+        let (w, h) = (b.width(), b.height());
+        let mut level = Level::new(b.left, b.top, w, h);
+        level.data.par_chunks_mut(w.max(1)).enumerate().for_each(|(y, row)| {
+            let (pixels, _) = piece.pixels.row(y).as_chunks::<4>();
+            let start = (b.top + y) * labels.width + b.left;
+            for ((out, p), l) in row.iter_mut().zip(pixels).zip(&labels.data[start..start + w]) {
+                *out = [p[0].into(), p[1].into(), p[2].into(), if *l == label { 1.0 } else { 0.0 }];
+            }
+        });
+        let last = self.levels.len() - 1;
+        for l in 0..last {
+            let smaller = halve(&level);
+            add_band(&mut self.levels[l], &level, Some(&smaller));
+            level = smaller;
+        }
+        add_band(&mut self.levels[last], &level, None);
+    }
+
+    /// The blended canvas; black where no label names a piece.
+    pub(crate) fn finish(mut self, labels: &Labels) -> RgbU8 {
+        for level in &mut self.levels {
+            level.data.par_iter_mut().for_each(|p| {
+                // A thousandth of a pixel's weight lies beyond every photograph's blending range.
+                let scale = if p[3] > 1e-3 { 1.0 / p[3] } else { 0.0 };
+                *p = [p[0] * scale, p[1] * scale, p[2] * scale, 0.0];
+            });
+        }
+        while self.levels.len() > 1 {
+            let (Some(smaller), Some(larger)) = (self.levels.pop(), self.levels.last_mut()) else { break };
+            larger.data.par_chunks_mut(larger.width.max(1)).enumerate().for_each_init(Vec::new, |buffer, (y, row)| {
+                enlarged_row(&smaller, 0, 0, y, row.len(), buffer, |x, up| {
+                    for c in 0..3 {
+                        row[x][c] += up[c];
+                    }
+                });
+            });
+        }
+        let mut image: RgbU8 = Image::new(self.width, self.height, [0; 3]);
+        let Some(base) = self.levels.first() else { return image };
+        image.as_mut_slice().par_chunks_mut(3 * self.width.max(1)).enumerate().for_each(|(y, row)| {
+            let labels = &labels.data[y * labels.width..];
+            for ((out, p), l) in row.as_chunks_mut::<3>().0.iter_mut().zip(base.row(y)).zip(labels) {
+                if *l != crate::seams::NONE {
+                    *out = [(p[0] + 0.5) as u8, (p[1] + 0.5) as u8, (p[2] + 0.5) as u8];
+                }
+            }
+        });
+        image
+    }
+}
+
+/// Burt's kernel 1 4 6 4 1.
+fn kernel(a: Pixel, b: Pixel, c: Pixel, d: Pixel, e: Pixel) -> Pixel {
+    std::array::from_fn(|i| (a[i] + e[i]) * 0.0625 + (b[i] + d[i]) * 0.25 + c[i] * 0.375)
+}
+
+/// The next level: blurred, every second pixel of every second row. Edges are repeated.
+fn halve(level: &Level) -> Level {
+    let (w, h) = (level.width, level.height);
+    let mut half = Level::new(level.left / 2, level.top / 2, w.div_ceil(2), h.div_ceil(2));
+    let width = half.width;
+    half.data.par_chunks_mut(width.max(1)).enumerate().for_each_init(
+        || vec![[0.0; 4]; w],
+        |column, (y, row)| {
+            let at = |dy: isize| level.row((2 * y as isize + dy).clamp(0, h as isize - 1) as usize);
+            let (a, b, c, d, e) = (at(-2), at(-1), at(0), at(1), at(2));
+            for x in 0..w {
+                column[x] = kernel(a[x], b[x], c[x], d[x], e[x]);
+            }
+            let at = |x: isize| column[x.clamp(0, w as isize - 1) as usize];
+            for (x, out) in row.iter_mut().enumerate() {
+                let x = 2 * x;
+                *out = if x >= 2 && x + 2 < w {
+                    kernel(column[x - 2], column[x - 1], column[x], column[x + 1], column[x + 2])
+                } else {
+                    let x = x as isize;
+                    kernel(at(x - 2), at(x - 1), at(x), at(x + 1), at(x + 2))
+                };
+            }
+        },
+    );
+    half
+}
+
+/// Hands every pixel of one row of the level twice as large to `put`: `x` from 0 to `width`, for the rectangle whose corner lies at `(left, top)` of that
+/// level.
+fn enlarged_row(
+    small: &Level,
+    left: usize,
+    top: usize,
+    y: usize,
+    width: usize,
+    buffer: &mut Vec<Pixel>,
+    mut put: impl FnMut(usize, Pixel),
+) {
+    let (w, h) = (small.width, small.height);
+    let y = top + y - 2 * small.top;
+    let at = |y: isize| small.row(y.clamp(0, h as isize - 1) as usize);
+    let middle = (y / 2) as isize;
+    buffer.clear();
+    if y % 2 == 0 {
+        let (a, b, c) = (at(middle - 1), at(middle), at(middle + 1));
+        buffer
+            .extend((0..w).map(|x| -> Pixel { std::array::from_fn(|i| (a[x][i] + c[x][i]) * 0.125 + b[x][i] * 0.75) }));
+    } else {
+        let (a, b) = (at(middle), at(middle + 1));
+        buffer.extend((0..w).map(|x| -> Pixel { std::array::from_fn(|i| (a[x][i] + b[x][i]) * 0.5) }));
+    }
+    // A copy at each end stands for the repeated edge.
+    let column = |x: isize| buffer[x.clamp(0, w as isize - 1) as usize];
+    let offset = left - 2 * small.left;
+    for x in 0..width {
+        let at = x + offset;
+        let middle = (at / 2) as isize;
+        let up = if at % 2 == 0 {
+            let (a, b, c) = (column(middle - 1), column(middle), column(middle + 1));
+            std::array::from_fn(|i| (a[i] + c[i]) * 0.125 + b[i] * 0.75)
+        } else {
+            let (a, b) = (column(middle), column(middle + 1));
+            std::array::from_fn(|i| (a[i] + b[i]) * 0.5)
+        };
+        put(x, up);
+    }
+}
+
+/// Adds `weight · (level − enlarged(smaller))` and the weight.
+fn add_band(sum: &mut Level, level: &Level, smaller: Option<&Level>) {
+    let (left, width) = (level.left, level.width);
+    let row_width = sum.width;
+    let rows = sum.data.par_chunks_mut(row_width.max(1)).skip(level.top).take(level.height).enumerate();
+    rows.for_each_init(Vec::new, |buffer, (y, row)| {
+        let source = level.row(y);
+        let row = &mut row[left..left + width];
+        match smaller {
+            None => {
+                for (out, p) in row.iter_mut().zip(source) {
+                    for c in 0..3 {
+                        out[c] += p[3] * p[c];
+                    }
+                    out[3] += p[3];
+                }
+            }
+            Some(smaller) => enlarged_row(smaller, left, level.top, y, width, buffer, |x, up| {
+                let p = source[x];
+                let (w, out) = (p[3], &mut row[x]);
+                *out =
+                    [out[0] + w * (p[0] - up[0]), out[1] + w * (p[1] - up[1]), out[2] + w * (p[2] - up[2]), out[3] + w];
+            }),
+        }
+    });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::seams::NONE;
+
+    fn piece(bounds: Bounds, f: impl Fn(usize, usize) -> [u8; 3]) -> Warped {
+        let pixels = Image::from_fn(bounds.width(), bounds.height(), |x, y| {
+            let [r, g, b] = f(bounds.left + x, bounds.top + y);
+            [r, g, b, 255]
+        });
+        Warped { bounds, pixels }
+    }
+
+    fn scene(x: usize, y: usize) -> [u8; 3] {
+        [((x * 7 + y * 3) % 251) as u8, ((x * y) % 241) as u8, if (x / 5 + y / 7) % 2 == 0 { 30 } else { 220 }]
+    }
+
+    #[test]
+    fn pieces_of_one_picture_give_that_picture_back_at_any_size_and_depth() {
+        for (w, h) in [(97, 61), (64, 64), (33, 18), (5, 3), (1, 1)] {
+            for bands in 0..5 {
+                let labels =
+                    Labels { width: w, height: h, data: (0..w * h).map(|i| u16::from(i % w > w / 2)).collect() };
+                let mut blender = Blender::new(w, h, bands);
+                let whole = Bounds { left: 0, top: 0, right: w, bottom: h };
+                for label in 0..2 {
+                    blender.add(&piece(whole, scene), &labels, label);
+                }
+                let result = blender.finish(&labels);
+                for y in 0..h {
+                    for x in 0..w {
+                        // Bands are taken off and put back in f32: exact but for rounding, far from half a level.
+                        assert_eq!(result.at(x, y), scene(x, y), "{w}x{h} {bands}: {x} {y}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_piece_that_ends_at_its_margin_still_gives_the_picture_back() {
+        let (w, h, bands) = (300, 40, 3);
+        let labels = Labels { width: w, height: h, data: (0..w * h).map(|i| u16::from(i % w >= 150)).collect() };
+        let mut blender = Blender::new(w, h, bands);
+        for (label, b) in labels.bounds(2).into_iter().enumerate() {
+            let region = Blender::region(&b.unwrap(), bands, w, h);
+            assert!(region.width() < 200);
+            blender.add(&piece(region, scene), &labels, label as u16);
+        }
+        let result = blender.finish(&labels);
+        for y in 0..h {
+            for x in 0..w {
+                for (got, want) in result.at(x, y).into_iter().zip(scene(x, y)) {
+                    // Beyond the margin a piece repeats its edge; the weights there are the tail of the kernel.
+                    assert!(got.abs_diff(want) <= 1, "{x} {y}: {got} {want}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_step_in_brightness_becomes_a_slope_and_stays_between_its_sides() {
+        let (w, h, bands) = (256, 32, 4);
+        let labels = Labels { width: w, height: h, data: (0..w * h).map(|i| u16::from(i % w >= 128)).collect() };
+        let mut blender = Blender::new(w, h, bands);
+        let whole = Bounds { left: 0, top: 0, right: w, bottom: h };
+        blender.add(&piece(whole, |_, _| [100; 3]), &labels, 0);
+        blender.add(&piece(whole, |_, _| [140; 3]), &labels, 1);
+        let result = blender.finish(&labels);
+        let row: Vec<u8> = (0..w).map(|x| result.at(x, 16)[0]).collect();
+        assert_eq!((row[0], row[255]), (100, 140));
+        assert!(row.windows(2).all(|p| p[1] >= p[0] && p[1] - p[0] <= 3), "{row:?}");
+        assert!((118..=122).contains(&row[128]));
+    }
+
+    #[test]
+    fn what_nobody_covers_is_black_and_darkens_nothing() {
+        let (w, h, bands) = (120, 60, 4);
+        let inside = |i: usize| (i % w > 20) && (i % w < 100) && (i / w > 9) && (i / w < 50);
+        let labels =
+            Labels { width: w, height: h, data: (0..w * h).map(|i| if inside(i) { 0 } else { NONE }).collect() };
+        let mut blender = Blender::new(w, h, bands);
+        blender.add(&piece(Bounds { left: 0, top: 0, right: w, bottom: h }, |_, _| [90, 180, 45]), &labels, 0);
+        let result = blender.finish(&labels);
+        for i in 0..w * h {
+            assert_eq!(result.at(i % w, i / w), if inside(i) { [90, 180, 45] } else { [0; 3] });
+        }
+    }
+}

@@ -1,0 +1,173 @@
+//! The canvas at a fraction of its size, where exposure and seams are decided.
+
+use crate::layout::{Bounds, Layout, Placement};
+use crate::projection::Surface;
+use crate::warp::{Interpolation, Map, Tone, Warped, warp};
+use cv_core::{ImageView, Point2, RgbU8};
+use rayon::prelude::*;
+
+/// Every placement drawn at one `1 / step` of the canvas.
+pub(crate) struct Preview {
+    /// Canvas pixels per preview pixel.
+    pub(crate) step: usize,
+    pub(crate) width: usize,
+    pub(crate) height: usize,
+    /// In the order of the layout's placements.
+    pub(crate) pieces: Vec<Piece>,
+}
+
+/// A placement on the preview.
+pub(crate) struct Piece {
+    pub(crate) warped: Warped,
+    /// Square of each pixel's distance from the photograph's middle, measured so that it is 1 all along the border.
+    pub(crate) eccentricity: Vec<f32>,
+    /// Square of each pixel's distance from the photograph's middle, 1 at the corners.
+    pub(crate) radius: Vec<f32>,
+}
+
+impl Piece {
+    /// Colour at a preview pixel; `None` where the photograph does not reach.
+    #[inline]
+    pub(crate) fn at(&self, x: usize, y: usize) -> Option<[u8; 3]> {
+        let b = self.warped.bounds;
+        if x < b.left || y < b.top || x >= b.right || y >= b.bottom {
+            return None;
+        }
+        let [r, g, b, a] = self.warped.pixels.at(x - b.left, y - b.top);
+        (a > 0).then_some([r, g, b])
+    }
+}
+
+impl Preview {
+    /// Draws the preview with at most about `max_pixels` pixels.
+    pub(crate) fn draw(photos: &[ImageView<'_, u8, 3>], layout: &Layout, resolution: f64, max_pixels: usize) -> Self {
+        let ratio = (layout.width as f64 * layout.height as f64 / max_pixels.max(1) as f64).sqrt();
+        let step = (ratio.ceil() as usize).max(1);
+        let s = 1.0 / step as f64;
+        let surface = Surface { scale: layout.surface.scale * s, ..layout.surface };
+        let (width, height) = (layout.width.div_ceil(step), layout.height.div_ceil(step));
+        // A photograph drawn smaller is averaged first, or fine texture would alias.
+        let shrink = ((step as f64 / resolution.max(1e-9)).round() as usize).max(1);
+        let small: Vec<Option<RgbU8>> = photos
+            .par_iter()
+            .enumerate()
+            .map(|(i, p)| layout.placements.iter().any(|q| q.photo == i).then(|| shrunk(*p, shrink)))
+            .collect();
+        let pieces = layout
+            .placements
+            .par_iter()
+            .filter_map(|p| {
+                let photo = small.get(p.photo)?.as_ref()?;
+                // Pixel centres at integers: the middle of a step × step block of canvas pixels.
+                let origin = p.origin.coords * s - nalgebra::Vector2::repeat(0.5 * s - 0.5);
+                let bounds = Bounds {
+                    left: p.bounds.left / step,
+                    top: p.bounds.top / step,
+                    right: p.bounds.right.div_ceil(step).min(width),
+                    bottom: p.bounds.bottom.div_ceil(step).min(height),
+                };
+                let view = shrunk_view(p, shrink, photo);
+                let small = Placement { view, bounds, origin: Point2::from(origin), ..*p };
+                let warped = warp(photo.view(), &small, &surface, bounds, Interpolation::Bilinear, Tone::NEUTRAL);
+                let (eccentricity, radius) = distances(&small, &surface);
+                Some(Piece { warped, eccentricity, radius })
+            })
+            .collect();
+        Self { step, width, height, pieces }
+    }
+}
+
+/// A placement's view of the photograph that [`shrunk`] made.
+pub(crate) fn shrunk_view(p: &Placement, shrink: usize, small: &RgbU8) -> crate::view::View {
+    let mut view = p.view.scaled(1.0 / shrink as f64);
+    // The blocks at the right and bottom that were not whole are gone.
+    (view.camera.width, view.camera.height) = small.size();
+    view
+}
+
+/// Means of `step × step` blocks; incomplete blocks at the right and bottom are dropped unless nothing would be left.
+pub(crate) fn shrunk(photo: ImageView<'_, u8, 3>, step: usize) -> RgbU8 {
+    if step == 1 {
+        return photo.to_image();
+    }
+    let (width, height) = ((photo.width() / step).max(1), (photo.height() / step).max(1));
+    let (bw, bh) = (step.min(photo.width()), step.min(photo.height()));
+    let mut small = RgbU8::new(width, height, [0; 3]);
+    let area = (bw * bh) as u32;
+    let mut sums = vec![0_u32; 3 * width];
+    for y in 0..height {
+        sums.fill(0);
+        for row in y * bh..(y + 1) * bh {
+            let row = photo.row(row);
+            for (sum, block) in sums.as_chunks_mut::<3>().0.iter_mut().zip(row.chunks_exact(3 * bw)) {
+                for p in block.as_chunks::<3>().0 {
+                    for c in 0..3 {
+                        sum[c] += u32::from(p[c]);
+                    }
+                }
+            }
+        }
+        for (out, sum) in small.row_mut(y).iter_mut().zip(&sums) {
+            *out = ((sum + area / 2) / area) as u8;
+        }
+    }
+    small
+}
+
+/// Both distances of every pixel from the middle of its photograph.
+fn distances(p: &Placement, surface: &Surface) -> (Vec<f32>, Vec<f32>) {
+    let map = Map::new(p, surface, p.bounds);
+    let (w, h) = (p.bounds.width(), p.bounds.height());
+    let (cx, cy) = (0.5 * (p.view.camera.width as f32 - 1.0), 0.5 * (p.view.camera.height as f32 - 1.0));
+    let corner = (cx + 0.5).powi(2) + (cy + 0.5).powi(2);
+    let (mut eccentricity, mut radius) = (Vec::with_capacity(w * h), Vec::with_capacity(w * h));
+    let (mut us, mut vs) = (vec![0.0; w], vec![0.0; w]);
+    for y in 0..h {
+        map.row(y, &mut us, &mut vs);
+        for (u, v) in us.iter().zip(&vs) {
+            let (x, y) = (u - cx, v - cy);
+            eccentricity.push((x.abs() / (cx + 0.5)).max(y.abs() / (cy + 0.5)).powi(2).min(4.0));
+            radius.push(((x * x + y * y) / corner).min(4.0));
+        }
+    }
+    (eccentricity, radius)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::projection::Projection;
+    use crate::view::View;
+    use cv_core::{Camera, Matrix3};
+
+    #[test]
+    fn the_preview_is_the_canvas_averaged() {
+        // A plane and a camera that looks straight at it: the canvas is the photograph.
+        let photo = RgbU8::from_fn(64, 48, |x, y| [(x * 3) as u8, (y * 5) as u8, 100]);
+        let surface = Surface { projection: Projection::Plane, scale: 80.0 };
+        let bounds = Bounds { left: 0, top: 0, right: 64, bottom: 48 };
+        let view = View { camera: Camera::from_focal(64, 48, 80.0), from_world: Matrix3::identity() };
+        let placement = Placement { photo: 0, view, bounds, origin: Point2::new(-31.5, -23.5) };
+        let layout = Layout { surface, width: 64, height: 48, full_circle: false, placements: vec![placement] };
+        let preview = Preview::draw(&[photo.view()], &layout, 1.0, 64 * 48 / 16);
+        assert_eq!((preview.step, preview.width, preview.height), (4, 16, 12));
+        for y in 0..12 {
+            for x in 0..16 {
+                let [r, g, b] = preview.pieces[0].at(x, y).unwrap();
+                // The mean of a ramp over a block is its value at the block's middle, rounded.
+                assert!((f64::from(r) - 3.0 * (4.0 * x as f64 + 1.5)).abs() <= 1.0, "{x} {y} {r}");
+                assert!((f64::from(g) - 5.0 * (4.0 * y as f64 + 1.5)).abs() <= 1.0);
+                assert_eq!(b, 100);
+            }
+        }
+        let e = &preview.pieces[0].eccentricity;
+        assert!(e[0] > 0.8 && e[6 * 16 + 8] < 0.02);
+    }
+
+    #[test]
+    fn shrinking_keeps_means_and_something_of_every_photograph() {
+        let photo = RgbU8::from_fn(5, 3, |x, _| [(10 * x) as u8, 0, 255]);
+        assert_eq!(shrunk(photo.view(), 2).as_slice(), [5, 0, 255, 25, 0, 255]);
+        assert_eq!(shrunk(photo.view(), 100).as_slice(), [20, 0, 255]);
+    }
+}
