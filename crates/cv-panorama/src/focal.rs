@@ -12,11 +12,8 @@ pub(crate) fn focals_from_homography(h: &Matrix3<f64>) -> (Option<f64>, Option<f
     let solve = |a: [f64; 2], b: [f64; 2]| -> Option<f64> {
         let (dot, aa, bb) = (a[0] * b[0] + a[1] * b[1], a[0] * a[0] + a[1] * a[1], b[0] * b[0] + b[1] * b[1]);
         // The two equations differ by up to 60°: of parallax and noise more than of rotation.
-        if !(-dot > 0.5 * (aa * bb).sqrt()) || bb == 0.0 {
-            return None;
-        }
-        let f = (-dot / bb).sqrt();
-        f.is_finite().then_some(f)
+        let believed = -dot > 0.5 * (aa * bb).sqrt() && bb > 0.0;
+        Some((-dot / bb).sqrt()).filter(|f| believed && f.is_finite())
     };
     let columns = |m: &Matrix3<f64>| {
         let a = [

@@ -128,17 +128,14 @@ pub(crate) fn layout(
         Projection::Auto if flat => attempt(Projection::Plane),
         Projection::Auto => {
             let (across, up) = extent(&views, scale);
+            let mut surfaces = Vec::new();
             if across <= 2.0 * PLANE_HALF_ANGLE && up <= PLANE_HALF_ANGLE {
-                if let Ok(plane) = attempt(Projection::Plane) {
-                    return Ok(plane);
-                }
+                surfaces.push(Projection::Plane);
             }
             if up <= CYLINDER_HALF_ANGLE {
-                if let Ok(cylinder) = attempt(Projection::Cylindrical) {
-                    return Ok(cylinder);
-                }
+                surfaces.push(Projection::Cylindrical);
             }
-            attempt(Projection::Spherical)
+            surfaces.into_iter().find_map(|s| attempt(s).ok()).map_or_else(|| attempt(Projection::Spherical), Ok)
         }
         chosen => attempt(chosen),
     }
@@ -278,7 +275,7 @@ fn on_surface(views: &[(usize, View)], surface: Surface, flat: bool, max_pixels:
         size.0 = period.round();
     }
     let (width, height) = (size.0.max(1.0), size.1.max(1.0));
-    if !(width * height <= max_pixels as f64) {
+    if width * height > max_pixels as f64 || !(width * height).is_finite() {
         return Err(LayoutError::TooLarge { width, height, max_pixels, projection: surface.projection });
     }
     let (canvas_w, canvas_h) = (width as usize, height as usize);

@@ -1,5 +1,36 @@
 //! Projections, alignment, exposure, seams and blending of overlapping photographs.
-#![allow(dead_code)]
+//!
+//! Takes matches, never detectors: `cv-pipeline` joins the two. From matches of pairs to the picture in three steps,
+//! [`verify_pair`], [`align`], [`render`]:
+//!
+//! ```
+//! use cv_core::{Correspondence, RgbU8};
+//! use cv_panorama::{AlignOptions, CameraMotion, Photo, RenderOptions, VerifyOptions, align, render, verify_pair};
+//!
+//! // Two windows, 60 pixels apart, of one picture; matches on a grid.
+//! let scene = |x: usize, y: usize| [(x * 2 % 256) as u8, (y * 3 % 256) as u8, ((x * y) % 256) as u8];
+//! let left = RgbU8::from_fn(160, 120, scene);
+//! let right = RgbU8::from_fn(160, 120, |x, y| scene(x + 60, y));
+//! let matches: Vec<_> = (0..60)
+//!     .map(|i| (65.0 + f64::from(i % 10) * 9.0, 5.0 + f64::from(i / 10) * 20.0))
+//!     .map(|(x, y)| Correspondence::new(x, y, x - 60.0, y))
+//!     .collect();
+//!
+//! let pair = verify_pair((0, left.size()), (1, right.size()), &matches, &VerifyOptions::default())?;
+//! let photos = [Photo::new(160, 120), Photo::new(160, 120)];
+//! let options = AlignOptions { motion: CameraMotion::Homography, ..AlignOptions::default() };
+//! let alignment = align(&photos, &[pair], &options)?;
+//! let panorama = render(&[left.view(), right.view()], &alignment, &RenderOptions::default())?;
+//! assert!(panorama.image.width().abs_diff(220) <= 1 && alignment.rms_px < 0.01);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+//!
+//! # Conventions
+//!
+//! * A [`View`] maps world rays to a photograph's pixels: `pixel ~ camera(from_world · ray)`. World frame: X right, Y down, Z to the
+//!   middle of the panorama.
+//! * The order of photographs and pairs does not matter but for rounding.
+//! * The same input and options give the same bytes at any number of threads.
 
 mod align;
 mod bundle;
@@ -22,6 +53,7 @@ mod view;
 mod warp;
 
 pub use align::{AlignError, AlignOptions, AlignedPair, Alignment, CameraMotion, Photo, Unplaced, align};
+pub use cv_imgproc::Interpolation;
 pub use exposure::{Exposure, Gains};
 pub use layout::LayoutError;
 pub use projection::Projection;
@@ -29,4 +61,3 @@ pub use render::{Blend, Panorama, RenderError, RenderOptions, render};
 pub use seams::Seams;
 pub use verify::{NotAPair, VerifiedPair, VerifyOptions, verify_pair};
 pub use view::View;
-pub use warp::Interpolation;

@@ -165,7 +165,7 @@ fn enlarged_row(
     let at = |y: isize| small.row(y.clamp(0, h as isize - 1) as usize);
     let middle = (y / 2) as isize;
     buffer.clear();
-    if y % 2 == 0 {
+    if y.is_multiple_of(2) {
         let (a, b, c) = (at(middle - 1), at(middle), at(middle + 1));
         buffer
             .extend((0..w).map(|x| -> Pixel { std::array::from_fn(|i| (a[x][i] + c[x][i]) * 0.125 + b[x][i] * 0.75) }));
@@ -179,7 +179,7 @@ fn enlarged_row(
     for x in 0..width {
         let at = x + offset;
         let middle = (at / 2) as isize;
-        let up = if at % 2 == 0 {
+        let up = if at.is_multiple_of(2) {
             let (a, b, c) = (column(middle - 1), column(middle), column(middle + 1));
             std::array::from_fn(|i| (a[i] + c[i]) * 0.125 + b[i] * 0.75)
         } else {
@@ -231,7 +231,7 @@ mod tests {
     }
 
     fn scene(x: usize, y: usize) -> [u8; 3] {
-        [((x * 7 + y * 3) % 251) as u8, ((x * y) % 241) as u8, if (x / 5 + y / 7) % 2 == 0 { 30 } else { 220 }]
+        [((x * 7 + y * 3) % 251) as u8, ((x * y) % 241) as u8, if (x / 5 + y / 7).is_multiple_of(2) { 30 } else { 220 }]
     }
 
     #[test]

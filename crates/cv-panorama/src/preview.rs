@@ -2,8 +2,9 @@
 
 use crate::layout::{Bounds, Layout, Placement};
 use crate::projection::Surface;
-use crate::warp::{Interpolation, Map, Tone, Warped, warp};
+use crate::warp::{Map, Tone, Warped, warp};
 use cv_core::{ImageView, Point2, RgbU8};
+use cv_imgproc::Interpolation;
 use rayon::prelude::*;
 
 /// Every placement drawn at one `1 / step` of the canvas.

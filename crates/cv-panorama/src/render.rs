@@ -10,8 +10,9 @@ use crate::poisson;
 use crate::preview::Preview;
 use crate::projection::Projection;
 use crate::seams::{self, Labels, NONE, Seams, Toned};
-use crate::warp::{Interpolation, Tone, Warped, warp};
+use crate::warp::{Tone, Warped, warp};
 use cv_core::{Image, ImageView, Mask, RgbU8};
+use cv_imgproc::Interpolation;
 use rayon::prelude::*;
 use std::time::Instant;
 
@@ -42,7 +43,7 @@ pub struct RenderOptions {
     pub seams: Seams,
     /// Blending. Default [`Blend::Multiband`].
     pub blend: Blend,
-    /// Interpolation. Default [`Interpolation::Bicubic`].
+    /// How values between pixels are found. Default bicubic: sharper than what other stitchers do, at a few milliseconds a megapixel.
     pub interpolation: Interpolation,
     /// Cut the result to the largest upright rectangle without empty pixels. Default false.
     pub crop: bool,
@@ -58,7 +59,7 @@ impl Default for RenderOptions {
             exposure: Exposure::default(),
             seams: Seams::default(),
             blend: Blend::default(),
-            interpolation: Interpolation::default(),
+            interpolation: Interpolation::Bicubic,
             crop: false,
             max_pixels: 400_000_000,
         }

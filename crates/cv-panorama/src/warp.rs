@@ -7,17 +7,8 @@ use crate::layout::{Bounds, Placement};
 use crate::projection::Surface;
 use crate::view::View;
 use cv_core::{Distortion, Image, ImageView, Matrix3, Point2};
+use cv_imgproc::Interpolation;
 use rayon::prelude::*;
-
-/// How pixels between pixels are found.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Interpolation {
-    /// The four neighbours.
-    Bilinear,
-    /// The sixteen neighbours, Keys' cubic convolution (1981) with a = −0.5: sharper.
-    #[default]
-    Bicubic,
-}
 
 /// A piece of the canvas seen through one photograph: red, green, blue, and 255 where the photograph reaches (0 where its edge
 /// pixels were repeated instead).
@@ -57,6 +48,7 @@ pub(crate) fn warp(
         |(us, vs), (y, row)| {
             map.row(y, us, vs);
             match interpolation {
+                Interpolation::Nearest => sample_row(photo, us, vs, row, tone, nearest),
                 Interpolation::Bilinear => sample_row(photo, us, vs, row, tone, bilinear),
                 Interpolation::Bicubic => sample_row(photo, us, vs, row, tone, bicubic),
             }
@@ -217,6 +209,11 @@ impl<'a> Source<'a> {
 fn round(v: f32) -> u8 {
     // Saturates, as float-to-integer casts do.
     (v + 0.5) as u8
+}
+
+#[inline(always)]
+fn nearest(s: &Source<'_>, u: f32, v: f32) -> [f32; 3] {
+    s.photo.at((u + 0.5) as usize, (v + 0.5) as usize).map(f32::from)
 }
 
 #[inline(always)]

@@ -27,6 +27,7 @@
 
 mod depth;
 mod matching;
+mod panorama;
 mod progress;
 mod stopwatch;
 
@@ -35,6 +36,13 @@ pub use matching::{
     FeatureMethod, MatchingError, MatchingOptions, MatchingResult, PhotoFeatures, correspondences, extract_features,
     match_features, match_photos,
 };
+pub use panorama::{
+    PanoramaError, PanoramaImage, PanoramaOptions, PanoramaPair, PanoramaPhoto, PanoramaResult, panorama,
+};
+/// The options of the panorama's stages.
+pub mod panorama_types {
+    pub use cv_panorama::*;
+}
 pub use progress::{Progress, Silent};
 pub use stopwatch::Stopwatch;
 

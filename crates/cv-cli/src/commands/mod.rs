@@ -71,4 +71,5 @@ commands! {
     Eval(eval),
     Completions(completions),
     Man(man),
+    Panorama(panorama),
 }

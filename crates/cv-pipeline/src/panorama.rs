@@ -1,0 +1,333 @@
+//! Panoramas from overlapping photographs.
+
+use crate::matching::{MatchingOptions, PhotoFeatures, correspondences, extract_features, match_features};
+use crate::{Progress, Stopwatch};
+use cv_core::{Camera, Correspondence, Image, ImageView, Mask, Point2, RgbU8};
+use cv_features::{Described, DescriptorKind, Descriptors};
+use cv_panorama::{
+    AlignError, AlignOptions, Alignment, CameraMotion, NotAPair, Photo, Projection, RenderError, RenderOptions,
+    Unplaced, VerifiedPair, VerifyOptions, align, render, verify_pair,
+};
+use rayon::prelude::*;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// A photograph and what is known about its camera.
+#[derive(Debug, Clone, Copy)]
+pub struct PanoramaPhoto<'a> {
+    /// The pixels, upright.
+    pub image: ImageView<'a, u8, 3>,
+    /// Focal length in pixels from EXIF, where there is one.
+    pub focal: Option<f64>,
+    /// The calibrated camera, where there is one; its lens distortion is taken out.
+    pub camera: Option<Camera>,
+}
+
+impl<'a> PanoramaPhoto<'a> {
+    /// A photograph of which nothing else is known.
+    pub fn new(image: ImageView<'a, u8, 3>) -> Self {
+        Self { image, focal: None, camera: None }
+    }
+}
+
+/// Settings of [`panorama`].
+#[derive(Debug, Clone)]
+pub struct PanoramaOptions {
+    /// Features and matching.
+    pub matching: MatchingOptions,
+    /// Pixels that photographs are reduced to (about) for features and alignment. 10,000 or more; default 800,000, in the range that OpenCV's stitcher
+    /// and Hugin's control point finders use.
+    pub registration_pixels: usize,
+    /// Which pairs overlap. The threshold is in pixels of the reduced photographs.
+    pub verify: VerifyOptions,
+    /// Alignment. `outlier_px` is in pixels of the reduced photographs.
+    pub align: AlignOptions,
+    /// Drawing.
+    pub render: RenderOptions,
+}
+
+impl Default for PanoramaOptions {
+    fn default() -> Self {
+        Self {
+            matching: MatchingOptions { max_features: Some(2000), ..MatchingOptions::default() },
+            registration_pixels: 800_000,
+            verify: VerifyOptions::default(),
+            align: AlignOptions::default(),
+            render: RenderOptions::default(),
+        }
+    }
+}
+
+/// What became of a photograph.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PanoramaImage {
+    /// Whether it is in the panorama.
+    pub used: bool,
+    /// Why not, where it is not.
+    pub reason: Option<String>,
+    /// Features found on it.
+    pub features: usize,
+    /// Its focal length in pixels, where it is used.
+    pub focal: Option<f64>,
+    /// What its red, green and blue were multiplied with.
+    pub gain: [f32; 3],
+}
+
+/// What became of a pair of photographs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PanoramaPair {
+    /// First photograph.
+    pub a: usize,
+    /// Second photograph.
+    pub b: usize,
+    /// Tentative matches, in pixels of the photographs.
+    pub matches: Vec<Correspondence>,
+    /// Which of them agree with a common homography; empty where the pair was rejected.
+    pub inliers: Vec<bool>,
+    /// Why the pair was rejected.
+    pub rejected: Option<NotAPair>,
+}
+
+/// A panorama and how it came about.
+#[derive(Debug, Clone)]
+pub struct PanoramaResult {
+    /// The picture; black where no photograph reaches.
+    pub image: RgbU8,
+    /// True where a photograph reaches.
+    pub mask: Mask,
+    /// Which photograph each pixel is from; `u16::MAX` where none reaches.
+    pub labels: Image<u16, 1>,
+    /// One entry per input.
+    pub images: Vec<PanoramaImage>,
+    /// All pairs that had matches.
+    pub pairs: Vec<PanoramaPair>,
+    /// Features of each photograph, in pixels of the reduced photographs (see `reduced`).
+    pub features: Vec<PhotoFeatures>,
+    /// By how much each photograph was reduced for features.
+    pub reduced: Vec<f64>,
+    /// The views, in full size.
+    pub alignment: Alignment,
+    /// The surface drawn on.
+    pub projection: Projection,
+    /// Root mean square error of all matches of all overlaps, in pixels of the photographs.
+    pub reprojection_rms_px: f64,
+    /// Stage names and their seconds.
+    pub stages: Vec<(&'static str, f64)>,
+}
+
+/// Why there is no panorama.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum PanoramaError {
+    /// The photographs could not be aligned. `reasons` says for each what is the matter with it.
+    #[error("{source}")]
+    Align {
+        /// Why.
+        source: AlignError,
+        /// One entry per input.
+        images: Vec<PanoramaImage>,
+    },
+    /// The panorama could not be drawn.
+    #[error(transparent)]
+    Render(#[from] RenderError),
+}
+
+/// Joins overlapping photographs, in any order, to a panorama.
+///
+/// Features on reduced photographs, matches of every pair, verification of the pairs, alignment of all at once, drawing in full size. Photographs that do
+/// not belong are left out and say why.
+///
+/// # Errors
+/// [`PanoramaError`]: fewer than two photographs belong together, or the canvas would be too large.
+pub fn panorama(
+    photos: &[PanoramaPhoto<'_>],
+    options: &PanoramaOptions,
+    progress: &dyn Progress,
+) -> Result<PanoramaResult, PanoramaError> {
+    let mut watch = Stopwatch::new();
+    let n = photos.len();
+    let done = AtomicUsize::new(0);
+    let tick = |stage, total| progress.report(stage, done.fetch_add(1, Ordering::Relaxed) + 1, total);
+    progress.report("features", 0, n);
+    let prepared: Vec<Prepared> = photos
+        .par_iter()
+        .map(|p| {
+            let prepared = Prepared::new(p, options);
+            tick("features", n);
+            prepared
+        })
+        .collect();
+    watch.lap("features");
+
+    let candidates: Vec<(usize, usize)> = (0..n).flat_map(|a| (a + 1..n).map(move |b| (a, b))).collect();
+    done.store(0, Ordering::Relaxed);
+    progress.report("match", 0, candidates.len());
+    let tried: Vec<Option<(PanoramaPair, Option<VerifiedPair>)>> = candidates
+        .par_iter()
+        .map(|&(a, b)| {
+            let pair = try_pair(&prepared, a, b, options);
+            tick("match", candidates.len());
+            pair
+        })
+        .collect();
+    watch.lap("match");
+    progress.report("align", 0, 1);
+    let (pairs, verified): (Vec<PanoramaPair>, Vec<Option<VerifiedPair>>) = tried.into_iter().flatten().unzip();
+    let verified: Vec<VerifiedPair> = verified.into_iter().flatten().collect();
+    let known: Vec<Photo> = prepared.iter().map(|p| p.photo).collect();
+    let mut alignment = match align(&known, &verified, &options.align) {
+        Ok(alignment) => alignment,
+        Err(source) => {
+            let views = vec![Err(Unplaced::Alone); n];
+            return Err(PanoramaError::Align { source, images: describe(&prepared, &views, &pairs) });
+        }
+    };
+    let mut images = describe(&prepared, &alignment.views, &pairs);
+    for ((view, p), photo) in alignment.views.iter_mut().zip(&prepared).zip(photos) {
+        if let Ok(view) = view {
+            view.camera = view.camera.scaled(p.factor);
+            (view.camera.width, view.camera.height) = photo.image.size();
+        }
+    }
+    for (image, view) in images.iter_mut().zip(&alignment.views) {
+        image.focal = view.as_ref().ok().filter(|_| alignment.motion == CameraMotion::Rotation).map(|v| v.camera.fx);
+    }
+    let mut factors: Vec<f64> = alignment.used().map(|(i, _)| prepared[i].factor).collect();
+    factors.sort_by(f64::total_cmp);
+    let factor = factors.get(factors.len() / 2).copied().unwrap_or(1.0);
+    alignment.rms_px *= factor;
+    alignment.median_px *= factor;
+    watch.lap("align");
+
+    progress.report("draw", 0, 1);
+    let views: Vec<ImageView<'_, u8, 3>> = photos.iter().map(|p| p.image).collect();
+    let drawn = render(&views, &alignment, &options.render)?;
+    for (image, gain) in images.iter_mut().zip(&drawn.gains.gains) {
+        image.gain = *gain;
+    }
+    for (stage, seconds) in &drawn.stages {
+        watch.add(stage, *seconds);
+    }
+    progress.report("draw", 1, 1);
+    Ok(PanoramaResult {
+        image: drawn.image,
+        mask: drawn.mask,
+        labels: drawn.labels,
+        images,
+        pairs,
+        reduced: prepared.iter().map(|p| p.factor).collect(),
+        features: prepared.into_iter().map(|p| p.features).collect(),
+        projection: drawn.projection,
+        reprojection_rms_px: alignment.rms_px,
+        alignment,
+        stages: watch.into_stages(),
+    })
+}
+
+/// A photograph ready to be matched.
+struct Prepared {
+    /// In pixels of the reduced photograph.
+    photo: Photo,
+    /// Size of the photograph over that of the reduced one.
+    factor: f64,
+    features: PhotoFeatures,
+    /// Why it has no features.
+    failure: Option<String>,
+}
+
+impl Prepared {
+    fn new(p: &PanoramaPhoto<'_>, options: &PanoramaOptions) -> Self {
+        let (w, h) = p.image.size();
+        let factor = ((w * h) as f64 / options.registration_pixels.max(10_000) as f64).sqrt().max(1.0);
+        let none = || PhotoFeatures {
+            described: Described {
+                keypoints: Vec::new(),
+                descriptors: Descriptors::new(DescriptorKind::RootSift),
+                dropped: Vec::new(),
+                beyond_limit: 0,
+            },
+            found: 0,
+        };
+        let size = ((w as f64 / factor).round() as usize, (h as f64 / factor).round() as usize);
+        let reduced = (factor > 1.2).then(|| cv_imgproc::resize_area(p.image, size.0, size.1).ok()).flatten();
+        let (image, factor) = match &reduced {
+            Some(small) => (small.view(), w as f64 / size.0 as f64),
+            None => (p.image, 1.0),
+        };
+        let (features, failure) = match extract_features(image, &options.matching) {
+            Ok(features) => (features, None),
+            Err(error) => (none(), Some(error.to_string())),
+        };
+        let (width, height) = image.size();
+        let camera = p.camera.map(|c| Camera { width, height, ..c.scaled(1.0 / factor) });
+        let photo = Photo { width, height, focal: p.focal.map(|f| f / factor), camera };
+        Self { photo, factor, features, failure }
+    }
+}
+
+/// Matches and verifies a pair; `None` where one has no features.
+fn try_pair(
+    prepared: &[Prepared],
+    a: usize,
+    b: usize,
+    options: &PanoramaOptions,
+) -> Option<(PanoramaPair, Option<VerifiedPair>)> {
+    let (p, q) = (&prepared[a], &prepared[b]);
+    let found = match_features(&p.features, &q.features, &options.matching).ok()?;
+    let matches = correspondences(&p.features, &q.features, &found);
+    let size = |p: &Prepared| (p.photo.width, p.photo.height);
+    let verified = verify_pair((a, size(p)), (b, size(q)), &matches, &options.verify);
+    // Both lists are in the order of the matches.
+    let mut rest = verified.as_ref().map(|v| v.inliers.as_slice()).unwrap_or_default().iter().peekable();
+    let inliers = match &verified {
+        Ok(_) => matches.iter().map(|m| rest.next_if(|i| *i == m).is_some()).collect(),
+        Err(_) => Vec::new(),
+    };
+    let enlarge = |p: Point2<f64>, factor: f64| ((p.coords.add_scalar(0.5)) * factor).add_scalar(-0.5).into();
+    let matches =
+        matches.iter().map(|c| Correspondence { a: enlarge(c.a, p.factor), b: enlarge(c.b, q.factor) }).collect();
+    let (verified, rejected) = match verified {
+        Ok(pair) => (Some(pair), None),
+        Err(reason) => (None, Some(reason)),
+    };
+    Some((PanoramaPair { a, b, matches, inliers, rejected }, verified))
+}
+
+/// What to tell about each photograph.
+fn describe(
+    prepared: &[Prepared],
+    views: &[Result<cv_panorama::View, Unplaced>],
+    pairs: &[PanoramaPair],
+) -> Vec<PanoramaImage> {
+    let reason = |i: usize, why: Unplaced| match (why, &prepared[i].failure) {
+        (_, Some(failure)) => failure.clone(),
+        (Unplaced::OtherGroup { size }, _) => format!("overlaps only with a smaller group of {size} photographs"),
+        (Unplaced::Contradicts, _) => "its overlaps contradict those of the other photographs".to_owned(),
+        (Unplaced::Alone, _) => {
+            let own = pairs.iter().filter(|p| p.a == i || p.b == i);
+            let agree = |p: &&PanoramaPair| match &p.rejected {
+                Some(NotAPair::TooFewAgree { agree, .. }) => *agree,
+                _ => 0,
+            };
+            match own.max_by_key(agree) {
+                _ if prepared[i].features.described.keypoints.is_empty() => "no features found on it".to_owned(),
+                Some(PanoramaPair { a, b, rejected: Some(rejected @ NotAPair::TooFewAgree { .. }), .. }) => {
+                    format!(
+                        "overlaps with no other photograph: with the likeliest, number {}, {rejected}",
+                        if *a == i { b + 1 } else { a + 1 }
+                    )
+                }
+                _ => "overlaps with no other photograph".to_owned(),
+            }
+        }
+    };
+    views
+        .iter()
+        .enumerate()
+        .map(|(i, view)| PanoramaImage {
+            used: view.is_ok(),
+            reason: view.as_ref().err().map(|why| reason(i, *why)),
+            features: prepared[i].features.described.keypoints.len(),
+            focal: None,
+            gain: [1.0; 3],
+        })
+        .collect()
+}
