@@ -6,7 +6,10 @@ use std::path::Path;
 
 use cv_core::{GrayF32, Image, ImageView};
 
-use crate::{FormatError, IoError, Pixels, read_image, write_png};
+use crate::files::read_bytes;
+use crate::{FormatError, IoError, Pixels, ReadOptions, decode_image, read_image, write_png};
+
+const NAME: &str = "disparity PNG";
 
 /// KITTI's 16-bit disparity PNG: `round(256 d)`, 0 = unknown.
 pub mod kitti {
@@ -65,19 +68,7 @@ pub mod scaled {
     /// [`IoError`]: as [`read_image`], or a colour picture, or a scale that is not positive.
     pub fn read(path: impl AsRef<Path>, scale: f64) -> Result<GrayF32, IoError> {
         let path = path.as_ref();
-        let fail = |reason| IoError::reading(path, reason);
-        if !(scale > 0.0 && scale.is_finite()) {
-            return Err(fail(FormatError::corrupt("disparity PNG", format!("the scale {scale} is not positive"))));
-        }
-        match read_image(path)?.pixels {
-            Pixels::Gray16(image) => Ok(values(&image, 1.0 / scale)),
-            Pixels::Gray8(image) => Ok(values(&image, 1.0 / scale)),
-            // Some tools save grey as three equal channels.
-            Pixels::Rgb8(image) if image.pixels().all(|[r, g, b]| r == g && g == b) => {
-                Ok(values(&image.map(|[v, _, _]| [v]), 1.0 / scale))
-            }
-            _ => Err(fail(FormatError::unsupported("disparity PNG", "a colour picture"))),
-        }
+        decode(&read_bytes(path)?, Some(scale)).map_err(|reason| IoError::reading(path, reason))
     }
 
     /// Writes disparities as bytes, `round(scale d)`, at least 1 where known. Returns how many known values do not fit and
@@ -89,6 +80,26 @@ pub mod scaled {
         let (stored, lost) = stored(disparity, scale, f64::from(u8::MAX));
         write_png(path, stored.map(|[v]| [v as u8]).view())?;
         Ok(lost)
+    }
+}
+
+/// The values of a grey picture over `scale`; without one, of a 16-bit picture over 256.
+pub(crate) fn decode(bytes: &[u8], scale: Option<f64>) -> Result<GrayF32, FormatError> {
+    let pixels = decode_image(bytes, &ReadOptions::default())?.pixels;
+    let scale = match (scale, &pixels) {
+        (Some(scale), _) if scale > 0.0 && scale.is_finite() => scale,
+        (Some(scale), _) => return Err(FormatError::corrupt(NAME, format!("the scale {scale} is not positive"))),
+        (None, Pixels::Gray16(_)) => 256.0,
+        (None, _) => return Err(FormatError::missing(NAME, "scale: 8 bits do not tell it")),
+    };
+    match pixels {
+        Pixels::Gray16(image) => Ok(values(&image, 1.0 / scale)),
+        Pixels::Gray8(image) => Ok(values(&image, 1.0 / scale)),
+        // Some tools save grey as three equal channels.
+        Pixels::Rgb8(image) if image.pixels().all(|[r, g, b]| r == g && g == b) => {
+            Ok(values(&image.map(|[v, _, _]| [v]), 1.0 / scale))
+        }
+        _ => Err(FormatError::unsupported(NAME, "a colour picture")),
     }
 }
 

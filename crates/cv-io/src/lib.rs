@@ -24,7 +24,7 @@
 //! | what | where |
 //! |---|---|
 //! | pictures | [`read_rgb`], [`read_gray_u8`], [`read_mask`], [`read_image`], [`write_png`], [`write_jpeg`] |
-//! | maps of floats | [`pfm`], [`kitti`], [`depth_mm`], [`scaled`] |
+//! | maps of floats | [`read_map`], [`pfm`], [`kitti`], [`depth_mm`], [`scaled`] |
 //! | arrays | [`npy`], [`npz`] |
 //! | clouds | [`ply`] |
 //! | cameras and rigs | [`read_camera`], [`write_camera`], [`read_rig`], [`write_rig`] |
@@ -38,6 +38,7 @@ mod encode;
 mod error;
 mod exif_info;
 mod files;
+mod maps;
 mod matches;
 pub mod npy;
 pub mod npz;
@@ -52,6 +53,7 @@ pub use encode::{JpegPixels, PngPixels, encode_jpeg, encode_png, write_image, wr
 pub use error::{FormatError, IoError};
 pub use exif_info::{ExifFocal, ExifInfo, FocalSource};
 pub use files::{MAX_FILE_BYTES, write_atomic, write_bytes};
+pub use maps::{decode_map, read_map};
 pub use matches::{Matches, parse_matches, read_matches, write_matches};
 pub use picture::{
     DEFAULT_MAX_PIXELS, DynImage, Pixels, ReadOptions, decode_image, exif_focal, read_gray_u8, read_image,

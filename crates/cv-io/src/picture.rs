@@ -184,14 +184,28 @@ fn without_alpha<T: Copy, const C: usize>(data: &[T]) -> Vec<T> {
 }
 
 fn from_image_error(format: ImageFormat, error: ImageError) -> FormatError {
+    use image::error::UnsupportedErrorKind as Kind;
     let name = sniff::name(format);
     match error {
         ImageError::IoError(e) if e.kind() == std::io::ErrorKind::UnexpectedEof => {
             FormatError::Truncated { format: name }
         }
         ImageError::IoError(e) => FormatError::corrupt(name, e.to_string()),
-        ImageError::Unsupported(e) => FormatError::unsupported(name, e.to_string()),
+        ImageError::Unsupported(e) => FormatError::unsupported(
+            name,
+            match e.kind() {
+                Kind::Color(color) => format!("the pixel type {color:?}"),
+                Kind::Format(_) => "this variant".to_owned(),
+                Kind::GenericFeature(feature) => format!("“{feature}”"),
+                other => format!("{other:?}"),
+            },
+        ),
         ImageError::Limits(e) => FormatError::corrupt(name, format!("it would take too much memory: {e}")),
+        // The decoder's own words, without those of the layers around it.
+        ImageError::Decoding(e) => {
+            let own = std::error::Error::source(&e).map(ToString::to_string);
+            FormatError::corrupt(name, own.unwrap_or_else(|| e.to_string()))
+        }
         error => FormatError::corrupt(name, error.to_string()),
     }
 }
