@@ -288,3 +288,6 @@ fn header(bytes: &[u8]) -> Result<((usize, usize), ExifInfo), FormatError> {
     catch_unwind(AssertUnwindSafe(read))
         .unwrap_or_else(|_| Err(FormatError::corrupt(sniff::name(format), "the decoder gave up on it")))
 }
+
+#[cfg(test)]
+mod tests;
