@@ -130,8 +130,14 @@ fn ratio(part: usize, whole: usize) -> f64 {
 }
 
 /// Root mean square in pixels, over the pixels of a 17 × 17 grid on the first picture that the second one sees too, of
-/// the distance between where two homographies send them. `None` where the pictures do not overlap.
-pub fn alignment_error(estimate: &Matrix3<f64>, truth: &Matrix3<f64>, width: usize, height: usize) -> Option<f64> {
+/// the distance between where `estimate` and the true homography send them; infinite where the estimate sends one
+/// nowhere. `None` where the pictures do not overlap.
+pub fn alignment_error(
+    estimate: impl Fn(Point2<f64>) -> Option<Point2<f64>>,
+    truth: &Matrix3<f64>,
+    width: usize,
+    height: usize,
+) -> Option<f64> {
     let (mut sum, mut n) = (0.0, 0.0);
     for (i, j) in (0..17).flat_map(|j| (0..17).map(move |i| (i, j))) {
         let x = f64::from(i) / 16.0 * (width as f64 - 1.0);
@@ -141,7 +147,7 @@ pub fn alignment_error(estimate: &Matrix3<f64>, truth: &Matrix3<f64>, width: usi
         let there = Point2::new(q.x / q.z, q.y / q.z);
         let inside = |v: f64, n: usize| v >= 0.0 && v <= n as f64 - 1.0;
         if q.z * truth[(2, 2)].signum() > 0.0 && inside(there.x, width) && inside(there.y, height) {
-            sum += apply(estimate, x, y).map_or(f64::INFINITY, |p| (p - there).norm_squared());
+            sum += estimate(Point2::new(x, y)).map_or(f64::INFINITY, |p| (p - there).norm_squared());
             n += 1.0;
         }
     }
@@ -170,9 +176,10 @@ mod tests {
     fn a_shift_is_its_length_at_every_corner() {
         let shift = Matrix3::new(1.0, 0.0, 3.0, 0.0, 1.0, 4.0, 0.0, 0.0, 1.0);
         assert_eq!(homography_corner_error(&shift, &Matrix3::identity(), 640, 480), 5.0);
-        assert_eq!(alignment_error(&Matrix3::identity(), &shift, 640, 480), Some(5.0));
+        assert_eq!(alignment_error(Some, &shift, 640, 480), Some(5.0));
+        assert_eq!(alignment_error(|_| None, &shift, 640, 480), Some(f64::INFINITY));
         let away = Matrix3::new(1.0, 0.0, 1e4, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0);
-        assert_eq!(alignment_error(&away, &away, 640, 480), None);
+        assert_eq!(alignment_error(Some, &away, 640, 480), None);
         assert_eq!(homography_corner_error(&Matrix3::zeros(), &shift, 640, 480), f64::INFINITY);
     }
 

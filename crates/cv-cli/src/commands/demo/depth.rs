@@ -1,0 +1,85 @@
+//! Depth of a room from a rectified pair.
+
+use super::{Check, Demo, Part};
+use crate::common::Failure;
+use cv_core::{GrayF32, Mask, RgbU8};
+use cv_pipeline::stereo::{StereoGeometry, StereoOptions};
+use cv_pipeline::{DepthOptions, depth};
+use cv_report::{MapStyle, PointScene, Viewpoint, colors, draw_map, render_points};
+use cv_synth::{RenderOptions, Scene, depth_score, stereo_pair};
+
+/// Metres between the two cameras.
+const BASELINE: f64 = 0.2;
+/// The bar: within this share of the true depth, below this many metres.
+const TOLERANCE: f32 = 0.05;
+const LIMIT: f32 = 10.0;
+
+pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
+    let scene = Scene::room(demo.seed);
+    let camera = demo.camera();
+    let pair = stereo_pair(&scene, &camera, &scene.viewpoint(), BASELINE, &RenderOptions::default())?;
+    let geometry = StereoGeometry::from_focal(camera.width, camera.height, camera.fx, BASELINE)?;
+    let options = DepthOptions { stereo: StereoOptions { disparities: 96, ..StereoOptions::default() }, ..DepthOptions::default() };
+    let (left, right) = (&pair.left.image, &pair.right.image);
+    let result = match depth(left.view(), right.view(), Some(&geometry), &options, demo.context) {
+        Ok(result) => result,
+        Err(error) => return Ok(Part::gave_up("depth", &error)),
+    };
+    let unknown = || GrayF32::new(camera.width, camera.height, [f32::NAN]);
+    let found = result.depth.unwrap_or_else(unknown);
+    let truth = &pair.left.depth;
+    let share = depth_score(&found, truth, &pair.visible, LIMIT, TOLERANCE).map_or(0.0, |s| s.within);
+    let check = Check::at_least("depth", "pixels within 5 % of their depth", share, 0.95, "%")
+        .of(format!("median {:.3} m", median(truth, &pair.visible)), format!("{:.3} m", median(&found, &pair.visible)));
+
+    let range = (0.0, LIMIT);
+    let style = MapStyle::depth("m").with_range(range.0, range.1);
+    let photos = vec![
+        demo.photo("depth-left.png", left, "Left photograph.")?,
+        demo.photo("depth-right.png", right, "Right photograph, 20 cm to the right.")?,
+    ];
+    let maps = vec![
+        demo.figure("depth-result.png", &draw_map(found.view(), &style), "Depth by the pipeline: near blue, far red.")?,
+        demo.figure("depth-truth.png", &draw_map(truth.view(), &style), "True depth.")?,
+        demo.figure(
+            "depth-errors.png",
+            &errors(left, &found, truth, &pair.visible),
+            "Off by more than 5 %: red. Seen by one camera only, where no method can measure: blue.",
+        )?,
+    ];
+    // Every third pixel is dense enough to look at, and keeps the report small.
+    let (points, colors): (Vec<_>, Vec<_>) =
+        geometry.cloud(found.view(), left.view()).into_iter().step_by(3).map(|p| (p.position, p.color)).unzip();
+    let cloud = PointScene::new(&points, &colors);
+    let still = cv_io::encode_png(render_points(&cloud, Viewpoint::Camera, 960, 600).view())?;
+    Ok(Part::new(vec![check], move |page| {
+        page.section("Depth")
+            .paragraph("A room photographed with two cameras side by side. The semi-global matcher finds how far each pixel shifts from left to right, and from that how far away it is.")
+            .figures(photos)
+            .figures(maps)
+            .points(&cloud, Some(still), "The measured depth in space. Drag to turn.");
+    }))
+}
+
+/// The median depth of the pixels that both cameras see.
+fn median(depth: &GrayF32, visible: &Mask) -> f32 {
+    let mut values: Vec<f32> =
+        depth.as_slice().iter().zip(visible.as_slice()).filter(|(d, v)| **v && d.is_finite()).map(|(d, _)| *d).collect();
+    let middle = values.len() / 2;
+    values.sort_by(f32::total_cmp);
+    values.get(middle).copied().unwrap_or(f32::NAN)
+}
+
+/// Wrong pixels in red and hidden ones in blue over the darkened photograph.
+fn errors(photo: &RgbU8, found: &GrayF32, truth: &GrayF32, visible: &Mask) -> RgbU8 {
+    RgbU8::from_fn(photo.width(), photo.height(), |x, y| {
+        let ([f], [t]) = (found.at(x, y), truth.at(x, y));
+        let grey = photo.at(x, y).map(|c| u32::from(c) * 2 / 5);
+        let grey = [(grey.iter().sum::<u32>() / 3 + 20) as u8; 3];
+        match visible.at(x, y)[0] {
+            false => [30, 60, 130],
+            true if (f - t).abs() <= TOLERANCE * t || t >= LIMIT => grey,
+            true => colors::RED,
+        }
+    })
+}
