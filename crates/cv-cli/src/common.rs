@@ -58,6 +58,7 @@ pub(crate) struct Outcome {
     unserialisable: Option<String>,
     summary: String,
     stdout: Vec<u8>,
+    but: Option<Failure>,
 }
 
 impl Outcome {
@@ -87,6 +88,12 @@ impl Outcome {
     pub(crate) fn text(mut self, key: &str, text: Vec<u8>) -> Self {
         self = self.with(key, String::from_utf8_lossy(&text));
         self.stdout = text;
+        self
+    }
+
+    /// The result is there and is printed, yet it is not what it should be: exit code 1 with this reason.
+    pub(crate) fn but(mut self, failure: Failure) -> Self {
+        self.but = Some(failure);
         self
     }
 
@@ -292,10 +299,13 @@ pub(crate) fn run(globals: &Globals, command: impl FnOnce(&Context) -> Result<Ou
     });
     context.bar.clear();
     let failure = match result {
-        Ok(outcome) => match finish(outcome, globals, start) {
-            Ok(()) => return ExitCode::SUCCESS,
-            Err(failure) => failure,
-        },
+        Ok(mut outcome) => {
+            let but = outcome.but.take();
+            match finish(outcome, globals, start).err().or(but) {
+                None => return ExitCode::SUCCESS,
+                Some(failure) => failure,
+            }
+        }
         Err(failure) => failure,
     };
     context.bar.print(&failure.text());

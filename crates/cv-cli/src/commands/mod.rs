@@ -70,6 +70,7 @@ commands! {
     Depth(depth),
     Eval(eval),
     Completions(completions),
+    Demo(demo),
     Man(man),
     Panorama(panorama),
 }
