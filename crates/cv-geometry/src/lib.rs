@@ -20,7 +20,9 @@
 //! * Thresholds and residuals are in the unit of the matches, that is, pixels.
 //! * The same matches, options and seed give the same bytes on any number of threads and with any vector unit.
 
+mod epipolar;
 mod error;
+mod essential;
 mod fundamental;
 mod homography;
 mod pairs;
@@ -29,8 +31,13 @@ mod robust;
 #[cfg(test)]
 mod testing;
 
+pub use epipolar::sampson;
 pub use error::{Degeneracy, EstimateError};
-pub use fundamental::{estimate_fundamental, fundamental_eight_point, fundamental_seven_point, sampson};
+pub use essential::{
+    RecoveredPose, decompose_essential, essential_five_point, essential_from_fundamental, essential_from_pose,
+    estimate_essential, estimate_relative_pose, normalize_matches, recover_pose,
+};
+pub use fundamental::{estimate_fundamental, fundamental_eight_point, fundamental_seven_point};
 pub use homography::{
     estimate_homography, homography_four_point, homography_from_points, homography_residual, refine_homography,
 };

@@ -29,6 +29,8 @@ pub(crate) struct Normalizer {
 }
 
 impl Normalizer {
+    pub(crate) const IDENTITY: Self = Self { center: Point2::new(0.0, 0.0), scale: 1.0 };
+
     /// As a 3×3 matrix.
     pub(crate) fn matrix(&self) -> Matrix3<f64> {
         let (s, c) = (self.scale, self.center);

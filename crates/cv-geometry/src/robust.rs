@@ -16,6 +16,11 @@ pub struct RobustModel<M> {
 }
 
 impl<M> RobustModel<M> {
+    /// The same with another form of the model.
+    pub(crate) fn map<N>(self, f: impl FnOnce(M) -> N) -> RobustModel<N> {
+        RobustModel { model: f(self.model), inliers: self.inliers, rms: self.rms, iterations: self.iterations }
+    }
+
     /// With the inliers by `residual`.
     pub(crate) fn new(
         model: M,

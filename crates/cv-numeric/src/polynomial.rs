@@ -318,11 +318,12 @@ fn bracketed(c: &[f64], mut low: f64, mut high: f64, rising: bool) -> f64 {
         }
         let newton = x - p / d;
         // Newton where it stays inside and at least halves the step.
-        let next =
-            if newton > low && newton < high && 2.0 * (newton - x).abs() <= last { newton } else { 0.5 * (low + high) };
+        let inside = newton > low && newton < high && 2.0 * (newton - x).abs() <= last;
+        let next = if inside { newton } else { 0.5 * (low + high) };
         last = (next - x).abs();
         x = next;
-        if last <= 4.0 * f64::EPSILON * x.abs() {
+        // Newton's error after a step is of the order of the step's square; what remains of a bisection's is the step.
+        if last <= (if inside { 1e-9 } else { 1e-15 }) * x.abs() {
             break;
         }
     }

@@ -2,28 +2,20 @@
 
 mod eight_point;
 mod plane;
-mod refine;
+mod rank_two;
 mod seven_point;
 
 pub use eight_point::fundamental_eight_point;
+pub(crate) use seven_point::epipolar_row;
 pub use seven_point::fundamental_seven_point;
 
+use crate::epipolar::{Epipolar, SampsonKernel, SampsonProblem, refine_sampson, sampson, second_epipole};
 use crate::error::EstimateError;
 use crate::pairs::{LANES, PairBlock, PairSet, point_degeneracy};
 use crate::ransac::{Estimator, RobustOptions, Scorer, ransac};
 use crate::robust::RobustModel;
-use cv_core::{Correspondence, Matrix3, Point2, Vector3};
-use refine::{SampsonProblem, refine_sampson};
-
-/// Sampson's distance of a match from the epipolar geometry `bᵀ F a = 0`, in pixels: the first-order distance to the nearest
-/// pair of points that satisfies it (Hartley & Zisserman, §11.4.3).
-///
-/// NaN where both epipolar lines vanish (both points are epipoles).
-pub fn sampson(f: &Matrix3<f64>, m: &Correspondence) -> f64 {
-    let (a, b) = (m.a.to_homogeneous(), m.b.to_homogeneous());
-    let (l, k) = (f * a, f.transpose() * b);
-    b.dot(&l).abs() / (l.x * l.x + l.y * l.y + k.x * k.x + k.y * k.y).sqrt()
-}
+use cv_core::{Correspondence, Matrix3, Point2};
+use rank_two::RankTwo;
 
 /// The fundamental matrix between two images of a rigid scene, from matches of which many may be wrong.
 ///
@@ -60,46 +52,6 @@ pub fn estimate_fundamental(
 
 struct FundamentalEstimator {
     set: PairSet,
-}
-
-/// F in f32, row by row.
-pub(crate) struct SampsonKernel([f32; 9]);
-
-impl SampsonKernel {
-    pub(crate) fn new(f: &Matrix3<f64>) -> Self {
-        Self(std::array::from_fn(|i| f[(i / 3, i % 3)] as f32))
-    }
-
-    #[inline(always)]
-    pub(crate) fn squared_residuals(&self, block: &PairBlock) -> [f32; LANES] {
-        let f = &self.0;
-        let mut out = [0f32; LANES];
-        for (i, r2) in out.iter_mut().enumerate() {
-            let (x, y, s, t) = (block.x1[i], block.y1[i], block.x2[i], block.y2[i]);
-            let l0 = f[0] * x + f[1] * y + f[2];
-            let l1 = f[3] * x + f[4] * y + f[5];
-            let l2 = f[6] * x + f[7] * y + f[8];
-            let m0 = f[0] * s + f[3] * t + f[6];
-            let m1 = f[1] * s + f[4] * t + f[7];
-            let c = s * l0 + t * l1 + l2;
-            *r2 = c * c / ((l0 * l0 + l1 * l1) + (m0 * m0 + m1 * m1));
-        }
-        out
-    }
-}
-
-/// The epipole of the second image, `Fᵀ e = 0`: the longest cross product of two columns.
-#[inline]
-pub(crate) fn second_epipole(f: &Matrix3<f64>) -> Vector3<f64> {
-    let c = [f.column(0), f.column(1), f.column(2)];
-    let crosses = [c[0].cross(&c[1]), c[1].cross(&c[2]), c[2].cross(&c[0])];
-    let mut best = crosses[0];
-    for e in &crosses[1..] {
-        if e.norm_squared() > best.norm_squared() {
-            best = *e;
-        }
-    }
-    best
 }
 
 impl Estimator for FundamentalEstimator {
@@ -153,8 +105,8 @@ impl Estimator for FundamentalEstimator {
         threshold: f64,
         iterations: usize,
     ) -> Option<Matrix3<f64>> {
-        let problem = SampsonProblem { pairs: &self.set.pairs, scorer, threshold };
-        refine_sampson(&problem, model, iterations)
+        let problem = SampsonProblem::new(&self.set.pairs, scorer, threshold);
+        refine_sampson(&problem, RankTwo::new(model)?, iterations).map(|f| f.matrix().normalize())
     }
 
     fn alternatives(&self, model: &Matrix3<f64>, sample: &[u32], threshold: f64, models: &mut Vec<Matrix3<f64>>) {
@@ -167,7 +119,7 @@ mod tests {
     use super::*;
     use crate::error::Degeneracy;
     use crate::testing::{TwoViews, cosine};
-    use cv_numeric::LeastSquares;
+    use cv_numeric::LeastSquares as _;
     use proptest::prelude::*;
 
     /// Plain least squares.
@@ -226,18 +178,18 @@ mod tests {
         fn the_gradient_is_that_of_the_cost(seed: u64) {
             let views = TwoViews::random(seed);
             let pairs: Vec<[f64; 4]> = views.normalised_matches(15, 1e-3).iter().map(|m| [m.a.x, m.a.y, m.b.x, m.b.y]).collect();
-            let problem = SampsonProblem { pairs: &pairs, scorer: &AllIn, threshold: 1.0 };
-            let start = refine::RankTwo::new(&views.essential()).unwrap();
-            let start = problem.step(&start, &nalgebra::SVector::from([0.01, -0.02, 0.01, 0.02, 0.01, -0.01, 0.02]));
+            let problem = SampsonProblem::new(&pairs, &AllIn, 1.0);
+            let start = RankTwo::new(&views.essential()).unwrap();
+            let start = start.step(&nalgebra::SVector::from([0.01, -0.02, 0.01, 0.02, 0.01, -0.01, 0.02]));
             let gradient = problem.linearize(&start).gradient;
-            let cost = |f: &refine::RankTwo| {
+            let cost = |f: &RankTwo| {
                 let f = f.matrix();
                 pairs.iter().map(|p| sampson(&f, &Correspondence::new(p[0], p[1], p[2], p[3])).powi(2)).sum::<f64>()
             };
             for i in 0..7 {
                 let mut d = nalgebra::SVector::<f64, 7>::zeros();
                 d[i] = 1e-6;
-                let numeric = (cost(&problem.step(&start, &d)) - cost(&problem.step(&start, &-d))) / 2e-6;
+                let numeric = (cost(&start.step(&d)) - cost(&start.step(&-d))) / 2e-6;
                 // Central differences: h² truncation and rounding over h; the gradient is half the derivative of Σr².
                 prop_assert!((0.5 * numeric - gradient[i]).abs() < 1e-6 + 1e-4 * gradient.amax(), "{i} {numeric} {}", gradient[i]);
             }

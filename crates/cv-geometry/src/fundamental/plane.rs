@@ -1,7 +1,7 @@
 //! Recovery from samples that lie on one plane (Chum, Werner & Matas, "Two-view geometry estimation unaffected by a
 //! dominant plane", 2005).
 
-use super::second_epipole;
+use crate::epipolar::second_epipole;
 use crate::homography::refine_on_plane;
 use crate::pairs::below;
 use cv_core::{Matrix3, Vector3};

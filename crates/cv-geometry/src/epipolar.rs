@@ -1,0 +1,175 @@
+//! The Sampson error of epipolar geometry, and its refinement.
+
+use crate::pairs::{LANES, PairBlock};
+use crate::ransac::Scorer;
+use cv_core::{Correspondence, Matrix3, Vector3};
+use cv_numeric::{LeastSquares, LmOptions, NormalEquations, levenberg_marquardt};
+use nalgebra::{Const, OMatrix, OVector, SMatrix, SVector};
+use std::marker::PhantomData;
+
+/// A family of matrices `F` with `bᵀ F a = 0`, with `N` degrees of freedom.
+pub(crate) trait Epipolar<const N: usize>: Clone {
+    /// The matrix; its scale does not matter.
+    fn matrix(&self) -> Matrix3<f64>;
+
+    /// Derivatives of the entries, row by row, by the degrees of freedom.
+    fn tangent(&self) -> SMatrix<f64, 9, N>;
+
+    /// Moved in the tangent space.
+    fn step(&self, delta: &OVector<f64, Const<N>>) -> Self;
+}
+
+/// Minimises `Σ ρ(sampson² / threshold²)` over a family of matrices.
+pub(crate) struct SampsonProblem<'a, C: Scorer, M, const N: usize> {
+    pub(crate) pairs: &'a [[f64; 4]],
+    pub(crate) scorer: &'a C,
+    pub(crate) threshold: f64,
+    family: PhantomData<M>,
+}
+
+impl<'a, C: Scorer, M: Epipolar<N>, const N: usize> SampsonProblem<'a, C, M, N> {
+    pub(crate) fn new(pairs: &'a [[f64; 4]], scorer: &'a C, threshold: f64) -> Self {
+        Self { pairs, scorer, threshold, family: PhantomData }
+    }
+
+    /// Calls `f(pair, F a, Fᵀ b, C, 1/D, u)` for each pair within the cutoff; returns the number of the others.
+    #[inline(always)]
+    fn each(&self, f: &Matrix3<f64>, mut each: impl FnMut(&[f64; 4], [f64; 2], [f64; 2], f64, f64, f64)) -> f64 {
+        let scale = 1.0 / (self.threshold * self.threshold);
+        let mut outside = 0.0;
+        for pair in self.pairs {
+            let [x, y, s, t] = *pair;
+            let l0 = f[(0, 0)] * x + f[(0, 1)] * y + f[(0, 2)];
+            let l1 = f[(1, 0)] * x + f[(1, 1)] * y + f[(1, 2)];
+            let l2 = f[(2, 0)] * x + f[(2, 1)] * y + f[(2, 2)];
+            let m0 = f[(0, 0)] * s + f[(1, 0)] * t + f[(2, 0)];
+            let m1 = f[(0, 1)] * s + f[(1, 1)] * t + f[(2, 1)];
+            let c = s * l0 + t * l1 + l2;
+            let inverse = 1.0 / (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1);
+            let u = c * c * inverse * scale;
+            if u < self.scorer.cutoff() {
+                each(pair, [l0, l1], [m0, m1], c, inverse, u);
+            } else {
+                outside += 1.0;
+            }
+        }
+        outside
+    }
+}
+
+impl<C: Scorer, M: Epipolar<N>, const N: usize> LeastSquares for SampsonProblem<'_, C, M, N> {
+    type Dim = Const<N>;
+    type Params = M;
+
+    fn dim(&self) -> Const<N> {
+        Const
+    }
+
+    fn cost(&self, f: &M) -> f64 {
+        let mut cost = 0.0;
+        let outside = self.each(&f.matrix(), |_, _, _, _, _, u| cost += f64::from(self.scorer.loss(u as f32)));
+        cost + outside
+    }
+
+    fn linearize(&self, f: &M) -> NormalEquations<Const<N>> {
+        let mut cost = 0.0;
+        let mut hessian = [[0.0; 9]; 9];
+        let mut gradient = [0.0; 9];
+        let outside = self.each(&f.matrix(), |&[x, y, s, t], l, m, c, inverse, u| {
+            cost += f64::from(self.scorer.loss(u as f32));
+            let weight = self.scorer.weight(u) * inverse;
+            // r = C/√D: ∂r = (∂C − C ∂D/(2D))/√D; ∂D/2 = l ∂l + m ∂m.
+            let k = c * inverse;
+            let (p, q) = ([s, t, 1.0], [x, y, 1.0]);
+            let (kl, km) = ([k * l[0], k * l[1], 0.0], [k * m[0], k * m[1], 0.0]);
+            let mut g = [0.0; 9];
+            for i in 0..3 {
+                for j in 0..3 {
+                    g[3 * i + j] = (p[i] - kl[i]) * q[j] - km[j] * p[i];
+                }
+            }
+            for i in 0..9 {
+                let w = weight * g[i];
+                gradient[i] += w * c;
+                for (h, g) in hessian[i].iter_mut().zip(g) {
+                    *h += w * g;
+                }
+            }
+        });
+        let tangent = f.tangent();
+        let hessian = SMatrix::<f64, 9, 9>::from_fn(|r, c| hessian[r][c]);
+        let gradient = tangent.transpose() * SVector::from(gradient);
+        let hessian = tangent.transpose() * hessian * tangent;
+        NormalEquations {
+            cost: cost + outside,
+            hessian: OMatrix::<f64, Const<N>, Const<N>>::from_fn(|r, c| hessian[(r, c)]),
+            gradient: OVector::<f64, Const<N>>::from_fn(|r, _| gradient[r]),
+        }
+    }
+
+    fn step(&self, f: &M, d: &OVector<f64, Const<N>>) -> M {
+        f.step(d)
+    }
+}
+
+/// At most `iterations` Levenberg–Marquardt steps from `start`; `None` where they lowered nothing.
+pub(crate) fn refine_sampson<C: Scorer, M: Epipolar<N>, const N: usize>(
+    problem: &SampsonProblem<'_, C, M, N>,
+    start: M,
+    iterations: usize,
+) -> Option<M> {
+    let options = LmOptions { max_iterations: iterations, cost_tolerance: 1e-6, ..LmOptions::default() };
+    let report = levenberg_marquardt(problem, start, &options);
+    (report.cost < report.initial_cost).then_some(report.params)
+}
+
+/// F in f32, row by row.
+pub(crate) struct SampsonKernel([f32; 9]);
+
+impl SampsonKernel {
+    pub(crate) fn new(f: &Matrix3<f64>) -> Self {
+        Self(std::array::from_fn(|i| f[(i / 3, i % 3)] as f32))
+    }
+
+    /// Squared Sampson distances.
+    #[inline(always)]
+    pub(crate) fn squared_residuals(&self, block: &PairBlock) -> [f32; LANES] {
+        let f = &self.0;
+        let mut out = [0f32; LANES];
+        for (i, r2) in out.iter_mut().enumerate() {
+            let (x, y, s, t) = (block.x1[i], block.y1[i], block.x2[i], block.y2[i]);
+            let l0 = f[0] * x + f[1] * y + f[2];
+            let l1 = f[3] * x + f[4] * y + f[5];
+            let l2 = f[6] * x + f[7] * y + f[8];
+            let m0 = f[0] * s + f[3] * t + f[6];
+            let m1 = f[1] * s + f[4] * t + f[7];
+            let c = s * l0 + t * l1 + l2;
+            *r2 = c * c / ((l0 * l0 + l1 * l1) + (m0 * m0 + m1 * m1));
+        }
+        out
+    }
+}
+
+/// Sampson's distance of a match from the epipolar geometry `bᵀ F a = 0`, in pixels: the first-order distance to the nearest
+/// pair of points that satisfies it (Hartley & Zisserman, §11.4.3).
+///
+/// NaN where both epipolar lines vanish (both points are epipoles).
+pub fn sampson(f: &Matrix3<f64>, m: &Correspondence) -> f64 {
+    let (a, b) = (m.a.to_homogeneous(), m.b.to_homogeneous());
+    let (l, k) = (f * a, f.transpose() * b);
+    b.dot(&l).abs() / (l.x * l.x + l.y * l.y + k.x * k.x + k.y * k.y).sqrt()
+}
+
+/// The epipole of the second image, `Fᵀ e = 0`: the longest cross product of two columns.
+#[inline]
+pub(crate) fn second_epipole(f: &Matrix3<f64>) -> Vector3<f64> {
+    let c = [f.column(0), f.column(1), f.column(2)];
+    let crosses = [c[0].cross(&c[1]), c[1].cross(&c[2]), c[2].cross(&c[0])];
+    let mut best = crosses[0];
+    for e in &crosses[1..] {
+        if e.norm_squared() > best.norm_squared() {
+            best = *e;
+        }
+    }
+    best
+}

@@ -1,0 +1,222 @@
+//! Essential matrices through five points.
+
+use crate::fundamental::epipolar_row;
+use cv_core::{Matrix3, Point2};
+use cv_numeric::{null_space, real_roots};
+
+/// A polynomial of degree one in x, y, z: coefficients of x, y, z, 1.
+type Linear = [f64; 4];
+/// Of degree two: x², xy, y², xz, yz, z², x, y, z, 1.
+type Quadratic = [f64; 10];
+/// Of degree three, in the order that the elimination needs: x³, y³, x²y, xy², x²z, x², y²z, y², xyz, xy, then xz², xz, x, yz², yz,
+/// y, z³, z², z, 1.
+type Cubic = [f64; 20];
+
+/// The essential matrices (at most ten) with `bᵢᵀ E aᵢ = 0` for five matches in normalised coordinates, each of
+/// Frobenius norm √2 (singular values 1, 1, 0).
+///
+/// Calls `found` for each; for none where the points are degenerate. Nistér, "An efficient solution to the five-point relative pose
+/// problem", 2004: null space, ten cubics, elimination, the real roots of a polynomial of degree ten.
+#[inline]
+pub fn essential_five_point(a: &[Point2<f64>; 5], b: &[Point2<f64>; 5], mut found: impl FnMut(Matrix3<f64>)) {
+    let rows = std::array::from_fn(|i| epipolar_row(a[i], b[i]));
+    let Some(mut basis) = null_space::<5, 9, 4>(rows) else { return };
+    orthonormalize(&mut basis);
+    let Some(reduced) = eliminate(constraints(&basis)) else { return };
+    // Three equations in (x, y, 1) with polynomials of z for coefficients: pairs of rows of which the second, times z, takes
+    // the leading monomial away from the first.
+    let mut x = [[0.0; 4]; 3];
+    let mut y = [[0.0; 4]; 3];
+    let mut one = [[0.0; 5]; 3];
+    for i in 0..3 {
+        let (e, f) = (&reduced[2 * i], &reduced[2 * i + 1]);
+        x[i] = [e[2], e[1] - f[2], e[0] - f[1], -f[0]];
+        y[i] = [e[5], e[4] - f[5], e[3] - f[4], -f[3]];
+        one[i] = [e[9], e[8] - f[9], e[7] - f[8], e[6] - f[7], -f[6]];
+    }
+    // The determinant, by the third column.
+    let mut determinant = [0.0; 11];
+    for (i, third) in one.iter().enumerate() {
+        let (j, k) = ((i + 1) % 3, (i + 2) % 3);
+        let mut minor = [0.0; 7];
+        for p in 0..4 {
+            for q in 0..4 {
+                minor[p + q] += x[j][p] * y[k][q] - x[k][p] * y[j][q];
+            }
+        }
+        for p in 0..7 {
+            for q in 0..5 {
+                determinant[p + q] += minor[p] * third[q];
+            }
+        }
+    }
+    for &z in real_roots(&determinant).iter() {
+        let at = |c: &[f64]| c.iter().rev().fold(0.0, |s, c| s * z + c);
+        let row = |i: usize| nalgebra::Vector3::new(at(&x[i]), at(&y[i]), at(&one[i]));
+        let r = [row(0), row(1), row(2)];
+        // (x, y, 1) is perpendicular to the rows: the longest of their cross products.
+        let mut best = r[0].cross(&r[1]);
+        for c in [r[1].cross(&r[2]), r[2].cross(&r[0])] {
+            if c.norm_squared() > best.norm_squared() {
+                best = c;
+            }
+        }
+        let (px, py) = (best.x / best.z, best.y / best.z);
+        let e = Matrix3::from_fn(|i, j| {
+            let k = 3 * i + j;
+            px * basis[0][k] + py * basis[1][k] + z * basis[2][k] + basis[3][k]
+        });
+        let norm = e.norm();
+        if norm.is_finite() && norm > 0.0 {
+            found(e * (std::f64::consts::SQRT_2 / norm));
+        }
+    }
+}
+
+/// Gram and Schmidt's method. The coefficients of the cubics are products of three entries: a basis of uneven lengths or small
+/// angles costs three times its digits.
+#[inline]
+fn orthonormalize(basis: &mut [[f64; 9]; 4]) {
+    for i in 0..4 {
+        let (done, rest) = basis.split_at_mut(i);
+        let v = &mut rest[0];
+        for u in done.iter() {
+            let dot: f64 = u.iter().zip(v.iter()).map(|(a, b)| a * b).sum();
+            v.iter_mut().zip(u).for_each(|(a, b)| *a -= dot * b);
+        }
+        let inverse = 1.0 / v.iter().map(|a| a * a).sum::<f64>().sqrt();
+        v.iter_mut().for_each(|a| *a *= inverse);
+    }
+}
+
+#[inline]
+fn times(a: &Linear, b: &Linear) -> Quadratic {
+    [
+        a[0] * b[0],
+        a[0] * b[1] + a[1] * b[0],
+        a[1] * b[1],
+        a[0] * b[2] + a[2] * b[0],
+        a[1] * b[2] + a[2] * b[1],
+        a[2] * b[2],
+        a[0] * b[3] + a[3] * b[0],
+        a[1] * b[3] + a[3] * b[1],
+        a[2] * b[3] + a[3] * b[2],
+        a[3] * b[3],
+    ]
+}
+
+#[inline]
+fn times_linear(q: &Quadratic, b: &Linear) -> Cubic {
+    [
+        q[0] * b[0],
+        q[2] * b[1],
+        q[0] * b[1] + q[1] * b[0],
+        q[1] * b[1] + q[2] * b[0],
+        q[0] * b[2] + q[3] * b[0],
+        q[0] * b[3] + q[6] * b[0],
+        q[2] * b[2] + q[4] * b[1],
+        q[2] * b[3] + q[7] * b[1],
+        q[1] * b[2] + q[3] * b[1] + q[4] * b[0],
+        q[1] * b[3] + q[6] * b[1] + q[7] * b[0],
+        q[3] * b[2] + q[5] * b[0],
+        q[3] * b[3] + q[6] * b[2] + q[8] * b[0],
+        q[6] * b[3] + q[9] * b[0],
+        q[4] * b[2] + q[5] * b[1],
+        q[4] * b[3] + q[7] * b[2] + q[8] * b[1],
+        q[7] * b[3] + q[9] * b[1],
+        q[5] * b[2],
+        q[5] * b[3] + q[8] * b[2],
+        q[8] * b[3] + q[9] * b[2],
+        q[9] * b[3],
+    ]
+}
+
+#[inline]
+fn add<const N: usize>(a: &mut [f64; N], b: &[f64; N]) {
+    for (x, y) in a.iter_mut().zip(b) {
+        *x += y;
+    }
+}
+
+/// `(E Eᵀ − ½ tr(E Eᵀ)) E = 0` and `det E = 0` for `E = x e₀ + y e₁ + z e₂ + e₃`, as ten cubics.
+#[inline]
+fn constraints(basis: &[[f64; 9]; 4]) -> [Cubic; 10] {
+    let entry = |i: usize, j: usize| -> Linear { std::array::from_fn(|k| basis[k][3 * i + j]) };
+    let e: [[Linear; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|j| entry(i, j)));
+    // E Eᵀ by its upper triangle: 00, 01, 02, 11, 12, 22.
+    let dot = |i: usize, j: usize| {
+        let mut sum = times(&e[i][0], &e[j][0]);
+        add(&mut sum, &times(&e[i][1], &e[j][1]));
+        add(&mut sum, &times(&e[i][2], &e[j][2]));
+        sum
+    };
+    let mut gram = [dot(0, 0), dot(0, 1), dot(0, 2), dot(1, 1), dot(1, 2), dot(2, 2)];
+    let half_trace: Quadratic = std::array::from_fn(|k| 0.5 * (gram[0][k] + gram[3][k] + gram[5][k]));
+    for d in [0, 3, 5] {
+        for k in 0..10 {
+            gram[d][k] -= half_trace[k];
+        }
+    }
+    const INDEX: [[usize; 3]; 3] = [[0, 1, 2], [1, 3, 4], [2, 4, 5]];
+    let mut rows = [[0.0; 20]; 10];
+    for i in 0..3 {
+        for j in 0..3 {
+            let row = &mut rows[3 * i + j];
+            *row = times_linear(&gram[INDEX[i][0]], &e[0][j]);
+            add(row, &times_linear(&gram[INDEX[i][1]], &e[1][j]));
+            add(row, &times_linear(&gram[INDEX[i][2]], &e[2][j]));
+        }
+    }
+    // The determinant by the first row.
+    for j in 0..3 {
+        let (k, l) = ((j + 1) % 3, (j + 2) % 3);
+        let mut minor = times(&e[1][k], &e[2][l]);
+        let other = times(&e[1][l], &e[2][k]);
+        for (m, o) in minor.iter_mut().zip(other) {
+            *m -= o;
+        }
+        add(&mut rows[9], &times_linear(&minor, &e[0][j]));
+    }
+    rows
+}
+
+/// Gauss–Jordan elimination of the first ten columns; of the last six rows, the remaining ten columns. `None` where a pivot vanishes.
+#[inline]
+fn eliminate(mut rows: [Cubic; 10]) -> Option<[[f64; 10]; 6]> {
+    for c in 0..10 {
+        let mut pivot = c;
+        for r in c + 1..10 {
+            if rows[r][c].abs() > rows[pivot][c].abs() {
+                pivot = r;
+            }
+        }
+        rows.swap(c, pivot);
+        let lead = rows[c][c];
+        // Also where it is NaN.
+        if lead.is_nan() || lead == 0.0 {
+            return None;
+        }
+        let inverse = 1.0 / lead;
+        let mut row = rows[c];
+        for v in &mut row[c..] {
+            *v *= inverse;
+        }
+        rows[c] = row;
+        // Rows above the fifth are not used: they only take part going down.
+        for (r, other) in rows.iter_mut().enumerate().skip(4) {
+            if r > c || (r < c && c > 4) {
+                let factor = other[c];
+                for (v, p) in other[c..].iter_mut().zip(&row[c..]) {
+                    *v -= factor * p;
+                }
+            }
+        }
+        for other in rows.iter_mut().take(4).skip(c + 1) {
+            let factor = other[c];
+            for (v, p) in other[c..].iter_mut().zip(&row[c..]) {
+                *v -= factor * p;
+            }
+        }
+    }
+    Some(std::array::from_fn(|i| std::array::from_fn(|j| rows[4 + i][10 + j])))
+}
