@@ -20,6 +20,7 @@
 //! * Thresholds and residuals are in the unit of the matches, that is, pixels.
 //! * The same matches, options and seed give the same bytes on any number of threads and with any vector unit.
 
+mod bundle;
 mod epipolar;
 mod error;
 mod essential;
@@ -30,7 +31,9 @@ mod ransac;
 mod robust;
 #[cfg(test)]
 mod testing;
+mod triangulation;
 
+pub use bundle::{BundleOptions, BundleReport, TwoViewBundle, adjust_two_views};
 pub use epipolar::sampson;
 pub use error::{Degeneracy, EstimateError};
 pub use essential::{
@@ -47,3 +50,4 @@ pub use ransac::{
     ransac,
 };
 pub use robust::RobustModel;
+pub use triangulation::{TriangulationError, correct_match, parallax_angle, triangulate, triangulate_linear};
