@@ -26,12 +26,15 @@
 //! * The same input, options and seed give the same result at any number of threads.
 
 mod depth;
+mod estimate;
 mod matching;
 mod panorama;
 mod progress;
 mod stopwatch;
 
+pub use cv_geometry::{EstimateError, RobustModel, RobustOptions};
 pub use depth::{DepthError, DepthOptions, DepthResult, depth};
+pub use estimate::{EstimateResult, ModelKind, estimate};
 pub use matching::{
     FeatureMethod, MatchingError, MatchingOptions, MatchingResult, PhotoFeatures, correspondences, extract_features,
     match_features, match_photos,

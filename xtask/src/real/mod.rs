@@ -4,6 +4,7 @@
 //! A figure that is off its bar fails the run; so does an error. Jobs print what else a person wants to see.
 
 pub(crate) mod depth;
+mod estimate;
 
 use anyhow::{Result, bail};
 use std::{path::Path, time::Instant};
@@ -11,7 +12,7 @@ use std::{path::Path, time::Instant};
 /// A job: its name on the command line and what it does.
 type Job = (&'static str, fn(&Path) -> Result<Vec<Check>>);
 
-const JOBS: &[Job] = &[("depth", depth::run)];
+const JOBS: &[Job] = &[("depth", depth::run), ("estimate", estimate::run)];
 
 /// A figure and the bar it is held against.
 #[derive(Debug, Clone, PartialEq)]
