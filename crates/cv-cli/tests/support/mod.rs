@@ -129,3 +129,77 @@ pub(crate) fn write_cmyk(path: &Path, image: &RgbU8) {
     jpeg_encoder::Encoder::new(&mut bytes, 95).encode(&inks, width, height, jpeg_encoder::ColorType::Cmyk).unwrap();
     fs::write(path, bytes).unwrap();
 }
+
+/// A command that takes pictures: how to call it and what it writes.
+pub(crate) struct Job {
+    /// For messages.
+    pub(crate) name: &'static str,
+    /// The fixtures it is given, in order.
+    pub(crate) inputs: &'static [&'static str],
+    /// The arguments, `{0}` standing for the first input and so on. Paths are relative to the folder it runs in.
+    pub(crate) args: &'static str,
+    /// The files it writes.
+    pub(crate) outputs: &'static [&'static str],
+}
+
+impl Job {
+    /// The arguments for these input files.
+    pub(crate) fn args(&self, inputs: &[String]) -> Vec<String> {
+        let fill = |word: &str| {
+            inputs.iter().enumerate().fold(word.to_owned(), |text, (i, input)| text.replace(&format!("{{{i}}}"), input))
+        };
+        self.args.split_whitespace().map(fill).collect()
+    }
+
+    /// The pictures of the inputs.
+    pub(crate) fn pictures(&self) -> Vec<RgbU8> {
+        self.inputs.iter().map(|name| cv_io::read_rgb(fixture(name)).unwrap()).collect()
+    }
+
+    /// A folder in which the job can run, and the names of the inputs in it.
+    pub(crate) fn folder(&self) -> (tempfile::TempDir, Vec<String>) {
+        let folder = tempfile::tempdir().unwrap();
+        let names = self.inputs.iter().enumerate().map(|(i, name)| {
+            let copy = format!("in{i}.{}", name.rsplit('.').next().unwrap());
+            fs::copy(fixture(name), folder.path().join(&copy)).unwrap();
+            copy
+        });
+        let names = names.collect();
+        self.prepare(folder.path());
+        (folder, names)
+    }
+
+    /// What the job needs beside its pictures.
+    pub(crate) fn prepare(&self, folder: &Path) {
+        if self.args.contains("model.json") && !self.args.contains("train") {
+            train(folder);
+        }
+    }
+
+    /// The bytes of all outputs.
+    pub(crate) fn written(&self, folder: &Path) -> Vec<Vec<u8>> {
+        let read = |name: &&str| fs::read(folder.join(name)).unwrap_or_else(|e| panic!("{}: {name}: {e}", self.name));
+        self.outputs.iter().map(read).collect()
+    }
+}
+
+/// A file under `fixtures/` at the root of the workspace.
+pub(crate) fn fixture(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../fixtures").join(name)
+}
+
+/// Borrows, as the program's arguments.
+pub(crate) fn strs(args: &[String]) -> Vec<&str> {
+    args.iter().map(String::as_str).collect()
+}
+
+/// The commands that take pictures.
+pub(crate) const JOBS: &[Job] = &[Job {
+    name: "depth",
+    inputs: &["stereo/left.jpg", "stereo/right.jpg"],
+    args: "depth {0} {1} -o d.pfm --disparities 32 --focal 230 --baseline 0.06 --depth depth.pfm --cloud cloud.ply",
+    outputs: &["d.pfm", "depth.pfm", "cloud.ply"],
+}];
+
+/// Trains `model.json` in a folder.
+pub(crate) fn train(_folder: &Path) {}

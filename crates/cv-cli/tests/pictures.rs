@@ -1,0 +1,154 @@
+//! Every command that takes pictures, given good, odd and broken files.
+
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
+
+mod support;
+
+use cv_core::{GrayU8, Image, RgbU8};
+use std::fs;
+use support::{JOBS, done, refused, run, snapshot, strs, write_broken, write_cmyk, write_dressed};
+
+#[test]
+fn a_file_that_is_no_picture_is_named_and_refused() {
+    for job in JOBS {
+        let (folder, good) = job.folder();
+        let broken = write_broken(folder.path(), &job.pictures()[0]);
+        let before = snapshot(folder.path());
+        for bad in &broken {
+            for place in 0..good.len() {
+                let mut inputs = good.clone();
+                inputs[place].clone_from(bad);
+                let ran = refused(folder.path(), &strs(&job.args(&inputs)));
+                assert!(ran.stderr.contains(bad.as_str()), "{}: {bad} as input {place}: {}", job.name, ran.stderr);
+                assert_eq!(snapshot(folder.path()), before, "{}: {bad} as input {place} left files", job.name);
+            }
+        }
+    }
+}
+
+#[test]
+fn the_same_picture_in_another_file_format_gives_the_same_bytes() {
+    for job in JOBS {
+        let (folder, _) = job.folder();
+        let pictures = job.pictures();
+        let dressed: Vec<Vec<String>> = pictures
+            .iter()
+            .enumerate()
+            .map(|(i, picture)| write_dressed(folder.path(), &format!("in{i}"), picture))
+            .collect();
+        let mut expected = None;
+        for dress in 0..dressed[0].len() {
+            let inputs: Vec<String> = dressed.iter().map(|names| names[dress].clone()).collect();
+            done(folder.path(), &strs(&job.args(&inputs)));
+            let written = job.written(folder.path());
+            // The first is the plain PNG.
+            let expected = expected.get_or_insert_with(|| written.clone());
+            assert!(*expected == written, "{}: {} differs from the plain PNG", job.name, inputs[0]);
+        }
+    }
+}
+
+#[test]
+fn grey_and_cmyk_pictures_are_taken() {
+    for job in JOBS {
+        let (folder, _) = job.folder();
+        for (kind, ending) in [("grey", "png"), ("grey16", "png"), ("cmyk", "jpg")] {
+            // A colour model cannot tell a grey ball from a grey floor; all else works on brightness.
+            if job.name.starts_with("segment") && kind != "cmyk" {
+                continue;
+            }
+            let mut inputs = Vec::new();
+            for (i, picture) in job.pictures().iter().enumerate() {
+                let name = format!("{kind}{i}.{ending}");
+                let path = folder.path().join(&name);
+                let grey: GrayU8 =
+                    picture.map(|[r, g, b]| [((u32::from(r) + 2 * u32::from(g) + u32::from(b)) / 4) as u8]);
+                match kind {
+                    "grey" => cv_io::write_png(&path, grey.view()).unwrap(),
+                    "grey16" => cv_io::write_png(&path, grey.map(|[v]| [u16::from(v) * 257]).view()).unwrap(),
+                    _ => write_cmyk(&path, picture),
+                }
+                inputs.push(name);
+            }
+            done(folder.path(), &strs(&job.args(&inputs)));
+            job.written(folder.path());
+        }
+    }
+}
+
+#[test]
+fn tiny_and_featureless_pictures_get_an_answer() {
+    let noise = |w, h| RgbU8::from_fn(w, h, |x, y| [(x * 97 + y * 57) as u8, (x * y * 31) as u8, (x * 13 + y) as u8]);
+    let odd: [(&str, RgbU8); 7] = [
+        ("one.png", RgbU8::new(1, 1, [90, 120, 30])),
+        ("two.png", noise(2, 2)),
+        ("row.png", noise(300, 1)),
+        ("column.png", noise(1, 300)),
+        ("small.png", noise(9, 7)),
+        ("black.png", RgbU8::new(64, 48, [0; 3])),
+        ("white.png", RgbU8::new(240, 180, [255; 3])),
+    ];
+    for job in JOBS {
+        let (folder, good) = job.folder();
+        for (name, picture) in &odd {
+            cv_io::write_png(folder.path().join(name), picture.view()).unwrap();
+            // All inputs odd, then one of them.
+            for place in 0..=good.len() {
+                let mut inputs = good.clone();
+                match inputs.get_mut(place) {
+                    Some(input) => input.clone_from(&(*name).to_owned()),
+                    None => inputs.fill((*name).to_owned()),
+                }
+                // `run` holds that the program does not stop at a bug of its own.
+                let ran = run(folder.path(), &strs(&job.args(&inputs)));
+                assert_ne!(ran.code, Some(2), "{}: {name} is no matter of usage: {}", job.name, ran.stderr);
+                if ran.code == Some(1) {
+                    assert!(ran.stderr.contains("error: "), "{}: {name}: {}", job.name, ran.stderr);
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn a_picture_that_lies_about_its_turn_or_ends_in_rubbish_is_still_read() {
+    for job in JOBS {
+        let (folder, good) = job.folder();
+        done(folder.path(), &strs(&job.args(&good)));
+        let expected = job.written(folder.path());
+        for name in &good {
+            let path = folder.path().join(name);
+            let mut bytes = fs::read(&path).unwrap();
+            bytes.extend_from_slice(b"rubbish after the end");
+            fs::write(&path, bytes).unwrap();
+        }
+        done(folder.path(), &strs(&job.args(&good)));
+        assert!(job.written(folder.path()) == expected, "{}", job.name);
+    }
+}
+
+#[test]
+fn names_with_spaces_and_other_scripts_work() {
+    for job in JOBS {
+        let (folder, good) = job.folder();
+        let mut inputs = Vec::new();
+        for name in &good {
+            let odd = format!("Überfahrt № 1 – {name}");
+            fs::rename(folder.path().join(name), folder.path().join(&odd)).unwrap();
+            inputs.push(odd);
+        }
+        done(folder.path(), &strs(&job.args(&inputs)));
+    }
+}
+
+#[test]
+fn a_fully_transparent_picture_is_read_by_its_colours() {
+    let clear: Image<u8, 4> = Image::new(32, 32, [10, 20, 30, 0]);
+    for job in JOBS {
+        let (folder, good) = job.folder();
+        cv_io::write_png(folder.path().join("clear.png"), clear.view()).unwrap();
+        let mut inputs = good.clone();
+        inputs[0] = "clear.png".to_owned();
+        run(folder.path(), &strs(&job.args(&inputs)));
+    }
+}
