@@ -11,45 +11,15 @@ pub(crate) fn fill_holes(disparity: &mut [f32], states: &[PixelState], width: us
     if width == 0 || height == 0 {
         return;
     }
+    // Down with the rays from the left and from above, up with the other four, at the same time.
+    let (mut down, mut up) =
+        rayon::join(|| rays(disparity, width, height, false), || rays(disparity, width, height, true));
+    up.reverse();
     let holes: Vec<u32> = (0..disparity.len()).filter(|&i| disparity[i].is_nan()).map(|i| i as u32).collect();
-    let mut rays = vec![[f32::NAN; 8]; holes.len()];
-    // Down with the rays from the left and from above, then up with the other four. A row of `reach` holds what the
-    // row before saw at each column along the three slanted or vertical rays.
-    for (pass, first_ray) in [(0, 0), (1, 4)] {
-        let mut reach = vec![[f32::NAN; 3]; width];
-        let mut next = reach.clone();
-        let mut hole = if pass == 0 { 0 } else { holes.len() };
-        for row in 0..height {
-            let y = if pass == 0 { row } else { height - 1 - row };
-            let mut beside = f32::NAN;
-            for column in 0..width {
-                let x = if pass == 0 { column } else { width - 1 - column };
-                let i = y * width + x;
-                let seen = if disparity[i].is_nan() {
-                    let seen = [
-                        if x > 0 { reach[x - 1][0] } else { f32::NAN },
-                        reach[x][1],
-                        if x + 1 < width { reach[x + 1][2] } else { f32::NAN },
-                    ];
-                    if pass == 1 {
-                        hole -= 1;
-                    }
-                    rays[hole][first_ray] = beside;
-                    rays[hole][first_ray + 1..first_ray + 4].copy_from_slice(&seen);
-                    if pass == 0 {
-                        hole += 1;
-                    }
-                    seen
-                } else {
-                    beside = disparity[i];
-                    [disparity[i]; 3]
-                };
-                next[x] = seen;
-            }
-            std::mem::swap(&mut reach, &mut next);
-        }
-    }
-    for (&i, mut seen) in holes.iter().zip(rays) {
+    for ((&i, down), up) in holes.iter().zip(down.drain(..)).zip(up) {
+        let [a, b, c, d] = down;
+        let [e, f, g, h] = up;
+        let mut seen = [a, b, c, d, e, f, g, h];
         // NaN sorts behind every number.
         seen.sort_unstable_by(f32::total_cmp);
         let n = seen.iter().filter(|v| !v.is_nan()).count();
@@ -62,9 +32,54 @@ pub(crate) fn fill_holes(disparity: &mut [f32], states: &[PixelState], width: us
     }
 }
 
+/// What each hole sees along four rays, of the holes in order: from beside, and from the row before straight and along
+/// both diagonals. From the bottom right with all rays turned round where `mirrored`.
+fn rays(disparity: &[f32], width: usize, height: usize, mirrored: bool) -> Vec<[f32; 4]> {
+    let mut found = Vec::new();
+    // What the row before saw at each column along the three rays, with a column of nothing on both sides.
+    let mut behind = vec![f32::NAN; width + 2];
+    let mut straight = behind.clone();
+    let mut ahead = behind.clone();
+    let mut next = behind.clone();
+    let keep = |d: f32, ray: f32| if d.is_nan() { ray } else { d };
+    for step in 0..height {
+        let y = if mirrored { height - 1 - step } else { step };
+        let row = &disparity[y * width..][..width];
+        let update = |next: &mut [f32], from: &[f32]| {
+            for ((n, &d), &ray) in next[1..=width].iter_mut().zip(row).zip(from) {
+                *n = keep(d, ray);
+            }
+        };
+        // In the mirrored sense the pixel behind is the one to the right.
+        let (left, right) = (0, 2);
+        let (from_behind, from_ahead) = if mirrored { (right, left) } else { (left, right) };
+        update(&mut next, &behind[from_behind..]);
+        std::mem::swap(&mut behind, &mut next);
+        update(&mut next, &straight[1..]);
+        std::mem::swap(&mut straight, &mut next);
+        update(&mut next, &ahead[from_ahead..]);
+        std::mem::swap(&mut ahead, &mut next);
+        let mut beside = f32::NAN;
+        let mut visit = |x: usize, d: f32| {
+            if d.is_nan() {
+                found.push([beside, behind[x + 1], straight[x + 1], ahead[x + 1]]);
+            } else {
+                beside = d;
+            }
+        };
+        if mirrored {
+            row.iter().enumerate().rev().for_each(|(x, &d)| visit(x, d));
+        } else {
+            row.iter().enumerate().for_each(|(x, &d)| visit(x, d));
+        }
+    }
+    found
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use proptest::prelude::*;
 
     #[test]
     fn an_occluded_hole_takes_the_background_and_a_mismatch_the_median() {
@@ -80,6 +95,40 @@ mod tests {
         states[2 * width + 4] = PixelState::Mismatched;
         fill_holes(&mut mismatch, &states, width, height);
         assert_eq!(mismatch[2 * width + 4], 9.0);
+    }
+
+    proptest! {
+        #[test]
+        fn the_sweeps_see_what_rays_walked_one_by_one_see(
+            width in 1usize..12,
+            values in proptest::collection::vec(prop_oneof![(0..9i32).prop_map(|v| v as f32), Just(f32::NAN)], 0..120),
+        ) {
+            let height = values.len() / width;
+            let d = &values[..width * height];
+            let holes: Vec<usize> = (0..d.len()).filter(|&i| d[i].is_nan()).collect();
+            let walk = |i: usize, (dx, dy): (i32, i32)| {
+                let (mut x, mut y) = ((i % width) as i32 + dx, (i / width) as i32 + dy);
+                while x >= 0 && y >= 0 && x < width as i32 && y < height as i32 {
+                    let value = d[y as usize * width + x as usize];
+                    if !value.is_nan() {
+                        return value.to_bits();
+                    }
+                    (x, y) = (x + dx, y + dy);
+                }
+                f32::NAN.to_bits()
+            };
+            for (mirrored, sign) in [(false, -1), (true, 1)] {
+                let mut found = rays(d, width, height, mirrored);
+                if mirrored {
+                    found.reverse();
+                }
+                prop_assert_eq!(found.len(), holes.len());
+                for (&i, seen) in holes.iter().zip(found) {
+                    let expected = [(sign, 0), (sign, sign), (0, sign), (-sign, sign)].map(|step| walk(i, step));
+                    prop_assert_eq!(seen.map(f32::to_bits), expected);
+                }
+            }
+        }
     }
 
     #[test]

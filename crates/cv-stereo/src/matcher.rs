@@ -4,8 +4,9 @@ use crate::census::{Grey, census, census_mirrored, planes};
 use crate::input::to_grey;
 use crate::kernel::Frame;
 use crate::sgm::{Aggregator, blocks};
+use crate::speckle::{Speckles, remove_speckles};
 use crate::winner::{NO_SUM, Winner, outside_cost, p2_table};
-use crate::{Intensity, Paths, StereoError, StereoOptions, Subpixel, fill, median, speckle};
+use crate::{Intensity, Paths, StereoError, StereoOptions, Subpixel, fill, median};
 use cv_core::{GrayF32, Image, ImageView, Sample};
 use fearless_simd::Level;
 use rayon::prelude::*;
@@ -85,7 +86,7 @@ pub struct StereoMatcher {
     grey8: Vec<u8>,
     census: [Vec<Vec<u8>>; 2],
     aggregator: Aggregator,
-    labels: Vec<u32>,
+    speckles: Speckles,
     scratch: Vec<f32>,
 }
 
@@ -103,7 +104,7 @@ impl StereoMatcher {
             grey8: Vec::new(),
             census: Default::default(),
             aggregator: Aggregator::default(),
-            labels: Vec::new(),
+            speckles: Speckles::default(),
             scratch: Vec::new(),
         })
     }
@@ -250,7 +251,7 @@ impl StereoMatcher {
         let (width, height) = map.disparity.size();
         let options = &self.options;
         let disparity = map.disparity.as_mut_slice();
-        speckle::remove_speckles(disparity, width, options.speckle_size, options.speckle_range, &mut self.labels);
+        remove_speckles(disparity, width, options.speckle_size, options.speckle_range, &mut self.speckles);
         for (state, d) in map.state.as_mut_slice().iter_mut().zip(disparity.iter()) {
             if *state == PixelState::Matched && d.is_nan() {
                 *state = PixelState::Mismatched;
@@ -260,7 +261,7 @@ impl StereoMatcher {
             fill::fill_holes(disparity, map.state.as_slice(), width, height);
         }
         if options.median > 0 {
-            median::median(disparity, width, height, options.median, &mut self.scratch);
+            median::median(self.level, disparity, width, options.median, &mut self.scratch);
             disparity.copy_from_slice(&self.scratch);
         }
     }

@@ -1,35 +1,83 @@
 //! Removal of small patches that agree only with themselves.
 
+/// Memory of [`remove_speckles`], kept between frames.
+#[derive(Debug, Default)]
+pub(crate) struct Speckles {
+    /// Run that each pixel of the row before belongs to, and of this row.
+    runs: [Vec<u32>; 2],
+    /// Parent of each run; a root is its own.
+    parents: Vec<u32>,
+    /// Pixels of each run, later of each patch.
+    sizes: Vec<u32>,
+    /// Where each run starts.
+    starts: Vec<u32>,
+}
+
 /// Sets to NaN every 4-connected patch of at most `max_size` pixels whose neighbours differ by no more than `range`.
 ///
-/// One scan that joins runs into a forest of labels (union–find with path halving), one that counts, one that clears:
-/// linear in the number of pixels.
-pub(crate) fn remove_speckles(disparity: &mut [f32], width: usize, max_size: usize, range: f32, labels: &mut Vec<u32>) {
+/// Runs of each row are joined into a forest (union–find with path halving), counted, and the small ones cleared: linear
+/// in the number of pixels.
+pub(crate) fn remove_speckles(
+    disparity: &mut [f32],
+    width: usize,
+    max_size: usize,
+    range: f32,
+    Speckles { runs, parents, sizes, starts }: &mut Speckles,
+) {
     if width == 0 || max_size == 0 || disparity.is_empty() {
         return;
     }
-    labels.clear();
-    labels.extend(0..disparity.len() as u32);
-    for i in 0..disparity.len() {
-        let d = disparity[i];
-        // NaN compares false: invalid pixels stay alone.
-        if i % width > 0 && (d - disparity[i - 1]).abs() <= range {
-            join(labels, i as u32 - 1, i as u32);
+    parents.clear();
+    sizes.clear();
+    starts.clear();
+    let [above, here] = runs;
+    above.resize(width, 0);
+    here.resize(width, 0);
+    let mut row_above: &[f32] = &[];
+    for (y, row) in disparity.chunks_exact(width).enumerate() {
+        // NaN compares false: invalid pixels are runs of their own.
+        let mut last = f32::NAN;
+        let mut first = 0;
+        for (x, (&d, run)) in row.iter().zip(here.iter_mut()).enumerate() {
+            if (d - last).abs() <= range {
+                *run = parents.len() as u32 - 1;
+            } else {
+                if x > 0 {
+                    sizes.push((x - first) as u32);
+                }
+                first = x;
+                *run = parents.len() as u32;
+                starts.push((y * width + x) as u32);
+                parents.push(*run);
+            }
+            last = d;
         }
-        if i >= width && (d - disparity[i - width]).abs() <= range {
-            join(labels, (i - width) as u32, i as u32);
+        sizes.push((width - first) as u32);
+        let mut joined = (u32::MAX, u32::MAX);
+        for (((&d, &up), &a), &b) in row.iter().zip(row_above).zip(above.iter()).zip(here.iter()) {
+            if (a, b) != joined && (d - up).abs() <= range {
+                join(parents, a, b);
+                joined = (a, b);
+            }
+        }
+        std::mem::swap(above, here);
+        row_above = row;
+    }
+    // Roots have the smallest index of their patch: counting from the end, every run is complete when it is added.
+    for run in (0..parents.len()).rev() {
+        let up = parents[run] as usize;
+        if up != run {
+            sizes[up] += sizes[run];
         }
     }
-    // Roots are the smallest index of their patch, so a root is seen before its members: sizes fit in one pass.
-    let mut sizes = vec![0u32; disparity.len()];
-    for i in 0..labels.len() {
-        let root = find(labels, i as u32);
-        labels[i] = root;
-        sizes[root as usize] += 1;
-    }
-    for (d, &root) in disparity.iter_mut().zip(labels.iter()) {
-        if sizes[root as usize] as usize <= max_size {
-            *d = f32::NAN;
+    let lengths = |run: usize| starts.get(run + 1).map_or(disparity.len(), |&s| s as usize);
+    let ends: Vec<usize> = (0..parents.len()).map(lengths).collect();
+    for run in 0..parents.len() {
+        // Parents come before children, so theirs is the size of the patch by now.
+        let up = parents[run] as usize;
+        sizes[run] = sizes[up];
+        if sizes[run] as usize <= max_size {
+            disparity[starts[run] as usize..ends[run]].fill(f32::NAN);
         }
     }
 }
@@ -46,8 +94,7 @@ fn find(labels: &mut [u32], mut i: u32) -> u32 {
 fn join(labels: &mut [u32], a: u32, b: u32) {
     let (a, b) = (find(labels, a), find(labels, b));
     // The smaller index becomes the root, whatever the order of the joins.
-    let (low, high) = (a.min(b), a.max(b));
-    labels[high as usize] = low;
+    labels[a.max(b) as usize] = a.min(b);
 }
 
 #[cfg(test)]
@@ -102,7 +149,7 @@ mod tests {
             let rows = values.len() / width;
             let mut d = values[..rows * width].to_vec();
             let keep = plain(&d, width, max_size, 1.0);
-            remove_speckles(&mut d, width, max_size, 1.0, &mut Vec::new());
+            remove_speckles(&mut d, width, max_size, 1.0, &mut Speckles::default());
             for (v, k) in d.iter().zip(keep) {
                 prop_assert_eq!(!v.is_nan(), k);
             }
