@@ -55,18 +55,10 @@ impl Frame<'_> {
     /// winning or lending to their neighbours, since additions saturate.
     #[inline(always)]
     fn costs<S: Simd>(&self, simd: S, x: usize, y: usize, out: &mut [u8]) {
-        let start = y * Self::right_stride(self.width, self.blocks) + self.width - 1 - x;
-        let pixel = y * self.width + x;
-        for (plane, (left, right)) in self.left.iter().zip(self.right).enumerate() {
-            let bits = S::u8s::splat(simd, left[pixel]);
-            let row = &right[start..start + out.len()];
-            for (sum, candidates) in out.chunks_exact_mut(S::u8s::LEN).zip(row.chunks_exact(S::u8s::LEN)) {
-                let mut count = (S::u8s::from_slice(simd, candidates) ^ bits).count_ones();
-                if plane > 0 {
-                    count += S::u8s::from_slice(simd, sum);
-                }
-                count.store_slice(sum);
-            }
+        match self.left.len() {
+            3 => self.hamming::<S, 3>(simd, x, y, out),
+            6 => self.hamming::<S, 6>(simd, x, y, out),
+            _ => self.hamming::<S, 8>(simd, x, y, out),
         }
         // The column in the right image falls with the index: at first it may lie right of the image, at last left.
         let column = x as i64 - self.min_disparity;
@@ -79,6 +71,33 @@ impl Frame<'_> {
             out[inside.end..self.disparities].fill(self.outside);
         }
         out[self.disparities..].fill(u8::MAX);
+    }
+}
+
+impl Frame<'_> {
+    /// Number of census bits in which pixel `(x, y)` and each of its candidates differ, over `PLANES` bytes.
+    #[inline(always)]
+    fn hamming<S: Simd, const PLANES: usize>(&self, simd: S, x: usize, y: usize, out: &mut [u8]) {
+        let start = y * Self::right_stride(self.width, self.blocks) + self.width - 1 - x;
+        let pixel = y * self.width + x;
+        let depth = out.len();
+        // Plain loops: closures of `from_fn` are not always inlined, and then lose the instruction set.
+        let mut bits = [S::u8s::splat(simd, 0); PLANES];
+        let mut rows: [&[u8]; PLANES] = [&[]; PLANES];
+        for p in 0..PLANES {
+            bits[p] = S::u8s::splat(simd, self.left[p][pixel]);
+            rows[p] = &self.right[p][start..start + depth];
+        }
+        let mut at = 0;
+        while at < depth {
+            let part = at..at + S::u8s::LEN;
+            let mut count = (S::u8s::from_slice(simd, &rows[0][part.clone()]) ^ bits[0]).count_ones();
+            for p in 1..PLANES {
+                count += (S::u8s::from_slice(simd, &rows[p][part.clone()]) ^ bits[p]).count_ones();
+            }
+            count.store_slice(&mut out[part]);
+            at += S::u8s::LEN;
+        }
     }
 }
 
@@ -164,8 +183,9 @@ fn rows<S: Simd, const PATHS: usize>(
     let depth = frame.blocks * BLOCK;
     let groups = frame.blocks.div_ceil(2);
     let Sweep { mirrored, rows, least, along, along_least, cost, sums, keys } = sweep;
-    let [behind, straight, ahead] = rows.each_mut().map(Aligned::as_mut_slice);
-    let [behind_least, straight_least, ahead_least] = least.each_mut().map(Vec::as_mut_slice);
+    let [behind, straight, ahead] = rows;
+    let (behind, straight, ahead) = (behind.as_mut_slice(), straight.as_mut_slice(), ahead.as_mut_slice());
+    let [behind_least, straight_least, ahead_least] = least;
     let (along, cost, sums) = (along.as_mut_slice(), cost.as_mut_slice(), sums.as_mut_slice());
     for step in 0..steps {
         let t = first + step;
@@ -206,33 +226,26 @@ fn rows<S: Simd, const PATHS: usize>(
             let y_before = if *mirrored { (y + 1).min(height - 1) } else { y.saturating_sub(1) };
             let p2 = |x: usize, y: usize| frame.p2[usize::from(here.abs_diff(grey(x, y)))];
 
-            let mut paths: [Path<'_>; PATHS] = {
-                let mut all = [
-                    Some(Path { slot: &mut *along, least: along_least, p2: p2(x_before, y) }),
-                    Some(Path {
-                        slot: &mut straight[i * depth..][..depth],
-                        least: &mut straight_least[i],
-                        p2: p2(x, y_before),
-                    }),
-                    Some(Path {
-                        slot: &mut behind[from_behind * depth..][..depth],
-                        least: &mut behind_least[from_behind],
-                        p2: p2(x_before, y_before),
-                    }),
-                    Some(Path {
-                        slot: &mut ahead[from_ahead * depth..][..depth],
-                        least: &mut ahead_least[from_ahead],
-                        p2: p2(x_after, y_before),
-                    }),
-                ];
-                #[allow(clippy::unwrap_used)] // each taken once
-                std::array::from_fn(|p| all[p].take().unwrap())
-            };
+            // With two paths the last two are not looked at.
+            let mut paths = [
+                Path { slot: &mut *along, least: along_least, p2: p2(x_before, y) },
+                Path { slot: &mut straight[i * depth..][..depth], least: &mut straight_least[i], p2: p2(x, y_before) },
+                Path {
+                    slot: &mut behind[from_behind * depth..][..depth],
+                    least: &mut behind_least[from_behind],
+                    p2: p2(x_before, y_before),
+                },
+                Path {
+                    slot: &mut ahead[from_ahead * depth..][..depth],
+                    least: &mut ahead_least[from_ahead],
+                    p2: p2(x_after, y_before),
+                },
+            ];
             let pixel = line * width + x;
             match output {
                 Output::Store(out) => {
                     let out = &mut out[pixel * depth..][..depth];
-                    extend(simd, frame.p1, cost, &mut paths, |at, sum: S::u8s| {
+                    extend::<S, PATHS>(simd, frame.p1, cost, &mut paths, |at, sum: S::u8s| {
                         sum.store_slice(&mut out[at..at + S::u8s::LEN]);
                     });
                 }
@@ -244,7 +257,7 @@ fn rows<S: Simd, const PATHS: usize>(
                     let half = S::u16s::LEN;
                     let mut group_best = none;
                     let mut best = (NO_SUM, 0u16);
-                    extend(simd, frame.p1, cost, &mut paths, |at, sum: S::u8s| {
+                    extend::<S, PATHS>(simd, frame.p1, cost, &mut paths, |at, sum: S::u8s| {
                         let (low, high) = sum.widening_add(S::u8s::from_slice(simd, &other[at..at + S::u8s::LEN]));
                         let group = at / GROUP;
                         let in_group = at % GROUP;
@@ -289,7 +302,7 @@ fn extend<S: Simd, const PATHS: usize>(
     simd: S,
     p1: u8,
     cost: &[u8],
-    paths: &mut [Path<'_>; PATHS],
+    paths: &mut [Path<'_>; 4],
     mut emit: impl FnMut(usize, S::u8s),
 ) {
     let depth = cost.len();
@@ -297,8 +310,12 @@ fn extend<S: Simd, const PATHS: usize>(
     let p1 = S::u8s::splat(simd, p1);
     let mut before = [worst; PATHS];
     let mut smallest = [worst; PATHS];
-    let least: [S::u8s; PATHS] = std::array::from_fn(|p| S::u8s::splat(simd, *paths[p].least));
-    let jump: [S::u8s; PATHS] = std::array::from_fn(|p| S::u8s::splat(simd, *paths[p].least + paths[p].p2));
+    let mut least = [worst; PATHS];
+    let mut jump = [worst; PATHS];
+    for p in 0..PATHS {
+        least[p] = S::u8s::splat(simd, *paths[p].least);
+        jump[p] = S::u8s::splat(simd, *paths[p].least + paths[p].p2);
+    }
     let mut at = 0;
     while at < depth {
         let c = S::u8s::from_slice(simd, &cost[at..at + S::u8s::LEN]);
@@ -358,17 +375,30 @@ fn finish<S: Simd>(simd: S, disparities: usize, (cost, index): (u16, u16), sums:
 
 /// Index of the best match of every pixel of a right row.
 fn right_indices(frame: &Frame<'_>, groups: usize, keys: &[u16], out: &mut [u16]) {
+    // Element j of the mirrored row is column width − 1 − min_disparity − j; group g starts at disparity g·GROUP, which
+    // is that many elements further.
     let width = frame.width as i64;
+    let stride = frame.width + GROUP;
+    let best_of = |key: u16, group: usize, best: (u16, u16)| {
+        let sum = key >> KEY_BITS;
+        if sum < best.0 { (sum, (key & (GROUP as u16 - 1)) + (group * GROUP) as u16) } else { best }
+    };
+    let first = width - 1 - frame.min_disparity;
+    if groups == 1 && frame.min_disparity >= 0 && first >= 0 {
+        // The usual case: columns 0 to `first` have candidates, those right of it none.
+        let (seen, unseen) = out.split_at_mut(first as usize + 1);
+        unseen.fill(0);
+        for (index, &key) in seen.iter_mut().zip(keys[..=first as usize].iter().rev()) {
+            *index = best_of(key, 0, (NO_SUM, 0)).1;
+        }
+        return;
+    }
     for (column, index) in out.iter_mut().enumerate() {
-        // The element j of the mirrored row; group g starts at disparity g·GROUP, which is that many elements further.
-        let j = width - 1 - frame.min_disparity - column as i64;
         let mut best = (NO_SUM, 0u16);
         for group in 0..groups {
-            let Ok(at) = usize::try_from(j - (group * GROUP) as i64) else { break };
-            let Some(&key) = keys[group * (frame.width + GROUP)..][..frame.width + GROUP].get(at) else { continue };
-            if key >> KEY_BITS < best.0 {
-                best = (key >> KEY_BITS, (key & (GROUP as u16 - 1)) + (group * GROUP) as u16);
-            }
+            let Ok(at) = usize::try_from(first - column as i64 - (group * GROUP) as i64) else { break };
+            let Some(&key) = keys[group * stride..][..stride].get(at) else { continue };
+            best = best_of(key, group, best);
         }
         *index = best.1;
     }
