@@ -10,7 +10,7 @@
 //! and adds them up. Two sweeps from opposite corners cover all directions.
 
 use crate::aligned::Aligned;
-use crate::winner::{NO_SUM, Winner};
+use crate::winner::{NO_SUM, Winner, outside_cost};
 use fearless_simd::prelude::*;
 use fearless_simd_macros::simd;
 
@@ -41,8 +41,6 @@ pub(crate) struct Frame<'a> {
     pub(crate) p1: u8,
     /// P2 by absolute grey difference.
     pub(crate) p2: &'a [u8; 256],
-    /// What a match outside the right image costs.
-    pub(crate) outside: u8,
 }
 
 impl Frame<'_> {
@@ -64,11 +62,10 @@ impl Frame<'_> {
         let column = x as i64 - self.min_disparity;
         let n = self.disparities as i64;
         let inside = (column - (self.width as i64 - 1)).clamp(0, n) as usize..(column + 1).clamp(0, n) as usize;
-        if inside.start > 0 {
-            out[..inside.start].fill(self.outside);
-        }
-        if inside.end < self.disparities {
-            out[inside.end..self.disparities].fill(self.outside);
+        if inside.len() < self.disparities {
+            let outside = outside_cost(&out[inside.clone()]);
+            out[..inside.start].fill(outside);
+            out[inside.end..self.disparities].fill(outside);
         }
         out[self.disparities..].fill(u8::MAX);
     }

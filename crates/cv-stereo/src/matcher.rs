@@ -5,7 +5,7 @@ use crate::input::to_grey;
 use crate::kernel::Frame;
 use crate::sgm::{Aggregator, blocks};
 use crate::speckle::{Speckles, remove_speckles};
-use crate::winner::{NO_SUM, Winner, outside_cost, p2_table};
+use crate::winner::{NO_SUM, Winner, p2_table};
 use crate::{Intensity, Paths, StereoError, StereoOptions, Subpixel, fill, median};
 use cv_core::{GrayF32, Image, ImageView, Sample};
 use fearless_simd::Level;
@@ -218,7 +218,6 @@ impl StereoMatcher {
             grey: &self.grey8,
             p1: options.p1,
             p2: &p2_table(options),
-            outside: outside_cost(options),
         };
         self.aggregator.run(self.level, &frame, options.paths == Paths::Eight);
     }

@@ -13,14 +13,20 @@ pub(crate) fn match_plain(
     height: usize,
 ) -> (Vec<Winner>, Vec<u16>) {
     let n = options.disparities;
-    let outside = outside_cost(options);
-    let cost = |x: usize, y: usize, k: usize| -> u32 {
+    let column = |x: usize, k: usize| {
         let xr = x as i64 - i64::from(options.min_disparity) - k as i64;
-        if xr < 0 || xr >= width as i64 {
-            return u32::from(outside);
-        }
-        (left[y * width + x] ^ right[y * width + xr as usize]).count_ones()
+        usize::try_from(xr).ok().filter(|&xr| xr < width)
     };
+    let costs: Vec<u8> = (0..width * height)
+        .flat_map(|i| {
+            let (x, row) = (i % width, i / width * width);
+            let inside: Vec<Option<u8>> =
+                (0..n).map(|k| column(x, k).map(|xr| (left[i] ^ right[row + xr]).count_ones() as u8)).collect();
+            let outside = outside_cost(&inside.iter().flatten().copied().collect::<Vec<_>>());
+            inside.into_iter().map(move |cost| cost.unwrap_or(outside)).collect::<Vec<_>>()
+        })
+        .collect();
+    let cost = |x: usize, y: usize, k: usize| u32::from(costs[(y * width + x) * n + k]);
     let table = p2_table(options);
     let p1 = u32::from(options.p1);
     let directions: &[(i64, i64)] = match options.paths {
@@ -204,7 +210,7 @@ mod tests {
                 let frame = Frame {
                     width, height, min_disparity, disparities: options.disparities, blocks,
                     left: &a, right: &b, grey: &bytes,
-                    p1: options.p1, p2: &p2_table(&options), outside: outside_cost(&options),
+                    p1: options.p1, p2: &p2_table(&options),
                 };
                 let mut aggregator = Aggregator::default();
                 // Twice, so that what a frame leaves behind would show.

@@ -20,10 +20,12 @@ pub(crate) struct Winner {
     pub(crate) above: u16,
 }
 
-/// What a match outside the right image costs: as much as a neighbourhood of which nothing is known, half of whose bits
-/// differ by chance.
-pub(crate) fn outside_cost(options: &StereoOptions) -> u8 {
-    (options.census.bits() / 2) as u8
+/// What a match outside the right image costs, given the costs inside: their mean. Where the image is flat all match
+/// equally well, and those outside must not look worse; where it is not, they cost as much as a chance match.
+pub(crate) fn outside_cost(inside: &[u8]) -> u8 {
+    let n = inside.len() as u32;
+    let sum: u32 = inside.iter().map(|&c| u32::from(c)).sum();
+    (sum + n / 2).checked_div(n).unwrap_or(0) as u8
 }
 
 /// P2 by the absolute difference of neighbouring grey values (0 to 255).
