@@ -13,14 +13,14 @@ pub(crate) fn median(level: Level, disparity: &[f32], width: usize, radius: usiz
     }
     let height = disparity.len() / width;
     out.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
-        let inner = radius == 1 && y > 0 && y + 1 < height && width > 2;
+        let inner = y >= radius && y + radius < height && width > 2 * radius;
         if inner {
-            let rows = &disparity[(y - 1) * width..(y + 2) * width];
-            dispatch!(level, simd => median_of_nine(simd, rows, width, row));
+            let rows = &disparity[(y - radius) * width..(y + radius + 1) * width];
+            dispatch!(level, simd => median_row(simd, rows, width, radius, row));
         }
         for (x, value) in row.iter_mut().enumerate() {
-            // A NaN of the fast path says that one of the nine was NaN.
-            if !inner || x == 0 || x + 1 == width || value.is_nan() {
+            // A NaN of the fast path says that a value of the window was NaN.
+            if !inner || x < radius || x + radius >= width || value.is_nan() {
                 *value = median_at(disparity, width, height, radius, x, y);
             }
         }
@@ -46,51 +46,79 @@ fn median_at(disparity: &[f32], width: usize, height: usize, radius: usize, x: u
     *window[..n].select_nth_unstable_by((n - 1) / 2, f32::total_cmp).1
 }
 
-/// Columns 1 to `width − 2` of the middle one of three rows; NaN where one of the nine values is.
+/// Exchanges of vectors, written out: a loop over a table of indices would keep the vectors in memory.
+macro_rules! exchange {
+    ($v:ident: $($i:literal $j:literal),*) => {
+        $(($v[$i], $v[$j]) = ($v[$i].min($v[$j]), $v[$i].max($v[$j]));)*
+    };
+}
+
+/// The median of nine (Devillard, "Fast median search", 1998).
+#[inline(always)]
+#[rustfmt::skip]
+fn of_nine<S: Simd>(mut v: [S::f32s; 9]) -> S::f32s {
+    exchange!(v:
+        1 2, 4 5, 7 8, 0 1, 3 4, 6 7, 1 2, 4 5, 7 8, 0 3, 5 8, 4 7, 3 6, 1 4, 2 5, 4 7,
+        4 2, 6 4, 4 2
+    );
+    v[4]
+}
+
+/// The median of twenty-five (likewise).
+#[inline(always)]
+#[rustfmt::skip]
+fn of_twenty_five<S: Simd>(mut v: [S::f32s; 25]) -> S::f32s {
+    exchange!(v:
+        0 1, 3 4, 2 4, 2 3, 6 7, 5 7, 5 6, 9 10, 8 10, 8 9, 12 13, 11 13, 11 12, 15 16, 14 16, 14 15,
+        18 19, 17 19, 17 18, 21 22, 20 22, 20 21, 23 24, 2 5, 3 6, 0 6, 0 3, 4 7, 1 7, 1 4, 11 14, 8 14,
+        8 11, 12 15, 9 15, 9 12, 13 16, 10 16, 10 13, 20 23, 17 23, 17 20, 21 24, 18 24, 18 21, 19 22, 8 17, 9 18,
+        0 18, 0 9, 10 19, 1 19, 1 10, 11 20, 2 20, 2 11, 12 21, 3 21, 3 12, 13 22, 4 22, 4 13, 14 23, 5 23,
+        5 14, 15 24, 6 24, 6 15, 7 16, 7 19, 13 21, 15 23, 7 13, 7 15, 1 9, 3 11, 5 17, 11 17, 9 17, 4 10,
+        6 12, 7 14, 4 6, 4 7, 12 14, 10 14, 6 7, 10 12, 6 10, 6 17, 12 17, 7 17, 7 10, 12 18, 7 12, 10 18,
+        12 20, 10 20, 10 12
+    );
+    v[12]
+}
+
+/// Medians of the columns `radius` to `width − 1 − radius` of the middle one of `2 radius + 1` rows; NaN where a value of
+/// the window is.
 #[simd]
-fn median_of_nine<S: Simd>(simd: S, rows: &[f32], width: usize, out: &mut [f32]) {
-    // Devillard's network of nineteen exchanges ("Fast median search", 1998).
-    const NETWORK: [(usize, usize); 19] = [
-        (1, 2),
-        (4, 5),
-        (7, 8),
-        (0, 1),
-        (3, 4),
-        (6, 7),
-        (1, 2),
-        (4, 5),
-        (7, 8),
-        (0, 3),
-        (5, 8),
-        (4, 7),
-        (3, 6),
-        (1, 4),
-        (2, 5),
-        (4, 7),
-        (4, 2),
-        (6, 4),
-        (4, 2),
-    ];
+fn median_row<S: Simd>(simd: S, rows: &[f32], width: usize, radius: usize, out: &mut [f32]) {
+    if radius == 1 {
+        windows(simd, rows, width, out, of_nine::<S>);
+    } else {
+        windows(simd, rows, width, out, of_twenty_five::<S>);
+    }
+}
+
+#[inline(always)]
+fn windows<S: Simd, const N: usize>(
+    simd: S,
+    rows: &[f32],
+    width: usize,
+    out: &mut [f32],
+    median: impl Fn([S::f32s; N]) -> S::f32s,
+) {
+    let side = N.isqrt();
+    let radius = side / 2;
     let lanes = S::f32s::LEN;
-    let n = width - 2;
+    let n = width - 2 * radius;
+    if n < lanes {
+        // Narrower than a vector: left to the definition.
+        out.fill(f32::NAN);
+        return;
+    }
     let mut start = 0;
     while start < n {
-        // The last vector overlaps the one before; rows narrower than a vector are left to the definition.
-        let x = if start + lanes <= n { start } else { n.saturating_sub(lanes) };
-        if x + lanes > n {
-            out[1..=n].fill(f32::NAN);
-            return;
-        }
-        let mut v: [S::f32s; 9] =
-            std::array::from_fn(|i| S::f32s::from_slice(simd, &rows[(i / 3) * width + x + i % 3..][..lanes]));
+        // The last vector overlaps the one before.
+        let x = start.min(n - lanes);
+        let mut v = [S::f32s::splat(simd, 0.0); N];
         let mut sum = v[0];
-        for value in &v[1..] {
+        for (i, value) in v.iter_mut().enumerate() {
+            *value = S::f32s::from_slice(simd, &rows[(i / side) * width + x + i % side..][..lanes]);
             sum += *value;
         }
-        for (i, j) in NETWORK {
-            (v[i], v[j]) = (v[i].min(v[j]), v[i].max(v[j]));
-        }
-        sum.is_nan().select(sum, v[4]).store_slice(&mut out[1 + x..][..lanes]);
+        sum.is_nan().select(sum, median(v)).store_slice(&mut out[radius + x..][..lanes]);
         start = x + lanes;
     }
 }

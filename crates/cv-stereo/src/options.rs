@@ -80,7 +80,7 @@ pub struct StereoOptions {
     pub speckle_range: f32,
     /// Sub-pixel placement. Default [`Subpixel::VFit`].
     pub subpixel: Subpixel,
-    /// Radius in px of the median filter; 0 for none, 1 or 2. Default 1 (3×3).
+    /// Radius in px of the median filter; 0 for none, 1 or 2. Default 2 (5×5).
     pub median: usize,
     /// Whether rejected pixels get a disparity from their surroundings (background side where occluded). They are told
     /// apart by [`crate::PixelState`]. Default true.
@@ -105,7 +105,7 @@ impl Default for StereoOptions {
             speckle_size: 100,
             speckle_range: 2.0,
             subpixel: Subpixel::VFit,
-            median: 1,
+            median: 2,
             fill: true,
             max_memory: None,
         }
