@@ -11,7 +11,7 @@ pub type Color = [u8; 3];
 pub mod colors {
     use super::Color;
     /// Right, accepted.
-    pub const GREEN: Color = [0, 200, 110];
+    pub const GREEN: Color = [40, 225, 115];
     /// Wrong, rejected.
     pub const RED: Color = [235, 60, 45];
     /// A third kind.

@@ -22,6 +22,7 @@
 //! | drawing | [`Canvas`], [`colors`] |
 //! | maps of numbers | [`colorize`], [`color_bar`], [`draw_map`], [`draw_error_map`] |
 //! | features and geometry | [`draw_keypoints`], [`draw_matches`], [`draw_epipolar_lines`], [`tile_patches`] |
+//! | arranging | [`side_by_side`], [`shrink_to_fit`] |
 //! | masks | [`overlay_mask`], [`overlay_comparison`] |
 //! | points and cameras | [`PointScene`], [`render_points`] |
 //! | pages | [`Report`], [`Figure`], [`Plot`] |
@@ -39,7 +40,7 @@ pub use canvas::{Canvas, Color, colors};
 pub use colormap::{Colormap, MapStyle, absolute_difference, color_bar, colorize, draw_map, quantile_range};
 pub use overlay::{
     MatchStyle, draw_epipolar_lines, draw_error_map, draw_keypoints, draw_matches, overlay_comparison, overlay_mask,
-    side_by_side, tile_patches,
+    shrink_to_fit, side_by_side, tile_patches,
 };
 pub use plot::Plot;
 pub use report::{Figure, Note, Report};

@@ -266,6 +266,52 @@ pub fn draw_error_map(estimate: ImageView<'_, f32, 1>, truth: ImageView<'_, f32,
     })
 }
 
+/// A picture no larger than `side` pixels either way, by averaging over areas; one that fits already is copied.
+///
+/// For pages: a panorama of 10,000 pixels would be tens of megabytes inside the file.
+pub fn shrink_to_fit(view: ImageView<'_, u8, 3>, side: usize) -> RgbU8 {
+    let (w, h) = view.size();
+    let (longest, side) = (w.max(h), side.max(1));
+    if longest <= side {
+        return view.to_image();
+    }
+    let scaled = |n: usize| (n * side / longest).max(1).min(n);
+    let (width, height) = (scaled(w), scaled(h));
+    let mut out = RgbU8::new(width, height, [0; 3]);
+    let mut sums = vec![[0.0f32; 3]; width];
+    let columns = spans(w, width);
+    for (y, (top, rows)) in spans(h, height).into_iter().enumerate() {
+        sums.fill([0.0; 3]);
+        for (j, weight_y) in rows.into_iter().enumerate() {
+            let row = view.row(top + j).as_chunks::<3>().0;
+            for (sum, (left, weights)) in sums.iter_mut().zip(&columns) {
+                for (pixel, weight_x) in row[*left..].iter().zip(weights) {
+                    let weight = weight_x * weight_y;
+                    for c in 0..3 {
+                        sum[c] += weight * f32::from(pixel[c]);
+                    }
+                }
+            }
+        }
+        for (pixel, sum) in out.row_mut(y).as_chunks_mut::<3>().0.iter_mut().zip(&sums) {
+            *pixel = sum.map(|v| (v + 0.5) as u8);
+        }
+    }
+    out
+}
+
+/// For each of `to` equal parts of a line of `from ≥ to` cells: its first cell, and the share each cell has in it (together 1).
+fn spans(from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
+    let step = from as f64 / to as f64;
+    let part = |i: usize| {
+        let (start, end) = (i as f64 * step, ((i + 1) as f64 * step).min(from as f64));
+        let (first, last) = (start as usize, (end.ceil() as usize).clamp(start as usize + 1, from));
+        let share = |cell: usize| ((end.min(cell as f64 + 1.0) - start.max(cell as f64)) / (end - start)) as f32;
+        (first, (first..last).map(share).collect())
+    };
+    (0..to).map(part).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -338,7 +384,31 @@ mod tests {
         assert!(tile_patches(&[], 8, 4, 2).is_empty() && tile_patches(&[1.0], 0, 4, 2).is_empty());
     }
 
+    #[test]
+    fn shrinking_averages_over_areas() {
+        let image =
+            RgbU8::from_vec(4, 2, [0, 100, 10, 30, 20, 200, 50, 70].iter().flat_map(|&v| [v, 255, 0]).collect());
+        let small = shrink_to_fit(image.unwrap().view(), 2);
+        assert_eq!(small.size(), (2, 1));
+        assert_eq!((small.at(0, 0), small.at(1, 0)), ([80, 255, 0], [40, 255, 0]));
+        // Three pixels in two: each part is one and a half of them.
+        let image = RgbU8::from_vec(3, 1, [0, 90, 240].iter().flat_map(|&v| [v; 3]).collect()).unwrap();
+        let small = shrink_to_fit(image.view(), 2);
+        assert_eq!((small.at(0, 0)[0], small.at(1, 0)[0]), (30, 190));
+    }
+
     proptest! {
+        #[test]
+        fn shrinking_keeps_the_mean_and_fits(w in 1usize..40, h in 1usize..40, side in 0usize..50, seed: u8) {
+            let image = RgbU8::from_fn(w, h, |x, y| [(x * 37 + y * 91) as u8 ^ seed, 0, 255]);
+            let small = shrink_to_fit(image.view(), side);
+            prop_assert!(small.width().max(small.height()) <= side.max(1));
+            prop_assert!(small.pixels().all(|p| p[1] == 0 && p[2] == 255));
+            let mean = |i: &RgbU8| i.pixels().map(|p| f64::from(p[0])).sum::<f64>() / i.pixels().len() as f64;
+            // Every pixel has equal weight in the whole; each result is rounded by at most a half.
+            prop_assert!((mean(&image) - mean(&small)).abs() <= 0.51, "{} {}", mean(&image), mean(&small));
+        }
+
         #[test]
         fn wild_input_never_panics(values in prop::array::uniform9(prop::num::f64::ANY), w in 0usize..9, h in 0usize..9) {
             let a = gray(w, h);
