@@ -46,8 +46,9 @@ fn rows(m: &Matrix3<f64>) -> Vec<Vec<f64>> {
 /// A rectified pair, its disparity and what both views see.
 fn stereo(root: &Path) -> Result<()> {
     let scene = Scene::tabletop(SEED);
-    let camera = Camera::from_focal(240, 180, 230.0);
-    let pair = stereo_pair(&scene, &camera, &scene.viewpoint(), 0.06, &RenderOptions::default())?;
+    // Disparities of tens of pixels, as in photographs: 5 % of the depth is then no fraction of what a pixel resolves.
+    let camera = Camera::from_focal(400, 300, 380.0);
+    let pair = stereo_pair(&scene, &camera, &scene.viewpoint(), 0.12, &RenderOptions::default())?;
     let to = folder(root, "stereo")?;
     photo(to.join("left.jpg"), &pair.left.image)?;
     photo(to.join("right.jpg"), &pair.right.image)?;

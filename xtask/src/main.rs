@@ -1,6 +1,7 @@
 //! Chores of the workspace. This file only routes: `cargo xtask --help` lists them.
 
 mod fixtures;
+mod golden;
 mod peers;
 mod real;
 mod tidy;
@@ -24,6 +25,12 @@ enum Chore {
     Fixtures,
     /// Check the rules of the workspace that no compiler checks.
     Tidy,
+    /// Run the pipelines on fixtures/, hold them against the truth and against what they gave before.
+    Golden {
+        /// Write nothing; fail where something changed.
+        #[arg(long)]
+        check: bool,
+    },
     /// Run the pipelines on real photographs with known truth and hold each figure against its bar.
     Real {
         /// Only this job.
@@ -40,6 +47,7 @@ fn main() -> ExitCode {
     let result = match Cli::parse().chore {
         Chore::Fixtures => fixtures::run(),
         Chore::Tidy => tidy::run(),
+        Chore::Golden { check } => golden::run(check),
         Chore::Real { job } => real::run(job.as_deref()),
         Chore::Peers { job } => peers::run(job.as_deref()),
     };

@@ -197,7 +197,7 @@ pub(crate) fn strs(args: &[String]) -> Vec<&str> {
 pub(crate) const JOBS: &[Job] = &[Job {
     name: "depth",
     inputs: &["stereo/left.jpg", "stereo/right.jpg"],
-    args: "depth {0} {1} -o d.pfm --disparities 32 --focal 230 --baseline 0.06 --depth depth.pfm --cloud cloud.ply",
+    args: "depth {0} {1} -o d.pfm --disparities 64 --focal 380 --baseline 0.12 --depth depth.pfm --cloud cloud.ply",
     outputs: &["d.pfm", "depth.pfm", "cloud.ply"],
 }];
 

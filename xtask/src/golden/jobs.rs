@@ -1,0 +1,122 @@
+//! The pipelines on their fixtures.
+//!
+//! Bars against the truth are those the pipelines promise on generated scenes, wider where a sentence says why: these
+//! pictures are an eighth of a photograph's size, so an error of a given angle is fewer of their pixels. Tolerances
+//! against the past are what other machines may differ by: libraries of elementary functions and fused multiply-adds differ
+//! in the last bits, which can tip single matches and pixels.
+
+use super::{Figure, Job, Outcome};
+use crate::real::Check;
+use anyhow::{Context, Result, ensure};
+use cv_core::{Matrix3, Point2, RgbU8};
+use cv_pipeline::stereo::{StereoGeometry, StereoOptions};
+use cv_pipeline::{
+    DepthOptions, MatchingOptions, ModelKind, PanoramaOptions, PanoramaPhoto, Silent, depth, estimate, match_photos,
+    panorama,
+};
+use cv_synth::{depth_score, homography_corner_error};
+use serde_json::Value;
+use std::path::Path;
+
+pub(super) const JOBS: &[Job] = &[("depth", stereo), ("plane", plane), ("panorama", views)];
+
+fn picture(fixtures: &Path, name: &str) -> Result<RgbU8> {
+    Ok(cv_io::read_rgb(fixtures.join(name))?)
+}
+
+fn truth(fixtures: &Path, name: &str) -> Result<Value> {
+    let path = fixtures.join("oracle").join(name);
+    let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+    Ok(serde_json::from_str(&text)?)
+}
+
+fn number(value: &Value, key: &str) -> Result<f64> {
+    value[key].as_f64().with_context(|| format!("no number {key}"))
+}
+
+fn matrix(value: &Value) -> Result<Matrix3<f64>> {
+    let entries: Vec<f64> =
+        value.as_array().into_iter().flatten().flat_map(Value::as_array).flatten().flat_map(Value::as_f64).collect();
+    ensure!(entries.len() == 9, "not a 3×3 matrix: {value}");
+    Ok(Matrix3::from_row_slice(&entries))
+}
+
+fn stereo(fixtures: &Path) -> Result<Outcome> {
+    let (left, right) = (picture(fixtures, "stereo/left.jpg")?, picture(fixtures, "stereo/right.jpg")?);
+    let known = truth(fixtures, "stereo.json")?;
+    let (focal, baseline) = (number(&known, "focal_px")?, number(&known, "baseline_m")?);
+    let geometry = StereoGeometry::from_focal(left.width(), left.height(), focal, baseline)?;
+    let options =
+        DepthOptions { stereo: StereoOptions { disparities: 64, ..Default::default() }, ..Default::default() };
+    let result = depth(left.view(), right.view(), Some(&geometry), &options, &Silent)?;
+    let true_disparity = cv_io::kitti::read(fixtures.join("oracle/stereo-disparity.png"))?;
+    let visible = cv_io::read_mask(fixtures.join("oracle/stereo-visible.png"))?;
+    let true_depth = geometry.depth_map(true_disparity.view(), (0.0, f32::INFINITY));
+    let estimated = result.depth.context("no depth")?;
+    let score = depth_score(&estimated, &true_depth, &visible, 10.0, 0.05).context("nothing to score")?;
+    let disparities: Vec<f64> =
+        result.map.disparity.pixels().map(|[d]| f64::from(d)).filter(|d| d.is_finite()).collect();
+    let mean = disparities.iter().sum::<f64>() / disparities.len() as f64;
+    Ok(Outcome {
+        checks: vec![Check::at_least("share of visible pixels within 5 % of the true depth", score.within, 0.95)],
+        figures: vec![
+            Figure { name: "within", value: score.within, tolerance: 0.002 },
+            Figure { name: "valid_fraction", value: result.map.valid_fraction(), tolerance: 0.002 },
+            Figure { name: "mean_disparity_px", value: mean, tolerance: 0.01 },
+        ],
+    })
+}
+
+fn plane(fixtures: &Path) -> Result<Outcome> {
+    let (a, b) = (picture(fixtures, "plane/a.jpg")?, picture(fixtures, "plane/b.jpg")?);
+    let known = matrix(&truth(fixtures, "plane.json")?["homography"])?;
+    let found = match_photos(a.view(), b.view(), &MatchingOptions::default(), &Silent)?;
+    let kind = ModelKind::Homography;
+    let model = estimate(&found.pairs, kind, &kind.options(), &Silent)?.robust;
+    let error = homography_corner_error(&model.model, &known, a.width(), a.height());
+    Ok(Outcome {
+        checks: vec![Check::at_most("corner error, px", error, 0.3)],
+        figures: vec![
+            Figure { name: "corner_error_px", value: error, tolerance: 0.02 },
+            Figure { name: "matches", value: found.pairs.len() as f64, tolerance: 3.0 },
+            Figure { name: "inliers", value: model.inliers.len() as f64, tolerance: 3.0 },
+        ],
+    })
+}
+
+fn views(fixtures: &Path) -> Result<Outcome> {
+    let pictures: Vec<RgbU8> =
+        (0..3).map(|i| picture(fixtures, &format!("panorama/view{i}.jpg"))).collect::<Result<_>>()?;
+    let known = truth(fixtures, "panorama.json")?;
+    let photos: Vec<PanoramaPhoto<'_>> = pictures.iter().map(|p| PanoramaPhoto::new(p.view())).collect();
+    let result = panorama(&photos, &PanoramaOptions::default(), &Silent)?;
+    let used = result.images.iter().filter(|image| image.used).count();
+    let mut worst = 0.0f64;
+    for (pair, homography) in known["homographies"].as_array().into_iter().flatten().enumerate() {
+        let homography = matrix(homography)?;
+        let view =
+            |i: usize| result.alignment.views[i].as_ref().ok().with_context(|| format!("view {i} is not placed"));
+        let (from, to) = (view(pair)?, view(pair + 1)?);
+        let through = |p: Point2<f64>| to.project(&from.ray(p)?);
+        let error = cv_synth::alignment_error(through, &homography, pictures[0].width(), pictures[0].height());
+        worst = worst.max(error.context("the views do not overlap")?);
+    }
+    let focal = result.images[1].focal.unwrap_or(f64::NAN);
+    Ok(Outcome {
+        checks: vec![
+            Check::at_least("photographs used", used as f64, 3.0),
+            Check::at_most("alignment error of neighbours, px", worst, 0.5),
+            Check::at_most(
+                "error of the focal length, %",
+                100.0 * (focal / number(&known, "focal_px")? - 1.0).abs(),
+                3.0,
+            ),
+        ],
+        figures: vec![
+            Figure { name: "alignment_error_px", value: worst, tolerance: 0.05 },
+            Figure { name: "focal_px", value: focal, tolerance: 1.0 },
+            Figure { name: "width", value: result.image.width() as f64, tolerance: 4.0 },
+            Figure { name: "height", value: result.image.height() as f64, tolerance: 4.0 },
+        ],
+    })
+}
