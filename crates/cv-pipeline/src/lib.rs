@@ -29,6 +29,7 @@ mod depth;
 mod estimate;
 mod matching;
 mod panorama;
+mod preview;
 mod progress;
 mod stopwatch;
 
@@ -46,6 +47,7 @@ pub use panorama::{
 pub mod panorama_types {
     pub use cv_panorama::*;
 }
+pub use preview::preview;
 pub use progress::{Progress, Silent};
 pub use stopwatch::Stopwatch;
 

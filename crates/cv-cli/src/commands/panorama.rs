@@ -1,6 +1,8 @@
 //! `cv panorama`: overlapping photographs to one picture.
 
-use crate::common::{Context, Failure, Outcome, Run, expand_images};
+mod report;
+
+use crate::common::{Context, Failure, Outcome, Run, expand_images, picture_name};
 use cv_pipeline::panorama_types::{Blend, Exposure, Projection, Seams};
 use cv_pipeline::{FeatureMethod, PanoramaError, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama};
 use serde_json::json;
@@ -16,8 +18,8 @@ pub(crate) struct Args {
     /// Photographs in any order, or folders of them. Those that do not belong are left out.
     #[arg(required = true, value_name = "IMAGES")]
     images: Vec<PathBuf>,
-    /// Where to write the panorama: .png, .jpg, .tif ...
-    #[arg(short, long, value_name = "FILE")]
+    /// Where to write the panorama: .png or .jpg.
+    #[arg(short, long, value_name = "FILE", value_parser = picture_name)]
     output: PathBuf,
     /// The surface to draw on; auto: a plane up to 90 degrees across, then a cylinder, a sphere where it is also high.
     #[arg(long, value_enum, default_value_t = ProjectionArg::Auto)]
@@ -139,6 +141,10 @@ impl Run for Args {
                 context.warn(format!("{} is not in the panorama: {reason}", path.display()));
             }
         }
+        context.report(|| {
+            let photos: Vec<_> = pictures.into_iter().map(|(_, image)| image).collect();
+            report::report(&paths, &photos, &result)
+        })?;
         Ok(outcome(&paths, &result))
     }
 }

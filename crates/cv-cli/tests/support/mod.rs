@@ -194,12 +194,20 @@ pub(crate) fn strs(args: &[String]) -> Vec<&str> {
 }
 
 /// The commands that take pictures.
-pub(crate) const JOBS: &[Job] = &[Job {
-    name: "depth",
-    inputs: &["stereo/left.jpg", "stereo/right.jpg"],
-    args: "depth {0} {1} -o d.pfm --disparities 64 --focal 380 --baseline 0.12 --depth depth.pfm --cloud cloud.ply",
-    outputs: &["d.pfm", "depth.pfm", "cloud.ply"],
-}];
+pub(crate) const JOBS: &[Job] = &[
+    Job {
+        name: "depth",
+        inputs: &["stereo/left.jpg", "stereo/right.jpg"],
+        args: "depth {0} {1} -o d.pfm --disparities 64 --focal 380 --baseline 0.12 --depth depth.pfm --cloud cloud.ply",
+        outputs: &["d.pfm", "depth.pfm", "cloud.ply"],
+    },
+    Job {
+        name: "panorama",
+        inputs: &["panorama/view0.jpg", "panorama/view1.jpg", "panorama/view2.jpg"],
+        args: "panorama {0} {1} {2} -o pano.png",
+        outputs: &["pano.png"],
+    },
+];
 
 /// Trains `model.json` in a folder.
 pub(crate) fn train(_folder: &Path) {}

@@ -1,0 +1,78 @@
+//! The report of `cv panorama`.
+
+use crate::common::Failure;
+use cv_core::{Correspondence, Point2, RgbU8};
+use cv_pipeline::{PanoramaResult, preview};
+use cv_report::{Figure, MatchStyle, Note, Report, draw_matches};
+use std::path::PathBuf;
+
+/// Pairs whose matches are drawn: more than these nobody looks at.
+const PAIRS: usize = 12;
+
+/// The page: the panorama, which photograph is where, and what became of each photograph and each overlap.
+pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResult) -> Result<String, Failure> {
+    let jpeg = |image: &RgbU8| cv_io::encode_jpeg(image.view(), 88);
+    let name = |i: usize| paths[i].file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let used = result.images.iter().filter(|image| image.used).count();
+    let (width, height) = result.image.size();
+    let mut page = Report::new("Panorama");
+    page.headline("photographs used", &format!("{used} of {}", paths.len()))
+        .headline("size", &format!("{width}×{height}"))
+        .headline("matches agree to", &format!("{:.2} px", result.reprojection_rms_px));
+    let (small, _) = preview(result.image.view(), 2000);
+    page.section("Panorama").figure(Figure::new(
+        jpeg(&small)?,
+        &format!("{} projection; black where no photograph reaches.", result.projection.name()),
+    ));
+    let sources = RgbU8::from_fn(width, height, |x, y| {
+        let label = result.labels.at(x, y)[0];
+        if label == u16::MAX { [0; 3] } else { tint(result.image.at(x, y), label) }
+    });
+    let (small, _) = preview(sources.view(), 2000);
+    page.figure(Figure::new(jpeg(&small)?, "Which photograph each pixel is from: the seams run where the colour changes."));
+
+    page.section("Photographs");
+    let rows: Vec<Vec<String>> = result
+        .images
+        .iter()
+        .enumerate()
+        .map(|(i, image)| {
+            let focal = image.focal.map_or_else(|| "–".to_owned(), |f| format!("{f:.0} px"));
+            let fate = image.reason.clone().unwrap_or_else(|| "used".to_owned());
+            vec![name(i), fate, image.features.to_string(), focal]
+        })
+        .collect();
+    page.table("", &["file", "used or why not", "features", "focal length"], &rows);
+    for (i, image) in result.images.iter().enumerate() {
+        if let Some(reason) = &image.reason {
+            page.note(Note::Warning, &format!("{} is not in the panorama: {reason}", name(i)));
+        }
+    }
+
+    page.section("Overlaps");
+    let accepted = result.pairs.iter().filter(|pair| pair.rejected.is_none());
+    for pair in accepted.take(PAIRS) {
+        let ((a, scale_a), (b, scale_b)) = (preview(photos[pair.a].view(), 700), preview(photos[pair.b].view(), 700));
+        let at = |p: Point2<f64>, s: f64| Point2::new((p.x + 0.5) * s - 0.5, (p.y + 0.5) * s - 0.5);
+        let matches: Vec<Correspondence> =
+            pair.matches.iter().map(|m| Correspondence { a: at(m.a, scale_a), b: at(m.b, scale_b) }).collect();
+        let picture = draw_matches(a.view(), b.view(), &matches, Some(&pair.inliers), &MatchStyle::default());
+        let good = pair.inliers.iter().filter(|&&inlier| inlier).count();
+        let words =
+            format!("{} and {}: {good} of {} matches agree (green).", name(pair.a), name(pair.b), matches.len());
+        page.figure(Figure::new(jpeg(&picture)?, &words));
+    }
+    let seconds: Vec<_> = result.stages.iter().map(|(stage, s)| (*stage, format!("{s:.2} s"))).collect();
+    page.section("Time").facts(&seconds);
+    Ok(page.to_html())
+}
+
+/// The pixel under a colour of its photograph's own; neighbours in number are far apart on the colour circle.
+fn tint(pixel: [u8; 3], label: u16) -> [u8; 3] {
+    const GOLDEN: f32 = 0.618_034;
+    let hue = f32::from(label) * GOLDEN * std::f32::consts::TAU;
+    std::array::from_fn(|c| {
+        let wave = 0.5 + 0.5 * (hue - c as f32 * std::f32::consts::TAU / 3.0).cos();
+        (0.5 * f32::from(pixel[c]) + 127.0 * wave) as u8
+    })
+}
