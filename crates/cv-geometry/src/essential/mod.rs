@@ -10,11 +10,12 @@ pub use decompose::{
 pub use five_point::essential_five_point;
 
 use crate::epipolar::{Epipolar, SampsonKernel, SampsonProblem, refine_sampson, sampson};
-use crate::error::EstimateError;
+use crate::error::{Degeneracy, EstimateError};
 use crate::pairs::{LANES, Normalizer, PairBlock, PairSet, check, point_degeneracy};
-use crate::ransac::{Estimator, RobustOptions, Scorer, ransac};
+use crate::ransac::{Estimator, Marginal, RobustOptions, Scorer, ransac};
 use crate::robust::RobustModel;
 use cv_core::{Camera, Correspondence, Matrix3, Point2, Pose, Rotation3, Vector3};
+use cv_numeric::{LeastSquares, svd3};
 use decompose::rotations_and_translation;
 use nalgebra::{SMatrix, SVector};
 
@@ -58,6 +59,47 @@ pub fn estimate_essential(
 ) -> Result<RobustModel<Matrix3<f64>>, EstimateError> {
     let found = estimate_relative_pose(matches, options)?;
     Ok(found.map(|pose| essential_from_pose(&pose)))
+}
+
+/// Refines a relative pose on all `matches` (normalised) that are within reach of it, to the least robust Sampson error.
+///
+/// Returns the pose and its loss: each match adds 0 (exact) to 1 (beyond 2.5 thresholds). `threshold` in normalised units.
+pub fn refine_relative_pose(pose: &Pose, matches: &[Correspondence], threshold: f64) -> (Pose, f64) {
+    let pairs: Vec<[f64; 4]> = matches.iter().map(|m| [m.a.x, m.a.y, m.b.x, m.b.y]).collect();
+    let problem = SampsonProblem::new(&pairs, &Marginal, threshold);
+    let mut refined = refine_sampson(&problem, *pose, 30).unwrap_or(*pose);
+    refined.rotation.renormalize();
+    (refined, problem.cost(&refined))
+}
+
+/// The rotation that best turns the rays of the first camera into those of the second (Kabsch 1976 on unit rays, reweighted
+/// five times so that single matches count little), and the share of matches that it maps to within `threshold`. All in normalised
+/// coordinates.
+///
+/// A share near one means that the camera only turned, or that everything is far away: no translation can be told.
+///
+/// # Errors
+/// [`EstimateError`]: fewer than two matches, or a coordinate that is not finite.
+pub fn rotation_between(matches: &[Correspondence], threshold: f64) -> Result<(Rotation3<f64>, f64), EstimateError> {
+    check(matches, 2)?;
+    let rays: Vec<_> =
+        matches.iter().map(|m| (m.a.to_homogeneous().normalize(), m.b.to_homogeneous().normalize())).collect();
+    let mut rotation = Rotation3::identity();
+    let mut weights = vec![1.0; rays.len()];
+    for _ in 0..6 {
+        let sum: Matrix3<f64> = rays.iter().zip(&weights).map(|((a, b), w)| b * a.transpose() * *w).sum();
+        let svd = svd3(&sum).map_err(|_| EstimateError::Degenerate { kind: Degeneracy::Coincident })?;
+        rotation = Rotation3::from_matrix_unchecked(svd.u * svd.v.transpose());
+        for ((a, b), w) in rays.iter().zip(&mut weights) {
+            *w = 1.0 / ((rotation * a - b).norm() / threshold).max(1.0);
+        }
+    }
+    let near = |m: &&Correspondence| {
+        let q = rotation * m.a.to_homogeneous();
+        q.z > 0.0 && (q.x / q.z - m.b.x).hypot(q.y / q.z - m.b.y) < threshold
+    };
+    let share = matches.iter().filter(near).count() as f64 / matches.len() as f64;
+    Ok((rotation, share))
 }
 
 /// Matches in pixels as normalised coordinates of two cameras, and the factor from pixels to normalised units.
@@ -165,7 +207,6 @@ impl Estimator for PoseEstimator {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::error::Degeneracy;
     use crate::testing::{TwoViews, cosine};
     use proptest::prelude::*;
 
@@ -264,6 +305,32 @@ mod tests {
         // Half a pixel at 500 px of focal length is 0.06 degrees for one ray; 150 of them fix rotation and direction to a few
         // hundredths and tenths; the worst of forty has its points and its motion in the least favourable place.
         assert!(errors[20].0 < 0.3 && errors[20].1 < 1.0 && errors[39].1 < 5.0, "{errors:?}");
+    }
+
+    #[test]
+    fn a_turn_is_told_from_a_move() {
+        let views = TwoViews::random(4);
+        let turn = Rotation3::new(Vector3::new(0.1, -0.2, 0.05));
+        let mut turned = views.normalised_matches(60, 0.0);
+        for m in &mut turned {
+            m.b = Point2::from_homogeneous(turn * m.a.to_homogeneous()).unwrap();
+        }
+        turned[3].b.x += 0.3;
+        let (rotation, share) = rotation_between(&turned, 1e-3).unwrap();
+        // One wrong match of sixty keeps a weight of a three-hundredth.
+        assert!((rotation.inverse() * turn).angle() < 1e-4 && share == 59.0 / 60.0);
+        assert!(rotation_between(&views.normalised_matches(60, 0.0), 1e-3).unwrap().1 < 0.5);
+        assert!(rotation_between(&turned[..1], 1e-3).is_err());
+    }
+
+    #[test]
+    fn refinement_finds_the_exact_pose() {
+        let views = TwoViews::random(2);
+        let m = views.normalised_matches(60, 0.0);
+        let start = Epipolar::step(&views.pose, &SVector::<f64, 5>::from([2e-3, -1e-3, 1e-3, 3e-3, 2e-3]));
+        let (pose, loss) = refine_relative_pose(&start, &m, 4e-3);
+        // An exact zero exists; Gauss and Newton's steps stop when the cost falls by less than a millionth.
+        assert!(loss < 1e-6 && (pose.translation - views.pose.translation).norm() < 1e-4, "{loss}");
     }
 
     #[test]
