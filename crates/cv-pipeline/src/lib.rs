@@ -31,6 +31,7 @@ mod matching;
 mod panorama;
 mod preview;
 mod progress;
+mod reconstruct;
 mod stopwatch;
 
 pub use cv_geometry::{EstimateError, RobustModel, RobustOptions};
@@ -49,6 +50,7 @@ pub mod panorama_types {
 }
 pub use preview::preview;
 pub use progress::{Progress, Silent};
+pub use reconstruct::{Intrinsics, ReconstructError, ReconstructOptions, ReconstructResult, ScenePoint, reconstruct};
 pub use stopwatch::Stopwatch;
 
 /// What a caller of [`depth()`] needs of the stereo stage: its options and results, rectification, geometry and scores.

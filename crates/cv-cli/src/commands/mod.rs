@@ -74,4 +74,5 @@ commands! {
     Demo(demo),
     Man(man),
     Panorama(panorama),
+    Reconstruct(reconstruct),
 }

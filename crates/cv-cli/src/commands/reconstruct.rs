@@ -1,0 +1,300 @@
+//! `cv reconstruct`: points and camera poses from two photographs.
+
+use crate::common::{Context, Explain, Failure, Outcome, Run};
+use cv_core::nalgebra::Matrix3;
+use cv_core::{Correspondence, Pose};
+use cv_io::DynImage;
+use cv_io::colmap::{Model, ModelImage, ModelPoint};
+use cv_io::ply::{Cloud, PlyEncoding};
+use cv_pipeline::{Intrinsics, ReconstructError, ReconstructOptions, ReconstructResult, reconstruct};
+use cv_report::{
+    Figure, MatchStyle, Note, PointScene, Report, Viewpoint, camera_color, draw_epipolar_lines, draw_keypoints,
+    draw_matches, render_points,
+};
+use std::path::{Path, PathBuf};
+
+/// Which way the axes of the written cloud point.
+#[derive(Debug, Clone, Copy, clap::ValueEnum)]
+enum Axes {
+    /// X right, Y down, Z forward
+    Opencv,
+    /// X right, Y up, Z backward: Blender, MeshLab and most viewers look along −Z
+    Opengl,
+}
+
+/// Reconstruct a coloured cloud of points and the camera's motion from two photographs.
+///
+/// The cloud is in the first camera's frame; its unit is the distance between the two cameras, which photographs cannot tell. Without
+/// --camera and --focal, the focal length comes from the photographs' EXIF, and is estimated where they have none.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cv reconstruct a.jpg b.jpg -o cloud.ply\n  \
+    cv reconstruct a.jpg b.jpg --camera cam.yaml -o cloud.ply --report out\n  \
+    cv reconstruct a.jpg b.jpg --focal 2900 -o cloud.ply --axes opengl --colmap model\n\n\
+    A camera file is ours, OpenCV's or ROS's YAML, a line of COLMAP's cameras.txt, or a 3×3 matrix.")]
+pub(crate) struct Args {
+    /// The first photograph.
+    first: PathBuf,
+    /// The second photograph.
+    second: PathBuf,
+    /// Where to write the cloud, as PLY.
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// Camera of both photographs.
+    #[arg(long, value_name = "FILE", conflicts_with = "focal")]
+    camera: Option<PathBuf>,
+    /// Camera of the second photograph, where it is another one.
+    #[arg(long, value_name = "FILE", requires = "camera")]
+    camera2: Option<PathBuf>,
+    /// Focal length of both photographs in pixels.
+    #[arg(long, value_name = "PX")]
+    focal: Option<f64>,
+    /// Estimate the focal length even where the photographs' EXIF has one.
+    #[arg(long, conflicts_with_all = ["camera", "focal"])]
+    ignore_exif: bool,
+    /// Largest distance of a match from its epipolar line, in pixels.
+    #[arg(long, value_name = "PX", default_value_t = ReconstructOptions::default().robust.threshold)]
+    threshold: f64,
+    /// Largest reprojection error of a point that is kept, in pixels.
+    #[arg(long, value_name = "PX", default_value_t = ReconstructOptions::default().max_reprojection)]
+    max_error: f64,
+    /// Smallest angle between the two rays of a point that is kept, in degrees.
+    #[arg(long, value_name = "DEGREES", default_value_t = 0.1)]
+    min_angle: f64,
+    /// Most features in a photograph.
+    #[arg(long, value_name = "N")]
+    features: Option<usize>,
+    /// Which way the axes of the cloud point.
+    #[arg(long, value_name = "opencv|opengl", default_value = "opencv")]
+    axes: Axes,
+    /// Where to write the cameras and points as a COLMAP text model: a folder.
+    #[arg(long, value_name = "DIR")]
+    colmap: Option<PathBuf>,
+}
+
+impl Run for Args {
+    fn outputs(&self) -> Vec<&Path> {
+        vec![&self.output]
+    }
+
+    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+        for (name, value) in [("--threshold", self.threshold), ("--max-error", self.max_error)] {
+            if !(value > 0.0 && value.is_finite()) {
+                return Err(Failure::usage(format!("{name} must be above 0, not {value}")));
+            }
+        }
+        if self.focal.is_some_and(|f| !(f > 0.0 && f.is_finite())) {
+            return Err(Failure::usage("--focal must be above 0"));
+        }
+        let photos = [cv_io::read_image(&self.first)?, cv_io::read_image(&self.second)?];
+        let (intrinsics, source) = self.intrinsics(&photos)?;
+        context.note(&source);
+        let mut options = ReconstructOptions { intrinsics, ..ReconstructOptions::default() };
+        options.robust.threshold = self.threshold;
+        options.max_reprojection = self.max_error;
+        options.min_angle = self.min_angle.to_radians();
+        options.matching.max_features = self.features;
+        if let Some(seed) = context.seed {
+            options.robust.seed = seed;
+        }
+        let [a, b] = photos.map(DynImage::into_rgb8);
+        let result = match reconstruct(a.view(), b.view(), &options, context) {
+            Ok(result) => result,
+            Err(error) => return Err(explained(&error, &self)),
+        };
+        let cloud = self.cloud(&result);
+        cv_io::ply::write_cloud(&self.output, &cloud, PlyEncoding::Binary)?;
+        if let Some(folder) = &self.colmap {
+            cv_io::colmap::write(folder, &self.model(&result))?;
+        }
+        context.report(|| self.html(&a, &b, &result, &source))?;
+        Ok(self.outcome(result))
+    }
+}
+
+/// A failure with its reason and what to try.
+fn explained(error: &ReconstructError, args: &Args) -> Failure {
+    let failure = Failure::new(format!("{} and {}: {error}", args.first.display(), args.second.display()));
+    failure.advice(error.advice())
+}
+
+impl Args {
+    /// What is known of the cameras, and how.
+    fn intrinsics(&self, photos: &[DynImage; 2]) -> Result<(Intrinsics, String), Failure> {
+        if let Some(path) = &self.camera {
+            let first = cv_io::read_camera(path, Some(photos[0].size()))?;
+            let second = match &self.camera2 {
+                Some(path) => cv_io::read_camera(path, Some(photos[1].size()))?,
+                None => first,
+            };
+            return Ok((Intrinsics::Known([first, second]), format!("camera from {}", path.display())));
+        }
+        if let Some(focal) = self.focal {
+            return Ok((Intrinsics::Focal([focal; 2]), format!("focal length {focal} px as given")));
+        }
+        let focal = photos.each_ref().map(|p| p.exif.focal.map(|f| f.pixels));
+        match (self.ignore_exif, focal) {
+            (false, [Some(a), Some(b)]) => {
+                Ok((Intrinsics::Focal([a, b]), format!("focal length {a:.0} px from EXIF (--focal or --camera to change it)")))
+            }
+            _ => Ok((Intrinsics::Unknown, "focal length unknown: estimating it".into())),
+        }
+    }
+
+    /// A position in the frame that was asked for.
+    fn turned(&self, p: [f32; 3]) -> [f32; 3] {
+        match self.axes {
+            Axes::Opencv => p,
+            Axes::Opengl => [p[0], -p[1], -p[2]],
+        }
+    }
+
+    fn cloud(&self, result: &ReconstructResult) -> Cloud {
+        let (positions, colors) = result.points.iter().map(|p| (self.turned(position(p)), p.color)).unzip();
+        Cloud::colored(positions, colors)
+    }
+
+    fn model(&self, result: &ReconstructResult) -> Model {
+        let same = result.cameras[0] == result.cameras[1];
+        let name = |path: &Path| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+        let mut model = Model::default();
+        model.cameras.insert(1, result.cameras[0]);
+        if !same {
+            model.cameras.insert(2, result.cameras[1]);
+        }
+        let pair = |i: usize| result.matching.pairs[result.points[i].match_index];
+        let points = 0..result.points.len();
+        let seen = |second: bool| {
+            let at = |i| if second { pair(i).b } else { pair(i).a };
+            points.clone().map(|i| (at(i), Some(i as u64 + 1))).collect()
+        };
+        let image = |path, camera, pose, points| ModelImage { name: name(path), camera, pose, points };
+        model.images.insert(1, image(&self.first, 1, Pose::identity(), seen(false)));
+        model.images.insert(2, image(&self.second, if same { 1 } else { 2 }, result.pose, seen(true)));
+        for (i, p) in result.points.iter().enumerate() {
+            let point = ModelPoint {
+                position: p.position,
+                color: p.color,
+                error: p.reprojection,
+                track: vec![(1, i as u32), (2, i as u32)],
+            };
+            model.points.insert(i as u64 + 1, point);
+        }
+        model
+    }
+
+    fn outcome(&self, result: ReconstructResult) -> Outcome {
+        let rows = |m: &Matrix3<f64>| -> [[f64; 3]; 3] { std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)])) };
+        let t = result.pose.translation;
+        let degrees = result.pose_deviation.map(f64::to_degrees);
+        let summary = format!(
+            "{} points from {} of {} matches, {:.3} px RMS; turned by {:.2} degrees, median angle {:.2} degrees",
+            result.points.len(),
+            result.inliers.len(),
+            result.matching.pairs.len(),
+            result.reprojection_rms,
+            result.pose.rotation.angle().to_degrees(),
+            result.median_angle.to_degrees(),
+        );
+        Outcome::new(result.stages.clone())
+            .with("points", result.points.len())
+            .with("matches", result.matching.pairs.len())
+            .with("inliers", result.inliers.len())
+            .with("reprojection_rms_px", result.reprojection_rms)
+            .with("rotation", rows(result.pose.rotation.matrix()))
+            .with("translation", [t.x, t.y, t.z])
+            .with("rotation_deviation_degrees", degrees[0])
+            .with("translation_deviation_degrees", degrees[1])
+            .with("focal_px", result.cameras.map(|c| c.fx))
+            .with("focal_deviation", result.focal_deviation)
+            .with("median_angle_degrees", result.median_angle.to_degrees())
+            .with("planar_share", result.planar_share)
+            .summary(summary)
+    }
+
+    fn html(
+        &self,
+        a: &cv_core::RgbU8,
+        b: &cv_core::RgbU8,
+        result: &ReconstructResult,
+        source: &str,
+    ) -> Result<String, Failure> {
+        let png = |image: &cv_core::RgbU8| cv_io::encode_jpeg(image.view(), 88).during("cannot encode a picture");
+        let mut report = Report::new("Two-view reconstruction");
+        report.subtitle(&format!("{} and {}", self.first.display(), self.second.display()));
+        report
+            .headline("points", &result.points.len().to_string())
+            .headline("matches that agree", &format!("{} of {}", result.inliers.len(), result.matching.pairs.len()))
+            .headline("reprojection", &format!("{:.2} px", result.reprojection_rms))
+            .headline("median angle", &format!("{:.2}°", result.median_angle.to_degrees()));
+
+        report.section("The cloud");
+        report.paragraph(
+            "Each point was seen in both photographs. The unit is the distance between the two cameras, which are drawn as pyramids. \
+             Drag to turn, scroll to come nearer.",
+        );
+        let positions: Vec<[f32; 3]> = result.points.iter().map(position).collect();
+        let colors: Vec<[u8; 3]> = result.points.iter().map(|p| p.color).collect();
+        let mut scene = PointScene::new(&positions, &colors);
+        scene.camera(&result.cameras[0], &Pose::identity(), camera_color(0));
+        scene.camera(&result.cameras[1], &result.pose, camera_color(1));
+        report.points(&scene, Some(png(&render_points(&scene, Viewpoint::Camera, 1200, 800))?), "The points and the two cameras.");
+        let top = Figure::new(png(&render_points(&scene, Viewpoint::Top, 900, 700))?, "From above: a map.");
+        let side = Figure::new(png(&render_points(&scene, Viewpoint::Side, 900, 700))?, "From the side.");
+        report.figures(vec![top, side]);
+
+        report.section("The motion");
+        let axis_angle = result.pose.rotation.scaled_axis();
+        let t = result.pose.translation;
+        let degrees = |v: f64| format!("{:.3}°", v.to_degrees());
+        report.facts(&[
+            ("rotation", format!("{} about ({:.3}, {:.3}, {:.3})", degrees(axis_angle.norm()), axis_angle.x, axis_angle.y, axis_angle.z)),
+            ("direction of the translation", format!("({:.4}, {:.4}, {:.4})", t.x, t.y, t.z)),
+            ("standard deviation of the rotation", degrees(result.pose_deviation[0])),
+            ("standard deviation of the direction", degrees(result.pose_deviation[1])),
+            ("focal lengths", format!("{:.1} and {:.1} px ({source})", result.cameras[0].fx, result.cameras[1].fx)),
+            ("explained by one plane", format!("{:.0} % of the matches that agree", 100.0 * result.planar_share)),
+        ]);
+        if result.planar_share > 0.8 {
+            report.note(Note::Warning, "Most of the scene is nearly one plane: the motion is less certain than the deviations say.");
+        }
+
+        report.section("Features and matches");
+        let [fa, fb] = result.matching.features.each_ref().map(|f| &f.described.keypoints);
+        let shown = |k: &[cv_core::Keypoint]| k.iter().step_by((k.len() / 2000).max(1)).copied().collect::<Vec<_>>();
+        let green = [0, 158, 115];
+        report.figures(vec![
+            Figure::new(png(&draw_keypoints(a.view(), &shown(fa), green))?, &format!("{} features of the first photograph (at most 2000 drawn).", fa.len())),
+            Figure::new(png(&draw_keypoints(b.view(), &shown(fb), green))?, &format!("{} of the second.", fb.len())),
+        ]);
+        let pairs = &result.matching.pairs;
+        let mut mask = vec![false; pairs.len()];
+        result.inliers.iter().for_each(|&i| mask[i] = true);
+        let style = MatchStyle::default();
+        let before = draw_matches(a.view(), b.view(), pairs, None, &style);
+        let after = draw_matches(a.view(), b.view(), pairs, Some(&mask), &style);
+        report.figure(Figure::new(png(&before)?, "Tentative matches, each in a colour of its own."));
+        report.figure(Figure::new(png(&after)?, "The same after the search for a motion: matches that agree green, others red."));
+        let chosen: Vec<Correspondence> = result.inliers.iter().map(|&i| pairs[i]).collect();
+        let lines = draw_epipolar_lines(a.view(), b.view(), &result.fundamental(), &chosen, 24);
+        report.figure(Figure::new(png(&lines)?, "Points and their epipolar lines: each point of one photograph lies on its line in the other (up to the lens distortion, which bends lines)."));
+
+        report.section("Quality");
+        let errors: Vec<f32> = result.points.iter().map(|p| p.reprojection as f32).collect();
+        let angles: Vec<f32> = result.points.iter().map(|p| p.angle.to_degrees() as f32).collect();
+        let plot = |title: &str, unit: &str, values: &[f32]| {
+            cv_report::Plot::new(title, unit, "points").histogram("", &values.iter().map(|v| f64::from(*v)).collect::<Vec<_>>(), 30)
+        };
+        report.plots(&[
+            (&plot("Reprojection error", "px", &errors), "How far the points are from where they were seen."),
+            (&plot("Angle between the rays", "degrees", &angles), "Small angles make uncertain depths."),
+        ]);
+        report.facts(&result.stages.iter().map(|(name, s)| (*name, format!("{s:.3} s"))).collect::<Vec<_>>());
+        Ok(report.to_html())
+    }
+}
+
+fn position(p: &cv_pipeline::ScenePoint) -> [f32; 3] {
+    [p.position.x as f32, p.position.y as f32, p.position.z as f32]
+}
+

@@ -1,0 +1,446 @@
+//! Points and camera poses from two photographs.
+
+use crate::{MatchingError, MatchingOptions, MatchingResult, Progress, Stopwatch, match_photos};
+use cv_core::{Camera, CameraError, Correspondence, ImageView, Matrix3, Point2, Point3, Pose};
+use cv_geometry::{
+    BundleOptions, EstimateError, RobustOptions, TwoViewBundle, adjust_two_views, essential_from_fundamental,
+    essential_from_pose, estimate_fundamental, estimate_homography, estimate_relative_pose, normalize_matches,
+    parallax_angle, recover_pose, refine_relative_pose, rotation_between, triangulate,
+};
+
+/// What is known of the cameras.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Intrinsics {
+    /// Both cameras are calibrated.
+    Known([Camera; 2]),
+    /// A focal length in pixels for each photograph, such as from EXIF; principal points in the middle, no distortion.
+    Focal([f64; 2]),
+    /// One unknown focal length for both photographs; principal points in the middle, no distortion.
+    Unknown,
+}
+
+/// Settings of [`reconstruct`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct ReconstructOptions {
+    /// Features and matches.
+    pub matching: MatchingOptions,
+    /// What is known of the cameras. Default unknown.
+    pub intrinsics: Intrinsics,
+    /// The search for the pose. The threshold is in pixels; default 2 px, three to four times what a SIFT point is good to.
+    pub robust: RobustOptions,
+    /// Fewest matches that must agree. Default 30, COLMAP's for a first pair being 100 and for any pair 15.
+    pub min_inliers: usize,
+    /// Smallest share of matches that must agree. 0 to 1; default 0.1: fewer may well agree by chance.
+    pub min_inlier_share: f64,
+    /// Smallest median angle between the two rays of a point, in radians. Default 0.5 degrees: depth is then known to a fifth
+    /// or so, for a point good to half a pixel at a focal length of 1000 px.
+    pub min_median_angle: f64,
+    /// Smallest angle between the two rays of a point that is kept, in radians. Default 0.1 degrees.
+    pub min_angle: f64,
+    /// Largest reprojection error of a point that is kept, in pixels, in either photograph. Default 2 px.
+    pub max_reprojection: f64,
+    /// A homography (or a rotation) that explains this share of the matches that agree makes the scene a plane (or the motion a
+    /// turn). 0 to 1; default 0.95.
+    pub degenerate_share: f64,
+}
+
+impl Default for ReconstructOptions {
+    fn default() -> Self {
+        Self {
+            matching: MatchingOptions::default(),
+            intrinsics: Intrinsics::Unknown,
+            robust: RobustOptions { threshold: 2.0, ..RobustOptions::default() },
+            min_inliers: 30,
+            min_inlier_share: 0.1,
+            min_median_angle: 0.5f64.to_radians(),
+            min_angle: 0.1f64.to_radians(),
+            max_reprojection: 2.0,
+            degenerate_share: 0.95,
+        }
+    }
+}
+
+/// A reconstructed point.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ScenePoint {
+    /// In the first camera's frame; the unit is the distance between the cameras.
+    pub position: Point3<f64>,
+    /// Of the first photograph.
+    pub color: [u8; 3],
+    /// Which match it comes from.
+    pub match_index: usize,
+    /// Root mean square of its reprojection errors in the two photographs, in pixels.
+    pub reprojection: f64,
+    /// Angle between its two rays, in radians.
+    pub angle: f64,
+    /// Covariance of the position.
+    pub covariance: Matrix3<f64>,
+}
+
+/// What [`reconstruct`] found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ReconstructResult {
+    /// Features and tentative matches.
+    pub matching: MatchingResult,
+    /// Indices of the matches that obey the epipolar geometry, ascending.
+    pub inliers: Vec<usize>,
+    /// The cameras, refined where they were not known.
+    pub cameras: [Camera; 2],
+    /// First camera frame to second; the translation has length one.
+    pub pose: Pose,
+    /// The points that were kept.
+    pub points: Vec<ScenePoint>,
+    /// Root mean square reprojection error of the points, over both photographs, in pixels.
+    pub reprojection_rms: f64,
+    /// Median angle between the two rays of a point, in radians.
+    pub median_angle: f64,
+    /// Standard deviations of the rotation and of the direction of the translation, in radians.
+    pub pose_deviation: [f64; 2],
+    /// Relative standard deviation of the focal length; 0 where it was given.
+    pub focal_deviation: f64,
+    /// Share of the inliers that one homography explains.
+    pub planar_share: f64,
+    /// Stage names and their seconds.
+    pub stages: Vec<(&'static str, f64)>,
+}
+
+impl ReconstructResult {
+    /// The fundamental matrix between undistorted pixels.
+    pub fn fundamental(&self) -> Matrix3<f64> {
+        let [a, b] = &self.cameras;
+        b.inverse_matrix().transpose() * essential_from_pose(&self.pose) * a.inverse_matrix()
+    }
+}
+
+/// Why two photographs could not be reconstructed.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum ReconstructError {
+    /// The photographs could not be matched at all.
+    #[error(transparent)]
+    Matching(#[from] MatchingError),
+    /// A camera is not one.
+    #[error("camera {index}: {source}")]
+    Camera {
+        /// 1 or 2.
+        index: usize,
+        /// Why.
+        source: CameraError,
+    },
+    /// A camera is not that of its photograph.
+    #[error("camera {index} takes pictures of {camera:?} px, but its photograph is of {photo:?} px")]
+    CameraSize {
+        /// 1 or 2.
+        index: usize,
+        /// Width and height by the camera.
+        camera: (usize, usize),
+        /// Width and height of the photograph.
+        photo: (usize, usize),
+    },
+    /// Too few tentative matches.
+    #[error("{got} matches are too few: at least {needed} are needed")]
+    TooFewMatches {
+        /// Matches found.
+        got: usize,
+        /// Matches needed.
+        needed: usize,
+    },
+    /// Too few matches agree on a motion.
+    #[error("only {inliers} of {matches} matches ({:.0} %) agree on a camera motion; at least {needed} must", 100.0 * *inliers as f64 / *matches as f64)]
+    TooFewInliers {
+        /// Matches that agree.
+        inliers: usize,
+        /// Matches.
+        matches: usize,
+        /// Matches that must agree.
+        needed: usize,
+    },
+    /// The camera turned without moving.
+    #[error("the camera only turned: a rotation by {degrees:.1} degrees explains {:.0} % of the matches", 100.0 * share)]
+    PureRotation {
+        /// Share of the inliers that the rotation explains.
+        share: f64,
+        /// Its angle in degrees.
+        degrees: f64,
+    },
+    /// All points lie on one plane.
+    #[error("the scene is one plane: a homography explains {:.0} % of the matches", 100.0 * share)]
+    Planar {
+        /// Share of the inliers that the homography explains.
+        share: f64,
+    },
+    /// The rays to the points are nearly parallel.
+    #[error(
+        "too little parallax: the median angle between the two rays of a point is {degrees:.2} degrees; {needed:.2} are needed"
+    )]
+    LittleParallax {
+        /// Median angle in degrees.
+        degrees: f64,
+        /// Angle needed, in degrees.
+        needed: f64,
+    },
+    /// The focal length that was given fits the matches much worse than others, or none can be told.
+    #[error("the focal length cannot be told from these photographs ({focal:.0} px, give or take {:.0} %)", 100.0 * deviation)]
+    UnknownFocal {
+        /// Best estimate in pixels.
+        focal: f64,
+        /// Relative standard deviation.
+        deviation: f64,
+    },
+    /// The search for a model failed.
+    #[error(transparent)]
+    Estimate(EstimateError),
+}
+
+impl ReconstructError {
+    /// What a person can do about it.
+    pub fn advice(&self) -> &'static str {
+        match self {
+            Self::Matching(_) => "take sharper photographs with more texture",
+            Self::Camera { .. } | Self::CameraSize { .. } => "check the camera file",
+            Self::TooFewMatches { .. } | Self::TooFewInliers { .. } => {
+                "take photographs that share more of the scene, from places nearer to each other"
+            }
+            Self::PureRotation { .. } => {
+                "step aside between the photographs; to join photographs from one place use `cv panorama`"
+            }
+            Self::Planar { .. } => "include things in front of the plane or behind it",
+            Self::LittleParallax { .. } => "take the photographs farther apart",
+            Self::UnknownFocal { .. } => "give the focal length (--focal) or a camera file (--camera)",
+            Self::Estimate(_) => "check the matches with `cv match`",
+        }
+    }
+}
+
+/// Reconstructs what two photographs show: features, matches, relative pose, points.
+///
+/// The world is the first camera's frame and its unit the distance between the cameras, which photographs cannot tell.
+///
+/// # Errors
+/// [`ReconstructError`], each with its numbers.
+pub fn reconstruct(
+    a: ImageView<'_, u8, 3>,
+    b: ImageView<'_, u8, 3>,
+    options: &ReconstructOptions,
+    progress: &dyn Progress,
+) -> Result<ReconstructResult, ReconstructError> {
+    let mut watch = Stopwatch::new();
+    let prior = cameras(options.intrinsics, [a.size(), b.size()])?;
+    let matching = match_photos(a, b, &options.matching, progress)?;
+    for &(stage, seconds) in &matching.stages {
+        watch.add(stage, seconds);
+    }
+    let pairs = &matching.pairs;
+    if pairs.len() < options.min_inliers {
+        return Err(ReconstructError::TooFewMatches { got: pairs.len(), needed: options.min_inliers });
+    }
+    progress.report("pose", 0, 1);
+    let (cameras, pose, inliers) = watch.time("pose", || initial(pairs, [a.size(), b.size()], prior, options))?;
+    let chosen: Vec<Correspondence> = inliers.iter().map(|&i| pairs[i]).collect();
+    let (normalised, unit) = normalize_matches(&chosen, &cameras[0], &cameras[1]);
+    let planar_share = watch.time("degeneracy", || degeneracy(&chosen, &normalised, unit, &cameras, options))?;
+
+    progress.report("points", 0, 1);
+    let mut kept = Vec::new();
+    let mut points = Vec::new();
+    for (k, m) in normalised.iter().enumerate() {
+        if let Ok(point) = triangulate(m, &pose) {
+            kept.push(k);
+            points.push(point);
+        }
+    }
+    watch.lap("triangulate");
+    let too_few = |n| ReconstructError::TooFewInliers { inliers: n, matches: pairs.len(), needed: options.min_inliers };
+    let mut bundle = TwoViewBundle { cameras, pose, points };
+    let refine_focal = prior.is_none();
+    let settings = BundleOptions { refine_focal, ..BundleOptions::default() };
+    let observed: Vec<Correspondence> = kept.iter().map(|&k| chosen[k]).collect();
+    let report = watch.time("bundle", || adjust_two_views(&mut bundle, &observed, &settings));
+    let report = report.ok_or_else(|| too_few(kept.len()))?;
+    let focal = bundle.cameras[0].fx;
+    // Beyond a third, the shape of the scene is a guess.
+    if refine_focal && report.focal_deviation > 0.33 {
+        return Err(ReconstructError::UnknownFocal { focal, deviation: report.focal_deviation });
+    }
+
+    let mut scene = Vec::new();
+    for (j, (point, m)) in bundle.points.iter().zip(&observed).enumerate() {
+        let Some(errors) = reprojection(&bundle, point, m) else { continue };
+        let angle = parallax_angle(point, &bundle.pose);
+        if angle >= options.min_angle && errors.iter().all(|e| *e <= options.max_reprojection) {
+            scene.push(ScenePoint {
+                position: *point,
+                color: color_at(a, m.a),
+                match_index: inliers[kept[j]],
+                reprojection: ((errors[0] * errors[0] + errors[1] * errors[1]) / 2.0).sqrt(),
+                angle,
+                covariance: report.covariances[j],
+            });
+        }
+    }
+    if scene.len() < options.min_inliers {
+        return Err(too_few(scene.len()));
+    }
+    let mut angles: Vec<f64> = scene.iter().map(|p| p.angle).collect();
+    let middle = angles.len() / 2;
+    let median_angle = *angles.select_nth_unstable_by(middle, f64::total_cmp).1;
+    if median_angle < options.min_median_angle {
+        return Err(ReconstructError::LittleParallax {
+            degrees: median_angle.to_degrees(),
+            needed: options.min_median_angle.to_degrees(),
+        });
+    }
+    let squares: f64 = scene.iter().map(|p| p.reprojection * p.reprojection).sum();
+    watch.lap("filter");
+    Ok(ReconstructResult {
+        inliers,
+        cameras: bundle.cameras,
+        pose: bundle.pose,
+        reprojection_rms: (squares / scene.len() as f64).sqrt(),
+        points: scene,
+        median_angle,
+        pose_deviation: report.pose_deviation,
+        focal_deviation: report.focal_deviation,
+        planar_share,
+        matching,
+        stages: watch.into_stages(),
+    })
+}
+
+/// The cameras, where they are known.
+fn cameras(intrinsics: Intrinsics, sizes: [(usize, usize); 2]) -> Result<Option<[Camera; 2]>, ReconstructError> {
+    let cameras = match intrinsics {
+        Intrinsics::Unknown => return Ok(None),
+        Intrinsics::Known(cameras) => cameras,
+        Intrinsics::Focal(focal) => [0, 1].map(|i: usize| Camera::from_focal(sizes[i].0, sizes[i].1, focal[i])),
+    };
+    for (i, camera) in cameras.iter().enumerate() {
+        camera.validate().map_err(|source| ReconstructError::Camera { index: i + 1, source })?;
+        if (camera.width, camera.height) != sizes[i] {
+            return Err(ReconstructError::CameraSize {
+                index: i + 1,
+                camera: (camera.width, camera.height),
+                photo: sizes[i],
+            });
+        }
+    }
+    Ok(Some(cameras))
+}
+
+/// Cameras, pose, and the matches that agree.
+type Initial = ([Camera; 2], Pose, Vec<usize>);
+
+fn initial(
+    pairs: &[Correspondence],
+    sizes: [(usize, usize); 2],
+    prior: Option<[Camera; 2]>,
+    options: &ReconstructOptions,
+) -> Result<Initial, ReconstructError> {
+    let (cameras, pose, inliers) = match prior {
+        Some(cameras) => {
+            let (pose, inliers) = calibrated(pairs, &cameras, options)?;
+            (cameras, pose, inliers)
+        }
+        None => uncalibrated(pairs, sizes, options)?,
+    };
+    let needed = options.min_inliers.max((options.min_inlier_share * pairs.len() as f64).ceil() as usize);
+    if inliers.len() < needed {
+        return Err(ReconstructError::TooFewInliers { inliers: inliers.len(), matches: pairs.len(), needed });
+    }
+    Ok((cameras, pose, inliers))
+}
+
+fn calibrated(
+    pairs: &[Correspondence],
+    cameras: &[Camera; 2],
+    options: &ReconstructOptions,
+) -> Result<(Pose, Vec<usize>), ReconstructError> {
+    let (normalised, unit) = normalize_matches(pairs, &cameras[0], &cameras[1]);
+    // A pixel that no ray reaches (beyond the range of the lens model) is no match.
+    let usable: Vec<usize> = (0..normalised.len()).filter(|&i| normalised[i].is_finite()).collect();
+    let normalised: Vec<_> = usable.iter().map(|&i| normalised[i]).collect();
+    let robust = RobustOptions { threshold: options.robust.threshold * unit, ..options.robust };
+    let found = estimate_relative_pose(&normalised, &robust).map_err(|error| failed(error, pairs.len(), options))?;
+    Ok((found.model, found.inliers.iter().map(|&i| usable[i]).collect()))
+}
+
+/// Too few matches that agree is the reason a person understands.
+fn failed(error: EstimateError, matches: usize, options: &ReconstructOptions) -> ReconstructError {
+    match error {
+        EstimateError::NoConsensus { inliers, .. } => {
+            ReconstructError::TooFewInliers { inliers, matches, needed: options.min_inliers }
+        }
+        EstimateError::NotEnoughMatches { got, .. } => {
+            ReconstructError::TooFewMatches { got, needed: options.min_inliers }
+        }
+        other => ReconstructError::Estimate(other),
+    }
+}
+
+/// Tries focal lengths on the inliers of a fundamental matrix and keeps the one whose essential matrix fits best.
+fn uncalibrated(
+    pairs: &[Correspondence],
+    sizes: [(usize, usize); 2],
+    options: &ReconstructOptions,
+) -> Result<Initial, ReconstructError> {
+    let found = estimate_fundamental(pairs, &options.robust).map_err(|error| failed(error, pairs.len(), options))?;
+    let chosen: Vec<Correspondence> = found.inliers.iter().map(|&i| pairs[i]).collect();
+    let (mut best, mut cameras, mut pose) = (f64::INFINITY, None, Pose::identity());
+    let longest = sizes[0].0.max(sizes[0].1) as f64;
+    // From 100 to 10 degrees of view, in steps of a tenth: refinement bridges half a step.
+    for k in 0..25 {
+        let focal = 0.4 * longest * 1.12f64.powi(k);
+        let pair = sizes.map(|(width, height)| Camera::from_focal(width, height, focal));
+        let Ok(e) = essential_from_fundamental(&found.model, &pair[0], &pair[1]) else { continue };
+        let (normalised, unit) = normalize_matches(&chosen, &pair[0], &pair[1]);
+        let Ok(recovered) = recover_pose(&e, &normalised) else { continue };
+        let (refined, loss) = refine_relative_pose(&recovered.pose, &normalised, options.robust.threshold * unit);
+        if loss < best {
+            (best, cameras, pose) = (loss, Some(pair), refined);
+        }
+    }
+    let cameras = cameras.ok_or(ReconstructError::UnknownFocal { focal: f64::NAN, deviation: f64::INFINITY })?;
+    Ok((cameras, pose, found.inliers))
+}
+
+/// Names a camera that only turned and a scene that is one plane; otherwise, the share that a homography explains.
+fn degeneracy(
+    pairs: &[Correspondence],
+    normalised: &[Correspondence],
+    unit: f64,
+    cameras: &[Camera; 2],
+    options: &ReconstructOptions,
+) -> Result<f64, ReconstructError> {
+    // Distances in two dimensions and two photographs, where the epipolar one is in one.
+    let reach = 2.0 * options.robust.threshold;
+    if let Ok((rotation, share)) = rotation_between(normalised, reach * unit)
+        && share >= options.degenerate_share
+    {
+        return Err(ReconstructError::PureRotation { share, degrees: rotation.angle().to_degrees() });
+    }
+    let straight: Vec<Correspondence> = pairs
+        .iter()
+        .map(|m| Correspondence { a: cameras[0].undistort_pixel(m.a), b: cameras[1].undistort_pixel(m.b) })
+        .collect();
+    let robust = RobustOptions { threshold: reach, ..options.robust };
+    let share = match estimate_homography(&straight, &robust) {
+        Ok(h) => h.inliers.len() as f64 / pairs.len() as f64,
+        Err(_) => 0.0,
+    };
+    if share >= options.degenerate_share {
+        return Err(ReconstructError::Planar { share });
+    }
+    Ok(share)
+}
+
+/// Reprojection errors in pixels in both photographs; `None` behind a camera.
+fn reprojection(bundle: &TwoViewBundle, point: &Point3<f64>, m: &Correspondence) -> Option<[f64; 2]> {
+    let first = bundle.cameras[0].project(point)?;
+    let second = bundle.cameras[1].project(&bundle.pose.transform(point))?;
+    Some([(first - m.a).norm(), (second - m.b).norm()])
+}
+
+/// The colour of the pixel nearest to a position.
+fn color_at(photo: ImageView<'_, u8, 3>, p: Point2<f64>) -> [u8; 3] {
+    let near = |v: f64, n: usize| v.round().clamp(0.0, n.saturating_sub(1) as f64) as usize;
+    photo.get(near(p.x, photo.width()), near(p.y, photo.height())).unwrap_or([0; 3])
+}
