@@ -111,7 +111,7 @@ pub fn color_bar(height: usize, range: (f32, f32), colormap: Colormap, label: &s
     // Text grows with the picture, between the sizes that can be read and that do not shout.
     let size = (height as f32 / 40.0).clamp(8.0, 22.0);
     let bar = (size * 1.6).round();
-    let (top, bottom) = ((size * 2.6).round(), (size * 1.1).round());
+    let (top, bottom) = ((size * 3.4).round(), (size * 1.1).round());
     let length = (height as f32 - top - bottom).max(1.0);
     let range64 = (f64::from(range.0), f64::from(range.1));
     let marks = ticks(range64, ((length / (size * 3.2)) as usize).clamp(2, 10));

@@ -24,8 +24,8 @@ pub fn draw_keypoints(view: ImageView<'_, u8, 3>, keypoints: &[Keypoint], color:
     for point in keypoints {
         let center = [point.position.x, point.position.y];
         let radius = (3.6 * u).max(3.0 * point.scale.clamp(0.0, 100.0));
-        canvas.circle(center, radius, 3.4 * u, colors::BLACK);
-        canvas.circle(center, radius, 1.7 * u, color);
+        canvas.circle(center, radius, 2.9 * u, colors::BLACK);
+        canvas.circle(center, radius, 1.5 * u, color);
         if point.angle != 0.0 && point.angle.is_finite() {
             let end = [center[0] + radius * point.angle.cos(), center[1] + radius * point.angle.sin()];
             canvas.line(center, end, 1.3 * u, color);

@@ -199,7 +199,9 @@ impl Report {
 
     /// Pictures beside each other, as many in a row as fit.
     pub fn figures(&mut self, figures: Vec<Figure>) -> &mut Self {
-        self.body.push_str("<div class=\"grid\">");
+        // Four in rows of three would leave one alone.
+        let pairs = if matches!(figures.len(), 2 | 4) { " pairs" } else { "" };
+        let _ = write!(self.body, "<div class=\"grid{pairs}\">");
         figures.iter().for_each(|f| self.push_figure(f));
         self.body.push_str("</div>");
         self
@@ -306,9 +308,10 @@ impl Report {
     }
 }
 
-/// True for a number with at most a unit behind it, and for the dash that stands for none.
+/// True for a number, maybe behind a sign such as ≤ and before a unit, and for the dash that stands for none.
 fn is_numeric(cell: &str) -> bool {
-    let first = cell.split([' ', '%']).next().unwrap_or("");
+    let bare = cell.trim_start_matches(['≤', '≥', '<', '>', '±', '~', ' ']);
+    let first = bare.split([' ', '%']).next().unwrap_or("");
     let digits = first.replace([',', '\u{2009}', '×'], "").replace('−', "-");
     matches!(cell, "" | "–" | "-" | "—") || digits.parse::<f64>().is_ok()
 }
@@ -356,11 +359,11 @@ mod tests {
         let mut report = Report::new("t");
         report.figures(vec![Figure::new(vec![0], "one"), Figure::new(vec![0], "two")]);
         report.plot(&Plot::new("p", "x", "y"), "three");
-        report.table("first", &["a", "b"], &[vec!["x", "1.5 px"], vec!["y", "–"]]);
+        report.table("first", &["a", "b"], &[vec!["x", "≤ 1.5 px"], vec!["y", "–"]]);
         let html = report.to_html();
         for text in ["Figure 1.</b> one", "Figure 2.</b> two", "Figure 3.</b> three", "Table 1.</b> first"] {
             assert!(html.contains(text), "{text}");
         }
-        assert!(html.contains("<td class=\"n\">1.5 px</td>") && html.contains("<td>x</td>"));
+        assert!(html.contains("<td class=\"n\">≤ 1.5 px</td>") && html.contains("<td>x</td>"));
     }
 }

@@ -61,7 +61,7 @@
       const back = scene.eye ? sub(scene.center, scene.eye) : [0, 0, 1];
       view.target = [...scene.center];
       const depth = Math.hypot(...back);
-      view.distance = scene.eye && depth > 0.5 * scene.radius ? Math.min(depth * 1.25, 6 * scene.radius) : 2.4 * scene.radius;
+      view.distance = scene.eye && depth > 0.5 * scene.radius ? Math.min(depth * 1.25, 6 * scene.radius) : 2 * scene.radius;
       view.yaw = Math.atan2(back[0], back[2]) + 0.15;
       view.pitch = Math.atan2(back[1], Math.hypot(back[0], back[2])) + 0.12;
       draw();
@@ -111,7 +111,7 @@
     }
 
     const turn = (dx, dy) => {
-      view.yaw -= dx * 0.006;
+      view.yaw += dx * 0.006;
       view.pitch = Math.max(-1.55, Math.min(1.55, view.pitch + dy * 0.006));
     };
     const pan = (dx, dy) => {
