@@ -61,8 +61,3 @@ pub mod stereo {
         StereoMatcher, StereoOptions, Subpixel, evaluate_disparity, non_occluded,
     };
 }
-
-/// What a caller needs of the geometry stage besides the jobs: robust estimation from matches.
-pub mod geometry {
-    pub use cv_geometry::{EstimateError, RobustModel, RobustOptions, estimate_homography, homography_residual};
-}

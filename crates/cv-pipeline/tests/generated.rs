@@ -4,10 +4,15 @@
 //! seed here, with none left out; the seeds were not chosen by their results.
 
 use cv_core::Camera;
-use cv_geometry::{RobustOptions, estimate_homography};
-use cv_pipeline::{DepthOptions, MatchingOptions, Silent, depth, match_photos};
+use cv_pipeline::{
+    DepthOptions, Intrinsics, MatchingOptions, ModelKind, PanoramaOptions, PanoramaPhoto, ReconstructOptions, Silent,
+    depth, estimate, match_photos, panorama, reconstruct,
+};
 use cv_stereo::{StereoGeometry, StereoOptions};
-use cv_synth::{RenderOptions, Scene, depth_score, homography_corner_error, homography_pair, stereo_pair};
+use cv_synth::{
+    RenderOptions, Scene, alignment_error, depth_score, direction_error, homography_corner_error, homography_pair,
+    panorama_views, rotation_error, stereo_pair, two_view,
+};
 
 const SEEDS: std::ops::Range<u64> = 0..6;
 
@@ -21,7 +26,8 @@ fn a_homographys_corners_are_within_three_tenths_of_a_pixel() {
         let pair = homography_pair(seed, &camera(), 0.3, &RenderOptions::default()).unwrap();
         let options = MatchingOptions::default();
         let found = match_photos(pair.a.image.view(), pair.b.image.view(), &options, &Silent).unwrap();
-        let model = estimate_homography(&found.pairs, &RobustOptions::homography()).unwrap();
+        let kind = ModelKind::Homography;
+        let model = estimate(&found.pairs, kind, &kind.options(), &Silent).unwrap().robust;
         let error = homography_corner_error(&model.model, &pair.homography, 640, 480);
         println!("seed {seed}: {} matches, {} inliers, {error:.3} px", found.pairs.len(), model.inliers.len());
         assert!(error <= 0.3, "seed {seed}: {error} px");
@@ -46,5 +52,67 @@ fn depth_is_within_five_percent_nearly_everywhere() {
             // Less than 280,000 of 307,200 would mean that the scene was not the one meant.
             assert!(score.within >= 0.95 && score.pixels > 280_000, "{name} {seed}: {score:?}");
         }
+    }
+}
+
+#[test]
+fn a_panorama_uses_every_photograph_and_aligns_within_a_fifth_of_a_pixel() {
+    // Five pictures a seed: fewer seeds.
+    for seed in 0..3 {
+        let camera = camera();
+        // Every other time somebody walks through.
+        let walk = cv_synth::PanoramaOptions { walker: seed % 2 == 0, ..cv_synth::PanoramaOptions::default() };
+        let set = panorama_views(seed, &camera, &walk, &RenderOptions::default()).unwrap();
+        let photos: Vec<_> = set.views.iter().map(|v| PanoramaPhoto::new(v.image.view())).collect();
+        let result = panorama(&photos, &PanoramaOptions::default(), &Silent).unwrap();
+        assert!(result.images.iter().all(|i| i.used), "seed {seed}: {:?}", result.images);
+        let views: Vec<_> = result.alignment.views.iter().map(|v| v.unwrap()).collect();
+        let (mut sum, mut pairs) = (0.0, 0.0);
+        for (i, j) in (0..views.len()).flat_map(|i| (0..views.len()).map(move |j| (i, j))).filter(|(i, j)| i != j) {
+            let map = |p| views[j].project(&views[i].ray(p)?);
+            if let Some(error) = alignment_error(map, |p| set.transfer(i, j, p), camera.width, camera.height) {
+                sum += error * error;
+                pairs += 1.0;
+            }
+        }
+        let rms = f64::sqrt(sum / pairs);
+        println!("seed {seed}: {rms:.3} px over {pairs} pairs, focal {:.2} px", views[0].camera.fx);
+        // Five photographs with a 45 % overlap: four pairs of neighbours, seen both ways, at least. Half a pixel at a seam
+        // would show; thousands of matches place a view several times better.
+        assert!(pairs >= 8.0 && rms <= 0.2, "seed {seed}: {rms} px over {pairs} pairs");
+    }
+}
+
+#[test]
+fn two_views_give_the_turn_and_the_direction_of_travel() {
+    for seed in SEEDS {
+        let camera = camera();
+        let pair = two_view(seed, &camera, 0.6, &RenderOptions::default()).unwrap();
+        let known = Intrinsics::Known([camera; 2]);
+        let options = ReconstructOptions { intrinsics: known, ..ReconstructOptions::default() };
+        let found = reconstruct(pair.a.image.view(), pair.b.image.view(), &options, &Silent).unwrap();
+        let turn = rotation_error(&found.pose.rotation, &pair.relative.rotation).to_degrees();
+        let way = direction_error(&found.pose.translation, &pair.relative.translation).to_degrees();
+        println!("seed {seed}: {} points, rotation {turn:.4}°, direction {way:.3}°", found.points.len());
+        assert!(turn <= 0.2 && way <= 1.0, "seed {seed}: rotation {turn}°, direction {way}°");
+        // The points too, at the true scale: their median distance from the surface that their pixel shows.
+        let scale = pair.relative.translation.norm() / found.pose.translation.norm();
+        let mut off: Vec<f64> = found
+            .points
+            .iter()
+            .filter_map(|p| {
+                let at = camera.project(&p.position)?;
+                let truth = pair.a.pose.transform(&pair.scene.point_at(&camera, &pair.a.pose, at)?);
+                Some((p.position.z * scale - truth.z).abs() / truth.z)
+            })
+            .collect();
+        off.sort_by(f64::total_cmp);
+        // A tenth of a pixel in a disparity of 31 px (6 m away) is 0.3 %; 2 % would be half a pixel.
+        assert!(
+            off.len() > 200 && off[off.len() / 2] < 0.02,
+            "seed {seed}: {} points, {}",
+            off.len(),
+            off[off.len() / 2]
+        );
     }
 }

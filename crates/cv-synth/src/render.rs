@@ -110,8 +110,8 @@ pub(crate) fn meter(scene: &Scene, lighting: &Lighting) -> f32 {
     levels.sort_by(f32::total_cmp);
     let mean = levels.iter().sum::<f32>() / levels.len().max(1) as f32;
     let bright = levels.get(levels.len() * 49 / 50).copied().unwrap_or(0.0);
-    // 0.19 linear is 47 % of the sRGB range.
-    let gain = (0.19 / mean).min(0.95 / bright);
+    // 0.25 linear is 54 % of the sRGB range.
+    let gain = (0.25 / mean).min(0.95 / bright);
     if gain.is_finite() { gain } else { 1.0 }
 }
 

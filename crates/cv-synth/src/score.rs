@@ -129,25 +129,21 @@ fn ratio(part: usize, whole: usize) -> f64 {
     if whole == 0 { 1.0 } else { part as f64 / whole as f64 }
 }
 
-/// Root mean square in pixels, over the pixels of a 17 × 17 grid on the first picture that the second one sees too, of
-/// the distance between where `estimate` and the true homography send them; infinite where the estimate sends one
-/// nowhere. `None` where the pictures do not overlap.
+/// Root mean square in pixels, over the pixels of a 17 × 17 grid on a first picture that a second one of the same size
+/// sees too, of the distance between where `estimate` and `truth` say that the second one sees them; infinite where the
+/// estimate names no place. `None` where the pictures do not overlap.
 pub fn alignment_error(
     estimate: impl Fn(Point2<f64>) -> Option<Point2<f64>>,
-    truth: &Matrix3<f64>,
+    truth: impl Fn(Point2<f64>) -> Option<Point2<f64>>,
     width: usize,
     height: usize,
 ) -> Option<f64> {
     let (mut sum, mut n) = (0.0, 0.0);
+    let inside = |v: f64, n: usize| v >= 0.0 && v <= n as f64 - 1.0;
     for (i, j) in (0..17).flat_map(|j| (0..17).map(move |i| (i, j))) {
-        let x = f64::from(i) / 16.0 * (width as f64 - 1.0);
-        let y = f64::from(j) / 16.0 * (height as f64 - 1.0);
-        let q = truth * Vector3::new(x, y, 1.0);
-        // In front of the second camera, and inside its picture.
-        let there = Point2::new(q.x / q.z, q.y / q.z);
-        let inside = |v: f64, n: usize| v >= 0.0 && v <= n as f64 - 1.0;
-        if q.z * truth[(2, 2)].signum() > 0.0 && inside(there.x, width) && inside(there.y, height) {
-            sum += estimate(Point2::new(x, y)).map_or(f64::INFINITY, |p| (p - there).norm_squared());
+        let here = Point2::new(f64::from(i) / 16.0 * (width as f64 - 1.0), f64::from(j) / 16.0 * (height as f64 - 1.0));
+        if let Some(there) = truth(here).filter(|p| inside(p.x, width) && inside(p.y, height)) {
+            sum += estimate(here).map_or(f64::INFINITY, |p| (p - there).norm_squared());
             n += 1.0;
         }
     }
@@ -176,10 +172,11 @@ mod tests {
     fn a_shift_is_its_length_at_every_corner() {
         let shift = Matrix3::new(1.0, 0.0, 3.0, 0.0, 1.0, 4.0, 0.0, 0.0, 1.0);
         assert_eq!(homography_corner_error(&shift, &Matrix3::identity(), 640, 480), 5.0);
-        assert_eq!(alignment_error(Some, &shift, 640, 480), Some(5.0));
-        assert_eq!(alignment_error(|_| None, &shift, 640, 480), Some(f64::INFINITY));
-        let away = Matrix3::new(1.0, 0.0, 1e4, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0);
-        assert_eq!(alignment_error(Some, &away, 640, 480), None);
+        let moved = |by: f64| move |p: Point2<f64>| Some(Point2::new(p.x + by, p.y));
+        assert_eq!(alignment_error(moved(3.0), moved(8.0), 640, 480), Some(5.0));
+        assert_eq!(alignment_error(|_| None, moved(8.0), 640, 480), Some(f64::INFINITY));
+        assert_eq!(alignment_error(Some, moved(1e4), 640, 480), None);
+        assert_eq!(alignment_error(Some, |_| None, 640, 480), None);
         assert_eq!(homography_corner_error(&Matrix3::zeros(), &shift, 640, 480), f64::INFINITY);
     }
 

@@ -7,7 +7,7 @@ use crate::scene::Scene;
 use crate::scenes::{Wall, path, walker};
 use crate::sensor::RenderOptions;
 use crate::truth::{plane_homography, rotation_homography};
-use cv_core::{Camera, Distortion, GrayF32, Mask, Pose};
+use cv_core::{Camera, Distortion, GrayF32, Mask, Point2, Pose};
 use nalgebra::{Matrix3, Point3, Rotation3, Vector3};
 
 /// A rectified pair.
@@ -142,6 +142,15 @@ impl PanoramaViews {
     pub fn homography(&self, from: usize, to: usize) -> Option<Matrix3<f64>> {
         let (a, b) = (self.views.get(from)?, self.views.get(to)?);
         Some(rotation_homography((&a.camera, &a.pose), (&b.camera, &b.pose)))
+    }
+
+    /// Where view `to` sees, inside its picture or not, what view `from` sees at a pixel; `None` where that is behind
+    /// it, or there is no such view. Lens distortion included.
+    pub fn transfer(&self, from: usize, to: usize, pixel: Point2<f64>) -> Option<Point2<f64>> {
+        let (a, b) = (self.views.get(from)?, self.views.get(to)?);
+        let n = a.camera.normalize(pixel);
+        let ray = Pose::relative(&a.pose, &b.pose).rotation * Point3::new(n.x, n.y, 1.0);
+        b.camera.project(&ray).filter(|p| p.x.is_finite() && p.y.is_finite())
     }
 }
 

@@ -209,7 +209,14 @@ fn a_panoramas_homographies_are_those_of_its_points() {
     for c in pairs {
         let q = h * Vector3::new(c.a.x, c.a.y, 1.0);
         assert!((q.x / q.z - c.b.x).hypot(q.y / q.z - c.b.y) < 1e-8);
+        assert!((set.transfer(0, 1, c.a).unwrap() - c.b).norm() < 1e-8);
     }
+    // What is in front of one view is behind one that looks the other way.
+    let around = PanoramaOptions { views: 4, overlap: 0.1, ..PanoramaOptions::default() };
+    let around = panorama_views(4, &camera, &around, &RenderOptions::default()).unwrap();
+    assert!(
+        around.transfer(0, 3, Point2::new(39.5, 29.5)).is_none() && around.transfer(0, 4, Point2::origin()).is_none()
+    );
     // The walker is in some picture, in none wholly.
     let share: Vec<usize> = set.walker.iter().map(|m| m.pixels().filter(|p| p[0]).count()).collect();
     assert!(share.iter().sum::<usize>() > 30 && share.iter().all(|&s| s < 2400), "{share:?}");

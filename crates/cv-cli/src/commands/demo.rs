@@ -2,6 +2,8 @@
 
 mod depth;
 mod homography;
+mod panorama;
+mod reconstruct;
 
 use crate::common::{Context, Failure, Outcome, Run, create_dir};
 use cv_core::{Camera, RgbU8};
@@ -110,7 +112,12 @@ impl Part {
 type Job = fn(&Demo<'_>) -> Result<Part, Failure>;
 
 /// In the order in which a reader learns them.
-const JOBS: [(&str, Job); 2] = [("homography", homography::run), ("depth", depth::run)];
+const JOBS: [(&str, Job); 4] = [
+    ("homography", homography::run),
+    ("panorama", panorama::run),
+    ("reconstruct", reconstruct::run),
+    ("depth", depth::run),
+];
 
 impl Run for Args {
     fn run(self, context: &Context) -> Result<Outcome, Failure> {

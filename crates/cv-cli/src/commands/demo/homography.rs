@@ -3,8 +3,7 @@
 use super::{Check, Demo, Part};
 use crate::common::Failure;
 use cv_core::{ImageView, Matrix3, RgbU8, Vector3};
-use cv_pipeline::geometry::{RobustOptions, estimate_homography};
-use cv_pipeline::{MatchingOptions, match_photos};
+use cv_pipeline::{MatchingOptions, ModelKind, estimate, match_photos};
 use cv_report::{MatchStyle, colors, draw_keypoints, draw_matches};
 use cv_synth::{RenderOptions, homography_corner_error, homography_pair};
 
@@ -16,12 +15,12 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
         Ok(found) => found,
         Err(error) => return Ok(Part::gave_up("homography", &error)),
     };
-    let mut options = RobustOptions::homography();
+    let mut options = ModelKind::Homography.options();
     if let Some(seed) = demo.context.seed {
         options.seed = seed;
     }
-    let model = match estimate_homography(&found.pairs, &options) {
-        Ok(model) => model,
+    let model = match estimate(&found.pairs, ModelKind::Homography, &options, demo.context) {
+        Ok(result) => result.robust,
         Err(error) => return Ok(Part::gave_up("homography", &error)),
     };
     let (width, height) = a.size();

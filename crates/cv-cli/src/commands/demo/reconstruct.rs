@@ -1,0 +1,68 @@
+//! Points and camera motion from two photographs of a room.
+
+use super::{Check, Demo, Part};
+use crate::common::Failure;
+use cv_core::Pose;
+use cv_pipeline::{Intrinsics, ReconstructOptions, reconstruct};
+use cv_report::{MatchStyle, PointScene, Viewpoint, camera_color, draw_epipolar_lines, draw_matches, render_points};
+use cv_synth::{RenderOptions, direction_error, rotation_error, two_view};
+
+/// Metres between the two places.
+const BASELINE: f64 = 0.6;
+
+pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
+    let camera = demo.camera();
+    let pair = two_view(demo.seed, &camera, BASELINE, &RenderOptions::default())?;
+    let (a, b) = (&pair.a.image, &pair.b.image);
+    let options = ReconstructOptions { intrinsics: Intrinsics::Known([camera; 2]), ..ReconstructOptions::default() };
+    let result = match reconstruct(a.view(), b.view(), &options, demo.context) {
+        Ok(result) => result,
+        Err(error) => return Ok(Part::gave_up("reconstruct", &error)),
+    };
+    let (truth, found) = (&pair.relative, &result.pose);
+    let turn = |pose: &Pose| format!("{:.2}° in all", pose.rotation.angle().to_degrees());
+    let way = |pose: &Pose| {
+        let t = pose.translation.normalize();
+        format!("({:.3}, {:.3}, {:.3})", t.x, t.y, t.z)
+    };
+    let rotation = rotation_error(&found.rotation, &truth.rotation).to_degrees();
+    let direction = direction_error(&found.translation, &truth.translation).to_degrees();
+    let checks = vec![
+        Check::at_most("reconstruct", "rotation", rotation, 0.2, "°").of(turn(truth), turn(found)),
+        Check::at_most("reconstruct", "direction of travel", direction, 1.0, "°").of(way(truth), way(found)),
+    ];
+
+    let pairs = &result.matching.pairs;
+    let mut inliers = vec![false; pairs.len()];
+    result.inliers.iter().for_each(|&i| inliers[i] = true);
+    let style = MatchStyle { limit: 160, ..MatchStyle::default() };
+    let agree = format!("{} of {} matches agree with one motion (green).", result.inliers.len(), pairs.len());
+    let figures = vec![
+        demo.photo("reconstruct-matches.png", &draw_matches(a.view(), b.view(), pairs, Some(&inliers), &style), &agree)?,
+        demo.photo(
+            "reconstruct-epipolar.png",
+            &draw_epipolar_lines(
+                a.view(),
+                b.view(),
+                &result.fundamental(),
+                &result.inliers.iter().map(|&i| pairs[i]).collect::<Vec<_>>(),
+                14,
+            ),
+            "Each point with the line on which it must lie in the other photograph.",
+        )?,
+    ];
+    let positions: Vec<[f32; 3]> = result.points.iter().map(|p| p.position.coords.cast::<f32>().into()).collect();
+    let colors: Vec<[u8; 3]> = result.points.iter().map(|p| p.color).collect();
+    let mut cloud = PointScene::new(&positions, &colors);
+    cloud.camera(&camera, &Pose::identity(), camera_color(0)).camera(&camera, found, camera_color(1));
+    let still = cv_io::encode_png(render_points(&cloud, Viewpoint::Camera, 960, 600).view())?;
+    let caption = format!("{} points and the two cameras. Drag to turn.", positions.len());
+    Ok(Part::new(checks, move |page| {
+        page.section("Reconstruction")
+            .paragraph("Two photographs from 60 cm apart. From the matches alone come the turn and the direction of travel of the camera, and the points in space.");
+        figures.into_iter().for_each(|figure| {
+            page.figure(figure);
+        });
+        page.points(&cloud, Some(still), &caption);
+    }))
+}
