@@ -131,17 +131,18 @@ fn cube_root(v: f32) -> f32 {
 /// sRGB bytes to CIE 1976 L*a*b* with the D65 white point: L 0 to 100, a and b about −110 to 110.
 pub fn rgb_to_lab(view: ImageView<'_, u8, 3>) -> Image<f32, 3> {
     let table = &*LINEAR;
-    convert(view, |rgb| lab(rgb.map(|v| table[usize::from(v)])))
+    convert(view, |rgb| linear_rgb_to_lab(rgb.map(|v| table[usize::from(v)])))
 }
 
 /// One pixel of [`rgb_to_lab`].
 #[inline]
 pub fn rgb_pixel_to_lab(rgb: [u8; 3]) -> [f32; 3] {
-    lab(rgb.map(|v| LINEAR[usize::from(v)]))
+    linear_rgb_to_lab(rgb.map(|v| LINEAR[usize::from(v)]))
 }
 
+/// Linear sRGB light, 0 to 1, to L*a*b*: what [`rgb_to_lab`] does after [`srgb_to_linear`]. Without branches, so that loops over it vectorise.
 #[inline(always)]
-fn lab([r, g, b]: [f32; 3]) -> [f32; 3] {
+pub fn linear_rgb_to_lab([r, g, b]: [f32; 3]) -> [f32; 3] {
     // Linear sRGB to XYZ over the white point (0.950456, 1, 1.088754): each row sums to one, so that greys have a = b = 0.
     let x = 0.433_953 * r + 0.376_219 * g + 0.189_828 * b;
     let y = 0.212_671 * r + 0.715_160 * g + 0.072_169 * b;

@@ -10,7 +10,11 @@ use crate::{FormatError, IoError};
 pub const MAX_FILE_BYTES: u64 = 4 << 30;
 
 /// The bytes of a file, of at most [`MAX_FILE_BYTES`].
-pub(crate) fn read_bytes(path: &Path) -> Result<Vec<u8>, IoError> {
+///
+/// # Errors
+/// [`IoError`]: cannot be opened or read, is a folder, is too large.
+pub fn read_bytes(path: impl AsRef<Path>) -> Result<Vec<u8>, IoError> {
+    let path = path.as_ref();
     let fail = |reason: FormatError| IoError::reading(path, reason);
     let file = File::open(path).map_err(|e| fail(e.into()))?;
     let metadata = file.metadata().map_err(|e| fail(e.into()))?;

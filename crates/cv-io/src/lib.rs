@@ -52,7 +52,7 @@ pub use depth_png::{depth_mm, kitti, scaled};
 pub use encode::{JpegPixels, PngPixels, encode_jpeg, encode_png, write_image, write_jpeg, write_png};
 pub use error::{FormatError, IoError};
 pub use exif_info::{ExifFocal, ExifInfo, FocalSource};
-pub use files::{MAX_FILE_BYTES, write_atomic, write_bytes};
+pub use files::{MAX_FILE_BYTES, read_bytes, write_atomic, write_bytes};
 pub use maps::{decode_map, read_map};
 pub use matches::{Matches, parse_matches, read_matches, write_matches};
 pub use picture::{

@@ -32,7 +32,9 @@ mod panorama;
 mod preview;
 mod progress;
 mod reconstruct;
+mod segment;
 mod stopwatch;
+mod thumbnail;
 
 pub use cv_geometry::{EstimateError, RobustModel, RobustOptions};
 pub use depth::{DepthError, DepthOptions, DepthResult, depth};
@@ -51,7 +53,9 @@ pub mod panorama_types {
 pub use preview::preview;
 pub use progress::{Progress, Silent};
 pub use reconstruct::{Intrinsics, ReconstructError, ReconstructOptions, ReconstructResult, ScenePoint, reconstruct};
+pub use segment::{SegmentResult, SegmentTraining, segment, train_segment};
 pub use stopwatch::Stopwatch;
+pub use thumbnail::thumbnail;
 
 /// What a caller of [`depth()`] needs of the stereo stage: its options and results, rectification, geometry and scores.
 pub mod stereo {
@@ -59,5 +63,12 @@ pub mod stereo {
         BAD_THRESHOLDS, Census, CloudPoint, DisparityMap, DisparityScores, EvaluateError, GeometryError, Intensity,
         Paths, PixelState, Rectification, RectifiedView, RectifyError, RectifyOptions, StereoError, StereoGeometry,
         StereoMatcher, StereoOptions, Subpixel, evaluate_disparity, non_occluded,
+    };
+}
+
+/// What a caller of [`train_segment`] and [`segment()`] needs of the colour models: options, model, scores.
+pub mod segmentation {
+    pub use cv_segment::{
+        Cleanup, ColorModel, ColorSpace, Labelled, Regions, Rule, Scores, SegmentError, TrainOptions, Trained,
     };
 }

@@ -5,6 +5,7 @@
 
 pub(crate) mod depth;
 mod estimate;
+mod segment;
 
 use anyhow::{Result, bail};
 use std::{path::Path, time::Instant};
@@ -12,7 +13,7 @@ use std::{path::Path, time::Instant};
 /// A job: its name on the command line and what it does.
 type Job = (&'static str, fn(&Path) -> Result<Vec<Check>>);
 
-const JOBS: &[Job] = &[("depth", depth::run), ("estimate", estimate::run)];
+const JOBS: &[Job] = &[("depth", depth::run), ("estimate", estimate::run), ("segment", segment::run)];
 
 /// A figure and the bar it is held against.
 #[derive(Debug, Clone, PartialEq)]

@@ -75,4 +75,5 @@ commands! {
     Man(man),
     Panorama(panorama),
     Reconstruct(reconstruct),
+    Segment(segment),
 }

@@ -1,0 +1,424 @@
+//! `cv segment`: an object by its colour.
+
+mod files;
+
+use crate::common::{Context, Explain, Failure, Outcome, Run, create_dir, expand_images};
+use cv_core::{Mask, RgbU8};
+use cv_pipeline::segmentation::{
+    ColorModel, ColorSpace, Labelled, Regions, Rule, Scores, SegmentError, TrainOptions,
+};
+use cv_pipeline::{Progress, segment, thumbnail, train_segment};
+use cv_report::{Figure, Note, Report, colors, overlay_comparison, overlay_mask};
+use files::{Pair, pair, read_pair, stem};
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+
+/// Longest side of the pictures in reports, in pixels.
+const REPORT_SIDE: usize = 800;
+/// Photographs shown in a report.
+const REPORT_PHOTOS: usize = 40;
+
+/// Find an object by its colour: learn it from masks, mark it in photographs, score the marks.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cv segment train --images photos --masks masks --model ball.json\n  \
+    cv segment predict --model ball.json new/*.jpg --out found\n  \
+    cv segment eval --model ball.json --images test --masks test-masks")]
+pub(crate) struct Args {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum What {
+    Train(Train),
+    Predict(Predict),
+    Eval(Eval),
+}
+
+impl Run for Args {
+    fn outputs(&self) -> Vec<&Path> {
+        match &self.what {
+            What::Train(args) => vec![&args.model],
+            What::Predict(_) | What::Eval(_) => Vec::new(),
+        }
+    }
+
+    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+        match self.what {
+            What::Train(args) => args.run(context),
+            What::Predict(args) => args.run(context),
+            What::Eval(args) => args.run(context),
+        }
+    }
+}
+
+/// Photographs and the folder of their masks.
+#[derive(Debug, clap::Args)]
+struct Labels {
+    /// Photographs, or folders of them.
+    #[arg(long, value_name = "DIR|FILES", num_args = 1.., required = true)]
+    images: Vec<PathBuf>,
+    /// The folder of the masks, white where the object is. The mask of NAME.jpg is NAME_mask.png or NAME.png.
+    #[arg(long, value_name = "DIR")]
+    masks: PathBuf,
+}
+
+#[derive(Debug, Clone, Copy, clap::ValueEnum)]
+enum Space {
+    Hsv,
+    Rgb,
+    Lab,
+}
+
+#[derive(Debug, Clone, Copy, clap::ValueEnum)]
+enum RuleArg {
+    /// Posterior odds, with the threshold that is best on the training photographs.
+    Tuned,
+    /// Posterior odds: marked where the object is likelier than not.
+    Posterior,
+    /// The object's density alone, with the threshold that is best on the training photographs.
+    Density,
+}
+
+#[derive(Debug, Clone, Copy, clap::ValueEnum)]
+enum RegionsArg {
+    /// The largest only, where every mask shows one region.
+    Auto,
+    /// The largest.
+    Largest,
+    /// All.
+    All,
+}
+
+/// Learn an object's colours from photographs and masks.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cv segment train --images photos --masks masks --model ball.json\n  \
+    cv segment train --images a.jpg b.jpg --masks . --space lab --components 3 --model ball.json --report out")]
+struct Train {
+    #[command(flatten)]
+    labels: Labels,
+    /// Where to write the model.
+    #[arg(long, value_name = "JSON")]
+    model: PathBuf,
+    /// Colour space.
+    #[arg(long, value_enum, default_value = "hsv")]
+    space: Space,
+    /// Gaussians for the object's colours, 1 to 64 [default: 5].
+    #[arg(long, value_name = "K", value_parser = clap::value_parser!(u16).range(1..=64))]
+    components: Option<u16>,
+    /// Gaussians for the background's colours, 1 to 63 [default: 10].
+    #[arg(long, value_name = "K", value_parser = clap::value_parser!(u16).range(1..=63))]
+    background_components: Option<u16>,
+    /// What a pixel's colour is judged by.
+    #[arg(long, value_enum, default_value = "tuned")]
+    rule: RuleArg,
+    /// Which regions are kept.
+    #[arg(long, value_enum, default_value = "auto")]
+    regions: RegionsArg,
+    /// Radius of the disc that masks are opened by; 0 for not at all [default: 2].
+    #[arg(long, value_name = "PX")]
+    open: Option<usize>,
+    /// Radius of the disc that masks are closed by; 0 for not at all [default: 2].
+    #[arg(long, value_name = "PX")]
+    close: Option<usize>,
+    /// Standard deviation by which scores are smoothed [default: 1].
+    #[arg(long, value_name = "PX")]
+    smoothing: Option<f32>,
+}
+
+impl Train {
+    fn options(&self, context: &Context) -> TrainOptions {
+        let default = TrainOptions::default();
+        TrainOptions {
+            space: match self.space {
+                Space::Hsv => ColorSpace::Hsv,
+                Space::Rgb => ColorSpace::Rgb,
+                Space::Lab => ColorSpace::Lab,
+            },
+            components: self.components.map_or(default.components, usize::from),
+            background_components: self.background_components.map_or(default.background_components, usize::from),
+            rule: match self.rule {
+                RuleArg::Tuned => Rule::Tuned,
+                RuleArg::Posterior => Rule::Posterior,
+                RuleArg::Density => Rule::Density,
+            },
+            regions: match self.regions {
+                RegionsArg::Auto => Regions::Auto,
+                RegionsArg::Largest => Regions::Largest,
+                RegionsArg::All => Regions::All,
+            },
+            open_radius: self.open.unwrap_or(default.open_radius),
+            close_radius: self.close.unwrap_or(default.close_radius),
+            smoothing: self.smoothing.unwrap_or(default.smoothing),
+            seed: context.seed.unwrap_or(default.seed),
+            ..default
+        }
+    }
+
+    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+        let pairs = pair(&self.labels.images, &self.labels.masks, context)?;
+        let mut photos = Vec::with_capacity(pairs.len());
+        for (i, pair) in pairs.iter().enumerate() {
+            Progress::report(context, "read", i, pairs.len());
+            photos.push(read_pair(pair, context)?);
+        }
+        let labelled: Vec<Labelled<'_>> = photos.iter().map(|(photo, mask)| (photo.view(), mask.view())).collect();
+        let options = self.options(context);
+        let training = train_segment(&labelled, &options, context).map_err(|error| refused(error, &pairs))?;
+        let trained = &training.trained;
+        write_model(&self.model, &trained.model)?;
+        let total: Scores = trained.scores.iter().copied().sum();
+        if total.f1() < 0.5 {
+            context.warn(format!(
+                "even on the photographs it was trained on, F1 is only {:.3}: the object's colours are not told from the background's",
+                total.f1()
+            ));
+        }
+        context.report(|| {
+            let mut page = Report::new("Segmentation: training");
+            headline(&mut page, &total, photos.len());
+            page.note(Note::Info, "These are the scores on the photographs the model was trained on. On others they will be lower: use cv segment eval.");
+            page.section("Model").facts(&[
+                ("colour space", format!("{:?}", options.space).to_uppercase()),
+                ("components of the object", trained.model.foreground().components.len().to_string()),
+                ("components of the background", trained.model.background().map_or(0, |b| b.components.len()).to_string()),
+                ("threshold", format!("{:.2} nats", trained.model.threshold())),
+                ("regions kept", if trained.model.cleanup().largest { "the largest" } else { "all" }.to_owned()),
+                ("pixels of the object", trained.foreground_pixels.to_string()),
+                ("other pixels", trained.background_pixels.to_string()),
+            ]);
+            let shown: Result<Vec<Figure>, Failure> = pairs
+                .iter()
+                .zip(&photos)
+                .zip(&trained.scores)
+                .take(REPORT_PHOTOS)
+                .map(|((pair, (photo, mask)), scores)| {
+                    comparison(&pair.photo, photo, &trained.model.predict(photo.view()), mask, scores)
+                })
+                .collect();
+            page.section("Photographs").paragraph(LEGEND).figures(shown?);
+            Ok(page.to_html())
+        })?;
+        let summary = format!(
+            "{} photographs, F1 {:.3} on themselves; model: {}",
+            pairs.len(),
+            total.f1(),
+            self.model.display()
+        );
+        Ok(with_scores(Outcome::new(training.stages), &pairs, &trained.scores)
+            .with("model", &self.model)
+            .with("foreground_pixels", trained.foreground_pixels)
+            .with("background_pixels", trained.background_pixels)
+            .with("threshold", trained.model.threshold())
+            .with("largest", trained.model.cleanup().largest)
+            .summary(summary))
+    }
+}
+
+/// Mark the object in photographs.
+///
+/// The mask of NAME.jpg is written as NAME_mask.png, white where the object is.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cv segment predict --model ball.json a.jpg b.jpg --out found\n  \
+    cv segment predict --model ball.json photos --out found --report found")]
+struct Predict {
+    /// The model.
+    #[arg(long, value_name = "JSON")]
+    model: PathBuf,
+    /// Photographs, or folders of them.
+    #[arg(required = true)]
+    images: Vec<PathBuf>,
+    /// The folder to write the masks into; made where it is not there.
+    #[arg(short, long, value_name = "DIR")]
+    out: PathBuf,
+}
+
+impl Predict {
+    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+        let model = read_model(&self.model)?;
+        let photos = files::without_masks(expand_images(&self.images)?);
+        let outputs: Vec<PathBuf> = photos.iter().map(|p| self.out.join(format!("{}_mask.png", stem(p)))).collect();
+        for (i, output) in outputs.iter().enumerate() {
+            if let Some(same) = outputs[..i].iter().position(|o| o == output) {
+                return Err(Failure::new(format!(
+                    "{} and {} would both be written to {}",
+                    photos[same].display(),
+                    photos[i].display(),
+                    output.display()
+                ))
+                .advice("run them into different folders"));
+            }
+            if photos.contains(output) {
+                return Err(Failure::new(format!("{} is a photograph and would be overwritten", output.display()))
+                    .advice("name another folder with --out"));
+            }
+        }
+        create_dir(&self.out)?;
+        let mut stages: Vec<(&'static str, f64)> = Vec::new();
+        let (mut images, mut figures, mut found) = (Vec::new(), Vec::new(), 0);
+        for (i, (path, output)) in photos.iter().zip(&outputs).enumerate() {
+            Progress::report(context, "predict", i, photos.len());
+            let photo = cv_io::read_rgb(path)?;
+            let result = segment(photo.view(), &model);
+            cv_io::write_png(output, result.mask.view())?;
+            found += usize::from(result.fraction > 0.0);
+            images.push(json!({ "path": path, "mask": output, "fraction": result.fraction }));
+            if context.wants_report() && figures.len() < REPORT_PHOTOS {
+                let overlay = overlay_mask(photo.view(), result.mask.view(), colors::GREEN, 0.35);
+                let words = format!("{}: {:.2} % marked", path.display(), 100.0 * result.fraction);
+                figures.push(figure(&overlay, &words)?);
+            }
+            add_stages(&mut stages, &result.stages);
+        }
+        context.report(|| {
+            let mut page = Report::new("Segmentation");
+            page.headline("photographs", &photos.len().to_string()).headline("with the object", &found.to_string());
+            page.section("Photographs").paragraph("What was marked, in green.").figures(figures);
+            Ok(page.to_html())
+        })?;
+        let summary = format!("{} photographs, the object found in {found}; masks: {}", photos.len(), self.out.display());
+        Ok(Outcome::new(stages).with("images", images).summary(summary))
+    }
+}
+
+/// Score a model on photographs with masks: precision, recall and F1.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cv segment eval --model ball.json --images test --masks test-masks\n  \
+    cv segment eval --model ball.json --images a.jpg b.jpg --masks masks --json --report out")]
+struct Eval {
+    /// The model.
+    #[arg(long, value_name = "JSON")]
+    model: PathBuf,
+    #[command(flatten)]
+    labels: Labels,
+}
+
+impl Eval {
+    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+        let model = read_model(&self.model)?;
+        let pairs = pair(&self.labels.images, &self.labels.masks, context)?;
+        let mut stages: Vec<(&'static str, f64)> = Vec::new();
+        let (mut scores, mut figures) = (Vec::new(), Vec::new());
+        for (i, pair) in pairs.iter().enumerate() {
+            Progress::report(context, "score", i, pairs.len());
+            let (photo, truth) = read_pair(pair, context)?;
+            if photo.size() != truth.size() {
+                let error = SegmentError::SizeMismatch { index: i, photo: photo.size(), mask: truth.size() };
+                return Err(refused(error, &pairs));
+            }
+            let result = segment(photo.view(), &model);
+            let score = Scores::new(result.mask.view(), truth.view())?;
+            if context.wants_report() && figures.len() < REPORT_PHOTOS {
+                figures.push(comparison(&pair.photo, &photo, &result.mask, &truth, &score)?);
+            }
+            scores.push(score);
+            add_stages(&mut stages, &result.stages);
+        }
+        let total: Scores = scores.iter().copied().sum();
+        context.report(|| {
+            let mut page = Report::new("Segmentation: scores");
+            headline(&mut page, &total, pairs.len());
+            let row = |(pair, s): (&Pair, &Scores)| {
+                let number = |v: f64| format!("{v:.4}");
+                vec![pair.photo.display().to_string(), number(s.precision()), number(s.recall()), number(s.f1())]
+            };
+            let rows: Vec<Vec<String>> = pairs.iter().zip(&scores).map(row).collect();
+            page.section("Scores").table(
+                "Scores of each photograph.",
+                &["photograph", "precision", "recall", "F1"],
+                &rows,
+            );
+            page.section("Photographs").paragraph(LEGEND).figures(figures);
+            Ok(page.to_html())
+        })?;
+        let summary = format!(
+            "{} photographs: precision {:.4}, recall {:.4}, F1 {:.4}",
+            pairs.len(),
+            total.precision(),
+            total.recall(),
+            total.f1()
+        );
+        Ok(with_scores(Outcome::new(stages), &pairs, &scores).summary(summary))
+    }
+}
+
+const LEGEND: &str = "Green: marked and right. Red: marked and wrong. Blue: missed.";
+
+/// The scores of all pixels together, and of each photograph.
+fn with_scores(outcome: Outcome, pairs: &[Pair], scores: &[Scores]) -> Outcome {
+    let total: Scores = scores.iter().copied().sum();
+    let images: Vec<Value> = pairs
+        .iter()
+        .zip(scores)
+        .map(|(pair, s)| {
+            json!({ "path": pair.photo, "mask": pair.mask, "precision": s.precision(), "recall": s.recall(), "f1": s.f1() })
+        })
+        .collect();
+    outcome
+        .with("precision", total.precision())
+        .with("recall", total.recall())
+        .with("f1", total.f1())
+        .with("images", images)
+}
+
+fn headline(page: &mut Report, total: &Scores, photos: usize) {
+    page.headline("F1", &format!("{:.3}", total.f1()))
+        .headline("precision", &format!("{:.3}", total.precision()))
+        .headline("recall", &format!("{:.3}", total.recall()))
+        .headline("photographs", &photos.to_string());
+}
+
+fn comparison(path: &Path, photo: &RgbU8, mask: &Mask, truth: &Mask, scores: &Scores) -> Result<Figure, Failure> {
+    let picture = overlay_comparison(photo.view(), mask.view(), truth.view());
+    figure(&picture, &format!("{}: F1 {:.3}", path.display(), scores.f1()))
+}
+
+fn figure(picture: &RgbU8, words: &str) -> Result<Figure, Failure> {
+    Ok(Figure::new(cv_io::encode_png(thumbnail(picture.view(), REPORT_SIDE).view())?, words))
+}
+
+fn add_stages(sums: &mut Vec<(&'static str, f64)>, stages: &[(&'static str, f64)]) {
+    for &(name, seconds) in stages {
+        match sums.iter_mut().find(|(n, _)| *n == name) {
+            Some((_, sum)) => *sum += seconds,
+            None => sums.push((name, seconds)),
+        }
+    }
+}
+
+/// The error with the names of the files it is about, and what to do.
+fn refused(error: SegmentError, pairs: &[Pair]) -> Failure {
+    match &error {
+        SegmentError::SizeMismatch { index, photo, mask } if *index < pairs.len() => Failure::new(format!(
+            "{} has {}×{} pixels, its mask {} has {}×{}",
+            pairs[*index].photo.display(),
+            photo.0,
+            photo.1,
+            pairs[*index].mask.display(),
+            mask.0,
+            mask.1
+        ))
+        .advice("a mask drawn on the photograph at its full size, turned the way a viewer shows it"),
+        SegmentError::NoForeground { .. } => Failure::from(error).advice("masks that are white (255) on the object and black elsewhere"),
+        SegmentError::NoBackground { .. } => Failure::from(error).advice("masks that are black (0) where the object is not"),
+        SegmentError::BadOption { .. } => Failure::usage(error),
+        _ => error.into(),
+    }
+}
+
+fn write_model(path: &Path, model: &ColorModel) -> Result<(), Failure> {
+    let mut text = serde_json::to_string_pretty(model).during("cannot write the model as JSON")?;
+    text.push('\n');
+    Ok(cv_io::write_bytes(path, text.as_bytes())?)
+}
+
+fn read_model(path: &Path) -> Result<ColorModel, Failure> {
+    let bytes = cv_io::read_bytes(path)?;
+    serde_json::from_slice(&bytes)
+        .during(format!("{} is no segmentation model", path.display()))
+        .advice("name a file that cv segment train has written")
+}

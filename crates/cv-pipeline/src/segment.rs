@@ -1,0 +1,95 @@
+//! Finding an object by its colour: train on photographs with masks, then mark it in others.
+
+use crate::{Progress, Stopwatch};
+use cv_core::{ImageView, Mask};
+use cv_segment::{ColorModel, Labelled, SegmentError, TrainOptions, Trained, train};
+
+/// What [`train_segment`] learnt.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SegmentTraining {
+    /// The model and its scores on the training photographs.
+    pub trained: Trained,
+    /// Stage names and their seconds.
+    pub stages: Vec<(&'static str, f64)>,
+}
+
+/// What [`segment`] found in a photograph.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SegmentResult {
+    /// Where the object is.
+    pub mask: Mask,
+    /// The share of the photograph's pixels that are marked, 0 to 1; 0 for an empty photograph.
+    pub fraction: f64,
+    /// Stage names and their seconds.
+    pub stages: Vec<(&'static str, f64)>,
+}
+
+/// Learns an object's colours from photographs and masks.
+///
+/// # Errors
+/// [`SegmentError`]: nothing to train on, masks that do not fit or show nothing, options out of range.
+pub fn train_segment(
+    photos: &[Labelled<'_>],
+    options: &TrainOptions,
+    progress: &dyn Progress,
+) -> Result<SegmentTraining, SegmentError> {
+    let mut watch = Stopwatch::new();
+    progress.report("train", 0, 1);
+    let trained = train(photos, options)?;
+    progress.report("train", 1, 1);
+    watch.lap("train");
+    Ok(SegmentTraining { trained, stages: watch.into_stages() })
+}
+
+/// Marks the object in a photograph.
+pub fn segment(photo: ImageView<'_, u8, 3>, model: &ColorModel) -> SegmentResult {
+    let mut watch = Stopwatch::new();
+    let raw = model.classify(photo);
+    watch.lap("classify");
+    let mask = model.cleanup().apply(raw.view());
+    watch.lap("clean up");
+    let marked = mask.as_slice().iter().filter(|&&m| m).count();
+    let fraction = marked as f64 / mask.as_slice().len().max(1) as f64;
+    SegmentResult { mask, fraction, stages: watch.into_stages() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Silent;
+    use cv_core::{Camera, RgbU8};
+    use cv_segment::{ColorSpace, Scores};
+    use cv_synth::{RenderOptions, ball_photos};
+
+    #[test]
+    fn a_ball_is_found_in_photographs_it_was_not_trained_on() {
+        let camera = Camera::from_focal(240, 180, 220.0);
+        for seed in [3, 4] {
+            let photos = ball_photos(seed, 8, &camera, &RenderOptions::default()).unwrap();
+            let labelled: Vec<Labelled<'_>> = photos.iter().map(|p| (p.view.image.view(), p.mask.view())).collect();
+            let half = |odd: usize| -> Vec<Labelled<'_>> { labelled.iter().copied().skip(odd).step_by(2).collect() };
+            for space in [ColorSpace::Hsv, ColorSpace::Rgb, ColorSpace::Lab] {
+                let options = TrainOptions { space, ..TrainOptions::default() };
+                let model = train_segment(&half(0), &options, &Silent).unwrap().trained.model;
+                let scores: Scores = half(1)
+                    .iter()
+                    .map(|(photo, mask)| Scores::new(segment(*photo, &model).mask.view(), *mask).unwrap())
+                    .sum();
+                // The bar for generated scenes.
+                assert!(scores.f1() >= 0.97, "seed {seed}, {space:?}: {} {scores:?}", scores.f1());
+            }
+        }
+    }
+
+    #[test]
+    fn an_empty_photograph_has_an_empty_mask() {
+        let photo = RgbU8::from_fn(8, 8, |x, _| if x < 4 { [200, 90, 20] } else { [40, 90, 200] });
+        let mask = Mask::from_fn(8, 8, |x, _| [x < 4]);
+        let model =
+            train_segment(&[(photo.view(), mask.view())], &TrainOptions::default(), &Silent).unwrap().trained.model;
+        let result = segment(RgbU8::new(0, 0, [0; 3]).view(), &model);
+        assert!(result.mask.is_empty() && result.fraction == 0.0);
+        let one = segment(RgbU8::new(1, 1, [200, 90, 20]).view(), &model);
+        assert_eq!((one.mask.at(0, 0), one.fraction), ([true], 1.0));
+    }
+}

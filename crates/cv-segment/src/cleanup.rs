@@ -1,0 +1,81 @@
+//! What turns marked pixels into regions.
+
+use cv_core::{ImageView, Mask};
+use cv_imgproc::{Connectivity, StructuringElement, close, connected_components, largest_component, open};
+use serde::{Deserialize, Serialize};
+
+/// How a mask is cleaned up: opened, closed, and perhaps only its largest region kept.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Cleanup {
+    /// Radius in pixels of the disc that the mask is opened by, which takes away what is narrower. 0 (not at all) to 1000; default 2, a 5×5 disc.
+    pub open_radius: usize,
+    /// Radius in pixels of the disc that the mask is closed by, which fills gaps that are narrower. 0 to 1000; default 2.
+    pub close_radius: usize,
+    /// Keep only the largest region. Default false; training decides it by whether the masks show one region each.
+    pub largest: bool,
+}
+
+impl Default for Cleanup {
+    fn default() -> Self {
+        Self { open_radius: 2, close_radius: 2, largest: false }
+    }
+}
+
+impl Cleanup {
+    /// Cleans up a mask.
+    pub fn apply(&self, mask: ImageView<'_, bool, 1>) -> Mask {
+        let opened = if self.open_radius > 0 {
+            open(mask, &StructuringElement::disc(self.open_radius))
+        } else {
+            mask.to_image()
+        };
+        let closed = if self.close_radius > 0 {
+            close(opened.view(), &StructuringElement::disc(self.close_radius))
+        } else {
+            opened
+        };
+        if self.largest { largest_component(closed.view(), Connectivity::Eight) } else { closed }
+    }
+}
+
+/// The share of a mask's true pixels that its largest region holds; 1 where there are none.
+pub(crate) fn largest_share(mask: ImageView<'_, bool, 1>) -> f64 {
+    let areas: Vec<usize> = connected_components(mask, Connectivity::Eight).stats.iter().map(|s| s.area).collect();
+    let largest = areas.iter().copied().max().unwrap_or(0);
+    let all: usize = areas.iter().sum();
+    if all == 0 { 1.0 } else { largest as f64 / all as f64 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn specks_go_gaps_close_and_the_largest_stays() {
+        // A disc of radius 8 with a hole of one pixel, a disc of radius 5, and a speck.
+        let disc = |x: usize, y: usize, cx: f64, cy: f64, r: f64| (x as f64 - cx).hypot(y as f64 - cy) <= r;
+        let mask = Mask::from_fn(60, 30, |x, y| {
+            [(disc(x, y, 15.0, 15.0, 8.0) && (x, y) != (15, 15)) || disc(x, y, 45.0, 15.0, 5.0) || (x, y) == (30, 3)]
+        });
+        // Opening first would widen the hole.
+        let cleaned = Cleanup { open_radius: 0, ..Default::default() }.apply(mask.view());
+        assert!(cleaned.at(15, 15)[0] && cleaned.at(45, 15)[0] && cleaned.at(30, 3)[0]);
+        let cleaned = Cleanup { largest: true, ..Default::default() }.apply(mask.view());
+        assert!(cleaned.at(15, 12)[0] && !cleaned.at(45, 15)[0] && !cleaned.at(30, 3)[0]);
+        let none = Cleanup { open_radius: 0, close_radius: 0, largest: false };
+        assert_eq!(none.apply(mask.view()), mask);
+        // 316 pixels of 398 or so: the first disc holds most, not all.
+        let share = largest_share(mask.view());
+        assert!(share > 0.6 && share < 0.8);
+        assert_eq!(largest_share(Mask::new(3, 3, [false]).view()), 1.0);
+    }
+
+    #[test]
+    fn nothing_stays_nothing() {
+        for size in [(0, 0), (1, 1), (0, 9)] {
+            let mask = Mask::new(size.0, size.1, [true]);
+            assert_eq!(Cleanup { largest: true, ..Default::default() }.apply(mask.view()), mask);
+        }
+    }
+}

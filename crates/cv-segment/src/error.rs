@@ -1,0 +1,54 @@
+//! What can go wrong.
+
+use crate::MixtureError;
+
+/// Why a model could not be trained, loaded, or scored.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum SegmentError {
+    /// There is nothing to train on.
+    #[error("there are no photos with masks to train on")]
+    NoPhotos,
+    /// A mask does not fit its photo.
+    #[error("photo {index} has {}×{} pixels, its mask {}×{}", photo.0, photo.1, mask.0, mask.1)]
+    SizeMismatch {
+        /// Which, from 0.
+        index: usize,
+        /// Width and height of the photo.
+        photo: (usize, usize),
+        /// Width and height of the mask.
+        mask: (usize, usize),
+    },
+    /// No mask marks any pixel.
+    #[error("none of the {photos} masks marks a pixel: the object's pixels must be white")]
+    NoForeground {
+        /// How many there are.
+        photos: usize,
+    },
+    /// The masks mark every pixel.
+    #[error("the {photos} masks mark every pixel: there is no background to tell the object from")]
+    NoBackground {
+        /// How many there are.
+        photos: usize,
+    },
+    /// An option is out of its range.
+    #[error("{name} is {value}; it must be {range}")]
+    BadOption {
+        /// Which.
+        name: &'static str,
+        /// Its value.
+        value: f64,
+        /// What it may be.
+        range: &'static str,
+    },
+    /// A mixture could not be fitted, or a loaded one is not one.
+    #[error(transparent)]
+    Mixture(#[from] MixtureError),
+    /// A model was written by another version.
+    #[error("the model has schema {found}; this program reads schema {known}: train it again")]
+    Schema {
+        /// What it says.
+        found: u32,
+        /// What is read here.
+        known: u32,
+    },
+}

@@ -1,0 +1,187 @@
+//! The trained model: two mixtures, a threshold, and what happens around them.
+
+use crate::{Cleanup, ColorSpace, Mixture, SegmentError, evaluate::Evaluator, mixture::Whitened};
+use cv_core::{GrayF32, ImageView, Mask, Matrix3, Vector3};
+use cv_imgproc::gaussian_blur;
+use serde::{Deserialize, Serialize};
+
+/// The version of the model's serialised form.
+const SCHEMA: u32 = 1;
+
+/// Scores are limited to this much on either side, in nats, before they are smoothed, so that one pixel cannot outvote many: e¹⁰ is 22,000 to 1.
+pub(crate) const LIMIT: f32 = 10.0;
+
+/// What a pixel's colour is judged by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Rule {
+    /// Posterior odds of object against background, held against the threshold that gives the best F1 on the training photos.
+    #[default]
+    Tuned,
+    /// Posterior odds with the prior of the training masks: marked where the object is likelier than not.
+    Posterior,
+    /// The object's density alone, held against the threshold that gives the best F1 on the training photos. There is no background model, so a background the
+    /// training photos did not show makes no difference.
+    Density,
+}
+
+/// A trained colour model. Serialises with serde; what is loaded is checked.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(try_from = "ModelFile", into = "ModelFile")]
+pub struct ColorModel {
+    file: ModelFile,
+    evaluator: Evaluator,
+    /// Added to the log odds.
+    offset: f32,
+}
+
+impl PartialEq for ColorModel {
+    fn eq(&self, other: &Self) -> bool {
+        self.file == other.file
+    }
+}
+
+/// The model as it is written.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct ModelFile {
+    pub(crate) schema: u32,
+    pub(crate) space: ColorSpace,
+    /// The hue that hues are measured from, radians.
+    pub(crate) hue: f32,
+    pub(crate) foreground: Mixture,
+    /// None under [`Rule::Density`].
+    pub(crate) background: Option<Mixture>,
+    /// The share of the background whose colours may be anything.
+    pub(crate) unknown: f64,
+    /// The share of the object's pixels among all.
+    pub(crate) prior: f64,
+    pub(crate) rule: Rule,
+    pub(crate) smoothing: f32,
+    pub(crate) threshold: f32,
+    pub(crate) cleanup: Cleanup,
+}
+
+impl ModelFile {
+    pub(crate) fn new(space: ColorSpace, hue: f32, foreground: Mixture, background: Option<Mixture>) -> Self {
+        Self {
+            schema: SCHEMA,
+            space,
+            hue,
+            foreground,
+            background,
+            unknown: 0.0,
+            prior: 0.5,
+            rule: Rule::default(),
+            smoothing: 0.0,
+            threshold: 0.0,
+            cleanup: Cleanup::default(),
+        }
+    }
+}
+
+impl From<ColorModel> for ModelFile {
+    fn from(model: ColorModel) -> Self {
+        model.file
+    }
+}
+
+impl TryFrom<ModelFile> for ColorModel {
+    type Error = SegmentError;
+
+    fn try_from(file: ModelFile) -> Result<Self, SegmentError> {
+        if file.schema != SCHEMA {
+            return Err(SegmentError::Schema { found: file.schema, known: SCHEMA });
+        }
+        let within = |name, value: f64, ok: bool, range| {
+            if ok { Ok(()) } else { Err(SegmentError::BadOption { name, value, range }) }
+        };
+        within("hue", file.hue.into(), file.hue.abs() <= 7.0, "an angle between −7 and 7 radians")?;
+        within("prior", file.prior, file.prior > 0.0 && file.prior < 1.0, "between 0 and 1")?;
+        within("unknown", file.unknown, (0.0..1.0).contains(&file.unknown), "from 0 to below 1")?;
+        within("smoothing", file.smoothing.into(), (0.0..=100.0).contains(&file.smoothing), "from 0 to 100 px")?;
+        within("threshold", file.threshold.into(), file.threshold.abs() <= LIMIT, "between −10 and 10")?;
+        for (name, radius) in [("open_radius", file.cleanup.open_radius), ("close_radius", file.cleanup.close_radius)] {
+            within(name, radius as f64, radius <= 1000, "from 0 to 1000 px")?;
+        }
+        let foreground = file.foreground.whitened()?;
+        let mut background = Vec::new();
+        let offset = match &file.background {
+            Some(mixture) => {
+                background = mixture.whitened()?;
+                for component in &mut background {
+                    component.constant += (1.0 - file.unknown).ln();
+                }
+                if file.unknown > 0.0 {
+                    // Equally likely everywhere in the space of colours.
+                    let constant = (file.unknown / file.space.volume()).ln();
+                    background.push(Whitened { constant, a: Matrix3::zeros(), b: Vector3::zeros() });
+                }
+                (file.prior / (1.0 - file.prior)).ln() as f32
+            }
+            // The highest peak is scored as high as the limit lets it.
+            None => LIMIT - foreground.iter().map(|c| c.constant).fold(f64::NEG_INFINITY, f64::max) as f32,
+        };
+        let evaluator = Evaluator::new(file.space, file.hue, &foreground, &background);
+        Ok(Self { file, evaluator, offset })
+    }
+}
+
+impl ColorModel {
+    /// The score of each pixel in nats, limited to ±10 and smoothed: with a background model the log odds of object against background at the training photos'
+    /// prior; without, the object's log density below its peak, plus 10. Pixels above [`ColorModel::threshold`] are marked.
+    pub fn score(&self, photo: ImageView<'_, u8, 3>) -> GrayF32 {
+        let mut score = self.evaluator.log_odds(photo);
+        for v in score.as_mut_slice() {
+            *v = (*v + self.offset).clamp(-LIMIT, LIMIT);
+        }
+        if self.file.smoothing > 0.0 { gaussian_blur(score.view(), self.file.smoothing) } else { score }
+    }
+
+    /// Where the object is, before cleaning up.
+    pub fn classify(&self, photo: ImageView<'_, u8, 3>) -> Mask {
+        let threshold = self.file.threshold;
+        self.score(photo).map(|[v]| [v > threshold])
+    }
+
+    /// Where the object is.
+    pub fn predict(&self, photo: ImageView<'_, u8, 3>) -> Mask {
+        self.file.cleanup.apply(self.classify(photo).view())
+    }
+
+    /// The colour space.
+    pub fn space(&self) -> ColorSpace {
+        self.file.space
+    }
+
+    /// The object's colours.
+    pub fn foreground(&self) -> &Mixture {
+        &self.file.foreground
+    }
+
+    /// The background's colours, where they are modelled.
+    pub fn background(&self) -> Option<&Mixture> {
+        self.file.background.as_ref()
+    }
+
+    /// Scores above this are marked.
+    pub fn threshold(&self) -> f32 {
+        self.file.threshold
+    }
+
+    /// What colours are judged by.
+    pub fn rule(&self) -> Rule {
+        self.file.rule
+    }
+
+    /// How masks are cleaned up.
+    pub fn cleanup(&self) -> Cleanup {
+        self.file.cleanup
+    }
+
+    /// The same model with another clean-up.
+    pub fn with_cleanup(mut self, cleanup: Cleanup) -> Self {
+        self.file.cleanup = cleanup;
+        self
+    }
+}

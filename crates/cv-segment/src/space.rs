@@ -1,0 +1,93 @@
+//! The coordinates in which colours are modelled.
+
+use cv_imgproc::{rgb_pixel_to_hsv, rgb_pixel_to_lab};
+use serde::{Deserialize, Serialize};
+use std::f32::consts::{PI, TAU};
+
+/// A colour space.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ColorSpace {
+    /// Hue, saturation, value. Hue is circular: it is measured from the object's circular mean hue, −π to π, so that the cut lies opposite the object and
+    /// averages are right (Mardia & Jupp, Directional Statistics). Modelling `(S cos H, S sin H, V)` instead, which has no cut at all, was measured and is worse:
+    /// its components are wide where saturation varies under highlights and shadow.
+    #[default]
+    Hsv,
+    /// Red, green, blue as in the file, 0 to 1.
+    Rgb,
+    /// CIE L*a*b*, D65.
+    Lab,
+}
+
+impl ColorSpace {
+    /// The coordinates of a colour. `hue` is the hue from which hues are measured, in radians; only HSV uses it.
+    #[inline]
+    pub fn coordinates(self, rgb: [u8; 3], hue: f32) -> [f32; 3] {
+        match self {
+            Self::Hsv => {
+                let [h, s, v] = rgb_pixel_to_hsv(rgb);
+                [wrap(h - hue), s, v]
+            }
+            Self::Rgb => rgb.map(|v| f32::from(v) / 255.0),
+            Self::Lab => rgb_pixel_to_lab(rgb),
+        }
+    }
+
+    /// Standard deviations that a step of one grey level makes about: differences below them mean nothing. For hue, at half saturation and value.
+    pub(crate) fn resolution(self) -> [f64; 3] {
+        const STEP: f64 = 1.0 / 255.0;
+        match self {
+            Self::Hsv => [4.0 * STEP, STEP, STEP],
+            Self::Rgb => [STEP; 3],
+            Self::Lab => [0.4; 3],
+        }
+    }
+
+    /// The volume that the colours of the screen take up. (Lab: that of the sRGB gamut.)
+    pub(crate) fn volume(self) -> f64 {
+        match self {
+            Self::Hsv => f64::from(TAU),
+            Self::Rgb => 1.0,
+            Self::Lab => 8.3e5,
+        }
+    }
+}
+
+/// An angle between −2π and 2π as one from −π to π.
+#[inline(always)]
+pub(crate) fn wrap(angle: f32) -> f32 {
+    let down = if angle > PI { angle - TAU } else { angle };
+    if down < -PI { down + TAU } else { down }
+}
+
+/// The circular mean of hues, each weighing its weight times its saturation (a grey has no hue), 0 to 2π; 0 where there is none.
+pub(crate) fn mean_hue(samples: impl Iterator<Item = ([u8; 3], f64)>) -> f32 {
+    let (mut x, mut y, mut total) = (0.0f64, 0.0f64, 0.0f64);
+    for (rgb, weight) in samples {
+        let [h, s, _] = rgb_pixel_to_hsv(rgb).map(f64::from);
+        x += weight * s * h.cos();
+        y += weight * s * h.sin();
+        total += weight * s;
+    }
+    // Opposite hues that cancel leave the rounding of f32 hues, not a direction.
+    if x.hypot(y) <= 1e-6 * total { 0.0 } else { y.atan2(x).rem_euclid(std::f64::consts::TAU) as f32 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn reds_on_both_sides_of_the_cut_average_to_red() {
+        // Hues 350° and 10°.
+        let pair = [([255, 0, 43], 1.0), ([255, 43, 0], 1.0)];
+        let mean = mean_hue(pair.into_iter());
+        // Both are a sixth of 60° from red: by symmetry the mean is 0, or 2π less a rounding.
+        assert!(wrap(mean).abs() < 1e-6, "{mean}");
+        for (rgb, _) in pair {
+            assert!(ColorSpace::Hsv.coordinates(rgb, mean)[0].abs() < 0.2);
+        }
+        assert_eq!(mean_hue([([9, 9, 9], 5.0)].into_iter()), 0.0);
+        assert_eq!(mean_hue([([255, 0, 0], 1.0), ([0, 255, 255], 1.0)].into_iter()), 0.0);
+    }
+}

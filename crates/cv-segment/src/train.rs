@@ -1,0 +1,220 @@
+//! Learning a model from photos and masks.
+
+use crate::{
+    Cleanup, ColorModel, ColorSpace, Mixture, MixtureOptions, Rule, Scores, SegmentError, WeightedSample,
+    cleanup::largest_share,
+    model::{LIMIT, ModelFile},
+    space::mean_hue,
+};
+use cv_core::ImageView;
+
+/// Which regions of a mask are kept.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Regions {
+    /// The largest only, where every training mask shows one region (that holds 95 % of what is marked); else all.
+    #[default]
+    Auto,
+    /// The largest.
+    Largest,
+    /// All.
+    All,
+}
+
+/// Settings of [`train`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrainOptions {
+    /// Colour space. Default HSV.
+    pub space: ColorSpace,
+    /// Gaussians for the object's colours, 1 to 64. Default 5.
+    pub components: usize,
+    /// Gaussians for the background's, 1 to 63. Default 10: there are more colours in the background than in an object.
+    pub background_components: usize,
+    /// What a pixel's colour is judged by. Default posterior odds with a tuned threshold.
+    pub rule: Rule,
+    /// The share of the background that may have any colour, so that one never seen is not taken for the object only because the background's Gaussians are even
+    /// farther away. 0 to below 1; default 0.01.
+    pub unknown: f64,
+    /// Standard deviation in pixels of the Gaussian by which scores are smoothed before they are held against the threshold: neighbours are mostly of one kind.
+    /// 0 to 100; default 1.
+    pub smoothing: f32,
+    /// Added to each variance, in units of the variance of the samples. Default 1e-6.
+    pub regularisation: f64,
+    /// Radius in pixels of the disc by which masks are opened. 0 to 1000; default 2.
+    pub open_radius: usize,
+    /// Radius in pixels of the disc by which masks are closed. 0 to 1000; default 2.
+    pub close_radius: usize,
+    /// Which regions are kept. Default: learnt from the masks.
+    pub regions: Regions,
+    /// Seed of the mixtures' first means. Default 1.
+    pub seed: u64,
+}
+
+impl Default for TrainOptions {
+    fn default() -> Self {
+        let Cleanup { open_radius, close_radius, .. } = Cleanup::default();
+        Self {
+            space: ColorSpace::default(),
+            components: 5,
+            background_components: 10,
+            rule: Rule::default(),
+            unknown: 0.01,
+            smoothing: 1.0,
+            regularisation: 1e-6,
+            open_radius,
+            close_radius,
+            regions: Regions::default(),
+            seed: 1,
+        }
+    }
+}
+
+/// A photo and the mask of the object in it.
+pub type Labelled<'a> = (ImageView<'a, u8, 3>, ImageView<'a, bool, 1>);
+
+/// A model and what is known about its training.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Trained {
+    /// The model.
+    pub model: ColorModel,
+    /// Its scores on the photos it was trained on, each by itself, after cleaning up. What it will do on others is less.
+    pub scores: Vec<Scores>,
+    /// Pixels of the object.
+    pub foreground_pixels: u64,
+    /// Other pixels.
+    pub background_pixels: u64,
+}
+
+/// Learns the object's colours, the background's, and the threshold between them.
+///
+/// Colours are counted in bins of four grey levels a side, so the time of fitting depends on how many different colours there are, not on the number of
+/// pixels. A photo without the object (an empty mask) is welcome: it shows what is not the object.
+///
+/// # Errors
+/// [`SegmentError`]: no photos, a mask of another size than its photo, no or all pixels marked, an option out of range.
+pub fn train(photos: &[Labelled<'_>], options: &TrainOptions) -> Result<Trained, SegmentError> {
+    if photos.is_empty() {
+        return Err(SegmentError::NoPhotos);
+    }
+    let mut colours = [Bins::new(), Bins::new()];
+    for (index, (photo, mask)) in photos.iter().enumerate() {
+        if photo.size() != mask.size() {
+            return Err(SegmentError::SizeMismatch { index, photo: photo.size(), mask: mask.size() });
+        }
+        for y in 0..photo.height() {
+            for (&rgb, &m) in photo.row(y).as_chunks::<3>().0.iter().zip(mask.row(y)) {
+                colours[usize::from(m)].add(rgb);
+            }
+        }
+    }
+    let [background, foreground] = &colours;
+    let counts = [foreground.total(), background.total()];
+    if counts[0] == 0 {
+        return Err(SegmentError::NoForeground { photos: photos.len() });
+    }
+    if counts[1] == 0 {
+        return Err(SegmentError::NoBackground { photos: photos.len() });
+    }
+    let hue = if options.space == ColorSpace::Hsv { mean_hue(foreground.colours()) } else { 0.0 };
+    let fit = |bins: &Bins, components| {
+        let sample =
+            |(rgb, weight)| WeightedSample { point: options.space.coordinates(rgb, hue).map(f64::from), weight };
+        let samples: Vec<WeightedSample> = bins.colours().map(sample).collect();
+        let resolution = options.space.resolution();
+        let settings = MixtureOptions {
+            components,
+            regularisation: options.regularisation,
+            resolution,
+            seed: options.seed,
+            ..Default::default()
+        };
+        Mixture::fit(&samples, &settings)
+    };
+    let object = fit(foreground, options.components)?;
+    let rest = if options.rule == Rule::Density {
+        None
+    } else {
+        Some(fit(background, options.background_components.min(63))?)
+    };
+    let largest = match options.regions {
+        Regions::Largest => true,
+        Regions::All => false,
+        Regions::Auto => photos.iter().all(|(_, mask)| largest_share(*mask) >= 0.95),
+    };
+    let mut file = ModelFile {
+        unknown: options.unknown,
+        prior: counts[0] as f64 / (counts[0] + counts[1]) as f64,
+        rule: options.rule,
+        smoothing: options.smoothing,
+        cleanup: Cleanup { open_radius: options.open_radius, close_radius: options.close_radius, largest },
+        ..ModelFile::new(options.space, hue, object, rest)
+    };
+    let mut model = ColorModel::try_from(file.clone())?;
+    if options.rule != Rule::Posterior {
+        file.threshold = best_threshold(&model, photos);
+        model = ColorModel::try_from(file)?;
+    }
+    let scores: Result<Vec<Scores>, SegmentError> =
+        photos.iter().map(|(photo, mask)| Scores::new(model.predict(*photo).view(), *mask)).collect();
+    Ok(Trained { model, scores: scores?, foreground_pixels: counts[0], background_pixels: counts[1] })
+}
+
+/// The threshold with the best F1 over all pixels of the photos, before cleaning up; the middle of the range around it that is within a thousandth of the best.
+fn best_threshold(model: &ColorModel, photos: &[Labelled<'_>]) -> f32 {
+    const BINS: usize = 2000;
+    let width = 2.0 * LIMIT / BINS as f32;
+    let mut counts = vec![[0u64; 2]; BINS + 1];
+    for (photo, mask) in photos {
+        let score = model.score(*photo);
+        for y in 0..score.height() {
+            for (&v, &m) in score.row(y).iter().zip(mask.row(y)) {
+                counts[(((v + LIMIT) / width) as usize).min(BINS)][usize::from(m)] += 1;
+            }
+        }
+    }
+    let truth: u64 = counts.iter().map(|c| c[1]).sum();
+    // F1 when everything from bin i on is marked.
+    let mut marked = [0u64; 2];
+    let mut f1 = vec![0.0; BINS + 1];
+    for (f1, count) in f1.iter_mut().zip(&counts).rev() {
+        marked[0] += count[0];
+        marked[1] += count[1];
+        *f1 = 2.0 * marked[1] as f64 / (marked[0] + marked[1] + truth) as f64;
+    }
+    let best = (0..=BINS).fold(0, |best, i| if f1[i] > f1[best] { i } else { best });
+    let good = |i: &usize| f1[*i] >= f1[best] - 1e-3;
+    let first = (0..best).rev().take_while(good).last().unwrap_or(best);
+    let last = (best..=BINS).take_while(good).last().unwrap_or(best);
+    ((first + last) as f32 * 0.5 * width - LIMIT).clamp(-LIMIT, LIMIT)
+}
+
+/// Counts of colours in bins of four grey levels a side, with the sums of what fell in.
+struct Bins {
+    bins: Vec<[u64; 4]>,
+}
+
+impl Bins {
+    fn new() -> Self {
+        Self { bins: vec![[0; 4]; 1 << 18] }
+    }
+
+    #[inline]
+    fn add(&mut self, rgb: [u8; 3]) {
+        let [r, g, b] = rgb.map(|v| usize::from(v >> 2));
+        let bin = &mut self.bins[r << 12 | g << 6 | b];
+        for (sum, v) in bin.iter_mut().zip([1, rgb[0], rgb[1], rgb[2]]) {
+            *sum += u64::from(v);
+        }
+    }
+
+    fn total(&self) -> u64 {
+        self.bins.iter().map(|b| b[0]).sum()
+    }
+
+    /// The mean colour of each bin that holds any, and how many it holds.
+    fn colours(&self) -> impl Iterator<Item = ([u8; 3], f64)> + '_ {
+        self.bins.iter().filter(|b| b[0] > 0).map(|b| {
+            let mean = |sum: u64| ((sum + b[0] / 2) / b[0]) as u8;
+            ([mean(b[1]), mean(b[2]), mean(b[3])], b[0] as f64)
+        })
+    }
+}
