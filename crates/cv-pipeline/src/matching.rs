@@ -1,7 +1,7 @@
 //! Features of photographs, and tentative matches between two of them.
 
 use crate::{Progress, Stopwatch};
-use cv_core::{Correspondence, DMatch, GrayF32, ImageView, Point2};
+use cv_core::{Correspondence, DMatch, GrayF32, ImageView, Keypoint, Point2};
 use cv_features::{
     Described, FeatureError, HarrisOptions, MatchError, MatchOptions, PatchOptions, SiftOptions, anms,
     describe_patches, harris, match_descriptors, sift,
@@ -62,6 +62,8 @@ pub struct PhotoFeatures {
     pub described: Described,
     /// Points found before spacing and limits.
     pub found: usize,
+    /// The corners before spacing, for pictures; empty for methods that do not space their points.
+    pub candidates: Vec<Keypoint>,
 }
 
 /// What [`match_photos`] found.
@@ -118,7 +120,7 @@ pub fn extract_features(photo: ImageView<'_, u8, 3>, options: &MatchingOptions) 
             let spaced: Vec<_> = anms(&corners, n, options.anms_robust).into_iter().map(|i| corners[i]).collect();
             let mut described = describe_patches(grey.view(), &spaced, &options.patch)?;
             described.beyond_limit = corners.len() - spaced.len();
-            Ok(PhotoFeatures { described, found: corners.len() })
+            Ok(PhotoFeatures { described, found: corners.len(), candidates: corners })
         }
         FeatureMethod::Sift => {
             let mut settings = options.sift.clone();
@@ -127,7 +129,7 @@ pub fn extract_features(photo: ImageView<'_, u8, 3>, options: &MatchingOptions) 
             }
             let described = sift(grey.view(), &settings)?;
             let found = described.keypoints.len() + described.dropped.len() + described.beyond_limit;
-            Ok(PhotoFeatures { described, found })
+            Ok(PhotoFeatures { described, found, candidates: Vec::new() })
         }
     }
 }

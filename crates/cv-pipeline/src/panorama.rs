@@ -245,6 +245,7 @@ impl Prepared {
                 beyond_limit: 0,
             },
             found: 0,
+            candidates: Vec::new(),
         };
         let size = ((w as f64 / factor).round() as usize, (h as f64 / factor).round() as usize);
         let reduced = (factor > 1.2).then(|| cv_imgproc::resize_area(p.image, size.0, size.1).ok()).flatten();

@@ -73,6 +73,7 @@ commands! {
     Completions(completions),
     Demo(demo),
     Man(man),
+    Match(match_),
     Panorama(panorama),
     Reconstruct(reconstruct),
     Segment(segment),
