@@ -3,6 +3,8 @@
 //! One file per job; its scripts and the pinned versions live in `peers/` at the root, whose `.venv` is made on the first
 //! run. Register a job with one line in `JOBS`; it returns whether ours meets its bars.
 
+mod stereo;
+
 use anyhow::{Context, Result, bail, ensure};
 use std::{
     path::{Path, PathBuf},
@@ -12,7 +14,7 @@ use std::{
 /// A job: its name on the command line and what it does with the Python of the peers and the data folder.
 type Job = (&'static str, fn(&Path, &Path) -> Result<bool>);
 
-const JOBS: &[Job] = &[];
+const JOBS: &[Job] = &[("stereo", stereo::run)];
 
 /// Runs all jobs, or the one named; true where ours meets every bar.
 pub(crate) fn run(only: Option<&str>) -> Result<bool> {
