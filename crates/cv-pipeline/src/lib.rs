@@ -32,6 +32,7 @@ mod panorama;
 mod preview;
 mod progress;
 mod reconstruct;
+mod rectify;
 mod segment;
 mod stopwatch;
 mod thumbnail;
@@ -53,6 +54,7 @@ pub mod panorama_types {
 pub use preview::preview;
 pub use progress::{Progress, Silent};
 pub use reconstruct::{Intrinsics, ReconstructError, ReconstructOptions, ReconstructResult, ScenePoint, reconstruct};
+pub use rectify::{RectifyResult, rectify};
 pub use segment::{SegmentResult, SegmentTraining, segment, train_segment};
 pub use stopwatch::Stopwatch;
 pub use thumbnail::thumbnail;

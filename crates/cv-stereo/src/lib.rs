@@ -8,6 +8,7 @@
 
 mod aligned;
 mod census;
+mod confidence;
 mod depth;
 mod error;
 mod evaluate;

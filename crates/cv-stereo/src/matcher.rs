@@ -1,6 +1,7 @@
 //! From a rectified pair to checked disparities.
 
 use crate::census::{Grey, census, census_mirrored, planes};
+use crate::confidence::{confidence, sigma};
 use crate::input::to_grey;
 use crate::kernel::Frame;
 use crate::sgm::{Aggregator, blocks};
@@ -166,6 +167,24 @@ impl StereoMatcher {
         self.check(map);
         self.refine(map);
         Ok(())
+    }
+
+    /// How sure each disparity of the last pair is, 0 to 1: how far its cost lies below the best one elsewhere; 0 where it
+    /// was filled. Empty before the first pair.
+    pub fn confidence(&self, map: &DisparityMap) -> GrayF32 {
+        self.per_pixel(map, confidence)
+    }
+
+    /// Standard deviation in px of each disparity of the last pair, from how sharp its minimum is; NaN where it was
+    /// filled. [`crate::StereoGeometry::depth_uncertainty`] makes error bars of depth from it.
+    pub fn uncertainty(&self, map: &DisparityMap) -> GrayF32 {
+        self.per_pixel(map, sigma)
+    }
+
+    fn per_pixel(&self, map: &DisparityMap, f: impl Fn(&Winner, PixelState) -> f32) -> GrayF32 {
+        let (width, height) = map.state.size();
+        let values = self.aggregator.winners.iter().zip(map.state.as_slice()).map(|(winner, &state)| f(winner, state));
+        GrayF32::from_vec(width, height, values.collect()).unwrap_or_else(|_| GrayF32::new(0, 0, [0.0]))
     }
 
     /// Refuses image sizes that these options cannot work on.

@@ -69,6 +69,7 @@ macro_rules! commands {
 commands! {
     Depth(depth),
     Eval(eval),
+    Rectify(rectify),
     Estimate(estimate),
     Completions(completions),
     Demo(demo),

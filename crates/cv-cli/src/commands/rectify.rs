@@ -1,0 +1,124 @@
+//! `cv rectify`: a pair as two cameras would have taken it whose rows coincide.
+
+use crate::common::{Context, Explain, Failure, Outcome, Run, create_dir};
+use cv_core::{RgbU8, StereoRig};
+use cv_io::RigFile;
+use cv_pipeline::rectify;
+use cv_pipeline::stereo::RectifyOptions;
+use cv_report::{Canvas, Figure, Report, colors, side_by_side};
+use serde_json::json;
+use std::path::{Path, PathBuf};
+
+/// Rectify a pair of photographs taken by a calibrated rig: the same scene point comes to lie in the same row of both.
+///
+/// Writes left.png, right.png, rig.yaml (the rectified cameras) and q.txt (the matrix that takes column, row, disparity, 1
+/// to space) to a folder. The vertical residual is measured on features found in both rectified photographs.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cv rectify left.jpg right.jpg --rig rig.yaml --out rectified\n  \
+    cv rectify left.jpg right.jpg --rig opencv-stereo.yml --alpha 1 --size 1280x960 --out rectified --report page")]
+pub(crate) struct Args {
+    /// The left (or upper) photograph.
+    left: PathBuf,
+    /// The right (or lower) photograph.
+    right: PathBuf,
+    /// Calibration of the rig: ours or OpenCV's YAML.
+    #[arg(long, value_name = "FILE")]
+    rig: PathBuf,
+    /// The folder for the results; made where it is missing.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// From 0 (no pixel without content) to 1 (no pixel lost).
+    #[arg(long, value_name = "A", default_value_t = 0.0)]
+    alpha: f64,
+    /// Width and height of the rectified photographs [default: as the left one].
+    #[arg(long, value_name = "WxH", value_parser = parse_size)]
+    size: Option<(usize, usize)>,
+}
+
+fn parse_size(text: &str) -> Result<(usize, usize), String> {
+    let (w, h) = text.split_once('x').ok_or("give width and height as 1280x960")?;
+    match (w.parse(), h.parse()) {
+        (Ok(w), Ok(h)) if (1..=32_768).contains(&w) && (1..=32_768).contains(&h) => Ok((w, h)),
+        _ => Err("width and height are whole numbers from 1 to 32768".to_owned()),
+    }
+}
+
+impl Run for Args {
+    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+        let left = cv_io::read_rgb(&self.left)?;
+        let right = cv_io::read_rgb(&self.right)?;
+        let RigFile { rig, unit, .. } = cv_io::read_rig(&self.rig, Some(left.size()))?;
+        let options = RectifyOptions { alpha: self.alpha, size: self.size };
+        let result = rectify(left.view(), right.view(), &rig, &options, context)
+            .during(self.rig.display())
+            .advice("check the calibration file, and that it belongs to these photographs")?;
+        create_dir(&self.out)?;
+        let at = |name: &str| self.out.join(name);
+        cv_io::write_png(at("left.png"), result.images[0].view())?;
+        cv_io::write_png(at("right.png"), result.images[1].view())?;
+        let r = &result.rectification;
+        let rotation = cv_core::Rotation3::identity();
+        let translation = cv_core::Vector3::new(-r.geometry.baseline, 0.0, 0.0);
+        let rectified = StereoRig {
+            left: r.left.camera,
+            right: r.right.camera,
+            right_from_left: cv_core::Pose::new(rotation, translation),
+        };
+        cv_io::write_rig(at("rig.yaml"), &RigFile { rig: rectified, unit }, &["rectified"])?;
+        let q = r.q();
+        let rows: Vec<String> =
+            q.row_iter().map(|row| row.iter().map(f64::to_string).collect::<Vec<_>>().join(" ")).collect();
+        cv_io::write_bytes(at("q.txt"), format!("{}\n", rows.join("\n")).as_bytes())?;
+        context.report(|| {
+            let mut page = Report::new("Rectification");
+            let quality = match result.vertical_px {
+                Some((median, p95)) => format!("{median:.2} px, 95 % under {p95:.2} px"),
+                None => "unknown: too few features".to_owned(),
+            };
+            page.headline("vertical residual", &quality)
+                .headline("valid area", &format!("{:.1} % and {:.1} %", 100.0 * result.valid_area[0], 100.0 * result.valid_area[1]));
+            page.section("Rectified pair").figure(Figure::new(
+                cv_io::encode_png(with_rows(&result.images).view())?,
+                "Both photographs with common rows drawn through: what is on a line on the left is on it on the right.",
+            ));
+            Ok(page.to_html())
+        })?;
+        let (width, height) = result.images[0].size();
+        let residual = result.vertical_px.map_or("unknown (too few features)".to_owned(), |(median, p95)| {
+            format!("{median:.2} px median, {p95:.2} px at 95 %, over {} features", result.matches)
+        });
+        Ok(Outcome::new(result.stages)
+            .with("width", width)
+            .with("height", height)
+            .with("vertical", r.vertical)
+            .with("focal_px", r.geometry.focal)
+            .with("baseline", r.geometry.baseline)
+            .with("principal_point", [r.geometry.cx, r.geometry.cy])
+            .with("q", q.row_iter().map(|row| row.iter().copied().collect::<Vec<f64>>()).collect::<Vec<_>>())
+            .with("valid_area", json!({ "left": result.valid_area[0], "right": result.valid_area[1] }))
+            .with("matches", result.matches)
+            .with("vertical_residual_px", result.vertical_px.map(|(median, p95)| json!({ "median": median, "p95": p95 })))
+            .summary(format!(
+                "{width}×{height} px; vertical residual {residual}; valid area {:.1} % left, {:.1} % right",
+                100.0 * result.valid_area[0],
+                100.0 * result.valid_area[1]
+            )))
+    }
+
+    fn outputs(&self) -> Vec<&Path> {
+        Vec::new()
+    }
+}
+
+/// Both views side by side with a line every sixteenth of the height.
+fn with_rows(images: &[RgbU8; 2]) -> RgbU8 {
+    let joined = side_by_side(&[images[0].view(), images[1].view()], 4);
+    let mut canvas = Canvas::from_rgb(joined.view());
+    let (width, height) = (canvas.width() as f32, canvas.height() as f32);
+    for line in 1..16 {
+        let y = height * line as f32 / 16.0;
+        canvas.line([0.0, y], [width, y], 1.0, colors::GREEN);
+    }
+    canvas.into_image()
+}

@@ -1,0 +1,96 @@
+//! Rectification of a pair of photographs, with what tells whether it is any good.
+
+use crate::{MatchingOptions, Progress, Stopwatch, match_photos};
+use cv_core::{ImageView, Mask, RgbU8, StereoRig};
+use cv_stereo::{Rectification, RectifyError, RectifyOptions};
+
+/// What [`rectify`] made.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RectifyResult {
+    /// Both rectified views and their geometry.
+    pub rectification: Rectification,
+    /// The rectified photographs, left and right.
+    pub images: [RgbU8; 2],
+    /// Where they show anything.
+    pub masks: [Mask; 2],
+    /// Share of pixels that show anything, left and right.
+    pub valid_area: [f64; 2],
+    /// Median and 95 % quantile in px of the difference in rows of features found in both rectified photographs; `None`
+    /// with fewer than eight of them.
+    pub vertical_px: Option<(f64, f64)>,
+    /// Number of those features.
+    pub matches: usize,
+    /// Stage names and their seconds.
+    pub stages: Vec<(&'static str, f64)>,
+}
+
+/// Rectifies a pair taken by `rig`.
+///
+/// # Errors
+/// [`RectifyError`] where the rig cannot be rectified, or the photographs are not of its cameras' sizes.
+pub fn rectify(
+    left: ImageView<'_, u8, 3>,
+    right: ImageView<'_, u8, 3>,
+    rig: &StereoRig,
+    options: &RectifyOptions,
+    progress: &dyn Progress,
+) -> Result<RectifyResult, RectifyError> {
+    let mut watch = Stopwatch::new();
+    progress.report("rectify", 0, 2);
+    let rectification = Rectification::new(rig, options)?;
+    let (left, mask_left) = rectification.left.apply(left)?;
+    let (right, mask_right) = rectification.right.apply(right)?;
+    watch.lap("rectify");
+    progress.report("rectify", 1, 2);
+    // A pair without features is rectified all the same; only its quality stays unknown.
+    let pairs = match_photos(left.view(), right.view(), &MatchingOptions::default(), progress)
+        .map(|found| found.pairs)
+        .unwrap_or_default();
+    // A wrong match has any row; those beyond a few pixels say nothing of the calibration.
+    let mut rows: Vec<f64> =
+        pairs.iter().filter(|p| p.a.x >= p.b.x - 4.0).map(|p| (p.a.y - p.b.y).abs()).filter(|&dy| dy < 8.0).collect();
+    rows.sort_unstable_by(f64::total_cmp);
+    let quantile = |share: f64| rows[((rows.len() - 1) as f64 * share) as usize];
+    let vertical_px = (rows.len() >= 8).then(|| (quantile(0.5), quantile(0.95)));
+    watch.lap("quality");
+    progress.report("rectify", 2, 2);
+    let share = |mask: &Mask| {
+        let m = mask.as_slice();
+        m.iter().filter(|&&v| v).count() as f64 / m.len().max(1) as f64
+    };
+    Ok(RectifyResult {
+        valid_area: [share(&mask_left), share(&mask_right)],
+        rectification,
+        images: [left, right],
+        masks: [mask_left, mask_right],
+        vertical_px,
+        matches: rows.len(),
+        stages: watch.into_stages(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Silent;
+    use cv_core::{Camera, Distortion, Pose, Rotation3, Vector3};
+    use cv_synth::{RenderOptions, Scene, render};
+
+    #[test]
+    fn features_of_a_turned_and_distorted_pair_come_to_lie_in_the_same_rows() {
+        let scene = Scene::room(2);
+        let mut camera = Camera::from_focal(320, 240, 260.0);
+        camera.distortion = Distortion::Radial { k1: -0.12, k2: 0.02 };
+        let relative = Pose::new(Rotation3::from_euler_angles(0.02, -0.03, 0.015), Vector3::new(-0.2, 0.01, 0.004));
+        let first = scene.viewpoint();
+        let options = RenderOptions::default();
+        let a = render(&scene, &camera, &first, &options).unwrap();
+        let b = render(&scene, &camera, &relative.compose(&first), &options).unwrap();
+        let rig = StereoRig { left: camera, right: camera, right_from_left: relative };
+        let result = rectify(a.image.view(), b.image.view(), &rig, &RectifyOptions::default(), &Silent).unwrap();
+        let (median, _) = result.vertical_px.unwrap();
+        // Features are placed to a few tenths of a pixel; an unrectified pair of this rig is off by five and more.
+        assert!(median < 0.4 && result.matches > 30, "{median} px over {}", result.matches);
+        assert!(result.valid_area[0] > 0.999 && result.valid_area[1] > 0.999);
+    }
+}
