@@ -26,6 +26,7 @@
 //! * The same input, options and seed give the same result at any number of threads.
 
 mod depth;
+mod disparity_range;
 mod estimate;
 mod matching;
 mod panorama;
@@ -39,6 +40,7 @@ mod thumbnail;
 
 pub use cv_geometry::{EstimateError, RobustModel, RobustOptions};
 pub use depth::{DepthError, DepthOptions, DepthResult, depth};
+pub use disparity_range::{RangeError, disparity_range};
 pub use estimate::{EstimateResult, ModelKind, estimate};
 pub use matching::{
     FeatureMethod, MatchingError, MatchingOptions, MatchingResult, PhotoFeatures, correspondences, extract_features,

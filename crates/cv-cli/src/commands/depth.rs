@@ -4,7 +4,7 @@ use crate::common::{Context, Explain, Failure, Outcome, Run};
 use cv_core::{GrayF32, ImageView, RgbU8};
 use cv_io::ply::{Cloud, PlyEncoding};
 use cv_io::{DynImage, Pixels};
-use cv_pipeline::{DepthOptions, DepthResult, depth};
+use cv_pipeline::{DepthOptions, DepthResult, depth, disparity_range};
 use cv_report::{Figure, MapStyle, Note, PointScene, Report, Viewpoint, draw_map, render_points};
 use cv_pipeline::stereo::{
     Census, CloudPoint, Intensity, Paths, PixelState, Rectification, RectifyOptions, StereoGeometry, StereoOptions,
@@ -20,6 +20,7 @@ use std::path::{Path, PathBuf};
 #[command(after_help = "Examples:\n  \
     cv depth left.png right.png -o disparity.pfm\n  \
     cv depth left.png right.png -o d.pfm --focal 1000 --baseline 0.12 --depth depth.pfm --cloud cloud.ply\n  \
+    cv depth left.png right.png --disparities auto -o disparity.npy\n  \
     cv depth left.jpg right.jpg --rig rig.yaml -o disparity.png --depth depth.png --report out\n\n\
     The ending of a file tells its format: .pfm (floats, +inf where unknown), .npy (floats, NaN), .png (disparity as KITTI's\n\
     16-bit PNG, 256 steps a pixel; depth as 16-bit millimetres for a baseline in metres); 0 is unknown in both.")]
@@ -40,12 +41,12 @@ pub(crate) struct Args {
     /// Calibration of the rig, ours or OpenCV's YAML: the photographs are rectified first.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["focal", "baseline"])]
     rig: Option<PathBuf>,
-    /// Number of disparities to try, in pixels.
-    #[arg(long, value_name = "N", default_value_t = 128)]
-    disparities: usize,
-    /// Smallest disparity to try, in pixels; may be negative.
-    #[arg(long, value_name = "PX", default_value_t = 0, allow_negative_numbers = true)]
-    min_disparity: i32,
+    /// Number of disparities to try, in pixels, or auto: from feature matches.
+    #[arg(long, value_name = "N|auto", default_value = "128", value_parser = parse_range)]
+    disparities: Range,
+    /// Smallest disparity to try, in pixels; may be negative [default: 0, or that of auto].
+    #[arg(long, value_name = "PX", allow_negative_numbers = true)]
+    min_disparity: Option<i32>,
     /// Focal length of the rectified photographs in pixels.
     #[arg(long, value_name = "PX", requires = "baseline")]
     focal: Option<f64>,
@@ -84,6 +85,20 @@ pub(crate) struct Args {
     no_fill: bool,
 }
 
+/// `--disparities`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Range {
+    Auto,
+    Number(usize),
+}
+
+fn parse_range(text: &str) -> Result<Range, String> {
+    if text == "auto" {
+        return Ok(Range::Auto);
+    }
+    text.parse().map(Range::Number).map_err(|_| "give a number, or auto".to_owned())
+}
+
 impl Run for Args {
     fn outputs(&self) -> Vec<&Path> {
         [Some(&self.output), self.depth.as_ref(), self.cloud.as_ref()].into_iter().flatten().map(|p| &**p).collect()
@@ -107,14 +122,19 @@ impl Run for Args {
                 self.right.display()
             )));
         }
-        let options = self.options();
+        let mut options = self.options();
         let job = match &self.rig {
             Some(path) => {
                 let rig = cv_io::read_rig(path, Some(left.size()))?.rig;
                 let rectified = Rectification::new(&rig, &RectifyOptions::default())
                     .during(path.display())
                     .advice("check the calibration file")?;
-                rectified_job(left, right, &rectified, &options, context)?
+                let advice = "use the photographs the rig was calibrated for";
+                let (left, _) = rectified.left.apply(left.into_rgb8().view()).advice(advice)?;
+                let (right, _) = rectified.right.apply(right.into_rgb8().view()).advice(advice)?;
+                self.set_range(&mut options, &left, &right, context)?;
+                let result = matched(left.view(), right.view(), Some(&rectified.geometry), &options, context)?;
+                Job { left, right, geometry: Some(rectified.geometry), result }
             }
             None => {
                 let (width, height) = left.size();
@@ -126,6 +146,10 @@ impl Run for Args {
                     }
                     _ => None,
                 };
+                if self.disparities == Range::Auto {
+                    let (a, b) = (left.clone().into_rgb8(), right.clone().into_rgb8());
+                    self.set_range(&mut options, &a, &b, context)?;
+                }
                 job(left, right, geometry, &options, context)?
             }
         };
@@ -167,12 +191,35 @@ impl Run for Args {
 }
 
 impl Args {
+    /// Under `--disparities auto`, the range that feature matches show.
+    fn set_range(
+        &self,
+        options: &mut DepthOptions,
+        left: &RgbU8,
+        right: &RgbU8,
+        context: &Context,
+    ) -> Result<(), Failure> {
+        if self.disparities == Range::Auto {
+            let (min, n) = disparity_range(left.view(), right.view(), context)
+                .during("--disparities auto")
+                .advice("give the number of disparities")?;
+            let end = min + n as i32;
+            options.stereo.min_disparity = self.min_disparity.unwrap_or(min);
+            options.stereo.disparities = (end - options.stereo.min_disparity).max(1) as usize;
+            context.note(format!("disparities {} to {}", options.stereo.min_disparity, end - 1));
+        }
+        Ok(())
+    }
+
     fn options(&self) -> DepthOptions {
         let default = StereoOptions::default();
         DepthOptions {
             stereo: StereoOptions {
-                min_disparity: self.min_disparity,
-                disparities: self.disparities,
+                min_disparity: self.min_disparity.unwrap_or(default.min_disparity),
+                disparities: match self.disparities {
+                    Range::Number(n) => n,
+                    Range::Auto => default.disparities,
+                },
                 census: match self.census.as_str() {
                     "5" => Census::Window5x5,
                     "7" => Census::Window7x7,
@@ -220,21 +267,6 @@ fn job(
         }
     };
     Ok(Job { left: left.into_rgb8(), right: right.into_rgb8(), geometry, result })
-}
-
-/// Rectifies, then matches.
-fn rectified_job(
-    left: DynImage,
-    right: DynImage,
-    rectified: &Rectification,
-    options: &DepthOptions,
-    context: &Context,
-) -> Result<Job, Failure> {
-    let (left, _) = rectified.left.apply(left.into_rgb8().view()).advice("use the photographs the rig was calibrated for")?;
-    let (right, _) =
-        rectified.right.apply(right.into_rgb8().view()).advice("use the photographs the rig was calibrated for")?;
-    let result = matched(left.view(), right.view(), Some(&rectified.geometry), options, context)?;
-    Ok(Job { left, right, geometry: Some(rectified.geometry), result })
 }
 
 fn matched<T: Intensity, const C: usize>(

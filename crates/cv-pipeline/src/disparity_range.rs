@@ -1,0 +1,81 @@
+//! Which disparities a pair shows, from sparse matches.
+
+use crate::{MatchingError, MatchingOptions, Progress, match_photos};
+use cv_core::ImageView;
+
+/// Why no range was found.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum RangeError {
+    /// No features to match.
+    #[error(transparent)]
+    Matching(#[from] MatchingError),
+    /// Too few matches lie in the same row of both photographs.
+    #[error(
+        "{found} of {matches} matches lie in the same row of both photographs, {needed} are needed: are they a rectified pair?"
+    )]
+    TooFew {
+        /// Matches in common rows.
+        found: usize,
+        /// All matches.
+        matches: usize,
+        /// How many are needed.
+        needed: usize,
+    },
+}
+
+/// Fewer matches than this do not tell a range.
+const NEEDED: usize = 16;
+
+/// Smallest disparity and number of disparities that a rectified pair shows: those of feature matches in common rows
+/// between their 1 % and 99 % quantiles, and an eighth of that and 4 px more at both ends for what features miss.
+///
+/// # Errors
+/// [`RangeError`] where too few matches lie in common rows.
+pub fn disparity_range(
+    left: ImageView<'_, u8, 3>,
+    right: ImageView<'_, u8, 3>,
+    progress: &dyn Progress,
+) -> Result<(i32, usize), RangeError> {
+    let pairs = match_photos(left, right, &MatchingOptions::default(), progress)?.pairs;
+    let mut disparities: Vec<f64> =
+        pairs.iter().filter(|p| (p.a.y - p.b.y).abs() <= 1.5).map(|p| p.a.x - p.b.x).collect();
+    if disparities.len() < NEEDED {
+        return Err(RangeError::TooFew { found: disparities.len(), matches: pairs.len(), needed: NEEDED });
+    }
+    disparities.sort_unstable_by(f64::total_cmp);
+    let at = |share: f64| disparities[((disparities.len() - 1) as f64 * share).round() as usize];
+    let (low, high) = (at(0.01), at(0.99));
+    let more = (high - low) / 8.0 + 4.0;
+    let min = (low - more).floor() as i32;
+    // A rectified pair shows nothing beyond infinity; a point or two below zero are wrong matches or rounding.
+    let min = if low > -1.0 { min.max(0) } else { min };
+    Ok((min, ((high + more).ceil() as i32 - min + 1).max(1) as usize))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Silent;
+    use cv_core::{Camera, RgbU8};
+    use cv_synth::{RenderOptions, Scene, stereo_pair};
+
+    #[test]
+    fn the_range_covers_a_generated_room_and_little_more() {
+        let scene = Scene::room(4);
+        let camera = Camera::from_focal(320, 240, 280.0);
+        let pair = stereo_pair(&scene, &camera, &scene.viewpoint(), 0.25, &RenderOptions::default()).unwrap();
+        let (min, n) = disparity_range(pair.left.image.view(), pair.right.image.view(), &Silent).unwrap();
+        let d = pair.disparity.as_slice();
+        let inside = d.iter().filter(|&&d| d >= min as f32 && d <= (min + n as i32 - 1) as f32).count();
+        let largest = d.iter().copied().fold(0.0, f32::max);
+        // Quantiles of features leave out a few pixels of the nearest things.
+        assert!(inside as f64 >= 0.97 * d.len() as f64, "{min} {n}: {inside} of {}", d.len());
+        assert!((n as f32) < 1.6 * largest + 10.0, "{min} {n} for {largest}");
+    }
+
+    #[test]
+    fn photographs_without_common_rows_are_refused() {
+        let flat = RgbU8::new(80, 60, [90; 3]);
+        assert!(disparity_range(flat.view(), flat.view(), &Silent).is_err());
+    }
+}
