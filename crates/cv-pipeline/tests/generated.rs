@@ -6,12 +6,12 @@
 use cv_core::Camera;
 use cv_pipeline::{
     DepthOptions, Intrinsics, MatchingOptions, ModelKind, PanoramaOptions, PanoramaPhoto, ReconstructOptions, Silent,
-    depth, estimate, match_photos, panorama, reconstruct,
+    depth, estimate, match_photos, panorama, reconstruct, segment, train_segment,
 };
 use cv_stereo::{StereoGeometry, StereoOptions};
 use cv_synth::{
-    RenderOptions, Scene, alignment_error, depth_score, direction_error, homography_corner_error, homography_pair,
-    panorama_views, rotation_error, stereo_pair, two_view,
+    MaskScore, RenderOptions, Scene, alignment_error, ball_photos, depth_score, direction_error,
+    homography_corner_error, homography_pair, panorama_views, rotation_error, stereo_pair, two_view,
 };
 
 const SEEDS: std::ops::Range<u64> = 0..6;
@@ -114,5 +114,23 @@ fn two_views_give_the_turn_and_the_direction_of_travel() {
             off.len(),
             off[off.len() / 2]
         );
+    }
+}
+
+#[test]
+fn a_ball_is_found_by_its_colour() {
+    // Eight photographs, each of a scene of its own: fewer seeds.
+    for seed in 0..3 {
+        let photos = ball_photos(seed, 8, &camera(), &RenderOptions::default()).unwrap();
+        let half: Vec<_> = photos.iter().step_by(2).map(|p| (p.view.image.view(), p.mask.view())).collect();
+        let model = train_segment(&half, &Default::default(), &Silent).unwrap().trained.model;
+        let score = photos
+            .iter()
+            .skip(1)
+            .step_by(2)
+            .map(|p| MaskScore::new(&segment(p.view.image.view(), &model).mask, &p.mask).unwrap())
+            .fold(MaskScore::default(), MaskScore::plus);
+        println!("seed {seed}: F1 {:.4}", score.f1());
+        assert!(score.f1() >= 0.97, "seed {seed}: {} {score:?}", score.f1());
     }
 }

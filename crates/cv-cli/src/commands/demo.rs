@@ -4,6 +4,7 @@ mod depth;
 mod homography;
 mod panorama;
 mod reconstruct;
+mod segment;
 
 use crate::common::{Context, Failure, Outcome, Run, create_dir};
 use cv_core::{Camera, RgbU8};
@@ -112,7 +113,8 @@ impl Part {
 type Job = fn(&Demo<'_>) -> Result<Part, Failure>;
 
 /// In the order in which a reader learns them.
-const JOBS: [(&str, Job); 4] = [
+const JOBS: [(&str, Job); 5] = [
+    ("segment", segment::run),
     ("homography", homography::run),
     ("panorama", panorama::run),
     ("reconstruct", reconstruct::run),

@@ -1,0 +1,41 @@
+//! An orange ball by its colour, trained on half of the photographs.
+
+use super::{Check, Demo, Part};
+use crate::common::Failure;
+use cv_pipeline::{segment, train_segment};
+use cv_report::overlay_comparison;
+use cv_synth::{MaskScore, RenderOptions, ball_photos};
+
+/// Photographs; every other one is trained on.
+const PHOTOS: usize = 8;
+
+pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
+    let photos = ball_photos(demo.seed, PHOTOS, &demo.camera(), &RenderOptions::default())?;
+    let labelled: Vec<_> = photos.iter().step_by(2).map(|p| (p.view.image.view(), p.mask.view())).collect();
+    let model = match train_segment(&labelled, &Default::default(), demo.context) {
+        Ok(training) => training.trained.model,
+        Err(error) => return Ok(Part::gave_up("segment", &error)),
+    };
+    let mut score = MaskScore::default();
+    let mut figures = Vec::new();
+    for (i, photo) in photos.iter().enumerate() {
+        demo.photo(&format!("segment-{}.png", i + 1), &photo.view.image, "")?;
+        if i % 2 == 0 {
+            continue;
+        }
+        let found = segment(photo.view.image.view(), &model).mask;
+        let one = MaskScore::new(&found, &photo.mask).unwrap_or_default();
+        score = score.plus(one);
+        let caption = format!("The ball {:.2} m away: F1 {:.3}.", photo.distance, one.f1());
+        let picture = overlay_comparison(photo.view.image.view(), found.view(), photo.mask.view());
+        figures.push(demo.photo(&format!("segment-{}-result.png", i + 1), &picture, &caption)?);
+    }
+    let pixels = |n: usize| format!("{n} px of ball");
+    let check = Check::at_least("segment", "F1 over all test pixels", score.f1(), 0.97, "")
+        .of(pixels(score.both + score.truth_only), pixels(score.both + score.estimate_only));
+    Ok(Part::new(vec![check], move |page| {
+        page.section("Segmentation")
+            .paragraph("A colour model learns the ball from four photographs with masks, and marks it in four others. Green is right, red invented, blue missed.")
+            .figures(figures);
+    }))
+}
