@@ -3,6 +3,8 @@
 use std::io::Write;
 use std::path::Path;
 
+use cv_core::{Camera, Point3, Pose};
+
 use crate::{FormatError, IoError, write_atomic};
 
 const NAME: &str = "PLY";
@@ -41,8 +43,9 @@ impl Cloud {
         Self { points, colors, ..Self::default() }
     }
 
-    /// Adds points of one colour joined by `edges`, whose indices count from the first added point. Colours and normals that
-    /// the cloud lacks so far stay absent where it is empty of them and non-empty of points.
+    /// Adds points of one colour joined by `edges`, whose indices count from the first added point.
+    ///
+    /// A cloud of points without colours stays without; normals, where there are some, are zero for the added points.
     pub fn add_wireframe(&mut self, corners: &[[f32; 3]], edges: &[[u32; 2]], color: [u8; 3]) {
         let first = self.points.len() as u32;
         let colored = self.points.is_empty() || !self.colors.is_empty();
@@ -55,6 +58,21 @@ impl Cloud {
             self.normals.extend(std::iter::repeat_n([0.0; 3], corners.len()));
         }
         self.edges.extend(edges.iter().map(|e| e.map(|i| i + first)));
+    }
+
+    /// Adds a camera's outline: its centre, and the corners of its picture `depth` in front of it.
+    pub fn add_camera(&mut self, camera: &Camera, pose: &Pose, depth: f64, color: [u8; 3]) {
+        let (right, bottom) = (camera.width as f64 - 0.5, camera.height as f64 - 0.5);
+        let to_world = pose.inverse();
+        let corner = |x: f64, y: f64| {
+            // Without the lens: an outline has straight edges.
+            let ray = Point3::new((x - camera.cx) / camera.fx * depth, (y - camera.cy) / camera.fy * depth, depth);
+            to_world.transform(&ray)
+        };
+        let corners =
+            [pose.center(), corner(-0.5, -0.5), corner(right, -0.5), corner(right, bottom), corner(-0.5, bottom)];
+        let corners = corners.map(|p| [p.x as f32, p.y as f32, p.z as f32]);
+        self.add_wireframe(&corners, &[[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]], color);
     }
 
     fn check(&self) -> Result<(), FormatError> {
@@ -242,6 +260,28 @@ mod tests {
             assert_eq!(cloud.edges, [[first, first + 1]]);
             encode(&cloud, PlyEncoding::Binary, &mut Vec::new()).unwrap();
         }
+    }
+
+    #[test]
+    fn a_cameras_outline_is_what_it_sees() {
+        let camera = Camera::pinhole(200, 100, 100.0, 100.0, 99.5, 49.5);
+        let pose =
+            Pose::look_at(Point3::new(1.0, 2.0, 3.0), Point3::new(4.0, 2.0, 3.0), cv_core::Vector3::y()).unwrap();
+        let mut cloud = Cloud::default();
+        cloud.add_camera(&camera, &pose, 2.0, [9, 9, 9]);
+        assert_eq!(cloud.points[0], [1.0, 2.0, 3.0]);
+        let seen: Vec<_> = cloud.points[1..]
+            .iter()
+            .map(|p| {
+                camera
+                    .project(&pose.transform(&Point3::new(f64::from(p[0]), f64::from(p[1]), f64::from(p[2]))))
+                    .unwrap()
+            })
+            .collect();
+        let corners = [(-0.5, -0.5), (199.5, -0.5), (199.5, 99.5), (-0.5, 99.5)];
+        // The points are stored as f32, with seven digits.
+        assert!(seen.iter().zip(corners).all(|(p, (x, y))| (p.x - x).hypot(p.y - y) < 1e-3), "{seen:?}");
+        assert_eq!((cloud.edges.len(), cloud.colors.len()), (8, 5));
     }
 
     #[test]
