@@ -6,7 +6,7 @@ use crate::graph::{self, Edge};
 use crate::straighten::straighten;
 use crate::verify::VerifiedPair;
 use crate::view::View;
-use cv_core::{Camera, Distortion, Point2};
+use cv_core::{Camera, Correspondence, Distortion, Point2};
 use cv_numeric::RobustLoss;
 use nalgebra::{Matrix3, Rotation3, Vector2};
 
@@ -131,14 +131,14 @@ pub enum Unplaced {
 }
 
 /// An overlap that holds in the whole.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct AlignedPair {
     /// First photograph.
     pub a: usize,
     /// Second photograph.
     pub b: usize,
-    /// Matches.
-    pub matches: usize,
+    /// Matches, in pixels.
+    pub matches: Vec<Correspondence>,
     /// Root mean square of their errors, in pixels.
     pub rms_px: f64,
 }
@@ -161,6 +161,34 @@ pub struct Alignment {
 }
 
 impl Alignment {
+    /// The same alignment of photographs of other sizes: each made `factor` times as large and then of `size`.
+    ///
+    /// Errors are scaled by the median factor of the photographs used.
+    pub fn resized(&self, sizes: &[(f64, (usize, usize))]) -> Self {
+        let mut out = self.clone();
+        for (view, (factor, size)) in out.views.iter_mut().zip(sizes) {
+            if let Ok(view) = view {
+                view.camera = view.camera.scaled(*factor);
+                (view.camera.width, view.camera.height) = *size;
+            }
+        }
+        let factor = |i: usize| sizes.get(i).map_or(1.0, |s| s.0);
+        let place = |p: Point2<f64>, f: f64| Point2::from((p.coords.add_scalar(0.5) * f).add_scalar(-0.5));
+        for pair in &mut out.pairs {
+            let (fa, fb) = (factor(pair.a), factor(pair.b));
+            pair.rms_px *= 0.5 * (fa + fb);
+            for m in &mut pair.matches {
+                (m.a, m.b) = (place(m.a, fa), place(m.b, fb));
+            }
+        }
+        let mut factors: Vec<f64> = self.used().map(|(i, _)| factor(i)).collect();
+        factors.sort_by(f64::total_cmp);
+        let typical = factors.get(factors.len() / 2).copied().unwrap_or(1.0);
+        out.rms_px *= typical;
+        out.median_px *= typical;
+        out
+    }
+
     /// The photographs in the panorama.
     pub fn used(&self) -> impl Iterator<Item = (usize, &View)> {
         self.views.iter().enumerate().filter_map(|(i, v)| v.as_ref().ok().map(|v| (i, v)))
@@ -527,7 +555,7 @@ impl<'a> Group<'a> {
             .pairs
             .iter()
             .zip(&errors)
-            .map(|(p, e)| AlignedPair { a: p.a, b: p.b, matches: e.len(), rms_px: rms(e) })
+            .map(|(p, e)| AlignedPair { a: p.a, b: p.b, matches: p.inliers.clone(), rms_px: rms(e) })
             .collect();
         let all: Vec<f64> = errors.concat();
         Ok(Alignment {

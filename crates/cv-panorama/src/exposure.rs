@@ -83,7 +83,43 @@ pub(crate) fn estimate(preview: &Preview, photo_of: &[usize], photos: usize, exp
             gain[channel] = log.clamp(-2.0, 2.0).exp() as f32;
         }
     }
+    spare_highlights(preview, photo_of, &mut gains);
     gains
+}
+
+/// Darkens all photographs alike until hardly any pixel is clipped that was not before: a gain brightens the darkest photographs, which are often those with
+/// the brightest things in them.
+fn spare_highlights(preview: &Preview, photo_of: &[usize], gains: &mut Gains) {
+    /// Share of the pixels that may be clipped.
+    const CLIPPED: usize = 50;
+    /// Never darker than this: a panorama is not ruined for one bright window.
+    const DARKEST: f32 = 0.6;
+    // How far each pixel lies over white, as a histogram of ratios from 1 to 1 / DARKEST.
+    let mut over = [0_usize; 64];
+    let mut total = 0;
+    let bin_of = |ratio: f32| (((ratio - 1.0) / (1.0 / DARKEST - 1.0) * 64.0) as usize).min(63);
+    for (piece, photo) in preview.pieces.iter().zip(photo_of) {
+        let gain = gains.gains[*photo];
+        for p in piece.warped.pixels.pixels().step_by(7).filter(|p| p[3] > 0) {
+            total += 1;
+            let before = p[0].max(p[1]).max(p[2]);
+            let after = (0..3).map(|c| gain[c] * f32::from(p[c]) / 255.0).fold(0.0, f32::max);
+            if before < 250 && after > 1.0 {
+                over[bin_of(after)] += 1;
+            }
+        }
+    }
+    let mut clipped = 0;
+    for (bin, count) in over.iter().enumerate().rev() {
+        clipped += count;
+        if clipped * CLIPPED > total {
+            let ratio = 1.0 + (bin + 1) as f32 / 64.0 * (1.0 / DARKEST - 1.0);
+            for gain in gains.gains.iter_mut().flatten() {
+                *gain /= ratio;
+            }
+            return;
+        }
+    }
 }
 
 fn samples(preview: &Preview, photo_of: &[usize]) -> Vec<Sample> {

@@ -36,6 +36,33 @@ pub enum LayoutError {
     },
 }
 
+/// Where a panorama's pixels look: pixel (0, 0) lies at `origin` of the surface, whose middle is the Z axis of `frame · world`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Canvas {
+    /// The surface, never [`Projection::Auto`].
+    pub projection: Projection,
+    /// Pixels per radian at the middle.
+    pub scale: f64,
+    /// Surface coordinates of pixel (0, 0).
+    pub origin: Point2<f64>,
+    /// The alignment's world to the surface's frame.
+    pub frame: Matrix3<f64>,
+}
+
+impl Canvas {
+    /// The world direction that a pixel of the panorama shows.
+    pub fn ray(&self, pixel: Point2<f64>) -> Vector3<f64> {
+        let surface = Surface { projection: self.projection, scale: self.scale };
+        self.frame.transpose() * surface.inverse(pixel + self.origin.coords)
+    }
+
+    /// Where the panorama shows a world direction; `None` where its surface does not reach.
+    pub fn pixel(&self, ray: &Vector3<f64>) -> Option<Point2<f64>> {
+        let surface = Surface { projection: self.projection, scale: self.scale };
+        surface.forward(&(self.frame * ray)).map(|p| p - self.origin.coords)
+    }
+}
+
 /// A photograph on the canvas.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Placement {
@@ -97,6 +124,7 @@ pub(crate) struct Layout {
     /// A full turn: the right edge continues at the left one.
     pub(crate) full_circle: bool,
     pub(crate) placements: Vec<Placement>,
+    pub(crate) canvas: Canvas,
 }
 
 /// Half the angle up to which a plane is chosen: there it stretches lengths by 1/cos² = 2.
@@ -217,8 +245,10 @@ fn on_surface(views: &[(usize, View)], surface: Surface, flat: bool, max_pixels:
         let degrees = up.0.max(2.0 * up.1).to_degrees();
         LayoutError::TooWide { degrees, projection: surface.projection }
     };
+    let mut frame = Matrix3::identity();
     // The middle of the panorama goes to the Z axis.
-    let recentred = |m: Matrix3<f64>| -> Vec<(usize, View)> {
+    let mut recentred = |m: Matrix3<f64>| -> Vec<(usize, View)> {
+        frame = m;
         views.iter().map(|&(i, v)| (i, View { from_world: v.from_world * m.transpose(), ..v })).collect()
     };
     let mut full_circle = false;
@@ -303,7 +333,8 @@ fn on_surface(views: &[(usize, View)], surface: Surface, flat: bool, max_pixels:
             }
         }
     }
-    Ok(Layout { surface, width: canvas_w, height: canvas_h, full_circle, placements })
+    let canvas = Canvas { projection: surface.projection, scale: surface.scale, origin, frame };
+    Ok(Layout { surface, width: canvas_w, height: canvas_h, full_circle, placements, canvas })
 }
 
 #[cfg(test)]

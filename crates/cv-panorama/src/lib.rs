@@ -35,6 +35,7 @@
 mod align;
 mod bundle;
 mod crop;
+mod elastic;
 mod exposure;
 mod feather;
 mod focal;
@@ -54,8 +55,9 @@ mod warp;
 
 pub use align::{AlignError, AlignOptions, AlignedPair, Alignment, CameraMotion, Photo, Unplaced, align};
 pub use cv_imgproc::Interpolation;
+pub use elastic::PhotoMap;
 pub use exposure::{Exposure, Gains};
-pub use layout::LayoutError;
+pub use layout::{Canvas, LayoutError};
 pub use projection::Projection;
 pub use render::{Blend, Panorama, RenderError, RenderOptions, render};
 pub use seams::Seams;

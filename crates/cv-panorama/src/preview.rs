@@ -1,5 +1,6 @@
 //! The canvas at a fraction of its size, where exposure and seams are decided.
 
+use crate::elastic::Field;
 use crate::layout::{Bounds, Layout, Placement};
 use crate::projection::Surface;
 use crate::warp::{Map, Tone, Warped, warp};
@@ -41,7 +42,13 @@ impl Piece {
 
 impl Preview {
     /// Draws the preview with at most about `max_pixels` pixels.
-    pub(crate) fn draw(photos: &[ImageView<'_, u8, 3>], layout: &Layout, resolution: f64, max_pixels: usize) -> Self {
+    pub(crate) fn draw(
+        photos: &[ImageView<'_, u8, 3>],
+        layout: &Layout,
+        fields: &[Option<Field>],
+        resolution: f64,
+        max_pixels: usize,
+    ) -> Self {
         let ratio = (layout.width as f64 * layout.height as f64 / max_pixels.max(1) as f64).sqrt();
         let step = (ratio.ceil() as usize).max(1);
         let s = 1.0 / step as f64;
@@ -57,7 +64,8 @@ impl Preview {
         let pieces = layout
             .placements
             .par_iter()
-            .filter_map(|p| {
+            .enumerate()
+            .filter_map(|(k, p)| {
                 let photo = small.get(p.photo)?.as_ref()?;
                 // Pixel centres at integers: the middle of a step × step block of canvas pixels.
                 let origin = p.origin.coords * s - nalgebra::Vector2::repeat(0.5 * s - 0.5);
@@ -67,9 +75,18 @@ impl Preview {
                     right: p.bounds.right.div_ceil(step).min(width),
                     bottom: p.bounds.bottom.div_ceil(step).min(height),
                 };
+                let field = fields.get(k).and_then(Option::as_ref).map(|f| f.scaled(s, 1.0 / shrink as f64));
                 let view = shrunk_view(p, shrink, photo);
                 let small = Placement { view, bounds, origin: Point2::from(origin), ..*p };
-                let warped = warp(photo.view(), &small, &surface, bounds, Interpolation::Bilinear, Tone::NEUTRAL);
+                let warped = warp(
+                    photo.view(),
+                    &small,
+                    &surface,
+                    bounds,
+                    field.as_ref(),
+                    Interpolation::Bilinear,
+                    Tone::NEUTRAL,
+                );
                 let (eccentricity, radius) = distances(&small, &surface);
                 Some(Piece { warped, eccentricity, radius })
             })
@@ -137,6 +154,7 @@ fn distances(p: &Placement, surface: &Surface) -> (Vec<f32>, Vec<f32>) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::layout::Canvas;
     use crate::projection::Projection;
     use crate::view::View;
     use cv_core::{Camera, Matrix3};
@@ -149,8 +167,20 @@ mod tests {
         let bounds = Bounds { left: 0, top: 0, right: 64, bottom: 48 };
         let view = View { camera: Camera::from_focal(64, 48, 80.0), from_world: Matrix3::identity() };
         let placement = Placement { photo: 0, view, bounds, origin: Point2::new(-31.5, -23.5) };
-        let layout = Layout { surface, width: 64, height: 48, full_circle: false, placements: vec![placement] };
-        let preview = Preview::draw(&[photo.view()], &layout, 1.0, 64 * 48 / 16);
+        let layout = Layout {
+            surface,
+            width: 64,
+            height: 48,
+            full_circle: false,
+            placements: vec![placement],
+            canvas: Canvas {
+                projection: Projection::Plane,
+                scale: 80.0,
+                origin: placement.origin,
+                frame: Matrix3::identity(),
+            },
+        };
+        let preview = Preview::draw(&[photo.view()], &layout, &[], 1.0, 64 * 48 / 16);
         assert_eq!((preview.step, preview.width, preview.height), (4, 16, 12));
         for y in 0..12 {
             for x in 0..16 {

@@ -56,7 +56,6 @@ impl Surface {
     }
 
     /// The direction at a point of the surface.
-    #[cfg(test)]
     pub(crate) fn inverse(&self, p: Point2<f64>) -> Vector3<f64> {
         let (ax, az) = self.column(p.x);
         let (g, b) = self.row(p.y);

@@ -2,9 +2,10 @@
 
 use crate::align::Alignment;
 use crate::crop::largest_rectangle;
+use crate::elastic::{self, PhotoMap};
 use crate::exposure::{self, Exposure, Gains};
 use crate::feather;
-use crate::layout::{self, Bounds, Layout, LayoutError};
+use crate::layout::{self, Bounds, Canvas, Layout, LayoutError};
 use crate::multiband::Blender;
 use crate::poisson;
 use crate::preview::Preview;
@@ -37,6 +38,8 @@ pub struct RenderOptions {
     pub projection: Projection,
     /// Size of the panorama relative to the photographs: 1 draws the middle of a photograph of median focal length pixel for pixel. Above 0; default 1.
     pub resolution: f64,
+    /// Deform photographs slightly and smoothly so that they meet where the camera did not turn about its centre. Default true.
+    pub elastic: bool,
     /// Exposure compensation. Default [`Exposure::Gain`].
     pub exposure: Exposure,
     /// Seam finding. Default [`Seams::GraphCut`].
@@ -56,6 +59,7 @@ impl Default for RenderOptions {
         Self {
             projection: Projection::Auto,
             resolution: 1.0,
+            elastic: true,
             exposure: Exposure::default(),
             seams: Seams::default(),
             blend: Blend::default(),
@@ -103,10 +107,10 @@ pub struct Panorama {
     pub mask: Mask,
     /// Which photograph each pixel is from; [`u16::MAX`] where none reaches.
     pub labels: Image<u16, 1>,
-    /// The surface it is drawn on, never [`Projection::Auto`].
-    pub projection: Projection,
-    /// Pixels per radian at the middle.
-    pub scale: f64,
+    /// Where its pixels look.
+    pub canvas: Canvas,
+    /// Where in its photograph each pixel comes from.
+    pub map: PhotoMap,
     /// True where the right edge continues at the left one.
     pub full_circle: bool,
     /// What each photograph was multiplied with.
@@ -143,7 +147,10 @@ pub fn render(
     }
     let layout = layout::layout(alignment, options.projection, options.resolution, options.max_pixels)?;
     let photo_of: Vec<usize> = layout.placements.iter().map(|p| p.photo).collect();
-    let preview = Preview::draw(photos, &layout, options.resolution, PREVIEW_PIXELS);
+    let fields =
+        if options.elastic { elastic::fields(photos, &layout, alignment) } else { vec![None; layout.placements.len()] };
+    clock.lap("elastic");
+    let preview = Preview::draw(photos, &layout, &fields, options.resolution, PREVIEW_PIXELS);
     clock.lap("preview");
     let gains = exposure::estimate(&preview, &photo_of, photos.len(), options.exposure);
     clock.lap("exposure");
@@ -162,18 +169,28 @@ pub fn render(
         .placements
         .iter()
         .zip(&regions)
-        .map(|(placement, region)| {
+        .zip(&fields)
+        .map(|((placement, region), field)| {
             let region = (*region)?;
             let tone = Tone { gain: gains.gains[placement.photo], vignetting: gains.vignetting };
             let shrink = ((1.0 / options.resolution).floor() as usize).max(1);
             let photo = photos[placement.photo];
             if shrink == 1 {
-                return Some(warp(photo, placement, &layout.surface, region, options.interpolation, tone));
+                return Some(warp(
+                    photo,
+                    placement,
+                    &layout.surface,
+                    region,
+                    field.as_ref(),
+                    options.interpolation,
+                    tone,
+                ));
             }
             let small = crate::preview::shrunk(photo, shrink);
             let placement =
                 layout::Placement { view: crate::preview::shrunk_view(placement, shrink, &small), ..*placement };
-            Some(warp(small.view(), &placement, &layout.surface, region, options.interpolation, tone))
+            let field = field.as_ref().map(|f| f.scaled(1.0, 1.0 / shrink as f64));
+            Some(warp(small.view(), &placement, &layout.surface, region, field.as_ref(), options.interpolation, tone))
         })
         .collect();
     clock.lap("warp");
@@ -207,8 +224,8 @@ pub fn render(
         image,
         mask,
         labels,
-        projection: layout.surface.projection,
-        scale: layout.surface.scale,
+        canvas: layout.canvas,
+        map: PhotoMap::new(&layout, fields),
         full_circle: layout.full_circle,
         gains,
         stages: Vec::new(),
@@ -319,6 +336,7 @@ fn enlarge(coarse: &Labels, preview: &Preview, layout: &Layout, pieces: &[Option
 fn crop(p: &mut Panorama) {
     let Some(b) = largest_rectangle(p.mask.view()) else { return };
     let (w, h) = (b.width(), b.height());
+    p.full_circle &= w == p.image.width();
     if let Some(view) = p.image.view().crop(b.left, b.top, w, h) {
         p.image = view.to_image();
     }
@@ -328,5 +346,6 @@ fn crop(p: &mut Panorama) {
     if let Some(view) = p.mask.view().crop(b.left, b.top, w, h) {
         p.mask = view.to_image();
     }
-    p.full_circle &= w == p.image.width() && b.left == 0;
+    p.map.crop(b.left, b.top);
+    p.canvas.origin += nalgebra::Vector2::new(b.left as f64, b.top as f64);
 }

@@ -3,6 +3,7 @@
 //! The three surfaces factor as `ray = (g(y)·ax(x), b(y), g(y)·az(x))` (see `projection`), so a canvas pixel's place in the photograph
 //! costs three multiply-adds per coordinate and one division.
 
+use crate::elastic::Field;
 use crate::layout::{Bounds, Placement};
 use crate::projection::Surface;
 use crate::view::View;
@@ -34,6 +35,7 @@ pub(crate) fn warp(
     placement: &Placement,
     surface: &Surface,
     bounds: Bounds,
+    field: Option<&Field>,
     interpolation: Interpolation,
     tone: Tone,
 ) -> Warped {
@@ -47,6 +49,9 @@ pub(crate) fn warp(
         || (vec![0.0_f32; width], vec![0.0_f32; width]),
         |(us, vs), (y, row)| {
             map.row(y, us, vs);
+            if let Some(field) = field {
+                field.add_row((bounds.top + y) as f64, bounds.left as f64, us, vs);
+            }
             match interpolation {
                 Interpolation::Nearest => sample_row(photo, us, vs, row, tone, nearest),
                 Interpolation::Bilinear => sample_row(photo, us, vs, row, tone, bilinear),
@@ -303,7 +308,7 @@ mod tests {
                 let surface = Surface { projection, scale: 110.0 };
                 let p = placement(camera, Rotation3::from_euler_angles(0.1, -0.15, 0.05), &surface, bounds);
                 for interpolation in [Interpolation::Bilinear, Interpolation::Bicubic] {
-                    let warped = warp(photo.view(), &p, &surface, bounds, interpolation, Tone::NEUTRAL);
+                    let warped = warp(photo.view(), &p, &surface, bounds, None, interpolation, Tone::NEUTRAL);
                     let mut seen = 0;
                     for y in bounds.top..bounds.bottom {
                         for x in bounds.left..bounds.right {
@@ -346,7 +351,7 @@ mod tests {
         ] {
             let camera = Camera { distortion, ..Camera::from_focal(20, 10, 20.0) };
             let p = placement(camera, Rotation3::identity(), &surface, bounds);
-            let warped = warp(photo.view(), &p, &surface, bounds, Interpolation::Bicubic, Tone::NEUTRAL);
+            let warped = warp(photo.view(), &p, &surface, bounds, None, Interpolation::Bicubic, Tone::NEUTRAL);
             let mut reached = 0;
             for y in 0..90 {
                 for x in 0..126 {

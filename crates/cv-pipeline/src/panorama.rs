@@ -5,7 +5,7 @@ use crate::{Progress, Stopwatch};
 use cv_core::{Camera, Correspondence, Image, ImageView, Mask, Point2, RgbU8};
 use cv_features::{Described, DescriptorKind, Descriptors};
 use cv_panorama::{
-    AlignError, AlignOptions, Alignment, CameraMotion, NotAPair, Photo, Projection, RenderError, RenderOptions,
+    AlignError, AlignOptions, Alignment, CameraMotion, Canvas, NotAPair, Photo, PhotoMap, RenderError, RenderOptions,
     Unplaced, VerifiedPair, VerifyOptions, align, render, verify_pair,
 };
 use rayon::prelude::*;
@@ -106,8 +106,10 @@ pub struct PanoramaResult {
     pub reduced: Vec<f64>,
     /// The views, in full size.
     pub alignment: Alignment,
-    /// The surface drawn on.
-    pub projection: Projection,
+    /// The surface drawn on, and where each pixel of the picture looks.
+    pub canvas: Canvas,
+    /// Where in its photograph each pixel of the picture comes from.
+    pub map: PhotoMap,
     /// Root mean square error of all matches of all overlaps, in pixels of the photographs.
     pub reprojection_rms_px: f64,
     /// Stage names and their seconds.
@@ -173,7 +175,7 @@ pub fn panorama(
     let (pairs, verified): (Vec<PanoramaPair>, Vec<Option<VerifiedPair>>) = tried.into_iter().flatten().unzip();
     let verified: Vec<VerifiedPair> = verified.into_iter().flatten().collect();
     let known: Vec<Photo> = prepared.iter().map(|p| p.photo).collect();
-    let mut alignment = match align(&known, &verified, &options.align) {
+    let alignment = match align(&known, &verified, &options.align) {
         Ok(alignment) => alignment,
         Err(source) => {
             let views = vec![Err(Unplaced::Alone); n];
@@ -181,20 +183,11 @@ pub fn panorama(
         }
     };
     let mut images = describe(&prepared, &alignment.views, &pairs);
-    for ((view, p), photo) in alignment.views.iter_mut().zip(&prepared).zip(photos) {
-        if let Ok(view) = view {
-            view.camera = view.camera.scaled(p.factor);
-            (view.camera.width, view.camera.height) = photo.image.size();
-        }
-    }
+    let sizes: Vec<_> = prepared.iter().zip(photos).map(|(p, photo)| (p.factor, photo.image.size())).collect();
+    let alignment = alignment.resized(&sizes);
     for (image, view) in images.iter_mut().zip(&alignment.views) {
         image.focal = view.as_ref().ok().filter(|_| alignment.motion == CameraMotion::Rotation).map(|v| v.camera.fx);
     }
-    let mut factors: Vec<f64> = alignment.used().map(|(i, _)| prepared[i].factor).collect();
-    factors.sort_by(f64::total_cmp);
-    let factor = factors.get(factors.len() / 2).copied().unwrap_or(1.0);
-    alignment.rms_px *= factor;
-    alignment.median_px *= factor;
     watch.lap("align");
 
     progress.report("draw", 0, 1);
@@ -215,7 +208,8 @@ pub fn panorama(
         pairs,
         reduced: prepared.iter().map(|p| p.factor).collect(),
         features: prepared.into_iter().map(|p| p.features).collect(),
-        projection: drawn.projection,
+        canvas: drawn.canvas,
+        map: drawn.map,
         reprojection_rms_px: alignment.rms_px,
         alignment,
         stages: watch.into_stages(),

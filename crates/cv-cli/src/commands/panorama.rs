@@ -178,11 +178,11 @@ fn outcome(paths: &[PathBuf], result: &PanoramaResult) -> Outcome {
         .with("images", images)
         .with("size", [w, h])
         .with("reprojection_rms_px", result.reprojection_rms_px)
-        .with("projection", result.projection.name())
+        .with("projection", result.canvas.projection.name())
         .summary(format!(
             "{used} of {} photographs, {w} x {h} pixels, {}, matches agree to {:.2} px (RMS)",
             paths.len(),
-            result.projection.name(),
+            result.canvas.projection.name(),
             result.reprojection_rms_px
         ))
 }
