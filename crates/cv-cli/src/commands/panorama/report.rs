@@ -22,7 +22,7 @@ pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResul
     let (small, _) = preview(result.image.view(), 2000);
     page.section("Panorama").figure(Figure::new(
         jpeg(&small)?,
-        &format!("{} projection; black where no photograph reaches.", result.projection.name()),
+        &format!("{} projection; black where no photograph reaches.", result.canvas.projection.name()),
     ));
     let sources = RgbU8::from_fn(width, height, |x, y| {
         let label = result.labels.at(x, y)[0];
