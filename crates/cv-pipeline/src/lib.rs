@@ -30,7 +30,6 @@ mod disparity_range;
 mod estimate;
 mod matching;
 mod panorama;
-mod preview;
 mod progress;
 mod reconstruct;
 mod rectify;
@@ -53,7 +52,6 @@ pub use panorama::{
 pub mod panorama_types {
     pub use cv_panorama::*;
 }
-pub use preview::preview;
 pub use progress::{Progress, Silent};
 pub use reconstruct::{Intrinsics, ReconstructError, ReconstructOptions, ReconstructResult, ScenePoint, reconstruct};
 pub use rectify::{RectifyResult, rectify};

@@ -2,8 +2,8 @@
 
 use crate::common::Failure;
 use cv_core::{Correspondence, Point2, RgbU8};
-use cv_pipeline::{PanoramaResult, preview};
-use cv_report::{Figure, MatchStyle, Note, Report, draw_matches};
+use cv_pipeline::PanoramaResult;
+use cv_report::{Figure, MatchStyle, Note, Report, draw_matches, shrink_to_fit};
 use std::path::PathBuf;
 
 /// Pairs whose matches are drawn: more than these nobody looks at.
@@ -19,7 +19,7 @@ pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResul
     page.headline("photographs used", &format!("{used} of {}", paths.len()))
         .headline("size", &format!("{width}×{height}"))
         .headline("matches agree to", &format!("{:.2} px", result.reprojection_rms_px));
-    let (small, _) = preview(result.image.view(), 2000);
+    let small = shrink_to_fit(result.image.view(), 2000);
     page.section("Panorama").figure(Figure::new(
         jpeg(&small)?,
         &format!("{} projection; black where no photograph reaches.", result.canvas.projection.name()),
@@ -28,7 +28,7 @@ pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResul
         let label = result.labels.at(x, y)[0];
         if label == u16::MAX { [0; 3] } else { tint(result.image.at(x, y), label) }
     });
-    let (small, _) = preview(sources.view(), 2000);
+    let small = shrink_to_fit(sources.view(), 2000);
     page.figure(Figure::new(jpeg(&small)?, "Which photograph each pixel is from: the seams run where the colour changes."));
 
     page.section("Photographs");
@@ -52,10 +52,14 @@ pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResul
     page.section("Overlaps");
     let accepted = result.pairs.iter().filter(|pair| pair.rejected.is_none());
     for pair in accepted.take(PAIRS) {
-        let ((a, scale_a), (b, scale_b)) = (preview(photos[pair.a].view(), 700), preview(photos[pair.b].view(), 700));
-        let at = |p: Point2<f64>, s: f64| Point2::new((p.x + 0.5) * s - 0.5, (p.y + 0.5) * s - 0.5);
+        let (photo_a, photo_b) = (&photos[pair.a], &photos[pair.b]);
+        let (a, b) = (shrink_to_fit(photo_a.view(), 700), shrink_to_fit(photo_b.view(), 700));
+        let at = |p: Point2<f64>, photo: &RgbU8, small: &RgbU8| {
+            let (x, y) = (small.width() as f64 / photo.width() as f64, small.height() as f64 / photo.height() as f64);
+            Point2::new((p.x + 0.5) * x - 0.5, (p.y + 0.5) * y - 0.5)
+        };
         let matches: Vec<Correspondence> =
-            pair.matches.iter().map(|m| Correspondence { a: at(m.a, scale_a), b: at(m.b, scale_b) }).collect();
+            pair.matches.iter().map(|m| Correspondence { a: at(m.a, photo_a, &a), b: at(m.b, photo_b, &b) }).collect();
         let picture = draw_matches(a.view(), b.view(), &matches, Some(&pair.inliers), &MatchStyle::default());
         let good = pair.inliers.iter().filter(|&&inlier| inlier).count();
         let words =
