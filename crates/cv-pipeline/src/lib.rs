@@ -74,3 +74,8 @@ pub mod segmentation {
         Cleanup, ColorModel, ColorSpace, Labelled, Regions, Rule, Scores, SegmentError, TrainOptions, Trained,
     };
 }
+
+/// The examples of the README, run as tests.
+#[cfg(doctest)]
+#[doc = include_str!("../../../README.md")]
+struct Readme;
