@@ -68,9 +68,10 @@ fn inputs_stay_as_they_are_and_only_outputs_appear() {
         let before = snapshot(folder.path());
         done(folder.path(), &strs(&job.args(&inputs)));
         let outputs: Vec<_> = job.outputs.iter().map(|name| folder.path().join(name)).collect();
+        let is_output = |path: &std::path::Path| outputs.iter().any(|output| path.starts_with(output));
         let mut after = snapshot(folder.path());
-        after.retain(|(path, _)| !outputs.contains(path));
-        let before: Vec<_> = before.into_iter().filter(|(path, _)| !outputs.contains(path)).collect();
+        after.retain(|(path, _)| !is_output(path));
+        let before: Vec<_> = before.into_iter().filter(|(path, _)| !is_output(path)).collect();
         assert!(before == after, "{}", job.name);
     }
 }
@@ -78,17 +79,17 @@ fn inputs_stay_as_they_are_and_only_outputs_appear() {
 #[test]
 fn an_output_that_cannot_be_written_is_told_before_the_work() {
     for job in JOBS {
-        for output in job.outputs.iter().filter(|name| !name.contains('/')) {
+        for output in job.files() {
             let (folder, inputs) = job.folder();
             let mut args = job.args(&inputs);
-            let place = args.iter().position(|word| word == output).unwrap();
+            let place = args.iter().position(|word| *word == output).unwrap();
             args[place] = format!("no/such/folder/{output}");
             let ran = refused(folder.path(), &strs(&args));
             assert!(ran.stderr.contains("no/such/folder"), "{}: {}", job.name, ran.stderr);
             assert!(!folder.path().join("no").exists(), "{}", job.name);
 
-            fs::create_dir(folder.path().join("a-folder")).unwrap();
-            args[place] = "a-folder".to_owned();
+            args[place] = format!("folder-{output}");
+            fs::create_dir(folder.path().join(&args[place])).unwrap();
             let ran = refused(folder.path(), &strs(&args));
             assert!(ran.stderr.contains("folder"), "{}: {}", job.name, ran.stderr);
         }
@@ -100,13 +101,13 @@ fn an_output_that_cannot_be_written_is_told_before_the_work() {
 fn a_read_only_folder_is_refused_and_nothing_appears_in_it() {
     use std::os::unix::fs::PermissionsExt;
     for job in JOBS {
-        for output in job.outputs.iter().filter(|name| !name.contains('/')) {
+        for output in job.files() {
             let (folder, inputs) = job.folder();
             let closed = folder.path().join("closed");
             fs::create_dir(&closed).unwrap();
             fs::set_permissions(&closed, fs::Permissions::from_mode(0o555)).unwrap();
             let mut args = job.args(&inputs);
-            let place = args.iter().position(|word| word == output).unwrap();
+            let place = args.iter().position(|word| *word == output).unwrap();
             args[place] = format!("closed/{output}");
             refused(folder.path(), &strs(&args));
             assert_eq!(fs::read_dir(&closed).unwrap().count(), 0, "{}", job.name);
@@ -131,8 +132,8 @@ fn a_failure_keeps_the_outputs_of_the_run_before() {
 /// Kills runs at moments spread over their whole duration.
 #[test]
 fn a_killed_run_leaves_old_or_new_outputs_and_never_half_of_one() {
-    const MOMENTS: u32 = 12;
-    for job in JOBS {
+    const MOMENTS: u32 = 8;
+    for job in JOBS.iter().filter(|job| !job.files().is_empty()) {
         let (folder, inputs) = job.folder();
         let args = job.args(&inputs);
         let start = Instant::now();

@@ -6,7 +6,7 @@ mod support;
 
 use cv_core::{GrayU8, Image, RgbU8};
 use std::fs;
-use support::{JOBS, done, refused, run, snapshot, strs, write_broken, write_cmyk, write_dressed};
+use support::{JOBS, done, odd_name, refused, run, snapshot, strs, write_broken, write_cmyk, write_dressed};
 
 #[test]
 fn a_file_that_is_no_picture_is_named_and_refused() {
@@ -133,7 +133,7 @@ fn names_with_spaces_and_other_scripts_work() {
         let (folder, good) = job.folder();
         let mut inputs = Vec::new();
         for name in &good {
-            let odd = format!("Überfahrt № 1 – {name}");
+            let odd = odd_name(name);
             fs::rename(folder.path().join(name), folder.path().join(&odd)).unwrap();
             inputs.push(odd);
         }

@@ -67,15 +67,14 @@ macro_rules! commands {
 }
 
 commands! {
+    Demo(demo),
+    Segment(segment),
+    Panorama(panorama),
+    Match(match_),
+    Estimate(estimate),
+    Reconstruct(reconstruct),
     Depth(depth),
     Eval(eval),
-    Rectify(rectify),
-    Estimate(estimate),
     Completions(completions),
-    Demo(demo),
     Man(man),
-    Match(match_),
-    Panorama(panorama),
-    Reconstruct(reconstruct),
-    Segment(segment),
 }

@@ -170,17 +170,51 @@ impl Job {
     }
 
     /// What the job needs beside its pictures.
-    pub(crate) fn prepare(&self, folder: &Path) {
-        if self.args.contains("model.json") && !self.args.contains("train") {
-            train(folder);
+    fn prepare(&self, folder: &Path) {
+        if self.args.contains("--masks") {
+            // A mask for each name that a test may give the picture.
+            fs::create_dir(folder.join("masks")).unwrap();
+            for i in 0..self.inputs.len() {
+                let dressed = ["", "-plain", "-misnamed", "-nameless", "-deep", "-alpha"].map(|d| format!("in{i}{d}"));
+                let broken = ["empty", "cut", "head", "text", "zeros", "bomb", "missing", "folder"].map(str::to_owned);
+                let others = [format!("cmyk{i}"), odd_name(&format!("in{i}"))];
+                for stem in dressed.into_iter().chain(broken).chain(others) {
+                    let mask = fixture(&format!("oracle/ball-masks/ball{i}_mask.png"));
+                    fs::copy(mask, folder.join(format!("masks/{stem}_mask.png"))).unwrap();
+                }
+            }
+        }
+        if self.args.contains("--model ball.json") {
+            let (images, masks) = (fixture("ball"), fixture("oracle/ball-masks"));
+            let [images, masks] = [images, masks].map(|path| path.to_str().unwrap().to_owned());
+            done(folder, &["segment", "train", "--images", &images, "--masks", &masks, "--model", "ball.json"]);
         }
     }
 
-    /// The bytes of all outputs.
-    pub(crate) fn written(&self, folder: &Path) -> Vec<Vec<u8>> {
-        let read = |name: &&str| fs::read(folder.join(name)).unwrap_or_else(|e| panic!("{}: {name}: {e}", self.name));
-        self.outputs.iter().map(read).collect()
+    /// The outputs that are single files.
+    pub(crate) fn files(&self) -> Vec<&'static str> {
+        self.outputs.iter().copied().filter(|name| !name.ends_with('/')).collect()
     }
+
+    /// The bytes of all outputs. Folders are emptied: the next run may give its files other names.
+    pub(crate) fn written(&self, folder: &Path) -> Vec<Vec<u8>> {
+        let mut bytes = Vec::new();
+        for name in self.outputs {
+            let path = folder.join(name);
+            if name.ends_with('/') {
+                bytes.extend(snapshot(&path).into_iter().map(|(_, bytes)| bytes));
+                fs::remove_dir_all(&path).unwrap();
+            } else {
+                bytes.push(fs::read(&path).unwrap_or_else(|e| panic!("{}: {name}: {e}", self.name)));
+            }
+        }
+        bytes
+    }
+}
+
+/// A name with spaces and letters of several scripts.
+pub(crate) fn odd_name(name: &str) -> String {
+    format!("Überfahrt № 1 – {name}")
 }
 
 /// A file under `fixtures/` at the root of the workspace.
@@ -207,7 +241,28 @@ pub(crate) const JOBS: &[Job] = &[
         args: "panorama {0} {1} {2} -o pano.png",
         outputs: &["pano.png"],
     },
+    Job {
+        name: "match",
+        inputs: &["plane/a.jpg", "plane/b.jpg"],
+        args: "match {0} {1} -o matches.txt",
+        outputs: &["matches.txt"],
+    },
+    Job {
+        name: "reconstruct",
+        inputs: &["two-view/a.jpg", "two-view/b.jpg"],
+        args: "reconstruct {0} {1} --focal 440 -o cloud.ply",
+        outputs: &["cloud.ply"],
+    },
+    Job {
+        name: "segment train",
+        inputs: &["ball/ball0.jpg", "ball/ball1.jpg"],
+        args: "segment train --images {0} {1} --masks masks --model trained.json",
+        outputs: &["trained.json"],
+    },
+    Job {
+        name: "segment predict",
+        inputs: &["ball/ball2.jpg", "ball/ball3.jpg"],
+        args: "segment predict --model ball.json {0} {1} --out found",
+        outputs: &["found/"],
+    },
 ];
-
-/// Trains `model.json` in a folder.
-pub(crate) fn train(_folder: &Path) {}
