@@ -80,6 +80,41 @@ fn the_formats_hold_the_same_map() {
 }
 
 #[test]
+fn frames_come_out_as_pairs_do() {
+    let folder = pair();
+    let at = |name: &str| folder.path().join(name);
+    for side in ["left", "right"] {
+        std::fs::create_dir(at(side)).unwrap();
+        for frame in ["f2.png", "f10.png"] {
+            std::fs::copy(at(&format!("{side}.png")), at(side).join(frame)).unwrap();
+        }
+    }
+    std::fs::create_dir(at("out")).unwrap();
+    done(folder.path(), &["depth", "left.png", "right.png", "-o", "one.pfm", "--disparities", "48"]);
+    let value = json(folder.path(), &["depth", "left", "right", "-o", "out", "--disparities", "48"]);
+    assert_eq!(value["frames"], 2);
+    assert!(value["frames_per_second"].as_f64().unwrap() > 0.0);
+    let expected = std::fs::read(at("one.pfm")).unwrap();
+    for name in ["out/f2.pfm", "out/f10.pfm"] {
+        assert!(std::fs::read(at(name)).unwrap() == expected, "{name}");
+    }
+    done(folder.path(), &["depth", "left/f2*", "right/f2*", "-o", "out", "--disparities", "48"]);
+    refused(folder.path(), &["depth", "left/x*", "right/f2*", "-o", "out"]);
+    refused(folder.path(), &["depth", "left", "right/f2*", "-o", "out"]);
+    refused(folder.path(), &["depth", "left", "right", "-o", "nowhere"]);
+}
+
+#[test]
+fn the_range_can_be_found_from_the_pictures() {
+    let folder = pair();
+    let value = json(folder.path(), &["depth", "left.png", "right.png", "-o", "d.pfm", "--disparities", "auto"]);
+    assert!((20..=80).contains(&value["disparities"].as_u64().unwrap()), "{value}");
+    let scores = json(folder.path(), &["eval", "disparity", "--estimate", "d.pfm", "--truth", "truth.pfm"]);
+    // All pixels, hidden ones included: a range that cuts things off would be wrong on all of them.
+    assert!(scores["all"]["bad"]["2.0"].as_f64().unwrap() < 0.2, "{scores}");
+}
+
+#[test]
 fn the_result_is_the_same_for_any_number_of_threads() {
     let folder = pair();
     let maps = ["1", "2", "4"].map(|threads| {

@@ -1,13 +1,14 @@
 //! `cv depth`: disparity, depth and a cloud from two photographs.
 
-use crate::common::{Context, Explain, Failure, Outcome, Run};
+use crate::common::{Context, Explain, Failure, Outcome, Run, expand_images};
 use cv_core::{GrayF32, ImageView, RgbU8};
 use cv_io::ply::{Cloud, PlyEncoding};
 use cv_io::{DynImage, Pixels};
-use cv_pipeline::{DepthOptions, DepthResult, depth, disparity_range};
+use cv_pipeline::{DepthOptions, DepthResult, Progress, depth, disparity_range};
 use cv_report::{Figure, MapStyle, Note, PointScene, Report, Viewpoint, draw_map, render_points};
 use cv_pipeline::stereo::{
-    Census, CloudPoint, Intensity, Paths, PixelState, Rectification, RectifyOptions, StereoGeometry, StereoOptions,
+    Census, CloudPoint, DisparityMap, Intensity, Paths, PixelState, Rectification, RectifyOptions, StereoGeometry, StereoMatcher,
+    StereoOptions,
 };
 use std::path::{Path, PathBuf};
 
@@ -21,15 +22,16 @@ use std::path::{Path, PathBuf};
     cv depth left.png right.png -o disparity.pfm\n  \
     cv depth left.png right.png -o d.pfm --focal 1000 --baseline 0.12 --depth depth.pfm --cloud cloud.ply\n  \
     cv depth left.png right.png --disparities auto -o disparity.npy\n  \
+    cv depth left right -o disparities\n  \
     cv depth left.jpg right.jpg --rig rig.yaml -o disparity.png --depth depth.png --report out\n\n\
     The ending of a file tells its format: .pfm (floats, +inf where unknown), .npy (floats, NaN), .png (disparity as KITTI's\n\
     16-bit PNG, 256 steps a pixel; depth as 16-bit millimetres for a baseline in metres); 0 is unknown in both.")]
 pub(crate) struct Args {
-    /// The left photograph.
+    /// The left photograph, or a folder or quoted pattern ('left/*.png') of frames.
     left: PathBuf,
-    /// The right photograph.
+    /// The right photograph, or as many frames.
     right: PathBuf,
-    /// Where to write the disparity: .pfm, .png or .npy.
+    /// Where to write the disparity: .pfm, .png or .npy; for frames an existing folder, which gets NAME.pfm of each.
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// Where to write the depth, in the unit of the baseline: .pfm, .png or .npy. Needs --rig, or --focal and --baseline.
@@ -101,10 +103,16 @@ fn parse_range(text: &str) -> Result<Range, String> {
 
 impl Run for Args {
     fn outputs(&self) -> Vec<&Path> {
+        if is_sequence(&self.left) {
+            return Vec::new();
+        }
         [Some(&self.output), self.depth.as_ref(), self.cloud.as_ref()].into_iter().flatten().map(|p| &**p).collect()
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
+        if is_sequence(&self.left) || is_sequence(&self.right) {
+            return self.run_frames(context);
+        }
         for path in [Some(&self.output), self.depth.as_ref()].into_iter().flatten() {
             map_format(path)?;
         }
@@ -190,7 +198,84 @@ impl Run for Args {
     }
 }
 
+/// True for a folder or a pattern.
+fn is_sequence(path: &Path) -> bool {
+    path.is_dir() || (!path.exists() && path.to_string_lossy().contains('*'))
+}
+
+/// The frames of a folder or pattern, in the order of their numbers.
+fn frames(path: &Path) -> Result<Vec<PathBuf>, Failure> {
+    if path.is_dir() {
+        return expand_images(&[path.to_owned()]);
+    }
+    let pattern = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let folder = match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder.to_owned(),
+        _ => PathBuf::from("."),
+    };
+    let mut found = expand_images(&[folder])?;
+    found.retain(|file| matches(&pattern, &file.file_name().unwrap_or_default().to_string_lossy()));
+    if found.is_empty() {
+        return Err(Failure::new(format!("there are no images like {}", path.display())).advice("check the pattern"));
+    }
+    Ok(found)
+}
+
+/// Whether a name fits a pattern in which `*` stands for anything.
+fn matches(pattern: &str, name: &str) -> bool {
+    match pattern.split_once('*') {
+        None => pattern == name,
+        Some((head, rest)) => name.strip_prefix(head).is_some_and(|name| {
+            (0..=name.len()).filter(|&i| name.is_char_boundary(i)).any(|i| matches(rest, &name[i..]))
+        }),
+    }
+}
+
 impl Args {
+    /// Frame after frame with the same buffers.
+    fn run_frames(&self, context: &Context) -> Result<Outcome, Failure> {
+        if self.disparities == Range::Auto
+            || self.depth.is_some()
+            || self.cloud.is_some()
+            || self.rig.is_some()
+            || context.wants_report()
+        {
+            return Err(Failure::usage("frames give disparities only")
+                .advice("leave out --rig, --depth, --cloud and --report, and give the number of disparities"));
+        }
+        let (lefts, rights) = (frames(&self.left)?, frames(&self.right)?);
+        if lefts.len() != rights.len() {
+            return Err(Failure::new(format!("{} left frames and {} right ones", lefts.len(), rights.len()))
+                .advice("give as many of each"));
+        }
+        if !self.output.is_dir() {
+            return Err(Failure::new(format!("{} is not a folder", self.output.display()))
+                .advice(format!("mkdir -p {}", self.output.display())));
+        }
+        let mut matcher = StereoMatcher::new(self.options().stereo)?;
+        let mut map = DisparityMap::empty();
+        let (mut seconds, mut valid) = (0.0, 0.0);
+        for (i, (left, right)) in lefts.iter().zip(&rights).enumerate() {
+            Progress::report(context, "frames", i, lefts.len());
+            let (a, b) = (cv_io::read_rgb(left)?, cv_io::read_rgb(right)?);
+            let start = std::time::Instant::now();
+            matcher.compute_into(a.view(), b.view(), &mut map).during(left.display())?;
+            seconds += start.elapsed().as_secs_f64();
+            valid += map.valid_fraction() / lefts.len() as f64;
+            let name = Path::new(left.file_stem().unwrap_or_default()).with_extension("pfm");
+            cv_io::pfm::write(self.output.join(name), map.disparity.view())?;
+        }
+        let rate = lefts.len() as f64 / seconds;
+        let (width, height) = map.disparity.size();
+        Ok(Outcome::new(vec![("match", seconds)])
+            .with("frames", lefts.len())
+            .with("frames_per_second", rate)
+            .with("width", width)
+            .with("height", height)
+            .with("valid_fraction", valid)
+            .summary(format!("{} frames of {width}×{height} px, {rate:.1} frames per second of matching", lefts.len())))
+    }
+
     /// Under `--disparities auto`, the range that feature matches show.
     fn set_range(
         &self,
