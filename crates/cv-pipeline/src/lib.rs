@@ -28,6 +28,7 @@
 mod depth;
 mod disparity_range;
 mod estimate;
+mod guided;
 mod matching;
 mod panorama;
 mod progress;

@@ -1,11 +1,12 @@
 //! Points and camera poses from two photographs.
 
-use crate::{MatchingError, MatchingOptions, MatchingResult, Progress, Stopwatch, match_photos};
+use crate::guided::{GuidedOptions, match_along_lines};
+use crate::{MatchingError, MatchingOptions, MatchingResult, Progress, Stopwatch, correspondences, match_photos};
 use cv_core::{Camera, CameraError, Correspondence, ImageView, Matrix3, Point2, Point3, Pose};
 use cv_geometry::{
-    BundleOptions, EstimateError, RobustOptions, TwoViewBundle, adjust_two_views, essential_from_fundamental,
-    essential_from_pose, estimate_fundamental, estimate_homography, estimate_relative_pose, normalize_matches,
-    parallax_angle, recover_pose, refine_relative_pose, rotation_between, triangulate,
+    BundleOptions, BundleReport, EstimateError, RobustOptions, TwoViewBundle, adjust_two_views,
+    essential_from_fundamental, essential_from_pose, estimate_fundamental, estimate_homography, estimate_relative_pose,
+    normalize_matches, parallax_angle, recover_pose, refine_relative_pose, rotation_between, triangulate,
 };
 
 /// What is known of the cameras.
@@ -39,6 +40,9 @@ pub struct ReconstructOptions {
     pub min_angle: f64,
     /// Largest reprojection error of a point that is kept, in pixels, in either photograph. Default 2 px.
     pub max_reprojection: f64,
+    /// Whether features are matched once more along the epipolar lines when the motion is known, which finds those that look alike
+    /// elsewhere (as COLMAP's guided matching does). Default true.
+    pub guided: bool,
     /// A homography (or a rotation) that explains this share of the matches that agree makes the scene a plane (or the motion a
     /// turn). 0 to 1; default 0.95.
     pub degenerate_share: f64,
@@ -55,6 +59,7 @@ impl Default for ReconstructOptions {
             min_median_angle: 0.5f64.to_radians(),
             min_angle: 0.1f64.to_radians(),
             max_reprojection: 2.0,
+            guided: true,
             degenerate_share: 0.95,
         }
     }
@@ -67,8 +72,8 @@ pub struct ScenePoint {
     pub position: Point3<f64>,
     /// Of the first photograph.
     pub color: [u8; 3],
-    /// Which match it comes from.
-    pub match_index: usize,
+    /// Where it was seen in the two photographs, in pixels.
+    pub pair: Correspondence,
     /// Root mean square of its reprojection errors in the two photographs, in pixels.
     pub reprojection: f64,
     /// Angle between its two rays, in radians.
@@ -84,6 +89,8 @@ pub struct ReconstructResult {
     pub matching: MatchingResult,
     /// Indices of the matches that obey the epipolar geometry, ascending.
     pub inliers: Vec<usize>,
+    /// Matches found along the epipolar lines, those of `inliers` that came back included; 0 where that was not asked for.
+    pub guided: usize,
     /// The cameras, refined where they were not known.
     pub cameras: [Camera; 2],
     /// First camera frame to second; the translation has length one.
@@ -107,8 +114,7 @@ pub struct ReconstructResult {
 impl ReconstructResult {
     /// The fundamental matrix between undistorted pixels.
     pub fn fundamental(&self) -> Matrix3<f64> {
-        let [a, b] = &self.cameras;
-        b.inverse_matrix().transpose() * essential_from_pose(&self.pose) * a.inverse_matrix()
+        fundamental_of(&self.cameras, &self.pose)
     }
 }
 
@@ -239,26 +245,36 @@ pub fn reconstruct(
     let (normalised, unit) = normalize_matches(&chosen, &cameras[0], &cameras[1]);
     let planar_share = watch.time("degeneracy", || degeneracy(&chosen, &normalised, unit, &cameras, options))?;
 
-    progress.report("points", 0, 1);
-    let mut kept = Vec::new();
-    let mut points = Vec::new();
-    for (k, m) in normalised.iter().enumerate() {
-        if let Ok(point) = triangulate(m, &pose) {
-            kept.push(k);
-            points.push(point);
-        }
-    }
-    watch.lap("triangulate");
     let too_few = |n| ReconstructError::TooFewInliers { inliers: n, matches: pairs.len(), needed: options.min_inliers };
-    let mut bundle = TwoViewBundle { cameras, pose, points };
-    let refine_focal = prior.is_none();
-    let settings = BundleOptions { refine_focal, ..BundleOptions::default() };
-    let observed: Vec<Correspondence> = kept.iter().map(|&k| chosen[k]).collect();
-    let report = watch.time("bundle", || adjust_two_views(&mut bundle, &observed, &settings));
-    let report = report.ok_or_else(|| too_few(kept.len()))?;
+    let settings = BundleOptions { refine_focal: prior.is_none(), ..BundleOptions::default() };
+    progress.report("points", 0, 1);
+    let mut fit = watch.time("bundle", || fit(&chosen, cameras, pose, &settings)).ok_or_else(|| too_few(0))?;
+    let mut guided = 0;
+    if options.guided {
+        let [fa, fb] = &matching.features;
+        let along = GuidedOptions { threshold: options.robust.threshold as f32, ..GuidedOptions::default() };
+        let matches = match_along_lines(
+            fa,
+            fb,
+            &fit.bundle.cameras,
+            &fundamental_of(&fit.bundle.cameras, &fit.bundle.pose),
+            &along,
+        );
+        watch.lap("guided");
+        guided = matches.len();
+        let more = correspondences(fa, fb, &matches);
+        // Fewer would mean that the first matches were not what the lines say.
+        if more.len() > chosen.len()
+            && let Some(better) = fit_again(&more, &fit, &settings)
+        {
+            fit = better;
+        }
+        watch.lap("bundle");
+    }
+    let Fit { bundle, observed, report } = fit;
     let focal = bundle.cameras[0].fx;
     // Beyond a third, the shape of the scene is a guess.
-    if refine_focal && report.focal_deviation > 0.33 {
+    if settings.refine_focal && report.focal_deviation > 0.33 {
         return Err(ReconstructError::UnknownFocal { focal, deviation: report.focal_deviation });
     }
 
@@ -270,7 +286,7 @@ pub fn reconstruct(
             scene.push(ScenePoint {
                 position: *point,
                 color: color_at(a, m.a),
-                match_index: inliers[kept[j]],
+                pair: *m,
                 reprojection: ((errors[0] * errors[0] + errors[1] * errors[1]) / 2.0).sqrt(),
                 angle,
                 covariance: report.covariances[j],
@@ -293,6 +309,7 @@ pub fn reconstruct(
     watch.lap("filter");
     Ok(ReconstructResult {
         inliers,
+        guided,
         cameras: bundle.cameras,
         pose: bundle.pose,
         reprojection_rms: (squares / scene.len() as f64).sqrt(),
@@ -304,6 +321,33 @@ pub fn reconstruct(
         matching,
         stages: watch.into_stages(),
     })
+}
+
+/// The fundamental matrix between undistorted pixels.
+fn fundamental_of([a, b]: &[Camera; 2], pose: &Pose) -> Matrix3<f64> {
+    b.inverse_matrix().transpose() * essential_from_pose(pose) * a.inverse_matrix()
+}
+
+/// A bundle, what it was fitted to, and how well.
+struct Fit {
+    bundle: TwoViewBundle,
+    observed: Vec<Correspondence>,
+    report: BundleReport,
+}
+
+/// Triangulates and adjusts; `None` where nothing can be triangulated.
+fn fit(matches: &[Correspondence], cameras: [Camera; 2], pose: Pose, settings: &BundleOptions) -> Option<Fit> {
+    let (normalised, _) = normalize_matches(matches, &cameras[0], &cameras[1]);
+    let seen = |(m, n): (&Correspondence, &Correspondence)| Some((*m, triangulate(n, &pose).ok()?));
+    let (observed, points): (Vec<_>, Vec<_>) = matches.iter().zip(&normalised).filter_map(seen).unzip();
+    let mut bundle = TwoViewBundle { cameras, pose, points };
+    let report = adjust_two_views(&mut bundle, &observed, settings)?;
+    Some(Fit { bundle, observed, report })
+}
+
+/// [`fit`] from the pose and cameras of an earlier one.
+fn fit_again(matches: &[Correspondence], before: &Fit, settings: &BundleOptions) -> Option<Fit> {
+    fit(matches, before.bundle.cameras, before.bundle.pose, settings)
 }
 
 /// The cameras, where they are known.

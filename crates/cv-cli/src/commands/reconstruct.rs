@@ -162,7 +162,7 @@ impl Args {
         if !same {
             model.cameras.insert(2, result.cameras[1]);
         }
-        let pair = |i: usize| result.matching.pairs[result.points[i].match_index];
+        let pair = |i: usize| result.points[i].pair;
         let points = 0..result.points.len();
         let seen = |second: bool| {
             let at = |i| if second { pair(i).b } else { pair(i).a };
@@ -200,6 +200,7 @@ impl Args {
             .with("points", result.points.len())
             .with("matches", result.matching.pairs.len())
             .with("inliers", result.inliers.len())
+            .with("guided", result.guided)
             .with("reprojection_rms_px", result.reprojection_rms)
             .with("rotation", rows(result.pose.rotation.matrix()))
             .with("translation", [t.x, t.y, t.z])
@@ -252,6 +253,7 @@ impl Args {
             ("direction of the translation", format!("({:.4}, {:.4}, {:.4})", t.x, t.y, t.z)),
             ("standard deviation of the rotation", degrees(result.pose_deviation[0])),
             ("standard deviation of the direction", degrees(result.pose_deviation[1])),
+            ("matches along epipolar lines", result.guided.to_string()),
             ("focal lengths", format!("{:.1} and {:.1} px ({source})", result.cameras[0].fx, result.cameras[1].fx)),
             ("explained by one plane", format!("{:.0} % of the matches that agree", 100.0 * result.planar_share)),
         ]);
