@@ -36,7 +36,6 @@ mod reconstruct;
 mod rectify;
 mod segment;
 mod stopwatch;
-mod thumbnail;
 
 pub use cv_geometry::{EstimateError, RobustModel, RobustOptions};
 pub use depth::{DepthError, DepthOptions, DepthResult, depth};
@@ -58,7 +57,6 @@ pub use reconstruct::{Intrinsics, ReconstructError, ReconstructOptions, Reconstr
 pub use rectify::{RectifyResult, rectify};
 pub use segment::{SegmentResult, SegmentTraining, segment, train_segment};
 pub use stopwatch::Stopwatch;
-pub use thumbnail::thumbnail;
 
 /// What a caller of [`depth()`] needs of the stereo stage: its options and results, rectification, geometry and scores.
 pub mod stereo {

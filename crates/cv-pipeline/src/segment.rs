@@ -64,7 +64,7 @@ mod tests {
     #[test]
     fn a_ball_is_found_in_photographs_it_was_not_trained_on() {
         let camera = Camera::from_focal(240, 180, 220.0);
-        for seed in [3, 4] {
+        for seed in [3] {
             let photos = ball_photos(seed, 8, &camera, &RenderOptions::default()).unwrap();
             let labelled: Vec<Labelled<'_>> = photos.iter().map(|p| (p.view.image.view(), p.mask.view())).collect();
             let half = |odd: usize| -> Vec<Labelled<'_>> { labelled.iter().copied().skip(odd).step_by(2).collect() };

@@ -44,10 +44,10 @@ pub enum SegmentError {
     #[error(transparent)]
     Mixture(#[from] MixtureError),
     /// A model was written by another version.
-    #[error("the model has schema {found}; this program reads schema {known}: train it again")]
+    #[error("the model has {}; this program reads schema {known}: train it again", found.map_or("no schema".to_owned(), |s| format!("schema {s}")))]
     Schema {
         /// What it says.
-        found: u32,
+        found: Option<u64>,
         /// What is read here.
         known: u32,
     },

@@ -90,9 +90,7 @@ impl TryFrom<ModelFile> for ColorModel {
     type Error = SegmentError;
 
     fn try_from(file: ModelFile) -> Result<Self, SegmentError> {
-        if file.schema != SCHEMA {
-            return Err(SegmentError::Schema { found: file.schema, known: SCHEMA });
-        }
+        Self::check_schema(Some(file.schema.into()))?;
         let within = |name, value: f64, ok: bool, range| {
             if ok { Ok(()) } else { Err(SegmentError::BadOption { name, value, range }) }
         };
@@ -128,6 +126,17 @@ impl TryFrom<ModelFile> for ColorModel {
 }
 
 impl ColorModel {
+    /// Whether a serialised model with this `schema` can be read here.
+    ///
+    /// # Errors
+    /// [`SegmentError::Schema`].
+    pub fn check_schema(schema: Option<u64>) -> Result<(), SegmentError> {
+        match schema {
+            Some(found) if found == u64::from(SCHEMA) => Ok(()),
+            found => Err(SegmentError::Schema { found, known: SCHEMA }),
+        }
+    }
+
     /// The score of each pixel in nats, limited to ±10 and smoothed: with a background model the log odds of object against background at the training photos'
     /// prior; without, the object's log density below its peak, plus 10. Pixels above [`ColorModel::threshold`] are marked.
     pub fn score(&self, photo: ImageView<'_, u8, 3>) -> GrayF32 {
@@ -183,5 +192,63 @@ impl ColorModel {
     pub fn with_cleanup(mut self, cleanup: Cleanup) -> Self {
         self.file.cleanup = cleanup;
         self
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Component;
+
+    fn file() -> ModelFile {
+        let at = |mean| Mixture {
+            components: vec![Component {
+                weight: 1.0,
+                mean,
+                covariance: [[0.01, 0.0, 0.0], [0.0, 0.01, 0.0], [0.0, 0.0, 0.01]],
+            }],
+        };
+        ModelFile::new(ColorSpace::Rgb, 0.0, at([0.8, 0.4, 0.1]), Some(at([0.4, 0.4, 0.4])))
+    }
+
+    #[test]
+    fn what_is_written_is_read_back() {
+        let model = ColorModel::try_from(file()).unwrap();
+        let text = serde_json::to_string(&model).unwrap();
+        assert_eq!(serde_json::from_str::<ColorModel>(&text).unwrap(), model);
+    }
+
+    #[test]
+    fn nonsense_is_refused() {
+        let refused = |change: &dyn Fn(&mut ModelFile)| {
+            let mut nonsense = file();
+            change(&mut nonsense);
+            ColorModel::try_from(nonsense).unwrap_err()
+        };
+        assert_eq!(refused(&|f| f.schema = 2), SegmentError::Schema { found: Some(2), known: 1 });
+        for (name, error) in [
+            ("prior", refused(&|f| f.prior = 1.0)),
+            ("prior", refused(&|f| f.prior = f64::NAN)),
+            ("unknown", refused(&|f| f.unknown = 1.0)),
+            ("threshold", refused(&|f| f.threshold = f32::NAN)),
+            ("smoothing", refused(&|f| f.smoothing = -1.0)),
+            ("hue", refused(&|f| f.hue = f32::INFINITY)),
+            ("close_radius", refused(&|f| f.cleanup.close_radius = 1001)),
+        ] {
+            assert!(matches!(error, SegmentError::BadOption { name: n, .. } if n == name), "{error:?}");
+        }
+        let error = refused(&|f| f.foreground.components[0].covariance[0][0] = -1.0);
+        assert!(matches!(error, SegmentError::Mixture(_)), "{error:?}");
+        assert!(ColorModel::check_schema(None).is_err());
+    }
+
+    #[test]
+    fn the_score_is_the_posterior_odds() {
+        let model = ColorModel::try_from(ModelFile { prior: 0.2, ..file() }).unwrap();
+        let photo = cv_core::RgbU8::new(1, 1, [153, 102, 64]);
+        let x = [0.6, 0.4, 64.0 / 255.0];
+        let odds = file().foreground.log_density(x) - file().background.unwrap().log_density(x) + (0.2f64 / 0.8).ln();
+        // Squares of up to 4 in f32.
+        assert!((f64::from(model.score(photo.view()).at(0, 0)[0]) - odds).abs() < 1e-5);
     }
 }

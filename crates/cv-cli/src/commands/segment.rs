@@ -7,7 +7,7 @@ use cv_core::{Mask, RgbU8};
 use cv_pipeline::segmentation::{
     ColorModel, ColorSpace, Labelled, Regions, Rule, Scores, SegmentError, TrainOptions,
 };
-use cv_pipeline::{Progress, segment, thumbnail, train_segment};
+use cv_pipeline::{Progress, preview, segment, train_segment};
 use cv_report::{Figure, Note, Report, colors, overlay_comparison, overlay_mask};
 use files::{Pair, pair, read_pair, stem};
 use serde_json::{Value, json};
@@ -239,7 +239,9 @@ struct Predict {
 impl Predict {
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
         let model = read_model(&self.model)?;
-        let photos = files::without_masks(expand_images(&self.images)?);
+        let given = expand_images(&self.images)?;
+        let same = |a: &Path, b: &Path| matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b);
+        let photos = files::without_masks(given.clone());
         let outputs: Vec<PathBuf> = photos.iter().map(|p| self.out.join(format!("{}_mask.png", stem(p)))).collect();
         for (i, output) in outputs.iter().enumerate() {
             if let Some(same) = outputs[..i].iter().position(|o| o == output) {
@@ -251,8 +253,9 @@ impl Predict {
                 ))
                 .advice("run them into different folders"));
             }
-            if photos.contains(output) {
-                return Err(Failure::new(format!("{} is a photograph and would be overwritten", output.display()))
+            // Masks drawn by hand often lie beside their photographs.
+            if given.iter().any(|path| same(path, output)) {
+                return Err(Failure::new(format!("{} is there already and would be overwritten", output.display()))
                     .advice("name another folder with --out"));
             }
         }
@@ -378,7 +381,7 @@ fn comparison(path: &Path, photo: &RgbU8, mask: &Mask, truth: &Mask, scores: &Sc
 }
 
 fn figure(picture: &RgbU8, words: &str) -> Result<Figure, Failure> {
-    Ok(Figure::new(cv_io::encode_png(thumbnail(picture.view(), REPORT_SIDE).view())?, words))
+    Ok(Figure::new(cv_io::encode_png(preview(picture.view(), REPORT_SIDE).0.view())?, words))
 }
 
 fn add_stages(sums: &mut Vec<(&'static str, f64)>, stages: &[(&'static str, f64)]) {
@@ -418,7 +421,11 @@ fn write_model(path: &Path, model: &ColorModel) -> Result<(), Failure> {
 
 fn read_model(path: &Path) -> Result<ColorModel, Failure> {
     let bytes = cv_io::read_bytes(path)?;
-    serde_json::from_slice(&bytes)
-        .during(format!("{} is no segmentation model", path.display()))
-        .advice("name a file that cv segment train has written")
+    // By way of a value: a model of another version says so, not which of its fields is missing.
+    let value: Result<Value, _> = serde_json::from_slice(&bytes);
+    let value = value.during(format!("{} is no segmentation model", path.display())).advice(TRAIN)?;
+    ColorModel::check_schema(value["schema"].as_u64()).during(path.display()).advice(TRAIN)?;
+    serde_json::from_value(value).during(format!("{} is no segmentation model", path.display())).advice(TRAIN)
 }
+
+const TRAIN: &str = "name a file that cv segment train has written";

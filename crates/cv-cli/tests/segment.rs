@@ -1,0 +1,103 @@
+//! `cv segment` from outside.
+
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
+
+mod support;
+
+use cv_core::{Mask, RgbU8};
+use std::fs;
+use support::{done, json, refused, run};
+
+/// Four pictures of an orange disc on grey with their masks, as files in a new folder.
+fn discs() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    for part in ["train", "test"] {
+        fs::create_dir(folder.path().join(part)).unwrap();
+        for i in 0..2 {
+            let inside = |x: usize, y: usize| (x as f64 - 40.0 - 9.0 * i as f64).hypot(y as f64 - 30.0) < 14.0;
+            let photo = RgbU8::from_fn(96, 64, |x, y| {
+                let shade = ((x * 7 + y * 13 + i) % 19) as u8;
+                if inside(x, y) { [225, 100 + shade, 20 + shade] } else { [90 + shade; 3] }
+            });
+            let at = |name: String| folder.path().join(part).join(name);
+            cv_io::write_png(at(format!("p{i}.png")), photo.view()).unwrap();
+            let mask = Mask::from_fn(96, 64, |x, y| [inside(x, y)]);
+            cv_io::write_png(at(format!("p{i}_mask.png")), mask.view()).unwrap();
+        }
+    }
+    folder
+}
+
+#[test]
+fn trained_predicted_and_scored() {
+    let discs = discs();
+    let folder = discs.path();
+    let train = ["segment", "train", "--images", "train", "--masks", "train", "--model", "m.json"];
+    let learnt = json(folder, &[&train[..], &["--report", "r"]].concat());
+    assert_eq!(learnt["images"].as_array().unwrap().len(), 2);
+    assert!(fs::read_to_string(folder.join("r/report.html")).unwrap().contains("Photographs"));
+    let scored = json(folder, &["segment", "eval", "--model", "m.json", "--images", "test", "--masks", "test"]);
+    for key in ["precision", "recall", "f1"] {
+        // The disc's colours occur nowhere else; smoothing and opening cost a part of its border, 88 of 616 pixels.
+        assert!(scored[key].as_f64().unwrap() > 0.95, "{key}: {scored}");
+    }
+    assert_eq!(scored["images"][1]["path"], "test/p1.png");
+    let found = json(folder, &["segment", "predict", "--model", "m.json", "test/p0.png", "--out", "new/found"]);
+    let share = found["images"][0]["fraction"].as_f64().unwrap();
+    assert!((share - 616.0 / 6144.0).abs() < 0.01, "{share}");
+    assert_eq!(cv_io::read_mask(folder.join("new/found/p0_mask.png")).unwrap().size(), (96, 64));
+    // The same model at any number of threads.
+    done(folder, &["segment", "train", "--images", "train", "--masks", "train", "--model", "n.json", "--threads", "1"]);
+    assert_eq!(fs::read(folder.join("m.json")).unwrap(), fs::read(folder.join("n.json")).unwrap());
+}
+
+#[test]
+fn bad_masks_are_named() {
+    let discs = discs();
+    let folder = discs.path();
+    for (name, mask, word) in [
+        ("black", Mask::new(96, 64, [false]), "marks a pixel"),
+        ("white", Mask::new(96, 64, [true]), "every pixel"),
+        ("small", Mask::new(9, 6, [true]), "96×64"),
+    ] {
+        fs::create_dir(folder.join(name)).unwrap();
+        cv_io::write_png(folder.join(name).join("p0.png"), mask.view()).unwrap();
+        let ran =
+            refused(folder, &["segment", "train", "--images", "train/p0.png", "--masks", name, "--model", "m.json"]);
+        assert!(ran.stderr.contains(word) && ran.stderr.contains("try: "), "{}", ran.stderr);
+    }
+    fs::create_dir(folder.join("other")).unwrap();
+    fs::copy(folder.join("train/p0.png"), folder.join("other/q.png")).unwrap();
+    for masks in ["other", "missing"] {
+        refused(folder, &["segment", "train", "--images", "train", "--masks", masks, "--model", "m.json"]);
+    }
+    assert!(!folder.join("m.json").exists());
+}
+
+#[test]
+fn bad_models_and_arguments_are_refused() {
+    let discs = discs();
+    let folder = discs.path();
+    for (text, word) in [
+        ("", "empty"),
+        ("[", "no segmentation model"),
+        ("{\"schema\": 9}", "schema 9"),
+        ("{}", "no schema"),
+        ("{\"schema\": 1}", "missing field"),
+    ] {
+        fs::write(folder.join("bad.json"), text).unwrap();
+        let ran = refused(folder, &["segment", "predict", "--model", "bad.json", "test", "--out", "found"]);
+        assert!(ran.stderr.contains(word), "{}", ran.stderr);
+    }
+    let train = ["segment", "train", "--images", "train", "--masks", "train", "--model", "m.json"];
+    for wrong in [["--components", "0"], ["--smoothing", "nan"], ["--space", "cmyk"], ["--open", "5000"]] {
+        assert_eq!(run(folder, &[&train[..], &wrong[..]].concat()).code, Some(2), "{wrong:?}");
+    }
+    // A prediction overwrites no mask drawn by hand, and no other prediction of the same run.
+    done(folder, &train);
+    let drawn = fs::read(folder.join("test/p0_mask.png")).unwrap();
+    let ran = refused(folder, &["segment", "predict", "--model", "m.json", "test", "--out", "test"]);
+    assert!(ran.stderr.contains("overwritten"), "{}", ran.stderr);
+    assert_eq!(fs::read(folder.join("test/p0_mask.png")).unwrap(), drawn);
+    refused(folder, &["segment", "predict", "--model", "m.json", "test/p0.png", "train/p0.png", "--out", "f"]);
+}
