@@ -7,7 +7,7 @@ use cv_core::{Mask, RgbU8};
 use cv_pipeline::segmentation::{
     ColorModel, ColorSpace, Labelled, Regions, Rule, Scores, SegmentError, TrainOptions,
 };
-use cv_pipeline::{Progress, preview, segment, train_segment};
+use cv_pipeline::{Progress, segment, train_segment};
 use cv_report::{Figure, Note, Report, colors, overlay_comparison, overlay_mask};
 use files::{Pair, pair, read_pair, stem};
 use serde_json::{Value, json};
@@ -381,7 +381,7 @@ fn comparison(path: &Path, photo: &RgbU8, mask: &Mask, truth: &Mask, scores: &Sc
 }
 
 fn figure(picture: &RgbU8, words: &str) -> Result<Figure, Failure> {
-    Ok(Figure::new(cv_io::encode_png(preview(picture.view(), REPORT_SIDE).0.view())?, words))
+    Ok(Figure::new(cv_io::encode_png(cv_report::shrink_to_fit(picture.view(), REPORT_SIDE).view())?, words))
 }
 
 fn add_stages(sums: &mut Vec<(&'static str, f64)>, stages: &[(&'static str, f64)]) {
