@@ -1,6 +1,16 @@
 //! Stereo: from a rectified pair of images to disparity and depth.
 //!
-//! See [`StereoMatcher`] for an example.
+//! ```
+//! use cv_core::GrayU8;
+//! use cv_stereo::{StereoMatcher, StereoOptions};
+//!
+//! // A wall of random bricks five pixels to the left in the right image.
+//! let wall = |shift: usize| GrayU8::from_fn(96, 64, |x, y| [((x + shift) / 3 * 31 + y / 4 * 17) as u8 * 53]);
+//! let mut matcher = StereoMatcher::new(StereoOptions { disparities: 16, ..StereoOptions::default() })?;
+//! let map = matcher.compute(wall(0).view(), wall(5).view())?;
+//! assert!((map.disparity.at(60, 30)[0] - 5.0).abs() < 0.5);
+//! # Ok::<(), cv_stereo::StereoError>(())
+//! ```
 //!
 //! # Conventions
 //!

@@ -6,6 +6,7 @@
 pub(crate) mod depth;
 mod estimate;
 mod panorama;
+mod reconstruct;
 mod segment;
 
 use anyhow::{Result, bail};
@@ -14,8 +15,13 @@ use std::{path::Path, time::Instant};
 /// A job: its name on the command line and what it does.
 type Job = (&'static str, fn(&Path) -> Result<Vec<Check>>);
 
-const JOBS: &[Job] =
-    &[("depth", depth::run), ("estimate", estimate::run), ("panorama", panorama::run), ("segment", segment::run)];
+const JOBS: &[Job] = &[
+    ("depth", depth::run),
+    ("estimate", estimate::run),
+    ("panorama", panorama::run),
+    ("reconstruct", reconstruct::run),
+    ("segment", segment::run),
+];
 
 /// A figure and the bar it is held against.
 #[derive(Debug, Clone, PartialEq)]

@@ -234,6 +234,12 @@ fn matches(pattern: &str, name: &str) -> bool {
 impl Args {
     /// Frame after frame with the same buffers.
     fn run_frames(&self, context: &Context) -> Result<Outcome, Failure> {
+        for (path, other) in [(&self.left, &self.right), (&self.right, &self.left)] {
+            if !is_sequence(path) {
+                return Err(Failure::new(format!("{} is one image, {} is not", path.display(), other.display()))
+                    .advice("give two images, or two folders or patterns of frames"));
+            }
+        }
         if self.disparities == Range::Auto
             || self.depth.is_some()
             || self.cloud.is_some()

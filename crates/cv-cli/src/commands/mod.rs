@@ -74,6 +74,7 @@ commands! {
     Estimate(estimate),
     Reconstruct(reconstruct),
     Depth(depth),
+    Rectify(rectify),
     Eval(eval),
     Completions(completions),
     Man(man),

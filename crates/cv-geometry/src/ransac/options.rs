@@ -65,7 +65,7 @@ impl RobustOptions {
 
     /// Defaults for fundamental matrices: threshold 1 px.
     pub fn fundamental() -> Self {
-        Self { threshold: 1.0, ..Self::default() }
+        Self { threshold: 1.0, min_iterations: 512, ..Self::default() }
     }
 
     pub(crate) fn check(&self) -> Result<(), EstimateError> {
