@@ -40,7 +40,7 @@ fn run_in(fixtures: &Path, jobs: &[Job], check: bool) -> Result<bool> {
     let mut ok = true;
     for (name, job) in jobs {
         let outcome = job(fixtures).with_context(|| (*name).to_owned())?;
-        for Check { name: what, figure, bar, ok: right } in &outcome.checks {
+        for Check { name: what, figure, bar, ok: right, .. } in &outcome.checks {
             let verdict = if *right { "ok" } else { "WRONG" };
             println!("{name}: {what} {figure:.4} {bar}: {verdict}");
             ok &= right;
