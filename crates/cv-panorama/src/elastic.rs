@@ -222,8 +222,9 @@ fn solve(fields: &mut [Field], ties: &[Tie], scale: f64) {
         offsets.push(offsets[offsets.len() - 1] + f.moved.len());
     }
     let n = offsets[fields.len()];
-    // Of each tie: eight vertices and their signed weights, and what is to be closed.
-    let terms: Vec<([(usize, f64); 8], Vector2<f64>)> = ties
+    /// Of a tie: eight vertices and their signed weights, and what is to be closed.
+    type Term = ([(usize, f64); 8], Vector2<f64>);
+    let terms: Vec<Term> = ties
         .iter()
         .map(|t| {
             let (a, b) = (fields[t.p].around(t.a), fields[t.q].around(t.b));

@@ -259,14 +259,15 @@ impl Predict {
                     .advice("name another folder with --out"));
             }
         }
-        create_dir(&self.out)?;
         let mut stages: Vec<(&'static str, f64)> = Vec::new();
         let (mut images, mut figures, mut found) = (Vec::new(), Vec::new(), 0);
+        // Encoded masks are small: they wait until every photograph is done, so that a bad one leaves nothing behind.
+        let mut masks = Vec::new();
         for (i, (path, output)) in photos.iter().zip(&outputs).enumerate() {
             Progress::report(context, "predict", i, photos.len());
             let photo = cv_io::read_rgb(path)?;
             let result = segment(photo.view(), &model);
-            cv_io::write_png(output, result.mask.view())?;
+            masks.push(cv_io::encode_png(result.mask.view()).during(path.display())?);
             found += usize::from(result.fraction > 0.0);
             images.push(json!({ "path": path, "mask": output, "fraction": result.fraction }));
             if context.wants_report() && figures.len() < REPORT_PHOTOS {
@@ -275,6 +276,10 @@ impl Predict {
                 figures.push(figure(&overlay, &words)?);
             }
             add_stages(&mut stages, &result.stages);
+        }
+        create_dir(&self.out)?;
+        for (output, mask) in outputs.iter().zip(&masks) {
+            cv_io::write_bytes(output, mask)?;
         }
         context.report(|| {
             let mut page = Report::new("Segmentation");
