@@ -5,7 +5,9 @@
 //! use cv_stereo::{StereoMatcher, StereoOptions};
 //!
 //! // A wall of random bricks five pixels to the left in the right image.
-//! let wall = |shift: usize| GrayU8::from_fn(96, 64, |x, y| [((x + shift) / 3 * 31 + y / 4 * 17) as u8 * 53]);
+//! let wall = |shift: usize| {
+//!     GrayU8::from_fn(96, 64, |x, y| [(((x + shift) / 3 * 7919 + y / 4 * 104_729) * 2_654_435 >> 9) as u8])
+//! };
 //! let mut matcher = StereoMatcher::new(StereoOptions { disparities: 16, ..StereoOptions::default() })?;
 //! let map = matcher.compute(wall(0).view(), wall(5).view())?;
 //! assert!((map.disparity.at(60, 30)[0] - 5.0).abs() < 0.5);
