@@ -96,8 +96,10 @@ fn bad_models_and_arguments_are_refused() {
     // A prediction overwrites no mask drawn by hand, and no other prediction of the same run.
     done(folder, &train);
     let drawn = fs::read(folder.join("test/p0_mask.png")).unwrap();
-    let ran = refused(folder, &["segment", "predict", "--model", "m.json", "test", "--out", "test"]);
-    assert!(ran.stderr.contains("overwritten"), "{}", ran.stderr);
+    for images in ["test", "test/p0.png"] {
+        let ran = refused(folder, &["segment", "predict", "--model", "m.json", images, "--out", "test"]);
+        assert!(ran.stderr.contains("overwritten"), "{}", ran.stderr);
+    }
     assert_eq!(fs::read(folder.join("test/p0_mask.png")).unwrap(), drawn);
     refused(folder, &["segment", "predict", "--model", "m.json", "test/p0.png", "train/p0.png", "--out", "f"]);
 }

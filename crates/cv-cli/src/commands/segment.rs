@@ -254,7 +254,10 @@ impl Predict {
                 .advice("run them into different folders"));
             }
             // Masks drawn by hand often lie beside their photographs.
-            if given.iter().any(|path| same(path, output)) {
+            // A bare name has the empty folder: joined to the current one it is that.
+            let folder = Path::new(".").join(photos[i].parent().unwrap_or(Path::new("")));
+            let beside = output.exists() && same(&folder, &self.out);
+            if beside || given.iter().any(|path| same(path, output)) {
                 return Err(Failure::new(format!("{} is there already and would be overwritten", output.display()))
                     .advice("name another folder with --out"));
             }
