@@ -2,30 +2,24 @@
 //!
 //! Source: D. Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 60(2), 2004, sections 3 and 4.
 
-use crate::blur::{blur, double, halve};
-use cv_core::{GrayF32, ImageView};
+use crate::scale_space::Ring;
+use crate::simd;
+use fearless_simd::Level;
 use nalgebra::{Matrix3, Vector3};
-use rayon::prelude::*;
+use std::ops::Range;
 
-/// Smoothing that the camera is assumed to have done, in input pixels (Lowe, section 3.3).
-const CAMERA_SIGMA: f32 = 0.5;
-/// Pixels at the border of an octave in which no extremum is looked for: gradients and derivatives need neighbours.
-const BORDER: usize = 2;
-/// Rows per task.
-const ROWS: usize = 32;
-
-/// Gaussian images at `layers + 3` scales; scale `i` has σ = `sigma · 2^(i / layers)` octave pixels.
-pub(crate) struct Octave {
-    pub(crate) images: Vec<GrayF32>,
-    /// Size of this octave's pixel in input pixels.
-    pub(crate) pixel: f32,
-}
+/// Pixels at the border of an octave in which no extremum is looked for (OpenCV's number): the mirrored border has extrema of its own.
+const BORDER: usize = 5;
+/// An extremum is followed at most this many pixels from where it was seen.
+const WANDER: usize = 2;
+/// So its differences are needed this far around.
+pub(crate) const REACH: usize = WANDER + 1;
 
 /// An extremum, in pixels of its octave.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Extremum {
     pub(crate) octave: usize,
-    /// The Gaussian image nearest in scale.
+    /// The scale nearest to it, 1 to `layers`.
     pub(crate) layer: usize,
     pub(crate) column: usize,
     pub(crate) row: usize,
@@ -47,118 +41,63 @@ pub(crate) struct Search {
     pub(crate) edge: f32,
 }
 
-/// The whole scale space: octaves until the shorter side is below 8 pixels.
-pub(crate) fn scale_space(view: ImageView<'_, f32, 1>, search: &Search) -> Vec<Octave> {
-    let missing = |target: f32, has: f32| (target * target - has * has).max(1e-4).sqrt();
-    let (mut base, mut pixel) = if search.upsample {
-        (double(view, missing(search.sigma * 0.5, CAMERA_SIGMA)), 0.5)
-    } else {
-        (blur(view, missing(search.sigma, CAMERA_SIGMA)), 1.0)
-    };
-    let mut octaves = Vec::new();
-    loop {
-        let scale = |i: usize| search.sigma * 2f32.powf(i as f32 / search.layers as f32);
-        let mut images = vec![base];
-        for i in 1..search.layers + 3 {
-            let next = blur(images[i - 1].view(), missing(scale(i), scale(i - 1)));
-            images.push(next);
-        }
-        base = halve(&images[search.layers]);
-        octaves.push(Octave { images, pixel });
-        pixel *= 2.0;
-        if base.width().min(base.height()) < 8 {
-            return octaves;
-        }
+/// Adds the extrema that are seen on row `y` and the columns of a tile.
+///
+/// A pixel is one where its difference is positive and not below any of its 26 neighbours, or negative and not above any, with at least 0.8 of the contrast asked for
+/// (the refined value may be that much larger).
+#[allow(clippy::too_many_arguments)]
+pub(crate) fn find(
+    differences: &[Ring],
+    octave: usize,
+    search: &Search,
+    (w, h): (usize, usize),
+    y: usize,
+    columns: Range<usize>,
+    level: Level,
+    found: &mut Vec<Extremum>,
+) {
+    if y < BORDER || y + BORDER >= h {
+        return;
     }
-}
-
-/// The extrema of an octave, refined, in raster order.
-pub(crate) fn extrema(octave: &Octave, index: usize, search: &Search) -> Vec<Extremum> {
-    let (w, h) = octave.images[0].size();
-    if w <= 2 * BORDER || h <= 2 * BORDER {
-        return Vec::new();
-    }
-    let starts: Vec<usize> = (BORDER..h - BORDER).step_by(ROWS).collect();
-    let found: Vec<Vec<Extremum>> = starts
-        .into_par_iter()
-        .map(|start| {
-            let mut found = Vec::new();
-            for (layer, y, x) in candidates(octave, start..(start + ROWS).min(h - BORDER), search) {
-                found.extend(refine(octave, index, search, (layer, y, x)));
-            }
-            found
-        })
-        .collect();
-    found.into_iter().flatten().collect()
-}
-
-/// Pixels of differences `1..=layers` that are not below (or not above) any of their 26 neighbours, with at least 0.8 of the contrast asked for
-/// (the refined value may be that much larger), in raster order.
-fn candidates(octave: &Octave, rows: std::ops::Range<usize>, search: &Search) -> Vec<(usize, usize, usize)> {
-    let w = octave.images[0].width();
-    let differences = octave.images.len() - 1;
+    let columns = columns.start.max(BORDER)..columns.end.min(w.saturating_sub(BORDER));
     let floor = 0.8 * search.contrast;
-    // Difference l of row y lives in ring[l][y % 3].
-    let mut ring = vec![[(); 3].map(|()| vec![0.0f32; w]); differences];
-    let difference = |ring: &mut Vec<[Vec<f32>; 3]>, y: usize| {
-        for (l, rows) in ring.iter_mut().enumerate() {
-            let (a, b) = (octave.images[l].row(y), octave.images[l + 1].row(y));
-            rows[y % 3].iter_mut().zip(a.iter().zip(b)).for_each(|(o, (a, b))| *o = b - a);
+    let mut seen = Vec::new();
+    for layer in 1..=search.layers {
+        let ring = &differences[layer];
+        let local = columns.start.saturating_sub(ring.from)..columns.end.saturating_sub(ring.from);
+        if local.is_empty() {
+            continue;
         }
-    };
-    let greater = |a: f32, b: f32| if a > b { a } else { b };
-    let less = |a: f32, b: f32| if a < b { a } else { b };
-    let mut columns = [vec![0.0f32; w], vec![0.0f32; w]];
-    let mut extremes = vec![[vec![0.0f32; w], vec![0.0f32; w]]; differences];
-    let mut marks = vec![0u8; w];
-    let mut found = Vec::new();
-    difference(&mut ring, rows.start - 1);
-    difference(&mut ring, rows.start);
-    for y in rows {
-        difference(&mut ring, y + 1);
-        for (rows, out) in ring.iter().zip(&mut extremes) {
-            let [a, b, c] = rows;
-            let [high, low] = &mut columns;
-            for x in 0..w {
-                high[x] = greater(greater(a[x], b[x]), c[x]);
-                low[x] = less(less(a[x], b[x]), c[x]);
-            }
-            let [max, min] = out;
-            for x in 1..w - 1 {
-                max[x] = greater(greater(high[x - 1], high[x]), high[x + 1]);
-                min[x] = less(less(low[x - 1], low[x]), low[x + 1]);
-            }
-        }
-        for l in 1..=search.layers {
-            let here = &ring[l][y % 3];
-            let [below, same, above] = [&extremes[l - 1], &extremes[l], &extremes[l + 1]];
-            for x in BORDER..w - BORDER {
-                let d = here[x];
-                let max = greater(greater(below[0][x], same[0][x]), above[0][x]);
-                let min = less(less(below[1][x], same[1][x]), above[1][x]);
-                marks[x] = u8::from(((d >= max) & (d > floor)) | ((d <= min) & (d < -floor)));
-            }
-            for (block, eight) in marks.chunks(8).enumerate() {
-                if eight.iter().fold(0, |any, m| any | m) != 0 {
-                    let hits = eight.iter().enumerate().filter(|(_, m)| **m != 0);
-                    found.extend(hits.map(|(i, _)| (l, y, block * 8 + i)));
-                }
+        seen.clear();
+        simd::peaks(level, [ring.row(y - 1), ring.row(y), ring.row(y + 1)], local, floor, &mut seen);
+        for &x in &seen {
+            let v = ring.row(y)[x];
+            let neighbours = [layer - 1, layer + 1].into_iter().flat_map(|l| (y - 1..=y + 1).map(move |y| (l, y)));
+            let extreme = neighbours.into_iter().all(|(l, y)| {
+                let row = &differences[l].row(y)[x - 1..=x + 1];
+                row.iter().all(|&d| if v > 0.0 { v >= d } else { v <= d })
+            });
+            if extreme {
+                let at = |l: usize, y: usize, x: usize| differences[l].row(y)[x - ring.from];
+                found.extend(refine(at, octave, search, (w, h), (layer, y, x + ring.from)));
             }
         }
     }
-    found
 }
 
 /// Follows the quadratic through the 3×3×3 differences to its extremum; `None` where it runs away, is faint, or lies on an edge.
-fn refine(octave: &Octave, index: usize, search: &Search, start: (usize, usize, usize)) -> Option<Extremum> {
-    let (w, h) = octave.images[0].size();
+fn refine(
+    at: impl Fn(usize, usize, usize) -> f32,
+    octave: usize,
+    search: &Search,
+    (w, h): (usize, usize),
+    start: (usize, usize, usize),
+) -> Option<Extremum> {
     let (mut layer, mut y, mut x) = start;
     // Five steps, as Lowe's and OpenCV's code.
     for _ in 0..5 {
         let d = |dl: isize, dy: isize, dx: isize| {
-            let l = layer.wrapping_add_signed(dl);
-            let (row, column) = (y.wrapping_add_signed(dy), x.wrapping_add_signed(dx));
-            octave.images[l + 1].row(row)[column] - octave.images[l].row(row)[column]
+            at(layer.wrapping_add_signed(dl), y.wrapping_add_signed(dy), x.wrapping_add_signed(dx))
         };
         let v = d(0, 0, 0);
         let gradient = Vector3::new(d(0, 0, 1) - d(0, 0, -1), d(0, 1, 0) - d(0, -1, 0), d(1, 0, 0) - d(-1, 0, 0)) * 0.5;
@@ -177,7 +116,7 @@ fn refine(octave: &Octave, index: usize, search: &Search, start: (usize, usize, 
                 return None;
             }
             return Some(Extremum {
-                octave: index,
+                octave,
                 layer,
                 column: x,
                 row: y,
@@ -193,9 +132,41 @@ fn refine(octave: &Octave, index: usize, search: &Search, start: (usize, usize, 
         let moved = |at: usize, by: f32| at.checked_add_signed(by.round() as isize);
         (x, y, layer) = (moved(x, step.x)?, moved(y, step.y)?, moved(layer, step.z)?);
         let inside = |v: usize, n: usize| (BORDER..n - BORDER).contains(&v);
-        if !(inside(x, w) && inside(y, h) && (1..=search.layers).contains(&layer)) {
+        let near = x.abs_diff(start.2).max(y.abs_diff(start.1)) <= WANDER;
+        if !(near && inside(x, w) && inside(y, h) && (1..=search.layers).contains(&layer)) {
             return None;
         }
     }
     None
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use cv_core::GrayF32;
+
+    /// The extrema of an octave straight from the definition: layer, row and column, sorted.
+    pub(crate) fn plain(images: &[GrayF32], octave: usize, search: &Search) -> Vec<(usize, usize, usize)> {
+        let (w, h) = images[0].size();
+        let at = |l: usize, y: usize, x: usize| images[l + 1].at(x, y)[0] - images[l].at(x, y)[0];
+        let mut found = Vec::new();
+        for layer in 1..=search.layers {
+            for y in BORDER..h.saturating_sub(BORDER) {
+                for x in BORDER..w.saturating_sub(BORDER) {
+                    let v = at(layer, y, x);
+                    let all = (layer - 1..=layer + 1)
+                        .flat_map(|l| (y - 1..=y + 1).flat_map(move |y| (x - 1..=x + 1).map(move |x| (l, y, x))));
+                    let mut around = all.map(|(l, y, x)| at(l, y, x));
+                    let strong = v.abs() > 0.8 * search.contrast;
+                    if strong && around.all(|d| if v > 0.0 { v >= d } else { v <= d }) {
+                        found.extend(refine(at, octave, search, (w, h), (layer, y, x)));
+                    }
+                }
+            }
+        }
+        let mut places: Vec<_> = found.iter().map(|e| (e.layer, e.row, e.column)).collect();
+        places.sort_unstable();
+        places.dedup();
+        places
+    }
 }

@@ -2,9 +2,10 @@
 //!
 //! Source: C. Harris & M. Stephens, "A combined corner and edge detector", Alvey Vision Conference 1988.
 
-use crate::blur::{blur, mirror};
 use crate::error::{FeatureError, check_image, check_option};
+use crate::rows::mirror;
 use cv_core::{GrayF32, ImageView, Keypoint};
+use cv_imgproc::gaussian_blur;
 
 /// Settings of [`harris`].
 #[derive(Debug, Clone, PartialEq)]
@@ -60,7 +61,7 @@ pub fn harris_response(view: ImageView<'_, f32, 1>, options: &HarrisOptions) -> 
             products[2].set(x, y, [gy * gy]);
         }
     }
-    let [xx, xy, yy] = products.map(|p| blur(p.view(), options.window_sigma));
+    let [xx, xy, yy] = products.map(|p| gaussian_blur(p.view(), options.window_sigma));
     Ok(GrayF32::from_fn(w, h, |x, y| {
         let ([xx], [xy], [yy]) = (xx.at(x, y), xy.at(x, y), yy.at(x, y));
         let trace = xx + yy;

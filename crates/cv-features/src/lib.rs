@@ -36,13 +36,15 @@
 //! * Results do not depend on the number of threads.
 
 mod anms;
-mod blur;
 mod descriptors;
 mod dog;
 mod error;
 mod harris;
+mod histogram;
 mod matching;
 mod patch;
+mod rows;
+mod scale_space;
 mod sift;
 mod simd;
 

@@ -3,10 +3,10 @@
 //! Source: M. Brown, R. Szeliski & S. Winder, "Multi-image matching using multi-scale oriented patches", CVPR 2005, section 4,
 //! without orientation.
 
-use crate::blur::blur;
 use crate::descriptors::{Described, DescriptorKind, Descriptors, DropReason, Dropped};
 use crate::error::{FeatureError, check_image, check_option};
 use cv_core::{GrayF32, ImageView, Keypoint};
+use cv_imgproc::gaussian_blur;
 use rayon::prelude::*;
 
 /// Samples on a side of a patch.
@@ -46,7 +46,7 @@ pub fn describe_patches(
     check_option("blur_sigma", options.blur_sigma.into(), "0.3 to 50 px", |v| (0.3..=50.0).contains(&v))?;
     check_option("min_deviation", options.min_deviation.into(), "0 or more", |v| v >= 0.0 && v.is_finite())?;
     check_image(view, options.window.ceil() as usize)?;
-    let smooth = blur(view, options.blur_sigma);
+    let smooth = gaussian_blur(view, options.blur_sigma);
     let patches: Vec<Result<[f32; SIDE * SIDE], DropReason>> =
         keypoints.par_iter().with_min_len(64).map(|k| patch(&smooth, k, options)).collect();
     let mut described = Described {

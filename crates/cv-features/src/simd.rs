@@ -11,105 +11,219 @@ pub(crate) fn level() -> Level {
     Level::new()
 }
 
-/// `out[x] = k[0]·rows[r][x] + Σ k[t]·(rows[r−t][x] + rows[r+t][x])` with `r = k.len() − 1` and `2r + 1` rows.
+/// `out[x] = k[0]·rows[r][x] + Σ k[t]·(rows[r−t][x] + rows[r+t][x])`, `t` from 1 to `r = k.len() − 1`.
 pub(crate) fn vertical(level: Level, out: &mut [f32], rows: &[&[f32]], kernel: &[f32]) {
     debug_assert!(rows.len() == 2 * kernel.len() - 1 && rows.iter().all(|r| r.len() == out.len()));
-    dispatch!(level, simd => vertical_impl(simd, out, rows, kernel));
+    dispatch!(level, simd => symmetric::<_, _, false>(simd, out, kernel, Down { rows }));
 }
 
-#[inline(always)]
-fn vertical_impl<S: Simd>(simd: S, out: &mut [f32], rows: &[&[f32]], kernel: &[f32]) {
-    let n = S::f32s::LEN;
-    let r = kernel.len() - 1;
-    let width = out.len();
-    let at = |row: usize, x: usize| S::f32s::from_slice(simd, &rows[row][x..x + n]);
-    let mut x = 0;
-    while x + 4 * n <= width {
-        let mut sums: [S::f32s; 4] = std::array::from_fn(|i| at(r, x + i * n) * kernel[0]);
-        for (t, &weight) in kernel.iter().enumerate().skip(1) {
-            for (i, sum) in sums.iter_mut().enumerate() {
-                *sum += (at(r - t, x + i * n) + at(r + t, x + i * n)) * weight;
-            }
-        }
-        for (i, sum) in sums.iter().enumerate() {
-            sum.store_slice(&mut out[x + i * n..x + (i + 1) * n]);
-        }
-        x += 4 * n;
-    }
-    while x < width {
-        if x + n > width {
-            if width < n {
-                break;
-            }
-            // The last columns again, as a whole vector.
-            x = width - n;
-        }
-        let mut sum = at(r, x) * kernel[0];
-        for (t, &weight) in kernel.iter().enumerate().skip(1) {
-            sum += (at(r - t, x) + at(r + t, x)) * weight;
-        }
-        sum.store_slice(&mut out[x..x + n]);
-        x += n;
-    }
-    if width < n {
-        for (x, o) in out.iter_mut().enumerate() {
-            let mut sum = rows[r][x] * kernel[0];
-            for (t, &weight) in kernel.iter().enumerate().skip(1) {
-                sum += (rows[r - t][x] + rows[r + t][x]) * weight;
-            }
-            *o = sum;
-        }
-    }
+/// `out[x] = Σ k[t]·(rows[r−t][x] + rows[r+1+t][x])`, `t` from 0 to `r = k.len() − 1`: half-way between rows `r` and `r + 1`.
+pub(crate) fn vertical_between(level: Level, out: &mut [f32], rows: &[&[f32]], kernel: &[f32]) {
+    debug_assert!(rows.len() == 2 * kernel.len() && rows.iter().all(|r| r.len() == out.len()));
+    dispatch!(level, simd => symmetric::<_, _, true>(simd, out, kernel, Down { rows }));
 }
 
-/// `out[x] = k[0]·row[x+r] + Σ k[t]·(row[x+r−t] + row[x+r+t])` with `r = k.len() − 1`; `row` has `2r` more samples than `out`.
+/// `out[x] = k[0]·row[x+r] + Σ k[t]·(row[x+r−t] + row[x+r+t])`, `t` from 1 to `r = k.len() − 1`.
 pub(crate) fn horizontal(level: Level, out: &mut [f32], row: &[f32], kernel: &[f32]) {
     debug_assert_eq!(row.len(), out.len() + 2 * (kernel.len() - 1));
-    dispatch!(level, simd => horizontal_impl(simd, out, row, kernel));
+    dispatch!(level, simd => symmetric::<_, _, false>(simd, out, kernel, Along { row }));
 }
 
+/// `out[x] = Σ k[t]·(row[x+r−t] + row[x+r+1+t])`, `t` from 0 to `r = k.len() − 1`: half-way between two samples.
+pub(crate) fn horizontal_between(level: Level, out: &mut [f32], row: &[f32], kernel: &[f32]) {
+    debug_assert_eq!(row.len() + 1, out.len() + 2 * kernel.len());
+    dispatch!(level, simd => symmetric::<_, _, true>(simd, out, kernel, Along { row }));
+}
+
+/// The samples that tap `tap` of a window multiplies.
+trait Taps: Copy {
+    fn at(&self, tap: usize, x: usize, n: usize) -> &[f32];
+}
+
+/// Taps on different rows.
+#[derive(Clone, Copy)]
+struct Down<'a> {
+    rows: &'a [&'a [f32]],
+}
+
+impl Taps for Down<'_> {
+    #[inline(always)]
+    fn at(&self, tap: usize, x: usize, n: usize) -> &[f32] {
+        &self.rows[tap][x..x + n]
+    }
+}
+
+/// Taps along one row.
+#[derive(Clone, Copy)]
+struct Along<'a> {
+    row: &'a [f32],
+}
+
+impl Taps for Along<'_> {
+    #[inline(always)]
+    fn at(&self, tap: usize, x: usize, n: usize) -> &[f32] {
+        &self.row[x + tap..x + tap + n]
+    }
+}
+
+/// Symmetric windows about a sample, or (`BETWEEN`) about the place between two.
 #[inline(always)]
-fn horizontal_impl<S: Simd>(simd: S, out: &mut [f32], row: &[f32], kernel: &[f32]) {
+fn symmetric<S: Simd, T: Taps, const BETWEEN: bool>(simd: S, out: &mut [f32], kernel: &[f32], taps: T) {
     let n = S::f32s::LEN;
-    let r = kernel.len() - 1;
     let width = out.len();
-    let at = |x: usize| S::f32s::from_slice(simd, &row[x..x + n]);
+    let r = kernel.len() - 1;
+    let gap = usize::from(BETWEEN);
     let mut x = 0;
+    // Four vectors at a time: their sums stay in registers over all taps.
     while x + 4 * n <= width {
-        let mut sums: [S::f32s; 4] = std::array::from_fn(|i| at(x + r + i * n) * kernel[0]);
-        for (t, &weight) in kernel.iter().enumerate().skip(1) {
-            for (i, sum) in sums.iter_mut().enumerate() {
-                *sum += (at(x + r - t + i * n) + at(x + r + t + i * n)) * weight;
+        let mut sums = [S::f32s::splat(simd, 0.0); 4];
+        if !BETWEEN {
+            let middle = taps.at(r, x, 4 * n);
+            for i in 0..4 {
+                sums[i] = S::f32s::from_slice(simd, &middle[i * n..(i + 1) * n]) * kernel[0];
             }
         }
-        for (i, sum) in sums.iter().enumerate() {
-            sum.store_slice(&mut out[x + i * n..x + (i + 1) * n]);
+        for (t, &weight) in kernel.iter().enumerate().skip(1 - gap) {
+            let (before, after) = (taps.at(r - t, x, 4 * n), taps.at(r + gap + t, x, 4 * n));
+            for i in 0..4 {
+                let a = S::f32s::from_slice(simd, &before[i * n..(i + 1) * n]);
+                let b = S::f32s::from_slice(simd, &after[i * n..(i + 1) * n]);
+                sums[i] += (a + b) * weight;
+            }
+        }
+        let out = &mut out[x..x + 4 * n];
+        for i in 0..4 {
+            sums[i].store_slice(&mut out[i * n..(i + 1) * n]);
         }
         x += 4 * n;
     }
-    while x < width {
-        if x + n > width {
-            if width < n {
-                break;
-            }
-            x = width - n;
+    while x < width && width >= n {
+        // The last vector overlaps the one before.
+        x = x.min(width - n);
+        let mut sum = S::f32s::splat(simd, 0.0);
+        if !BETWEEN {
+            sum = S::f32s::from_slice(simd, taps.at(r, x, n)) * kernel[0];
         }
-        let mut sum = at(x + r) * kernel[0];
-        for (t, &weight) in kernel.iter().enumerate().skip(1) {
-            sum += (at(x + r - t) + at(x + r + t)) * weight;
+        for (t, &weight) in kernel.iter().enumerate().skip(1 - gap) {
+            let a = S::f32s::from_slice(simd, taps.at(r - t, x, n));
+            let b = S::f32s::from_slice(simd, taps.at(r + gap + t, x, n));
+            sum += (a + b) * weight;
         }
         sum.store_slice(&mut out[x..x + n]);
         x += n;
     }
     if width < n {
         for (x, o) in out.iter_mut().enumerate() {
-            let mut sum = row[x + r] * kernel[0];
-            for (t, &weight) in kernel.iter().enumerate().skip(1) {
-                sum += (row[x + r - t] + row[x + r + t]) * weight;
+            *o = if BETWEEN { 0.0 } else { taps.at(r, x, 1)[0] * kernel[0] };
+            for (t, &weight) in kernel.iter().enumerate().skip(1 - gap) {
+                *o += (taps.at(r - t, x, 1)[0] + taps.at(r + gap + t, x, 1)[0]) * weight;
             }
-            *o = sum;
         }
     }
+}
+
+/// `out = [a0, b0, a1, b1, …]`.
+pub(crate) fn interleave(level: Level, out: &mut [f32], a: &[f32], b: &[f32]) {
+    dispatch!(level, simd => interleave_impl(simd, out, a, b));
+}
+
+#[inline(always)]
+fn interleave_impl<S: Simd>(_: S, out: &mut [f32], a: &[f32], b: &[f32]) {
+    for ((o, a), b) in out.as_chunks_mut::<2>().0.iter_mut().zip(a).zip(b) {
+        *o = [*a, *b];
+    }
+}
+
+/// `out = a − b`.
+pub(crate) fn subtract(level: Level, out: &mut [f32], a: &[f32], b: &[f32]) {
+    dispatch!(level, simd => subtract_impl(simd, out, a, b));
+}
+
+#[inline(always)]
+fn subtract_impl<S: Simd>(_: S, out: &mut [f32], a: &[f32], b: &[f32]) {
+    for ((o, a), b) in out.iter_mut().zip(a).zip(b) {
+        *o = a - b;
+    }
+}
+
+/// `out = (values − dark)·gain`, rounded, 0 to 65535.
+pub(crate) fn quantize(level: Level, out: &mut [u16], values: &[f32], dark: f32, gain: f32) {
+    dispatch!(level, simd => quantize_impl(simd, out, values, dark, gain));
+}
+
+#[inline(always)]
+fn quantize_impl<S: Simd>(_: S, out: &mut [u16], values: &[f32], dark: f32, gain: f32) {
+    for (o, v) in out.iter_mut().zip(values) {
+        let v = (v - dark) * gain + 0.5;
+        let v = if v > 0.0 { v } else { 0.0 };
+        let v = if v < 65535.0 { v } else { 65535.0 };
+        *o = v as i32 as u16;
+    }
+}
+
+/// Adds the columns of `range` where the middle row is above `floor` and not below any of its eight neighbours, or below `−floor` and not above any.
+pub(crate) fn peaks(
+    level: Level,
+    rows: [&[f32]; 3],
+    range: std::ops::Range<usize>,
+    floor: f32,
+    found: &mut Vec<usize>,
+) {
+    dispatch!(level, simd => peaks_impl(simd, rows, range, floor, found));
+}
+
+#[inline(always)]
+fn peaks_impl<S: Simd>(
+    simd: S,
+    [above, here, below]: [&[f32]; 3],
+    range: std::ops::Range<usize>,
+    floor: f32,
+    found: &mut Vec<usize>,
+) {
+    let n = S::f32s::LEN;
+    let (floor_vector, minus) = (S::f32s::splat(simd, floor), S::f32s::splat(simd, -floor));
+    let mut x = range.start;
+    while x + n <= range.end {
+        let v = S::f32s::from_slice(simd, &here[x..x + n]);
+        if v.simd_gt(floor_vector).any_true() || v.simd_lt(minus).any_true() {
+            let mut high = S::f32s::from_slice(simd, &here[x - 1..x - 1 + n]);
+            let mut low = high;
+            let right = S::f32s::from_slice(simd, &here[x + 1..x + 1 + n]);
+            high = high.max(right);
+            low = low.min(right);
+            for row in [above, below] {
+                for d in [x - 1, x, x + 1] {
+                    let other = S::f32s::from_slice(simd, &row[d..d + n]);
+                    high = high.max(other);
+                    low = low.min(other);
+                }
+            }
+            let up = v.simd_gt(floor_vector) & v.simd_ge(high);
+            let down = v.simd_lt(minus) & v.simd_le(low);
+            let hits = up | down;
+            if hits.any_true() {
+                for i in 0..n {
+                    if is_peak(above, here, below, x + i, floor) {
+                        found.push(x + i);
+                    }
+                }
+            }
+        }
+        x += n;
+    }
+    for x in x..range.end {
+        if is_peak(above, here, below, x, floor) {
+            found.push(x);
+        }
+    }
+}
+
+#[inline(always)]
+fn is_peak(above: &[f32], here: &[f32], below: &[f32], x: usize, floor: f32) -> bool {
+    let v = here[x];
+    let around = [&above[x - 1..x + 2], &here[x - 1..x + 2], &below[x - 1..x + 2]];
+    (v > floor && around.iter().all(|r| r.iter().all(|&d| v >= d)))
+        || (v < -floor && around.iter().all(|r| r.iter().all(|&d| v <= d)))
 }
 
 #[cfg(test)]
@@ -136,34 +250,54 @@ pub(crate) mod tests {
 
     proptest! {
         #[test]
-        fn both_passes_equal_the_plain_loops(width in 1usize..200, r in 0usize..12, seed in any::<u32>()) {
+        fn all_passes_equal_the_plain_loops(width in 1usize..200, r in 0usize..12, seed in any::<u32>()) {
             let mut state = seed | 1;
             let mut random = || {
                 state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
                 (state >> 8) as f32 / (1 << 24) as f32
             };
             let kernel: Vec<f32> = (0..=r).map(|_| random()).collect();
-            let data: Vec<Vec<f32>> = (0..2 * r + 1).map(|_| (0..width + 2 * r).map(|_| random()).collect()).collect();
+            let data: Vec<Vec<f32>> =
+                (0..2 * r + 2).map(|_| (0..width + 2 * r + 1).map(|_| random() - 0.5).collect()).collect();
             let rows: Vec<&[f32]> = data.iter().map(|v| &v[..width]).collect();
-            let plain = |at: &dyn Fn(usize, usize) -> f32| -> Vec<f32> {
+            let plain = |at: &dyn Fn(usize, usize) -> f32, gap: usize| -> Vec<f32> {
                 (0..width)
                     .map(|x| {
-                        let mut sum = at(x, r) * kernel[0];
-                        for (t, weight) in kernel.iter().enumerate().skip(1) {
-                            sum += (at(x, r - t) + at(x, r + t)) * weight;
+                        let mut sum = if gap == 0 { at(x, r) * kernel[0] } else { 0.0 };
+                        for (t, weight) in kernel.iter().enumerate().skip(1 - gap) {
+                            sum += (at(x, r - t) + at(x, r + gap + t)) * weight;
                         }
                         sum
                     })
                     .collect()
             };
-            let down = plain(&|x, t| rows[t][x]);
-            let along = plain(&|x, t| data[0][x + t]);
+            let expected = [0, 1].map(|gap| [plain(&|x, t| rows[t][x], gap), plain(&|x, t| data[0][x + t], gap)]);
+            let three = [&data[0][..], &data[1][..], &data[2 * r + 1][..]];
+            let range = 1..width + 2 * r;
+            let flat: Vec<usize> = range.clone().filter(|&x| is_peak(three[0], three[1], three[2], x, 0.1)).collect();
             for level in levels() {
                 let mut out = vec![0.0; width];
-                vertical(level, &mut out, &rows, &kernel);
-                prop_assert_eq!(&out, &down, "{:?}", level);
-                horizontal(level, &mut out, &data[0], &kernel);
-                prop_assert_eq!(&out, &along, "{:?}", level);
+                vertical(level, &mut out, &rows[..2 * r + 1], &kernel);
+                prop_assert_eq!(&out, &expected[0][0], "{:?}", level);
+                horizontal(level, &mut out, &data[0][..width + 2 * r], &kernel);
+                prop_assert_eq!(&out, &expected[0][1], "{:?}", level);
+                vertical_between(level, &mut out, &rows, &kernel);
+                prop_assert_eq!(&out, &expected[1][0], "{:?}", level);
+                horizontal_between(level, &mut out, &data[0], &kernel);
+                prop_assert_eq!(&out, &expected[1][1], "{:?}", level);
+                let mut found = Vec::new();
+                peaks(level, three, range.clone(), 0.1, &mut found);
+                prop_assert_eq!(&found, &flat, "{:?}", level);
+                let mut twice = vec![0.0; 2 * width];
+                interleave(level, &mut twice, rows[0], rows[1]);
+                subtract(level, &mut out, rows[0], rows[1]);
+                let mut small = vec![0u16; width];
+                quantize(level, &mut small, rows[0], -0.25, 120_000.0);
+                for x in 0..width {
+                    prop_assert_eq!((twice[2 * x], twice[2 * x + 1]), (rows[0][x], rows[1][x]));
+                    prop_assert_eq!(out[x], rows[0][x] - rows[1][x]);
+                    prop_assert_eq!(small[x], ((rows[0][x] + 0.25) * 120_000.0 + 0.5).clamp(0.0, 65535.0) as u16);
+                }
             }
         }
     }
