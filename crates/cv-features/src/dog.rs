@@ -63,24 +63,18 @@ pub(crate) fn find(
     let floor = 0.8 * search.contrast;
     let mut seen = Vec::new();
     for layer in 1..=search.layers {
-        let ring = &differences[layer];
-        let local = columns.start.saturating_sub(ring.from)..columns.end.saturating_sub(ring.from);
+        // All differences cover the same columns.
+        let from = differences[layer].from;
+        let local = columns.start.saturating_sub(from)..columns.end.saturating_sub(from);
         if local.is_empty() {
             continue;
         }
+        let rows = [layer - 1, layer, layer + 1].map(|l| [y - 1, y, y + 1].map(|y| differences[l].row(y)));
         seen.clear();
-        simd::peaks(level, [ring.row(y - 1), ring.row(y), ring.row(y + 1)], local, floor, &mut seen);
+        simd::extremes(level, rows, local, floor, &mut seen);
         for &x in &seen {
-            let v = ring.row(y)[x];
-            let neighbours = [layer - 1, layer + 1].into_iter().flat_map(|l| (y - 1..=y + 1).map(move |y| (l, y)));
-            let extreme = neighbours.into_iter().all(|(l, y)| {
-                let row = &differences[l].row(y)[x - 1..=x + 1];
-                row.iter().all(|&d| if v > 0.0 { v >= d } else { v <= d })
-            });
-            if extreme {
-                let at = |l: usize, y: usize, x: usize| differences[l].row(y)[x - ring.from];
-                found.extend(refine(at, octave, search, (w, h), (layer, y, x + ring.from)));
-            }
+            let at = |l: usize, y: usize, x: usize| differences[l].row(y)[x - from];
+            found.extend(refine(at, octave, search, (w, h), (layer, y, x + from)));
         }
     }
 }

@@ -2,6 +2,7 @@
 //!
 //! Source: D. Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 60(2), 2004, sections 5 and 6.
 
+use crate::simd::round;
 use cv_core::Image;
 use fearless_simd::{Level, dispatch, f32x8, prelude::*};
 use std::f32::consts::{FRAC_PI_2, PI, TAU};
@@ -76,7 +77,7 @@ fn vote<S: Simd>(_: S, image: &Image<u16, 1>, (px, py): (f32, f32), sigma: f32, 
             let gx = right[i] as f32 - left[i] as f32;
             let gy = below[i] as f32 - above[i] as f32;
             votes[i] = weight * weights[i] * (gx * gx + gy * gy).sqrt();
-            places[i] = (turn(gy, gx) * BINS as f32 + 0.5) as i32 as u32;
+            places[i] = round(turn(gy, gx) * BINS as f32);
         }
         for (pair, votes) in places[..n].chunks(2).zip(votes[..n].chunks(2)) {
             for ((sums, place), vote) in sums.iter_mut().zip(pair).zip(votes) {
@@ -152,7 +153,7 @@ fn describe_impl<S: Simd>(
     for j in 0..PADDED {
         let v = j as f32 - middle;
         let (mut fx, mut fy) = ([0.0f32; PADDED], [0.0f32; PADDED]);
-        let mut starts = [0i32; PADDED];
+        let mut starts = [0u32; PADDED];
         let (x0, y0) = (px - v * uy - middle * ux, py + v * ux - middle * uy);
         for i in 0..PADDED {
             let (mut x, mut y) = (x0 + i as f32 * ux, y0 + i as f32 * uy);
@@ -161,15 +162,24 @@ fn describe_impl<S: Simd>(
                 inside[j * PADDED + i] = if cx == x && cy == y { 1.0 } else { 0.0 };
                 (x, y) = (cx, cy);
             }
-            let (column, row) = ((x as i32).min(w as i32 - 2), (y as i32).min(h as i32 - 2));
+            // The square of pixels around it; on its border either neighbour will do.
+            let (column, row) =
+                (round((x - 0.5).max(0.0)).min(w as u32 - 2), round((y - 0.5).max(0.0)).min(h as u32 - 2));
             fx[i] = x - column as f32;
             fy[i] = y - row as f32;
-            starts[i] = row * w as i32 + column;
+            starts[i] = row * w as u32 + column;
+        }
+        // Two neighbours in one number each: gathering is what takes the time.
+        let (mut tops, mut bottoms) = ([0u32; PADDED], [0u32; PADDED]);
+        for i in 0..PADDED {
+            let square = &pixels[starts[i] as usize..][..w + 2];
+            tops[i] = square[0] as u32 | (square[1] as u32) << 16;
+            bottoms[i] = square[w] as u32 | (square[w + 1] as u32) << 16;
         }
         let samples = &mut samples[j * PADDED..(j + 1) * PADDED];
         for i in 0..PADDED {
-            let square = &pixels[starts[i] as usize..][..w + 2];
-            let (a, b, c, d) = (square[0] as f32, square[1] as f32, square[w] as f32, square[w + 1] as f32);
+            let (a, b) = ((tops[i] & 0xFFFF) as f32, (tops[i] >> 16) as f32);
+            let (c, d) = ((bottoms[i] & 0xFFFF) as f32, (bottoms[i] >> 16) as f32);
             let (top, bottom) = (a + fx[i] * (b - a), c + fx[i] * (d - c));
             samples[i] = top + fy[i] * (bottom - top);
         }

@@ -11,11 +11,12 @@ use crate::simd;
 use cv_core::{GrayF32, Image, ImageView};
 use fearless_simd::Level;
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// Columns of a tile: the rows of all scales it needs (about 190 at the usual settings) then take under a megabyte.
 const COLUMNS: usize = 1024;
-/// Rows of a strip, about: each costs some 30 more at its edges.
-const ROWS: usize = 192;
+/// Rows of a strip, at most: each costs some 30 more at its edges.
+const ROWS: usize = 512;
 /// Octaves end before their shorter side is below this.
 const SMALLEST_SIDE: usize = 12;
 
@@ -122,7 +123,7 @@ pub(crate) struct Ring {
 }
 
 impl Ring {
-    fn new(columns: std::ops::Range<usize>, rows: usize) -> Self {
+    fn new(columns: Range<usize>, rows: usize) -> Self {
         Self { data: vec![0.0; columns.len() * rows], from: columns.start, width: columns.len(), rows }
     }
 
@@ -136,6 +137,21 @@ impl Ring {
     fn row_mut(&mut self, y: usize) -> &mut [f32] {
         let start = (y % self.rows) * self.width;
         &mut self.data[start..start + self.width]
+    }
+
+    /// Columns `a..b` of the rows `y − r` to `y + r` of an image of `h` rows, mirrored at its ends.
+    fn window<'a>(&'a self, y: usize, r: usize, h: usize, columns: &Range<usize>, rows: &mut Vec<&'a [f32]>) {
+        let (a, b) = (columns.start - self.from, columns.end - self.from);
+        rows.clear();
+        if y >= r && y + r < h {
+            let mut slot = (y - r) % self.rows;
+            for _ in 0..=2 * r {
+                rows.push(&self.data[slot * self.width..][a..b]);
+                slot = if slot + 1 == self.rows { 0 } else { slot + 1 };
+            }
+        } else {
+            rows.extend((0..=2 * r).map(|d| &self.row(mirror((y + d) as isize - r as isize, h))[a..b]));
+        }
     }
 }
 
@@ -263,7 +279,7 @@ fn octave(plan: &Plan<'_>) -> (Vec<Image<u16, 1>>, GrayF32, Vec<Extremum>) {
 }
 
 /// Streams the rows of a tile through all scales.
-fn tile(plan: &Plan<'_>, strip: &mut Strip<'_>, columns: std::ops::Range<usize>, found: &mut Vec<Extremum>) {
+fn tile(plan: &Plan<'_>, strip: &mut Strip<'_>, columns: Range<usize>, found: &mut Vec<Extremum>) {
     let (w, h) = (plan.width, plan.height);
     let last = plan.kernels.len();
     let radius = |scale: usize| plan.kernels[scale - 1].len() - 1;
@@ -296,12 +312,8 @@ fn tile(plan: &Plan<'_>, strip: &mut Strip<'_>, columns: std::ops::Range<usize>,
             let (a, b) = (from.saturating_sub(r), (to + r).min(w));
             let padded = buffer.padded(to - from + 2 * r);
             let (left, right) = (a + r - from, to + r - b);
-            let rows: Vec<&[f32]> = (0..=2 * r)
-                .map(|d| {
-                    let row = previous.row(mirror((y + d) as isize - r as isize, h));
-                    &row[a - previous.from..b - previous.from]
-                })
-                .collect();
+            let mut rows = Vec::with_capacity(2 * r + 1);
+            previous.window(y, r, h, &(a..b), &mut rows);
             simd::vertical(plan.level, &mut padded[left..left + b - a], &rows, kernel);
             mirror_ends(padded, left, right);
             simd::horizontal(plan.level, ring.row_mut(y), padded, kernel);

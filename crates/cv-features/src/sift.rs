@@ -85,10 +85,14 @@ pub fn sift(view: ImageView<'_, f32, 1>, options: &SiftOptions) -> Result<Descri
     out.beyond_limit = points.len().saturating_sub(options.max_features);
     points.truncate(options.max_features);
     let level = simd::level();
-    let features: Vec<Vec<(Keypoint, [f32; DIMENSION], f32)>> = points
-        .par_iter()
+    // In the order of the image, so that neighbours find each other's pixels in the cache.
+    let mut order: Vec<usize> = (0..points.len()).collect();
+    order.sort_unstable_by_key(|&i| (points[i].octave, points[i].row / 16, points[i].column, i));
+    let mut features: Vec<(usize, Vec<Feature>)> = order
+        .into_par_iter()
         .with_min_len(16)
-        .map(|point| {
+        .map(|index| {
+            let point = &points[index];
             let octave = &octaves[point.octave];
             let image = &octave.scales[point.layer - 1];
             let angles = if options.upright {
@@ -101,10 +105,11 @@ pub fn sift(view: ImageView<'_, f32, 1>, options: &SiftOptions) -> Result<Descri
                 let norm = normalize(&mut histogram, options.root);
                 (keypoint(point, octave, angle), histogram, norm)
             };
-            angles.into_iter().map(describe).collect()
+            (index, angles.into_iter().map(describe).collect())
         })
         .collect();
-    for (index, (keypoint, histogram, norm)) in features.into_iter().flatten().enumerate() {
+    features.sort_unstable_by_key(|f| f.0);
+    for (index, (keypoint, histogram, norm)) in features.into_iter().flat_map(|f| f.1).enumerate() {
         if norm <= 0.0 {
             out.dropped.push(Dropped { index, reason: DropReason::Flat { deviation: norm } });
         } else if out.keypoints.len() == options.max_features {
@@ -116,6 +121,9 @@ pub fn sift(view: ImageView<'_, f32, 1>, options: &SiftOptions) -> Result<Descri
     }
     Ok(out)
 }
+
+/// A keypoint, its descriptor, and the length of that before it was normalised.
+type Feature = (Keypoint, [f32; DIMENSION], f32);
 
 fn keypoint(point: &Extremum, octave: &Octave, angle: f32) -> Keypoint {
     Keypoint {
