@@ -42,6 +42,7 @@ mod error;
 mod harris;
 mod histogram;
 mod matching;
+mod nearest;
 mod patch;
 mod rows;
 mod scale_space;

@@ -1,8 +1,9 @@
 //! Nearest-neighbour matching of descriptors.
 
 use crate::descriptors::{DescriptorKind, Descriptors};
+use crate::nearest::nearest;
+use crate::simd;
 use cv_core::DMatch;
-use rayon::prelude::*;
 
 /// Why two sets could not be matched.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
@@ -57,11 +58,14 @@ pub struct MatchOptions {
     pub measure: RatioMeasure,
     /// Keep a match only where each is the other's nearest. Default off.
     pub mutual: bool,
+    /// Of several matches with the same descriptor of the second set, keep only the one with the smallest distance (the first of equals). Default off;
+    /// mutual matches are one-to-one already.
+    pub one_to_one: bool,
 }
 
 impl Default for MatchOptions {
     fn default() -> Self {
-        Self { ratio: Some(0.66), measure: RatioMeasure::Ssd, mutual: false }
+        Self { ratio: Some(0.66), measure: RatioMeasure::Ssd, mutual: false, one_to_one: false }
     }
 }
 
@@ -89,11 +93,10 @@ pub fn match_descriptors(
     if let Some(ratio) = options.ratio.filter(|r| !(0.0..=1.0).contains(r)) {
         return Err(MatchError::BadRatio { ratio });
     }
-    let forward = two_nearest(query, train);
-    let backward = options.mutual.then(|| two_nearest(train, query));
+    let (forward, backward) = nearest(simd::level(), query, train, options.mutual);
     let mut matches = Vec::new();
     for (i, two) in forward.iter().enumerate() {
-        if backward.as_ref().is_some_and(|b| b[two.best as usize].best as usize != i) {
+        if options.mutual && backward[two.best as usize] as usize != i {
             continue;
         }
         let of_ssd = |v: f32| if options.measure == RatioMeasure::Ssd { v } else { v.sqrt() };
@@ -104,49 +107,24 @@ pub fn match_descriptors(
             matches.push(DMatch { query: i as u32, train: two.best, distance, ratio });
         }
     }
+    if options.one_to_one {
+        keep_nearest_of_each(&mut matches, train.len());
+    }
     Ok(matches)
 }
 
-/// The nearest and second-nearest neighbour of a descriptor.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct TwoNearest {
-    best: u32,
-    ssd: f32,
-    /// Infinite where there is only one candidate.
-    second_ssd: f32,
-}
-
-fn two_nearest(query: &Descriptors, train: &Descriptors) -> Vec<TwoNearest> {
-    let dimension = query.dimension();
-    query
-        .as_slice()
-        .par_chunks(dimension)
-        .with_min_len(16)
-        .map(|q| {
-            let mut two = TwoNearest { best: 0, ssd: f32::INFINITY, second_ssd: f32::INFINITY };
-            for (j, t) in train.as_slice().chunks_exact(dimension).enumerate() {
-                let d = ssd(q, t);
-                if d < two.ssd {
-                    two = TwoNearest { best: j as u32, ssd: d, second_ssd: two.ssd };
-                } else if d < two.second_ssd {
-                    two.second_ssd = d;
-                }
-            }
-            two
-        })
-        .collect()
-}
-
-/// Sum of squared differences, over 16 running sums so that it vectorises.
-fn ssd(a: &[f32], b: &[f32]) -> f32 {
-    let mut sums = [0.0f32; 16];
-    for (a, b) in a.chunks_exact(16).zip(b.chunks_exact(16)) {
-        for i in 0..16 {
-            let d = a[i] - b[i];
-            sums[i] += d * d;
-        }
+/// Leaves one match for each descriptor of the second set: that with the smallest distance, of equals the first.
+pub(crate) fn keep_nearest_of_each(matches: &mut Vec<DMatch>, train: usize) {
+    let mut best = vec![f32::INFINITY; train];
+    for m in matches.iter() {
+        let b = &mut best[m.train as usize];
+        *b = b.min(m.distance);
     }
-    sums.iter().sum()
+    let mut taken = vec![false; train];
+    matches.retain(|m| {
+        let t = m.train as usize;
+        m.distance <= best[t] && !std::mem::replace(&mut taken[t], true)
+    });
 }
 
 #[cfg(test)]
@@ -177,6 +155,8 @@ mod tests {
         let mutual = MatchOptions { mutual: true, ..all.clone() };
         let found = match_descriptors(&a, &b, &mutual).unwrap();
         assert_eq!(found.iter().map(|m| (m.query, m.train)).collect::<Vec<_>>(), [(0, 0), (1, 2)]);
+        let single = MatchOptions { one_to_one: true, ..all.clone() };
+        assert_eq!(match_descriptors(&a, &b, &single).unwrap(), found);
         let strict = MatchOptions { ratio: Some(0.05), ..MatchOptions::default() };
         assert_eq!(match_descriptors(&a, &b, &strict).unwrap().len(), 1);
     }

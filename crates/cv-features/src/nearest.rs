@@ -1,0 +1,343 @@
+//! Exact nearest neighbours by blocked matrix products.
+//!
+//! |q − t|² = |q|² + |t|² − 2 q·t: for a query the nearest candidate is the one with the largest q·t − |t|²/2. The products of six queries with a panel
+//! of candidates stay in registers, and the two best of each are picked before anything is stored. The same products give the nearest query
+//! of each candidate. The distances of what was picked are then computed anew as sums of squared differences, so equal descriptors are
+//! at distance zero.
+
+use crate::descriptors::Descriptors;
+use fearless_simd::{Level, dispatch, prelude::*};
+use rayon::prelude::*;
+
+/// The nearest and second-nearest neighbour of a descriptor.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct TwoNearest {
+    pub(crate) best: u32,
+    pub(crate) ssd: f32,
+    /// Infinite where there is only one candidate.
+    pub(crate) second_ssd: f32,
+}
+
+/// Queries of a register block.
+const QUERIES: usize = 6;
+/// Queries of a task: they and a panel fit the second-level cache.
+const TASK: usize = 16 * QUERIES;
+/// No candidate.
+const NONE: u32 = u32::MAX;
+
+/// For each query its two nearest candidates and, where asked for, for each candidate its nearest query. Of equally near ones the first counts.
+///
+/// Both sets must hold at least one descriptor, of the same dimension, and fewer than 2³² − 1.
+pub(crate) fn nearest(
+    level: Level,
+    query: &Descriptors,
+    train: &Descriptors,
+    both_ways: bool,
+) -> (Vec<TwoNearest>, Vec<u32>) {
+    dispatch!(level, simd => nearest_impl(simd, query, train, both_ways))
+}
+
+#[inline(always)]
+fn nearest_impl<S: Simd>(
+    simd: S,
+    query: &Descriptors,
+    train: &Descriptors,
+    both_ways: bool,
+) -> (Vec<TwoNearest>, Vec<u32>) {
+    // As many sums as the registers of the instruction set hold.
+    if S::f32s::LEN >= 16 {
+        blocked::<S, 4>(simd, query, train, both_ways)
+    } else {
+        blocked::<S, 2>(simd, query, train, both_ways)
+    }
+}
+
+/// Candidates, `V` vectors of them side by side, transposed so that a step of the product reads along.
+struct Panels {
+    /// Panel after panel: `dimension` rows of `wide` numbers.
+    data: Vec<f32>,
+    /// |t|²/2; infinite beyond the last candidate.
+    half_norms: Vec<f32>,
+    wide: usize,
+}
+
+impl Panels {
+    fn new(set: &Descriptors, wide: usize) -> Self {
+        let d = set.dimension();
+        let count = set.len().div_ceil(wide);
+        let mut data = vec![0.0f32; count * wide * d];
+        data.par_chunks_mut(wide * d).enumerate().for_each(|(p, panel)| {
+            for (j, row) in set.as_slice().chunks_exact(d).skip(p * wide).take(wide).enumerate() {
+                for (k, v) in row.iter().enumerate() {
+                    panel[k * wide + j] = *v;
+                }
+            }
+        });
+        let mut half_norms = vec![f32::INFINITY; count * wide];
+        half_norms.iter_mut().zip(set.as_slice().chunks_exact(d)).for_each(|(o, row)| *o = 0.5 * dot(row, row));
+        Self { data, half_norms, wide }
+    }
+}
+
+/// What is known about a query so far, lane by lane.
+struct Best {
+    score: Vec<f32>,
+    second: Vec<f32>,
+    index: Vec<u32>,
+    second_index: Vec<u32>,
+}
+
+fn blocked<S: Simd, const V: usize>(
+    simd: S,
+    query: &Descriptors,
+    train: &Descriptors,
+    both_ways: bool,
+) -> (Vec<TwoNearest>, Vec<u32>) {
+    let d = query.dimension();
+    let panels = Panels::new(train, V * S::f32s::LEN);
+    let tasks: Vec<(Vec<TwoNearest>, Vec<(f32, u32)>)> = query
+        .as_slice()
+        .par_chunks(TASK * d)
+        .enumerate()
+        .map(|(task, rows)| {
+            simd.vectorize(
+                #[inline(always)]
+                || block::<S, V>(simd, rows, (task * TASK) as u32, d, train, &panels, both_ways),
+            )
+        })
+        .collect();
+    let mut forward = Vec::with_capacity(query.len());
+    let mut backward = vec![(f32::NEG_INFINITY, NONE); if both_ways { train.len() } else { 0 }];
+    for (rows, columns) in tasks {
+        forward.extend(rows);
+        for (best, found) in backward.iter_mut().zip(columns) {
+            // Tasks come in order of their queries: the first of equals stays.
+            if found.0 > best.0 {
+                *best = found;
+            }
+        }
+    }
+    (forward, backward.into_iter().map(|b| b.1).collect())
+}
+
+/// The queries of a task against all panels.
+#[inline(always)]
+fn block<S: Simd, const V: usize>(
+    simd: S,
+    rows: &[f32],
+    first: u32,
+    d: usize,
+    train: &Descriptors,
+    panels: &Panels,
+    both_ways: bool,
+) -> (Vec<TwoNearest>, Vec<(f32, u32)>) {
+    let n = S::f32s::LEN;
+    let wide = panels.wide;
+    let count = rows.len() / d;
+    let groups = count.div_ceil(QUERIES);
+    // Each group interleaved: the six numbers of a step side by side. Queries beyond the last are zero and their results not looked at.
+    let mut packed = vec![0.0f32; groups * QUERIES * d];
+    for (i, row) in rows.chunks_exact(d).enumerate() {
+        let group = &mut packed[i / QUERIES * QUERIES * d..];
+        for (k, v) in row.iter().enumerate() {
+            group[k * QUERIES + i % QUERIES] = *v;
+        }
+    }
+    let mut half_norms = vec![f32::INFINITY; groups * QUERIES];
+    half_norms.iter_mut().zip(rows.chunks_exact(d)).for_each(|(o, row)| *o = 0.5 * dot(row, row));
+    let mut best = Best {
+        score: vec![f32::NEG_INFINITY; groups * QUERIES * n],
+        second: vec![f32::NEG_INFINITY; groups * QUERIES * n],
+        index: vec![NONE; groups * QUERIES * n],
+        second_index: vec![NONE; groups * QUERIES * n],
+    };
+    let mut columns = vec![(f32::NEG_INFINITY, NONE); 0];
+    let mut column_score = vec![f32::NEG_INFINITY; if both_ways { panels.half_norms.len() } else { 0 }];
+    let mut column_index = vec![NONE; column_score.len()];
+    let lanes: Vec<u32> = (0..n as u32).collect();
+    let lanes = S::u32s::from_slice(simd, &lanes);
+    for (p, panel) in panels.data.chunks_exact(wide * d).enumerate() {
+        let candidates = &panels.half_norms[p * wide..(p + 1) * wide];
+        for (g, group) in packed.chunks_exact(QUERIES * d).enumerate() {
+            let products = product::<S, V>(simd, group, panel);
+            for (i, products) in products.iter().enumerate() {
+                let at = (g * QUERIES + i) * n;
+                let mut score = S::f32s::from_slice(simd, &best.score[at..at + n]);
+                let mut second = S::f32s::from_slice(simd, &best.second[at..at + n]);
+                let mut index = S::u32s::from_slice(simd, &best.index[at..at + n]);
+                let mut second_index = S::u32s::from_slice(simd, &best.second_index[at..at + n]);
+                for (v, product) in products.iter().enumerate() {
+                    let own = lanes + (p * wide + v * n) as u32;
+                    let s = *product - S::f32s::from_slice(simd, &candidates[v * n..(v + 1) * n]);
+                    let better = s.simd_gt(score);
+                    let next = s.simd_gt(second);
+                    second_index = better.select(index, next.select(own, second_index));
+                    second = better.select(score, next.select(s, second));
+                    index = better.select(own, index);
+                    score = better.select(s, score);
+                }
+                score.store_slice(&mut best.score[at..at + n]);
+                second.store_slice(&mut best.second[at..at + n]);
+                index.store_slice(&mut best.index[at..at + n]);
+                second_index.store_slice(&mut best.second_index[at..at + n]);
+            }
+            if both_ways {
+                for v in 0..V {
+                    let at = p * wide + v * n;
+                    let mut score = S::f32s::from_slice(simd, &column_score[at..at + n]);
+                    let mut index = S::u32s::from_slice(simd, &column_index[at..at + n]);
+                    for (i, products) in products.iter().enumerate() {
+                        let query = g * QUERIES + i;
+                        let s = products[v] - half_norms[query];
+                        let better = s.simd_gt(score);
+                        index = better.select(S::u32s::splat(simd, first + query as u32), index);
+                        score = better.select(s, score);
+                    }
+                    score.store_slice(&mut column_score[at..at + n]);
+                    index.store_slice(&mut column_index[at..at + n]);
+                }
+            }
+        }
+    }
+    if both_ways {
+        columns = column_score.into_iter().zip(column_index).take(train.len()).collect();
+    }
+    let two = rows
+        .chunks_exact(d)
+        .enumerate()
+        .map(|(i, row)| {
+            let lanes = i * n..(i + 1) * n;
+            let firsts = lanes.clone().map(|l| (best.score[l], best.index[l]));
+            let seconds = lanes.map(|l| (best.second[l], best.second_index[l]));
+            pick(row, train, firsts.chain(seconds))
+        })
+        .collect();
+    (two, columns)
+}
+
+/// Six queries times a panel of candidates.
+#[inline(always)]
+fn product<S: Simd, const V: usize>(simd: S, group: &[f32], panel: &[f32]) -> [[S::f32s; V]; QUERIES] {
+    let n = S::f32s::LEN;
+    let mut sums = [[S::f32s::splat(simd, 0.0); V]; QUERIES];
+    for (queries, candidates) in group.chunks_exact(QUERIES).zip(panel.chunks_exact(V * n)) {
+        let mut step = [S::f32s::splat(simd, 0.0); V];
+        for v in 0..V {
+            step[v] = S::f32s::from_slice(simd, &candidates[v * n..(v + 1) * n]);
+        }
+        for i in 0..QUERIES {
+            let q = S::f32s::splat(simd, queries[i]);
+            for v in 0..V {
+                sums[i][v] = q.mul_add(step[v], sums[i][v]);
+            }
+        }
+    }
+    sums
+}
+
+/// The two best of the lanes, with their true distances.
+fn pick(row: &[f32], train: &Descriptors, found: impl Iterator<Item = (f32, u32)>) -> TwoNearest {
+    let mut two = [(f32::NEG_INFINITY, NONE); 2];
+    for (score, index) in found.filter(|f| f.1 != NONE) {
+        let before = |other: (f32, u32)| score > other.0 || (score == other.0 && index < other.1);
+        if before(two[0]) {
+            two = [(score, index), two[0]];
+        } else if before(two[1]) {
+            two[1] = (score, index);
+        }
+    }
+    let distance = |index: u32| if index == NONE { f32::INFINITY } else { ssd(row, train.row(index as usize)) };
+    let (a, b) = (distance(two[0].1), distance(two[1].1));
+    // The products round differently from the differences: what is nearer by these is nearer.
+    if b < a {
+        TwoNearest { best: two[1].1, ssd: b, second_ssd: a }
+    } else {
+        TwoNearest { best: two[0].1, ssd: a, second_ssd: b }
+    }
+}
+
+/// Sum of squared differences, over 16 running sums so that it vectorises.
+pub(crate) fn ssd(a: &[f32], b: &[f32]) -> f32 {
+    let mut sums = [0.0f32; 16];
+    for (a, b) in a.as_chunks::<16>().0.iter().zip(b.as_chunks::<16>().0) {
+        for i in 0..16 {
+            let d = a[i] - b[i];
+            sums[i] += d * d;
+        }
+    }
+    sums.iter().sum()
+}
+
+fn dot(a: &[f32], b: &[f32]) -> f32 {
+    let mut sums = [0.0f32; 16];
+    for (a, b) in a.as_chunks::<16>().0.iter().zip(b.as_chunks::<16>().0) {
+        for i in 0..16 {
+            sums[i] += a[i] * b[i];
+        }
+    }
+    sums.iter().sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::descriptors::DescriptorKind;
+    use crate::simd::tests::levels;
+    use proptest::prelude::*;
+
+    /// The definition: every distance in f64, the first of equals.
+    fn plain(query: &Descriptors, train: &Descriptors) -> Vec<(usize, f64, f64)> {
+        let distance = |i: usize, j: usize| -> f64 {
+            query.row(i).iter().zip(train.row(j)).map(|(a, b)| f64::from(a - b).powi(2)).sum()
+        };
+        (0..query.len())
+            .map(|i| {
+                let mut two = (0, f64::INFINITY, f64::INFINITY);
+                for j in 0..train.len() {
+                    let s = distance(i, j);
+                    if s < two.1 {
+                        two = (j, s, two.1);
+                    } else if s < two.2 {
+                        two.2 = s;
+                    }
+                }
+                two
+            })
+            .collect()
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(40))]
+        #[test]
+        fn equals_the_definition(nq in 1usize..230, nt in 1usize..260, values in 2u32..40, seed in any::<u32>()) {
+            // Whole numbers, so that sums are exact and duplicates and ties occur.
+            let mut state = seed | 1;
+            let mut set = |n: usize| {
+                let data = (0..n * 64)
+                    .map(|k| {
+                        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                        // Few of the dimensions differ, so that whole descriptors coincide.
+                        if k % 64 < 3 { (state >> 16) as f32 % values as f32 } else { 1.0 }
+                    })
+                    .collect();
+                Descriptors::from_vec(DescriptorKind::Patch, data).unwrap()
+            };
+            let (query, train) = (set(nq), set(nt));
+            let expected = plain(&query, &train);
+            let back = plain(&train, &query);
+            for level in levels() {
+                for both_ways in [false, true] {
+                    let (forward, backward) = nearest(level, &query, &train, both_ways);
+                    for (f, e) in forward.iter().zip(&expected) {
+                        prop_assert_eq!((f.best as usize, f64::from(f.ssd), f64::from(f.second_ssd)), *e, "{:?}", level);
+                    }
+                    prop_assert_eq!(forward.len(), nq);
+                    prop_assert_eq!(backward.len(), if both_ways { nt } else { 0 });
+                    for (b, e) in backward.iter().zip(&back) {
+                        prop_assert_eq!(*b as usize, e.0, "{:?}", level);
+                    }
+                }
+            }
+        }
+    }
+}
