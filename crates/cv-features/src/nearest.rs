@@ -87,6 +87,9 @@ struct Best {
     second_index: Vec<u32>,
 }
 
+/// What one task finds: the two nearest of its queries, and of each candidate the best of its queries.
+type Task = (Vec<TwoNearest>, Vec<(f32, u32)>);
+
 fn blocked<S: Simd, const V: usize>(
     simd: S,
     query: &Descriptors,
@@ -95,7 +98,7 @@ fn blocked<S: Simd, const V: usize>(
 ) -> (Vec<TwoNearest>, Vec<u32>) {
     let d = query.dimension();
     let panels = Panels::new(train, V * S::f32s::LEN);
-    let tasks: Vec<(Vec<TwoNearest>, Vec<(f32, u32)>)> = query
+    let tasks: Vec<Task> = query
         .as_slice()
         .par_chunks(TASK * d)
         .enumerate()
@@ -130,7 +133,7 @@ fn block<S: Simd, const V: usize>(
     train: &Descriptors,
     panels: &Panels,
     both_ways: bool,
-) -> (Vec<TwoNearest>, Vec<(f32, u32)>) {
+) -> Task {
     let n = S::f32s::LEN;
     let wide = panels.wide;
     let count = rows.len() / d;
