@@ -1,6 +1,8 @@
 //! What can be wrong with an image handed to a detector or descriptor.
 
+use crate::simd;
 use cv_core::ImageView;
+use rayon::prelude::*;
 
 /// Why an image has no features to give.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
@@ -41,16 +43,12 @@ pub(crate) fn check_image(view: ImageView<'_, f32, 1>, needed: usize) -> Result<
     if width < needed || height < needed {
         return Err(FeatureError::ImageTooSmall { width, height, needed });
     }
-    for y in 0..height {
-        // v·0 is 0 for every finite v and NaN for the rest: a sum that vectorises.
-        let row = view.row(y);
-        if row.iter().map(|v| v * 0.0).fold(false, |bad, z| bad | (z != 0.0))
-            && let Some(x) = row.iter().position(|v| !v.is_finite())
-        {
-            return Err(FeatureError::NotFinite { x, y });
-        }
+    let level = simd::level();
+    let bad = (0..height).into_par_iter().with_min_len(64).find_first(|&y| !simd::all_finite(level, view.row(y)));
+    match bad.and_then(|y| Some((view.row(y).iter().position(|v| !v.is_finite())?, y))) {
+        Some((x, y)) => Err(FeatureError::NotFinite { x, y }),
+        None => Ok(()),
     }
-    Ok(())
 }
 
 /// Refuses an option outside `ok`.

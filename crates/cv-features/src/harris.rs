@@ -1,17 +1,35 @@
-//! Harris corners.
+//! Harris corners, and those of Shi & Tomasi.
 //!
-//! Source: C. Harris & M. Stephens, "A combined corner and edge detector", Alvey Vision Conference 1988.
+//! Sources: C. Harris & M. Stephens, "A combined corner and edge detector", Alvey Vision Conference 1988; J. Shi & C. Tomasi, "Good features to
+//! track", CVPR 1994.
 
 use crate::error::{FeatureError, check_image, check_option};
-use crate::rows::mirror;
+use crate::rows::Ring;
+use crate::simd;
+use crate::structure::{Structure, Walk};
 use cv_core::{GrayF32, ImageView, Keypoint};
-use cv_imgproc::gaussian_blur;
+use cv_imgproc::gaussian_half_kernel;
+use fearless_simd::Level;
+use rayon::prelude::*;
+use std::ops::Range;
+
+/// What makes a pixel a corner, from the two eigenvalues λ₁ ≤ λ₂ of its structure tensor.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum CornerMeasure {
+    /// λ₁λ₂ − k·(λ₁ + λ₂)² (Harris & Stephens).
+    Harris {
+        /// Weight of the squared trace. 0 to 0.25; usually 0.04 (Harris & Stephens' range is 0.04 to 0.06).
+        k: f32,
+    },
+    /// λ₁ (Shi & Tomasi): more corners on weak texture beside strong, for the same share of the strongest.
+    ShiTomasi,
+}
 
 /// Settings of [`harris`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct HarrisOptions {
-    /// Weight of the squared trace in `det − k·trace²`. 0 to 0.25; default 0.04 (Harris & Stephens' range is 0.04 to 0.06).
-    pub k: f32,
+    /// The corner measure. Default Harris with `k` = 0.04.
+    pub measure: CornerMeasure,
     /// Standard deviation of the Gaussian window over the gradient products, in pixels. 0.3 to 20; default 1, the integration
     /// scale that Brown, Szeliski & Winder pair with single-pixel gradients (their 1.5, less what the Sobel mask smooths).
     pub window_sigma: f32,
@@ -22,22 +40,33 @@ pub struct HarrisOptions {
 
 impl Default for HarrisOptions {
     fn default() -> Self {
-        Self { k: 0.04, window_sigma: 1.0, threshold: 0.01 }
+        Self { measure: CornerMeasure::Harris { k: 0.04 }, window_sigma: 1.0, threshold: 0.01 }
     }
 }
 
 impl HarrisOptions {
     fn check(&self) -> Result<(), FeatureError> {
-        check_option("k", self.k.into(), "0 to 0.25", |v| (0.0..=0.25).contains(&v))?;
+        if let CornerMeasure::Harris { k } = self.measure {
+            check_option("k", k.into(), "0 to 0.25", |v| (0.0..=0.25).contains(&v))?;
+        }
         check_option("window_sigma", self.window_sigma.into(), "0.3 to 20 px", |v| (0.3..=20.0).contains(&v))?;
         check_option("threshold", self.threshold.into(), "0 to 1", |v| (0.0..=1.0).contains(&v))
+    }
+
+    fn plan<'a>(&self, view: ImageView<'a, f32, 1>, level: Level) -> Structure<'a> {
+        Structure { view, kernel: gaussian_half_kernel(self.window_sigma), measure: self.measure, level }
     }
 }
 
 /// The smallest image with a pixel that has all its eight neighbours.
 const SMALLEST: usize = 3;
 
-/// The Harris response `det M − k·(trace M)²` of every pixel.
+/// Rows that a task works on: enough that the rows its window reaches beyond them cost little, few enough to share out.
+fn rows_of_a_task(h: usize) -> usize {
+    h.div_ceil(4 * rayon::current_num_threads()).max(48)
+}
+
+/// The corner measure of every pixel: for Harris `det M − k·(trace M)²`, for Shi & Tomasi the smaller eigenvalue of M.
 ///
 /// M is the Gaussian-weighted sum of gradient products, the gradient being the 3×3 Sobel mask divided by 8 (so that a ramp of slope s
 /// has gradient s). Borders are mirrored (OpenCV's BORDER_REFLECT_101).
@@ -47,63 +76,74 @@ const SMALLEST: usize = 3;
 pub fn harris_response(view: ImageView<'_, f32, 1>, options: &HarrisOptions) -> Result<GrayF32, FeatureError> {
     options.check()?;
     check_image(view, SMALLEST)?;
-    let (w, h) = view.size();
-    let mut products = [(); 3].map(|()| GrayF32::new(w, h, [0.0]));
-    for y in 0..h {
-        let rows = [-1, 0, 1].map(|dy| view.row(mirror(y as isize + dy, h)));
-        for x in 0..w {
-            let (l, r) = (mirror(x as isize - 1, w), mirror(x as isize + 1, w));
-            let [a, b, c] = rows;
-            let gx = ((a[r] - a[l]) + 2.0 * (b[r] - b[l]) + (c[r] - c[l])) * 0.125;
-            let gy = ((c[l] - a[l]) + 2.0 * (c[x] - a[x]) + (c[r] - a[r])) * 0.125;
-            products[0].set(x, y, [gx * gx]);
-            products[1].set(x, y, [gx * gy]);
-            products[2].set(x, y, [gy * gy]);
-        }
-    }
-    let [xx, xy, yy] = products.map(|p| gaussian_blur(p.view(), options.window_sigma));
-    Ok(GrayF32::from_fn(w, h, |x, y| {
-        let ([xx], [xy], [yy]) = (xx.at(x, y), xy.at(x, y), yy.at(x, y));
-        let trace = xx + yy;
-        [xx * yy - xy * xy - options.k * trace * trace]
-    }))
+    Ok(response(&options.plan(view, simd::level())))
+}
+
+fn response(plan: &Structure<'_>) -> GrayF32 {
+    let (w, h) = plan.view.size();
+    let mut out = GrayF32::new(w, h, [0.0]);
+    let rows = rows_of_a_task(h);
+    out.as_mut_slice().par_chunks_mut(rows * w).enumerate().for_each(|(i, strip)| {
+        let mut walk = Walk::new(plan, i * rows);
+        strip.chunks_exact_mut(w).enumerate().for_each(|(y, row)| walk.row(i * rows + y, row));
+    });
+    out
 }
 
 /// Harris corners: local maxima of [`harris_response`] above a share of the strongest, with sub-pixel positions, in raster order.
 ///
 /// A corner is a pixel (not of the outermost ring) whose response is not exceeded in its 3×3 neighbourhood; of a plateau, the first
 /// pixel in raster order. Its position is refined to the maximum of the quadratic through the nine responses, at most
-/// half a pixel away. A flat image has no corners: the result is empty.
+/// half a pixel away. A flat image has no corners: the result is empty. No full-size image is stored on the way.
 ///
 /// # Errors
 /// As [`harris_response`].
 pub fn harris(view: ImageView<'_, f32, 1>, options: &HarrisOptions) -> Result<Vec<Keypoint>, FeatureError> {
-    let response = harris_response(view, options)?;
-    let (w, h) = response.size();
-    let max = response.as_slice().iter().fold(0.0f32, |m, &v| m.max(v));
-    let least = options.threshold * max;
-    let mut corners = Vec::new();
-    for y in 1..h - 1 {
-        let [above, here, below] = [response.row(y - 1), response.row(y), response.row(y + 1)];
-        for x in 1..w - 1 {
+    options.check()?;
+    check_image(view, SMALLEST)?;
+    Ok(corners(&options.plan(view, simd::level()), options.threshold))
+}
+
+fn corners(plan: &Structure<'_>, threshold: f32) -> Vec<Keypoint> {
+    let h = plan.view.height();
+    let rows = rows_of_a_task(h);
+    let strips: Vec<(f32, Vec<Keypoint>)> = (0..h.div_ceil(rows))
+        .into_par_iter()
+        .map(|i| strip_corners(plan, threshold, i * rows..((i + 1) * rows).min(h)))
+        .collect();
+    let max = strips.iter().fold(0.0f32, |m, s| m.max(s.0));
+    let mut corners: Vec<Keypoint> = strips.into_iter().flat_map(|s| s.1).collect();
+    corners.retain(|c| c.response >= threshold * max);
+    corners
+}
+
+/// The largest response of some rows, and their corners above the threshold (against that largest response: a few too many).
+fn strip_corners(plan: &Structure<'_>, threshold: f32, rows: Range<usize>) -> (f32, Vec<Keypoint>) {
+    let (w, h) = plan.view.size();
+    let (first, last) = (rows.start.saturating_sub(1), (rows.end + 1).min(h));
+    let mut walk = Walk::new(plan, first);
+    let mut ring = Ring::new(0..w, 3);
+    let (mut max, mut seen, mut found) = (0.0f32, Vec::new(), Vec::new());
+    for y in first..last {
+        walk.row(y, ring.row_mut(y));
+        max = simd::maximum(plan.level, ring.row(y), max);
+        if y < first + 2 {
+            continue;
+        }
+        // The row above now has both its neighbours.
+        let [above, here, below] = [y - 2, y - 1, y].map(|y| ring.row(y));
+        seen.clear();
+        simd::peaks(plan.level, [above, here, below], threshold * max, &mut seen);
+        for &x in &seen {
             let v = here[x];
-            if v > 0.0
-                && v >= least
-                && v > above[x - 1]
-                && v > above[x]
-                && v > above[x + 1]
-                && v > here[x - 1]
-                && v >= here[x + 1]
-                && v >= below[x - 1]
-                && v >= below[x]
-                && v >= below[x + 1]
-            {
+            // Of a plateau the first pixel.
+            if v > above[x - 1] && v > above[x] && v > above[x + 1] && v > here[x - 1] {
                 let (dx, dy) = quadratic_peak([above, here, below].map(|r| [r[x - 1], r[x], r[x + 1]]));
-                corners.push(Keypoint::new(x as f32 + dx, y as f32 + dy, v));
+                found.push(Keypoint::new(x as f32 + dx, (y - 1) as f32 + dy, v));
             }
         }
     }
-    Ok(corners)
+    (max, found)
 }
 
 /// Offset from the middle of the maximum of the quadratic through 3×3 values (least squares for the cross term), each part held to ±0.5.
@@ -128,22 +168,99 @@ pub(crate) fn quadratic_peak(v: [[f32; 3]; 3]) -> (f32, f32) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::rows::mirror;
+    use crate::simd::tests::levels;
+    use crate::structure::{harris_at, products_at, smaller_eigenvalue};
     use cv_core::Image;
+    use cv_imgproc::gaussian_blur;
+    use proptest::prelude::*;
+
+    /// The definition, whole image after whole image.
+    fn plain_response(view: ImageView<'_, f32, 1>, options: &HarrisOptions) -> GrayF32 {
+        let (w, h) = view.size();
+        let product =
+            |i: usize| {
+                GrayF32::from_fn(w, h, |x, y| {
+                    [products_at([-1, 0, 1].map(|dy| view.row(mirror(y as isize + dy, h))), x)[i]]
+                })
+            };
+        let [xx, xy, yy] = [0, 1, 2].map(|i| gaussian_blur(product(i).view(), options.window_sigma));
+        GrayF32::from_fn(w, h, |x, y| {
+            let ([xx], [xy], [yy]) = (xx.at(x, y), xy.at(x, y), yy.at(x, y));
+            [match options.measure {
+                CornerMeasure::Harris { k } => harris_at(xx, xy, yy, k),
+                CornerMeasure::ShiTomasi => smaller_eigenvalue(xx, xy, yy),
+            }]
+        })
+    }
+
+    /// Corners straight from the words of [`harris`].
+    fn plain_corners(response: &GrayF32, threshold: f32) -> Vec<Keypoint> {
+        let (w, h) = response.size();
+        let max = response.as_slice().iter().fold(0.0f32, |m, &v| m.max(v));
+        let mut corners = Vec::new();
+        for y in 1..h - 1 {
+            for x in 1..w - 1 {
+                let around = [y - 1, y, y + 1].map(|y| [x - 1, x, x + 1].map(|x| response.at(x, y)[0]));
+                let v = around[1][1];
+                let before = around.iter().flatten().take(4).all(|&o| v > o);
+                let after = around.iter().flatten().skip(5).all(|&o| v >= o);
+                if v > 0.0 && v >= threshold * max && before && after {
+                    let (dx, dy) = quadratic_peak(around);
+                    corners.push(Keypoint::new(x as f32 + dx, y as f32 + dy, v));
+                }
+            }
+        }
+        corners
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(60))]
+        #[test]
+        fn one_pass_equals_whole_image_passes(
+            w in 3usize..90, h in 3usize..150, sigma in 0.3f32..3.0, cell in 1usize..9, seed in any::<u32>(), shi in any::<bool>()
+        ) {
+            // Squares of random grey: corners, plateaus and flat places.
+            let image = GrayF32::from_fn(w, h, |x, y| {
+                let mut v = ((x / cell) as u32).wrapping_mul(0x9E37_79B9) ^ ((y / cell) as u32).wrapping_mul(0x85EB_CA6B) ^ seed;
+                v = (v ^ (v >> 15)).wrapping_mul(0x2C1B_3C6D);
+                v = (v ^ (v >> 12)).wrapping_mul(0x297A_2D39);
+                [((v ^ (v >> 15)) >> 28) as f32 / 15.0]
+            });
+            let measure = if shi { CornerMeasure::ShiTomasi } else { CornerMeasure::Harris { k: 0.05 } };
+            let options = HarrisOptions { measure, window_sigma: sigma, ..HarrisOptions::default() };
+            let expected = plain_response(image.view(), &options);
+            let expected_corners = plain_corners(&expected, options.threshold);
+            for level in levels() {
+                let plan = options.plan(image.view(), level);
+                prop_assert_eq!(&response(&plan), &expected, "{:?}", level);
+                prop_assert_eq!(&corners(&plan, options.threshold), &expected_corners, "{:?}", level);
+                // Wherever the image is cut.
+                let mut walk = Walk::new(&plan, h / 2);
+                let mut row = vec![0.0; w];
+                walk.row(h / 2, &mut row);
+                prop_assert_eq!(&row[..], expected.row(h / 2), "{:?}", level);
+            }
+        }
+    }
 
     #[test]
     fn a_square_has_its_four_corners() {
         let image =
             GrayF32::from_fn(40, 30, |x, y| [if (10..25).contains(&x) && (8..20).contains(&y) { 0.8 } else { 0.2 }]);
-        let mut corners = harris(image.view(), &HarrisOptions::default()).unwrap();
-        corners.sort_by(|a, b| b.response.total_cmp(&a.response));
-        // Edges lie half-way between pixels: (9.5, 7.5) to (24.5, 19.5). The Harris maximum of a right angle smoothed by a window of
-        // sigma about 1 lies inside the corner by less than that sigma.
-        for (x, y) in [(9.5, 7.5), (24.5, 7.5), (9.5, 19.5), (24.5, 19.5)] {
-            let inside =
-                corners[..4].iter().filter(|c| (c.position.x - x).abs() < 1.0 && (c.position.y - y).abs() < 1.0);
-            assert_eq!(inside.count(), 1, "near ({x}, {y}) in {corners:?}");
+        for measure in [CornerMeasure::Harris { k: 0.04 }, CornerMeasure::ShiTomasi] {
+            let mut corners =
+                harris(image.view(), &HarrisOptions { measure, threshold: 0.1, ..HarrisOptions::default() }).unwrap();
+            corners.sort_by(|a, b| b.response.total_cmp(&a.response));
+            // Edges lie half-way between pixels: (9.5, 7.5) to (24.5, 19.5). The Harris maximum of a right angle smoothed by a window of
+            // sigma about 1 lies inside the corner by less than that sigma.
+            for (x, y) in [(9.5, 7.5), (24.5, 7.5), (9.5, 19.5), (24.5, 19.5)] {
+                let inside =
+                    corners[..4].iter().filter(|c| (c.position.x - x).abs() < 1.0 && (c.position.y - y).abs() < 1.0);
+                assert_eq!(inside.count(), 1, "near ({x}, {y}) in {corners:?}");
+            }
+            assert_eq!(corners.len(), 4);
         }
-        assert_eq!(corners.len(), 4);
     }
 
     #[test]

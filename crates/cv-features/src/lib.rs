@@ -48,11 +48,12 @@ mod rows;
 mod scale_space;
 mod sift;
 mod simd;
+mod structure;
 
 pub use anms::{anms, suppression_radii};
 pub use descriptors::{Described, DescriptorKind, Descriptors, DropReason, Dropped};
 pub use error::FeatureError;
-pub use harris::{HarrisOptions, harris, harris_response};
+pub use harris::{CornerMeasure, HarrisOptions, harris, harris_response};
 pub use matching::{MatchError, MatchOptions, RatioMeasure, match_descriptors};
 pub use patch::{PatchOptions, describe_patches};
 pub use sift::{SiftOptions, sift};

@@ -226,6 +226,70 @@ fn extremes_impl<S: Simd>(
     }
 }
 
+/// Adds the columns, but the first and the last, where the middle row is above zero, not below `floor`, and not below any of the eight neighbours.
+pub(crate) fn peaks(level: Level, rows: [&[f32]; 3], floor: f32, found: &mut Vec<usize>) {
+    dispatch!(level, simd => peaks_impl(simd, rows, floor, found));
+}
+
+#[inline(always)]
+fn peaks_impl<S: Simd>(simd: S, rows: [&[f32]; 3], floor: f32, found: &mut Vec<usize>) {
+    let n = S::f32s::LEN;
+    let [above, here, below] = rows;
+    let end = here.len() - 1;
+    let (zero, floor_lanes) = (S::f32s::splat(simd, 0.0), S::f32s::splat(simd, floor));
+    let mut x = 1;
+    while x + n <= end {
+        let load = |row: &[f32], x: usize| S::f32s::from_slice(simd, &row[x..x + n]);
+        let v = load(here, x);
+        let mut high = v.simd_gt(zero) & v.simd_ge(floor_lanes);
+        if high.to_bitmask() != 0 {
+            high &= v.simd_ge(load(here, x - 1).max(load(here, x + 1)));
+            for row in [above, below] {
+                high &= v.simd_ge(load(row, x - 1).max(load(row, x)).max(load(row, x + 1)));
+            }
+            let mut hits = high.to_bitmask();
+            while hits != 0 {
+                found.push(x + hits.trailing_zeros() as usize);
+                hits &= hits - 1;
+            }
+        }
+        x += n;
+    }
+    found.extend((x..end).filter(|&x| {
+        let v = here[x];
+        v > 0.0 && v >= floor && rows.iter().all(|row| row[x - 1..x + 2].iter().all(|&o| v >= o))
+    }));
+}
+
+/// Whether no sample is NaN or infinite.
+pub(crate) fn all_finite(level: Level, row: &[f32]) -> bool {
+    dispatch!(level, simd => all_finite_impl(simd, row))
+}
+
+#[inline(always)]
+fn all_finite_impl<S: Simd>(_: S, row: &[f32]) -> bool {
+    // v·0 is 0 for every finite v and NaN for the rest.
+    row.iter().fold(true, |good, v| good & (v * 0.0 == 0.0))
+}
+
+/// The largest of `row` and `least`.
+pub(crate) fn maximum(level: Level, row: &[f32], least: f32) -> f32 {
+    dispatch!(level, simd => maximum_impl(simd, row, least))
+}
+
+#[inline(always)]
+fn maximum_impl<S: Simd>(_: S, row: &[f32], least: f32) -> f32 {
+    let more = |a: f32, b: f32| if b > a { b } else { a };
+    let (blocks, rest) = row.as_chunks::<32>();
+    let mut lanes = [least; 32];
+    for block in blocks {
+        for i in 0..32 {
+            lanes[i] = more(lanes[i], block[i]);
+        }
+    }
+    lanes.into_iter().chain(rest.iter().copied()).fold(least, more)
+}
+
 #[inline(always)]
 fn is_extreme(differences: [[&[f32]; 3]; 3], x: usize, floor: f32) -> bool {
     let v = differences[1][1][x];
