@@ -2,8 +2,8 @@
 //!
 //! Source: M. Brown, R. Szeliski & S. Winder, "Multi-image matching using multi-scale oriented patches", CVPR 2005, section 3.
 //! A corner's suppression radius is the distance to the nearest corner that is stronger by the factor `1 / robust`; the `n` corners with the
-//! largest radii are kept. The definition costs O(n²); here a k-d tree whose nodes know their largest response answers
-//! "nearest sufficiently stronger corner" by branch and bound, near O(n log n) in all, with the same result.
+//! largest radii are kept. The definition costs O(n²); here a tree of boxes that know their largest response answers
+//! "nearest sufficiently stronger corner" by branch and bound, and most corners fall out before they ask: near O(n log n), with the same result.
 
 use cv_core::Keypoint;
 use rayon::prelude::*;
@@ -17,65 +17,60 @@ const LEAF: usize = 8;
 /// ordered by falling response, then by index. `robust` is 0 to 1; Brown, Szeliski & Winder use 0.9. Corners whose position
 /// or response is not finite are never chosen and suppress nothing.
 pub fn anms(corners: &[Keypoint], n: usize, robust: f32) -> Vec<usize> {
-    let radii = suppression_radii(corners, robust);
-    let mut order: Vec<usize> = (0..corners.len()).filter(|&i| !radii[i].is_nan()).collect();
-    let by_radius = |&a: &usize, &b: &usize| {
-        radii[b].total_cmp(&radii[a]).then(corners[b].response.total_cmp(&corners[a].response)).then(a.cmp(&b))
-    };
-    if n == 0 {
+    let tree = Tree::new(corners, robust);
+    let total = tree.points.len();
+    if n == 0 || total == 0 {
         return Vec::new();
     }
-    if n < order.len() {
-        order.select_nth_unstable_by(n - 1, by_radius);
-        order.truncate(n);
+    let mut found = if total > 4 * n {
+        // The n-th largest radius among any of them is a bound on that of all: whoever has a suppressor nearer than that is out, and its radius need
+        // not be known. Strong corners have large radii.
+        let mut strong: Vec<u32> = (0..total as u32).collect();
+        let response = |p: u32| tree.points[p as usize].response;
+        strong.select_nth_unstable_by(2 * n, |&a, &b| response(b).total_cmp(&response(a)).then(a.cmp(&b)));
+        strong.truncate(2 * n);
+        let mut radii: Vec<f32> = tree.radii(&strong, 0.0).into_iter().map(|f| f.1).collect();
+        let bound = *radii.select_nth_unstable_by(n - 1, |a, b| b.total_cmp(a)).1;
+        tree.radii(&tree.candidates(bound), bound)
+    } else {
+        tree.radii(&(0..total as u32).collect::<Vec<_>>(), 0.0)
+    };
+    let by_radius = |a: &(u32, f32), b: &(u32, f32)| {
+        let response = |i: u32| corners[i as usize].response;
+        b.1.total_cmp(&a.1).then(response(b.0).total_cmp(&response(a.0))).then(a.0.cmp(&b.0))
+    };
+    if n < found.len() {
+        found.select_nth_unstable_by(n - 1, by_radius);
+        found.truncate(n);
     }
-    order.sort_unstable_by(by_radius);
-    order
+    found.sort_unstable_by(by_radius);
+    found.into_iter().map(|f| f.0 as usize).collect()
 }
 
 /// The squared suppression radius of each corner, in square pixels; NaN for a corner that is not finite. See [`anms`].
 pub fn suppression_radii(corners: &[Keypoint], robust: f32) -> Vec<f32> {
-    let mut points: Vec<Point> = corners
-        .iter()
-        .enumerate()
-        .filter(|(_, c)| usable(c))
-        .map(|(i, c)| Point { at: [c.position.x, c.position.y], suppresses: robust * c.response, index: i as u32 })
-        .collect();
+    let tree = Tree::new(corners, robust);
     let mut radii = vec![f32::NAN; corners.len()];
-    if points.is_empty() {
-        return radii;
-    }
-    let mut nodes = vec![Node::default(); 2 * points.len().div_ceil(LEAF).next_power_of_two()];
-    build(&mut nodes, 1, &mut points);
-    let found: Vec<(u32, f32)> = points
-        .par_iter()
-        .with_min_len(256)
-        .map(|p| {
-            let mut best = f32::INFINITY;
-            nearest(&nodes, &points, 1, (0, points.len()), p.at, corners[p.index as usize].response, &mut best);
-            (p.index, best)
-        })
-        .collect();
-    for (index, radius) in found {
+    for (index, radius) in tree.radii(&(0..tree.points.len() as u32).collect::<Vec<_>>(), 0.0) {
         radii[index as usize] = radius;
     }
     radii
 }
 
-fn usable(c: &Keypoint) -> bool {
+pub(crate) fn usable(c: &Keypoint) -> bool {
     c.position.x.is_finite() && c.position.y.is_finite() && c.response.is_finite()
 }
 
 #[derive(Clone, Copy)]
 struct Point {
     at: [f32; 2],
+    response: f32,
     /// Corners with a response below this are suppressed by this one.
     suppresses: f32,
     index: u32,
 }
 
-/// A node of the implicit tree: the box of its corners and the largest `suppresses` among them. Node `i` has children `2i` and `2i + 1`, each
-/// with half of the corners.
+/// The box of some corners and the largest `suppresses` among them.
 #[derive(Clone, Copy)]
 struct Node {
     low: [f32; 2],
@@ -83,73 +78,162 @@ struct Node {
     suppresses: f32,
 }
 
-impl Default for Node {
-    fn default() -> Self {
-        Self { low: [f32::INFINITY; 2], high: [f32::NEG_INFINITY; 2], suppresses: f32::NEG_INFINITY }
-    }
-}
-
 impl Node {
+    const EMPTY: Self = Self { low: [f32::INFINITY; 2], high: [f32::NEG_INFINITY; 2], suppresses: f32::NEG_INFINITY };
+
+    fn around(&self, other: &Self) -> Self {
+        Self {
+            low: [self.low[0].min(other.low[0]), self.low[1].min(other.low[1])],
+            high: [self.high[0].max(other.high[0]), self.high[1].max(other.high[1])],
+            suppresses: self.suppresses.max(other.suppresses),
+        }
+    }
+
     /// Squared distance from the box.
     fn distance(&self, p: [f32; 2]) -> f32 {
         let d = |i: usize| (self.low[i] - p[i]).max(p[i] - self.high[i]).max(0.0);
         let (x, y) = (d(0), d(1));
         x * x + y * y
     }
+
+    /// Squared length of the diagonal: no two corners in the box are further apart, computed in the same numbers.
+    fn diagonal(&self) -> f32 {
+        let (x, y) = (self.high[0] - self.low[0], self.high[1] - self.low[1]);
+        x * x + y * y
+    }
 }
 
-fn build(nodes: &mut [Node], node: usize, points: &mut [Point]) {
-    let mut bounds = Node::default();
-    for p in points.iter() {
-        for (i, v) in p.at.into_iter().enumerate() {
-            bounds.low[i] = bounds.low[i].min(v);
-            bounds.high[i] = bounds.high[i].max(v);
+/// The finite corners along a Morton curve, and over each [`LEAF`] of them a binary tree of boxes: node `i` has the children `2i` and `2i + 1`.
+struct Tree {
+    nodes: Vec<Node>,
+    points: Vec<Point>,
+}
+
+impl Tree {
+    fn new(corners: &[Keypoint], robust: f32) -> Self {
+        let mut bounds = Node::EMPTY;
+        for c in corners.iter().filter(|c| usable(c)) {
+            let at = [c.position.x, c.position.y];
+            bounds = bounds.around(&Node { low: at, high: at, suppresses: 0.0 });
         }
-        bounds.suppresses = bounds.suppresses.max(p.suppresses);
-    }
-    nodes[node] = bounds;
-    if points.len() > LEAF {
-        let axis = usize::from(bounds.high[1] - bounds.low[1] > bounds.high[0] - bounds.low[0]);
-        let middle = points.len() / 2;
-        points.select_nth_unstable_by(middle, |a, b| a.at[axis].total_cmp(&b.at[axis]));
-        let (left, right) = points.split_at_mut(middle);
-        build(nodes, 2 * node, left);
-        build(nodes, 2 * node + 1, right);
-    }
-}
-
-/// Lowers `best` to the squared distance of the nearest corner that suppresses `response`.
-fn nearest(
-    nodes: &[Node],
-    points: &[Point],
-    node: usize,
-    (from, to): (usize, usize),
-    at: [f32; 2],
-    response: f32,
-    best: &mut f32,
-) {
-    if to - from <= LEAF {
-        for p in &points[from..to] {
-            let (x, y) = (p.at[0] - at[0], p.at[1] - at[1]);
-            let d = x * x + y * y;
-            if response < p.suppresses && d < *best {
-                *best = d;
+        // Twice the range may be infinite: halves of it are not.
+        let scale = [0, 1].map(|i| 32767.0 / (0.5 * bounds.high[i] - 0.5 * bounds.low[i]).max(f32::MIN_POSITIVE));
+        let cell = |v: f32, i: usize| spread(((0.5 * v - 0.5 * bounds.low[i]) * scale[i]) as u32 & 0xFFFF);
+        let keys = corners.iter().enumerate().filter(|(_, c)| usable(c)).map(|(i, c)| {
+            let key = cell(c.position.x, 0) | cell(c.position.y, 1) << 1;
+            u64::from(key) << 32 | i as u64
+        });
+        let points: Vec<Point> = sorted_by_high_half(keys.collect())
+            .into_iter()
+            .map(|key| {
+                let c = &corners[key as u32 as usize];
+                let at = [c.position.x, c.position.y];
+                Point { at, response: c.response, suppresses: robust * c.response, index: key as u32 }
+            })
+            .collect();
+        let leaves = points.len().div_ceil(LEAF).next_power_of_two();
+        let mut nodes = vec![Node::EMPTY; 2 * leaves];
+        for (node, points) in nodes[leaves..].iter_mut().zip(points.chunks(LEAF)) {
+            for p in points {
+                *node = node.around(&Node { low: p.at, high: p.at, suppresses: p.suppresses });
             }
         }
-        return;
-    }
-    let middle = from + (to - from) / 2;
-    let mut children = [(2 * node, (from, middle)), (2 * node + 1, (middle, to))];
-    let mut distance = children.map(|(child, _)| nodes[child].distance(at));
-    if distance[1] < distance[0] {
-        children.swap(0, 1);
-        distance.swap(0, 1);
-    }
-    for ((child, range), d) in children.into_iter().zip(distance) {
-        if d < *best && response < nodes[child].suppresses {
-            nearest(nodes, points, child, range, at, response, best);
+        for i in (1..leaves).rev() {
+            nodes[i] = nodes[2 * i].around(&nodes[2 * i + 1]);
         }
+        Self { nodes, points }
     }
+
+    /// The places of all corners but those that share a small box, of a squared diagonal below `bound`, with one that suppresses them.
+    fn candidates(&self, bound: f32) -> Vec<u32> {
+        let leaves = self.nodes.len() / 2;
+        let mut kept = Vec::new();
+        for (leaf, points) in self.points.chunks(LEAF).enumerate() {
+            let (mut node, mut suppresses) = (leaves + leaf, f32::NEG_INFINITY);
+            while node > 0 && self.nodes[node].diagonal() < bound {
+                suppresses = self.nodes[node].suppresses;
+                node /= 2;
+            }
+            let left = points.iter().enumerate().filter(|(_, p)| p.response >= suppresses);
+            kept.extend(left.map(|(i, _)| (leaf * LEAF + i) as u32));
+        }
+        kept
+    }
+
+    /// Index and squared radius of the corners at the places `of`. Where a radius is below `bound`, another number below `bound` may stand for it.
+    fn radii(&self, of: &[u32], bound: f32) -> Vec<(u32, f32)> {
+        of.par_iter()
+            .with_min_len(128)
+            .map(|&place| (self.points[place as usize].index, self.radius(place as usize, bound)))
+            .collect()
+    }
+
+    fn radius(&self, place: usize, bound: f32) -> f32 {
+        let Point { at, response, .. } = self.points[place];
+        let leaves = self.nodes.len() / 2;
+        let mut best = f32::INFINITY;
+        // One node of each depth may wait, and the two last.
+        let mut stack = [(0.0f32, 0u32); 33];
+        (stack[0], stack[1]) = ((0.0, 0), (0.0, 1));
+        let mut height = 2;
+        while height > 1 && best >= bound {
+            height -= 1;
+            let (distance, node) = stack[height];
+            let node = node as usize;
+            if distance >= best {
+                continue;
+            }
+            if node >= leaves {
+                for p in self.points.iter().skip((node - leaves) * LEAF).take(LEAF) {
+                    let (x, y) = (p.at[0] - at[0], p.at[1] - at[1]);
+                    let d = x * x + y * y;
+                    if response < p.suppresses && d < best {
+                        best = d;
+                    }
+                }
+                continue;
+            }
+            let mut children = [2 * node, 2 * node + 1].map(|child| (self.nodes[child].distance(at), child as u32));
+            // The nearer one on top.
+            if children[0].0 < children[1].0 {
+                children.swap(0, 1);
+            }
+            for child in children {
+                if child.0 < best && response < self.nodes[child.1 as usize].suppresses {
+                    stack[height] = child;
+                    height += 1;
+                }
+            }
+        }
+        best
+    }
+}
+
+/// The 16 low bits at the even places.
+fn spread(v: u32) -> u32 {
+    let v = (v | v << 8) & 0x00FF_00FF;
+    let v = (v | v << 4) & 0x0F0F_0F0F;
+    let v = (v | v << 2) & 0x3333_3333;
+    (v | v << 1) & 0x5555_5555
+}
+
+/// Sorts by the upper 32 bits, equal ones as they came: four passes of counting.
+fn sorted_by_high_half(mut keys: Vec<u64>) -> Vec<u64> {
+    let mut other = vec![0; keys.len()];
+    for shift in [32, 40, 48, 56] {
+        let digit = |key: u64| (key >> shift) as usize & 255;
+        let mut place = [0usize; 256];
+        keys.iter().for_each(|&key| place[digit(key)] += 1);
+        let mut sum = 0;
+        place.iter_mut().for_each(|p| sum += std::mem::replace(p, sum));
+        for &key in &keys {
+            let p = &mut place[digit(key)];
+            other[*p] = key;
+            *p += 1;
+        }
+        std::mem::swap(&mut keys, &mut other);
+    }
+    keys
 }
 
 #[cfg(test)]

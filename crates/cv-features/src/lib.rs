@@ -48,6 +48,7 @@ mod rows;
 mod scale_space;
 mod sift;
 mod simd;
+mod spacing;
 mod structure;
 
 pub use anms::{anms, suppression_radii};
@@ -57,3 +58,4 @@ pub use harris::{CornerMeasure, HarrisOptions, harris, harris_response};
 pub use matching::{MatchError, MatchOptions, RatioMeasure, match_descriptors};
 pub use patch::{PatchOptions, describe_patches};
 pub use sift::{SiftOptions, sift};
+pub use spacing::{anms_square_covering, anms_tiled};
