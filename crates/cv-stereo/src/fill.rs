@@ -2,6 +2,7 @@
 //! mutual information", PAMI 2008, section 2.6.4).
 
 use crate::PixelState;
+use rayon::prelude::*;
 
 /// Fills every NaN from the nearest values along eight directions: an occluded pixel belongs to the background and
 /// takes the second smallest, a mismatched one takes the median. Pixels whose eight rays meet nothing stay NaN.
@@ -12,24 +13,45 @@ pub(crate) fn fill_holes(disparity: &mut [f32], states: &[PixelState], width: us
         return;
     }
     // Down with the rays from the left and from above, up with the other four, at the same time.
-    let (mut down, mut up) =
-        rayon::join(|| rays(disparity, width, height, false), || rays(disparity, width, height, true));
-    up.reverse();
-    let holes: Vec<u32> = (0..disparity.len()).filter(|&i| disparity[i].is_nan()).map(|i| i as u32).collect();
-    for ((&i, down), up) in holes.iter().zip(down.drain(..)).zip(up) {
-        let [a, b, c, d] = down;
-        let [e, f, g, h] = up;
-        let mut seen = [a, b, c, d, e, f, g, h];
-        // NaN sorts behind every number.
-        seen.sort_unstable_by(f32::total_cmp);
-        let n = seen.iter().filter(|v| !v.is_nan()).count();
-        if n > 0 {
-            disparity[i as usize] = match states[i as usize] {
-                PixelState::Mismatched | PixelState::Matched => seen[(n - 1) / 2],
-                PixelState::Occluded | PixelState::OutOfView => seen[1.min(n - 1)],
-            };
-        }
+    let (down, up) = rayon::join(|| rays(disparity, width, height, false), || rays(disparity, width, height, true));
+    // Holes before the first, second ... row.
+    let mut first = Vec::with_capacity(height);
+    let mut count = 0;
+    for row in disparity.chunks_exact(width) {
+        first.push(count);
+        count += row.iter().map(|d| usize::from(d.is_nan())).sum::<usize>();
     }
+    let rows = disparity.par_chunks_mut(width).zip(states.par_chunks(width)).zip(&first);
+    rows.for_each(|((row, states), &first)| {
+        let holes = row.iter_mut().zip(states).filter(|(d, _)| d.is_nan());
+        // The sweep upwards met the holes in the opposite order.
+        for ((d, state), (a, b)) in holes.zip(down[first..].iter().zip(up[..count - first].iter().rev())) {
+            let seen = sorted([a[0], a[1], a[2], a[3], b[0], b[1], b[2], b[3]]);
+            let n = seen.iter().filter(|v| !v.is_nan()).count();
+            if n > 0 {
+                *d = match state {
+                    PixelState::Mismatched | PixelState::Matched => seen[(n - 1) / 2],
+                    PixelState::Occluded | PixelState::OutOfView => seen[1.min(n - 1)],
+                };
+            }
+        }
+    });
+}
+
+/// Eight values in ascending order, NaN behind every number (Batcher's odd-even merge network; integers with the order
+/// of the floats, as in `f32::total_cmp`).
+fn sorted(values: [f32; 8]) -> [f32; 8] {
+    // Its own inverse.
+    let flip = |bits: i32| bits ^ (((bits >> 31) as u32) >> 1) as i32;
+    let mut v = values.map(|f| flip(f.to_bits() as i32));
+    const PAIRS: [(usize, usize); 19] = [
+        (0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (1, 2), (5, 6), (0, 4), (1, 5), (2, 6), (3, 7),
+        (2, 4), (3, 5), (1, 2), (3, 4), (5, 6),
+    ];
+    for (i, j) in PAIRS {
+        (v[i], v[j]) = (v[i].min(v[j]), v[i].max(v[j]));
+    }
+    v.map(|bits| f32::from_bits(flip(bits) as u32))
 }
 
 /// What each hole sees along four rays, of the holes in order: from beside, and from the row before straight and along
@@ -128,6 +150,17 @@ mod tests {
                     prop_assert_eq!(seen.map(f32::to_bits), expected);
                 }
             }
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn eight_values_come_out_in_order(
+            values in proptest::array::uniform8(prop_oneof![9 => -9f32..9.0, 1 => Just(f32::NAN), 1 => Just(-0.0f32)]),
+        ) {
+            let mut expected = values;
+            expected.sort_by(f32::total_cmp);
+            prop_assert_eq!(sorted(values).map(f32::to_bits), expected.map(f32::to_bits));
         }
     }
 

@@ -270,11 +270,13 @@ impl StereoMatcher {
         let options = &self.options;
         let disparity = map.disparity.as_mut_slice();
         remove_speckles(disparity, width, options.speckle_size, options.speckle_range, &mut self.speckles);
-        for (state, d) in map.state.as_mut_slice().iter_mut().zip(disparity.iter()) {
-            if *state == PixelState::Matched && d.is_nan() {
-                *state = PixelState::Mismatched;
+        map.state.as_mut_slice().par_chunks_mut(width).zip(disparity.par_chunks(width)).for_each(|(states, row)| {
+            for (state, d) in states.iter_mut().zip(row) {
+                if *state == PixelState::Matched && d.is_nan() {
+                    *state = PixelState::Mismatched;
+                }
             }
-        }
+        });
         if options.fill {
             fill::fill_holes(disparity, map.state.as_slice(), width, height);
         }

@@ -1,15 +1,31 @@
 //! Removal of small patches that agree only with themselves.
 
+use rayon::prelude::*;
+
+/// Rows per strip: strips are labelled side by side, then joined. Small enough to occupy every core.
+const STRIP: usize = 64;
+
 /// Memory of [`remove_speckles`], kept between frames.
 #[derive(Debug, Default)]
 pub(crate) struct Speckles {
-    /// Run that each pixel of the row before belongs to, and of this row.
-    runs: [Vec<u32>; 2],
+    strips: Vec<Strip>,
     /// Parent of each run; a root is its own.
     parents: Vec<u32>,
     /// Pixels of each run, later of each patch.
     sizes: Vec<u32>,
-    /// Where each run starts.
+}
+
+/// The runs of some rows.
+#[derive(Debug, Default)]
+struct Strip {
+    /// Run that each pixel of the first row belongs to, of the last row, and of a row in between.
+    first: Vec<u32>,
+    last: Vec<u32>,
+    next: Vec<u32>,
+    /// Parent of each run, counted from the first of the strip.
+    parents: Vec<u32>,
+    sizes: Vec<u32>,
+    /// Where each run starts in the strip.
     starts: Vec<u32>,
 }
 
@@ -22,46 +38,31 @@ pub(crate) fn remove_speckles(
     width: usize,
     max_size: usize,
     range: f32,
-    Speckles { runs, parents, sizes, starts }: &mut Speckles,
+    Speckles { strips, parents, sizes }: &mut Speckles,
 ) {
     if width == 0 || max_size == 0 || disparity.is_empty() {
         return;
     }
+    let strip = width * STRIP;
+    strips.resize_with(disparity.len().div_ceil(strip), Strip::default);
+    strips.par_iter_mut().zip(disparity.par_chunks(strip)).for_each(|(runs, rows)| runs.label(rows, width, range));
     parents.clear();
     sizes.clear();
-    starts.clear();
-    let [above, here] = runs;
-    above.resize(width, 0);
-    here.resize(width, 0);
-    let mut row_above: &[f32] = &[];
-    for (y, row) in disparity.chunks_exact(width).enumerate() {
-        // NaN compares false: invalid pixels are runs of their own.
-        let mut last = f32::NAN;
-        let mut first = 0;
-        for (x, (&d, run)) in row.iter().zip(here.iter_mut()).enumerate() {
-            if (d - last).abs() <= range {
-                *run = parents.len() as u32 - 1;
-            } else {
-                if x > 0 {
-                    sizes.push((x - first) as u32);
+    for (number, Strip { first, parents: own, sizes: own_sizes, .. }) in strips.iter().enumerate() {
+        let offset = parents.len() as u32;
+        parents.extend(own.iter().map(|&parent| parent + offset));
+        sizes.extend_from_slice(own_sizes);
+        if number > 0 {
+            let above = &strips[number - 1];
+            let offset_above = offset - above.parents.len() as u32;
+            let from = number * strip;
+            let (up, here) = (&disparity[from - width..from], &disparity[from..from + width]);
+            for (((&d, &up), &a), &b) in here.iter().zip(up).zip(&above.last).zip(first) {
+                if (d - up).abs() <= range {
+                    join(parents, a + offset_above, b + offset);
                 }
-                first = x;
-                *run = parents.len() as u32;
-                starts.push((y * width + x) as u32);
-                parents.push(*run);
-            }
-            last = d;
-        }
-        sizes.push((width - first) as u32);
-        let mut joined = (u32::MAX, u32::MAX);
-        for (((&d, &up), &a), &b) in row.iter().zip(row_above).zip(above.iter()).zip(here.iter()) {
-            if (a, b) != joined && (d - up).abs() <= range {
-                join(parents, a, b);
-                joined = (a, b);
             }
         }
-        std::mem::swap(above, here);
-        row_above = row;
     }
     // Roots have the smallest index of their patch: counting from the end, every run is complete when it is added.
     for run in (0..parents.len()).rev() {
@@ -70,14 +71,63 @@ pub(crate) fn remove_speckles(
             sizes[up] += sizes[run];
         }
     }
-    let lengths = |run: usize| starts.get(run + 1).map_or(disparity.len(), |&s| s as usize);
-    let ends: Vec<usize> = (0..parents.len()).map(lengths).collect();
+    // Parents come before children, so theirs is the size of the patch by now.
     for run in 0..parents.len() {
-        // Parents come before children, so theirs is the size of the patch by now.
-        let up = parents[run] as usize;
-        sizes[run] = sizes[up];
-        if sizes[run] as usize <= max_size {
-            disparity[starts[run] as usize..ends[run]].fill(f32::NAN);
+        sizes[run] = sizes[parents[run] as usize];
+    }
+    let mut offset = 0;
+    for (runs, rows) in strips.iter().zip(disparity.chunks_mut(strip)) {
+        let sizes = &sizes[offset..offset + runs.starts.len()];
+        for (run, (&start, &size)) in runs.starts.iter().zip(sizes).enumerate() {
+            if size as usize <= max_size {
+                let end = runs.starts.get(run + 1).map_or(rows.len(), |&s| s as usize);
+                rows[start as usize..end].fill(f32::NAN);
+            }
+        }
+        offset += runs.starts.len();
+    }
+}
+
+impl Strip {
+    fn label(&mut self, disparity: &[f32], width: usize, range: f32) {
+        let Self { first, last, next, parents, sizes, starts } = self;
+        parents.clear();
+        sizes.clear();
+        starts.clear();
+        last.resize(width, 0);
+        next.resize(width, 0);
+        let mut row_above: &[f32] = &[];
+        for (y, row) in disparity.chunks_exact(width).enumerate() {
+            // NaN compares false: invalid pixels are runs of their own.
+            let mut before = f32::NAN;
+            let mut from = 0;
+            for (x, (&d, run)) in row.iter().zip(next.iter_mut()).enumerate() {
+                if (d - before).abs() <= range {
+                    *run = parents.len() as u32 - 1;
+                } else {
+                    if x > 0 {
+                        sizes.push((x - from) as u32);
+                    }
+                    from = x;
+                    *run = parents.len() as u32;
+                    starts.push((y * width + x) as u32);
+                    parents.push(*run);
+                }
+                before = d;
+            }
+            sizes.push((width - from) as u32);
+            let mut joined = (u32::MAX, u32::MAX);
+            for (((&d, &up), &a), &b) in row.iter().zip(row_above).zip(last.iter()).zip(next.iter()) {
+                if (a, b) != joined && (d - up).abs() <= range {
+                    join(parents, a, b);
+                    joined = (a, b);
+                }
+            }
+            if y == 0 {
+                first.clone_from(next);
+            }
+            std::mem::swap(last, next);
+            row_above = row;
         }
     }
 }
@@ -137,6 +187,23 @@ mod tests {
                 size > max_size
             })
             .collect()
+    }
+
+    #[test]
+    fn patches_reach_across_strips() {
+        // A column of nines through four strips, one pixel wide, and a short one across a joint.
+        let (width, height) = (5, 3 * STRIP + 7);
+        let mut d: Vec<f32> = vec![0.0; width * height];
+        for y in 0..height {
+            d[y * width + 1] = 9.0;
+            if y.abs_diff(2 * STRIP) < 3 {
+                d[y * width + 3] = 9.0;
+            }
+        }
+        let keep = plain(&d, width, 5, 1.0);
+        remove_speckles(&mut d, width, 5, 1.0, &mut Speckles::default());
+        assert_eq!(keep.iter().filter(|k| !**k).count(), 5);
+        assert!(d.iter().zip(keep).all(|(v, k)| v.is_nan() != k));
     }
 
     proptest! {
