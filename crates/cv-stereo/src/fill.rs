@@ -2,68 +2,104 @@
 //! mutual information", PAMI 2008, section 2.6.4).
 
 use crate::PixelState;
+use fearless_simd::{Level, dispatch, prelude::*};
+use fearless_simd_macros::simd;
 use rayon::prelude::*;
+
+/// Memory of [`fill_holes`], kept between frames.
+#[derive(Debug, Default)]
+pub(crate) struct Holes {
+    /// What each hole sees along four rays, hole by hole, [`f32::INFINITY`] where nothing: downwards and upwards.
+    seen: [[Vec<f32>; 4]; 2],
+    /// Number of holes before each row.
+    first: Vec<usize>,
+}
 
 /// Fills every NaN from the nearest values along eight directions: an occluded pixel belongs to the background and
 /// takes the second smallest, a mismatched one takes the median. Pixels whose eight rays meet nothing stay NaN.
 ///
 /// Two sweeps, linear in the number of pixels.
-pub(crate) fn fill_holes(disparity: &mut [f32], states: &[PixelState], width: usize, height: usize) {
-    if width == 0 || height == 0 {
+pub(crate) fn fill_holes(
+    level: Level,
+    disparity: &mut [f32],
+    states: &[PixelState],
+    width: usize,
+    Holes { seen, first }: &mut Holes,
+) {
+    if width == 0 || disparity.is_empty() {
         return;
     }
-    // Down with the rays from the left and from above, up with the other four, at the same time.
-    let (down, up) = rayon::join(|| rays(disparity, width, height, false), || rays(disparity, width, height, true));
-    // Holes before the first, second ... row.
-    let mut first = Vec::with_capacity(height);
     let mut count = 0;
+    first.clear();
     for row in disparity.chunks_exact(width) {
         first.push(count);
         count += row.iter().map(|d| usize::from(d.is_nan())).sum::<usize>();
     }
-    let rows = disparity.par_chunks_mut(width).zip(states.par_chunks(width)).zip(&first);
-    rows.for_each(|((row, states), &first)| {
+    // Down with the rays from the left and from above, up with the other four, at the same time.
+    let [down, up] = seen;
+    rayon::join(|| rays(disparity, width, count, false, down), || rays(disparity, width, count, true, up));
+    // The median and the second smallest take the places of the first two rays.
+    let [a, b, c, d] = down;
+    let ahead = a.par_chunks_mut(PART).zip(b.par_chunks_mut(PART)).zip(c.par_chunks(PART).zip(d.par_chunks(PART)));
+    ahead.enumerate().for_each(|(part, ((a, b), (c, d)))| {
+        let up = [0, 1, 2, 3].map(|ray| &up[ray][part * PART..][..c.len()]);
+        dispatch!(level, simd => ranks(simd, [a, b], [c, d], up));
+    });
+    let (median, second) = (&*a, &*b);
+    let rows = disparity.par_chunks_mut(width).zip(states.par_chunks(width)).zip(first);
+    rows.for_each(|((row, states), &mut first)| {
         let holes = row.iter_mut().zip(states).filter(|(d, _)| d.is_nan());
-        // The sweep upwards met the holes in the opposite order.
-        for ((d, state), (a, b)) in holes.zip(down[first..].iter().zip(up[..count - first].iter().rev())) {
-            let seen = sorted([a[0], a[1], a[2], a[3], b[0], b[1], b[2], b[3]]);
-            let n = seen.iter().filter(|v| !v.is_nan()).count();
-            if n > 0 {
-                *d = match state {
-                    PixelState::Mismatched | PixelState::Matched => seen[(n - 1) / 2],
-                    PixelState::Occluded | PixelState::OutOfView => seen[1.min(n - 1)],
-                };
-            }
+        for ((d, state), (&median, &second)) in holes.zip(median[first..].iter().zip(&second[first..])) {
+            let value = match state {
+                PixelState::Mismatched | PixelState::Matched => median,
+                PixelState::Occluded | PixelState::OutOfView => second,
+            };
+            *d = if value == f32::INFINITY { f32::NAN } else { value };
         }
     });
 }
 
-/// Eight values in ascending order, NaN behind every number (Batcher's odd-even merge network; integers with the order
-/// of the floats, as in `f32::total_cmp`).
-fn sorted(values: [f32; 8]) -> [f32; 8] {
-    // Its own inverse.
-    let flip = |bits: i32| bits ^ (((bits >> 31) as u32) >> 1) as i32;
-    let mut v = values.map(|f| flip(f.to_bits() as i32));
-    const PAIRS: [(usize, usize); 19] = [
-        (0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (1, 2), (5, 6), (0, 4), (1, 5), (2, 6), (3, 7),
-        (2, 4), (3, 5), (1, 2), (3, 4), (5, 6),
-    ];
-    for (i, j) in PAIRS {
-        (v[i], v[j]) = (v[i].min(v[j]), v[i].max(v[j]));
+/// Holes per task; a whole number of vectors of any instruction set.
+const PART: usize = 4096;
+
+/// Replaces the first two of each hole's eight values by the lower median and the second smallest of those that are not
+/// infinite, the smallest where there is but one.
+#[simd]
+fn ranks<S: Simd>(simd: S, [a, b]: [&mut [f32]; 2], [c, d]: [&[f32]; 2], up: [&[f32]; 4]) {
+    let lanes = S::f32s::LEN;
+    for at in (0..a.len()).step_by(lanes) {
+        let part = at..at + lanes;
+        let mut v = [S::f32s::splat(simd, 0.0); 8];
+        for (v, values) in v.iter_mut().zip([&*a, &*b, c, d, up[0], up[1], up[2], up[3]]) {
+            *v = S::f32s::from_slice(simd, &values[part.clone()]);
+        }
+        // Batcher's odd-even merge network.
+        macro_rules! sort {
+            ($($i:literal $j:literal),*) => { $((v[$i], v[$j]) = (v[$i].min(v[$j]), v[$i].max(v[$j]));)* };
+        }
+        sort!(0 1, 2 3, 4 5, 6 7, 0 2, 1 3, 4 6, 5 7, 1 2, 5 6, 0 4, 1 5, 2 6, 3 7, 2 4, 3 5, 1 2, 3 4, 5 6);
+        let known = |rank: usize| v[rank].simd_lt(S::f32s::splat(simd, f32::INFINITY));
+        let median = known(6).select(v[3], known(4).select(v[2], known(2).select(v[1], v[0])));
+        median.store_slice(&mut a[part.clone()]);
+        known(1).select(v[1], v[0]).store_slice(&mut b[part]);
     }
-    v.map(|bits| f32::from_bits(flip(bits) as u32))
 }
 
-/// What each hole sees along four rays, of the holes in order: from beside, and from the row before straight and along
-/// both diagonals. From the bottom right with all rays turned round where `mirrored`.
-fn rays(disparity: &[f32], width: usize, height: usize, mirrored: bool) -> Vec<[f32; 4]> {
-    let mut found = Vec::new();
+/// What each of `count` holes sees along four rays, of the holes in order: from beside, and from the row before straight
+/// and along both diagonals. From the bottom right with all rays turned round where `mirrored`.
+fn rays(disparity: &[f32], width: usize, count: usize, mirrored: bool, found: &mut [Vec<f32>; 4]) {
+    let height = disparity.len() / width;
+    for ray in &mut *found {
+        ray.resize(count.next_multiple_of(64), f32::INFINITY);
+    }
+    let [from_beside, from_behind, from_straight, from_ahead] = found;
     // What the row before saw at each column along the three rays, with a column of nothing on both sides.
-    let mut behind = vec![f32::NAN; width + 2];
+    let mut behind = vec![f32::INFINITY; width + 2];
     let mut straight = behind.clone();
     let mut ahead = behind.clone();
     let mut next = behind.clone();
     let keep = |d: f32, ray: f32| if d.is_nan() { ray } else { d };
+    let mut hole = if mirrored { count } else { 0 };
     for step in 0..height {
         let y = if mirrored { height - 1 - step } else { step };
         let row = &disparity[y * width..][..width];
@@ -74,48 +110,65 @@ fn rays(disparity: &[f32], width: usize, height: usize, mirrored: bool) -> Vec<[
         };
         // In the mirrored sense the pixel behind is the one to the right.
         let (left, right) = (0, 2);
-        let (from_behind, from_ahead) = if mirrored { (right, left) } else { (left, right) };
-        update(&mut next, &behind[from_behind..]);
+        let (one, other) = if mirrored { (right, left) } else { (left, right) };
+        update(&mut next, &behind[one..]);
         std::mem::swap(&mut behind, &mut next);
         update(&mut next, &straight[1..]);
         std::mem::swap(&mut straight, &mut next);
-        update(&mut next, &ahead[from_ahead..]);
+        update(&mut next, &ahead[other..]);
         std::mem::swap(&mut ahead, &mut next);
-        let mut beside = f32::NAN;
-        let mut visit = |x: usize, d: f32| {
-            if d.is_nan() {
-                found.push([beside, behind[x + 1], straight[x + 1], ahead[x + 1]]);
-            } else {
-                beside = d;
-            }
+        let mut beside = f32::INFINITY;
+        let mut visit = |x: usize, at: usize, beside: f32| {
+            from_beside[at] = beside;
+            from_behind[at] = behind[x + 1];
+            from_straight[at] = straight[x + 1];
+            from_ahead[at] = ahead[x + 1];
         };
         if mirrored {
-            row.iter().enumerate().rev().for_each(|(x, &d)| visit(x, d));
+            for (x, &d) in row.iter().enumerate().rev() {
+                if d.is_nan() {
+                    hole -= 1;
+                    visit(x, hole, beside);
+                } else {
+                    beside = d;
+                }
+            }
         } else {
-            row.iter().enumerate().for_each(|(x, &d)| visit(x, d));
+            for (x, &d) in row.iter().enumerate() {
+                if d.is_nan() {
+                    visit(x, hole, beside);
+                    hole += 1;
+                } else {
+                    beside = d;
+                }
+            }
         }
     }
-    found
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::levels::levels;
     use proptest::prelude::*;
+
+    fn fill(disparity: &mut [f32], states: &[PixelState], width: usize) {
+        fill_holes(Level::new(), disparity, states, width, &mut Holes::default());
+    }
 
     #[test]
     fn an_occluded_hole_takes_the_background_and_a_mismatch_the_median() {
         // Left half at 2 (far), right half at 9 (near), a hole between them.
-        let (width, height) = (9, 5);
+        let width = 9;
         let mut d: Vec<f32> = (0..45).map(|i| if i % width < 4 { 2.0 } else { 9.0 }).collect();
         let mut states = vec![PixelState::Matched; 45];
         d[2 * width + 4] = f32::NAN;
         states[2 * width + 4] = PixelState::Occluded;
         let mut mismatch = d.clone();
-        fill_holes(&mut d, &states, width, height);
+        fill(&mut d, &states, width);
         assert_eq!(d[2 * width + 4], 2.0);
         states[2 * width + 4] = PixelState::Mismatched;
-        fill_holes(&mut mismatch, &states, width, height);
+        fill(&mut mismatch, &states, width);
         assert_eq!(mismatch[2 * width + 4], 9.0);
     }
 
@@ -137,17 +190,16 @@ mod tests {
                     }
                     (x, y) = (x + dx, y + dy);
                 }
-                f32::NAN.to_bits()
+                f32::INFINITY.to_bits()
             };
             for (mirrored, sign) in [(false, -1), (true, 1)] {
-                let mut found = rays(d, width, height, mirrored);
-                if mirrored {
-                    found.reverse();
+                let mut found: [Vec<f32>; 4] = Default::default();
+                if width * height > 0 {
+                    rays(d, width, holes.len(), mirrored, &mut found);
                 }
-                prop_assert_eq!(found.len(), holes.len());
-                for (&i, seen) in holes.iter().zip(found) {
+                for (n, &i) in holes.iter().enumerate() {
                     let expected = [(sign, 0), (sign, sign), (0, sign), (-sign, sign)].map(|step| walk(i, step));
-                    prop_assert_eq!(seen.map(f32::to_bits), expected);
+                    prop_assert_eq!([0, 1, 2, 3].map(|ray| found[ray][n].to_bits()), expected);
                 }
             }
         }
@@ -155,20 +207,32 @@ mod tests {
 
     proptest! {
         #[test]
-        fn eight_values_come_out_in_order(
-            values in proptest::array::uniform8(prop_oneof![9 => -9f32..9.0, 1 => Just(f32::NAN), 1 => Just(-0.0f32)]),
+        fn the_ranks_are_those_of_sorted_values(
+            holes in proptest::collection::vec(
+                proptest::array::uniform8(prop_oneof![3 => -9f32..9.0, 1 => Just(f32::INFINITY)]), 1..80),
         ) {
-            let mut expected = values;
-            expected.sort_by(f32::total_cmp);
-            prop_assert_eq!(sorted(values).map(f32::to_bits), expected.map(f32::to_bits));
+            for level in levels() {
+                let n = holes.len().next_multiple_of(64);
+                let mut rays: [Vec<f32>; 8] = std::array::from_fn(|ray| holes.iter().map(|h| h[ray]).collect());
+                rays.iter_mut().for_each(|r| r.resize(n, f32::INFINITY));
+                let [a, b, c, d, e, f, g, h] = &mut rays;
+                dispatch!(level, simd => ranks(simd, [a, b], [c, d], [e, f, g, h]));
+                for (i, hole) in holes.iter().enumerate() {
+                    let mut known: Vec<f32> = hole.iter().copied().filter(|v| v.is_finite()).collect();
+                    known.sort_by(f32::total_cmp);
+                    let last = known.len().saturating_sub(1);
+                    let at = |rank: usize| known.get(rank).copied().unwrap_or(f32::INFINITY);
+                    prop_assert_eq!((a[i], b[i]), (at(last / 2), at(1.min(last))), "{:?}", level);
+                }
+            }
         }
     }
 
     #[test]
     fn nothing_to_fill_from_leaves_nothing() {
         let mut d = vec![f32::NAN; 12];
-        fill_holes(&mut d, &[PixelState::Occluded; 12], 4, 3);
+        fill(&mut d, &[PixelState::Occluded; 12], 4);
         assert!(d.iter().all(|v| v.is_nan()));
-        fill_holes(&mut [], &[], 0, 0);
+        fill(&mut [], &[], 0);
     }
 }

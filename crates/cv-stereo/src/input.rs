@@ -2,6 +2,8 @@
 
 use crate::census::{Grey, MARGIN};
 use cv_core::{ImageView, Sample};
+use fearless_simd::{Level, dispatch, prelude::*};
+use fearless_simd_macros::simd;
 use rayon::prelude::*;
 
 /// A channel type the matcher takes.
@@ -42,7 +44,7 @@ impl Intensity for f32 {
 
 /// Grey of `view` into `out` (resized), Rec. 601 weights for three or more channels. Returns how many samples are no
 /// numbers.
-pub(crate) fn to_grey<T: Intensity, const C: usize>(view: ImageView<'_, T, C>, out: &mut Grey) -> usize {
+pub(crate) fn to_grey<T: Intensity, const C: usize>(level: Level, view: ImageView<'_, T, C>, out: &mut Grey) -> usize {
     let (width, height) = view.size();
     (out.width, out.height) = (width, height);
     let stride = out.stride();
@@ -55,21 +57,28 @@ pub(crate) fn to_grey<T: Intensity, const C: usize>(view: ImageView<'_, T, C>, o
         .enumerate()
         .map(|(y, row)| {
             let samples = view.row(y);
-            for (pixel, grey) in samples.chunks_exact(C).zip(&mut row[MARGIN..MARGIN + width]) {
-                *grey = if C >= 3 {
-                    // The weights add up to 2¹⁶, so that a grey pixel keeps its value.
-                    let [r, g, b] = [pixel[0], pixel[1], pixel[2]].map(|v| u32::from(v.to_u16()));
-                    ((r * 19595 + g * 38470 + b * 7471 + 32768) >> 16) as u16
-                } else {
-                    pixel[0].to_u16()
-                };
-            }
+            let pixels = samples.as_chunks::<C>().0;
+            dispatch!(level, simd => grey_row(simd, pixels, &mut row[MARGIN..MARGIN + width]));
             let (first, last) = (row[MARGIN], row[MARGIN + width - 1]);
             row[..MARGIN].fill(first);
             row[MARGIN + width..].fill(last);
             samples.iter().filter(|v| !v.is_number()).count()
         })
         .sum()
+}
+
+/// Grey of a row; integers throughout, so that every instruction set gives the same.
+#[simd]
+fn grey_row<S: Simd, T: Intensity, const C: usize>(_: S, pixels: &[[T; C]], out: &mut [u16]) {
+    for (pixel, grey) in pixels.iter().zip(out) {
+        *grey = if C >= 3 {
+            // The weights add up to 2¹⁶, so that a grey pixel keeps its value.
+            let [r, g, b] = [pixel[0], pixel[1], pixel[2]].map(|v| u32::from(v.to_u16()));
+            ((r * 19595 + g * 38470 + b * 7471 + 32768) >> 16) as u16
+        } else {
+            pixel[0].to_u16()
+        };
+    }
 }
 
 #[cfg(test)]
@@ -82,8 +91,8 @@ mod tests {
         let grey = Image::<u8, 1>::from_fn(256, 1, |x, _| [x as u8]);
         let rgb = grey.map(|[v]| [v; 3]);
         let (mut a, mut b) = (Grey::default(), Grey::default());
-        to_grey(grey.view(), &mut a);
-        to_grey(rgb.view(), &mut b);
+        to_grey(Level::new(), grey.view(), &mut a);
+        to_grey(Level::new(), rgb.view(), &mut b);
         assert_eq!(a.values, b.values);
         assert_eq!((a.values[MARGIN], a.values[MARGIN + 255]), (0, 65535));
     }
@@ -92,7 +101,7 @@ mod tests {
     fn what_is_not_a_number_is_counted() {
         let image = Image::<f32, 1>::from_vec(2, 2, vec![0.5, f32::NAN, f32::INFINITY, 2.0]).unwrap();
         let mut out = Grey::default();
-        assert_eq!(to_grey(image.view(), &mut out), 2);
+        assert_eq!(to_grey(Level::new(), image.view(), &mut out), 2);
         assert_eq!((out.values[MARGIN], out.values[out.stride() + MARGIN + 1]), (32768, 65535));
     }
 }

@@ -41,6 +41,8 @@ pub(crate) struct Frame<'a> {
     pub(crate) p1: u8,
     /// P2 by absolute grey difference.
     pub(crate) p2: &'a [u8; 256],
+    /// Whether [`Winner::second`] is wanted.
+    pub(crate) second: bool,
 }
 
 impl Frame<'_> {
@@ -49,15 +51,19 @@ impl Frame<'_> {
         width + blocks * BLOCK
     }
 
+    /// True where every lane is a disparity asked for whose match lies inside the right image.
+    #[inline(always)]
+    fn all_inside(&self, x: usize) -> bool {
+        let column = x as i64 - self.min_disparity;
+        let last = (self.blocks * BLOCK) as i64 - 1;
+        self.disparities == self.blocks * BLOCK && column < self.width as i64 && column >= last
+    }
+
     /// Costs of pixel `(x, y)` at every disparity; 255 in the lanes beyond the last one, which keeps them from ever
     /// winning or lending to their neighbours, since additions saturate.
     #[inline(always)]
     fn costs<S: Simd>(&self, simd: S, x: usize, y: usize, out: &mut [u8]) {
-        match self.left.len() {
-            3 => self.hamming::<S, 3>(simd, x, y, out),
-            6 => self.hamming::<S, 6>(simd, x, y, out),
-            _ => self.hamming::<S, 8>(simd, x, y, out),
-        }
+        self.bits(simd, x, y, out);
         // The column in the right image falls with the index: at first it may lie right of the image, at last left.
         let column = x as i64 - self.min_disparity;
         let n = self.disparities as i64;
@@ -72,6 +78,16 @@ impl Frame<'_> {
 }
 
 impl Frame<'_> {
+    /// Costs without regard to the borders.
+    #[inline(always)]
+    fn bits<S: Simd>(&self, simd: S, x: usize, y: usize, out: &mut [u8]) {
+        match self.left.len() {
+            3 => self.hamming::<S, 3>(simd, x, y, out),
+            6 => self.hamming::<S, 6>(simd, x, y, out),
+            _ => self.hamming::<S, 8>(simd, x, y, out),
+        }
+    }
+
     /// Number of census bits in which pixel `(x, y)` and each of its candidates differ, over `PLANES` bytes.
     #[inline(always)]
     fn hamming<S: Simd, const PLANES: usize>(&self, simd: S, x: usize, y: usize, out: &mut [u8]) {
@@ -160,15 +176,19 @@ pub(crate) fn sweep_rows<S: Simd>(
     output: &mut Output<'_>,
     eight: bool,
 ) {
-    if eight {
-        rows::<S, 4>(simd, frame, sweep, first, steps, output);
-    } else {
-        rows::<S, 2>(simd, frame, sweep, first, steps, output);
+    // The usual numbers of disparities as constants: loops over them unroll, and indices need no checks.
+    match (eight, frame.blocks) {
+        (false, 1) => rows::<S, 2, 1>(simd, frame, sweep, first, steps, output),
+        (false, 2) => rows::<S, 2, 2>(simd, frame, sweep, first, steps, output),
+        (false, _) => rows::<S, 2, 0>(simd, frame, sweep, first, steps, output),
+        (true, 1) => rows::<S, 4, 1>(simd, frame, sweep, first, steps, output),
+        (true, 2) => rows::<S, 4, 2>(simd, frame, sweep, first, steps, output),
+        (true, _) => rows::<S, 4, 0>(simd, frame, sweep, first, steps, output),
     }
 }
 
 #[inline(always)]
-fn rows<S: Simd, const PATHS: usize>(
+fn rows<S: Simd, const PATHS: usize, const BLOCKS: usize>(
     simd: S,
     frame: &Frame<'_>,
     sweep: &mut Sweep,
@@ -177,13 +197,17 @@ fn rows<S: Simd, const PATHS: usize>(
     output: &mut Output<'_>,
 ) {
     let (width, height) = (frame.width, frame.height);
-    let depth = frame.blocks * BLOCK;
-    let groups = frame.blocks.div_ceil(2);
+    // Blocks of any number where `BLOCKS` is zero.
+    let blocks = if BLOCKS > 0 { BLOCKS } else { frame.blocks };
+    let depth = blocks * BLOCK;
+    let groups = blocks.div_ceil(2);
     let Sweep { mirrored, rows, least, along, along_least, cost, sums, keys } = sweep;
     let [behind, straight, ahead] = rows;
     let (behind, straight, ahead) = (behind.as_mut_slice(), straight.as_mut_slice(), ahead.as_mut_slice());
     let [behind_least, straight_least, ahead_least] = least;
-    let (along, cost, sums) = (along.as_mut_slice(), cost.as_mut_slice(), sums.as_mut_slice());
+    let along = &mut along.as_mut_slice()[..depth];
+    let cost = &mut cost.as_mut_slice()[..depth];
+    let sums = &mut sums.as_mut_slice()[..depth];
     for step in 0..steps {
         let t = first + step;
         let y = if *mirrored { height - 1 - t } else { t };
@@ -210,7 +234,21 @@ fn rows<S: Simd, const PATHS: usize>(
                 ahead[from_ahead * depth..][..depth].fill(0);
                 ahead_least[from_ahead] = 0;
             }
-            frame.costs(simd, x, y, cost);
+            // A copy on the stack that is only touched at constant places lives in registers.
+            let mut local = [[0u8; BLOCK]; BLOCKS];
+            let cost: &[u8] = if BLOCKS == 0 {
+                frame.costs(simd, x, y, cost);
+                cost
+            } else {
+                let local = local.as_flattened_mut();
+                if frame.all_inside(x) {
+                    frame.bits(simd, x, y, local);
+                } else {
+                    frame.costs(simd, x, y, cost);
+                    local.copy_from_slice(cost);
+                }
+                local
+            };
 
             // Neighbours the paths come from; at a border any value does, since the slots there are all zero.
             let grey = |x: usize, y: usize| frame.grey[y * width + x];
@@ -276,7 +314,7 @@ fn rows<S: Simd, const PATHS: usize>(
                             }
                         }
                     });
-                    winners[pixel] = finish(simd, frame.disparities, best, sums);
+                    winners[pixel] = finish(simd, frame, best, sums);
                 }
             }
         }
@@ -353,7 +391,16 @@ fn up_one<S: Simd>(before: S::u8s, here: S::u8s) -> S::u8s {
 
 /// The winner with its surroundings.
 #[inline(always)]
-fn finish<S: Simd>(simd: S, disparities: usize, (cost, index): (u16, u16), sums: &[u16]) -> Winner {
+fn finish<S: Simd>(simd: S, frame: &Frame<'_>, (cost, index): (u16, u16), sums: &[u16]) -> Winner {
+    let k = usize::from(index);
+    let at = |k: usize| if k < frame.disparities { sums[k] } else { NO_SUM };
+    let second = if frame.second { second(simd, index, sums) } else { NO_SUM };
+    Winner { index, cost, second, below: at(k.wrapping_sub(1)), above: at(k + 1) }
+}
+
+/// The smallest sum that is not next to the winner.
+#[inline(always)]
+fn second<S: Simd>(simd: S, index: u16, sums: &[u16]) -> u16 {
     let iota = S::u16s::from_fn(simd, |lane| lane as u16);
     let none = S::u16s::splat(simd, u16::MAX);
     // Lanes within one of the winner, by unsigned wrap-around.
@@ -364,10 +411,7 @@ fn finish<S: Simd>(simd: S, disparities: usize, (cost, index): (u16, u16), sums:
         let far = distance.simd_gt(S::u16s::splat(simd, 2));
         second = second.min(far.select(S::u16s::from_slice(simd, part), none));
     }
-    let k = usize::from(index);
-    let at = |k: usize| if k < disparities { sums[k] } else { NO_SUM };
-    let second = second.reduce_min().min(NO_SUM);
-    Winner { index, cost, second, below: at(k.wrapping_sub(1)), above: at(k + 1) }
+    second.reduce_min().min(NO_SUM)
 }
 
 /// Index of the best match of every pixel of a right row.

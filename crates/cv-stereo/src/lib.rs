@@ -27,6 +27,8 @@ mod evaluate;
 mod fill;
 mod input;
 mod kernel;
+#[cfg(test)]
+mod levels;
 mod matcher;
 mod median;
 mod options;

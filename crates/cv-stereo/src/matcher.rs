@@ -2,12 +2,13 @@
 
 use crate::census::{Grey, census, census_mirrored, planes};
 use crate::confidence::{confidence, sigma};
+use crate::fill::{Holes, fill_holes};
 use crate::input::to_grey;
 use crate::kernel::Frame;
 use crate::sgm::{Aggregator, blocks};
 use crate::speckle::{Speckles, remove_speckles};
 use crate::winner::{NO_SUM, Winner, p2_table};
-use crate::{Intensity, Paths, StereoError, StereoOptions, Subpixel, fill, median};
+use crate::{Intensity, Paths, StereoError, StereoOptions, Subpixel, median};
 use cv_core::{GrayF32, Image, ImageView, Sample};
 use fearless_simd::Level;
 use rayon::prelude::*;
@@ -88,6 +89,7 @@ pub struct StereoMatcher {
     census: [Vec<Vec<u8>>; 2],
     aggregator: Aggregator,
     speckles: Speckles,
+    holes: Holes,
     scratch: Vec<f32>,
 }
 
@@ -106,6 +108,7 @@ impl StereoMatcher {
             census: Default::default(),
             aggregator: Aggregator::default(),
             speckles: Speckles::default(),
+            holes: Holes::default(),
             scratch: Vec::new(),
         })
     }
@@ -157,7 +160,7 @@ impl StereoMatcher {
         }
         self.check_size(width, height)?;
         for (side, view, grey) in [("left", left, 0), ("right", right, 1)] {
-            let count = to_grey(view, &mut self.grey[grey]);
+            let count = to_grey(self.level, view, &mut self.grey[grey]);
             if count > 0 {
                 return Err(StereoError::NotFinite { side, count });
             }
@@ -170,9 +173,10 @@ impl StereoMatcher {
     }
 
     /// How sure each disparity of the last pair is, 0 to 1: how far its cost lies below the best one elsewhere; 0 where it
-    /// was filled. Empty before the first pair.
-    pub fn confidence(&self, map: &DisparityMap) -> GrayF32 {
-        self.per_pixel(map, confidence)
+    /// was filled. `None` without [`StereoOptions::confidence`], and before the first pair.
+    pub fn confidence(&self, map: &DisparityMap) -> Option<GrayF32> {
+        let known = self.options.confidence && self.aggregator.winners.len() == map.state.as_slice().len();
+        known.then(|| self.per_pixel(map, confidence))
     }
 
     /// Standard deviation in px of each disparity of the last pair, from how sharp its minimum is; NaN where it was
@@ -237,6 +241,7 @@ impl StereoMatcher {
             grey: &self.grey8,
             p1: options.p1,
             p2: &p2_table(options),
+            second: options.confidence || options.uniqueness > 0,
         };
         self.aggregator.run(self.level, &frame, options.paths == Paths::Eight);
     }
@@ -266,7 +271,7 @@ impl StereoMatcher {
 
     /// Speckles, holes, median.
     fn refine(&mut self, map: &mut DisparityMap) {
-        let (width, height) = map.disparity.size();
+        let width = map.disparity.width();
         let options = &self.options;
         let disparity = map.disparity.as_mut_slice();
         remove_speckles(disparity, width, options.speckle_size, options.speckle_range, &mut self.speckles);
@@ -278,7 +283,7 @@ impl StereoMatcher {
             }
         });
         if options.fill {
-            fill::fill_holes(disparity, map.state.as_slice(), width, height);
+            fill_holes(self.level, disparity, map.state.as_slice(), width, &mut self.holes);
         }
         if options.median > 0 {
             median::median(self.level, disparity, width, options.median, &mut self.scratch);
@@ -299,7 +304,8 @@ fn judge(options: &StereoOptions, x: usize, winner: &Winner, right: &[u16]) -> P
         // What the right camera sees there is nearer: it hides this pixel.
         return if seen > winner.index { PixelState::Occluded } else { PixelState::Mismatched };
     }
-    if u32::from(winner.second) * u32::from(100 - options.uniqueness) < u32::from(winner.cost) * 100 {
+    let unsure = u32::from(winner.second) * u32::from(100 - options.uniqueness) < u32::from(winner.cost) * 100;
+    if options.uniqueness > 0 && unsure {
         return PixelState::Mismatched;
     }
     PixelState::Matched

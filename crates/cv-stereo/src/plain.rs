@@ -79,7 +79,8 @@ pub(crate) fn match_plain(
             let s = &sums[(y * width + x) * n..][..n];
             let at = |k: usize| s.get(k).copied().unwrap_or(NO_SUM);
             let index = (0..n).min_by_key(|&k| (s[k], k)).filter(|&k| s[k] < NO_SUM).unwrap_or(0);
-            let second = (0..n).filter(|k| k.abs_diff(index) > 1).map(at).min().unwrap_or(NO_SUM);
+            let far = (0..n).filter(|k| options.confidence && k.abs_diff(index) > 1);
+            let second = far.map(at).min().unwrap_or(NO_SUM);
             winners[y * width + x] = Winner {
                 index: index as u16,
                 cost: s[index].min(NO_SUM),
@@ -105,24 +106,10 @@ mod tests {
     use super::*;
     use crate::census::{Grey, MARGIN, census, census_mirrored};
     use crate::kernel::Frame;
+    use crate::levels::levels;
     use crate::sgm::{Aggregator, blocks};
     use crate::{Census, StereoOptions};
-    use fearless_simd::Level;
     use proptest::prelude::*;
-
-    /// Every instruction set this machine has.
-    fn levels() -> Vec<Level> {
-        let best = Level::new();
-        let mut all = vec![Level::baseline()];
-        #[cfg(target_arch = "x86_64")]
-        {
-            all.extend(best.as_sse4_2().map(Level::Sse4_2));
-            all.extend(best.as_avx2().map(Level::Avx2));
-            all.extend(best.as_avx512().map(Level::Avx512));
-        }
-        all.push(best);
-        all
-    }
 
     /// Census bits by definition.
     fn census_plain(grey: &[u16], width: usize, height: usize, window: Census) -> Vec<u64> {
@@ -172,6 +159,7 @@ mod tests {
                 p2: p1 + more + most,
                 p2_gradient,
                 paths: if eight { Paths::Eight } else { Paths::Four },
+                confidence: disparities % 2 == 0,
                 ..Default::default()
             },
         )
@@ -210,7 +198,7 @@ mod tests {
                 let frame = Frame {
                     width, height, min_disparity, disparities: options.disparities, blocks,
                     left: &a, right: &b, grey: &bytes,
-                    p1: options.p1, p2: &p2_table(&options),
+                    p1: options.p1, p2: &p2_table(&options), second: options.confidence,
                 };
                 let mut aggregator = Aggregator::default();
                 // Twice, so that what a frame leaves behind would show.

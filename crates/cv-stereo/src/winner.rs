@@ -12,7 +12,7 @@ pub(crate) struct Winner {
     pub(crate) index: u16,
     /// The smallest sum.
     pub(crate) cost: u16,
-    /// The smallest sum at indices not next to the winner; [`NO_SUM`] where there are none.
+    /// The smallest sum at indices not next to the winner; [`NO_SUM`] where there are none, and where nobody asked.
     pub(crate) second: u16,
     /// The sum one index below; [`NO_SUM`] at the end of the range.
     pub(crate) below: u16,
