@@ -240,10 +240,16 @@ pub fn reconstruct(
         return Err(ReconstructError::TooFewMatches { got: pairs.len(), needed: options.min_inliers });
     }
     progress.report("pose", 0, 1);
-    let (cameras, pose, inliers) = watch.time("pose", || initial(pairs, [a.size(), b.size()], prior, options))?;
+    let simple = watch.time("degeneracy", || Simple::new(pairs, prior.as_ref(), options));
+    let found = watch.time("pose", || initial(pairs, [a.size(), b.size()], prior, options));
+    // Of a turn, a search for a moving camera finds but a part: half of the points are behind whatever it supposes.
+    if let Err(ReconstructError::TooFewInliers { inliers, .. }) = &found {
+        simple.check(*inliers, options)?;
+    }
+    let (cameras, pose, inliers) = found?;
+    simple.check(inliers.len(), options)?;
+    let planar_share = simple.planar as f64 / inliers.len() as f64;
     let chosen: Vec<Correspondence> = inliers.iter().map(|&i| pairs[i]).collect();
-    let (normalised, unit) = normalize_matches(&chosen, &cameras[0], &cameras[1]);
-    let planar_share = watch.time("degeneracy", || degeneracy(&chosen, &normalised, unit, &cameras, options))?;
 
     let too_few = |n| ReconstructError::TooFewInliers { inliers: n, matches: pairs.len(), needed: options.min_inliers };
     let settings = BundleOptions { refine_focal: prior.is_none(), ..BundleOptions::default() };
@@ -446,34 +452,55 @@ fn uncalibrated(
     Ok((cameras, pose, found.inliers))
 }
 
-/// Names a camera that only turned and a scene that is one plane; otherwise, the share that a homography explains.
-fn degeneracy(
-    pairs: &[Correspondence],
-    normalised: &[Correspondence],
-    unit: f64,
-    cameras: &[Camera; 2],
-    options: &ReconstructOptions,
-) -> Result<f64, ReconstructError> {
-    // Distances in two dimensions and two photographs, where the epipolar one is in one.
-    let reach = 2.0 * options.robust.threshold;
-    if let Ok((rotation, share)) = rotation_between(normalised, reach * unit)
-        && share >= options.degenerate_share
-    {
-        return Err(ReconstructError::PureRotation { share, degrees: rotation.angle().to_degrees() });
+/// What simpler explanations than a moving camera and a scene with depth make of the matches.
+struct Simple {
+    /// Matches that one homography explains.
+    planar: usize,
+    /// Matches that a rotation explains, and its angle in degrees; needs cameras.
+    turned: usize,
+    degrees: f64,
+}
+
+impl Simple {
+    fn new(pairs: &[Correspondence], cameras: Option<&[Camera; 2]>, options: &ReconstructOptions) -> Self {
+        // Distances in two dimensions and two photographs, where the epipolar one is in one.
+        let reach = 2.0 * options.robust.threshold;
+        let straight: Vec<Correspondence> = match cameras {
+            Some([a, b]) => pairs
+                .iter()
+                .map(|m| Correspondence { a: a.undistort_pixel(m.a), b: b.undistort_pixel(m.b) })
+                .filter(Correspondence::is_finite)
+                .collect(),
+            None => pairs.to_vec(),
+        };
+        let robust = RobustOptions { threshold: reach, ..options.robust };
+        let mut simple = Self { planar: 0, turned: 0, degrees: 0.0 };
+        let Ok(h) = estimate_homography(&straight, &robust) else { return simple };
+        simple.planar = h.inliers.len();
+        if let Some([a, b]) = cameras {
+            let on_plane: Vec<Correspondence> = h.inliers.iter().map(|&i| straight[i]).collect();
+            let pinhole = |c: &Camera| Camera::pinhole(c.width, c.height, c.fx, c.fy, c.cx, c.cy);
+            let (normalised, unit) = normalize_matches(&on_plane, &pinhole(a), &pinhole(b));
+            if let Ok((rotation, share)) = rotation_between(&normalised, reach * unit) {
+                simple.turned = (share * on_plane.len() as f64).round() as usize;
+                simple.degrees = rotation.angle().to_degrees();
+            }
+        }
+        simple
     }
-    let straight: Vec<Correspondence> = pairs
-        .iter()
-        .map(|m| Correspondence { a: cameras[0].undistort_pixel(m.a), b: cameras[1].undistort_pixel(m.b) })
-        .collect();
-    let robust = RobustOptions { threshold: reach, ..options.robust };
-    let share = match estimate_homography(&straight, &robust) {
-        Ok(h) => h.inliers.len() as f64 / pairs.len() as f64,
-        Err(_) => 0.0,
-    };
-    if share >= options.degenerate_share {
-        return Err(ReconstructError::Planar { share });
+
+    /// Names a camera that only turned and a scene that is one plane, beside `inliers` matches that a general motion explains.
+    fn check(&self, inliers: usize, options: &ReconstructOptions) -> Result<(), ReconstructError> {
+        let share = |n: usize| (n as f64 / inliers.max(1) as f64).min(1.0);
+        let enough = |n: usize| n >= options.min_inliers && share(n) >= options.degenerate_share;
+        if enough(self.turned) {
+            return Err(ReconstructError::PureRotation { share: share(self.turned), degrees: self.degrees });
+        }
+        if enough(self.planar) {
+            return Err(ReconstructError::Planar { share: share(self.planar) });
+        }
+        Ok(())
     }
-    Ok(share)
 }
 
 /// Reprojection errors in pixels in both photographs; `None` behind a camera.

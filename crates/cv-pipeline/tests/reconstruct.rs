@@ -1,0 +1,76 @@
+//! Two-view reconstruction of generated scenes with exact truth, and the scenes it has to refuse.
+
+use cv_core::{Camera, Pose, RgbU8, Rotation3, Vector3};
+use cv_pipeline::{Intrinsics, ReconstructError, ReconstructOptions, Silent, reconstruct};
+use cv_synth::{RenderOptions, Scene, direction_error, render, rotation_error, two_view};
+
+fn camera() -> Camera {
+    Camera::from_focal(640, 480, 560.0)
+}
+
+fn known() -> ReconstructOptions {
+    ReconstructOptions { intrinsics: Intrinsics::Known([camera(); 2]), ..ReconstructOptions::default() }
+}
+
+#[test]
+fn a_room_comes_back_with_its_pose_and_depths() {
+    let views = two_view(3, &camera(), 0.4, &RenderOptions::default()).unwrap();
+    let result = reconstruct(views.a.image.view(), views.b.image.view(), &known(), &Silent).unwrap();
+    let turn = rotation_error(&result.pose.rotation, &views.relative.rotation).to_degrees();
+    let direction = direction_error(&result.pose.translation, &views.relative.translation).to_degrees();
+    // The bars of the project.
+    assert!(turn <= 0.2 && direction <= 1.0, "{turn} {direction}");
+    assert!(result.points.len() >= 100 && result.reprojection_rms < 1.0);
+    // Depths, in units of the base line of 0.4 m: within 5 % for most points, each at its own pixel.
+    let baseline = views.relative.translation.norm();
+    let right = result.points.iter().filter(|p| {
+        let (x, y) = (p.pair.a.x.round() as usize, p.pair.a.y.round() as usize);
+        let truth = f64::from(views.a.depth.at(x.min(639), y.min(479))[0]);
+        (p.position.z * baseline / truth - 1.0).abs() < 0.05
+    });
+    // Points on outlines have the depth of either side.
+    let share = right.count() as f64 / result.points.len() as f64;
+    assert!(share > 0.8, "{share}");
+}
+
+#[test]
+fn a_camera_that_only_turned_is_told() {
+    let scene = Scene::room(5);
+    let first = scene.viewpoint();
+    let turn = Pose::new(Rotation3::new(Vector3::new(0.02, 0.12, 0.01)), Vector3::zeros());
+    let photos = [first, turn.compose(&first)]
+        .map(|pose| render(&scene, &camera(), &pose, &RenderOptions::default()).unwrap().image);
+    match reconstruct(photos[0].view(), photos[1].view(), &known(), &Silent) {
+        Err(ReconstructError::PureRotation { share, degrees }) => {
+            // The angle of (0.02, 0.12, 0.01) is 7.0 degrees.
+            assert!(share > 0.95 && (degrees - 7.0).abs() < 0.2, "{share} {degrees}");
+        }
+        other => panic!("{:?}", other.map(|r| r.points.len())),
+    }
+}
+
+#[test]
+fn too_little_is_told_with_its_numbers() {
+    let flat = RgbU8::new(640, 480, [90; 3]);
+    assert!(matches!(reconstruct(flat.view(), flat.view(), &known(), &Silent), Err(ReconstructError::Matching(_))));
+    let views = [3, 4].map(|seed| {
+        let scene = Scene::room(seed);
+        render(&scene, &camera(), &scene.viewpoint(), &RenderOptions::default()).unwrap().image
+    });
+    // Two rooms that have nothing in common.
+    assert!(matches!(
+        reconstruct(views[0].view(), views[1].view(), &known(), &Silent),
+        Err(ReconstructError::TooFewMatches { .. } | ReconstructError::TooFewInliers { .. })
+    ));
+    let other = Camera::from_focal(320, 240, 560.0);
+    let wrong = ReconstructOptions { intrinsics: Intrinsics::Known([other; 2]), ..ReconstructOptions::default() };
+    assert!(matches!(
+        reconstruct(views[0].view(), views[1].view(), &wrong, &Silent),
+        Err(ReconstructError::CameraSize { index: 1, .. })
+    ));
+    let negative = ReconstructOptions { intrinsics: Intrinsics::Focal([-1.0, 5.0]), ..ReconstructOptions::default() };
+    assert!(matches!(
+        reconstruct(views[0].view(), views[1].view(), &negative, &Silent),
+        Err(ReconstructError::Camera { index: 1, .. })
+    ));
+}
