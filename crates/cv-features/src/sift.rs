@@ -19,8 +19,12 @@ use rayon::prelude::*;
 /// Settings of [`sift`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct SiftOptions {
-    /// Largest number of features; those with the strongest contrast stay. 1 or more; default 8192 (COLMAP's).
+    /// Largest number of features; those with the strongest contrast stay (or those of the largest scale, see `coarse_first`). 1 or
+    /// more; default 8192 (COLMAP's).
     pub max_features: usize,
+    /// Where there are more than `max_features`, those of the largest scale stay (COLMAP's choice) instead of those with the strongest
+    /// contrast: gravel, leaves and grain have much contrast, but look alike everywhere and like nothing from another place. Default false.
+    pub coarse_first: bool,
     /// Start from an image of twice the size, which about quadruples the number of points and finds the smallest. Default true (Lowe).
     pub upsample: bool,
     /// Scales per octave. 1 to 8; default 3 (Lowe).
@@ -41,6 +45,7 @@ impl Default for SiftOptions {
     fn default() -> Self {
         Self {
             max_features: 8192,
+            coarse_first: false,
             upsample: true,
             layers: 3,
             sigma: 1.6,
@@ -81,6 +86,13 @@ pub fn sift(view: ImageView<'_, f32, 1>, options: &SiftOptions) -> Result<Descri
     let kind = if options.root { DescriptorKind::RootSift } else { DescriptorKind::Sift };
     let mut out =
         Described { keypoints: Vec::new(), descriptors: Descriptors::new(kind), dropped: Vec::new(), beyond_limit: 0 };
+    if options.coarse_first && points.len() > options.max_features {
+        // Stable: contrast decides between equals.
+        points.sort_by(|a, b| {
+            let scale = |p: &Extremum| p.sigma * octaves[p.octave].pixel;
+            scale(b).total_cmp(&scale(a))
+        });
+    }
     // A point gives at least one feature: more points than the limit are never needed.
     out.beyond_limit = points.len().saturating_sub(options.max_features);
     points.truncate(options.max_features);

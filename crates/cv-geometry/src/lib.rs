@@ -38,8 +38,8 @@ pub use epipolar::sampson;
 pub use error::{Degeneracy, EstimateError};
 pub use essential::{
     RecoveredPose, decompose_essential, essential_five_point, essential_from_fundamental, essential_from_pose,
-    estimate_essential, estimate_relative_pose, normalize_matches, recover_pose, refine_relative_pose,
-    rotation_between,
+    estimate_essential, estimate_relative_pose, normalize_matches, pose_difference, pose_stability, poses_are_rivals,
+    recover_pose, refine_relative_pose, rotation_between,
 };
 pub use fundamental::{estimate_fundamental, fundamental_eight_point, fundamental_seven_point};
 pub use homography::{

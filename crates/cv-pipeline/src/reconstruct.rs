@@ -3,11 +3,15 @@
 use crate::guided::{GuidedOptions, match_along_lines};
 use crate::{MatchingError, MatchingOptions, MatchingResult, Progress, Stopwatch, correspondences, match_photos};
 use cv_core::{Camera, CameraError, Correspondence, ImageView, Matrix3, Point2, Point3, Pose};
+use cv_features::SiftOptions;
 use cv_geometry::{
-    BundleOptions, BundleReport, EstimateError, RobustOptions, TwoViewBundle, adjust_two_views,
+    BundleOptions, BundleReport, EstimateError, RobustModel, RobustOptions, TwoViewBundle, adjust_two_views,
     essential_from_fundamental, essential_from_pose, estimate_fundamental, estimate_homography, estimate_relative_pose,
-    normalize_matches, parallax_angle, recover_pose, refine_relative_pose, rotation_between, triangulate,
+    normalize_matches, parallax_angle, pose_difference, pose_stability, poses_are_rivals, recover_pose,
+    refine_relative_pose, rotation_between, triangulate,
 };
+use cv_imgproc::resize_area;
+use rayon::prelude::*;
 
 /// What is known of the cameras.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -23,8 +27,12 @@ pub enum Intrinsics {
 /// Settings of [`reconstruct`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct ReconstructOptions {
-    /// Features and matches.
+    /// Features and matches. Default as of [`MatchingOptions`], but the coarsest SIFT features are kept, not the strongest.
     pub matching: MatchingOptions,
+    /// Photographs whose longer side is above this are reduced to it before features are looked for, in pixels; positions are given in
+    /// pixels of the photograph all the same. 8 or more; default 2400 (COLMAP's high quality); finer
+    /// features are grain.
+    pub max_size: usize,
     /// What is known of the cameras. Default unknown.
     pub intrinsics: Intrinsics,
     /// The search for the pose. The threshold is in pixels; default 2 px, three to four times what a SIFT point is good to.
@@ -36,6 +44,9 @@ pub struct ReconstructOptions {
     /// Smallest median angle between the two rays of a point, in radians. Default 0.5 degrees: depth is then known to a fifth
     /// or so, for a point good to half a pixel at a focal length of 1000 px.
     pub min_median_angle: f64,
+    /// Largest standard deviation of the direction of the translation, in radians, and largest angle to another direction that the
+    /// matches do not exclude. Default 3 degrees: beyond, depths along the motion are off by a tenth and more.
+    pub max_deviation: f64,
     /// Smallest angle between the two rays of a point that is kept, in radians. Default 0.1 degrees.
     pub min_angle: f64,
     /// Largest reprojection error of a point that is kept, in pixels, in either photograph. Default 2 px.
@@ -51,12 +62,17 @@ pub struct ReconstructOptions {
 impl Default for ReconstructOptions {
     fn default() -> Self {
         Self {
-            matching: MatchingOptions::default(),
+            matching: MatchingOptions {
+                sift: SiftOptions { coarse_first: true, ..SiftOptions::default() },
+                ..MatchingOptions::default()
+            },
+            max_size: 2400,
             intrinsics: Intrinsics::Unknown,
             robust: RobustOptions { threshold: 2.0, ..RobustOptions::default() },
             min_inliers: 30,
             min_inlier_share: 0.1,
             min_median_angle: 0.5f64.to_radians(),
+            max_deviation: 3f64.to_radians(),
             min_angle: 0.1f64.to_radians(),
             max_reprojection: 2.0,
             guided: true,
@@ -101,7 +117,8 @@ pub struct ReconstructResult {
     pub reprojection_rms: f64,
     /// Median angle between the two rays of a point, in radians.
     pub median_angle: f64,
-    /// Standard deviations of the rotation and of the direction of the translation, in radians.
+    /// Standard deviations of the rotation and of the direction of the translation, in radians: the larger of what the residuals say
+    /// and of what leaving out one part of the photograph after the other does ([`pose_stability`]).
     pub pose_deviation: [f64; 2],
     /// Relative standard deviation of the focal length; 0 where it was given.
     pub focal_deviation: f64,
@@ -184,6 +201,20 @@ pub enum ReconstructError {
         /// Angle needed, in degrees.
         needed: f64,
     },
+    /// The matches do not tell the motion well enough.
+    #[error(
+        "the motion is uncertain: {degrees:.1} degrees in its direction, {allowed:.1} are allowed ({inliers} of {matches} matches agree)"
+    )]
+    UncertainPose {
+        /// Standard deviation of the direction, or angle to another direction that fits as well, in degrees.
+        degrees: f64,
+        /// Angle allowed, in degrees.
+        allowed: f64,
+        /// Matches that agree.
+        inliers: usize,
+        /// Matches.
+        matches: usize,
+    },
     /// The focal length that was given fits the matches much worse than others, or none can be told.
     #[error("the focal length cannot be told from these photographs ({focal:.0} px, give or take {:.0} %)", 100.0 * deviation)]
     UnknownFocal {
@@ -210,6 +241,9 @@ impl ReconstructError {
                 "step aside between the photographs; to join photographs from one place use `cv panorama`"
             }
             Self::Planar { .. } => "include things in front of the plane or behind it",
+            Self::UncertainPose { .. } => {
+                "take photographs that share more of the scene, with things near and far all over them, or find more features (--features)"
+            }
             Self::LittleParallax { .. } => "take the photographs farther apart",
             Self::UnknownFocal { .. } => "give the focal length (--focal) or a camera file (--camera)",
             Self::Estimate(_) => "check the matches with `cv match`",
@@ -231,7 +265,7 @@ pub fn reconstruct(
 ) -> Result<ReconstructResult, ReconstructError> {
     let mut watch = Stopwatch::new();
     let prior = cameras(options.intrinsics, [a.size(), b.size()])?;
-    let matching = match_photos(a, b, &options.matching, progress)?;
+    let matching = matched([a, b], options, progress)?;
     for &(stage, seconds) in &matching.stages {
         watch.add(stage, seconds);
     }
@@ -243,7 +277,9 @@ pub fn reconstruct(
     let simple = watch.time("degeneracy", || Simple::new(pairs, prior.as_ref(), options));
     let found = watch.time("pose", || initial(pairs, [a.size(), b.size()], prior, options));
     // Of a turn, a search for a moving camera finds but a part: half of the points are behind whatever it supposes.
-    if let Err(ReconstructError::TooFewInliers { inliers, .. }) = &found {
+    if let Err(ReconstructError::TooFewInliers { inliers, .. } | ReconstructError::UncertainPose { inliers, .. }) =
+        &found
+    {
         simple.check(*inliers, options)?;
     }
     let (cameras, pose, inliers) = found?;
@@ -255,6 +291,10 @@ pub fn reconstruct(
     let settings = BundleOptions { refine_focal: prior.is_none(), ..BundleOptions::default() };
     progress.report("points", 0, 1);
     let mut fit = watch.time("bundle", || fit(&chosen, cameras, pose, &settings)).ok_or_else(|| too_few(0))?;
+    // Before the matches along the lines: those agree with the pose because they were looked for where it says.
+    let (normalised, unit) = normalize_matches(&fit.observed, &fit.bundle.cameras[0], &fit.bundle.cameras[1]);
+    let reach = options.robust.threshold * unit;
+    let stability = watch.time("stability", || pose_stability(&fit.bundle.pose, &normalised, reach));
     let mut guided = 0;
     if options.guided {
         let [fa, fb] = &matching.features;
@@ -278,6 +318,7 @@ pub fn reconstruct(
         watch.lap("bundle");
     }
     let Fit { bundle, observed, report } = fit;
+    let pose_deviation = [0, 1].map(|i| stability[i].max(report.pose_deviation[i]));
     let focal = bundle.cameras[0].fx;
     // Beyond a third, the shape of the scene is a guess.
     if settings.refine_focal && report.focal_deviation > 0.33 {
@@ -311,6 +352,14 @@ pub fn reconstruct(
             needed: options.min_median_angle.to_degrees(),
         });
     }
+    if pose_deviation[1] > options.max_deviation {
+        return Err(ReconstructError::UncertainPose {
+            degrees: pose_deviation[1].to_degrees(),
+            allowed: options.max_deviation.to_degrees(),
+            inliers: scene.len(),
+            matches: pairs.len().max(guided),
+        });
+    }
     let squares: f64 = scene.iter().map(|p| p.reprojection * p.reprojection).sum();
     watch.lap("filter");
     Ok(ReconstructResult {
@@ -321,12 +370,40 @@ pub fn reconstruct(
         reprojection_rms: (squares / scene.len() as f64).sqrt(),
         points: scene,
         median_angle,
-        pose_deviation: report.pose_deviation,
+        pose_deviation,
         focal_deviation: report.focal_deviation,
         planar_share,
         matching,
         stages: watch.into_stages(),
     })
+}
+
+/// Tentative matches, found in reduced photographs where those are large, in pixels of the photographs themselves.
+fn matched(
+    photos: [ImageView<'_, u8, 3>; 2],
+    options: &ReconstructOptions,
+    progress: &dyn Progress,
+) -> Result<MatchingResult, MatchingError> {
+    let reduced = photos.map(|photo| {
+        let factor = options.max_size.max(8) as f64 / photo.width().max(photo.height()) as f64;
+        let side = |n: usize| ((n as f64 * factor).round() as usize).max(1);
+        (factor < 1.0).then(|| resize_area(photo, side(photo.width()), side(photo.height())).ok()).flatten()
+    });
+    let views = [0, 1].map(|i: usize| reduced[i].as_ref().map_or(photos[i], |r| r.view()));
+    let mut matching = match_photos(views[0], views[1], &options.matching, progress)?;
+    for ((features, view), photo) in matching.features.iter_mut().zip(&views).zip(&photos) {
+        let ratio = |a: usize, b: usize| a as f32 / b as f32;
+        let (x, y) = (ratio(photo.width(), view.width()), ratio(photo.height(), view.height()));
+        let points = features.described.keypoints.iter_mut();
+        for point in points.chain(&mut features.candidates) {
+            // The corners of the pictures meet, not the centres of their corner pixels.
+            point.position.x = (point.position.x + 0.5) * x - 0.5;
+            point.position.y = (point.position.y + 0.5) * y - 0.5;
+            point.scale *= (x * y).sqrt();
+        }
+    }
+    matching.pairs = correspondences(&matching.features[0], &matching.features[1], &matching.matches);
+    Ok(matching)
 }
 
 /// The fundamental matrix between undistorted pixels.
@@ -392,11 +469,17 @@ fn initial(
         }
         None => uncalibrated(pairs, sizes, options)?,
     };
-    let needed = options.min_inliers.max((options.min_inlier_share * pairs.len() as f64).ceil() as usize);
-    if inliers.len() < needed {
-        return Err(ReconstructError::TooFewInliers { inliers: inliers.len(), matches: pairs.len(), needed });
-    }
+    enough(inliers.len(), pairs.len(), options)?;
     Ok((cameras, pose, inliers))
+}
+
+/// Refuses where fewer agree than were asked for.
+fn enough(inliers: usize, matches: usize, options: &ReconstructOptions) -> Result<(), ReconstructError> {
+    let needed = options.min_inliers.max((options.min_inlier_share * matches as f64).ceil() as usize);
+    if inliers < needed {
+        return Err(ReconstructError::TooFewInliers { inliers, matches, needed });
+    }
+    Ok(())
 }
 
 fn calibrated(
@@ -408,10 +491,39 @@ fn calibrated(
     // A pixel that no ray reaches (beyond the range of the lens model) is no match.
     let usable: Vec<usize> = (0..normalised.len()).filter(|&i| normalised[i].is_finite()).collect();
     let normalised: Vec<_> = usable.iter().map(|&i| normalised[i]).collect();
-    let robust = RobustOptions { threshold: options.robust.threshold * unit, ..options.robust };
-    let found = estimate_relative_pose(&normalised, &robust).map_err(|error| failed(error, pairs.len(), options))?;
-    Ok((found.model, found.inliers.iter().map(|&i| usable[i]).collect()))
+    let threshold = options.robust.threshold * unit;
+    let search = |k: u64| {
+        let seed = options.robust.seed.wrapping_add(k);
+        let found = estimate_relative_pose(&normalised, &RobustOptions { threshold, seed, ..options.robust })?;
+        let (pose, loss) = refine_relative_pose(&found.model, &normalised, threshold);
+        Ok((RobustModel { model: pose, ..found }, loss))
+    };
+    let searches: Vec<_> = (0..SEARCHES).into_par_iter().map(search).collect();
+    let mut found: Vec<(RobustModel<Pose>, f64)> =
+        searches.into_iter().collect::<Result<_, _>>().map_err(|error| failed(error, pairs.len(), options))?;
+    found.sort_by(|a, b| a.1.total_cmp(&b.1));
+    let (best, others) = (&found[0].0, &found[1..]);
+    enough(best.inliers.len(), pairs.len(), options)?;
+    // As far as another search got, where the matches do not say that it got to a worse place.
+    let apart = others
+        .iter()
+        .filter(|other| poses_are_rivals(&best.model, &other.0.model, &normalised, threshold))
+        .map(|other| pose_difference(&best.model, &other.0.model)[1])
+        .fold(0.0, f64::max);
+    if apart > options.max_deviation {
+        return Err(ReconstructError::UncertainPose {
+            degrees: apart.to_degrees(),
+            allowed: options.max_deviation.to_degrees(),
+            inliers: best.inliers.len(),
+            matches: pairs.len(),
+        });
+    }
+    Ok((best.model, best.inliers.iter().map(|&i| usable[i]).collect()))
 }
+
+/// Searches from different seeds. Where the matches determine a pose, all find it; five miss a second one that is found as often as
+/// the first in one case of sixteen.
+const SEARCHES: u64 = 5;
 
 /// Too few matches that agree is the reason a person understands.
 fn failed(error: EstimateError, matches: usize, options: &ReconstructOptions) -> ReconstructError {

@@ -2,12 +2,14 @@
 
 mod decompose;
 mod five_point;
+mod stability;
 
 pub(crate) use decompose::in_front;
 pub use decompose::{
     RecoveredPose, decompose_essential, essential_from_fundamental, essential_from_pose, recover_pose,
 };
 pub use five_point::essential_five_point;
+pub use stability::{pose_difference, pose_stability, poses_are_rivals};
 
 use crate::epipolar::{Epipolar, SampsonKernel, SampsonProblem, refine_sampson, sampson};
 use crate::error::{Degeneracy, EstimateError};
@@ -155,6 +157,8 @@ impl Estimator for PoseEstimator {
     type Block = PairBlock;
     type Kernel = SampsonKernel;
     const SAMPLE: usize = 5;
+    // From one and the same basin of the loss, the steps end in one place instead of several beside each other.
+    const WIDENINGS: u32 = 2;
 
     fn count(&self) -> usize {
         self.set.pairs.len()
