@@ -42,6 +42,7 @@ mod focal;
 mod graph;
 mod layout;
 mod maxflow;
+mod misalignment;
 mod multiband;
 mod poisson;
 mod preview;

@@ -155,7 +155,7 @@ pub fn render(
     let gains = exposure::estimate(&preview, &photo_of, photos.len(), options.exposure);
     clock.lap("exposure");
     let per_piece: Vec<[f32; 3]> = photo_of.iter().map(|&p| gains.gains[p]).collect();
-    let coarse = seams::on_preview(&preview, &per_piece, options.seams);
+    let coarse = seams::on_preview(&preview, &per_piece, &photo_of, options.seams);
     clock.lap("seams");
 
     let bands = bands(&layout);

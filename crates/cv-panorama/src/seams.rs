@@ -6,6 +6,7 @@
 
 use crate::layout::Bounds;
 use crate::maxflow::GridCut;
+use crate::misalignment::Misalignments;
 use crate::preview::Preview;
 use crate::warp::Warped;
 
@@ -61,6 +62,12 @@ const STEP: i32 = 4 * 3;
 /// the photographs agree.
 const BORDER_PIXEL: f32 = 4.0;
 
+/// Cost of a seam through a pixel where the photographs disagree by a canvas pixel more than one, beyond the difference of colours: 15 grey levels in
+/// one channel.
+const MISALIGNED: f32 = 4.0 * 15.0;
+/// Canvas pixels of misalignment beyond which nothing gets worse.
+const FARTHEST: f32 = 8.0;
+
 /// How much two photographs differ at a pixel: sum over channels of the absolute difference, in quarters of a grey level, and the same of the
 /// gradients of brightness.
 fn difference(a: &Option<Toned<'_>>, b: &Option<Toned<'_>>, x: usize, y: usize) -> i32 {
@@ -107,7 +114,7 @@ impl Labels {
 }
 
 /// Labels on the preview.
-pub(crate) fn on_preview(preview: &Preview, gains: &[[f32; 3]], seams: Seams) -> Labels {
+pub(crate) fn on_preview(preview: &Preview, gains: &[[f32; 3]], photo_of: &[usize], seams: Seams) -> Labels {
     let (width, height) = (preview.width, preview.height);
     let mut labels = Labels { width, height, data: vec![NONE; width * height] };
     for y in 0..height {
@@ -129,8 +136,12 @@ pub(crate) fn on_preview(preview: &Preview, gains: &[[f32; 3]], seams: Seams) ->
             preview.pieces.iter().zip(gains).map(|(p, g)| Some(Toned::new(&p.warped, *g))).collect();
         let unary =
             |label: usize, x: usize, y: usize| (BORDER_PIXEL * eccentricity(&preview.pieces[label], x, y)) as i32;
+        let found = Misalignments::find(preview, photo_of);
+        let misaligned = |a: usize, b: usize, x: usize, y: usize| {
+            (MISALIGNED * (preview.step as f32 * found.at(a, b, x, y) - 1.0).clamp(0.0, FARTHEST)) as i32
+        };
         // The first round does nearly all; four settle every set met so far.
-        expand(&mut labels, &pieces, unary, |_, _| true, 4);
+        expand(&mut labels, &pieces, unary, misaligned, |_, _| true, 4);
     }
     labels
 }
@@ -144,7 +155,7 @@ fn eccentricity(piece: &crate::preview::Piece, x: usize, y: usize) -> f32 {
 pub(crate) fn refine(labels: &mut Labels, pieces: &[Option<Toned<'_>>], reach: usize) {
     let near = near_seams(labels, reach);
     let width = labels.width;
-    expand(labels, pieces, |_, _, _| 0, |x, y| near[y * width + x], 1);
+    expand(labels, pieces, |_, _, _| 0, |_, _, _, _| 0, |x, y| near[y * width + x], 1);
 }
 
 /// True within `reach` pixels (in x and y) of a border between two labels.
@@ -196,6 +207,7 @@ fn expand(
     labels: &mut Labels,
     pieces: &[Option<Toned<'_>>],
     unary: impl Fn(usize, usize, usize) -> i32,
+    pairwise: impl Fn(usize, usize, usize, usize) -> i32,
     free: impl Fn(usize, usize) -> bool,
     rounds: usize,
 ) {
@@ -203,7 +215,9 @@ fn expand(
     let mut stale = vec![true; pieces.len()];
     for _ in 0..rounds {
         for alpha in 0..pieces.len() {
-            if std::mem::replace(&mut stale[alpha], false) && expand_one(labels, pieces, alpha, &unary, &free) {
+            if std::mem::replace(&mut stale[alpha], false)
+                && expand_one(labels, pieces, alpha, &unary, &pairwise, &free)
+            {
                 let bounds = |k: usize| pieces[k].as_ref().map(|p| p.warped.bounds);
                 for (other, s) in stale.iter_mut().enumerate() {
                     let (Some(a), Some(b)) = (bounds(other), bounds(alpha)) else { continue };
@@ -225,6 +239,7 @@ fn expand_one(
     pieces: &[Option<Toned<'_>>],
     alpha: usize,
     unary: impl Fn(usize, usize, usize) -> i32,
+    pairwise: impl Fn(usize, usize, usize, usize) -> i32,
     free: impl Fn(usize, usize) -> bool,
 ) -> bool {
     let Some(own) = &pieces[alpha] else { return false };
@@ -233,6 +248,8 @@ fn expand_one(
     else {
         return false;
     };
+    let differ =
+        |a: usize, c: usize, x: usize, y: usize| difference(&pieces[a], &pieces[c], x, y) + pairwise(a, c, x, y);
     // A pixel may switch where it is free, alpha reaches it, and it shows something else.
     let may = |x: usize, y: usize| {
         let label = labels.at(x, y);
@@ -277,7 +294,7 @@ fn expand_one(
                     if a == c {
                         return 0;
                     }
-                    STEP + difference(&pieces[a], &pieces[c], x, y) + difference(&pieces[a], &pieces[c], nx, ny)
+                    STEP + differ(a, c, x, y) + differ(a, c, nx, ny)
                 };
                 let keep = pay(p, q);
                 // Cost where only the first, or only the second, becomes alpha.
@@ -313,11 +330,7 @@ fn expand_one(
             continue;
         }
         let pay = |a: usize, c: usize| {
-            if a == c {
-                0
-            } else {
-                STEP + difference(&pieces[a], &pieces[c], x, y) + difference(&pieces[a], &pieces[c], nx, ny)
-            }
+            if a == c { 0 } else { STEP + differ(a, c, x, y) + differ(a, c, nx, ny) }
         };
         add_signed(
             &mut cut,

@@ -13,7 +13,8 @@ use std::path::{Path, PathBuf};
 #[command(after_help = "Examples:\n  \
     cv panorama IMG_*.jpg -o pano.png\n  \
     cv panorama holiday/ -o pano.jpg --projection spherical --crop\n  \
-    cv panorama a.jpg b.jpg c.jpg -o pano.png --blend poisson --report out/")]
+    cv panorama a.jpg b.jpg c.jpg -o pano.png --blend poisson --report out/\n  \
+    cv panorama wide/ -o pano.png --camera cam.yaml")]
 pub(crate) struct Args {
     /// Photographs in any order, or folders of them. Those that do not belong are left out.
     #[arg(required = true, value_name = "IMAGES")]
@@ -42,6 +43,10 @@ pub(crate) struct Args {
     /// Features to match: sift for any photographs, harris for speed where they are all upright and of one size.
     #[arg(long, value_enum, default_value_t = FeaturesArg::Sift)]
     features: FeaturesArg,
+    /// The calibrated camera that took all of them (ours, OpenCV's or ROS's YAML, COLMAP's cameras.txt): its focal length is believed and its distortion
+    /// taken out. Without, the focal length is estimated, from EXIF on.
+    #[arg(long, value_name = "FILE")]
+    camera: Option<PathBuf>,
 }
 
 #[derive(Debug, Clone, Copy, clap::ValueEnum)]
@@ -116,6 +121,9 @@ impl Args {
     }
 }
 
+/// Share of a photograph's side by which matches disagree when the camera clearly moved: 5 px of 1,000.
+const MUCH: f64 = 0.005;
+
 impl Run for Args {
     fn outputs(&self) -> Vec<&Path> {
         vec![&self.output]
@@ -132,14 +140,27 @@ impl Run for Args {
             .collect::<Result<Vec<_>, cv_io::IoError>>()?;
         let photos: Vec<PanoramaPhoto<'_>> = pictures
             .iter()
-            .map(|(focal, image)| PanoramaPhoto { focal: focal.as_ref().map(|f| f.pixels), ..PanoramaPhoto::new(image.view()) })
-            .collect();
+            .map(|(focal, image)| {
+                let camera = match &self.camera {
+                    Some(path) => Some(cv_io::read_camera(path, Some(image.size()))?),
+                    None => None,
+                };
+                Ok(PanoramaPhoto { image: image.view(), focal: focal.as_ref().map(|f| f.pixels), camera })
+            })
+            .collect::<Result<_, cv_io::IoError>>()?;
         let result = panorama(&photos, &self.options(context), context).map_err(|error| failure(error, &paths))?;
         cv_io::write_image(&self.output, result.image.view())?;
         for (path, image) in paths.iter().zip(&result.images) {
             if let Some(reason) = &image.reason {
                 context.warn(format!("{} is not in the panorama: {reason}", path.display()));
             }
+        }
+        // Features are good to a pixel or two; parallax is what is left.
+        let (rms, long) = (result.reprojection_rms_px, pictures.iter().map(|(_, p)| p.width().max(p.height())).max());
+        if rms > MUCH * long.unwrap_or(0) as f64 {
+            context.warn(format!(
+                "the photographs agree only to {rms:.1} px: they were taken from different places, and what is near may be cut in two at the seams"
+            ));
         }
         context.report(|| {
             let photos: Vec<_> = pictures.into_iter().map(|(_, image)| image).collect();

@@ -1,0 +1,196 @@
+//! Where two photographs show the same thing at different places of the preview: near things against far ones, where no deformation is smooth enough
+//! to bring both together. A seam there cuts things in two however little the colours on it differ.
+
+use crate::preview::{Piece, Preview};
+use cv_core::GrayF32;
+use rayon::prelude::*;
+
+/// Half the side of the patches compared, in preview pixels.
+const HALF: usize = 4;
+/// Farthest displacement looked for, in preview pixels.
+const REACH: isize = 8;
+/// Preview pixels between places looked at.
+const STEP: usize = 3;
+/// Least root mean square contrast of a patch, in grey levels: below it, what is cut in two is not seen.
+const CONTRAST: f32 = 4.0;
+/// Correlation at which two patches show the same thing.
+const ALIKE: f32 = 0.85;
+/// Correlations closer than this to the best are as good: along an edge any place is, and the nearest counts.
+const AS_GOOD: f32 = 0.03;
+
+/// For every two pieces, by how many preview pixels they disagree.
+pub(crate) struct Misalignments {
+    pieces: usize,
+    pairs: Vec<Option<Pair>>,
+}
+
+struct Pair {
+    left: usize,
+    top: usize,
+    columns: usize,
+    rows: usize,
+    pixels: Vec<f32>,
+}
+
+impl Misalignments {
+    /// Compares all overlapping pieces. O(overlap · reach² · patch) where they disagree, O(overlap · patch) where not.
+    pub(crate) fn find(preview: &Preview, photo_of: &[usize]) -> Self {
+        let lumas: Vec<GrayF32> = preview.pieces.par_iter().map(luma).collect();
+        let n = preview.pieces.len();
+        let pairs = (0..n * n)
+            .into_par_iter()
+            .map(|k| {
+                let (a, b) = (k / n, k % n);
+                (a < b && photo_of[a] != photo_of[b]).then(|| compare(preview, &lumas, a, b)).flatten()
+            })
+            .collect();
+        Self { pieces: n, pairs }
+    }
+
+    /// By how many preview pixels two pieces disagree about a preview pixel; 0 where that is not known.
+    #[inline]
+    pub(crate) fn at(&self, a: usize, b: usize, x: usize, y: usize) -> f32 {
+        let (a, b) = (a.min(b), a.max(b));
+        let Some(Some(p)) = self.pairs.get(a * self.pieces + b) else { return 0.0 };
+        let (Some(x), Some(y)) = (x.checked_sub(p.left), y.checked_sub(p.top)) else { return 0.0 };
+        let (column, row) = (x / STEP, y / STEP);
+        if column < p.columns && row < p.rows { p.pixels[row * p.columns + column] } else { 0.0 }
+    }
+}
+
+/// Brightness, NaN where the photograph does not reach.
+fn luma(piece: &Piece) -> GrayF32 {
+    let (w, h) = piece.warped.pixels.size();
+    GrayF32::from_fn(w, h, |x, y| {
+        let [r, g, b, a] = piece.warped.pixels.at(x, y).map(f32::from);
+        [if a > 0.0 { 0.299 * r + 0.587 * g + 0.114 * b } else { f32::NAN }]
+    })
+}
+
+fn compare(preview: &Preview, lumas: &[GrayF32], a: usize, b: usize) -> Option<Pair> {
+    let (first, second) = (preview.pieces[a].warped.bounds, preview.pieces[b].warped.bounds);
+    let common = first.intersection(&second)?;
+    let (columns, rows) = (common.width() / STEP, common.height() / STEP);
+    let mut pixels = vec![0.0; columns * rows];
+    for row in 0..rows {
+        for column in 0..columns {
+            let (x, y) = (common.left + column * STEP + STEP / 2, common.top + row * STEP + STEP / 2);
+            let p = ((x - first.left) as isize, (y - first.top) as isize);
+            let q = ((x - second.left) as isize, (y - second.top) as isize);
+            pixels[row * columns + column] = displacement(&lumas[a], p, &lumas[b], q);
+        }
+    }
+    spread(&mut pixels, columns);
+    Some(Pair { left: common.left, top: common.top, columns, rows, pixels })
+}
+
+/// Places too near a border to be compared take the worst of their neighbours: a seam along the border cuts what those show. The others stay as they are.
+fn spread(pixels: &mut [f32], columns: usize) {
+    // From the border to where a whole patch fits it is this many places.
+    for _ in 0..HALF.div_ceil(STEP) + 1 {
+        let before = pixels.to_vec();
+        for (i, pixel) in pixels.iter_mut().enumerate().filter(|(_, p)| p.is_nan()) {
+            let (x, y) = (i % columns, i / columns);
+            let rows = y.saturating_sub(1)..(y + 2).min(before.len() / columns);
+            let around = rows.flat_map(|r| &before[r * columns..][x.saturating_sub(1)..(x + 2).min(columns)]);
+            // `max` passes over NaN.
+            *pixel = around.fold(f32::NAN, |m, v| m.max(*v));
+        }
+    }
+    pixels.iter_mut().filter(|p| p.is_nan()).for_each(|p| *p = 0.0);
+}
+
+/// The least displacement at which the patch around `p` looks as around `q`: 0 where it is too plain, [`REACH`] where nothing looks like it, NaN where one
+/// of the two is not wholly inside its photograph.
+fn displacement(first: &GrayF32, p: (isize, isize), second: &GrayF32, q: (isize, isize)) -> f32 {
+    let n = ((2 * HALF + 1) * (2 * HALF + 1)) as f32;
+    let mut patch = [0.0_f32; (2 * HALF + 1) * (2 * HALF + 1)];
+    let (Some(ours), Some(theirs)) = (rows(first, p), rows(second, q)) else { return f32::NAN };
+    if theirs.flatten().any(|v| v.is_nan()) {
+        return f32::NAN;
+    }
+    for (to, from) in patch.chunks_exact_mut(2 * HALF + 1).zip(ours) {
+        to.copy_from_slice(from);
+    }
+    let mean = patch.iter().sum::<f32>() / n;
+    patch.iter_mut().for_each(|v| *v -= mean);
+    let energy: f32 = patch.iter().map(|v| v * v).sum();
+    if energy.is_nan() {
+        return f32::NAN;
+    }
+    if energy < n * CONTRAST * CONTRAST {
+        return 0.0;
+    }
+    let score = |dx: isize, dy: isize| -> Option<f32> {
+        let (mut sum, mut squares, mut product) = (0.0_f32, 0.0_f32, 0.0_f32);
+        for (ours, theirs) in patch.chunks_exact(2 * HALF + 1).zip(rows(second, (q.0 + dx, q.1 + dy))?) {
+            for (a, b) in ours.iter().zip(theirs) {
+                sum += b;
+                squares += b * b;
+                product += a * b;
+            }
+        }
+        let score = product / (energy * (squares - sum * sum / n).max(1e-3)).sqrt();
+        score.is_finite().then_some(score)
+    };
+    if score(0, 0).is_some_and(|s| s > 1.0 - AS_GOOD) {
+        return 0.0;
+    }
+    let side = (2 * REACH + 1) as usize;
+    let mut scores = [f32::NEG_INFINITY; ((2 * REACH + 1) * (2 * REACH + 1)) as usize];
+    for (i, s) in scores.iter_mut().enumerate() {
+        *s = score((i % side) as isize - REACH, (i / side) as isize - REACH).unwrap_or(f32::NEG_INFINITY);
+    }
+    let best = scores.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    if best < ALIKE {
+        return REACH as f32;
+    }
+    let distance = |i: usize| ((i % side) as f32 - REACH as f32).hypot((i / side) as f32 - REACH as f32);
+    (0..scores.len()).filter(|&i| scores[i] >= best - AS_GOOD).map(distance).fold(REACH as f32, f32::min)
+}
+
+/// The rows of the patch around a pixel; `None` where it is not wholly inside.
+fn rows(image: &GrayF32, (x, y): (isize, isize)) -> Option<impl Iterator<Item = &[f32]>> {
+    let h = HALF as isize;
+    let inside = x >= h && y >= h && x + h < image.width() as isize && y + h < image.height() as isize;
+    inside.then(|| (y - h..=y + h).map(move |y| &image.row(y as usize)[(x - h) as usize..=(x + h) as usize]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Blotches that no shift by less than their size maps to themselves.
+    fn blotches(x: f32, y: f32) -> f32 {
+        120.0 + 60.0 * (0.31 * x + 0.2 * (0.17 * y).sin() * x).sin() + 50.0 * (0.43 * y + 0.011 * x * x).cos()
+    }
+
+    #[test]
+    fn a_shift_is_found_and_the_plain_and_the_foreign_are_told_apart() {
+        let first = GrayF32::from_fn(60, 60, |x, y| [blotches(x as f32, y as f32)]);
+        for (dx, dy) in [(0, 0), (3, -2), (-5, 4), (7, 7)] {
+            let moved =
+                GrayF32::from_fn(60, 60, |x, y| [0.7 * blotches((x as i32 - dx) as f32, (y as i32 - dy) as f32) + 9.0]);
+            let found = displacement(&first, (30, 30), &moved, (30, 30));
+            let truth = (dx as f32).hypot(dy as f32);
+            // The nearest of the places that look nearly as alike may be one pixel nearer in either direction.
+            assert!(found <= truth + 1e-3 && found >= truth - 1.5, "{dx} {dy}: {found}");
+        }
+        let plain = GrayF32::from_fn(60, 60, |_, _| [100.0]);
+        assert_eq!(displacement(&plain, (30, 30), &first, (30, 30)), 0.0);
+        let foreign = GrayF32::from_fn(60, 60, |x, y| [255.0 * ((x * 7919 + y * 104_729) % 97) as f32 / 97.0]);
+        assert_eq!(displacement(&first, (30, 30), &foreign, (30, 30)), REACH as f32);
+        // Along an edge nothing is known: the nearest place counts.
+        let edge = GrayF32::from_fn(60, 60, |x, _| [if x < 30 { 20.0 } else { 200.0 }]);
+        assert_eq!(displacement(&edge, (30, 25), &edge, (30, 33)), 0.0);
+        assert!(displacement(&first, (2, 30), &first, (2, 30)).is_nan());
+    }
+
+    #[test]
+    fn places_at_the_border_take_the_worst_of_their_neighbours() {
+        let nan = f32::NAN;
+        let mut pixels = vec![nan, nan, nan, nan, nan, 2.0, 5.0, nan, nan, 1.0, 0.0, nan];
+        spread(&mut pixels, 4);
+        assert_eq!(pixels, [2.0, 5.0, 5.0, 5.0, 2.0, 2.0, 5.0, 5.0, 2.0, 1.0, 0.0, 5.0]);
+    }
+}
