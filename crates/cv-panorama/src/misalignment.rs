@@ -146,7 +146,7 @@ fn displacement(first: &GrayF32, p: (isize, isize), second: &GrayF32, q: (isize,
         return REACH as f32;
     }
     let distance = |i: usize| ((i % side) as f32 - REACH as f32).hypot((i / side) as f32 - REACH as f32);
-    (0..scores.len()).filter(|&i| scores[i] >= best - AS_GOOD).map(distance).fold(REACH as f32, f32::min)
+    (0..scores.len()).filter(|&i| scores[i] >= best - AS_GOOD).map(distance).fold(f32::INFINITY, f32::min)
 }
 
 /// The rows of the patch around a pixel; `None` where it is not wholly inside.

@@ -189,12 +189,15 @@ fn displacement(
         *score = correlation(&first, side, at);
     }
     let (best, score) = scores.iter().copied().enumerate().max_by(|p, q| p.1.total_cmp(&q.1))?;
-    // Below this the two show different things: water, leaves, people.
-    if score < 0.85 {
+    let place = |k: usize| ((k % (2 * reach + 1)) as f64 - reach as f64, (k / (2 * reach + 1)) as f64 - reach as f64);
+    // Below this the two show different things: water, leaves, people. At the end of the reach there is no peak.
+    let (dx, dy) = place(best);
+    if score < 0.85 || dx.abs().max(dy.abs()) >= f64::from(REACH) {
         return None;
     }
-    let (dy, dx) = ((best / (2 * reach + 1)) as f64 - reach as f64, (best % (2 * reach + 1)) as f64 - reach as f64);
-    Some(dx.hypot(dy))
+    // Along an edge many places are as alike but for noise: the nearest of them is what is known of the displacement.
+    let near = (0..scores.len()).filter(|&k| scores[k] >= score - 0.02).map(place).map(|(dx, dy)| dx.hypot(dy));
+    near.min_by(f64::total_cmp)
 }
 
 fn correlation(first: &[f64], side: usize, second: impl Fn(usize, usize) -> f64) -> f64 {
