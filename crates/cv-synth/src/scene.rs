@@ -7,7 +7,7 @@ use crate::shape::{Ray, Shape, Surface};
 use crate::texture::{Rgb, SurfacePoint, Texture};
 use cv_core::Pose;
 use nalgebra::{Point3, Rotation3, Vector3};
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 
 /// A surface of an object.
 #[derive(Debug, Clone)]
@@ -80,7 +80,7 @@ pub(crate) struct Lighting {
 
 /// Textured surfaces under lights, in metres; X right, Y **down**, Z forward, the floor of the presets at y = 0.
 ///
-/// Light is worked out on the first rendering and kept: diffuse direct light with soft shadows and one bounce.
+/// Light is worked out when the scene is put together and kept: diffuse direct light with soft shadows and one bounce.
 /// It depends on the scene only, so that every view sees the same.
 #[derive(Debug, Clone)]
 pub struct Scene {
@@ -93,7 +93,7 @@ pub struct Scene {
     /// Spheres that darken what is near, for things that were put in after the light was worked out.
     pub(crate) blobs: Vec<(Point3<f64>, f64)>,
     viewpoint: Pose,
-    lighting: Arc<OnceLock<Lighting>>,
+    lighting: Arc<Lighting>,
 }
 
 impl Scene {
@@ -147,12 +147,7 @@ impl Scene {
     }
 
     pub(crate) fn lighting(&self) -> &Lighting {
-        self.lighting.get_or_init(|| {
-            let maps = light::bake(self, 0);
-            let mut lighting = Lighting { maps, gain: 1.0 };
-            lighting.gain = meter(self, &lighting);
-            lighting
-        })
+        &self.lighting
     }
 
     /// Reflectance (or radiance) of a surface seen with a sample of `width` metres.
@@ -185,9 +180,7 @@ impl Scene {
         scene.blobs = blobs;
         let mut maps = old.maps.clone();
         maps.extend(light::bake(&scene, first));
-        let lighting = OnceLock::new();
-        lighting.get_or_init(|| Lighting { maps, gain: old.gain });
-        scene.lighting = Arc::new(lighting);
+        scene.lighting = Arc::new(Lighting { maps, gain: old.gain });
         scene
     }
 }
@@ -359,7 +352,7 @@ impl SceneBuilder {
 
     /// The scene, with the pose that [`Scene::viewpoint`] offers.
     pub fn build(self, viewpoint: Pose) -> Scene {
-        Scene {
+        let mut scene = Scene {
             bvh: tree(&self.prims, &self.blocks),
             prims: self.prims,
             blocks: self.blocks,
@@ -368,7 +361,11 @@ impl SceneBuilder {
             ambient: self.ambient,
             blobs: Vec::new(),
             viewpoint,
-            lighting: Arc::new(OnceLock::new()),
-        }
+            lighting: Arc::new(Lighting { maps: Vec::new(), gain: 1.0 }),
+        };
+        let mut lighting = Lighting { maps: light::bake(&scene, 0), gain: 1.0 };
+        lighting.gain = meter(&scene, &lighting);
+        scene.lighting = Arc::new(lighting);
+        scene
     }
 }

@@ -8,17 +8,19 @@
 use super::{Figure, Job, Outcome};
 use crate::real::Check;
 use anyhow::{Context, Result, ensure};
-use cv_core::{Matrix3, Point2, RgbU8};
+use cv_core::{Camera, Mask, Matrix3, Point2, RgbU8, Vector3};
 use cv_pipeline::stereo::{StereoGeometry, StereoOptions};
 use cv_pipeline::{
-    DepthOptions, MatchingOptions, ModelKind, PanoramaOptions, PanoramaPhoto, Silent, depth, estimate, match_photos,
-    panorama,
+    DepthOptions, Intrinsics, MatchingOptions, ModelKind, PanoramaOptions, PanoramaPhoto, ReconstructOptions, Silent,
+    depth, estimate, match_photos, panorama, reconstruct, segment, train_segment,
 };
-use cv_synth::{depth_score, homography_corner_error};
+use cv_synth::{MaskScore, depth_score, direction_error, homography_corner_error, rotation_error};
+use nalgebra::Rotation3;
 use serde_json::Value;
 use std::path::Path;
 
-pub(super) const JOBS: &[Job] = &[("depth", stereo), ("plane", plane), ("panorama", views)];
+pub(super) const JOBS: &[Job] =
+    &[("depth", stereo), ("plane", plane), ("panorama", views), ("reconstruct", two_views), ("segment", ball)];
 
 fn picture(fixtures: &Path, name: &str) -> Result<RgbU8> {
     Ok(cv_io::read_rgb(fixtures.join(name))?)
@@ -122,6 +124,56 @@ fn views(fixtures: &Path) -> Result<Outcome> {
             Figure { name: "focal_px", value: focal, tolerance: 1.0 },
             Figure { name: "width", value: result.image.width() as f64, tolerance: 4.0 },
             Figure { name: "height", value: result.image.height() as f64, tolerance: 4.0 },
+        ],
+    })
+}
+
+fn two_views(fixtures: &Path) -> Result<Outcome> {
+    let (a, b) = (picture(fixtures, "two-view/a.jpg")?, picture(fixtures, "two-view/b.jpg")?);
+    let known = truth(fixtures, "two-view.json")?;
+    let camera = Camera::from_focal(a.width(), a.height(), number(&known, "focal_px")?);
+    let options = ReconstructOptions { intrinsics: Intrinsics::Known([camera; 2]), ..ReconstructOptions::default() };
+    let found = reconstruct(a.view(), b.view(), &options, &Silent)?;
+    let rotation = Rotation3::from_matrix_unchecked(matrix(&known["rotation"])?);
+    let translation: Vec<f64> =
+        known["translation_m"].as_array().into_iter().flatten().filter_map(Value::as_f64).collect();
+    ensure!(translation.len() == 3, "no translation");
+    let turn = rotation_error(&found.pose.rotation, &rotation).to_degrees();
+    let way = direction_error(&found.pose.translation, &Vector3::from_column_slice(&translation)).to_degrees();
+    Ok(Outcome {
+        checks: vec![
+            Check::at_most("error of the rotation, degrees", turn, 0.2),
+            Check::at_most("error of the direction of travel, degrees", way, 1.0),
+        ],
+        figures: vec![
+            Figure { name: "rotation_error_deg", value: turn, tolerance: 0.01 },
+            Figure { name: "direction_error_deg", value: way, tolerance: 0.1 },
+            Figure { name: "points", value: found.points.len() as f64, tolerance: 10.0 },
+            Figure { name: "reprojection_rms_px", value: found.reprojection_rms, tolerance: 0.02 },
+        ],
+    })
+}
+
+fn ball(fixtures: &Path) -> Result<Outcome> {
+    let photos: Vec<(RgbU8, Mask)> = (0..8)
+        .map(|i| {
+            let mask = cv_io::read_mask(fixtures.join(format!("oracle/ball-masks/ball{i}_mask.png")))?;
+            Ok((picture(fixtures, &format!("ball/ball{i}.jpg"))?, mask))
+        })
+        .collect::<Result<_>>()?;
+    let half: Vec<_> = photos.iter().step_by(2).map(|(photo, mask)| (photo.view(), mask.view())).collect();
+    let model = train_segment(&half, &Default::default(), &Silent)?.trained.model;
+    let score = photos
+        .iter()
+        .skip(1)
+        .step_by(2)
+        .map(|(photo, mask)| MaskScore::new(&segment(photo.view(), &model).mask, mask).context("sizes differ"))
+        .try_fold(MaskScore::default(), |sum, score| score.map(|s| sum.plus(s)))?;
+    Ok(Outcome {
+        checks: vec![Check::at_least("F1", score.f1(), 0.97)],
+        figures: vec![
+            Figure { name: "precision", value: score.precision(), tolerance: 0.01 },
+            Figure { name: "recall", value: score.recall(), tolerance: 0.01 },
         ],
     })
 }
