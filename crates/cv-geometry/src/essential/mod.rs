@@ -157,6 +157,7 @@ impl Estimator for PoseEstimator {
     type Block = PairBlock;
     type Kernel = SampsonKernel;
     const SAMPLE: usize = 5;
+    const RESIDUAL_DIMENSION: i32 = 1;
     // From one and the same basin of the loss, the steps end in one place instead of several beside each other.
     const WIDENINGS: u32 = 2;
 

@@ -10,7 +10,8 @@ pub(crate) use seven_point::epipolar_row;
 pub use seven_point::fundamental_seven_point;
 
 use crate::epipolar::{Epipolar, SampsonKernel, SampsonProblem, refine_sampson, sampson, second_epipole};
-use crate::error::EstimateError;
+use crate::error::{Degeneracy, EstimateError};
+use crate::homography::{homography_from_points, homography_residual};
 use crate::pairs::{LANES, PairBlock, PairSet, point_degeneracy};
 use crate::ransac::{Estimator, RobustOptions, Scorer, ransac};
 use crate::robust::RobustModel;
@@ -23,31 +24,44 @@ use rank_two::RankTwo;
 /// plane (DEGENSAC, Chum, Werner & Matas 2005). `bᵀ F a = 0`; Frobenius norm 1, the largest entry positive.
 ///
 /// # Errors
-/// [`EstimateError`]: fewer than eight matches, a coordinate that is not finite, coincident or collinear points, or no
+/// [`EstimateError`]: fewer than eight matches, a coordinate that is not finite, coincident or collinear points, points on one plane, or no
 /// consensus of more than seven matches.
 pub fn estimate_fundamental(
     matches: &[Correspondence],
     options: &RobustOptions,
 ) -> Result<RobustModel<Matrix3<f64>>, EstimateError> {
+    options.check()?;
     let set = PairSet::new(matches, 8)?;
-    let estimator = FundamentalEstimator { set };
-    let found = ransac(&estimator, options);
-    let set = &estimator.set;
     let degenerate = |kind| EstimateError::Degenerate { kind };
-    let found = match found {
-        Ok(found) => found,
-        Err(error @ EstimateError::NoConsensus { .. }) => {
-            return Err(point_degeneracy(set.pairs.iter(), 8, 0.0).map_or(error, degenerate));
-        }
-        Err(error) => return Err(error),
-    };
+    // Before the search, which would draw every sample it may and find none of use.
+    if let Some(kind) = point_degeneracy(set.pairs.iter(), 8, 0.0) {
+        return Err(degenerate(kind));
+    }
+    let estimator = FundamentalEstimator { set };
+    let found = ransac(&estimator, options)?;
+    let set = &estimator.set;
     let f = eight_point::unit(&(set.second.matrix().transpose() * found.model * set.first.matrix()));
     let result = RobustModel::new(f, matches, options.threshold, found.iterations, sampson);
     let width = options.threshold / 3.0 * set.first.scale;
     match point_degeneracy(result.inliers.iter().map(|&i| &set.pairs[i]), 8, width) {
         Some(kind) => Err(degenerate(kind)),
+        None if on_one_plane(matches, &result.inliers, options.threshold) => Err(degenerate(Degeneracy::Planar)),
         None => Ok(result),
     }
+}
+
+/// Whether a homography explains all inliers but two, which fix no more than the epipole: then any epipole would do.
+fn on_one_plane(matches: &[Correspondence], inliers: &[usize], threshold: f64) -> bool {
+    let mut on: Vec<Correspondence> = inliers.iter().map(|&i| matches[i]).collect();
+    // Least squares, again without those that it does not explain: the distance has two dimensions where the epipolar one has one. A scene with depth leaves most of them far off at once.
+    for reach in [12.0, 3.0, 1.5] {
+        let Ok(h) = homography_from_points(&on) else { return false };
+        on = inliers.iter().map(|&i| matches[i]).filter(|m| homography_residual(&h, m) < reach * threshold).collect();
+        if 2 * on.len() < inliers.len() {
+            return false;
+        }
+    }
+    inliers.len() - on.len() <= 2
 }
 
 struct FundamentalEstimator {
@@ -59,6 +73,7 @@ impl Estimator for FundamentalEstimator {
     type Block = PairBlock;
     type Kernel = SampsonKernel;
     const SAMPLE: usize = 7;
+    const RESIDUAL_DIMENSION: i32 = 1;
     const WIDENINGS: u32 = 2;
 
     fn count(&self) -> usize {
@@ -117,7 +132,6 @@ impl Estimator for FundamentalEstimator {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::error::Degeneracy;
     use crate::testing::{TwoViews, cosine};
     use cv_numeric::LeastSquares as _;
     use proptest::prelude::*;
@@ -251,6 +265,20 @@ mod tests {
         // Twenty points fix what the plane leaves open; a degenerate answer is off by tens of pixels. Now and then a few wrong
         // matches agree on another epipole as well as the few right ones do.
         assert!(errors[10] < 0.3 && errors[17] < 1.0, "{errors:?}");
+    }
+
+    #[test]
+    fn a_scene_that_is_all_plane_is_named() {
+        for seed in 0..10 {
+            let views = TwoViews::random(seed);
+            let m = views.planar_matches(100, 0.1);
+            let found = estimate_fundamental(&m, &RobustOptions { seed, ..RobustOptions::fundamental() });
+            assert_eq!(
+                found.map(|r| r.inliers.len()),
+                Err(EstimateError::Degenerate { kind: Degeneracy::Planar }),
+                "{seed}"
+            );
+        }
     }
 
     #[test]

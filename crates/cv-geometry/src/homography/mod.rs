@@ -53,19 +53,16 @@ pub fn estimate_homography(
     matches: &[Correspondence],
     options: &RobustOptions,
 ) -> Result<RobustModel<Matrix3<f64>>, EstimateError> {
+    options.check()?;
     let set = PairSet::new(matches, 4)?;
-    let estimator = HomographyEstimator { set };
-    let found = ransac(&estimator, options);
-    let set = &estimator.set;
     let degenerate = |kind| EstimateError::Degenerate { kind };
-    let found = match found {
-        Ok(found) => found,
-        Err(error @ EstimateError::NoConsensus { .. }) => {
-            // Say why, where the reason is in the input.
-            return Err(point_degeneracy(set.pairs.iter(), 4, 0.0).map_or(error, degenerate));
-        }
-        Err(error) => return Err(error),
-    };
+    // Before the search, which would draw every sample it may and find none of use.
+    if let Some(kind) = point_degeneracy(set.pairs.iter(), 4, 0.0) {
+        return Err(degenerate(kind));
+    }
+    let estimator = HomographyEstimator { set };
+    let found = ransac(&estimator, options)?;
+    let set = &estimator.set;
     let h = dlt::scaled(&(set.second.inverse_matrix() * found.model * set.first.matrix()));
     let result = RobustModel::new(h, matches, options.threshold, found.iterations, homography_residual);
     // Points that are on a line up to their own noise say nothing about the plane beside it.
@@ -161,6 +158,7 @@ impl Estimator for HomographyEstimator {
     type Block = PairBlock;
     type Kernel = TransferKernel;
     const SAMPLE: usize = 4;
+    const RESIDUAL_DIMENSION: i32 = 2;
 
     fn count(&self) -> usize {
         self.set.pairs.len()

@@ -25,6 +25,8 @@ pub trait Estimator: Sync {
     type Kernel;
     /// Size of a minimal sample.
     const SAMPLE: usize;
+    /// Dimension of the residuals of right data: 1 for distances from a line, 2 for distances from a point.
+    const RESIDUAL_DIMENSION: i32;
     /// Local optimisation starts at a threshold widened by 2 to this power, and halves it: for models whose minimal
     /// solutions are far off and whose loss has many local minima.
     const WIDENINGS: u32 = 0;
@@ -181,6 +183,60 @@ impl<'a, E: Estimator, C: Scorer> Judge<'a, E, C> {
     }
 }
 
+/// The scale of Tukey's biweight, in standard deviations, at which it is 95 % as good as least squares on Gaussian errors (Huber &
+/// Ronchetti, "Robust statistics", 2009).
+const BIWEIGHT: f64 = 4.685;
+/// Rounds of noise and refinement at the end; a third changes the model by less than a tenth of its deviation.
+const POLISH: usize = 2;
+
+impl<E: Estimator, C: Scorer> Judge<'_, E, C> {
+    /// Refines on the noise that the data show instead of the threshold that they were searched with: small noise leaves room for wrong
+    /// data that happen to fit, large noise loses right ones.
+    fn polish(&self, model: &mut E::Model) {
+        for _ in 0..POLISH {
+            let Some(sigma) = self.noise(model) else { return };
+            let threshold = BIWEIGHT * sigma * self.threshold / Marginal.cutoff().sqrt();
+            let Some(better) = self.estimator.refine(model, &Marginal, threshold, FINAL_STEPS) else { return };
+            *model = better;
+        }
+    }
+
+    /// Standard deviation of the residuals of right data in thresholds, by expectation maximisation on a mixture of a Gaussian and an even
+    /// background (MLESAC, Torr & Zisserman 2000); the background is what is found from 3 to 10 thresholds away. At most one threshold.
+    fn noise(&self, model: &E::Model) -> Option<f64> {
+        let kernel = self.estimator.kernel(model);
+        let scale = self.inverse_threshold2;
+        let near: Vec<f64> = self
+            .estimator
+            .blocks()
+            .iter()
+            .flat_map(|block| E::squared_residuals(&kernel, block))
+            .map(|r2| f64::from(r2 * scale))
+            .filter(|u| *u < 100.0)
+            .collect();
+        let shell = near.iter().filter(|u| **u >= 9.0).count() as f64;
+        let one = E::RESIDUAL_DIMENSION == 1;
+        let density = shell / if one { 14.0 } else { 91.0 * std::f64::consts::PI };
+        let mut sigma2 = 0.25;
+        let mut inliers = 0.5 * near.len() as f64;
+        for _ in 0..12 {
+            let peak = inliers * (std::f64::consts::TAU * sigma2).powf(-0.5 * f64::from(E::RESIDUAL_DIMENSION));
+            let (mut sum, mut weights) = (0.0, 0.0);
+            for u in &near {
+                let g = peak * (-0.5 * u / sigma2).exp();
+                let w = g / (g + density + 1e-12);
+                sum += w * u;
+                weights += w;
+            }
+            if weights < E::SAMPLE as f64 {
+                return None;
+            }
+            inliers = weights;
+            sigma2 = (sum / (f64::from(E::RESIDUAL_DIMENSION) * weights)).clamp(1e-6, 1.0);
+        }
+        Some(sigma2.sqrt())
+    }
+}
 /// Samples of one batch. A batch is judged as a whole, so the result does not depend on how it is spread over threads.
 const BATCH: usize = 16;
 /// Data from which on a batch is spread over threads: below, a batch is done before a thread wakes up.
@@ -252,7 +308,11 @@ fn search<E: Estimator, C: Scorer, S: Sampler>(
         }
     }
     let (mut model, mut score) = best?;
-    judge.improve(&mut model, &mut score, FINAL_STEPS);
+    if E::WIDENINGS > 0 {
+        judge.improve(&mut model, &mut score, FINAL_STEPS);
+    }
+    judge.polish(&mut model);
+    score = judge.score(&model, f32::INFINITY);
     Some(Consensus { model, score, iterations })
 }
 

@@ -36,7 +36,8 @@ impl Scorer for Msac {
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Marginal;
 
-/// The square of 2.5.
+/// The square of 2.5: of 1, 1.5, 2, 2.5 and 3.5 that with the least errors on generated fundamental matrices of general scenes and of planes
+/// with a fifth of the points off them (noise 0.1 to 2 px, 20 to 80 % wrong); homographies want 3.5, but hardly.
 const MARGINAL_CUTOFF: f32 = 6.25;
 
 impl Scorer for Marginal {
