@@ -20,6 +20,7 @@
 //! * Thresholds and residuals are in the unit of the matches, that is, pixels.
 //! * The same matches, options and seed give the same bytes on any number of threads and with any vector unit.
 
+mod absolute;
 mod bundle;
 mod epipolar;
 mod error;
@@ -33,6 +34,9 @@ mod robust;
 mod testing;
 mod triangulation;
 
+pub use absolute::{
+    Similarity, WorldMatch, align_points, estimate_pose, pose_from_points, pose_three_points, refine_pose,
+};
 pub use bundle::{BundleOptions, BundleReport, TwoViewBundle, adjust_two_views};
 pub use epipolar::sampson;
 pub use error::{Degeneracy, EstimateError};
