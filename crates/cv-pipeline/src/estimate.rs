@@ -1,8 +1,11 @@
 //! A model of two views from matches.
 
 use crate::{Progress, Stopwatch};
-use cv_core::{Correspondence, Matrix3};
-use cv_geometry::{EstimateError, RobustModel, RobustOptions, estimate_fundamental, estimate_homography};
+use cv_core::{Camera, Correspondence, Matrix3, Pose};
+use cv_geometry::{
+    EstimateError, RobustModel, RobustOptions, essential_from_pose, estimate_fundamental, estimate_homography,
+    estimate_relative_pose, normalize_matches,
+};
 
 /// Which model of two views.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -51,4 +54,42 @@ pub fn estimate(
     progress.report("estimate", 1, 1);
     watch.lap("estimate");
     Ok(EstimateResult { robust, stages: watch.into_stages() })
+}
+
+/// What [`estimate_calibrated`] found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CalibratedResult {
+    /// The essential matrix (of normalised coordinates; singular values 1, 1, 0) and the matches that fit it, in pixels.
+    pub robust: RobustModel<Matrix3<f64>>,
+    /// First camera frame to second; the translation has length one.
+    pub pose: Pose,
+    /// Stage names and their seconds.
+    pub stages: Vec<(&'static str, f64)>,
+}
+
+/// Estimates the essential matrix of two calibrated cameras from matches in pixels of which many may be wrong. The threshold is in pixels, as
+/// are the residuals.
+///
+/// # Errors
+/// [`EstimateError`] as of [`estimate`]; a pixel that no ray of its camera reaches counts as a coordinate that is not a number.
+pub fn estimate_calibrated(
+    pairs: &[Correspondence],
+    cameras: &[Camera; 2],
+    options: &RobustOptions,
+    progress: &dyn Progress,
+) -> Result<CalibratedResult, EstimateError> {
+    let mut watch = Stopwatch::new();
+    progress.report("estimate", 0, 1);
+    let (normalised, unit) = normalize_matches(pairs, &cameras[0], &cameras[1]);
+    let found =
+        estimate_relative_pose(&normalised, &RobustOptions { threshold: options.threshold * unit, ..*options })?;
+    progress.report("estimate", 1, 1);
+    watch.lap("estimate");
+    let robust = RobustModel {
+        model: essential_from_pose(&found.model),
+        inliers: found.inliers,
+        rms: found.rms / unit,
+        iterations: found.iterations,
+    };
+    Ok(CalibratedResult { robust, pose: found.model, stages: watch.into_stages() })
 }

@@ -40,7 +40,7 @@ mod stopwatch;
 pub use cv_geometry::{EstimateError, RobustModel, RobustOptions};
 pub use depth::{DepthError, DepthOptions, DepthResult, depth};
 pub use disparity_range::{RangeError, disparity_range};
-pub use estimate::{EstimateResult, ModelKind, estimate};
+pub use estimate::{CalibratedResult, EstimateResult, ModelKind, estimate, estimate_calibrated};
 pub use matching::{
     FeatureMethod, MatchingError, MatchingOptions, MatchingResult, PhotoFeatures, correspondences, extract_features,
     match_features, match_photos,

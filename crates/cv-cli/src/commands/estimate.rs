@@ -1,8 +1,10 @@
-//! `cv estimate`: a homography or fundamental matrix from a matches file.
+//! `cv estimate`: a homography, fundamental or essential matrix from a matches file.
 
 use crate::common::{Context, Explain, Failure, Outcome, Run};
 use clap::ValueEnum;
-use cv_pipeline::{EstimateError, ModelKind, RobustOptions, estimate};
+use cv_core::nalgebra::Matrix3;
+use cv_core::{Camera, Correspondence};
+use cv_pipeline::{EstimateError, ModelKind, RobustOptions, estimate, estimate_calibrated};
 use std::path::PathBuf;
 
 /// Which model to estimate.
@@ -12,13 +14,35 @@ enum Model {
     Homography,
     /// A general scene: bᵀ F a = 0
     Fundamental,
+    /// A general scene and calibrated cameras: needs --camera, or --focal and --size
+    Essential,
 }
 
-/// Estimate a homography or fundamental matrix from matches of which many may be wrong.
+impl Model {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Homography => "homography",
+            Self::Fundamental => "fundamental matrix",
+            Self::Essential => "essential matrix",
+        }
+    }
+
+    /// In JSON.
+    fn key(self) -> &'static str {
+        match self {
+            Self::Homography => "homography",
+            Self::Fundamental => "fundamental",
+            Self::Essential => "essential",
+        }
+    }
+}
+
+/// Estimate a homography, fundamental or essential matrix from matches of which many may be wrong.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   cv match left.jpg right.jpg -o matches.txt && cv estimate homography --matches matches.txt
   cv estimate fundamental --matches matches.txt --threshold 0.5 --json
+  cv estimate essential --matches matches.txt --focal 2900 --size 2832x2128
 
 The matches file has a row per match, `x1 y1 x2 y2` in pixels with an optional score; `#` starts a comment.")]
 pub(crate) struct Args {
@@ -27,57 +51,113 @@ pub(crate) struct Args {
     /// The matches.
     #[arg(long, value_name = "FILE")]
     matches: PathBuf,
-    /// Largest error of an inlier in pixels [default: 3 for a homography, 1 for a fundamental matrix].
+    /// Largest error of an inlier in pixels [default: 3 for a homography, 1 otherwise].
     #[arg(long, value_name = "PX")]
     threshold: Option<f64>,
     /// Probability with which a sample without outliers is drawn before the search stops.
     #[arg(long, value_name = "P", default_value_t = RobustOptions::default().confidence)]
     confidence: f64,
-    /// Most samples drawn.
-    #[arg(long, value_name = "N", default_value_t = RobustOptions::default().max_iterations)]
-    max_iterations: usize,
+    /// Most samples drawn [default: 10000 for a homography, 50000 otherwise].
+    #[arg(long, value_name = "N")]
+    max_iterations: Option<usize>,
+    /// Camera of both views, for an essential matrix: YAML, a line of COLMAP's cameras.txt, or a 3×3 matrix.
+    #[arg(long, value_name = "FILE", conflicts_with = "focal")]
+    camera: Option<PathBuf>,
+    /// Camera of the second view, where it is another one.
+    #[arg(long, value_name = "FILE", requires = "camera")]
+    camera2: Option<PathBuf>,
+    /// Focal length of both views in pixels, for an essential matrix; the principal point is the middle of --size.
+    #[arg(long, value_name = "PX", requires = "size")]
+    focal: Option<f64>,
+    /// Width and height of both views in pixels, such as 2832x2128.
+    #[arg(long, value_name = "WxH", value_parser = size)]
+    size: Option<(usize, usize)>,
+}
+
+/// `640x480`.
+fn size(text: &str) -> Result<(usize, usize), String> {
+    let parts = text.split_once(['x', '×']).and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
+    parts.filter(|(w, h)| *w > 0 && *h > 0).ok_or_else(|| "a size is a width and a height, such as 640x480".into())
+}
+
+impl Args {
+    /// The cameras that an essential matrix needs; `None` for the other models.
+    fn cameras(&self) -> Result<Option<[Camera; 2]>, Failure> {
+        if !matches!(self.model, Model::Essential) {
+            if self.camera.is_some() || self.focal.is_some() {
+                return Err(Failure::usage("only an essential matrix has use for --camera or --focal"));
+            }
+            return Ok(None);
+        }
+        if let Some(path) = &self.camera {
+            let first = cv_io::read_camera(path, self.size)?;
+            let second = match &self.camera2 {
+                Some(path) => cv_io::read_camera(path, self.size)?,
+                None => first,
+            };
+            return Ok(Some([first, second]));
+        }
+        let (Some(focal), Some((width, height))) = (self.focal, self.size) else {
+            return Err(Failure::usage("an essential matrix needs --camera, or --focal and --size"));
+        };
+        if !(focal > 0.0 && focal.is_finite()) {
+            return Err(Failure::usage("--focal must be above 0"));
+        }
+        Ok(Some([Camera::from_focal(width, height, focal); 2]))
+    }
+}
+
+fn rows(m: &Matrix3<f64>) -> [[f64; 3]; 3] {
+    std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]))
 }
 
 impl Run for Args {
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
         let matches = cv_io::read_matches(&self.matches)?;
-        let (kind, name) = match self.model {
-            Model::Homography => (ModelKind::Homography, "homography"),
-            Model::Fundamental => (ModelKind::Fundamental, "fundamental matrix"),
-        };
-        let mut options =
-            RobustOptions { confidence: self.confidence, max_iterations: self.max_iterations, ..kind.options() };
+        let cameras = self.cameras()?;
+        let name = self.model.name();
+        let kind = if matches!(self.model, Model::Homography) { ModelKind::Homography } else { ModelKind::Fundamental };
+        let mut options = RobustOptions { confidence: self.confidence, ..kind.options() };
+        options.max_iterations = self.max_iterations.unwrap_or(options.max_iterations);
         if let Some(threshold) = self.threshold {
             options.threshold = threshold;
         }
         if let Some(seed) = context.seed {
             options.seed = seed;
         }
-        let result = estimate(&matches.pairs, kind, &options, context).map_err(|error| match error {
+        let pairs: &[Correspondence] = &matches.pairs;
+        let result = match &cameras {
+            None => estimate(pairs, kind, &options, context).map(|r| (r.robust, None, r.stages)),
+            Some(cameras) => estimate_calibrated(pairs, cameras, &options, context)
+                .map(|r| (r.robust, Some(r.pose), r.stages)),
+        };
+        let result = result.map_err(|error| match error {
             EstimateError::BadOption { .. } => Failure::usage(error),
             _ => Failure::new(error),
         });
-        let result = result.during(format!("no {name} from {}", self.matches.display())).advice(
+        let (robust, pose, stages) = result.during(format!("no {name} from {}", self.matches.display())).advice(
             "check the matches by eye with `cv match A B --report DIR`, or pass a larger --threshold",
         )?;
-        let robust = &result.robust;
-        let m = &robust.model;
-        let rows: [[f64; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]));
-        let total = matches.pairs.len();
-        let text: String = rows.iter().map(|r| format!("{:>16.9e} {:>16.9e} {:>16.9e}\n", r[0], r[1], r[2])).collect();
-        Ok(Outcome::new(result.stages)
-            .with("kind", if matches!(self.model, Model::Homography) { "homography" } else { "fundamental" })
-            .with("model", rows)
+        let model = rows(&robust.model);
+        let total = pairs.len();
+        let text: String = model.iter().map(|r| format!("{:>16.9e} {:>16.9e} {:>16.9e}\n", r[0], r[1], r[2])).collect();
+        let mut outcome = Outcome::new(stages)
+            .with("kind", self.model.key())
+            .with("model", model)
             .with("inliers", &robust.inliers)
             .with("matches", total)
             .with("iterations", robust.iterations)
-            .with("rms_px", robust.rms)
-            .summary(format!(
-                "{text}{name}: {} of {total} matches within {} px, {:.3} px RMS, {} samples",
-                robust.inliers.len(),
-                options.threshold,
-                robust.rms,
-                robust.iterations
-            )))
+            .with("rms_px", robust.rms);
+        if let Some(pose) = pose {
+            let t = pose.translation;
+            outcome = outcome.with("rotation", rows(pose.rotation.matrix())).with("translation", [t.x, t.y, t.z]);
+        }
+        Ok(outcome.summary(format!(
+            "{text}{name}: {} of {total} matches within {} px, {:.3} px RMS, {} samples",
+            robust.inliers.len(),
+            options.threshold,
+            robust.rms,
+            robust.iterations
+        )))
     }
 }

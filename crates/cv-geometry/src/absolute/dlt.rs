@@ -18,7 +18,7 @@ pub fn pose_from_points(matches: &[WorldMatch]) -> Result<Pose, EstimateError> {
     let n = matches.len() as f64;
     let centre = matches.iter().map(|m| m.world.coords).sum::<Vector3<f64>>() / n;
     let spread = matches.iter().map(|m| (m.world.coords - centre).norm()).sum::<f64>() / n;
-    if !(spread > 1e-14 * (1.0 + centre.norm())) {
+    if spread <= 1e-14 * (1.0 + centre.norm()) {
         return Err(EstimateError::Degenerate { kind: Degeneracy::Coincident });
     }
     let mut ata = SMatrix::<f64, 12, 12>::zeros();
@@ -36,7 +36,7 @@ pub fn pose_from_points(matches: &[WorldMatch]) -> Result<Pose, EstimateError> {
     }
     let (values, vectors) = symmetric_eigen(&ata);
     // A plane leaves a null space of dimension four. Eigenvalues are squares: 1e-14 is a relative 1e-7.
-    if !(values[1] > 1e-14 * values[11]) {
+    if values[1] <= 1e-14 * values[11] {
         return Err(EstimateError::Degenerate { kind: Degeneracy::Planar });
     }
     let v = vectors.column(0);

@@ -127,7 +127,7 @@ impl<C: Scorer> LeastSquares for ReprojectionProblem<'_, C> {
             let i = 1.0 / p.z;
             let r = [p.x * i - m.image.x, p.y * i - m.image.y];
             let u = (r[0] * r[0] + r[1] * r[1]) / (self.threshold * self.threshold);
-            if !(p.z > 0.0 && u < self.scorer.cutoff()) {
+            if p.z.is_nan() || p.z <= 0.0 || u.is_nan() || u >= self.scorer.cutoff() {
                 equations.cost += 1.0;
                 continue;
             }
@@ -136,9 +136,9 @@ impl<C: Scorer> LeastSquares for ReprojectionProblem<'_, C> {
             let by_point = Matrix2x3::new(i, 0.0, -p.x * i * i, 0.0, i, -p.y * i * i);
             // R exp(ω) x ≈ R x − R [x]× ω.
             let by_rotation = -by_point * rotation * m.world.coords.cross_matrix();
-            for k in 0..2 {
+            for (k, r) in r.into_iter().enumerate() {
                 let (w, t) = (by_rotation.row(k), by_point.row(k));
-                equations.add(r[k], &SVector::from([w[0], w[1], w[2], t[0], t[1], t[2]]), weight);
+                equations.add(r, &SVector::from([w[0], w[1], w[2], t[0], t[1], t[2]]), weight);
             }
         }
         equations

@@ -16,8 +16,8 @@ pub fn pose_three_points(m: &[WorldMatch; 3], mut found: impl FnMut(Pose)) {
     let (d01, d02) = (world[0] - world[1], world[0] - world[2]);
     let normal = d01.cross(&d02);
     let (a01, a02, a12) = (d01.norm_squared(), d02.norm_squared(), (world[1] - world[2]).norm_squared());
-    // Also where a coordinate is not finite.
-    if !(normal.norm_squared() > 1e-20 * a01 * a02) {
+    let area = normal.norm_squared();
+    if !area.is_finite() || area <= 1e-20 * a01 * a02 {
         return;
     }
     let (b01, b02, b12) = (rays[0].dot(&rays[1]), rays[0].dot(&rays[2]), rays[1].dot(&rays[2]));

@@ -28,20 +28,20 @@ use nalgebra::{SMatrix, SVector};
 /// length. Inliers lie in front of both cameras.
 ///
 /// # Errors
-/// [`EstimateError`]: fewer than six matches, a coordinate that is not finite, coincident points, or no consensus of more than five
-/// matches.
+/// [`EstimateError`]: fewer than six matches, a coordinate that is not finite, coincident or collinear points, or no consensus of more
+/// than five matches.
 pub fn estimate_relative_pose(
     matches: &[Correspondence],
     options: &RobustOptions,
 ) -> Result<RobustModel<Pose>, EstimateError> {
+    options.check()?;
     check(matches, 6)?;
     let set = PairSet::with(matches, Normalizer::IDENTITY, Normalizer::IDENTITY);
-    let estimator = PoseEstimator { set };
-    let found = ransac(&estimator, options).map_err(|error| match error {
-        EstimateError::NoConsensus { .. } => point_degeneracy(estimator.set.pairs.iter(), 6, 0.0)
-            .map_or(error, |kind| EstimateError::Degenerate { kind }),
-        _ => error,
-    })?;
+    // Before the search, which would draw every sample it may and find none of use.
+    if let Some(kind) = point_degeneracy(set.pairs.iter(), 6, 0.0) {
+        return Err(EstimateError::Degenerate { kind });
+    }
+    let found = ransac(&PoseEstimator { set }, options)?;
     let pose = found.model;
     let e = essential_from_pose(&pose);
     let residual = |_: &Pose, m: &Correspondence| {

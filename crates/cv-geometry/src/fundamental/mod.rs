@@ -33,9 +33,13 @@ pub fn estimate_fundamental(
     options.check()?;
     let set = PairSet::new(matches, 8)?;
     let degenerate = |kind| EstimateError::Degenerate { kind };
-    // Before the search, which would draw every sample it may and find none of use.
+    // All before the search, which would draw every sample it may and find none of use.
     if let Some(kind) = point_degeneracy(set.pairs.iter(), 8, 0.0) {
         return Err(degenerate(kind));
+    }
+    let all: Vec<usize> = (0..matches.len()).collect();
+    if on_one_plane(matches, &all, options.threshold) {
+        return Err(degenerate(Degeneracy::Planar));
     }
     let estimator = FundamentalEstimator { set };
     let found = ransac(&estimator, options)?;

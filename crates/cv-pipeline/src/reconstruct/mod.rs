@@ -1,17 +1,20 @@
 //! Points and camera poses from two photographs.
 
+mod error;
+mod initial;
+
+pub use error::ReconstructError;
+use initial::{cameras, initial};
+
 use crate::guided::{GuidedOptions, match_along_lines};
 use crate::{MatchingError, MatchingOptions, MatchingResult, Progress, Stopwatch, correspondences, match_photos};
-use cv_core::{Camera, CameraError, Correspondence, ImageView, Matrix3, Point2, Point3, Pose};
+use cv_core::{Camera, Correspondence, ImageView, Matrix3, Point2, Point3, Pose};
 use cv_features::SiftOptions;
 use cv_geometry::{
-    BundleOptions, BundleReport, EstimateError, RobustModel, RobustOptions, TwoViewBundle, adjust_two_views,
-    essential_from_fundamental, essential_from_pose, estimate_fundamental, estimate_homography, estimate_relative_pose,
-    normalize_matches, parallax_angle, pose_difference, pose_stability, poses_are_rivals, recover_pose,
-    refine_relative_pose, rotation_between, triangulate,
+    BundleOptions, BundleReport, RobustOptions, TwoViewBundle, adjust_two_views, essential_from_pose,
+    estimate_homography, normalize_matches, parallax_angle, pose_stability, rotation_between, triangulate,
 };
 use cv_imgproc::resize_area;
-use rayon::prelude::*;
 
 /// What is known of the cameras.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -132,122 +135,6 @@ impl ReconstructResult {
     /// The fundamental matrix between undistorted pixels.
     pub fn fundamental(&self) -> Matrix3<f64> {
         fundamental_of(&self.cameras, &self.pose)
-    }
-}
-
-/// Why two photographs could not be reconstructed.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum ReconstructError {
-    /// The photographs could not be matched at all.
-    #[error(transparent)]
-    Matching(#[from] MatchingError),
-    /// A camera is not one.
-    #[error("camera {index}: {source}")]
-    Camera {
-        /// 1 or 2.
-        index: usize,
-        /// Why.
-        source: CameraError,
-    },
-    /// A camera is not that of its photograph.
-    #[error("camera {index} takes pictures of {camera:?} px, but its photograph is of {photo:?} px")]
-    CameraSize {
-        /// 1 or 2.
-        index: usize,
-        /// Width and height by the camera.
-        camera: (usize, usize),
-        /// Width and height of the photograph.
-        photo: (usize, usize),
-    },
-    /// Too few tentative matches.
-    #[error("{got} matches are too few: at least {needed} are needed")]
-    TooFewMatches {
-        /// Matches found.
-        got: usize,
-        /// Matches needed.
-        needed: usize,
-    },
-    /// Too few matches agree on a motion.
-    #[error("only {inliers} of {matches} matches ({:.0} %) agree on a camera motion; at least {needed} must", 100.0 * *inliers as f64 / *matches as f64)]
-    TooFewInliers {
-        /// Matches that agree.
-        inliers: usize,
-        /// Matches.
-        matches: usize,
-        /// Matches that must agree.
-        needed: usize,
-    },
-    /// The camera turned without moving.
-    #[error("the camera only turned: a rotation by {degrees:.1} degrees explains {:.0} % of the matches", 100.0 * share)]
-    PureRotation {
-        /// Share of the inliers that the rotation explains.
-        share: f64,
-        /// Its angle in degrees.
-        degrees: f64,
-    },
-    /// All points lie on one plane.
-    #[error("the scene is one plane: a homography explains {:.0} % of the matches", 100.0 * share)]
-    Planar {
-        /// Share of the inliers that the homography explains.
-        share: f64,
-    },
-    /// The rays to the points are nearly parallel.
-    #[error(
-        "too little parallax: the median angle between the two rays of a point is {degrees:.2} degrees; {needed:.2} are needed"
-    )]
-    LittleParallax {
-        /// Median angle in degrees.
-        degrees: f64,
-        /// Angle needed, in degrees.
-        needed: f64,
-    },
-    /// The matches do not tell the motion well enough.
-    #[error(
-        "the motion is uncertain: {degrees:.1} degrees in its direction, {allowed:.1} are allowed ({inliers} of {matches} matches agree)"
-    )]
-    UncertainPose {
-        /// Standard deviation of the direction, or angle to another direction that fits as well, in degrees.
-        degrees: f64,
-        /// Angle allowed, in degrees.
-        allowed: f64,
-        /// Matches that agree.
-        inliers: usize,
-        /// Matches.
-        matches: usize,
-    },
-    /// The focal length that was given fits the matches much worse than others, or none can be told.
-    #[error("the focal length cannot be told from these photographs ({focal:.0} px, give or take {:.0} %)", 100.0 * deviation)]
-    UnknownFocal {
-        /// Best estimate in pixels.
-        focal: f64,
-        /// Relative standard deviation.
-        deviation: f64,
-    },
-    /// The search for a model failed.
-    #[error(transparent)]
-    Estimate(EstimateError),
-}
-
-impl ReconstructError {
-    /// What a person can do about it.
-    pub fn advice(&self) -> &'static str {
-        match self {
-            Self::Matching(_) => "take sharper photographs with more texture",
-            Self::Camera { .. } | Self::CameraSize { .. } => "check the camera file",
-            Self::TooFewMatches { .. } | Self::TooFewInliers { .. } => {
-                "take photographs that share more of the scene, from places nearer to each other"
-            }
-            Self::PureRotation { .. } => {
-                "step aside between the photographs; to join photographs from one place use `cv panorama`"
-            }
-            Self::Planar { .. } => "include things in front of the plane or behind it",
-            Self::UncertainPose { .. } => {
-                "take photographs that share more of the scene, with things near and far all over them, or find more features (--features)"
-            }
-            Self::LittleParallax { .. } => "take the photographs farther apart",
-            Self::UnknownFocal { .. } => "give the focal length (--focal) or a camera file (--camera)",
-            Self::Estimate(_) => "check the matches with `cv match`",
-        }
     }
 }
 
@@ -431,137 +318,6 @@ fn fit(matches: &[Correspondence], cameras: [Camera; 2], pose: Pose, settings: &
 /// [`fit`] from the pose and cameras of an earlier one.
 fn fit_again(matches: &[Correspondence], before: &Fit, settings: &BundleOptions) -> Option<Fit> {
     fit(matches, before.bundle.cameras, before.bundle.pose, settings)
-}
-
-/// The cameras, where they are known.
-fn cameras(intrinsics: Intrinsics, sizes: [(usize, usize); 2]) -> Result<Option<[Camera; 2]>, ReconstructError> {
-    let cameras = match intrinsics {
-        Intrinsics::Unknown => return Ok(None),
-        Intrinsics::Known(cameras) => cameras,
-        Intrinsics::Focal(focal) => [0, 1].map(|i: usize| Camera::from_focal(sizes[i].0, sizes[i].1, focal[i])),
-    };
-    for (i, camera) in cameras.iter().enumerate() {
-        camera.validate().map_err(|source| ReconstructError::Camera { index: i + 1, source })?;
-        if (camera.width, camera.height) != sizes[i] {
-            return Err(ReconstructError::CameraSize {
-                index: i + 1,
-                camera: (camera.width, camera.height),
-                photo: sizes[i],
-            });
-        }
-    }
-    Ok(Some(cameras))
-}
-
-/// Cameras, pose, and the matches that agree.
-type Initial = ([Camera; 2], Pose, Vec<usize>);
-
-fn initial(
-    pairs: &[Correspondence],
-    sizes: [(usize, usize); 2],
-    prior: Option<[Camera; 2]>,
-    options: &ReconstructOptions,
-) -> Result<Initial, ReconstructError> {
-    let (cameras, pose, inliers) = match prior {
-        Some(cameras) => {
-            let (pose, inliers) = calibrated(pairs, &cameras, options)?;
-            (cameras, pose, inliers)
-        }
-        None => uncalibrated(pairs, sizes, options)?,
-    };
-    enough(inliers.len(), pairs.len(), options)?;
-    Ok((cameras, pose, inliers))
-}
-
-/// Refuses where fewer agree than were asked for.
-fn enough(inliers: usize, matches: usize, options: &ReconstructOptions) -> Result<(), ReconstructError> {
-    let needed = options.min_inliers.max((options.min_inlier_share * matches as f64).ceil() as usize);
-    if inliers < needed {
-        return Err(ReconstructError::TooFewInliers { inliers, matches, needed });
-    }
-    Ok(())
-}
-
-fn calibrated(
-    pairs: &[Correspondence],
-    cameras: &[Camera; 2],
-    options: &ReconstructOptions,
-) -> Result<(Pose, Vec<usize>), ReconstructError> {
-    let (normalised, unit) = normalize_matches(pairs, &cameras[0], &cameras[1]);
-    // A pixel that no ray reaches (beyond the range of the lens model) is no match.
-    let usable: Vec<usize> = (0..normalised.len()).filter(|&i| normalised[i].is_finite()).collect();
-    let normalised: Vec<_> = usable.iter().map(|&i| normalised[i]).collect();
-    let threshold = options.robust.threshold * unit;
-    let search = |k: u64| {
-        let seed = options.robust.seed.wrapping_add(k);
-        let found = estimate_relative_pose(&normalised, &RobustOptions { threshold, seed, ..options.robust })?;
-        let (pose, loss) = refine_relative_pose(&found.model, &normalised, threshold);
-        Ok((RobustModel { model: pose, ..found }, loss))
-    };
-    let searches: Vec<_> = (0..SEARCHES).into_par_iter().map(search).collect();
-    let mut found: Vec<(RobustModel<Pose>, f64)> =
-        searches.into_iter().collect::<Result<_, _>>().map_err(|error| failed(error, pairs.len(), options))?;
-    found.sort_by(|a, b| a.1.total_cmp(&b.1));
-    let (best, others) = (&found[0].0, &found[1..]);
-    enough(best.inliers.len(), pairs.len(), options)?;
-    // As far as another search got, where the matches do not say that it got to a worse place.
-    let apart = others
-        .iter()
-        .filter(|other| poses_are_rivals(&best.model, &other.0.model, &normalised, threshold))
-        .map(|other| pose_difference(&best.model, &other.0.model)[1])
-        .fold(0.0, f64::max);
-    if apart > options.max_deviation {
-        return Err(ReconstructError::UncertainPose {
-            degrees: apart.to_degrees(),
-            allowed: options.max_deviation.to_degrees(),
-            inliers: best.inliers.len(),
-            matches: pairs.len(),
-        });
-    }
-    Ok((best.model, best.inliers.iter().map(|&i| usable[i]).collect()))
-}
-
-/// Searches from different seeds. Where the matches determine a pose, all find it; five miss a second one that is found as often as
-/// the first in one case of sixteen.
-const SEARCHES: u64 = 5;
-
-/// Too few matches that agree is the reason a person understands.
-fn failed(error: EstimateError, matches: usize, options: &ReconstructOptions) -> ReconstructError {
-    match error {
-        EstimateError::NoConsensus { inliers, .. } => {
-            ReconstructError::TooFewInliers { inliers, matches, needed: options.min_inliers }
-        }
-        EstimateError::NotEnoughMatches { got, .. } => {
-            ReconstructError::TooFewMatches { got, needed: options.min_inliers }
-        }
-        other => ReconstructError::Estimate(other),
-    }
-}
-
-/// Tries focal lengths on the inliers of a fundamental matrix and keeps the one whose essential matrix fits best.
-fn uncalibrated(
-    pairs: &[Correspondence],
-    sizes: [(usize, usize); 2],
-    options: &ReconstructOptions,
-) -> Result<Initial, ReconstructError> {
-    let found = estimate_fundamental(pairs, &options.robust).map_err(|error| failed(error, pairs.len(), options))?;
-    let chosen: Vec<Correspondence> = found.inliers.iter().map(|&i| pairs[i]).collect();
-    let (mut best, mut cameras, mut pose) = (f64::INFINITY, None, Pose::identity());
-    let longest = sizes[0].0.max(sizes[0].1) as f64;
-    // From 100 to 10 degrees of view, in steps of a tenth: refinement bridges half a step.
-    for k in 0..25 {
-        let focal = 0.4 * longest * 1.12f64.powi(k);
-        let pair = sizes.map(|(width, height)| Camera::from_focal(width, height, focal));
-        let Ok(e) = essential_from_fundamental(&found.model, &pair[0], &pair[1]) else { continue };
-        let (normalised, unit) = normalize_matches(&chosen, &pair[0], &pair[1]);
-        let Ok(recovered) = recover_pose(&e, &normalised) else { continue };
-        let (refined, loss) = refine_relative_pose(&recovered.pose, &normalised, options.robust.threshold * unit);
-        if loss < best {
-            (best, cameras, pose) = (loss, Some(pair), refined);
-        }
-    }
-    let cameras = cameras.ok_or(ReconstructError::UnknownFocal { focal: f64::NAN, deviation: f64::INFINITY })?;
-    Ok((cameras, pose, found.inliers))
 }
 
 /// What simpler explanations than a moving camera and a scene with depth make of the matches.

@@ -1,0 +1,113 @@
+//! `cv estimate` from outside: the three models, and matches that determine none.
+
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
+
+mod support;
+
+use std::{fs, path::Path};
+use support::{json, refused, run};
+
+/// Matches of a camera of 800 px focal length that moves to the right and turns by 0.1 rad about the vertical, and every fifth one wrong.
+fn two_views(flat: bool) -> Vec<[f64; 4]> {
+    let mut state = 5u32;
+    let mut random = || {
+        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        f64::from(state >> 8) / f64::from(1 << 24)
+    };
+    let (sin, cos) = 0.1f64.sin_cos();
+    let mut rows = Vec::new();
+    while rows.len() < 200 {
+        let (u, v) = (640.0 * random(), 480.0 * random());
+        let z = if flat { 6.0 } else { 4.0 + 6.0 * random() };
+        let (x, y) = ((u - 319.5) / 800.0 * z, (v - 239.5) / 800.0 * z);
+        // R about y, then one unit to the left: the camera went right.
+        let (p, r) = (cos * x + sin * z - 1.0, -sin * x + cos * z);
+        let seen = [800.0 * p / r + 319.5, 800.0 * y / r + 239.5];
+        if rows.len() % 5 == 4 {
+            rows.push([u, v, 640.0 * random(), 480.0 * random()]);
+        } else {
+            rows.push([u, v, seen[0], seen[1]]);
+        }
+    }
+    rows
+}
+
+fn write(folder: &Path, name: &str, rows: &[[f64; 4]]) {
+    let text: String = rows.iter().map(|r| format!("{} {} {} {}\n", r[0], r[1], r[2], r[3])).collect();
+    fs::write(folder.join(name), text).unwrap();
+}
+
+#[test]
+fn an_essential_matrix_gives_the_pose() {
+    let folder = tempfile::tempdir().unwrap();
+    write(folder.path(), "m.txt", &two_views(false));
+    let args = ["estimate", "essential", "--matches", "m.txt", "--focal", "800", "--size", "640x480"];
+    let result = json(folder.path(), &args);
+    let at = |key: &str, i: usize, j: usize| result[key][i][j].as_f64().unwrap();
+    // The right matches are exact: what is left are wrong ones within a pixel of their lines, which the weights nearly ignore.
+    assert!((at("rotation", 0, 2) - 0.1f64.sin()).abs() < 1e-3 && (at("rotation", 1, 1) - 1.0).abs() < 1e-3);
+    assert!((result["translation"][0].as_f64().unwrap() + 1.0).abs() < 1e-3);
+    assert!(result["inliers"].as_array().unwrap().len() >= 160);
+    // bᵀ E a = 0 with a = (0, 0, 1), which the turn alone brings to (tan 0.1, 0, 1): E of a sideways motion has no entry there.
+    assert!(at("model", 0, 0).abs() < 1e-2);
+    // The same from a camera file.
+    fs::write(folder.path().join("k.txt"), "800 0 319.5\n0 800 239.5\n0 0 1\n").unwrap();
+    let again =
+        json(folder.path(), &["estimate", "essential", "--matches", "m.txt", "--camera", "k.txt", "--size", "640x480"]);
+    assert_eq!(again["inliers"], result["inliers"]);
+    assert_eq!(run(folder.path(), &["estimate", "essential", "--matches", "m.txt"]).code, Some(2));
+    assert_eq!(run(folder.path(), &["estimate", "homography", "--matches", "m.txt", "--focal", "5"]).code, Some(2));
+}
+
+#[test]
+fn planes_and_scenes_with_depth() {
+    let folder = tempfile::tempdir().unwrap();
+    write(folder.path(), "deep.txt", &two_views(false));
+    write(folder.path(), "flat.txt", &two_views(true));
+    let deep = json(folder.path(), &["estimate", "fundamental", "--matches", "deep.txt"]);
+    assert!(deep["inliers"].as_array().unwrap().len() >= 160);
+    let flat = json(folder.path(), &["estimate", "homography", "--matches", "flat.txt"]);
+    assert!(flat["inliers"].as_array().unwrap().len() >= 160);
+    // Without wrong matches nothing at all fixes the epipole.
+    let exact: Vec<_> = two_views(true).into_iter().enumerate().filter(|(i, _)| i % 5 != 4).map(|r| r.1).collect();
+    write(folder.path(), "flat.txt", &exact);
+    let said = refused(folder.path(), &["estimate", "fundamental", "--matches", "flat.txt"]).stderr;
+    assert!(said.contains("a plane"), "{said}");
+}
+
+#[test]
+fn matches_that_determine_nothing_are_refused_with_the_reason() {
+    let folder = tempfile::tempdir().unwrap();
+    let good = two_views(false);
+    let line: Vec<[f64; 4]> = (0..30).map(f64::from).map(|i| [i, 2.0 * i, i + 3.0, 2.0 * i]).collect();
+    let mut nan = good.clone();
+    nan[7][2] = f64::NAN;
+    let mut infinite = good.clone();
+    infinite[9][1] = f64::INFINITY;
+    let cases: [(&[[f64; 4]], &str); 5] = [
+        (&good[..3], "3 matches are too few"),
+        (&[good[0]; 30], "different"),
+        (&line, "line"),
+        (&nan, ""),
+        (&infinite, ""),
+    ];
+    for (rows, reason) in cases {
+        write(folder.path(), "m.txt", rows);
+        for model in ["homography", "fundamental", "essential"] {
+            let mut args = vec!["estimate", model, "--matches", "m.txt"];
+            if model == "essential" {
+                args.extend(["--focal", "800", "--size", "640x480"]);
+            }
+            let said = refused(folder.path(), &args).stderr;
+            assert!(said.contains(reason), "{model}: {said}");
+        }
+    }
+    // One wild coordinate is a wrong match like any other.
+    let mut wild = good;
+    wild[4][0] = 1e9;
+    write(folder.path(), "m.txt", &wild);
+    assert!(
+        json(folder.path(), &["estimate", "fundamental", "--matches", "m.txt"])["inliers"].as_array().unwrap().len()
+            >= 158
+    );
+}
