@@ -40,6 +40,7 @@ mod exposure;
 mod feather;
 mod focal;
 mod graph;
+mod group;
 mod layout;
 mod maxflow;
 mod misalignment;

@@ -1,0 +1,371 @@
+//! One group of connected photographs: cameras from a spanning tree, then all at once over all overlaps.
+
+use crate::align::{AlignError, AlignOptions, AlignedPair, Alignment, CameraMotion, Photo, Unplaced};
+use crate::bundle::{Lens, Motion, Overlap, Problem, State};
+use crate::focal::focals_from_homography;
+use crate::graph::{self, Edge};
+use crate::straighten::straighten;
+use crate::verify::VerifiedPair;
+use crate::view::View;
+use cv_core::{Camera, Distortion, Point2};
+use cv_numeric::RobustLoss;
+use nalgebra::{Matrix3, Rotation3, Vector2};
+
+/// The connected photographs to be placed, under indices of their own.
+pub(crate) struct Group<'a> {
+    /// Photograph of each member.
+    members: Vec<usize>,
+    photos: Vec<Photo>,
+    pub(crate) pairs: Vec<&'a VerifiedPair>,
+    /// Of `pairs`, in members' indices and centred pixels.
+    overlaps: Vec<Overlap>,
+    edges: Vec<Edge>,
+    tree: Vec<usize>,
+    reference: usize,
+    groups: Vec<Vec<usize>>,
+}
+
+/// Pixel centre of a photograph's middle, or its camera's principal point.
+fn centre(p: &Photo) -> Vector2<f64> {
+    match p.camera {
+        Some(c) => Vector2::new(c.cx, c.cy),
+        None => Vector2::new((p.width as f64 - 1.0) / 2.0, (p.height as f64 - 1.0) / 2.0),
+    }
+}
+
+/// A pixel of the photograph as an ideal camera with square pixels of width fx would have it, from the principal point.
+fn ideal(p: &Photo, pixel: Point2<f64>) -> Vector2<f64> {
+    match p.camera {
+        Some(c) => c.normalize(pixel).coords * c.fx,
+        None => pixel.coords - centre(p),
+    }
+}
+
+impl<'a> Group<'a> {
+    pub(crate) fn largest(photos: &[Photo], pairs: &[&'a VerifiedPair]) -> Result<Self, AlignError> {
+        let n = photos.len();
+        let all: Vec<Edge> = pairs.iter().map(|p| Edge { a: p.a, b: p.b, weight: p.inliers.len() as f64 }).collect();
+        let groups = graph::groups(n, &all);
+        let members = groups.first().cloned().unwrap_or_default();
+        if members.len() < 2 {
+            return Err(AlignError::NoOverlap { photos: n });
+        }
+        let index = |photo: usize| members.binary_search(&photo).ok();
+        let (mut kept, mut overlaps, mut edges) = (Vec::new(), Vec::new(), Vec::new());
+        for (pair, edge) in pairs.iter().zip(&all) {
+            let (Some(i), Some(j)) = (index(pair.a), index(pair.b)) else { continue };
+            let points = pair
+                .inliers
+                .iter()
+                .map(|c| (ideal(&photos[pair.a], c.a), ideal(&photos[pair.b], c.b)))
+                .filter(|(a, b)| a.iter().chain(b.iter()).all(|v| v.is_finite()))
+                .collect();
+            kept.push(*pair);
+            overlaps.push(Overlap { i, j, points });
+            edges.push(Edge { a: i, b: j, weight: edge.weight });
+        }
+        let tree = graph::maximum_spanning_tree(members.len(), &edges);
+        let own: Vec<usize> = (0..members.len()).collect();
+        let reference = graph::middle(members.len(), &edges, &tree, &own).unwrap_or(0);
+        let photos = members.iter().map(|&m| photos[m]).collect();
+        Ok(Self { members, photos, pairs: kept, overlaps, edges, tree, reference, groups })
+    }
+
+    /// Photographs to lenses, and a representative photograph of each lens.
+    fn lenses(&self) -> (Vec<usize>, Vec<usize>) {
+        let mut heads: Vec<usize> = Vec::new();
+        let of = (0..self.photos.len())
+            .map(|i| match heads.iter().position(|&h| self.photos[h].shares_lens(&self.photos[i])) {
+                Some(lens) => lens,
+                None => {
+                    heads.push(i);
+                    heads.len() - 1
+                }
+            })
+            .collect();
+        (of, heads)
+    }
+
+    /// The homography of an edge from member `from`, in centred pixels.
+    fn homography(&self, edge: usize, from: usize) -> Matrix3<f64> {
+        let (pair, e) = (self.pairs[edge], self.edges[edge]);
+        let shift = |v: Vector2<f64>| Matrix3::new(1.0, 0.0, v.x, 0.0, 1.0, v.y, 0.0, 0.0, 1.0);
+        let h = shift(-centre(&self.photos[e.b])) * pair.homography * shift(centre(&self.photos[e.a]));
+        if from == e.a { h } else { h.try_inverse().unwrap_or_else(Matrix3::identity) }
+    }
+
+    /// First guess of each lens's focal length with the standard deviation of its logarithm.
+    fn focal_guesses(&self, heads: &[usize]) -> Vec<(f64, f64)> {
+        // Focal lengths over long sides, so that photographs of other sizes can lend theirs.
+        let mut estimates: Vec<f64> = Vec::new();
+        for edge in 0..self.edges.len() {
+            let (a, b) = (self.edges[edge].a, self.edges[edge].b);
+            let (fa, fb) = focals_from_homography(&self.homography(edge, a));
+            estimates.extend(fa.map(|f| f / self.photos[a].long_side()));
+            estimates.extend(fb.map(|f| f / self.photos[b].long_side()));
+        }
+        // 0.25 is a lens of 127° across, 20 one of 3°.
+        estimates.retain(|ratio| (0.25..20.0).contains(ratio));
+        estimates.sort_by(f64::total_cmp);
+        // Without any estimate: 53° across, a usual wide lens.
+        let ratio = estimates.get(estimates.len() / 2).copied().unwrap_or(1.0);
+        heads
+            .iter()
+            .map(|&h| match (self.photos[h].camera, self.photos[h].focal) {
+                // Calibrated: not to be moved.
+                (Some(camera), _) => (camera.fx.ln(), 1e-6),
+                // EXIF is right to a few percent, unless the photograph was cropped.
+                (None, Some(focal)) if focal.is_finite() && focal > 0.0 => (focal.ln(), 0.2),
+                _ => ((ratio * self.photos[h].long_side()).ln(), 0.7),
+            })
+            .collect()
+    }
+
+    /// Motions chained along the spanning tree.
+    fn chain(&self, kind: Motion, lens_of: &[usize], lenses: &[Lens]) -> Vec<Matrix3<f64>> {
+        let mut motion = vec![Matrix3::identity(); self.photos.len()];
+        let focal = |i: usize| lenses[lens_of[i]].log_focal.exp();
+        let k = |f: f64| Matrix3::new(f, 0.0, 0.0, 0.0, f, 0.0, 0.0, 0.0, 1.0);
+        for step in graph::walk(self.photos.len(), &self.edges, &self.tree, self.reference) {
+            let h = self.homography(step.edge, step.parent);
+            let m = k(1.0 / focal(step.node)) * h * k(focal(step.parent));
+            let m = m / m.determinant().cbrt();
+            let m = if m.iter().all(|v| v.is_finite()) { m } else { Matrix3::identity() };
+            let relative = match kind {
+                Motion::Rotation => Rotation3::from_matrix_eps(&m, 1e-10, 100, Rotation3::identity()).into_inner(),
+                Motion::Homography => m,
+            };
+            motion[step.node] = relative * motion[step.parent];
+        }
+        motion
+    }
+
+    fn problem<'p>(&'p self, kind: Motion, lens_of: &'p [usize], prior: &'p [(f64, f64)], scale: f64) -> Problem<'p> {
+        Problem {
+            kind,
+            overlaps: &self.overlaps,
+            lens_of,
+            fixed: self.reference,
+            free_focal: kind == Motion::Rotation && self.photos.iter().any(|p| p.camera.is_none()),
+            free_k1: false,
+            focal_prior: prior,
+            loss: RobustLoss::Cauchy { scale },
+        }
+    }
+
+    pub(crate) fn solve(&self, options: &AlignOptions) -> (Solution, CameraMotion) {
+        let rotation = (options.motion != CameraMotion::Homography).then(|| self.solve_rotation(options));
+        let flat = || self.solve_homography(options);
+        match (options.motion, rotation) {
+            (CameraMotion::Auto, Some(rotation)) => {
+                let typical = self.median_error(Motion::Rotation, &rotation);
+                // Matches fit a turn to the σ of the loss: no need to look for another explanation.
+                if typical <= 0.75 * options.outlier_px {
+                    return (rotation, CameraMotion::Rotation);
+                }
+                let flat = flat();
+                // Five more unknowns per photograph always fit better: only a far better fit means a flat scene.
+                let better = self.median_error(Motion::Homography, &flat) < 0.4 * typical;
+                if better && self.in_front(&flat) {
+                    (flat, CameraMotion::Homography)
+                } else {
+                    (rotation, CameraMotion::Rotation)
+                }
+            }
+            (_, Some(rotation)) => (rotation, CameraMotion::Rotation),
+            (_, None) => (flat(), CameraMotion::Homography),
+        }
+    }
+
+    /// Turning cameras: shared lenses first, from several focal lengths where none is known, then what the matches ask for.
+    fn solve_rotation(&self, options: &AlignOptions) -> Solution {
+        let (lens_of, heads) = self.lenses();
+        let prior = self.focal_guesses(&heads);
+        let known = heads.iter().all(|&h| self.photos[h].camera.is_some() || self.photos[h].focal.is_some());
+        let factors: &[f64] = if known { &[1.0] } else { &[1.0, 0.6, 1.7, 3.0] };
+        let wide = self.problem(Motion::Rotation, &lens_of, &prior, 10.0 * options.outlier_px);
+        let start = |factor: &f64| {
+            let lenses: Vec<Lens> = prior
+                .iter()
+                .zip(&heads)
+                .map(|(p, &h)| {
+                    let free = self.photos[h].camera.is_none() && self.photos[h].focal.is_none();
+                    Lens { log_focal: p.0 + if free { factor.ln() } else { 0.0 }, k1: 0.0 }
+                })
+                .collect();
+            let motion = self.chain(Motion::Rotation, &lens_of, &lenses);
+            wide.solve(State { motion, lenses }, 30)
+        };
+        let Some((state, _)) = factors.iter().map(start).min_by(|x, y| x.1.total_cmp(&y.1)) else {
+            return Solution { lens_of, prior, state: State { motion: Vec::new(), lenses: Vec::new() } };
+        };
+        let mut problem = self.problem(Motion::Rotation, &lens_of, &prior, options.outlier_px);
+        let (mut state, mut cost) = problem.solve(state, 50);
+        // A coefficient earns its place by a twentieth of the cost: less is what parallax gives to any new unknown.
+        let earns = |new: f64, old: f64| new < 0.95 * old - 20.0 * options.outlier_px.powi(2);
+        let calibrated = self.photos.iter().any(|p| p.camera.is_some());
+        if options.refine_distortion && !calibrated {
+            let radial = Problem { free_k1: true, ..problem.clone() };
+            let (with, new) = radial.solve(state.clone(), 50);
+            if earns(new, cost) {
+                (state, cost) = (with, new);
+                problem = radial;
+            }
+        }
+        if !calibrated && lens_of.len() > heads.len() {
+            let own: Vec<usize> = (0..lens_of.len()).collect();
+            // Zoomed between photographs: each has a focal length of its own, near the common one.
+            let own_prior: Vec<(f64, f64)> = lens_of.iter().map(|&l| (state.lenses[l].log_focal, prior[l].1)).collect();
+            let lenses = lens_of.iter().map(|&l| state.lenses[l]).collect();
+            let apart = Problem { lens_of: &own, focal_prior: &own_prior, ..problem.clone() };
+            let (with, new) = apart.solve(State { motion: state.motion.clone(), lenses }, 50);
+            if earns(new, cost) && new < 0.8 * cost {
+                return Solution { lens_of: own, prior: own_prior, state: with };
+            }
+        }
+        Solution { lens_of, prior, state }
+    }
+
+    fn solve_homography(&self, options: &AlignOptions) -> Solution {
+        let (lens_of, heads) = self.lenses();
+        let prior = self.focal_guesses(&heads);
+        // Any focal length will do, as the homographies take up the difference; this one keeps the numbers near one.
+        let lenses: Vec<Lens> = heads
+            .iter()
+            .map(|&h| Lens {
+                log_focal: self.photos[h].camera.map_or(self.photos[h].long_side(), |c| c.fx).ln(),
+                k1: 0.0,
+            })
+            .collect();
+        let motion = self.chain(Motion::Homography, &lens_of, &lenses);
+        let wide = self.problem(Motion::Homography, &lens_of, &prior, 10.0 * options.outlier_px);
+        let (state, _) = wide.solve(State { motion, lenses }, 30);
+        let problem = self.problem(Motion::Homography, &lens_of, &prior, options.outlier_px);
+        let (state, _) = problem.solve(state, 50);
+        Solution { lens_of, prior, state }
+    }
+
+    fn errors(&self, kind: Motion, s: &Solution) -> Vec<Vec<f64>> {
+        let problem = self.problem(kind, &s.lens_of, &s.prior, 1.0);
+        self.overlaps.iter().map(|o| problem.squared_errors(&s.state, o)).collect()
+    }
+
+    fn median_error(&self, kind: Motion, s: &Solution) -> f64 {
+        median(self.errors(kind, s).into_iter().flatten().collect()).sqrt()
+    }
+
+    /// No photograph reaches the horizon of the common plane.
+    fn in_front(&self, s: &Solution) -> bool {
+        (0..self.photos.len()).all(|i| {
+            let Some(inverse) = s.state.motion[i].try_inverse() else { return false };
+            let view = self.view(i, s);
+            view.border(1).iter().all(|&p| {
+                let n = view.camera.normalize(p);
+                let ray = inverse * nalgebra::Vector3::new(n.x, n.y, 1.0);
+                ray.z > 0.05 * ray.norm()
+            })
+        })
+    }
+
+    /// The overlap that the solution contradicts most, where it contradicts one outright.
+    pub(crate) fn worst_contradiction(
+        &self,
+        s: &Solution,
+        motion: CameraMotion,
+        options: &AlignOptions,
+    ) -> Option<usize> {
+        let errors = self.errors(kind_of(motion), s);
+        let typical = median(errors.iter().flatten().copied().collect()).sqrt();
+        // Parallax moves matches by some pixels; a false overlap of repeated structure is off by tens.
+        let limit = (8.0 * options.outlier_px).max(6.0 * typical);
+        errors
+            .into_iter()
+            .enumerate()
+            .map(|(i, e)| (i, median(e).sqrt()))
+            .filter(|(_, e)| *e > limit)
+            .max_by(|x, y| x.1.total_cmp(&y.1))
+            .map(|(i, _)| i)
+    }
+
+    fn view(&self, i: usize, s: &Solution) -> View {
+        let lens = s.state.lenses[s.lens_of[i]];
+        let p = &self.photos[i];
+        let camera = p.camera.unwrap_or_else(|| Camera {
+            distortion: if lens.k1 == 0.0 { Distortion::None } else { Distortion::Radial { k1: lens.k1, k2: 0.0 } },
+            ..Camera::from_focal(p.width, p.height, lens.log_focal.exp())
+        });
+        View { camera, from_world: s.state.motion[i] }
+    }
+
+    pub(crate) fn finish(
+        &self,
+        photos: &[Photo],
+        solution: &Solution,
+        motion: CameraMotion,
+        contradicting: &[bool],
+        options: &AlignOptions,
+    ) -> Result<Alignment, AlignError> {
+        if !solution.state.motion.iter().all(|m| m.iter().all(|v| v.is_finite())) {
+            return Err(AlignError::Inconsistent { photos: self.members.len() });
+        }
+        let mut views: Vec<Result<View, Unplaced>> = (0..photos.len())
+            .map(|i| {
+                let size = self.groups.iter().find(|g| g.contains(&i)).map_or(1, Vec::len);
+                Err(match size {
+                    _ if contradicting[i] => Unplaced::Contradicts,
+                    1 => Unplaced::Alone,
+                    size => Unplaced::OtherGroup { size },
+                })
+            })
+            .collect();
+        let upright = if options.straighten && motion == CameraMotion::Rotation {
+            straighten(&solution.state.motion)
+        } else {
+            Matrix3::identity()
+        };
+        for (i, &member) in self.members.iter().enumerate() {
+            let view = self.view(i, solution);
+            views[member] = Ok(View { from_world: view.from_world * upright.transpose(), ..view });
+        }
+        let errors = self.errors(kind_of(motion), solution);
+        let rms = |e: &[f64]| (e.iter().sum::<f64>() / e.len().max(1) as f64).sqrt();
+        let pairs = self
+            .pairs
+            .iter()
+            .zip(&errors)
+            .map(|(p, e)| AlignedPair { a: p.a, b: p.b, matches: p.inliers.clone(), rms_px: rms(e) })
+            .collect();
+        let all: Vec<f64> = errors.concat();
+        Ok(Alignment {
+            views,
+            reference: self.members[self.reference],
+            motion,
+            pairs,
+            rms_px: rms(&all),
+            median_px: median(all).sqrt(),
+        })
+    }
+}
+
+/// The unknowns, found.
+pub(crate) struct Solution {
+    lens_of: Vec<usize>,
+    prior: Vec<(f64, f64)>,
+    state: State,
+}
+
+fn kind_of(motion: CameraMotion) -> Motion {
+    match motion {
+        CameraMotion::Homography => Motion::Homography,
+        CameraMotion::Auto | CameraMotion::Rotation => Motion::Rotation,
+    }
+}
+
+/// The upper median; 0 of nothing.
+fn median(mut values: Vec<f64>) -> f64 {
+    if values.is_empty() {
+        return 0.0;
+    }
+    let middle = values.len() / 2;
+    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+}
