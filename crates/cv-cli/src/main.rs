@@ -1,7 +1,6 @@
 //! The program `cv`: arguments, files and reports. The work itself is done by `cv-pipeline`.
 
 mod commands;
-#[allow(dead_code, reason = "the commands that use the rest arrive with their pipelines")]
 mod common;
 
 use clap::Parser;
