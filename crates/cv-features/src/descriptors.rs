@@ -7,6 +7,8 @@ use cv_core::Keypoint;
 pub enum DescriptorKind {
     /// 8×8 upright patches, zero mean and unit variance ([`describe_patches`](crate::describe_patches)).
     Patch,
+    /// 8×8 patches turned to the keypoint's direction and sized to its scale, zero mean and unit variance ([`mops`](crate::mops)).
+    Mops,
     /// SIFT gradient histograms of unit length ([`sift`](crate::sift) with `root: false`).
     Sift,
     /// The square roots of SIFT histograms that sum to one ([`sift`](crate::sift)); unit length.
@@ -17,7 +19,7 @@ impl DescriptorKind {
     /// Numbers in one descriptor.
     pub fn dimension(self) -> usize {
         match self {
-            Self::Patch => 64,
+            Self::Patch | Self::Mops => 64,
             Self::Sift | Self::RootSift => 128,
         }
     }
@@ -27,6 +29,7 @@ impl std::fmt::Display for DescriptorKind {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(match self {
             Self::Patch => "8×8 patch",
+            Self::Mops => "MOPS",
             Self::Sift => "SIFT",
             Self::RootSift => "rootSIFT",
         })

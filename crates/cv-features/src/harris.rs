@@ -104,7 +104,8 @@ pub fn harris(view: ImageView<'_, f32, 1>, options: &HarrisOptions) -> Result<Ve
     Ok(corners(&options.plan(view, simd::level()), options.threshold))
 }
 
-fn corners(plan: &Structure<'_>, threshold: f32) -> Vec<Keypoint> {
+/// Local maxima of the measure of at least a share of the largest, in raster order.
+pub(crate) fn corners(plan: &Structure<'_>, threshold: f32) -> Vec<Keypoint> {
     let h = plan.view.height();
     let rows = rows_of_a_task(h);
     let strips: Vec<(f32, Vec<Keypoint>)> = (0..h.div_ceil(rows))

@@ -42,8 +42,10 @@ mod error;
 mod harris;
 mod histogram;
 mod matching;
+mod mops;
 mod nearest;
 mod patch;
+mod pyramid;
 mod rows;
 mod scale_space;
 mod sift;
@@ -56,6 +58,7 @@ pub use descriptors::{Described, DescriptorKind, Descriptors, DropReason, Droppe
 pub use error::FeatureError;
 pub use harris::{CornerMeasure, HarrisOptions, harris, harris_response};
 pub use matching::{MatchError, MatchOptions, RatioMeasure, match_descriptors};
+pub use mops::{MopsOptions, MultiScaleOptions, describe_oriented_patches, harris_laplace, mops};
 pub use patch::{PatchOptions, describe_patches};
 pub use sift::{SiftOptions, sift};
 pub use spacing::{anms_square_covering, anms_tiled};

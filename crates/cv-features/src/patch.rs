@@ -10,7 +10,7 @@ use cv_imgproc::gaussian_blur;
 use rayon::prelude::*;
 
 /// Samples on a side of a patch.
-const SIDE: usize = 8;
+pub(crate) const SIDE: usize = 8;
 
 /// Settings of [`describe_patches`].
 #[derive(Debug, Clone, PartialEq)]

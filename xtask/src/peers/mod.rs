@@ -3,6 +3,8 @@
 //! One file per job; its scripts and the pinned versions live in `peers/` at the root, whose `.venv` is made on the first
 //! run. Register a job with one line in `JOBS`; it returns whether ours meets its bars.
 
+mod feature_quality;
+mod features;
 mod stereo;
 
 use anyhow::{Context, Result, bail, ensure};
@@ -14,7 +16,7 @@ use std::{
 /// A job: its name on the command line and what it does with the Python of the peers and the data folder.
 type Job = (&'static str, fn(&Path, &Path) -> Result<bool>);
 
-const JOBS: &[Job] = &[("stereo", stereo::run)];
+const JOBS: &[Job] = &[("stereo", stereo::run), ("features", features::run)];
 
 /// Runs all jobs, or the one named; true where ours meets every bar.
 pub(crate) fn run(only: Option<&str>) -> Result<bool> {
@@ -62,4 +64,51 @@ pub(crate) fn check(command: &mut Command) -> Result<()> {
     let status = command.status().with_context(|| format!("cannot start {command:?}"))?;
     ensure!(status.success(), "{command:?} failed: {status}");
     Ok(())
+}
+
+/// Replaces the section under `## name` of `docs/benchmarks.md`, or adds it at the end.
+pub(crate) fn write_section(name: &str, text: &str) -> Result<()> {
+    let path = crate::root().join("docs/benchmarks.md");
+    let page = std::fs::read_to_string(&path).unwrap_or_else(|_| "# Benchmarks\n".to_owned());
+    cv_io::write_bytes(path, with_section(&page, name, text).as_bytes())?;
+    Ok(())
+}
+
+fn with_section(page: &str, name: &str, text: &str) -> String {
+    let title = format!("## {name}");
+    let (mut before, mut after, mut inside, mut seen) = (String::new(), String::new(), false, false);
+    for line in page.lines() {
+        if line.starts_with("## ") {
+            inside = line == title;
+            seen |= inside;
+        }
+        if !inside {
+            let part = if seen { &mut after } else { &mut before };
+            part.push_str(line);
+            part.push('\n');
+        }
+    }
+    let after = if after.is_empty() { String::new() } else { format!("\n{after}") };
+    format!("{}\n\n{title}\n\n{}\n{after}", before.trim_end(), text.trim())
+}
+
+/// Processor and number of cores.
+pub(crate) fn machine() -> String {
+    let info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let name = info.lines().find_map(|line| line.strip_prefix("model name")).unwrap_or(": unknown processor");
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    format!("{}, {cores} cores", name.trim_start_matches([' ', '\t', ':']))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_section_is_replaced_where_it_stands() {
+        let page = with_section("# Page\n\nIntro.\n\n## A\n\nold\n\n## B\n\nkept\n", "A", "new\n");
+        assert_eq!(page, "# Page\n\nIntro.\n\n## A\n\nnew\n\n## B\n\nkept\n");
+        assert_eq!(with_section(&page, "A", "new"), page);
+        assert_eq!(with_section("# Page\n", "C", "x"), "# Page\n\n## C\n\nx\n");
+    }
 }

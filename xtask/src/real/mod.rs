@@ -5,6 +5,7 @@
 
 pub(crate) mod depth;
 mod estimate;
+mod matching;
 mod panorama;
 mod reconstruct;
 mod segment;
@@ -18,6 +19,7 @@ type Job = (&'static str, fn(&Path) -> Result<Vec<Check>>);
 const JOBS: &[Job] = &[
     ("depth", depth::run),
     ("estimate", estimate::run),
+    ("matching", matching::run),
     ("panorama", panorama::run),
     ("reconstruct", reconstruct::run),
     ("segment", segment::run),

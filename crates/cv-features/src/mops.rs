@@ -1,0 +1,231 @@
+//! Corners at all scales, and oriented patches around them.
+//!
+//! Sources: M. Brown, R. Szeliski & S. Winder, "Multi-image matching using multi-scale oriented patches", CVPR 2005; K. Mikolajczyk & C. Schmid,
+//! "Indexing based on scale invariant interest points", ICCV 2001 (Harris-Laplace).
+
+use crate::descriptors::{Described, DescriptorKind, Descriptors, DropReason, Dropped};
+use crate::error::{FeatureError, check_image, check_option};
+use crate::harris::{CornerMeasure, corners};
+use crate::patch::{SIDE, normalize};
+use crate::pyramid::{FIRST_SIGMA, Pyramid};
+use crate::simd;
+use crate::structure::Structure;
+use cv_core::{ImageView, Keypoint};
+use cv_imgproc::gaussian_half_kernel;
+use rayon::prelude::*;
+
+/// Settings of [`harris_laplace`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct MultiScaleOptions {
+    /// The corner measure. Default Harris with `k` = 0.04.
+    pub measure: CornerMeasure,
+    /// Scales per octave. 1 to 6; default 3 (as SIFT).
+    pub layers: usize,
+    /// Corners weaker than this share of the strongest (of all scales, gradients times σ) are left out. 0 to 1; default 0.001.
+    pub threshold: f32,
+    /// Keep a corner only at the scales where the Laplacian is larger than at the next ones (Harris-Laplace), and refine the scale. Without it, a corner
+    /// appears at every scale at which it is one. Default true.
+    pub laplacian: bool,
+}
+
+impl Default for MultiScaleOptions {
+    fn default() -> Self {
+        Self { measure: CornerMeasure::Harris { k: 0.04 }, layers: 3, threshold: 1e-3, laplacian: true }
+    }
+}
+
+/// Settings of [`mops`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct MopsOptions {
+    /// Largest number of features; the strongest stay. 1 or more; default 2000.
+    pub max_features: usize,
+    /// Where the corners come from.
+    pub corners: MultiScaleOptions,
+    /// Side of the window in units of the keypoint's scale; its 64 samples lie an eighth of it apart, in an image smoothed by half of that distance. 8 to 100; default 40
+    /// (Brown, Szeliski & Winder).
+    pub window: f32,
+    /// σ of the gradient that gives the direction, in units of the keypoint's scale. 1 to 20; default 4.5 (Brown, Szeliski & Winder).
+    pub orientation_sigma: f32,
+    /// Leave every angle at zero. Default false.
+    pub upright: bool,
+    /// As [`PatchOptions::min_deviation`](crate::PatchOptions::min_deviation).
+    pub min_deviation: f32,
+}
+
+impl Default for MopsOptions {
+    fn default() -> Self {
+        Self {
+            max_features: 2000,
+            corners: MultiScaleOptions::default(),
+            window: 40.0,
+            orientation_sigma: 4.5,
+            upright: false,
+            min_deviation: 1e-3,
+        }
+    }
+}
+
+/// The smallest image with one octave.
+const SMALLEST: usize = 16;
+/// σ of the window of the structure tensor over that of the gradients (Brown, Szeliski & Winder).
+const WINDOW: f32 = 1.5;
+
+/// Corners at all scales, strongest first, with sub-pixel position and scale.
+///
+/// `scale` is the σ in input pixels of the Gaussian whose gradients made it a corner, `response` the measure of gradients times σ, so that scales compare.
+///
+/// # Errors
+/// [`FeatureError`] for images below 16×16, samples that are not finite, options out of range.
+pub fn harris_laplace(view: ImageView<'_, f32, 1>, options: &MultiScaleOptions) -> Result<Vec<Keypoint>, FeatureError> {
+    check(options)?;
+    check_image(view, SMALLEST)?;
+    Ok(detect(&Pyramid::new(view, options.layers), options))
+}
+
+/// Finds corners at all scales and describes each by an 8×8 patch turned to its direction and sized to its scale; strongest first.
+///
+/// The direction is that of the gradient at a larger scale. Samples are read from the pyramid level whose smoothing fits their distance. Corners whose samples leave the image,
+/// or lie on a flat window, are in `dropped` with the reason.
+///
+/// # Errors
+/// As [`harris_laplace`].
+pub fn mops(view: ImageView<'_, f32, 1>, options: &MopsOptions) -> Result<Described, FeatureError> {
+    check(&options.corners)?;
+    check_patches(options)?;
+    check_image(view, SMALLEST)?;
+    let pyramid = Pyramid::new(view, options.corners.layers);
+    let found = detect(&pyramid, &options.corners);
+    Ok(describe(&pyramid, view.size(), &found, options))
+}
+
+/// Describes given keypoints as [`mops`] does: their scale is used, their angle is replaced (unless `upright`).
+///
+/// # Errors
+/// As [`harris_laplace`].
+pub fn describe_oriented_patches(
+    view: ImageView<'_, f32, 1>,
+    keypoints: &[Keypoint],
+    options: &MopsOptions,
+) -> Result<Described, FeatureError> {
+    check(&options.corners)?;
+    check_patches(options)?;
+    check_image(view, SMALLEST)?;
+    let options = MopsOptions { max_features: usize::MAX, ..options.clone() };
+    Ok(describe(&Pyramid::new(view, options.corners.layers), view.size(), keypoints, &options))
+}
+
+fn check(options: &MultiScaleOptions) -> Result<(), FeatureError> {
+    if let CornerMeasure::Harris { k } = options.measure {
+        check_option("k", k.into(), "0 to 0.25", |v| (0.0..=0.25).contains(&v))?;
+    }
+    check_option("layers", options.layers as f64, "1 to 6", |v| (1.0..=6.0).contains(&v))?;
+    check_option("threshold", options.threshold.into(), "0 to 1", |v| (0.0..=1.0).contains(&v))
+}
+
+fn check_patches(options: &MopsOptions) -> Result<(), FeatureError> {
+    check_option("max_features", options.max_features as f64, "1 or more", |v| v >= 1.0)?;
+    check_option("window", options.window.into(), "8 to 100 scales", |v| (8.0..=100.0).contains(&v))?;
+    check_option("orientation_sigma", options.orientation_sigma.into(), "1 to 20 scales", |v| {
+        (1.0..=20.0).contains(&v)
+    })?;
+    check_option("min_deviation", options.min_deviation.into(), "0 or more", |v| v >= 0.0 && v.is_finite())
+}
+
+fn detect(pyramid: &Pyramid, options: &MultiScaleOptions) -> Vec<Keypoint> {
+    let levels = &pyramid.levels;
+    let mut all: Vec<Keypoint> = Vec::new();
+    for (i, level) in levels.iter().enumerate() {
+        let plan = Structure {
+            view: level.image.view(),
+            kernel: gaussian_half_kernel(WINDOW * level.sigma),
+            measure: options.measure,
+            level: simd::level(),
+        };
+        let found = corners(&plan, options.threshold);
+        // Two gradients to a product, and two products to Harris's measure.
+        let power = if matches!(options.measure, CornerMeasure::ShiTomasi) { 2 } else { 4 };
+        let gain = level.sigma.powi(power);
+        all.par_extend(found.par_iter().with_min_len(64).filter_map(|corner| {
+            let (x, y) = (corner.position.x * level.pixel, corner.position.y * level.pixel);
+            let mut scale = level.sigma * level.pixel;
+            if options.laplacian {
+                // The finest and the coarsest have a neighbour on one side only: nothing is known about a maximum there.
+                let (below, above) = (levels.get(i.wrapping_sub(1))?, levels.get(i + 1)?);
+                let [a, b, c] = [below, level, above].map(|l| l.laplacian(x, y).abs());
+                if b <= a || b <= c {
+                    return None;
+                }
+                let offset = 0.5 * (a - c) / (a - 2.0 * b + c);
+                scale *= 2f32.powf(offset.clamp(-0.5, 0.5) / pyramid.per_octave as f32);
+            }
+            Some(Keypoint { scale, ..Keypoint::new(x, y, gain * corner.response) })
+        }));
+    }
+    let strongest = all.iter().fold(0.0f32, |m, k| m.max(k.response));
+    all.retain(|k| k.response >= options.threshold * strongest);
+    all.sort_by(|a, b| b.response.total_cmp(&a.response));
+    all
+}
+
+fn describe(pyramid: &Pyramid, size: (usize, usize), keypoints: &[Keypoint], options: &MopsOptions) -> Described {
+    let patches: Vec<Result<(f32, Patch), DropReason>> =
+        keypoints.par_iter().with_min_len(32).map(|k| patch(pyramid, size, k, options)).collect();
+    let mut out = Described {
+        keypoints: Vec::new(),
+        descriptors: Descriptors::new(DescriptorKind::Mops),
+        dropped: Vec::new(),
+        beyond_limit: 0,
+    };
+    for (index, (keypoint, patch)) in keypoints.iter().zip(patches).enumerate() {
+        match patch {
+            Err(reason) => out.dropped.push(Dropped { index, reason }),
+            Ok(_) if out.keypoints.len() == options.max_features => out.beyond_limit += 1,
+            Ok((angle, values)) => {
+                out.keypoints.push(Keypoint { angle, ..*keypoint });
+                out.descriptors.push(&values);
+            }
+        }
+    }
+    out
+}
+
+type Patch = [f32; SIDE * SIDE];
+
+/// The direction and the patch of a keypoint.
+fn patch(
+    pyramid: &Pyramid,
+    (w, h): (usize, usize),
+    keypoint: &Keypoint,
+    options: &MopsOptions,
+) -> Result<(f32, Patch), DropReason> {
+    let (x, y, scale) = (keypoint.position.x, keypoint.position.y, keypoint.scale);
+    if !(x.is_finite() && y.is_finite() && scale.is_finite() && scale > 0.0) {
+        return Err(DropReason::NotFinite);
+    }
+    let angle = if options.upright {
+        0.0
+    } else {
+        let level = pyramid.nearest(options.orientation_sigma * scale);
+        let p = level.pixel;
+        let (gx, gy) = (level.at(x + p, y) - level.at(x - p, y), level.at(x, y + p) - level.at(x, y - p));
+        gy.atan2(gx).rem_euclid(std::f32::consts::TAU)
+    };
+    let spacing = options.window * scale / SIDE as f32;
+    let (sin, cos) = angle.sin_cos();
+    let half = 0.5 * (SIDE as f32 - 1.0) * spacing;
+    let margin = half * (sin.abs() + cos.abs());
+    if x < margin || y < margin || x + margin > w as f32 - 1.0 || y + margin > h as f32 - 1.0 {
+        return Err(DropReason::OutsideImage { margin });
+    }
+    let level = pyramid.nearest((0.5 * spacing).max(FIRST_SIGMA));
+    let mut values = [0.0; SIDE * SIDE];
+    for (j, row) in values.chunks_exact_mut(SIDE).enumerate() {
+        let v = j as f32 * spacing - half;
+        for (i, o) in row.iter_mut().enumerate() {
+            let u = i as f32 * spacing - half;
+            *o = level.at(x + u * cos - v * sin, y + u * sin + v * cos);
+        }
+    }
+    normalize(&mut values, options.min_deviation)?;
+    Ok((angle, values))
+}

@@ -1,0 +1,89 @@
+//! A Gaussian pyramid with several scales per octave, for corners and patches of any size.
+
+use cv_core::{GrayF32, ImageView};
+use cv_imgproc::gaussian_blur;
+use rayon::prelude::*;
+
+/// σ that a photograph comes with, in its pixels (Lowe).
+const CAMERA_SIGMA: f32 = 0.5;
+/// σ of the first scale of an octave, in its pixels (Brown, Szeliski & Winder).
+pub(crate) const FIRST_SIGMA: f32 = 1.0;
+/// Octaves end before their shorter side is below this.
+const SMALLEST_SIDE: usize = 16;
+
+/// One scale.
+pub(crate) struct Level {
+    pub(crate) image: GrayF32,
+    /// Size of its pixel in input pixels: a power of two. Its pixel (x, y) lies at `pixel · (x, y)`.
+    pub(crate) pixel: f32,
+    /// σ in its own pixels: [`FIRST_SIGMA`] to less than twice that.
+    pub(crate) sigma: f32,
+}
+
+/// The scales of an image, `per_octave` for each doubling.
+pub(crate) struct Pyramid {
+    pub(crate) levels: Vec<Level>,
+    pub(crate) per_octave: usize,
+}
+
+impl Pyramid {
+    pub(crate) fn new(view: ImageView<'_, f32, 1>, per_octave: usize) -> Self {
+        let mut levels = Vec::new();
+        let mut base = gaussian_blur(view, (FIRST_SIGMA * FIRST_SIGMA - CAMERA_SIGMA * CAMERA_SIGMA).sqrt());
+        let mut pixel = 1.0;
+        loop {
+            let sigma = |i: usize| FIRST_SIGMA * 2f32.powf(i as f32 / per_octave as f32);
+            let from_base =
+                |i: usize| gaussian_blur(base.view(), (sigma(i) * sigma(i) - FIRST_SIGMA * FIRST_SIGMA).sqrt());
+            let next = half(&from_base(per_octave));
+            let further: Vec<GrayF32> = (1..per_octave).map(from_base).collect();
+            let images = std::iter::once(base).chain(further);
+            levels.extend(images.enumerate().map(|(i, image)| Level { image, pixel, sigma: sigma(i) }));
+            if next.width().min(next.height()) < SMALLEST_SIDE {
+                return Self { levels, per_octave };
+            }
+            base = next;
+            pixel *= 2.0;
+        }
+    }
+
+    /// The level whose σ is nearest to `sigma` input pixels.
+    pub(crate) fn nearest(&self, sigma: f32) -> &Level {
+        let place = (self.per_octave as f32 * (sigma / FIRST_SIGMA).log2()).round().max(0.0) as usize;
+        &self.levels[place.min(self.levels.len() - 1)]
+    }
+}
+
+impl Level {
+    /// The value at a position in input pixels; beyond the border, that of the border.
+    pub(crate) fn at(&self, x: f32, y: f32) -> f32 {
+        let (w, h) = self.image.size();
+        let place = |v: f32, n: usize| {
+            let v = (v / self.pixel).clamp(0.0, n as f32 - 1.0);
+            let cell = (v as usize).min(n - 2);
+            (cell, v - cell as f32)
+        };
+        let ((column, fx), (row, fy)) = (place(x, w), place(y, h));
+        let (top, bottom) = (self.image.row(row), self.image.row(row + 1));
+        let a = top[column] + fx * (top[column + 1] - top[column]);
+        let b = bottom[column] + fx * (bottom[column + 1] - bottom[column]);
+        a + fy * (b - a)
+    }
+
+    /// σ² times the Laplacian, at a position in input pixels.
+    pub(crate) fn laplacian(&self, x: f32, y: f32) -> f32 {
+        let p = self.pixel;
+        let around = self.at(x - p, y) + self.at(x + p, y) + self.at(x, y - p) + self.at(x, y + p);
+        self.sigma * self.sigma * (around - 4.0 * self.at(x, y))
+    }
+}
+
+/// Every second pixel of every second row.
+fn half(image: &GrayF32) -> GrayF32 {
+    let (w, h) = image.size();
+    let mut out = GrayF32::new(w.div_ceil(2), h.div_ceil(2), [0.0]);
+    out.as_mut_slice().par_chunks_mut(w.div_ceil(2)).enumerate().for_each(|(y, row)| {
+        row.iter_mut().zip(image.row(2 * y).iter().step_by(2)).for_each(|(o, v)| *o = *v);
+    });
+    out
+}

@@ -1,0 +1,230 @@
+//! OpenCV's features and ours on the same photograph in turns (A B A B), then repeatability and matching on photographs and warps of known truth.
+//! Writes the section "Features" of `docs/benchmarks.md`.
+
+use super::feature_quality::{self, Quality};
+use anyhow::{Context, Result, ensure};
+use cv_core::Keypoint;
+use cv_features::{
+    CornerMeasure, DescriptorKind, Descriptors, HarrisOptions, MatchOptions, SiftOptions, anms, harris,
+    harris_response, match_descriptors, sift,
+};
+use serde::Deserialize;
+use std::{fmt::Write as _, hint::black_box, path::Path, process::Command, time::Instant};
+
+const ROUNDS: usize = 4;
+
+/// Seconds of a stage of OpenCV's.
+#[derive(Deserialize)]
+struct Line {
+    seconds: f64,
+    version: String,
+}
+
+/// A stage of ours beside one of OpenCV's.
+struct Stage<'a> {
+    name: &'static str,
+    peer: &'static str,
+    /// Largest ratio of ours to the peer's; infinite where there is none.
+    bar: f64,
+    ours: Box<dyn Fn() + Send + Sync + 'a>,
+    repeats: usize,
+    best: [f64; 2],
+}
+
+pub(crate) fn run(python: &Path, data: &Path) -> Result<bool> {
+    let script = crate::root().join("peers/features_opencv.py");
+    let photo = data.join("panorama/weir/weir_1.jpg");
+    let grey = cv_io::read_gray_u8(&photo)?;
+    let (w, h) = grey.size();
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().context("cannot start two threads")?;
+    let options = HarrisOptions::default();
+    let shi = HarrisOptions { measure: CornerMeasure::ShiTomasi, ..options.clone() };
+    let settings = SiftOptions { max_features: 2000, ..SiftOptions::default() };
+    let nearest = MatchOptions { ratio: None, ..MatchOptions::default() };
+    let mut random = Random(1);
+    let mut set = |kind: DescriptorKind, n: usize| {
+        let data = (0..n * kind.dimension()).map(|_| random.next()).collect();
+        Descriptors::from_vec(kind, data).context("descriptors")
+    };
+    let small = [set(DescriptorKind::Patch, 2000)?, set(DescriptorKind::Patch, 2000)?];
+    let large = [set(DescriptorKind::RootSift, 8192)?, set(DescriptorKind::RootSift, 8192)?];
+    let corners: Vec<Keypoint> = (0..20_000)
+        .map(|_| Keypoint::new(1333.0 * random.next(), 750.0 * random.next(), random.next().powi(3)))
+        .collect();
+    // The conversion from bytes counts as ours: OpenCV reads them.
+    let float = || cv_imgproc::gray_to_f32(grey.view());
+    let stage = |name, peer, bar, repeats, ours: Box<dyn Fn() + Send + Sync>| Stage {
+        name,
+        peer,
+        bar,
+        ours,
+        repeats,
+        best: [f64::INFINITY; 2],
+    };
+    let detect = |options: &HarrisOptions| {
+        let corners = harris(float().view(), options).unwrap_or_default();
+        black_box(anms(&corners, 500, 0.9));
+    };
+    let two = |sets: &[Descriptors; 2]| {
+        black_box(match_descriptors(&sets[0], &sets[1], &nearest)).ok();
+    };
+    let mut stages = vec![
+        stage(
+            "Harris response",
+            "cornerHarris",
+            0.6,
+            20,
+            Box::new(|| {
+                black_box(harris_response(float().view(), &options)).ok();
+            }),
+        ),
+        stage("500 spaced Harris corners", "goodFeaturesToTrack", 0.6, 20, Box::new(|| detect(&options))),
+        stage(
+            "500 spaced Shi-Tomasi corners",
+            "goodFeaturesToTrack, Shi-Tomasi",
+            f64::INFINITY,
+            10,
+            Box::new(|| {
+                detect(&shi);
+            }),
+        ),
+        stage("two nearest, 2000×2000×64", "BFMatcher 2000", 0.5, 20, Box::new(|| two(&small))),
+        stage("two nearest, 8192×8192×128", "BFMatcher 8192", f64::INFINITY, 4, Box::new(|| two(&large))),
+        stage(
+            "2000 SIFT features",
+            "SIFT",
+            0.6,
+            5,
+            Box::new(|| {
+                black_box(sift(float().view(), &settings)).ok();
+            }),
+        ),
+        stage(
+            "2000 MOPS features",
+            "ORB",
+            f64::INFINITY,
+            5,
+            Box::new(|| {
+                black_box(feature_quality::mops(&float(), 2000)).ok();
+            }),
+        ),
+        stage(
+            "20,000 corners to 500",
+            "",
+            f64::INFINITY,
+            20,
+            Box::new(|| {
+                black_box(anms(&corners, 500, 0.9));
+            }),
+        ),
+        stage("", "matrix product 4096", f64::INFINITY, 0, Box::new(|| ())),
+    ];
+    let mut version = String::new();
+    for round in 0..ROUNDS {
+        println!("round {} of {ROUNDS}", round + 1);
+        for stage in &mut stages {
+            for repeat in 0..=stage.repeats {
+                let start = Instant::now();
+                pool.install(|| (stage.ours)());
+                if repeat > 0 {
+                    stage.best[0] = stage.best[0].min(start.elapsed().as_secs_f64());
+                }
+            }
+            if !stage.peer.is_empty() {
+                let output = output(python, &script, &["speed", path_of(&photo)?, stage.peer])?;
+                let line: Line = serde_json::from_str(output.trim()).context("OpenCV's time")?;
+                stage.best[1] = stage.best[1].min(line.seconds);
+                version = line.version;
+            }
+        }
+    }
+    let time = |name: &str, of: usize| {
+        stages.iter().find(|s| s.name == name || s.peer == name).map_or(f64::NAN, |s| s.best[of])
+    };
+    let peak = 2.0 * 4096f64.powi(3) / time("matrix product 4096", 1);
+    let reached = 2.0 * 8192.0 * 8192.0 * 128.0 / time("two nearest, 8192×8192×128", 0);
+    let mut bars: Vec<(String, f64, f64)> = stages
+        .iter()
+        .filter(|s| s.bar.is_finite())
+        .map(|s| (format!("{} / OpenCV {}", s.name, s.peer), s.best[0] / s.best[1], s.bar))
+        .collect();
+    bars.push(("20,000 corners to 500, ms".into(), 1e3 * time("20,000 corners to 500", 0), 3.0));
+    // Written as a quotient that must be small, like the others.
+    bars.push(("measured peak of f32 products / rate of two nearest, 8192×8192×128".into(), peak / reached, 1.0 / 0.6));
+    let quality = feature_quality::run(python, &script, data)?;
+    for (name, ours, theirs) in quality.bars() {
+        bars.push((format!("OpenCV / ours: {name}"), theirs / ours, 1.0));
+    }
+    let text = page(&stages, &bars, &quality, (w, h), &version, (reached, peak));
+    print!("{text}");
+    super::write_section("Features", &text)?;
+    // NaN meets no bar.
+    Ok(bars.iter().all(|(_, figure, bar)| figure <= bar))
+}
+
+fn page(
+    stages: &[Stage<'_>],
+    bars: &[(String, f64, f64)],
+    quality: &Quality,
+    (w, h): (usize, usize),
+    version: &str,
+    (reached, peak): (f64, f64),
+) -> String {
+    let mut text = String::new();
+    // `fmt::Write` on a String cannot fail.
+    let _ = writeln!(
+        text,
+        "Written by `cargo xtask peers features`. {}. Two threads, {w}×{h} grey bytes in, ours and OpenCV {version} in turns, the fastest of \
+         {ROUNDS} rounds of warm repeats.\n\n| stage | ours | OpenCV | ratio |\n|---|---|---|---|",
+        super::machine()
+    );
+    for stage in stages.iter().filter(|s| !s.name.is_empty()) {
+        let [ours, theirs] = stage.best;
+        let _ = if theirs.is_finite() {
+            writeln!(
+                text,
+                "| {} / {} | {:.2} ms | {:.2} ms | {:.2} |",
+                stage.name,
+                stage.peer,
+                1e3 * ours,
+                1e3 * theirs,
+                ours / theirs
+            )
+        } else {
+            writeln!(text, "| {} | {:.2} ms | | |", stage.name, 1e3 * ours)
+        };
+    }
+    let _ = writeln!(
+        text,
+        "\nTwo nearest of 8192×8192×128: {:.0} GFlop/s, {:.0} % of NumPy's product of two 4096×4096 matrices ({:.0} GFlop/s).\n\n{}\n| figure | measured | bar |\n|---|---|---|",
+        reached * 1e-9,
+        100.0 * reached / peak,
+        peak * 1e-9,
+        quality.text()
+    );
+    for (name, figure, bar) in bars {
+        let verdict = if figure <= bar { "" } else { " (missed)" };
+        let _ = writeln!(text, "| {name} | {figure:.3} | {bar:.3}{verdict} |");
+    }
+    text
+}
+
+/// Numbers from 0 to 1, always the same.
+pub(super) struct Random(pub(super) u32);
+
+impl Random {
+    pub(super) fn next(&mut self) -> f32 {
+        self.0 = self.0.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        (self.0 >> 8) as f32 / (1 << 24) as f32
+    }
+}
+
+fn path_of(path: &Path) -> Result<&str> {
+    path.to_str().with_context(|| format!("{} is not text", path.display()))
+}
+
+fn output(python: &Path, file: &Path, args: &[&str]) -> Result<String> {
+    let output = Command::new(python).arg(file).args(args).output().context("cannot start Python")?;
+    ensure!(output.status.success(), "{}: {}", file.display(), String::from_utf8_lossy(&output.stderr));
+    Ok(String::from_utf8(output.stdout)?)
+}
