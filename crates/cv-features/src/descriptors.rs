@@ -134,3 +134,25 @@ pub struct Described {
     /// Features left out only because there are more than the options allow. With this, everything handed in or found is accounted for.
     pub beyond_limit: usize,
 }
+
+impl Described {
+    /// Leaves the features for which `keep` is true.
+    pub(crate) fn retain(&mut self, keep: &[bool]) {
+        let d = self.descriptors.dimension();
+        let mut which = keep.iter();
+        self.keypoints.retain(|_| which.next() == Some(&true));
+        let rows = self.descriptors.data.chunks_exact(d).zip(keep).filter(|(_, keep)| **keep);
+        self.descriptors.data = rows.flat_map(|(row, _)| row).copied().collect();
+    }
+
+    /// Adds a feature of another set of the same kind; `None` where the kinds differ or there is no such feature.
+    pub fn add(&mut self, other: &Self, index: usize) -> Option<u32> {
+        let keypoint = other.keypoints.get(index)?;
+        if other.descriptors.kind() != self.descriptors.kind() {
+            return None;
+        }
+        self.keypoints.push(*keypoint);
+        self.descriptors.push(other.descriptors.row(index));
+        u32::try_from(self.keypoints.len() - 1).ok()
+    }
+}

@@ -52,6 +52,7 @@ mod sift;
 mod simd;
 mod spacing;
 mod structure;
+mod views;
 
 pub use anms::{anms, suppression_radii};
 pub use descriptors::{Described, DescriptorKind, Descriptors, DropReason, Dropped};
@@ -62,3 +63,4 @@ pub use mops::{MopsOptions, MultiScaleOptions, describe_oriented_patches, harris
 pub use patch::{PatchOptions, describe_patches};
 pub use sift::{SiftOptions, sift};
 pub use spacing::{anms_square_covering, anms_tiled};
+pub use views::sift_tilted;

@@ -58,7 +58,7 @@ impl Default for SiftOptions {
 }
 
 /// The smallest image the scale space can be built on.
-const SMALLEST: usize = 8;
+pub(crate) const SMALLEST: usize = 8;
 
 /// Finds and describes SIFT features, strongest contrast first.
 ///

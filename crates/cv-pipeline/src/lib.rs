@@ -36,14 +36,15 @@ mod reconstruct;
 mod rectify;
 mod segment;
 mod stopwatch;
+mod views;
 
 pub use cv_geometry::{EstimateError, RobustModel, RobustOptions};
 pub use depth::{DepthError, DepthOptions, DepthResult, depth};
 pub use disparity_range::{RangeError, disparity_range};
 pub use estimate::{CalibratedResult, EstimateResult, ModelKind, estimate, estimate_calibrated};
 pub use matching::{
-    FeatureMethod, MatchingError, MatchingOptions, MatchingResult, PhotoFeatures, correspondences, extract_features,
-    match_features, match_photos,
+    FeatureMethod, MatchingError, MatchingOptions, MatchingResult, PhotoFeatures, Slanted, correspondences,
+    extract_features, match_features, match_photos,
 };
 pub use panorama::{
     PanoramaError, PanoramaImage, PanoramaOptions, PanoramaPair, PanoramaPhoto, PanoramaResult, panorama,

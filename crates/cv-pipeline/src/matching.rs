@@ -1,6 +1,7 @@
 //! Features of photographs, and tentative matches between two of them.
 
-use crate::{Progress, Stopwatch};
+use crate::views::match_slanted;
+use crate::{ModelKind, Progress, Silent, Stopwatch, estimate};
 use cv_core::{Correspondence, DMatch, GrayF32, ImageView, Keypoint, Point2};
 use cv_features::{
     Described, FeatureError, HarrisOptions, MatchError, MatchOptions, PatchOptions, SiftOptions, anms,
@@ -17,6 +18,19 @@ pub enum FeatureMethod {
     Sift,
 }
 
+/// Whether [`match_photos`] also looks at simulated slanted views (Morel & Yu's ASIFT), with SIFT only: some ten times the time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Slanted {
+    /// Never.
+    Never,
+    /// Where neither a homography nor a fundamental matrix explains enough of the plain matches: 8 and 30 % of them (Brown & Lowe's test of a true
+    /// match of two pictures, "Automatic panoramic image stitching", IJCV 2007).
+    #[default]
+    AsNeeded,
+    /// Always.
+    Always,
+}
+
 /// Settings of [`extract_features`] and [`match_photos`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct MatchingOptions {
@@ -31,13 +45,15 @@ pub struct MatchingOptions {
     pub anms_robust: f32,
     /// Settings of the patches.
     pub patch: PatchOptions,
-    /// Settings of SIFT.
+    /// Settings of SIFT. Of more features than asked for, the coarse ones stay by default (COLMAP's choice).
     pub sift: SiftOptions,
     /// Largest ratio of the SSD of the best candidate to that of the second. 0 to 1; `None` keeps every nearest neighbour. Default 0.66, which is
     /// 0.81 on distances.
     pub ratio: Option<f32>,
     /// Keep a match only where each feature is the other's nearest. Default true.
     pub mutual: bool,
+    /// Simulated slanted views. Default where needed.
+    pub slanted: Slanted,
 }
 
 impl Default for MatchingOptions {
@@ -48,9 +64,10 @@ impl Default for MatchingOptions {
             harris: HarrisOptions::default(),
             anms_robust: 0.9,
             patch: PatchOptions::default(),
-            sift: SiftOptions::default(),
+            sift: SiftOptions { coarse_first: true, ..SiftOptions::default() },
             ratio: Some(0.66),
             mutual: true,
+            slanted: Slanted::default(),
         }
     }
 }
@@ -173,13 +190,31 @@ pub fn match_photos(
         }
         Ok(features)
     };
-    let features = [extract(a, 1)?, extract(b, 2)?];
+    let mut features = [extract(a, 1)?, extract(b, 2)?];
     watch.lap("features");
     progress.report("match", 0, 1);
-    let matches = match_features(&features[0], &features[1], options)?;
-    let pairs = correspondences(&features[0], &features[1], &matches);
+    let mut matches = match_features(&features[0], &features[1], options)?;
     watch.lap("match");
+    let slanted = match options.slanted {
+        Slanted::Never => false,
+        Slanted::AsNeeded => !explained(&correspondences(&features[0], &features[1], &matches)),
+        Slanted::Always => true,
+    };
+    if slanted && options.method == FeatureMethod::Sift {
+        progress.report("slanted views", 0, 1);
+        match_slanted([&luma(a), &luma(b)], &mut features, &mut matches, options);
+        watch.lap("slanted views");
+    }
+    let pairs = correspondences(&features[0], &features[1], &matches);
     Ok(MatchingResult { features, matches, pairs, stages: watch.into_stages() })
+}
+
+/// Whether a homography or a fundamental matrix explains enough of the matches: see [`Slanted::AsNeeded`].
+fn explained(pairs: &[Correspondence]) -> bool {
+    [ModelKind::Homography, ModelKind::Fundamental].into_iter().any(|kind| {
+        let model = estimate(pairs, kind, &kind.options(), &Silent);
+        model.is_ok_and(|m| m.robust.inliers.len() as f64 > 8.0 + 0.3 * pairs.len() as f64)
+    })
 }
 
 /// Rec. 601 luma, 0 to 1, not rounded to bytes.

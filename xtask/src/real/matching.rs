@@ -35,8 +35,7 @@ pub(super) fn run(data: &Path) -> Result<Vec<Check>> {
             for (seed, errors) in errors.iter_mut().enumerate() {
                 let options = RobustOptions { seed: seed as u64, ..kind.options() };
                 let model = matched.as_ref().ok().and_then(|m| estimate(&m.pairs, kind, &options, &Silent).ok());
-                let error =
-                    model.map_or(f64::INFINITY, |m| annotated::rms(kind, &m.robust.model, &pair.checked));
+                let error = model.map_or(f64::INFINITY, |m| annotated::rms(kind, &m.robust.model, &pair.checked));
                 line.push_str(&format!(" {error:7.2}"));
                 errors.push(error);
             }
@@ -45,7 +44,11 @@ pub(super) fn run(data: &Path) -> Result<Vec<Check>> {
         let over_seeds = |figure: &dyn Fn(&[f64]) -> f64| median(errors.iter().map(|e| figure(e)).collect());
         let success = over_seeds(&|e| e.iter().filter(|e| **e < 10.0).count() as f64);
         checks.push(Check::at_least(format!("{name} pairs under 10 px"), success, success_bar));
-        checks.push(Check::at_most(format!("{name} median error, px"), over_seeds(&|e| median(e.to_vec())), median_bar));
+        checks.push(Check::at_most(
+            format!("{name} median error, px"),
+            over_seeds(&|e| median(e.to_vec())),
+            median_bar,
+        ));
         let accuracy = over_seeds(&annotated::mean_average_accuracy);
         checks.push(Check::at_least(format!("{name} mAA at 1 to 10 px"), accuracy, accuracy_bar));
     }
