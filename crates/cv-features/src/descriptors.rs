@@ -13,6 +13,11 @@ pub enum DescriptorKind {
     Sift,
     /// The square roots of SIFT histograms that sum to one ([`sift`](crate::sift)); unit length.
     RootSift,
+    /// Rows of another program, compared by their Euclidean distance.
+    Foreign {
+        /// Numbers in one descriptor.
+        dimension: usize,
+    },
 }
 
 impl DescriptorKind {
@@ -21,13 +26,18 @@ impl DescriptorKind {
         match self {
             Self::Patch | Self::Mops => 64,
             Self::Sift | Self::RootSift => 128,
+            Self::Foreign { dimension } => dimension,
         }
     }
 }
 
 impl std::fmt::Display for DescriptorKind {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        if let Self::Foreign { dimension } = self {
+            return write!(f, "foreign {dimension}-number");
+        }
         f.write_str(match self {
+            Self::Foreign { .. } => "foreign",
             Self::Patch => "8×8 patch",
             Self::Mops => "MOPS",
             Self::Sift => "SIFT",
@@ -49,9 +59,10 @@ impl Descriptors {
         Self { kind, data: Vec::new() }
     }
 
-    /// Takes over rows of numbers; `None` where the length is not a multiple of the kind's dimension.
+    /// Takes over rows of numbers; `None` where the length is not a multiple of the kind's dimension, or that is zero.
     pub fn from_vec(kind: DescriptorKind, data: Vec<f32>) -> Option<Self> {
-        data.len().is_multiple_of(kind.dimension()).then_some(Self { kind, data })
+        let whole = kind.dimension() > 0 && data.len().is_multiple_of(kind.dimension());
+        whole.then_some(Self { kind, data })
     }
 
     pub(crate) fn push(&mut self, row: &[f32]) {
@@ -71,7 +82,7 @@ impl Descriptors {
 
     /// Number of descriptors.
     pub fn len(&self) -> usize {
-        self.data.len() / self.dimension()
+        self.data.len().checked_div(self.dimension()).unwrap_or(0)
     }
 
     /// True where there are none.

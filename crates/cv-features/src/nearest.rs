@@ -262,23 +262,25 @@ fn pick(row: &[f32], train: &Descriptors, found: impl Iterator<Item = (f32, u32)
 /// Sum of squared differences, over 16 running sums so that it vectorises.
 pub(crate) fn ssd(a: &[f32], b: &[f32]) -> f32 {
     let mut sums = [0.0f32; 16];
-    for (a, b) in a.as_chunks::<16>().0.iter().zip(b.as_chunks::<16>().0) {
+    let ((a, rest_a), (b, rest_b)) = (a.as_chunks::<16>(), b.as_chunks::<16>());
+    for (a, b) in a.iter().zip(b) {
         for i in 0..16 {
             let d = a[i] - b[i];
             sums[i] += d * d;
         }
     }
-    sums.iter().sum()
+    sums.iter().sum::<f32>() + rest_a.iter().zip(rest_b).map(|(a, b)| (a - b) * (a - b)).sum::<f32>()
 }
 
 fn dot(a: &[f32], b: &[f32]) -> f32 {
     let mut sums = [0.0f32; 16];
-    for (a, b) in a.as_chunks::<16>().0.iter().zip(b.as_chunks::<16>().0) {
+    let ((a, rest_a), (b, rest_b)) = (a.as_chunks::<16>(), b.as_chunks::<16>());
+    for (a, b) in a.iter().zip(b) {
         for i in 0..16 {
             sums[i] += a[i] * b[i];
         }
     }
-    sums.iter().sum()
+    sums.iter().sum::<f32>() + rest_a.iter().zip(rest_b).map(|(a, b)| a * b).sum::<f32>()
 }
 
 #[cfg(test)]
@@ -312,18 +314,18 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(40))]
         #[test]
-        fn equals_the_definition(nq in 1usize..230, nt in 1usize..260, values in 2u32..40, seed in any::<u32>()) {
+        fn equals_the_definition(nq in 1usize..230, nt in 1usize..260, values in 2u32..40, d in 1usize..70, seed in any::<u32>()) {
             // Whole numbers, so that sums are exact and duplicates and ties occur.
             let mut state = seed | 1;
             let mut set = |n: usize| {
-                let data = (0..n * 64)
+                let data = (0..n * d)
                     .map(|k| {
                         state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
                         // Few of the dimensions differ, so that whole descriptors coincide.
-                        if k % 64 < 3 { (state >> 16) as f32 % values as f32 } else { 1.0 }
+                        if k % d < 3 { (state >> 16) as f32 % values as f32 } else { 1.0 }
                     })
                     .collect();
-                Descriptors::from_vec(DescriptorKind::Patch, data).unwrap()
+                Descriptors::from_vec(DescriptorKind::Foreign { dimension: d }, data).unwrap()
             };
             let (query, train) = (set(nq), set(nt));
             let expected = plain(&query, &train);

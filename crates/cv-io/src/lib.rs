@@ -37,6 +37,7 @@ mod depth_png;
 mod encode;
 mod error;
 mod exif_info;
+mod features;
 mod files;
 mod maps;
 mod matches;
@@ -52,6 +53,10 @@ pub use depth_png::{depth_mm, kitti, scaled};
 pub use encode::{JpegPixels, PngPixels, encode_jpeg, encode_png, write_image, write_jpeg, write_png};
 pub use error::{FormatError, IoError};
 pub use exif_info::{ExifFocal, ExifInfo, FocalSource};
+pub use features::{
+    FeatureRows, descriptors_from_npy, descriptors_to_npy, keypoints_from_npy, keypoints_to_npy, parse_colmap_features,
+    read_colmap_features, write_colmap_features,
+};
 pub use files::{MAX_FILE_BYTES, read_bytes, write_atomic, write_bytes};
 pub use maps::{decode_map, read_map};
 pub use matches::{Matches, parse_matches, read_matches, write_matches};

@@ -43,9 +43,16 @@ pub use depth::{DepthError, DepthOptions, DepthResult, depth};
 pub use disparity_range::{RangeError, disparity_range};
 pub use estimate::{CalibratedResult, EstimateResult, ModelKind, estimate, estimate_calibrated};
 pub use matching::{
-    FeatureMethod, MatchingError, MatchingOptions, MatchingResult, PhotoFeatures, Slanted, correspondences,
-    extract_features, match_features, match_photos,
+    FeatureMethod, MatchingError, MatchingOptions, MatchingResult, PhotoFeatures, Slanted, Spacing, correspondences,
+    extract_features, match_extracted, match_features, match_photos,
 };
+/// What a caller of [`match_extracted`] needs to hand in features found elsewhere, and to choose among ours.
+pub mod features {
+    pub use cv_features::{
+        CornerMeasure, Described, DescriptorKind, Descriptors, DropReason, Dropped, HarrisOptions, MopsOptions,
+        MultiScaleOptions, SiftOptions,
+    };
+}
 pub use panorama::{
     PanoramaError, PanoramaImage, PanoramaOptions, PanoramaPair, PanoramaPhoto, PanoramaResult, panorama,
 };

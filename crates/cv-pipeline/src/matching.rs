@@ -4,8 +4,9 @@ use crate::views::match_slanted;
 use crate::{ModelKind, Progress, Silent, Stopwatch, estimate};
 use cv_core::{Correspondence, DMatch, GrayF32, ImageView, Keypoint, Point2};
 use cv_features::{
-    Described, FeatureError, HarrisOptions, MatchError, MatchOptions, PatchOptions, SiftOptions, anms,
-    describe_patches, harris, match_descriptors, sift,
+    Described, DescriptorKind, FeatureError, GuidedOptions, HarrisOptions, MatchError, MatchOptions, MopsOptions,
+    PatchOptions, SiftOptions, TwoViewModel, anms, anms_square_covering, anms_tiled, describe_patches, harris,
+    match_descriptors, match_guided, mops, sift,
 };
 
 /// Which features to find.
@@ -13,9 +14,23 @@ use cv_features::{
 pub enum FeatureMethod {
     /// Harris corners with upright 8×8 patches: fast, for neighbouring frames of a film or a slowly turned camera.
     Harris,
+    /// Corners at all scales with oriented 8×8 patches: for photographs that turn and zoom a little, at half the time of SIFT.
+    Mops,
     /// rootSIFT: for photographs that turn, zoom, or change light or viewpoint.
     #[default]
     Sift,
+}
+
+/// How Harris corners are spread over the photograph.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Spacing {
+    /// By suppression radius (Brown, Szeliski & Winder).
+    #[default]
+    Radius,
+    /// By square covering (Bailo et al.): faster, nearly as even.
+    Squares,
+    /// As many from each of 8 × 8 tiles.
+    Tiles,
 }
 
 /// Whether [`match_photos`] also looks at simulated slanted views (Morel & Yu's ASIFT), with SIFT only: some ten times the time.
@@ -36,15 +51,19 @@ pub enum Slanted {
 pub struct MatchingOptions {
     /// Which features. Default SIFT, which works on a stranger's photographs without knowing anything about them.
     pub method: FeatureMethod,
-    /// Most features per photograph; `None` takes the method's default: 500 well-spread corners (Brown, Szeliski & Winder), or 8192 SIFT
-    /// features (COLMAP's).
+    /// Most features per photograph; `None` takes the method's default: 500 well-spread corners (Brown, Szeliski & Winder), 2000 oriented
+    /// patches, or 8192 SIFT features (COLMAP's).
     pub max_features: Option<usize>,
     /// Settings of the corners.
     pub harris: HarrisOptions,
     /// Robustness factor of the suppression. 0 to 1; default 0.9 (Brown, Szeliski & Winder).
     pub anms_robust: f32,
+    /// How the corners are spread. Default by radius.
+    pub spacing: Spacing,
     /// Settings of the patches.
     pub patch: PatchOptions,
+    /// Settings of the oriented patches and their corners.
+    pub mops: MopsOptions,
     /// Settings of SIFT. Of more features than asked for, the coarse ones stay by default (COLMAP's choice).
     pub sift: SiftOptions,
     /// Largest ratio of the SSD of the best candidate to that of the second. 0 to 1; `None` keeps every nearest neighbour. Default 0.66, which is
@@ -54,6 +73,9 @@ pub struct MatchingOptions {
     pub mutual: bool,
     /// Simulated slanted views. Default where needed.
     pub slanted: Slanted,
+    /// Estimate this model from the matches and match once more along it: more matches, nearly all of them right, and none that disagree.
+    /// Default none.
+    pub guided: Option<ModelKind>,
 }
 
 impl Default for MatchingOptions {
@@ -63,11 +85,14 @@ impl Default for MatchingOptions {
             max_features: None,
             harris: HarrisOptions::default(),
             anms_robust: 0.9,
+            spacing: Spacing::default(),
             patch: PatchOptions::default(),
+            mops: MopsOptions::default(),
             sift: SiftOptions { coarse_first: true, ..SiftOptions::default() },
             ratio: Some(0.66),
             mutual: true,
             slanted: Slanted::default(),
+            guided: None,
         }
     }
 }
@@ -134,10 +159,23 @@ pub fn extract_features(photo: ImageView<'_, u8, 3>, options: &MatchingOptions) 
         FeatureMethod::Harris => {
             let corners = harris(grey.view(), &options.harris)?;
             let n = options.max_features.unwrap_or(500);
-            let spaced: Vec<_> = anms(&corners, n, options.anms_robust).into_iter().map(|i| corners[i]).collect();
+            let spaced = match options.spacing {
+                Spacing::Radius => anms(&corners, n, options.anms_robust),
+                Spacing::Squares => anms_square_covering(&corners, n),
+                Spacing::Tiles => anms_tiled(&corners, n, (8, 8)),
+            };
+            let spaced: Vec<_> = spaced.into_iter().map(|i| corners[i]).collect();
             let mut described = describe_patches(grey.view(), &spaced, &options.patch)?;
             described.beyond_limit = corners.len() - spaced.len();
             Ok(PhotoFeatures { described, found: corners.len(), candidates: corners })
+        }
+        FeatureMethod::Mops => {
+            let mut settings = options.mops.clone();
+            if let Some(n) = options.max_features {
+                settings.max_features = n;
+            }
+            let described = mops(grey.view(), &settings)?;
+            Ok(PhotoFeatures { found: accounted(&described), described, candidates: Vec::new() })
         }
         FeatureMethod::Sift => {
             let mut settings = options.sift.clone();
@@ -145,10 +183,14 @@ pub fn extract_features(photo: ImageView<'_, u8, 3>, options: &MatchingOptions) 
                 settings.max_features = n;
             }
             let described = sift(grey.view(), &settings)?;
-            let found = described.keypoints.len() + described.dropped.len() + described.beyond_limit;
-            Ok(PhotoFeatures { described, found, candidates: Vec::new() })
+            Ok(PhotoFeatures { found: accounted(&described), described, candidates: Vec::new() })
         }
     }
+}
+
+/// The features kept, dropped, and beyond the limit.
+fn accounted(described: &Described) -> usize {
+    described.keypoints.len() + described.dropped.len() + described.beyond_limit
 }
 
 /// Tentative matches between the features of two photographs.
@@ -205,7 +247,54 @@ pub fn match_photos(
         match_slanted([&luma(a), &luma(b)], &mut features, &mut matches, options);
         watch.lap("slanted views");
     }
-    let pairs = correspondences(&features[0], &features[1], &matches);
+    finish(features, matches, options, progress, watch)
+}
+
+/// Tentative matches between features found elsewhere; those of other programs count as [`DescriptorKind::Foreign`](cv_features::DescriptorKind::Foreign).
+///
+/// # Errors
+/// [`MatchingError`] where there are none, or they are of different kinds.
+pub fn match_extracted(
+    features: [PhotoFeatures; 2],
+    options: &MatchingOptions,
+    progress: &dyn Progress,
+) -> Result<MatchingResult, MatchingError> {
+    let mut watch = Stopwatch::new();
+    let matches = match_features(&features[0], &features[1], options)?;
+    watch.lap("match");
+    finish(features, matches, options, progress, watch)
+}
+
+/// Matches once more along a model, where asked for, and packs up.
+fn finish(
+    features: [PhotoFeatures; 2],
+    mut matches: Vec<DMatch>,
+    options: &MatchingOptions,
+    progress: &dyn Progress,
+    mut watch: Stopwatch,
+) -> Result<MatchingResult, MatchingError> {
+    let mut pairs = correspondences(&features[0], &features[1], &matches);
+    if let Some(kind) = options.guided {
+        // Without a model there is nothing to be guided by: the tentative matches stay.
+        if let Ok(found) = estimate(&pairs, kind, &kind.options(), progress) {
+            let model = match kind {
+                ModelKind::Homography => TwoViewModel::Homography(found.robust.model),
+                ModelKind::Fundamental => TwoViewModel::Fundamental(found.robust.model),
+            };
+            // Patches are of unit variance, 64 numbers: the limit for unit vectors times 64.
+            let unit = features[0].described.descriptors.kind();
+            let max_ssd = match unit {
+                DescriptorKind::Patch | DescriptorKind::Mops => 64.0 * GuidedOptions::default().max_ssd,
+                DescriptorKind::Foreign { .. } => f32::INFINITY,
+                DescriptorKind::Sift | DescriptorKind::RootSift => GuidedOptions::default().max_ssd,
+            };
+            let along =
+                GuidedOptions { threshold: kind.options().threshold as f32, max_ssd, ..GuidedOptions::default() };
+            matches = match_guided(&features[0].described, &features[1].described, None, &model, &along)?;
+            pairs = correspondences(&features[0], &features[1], &matches);
+        }
+        watch.lap("guided");
+    }
     Ok(MatchingResult { features, matches, pairs, stages: watch.into_stages() })
 }
 
@@ -257,7 +346,7 @@ mod tests {
     #[test]
     fn both_methods_find_a_shift() {
         let (a, b) = (blobs((0.0, 0.0)), blobs((6.5, -4.0)));
-        for method in [FeatureMethod::Harris, FeatureMethod::Sift] {
+        for method in [FeatureMethod::Harris, FeatureMethod::Mops, FeatureMethod::Sift] {
             let options = MatchingOptions { method, ..MatchingOptions::default() };
             let result = match_photos(a.view(), b.view(), &options, &Silent).unwrap();
             let good = result
@@ -266,7 +355,13 @@ mod tests {
                 .filter(|p| (p.b.x - p.a.x - 6.5).abs() < 1.0 && (p.b.y - p.a.y + 4.0).abs() < 1.0)
                 .count();
             // The images differ only by the shift and rounding to bytes; a pixel is what the top of a round blob may wander by that.
-            assert!(good >= 30 && good * 10 >= result.pairs.len() * 9, "{method:?}: {good} of {}", result.pairs.len());
+            // Oriented patches at all scales need a wide margin: few fit into this small image.
+            let least = if method == FeatureMethod::Mops { 15 } else { 30 };
+            assert!(
+                good >= least && good * 10 >= result.pairs.len() * 9,
+                "{method:?}: {good} of {}",
+                result.pairs.len()
+            );
             assert_eq!(result.matches.len(), result.pairs.len());
         }
     }
@@ -275,7 +370,7 @@ mod tests {
     fn photographs_without_features_are_named() {
         let flat = RgbU8::new(100, 80, [9; 3]);
         let good = blobs((0.0, 0.0));
-        for method in [FeatureMethod::Harris, FeatureMethod::Sift] {
+        for method in [FeatureMethod::Harris, FeatureMethod::Mops, FeatureMethod::Sift] {
             let options = MatchingOptions { method, ..MatchingOptions::default() };
             let error = match_photos(good.view(), flat.view(), &options, &Silent).unwrap_err();
             assert_eq!(error, MatchingError::NoFeatures { index: 2, found: 0, dropped: 0 });

@@ -3,9 +3,11 @@
 use crate::common::{Context, Explain, Failure, Outcome, Run};
 use clap::ValueEnum;
 use cv_core::{Keypoint, RgbU8};
+use cv_io::FeatureRows;
+use cv_pipeline::features::{CornerMeasure, Described, DescriptorKind, Descriptors};
 use cv_pipeline::{
     FeatureMethod, MatchingError, MatchingOptions, MatchingResult, ModelKind, PhotoFeatures, RobustOptions, Silent,
-    estimate, match_photos,
+    Slanted, Spacing, estimate, match_extracted, match_photos,
 };
 use cv_report::{Figure, MatchStyle, Note, Report, colors, draw_keypoints, draw_matches, tile_patches};
 use std::path::{Path, PathBuf};
@@ -15,8 +17,44 @@ use std::path::{Path, PathBuf};
 enum Features {
     /// rootSIFT: photographs that turn, zoom, or change light or viewpoint
     Sift,
-    /// Harris corners with upright 8×8 patches: neighbouring frames of a film or of a slowly turned camera
+    /// Corners at all scales with oriented 8×8 patches
+    Mops,
+    /// Corners with upright 8×8 patches: neighbouring frames of a film or of a slowly turned camera
     Harris,
+}
+
+/// What makes a corner.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Corners {
+    Harris,
+    ShiTomasi,
+}
+
+/// How upright corners are spread.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Spread {
+    /// By suppression radius
+    Radius,
+    /// By square covering: faster, nearly as even
+    Squares,
+    /// As many from each of 8×8 tiles
+    Tiles,
+}
+
+/// When to look at simulated slanted views.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Views {
+    Never,
+    /// Where no model explains enough of the plain matches
+    AsNeeded,
+    Always,
+}
+
+/// Along which model to match once more.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Guide {
+    Homography,
+    Fundamental,
 }
 
 /// Find the same points in two photographs.
@@ -26,10 +64,17 @@ enum Features {
 #[command(after_help = "Examples:
   cv match left.jpg right.jpg -o matches.txt
   cv match left.jpg right.jpg -o matches.txt --report out
-  cv match frame1.png frame2.png --features harris --max-features 1000 -o matches.txt
+  cv match frame1.png frame2.png --features harris --corners shi-tomasi --max-features 1000 -o matches.txt
+  cv match left.jpg right.jpg --guided fundamental -o matches.txt
+  cv match left.jpg right.jpg --save-features features
+  cv match left.jpg right.jpg --load-features features -o matches.txt
 
 The matches file has a row per match: x1 y1 x2 y2 in pixels, and the ratio of the best distance to the second best as
-a score (smaller is surer).")]
+a score (smaller is surer).
+
+--save-features writes for left.jpg: left.keypoints.npy (x, y, scale, angle, response), left.KIND.npy (a descriptor per row) and,
+for SIFT, left.txt in COLMAP's words. --load-features reads left.keypoints.npy with left.KIND.npy or
+left.descriptors.npy, else left.txt.")]
 pub(crate) struct Args {
     /// The first photograph.
     first: PathBuf,
@@ -39,9 +84,27 @@ pub(crate) struct Args {
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// Which features.
-    #[arg(long, value_name = "sift|harris", default_value = "sift")]
+    #[arg(long, value_name = "sift|mops|harris", default_value = "sift")]
     features: Features,
-    /// Most features per photograph [default: 8192 SIFT features, 500 corners].
+    /// What makes a corner, for mops and harris.
+    #[arg(long, value_name = "harris|shi-tomasi", default_value = "harris")]
+    corners: Corners,
+    /// How the corners of harris are spread.
+    #[arg(long, value_name = "radius|squares|tiles", default_value = "radius")]
+    spacing: Spread,
+    /// Look at simulated slanted views too, with sift: for photographs from very different directions; about ten times slower.
+    #[arg(long, value_name = "never|as-needed|always", default_value = "as-needed")]
+    slanted: Views,
+    /// Find this model and match once more along it: more matches, nearly all right, and none that disagree.
+    #[arg(long, value_name = "homography|fundamental")]
+    guided: Option<Guide>,
+    /// Write the features of both photographs to this folder, for other programs.
+    #[arg(long, value_name = "DIR")]
+    save_features: Option<PathBuf>,
+    /// Take the features from this folder instead of finding them.
+    #[arg(long, value_name = "DIR", conflicts_with = "save_features")]
+    load_features: Option<PathBuf>,
+    /// Most features per photograph [default: 8192 SIFT features, 2000 MOPS, 500 corners].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     max_features: Option<u32>,
     /// Largest ratio of the squared distance of the best candidate to that of the second; 1 keeps all.
@@ -62,17 +125,43 @@ impl Run for Args {
             return Err(Failure::usage(format!("--ratio must be from 0 to 1, not {}", self.ratio)));
         }
         let (a, b) = (cv_io::read_rgb(&self.first)?, cv_io::read_rgb(&self.second)?);
-        let options = MatchingOptions {
+        let mut options = MatchingOptions {
             method: match self.features {
                 Features::Sift => FeatureMethod::Sift,
+                Features::Mops => FeatureMethod::Mops,
                 Features::Harris => FeatureMethod::Harris,
             },
+            spacing: match self.spacing {
+                Spread::Radius => Spacing::Radius,
+                Spread::Squares => Spacing::Squares,
+                Spread::Tiles => Spacing::Tiles,
+            },
+            slanted: match self.slanted {
+                Views::Never => Slanted::Never,
+                Views::AsNeeded => Slanted::AsNeeded,
+                Views::Always => Slanted::Always,
+            },
+            guided: self.guided.map(|guide| match guide {
+                Guide::Homography => ModelKind::Homography,
+                Guide::Fundamental => ModelKind::Fundamental,
+            }),
             max_features: self.max_features.map(|n| n as usize),
             ratio: (self.ratio < 1.0).then_some(self.ratio),
             mutual: !self.one_way,
             ..MatchingOptions::default()
         };
-        let result = match_photos(a.view(), b.view(), &options, context).map_err(|error| {
+        if matches!(self.corners, Corners::ShiTomasi) {
+            options.harris.measure = CornerMeasure::ShiTomasi;
+            options.mops.corners.measure = CornerMeasure::ShiTomasi;
+        }
+        let result = match &self.load_features {
+            Some(folder) => {
+                let features = [load_features(folder, &self.first)?, load_features(folder, &self.second)?];
+                match_extracted(features, &options, context)
+            }
+            None => match_photos(a.view(), b.view(), &options, context),
+        };
+        let result = result.map_err(|error| {
             let path = match &error {
                 MatchingError::Features { index: 2, .. } | MatchingError::NoFeatures { index: 2, .. } => &self.second,
                 _ => &self.first,
@@ -89,6 +178,12 @@ impl Run for Args {
             ))
             .advice("a larger --ratio, --features sift, or photographs that show more of the same"));
         }
+        if let Some(folder) = &self.save_features {
+            std::fs::create_dir_all(folder).during(format!("cannot make {}", folder.display()))?;
+            for (photo, features) in [&self.first, &self.second].into_iter().zip(&result.features) {
+                save_features(folder, photo, features)?;
+            }
+        }
         if let Some(path) = &self.output {
             let scores: Vec<f64> = result.matches.iter().map(|m| f64::from(m.ratio)).collect();
             cv_io::write_matches(path, &result.pairs, Some(&scores))?;
@@ -101,9 +196,12 @@ impl Run for Args {
             .with("features", counts)
             .with("dropped", dropped)
             .with("method", match self.features {
+                _ if self.load_features.is_some() => "loaded",
                 Features::Sift => "sift",
+                Features::Mops => "mops",
                 Features::Harris => "harris",
             })
+            .with("beyond_limit", result.features.each_ref().map(|f| f.described.beyond_limit))
             .summary(format!(
                 "{} matches between {} and {} features ({} and {} points left out near the border or on flat patches)",
                 result.pairs.len(),
@@ -138,7 +236,7 @@ impl Args {
             figures.push(picture(spaced, &format!("{name}: {} features that are described", kept.len()))?);
             report.figures(figures);
         }
-        if matches!(self.features, Features::Harris) {
+        if result.features.iter().all(|f| f.described.descriptors.dimension() == 64) {
             let tiles = |f: &PhotoFeatures| {
                 let n = f.described.descriptors.as_slice().len().min(120 * 64);
                 tile_patches(&f.described.descriptors.as_slice()[..n], 8, 24, 4)
@@ -165,6 +263,73 @@ impl Args {
         report.facts(&result.stages.iter().map(|(name, s)| (*name, format!("{s:.3} s"))).collect::<Vec<_>>());
         Ok(report.to_html())
     }
+}
+
+/// Kinds of descriptors and their names in files.
+const KINDS: [(DescriptorKind, &str); 4] = [
+    (DescriptorKind::RootSift, "rootsift"),
+    (DescriptorKind::Sift, "sift"),
+    (DescriptorKind::Mops, "mops"),
+    (DescriptorKind::Patch, "patch"),
+];
+
+/// `FOLDER/STEM.ending` for a photograph.
+fn beside(folder: &Path, photo: &Path, ending: &str) -> PathBuf {
+    let mut name = photo.file_stem().unwrap_or_default().to_owned();
+    name.push(".");
+    name.push(ending);
+    folder.join(name)
+}
+
+fn save_features(folder: &Path, photo: &Path, features: &PhotoFeatures) -> Result<(), Failure> {
+    let (keypoints, descriptors) = (&features.described.keypoints, &features.described.descriptors);
+    let name = KINDS.iter().find(|k| k.0 == descriptors.kind()).map_or("descriptors", |k| k.1);
+    cv_io::npy::write(beside(folder, photo, "keypoints.npy"), &cv_io::keypoints_to_npy(keypoints))?;
+    let array = cv_io::descriptors_to_npy(descriptors.dimension(), descriptors.as_slice());
+    cv_io::npy::write(beside(folder, photo, &format!("{name}.npy")), &array)?;
+    if matches!(descriptors.kind(), DescriptorKind::Sift | DescriptorKind::RootSift) {
+        let rows = FeatureRows {
+            keypoints: keypoints.clone(),
+            dimension: descriptors.dimension(),
+            descriptors: descriptors.as_slice().to_vec(),
+        };
+        cv_io::write_colmap_features(beside(folder, photo, "txt"), &rows)?;
+    }
+    Ok(())
+}
+
+fn load_features(folder: &Path, photo: &Path) -> Result<PhotoFeatures, Failure> {
+    let points = beside(folder, photo, "keypoints.npy");
+    let (rows, kind, path) = if points.exists() {
+        let keypoints = cv_io::keypoints_from_npy(&cv_io::npy::read(&points)?).during(points.display().to_string())?;
+        let named = KINDS.iter().map(|(kind, name)| (Some(*kind), beside(folder, photo, &format!("{name}.npy"))));
+        let (kind, path) = named
+            .chain([(None, beside(folder, photo, "descriptors.npy"))])
+            .find(|(_, path)| path.exists())
+            .ok_or_else(|| Failure::new(format!("there are no descriptors beside {}", points.display())))?;
+        let array = cv_io::npy::read(&path)?;
+        let (dimension, descriptors) = cv_io::descriptors_from_npy(&array).during(path.display().to_string())?;
+        (FeatureRows { keypoints, dimension, descriptors }, kind, path)
+    } else {
+        let path = beside(folder, photo, "txt");
+        (cv_io::read_colmap_features(&path)?, None, path)
+    };
+    let kind = kind.unwrap_or(DescriptorKind::Foreign { dimension: rows.dimension });
+    let counts = (rows.keypoints.len(), rows.descriptors.len().checked_div(rows.dimension).unwrap_or(0));
+    let finite = rows.descriptors.iter().all(|v| v.is_finite());
+    let fits = kind.dimension() == rows.dimension && counts.0 == counts.1 && finite;
+    let descriptors = Descriptors::from_vec(kind, rows.descriptors).filter(|_| fits).ok_or_else(|| {
+        let reason = format!(
+            "{}: {} keypoints and {} descriptors of {} numbers do not make {kind} features (or a number is not finite)",
+            path.display(),
+            counts.0,
+            counts.1,
+            rows.dimension
+        );
+        Failure::new(reason)
+    })?;
+    let described = Described { keypoints: rows.keypoints, descriptors, dropped: Vec::new(), beyond_limit: 0 };
+    Ok(PhotoFeatures { found: counts.0, described, candidates: Vec::new() })
 }
 
 /// At most 3000 points, evenly taken: more would hide the picture.

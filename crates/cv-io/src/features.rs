@@ -1,0 +1,186 @@
+//! Keypoints and descriptors as other programs read and write them: COLMAP's feature text and NumPy arrays.
+//!
+//! COLMAP's text starts with a line `count 128`; then a row per feature: `x y scale orientation d1 … d128`, the centre of the top-left pixel at (0.5, 0.5), the angle in
+//! radians, the descriptor as whole numbers 0 to 255 that are 512 times those of unit length. It has no strengths: they read as 0.
+
+use crate::files::{read_text, write_bytes};
+use crate::npy::{NpyArray, NpyData};
+use crate::{FormatError, IoError};
+use cv_core::{Keypoint, Point2};
+use std::fmt::Write as _;
+use std::path::Path;
+
+const NAME: &str = "COLMAP feature text";
+const CENTER: f32 = 0.5;
+const UNIT: f32 = 512.0;
+/// Numbers in a descriptor of COLMAP's.
+const DIMENSION: usize = 128;
+
+/// Keypoints with a descriptor each.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct FeatureRows {
+    /// The points, pixel centres at integers.
+    pub keypoints: Vec<Keypoint>,
+    /// Numbers in one descriptor.
+    pub dimension: usize,
+    /// Row after row, one per keypoint.
+    pub descriptors: Vec<f32>,
+}
+
+/// Parses COLMAP's feature text.
+///
+/// # Errors
+/// [`FormatError`] with the line where a row is not what the first line announces.
+pub fn parse_colmap_features(text: &str) -> Result<FeatureRows, FormatError> {
+    let mut lines = text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty() && !l.starts_with('#'));
+    let (at, head) = lines.next().ok_or_else(|| FormatError::line(1, "“count 128” is missing"))?;
+    let words: Vec<&str> = head.split_whitespace().collect();
+    let [count, DIMENSION] = words.iter().filter_map(|w| w.parse::<usize>().ok()).collect::<Vec<_>>()[..] else {
+        return Err(FormatError::line(at + 1, format!("“{head:.40}” is not a count and 128")));
+    };
+    let mut rows = FeatureRows { dimension: DIMENSION, ..FeatureRows::default() };
+    for (at, line) in lines {
+        let mut values = Vec::with_capacity(DIMENSION + 4);
+        for word in line.split_whitespace() {
+            let value: f32 =
+                word.parse().map_err(|_| FormatError::line(at + 1, format!("“{word:.40}” is not a number")))?;
+            values.push(value);
+        }
+        let [x, y, scale, angle, ref descriptor @ ..] = values[..] else {
+            return Err(FormatError::line(at + 1, "a feature needs x, y, scale, orientation and 128 numbers"));
+        };
+        if descriptor.len() != DIMENSION {
+            return Err(FormatError::line(at + 1, format!("{} numbers in a descriptor, not 128", descriptor.len())));
+        }
+        rows.keypoints.push(Keypoint { position: Point2::new(x - CENTER, y - CENTER), response: 0.0, scale, angle });
+        rows.descriptors.extend(descriptor.iter().map(|v| v / UNIT));
+    }
+    if rows.keypoints.len() != count {
+        return Err(FormatError::corrupt(NAME, format!("{count} features announced, {} there", rows.keypoints.len())));
+    }
+    Ok(rows)
+}
+
+/// Reads COLMAP's feature text.
+///
+/// # Errors
+/// As [`parse_colmap_features`], and where the file cannot be read.
+pub fn read_colmap_features(path: impl AsRef<Path>) -> Result<FeatureRows, IoError> {
+    let path = path.as_ref();
+    parse_colmap_features(&read_text(path)?).map_err(|reason| IoError::reading(path, reason))
+}
+
+/// Writes COLMAP's feature text, which `colmap feature_importer` reads.
+///
+/// # Errors
+/// [`FormatError::NotRepresentable`] for descriptors that are not 128 numbers of 0 to 0.5, and where the file cannot be written.
+pub fn write_colmap_features(path: impl AsRef<Path>, rows: &FeatureRows) -> Result<(), IoError> {
+    let path = path.as_ref();
+    write_bytes(path, format_rows(rows).map_err(|reason| IoError::writing(path, reason))?.as_bytes())
+}
+
+fn format_rows(rows: &FeatureRows) -> Result<String, FormatError> {
+    let not = |what: String| FormatError::NotRepresentable { format: NAME, what };
+    if rows.dimension != DIMENSION || rows.descriptors.len() != DIMENSION * rows.keypoints.len() {
+        return Err(not(format!("{} descriptors of {} numbers", rows.keypoints.len(), rows.dimension)));
+    }
+    let mut text = format!("{} {DIMENSION}\n", rows.keypoints.len());
+    for (k, row) in rows.keypoints.iter().zip(rows.descriptors.chunks_exact(DIMENSION)) {
+        // `fmt::Write` on a String cannot fail.
+        let _ = write!(text, "{} {} {} {}", k.position.x + CENTER, k.position.y + CENTER, k.scale, k.angle);
+        for v in row {
+            if !(0.0..=1.0).contains(v) {
+                return Err(not(format!("the number {v} in a descriptor")));
+            }
+            let _ = write!(text, " {}", (v * UNIT).round().min(255.0));
+        }
+        text.push('\n');
+    }
+    Ok(text)
+}
+
+/// Keypoints as an array with a row `x, y, scale, angle, response` each.
+pub fn keypoints_to_npy(keypoints: &[Keypoint]) -> NpyArray {
+    let rows = keypoints.iter().flat_map(|k| [k.position.x, k.position.y, k.scale, k.angle, k.response]);
+    NpyArray { shape: vec![keypoints.len(), 5], data: NpyData::F32(rows.collect()) }
+}
+
+/// Keypoints from an array of two to five columns `x, y, scale, angle, response`; what is missing is 1, 0, 0.
+///
+/// # Errors
+/// [`FormatError`] for an array of another shape.
+pub fn keypoints_from_npy(array: &NpyArray) -> Result<Vec<Keypoint>, FormatError> {
+    let [_, columns @ 2..=5] = array.shape[..] else {
+        return Err(FormatError::unsupported(
+            "NumPy array",
+            format!("an array of shape {:?} as keypoints", array.shape),
+        ));
+    };
+    let values = array.to_f64();
+    let row = |r: &[f64]| {
+        let at = |i: usize, missing: f32| r.get(i).map_or(missing, |v| *v as f32);
+        Keypoint {
+            position: Point2::new(at(0, 0.0), at(1, 0.0)),
+            scale: at(2, 1.0),
+            angle: at(3, 0.0),
+            response: at(4, 0.0),
+        }
+    };
+    Ok(values.chunks_exact(columns).map(row).collect())
+}
+
+/// Descriptors as an array with a row each.
+pub fn descriptors_to_npy(dimension: usize, descriptors: &[f32]) -> NpyArray {
+    let rows = descriptors.len().checked_div(dimension).unwrap_or(0);
+    NpyArray { shape: vec![rows, dimension], data: NpyData::F32(descriptors.to_vec()) }
+}
+
+/// The number of columns and the numbers of a two-dimensional array.
+///
+/// # Errors
+/// [`FormatError`] for an array of another shape.
+pub fn descriptors_from_npy(array: &NpyArray) -> Result<(usize, Vec<f32>), FormatError> {
+    let [_, columns] = array.shape[..] else {
+        return Err(FormatError::unsupported(
+            "NumPy array",
+            format!("an array of shape {:?} as descriptors", array.shape),
+        ));
+    };
+    Ok((columns, array.to_f64().into_iter().map(|v| v as f32).collect()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn text_in_colmaps_words() {
+        let ones = " 128".repeat(127);
+        let text = format!("# made by hand\n1 128\n10.5 20.75 2.5 -1.25 255{ones}\n");
+        let rows = parse_colmap_features(&text).unwrap();
+        let k = rows.keypoints[0];
+        assert_eq!((k.position, k.scale, k.angle), (Point2::new(10.0, 20.25), 2.5, -1.25));
+        assert_eq!((rows.dimension, rows.descriptors[0], rows.descriptors[127]), (128, 255.0 / 512.0, 0.25));
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.txt");
+        write_colmap_features(&path, &rows).unwrap();
+        assert_eq!(read_colmap_features(&path).unwrap(), rows);
+        for bad in ["", "2 128\n", "x 128\n", "1 64\n", "1 128\n1 2 3\n", "1 128\n1 2 3 4 5 6\n"] {
+            assert!(parse_colmap_features(bad).is_err(), "{bad}");
+        }
+        let negative = FeatureRows { descriptors: vec![-0.1; 128], ..rows.clone() };
+        assert!(write_colmap_features(&path, &negative).is_err());
+        assert!(write_colmap_features(&path, &FeatureRows { dimension: 64, ..rows }).is_err());
+    }
+
+    #[test]
+    fn arrays_come_back() {
+        let k = Keypoint { position: Point2::new(1.5, 2.5), response: 9.0, scale: 3.0, angle: 0.5 };
+        assert_eq!(keypoints_from_npy(&keypoints_to_npy(&[k, k])).unwrap(), [k, k]);
+        let two = NpyArray { shape: vec![1, 2], data: NpyData::F64(vec![4.0, 5.0]) };
+        assert_eq!(keypoints_from_npy(&two).unwrap(), [Keypoint::new(4.0, 5.0, 0.0)]);
+        assert!(keypoints_from_npy(&NpyArray { shape: vec![2], data: NpyData::F64(vec![4.0, 5.0]) }).is_err());
+        let array = descriptors_to_npy(3, &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
+        assert_eq!(descriptors_from_npy(&array).unwrap(), (3, vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0]));
+    }
+}
