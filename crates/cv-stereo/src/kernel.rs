@@ -36,6 +36,9 @@ pub(crate) struct Frame<'a> {
     /// Census bytes of the right image, each row mirrored so that disparities ascend: element `j` of a row is column
     /// `width − 1 − min_disparity − j`, and the match of column `x` at index `k` is element `width − 1 − x + k`.
     pub(crate) right: &'a [Vec<u8>],
+    /// The values whose absolute difference, at most so much, is added to the bits: of the left image, and of the
+    /// right one laid out as its bits.
+    pub(crate) blend: Option<(&'a [u8], &'a [u8], u8)>,
     /// Grey values of the left image, 0 to 255.
     pub(crate) grey: &'a [u8],
     pub(crate) p1: u8,
@@ -85,6 +88,16 @@ impl Frame<'_> {
             3 => self.hamming::<S, 3>(simd, x, y, out),
             6 => self.hamming::<S, 6>(simd, x, y, out),
             _ => self.hamming::<S, 8>(simd, x, y, out),
+        }
+        if let Some((left, right, cap)) = self.blend {
+            let value = S::u8s::splat(simd, left[y * self.width + x]);
+            let cap = S::u8s::splat(simd, cap);
+            let row = &right[y * Self::right_stride(self.width, self.blocks) + self.width - 1 - x..][..out.len()];
+            for (out, row) in out.chunks_exact_mut(S::u8s::LEN).zip(row.chunks_exact(S::u8s::LEN)) {
+                let other = S::u8s::from_slice(simd, row);
+                let more = (value.max(other) - value.min(other)).min(cap);
+                (S::u8s::from_slice(simd, out) + more).store_slice(out);
+            }
         }
     }
 

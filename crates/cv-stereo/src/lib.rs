@@ -44,5 +44,5 @@ pub use error::StereoError;
 pub use evaluate::{BAD_THRESHOLDS, DisparityScores, EvaluateError, evaluate_disparity, non_occluded};
 pub use input::Intensity;
 pub use matcher::{DisparityMap, PixelState, StereoMatcher};
-pub use options::{Census, Paths, StereoOptions, Subpixel};
+pub use options::{Blend, Census, Paths, StereoOptions, Subpixel};
 pub use rectify::{Rectification, RectifiedView, RectifyError, RectifyOptions};

@@ -1,6 +1,6 @@
 //! From a rectified pair to checked disparities.
 
-use crate::census::{Grey, census, census_mirrored, planes};
+use crate::census::{Grey, blend_planes, census, census_mirrored, planes};
 use crate::confidence::{confidence, sigma};
 use crate::fill::{Holes, fill_holes};
 use crate::input::to_grey;
@@ -8,7 +8,7 @@ use crate::kernel::Frame;
 use crate::sgm::{Aggregator, blocks};
 use crate::speckle::{Speckles, remove_speckles};
 use crate::winner::{NO_SUM, Winner, p2_table};
-use crate::{Intensity, Paths, StereoError, StereoOptions, Subpixel, median};
+use crate::{Blend, Intensity, Paths, StereoError, StereoOptions, Subpixel, median};
 use cv_core::{GrayF32, Image, ImageView, Sample};
 use fearless_simd::Level;
 use rayon::prelude::*;
@@ -87,6 +87,7 @@ pub struct StereoMatcher {
     grey: [Grey; 2],
     grey8: Vec<u8>,
     census: [Vec<Vec<u8>>; 2],
+    blend: [Vec<u8>; 2],
     aggregator: Aggregator,
     speckles: Speckles,
     holes: Holes,
@@ -106,6 +107,7 @@ impl StereoMatcher {
             grey: Default::default(),
             grey8: Vec::new(),
             census: Default::default(),
+            blend: Default::default(),
             aggregator: Aggregator::default(),
             speckles: Speckles::default(),
             holes: Holes::default(),
@@ -123,7 +125,7 @@ impl StereoMatcher {
     pub fn memory(&self, width: usize, height: usize) -> usize {
         let pixels = width.saturating_mul(height);
         let blocks = blocks(self.options.disparities);
-        let planes = planes(self.options.census);
+        let planes = planes(self.options.census) + usize::from(self.options.blend != Blend::None);
         // Grey of both views in 16 bits, of one in 8; census; labels, scratch and outputs.
         Aggregator::bytes(width, height, self.options.disparities)
             .saturating_add(pixels.saturating_mul(5 + planes + 8 + 4 + 5))
@@ -229,6 +231,7 @@ impl StereoMatcher {
         let stride = Frame::right_stride(width, blocks);
         census(self.level, &self.grey[0], options.census, &mut self.census[0]);
         census_mirrored(self.level, &self.grey[1], options.census, min_disparity, stride, &mut self.census[1]);
+        blend_planes(self.level, &self.grey, options.blend, min_disparity, stride, &mut self.blend);
         self.grey[0].to_bytes(&mut self.grey8);
         let frame = Frame {
             width,
@@ -238,6 +241,7 @@ impl StereoMatcher {
             blocks,
             left: &self.census[0],
             right: &self.census[1],
+            blend: (options.blend != Blend::None).then_some((&self.blend[0], &self.blend[1], options.blend.cap())),
             grey: &self.grey8,
             p1: options.p1,
             p2: &p2_table(options),

@@ -30,6 +30,38 @@ impl Census {
     }
 }
 
+/// What is added to the number of census bits in which two pixels differ, from the two pixels alone: sharper at the
+/// outlines of things than a window, but not indifferent to exposure.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Blend {
+    /// Nothing.
+    None,
+    /// The absolute difference of their grey values (AD-Census; Mei et al., ICCV workshops 2011).
+    Grey {
+        /// Grey levels (of 255) that count as one bit; 1 or more.
+        per_bit: u8,
+        /// The most that is added.
+        cap: u8,
+    },
+    /// The absolute difference of their horizontal gradients, which a change of exposure only scales.
+    Gradient {
+        /// Grey levels per pixel (of 255) that count as one bit; 1 or more.
+        per_bit: u8,
+        /// The most that is added.
+        cap: u8,
+    },
+}
+
+impl Blend {
+    /// The most that is added.
+    pub fn cap(self) -> u8 {
+        match self {
+            Self::None => 0,
+            Self::Grey { cap, .. } | Self::Gradient { cap, .. } => cap,
+        }
+    }
+}
+
 /// Along how many directions costs are aggregated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Paths {
@@ -57,6 +89,8 @@ pub struct StereoOptions {
     pub disparities: usize,
     /// Matching window. Default 5×5.
     pub census: Census,
+    /// What is added to the differing bits. Default nothing.
+    pub blend: Blend,
     /// Penalty for a disparity step of one pixel between neighbours. Default 4 (Pandora's default for census 5×5).
     pub p1: u8,
     /// Penalty for a larger step where the image is smooth. Default 20 (likewise).
@@ -98,6 +132,7 @@ impl Default for StereoOptions {
             min_disparity: 0,
             disparities: 128,
             census: Census::Window5x5,
+            blend: Blend::None,
             p1: 4,
             p2: 20,
             p2_min: 8,
@@ -135,8 +170,15 @@ impl StereoOptions {
         if self.p2 < self.p2_min {
             return bad("p2", f64::from(self.p2), "at least p2_min");
         }
-        if usize::from(self.p2) + self.census.bits() > 254 {
-            return bad("p2", f64::from(self.p2), "at most 254 less the bits of the census window");
+        if usize::from(self.p2) + self.census.bits() + usize::from(self.blend.cap()) > 254 {
+            return bad(
+                "p2",
+                f64::from(self.p2),
+                "at most 254 less the bits of the census window and the cap of the blend",
+            );
+        }
+        if matches!(self.blend, Blend::Grey { per_bit: 0, .. } | Blend::Gradient { per_bit: 0, .. }) {
+            return bad("per_bit", 0.0, "1 or more");
         }
         if self.uniqueness > 99 {
             return bad("uniqueness", f64::from(self.uniqueness), "0 to 99");

@@ -1,7 +1,7 @@
 //! Semi-global matching as it is written down, with whole volumes and no tricks: what the fast matcher must equal.
 
 use crate::winner::{NO_SUM, Winner, outside_cost, p2_table};
-use crate::{Paths, StereoOptions};
+use crate::{Blend, Paths, StereoOptions};
 
 /// Winners of the left image and indices of the right one's, row by row.
 pub(crate) fn match_plain(
@@ -9,6 +9,7 @@ pub(crate) fn match_plain(
     grey: &[u16],
     left: &[u64],
     right: &[u64],
+    blend: &[Vec<u8>; 2],
     width: usize,
     height: usize,
 ) -> (Vec<Winner>, Vec<u16>) {
@@ -17,11 +18,14 @@ pub(crate) fn match_plain(
         let xr = x as i64 - i64::from(options.min_disparity) - k as i64;
         usize::try_from(xr).ok().filter(|&xr| xr < width)
     };
+    let bits = |i: usize, j: usize| {
+        let more = if options.blend == Blend::None { 0 } else { blend[0][i].abs_diff(blend[1][j]) };
+        (left[i] ^ right[j]).count_ones() as u8 + more.min(options.blend.cap())
+    };
     let costs: Vec<u8> = (0..width * height)
         .flat_map(|i| {
             let (x, row) = (i % width, i / width * width);
-            let inside: Vec<Option<u8>> =
-                (0..n).map(|k| column(x, k).map(|xr| (left[i] ^ right[row + xr]).count_ones() as u8)).collect();
+            let inside: Vec<Option<u8>> = (0..n).map(|k| column(x, k).map(|xr| bits(i, row + xr))).collect();
             let outside = outside_cost(&inside.iter().flatten().copied().collect::<Vec<_>>());
             inside.into_iter().map(move |cost| cost.unwrap_or(outside)).collect::<Vec<_>>()
         })
@@ -104,7 +108,7 @@ pub(crate) fn match_plain(
 
 mod tests {
     use super::*;
-    use crate::census::{Grey, MARGIN, census, census_mirrored};
+    use crate::census::{Grey, MARGIN, blend_planes, census, census_mirrored};
     use crate::kernel::Frame;
     use crate::levels::levels;
     use crate::sgm::{Aggregator, blocks};
@@ -135,6 +139,23 @@ mod tests {
             .collect()
     }
 
+    /// What the blend compares, by definition.
+    fn blend_plain(grey: &[u16], width: usize, blend: Blend) -> Vec<u8> {
+        let value = |i: usize| {
+            let at = |x: usize| i32::from(grey[i / width * width + x]);
+            let x = i % width;
+            match blend {
+                Blend::None => 0,
+                Blend::Grey { per_bit, .. } => (f64::from(at(x)) / 257.0 / f64::from(per_bit) + 1e-9).round() as u8,
+                Blend::Gradient { per_bit, .. } => {
+                    let slope = at((x + 1).min(width - 1)) - at(x.saturating_sub(1));
+                    (128.0 + (f64::from(slope) / 514.0 / f64::from(per_bit)).trunc()).clamp(0.0, 255.0) as u8
+                }
+            }
+        };
+        (0..grey.len()).map(value).collect()
+    }
+
     fn padded(values: &[u16], width: usize, height: usize) -> Grey {
         let mut grey = Grey { values: Vec::new(), width, height };
         for row in values.chunks_exact(width) {
@@ -149,9 +170,15 @@ mod tests {
         let window = prop_oneof![Just(Census::Window5x5), Just(Census::Window7x7), Just(Census::Window9x7)];
         // Ranges below, at and above one block and one group; penalties that do and do not saturate.
         let disparities = prop_oneof![1usize..70, Just(64), Just(128), 120usize..300];
-        (window, disparities, -40i32..40, 0u8..30, 0u8..60, 0u8..60, 0u8..40, any::<bool>()).prop_map(
-            |(census, disparities, min_disparity, p1, more, most, p2_gradient, eight)| StereoOptions {
+        let blend = prop_oneof![
+            Just(Blend::None),
+            (1u8.., 0u8..40).prop_map(|(per_bit, cap)| Blend::Grey { per_bit, cap }),
+            (1u8.., 0u8..40).prop_map(|(per_bit, cap)| Blend::Gradient { per_bit, cap }),
+        ];
+        (window, disparities, -40i32..40, 0u8..30, 0u8..60, 0u8..60, 0u8..40, any::<bool>(), blend).prop_map(
+            |(census, disparities, min_disparity, p1, more, most, p2_gradient, eight, blend)| StereoOptions {
                 census,
+                blend,
                 disparities,
                 min_disparity,
                 p1,
@@ -185,7 +212,8 @@ mod tests {
             let left: Vec<u16> = (0..width * height).map(noise).collect();
             let right: Vec<u16> = (0..width * height).map(|i| noise(if i % 5 == 0 { i + 7 } else { i + 3 })).collect();
             let bits = [&left, &right].map(|g| census_plain(g, width, height, options.census));
-            let expected = match_plain(&options, &left, &bits[0], &bits[1], width, height);
+            let planes = [&left, &right].map(|g| blend_plain(g, width, options.blend));
+            let expected = match_plain(&options, &left, &bits[0], &bits[1], &planes, width, height);
 
             let grey = [padded(&left, width, height), padded(&right, width, height)];
             let blocks = blocks(options.disparities);
@@ -195,9 +223,13 @@ mod tests {
                 census(level, &grey[0], options.census, &mut a);
                 census_mirrored(level, &grey[1], options.census, min_disparity, Frame::right_stride(width, blocks), &mut b);
                 grey[0].to_bytes(&mut bytes);
+                let mut planes: [Vec<u8>; 2] = Default::default();
+                let stride = Frame::right_stride(width, blocks);
+                blend_planes(level, &grey, options.blend, min_disparity, stride, &mut planes);
                 let frame = Frame {
                     width, height, min_disparity, disparities: options.disparities, blocks,
                     left: &a, right: &b, grey: &bytes,
+                    blend: (options.blend != Blend::None).then_some((&planes[0], &planes[1], options.blend.cap())),
                     p1: options.p1, p2: &p2_table(&options), second: options.confidence,
                 };
                 let mut aggregator = Aggregator::default();
