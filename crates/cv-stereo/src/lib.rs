@@ -36,6 +36,7 @@ mod options;
 mod plain;
 mod rectify;
 mod sgm;
+mod smooth;
 mod speckle;
 mod winner;
 
@@ -44,5 +45,5 @@ pub use error::StereoError;
 pub use evaluate::{BAD_THRESHOLDS, DisparityScores, EvaluateError, evaluate_disparity, non_occluded};
 pub use input::Intensity;
 pub use matcher::{DisparityMap, PixelState, StereoMatcher};
-pub use options::{Blend, Census, Paths, StereoOptions, Subpixel};
+pub use options::{Blend, Census, Paths, Smoothing, StereoOptions, Subpixel};
 pub use rectify::{Rectification, RectifiedView, RectifyError, RectifyOptions};

@@ -6,6 +6,7 @@ use crate::fill::{Holes, fill_holes};
 use crate::input::to_grey;
 use crate::kernel::Frame;
 use crate::sgm::{Aggregator, blocks};
+use crate::smooth::{self, Planes, smooth};
 use crate::speckle::{Speckles, remove_speckles};
 use crate::winner::{NO_SUM, Winner, p2_table};
 use crate::{Blend, Intensity, Paths, StereoError, StereoOptions, Subpixel, median};
@@ -92,6 +93,7 @@ pub struct StereoMatcher {
     speckles: Speckles,
     holes: Holes,
     scratch: Vec<f32>,
+    planes: Planes,
 }
 
 impl StereoMatcher {
@@ -112,6 +114,7 @@ impl StereoMatcher {
             speckles: Speckles::default(),
             holes: Holes::default(),
             scratch: Vec::new(),
+            planes: Planes::default(),
         })
     }
 
@@ -129,6 +132,7 @@ impl StereoMatcher {
         // Grey of both views in 16 bits, of one in 8; census; labels, scratch and outputs.
         Aggregator::bytes(width, height, self.options.disparities)
             .saturating_add(pixels.saturating_mul(5 + planes + 8 + 4 + 5))
+            .saturating_add(smooth::bytes(self.options.smoothing, width, height))
             .saturating_add(Frame::right_stride(width, blocks).saturating_mul(height).saturating_mul(planes))
     }
 
@@ -293,6 +297,8 @@ impl StereoMatcher {
             median::median(self.level, disparity, width, options.median, &mut self.scratch);
             disparity.copy_from_slice(&self.scratch);
         }
+        let states = map.state.as_slice();
+        smooth(self.level, options.smoothing, disparity, states, &self.grey8, width, &mut self.planes);
     }
 }
 

@@ -1,0 +1,430 @@
+//! Smoothing that stops where the photograph has an edge.
+//!
+//! Two ways. The bilateral one first moves the outlines of things to where the photograph has them: a window that
+//! straddles an outline sees the nearer side of it, so that matching draws things a pixel or two too wide. Then it
+//! averages each surface. The other one is the fast global smoother (Min et al., "Fast global image smoothing based on
+//! weighted least squares", TIP 2014), weighted by what was matched, which OpenCV's users know as its WLS filter.
+
+use crate::{PixelState, Smoothing};
+use fearless_simd::{Level, dispatch, prelude::*};
+use fearless_simd_macros::simd;
+use rayon::prelude::*;
+
+/// Reach of a window, and the spacing of the pixels in it that are looked at: 25 of 81 serve as well as all.
+const REACH: usize = 4;
+const SPACING: usize = 2;
+/// Room on both sides of a row: the reach, and on the right as much as a vector may run over.
+const LEFT: usize = REACH;
+const RIGHT: usize = REACH + 16;
+/// Weight of a filled pixel against a matched one.
+const FILLED: f32 = 0.1;
+/// Neighbours that differ by more than so many px belong to different surfaces.
+const STEP: f32 = 1.5;
+
+/// Memory of [`smooth`], kept between frames: rows with room on both sides, and rows of nothing above and below.
+#[derive(Debug, Default)]
+pub(crate) struct Planes {
+    /// Disparity, 0 where unknown.
+    disparity: Vec<f32>,
+    /// With outlines moved.
+    moved: Vec<f32>,
+    /// Grey values 0 to 255.
+    grey: Vec<f32>,
+    /// Weight of each pixel; 0 where the disparity is unknown.
+    weight: Vec<f32>,
+}
+
+/// Bytes that [`smooth`] holds on to.
+pub(crate) fn bytes(smoothing: Smoothing, width: usize, height: usize) -> usize {
+    let planes = match smoothing {
+        Smoothing::None => 0,
+        Smoothing::Bilateral { .. } | Smoothing::LeastSquares { .. } => 4,
+    };
+    planes * size_of::<f32>() * (width.saturating_add(LEFT + RIGHT)).saturating_mul(height.saturating_add(2 * REACH))
+}
+
+/// Smooths a map; unknown pixels stay unknown.
+pub(crate) fn smooth(
+    level: Level,
+    smoothing: Smoothing,
+    disparity: &mut [f32],
+    states: &[PixelState],
+    grey: &[u8],
+    width: usize,
+    planes: &mut Planes,
+) {
+    if width == 0 || disparity.is_empty() || smoothing == Smoothing::None {
+        return;
+    }
+    let height = disparity.len() / width;
+    let stride = width + LEFT + RIGHT;
+    planes.fill(disparity, states, grey, width);
+    match smoothing {
+        Smoothing::None => {}
+        Smoothing::Bilateral { sigma } => {
+            let Planes { disparity: before, moved, grey, weight } = planes;
+            let [before, grey, weight] = [before, grey, weight].map(|plane| plane.as_slice());
+            let inside = &mut moved[REACH * stride..(REACH + height) * stride];
+            inside.par_chunks_mut(stride).enumerate().for_each(|(y, out)| {
+                let rows = Rows { disparity: before, grey, weight, stride, y, scale: 1.0 / sigma };
+                dispatch!(level, simd => move_outlines(simd, rows, &mut out[LEFT..LEFT + width.next_multiple_of(16)]));
+            });
+            disparity.par_chunks_mut(width).enumerate().for_each_init(
+                || vec![0.0; width.next_multiple_of(16)],
+                |smoothed, (y, out)| {
+                    let rows = Rows { disparity: moved, grey, weight, stride, y, scale: 1.0 / sigma };
+                    dispatch!(level, simd => average(simd, rows, smoothed));
+                    for (d, &value) in out.iter_mut().zip(&*smoothed) {
+                        *d = if d.is_nan() { f32::NAN } else { value };
+                    }
+                },
+            );
+        }
+        Smoothing::LeastSquares { lambda, sigma } => {
+            least_squares(planes, width, height, lambda, sigma);
+            disparity.par_chunks_mut(width).enumerate().for_each(|(y, out)| {
+                let from = (REACH + y) * stride + LEFT;
+                let (value, weight) = (&planes.disparity[from..][..width], &planes.weight[from..][..width]);
+                for ((d, &v), &w) in out.iter_mut().zip(value).zip(weight) {
+                    if !d.is_nan() && w > 0.0 {
+                        *d = v / w;
+                    }
+                }
+            });
+        }
+    }
+}
+
+impl Planes {
+    fn fill(&mut self, disparity: &[f32], states: &[PixelState], grey: &[u8], width: usize) {
+        let stride = width + LEFT + RIGHT;
+        let len = (disparity.len() / width + 2 * REACH) * stride;
+        for plane in [&mut self.disparity, &mut self.moved, &mut self.grey, &mut self.weight] {
+            // Another size: the room around must be zero again.
+            if plane.len() != len {
+                plane.clear();
+                plane.resize(len, 0.0);
+            }
+        }
+        let rows = |plane| {
+            let plane: &mut Vec<f32> = plane;
+            plane.par_chunks_mut(stride).skip(REACH)
+        };
+        let planes = rows(&mut self.disparity).zip(rows(&mut self.grey)).zip(rows(&mut self.weight));
+        let pixels = disparity.par_chunks(width).zip(states.par_chunks(width)).zip(grey.par_chunks(width));
+        planes.zip(pixels).for_each(|(((d, g), w), ((disparity, states), grey))| {
+            let inside = LEFT..LEFT + width;
+            for (out, &value) in d[inside.clone()].iter_mut().zip(disparity) {
+                *out = if value.is_nan() { 0.0 } else { value };
+            }
+            for (out, &value) in g[inside.clone()].iter_mut().zip(grey) {
+                *out = f32::from(value);
+            }
+            for ((out, &value), &state) in w[inside].iter_mut().zip(disparity).zip(states) {
+                let known = if state == PixelState::Matched { 1.0 } else { FILLED };
+                *out = if value.is_nan() { 0.0 } else { known };
+            }
+            // The last frame may have been of another width with the same number of pixels.
+            for row in [d, g, w] {
+                row[..LEFT].fill(0.0);
+                row[LEFT + width..].fill(0.0);
+            }
+        });
+    }
+}
+
+/// A row with those around it.
+#[derive(Clone, Copy)]
+struct Rows<'a> {
+    disparity: &'a [f32],
+    grey: &'a [f32],
+    weight: &'a [f32],
+    stride: usize,
+    y: usize,
+    /// Share of the weight lost per grey level of difference.
+    scale: f32,
+}
+
+impl Rows<'_> {
+    /// Where the pixel `(dx, dy)` from the first of a vector at `x` lies; both count from −[`REACH`].
+    #[inline(always)]
+    fn at(&self, x: usize, dx: usize, dy: usize) -> usize {
+        (self.y + dy) * self.stride + x + dx
+    }
+}
+
+/// A pixel within [`STEP`] of whose disparity not all of its neighbours lie takes the disparity of the other side of the
+/// step where more of the pixels around that look like it are of the other side.
+#[simd]
+fn move_outlines<S: Simd>(simd: S, rows: Rows<'_>, out: &mut [f32]) {
+    let lanes = S::f32s::LEN;
+    let load = |plane: &[f32], at: usize| S::f32s::from_slice(simd, &plane[at..at + lanes]);
+    let zero = S::f32s::splat(simd, 0.0);
+    for x in (0..out.len()).step_by(lanes) {
+        let centre = rows.at(x, REACH, REACH);
+        let here = load(rows.disparity, centre);
+        let (mut low, mut high) = (here, here);
+        for (dx, dy) in [(2, 4), (3, 4), (5, 4), (6, 4), (4, 2), (4, 3), (4, 5), (4, 6)] {
+            let at = rows.at(x, dx, dy);
+            let value = load(rows.weight, at).simd_gt(zero).select(load(rows.disparity, at), here);
+            low = low.min(value);
+            high = high.max(value);
+        }
+        let step = (high - low).simd_gt(S::f32s::splat(simd, STEP));
+        let mut result = here;
+        if step.any_true() {
+            let middle = (low + high) * 0.5;
+            let grey = load(rows.grey, centre);
+            let [mut near, mut near_sum, mut all, mut all_sum] = [zero; 4];
+            for dy in (0..=2 * REACH).step_by(SPACING) {
+                for dx in (0..=2 * REACH).step_by(SPACING) {
+                    let at = rows.at(x, dx, dy);
+                    let value = load(rows.disparity, at);
+                    let alike = (S::f32s::splat(simd, 1.0) - (load(rows.grey, at) - grey).abs() * rows.scale).max(zero);
+                    let weight = alike * load(rows.weight, at);
+                    let nearer = value.simd_gt(middle).select(weight, zero);
+                    all += weight;
+                    all_sum += weight * value;
+                    near += nearer;
+                    near_sum += nearer * value;
+                }
+            }
+            let is_near = here.simd_gt(middle);
+            let (far, far_sum) = (all - near, all_sum - near_sum);
+            let own = is_near.select(near, far);
+            let other = is_near.select(far, near);
+            let sum = is_near.select(far_sum, near_sum);
+            // Half a pixel's weight at least: less is no evidence.
+            let moves = step & other.simd_gt(own) & other.simd_gt(S::f32s::splat(simd, 0.5));
+            result = moves.select(sum / other, here);
+        }
+        result.store_slice(&mut out[x..x + lanes]);
+    }
+}
+
+/// Weighted mean of the pixels around that look alike and lie within [`STEP`].
+#[simd]
+fn average<S: Simd>(simd: S, rows: Rows<'_>, out: &mut [f32]) {
+    let lanes = S::f32s::LEN;
+    let load = |plane: &[f32], at: usize| S::f32s::from_slice(simd, &plane[at..at + lanes]);
+    let zero = S::f32s::splat(simd, 0.0);
+    for x in (0..out.len()).step_by(lanes) {
+        let centre = rows.at(x, REACH, REACH);
+        let (here, grey) = (load(rows.disparity, centre), load(rows.grey, centre));
+        let (mut all, mut sum) = (S::f32s::splat(simd, 1e-6), zero);
+        for dy in (0..=2 * REACH).step_by(SPACING) {
+            for dx in (0..=2 * REACH).step_by(SPACING) {
+                let at = rows.at(x, dx, dy);
+                let off = load(rows.disparity, at) - here;
+                let alike = (S::f32s::splat(simd, 1.0) - (load(rows.grey, at) - grey).abs() * rows.scale).max(zero);
+                let weight = off.abs().simd_le(S::f32s::splat(simd, STEP)).select(alike * load(rows.weight, at), zero);
+                all += weight;
+                sum += weight * off;
+            }
+        }
+        (here + sum / all).store_slice(&mut out[x..x + lanes]);
+    }
+}
+
+/// Three rounds of exact one-dimensional smoothing along rows and columns, of weighted disparity and of the weights.
+fn least_squares(planes: &mut Planes, width: usize, height: usize, lambda: f32, sigma: f32) {
+    const ROUNDS: i32 = 3;
+    let stride = width + LEFT + RIGHT;
+    let Planes { disparity, moved, grey, weight } = planes;
+    for (d, &w) in disparity.iter_mut().zip(weight.iter()) {
+        *d *= w;
+    }
+    let likeness = |a: f32, b: f32| (-(a - b).abs() / sigma).exp();
+    for round in 1..=ROUNDS {
+        // Falls by four each round (equation 13 of the paper).
+        let strength = 1.5 * 4f32.powi(ROUNDS - round) / (4f32.powi(ROUNDS) - 1.0) * lambda;
+        let rows = disparity.par_chunks_mut(stride).zip(weight.par_chunks_mut(stride)).zip(grey.par_chunks(stride));
+        rows.skip(REACH).take(height).for_each_init(
+            || vec![0.0; width],
+            |factors, ((d, w), g)| {
+                let (d, w, g) = (&mut d[LEFT..LEFT + width], &mut w[LEFT..LEFT + width], &g[LEFT..LEFT + width]);
+                // Thomas' algorithm for the system 1 + A, of both right-hand sides at once.
+                let mut before = 0.0;
+                for x in 0..width {
+                    let after = if x + 1 < width { -strength * likeness(g[x], g[x + 1]) } else { 0.0 };
+                    let diagonal = 1.0 - before - after;
+                    let scale = if x > 0 { 1.0 / (diagonal - before * factors[x - 1]) } else { 1.0 / diagonal };
+                    factors[x] = after * scale;
+                    let (d_before, w_before) = if x > 0 { (d[x - 1], w[x - 1]) } else { (0.0, 0.0) };
+                    d[x] = (d[x] - before * d_before) * scale;
+                    w[x] = (w[x] - before * w_before) * scale;
+                    before = after;
+                }
+                for x in (0..width.saturating_sub(1)).rev() {
+                    d[x] -= factors[x] * d[x + 1];
+                    w[x] -= factors[x] * w[x + 1];
+                }
+            },
+        );
+        // Columns, a row of them at a time.
+        let row = |y: usize| (REACH + y) * stride + LEFT;
+        let factors = &mut moved[..];
+        for y in 0..height {
+            for x in 0..width {
+                let at = row(y) + x;
+                let g = grey[at];
+                let before = if y > 0 { -strength * likeness(grey[at - stride], g) } else { 0.0 };
+                let after = if y + 1 < height { -strength * likeness(g, grey[at + stride]) } else { 0.0 };
+                let up = if y > 0 {
+                    (factors[at - stride], disparity[at - stride], weight[at - stride])
+                } else {
+                    (0.0, 0.0, 0.0)
+                };
+                let scale = 1.0 / (1.0 - before - after - before * up.0);
+                factors[at] = after * scale;
+                disparity[at] = (disparity[at] - before * up.1) * scale;
+                weight[at] = (weight[at] - before * up.2) * scale;
+            }
+        }
+        for y in (0..height.saturating_sub(1)).rev() {
+            for at in row(y)..row(y) + width {
+                disparity[at] -= factors[at] * disparity[at + stride];
+                weight[at] -= factors[at] * weight[at + stride];
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::levels::levels;
+    use proptest::prelude::*;
+
+    /// The two passes of the bilateral smoother, pixel by pixel.
+    fn plain(d: &[f32], states: &[PixelState], grey: &[u8], width: usize, sigma: f32) -> Vec<f32> {
+        let height = d.len() / width;
+        let at = |x: i64, y: i64| {
+            (x >= 0 && y >= 0 && x < width as i64 && y < height as i64).then(|| y as usize * width + x as usize)
+        };
+        let weight = |i: usize, j: usize| {
+            let known = if d[j].is_nan() {
+                0.0
+            } else if states[j] == PixelState::Matched {
+                1.0
+            } else {
+                FILLED
+            };
+            (1.0 - f32::from(grey[i].abs_diff(grey[j])) * (1.0 / sigma)).max(0.0) * known
+        };
+        let around = |i: usize| {
+            let (x, y) = ((i % width) as i64, (i / width) as i64);
+            let offsets = (-4..=4).step_by(2).flat_map(|dy| (-4..=4).step_by(2).map(move |dx| (dx, dy)));
+            offsets.filter_map(|(dx, dy)| at(x + dx, y + dy)).collect::<Vec<_>>()
+        };
+        let moved: Vec<f32> = (0..d.len())
+            .map(|i| {
+                if d[i].is_nan() {
+                    return 0.0;
+                }
+                let (x, y) = ((i % width) as i64, (i / width) as i64);
+                let cross = [(-2, 0), (-1, 0), (1, 0), (2, 0), (0, -2), (0, -1), (0, 1), (0, 2), (0, 0)];
+                let near: Vec<f32> = cross
+                    .into_iter()
+                    .filter_map(|(dx, dy)| at(x + dx, y + dy).map(|j| d[j]).filter(|v| !v.is_nan()))
+                    .collect();
+                let low = near.iter().copied().fold(f32::INFINITY, f32::min);
+                let high = near.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+                if high - low <= STEP {
+                    return d[i];
+                }
+                let middle = (low + high) * 0.5;
+                let [mut near, mut near_sum, mut all, mut all_sum] = [0.0f32; 4];
+                for j in around(i) {
+                    let value = if d[j].is_nan() { 0.0 } else { d[j] };
+                    let w = weight(i, j);
+                    let nearer = if value > middle { w } else { 0.0 };
+                    all += w;
+                    all_sum += w * value;
+                    near += nearer;
+                    near_sum += nearer * value;
+                }
+                let (far, far_sum) = (all - near, all_sum - near_sum);
+                let (own, other, sum) = if d[i] > middle { (near, far, far_sum) } else { (far, near, near_sum) };
+                if other > own && other > 0.5 { sum / other } else { d[i] }
+            })
+            .collect();
+        (0..d.len())
+            .map(|i| {
+                let (mut all, mut sum) = (1e-6f32, 0.0f32);
+                for j in around(i) {
+                    let off = moved[j] - moved[i];
+                    let w = if off.abs() <= STEP { weight(i, j) } else { 0.0 };
+                    all += w;
+                    sum += w * off;
+                }
+                if d[i].is_nan() { f32::NAN } else { moved[i] + sum / all }
+            })
+            .collect()
+    }
+
+    fn state(n: u8) -> PixelState {
+        [PixelState::Matched, PixelState::Matched, PixelState::Occluded, PixelState::Mismatched][usize::from(n % 4)]
+    }
+
+    proptest! {
+        #[test]
+        fn every_instruction_set_gives_the_bits_of_the_definition(
+            width in 1usize..45,
+            pixels in proptest::collection::vec(
+                (prop_oneof![6 => 0f32..3.0, 3 => 6f32..7.0, 1 => Just(f32::NAN)], 0u8..40, any::<u8>()), 45..400),
+            sigma in 1f32..60.0,
+        ) {
+            let pixels = &pixels[..pixels.len() / width * width];
+            let d: Vec<f32> = pixels.iter().map(|p| p.0).collect();
+            let grey: Vec<u8> = pixels.iter().map(|p| p.1).collect();
+            let states: Vec<PixelState> = pixels.iter().map(|p| state(p.2)).collect();
+            let expected: Vec<u32> = plain(&d, &states, &grey, width, sigma).iter().map(|v| v.to_bits()).collect();
+            for level in levels() {
+                let mut planes = Planes::default();
+                // Twice, so that what a frame leaves behind would show.
+                for _ in 0..2 {
+                    let mut out = d.clone();
+                    smooth(level, Smoothing::Bilateral { sigma }, &mut out, &states, &grey, width, &mut planes);
+                    let bits: Vec<u32> = out.iter().map(|v| v.to_bits()).collect();
+                    prop_assert_eq!(&bits, &expected, "{:?}", level);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn an_outline_moves_to_the_edge_of_the_photograph() {
+        // A near thing from column 20 on, matched two pixels too wide.
+        let (width, height) = (40, 30);
+        let grey: Vec<u8> = (0..width * height).map(|i| if i % width < 20 { 60 } else { 180 }).collect();
+        let mut d: Vec<f32> = (0..width * height).map(|i| if i % width < 18 { 5.0 } else { 12.0 }).collect();
+        let states = vec![PixelState::Matched; d.len()];
+        let options = Smoothing::Bilateral { sigma: 24.0 };
+        smooth(Level::new(), options, &mut d, &states, &grey, width, &mut Planes::default());
+        for (i, d) in d.iter().enumerate() {
+            let truth = if i % width < 20 { 5.0 } else { 12.0 };
+            // Sums of 25 terms in f32.
+            assert!((d - truth).abs() < 1e-4, "column {}: {d}", i % width);
+        }
+    }
+
+    #[test]
+    fn least_squares_smooths_a_surface_and_keeps_a_step_where_the_photograph_has_one() {
+        let (width, height) = (48, 32);
+        let grey: Vec<u8> = (0..width * height).map(|i| if i % width < 24 { 60 } else { 180 }).collect();
+        let truth = |i: usize| if i % width < 24 { 5.0 } else { 12.0 };
+        let noisy = |i: usize| truth(i) + if (i * 7919 / 13).is_multiple_of(2) { 0.5 } else { -0.5 };
+        let mut d: Vec<f32> = (0..width * height).map(noisy).collect();
+        d[5 * width + 5] = f32::NAN;
+        let states = vec![PixelState::Matched; d.len()];
+        let options = Smoothing::LeastSquares { lambda: 100.0, sigma: 4.0 };
+        smooth(Level::new(), options, &mut d, &states, &grey, width, &mut Planes::default());
+        assert!(d[5 * width + 5].is_nan());
+        for (i, d) in d.iter().enumerate().filter(|(_, d)| !d.is_nan()) {
+            // Noise of 0.5 px averaged over some 60 pixels (twice the square root of lambda along both axes), and
+            // exp(−30) of the other side's 7 px.
+            assert!((d - truth(i)).abs() < 0.25, "pixel {i}: {d}");
+        }
+    }
+}
