@@ -328,5 +328,14 @@ fn subpixel(method: Subpixel, winner: &Winner) -> f32 {
     }
     let [below, above, cost] = [winner.below, winner.above, winner.cost].map(f32::from);
     let slope = below.max(above) - cost;
-    if slope > 0.0 { (below - above) / (2.0 * slope) } else { 0.0 }
+    if slope <= 0.0 {
+        return 0.0;
+    }
+    // Rise on the lower side as a share of that on the higher: 1 in the middle, 0 half a pixel away.
+    let ratio = (below.min(above) - cost) / slope;
+    let rest = match method {
+        Subpixel::CorrectedVFit => 0.5 * ratio * (1.0 + ratio),
+        Subpixel::None | Subpixel::VFit => ratio,
+    };
+    (0.5 * (1.0 - rest)).copysign(below - above)
 }

@@ -1,0 +1,112 @@
+//! The bars of stereo matching on rendered scenes, against exact truth, with default options.
+//!
+//! The seeds were not chosen by their results. Shares are over the pixels of all scenes together; what the worst scene
+//! reaches is printed.
+
+use cv_core::{Camera, Pose};
+use cv_stereo::{DisparityMap, PixelState, StereoMatcher, StereoOptions};
+use cv_synth::{RenderOptions, Scene, SceneBuilder, StereoPair, Texture, srgb, stereo_pair};
+use nalgebra::Point3;
+
+const SEEDS: std::ops::Range<u64> = 0..4;
+
+fn camera() -> Camera {
+    Camera::from_focal(640, 480, 520.0)
+}
+
+fn matched(left: &StereoPair, right: &StereoPair) -> DisparityMap {
+    let options = StereoOptions { disparities: 96, ..StereoOptions::default() };
+    StereoMatcher::new(options).unwrap().compute(left.left.image.view(), right.right.image.view()).unwrap()
+}
+
+/// A room with a baseline of 20 cm and a table with one of 6 cm, so that both have about 50 px of disparity.
+fn scenes() -> impl Iterator<Item = (String, Scene, f64)> {
+    SEEDS.flat_map(|seed| {
+        [(format!("room {seed}"), Scene::room(seed), 0.2), (format!("table {seed}"), Scene::tabletop(seed), 0.06)]
+    })
+}
+
+#[test]
+fn depth_is_within_five_percent_and_exposure_does_not_matter() {
+    // Pixels counted, and good ones.
+    let (mut depth, mut exposed) = ([0u32; 2], [0u32; 2]);
+    for (name, scene, baseline) in scenes() {
+        let camera = camera();
+        let pose = scene.viewpoint();
+        let options = RenderOptions::default();
+        let pair = stereo_pair(&scene, &camera, &pose, baseline, &options).unwrap();
+        // The right camera at half the light, with noise of its own.
+        let dark = RenderOptions { exposure: -1.0, ..options.with_seed(99) };
+        let darker = stereo_pair(&scene, &camera, &pose, baseline, &dark).unwrap();
+        let (even, uneven) = (matched(&pair, &pair), matched(&pair, &darker));
+        let (mut here, mut here_exposed) = ([0u32; 2], [0u32; 2]);
+        for (y, x) in (0..480).flat_map(|y| (0..640).map(move |x| (y, x))).filter(|&(y, x)| pair.visible.at(x, y)[0]) {
+            let (z, truth) = (pair.left.depth.at(x, y)[0], pair.disparity.at(x, y)[0]);
+            if z < 10.0 {
+                let found = (camera.fx * baseline) as f32 / even.disparity.at(x, y)[0];
+                here[0] += 1;
+                here[1] += u32::from((found - z).abs() <= 0.05 * z);
+            }
+            here_exposed[0] += 1;
+            here_exposed[1] += u32::from((uneven.disparity.at(x, y)[0] - truth).abs() <= 1.0);
+        }
+        let share = |[all, good]: [u32; 2]| 100.0 * f64::from(good) / f64::from(all);
+        println!("{name}: {:.2} % within 5 %, at one stop less {:.2} % within 1 px", share(here), share(here_exposed));
+        // No scene far below the rest: room 3 has a dark wooden floor with less texture than noise.
+        assert!(share(here) >= 96.0 && share(here_exposed) >= 95.0, "{name}: {here:?} {here_exposed:?}");
+        for i in 0..2 {
+            depth[i] += here[i];
+            exposed[i] += here_exposed[i];
+        }
+    }
+    let share = |[all, good]: [u32; 2]| f64::from(good) / f64::from(all);
+    println!("all: {:.4} within 5 %, at one stop less {:.4} within 1 px", share(depth), share(exposed));
+    // The bars of the project.
+    assert!(share(depth) >= 0.98 && share(exposed) >= 0.97, "{depth:?} {exposed:?}");
+}
+
+#[test]
+fn the_fractions_of_disparities_come_out_even() {
+    const BINS: usize = 20;
+    let mut counts = [0u32; BINS];
+    let textures = [
+        Texture::Stone { colors: [srgb(0x555555), srgb(0xbbbbbb)], seed: 7 },
+        Texture::Bricks { colors: [srgb(0x8a4a3a), srgb(0xa86a50)], mortar: srgb(0xb0b0a8), seed: 8 },
+        Texture::Wallpaper {
+            ground: srgb(0xd8d0c0),
+            inks: [srgb(0x884422), srgb(0x226644), srgb(0x333388)],
+            cell: 0.12,
+            seed: 9,
+        },
+        Texture::Wood { colors: [srgb(0x6b4526), srgb(0xa87b4c)], seed: 10 },
+    ];
+    for texture in &textures {
+        // Planes over which the disparity changes by tens of pixels: every fraction is as frequent as any other.
+        for (across, down) in [(0.5, 0.0), (0.0, 0.5), (-0.4, 0.3)] {
+            let at = |x: f64, y: f64| Point3::new(x, y, 3.0 + across * x + down * y);
+            let corner = at(-4.0, -3.5);
+            let mut builder = SceneBuilder::new();
+            builder.ambient([0.9, 0.9, 0.9]);
+            builder.object("wall").rect(corner, at(4.0, -3.5) - corner, at(-4.0, 3.5) - corner, texture.clone());
+            let scene = builder.build(Pose::identity());
+            let pair = stereo_pair(&scene, &camera(), &Pose::identity(), 0.2, &RenderOptions::default()).unwrap();
+            let map = matched(&pair, &pair);
+            for (i, &d) in map.disparity.as_slice().iter().enumerate() {
+                let (x, y) = (i % 640, i / 640);
+                // Borders aside, where windows and paths end.
+                let inside = (8..632).contains(&x) && (8..472).contains(&y);
+                if inside
+                    && map.state.at(x, y)[0] == PixelState::Matched
+                    && (d - pair.disparity.at(x, y)[0]).abs() < 1.0
+                {
+                    counts[((d.fract() * BINS as f32) as usize).min(BINS - 1)] += 1;
+                }
+            }
+        }
+    }
+    let mean = f64::from(counts.iter().sum::<u32>()) / BINS as f64;
+    let shares = counts.map(|n| f64::from(n) / mean);
+    println!("{shares:.3?}");
+    // The bar of the project: within 10 % of even. The planes themselves are even within 2 %.
+    assert!(mean > 50_000.0 && shares.iter().all(|s| (0.9..=1.1).contains(s)), "{shares:?}");
+}
