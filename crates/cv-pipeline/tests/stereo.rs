@@ -3,6 +3,8 @@
 //! The seeds were not chosen by their results. Shares are over the pixels of all scenes together; what the worst scene
 //! reaches is printed.
 
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
 use cv_core::{Camera, Pose};
 use cv_stereo::{DisparityMap, PixelState, StereoMatcher, StereoOptions};
 use cv_synth::{RenderOptions, Scene, SceneBuilder, StereoPair, Texture, srgb, stereo_pair};
