@@ -26,6 +26,10 @@ pub struct DepthResult {
     pub map: DisparityMap,
     /// Depth of the left image in the unit of the baseline, NaN where unknown; `None` without a geometry.
     pub depth: Option<GrayF32>,
+    /// How sure each disparity is, 0 to 1, 0 where filled; `None` without [`StereoOptions::confidence`].
+    pub confidence: Option<GrayF32>,
+    /// Standard deviation of each disparity in px, NaN where filled.
+    pub sigma: GrayF32,
     /// Stage names and their seconds. `match` is the matcher from the grey images to checked disparities; `prepare` is
     /// the memory it asks for beforehand.
     pub stages: Vec<(&'static str, f64)>,
@@ -40,6 +44,17 @@ pub enum DepthError {
     /// The geometry is none.
     #[error(transparent)]
     Geometry(#[from] GeometryError),
+    /// Hardly any pixel of one photograph has a partner in the other.
+    #[error(
+        "only {:.1} % of the pixels were matched and confirmed, fewer than the {:.0} % that a rectified pair shows at the least",
+        100.0 * .matched, 100.0 * .needed
+    )]
+    NoPair {
+        /// Share of the pixels that were matched and confirmed.
+        matched: f64,
+        /// The least that counts.
+        needed: f64,
+    },
     /// The range of depths is empty.
     #[error("the depth range {near} to {far} is empty")]
     Range {
@@ -48,6 +63,19 @@ pub enum DepthError {
         /// Farthest depth kept.
         far: f32,
     },
+}
+
+/// Share of the pixels that must be matched and confirmed. Rectified pairs have more than half; photographs that are no
+/// pair, or exchanged, reach one to seven in a hundred by chance.
+const LEAST_MATCHED: f64 = 0.1;
+
+/// Refuses a map that has hardly any matches: what was filled in would be made up.
+///
+/// # Errors
+/// [`DepthError::NoPair`].
+pub fn check_matched(map: &DisparityMap) -> Result<(), DepthError> {
+    let matched = map.matched_fraction();
+    if matched < LEAST_MATCHED { Err(DepthError::NoPair { matched, needed: LEAST_MATCHED }) } else { Ok(()) }
 }
 
 /// Disparity of a rectified pair, and depth where its geometry is known.
@@ -78,10 +106,12 @@ pub fn depth<T: Intensity, const C: usize>(
     progress.report("match", 0, 1);
     matcher.compute_into(left, right, &mut map)?;
     watch.lap("match");
+    check_matched(&map)?;
     progress.report("match", 1, 1);
     let depth = geometry.map(|geometry| geometry.depth_map(map.disparity.view(), options.range));
+    let (confidence, sigma) = (matcher.confidence(&map), matcher.uncertainty(&map));
     watch.lap("depth");
-    Ok(DepthResult { map, depth, stages: watch.into_stages() })
+    Ok(DepthResult { map, depth, confidence, sigma, stages: watch.into_stages() })
 }
 
 #[cfg(test)]
@@ -114,6 +144,26 @@ mod tests {
         }
         // The bar of the project: 95 % of the visible pixels within 5 %.
         assert!(f64::from(good) >= 0.95 * f64::from(all), "{good} of {all}");
+    }
+
+    #[test]
+    fn what_is_no_pair_is_refused() {
+        let scene = Scene::room(1);
+        let camera = Camera::from_focal(320, 240, 280.0);
+        let pair = stereo_pair(&scene, &camera, &scene.viewpoint(), 0.25, &RenderOptions::default()).unwrap();
+        let other =
+            stereo_pair(&Scene::tabletop(2), &camera, &scene.viewpoint(), 0.25, &RenderOptions::default()).unwrap();
+        let options =
+            DepthOptions { stereo: StereoOptions { disparities: 64, ..Default::default() }, ..Default::default() };
+        let grey = Image::<u8, 3>::new(320, 240, [90; 3]);
+        let (left, right) = (pair.left.image.view(), pair.right.image.view());
+        // One colour twice, one colour and a photograph, exchanged, of something else.
+        let pairs = [(grey.view(), grey.view()), (grey.view(), right), (right, left), (left, other.right.image.view())];
+        for (i, (a, b)) in pairs.into_iter().enumerate() {
+            let error = depth(a, b, None, &options, &Silent).map(|found| found.map.matched_fraction()).unwrap_err();
+            assert!(matches!(error, DepthError::NoPair { .. }), "{i}: {error}");
+        }
+        assert!(depth(left, right, None, &options, &Silent).unwrap().map.matched_fraction() > 0.5);
     }
 
     #[test]

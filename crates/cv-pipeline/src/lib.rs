@@ -39,7 +39,7 @@ mod stopwatch;
 mod views;
 
 pub use cv_geometry::{EstimateError, RobustModel, RobustOptions};
-pub use depth::{DepthError, DepthOptions, DepthResult, depth};
+pub use depth::{DepthError, DepthOptions, DepthResult, check_matched, depth};
 pub use disparity_range::{RangeError, disparity_range};
 pub use estimate::{CalibratedResult, EstimateResult, ModelKind, estimate, estimate_calibrated};
 pub use matching::{
@@ -69,9 +69,9 @@ pub use stopwatch::Stopwatch;
 /// What a caller of [`depth()`] needs of the stereo stage: its options and results, rectification, geometry and scores.
 pub mod stereo {
     pub use cv_stereo::{
-        BAD_THRESHOLDS, Census, CloudPoint, DisparityMap, DisparityScores, EvaluateError, GeometryError, Intensity,
-        Paths, PixelState, Rectification, RectifiedView, RectifyError, RectifyOptions, StereoError, StereoGeometry,
-        StereoMatcher, StereoOptions, Subpixel, evaluate_disparity, non_occluded,
+        BAD_THRESHOLDS, Blend, Census, CloudPoint, DisparityMap, DisparityScores, EvaluateError, GeometryError,
+        Intensity, Paths, PixelState, Rectification, RectifiedView, RectifyError, RectifyOptions, Smoothing,
+        StereoError, StereoGeometry, StereoMatcher, StereoOptions, Subpixel, evaluate_disparity, non_occluded,
     };
 }
 

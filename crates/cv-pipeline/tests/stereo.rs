@@ -6,7 +6,7 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
 use cv_core::{Camera, Pose};
-use cv_stereo::{DisparityMap, PixelState, StereoMatcher, StereoOptions};
+use cv_stereo::{DisparityMap, PixelState, StereoError, StereoMatcher, StereoOptions};
 use cv_synth::{RenderOptions, Scene, SceneBuilder, StereoPair, Texture, srgb, stereo_pair};
 use nalgebra::Point3;
 
@@ -65,6 +65,30 @@ fn depth_is_within_five_percent_and_exposure_does_not_matter() {
     println!("all: {:.4} within 5 %, at one stop less {:.4} within 1 px", share(depth), share(exposed));
     // The bars of the project.
     assert!(share(depth) >= 0.98 && share(exposed) >= 0.97, "{depth:?} {exposed:?}");
+}
+
+#[test]
+fn strips_of_rows_take_less_memory_and_hardly_change_the_result() {
+    for (name, scene, baseline) in scenes().take(2) {
+        let pair = stereo_pair(&scene, &camera(), &scene.viewpoint(), baseline, &RenderOptions::default()).unwrap();
+        let whole = matched(&pair, &pair);
+        let options = StereoOptions { disparities: 96, ..StereoOptions::default() };
+        let all = StereoMatcher::new(options.clone()).unwrap().memory(640, 480);
+        let mut matcher =
+            StereoMatcher::new(StereoOptions { max_memory: Some(all * 11 / 20), ..options.clone() }).unwrap();
+        assert!(matcher.memory(640, 480) <= all * 11 / 20);
+        let strips = matcher.compute(pair.left.image.view(), pair.right.image.view()).unwrap();
+        let pairs = whole.disparity.as_slice().iter().zip(strips.disparity.as_slice());
+        let differ = pairs.filter(|(a, b)| a.is_nan() != b.is_nan() || (**a - **b).abs() > 0.5).count();
+        println!("{name}: {differ} pixels differ");
+        // What the option promises: a thousandth.
+        assert!(differ * 1000 <= 640 * 480, "{name}: {differ}");
+        let refused = StereoMatcher::new(StereoOptions { max_memory: Some(all / 10), ..options }).unwrap();
+        assert!(matches!(
+            { refused }.compute(pair.left.image.view(), pair.right.image.view()),
+            Err(StereoError::Memory { .. })
+        ));
+    }
 }
 
 #[test]

@@ -10,7 +10,7 @@
 //! and adds them up. Two sweeps from opposite corners cover all directions.
 
 use crate::aligned::Aligned;
-use crate::winner::{NO_SUM, Winner, outside_cost};
+use crate::winner::{NO_SUM, Winner, is_flat, outside_cost};
 use fearless_simd::prelude::*;
 use fearless_simd_macros::simd;
 
@@ -32,10 +32,10 @@ pub(crate) struct Frame<'a> {
     /// Number of blocks that hold them.
     pub(crate) blocks: usize,
     /// Census bytes of the left image, one plane after the other.
-    pub(crate) left: &'a [Vec<u8>],
+    pub(crate) left: &'a [&'a [u8]],
     /// Census bytes of the right image, each row mirrored so that disparities ascend: element `j` of a row is column
     /// `width − 1 − min_disparity − j`, and the match of column `x` at index `k` is element `width − 1 − x + k`.
-    pub(crate) right: &'a [Vec<u8>],
+    pub(crate) right: &'a [&'a [u8]],
     /// The values whose absolute difference, at most so much, is added to the bits: of the left image, and of the
     /// right one laid out as its bits.
     pub(crate) blend: Option<(&'a [u8], &'a [u8], u8)>,
@@ -408,7 +408,9 @@ fn finish<S: Simd>(simd: S, frame: &Frame<'_>, (cost, index): (u16, u16), sums: 
     let k = usize::from(index);
     let at = |k: usize| if k < frame.disparities { sums[k] } else { NO_SUM };
     let second = if frame.second { second(simd, index, sums) } else { NO_SUM };
-    Winner { index, cost, second, below: at(k.wrapping_sub(1)), above: at(k + 1) }
+    let (below, above) =
+        if is_flat(k, frame.disparities, cost, at) { (cost, cost) } else { (at(k.wrapping_sub(1)), at(k + 1)) };
+    Winner { index, cost, second, below, above }
 }
 
 /// The smallest sum that is not next to the winner.

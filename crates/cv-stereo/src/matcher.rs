@@ -13,6 +13,13 @@ use crate::{Blend, Intensity, Paths, StereoError, StereoOptions, Subpixel, media
 use cv_core::{GrayF32, Image, ImageView, Sample};
 use fearless_simd::Level;
 use rayon::prelude::*;
+use std::ops::Range;
+
+/// Rows beyond a strip that its paths start from: what lies farther away hardly matters.
+const OVERLAP: usize = 32;
+
+/// Fewer rows than so many at a time would mostly repeat the overlap.
+const MIN_STRIP: usize = 32;
 
 /// How a pixel came by its disparity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -90,6 +97,8 @@ pub struct StereoMatcher {
     census: [Vec<Vec<u8>>; 2],
     blend: [Vec<u8>; 2],
     aggregator: Aggregator,
+    /// For aggregation in strips.
+    strip: Aggregator,
     speckles: Speckles,
     holes: Holes,
     scratch: Vec<f32>,
@@ -111,6 +120,7 @@ impl StereoMatcher {
             census: Default::default(),
             blend: Default::default(),
             aggregator: Aggregator::default(),
+            strip: Aggregator::default(),
             speckles: Speckles::default(),
             holes: Holes::default(),
             scratch: Vec::new(),
@@ -124,16 +134,40 @@ impl StereoMatcher {
     }
 
     /// Bytes that matching images of this size takes, outputs included: about one byte per pixel and disparity for the
-    /// sums, and forty per pixel.
+    /// sums, and sixty per pixel (grey values 6, bits 3 to 8 of each view, winners 12, labels up to 8, the planes of the
+    /// smoothing 16, outputs and scratch 9). Under [`StereoOptions::max_memory`] the sums are those of a strip.
     pub fn memory(&self, width: usize, height: usize) -> usize {
+        let rows = self.strip_rows(width, height).unwrap_or(height);
+        self.memory_of(width, height, rows)
+    }
+
+    /// Bytes where `rows` rows at a time are aggregated.
+    fn memory_of(&self, width: usize, height: usize, rows: usize) -> usize {
+        let options = &self.options;
         let pixels = width.saturating_mul(height);
-        let blocks = blocks(self.options.disparities);
-        let planes = planes(self.options.census) + usize::from(self.options.blend != Blend::None);
-        // Grey of both views in 16 bits, of one in 8; census; labels, scratch and outputs.
-        Aggregator::bytes(width, height, self.options.disparities)
-            .saturating_add(pixels.saturating_mul(5 + planes + 8 + 4 + 5))
-            .saturating_add(smooth::bytes(self.options.smoothing, width, height))
-            .saturating_add(Frame::right_stride(width, blocks).saturating_mul(height).saturating_mul(planes))
+        let planes = planes(options.census) + usize::from(options.blend != Blend::None);
+        let strip = if rows < height { (rows + 2 * OVERLAP).min(height) } else { 0 };
+        let whole = if rows < height { 0 } else { height };
+        // Grey of both views in 16 bits, of one in 8; winners of both views; labels, scratch and outputs.
+        let fixed = 5 + planes + size_of::<Winner>() + size_of::<u16>() + 8 + 4 + 5;
+        let stride = Frame::right_stride(width, blocks(options.disparities));
+        Aggregator::bytes(width, strip.max(whole), options.disparities)
+            .saturating_add(strip.saturating_mul(width).saturating_mul(size_of::<Winner>() + size_of::<u16>()))
+            .saturating_add(pixels.saturating_mul(fixed))
+            .saturating_add(smooth::bytes(options.smoothing, width, height))
+            .saturating_add(stride.saturating_mul(height).saturating_mul(planes))
+    }
+
+    /// How many rows at a time are aggregated under [`StereoOptions::max_memory`]: `None` for all, or where not even few
+    /// would do.
+    fn strip_rows(&self, width: usize, height: usize) -> Option<usize> {
+        let allowed = self.options.max_memory?;
+        if self.memory_of(width, height, height) <= allowed {
+            return None;
+        }
+        // The more rows, the less is done twice.
+        let fits = |rows: &usize| self.memory_of(width, height, *rows) <= allowed;
+        (MIN_STRIP..height).step_by(MIN_STRIP).take_while(fits).last()
     }
 
     /// Disparities of `left`. The images are rectified: a scene point has the same y in both.
@@ -208,9 +242,9 @@ impl StereoMatcher {
         if min >= width as i64 || max <= -(width as i64) {
             return Err(StereoError::RangeOutsideImage { min, max, width });
         }
-        let needed = self.memory(width, height);
         let allowed = self.options.max_memory.unwrap_or(isize::MAX as usize);
-        if needed > allowed {
+        if self.memory(width, height) > allowed {
+            let needed = self.memory_of(width, height, MIN_STRIP).min(self.memory_of(width, height, height));
             return Err(StereoError::Memory { needed, allowed });
         }
         Ok(())
@@ -222,7 +256,12 @@ impl StereoMatcher {
     /// [`StereoError`] where the disparities do not fit the images, or the memory is more than allowed.
     pub fn prepare(&mut self, width: usize, height: usize, map: &mut DisparityMap) -> Result<(), StereoError> {
         self.check_size(width, height)?;
-        self.aggregator.prepare(width, height, self.options.disparities);
+        match self.strip_rows(width, height) {
+            None => self.aggregator.prepare(width, height, self.options.disparities),
+            Some(rows) => {
+                self.strip.prepare(width, (rows + 2 * OVERLAP).min(height), self.options.disparities);
+            }
+        }
         map.resize(width, height);
         Ok(())
     }
@@ -237,21 +276,45 @@ impl StereoMatcher {
         census_mirrored(self.level, &self.grey[1], options.census, min_disparity, stride, &mut self.census[1]);
         blend_planes(self.level, &self.grey, options.blend, min_disparity, stride, &mut self.blend);
         self.grey[0].to_bytes(&mut self.grey8);
-        let frame = Frame {
-            width,
-            height,
-            min_disparity,
-            disparities: options.disparities,
-            blocks,
-            left: &self.census[0],
-            right: &self.census[1],
-            blend: (options.blend != Blend::None).then_some((&self.blend[0], &self.blend[1], options.blend.cap())),
-            grey: &self.grey8,
-            p1: options.p1,
-            p2: &p2_table(options),
-            second: options.confidence || options.uniqueness > 0,
+        let p2 = p2_table(options);
+        let cap = options.blend.cap();
+        let run = |aggregator: &mut Aggregator, rows: Range<usize>| {
+            let here = rows.start * width..rows.end * width;
+            let there = rows.start * stride..rows.end * stride;
+            let left: Vec<&[u8]> = self.census[0].iter().map(|plane| &plane[here.clone()]).collect();
+            let right: Vec<&[u8]> = self.census[1].iter().map(|plane| &plane[there.clone()]).collect();
+            let [blend_left, blend_right] = &self.blend;
+            let frame = Frame {
+                width,
+                height: rows.len(),
+                min_disparity,
+                disparities: options.disparities,
+                blocks,
+                left: &left,
+                right: &right,
+                blend: (options.blend != Blend::None).then(|| (&blend_left[here.clone()], &blend_right[there], cap)),
+                grey: &self.grey8[here],
+                p1: options.p1,
+                p2: &p2,
+                second: options.confidence || options.uniqueness > 0,
+            };
+            aggregator.run(self.level, &frame, options.paths == Paths::Eight);
         };
-        self.aggregator.run(self.level, &frame, options.paths == Paths::Eight);
+        let Some(rows) = self.strip_rows(width, height) else {
+            run(&mut self.aggregator, 0..height);
+            return;
+        };
+        let Aggregator { winners, right, .. } = &mut self.aggregator;
+        winners.resize(width * height, Winner::default());
+        right.resize(width * height, 0);
+        for start in (0..height).step_by(rows) {
+            let end = (start + rows).min(height);
+            let from = start.saturating_sub(OVERLAP);
+            run(&mut self.strip, from..(end + OVERLAP).min(height));
+            let inside = (start - from) * width..(end - from) * width;
+            winners[start * width..end * width].copy_from_slice(&self.strip.winners[inside.clone()]);
+            right[start * width..end * width].copy_from_slice(&self.strip.right[inside]);
+        }
     }
 
     /// Uniqueness, view, left-right consistency; sub-pixel place of what passes.
@@ -313,6 +376,10 @@ fn judge(options: &StereoOptions, x: usize, winner: &Winner, right: &[u16]) -> P
     {
         // What the right camera sees there is nearer: it hides this pixel.
         return if seen > winner.index { PixelState::Occluded } else { PixelState::Mismatched };
+    }
+    // Nothing tells one disparity from the next.
+    if winner.below == winner.cost {
+        return PixelState::Mismatched;
     }
     let unsure = u32::from(winner.second) * u32::from(100 - options.uniqueness) < u32::from(winner.cost) * 100;
     if options.uniqueness > 0 && unsure {

@@ -149,7 +149,9 @@ pub struct StereoOptions {
     /// Whether [`crate::StereoMatcher::confidence`] is wanted: finding the second best match takes a tenth of the time.
     /// Default false.
     pub confidence: bool,
-    /// Most bytes the matcher may hold; `None` sets no limit. Default `None`. See [`crate::StereoMatcher::memory`].
+    /// Most bytes the matcher may hold; `None` sets no limit. Where the whole image does not fit, costs are aggregated in
+    /// strips of rows that overlap by 32: at most 0.1 % of the pixels then differ by more than half a pixel from what
+    /// they are without the limit. Default `None`. See [`crate::StereoMatcher::memory`].
     pub max_memory: Option<usize>,
 }
 

@@ -83,13 +83,14 @@ pub(crate) fn match_plain(
             let s = &sums[(y * width + x) * n..][..n];
             let at = |k: usize| s.get(k).copied().unwrap_or(NO_SUM);
             let index = (0..n).min_by_key(|&k| (s[k], k)).filter(|&k| s[k] < NO_SUM).unwrap_or(0);
+            let flat = at(index + 1) == s[index] && (index + 2 >= n || at(index + 2) == s[index]);
             let far = (0..n).filter(|k| options.confidence && k.abs_diff(index) > 1);
             let second = far.map(at).min().unwrap_or(NO_SUM);
             winners[y * width + x] = Winner {
                 index: index as u16,
                 cost: s[index].min(NO_SUM),
                 second,
-                below: at(index.wrapping_sub(1)),
+                below: if flat { s[index] } else { at(index.wrapping_sub(1)) },
                 above: at(index + 1),
             };
             for (k, &sum) in s.iter().enumerate() {
@@ -226,9 +227,10 @@ mod tests {
                 let mut planes: [Vec<u8>; 2] = Default::default();
                 let stride = Frame::right_stride(width, blocks);
                 blend_planes(level, &grey, options.blend, min_disparity, stride, &mut planes);
+                let slices = [&a, &b].map(|planes| planes.iter().map(Vec::as_slice).collect::<Vec<_>>());
                 let frame = Frame {
                     width, height, min_disparity, disparities: options.disparities, blocks,
-                    left: &a, right: &b, grey: &bytes,
+                    left: &slices[0], right: &slices[1], grey: &bytes,
                     blend: (options.blend != Blend::None).then_some((&planes[0], &planes[1], options.blend.cap())),
                     p1: options.p1, p2: &p2_table(&options), second: options.confidence,
                 };

@@ -14,10 +14,18 @@ pub(crate) struct Winner {
     pub(crate) cost: u16,
     /// The smallest sum at indices not next to the winner; [`NO_SUM`] where there are none, and where nobody asked.
     pub(crate) second: u16,
-    /// The sum one index below; [`NO_SUM`] at the end of the range.
+    /// The sum one index below; [`NO_SUM`] at the end of the range. It is larger than [`Winner::cost`], since the first of
+    /// equals wins, but where the sums are flat: there both neighbours equal it.
     pub(crate) below: u16,
     /// The sum one index above; [`NO_SUM`] at the end of the range.
     pub(crate) above: u16,
+}
+
+/// Whether the sums after the winner at `index` are all alike: the next two, or what there is of them. The one after it
+/// alone may be, half a pixel away from both.
+#[inline(always)]
+pub(crate) fn is_flat(index: usize, disparities: usize, cost: u16, at: impl Fn(usize) -> u16) -> bool {
+    at(index + 1) == cost && (index + 2 >= disparities || at(index + 2) == cost)
 }
 
 /// What a match outside the right image costs, given the costs inside: their mean. Where the image is flat all match

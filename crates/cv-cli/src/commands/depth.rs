@@ -4,10 +4,10 @@ use crate::common::{Context, Explain, Failure, Outcome, Run, expand_images};
 use cv_core::{GrayF32, ImageView, RgbU8};
 use cv_io::ply::{Cloud, PlyEncoding};
 use cv_io::{DynImage, Pixels};
-use cv_pipeline::{DepthOptions, DepthResult, Progress, depth, disparity_range};
+use cv_pipeline::{DepthError, DepthOptions, DepthResult, Progress, check_matched, depth, disparity_range};
 use cv_report::{Figure, MapStyle, Note, PointScene, Report, Viewpoint, draw_map, render_points};
 use cv_pipeline::stereo::{
-    Census, CloudPoint, DisparityMap, Intensity, Paths, PixelState, Rectification, RectifyOptions, StereoGeometry, StereoMatcher,
+    Blend, Census, CloudPoint, DisparityMap, Smoothing, StereoError, Intensity, Paths, PixelState, Rectification, RectifyOptions, StereoGeometry, StereoMatcher,
     StereoOptions,
 };
 use std::path::{Path, PathBuf};
@@ -85,6 +85,31 @@ pub(crate) struct Args {
     /// Leave pixels without a match of their own unknown.
     #[arg(long)]
     no_fill: bool,
+    /// Add to the differing bits the absolute difference of grey values, or of horizontal gradients: sharper outlines.
+    #[arg(long, value_name = "WHAT", default_value = "none", value_parser = ["none", "grey", "gradient"])]
+    blend: String,
+    /// Edge-preserving smoothing: bilateral, wls (weighted least squares) or none.
+    #[arg(long, value_name = "HOW", default_value = "bilateral", value_parser = ["none", "bilateral", "wls"])]
+    smoothing: String,
+    /// Strength of --smoothing wls.
+    #[arg(long, value_name = "L", default_value_t = 100.0)]
+    lambda: f32,
+    /// Grey levels (of 255) across which --smoothing does not reach [default: 24; 1.5 for wls].
+    #[arg(long, value_name = "LEVELS")]
+    sigma: Option<f32>,
+    /// Most memory for matching, in MiB: where the whole does not fit, rows are matched in strips that overlap.
+    #[arg(long, value_name = "MIB")]
+    max_memory: Option<usize>,
+    /// Where to write how sure each disparity is, from 0 to 1 (0 where filled): .pfm, .npy or .png (0 to 255).
+    #[arg(long, value_name = "FILE")]
+    confidence: Option<PathBuf>,
+    /// Where to write where each disparity comes from, as a PNG: 255 matched, 0 filled.
+    #[arg(long, value_name = "PNG")]
+    matched: Option<PathBuf>,
+    /// Where to write the standard deviation of the depth, or of the disparity without a geometry; unknown where filled:
+    /// .pfm, .npy or .png (as --depth or the disparity).
+    #[arg(long, value_name = "FILE")]
+    uncertainty: Option<PathBuf>,
 }
 
 /// `--disparities`.
@@ -106,15 +131,22 @@ impl Run for Args {
         if is_sequence(&self.left) {
             return Vec::new();
         }
-        [Some(&self.output), self.depth.as_ref(), self.cloud.as_ref()].into_iter().flatten().map(|p| &**p).collect()
+        let more = [&self.depth, &self.cloud, &self.confidence, &self.matched, &self.uncertainty];
+        std::iter::once(&self.output).chain(more.into_iter().flatten()).map(|p| &**p).collect()
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
         if is_sequence(&self.left) || is_sequence(&self.right) {
             return self.run_frames(context);
         }
-        for path in [Some(&self.output), self.depth.as_ref()].into_iter().flatten() {
+        let maps = [Some(&self.output), self.depth.as_ref(), self.confidence.as_ref(), self.uncertainty.as_ref()];
+        for path in maps.into_iter().flatten() {
             map_format(path)?;
+        }
+        if let Some(path) = &self.matched
+            && !path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("png"))
+        {
+            return Err(Failure::usage(format!("{} is not a .png", path.display())).advice("end it with .png"));
         }
         if (self.depth.is_some() || self.cloud.is_some()) && self.rig.is_none() && self.focal.is_none() {
             return Err(Failure::usage("depth needs the geometry of the cameras")
@@ -170,6 +202,7 @@ impl Run for Args {
         {
             context.warn(format!("{lost} depths do not fit 0 to 65.535 m and are stored as unknown"));
         }
+        self.write_quality(&job, context)?;
         let points = match (&job.geometry, depth) {
             (Some(geometry), Some(depth)) if self.cloud.is_some() || context.wants_report() => {
                 geometry.cloud(depth.view(), job.left.view())
@@ -244,10 +277,13 @@ impl Args {
             || self.depth.is_some()
             || self.cloud.is_some()
             || self.rig.is_some()
+            || self.confidence.is_some()
+            || self.matched.is_some()
+            || self.uncertainty.is_some()
             || context.wants_report()
         {
             return Err(Failure::usage("frames give disparities only")
-                .advice("leave out --rig, --depth, --cloud and --report, and give the number of disparities"));
+                .advice("leave out --rig, --depth, --cloud, --confidence, --matched, --uncertainty and --report, and give the number of disparities"));
         }
         let (lefts, rights) = (frames(&self.left)?, frames(&self.right)?);
         if lefts.len() != rights.len() {
@@ -260,12 +296,18 @@ impl Args {
         }
         let mut matcher = StereoMatcher::new(self.options().stereo)?;
         let mut map = DisparityMap::empty();
+        let mut said = (0, 0);
         let (mut seconds, mut valid) = (0.0, 0.0);
         for (i, (left, right)) in lefts.iter().zip(&rights).enumerate() {
             Progress::report(context, "frames", i, lefts.len());
             let (a, b) = (cv_io::read_rgb(left)?, cv_io::read_rgb(right)?);
+            if a.size() != said {
+                said = a.size();
+                say_memory(&matcher, said, context);
+            }
             let start = std::time::Instant::now();
             matcher.compute_into(a.view(), b.view(), &mut map).during(left.display())?;
+            check_matched(&map).map_err(explained).during(left.display())?;
             seconds += start.elapsed().as_secs_f64();
             valid += map.valid_fraction() / lefts.len() as f64;
             let name = Path::new(left.file_stem().unwrap_or_default()).with_extension("pfm");
@@ -280,6 +322,39 @@ impl Args {
             .with("height", height)
             .with("valid_fraction", valid)
             .summary(format!("{} frames of {width}×{height} px, {rate:.1} frames per second of matching", lefts.len())))
+    }
+
+    /// Confidence, origin and uncertainty, where asked for.
+    fn write_quality(&self, job: &Job, context: &Context) -> Result<(), Failure> {
+        let DepthResult { map, depth, confidence, sigma, .. } = &job.result;
+        if let (Some(path), Some(confidence)) = (&self.confidence, confidence) {
+            let grey = |path: &Path, map: ImageView<'_, f32, 1>| {
+                let bytes = cv_core::GrayU8::from_fn(map.width(), map.height(), |x, y| {
+                    [(map.at(x, y)[0] * 255.0 + 0.5) as u8]
+                });
+                cv_io::write_png(path, bytes.view()).map(|()| 0)
+            };
+            write_map(path, confidence.view(), grey)?;
+        }
+        if let Some(path) = &self.matched {
+            let matched = map.state.map(|[state]| [if state == PixelState::Matched { 255u8 } else { 0 }]);
+            cv_io::write_png(path, matched.view())?;
+        }
+        if let Some(path) = &self.uncertainty {
+            let lost = match (&job.geometry, depth) {
+                (Some(geometry), Some(depth)) => {
+                    let bars = GrayF32::from_fn(depth.width(), depth.height(), |x, y| {
+                        [geometry.depth_uncertainty(depth.at(x, y)[0], sigma.at(x, y)[0])]
+                    });
+                    write_map(path, bars.view(), |path, map| cv_io::depth_mm::write(path, map))?
+                }
+                _ => write_map(path, sigma.view(), |path, map| cv_io::kitti::write(path, map))?,
+            };
+            if let Some(lost) = lost {
+                context.warn(format!("{lost} uncertainties do not fit the format and are stored as unknown"));
+            }
+        }
+        Ok(())
     }
 
     /// Under `--disparities auto`, the range that feature matches show.
@@ -323,6 +398,19 @@ impl Args {
                 uniqueness: self.uniqueness.unwrap_or(default.uniqueness),
                 speckle_size: self.speckle_size.unwrap_or(default.speckle_size),
                 fill: !self.no_fill,
+                blend: match self.blend.as_str() {
+                    // Of the weights tried on rendered scenes and photographs, those that gave the fewest errors.
+                    "grey" => Blend::Grey { per_bit: 2, cap: 8 },
+                    "gradient" => Blend::Gradient { per_bit: 1, cap: 6 },
+                    _ => Blend::None,
+                },
+                smoothing: match self.smoothing.as_str() {
+                    "bilateral" => Smoothing::Bilateral { sigma: self.sigma.unwrap_or(24.0) },
+                    "wls" => Smoothing::LeastSquares { lambda: self.lambda, sigma: self.sigma.unwrap_or(1.5) },
+                    _ => Smoothing::None,
+                },
+                confidence: self.confidence.is_some(),
+                max_memory: self.max_memory.map(|mib| mib.saturating_mul(1 << 20)),
                 ..default
             },
             range: (self.near, self.far.unwrap_or(f32::INFINITY)),
@@ -360,6 +448,24 @@ fn job(
     Ok(Job { left: left.into_rgb8(), right: right.into_rgb8(), geometry, result })
 }
 
+/// Tells what matching will take, before it is asked for.
+fn say_memory(matcher: &StereoMatcher, (width, height): (usize, usize), context: &Context) {
+    let mib = matcher.memory(width, height) as f64 / f64::from(1 << 20);
+    context.note(format!("matching {width}×{height} px at {} disparities takes {mib:.1} MiB", matcher.options().disparities));
+}
+
+/// What to try where there is no depth.
+fn explained(error: DepthError) -> Failure {
+    let advice = match error {
+        DepthError::NoPair { .. } => {
+            "check that the pair is rectified (--rig does it), that left and right are not exchanged, and the range (--disparities, --min-disparity)"
+        }
+        DepthError::Stereo(StereoError::Memory { .. }) => "allow more memory (--max-memory), or fewer disparities",
+        _ => "see `cv depth --help` for the range of each option",
+    };
+    Failure::from(error).advice(advice)
+}
+
 fn matched<T: Intensity, const C: usize>(
     left: ImageView<'_, T, C>,
     right: ImageView<'_, T, C>,
@@ -367,7 +473,8 @@ fn matched<T: Intensity, const C: usize>(
     options: &DepthOptions,
     context: &Context,
 ) -> Result<DepthResult, Failure> {
-    depth(left, right, geometry, options, context).advice("see `cv depth --help` for the range of each option")
+    say_memory(&StereoMatcher::new(options.stereo.clone())?, left.size(), context);
+    depth(left, right, geometry, options, context).map_err(explained)
 }
 
 /// The formats a map can be written in.
@@ -416,7 +523,7 @@ fn draw_states(left: ImageView<'_, u8, 3>, states: ImageView<'_, PixelState, 1>)
 }
 
 fn report(job: &Job, points: &[CloudPoint]) -> Result<String, Failure> {
-    let DepthResult { map, depth, stages } = &job.result;
+    let DepthResult { map, depth, stages, .. } = &job.result;
     let png = |image: &RgbU8| cv_io::encode_png(image.view());
     let mut page = Report::new("Depth");
     let (width, height) = map.disparity.size();

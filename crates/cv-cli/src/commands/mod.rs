@@ -49,7 +49,7 @@ macro_rules! commands {
 
         #[derive(clap::Subcommand)]
         pub(crate) enum Command {
-            $($variant($module::Args),)*
+            $($variant(Box<$module::Args>),)*
         }
 
         impl Command {
@@ -58,7 +58,7 @@ macro_rules! commands {
                 match self {
                     $(Self::$variant(args) => {
                         crate::common::check_outputs(&args.outputs())?;
-                        args.run(context)
+                        (*args).run(context)
                     })*
                 }
             }
