@@ -13,7 +13,7 @@ use crate::{Blend, Intensity, Paths, StereoError, StereoOptions, Subpixel, media
 use cv_core::{GrayF32, Image, ImageView, Sample};
 use fearless_simd::Level;
 use rayon::prelude::*;
-use std::ops::Range;
+use std::{ops::Range, time::Instant};
 
 /// Rows beyond a strip that its paths start from: what lies farther away hardly matters.
 const OVERLAP: usize = 32;
@@ -103,6 +103,7 @@ pub struct StereoMatcher {
     holes: Holes,
     scratch: Vec<f32>,
     planes: Planes,
+    stages: [(&'static str, f64); 4],
 }
 
 impl StereoMatcher {
@@ -125,6 +126,7 @@ impl StereoMatcher {
             holes: Holes::default(),
             scratch: Vec::new(),
             planes: Planes::default(),
+            stages: Default::default(),
         })
     }
 
@@ -199,17 +201,34 @@ impl StereoMatcher {
             return Err(StereoError::SizeMismatch { left: left.size(), right: right.size() });
         }
         self.check_size(width, height)?;
+        let start = Instant::now();
         for (side, view, grey) in [("left", left, 0), ("right", right, 1)] {
             let count = to_grey(self.level, view, &mut self.grey[grey]);
             if count > 0 {
                 return Err(StereoError::NotFinite { side, count });
             }
         }
+        let prepared = Instant::now();
+        self.bits();
+        let described = Instant::now();
         self.aggregate(width, height);
+        let aggregated = Instant::now();
         map.resize(width, height);
         self.check(map);
         self.refine(map);
+        self.stages = [
+            ("grey", (prepared - start).as_secs_f64()),
+            ("bits", (described - prepared).as_secs_f64()),
+            ("aggregate", (aggregated - described).as_secs_f64()),
+            ("check", aggregated.elapsed().as_secs_f64()),
+        ];
         Ok(())
+    }
+
+    /// What the last pair took in seconds, stage by stage: grey values, description of the pixels, costs and path sums,
+    /// checks and refinement.
+    pub fn stages(&self) -> &[(&'static str, f64)] {
+        &self.stages
     }
 
     /// How sure each disparity of the last pair is, 0 to 1: how far its cost lies below the best one elsewhere; 0 where it
@@ -266,16 +285,28 @@ impl StereoMatcher {
         Ok(())
     }
 
-    /// Costs and path sums; winners of both views.
-    fn aggregate(&mut self, width: usize, height: usize) {
+    /// Length of a row of the right view's planes.
+    fn stride(&self, width: usize) -> usize {
+        Frame::right_stride(width, blocks(self.options.disparities))
+    }
+
+    /// What costs are made of.
+    fn bits(&mut self) {
+        let stride = self.stride(self.grey[0].width);
         let options = &self.options;
-        let blocks = blocks(options.disparities);
         let min_disparity = i64::from(options.min_disparity);
-        let stride = Frame::right_stride(width, blocks);
         census(self.level, &self.grey[0], options.census, &mut self.census[0]);
         census_mirrored(self.level, &self.grey[1], options.census, min_disparity, stride, &mut self.census[1]);
         blend_planes(self.level, &self.grey, options.blend, min_disparity, stride, &mut self.blend);
         self.grey[0].to_bytes(&mut self.grey8);
+    }
+
+    /// Costs and path sums; winners of both views.
+    fn aggregate(&mut self, width: usize, height: usize) {
+        let stride = self.stride(width);
+        let options = &self.options;
+        let blocks = blocks(options.disparities);
+        let min_disparity = i64::from(options.min_disparity);
         let p2 = p2_table(options);
         let cap = options.blend.cap();
         let run = |aggregator: &mut Aggregator, rows: Range<usize>| {
@@ -405,4 +436,55 @@ fn subpixel(method: Subpixel, winner: &Winner) -> f32 {
         Subpixel::None | Subpixel::VFit => ratio,
     };
     (0.5 * (1.0 - rest)).copysign(below - above)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Smoothing;
+    use crate::levels::levels;
+    use cv_core::GrayU8;
+
+    /// A textured slope before a textured wall, with a patch without texture.
+    fn pair() -> [GrayU8; 2] {
+        let noise = |x: usize, y: usize| (x * 7919 + y * 104_729 + x * y % 97 * 31).wrapping_mul(2_654_435_761) >> 13;
+        [0, 1].map(|right| {
+            GrayU8::from_fn(150, 150, |x, y| {
+                let near = (40..90).contains(&x) && y > 30;
+                let shift = if near { 12 + y / 16 } else { 3 };
+                let flat = x > 110 && y > 100;
+                [if flat { 128 } else { noise(x / 2 + right * shift / 2 + 1000 * usize::from(near), y / 2) as u8 }]
+            })
+        })
+    }
+
+    #[test]
+    fn every_instruction_set_and_number_of_threads_gives_the_same_bytes() {
+        let [left, right] = pair();
+        let smoothings = [Smoothing::None, StereoOptions::default().smoothing];
+        for (smoothing, fill) in smoothings.into_iter().flat_map(|s| [(s, true), (s, false)]) {
+            let options = StereoOptions { disparities: 40, smoothing, fill, median: 2, ..Default::default() };
+            let mut first: Option<(Vec<u32>, Vec<PixelState>)> = None;
+            for level in levels() {
+                for threads in [1, 2, 4] {
+                    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+                    let mut matcher = StereoMatcher::new(options.clone()).unwrap();
+                    matcher.level = level;
+                    let map = pool.install(|| matcher.compute(left.view(), right.view())).unwrap();
+                    let bits = map.disparity.as_slice().iter().map(|d| d.to_bits()).collect();
+                    let found = (bits, map.state.as_slice().to_vec());
+                    let expected = first.get_or_insert_with(|| found.clone());
+                    assert!(found == *expected, "{level:?}, {threads} threads, {smoothing:?}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_picture_of_one_colour_matches_nowhere() {
+        let grey = GrayU8::new(60, 40, [77]);
+        let mut matcher = StereoMatcher::new(StereoOptions { disparities: 24, ..Default::default() }).unwrap();
+        let map = matcher.compute(grey.view(), grey.view()).unwrap();
+        assert_eq!((map.matched_fraction(), map.valid_fraction()), (0.0, 0.0));
+    }
 }

@@ -1,8 +1,9 @@
 //! OpenCV's matchers, Pandora and ours on the same pairs: ours and OpenCV's in turns (A B A B) within one run, Pandora,
-//! which takes seconds, once. Writes `docs/benchmarks.md`.
+//! which takes seconds, once. Writes the section "Stereo" of `docs/benchmarks.md`.
 
 use crate::real::depth::{SCENES, Scene, truth};
 use anyhow::{Context, Result, ensure};
+use cv_core::GrayU8;
 use cv_pipeline::stereo::{DisparityMap, Paths, PixelState, StereoMatcher, StereoOptions, evaluate_disparity};
 use serde::Deserialize;
 use std::{fmt::Write as _, path::Path, process::Command, time::Instant};
@@ -62,9 +63,11 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<bool> {
         ("4 paths with all checks / OpenCV 3WAY", four / seconds("3WAY"), 0.5),
         ("memory / OpenCV HH", our_bytes / hh_bytes, 0.6),
     ];
-    let page = page(&best, &bars, our_bytes, hh_bytes, &load);
-    print!("{page}");
-    cv_io::write_bytes(crate::root().join("docs/benchmarks.md"), page.as_bytes())?;
+    let mut section = page(&best, &bars, our_bytes, hh_bytes, &load);
+    pool.install(|| scaling(&mut section))?;
+    pool.install(|| bandwidth(&mut section, &folder, motorcycle))?;
+    print!("{section}");
+    super::write_section("Stereo", &section)?;
     // NaN meets no bar.
     Ok(bars.iter().all(|(_, ratio, bar)| ratio <= bar))
 }
@@ -145,16 +148,15 @@ fn ours(folder: &Path, scene: &Scene, mode: &str, paths: Paths) -> Result<Line> 
 }
 
 fn page(lines: &[Line], bars: &[(&str, f64, f64)], our_bytes: f64, hh_bytes: f64, load: &str) -> String {
-    let mut text = String::from(
-        "# Benchmarks\n\nWritten by `cargo xtask peers stereo`; every figure comes from one run on one machine.\n\n## Stereo\n\n",
-    );
+    let mut text =
+        String::from("Written by `cargo xtask peers stereo`; every figure comes from one run on one machine.\n\n");
     let version = |mode: &str| lines.iter().find(|l| l.mode == mode).map_or("", |l| l.version.as_str());
     // `fmt::Write` on a String cannot fail.
     let _ = writeln!(
         text,
         "{}, load {load} before the run (times are lower on an idle machine; compare them as ratios). Two threads, ours and OpenCV {} in \
          turns, the fastest of {ROUNDS} × 3 warm repeats; Pandora as a whole run, once.\n",
-        machine(),
+        super::machine(),
         version("3WAY"),
     );
     text.push_str(
@@ -189,10 +191,80 @@ fn page(lines: &[Line], bars: &[(&str, f64, f64)], our_bytes: f64, hh_bytes: f64
     text
 }
 
-/// Processor and number of cores.
-fn machine() -> String {
-    let info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let name = info.lines().find_map(|line| line.strip_prefix("model name")).unwrap_or(": unknown processor");
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    format!("{}, {cores} cores", name.trim_start_matches([' ', '\t', ':']))
+/// Time per pixel and disparity from a tenth of a megapixel to eight.
+fn scaling(text: &mut String) -> Result<()> {
+    text.push_str("\n| megapixels | 8 paths, ns per pixel and disparity | 4 paths |\n|---|---|---|\n");
+    let noise = |x: usize, y: usize| (x * 7919 + y * 104_729 + x * y % 97 * 31).wrapping_mul(2_654_435_761) >> 13;
+    let mut spread = [(f64::INFINITY, 0f64); 2];
+    for (width, height) in [(366, 274), (742, 500), (1156, 866), (1634, 1224), (2312, 1730), (3264, 2450)] {
+        let pair = [0, 20].map(|shift| GrayU8::from_fn(width, height, |x, y| [noise((x + shift) / 3, y / 3) as u8]));
+        let mut figures = [0.0; 2];
+        for (i, paths) in [Paths::Eight, Paths::Four].into_iter().enumerate() {
+            let mut matcher = StereoMatcher::new(StereoOptions { paths, ..Default::default() })?;
+            let mut map = DisparityMap::empty();
+            let mut seconds = f64::INFINITY;
+            for repeat in 0..if width < 1500 { 16 } else { 5 } {
+                let start = Instant::now();
+                matcher.compute_into(pair[0].view(), pair[1].view(), &mut map)?;
+                if repeat > 0 {
+                    seconds = seconds.min(start.elapsed().as_secs_f64());
+                }
+            }
+            figures[i] = 1e9 * seconds / (width * height * matcher.options().disparities) as f64;
+            spread[i] = (spread[i].0.min(figures[i]), spread[i].1.max(figures[i]));
+        }
+        let _ = writeln!(text, "| {:.2} | {:.3} | {:.3} |", (width * height) as f64 / 1e6, figures[0], figures[1]);
+    }
+    let [a, b] = spread.map(|(low, high)| 100.0 * (high / low - 1.0));
+    let _ = writeln!(text, "\nThe slowest size is {a:.0} % (4 paths {b:.0} %) above the fastest; the bar is 15 %.");
+    Ok(())
+}
+
+/// What aggregation takes against the time to stream its memory traffic.
+fn bandwidth(text: &mut String, folder: &Path, scene: &Scene) -> Result<()> {
+    // Copies on both cores, as aggregation writes the sums once and reads them once.
+    let from = vec![1u8; 256 << 20];
+    let mut to = vec![0u8; from.len()];
+    let mut seconds = f64::INFINITY;
+    for _ in 0..5 {
+        let start = Instant::now();
+        let chunk = from.len() / 2;
+        let (a, b) = to.split_at_mut(chunk);
+        rayon::join(|| a.copy_from_slice(&from[..chunk]), || b.copy_from_slice(&from[chunk..]));
+        seconds = seconds.min(start.elapsed().as_secs_f64());
+    }
+    let rate = 2.0 * from.len() as f64 / seconds;
+    let left = cv_io::read_rgb(folder.join(scene.left))?;
+    let right = cv_io::read_rgb(folder.join(scene.right))?;
+    let traffic = 2.0 * (left.width() * left.height() * scene.disparities) as f64;
+    let _ = writeln!(
+        text,
+        "\nAggregation alone at 741×500×128: its sums are written once and read once, {:.0} MB, {:.1} ms at the {:.1} GB/s that \
+         copying on both cores reaches.",
+        traffic / 1e6,
+        1e3 * traffic / rate,
+        rate / 1e9
+    );
+    for (name, paths) in [("8", Paths::Eight), ("4", Paths::Four)] {
+        let mut matcher =
+            StereoMatcher::new(StereoOptions { disparities: scene.disparities, paths, ..Default::default() })?;
+        let mut map = DisparityMap::empty();
+        let mut best: Option<Vec<(&str, f64)>> = None;
+        for _ in 0..12 {
+            matcher.compute_into(left.view(), right.view(), &mut map)?;
+            let stages = matcher.stages().to_vec();
+            if best.as_ref().is_none_or(|b| stages[2].1 < b[2].1) {
+                best = Some(stages);
+            }
+        }
+        let stages = best.unwrap_or_default();
+        let list: Vec<String> = stages.iter().map(|(stage, s)| format!("{stage} {:.1} ms", 1e3 * s)).collect();
+        let ratio = stages.get(2).map_or(f64::NAN, |s| s.1 * rate / traffic);
+        let _ = writeln!(
+            text,
+            "{name} paths: {}; aggregation is {ratio:.1} times the streaming (the bar is 2).",
+            list.join(", ")
+        );
+    }
+    Ok(())
 }

@@ -53,10 +53,6 @@ impl Run for Args {
         let result = rectify(left.view(), right.view(), &rig, &options, context)
             .during(self.rig.display())
             .advice("check the calibration file, and that it belongs to these photographs")?;
-        create_dir(&self.out)?;
-        let at = |name: &str| self.out.join(name);
-        cv_io::write_png(at("left.png"), result.images[0].view())?;
-        cv_io::write_png(at("right.png"), result.images[1].view())?;
         let r = &result.rectification;
         let rotation = cv_core::Rotation3::identity();
         let translation = cv_core::Vector3::new(-r.geometry.baseline, 0.0, 0.0);
@@ -65,11 +61,17 @@ impl Run for Args {
             right: r.right.camera,
             right_from_left: cv_core::Pose::new(rotation, translation),
         };
-        cv_io::write_rig(at("rig.yaml"), &RigFile { rig: rectified, unit }, &["rectified"])?;
         let q = r.q();
         let rows: Vec<String> =
             q.row_iter().map(|row| row.iter().map(f64::to_string).collect::<Vec<_>>().join(" ")).collect();
-        cv_io::write_bytes(at("q.txt"), format!("{}\n", rows.join("\n")).as_bytes())?;
+        create_dir(&self.out)?;
+        all_or_none(&self.out, &["left.png", "right.png", "rig.yaml", "q.txt"], |folder| {
+            cv_io::write_png(folder.join("left.png"), result.images[0].view())?;
+            cv_io::write_png(folder.join("right.png"), result.images[1].view())?;
+            cv_io::write_rig(folder.join("rig.yaml"), &RigFile { rig: rectified, unit }, &["rectified"])?;
+            cv_io::write_bytes(folder.join("q.txt"), format!("{}\n", rows.join("\n")).as_bytes())?;
+            Ok(())
+        })?;
         context.report(|| {
             let mut page = Report::new("Rectification");
             let quality = match result.vertical_px {
@@ -109,6 +111,28 @@ impl Run for Args {
     fn outputs(&self) -> Vec<&Path> {
         Vec::new()
     }
+}
+
+/// Lets `write` write the files into a folder of its own inside `out`, and moves them up once all are there: where one
+/// cannot be written, or a folder stands where one is to go, nothing changes.
+fn all_or_none(out: &Path, names: &[&str], write: impl FnOnce(&Path) -> Result<(), Failure>) -> Result<(), Failure> {
+    for name in names {
+        let path = out.join(name);
+        if path.is_dir() {
+            return Err(Failure::new(format!("{} is a folder, not a file to write", path.display())));
+        }
+    }
+    let folder = out.join(format!(".cv-{}.part", std::process::id()));
+    create_dir(&folder)?;
+    let done = write(&folder).and_then(|()| {
+        for name in names {
+            std::fs::rename(folder.join(name), out.join(name)).during(format!("cannot write {name}"))?;
+        }
+        Ok(())
+    });
+    // Of no use any more, whether or not it worked.
+    let _ = std::fs::remove_dir_all(&folder);
+    done
 }
 
 /// Both views side by side with a line every sixteenth of the height.
