@@ -65,8 +65,9 @@ const BORDER_PIXEL: f32 = 4.0;
 /// Cost of a seam through a pixel where the photographs disagree by a canvas pixel more than one, beyond the difference of colours: 15 grey levels in
 /// one channel.
 const MISALIGNED: f32 = 4.0 * 15.0;
-/// Canvas pixels of misalignment beyond which nothing gets worse.
-const FARTHEST: f32 = 8.0;
+/// Canvas pixels of misalignment, beyond the first, after which nothing looks worse and the colours decide alone: then it costs as much as the border of a
+/// photograph.
+const FARTHEST: f32 = 3.0;
 
 /// How much two photographs differ at a pixel: sum over channels of the absolute difference, in quarters of a grey level, and the same of the
 /// gradients of brightness.
