@@ -34,6 +34,25 @@ fn a_room_comes_back_with_its_pose_and_depths() {
 }
 
 #[test]
+fn an_unknown_lens_that_bends_lines_is_found() {
+    let mut lens = camera();
+    lens.distortion = cv_core::Distortion::Radial { k1: -0.15, k2: 0.0 };
+    let views = two_view(3, &lens, 0.4, &RenderOptions::default()).unwrap();
+    let direction = |intrinsics| {
+        let options = ReconstructOptions { intrinsics, ..ReconstructOptions::default() };
+        let result = reconstruct(views.a.image.view(), views.b.image.view(), &options, &Silent).unwrap();
+        let off = direction_error(&result.pose.translation, &views.relative.translation).to_degrees();
+        (result.cameras[0].fx / 560.0 - 1.0, off)
+    };
+    // The bars of the project: five per cent, three degrees.
+    let (focal, off) = direction(Intrinsics::Unknown);
+    assert!(focal.abs() < 0.05 && off < 3.0, "{focal} {off}");
+    // A focal length that is given stays; EXIF's is good to a few per cent.
+    let (focal, off) = direction(Intrinsics::Focal([575.0; 2]));
+    assert!((focal - 575.0 / 560.0 + 1.0).abs() < 1e-12 && off < 3.0, "{focal} {off}");
+}
+
+#[test]
 fn a_camera_that_only_turned_is_told() {
     let scene = Scene::room(5);
     let first = scene.viewpoint();

@@ -16,10 +16,12 @@ pub(crate) fn run(data: &Path) -> Result<Vec<Check>> {
     let text = std::fs::read_to_string(&reference).with_context(|| reference.display().to_string())?;
     let (mut turn, mut direction, mut rms, mut points) = (0.0f64, 0.0f64, 0.0f64, usize::MAX);
     let name = |i: usize| format!("100_71{i:02}.JPG");
-    let read = |i: usize| cv_io::read_rgb(folder.join("sceaux").join(name(i)));
-    let mut first = read(0)?;
+    let read = |i: usize| cv_io::read_image(folder.join("sceaux").join(name(i)));
+    let (mut exif_direction, mut exif_focal) = (0.0f64, 0.0f64);
+    let focal = read(0)?.exif.focal.context("no focal length in EXIF")?.pixels;
+    let mut first = read(0)?.into_rgb8();
     for i in 0..PAIRS {
-        let second = read(i + 1)?;
+        let second = read(i + 1)?.into_rgb8();
         // The header holds COLMAP's camera, whose pixel centres the reader brings to ours.
         let camera = cv_io::read_camera(&reference, Some(first.size()))?;
         let options =
@@ -44,6 +46,14 @@ pub(crate) fn run(data: &Path) -> Result<Vec<Check>> {
         );
         (turn, direction) = (turn.max(turned), direction.max(moved));
         (rms, points) = (rms.max(result.reprojection_rms), points.min(result.points.len()));
+        // Without the camera: the focal length of EXIF, and the distortion that the matches show.
+        let options = ReconstructOptions { intrinsics: Intrinsics::Focal([focal; 2]), ..options };
+        let result = reconstruct(first.view(), second.view(), &options, &Silent)
+            .with_context(|| format!("{} and {} by EXIF", name(i), name(i + 1)))?;
+        let moved = cv_synth::direction_error(&result.pose.translation, &truth.translation).to_degrees();
+        println!("  by EXIF: focal length {:.0} px, direction {moved:.3}°", result.cameras[0].fx);
+        exif_direction = exif_direction.max(moved);
+        exif_focal = exif_focal.max((result.cameras[0].fx / camera.fx - 1.0).abs());
         first = second;
     }
     Ok(vec![
@@ -51,6 +61,8 @@ pub(crate) fn run(data: &Path) -> Result<Vec<Check>> {
         Check::at_most("reprojection RMS of the worst, px", rms, 0.7),
         Check::at_most("rotation of the worst, degrees", turn, 0.5),
         Check::at_most("direction of the worst, degrees", direction, 3.0),
+        Check::at_most("by EXIF: error of the focal length, %", 100.0 * exif_focal, 5.0),
+        Check::at_most("by EXIF: direction of the worst, degrees", exif_direction, 3.0),
     ])
 }
 

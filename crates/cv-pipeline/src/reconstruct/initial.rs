@@ -1,10 +1,11 @@
 //! The cameras and the first pose, from all tentative matches.
 
+use super::lens::{Found, find_lens};
 use super::{Intrinsics, ReconstructError, ReconstructOptions};
 use cv_core::{Camera, Correspondence, Pose};
 use cv_geometry::{
-    EstimateError, RobustModel, RobustOptions, essential_from_fundamental, estimate_fundamental,
-    estimate_relative_pose, normalize_matches, pose_difference, poses_are_rivals, recover_pose, refine_relative_pose,
+    EstimateError, RobustModel, RobustOptions, estimate_relative_pose, normalize_matches, pose_difference,
+    poses_are_rivals, refine_relative_pose,
 };
 use rayon::prelude::*;
 
@@ -31,8 +32,15 @@ pub(super) fn cameras(
     Ok(Some(cameras))
 }
 
-/// Cameras, pose, and the matches that agree.
-type Initial = ([Camera; 2], Pose, Vec<usize>);
+/// A first guess at the geometry.
+pub(super) struct Initial {
+    pub(super) cameras: [Camera; 2],
+    pub(super) pose: Pose,
+    /// The matches that agree, ascending.
+    pub(super) inliers: Vec<usize>,
+    /// Largest relative change of the focal length that the matches do not exclude; 0 where it was given.
+    pub(super) focal_range: f64,
+}
 
 pub(super) fn initial(
     pairs: &[Correspondence],
@@ -40,15 +48,18 @@ pub(super) fn initial(
     prior: Option<[Camera; 2]>,
     options: &ReconstructOptions,
 ) -> Result<Initial, ReconstructError> {
-    let (cameras, pose, inliers) = match prior {
-        Some(cameras) => {
-            let (pose, inliers) = calibrated(pairs, &cameras, options)?;
-            (cameras, pose, inliers)
-        }
-        None => uncalibrated(pairs, sizes, options)?,
+    let given = match (options.intrinsics, prior) {
+        (Intrinsics::Known(_), Some(cameras)) => Some(Found { cameras, focal_range: 0.0 }),
+        (Intrinsics::Focal(focal), _) => find_lens(pairs, sizes, Some(focal), &options.robust),
+        _ => find_lens(pairs, sizes, None, &options.robust),
     };
-    enough(inliers.len(), pairs.len(), options)?;
-    Ok((cameras, pose, inliers))
+    // Where no lens has a pose, the search with an ordinary one says why.
+    let longest = sizes[0].0.max(sizes[0].1) as f64;
+    let ordinary = || sizes.map(|(width, height)| Camera::from_focal(width, height, 1.2 * longest));
+    let Found { cameras, focal_range } =
+        given.unwrap_or_else(|| Found { cameras: prior.unwrap_or_else(ordinary), focal_range: 0.0 });
+    let (pose, inliers) = calibrated(pairs, &cameras, options)?;
+    Ok(Initial { cameras, pose, inliers, focal_range })
 }
 
 /// Refuses where fewer agree than were asked for.
@@ -114,30 +125,4 @@ fn failed(error: EstimateError, matches: usize, options: &ReconstructOptions) ->
         }
         other => ReconstructError::Estimate(other),
     }
-}
-
-/// Tries focal lengths on the inliers of a fundamental matrix and keeps the one whose essential matrix fits best.
-fn uncalibrated(
-    pairs: &[Correspondence],
-    sizes: [(usize, usize); 2],
-    options: &ReconstructOptions,
-) -> Result<Initial, ReconstructError> {
-    let found = estimate_fundamental(pairs, &options.robust).map_err(|error| failed(error, pairs.len(), options))?;
-    let chosen: Vec<Correspondence> = found.inliers.iter().map(|&i| pairs[i]).collect();
-    let (mut best, mut cameras, mut pose) = (f64::INFINITY, None, Pose::identity());
-    let longest = sizes[0].0.max(sizes[0].1) as f64;
-    // From 100 to 10 degrees of view, in steps of a tenth: refinement bridges half a step.
-    for k in 0..25 {
-        let focal = 0.4 * longest * 1.12f64.powi(k);
-        let pair = sizes.map(|(width, height)| Camera::from_focal(width, height, focal));
-        let Ok(e) = essential_from_fundamental(&found.model, &pair[0], &pair[1]) else { continue };
-        let (normalised, unit) = normalize_matches(&chosen, &pair[0], &pair[1]);
-        let Ok(recovered) = recover_pose(&e, &normalised) else { continue };
-        let (refined, loss) = refine_relative_pose(&recovered.pose, &normalised, options.robust.threshold * unit);
-        if loss < best {
-            (best, cameras, pose) = (loss, Some(pair), refined);
-        }
-    }
-    let cameras = cameras.ok_or(ReconstructError::UnknownFocal { focal: f64::NAN, deviation: f64::INFINITY })?;
-    Ok((cameras, pose, found.inliers))
 }

@@ -2,9 +2,10 @@
 
 mod error;
 mod initial;
+mod lens;
 
 pub use error::ReconstructError;
-use initial::{cameras, initial};
+use initial::{Initial, cameras, initial};
 
 use crate::guided::{GuidedOptions, match_along_lines};
 use crate::{MatchingError, MatchingOptions, MatchingResult, Progress, Stopwatch, correspondences, match_photos};
@@ -21,9 +22,10 @@ use cv_imgproc::resize_area;
 pub enum Intrinsics {
     /// Both cameras are calibrated.
     Known([Camera; 2]),
-    /// A focal length in pixels for each photograph, such as from EXIF; principal points in the middle, no distortion.
+    /// A focal length in pixels for each photograph, such as from EXIF; principal points in the middle;
+    /// radial distortion is estimated where it shows.
     Focal([f64; 2]),
-    /// One unknown focal length for both photographs; principal points in the middle, no distortion.
+    /// One unknown focal length for both photographs; principal points in the middle; radial distortion is estimated where it shows.
     Unknown,
 }
 
@@ -169,7 +171,7 @@ pub fn reconstruct(
     {
         simple.check(*inliers, options)?;
     }
-    let (cameras, pose, inliers) = found?;
+    let Initial { cameras, pose, inliers, focal_range } = found?;
     simple.check(inliers.len(), options)?;
     let planar_share = simple.planar as f64 / inliers.len() as f64;
     let chosen: Vec<Correspondence> = inliers.iter().map(|&i| pairs[i]).collect();
@@ -207,9 +209,10 @@ pub fn reconstruct(
     let Fit { bundle, observed, report } = fit;
     let pose_deviation = [0, 1].map(|i| stability[i].max(report.pose_deviation[i]));
     let focal = bundle.cameras[0].fx;
-    // Beyond a third, the shape of the scene is a guess.
-    if settings.refine_focal && report.focal_deviation > 0.33 {
-        return Err(ReconstructError::UnknownFocal { focal, deviation: report.focal_deviation });
+    let focal_deviation = report.focal_deviation.max(focal_range / 2.0);
+    // Beyond a third either way, the shape of the scene is a guess.
+    if focal_deviation > 0.165 {
+        return Err(ReconstructError::UnknownFocal { focal, deviation: focal_deviation });
     }
 
     let mut scene = Vec::new();
@@ -258,7 +261,7 @@ pub fn reconstruct(
         points: scene,
         median_angle,
         pose_deviation,
-        focal_deviation: report.focal_deviation,
+        focal_deviation,
         planar_share,
         matching,
         stages: watch.into_stages(),
