@@ -5,6 +5,7 @@
 
 mod feature_quality;
 mod features;
+mod geometry;
 mod stereo;
 
 use anyhow::{Context, Result, bail, ensure};
@@ -16,7 +17,7 @@ use std::{
 /// A job: its name on the command line and what it does with the Python of the peers and the data folder.
 type Job = (&'static str, fn(&Path, &Path) -> Result<bool>);
 
-const JOBS: &[Job] = &[("stereo", stereo::run), ("features", features::run)];
+const JOBS: &[Job] = &[("stereo", stereo::run), ("features", features::run), ("geometry", geometry::run)];
 
 /// Runs all jobs, or the one named; true where ours meets every bar.
 pub(crate) fn run(only: Option<&str>) -> Result<bool> {

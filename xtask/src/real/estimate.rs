@@ -49,15 +49,15 @@ pub(super) fn run(data: &Path) -> Result<Vec<Check>> {
 }
 
 /// A pair of images' annotated matches.
-pub(super) struct Pair {
-    pub(super) name: String,
-    tentative: Vec<Correspondence>,
-    pub(super) checked: Vec<Correspondence>,
+pub(crate) struct Pair {
+    pub(crate) name: String,
+    pub(crate) tentative: Vec<Correspondence>,
+    pub(crate) checked: Vec<Correspondence>,
 }
 
 /// Reads the `NAME_pts.txt` that have a `NAME_model.txt` beside them, as the peers' script does: rows
 /// `x1 y1 1 x2 y2 1 label`.
-pub(super) fn load(folder: &Path) -> Result<Vec<Pair>> {
+pub(crate) fn load(folder: &Path) -> Result<Vec<Pair>> {
     let mut pairs = Vec::new();
     for entry in std::fs::read_dir(folder).with_context(|| folder.display().to_string())? {
         let path = entry?.path();
@@ -82,7 +82,7 @@ pub(super) fn load(folder: &Path) -> Result<Vec<Pair>> {
 }
 
 /// Symmetric transfer RMS of a homography, Sampson RMS of a fundamental matrix, in px.
-pub(super) fn rms(kind: ModelKind, m: &Matrix3<f64>, points: &[Correspondence]) -> f64 {
+pub(crate) fn rms(kind: ModelKind, m: &Matrix3<f64>, points: &[Correspondence]) -> f64 {
     let h = |p: cv_core::Point2<f64>| Vector3::new(p.x, p.y, 1.0);
     let sum: f64 = match kind {
         ModelKind::Homography => {
@@ -105,7 +105,7 @@ pub(super) fn rms(kind: ModelKind, m: &Matrix3<f64>, points: &[Correspondence]) 
 }
 
 /// The mean over k = 1 … 10 of the share of errors below k px.
-pub(super) fn mean_average_accuracy(errors: &[f64]) -> f64 {
+pub(crate) fn mean_average_accuracy(errors: &[f64]) -> f64 {
     let below = |k: f64| errors.iter().filter(|e| **e < k).count() as f64 / errors.len() as f64;
     (1..=10).map(|k| below(f64::from(k))).sum::<f64>() / 10.0
 }

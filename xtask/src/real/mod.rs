@@ -4,7 +4,7 @@
 //! A figure that is off its bar fails the run; so does an error. Jobs print what else a person wants to see.
 
 pub(crate) mod depth;
-mod estimate;
+pub(crate) mod estimate;
 mod matching;
 mod panorama;
 mod reconstruct;
