@@ -39,7 +39,8 @@ impl Default for MultiScaleOptions {
 pub struct MopsOptions {
     /// Largest number of features; the strongest stay. 1 or more; default 2000.
     pub max_features: usize,
-    /// Where the corners come from.
+    /// Where the corners come from. Default two scales per octave, every corner at every scale where it is one (as Brown, Szeliski & Winder): points come back from
+    /// other viewpoints more often than those at a scale of their own.
     pub corners: MultiScaleOptions,
     /// Side of the window in units of the keypoint's scale; its 64 samples lie an eighth of it apart, in an image smoothed by half of that distance. 8 to 100; default 40
     /// (Brown, Szeliski & Winder).
@@ -56,7 +57,7 @@ impl Default for MopsOptions {
     fn default() -> Self {
         Self {
             max_features: 2000,
-            corners: MultiScaleOptions::default(),
+            corners: MultiScaleOptions { layers: 2, laplacian: false, ..MultiScaleOptions::default() },
             window: 40.0,
             orientation_sigma: 4.5,
             upright: false,

@@ -1,0 +1,77 @@
+//! `cargo bench -p cv-features`: the stages on a generated 1333×750 image, and matching on generated descriptors.
+
+use cv_core::{GrayF32, Keypoint};
+use cv_features::{
+    DescriptorKind, Descriptors, HarrisOptions, MatchOptions, MopsOptions, SiftOptions, anms, anms_square_covering,
+    harris, harris_response, match_descriptors, mops, sift,
+};
+use std::{hint::black_box, time::Instant};
+
+/// Squares of random grey at several sizes: corners and blobs at all scales.
+fn image() -> GrayF32 {
+    let cell = |x: usize, y: usize, size: usize| {
+        let mut v =
+            ((x / size) as u32).wrapping_mul(0x9E37_79B9) ^ ((y / size + size) as u32).wrapping_mul(0x85EB_CA6B);
+        v = (v ^ (v >> 15)).wrapping_mul(0x2C1B_3C6D);
+        v = (v ^ (v >> 12)).wrapping_mul(0x297A_2D39);
+        ((v ^ (v >> 15)) >> 8) as f32 / (1 << 24) as f32
+    };
+    GrayF32::from_fn(1333, 750, |x, y| [[3, 7, 13, 29, 61].map(|size| cell(x, y, size)).iter().sum::<f32>() / 5.0])
+}
+
+/// Numbers from 0 to 1, always the same.
+fn random(state: &mut u32) -> f32 {
+    *state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+    (*state >> 8) as f32 / (1 << 24) as f32
+}
+
+fn detection() {
+    let image = image();
+    let options = HarrisOptions::default();
+    bench("harris_response 1333x750", || harris_response(image.view(), &options));
+    bench("harris 1333x750", || harris(image.view(), &options));
+    let mut state = 1;
+    let corners: Vec<Keypoint> = (0..20_000)
+        .map(|_| Keypoint::new(1333.0 * random(&mut state), 750.0 * random(&mut state), random(&mut state).powi(3)))
+        .collect();
+    bench("anms 20000 to 500", || anms(&corners, 500, 0.9));
+    bench("anms_square_covering 20000 to 500", || anms_square_covering(&corners, 500));
+    let (settings, oriented) = (SiftOptions { max_features: 2000, ..SiftOptions::default() }, MopsOptions::default());
+    bench("sift 2000 of 1333x750", || sift(image.view(), &settings));
+    bench("mops 2000 of 1333x750", || mops(image.view(), &oriented));
+}
+
+fn matching() {
+    let mut state = 1;
+    let options = MatchOptions { ratio: None, ..MatchOptions::default() };
+    for (count, kind) in [(2000, DescriptorKind::Patch), (8192, DescriptorKind::RootSift)] {
+        let mut set = || (0..count * kind.dimension()).map(|_| random(&mut state)).collect::<Vec<f32>>();
+        let empty = || Descriptors::new(kind);
+        let pair = [set(), set()].map(|data| Descriptors::from_vec(kind, data).unwrap_or_else(empty));
+        let name = format!("two nearest {count}x{count}x{}", kind.dimension());
+        bench(&name, || match_descriptors(&pair[0], &pair[1], &options));
+    }
+}
+
+/// The fastest and the middle one of some warm runs. (No benchmark library: criterion needs a C compiler.)
+fn bench<R>(name: &str, call: impl Fn() -> R) {
+    black_box(call());
+    let mut times: Vec<f64> = (0..15)
+        .map(|_| {
+            let start = Instant::now();
+            black_box(call());
+            1e3 * start.elapsed().as_secs_f64()
+        })
+        .collect();
+    times.sort_by(f64::total_cmp);
+    println!("{name:44} {:8.3} ms, middle {:8.3} ms", times[0], times[times.len() / 2]);
+}
+
+fn main() {
+    // `cargo bench` says so; `cargo test --all-targets` only asks whether it builds and starts.
+    if !std::env::args().any(|a| a == "--bench") {
+        return;
+    }
+    detection();
+    matching();
+}
