@@ -156,3 +156,142 @@ fn what_cannot_be_done_is_said_and_nothing_is_written() {
     );
     usage(&["eval", "disparity", "--estimate", "truth.pfm", "--truth", "truth.pfm", "--truth-scale", "0"]);
 }
+
+#[test]
+fn what_a_disparity_is_worth_comes_out_too() {
+    let folder = pair();
+    let ran = done(
+        folder.path(),
+        &[
+            "depth",
+            "left.png",
+            "right.png",
+            "-o",
+            "d.pfm",
+            "--focal",
+            "210",
+            "--baseline",
+            "0.25",
+            "--confidence",
+            "c.pfm",
+            "--matched",
+            "m.png",
+            "--uncertainty",
+            "u.pfm",
+            "--disparities",
+            "70",
+        ],
+    );
+    // Said before the work.
+    assert!(ran.stderr.contains("240×180 px at 70 disparities takes ") && ran.stderr.contains("MiB"), "{ran:?}");
+    let read = |name: &str| cv_io::pfm::read(folder.path().join(name)).unwrap();
+    let (d, c, u) = (read("d.pfm"), read("c.pfm"), read("u.pfm"));
+    let m = cv_io::read_gray_u8(folder.path().join("m.png")).unwrap();
+    let mut matched = 0;
+    for (x, y) in (0..180).flat_map(|y| (0..240).map(move |x| (x, y))) {
+        let is_matched = m.at(x, y)[0] == 255;
+        matched += usize::from(is_matched);
+        let (confidence, bar) = (c.at(x, y)[0], u.at(x, y)[0]);
+        // Every pixel has a disparity, those on the left border too; filled ones have no confidence and no error bar.
+        assert!(d.at(x, y)[0].is_finite());
+        assert!(if is_matched {
+            (0.0..=1.0).contains(&confidence) && bar > 0.0
+        } else {
+            confidence == 0.0 && bar.is_nan()
+        });
+    }
+    assert!(matched > 240 * 180 / 2 && matched < 240 * 180);
+}
+
+#[test]
+fn costs_smoothing_ranges_and_memory_can_be_chosen() {
+    let folder = pair();
+    let score = |more: &[&str]| {
+        done(folder.path(), &[&["depth", "left.png", "right.png", "-o", "d.pfm"], more].concat());
+        let scores = json(folder.path(), &["eval", "disparity", "--estimate", "d.pfm", "--truth", "truth.pfm"]);
+        scores["all"]["bad"]["2.0"].as_f64().unwrap()
+    };
+    for more in [
+        &["--blend", "grey"] as &[&str],
+        &["--blend", "gradient", "--census", "7"],
+        &["--smoothing", "none", "--census", "9"],
+        &["--smoothing", "wls", "--lambda", "10"],
+        &["--min-disparity", "-13", "--disparities", "77", "--paths", "4"],
+        &["--min-disparity", "3", "--disparities", "61"],
+        &["--max-memory", "6", "--disparities", "64"],
+    ] {
+        // Hidden pixels are counted: as for the range found from the pictures above.
+        let bad = score(more);
+        assert!(bad < 0.2, "{more:?}: {bad}");
+    }
+    refused(folder.path(), &["depth", "left.png", "right.png", "-o", "x.pfm", "--max-memory", "1"]);
+}
+
+#[test]
+fn grey_and_sixteen_bits_match_as_colour_does() {
+    let folder = pair();
+    let at = |name: &str| folder.path().join(name);
+    for side in ["left", "right"] {
+        let rgb = cv_io::read_rgb(at(&format!("{side}.png"))).unwrap();
+        let grey = rgb.map(|[r, g, b]| [((u32::from(r) * 299 + u32::from(g) * 587 + u32::from(b) * 114) / 1000) as u8]);
+        cv_io::write_png(at(&format!("{side}8.png")), grey.view()).unwrap();
+        cv_io::write_png(at(&format!("{side}16.png")), grey.map(|[v]| [u16::from(v) * 257]).view()).unwrap();
+    }
+    for bits in ["8", "16"] {
+        let (left, right, out) = (format!("left{bits}.png"), format!("right{bits}.png"), format!("d{bits}.pfm"));
+        done(folder.path(), &["depth", &left, &right, "-o", &out]);
+    }
+    // Sixteen bits that say the same as eight give the same map.
+    assert!(std::fs::read(at("d8.pfm")).unwrap() == std::fs::read(at("d16.pfm")).unwrap());
+    let scores = json(folder.path(), &["eval", "disparity", "--estimate", "d16.pfm", "--truth", "truth.pfm"]);
+    assert!(scores["all"]["bad"]["2.0"].as_f64().unwrap() < 0.2, "{scores}");
+}
+
+#[test]
+fn what_is_no_pair_is_refused_with_what_to_try() {
+    let folder = pair();
+    cv_io::write_png(folder.path().join("grey.png"), RgbU8::new(240, 180, [99; 3]).view()).unwrap();
+    for (left, right) in [("grey.png", "grey.png"), ("grey.png", "right.png")] {
+        let ran = refused(folder.path(), &["depth", left, right, "-o", "out.pfm"]);
+        assert!(ran.stderr.contains("matched and confirmed") && ran.stderr.contains("rectified"), "{ran:?}");
+    }
+    assert!(!folder.path().join("out.pfm").exists());
+}
+
+/// Peak resident memory of a command in KiB, as the kernel counts it.
+#[cfg(target_os = "linux")]
+fn peak_of_frames(frames: usize) -> f64 {
+    let folder = pair();
+    for side in ["left", "right"] {
+        std::fs::create_dir(folder.path().join(side)).unwrap();
+        for frame in 0..frames {
+            let to = folder.path().join(format!("{side}/{frame}.png"));
+            std::fs::copy(folder.path().join(format!("{side}.png")), to).unwrap();
+        }
+    }
+    std::fs::create_dir(folder.path().join("out")).unwrap();
+    let mut child = support::cv(folder.path())
+        .args(["depth", "left", "right", "-o", "out", "--quiet", "--threads", "2"])
+        .spawn()
+        .unwrap();
+    let status = format!("/proc/{}/status", child.id());
+    let mut peak = 0.0f64;
+    while child.try_wait().unwrap().is_none() {
+        // Gone between the two calls: it has ended.
+        let text = std::fs::read_to_string(&status).unwrap_or_default();
+        let line = text.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap_or("0");
+        peak = peak.max(line.trim().trim_end_matches(" kB").trim().parse().unwrap_or(0.0));
+        std::thread::sleep(std::time::Duration::from_millis(2));
+    }
+    assert_eq!(std::fs::read_dir(folder.path().join("out")).unwrap().count(), frames);
+    peak
+}
+
+#[test]
+#[cfg(target_os = "linux")]
+fn many_frames_take_the_memory_of_few() {
+    let (few, many) = (peak_of_frames(6), peak_of_frames(60));
+    // A frame's buffers are 9 MB, its pictures 0.3 MB: 54 further frames would add 16 MB at the least if anything of
+    // them were kept.
+    assert!(few > 1000.0 && many < few + 8192.0, "{few} and {many} KiB");
+}
