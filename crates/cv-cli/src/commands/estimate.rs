@@ -116,8 +116,12 @@ impl Run for Args {
         let matches = cv_io::read_matches(&self.matches)?;
         let cameras = self.cameras()?;
         let name = self.model.name();
-        let kind = if matches!(self.model, Model::Homography) { ModelKind::Homography } else { ModelKind::Fundamental };
-        let mut options = RobustOptions { confidence: self.confidence, ..kind.options() };
+        let (kind, options) = match self.model {
+            Model::Homography => (ModelKind::Homography, RobustOptions::homography()),
+            Model::Fundamental => (ModelKind::Fundamental, RobustOptions::fundamental()),
+            Model::Essential => (ModelKind::Fundamental, RobustOptions::essential()),
+        };
+        let mut options = RobustOptions { confidence: self.confidence, ..options };
         options.max_iterations = self.max_iterations.unwrap_or(options.max_iterations);
         if let Some(threshold) = self.threshold {
             options.threshold = threshold;

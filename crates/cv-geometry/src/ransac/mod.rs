@@ -167,7 +167,8 @@ impl<'a, E: Estimator, C: Scorer> Judge<'a, E, C> {
     /// Local optimisation: `model` after refinement, where that lowered the loss below `score`'s.
     fn improve(&self, model: &mut E::Model, score: &mut Score, iterations: usize) {
         let mut start = model.clone();
-        for k in (1..=E::WIDENINGS).rev() {
+        let widenings = if C::WIDENS { E::WIDENINGS } else { 0 };
+        for k in (1..=widenings).rev() {
             let wide = self.threshold * f64::from(1u32 << k);
             if let Some(better) = self.estimator.refine(&start, self.scorer, wide, WIDE_STEPS) {
                 start = better;

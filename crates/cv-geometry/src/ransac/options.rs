@@ -70,9 +70,11 @@ impl RobustOptions {
     }
 
     /// Defaults for essential matrices and poses: threshold 1, to be multiplied by one over the focal length where matches are in normalised
-    /// coordinates; 50 000 samples at most (enough for four fifths of wrong matches).
+    /// coordinates; 1000 samples at least and 50 000 at most (enough for four fifths of wrong matches), judged by [`Scoring::Msac`]: of the
+    /// two losses that with the smaller errors on generated poses with up to 95 % of wrong matches.
     pub fn essential() -> Self {
-        Self { threshold: 1.0, max_iterations: 50_000, ..Self::default() }
+        let (min_iterations, max_iterations) = (1000, 50_000);
+        Self { threshold: 1.0, min_iterations, max_iterations, scoring: Scoring::Msac, ..Self::default() }
     }
 
     pub(crate) fn check(&self) -> Result<(), EstimateError> {
