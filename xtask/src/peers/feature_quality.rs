@@ -6,7 +6,7 @@
 
 use super::features::Random;
 use anyhow::{Context, Result, ensure};
-use cv_core::{DMatch, GrayF32, GrayU8, Keypoint, Matrix3, Point2, Vector3};
+use cv_core::{DMatch, GrayU8, ImageView, Keypoint, Matrix3, Point2, Vector3};
 use cv_features::{
     DescriptorKind, Descriptors, FeatureError, MatchOptions, MopsOptions, SiftOptions, match_descriptors, sift,
 };
@@ -107,7 +107,7 @@ pub(super) fn run(python: &Path, script: &Path, data: &Path) -> Result<Quality> 
         let sets = vec![
             Set { keypoints: of_sift.keypoints, rows: Rows::Floats(of_sift.descriptors) },
             read(&features_of(&path, "sift"), false)?,
-            mops(&float, COUNT)?,
+            mops(float.view(), COUNT)?,
             read(&features_of(&path, "orb"), true)?,
         ];
         found.insert(path, (image.size(), sets));
@@ -149,8 +149,8 @@ fn features_of(picture: &Path, name: &str) -> PathBuf {
 }
 
 /// Our counterpart of ORB.
-pub(super) fn mops(image: &GrayF32, count: usize) -> Result<Set, FeatureError> {
-    let found = cv_features::mops(image.view(), &MopsOptions { max_features: count, ..MopsOptions::default() })?;
+pub(super) fn mops(image: ImageView<'_, f32, 1>, count: usize) -> Result<Set, FeatureError> {
+    let found = cv_features::mops(image, &MopsOptions { max_features: count, ..MopsOptions::default() })?;
     Ok(Set { keypoints: found.keypoints, rows: Rows::Floats(found.descriptors) })
 }
 
