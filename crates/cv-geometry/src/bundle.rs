@@ -1,6 +1,7 @@
 //! Two-view bundle adjustment.
 
 use crate::essential::tangent_of;
+use crate::rotation::orthonormalized;
 use cv_core::{Camera, Correspondence, Matrix3, Point2, Point3, Pose, Rotation3, Vector3};
 use cv_numeric::{RobustLoss, solve_positive_definite};
 use nalgebra::{Matrix2, Matrix2x3, SMatrix, SVector};
@@ -213,7 +214,11 @@ pub fn adjust_two_views(
         let mut moved = bundle.clone();
         let [tu, tv] = tangent_of(&bundle.pose.translation);
         moved.pose.rotation *= Rotation3::new(Vector3::new(step[0], step[1], step[2]));
-        moved.pose.rotation.renormalize();
+        let Some(rotation) = orthonormalized(&moved.pose.rotation) else {
+            damping *= 10.0;
+            continue;
+        };
+        moved.pose.rotation = rotation;
         moved.pose.translation = (bundle.pose.translation + tu * step[3] + tv * step[4]).normalize();
         if options.refine_focal {
             for camera in &mut moved.cameras {

@@ -30,6 +30,7 @@ mod homography;
 mod pairs;
 mod ransac;
 mod robust;
+mod rotation;
 #[cfg(test)]
 mod testing;
 mod triangulation;

@@ -12,6 +12,7 @@ use crate::error::{Degeneracy, EstimateError};
 use crate::pairs::LANES;
 use crate::ransac::{Estimator, Marginal, RobustOptions, Scorer, ransac};
 use crate::robust::RobustModel;
+use crate::rotation::orthonormalized;
 use cv_core::{Matrix3, Point2, Point3, Pose, Rotation3, Vector3};
 use cv_numeric::{LeastSquares, LmOptions, NormalEquations, levenberg_marquardt};
 use nalgebra::{Const, Matrix2x3, SVector};
@@ -153,9 +154,8 @@ impl<C: Scorer> LeastSquares for ReprojectionProblem<'_, C> {
 fn refine<C: Scorer>(problem: &ReprojectionProblem<'_, C>, start: &Pose, iterations: usize) -> Option<Pose> {
     let options = LmOptions { max_iterations: iterations, cost_tolerance: 1e-6, ..LmOptions::default() };
     let report = levenberg_marquardt(problem, *start, &options);
-    let mut pose = report.params;
-    pose.rotation.renormalize();
-    (report.cost < report.initial_cost).then_some(pose)
+    let rotation = orthonormalized(&report.params.rotation)?;
+    (report.cost < report.initial_cost).then(|| Pose::new(rotation, report.params.translation))
 }
 
 /// [`LANES`] matches, coordinate by coordinate; missing ones are NaN.

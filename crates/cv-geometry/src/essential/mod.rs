@@ -16,6 +16,7 @@ use crate::error::{Degeneracy, EstimateError};
 use crate::pairs::{LANES, Normalizer, PairBlock, PairSet, check, point_degeneracy};
 use crate::ransac::{Estimator, Marginal, RobustOptions, Scorer, ransac};
 use crate::robust::RobustModel;
+use crate::rotation::orthonormalized;
 use cv_core::{Camera, Correspondence, Matrix3, Point2, Pose, Rotation3, Vector3};
 use cv_numeric::{LeastSquares, svd3};
 use decompose::rotations_and_translation;
@@ -69,9 +70,13 @@ pub fn estimate_essential(
 pub fn refine_relative_pose(pose: &Pose, matches: &[Correspondence], threshold: f64) -> (Pose, f64) {
     let pairs: Vec<[f64; 4]> = matches.iter().map(|m| [m.a.x, m.a.y, m.b.x, m.b.y]).collect();
     let problem = SampsonProblem::new(&pairs, &Marginal, threshold);
-    let mut refined = refine_sampson(&problem, *pose, 30).unwrap_or(*pose);
-    refined.rotation.renormalize();
+    let refined = refine_sampson(&problem, *pose, 30).and_then(straightened).unwrap_or(*pose);
     (refined, problem.cost(&refined))
+}
+
+/// A pose with its rotation made one again after many small turns.
+fn straightened(pose: Pose) -> Option<Pose> {
+    Some(Pose::new(orthonormalized(&pose.rotation)?, pose.translation))
 }
 
 /// The rotation that best turns the rays of the first camera into those of the second (Kabsch 1976 on unit rays, reweighted
@@ -203,9 +208,7 @@ impl Estimator for PoseEstimator {
 
     fn refine<C: Scorer>(&self, model: &Pose, scorer: &C, threshold: f64, iterations: usize) -> Option<Pose> {
         let problem = SampsonProblem::new(&self.set.pairs, scorer, threshold);
-        let mut pose = refine_sampson(&problem, *model, iterations)?;
-        pose.rotation.renormalize();
-        Some(pose)
+        refine_sampson(&problem, *model, iterations).and_then(straightened)
     }
 }
 
