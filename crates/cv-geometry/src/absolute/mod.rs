@@ -256,6 +256,7 @@ impl Estimator for AbsoluteEstimator {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ransac::AllIn;
     use crate::testing::{TwoViews, gauss, uniform};
     use rand_chacha::ChaCha8Rng;
     use rand_chacha::rand_core::SeedableRng;
@@ -289,18 +290,6 @@ mod tests {
 
     #[test]
     fn derivatives_are_those_of_the_cost() {
-        struct AllIn;
-        impl Scorer for AllIn {
-            fn loss(&self, u: f32) -> f32 {
-                u
-            }
-            fn weight(&self, _: f64) -> f64 {
-                1.0
-            }
-            fn cutoff(&self) -> f64 {
-                f64::INFINITY
-            }
-        }
         let (views, m) = world(3, 20, 1e-2);
         let problem = ReprojectionProblem { matches: &m, scorer: &AllIn, threshold: 1.0 };
         let gradient = problem.linearize(&views.pose).gradient;

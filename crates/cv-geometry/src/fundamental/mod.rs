@@ -136,24 +136,10 @@ impl Estimator for FundamentalEstimator {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ransac::AllIn;
     use crate::testing::{TwoViews, cosine};
     use cv_numeric::LeastSquares as _;
     use proptest::prelude::*;
-
-    /// Plain least squares.
-    struct AllIn;
-
-    impl Scorer for AllIn {
-        fn loss(&self, u: f32) -> f32 {
-            u
-        }
-        fn weight(&self, _: f64) -> f64 {
-            1.0
-        }
-        fn cutoff(&self) -> f64 {
-            f64::INFINITY
-        }
-    }
 
     fn points<const N: usize>(m: &[Correspondence]) -> ([Point2<f64>; N], [Point2<f64>; N]) {
         (std::array::from_fn(|i| m[i].a), std::array::from_fn(|i| m[i].b))

@@ -9,6 +9,7 @@ pub use four_point::homography_four_point;
 
 use crate::error::EstimateError;
 use crate::pairs::{LANES, PairBlock, PairSet, point_degeneracy};
+use crate::ransac::AllIn;
 use crate::ransac::{Estimator, Marginal, RobustOptions, Scorer, ransac};
 use crate::robust::RobustModel;
 use cv_core::{Correspondence, Matrix3, Point2};
@@ -89,21 +90,6 @@ pub fn refine_homography(h: &Matrix3<f64>, matches: &[Correspondence]) -> Result
 pub(crate) fn refine_on_plane(pairs: &[[f64; 4]], h: &Matrix3<f64>, threshold: f64) -> Matrix3<f64> {
     let problem = TransferProblem { pairs, scorer: &Marginal, threshold };
     refine_transfer(&problem, h, 10).unwrap_or(*h)
-}
-
-/// Plain least squares.
-struct AllIn;
-
-impl Scorer for AllIn {
-    fn loss(&self, u: f32) -> f32 {
-        u
-    }
-    fn weight(&self, _: f64) -> f64 {
-        1.0
-    }
-    fn cutoff(&self) -> f64 {
-        f64::INFINITY
-    }
 }
 
 struct HomographyEstimator {

@@ -6,6 +6,7 @@ mod scorer;
 
 pub use options::{RobustOptions, Sampling, Scoring};
 pub use sampler::{Prosac, Sampler, Uniform};
+pub(crate) use scorer::AllIn;
 pub use scorer::{Marginal, Msac, Scorer};
 
 use crate::EstimateError;

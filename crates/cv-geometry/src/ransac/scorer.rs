@@ -16,6 +16,21 @@ pub trait Scorer: Sync {
     fn cutoff(&self) -> f64;
 }
 
+/// Plain least squares: for matches that are all taken to be right.
+pub(crate) struct AllIn;
+
+impl Scorer for AllIn {
+    fn loss(&self, u: f32) -> f32 {
+        u
+    }
+    fn weight(&self, _: f64) -> f64 {
+        1.0
+    }
+    fn cutoff(&self) -> f64 {
+        f64::INFINITY
+    }
+}
+
 /// `min(u, 1)`: MSAC (Torr & Zisserman, "MLESAC", 2000, §3).
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Msac;
