@@ -1,4 +1,5 @@
-//! OpenCV's features and ours on the same photograph in turns (A B A B), then repeatability and matching on photographs and warps of known truth.
+//! OpenCV's features, those of Rust libraries and ours on the same photograph in turns (A B A B), then repeatability and matching on photographs and
+//! warps of known truth.
 //! Writes the section "Features" of `docs/benchmarks.md`.
 
 use super::feature_quality::{self, Quality};
@@ -13,7 +14,7 @@ use serde::Deserialize;
 use std::{
     fmt::Write as _,
     hint::black_box,
-    path::Path,
+    path::{Path, PathBuf},
     process::Command,
     sync::{Mutex, PoisonError},
     time::Instant,
@@ -21,12 +22,23 @@ use std::{
 
 const ROUNDS: usize = 4;
 
-/// Seconds of a stage of OpenCV's.
+/// Seconds of a stage of OpenCV's or of a Rust library's.
 #[derive(Deserialize)]
 struct Line {
     seconds: f64,
+    #[serde(default)]
     version: String,
 }
+
+/// Stages of the program in `peers/rust` by our stage's name. imageproc has no Harris and no SIFT; no bar hangs on these.
+const RUST: &[(&str, &str)] = &[
+    ("Harris response", "kornia Harris"),
+    ("500 spaced Shi-Tomasi corners", "kornia Shi-Tomasi"),
+    ("two nearest, 2000×2000×64", "kornia nearest 2000"),
+    ("2000 SIFT features", "kornia SIFT"),
+    ("2000 MOPS features", "kornia ORB"),
+    ("2000 MOPS features", "imageproc FAST and BRIEF"),
+];
 
 /// A stage of ours beside one of OpenCV's.
 struct Stage<'a> {
@@ -41,6 +53,7 @@ struct Stage<'a> {
 
 pub(crate) fn run(python: &Path, data: &Path) -> Result<bool> {
     let script = crate::root().join("peers/features_opencv.py");
+    let rust = rust_peers()?;
     let photo = data.join("panorama/weir/weir_1.jpg");
     let grey = cv_io::read_gray_u8(&photo)?;
     let (w, h) = grey.size();
@@ -142,6 +155,7 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<bool> {
         stage("", "matrix product 4096", f64::INFINITY, 0, Box::new(|| ())),
     ];
     let mut version = String::new();
+    let mut others = [f64::INFINITY; RUST.len()];
     for round in 0..ROUNDS {
         println!("round {} of {ROUNDS}", round + 1);
         for stage in &mut stages {
@@ -153,11 +167,13 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<bool> {
                 }
             }
             if !stage.peer.is_empty() {
-                let output = output(python, &script, &["speed", path_of(&photo)?, stage.peer])?;
-                let line: Line = serde_json::from_str(output.trim()).context("OpenCV's time")?;
+                let line = line(Command::new(python).arg(&script).arg("speed").arg(&photo).arg(stage.peer))?;
                 stage.best[1] = stage.best[1].min(line.seconds);
                 version = line.version;
             }
+        }
+        for (best, (_, what)) in others.iter_mut().zip(RUST) {
+            *best = best.min(line(Command::new(&rust).arg(&photo).arg(what))?.seconds);
         }
     }
     let time = |name: &str, of: usize| {
@@ -177,7 +193,7 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<bool> {
     for (name, ours, theirs) in quality.bars() {
         bars.push((format!("OpenCV / ours: {name}"), theirs / ours, 1.0));
     }
-    let mut text = page(&stages, &bars, &quality, (w, h), &version, (reached, peak));
+    let mut text = page(&stages, &others, &bars, &quality, (w, h), &version, (reached, peak));
     let recall = recall(&data.join("panorama/weir"), &settings, &nearest)?;
     let _ = writeln!(
         text,
@@ -207,6 +223,7 @@ fn recall(folder: &Path, settings: &SiftOptions, nearest: &MatchOptions) -> Resu
 
 fn page(
     stages: &[Stage<'_>],
+    others: &[f64],
     bars: &[(String, f64, f64)],
     quality: &Quality,
     (w, h): (usize, usize),
@@ -237,9 +254,14 @@ fn page(
             writeln!(text, "| {} | {:.2} ms | | |", stage.name, 1e3 * ours)
         };
     }
+    text.push_str("\n| stage | library, stage | time | ours / it |\n|---|---|---|---|\n");
+    for ((name, what), theirs) in RUST.iter().zip(others) {
+        let ours = stages.iter().find(|s| s.name == *name).map_or(f64::NAN, |s| s.best[0]);
+        let _ = writeln!(text, "| {name} | {what} | {:.2} ms | {:.2} |", 1e3 * theirs, ours / theirs);
+    }
     let _ = writeln!(
         text,
-        "\nTwo nearest of 8192×8192×128: {:.0} GFlop/s, {:.0} % of NumPy's product of two 4096×4096 matrices ({:.0} GFlop/s).\n\n{}\n| figure | measured | bar |\n|---|---|---|",
+        "\nkornia-rs 0.2.0 and imageproc 0.27.0; kornia's Shi-Tomasi is the response with suppression only, without spacing.\n\nTwo nearest of 8192×8192×128: {:.0} GFlop/s, {:.0} % of NumPy's product of two 4096×4096 matrices ({:.0} GFlop/s).\n\n{}\n| figure | measured | bar |\n|---|---|---|",
         reached * 1e-9,
         100.0 * reached / peak,
         peak * 1e-9,
@@ -262,12 +284,22 @@ impl Random {
     }
 }
 
-fn path_of(path: &Path) -> Result<&str> {
-    path.to_str().with_context(|| format!("{} is not text", path.display()))
+/// Runs a program that prints one line.
+fn line(command: &mut Command) -> Result<Line> {
+    let output = command.output().with_context(|| format!("cannot start {command:?}"))?;
+    ensure!(output.status.success(), "{command:?}: {}", String::from_utf8_lossy(&output.stderr));
+    serde_json::from_slice(&output.stdout).with_context(|| format!("what {command:?} printed"))
 }
 
-fn output(python: &Path, file: &Path, args: &[&str]) -> Result<String> {
-    let output = Command::new(python).arg(file).args(args).output().context("cannot start Python")?;
-    ensure!(output.status.success(), "{}: {}", file.display(), String::from_utf8_lossy(&output.stderr));
-    Ok(String::from_utf8(output.stdout)?)
+/// Builds the program of the Rust libraries, for this machine's processor: they have no dispatch at run time everywhere, as ours has.
+fn rust_peers() -> Result<PathBuf> {
+    let target = crate::root().join("target/peers-rust");
+    super::check(
+        Command::new("cargo")
+            .args(["build", "--release", "--quiet", "--locked", "--manifest-path"])
+            .arg(crate::root().join("peers/rust/Cargo.toml"))
+            .env("CARGO_TARGET_DIR", &target)
+            .env("RUSTFLAGS", "-C target-cpu=native"),
+    )?;
+    Ok(target.join("release/rust-peers"))
 }
