@@ -22,7 +22,7 @@ def fastest(call, repeats):
 def speed(path, what):
     grey = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
     random = np.random.default_rng(1)
-    sets = {n: [random.random((n, d), np.float32) for _ in range(2)] for n, d in ((2000, 64), (8192, 128))}
+    sets = {n: [random.random((n, d), np.float32) for _ in range(2)] for n, d in ((2000, 64), (8192, 128), (20000, 128))}
     square = random.random((4096, 4096), np.float32)
     stages = {
         "cornerHarris": (lambda: cv2.cornerHarris(grey, 3, 3, 0.04), 20),
@@ -32,6 +32,7 @@ def speed(path, what):
         "ORB": (lambda: cv2.ORB_create(2000).detectAndCompute(grey, None), 10),
         "BFMatcher 2000": (lambda: cv2.BFMatcher(cv2.NORM_L2).knnMatch(*sets[2000], 2), 8),
         "BFMatcher 8192": (lambda: cv2.BFMatcher(cv2.NORM_L2).knnMatch(*sets[8192], 2), 1),
+        "FlannBasedMatcher 20000": (lambda: cv2.FlannBasedMatcher({"algorithm": 1, "trees": 4}, {"checks": 32}).knnMatch(*sets[20000], 2), 1),
         "matrix product 4096": (lambda: square @ square, 3),
     }
     call, repeats = stages[what]

@@ -2,8 +2,8 @@
 
 use crate::PhotoFeatures;
 use crate::matching::{MatchingOptions, match_features};
-use cv_core::{DMatch, GrayF32, Keypoint};
-use cv_features::{Described, sift_tilted};
+use cv_core::{DMatch, GrayF32};
+use cv_features::sift_tilted;
 use std::f32::consts::PI;
 
 /// Tilts that are simulated: with the √2 that SIFT itself bears on either side of each, up to a slant of 80°.
@@ -14,7 +14,7 @@ const STEP: f32 = 0.4 * PI;
 const SAME: f32 = 2.0;
 
 /// Matches the slanted views of each photograph with the other as it is. The features that match are added to the photographs' own, and the matches to
-/// `matches`.
+/// `matches`, unless they are there already or the other photograph's feature has a match at a smaller distance.
 pub(crate) fn match_slanted(
     photos: [&GrayF32; 2],
     features: &mut [PhotoFeatures; 2],
@@ -30,21 +30,23 @@ pub(crate) fn match_slanted(
                 // A view that is too small to look at has nothing to add.
                 let Ok(described) = sift_tilted(photos[side].view(), &options.sift, tilt, rotation) else { continue };
                 let view = PhotoFeatures { described, found: 0, candidates: Vec::new() };
-                let pair = if side == 0 { [&view, &plain[1]] } else { [&plain[0], &view] };
-                let Ok(more) = match_features(pair[0], pair[1], options) else { continue };
+                // The view asks, the whole photograph answers: among the few features of a view, the second best would be far too often.
+                let Ok(more) = match_features(&view, &plain[1 - side], options) else { continue };
                 for m in more {
-                    let at = |d: &Described, i: u32| -> Keypoint { d.keypoints[i as usize] };
-                    let (a, b) = (at(&pair[0].described, m.query), at(&pair[1].described, m.train));
+                    let new = view.described.keypoints[m.query as usize].position;
+                    let old = plain[1 - side].described.keypoints[m.train as usize].position;
                     let known = matches.iter().any(|n| {
-                        let (c, d) = (at(&features[0].described, n.query), at(&features[1].described, n.train));
-                        (a.position - c.position).norm() < SAME && (b.position - d.position).norm() < SAME
+                        let at = |side: usize, i: u32| features[side].described.keypoints[i as usize].position;
+                        let ends = [at(0, n.query), at(1, n.train)];
+                        (ends[side] - new).norm() < SAME && (ends[1 - side] - old).norm() < SAME
                     });
-                    let own = if side == 0 { m.query } else { m.train };
-                    if known {
+                    let taken =
+                        matches.iter().any(|n| [n.query, n.train][1 - side] == m.train && n.distance <= m.distance);
+                    if known || taken {
                         continue;
                     }
-                    let Some(added) = features[side].described.add(&view.described, own as usize) else { continue };
-                    let (query, train) = if side == 0 { (added, m.train) } else { (m.query, added) };
+                    let Some(added) = features[side].described.add(&view.described, m.query as usize) else { continue };
+                    let (query, train) = if side == 0 { (added, m.train) } else { (m.train, added) };
                     matches.push(DMatch { query, train, ..m });
                 }
             }

@@ -69,6 +69,7 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<bool> {
     };
     let small = [set(DescriptorKind::Patch, 2000)?, set(DescriptorKind::Patch, 2000)?];
     let large = [set(DescriptorKind::RootSift, 8192)?, set(DescriptorKind::RootSift, 8192)?];
+    let huge = [set(DescriptorKind::RootSift, 20_000)?, set(DescriptorKind::RootSift, 20_000)?];
     let corners: Vec<Keypoint> = (0..20_000)
         .map(|_| Keypoint::new(1333.0 * random.next(), 750.0 * random.next(), random.next().powi(3)))
         .collect();
@@ -121,6 +122,8 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<bool> {
         ),
         stage("two nearest, 2000×2000×64", "BFMatcher 2000", 0.5, 20, Box::new(|| two(&small))),
         stage("two nearest, 8192×8192×128", "BFMatcher 8192", f64::INFINITY, 4, Box::new(|| two(&large))),
+        // An approximate index (a forest of four k-d trees, 32 checks: OpenCV's defaults) beside the exact search.
+        stage("two nearest, 20,000×20,000×128", "FlannBasedMatcher 20000", f64::INFINITY, 1, Box::new(|| two(&huge))),
         stage(
             "2000 SIFT features",
             "SIFT",

@@ -9,7 +9,7 @@ use cv_pipeline::{
     FeatureMethod, MatchingError, MatchingOptions, MatchingResult, ModelKind, PhotoFeatures, RobustOptions, Silent,
     Slanted, Spacing, estimate, match_extracted, match_photos,
 };
-use cv_report::{Figure, MatchStyle, Note, Report, colors, draw_keypoints, draw_matches, tile_patches};
+use cv_report::{Figure, MatchStyle, Note, Plot, Report, colors, draw_keypoints, draw_matches, tile_patches};
 use std::path::{Path, PathBuf};
 
 /// Which features to match.
@@ -194,6 +194,7 @@ impl Run for Args {
         Ok(Outcome::new(result.stages)
             .with("matches", result.pairs.len())
             .with("features", counts)
+            .with("found", result.features.each_ref().map(|f| f.found))
             .with("dropped", dropped)
             .with("method", match self.features {
                 _ if self.load_features.is_some() => "loaded",
@@ -229,11 +230,15 @@ impl Args {
             let kept = &features.described.keypoints;
             let mut figures = Vec::new();
             if !features.candidates.is_empty() {
-                let all = draw_keypoints(image.view(), &thinned(&features.candidates), colors::RED);
-                figures.push(picture(all, &format!("{name}: {} corners before spacing", features.candidates.len()))?);
+                let some = thinned(&features.candidates);
+                let all = draw_keypoints(image.view(), &some, colors::RED);
+                let caption = format!("{name}: {} corners before spacing{}", features.candidates.len(), shown(some.len(), features.candidates.len()));
+                figures.push(picture(all, &caption)?);
             }
-            let spaced = draw_keypoints(image.view(), &thinned(kept), colors::GREEN);
-            figures.push(picture(spaced, &format!("{name}: {} features that are described", kept.len()))?);
+            let some = thinned(kept);
+            let spaced = draw_keypoints(image.view(), &some, colors::GREEN);
+            let caption = format!("{name}: {} features that are described{}", kept.len(), shown(some.len(), kept.len()));
+            figures.push(picture(spaced, &caption)?);
             report.figures(figures);
         }
         if result.features.iter().all(|f| f.described.descriptors.dimension() == 64) {
@@ -260,7 +265,7 @@ impl Args {
                 report.note(Note::Warning, "No homography and no fundamental matrix explains enough of these matches.");
             }
         }
-        report.facts(&result.stages.iter().map(|(name, s)| (*name, format!("{s:.3} s"))).collect::<Vec<_>>());
+        statistics(&mut report, result);
         Ok(report.to_html())
     }
 }
@@ -332,9 +337,33 @@ fn load_features(folder: &Path, photo: &Path) -> Result<PhotoFeatures, Failure> 
     Ok(PhotoFeatures { found: counts.0, described, candidates: Vec::new() })
 }
 
-/// At most 3000 points, evenly taken: more would hide the picture.
+/// At most 1000 points, evenly taken: more would hide the picture.
 fn thinned(points: &[Keypoint]) -> Vec<Keypoint> {
-    points.iter().step_by((points.len() / 3000).max(1)).copied().collect()
+    points.iter().step_by(points.len().div_ceil(1000).max(1)).copied().collect()
+}
+
+/// What to say of points of which only some are drawn.
+fn shown(some: usize, all: usize) -> String {
+    if some < all { format!(", {some} of them drawn") } else { String::new() }
+}
+
+/// Counts of both photographs, how sure the matches are, and the times.
+fn statistics(report: &mut Report, result: &MatchingResult) {
+    report.section("Statistics");
+    let row = |name: &str, count: &dyn Fn(&PhotoFeatures) -> usize| {
+        let [first, second] = result.features.each_ref().map(|f| count(f).to_string());
+        vec![name.to_owned(), first, second]
+    };
+    report.table("Features", &["", "first", "second"], &[
+        row("points found", &|f| f.found),
+        row("left out at the border or on flat patches", &|f| f.described.dropped.len()),
+        row("beyond the number asked for", &|f| f.described.beyond_limit),
+        row("described", &|f| f.described.keypoints.len()),
+    ]);
+    let ratios: Vec<f64> = result.matches.iter().map(|m| f64::from(m.ratio)).collect();
+    let plot = Plot::new("How sure the matches are", "ratio", "matches").histogram_within("matches", &ratios, 20, (0.0, 1.0));
+    report.plot(&plot, "Ratio of the squared distance of the best candidate to that of the second: matches far to the left are unmistakable.");
+    report.facts(&result.stages.iter().map(|(name, s)| (*name, format!("{s:.3} s"))).collect::<Vec<_>>());
 }
 
 /// The model that most matches agree on, and which those are. A fundamental matrix always fits somewhat more matches
