@@ -61,7 +61,10 @@ pub mod panorama_types {
     pub use cv_panorama::*;
 }
 pub use progress::{Progress, Silent};
-pub use reconstruct::{Intrinsics, ReconstructError, ReconstructOptions, ReconstructResult, ScenePoint, reconstruct};
+pub use reconstruct::{
+    DenseError, DenseOptions, DenseResult, Intrinsics, ReconstructError, ReconstructOptions, ReconstructResult,
+    ScenePoint, reconstruct, reconstruct_dense,
+};
 pub use rectify::{RectifyResult, rectify};
 pub use segment::{SegmentResult, SegmentTraining, segment, train_segment};
 pub use stopwatch::Stopwatch;

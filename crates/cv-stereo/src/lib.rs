@@ -35,6 +35,7 @@ mod options;
 #[cfg(test)]
 mod plain;
 mod rectify;
+mod rectify_scene;
 mod sgm;
 mod smooth;
 mod speckle;
@@ -47,3 +48,4 @@ pub use input::Intensity;
 pub use matcher::{DisparityMap, PixelState, StereoMatcher};
 pub use options::{Blend, Census, Paths, Smoothing, StereoOptions, Subpixel};
 pub use rectify::{Rectification, RectifiedView, RectifyError, RectifyOptions};
+pub use rectify_scene::SceneRectification;

@@ -95,7 +95,7 @@ pub enum RectifyError {
 }
 
 /// The most a camera is turned: beyond, a plane image sensor would see the scene at a grazing angle.
-const MAX_TURN_DEGREES: f64 = 60.0;
+pub(crate) const MAX_TURN_DEGREES: f64 = 60.0;
 
 /// One view of a rectified rig.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -247,11 +247,11 @@ impl Rectification {
 
 /// A rectangle in normalised coordinates.
 #[derive(Debug, Clone, Copy)]
-struct Rect {
-    left: f64,
-    top: f64,
-    right: f64,
-    bottom: f64,
+pub(crate) struct Rect {
+    pub(crate) left: f64,
+    pub(crate) top: f64,
+    pub(crate) right: f64,
+    pub(crate) bottom: f64,
 }
 
 impl Rect {
@@ -265,7 +265,7 @@ impl Rect {
 }
 
 /// What a camera sees in the rectified frame: a rectangle inside its field of view, and one around it.
-fn field(camera: &Camera, rotation: &Rotation3<f64>) -> (Rect, Rect) {
+pub(crate) fn field(camera: &Camera, rotation: &Rotation3<f64>) -> (Rect, Rect) {
     // As many points per side as show the bend of a strong distortion.
     const STEPS: usize = 64;
     let (w, h) = (camera.width as f64 - 1.0, camera.height as f64 - 1.0);

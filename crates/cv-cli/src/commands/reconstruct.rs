@@ -6,10 +6,13 @@ use cv_core::{Correspondence, Pose};
 use cv_io::DynImage;
 use cv_io::colmap::{Model, ModelImage, ModelPoint};
 use cv_io::ply::{Cloud, PlyEncoding};
-use cv_pipeline::{Intrinsics, ReconstructError, ReconstructOptions, ReconstructResult, reconstruct};
+use cv_pipeline::{
+    DenseOptions, DenseResult, Intrinsics, ReconstructError, ReconstructOptions, ReconstructResult, reconstruct,
+    reconstruct_dense,
+};
 use cv_report::{
-    Figure, MatchStyle, Note, PointScene, Report, Viewpoint, camera_color, draw_epipolar_lines, draw_keypoints,
-    draw_matches, render_points,
+    Figure, MapStyle, MatchStyle, Note, PointScene, Report, Viewpoint, camera_color, draw_epipolar_lines, draw_keypoints,
+    draw_map, draw_matches, render_points,
 };
 use std::path::{Path, PathBuf};
 
@@ -26,11 +29,15 @@ enum Axes {
 ///
 /// The cloud is in the first camera's frame; its unit is the distance between the two cameras, which photographs cannot tell. Without
 /// --camera and --focal, the focal length comes from the photographs' EXIF, and is estimated where they have none.
+///
+/// With --dense, the photographs are also rectified by the geometry found and matched pixel by pixel; what both confirm becomes a second, dense
+/// cloud in the same frame and unit.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv reconstruct a.jpg b.jpg -o cloud.ply\n  \
     cv reconstruct a.jpg b.jpg --camera cam.yaml -o cloud.ply --report out\n  \
-    cv reconstruct a.jpg b.jpg --focal 2900 -o cloud.ply --axes opengl --colmap model\n\n\
+    cv reconstruct a.jpg b.jpg --focal 2900 -o cloud.ply --axes opengl --colmap model\n  \
+    cv reconstruct a.jpg b.jpg -o sparse.ply --dense dense.ply --dense-size 2400\n\n\
     A camera file is ours, OpenCV's or ROS's YAML, a line of COLMAP's cameras.txt, or a 3×3 matrix.")]
 pub(crate) struct Args {
     /// The first photograph.
@@ -70,11 +77,23 @@ pub(crate) struct Args {
     /// Where to write the cameras and points as a COLMAP text model: a folder.
     #[arg(long, value_name = "DIR")]
     colmap: Option<PathBuf>,
+    /// Where to write a dense cloud, as PLY.
+    #[arg(long, value_name = "FILE")]
+    dense: Option<PathBuf>,
+    /// Longer side to which the photographs are reduced for the dense cloud, in pixels.
+    #[arg(long, value_name = "PX", default_value_t = DenseOptions::default().max_size, requires = "dense")]
+    dense_size: usize,
+    /// Give pixels that the other photograph does not confirm a depth from around them.
+    #[arg(long, requires = "dense")]
+    dense_fill: bool,
+    /// Most memory for dense matching, in MiB.
+    #[arg(long, value_name = "MIB", default_value_t = DenseOptions::default().max_memory >> 20, requires = "dense")]
+    max_memory: usize,
 }
 
 impl Run for Args {
     fn outputs(&self) -> Vec<&Path> {
-        vec![&self.output]
+        std::iter::once(&self.output).chain(&self.dense).map(PathBuf::as_path).collect()
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
@@ -102,13 +121,19 @@ impl Run for Args {
             Ok(result) => result,
             Err(error) => return Err(explained(&error, &self)),
         };
-        let cloud = self.cloud(&result);
+        // Before anything is written: a dense cloud that cannot be had leaves no half of the outputs behind.
+        let dense = self.dense(&a, &b, &result, context)?;
+        let cloud = self.cloud(result.points.iter().map(|p| (position(p), p.color)));
         cv_io::ply::write_cloud(&self.output, &cloud, PlyEncoding::Binary)?;
+        if let (Some(path), Some(dense)) = (&self.dense, &dense) {
+            let cloud = self.cloud(dense.points.iter().map(|p| (p.position, p.color)));
+            cv_io::ply::write_cloud(path, &cloud, PlyEncoding::Binary)?;
+        }
         if let Some(folder) = &self.colmap {
             cv_io::colmap::write(folder, &self.model(&result))?;
         }
-        context.report(|| self.html(&a, &b, &result, &source))?;
-        Ok(self.outcome(result))
+        context.report(|| self.html([&a, &b], &result, dense.as_ref(), &source))?;
+        Ok(self.outcome(&result, dense.as_ref()))
     }
 }
 
@@ -149,9 +174,33 @@ impl Args {
         }
     }
 
-    fn cloud(&self, result: &ReconstructResult) -> Cloud {
-        let (positions, colors) = result.points.iter().map(|p| (self.turned(position(p)), p.color)).unzip();
+    fn cloud(&self, points: impl Iterator<Item = ([f32; 3], [u8; 3])>) -> Cloud {
+        let (positions, colors) = points.map(|(p, color)| (self.turned(p), color)).unzip();
         Cloud::colored(positions, colors)
+    }
+
+    /// The dense cloud, where it is asked for.
+    fn dense(
+        &self,
+        a: &cv_core::RgbU8,
+        b: &cv_core::RgbU8,
+        sparse: &ReconstructResult,
+        context: &Context,
+    ) -> Result<Option<DenseResult>, Failure> {
+        if self.dense.is_none() {
+            return Ok(None);
+        }
+        let options = DenseOptions {
+            max_size: self.dense_size,
+            fill: self.dense_fill,
+            max_memory: self.max_memory.saturating_mul(1 << 20),
+            ..DenseOptions::default()
+        };
+        let dense = reconstruct_dense(a.view(), b.view(), sparse, &options, context);
+        dense.map(Some).map_err(|error| {
+            let words = format!("no dense cloud of {} and {}: {error}", self.first.display(), self.second.display());
+            Failure::new(words).advice(error.advice())
+        })
     }
 
     fn model(&self, result: &ReconstructResult) -> Model {
@@ -183,11 +232,11 @@ impl Args {
         model
     }
 
-    fn outcome(&self, result: ReconstructResult) -> Outcome {
+    fn outcome(&self, result: &ReconstructResult, dense: Option<&DenseResult>) -> Outcome {
         let rows = |m: &Matrix3<f64>| -> [[f64; 3]; 3] { std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)])) };
         let t = result.pose.translation;
         let degrees = result.pose_deviation.map(f64::to_degrees);
-        let summary = format!(
+        let mut summary = format!(
             "{} points from {} of {} matches, {:.3} px RMS; turned by {:.2} degrees, median angle {:.2} degrees",
             result.points.len(),
             result.inliers.len(),
@@ -196,7 +245,9 @@ impl Args {
             result.pose.rotation.angle().to_degrees(),
             result.median_angle.to_degrees(),
         );
-        Outcome::new(result.stages.clone())
+        let mut stages = result.stages.clone();
+        stages.extend(dense.iter().flat_map(|d| &d.stages).map(|(name, seconds)| (dense_stage(name), *seconds)));
+        let outcome = Outcome::new(stages)
             .with("points", result.points.len())
             .with("matches", result.matching.pairs.len())
             .with("inliers", result.inliers.len())
@@ -209,15 +260,25 @@ impl Args {
             .with("focal_px", result.cameras.map(|c| c.fx))
             .with("focal_deviation", result.focal_deviation)
             .with("median_angle_degrees", result.median_angle.to_degrees())
-            .with("planar_share", result.planar_share)
+            .with("planar_share", result.planar_share);
+        let Some(dense) = dense else { return outcome.summary(summary) };
+        let (width, height) = dense.size;
+        let (first, count) = dense.disparities;
+        let share = 100.0 * dense.coverage;
+        summary += &format!("; {} dense points, {share:.0} % of what both photographs show", dense.points.len());
+        outcome
+            .with("dense_points", dense.points.len())
+            .with("dense_coverage", dense.coverage)
+            .with("dense_size", [width, height])
+            .with("dense_disparities", [i64::from(first), i64::from(first) + count as i64 - 1])
             .summary(summary)
     }
 
     fn html(
         &self,
-        a: &cv_core::RgbU8,
-        b: &cv_core::RgbU8,
+        [a, b]: [&cv_core::RgbU8; 2],
         result: &ReconstructResult,
+        dense: Option<&DenseResult>,
         source: &str,
     ) -> Result<String, Failure> {
         let png = |image: &cv_core::RgbU8| cv_io::encode_jpeg(image.view(), 88).during("cannot encode a picture");
@@ -243,6 +304,9 @@ impl Args {
         let top = Figure::new(png(&render_points(&scene, Viewpoint::Top, 900, 700))?, "From above: a map.");
         let side = Figure::new(png(&render_points(&scene, Viewpoint::Side, 900, 700))?, "From the side.");
         report.figures(vec![top, side]);
+        if let Some(dense) = dense {
+            dense_section(&mut report, dense, result)?;
+        }
 
         report.section("The motion");
         let axis_angle = result.pose.rotation.scaled_axis();
@@ -294,6 +358,44 @@ impl Args {
         report.facts(&result.stages.iter().map(|(name, s)| (*name, format!("{s:.3} s"))).collect::<Vec<_>>());
         Ok(report.to_html())
     }
+}
+
+/// The stage names of the dense cloud, told from those of the sparse one.
+fn dense_stage(name: &str) -> &'static str {
+    match name {
+        "rectify" => "dense_rectify",
+        "match" => "dense_match",
+        _ => "dense_cloud",
+    }
+}
+
+/// Depth and cloud of the dense matching.
+fn dense_section(report: &mut Report, dense: &DenseResult, result: &ReconstructResult) -> Result<(), Failure> {
+    let png = |image: &cv_core::RgbU8| cv_io::encode_jpeg(image.view(), 88).during("cannot encode a picture");
+    report.section("The dense cloud");
+    let (width, height) = dense.size;
+    report.paragraph(&format!(
+        "The photographs were rectified to {width}×{height} px and matched at {} disparities. {} points, {:.0} % of what both show, were confirmed \
+         from both.",
+        dense.disparities.1,
+        dense.points.len(),
+        100.0 * dense.coverage,
+    ));
+    let depth = draw_map(dense.depth.view(), &MapStyle::depth("distances between the cameras"));
+    report.figure(Figure::new(png(&depth)?, "Depth of the first photograph: near blue, far red, unknown grey."));
+    let (positions, colors): (Vec<_>, Vec<_>) = dense.points.iter().map(|p| (p.position, p.color)).unzip();
+    let mut scene = PointScene::new(&positions, &colors);
+    scene.camera(&result.cameras[0], &Pose::identity(), camera_color(0));
+    scene.camera(&result.cameras[1], &result.pose, camera_color(1));
+    let caption = match scene.left_out() {
+        0 => "The dense cloud.".to_owned(),
+        n => format!("The dense cloud, thinned by {n} points; the file has all of them."),
+    };
+    report.points(&scene, Some(png(&render_points(&scene, Viewpoint::Camera, 1200, 800))?), &caption);
+    let top = Figure::new(png(&render_points(&scene, Viewpoint::Top, 900, 700))?, "From above: a map.");
+    let side = Figure::new(png(&render_points(&scene, Viewpoint::Side, 900, 700))?, "From the side.");
+    report.figures(vec![top, side]);
+    Ok(())
 }
 
 fn position(p: &cv_pipeline::ScenePoint) -> [f32; 3] {

@@ -33,6 +33,11 @@ pub(super) struct Found {
 /// Displacements of the corners that are tried: from the barrel of a wide angle to the pincushion of a long lens. The steps between them are
 /// narrowed down.
 const BENDS: [f64; 5] = [-0.09, -0.06, -0.03, 0.0, 0.03];
+/// Displacements that a search may end at: a fisheye bends more, and is no lens for this model. Without an end, forward motion, whose flow a
+/// bent lens can imitate, leads on and on.
+const BEND_RANGE: (f64, f64) = (-0.3, 0.15);
+/// Most steps of a search; from the grid to the optimum it takes ten or so.
+const MAX_STEPS: usize = 40;
 /// Focal lengths that are tried, in longer sides: from 100 to 20 degrees of view.
 const FOCALS: i32 = 10;
 /// Samples for each: enough to find a pose among half wrong matches; the right lens needs the fewest.
@@ -141,14 +146,18 @@ impl Search<'_> {
     /// Steps of focal length and distortion, halved where none helps, down to half a per cent and a thousandth.
     fn narrow(&self, mut best: Trial, focal: bool, bend: bool) -> Trial {
         let mut step = 1.0;
-        while step > 0.05 {
+        for _ in 0..MAX_STEPS {
+            if step <= 0.05 {
+                break;
+            }
             let mut lenses = Vec::new();
             for sign in [-1.0f64, 1.0] {
                 if focal {
                     lenses.push(Lens { focal: best.lens.focal.map(|f| f * (0.09 * sign * step).exp()), ..best.lens });
                 }
                 if bend {
-                    lenses.push(Lens { bend: best.lens.bend + 0.015 * sign * step, ..best.lens });
+                    let bend = (best.lens.bend + 0.015 * sign * step).clamp(BEND_RANGE.0, BEND_RANGE.1);
+                    lenses.push(Lens { bend, ..best.lens });
                 }
             }
             let trials: Vec<Trial> = lenses.par_iter().map(|lens| self.refined(*lens, &best.pose)).collect();

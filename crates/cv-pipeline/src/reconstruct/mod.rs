@@ -1,9 +1,11 @@
 //! Points and camera poses from two photographs.
 
+mod dense;
 mod error;
 mod initial;
 mod lens;
 
+pub use dense::{DenseError, DenseOptions, DenseResult, reconstruct_dense};
 pub use error::ReconstructError;
 use initial::{Initial, cameras, initial};
 

@@ -1,0 +1,230 @@
+//! Rectification of two photographs from anywhere, around the points that both are known to show.
+//!
+//! A rig made for stereo has its cameras side by side, and one common camera serves both rectified views
+//! ([`Rectification::new`]). Two photographs taken by hand converge on what they show: the parts of their rectified views
+//! that have it in common then lie far apart, and each view gets a principal point of its own.
+
+use crate::rectify::{MAX_TURN_DEGREES, Rectification, RectifiedView, RectifyError, field};
+use crate::{StereoGeometry, StereoOptions};
+use cv_core::{Camera, Point3, Rotation3, StereoRig, Vector3};
+use nalgebra::Matrix3;
+
+/// Two rectified views, and the disparities of what they show.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SceneRectification {
+    /// Both views. Never turned by quarters ([`Rectification::vertical`] is false): the rows of the views run along the
+    /// baseline, whichever way that lies in the photographs.
+    pub views: Rectification,
+    /// Smallest disparity of the scene in px, and the number of disparities.
+    pub disparities: (i32, usize),
+}
+
+/// Share of the points at either end of the depths that may be wrong ones.
+const TAIL: f64 = 0.01;
+
+/// The widest angle from the axis of a rectified view that is shown: beyond, a plane image takes ten times the pixels for what it shows.
+const WIDEST_DEGREES: f64 = 70.0;
+
+impl SceneRectification {
+    /// Rectifies two views of a scene of which `points` (in the left camera's frame, in the unit of the rig) are known.
+    ///
+    /// `left` is simply the first view; it may stand on either side of the other, above it or below it. The rectified views
+    /// show what both photographs do at the depths of the points, with about as many pixels as the photographs have there. The
+    /// disparities are those of the points but for one per cent at either end, and a quarter of their range and 4 px more at both
+    /// ends, for what the points miss; never beyond infinity.
+    ///
+    /// # Errors
+    /// [`RectifyError`] with the reason why it cannot be done: [`RectifyError::TooFarTurned`] where one camera stands more or less ahead of
+    /// the other, [`RectifyError::NoOverlap`] where no point is in front of both rectified cameras.
+    pub fn new(rig: &StereoRig, points: &[Point3<f64>]) -> Result<Self, RectifyError> {
+        for (side, camera) in [("left", &rig.left), ("right", &rig.right)] {
+            camera.validate().map_err(|error| RectifyError::Camera { side, error })?;
+        }
+        let pose = &rig.right_from_left;
+        let baseline = rig.baseline();
+        let centre = pose.center().coords;
+        let Some(x) = centre.try_normalize(1e-12).filter(|_| baseline.is_finite()) else {
+            return Err(RectifyError::NoBaseline { baseline });
+        };
+        let rotations = rotations(x, &pose.rotation)?;
+
+        // What the points look like to the rectified views: inverse depth, and how much larger the views show them than the photographs do.
+        let mut inverse = Vec::new();
+        let mut growth = Vec::new();
+        for p in points {
+            let q = pose.transform(p);
+            let common = rotations[0] * p;
+            if !(p.z > 0.0 && q.z > 0.0 && common.z > 0.0) {
+                continue;
+            }
+            inverse.push(1.0 / common.z);
+            // A central projection shows a solid angle at the angle θ from its axis with an area of 1 / cos³ θ; both distances are the point's.
+            growth.push((p.z / common.z).powi(3).sqrt() / rig.left.fx);
+            growth.push((q.z / common.z).powi(3).sqrt() / rig.right.fx);
+        }
+        if inverse.is_empty() {
+            return Err(RectifyError::NoOverlap);
+        }
+        inverse.sort_unstable_by(f64::total_cmp);
+        growth.sort_unstable_by(f64::total_cmp);
+        let focal = 1.0 / growth[growth.len() / 2];
+        let at = |share: f64| inverse[((inverse.len() - 1) as f64 * share).round() as usize];
+        // Normalised disparities: baseline over depth.
+        let (low, high) = (baseline * at(TAIL), baseline * at(1.0 - TAIL));
+        let more = 0.25 * (high - low) + 4.0 / focal;
+        let (low, high) = ((low - more).max(0.0), high + more);
+
+        let widest = WIDEST_DEGREES.to_radians().tan();
+        let [(_, a), (_, b)] = [field(&rig.left, &rotations[0]), field(&rig.right, &rotations[1])];
+        let clip = |v: f64| v.clamp(-widest, widest);
+        let (top, bottom) = (clip(a.top.max(b.top)), clip(a.bottom.min(b.bottom)));
+        // A point at x in the left view is at x − d in the right one.
+        let (left_a, right_a) = (clip(a.left.max(b.left + low)), clip(a.right.min(b.right + high)));
+        let (left_b, right_b) = (clip(b.left.max(a.left - high)), clip(b.right.min(a.right - low)));
+        let span = (right_a - left_a).max(right_b - left_b);
+        if !(right_a > left_a && right_b > left_b && bottom > top && focal.is_finite()) {
+            return Err(RectifyError::NoOverlap);
+        }
+        let pixels = |span: f64| (span * focal).round() as usize + 1;
+        let (width, height) = (pixels(span), pixels(bottom - top));
+        let camera = |left: f64| Camera::pinhole(width, height, focal, focal, -left * focal, -top * focal);
+        let view = |source, left, rotation| RectifiedView { source, camera: camera(left), rotation };
+        let left = view(rig.left, left_a, rotations[0]);
+        let right = view(rig.right, left_b, rotations[1]);
+        let offset = right.camera.cx - left.camera.cx;
+        let geometry = StereoGeometry { focal, cx: left.camera.cx, cy: left.camera.cy, baseline, offset };
+        let first = (focal * low - offset).floor();
+        let last = (focal * high - offset).ceil();
+        let views = Rectification { left, right, geometry, vertical: false };
+        Ok(Self { views, disparities: (first as i32, (last - first) as usize + 1) })
+    }
+
+    /// Options of a matcher for these views: the disparities of the scene, and nothing filled in.
+    pub fn stereo_options(&self) -> StereoOptions {
+        let (min_disparity, disparities) = self.disparities;
+        StereoOptions { min_disparity, disparities, fill: false, ..StereoOptions::default() }
+    }
+}
+
+/// Rotations of both cameras to the common frame: x along the baseline, z as near to where both look on average as can be.
+fn rotations(x: Vector3<f64>, relative: &Rotation3<f64>) -> Result<[Rotation3<f64>; 2], RectifyError> {
+    let axes = [Vector3::z(), relative.inverse() * Vector3::z()];
+    let turned = |side, degrees: f64| RectifyError::TooFarTurned { side, degrees, limit: MAX_TURN_DEGREES };
+    let mean = axes[0] + axes[1];
+    let across = mean - x * x.dot(&mean);
+    let Some(z) = across.try_normalize(1e-9) else { return Err(turned("right", 90.0)) };
+    for (side, axis) in [("left", axes[0]), ("right", axes[1])] {
+        let degrees = axis.angle(&z).to_degrees();
+        if degrees > MAX_TURN_DEGREES {
+            return Err(turned(side, degrees));
+        }
+    }
+    let rows = Matrix3::from_rows(&[x.transpose(), z.cross(&x).transpose(), z.transpose()]);
+    let to_common = Rotation3::from_matrix_unchecked(rows);
+    Ok([to_common, to_common * relative.inverse()])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cv_core::{Distortion, Pose};
+    use proptest::prelude::*;
+
+    fn rig(angles: [f64; 3], centre: Vector3<f64>) -> StereoRig {
+        let mut left = Camera::pinhole(640, 480, 520.0, 515.0, 322.0, 236.0);
+        left.distortion = Distortion::Radial { k1: -0.1, k2: 0.02 };
+        let right = Camera::pinhole(600, 500, 530.0, 533.0, 310.0, 245.0);
+        let rotation = Rotation3::from_euler_angles(angles[0], angles[1], angles[2]);
+        StereoRig { left, right, right_from_left: Pose::new(rotation, -(rotation * centre)) }
+    }
+
+    /// Points that both cameras see.
+    fn points(rig: &StereoRig) -> Vec<Point3<f64>> {
+        let inside = |camera: &Camera, p: &Point3<f64>| {
+            camera.project(p).is_some_and(|q| {
+                q.x > 0.0 && q.y > 0.0 && q.x < camera.width as f64 - 1.0 && q.y < camera.height as f64 - 1.0
+            })
+        };
+        let grid = (0..1000).map(|i| {
+            let at = |step: usize| ((i * step) % 997) as f64 / 997.0 - 0.5;
+            let z = 5.0 + 4.0 * at(389);
+            Point3::new(1.2 * z * at(101), z * at(211), z)
+        });
+        grid.filter(|p| inside(&rig.left, p) && inside(&rig.right, &rig.right_from_left.transform(p))).collect()
+    }
+
+    proptest! {
+        #[test]
+        fn scene_points_have_the_same_row_and_the_disparity_their_depth_says(
+            angles in (-0.1..0.1f64, -0.1..0.1f64, -1.5..1.5f64), way in 0.0..std::f64::consts::TAU, ahead in -0.3..0.3f64,
+        ) {
+            // Any direction across the line of sight, and turned together with it or against it.
+            let rig = rig([angles.0, angles.1, angles.2], Vector3::new(way.cos(), way.sin(), ahead));
+            let points = points(&rig);
+            prop_assume!(points.len() > 200);
+            let found = SceneRectification::new(&rig, &points).unwrap();
+            let (min, n) = found.disparities;
+            let views = &found.views;
+            let mut outside = 0;
+            for p in &points {
+                let a = rig.left.project(p).and_then(|a| views.left.rectified_pixel(a)).unwrap();
+                let b = rig.right.project(&rig.right_from_left.transform(p)).and_then(|b| views.right.rectified_pixel(b)).unwrap();
+                // Undistorting stops at 1e-13 of the focal length; a thousand pixels lose three digits more.
+                prop_assert!((a.y - b.y).abs() < 1e-8, "rows {} and {}", a.y, b.y);
+                let depth = (views.left.rotation * p).z;
+                prop_assert!((a.x - b.x - views.geometry.disparity(depth)).abs() < 1e-8);
+                let shown = |q: cv_core::Point2<f64>, c: &Camera| {
+                    q.x > -1.0 && q.y > -1.0 && q.x < c.width as f64 && q.y < c.height as f64
+                };
+                let d = a.x - b.x - f64::from(min);
+                outside += usize::from(!(shown(a, &views.left.camera) && shown(b, &views.right.camera) && d >= 0.0 && d < n as f64));
+            }
+            // All but the one per cent at either end is inside, and the margins take most of that.
+            prop_assert!(outside <= points.len() / 50, "{outside} of {}", points.len());
+        }
+    }
+
+    #[test]
+    fn a_point_is_shown_about_as_large_as_in_the_photographs() {
+        let rig = rig([0.0, 0.3, 0.0], Vector3::new(-1.0, 0.2, 0.1));
+        let all = points(&rig);
+        let found = SceneRectification::new(&rig, &all).unwrap();
+        let area = |camera: &dyn Fn(&Point3<f64>) -> cv_core::Point2<f64>, p: &Point3<f64>| {
+            let h = 1e-4;
+            // Turned about the camera: along the two directions across the ray.
+            let across = p.coords.cross(&Vector3::y()).normalize();
+            let other = p.coords.cross(&across).normalize();
+            let (u, v) = (camera(&(p + across * h)) - camera(p), camera(&(p + other * h)) - camera(p));
+            (u.x * v.y - u.y * v.x).abs()
+        };
+        let mut ratios: Vec<f64> = all
+            .iter()
+            .map(|p| {
+                let photo = area(&|q| rig.left.project(q).unwrap(), p);
+                let view = area(&|q| found.views.left.camera.project(&(found.views.left.rotation * q)).unwrap(), p);
+                (view / photo).sqrt()
+            })
+            .collect();
+        ratios.sort_by(f64::total_cmp);
+        // The median over both views is one; the left one's differs by how differently the two look at the scene, and by the lens.
+        let median = ratios[ratios.len() / 2];
+        assert!((0.8..1.25).contains(&median), "{median}");
+    }
+
+    #[test]
+    fn what_cannot_be_rectified_is_refused_with_the_reason() {
+        let get = |centre, points: &[Point3<f64>]| SceneRectification::new(&rig([0.0; 3], centre), points).unwrap_err();
+        let point = [Point3::new(0.0, 0.0, 5.0)];
+        assert!(
+            matches!(get(Vector3::new(0.1, 0.0, 1.0), &point), RectifyError::TooFarTurned { degrees, .. } if degrees > 80.0)
+        );
+        assert!(matches!(get(Vector3::z(), &point), RectifyError::TooFarTurned { degrees: 90.0, .. }));
+        assert!(matches!(get(Vector3::zeros(), &point), RectifyError::NoBaseline { .. }));
+        assert!(matches!(get(Vector3::x(), &[]), RectifyError::NoOverlap));
+        assert!(matches!(get(Vector3::x(), &[Point3::new(0.0, 0.0, -5.0)]), RectifyError::NoOverlap));
+        assert!(matches!(get(Vector3::x(), &[Point3::new(f64::NAN, 0.0, f64::NAN)]), RectifyError::NoOverlap));
+        // One point alone has no range: the margin is all there is.
+        let found = SceneRectification::new(&rig([0.0; 3], Vector3::x()), &point).unwrap();
+        assert!((9..=12).contains(&found.disparities.1), "{:?}", found.disparities);
+    }
+}
