@@ -5,6 +5,7 @@
 //! and zero where nothing asks for more. That is linear least squares, reweighted so that false matches count little.
 
 use crate::align::Alignment;
+use crate::correlation::{PAD, PLACES, REACH, Template};
 use crate::layout::{Bounds, Layout, Placement};
 use crate::projection::Surface;
 use cv_core::{ImageView, Point2, Vector2};
@@ -331,8 +332,6 @@ fn conjugate_gradients(
 
 /// Half the side of the patches that are compared.
 const HALF: usize = 8;
-/// Farthest displacement looked for, in canvas pixels.
-const REACH: usize = 8;
 /// Patches tried in each overlap at most.
 const PER_OVERLAP: usize = 800;
 
@@ -446,26 +445,10 @@ fn corner_strength(patch: &[f32]) -> f32 {
 /// How far the content of `first` lies from the middle of the larger `second`, by normalised correlation with a parabola at its peak; `None` where nothing is
 /// alike, or two places are.
 fn register(first: &[f32], second: &[f32]) -> Option<Vector2<f64>> {
-    let (side, wide, places) = (2 * HALF + 1, 2 * (HALF + REACH) + 1, 2 * REACH + 1);
-    let n = (side * side) as f32;
-    let mean = first.iter().sum::<f32>() / n;
-    let centred: Vec<f32> = first.iter().map(|v| v - mean).collect();
-    let energy: f32 = centred.iter().map(|v| v * v).sum();
-    let mut scores = vec![0.0_f32; places * places];
-    for dy in 0..places {
-        for dx in 0..places {
-            let (mut sum, mut squares, mut product) = (0.0_f32, 0.0_f32, 0.0_f32);
-            for r in 0..side {
-                let row = &second[(r + dy) * wide + dx..][..side];
-                for (a, b) in centred[r * side..(r + 1) * side].iter().zip(row) {
-                    sum += b;
-                    squares += b * b;
-                    product += a * b;
-                }
-            }
-            scores[dy * places + dx] = product / (energy * (squares - sum * sum / n)).max(1e-6).sqrt();
-        }
-    }
+    let mut window = second.to_vec();
+    window.resize(second.len() + PAD, 0.0);
+    let scores = Template::new(2 * HALF + 1, first).scores(&window);
+    let places = PLACES;
     let (best, &score) = scores.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1))?;
     let (y, x) = (best / places, best % places);
     if score < 0.85 || x == 0 || y == 0 || x == places - 1 || y == places - 1 {

@@ -34,6 +34,7 @@
 
 mod align;
 mod bundle;
+mod correlation;
 mod crop;
 mod elastic;
 mod exposure;

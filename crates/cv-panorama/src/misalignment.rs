@@ -1,14 +1,13 @@
 //! Where two photographs show the same thing at different places of the preview: near things against far ones, where no deformation is smooth enough
 //! to bring both together. A seam there cuts things in two however little the colours on it differ.
 
+use crate::correlation::{PAD, PLACES, REACH, Template};
 use crate::preview::{Piece, Preview};
 use cv_core::GrayF32;
 use rayon::prelude::*;
 
 /// Half the side of the patches compared, in preview pixels.
 const HALF: usize = 4;
-/// Farthest displacement looked for, in preview pixels.
-const REACH: isize = 8;
 /// Preview pixels between places looked at.
 const STEP: usize = 3;
 /// Least root mean square contrast of a patch, in grey levels: below it, what is cut in two is not seen.
@@ -72,14 +71,14 @@ fn compare(preview: &Preview, lumas: &[GrayF32], a: usize, b: usize) -> Option<P
     let common = first.intersection(&second)?;
     let (columns, rows) = (common.width() / STEP, common.height() / STEP);
     let mut pixels = vec![0.0; columns * rows];
-    for row in 0..rows {
-        for column in 0..columns {
+    pixels.par_chunks_mut(columns.max(1)).enumerate().for_each(|(row, out)| {
+        for (column, out) in out.iter_mut().enumerate() {
             let (x, y) = (common.left + column * STEP + STEP / 2, common.top + row * STEP + STEP / 2);
             let p = ((x - first.left) as isize, (y - first.top) as isize);
             let q = ((x - second.left) as isize, (y - second.top) as isize);
-            pixels[row * columns + column] = displacement(&lumas[a], p, &lumas[b], q);
+            *out = displacement(&lumas[a], p, &lumas[b], q);
         }
-    }
+    });
     spread(&mut pixels, columns);
     Some(Pair { left: common.left, top: common.top, columns, rows, pixels })
 }
@@ -103,54 +102,49 @@ fn spread(pixels: &mut [f32], columns: usize) {
 /// The least displacement at which the patch around `p` looks as around `q`: 0 where it is too plain, [`REACH`] where nothing looks like it, NaN where one
 /// of the two is not wholly inside its photograph.
 fn displacement(first: &GrayF32, p: (isize, isize), second: &GrayF32, q: (isize, isize)) -> f32 {
-    let n = ((2 * HALF + 1) * (2 * HALF + 1)) as f32;
-    let mut patch = [0.0_f32; (2 * HALF + 1) * (2 * HALF + 1)];
+    const SIDE: usize = 2 * HALF + 1;
+    let mut patch = [0.0_f32; SIDE * SIDE];
     let (Some(ours), Some(theirs)) = (rows(first, p), rows(second, q)) else { return f32::NAN };
-    if theirs.flatten().any(|v| v.is_nan()) {
+    if theirs.clone().flatten().any(|v| v.is_nan()) {
         return f32::NAN;
     }
-    for (to, from) in patch.chunks_exact_mut(2 * HALF + 1).zip(ours) {
+    for (to, from) in patch.chunks_exact_mut(SIDE).zip(ours) {
         to.copy_from_slice(from);
     }
-    let mean = patch.iter().sum::<f32>() / n;
-    patch.iter_mut().for_each(|v| *v -= mean);
-    let energy: f32 = patch.iter().map(|v| v * v).sum();
-    if energy.is_nan() {
+    let template = Template::new(SIDE, &patch);
+    if template.energy().is_nan() {
         return f32::NAN;
     }
-    if energy < n * CONTRAST * CONTRAST {
+    if template.energy() < (SIDE * SIDE) as f32 * CONTRAST * CONTRAST {
         return 0.0;
     }
-    let score = |dx: isize, dy: isize| -> Option<f32> {
-        let (mut sum, mut squares, mut product) = (0.0_f32, 0.0_f32, 0.0_f32);
-        for (ours, theirs) in patch.chunks_exact(2 * HALF + 1).zip(rows(second, (q.0 + dx, q.1 + dy))?) {
-            for (a, b) in ours.iter().zip(theirs) {
-                sum += b;
-                squares += b * b;
-                product += a * b;
-            }
-        }
-        let score = product / (energy * (squares - sum * sum / n).max(1e-3)).sqrt();
-        score.is_finite().then_some(score)
-    };
-    if score(0, 0).is_some_and(|s| s > 1.0 - AS_GOOD) {
+    if template.score(theirs) > 1.0 - AS_GOOD {
         return 0.0;
     }
-    let side = (2 * REACH + 1) as usize;
-    let mut scores = [f32::NEG_INFINITY; ((2 * REACH + 1) * (2 * REACH + 1)) as usize];
-    for (i, s) in scores.iter_mut().enumerate() {
-        *s = score((i % side) as isize - REACH, (i / side) as isize - REACH).unwrap_or(f32::NEG_INFINITY);
+    // Where the window leaves the photograph it is NaN, and so are the scores there.
+    const WIDE: usize = SIDE + 2 * REACH;
+    let mut window = [f32::NAN; WIDE * WIDE + PAD];
+    let reach = (HALF + REACH) as isize;
+    let (w, h) = (second.width() as isize, second.height() as isize);
+    let (left, right) = ((q.0 - reach).max(0), (q.0 + reach + 1).min(w));
+    for y in (q.1 - reach).max(0)..(q.1 + reach + 1).min(h) {
+        let start = (y - q.1 + reach) as usize * WIDE + (left - q.0 + reach) as usize;
+        let row = &second.row(y as usize)[left as usize..right as usize];
+        window[start..start + row.len()].copy_from_slice(row);
     }
+    let scores = template.scores(&window);
+    // `max` passes over NaN.
     let best = scores.iter().copied().fold(f32::NEG_INFINITY, f32::max);
     if best < ALIKE {
         return REACH as f32;
     }
-    let distance = |i: usize| ((i % side) as f32 - REACH as f32).hypot((i / side) as f32 - REACH as f32);
+    let off = |i: usize| i.abs_diff(REACH) as f32;
+    let distance = |i: usize| off(i % PLACES).hypot(off(i / PLACES));
     (0..scores.len()).filter(|&i| scores[i] >= best - AS_GOOD).map(distance).fold(f32::INFINITY, f32::min)
 }
 
 /// The rows of the patch around a pixel; `None` where it is not wholly inside.
-fn rows(image: &GrayF32, (x, y): (isize, isize)) -> Option<impl Iterator<Item = &[f32]>> {
+fn rows(image: &GrayF32, (x, y): (isize, isize)) -> Option<impl Iterator<Item = &[f32]> + Clone> {
     let h = HALF as isize;
     let inside = x >= h && y >= h && x + h < image.width() as isize && y + h < image.height() as isize;
     inside.then(|| (y - h..=y + h).map(move |y| &image.row(y as usize)[(x - h) as usize..=(x + h) as usize]))

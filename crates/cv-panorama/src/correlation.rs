@@ -1,0 +1,134 @@
+//! Normalised cross-correlation of a small square patch with all places of a window around where it is expected.
+
+use fearless_simd::{Level, dispatch};
+
+/// Farthest displacement looked for, in pixels of the patch.
+pub(crate) const REACH: usize = 8;
+/// Displacements along each axis.
+pub(crate) const PLACES: usize = 2 * REACH + 1;
+/// Displacements along a row are worked on side by side: as many as fill whole vectors of every instruction set.
+const LANES: usize = 24;
+/// Numbers after the last of a window, which the lanes beyond [`PLACES`] read and nobody uses.
+pub(crate) const PAD: usize = LANES - PLACES;
+
+/// A patch to look for: less its mean, row by row.
+pub(crate) struct Template {
+    side: usize,
+    centred: Vec<f32>,
+    energy: f32,
+}
+
+impl Template {
+    pub(crate) fn new(side: usize, patch: &[f32]) -> Self {
+        let mean = patch.iter().sum::<f32>() / patch.len() as f32;
+        let centred: Vec<f32> = patch.iter().map(|v| v - mean).collect();
+        let energy = centred.iter().map(|v| v * v).sum();
+        Self { side, centred, energy }
+    }
+
+    /// Sum of the squares about the mean.
+    pub(crate) fn energy(&self) -> f32 {
+        self.energy
+    }
+
+    /// The correlation with one place, given by its rows: −1 to 1; NaN where they are.
+    pub(crate) fn score<'a>(&self, rows: impl Iterator<Item = &'a [f32]>) -> f32 {
+        let (mut sum, mut squares, mut product) = (0.0_f32, 0.0_f32, 0.0_f32);
+        for (ours, theirs) in self.centred.chunks_exact(self.side).zip(rows) {
+            for (a, b) in ours.iter().zip(theirs) {
+                sum += b;
+                squares += b * b;
+                product += a * b;
+            }
+        }
+        self.normalised(sum, squares, product)
+    }
+
+    /// The correlations with all places of a window of `side + 2 REACH` on a side, followed by [`PAD`] numbers: row by row, the same as [`Self::score`] of
+    /// each.
+    pub(crate) fn scores(&self, window: &[f32]) -> [f32; PLACES * PLACES] {
+        dispatch!(Level::new(), _simd => self.scores_inner(window))
+    }
+
+    #[inline(always)]
+    fn scores_inner(&self, window: &[f32]) -> [f32; PLACES * PLACES] {
+        let wide = self.side + 2 * REACH;
+        debug_assert_eq!(window.len(), wide * wide + PAD);
+        let mut scores = [0.0; PLACES * PLACES];
+        for (dy, out) in scores.chunks_exact_mut(PLACES).enumerate() {
+            let (mut sum, mut squares, mut product) = ([0.0_f32; LANES], [0.0_f32; LANES], [0.0_f32; LANES]);
+            for (r, ours) in self.centred.chunks_exact(self.side).enumerate() {
+                let row = &window[(r + dy) * wide..][..self.side - 1 + LANES];
+                for (a, theirs) in ours.iter().zip(row.windows(LANES)) {
+                    for k in 0..LANES {
+                        sum[k] += theirs[k];
+                        squares[k] += theirs[k] * theirs[k];
+                        product[k] += a * theirs[k];
+                    }
+                }
+            }
+            for (k, out) in out.iter_mut().enumerate() {
+                *out = self.normalised(sum[k], squares[k], product[k]);
+            }
+        }
+        scores
+    }
+
+    #[inline(always)]
+    fn normalised(&self, sum: f32, squares: f32, product: f32) -> f32 {
+        // Grey levels: below a thousandth there is nothing to compare, only rounding. (A NaN passes by way of the product.)
+        product / (self.energy * (squares - sum * sum / self.centred.len() as f32).max(1e-3)).sqrt()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn all_places_at_once_are_each_place_by_itself(half in 1_usize..9, seed in any::<u32>(), hole in 0_usize..2000) {
+            let side = 2 * half + 1;
+            let wide = side + 2 * REACH;
+            let mut state = seed;
+            let mut random = || {
+                state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                (state >> 8) as f32 / (1 << 16) as f32
+            };
+            let patch: Vec<f32> = (0..side * side).map(|_| random()).collect();
+            let mut window: Vec<f32> = (0..wide * wide).map(|_| random()).collect();
+            if let Some(v) = window.get_mut(hole) {
+                *v = f32::NAN;
+            }
+            window.resize(wide * wide + PAD, 0.0);
+            let template = Template::new(side, &patch);
+            let scores = template.scores(&window);
+            for (i, found) in scores.iter().enumerate() {
+                let (y, x) = (i / PLACES, i % PLACES);
+                let one = template.score((0..side).map(|r| &window[(y + r) * wide + x..][..side]));
+                prop_assert_eq!(found.to_bits(), one.to_bits());
+                prop_assert!(one.is_nan() || one.abs() < 1.0001);
+            }
+        }
+    }
+
+    #[test]
+    fn a_patch_is_found_where_it_was_cut_out() {
+        let (side, wide) = (9, 9 + 2 * REACH);
+        let mut window: Vec<f32> = (0..wide * wide)
+            .map(|i| (i as u32).wrapping_mul(2_654_435_761).rotate_left(13).wrapping_mul(1_664_525) >> 24)
+            .map(|v| v as f32)
+            .collect();
+        window.resize(wide * wide + PAD, 0.0);
+        let (x, y) = (11, 3);
+        // Brighter and of less contrast: the correlation does not mind.
+        let patch: Vec<f32> =
+            (0..side * side).map(|i| 0.5 * window[(y + i / side) * wide + x + i % side] + 40.0).collect();
+        let scores = Template::new(side, &patch).scores(&window);
+        let best = (0..scores.len()).max_by(|a, b| scores[*a].total_cmp(&scores[*b]));
+        assert_eq!(best, Some(y * PLACES + x));
+        // Rounding of some eighty sums.
+        assert!((scores[y * PLACES + x] - 1.0).abs() < 1e-4);
+    }
+}
