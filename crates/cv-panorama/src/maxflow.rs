@@ -13,6 +13,20 @@ const TERMINAL: u8 = 4;
 /// `parent` of a node that lost its way to a terminal.
 const ORPHAN: u8 = 5;
 
+/// All of a node beside each other: a step to a neighbour touches half a cache line.
+#[derive(Clone, Copy)]
+struct Node {
+    /// Residual capacity of the four outgoing arcs.
+    capacity: [i32; 4],
+    /// Residual capacity from the source (positive) or to the sink (negative).
+    terminal: i32,
+    time: u32,
+    distance: u32,
+    tree: u8,
+    parent: u8,
+    is_active: bool,
+}
+
 /// A graph of `width × height` nodes with edges between four-neighbours and to two terminals.
 ///
 /// Nodes that carry no capacity cost nothing, so that a region of any shape is cut in its bounding box.
@@ -21,16 +35,8 @@ pub(crate) struct GridCut {
     /// Of the padded grid: a border of one node without capacities spares every test for the edge.
     stride: usize,
     height: usize,
-    /// Residual capacity of each node's four outgoing arcs.
-    capacity: Vec<[i32; 4]>,
-    /// Residual capacity from the source (positive) or to the sink (negative).
-    terminal: Vec<i32>,
-    tree: Vec<u8>,
-    parent: Vec<u8>,
-    time: Vec<u32>,
-    distance: Vec<u32>,
+    nodes: Vec<Node>,
     active: std::collections::VecDeque<u32>,
-    is_active: Vec<bool>,
     orphans: std::collections::VecDeque<u32>,
     clock: u32,
 }
@@ -38,19 +44,14 @@ pub(crate) struct GridCut {
 impl GridCut {
     pub(crate) fn new(width: usize, height: usize) -> Self {
         let (stride, rows) = (width + 2, height + 2);
-        let n = stride * rows;
+        let node =
+            Node { capacity: [0; 4], terminal: 0, time: 0, distance: 0, tree: FREE, parent: ORPHAN, is_active: false };
         Self {
             width,
             stride,
             height,
-            capacity: vec![[0; 4]; n],
-            terminal: vec![0; n],
-            tree: vec![FREE; n],
-            parent: vec![ORPHAN; n],
-            time: vec![0; n],
-            distance: vec![0; n],
+            nodes: vec![node; stride * rows],
             active: std::collections::VecDeque::new(),
-            is_active: vec![false; n],
             orphans: std::collections::VecDeque::new(),
             clock: 0,
         }
@@ -73,7 +74,7 @@ impl GridCut {
     /// Adds costs of being cut from the source and from the sink (both at least 0): a node on the sink's side pays the first.
     pub(crate) fn add_terminal(&mut self, x: usize, y: usize, source: i32, sink: i32) {
         let node = self.node(x, y);
-        self.terminal[node] += source - sink;
+        self.nodes[node].terminal += source - sink;
     }
 
     /// Adds capacities between a pixel and its right neighbour: paid where this one is on the source's side and that one on the
@@ -89,31 +90,31 @@ impl GridCut {
 
     fn add_edge(&mut self, node: usize, direction: usize, forward: i32, backward: i32) {
         let other = self.neighbour(node, direction);
-        self.capacity[node][direction] += forward;
-        self.capacity[other][direction ^ 1] += backward;
+        self.nodes[node].capacity[direction] += forward;
+        self.nodes[other].capacity[direction ^ 1] += backward;
     }
 
     /// After [`Self::solve`]: whether the pixel is on the sink's side of the cut. What could be on either is on the source's.
     pub(crate) fn on_sink_side(&self, x: usize, y: usize) -> bool {
-        self.tree[self.node(x, y)] == SINK
+        self.nodes[self.node(x, y)].tree == SINK
     }
 
     /// Finds a minimum cut.
     pub(crate) fn solve(&mut self) {
-        for node in 0..self.terminal.len() {
-            let t = self.terminal[node];
+        for node in 0..self.nodes.len() {
+            let t = self.nodes[node].terminal;
             if t != 0 {
-                self.tree[node] = if t > 0 { SOURCE } else { SINK };
-                self.parent[node] = TERMINAL;
-                self.distance[node] = 1;
+                self.nodes[node].tree = if t > 0 { SOURCE } else { SINK };
+                self.nodes[node].parent = TERMINAL;
+                self.nodes[node].distance = 1;
                 self.activate(node);
             }
         }
         while let Some(node) = self.active.pop_front() {
             let node = node as usize;
-            self.is_active[node] = false;
+            self.nodes[node].is_active = false;
             // A node stays at work until it meets the other tree no more.
-            while self.tree[node] != FREE {
+            while self.nodes[node].tree != FREE {
                 let Some((s, direction)) = self.grow(node) else { break };
                 self.clock += 1;
                 self.augment(s, direction);
@@ -125,37 +126,43 @@ impl GridCut {
     }
 
     fn activate(&mut self, node: usize) {
-        if !std::mem::replace(&mut self.is_active[node], true) {
+        if !std::mem::replace(&mut self.nodes[node].is_active, true) {
             self.active.push_back(node as u32);
         }
     }
 
     /// Whether flow can still pass along the tree edge between a node and its neighbour towards the leaves of that tree.
     fn open(&self, tree: u8, node: usize, direction: usize, other: usize) -> bool {
-        if tree == SOURCE { self.capacity[node][direction] > 0 } else { self.capacity[other][direction ^ 1] > 0 }
+        if tree == SOURCE {
+            self.nodes[node].capacity[direction] > 0
+        } else {
+            self.nodes[other].capacity[direction ^ 1] > 0
+        }
     }
 
     /// Lets the node's tree take its free neighbours; returns an arc from the source's tree to the sink's where they touch.
     fn grow(&mut self, node: usize) -> Option<(usize, usize)> {
-        let tree = self.tree[node];
+        let tree = self.nodes[node].tree;
         for direction in 0..4 {
             let other = self.neighbour(node, direction);
             if !self.open(tree, node, direction, other) {
                 continue;
             }
-            if self.tree[other] == FREE {
-                self.tree[other] = tree;
-                self.parent[other] = (direction ^ 1) as u8;
-                self.time[other] = self.time[node];
-                self.distance[other] = self.distance[node] + 1;
+            if self.nodes[other].tree == FREE {
+                self.nodes[other].tree = tree;
+                self.nodes[other].parent = (direction ^ 1) as u8;
+                self.nodes[other].time = self.nodes[node].time;
+                self.nodes[other].distance = self.nodes[node].distance + 1;
                 self.activate(other);
-            } else if self.tree[other] != tree {
+            } else if self.nodes[other].tree != tree {
                 return Some(if tree == SOURCE { (node, direction) } else { (other, direction ^ 1) });
-            } else if self.time[other] <= self.time[node] && self.distance[other] > self.distance[node] + 1 {
+            } else if self.nodes[other].time <= self.nodes[node].time
+                && self.nodes[other].distance > self.nodes[node].distance + 1
+            {
                 // A shorter way to the same terminal.
-                self.parent[other] = (direction ^ 1) as u8;
-                self.time[other] = self.time[node];
-                self.distance[other] = self.distance[node] + 1;
+                self.nodes[other].parent = (direction ^ 1) as u8;
+                self.nodes[other].time = self.nodes[node].time;
+                self.nodes[other].distance = self.nodes[node].distance + 1;
             }
         }
         None
@@ -163,74 +170,74 @@ impl GridCut {
 
     fn augment(&mut self, s: usize, direction: usize) {
         let t = self.neighbour(s, direction);
-        let mut flow = self.capacity[s][direction];
+        let mut flow = self.nodes[s].capacity[direction];
         let mut node = s;
-        while self.parent[node] != TERMINAL {
-            let d = self.parent[node] as usize;
+        while self.nodes[node].parent != TERMINAL {
+            let d = self.nodes[node].parent as usize;
             let up = self.neighbour(node, d);
-            flow = flow.min(self.capacity[up][d ^ 1]);
+            flow = flow.min(self.nodes[up].capacity[d ^ 1]);
             node = up;
         }
-        flow = flow.min(self.terminal[node]);
+        flow = flow.min(self.nodes[node].terminal);
         node = t;
-        while self.parent[node] != TERMINAL {
-            let d = self.parent[node] as usize;
-            flow = flow.min(self.capacity[node][d]);
+        while self.nodes[node].parent != TERMINAL {
+            let d = self.nodes[node].parent as usize;
+            flow = flow.min(self.nodes[node].capacity[d]);
             node = self.neighbour(node, d);
         }
-        flow = flow.min(-self.terminal[node]);
+        flow = flow.min(-self.nodes[node].terminal);
 
-        self.capacity[s][direction] -= flow;
-        self.capacity[t][direction ^ 1] += flow;
+        self.nodes[s].capacity[direction] -= flow;
+        self.nodes[t].capacity[direction ^ 1] += flow;
         node = s;
-        while self.parent[node] != TERMINAL {
-            let d = self.parent[node] as usize;
+        while self.nodes[node].parent != TERMINAL {
+            let d = self.nodes[node].parent as usize;
             let up = self.neighbour(node, d);
-            self.capacity[node][d] += flow;
-            self.capacity[up][d ^ 1] -= flow;
-            if self.capacity[up][d ^ 1] == 0 {
+            self.nodes[node].capacity[d] += flow;
+            self.nodes[up].capacity[d ^ 1] -= flow;
+            if self.nodes[up].capacity[d ^ 1] == 0 {
                 self.orphan(node);
             }
             node = up;
         }
-        self.terminal[node] -= flow;
-        if self.terminal[node] == 0 {
+        self.nodes[node].terminal -= flow;
+        if self.nodes[node].terminal == 0 {
             self.orphan(node);
         }
         node = t;
-        while self.parent[node] != TERMINAL {
-            let d = self.parent[node] as usize;
+        while self.nodes[node].parent != TERMINAL {
+            let d = self.nodes[node].parent as usize;
             let up = self.neighbour(node, d);
-            self.capacity[up][d ^ 1] += flow;
-            self.capacity[node][d] -= flow;
-            if self.capacity[node][d] == 0 {
+            self.nodes[up].capacity[d ^ 1] += flow;
+            self.nodes[node].capacity[d] -= flow;
+            if self.nodes[node].capacity[d] == 0 {
                 self.orphan(node);
             }
             node = up;
         }
-        self.terminal[node] += flow;
-        if self.terminal[node] == 0 {
+        self.nodes[node].terminal += flow;
+        if self.nodes[node].terminal == 0 {
             self.orphan(node);
         }
     }
 
     fn orphan(&mut self, node: usize) {
-        self.parent[node] = ORPHAN;
+        self.nodes[node].parent = ORPHAN;
         self.orphans.push_back(node as u32);
     }
 
     fn adopt(&mut self, node: usize) {
-        let tree = self.tree[node];
+        let tree = self.nodes[node].tree;
         let mut best: Option<(u32, usize)> = None;
         for direction in 0..4 {
             let other = self.neighbour(node, direction);
             // Flow runs from the other node to this one in the source's tree, the other way in the sink's.
             let open = if tree == SOURCE {
-                self.capacity[other][direction ^ 1] > 0
+                self.nodes[other].capacity[direction ^ 1] > 0
             } else {
-                self.capacity[node][direction] > 0
+                self.nodes[node].capacity[direction] > 0
             };
-            if !open || self.tree[other] != tree {
+            if !open || self.nodes[other].tree != tree {
                 continue;
             }
             if let Some(distance) = self.distance_to_terminal(other)
@@ -240,26 +247,26 @@ impl GridCut {
             }
         }
         if let Some((distance, direction)) = best {
-            self.parent[node] = direction as u8;
-            self.time[node] = self.clock;
-            self.distance[node] = distance + 1;
+            self.nodes[node].parent = direction as u8;
+            self.nodes[node].time = self.clock;
+            self.nodes[node].distance = distance + 1;
             return;
         }
-        self.tree[node] = FREE;
+        self.nodes[node].tree = FREE;
         for direction in 0..4 {
             let other = self.neighbour(node, direction);
-            if self.tree[other] != tree {
+            if self.nodes[other].tree != tree {
                 continue;
             }
             let open = if tree == SOURCE {
-                self.capacity[other][direction ^ 1] > 0
+                self.nodes[other].capacity[direction ^ 1] > 0
             } else {
-                self.capacity[node][direction] > 0
+                self.nodes[node].capacity[direction] > 0
             };
             if open {
                 self.activate(other);
             }
-            if usize::from(self.parent[other]) == direction ^ 1 {
+            if usize::from(self.nodes[other].parent) == direction ^ 1 {
                 self.orphan(other);
             }
         }
@@ -269,13 +276,13 @@ impl GridCut {
     fn distance_to_terminal(&mut self, start: usize) -> Option<u32> {
         let (mut node, mut steps) = (start, 0);
         let total = loop {
-            if self.time[node] == self.clock {
-                break steps + self.distance[node];
+            if self.nodes[node].time == self.clock {
+                break steps + self.nodes[node].distance;
             }
-            match self.parent[node] {
+            match self.nodes[node].parent {
                 TERMINAL => {
-                    self.time[node] = self.clock;
-                    self.distance[node] = 1;
+                    self.nodes[node].time = self.clock;
+                    self.nodes[node].distance = 1;
                     break steps + 1;
                 }
                 ORPHAN => return None,
@@ -286,11 +293,11 @@ impl GridCut {
             }
         };
         let (mut node, mut distance) = (start, total);
-        while self.time[node] != self.clock {
-            self.time[node] = self.clock;
-            self.distance[node] = distance;
+        while self.nodes[node].time != self.clock {
+            self.nodes[node].time = self.clock;
+            self.nodes[node].distance = distance;
             distance -= 1;
-            node = self.neighbour(node, usize::from(self.parent[node]));
+            node = self.neighbour(node, usize::from(self.nodes[node].parent));
         }
         Some(total)
     }

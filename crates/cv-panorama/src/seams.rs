@@ -9,6 +9,7 @@ use crate::maxflow::GridCut;
 use crate::misalignment::Misalignments;
 use crate::preview::Preview;
 use crate::warp::Warped;
+use rayon::prelude::*;
 
 /// How seams are found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -207,22 +208,24 @@ fn near_seams(labels: &Labels, reach: usize) -> Vec<bool> {
 fn expand(
     labels: &mut Labels,
     pieces: &[Option<Toned<'_>>],
-    unary: impl Fn(usize, usize, usize) -> i32,
-    pairwise: impl Fn(usize, usize, usize, usize) -> i32,
-    free: impl Fn(usize, usize) -> bool,
+    unary: impl Fn(usize, usize, usize) -> i32 + Sync,
+    pairwise: impl Fn(usize, usize, usize, usize) -> i32 + Sync,
+    free: impl Fn(usize, usize) -> bool + Sync,
     rounds: usize,
 ) {
+    let groups = apart(pieces);
     // A label need not be tried again unless something changed since.
     let mut stale = vec![true; pieces.len()];
     for _ in 0..rounds {
-        for alpha in 0..pieces.len() {
-            if std::mem::replace(&mut stale[alpha], false)
-                && expand_one(labels, pieces, alpha, &unary, &pairwise, &free)
-            {
-                let bounds = |k: usize| pieces[k].as_ref().map(|p| p.warped.bounds);
+        for group in &groups {
+            let turn: Vec<usize> = group.iter().copied().filter(|&k| std::mem::replace(&mut stale[k], false)).collect();
+            let snapshot = &*labels;
+            let changes: Vec<Vec<usize>> =
+                turn.par_iter().map(|&alpha| expand_one(snapshot, pieces, alpha, &unary, &pairwise, &free)).collect();
+            for (&alpha, changed) in turn.iter().zip(&changes).filter(|(_, changed)| !changed.is_empty()) {
+                changed.iter().for_each(|&i| labels.data[i] = alpha as u16);
                 for (other, s) in stale.iter_mut().enumerate() {
-                    let (Some(a), Some(b)) = (bounds(other), bounds(alpha)) else { continue };
-                    *s |= other != alpha && a.intersection(&b).is_some();
+                    *s |= other != alpha && touch(pieces, other, alpha);
                 }
             }
         }
@@ -232,22 +235,41 @@ fn expand(
     }
 }
 
+/// Whether two pieces reach a common pixel or neighbouring ones, going by their bounds.
+fn touch(pieces: &[Option<Toned<'_>>], a: usize, b: usize) -> bool {
+    let (Some(a), Some(b)) = (&pieces[a], &pieces[b]) else { return false };
+    a.warped.bounds.grown(1, usize::MAX, usize::MAX).intersection(&b.warped.bounds).is_some()
+}
+
+/// The pieces in groups that do not touch each other: in a group, what one takes over changes nothing for the others, so that they may all be tried at once.
+fn apart(pieces: &[Option<Toned<'_>>]) -> Vec<Vec<usize>> {
+    let mut groups: Vec<Vec<usize>> = Vec::new();
+    for k in 0..pieces.len() {
+        match groups.iter_mut().find(|group| group.iter().all(|&other| !touch(pieces, k, other))) {
+            Some(group) => group.push(k),
+            None => groups.push(vec![k]),
+        }
+    }
+    groups
+}
+
 /// Capacity that no cut can afford.
 const NEVER: i32 = 1 << 28;
 
+/// The pixels that `alpha` should take over, by index.
 fn expand_one(
-    labels: &mut Labels,
+    labels: &Labels,
     pieces: &[Option<Toned<'_>>],
     alpha: usize,
-    unary: impl Fn(usize, usize, usize) -> i32,
-    pairwise: impl Fn(usize, usize, usize, usize) -> i32,
-    free: impl Fn(usize, usize) -> bool,
-) -> bool {
-    let Some(own) = &pieces[alpha] else { return false };
+    unary: impl Fn(usize, usize, usize) -> i32 + Sync,
+    pairwise: impl Fn(usize, usize, usize, usize) -> i32 + Sync,
+    free: impl Fn(usize, usize) -> bool + Sync,
+) -> Vec<usize> {
+    let Some(own) = &pieces[alpha] else { return Vec::new() };
     let Some(b) =
         own.warped.bounds.intersection(&Bounds { left: 0, top: 0, right: labels.width, bottom: labels.height })
     else {
-        return false;
+        return Vec::new();
     };
     let differ =
         |a: usize, c: usize, x: usize, y: usize| difference(&pieces[a], &pieces[c], x, y) + pairwise(a, c, x, y);
@@ -265,8 +287,27 @@ fn expand_one(
             }
         }
     }
-    let Some(b) = any else { return false };
+    let Some(b) = any else { return Vec::new() };
     let (w, h) = (b.width(), b.height());
+    // How alpha and what is shown differ at each pixel: most edges run between pixels of one label and need just this.
+    let mut shown = vec![0; w * h];
+    shown.par_chunks_mut(w).enumerate().for_each(|(row, out)| {
+        let y = b.top + row;
+        for (x, out) in (b.left..).zip(out) {
+            let label = labels.at(x, y);
+            if label != NONE && usize::from(label) != alpha {
+                *out = differ(alpha, usize::from(label), x, y);
+            }
+        }
+    });
+    let from_alpha = |c: usize, x: usize, y: usize| {
+        let inside = x >= b.left && y >= b.top && x < b.right && y < b.bottom;
+        if inside && usize::from(labels.at(x, y)) == c {
+            shown[(y - b.top) * w + x - b.left]
+        } else {
+            differ(alpha, c, x, y)
+        }
+    };
     let mut cut = GridCut::new(w, h);
     // Source side: keeps its label. Sink side: becomes alpha.
     for y in b.top..b.bottom {
@@ -291,15 +332,10 @@ fn expand_one(
                     continue;
                 }
                 let (p, q) = (usize::from(label), usize::from(other));
-                let pay = |a: usize, c: usize| -> i32 {
-                    if a == c {
-                        return 0;
-                    }
-                    STEP + differ(a, c, x, y) + differ(a, c, nx, ny)
-                };
-                let keep = pay(p, q);
+                let keep = if p == q { 0 } else { STEP + differ(p, q, x, y) + differ(p, q, nx, ny) };
+                let pay = |c: usize| if c == alpha { 0 } else { STEP + from_alpha(c, x, y) + from_alpha(c, nx, ny) };
                 // Cost where only the first, or only the second, becomes alpha.
-                let (first, second) = (pay(alpha, q), pay(p, alpha));
+                let (first, second) = (pay(q), pay(p));
                 match (mine, theirs) {
                     (true, true) => {
                         // E(keep, keep) ≤ E(alpha, keep) + E(keep, alpha) holds for differences; at borders it is made to.
@@ -349,10 +385,7 @@ fn expand_one(
             }
         }
     }
-    for &i in &changed {
-        labels.data[i] = alpha as u16;
-    }
-    !changed.is_empty()
+    changed
 }
 
 /// A cost (of either sign) of switching to alpha, that is, of being on the sink's side.
