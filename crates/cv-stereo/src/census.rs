@@ -1,6 +1,7 @@
 //! The census transform (Zabih & Woodfill, ECCV 1994): what a pixel's neighbourhood looks like, in bits that no
 //! change of exposure touches.
 
+use crate::layout::Layout;
 use crate::{Blend, Census};
 use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
@@ -39,83 +40,77 @@ impl Grey {
     }
 }
 
-/// Number of bytes per pixel.
-pub(crate) fn planes(window: Census) -> usize {
-    window.bits().div_ceil(8)
+/// Number of bytes that describe a pixel: its census bits, and what the blend compares.
+pub(crate) fn planes(window: Census, blend: Blend) -> usize {
+    window.bits().div_ceil(8) + usize::from(blend != Blend::None)
 }
 
-/// Census bytes of every pixel, a plane per byte, into `out` (resized). Bit `i` tells whether the `i`-th neighbour, row
-/// by row, is darker than the centre.
-pub(crate) fn census(level: Level, grey: &Grey, window: Census, out: &mut Vec<Vec<u8>>) {
-    let width = grey.width;
-    out.resize_with(planes(window), Vec::new);
-    for (plane, bytes) in out.iter_mut().enumerate() {
-        bytes.resize(width * grey.height, 0);
-        bytes
-            .par_chunks_mut(width)
-            .enumerate()
-            .for_each(|(y, row)| dispatch!(level, simd => census_row(simd, grey, window, plane, y, row)));
-    }
+/// Describes every pixel, into `out` (resized): the bytes of a row one after the other. Bit `i` of the census tells
+/// whether the `i`-th neighbour, row by row, is darker than the centre.
+pub(crate) fn describe(level: Level, grey: &Grey, window: Census, blend: Blend, out: &mut Vec<u8>) {
+    let stride = grey.width * planes(window, blend);
+    out.resize(stride * grey.height, 0);
+    out.par_chunks_mut(stride).enumerate().for_each(|(y, row)| describe_row(level, grey, window, blend, y, row));
 }
 
-/// As [`census`], each row mirrored: element `j` of its `stride` elements is column `width − 1 − min_disparity − j`, zero
-/// outside the image.
-pub(crate) fn census_mirrored(
+/// As [`describe`], each row mirrored and dealt out to the phases of `layout`: element `j` is column
+/// `width − 1 − min_disparity − j`, zero outside the image.
+pub(crate) fn describe_mirrored(
     level: Level,
     grey: &Grey,
     window: Census,
+    blend: Blend,
     min_disparity: i64,
-    stride: usize,
-    out: &mut Vec<Vec<u8>>,
+    layout: Layout,
+    out: &mut Vec<u8>,
 ) {
-    out.resize_with(planes(window), Vec::new);
-    for (plane, bytes) in out.iter_mut().enumerate() {
-        mirrored(grey, min_disparity, stride, bytes, |y, row| {
-            dispatch!(level, simd => census_row(simd, grey, window, plane, y, row));
-        });
-    }
-}
-
-/// Rows of bytes that `fill` makes, mirrored as [`census_mirrored`] says, into `out` (resized).
-fn mirrored(grey: &Grey, min_disparity: i64, stride: usize, out: &mut Vec<u8>, fill: impl Fn(usize, &mut [u8]) + Sync) {
-    let width = grey.width;
+    let (width, planes) = (grey.width, planes(window, blend));
+    let (n, phase, len) = (layout.vectors(), layout.phase(width), layout.right_row(width));
     // Element of the last column, and where it would be were the row long enough on both sides.
     let first = -min_disparity;
-    let inside = first.clamp(0, stride as i64) as usize..(first + width as i64).clamp(0, stride as i64) as usize;
-    // The column of the first element inside.
-    let last_column = (width as i64 - 1 + first - inside.start as i64).max(0) as usize;
-    out.resize(stride * grey.height, 0);
-    out.par_chunks_mut(stride).enumerate().for_each_init(
-        || vec![0u8; width],
-        |row, (y, mirrored)| {
-            fill(y, row);
-            mirrored[..inside.start].fill(0);
-            mirrored[inside.end..].fill(0);
-            for (to, from) in mirrored[inside.clone()].iter_mut().zip(row[..=last_column].iter().rev()) {
-                *to = *from;
+    let inside = first.clamp(0, len as i64) as usize..(first + width as i64).clamp(0, len as i64) as usize;
+    // One past the column of the first element inside.
+    let columns = (width as i64 + first - inside.start as i64).max(0) as usize;
+    out.resize(planes * len * grey.height, 0);
+    out.par_chunks_mut(planes * len).enumerate().for_each_init(
+        || (vec![0; width * planes], vec![0; len + n]),
+        |(described, mirrored), (y, row)| {
+            describe_row(level, grey, window, blend, y, described);
+            for (p, plane) in described.chunks_exact(width).enumerate() {
+                for (to, from) in mirrored[inside.clone()].iter_mut().zip(plane[..columns].iter().rev()) {
+                    *to = *from;
+                }
+                for of in 0..n {
+                    let to = &mut row[(of * planes + p) * phase..][..phase];
+                    match n {
+                        1 => to.copy_from_slice(&mirrored[..phase]),
+                        2 => every(&mirrored[of..], to, |v| u16::from_le_bytes(v) as u8),
+                        4 => every(&mirrored[of..], to, |v| u32::from_le_bytes(v) as u8),
+                        _ => every(&mirrored[of..], to, |v| u64::from_le_bytes(v) as u8),
+                    }
+                }
             }
         },
     );
 }
 
-/// What [`Blend`] compares, of every pixel of the left image and, laid out as [`census_mirrored`] says, of the right one.
-pub(crate) fn blend_planes(
-    level: Level,
-    grey: &[Grey; 2],
-    blend: Blend,
-    min_disparity: i64,
-    stride: usize,
-    [left, right]: &mut [Vec<u8>; 2],
-) {
-    if blend == Blend::None {
-        return;
+/// Every `N`-th element from the first on. To narrow integers is something that compilers have instructions for.
+fn every<const N: usize>(from: &[u8], to: &mut [u8], first: impl Fn([u8; N]) -> u8) {
+    for (to, from) in to.iter_mut().zip(from.as_chunks::<N>().0) {
+        *to = first(*from);
     }
-    let fill = |side: usize, y: usize, row: &mut [u8]| {
-        dispatch!(level, simd => blend_row(simd, &grey[side], blend, y, row));
-    };
-    left.resize(grey[0].width * grey[0].height, 0);
-    left.par_chunks_mut(grey[0].width).enumerate().for_each(|(y, row)| fill(0, y, row));
-    mirrored(&grey[1], min_disparity, stride, right, |y, row| fill(1, y, row));
+}
+
+/// The bytes of row `y`, one after the other.
+fn describe_row(level: Level, grey: &Grey, window: Census, blend: Blend, y: usize, out: &mut [u8]) {
+    let bytes = planes(window, Blend::None);
+    for (plane, row) in out.chunks_exact_mut(grey.width).enumerate() {
+        if plane < bytes {
+            dispatch!(level, simd => census_row(simd, grey, window, plane, y, row));
+        } else {
+            dispatch!(level, simd => blend_row(simd, grey, blend, y, row));
+        }
+    }
 }
 
 #[simd]

@@ -21,12 +21,14 @@
 mod aligned;
 mod census;
 mod confidence;
+mod cost;
 mod depth;
 mod error;
 mod evaluate;
 mod fill;
 mod input;
 mod kernel;
+mod layout;
 #[cfg(test)]
 mod levels;
 mod matcher;
@@ -36,6 +38,7 @@ mod options;
 mod plain;
 mod rectify;
 mod rectify_scene;
+mod select;
 mod sgm;
 mod smooth;
 mod speckle;

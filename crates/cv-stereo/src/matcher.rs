@@ -1,14 +1,15 @@
 //! From a rectified pair to checked disparities.
 
-use crate::census::{Grey, blend_planes, census, census_mirrored, planes};
+use crate::census::{Grey, describe, describe_mirrored, planes};
 use crate::confidence::{confidence, sigma};
+use crate::cost::{Frame, Penalties};
 use crate::fill::{Holes, fill_holes};
 use crate::input::to_grey;
-use crate::kernel::Frame;
-use crate::sgm::{Aggregator, blocks};
+use crate::layout::Layout;
+use crate::sgm::Aggregator;
 use crate::smooth::{self, Planes, smooth};
 use crate::speckle::{Speckles, remove_speckles};
-use crate::winner::{NO_SUM, Winner, p2_table};
+use crate::winner::{NO_SUM, Winner};
 use crate::{Blend, Intensity, Paths, StereoError, StereoOptions, Subpixel, median};
 use cv_core::{GrayF32, Image, ImageView, Sample};
 use fearless_simd::Level;
@@ -94,8 +95,8 @@ pub struct StereoMatcher {
     level: Level,
     grey: [Grey; 2],
     grey8: Vec<u8>,
-    census: [Vec<Vec<u8>>; 2],
-    blend: [Vec<u8>; 2],
+    /// Census bits and what the blend compares, of both views.
+    described: [Vec<u8>; 2],
     aggregator: Aggregator,
     /// For aggregation in strips.
     strip: Aggregator,
@@ -118,8 +119,7 @@ impl StereoMatcher {
             level: Level::new(),
             grey: Default::default(),
             grey8: Vec::new(),
-            census: Default::default(),
-            blend: Default::default(),
+            described: Default::default(),
             aggregator: Aggregator::default(),
             strip: Aggregator::default(),
             speckles: Speckles::default(),
@@ -147,13 +147,13 @@ impl StereoMatcher {
     fn memory_of(&self, width: usize, height: usize, rows: usize) -> usize {
         let options = &self.options;
         let pixels = width.saturating_mul(height);
-        let planes = planes(options.census) + usize::from(options.blend != Blend::None);
+        let planes = planes(options.census, options.blend);
         let strip = if rows < height { (rows + 2 * OVERLAP).min(height) } else { 0 };
         let whole = if rows < height { 0 } else { height };
         // Grey of both views in 16 bits, of one in 8; winners of both views; labels, scratch and outputs.
         let fixed = 5 + planes + size_of::<Winner>() + size_of::<u16>() + 8 + 4 + 5;
-        let stride = Frame::right_stride(width, blocks(options.disparities));
-        Aggregator::bytes(width, strip.max(whole), options.disparities)
+        let stride = self.layout().right_row(width);
+        Aggregator::bytes(width, strip.max(whole), self.layout())
             .saturating_add(strip.saturating_mul(width).saturating_mul(size_of::<Winner>() + size_of::<u16>()))
             .saturating_add(pixels.saturating_mul(fixed))
             .saturating_add(smooth::bytes(options.smoothing, width, height))
@@ -276,55 +276,49 @@ impl StereoMatcher {
     pub fn prepare(&mut self, width: usize, height: usize, map: &mut DisparityMap) -> Result<(), StereoError> {
         self.check_size(width, height)?;
         match self.strip_rows(width, height) {
-            None => self.aggregator.prepare(width, height, self.options.disparities),
+            None => self.aggregator.prepare(width, height, self.layout()),
             Some(rows) => {
-                self.strip.prepare(width, (rows + 2 * OVERLAP).min(height), self.options.disparities);
+                self.strip.prepare(width, (rows + 2 * OVERLAP).min(height), self.layout());
             }
         }
         map.resize(width, height);
         Ok(())
     }
 
-    /// Length of a row of the right view's planes.
-    fn stride(&self, width: usize) -> usize {
-        Frame::right_stride(width, blocks(self.options.disparities))
+    /// In which order the disparities of a pixel lie in memory.
+    fn layout(&self) -> Layout {
+        Layout::new(self.level, self.options.disparities)
     }
 
     /// What costs are made of.
     fn bits(&mut self) {
-        let stride = self.stride(self.grey[0].width);
-        let options = &self.options;
-        let min_disparity = i64::from(options.min_disparity);
-        census(self.level, &self.grey[0], options.census, &mut self.census[0]);
-        census_mirrored(self.level, &self.grey[1], options.census, min_disparity, stride, &mut self.census[1]);
-        blend_planes(self.level, &self.grey, options.blend, min_disparity, stride, &mut self.blend);
+        let (level, layout) = (self.level, self.layout());
+        let StereoOptions { census, blend, min_disparity, .. } = self.options;
+        let [left, right] = &mut self.described;
+        describe(level, &self.grey[0], census, blend, left);
+        describe_mirrored(level, &self.grey[1], census, blend, i64::from(min_disparity), layout, right);
         self.grey[0].to_bytes(&mut self.grey8);
     }
 
     /// Costs and path sums; winners of both views.
     fn aggregate(&mut self, width: usize, height: usize) {
-        let stride = self.stride(width);
         let options = &self.options;
-        let blocks = blocks(options.disparities);
-        let min_disparity = i64::from(options.min_disparity);
-        let p2 = p2_table(options);
-        let cap = options.blend.cap();
+        let layout = self.layout();
+        let planes = planes(options.census, options.blend);
+        let stride = planes * layout.right_row(width);
+        let p2 = Penalties::new(options);
         let run = |aggregator: &mut Aggregator, rows: Range<usize>| {
-            let here = rows.start * width..rows.end * width;
-            let there = rows.start * stride..rows.end * stride;
-            let left: Vec<&[u8]> = self.census[0].iter().map(|plane| &plane[here.clone()]).collect();
-            let right: Vec<&[u8]> = self.census[1].iter().map(|plane| &plane[there.clone()]).collect();
-            let [blend_left, blend_right] = &self.blend;
             let frame = Frame {
                 width,
                 height: rows.len(),
-                min_disparity,
+                min_disparity: i64::from(options.min_disparity),
                 disparities: options.disparities,
-                blocks,
-                left: &left,
-                right: &right,
-                blend: (options.blend != Blend::None).then(|| (&blend_left[here.clone()], &blend_right[there], cap)),
-                grey: &self.grey8[here],
+                layout,
+                planes,
+                left: &self.described[0][rows.start * width * planes..rows.end * width * planes],
+                right: &self.described[1][rows.start * stride..rows.end * stride],
+                blend_cap: (options.blend != Blend::None).then(|| options.blend.cap()),
+                grey: &self.grey8[rows.start * width..rows.end * width],
                 p1: options.p1,
                 p2: &p2,
                 second: options.confidence || options.uniqueness > 0,

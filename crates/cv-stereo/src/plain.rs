@@ -26,7 +26,8 @@ pub(crate) fn match_plain(
         .flat_map(|i| {
             let (x, row) = (i % width, i / width * width);
             let inside: Vec<Option<u8>> = (0..n).map(|k| column(x, k).map(|xr| bits(i, row + xr))).collect();
-            let outside = outside_cost(&inside.iter().flatten().copied().collect::<Vec<_>>());
+            let known = inside.iter().flatten();
+            let outside = outside_cost(known.clone().map(|&c| u32::from(c)).sum(), known.count());
             inside.into_iter().map(move |cost| cost.unwrap_or(outside)).collect::<Vec<_>>()
         })
         .collect();
@@ -109,10 +110,11 @@ pub(crate) fn match_plain(
 
 mod tests {
     use super::*;
-    use crate::census::{Grey, MARGIN, blend_planes, census, census_mirrored};
-    use crate::kernel::Frame;
+    use crate::census::{Grey, MARGIN, describe, describe_mirrored, planes};
+    use crate::cost::{Frame, Penalties};
+    use crate::layout::Layout;
     use crate::levels::levels;
-    use crate::sgm::{Aggregator, blocks};
+    use crate::sgm::Aggregator;
     use crate::{Census, StereoOptions};
     use proptest::prelude::*;
 
@@ -213,26 +215,24 @@ mod tests {
             let left: Vec<u16> = (0..width * height).map(noise).collect();
             let right: Vec<u16> = (0..width * height).map(|i| noise(if i % 5 == 0 { i + 7 } else { i + 3 })).collect();
             let bits = [&left, &right].map(|g| census_plain(g, width, height, options.census));
-            let planes = [&left, &right].map(|g| blend_plain(g, width, options.blend));
-            let expected = match_plain(&options, &left, &bits[0], &bits[1], &planes, width, height);
+            let blended = [&left, &right].map(|g| blend_plain(g, width, options.blend));
+            let expected = match_plain(&options, &left, &bits[0], &bits[1], &blended, width, height);
 
             let grey = [padded(&left, width, height), padded(&right, width, height)];
-            let blocks = blocks(options.disparities);
             let min_disparity = i64::from(options.min_disparity);
+            let StereoOptions { census, blend, disparities, .. } = options;
+            let p2 = Penalties::new(&options);
             for level in levels() {
+                let layout = Layout::new(level, disparities);
                 let (mut a, mut b, mut bytes) = (Vec::new(), Vec::new(), Vec::new());
-                census(level, &grey[0], options.census, &mut a);
-                census_mirrored(level, &grey[1], options.census, min_disparity, Frame::right_stride(width, blocks), &mut b);
+                describe(level, &grey[0], census, blend, &mut a);
+                describe_mirrored(level, &grey[1], census, blend, min_disparity, layout, &mut b);
                 grey[0].to_bytes(&mut bytes);
-                let mut planes: [Vec<u8>; 2] = Default::default();
-                let stride = Frame::right_stride(width, blocks);
-                blend_planes(level, &grey, options.blend, min_disparity, stride, &mut planes);
-                let slices = [&a, &b].map(|planes| planes.iter().map(Vec::as_slice).collect::<Vec<_>>());
                 let frame = Frame {
-                    width, height, min_disparity, disparities: options.disparities, blocks,
-                    left: &slices[0], right: &slices[1], grey: &bytes,
-                    blend: (options.blend != Blend::None).then_some((&planes[0], &planes[1], options.blend.cap())),
-                    p1: options.p1, p2: &p2_table(&options), second: options.confidence,
+                    width, height, min_disparity, disparities, layout, planes: planes(census, blend),
+                    left: &a, right: &b, grey: &bytes,
+                    blend_cap: (blend != Blend::None).then_some(blend.cap()),
+                    p1: options.p1, p2: &p2, second: options.confidence,
                 };
                 let mut aggregator = Aggregator::default();
                 // Twice, so that what a frame leaves behind would show.

@@ -7,7 +7,9 @@
 //! and no two threads ever write to the same memory.
 
 use crate::aligned::Aligned;
-use crate::kernel::{BLOCK, Frame, Output, Sweep, sweep_rows};
+use crate::cost::Frame;
+use crate::kernel::{Output, Sweep, sweep_rows};
+use crate::layout::Layout;
 use crate::winner::Winner;
 use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
@@ -21,19 +23,13 @@ pub(crate) struct Aggregator {
     pub(crate) right: Vec<u16>,
 }
 
-/// Blocks that hold `disparities`.
-pub(crate) fn blocks(disparities: usize) -> usize {
-    disparities.div_ceil(BLOCK)
-}
-
 impl Aggregator {
     /// Bytes for images of this size.
-    pub(crate) fn bytes(width: usize, height: usize, disparities: usize) -> usize {
+    pub(crate) fn bytes(width: usize, height: usize, layout: Layout) -> usize {
         let pixels = width.saturating_mul(height);
-        let blocks = blocks(disparities);
         pixels
-            .saturating_mul(blocks * BLOCK + size_of::<Winner>() + size_of::<u16>())
-            .saturating_add(2 * Sweep::bytes(width, blocks))
+            .saturating_mul(layout.depth + size_of::<Winner>() + size_of::<u16>())
+            .saturating_add(2 * Sweep::bytes(width, layout.depth))
     }
 
     fn resize(&mut self, width: usize, height: usize, depth: usize) {
@@ -43,15 +39,15 @@ impl Aggregator {
     }
 
     /// Asks for the memory of a frame and touches every page of it.
-    pub(crate) fn prepare(&mut self, width: usize, height: usize, disparities: usize) {
-        self.resize(width, height, blocks(disparities) * BLOCK);
+    pub(crate) fn prepare(&mut self, width: usize, height: usize, layout: Layout) {
+        self.resize(width, height, layout.depth);
         self.sums.as_mut_slice().par_chunks_mut(1 << 20).for_each(|part| part.fill(0));
     }
 
     /// Fills [`Aggregator::winners`] and [`Aggregator::right`].
     pub(crate) fn run(&mut self, level: Level, frame: &Frame<'_>, eight: bool) {
         let (width, height) = (frame.width, frame.height);
-        let depth = frame.blocks * BLOCK;
+        let depth = frame.layout.depth;
         self.resize(width, height, depth);
         let [down, up] = &mut self.sweeps;
         // Rows of the upper half, swept first by `down` and last by `up`.

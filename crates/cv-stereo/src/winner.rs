@@ -28,11 +28,11 @@ pub(crate) fn is_flat(index: usize, disparities: usize, cost: u16, at: impl Fn(u
     at(index + 1) == cost && (index + 2 >= disparities || at(index + 2) == cost)
 }
 
-/// What a match outside the right image costs, given the costs inside: their mean. Where the image is flat all match
-/// equally well, and those outside must not look worse; where it is not, they cost as much as a chance match.
-pub(crate) fn outside_cost(inside: &[u8]) -> u8 {
-    let n = inside.len() as u32;
-    let sum: u32 = inside.iter().map(|&c| u32::from(c)).sum();
+/// What a match outside the right image costs, given the sum of the costs inside and their number: their mean. Where the
+/// image is flat all match equally well, and those outside must not look worse; where it is not, they cost as much as a
+/// chance match.
+pub(crate) fn outside_cost(sum: u32, n: usize) -> u8 {
+    let n = n as u32;
     (sum + n / 2).checked_div(n).unwrap_or(0) as u8
 }
 

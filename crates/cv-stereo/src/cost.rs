@@ -1,0 +1,189 @@
+//! What matching costs, from the census bits, and the penalties along the paths.
+
+use crate::StereoOptions;
+use crate::layout::{BLOCK, Layout};
+use crate::winner::outside_cost;
+use fearless_simd::prelude::*;
+use fearless_simd_macros::simd;
+use std::ops::Range;
+
+/// What both sweeps read.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Frame<'a> {
+    pub(crate) width: usize,
+    pub(crate) height: usize,
+    pub(crate) min_disparity: i64,
+    /// Number of disparities asked for.
+    pub(crate) disparities: usize,
+    pub(crate) layout: Layout,
+    /// Bytes that describe a pixel: its census bits, then, with a cap, what the blend compares.
+    pub(crate) planes: usize,
+    /// The bytes of the left image, each row plane by plane.
+    pub(crate) left: &'a [u8],
+    /// The bytes of the right image, each row mirrored so that disparities ascend: element `j` of a row is column
+    /// `width − 1 − min_disparity − j`, and the match of column `x` at index `k` is element `width − 1 − x + k`. A row
+    /// holds the elements of phase 0 plane by plane, then those of phase 1 and so on.
+    pub(crate) right: &'a [u8],
+    /// The most that the blend adds to the bits.
+    pub(crate) blend_cap: Option<u8>,
+    /// Grey values of the left image, 0 to 255.
+    pub(crate) grey: &'a [u8],
+    pub(crate) p1: u8,
+    pub(crate) p2: &'a Penalties,
+    /// Whether [`crate::winner::Winner::second`] is wanted.
+    pub(crate) second: bool,
+}
+
+impl Frame<'_> {
+    /// Indices whose match lies inside the right image: its column falls with the index, so that the first ones may lie
+    /// right of the image and the last ones left of it.
+    #[inline(always)]
+    fn inside(&self, x: usize) -> Range<usize> {
+        let column = x as i64 - self.min_disparity;
+        let n = self.disparities as i64;
+        (column - (self.width as i64 - 1)).clamp(0, n) as usize..(column + 1).clamp(0, n) as usize
+    }
+
+    /// Costs of the pixels `xs` of row `y` at every disparity; 255 beyond the last one, which keeps those lanes from ever
+    /// winning or lending to their neighbours, since additions saturate. Groups are of `BLOCKS` blocks, and there is but
+    /// one where `SINGLE`.
+    #[inline(always)]
+    pub(crate) fn costs<S: Simd, const BLOCKS: usize, const SINGLE: bool>(
+        &self,
+        simd: S,
+        y: usize,
+        xs: Range<usize>,
+        out: &mut [u8],
+    ) {
+        match self.planes - usize::from(self.blend_cap.is_some()) {
+            3 => costs::<S, 3, BLOCKS, SINGLE>(simd, self, y, xs, out),
+            6 => costs::<S, 6, BLOCKS, SINGLE>(simd, self, y, xs, out),
+            _ => costs::<S, 8, BLOCKS, SINGLE>(simd, self, y, xs, out),
+        }
+    }
+}
+
+#[simd]
+fn costs<S: Simd, const BITS: usize, const BLOCKS: usize, const SINGLE: bool>(
+    simd: S,
+    frame: &Frame<'_>,
+    y: usize,
+    xs: Range<usize>,
+    out: &mut [u8],
+) {
+    let lanes = S::u8s::LEN;
+    let group = BLOCKS * BLOCK;
+    let n = group / lanes;
+    let groups = if SINGLE { 1 } else { frame.layout.groups() };
+    let (width, planes) = (frame.width, frame.planes);
+    let phase = frame.layout.phase(width);
+    let row = &frame.right[y * planes * n * phase..][..planes * n * phase];
+    let left = &frame.left[y * width * planes..][..width * planes];
+    for (x, out) in xs.zip(out.chunks_exact_mut(groups * group)) {
+        let mut bits = [S::u8s::splat(simd, 0); BITS];
+        for p in 0..BITS {
+            bits[p] = S::u8s::splat(simd, left[p * width + x]);
+        }
+        let start = width - 1 - x;
+        for v in 0..n {
+            let (of, index) = ((start + v) % n, (start + v) / n);
+            let part = &row[of * planes * phase..][..planes * phase];
+            for g in 0..groups {
+                // Candidates of the same vector in later groups follow at once.
+                let at = index + g * lanes;
+                let mut count = (S::u8s::from_slice(simd, &part[at..][..lanes]) ^ bits[0]).count_ones();
+                for p in 1..BITS {
+                    count += (S::u8s::from_slice(simd, &part[p * phase + at..][..lanes]) ^ bits[p]).count_ones();
+                }
+                if let Some(cap) = frame.blend_cap {
+                    let value = S::u8s::splat(simd, left[BITS * width + x]);
+                    let other = S::u8s::from_slice(simd, &part[BITS * phase + at..][..lanes]);
+                    count += (value.max(other) - value.min(other)).min(S::u8s::splat(simd, cap));
+                }
+                count.store_slice(&mut out[(g * n + v) * lanes..][..lanes]);
+            }
+        }
+        let inside = frame.inside(x);
+        if inside.len() < groups * group {
+            borders::<S, BLOCKS>(simd, frame, inside, out);
+        }
+    }
+}
+
+/// Replaces the costs of matches outside the right image, and of disparities beyond the last one.
+#[inline(always)]
+fn borders<S: Simd, const BLOCKS: usize>(simd: S, frame: &Frame<'_>, inside: Range<usize>, out: &mut [u8]) {
+    let lanes = S::u8s::LEN;
+    let group = BLOCKS * BLOCK;
+    let n = group / lanes;
+    let first = S::u8s::from_fn(simd, |lane| (lane * n) as u8);
+    let zero = S::u8s::splat(simd, 0);
+    // At most 128: they and the indices of a group fit a byte.
+    let local = |k: usize, g: usize| S::u8s::splat(simd, k.saturating_sub(g * group).min(group) as u8);
+    let mut sum = 0;
+    for (g, out) in out.chunks_exact(group).enumerate() {
+        let (low, high) = (local(inside.start, g), local(inside.end, g));
+        // At most eight times 508.
+        let mut part = S::u16s::splat(simd, 0);
+        for v in 0..n {
+            let k = first + v as u8;
+            let cost = S::u8s::from_slice(simd, &out[v * lanes..][..lanes]);
+            part += (k.simd_ge(low) & k.simd_lt(high)).select(cost, zero).pairwise_widening_add();
+        }
+        // At most 128 times 254.
+        sum += u32::from(part.reduce_sum());
+    }
+    let outside = S::u8s::splat(simd, outside_cost(sum, inside.len()));
+    let worst = S::u8s::splat(simd, u8::MAX);
+    for (g, out) in out.chunks_exact_mut(group).enumerate() {
+        let (low, high) = (local(inside.start, g), local(inside.end, g));
+        let end = local(frame.disparities, g);
+        for v in 0..n {
+            let k = first + v as u8;
+            let out = &mut out[v * lanes..][..lanes];
+            let cost = (k.simd_ge(low) & k.simd_lt(high)).select(S::u8s::from_slice(simd, out), outside);
+            k.simd_lt(end).select(cost, worst).store_slice(out);
+        }
+    }
+}
+
+/// P2 by the absolute difference of neighbouring grey values.
+#[derive(Debug, Clone)]
+pub(crate) struct Penalties {
+    table: [u8; 256],
+    /// The differences from which on it is one less; several where it falls by more.
+    steps: Vec<u8>,
+}
+
+impl Penalties {
+    pub(crate) fn new(options: &StereoOptions) -> Self {
+        let table = crate::winner::p2_table(options);
+        let falls = |step: &u8| usize::from(table[usize::from(*step) - 1] - table[usize::from(*step)]);
+        let steps = (1..=255u8).flat_map(|step| std::iter::repeat_n(step, falls(&step))).collect();
+        Self { table, steps }
+    }
+
+    /// P2 between the pixels of two rows.
+    pub(crate) fn between<S: Simd>(&self, simd: S, a: &[u8], b: &[u8], out: &mut [u8]) {
+        between(simd, self, a, b, out);
+    }
+}
+
+#[simd]
+fn between<S: Simd>(simd: S, penalties: &Penalties, a: &[u8], b: &[u8], out: &mut [u8]) {
+    let lanes = S::u8s::LEN;
+    let whole = out.len() - out.len() % lanes;
+    let one = S::u8s::splat(simd, 1);
+    for at in (0..whole).step_by(lanes) {
+        let (a, b) = (S::u8s::from_slice(simd, &a[at..][..lanes]), S::u8s::from_slice(simd, &b[at..][..lanes]));
+        let difference = a.max(b) - a.min(b);
+        let mut p2 = S::u8s::splat(simd, penalties.table[0]);
+        for &step in &penalties.steps {
+            p2 = difference.simd_ge(S::u8s::splat(simd, step)).select(p2 - one, p2);
+        }
+        p2.store_slice(&mut out[at..][..lanes]);
+    }
+    for ((out, &a), &b) in out[whole..].iter_mut().zip(&a[whole..]).zip(&b[whole..]) {
+        *out = penalties.table[usize::from(a.abs_diff(b))];
+    }
+}

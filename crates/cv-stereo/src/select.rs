@@ -1,0 +1,235 @@
+//! The winners of both views, from the sums of a pixel while they are at hand.
+//!
+//! A sum and its index share a 16-bit key, so that the least key is the first of the least sums. The candidates of a pixel
+//! of the right image are met pixel by pixel of the left one, each time one index further: the best keys so far are held
+//! in vectors that move along by one index a pixel, and what leaves at the end is decided.
+
+use crate::aligned::Aligned;
+use crate::cost::Frame;
+use crate::layout::place;
+use crate::winner::{NO_SUM, Winner, is_flat};
+use fearless_simd::prelude::*;
+
+/// Bits of a key that hold the index within a group.
+const KEY_BITS: u32 = 7;
+const INDEX: u16 = (1 << KEY_BITS) - 1;
+
+/// State of the selection, kept between frames.
+#[derive(Debug, Default)]
+pub(crate) struct Selection {
+    /// Best keys of the right pixels that the current pixel looks at. Vector `r` of the `2n` of a group holds indices
+    /// `2n·l + r`.
+    running: Aligned<u16>,
+    /// Best keys of the right pixels that are decided, group by group: at `x + group − 1 − k` that of the pixel which `x`
+    /// looks at with index `k`.
+    decided: Vec<u16>,
+}
+
+impl Selection {
+    pub(crate) fn bytes(width: usize, depth: usize) -> usize {
+        2 * depth + 2 * depth.div_ceil(64) * (width + 128)
+    }
+
+    pub(crate) fn resize(&mut self, frame: &Frame<'_>) {
+        let layout = frame.layout;
+        self.running.resize(layout.depth, 0);
+        self.decided.resize(layout.groups() * (frame.width + layout.group), 0);
+    }
+
+    /// Prepares for a row. The decided keys, and the running ones.
+    pub(crate) fn start(&mut self) -> (&mut [u16], &mut [u16]) {
+        let running = self.running.as_mut_slice();
+        running.fill(u16::MAX);
+        (&mut self.decided, running)
+    }
+
+    /// Ends a row whose last pixel was `x`: index of the best match of every pixel of the right row.
+    pub(crate) fn finish(&mut self, frame: &Frame<'_>, x: usize, out: &mut [u16]) {
+        let (group, stride) = (frame.layout.group, frame.width + frame.layout.group);
+        // Half vectors: as many lanes as a vector of keys has.
+        let lanes = frame.layout.lanes / 2;
+        let running = self.running.as_mut_slice();
+        for (running, decided) in running.chunks_exact(group).zip(self.decided.chunks_exact_mut(stride)) {
+            for k in 0..group {
+                decided[x + group - 1 - k] = running[place(k, group, lanes)];
+            }
+        }
+        // Where the key of column 0 lies in the first group.
+        let first = frame.min_disparity + group as i64 - 1;
+        if frame.layout.groups() == 1 {
+            // Columns that some pixel looks at.
+            let start = (-first).clamp(0, frame.width as i64) as usize;
+            let end = ((stride - 1) as i64 - first).clamp(start as i64, frame.width as i64) as usize;
+            out[..start].fill(0);
+            out[end..].fill(0);
+            let keys = self.decided.iter().skip((start as i64 + first) as usize);
+            for (out, &key) in out[start..end].iter_mut().zip(keys) {
+                *out = if key >> KEY_BITS < NO_SUM { key & INDEX } else { 0 };
+            }
+            return;
+        }
+        for (column, out) in out.iter_mut().enumerate() {
+            let mut best = (NO_SUM, 0);
+            for (g, decided) in self.decided.chunks_exact(stride).enumerate() {
+                let at = column as i64 + first + (g * group) as i64;
+                if at >= (stride - 1) as i64 {
+                    break;
+                }
+                let Some(&key) = usize::try_from(at).ok().and_then(|at| decided.get(at)) else { continue };
+                if key >> KEY_BITS < best.0 {
+                    best = (key >> KEY_BITS, (key & INDEX) + (g * group) as u16);
+                }
+            }
+            *out = best.1;
+        }
+    }
+}
+
+/// The keys of a group at one pixel.
+pub(crate) struct Keys<S: Simd> {
+    /// What the vectors before the next two held before this pixel.
+    even: S::u16s,
+    odd: S::u16s,
+    /// What vectors `0` and `n` held before this pixel.
+    first: S::u16s,
+    middle: S::u16s,
+    /// The least keys so far.
+    best: S::u16s,
+}
+
+/// Vector `r` of some.
+#[inline(always)]
+fn vector<S: Simd>(simd: S, of: &[u16], r: usize) -> S::u16s {
+    S::u16s::from_slice(simd, &of[r * S::u16s::LEN..][..S::u16s::LEN])
+}
+
+impl<S: Simd> Keys<S> {
+    /// Begins with group of `n` vectors.
+    #[inline(always)]
+    pub(crate) fn begin(simd: S, running: &[u16], n: usize) -> Self {
+        let none = S::u16s::splat(simd, u16::MAX);
+        let last = vector(simd, running, 2 * n - 1);
+        let even = match S::u16s::LEN {
+            8 => none.slide::<7>(last),
+            16 => none.slide::<15>(last),
+            _ => none.slide::<31>(last),
+        };
+        let (first, middle) = (vector(simd, running, 0), vector(simd, running, n));
+        Self { even, odd: vector(simd, running, n - 1), first, middle, best: none }
+    }
+
+    /// Adds the sums of both sweeps at vector `v` of `n`. `ids` are the indices that vectors of keys hold.
+    #[inline(always)]
+    #[allow(clippy::too_many_arguments, reason = "inner loop")]
+    pub(crate) fn add(
+        &mut self,
+        simd: S,
+        [own, other]: [S::u8s; 2],
+        ids: &[S::u16s; MAX_VECTORS],
+        running: &mut [u16],
+        v: usize,
+        n: usize,
+        mirrored: bool,
+    ) {
+        // Bytes in even places, and those in odd ones.
+        let [own, other] = [own.bitcast::<S::u16s>(), other.bitcast::<S::u16s>()];
+        let low = S::u16s::splat(simd, 0xff);
+        let even = (((own & low) + (other & low)) << KEY_BITS) | ids[v];
+        let odd = (((own >> 8) + (other >> 8)) << KEY_BITS) | ids[n + v];
+        self.best = self.best.min(even).min(odd);
+        let here = [vector(simd, running, v), vector(simd, running, n + v)];
+        let [before_even, before_odd] = if !mirrored {
+            [self.even, self.odd]
+        } else if v + 1 < n {
+            [vector(simd, running, v + 1), vector(simd, running, n + v + 1)]
+        } else {
+            [self.middle, self.first.slide::<1>(S::u16s::splat(simd, u16::MAX))]
+        };
+        [self.even, self.odd] = here;
+        before_even.min(even).store_slice(&mut running[v * S::u16s::LEN..][..S::u16s::LEN]);
+        before_odd.min(odd).store_slice(&mut running[(n + v) * S::u16s::LEN..][..S::u16s::LEN]);
+    }
+
+    /// Ends the group at pixel `x`, whose key that leaves is kept in `decided`. The least sum and its index, if less than
+    /// `best`.
+    #[inline(always)]
+    pub(crate) fn end(
+        &self,
+        decided: &mut [u16],
+        running: &[u16],
+        x: usize,
+        (group, g): (usize, usize),
+        mirrored: bool,
+        best: (u16, u16),
+    ) -> (u16, u16) {
+        if mirrored {
+            decided[x + group - 1] = running[0];
+        } else {
+            decided[x] = running[group - 1];
+        }
+        let key = self.best.reduce_min();
+        if key >> KEY_BITS < best.0 { (key >> KEY_BITS, (key & INDEX) + (g * group) as u16) } else { best }
+    }
+}
+
+/// Most vectors of keys in a group.
+pub(crate) const MAX_VECTORS: usize = 16;
+
+/// The indices that vectors of keys hold, of `n` vectors of sums per group.
+#[inline(always)]
+pub(crate) fn ids<S: Simd>(simd: S, n: usize) -> [S::u16s; MAX_VECTORS] {
+    let first = S::u16s::from_fn(simd, |lane| (lane * 2 * n) as u16);
+    let mut ids = [first; MAX_VECTORS];
+    for (r, id) in ids.iter_mut().enumerate() {
+        *id += S::u16s::splat(simd, r as u16);
+    }
+    ids
+}
+
+/// The winner with its surroundings, given the sums of both sweeps.
+#[inline(always)]
+pub(crate) fn winner<S: Simd>(
+    simd: S,
+    frame: &Frame<'_>,
+    group: usize,
+    (cost, index): (u16, u16),
+    own: &[u8],
+    other: &[u8],
+) -> Winner {
+    let k = usize::from(index);
+    let other = &other[..own.len()];
+    let at = |k: usize| {
+        if k < frame.disparities {
+            let place = place(k, group, S::u8s::LEN);
+            u16::from(own[place]) + u16::from(other[place])
+        } else {
+            NO_SUM
+        }
+    };
+    let second = if frame.second { second(simd, group, index, own, other) } else { NO_SUM };
+    let (below, above) =
+        if is_flat(k, frame.disparities, cost, at) { (cost, cost) } else { (at(k.wrapping_sub(1)), at(k + 1)) };
+    Winner { index, cost, second, below, above }
+}
+
+/// The smallest sum that is not next to the winner.
+#[inline(always)]
+fn second<S: Simd>(simd: S, group: usize, index: u16, own: &[u8], other: &[u8]) -> u16 {
+    let n = group / S::u8s::LEN;
+    let ids = ids(simd, n);
+    let none = S::u16s::splat(simd, u16::MAX);
+    // Indices within one of the winner, by unsigned wrap-around.
+    let low = S::u16s::splat(simd, index.wrapping_sub(1));
+    let two = S::u16s::splat(simd, 2);
+    let byte = S::u16s::splat(simd, 0xff);
+    let mut second = none;
+    for (at, (own, other)) in own.chunks_exact(S::u8s::LEN).zip(other.chunks_exact(S::u8s::LEN)).enumerate() {
+        let [own, other] = [own, other].map(|part| S::u8s::from_slice(simd, part).bitcast::<S::u16s>());
+        let (g, v) = (at / n, at % n);
+        for (sum, id) in [((own & byte) + (other & byte), ids[v]), ((own >> 8) + (other >> 8), ids[n + v])] {
+            let far = (id + (g * group) as u16 - low).simd_gt(two);
+            second = second.min(far.select(sum, none));
+        }
+    }
+    second.reduce_min().min(NO_SUM)
+}
