@@ -3,8 +3,10 @@
 mod report;
 
 use crate::common::{Context, Failure, Outcome, Run, expand_images, picture_name};
+use cv_core::Image;
 use cv_pipeline::panorama_types::{Blend, Exposure, Projection, Seams};
 use cv_pipeline::{FeatureMethod, PanoramaError, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama};
+use rayon::prelude::*;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
@@ -14,6 +16,7 @@ use std::path::{Path, PathBuf};
     cv panorama IMG_*.jpg -o pano.png\n  \
     cv panorama holiday/ -o pano.jpg --projection spherical --crop\n  \
     cv panorama a.jpg b.jpg c.jpg -o pano.png --blend poisson --report out/\n  \
+    cv panorama a.jpg b.jpg c.jpg -o pano.png --alpha\n  \
     cv panorama wide/ -o pano.png --camera cam.yaml")]
 pub(crate) struct Args {
     /// Photographs in any order, or folders of them. Those that do not belong are left out.
@@ -37,6 +40,9 @@ pub(crate) struct Args {
     /// Cut the result to the largest rectangle without empty pixels.
     #[arg(long)]
     crop: bool,
+    /// Transparent instead of black where no photograph reaches; for .png.
+    #[arg(long)]
+    alpha: bool,
     /// Size relative to the photographs.
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0)]
     scale: f64,
@@ -133,9 +139,12 @@ impl Run for Args {
         if !(self.scale > 0.0 && self.scale <= 10.0) {
             return Err(Failure::usage(format!("--scale {} is not between 0 and 10", self.scale)));
         }
+        if self.alpha && !self.output.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("png")) {
+            return Err(Failure::usage("--alpha needs a .png: JPEG has no transparency"));
+        }
         let paths = expand_images(&self.images)?;
         let pictures = paths
-            .iter()
+            .par_iter()
             .map(|path| Ok((cv_io::exif_focal(path)?, cv_io::read_rgb(path)?)))
             .collect::<Result<Vec<_>, cv_io::IoError>>()?;
         let photos: Vec<PanoramaPhoto<'_>> = pictures
@@ -149,7 +158,11 @@ impl Run for Args {
             })
             .collect::<Result<_, cv_io::IoError>>()?;
         let result = panorama(&photos, &self.options(context), context).map_err(|error| failure(error, &paths))?;
-        cv_io::write_image(&self.output, result.image.view())?;
+        if self.alpha {
+            cv_io::write_png(&self.output, transparent(&result).view())?;
+        } else {
+            cv_io::write_image(&self.output, result.image.view())?;
+        }
         for (path, image) in paths.iter().zip(&result.images) {
             if let Some(reason) = &image.reason {
                 context.warn(format!("{} is not in the panorama: {reason}", path.display()));
@@ -168,6 +181,15 @@ impl Run for Args {
         })?;
         Ok(outcome(&paths, &result))
     }
+}
+
+/// The picture with an opacity of 255 where a photograph reaches and 0 elsewhere.
+fn transparent(result: &PanoramaResult) -> Image<u8, 4> {
+    let (w, h) = result.image.size();
+    Image::from_fn(w, h, |x, y| {
+        let [r, g, b] = result.image.at(x, y);
+        [r, g, b, if result.mask.at(x, y)[0] { 255 } else { 0 }]
+    })
 }
 
 fn failure(error: PanoramaError, paths: &[PathBuf]) -> Failure {
