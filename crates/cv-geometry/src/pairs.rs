@@ -59,6 +59,8 @@ pub(crate) struct PairSet {
     pub(crate) pairs: Vec<[f64; 4]>,
     /// The same, in random order: the first blocks are a fair sample of all matches.
     pub(crate) blocks: Vec<PairBlock>,
+    /// The place in `pairs` of each lane of `blocks`.
+    pub(crate) order: Vec<u32>,
     /// Of the first image.
     pub(crate) first: Normalizer,
     /// Of the second image; the same scale.
@@ -115,7 +117,7 @@ impl PairSet {
             .chunks(LANES)
             .map(|c| PairBlock { x1: lane(c, 0), y1: lane(c, 1), x2: lane(c, 2), y2: lane(c, 3) })
             .collect();
-        Self { pairs, blocks, first, second }
+        Self { pairs, blocks, order, first, second }
     }
 }
 

@@ -42,7 +42,7 @@ pub fn estimate_relative_pose(
     if let Some(kind) = point_degeneracy(set.pairs.iter(), 6, 0.0) {
         return Err(EstimateError::Degenerate { kind });
     }
-    let found = ransac(&PoseEstimator { set }, options)?;
+    let found = ransac(&PoseEstimator { set, reach: options.threshold }, options)?;
     let pose = found.model;
     let e = essential_from_pose(&pose);
     let residual = |_: &Pose, m: &Correspondence| {
@@ -155,16 +155,60 @@ pub(crate) fn tangent_of(t: &Vector3<f64>) -> [Vector3<f64>; 2] {
 
 struct PoseEstimator {
     set: PairSet,
+    /// Threshold.
+    reach: f64,
+}
+
+/// The essential matrix and the pose it is of.
+struct PoseKernel {
+    sampson: SampsonKernel,
+    r: [f32; 9],
+    t: [f32; 3],
+    reach2: f32,
+}
+
+impl PoseKernel {
+    fn new(pose: &Pose, reach: f64) -> Self {
+        let r = pose.rotation.matrix();
+        Self {
+            sampson: SampsonKernel::new(&essential_from_pose(pose)),
+            r: std::array::from_fn(|i| r[(i / 3, i % 3)] as f32),
+            t: std::array::from_fn(|i| pose.translation[i] as f32),
+            reach2: (reach * reach) as f32,
+        }
+    }
+
+    #[inline(always)]
+    fn squared_residuals(&self, block: &PairBlock) -> [f32; LANES] {
+        let mut out = self.sampson.squared_residuals(block);
+        let (r, t) = (&self.r, &self.t);
+        for (i, r2) in out.iter_mut().enumerate() {
+            let (x, y, u, v) = (block.x1[i], block.y1[i], block.x2[i], block.y2[i]);
+            let p = [r[0] * x + r[1] * y + r[2], r[3] * x + r[4] * y + r[5], r[6] * x + r[7] * y + r[8]];
+            // b × Ra, b × t, Ra × t.
+            let n = [v * p[2] - p[1], p[0] - u * p[2], u * p[1] - v * p[0]];
+            let bt = [v * t[2] - t[1], t[0] - u * t[2], u * t[1] - v * t[0]];
+            let pt = [p[1] * t[2] - p[2] * t[1], p[2] * t[0] - p[0] * t[2], p[0] * t[1] - p[1] * t[0]];
+            let first = n[0] * bt[0] + n[1] * bt[1] + n[2] * bt[2];
+            let second = n[0] * pt[0] + n[1] * pt[1] + n[2] * pt[2];
+            let (lb, lp) = (u * u + v * v + 1.0, p[0] * p[0] + p[1] * p[1] + p[2] * p[2]);
+            let far = self.reach2 * lp;
+            let one = first * first.max(0.0) > far * (bt[0] * bt[0] + bt[1] * bt[1] + bt[2] * bt[2]);
+            let two = second * second.max(0.0) > self.reach2 * lb * (pt[0] * pt[0] + pt[1] * pt[1] + pt[2] * pt[2]);
+            *r2 = if one | two { f32::INFINITY } else { *r2 };
+        }
+        out
+    }
 }
 
 impl Estimator for PoseEstimator {
     type Model = Pose;
     type Block = PairBlock;
-    type Kernel = SampsonKernel;
+    type Kernel = PoseKernel;
     const SAMPLE: usize = 5;
     const RESIDUAL_DIMENSION: i32 = 1;
     // From one and the same basin of the loss, the steps end in one place instead of several beside each other.
-    const WIDENINGS: u32 = 2;
+    const RESAMPLES: usize = 20;
 
     fn count(&self) -> usize {
         self.set.pairs.len()
@@ -176,6 +220,10 @@ impl Estimator for PoseEstimator {
 
     fn blocks(&self) -> &[PairBlock] {
         &self.set.blocks
+    }
+
+    fn order(&self) -> &[u32] {
+        &self.set.order
     }
 
     fn solve(&self, sample: &[u32], models: &mut Vec<Pose>) {
@@ -197,12 +245,12 @@ impl Estimator for PoseEstimator {
         });
     }
 
-    fn kernel(&self, model: &Pose) -> SampsonKernel {
-        SampsonKernel::new(&essential_from_pose(model))
+    fn kernel(&self, model: &Pose) -> PoseKernel {
+        PoseKernel::new(model, self.reach)
     }
 
     #[inline(always)]
-    fn squared_residuals(kernel: &SampsonKernel, block: &PairBlock) -> [f32; LANES] {
+    fn squared_residuals(kernel: &PoseKernel, block: &PairBlock) -> [f32; LANES] {
         kernel.squared_residuals(block)
     }
 

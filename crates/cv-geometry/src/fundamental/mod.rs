@@ -78,7 +78,7 @@ impl Estimator for FundamentalEstimator {
     type Kernel = SampsonKernel;
     const SAMPLE: usize = 7;
     const RESIDUAL_DIMENSION: i32 = 1;
-    const WIDENINGS: u32 = 2;
+    const RESAMPLES: usize = 20;
 
     fn count(&self) -> usize {
         self.set.pairs.len()
@@ -90,6 +90,10 @@ impl Estimator for FundamentalEstimator {
 
     fn blocks(&self) -> &[PairBlock] {
         &self.set.blocks
+    }
+
+    fn order(&self) -> &[u32] {
+        &self.set.order
     }
 
     fn solve(&self, sample: &[u32], models: &mut Vec<Matrix3<f64>>) {

@@ -158,6 +158,10 @@ impl Estimator for HomographyEstimator {
         &self.set.blocks
     }
 
+    fn order(&self) -> &[u32] {
+        &self.set.order
+    }
+
     fn solve(&self, sample: &[u32], models: &mut Vec<Matrix3<f64>>) {
         let pair = |i: usize| &self.set.pairs[sample[i] as usize];
         let a = std::array::from_fn(|i| Point2::new(pair(i)[0], pair(i)[1]));

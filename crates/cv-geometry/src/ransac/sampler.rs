@@ -25,7 +25,7 @@ impl Uniform {
 }
 
 /// Fills `sample` with different numbers below `n`.
-fn distinct(rng: &mut ChaCha8Rng, n: u32, sample: &mut [u32]) {
+pub(super) fn distinct(rng: &mut ChaCha8Rng, n: u32, sample: &mut [u32]) {
     for i in 0..sample.len() {
         // Rejection: samples are small, so it seldom takes two tries.
         sample[i] = loop {

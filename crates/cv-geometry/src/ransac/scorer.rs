@@ -2,10 +2,6 @@
 
 /// A loss of `u = (residual / threshold)²`, from 0 at `u = 0` to 1 for outliers (and for NaN).
 pub trait Scorer: Sync {
-    /// Whether local optimisation may start at a wider threshold ([`crate::Estimator::WIDENINGS`]). A loss that ends at the threshold is for data of which
-    /// few are right, where a wider start is drawn to the wrong ones.
-    const WIDENS: bool = true;
-
     /// The loss. Must be `#[inline(always)]`: it runs inside vector code.
     fn loss(&self, u: f32) -> f32;
 
@@ -36,8 +32,6 @@ impl Scorer for AllIn {
 pub struct Msac;
 
 impl Scorer for Msac {
-    const WIDENS: bool = false;
-
     #[inline(always)]
     fn loss(&self, u: f32) -> f32 {
         if u < 1.0 { u } else { 1.0 }

@@ -1,0 +1,178 @@
+//! Scores and improves models of one estimator.
+
+use super::search::{Found, LOCAL_STEPS};
+use super::{Estimator, Score, Scorer};
+use super::sampler::distinct;
+use crate::pairs::LANES;
+use fearless_simd::{Level, dispatch};
+use rand_chacha::ChaCha8Rng;
+
+/// Sum of losses over all blocks, or [`Score::WORST`] as soon as it is certain to exceed `limit`.
+///
+/// Lanes are summed on their own in a fixed order and no product is fused, so every instruction set gives the same bits.
+#[inline(always)]
+fn score_blocks<E: Estimator, C: Scorer>(
+    kernel: &E::Kernel,
+    blocks: &[E::Block],
+    padding: usize,
+    scorer: &C,
+    inverse_threshold2: f32,
+    limit: f32,
+) -> Score {
+    // The losses of the padding lanes, 1 each, are known from the start.
+    let limit = limit + padding as f32;
+    let mut losses = [0f32; LANES];
+    let mut inliers = [0u32; LANES];
+    for run in blocks.chunks(4) {
+        for block in run {
+            let r2 = E::squared_residuals(kernel, block);
+            for i in 0..LANES {
+                let u = r2[i] * inverse_threshold2;
+                losses[i] += scorer.loss(u);
+                inliers[i] += u32::from(u < 1.0);
+            }
+        }
+        if sum(&losses) > limit {
+            return Score::WORST;
+        }
+    }
+    Score { loss: sum(&losses) - padding as f32, inliers: inliers.iter().sum() }
+}
+
+#[inline(always)]
+fn sum(lanes: &[f32; LANES]) -> f32 {
+    let mut half = [0f32; LANES / 2];
+    for i in 0..LANES / 2 {
+        half[i] = lanes[i] + lanes[i + LANES / 2];
+    }
+    ((half[0] + half[4]) + (half[1] + half[5])) + ((half[2] + half[6]) + (half[3] + half[7]))
+}
+
+/// Most samples of [`Judge::explore`] on one model.
+const MOST_RESAMPLES: usize = 200;
+/// The factor by which a loss has to fall to count as a better minimum, not a better place in the same one.
+const BETTER: f32 = 0.9999;
+
+/// Scores models of one estimator against its data.
+pub(super) struct Judge<'a, E: Estimator, C: Scorer> {
+    pub(super) estimator: &'a E,
+    scorer: &'a C,
+    /// In estimator units.
+    pub(super) threshold: f64,
+    level: Level,
+    inverse_threshold2: f32,
+    padding: usize,
+}
+
+impl<'a, E: Estimator, C: Scorer> Judge<'a, E, C> {
+    pub(super) fn new(estimator: &'a E, scorer: &'a C, threshold: f64) -> Self {
+        Self {
+            estimator,
+            scorer,
+            threshold,
+            level: Level::new(),
+            inverse_threshold2: (1.0 / (threshold * threshold)) as f32,
+            padding: estimator.blocks().len() * LANES - estimator.count(),
+        }
+    }
+
+    /// The score, or [`Score::WORST`] where the loss is certain to exceed `limit`.
+    pub(super) fn score(&self, model: &E::Model, limit: f32) -> Score {
+        let kernel = self.estimator.kernel(model);
+        let (blocks, padding, scale) = (self.estimator.blocks(), self.padding, self.inverse_threshold2);
+        dispatch!(self.level, _simd => score_blocks::<E, C>(&kernel, blocks, padding, self.scorer, scale, limit))
+    }
+
+    /// Local optimisation: the model after refinement, where that lowered its loss.
+    pub(super) fn improve(&self, found: &mut Found<E::Model>, iterations: usize) {
+        if let Some(model) = self.estimator.refine(&found.model, self.scorer, self.threshold, iterations) {
+            let score = self.score(&model, found.score.loss);
+            if score.loss < found.score.loss {
+                *found = Found { model, score };
+            }
+        }
+    }
+
+    /// The inner search of LO-RANSAC (Chum, Matas & Kittler, "Locally optimized RANSAC", 2003): samples of the data near the best model, which are
+    /// seldom wrong, until [`Estimator::RESAMPLES`] of them in a row led to nothing better.
+    ///
+    /// A minimal model with one wrong or noisy datum is in the basin of another minimum of the loss. Refinement does not leave it; this does.
+    pub(super) fn explore(&self, best: &mut Found<E::Model>, rng: &mut ChaCha8Rng, models: &mut Vec<E::Model>) {
+        let mut near = self.near(&best.model);
+        let mut left = E::RESAMPLES;
+        let mut limit = f32::INFINITY;
+        for _ in 0..MOST_RESAMPLES {
+            if left == 0 || near.len() <= E::SAMPLE {
+                return;
+            }
+            left -= 1;
+            let mut sample = [0u32; 8];
+            distinct(rng, near.len() as u32, &mut sample[..E::SAMPLE]);
+            sample[..E::SAMPLE].iter_mut().for_each(|i| *i = near[*i as usize]);
+            models.clear();
+            self.estimator.solve(&sample[..E::SAMPLE], models);
+            let mut candidate: Option<Found<E::Model>> = None;
+            for model in models.drain(..) {
+                let score = self.score(&model, limit);
+                if score.loss < limit {
+                    limit = score.loss;
+                    candidate = Some(Found { model, score });
+                }
+            }
+            if let Some(mut candidate) = candidate {
+                self.improve(&mut candidate, LOCAL_STEPS);
+                if candidate.score.loss < best.score.loss {
+                    if candidate.score.loss < BETTER * best.score.loss {
+                        near = self.near(&candidate.model);
+                        left = E::RESAMPLES;
+                    }
+                    *best = candidate;
+                }
+            }
+        }
+    }
+
+    /// Data within twice the threshold.
+    fn near(&self, model: &E::Model) -> Vec<u32> {
+        let kernel = self.estimator.kernel(model);
+        let residuals = self.estimator.blocks().iter().flat_map(|block| E::squared_residuals(&kernel, block));
+        let within = residuals.zip(self.estimator.order()).filter(|(r2, _)| *r2 * self.inverse_threshold2 < 4.0);
+        within.map(|(_, i)| *i).collect()
+    }
+
+    /// Standard deviation of the residuals of right data in thresholds, by expectation maximisation on a mixture of a Gaussian and an even
+    /// background (MLESAC, Torr & Zisserman 2000); the background is what is found from 3 to 10 thresholds away. At most one threshold.
+    pub(super) fn noise(&self, model: &E::Model) -> Option<f64> {
+        let kernel = self.estimator.kernel(model);
+        let scale = self.inverse_threshold2;
+        let near: Vec<f64> = self
+            .estimator
+            .blocks()
+            .iter()
+            .flat_map(|block| E::squared_residuals(&kernel, block))
+            .map(|r2| f64::from(r2 * scale))
+            .filter(|u| *u < 100.0)
+            .collect();
+        let shell = near.iter().filter(|u| **u >= 9.0).count() as f64;
+        let one = E::RESIDUAL_DIMENSION == 1;
+        let density = shell / if one { 14.0 } else { 91.0 * std::f64::consts::PI };
+        let mut sigma2 = 0.25;
+        let mut inliers = 0.5 * near.len() as f64;
+        for _ in 0..12 {
+            let peak = inliers * (std::f64::consts::TAU * sigma2).powf(-0.5 * f64::from(E::RESIDUAL_DIMENSION));
+            let (mut sum, mut weights) = (0.0, 0.0);
+            for u in &near {
+                let g = peak * (-0.5 * u / sigma2).exp();
+                let w = g / (g + density + 1e-12);
+                sum += w * u;
+                weights += w;
+            }
+            if weights < E::SAMPLE as f64 {
+                return None;
+            }
+            inliers = weights;
+            sigma2 = (sum / (f64::from(E::RESIDUAL_DIMENSION) * weights)).clamp(1e-6, 1.0);
+        }
+        Some(sigma2.sqrt())
+    }
+}
