@@ -4,6 +4,7 @@ use crate::pairs::{LANES, PairBlock};
 use crate::ransac::Scorer;
 use cv_core::{Correspondence, Matrix3, Vector3};
 use cv_numeric::{LeastSquares, LmOptions, NormalEquations, levenberg_marquardt};
+use fearless_simd::{Level, dispatch};
 use nalgebra::{Const, OMatrix, OVector, SMatrix, SVector};
 use std::marker::PhantomData;
 
@@ -57,6 +58,53 @@ impl<'a, C: Scorer, M: Epipolar<N>, const N: usize> SampsonProblem<'a, C, M, N> 
     }
 }
 
+/// Cost, gradient and Hessian by the nine entries of the matrix: eight and one, for vectors of four or eight. The derivative by the last entry is 1.
+struct Sums {
+    cost: f64,
+    hessian: [[f64; 8]; 8],
+    /// The last column but its end, and its end.
+    last: [f64; 8],
+    weight: f64,
+    gradient: [f64; 8],
+    weighted: f64,
+}
+
+impl<C: Scorer, M: Epipolar<N>, const N: usize> SampsonProblem<'_, C, M, N> {
+    #[inline(always)]
+    fn sum(&self, f: &Matrix3<f64>) -> f64 {
+        let mut cost = 0.0;
+        let outside = self.each(f, |_, _, _, _, _, u| cost += f64::from(self.scorer.loss(u as f32)));
+        cost + outside
+    }
+
+    #[inline(always)]
+    fn sums(&self, f: &Matrix3<f64>) -> Sums {
+        let (mut hessian, mut last, mut gradient) = ([[0.0; 8]; 8], [0.0; 8], [0.0; 8]);
+        let (mut cost, mut sum, mut weighted) = (0.0, 0.0, 0.0);
+        let outside = self.each(f, |&[x, y, s, t], l, m, c, inverse, u| {
+            cost += f64::from(self.scorer.loss(u as f32));
+            let weight = self.scorer.weight(u) * inverse;
+            // r = C/√D: ∂r = (∂C − C ∂D/(2D))/√D; ∂D/2 = l ∂l + m ∂m.
+            let k = c * inverse;
+            let (p0, p1, q0, q1) = (s - k * l[0], t - k * l[1], k * m[0], k * m[1]);
+            let g = [p0 * x - q0 * s, p0 * y - q1 * s, p0, p1 * x - q0 * t, p1 * y - q1 * t, p1, x - q0, y - q1];
+            let w = g.map(|g| weight * g);
+            for i in 0..8 {
+                for j in 0..8 {
+                    hessian[i][j] += w[i] * g[j];
+                }
+            }
+            for j in 0..8 {
+                last[j] += w[j];
+                gradient[j] += w[j] * c;
+            }
+            sum += weight;
+            weighted += weight * c;
+        });
+        Sums { cost: cost + outside, hessian, last, weight: sum, gradient, weighted }
+    }
+}
+
 impl<C: Scorer, M: Epipolar<N>, const N: usize> LeastSquares for SampsonProblem<'_, C, M, N> {
     type Dim = Const<N>;
     type Params = M;
@@ -66,42 +114,29 @@ impl<C: Scorer, M: Epipolar<N>, const N: usize> LeastSquares for SampsonProblem<
     }
 
     fn cost(&self, f: &M) -> f64 {
-        let mut cost = 0.0;
-        let outside = self.each(&f.matrix(), |_, _, _, _, _, u| cost += f64::from(self.scorer.loss(u as f32)));
-        cost + outside
+        let matrix = f.matrix();
+        dispatch!(Level::new(), _simd => self.sum(&matrix))
     }
 
     fn linearize(&self, f: &M) -> NormalEquations<Const<N>> {
-        let mut cost = 0.0;
-        let mut hessian = [[0.0; 9]; 9];
-        let mut gradient = [0.0; 9];
-        let outside = self.each(&f.matrix(), |&[x, y, s, t], l, m, c, inverse, u| {
-            cost += f64::from(self.scorer.loss(u as f32));
-            let weight = self.scorer.weight(u) * inverse;
-            // r = C/√D: ∂r = (∂C − C ∂D/(2D))/√D; ∂D/2 = l ∂l + m ∂m.
-            let k = c * inverse;
-            let (p, q) = ([s, t, 1.0], [x, y, 1.0]);
-            let (kl, km) = ([k * l[0], k * l[1], 0.0], [k * m[0], k * m[1], 0.0]);
-            let mut g = [0.0; 9];
-            for i in 0..3 {
-                for j in 0..3 {
-                    g[3 * i + j] = (p[i] - kl[i]) * q[j] - km[j] * p[i];
-                }
-            }
-            for i in 0..9 {
-                let w = weight * g[i];
-                gradient[i] += w * c;
-                for (h, g) in hessian[i].iter_mut().zip(g) {
-                    *h += w * g;
-                }
-            }
-        });
+        let matrix = f.matrix();
+        // No product is fused, so every instruction set gives the same bits.
+        let sums = dispatch!(Level::new(), _simd => self.sums(&matrix));
         let tangent = f.tangent();
-        let hessian = SMatrix::<f64, 9, 9>::from_fn(|r, c| hessian[r][c]);
-        let gradient = tangent.transpose() * SVector::from(gradient);
+        let mut hessian = SMatrix::<f64, 9, 9>::zeros();
+        let mut gradient = SVector::<f64, 9>::zeros();
+        for i in 0..8 {
+            for j in 0..8 {
+                hessian[(i, j)] = sums.hessian[i][j];
+            }
+            (hessian[(i, 8)], hessian[(8, i)]) = (sums.last[i], sums.last[i]);
+            gradient[i] = sums.gradient[i];
+        }
+        (hessian[(8, 8)], gradient[8]) = (sums.weight, sums.weighted);
+        let gradient = tangent.transpose() * gradient;
         let hessian = tangent.transpose() * hessian * tangent;
         NormalEquations {
-            cost: cost + outside,
+            cost: sums.cost,
             hessian: OMatrix::<f64, Const<N>, Const<N>>::from_fn(|r, c| hessian[(r, c)]),
             gradient: OVector::<f64, Const<N>>::from_fn(|r, _| gradient[r]),
         }

@@ -285,7 +285,7 @@ pub fn solve_positive_definite_dense(m: &DMatrix<f64>, b: &DVector<f64>) -> Resu
 ///
 /// Gauss–Jordan elimination, each row with its largest entry as the pivot; `None` where a pivot falls below `1e-9` of its
 /// row's largest entry: the rank is lower. About R²C multiplications, for the minimal solvers.
-#[inline]
+#[inline(always)]
 pub fn null_space<const R: usize, const C: usize, const K: usize>(mut rows: [[f64; C]; R]) -> Option<[[f64; C]; K]> {
     const { assert!(R + K == C, "a full-rank R x C matrix has a null space of dimension C - R") };
     const SINGULAR: f64 = 1e-9;

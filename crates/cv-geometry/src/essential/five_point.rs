@@ -3,6 +3,7 @@
 use crate::fundamental::epipolar_row;
 use cv_core::{Matrix3, Point2};
 use cv_numeric::{null_space, real_roots};
+use fearless_simd::{Level, dispatch};
 
 /// A polynomial of degree one in x, y, z: coefficients of x, y, z, 1.
 type Linear = [f64; 4];
@@ -12,6 +13,11 @@ type Quadratic = [f64; 10];
 /// y, z³, z², z, 1.
 type Cubic = [f64; 20];
 
+/// Four vectors that span the null space of five equations.
+type Basis = [[f64; 9]; 4];
+/// What elimination leaves of six of the ten cubics.
+type Reduced = [[f64; 10]; 6];
+
 /// The essential matrices (at most ten) with `bᵢᵀ E aᵢ = 0` for five matches in normalised coordinates, each of
 /// Frobenius norm √2 (singular values 1, 1, 0).
 ///
@@ -19,10 +25,8 @@ type Cubic = [f64; 20];
 /// problem", 2004: null space, ten cubics, elimination, the real roots of a polynomial of degree ten.
 #[inline]
 pub fn essential_five_point(a: &[Point2<f64>; 5], b: &[Point2<f64>; 5], mut found: impl FnMut(Matrix3<f64>)) {
-    let rows = std::array::from_fn(|i| epipolar_row(a[i], b[i]));
-    let Some(mut basis) = null_space::<5, 9, 4>(rows) else { return };
-    orthonormalize(&mut basis);
-    let Some(reduced) = eliminate(constraints(&basis)) else { return };
+    // No product is fused, so every instruction set gives the same bits.
+    let Some((basis, reduced)) = dispatch!(Level::new(), _simd => reduce(a, b)) else { return };
     // Three equations in (x, y, 1) with polynomials of z for coefficients: pairs of rows of which the second, times z, takes
     // the leading monomial away from the first.
     let mut x = [[0.0; 4]; 3];
@@ -73,10 +77,20 @@ pub fn essential_five_point(a: &[Point2<f64>; 5], b: &[Point2<f64>; 5], mut foun
     }
 }
 
+/// The null space of the five equations and, of the ten cubics in its coordinates, what elimination leaves of six.
+#[inline(always)]
+fn reduce(a: &[Point2<f64>; 5], b: &[Point2<f64>; 5]) -> Option<(Basis, Reduced)> {
+    let rows = std::array::from_fn(|i| epipolar_row(a[i], b[i]));
+    let mut basis = null_space::<5, 9, 4>(rows)?;
+    orthonormalize(&mut basis);
+    let reduced = eliminate(constraints(&basis))?;
+    Some((basis, reduced))
+}
+
 /// Gram and Schmidt's method. The coefficients of the cubics are products of three entries: a basis of uneven lengths or small
 /// angles costs three times its digits.
-#[inline]
-fn orthonormalize(basis: &mut [[f64; 9]; 4]) {
+#[inline(always)]
+fn orthonormalize(basis: &mut Basis) {
     for i in 0..4 {
         let (done, rest) = basis.split_at_mut(i);
         let v = &mut rest[0];
@@ -89,7 +103,7 @@ fn orthonormalize(basis: &mut [[f64; 9]; 4]) {
     }
 }
 
-#[inline]
+#[inline(always)]
 fn times(a: &Linear, b: &Linear) -> Quadratic {
     [
         a[0] * b[0],
@@ -105,7 +119,7 @@ fn times(a: &Linear, b: &Linear) -> Quadratic {
     ]
 }
 
-#[inline]
+#[inline(always)]
 fn times_linear(q: &Quadratic, b: &Linear) -> Cubic {
     [
         q[0] * b[0],
@@ -131,7 +145,7 @@ fn times_linear(q: &Quadratic, b: &Linear) -> Cubic {
     ]
 }
 
-#[inline]
+#[inline(always)]
 fn add<const N: usize>(a: &mut [f64; N], b: &[f64; N]) {
     for (x, y) in a.iter_mut().zip(b) {
         *x += y;
@@ -139,8 +153,8 @@ fn add<const N: usize>(a: &mut [f64; N], b: &[f64; N]) {
 }
 
 /// `(E Eᵀ − ½ tr(E Eᵀ)) E = 0` and `det E = 0` for `E = x e₀ + y e₁ + z e₂ + e₃`, as ten cubics.
-#[inline]
-fn constraints(basis: &[[f64; 9]; 4]) -> [Cubic; 10] {
+#[inline(always)]
+fn constraints(basis: &Basis) -> [Cubic; 10] {
     let entry = |i: usize, j: usize| -> Linear { std::array::from_fn(|k| basis[k][3 * i + j]) };
     let e: [[Linear; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|j| entry(i, j)));
     // E Eᵀ by its upper triangle: 00, 01, 02, 11, 12, 22.
@@ -181,8 +195,8 @@ fn constraints(basis: &[[f64; 9]; 4]) -> [Cubic; 10] {
 }
 
 /// Gauss–Jordan elimination of the first ten columns; of the last six rows, the remaining ten columns. `None` where a pivot vanishes.
-#[inline]
-fn eliminate(mut rows: [Cubic; 10]) -> Option<[[f64; 10]; 6]> {
+#[inline(always)]
+fn eliminate(mut rows: [Cubic; 10]) -> Option<Reduced> {
     for c in 0..10 {
         let mut pivot = c;
         for r in c + 1..10 {
@@ -197,24 +211,16 @@ fn eliminate(mut rows: [Cubic; 10]) -> Option<[[f64; 10]; 6]> {
             return None;
         }
         let inverse = 1.0 / lead;
-        let mut row = rows[c];
-        for v in &mut row[c..] {
-            *v *= inverse;
-        }
+        let row = rows[c].map(|v| v * inverse);
         rows[c] = row;
-        // Rows above the fifth are not used: they only take part going down.
-        for (r, other) in rows.iter_mut().enumerate().skip(4) {
-            if r > c || (r < c && c > 4) {
+        // Rows above the fifth are not used: they only take part going down. Whole rows, of one length, suit vector units; what they do left
+        // of the pivot is not used either.
+        for (r, other) in rows.iter_mut().enumerate() {
+            if r > c || (r >= 4 && r < c) {
                 let factor = other[c];
-                for (v, p) in other[c..].iter_mut().zip(&row[c..]) {
+                for (v, p) in other.iter_mut().zip(&row) {
                     *v -= factor * p;
                 }
-            }
-        }
-        for other in rows.iter_mut().take(4).skip(c + 1) {
-            let factor = other[c];
-            for (v, p) in other[c..].iter_mut().zip(&row[c..]) {
-                *v -= factor * p;
             }
         }
     }

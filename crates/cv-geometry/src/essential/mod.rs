@@ -318,6 +318,53 @@ mod tests {
     }
 
     #[test]
+    fn vector_residuals_are_the_plain_ones_and_infinite_behind_a_camera() {
+        let (mut behind, mut front) = (0, 0);
+        for seed in 0..40 {
+            let views = TwoViews::random(seed);
+            let mut m = views.matches(30, 1.0);
+            m.extend(views.wrong(30));
+            let (m, unit) = normalize_matches(&m, &views.camera, &views.camera);
+            let set = PairSet::with(&m, Normalizer::IDENTITY, Normalizer::IDENTITY);
+            let (r, t) = (views.pose.rotation.matrix(), &views.pose.translation);
+            let kernel = PoseKernel::new(&views.pose, 2.0 * unit);
+            let fast: Vec<f32> = set.blocks.iter().flat_map(|b| kernel.squared_residuals(b)).collect();
+            for (&i, fast) in set.order.iter().zip(&fast) {
+                let m = &m[i as usize];
+                let plain = sampson(&views.essential(), m);
+                if fast.is_finite() {
+                    front += 1;
+                    // Coordinates of order one in f32.
+                    assert!((f64::from(*fast).sqrt() - plain).abs() < 1e-5, "{fast} {plain}");
+                } else {
+                    behind += 1;
+                    assert!(!in_front(r, t, &m.a.to_homogeneous(), &m.b.to_homogeneous()));
+                }
+            }
+        }
+        // Noise of one pixel does not take a right match behind a camera by two; of the wrong ones two in three are behind one or the other.
+        assert!(front > 40 * 30 && behind > 40 * 10, "{front} {behind}");
+    }
+
+    #[test]
+    fn the_same_pose_on_any_number_of_threads() {
+        // Few are right, so that the batches grow to those that are spread over threads.
+        let views = TwoViews::random(7);
+        let mut m = views.matches(40, 0.5);
+        m.extend(views.wrong(110));
+        let (m, unit) = normalize_matches(&m, &views.camera, &views.camera);
+        let run = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let options = RobustOptions { threshold: 1.5 * unit, ..RobustOptions::essential() };
+            pool.install(|| estimate_relative_pose(&m, &options).unwrap())
+        };
+        let (one, four) = (run(1), run(4));
+        assert!(one.iterations > 2048 + 256, "{}", one.iterations);
+        assert_eq!(one, four);
+        assert!(views.pose.rotation.angle_to(&one.model.rotation).to_degrees() < 1.0);
+    }
+
+    #[test]
     fn one_of_the_five_point_solutions_is_the_truth_and_all_are_essential() {
         let mut missed = 0;
         for seed in 0..1000 {

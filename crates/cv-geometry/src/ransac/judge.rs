@@ -1,8 +1,8 @@
 //! Scores and improves models of one estimator.
 
+use super::sampler::distinct;
 use super::search::{Found, LOCAL_STEPS};
 use super::{Estimator, Score, Scorer};
-use super::sampler::distinct;
 use crate::pairs::LANES;
 use fearless_simd::{Level, dispatch};
 use rand_chacha::ChaCha8Rng;

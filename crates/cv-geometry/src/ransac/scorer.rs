@@ -16,12 +16,17 @@ pub trait Scorer: Sync {
 pub(crate) struct AllIn;
 
 impl Scorer for AllIn {
+    #[inline(always)]
     fn loss(&self, u: f32) -> f32 {
         u
     }
+
+    #[inline(always)]
     fn weight(&self, _: f64) -> f64 {
         1.0
     }
+
+    #[inline(always)]
     fn cutoff(&self) -> f64 {
         f64::INFINITY
     }
@@ -37,10 +42,12 @@ impl Scorer for Msac {
         if u < 1.0 { u } else { 1.0 }
     }
 
+    #[inline(always)]
     fn weight(&self, u: f64) -> f64 {
         if u < 1.0 { 1.0 } else { 0.0 }
     }
 
+    #[inline(always)]
     fn cutoff(&self) -> f64 {
         1.0
     }
@@ -63,11 +70,13 @@ impl Scorer for Marginal {
         1.0 - w * w * w
     }
 
+    #[inline(always)]
     fn weight(&self, u: f64) -> f64 {
         let w = (1.0 - u / f64::from(MARGINAL_CUTOFF)).max(0.0);
         w * w
     }
 
+    #[inline(always)]
     fn cutoff(&self) -> f64 {
         f64::from(MARGINAL_CUTOFF)
     }

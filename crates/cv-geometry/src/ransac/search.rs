@@ -6,10 +6,14 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use rayon::prelude::*;
 
-/// Samples of one batch. A batch is judged as a whole, so the result does not depend on how it is spread over threads.
-const BATCH: usize = 16;
-/// Data from which on a batch is spread over threads: below, a batch is done before a thread wakes up.
+/// Samples that are judged together, by one thread.
+const CHUNK: usize = 16;
+/// Most samples of a batch, and those from which on it is spread over threads: below, it is done before a thread wakes up.
+const MOST: usize = 256;
+/// Data from which on any batch is spread over threads.
 const PARALLEL_FROM: usize = 8192;
+/// Minimal models kept to be searched around, should the samples run out before the confidence is reached.
+const RUNNERS_UP: usize = 32;
 /// Steps of a local optimisation inside the loop, and at the end.
 pub(super) const LOCAL_STEPS: usize = 5;
 const FINAL_STEPS: usize = 20;
@@ -25,69 +29,107 @@ pub(super) struct Found<M> {
     pub(super) score: Score,
 }
 
-/// The best model of a batch, and the sample it is made of.
+/// The best model of a chunk, and the sample it is made of.
 struct Winner<M> {
     found: Found<M>,
     sample: [u32; 8],
 }
 
 /// Draws samples until enough were drawn. Every minimal model that is the best so far is locally optimised on the same loss it is judged by. (Not only
-/// one that beats the optimised: noise lets hardly any minimal model do that.) A model is given up as soon as its loss exceeds that of the best
-/// minimal one, which never changes the result.
+/// one that beats the optimised: noise lets hardly any minimal model do that.) A model is given up as soon as its loss is too large to
+/// matter, which never changes the result.
+///
+/// Batches grow with the number of samples drawn, and each is judged by what was known before it, so the result does not depend on how it is
+/// spread over threads.
 pub(super) fn search<E: Estimator, C: Scorer, S: Sampler>(
     judge: &Judge<'_, E, C>,
     sampler: &mut S,
     options: &RobustOptions,
 ) -> Option<Consensus<E::Model>> {
-    let estimator = judge.estimator;
-    let n = estimator.count();
+    let n = judge.estimator.count();
     let mut best: Option<Found<E::Model>> = None;
     let mut minimal = f32::INFINITY;
-    let mut samples = vec![[0u32; 8]; BATCH];
+    let mut waiting: Vec<Winner<E::Model>> = Vec::new();
+    let mut samples = Vec::with_capacity(MOST);
     let mut models = Vec::new();
     let mut rng = ChaCha8Rng::seed_from_u64(!options.seed);
     let mut iterations = 0;
     let mut needed = options.max_iterations;
     while iterations < needed {
-        let count = BATCH.min(needed - iterations);
-        for sample in &mut samples[..count] {
+        let count = (iterations / 8).clamp(CHUNK, MOST).min(needed - iterations);
+        samples.resize(count, [0u32; 8]);
+        for sample in &mut samples {
             sampler.draw(&mut sample[..E::SAMPLE]);
         }
         iterations += count;
-        let winner = if n < PARALLEL_FROM {
-            best_of(judge, &samples[..count], minimal, &mut models)
-        } else {
-            let each = samples[..count].par_iter();
-            each.map(|sample| best_of(judge, std::slice::from_ref(sample), minimal, &mut Vec::new()))
-                .reduce(|| None, earlier_of_equals)
+        let limit = match waiting.get(RUNNERS_UP - 1) {
+            Some(last) => last.found.score.loss,
+            None if E::RESAMPLES > 0 => f32::INFINITY,
+            None => minimal,
         };
-        let Some(Winner { mut found, sample }) = winner else { continue };
-        minimal = found.score.loss;
-        models.clear();
-        estimator.alternatives(&found.model, &sample[..E::SAMPLE], judge.threshold, &mut models);
-        // The best alternative is optimised before it is compared: the model is too.
-        let other = models.drain(..).fold(None, |best: Option<Found<E::Model>>, model| {
-            let score = judge.score(&model, best.as_ref().map_or(f32::INFINITY, |b| b.score.loss));
-            if best.as_ref().is_none_or(|b| score.loss < b.score.loss) { Some(Found { model, score }) } else { best }
-        });
-        judge.improve(&mut found, LOCAL_STEPS);
-        if let Some(mut other) = other {
-            judge.improve(&mut other, LOCAL_STEPS);
-            if other.score.loss < found.score.loss {
-                found = other;
+        let winners: Vec<Winner<E::Model>> = if n < PARALLEL_FROM && count < MOST {
+            samples.chunks(CHUNK).filter_map(|chunk| best_of(judge, chunk, limit, &mut models)).collect()
+        } else {
+            samples.par_chunks(CHUNK).filter_map(|chunk| best_of(judge, chunk, limit, &mut Vec::new())).collect()
+        };
+        for winner in winners {
+            if winner.found.score.loss >= minimal {
+                if E::RESAMPLES > 0 {
+                    let at = waiting.partition_point(|w| w.found.score.loss <= winner.found.score.loss);
+                    waiting.insert(at, winner);
+                    waiting.truncate(RUNNERS_UP);
+                }
+                continue;
             }
-        }
-        judge.explore(&mut found, &mut rng, &mut models);
-        if best.as_ref().is_none_or(|b| found.score.loss < b.score.loss) {
-            needed = options.needed(found.score.inliers as usize, n, E::SAMPLE);
-            best = Some(found);
+            minimal = winner.found.score.loss;
+            let mut found = optimized(judge, winner, &mut models);
+            judge.explore(&mut found, &mut rng, &mut models);
+            if best.as_ref().is_none_or(|b| found.score.loss < b.score.loss) {
+                needed = options.needed(found.score.inliers as usize, n, E::SAMPLE);
+                best = Some(found);
+            }
         }
     }
     let mut best = best?;
+    if iterations == options.max_iterations {
+        for winner in waiting {
+            let mut found = optimized(judge, winner, &mut models);
+            judge.explore(&mut found, &mut rng, &mut models);
+            if found.score.loss < best.score.loss {
+                best = found;
+            }
+        }
+    }
     judge.improve(&mut best, FINAL_STEPS);
     let model = settle(judge, best.model, &mut rng, &mut models);
     let score = judge.score(&model, f32::INFINITY);
     Some(Consensus { model, score, iterations })
+}
+
+/// The minimal model or the best of its alternatives, both locally optimised.
+fn optimized<E: Estimator, C: Scorer>(
+    judge: &Judge<'_, E, C>,
+    winner: Winner<E::Model>,
+    models: &mut Vec<E::Model>,
+) -> Found<E::Model> {
+    let Winner { mut found, sample } = winner;
+    models.clear();
+    judge.estimator.alternatives(&found.model, &sample[..E::SAMPLE], judge.threshold, models);
+    judge.improve(&mut found, LOCAL_STEPS);
+    let mut other: Option<Found<E::Model>> = None;
+    for model in models.drain(..) {
+        let score = judge.score(&model, other.as_ref().map_or(f32::INFINITY, |o| o.score.loss));
+        if other.as_ref().is_none_or(|o| score.loss < o.score.loss) {
+            other = Some(Found { model, score });
+        }
+    }
+    if let Some(mut other) = other {
+        judge.improve(&mut other, LOCAL_STEPS);
+        if other.score.loss < found.score.loss {
+            found = other;
+        }
+    }
+    found
 }
 
 /// Searches on, near the model, with the noise that the data show instead of the threshold they were searched with: small noise leaves room for
@@ -132,13 +174,4 @@ fn best_of<E: Estimator, C: Scorer>(
         }
     }
     best
-}
-
-/// The better of two winners; of equals the earlier, as in one thread.
-fn earlier_of_equals<M>(a: Option<Winner<M>>, b: Option<Winner<M>>) -> Option<Winner<M>> {
-    match (&a, &b) {
-        (Some(x), Some(y)) if y.found.score.loss < x.found.score.loss => b,
-        (None, _) => b,
-        _ => a,
-    }
 }
