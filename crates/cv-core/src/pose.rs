@@ -63,6 +63,15 @@ impl Pose {
         b.compose(&a.inverse())
     }
 
+    /// The angle by which the rotation turns, in radians, 0 to π.
+    ///
+    /// By the chord: the arc cosine of the trace ([`Rotation3::angle`]) has half of the digits at small angles, and is NaN where rounding
+    /// takes the trace above three.
+    pub fn rotation_angle(&self) -> f64 {
+        let chord = (self.rotation.matrix() - nalgebra::Matrix3::identity()).norm() / 8f64.sqrt();
+        2.0 * chord.min(1.0).asin()
+    }
+
     /// `[R | t]`, 3×4.
     pub fn matrix(&self) -> Matrix3x4<f64> {
         let mut m = Matrix3x4::zeros();
@@ -78,6 +87,21 @@ mod tests {
 
     // f64 arithmetic on numbers of order one, a few operations deep.
     const TOLERANCE: f64 = 1e-12;
+
+    #[test]
+    fn the_angle_is_that_of_the_rotation_down_to_nothing() {
+        let axis = Vector3::new(2.0, -1.0, 0.5).normalize();
+        for angle in [0.0, 1e-12, 1e-9, 1e-3, 1.0, 3.0] {
+            let pose = Pose::new(Rotation3::new(axis * angle), Vector3::zeros());
+            assert!((pose.rotation_angle() - angle).abs() < TOLERANCE * (1.0 + angle), "{angle}");
+        }
+        // A trace above three by rounding, and a half turn.
+        let bent = Rotation3::from_matrix_unchecked(nalgebra::Matrix3::identity() * (1.0 + 1e-15));
+        assert!(Pose::new(bent, Vector3::zeros()).rotation_angle() < TOLERANCE);
+        let half = Pose::new(Rotation3::new(axis * std::f64::consts::PI), Vector3::zeros());
+        // The arc sine at one has half of the digits.
+        assert!((half.rotation_angle() - std::f64::consts::PI).abs() < 1e-7);
+    }
 
     #[test]
     fn looking_at_a_point_puts_it_on_the_optical_axis_and_down_is_down() {

@@ -284,7 +284,7 @@ fn report(problem: &Problem<'_>, blocks: &[PointBlock], cost: [f64; 2], iteratio
 mod tests {
     use super::*;
     use crate::testing::{TwoViews, gauss, uniform};
-    use crate::triangulate;
+    use crate::{pose_difference, triangulate};
     use cv_core::Distortion;
     use rand_chacha::ChaCha8Rng;
     use rand_chacha::rand_core::SeedableRng;
@@ -347,23 +347,25 @@ mod tests {
     #[test]
     fn exact_matches_lead_to_the_exact_scene() {
         for refine_focal in [false, true] {
-            let mut right = 0;
-            for seed in 0..10 {
+            for seed in 0..30 {
                 let (matches, truth, mut start) = problem(seed, 60, 0.0);
                 if refine_focal {
                     start.cameras.iter_mut().for_each(|c| (c.fx, c.fy) = (c.fx * 1.01, c.fy * 1.01));
                 }
                 let options = BundleOptions { refine_focal, max_iterations: 200, ..BundleOptions::default() };
                 let report = adjust_two_views(&mut start, &matches, &options).unwrap();
-                // An exact zero is approached until the cost no longer falls: far below a thousandth of a pixel.
-                assert!(report.cost[1] < 1e-9, "{report:?}");
-                let turn = (start.pose.rotation.inverse() * truth.pose.rotation).angle();
-                let shift = (start.pose.translation - truth.pose.translation).norm();
+                // Rounding of pixels: 1e-13 of a few hundred, squared, over 240 residuals; Newton's method goes on until it is all that is left.
+                assert!(report.cost[1] < 1e-17, "{report:?}");
+                let [turn, shift] = pose_difference(&start.pose, &truth.pose);
                 let focal = (start.cameras[0].fx / truth.cameras[0].fx - 1.0).abs();
-                right += usize::from(turn < 1e-5 && shift < 1e-4 && focal < 1e-4);
+                let off = start.points.iter().zip(&truth.points).map(|(x, t)| (x - t).norm()).fold(0.0, f64::max);
+                // That rounding is 1e-16 of a focal length; the motion that shows least of the pose and the focal length, and the point at twelve
+                // units with 0.03 rad of parallax, make 1e-12 and 1e-11 of it. A hundred times that for other seeds.
+                assert!(
+                    turn < 1e-10 && shift < 1e-10 && focal < 1e-10 && off < 1e-9,
+                    "{seed}: {turn} {shift} {focal} {off}"
+                );
             }
-            // Some motions hardly show the focal length, and one of the ten hardly its direction: the cost is as low elsewhere.
-            assert!(right >= if refine_focal { 7 } else { 9 }, "{right}");
         }
     }
 
@@ -384,7 +386,7 @@ mod tests {
                 sum += d.dot(&(c.try_inverse().unwrap() * d));
                 count += 3.0;
             }
-            turns += ((start.pose.rotation.inverse() * truth.pose.rotation).angle() / report.pose_deviation[0]).powi(2);
+            turns += (pose_difference(&start.pose, &truth.pose)[0] / report.pose_deviation[0]).powi(2);
             let sine = start.pose.translation.cross(&truth.pose.translation).norm();
             directions += (sine / report.pose_deviation[1]).powi(2);
         }
@@ -403,7 +405,7 @@ mod tests {
         let (mut matches, truth, mut start) = problem(3, 80, 0.2);
         matches[7].b.x += 40.0;
         adjust_two_views(&mut start, &matches, &BundleOptions::default()).unwrap();
-        let turn = (start.pose.rotation.inverse() * truth.pose.rotation).angle();
+        let turn = pose_difference(&start.pose, &truth.pose)[0];
         // 0.2 px is 4e-4 rad for one ray, much less for 80; 40 px undamped would be 0.08 rad for one.
         assert!(turn < 2e-3, "{turn}");
     }

@@ -31,9 +31,11 @@ mod pairs;
 mod ransac;
 mod robust;
 mod rotation;
+mod six_point;
 #[cfg(test)]
 mod testing;
 mod triangulation;
+mod unknown_focal;
 
 pub use absolute::{
     Similarity, WorldMatch, align_points, estimate_pose, pose_from_points, pose_three_points, refine_pose,
@@ -56,4 +58,6 @@ pub use ransac::{
     ransac,
 };
 pub use robust::RobustModel;
+pub use six_point::fundamental_six_point;
 pub use triangulation::{TriangulationError, correct_match, parallax_angle, triangulate, triangulate_linear};
+pub use unknown_focal::{FocalPose, estimate_focal_pose, refine_focal_pose};

@@ -13,11 +13,13 @@
 //! # Ok::<(), cv_numeric::LinearError>(())
 //! ```
 
+mod eigen;
 mod levenberg_marquardt;
 mod linear;
 mod polynomial;
 mod robust_loss;
 
+pub use eigen::{kernel_vector, real_quadratic_eigenvalues};
 pub use levenberg_marquardt::{LeastSquares, LmOptions, LmReport, NormalEquations, levenberg_marquardt};
 pub use linear::{
     LinearError, Svd3, null_space, null_vector, smallest_eigenvector, solve_positive_definite,

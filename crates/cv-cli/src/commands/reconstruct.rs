@@ -242,7 +242,7 @@ impl Args {
             result.inliers.len(),
             result.matching.pairs.len(),
             result.reprojection_rms,
-            result.pose.rotation.angle().to_degrees(),
+            result.pose.rotation_angle().to_degrees(),
             result.median_angle.to_degrees(),
         );
         let mut stages = result.stages.clone();
@@ -309,11 +309,12 @@ impl Args {
         }
 
         report.section("The motion");
-        let axis_angle = result.pose.rotation.scaled_axis();
+        let angle = result.pose.rotation_angle();
+        let axis = result.pose.rotation.axis().map_or([0.0; 3], |axis| [axis.x, axis.y, axis.z].map(|v| v * angle));
         let t = result.pose.translation;
         let degrees = |v: f64| format!("{:.3}°", v.to_degrees());
         report.facts(&[
-            ("rotation", format!("{} about ({:.3}, {:.3}, {:.3})", degrees(axis_angle.norm()), axis_angle.x, axis_angle.y, axis_angle.z)),
+            ("rotation", format!("{} about ({:.3}, {:.3}, {:.3})", degrees(angle), axis[0], axis[1], axis[2])),
             ("direction of the translation", format!("({:.4}, {:.4}, {:.4})", t.x, t.y, t.z)),
             ("standard deviation of the rotation", degrees(result.pose_deviation[0])),
             ("standard deviation of the direction", degrees(result.pose_deviation[1])),

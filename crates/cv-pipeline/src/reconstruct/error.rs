@@ -47,7 +47,7 @@ pub enum ReconstructError {
         needed: usize,
     },
     /// The camera turned without moving.
-    #[error("the camera only turned: a rotation by {degrees:.1} degrees explains {:.0} % of the matches", 100.0 * share)]
+    #[error("the camera only turned, or hardly moved: a rotation by {degrees:.1} degrees explains {:.0} % of the matches", 100.0 * share)]
     PureRotation {
         /// Share of the inliers that the rotation explains.
         share: f64,
@@ -57,6 +57,12 @@ pub enum ReconstructError {
     /// All points lie on one plane.
     #[error("the scene is one plane: a homography explains {:.0} % of the matches", 100.0 * share)]
     Planar {
+        /// Share of the inliers that the homography explains.
+        share: f64,
+    },
+    /// A homography explains the matches, and the focal length, by which a plane and a turn could be told apart, is unknown.
+    #[error("the scene is one plane, or the camera only turned: a homography explains {:.0} % of the matches", 100.0 * share)]
+    PlanarOrTurned {
         /// Share of the inliers that the homography explains.
         share: f64,
     },
@@ -84,13 +90,31 @@ pub enum ReconstructError {
         /// Matches.
         matches: usize,
     },
-    /// The focal length that was given fits the matches much worse than others, or none can be told.
-    #[error("the focal length cannot be told from these photographs ({focal:.0} px, give or take {:.0} %)", 100.0 * deviation)]
+    /// Another focal length explains the matches far better than the one that was given.
+    #[error(
+        "the focal length given, {given:.0} px, fits the matches worse than one of about {better:.0} px, by {deviations:.0} standard deviations"
+    )]
+    WrongFocal {
+        /// Focal length given, in pixels.
+        given: f64,
+        /// One that fits better, in pixels.
+        better: f64,
+        /// By how much better, in standard deviations of the difference.
+        deviations: f64,
+        /// Matches that agree by the better one.
+        inliers: usize,
+    },
+    /// No focal length fits the matches better than others.
+    #[error(
+        "the focal length cannot be told from these photographs: none between {low:.0} and {high:.0} px fits better than the others"
+    )]
     UnknownFocal {
-        /// Best estimate in pixels.
-        focal: f64,
-        /// Relative standard deviation.
-        deviation: f64,
+        /// Smallest that fits, in pixels; at the least that of a field of view of 170 degrees.
+        low: f64,
+        /// Largest that fits, in pixels; at the most that of a field of view of 1 degree.
+        high: f64,
+        /// Longer side of the photographs, in pixels.
+        side: usize,
     },
     /// The search for a model failed.
     #[error(transparent)]
@@ -98,9 +122,21 @@ pub enum ReconstructError {
 }
 
 impl ReconstructError {
+    /// No focal length between `focal` less and more its `deviation` (relative) is worse than the others.
+    pub(super) fn unknown_focal(focal: f64, deviation: f64, side: usize) -> Self {
+        // Fields of view of 170 degrees and of one degree along the longer side: no lens of a photograph is beyond.
+        let plausible = [85f64, 0.5].map(|half| 0.5 * side as f64 / half.to_radians().tan());
+        let [least, most] = plausible;
+        let (low, high) = (focal / (1.0 + deviation), focal * (1.0 + deviation));
+        // An estimate out there says only that there is none.
+        let (low, high) =
+            if (least..=most).contains(&focal) { (low.max(least), high.min(most)) } else { (least, most) };
+        Self::UnknownFocal { low, high, side }
+    }
+
     /// What a person can do about it.
-    pub fn advice(&self) -> &'static str {
-        match self {
+    pub fn advice(&self) -> String {
+        let words = match self {
             Self::Matching(_) => "take sharper photographs with more texture",
             Self::Camera { .. } | Self::CameraSize { .. } => "check the camera file",
             Self::TooFewMatches { .. } | Self::TooFewInliers { .. } => {
@@ -109,13 +145,27 @@ impl ReconstructError {
             Self::PureRotation { .. } => {
                 "step aside between the photographs; to join photographs from one place use `cv panorama`"
             }
+            Self::PlanarOrTurned { .. } => {
+                "step aside between the photographs and include things in front of the plane or behind it; --focal tells a plane from a turn; to join photographs from one place use `cv panorama`"
+            }
             Self::Planar { .. } => "include things in front of the plane or behind it",
             Self::UncertainPose { .. } => {
                 "take photographs that share more of the scene, with things near and far all over them, or find more features (--features)"
             }
             Self::LittleParallax { .. } => "take the photographs farther apart",
-            Self::UnknownFocal { .. } => "give the focal length (--focal) or a camera file (--camera)",
+            Self::WrongFocal { better, .. } => {
+                return format!(
+                    "check the focal length, which is in pixels of the photograph: --focal {better:.0}, or leave it out (--ignore-exif where the photograph has a wrong one)"
+                );
+            }
+            Self::UnknownFocal { side, .. } => {
+                let phone = 0.8 * *side as f64;
+                return format!(
+                    "give the focal length in pixels: --focal {phone:.0} (a phone's main camera: about 0.8 times the longer side), or a camera file (--camera)"
+                );
+            }
             Self::Estimate(_) => "check the matches with `cv match`",
-        }
+        };
+        words.to_owned()
     }
 }

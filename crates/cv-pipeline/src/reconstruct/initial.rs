@@ -1,6 +1,6 @@
 //! The cameras and the first pose, from all tentative matches.
 
-use super::lens::{Found, find_lens};
+use super::lens::{Found, Rival, find_lens};
 use super::{Intrinsics, ReconstructError, ReconstructOptions};
 use cv_core::{Camera, Correspondence, Pose};
 use cv_geometry::{
@@ -49,15 +49,19 @@ pub(super) fn initial(
     options: &ReconstructOptions,
 ) -> Result<Initial, ReconstructError> {
     let given = match (options.intrinsics, prior) {
-        (Intrinsics::Known(_), Some(cameras)) => Some(Found { cameras, focal_range: 0.0 }),
+        (Intrinsics::Known(_), Some(cameras)) => Some(Found { cameras, focal_range: 0.0, rival: None }),
         (Intrinsics::Focal(focal), _) => find_lens(pairs, sizes, Some(focal), &options.robust),
         _ => find_lens(pairs, sizes, None, &options.robust),
     };
     // Where no lens has a pose, the search with an ordinary one says why.
     let longest = sizes[0].0.max(sizes[0].1) as f64;
     let ordinary = || sizes.map(|(width, height)| Camera::from_focal(width, height, 1.2 * longest));
-    let Found { cameras, focal_range } =
-        given.unwrap_or_else(|| Found { cameras: prior.unwrap_or_else(ordinary), focal_range: 0.0 });
+    if let Some(Found { cameras, rival: Some(rival), .. }) = &given {
+        let Rival { focal: better, deviations, inliers } = *rival;
+        return Err(ReconstructError::WrongFocal { given: cameras[0].fx, better, deviations, inliers });
+    }
+    let Found { cameras, focal_range, .. } =
+        given.unwrap_or_else(|| Found { cameras: prior.unwrap_or_else(ordinary), focal_range: 0.0, rival: None });
     let (pose, inliers) = calibrated(pairs, &cameras, options)?;
     Ok(Initial { cameras, pose, inliers, focal_range })
 }

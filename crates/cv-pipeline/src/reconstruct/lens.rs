@@ -1,9 +1,9 @@
 //! The lens that the matches themselves tell: focal length and radial distortion.
 
-use cv_core::{Camera, Correspondence, Distortion, Pose};
+use cv_core::{Camera, Correspondence, Distortion, Matrix3, Pose};
 use cv_geometry::{
-    Marginal, RobustOptions, Scorer, essential_from_pose, estimate_relative_pose, normalize_matches,
-    refine_relative_pose, sampson,
+    FocalPose, Marginal, RobustOptions, Scorer, essential_from_pose, estimate_focal_pose, estimate_relative_pose,
+    normalize_matches, refine_focal_pose, refine_relative_pose, sampson,
 };
 use rayon::prelude::*;
 
@@ -28,7 +28,24 @@ pub(super) struct Found {
     pub(super) cameras: [Camera; 2],
     /// Largest relative change of the focal length that the matches do not exclude; 0 where it was given.
     pub(super) focal_range: f64,
+    /// Where the focal length was given and is far from one that explains the matches much better.
+    pub(super) rival: Option<Rival>,
 }
+
+/// Another focal length than the one given.
+pub(super) struct Rival {
+    /// In pixels.
+    pub(super) focal: f64,
+    /// By how many standard deviations it fits better.
+    pub(super) deviations: f64,
+    /// Matches within the threshold.
+    pub(super) inliers: usize,
+}
+
+/// Standard deviations that leave no doubt: one chance in thirty thousand.
+const BEYOND_DOUBT: f64 = 4.0;
+/// A given focal length this far from the best one, as a logarithm (half as long again), is no inaccuracy of EXIF but another lens, a cropped picture, or another unit.
+const FAR: f64 = 0.405;
 
 /// Displacements of the corners that are tried: from the barrel of a wide angle to the pincushion of a long lens. The steps between them are
 /// narrowed down.
@@ -38,12 +55,11 @@ const BENDS: [f64; 5] = [-0.09, -0.06, -0.03, 0.0, 0.03];
 const BEND_RANGE: (f64, f64) = (-0.3, 0.15);
 /// Most steps of a search; from the grid to the optimum it takes ten or so.
 const MAX_STEPS: usize = 40;
-/// Focal lengths that are tried, in longer sides: from 100 to 20 degrees of view.
-const FOCALS: i32 = 10;
-/// Samples for each: enough to find a pose among half wrong matches; the right lens needs the fewest.
-const SAMPLES: usize = 300;
+/// Samples for each of them: enough to find a pose among half wrong matches, of five (the focal length given) or six; the right lens needs
+/// the fewest.
+const SAMPLES: [usize; 2] = [300, 800];
 
-/// The lens whose best pose leaves the least robust Sampson error, among all focal lengths or with those given. Distortion is left out
+/// The lens whose best pose leaves the least robust Sampson error, of all focal lengths or with those given. Distortion is left out
 /// where it makes no significant difference. `None` where no lens has a pose.
 pub(super) fn find_lens(
     pairs: &[Correspondence],
@@ -52,17 +68,23 @@ pub(super) fn find_lens(
     robust: &RobustOptions,
 ) -> Option<Found> {
     let search = Search { pairs, sizes, robust };
-    let longest = sizes[0].0.max(sizes[0].1) as f64;
-    let focals: Vec<[f64; 2]> = match given {
-        Some(focal) => vec![focal],
-        None => (0..FOCALS).map(|k| [0.45 * longest * 1.2f64.powi(k); 2]).collect(),
-    };
-    let lenses: Vec<Lens> = focals.iter().flat_map(|&focal| BENDS.map(|bend| Lens { focal, bend })).collect();
-    let trials: Vec<Trial> = lenses.par_iter().filter_map(|lens| search.searched(*lens)).collect();
-    let least = |of: &mut dyn Iterator<Item = &Trial>| of.min_by(|a, b| a.sum.total_cmp(&b.sum)).cloned();
     let free = given.is_none();
-    let straight = least(&mut trials.iter().filter(|t| t.lens.bend == 0.0)).map(|t| search.narrow(t, free, false));
-    let bent = search.narrow(least(&mut trials.iter())?, free, true);
+    let least = |trials: &[Trial]| trials.iter().min_by(|a, b| a.sum.total_cmp(&b.sum)).cloned();
+    let searched = |bend: &f64| match given {
+        Some(focal) => search.searched(Lens { focal, bend: *bend }),
+        None => search.searched_free(*bend),
+    };
+    let mut trials: Vec<Trial> = BENDS.par_iter().filter_map(searched).collect();
+    let best = least(&trials)?;
+    // From the best one's pose too: a search now and then ends elsewhere.
+    for trial in &mut trials {
+        let other = search.near(&best, trial.lens.bend, free);
+        if other.sum < trial.sum {
+            *trial = other;
+        }
+    }
+    let straight = trials.iter().find(|t| t.lens.bend == 0.0).cloned();
+    let bent = search.narrow(least(&trials)?, free);
     let (best, bends) = match straight {
         Some(straight) if !significantly_worse(&straight, &bent) => (straight, false),
         _ => (bent, true),
@@ -75,7 +97,10 @@ pub(super) fn find_lens(
             for k in 1..=8 {
                 let factor = 1.05f64.powf(direction * f64::from(k));
                 let lens = Lens { focal: best.lens.focal.map(|f| f * factor), bend: at.lens.bend };
-                at = search.narrow(search.refined(lens, &at.pose), false, bends);
+                at = search.refined(lens, &at.pose);
+                if bends {
+                    at = search.narrow(at, false);
+                }
                 if significantly_worse(&at, &best) {
                     break;
                 }
@@ -83,14 +108,20 @@ pub(super) fn find_lens(
             }
         }
     }
-    Some(Found { cameras: search.cameras(&best.lens), focal_range })
+    let rival = if free { None } else { search.rival(&best) };
+    Some(Found { cameras: search.cameras(&best.lens), focal_range, rival })
 }
 
 /// Vuong's test at two standard deviations: see [`cv_geometry::poses_are_rivals`].
 fn significantly_worse(a: &Trial, b: &Trial) -> bool {
+    worse_by(a, b) > 2.0
+}
+
+/// By how many standard deviations of the difference `a` is worse; 0 where they are the same.
+fn worse_by(a: &Trial, b: &Trial) -> f64 {
     let (sum, squares) =
         a.losses.iter().zip(&b.losses).fold((0.0, 0.0), |(s, q), (a, b)| (s + a - b, q + (a - b) * (a - b)));
-    sum > 2.0 * f64::sqrt(squares)
+    if squares > 0.0 { sum / f64::sqrt(squares) } else { 0.0 }
 }
 
 struct Search<'a> {
@@ -112,18 +143,46 @@ impl Search<'_> {
         })
     }
 
-    /// The best pose of a search.
+    /// The best pose of a search with a lens.
     fn searched(&self, lens: Lens) -> Option<Trial> {
         let [a, b] = self.cameras(&lens);
         let (normalised, unit) = normalize_matches(self.pairs, &a, &b);
         let usable: Vec<_> = normalised.into_iter().filter(Correspondence::is_finite).collect();
         let options = RobustOptions {
             threshold: self.robust.threshold * unit,
-            max_iterations: SAMPLES.min(self.robust.max_iterations),
+            max_iterations: SAMPLES[0].min(self.robust.max_iterations),
             ..*self.robust
         };
         let found = estimate_relative_pose(&usable, &options).ok()?;
         Some(self.refined(lens, &found.model))
+    }
+
+    /// The best pose and focal length of a search with a distortion.
+    fn searched_free(&self, bend: f64) -> Option<Trial> {
+        let usable: Vec<_> = self.straightened(bend).into_iter().filter(Correspondence::is_finite).collect();
+        let options = RobustOptions { max_iterations: SAMPLES[1].min(self.robust.max_iterations), ..*self.robust };
+        let found = estimate_focal_pose(&usable, &options).ok()?;
+        Some(self.refined_free(bend, &found.model))
+    }
+
+    /// A focal length far from the given one that is better beyond doubt.
+    fn rival(&self, given: &Trial) -> Option<Rival> {
+        let other = self.searched_free(given.lens.bend)?;
+        let usual = (given.lens.focal[0] * given.lens.focal[1]).sqrt();
+        let focal = other.lens.focal[0];
+        let deviations = worse_by(given, &other);
+        let reach = f64::from(Marginal.loss(1.0));
+        let inliers = other.losses.iter().filter(|loss| **loss < reach).count();
+        ((focal / usual).ln().abs() > FAR && deviations > BEYOND_DOUBT).then_some(Rival { focal, deviations, inliers })
+    }
+
+    /// The best one near another with another distortion, the focal length too where it is free.
+    fn near(&self, other: &Trial, bend: f64, free: bool) -> Trial {
+        if free {
+            self.refined_free(bend, &FocalPose { pose: other.pose, focal: other.lens.focal[0] })
+        } else {
+            self.refined(Lens { bend, ..other.lens }, &other.pose)
+        }
     }
 
     /// The best pose near another.
@@ -133,34 +192,36 @@ impl Search<'_> {
         let threshold = self.robust.threshold * unit;
         let usable: Vec<_> = normalised.iter().copied().filter(Correspondence::is_finite).collect();
         let (pose, _) = refine_relative_pose(pose, &usable, threshold);
-        let e = essential_from_pose(&pose);
-        let loss = |m: &Correspondence| {
-            let r = sampson(&e, m) / threshold;
-            f64::from(Marginal.loss((r * r) as f32))
-        };
-        let losses: Vec<f64> = normalised.iter().map(loss).collect();
-        let sum = losses.iter().sum();
-        Trial { lens, pose, losses, sum }
+        trial(lens, pose, &essential_from_pose(&pose), &normalised, threshold)
     }
 
-    /// Steps of focal length and distortion, halved where none helps, down to half a per cent and a thousandth.
-    fn narrow(&self, mut best: Trial, focal: bool, bend: bool) -> Trial {
+    /// The best pose and focal length near others.
+    fn refined_free(&self, bend: f64, start: &FocalPose) -> Trial {
+        let matches = self.straightened(bend);
+        let usable: Vec<_> = matches.iter().copied().filter(Correspondence::is_finite).collect();
+        let (found, _) = refine_focal_pose(start, &usable, self.robust.threshold);
+        let lens = Lens { focal: [found.focal; 2], bend };
+        trial(lens, found.pose, &found.fundamental(), &matches, self.robust.threshold)
+    }
+
+    /// Matches in pixels from the principal points with the distortion taken out: it is a share of the picture, whatever the focal length.
+    fn straightened(&self, bend: f64) -> Vec<Correspondence> {
+        let any = self.sizes[0].0.max(self.sizes[0].1) as f64;
+        let [a, b] = self.cameras(&Lens { focal: [any; 2], bend });
+        let (normalised, _) = normalize_matches(self.pairs, &a, &b);
+        normalised.into_iter().map(|m| Correspondence { a: m.a * any, b: m.b * any }).collect()
+    }
+
+    /// Steps of the distortion, halved where none helps, down to a thousandth.
+    fn narrow(&self, mut best: Trial, free: bool) -> Trial {
         let mut step = 1.0;
         for _ in 0..MAX_STEPS {
             if step <= 0.05 {
                 break;
             }
-            let mut lenses = Vec::new();
-            for sign in [-1.0f64, 1.0] {
-                if focal {
-                    lenses.push(Lens { focal: best.lens.focal.map(|f| f * (0.09 * sign * step).exp()), ..best.lens });
-                }
-                if bend {
-                    let bend = (best.lens.bend + 0.015 * sign * step).clamp(BEND_RANGE.0, BEND_RANGE.1);
-                    lenses.push(Lens { bend, ..best.lens });
-                }
-            }
-            let trials: Vec<Trial> = lenses.par_iter().map(|lens| self.refined(*lens, &best.pose)).collect();
+            let bends =
+                [-1.0, 1.0].map(|sign| (best.lens.bend + 0.015 * sign * step).clamp(BEND_RANGE.0, BEND_RANGE.1));
+            let trials: Vec<Trial> = bends.par_iter().map(|bend| self.near(&best, *bend, free)).collect();
             match trials.into_iter().min_by(|a, b| a.sum.total_cmp(&b.sum)) {
                 Some(trial) if trial.sum < best.sum => best = trial,
                 _ => step *= 0.5,
@@ -168,4 +229,15 @@ impl Search<'_> {
         }
         best
     }
+}
+
+/// What each match loses by a geometry.
+fn trial(lens: Lens, pose: Pose, f: &Matrix3<f64>, matches: &[Correspondence], threshold: f64) -> Trial {
+    let loss = |m: &Correspondence| {
+        let r = sampson(f, m) / threshold;
+        f64::from(Marginal.loss((r * r) as f32))
+    };
+    let losses: Vec<f64> = matches.iter().map(loss).collect();
+    let sum = losses.iter().sum();
+    Trial { lens, pose, losses, sum }
 }

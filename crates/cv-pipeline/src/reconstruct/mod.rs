@@ -11,7 +11,7 @@ use initial::{Initial, cameras, initial};
 
 use crate::guided::{GuidedOptions, match_along_lines};
 use crate::{MatchingError, MatchingOptions, MatchingResult, Progress, Stopwatch, correspondences, match_photos};
-use cv_core::{Camera, Correspondence, ImageView, Matrix3, Point2, Point3, Pose};
+use cv_core::{Camera, Correspondence, ImageView, Matrix3, Point2, Point3, Pose, Vector3};
 use cv_features::SiftOptions;
 use cv_geometry::{
     BundleOptions, BundleReport, RobustOptions, TwoViewBundle, adjust_two_views, essential_from_pose,
@@ -166,10 +166,15 @@ pub fn reconstruct(
     }
     progress.report("pose", 0, 1);
     let simple = watch.time("degeneracy", || Simple::new(pairs, prior.as_ref(), options));
+    // Nothing can have more inliers than there are matches.
+    simple.check(pairs.len(), options)?;
     let found = watch.time("pose", || initial(pairs, [a.size(), b.size()], prior, options));
     // Of a turn, a search for a moving camera finds but a part: half of the points are behind whatever it supposes.
-    if let Err(ReconstructError::TooFewInliers { inliers, .. } | ReconstructError::UncertainPose { inliers, .. }) =
-        &found
+    if let Err(
+        ReconstructError::TooFewInliers { inliers, .. }
+        | ReconstructError::UncertainPose { inliers, .. }
+        | ReconstructError::WrongFocal { inliers, .. },
+    ) = &found
     {
         simple.check(*inliers, options)?;
     }
@@ -214,7 +219,8 @@ pub fn reconstruct(
     let focal_deviation = report.focal_deviation.max(focal_range / 2.0);
     // Beyond a third either way, the shape of the scene is a guess.
     if focal_deviation > 0.165 {
-        return Err(ReconstructError::UnknownFocal { focal, deviation: focal_deviation });
+        let side = [a, b].map(|photo| photo.width().max(photo.height())).into_iter().max().unwrap_or(0);
+        return Err(ReconstructError::unknown_focal(focal, focal_deviation, side));
     }
 
     let mut scene = Vec::new();
@@ -329,6 +335,8 @@ fn fit_again(matches: &[Correspondence], before: &Fit, settings: &BundleOptions)
 struct Simple {
     /// Matches that one homography explains.
     planar: usize,
+    /// Whether the cameras are known, so that a turn can be told from a plane.
+    calibrated: bool,
     /// Matches that a rotation explains, and its angle in degrees; needs cameras.
     turned: usize,
     degrees: f64,
@@ -347,7 +355,7 @@ impl Simple {
             None => pairs.to_vec(),
         };
         let robust = RobustOptions { threshold: reach, ..options.robust };
-        let mut simple = Self { planar: 0, turned: 0, degrees: 0.0 };
+        let mut simple = Self { planar: 0, calibrated: cameras.is_some(), turned: 0, degrees: 0.0 };
         let Ok(h) = estimate_homography(&straight, &robust) else { return simple };
         simple.planar = h.inliers.len();
         if let Some([a, b]) = cameras {
@@ -356,7 +364,7 @@ impl Simple {
             let (normalised, unit) = normalize_matches(&on_plane, &pinhole(a), &pinhole(b));
             if let Ok((rotation, share)) = rotation_between(&normalised, reach * unit) {
                 simple.turned = (share * on_plane.len() as f64).round() as usize;
-                simple.degrees = rotation.angle().to_degrees();
+                simple.degrees = Pose::new(rotation, Vector3::zeros()).rotation_angle().to_degrees();
             }
         }
         simple
@@ -370,7 +378,12 @@ impl Simple {
             return Err(ReconstructError::PureRotation { share: share(self.turned), degrees: self.degrees });
         }
         if enough(self.planar) {
-            return Err(ReconstructError::Planar { share: share(self.planar) });
+            let share = share(self.planar);
+            return Err(if self.calibrated {
+                ReconstructError::Planar { share }
+            } else {
+                ReconstructError::PlanarOrTurned { share }
+            });
         }
         Ok(())
     }

@@ -20,7 +20,7 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
         Err(error) => return Ok(Part::gave_up("reconstruct", &error)),
     };
     let (truth, found) = (&pair.relative, &result.pose);
-    let turn = |pose: &Pose| format!("{:.2}° in all", pose.rotation.angle().to_degrees());
+    let turn = |pose: &Pose| format!("{:.2}° in all", pose.rotation_angle().to_degrees());
     let way = |pose: &Pose| {
         let t = pose.translation.normalize();
         format!("({:.3}, {:.3}, {:.3})", t.x, t.y, t.z)
