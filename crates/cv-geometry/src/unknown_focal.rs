@@ -139,7 +139,7 @@ impl Estimator for FocalEstimator {
     const SAMPLE: usize = 6;
     const RESIDUAL_DIMENSION: i32 = 1;
     // As for calibrated poses.
-    const WIDENINGS: u32 = 2;
+    const RESAMPLES: usize = 20;
 
     fn count(&self) -> usize {
         self.set.pairs.len()
@@ -151,6 +151,10 @@ impl Estimator for FocalEstimator {
 
     fn blocks(&self) -> &[PairBlock] {
         &self.set.blocks
+    }
+
+    fn order(&self) -> &[u32] {
+        &self.set.order
     }
 
     fn solve(&self, sample: &[u32], models: &mut Vec<FocalPose>) {
