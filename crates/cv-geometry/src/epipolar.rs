@@ -33,56 +33,43 @@ impl<'a, C: Scorer, M: Epipolar<N>, const N: usize> SampsonProblem<'a, C, M, N> 
         Self { pairs, scorer, threshold, family: PhantomData }
     }
 
-    /// Calls `f(pair, F a, Fᵀ b, C, 1/D, u)` for each pair within the cutoff; returns the number of the others.
+    /// `F a` and `Fᵀ b` but their last entries, `C = bᵀ F a`, `1/D`, and `u`.
     #[inline(always)]
-    fn each(&self, f: &Matrix3<f64>, mut each: impl FnMut(&[f64; 4], [f64; 2], [f64; 2], f64, f64, f64)) -> f64 {
-        let scale = 1.0 / (self.threshold * self.threshold);
-        let mut outside = 0.0;
-        for pair in self.pairs {
-            let [x, y, s, t] = *pair;
-            let l0 = f[(0, 0)] * x + f[(0, 1)] * y + f[(0, 2)];
-            let l1 = f[(1, 0)] * x + f[(1, 1)] * y + f[(1, 2)];
-            let l2 = f[(2, 0)] * x + f[(2, 1)] * y + f[(2, 2)];
-            let m0 = f[(0, 0)] * s + f[(1, 0)] * t + f[(2, 0)];
-            let m1 = f[(0, 1)] * s + f[(1, 1)] * t + f[(2, 1)];
-            let c = s * l0 + t * l1 + l2;
-            let inverse = 1.0 / (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1);
-            let u = c * c * inverse * scale;
-            if u < self.scorer.cutoff() {
-                each(pair, [l0, l1], [m0, m1], c, inverse, u);
-            } else {
-                outside += 1.0;
-            }
-        }
-        outside
+    fn terms(&self, f: &Matrix3<f64>, &[x, y, s, t]: &[f64; 4]) -> ([f64; 2], [f64; 2], f64, f64, f64) {
+        let l0 = f[(0, 0)] * x + f[(0, 1)] * y + f[(0, 2)];
+        let l1 = f[(1, 0)] * x + f[(1, 1)] * y + f[(1, 2)];
+        let l2 = f[(2, 0)] * x + f[(2, 1)] * y + f[(2, 2)];
+        let m0 = f[(0, 0)] * s + f[(1, 0)] * t + f[(2, 0)];
+        let m1 = f[(0, 1)] * s + f[(1, 1)] * t + f[(2, 1)];
+        let c = s * l0 + t * l1 + l2;
+        let inverse = 1.0 / (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1);
+        ([l0, l1], [m0, m1], c, inverse, c * c * inverse / (self.threshold * self.threshold))
     }
-}
 
-/// Cost, gradient and Hessian by the nine entries of the matrix: eight and one, for vectors of four or eight. The derivative by the last entry is 1.
-struct Sums {
-    cost: f64,
-    hessian: [[f64; 8]; 8],
-    /// The last column but its end, and its end.
-    last: [f64; 8],
-    weight: f64,
-    gradient: [f64; 8],
-    weighted: f64,
-}
-
-impl<C: Scorer, M: Epipolar<N>, const N: usize> SampsonProblem<'_, C, M, N> {
     #[inline(always)]
     fn sum(&self, f: &Matrix3<f64>) -> f64 {
         let mut cost = 0.0;
-        let outside = self.each(f, |_, _, _, _, _, u| cost += f64::from(self.scorer.loss(u as f32)));
-        cost + outside
+        for pair in self.pairs {
+            let u = self.terms(f, pair).4;
+            cost += if u < self.scorer.cutoff() { f64::from(self.scorer.loss(u as f32)) } else { 1.0 };
+        }
+        cost
     }
 
     #[inline(always)]
     fn sums(&self, f: &Matrix3<f64>) -> Sums {
         let (mut hessian, mut last, mut gradient) = ([[0.0; 8]; 8], [0.0; 8], [0.0; 8]);
         let (mut cost, mut sum, mut weighted) = (0.0, 0.0, 0.0);
-        let outside = self.each(f, |&[x, y, s, t], l, m, c, inverse, u| {
+        for pair in self.pairs {
+            let (l, m, c, inverse, u) = self.terms(f, pair);
+            // Also where it is NaN.
+            let near = u < self.scorer.cutoff();
+            if !near {
+                cost += 1.0;
+                continue;
+            }
             cost += f64::from(self.scorer.loss(u as f32));
+            let [x, y, s, t] = *pair;
             let weight = self.scorer.weight(u) * inverse;
             // r = C/√D: ∂r = (∂C − C ∂D/(2D))/√D; ∂D/2 = l ∂l + m ∂m.
             let k = c * inverse;
@@ -100,9 +87,20 @@ impl<C: Scorer, M: Epipolar<N>, const N: usize> SampsonProblem<'_, C, M, N> {
             }
             sum += weight;
             weighted += weight * c;
-        });
-        Sums { cost: cost + outside, hessian, last, weight: sum, gradient, weighted }
+        }
+        Sums { cost, hessian, last, weight: sum, gradient, weighted }
     }
+}
+
+/// Cost, gradient and Hessian by the nine entries of the matrix: eight and one, for vectors of four or eight. The derivative by the last entry is 1.
+struct Sums {
+    cost: f64,
+    hessian: [[f64; 8]; 8],
+    /// The last column but its end, and its end.
+    last: [f64; 8],
+    weight: f64,
+    gradient: [f64; 8],
+    weighted: f64,
 }
 
 impl<C: Scorer, M: Epipolar<N>, const N: usize> LeastSquares for SampsonProblem<'_, C, M, N> {

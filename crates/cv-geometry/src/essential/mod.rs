@@ -26,7 +26,11 @@ use nalgebra::{SMatrix, SVector};
 ///
 /// RANSAC over five-point samples with local optimisation of the pose on the Sampson error. The pose maps the first camera's
 /// coordinates to the second's; its translation has length one. `options.threshold` is in normalised units: pixels over the focal
-/// length. Inliers lie in front of both cameras.
+/// length. Inliers lie in front of both cameras; in the search, a point that noise alone may have put behind one counts as in front.
+///
+/// Five matches leave up to ten poses, so a sixth is needed to choose, and a plane leaves up to two (Longuet-Higgins, "The reconstruction of a plane
+/// surface from two perspective projections", 1986) of which the one that fits better is given. A camera that only turned leaves the
+/// direction open: see [`rotation_between`].
 ///
 /// # Errors
 /// [`EstimateError`]: fewer than six matches, a coordinate that is not finite, coincident or collinear points, or no consensus of more

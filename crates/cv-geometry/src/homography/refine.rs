@@ -3,6 +3,7 @@
 use crate::ransac::Scorer;
 use cv_core::Matrix3;
 use cv_numeric::{LeastSquares, LmOptions, NormalEquations, levenberg_marquardt};
+use fearless_simd::{Level, dispatch};
 use nalgebra::{Const, SMatrix, SVector};
 
 /// Minimises `Σ ρ((d₁² + d₂²)/2 / threshold²)` over the eight entries beside `H[2][2] = 1`, with `d₂` the distance from
@@ -16,14 +17,14 @@ pub(crate) struct TransferProblem<'a, C: Scorer> {
 /// The sums of one direction: `Σ k u^i v^j p pᵀ` by the nine entries of the matrix that maps `p`.
 #[derive(Clone, Copy)]
 struct OneWay {
-    /// Σ k ppᵀ, Σ k u ppᵀ, Σ k v ppᵀ, Σ k (u² + v²) ppᵀ; each xx, xy, yy, x, y, 1.
-    moments: [[f64; 6]; 4],
+    /// Of xx, xy, yy, x, y, 1: Σ k, Σ k u, Σ k v, Σ k (u² + v²). Four side by side suit a vector unit.
+    moments: [[f64; 4]; 6],
     /// Derivative of half the cost by the nine entries, row-major.
     gradient: [f64; 9],
 }
 
 impl OneWay {
-    const ZERO: Self = Self { moments: [[0.0; 6]; 4], gradient: [0.0; 9] };
+    const ZERO: Self = Self { moments: [[0.0; 4]; 6], gradient: [0.0; 9] };
 
     /// Adds a point `(x, y)` that is mapped to `(u, v)` with denominator `w`, off by `(ru, rv)`.
     #[inline(always)]
@@ -31,8 +32,8 @@ impl OneWay {
         let k = weight * inverse_w * inverse_w;
         let p = [x * x, x * y, y * y, x, y, 1.0];
         let factors = [k, k * u, k * v, k * (u * u + v * v)];
-        for (m, f) in self.moments.iter_mut().zip(factors) {
-            for (sum, q) in m.iter_mut().zip(p) {
+        for (m, q) in self.moments.iter_mut().zip(p) {
+            for (sum, f) in m.iter_mut().zip(factors) {
                 *sum += f * q;
             }
         }
@@ -46,8 +47,12 @@ impl OneWay {
     }
 
     fn hessian(&self) -> SMatrix<f64, 9, 9> {
-        let block = |m: &[f64; 6]| Matrix3::new(m[0], m[1], m[3], m[1], m[2], m[4], m[3], m[4], m[5]);
-        let [a, u, v, uv] = self.moments.each_ref().map(block);
+        let m = &self.moments;
+        let block = |k: usize| {
+            let [xx, xy, yy, x, y, one] = m.each_ref().map(|m| m[k]);
+            Matrix3::new(xx, xy, x, xy, yy, y, x, y, one)
+        };
+        let [a, u, v, uv] = [0, 1, 2, 3].map(block);
         let mut h = SMatrix::<f64, 9, 9>::zeros();
         for (row, column, b) in [(0, 0, a), (3, 3, a), (6, 6, uv), (6, 0, -u), (0, 6, -u), (6, 3, -v), (3, 6, -v)] {
             h.fixed_view_mut::<3, 3>(row, column).copy_from(&b);
@@ -57,28 +62,48 @@ impl OneWay {
 }
 
 impl<C: Scorer> TransferProblem<'_, C> {
-    /// Calls `f(a, b, H a, H⁻¹ b, 1/w, 1/w', u)` for each pair that both maps send to the front.
+    /// `H a`, `1/w`, `H⁻¹ b`, `1/w'`, and `u`, beyond the cutoff where a map sends its point behind.
     #[inline(always)]
-    fn each(&self, h: &Matrix3<f64>, g: &Matrix3<f64>, mut f: impl FnMut(&[f64; 4], [f64; 6], f64)) -> f64 {
-        let scale = 0.5 / (self.threshold * self.threshold);
-        let mut outside = 0.0;
+    fn terms(&self, h: &Matrix3<f64>, g: &Matrix3<f64>, &[x, y, s, t]: &[f64; 4]) -> ([f64; 3], [f64; 3], f64) {
+        let wa = 1.0 / (h[(2, 0)] * x + h[(2, 1)] * y + h[(2, 2)]);
+        let wb = 1.0 / (g[(2, 0)] * s + g[(2, 1)] * t + g[(2, 2)]);
+        let p = (h[(0, 0)] * x + h[(0, 1)] * y + h[(0, 2)]) * wa;
+        let q = (h[(1, 0)] * x + h[(1, 1)] * y + h[(1, 2)]) * wa;
+        let m = (g[(0, 0)] * s + g[(0, 1)] * t + g[(0, 2)]) * wb;
+        let n = (g[(1, 0)] * s + g[(1, 1)] * t + g[(1, 2)]) * wb;
+        let d2 = (p - s) * (p - s) + (q - t) * (q - t) + (m - x) * (m - x) + (n - y) * (n - y);
+        let u = if wa > 0.0 && wb > 0.0 { d2 * (0.5 / (self.threshold * self.threshold)) } else { f64::NAN };
+        ([p, q, wa], [m, n, wb], u)
+    }
+
+    #[inline(always)]
+    fn sum(&self, h: &Matrix3<f64>, g: &Matrix3<f64>) -> f64 {
+        let mut cost = 0.0;
         for pair in self.pairs {
-            let [x, y, s, t] = *pair;
-            let wa = 1.0 / (h[(2, 0)] * x + h[(2, 1)] * y + h[(2, 2)]);
-            let wb = 1.0 / (g[(2, 0)] * s + g[(2, 1)] * t + g[(2, 2)]);
-            let p = (h[(0, 0)] * x + h[(0, 1)] * y + h[(0, 2)]) * wa;
-            let q = (h[(1, 0)] * x + h[(1, 1)] * y + h[(1, 2)]) * wa;
-            let m = (g[(0, 0)] * s + g[(0, 1)] * t + g[(0, 2)]) * wb;
-            let n = (g[(1, 0)] * s + g[(1, 1)] * t + g[(1, 2)]) * wb;
-            let d2 = (p - s) * (p - s) + (q - t) * (q - t) + (m - x) * (m - x) + (n - y) * (n - y);
-            let u = d2 * scale;
-            if wa > 0.0 && wb > 0.0 && u < self.scorer.cutoff() {
-                f(pair, [p, q, wa, m, n, wb], u);
+            let u = self.terms(h, g, pair).2;
+            cost += if u < self.scorer.cutoff() { f64::from(self.scorer.loss(u as f32)) } else { 1.0 };
+        }
+        cost
+    }
+
+    #[inline(always)]
+    fn sums(&self, h: &Matrix3<f64>, g: &Matrix3<f64>) -> (f64, OneWay, OneWay) {
+        let (mut forth, mut back) = (OneWay::ZERO, OneWay::ZERO);
+        let mut cost = 0.0;
+        for pair in self.pairs {
+            let (a, b, u) = self.terms(h, g, pair);
+            // Not where it is NaN.
+            if u < self.scorer.cutoff() {
+                let [x, y, s, t] = *pair;
+                cost += f64::from(self.scorer.loss(u as f32));
+                let weight = self.scorer.weight(u);
+                forth.add([x, y], a, [a[0] - s, a[1] - t], weight);
+                back.add([s, t], b, [b[0] - x, b[1] - y], weight);
             } else {
-                outside += 1.0;
+                cost += 1.0;
             }
         }
-        outside
+        (cost, forth, back)
     }
 }
 
@@ -97,9 +122,7 @@ impl<C: Scorer> LeastSquares for TransferProblem<'_, C> {
 
     fn cost(&self, h: &Matrix3<f64>) -> f64 {
         let Some(g) = inverse(h) else { return f64::INFINITY };
-        let mut cost = 0.0;
-        let outside = self.each(h, &g, |_, _, u| cost += f64::from(self.scorer.loss(u as f32)));
-        cost + outside
+        dispatch!(Level::new(), _simd => self.sum(h, &g))
     }
 
     fn linearize(&self, h: &Matrix3<f64>) -> NormalEquations<Const<8>> {
@@ -108,19 +131,13 @@ impl<C: Scorer> LeastSquares for TransferProblem<'_, C> {
             equations.cost = f64::INFINITY;
             return equations;
         };
-        let (mut forth, mut back) = (OneWay::ZERO, OneWay::ZERO);
-        let mut cost = 0.0;
-        let outside = self.each(h, &g, |&[x, y, s, t], [p, q, wa, m, n, wb], u| {
-            cost += f64::from(self.scorer.loss(u as f32));
-            let weight = self.scorer.weight(u);
-            forth.add([x, y], [p, q, wa], [p - s, q - t], weight);
-            back.add([s, t], [m, n, wb], [m - x, n - y], weight);
-        });
+        // No product is fused, so every instruction set gives the same bits.
+        let (cost, forth, back) = dispatch!(Level::new(), _simd => self.sums(h, &g));
         // dG = −G dH G, so by entries: dG[i][j] = −Σ G[i][k] G[l][j] dH[k][l].
         let turn = SMatrix::<f64, 9, 9>::from_fn(|r, c| -g[(r / 3, c / 3)] * g[(c % 3, r % 3)]);
         let hessian = forth.hessian() + turn.transpose() * back.hessian() * turn;
         let gradient = SVector::from(forth.gradient) + turn.transpose() * SVector::from(back.gradient);
-        equations.cost = cost + outside;
+        equations.cost = cost;
         equations.hessian.copy_from(&hessian.fixed_view::<8, 8>(0, 0));
         equations.gradient.copy_from(&gradient.fixed_rows::<8>(0));
         equations

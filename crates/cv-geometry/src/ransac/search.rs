@@ -100,8 +100,7 @@ pub(super) fn search<E: Estimator, C: Scorer, S: Sampler>(
             }
         }
     }
-    judge.improve(&mut best, FINAL_STEPS);
-    let model = settle(judge, best.model, &mut rng, &mut models);
+    let model = settle(judge, best, &mut rng, &mut models);
     let score = judge.score(&model, f32::INFINITY);
     Some(Consensus { model, score, iterations })
 }
@@ -136,22 +135,27 @@ fn optimized<E: Estimator, C: Scorer>(
 /// wrong data that happen to fit and for other minima, large noise loses right data.
 fn settle<E: Estimator, C: Scorer>(
     judge: &Judge<'_, E, C>,
-    mut model: E::Model,
+    mut best: Found<E::Model>,
     rng: &mut ChaCha8Rng,
     models: &mut Vec<E::Model>,
 ) -> E::Model {
     for _ in 0..POLISH {
-        let Some(sigma) = judge.noise(&model) else { break };
+        let Some(sigma) = judge.noise(&best.model) else {
+            // Too few data for a noise of their own.
+            best.score = judge.score(&best.model, f32::INFINITY);
+            judge.improve(&mut best, FINAL_STEPS);
+            break;
+        };
         let threshold = BIWEIGHT * sigma * judge.threshold / Marginal.cutoff().sqrt();
         let fine = Judge::new(judge.estimator, &Marginal, threshold);
-        let score = fine.score(&model, f32::INFINITY);
-        let mut found = Found { model, score };
-        fine.improve(&mut found, FINAL_STEPS);
-        fine.explore(&mut found, rng, models);
-        fine.improve(&mut found, FINAL_STEPS);
-        model = found.model;
+        best.score = fine.score(&best.model, f32::INFINITY);
+        fine.improve(&mut best, FINAL_STEPS);
+        if E::RESAMPLES > 0 {
+            fine.explore(&mut best, rng, models);
+            fine.improve(&mut best, FINAL_STEPS);
+        }
     }
-    model
+    best.model
 }
 
 /// The model of least loss below `limit` of all samples; the earliest of equals.
