@@ -4,10 +4,12 @@ mod dense;
 mod error;
 mod initial;
 mod lens;
+mod neighbours;
 
 pub use dense::{DenseError, DenseOptions, DenseResult, reconstruct_dense};
 pub use error::ReconstructError;
 use initial::{Initial, cameras, initial};
+use neighbours::like_their_neighbours;
 
 use crate::guided::{GuidedOptions, match_along_lines};
 use crate::{MatchingError, MatchingOptions, MatchingResult, Progress, Stopwatch, correspondences, match_photos};
@@ -112,7 +114,8 @@ pub struct ReconstructResult {
     pub matching: MatchingResult,
     /// Indices of the matches that obey the epipolar geometry, ascending.
     pub inliers: Vec<usize>,
-    /// Matches found along the epipolar lines, those of `inliers` that came back included; 0 where that was not asked for.
+    /// Matches found along the epipolar lines at the depth of their neighbours, those of `inliers` that came back included; 0 where that was not
+    /// asked for.
     pub guided: usize,
     /// The cameras, refined where they were not known.
     pub cameras: [Camera; 2],
@@ -203,8 +206,10 @@ pub fn reconstruct(
             &along,
         );
         watch.lap("guided");
-        guided = matches.len();
         let more = correspondences(fa, fb, &matches);
+        let TwoViewBundle { cameras, pose, points } = &fit.bundle;
+        let more = like_their_neighbours(&more, &fit.observed, points, cameras, pose);
+        guided = more.len();
         // Fewer would mean that the first matches were not what the lines say.
         if more.len() > chosen.len()
             && let Some(better) = fit_again(&more, &fit, &settings)
