@@ -89,8 +89,8 @@ fn frames_come_out_as_pairs_do() {
             std::fs::copy(at(&format!("{side}.png")), at(side).join(frame)).unwrap();
         }
     }
-    std::fs::create_dir(at("out")).unwrap();
     done(folder.path(), &["depth", "left.png", "right.png", "-o", "one.pfm", "--disparities", "48"]);
+    // The folder comes into being with the first frame.
     let value = json(folder.path(), &["depth", "left", "right", "-o", "out", "--disparities", "48"]);
     assert_eq!(value["frames"], 2);
     assert!(value["frames_per_second"].as_f64().unwrap() > 0.0);
@@ -101,7 +101,9 @@ fn frames_come_out_as_pairs_do() {
     done(folder.path(), &["depth", "left/f2*", "right/f2*", "-o", "out", "--disparities", "48"]);
     refused(folder.path(), &["depth", "left/x*", "right/f2*", "-o", "out"]);
     refused(folder.path(), &["depth", "left", "right/f2*", "-o", "out"]);
-    refused(folder.path(), &["depth", "left", "right", "-o", "nowhere"]);
+    refused(folder.path(), &["depth", "left", "right", "-o", "one.pfm"]);
+    refused(folder.path(), &["depth", "left", "right", "-o", "nowhere", "--disparities", "5000"]);
+    assert!(!at("nowhere").exists());
 }
 
 #[test]
@@ -122,6 +124,47 @@ fn the_result_is_the_same_for_any_number_of_threads() {
         std::fs::read(folder.path().join("d.pfm")).unwrap()
     });
     assert!(maps[0] == maps[1] && maps[0] == maps[2]);
+}
+
+#[test]
+fn a_range_far_from_zero_finds_what_lies_there() {
+    let folder = pair();
+    let at = |name: &str| folder.path().join(name);
+    // The same pair with 60 columns cut off on the right of one and on the left of the other: 60 px more everywhere.
+    const MORE: usize = 60;
+    let [left, right] = ["left.png", "right.png"].map(|name| cv_io::read_rgb(at(name)).unwrap());
+    let width = left.width() - MORE;
+    let cut = |image: &RgbU8, from| RgbU8::from_fn(width, image.height(), |x, y| image.at(x + from, y));
+    cv_io::write_png(at("a.png"), cut(&left, 0).view()).unwrap();
+    cv_io::write_png(at("b.png"), cut(&right, MORE).view()).unwrap();
+    let args = ["depth", "a.png", "b.png", "-o", "d.pfm", "--matched", "m.png", "--report", "r"];
+    done(folder.path(), &[&args[..], &["--min-disparity", "60", "--disparities", "48"]].concat());
+    done(
+        folder.path(),
+        &["depth", "left.png", "right.png", "-o", "plain.pfm", "--matched", "p.png", "--disparities", "48"],
+    );
+    let truth = cv_io::pfm::read(at("truth.pfm")).unwrap();
+    // Of the pixels whose match lies inside the cut picture: all, those confirmed, and those within 1 px.
+    let count = |disparity: &str, mask: &str, more: usize| {
+        let (map, mask) = (cv_io::pfm::read(at(disparity)).unwrap(), cv_io::read_gray_u8(at(mask)).unwrap());
+        let [mut all, mut kept, mut good] = [0.0f64; 3];
+        for (y, x) in (0..map.height()).flat_map(|y| (0..width).map(move |x| (y, x))) {
+            if truth.at(x, y)[0] + MORE as f32 <= x as f32 {
+                all += 1.0;
+                if mask.at(x, y)[0] == 255 {
+                    kept += 1.0;
+                    good += f64::from((map.at(x, y)[0] - truth.at(x, y)[0] - more as f32).abs() <= 1.0);
+                }
+            }
+        }
+        (kept / all, good / kept)
+    };
+    let (far, plain) = (count("d.pfm", "m.png", MORE), count("plain.pfm", "p.png", 0));
+    // The same pictures and range but for the shift, and five columns of border more or less: one in forty.
+    assert!(plain.0 > 0.8 && (far.0 - plain.0).abs() < 0.025 && (far.1 - plain.1).abs() < 0.025, "{far:?} {plain:?}");
+    let page = std::fs::read_dir(at("r")).unwrap().map(|e| e.unwrap().path());
+    let page = page.into_iter().find(|p| p.extension().is_some_and(|e| e == "html")).unwrap();
+    assert!(std::fs::read_to_string(page).unwrap().contains("Fractions of disparities"));
 }
 
 #[test]

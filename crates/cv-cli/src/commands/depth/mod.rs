@@ -1,16 +1,24 @@
 //! `cv depth`: disparity, depth and a cloud from two photographs.
 
-use crate::common::{Context, Explain, Failure, Outcome, Run, expand_images};
+mod frames;
+mod maps;
+mod options;
+mod report;
+
+use crate::common::{Context, Explain, Failure, Outcome, Run};
 use cv_core::{GrayF32, ImageView, RgbU8};
 use cv_io::ply::{Cloud, PlyEncoding};
 use cv_io::{DynImage, Pixels};
-use cv_pipeline::{DepthError, DepthOptions, DepthResult, Progress, check_matched, depth, disparity_range};
-use cv_report::{Figure, MapStyle, Note, PointScene, Report, Viewpoint, draw_map, render_points};
 use cv_pipeline::stereo::{
-    Blend, Census, CloudPoint, DisparityMap, Smoothing, StereoError, Intensity, Paths, PixelState, Rectification, RectifyOptions, StereoGeometry, StereoMatcher,
-    StereoOptions,
+    Intensity, PixelState, Rectification, RectifyOptions, StereoError, StereoGeometry, StereoMatcher,
 };
+use cv_pipeline::{DepthError, DepthOptions, DepthResult, depth};
+use frames::is_sequence;
+use maps::{map_format, write_map};
+use options::{Range, parse_range};
 use std::path::{Path, PathBuf};
+
+pub(crate) use maps::read_map;
 
 /// Compute disparity, and depth where the geometry is known, from a left and a right photograph.
 ///
@@ -31,7 +39,7 @@ pub(crate) struct Args {
     left: PathBuf,
     /// The right photograph, or as many frames.
     right: PathBuf,
-    /// Where to write the disparity: .pfm, .png or .npy; for frames an existing folder, which gets NAME.pfm of each.
+    /// Where to write the disparity: .pfm, .png or .npy; for frames a folder, which gets NAME.pfm of each.
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// Where to write the depth, in the unit of the baseline: .pfm, .png or .npy. Needs --rig, or --focal and --baseline.
@@ -110,20 +118,6 @@ pub(crate) struct Args {
     /// .pfm, .npy or .png (as --depth or the disparity).
     #[arg(long, value_name = "FILE")]
     uncertainty: Option<PathBuf>,
-}
-
-/// `--disparities`.
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Range {
-    Auto,
-    Number(usize),
-}
-
-fn parse_range(text: &str) -> Result<Range, String> {
-    if text == "auto" {
-        return Ok(Range::Auto);
-    }
-    text.parse().map(Range::Number).map_err(|_| "give a number, or auto".to_owned())
 }
 
 impl Run for Args {
@@ -213,7 +207,7 @@ impl Run for Args {
             let (positions, colors) = points.iter().map(|p| (p.position, p.color)).unzip();
             cv_io::ply::write_cloud(path, &Cloud::colored(positions, colors), PlyEncoding::Binary)?;
         }
-        context.report(|| report(&job, &points))?;
+        context.report(|| report::report(&job, &points))?;
         let (valid, matched) = (map.valid_fraction(), map.matched_fraction());
         let (width, height) = map.disparity.size();
         Ok(Outcome::new(job.result.stages.clone())
@@ -231,99 +225,7 @@ impl Run for Args {
     }
 }
 
-/// True for a folder or a pattern.
-fn is_sequence(path: &Path) -> bool {
-    path.is_dir() || (!path.exists() && path.to_string_lossy().contains('*'))
-}
-
-/// The frames of a folder or pattern, in the order of their numbers.
-fn frames(path: &Path) -> Result<Vec<PathBuf>, Failure> {
-    if path.is_dir() {
-        return expand_images(&[path.to_owned()]);
-    }
-    let pattern = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let folder = match path.parent() {
-        Some(folder) if !folder.as_os_str().is_empty() => folder.to_owned(),
-        _ => PathBuf::from("."),
-    };
-    let mut found = expand_images(&[folder])?;
-    found.retain(|file| matches(&pattern, &file.file_name().unwrap_or_default().to_string_lossy()));
-    if found.is_empty() {
-        return Err(Failure::new(format!("there are no images like {}", path.display())).advice("check the pattern"));
-    }
-    Ok(found)
-}
-
-/// Whether a name fits a pattern in which `*` stands for anything.
-fn matches(pattern: &str, name: &str) -> bool {
-    match pattern.split_once('*') {
-        None => pattern == name,
-        Some((head, rest)) => name.strip_prefix(head).is_some_and(|name| {
-            (0..=name.len()).filter(|&i| name.is_char_boundary(i)).any(|i| matches(rest, &name[i..]))
-        }),
-    }
-}
-
 impl Args {
-    /// Frame after frame with the same buffers.
-    fn run_frames(&self, context: &Context) -> Result<Outcome, Failure> {
-        for (path, other) in [(&self.left, &self.right), (&self.right, &self.left)] {
-            if !is_sequence(path) {
-                return Err(Failure::new(format!("{} is one image, {} is not", path.display(), other.display()))
-                    .advice("give two images, or two folders or patterns of frames"));
-            }
-        }
-        if self.disparities == Range::Auto
-            || self.depth.is_some()
-            || self.cloud.is_some()
-            || self.rig.is_some()
-            || self.confidence.is_some()
-            || self.matched.is_some()
-            || self.uncertainty.is_some()
-            || context.wants_report()
-        {
-            return Err(Failure::usage("frames give disparities only")
-                .advice("leave out --rig, --depth, --cloud, --confidence, --matched, --uncertainty and --report, and give the number of disparities"));
-        }
-        let (lefts, rights) = (frames(&self.left)?, frames(&self.right)?);
-        if lefts.len() != rights.len() {
-            return Err(Failure::new(format!("{} left frames and {} right ones", lefts.len(), rights.len()))
-                .advice("give as many of each"));
-        }
-        if !self.output.is_dir() {
-            return Err(Failure::new(format!("{} is not a folder", self.output.display()))
-                .advice(format!("mkdir -p {}", self.output.display())));
-        }
-        let mut matcher = StereoMatcher::new(self.options().stereo)?;
-        let mut map = DisparityMap::empty();
-        let mut said = (0, 0);
-        let (mut seconds, mut valid) = (0.0, 0.0);
-        for (i, (left, right)) in lefts.iter().zip(&rights).enumerate() {
-            Progress::report(context, "frames", i, lefts.len());
-            let (a, b) = (cv_io::read_rgb(left)?, cv_io::read_rgb(right)?);
-            if a.size() != said {
-                said = a.size();
-                say_memory(&matcher, said, context);
-            }
-            let start = std::time::Instant::now();
-            matcher.compute_into(a.view(), b.view(), &mut map).during(left.display())?;
-            check_matched(&map).map_err(explained).during(left.display())?;
-            seconds += start.elapsed().as_secs_f64();
-            valid += map.valid_fraction() / lefts.len() as f64;
-            let name = Path::new(left.file_stem().unwrap_or_default()).with_extension("pfm");
-            cv_io::pfm::write(self.output.join(name), map.disparity.view())?;
-        }
-        let rate = lefts.len() as f64 / seconds;
-        let (width, height) = map.disparity.size();
-        Ok(Outcome::new(vec![("match", seconds)])
-            .with("frames", lefts.len())
-            .with("frames_per_second", rate)
-            .with("width", width)
-            .with("height", height)
-            .with("valid_fraction", valid)
-            .summary(format!("{} frames of {width}×{height} px, {rate:.1} frames per second of matching", lefts.len())))
-    }
-
     /// Confidence, origin and uncertainty, where asked for.
     fn write_quality(&self, job: &Job, context: &Context) -> Result<(), Failure> {
         let DepthResult { map, depth, confidence, sigma, .. } = &job.result;
@@ -355,66 +257,6 @@ impl Args {
             }
         }
         Ok(())
-    }
-
-    /// Under `--disparities auto`, the range that feature matches show.
-    fn set_range(
-        &self,
-        options: &mut DepthOptions,
-        left: &RgbU8,
-        right: &RgbU8,
-        context: &Context,
-    ) -> Result<(), Failure> {
-        if self.disparities == Range::Auto {
-            let (min, n) = disparity_range(left.view(), right.view(), context)
-                .during("--disparities auto")
-                .advice("give the number of disparities")?;
-            let end = min + n as i32;
-            options.stereo.min_disparity = self.min_disparity.unwrap_or(min);
-            options.stereo.disparities = (end - options.stereo.min_disparity).max(1) as usize;
-            context.note(format!("disparities {} to {}", options.stereo.min_disparity, end - 1));
-        }
-        Ok(())
-    }
-
-    fn options(&self) -> DepthOptions {
-        let default = StereoOptions::default();
-        DepthOptions {
-            stereo: StereoOptions {
-                min_disparity: self.min_disparity.unwrap_or(default.min_disparity),
-                disparities: match self.disparities {
-                    Range::Number(n) => n,
-                    Range::Auto => default.disparities,
-                },
-                census: match self.census.as_str() {
-                    "5" => Census::Window5x5,
-                    "7" => Census::Window7x7,
-                    _ => Census::Window9x7,
-                },
-                p1: self.p1.unwrap_or(default.p1),
-                p2: self.p2.unwrap_or(default.p2),
-                p2_min: default.p2_min.clamp(self.p1.unwrap_or(0), self.p2.unwrap_or(u8::MAX).max(self.p1.unwrap_or(0))),
-                paths: if self.paths == "4" { Paths::Four } else { Paths::Eight },
-                uniqueness: self.uniqueness.unwrap_or(default.uniqueness),
-                speckle_size: self.speckle_size.unwrap_or(default.speckle_size),
-                fill: !self.no_fill,
-                blend: match self.blend.as_str() {
-                    // Of the weights tried on rendered scenes and photographs, those that gave the fewest errors.
-                    "grey" => Blend::Grey { per_bit: 2, cap: 8 },
-                    "gradient" => Blend::Gradient { per_bit: 1, cap: 6 },
-                    _ => Blend::None,
-                },
-                smoothing: match self.smoothing.as_str() {
-                    "bilateral" => Smoothing::Bilateral { sigma: self.sigma.unwrap_or(24.0) },
-                    "wls" => Smoothing::LeastSquares { lambda: self.lambda, sigma: self.sigma.unwrap_or(1.5) },
-                    _ => Smoothing::None,
-                },
-                confidence: self.confidence.is_some(),
-                max_memory: self.max_memory.map(|mib| mib.saturating_mul(1 << 20)),
-                ..default
-            },
-            range: (self.near, self.far.unwrap_or(f32::INFINITY)),
-        }
     }
 }
 
@@ -477,117 +319,3 @@ fn matched<T: Intensity, const C: usize>(
     depth(left, right, geometry, options, context).map_err(explained)
 }
 
-/// The formats a map can be written in.
-enum MapFormat {
-    Pfm,
-    Png,
-    Npy,
-}
-
-fn map_format(path: &Path) -> Result<MapFormat, Failure> {
-    match path.extension().unwrap_or_default().to_string_lossy().to_lowercase().as_str() {
-        "pfm" => Ok(MapFormat::Pfm),
-        "png" => Ok(MapFormat::Png),
-        "npy" => Ok(MapFormat::Npy),
-        _ => Err(Failure::usage(format!("{} does not tell a format by its ending", path.display()))
-            .advice("end it with .pfm, .png or .npy")),
-    }
-}
-
-/// Writes a map. `Some` count where values did not fit the format.
-fn write_map(
-    path: &Path,
-    map: ImageView<'_, f32, 1>,
-    png: impl FnOnce(&Path, ImageView<'_, f32, 1>) -> Result<usize, cv_io::IoError>,
-) -> Result<Option<usize>, Failure> {
-    match map_format(path)? {
-        MapFormat::Pfm => cv_io::pfm::write(path, map)?,
-        MapFormat::Npy => cv_io::npy::write(path, &cv_io::npy::NpyArray::from_view(map))?,
-        MapFormat::Png => return Ok(Some(png(path, map)?).filter(|&lost| lost > 0)),
-    }
-    Ok(None)
-}
-
-/// Where each disparity comes from, over the darkened photograph.
-fn draw_states(left: ImageView<'_, u8, 3>, states: ImageView<'_, PixelState, 1>) -> RgbU8 {
-    RgbU8::from_fn(states.width(), states.height(), |x, y| {
-        let pixel = left.at(x, y);
-        let tint = match states.at(x, y)[0] {
-            PixelState::Matched => return pixel,
-            PixelState::Occluded => [60u8, 110, 255],
-            PixelState::Mismatched => [255, 150, 40],
-            PixelState::OutOfView => [200, 60, 220],
-        };
-        std::array::from_fn(|c| ((u16::from(pixel[c]) + 3 * u16::from(tint[c])) / 4) as u8)
-    })
-}
-
-fn report(job: &Job, points: &[CloudPoint]) -> Result<String, Failure> {
-    let DepthResult { map, depth, stages, .. } = &job.result;
-    let png = |image: &RgbU8| cv_io::encode_png(image.view());
-    let mut page = Report::new("Depth");
-    let (width, height) = map.disparity.size();
-    page.headline("size", &format!("{width}×{height}"))
-        .headline("with a disparity", &format!("{:.1} %", 100.0 * map.valid_fraction()))
-        .headline("matched and confirmed", &format!("{:.1} %", 100.0 * map.matched_fraction()));
-    page.section("Photographs").figures(vec![
-        Figure::new(png(&job.left)?, "Left photograph."),
-        Figure::new(png(&job.right)?, "Right photograph."),
-    ]);
-    page.section("Disparity").figures(vec![
-        Figure::new(
-            png(&draw_map(map.disparity.view(), &MapStyle::disparity()))?,
-            "Disparity: near (large) blue, far (small) red, unknown black.",
-        ),
-        Figure::new(
-            png(&draw_states(job.left.view(), map.state.view()))?,
-            "Filled pixels: blue hidden from the right camera, orange mismatched, violet outside the right photograph.",
-        ),
-    ]);
-    if let Some(depth) = depth {
-        page.section("Depth").figure(Figure::new(
-            png(&draw_map(depth.view(), &MapStyle::depth("")))?,
-            "Depth in the unit of the baseline: near blue, far red, unknown black.",
-        ));
-        let (positions, colors): (Vec<_>, Vec<_>) = points.iter().map(|p| (p.position, p.color)).unzip();
-        let scene = PointScene::new(&positions, &colors);
-        let still = png(&render_points(&scene, Viewpoint::Camera, 960, 640))?;
-        page.section("Cloud").points(&scene, Some(still), "The depth map in space.");
-    } else {
-        page.note(Note::Info, "No depth: the focal length and the baseline were not given.");
-    }
-    page.section("Time").facts(
-        &stages.iter().map(|(stage, seconds)| (*stage, format!("{:.1} ms", 1e3 * seconds))).collect::<Vec<_>>(),
-    );
-    Ok(page.to_html())
-}
-
-/// A map of any of the formats that truth and estimates come in: PFM, KITTI's PNG or (with `scale`) another one, NumPy's.
-pub(crate) fn read_map(path: &Path, scale: Option<f64>) -> Result<GrayF32, Failure> {
-    let map = match path.extension().unwrap_or_default().to_string_lossy().to_lowercase().as_str() {
-        "pfm" => cv_io::pfm::read(path)?,
-        "npy" => gray(path, cv_io::npy::read(path)?.to_gray())?,
-        "npz" => {
-            let arrays = cv_io::npz::read(path)?;
-            let [(_, array)] = arrays.as_slice() else {
-                return Err(Failure::new(format!("{} holds {} arrays, not one", path.display(), arrays.len())));
-            };
-            gray(path, array.to_gray())?
-        }
-        // Pictures, whatever they are called.
-        _ => {
-            return match scale {
-                Some(scale) => Ok(cv_io::scaled::read(path, scale)?),
-                None => Ok(cv_io::kitti::read(path).advice("for other pictures give the scale (--truth-scale)")?),
-            };
-        }
-    };
-    Ok(match scale {
-        Some(scale) => map.map(|[v]| [(f64::from(v) / scale) as f32]),
-        None => map,
-    })
-}
-
-fn gray(path: &Path, map: Result<GrayF32, cv_io::FormatError>) -> Result<GrayF32, Failure> {
-    map.during(format!("cannot read {}", path.display()))
-}

@@ -1,0 +1,66 @@
+//! Maps of floats in files.
+
+use crate::common::{Explain, Failure};
+use cv_core::{GrayF32, ImageView};
+use std::path::Path;
+
+/// The formats a map can be written in.
+pub(super) enum MapFormat {
+    Pfm,
+    Png,
+    Npy,
+}
+
+pub(super) fn map_format(path: &Path) -> Result<MapFormat, Failure> {
+    match path.extension().unwrap_or_default().to_string_lossy().to_lowercase().as_str() {
+        "pfm" => Ok(MapFormat::Pfm),
+        "png" => Ok(MapFormat::Png),
+        "npy" => Ok(MapFormat::Npy),
+        _ => Err(Failure::usage(format!("{} does not tell a format by its ending", path.display()))
+            .advice("end it with .pfm, .png or .npy")),
+    }
+}
+
+/// Writes a map. `Some` count where values did not fit the format.
+pub(super) fn write_map(
+    path: &Path,
+    map: ImageView<'_, f32, 1>,
+    png: impl FnOnce(&Path, ImageView<'_, f32, 1>) -> Result<usize, cv_io::IoError>,
+) -> Result<Option<usize>, Failure> {
+    match map_format(path)? {
+        MapFormat::Pfm => cv_io::pfm::write(path, map)?,
+        MapFormat::Npy => cv_io::npy::write(path, &cv_io::npy::NpyArray::from_view(map))?,
+        MapFormat::Png => return Ok(Some(png(path, map)?).filter(|&lost| lost > 0)),
+    }
+    Ok(None)
+}
+
+/// A map of any of the formats that truth and estimates come in: PFM, KITTI's PNG or (with `scale`) another one, NumPy's.
+pub(crate) fn read_map(path: &Path, scale: Option<f64>) -> Result<GrayF32, Failure> {
+    let map = match path.extension().unwrap_or_default().to_string_lossy().to_lowercase().as_str() {
+        "pfm" => cv_io::pfm::read(path)?,
+        "npy" => gray(path, cv_io::npy::read(path)?.to_gray())?,
+        "npz" => {
+            let arrays = cv_io::npz::read(path)?;
+            let [(_, array)] = arrays.as_slice() else {
+                return Err(Failure::new(format!("{} holds {} arrays, not one", path.display(), arrays.len())));
+            };
+            gray(path, array.to_gray())?
+        }
+        // Pictures, whatever they are called.
+        _ => {
+            return match scale {
+                Some(scale) => Ok(cv_io::scaled::read(path, scale)?),
+                None => Ok(cv_io::kitti::read(path).advice("for other pictures give the scale (--truth-scale)")?),
+            };
+        }
+    };
+    Ok(match scale {
+        Some(scale) => map.map(|[v]| [(f64::from(v) / scale) as f32]),
+        None => map,
+    })
+}
+
+fn gray(path: &Path, map: Result<GrayF32, cv_io::FormatError>) -> Result<GrayF32, Failure> {
+    map.during(format!("cannot read {}", path.display()))
+}

@@ -1,0 +1,75 @@
+//! The report of `cv depth`.
+
+use super::Job;
+use crate::common::Failure;
+use cv_core::{ImageView, RgbU8};
+use cv_pipeline::DepthResult;
+use cv_pipeline::stereo::{CloudPoint, DisparityMap, PixelState};
+use cv_report::{Figure, MapStyle, Note, Plot, PointScene, Report, Viewpoint, draw_map, render_points};
+
+/// Where each disparity comes from, over the darkened photograph.
+fn draw_states(left: ImageView<'_, u8, 3>, states: ImageView<'_, PixelState, 1>) -> RgbU8 {
+    RgbU8::from_fn(states.width(), states.height(), |x, y| {
+        let pixel = left.at(x, y);
+        let tint = match states.at(x, y)[0] {
+            PixelState::Matched => return pixel,
+            PixelState::Occluded => [60u8, 110, 255],
+            PixelState::Mismatched => [255, 150, 40],
+            PixelState::OutOfView => [200, 60, 220],
+        };
+        std::array::from_fn(|c| ((u16::from(pixel[c]) + 3 * u16::from(tint[c])) / 4) as u8)
+    })
+}
+
+pub(super) fn report(job: &Job, points: &[CloudPoint]) -> Result<String, Failure> {
+    let DepthResult { map, depth, stages, .. } = &job.result;
+    let png = |image: &RgbU8| cv_io::encode_png(image.view());
+    let mut page = Report::new("Depth");
+    let (width, height) = map.disparity.size();
+    page.headline("size", &format!("{width}×{height}"))
+        .headline("with a disparity", &format!("{:.1} %", 100.0 * map.valid_fraction()))
+        .headline("matched and confirmed", &format!("{:.1} %", 100.0 * map.matched_fraction()));
+    page.section("Photographs").figures(vec![
+        Figure::new(png(&job.left)?, "Left photograph."),
+        Figure::new(png(&job.right)?, "Right photograph."),
+    ]);
+    page.section("Disparity").figures(vec![
+        Figure::new(
+            png(&draw_map(map.disparity.view(), &MapStyle::disparity()))?,
+            "Disparity: near (large) blue, far (small) red, unknown black.",
+        ),
+        Figure::new(
+            png(&draw_states(job.left.view(), map.state.view()))?,
+            "Filled pixels: blue hidden from the right camera, orange mismatched, violet outside the right photograph.",
+        ),
+    ]);
+    page.section("Fractions").plot(
+        &fractions(map),
+        "How often matched disparities have each fraction. Whole pixels that stand out (pixel locking) betray a poor fit \
+         between pixels, unless the scene is of few planes that face the cameras.",
+    );
+    if let Some(depth) = depth {
+        page.section("Depth").figure(Figure::new(
+            png(&draw_map(depth.view(), &MapStyle::depth("")))?,
+            "Depth in the unit of the baseline: near blue, far red, unknown black.",
+        ));
+        let (positions, colors): (Vec<_>, Vec<_>) = points.iter().map(|p| (p.position, p.color)).unzip();
+        let scene = PointScene::new(&positions, &colors);
+        let still = png(&render_points(&scene, Viewpoint::Camera, 960, 640))?;
+        page.section("Cloud").points(&scene, Some(still), "The depth map in space.");
+    } else {
+        page.note(Note::Info, "No depth: the focal length and the baseline were not given.");
+    }
+    page.section("Time").facts(
+        &stages.iter().map(|(stage, seconds)| (*stage, format!("{:.1} ms", 1e3 * seconds))).collect::<Vec<_>>(),
+    );
+    Ok(page.to_html())
+}
+
+/// How the fractions of matched disparities are spread.
+fn fractions(map: &DisparityMap) -> Plot {
+    let pixels = map.disparity.as_slice().iter().zip(map.state.as_slice());
+    let matched = pixels.filter(|(d, state)| d.is_finite() && **state == PixelState::Matched);
+    let values: Vec<f64> = matched.map(|(&d, _)| f64::from(d) - f64::from(d).floor()).collect();
+    Plot::new("Fractions of disparities", "fraction of a pixel", "pixels").histogram_within("", &values, 20, (0.0, 1.0))
+}
