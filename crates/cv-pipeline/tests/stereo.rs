@@ -68,6 +68,37 @@ fn depth_is_within_five_percent_and_exposure_does_not_matter() {
 }
 
 #[test]
+fn errors_are_as_large_as_the_stated_uncertainty() {
+    // Errors within one and within two standard deviations, of those stated below and above 0.15 px, which halves them.
+    let mut counts = [[0u32; 3]; 2];
+    for (name, scene, baseline) in scenes() {
+        let (camera, pose) = (camera(), scene.viewpoint());
+        let pair = stereo_pair(&scene, &camera, &pose, baseline, &RenderOptions::default()).unwrap();
+        let other = RenderOptions { exposure: -1.0, ..RenderOptions::default().with_seed(99) };
+        let other = stereo_pair(&scene, &camera, &pose, baseline, &other).unwrap();
+        let mut matcher = StereoMatcher::new(StereoOptions { disparities: 96, ..StereoOptions::default() }).unwrap();
+        let map = matcher.compute(pair.left.image.view(), other.right.image.view()).unwrap();
+        let sigma = matcher.uncertainty(&map);
+        for (y, x) in (0..480).flat_map(|y| (0..640).map(move |x| (y, x))).filter(|&(y, x)| pair.visible.at(x, y)[0]) {
+            let (sigma, error) = (sigma.at(x, y)[0], (map.disparity.at(x, y)[0] - pair.disparity.at(x, y)[0]).abs());
+            assert_eq!(sigma.is_finite(), map.state.at(x, y)[0] == PixelState::Matched, "{name}: {x} {y}");
+            if sigma.is_finite() {
+                let counts = &mut counts[usize::from(sigma > 0.15)];
+                counts[0] += 1;
+                counts[1] += u32::from(error <= sigma);
+                counts[2] += u32::from(error <= 2.0 * sigma);
+            }
+        }
+    }
+    for [all, one, two] in counts {
+        let [one, two] = [one, two].map(|n| f64::from(n) / f64::from(all));
+        println!("{all} pixels: {one:.3} within one standard deviation, {two:.3} within two");
+        // 0.68 and 0.95 are those of a normal distribution; errors have heavier tails, and scenes differ.
+        assert!(all > 100_000 && (0.6..0.8).contains(&one) && (0.84..0.97).contains(&two), "{all} {one} {two}");
+    }
+}
+
+#[test]
 fn strips_of_rows_take_less_memory_and_hardly_change_the_result() {
     for (name, scene, baseline) in scenes().take(2) {
         let pair = stereo_pair(&scene, &camera(), &scene.viewpoint(), baseline, &RenderOptions::default()).unwrap();

@@ -31,7 +31,7 @@ pub enum PixelState {
     Matched,
     /// Seen by the left camera only: something nearer hides it from the right one. Filled from the background.
     Occluded,
-    /// Its match failed a check. Filled from around.
+    /// Its match failed a check, or smoothing found it on the wrong side of an outline of the photograph. Filled from around.
     Mismatched,
     /// Its match would lie outside the right image. Filled from around.
     OutOfView,
@@ -385,7 +385,7 @@ impl StereoMatcher {
             median::median(self.level, disparity, width, options.median, &mut self.scratch);
             disparity.copy_from_slice(&self.scratch);
         }
-        let states = map.state.as_slice();
+        let states = map.state.as_mut_slice();
         smooth(self.level, options.smoothing, disparity, states, &self.grey8, width, &mut self.planes);
     }
 }

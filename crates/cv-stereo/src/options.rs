@@ -91,7 +91,9 @@ pub enum Smoothing {
     None,
     /// Outlines move to the edges of the photograph, and pixels of a surface are averaged over 9×9 px.
     Bilateral {
-        /// Grey levels (of 255) between pixels at which they have no more to say to each other; positive. Default 24.
+        /// Grey levels (of 255) between pixels at which they have no more to say to each other; positive. Default 24: on
+        /// sixteen generated scenes of four kinds (rooms, tables, balls, posters; seeds 100 to 103, both cameras with noise,
+        /// half at one stop less) 16 to 32 leave 1.64 % of errors above 1 px, 8 leaves 1.71 and 56 leaves 1.66.
         sigma: f32,
     },
     /// Weighted least squares (Min et al., TIP 2014), as in OpenCV's `DisparityWLSFilter`: reaches farther, takes longer.
