@@ -8,8 +8,8 @@ use rayon::prelude::*;
 const NEIGHBOURS: usize = 8;
 /// How far beyond the inverse depths of its neighbours a point may lie, as a share of their range.
 const MORE: f64 = 0.5;
-/// And in pixels of parallax.
-const PIXELS: f64 = 3.0;
+/// And in radians of parallax: three pixels of a small photograph, a dozen of a large one.
+const PARALLAX: f64 = 0.005;
 
 /// The matches whose depth is that of the points around them, or that belong to one of those. `points` are known from `matches`, one each.
 ///
@@ -23,7 +23,6 @@ pub(super) fn like_their_neighbours(
     pose: &Pose,
 ) -> Vec<Correspondence> {
     let (normalised, _) = normalize_matches(more, &cameras[0], &cameras[1]);
-    let tolerance = PIXELS / cameras[0].fx;
     let belongs = |(m, n): (&Correspondence, &Correspondence)| {
         // The nearest of the known ones in the first photograph, the nearest first.
         let mut near = [(f64::INFINITY, 0.0); NEIGHBOURS];
@@ -41,7 +40,7 @@ pub(super) fn like_their_neighbours(
         let Ok(point) = triangulate(n, pose) else { return false };
         let found = near.iter().filter(|other| other.0.is_finite());
         let (low, high) = found.fold((f64::MAX, f64::MIN), |(low, high), other| (low.min(other.1), high.max(other.1)));
-        let reach = MORE * (high - low) + tolerance;
+        let reach = MORE * (high - low) + PARALLAX;
         (low - reach..=high + reach).contains(&(1.0 / point.z))
     };
     let keep: Vec<bool> = more.par_iter().zip(&normalised).map(belongs).collect();
