@@ -20,8 +20,6 @@ const FINAL_STEPS: usize = 20;
 /// The scale of Tukey's biweight, in standard deviations, at which it is 95 % as good as least squares on Gaussian errors (Huber &
 /// Ronchetti, "Robust statistics", 2009).
 const BIWEIGHT: f64 = 4.685;
-/// Rounds of noise and refinement at the end; a third changes the model by less than a tenth of its deviation.
-const POLISH: usize = 2;
 
 /// A model and how well it fits.
 pub(super) struct Found<M> {
@@ -132,14 +130,16 @@ fn optimized<E: Estimator, C: Scorer>(
 }
 
 /// Searches on, near the model, with the noise that the data show instead of the threshold they were searched with: small noise leaves room for
-/// wrong data that happen to fit and for other minima, large noise loses right data.
+/// wrong data that happen to fit and for other minima, large noise loses right data. Twice: a third round changes the model by less than a
+/// tenth of its deviation.
 fn settle<E: Estimator, C: Scorer>(
     judge: &Judge<'_, E, C>,
     mut best: Found<E::Model>,
     rng: &mut ChaCha8Rng,
     models: &mut Vec<E::Model>,
 ) -> E::Model {
-    for _ in 0..POLISH {
+    // The scale of the last round is the one to converge at.
+    for steps in [LOCAL_STEPS, FINAL_STEPS] {
         let Some(sigma) = judge.noise(&best.model) else {
             // Too few data for a noise of their own.
             best.score = judge.score(&best.model, f32::INFINITY);
@@ -149,10 +149,10 @@ fn settle<E: Estimator, C: Scorer>(
         let threshold = BIWEIGHT * sigma * judge.threshold / Marginal.cutoff().sqrt();
         let fine = Judge::new(judge.estimator, &Marginal, threshold);
         best.score = fine.score(&best.model, f32::INFINITY);
-        fine.improve(&mut best, FINAL_STEPS);
+        fine.improve(&mut best, steps);
         if E::RESAMPLES > 0 {
             fine.explore(&mut best, rng, models);
-            fine.improve(&mut best, FINAL_STEPS);
+            fine.improve(&mut best, steps);
         }
     }
     best.model
