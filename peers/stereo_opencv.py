@@ -1,5 +1,5 @@
 """OpenCV's stereo matchers on Middlebury pairs, one JSON line per pair and matcher. usage: stereo_opencv.py DATA/stereo"""
-import json, resource, sys, time
+import json, sys, time
 import cv2
 import numpy as np
 
@@ -42,7 +42,9 @@ MODES = {
 
 
 def peak():
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    # Not ru_maxrss, which starts at what the program that started this one holds.
+    with open("/proc/self/status") as status:
+        return 1024 * next(int(line.split()[1]) for line in status if line.startswith("VmHWM"))
 
 
 # The memory of HH at the largest size, before anything else has raised the peak.
