@@ -49,8 +49,8 @@ pub fn pose_three_points(m: &[WorldMatch; 3], mut found: impl FnMut(Pose)) {
     let product = d + axis.cross_matrix();
     let (r, c) = product.iamax_full();
     let sides: [Vector3<f64>; 2] = [product.row(r).transpose(), product.column(c).into_owned()];
-    let inverse = Matrix3::from_columns(&[d01, d02, normal]).try_inverse();
-    let Some(inverse) = inverse else { return };
+    // Of the matrix of the columns d01, d02 and their normal.
+    let inverse = Matrix3::from_columns(&[d02.cross(&normal), normal.cross(&d01), normal]).transpose() / area;
     for n in sides {
         let i = n.iamax();
         let (j, k) = ((i + 1) % 3, (i + 2) % 3);
@@ -79,8 +79,11 @@ pub fn pose_three_points(m: &[WorldMatch; 3], mut found: impl FnMut(Pose)) {
             let form = depth.norm_squared() * 2.0
                 - 2.0 * (b01 * depth[0] * depth[1] + b02 * depth[0] * depth[2] + b12 * depth[1] * depth[2]);
             let mut depth = depth * ((a01 + a02 + a12) / form).sqrt();
+            // Seldom more than one step: twice where two solutions are near each other.
             for _ in 0..2 {
-                newton(&mut depth, [a01, a02, a12], [b01, b02, b12]);
+                if newton(&mut depth, [a01, a02, a12], [b01, b02, b12]) {
+                    break;
+                }
             }
             if !depth.iter().all(|x| *x > 0.0) {
                 continue;
@@ -94,14 +97,17 @@ pub fn pose_three_points(m: &[WorldMatch; 3], mut found: impl FnMut(Pose)) {
     }
 }
 
-/// One step of Newton's method on the three squared distances.
+/// One step of Newton's method on the three squared distances; true where none is needed, since they hold to rounding.
 #[inline]
-fn newton(l: &mut Vector3<f64>, [a01, a02, a12]: [f64; 3], [b01, b02, b12]: [f64; 3]) {
+fn newton(l: &mut Vector3<f64>, [a01, a02, a12]: [f64; 3], [b01, b02, b12]: [f64; 3]) -> bool {
     let r = Vector3::new(
         l[0] * l[0] + l[1] * l[1] - 2.0 * b01 * l[0] * l[1] - a01,
         l[0] * l[0] + l[2] * l[2] - 2.0 * b02 * l[0] * l[2] - a02,
         l[1] * l[1] + l[2] * l[2] - 2.0 * b12 * l[1] * l[2] - a12,
     );
+    if r.amax() <= 4.0 * f64::EPSILON * l.norm_squared() {
+        return true;
+    }
     // Half of the derivatives.
     let (p, q) = (l[0] - b01 * l[1], l[1] - b01 * l[0]);
     let (s, t) = (l[0] - b02 * l[2], l[2] - b02 * l[0]);
@@ -114,6 +120,7 @@ fn newton(l: &mut Vector3<f64>, [a01, a02, a12]: [f64; 3], [b01, b02, b12]: [f64
         l[1] -= i * (-s * w * r[0] + p * w * r[1] - p * t * r[2]);
         l[2] -= i * (s * v * r[0] - p * v * r[1] - q * s * r[2]);
     }
+    false
 }
 
 /// The transposed cofactors of a symmetric matrix.
