@@ -74,8 +74,8 @@ impl Default for MatchOptions {
 /// Exact: every pair is compared. Of equally near descriptors the first counts as the best, so that a duplicate gives ratio 1. Where `train`
 /// has a single descriptor nothing can be said about ambiguity: the ratio is 1, and only `ratio: None` keeps such a match. O(query · train · dimension).
 ///
-/// There is no approximate index: at 20,000 descriptors of 128 numbers on each side OpenCV's forest of k-d trees takes longer than this (see
-/// `docs/benchmarks.md`).
+/// There is no approximate index: at 20,000 descriptors of 128 numbers on each side OpenCV's forest of k-d trees takes about as long as this (see
+/// `docs/benchmarks.md`) and does not always find the nearest.
 ///
 /// # Errors
 /// [`MatchError`] for kinds that differ, an empty set, a ratio out of range.
