@@ -74,7 +74,7 @@ impl Default for MatchOptions {
 /// Exact: every pair is compared. Of equally near descriptors the first counts as the best, so that a duplicate gives ratio 1. Where `train`
 /// has a single descriptor nothing can be said about ambiguity: the ratio is 1, and only `ratio: None` keeps such a match. O(query · train · dimension).
 ///
-/// There is no approximate index: at 20,000 descriptors of 128 numbers on each side OpenCV's forest of k-d trees takes about as long as this (see
+/// There is no approximate index: at 20,000 descriptors of 128 numbers on each side OpenCV's forest of k-d trees is faster by a half at most (see
 /// `docs/benchmarks.md`) and does not always find the nearest.
 ///
 /// # Errors
