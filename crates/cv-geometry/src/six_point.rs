@@ -1,5 +1,6 @@
 //! Relative poses of two views of one unknown focal length, through six points.
 
+use crate::essential::orthonormalize;
 use crate::fundamental::epipolar_row;
 use cv_core::{Matrix3, Point2};
 use cv_numeric::{kernel_vector, null_space, real_quadratic_eigenvalues};
@@ -31,8 +32,13 @@ pub fn fundamental_six_point(a: &[Point2<f64>; 6], b: &[Point2<f64>; 6], mut fou
     }
     let unit = |p: &Point2<f64>| Point2::from(p.coords / size);
     let rows = std::array::from_fn(|i| epipolar_row(unit(&a[i]), unit(&b[i])));
-    let Some(basis) = null_space::<6, 9, 3>(rows) else { return };
-    let Some(basis) = orthonormal(&basis) else { return };
+    let Some(mut basis) = null_space::<6, 9, 3>(rows) else { return };
+    // Twice: the second time mends what small angles cost the first.
+    orthonormalize(&mut basis);
+    orthonormalize(&mut basis);
+    if !basis.iter().flatten().all(|v| v.is_finite()) {
+        return;
+    }
     let pencil = constraints(&basis);
     // Squares of focal lengths are positive: the shift is no solution.
     for w in real_quadratic_eigenvalues(pencil.each_ref(), -1.0) {
@@ -56,24 +62,6 @@ pub fn fundamental_six_point(a: &[Point2<f64>; 6], b: &[Point2<f64>; 6], mut fou
 
 /// Of `1/f²` in units of the largest coordinate; its root is from a tenth of a degree of view to nearly 180.
 const SMALLEST: f64 = 1e-6;
-
-/// Gram and Schmidt's method, twice: the coefficients of the cubics are products of three entries.
-fn orthonormal(basis: &[[f64; 9]; 3]) -> Option<[[f64; 9]; 3]> {
-    let mut out = *basis;
-    for _ in 0..2 {
-        for i in 0..3 {
-            let (done, rest) = out.split_at_mut(i);
-            let v = &mut rest[0];
-            for u in done.iter() {
-                let dot: f64 = u.iter().zip(v.iter()).map(|(a, b)| a * b).sum();
-                v.iter_mut().zip(u).for_each(|(a, b)| *a -= dot * b);
-            }
-            let norm = v.iter().map(|a| a * a).sum::<f64>().sqrt();
-            v.iter_mut().for_each(|a| *a /= norm);
-        }
-    }
-    out.iter().flatten().all(|v| v.is_finite()).then_some(out)
-}
 
 fn times(a: &Linear, b: &Linear) -> Quadratic {
     [

@@ -365,7 +365,7 @@ fn patch_ties(photos: &[ImageView<'_, u8, 3>], layout: &Layout, fields: &[Field]
                 return None;
             }
             let second = patch(photos, layout, &fields[q], q, c, HALF + REACH)?;
-            let offset = register(&first, &second)?;
+            let offset = register(&first, second)?;
             let other = c + offset;
             Some(Tie { p, q, a: c - fields[p].at(c), b: other - fields[q].at(other) })
         })
@@ -444,19 +444,17 @@ fn corner_strength(patch: &[f32]) -> f32 {
 
 /// How far the content of `first` lies from the middle of the larger `second`, by normalised correlation with a parabola at its peak; `None` where nothing is
 /// alike, or two places are.
-fn register(first: &[f32], second: &[f32]) -> Option<Vector2<f64>> {
-    let mut window = second.to_vec();
-    window.resize(second.len() + PAD, 0.0);
-    let scores = Template::new(2 * HALF + 1, first).scores(&window);
-    let places = PLACES;
+fn register(first: &[f32], mut second: Vec<f32>) -> Option<Vector2<f64>> {
+    second.resize(second.len() + PAD, 0.0);
+    let scores = Template::new(2 * HALF + 1, first).scores(&second);
     let (best, &score) = scores.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1))?;
-    let (y, x) = (best / places, best % places);
-    if score < 0.85 || x == 0 || y == 0 || x == places - 1 || y == places - 1 {
+    let (y, x) = (best / PLACES, best % PLACES);
+    if score < 0.85 || x == 0 || y == 0 || x == PLACES - 1 || y == PLACES - 1 {
         return None;
     }
     // Repeated structure: another place that is nearly as good, not beside the best.
     let rival = scores.iter().enumerate().any(|(i, s)| {
-        let far = (i / places).abs_diff(y).max((i % places).abs_diff(x)) > 2;
+        let far = (i / PLACES).abs_diff(y).max((i % PLACES).abs_diff(x)) > 2;
         far && *s > score - 0.05
     });
     if rival {
@@ -467,6 +465,6 @@ fn register(first: &[f32], second: &[f32]) -> Option<Vector2<f64>> {
         if curvature < 0.0 { f64::from(0.5 * (a - c) / curvature).clamp(-0.5, 0.5) } else { 0.0 }
     };
     let fx = parabola(scores[best - 1], score, scores[best + 1]);
-    let fy = parabola(scores[best - places], score, scores[best + places]);
+    let fy = parabola(scores[best - PLACES], score, scores[best + PLACES]);
     Some(Vector2::new(x as f64 + fx - REACH as f64, y as f64 + fy - REACH as f64))
 }

@@ -57,7 +57,7 @@ pub(crate) struct Args {
     /// Probability with which a sample without outliers is drawn before the search stops.
     #[arg(long, value_name = "P", default_value_t = RobustOptions::default().confidence)]
     confidence: f64,
-    /// Most samples drawn [default: 10000 for a homography, 50000 otherwise].
+    /// Most samples drawn [default: 10000 for a homography, 20000 otherwise].
     #[arg(long, value_name = "N")]
     max_iterations: Option<usize>,
     /// Camera of both views, for an essential matrix: YAML, a line of COLMAP's cameras.txt, or a 3×3 matrix.

@@ -90,8 +90,8 @@ fn reduce(a: &[Point2<f64>; 5], b: &[Point2<f64>; 5]) -> Option<(Basis, Reduced)
 /// Gram and Schmidt's method. The coefficients of the cubics are products of three entries: a basis of uneven lengths or small
 /// angles costs three times its digits.
 #[inline(always)]
-fn orthonormalize(basis: &mut Basis) {
-    for i in 0..4 {
+pub(crate) fn orthonormalize<const N: usize>(basis: &mut [[f64; 9]; N]) {
+    for i in 0..N {
         let (done, rest) = basis.split_at_mut(i);
         let v = &mut rest[0];
         for u in done.iter() {

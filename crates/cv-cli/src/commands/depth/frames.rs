@@ -85,8 +85,10 @@ impl Args {
             check_matched(&map).map_err(explained).during(left.display())?;
             seconds += start.elapsed().as_secs_f64();
             valid += map.valid_fraction() / lefts.len() as f64;
-            // Not before there is something to put there.
-            std::fs::create_dir_all(&self.output).during(self.output.display())?;
+            if i == 0 {
+                // Not before there is something to put there.
+                std::fs::create_dir_all(&self.output).during(self.output.display())?;
+            }
             let name = Path::new(left.file_stem().unwrap_or_default()).with_extension("pfm");
             cv_io::pfm::write(self.output.join(name), map.disparity.view())?;
         }
