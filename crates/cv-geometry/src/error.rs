@@ -46,14 +46,14 @@ pub enum EstimateError {
     },
     /// No model is supported by more matches than chance would give.
     #[error(
-        "after {iterations} samples the best model fits {inliers} of {matches} matches; at least {needed} are needed"
+        "after {iterations} samples the best model fits {inliers} of {matches} matches, which chance would give; at least {needed} are needed"
     )]
     NoConsensus {
         /// Matches that fit the best model.
         inliers: usize,
         /// Matches given.
         matches: usize,
-        /// Matches that must fit.
+        /// Matches that must fit: fewer would fit some model if all were wrong. More than there are where the threshold is so large that any do.
         needed: usize,
         /// Samples drawn.
         iterations: usize,

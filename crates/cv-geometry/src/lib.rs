@@ -18,6 +18,7 @@
 //!
 //! * A homography maps the first image to the second, `b ~ H a`, scaled to `H[2][2] = 1`.
 //! * Thresholds and residuals are in the unit of the matches, that is, pixels.
+//! * A robust estimate is refused where chance would support a model as well (`RobustModel::log_nfa`, the number of false alarms).
 //! * The same matches, options and seed give the same bytes on any number of threads and with any vector unit.
 
 mod absolute;

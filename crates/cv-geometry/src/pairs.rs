@@ -1,7 +1,7 @@
 //! Correspondences, normalised and laid out for vector units.
 
 use crate::{EstimateError, error::Degeneracy};
-use cv_core::{Correspondence, Matrix3, Point2};
+use cv_core::{Correspondence, Matrix3, Point2, Vector3};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
@@ -119,6 +119,30 @@ impl PairSet {
             .collect();
         Self { pairs, blocks, order, first, second }
     }
+
+    /// First points with the second ones of other matches.
+    pub(crate) fn wrong(&self, most: usize) -> Vec<PairBlock> {
+        let mut pairs = different(self.order.len(), most);
+        let mut blocks = Vec::with_capacity(most / LANES + 1);
+        while let Some(first) = pairs.next() {
+            let mut block = PairBlock { x1: [0.0; LANES], y1: [0.0; LANES], x2: [0.0; LANES], y2: [0.0; LANES] };
+            for (lane, (i, j)) in std::iter::once(first).chain(pairs.by_ref().take(LANES - 1)).enumerate() {
+                let (a, b) = (&self.pairs[self.order[i] as usize], &self.pairs[self.order[j] as usize]);
+                (block.x1[lane], block.y1[lane]) = (a[0] as f32, a[1] as f32);
+                (block.x2[lane], block.y2[lane]) = (b[2] as f32, b[3] as f32);
+            }
+            blocks.push(block);
+        }
+        blocks
+    }
+}
+
+/// Indices of two different ones of `n` data, each pair once before any comes twice: about `most`, a multiple of [`LANES`].
+pub(crate) fn different(n: usize, most: usize) -> impl Iterator<Item = (usize, usize)> {
+    let count = if n < 2 { 0 } else { (n * (n - 1)).min(most).next_multiple_of(LANES) };
+    let apart =
+        (1..n).flat_map(move |shift| (0..n).map(move |i| (i, if i + shift < n { i + shift } else { i + shift - n })));
+    apart.cycle().take(count)
 }
 
 /// Whether the chosen points, in either image, are fewer than `needed` different ones, or lie on a line: their root mean
@@ -130,13 +154,7 @@ pub(crate) fn point_degeneracy<'a>(
 ) -> Option<Degeneracy> {
     for image in [0, 2] {
         let points = pairs.clone().map(|p| [p[image], p[image + 1]]);
-        let mut different: Vec<[f64; 2]> = Vec::with_capacity(needed);
-        for p in points.clone() {
-            if different.len() < needed && !different.contains(&p) {
-                different.push(p);
-            }
-        }
-        if different.len() < needed {
+        if fewer_than(needed, points.clone()) {
             return Some(Degeneracy::Coincident);
         }
         let n = points.clone().count() as f64;
@@ -157,6 +175,49 @@ pub(crate) fn point_degeneracy<'a>(
         }
     }
     None
+}
+
+/// As [`point_degeneracy`] for normalised coordinates of calibrated cameras, in which a line is a plane of rays: their root mean square angle from the
+/// plane, or from one ray, is at most `width`. Far from the middle of the image, that is not what the coordinates say.
+pub(crate) fn ray_degeneracy<'a>(
+    pairs: impl Iterator<Item = &'a [f64; 4]> + Clone,
+    needed: usize,
+    width: f64,
+) -> Option<Degeneracy> {
+    for image in [0, 2] {
+        let points = pairs.clone().map(|p| [p[image], p[image + 1]]);
+        if fewer_than(needed, points.clone()) {
+            return Some(Degeneracy::Coincident);
+        }
+        let (mut moment, mut n) = (Matrix3::zeros(), 0.0);
+        for [x, y] in points {
+            let ray = Vector3::new(x, y, 1.0).normalize();
+            moment += ray * ray.transpose();
+            n += 1.0;
+        }
+        let mut squares = (moment / n).symmetric_eigenvalues();
+        squares.as_mut_slice().sort_unstable_by(f64::total_cmp);
+        // Rounding of the products above.
+        let limit = (width * width).max(1e-14);
+        if squares[0] <= limit {
+            return Some(if squares[1] <= limit { Degeneracy::Coincident } else { Degeneracy::Collinear });
+        }
+    }
+    None
+}
+
+/// Whether there are fewer than `needed` different points.
+fn fewer_than(needed: usize, points: impl Iterator<Item = [f64; 2]>) -> bool {
+    let mut different: Vec<[f64; 2]> = Vec::with_capacity(needed);
+    for p in points {
+        if different.len() == needed {
+            break;
+        }
+        if !different.contains(&p) {
+            different.push(p);
+        }
+    }
+    different.len() < needed
 }
 
 /// A number in `0..n` (n > 0), by multiplication; the bias is below n/2³².

@@ -1,5 +1,6 @@
 //! What robust estimators return.
 
+use crate::ransac::Consensus;
 use cv_core::Correspondence;
 
 /// A model and the matches that fit it.
@@ -13,20 +14,29 @@ pub struct RobustModel<M> {
     pub rms: f64,
     /// Samples drawn.
     pub iterations: usize,
+    /// log₁₀ of the number of models as well supported that chance would make of so many wrong matches, below 0: −20 says that one in 10²⁰ such sets has
+    /// one. `None` where there are no more matches than a sample takes.
+    pub log_nfa: Option<f64>,
 }
 
 impl<M> RobustModel<M> {
     /// The same with another form of the model.
     pub(crate) fn map<N>(self, f: impl FnOnce(M) -> N) -> RobustModel<N> {
-        RobustModel { model: f(self.model), inliers: self.inliers, rms: self.rms, iterations: self.iterations }
+        RobustModel {
+            model: f(self.model),
+            inliers: self.inliers,
+            rms: self.rms,
+            iterations: self.iterations,
+            log_nfa: self.log_nfa,
+        }
     }
 
-    /// With the inliers by `residual`.
-    pub(crate) fn new(
+    /// With the inliers by `residual`, of what the search found.
+    pub(crate) fn new<N>(
         model: M,
         matches: &[Correspondence],
         threshold: f64,
-        iterations: usize,
+        found: &Consensus<N>,
         residual: impl Fn(&M, &Correspondence) -> f64,
     ) -> Self {
         let mut inliers = Vec::new();
@@ -39,6 +49,6 @@ impl<M> RobustModel<M> {
             }
         }
         let rms = (sum / inliers.len() as f64).sqrt();
-        Self { model, inliers, rms, iterations }
+        Self { model, inliers, rms, iterations: found.iterations, log_nfa: found.log_nfa }
     }
 }

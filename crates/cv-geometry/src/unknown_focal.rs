@@ -45,8 +45,8 @@ impl FocalPose {
 /// Inliers lie in front of both cameras.
 ///
 /// # Errors
-/// [`EstimateError`]: fewer than seven matches, a coordinate that is not finite, coincident or collinear points, or no consensus of more
-/// than six matches.
+/// [`EstimateError`]: fewer than seven matches, a coordinate that is not finite, coincident or collinear points, or no model supported by more
+/// matches than chance would give.
 pub fn estimate_focal_pose(
     matches: &[Correspondence],
     options: &RobustOptions,
@@ -70,7 +70,7 @@ pub fn estimate_focal_pose(
         let front = in_front(m.pose.rotation.matrix(), &m.pose.translation, &ray(&pair.a), &ray(&pair.b));
         if front { sampson(&f, pair) } else { f64::INFINITY }
     };
-    Ok(RobustModel::new(model, matches, options.threshold, found.iterations, residual))
+    Ok(RobustModel::new(model, matches, options.threshold, &found, residual))
 }
 
 /// Refines a pose and a focal length on all `matches` (pixels relative to the principal points) that are within reach, to the least robust
@@ -155,6 +155,10 @@ impl Estimator for FocalEstimator {
 
     fn order(&self) -> &[u32] {
         &self.set.order
+    }
+
+    fn wrong(&self, most: usize) -> Vec<PairBlock> {
+        self.set.wrong(most)
     }
 
     fn solve(&self, sample: &[u32], models: &mut Vec<FocalPose>) {

@@ -90,6 +90,7 @@ pub fn estimate_calibrated(
         inliers: found.inliers,
         rms: found.rms / unit,
         iterations: found.iterations,
+        log_nfa: found.log_nfa,
     };
     Ok(CalibratedResult { robust, pose: found.model, stages: watch.into_stages() })
 }

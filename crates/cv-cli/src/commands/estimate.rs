@@ -151,7 +151,8 @@ impl Run for Args {
             .with("inliers", &robust.inliers)
             .with("matches", total)
             .with("iterations", robust.iterations)
-            .with("rms_px", robust.rms);
+            .with("rms_px", robust.rms)
+            .with("log10_false_alarms", robust.log_nfa);
         if let Some(pose) = pose {
             let t = pose.translation;
             outcome = outcome.with("rotation", rows(pose.rotation.matrix())).with("translation", [t.x, t.y, t.z]);

@@ -9,7 +9,7 @@ pub use dlt::pose_from_points;
 pub use p3p::pose_three_points;
 
 use crate::error::{Degeneracy, EstimateError};
-use crate::pairs::LANES;
+use crate::pairs::{LANES, different};
 use crate::ransac::{Estimator, Marginal, RobustOptions, Scorer, ransac};
 use crate::robust::RobustModel;
 use crate::rotation::orthonormalized;
@@ -52,7 +52,7 @@ pub fn estimate_pose(matches: &[WorldMatch], options: &RobustOptions) -> Result<
         }
     }
     let rms = (sum / inliers.len() as f64).sqrt();
-    Ok(RobustModel { model: pose, inliers, rms, iterations: found.iterations })
+    Ok(RobustModel { model: pose, inliers, rms, iterations: found.iterations, log_nfa: found.log_nfa })
 }
 
 /// Refines a pose on all `matches` within reach of it, to the least robust reprojection error.
@@ -164,6 +164,18 @@ struct WorldBlock {
     image: [[f32; LANES]; 2],
 }
 
+impl WorldBlock {
+    fn new(chunk: &[WorldMatch]) -> Self {
+        let lanes = |of: &dyn Fn(&WorldMatch) -> f64| -> [f32; LANES] {
+            std::array::from_fn(|i| chunk.get(i).map_or(f32::NAN, |m| of(m) as f32))
+        };
+        Self {
+            world: [0, 1, 2].map(|k: usize| lanes(&|m| m.world[k])),
+            image: [0, 1].map(|k: usize| lanes(&|m| m.image[k])),
+        }
+    }
+}
+
 struct AbsoluteEstimator {
     /// With the world's origin amid the points, for the sake of f32.
     matches: Vec<WorldMatch>,
@@ -182,16 +194,7 @@ impl AbsoluteEstimator {
         let centre = Vector3::new(median(0), median(1), median(2));
         let moved = |m: &WorldMatch| WorldMatch { world: m.world - centre, image: m.image };
         let matches: Vec<WorldMatch> = matches.iter().map(moved).collect();
-        let lanes = |chunk: &[WorldMatch], of: &dyn Fn(&WorldMatch) -> f64| -> [f32; LANES] {
-            std::array::from_fn(|i| chunk.get(i).map_or(f32::NAN, |m| of(m) as f32))
-        };
-        let blocks = matches
-            .chunks(LANES)
-            .map(|c| WorldBlock {
-                world: [0, 1, 2].map(|k: usize| lanes(c, &|m| m.world[k])),
-                image: [0, 1].map(|k: usize| lanes(c, &|m| m.image[k])),
-            })
-            .collect();
+        let blocks = matches.chunks(LANES).map(WorldBlock::new).collect();
         Self { matches, centre, blocks }
     }
 
@@ -220,6 +223,12 @@ impl Estimator for AbsoluteEstimator {
 
     fn blocks(&self) -> &[WorldBlock] {
         &self.blocks
+    }
+
+    fn wrong(&self, most: usize) -> Vec<WorldBlock> {
+        let mixed = |(i, j): (usize, usize)| WorldMatch { world: self.matches[i].world, image: self.matches[j].image };
+        let mixed: Vec<WorldMatch> = different(self.matches.len(), most).map(mixed).collect();
+        mixed.chunks(LANES).map(WorldBlock::new).collect()
     }
 
     fn solve(&self, sample: &[u32], models: &mut Vec<Pose>) {

@@ -14,7 +14,7 @@ pub use stability::{pose_difference, pose_stability, poses_are_rivals};
 
 use crate::epipolar::{Epipolar, SampsonKernel, SampsonProblem, refine_sampson, sampson};
 use crate::error::{Degeneracy, EstimateError};
-use crate::pairs::{LANES, Normalizer, PairBlock, PairSet, check, point_degeneracy};
+use crate::pairs::{LANES, Normalizer, PairBlock, PairSet, check, ray_degeneracy};
 use crate::ransac::{Estimator, Marginal, RobustOptions, Scorer, ransac};
 use crate::robust::RobustModel;
 use crate::rotation::orthonormalized;
@@ -34,8 +34,8 @@ use nalgebra::{SMatrix, SVector};
 /// direction open: see [`rotation_between`].
 ///
 /// # Errors
-/// [`EstimateError`]: fewer than six matches, a coordinate that is not finite, coincident or collinear points, or no consensus of more
-/// than five matches.
+/// [`EstimateError`]: fewer than six matches, a coordinate that is not finite, coincident or collinear points, or no model supported by more
+/// matches than chance would give.
 pub fn estimate_relative_pose(
     matches: &[Correspondence],
     options: &RobustOptions,
@@ -43,18 +43,26 @@ pub fn estimate_relative_pose(
     options.check()?;
     check(matches, 6)?;
     let set = PairSet::with(matches, Normalizer::IDENTITY, Normalizer::IDENTITY);
+    let degenerate = |kind| EstimateError::Degenerate { kind };
+    // Rays that are in a plane up to their own noise say nothing about what is beside it.
+    let width = options.threshold / 3.0;
     // Before the search, which would draw every sample it may and find none of use.
-    if let Some(kind) = point_degeneracy(set.pairs.iter(), 6, 0.0) {
-        return Err(EstimateError::Degenerate { kind });
+    if let Some(kind) = ray_degeneracy(set.pairs.iter(), 6, width) {
+        return Err(degenerate(kind));
     }
-    let found = ransac(&PoseEstimator { set, reach: options.threshold }, options)?;
+    let estimator = PoseEstimator { set, reach: options.threshold };
+    let found = ransac(&estimator, options)?;
     let pose = found.model;
     let e = essential_from_pose(&pose);
     let residual = |_: &Pose, m: &Correspondence| {
         let front = in_front(pose.rotation.matrix(), &pose.translation, &m.a.to_homogeneous(), &m.b.to_homogeneous());
         if front { sampson(&e, m) } else { f64::INFINITY }
     };
-    Ok(RobustModel::new(pose, matches, options.threshold, found.iterations, residual))
+    let result = RobustModel::new(pose, matches, options.threshold, &found, residual);
+    match ray_degeneracy(result.inliers.iter().map(|&i| &estimator.set.pairs[i]), 6, width) {
+        Some(kind) => Err(degenerate(kind)),
+        None => Ok(result),
+    }
 }
 
 /// The essential matrix `[t]× R` (singular values 1, 1, 0) of [`estimate_relative_pose`].
@@ -229,6 +237,10 @@ impl Estimator for PoseEstimator {
 
     fn order(&self) -> &[u32] {
         &self.set.order
+    }
+
+    fn wrong(&self, most: usize) -> Vec<PairBlock> {
+        self.set.wrong(most)
     }
 
     fn solve(&self, sample: &[u32], models: &mut Vec<Pose>) {

@@ -24,8 +24,8 @@ use rank_two::RankTwo;
 /// plane (DEGENSAC, Chum, Werner & Matas 2005). `bᵀ F a = 0`; Frobenius norm 1, the largest entry positive.
 ///
 /// # Errors
-/// [`EstimateError`]: fewer than eight matches, a coordinate that is not finite, coincident or collinear points, points on one plane, or no
-/// consensus of more than seven matches.
+/// [`EstimateError`]: fewer than eight matches, a coordinate that is not finite, coincident or collinear points, points on one plane, or no model supported by more
+/// matches than chance would give.
 pub fn estimate_fundamental(
     matches: &[Correspondence],
     options: &RobustOptions,
@@ -34,7 +34,8 @@ pub fn estimate_fundamental(
     let set = PairSet::new(matches, 8)?;
     let degenerate = |kind| EstimateError::Degenerate { kind };
     // All before the search, which would draw every sample it may and find none of use.
-    if let Some(kind) = point_degeneracy(set.pairs.iter(), 8, 0.0) {
+    let width = options.threshold / 3.0 * set.first.scale;
+    if let Some(kind) = point_degeneracy(set.pairs.iter(), 8, width) {
         return Err(degenerate(kind));
     }
     let all: Vec<usize> = (0..matches.len()).collect();
@@ -45,8 +46,7 @@ pub fn estimate_fundamental(
     let found = ransac(&estimator, options)?;
     let set = &estimator.set;
     let f = eight_point::unit(&(set.second.matrix().transpose() * found.model * set.first.matrix()));
-    let result = RobustModel::new(f, matches, options.threshold, found.iterations, sampson);
-    let width = options.threshold / 3.0 * set.first.scale;
+    let result = RobustModel::new(f, matches, options.threshold, &found, sampson);
     match point_degeneracy(result.inliers.iter().map(|&i| &set.pairs[i]), 8, width) {
         Some(kind) => Err(degenerate(kind)),
         None if on_one_plane(matches, &result.inliers, options.threshold) => Err(degenerate(Degeneracy::Planar)),
@@ -94,6 +94,10 @@ impl Estimator for FundamentalEstimator {
 
     fn order(&self) -> &[u32] {
         &self.set.order
+    }
+
+    fn wrong(&self, most: usize) -> Vec<PairBlock> {
+        self.set.wrong(most)
     }
 
     fn solve(&self, sample: &[u32], models: &mut Vec<Matrix3<f64>>) {

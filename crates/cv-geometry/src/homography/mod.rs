@@ -48,8 +48,8 @@ pub fn homography_residual(h: &Matrix3<f64>, m: &Correspondence) -> f64 {
 /// ```
 ///
 /// # Errors
-/// [`EstimateError`]: fewer than four matches, a coordinate that is not finite, coincident or collinear points, or no
-/// consensus of more than four matches (where there are more than four).
+/// [`EstimateError`]: fewer than four matches, a coordinate that is not finite, coincident or collinear points, or no model supported by more
+/// matches than chance would give (where there are more than four).
 pub fn estimate_homography(
     matches: &[Correspondence],
     options: &RobustOptions,
@@ -57,17 +57,17 @@ pub fn estimate_homography(
     options.check()?;
     let set = PairSet::new(matches, 4)?;
     let degenerate = |kind| EstimateError::Degenerate { kind };
+    // Points that are on a line up to their own noise say nothing about the plane beside it.
+    let width = options.threshold / 3.0 * set.first.scale;
     // Before the search, which would draw every sample it may and find none of use.
-    if let Some(kind) = point_degeneracy(set.pairs.iter(), 4, 0.0) {
+    if let Some(kind) = point_degeneracy(set.pairs.iter(), 4, width) {
         return Err(degenerate(kind));
     }
     let estimator = HomographyEstimator { set };
     let found = ransac(&estimator, options)?;
     let set = &estimator.set;
     let h = dlt::scaled(&(set.second.inverse_matrix() * found.model * set.first.matrix()));
-    let result = RobustModel::new(h, matches, options.threshold, found.iterations, homography_residual);
-    // Points that are on a line up to their own noise say nothing about the plane beside it.
-    let width = options.threshold / 3.0 * set.first.scale;
+    let result = RobustModel::new(h, matches, options.threshold, &found, homography_residual);
     match point_degeneracy(result.inliers.iter().map(|&i| &set.pairs[i]), 4, width) {
         Some(kind) => Err(degenerate(kind)),
         None => Ok(result),
@@ -160,6 +160,10 @@ impl Estimator for HomographyEstimator {
 
     fn order(&self) -> &[u32] {
         &self.set.order
+    }
+
+    fn wrong(&self, most: usize) -> Vec<PairBlock> {
+        self.set.wrong(most)
     }
 
     fn solve(&self, sample: &[u32], models: &mut Vec<Matrix3<f64>>) {

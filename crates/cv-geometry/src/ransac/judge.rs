@@ -39,6 +39,23 @@ fn score_blocks<E: Estimator, C: Scorer>(
     Score { loss: sum(&losses) - padding as f32, inliers: inliers.iter().sum() }
 }
 
+/// Data with a residual within one over the root of `scale`, half of that, and so on.
+#[inline(always)]
+fn count_blocks<E: Estimator, const N: usize>(kernel: &E::Kernel, blocks: &[E::Block], scale: f32) -> [u32; N] {
+    let mut counts = [[0u32; LANES]; N];
+    for block in blocks {
+        let r2 = E::squared_residuals(kernel, block);
+        let mut limit = 1.0;
+        for count in &mut counts {
+            for i in 0..LANES {
+                count[i] += u32::from(r2[i] * scale < limit);
+            }
+            limit *= 0.25;
+        }
+    }
+    counts.map(|count| count.iter().sum())
+}
+
 #[inline(always)]
 fn sum(lanes: &[f32; LANES]) -> f32 {
     let mut half = [0f32; LANES / 2];
@@ -81,6 +98,13 @@ impl<'a, E: Estimator, C: Scorer> Judge<'a, E, C> {
         let kernel = self.estimator.kernel(model);
         let (blocks, padding, scale) = (self.estimator.blocks(), self.padding, self.inverse_threshold2);
         dispatch!(self.level, _simd => score_blocks::<E, C>(&kernel, blocks, padding, self.scorer, scale, limit))
+    }
+
+    /// Data of `blocks` within `reach` thresholds, half of that, and so on.
+    pub(super) fn counts<const N: usize>(&self, model: &E::Model, blocks: &[E::Block], reach: f64) -> [u32; N] {
+        let kernel = self.estimator.kernel(model);
+        let scale = self.inverse_threshold2 / (reach * reach) as f32;
+        dispatch!(self.level, _simd => count_blocks::<E, N>(&kernel, blocks, scale))
     }
 
     /// Local optimisation: the model after refinement, where that lowered its loss.

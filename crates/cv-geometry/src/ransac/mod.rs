@@ -1,5 +1,6 @@
 //! The one RANSAC driver.
 
+mod chance;
 mod judge;
 mod options;
 mod sampler;
@@ -13,6 +14,7 @@ pub use scorer::{Marginal, Msac, Scorer};
 
 use crate::EstimateError;
 use crate::pairs::LANES;
+use chance::chance;
 use judge::Judge;
 use search::search;
 
@@ -46,6 +48,13 @@ pub trait Estimator: Sync {
     /// The datum of each lane of the blocks; those of [`Estimator::RESAMPLES`] that are 0 are not asked.
     fn order(&self) -> &[u32] {
         &[]
+    }
+
+    /// Up to some `most` data that are wrong for certain: parts of different data put together. Chance is judged by how many of them fit a model. By
+    /// default none, and chance is not asked.
+    fn wrong(&self, most: usize) -> Vec<Self::Block> {
+        let _ = most;
+        Vec::new()
     }
 
     /// Appends the models through a minimal sample; none where the sample is degenerate or impossible.
@@ -98,6 +107,9 @@ pub struct Consensus<M> {
     pub score: Score,
     /// Samples drawn.
     pub iterations: usize,
+    /// log₁₀ of the number of models as well supported that chance would make of so many data, all wrong; below 0. `None` where the estimator knows no
+    /// data that are wrong for certain ([`Estimator::wrong`]), or a sample is all there is.
+    pub log_nfa: Option<f64>,
 }
 
 /// Draws samples until one without outliers was drawn with the stated confidence, keeps the model of least loss and refines it.
@@ -108,7 +120,7 @@ pub struct Consensus<M> {
 ///
 /// # Errors
 /// [`EstimateError::BadOption`], [`EstimateError::NotEnoughMatches`] with fewer data than a sample has, and
-/// [`EstimateError::NoConsensus`] where no model fits more data than its own sample.
+/// [`EstimateError::NoConsensus`] where no model fits more data than chance would make fit.
 pub fn ransac<E: Estimator>(estimator: &E, options: &RobustOptions) -> Result<Consensus<E::Model>, EstimateError> {
     options.check()?;
     match options.scoring {
@@ -135,10 +147,15 @@ fn with_scorer<E: Estimator, C: Scorer>(
     };
     // The sample itself always fits.
     let needed = if n > E::SAMPLE { E::SAMPLE + 1 } else { E::SAMPLE };
-    let none = |inliers, iterations| EstimateError::NoConsensus { inliers, matches: n, needed, iterations };
-    match found {
-        None => Err(none(0, options.max_iterations)),
-        Some(c) if (c.score.inliers as usize) < needed => Err(none(c.score.inliers as usize, c.iterations)),
-        Some(c) => Ok(c),
+    let none = |inliers, needed, iterations| EstimateError::NoConsensus { inliers, matches: n, needed, iterations };
+    let Some(mut found) = found else { return Err(none(0, needed, options.max_iterations)) };
+    let inliers = found.score.inliers as usize;
+    let chance = chance(&judge, &found.model);
+    match &chance {
+        Some(c) if c.log_nfa >= 0.0 => return Err(none(inliers, c.needed, found.iterations)),
+        None if inliers < needed => return Err(none(inliers, needed, found.iterations)),
+        _ => {}
     }
+    found.log_nfa = chance.map(|c| c.log_nfa);
+    Ok(found)
 }

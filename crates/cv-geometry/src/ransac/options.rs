@@ -70,7 +70,7 @@ impl RobustOptions {
     }
 
     /// Defaults for essential matrices and poses: threshold 1, to be multiplied by one over the focal length where matches are in normalised
-    /// coordinates; 20 000 samples at most (enough for four fifths of wrong matches; random matches take some 50 ms), judged by [`Scoring::Msac`]: of the two losses that
+    /// coordinates; 20 000 samples at most (enough for four fifths of wrong matches), judged by [`Scoring::Msac`]: of the two losses that
     /// with the smaller errors on generated poses with up to 95 % of wrong matches.
     pub fn essential() -> Self {
         Self { threshold: 1.0, max_iterations: 20_000, scoring: Scoring::Msac, ..Self::default() }
@@ -97,6 +97,6 @@ impl RobustOptions {
         let count = (1.0 - self.confidence).ln() / (-good).ln_1p();
         // NaN and infinity (no good sample at all) end at the maximum.
         let count = if count < self.max_iterations as f64 { count.ceil() as usize } else { self.max_iterations };
-        count.max(self.min_iterations).min(self.max_iterations)
+        count.max(self.min_iterations).clamp(1, self.max_iterations)
     }
 }

@@ -52,7 +52,9 @@ pub(super) fn search<E: Estimator, C: Scorer, S: Sampler>(
     let mut models = Vec::new();
     let mut rng = ChaCha8Rng::seed_from_u64(!options.seed);
     let mut iterations = 0;
-    let mut needed = options.max_iterations;
+    // Of few data there are few samples: of the smallest support that counts, one is soon drawn.
+    let most = options.needed(n.min(E::SAMPLE + 1), n, E::SAMPLE);
+    let mut needed = most;
     while iterations < needed {
         let count = (iterations / 8).clamp(CHUNK, MOST).min(needed - iterations);
         samples.resize(count, [0u32; 8]);
@@ -83,16 +85,22 @@ pub(super) fn search<E: Estimator, C: Scorer, S: Sampler>(
             let mut found = optimized(judge, winner, &mut models);
             judge.explore(&mut found, &mut rng, &mut models);
             if best.as_ref().is_none_or(|b| found.score.loss < b.score.loss) {
-                needed = options.needed(found.score.inliers as usize, n, E::SAMPLE);
+                needed = options.needed(found.score.inliers as usize, n, E::SAMPLE).min(most);
                 best = Some(found);
             }
         }
     }
     let mut best = best?;
-    if iterations == options.max_iterations {
-        for winner in waiting {
+    if iterations == most {
+        let searched = |(k, winner): (usize, Winner<E::Model>)| {
+            let (mut rng, mut models) = (rng.clone(), Vec::new());
+            rng.set_stream(k as u64 + 1);
             let mut found = optimized(judge, winner, &mut models);
             judge.explore(&mut found, &mut rng, &mut models);
+            found
+        };
+        let others: Vec<Found<E::Model>> = waiting.into_par_iter().enumerate().map(searched).collect();
+        for found in others {
             if found.score.loss < best.score.loss {
                 best = found;
             }
@@ -100,7 +108,7 @@ pub(super) fn search<E: Estimator, C: Scorer, S: Sampler>(
     }
     let model = settle(judge, best, &mut rng, &mut models);
     let score = judge.score(&model, f32::INFINITY);
-    Some(Consensus { model, score, iterations })
+    Some(Consensus { model, score, iterations, log_nfa: None })
 }
 
 /// The minimal model or the best of its alternatives, both locally optimised.
