@@ -36,6 +36,7 @@ mod median;
 mod options;
 #[cfg(test)]
 mod plain;
+mod plane;
 mod rectify;
 mod rectify_scene;
 mod select;

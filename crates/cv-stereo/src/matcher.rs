@@ -6,6 +6,7 @@ use crate::cost::{Frame, Penalties};
 use crate::fill::{Holes, fill_holes};
 use crate::input::to_grey;
 use crate::layout::Layout;
+use crate::plane::{self, fill_planes};
 use crate::sgm::Aggregator;
 use crate::smooth::{self, Planes, smooth};
 use crate::speckle::{Speckles, remove_speckles};
@@ -101,6 +102,7 @@ pub struct StereoMatcher {
     /// For aggregation in strips.
     strip: Aggregator,
     speckles: Speckles,
+    large_holes: plane::Planes,
     holes: Holes,
     scratch: Vec<f32>,
     planes: Planes,
@@ -123,6 +125,7 @@ impl StereoMatcher {
             aggregator: Aggregator::default(),
             strip: Aggregator::default(),
             speckles: Speckles::default(),
+            large_holes: plane::Planes::default(),
             holes: Holes::default(),
             scratch: Vec::new(),
             planes: Planes::default(),
@@ -380,6 +383,7 @@ impl StereoMatcher {
         });
         if options.fill {
             fill_holes(self.level, disparity, map.state.as_slice(), width, &mut self.holes);
+            fill_planes(disparity, map.state.as_slice(), &self.grey8, width, &mut self.large_holes);
         }
         if options.median > 0 {
             median::median(self.level, disparity, width, options.median, &mut self.scratch);
@@ -392,6 +396,10 @@ impl StereoMatcher {
 
 /// What the checks say of a pixel's winner.
 fn judge(options: &StereoOptions, x: usize, winner: &Winner, right: &[u16]) -> PixelState {
+    // Nothing tells one disparity from the next, nor what hides the pixel.
+    if winner.below == winner.cost {
+        return PixelState::Mismatched;
+    }
     let xr = x as i64 - i64::from(options.min_disparity) - i64::from(winner.index);
     let Some(&seen) = usize::try_from(xr).ok().and_then(|xr| right.get(xr)) else {
         return PixelState::OutOfView;
@@ -401,10 +409,6 @@ fn judge(options: &StereoOptions, x: usize, winner: &Winner, right: &[u16]) -> P
     {
         // What the right camera sees there is nearer: it hides this pixel.
         return if seen > winner.index { PixelState::Occluded } else { PixelState::Mismatched };
-    }
-    // Nothing tells one disparity from the next.
-    if winner.below == winner.cost {
-        return PixelState::Mismatched;
     }
     let unsure = u32::from(winner.second) * u32::from(100 - options.uniqueness) < u32::from(winner.cost) * 100;
     if options.uniqueness > 0 && unsure {

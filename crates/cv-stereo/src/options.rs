@@ -121,10 +121,12 @@ pub struct StereoOptions {
     pub p1: u8,
     /// Penalty for a larger step where the image is smooth. Default 20 (likewise).
     pub p2: u8,
-    /// What `p2` falls to across a strong edge of the image. Default 8.
+    /// What `p2` falls to across a strong edge of the image. Default 4: that and
+    /// `p2_gradient` left the fewest errors of twelve settings on generated scenes (rooms, tables, a ball and a poster wall, seeds
+    /// 300 to 305, half of them at one stop less).
     pub p2_min: u8,
     /// Grey levels (of 255) between neighbours at which `p2` has fallen half way to `p2_min`; 0 keeps `p2` everywhere.
-    /// Default 16.
+    /// Default 8.
     pub p2_gradient: u8,
     /// Directions of aggregation. Default eight.
     pub paths: Paths,
@@ -145,8 +147,8 @@ pub struct StereoOptions {
     /// Edge-preserving smoothing, last of all. Default [`Smoothing::Bilateral`] of 24 grey levels: on rendered scenes and
     /// on photographs, errors above 1 px fall by a tenth.
     pub smoothing: Smoothing,
-    /// Whether rejected pixels get a disparity from their surroundings (background side where occluded). They are told
-    /// apart by [`crate::PixelState`]. Default true.
+    /// Whether rejected pixels get a disparity from their surroundings (background side where occluded, the plane of
+    /// what is around a large hole where that lies on one). They are told apart by [`crate::PixelState`]. Default true.
     pub fill: bool,
     /// Whether [`crate::StereoMatcher::confidence`] is wanted: finding the second best match takes a tenth of the time.
     /// Default false.
@@ -166,8 +168,8 @@ impl Default for StereoOptions {
             blend: Blend::None,
             p1: 4,
             p2: 20,
-            p2_min: 8,
-            p2_gradient: 16,
+            p2_min: 4,
+            p2_gradient: 8,
             paths: Paths::Eight,
             uniqueness: 0,
             left_right: Some(1),
