@@ -1,7 +1,7 @@
 //! What matching costs, from the census bits, and the penalties along the paths.
 
 use crate::StereoOptions;
-use crate::layout::{BLOCK, Layout};
+use crate::layout::{BLOCK, Layout, MAX_VECTORS};
 use crate::winner::outside_cost;
 use fearless_simd::prelude::*;
 use fearless_simd_macros::simd;
@@ -76,36 +76,65 @@ fn costs<S: Simd, const BITS: usize, const BLOCKS: usize, const SINGLE: bool>(
     let n = group / lanes;
     let groups = if SINGLE { 1 } else { frame.layout.groups() };
     let (width, planes) = (frame.width, frame.planes);
-    let phase = frame.layout.phase(width);
-    let row = &frame.right[y * planes * n * phase..][..planes * n * phase];
+    let (count, phase) = (xs.len(), frame.layout.phase(width));
     let left = &frame.left[y * width * planes..][..width * planes];
-    for (x, out) in xs.zip(out.chunks_exact_mut(groups * group)) {
-        let mut bits = [S::u8s::splat(simd, 0); BITS];
+    let row = &frame.right[y * planes * n * phase..][..planes * n * phase];
+    let out = &mut out[..count * groups * group];
+    let here = |p: usize| &left[p * width + xs.start..][..count];
+    // Pixels `n` apart find their candidates in the same phases, one element further.
+    for class in 0..n.min(count) {
+        let start = width - xs.end + class;
+        let steps = (count - class).div_ceil(n);
+        let reach = steps - 1 + groups * lanes;
+        let mut candidates = [[&row[..0]; BITS]; MAX_VECTORS];
+        let mut described = [&row[..0]; BITS];
         for p in 0..BITS {
-            bits[p] = S::u8s::splat(simd, left[p * width + x]);
+            for v in 0..n {
+                candidates[v][p] = &row[((start + v) % n * planes + p) * phase + (start + v) / n..][..reach];
+            }
+            described[p] = here(p);
         }
-        let start = width - 1 - x;
-        for v in 0..n {
-            let (of, index) = ((start + v) % n, (start + v) / n);
-            let part = &row[of * planes * phase..][..planes * phase];
+        for step in 0..steps {
+            let pixel = count - 1 - class - step * n;
+            let out = &mut out[pixel * groups * group..][..groups * group];
+            let mut bits = [S::u8s::splat(simd, 0); BITS];
+            for p in 0..BITS {
+                bits[p] = S::u8s::splat(simd, described[p][pixel]);
+            }
             for g in 0..groups {
                 // Candidates of the same vector in later groups follow at once.
-                let at = index + g * lanes;
-                let mut count = (S::u8s::from_slice(simd, &part[at..][..lanes]) ^ bits[0]).count_ones();
-                for p in 1..BITS {
-                    count += (S::u8s::from_slice(simd, &part[p * phase + at..][..lanes]) ^ bits[p]).count_ones();
+                let at = step + g * lanes;
+                for v in 0..n {
+                    let mut differing = S::u8s::splat(simd, 0);
+                    for p in 0..BITS {
+                        let candidate = S::u8s::from_slice(simd, &candidates[v][p][at..][..lanes]);
+                        differing += (candidate ^ bits[p]).count_ones();
+                    }
+                    differing.store_slice(&mut out[(g * n + v) * lanes..][..lanes]);
                 }
-                if let Some(cap) = frame.blend_cap {
-                    let value = S::u8s::splat(simd, left[BITS * width + x]);
-                    let other = S::u8s::from_slice(simd, &part[BITS * phase + at..][..lanes]);
-                    count += (value.max(other) - value.min(other)).min(S::u8s::splat(simd, cap));
-                }
-                count.store_slice(&mut out[(g * n + v) * lanes..][..lanes]);
             }
         }
-        let inside = frame.inside(x);
-        if inside.len() < groups * group {
-            borders::<S, BLOCKS>(simd, frame, inside, out);
+    }
+    if let Some(cap) = frame.blend_cap {
+        let cap = S::u8s::splat(simd, cap);
+        let plane = here(BITS);
+        for (pixel, out) in out.chunks_exact_mut(groups * group).enumerate() {
+            let value = S::u8s::splat(simd, plane[pixel]);
+            for (at, out) in out.chunks_exact_mut(lanes).enumerate() {
+                let (g, v) = (at / n, at % n);
+                let start = width - 1 - (xs.start + pixel) + v;
+                let other = &row[(start % n * planes + BITS) * phase + start / n + g * lanes..][..lanes];
+                let other = S::u8s::from_slice(simd, other);
+                let more = (value.max(other) - value.min(other)).min(cap);
+                (S::u8s::from_slice(simd, out) + more).store_slice(out);
+            }
+        }
+    }
+    // Only near the ends of a row do pixels look beyond the right image.
+    let all = |x: usize| frame.inside(x).len() == groups * group;
+    if !(xs.is_empty() || all(xs.start) && all(xs.end - 1)) {
+        for (x, out) in xs.zip(out.chunks_exact_mut(groups * group)) {
+            borders::<S, BLOCKS>(simd, frame, frame.inside(x), out);
         }
     }
 }
@@ -147,7 +176,7 @@ fn borders<S: Simd, const BLOCKS: usize>(simd: S, frame: &Frame<'_>, inside: Ran
     }
 }
 
-/// P2 by the absolute difference of neighbouring grey values.
+/// P2 − P1 by the absolute difference of neighbouring grey values.
 #[derive(Debug, Clone)]
 pub(crate) struct Penalties {
     table: [u8; 256],
@@ -157,13 +186,13 @@ pub(crate) struct Penalties {
 
 impl Penalties {
     pub(crate) fn new(options: &StereoOptions) -> Self {
-        let table = crate::winner::p2_table(options);
+        let table = crate::winner::p2_table(options).map(|p2| p2 - options.p1);
         let falls = |step: &u8| usize::from(table[usize::from(*step) - 1] - table[usize::from(*step)]);
         let steps = (1..=255u8).flat_map(|step| std::iter::repeat_n(step, falls(&step))).collect();
         Self { table, steps }
     }
 
-    /// P2 between the pixels of two rows.
+    /// P2 − P1 between the pixels of two rows.
     pub(crate) fn between<S: Simd>(&self, simd: S, a: &[u8], b: &[u8], out: &mut [u8]) {
         between(simd, self, a, b, out);
     }

@@ -12,32 +12,43 @@
 use crate::aligned::Aligned;
 use crate::cost::Frame;
 use crate::layout::BLOCK;
-use crate::select::{Keys, Selection, ids, winner};
+use crate::select::{Ends, Keys, Selection, ids, select};
 use crate::winner::{NO_SUM, Winner};
 use fearless_simd::prelude::*;
 use fearless_simd_macros::simd;
 
 /// Pixels whose costs are computed at a time: 4 KiB at 128 disparities, which stay in the first cache.
-const TILE: usize = 32;
+pub(crate) const TILE: usize = 32;
 
 /// State of one sweep.
 #[derive(Debug, Default)]
 pub(crate) struct Sweep {
     /// True for the sweep from the bottom right.
     mirrored: bool,
-    /// Path costs of the row before, for the paths from behind, straight and ahead in the sense of the sweep. Pixels of
-    /// a diagonal share a slot, so that a slot is read and overwritten at the same visit.
-    rows: [Aligned<u8>; 3],
-    /// The smallest of each slot.
-    least: [Vec<u8>; 3],
-    /// Path costs of the pixel before.
-    along: Aligned<u8>,
+    /// Path costs of the row before, pixel by pixel: from ahead, straight, from behind, in the sense of the sweep, or
+    /// straight only. Beyond the last pixel zeros, for the path from ahead of the last one.
+    row: Aligned<u8>,
+    /// The smallest of each of them.
+    least: Vec<u8>,
+    ongoing: Ongoing,
     /// Costs of a tile of pixels.
     costs: Aligned<u8>,
+    /// Sums of these pixels.
     sums: Aligned<u8>,
     /// P2 of each pixel of the row for each path: from before, straight, behind and ahead.
     p2: [Vec<u8>; 4],
     selection: Selection,
+}
+
+/// The paths that go on within a row.
+#[derive(Debug, Default)]
+struct Ongoing {
+    /// Path costs of the pixel before.
+    along: Aligned<u8>,
+    along_least: u8,
+    /// Path costs of the row before at the pixel before, whose place has been taken.
+    behind: Aligned<u8>,
+    behind_least: u8,
 }
 
 /// What becomes of the sums of a sweep.
@@ -51,22 +62,21 @@ pub(crate) enum Output<'a> {
 impl Sweep {
     /// Bytes that [`Sweep::start`] will hold on to.
     pub(crate) fn bytes(width: usize, depth: usize) -> usize {
-        3 * width * (depth + 1) + (TILE + 2) * depth + 4 * width + Selection::bytes(width, depth)
+        3 * width * (depth + 1) + (2 * TILE + 3) * depth + 4 * width + Selection::bytes(width, depth)
     }
 
     /// Prepares for a frame.
     pub(crate) fn start(&mut self, frame: &Frame<'_>, mirrored: bool) {
         let depth = frame.layout.depth;
         self.mirrored = mirrored;
-        for (row, least) in self.rows.iter_mut().zip(&mut self.least) {
-            row.resize(frame.width * depth, 0);
-            row.as_mut_slice().fill(0);
-            least.clear();
-            least.resize(frame.width, 0);
-        }
-        self.along.resize(depth, 0);
+        self.row.resize((3 * frame.width + 1) * depth, 0);
+        self.row.as_mut_slice().fill(0);
+        self.least.clear();
+        self.least.resize(3 * frame.width + 1, 0);
+        self.ongoing.along.resize(depth, 0);
+        self.ongoing.behind.resize(depth, 0);
         self.costs.resize(TILE * depth, 0);
-        self.sums.resize(depth, 0);
+        self.sums.resize(TILE * depth, 0);
         for p2 in &mut self.p2 {
             p2.resize(frame.width, 0);
         }
@@ -110,96 +120,49 @@ fn rows<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool>(
     output: &mut Output<'_>,
 ) {
     let (width, height) = (frame.width, frame.height);
-    let group = BLOCKS * BLOCK;
-    let n = group / S::u8s::LEN;
-    let depth = if SINGLE { group } else { frame.layout.depth };
-    let Sweep { mirrored, rows, least, along, costs, sums, p2, selection } = sweep;
+    let depth = if SINGLE { BLOCKS * BLOCK } else { frame.layout.depth };
+    let Sweep { mirrored, row, least, ongoing, costs, sums, p2, selection } = sweep;
     let mirrored = *mirrored;
-    let [behind, straight, ahead] = rows.each_mut().map(|row| &mut row.as_mut_slice()[..width * depth]);
-    let [behind_least, straight_least, ahead_least] = least.each_mut().map(|least| &mut least[..width]);
-    let along = &mut along.as_mut_slice()[..depth];
+    let row = row.as_mut_slice();
     let costs = &mut costs.as_mut_slice()[..TILE * depth];
-    let sums = &mut sums.as_mut_slice()[..depth];
-    let ids = ids(simd, n);
-    let p1 = S::u8s::splat(simd, frame.p1);
+    let sums = &mut sums.as_mut_slice()[..TILE * depth];
     for step in 0..steps {
         let t = first + step;
         let y = if mirrored { height - 1 - t } else { t };
         // Row of `output`.
         let line = if mirrored { steps - 1 - step } else { step };
         penalties::<S, PATHS>(simd, frame, y, mirrored, p2);
-        let [p2_along, p2_straight, p2_behind, p2_ahead] = p2.each_ref().map(|p2| &p2[..width]);
-        // Slots: pixel i of row t on the diagonal i − t or i + t. Paths that start at the border start from nothing.
-        let turn = t % width;
-        along.fill(0);
-        let mut along_least = 0;
-        if PATHS == 4 {
-            let (from_behind, from_ahead) = ((width - turn) % width, (width - 1 + turn) % width);
-            behind[from_behind * depth..][..depth].fill(0);
-            behind_least[from_behind] = 0;
-            ahead[from_ahead * depth..][..depth].fill(0);
-            ahead_least[from_ahead] = 0;
-        }
-        let (decided, running) = selection.start();
-        let held = width + group;
-        for tile in (0..width).step_by(TILE) {
-            let end = (tile + TILE).min(width);
-            let columns = if mirrored { width - end..width - tile } else { tile..end };
-            let start = columns.start;
-            frame.costs::<S, BLOCKS, SINGLE>(simd, y, columns, costs);
-            for i in tile..end {
-                let x = if mirrored { width - 1 - i } else { i };
-                let from_behind = if i >= turn { i - turn } else { i + width - turn };
-                let from_ahead = if i + turn < width { i + turn } else { i + turn - width };
-                let cost = &costs[(x - start) * depth..][..depth];
-                // With two paths the last two are not looked at.
-                let mut paths = [
-                    Path { slot: &mut *along, least: &mut along_least, p2: p2_along[x] },
-                    Path {
-                        slot: &mut straight[i * depth..][..depth],
-                        least: &mut straight_least[i],
-                        p2: p2_straight[x],
-                    },
-                    Path {
-                        slot: &mut behind[from_behind * depth..][..depth],
-                        least: &mut behind_least[from_behind],
-                        p2: p2_behind[x],
-                    },
-                    Path {
-                        slot: &mut ahead[from_ahead * depth..][..depth],
-                        least: &mut ahead_least[from_ahead],
-                        p2: p2_ahead[x],
-                    },
-                ];
-                let pixel = line * width + x;
-                match output {
-                    Output::Store(out) => {
-                        let out = &mut out[pixel * depth..][..depth];
-                        extend::<S, PATHS>(simd, p1, cost, &mut paths, group, |at, sum: S::u8s| {
-                            sum.store_slice(&mut out[at..][..S::u8s::LEN]);
-                        });
+        // Paths that start at the border start from nothing.
+        ongoing.along.as_mut_slice().fill(0);
+        ongoing.behind.as_mut_slice().fill(0);
+        (ongoing.along_least, ongoing.behind_least) = (0, 0);
+        selection.start();
+        for begin in (0..width).step_by(TILE) {
+            let end = (begin + TILE).min(width);
+            let columns = if mirrored { width - end..width - begin } else { begin..end };
+            frame.costs::<S, BLOCKS, SINGLE>(simd, y, columns.clone(), costs);
+            let pixels = line * width + columns.start..line * width + columns.end;
+            let span = pixels.start * depth..pixels.end * depth;
+            let p2 = p2.each_ref().map(|p2| &p2[columns.clone()]);
+            let tile = Tile { costs: &costs[..span.len()], p1: frame.p1, p2, mirrored };
+            let row = &mut row[begin * (PATHS - 1) * depth..];
+            let least = &mut least[begin * (PATHS - 1)..];
+            match output {
+                Output::Store(out) => {
+                    let ends = Ends { other: &[], running: &mut [], decided: &mut [], best: &mut [], stride: 0 };
+                    extend::<S, PATHS, BLOCKS, SINGLE, 0>(simd, &tile, ongoing, row, least, &mut out[span], ends);
+                }
+                Output::Finish { other, winners, .. } => {
+                    let own = &mut sums[..span.len()];
+                    let mut best = [(NO_SUM, 0); TILE];
+                    let other = &other[span];
+                    let ends = selection.ends(frame, mirrored, &columns, other, &mut best);
+                    if mirrored {
+                        extend::<S, PATHS, BLOCKS, SINGLE, 2>(simd, &tile, ongoing, row, least, own, ends);
+                    } else {
+                        extend::<S, PATHS, BLOCKS, SINGLE, 1>(simd, &tile, ongoing, row, least, own, ends);
                     }
-                    Output::Finish { other, winners, .. } => {
-                        let other = &other[pixel * depth..][..depth];
-                        let mut best = (NO_SUM, 0u16);
-                        let mut keys = Keys::begin(simd, &running[..group], n);
-                        extend::<S, PATHS>(simd, p1, cost, &mut paths, group, |at, own: S::u8s| {
-                            own.store_slice(&mut sums[at..][..S::u8s::LEN]);
-                            let (g, v) =
-                                if SINGLE { (0, at / S::u8s::LEN) } else { (at / group, at % group / S::u8s::LEN) };
-                            let running = &mut running[g * group..][..group];
-                            if !SINGLE && v == 0 {
-                                keys = Keys::begin(simd, running, n);
-                            }
-                            let other = S::u8s::from_slice(simd, &other[at..][..S::u8s::LEN]);
-                            keys.add(simd, [own, other], &ids, running, v, n, mirrored);
-                            if v + 1 == n {
-                                let decided = &mut decided[g * held..][..held];
-                                best = keys.end(decided, running, x, (group, g), mirrored, best);
-                            }
-                        });
-                        winners[pixel] = winner(simd, frame, group, best, sums, other);
-                    }
+                    select::<S, BLOCKS, SINGLE>(simd, frame, &best, [own, other], &mut winners[pixels]);
                 }
             }
         }
@@ -244,51 +207,131 @@ fn penalties<S: Simd, const PATHS: usize>(
     between(here, before, straight);
 }
 
-/// One path at one pixel.
-struct Path<'a> {
-    slot: &'a mut [u8],
-    least: &'a mut u8,
-    p2: u8,
+/// Some pixels of a row, in the sense of the image.
+struct Tile<'a> {
+    costs: &'a [u8],
+    p1: u8,
+    /// P2 − P1 of each path.
+    p2: [&'a [u8]; 4],
+    mirrored: bool,
 }
 
-/// Extends every path by a pixel and hands on the sum of the extended ones, a vector at a time with its place.
-#[inline(always)]
-fn extend<S: Simd, const PATHS: usize>(
+/// Extends every path pixel by pixel and stores the sums of the extended ones, in the sense of the image. With `KEYS` also
+/// meets the sums of the other sweep: 1 from left to right, 2 from right to left.
+#[simd]
+fn extend<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool, const KEYS: usize>(
     simd: S,
-    p1: S::u8s,
-    cost: &[u8],
-    [along, others @ ..]: &mut [Path<'_>; 4],
-    group: usize,
-    mut emit: impl FnMut(usize, S::u8s),
+    tile: &Tile<'_>,
+    ongoing: &mut Ongoing,
+    row: &mut [u8],
+    row_least: &mut [u8],
+    sums: &mut [u8],
+    ends: Ends<'_>,
 ) {
-    let (depth, lanes) = (cost.len(), S::u8s::LEN);
-    // First of all the path from the pixel before: the next pixel waits for it.
-    let mut step = Step::new(simd, along);
-    for start in (0..depth).step_by(group) {
-        for v in 0..group / lanes {
-            step.extend(simd, p1, cost, along.slot, (start, v, group));
+    let lanes = S::u8s::LEN;
+    let group = BLOCKS * BLOCK;
+    let n = group / lanes;
+    let along = ongoing.along.as_mut_slice();
+    let behind = ongoing.behind.as_mut_slice();
+    let depth = if SINGLE { group } else { along.len() };
+    // A pixel of the row before.
+    let stride = (PATHS - 1) * depth;
+    let count = tile.p2[0].len();
+    let p2 = tile.p2.map(|p2| &p2[..count]);
+    let p1 = S::u8s::splat(simd, tile.p1);
+    let Ends { other, running, decided, best, stride: decided_stride } = ends;
+    let ids = ids(simd, n);
+    let mut along_least = S::u8s::splat(simd, ongoing.along_least);
+    let mut behind_least = ongoing.behind_least;
+    // In registers where they fit.
+    let (mut held_along, mut held_behind, mut held_keys) = ([0; 2 * BLOCK], [0; 2 * BLOCK], [0; 2 * BLOCK]);
+    if SINGLE {
+        held_along[..group].copy_from_slice(along);
+        held_behind[..group].copy_from_slice(behind);
+        if KEYS > 0 {
+            held_keys[..group].copy_from_slice(running);
         }
     }
-    *along.least = step.smallest.reduce_min();
-    let mut steps = others.each_ref().map(|path| Step::new(simd, path));
-    for start in (0..depth).step_by(group) {
-        for v in 0..group / lanes {
-            let at = start + v * lanes;
-            let mut sum = S::u8s::from_slice(simd, &along.slot[at..][..lanes]);
-            for p in 0..PATHS - 1 {
-                sum = sum.saturating_add(steps[p].extend(simd, p1, cost, others[p].slot, (start, v, group)));
+    for k in 0..count {
+        let at = if tile.mirrored { count - 1 - k } else { k };
+        let cost = &tile.costs[at * depth..][..depth];
+        let sums = &mut sums[at * depth..][..depth];
+        let (here, next) = row[k * stride..][..stride + depth].split_at_mut(stride);
+        let along = if SINGLE { &mut held_along[..group] } else { &mut *along };
+        let behind = if SINGLE { &mut held_behind[..group] } else { &mut *behind };
+        // First of all the path from the pixel before: the next pixel waits for it.
+        let mut step = Step::new(simd, along_least, p2[0][at]);
+        for start in (0..depth).step_by(group) {
+            for v in 0..n {
+                let extended = step.extend(simd, p1, cost, along, (start, v, group));
+                extended.store_slice(&mut along[start + v * lanes..][..lanes]);
             }
-            emit(at, sum);
+        }
+        along_least = S::u8s::splat(simd, step.smallest.reduce_min());
+        let least = &mut row_least[k * (PATHS - 1)..][..PATHS];
+        let splat = |value: u8| S::u8s::splat(simd, value);
+        let mut straight_step = Step::new(simd, splat(least[if PATHS == 4 { 1 } else { 0 }]), p2[1][at]);
+        let mut behind_step = Step::new(simd, splat(behind_least), p2[2][at]);
+        let mut ahead_step = Step::new(simd, splat(least[PATHS - 1]), p2[3][at]);
+        for start in (0..depth).step_by(group) {
+            let running = if SINGLE || KEYS == 0 { &mut held_keys[..group] } else { &mut running[start..][..group] };
+            let mut keys = Keys::begin(simd, running, n);
+            for v in 0..n {
+                let place = (start, v, group);
+                let to = start + v * lanes;
+                let mut sum = S::u8s::from_slice(simd, &along[to..][..lanes]);
+                if PATHS == 4 {
+                    let (ahead_here, rest) = here.split_at_mut(depth);
+                    let (straight, behind_here) = rest.split_at_mut(depth);
+                    let extended = straight_step.extend(simd, p1, cost, straight, place);
+                    extended.store_slice(&mut straight[to..][..lanes]);
+                    sum = sum.saturating_add(extended);
+                    let extended = behind_step.extend(simd, p1, cost, behind, place);
+                    behind[to..][..lanes].copy_from_slice(&behind_here[to..][..lanes]);
+                    extended.store_slice(&mut behind_here[to..][..lanes]);
+                    sum = sum.saturating_add(extended);
+                    let extended = ahead_step.extend(simd, p1, cost, next, place);
+                    extended.store_slice(&mut ahead_here[to..][..lanes]);
+                    sum = sum.saturating_add(extended);
+                } else {
+                    let extended = straight_step.extend(simd, p1, cost, here, place);
+                    extended.store_slice(&mut here[to..][..lanes]);
+                    sum = sum.saturating_add(extended);
+                }
+                sum.store_slice(&mut sums[to..][..lanes]);
+                if KEYS > 0 {
+                    let other = S::u8s::from_slice(simd, &other[at * depth + to..][..lanes]);
+                    keys.add::<KEYS>(simd, [sum, other], &ids, running, v, n);
+                }
+            }
+            if KEYS > 0 {
+                decided[start / group * decided_stride + at] = running[if KEYS == 2 { 0 } else { group - 1 }];
+                best[at] = keys.end(best[at], start);
+            }
+        }
+        if PATHS == 4 {
+            behind_least = least[2];
+            least[0] = ahead_step.smallest.reduce_min();
+            least[1] = straight_step.smallest.reduce_min();
+            least[2] = behind_step.smallest.reduce_min();
+        } else {
+            least[0] = straight_step.smallest.reduce_min();
         }
     }
-    for p in 0..PATHS - 1 {
-        *others[p].least = steps[p].smallest.reduce_min();
+    ongoing.along_least = along_least.as_slice()[0];
+    ongoing.behind_least = behind_least;
+    if SINGLE {
+        along.copy_from_slice(&held_along[..group]);
+        behind.copy_from_slice(&held_behind[..group]);
+        if KEYS > 0 {
+            running.copy_from_slice(&held_keys[..group]);
+        }
     }
 }
 
 /// A path in the midst of being extended by a pixel.
 struct Step<S: Simd> {
-    /// The least at the pixel before, and with P2.
+    /// The least at the pixel before, and with P2 − P1.
     least: S::u8s,
     jump: S::u8s,
     /// What the vector before held, the first one of the group, and the last one of the group before.
@@ -300,26 +343,19 @@ struct Step<S: Simd> {
 
 impl<S: Simd> Step<S> {
     #[inline(always)]
-    fn new(simd: S, path: &Path<'_>) -> Self {
+    fn new(simd: S, least: S::u8s, p2: u8) -> Self {
         let worst = S::u8s::splat(simd, u8::MAX);
-        Self {
-            least: S::u8s::splat(simd, *path.least),
-            jump: S::u8s::splat(simd, *path.least + path.p2),
-            before: worst,
-            first: worst,
-            last: worst,
-            smallest: worst,
-        }
+        Self { least, jump: least + S::u8s::splat(simd, p2), before: worst, first: worst, last: worst, smallest: worst }
     }
 
-    /// Extends vector `v` of the group at `start`.
+    /// Extends vector `v` of the group at `start`. The vectors before have been replaced, if any were.
     #[inline(always)]
     fn extend(
         &mut self,
         simd: S,
         p1: S::u8s,
         cost: &[u8],
-        slot: &mut [u8],
+        slot: &[u8],
         (start, v, group): (usize, usize, usize),
     ) -> S::u8s {
         let lanes = S::u8s::LEN;
@@ -341,10 +377,10 @@ impl<S: Simd> Step<S> {
                 if start + group < cost.len() { load(slot, start + group) } else { S::u8s::splat(simd, u8::MAX) };
             self.first.slide::<1>(next)
         };
-        let step = below.min(above).saturating_add(p1);
-        let cheapest = step.min(here).min(self.jump);
+        // Never above 255, unlike neighbours beyond the last disparity.
+        let step = below.min(above).min(self.jump) + p1;
+        let cheapest = step.min(here);
         let extended = (cheapest - self.least).saturating_add(load(cost, at));
-        extended.store_slice(&mut slot[at..][..lanes]);
         self.smallest = self.smallest.min(extended);
         self.before = here;
         extended

@@ -9,6 +9,9 @@ use fearless_simd::{Level, dispatch, prelude::*};
 /// Disparities come in multiples of so many: a cache line, one to four vectors.
 pub(crate) const BLOCK: usize = 64;
 
+/// Most vectors in a group, those of 16 bytes.
+pub(crate) const MAX_VECTORS: usize = 2 * BLOCK / 16;
+
 /// The order for a number of disparities and an instruction set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Layout {

@@ -6,9 +6,11 @@
 
 use crate::aligned::Aligned;
 use crate::cost::Frame;
-use crate::layout::place;
+use crate::layout::{BLOCK, MAX_VECTORS, place};
 use crate::winner::{NO_SUM, Winner, is_flat};
 use fearless_simd::prelude::*;
+use fearless_simd_macros::simd;
+use std::ops::Range;
 
 /// Bits of a key that hold the index within a group.
 const KEY_BITS: u32 = 7;
@@ -36,11 +38,28 @@ impl Selection {
         self.decided.resize(layout.groups() * (frame.width + layout.group), 0);
     }
 
-    /// Prepares for a row. The decided keys, and the running ones.
-    pub(crate) fn start(&mut self) -> (&mut [u16], &mut [u16]) {
-        let running = self.running.as_mut_slice();
-        running.fill(u16::MAX);
-        (&mut self.decided, running)
+    /// Prepares for a row.
+    pub(crate) fn start(&mut self) {
+        self.running.as_mut_slice().fill(u16::MAX);
+    }
+
+    /// What the columns `xs` need.
+    pub(crate) fn ends<'a>(
+        &'a mut self,
+        frame: &Frame<'_>,
+        mirrored: bool,
+        xs: &Range<usize>,
+        other: &'a [u8],
+        best: &'a mut [(u16, u16)],
+    ) -> Ends<'a> {
+        let start = if mirrored { xs.start + frame.layout.group - 1 } else { xs.start };
+        Ends {
+            other,
+            running: self.running.as_mut_slice(),
+            decided: &mut self.decided[start..],
+            best,
+            stride: frame.width + frame.layout.group,
+        }
     }
 
     /// Ends a row whose last pixel was `x`: index of the best match of every pixel of the right row.
@@ -85,6 +104,34 @@ impl Selection {
     }
 }
 
+/// What picks the winners of some pixels.
+pub(crate) struct Ends<'a> {
+    /// Sums of the other sweep.
+    pub(crate) other: &'a [u8],
+    pub(crate) running: &'a mut [u16],
+    pub(crate) decided: &'a mut [u16],
+    /// From group to group of the decided ones.
+    pub(crate) stride: usize,
+    /// The least sum and its index.
+    pub(crate) best: &'a mut [(u16, u16)],
+}
+
+/// The winners of some pixels.
+#[simd]
+pub(crate) fn select<S: Simd, const BLOCKS: usize, const SINGLE: bool>(
+    simd: S,
+    frame: &Frame<'_>,
+    best: &[(u16, u16)],
+    [own, other]: [&[u8]; 2],
+    winners: &mut [Winner],
+) {
+    let depth = if SINGLE { BLOCKS * BLOCK } else { frame.layout.depth };
+    let (own, other) = (own.chunks_exact(depth), other.chunks_exact(depth));
+    for ((winner, &best), (own, other)) in winners.iter_mut().zip(best).zip(own.zip(other)) {
+        *winner = surroundings(simd, frame, BLOCKS * BLOCK, best, own, other);
+    }
+}
+
 /// The keys of a group at one pixel.
 pub(crate) struct Keys<S: Simd> {
     /// What the vectors before the next two held before this pixel.
@@ -120,16 +167,14 @@ impl<S: Simd> Keys<S> {
 
     /// Adds the sums of both sweeps at vector `v` of `n`. `ids` are the indices that vectors of keys hold.
     #[inline(always)]
-    #[allow(clippy::too_many_arguments, reason = "inner loop")]
-    pub(crate) fn add(
+    pub(crate) fn add<const KEYS: usize>(
         &mut self,
         simd: S,
         [own, other]: [S::u8s; 2],
-        ids: &[S::u16s; MAX_VECTORS],
+        ids: &[S::u16s; 2 * MAX_VECTORS],
         running: &mut [u16],
         v: usize,
         n: usize,
-        mirrored: bool,
     ) {
         // Bytes in even places, and those in odd ones.
         let [own, other] = [own.bitcast::<S::u16s>(), other.bitcast::<S::u16s>()];
@@ -138,7 +183,7 @@ impl<S: Simd> Keys<S> {
         let odd = (((own >> 8) + (other >> 8)) << KEY_BITS) | ids[n + v];
         self.best = self.best.min(even).min(odd);
         let here = [vector(simd, running, v), vector(simd, running, n + v)];
-        let [before_even, before_odd] = if !mirrored {
+        let [before_even, before_odd] = if KEYS == 1 {
             [self.even, self.odd]
         } else if v + 1 < n {
             [vector(simd, running, v + 1), vector(simd, running, n + v + 1)]
@@ -150,36 +195,19 @@ impl<S: Simd> Keys<S> {
         before_odd.min(odd).store_slice(&mut running[(n + v) * S::u16s::LEN..][..S::u16s::LEN]);
     }
 
-    /// Ends the group at pixel `x`, whose key that leaves is kept in `decided`. The least sum and its index, if less than
-    /// `best`.
+    /// The least sum and its index, of this group, whose first index is `start`, or `best` of those before.
     #[inline(always)]
-    pub(crate) fn end(
-        &self,
-        decided: &mut [u16],
-        running: &[u16],
-        x: usize,
-        (group, g): (usize, usize),
-        mirrored: bool,
-        best: (u16, u16),
-    ) -> (u16, u16) {
-        if mirrored {
-            decided[x + group - 1] = running[0];
-        } else {
-            decided[x] = running[group - 1];
-        }
+    pub(crate) fn end(&self, best: (u16, u16), start: usize) -> (u16, u16) {
         let key = self.best.reduce_min();
-        if key >> KEY_BITS < best.0 { (key >> KEY_BITS, (key & INDEX) + (g * group) as u16) } else { best }
+        if key >> KEY_BITS < best.0 { (key >> KEY_BITS, (key & INDEX) + start as u16) } else { best }
     }
 }
 
-/// Most vectors of keys in a group.
-pub(crate) const MAX_VECTORS: usize = 16;
-
 /// The indices that vectors of keys hold, of `n` vectors of sums per group.
 #[inline(always)]
-pub(crate) fn ids<S: Simd>(simd: S, n: usize) -> [S::u16s; MAX_VECTORS] {
+pub(crate) fn ids<S: Simd>(simd: S, n: usize) -> [S::u16s; 2 * MAX_VECTORS] {
     let first = S::u16s::from_fn(simd, |lane| (lane * 2 * n) as u16);
-    let mut ids = [first; MAX_VECTORS];
+    let mut ids = [first; 2 * MAX_VECTORS];
     for (r, id) in ids.iter_mut().enumerate() {
         *id += S::u16s::splat(simd, r as u16);
     }
@@ -188,7 +216,7 @@ pub(crate) fn ids<S: Simd>(simd: S, n: usize) -> [S::u16s; MAX_VECTORS] {
 
 /// The winner with its surroundings, given the sums of both sweeps.
 #[inline(always)]
-pub(crate) fn winner<S: Simd>(
+fn surroundings<S: Simd>(
     simd: S,
     frame: &Frame<'_>,
     group: usize,
