@@ -33,11 +33,15 @@ pub(crate) fn fill_holes(
     first.clear();
     for row in disparity.chunks_exact(width) {
         first.push(count);
-        count += row.iter().map(|d| usize::from(d.is_nan())).sum::<usize>();
+        count += row.iter().map(|d| u32::from(d.is_nan())).sum::<u32>() as usize;
     }
     // Down with the rays from the left and from above, up with the other four, at the same time.
     let [down, up] = seen;
-    rayon::join(|| rays(disparity, width, count, false, down), || rays(disparity, width, count, true, up));
+    let view = &*disparity;
+    rayon::join(
+        || dispatch!(level, simd => rays(simd, view, width, count, false, down)),
+        || dispatch!(level, simd => rays(simd, view, width, count, true, up)),
+    );
     // The median and the second smallest take the places of the first two rays.
     let [a, b, c, d] = down;
     let ahead = a.par_chunks_mut(PART).zip(b.par_chunks_mut(PART)).zip(c.par_chunks(PART).zip(d.par_chunks(PART)));
@@ -87,7 +91,8 @@ fn ranks<S: Simd>(simd: S, [a, b]: [&mut [f32]; 2], [c, d]: [&[f32]; 2], up: [&[
 
 /// What each of `count` holes sees along four rays, of the holes in order: from beside, and from the row before straight
 /// and along both diagonals. From the bottom right with all rays turned round where `mirrored`.
-fn rays(disparity: &[f32], width: usize, count: usize, mirrored: bool, found: &mut [Vec<f32>; 4]) {
+#[simd]
+fn rays<S: Simd>(_: S, disparity: &[f32], width: usize, count: usize, mirrored: bool, found: &mut [Vec<f32>; 4]) {
     let height = disparity.len() / width;
     for ray in &mut *found {
         ray.resize(count.next_multiple_of(64), f32::INFINITY);
@@ -195,7 +200,7 @@ mod tests {
             for (mirrored, sign) in [(false, -1), (true, 1)] {
                 let mut found: [Vec<f32>; 4] = Default::default();
                 if width * height > 0 {
-                    rays(d, width, holes.len(), mirrored, &mut found);
+                    dispatch!(Level::new(), simd => rays(simd, d, width, holes.len(), mirrored, &mut found));
                 }
                 for (n, &i) in holes.iter().enumerate() {
                     let expected = [(sign, 0), (sign, sign), (0, sign), (-sign, sign)].map(|step| walk(i, step));

@@ -356,14 +356,12 @@ impl StereoMatcher {
             .zip(map.state.as_mut_slice().par_chunks_mut(width))
             .zip(winners.par_chunks(width).zip(right.par_chunks(width)))
             .for_each(|((disparity, state), (winners, right))| {
-                for (x, winner) in winners.iter().enumerate() {
-                    state[x] = judge(options, x, winner, right);
-                    disparity[x] = if state[x] == PixelState::Matched {
-                        let whole = options.min_disparity + i32::from(winner.index);
-                        whole as f32 + subpixel(options.subpixel, winner)
-                    } else {
-                        f32::NAN
-                    };
+                for (x, ((winner, state), d)) in winners.iter().zip(state).zip(disparity).enumerate() {
+                    *state = judge(options, x, winner, right);
+                    let whole = (options.min_disparity + i32::from(winner.index)) as f32;
+                    // Computed in any case: a branch would be guessed wrong where matched and lost pixels mix.
+                    let value = whole + subpixel(options.subpixel, winner);
+                    *d = if *state == PixelState::Matched { value } else { f32::NAN };
                 }
             });
     }
@@ -372,68 +370,57 @@ impl StereoMatcher {
     fn refine(&mut self, map: &mut DisparityMap) {
         let width = map.disparity.width();
         let options = &self.options;
-        let disparity = map.disparity.as_mut_slice();
-        remove_speckles(disparity, width, options.speckle_size, options.speckle_range, &mut self.speckles);
-        map.state.as_mut_slice().par_chunks_mut(width).zip(disparity.par_chunks(width)).for_each(|(states, row)| {
-            for (state, d) in states.iter_mut().zip(row) {
-                if *state == PixelState::Matched && d.is_nan() {
-                    *state = PixelState::Mismatched;
-                }
-            }
-        });
+        let (disparity, states) = (map.disparity.as_mut_slice(), map.state.as_mut_slice());
+        remove_speckles(disparity, states, width, options.speckle_size, options.speckle_range, &mut self.speckles);
         if options.fill {
-            fill_holes(self.level, disparity, map.state.as_slice(), width, &mut self.holes);
-            fill_planes(disparity, map.state.as_slice(), &self.grey8, width, &mut self.large_holes);
+            fill_holes(self.level, disparity, states, width, &mut self.holes);
+            fill_planes(disparity, states, &self.grey8, width, &mut self.large_holes);
         }
         if options.median > 0 {
             median::median(self.level, disparity, width, options.median, &mut self.scratch);
-            disparity.copy_from_slice(&self.scratch);
+            disparity
+                .par_chunks_mut(1 << 16)
+                .zip(self.scratch.par_chunks(1 << 16))
+                .for_each(|(d, s)| d.copy_from_slice(s));
         }
-        let states = map.state.as_mut_slice();
         smooth(self.level, options.smoothing, disparity, states, &self.grey8, width, &mut self.planes);
     }
 }
 
-/// What the checks say of a pixel's winner.
+/// What the checks say of a pixel's winner. Without branches on what pixels hold: they would be guessed wrong where matched and
+/// lost pixels mix.
+#[inline(always)]
 fn judge(options: &StereoOptions, x: usize, winner: &Winner, right: &[u16]) -> PixelState {
-    // Nothing tells one disparity from the next, nor what hides the pixel.
-    if winner.below == winner.cost {
-        return PixelState::Mismatched;
-    }
     let xr = x as i64 - i64::from(options.min_disparity) - i64::from(winner.index);
-    let Some(&seen) = usize::try_from(xr).ok().and_then(|xr| right.get(xr)) else {
-        return PixelState::OutOfView;
-    };
-    if let Some(tolerance) = options.left_right
-        && seen.abs_diff(winner.index) > tolerance
-    {
-        // What the right camera sees there is nearer: it hides this pixel.
-        return if seen > winner.index { PixelState::Occluded } else { PixelState::Mismatched };
-    }
+    let inside = xr >= 0 && xr < right.len() as i64;
+    let seen = right[xr.clamp(0, right.len() as i64 - 1) as usize];
+    let differs = options.left_right.is_some_and(|tolerance| seen.abs_diff(winner.index) > tolerance);
+    // Nothing tells one disparity from the next, nor what hides the pixel.
+    let flat = winner.below == winner.cost;
     let unsure = u32::from(winner.second) * u32::from(100 - options.uniqueness) < u32::from(winner.cost) * 100;
-    if options.uniqueness > 0 && unsure {
-        return PixelState::Mismatched;
-    }
-    PixelState::Matched
+    let unsure = flat | (unsure & (options.uniqueness > 0));
+    let mut state = if unsure { PixelState::Mismatched } else { PixelState::Matched };
+    // What the right camera sees there is nearer: it hides this pixel.
+    let hidden = if seen > winner.index { PixelState::Occluded } else { PixelState::Mismatched };
+    state = if differs { hidden } else { state };
+    state = if inside { state } else { PixelState::OutOfView };
+    if flat { PixelState::Mismatched } else { state }
 }
 
-/// Offset of the minimum from the winning index, −0.5 to 0.5.
+/// Offset of the minimum from the winning index, −0.5 to 0.5; without branches on sums, as above.
+#[inline(always)]
 fn subpixel(method: Subpixel, winner: &Winner) -> f32 {
-    if method == Subpixel::None || winner.below == NO_SUM || winner.above == NO_SUM {
-        return 0.0;
-    }
     let [below, above, cost] = [winner.below, winner.above, winner.cost].map(f32::from);
     let slope = below.max(above) - cost;
-    if slope <= 0.0 {
-        return 0.0;
-    }
     // Rise on the lower side as a share of that on the higher: 1 in the middle, 0 half a pixel away.
     let ratio = (below.min(above) - cost) / slope;
     let rest = match method {
         Subpixel::CorrectedVFit => 0.5 * ratio * (1.0 + ratio),
         Subpixel::None | Subpixel::VFit => ratio,
     };
-    (0.5 * (1.0 - rest)).copysign(below - above)
+    let offset = (0.5 * (1.0 - rest)).copysign(below - above);
+    let none = (method == Subpixel::None) | (winner.below == NO_SUM) | (winner.above == NO_SUM) | (slope <= 0.0);
+    if none { 0.0 } else { offset }
 }
 
 #[cfg(test)]

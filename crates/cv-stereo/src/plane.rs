@@ -124,8 +124,7 @@ fn find_runs(states: &[PixelState], width: usize, runs: &mut Vec<Run>) {
     for (y, row) in states.chunks_exact(width).enumerate() {
         let first = runs.len();
         let mut x = 0;
-        while let Some(start) = row[x..].iter().position(|&s| s == PixelState::Mismatched) {
-            let start = x + start;
+        while let Some(start) = next(row, x) {
             let end = row[start..].iter().position(|&s| s != PixelState::Mismatched).map_or(width, |n| start + n);
             runs.push(Run { y, start, end, parent: runs.len() });
             x = end;
@@ -144,6 +143,14 @@ fn find_runs(states: &[PixelState], width: usize, runs: &mut Vec<Run>) {
         }
         above = first..runs.len();
     }
+}
+
+/// The first mismatched pixel from `x` on, found block by block.
+fn next(row: &[PixelState], x: usize) -> Option<usize> {
+    let mismatched = |state: &PixelState| *state == PixelState::Mismatched;
+    let block = row[x..].chunks(32).position(|block| block.iter().fold(false, |any, state| any | mismatched(state)))?;
+    let from = x + 32 * block;
+    row[from..].iter().position(mismatched).map(|n| from + n)
 }
 
 fn find(runs: &mut [Run], mut i: usize) -> usize {
@@ -196,11 +203,13 @@ fn collect(
 /// Planes through three samples each are tried, which is robust where least squares over all would mix two surfaces.
 fn fit(samples: &[Sample]) -> Option<Plane> {
     let step = samples.len().div_ceil(MAX_SAMPLES).max(1);
-    let samples: Vec<Sample> = samples.iter().step_by(step).copied().collect();
-    let n = samples.len();
+    let n = samples.len().div_ceil(step);
     if n < MIN_SAMPLES {
         return None;
     }
+    let mut taken = [Sample { x: 0.0, y: 0.0, d: 0.0 }; MAX_SAMPLES];
+    taken.iter_mut().zip(samples.iter().step_by(step)).for_each(|(to, from)| *to = *from);
+    let samples = &taken[..n];
     let on = |p: &Vector3<f64>, s: &Sample| (p.x * s.x + p.y * s.y + p.z - s.d).abs() <= ON_PLANE;
     let count = |p: &Vector3<f64>| samples.iter().filter(|s| on(p, s)).count();
     // One sample of each third: they are in the order of the rows, so that the three lie far apart.

@@ -60,7 +60,7 @@ pub(crate) fn smooth(
     }
     let height = disparity.len() / width;
     let stride = width + LEFT + RIGHT;
-    planes.fill(disparity, states, grey, width);
+    planes.fill(level, disparity, states, grey, width);
     match smoothing {
         Smoothing::None => {}
         Smoothing::Bilateral { sigma } => {
@@ -105,7 +105,7 @@ pub(crate) fn smooth(
 }
 
 impl Planes {
-    fn fill(&mut self, disparity: &[f32], states: &[PixelState], grey: &[u8], width: usize) {
+    fn fill(&mut self, level: Level, disparity: &[f32], states: &[PixelState], grey: &[u8], width: usize) {
         let stride = width + LEFT + RIGHT;
         let len = (disparity.len() / width + 2 * REACH) * stride;
         for plane in [&mut self.disparity, &mut self.moved, &mut self.grey, &mut self.weight] {
@@ -123,22 +123,29 @@ impl Planes {
         let pixels = disparity.par_chunks(width).zip(states.par_chunks(width)).zip(grey.par_chunks(width));
         planes.zip(pixels).for_each(|(((d, g), w), ((disparity, states), grey))| {
             let inside = LEFT..LEFT + width;
-            for (out, &value) in d[inside.clone()].iter_mut().zip(disparity) {
-                *out = if value.is_nan() { 0.0 } else { value };
-            }
-            for (out, &value) in g[inside.clone()].iter_mut().zip(grey) {
-                *out = f32::from(value);
-            }
-            for ((out, &value), &state) in w[inside].iter_mut().zip(disparity).zip(states) {
-                let known = if state == PixelState::Matched { 1.0 } else { FILLED };
-                *out = if value.is_nan() { 0.0 } else { known };
-            }
+            let out = [&mut d[inside.clone()], &mut g[inside.clone()], &mut w[inside]];
+            dispatch!(level, simd => fill_row(simd, out, disparity, states, grey));
             // The last frame may have been of another width with the same number of pixels.
             for row in [d, g, w] {
                 row[..LEFT].fill(0.0);
                 row[LEFT + width..].fill(0.0);
             }
         });
+    }
+}
+
+/// Disparity, grey values and weights of a row, without its room.
+#[simd]
+fn fill_row<S: Simd>(_: S, [d, g, w]: [&mut [f32]; 3], disparity: &[f32], states: &[PixelState], grey: &[u8]) {
+    for (out, &value) in d.iter_mut().zip(disparity) {
+        *out = if value.is_nan() { 0.0 } else { value };
+    }
+    for (out, &value) in g.iter_mut().zip(grey) {
+        *out = f32::from(value);
+    }
+    for ((out, &value), &state) in w.iter_mut().zip(disparity).zip(states) {
+        let known = if state == PixelState::Matched { 1.0 } else { FILLED };
+        *out = if value.is_nan() { 0.0 } else { known };
     }
 }
 

@@ -1,5 +1,6 @@
 //! Removal of small patches that agree only with themselves.
 
+use crate::PixelState;
 use rayon::prelude::*;
 
 /// Rows per strip: strips are labelled side by side, then joined. Small enough to occupy every core.
@@ -18,23 +19,30 @@ pub(crate) struct Speckles {
 /// The runs of some rows.
 #[derive(Debug, Default)]
 struct Strip {
-    /// Run that each pixel of the first row belongs to, of the last row, and of a row in between.
-    first: Vec<u32>,
-    last: Vec<u32>,
-    next: Vec<u32>,
+    runs: Vec<Run>,
+    /// Where the runs of the last row begin, and where those of the first one end.
+    last: usize,
+    first_end: usize,
     /// Parent of each run, counted from the first of the strip.
     parents: Vec<u32>,
-    sizes: Vec<u32>,
-    /// Where each run starts in the strip.
-    starts: Vec<u32>,
 }
 
-/// Sets to NaN every 4-connected patch of at most `max_size` pixels whose neighbours differ by no more than `range`.
+/// Pixels beside each other of one surface: columns `start` to `end` of a row.
+#[derive(Debug, Clone, Copy)]
+struct Run {
+    y: u32,
+    start: u32,
+    end: u32,
+}
+
+/// Sets to NaN, and from matched to mismatched, every 4-connected patch of at most `max_size` pixels whose neighbours differ by no
+/// more than `range`.
 ///
 /// Runs of each row are joined into a forest (union–find with path halving), counted, and the small ones cleared: linear
 /// in the number of pixels.
 pub(crate) fn remove_speckles(
     disparity: &mut [f32],
+    states: &mut [PixelState],
     width: usize,
     max_size: usize,
     range: f32,
@@ -48,20 +56,20 @@ pub(crate) fn remove_speckles(
     strips.par_iter_mut().zip(disparity.par_chunks(strip)).for_each(|(runs, rows)| runs.label(rows, width, range));
     parents.clear();
     sizes.clear();
-    for (number, Strip { first, parents: own, sizes: own_sizes, .. }) in strips.iter().enumerate() {
+    for (number, here) in strips.iter().enumerate() {
         let offset = parents.len() as u32;
-        parents.extend(own.iter().map(|&parent| parent + offset));
-        sizes.extend_from_slice(own_sizes);
+        parents.extend(here.parents.iter().map(|&parent| parent + offset));
+        sizes.extend(here.runs.iter().map(|run| run.end - run.start));
         if number > 0 {
             let above = &strips[number - 1];
-            let offset_above = offset - above.parents.len() as u32;
             let from = number * strip;
-            let (up, here) = (&disparity[from - width..from], &disparity[from..from + width]);
-            for (((&d, &up), &a), &b) in here.iter().zip(up).zip(&above.last).zip(first) {
-                if (d - up).abs() <= range {
-                    join(parents, a + offset_above, b + offset);
-                }
-            }
+            let (up, row) = (&disparity[from - width..from], &disparity[from..from + width]);
+            let last = Row {
+                row: up,
+                runs: &above.runs[above.last..],
+                first: offset - (above.runs.len() - above.last) as u32,
+            };
+            join_rows(last, Row { row, runs: &here.runs[..here.first_end], first: offset }, range, parents);
         }
     }
     // Roots have the smallest index of their patch: counting from the end, every run is complete when it is added.
@@ -71,63 +79,82 @@ pub(crate) fn remove_speckles(
             sizes[up] += sizes[run];
         }
     }
-    // Parents come before children, so theirs is the size of the patch by now.
+    // Parents come before their children: each takes over the size of its patch.
     for run in 0..parents.len() {
         sizes[run] = sizes[parents[run] as usize];
     }
-    let mut offset = 0;
-    for (runs, rows) in strips.iter().zip(disparity.chunks_mut(strip)) {
-        let sizes = &sizes[offset..offset + runs.starts.len()];
-        for (run, (&start, &size)) in runs.starts.iter().zip(sizes).enumerate() {
-            if size as usize <= max_size {
-                let end = runs.starts.get(run + 1).map_or(rows.len(), |&s| s as usize);
-                rows[start as usize..end].fill(f32::NAN);
+    let runs =
+        strips.iter().enumerate().flat_map(|(number, strip)| strip.runs.iter().map(move |run| (number * STRIP, run)));
+    for ((top, run), _) in runs.zip(&*sizes).filter(|(_, size)| **size as usize <= max_size) {
+        let row = (top + run.y as usize) * width;
+        let pixels = row + run.start as usize..row + run.end as usize;
+        disparity[pixels.clone()].fill(f32::NAN);
+        for state in &mut states[pixels] {
+            if *state == PixelState::Matched {
+                *state = PixelState::Mismatched;
             }
         }
-        offset += runs.starts.len();
     }
 }
 
 impl Strip {
     fn label(&mut self, disparity: &[f32], width: usize, range: f32) {
-        let Self { first, last, next, parents, sizes, starts } = self;
+        let Self { runs, last, first_end, parents } = self;
+        runs.clear();
         parents.clear();
-        sizes.clear();
-        starts.clear();
-        last.resize(width, 0);
-        next.resize(width, 0);
-        let mut row_above: &[f32] = &[];
+        let mut above = 0..0;
         for (y, row) in disparity.chunks_exact(width).enumerate() {
-            // NaN compares false: invalid pixels are runs of their own.
-            let mut before = f32::NAN;
-            let mut from = 0;
-            for (x, (&d, run)) in row.iter().zip(next.iter_mut()).enumerate() {
-                if (d - before).abs() <= range {
-                    *run = parents.len() as u32 - 1;
-                } else {
-                    if x > 0 {
-                        sizes.push((x - from) as u32);
-                    }
-                    from = x;
-                    *run = parents.len() as u32;
-                    starts.push((y * width + x) as u32);
-                    parents.push(*run);
+            let first = runs.len();
+            let mut x = 0;
+            while x < width {
+                let start = x;
+                let mut before = row[x];
+                x += 1;
+                // NaN compares false.
+                while x < width && (row[x] - before).abs() <= range {
+                    before = row[x];
+                    x += 1;
                 }
-                before = d;
-            }
-            sizes.push((width - from) as u32);
-            let mut joined = (u32::MAX, u32::MAX);
-            for (((&d, &up), &a), &b) in row.iter().zip(row_above).zip(last.iter()).zip(next.iter()) {
-                if (a, b) != joined && (d - up).abs() <= range {
-                    join(parents, a, b);
-                    joined = (a, b);
+                if !before.is_nan() {
+                    parents.push(runs.len() as u32);
+                    runs.push(Run { y: y as u32, start: start as u32, end: x as u32 });
                 }
             }
             if y == 0 {
-                first.clone_from(next);
+                *first_end = runs.len();
+            } else {
+                let up = &disparity[(y - 1) * width..y * width];
+                let up = Row { row: up, runs: &runs[above.clone()], first: above.start as u32 };
+                join_rows(up, Row { row, runs: &runs[first..], first: first as u32 }, range, parents);
             }
-            std::mem::swap(last, next);
-            row_above = row;
+            *last = first;
+            above = first..runs.len();
+        }
+    }
+}
+
+/// A row, its runs, and the number of the first one.
+struct Row<'a> {
+    row: &'a [f32],
+    runs: &'a [Run],
+    first: u32,
+}
+
+/// Joins the runs of two rows that touch where the disparities agree.
+fn join_rows(up: Row<'_>, here: Row<'_>, range: f32, parents: &mut [u32]) {
+    let mut next = 0;
+    for (i, run) in here.runs.iter().enumerate() {
+        while let Some(above) = up.runs.get(next).filter(|above| above.start < run.end) {
+            let shared = run.start.max(above.start) as usize..run.end.min(above.end) as usize;
+            // Empty where the one above ends before this one starts.
+            let mut pixels = shared.map(|x| (up.row[x] - here.row[x]).abs());
+            if pixels.any(|difference| difference <= range) {
+                join(parents, up.first + next as u32, here.first + i as u32);
+            }
+            if above.end > run.end {
+                break;
+            }
+            next += 1;
         }
     }
 }
@@ -151,6 +178,11 @@ fn join(labels: &mut [u32], a: u32, b: u32) {
 mod tests {
     use super::*;
     use proptest::prelude::*;
+
+    /// Matched where there is a disparity.
+    fn states(disparity: &[f32]) -> Vec<PixelState> {
+        disparity.iter().map(|d| if d.is_nan() { PixelState::OutOfView } else { PixelState::Matched }).collect()
+    }
 
     /// The definition: flood fill from every pixel.
     fn plain(disparity: &[f32], width: usize, max_size: usize, range: f32) -> Vec<bool> {
@@ -201,7 +233,8 @@ mod tests {
             }
         }
         let keep = plain(&d, width, 5, 1.0);
-        remove_speckles(&mut d, width, 5, 1.0, &mut Speckles::default());
+        let mut states = states(&d);
+        remove_speckles(&mut d, &mut states, width, 5, 1.0, &mut Speckles::default());
         assert_eq!(keep.iter().filter(|k| !**k).count(), 5);
         assert!(d.iter().zip(keep).all(|(v, k)| v.is_nan() != k));
     }
@@ -216,7 +249,17 @@ mod tests {
             let rows = values.len() / width;
             let mut d = values[..rows * width].to_vec();
             let keep = plain(&d, width, max_size, 1.0);
-            remove_speckles(&mut d, width, max_size, 1.0, &mut Speckles::default());
+            let before = d.clone();
+            let mut states = states(&d);
+            remove_speckles(&mut d, &mut states, width, max_size, 1.0, &mut Speckles::default());
+            for ((state, v), before) in states.iter().zip(&d).zip(before) {
+                let expected = match (before.is_nan(), v.is_nan()) {
+                    (true, _) => PixelState::OutOfView,
+                    (false, true) => PixelState::Mismatched,
+                    (false, false) => PixelState::Matched,
+                };
+                prop_assert_eq!(*state, expected);
+            }
             for (v, k) in d.iter().zip(keep) {
                 prop_assert_eq!(!v.is_nan(), k);
             }
