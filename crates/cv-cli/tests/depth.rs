@@ -59,7 +59,10 @@ fn a_generated_pair_becomes_disparity_depth_and_cloud() {
     assert!(std::fs::read_to_string(at("page/report.html")).unwrap().contains("near blue, far red"));
 
     let eval = ["eval", "disparity", "--estimate", "d.pfm", "--truth", "truth.pfm", "--truth-right", "truth_right.pfm"];
-    let scores = json(folder.path(), &eval);
+    let scores = json(folder.path(), &[&eval[..], &["--error", "error.png", "--report", "scores"]].concat());
+    let page = std::fs::read_to_string(at("scores/report.html")).unwrap();
+    assert!(["bad-0.5", "A95", "non-occluded", "Fractions of the truth"].iter().all(|words| page.contains(words)));
+    assert_eq!(cv_io::read_rgb(at("error.png")).unwrap().size(), (240, 180));
     // A wrong sign, unit or row order would be off everywhere; a sound matcher is wrong at a few outlines.
     assert!(scores["non_occluded"]["bad"]["2.0"].as_f64().unwrap() < 0.1, "{scores}");
     assert!(scores["all"]["pixels"].as_u64().unwrap() == 240 * 180);
@@ -296,8 +299,10 @@ fn what_is_no_pair_is_refused_with_what_to_try() {
     cv_io::write_png(folder.path().join("grey.png"), RgbU8::new(240, 180, [99; 3]).view()).unwrap();
     for (left, right) in [("grey.png", "grey.png"), ("grey.png", "right.png")] {
         let ran = refused(folder.path(), &["depth", left, right, "-o", "out.pfm"]);
-        assert!(ran.stderr.contains("matched and confirmed") && ran.stderr.contains("rectified"), "{ran:?}");
+        assert!(ran.stderr.contains("matched and confirmed") && ran.stderr.contains("different things"), "{ran:?}");
     }
+    let ran = refused(folder.path(), &["depth", "right.png", "left.png", "-o", "out.pfm"]);
+    assert!(ran.stderr.contains("left and right are exchanged") && ran.stderr.contains("exchange the two"), "{ran:?}");
     assert!(!folder.path().join("out.pfm").exists());
 }
 

@@ -170,10 +170,10 @@ pub(crate) fn quadratic_peak(v: [[f32; 3]; 3]) -> (f32, f32) {
 mod tests {
     use super::*;
     use crate::rows::mirror;
-    use crate::simd::tests::levels;
     use crate::structure::{harris_at, products_at, smaller_eigenvalue};
     use cv_core::Image;
     use cv_imgproc::gaussian_blur;
+    use cv_synth::instruction_sets;
     use proptest::prelude::*;
 
     /// The definition, whole image after whole image.
@@ -232,7 +232,7 @@ mod tests {
             let options = HarrisOptions { measure, window_sigma: sigma, ..HarrisOptions::default() };
             let expected = plain_response(image.view(), &options);
             let expected_corners = plain_corners(&expected, options.threshold);
-            for level in levels() {
+            for level in instruction_sets() {
                 let plan = options.plan(image.view(), level);
                 prop_assert_eq!(&response(&plan), &expected, "{:?}", level);
                 prop_assert_eq!(&corners(&plan, options.threshold), &expected_corners, "{:?}", level);

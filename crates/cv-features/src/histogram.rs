@@ -243,7 +243,7 @@ fn turn(y: f32, x: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simd::tests::levels;
+    use cv_synth::instruction_sets;
 
     #[test]
     fn angles_are_those_of_the_library() {
@@ -274,7 +274,7 @@ mod tests {
         for k in 0..24 {
             let angle = k as f32 * TAU / 24.0 + 0.03;
             let image = slope(angle);
-            for level in levels() {
+            for level in instruction_sets() {
                 let found = dominant_angles(level, &image, (60.3, 54.8), 2.2);
                 let off = (found[0] - angle).abs();
                 // All votes fall in one bin of 10°, whose neighbours are symmetric after smoothing: half a bin is the resolution of such a histogram.
@@ -337,7 +337,7 @@ mod tests {
         for (at, sigma, angle) in [((60.2, 50.7), 2.1, 0.7), ((8.1, 90.2), 3.0, 4.0), ((117.0, 5.0), 1.7, 2.5)] {
             let expected = plain(&image, at, sigma, angle);
             let norm = expected.iter().map(|v| v * v).sum::<f64>().sqrt();
-            for level in levels() {
+            for level in instruction_sets() {
                 let got = describe(level, &image, at, sigma, angle);
                 for (g, e) in got.iter().zip(&expected) {
                     // Twenty-odd f32 operations on positions of up to 120 pixels, times the slope between pixels.

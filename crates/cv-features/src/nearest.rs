@@ -287,7 +287,7 @@ fn dot(a: &[f32], b: &[f32]) -> f32 {
 mod tests {
     use super::*;
     use crate::descriptors::DescriptorKind;
-    use crate::simd::tests::levels;
+    use cv_synth::instruction_sets;
     use proptest::prelude::*;
 
     /// The definition: every distance in f64, the first of equals.
@@ -330,7 +330,7 @@ mod tests {
             let (query, train) = (set(nq), set(nt));
             let expected = plain(&query, &train);
             let back = plain(&train, &query);
-            for level in levels() {
+            for level in instruction_sets() {
                 for both_ways in [false, true] {
                     let (forward, backward) = nearest(level, &query, &train, both_ways);
                     for (f, e) in forward.iter().zip(&expected) {

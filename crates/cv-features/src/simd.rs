@@ -300,26 +300,10 @@ fn is_extreme(differences: [[&[f32]; 3]; 3], x: usize, floor: f32) -> bool {
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
+mod tests {
     use super::*;
+    use cv_synth::instruction_sets;
     use proptest::prelude::*;
-
-    /// Every instruction set this machine has; the missing ones are named on stderr.
-    pub(crate) fn levels() -> Vec<Level> {
-        let mut found = vec![Level::baseline()];
-        #[cfg(target_arch = "x86_64")]
-        {
-            let widest = Level::new();
-            let mut add = |name: &str, level: Option<Level>| match level {
-                Some(level) => found.push(level),
-                None => eprintln!("ignored: this machine has no {name}"),
-            };
-            add("SSE4.2", widest.as_sse4_2().map(Level::Sse4_2));
-            add("AVX2", widest.as_avx2().map(Level::Avx2));
-            add("AVX-512", widest.as_avx512().map(Level::Avx512));
-        }
-        found
-    }
 
     proptest! {
         #[test]
@@ -351,7 +335,7 @@ pub(crate) mod tests {
                 .collect();
             let nine = [0, 3, 6].map(|i| [&coarse[i][..], &coarse[i + 1][..], &coarse[i + 2][..]]);
             let extreme: Vec<usize> = (1..width + 1).filter(|&x| is_extreme(nine, x, 4.0)).collect();
-            for level in levels() {
+            for level in instruction_sets() {
                 let mut out = vec![0.0; width];
                 vertical(level, &mut out, &rows[..2 * r + 1], &kernel);
                 prop_assert_eq!(&out, &expected[0][0], "{:?}", level);

@@ -104,26 +104,10 @@ fn sobel_inner([a, b, c]: [&[f32]; 3], dx: &mut [f32], dy: &mut [f32]) {
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
+mod tests {
     use super::*;
+    use cv_synth::instruction_sets;
     use proptest::prelude::*;
-
-    /// Every instruction set this machine has; the missing ones are named on stderr.
-    pub(crate) fn levels() -> Vec<Level> {
-        let mut found = vec![Level::baseline()];
-        #[cfg(target_arch = "x86_64")]
-        {
-            let widest = Level::new();
-            let mut add = |name: &str, level: Option<Level>| match level {
-                Some(level) => found.push(level),
-                None => eprintln!("ignored: this machine has no {name}"),
-            };
-            add("SSE4.2", widest.as_sse4_2().map(Level::Sse4_2));
-            add("AVX2", widest.as_avx2().map(Level::Avx2));
-            add("AVX-512", widest.as_avx512().map(Level::Avx512));
-        }
-        found
-    }
 
     proptest! {
         #[test]
@@ -143,7 +127,7 @@ pub(crate) mod tests {
             let down = plain(&|x, t| rows[t][x]);
             let along = plain(&|x, t| data[0][x + t * c]);
             let mut slopes = Vec::new();
-            for level in levels() {
+            for level in instruction_sets() {
                 let mut out = vec![0.0; width];
                 vertical(level, &mut out, &rows, &half);
                 prop_assert_eq!(&out, &down, "{:?}", level);

@@ -1,5 +1,6 @@
 //! Depth from a rectified pair.
 
+use crate::no_pair::{NoPairCause, cause};
 use crate::{Progress, Stopwatch};
 use cv_core::{GrayF32, ImageView};
 use cv_stereo::{DisparityMap, GeometryError, Intensity, StereoError, StereoGeometry, StereoMatcher, StereoOptions};
@@ -46,7 +47,7 @@ pub enum DepthError {
     Geometry(#[from] GeometryError),
     /// Hardly any pixel of one photograph has a partner in the other.
     #[error(
-        "only {:.1} % of the pixels were matched and confirmed, fewer than the {:.0} % that a rectified pair shows at the least",
+        "only {:.1} % of the pixels were matched and confirmed, fewer than the {:.0} % that a rectified pair shows at the least; {cause}",
         100.0 * .matched, 100.0 * .needed
     )]
     NoPair {
@@ -54,6 +55,8 @@ pub enum DepthError {
         matched: f64,
         /// The least that counts.
         needed: f64,
+        /// What features show.
+        cause: NoPairCause,
     },
     /// The range of depths is empty.
     #[error("the depth range {near} to {far} is empty")]
@@ -70,13 +73,23 @@ pub enum DepthError {
 /// more than 15 %.
 const LEAST_MATCHED: f64 = 0.2;
 
-/// Refuses a map that has hardly any matches: what was filled in would be made up.
+/// Refuses a map of `left` and `right` that has hardly any matches: what was filled in would be made up. Features are matched
+/// to say why.
 ///
 /// # Errors
 /// [`DepthError::NoPair`].
-pub fn check_matched(map: &DisparityMap) -> Result<(), DepthError> {
+pub fn check_pair<T: Intensity, const C: usize>(
+    map: &DisparityMap,
+    left: ImageView<'_, T, C>,
+    right: ImageView<'_, T, C>,
+    options: &StereoOptions,
+    progress: &dyn Progress,
+) -> Result<(), DepthError> {
     let matched = map.matched_fraction();
-    if matched < LEAST_MATCHED { Err(DepthError::NoPair { matched, needed: LEAST_MATCHED }) } else { Ok(()) }
+    if matched >= LEAST_MATCHED {
+        return Ok(());
+    }
+    Err(DepthError::NoPair { matched, needed: LEAST_MATCHED, cause: cause(left, right, options, progress) })
 }
 
 /// Disparity of a rectified pair, and depth where its geometry is known.
@@ -107,7 +120,7 @@ pub fn depth<T: Intensity, const C: usize>(
     progress.report("match", 0, 1);
     matcher.compute_into(left, right, &mut map)?;
     watch.lap("match");
-    check_matched(&map)?;
+    check_pair(&map, left, right, &options.stereo, progress)?;
     progress.report("match", 1, 1);
     let depth = geometry.map(|geometry| geometry.depth_map(map.disparity.view(), options.range));
     let (confidence, sigma) = (matcher.confidence(&map), matcher.uncertainty(&map));
@@ -162,8 +175,21 @@ mod tests {
         let pairs = [(grey.view(), grey.view()), (grey.view(), right), (right, left), (left, other.right.image.view())];
         for (i, (a, b)) in pairs.into_iter().enumerate() {
             let error = depth(a, b, None, &options, &Silent).map(|found| found.map.matched_fraction()).unwrap_err();
-            assert!(matches!(error, DepthError::NoPair { .. }), "{i}: {error}");
+            let DepthError::NoPair { cause, .. } = error else { panic!("{i}: {error}") };
+            match i {
+                2 => assert!(matches!(cause, NoPairCause::Exchanged { range: (..0, ..9) }), "{cause:?}"),
+                _ => assert!(matches!(cause, NoPairCause::Unrelated { .. }), "{i}: {cause:?}"),
+            }
         }
+        // Ten rows lower, and a range that ends before the nearest wall begins.
+        let lower = pair.right.image.view().crop(0, 10, 320, 230).unwrap();
+        let error =
+            depth(pair.left.image.view().crop(0, 0, 320, 230).unwrap(), lower, None, &options, &Silent).unwrap_err();
+        let DepthError::NoPair { cause: NoPairCause::Rows { apart }, .. } = error else { panic!("{error}") };
+        assert!((apart - 10.0).abs() < 1.0, "{apart}");
+        let far = StereoOptions { min_disparity: 200, disparities: 64, ..Default::default() };
+        let error = depth(left, right, None, &DepthOptions { stereo: far, ..Default::default() }, &Silent).unwrap_err();
+        assert!(matches!(error, DepthError::NoPair { cause: NoPairCause::Range { .. }, .. }), "{error}");
         assert!(depth(left, right, None, &options, &Silent).unwrap().map.matched_fraction() > 0.5);
     }
 

@@ -24,7 +24,10 @@ pub enum RangeError {
 }
 
 /// Fewer matches than this do not tell a range.
-const NEEDED: usize = 16;
+pub(crate) const NEEDED: usize = 16;
+
+/// Features in a common row differ by no more than this in y, in px.
+pub(crate) const COMMON_ROW: f64 = 1.5;
 
 /// Smallest disparity and number of disparities that a rectified pair shows: those of feature matches in common rows
 /// between their 1 % and 99 % quantiles, and an eighth of that and 4 px more at both ends for what features miss.
@@ -37,11 +40,16 @@ pub fn disparity_range(
     progress: &dyn Progress,
 ) -> Result<(i32, usize), RangeError> {
     let pairs = match_photos(left, right, &MatchingOptions::default(), progress)?.pairs;
-    let mut disparities: Vec<f64> =
-        pairs.iter().filter(|p| (p.a.y - p.b.y).abs() <= 1.5).map(|p| p.a.x - p.b.x).collect();
+    let disparities: Vec<f64> =
+        pairs.iter().filter(|p| (p.a.y - p.b.y).abs() <= COMMON_ROW).map(|p| p.a.x - p.b.x).collect();
     if disparities.len() < NEEDED {
         return Err(RangeError::TooFew { found: disparities.len(), matches: pairs.len(), needed: NEEDED });
     }
+    Ok(range_of(disparities))
+}
+
+/// The range of some disparities, of which there is at least one.
+pub(crate) fn range_of(mut disparities: Vec<f64>) -> (i32, usize) {
     disparities.sort_unstable_by(f64::total_cmp);
     let at = |share: f64| disparities[((disparities.len() - 1) as f64 * share).round() as usize];
     let (low, high) = (at(0.01), at(0.99));
@@ -49,7 +57,7 @@ pub fn disparity_range(
     let min = (low - more).floor() as i32;
     // A rectified pair shows nothing beyond infinity; a point or two below zero are wrong matches or rounding.
     let min = if low > -1.0 { min.max(0) } else { min };
-    Ok((min, ((high + more).ceil() as i32 - min + 1).max(1) as usize))
+    (min, ((high + more).ceil() as i32 - min + 1).max(1) as usize)
 }
 
 #[cfg(test)]

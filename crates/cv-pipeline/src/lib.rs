@@ -30,6 +30,7 @@ mod disparity_range;
 mod estimate;
 mod guided;
 mod matching;
+mod no_pair;
 mod panorama;
 mod progress;
 mod reconstruct;
@@ -39,13 +40,14 @@ mod stopwatch;
 mod views;
 
 pub use cv_geometry::{EstimateError, RobustModel, RobustOptions};
-pub use depth::{DepthError, DepthOptions, DepthResult, check_matched, depth};
+pub use depth::{DepthError, DepthOptions, DepthResult, check_pair, depth};
 pub use disparity_range::{RangeError, disparity_range};
 pub use estimate::{CalibratedResult, EstimateResult, ModelKind, estimate, estimate_calibrated};
 pub use matching::{
     FeatureMethod, MatchingError, MatchingOptions, MatchingResult, PhotoFeatures, Slanted, Spacing, correspondences,
     extract_features, match_extracted, match_features, match_photos,
 };
+pub use no_pair::NoPairCause;
 /// What a caller of [`match_extracted`] needs to hand in features found elsewhere, and to choose among ours.
 pub mod features {
     pub use cv_features::{

@@ -218,23 +218,8 @@ mod tests {
     use super::*;
     use crate::{Component, Mixture};
     use cv_core::RgbU8;
+    use cv_synth::instruction_sets;
     use proptest::prelude::*;
-
-    fn levels() -> Vec<Level> {
-        let mut found = vec![Level::baseline()];
-        #[cfg(target_arch = "x86_64")]
-        {
-            let widest = Level::new();
-            let mut add = |name: &str, level: Option<Level>| match level {
-                Some(level) => found.push(level),
-                None => eprintln!("ignored: this machine has no {name}"),
-            };
-            add("SSE4.2", widest.as_sse4_2().map(Level::Sse4_2));
-            add("AVX2", widest.as_avx2().map(Level::Avx2));
-            add("AVX-512", widest.as_avx512().map(Level::Avx512));
-        }
-        found
-    }
 
     #[test]
     fn the_exponential_and_the_logarithm_are_those() {
@@ -295,7 +280,7 @@ mod tests {
                     prop_assert!((got - (f - b)).abs() < 1e-4 + 4e-6 * (f.abs() + b.abs()), "{:?} {} {} {}", image.at(x, y), got, f, b);
                 }
             }
-            for level in levels() {
+            for level in instruction_sets() {
                 prop_assert_eq!(&evaluator.log_odds_at(level, image.view()), &first, "{:?}", level);
             }
         }

@@ -62,11 +62,16 @@ pub enum StereoError {
         count: usize,
     },
     /// The job needs more memory than allowed.
-    #[error("matching needs {needed} bytes and {allowed} are allowed")]
+    #[error("matching needs {:.1} MiB and {:.1} MiB are allowed", mib(*.needed), mib(*.allowed))]
     Memory {
         /// Bytes needed by the smallest way to do the job.
         needed: usize,
         /// Bytes allowed by `max_memory`.
         allowed: usize,
     },
+}
+
+/// Bytes as MiB.
+fn mib(bytes: usize) -> f64 {
+    bytes as f64 / f64::from(1 << 20)
 }

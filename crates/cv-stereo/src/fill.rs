@@ -154,7 +154,7 @@ fn rays<S: Simd>(_: S, disparity: &[f32], width: usize, count: usize, mirrored: 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::levels::levels;
+    use cv_synth::instruction_sets;
     use proptest::prelude::*;
 
     fn fill(disparity: &mut [f32], states: &[PixelState], width: usize) {
@@ -216,7 +216,7 @@ mod tests {
             holes in proptest::collection::vec(
                 proptest::array::uniform8(prop_oneof![3 => -9f32..9.0, 1 => Just(f32::INFINITY)]), 1..80),
         ) {
-            for level in levels() {
+            for level in instruction_sets() {
                 let n = holes.len().next_multiple_of(64);
                 let mut rays: [Vec<f32>; 8] = std::array::from_fn(|ray| holes.iter().map(|h| h[ray]).collect());
                 rays.iter_mut().for_each(|r| r.resize(n, f32::INFINITY));

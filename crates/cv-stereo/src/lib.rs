@@ -29,8 +29,6 @@ mod fill;
 mod input;
 mod kernel;
 mod layout;
-#[cfg(test)]
-mod levels;
 mod matcher;
 mod median;
 mod options;

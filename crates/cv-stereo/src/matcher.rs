@@ -427,8 +427,8 @@ fn subpixel(method: Subpixel, winner: &Winner) -> f32 {
 mod tests {
     use super::*;
     use crate::Smoothing;
-    use crate::levels::levels;
     use cv_core::GrayU8;
+    use cv_synth::instruction_sets;
 
     /// A textured slope before a textured wall, with a patch without texture.
     fn pair() -> [GrayU8; 2] {
@@ -450,7 +450,7 @@ mod tests {
         for (smoothing, fill) in smoothings.into_iter().flat_map(|s| [(s, true), (s, false)]) {
             let options = StereoOptions { disparities: 40, smoothing, fill, median: 2, ..Default::default() };
             let mut first: Option<(Vec<u32>, Vec<PixelState>)> = None;
-            for level in levels() {
+            for level in instruction_sets() {
                 for threads in [1, 2, 4] {
                     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
                     let mut matcher = StereoMatcher::new(options.clone()).unwrap();

@@ -113,9 +113,9 @@ mod tests {
     use crate::census::{Grey, MARGIN, describe, describe_mirrored, planes};
     use crate::cost::{Frame, Penalties};
     use crate::layout::Layout;
-    use crate::levels::levels;
     use crate::sgm::Aggregator;
     use crate::{Census, StereoOptions};
+    use cv_synth::instruction_sets;
     use proptest::prelude::*;
 
     /// Census bits by definition.
@@ -222,7 +222,7 @@ mod tests {
             let min_disparity = i64::from(options.min_disparity);
             let StereoOptions { census, blend, disparities, .. } = options;
             let p2 = Penalties::new(&options);
-            for level in levels() {
+            for level in instruction_sets() {
                 let layout = Layout::new(level, disparities);
                 let (mut a, mut b, mut bytes) = (Vec::new(), Vec::new(), Vec::new());
                 describe(level, &grey[0], census, blend, &mut a);

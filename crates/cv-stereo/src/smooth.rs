@@ -309,7 +309,7 @@ fn least_squares(planes: &mut Planes, width: usize, height: usize, lambda: f32, 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::levels::levels;
+    use cv_synth::instruction_sets;
     use proptest::prelude::*;
 
     /// The two passes of the bilateral smoother, pixel by pixel.
@@ -402,7 +402,7 @@ mod tests {
             let states: Vec<PixelState> = pixels.iter().map(|p| state(p.2)).collect();
             let (expected, after) = plain(&d, &states, &grey, width, sigma);
             let expected: Vec<u32> = expected.iter().map(|v| v.to_bits()).collect();
-            for level in levels() {
+            for level in instruction_sets() {
                 let mut planes = Planes::default();
                 // Twice, so that what a frame leaves behind would show.
                 for _ in 0..2 {

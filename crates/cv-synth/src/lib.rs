@@ -21,6 +21,7 @@
 //!   [`plane_homography`], [`rotation_homography`].
 //! * Measures against it: [`homography_corner_error`], [`alignment_error`], [`rotation_error`], [`direction_error`],
 //!   [`depth_score`], [`MaskScore`].
+//! * The instruction sets that tests of vector code go through: [`instruction_sets`].
 //!
 //! # Conventions
 //!
@@ -31,6 +32,7 @@
 mod bvh;
 mod error;
 mod font;
+mod instruction_sets;
 mod light;
 mod noise;
 mod poster;
@@ -46,6 +48,7 @@ mod texture;
 mod truth;
 
 pub use error::SynthError;
+pub use instruction_sets::instruction_sets;
 pub use poster::Poster;
 pub use render::{Rendered, render};
 pub use scene::{Scene, SceneBuilder};

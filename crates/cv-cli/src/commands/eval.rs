@@ -1,6 +1,6 @@
 //! `cv eval`: results against the truth.
 
-use super::depth::read_map;
+use super::depth::{fractions, read_map};
 use crate::common::{Context, Failure, Outcome, Run};
 use cv_core::Mask;
 use cv_report::{Figure, MapStyle, Report, draw_error_map, draw_map};
@@ -116,6 +116,13 @@ impl Disparity {
                     "Errors: grey up to 2 px, red and yellow beyond, blue without an estimate, black without truth.",
                 ),
             ]);
+            page.section("Fractions").plot(
+                &fractions(estimate.as_slice().iter().copied()),
+                "How often the estimate has each fraction of a pixel. Whole pixels that stand out (pixel locking) betray a poor \
+                 fit between pixels, unless the truth stands out likewise:",
+            );
+            page.section("Fractions of the truth")
+                .plot(&fractions(truth.as_slice().iter().copied()), "The same of the true disparities.");
             Ok(page.to_html())
         })?;
         let mut outcome = Outcome::default().with("all", object(&all));

@@ -3,7 +3,7 @@
 use super::{Args, Range, explained, say_memory};
 use crate::common::{Context, Explain, Failure, Outcome, expand_images};
 use cv_pipeline::stereo::{DisparityMap, StereoMatcher};
-use cv_pipeline::{Progress, check_matched};
+use cv_pipeline::{Progress, check_pair};
 use std::path::{Path, PathBuf};
 
 /// True for a folder or a pattern.
@@ -82,7 +82,7 @@ impl Args {
             }
             let start = std::time::Instant::now();
             matcher.compute_into(a.view(), b.view(), &mut map).during(left.display())?;
-            check_matched(&map).map_err(explained).during(left.display())?;
+            check_pair(&map, a.view(), b.view(), matcher.options(), context).map_err(explained).during(left.display())?;
             seconds += start.elapsed().as_secs_f64();
             valid += map.valid_fraction() / lefts.len() as f64;
             if i == 0 {

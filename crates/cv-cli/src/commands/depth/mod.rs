@@ -19,6 +19,7 @@ use options::{Range, parse_range};
 use std::path::{Path, PathBuf};
 
 pub(crate) use maps::read_map;
+pub(crate) use report::fractions;
 
 /// Compute disparity, and depth where the geometry is known, from a left and a right photograph.
 ///
@@ -78,16 +79,16 @@ pub(crate) struct Args {
     /// Matching window: 5 (5×5), 7 (7×7) or 9 (9×7).
     #[arg(long, value_name = "5|7|9", default_value = "5", value_parser = ["5", "7", "9"])]
     census: String,
-    /// Penalty for a disparity step of one pixel, in bits of the window.
+    /// Penalty for a disparity step of one pixel, in bits of the window [default: 4].
     #[arg(long, value_name = "BITS")]
     p1: Option<u8>,
-    /// Penalty for a larger step, in bits of the window.
+    /// Penalty for a larger step where the photograph has no edge, in bits of the window [default: 20].
     #[arg(long, value_name = "BITS")]
     p2: Option<u8>,
-    /// By how many percent the best match must beat the rest.
+    /// By how many percent the best match must beat the rest [default: 0].
     #[arg(long, value_name = "PERCENT")]
     uniqueness: Option<u8>,
-    /// Remove patches of up to this many pixels; 0 for none.
+    /// Remove patches of up to this many pixels; 0 for none [default: 100].
     #[arg(long, value_name = "PIXELS")]
     speckle_size: Option<usize>,
     /// Leave pixels without a match of their own unknown.
@@ -298,10 +299,12 @@ fn say_memory(matcher: &StereoMatcher, (width, height): (usize, usize), context:
 
 /// What to try where there is no depth.
 fn explained(error: DepthError) -> Failure {
-    let advice = match error {
-        DepthError::NoPair { .. } => {
-            "check that the pair is rectified (--rig does it), that left and right are not exchanged, and the range (--disparities, --min-disparity)"
+    let advice = match &error {
+        DepthError::NoPair { cause, .. } => {
+            let advice = cause.advice();
+            return Failure::from(error).advice(advice);
         }
+        DepthError::Stereo(StereoError::TooSmall { .. }) => "take larger photographs",
         DepthError::Stereo(StereoError::Memory { .. }) => "allow more memory (--max-memory), or fewer disparities",
         _ => "see `cv depth --help` for the range of each option",
     };

@@ -4,7 +4,7 @@ use super::Job;
 use crate::common::Failure;
 use cv_core::{ImageView, RgbU8};
 use cv_pipeline::DepthResult;
-use cv_pipeline::stereo::{CloudPoint, DisparityMap, PixelState};
+use cv_pipeline::stereo::{CloudPoint, PixelState};
 use cv_report::{Figure, MapStyle, Note, Plot, PointScene, Report, Viewpoint, draw_map, render_points};
 
 /// Where each disparity comes from, over the darkened photograph.
@@ -43,8 +43,10 @@ pub(super) fn report(job: &Job, points: &[CloudPoint]) -> Result<String, Failure
             "Filled pixels: blue hidden from the right camera, orange mismatched, violet outside the right photograph.",
         ),
     ]);
+    let pixels = map.disparity.as_slice().iter().zip(map.state.as_slice());
+    let matched = pixels.filter(|(_, state)| **state == PixelState::Matched);
     page.section("Fractions").plot(
-        &fractions(map),
+        &fractions(matched.map(|(&d, _)| d)),
         "How often matched disparities have each fraction. Whole pixels that stand out (pixel locking) betray a poor fit \
          between pixels, unless the scene is of few planes that face the cameras.",
     );
@@ -66,10 +68,9 @@ pub(super) fn report(job: &Job, points: &[CloudPoint]) -> Result<String, Failure
     Ok(page.to_html())
 }
 
-/// How the fractions of matched disparities are spread.
-fn fractions(map: &DisparityMap) -> Plot {
-    let pixels = map.disparity.as_slice().iter().zip(map.state.as_slice());
-    let matched = pixels.filter(|(d, state)| d.is_finite() && **state == PixelState::Matched);
-    let values: Vec<f64> = matched.map(|(&d, _)| f64::from(d) - f64::from(d).floor()).collect();
+/// How the fractions of disparities are spread.
+pub(crate) fn fractions(disparities: impl Iterator<Item = f32>) -> Plot {
+    let values: Vec<f64> =
+        disparities.filter(|d| d.is_finite()).map(|d| f64::from(d) - f64::from(d).floor()).collect();
     Plot::new("Fractions of disparities", "fraction of a pixel", "pixels").histogram_within("", &values, 20, (0.0, 1.0))
 }

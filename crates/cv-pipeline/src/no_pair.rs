@@ -1,0 +1,121 @@
+//! Why hardly any pixel of one photograph has a partner in the other, as far as feature matches tell.
+
+use crate::disparity_range::{COMMON_ROW, NEEDED, range_of};
+use crate::{MatchingOptions, Progress, match_photos};
+use cv_core::{ImageView, RgbU8};
+use cv_stereo::{Intensity, StereoOptions};
+
+/// What feature matches of a refused pair show.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum NoPairCause {
+    /// Too few features of one are found in the other: another scene, or hardly anything in common.
+    Unrelated {
+        /// Matches that could be right.
+        matches: usize,
+    },
+    /// Matches do not lie in common rows: the pair is not rectified.
+    Rows {
+        /// Median of the vertical distance in px.
+        apart: f64,
+    },
+    /// Disparities are negative: the first photograph is the right one.
+    Exchanged {
+        /// Smallest and largest disparity of the matches in px.
+        range: (i32, i32),
+    },
+    /// Disparities lie outside the range that was tried.
+    Range {
+        /// Smallest and largest disparity of the matches in px.
+        range: (i32, i32),
+    },
+    /// Matches lie where they should: the photographs show too little texture, or move.
+    Unknown,
+}
+
+impl std::fmt::Display for NoPairCause {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Unrelated { matches } => {
+                write!(
+                    f,
+                    "only {matches} features of one are found in the other: they show different things, or none with texture"
+                )
+            }
+            Self::Rows { apart } => write!(f, "features lie {apart:.1} px apart vertically: the pair is not rectified"),
+            Self::Exchanged { range: (low, high) } => {
+                write!(f, "features show disparities {low} to {high}: left and right are exchanged")
+            }
+            Self::Range { range: (low, high) } => {
+                write!(f, "features show disparities {low} to {high}, outside the range that was tried")
+            }
+            Self::Unknown => f.write_str("features lie in common rows: too little texture, or things that moved"),
+        }
+    }
+}
+
+impl NoPairCause {
+    /// What a person can do about it.
+    pub fn advice(&self) -> String {
+        match self {
+            Self::Unrelated { .. } => "take two photographs of the same things, with texture on them".to_owned(),
+            Self::Rows { .. } => "rectify the pair (--rig, or `cv rectify`)".to_owned(),
+            Self::Exchanged { range: (low, _) } => {
+                format!("exchange the two photographs; if they are in order, give --min-disparity {low}")
+            }
+            Self::Range { range: (low, high) } => format!(
+                "--disparities auto, or --min-disparity {low} --disparities {}",
+                i64::from(*high) - i64::from(*low) + 1
+            ),
+            Self::Unknown => "a larger window (--census 9), or more light".to_owned(),
+        }
+    }
+}
+
+/// Between the quartiles of chance matches' vertical distances lies about a third of the height; a pair that is ten degrees askew
+/// stays below this share of it.
+const SPREAD: f64 = 0.15;
+
+/// Looks at the matches of a pair that was refused.
+pub(crate) fn cause<T: Intensity, const C: usize>(
+    left: ImageView<'_, T, C>,
+    right: ImageView<'_, T, C>,
+    options: &StereoOptions,
+    progress: &dyn Progress,
+) -> NoPairCause {
+    let [a, b] = [left, right].map(|view| {
+        RgbU8::from_fn(view.width(), view.height(), |x, y| {
+            let pixel = view.at(x, y);
+            std::array::from_fn(|c| (pixel[if C >= 3 { c } else { 0 }].to_u16() >> 8) as u8)
+        })
+    });
+    let Ok(found) = match_photos(a.view(), b.view(), &MatchingOptions::default(), progress) else {
+        return NoPairCause::Unrelated { matches: 0 };
+    };
+    let mut apart: Vec<f64> = found.pairs.iter().map(|p| p.a.y - p.b.y).collect();
+    let n = apart.len();
+    if n < NEEDED {
+        return NoPairCause::Unrelated { matches: n };
+    }
+    apart.sort_unstable_by(f64::total_cmp);
+    let common: Vec<f64> =
+        found.pairs.iter().filter(|p| (p.a.y - p.b.y).abs() <= COMMON_ROW).map(|p| p.a.x - p.b.x).collect();
+    // Wrong matches are few: most lie in common rows where the pair is rectified.
+    if common.len() < NEEDED.max(n / 2) {
+        // Cameras that are not aligned shift neighbours alike; chance matches are anywhere.
+        let spread = apart[3 * n / 4] - apart[n / 4];
+        return if spread <= SPREAD * left.height() as f64 {
+            NoPairCause::Rows { apart: apart[n / 2].abs() }
+        } else {
+            NoPairCause::Unrelated { matches: common.len() }
+        };
+    }
+    let (min, n) = range_of(common);
+    let (low, high) = (min, min + n as i32 - 1);
+    let tried = (options.min_disparity, options.min_disparity + options.disparities as i32 - 1);
+    if high <= 8 && low < -8 && tried.0 >= 0 {
+        return NoPairCause::Exchanged { range: (low, high) };
+    }
+    // Most of what there is must have been tried.
+    let overlap = tried.1.min(high) - tried.0.max(low) + 1;
+    if 2 * overlap < high - low + 1 { NoPairCause::Range { range: (low, high) } } else { NoPairCause::Unknown }
+}

@@ -1,0 +1,68 @@
+//! The instruction sets that tests go through.
+
+use fearless_simd::Level;
+
+/// Every instruction set this machine has, the least first. Tests hold each to the same definition; those that the machine lacks
+/// are the ignored tests of this module.
+pub fn instruction_sets() -> Vec<Level> {
+    #[cfg_attr(not(target_arch = "x86_64"), allow(unused_mut, reason = "only one elsewhere"))]
+    let mut all = vec![Level::baseline()];
+    #[cfg(target_arch = "x86_64")]
+    {
+        let best = Level::new();
+        let more =
+            [best.as_sse4_2().map(Level::Sse4_2), best.as_avx2().map(Level::Avx2), best.as_avx512().map(Level::Avx512)];
+        all.extend(more.into_iter().flatten());
+    }
+    all
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn has(name: &str) -> bool {
+        instruction_sets().iter().any(|level| format!("{level:?}").starts_with(name))
+    }
+
+    #[test]
+    #[cfg_attr(
+        without_sse4_2,
+        ignore = "this machine has no SSE4.2: whatever goes through the instruction sets left it out"
+    )]
+    fn sse4_2_is_tested() {
+        assert!(has("Sse4_2"));
+    }
+
+    #[test]
+    #[cfg_attr(
+        without_avx2,
+        ignore = "this machine has no AVX2: whatever goes through the instruction sets left it out"
+    )]
+    fn avx2_is_tested() {
+        assert!(has("Avx2"));
+    }
+
+    #[test]
+    #[cfg_attr(
+        without_avx512,
+        ignore = "this machine has no AVX-512: whatever goes through the instruction sets left it out"
+    )]
+    fn avx512_is_tested() {
+        assert!(has("Avx512"));
+    }
+
+    #[test]
+    #[cfg_attr(
+        not(target_arch = "aarch64"),
+        ignore = "this machine has no NEON: whatever goes through the instruction sets left it out"
+    )]
+    fn neon_is_tested() {
+        assert!(has("Neon"));
+    }
+
+    #[test]
+    fn the_one_that_runs_outside_tests_is_among_them() {
+        assert!(has(format!("{:?}", Level::new()).split('(').next().unwrap_or_default()));
+    }
+}
