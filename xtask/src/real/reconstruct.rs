@@ -18,6 +18,7 @@ pub(crate) fn run(data: &Path) -> Result<Vec<Check>> {
     let name = |i: usize| format!("100_71{i:02}.JPG");
     let read = |i: usize| cv_io::read_image(folder.join("sceaux").join(name(i)));
     let (mut exif_direction, mut exif_focal) = (0.0f64, 0.0f64);
+    let (mut free_close, mut free_squares) = (0.0, 0.0);
     let focal = read(0)?.exif.focal.context("no focal length in EXIF")?.pixels;
     let mut first = read(0)?.into_rgb8();
     for i in 0..PAIRS {
@@ -54,6 +55,19 @@ pub(crate) fn run(data: &Path) -> Result<Vec<Check>> {
         println!("  by EXIF: focal length {:.0} px, direction {moved:.3}°", result.cameras[0].fx);
         exif_direction = exif_direction.max(moved);
         exif_focal = exif_focal.max((result.cameras[0].fx / camera.fx - 1.0).abs());
+        // And without that: from the matches alone.
+        let options = ReconstructOptions { intrinsics: Intrinsics::Unknown, ..options };
+        let result = reconstruct(first.view(), second.view(), &options, &Silent)
+            .with_context(|| format!("{} and {} by themselves", name(i), name(i + 1)))?;
+        let off = result.cameras[0].fx / camera.fx - 1.0;
+        println!(
+            "  by themselves: focal length {:.0} px, off {:+.1} % ({:.1} % by our own account)",
+            result.cameras[0].fx,
+            100.0 * off,
+            100.0 * result.focal_deviation
+        );
+        free_close += f64::from(u8::from(off.abs() <= 0.05));
+        free_squares += (off / result.focal_deviation).powi(2);
         first = second;
     }
     Ok(vec![
@@ -63,6 +77,13 @@ pub(crate) fn run(data: &Path) -> Result<Vec<Check>> {
         Check::at_most("direction of the worst, degrees", direction, 3.0),
         Check::at_most("by EXIF: error of the focal length, %", 100.0 * exif_focal, 5.0),
         Check::at_most("by EXIF: direction of the worst, degrees", exif_direction, 3.0),
+        Check::at_least("by themselves: pairs with a focal length within 5 %", free_close, 9.0),
+        // Of ten normal errors, one set in a hundred has more.
+        Check::at_most(
+            "by themselves: errors of it, in deviations that are stated (RMS)",
+            (free_squares / PAIRS as f64).sqrt(),
+            1.52,
+        ),
     ])
 }
 

@@ -104,14 +104,22 @@ pub enum ReconstructError {
         /// Matches that agree by the better one.
         inliers: usize,
     },
-    /// No focal length fits the matches better than others.
+    /// The longer the focal length is taken to be, the better it fits.
+    #[error(
+        "the focal length cannot be told from these photographs: they show no perspective (the subject is too far away, or the view too narrow)"
+    )]
+    NoPerspective {
+        /// Longer side of the photographs, in pixels.
+        side: usize,
+    },
+    /// Many focal lengths fit the matches as well as the best.
     #[error(
         "the focal length cannot be told from these photographs: none between {low:.0} and {high:.0} px fits better than the others"
     )]
     UnknownFocal {
         /// Smallest that fits, in pixels; at the least that of a field of view of 170 degrees.
         low: f64,
-        /// Largest that fits, in pixels; at the most that of a field of view of 1 degree.
+        /// Largest that fits, in pixels; at the most that of a field of view of 3 degrees.
         high: f64,
         /// Longer side of the photographs, in pixels.
         side: usize,
@@ -122,16 +130,22 @@ pub enum ReconstructError {
 }
 
 impl ReconstructError {
-    /// No focal length between `focal` less and more its `deviation` (relative) is worse than the others.
-    pub(super) fn unknown_focal(focal: f64, deviation: f64, side: usize) -> Self {
-        // Fields of view of 170 degrees and of one degree along the longer side: no lens of a photograph is beyond.
-        let plausible = [85f64, 0.5].map(|half| 0.5 * side as f64 / half.to_radians().tan());
-        let [least, most] = plausible;
-        let (low, high) = (focal / (1.0 + deviation), focal * (1.0 + deviation));
-        // An estimate out there says only that there is none.
-        let (low, high) =
-            if (least..=most).contains(&focal) { (low.max(least), high.min(most)) } else { (least, most) };
-        Self::UnknownFocal { low, high, side }
+    /// Refuses a focal length (pixels) that no lens of a photograph has, and one with a relative standard deviation over a tenth: the depth of the
+    /// scene, which goes with it, may well be off by a fifth.
+    pub(super) fn check_focal(focal: f64, deviation: f64, side: usize) -> Result<(), Self> {
+        // Fields of view along the longer side of 170 degrees, and of 3 degrees: 690 mm before a film of 36 mm.
+        let [least, most] = [85f64, 1.5].map(|half| 0.5 * side as f64 / half.to_radians().tan());
+        if focal > most {
+            return Err(Self::NoPerspective { side });
+        }
+        if focal < least {
+            return Err(Self::UnknownFocal { low: least, high: most, side });
+        }
+        if deviation > 0.1 {
+            let (low, high) = ((focal / (1.0 + deviation)).max(least), (focal * (1.0 + deviation)).min(most));
+            return Err(Self::UnknownFocal { low, high, side });
+        }
+        Ok(())
     }
 
     /// What a person can do about it.
@@ -158,7 +172,7 @@ impl ReconstructError {
                     "check the focal length, which is in pixels of the photograph: --focal {better:.0}, or leave it out (--ignore-exif where the photograph has a wrong one)"
                 );
             }
-            Self::UnknownFocal { side, .. } => {
+            Self::NoPerspective { side } | Self::UnknownFocal { side, .. } => {
                 let phone = 0.8 * *side as f64;
                 return format!(
                     "give the focal length in pixels: --focal {phone:.0} (a phone's main camera: about 0.8 times the longer side), or a camera file (--camera)"
@@ -167,5 +181,24 @@ impl ReconstructError {
             Self::Estimate(_) => "check the matches with `cv match`",
         };
         words.to_owned()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_focal_length_is_told_or_the_reason_why_not() {
+        assert_eq!(ReconstructError::check_focal(1000.0, 0.05, 1200), Ok(()));
+        // Fifty times the longer side is a telescope's.
+        assert_eq!(
+            ReconstructError::check_focal(60_000.0, 0.05, 1200),
+            Err(ReconstructError::NoPerspective { side: 1200 })
+        );
+        let error = ReconstructError::check_focal(1000.0, 0.25, 1200).unwrap_err();
+        assert_eq!(error, ReconstructError::UnknownFocal { low: 800.0, high: 1250.0, side: 1200 });
+        assert!(error.advice().contains("--focal 960"));
+        assert!(matches!(ReconstructError::check_focal(10.0, 0.0, 1200), Err(ReconstructError::UnknownFocal { .. })));
     }
 }
