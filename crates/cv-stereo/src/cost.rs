@@ -24,6 +24,8 @@ pub(crate) struct Frame<'a> {
     /// `width − 1 − min_disparity − j`, and the match of column `x` at index `k` is element `width − 1 − x + k`. A row
     /// holds the elements of phase 0 plane by plane, then those of phase 1 and so on.
     pub(crate) right: &'a [u8],
+    /// The costs, pixel by pixel in the order of `layout`, where they are not made of the bytes.
+    pub(crate) given: Option<&'a [u8]>,
     /// The most that the blend adds to the bits.
     pub(crate) blend_cap: Option<u8>,
     /// Grey values of the left image, 0 to 255.

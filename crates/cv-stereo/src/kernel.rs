@@ -28,14 +28,16 @@ pub(crate) struct Sweep {
     /// Path costs of the row before, pixel by pixel: from ahead, straight, from behind, in the sense of the sweep, or
     /// straight only. Beyond the last pixel zeros, for the path from ahead of the last one.
     row: Aligned<u8>,
-    /// The smallest of each of them.
-    least: Vec<u8>,
+    /// The smallest of them: straight, from behind and from ahead, in the sense of the image.
+    least: [Vec<u8>; 3],
+    /// The smallest of those that pixels of this row look at.
+    before: [Vec<u8>; 3],
     ongoing: Ongoing,
     /// Costs of a tile of pixels.
     costs: Aligned<u8>,
     /// Sums of these pixels.
     sums: Aligned<u8>,
-    /// P2 of each pixel of the row for each path: from before, straight, behind and ahead.
+    /// P2 − P1 of each pixel of the row from before; with the smallest before also straight, from behind and from ahead.
     p2: [Vec<u8>; 4],
     selection: Selection,
 }
@@ -48,7 +50,6 @@ struct Ongoing {
     along_least: u8,
     /// Path costs of the row before at the pixel before, whose place has been taken.
     behind: Aligned<u8>,
-    behind_least: u8,
 }
 
 /// What becomes of the sums of a sweep.
@@ -62,7 +63,7 @@ pub(crate) enum Output<'a> {
 impl Sweep {
     /// Bytes that [`Sweep::start`] will hold on to.
     pub(crate) fn bytes(width: usize, depth: usize) -> usize {
-        3 * width * (depth + 1) + (2 * TILE + 3) * depth + 4 * width + Selection::bytes(width, depth)
+        3 * width * depth + (2 * TILE + 3) * depth + 10 * width + Selection::bytes(width, depth)
     }
 
     /// Prepares for a frame.
@@ -71,8 +72,10 @@ impl Sweep {
         self.mirrored = mirrored;
         self.row.resize((3 * frame.width + 1) * depth, 0);
         self.row.as_mut_slice().fill(0);
-        self.least.clear();
-        self.least.resize(3 * frame.width + 1, 0);
+        for least in self.least.iter_mut().chain(&mut self.before) {
+            least.clear();
+            least.resize(frame.width, 0);
+        }
         self.ongoing.along.resize(depth, 0);
         self.ongoing.behind.resize(depth, 0);
         self.costs.resize(TILE * depth, 0);
@@ -121,7 +124,7 @@ fn rows<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool>(
 ) {
     let (width, height) = (frame.width, frame.height);
     let depth = if SINGLE { BLOCKS * BLOCK } else { frame.layout.depth };
-    let Sweep { mirrored, row, least, ongoing, costs, sums, p2, selection } = sweep;
+    let Sweep { mirrored, row, least, before, ongoing, costs, sums, p2, selection } = sweep;
     let mirrored = *mirrored;
     let row = row.as_mut_slice();
     let costs = &mut costs.as_mut_slice()[..TILE * depth];
@@ -132,21 +135,29 @@ fn rows<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool>(
         // Row of `output`.
         let line = if mirrored { steps - 1 - step } else { step };
         penalties::<S, PATHS>(simd, frame, y, mirrored, p2);
+        jumps::<S, PATHS>(simd, mirrored, least, before, p2);
         // Paths that start at the border start from nothing.
         ongoing.along.as_mut_slice().fill(0);
         ongoing.behind.as_mut_slice().fill(0);
-        (ongoing.along_least, ongoing.behind_least) = (0, 0);
+        ongoing.along_least = 0;
         selection.start();
         for begin in (0..width).step_by(TILE) {
             let end = (begin + TILE).min(width);
             let columns = if mirrored { width - end..width - begin } else { begin..end };
-            frame.costs::<S, BLOCKS, SINGLE>(simd, y, columns.clone(), costs);
             let pixels = line * width + columns.start..line * width + columns.end;
             let span = pixels.start * depth..pixels.end * depth;
-            let p2 = p2.each_ref().map(|p2| &p2[columns.clone()]);
-            let tile = Tile { costs: &costs[..span.len()], p1: frame.p1, p2, mirrored };
+            let jumps = p2.each_ref().map(|jumps| &jumps[columns.clone()]);
+            let before = before.each_ref().map(|before| &before[columns.clone()]);
+            let costs = match frame.given {
+                Some(given) => &given[y * width * depth..][columns.start * depth..columns.end * depth],
+                None => {
+                    frame.costs::<S, BLOCKS, SINGLE>(simd, y, columns.clone(), costs);
+                    &costs[..span.len()]
+                }
+            };
+            let tile = Tile { costs, p1: frame.p1, jumps, before, mirrored };
             let row = &mut row[begin * (PATHS - 1) * depth..];
-            let least = &mut least[begin * (PATHS - 1)..];
+            let least = least.each_mut().map(|least| &mut least[columns.clone()]);
             match output {
                 Output::Store(out) => {
                     let ends = Ends { other: &[], running: &mut [], decided: &mut [], best: &mut [], stride: 0 };
@@ -207,12 +218,45 @@ fn penalties<S: Simd, const PATHS: usize>(
     between(here, before, straight);
 }
 
+/// Finds the smallest before each pixel and adds it to P2 − P1, whole rows at a time: `extend` then has but to load them.
+#[simd]
+fn jumps<S: Simd, const PATHS: usize>(
+    _: S,
+    mirrored: bool,
+    [straight_least, behind_least, ahead_least]: &[Vec<u8>; 3],
+    [straight, behind, ahead]: &mut [Vec<u8>; 3],
+    [_, straight_jump, behind_jump, ahead_jump]: &mut [Vec<u8>; 4],
+) {
+    let last = straight.len() - 1;
+    let add = |jumps: &mut [u8], before: &[u8]| {
+        for (jump, before) in jumps.iter_mut().zip(before) {
+            *jump = jump.wrapping_add(*before);
+        }
+    };
+    straight.copy_from_slice(straight_least);
+    add(straight_jump, straight);
+    if PATHS == 4 {
+        // Paths that start at the border start from nothing, which their place in `before` always holds.
+        let (from_left, left, from_right, right) = if mirrored {
+            (ahead_least, &mut *ahead, behind_least, &mut *behind)
+        } else {
+            (behind_least, &mut *behind, ahead_least, &mut *ahead)
+        };
+        left[1..].copy_from_slice(&from_left[..last]);
+        right[..last].copy_from_slice(&from_right[1..]);
+        add(behind_jump, behind);
+        add(ahead_jump, ahead);
+    }
+}
+
 /// Some pixels of a row, in the sense of the image.
 struct Tile<'a> {
     costs: &'a [u8],
     p1: u8,
-    /// P2 − P1 of each path.
-    p2: [&'a [u8]; 4],
+    /// P2 − P1 from before; with the smallest before also straight, from behind and from ahead.
+    jumps: [&'a [u8]; 4],
+    /// The smallest before straight, from behind and from ahead.
+    before: [&'a [u8]; 3],
     mirrored: bool,
 }
 
@@ -224,7 +268,7 @@ fn extend<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool, 
     tile: &Tile<'_>,
     ongoing: &mut Ongoing,
     row: &mut [u8],
-    row_least: &mut [u8],
+    [straight_least, behind_least, ahead_least]: [&mut [u8]; 3],
     sums: &mut [u8],
     ends: Ends<'_>,
 ) {
@@ -236,13 +280,14 @@ fn extend<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool, 
     let depth = if SINGLE { group } else { along.len() };
     // A pixel of the row before.
     let stride = (PATHS - 1) * depth;
-    let count = tile.p2[0].len();
-    let p2 = tile.p2.map(|p2| &p2[..count]);
-    let p1 = S::u8s::splat(simd, tile.p1);
+    let count = tile.jumps[0].len();
+    let jumps = tile.jumps.map(|jumps| &jumps[..count]);
+    let before = tile.before.map(|before| &before[..count]);
+    let splat = |value: u8| S::u8s::splat(simd, value);
+    let p1 = splat(tile.p1);
     let Ends { other, running, decided, best, stride: decided_stride } = ends;
     let ids = ids(simd, n);
     let mut along_least = S::u8s::splat(simd, ongoing.along_least);
-    let mut behind_least = ongoing.behind_least;
     // In registers where they fit.
     let (mut held_along, mut held_behind, mut held_keys) = ([0; 2 * BLOCK], [0; 2 * BLOCK], [0; 2 * BLOCK]);
     if SINGLE {
@@ -260,7 +305,7 @@ fn extend<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool, 
         let along = if SINGLE { &mut held_along[..group] } else { &mut *along };
         let behind = if SINGLE { &mut held_behind[..group] } else { &mut *behind };
         // First of all the path from the pixel before: the next pixel waits for it.
-        let mut step = Step::new(simd, along_least, p2[0][at]);
+        let mut step = Step::new(simd, along_least, along_least + splat(jumps[0][at]));
         for start in (0..depth).step_by(group) {
             for v in 0..n {
                 let extended = step.extend(simd, p1, cost, along, (start, v, group));
@@ -268,11 +313,9 @@ fn extend<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool, 
             }
         }
         along_least = S::u8s::splat(simd, step.smallest.reduce_min());
-        let least = &mut row_least[k * (PATHS - 1)..][..PATHS];
-        let splat = |value: u8| S::u8s::splat(simd, value);
-        let mut straight_step = Step::new(simd, splat(least[if PATHS == 4 { 1 } else { 0 }]), p2[1][at]);
-        let mut behind_step = Step::new(simd, splat(behind_least), p2[2][at]);
-        let mut ahead_step = Step::new(simd, splat(least[PATHS - 1]), p2[3][at]);
+        let mut straight_step = Step::new(simd, splat(before[0][at]), splat(jumps[1][at]));
+        let mut behind_step = Step::new(simd, splat(before[1][at]), splat(jumps[2][at]));
+        let mut ahead_step = Step::new(simd, splat(before[2][at]), splat(jumps[3][at]));
         for start in (0..depth).step_by(group) {
             let running = if SINGLE || KEYS == 0 { &mut held_keys[..group] } else { &mut running[start..][..group] };
             let mut keys = Keys::begin(simd, running, n);
@@ -309,17 +352,13 @@ fn extend<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool, 
                 best[at] = keys.end(best[at], start);
             }
         }
+        straight_least[at] = straight_step.smallest.reduce_min();
         if PATHS == 4 {
-            behind_least = least[2];
-            least[0] = ahead_step.smallest.reduce_min();
-            least[1] = straight_step.smallest.reduce_min();
-            least[2] = behind_step.smallest.reduce_min();
-        } else {
-            least[0] = straight_step.smallest.reduce_min();
+            behind_least[at] = behind_step.smallest.reduce_min();
+            ahead_least[at] = ahead_step.smallest.reduce_min();
         }
     }
     ongoing.along_least = along_least.as_slice()[0];
-    ongoing.behind_least = behind_least;
     if SINGLE {
         along.copy_from_slice(&held_along[..group]);
         behind.copy_from_slice(&held_behind[..group]);
@@ -343,9 +382,9 @@ struct Step<S: Simd> {
 
 impl<S: Simd> Step<S> {
     #[inline(always)]
-    fn new(simd: S, least: S::u8s, p2: u8) -> Self {
+    fn new(simd: S, least: S::u8s, jump: S::u8s) -> Self {
         let worst = S::u8s::splat(simd, u8::MAX);
-        Self { least, jump: least + S::u8s::splat(simd, p2), before: worst, first: worst, last: worst, smallest: worst }
+        Self { least, jump, before: worst, first: worst, last: worst, smallest: worst }
     }
 
     /// Extends vector `v` of the group at `start`. The vectors before have been replaced, if any were.

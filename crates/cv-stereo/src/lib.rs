@@ -32,6 +32,7 @@ mod layout;
 mod matcher;
 mod median;
 mod options;
+mod path_sums;
 #[cfg(test)]
 mod plain;
 mod plane;
@@ -49,5 +50,7 @@ pub use evaluate::{BAD_THRESHOLDS, DisparityScores, EvaluateError, evaluate_disp
 pub use input::Intensity;
 pub use matcher::{DisparityMap, PixelState, StereoMatcher};
 pub use options::{Blend, Census, Paths, Smoothing, StereoOptions, Subpixel};
+#[doc(hidden)]
+pub use path_sums::PathSums;
 pub use rectify::{Rectification, RectifiedView, RectifyError, RectifyOptions};
 pub use rectify_scene::SceneRectification;

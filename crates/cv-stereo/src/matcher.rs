@@ -320,6 +320,7 @@ impl StereoMatcher {
                 planes,
                 left: &self.described[0][rows.start * width * planes..rows.end * width * planes],
                 right: &self.described[1][rows.start * stride..rows.end * stride],
+                given: None,
                 blend_cap: (options.blend != Blend::None).then(|| options.blend.cap()),
                 grey: &self.grey8[rows.start * width..rows.end * width],
                 p1: options.p1,

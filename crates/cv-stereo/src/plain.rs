@@ -231,6 +231,7 @@ mod tests {
                 let frame = Frame {
                     width, height, min_disparity, disparities, layout, planes: planes(census, blend),
                     left: &a, right: &b, grey: &bytes,
+                    given: None,
                     blend_cap: (blend != Blend::None).then_some(blend.cap()),
                     p1: options.p1, p2: &p2, second: options.confidence,
                 };

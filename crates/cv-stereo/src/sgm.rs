@@ -13,6 +13,7 @@ use crate::layout::Layout;
 use crate::winner::Winner;
 use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// Buffers of the aggregation, kept between frames.
 #[derive(Debug, Default)]
@@ -56,8 +57,8 @@ impl Aggregator {
         let (sums_top, sums_bottom) = self.sums.as_mut_slice().split_at_mut(top * width * depth);
         let (winners_top, winners_bottom) = self.winners.split_at_mut(top * width);
         let (right_top, right_bottom) = self.right.split_at_mut(top * width);
-        let run = |sweep: &mut Sweep, first: usize, steps: usize, mut output: Output<'_>| {
-            dispatch!(level, simd => sweep_rows(simd, frame, sweep, first, steps, &mut output, eight));
+        let run = |state: &mut Sweep, first: usize, steps: usize, output: Output<'_>| {
+            sweep(level, frame, state, first..first + steps, output, eight);
         };
         rayon::join(
             || {
@@ -81,4 +82,16 @@ impl Aggregator {
             || run(up, bottom, top, Output::Finish { other: sums_top, winners: winners_top, right: right_top }),
         );
     }
+}
+
+/// Runs a sweep over some rows, counted in its own sense, for which `output` is.
+pub(crate) fn sweep(
+    level: Level,
+    frame: &Frame<'_>,
+    state: &mut Sweep,
+    rows: Range<usize>,
+    mut output: Output<'_>,
+    eight: bool,
+) {
+    dispatch!(level, simd => sweep_rows(simd, frame, state, rows.start, rows.len(), &mut output, eight));
 }
