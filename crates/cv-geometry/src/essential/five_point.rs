@@ -1,7 +1,7 @@
 //! Essential matrices through five points.
 
 use crate::fundamental::epipolar_row;
-use cv_core::{Matrix3, Point2};
+use cv_core::{Matrix3, Point2, Vector3};
 use cv_numeric::{null_space, real_roots};
 use fearless_simd::{Level, dispatch};
 
@@ -12,6 +12,9 @@ type Quadratic = [f64; 10];
 /// Of degree three, in the order that the elimination needs: x³, y³, x²y, xy², x²z, x², y²z, y², xyz, xy, then xz², xz, x, yz², yz,
 /// y, z³, z², z, 1.
 type Cubic = [f64; 20];
+
+/// Square of the relative residual of the constraints from which on a root has all its digits.
+const EXACT: f64 = 1e-26;
 
 /// Four vectors that span the null space of five equations.
 type Basis = [[f64; 9]; 4];
@@ -56,7 +59,7 @@ pub fn essential_five_point(a: &[Point2<f64>; 5], b: &[Point2<f64>; 5], mut foun
     }
     for &z in real_roots(&determinant).iter() {
         let at = |c: &[f64]| c.iter().rev().fold(0.0, |s, c| s * z + c);
-        let row = |i: usize| nalgebra::Vector3::new(at(&x[i]), at(&y[i]), at(&one[i]));
+        let row = |i: usize| Vector3::new(at(&x[i]), at(&y[i]), at(&one[i]));
         let r = [row(0), row(1), row(2)];
         // (x, y, 1) is perpendicular to the rows: the longest of their cross products.
         let mut best = r[0].cross(&r[1]);
@@ -65,16 +68,44 @@ pub fn essential_five_point(a: &[Point2<f64>; 5], b: &[Point2<f64>; 5], mut foun
                 best = c;
             }
         }
-        let (px, py) = (best.x / best.z, best.y / best.z);
-        let e = Matrix3::from_fn(|i, j| {
-            let k = 3 * i + j;
-            px * basis[0][k] + py * basis[1][k] + z * basis[2][k] + basis[3][k]
-        });
+        let e = polished(&basis, Vector3::new(best.x / best.z, best.y / best.z, z));
         let norm = e.norm();
         if norm.is_finite() && norm > 0.0 {
             found(e * (std::f64::consts::SQRT_2 / norm));
         }
     }
+}
+
+/// The matrix at (x, y, z), after Newton's steps on the constraints themselves where it obeys them to less than all digits: where two roots are close, elimination
+/// and the polynomial of degree ten leave five of them.
+#[inline]
+fn polished(basis: &Basis, mut at: Vector3<f64>) -> Matrix3<f64> {
+    let parts = basis.map(|b| Matrix3::from_row_slice(&b));
+    let matrix = |p: &Vector3<f64>| parts[0] * p.x + parts[1] * p.y + parts[2] * p.z + parts[3];
+    let mut e = matrix(&at);
+    for _ in 0..2 {
+        // 2 E Eᵀ E − tr(E Eᵀ) E; a determinant of zero follows.
+        let gram = e * e.transpose();
+        let trace = gram.trace();
+        let residual = gram * e * 2.0 - e * trace;
+        if residual.norm_squared() <= EXACT * trace * trace * trace {
+            break;
+        }
+        let inner = e.transpose() * e;
+        let change =
+            |b: &Matrix3<f64>| (b * inner + e * b.transpose() * e + gram * b) * 2.0 - e * (2.0 * b.dot(&e)) - b * trace;
+        let changes = [change(&parts[0]), change(&parts[1]), change(&parts[2])];
+        let normal = Matrix3::from_fn(|i, j| changes[i].dot(&changes[j]));
+        let right = Vector3::from_fn(|i, _| changes[i].dot(&residual));
+        let Some(inverse) = normal.try_inverse() else { break };
+        let next = at - inverse * right;
+        let moved = matrix(&next);
+        if !moved.norm_squared().is_finite() {
+            break;
+        }
+        (at, e) = (next, moved);
+    }
+    e
 }
 
 /// The null space of the five equations and, of the ten cubics in its coordinates, what elimination leaves of six.

@@ -283,8 +283,8 @@ mod tests {
     use crate::testing::{TwoViews, cosine};
     use proptest::prelude::*;
 
-    fn angle(a: &Vector3<f64>, b: &Vector3<f64>) -> f64 {
-        a.cross(b).norm().atan2(a.dot(b))
+    fn turn_between(a: &Rotation3<f64>, b: &Rotation3<f64>) -> f64 {
+        Pose::new(a.inverse() * b, Vector3::zeros()).rotation_angle()
     }
 
     proptest! {
@@ -378,12 +378,11 @@ mod tests {
         let (one, four) = (run(1), run(4));
         assert!(one.iterations > 2048 + 256, "{}", one.iterations);
         assert_eq!(one, four);
-        assert!(views.pose.rotation.angle_to(&one.model.rotation).to_degrees() < 1.0);
+        assert!(pose_difference(&views.pose, &one.model)[0].to_degrees() < 1.0);
     }
 
     #[test]
     fn one_of_the_five_point_solutions_is_the_truth_and_all_are_essential() {
-        let mut missed = 0;
         for seed in 0..1000 {
             let views = TwoViews::random(seed);
             let m = views.normalised_matches(5, 0.0);
@@ -399,10 +398,9 @@ mod tests {
                 }
             });
             assert!(count <= 10);
-            missed += usize::from(1.0 - best > 1e-9);
+            // The sine of the angle is the root of twice that: 1e-6, where roundings of 1e-16 meet two roots that are apart by 1e-10.
+            assert!(1.0 - best < 1e-12, "{seed}: {:e}", 1.0 - best);
         }
-        // Where two roots nearly coincide half of the digits are lost, and one in a few hundred random samples is such.
-        assert!(missed <= 10, "{missed}");
     }
 
     #[test]
@@ -415,16 +413,15 @@ mod tests {
             let (normalised, unit) = normalize_matches(&m, &views.camera, &views.camera);
             let options = RobustOptions { threshold: 1.5 * unit, seed, ..RobustOptions::default() };
             let found = estimate_relative_pose(&normalised, &options).unwrap();
-            let rotation = (found.model.rotation.inverse() * views.pose.rotation).angle().to_degrees();
-            errors.push((rotation, angle(&found.model.translation, &views.pose.translation).to_degrees()));
+            errors.push(pose_difference(&found.model, &views.pose).map(f64::to_degrees));
             let right = found.inliers.iter().filter(|i| **i < 150).count();
             // 1.5 px is three standard deviations; a wrong match is that close to a line with a chance of about 3 in 480.
             assert!(right >= 140 && found.inliers.len() - right <= 15);
         }
-        errors.sort_by(|a, b| (a.0 + a.1).total_cmp(&(b.0 + b.1)));
+        errors.sort_by(|a, b| (a[0] + a[1]).total_cmp(&(b[0] + b[1])));
         // Half a pixel at 500 px of focal length is 0.06 degrees for one ray; 150 of them fix rotation and direction to a few
         // hundredths and tenths; the worst of forty has its points and its motion in the least favourable place.
-        assert!(errors[20].0 < 0.3 && errors[20].1 < 1.0 && errors[39].1 < 5.0, "{errors:?}");
+        assert!(errors[20][0] < 0.3 && errors[20][1] < 1.0 && errors[39][1] < 5.0, "{errors:?}");
     }
 
     #[test]
@@ -438,7 +435,7 @@ mod tests {
             let (normalised, unit) = normalize_matches(&m, &views.camera, &views.camera);
             let options = RobustOptions { threshold: 1.5 * unit, seed, ..RobustOptions::essential() };
             let found = estimate_relative_pose(&normalised, &options).unwrap();
-            errors.push(angle(&found.model.translation, &views.pose.translation).to_degrees());
+            errors.push(pose_difference(&found.model, &views.pose)[1].to_degrees());
         }
         errors.sort_by(f64::total_cmp);
         // Ten times the uncertainty of a base line of one unit, a few tenths of a degree per pixel of noise; and never the other way round, which
@@ -457,7 +454,7 @@ mod tests {
         turned[3].b.x += 0.3;
         let (rotation, share) = rotation_between(&turned, 1e-3).unwrap();
         // One wrong match of sixty keeps a weight of a three-hundredth.
-        assert!((rotation.inverse() * turn).angle() < 1e-4 && share == 59.0 / 60.0);
+        assert!(turn_between(&rotation, &turn) < 1e-4 && share == 59.0 / 60.0);
         assert!(rotation_between(&views.normalised_matches(60, 0.0), 1e-3).unwrap().1 < 0.5);
         assert!(rotation_between(&turned[..1], 1e-3).is_err());
     }

@@ -260,9 +260,9 @@ mod tests {
             errors.push(views.exact_rms(&found.model));
         }
         errors.sort_by(f64::total_cmp);
-        // Twenty points fix what the plane leaves open; a degenerate answer is off by tens of pixels. Now and then a few wrong
-        // matches agree on another epipole as well as the few right ones do.
-        assert!(errors[10] < 0.3 && errors[17] < 1.0, "{errors:?}");
+        // Twenty points of 0.3 px fix what the plane leaves open, two degrees of freedom, to 0.3 px · √(2/20) = 0.1 px where they are spread; a degenerate answer is
+        // off by tens of pixels, and one within the threshold of every exact point is none.
+        assert!(errors[10] < 0.2 && errors[19] < 1.0, "{errors:?}");
     }
 
     #[test]
