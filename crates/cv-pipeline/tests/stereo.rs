@@ -54,8 +54,10 @@ fn depth_is_within_five_percent_and_exposure_does_not_matter() {
         }
         let share = |[all, good]: [u32; 2]| 100.0 * f64::from(good) / f64::from(all);
         println!("{name}: {:.2} % within 5 %, at one stop less {:.2} % within 1 px", share(here), share(here_exposed));
-        // No scene far below the rest: room 3 has a dark wooden floor with less texture than noise.
-        assert!(share(here) >= 96.0 && share(here_exposed) >= 95.0, "{name}: {here:?} {here_exposed:?}");
+        // No scene far below the rest. Every table is above both bars; rooms 1 to 3 lie below the first and room 3 below the second: floors
+        // of planks that run along the rows have nothing to match, and take the depth of what stands on them for some pixels around.
+        let least = if name.starts_with("room") { (96.8, 96.0) } else { (98.0, 97.0) };
+        assert!(share(here) >= least.0 && share(here_exposed) >= least.1, "{name}: {here:?} {here_exposed:?}");
         for i in 0..2 {
             depth[i] += here[i];
             exposed[i] += here_exposed[i];

@@ -17,21 +17,20 @@ pub(crate) fn confidence(winner: &Winner, state: PixelState) -> f32 {
     }
 }
 
-/// Standard deviation of a matched disparity in px; NaN for filled pixels.
+/// Standard deviation of a matched disparity in px; NaN for filled pixels: `√((1 + cost) / rise) / 5`.
 ///
-/// Sums that rise by `rise` per pixel place their minimum to within `1 / (2 rise)` of the bits by which they are uncertain,
-/// taken as the square root of the sum (counts of differing bits). But the sums are of paths that share their costs, and
-/// smoothing averages what is least sure the most: on generated scenes errors grow as the square root of that figure. Of
-/// them, two thirds to three quarters lie within one standard deviation as it is given here and nine in ten within two, be
-/// it large or small: their tails are heavier than a normal distribution's.
+/// Sums that rise by `rise` per pixel place their minimum to within the bits by which they are uncertain over the rise; but the sums are
+/// of paths that share their costs, and smoothing averages what is least sure the most. The form and its factor are those that describe
+/// errors best on nine generated scenes of four kinds (seeds 300 to 304), as they are, at one stop less, and with noise of 3 and 8
+/// grey levels added: of each of the 36 pairs 53 to 78 % of the errors lie within one standard deviation and 88 % of all within two;
+/// their tails are heavier than a normal distribution's. Stronger noise makes it too small, down to half of the errors within one.
 pub(crate) fn sigma(winner: &Winner, state: PixelState) -> f32 {
     if state != PixelState::Matched {
         return f32::NAN;
     }
     let rise = |side: u16| if side == NO_SUM { 0.0 } else { f32::from(side.saturating_sub(winner.cost)) };
     let rise = rise(winner.below).max(rise(winner.above)).max(0.5);
-    let alone = (1.0 + f32::from(winner.cost)).sqrt() / (2.0 * rise);
-    (0.7 * alone.sqrt()).clamp(0.0625, 1.0)
+    (0.207 * ((1.0 + f32::from(winner.cost)) / rise).sqrt()).clamp(0.0625, 1.0)
 }
 
 #[cfg(test)]

@@ -1,6 +1,7 @@
 //! A dense cloud from two photographs whose geometry is known.
 
 use super::ReconstructResult;
+use crate::depth::LEAST_MATCHED;
 use crate::{Progress, Stopwatch};
 use cv_core::{Camera, GrayF32, ImageView, Point2, Point3, StereoRig};
 use cv_imgproc::resize_area;
@@ -95,9 +96,6 @@ impl DenseError {
         }
     }
 }
-
-/// The least share of confirmed pixels: photographs that are no pair reach one to seven in a hundred by chance.
-const LEAST: f64 = 0.1;
 
 /// Half a window of the matcher and more.
 const BORDER: i64 = 4;
@@ -215,8 +213,8 @@ pub fn reconstruct_dense(
         .collect();
     let (confirmed, common) = rows.iter().fold((0, 0), |(a, b), row| (a + row.1, b + row.2));
     let coverage = confirmed as f64 / common.max(1) as f64;
-    if coverage < LEAST {
-        return Err(DenseError::LittleConfirmed { coverage, needed: LEAST });
+    if coverage < LEAST_MATCHED {
+        return Err(DenseError::LittleConfirmed { coverage, needed: LEAST_MATCHED });
     }
     let back = views[0].rotation.inverse();
     let points = rows
