@@ -71,9 +71,9 @@ impl NoPairCause {
     }
 }
 
-/// Between the quartiles of chance matches' vertical distances lies about a third of the height; a pair that is ten degrees askew
-/// stays below this share of it.
-const SPREAD: f64 = 0.15;
+/// Between the quartiles of chance matches' vertical distances lies about a third of the height; a pair whose rows are askew by ten
+/// degrees stays below this share of it.
+const SPREAD: f64 = 0.1;
 
 /// Looks at the matches of a pair that was refused.
 pub(crate) fn cause<T: Intensity, const C: usize>(
@@ -103,7 +103,7 @@ pub(crate) fn cause<T: Intensity, const C: usize>(
     if common.len() < NEEDED.max(n / 2) {
         // Cameras that are not aligned shift neighbours alike; chance matches are anywhere.
         let spread = apart[3 * n / 4] - apart[n / 4];
-        return if spread <= SPREAD * left.height() as f64 {
+        return if n >= 2 * NEEDED && spread <= SPREAD * left.height() as f64 {
             NoPairCause::Rows { apart: apart[n / 2].abs() }
         } else {
             NoPairCause::Unrelated { matches: common.len() }

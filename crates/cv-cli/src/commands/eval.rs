@@ -119,7 +119,7 @@ impl Disparity {
             page.section("Fractions").plot(
                 &fractions(estimate.as_slice().iter().copied()),
                 "How often the estimate has each fraction of a pixel. Whole pixels that stand out (pixel locking) betray a poor \
-                 fit between pixels, unless the truth stands out likewise:",
+                 fit between pixels, unless the truth stands out likewise.",
             );
             page.section("Fractions of the truth")
                 .plot(&fractions(truth.as_slice().iter().copied()), "The same of the true disparities.");
