@@ -26,6 +26,7 @@ mod depth;
 mod error;
 mod evaluate;
 mod fill;
+mod forest;
 mod input;
 mod kernel;
 mod layout;

@@ -5,6 +5,7 @@
 //! [`crate::fill`] takes are a step on a slanted surface, and too far or too near where the hole reaches the border.
 
 use crate::PixelState;
+use crate::forest::{find, join};
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 
@@ -32,6 +33,8 @@ const MAX_SLOPE: f64 = 0.3;
 #[derive(Debug, Default)]
 pub(crate) struct Planes {
     runs: Vec<Run>,
+    /// An earlier run of the same hole, or the run itself.
+    parents: Vec<u32>,
     /// Number of pixels of each hole, at its first run; then its place among the large ones.
     sizes: Vec<usize>,
     samples: Vec<Vec<Sample>>,
@@ -44,8 +47,6 @@ struct Run {
     y: usize,
     start: usize,
     end: usize,
-    /// An earlier run of the same hole, or itself.
-    parent: usize,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -76,13 +77,12 @@ pub(crate) fn fill_planes(
     if width == 0 || disparity.is_empty() {
         return;
     }
-    let Planes { runs, sizes, samples, planes } = memory;
-    find_runs(states, width, runs);
+    let Planes { runs, parents, sizes, samples, planes } = memory;
+    find_runs(states, width, runs, parents);
     sizes.clear();
     sizes.resize(runs.len(), 0);
-    for i in 0..runs.len() {
-        let root = find(runs, i);
-        sizes[root] += runs[i].end - runs[i].start;
+    for (i, run) in runs.iter().enumerate() {
+        sizes[find(parents, i as u32) as usize] += run.end - run.start;
     }
     let mut large = 0;
     for size in sizes.iter_mut() {
@@ -98,17 +98,16 @@ pub(crate) fn fill_planes(
     }
     samples.iter_mut().for_each(Vec::clear);
     samples.resize_with(large.max(samples.len()), Vec::new);
-    for i in 0..runs.len() {
-        let place = sizes[find(runs, i)];
+    for (i, run) in runs.iter().enumerate() {
+        let place = sizes[find(parents, i as u32) as usize];
         if let Some(samples) = samples.get_mut(place) {
-            collect(disparity, states, grey, width, &runs[i], samples);
+            collect(disparity, states, grey, width, run, samples);
         }
     }
     samples[..large].par_iter().map(|samples| fit(samples)).collect_into_vec(planes);
-    for i in 0..runs.len() {
-        let place = sizes[find(runs, i)];
+    for (i, &Run { y, start, end }) in runs.iter().enumerate() {
+        let place = sizes[find(parents, i as u32) as usize];
         let Some(Some(plane)) = planes.get(place) else { continue };
-        let Run { y, start, end, .. } = runs[i];
         let first = plane.slope.1 * (y as f64 - plane.origin.1) + plane.d;
         for (x, d) in disparity[y * width..][start..end].iter_mut().enumerate() {
             let value = plane.slope.0 * ((start + x) as f64 - plane.origin.0) + first;
@@ -118,15 +117,17 @@ pub(crate) fn fill_planes(
 }
 
 /// Runs of mismatched pixels, joined where they touch from row to row.
-fn find_runs(states: &[PixelState], width: usize, runs: &mut Vec<Run>) {
+fn find_runs(states: &[PixelState], width: usize, runs: &mut Vec<Run>, parents: &mut Vec<u32>) {
     runs.clear();
+    parents.clear();
     let mut above = 0..0;
     for (y, row) in states.chunks_exact(width).enumerate() {
         let first = runs.len();
         let mut x = 0;
         while let Some(start) = next(row, x) {
             let end = row[start..].iter().position(|&s| s != PixelState::Mismatched).map_or(width, |n| start + n);
-            runs.push(Run { y, start, end, parent: runs.len() });
+            parents.push(runs.len() as u32);
+            runs.push(Run { y, start, end });
             x = end;
         }
         let mut up = above.start;
@@ -136,8 +137,7 @@ fn find_runs(states: &[PixelState], width: usize, runs: &mut Vec<Run>) {
             }
             let mut other = up;
             while other < above.end && runs[other].start < runs[i].end {
-                let (a, b) = (find(runs, other), find(runs, i));
-                runs[a.max(b)].parent = a.min(b);
+                join(parents, other as u32, i as u32);
                 other += 1;
             }
         }
@@ -153,22 +153,13 @@ fn next(row: &[PixelState], x: usize) -> Option<usize> {
     row[from..].iter().position(mismatched).map(|n| from + n)
 }
 
-fn find(runs: &mut [Run], mut i: usize) -> usize {
-    while runs[i].parent != i {
-        let up = runs[runs[i].parent].parent;
-        runs[i].parent = up;
-        i = up;
-    }
-    i
-}
-
 /// Matched pixels before, after, above and below a run that look like the pixel of it next to them.
 fn collect(
     disparity: &[f32],
     states: &[PixelState],
     grey: &[u8],
     width: usize,
-    &Run { y, start, end, .. }: &Run,
+    &Run { y, start, end }: &Run,
     samples: &mut Vec<Sample>,
 ) {
     let height = disparity.len() / width;

@@ -1,6 +1,7 @@
 //! Removal of small patches that agree only with themselves.
 
 use crate::PixelState;
+use crate::forest::join;
 use rayon::prelude::*;
 
 /// Rows per strip: strips are labelled side by side, then joined. Small enough to occupy every core.
@@ -157,21 +158,6 @@ fn join_rows(up: Row<'_>, here: Row<'_>, range: f32, parents: &mut [u32]) {
             next += 1;
         }
     }
-}
-
-fn find(labels: &mut [u32], mut i: u32) -> u32 {
-    while labels[i as usize] != i {
-        let up = labels[labels[i as usize] as usize];
-        labels[i as usize] = up;
-        i = up;
-    }
-    i
-}
-
-fn join(labels: &mut [u32], a: u32, b: u32) {
-    let (a, b) = (find(labels, a), find(labels, b));
-    // The smaller index becomes the root, whatever the order of the joins.
-    labels[a.max(b) as usize] = a.min(b);
 }
 
 #[cfg(test)]
