@@ -25,5 +25,7 @@ pub use linear::{
     LinearError, Svd3, null_space, null_vector, smallest_eigenvector, solve_positive_definite,
     solve_positive_definite_dense, svd3, symmetric_eigen,
 };
-pub use polynomial::{Roots, real_roots, real_roots_cubic, real_roots_quadratic, real_roots_quartic};
+pub use polynomial::{
+    Roots, farthest_root_cubic, real_roots, real_roots_cubic, real_roots_quadratic, real_roots_quartic,
+};
 pub use robust_loss::RobustLoss;

@@ -2,7 +2,7 @@
 
 use super::WorldMatch;
 use cv_core::{Matrix3, Pose, Rotation3, Vector3};
-use cv_numeric::{real_roots_cubic, real_roots_quadratic};
+use cv_numeric::{farthest_root_cubic, real_roots_quadratic};
 
 /// The poses (at most four), world to camera, that see three world points at three places, in normalised coordinates.
 ///
@@ -36,19 +36,20 @@ pub fn pose_three_points(m: &[WorldMatch; 3], mut found: impl FnMut(Pose)) {
         trace(&adj2, &one),
         two.column(0).dot(&adj2.column(0)),
     ];
-    // The member of the pencil that is a pair of real planes, the most clearly so.
-    let (mut best, mut planes) = (0.0, None);
-    for &g in real_roots_cubic(cubic).iter() {
-        let d = one + two * g;
-        let b = adjugate(&d);
-        let i = (0..3).max_by(|&i, &j| (-b[(i, i)]).total_cmp(&-b[(j, j)])).unwrap_or(0);
-        let strength = -b[(i, i)] / d.norm_squared();
-        if strength > best {
-            best = strength;
-            planes = Some((d, b.column(i) * (1.0 / (-b[(i, i)]).sqrt())));
-        }
+    // Of the pencil's degenerate members the one that is the best determined. Where it is no pair of real planes (beside two others, both
+    // complex or both real), the two forms vanish together nowhere.
+    let pencil = if cubic[3].abs() < cubic[0].abs() {
+        farthest_root_cubic([cubic[3], cubic[2], cubic[1], cubic[0]]).map(|g| one * g + two)
+    } else {
+        farthest_root_cubic(cubic).map(|g| one + two * g)
+    };
+    let Some(d) = pencil else { return };
+    let b = adjugate(&d);
+    let i = (0..3).max_by(|&i, &j| (-b[(i, i)]).total_cmp(&-b[(j, j)])).unwrap_or(0);
+    if b[(i, i)] >= 0.0 {
+        return;
     }
-    let Some((d, axis)) = planes else { return };
+    let axis = b.column(i) * (1.0 / (-b[(i, i)]).sqrt());
     // D + [axis]× is the product of the two planes.
     let product = d + axis.cross_matrix();
     let (r, c) = product.iamax_full();
