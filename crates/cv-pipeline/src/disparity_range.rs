@@ -1,7 +1,7 @@
 //! Which disparities a pair shows, from sparse matches.
 
 use crate::{MatchingError, MatchingOptions, Progress, match_photos};
-use cv_core::ImageView;
+use cv_core::{Correspondence, ImageView};
 
 /// Why no range was found.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -27,7 +27,12 @@ pub enum RangeError {
 pub(crate) const NEEDED: usize = 16;
 
 /// Features in a common row differ by no more than this in y, in px.
-pub(crate) const COMMON_ROW: f64 = 1.5;
+const COMMON_ROW: f64 = 1.5;
+
+/// Disparities of those matches that lie in a common row.
+pub(crate) fn in_common_rows(matches: &[Correspondence]) -> Vec<f64> {
+    matches.iter().filter(|m| (m.a.y - m.b.y).abs() <= COMMON_ROW).map(|m| m.a.x - m.b.x).collect()
+}
 
 /// Smallest disparity and number of disparities that a rectified pair shows: those of feature matches in common rows
 /// between their 1 % and 99 % quantiles, and an eighth of that and 4 px more at both ends for what features miss.
@@ -40,8 +45,7 @@ pub fn disparity_range(
     progress: &dyn Progress,
 ) -> Result<(i32, usize), RangeError> {
     let pairs = match_photos(left, right, &MatchingOptions::default(), progress)?.pairs;
-    let disparities: Vec<f64> =
-        pairs.iter().filter(|p| (p.a.y - p.b.y).abs() <= COMMON_ROW).map(|p| p.a.x - p.b.x).collect();
+    let disparities = in_common_rows(&pairs);
     if disparities.len() < NEEDED {
         return Err(RangeError::TooFew { found: disparities.len(), matches: pairs.len(), needed: NEEDED });
     }

@@ -1,6 +1,6 @@
 //! Why hardly any pixel of one photograph has a partner in the other, as far as feature matches tell.
 
-use crate::disparity_range::{COMMON_ROW, NEEDED, range_of};
+use crate::disparity_range::{NEEDED, in_common_rows, range_of};
 use crate::{MatchingOptions, Progress, match_photos};
 use cv_core::{ImageView, RgbU8};
 use cv_stereo::{Intensity, StereoOptions};
@@ -97,8 +97,7 @@ pub(crate) fn cause<T: Intensity, const C: usize>(
         return NoPairCause::Unrelated { matches: n };
     }
     apart.sort_unstable_by(f64::total_cmp);
-    let common: Vec<f64> =
-        found.pairs.iter().filter(|p| (p.a.y - p.b.y).abs() <= COMMON_ROW).map(|p| p.a.x - p.b.x).collect();
+    let common = in_common_rows(&found.pairs);
     // Wrong matches are few: most lie in common rows where the pair is rectified.
     if common.len() < NEEDED.max(n / 2) {
         // Cameras that are not aligned shift neighbours alike; chance matches are anywhere.
