@@ -152,13 +152,9 @@ pub(crate) fn point_degeneracy<'a>(
     needed: usize,
     width: f64,
 ) -> Option<Degeneracy> {
-    for image in [0, 2] {
-        let points = pairs.clone().map(|p| [p[image], p[image + 1]]);
-        if fewer_than(needed, points.clone()) {
-            return Some(Degeneracy::Coincident);
-        }
-        let n = points.clone().count() as f64;
-        let (mx, my) = points.clone().fold((0.0, 0.0), |(x, y), p| (x + p[0] / n, y + p[1] / n));
+    in_either_image(pairs, needed, |points| {
+        let n = points.len() as f64;
+        let (mx, my) = points.iter().fold((0.0, 0.0), |(x, y), p| (x + p[0] / n, y + p[1] / n));
         let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
         for [x, y] in points {
             xx += (x - mx) * (x - mx) / n;
@@ -170,11 +166,8 @@ pub(crate) fn point_degeneracy<'a>(
         let larger = half + ((xx - yy) / 2.0).hypot(xy);
         let smaller = (xx * yy - xy * xy).max(0.0) / larger;
         // Rounding of the products above.
-        if smaller <= (width * width).max(1e-14 * larger) {
-            return Some(Degeneracy::Collinear);
-        }
-    }
-    None
+        (smaller <= (width * width).max(1e-14 * larger)).then_some(Degeneracy::Collinear)
+    })
 }
 
 /// As [`point_degeneracy`] for normalised coordinates of calibrated cameras, in which a line is a plane of rays: their root mean square angle from the
@@ -184,37 +177,42 @@ pub(crate) fn ray_degeneracy<'a>(
     needed: usize,
     width: f64,
 ) -> Option<Degeneracy> {
-    for image in [0, 2] {
-        let points = pairs.clone().map(|p| [p[image], p[image + 1]]);
-        if fewer_than(needed, points.clone()) {
-            return Some(Degeneracy::Coincident);
-        }
-        let (mut moment, mut n) = (Matrix3::zeros(), 0.0);
-        for [x, y] in points {
+    in_either_image(pairs, needed, |points| {
+        let mut moment = Matrix3::zeros();
+        for &[x, y] in points {
             let ray = Vector3::new(x, y, 1.0).normalize();
             moment += ray * ray.transpose();
-            n += 1.0;
         }
-        let mut squares = (moment / n).symmetric_eigenvalues();
+        let mut squares = (moment / points.len() as f64).symmetric_eigenvalues();
         squares.as_mut_slice().sort_unstable_by(f64::total_cmp);
         // Rounding of the products above.
         let limit = (width * width).max(1e-14);
-        if squares[0] <= limit {
-            return Some(if squares[1] <= limit { Degeneracy::Coincident } else { Degeneracy::Collinear });
-        }
-    }
-    None
+        let kind = if squares[1] <= limit { Degeneracy::Coincident } else { Degeneracy::Collinear };
+        (squares[0] <= limit).then_some(kind)
+    })
+}
+
+/// What is wrong with the points of the first image, or else of the second: fewer than `needed` different ones, or what `judge` finds.
+fn in_either_image<'a>(
+    pairs: impl Iterator<Item = &'a [f64; 4]> + Clone,
+    needed: usize,
+    judge: impl Fn(&[[f64; 2]]) -> Option<Degeneracy>,
+) -> Option<Degeneracy> {
+    [0, 2].into_iter().find_map(|image| {
+        let points: Vec<[f64; 2]> = pairs.clone().map(|p| [p[image], p[image + 1]]).collect();
+        if fewer_than(needed, &points) { Some(Degeneracy::Coincident) } else { judge(&points) }
+    })
 }
 
 /// Whether there are fewer than `needed` different points.
-fn fewer_than(needed: usize, points: impl Iterator<Item = [f64; 2]>) -> bool {
+fn fewer_than(needed: usize, points: &[[f64; 2]]) -> bool {
     let mut different: Vec<[f64; 2]> = Vec::with_capacity(needed);
     for p in points {
         if different.len() == needed {
             break;
         }
-        if !different.contains(&p) {
-            different.push(p);
+        if !different.contains(p) {
+            different.push(*p);
         }
     }
     different.len() < needed
