@@ -2,7 +2,7 @@
 //!
 //! Source: D. Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 60(2), 2004, sections 3 and 4.
 
-use crate::rows::Ring;
+use crate::ring::Ring;
 use crate::simd;
 use fearless_simd::Level;
 use nalgebra::{Matrix3, Vector3};

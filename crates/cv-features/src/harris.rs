@@ -4,7 +4,7 @@
 //! track", CVPR 1994.
 
 use crate::error::{FeatureError, check_image, check_option};
-use crate::rows::Ring;
+use crate::ring::Ring;
 use crate::simd;
 use crate::structure::{Structure, Walk};
 use cv_core::{GrayF32, ImageView, Keypoint};
@@ -169,22 +169,21 @@ pub(crate) fn quadratic_peak(v: [[f32; 3]; 3]) -> (f32, f32) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::rows::mirror;
     use crate::structure::{harris_at, products_at, smaller_eigenvalue};
     use cv_core::Image;
     use cv_imgproc::gaussian_blur;
+    use cv_imgproc::mirror_index;
     use cv_synth::instruction_sets;
     use proptest::prelude::*;
 
     /// The definition, whole image after whole image.
     fn plain_response(view: ImageView<'_, f32, 1>, options: &HarrisOptions) -> GrayF32 {
         let (w, h) = view.size();
-        let product =
-            |i: usize| {
-                GrayF32::from_fn(w, h, |x, y| {
-                    [products_at([-1, 0, 1].map(|dy| view.row(mirror(y as isize + dy, h))), x)[i]]
-                })
-            };
+        let product = |i: usize| {
+            GrayF32::from_fn(w, h, |x, y| {
+                [products_at([-1, 0, 1].map(|dy| view.row(mirror_index(y as isize + dy, h))), x)[i]]
+            })
+        };
         let [xx, xy, yy] = [0, 1, 2].map(|i| gaussian_blur(product(i).view(), options.window_sigma));
         GrayF32::from_fn(w, h, |x, y| {
             let ([xx], [xy], [yy]) = (xx.at(x, y), xy.at(x, y), yy.at(x, y));

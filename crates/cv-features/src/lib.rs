@@ -48,7 +48,7 @@ mod nearest;
 mod patch;
 mod pyramid;
 mod quantized;
-mod rows;
+mod ring;
 mod scale_space;
 mod sift;
 mod simd;

@@ -6,9 +6,10 @@
 //! reach; results do not depend on how the image is cut.
 
 use crate::dog::{Extremum, REACH, Search, find};
-use crate::rows::{Ring, mirror, mirror_ends};
+use crate::ring::Ring;
 use crate::simd;
 use cv_core::{GrayF32, Image, ImageView};
+use cv_imgproc::{mirror_ends, mirror_index};
 use fearless_simd::Level;
 use rayon::prelude::*;
 use std::ops::Range;
@@ -76,7 +77,7 @@ impl Source<'_> {
                 let Buffer { padded, phases: [evens, odds, both] } = buffer;
                 padded.resize(count + 2 * pad, 0.0);
                 let middle = &mut padded[left..left + b - a];
-                let row = |d: isize| &view.row(mirror((y / 2) as isize + d, h))[a..b];
+                let row = |d: isize| &view.row(mirror_index((y / 2) as isize + d, h))[a..b];
                 let mut rows: Vec<&[f32]> = Vec::with_capacity(2 * pad);
                 let r = pad as isize - 1;
                 if y.is_multiple_of(2) {
@@ -86,7 +87,7 @@ impl Source<'_> {
                     rows.extend((-r..=r + 1).map(row));
                     simd::vertical_between(level, middle, &rows, odd);
                 }
-                mirror_ends(padded, left, right);
+                mirror_ends::<1>(padded, left, right);
                 evens.resize(count, 0.0);
                 odds.resize(count, 0.0);
                 both.resize(2 * count, 0.0);
@@ -273,7 +274,7 @@ fn tile(plan: &Plan<'_>, strip: &mut Strip<'_>, columns: Range<usize>, found: &m
             let mut rows = Vec::with_capacity(2 * r + 1);
             previous.window(y, r, h, &(a..b), &mut rows);
             simd::vertical(plan.level, &mut padded[left..left + b - a], &rows, kernel);
-            mirror_ends(padded, left, right);
+            mirror_ends::<1>(padded, left, right);
             simd::horizontal(plan.level, ring.row_mut(y), padded, kernel);
 
             let difference = &mut differences[i - 1];

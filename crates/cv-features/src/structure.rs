@@ -4,9 +4,10 @@
 //! leaves. Sums are in the order of whole-image passes (window down, then along), so the result is theirs to the last bit.
 
 use crate::harris::CornerMeasure;
-use crate::rows::{Ring, mirror, mirror_ends};
+use crate::ring::Ring;
 use crate::simd;
 use cv_core::ImageView;
+use cv_imgproc::{mirror_ends, mirror_index};
 use fearless_simd::{Level, dispatch, prelude::*};
 
 /// What all strips of an image share.
@@ -49,7 +50,7 @@ impl<'a, 'b> Walk<'a, 'b> {
         let (w, h) = plan.view.size();
         let r = plan.kernel.len() - 1;
         while *next <= (y + r).min(h - 1) {
-            let rows = [-1, 0, 1].map(|d| plan.view.row(mirror(*next as isize + d, h)));
+            let rows = [-1, 0, 1].map(|d| plan.view.row(mirror_index(*next as isize + d, h)));
             let [xx, xy, yy] = products.each_mut().map(|p| p.row_mut(*next));
             multiply(plan.level, rows, [xx, xy, yy]);
             *next += 1;
@@ -58,7 +59,7 @@ impl<'a, 'b> Walk<'a, 'b> {
         for (product, smooth) in products.iter().zip(smooth.iter_mut()) {
             product.window(y, r, h, &(0..w), &mut rows);
             simd::vertical(plan.level, &mut padded[r..r + w], &rows, &plan.kernel);
-            mirror_ends(padded, r, r);
+            mirror_ends::<1>(padded, r, r);
             simd::horizontal(plan.level, smooth, padded, &plan.kernel);
         }
         measure(plan.level, plan.measure, smooth.each_ref().map(Vec::as_slice), out);
@@ -103,7 +104,7 @@ fn multiply_impl<S: Simd>(simd: S, [a, b, c]: [&[f32]; 3], [xx, xy, yy]: [&mut [
 /// gx², gx·gy and gy² at one pixel.
 #[inline(always)]
 pub(crate) fn products_at([a, b, c]: [&[f32]; 3], x: usize) -> [f32; 3] {
-    let (l, r) = (mirror(x as isize - 1, b.len()), mirror(x as isize + 1, b.len()));
+    let (l, r) = (mirror_index(x as isize - 1, b.len()), mirror_index(x as isize + 1, b.len()));
     let gx = ((a[r] - a[l]) + (b[r] - b[l]) * 2.0 + (c[r] - c[l])) * 0.125;
     let gy = ((c[l] - a[l]) + (c[x] - a[x]) * 2.0 + (c[r] - a[r])) * 0.125;
     [gx * gx, gx * gy, gy * gy]

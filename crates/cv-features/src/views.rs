@@ -5,11 +5,10 @@
 
 use crate::descriptors::Described;
 use crate::error::{FeatureError, check_image, check_option};
-use crate::rows::mirror_ends;
 use crate::sift::{SMALLEST, SiftOptions, sift};
 use crate::simd;
 use cv_core::{GrayF32, ImageView, Point2};
-use cv_imgproc::{Border, RemapOptions, gaussian_half_kernel, warp_with};
+use cv_imgproc::{Border, RemapOptions, gaussian_half_kernel, mirror_ends, warp_with};
 use rayon::prelude::*;
 
 /// SIFT features of the image turned by `rotation` radians and then compressed `tilt` times along x; positions, scales and angles in the image as it is.
@@ -81,7 +80,7 @@ fn compressed(image: &GrayF32, tilt: f32, width: usize) -> GrayF32 {
     let buffers = || (vec![0.0; w + 2 * r], vec![0.0; w]);
     out.as_mut_slice().par_chunks_mut(width).enumerate().for_each_init(buffers, |(padded, smooth), (y, row)| {
         padded[r..r + w].copy_from_slice(image.row(y));
-        mirror_ends(padded, r, r);
+        mirror_ends::<1>(padded, r, r);
         simd::horizontal(level, smooth, padded, &kernel);
         for (i, o) in row.iter_mut().enumerate() {
             let x = i as f32 * tilt;

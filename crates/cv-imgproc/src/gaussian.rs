@@ -1,6 +1,7 @@
 //! Separable filters: Gaussian smoothing and first derivatives.
 
-use crate::rows::{for_rows_with, mirror, mirror_ends};
+use crate::mirror::{mirror_ends, mirror_index};
+use crate::rows::for_rows_with;
 use crate::simd;
 use cv_core::{GrayF32, Image, ImageView};
 
@@ -47,9 +48,9 @@ pub fn separable_symmetric<const C: usize>(view: ImageView<'_, f32, C>, half: &[
     let buffers = || (vec![0.0f32; (w + 2 * r) * C], Vec::with_capacity(2 * r + 1));
     for_rows_with(&mut out, buffers, |(padded, sources), y, row| {
         sources.clear();
-        sources.extend((0..=2 * r).map(|i| view.row(mirror((y + i) as isize - r as isize, h))));
+        sources.extend((0..=2 * r).map(|i| view.row(mirror_index((y + i) as isize - r as isize, h))));
         simd::vertical(level, &mut padded[r * C..(r + w) * C], sources, half);
-        mirror_ends::<C>(padded, r);
+        mirror_ends::<C>(padded, r, r);
         simd::horizontal(level, row, padded, half, C);
     });
     out
@@ -66,8 +67,8 @@ pub fn sobel(view: ImageView<'_, f32, 1>) -> (GrayF32, GrayF32) {
     }
     let level = simd::level();
     crate::rows::for_rows2(&mut dx, &mut dy, |y, dx, dy| {
-        let above = view.row(mirror(y as isize - 1, h));
-        let below = view.row(mirror(y as isize + 1, h));
+        let above = view.row(mirror_index(y as isize - 1, h));
+        let below = view.row(mirror_index(y as isize + 1, h));
         simd::sobel(level, [above, view.row(y), below], dx, dy);
     });
     (dx, dy)
@@ -87,7 +88,7 @@ mod tests {
                 let mut sum = 0.0;
                 for j in -r..=r {
                     for i in -r..=r {
-                        let v = view.at(mirror(x as isize + i, w), mirror(y as isize + j, h))[c];
+                        let v = view.at(mirror_index(x as isize + i, w), mirror_index(y as isize + j, h))[c];
                         sum += f64::from(half[i.unsigned_abs()]) * f64::from(half[j.unsigned_abs()]) * f64::from(v);
                     }
                 }
@@ -124,7 +125,7 @@ mod tests {
             let (dx, dy) = sobel(image.view());
             for y in 0..h {
                 for x in 0..w {
-                    let at = |i: isize, j: isize| image.at(mirror(x as isize + i, w), mirror(y as isize + j, h))[0];
+                    let at = |i: isize, j: isize| image.at(mirror_index(x as isize + i, w), mirror_index(y as isize + j, h))[0];
                     let gx = at(1, -1) - at(-1, -1) + 2.0 * (at(1, 0) - at(-1, 0)) + at(1, 1) - at(-1, 1);
                     let gy = at(-1, 1) - at(-1, -1) + 2.0 * (at(0, 1) - at(0, -1)) + at(1, 1) - at(1, -1);
                     // Six terms of at most 2 in another order.

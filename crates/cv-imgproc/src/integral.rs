@@ -1,6 +1,7 @@
 //! Sums over rectangles in constant time, and the box filter.
 
-use crate::rows::{for_rows_with, mirror};
+use crate::mirror::mirror_index;
+use crate::rows::for_rows_with;
 use cv_core::{Image, ImageView};
 
 /// Sums over all rectangles from the top-left corner.
@@ -54,7 +55,7 @@ pub fn box_filter<const C: usize>(view: ImageView<'_, f32, C>, rx: usize, ry: us
     // Column sums of the previous row of the band, updated by the row that enters and the one that leaves.
     let buffers = || (Vec::<f64>::new(), 0usize);
     for_rows_with(&mut out, buffers, |(columns, last), y, row| {
-        let source = |d: isize| view.row(mirror(y as isize + d, h));
+        let source = |d: isize| view.row(mirror_index(y as isize + d, h));
         let ry = ry as isize;
         if columns.len() == w * C && *last + 1 == y {
             let (enters, leaves) = (source(ry), source(-ry - 1));
@@ -69,7 +70,7 @@ pub fn box_filter<const C: usize>(view: ImageView<'_, f32, C>, rx: usize, ry: us
             }
         }
         *last = y;
-        let at = |x: isize, c: usize| columns[mirror(x, w) * C + c];
+        let at = |x: isize, c: usize| columns[mirror_index(x, w) * C + c];
         let r = rx as isize;
         for c in 0..C {
             let mut sum: f64 = (-r..=r).map(|x| at(x, c)).sum();
@@ -104,7 +105,7 @@ mod tests {
             let mut mean = 0.0;
             for j in -ry..=ry {
                 for i in -rx..=rx {
-                    mean += f64::from(image.at(mirror(x as isize + i, w), mirror(y as isize + j, h))[0]);
+                    mean += f64::from(image.at(mirror_index(x as isize + i, w), mirror_index(y as isize + j, h))[0]);
                 }
             }
             mean /= ((2 * rx + 1) * (2 * ry + 1)) as f64;

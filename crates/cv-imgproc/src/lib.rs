@@ -30,6 +30,7 @@ mod components;
 mod gaussian;
 mod integral;
 mod median;
+mod mirror;
 mod morphology;
 mod pixel;
 mod pyramid;
@@ -50,6 +51,7 @@ pub use components::{
 pub use gaussian::{gaussian_blur, gaussian_half_kernel, separable_symmetric, sobel};
 pub use integral::{Integral, box_filter};
 pub use median::{median_filter_3x3, median_filter_5x5};
+pub use mirror::{mirror_ends, mirror_index};
 pub use morphology::{StructuringElement, close, dilate, erode, open};
 pub use pixel::Pixel;
 pub use pyramid::{gaussian_pyramid, pyr_down, pyr_up};

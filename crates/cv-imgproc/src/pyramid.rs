@@ -1,6 +1,7 @@
 //! Image pyramids (Burt & Adelson 1983).
 
-use crate::rows::{for_rows_with, mirror, mirror_ends};
+use crate::mirror::{mirror_ends, mirror_index};
+use crate::rows::for_rows_with;
 use cv_core::{Image, ImageView};
 
 /// Half the size (rounded up): smoothed by `[1 4 6 4 1]/16` both ways, then every second pixel of every second row from the top left (OpenCV's `pyrDown`).
@@ -13,12 +14,12 @@ pub fn pyr_down<const C: usize>(view: ImageView<'_, f32, C>) -> Image<f32, C> {
         &mut out,
         || vec![0.0f32; (w + 4) * C],
         |padded, y, row| {
-            let source = |d: isize| view.row(mirror(2 * y as isize + d, h));
+            let source = |d: isize| view.row(mirror_index(2 * y as isize + d, h));
             let (a, b, c, d, e) = (source(-2), source(-1), source(0), source(1), source(2));
             for (i, out) in padded[2 * C..(w + 2) * C].iter_mut().enumerate() {
                 *out = (a[i] + e[i]) + 4.0 * (b[i] + d[i]) + 6.0 * c[i];
             }
-            mirror_ends::<C>(padded, 2);
+            mirror_ends::<C>(padded, 2, 2);
             for (x, out) in row.chunks_exact_mut(C).enumerate() {
                 let p = &padded[2 * x * C..(2 * x + 5) * C];
                 for (c, out) in out.iter_mut().enumerate() {
@@ -42,7 +43,7 @@ pub fn pyr_up<const C: usize>(view: ImageView<'_, f32, C>, size: (usize, usize))
         return out;
     }
     // Before the first sample the mirrored second; after the last the last again, as OpenCV does.
-    let index = |i: isize, n: usize| if i < 0 { mirror(i, n) } else { (i as usize).min(n - 1) };
+    let index = |i: isize, n: usize| if i < 0 { mirror_index(i, n) } else { (i as usize).min(n - 1) };
     for_rows_with(
         &mut out,
         || vec![0.0f32; w * C],

@@ -1,4 +1,4 @@
-//! Rows of an image in parallel, and the mirror at its borders.
+//! Rows of an image in parallel.
 
 use cv_core::{Image, Sample};
 use rayon::prelude::*;
@@ -60,44 +60,9 @@ pub(crate) fn for_rows2<T: Sample, const C: usize, U: Sample, const D: usize>(
     }
 }
 
-/// Index `i` of a line of `n > 0` samples mirrored about its end samples (`dcb|abcd|cba`, OpenCV's BORDER_REFLECT_101).
-#[inline]
-pub(crate) fn mirror(i: isize, n: usize) -> usize {
-    let n = n as isize;
-    if (0..n).contains(&i) {
-        return i as usize;
-    }
-    if n == 1 {
-        return 0;
-    }
-    let period = 2 * (n - 1);
-    let i = i.rem_euclid(period);
-    (if i < n { i } else { period - i }) as usize
-}
-
-/// Fills the `r` pixels of `C` samples on each side of the middle of `padded` with its mirror image.
-#[inline]
-pub(crate) fn mirror_ends<const C: usize>(padded: &mut [f32], r: usize) {
-    let w = padded.len() / C - 2 * r;
-    for k in 1..=r {
-        for (to, from) in [(r - k, mirror(-(k as isize), w)), (r + w - 1 + k, mirror((w - 1 + k) as isize, w))] {
-            for c in 0..C {
-                padded[to * C + c] = padded[(r + from) * C + c];
-            }
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn mirrors_as_often_as_it_takes() {
-        let seen: Vec<usize> = (-5..7).map(|i| mirror(i, 3)).collect();
-        assert_eq!(seen, [1, 0, 1, 2, 1, 0, 1, 2, 1, 0, 1, 2]);
-        assert_eq!((mirror(-3, 1), mirror(4, 1)), (0, 0));
-    }
 
     #[test]
     fn every_row_is_visited_once_with_its_own_number() {

@@ -1,0 +1,53 @@
+//! Rings of the last few rows.
+
+use cv_imgproc::mirror_index;
+use std::ops::Range;
+
+/// The last rows of a part of an image.
+pub(crate) struct Ring {
+    data: Vec<f32>,
+    /// First column.
+    pub(crate) from: usize,
+    pub(crate) width: usize,
+    rows: usize,
+}
+
+impl Ring {
+    pub(crate) fn new(columns: Range<usize>, rows: usize) -> Self {
+        Self { data: vec![0.0; columns.len() * rows], from: columns.start, width: columns.len(), rows }
+    }
+
+    /// Row `y` of the image, from column `from` on.
+    #[inline]
+    pub(crate) fn row(&self, y: usize) -> &[f32] {
+        let start = (y % self.rows) * self.width;
+        &self.data[start..start + self.width]
+    }
+
+    pub(crate) fn row_mut(&mut self, y: usize) -> &mut [f32] {
+        let start = (y % self.rows) * self.width;
+        &mut self.data[start..start + self.width]
+    }
+
+    /// Columns `a..b` of the rows `y − r` to `y + r` of an image of `h` rows, mirrored at its ends.
+    pub(crate) fn window<'a>(
+        &'a self,
+        y: usize,
+        r: usize,
+        h: usize,
+        columns: &Range<usize>,
+        rows: &mut Vec<&'a [f32]>,
+    ) {
+        let (a, b) = (columns.start - self.from, columns.end - self.from);
+        rows.clear();
+        if y >= r && y + r < h {
+            let mut slot = (y - r) % self.rows;
+            for _ in 0..=2 * r {
+                rows.push(&self.data[slot * self.width..][a..b]);
+                slot = if slot + 1 == self.rows { 0 } else { slot + 1 };
+            }
+        } else {
+            rows.extend((0..=2 * r).map(|d| &self.row(mirror_index((y + d) as isize - r as isize, h))[a..b]));
+        }
+    }
+}
