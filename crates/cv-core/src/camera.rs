@@ -234,15 +234,26 @@ impl Camera {
         Point2::new(self.fx * n.x + self.cx, self.fy * n.y + self.cy)
     }
 
-    /// The same camera behind an image scaled by `factor` (0.5 for half size), pixel centres at integers.
+    /// The same camera behind an image scaled by `factor` (0.5 for half size), pixel centres at integers. Where the image was made of a whole
+    /// number of pixels, [`Self::resized`] says what it shows to the last digit.
     pub fn scaled(&self, factor: f64) -> Self {
+        let side = |n: usize| (n as f64 * factor).round() as usize;
+        self.stretched((side(self.width), side(self.height)), factor, factor)
+    }
+
+    /// The same camera behind an image resized to `width × height`: the corners of the pictures meet, not the centres of their corner pixels.
+    pub fn resized(&self, width: usize, height: usize) -> Self {
+        self.stretched((width, height), width as f64 / self.width as f64, height as f64 / self.height as f64)
+    }
+
+    fn stretched(&self, (width, height): (usize, usize), x: f64, y: f64) -> Self {
         Self {
-            width: (self.width as f64 * factor).round() as usize,
-            height: (self.height as f64 * factor).round() as usize,
-            fx: self.fx * factor,
-            fy: self.fy * factor,
-            cx: (self.cx + 0.5) * factor - 0.5,
-            cy: (self.cy + 0.5) * factor - 0.5,
+            width,
+            height,
+            fx: self.fx * x,
+            fy: self.fy * y,
+            cx: (self.cx + 0.5) * x - 0.5,
+            cy: (self.cy + 0.5) * y - 0.5,
             distortion: self.distortion,
         }
     }
@@ -314,6 +325,18 @@ mod tests {
         let camera = Camera::from_focal(640, 480, 500.0).scaled(0.5);
         assert_eq!((camera.width, camera.height, camera.fx), (320, 240, 250.0));
         assert_eq!((camera.cx, camera.cy), (159.5, 119.5));
+    }
+
+    #[test]
+    fn resizing_keeps_each_edge_where_it_is_though_the_sides_round_apart() {
+        let camera = Camera::pinhole(641, 479, 500.0, 510.0, 300.0, 250.0);
+        let small = camera.resized(100, 75);
+        // A ray through an edge of the picture goes through that edge of the small one: half a pixel outside the first and last centres.
+        for (x, y) in [(0.0, 0.0), (1.0, 1.0)] {
+            let ray = camera.normalize(Point2::new(641.0 * x - 0.5, 479.0 * y - 0.5));
+            let p = small.denormalize(ray);
+            assert!((p - Point2::new(100.0 * x - 0.5, 75.0 * y - 0.5)).norm() < 1e-12, "{p}");
+        }
     }
 
     #[test]

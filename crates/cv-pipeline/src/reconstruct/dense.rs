@@ -3,7 +3,7 @@
 use super::ReconstructResult;
 use crate::depth::LEAST_MATCHED;
 use crate::{Progress, Stopwatch};
-use cv_core::{Camera, GrayF32, ImageView, Point2, Point3, StereoRig};
+use cv_core::{GrayF32, ImageView, Point2, Point3, StereoRig};
 use cv_imgproc::resize_area;
 use cv_stereo::{CloudPoint, PixelState, RectifyError, SceneRectification, StereoError, StereoMatcher, StereoOptions};
 use rayon::prelude::*;
@@ -135,7 +135,8 @@ pub fn reconstruct_dense(
     progress.report("rectify", 0, 1);
     let longest = sparse.cameras.iter().map(|c| c.width.max(c.height)).max().unwrap_or(1);
     let factor = (options.max_size as f64 / longest as f64).min(1.0);
-    let cameras = sparse.cameras.map(|camera| reduced(&camera, factor));
+    let side = |n: usize| ((n as f64 * factor).round() as usize).max(1);
+    let cameras = sparse.cameras.map(|camera| camera.resized(side(camera.width), side(camera.height)));
     let rig = StereoRig { left: cameras[0], right: cameras[1], right_from_left: sparse.pose };
     let positions: Vec<Point3<f64>> = sparse.points.iter().map(|p| p.position).collect();
     let scene = SceneRectification::new(&rig, &positions)?;
@@ -249,21 +250,4 @@ pub fn reconstruct_dense(
     }
     watch.lap("cloud");
     Ok(DenseResult { points, depth, size, disparities: scene.disparities, coverage, stages: watch.into_stages() })
-}
-
-/// The camera of a photograph that is reduced.
-fn reduced(camera: &Camera, factor: f64) -> Camera {
-    let side = |n: usize| ((n as f64 * factor).round() as usize).max(1);
-    let (width, height) = (side(camera.width), side(camera.height));
-    let (rx, ry) = (width as f64 / camera.width as f64, height as f64 / camera.height as f64);
-    // The corners of the pictures meet, not the centres of their corner pixels.
-    Camera {
-        width,
-        height,
-        fx: camera.fx * rx,
-        fy: camera.fy * ry,
-        cx: (camera.cx + 0.5) * rx - 0.5,
-        cy: (camera.cy + 0.5) * ry - 0.5,
-        distortion: camera.distortion,
-    }
 }
