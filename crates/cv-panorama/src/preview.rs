@@ -4,7 +4,7 @@ use crate::elastic::Field;
 use crate::layout::{Bounds, Layout, Placement};
 use crate::projection::Surface;
 use crate::warp::{Map, Tone, Warped, warp};
-use cv_core::{ImageView, Point2, RgbU8};
+use cv_core::{Image, ImageView, Point2, RgbU8};
 use cv_imgproc::Interpolation;
 use rayon::prelude::*;
 
@@ -28,6 +28,30 @@ pub(crate) struct Piece {
 }
 
 impl Piece {
+    /// The blocks of two by two pixels that lie wholly within the bounds; reached where all four are.
+    fn halved(&self) -> Self {
+        let (b, pixels) = (self.warped.bounds, &self.warped.pixels);
+        let (left, top) = (b.left.div_ceil(2), b.top.div_ceil(2));
+        let bounds = Bounds { left, top, right: (b.right / 2).max(left), bottom: (b.bottom / 2).max(top) };
+        let (width, height) = (bounds.width(), bounds.height());
+        let corner = |x: usize, y: usize| (2 * (left + x) - b.left, 2 * (top + y) - b.top);
+        let pixels = Image::from_fn(width, height, |x, y| {
+            let (x, y) = corner(x, y);
+            let block = [pixels.at(x, y), pixels.at(x + 1, y), pixels.at(x, y + 1), pixels.at(x + 1, y + 1)];
+            let mean = |c: usize| ((block.iter().map(|p| u16::from(p[c])).sum::<u16>() + 2) / 4) as u8;
+            [mean(0), mean(1), mean(2), if block.iter().all(|p| p[3] > 0) { 255 } else { 0 }]
+        });
+        let at_corners = |values: &[f32]| {
+            let places = (0..height).flat_map(|y| (0..width).map(move |x| corner(x, y)));
+            places.map(|(x, y)| values[y * b.width() + x]).collect()
+        };
+        Self {
+            warped: Warped { bounds, pixels },
+            eccentricity: at_corners(&self.eccentricity),
+            radius: at_corners(&self.radius),
+        }
+    }
+
     /// Colour at a preview pixel; `None` where the photograph does not reach.
     #[inline]
     pub(crate) fn at(&self, x: usize, y: usize) -> Option<[u8; 3]> {
@@ -92,6 +116,12 @@ impl Preview {
             })
             .collect();
         Self { step, width, height, pieces }
+    }
+
+    /// The same at half the size.
+    pub(crate) fn halved(&self) -> Self {
+        let pieces = self.pieces.par_iter().map(Piece::halved).collect();
+        Self { step: 2 * self.step, width: self.width / 2, height: self.height / 2, pieces }
     }
 }
 
@@ -193,6 +223,31 @@ mod tests {
         }
         let e = &preview.pieces[0].eccentricity;
         assert!(e[0] > 0.8 && e[6 * 16 + 8] < 0.02);
+    }
+
+    #[test]
+    fn a_halved_piece_has_the_blocks_that_are_whole_and_wholly_reached() {
+        let bounds = Bounds { left: 3, top: 2, right: 10, bottom: 7 };
+        // Canvas pixel (7, 4) is not reached.
+        let pixels =
+            Image::from_fn(7, 5, |x, y| [(10 * x) as u8, (20 * y) as u8, 7, if (x, y) == (4, 2) { 0 } else { 255 }]);
+        let numbered: Vec<f32> = (0..35).map(|i| i as f32).collect();
+        let piece = Piece { warped: Warped { bounds, pixels }, eccentricity: numbered.clone(), radius: numbered };
+        let half = piece.halved();
+        assert_eq!(half.warped.bounds, Bounds { left: 2, top: 1, right: 5, bottom: 3 });
+        // Canvas pixels 4 and 5 of rows 2 and 3: the piece's columns 1 and 2, rows 0 and 1.
+        assert_eq!(half.at(2, 1), Some([15, 10, 7]));
+        assert_eq!(half.at(3, 2), None);
+        assert_eq!(half.at(4, 2), Some([55, 50, 7]));
+        assert_eq!(half.eccentricity, [1.0, 3.0, 5.0, 15.0, 17.0, 19.0]);
+    }
+
+    #[test]
+    fn halving_a_pixel_leaves_nothing() {
+        let bounds = Bounds { left: 3, top: 2, right: 4, bottom: 3 };
+        let pixels = Image::new(1, 1, [9, 9, 9, 255]);
+        let half = Piece { warped: Warped { bounds, pixels }, eccentricity: vec![0.0], radius: vec![0.0] }.halved();
+        assert!(half.warped.pixels.is_empty() && half.radius.is_empty());
     }
 
     #[test]

@@ -115,8 +115,52 @@ impl Labels {
     }
 }
 
-/// Labels on the preview.
+/// Preview pixels on either side of the seams of the halved preview among which the preview's own are found. Over the whole preview costs four times as
+/// much and finds seams that cost 0.4 to 3 % less.
+const NEAR: usize = 4;
+
+/// Labels on the preview: seams through it all at half its size, then near those.
 pub(crate) fn on_preview(preview: &Preview, gains: &[[f32; 3]], photo_of: &[usize], seams: Seams) -> Labels {
+    let mut labels = nearest_middle(preview);
+    if seams == Seams::Middle {
+        return labels;
+    }
+    let found = Misalignments::find(preview, photo_of);
+    let misaligned = |a: usize, b: usize, x: usize, y: usize| {
+        (MISALIGNED * (preview.step as f32 * found.at(a, b, x, y) - 1.0).clamp(0.0, FARTHEST)) as i32
+    };
+
+    let half = preview.halved();
+    let mut coarse = nearest_middle(&half);
+    // A pixel stands for four, a step of a seam for two.
+    let pixel =
+        |label: usize, x: usize, y: usize| (2.0 * BORDER_PIXEL * eccentricity(&half.pieces[label], x, y)) as i32;
+    // The first round does nearly all; four settle every set met so far.
+    let everywhere = |_, _| true;
+    expand(&mut coarse, &toned(&half, gains), pixel, |a, b, x, y| misaligned(a, b, 2 * x, 2 * y), everywhere, 4);
+
+    let width = preview.width;
+    for (i, label) in labels.data.iter_mut().enumerate() {
+        let (x, y) = (i % width, i / width);
+        if x / 2 < coarse.width && y / 2 < coarse.height {
+            let found = coarse.at(x / 2, y / 2);
+            if found != NONE && preview.pieces[usize::from(found)].at(x, y).is_some() {
+                *label = found;
+            }
+        }
+    }
+    let near = near_seams(&labels, NEAR);
+    let pixel = |label: usize, x: usize, y: usize| (BORDER_PIXEL * eccentricity(&preview.pieces[label], x, y)) as i32;
+    expand(&mut labels, &toned(preview, gains), pixel, misaligned, |x, y| near[y * width + x], 4);
+    labels
+}
+
+fn toned<'a>(preview: &'a Preview, gains: &[[f32; 3]]) -> Vec<Option<Toned<'a>>> {
+    preview.pieces.iter().zip(gains).map(|(p, g)| Some(Toned::new(&p.warped, *g))).collect()
+}
+
+/// Every pixel from the photograph whose middle is nearest.
+fn nearest_middle(preview: &Preview) -> Labels {
     let (width, height) = (preview.width, preview.height);
     let mut labels = Labels { width, height, data: vec![NONE; width * height] };
     for y in 0..height {
@@ -132,18 +176,6 @@ pub(crate) fn on_preview(preview: &Preview, gains: &[[f32; 3]], photo_of: &[usiz
                 labels.data[y * width + x] = i as u16;
             }
         }
-    }
-    if seams == Seams::GraphCut {
-        let pieces: Vec<Option<Toned<'_>>> =
-            preview.pieces.iter().zip(gains).map(|(p, g)| Some(Toned::new(&p.warped, *g))).collect();
-        let unary =
-            |label: usize, x: usize, y: usize| (BORDER_PIXEL * eccentricity(&preview.pieces[label], x, y)) as i32;
-        let found = Misalignments::find(preview, photo_of);
-        let misaligned = |a: usize, b: usize, x: usize, y: usize| {
-            (MISALIGNED * (preview.step as f32 * found.at(a, b, x, y) - 1.0).clamp(0.0, FARTHEST)) as i32
-        };
-        // The first round does nearly all; four settle every set met so far.
-        expand(&mut labels, &pieces, unary, misaligned, |_, _| true, 4);
     }
     labels
 }
