@@ -1,9 +1,11 @@
 //! Panoramas from overlapping photographs.
 
-use crate::matching::{MatchingOptions, PhotoFeatures, correspondences, extract_features, match_features};
+use crate::matching::{
+    FeatureMethod, MatchingOptions, PhotoFeatures, correspondences, extract_features, match_features,
+};
 use crate::{Progress, Stopwatch};
 use cv_core::{Camera, Correspondence, Image, ImageView, Mask, Point2, RgbU8};
-use cv_features::{Described, DescriptorKind, Descriptors};
+use cv_features::{Described, DescriptorKind, Descriptors, SiftOptions};
 use cv_panorama::{
     AlignError, AlignOptions, Alignment, CameraMotion, Canvas, NotAPair, Photo, PhotoMap, RenderError, RenderOptions,
     Unplaced, VerifiedPair, VerifyOptions, align, render, verify_pair,
@@ -32,7 +34,8 @@ impl<'a> PanoramaPhoto<'a> {
 /// Settings of [`panorama`].
 #[derive(Debug, Clone)]
 pub struct PanoramaOptions {
-    /// Features and matching.
+    /// Features and matching. SIFT starts from the enlarged image (`sift.upsample`) only where the features of the plain one do not hold the photographs
+    /// together firmly.
     pub matching: MatchingOptions,
     /// Pixels that photographs are reduced to (about) for features and alignment. 10,000 or more; default 800,000, in the range that OpenCV's stitcher
     /// and Hugin's control point finders use.
@@ -134,8 +137,8 @@ pub enum PanoramaError {
 
 /// Joins overlapping photographs, in any order, to a panorama.
 ///
-/// Features on reduced photographs, matches of every pair, verification of the pairs, alignment of all at once, drawing in full size. Photographs that do
-/// not belong are left out and say why.
+/// Features on reduced photographs, matches of every pair, verification of the pairs (all of it again with finer features where some hold only loosely),
+/// alignment of all at once, drawing in full size. Photographs that do not belong are left out and say why.
 ///
 /// # Errors
 /// [`PanoramaError`]: fewer than two photographs belong together, or the canvas would be too large.
@@ -146,31 +149,36 @@ pub fn panorama(
 ) -> Result<PanoramaResult, PanoramaError> {
     let mut watch = Stopwatch::new();
     let n = photos.len();
-    let done = AtomicUsize::new(0);
-    let tick = |stage, total| progress.report(stage, done.fetch_add(1, Ordering::Relaxed) + 1, total);
-    progress.report("features", 0, n);
-    let prepared: Vec<Prepared> = photos
-        .par_iter()
-        .map(|p| {
-            let prepared = Prepared::new(p, options);
+    let candidates: Vec<(usize, usize)> = (0..n).flat_map(|a| (a + 1..n).map(move |b| (a, b))).collect();
+    let mut look = |matching: &MatchingOptions| -> (Vec<Prepared>, Vec<Option<Tried>>) {
+        let done = AtomicUsize::new(0);
+        let tick = |stage, total| progress.report(stage, done.fetch_add(1, Ordering::Relaxed) + 1, total);
+        progress.report("features", 0, n);
+        let extract = |p| {
+            let prepared = Prepared::new(p, matching, options.registration_pixels);
             tick("features", n);
             prepared
-        })
-        .collect();
-    watch.lap("features");
-
-    let candidates: Vec<(usize, usize)> = (0..n).flat_map(|a| (a + 1..n).map(move |b| (a, b))).collect();
-    done.store(0, Ordering::Relaxed);
-    progress.report("match", 0, candidates.len());
-    let tried: Vec<Option<(PanoramaPair, Option<VerifiedPair>)>> = candidates
-        .par_iter()
-        .map(|&(a, b)| {
+        };
+        let prepared: Vec<Prepared> = photos.par_iter().map(extract).collect();
+        watch.lap("features");
+        done.store(0, Ordering::Relaxed);
+        progress.report("match", 0, candidates.len());
+        let compare = |&(a, b): &(usize, usize)| {
             let pair = try_pair(&prepared, a, b, options);
             tick("match", candidates.len());
             pair
-        })
-        .collect();
-    watch.lap("match");
+        };
+        let tried = candidates.par_iter().map(compare).collect();
+        watch.lap("match");
+        (prepared, tried)
+    };
+    let matching = &options.matching;
+    let plain = MatchingOptions { sift: SiftOptions { upsample: false, ..matching.sift.clone() }, ..matching.clone() };
+    // The enlarged image is most of the work of SIFT, and seldom needed.
+    let (mut prepared, mut tried) = look(&plain);
+    if matching.method == FeatureMethod::Sift && matching.sift.upsample && !held_firmly(n, &tried) {
+        (prepared, tried) = look(matching);
+    }
     progress.report("align", 0, 1);
     let (pairs, verified): (Vec<PanoramaPair>, Vec<Option<VerifiedPair>>) = tried.into_iter().flatten().unzip();
     let verified: Vec<VerifiedPair> = verified.into_iter().flatten().collect();
@@ -228,9 +236,9 @@ struct Prepared {
 }
 
 impl Prepared {
-    fn new(p: &PanoramaPhoto<'_>, options: &PanoramaOptions) -> Self {
+    fn new(p: &PanoramaPhoto<'_>, matching: &MatchingOptions, registration_pixels: usize) -> Self {
         let (w, h) = p.image.size();
-        let factor = ((w * h) as f64 / options.registration_pixels.max(10_000) as f64).sqrt().max(1.0);
+        let factor = ((w * h) as f64 / registration_pixels.max(10_000) as f64).sqrt().max(1.0);
         let none = || PhotoFeatures {
             described: Described {
                 keypoints: Vec::new(),
@@ -247,7 +255,7 @@ impl Prepared {
             Some(small) => (small.view(), w as f64 / size.0 as f64),
             None => (p.image, 1.0),
         };
-        let (features, failure) = match extract_features(image, &options.matching) {
+        let (features, failure) = match extract_features(image, matching) {
             Ok(features) => (features, None),
             Err(error) => (none(), Some(error.to_string())),
         };
@@ -258,13 +266,26 @@ impl Prepared {
     }
 }
 
+/// A pair that was matched, and what verification left of it.
+type Tried = (PanoramaPair, Option<VerifiedPair>);
+
+/// Agreeing matches that hold two photographs together firmly: with 66 and more, neighbours of sixteen rendered sets lie within 0.16 px of the truth; with
+/// those of the enlarged image too, within 0.08 px.
+const FIRM: usize = 50;
+
+/// Whether all photographs hang together by links that are firm.
+fn held_firmly(n: usize, tried: &[Option<Tried>]) -> bool {
+    let mut group: Vec<usize> = (0..n).collect();
+    let verified = tried.iter().flatten().filter_map(|(_, verified)| verified.as_ref());
+    for link in verified.filter(|v| v.inliers.len() >= FIRM) {
+        let (to, from) = (group[link.a], group[link.b]);
+        group.iter_mut().filter(|g| **g == from).for_each(|g| *g = to);
+    }
+    group.iter().all(|g| *g == group[0])
+}
+
 /// Matches and verifies a pair; `None` where one has no features.
-fn try_pair(
-    prepared: &[Prepared],
-    a: usize,
-    b: usize,
-    options: &PanoramaOptions,
-) -> Option<(PanoramaPair, Option<VerifiedPair>)> {
+fn try_pair(prepared: &[Prepared], a: usize, b: usize, options: &PanoramaOptions) -> Option<Tried> {
     let (p, q) = (&prepared[a], &prepared[b]);
     let found = match_features(&p.features, &q.features, &options.matching).ok()?;
     let matches = correspondences(&p.features, &q.features, &found);
@@ -325,4 +346,28 @@ fn describe(
             gain: [1.0; 3],
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cv_core::Matrix3;
+
+    #[test]
+    fn photographs_hold_firmly_where_firm_links_connect_them_all() {
+        let link = |a: usize, b: usize, agree: usize| {
+            let pair = PanoramaPair { a, b, matches: Vec::new(), inliers: Vec::new(), rejected: None };
+            let inliers = vec![Correspondence::new(0.0, 0.0, 0.0, 0.0); agree];
+            Some((pair, Some(VerifiedPair { a, b, homography: Matrix3::identity(), inliers })))
+        };
+        let rejected = || {
+            let pair = PanoramaPair { a: 0, b: 1, matches: Vec::new(), inliers: Vec::new(), rejected: None };
+            Some((pair, None))
+        };
+        assert!(held_firmly(0, &[]) && held_firmly(1, &[]));
+        assert!(!held_firmly(2, &[None]) && !held_firmly(2, &[rejected()]));
+        assert!(held_firmly(3, &[link(1, 2, FIRM), None, link(0, 2, FIRM), link(0, 1, 9)]));
+        // Two firm pairs and a loose link between them.
+        assert!(!held_firmly(4, &[link(2, 3, FIRM), link(0, 1, 900), link(0, 2, FIRM - 1)]));
+    }
 }
