@@ -83,3 +83,26 @@ fn what_cannot_be_dense_is_refused_and_nothing_is_written() {
     let tiny = refused(folder.path(), &[&args[..], &["--dense-size", "7"]].concat()).stderr;
     assert!(tiny.contains("at least 32"), "{tiny}");
 }
+
+#[test]
+fn a_focal_length_that_was_estimated_is_said_with_its_deviation() {
+    let folder = tempfile::tempdir().unwrap();
+    two_views(folder.path());
+    let args = ["reconstruct", "a.jpg", "b.jpg", "-o", "s.ply", "--report", "out"];
+    let said = run(folder.path(), &args).stderr;
+    let value = json(folder.path(), &args);
+    let (focal, deviation) = (value["focal_px"][0].as_f64().unwrap(), value["focal_deviation"].as_f64().unwrap());
+    // The photographs were rendered at 440 px; three deviations hold all but one in three hundred.
+    assert!((focal / 440.0 - 1.0).abs() < 3.0 * deviation && deviation < 0.1, "{focal} {deviation}");
+    assert!(said.contains(&format!("focal length {focal:.0} px ± {:.1} %", 100.0 * deviation)), "{said}");
+    // A warning from 5 % on, in the report too.
+    let doubtful = deviation > 0.05;
+    let html = fs::read_to_string(folder.path().join("out/report.html")).unwrap();
+    assert!(
+        said.contains("warning: the focal length") == doubtful
+            && html.contains("The focal length is known") == doubtful
+    );
+    // None where the focal length is given.
+    let said = run(folder.path(), &[&args[..], &["--focal", "440"]].concat()).stderr;
+    assert!(!said.contains("±") && !said.contains("warning"), "{said}");
+}

@@ -132,6 +132,9 @@ impl Run for Args {
         if let Some(folder) = &self.colmap {
             cv_io::colmap::write(folder, &self.model(&result))?;
         }
+        if let Some(text) = doubt(&result) {
+            context.warn(format!("{text}; --focal or --camera if you know it"));
+        }
         context.report(|| self.html([&a, &b], &result, dense.as_ref(), &source))?;
         Ok(self.outcome(&result, dense.as_ref()))
     }
@@ -141,6 +144,17 @@ impl Run for Args {
 fn explained(error: &ReconstructError, args: &Args) -> Failure {
     let failure = Failure::new(format!("{} and {}: {error}", args.first.display(), args.second.display()));
     failure.advice(error.advice())
+}
+
+/// A relative standard deviation of an estimated focal length that is worth a word: the error of a usual EXIF entry.
+const DOUBTFUL: f64 = 0.05;
+
+/// What to think of a focal length that the photographs hardly show.
+fn doubt(result: &ReconstructResult) -> Option<String> {
+    let percent = 100.0 * result.focal_deviation;
+    (result.focal_deviation > DOUBTFUL).then(|| {
+        format!("the focal length is known to ±{percent:.0} % only, and the depth of the cloud may be stretched by as much")
+    })
 }
 
 impl Args {
@@ -162,7 +176,7 @@ impl Args {
             (false, [Some(a), Some(b)]) => {
                 Ok((Intrinsics::Focal([a, b]), format!("focal length {a:.0} px from EXIF (--focal or --camera to change it)")))
             }
-            _ => Ok((Intrinsics::Unknown, "focal length unknown: estimating it".into())),
+            _ => Ok((Intrinsics::Unknown, "focal length unknown: estimated from the matches".into())),
         }
     }
 
@@ -245,6 +259,10 @@ impl Args {
             result.pose.rotation_angle().to_degrees(),
             result.median_angle.to_degrees(),
         );
+        if result.focal_deviation > 0.0 {
+            let (focal, percent) = (result.cameras[0].fx, 100.0 * result.focal_deviation);
+            summary += &format!("; focal length {focal:.0} px ± {percent:.1} %");
+        }
         let mut stages = result.stages.clone();
         stages.extend(dense.iter().flat_map(|d| &d.stages).map(|(name, seconds)| (dense_stage(name), *seconds)));
         let outcome = Outcome::new(stages)
@@ -313,15 +331,25 @@ impl Args {
         let axis = result.pose.rotation.axis().map_or([0.0; 3], |axis| [axis.x, axis.y, axis.z].map(|v| v * angle));
         let t = result.pose.translation;
         let degrees = |v: f64| format!("{:.3}°", v.to_degrees());
+        let deviation = match result.focal_deviation {
+            0.0 => String::new(),
+            share => format!(" ± {:.1} %", 100.0 * share),
+        };
         report.facts(&[
             ("rotation", format!("{} about ({:.3}, {:.3}, {:.3})", degrees(angle), axis[0], axis[1], axis[2])),
             ("direction of the translation", format!("({:.4}, {:.4}, {:.4})", t.x, t.y, t.z)),
             ("standard deviation of the rotation", degrees(result.pose_deviation[0])),
             ("standard deviation of the direction", degrees(result.pose_deviation[1])),
             ("matches along epipolar lines", result.guided.to_string()),
-            ("focal lengths", format!("{:.1} and {:.1} px ({source})", result.cameras[0].fx, result.cameras[1].fx)),
+            (
+                "focal lengths",
+                format!("{:.1} and {:.1} px{deviation} ({source})", result.cameras[0].fx, result.cameras[1].fx),
+            ),
             ("explained by one plane", format!("{:.0} % of the matches that agree", 100.0 * result.planar_share)),
         ]);
+        if let Some(text) = doubt(result) {
+            report.note(Note::Warning, &format!("{}{}.", text[..1].to_uppercase(), &text[1..]));
+        }
         if result.planar_share > 0.8 {
             report.note(Note::Warning, "Most of the scene is nearly one plane: the motion is less certain than the deviations say.");
         }
