@@ -369,6 +369,20 @@ fn folder_of(path: &Path) -> &Path {
     }
 }
 
+/// Whether two paths lead to one file. What cannot be looked at does not exist yet, or will be told of when it is read.
+pub(crate) fn same_file(a: &Path, b: &Path) -> bool {
+    matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b)
+}
+
+/// Refuses to write over what is read: outputs whose names the person did not type.
+pub(crate) fn spare_inputs(outputs: &[PathBuf], inputs: &[&Path]) -> Result<(), Failure> {
+    match outputs.iter().find(|output| inputs.iter().any(|input| same_file(output, input))) {
+        Some(path) => Err(Failure::new(format!("{} would be written over, and is read", path.display()))
+            .advice("give another folder for the results")),
+        None => Ok(()),
+    }
+}
+
 /// Makes a folder for outputs, and those above it.
 pub(crate) fn create_dir(path: &Path) -> Result<(), Failure> {
     fs::create_dir_all(path).during(format!("cannot make the folder {}", path.display()))?;
@@ -376,8 +390,8 @@ pub(crate) fn create_dir(path: &Path) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Removes what a run left behind that was killed while it wrote: `cv_io`'s temporary files. A write takes seconds, so
-/// one that is an hour old belongs to nobody.
+/// Removes what a run left behind that was killed while it wrote: `cv_io`'s temporary files, and folders of several. A write
+/// takes seconds, so one that is an hour old belongs to nobody.
 fn remove_stale(folder: &Path) {
     let Ok(entries) = fs::read_dir(folder) else { return };
     for entry in entries.flatten() {
@@ -385,8 +399,9 @@ fn remove_stale(folder: &Path) {
         let ours = name.to_str().is_some_and(|name| name.starts_with(".cv-") && name.ends_with(".part"));
         let age = || SystemTime::now().duration_since(entry.metadata().ok()?.modified().ok()?).ok();
         if ours && age().is_some_and(|age| age > Duration::from_secs(3600)) {
+            let folder = entry.file_type().is_ok_and(|kind| kind.is_dir());
             // Not ours to worry about where it cannot be removed.
-            let _ = fs::remove_file(entry.path());
+            let _ = if folder { fs::remove_dir_all(entry.path()) } else { fs::remove_file(entry.path()) };
         }
     }
 }
@@ -495,8 +510,12 @@ mod tests {
             let file = fs::File::options().write(true).open(path).unwrap();
             file.set_modified(SystemTime::now() - Duration::from_secs(4000)).unwrap();
         }
+        let several = folder.path().join(".cv-several.part");
+        fs::create_dir(&several).unwrap();
+        fs::write(several.join("left.png"), "half").unwrap();
+        fs::File::open(&several).unwrap().set_modified(SystemTime::now() - Duration::from_secs(4000)).unwrap();
         check_outputs(&[&folder.path().join("out.txt")]).unwrap();
-        assert!(!old.exists() && new.exists() && foreign.exists());
+        assert!(!old.exists() && !several.exists() && new.exists() && foreign.exists());
     }
 
     #[test]

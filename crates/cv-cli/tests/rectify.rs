@@ -7,7 +7,7 @@ mod support;
 use cv_core::{Camera, Pose, Rotation3, StereoRig, Vector3};
 use cv_io::RigFile;
 use cv_synth::{RenderOptions, Scene, render};
-use support::{json, refused};
+use support::{json, refused, snapshot};
 
 /// Two photographs of a room by a rig whose second camera is turned by a degree or so, and the rig's file.
 fn rig(vertical: bool) -> tempfile::TempDir {
@@ -72,4 +72,22 @@ fn rigs_that_are_none_are_refused_and_nothing_is_written() {
     std::fs::create_dir_all(folder.path().join("out/rig.yaml")).unwrap();
     assert!(refuse("rig.yaml", &[]).contains("is a folder"));
     assert_eq!(std::fs::read_dir(folder.path().join("out")).unwrap().count(), 1);
+}
+
+#[test]
+fn what_is_read_is_never_written_over() {
+    let folder = rig(false);
+    std::fs::rename(folder.path().join("a.png"), folder.path().join("left.png")).unwrap();
+    std::fs::create_dir(folder.path().join("calibration")).unwrap();
+    std::fs::copy(folder.path().join("rig.yaml"), folder.path().join("calibration/rig.yaml")).unwrap();
+    let before = snapshot(folder.path());
+    // The photograph in the folder itself; the calibration by another way to its folder.
+    for (left, rig, out, named) in [
+        ("left.png", "none.yaml", ".", "left.png"),
+        ("b.png", "calibration/rig.yaml", "./calibration/../calibration", "rig.yaml"),
+    ] {
+        let ran = refused(folder.path(), &["rectify", left, "b.png", "--rig", rig, "--out", out]);
+        assert!(ran.stderr.contains(named) && ran.stderr.contains("would be written over"), "{ran:?}");
+    }
+    assert!(snapshot(folder.path()) == before);
 }

@@ -1,6 +1,6 @@
 //! `cv rectify`: a pair as two cameras would have taken it whose rows coincide.
 
-use crate::common::{Context, Explain, Failure, Outcome, Run, create_dir};
+use crate::common::{Context, Explain, Failure, Outcome, Run, create_dir, spare_inputs};
 use cv_core::{RgbU8, StereoRig};
 use cv_io::RigFile;
 use cv_pipeline::rectify;
@@ -44,8 +44,12 @@ fn parse_size(text: &str) -> Result<(usize, usize), String> {
     }
 }
 
+/// The files that are written.
+const NAMES: [&str; 4] = ["left.png", "right.png", "rig.yaml", "q.txt"];
+
 impl Run for Args {
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
+        spare_inputs(&NAMES.map(|name| self.out.join(name)), &[&self.left, &self.right, &self.rig])?;
         let left = cv_io::read_rgb(&self.left)?;
         let right = cv_io::read_rgb(&self.right)?;
         let RigFile { rig, unit, .. } = cv_io::read_rig(&self.rig, Some(left.size()))?;
@@ -65,7 +69,7 @@ impl Run for Args {
         let rows: Vec<String> =
             q.row_iter().map(|row| row.iter().map(f64::to_string).collect::<Vec<_>>().join(" ")).collect();
         create_dir(&self.out)?;
-        all_or_none(&self.out, &["left.png", "right.png", "rig.yaml", "q.txt"], |folder| {
+        all_or_none(&self.out, |folder| {
             cv_io::write_png(folder.join("left.png"), result.images[0].view())?;
             cv_io::write_png(folder.join("right.png"), result.images[1].view())?;
             cv_io::write_rig(folder.join("rig.yaml"), &RigFile { rig: rectified, unit }, &["rectified"])?;
@@ -115,8 +119,8 @@ impl Run for Args {
 
 /// Lets `write` write the files into a folder of its own inside `out`, and moves them up once all are there: where one
 /// cannot be written, or a folder stands where one is to go, nothing changes.
-fn all_or_none(out: &Path, names: &[&str], write: impl FnOnce(&Path) -> Result<(), Failure>) -> Result<(), Failure> {
-    for name in names {
+fn all_or_none(out: &Path, write: impl FnOnce(&Path) -> Result<(), Failure>) -> Result<(), Failure> {
+    for name in NAMES {
         let path = out.join(name);
         if path.is_dir() {
             return Err(Failure::new(format!("{} is a folder, not a file to write", path.display())));
@@ -125,7 +129,7 @@ fn all_or_none(out: &Path, names: &[&str], write: impl FnOnce(&Path) -> Result<(
     let folder = out.join(format!(".cv-{}.part", std::process::id()));
     create_dir(&folder)?;
     let done = write(&folder).and_then(|()| {
-        for name in names {
+        for name in NAMES {
             std::fs::rename(folder.join(name), out.join(name)).during(format!("cannot write {name}"))?;
         }
         Ok(())

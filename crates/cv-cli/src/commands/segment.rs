@@ -2,7 +2,7 @@
 
 mod files;
 
-use crate::common::{Context, Explain, Failure, Outcome, Run, create_dir, expand_images};
+use crate::common::{Context, Explain, Failure, Outcome, Run, create_dir, expand_images, same_file};
 use cv_core::{Mask, RgbU8};
 use cv_pipeline::segmentation::{
     ColorModel, ColorSpace, Labelled, Regions, Rule, Scores, SegmentError, TrainOptions,
@@ -240,7 +240,6 @@ impl Predict {
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
         let model = read_model(&self.model)?;
         let given = expand_images(&self.images)?;
-        let same = |a: &Path, b: &Path| matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b);
         let photos = files::without_masks(given.clone());
         let outputs: Vec<PathBuf> = photos.iter().map(|p| self.out.join(format!("{}_mask.png", stem(p)))).collect();
         for (i, output) in outputs.iter().enumerate() {
@@ -256,8 +255,8 @@ impl Predict {
             // Masks drawn by hand often lie beside their photographs.
             // A bare name has the empty folder: joined to the current one it is that.
             let folder = Path::new(".").join(photos[i].parent().unwrap_or(Path::new("")));
-            let beside = output.exists() && same(&folder, &self.out);
-            if beside || given.iter().any(|path| same(path, output)) {
+            let beside = output.exists() && same_file(&folder, &self.out);
+            if beside || given.iter().any(|path| same_file(path, output)) {
                 return Err(Failure::new(format!("{} is there already and would be overwritten", output.display()))
                     .advice("name another folder with --out"));
             }
