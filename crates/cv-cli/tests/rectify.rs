@@ -7,7 +7,7 @@ mod support;
 use cv_core::{Camera, Pose, Rotation3, StereoRig, Vector3};
 use cv_io::RigFile;
 use cv_synth::{RenderOptions, Scene, render};
-use support::{json, refused, snapshot};
+use support::{done, json, refused, run, snapshot};
 
 /// Two photographs of a room by a rig whose second camera is turned by a degree or so, and the rig's file.
 fn rig(vertical: bool) -> tempfile::TempDir {
@@ -90,4 +90,37 @@ fn what_is_read_is_never_written_over() {
         assert!(ran.stderr.contains(named) && ran.stderr.contains("would be written over"), "{ran:?}");
     }
     assert!(snapshot(folder.path()) == before);
+}
+
+#[test]
+fn photographs_that_do_not_fit_the_rig_are_told_from_those_without_features() {
+    for vertical in [false, true] {
+        let folder = rig(vertical);
+        let rectify = |a: &str, b: &str| {
+            let ran = run(folder.path(), &["rectify", a, b, "--rig", "rig.yaml", "--out", "out", "--json"]);
+            (ran.code, serde_json::from_str::<serde_json::Value>(&ran.stdout).unwrap(), ran.stderr)
+        };
+        // In the wrong order: the turn of the cameras moves rows the other way, by twice its five pixels and more.
+        let (code, value, stderr) = rectify("b.png", "a.png");
+        assert_eq!(code, Some(1));
+        assert!(stderr.contains("px apart vertically") && stderr.contains("in its order"), "{stderr}");
+        assert!(value["vertical_residual_px"].is_null() && value["fault"].is_string(), "{value}");
+        // Nothing to see: nothing is known against the calibration.
+        cv_io::write_png(folder.path().join("flat.png"), cv_core::RgbU8::new(320, 240, [90; 3]).view()).unwrap();
+        let (code, value, _) = rectify("flat.png", "flat.png");
+        assert!(code == Some(0) && value["vertical_residual_px"].is_null() && value["fault"].is_null(), "{value}");
+    }
+    // A rig without any turn, its photographs exchanged: rows fit, disparities are those of a world behind the cameras.
+    let folder = rig(false);
+    let straight = Pose::new(Rotation3::identity(), Vector3::new(-0.25, 0.0, 0.0));
+    let camera = Camera::from_focal(320, 240, 280.0);
+    let file =
+        RigFile { rig: StereoRig { left: camera, right: camera, right_from_left: straight }, unit: String::new() };
+    cv_io::write_rig(folder.path().join("straight.yaml"), &file, &[]).unwrap();
+    done(folder.path(), &["rectify", "a.png", "b.png", "--rig", "rig.yaml", "--out", "out"]);
+    let ran = refused(
+        folder.path(),
+        &["rectify", "out/right.png", "out/left.png", "--rig", "straight.yaml", "--out", "again"],
+    );
+    assert!(ran.stderr.contains("left and right are exchanged"), "{ran:?}");
 }

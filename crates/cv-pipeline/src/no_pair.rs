@@ -2,7 +2,7 @@
 
 use crate::disparity_range::{NEEDED, in_common_rows, range_of};
 use crate::{MatchingOptions, Progress, match_photos};
-use cv_core::{ImageView, RgbU8};
+use cv_core::{Correspondence, ImageView, RgbU8};
 use cv_stereo::{Intensity, StereoOptions};
 
 /// What feature matches of a refused pair show.
@@ -91,18 +91,25 @@ pub(crate) fn cause<T: Intensity, const C: usize>(
     let Ok(found) = match_photos(a.view(), b.view(), &MatchingOptions::default(), progress) else {
         return NoPairCause::Unrelated { matches: 0 };
     };
-    let mut apart: Vec<f64> = found.pairs.iter().map(|p| p.a.y - p.b.y).collect();
+    let tried = (options.min_disparity, options.min_disparity + options.disparities as i32 - 1);
+    judge(&found.pairs, left.height(), Some(tried))
+}
+
+/// What matches of two photographs of a height show, of which the disparities `tried` gave hardly any; [`NoPairCause::Unknown`] where
+/// they lie as those of a rectified pair do.
+pub(crate) fn judge(matches: &[Correspondence], height: usize, tried: Option<(i32, i32)>) -> NoPairCause {
+    let mut apart: Vec<f64> = matches.iter().map(|p| p.a.y - p.b.y).collect();
     let n = apart.len();
     if n < NEEDED {
         return NoPairCause::Unrelated { matches: n };
     }
     apart.sort_unstable_by(f64::total_cmp);
-    let common = in_common_rows(&found.pairs);
+    let common = in_common_rows(matches);
     // Wrong matches are few: most lie in common rows where the pair is rectified.
     if common.len() < NEEDED.max(n / 2) {
         // Cameras that are not aligned shift neighbours alike; chance matches are anywhere.
         let spread = apart[3 * n / 4] - apart[n / 4];
-        return if n >= 2 * NEEDED && spread <= SPREAD * left.height() as f64 {
+        return if n >= 2 * NEEDED && spread <= SPREAD * height as f64 {
             NoPairCause::Rows { apart: apart[n / 2].abs() }
         } else {
             NoPairCause::Unrelated { matches: common.len() }
@@ -110,10 +117,10 @@ pub(crate) fn cause<T: Intensity, const C: usize>(
     }
     let (min, n) = range_of(common);
     let (low, high) = (min, min + n as i32 - 1);
-    let tried = (options.min_disparity, options.min_disparity + options.disparities as i32 - 1);
-    if high <= 8 && low < -8 && tried.0 >= 0 {
+    if high <= 8 && low < -8 && tried.is_none_or(|tried| tried.0 >= 0) {
         return NoPairCause::Exchanged { range: (low, high) };
     }
+    let Some(tried) = tried else { return NoPairCause::Unknown };
     // Most of what there is must have been tried.
     let overlap = tried.1.min(high) - tried.0.max(low) + 1;
     if 2 * overlap < high - low + 1 { NoPairCause::Range { range: (low, high) } } else { NoPairCause::Unknown }

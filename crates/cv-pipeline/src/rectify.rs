@@ -1,6 +1,7 @@
 //! Rectification of a pair of photographs, with what tells whether it is any good.
 
-use crate::{MatchingOptions, Progress, Stopwatch, match_photos};
+use crate::no_pair::judge;
+use crate::{MatchingOptions, NoPairCause, Progress, Stopwatch, match_photos};
 use cv_core::{ImageView, Mask, RgbU8, StereoRig};
 use cv_stereo::{Rectification, RectifyError, RectifyOptions};
 
@@ -16,10 +17,13 @@ pub struct RectifyResult {
     /// Share of pixels that show anything, left and right.
     pub valid_area: [f64; 2],
     /// Median and 95 % quantile in px of the difference in rows of features found in both rectified photographs; `None`
-    /// with fewer than eight of them.
+    /// with fewer than eight of them, or where most features say something else.
     pub vertical_px: Option<(f64, f64)>,
     /// Number of those features.
     pub matches: usize,
+    /// What most features show where they do not lie as those of a rectified pair: the rig is not that of the photographs,
+    /// or they are not in its order.
+    pub fault: Option<NoPairCause>,
     /// Stage names and their seconds.
     pub stages: Vec<(&'static str, f64)>,
 }
@@ -50,8 +54,12 @@ pub fn rectify(
     let mut rows: Vec<f64> =
         pairs.iter().filter(|p| p.a.x >= p.b.x - 4.0).map(|p| (p.a.y - p.b.y).abs()).filter(|&dy| dy < 8.0).collect();
     rows.sort_unstable_by(f64::total_cmp);
+    // Unless they are most of them.
+    let fault = (2 * rows.len() < pairs.len())
+        .then(|| judge(&pairs, left.height(), None))
+        .filter(|cause| *cause != NoPairCause::Unknown);
     let quantile = |share: f64| rows[((rows.len() - 1) as f64 * share) as usize];
-    let vertical_px = (rows.len() >= 8).then(|| (quantile(0.5), quantile(0.95)));
+    let vertical_px = (rows.len() >= 8 && fault.is_none()).then(|| (quantile(0.5), quantile(0.95)));
     watch.lap("quality");
     progress.report("rectify", 2, 2);
     let share = |mask: &Mask| {
@@ -65,6 +73,7 @@ pub fn rectify(
         masks: [mask_left, mask_right],
         vertical_px,
         matches: rows.len(),
+        fault,
         stages: watch.into_stages(),
     })
 }
@@ -91,6 +100,7 @@ mod tests {
         let (median, _) = result.vertical_px.unwrap();
         // Features are placed to a few tenths of a pixel; an unrectified pair of this rig is off by five and more.
         assert!(median < 0.4 && result.matches > 30, "{median} px over {}", result.matches);
+        assert_eq!(result.fault, None);
         assert!(result.valid_area[0] > 0.999 && result.valid_area[1] > 0.999);
     }
 }

@@ -3,7 +3,7 @@
 use crate::common::{Context, Explain, Failure, Outcome, Run, create_dir, spare_inputs};
 use cv_core::{RgbU8, StereoRig};
 use cv_io::RigFile;
-use cv_pipeline::rectify;
+use cv_pipeline::{NoPairCause, rectify};
 use cv_pipeline::stereo::RectifyOptions;
 use cv_report::{Canvas, Figure, Report, colors, side_by_side};
 use serde_json::json;
@@ -76,13 +76,16 @@ impl Run for Args {
             cv_io::write_bytes(folder.join("q.txt"), format!("{}\n", rows.join("\n")).as_bytes())?;
             Ok(())
         })?;
+        let residual = match (result.vertical_px, &result.fault) {
+            (Some((median, p95)), _) => {
+                format!("{median:.2} px median, {p95:.2} px at 95 %, over {} features", result.matches)
+            }
+            (None, Some(cause)) => format!("unknown ({cause})"),
+            (None, None) => "unknown (too few features)".to_owned(),
+        };
         context.report(|| {
             let mut page = Report::new("Rectification");
-            let quality = match result.vertical_px {
-                Some((median, p95)) => format!("{median:.2} px, 95 % under {p95:.2} px"),
-                None => "unknown: too few features".to_owned(),
-            };
-            page.headline("vertical residual", &quality)
+            page.headline("vertical residual", &residual)
                 .headline("valid area", &format!("{:.1} % and {:.1} %", 100.0 * result.valid_area[0], 100.0 * result.valid_area[1]));
             page.section("Rectified pair").figure(Figure::new(
                 cv_io::encode_png(with_rows(&result.images).view())?,
@@ -91,10 +94,7 @@ impl Run for Args {
             Ok(page.to_html())
         })?;
         let (width, height) = result.images[0].size();
-        let residual = result.vertical_px.map_or("unknown (too few features)".to_owned(), |(median, p95)| {
-            format!("{median:.2} px median, {p95:.2} px at 95 %, over {} features", result.matches)
-        });
-        Ok(Outcome::new(result.stages)
+        let outcome = Outcome::new(result.stages)
             .with("width", width)
             .with("height", height)
             .with("vertical", r.vertical)
@@ -105,11 +105,20 @@ impl Run for Args {
             .with("valid_area", json!({ "left": result.valid_area[0], "right": result.valid_area[1] }))
             .with("matches", result.matches)
             .with("vertical_residual_px", result.vertical_px.map(|(median, p95)| json!({ "median": median, "p95": p95 })))
+            .with("fault", result.fault.map(|cause| cause.to_string()))
             .summary(format!(
                 "{width}×{height} px; vertical residual {residual}; valid area {:.1} % left, {:.1} % right",
                 100.0 * result.valid_area[0],
                 100.0 * result.valid_area[1]
-            )))
+            ));
+        Ok(match result.fault {
+            // What is known is that the calibration says one thing and the photographs another.
+            Some(cause @ (NoPairCause::Rows { .. } | NoPairCause::Exchanged { .. })) => outcome.but(
+                Failure::new(format!("the photographs do not fit {}: {cause}", self.rig.display()))
+                    .advice("check that the calibration is that of these photographs, and that they are in its order"),
+            ),
+            _ => outcome,
+        })
     }
 
     fn outputs(&self) -> Vec<&Path> {
