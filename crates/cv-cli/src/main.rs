@@ -2,6 +2,7 @@
 
 mod commands;
 mod common;
+mod rig;
 
 use clap::Parser;
 use common::Globals;

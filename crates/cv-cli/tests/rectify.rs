@@ -23,13 +23,14 @@ fn rig(vertical: bool) -> tempfile::TempDir {
     for (name, pose) in [("a.png", first), ("b.png", second)] {
         let view = render(&scene, &camera, &pose, &RenderOptions::default()).unwrap();
         cv_io::write_png(folder.path().join(name), view.image.view()).unwrap();
+        cv_io::pfm::write(folder.path().join(name).with_extension("pfm"), view.depth.view()).unwrap();
     }
     let write = |name: &str, relative: Pose| {
         let rig = StereoRig { left: camera, right: camera, right_from_left: relative };
         cv_io::write_rig(folder.path().join(name), &RigFile { rig, unit: "m".to_owned() }, &[]).unwrap();
     };
     write("rig.yaml", relative);
-    write("exchanged.yaml", Pose::new(turn, turn * aside));
+    write("exchanged.yaml", relative.inverse());
     write("none.yaml", Pose::new(turn, Vector3::zeros()));
     folder
 }
@@ -63,10 +64,27 @@ fn rigs_that_are_none_are_refused_and_nothing_is_written() {
     let refuse = |rig: &str, more: &[&str]| {
         refused(folder.path(), &[&["rectify", "a.png", "b.png", "--rig", rig, "--out", "out"], more].concat()).stderr
     };
-    assert!(refuse("exchanged.yaml", &[]).contains("exchange the two"));
+    assert!(refuse("exchanged.yaml", &[]).contains("left of the first: they are exchanged"));
+    assert!(refuse("exchanged.yaml", &[]).contains("give --exchange"));
+    assert!(refuse("rig.yaml", &["--exchange"]).contains("leave out --exchange"));
     let none = refuse("none.yaml", &[]);
     assert!(none.contains("zero"), "{none}");
-    assert!(refuse("rig.yaml", &["--alpha", "2"]).contains("alpha"));
+    for more in [["--alpha", "2"], ["--alpha", "nan"], ["--size", "640"]] {
+        let ran = run(
+            folder.path(),
+            &[&["rectify", "a.png", "b.png", "--rig", "rig.yaml", "--out", "out"], &more[..]].concat(),
+        );
+        assert!(ran.code == Some(2) && ran.stderr.contains(more[0]), "{ran:?}");
+    }
+    // The photograph is named, and so is what a file lacks that is a calibration in part.
+    cv_io::write_png(folder.path().join("small.png"), cv_core::RgbU8::new(160, 120, [90; 3]).view()).unwrap();
+    for command in [["rectify", "a.png", "small.png", "--out", "out"], ["depth", "a.png", "small.png", "-o", "d.pfm"]] {
+        let small = refused(folder.path(), &[&command[..], &["--rig", "rig.yaml"]].concat()).stderr;
+        assert!(small.contains("small.png is 160×120 px") && small.contains("320×240"), "{small}");
+        std::fs::write(folder.path().join("part.yml"), "%YAML:1.0\n---\nM1: [9, 0, 1, 0, 9, 1, 0, 0, 1]\n").unwrap();
+        let part = refused(folder.path(), &[&command[..], &["--rig", "part.yml"]].concat()).stderr;
+        assert!(part.contains("there is no M2") && part.contains("cv rectify --help"), "{part}");
+    }
     assert!(!folder.path().join("out").exists());
     // One of four files cannot be written: none is.
     std::fs::create_dir_all(folder.path().join("out/rig.yaml")).unwrap();
@@ -123,4 +141,56 @@ fn photographs_that_do_not_fit_the_rig_are_told_from_those_without_features() {
         &["rectify", "out/right.png", "out/left.png", "--rig", "straight.yaml", "--out", "again"],
     );
     assert!(ran.stderr.contains("left and right are exchanged"), "{ran:?}");
+}
+
+#[test]
+fn the_rig_file_of_the_help_is_one() {
+    let folder = rig(false);
+    let help = done(folder.path(), &["rectify", "--help"]).stdout;
+    let file: Vec<&str> =
+        help.lines().skip_while(|l| !l.starts_with("A rig file")).skip(1).take_while(|l| l.starts_with("  ")).collect();
+    std::fs::write(folder.path().join("help.yaml"), file.join("\n").replace("\n  ", "\n").trim_start()).unwrap();
+    let ran = refused(folder.path(), &["rectify", "a.png", "b.png", "--rig", "help.yaml", "--out", "out"]);
+    // Understood in full: only the size is not that of these photographs.
+    assert!(ran.stderr.contains("calibrated for 640×480 px"), "{ran:?}");
+}
+
+/// Positions in a binary PLY of coloured points.
+fn positions(path: &std::path::Path) -> Vec<[f64; 3]> {
+    let bytes = std::fs::read(path).unwrap();
+    let header = b"end_header\n";
+    let start = bytes.windows(header.len()).position(|w| w == header).unwrap() + header.len();
+    let points: Vec<[f64; 3]> = bytes[start..]
+        .chunks_exact(15)
+        .map(|p| [0, 4, 8].map(|i| f64::from(f32::from_le_bytes([p[i], p[i + 1], p[i + 2], p[i + 3]]))))
+        .collect();
+    assert!(points.len() * 15 == bytes.len() - start);
+    points
+}
+
+#[test]
+fn depth_by_a_rig_lies_on_the_scene_in_the_left_camera_s_frame() {
+    let camera = Camera::from_focal(320, 240, 280.0);
+    for vertical in [false, true] {
+        let folder = rig(vertical);
+        let truth = cv_io::pfm::read(folder.path().join("a.pfm")).unwrap();
+        // In the file's order, and with a file in the other order.
+        for more in [&["--rig", "rig.yaml"][..], &["--rig", "exchanged.yaml", "--exchange"]] {
+            let args =
+                ["depth", "a.png", "b.png", "-o", "d.pfm", "--cloud", "c.ply", "--disparities", "64", "--no-fill"];
+            let ran = done(folder.path(), &[&args, more].concat());
+            assert_eq!(ran.stderr.contains("the rig is vertical"), vertical, "{ran:?}");
+            let points = positions(&folder.path().join("c.ply"));
+            let right = points.iter().filter(|[x, y, z]| {
+                let p = camera.project(&cv_core::Point3::new(*x, *y, *z)).unwrap();
+                let (x, y) = (p.x.round(), p.y.round());
+                let seen = x >= 0.0 && y >= 0.0 && x < 320.0 && y < 240.0;
+                // A disparity is good to half a pixel of the fifteen and more that this scene has.
+                seen && (f64::from(truth.at(x as usize, y as usize)[0]) - z).abs() < 0.04 * z
+            });
+            // The rest are outlines of things, a pixel beside them.
+            let share = right.count() as f64 / points.len() as f64;
+            assert!(share > 0.9 && points.len() > 40_000, "{share} of {}", points.len());
+        }
+    }
 }

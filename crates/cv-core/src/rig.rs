@@ -19,4 +19,9 @@ impl StereoRig {
     pub fn baseline(&self) -> f64 {
         self.right_from_left.translation.norm()
     }
+
+    /// The same rig with its right camera as the left one.
+    pub fn exchanged(&self) -> Self {
+        Self { left: self.right, right: self.left, right_from_left: self.right_from_left.inverse() }
+    }
 }

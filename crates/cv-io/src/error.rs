@@ -4,6 +4,10 @@ use std::fmt;
 use std::io;
 use std::path::{Path, PathBuf};
 
+use crate::sniff::PICTURES;
+
+const CONVERT: &str = "convert it, for example to PNG or JPEG";
+
 /// Why bytes could not be understood, or values not be stored. Carries no path: see [`IoError`].
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -23,6 +27,14 @@ pub enum FormatError {
     /// A known format, or a variant of one, that this crate does not read or write.
     #[error("{format}: {what} is not supported")]
     Unsupported {
+        /// Name of the format.
+        format: &'static str,
+        /// The variant or feature.
+        what: String,
+    },
+    /// A picture that this crate does not read, or something in the place of one.
+    #[error("{format}: {what} is not supported")]
+    UnsupportedPicture {
         /// Name of the format.
         format: &'static str,
         /// The variant or feature.
@@ -95,6 +107,10 @@ impl FormatError {
         Self::Unsupported { format, what: what.into() }
     }
 
+    pub(crate) fn unsupported_picture(format: &'static str, what: impl Into<String>) -> Self {
+        Self::UnsupportedPicture { format, what: what.into() }
+    }
+
     pub(crate) fn line(line: usize, reason: impl Into<String>) -> Self {
         Self::Line { line, reason: reason.into() }
     }
@@ -114,7 +130,8 @@ impl FormatError {
                 _ => None,
             },
             Self::Empty | Self::Truncated { .. } => Some("copy or export the file again"),
-            Self::UnknownFormat { .. } | Self::Unsupported { .. } => Some("convert it, for example to PNG or JPEG"),
+            Self::UnsupportedPicture { .. } => Some(CONVERT),
+            Self::UnknownFormat { expected } if *expected == PICTURES => Some(CONVERT),
             Self::TooManyPixels { .. } => Some("make the image smaller, or raise the limit if the size is meant"),
             Self::TooManyBytes { .. } => Some("raise the limit if the size is meant"),
             _ => None,

@@ -124,7 +124,7 @@ pub fn decode_image(bytes: &[u8], options: &ReadOptions) -> Result<DynImage, For
 fn decode(bytes: &[u8], format: ImageFormat, options: &ReadOptions) -> Result<DynImage, FormatError> {
     let fail = |error| from_image_error(format, error);
     if format == ImageFormat::Tiff && is_raw_preview(bytes) {
-        return Err(FormatError::unsupported("camera raw", "undeveloped sensor data"));
+        return Err(FormatError::unsupported_picture("camera raw", "undeveloped sensor data"));
     }
     let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
     // Enough for any header's own allocations; the pixels are allowed for once their number is known.
@@ -171,7 +171,9 @@ fn pixels(picture: DynamicImage) -> Result<Pixels, FormatError> {
         DynamicImage::ImageLumaA16(i) => Pixels::Gray16(owned(w, h, without_alpha::<_, 1>(&i.into_raw()))?),
         DynamicImage::ImageRgba16(i) => Pixels::Rgb16(owned(w, h, without_alpha::<_, 3>(&i.into_raw()))?),
         DynamicImage::ImageRgba32F(i) => Pixels::RgbF32(owned(w, h, without_alpha::<_, 3>(&i.into_raw()))?),
-        other => return Err(FormatError::unsupported("picture", format!("the pixel type {:?}", other.color()))),
+        other => {
+            return Err(FormatError::unsupported_picture("picture", format!("the pixel type {:?}", other.color())));
+        }
     })
 }
 
@@ -191,7 +193,7 @@ fn from_image_error(format: ImageFormat, error: ImageError) -> FormatError {
             FormatError::Truncated { format: name }
         }
         ImageError::IoError(e) => FormatError::corrupt(name, e.to_string()),
-        ImageError::Unsupported(e) => FormatError::unsupported(
+        ImageError::Unsupported(e) => FormatError::unsupported_picture(
             name,
             match e.kind() {
                 Kind::Color(color) => format!("the pixel type {color:?}"),

@@ -4,7 +4,7 @@ use image::ImageFormat;
 
 use crate::FormatError;
 
-const PICTURES: &str = "a PNG, JPEG, TIFF, BMP, PNM, OpenEXR or Radiance HDR picture";
+pub(crate) const PICTURES: &str = "a PNG, JPEG, TIFF, BMP, PNM, OpenEXR or Radiance HDR picture";
 
 /// The picture format of `bytes`, or an error that names what they are instead.
 pub(crate) fn picture_format(bytes: &[u8]) -> Result<ImageFormat, FormatError> {
@@ -33,7 +33,7 @@ pub(crate) fn picture_format(bytes: &[u8]) -> Result<ImageFormat, FormatError> {
         _ => None,
     };
     if let Some((format, what)) = other {
-        return Err(FormatError::unsupported(format, what));
+        return Err(FormatError::unsupported_picture(format, what));
     }
     match bytes {
         // Radiance files begin with either of two words.

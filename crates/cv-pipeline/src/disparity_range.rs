@@ -10,9 +10,7 @@ pub enum RangeError {
     #[error(transparent)]
     Matching(#[from] MatchingError),
     /// Too few matches lie in the same row of both photographs.
-    #[error(
-        "{found} of {matches} matches lie in the same row of both photographs, {needed} are needed: are they a rectified pair?"
-    )]
+    #[error("only {found} of {matches} matches lie in the same row of both photographs, {needed} are needed")]
     TooFew {
         /// Matches in common rows.
         found: usize,

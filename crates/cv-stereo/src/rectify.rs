@@ -38,13 +38,16 @@ pub enum RectifyError {
         error: CameraError,
     },
     /// The two cameras stand at the same place, or the translation is not finite.
-    #[error("the cameras are {baseline} apart: there is no parallax between them")]
+    #[error("the cameras are {} apart: there is no parallax between them", four_digits(*.baseline))]
     NoBaseline {
         /// Length of the translation.
         baseline: f64,
     },
     /// The right camera stands left of the left one, or the lower one above.
-    #[error("the right camera stands {distance} to the {} of the left one: exchange the two", if *.vertical { "top" } else { "left" })]
+    #[error(
+        "the second camera stands {} {} the first: they are exchanged",
+        four_digits(*.distance), if *.vertical { "above" } else { "left of" }
+    )]
     Exchanged {
         /// By how much, in the unit of the rig.
         distance: f64,
@@ -53,7 +56,7 @@ pub enum RectifyError {
     },
     /// The cameras stand one behind the other, or look apart, so that rectified ones would see something else.
     #[error(
-        "camera {side} would have to turn by {degrees:.1}°, more than {limit}°, to look across the baseline: the rig is not a stereo rig"
+        "the {side} camera would have to turn by {degrees:.1}°, more than {limit}°, to look across the baseline: the rig is not a stereo rig"
     )]
     TooFarTurned {
         /// `left` or `right`.
@@ -92,6 +95,11 @@ pub enum RectifyError {
         /// What would be accepted.
         allowed: &'static str,
     },
+}
+
+/// A length as people read it.
+fn four_digits(value: f64) -> f64 {
+    format!("{value:.3e}").parse().unwrap_or(value)
 }
 
 /// The most a camera is turned: beyond, a plane image sensor would see the scene at a grazing angle.
@@ -417,6 +425,15 @@ mod tests {
         let p = rectified.left.source_pixel(Point2::new(17.0, 200.0)).unwrap();
         assert!((p - Point2::new(17.0, 200.0)).norm() < 1e-9);
         assert!((rectified.geometry.baseline - 0.1).abs() < 1e-15 && (rectified.geometry.focal - 300.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn distances_are_told_as_people_read_them() {
+        let text = |distance, vertical| RectifyError::Exchanged { distance, vertical }.to_string();
+        assert_eq!(text(0.20000000000000004, true), "the second camera stands 0.2 above the first: they are exchanged");
+        assert!(text(123456.7, false).contains(" 123500 left of"));
+        assert_eq!(four_digits(0.0), 0.0);
+        assert!(four_digits(f64::NAN).is_nan());
     }
 
     #[test]

@@ -1,9 +1,10 @@
 //! `cv rectify`: a pair as two cameras would have taken it whose rows coincide.
 
 use crate::common::{Context, Explain, Failure, Outcome, Run, create_dir, spare_inputs};
+use crate::rig;
 use cv_core::{RgbU8, StereoRig};
 use cv_io::RigFile;
-use cv_pipeline::{NoPairCause, rectify};
+use cv_pipeline::rectify;
 use cv_pipeline::stereo::RectifyOptions;
 use cv_report::{Canvas, Figure, Report, colors, side_by_side};
 use serde_json::json;
@@ -13,10 +14,23 @@ use std::path::{Path, PathBuf};
 ///
 /// Writes left.png, right.png, rig.yaml (the rectified cameras) and q.txt (the matrix that takes column, row, disparity, 1
 /// to space) to a folder. The vertical residual is measured on features found in both rectified photographs.
+///
+/// Where one camera stands below the other, both results are turned by a quarter, anticlockwise: down in the scene is to the
+/// right, and rows coincide all the same. The upper photograph becomes left.png.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv rectify left.jpg right.jpg --rig rig.yaml --out rectified\n  \
-    cv rectify left.jpg right.jpg --rig opencv-stereo.yml --alpha 1 --size 1280x960 --out rectified --report page")]
+    cv rectify left.jpg right.jpg --rig opencv-stereo.yml --alpha 1 --size 1280x960 --out rectified --report page\n\n\
+    A rig file is ours:\n  \
+    schema: cv-rig/1\n  \
+    unit: m\n  \
+    left: {width: 640, height: 480, fx: 560, fy: 560, cx: 319.5, cy: 239.5}\n  \
+    right: {width: 640, height: 480, fx: 555, fy: 555, cx: 325, cy: 236}\n  \
+    rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]   # x_right = rotation · x_left + translation\n  \
+    translation: [-0.12, 0, 0]                    # the right camera stands 0.12 m to the right\n\
+    A camera may also have distortion: radial, brown_conrady or fisheye, and its 2, 5 or 4\n\
+    coefficients: [k1, k2], [k1, k2, p1, p2, k3] or [k1, k2, k3, k4]. Or the file is OpenCV's YAML,\n\
+    with M1, D1, M2, D2, R and T in one.")]
 pub(crate) struct Args {
     /// The left (or upper) photograph.
     left: PathBuf,
@@ -29,11 +43,18 @@ pub(crate) struct Args {
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// From 0 (no pixel without content) to 1 (no pixel lost).
-    #[arg(long, value_name = "A", default_value_t = 0.0)]
+    #[arg(long, value_name = "A", default_value_t = 0.0, value_parser = parse_share)]
     alpha: f64,
-    /// Width and height of the rectified photographs [default: as the left one].
+    /// Width and height of the rectified photographs [default: as the left one, turned with it where the rig is vertical].
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
     size: Option<(usize, usize)>,
+    /// The rig file has the cameras in the other order: its first one took the right (or lower) photograph.
+    #[arg(long)]
+    exchange: bool,
+}
+
+fn parse_share(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|share| (0.0..=1.0).contains(share)).ok_or_else(|| "give a number from 0 to 1".to_owned())
 }
 
 fn parse_size(text: &str) -> Result<(usize, usize), String> {
@@ -49,14 +70,16 @@ const NAMES: [&str; 4] = ["left.png", "right.png", "rig.yaml", "q.txt"];
 
 impl Run for Args {
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
+        let exchange = self.exchange;
         spare_inputs(&NAMES.map(|name| self.out.join(name)), &[&self.left, &self.right, &self.rig])?;
         let left = cv_io::read_rgb(&self.left)?;
         let right = cv_io::read_rgb(&self.right)?;
-        let RigFile { rig, unit, .. } = cv_io::read_rig(&self.rig, Some(left.size()))?;
+        let RigFile { rig, unit, .. } = rig::read(&self.rig, left.size(), exchange)?;
+        rig::check_size(&self.rig, &self.left, left.size(), &rig.left)?;
+        rig::check_size(&self.rig, &self.right, right.size(), &rig.right)?;
         let options = RectifyOptions { alpha: self.alpha, size: self.size };
         let result = rectify(left.view(), right.view(), &rig, &options, context)
-            .during(self.rig.display())
-            .advice("check the calibration file, and that it belongs to these photographs")?;
+            .map_err(|error| rig::explained(error, &self.rig, exchange))?;
         let r = &result.rectification;
         let rotation = cv_core::Rotation3::identity();
         let translation = cv_core::Vector3::new(-r.geometry.baseline, 0.0, 0.0);
@@ -111,14 +134,7 @@ impl Run for Args {
                 100.0 * result.valid_area[0],
                 100.0 * result.valid_area[1]
             ));
-        Ok(match result.fault {
-            // What is known is that the calibration says one thing and the photographs another.
-            Some(cause @ (NoPairCause::Rows { .. } | NoPairCause::Exchanged { .. })) => outcome.but(
-                Failure::new(format!("the photographs do not fit {}: {cause}", self.rig.display()))
-                    .advice("check that the calibration is that of these photographs, and that they are in its order"),
-            ),
-            _ => outcome,
-        })
+        Ok(rig::checked(outcome, &self.rig, result.fault))
     }
 
     fn outputs(&self) -> Vec<&Path> {

@@ -5,14 +5,15 @@ mod maps;
 mod options;
 mod report;
 
-use crate::common::{Context, Explain, Failure, Outcome, Run};
-use cv_core::{GrayF32, ImageView, RgbU8};
+use crate::common::{Context, Failure, Outcome, Run};
+use crate::rig;
+use cv_core::{GrayF32, ImageView, Point3, RgbU8, Rotation3};
 use cv_io::ply::{Cloud, PlyEncoding};
 use cv_io::{DynImage, Pixels};
 use cv_pipeline::stereo::{
     Intensity, PixelState, Rectification, RectifyOptions, StereoError, StereoGeometry, StereoMatcher,
 };
-use cv_pipeline::{DepthError, DepthOptions, DepthResult, depth};
+use cv_pipeline::{DepthError, DepthOptions, DepthResult, NoPairCause, depth};
 use frames::is_sequence;
 use maps::{map_format, write_map};
 use options::{Range, parse_range};
@@ -46,12 +47,17 @@ pub(crate) struct Args {
     /// Where to write the depth, in the unit of the baseline: .pfm, .png or .npy. Needs --rig, or --focal and --baseline.
     #[arg(long, value_name = "FILE")]
     depth: Option<PathBuf>,
-    /// Where to write a coloured point cloud, as PLY. Needs what --depth needs.
+    /// Where to write a coloured point cloud, as PLY, in the frame of the left camera: x right, y down, z ahead. Needs what --depth
+    /// needs.
     #[arg(long, value_name = "FILE")]
     cloud: Option<PathBuf>,
-    /// Calibration of the rig, ours or OpenCV's YAML: the photographs are rectified first.
+    /// Calibration of the rig, ours or OpenCV's YAML (see `cv rectify --help`): the photographs are rectified first, and the maps
+    /// are those of the rectified left (or upper) one, which `cv rectify` writes.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["focal", "baseline"])]
     rig: Option<PathBuf>,
+    /// The rig file has the cameras in the other order: its first one took the right (or lower) photograph.
+    #[arg(long, requires = "rig")]
+    exchange: bool,
     /// Number of disparities to try, in pixels, or auto: from feature matches.
     #[arg(long, value_name = "N|auto", default_value = "128", value_parser = parse_range)]
     disparities: Range,
@@ -160,16 +166,21 @@ impl Run for Args {
         let mut options = self.options();
         let job = match &self.rig {
             Some(path) => {
-                let rig = cv_io::read_rig(path, Some(left.size()))?.rig;
-                let rectified = Rectification::new(&rig, &RectifyOptions::default())
-                    .during(path.display())
-                    .advice("check the calibration file")?;
-                let advice = "use the photographs the rig was calibrated for";
-                let (left, _) = rectified.left.apply(left.into_rgb8().view()).advice(advice)?;
-                let (right, _) = rectified.right.apply(right.into_rgb8().view()).advice(advice)?;
+                let rig = rig::read(path, left.size(), self.exchange)?.rig;
+                rig::check_size(path, &self.left, left.size(), &rig.left)?;
+                rig::check_size(path, &self.right, right.size(), &rig.right)?;
+                let explain = |error| rig::explained(error, path, self.exchange);
+                let rectified = Rectification::new(&rig, &RectifyOptions::default()).map_err(explain)?;
+                let (left, _) = rectified.left.apply(left.into_rgb8().view()).map_err(explain)?;
+                let (right, _) = rectified.right.apply(right.into_rgb8().view()).map_err(explain)?;
+                if rectified.vertical {
+                    context.note("the rig is vertical: the maps are those of the photograph turned by a quarter, as `cv rectify` turns it");
+                }
                 self.set_range(&mut options, &left, &right, context)?;
-                let result = matched(left.view(), right.view(), Some(&rectified.geometry), &options, context)?;
-                Job { left, right, geometry: Some(rectified.geometry), result }
+                let result = matched(left.view(), right.view(), Some(&rectified.geometry), &options, context)
+                    .map_err(|error| explained(error, true))?;
+                let to_camera = Some(rectified.left.rotation.inverse());
+                Job { left, right, geometry: Some(rectified.geometry), to_camera, result }
             }
             None => {
                 let (width, height) = left.size();
@@ -200,7 +211,12 @@ impl Run for Args {
         self.write_quality(&job, context)?;
         let points = match (&job.geometry, depth) {
             (Some(geometry), Some(depth)) if self.cloud.is_some() || context.wants_report() => {
-                geometry.cloud(depth.view(), job.left.view())
+                let mut points = geometry.cloud(depth.view(), job.left.view());
+                if let Some(back) = job.to_camera {
+                    let turn = |p: [f32; 3]| (back * Point3::from(p.map(f64::from))).coords.map(|v| v as f32).into();
+                    points.iter_mut().for_each(|p| p.position = turn(p.position));
+                }
+                points
             }
             _ => Vec::new(),
         };
@@ -266,6 +282,8 @@ struct Job {
     left: RgbU8,
     right: RgbU8,
     geometry: Option<StereoGeometry>,
+    /// From the frame of the photographs to that of the left camera, where they were rectified.
+    to_camera: Option<Rotation3<f64>>,
     result: DepthResult,
 }
 
@@ -279,16 +297,17 @@ fn job(
 ) -> Result<Job, Failure> {
     let geometry_ref = geometry.as_ref();
     let result = match (&left.pixels, &right.pixels) {
-        (Pixels::Gray8(a), Pixels::Gray8(b)) => matched(a.view(), b.view(), geometry_ref, options, context)?,
-        (Pixels::Gray16(a), Pixels::Gray16(b)) => matched(a.view(), b.view(), geometry_ref, options, context)?,
-        (Pixels::Rgb16(a), Pixels::Rgb16(b)) => matched(a.view(), b.view(), geometry_ref, options, context)?,
-        (Pixels::Rgb8(a), Pixels::Rgb8(b)) => matched(a.view(), b.view(), geometry_ref, options, context)?,
+        (Pixels::Gray8(a), Pixels::Gray8(b)) => matched(a.view(), b.view(), geometry_ref, options, context),
+        (Pixels::Gray16(a), Pixels::Gray16(b)) => matched(a.view(), b.view(), geometry_ref, options, context),
+        (Pixels::Rgb16(a), Pixels::Rgb16(b)) => matched(a.view(), b.view(), geometry_ref, options, context),
+        (Pixels::Rgb8(a), Pixels::Rgb8(b)) => matched(a.view(), b.view(), geometry_ref, options, context),
         _ => {
             let (a, b) = (left.clone().into_rgb8(), right.clone().into_rgb8());
-            matched(a.view(), b.view(), geometry_ref, options, context)?
+            matched(a.view(), b.view(), geometry_ref, options, context)
         }
-    };
-    Ok(Job { left: left.into_rgb8(), right: right.into_rgb8(), geometry, result })
+    }
+    .map_err(|error| explained(error, false))?;
+    Ok(Job { left: left.into_rgb8(), right: right.into_rgb8(), geometry, to_camera: None, result })
 }
 
 /// Tells what matching will take, before it is asked for.
@@ -297,9 +316,10 @@ fn say_memory(matcher: &StereoMatcher, (width, height): (usize, usize), context:
     context.note(format!("matching {width}×{height} px at {} disparities takes {mib:.1} MiB", matcher.options().disparities));
 }
 
-/// What to try where there is no depth.
-fn explained(error: DepthError) -> Failure {
+/// What to try where there is no depth; with a rig, the pair is as its calibration says.
+fn explained(error: DepthError, with_rig: bool) -> Failure {
     let advice = match &error {
+        DepthError::NoPair { cause: NoPairCause::Rows { .. } | NoPairCause::Exchanged { .. }, .. } if with_rig => rig::ADVICE,
         DepthError::NoPair { cause, .. } => {
             let advice = cause.advice();
             return Failure::from(error).advice(advice);
@@ -317,8 +337,8 @@ fn matched<T: Intensity, const C: usize>(
     geometry: Option<&StereoGeometry>,
     options: &DepthOptions,
     context: &Context,
-) -> Result<DepthResult, Failure> {
+) -> Result<DepthResult, DepthError> {
     say_memory(&StereoMatcher::new(options.stereo.clone())?, left.size(), context);
-    depth(left, right, geometry, options, context).map_err(explained)
+    depth(left, right, geometry, options, context)
 }
 

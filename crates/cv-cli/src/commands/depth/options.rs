@@ -1,6 +1,7 @@
 //! What the arguments of `cv depth` mean to the matcher.
 
 use super::Args;
+use crate::rig;
 use crate::common::{Context, Explain, Failure};
 use cv_core::RgbU8;
 use cv_pipeline::stereo::{Blend, Census, Paths, Smoothing, StereoOptions};
@@ -32,7 +33,10 @@ impl Args {
         if self.disparities == Range::Auto {
             let (min, n) = disparity_range(left.view(), right.view(), context)
                 .during("--disparities auto")
-                .advice("give the number of disparities")?;
+                .advice(match self.rig {
+                    Some(_) => rig::ADVICE,
+                    None => "rectify the pair (--rig, or `cv rectify`), or give the number of disparities",
+                })?;
             let end = min + n as i32;
             options.stereo.min_disparity = self.min_disparity.unwrap_or(min);
             options.stereo.disparities = (end - options.stereo.min_disparity).max(1) as usize;
