@@ -147,6 +147,21 @@ impl RectifiedView {
             .map_err(|_| RectifyError::TooLarge { width: size.0, height: size.1 })
     }
 
+    /// How many px of the original the outermost pixel of the rectified image lies outside it; infinity where the camera does
+    /// not look there at all, negative inside.
+    fn beyond_the_border(&self) -> f64 {
+        let last = |n: usize| n as f64 - 1.0;
+        let (w, h) = (last(self.source.width), last(self.source.height));
+        let outside = |x: usize, y: usize| {
+            self.source_pixel(Point2::new(x as f64, y as f64))
+                .map_or(f64::INFINITY, |p| (-p.x).max(-p.y).max(p.x - w).max(p.y - h))
+        };
+        let (right, bottom) = (self.camera.width - 1, self.camera.height - 1);
+        let columns = (0..=right).map(|x| outside(x, 0).max(outside(x, bottom)));
+        let rows = (0..=bottom).map(|y| outside(0, y).max(outside(right, y)));
+        columns.chain(rows).fold(-f64::INFINITY, f64::max)
+    }
+
     /// Where a pixel of the original lies in the rectified image; `None` behind the rectified camera.
     pub fn rectified_pixel(&self, pixel: Point2<f64>) -> Option<Point2<f64>> {
         let n = self.source.normalize(pixel);
@@ -215,8 +230,8 @@ impl Rectification {
         if width == 0 || height == 0 {
             return Err(RectifyError::Option { name: "size", value: 0.0, allowed: "at least 1×1 px" });
         }
-        let fields = [field(&rig.left, &rotations[0]), field(&rig.right, &rotations[1])];
-        let camera = common_camera(fields, width, height, options.alpha)?;
+        let sources = [(rig.left, rotations[0]), (rig.right, rotations[1])];
+        let camera = common_camera(sources, (width, height), options.alpha)?;
         let view = |source, rotation| RectifiedView { source, camera, rotation };
         Ok(Self {
             left: view(rig.left, rotations[0]),
@@ -262,88 +277,132 @@ pub(crate) struct Rect {
     pub(crate) bottom: f64,
 }
 
-impl Rect {
-    fn size(&self) -> (f64, f64) {
-        (self.right - self.left, self.bottom - self.top)
-    }
-
-    fn middle(&self) -> (f64, f64) {
-        ((self.left + self.right) / 2.0, (self.top + self.bottom) / 2.0)
-    }
-}
-
-/// What a camera sees in the rectified frame: a rectangle inside its field of view, and one around it.
-pub(crate) fn field(camera: &Camera, rotation: &Rotation3<f64>) -> (Rect, Rect) {
+/// The border of what a camera sees, in the rectified frame: a closed polygon, from which parts that are behind are missing.
+pub(crate) fn outline(camera: &Camera, rotation: &Rotation3<f64>) -> Vec<Point2<f64>> {
     // As many points per side as show the bend of a strong distortion.
     const STEPS: usize = 64;
     let (w, h) = (camera.width as f64 - 1.0, camera.height as f64 - 1.0);
-    let everything = f64::INFINITY;
-    let mut inner = Rect { left: -everything, top: -everything, right: everything, bottom: everything };
-    let mut outer = Rect { left: everything, top: everything, right: -everything, bottom: -everything };
-    // Where the middle of each side goes tells which side of the rectified image it bounds: a rig on its side turns.
-    let project = |x: f64, y: f64| {
-        let n = camera.normalize(Point2::new(x, y));
-        let ray = rotation * Point3::new(n.x, n.y, 1.0);
-        (ray.z > 1e-3).then(|| Point2::new(ray.x / ray.z, ray.y / ray.z))
-    };
-    let Some(middle) = project(w / 2.0, h / 2.0) else { return (inner, outer) };
-    for (from, to) in [((0.0, 0.0), (w, 0.0)), ((w, 0.0), (w, h)), ((w, h), (0.0, h)), ((0.0, h), (0.0, 0.0))] {
-        let side = project((from.0 + to.0) / 2.0, (from.1 + to.1) / 2.0).map(|p| p - middle);
-        for step in 0..=STEPS {
-            let t = step as f64 / STEPS as f64;
-            let Some(p) = project(from.0 + (to.0 - from.0) * t, from.1 + (to.1 - from.1) * t) else { continue };
-            outer.left = outer.left.min(p.x);
-            outer.right = outer.right.max(p.x);
-            outer.top = outer.top.min(p.y);
-            outer.bottom = outer.bottom.max(p.y);
-            match side {
-                Some(s) if s.x.abs() > s.y.abs() && s.x < 0.0 => inner.left = inner.left.max(p.x),
-                Some(s) if s.x.abs() > s.y.abs() => inner.right = inner.right.min(p.x),
-                Some(s) if s.y < 0.0 => inner.top = inner.top.max(p.y),
-                Some(_) => inner.bottom = inner.bottom.min(p.y),
-                None => {}
+    let corners = [(0.0, 0.0), (w, 0.0), (w, h), (0.0, h)];
+    (0..4 * STEPS)
+        .filter_map(|i| {
+            let (from, to) = (corners[i / STEPS], corners[(i / STEPS + 1) % 4]);
+            let t = (i % STEPS) as f64 / STEPS as f64;
+            let n = camera.normalize(Point2::new(from.0 + (to.0 - from.0) * t, from.1 + (to.1 - from.1) * t));
+            let ray = rotation * Point3::new(n.x, n.y, 1.0);
+            (ray.z > 1e-3).then(|| Point2::new(ray.x / ray.z, ray.y / ray.z))
+        })
+        .collect()
+}
+
+/// The smallest rectangle around an outline.
+pub(crate) fn around(outline: &[Point2<f64>]) -> Rect {
+    let nothing = Rect { left: f64::INFINITY, top: f64::INFINITY, right: -f64::INFINITY, bottom: -f64::INFINITY };
+    outline.iter().fold(nothing, |r, p| Rect {
+        left: r.left.min(p.x),
+        top: r.top.min(p.y),
+        right: r.right.max(p.x),
+        bottom: r.bottom.max(p.y),
+    })
+}
+
+/// The sides of a closed polygon.
+fn sides(outline: &[Point2<f64>]) -> impl Iterator<Item = (Point2<f64>, Point2<f64>)> {
+    outline.iter().copied().zip(outline.iter().copied().cycle().skip(1))
+}
+
+/// How far the inside of a polygon reaches from `p` to the left and right of it, or, with `axis` 1, up and down; `None` outside.
+fn reach(outline: &[Point2<f64>], p: Point2<f64>, axis: usize) -> Option<(f64, f64)> {
+    let (along, across) = (axis, 1 - axis);
+    let (mut before, mut behind, mut crossed) = (-f64::INFINITY, f64::INFINITY, 0);
+    for (a, b) in sides(outline) {
+        if (a[across] > p[across]) == (b[across] > p[across]) {
+            continue;
+        }
+        let t = (p[across] - a[across]) / (b[across] - a[across]);
+        let at = a[along] + (b[along] - a[along]) * t - p[along];
+        if at < 0.0 {
+            crossed += 1;
+            before = before.max(at);
+        } else {
+            behind = behind.min(at);
+        }
+    }
+    (crossed % 2 == 1 && behind.is_finite()).then_some((before, behind))
+}
+
+/// By how much a rectangle around `middle` that reaches `half` to the sides can grow before it meets a polygon.
+fn room(outline: &[Point2<f64>], middle: Point2<f64>, half: (f64, f64)) -> f64 {
+    let mut least = f64::INFINITY;
+    for (a, b) in sides(outline) {
+        // In units of the rectangle; along the side, the larger of both is least at an end or where they are the same.
+        let (u0, v0) = ((a.x - middle.x) / half.0, (a.y - middle.y) / half.1);
+        let (u1, v1) = ((b.x - middle.x) / half.0, (b.y - middle.y) / half.1);
+        let same = |sign: f64| (u0 - sign * v0) / ((u0 - sign * v0) - (u1 - sign * v1));
+        for t in [0.0, same(1.0), same(-1.0)] {
+            if (0.0..=1.0).contains(&t) {
+                least = least.min((u0 + (u1 - u0) * t).abs().max((v0 + (v1 - v0) * t).abs()));
             }
         }
     }
-    (inner, outer)
+    least
 }
 
 /// One camera for both views: between the largest that shows only what both see, and the smallest that shows all.
-fn common_camera(fields: [(Rect, Rect); 2], width: usize, height: usize, alpha: f64) -> Result<Camera, RectifyError> {
-    let [(inner_a, outer_a), (inner_b, outer_b)] = fields;
-    let inner = Rect {
-        left: inner_a.left.max(inner_b.left),
-        top: inner_a.top.max(inner_b.top),
-        right: inner_a.right.min(inner_b.right),
-        bottom: inner_a.bottom.min(inner_b.bottom),
+fn common_camera(
+    sources: [(Camera, Rotation3<f64>); 2],
+    (width, height): (usize, usize),
+    alpha: f64,
+) -> Result<Camera, RectifyError> {
+    let outlines = sources.map(|(camera, rotation)| outline(&camera, &rotation));
+    let [a, b] = [around(&outlines[0]), around(&outlines[1])];
+    let middle = |left: f64, right: f64, top: f64, bottom: f64| Point2::new((left + right) / 2.0, (top + bottom) / 2.0);
+    let both = middle(a.left.max(b.left), a.right.min(b.right), a.top.max(b.top), a.bottom.min(b.bottom));
+    let (left, right) = (a.left.min(b.left), a.right.max(b.right));
+    let (top, bottom) = (a.top.min(b.top), a.bottom.max(b.bottom));
+    // How far both see from a point: the way to the nearer of their borders.
+    let reach_of_both = |p: Point2<f64>, axis: usize| -> Option<(f64, f64)> {
+        let ((a0, a1), (b0, b1)) = (reach(&outlines[0], p, axis)?, reach(&outlines[1], p, axis)?);
+        Some((a0.max(b0), a1.min(b1)))
     };
-    let outer = Rect {
-        left: outer_a.left.min(outer_b.left),
-        top: outer_a.top.min(outer_b.top),
-        right: outer_a.right.max(outer_b.right),
-        bottom: outer_a.bottom.max(outer_b.bottom),
-    };
-    let sizes = [inner.size(), outer.size()];
-    if !sizes.iter().all(|s| s.0 > 0.0 && s.1 > 0.0 && s.0.is_finite() && s.1.is_finite()) {
+    let (Some(x), Some(y)) = (reach_of_both(both, 0), reach_of_both(both, 1)) else {
         return Err(RectifyError::NoOverlap);
-    }
+    };
+    let inner = Point2::new(both.x + (x.0 + x.1) / 2.0, both.y + (y.0 + y.1) / 2.0);
+    let inner = if reach_of_both(inner, 0).is_some() { inner } else { both };
     // Pixel centres at the very corners.
     let (w, h) = ((width as f64 - 1.0).max(1.0), (height as f64 - 1.0).max(1.0));
-    let tight = (w / sizes[0].0).max(h / sizes[0].1);
-    let wide = (w / sizes[1].0).min(h / sizes[1].1);
-    let focal = tight + (wide - tight) * alpha;
-    let (m0, m1) = (inner.middle(), outer.middle());
-    let middle = (m0.0 + (m1.0 - m0.0) * alpha, m0.1 + (m1.1 - m0.1) * alpha);
-    Ok(Camera {
+    let camera = |focal: f64, middle: Point2<f64>| Camera {
         width,
         height,
         fx: focal,
         fy: focal,
-        cx: (width as f64 - 1.0) / 2.0 - focal * middle.0,
-        cy: (height as f64 - 1.0) / 2.0 - focal * middle.1,
+        cx: (width as f64 - 1.0) / 2.0 - focal * middle.x,
+        cy: (height as f64 - 1.0) / 2.0 - focal * middle.y,
         distortion: Distortion::None,
-    })
+    };
+    let [room_a, room_b] = [0, 1].map(|i: usize| room(&outlines[i], inner, (w / 2.0, h / 2.0)));
+    let mut tight = (1.0 + ROUNDING) / room_a.min(room_b);
+    // Between the points of its outline a border bends: by less and less of a pixel, until no pixel is outside.
+    for _ in 0..20 {
+        let beyond = sources.map(|(source, rotation)| {
+            RectifiedView { source, camera: camera(tight, inner), rotation }.beyond_the_border()
+        });
+        let beyond = beyond[0].max(beyond[1]);
+        if beyond <= 0.0 {
+            break;
+        }
+        tight *= 1.0 + ROUNDING + (4.0 * beyond / w.min(h)).min(0.05);
+    }
+    let wide = (w / (right - left)).min(h / (bottom - top));
+    let focal = tight + (wide - tight) * alpha;
+    if !(focal.is_finite() && focal > 0.0) {
+        return Err(RectifyError::NoOverlap);
+    }
+    Ok(camera(focal, inner + (middle(left, right, top, bottom) - inner) * alpha))
 }
+
+/// Of a focal length: far above what arithmetic loses, far below what a pixel shows.
+const ROUNDING: f64 = 1e-12;
 
 #[cfg(test)]
 mod tests {
@@ -414,6 +473,27 @@ mod tests {
             }
         }
         assert!(wide.valid_area().0 < 0.99 && wide.geometry.focal < tight.geometry.focal);
+    }
+
+    #[test]
+    fn a_rig_that_leans_shows_as_much_as_fits() {
+        let camera = Camera::from_focal(641, 481, 500.0);
+        for degrees in [0.0_f64, 2.0, 10.0, 30.0, 43.0, 50.0, 80.0] {
+            let (sin, cos) = degrees.to_radians().sin_cos();
+            let pose = Pose::new(Rotation3::identity(), -Vector3::new(0.1 * cos, 0.1 * sin, 0.0));
+            let rig = StereoRig { left: camera, right: camera, right_from_left: pose };
+            let rectified = Rectification::new(&rig, &RectifyOptions::default()).unwrap();
+            assert_eq!(rectified.valid_area(), (1.0, 1.0), "{degrees}");
+            // A rectangle of half the sides (w, h), turned, in one of (320, 240): each of its corners inside.
+            let (w, h) = if rectified.vertical { (240.0, 320.0) } else { (320.0, 240.0) };
+            let fits = (320.0 / (w * cos + h * sin)).min(240.0 / (w * sin + h * cos));
+            // Undistorting is exact here; the border's points and a margin of 1e-9 are not.
+            assert!(
+                (rectified.geometry.focal / (500.0 / fits) - 1.0).abs() < 1e-8,
+                "{degrees}: {}",
+                rectified.geometry.focal
+            );
+        }
     }
 
     #[test]

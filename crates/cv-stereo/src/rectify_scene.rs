@@ -4,7 +4,7 @@
 //! ([`Rectification::new`]). Two photographs taken by hand converge on what they show: the parts of their rectified views
 //! that have it in common then lie far apart, and each view gets a principal point of its own.
 
-use crate::rectify::{MAX_TURN_DEGREES, Rectification, RectifiedView, RectifyError, field};
+use crate::rectify::{MAX_TURN_DEGREES, Rectification, RectifiedView, RectifyError, around, outline};
 use crate::{StereoGeometry, StereoOptions};
 use cv_core::{Camera, Point3, Rotation3, StereoRig, Vector3};
 use nalgebra::Matrix3;
@@ -75,7 +75,7 @@ impl SceneRectification {
         let (low, high) = ((low - more).max(0.0), high + more);
 
         let widest = WIDEST_DEGREES.to_radians().tan();
-        let [(_, a), (_, b)] = [field(&rig.left, &rotations[0]), field(&rig.right, &rotations[1])];
+        let [a, b] = [around(&outline(&rig.left, &rotations[0])), around(&outline(&rig.right, &rotations[1]))];
         let clip = |v: f64| v.clamp(-widest, widest);
         let (top, bottom) = (clip(a.top.max(b.top)), clip(a.bottom.min(b.bottom)));
         // A point at x in the left view is at x − d in the right one.
