@@ -60,8 +60,8 @@ fn parse_share(text: &str) -> Result<f64, String> {
 fn parse_size(text: &str) -> Result<(usize, usize), String> {
     let (w, h) = text.split_once('x').ok_or("give width and height as 1280x960")?;
     match (w.parse(), h.parse()) {
-        (Ok(w), Ok(h)) if (1..=32_768).contains(&w) && (1..=32_768).contains(&h) => Ok((w, h)),
-        _ => Err("width and height are whole numbers from 1 to 32768".to_owned()),
+        (Ok(w), Ok(h)) if (1..=16_384).contains(&w) && (1..=16_384).contains(&h) => Ok((w, h)),
+        _ => Err("width and height are whole numbers from 1 to 16384".to_owned()),
     }
 }
 
