@@ -8,7 +8,7 @@ use crate::align::Alignment;
 use crate::correlation::{PAD, PLACES, REACH, Template};
 use crate::layout::{Bounds, Layout, Placement};
 use crate::projection::Surface;
-use cv_core::{ImageView, Point2, Vector2};
+use cv_core::{GrayU8, ImageView, Point2, Vector2};
 use rayon::prelude::*;
 
 /// Displacements of one photograph on a grid over its part of the canvas.
@@ -174,10 +174,11 @@ pub(crate) fn fields(photos: &[ImageView<'_, u8, 3>], layout: &Layout, alignment
     // Feature positions are good to a pixel or so of the photographs they were found on, patches to a fraction.
     solve(&mut fields, &ties, 3.0);
     let features = ties.len();
+    let greys: Vec<GrayU8> = photos.par_iter().map(|p| cv_imgproc::rgb_to_gray(*p)).collect();
     // Twice: what the first round brings within reach, the second registers.
     for _ in 0..2 {
         ties.truncate(features);
-        ties.extend(patch_ties(photos, layout, &fields, spacing));
+        ties.extend(patch_ties(&greys, layout, &fields, spacing));
         solve(&mut fields, &ties, 3.0);
     }
     for (field, placement) in fields.iter_mut().zip(&layout.placements) {
@@ -307,10 +308,11 @@ fn conjugate_gradients(
     let mut z = scaled(&r);
     let mut direction = z.clone();
     let mut rz = dot(&r, &z);
-    let start = rz;
+    // Against the right side, not against the first residual: what a former solution leaves may be small already.
+    let whole = dot(right, &scaled(right));
     for _ in 0..200 {
         // A thousandth of the error a pixel leaves is enough.
-        if rz.x <= 1e-8 * start.x.max(1e-6) && rz.y <= 1e-8 * start.y.max(1e-6) {
+        if rz.x <= 1e-8 * whole.x.max(1e-6) && rz.y <= 1e-8 * whole.y.max(1e-6) {
             break;
         }
         let product = apply(&direction);
@@ -336,7 +338,7 @@ const HALF: usize = 8;
 const PER_OVERLAP: usize = 800;
 
 /// Ties between patches of the photographs as drawn with the fields so far.
-fn patch_ties(photos: &[ImageView<'_, u8, 3>], layout: &Layout, fields: &[Field], spacing: f64) -> Vec<Tie> {
+fn patch_ties(photos: &[GrayU8], layout: &Layout, fields: &[Field], spacing: f64) -> Vec<Tie> {
     let mut tries = Vec::new();
     for (p, first) in layout.placements.iter().enumerate() {
         for (q, second) in layout.placements.iter().enumerate().skip(p + 1) {
@@ -373,15 +375,8 @@ fn patch_ties(photos: &[ImageView<'_, u8, 3>], layout: &Layout, fields: &[Field]
     found.into_iter().flatten().collect()
 }
 
-/// Luma of a placement as drawn around a canvas pixel, `2 half + 1` on a side; `None` where it is not wholly inside the photograph.
-fn patch(
-    photos: &[ImageView<'_, u8, 3>],
-    layout: &Layout,
-    field: &Field,
-    p: usize,
-    c: Point2<f64>,
-    half: usize,
-) -> Option<Vec<f32>> {
+/// A placement as drawn around a canvas pixel, `2 half + 1` on a side; `None` where it is not wholly inside the photograph.
+fn patch(photos: &[GrayU8], layout: &Layout, field: &Field, p: usize, c: Point2<f64>, half: usize) -> Option<Vec<f32>> {
     let placement = &layout.placements[p];
     let photo = photos.get(placement.photo)?;
     let look =
@@ -402,27 +397,23 @@ fn patch(
         }
     }
     let side = 2 * half + 1;
+    let (width, pixels) = (photo.width(), photo.as_slice());
+    let (ux, uy) = (ux.cast::<f32>(), uy.cast::<f32>());
     let mut values = Vec::with_capacity(side * side);
     for j in 0..side {
+        let start = middle.cast::<f32>() + uy * (j as f32 - half as f32);
         for i in 0..side {
-            let at = middle + ux * (i as f64 - h) + uy * (j as f64 - h);
-            values.push(luma(photo, at.x as f32, at.y as f32));
+            let at = start + ux * (i as f32 - half as f32);
+            // Rounding to single precision may reach the last column or row.
+            let (x, y) = ((at.x as usize).min(width - 2), (at.y as usize).min(photo.height() - 2));
+            let (fx, fy) = (at.x - x as f32, at.y - y as f32);
+            let four = &pixels[y * width + x..][..width + 2];
+            let [a, b, c, d] = [four[0], four[1], four[width], four[width + 1]].map(f32::from);
+            let (top, bottom) = (a + (b - a) * fx, c + (d - c) * fx);
+            values.push(top + (bottom - top) * fy);
         }
     }
     Some(values)
-}
-
-fn luma(photo: &ImageView<'_, u8, 3>, x: f32, y: f32) -> f32 {
-    let (x0, y0) = (x as usize, y as usize);
-    let (fx, fy) = (x - x0 as f32, y - y0 as f32);
-    let (x1, y1) = ((x0 + 1).min(photo.width() - 1), (y0 + 1).min(photo.height() - 1));
-    let (top, bottom) = (photo.row(y0), photo.row(y1));
-    let at = |row: &[u8], x: usize| {
-        0.299 * f32::from(row[3 * x]) + 0.587 * f32::from(row[3 * x + 1]) + 0.114 * f32::from(row[3 * x + 2])
-    };
-    let (a, b) =
-        (at(top, x0) + (at(top, x1) - at(top, x0)) * fx, at(bottom, x0) + (at(bottom, x1) - at(bottom, x0)) * fx);
-    a + (b - a) * fy
 }
 
 /// The lesser eigenvalue of the mean structure tensor of a patch.
