@@ -289,11 +289,7 @@ fn regions(coarse: &Labels, preview: &Preview, layout: &Layout, bands: usize) ->
 fn enlarge(coarse: &Labels, preview: &Preview, layout: &Layout, pieces: &[Option<Warped>]) -> Labels {
     let (w, h, step) = (layout.width, layout.height, preview.step);
     let reaches = |label: u16, x: usize, y: usize| {
-        pieces.get(usize::from(label)).and_then(Option::as_ref).is_some_and(|p| {
-            let b = p.bounds;
-            let inside = x >= b.left && y >= b.top && x < b.right && y < b.bottom;
-            inside && p.pixels.row(y - b.top)[4 * (x - b.left) + 3] > 0
-        })
+        pieces.get(usize::from(label)).and_then(Option::as_ref).is_some_and(|p| p.reaches(x, y))
     };
     let mut data = vec![NONE; w * h];
     let (cw, ch) = (coarse.width, coarse.height);

@@ -47,11 +47,6 @@ impl<'a> Toned<'a> {
         let t = &self.tables;
         (a > 0).then(|| [t[0][usize::from(r)].into(), t[1][usize::from(g)].into(), t[2][usize::from(b)].into()])
     }
-
-    pub(crate) fn reaches(&self, x: usize, y: usize) -> bool {
-        let b = self.warped.bounds;
-        x >= b.left && y >= b.top && x < b.right && y < b.bottom && self.warped.pixels.at(x - b.left, y - b.top)[3] > 0
-    }
 }
 
 /// Cost of a seam through a pixel that only one of the two photographs shows, in the unit of [`difference`]: a difference of 15 grey levels
@@ -126,18 +121,25 @@ pub(crate) fn on_preview(preview: &Preview, gains: &[[f32; 3]], photo_of: &[usiz
         return labels;
     }
     let found = Misalignments::find(preview, photo_of);
-    let misaligned = |a: usize, b: usize, x: usize, y: usize| {
-        (MISALIGNED * (preview.step as f32 * found.at(a, b, x, y) - 1.0).clamp(0.0, FARTHEST)) as i32
+    let pieces: Vec<Option<Toned<'_>>> =
+        preview.pieces.iter().zip(gains).map(|(p, g)| Some(Toned::new(&p.warped, *g))).collect();
+    let differ = |a: usize, b: usize, x: usize, y: usize| {
+        let off = preview.step as f32 * found.at(a, b, x, y) - 1.0;
+        difference(&pieces[a], &pieces[b], x, y) + (MISALIGNED * off.clamp(0.0, FARTHEST)) as i32
     };
-
     let half = preview.halved();
     let mut coarse = nearest_middle(&half);
+    // The worst of four pixels: their mean colours would hide a pole that the seam cuts in two.
+    let worst = |a: usize, b: usize, x: usize, y: usize| {
+        let four = [(0, 0), (1, 0), (0, 1), (1, 1)];
+        four.into_iter().map(|(i, j)| differ(a, b, 2 * x + i, 2 * y + j)).fold(0, i32::max)
+    };
     // A pixel stands for four, a step of a seam for two.
     let pixel =
         |label: usize, x: usize, y: usize| (2.0 * BORDER_PIXEL * eccentricity(&half.pieces[label], x, y)) as i32;
+    let reach: Vec<_> = half.pieces.iter().map(|p| Some(&p.warped)).collect();
     // The first round does nearly all; four settle every set met so far.
-    let everywhere = |_, _| true;
-    expand(&mut coarse, &toned(&half, gains), pixel, |a, b, x, y| misaligned(a, b, 2 * x, 2 * y), everywhere, 4);
+    expand(&mut coarse, &reach, pixel, worst, |_, _| true, 4);
 
     let width = preview.width;
     for (i, label) in labels.data.iter_mut().enumerate() {
@@ -151,12 +153,9 @@ pub(crate) fn on_preview(preview: &Preview, gains: &[[f32; 3]], photo_of: &[usiz
     }
     let near = near_seams(&labels, NEAR);
     let pixel = |label: usize, x: usize, y: usize| (BORDER_PIXEL * eccentricity(&preview.pieces[label], x, y)) as i32;
-    expand(&mut labels, &toned(preview, gains), pixel, misaligned, |x, y| near[y * width + x], 4);
+    let reach: Vec<_> = preview.pieces.iter().map(|p| Some(&p.warped)).collect();
+    expand(&mut labels, &reach, pixel, differ, |x, y| near[y * width + x], 4);
     labels
-}
-
-fn toned<'a>(preview: &'a Preview, gains: &[[f32; 3]]) -> Vec<Option<Toned<'a>>> {
-    preview.pieces.iter().zip(gains).map(|(p, g)| Some(Toned::new(&p.warped, *g))).collect()
 }
 
 /// Every pixel from the photograph whose middle is nearest.
@@ -189,7 +188,9 @@ fn eccentricity(piece: &crate::preview::Piece, x: usize, y: usize) -> f32 {
 pub(crate) fn refine(labels: &mut Labels, pieces: &[Option<Toned<'_>>], reach: usize) {
     let near = near_seams(labels, reach);
     let width = labels.width;
-    expand(labels, pieces, |_, _, _| 0, |_, _, _, _| 0, |x, y| near[y * width + x], 1);
+    let differ = |a: usize, c: usize, x: usize, y: usize| difference(&pieces[a], &pieces[c], x, y);
+    let reach: Vec<_> = pieces.iter().map(|p| p.as_ref().map(|p| p.warped)).collect();
+    expand(labels, &reach, |_, _, _| 0, differ, |x, y| near[y * width + x], 1);
 }
 
 /// True within `reach` pixels (in x and y) of a border between two labels.
@@ -239,9 +240,9 @@ fn near_seams(labels: &Labels, reach: usize) -> Vec<bool> {
 /// their label.
 fn expand(
     labels: &mut Labels,
-    pieces: &[Option<Toned<'_>>],
+    pieces: &[Option<&Warped>],
     unary: impl Fn(usize, usize, usize) -> i32 + Sync,
-    pairwise: impl Fn(usize, usize, usize, usize) -> i32 + Sync,
+    differ: impl Fn(usize, usize, usize, usize) -> i32 + Sync,
     free: impl Fn(usize, usize) -> bool + Sync,
     rounds: usize,
 ) {
@@ -253,7 +254,7 @@ fn expand(
             let turn: Vec<usize> = group.iter().copied().filter(|&k| std::mem::replace(&mut stale[k], false)).collect();
             let snapshot = &*labels;
             let changes: Vec<Vec<usize>> =
-                turn.par_iter().map(|&alpha| expand_one(snapshot, pieces, alpha, &unary, &pairwise, &free)).collect();
+                turn.par_iter().map(|&alpha| expand_one(snapshot, pieces, alpha, &unary, &differ, &free)).collect();
             for (&alpha, changed) in turn.iter().zip(&changes).filter(|(_, changed)| !changed.is_empty()) {
                 changed.iter().for_each(|&i| labels.data[i] = alpha as u16);
                 for (other, s) in stale.iter_mut().enumerate() {
@@ -268,13 +269,13 @@ fn expand(
 }
 
 /// Whether two pieces reach a common pixel or neighbouring ones, going by their bounds.
-fn touch(pieces: &[Option<Toned<'_>>], a: usize, b: usize) -> bool {
-    let (Some(a), Some(b)) = (&pieces[a], &pieces[b]) else { return false };
-    a.warped.bounds.grown(1, usize::MAX, usize::MAX).intersection(&b.warped.bounds).is_some()
+fn touch(pieces: &[Option<&Warped>], a: usize, b: usize) -> bool {
+    let (Some(a), Some(b)) = (pieces[a], pieces[b]) else { return false };
+    a.bounds.grown(1, usize::MAX, usize::MAX).intersection(&b.bounds).is_some()
 }
 
 /// The pieces in groups that do not touch each other: in a group, what one takes over changes nothing for the others, so that they may all be tried at once.
-fn apart(pieces: &[Option<Toned<'_>>]) -> Vec<Vec<usize>> {
+fn apart(pieces: &[Option<&Warped>]) -> Vec<Vec<usize>> {
     let mut groups: Vec<Vec<usize>> = Vec::new();
     for k in 0..pieces.len() {
         match groups.iter_mut().find(|group| group.iter().all(|&other| !touch(pieces, k, other))) {
@@ -291,20 +292,17 @@ const NEVER: i32 = 1 << 28;
 /// The pixels that `alpha` should take over, by index.
 fn expand_one(
     labels: &Labels,
-    pieces: &[Option<Toned<'_>>],
+    pieces: &[Option<&Warped>],
     alpha: usize,
     unary: impl Fn(usize, usize, usize) -> i32 + Sync,
-    pairwise: impl Fn(usize, usize, usize, usize) -> i32 + Sync,
+    differ: impl Fn(usize, usize, usize, usize) -> i32 + Sync,
     free: impl Fn(usize, usize) -> bool + Sync,
 ) -> Vec<usize> {
-    let Some(own) = &pieces[alpha] else { return Vec::new() };
-    let Some(b) =
-        own.warped.bounds.intersection(&Bounds { left: 0, top: 0, right: labels.width, bottom: labels.height })
+    let Some(own) = pieces[alpha] else { return Vec::new() };
+    let Some(b) = own.bounds.intersection(&Bounds { left: 0, top: 0, right: labels.width, bottom: labels.height })
     else {
         return Vec::new();
     };
-    let differ =
-        |a: usize, c: usize, x: usize, y: usize| difference(&pieces[a], &pieces[c], x, y) + pairwise(a, c, x, y);
     // A pixel may switch where it is free, alpha reaches it, and it shows something else.
     let may = |x: usize, y: usize| {
         let label = labels.at(x, y);

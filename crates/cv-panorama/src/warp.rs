@@ -18,6 +18,16 @@ pub(crate) struct Warped {
     pub(crate) pixels: Image<u8, 4>,
 }
 
+impl Warped {
+    /// Whether the photograph reaches a canvas pixel.
+    #[inline]
+    pub(crate) fn reaches(&self, x: usize, y: usize) -> bool {
+        let b = self.bounds;
+        let inside = x >= b.left && y >= b.top && x < b.right && y < b.bottom;
+        inside && self.pixels.row(y - b.top)[4 * (x - b.left) + 3] > 0
+    }
+}
+
 /// What to multiply a photograph with: a factor per channel, and `exp(v₁ r² + v₂ r⁴)` with r = 1 at its corners.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Tone {
