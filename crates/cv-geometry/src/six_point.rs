@@ -1,6 +1,6 @@
 //! Relative poses of two views of one unknown focal length, through six points.
 
-use crate::essential::orthonormalize;
+use crate::essential::{mix, orthonormalize};
 use crate::fundamental::epipolar_row;
 use cv_core::{Matrix3, Point2};
 use cv_numeric::{kernel_vector, null_space, real_quadratic_eigenvalues};
@@ -36,6 +36,7 @@ pub fn fundamental_six_point(a: &[Point2<f64>; 6], b: &[Point2<f64>; 6], mut fou
     // Twice: the second time mends what small angles cost the first.
     orthonormalize(&mut basis);
     orthonormalize(&mut basis);
+    mix(&mut basis);
     if !basis.iter().flatten().all(|v| v.is_finite()) {
         return;
     }

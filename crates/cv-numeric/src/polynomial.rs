@@ -59,13 +59,15 @@ fn polish(c: &[f64], mut x: f64) -> f64 {
     x
 }
 
-/// Real roots of `c[0] + c[1] x + c[2] x²`, without cancellation. A double root comes twice.
+/// Real roots of `c[0] + c[1] x + c[2] x²`, without cancellation. A double root comes twice, also where the coefficients are off by their last bits.
 #[inline]
 pub fn real_roots_quadratic(c: [f64; 3]) -> Roots<2> {
     let mut roots = Roots::NONE;
-    let discriminant = c[1] * c[1] - 4.0 * c[2] * c[0];
-    if discriminant >= 0.0 {
-        let q = -0.5 * (c[1] + discriminant.sqrt().copysign(c[1]));
+    let square = c[1] * c[1];
+    let discriminant = square - 4.0 * c[2] * c[0];
+    // Half of a last bit in each coefficient and each product make four in all.
+    if discriminant >= -4.0 * f64::EPSILON * square {
+        let q = -0.5 * (c[1] + discriminant.max(0.0).sqrt().copysign(c[1]));
         // With a vanishing leading coefficient the first is infinite and left out.
         roots.push(q / c[2]);
         if q != 0.0 {
@@ -492,6 +494,17 @@ mod tests {
         // Three equal roots: a rounding of the coefficients moves them by its cube root.
         assert_eq!(farthest_root_cubic([0.0, 0.0, 0.0, 1.0]).map(|x| x.abs() < 1e-45), Some(true));
         assert!((farthest_root_cubic([-0.001, 0.03, -0.3, 1.0]).unwrap() - 0.1).abs() < 1e-5);
+    }
+
+    #[test]
+    fn a_double_root_survives_rounding() {
+        // 0.3 (x − a)² with its coefficients rounded: for one a in four the discriminant is below zero.
+        for i in 1..200 {
+            let a = 1.0 + f64::from(i) / 97.0;
+            let roots = real_roots_quadratic([0.3 * a * a, -0.6 * a, 0.3]);
+            assert!(close(&roots, &[a, a], 1e-7), "{a} {roots:?}");
+        }
+        assert!(real_roots_quadratic([1.0 + 1e-14, -2.0, 1.0]).is_empty());
     }
 
     #[test]

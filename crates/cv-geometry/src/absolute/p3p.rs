@@ -180,6 +180,39 @@ mod tests {
     }
 
     #[test]
+    fn markers_seen_from_straight_ahead_are_no_special_case() {
+        // Symmetry makes coefficients of the cubic vanish, and straight above a corner on the circle through all three two solutions meet.
+        let side = 3f64.sqrt();
+        let shapes = [
+            [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]],
+            [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0]],
+            [[-1.0, -1.0], [1.0, -1.0], [0.0, side - 1.0]],
+            [[1.0, 0.0], [-0.5, 0.5 * side], [-0.5, -0.5 * side]],
+            [[-1.0, 0.0], [1.0, 0.0], [0.0, 3.0]],
+        ];
+        for shape in shapes {
+            for turn in [0.0, 0.25, 0.5, 1.0] {
+                for (axis, distance) in [(Vector3::x(), 4.0), (Vector3::y(), 4.0), (Vector3::z(), 40.0)] {
+                    let truth = Pose::new(Rotation3::new(axis * turn), Vector3::new(0.0, 0.0, distance));
+                    let m = shape.map(|[x, y]| {
+                        let world = Point3::new(x, y, 0.0);
+                        let q = truth.transform(&world);
+                        WorldMatch { world, image: Point2::new(q.x / q.z, q.y / q.z) }
+                    });
+                    let mut best = f64::INFINITY;
+                    pose_three_points(&m, |pose| {
+                        let e = (pose.rotation.matrix() - truth.rotation.matrix()).norm()
+                            + (pose.translation - truth.translation).norm() / distance;
+                        best = best.min(e);
+                    });
+                    // Where two solutions meet, half of the digits are lost, and two more at forty times the triangle's size.
+                    assert!(best < 1e-5, "{shape:?} {turn} {axis:?}: {best}");
+                }
+            }
+        }
+    }
+
+    #[test]
     fn degenerate_triples_give_nothing() {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let image = [(); 3].map(|()| Point2::new(uniform(&mut rng), uniform(&mut rng)));

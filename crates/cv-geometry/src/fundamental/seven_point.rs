@@ -1,5 +1,6 @@
 //! Fundamental matrices through seven points.
 
+use crate::essential::mix;
 use cv_core::{Matrix3, Point2};
 use cv_numeric::{null_space, real_roots_cubic};
 
@@ -11,7 +12,9 @@ use cv_numeric::{null_space, real_roots_cubic};
 #[inline]
 pub fn fundamental_seven_point(a: &[Point2<f64>; 7], b: &[Point2<f64>; 7], mut found: impl FnMut(Matrix3<f64>)) {
     let rows = std::array::from_fn(|i| epipolar_row(a[i], b[i]));
-    let Some([f, g]) = null_space::<7, 9, 2>(rows) else { return };
+    let Some(mut basis) = null_space::<7, 9, 2>(rows) else { return };
+    mix(&mut basis);
+    let [f, g] = basis;
     // det(f + t g) = det f + t tr(adj(f) g) + t² tr(adj(g) f) + t³ det g.
     let (adj_f, adj_g) = (adjugate(&f), adjugate(&g));
     let trace = |m: &[f64; 9], n: &[f64; 9]| (0..9).map(|i| m[i] * n[3 * (i % 3) + i / 3]).sum::<f64>();
