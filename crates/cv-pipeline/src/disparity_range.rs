@@ -24,12 +24,15 @@ pub enum RangeError {
 /// Fewer matches than this do not tell a range.
 pub(crate) const NEEDED: usize = 16;
 
-/// Features in a common row differ by no more than this in y, in px.
-const COMMON_ROW: f64 = 1.5;
+/// Whether features that differ by so many px in y lie in a common row.
+pub(crate) fn is_common_row(apart: f64) -> bool {
+    const COMMON_ROW: f64 = 1.5;
+    apart.abs() <= COMMON_ROW
+}
 
 /// Disparities of those matches that lie in a common row.
 pub(crate) fn in_common_rows(matches: &[Correspondence]) -> Vec<f64> {
-    matches.iter().filter(|m| (m.a.y - m.b.y).abs() <= COMMON_ROW).map(|m| m.a.x - m.b.x).collect()
+    matches.iter().filter(|m| is_common_row(m.a.y - m.b.y)).map(|m| m.a.x - m.b.x).collect()
 }
 
 /// Smallest disparity and number of disparities that a rectified pair shows: those of feature matches in common rows

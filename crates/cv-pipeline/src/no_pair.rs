@@ -1,6 +1,6 @@
 //! Why hardly any pixel of one photograph has a partner in the other, as far as feature matches tell.
 
-use crate::disparity_range::{NEEDED, in_common_rows, range_of};
+use crate::disparity_range::{NEEDED, in_common_rows, is_common_row, range_of};
 use crate::{MatchingOptions, Progress, match_photos};
 use cv_core::{Correspondence, ImageView, RgbU8};
 use cv_stereo::{Intensity, StereoOptions};
@@ -28,7 +28,7 @@ pub enum NoPairCause {
         /// Smallest and largest disparity of the matches in px.
         range: (i32, i32),
     },
-    /// Matches lie where they should: the photographs show too little texture, or move.
+    /// Matches lie where they should: the photographs show too little texture or a pattern that repeats, or things moved.
     Unknown,
 }
 
@@ -48,7 +48,9 @@ impl std::fmt::Display for NoPairCause {
             Self::Range { range: (low, high) } => {
                 write!(f, "features show disparities {low} to {high}, outside the range that was tried")
             }
-            Self::Unknown => f.write_str("features lie in common rows: too little texture, or things that moved"),
+            Self::Unknown => f.write_str(
+                "features lie in common rows: too little texture, a pattern that repeats, or things that moved",
+            ),
         }
     }
 }
@@ -109,11 +111,12 @@ pub(crate) fn judge(matches: &[Correspondence], height: usize, tried: Option<(i3
     if common.len() < NEEDED.max(n / 2) {
         // Cameras that are not aligned shift neighbours alike; chance matches are anywhere.
         let spread = apart[3 * n / 4] - apart[n / 4];
-        return if n >= 2 * NEEDED && spread <= SPREAD * height as f64 {
-            NoPairCause::Rows { apart: apart[n / 2].abs() }
-        } else {
-            NoPairCause::Unrelated { matches: common.len() }
-        };
+        if n < 2 * NEEDED || spread > SPREAD * height as f64 {
+            return NoPairCause::Unrelated { matches: common.len() };
+        }
+        let middle = apart[n / 2];
+        // Where wrong matches lie as often above as below, a pattern repeats.
+        return if is_common_row(middle) { NoPairCause::Unknown } else { NoPairCause::Rows { apart: middle.abs() } };
     }
     let (min, n) = range_of(common);
     let (low, high) = (min, min + n as i32 - 1);
@@ -124,4 +127,33 @@ pub(crate) fn judge(matches: &[Correspondence], height: usize, tried: Option<(i3
     // Most of what there is must have been tried.
     let overlap = tried.1.min(high) - tried.0.max(low) + 1;
     if 2 * overlap < high - low + 1 { NoPairCause::Range { range: (low, high) } } else { NoPairCause::Unknown }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cv_core::Point2;
+
+    /// Matches with these differences in y, and a disparity of 20 px.
+    fn matches(apart: impl Iterator<Item = f64>) -> Vec<Correspondence> {
+        apart
+            .enumerate()
+            .map(|(i, dy)| {
+                let (x, y) = ((i * 37 % 600) as f64, (i * 53 % 400) as f64);
+                Correspondence { a: Point2::new(x + 20.0, y + dy), b: Point2::new(x, y) }
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_board_that_repeats_is_not_askew() {
+        // Two fifths are right, the others a square of 20 px too high or too low.
+        let board = |shift: f64| {
+            matches(
+                (0..200).map(move |i| shift + [0.0, 0.0, -20.0, 20.0, 20.0 - 40.0 * f64::from(i % 2)][i as usize % 5]),
+            )
+        };
+        assert_eq!(judge(&board(0.1), 480, None), NoPairCause::Unknown);
+        assert_eq!(judge(&board(12.0), 480, None), NoPairCause::Rows { apart: 12.0 });
+    }
 }
