@@ -25,12 +25,23 @@ pub(crate) fn split(v: f64, n: usize) -> Option<(usize, f32)> {
 /// `None` outside the rectangle of the outermost pixel centres, `[0, w − 1] × [0, h − 1]` (with a thousandth of a pixel of slack).
 #[inline]
 pub fn sample_bilinear<T: Pixel, const C: usize>(view: ImageView<'_, T, C>, x: f64, y: f64) -> Option<[f32; C]> {
+    sampled(view, x, y, bilinear_at)
+}
+
+/// What `at` makes of the base pixel of `(x, y)` and the fractions beyond it; `None` outside.
+#[inline(always)]
+fn sampled<T: Pixel, const C: usize>(
+    view: ImageView<'_, T, C>,
+    x: f64,
+    y: f64,
+    at: impl Fn(ImageView<'_, T, C>, usize, usize, f32, f32) -> [f32; C],
+) -> Option<[f32; C]> {
     if view.is_empty() {
         return None;
     }
     let (ix, fx) = split(x, view.width())?;
     let (iy, fy) = split(y, view.height())?;
-    Some(bilinear_at(view, ix, iy, fx, fy))
+    Some(at(view, ix, iy, fx, fy))
 }
 
 /// Bilinear interpolation from the base pixel `(ix, iy)` by the fractions `fx`, `fy`.
@@ -61,12 +72,7 @@ pub(crate) fn bilinear_at<T: Pixel, const C: usize>(
 /// overshoot those of the image at edges.
 #[inline]
 pub fn sample_bicubic<T: Pixel, const C: usize>(view: ImageView<'_, T, C>, x: f64, y: f64) -> Option<[f32; C]> {
-    if view.is_empty() {
-        return None;
-    }
-    let (ix, fx) = split(x, view.width())?;
-    let (iy, fy) = split(y, view.height())?;
-    Some(bicubic_at(view, ix, iy, fx, fy))
+    sampled(view, x, y, bicubic_at)
 }
 
 /// The four weights of Keys's kernel for a fraction in 0 to 1.

@@ -103,7 +103,7 @@ fn four_digits(value: f64) -> f64 {
 }
 
 /// The most a camera is turned: beyond, a plane image sensor would see the scene at a grazing angle.
-pub(crate) const MAX_TURN_DEGREES: f64 = 60.0;
+const MAX_TURN_DEGREES: f64 = 60.0;
 
 /// One view of a rectified rig.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -189,41 +189,17 @@ impl Rectification {
     /// # Errors
     /// [`RectifyError`] with the reason why it cannot be done.
     pub fn new(rig: &StereoRig, options: &RectifyOptions) -> Result<Self, RectifyError> {
-        for (side, camera) in [("left", &rig.left), ("right", &rig.right)] {
-            camera.validate().map_err(|error| RectifyError::Camera { side, error })?;
-        }
+        let (x, baseline) = along_the_baseline(rig)?;
         if !(0.0..=1.0).contains(&options.alpha) {
             return Err(RectifyError::Option { name: "alpha", value: options.alpha, allowed: "from 0 to 1" });
         }
-        let relative = rig.right_from_left.rotation;
-        let baseline = rig.baseline();
-        // The right camera's centre in the left one's frame.
-        let centre = -(relative.inverse() * rig.right_from_left.translation);
-        let Some(x) = centre.try_normalize(1e-12).filter(|_| baseline.is_finite()) else {
-            return Err(RectifyError::NoBaseline { baseline });
-        };
+        let centre = rig.right_from_left.center();
         let vertical = centre.y.abs() > centre.x.abs();
         let along = if vertical { centre.y } else { centre.x };
         if along < 0.0 {
             return Err(RectifyError::Exchanged { distance: -along, vertical });
         }
-        // Mean optical axis, made perpendicular to the baseline.
-        let axis_left = Vector3::z();
-        let axis_right = relative.inverse() * Vector3::z();
-        let turned = |side, degrees: f64| RectifyError::TooFarTurned { side, degrees, limit: MAX_TURN_DEGREES };
-        let mean = axis_left + axis_right;
-        let across = mean - x * x.dot(&mean);
-        let Some(z) = across.try_normalize(1e-9) else { return Err(turned("right", 90.0)) };
-        for (side, axis) in [("left", axis_left), ("right", axis_right)] {
-            let degrees = axis.angle(&z).to_degrees();
-            if degrees > MAX_TURN_DEGREES {
-                return Err(turned(side, degrees));
-            }
-        }
-        let y = z.cross(&x);
-        let to_common =
-            Rotation3::from_matrix_unchecked(Matrix3::from_rows(&[x.transpose(), y.transpose(), z.transpose()]));
-        let rotations = [to_common, to_common * relative.inverse()];
+        let rotations = rotations(x, &rig.right_from_left.rotation)?;
 
         let native = (rig.left.width, rig.left.height);
         let (width, height) = options.size.unwrap_or(if vertical { (native.1, native.0) } else { native });
@@ -266,6 +242,34 @@ impl Rectification {
         };
         (share(&self.left), share(&self.right))
     }
+}
+
+/// The direction from the left camera's centre to the right one's, in the left one's frame, and its length; the cameras are checked.
+pub(crate) fn along_the_baseline(rig: &StereoRig) -> Result<(Vector3<f64>, f64), RectifyError> {
+    for (side, camera) in [("left", &rig.left), ("right", &rig.right)] {
+        camera.validate().map_err(|error| RectifyError::Camera { side, error })?;
+    }
+    let baseline = rig.baseline();
+    let x = rig.right_from_left.center().coords.try_normalize(1e-12).filter(|_| baseline.is_finite());
+    x.map(|x| (x, baseline)).ok_or(RectifyError::NoBaseline { baseline })
+}
+
+/// Rotations of both cameras to the common frame: x along the baseline, z as near to where both look on average as can be.
+pub(crate) fn rotations(x: Vector3<f64>, relative: &Rotation3<f64>) -> Result<[Rotation3<f64>; 2], RectifyError> {
+    let axes = [Vector3::z(), relative.inverse() * Vector3::z()];
+    let turned = |side, degrees: f64| RectifyError::TooFarTurned { side, degrees, limit: MAX_TURN_DEGREES };
+    let mean = axes[0] + axes[1];
+    let across = mean - x * x.dot(&mean);
+    let Some(z) = across.try_normalize(1e-9) else { return Err(turned("right", 90.0)) };
+    for (side, axis) in [("left", axes[0]), ("right", axes[1])] {
+        let degrees = axis.angle(&z).to_degrees();
+        if degrees > MAX_TURN_DEGREES {
+            return Err(turned(side, degrees));
+        }
+    }
+    let rows = Matrix3::from_rows(&[x.transpose(), z.cross(&x).transpose(), z.transpose()]);
+    let to_common = Rotation3::from_matrix_unchecked(rows);
+    Ok([to_common, to_common * relative.inverse()])
 }
 
 /// A rectangle in normalised coordinates.

@@ -4,10 +4,9 @@
 //! ([`Rectification::new`]). Two photographs taken by hand converge on what they show: the parts of their rectified views
 //! that have it in common then lie far apart, and each view gets a principal point of its own.
 
-use crate::rectify::{MAX_TURN_DEGREES, Rectification, RectifiedView, RectifyError, around, outline};
+use crate::rectify::{Rectification, RectifiedView, RectifyError, along_the_baseline, around, outline, rotations};
 use crate::{StereoGeometry, StereoOptions};
-use cv_core::{Camera, Point3, Rotation3, StereoRig, Vector3};
-use nalgebra::Matrix3;
+use cv_core::{Camera, Point3, StereoRig};
 
 /// Two rectified views, and the disparities of what they show.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -37,15 +36,8 @@ impl SceneRectification {
     /// [`RectifyError`] with the reason why it cannot be done: [`RectifyError::TooFarTurned`] where one camera stands more or less ahead of
     /// the other, [`RectifyError::NoOverlap`] where no point is in front of both rectified cameras.
     pub fn new(rig: &StereoRig, points: &[Point3<f64>]) -> Result<Self, RectifyError> {
-        for (side, camera) in [("left", &rig.left), ("right", &rig.right)] {
-            camera.validate().map_err(|error| RectifyError::Camera { side, error })?;
-        }
+        let (x, baseline) = along_the_baseline(rig)?;
         let pose = &rig.right_from_left;
-        let baseline = rig.baseline();
-        let centre = pose.center().coords;
-        let Some(x) = centre.try_normalize(1e-12).filter(|_| baseline.is_finite()) else {
-            return Err(RectifyError::NoBaseline { baseline });
-        };
         let rotations = rotations(x, &pose.rotation)?;
 
         // What the points look like to the rectified views: inverse depth, and how much larger the views show them than the photographs do.
@@ -106,28 +98,10 @@ impl SceneRectification {
     }
 }
 
-/// Rotations of both cameras to the common frame: x along the baseline, z as near to where both look on average as can be.
-fn rotations(x: Vector3<f64>, relative: &Rotation3<f64>) -> Result<[Rotation3<f64>; 2], RectifyError> {
-    let axes = [Vector3::z(), relative.inverse() * Vector3::z()];
-    let turned = |side, degrees: f64| RectifyError::TooFarTurned { side, degrees, limit: MAX_TURN_DEGREES };
-    let mean = axes[0] + axes[1];
-    let across = mean - x * x.dot(&mean);
-    let Some(z) = across.try_normalize(1e-9) else { return Err(turned("right", 90.0)) };
-    for (side, axis) in [("left", axes[0]), ("right", axes[1])] {
-        let degrees = axis.angle(&z).to_degrees();
-        if degrees > MAX_TURN_DEGREES {
-            return Err(turned(side, degrees));
-        }
-    }
-    let rows = Matrix3::from_rows(&[x.transpose(), z.cross(&x).transpose(), z.transpose()]);
-    let to_common = Rotation3::from_matrix_unchecked(rows);
-    Ok([to_common, to_common * relative.inverse()])
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cv_core::{Distortion, Pose};
+    use cv_core::{Distortion, Pose, Rotation3, Vector3};
     use proptest::prelude::*;
 
     fn rig(angles: [f64; 3], centre: Vector3<f64>) -> StereoRig {

@@ -135,12 +135,14 @@ pub(crate) fn run(data: &Path) -> Result<Vec<Check>> {
             "{:11} bad-1.0 {:5.2} %  bad-2.0 {:5.2} %  matched {:.1} %, {:.2} % of those off by more than 2 px",
             scene.name, bad.0, bad.1, matched.0, matched.1
         );
-        checks.push(Check::at_most(format!("{} bad-2.0 %, 0.6 of OpenCV's", scene.name), bad.1, 0.6 * scene.opencv));
-        checks.push(Check::at_most(format!("{} bad-2.0 %, Pandora's", scene.name), bad.1, scene.pandora.1));
-        checks.push(Check::at_most(format!("{} bad-1.0 %, Pandora's", scene.name), bad.0, scene.pandora.0));
+        let most = [
+            ("bad-2.0 %, 0.6 of OpenCV's", bad.1, 0.6 * scene.opencv),
+            ("bad-2.0 %, Pandora's", bad.1, scene.pandora.1),
+            ("bad-1.0 %, Pandora's", bad.0, scene.pandora.0),
+            ("bad-2.0 % of matched, OpenCV's", matched.1, scene.opencv_left.1),
+        ];
+        checks.extend(most.map(|(name, figure, bar)| Check::at_most(format!("{} {name}", scene.name), figure, bar)));
         checks.push(Check::at_least(format!("{} matched %, OpenCV's", scene.name), matched.0, scene.opencv_left.0));
-        let name = format!("{} bad-2.0 % of matched, OpenCV's", scene.name);
-        checks.push(Check::at_most(name, matched.1, scene.opencv_left.1));
         for (sum, value) in sums.iter_mut().zip([bad.0, scene.pandora.0, bad.1, scene.pandora.1]) {
             *sum += value / SCENES.len() as f64;
         }
