@@ -6,7 +6,7 @@ use cv_core::{RgbU8, StereoRig};
 use cv_io::RigFile;
 use cv_pipeline::rectify;
 use cv_pipeline::stereo::RectifyOptions;
-use cv_report::{Canvas, Figure, Report, colors, side_by_side};
+use cv_report::{Canvas, Figure, Note, Report, colors, side_by_side};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
@@ -108,12 +108,20 @@ impl Run for Args {
         };
         context.report(|| {
             let mut page = Report::new("Rectification");
-            page.headline("vertical residual", &residual)
+            let quality = match (result.vertical_px, &result.fault) {
+                (Some((median, p95)), _) => format!("{median:.2} px, 95 % under {p95:.2} px"),
+                (None, Some(_)) => "unknown: see below".to_owned(),
+                (None, None) => "unknown: too few features".to_owned(),
+            };
+            page.headline("vertical residual", &quality)
                 .headline("valid area", &format!("{:.1} % and {:.1} %", 100.0 * result.valid_area[0], 100.0 * result.valid_area[1]));
             page.section("Rectified pair").figure(Figure::new(
                 cv_io::encode_png(with_rows(&result.images).view())?,
                 "Both photographs with common rows drawn through: what is on a line on the left is on it on the right.",
             ));
+            if let Some(cause) = &result.fault {
+                page.note(Note::Warning, &format!("What the photographs show: {cause}."));
+            }
             Ok(page.to_html())
         })?;
         let (width, height) = result.images[0].size();
