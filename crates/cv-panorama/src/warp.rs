@@ -9,6 +9,7 @@ use crate::projection::Surface;
 use crate::view::View;
 use cv_core::{Distortion, Image, ImageView, Matrix3, Point2};
 use cv_imgproc::Interpolation;
+use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 
 /// A piece of the canvas seen through one photograph: red, green, blue, and 255 where the photograph reaches (0 where its edge
@@ -55,17 +56,19 @@ pub(crate) fn warp(
         return Warped { bounds, pixels };
     }
     let map = Map::new(placement, surface, bounds);
+    // Plain loops compiled for each instruction set; without fused multiply-adds all give the same bytes.
+    let level = Level::new();
     pixels.as_mut_slice().par_chunks_mut(4 * width).enumerate().for_each_init(
         || (vec![0.0_f32; width], vec![0.0_f32; width]),
         |(us, vs), (y, row)| {
-            map.row(y, us, vs);
+            dispatch!(level, _simd => map.row(y, us, vs));
             if let Some(field) = field {
                 field.add_row((bounds.top + y) as f64, bounds.left as f64, us, vs);
             }
             match interpolation {
-                Interpolation::Nearest => sample_row(photo, us, vs, row, tone, nearest),
-                Interpolation::Bilinear => sample_row(photo, us, vs, row, tone, bilinear),
-                Interpolation::Bicubic => sample_row(photo, us, vs, row, tone, bicubic),
+                Interpolation::Nearest => dispatch!(level, _simd => sample_row(photo, us, vs, row, tone, nearest)),
+                Interpolation::Bilinear => dispatch!(level, _simd => sample_row(photo, us, vs, row, tone, bilinear)),
+                Interpolation::Bicubic => dispatch!(level, _simd => sample_row(photo, us, vs, row, tone, bicubic)),
             }
         },
     );
@@ -131,6 +134,7 @@ impl Map {
     }
 
     /// Photograph coordinates of row `y` of the bounds. What lies behind the camera comes out far outside the photograph.
+    #[inline(always)]
     pub(crate) fn row(&self, y: usize, us: &mut [f32], vs: &mut [f32]) {
         let (g, b) = self.surface.row(self.top + y as f64);
         let g = g as f32;
