@@ -138,8 +138,8 @@ pub(crate) fn on_preview(preview: &Preview, gains: &[[f32; 3]], photo_of: &[usiz
     let pixel =
         |label: usize, x: usize, y: usize| (2.0 * BORDER_PIXEL * eccentricity(&half.pieces[label], x, y)) as i32;
     let reach: Vec<_> = half.pieces.iter().map(|p| Some(&p.warped)).collect();
-    // The first round does nearly all; four settle every set met so far.
-    expand(&mut coarse, &reach, pixel, worst, |_, _| true, 4);
+    // The first round does nearly all: a third here and a second below leave the misfits at the seams of every set met so far as they are.
+    expand(&mut coarse, &reach, pixel, worst, |_, _| true, 2);
 
     let width = preview.width;
     for (i, label) in labels.data.iter_mut().enumerate() {
@@ -154,7 +154,7 @@ pub(crate) fn on_preview(preview: &Preview, gains: &[[f32; 3]], photo_of: &[usiz
     let near = near_seams(&labels, NEAR);
     let pixel = |label: usize, x: usize, y: usize| (BORDER_PIXEL * eccentricity(&preview.pieces[label], x, y)) as i32;
     let reach: Vec<_> = preview.pieces.iter().map(|p| Some(&p.warped)).collect();
-    expand(&mut labels, &reach, pixel, differ, |x, y| near[y * width + x], 4);
+    expand(&mut labels, &reach, pixel, differ, |x, y| near[y * width + x], 1);
     labels
 }
 
