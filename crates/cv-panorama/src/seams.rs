@@ -110,8 +110,8 @@ impl Labels {
     }
 }
 
-/// Preview pixels on either side of the seams of the halved preview among which the preview's own are found. Over the whole preview costs four times as
-/// much and finds seams that cost 0.4 to 3 % less.
+/// Preview pixels on either side of the seams of the halved preview among which the preview's own are found: a cut over the whole preview takes
+/// several times as long for seams that are hardly cheaper.
 const NEAR: usize = 4;
 
 /// Labels on the preview: seams through it all at half its size, then near those.
