@@ -8,6 +8,7 @@ use cv_features::{
     PatchOptions, SiftOptions, TwoViewModel, anms, anms_square_covering, anms_tiled, describe_patches, harris,
     match_descriptors, match_guided, mops, sift,
 };
+use cv_imgproc::resize_area;
 
 /// Which features to find.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -316,6 +317,35 @@ fn luma(photo: ImageView<'_, u8, 3>) -> GrayF32 {
         }
     }
     grey
+}
+
+/// [`match_photos`] in photographs reduced to a longer side of `max_size` where they are larger, in pixels of the photographs themselves.
+pub(crate) fn match_reduced(
+    photos: [ImageView<'_, u8, 3>; 2],
+    max_size: usize,
+    options: &MatchingOptions,
+    progress: &dyn Progress,
+) -> Result<MatchingResult, MatchingError> {
+    let reduced = photos.map(|photo| {
+        let factor = max_size.max(8) as f64 / photo.width().max(photo.height()) as f64;
+        let side = |n: usize| ((n as f64 * factor).round() as usize).max(1);
+        (factor < 1.0).then(|| resize_area(photo, side(photo.width()), side(photo.height())).ok()).flatten()
+    });
+    let views = [0, 1].map(|i: usize| reduced[i].as_ref().map_or(photos[i], |r| r.view()));
+    let mut matching = match_photos(views[0], views[1], options, progress)?;
+    for ((features, view), photo) in matching.features.iter_mut().zip(&views).zip(&photos) {
+        let ratio = |a: usize, b: usize| a as f32 / b as f32;
+        let (x, y) = (ratio(photo.width(), view.width()), ratio(photo.height(), view.height()));
+        let points = features.described.keypoints.iter_mut();
+        for point in points.chain(&mut features.candidates) {
+            // The corners of the pictures meet, not the centres of their corner pixels.
+            point.position.x = (point.position.x + 0.5) * x - 0.5;
+            point.position.y = (point.position.y + 0.5) * y - 0.5;
+            point.scale *= (x * y).sqrt();
+        }
+    }
+    matching.pairs = correspondences(&matching.features[0], &matching.features[1], &matching.matches);
+    Ok(matching)
 }
 
 #[cfg(test)]

@@ -1,9 +1,9 @@
 //! Rectification of a pair of photographs, with what tells whether it is any good.
 
+use crate::matching::match_reduced;
 use crate::no_pair::judge;
-use crate::{MatchingOptions, NoPairCause, Progress, Stopwatch, match_photos};
-use cv_core::{Correspondence, ImageView, Mask, Point2, RgbU8, StereoRig};
-use cv_imgproc::resize_area;
+use crate::{MatchingOptions, NoPairCause, Progress, Stopwatch};
+use cv_core::{ImageView, Mask, RgbU8, StereoRig};
 use cv_stereo::{Rectification, RectifyError, RectifyOptions};
 
 /// What [`rectify`] made.
@@ -48,7 +48,9 @@ pub fn rectify(
     watch.lap("rectify");
     progress.report("rectify", 1, 2);
     // A pair without features is rectified all the same; only its quality stays unknown.
-    let pairs = matched([&left, &right], progress).unwrap_or_default();
+    let pairs = match_reduced([left.view(), right.view()], LARGEST, &MatchingOptions::default(), progress)
+        .map(|found| found.pairs)
+        .unwrap_or_default();
     // A wrong match has any row; those beyond a few pixels say nothing of the calibration.
     let mut rows: Vec<f64> =
         pairs.iter().filter(|p| p.a.x >= p.b.x - 4.0).map(|p| (p.a.y - p.b.y).abs()).filter(|&dy| dy < 8.0).collect();
@@ -81,28 +83,6 @@ pub fn rectify(
 /// memory, and tell no more of the calibration.
 const LARGEST: usize = 4096;
 
-/// Matches of two photographs of the same size, in their own pixels.
-fn matched(photos: [&RgbU8; 2], progress: &dyn Progress) -> Option<Vec<Correspondence>> {
-    let (width, height) = photos[0].size();
-    let options = MatchingOptions::default();
-    let found =
-        |a: &RgbU8, b: &RgbU8| match_photos(a.view(), b.view(), &options, progress).ok().map(|found| found.pairs);
-    let factor = LARGEST as f64 / width.max(height) as f64;
-    if factor >= 1.0 {
-        return found(photos[0], photos[1]);
-    }
-    let side = |n: usize| ((n as f64 * factor).round() as usize).max(1);
-    let (w, h) = (side(width), side(height));
-    let [a, b] = photos.map(|photo| resize_area(photo.view(), w, h).ok());
-    let mut pairs = found(&a?, &b?)?;
-    let (x, y) = (width as f64 / w as f64, height as f64 / h as f64);
-    for p in pairs.iter_mut().flat_map(|m| [&mut m.a, &mut m.b]) {
-        // The corners of the pictures meet, not the centres of their corner pixels.
-        *p = Point2::new((p.x + 0.5) * x - 0.5, (p.y + 0.5) * y - 0.5);
-    }
-    Some(pairs)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -117,7 +97,8 @@ mod tests {
         let photo = render(&scene, &camera, &scene.viewpoint(), &RenderOptions::default()).unwrap().image;
         let large = cv_imgproc::resize(photo.view(), 4500, 900, cv_imgproc::Interpolation::Bilinear).unwrap();
         let moved = RgbU8::from_fn(4500, 900, |x, y| large.at((x + 370).min(4499), (y + 90).min(899)));
-        let pairs = matched([&large, &moved], &Silent).unwrap();
+        let pairs =
+            match_reduced([large.view(), moved.view()], LARGEST, &MatchingOptions::default(), &Silent).unwrap().pairs;
         let mut shift =
             [pairs.iter().map(|p| p.a.x - p.b.x).collect::<Vec<_>>(), pairs.iter().map(|p| p.a.y - p.b.y).collect()];
         let [x, y] = shift.each_mut().map(|d| *d.select_nth_unstable_by(pairs.len() / 2, f64::total_cmp).1);

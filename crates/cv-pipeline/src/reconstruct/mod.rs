@@ -12,14 +12,14 @@ use initial::{Initial, cameras, initial};
 use neighbours::like_their_neighbours;
 
 use crate::guided::{GuidedOptions, match_along_lines};
-use crate::{MatchingError, MatchingOptions, MatchingResult, Progress, Stopwatch, correspondences, match_photos};
+use crate::matching::match_reduced;
+use crate::{MatchingOptions, MatchingResult, Progress, Stopwatch, correspondences};
 use cv_core::{Camera, Correspondence, ImageView, Matrix3, Point2, Point3, Pose, Vector3};
 use cv_features::SiftOptions;
 use cv_geometry::{
     BundleOptions, BundleReport, RobustLoss, RobustOptions, TwoViewBundle, adjust_two_views, essential_from_pose,
     estimate_homography, normalize_matches, parallax_angle, pose_stability, rotation_between, triangulate,
 };
-use cv_imgproc::resize_area;
 
 /// What is known of the cameras.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -159,7 +159,7 @@ pub fn reconstruct(
 ) -> Result<ReconstructResult, ReconstructError> {
     let mut watch = Stopwatch::new();
     let prior = cameras(options.intrinsics, [a.size(), b.size()])?;
-    let matching = matched([a, b], options, progress)?;
+    let matching = match_reduced([a, b], options.max_size, &options.matching, progress)?;
     for &(stage, seconds) in &matching.stages {
         watch.add(stage, seconds);
     }
@@ -283,34 +283,6 @@ pub fn reconstruct(
         matching,
         stages: watch.into_stages(),
     })
-}
-
-/// Tentative matches, found in reduced photographs where those are large, in pixels of the photographs themselves.
-fn matched(
-    photos: [ImageView<'_, u8, 3>; 2],
-    options: &ReconstructOptions,
-    progress: &dyn Progress,
-) -> Result<MatchingResult, MatchingError> {
-    let reduced = photos.map(|photo| {
-        let factor = options.max_size.max(8) as f64 / photo.width().max(photo.height()) as f64;
-        let side = |n: usize| ((n as f64 * factor).round() as usize).max(1);
-        (factor < 1.0).then(|| resize_area(photo, side(photo.width()), side(photo.height())).ok()).flatten()
-    });
-    let views = [0, 1].map(|i: usize| reduced[i].as_ref().map_or(photos[i], |r| r.view()));
-    let mut matching = match_photos(views[0], views[1], &options.matching, progress)?;
-    for ((features, view), photo) in matching.features.iter_mut().zip(&views).zip(&photos) {
-        let ratio = |a: usize, b: usize| a as f32 / b as f32;
-        let (x, y) = (ratio(photo.width(), view.width()), ratio(photo.height(), view.height()));
-        let points = features.described.keypoints.iter_mut();
-        for point in points.chain(&mut features.candidates) {
-            // The corners of the pictures meet, not the centres of their corner pixels.
-            point.position.x = (point.position.x + 0.5) * x - 0.5;
-            point.position.y = (point.position.y + 0.5) * y - 0.5;
-            point.scale *= (x * y).sqrt();
-        }
-    }
-    matching.pairs = correspondences(&matching.features[0], &matching.features[1], &matching.matches);
-    Ok(matching)
 }
 
 /// The fundamental matrix between undistorted pixels.
