@@ -149,8 +149,10 @@ pub fn real_roots_cubic(c: [f64; 4]) -> Roots<3> {
         return roots;
     }
     let depressed = Depressed::new(&c);
-    let first = depressed.farthest_root();
-    roots.push(polish(&c, first - depressed.shift));
+    let root = polish(&c, depressed.farthest_root() - depressed.shift);
+    roots.push(root);
+    // Polished: where it is far away, what is left of the others is the difference of large numbers.
+    let first = root + depressed.shift;
     // x² + first x + (first² − 3 q) = 0.
     let discriminant = 3.0 * (4.0 * depressed.q - first * first);
     if discriminant >= 0.0 {
@@ -494,6 +496,12 @@ mod tests {
         // Three equal roots: a rounding of the coefficients moves them by its cube root.
         assert_eq!(farthest_root_cubic([0.0, 0.0, 0.0, 1.0]).map(|x| x.abs() < 1e-45), Some(true));
         assert!((farthest_root_cubic([-0.001, 0.03, -0.3, 1.0]).unwrap() - 0.1).abs() < 1e-5);
+    }
+
+    #[test]
+    fn a_root_far_away_leaves_the_others_their_digits() {
+        let roots = [0.62, 1.41, 38675.0];
+        assert!(close(&real_roots_cubic(expand(&roots, &[], -6e-7)), &roots, 1e-10));
     }
 
     #[test]
