@@ -22,6 +22,7 @@
 //! * The same matches, options and seed give the same bytes on any number of threads and with any vector unit.
 
 mod absolute;
+mod basis;
 mod bundle;
 mod epipolar;
 mod error;

@@ -1,6 +1,6 @@
 //! Relative poses of two views of one unknown focal length, through six points.
 
-use crate::essential::{mix, orthonormalize};
+use crate::basis::{mix, orthonormalize};
 use crate::fundamental::epipolar_row;
 use cv_core::{Matrix3, Point2};
 use cv_numeric::{kernel_vector, null_space, real_quadratic_eigenvalues};

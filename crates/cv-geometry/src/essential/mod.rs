@@ -9,7 +9,6 @@ pub use decompose::{
     RecoveredPose, decompose_essential, essential_from_fundamental, essential_from_pose, recover_pose,
 };
 pub use five_point::essential_five_point;
-pub(crate) use five_point::{mix, orthonormalize};
 pub use stability::{pose_difference, pose_stability, poses_are_rivals};
 
 use crate::epipolar::{Epipolar, SampsonKernel, SampsonProblem, refine_sampson, sampson};

@@ -1,6 +1,6 @@
 //! Fundamental matrices through seven points.
 
-use crate::essential::mix;
+use crate::basis::mix;
 use cv_core::{Matrix3, Point2};
 use cv_numeric::{null_space, real_roots_cubic};
 
