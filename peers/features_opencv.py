@@ -20,18 +20,18 @@ def fastest(call, repeats):
 
 
 def speed(path, what):
-    grey = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
+    gray = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
     random = np.random.default_rng(1)
     # Only what the stage needs: large arrays that lie around slow down how OpenCV gets its buffers.
     sizes = [(n, d) for n, d in ((2000, 64), (8192, 128), (20000, 128)) if what.endswith(f" {n}")]
     sets = {n: [random.random((n, d), np.float32) for _ in range(2)] for n, d in sizes}
     square = random.random((4096, 4096), np.float32) if "product" in what else None
     stages = {
-        "cornerHarris": (lambda: cv2.cornerHarris(grey, 3, 3, 0.04), 20),
-        "goodFeaturesToTrack": (lambda: cv2.goodFeaturesToTrack(grey, 500, 0.01, 8, useHarrisDetector=True), 20),
-        "goodFeaturesToTrack, Shi-Tomasi": (lambda: cv2.goodFeaturesToTrack(grey, 500, 0.01, 8), 10),
-        "SIFT": (lambda: cv2.SIFT_create(2000).detectAndCompute(grey, None), 5),
-        "ORB": (lambda: cv2.ORB_create(2000).detectAndCompute(grey, None), 10),
+        "cornerHarris": (lambda: cv2.cornerHarris(gray, 3, 3, 0.04), 20),
+        "goodFeaturesToTrack": (lambda: cv2.goodFeaturesToTrack(gray, 500, 0.01, 8, useHarrisDetector=True), 20),
+        "goodFeaturesToTrack, Shi-Tomasi": (lambda: cv2.goodFeaturesToTrack(gray, 500, 0.01, 8), 10),
+        "SIFT": (lambda: cv2.SIFT_create(2000).detectAndCompute(gray, None), 5),
+        "ORB": (lambda: cv2.ORB_create(2000).detectAndCompute(gray, None), 10),
         "BFMatcher 2000": (lambda: cv2.BFMatcher(cv2.NORM_L2).knnMatch(*sets[2000], 2), 8),
         "BFMatcher 8192": (lambda: cv2.BFMatcher(cv2.NORM_L2).knnMatch(*sets[8192], 2), 1),
         "FlannBasedMatcher 20000": (lambda: cv2.FlannBasedMatcher({"algorithm": 1, "trees": 4}, {"checks": 32}).knnMatch(*sets[20000], 2), 1),
@@ -43,9 +43,9 @@ def speed(path, what):
 
 def extract(count, paths):
     for path in paths:
-        grey = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
+        gray = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
         for name, detector in (("sift", cv2.SIFT_create(count)), ("orb", cv2.ORB_create(count))):
-            keypoints, descriptors = detector.detectAndCompute(grey, None)
+            keypoints, descriptors = detector.detectAndCompute(gray, None)
             order = sorted(range(len(keypoints)), key=lambda i: -keypoints[i].response)[:count]
             dimension = 128 if name == "sift" else 32
             rows = np.zeros((len(order), 5 + dimension), np.float32)

@@ -21,10 +21,10 @@ def read(path):
 
 for scene, left, right, disparities in SCENES:
     for side, name in (("L", left), ("R", right)):
-        grey = read(f"{folder}/{scene}/{name}").astype("uint8")
-        with rasterio.open(f"{work}/{side}.tif", "w", driver="GTiff", height=grey.shape[0], width=grey.shape[1], count=1,
+        gray = read(f"{folder}/{scene}/{name}").astype("uint8")
+        with rasterio.open(f"{work}/{side}.tif", "w", driver="GTiff", height=gray.shape[0], width=gray.shape[1], count=1,
                            dtype="uint8") as file:
-            file.write(grey, 1)
+            file.write(gray, 1)
     config = {
         "input": {"left": {"img": work + "/L.tif", "disp": [-disparities, 0]}, "right": {"img": work + "/R.tif"}},
         "pipeline": {

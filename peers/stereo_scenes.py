@@ -14,7 +14,7 @@ TRUTHS = {"cones": (["disp2.png", "disp6.png"], 4), "teddy": (["disp2.png"], 4),
 
 def truth_and_mask(folder, scene, read):
     """True disparities, and the pixels that count: those that both photographs see where a right truth tells, else all
-    with truth. `read` reads a grey image."""
+    with truth. `read` reads a gray image."""
     if scene == "motorcycle":
         left = np.load(f"{folder}/motorcycle/motorcycle_disp.npz")["arr_0"]
         return left, np.isfinite(left)

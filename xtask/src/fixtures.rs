@@ -59,7 +59,7 @@ fn stereo(root: &Path) -> Result<()> {
     oracle(root, "stereo.json", &json!({ "focal_px": camera.fx, "baseline_m": pair.baseline }))
 }
 
-/// Three overlapping photographs from one point and the homographies between neighbours.
+/// Three overlapping photographs from one point and the homographies between neighbors.
 fn panorama(root: &Path) -> Result<()> {
     let camera = Camera::from_focal(320, 240, 330.0);
     let options = PanoramaOptions { views: 3, ..PanoramaOptions::default() };

@@ -55,7 +55,7 @@ pub(crate) trait Run: Args {
 pub(crate) struct Outcome {
     stages: Vec<(&'static str, f64)>,
     values: Map<String, Value>,
-    unserialisable: Option<String>,
+    unserializable: Option<String>,
     summary: String,
     stdout: Vec<u8>,
     but: Option<Failure>,
@@ -73,7 +73,7 @@ impl Outcome {
             Ok(value) => {
                 self.values.insert(key.to_owned(), value);
             }
-            Err(error) => self.unserialisable = Some(format!("{key}: {error}")),
+            Err(error) => self.unserializable = Some(format!("{key}: {error}")),
         }
         self
     }
@@ -322,7 +322,7 @@ fn start_threads(threads: Option<u16>) -> Result<(), Failure> {
 
 /// Prints what the person asked to see.
 fn finish(mut outcome: Outcome, globals: &Globals, start: Instant) -> Result<(), Failure> {
-    if let Some(key) = outcome.unserialisable.take() {
+    if let Some(key) = outcome.unserializable.take() {
         return Err(Failure::new(format!("cannot write the JSON value {key}")));
     }
     if globals.json {

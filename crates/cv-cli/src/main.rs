@@ -7,7 +7,7 @@ mod rig;
 use clap::Parser;
 use common::Globals;
 
-/// Classical computer vision: colour segmentation, panoramas, two-view reconstruction and stereo depth.
+/// Classical computer vision: color segmentation, panoramas, two-view reconstruction and stereo depth.
 #[derive(Parser)]
 #[command(name = "cv", version, propagate_version = true, arg_required_else_help = true, max_term_width = 100)]
 #[command(after_help = "Exit codes: 0 done; 1 the job could not be done (the reason is on stderr); 2 wrong usage.\n\

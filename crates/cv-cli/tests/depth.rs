@@ -258,7 +258,7 @@ fn costs_smoothing_ranges_and_memory_can_be_chosen() {
         scores["all"]["bad"]["2.0"].as_f64().unwrap()
     };
     for more in [
-        &["--blend", "grey"] as &[&str],
+        &["--blend", "gray"] as &[&str],
         &["--blend", "gradient", "--census", "7"],
         &["--smoothing", "none", "--census", "9"],
         &["--smoothing", "wls", "--lambda", "10"],
@@ -274,14 +274,14 @@ fn costs_smoothing_ranges_and_memory_can_be_chosen() {
 }
 
 #[test]
-fn grey_and_sixteen_bits_match_as_colour_does() {
+fn gray_and_sixteen_bits_match_as_color_does() {
     let folder = pair();
     let at = |name: &str| folder.path().join(name);
     for side in ["left", "right"] {
         let rgb = cv_io::read_rgb(at(&format!("{side}.png"))).unwrap();
-        let grey = rgb.map(|[r, g, b]| [((u32::from(r) * 299 + u32::from(g) * 587 + u32::from(b) * 114) / 1000) as u8]);
-        cv_io::write_png(at(&format!("{side}8.png")), grey.view()).unwrap();
-        cv_io::write_png(at(&format!("{side}16.png")), grey.map(|[v]| [u16::from(v) * 257]).view()).unwrap();
+        let gray = rgb.map(|[r, g, b]| [((u32::from(r) * 299 + u32::from(g) * 587 + u32::from(b) * 114) / 1000) as u8]);
+        cv_io::write_png(at(&format!("{side}8.png")), gray.view()).unwrap();
+        cv_io::write_png(at(&format!("{side}16.png")), gray.map(|[v]| [u16::from(v) * 257]).view()).unwrap();
     }
     for bits in ["8", "16"] {
         let (left, right, out) = (format!("left{bits}.png"), format!("right{bits}.png"), format!("d{bits}.pfm"));
@@ -296,8 +296,8 @@ fn grey_and_sixteen_bits_match_as_colour_does() {
 #[test]
 fn what_is_no_pair_is_refused_with_what_to_try() {
     let folder = pair();
-    cv_io::write_png(folder.path().join("grey.png"), RgbU8::new(240, 180, [99; 3]).view()).unwrap();
-    for (left, right) in [("grey.png", "grey.png"), ("grey.png", "right.png")] {
+    cv_io::write_png(folder.path().join("gray.png"), RgbU8::new(240, 180, [99; 3]).view()).unwrap();
+    for (left, right) in [("gray.png", "gray.png"), ("gray.png", "right.png")] {
         let ran = refused(folder.path(), &["depth", left, right, "-o", "out.pfm"]);
         assert!(ran.stderr.contains("matched and confirmed") && ran.stderr.contains("different things"), "{ran:?}");
     }

@@ -88,8 +88,8 @@ fn guided_matching_finds_more_and_leaves_out_what_disagrees() {
     let (folder, truth) = pair("two-view");
     let file = folder.path().join("m.txt");
     let (w, h) = cv_io::read_rgb(folder.path().join("a.jpg")).unwrap().size();
-    let (f, centre) = (truth["focal_px"].as_f64().unwrap(), [(w as f64 - 1.0) / 2.0, (h as f64 - 1.0) / 2.0]);
-    let back = Matrix3::new(1.0 / f, 0.0, -centre[0] / f, 0.0, 1.0 / f, -centre[1] / f, 0.0, 0.0, 1.0);
+    let (f, center) = (truth["focal_px"].as_f64().unwrap(), [(w as f64 - 1.0) / 2.0, (h as f64 - 1.0) / 2.0]);
+    let back = Matrix3::new(1.0 / f, 0.0, -center[0] / f, 0.0, 1.0 / f, -center[1] / f, 0.0, 0.0, 1.0);
     let t = Vector3::from_fn(|i, _| truth["translation_m"][i].as_f64().unwrap());
     let fundamental = back.transpose() * t.cross_matrix() * matrix(&truth["rotation"]) * back;
     // Sampson's distance (Hartley & Zisserman, 11.9).

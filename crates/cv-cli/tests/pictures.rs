@@ -49,11 +49,11 @@ fn the_same_picture_in_another_file_format_gives_the_same_bytes() {
 }
 
 #[test]
-fn grey_and_cmyk_pictures_are_taken() {
+fn gray_and_cmyk_pictures_are_taken() {
     for job in JOBS {
         let (folder, _) = job.folder();
-        for (kind, ending) in [("grey", "png"), ("grey16", "png"), ("cmyk", "jpg")] {
-            // A colour model cannot tell a grey ball from a grey floor; all else works on brightness.
+        for (kind, ending) in [("gray", "png"), ("gray16", "png"), ("cmyk", "jpg")] {
+            // A color model cannot tell a gray ball from a gray floor; all else works on brightness.
             if job.name.starts_with("segment") && kind != "cmyk" {
                 continue;
             }
@@ -61,11 +61,11 @@ fn grey_and_cmyk_pictures_are_taken() {
             for (i, picture) in job.pictures().iter().enumerate() {
                 let name = format!("{kind}{i}.{ending}");
                 let path = folder.path().join(&name);
-                let grey: GrayU8 =
+                let gray: GrayU8 =
                     picture.map(|[r, g, b]| [((u32::from(r) + 2 * u32::from(g) + u32::from(b)) / 4) as u8]);
                 match kind {
-                    "grey" => cv_io::write_png(&path, grey.view()).unwrap(),
-                    "grey16" => cv_io::write_png(&path, grey.map(|[v]| [u16::from(v) * 257]).view()).unwrap(),
+                    "gray" => cv_io::write_png(&path, gray.view()).unwrap(),
+                    "gray16" => cv_io::write_png(&path, gray.map(|[v]| [u16::from(v) * 257]).view()).unwrap(),
                     _ => write_cmyk(&path, picture),
                 }
                 inputs.push(name);
@@ -142,7 +142,7 @@ fn names_with_spaces_and_other_scripts_work() {
 }
 
 #[test]
-fn a_fully_transparent_picture_is_read_by_its_colours() {
+fn a_fully_transparent_picture_is_read_by_its_colors() {
     let clear: Image<u8, 4> = Image::new(32, 32, [10, 20, 30, 0]);
     for job in JOBS {
         let (folder, good) = job.folder();

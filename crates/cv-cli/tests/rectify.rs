@@ -155,7 +155,7 @@ fn the_rig_file_of_the_help_is_one() {
     assert!(ran.stderr.contains("calibrated for 640×480 px"), "{ran:?}");
 }
 
-/// Positions in a binary PLY of coloured points.
+/// Positions in a binary PLY of colored points.
 fn positions(path: &std::path::Path) -> Vec<[f64; 3]> {
     let bytes = std::fs::read(path).unwrap();
     let header = b"end_header\n";

@@ -8,7 +8,7 @@ use cv_core::{Mask, RgbU8};
 use std::fs;
 use support::{done, json, refused, run};
 
-/// Four pictures of an orange disc on grey with their masks, as files in a new folder.
+/// Four pictures of an orange disc on gray with their masks, as files in a new folder.
 fn discs() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     for part in ["train", "test"] {
@@ -33,12 +33,12 @@ fn trained_predicted_and_scored() {
     let discs = discs();
     let folder = discs.path();
     let train = ["segment", "train", "--images", "train", "--masks", "train", "--model", "m.json"];
-    let learnt = json(folder, &[&train[..], &["--report", "r"]].concat());
-    assert_eq!(learnt["images"].as_array().unwrap().len(), 2);
+    let learned = json(folder, &[&train[..], &["--report", "r"]].concat());
+    assert_eq!(learned["images"].as_array().unwrap().len(), 2);
     assert!(fs::read_to_string(folder.join("r/report.html")).unwrap().contains("Photographs"));
     let scored = json(folder, &["segment", "eval", "--model", "m.json", "--images", "test", "--masks", "test"]);
     for key in ["precision", "recall", "f1"] {
-        // The disc's colours occur nowhere else; smoothing and opening cost a part of its border, 88 of 616 pixels.
+        // The disc's colors occur nowhere else; smoothing and opening cost a part of its border, 88 of 616 pixels.
         assert!(scored[key].as_f64().unwrap() > 0.95, "{key}: {scored}");
     }
     assert_eq!(scored["images"][1]["path"], "test/p1.png");

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix2, Matrix3, Point2, Point3, Vector2};
 
-/// Lens distortion, applied to normalised image coordinates `(x, y) = (X/Z, Y/Z)`.
+/// Lens distortion, applied to normalized image coordinates `(x, y) = (X/Z, Y/Z)`.
 ///
 /// The coefficients keep the names and order of OpenCV's `calib3d` and COLMAP's camera models.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -44,12 +44,12 @@ pub enum Distortion {
 }
 
 impl Distortion {
-    /// Ideal to distorted normalised coordinates.
+    /// Ideal to distorted normalized coordinates.
     pub fn distort(&self, p: Point2<f64>) -> Point2<f64> {
         self.distort_with_jacobian(p).0
     }
 
-    /// Ideal to distorted normalised coordinates, with the 2×2 derivative by the ideal ones.
+    /// Ideal to distorted normalized coordinates, with the 2×2 derivative by the ideal ones.
     pub fn distort_with_jacobian(&self, p: Point2<f64>) -> (Point2<f64>, Matrix2<f64>) {
         let (x, y) = (p.x, p.y);
         let r2 = x * x + y * y;
@@ -89,7 +89,7 @@ impl Distortion {
         }
     }
 
-    /// Distorted to ideal normalised coordinates, by Newton's method from the distorted point.
+    /// Distorted to ideal normalized coordinates, by Newton's method from the distorted point.
     ///
     /// NaN where no ideal point near the image maps there (outside the range in which the model is monotonic).
     pub fn undistort(&self, q: Point2<f64>) -> Point2<f64> {
@@ -116,7 +116,7 @@ impl Distortion {
                 break;
             }
             let Some(step) = j.try_inverse().map(|inverse| inverse * error) else { return NONE };
-            // Damped, so that a step never leaves the neighbourhood where the model means something.
+            // Damped, so that a step never leaves the neighborhood where the model means something.
             let limit = 0.5 * (1.0 + p.coords.norm());
             let norm = step.norm();
             p -= if norm > limit { step * (limit / norm) } else { step };
@@ -164,7 +164,7 @@ pub struct Camera {
     pub fx: f64,
     /// Vertical focal length in pixels.
     pub fy: f64,
-    /// Principal point, x, pixel centres at integers. (COLMAP puts them at +0.5: subtract 0.5 from its value.)
+    /// Principal point, x, pixel centers at integers. (COLMAP puts them at +0.5: subtract 0.5 from its value.)
     pub cx: f64,
     /// Principal point, y.
     pub cy: f64,
@@ -215,13 +215,13 @@ impl Camera {
         (p.z > 0.0).then(|| self.denormalize(Point2::new(p.x / p.z, p.y / p.z)))
     }
 
-    /// Pixel to the ideal normalised coordinates of its ray (distortion removed): the direction is `(x, y, 1)`.
+    /// Pixel to the ideal normalized coordinates of its ray (distortion removed): the direction is `(x, y, 1)`.
     #[inline]
     pub fn normalize(&self, pixel: Point2<f64>) -> Point2<f64> {
         self.distortion.undistort(Point2::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy))
     }
 
-    /// Ideal normalised coordinates to a pixel (distortion applied).
+    /// Ideal normalized coordinates to a pixel (distortion applied).
     #[inline]
     pub fn denormalize(&self, ray: Point2<f64>) -> Point2<f64> {
         let d = self.distortion.distort(ray);
@@ -234,14 +234,14 @@ impl Camera {
         Point2::new(self.fx * n.x + self.cx, self.fy * n.y + self.cy)
     }
 
-    /// The same camera behind an image scaled by `factor` (0.5 for half size), pixel centres at integers. Where the image was made of a whole
+    /// The same camera behind an image scaled by `factor` (0.5 for half size), pixel centers at integers. Where the image was made of a whole
     /// number of pixels, [`Self::resized`] says what it shows to the last digit.
     pub fn scaled(&self, factor: f64) -> Self {
         let side = |n: usize| (n as f64 * factor).round() as usize;
         self.stretched((side(self.width), side(self.height)), factor, factor)
     }
 
-    /// The same camera behind an image resized to `width × height`: the corners of the pictures meet, not the centres of their corner pixels.
+    /// The same camera behind an image resized to `width × height`: the corners of the pictures meet, not the centers of their corner pixels.
     pub fn resized(&self, width: usize, height: usize) -> Self {
         self.stretched((width, height), width as f64 / self.width as f64, height as f64 / self.height as f64)
     }
@@ -331,7 +331,7 @@ mod tests {
     fn resizing_keeps_each_edge_where_it_is_though_the_sides_round_apart() {
         let camera = Camera::pinhole(641, 479, 500.0, 510.0, 300.0, 250.0);
         let small = camera.resized(100, 75);
-        // A ray through an edge of the picture goes through that edge of the small one: half a pixel outside the first and last centres.
+        // A ray through an edge of the picture goes through that edge of the small one: half a pixel outside the first and last centers.
         for (x, y) in [(0.0, 0.0), (1.0, 1.0)] {
             let ray = camera.normalize(Point2::new(641.0 * x - 0.5, 479.0 * y - 0.5));
             let p = small.denormalize(ray);

@@ -5,7 +5,7 @@ use nalgebra::Point2;
 /// A detected point, in the spirit of `cv::KeyPoint`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Keypoint {
-    /// Sub-pixel position, pixel centres at integers.
+    /// Sub-pixel position, pixel centers at integers.
     pub position: Point2<f32>,
     /// Strength by the detector's own measure; larger is stronger.
     pub response: f32,

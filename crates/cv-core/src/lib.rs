@@ -4,10 +4,10 @@
 //! ```
 //! use cv_core::{Image, Point2};
 //!
-//! let mut grey = Image::<f32, 1>::new(4, 3, [0.0]);
-//! grey.set(2, 1, [1.0]);
-//! assert_eq!(grey.at(2, 1), [1.0]);
-//! assert_eq!(grey.view().crop(1, 1, 2, 2).map(|v| v.at(1, 0)), Some([1.0]));
+//! let mut gray = Image::<f32, 1>::new(4, 3, [0.0]);
+//! gray.set(2, 1, [1.0]);
+//! assert_eq!(gray.at(2, 1), [1.0]);
+//! assert_eq!(gray.view().crop(1, 1, 2, 2).map(|v| v.at(1, 0)), Some([1.0]));
 //!
 //! let camera = cv_core::Camera::pinhole(640, 480, 500.0, 500.0, 319.5, 239.5);
 //! let ray = camera.normalize(Point2::new(319.5, 239.5));
@@ -16,12 +16,12 @@
 //!
 //! # Conventions
 //!
-//! * Pixel centres lie at integer coordinates; x points right, y points down; the
-//!   origin is the centre of the top-left pixel. An image of width `w` covers
+//! * Pixel centers lie at integer coordinates; x points right, y points down; the
+//!   origin is the center of the top-left pixel. An image of width `w` covers
 //!   `[-0.5, w - 0.5]` in x.
 //! * A camera frame has X right, Y down, Z forward. A [`Pose`] maps world to camera:
 //!   `x_cam = R x_world + t`.
-//! * Images are row-major with interleaved channels. Colour is RGB.
+//! * Images are row-major with interleaved channels. Color is RGB.
 //! * Disparity is `x_left − x_right` in pixels. Invalid disparity and depth are NaN.
 //! * Angles are radians.
 

@@ -39,7 +39,7 @@ impl Pose {
         self.rotation * world + self.translation
     }
 
-    /// The camera centre in the world, `−Rᵀ t`.
+    /// The camera center in the world, `−Rᵀ t`.
     pub fn center(&self) -> Point3<f64> {
         Point3::from(-(self.rotation.inverse() * self.translation))
     }

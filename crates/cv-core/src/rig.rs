@@ -15,7 +15,7 @@ pub struct StereoRig {
 }
 
 impl StereoRig {
-    /// Distance between the two camera centres, in the unit of the rig.
+    /// Distance between the two camera centers, in the unit of the rig.
     pub fn baseline(&self) -> f64 {
         self.right_from_left.translation.norm()
     }

@@ -7,7 +7,7 @@ use cv_features::{
 };
 use std::{hint::black_box, time::Instant};
 
-/// Squares of random grey at several sizes: corners and blobs at all scales.
+/// Squares of random gray at several sizes: corners and blobs at all scales.
 fn image() -> GrayF32 {
     let cell = |x: usize, y: usize, size: usize| {
         let mut v =

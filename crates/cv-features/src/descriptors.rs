@@ -113,7 +113,7 @@ pub enum DropReason {
         /// Pixels needed on each side.
         margin: f32,
     },
-    /// Its window is (nearly) one grey value: there is nothing to compare.
+    /// Its window is (nearly) one gray value: there is nothing to compare.
     #[error("the window is flat: standard deviation {deviation}")]
     Flat {
         /// Standard deviation of the samples, in the image's unit.

@@ -43,7 +43,7 @@ pub(crate) struct Search {
 
 /// Adds the extrema that are seen on row `y` and the columns of a tile.
 ///
-/// A pixel is one where its difference is positive and not below any of its 26 neighbours, or negative and not above any, with at least 0.8 of the contrast asked for
+/// A pixel is one where its difference is positive and not below any of its 26 neighbors, or negative and not above any, with at least 0.8 of the contrast asked for
 /// (the refined value may be that much larger).
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn find(

@@ -58,7 +58,7 @@ impl HarrisOptions {
     }
 }
 
-/// The smallest image with a pixel that has all its eight neighbours.
+/// The smallest image with a pixel that has all its eight neighbors.
 const SMALLEST: usize = 3;
 
 /// Rows that a task works on: enough that the rows its window reaches beyond them cost little, few enough to share out.
@@ -92,7 +92,7 @@ fn response(plan: &Structure<'_>) -> GrayF32 {
 
 /// Harris corners: local maxima of [`harris_response`] above a share of the strongest, with sub-pixel positions, in raster order.
 ///
-/// A corner is a pixel (not of the outermost ring) whose response is not exceeded in its 3×3 neighbourhood; of a plateau, the first
+/// A corner is a pixel (not of the outermost ring) whose response is not exceeded in its 3×3 neighborhood; of a plateau, the first
 /// pixel in raster order. Its position is refined to the maximum of the quadratic through the nine responses, at most
 /// half a pixel away. A flat image has no corners: the result is empty. No full-size image is stored on the way.
 ///
@@ -131,7 +131,7 @@ fn strip_corners(plan: &Structure<'_>, threshold: f32, rows: Range<usize>) -> (f
         if y < first + 2 {
             continue;
         }
-        // The row above now has both its neighbours.
+        // The row above now has both its neighbors.
         let [above, here, below] = [y - 2, y - 1, y].map(|y| ring.row(y));
         seen.clear();
         simd::peaks(plan.level, [above, here, below], threshold * max, &mut seen);
@@ -149,7 +149,7 @@ fn strip_corners(plan: &Structure<'_>, threshold: f32, rows: Range<usize>) -> (f
 
 /// Offset from the middle of the maximum of the quadratic through 3×3 values (least squares for the cross term), each part held to ±0.5.
 pub(crate) fn quadratic_peak(v: [[f32; 3]; 3]) -> (f32, f32) {
-    // Relative to the centre, so that the differences keep their digits.
+    // Relative to the center, so that the differences keep their digits.
     let v = v.map(|r| r.map(|a| f64::from(a) - f64::from(v[1][1])));
     let gx = 0.5 * (v[1][2] - v[1][0]);
     let gy = 0.5 * (v[2][1] - v[0][1]);
@@ -220,7 +220,7 @@ mod tests {
         fn one_pass_equals_whole_image_passes(
             w in 3usize..90, h in 3usize..150, sigma in 0.3f32..3.0, cell in 1usize..9, seed in any::<u32>(), shi in any::<bool>()
         ) {
-            // Squares of random grey: corners, plateaus and flat places.
+            // Squares of random gray: corners, plateaus and flat places.
             let image = GrayF32::from_fn(w, h, |x, y| {
                 let mut v = ((x / cell) as u32).wrapping_mul(0x9E37_79B9) ^ ((y / cell) as u32).wrapping_mul(0x85EB_CA6B) ^ seed;
                 v = (v ^ (v >> 15)).wrapping_mul(0x2C1B_3C6D);

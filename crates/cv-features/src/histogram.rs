@@ -33,7 +33,7 @@ pub(crate) fn dominant_angles(level: Level, image: &Image<u16, 1>, (px, py): (f3
             })
         })
         .collect();
-    // A flat or perfectly round neighbourhood has no direction of its own.
+    // A flat or perfectly round neighborhood has no direction of its own.
     if peaks.is_empty() {
         return vec![0.0];
     }
@@ -119,7 +119,7 @@ fn window_weights() -> [f32; GRID] {
     })
 }
 
-/// Gradient histograms of the window turned by `angle`; not normalised. Samples outside the image count nothing.
+/// Gradient histograms of the window turned by `angle`; not normalized. Samples outside the image count nothing.
 pub(crate) fn describe(
     level: Level,
     image: &Image<u16, 1>,
@@ -162,14 +162,14 @@ fn describe_impl<S: Simd>(
                 inside[j * PADDED + i] = if cx == x && cy == y { 1.0 } else { 0.0 };
                 (x, y) = (cx, cy);
             }
-            // The square of pixels around it; on its border either neighbour will do.
+            // The square of pixels around it; on its border either neighbor will do.
             let (column, row) =
                 (round((x - 0.5).max(0.0)).min(w as u32 - 2), round((y - 0.5).max(0.0)).min(h as u32 - 2));
             fx[i] = x - column as f32;
             fy[i] = y - row as f32;
             starts[i] = row * w as u32 + column;
         }
-        // Two neighbours in one number each: gathering is what takes the time.
+        // Two neighbors in one number each: gathering is what takes the time.
         let (mut tops, mut bottoms) = ([0u32; PADDED], [0u32; PADDED]);
         for i in 0..PADDED {
             let square = &pixels[starts[i] as usize..][..w + 2];
@@ -277,7 +277,7 @@ mod tests {
             for level in instruction_sets() {
                 let found = dominant_angles(level, &image, (60.3, 54.8), 2.2);
                 let off = (found[0] - angle).abs();
-                // All votes fall in one bin of 10°, whose neighbours are symmetric after smoothing: half a bin is the resolution of such a histogram.
+                // All votes fall in one bin of 10°, whose neighbors are symmetric after smoothing: half a bin is the resolution of such a histogram.
                 assert!(found.len() == 1 && off.min(TAU - off) <= TAU / 72.0 + 1e-3, "{angle}: {found:?}");
             }
         }

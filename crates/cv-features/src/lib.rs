@@ -1,12 +1,12 @@
 //! Corners, spacing, descriptors and matching.
 //!
-//! From two grey images to tentative matches, the classical way:
+//! From two gray images to tentative matches, the classical way:
 //!
 //! ```
 //! use cv_core::GrayF32;
 //! use cv_features::{anms, describe_patches, harris, match_descriptors, HarrisOptions, MatchOptions, PatchOptions};
 //!
-//! // A board of random grey squares, and the same board moved by (3, 2) pixels.
+//! // A board of random gray squares, and the same board moved by (3, 2) pixels.
 //! let board = |dx: usize, dy: usize| {
 //!     GrayF32::from_fn(160, 120, |x, y| {
 //!         let cell = ((x + dx) / 9 * 31 + (y + dy) / 7 * 17) % 11;
@@ -31,7 +31,7 @@
 //! # Conventions
 //!
 //! * Images are one channel of `f32`, by convention 0 to 1. A sample that is not finite is an error, never a NaN in a result.
-//! * Positions are sub-pixel with pixel centres at integers. Angles are radians, clockwise on screen from +x.
+//! * Positions are sub-pixel with pixel centers at integers. Angles are radians, clockwise on screen from +x.
 //! * Every detector and descriptor returns what it dropped, with the reason, beside what it kept.
 //! * Results do not depend on the number of threads.
 

@@ -1,4 +1,4 @@
-//! Nearest-neighbour matching of descriptors.
+//! Nearest-neighbor matching of descriptors.
 
 use crate::descriptors::{DescriptorKind, Descriptors};
 use crate::nearest::nearest;

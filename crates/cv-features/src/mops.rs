@@ -150,7 +150,7 @@ fn detect(pyramid: &Pyramid, options: &MultiScaleOptions) -> Vec<Keypoint> {
             let (x, y) = (corner.position.x * level.pixel, corner.position.y * level.pixel);
             let mut scale = level.sigma * level.pixel;
             if options.laplacian {
-                // The finest and the coarsest have a neighbour on one side only: nothing is known about a maximum there.
+                // The finest and the coarsest have a neighbor on one side only: nothing is known about a maximum there.
                 let (below, above) = (levels.get(i.wrapping_sub(1))?, levels.get(i + 1)?);
                 let [a, b, c] = [below, level, above].map(|l| l.laplacian(x, y).abs());
                 if b <= a || b <= c {
@@ -237,14 +237,14 @@ mod tests {
     use crate::matching::{MatchOptions, match_descriptors};
     use cv_core::GrayF32;
 
-    /// A plane of random grey squares of three sizes, with soft edges.
+    /// A plane of random gray squares of three sizes, with soft edges.
     fn squares(x: f32, y: f32) -> f32 {
         let cell = |size: f32| {
             let soft = |v: f32| {
                 let (whole, part) = ((v / size).floor(), (v / size).fract());
                 (whole, ((part - 1.0) * size + 1.0).clamp(0.0, 1.0))
             };
-            let grey = |i: f32, j: f32| {
+            let gray = |i: f32, j: f32| {
                 let mut v = (i as i32 as u32).wrapping_mul(0x9E37_79B9)
                     ^ (j as i32 as u32 + size as u32).wrapping_mul(0x85EB_CA6B);
                 v = (v ^ (v >> 15)).wrapping_mul(0x2C1B_3C6D);
@@ -252,8 +252,8 @@ mod tests {
                 ((v ^ (v >> 15)) >> 8) as f32 / (1 << 24) as f32
             };
             let ((i, fx), (j, fy)) = (soft(x + 1000.0 * size), soft(y + 1000.0 * size));
-            let top = grey(i, j) * (1.0 - fx) + grey(i + 1.0, j) * fx;
-            let bottom = grey(i, j + 1.0) * (1.0 - fx) + grey(i + 1.0, j + 1.0) * fx;
+            let top = gray(i, j) * (1.0 - fx) + gray(i + 1.0, j) * fx;
+            let bottom = gray(i, j + 1.0) * (1.0 - fx) + gray(i + 1.0, j + 1.0) * fx;
             top * (1.0 - fy) + bottom * fy
         };
         (cell(13.0) + cell(29.0) + cell(61.0)) / 3.0
@@ -285,7 +285,7 @@ mod tests {
                 let (p, q) = (fa.keypoints[m.query as usize], fb.keypoints[m.train as usize]);
                 let (x, y) = place(q.position.x, q.position.y);
                 let turn = (q.angle - p.angle - angle).rem_euclid(std::f32::consts::TAU);
-                // A scale step is 2^(1/3), and neighbours of the right one pass; a tenth of a radian is what the direction at a corner loses to resampling.
+                // A scale step is 2^(1/3), and neighbors of the right one pass; a tenth of a radian is what the direction at a corner loses to resampling.
                 let same_scale = (q.scale / p.scale / scale).log2().abs() < 0.4;
                 let same_turn = turn.min(std::f32::consts::TAU - turn) < 0.1;
                 right += usize::from((x - p.position.x).hypot(y - p.position.y) < 2.0 && same_scale && same_turn);

@@ -1,4 +1,4 @@
-//! Exact nearest neighbours by blocked matrix products.
+//! Exact nearest neighbors by blocked matrix products.
 //!
 //! |q − t|² = |q|² + |t|² − 2 q·t: for a query the nearest candidate is the one with the largest q·t − |t|²/2. The products of six queries with a panel
 //! of candidates stay in registers, and the two best of each are picked before anything is stored. The same products give the nearest query
@@ -9,7 +9,7 @@ use crate::descriptors::Descriptors;
 use fearless_simd::{Level, dispatch, prelude::*};
 use rayon::prelude::*;
 
-/// The nearest and second-nearest neighbour of a descriptor.
+/// The nearest and second-nearest neighbor of a descriptor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct TwoNearest {
     pub(crate) best: u32,
@@ -259,7 +259,7 @@ fn pick(row: &[f32], train: &Descriptors, found: impl Iterator<Item = (f32, u32)
     }
 }
 
-/// Sum of squared differences, over 16 running sums so that it vectorises.
+/// Sum of squared differences, over 16 running sums so that it vectorizes.
 pub(crate) fn ssd(a: &[f32], b: &[f32]) -> f32 {
     let mut sums = [0.0f32; 16];
     let ((a, rest_a), (b, rest_b)) = (a.as_chunks::<16>(), b.as_chunks::<16>());

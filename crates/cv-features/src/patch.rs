@@ -20,7 +20,7 @@ pub struct PatchOptions {
     /// Standard deviation in pixels of the blur before sampling. 0.3 to 50; default 2.5, half the distance of the samples, which leaves little above
     /// their Nyquist frequency.
     pub blur_sigma: f32,
-    /// Patches whose standard deviation is below this count as flat, in the image's unit. Default 0.001 for images of 0 to 1: a quarter of a grey
+    /// Patches whose standard deviation is below this count as flat, in the image's unit. Default 0.001 for images of 0 to 1: a quarter of a gray
     /// level of an 8-bit image, below which a patch is rounding noise.
     pub min_deviation: f32,
 }

@@ -6,7 +6,7 @@ use cv_core::DMatch;
 
 /// Descriptors whose numbers are rounded to bytes, by a scale that belongs to their kind: sets made apart compare.
 ///
-/// Of 2000 rootSIFT features of a photograph, the nearest in a neighbouring one is the same as without rounding for 99 % (`cargo xtask peers features` measures it).
+/// Of 2000 rootSIFT features of a photograph, the nearest in a neighboring one is the same as without rounding for 99 % (`cargo xtask peers features` measures it).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ByteDescriptors {
     kind: DescriptorKind,

@@ -29,7 +29,7 @@ pub(crate) struct Octave {
     pub(crate) pixel: f32,
 }
 
-/// The half of a sampled Gaussian from its centre outwards to three standard deviations, the whole summing to one.
+/// The half of a sampled Gaussian from its center outwards to three standard deviations, the whole summing to one.
 fn half_kernel(sigma: f32) -> Vec<f32> {
     let radius = (3.0 * sigma).ceil().max(1.0) as usize;
     let weight = |i: usize| (-0.5 * (i as f64 / f64::from(sigma)).powi(2)).exp();

@@ -35,7 +35,7 @@ pub struct SiftOptions {
     pub contrast: f32,
     /// Largest ratio of the two principal curvatures. 1 or more; default 10 (Lowe).
     pub edge: f32,
-    /// Take the square root of the L1-normalised histogram (rootSIFT). Default true.
+    /// Take the square root of the L1-normalized histogram (rootSIFT). Default true.
     pub root: bool,
     /// Leave every angle at zero: for images known to be upright. Default false.
     pub upright: bool,
@@ -97,7 +97,7 @@ pub fn sift(view: ImageView<'_, f32, 1>, options: &SiftOptions) -> Result<Descri
     out.beyond_limit = points.len().saturating_sub(options.max_features);
     points.truncate(options.max_features);
     let level = simd::level();
-    // In the order of the image, so that neighbours find each other's pixels in the cache.
+    // In the order of the image, so that neighbors find each other's pixels in the cache.
     let mut order: Vec<usize> = (0..points.len()).collect();
     order.sort_unstable_by_key(|&i| (points[i].octave, points[i].row / 16, points[i].column, i));
     let mut features: Vec<(usize, Vec<Feature>)> = order
@@ -134,7 +134,7 @@ pub fn sift(view: ImageView<'_, f32, 1>, options: &SiftOptions) -> Result<Descri
     Ok(out)
 }
 
-/// A keypoint, its descriptor, and the length of that before it was normalised.
+/// A keypoint, its descriptor, and the length of that before it was normalized.
 type Feature = (Keypoint, [f32; DIMENSION], f32);
 
 fn keypoint(point: &Extremum, octave: &Octave, angle: f32) -> Keypoint {
@@ -175,7 +175,7 @@ mod tests {
 
     #[test]
     fn a_gaussian_blob_is_found_where_and_as_large_as_it_is() {
-        // The normalised Laplacian of a Gaussian blob of σ0 peaks at σ = σ0; the difference of Gaussians with k = 2^(1/3) peaks where the two
+        // The normalized Laplacian of a Gaussian blob of σ0 peaks at σ = σ0; the difference of Gaussians with k = 2^(1/3) peaks where the two
         // scales it compares bracket that, and a point takes the smaller of the two: σ0 = σ·2^(1/6) to first order. The camera's 0.5 is
         // already counted in the image.
         for (x0, y0, s0) in [(60.3f32, 50.7f32, 4.0f32), (70.0, 60.5, 6.0), (64.25, 61.0, 2.5)] {

@@ -161,13 +161,13 @@ fn quantize_impl<S: Simd>(_: S, out: &mut [u16], values: &[f32], dark: f32, gain
     }
 }
 
-/// The nearest whole number, for 0 ≤ v < 2²² (halves to the even one): beyond 2²³ an f32 has no fraction. Unlike `as`, this vectorises.
+/// The nearest whole number, for 0 ≤ v < 2²² (halves to the even one): beyond 2²³ an f32 has no fraction. Unlike `as`, this vectorizes.
 #[inline(always)]
 pub(crate) fn round(v: f32) -> u32 {
     (v + 8_388_608.0).to_bits() & 0x7F_FFFF
 }
 
-/// Adds the columns of `range` where the middle of three differences (three rows each) is above `floor` and not below any of its 26 neighbours,
+/// Adds the columns of `range` where the middle of three differences (three rows each) is above `floor` and not below any of its 26 neighbors,
 /// or below `−floor` and not above any.
 pub(crate) fn extremes(
     level: Level,
@@ -195,7 +195,7 @@ fn extremes_impl<S: Simd>(
         let v = S::f32s::from_slice(simd, &here[x..x + n]);
         let mut up = v.simd_gt(above_floor);
         let mut down = v.simd_lt(below_floor);
-        // Most pixels fall out at the floor or beside their own neighbours.
+        // Most pixels fall out at the floor or beside their own neighbors.
         for rows in [differences[1], differences[0], differences[2]] {
             if (up | down).to_bitmask() == 0 {
                 break;
@@ -226,7 +226,7 @@ fn extremes_impl<S: Simd>(
     }
 }
 
-/// Adds the columns, but the first and the last, where the middle row is above zero, not below `floor`, and not below any of the eight neighbours.
+/// Adds the columns, but the first and the last, where the middle row is above zero, not below `floor`, and not below any of the eight neighbors.
 pub(crate) fn peaks(level: Level, rows: [&[f32]; 3], floor: f32, found: &mut Vec<usize>) {
     dispatch!(level, simd => peaks_impl(simd, rows, floor, found));
 }
@@ -329,7 +329,7 @@ mod tests {
                     .collect()
             };
             let expected = [0, 1].map(|gap| [plain(&|x, t| rows[t][x], gap), plain(&|x, t| data[0][x + t], gap)]);
-            // Coarse values, so that equal neighbours occur; the middle rows stand out, so that extremes do.
+            // Coarse values, so that equal neighbors occur; the middle rows stand out, so that extremes do.
             let coarse: Vec<Vec<f32>> = (0..9)
                 .map(|i| (0..width + 2).map(|_| ((random() - 0.5) * if i == 4 { 40.0 } else { 20.0 }).round()).collect())
                 .collect();

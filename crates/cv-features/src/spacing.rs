@@ -152,7 +152,7 @@ mod tests {
             let p = corners[i].position;
             counts[(p.y / 200.0) as usize * 4 + (p.x / 200.0) as usize] += 1;
         }
-        // Tiles lie on the box of the corners, here 800 × 600 less the gap to the outermost of 5000: a corner near a tile's edge may be its neighbour's.
+        // Tiles lie on the box of the corners, here 800 × 600 less the gap to the outermost of 5000: a corner near a tile's edge may be its neighbor's.
         assert!(counts.iter().all(|c| (7..=9).contains(c)), "{counts:?}");
         assert_eq!(anms_tiled(&corners, 9999, (4, 3)).len(), 5000);
         assert!(anms_tiled(&[], 9, (0, 0)).is_empty());

@@ -11,7 +11,7 @@ use cv_geometry::{
 };
 use std::hint::black_box;
 
-/// Eight points that two cameras see, in normalised coordinates.
+/// Eight points that two cameras see, in normalized coordinates.
 fn scene() -> (Vec<Point3<f64>>, Vec<Correspondence>) {
     let pose = Pose::new(Rotation3::new(Vector3::new(0.05, -0.1, 0.02)), Vector3::new(-0.9, 0.1, 0.3));
     let points: Vec<Point3<f64>> = (0..8)

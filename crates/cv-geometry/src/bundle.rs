@@ -17,7 +17,7 @@ pub struct BundleOptions {
     pub refine_focal: bool,
     /// Whether k1 and k2 of lenses with [`Distortion::Radial`] may change, by as much in both cameras. Default false.
     pub refine_radial: bool,
-    /// Most linearisations. Default 200; without focal lengths it takes ten or so.
+    /// Most linearizations. Default 200; without focal lengths it takes ten or so.
     pub max_iterations: usize,
 }
 
@@ -43,7 +43,7 @@ pub struct TwoViewBundle {
 pub struct BundleReport {
     /// Cost, `Σ ρ(r²)` in square pixels over both images, at the start and at the end.
     pub cost: [f64; 2],
-    /// Linearisations.
+    /// Linearizations.
     pub iterations: usize,
     /// Covariance of each point in the unit of the base line, for the noise that the residuals show (robustly weighted). The length of
     /// the base line, which nothing determines, counts as exact. Of generated points with normal noise, 93 to 95 in a hundred lie within the
@@ -53,7 +53,7 @@ pub struct BundleReport {
     pub pose_deviation: [f64; 2],
     /// Standard deviation of the common factor of the focal lengths; 0 where they were held. Where they are free, the noise is not all there is to it: so it
     /// and the other deviations suppose that the two focal lengths may differ by 0.2 % (the camera focused anew), that the principal points are off the middle by 1 % of
-    /// half the diagonal, and off each other by 0.2 % (stabilised pictures).
+    /// half the diagonal, and off each other by 0.2 % (stabilized pictures).
     pub focal_deviation: f64,
 }
 

@@ -20,7 +20,7 @@ pub(crate) trait Epipolar<const N: usize>: Clone {
     fn step(&self, delta: &OVector<f64, Const<N>>) -> Self;
 }
 
-/// Minimises `Σ ρ(sampson² / threshold²)` over a family of matrices.
+/// Minimizes `Σ ρ(sampson² / threshold²)` over a family of matrices.
 pub(crate) struct SampsonProblem<'a, C: Scorer, M, const N: usize> {
     pub(crate) pairs: &'a [[f64; 4]],
     pub(crate) scorer: &'a C,

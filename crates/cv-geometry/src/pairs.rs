@@ -1,4 +1,4 @@
-//! Correspondences, normalised and laid out for vector units.
+//! Correspondences, normalized and laid out for vector units.
 
 use crate::{EstimateError, error::Degeneracy};
 use cv_core::{Correspondence, Matrix3, Point2, Vector3};
@@ -21,7 +21,7 @@ pub struct PairBlock {
     pub y2: [f32; LANES],
 }
 
-/// Normalised coordinates `(p − center) · scale`.
+/// Normalized coordinates `(p − center) · scale`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Normalizer {
     pub(crate) center: Point2<f64>,
@@ -49,13 +49,13 @@ impl Normalizer {
     }
 }
 
-/// Normalised correspondences, in the caller's order in f64 and shuffled into blocks in f32.
+/// Normalized correspondences, in the caller's order in f64 and shuffled into blocks in f32.
 ///
-/// The centres are medians and the scale is a median distance, so that a wild match cannot squeeze the others together;
+/// The centers are medians and the scale is a median distance, so that a wild match cannot squeeze the others together;
 /// one scale for both images keeps every image distance in proportion to pixels.
 #[derive(Debug, Clone)]
 pub(crate) struct PairSet {
-    /// Normalised, in the caller's order: x1, y1, x2, y2.
+    /// Normalized, in the caller's order: x1, y1, x2, y2.
     pub(crate) pairs: Vec<[f64; 4]>,
     /// The same, in random order: the first blocks are a fair sample of all matches.
     pub(crate) blocks: Vec<PairBlock>,
@@ -68,7 +68,7 @@ pub(crate) struct PairSet {
 }
 
 impl PairSet {
-    /// Normalises and checks `matches`.
+    /// Normalizes and checks `matches`.
     pub(crate) fn new(matches: &[Correspondence], needed: usize) -> Result<Self, EstimateError> {
         check(matches, needed)?;
         let mut scratch = Vec::with_capacity(matches.len());
@@ -95,7 +95,7 @@ impl PairSet {
         Ok(Self::with(matches, Normalizer { center: c1, scale }, Normalizer { center: c2, scale }))
     }
 
-    /// With given normalisations.
+    /// With given normalizations.
     pub(crate) fn with(matches: &[Correspondence], first: Normalizer, second: Normalizer) -> Self {
         let pairs: Vec<[f64; 4]> = matches
             .iter()
@@ -146,7 +146,7 @@ pub(crate) fn different(n: usize, most: usize) -> impl Iterator<Item = (usize, u
 }
 
 /// Whether the chosen points, in either image, are fewer than `needed` different ones, or lie on a line: their root mean
-/// square distance from it is at most `width`, in normalised units.
+/// square distance from it is at most `width`, in normalized units.
 pub(crate) fn point_degeneracy<'a>(
     pairs: impl Iterator<Item = &'a [f64; 4]> + Clone,
     needed: usize,
@@ -170,7 +170,7 @@ pub(crate) fn point_degeneracy<'a>(
     })
 }
 
-/// As [`point_degeneracy`] for normalised coordinates of calibrated cameras, in which a line is a plane of rays: their root mean square angle from the
+/// As [`point_degeneracy`] for normalized coordinates of calibrated cameras, in which a line is a plane of rays: their root mean square angle from the
 /// plane, or from one ray, is at most `width`. Far from the middle of the image, that is not what the coordinates say.
 pub(crate) fn ray_degeneracy<'a>(
     pairs: impl Iterator<Item = &'a [f64; 4]> + Clone,
@@ -245,7 +245,7 @@ fn median(scratch: &mut Vec<f64>, values: impl Iterator<Item = f64>) -> f64 {
     *scratch.select_nth_unstable_by(middle, f64::total_cmp).1
 }
 
-/// Hartley's normalisation: centroid at the origin, mean distance √2. `None` where all points coincide.
+/// Hartley's normalization: centroid at the origin, mean distance √2. `None` where all points coincide.
 pub(crate) fn hartley(points: impl Iterator<Item = Point2<f64>> + Clone) -> Option<Normalizer> {
     let mut n = 0.0;
     let mut sum = cv_core::Vector2::zeros();

@@ -139,7 +139,7 @@ mod tests {
     use cv_core::Vector3;
 
     /// Coordinates relative to the principal point.
-    fn centred(views: &TwoViews) -> ([Point2<f64>; 6], [Point2<f64>; 6]) {
+    fn centered(views: &TwoViews) -> ([Point2<f64>; 6], [Point2<f64>; 6]) {
         let m = views.matches(6, 0.0);
         let c = Point2::new(views.camera.cx, views.camera.cy).coords;
         (std::array::from_fn(|i| m[i].a - c), std::array::from_fn(|i| m[i].b - c))
@@ -150,7 +150,7 @@ mod tests {
         let (mut missed, mut total, mut most) = (0, 0, 0);
         for seed in 0..1000 {
             let views = TwoViews::random(seed);
-            let (a, b) = centred(&views);
+            let (a, b) = centered(&views);
             let diagonal = |f: f64| Matrix3::from_diagonal(&Vector3::new(f, f, 1.0));
             let truth = views.essential();
             let (mut best, mut count) = (f64::INFINITY, 0);

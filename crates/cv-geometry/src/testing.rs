@@ -90,12 +90,12 @@ impl TwoViews {
         (0..n).map(|_| Correspondence::new(u(640.0), u(480.0), u(640.0), u(480.0))).collect()
     }
 
-    /// Right matches in normalised coordinates, noise too.
-    pub(crate) fn normalised_matches(&self, n: usize, noise: f64) -> Vec<Correspondence> {
-        self.matches(n, noise * 500.0).iter().map(|m| self.normalise(m)).collect()
+    /// Right matches in normalized coordinates, noise too.
+    pub(crate) fn normalized_matches(&self, n: usize, noise: f64) -> Vec<Correspondence> {
+        self.matches(n, noise * 500.0).iter().map(|m| self.normalize(m)).collect()
     }
 
-    pub(crate) fn normalise(&self, m: &Correspondence) -> Correspondence {
+    pub(crate) fn normalize(&self, m: &Correspondence) -> Correspondence {
         Correspondence { a: self.camera.normalize(m.a), b: self.camera.normalize(m.b) }
     }
 

@@ -24,7 +24,7 @@ pub enum TriangulationError {
 
 /// The point of least squared image error in two views, in the frame of the first.
 ///
-/// `m` in normalised coordinates; `pose` maps the first camera's frame to the second's. The match is moved to the nearest one
+/// `m` in normalized coordinates; `pose` maps the first camera's frame to the second's. The match is moved to the nearest one
 /// (in the sum of squared distances) that obeys the epipolar geometry, in two steps that are exact to about 1e-6 of the error
 /// (Lindstrom, "Triangulation made easy", 2010, `niter2`), and its rays are intersected.
 ///
@@ -76,7 +76,7 @@ fn intersect(m: &Correspondence, pose: &Pose) -> Result<Point3<f64>, Triangulati
 
 /// The point of least algebraic error in any number of views (Hartley & Zisserman, §12.2), in the world's frame.
 ///
-/// Each view is a normalised image point and its pose. A start for refinement: [`triangulate`] is better where there are two.
+/// Each view is a normalized image point and its pose. A start for refinement: [`triangulate`] is better where there are two.
 ///
 /// # Errors
 /// [`TriangulationError`]: fewer than two views, parallel rays, or a point behind one of the cameras.
@@ -126,7 +126,7 @@ mod tests {
         fn exact_matches_give_the_exact_point(seed: u64) {
             let views = TwoViews::random(seed);
             let (point, m) = views.point(None);
-            let m = views.normalise(&m);
+            let m = views.normalize(&m);
             prop_assume!(parallax_angle(&point, &views.pose) > 0.01);
             // Rounding of the rays over the parallax.
             prop_assert!((triangulate(&m, &views.pose).unwrap() - point).norm() < 1e-9);
@@ -138,7 +138,7 @@ mod tests {
         #[test]
         fn nothing_near_it_fits_a_noisy_match_better(seed: u64) {
             let views = TwoViews::random(seed);
-            let m = &views.normalised_matches(1, 2e-3)[0];
+            let m = &views.normalized_matches(1, 2e-3)[0];
             let Ok(point) = triangulate(m, &views.pose) else { return Ok(()) };
             prop_assume!(parallax_angle(&point, &views.pose) > 0.02);
             let best = reprojection2(&point, m, &views.pose);

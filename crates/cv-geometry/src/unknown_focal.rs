@@ -41,7 +41,7 @@ impl FocalPose {
 /// The relative pose and the focal length of two cameras of one unknown focal length, from matches in pixels relative to the principal points,
 /// of which many may be wrong.
 ///
-/// RANSAC over six-point samples ([`fundamental_six_point`]) with local optimisation of pose and focal length together on the Sampson error.
+/// RANSAC over six-point samples ([`fundamental_six_point`]) with local optimization of pose and focal length together on the Sampson error.
 /// Inliers lie in front of both cameras.
 ///
 /// # Errors
@@ -122,7 +122,7 @@ impl Epipolar<6> for FocalPose {
 
     fn step(&self, d: &SVector<f64, 6>) -> Self {
         let pose = Epipolar::<5>::step(&self.pose, &d.fixed_rows::<5>(0).into_owned());
-        // A step of more than a factor of two is beyond what a linearisation knows.
+        // A step of more than a factor of two is beyond what a linearization knows.
         Self { pose, focal: self.focal * d[5].clamp(-0.7, 0.7).exp() }
     }
 }
@@ -201,7 +201,7 @@ mod tests {
     use proptest::prelude::*;
 
     /// Relative to the principal point.
-    fn centred(views: &TwoViews, matches: Vec<Correspondence>) -> Vec<Correspondence> {
+    fn centered(views: &TwoViews, matches: Vec<Correspondence>) -> Vec<Correspondence> {
         let c = Point2::new(views.camera.cx, views.camera.cy).coords;
         matches.into_iter().map(|m| Correspondence { a: m.a - c, b: m.b - c }).collect()
     }
@@ -228,7 +228,7 @@ mod tests {
         let (mut exact, mut off) = (Vec::new(), Vec::new());
         for seed in 0..40 {
             let views = TwoViews::random(seed);
-            let mut m = centred(&views, views.matches(60, 0.0));
+            let mut m = centered(&views, views.matches(60, 0.0));
             let options = RobustOptions { threshold: 1.0, seed, ..RobustOptions::default() };
             let error = |m: &[Correspondence]| {
                 let found = estimate_focal_pose(m, &options).unwrap();
@@ -236,12 +236,12 @@ mod tests {
                 (refine_focal_pose(&found.model, m, 1.0).0.focal / 500.0 - 1.0).abs()
             };
             exact.push(error(&m));
-            m.extend(centred(&views, views.wrong(40)));
+            m.extend(centered(&views, views.wrong(40)));
             off.push(error(&m));
         }
         exact.sort_by(f64::total_cmp);
         off.sort_by(f64::total_cmp);
-        // Steps end when the cost falls by less than a millionth of what it is: of nothing, at 1e-3 px or less. The least favourable motion of
+        // Steps end when the cost falls by less than a millionth of what it is: of nothing, at 1e-3 px or less. The least favorable motion of
         // forty shows the focal length by a hundredth of a pixel for each per cent.
         assert!(exact[39] < 1e-3, "{exact:?}");
         // One or two wrong matches of forty lie near the right lines by chance, and pull as one or two of sixty do.
@@ -252,7 +252,7 @@ mod tests {
     fn bad_input_gets_a_typed_answer() {
         let views = TwoViews::random(1);
         let options = RobustOptions { threshold: 1.0, ..RobustOptions::default() };
-        let good = centred(&views, views.matches(20, 0.0));
+        let good = centered(&views, views.matches(20, 0.0));
         let get = |m: &[Correspondence]| estimate_focal_pose(m, &options).unwrap_err();
         assert_eq!(get(&good[..6]), EstimateError::NotEnoughMatches { got: 6, needed: 7 });
         assert_eq!(

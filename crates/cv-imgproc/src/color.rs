@@ -1,4 +1,4 @@
-//! Colour conversion.
+//! Color conversion.
 
 use crate::{Pixel, rows::for_rows};
 use cv_core::{GrayF32, GrayU8, Image, ImageView, RgbF32, RgbU8, Sample};
@@ -60,7 +60,7 @@ pub fn f32_to_u8<const C: usize>(view: ImageView<'_, f32, C>) -> Image<u8, C> {
 
 /// RGB bytes to hue in radians `[0, 2π)`, saturation and value 0 to 1 (Smith, SIGGRAPH 1978).
 ///
-/// Grey pixels have no hue and get 0; black ones have saturation 0.
+/// Gray pixels have no hue and get 0; black ones have saturation 0.
 pub fn rgb_to_hsv(view: ImageView<'_, u8, 3>) -> Image<f32, 3> {
     convert(view, rgb_pixel_to_hsv)
 }
@@ -140,10 +140,10 @@ pub fn rgb_pixel_to_lab(rgb: [u8; 3]) -> [f32; 3] {
     linear_rgb_to_lab(rgb.map(|v| LINEAR[usize::from(v)]))
 }
 
-/// Linear sRGB light, 0 to 1, to L*a*b*: what [`rgb_to_lab`] does after [`srgb_to_linear`]. Without branches, so that loops over it vectorise.
+/// Linear sRGB light, 0 to 1, to L*a*b*: what [`rgb_to_lab`] does after [`srgb_to_linear`]. Without branches, so that loops over it vectorize.
 #[inline(always)]
 pub fn linear_rgb_to_lab([r, g, b]: [f32; 3]) -> [f32; 3] {
-    // Linear sRGB to XYZ over the white point (0.950456, 1, 1.088754): each row sums to one, so that greys have a = b = 0.
+    // Linear sRGB to XYZ over the white point (0.950456, 1, 1.088754): each row sums to one, so that grays have a = b = 0.
     let x = 0.433_953 * r + 0.376_219 * g + 0.189_828 * b;
     let y = 0.212_671 * r + 0.715_160 * g + 0.072_169 * b;
     let z = 0.017_758 * r + 0.109_477 * g + 0.872_765 * b;
@@ -184,8 +184,8 @@ mod tests {
     }
 
     #[test]
-    fn lab_of_colours_others_have_tabulated() {
-        // Values of the CIE formulas for sRGB, D65, as colour calculators give them to two digits; matrices with four or six digits differ by 0.02.
+    fn lab_of_colors_others_have_tabulated() {
+        // Values of the CIE formulas for sRGB, D65, as color calculators give them to two digits; matrices with four or six digits differ by 0.02.
         for (rgb, expected) in [
             ([255, 255, 255], [100.0, 0.0, 0.0]),
             ([0, 0, 0], [0.0, 0.0, 0.0]),

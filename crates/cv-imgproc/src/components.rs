@@ -25,7 +25,7 @@ pub struct ComponentStats {
     pub width: usize,
     /// Height of the bounding box in pixels.
     pub height: usize,
-    /// Mean position of the pixels' centres.
+    /// Mean position of the pixels' centers.
     pub centroid: Point2<f64>,
 }
 
@@ -93,7 +93,7 @@ pub fn connected_components(view: ImageView<'_, bool, 1>, connectivity: Connecti
 fn joined_runs(view: ImageView<'_, bool, 1>, connectivity: Connectivity) -> (Vec<Run>, Vec<u32>) {
     let mut runs: Vec<Run> = Vec::new();
     let mut parent: Vec<u32> = Vec::new();
-    // Runs a and b of neighbouring rows touch where a.start < b.end + reach and b.start < a.end + reach.
+    // Runs a and b of neighboring rows touch where a.start < b.end + reach and b.start < a.end + reach.
     let reach = usize::from(connectivity == Connectivity::Eight);
     let mut above = 0..0;
     for y in 0..view.height() {

@@ -20,7 +20,7 @@ pub fn gaussian_blur<const C: usize>(view: ImageView<'_, f32, C>, sigma: f32) ->
     }
 }
 
-/// The sampled Gaussian from its centre outwards, as [`gaussian_blur`] uses it; the whole kernel sums to one.
+/// The sampled Gaussian from its center outwards, as [`gaussian_blur`] uses it; the whole kernel sums to one.
 ///
 /// `sigma` must be positive; others give the kernel `[1]`.
 pub fn gaussian_half_kernel(sigma: f32) -> Vec<f32> {
@@ -34,7 +34,7 @@ pub fn gaussian_half_kernel(sigma: f32) -> Vec<f32> {
     (0..=radius).map(|i| (weight(i) / sum) as f32).collect()
 }
 
-/// Convolves rows and columns with the symmetric kernel whose centre is `half[0]` and whose arms are `half[1..]`, borders mirrored.
+/// Convolves rows and columns with the symmetric kernel whose center is `half[0]` and whose arms are `half[1..]`, borders mirrored.
 ///
 /// An empty kernel returns a copy. Each output row gathers its source rows into one buffer, then runs along it, so no intermediate image is stored.
 pub fn separable_symmetric<const C: usize>(view: ImageView<'_, f32, C>, half: &[f32]) -> Image<f32, C> {
@@ -56,7 +56,7 @@ pub fn separable_symmetric<const C: usize>(view: ImageView<'_, f32, C>, half: &[
     out
 }
 
-/// The derivatives by x and by y of Sobel's 3×3 operator, `[1 2 1]` across and `[−1 0 1]` along, not normalised (as OpenCV's `Sobel`): a ramp
+/// The derivatives by x and by y of Sobel's 3×3 operator, `[1 2 1]` across and `[−1 0 1]` along, not normalized (as OpenCV's `Sobel`): a ramp
 /// of slope 1 gives 8. The border is mirrored about the end samples.
 pub fn sobel(view: ImageView<'_, f32, 1>) -> (GrayF32, GrayF32) {
     let (w, h) = view.size();
@@ -79,7 +79,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// The definition: every pixel the weighted sum of its mirrored neighbours, in f64.
+    /// The definition: every pixel the weighted sum of its mirrored neighbors, in f64.
     fn plain(view: ImageView<'_, f32, 2>, half: &[f32]) -> Image<f32, 2> {
         let r = half.len() as isize - 1;
         let (w, h) = view.size();

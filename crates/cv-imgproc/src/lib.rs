@@ -1,4 +1,4 @@
-//! Image processing: colour conversion, filtering, sampling, warping, pyramids, morphology and components.
+//! Image processing: color conversion, filtering, sampling, warping, pyramids, morphology and components.
 //!
 //! ```
 //! use cv_core::{Matrix3, RgbU8};
@@ -22,7 +22,7 @@
 //!
 //! * Functions take views and return owned images. `f32` pictures are 0 to 1.
 //! * Filters mirror the border about the end samples (`dcb|abcd|cba`), as OpenCV's default does; medians repeat it.
-//! * Empty images give empty results. Where not said otherwise a NaN pixel spoils the results its neighbourhood enters, nothing else.
+//! * Empty images give empty results. Where not said otherwise a NaN pixel spoils the results its neighborhood enters, nothing else.
 //! * Rows are shared out between threads; results do not depend on their number, nor on the instruction set.
 
 mod color;

@@ -218,12 +218,12 @@ fn shift_down(bits: usize, from: &[u64], to: &mut [u64]) {
     }
 }
 
-/// True where the element, reflected and centred on the pixel, touches a true pixel. Outside the image counts as false.
+/// True where the element, reflected and centered on the pixel, touches a true pixel. Outside the image counts as false.
 pub fn dilate(view: ImageView<'_, bool, 1>, element: &StructuringElement) -> Mask {
     Bits::pack(view).dilate(element).unpack()
 }
 
-/// True where the element, centred on the pixel, covers only true pixels. Outside the image counts as true.
+/// True where the element, centered on the pixel, covers only true pixels. Outside the image counts as true.
 pub fn erode(view: ImageView<'_, bool, 1>, element: &StructuringElement) -> Mask {
     eroded(Bits::pack(view), element).unpack()
 }

@@ -3,9 +3,9 @@
 use crate::{Interpolation, Pixel, RemapOptions, WarpError, rows::for_rows_with, warp_with};
 use cv_core::{Image, ImageError, ImageView, Point2};
 
-/// Resamples to `width × height`; the corners of the image areas match, so pixel centre `x` comes from `(x + ½) w / width − ½` (as OpenCV's `resize`).
+/// Resamples to `width × height`; the corners of the image areas match, so pixel center `x` comes from `(x + ½) w / width − ½` (as OpenCV's `resize`).
 ///
-/// Interpolates between neighbours only: to make an image smaller without aliasing use [`resize_area`].
+/// Interpolates between neighbors only: to make an image smaller without aliasing use [`resize_area`].
 ///
 /// # Errors
 /// [`ImageError::TooLarge`]. An empty source gives zeros.

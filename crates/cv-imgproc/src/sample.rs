@@ -3,7 +3,7 @@
 use crate::Pixel;
 use cv_core::ImageView;
 
-/// How far outside the outermost pixel centres a point may lie and still count as on them, in pixels: the rounding of a map of
+/// How far outside the outermost pixel centers a point may lie and still count as on them, in pixels: the rounding of a map of
 /// a few thousand pixels in `f32`.
 const SLACK: f64 = 1e-3;
 
@@ -22,7 +22,7 @@ pub(crate) fn split(v: f64, n: usize) -> Option<(usize, f32)> {
 
 /// The value at `(x, y)` by bilinear interpolation, in the unit of the image.
 ///
-/// `None` outside the rectangle of the outermost pixel centres, `[0, w − 1] × [0, h − 1]` (with a thousandth of a pixel of slack).
+/// `None` outside the rectangle of the outermost pixel centers, `[0, w − 1] × [0, h − 1]` (with a thousandth of a pixel of slack).
 #[inline]
 pub fn sample_bilinear<T: Pixel, const C: usize>(view: ImageView<'_, T, C>, x: f64, y: f64) -> Option<[f32; C]> {
     sampled(view, x, y, bilinear_at)

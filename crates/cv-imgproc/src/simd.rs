@@ -79,7 +79,7 @@ fn filter<'a, S: Simd>(
 /// Sobel derivatives of the middle one of three rows, the ends mirrored.
 pub(crate) fn sobel(level: Level, rows: [&[f32]; 3], dx: &mut [f32], dy: &mut [f32]) {
     let w = dx.len();
-    // Mirrored about an end sample, both neighbours are the same: no slope by x, and the slope by y counts them twice.
+    // Mirrored about an end sample, both neighbors are the same: no slope by x, and the slope by y counts them twice.
     let end = |x: usize, inner: usize| 2.0 * ((rows[2][x] - rows[0][x]) + (rows[2][inner] - rows[0][inner]));
     for (x, inner) in [(0, 1.min(w - 1)), (w - 1, w.saturating_sub(2))] {
         dx[x] = 0.0;

@@ -110,7 +110,7 @@ impl<T: Pixel, const C: usize> Sampler<'_, T, C> {
 
 /// An image of `size` (width, height) whose pixel `(x, y)` is the source at `map(x, y)`, and where that lies inside the source.
 ///
-/// Inside means between the outermost pixel centres, `[0, w − 1] × [0, h − 1]`. Where the map is `None` the pixel is zero. The map is called in no
+/// Inside means between the outermost pixel centers, `[0, w − 1] × [0, h − 1]`. Where the map is `None` the pixel is zero. The map is called in no
 /// particular order, from several threads.
 ///
 /// # Errors
@@ -164,7 +164,7 @@ pub fn remap<T: Pixel, const C: usize>(
 /// result comes from inside the source.
 ///
 /// Works by inverse mapping: each result pixel looks up its source position. Pixels whose source lies at or behind the horizon (the homography's
-/// third coordinate does not have the sign it has at the source's centre) map nowhere.
+/// third coordinate does not have the sign it has at the source's center) map nowhere.
 ///
 /// # Errors
 /// [`WarpError::NotInvertible`], [`WarpError::Size`].
@@ -175,9 +175,9 @@ pub fn warp_perspective<T: Pixel, const C: usize>(
     options: &RemapOptions,
 ) -> Result<(Image<T, C>, Mask), WarpError> {
     let m = inverse(h)?;
-    // The centre of the source is in front: make its weight through the inverse positive.
-    let centre = h * cv_core::Vector3::new(view.width() as f64 / 2.0, view.height() as f64 / 2.0, 1.0);
-    let m = if centre.z < 0.0 { -m } else { m };
+    // The center of the source is in front: make its weight through the inverse positive.
+    let center = h * cv_core::Vector3::new(view.width() as f64 / 2.0, view.height() as f64 / 2.0, 1.0);
+    let m = if center.z < 0.0 { -m } else { m };
     warp_with(view, size, options, |x, y| {
         let (x, y) = (x as f64, y as f64);
         let w = m[(2, 0)] * x + m[(2, 1)] * y + m[(2, 2)];

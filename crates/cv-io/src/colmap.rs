@@ -1,6 +1,6 @@
 //! COLMAP's text models: `cameras.txt`, `images.txt`, `points3D.txt` in one folder.
 //!
-//! COLMAP puts the centre of the top-left pixel at (0.5, 0.5). Principal points and image points are brought to our convention, integers,
+//! COLMAP puts the center of the top-left pixel at (0.5, 0.5). Principal points and image points are brought to our convention, integers,
 //! when read, and back when written. Poses are world to camera in both.
 
 use std::collections::BTreeMap;
@@ -38,7 +38,7 @@ pub struct ModelImage {
     pub camera: u32,
     /// World to camera.
     pub pose: Pose,
-    /// Image points in pixels (centres at integers), and the scene point each belongs to, if any.
+    /// Image points in pixels (centers at integers), and the scene point each belongs to, if any.
     pub points: Vec<(Point2<f64>, Option<u64>)>,
 }
 
@@ -47,7 +47,7 @@ pub struct ModelImage {
 pub struct ModelPoint {
     /// Position in the world.
     pub position: Point3<f64>,
-    /// RGB colour.
+    /// RGB color.
     pub color: [u8; 3],
     /// Mean reprojection error in pixels; negative or NaN where unknown.
     pub error: f64,
@@ -290,7 +290,7 @@ mod tests {
         let first = &images[&1];
         assert_eq!(first.points[0], (Point2::new(2361.89, 247.998), Some(58396)));
         assert_eq!(first.points[2].1, None);
-        // R of a quaternion by its definition: the first entry is 1 − 2(y² + z²), normalised.
+        // R of a quaternion by its definition: the first entry is 1 − 2(y² + z²), normalized.
         let n = 0.851773f64.powi(2) + 0.0165051f64.powi(2) + 0.503764f64.powi(2) + 0.142941f64.powi(2);
         let r00 = 1.0 - 2.0 * (0.503764f64.powi(2) + 0.142941f64.powi(2)) / n;
         assert!((first.pose.rotation.matrix()[(0, 0)] - r00).abs() < 1e-12);

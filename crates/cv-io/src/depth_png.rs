@@ -1,4 +1,4 @@
-//! Disparity and depth in ordinary PNG files: KITTI's 1/256 px, 16-bit millimetres, Middlebury's scaled bytes.
+//! Disparity and depth in ordinary PNG files: KITTI's 1/256 px, 16-bit millimeters, Middlebury's scaled bytes.
 //!
 //! All three keep 0 for "unknown", which is NaN in memory.
 
@@ -18,7 +18,7 @@ pub mod kitti {
     /// Reads disparities in pixels.
     ///
     /// # Errors
-    /// [`IoError`]: as [`read_image`], or not a grey picture of 16 bits.
+    /// [`IoError`]: as [`read_image`], or not a gray picture of 16 bits.
     pub fn read(path: impl AsRef<Path>) -> Result<GrayF32, IoError> {
         Ok(values(&read_16(path.as_ref())?, 1.0 / 256.0))
     }
@@ -35,19 +35,19 @@ pub mod kitti {
     }
 }
 
-/// 16-bit PNG of millimetres, 0 = unknown: what depth cameras, ScanNet and TUM-like tools exchange.
+/// 16-bit PNG of millimeters, 0 = unknown: what depth cameras, ScanNet and TUM-like tools exchange.
 pub mod depth_mm {
     use super::*;
 
-    /// Reads depth in metres.
+    /// Reads depth in meters.
     ///
     /// # Errors
-    /// [`IoError`]: as [`read_image`], or not a grey picture of 16 bits.
+    /// [`IoError`]: as [`read_image`], or not a gray picture of 16 bits.
     pub fn read(path: impl AsRef<Path>) -> Result<GrayF32, IoError> {
         Ok(values(&read_16(path.as_ref())?, 1.0 / 1000.0))
     }
 
-    /// Writes depth in metres.
+    /// Writes depth in meters.
     ///
     /// Returns how many known values lie outside 0 to 65.535 m and had to be stored as unknown.
     ///
@@ -58,14 +58,14 @@ pub mod depth_mm {
     }
 }
 
-/// Grey PNG of 8 or 16 bits where `value / scale` is the disparity in pixels and 0 = unknown (Middlebury 2001 to 2006).
+/// Gray PNG of 8 or 16 bits where `value / scale` is the disparity in pixels and 0 = unknown (Middlebury 2001 to 2006).
 pub mod scaled {
     use super::*;
 
     /// Reads disparities in pixels. `scale` is 4 for Middlebury's cones at quarter size, 256 for KITTI.
     ///
     /// # Errors
-    /// [`IoError`]: as [`read_image`], or a colour picture, or a scale that is not positive.
+    /// [`IoError`]: as [`read_image`], or a color picture, or a scale that is not positive.
     pub fn read(path: impl AsRef<Path>, scale: f64) -> Result<GrayF32, IoError> {
         let path = path.as_ref();
         decode(&read_bytes(path)?, Some(scale)).map_err(|reason| IoError::reading(path, reason))
@@ -83,7 +83,7 @@ pub mod scaled {
     }
 }
 
-/// The values of a grey picture over `scale`; without one, of a 16-bit picture over 256.
+/// The values of a gray picture over `scale`; without one, of a 16-bit picture over 256.
 pub(crate) fn decode(bytes: &[u8], scale: Option<f64>) -> Result<GrayF32, FormatError> {
     let pixels = decode_image(bytes, &ReadOptions::default())?.pixels;
     let scale = match (scale, &pixels) {
@@ -95,11 +95,11 @@ pub(crate) fn decode(bytes: &[u8], scale: Option<f64>) -> Result<GrayF32, Format
     match pixels {
         Pixels::Gray16(image) => Ok(values(&image, 1.0 / scale)),
         Pixels::Gray8(image) => Ok(values(&image, 1.0 / scale)),
-        // Some tools save grey as three equal channels.
+        // Some tools save gray as three equal channels.
         Pixels::Rgb8(image) if image.pixels().all(|[r, g, b]| r == g && g == b) => {
             Ok(values(&image.map(|[v, _, _]| [v]), 1.0 / scale))
         }
-        _ => Err(FormatError::unsupported(NAME, "a colour picture")),
+        _ => Err(FormatError::unsupported(NAME, "a color picture")),
     }
 }
 
@@ -109,7 +109,7 @@ fn read_16(path: &Path) -> Result<Image<u16, 1>, IoError> {
         Pixels::Gray8(_) => {
             Err(IoError::reading(path, FormatError::unsupported("16-bit PNG", "a picture of 8 bits in its place")))
         }
-        _ => Err(IoError::reading(path, FormatError::unsupported("16-bit PNG", "a colour picture in its place"))),
+        _ => Err(IoError::reading(path, FormatError::unsupported("16-bit PNG", "a color picture in its place"))),
     }
 }
 
@@ -168,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn millimetres_and_scaled_bytes() {
+    fn millimeters_and_scaled_bytes() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("d.png");
         let image = GrayF32::from_vec(4, 1, vec![0.5, 65.535, 65.6, f32::NAN]).unwrap();

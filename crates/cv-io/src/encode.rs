@@ -11,7 +11,7 @@ use crate::{FormatError, IoError};
 
 /// What a PNG can hold here: views of 1, 3 or 4 channels of `u8` or `u16`, and masks.
 pub trait PngPixels: sealed::Sealed {
-    /// Width, height, colour type and the rows, big-endian, without padding.
+    /// Width, height, color type and the rows, big-endian, without padding.
     #[doc(hidden)]
     fn parts(&self) -> (usize, usize, ExtendedColorType, Vec<u8>);
 }
@@ -73,7 +73,7 @@ pub trait JpegPixels: PngPixels {}
 impl JpegPixels for ImageView<'_, u8, 1> {}
 impl JpegPixels for ImageView<'_, u8, 3> {}
 
-/// The bytes of a JPEG file at `quality` 1 to 100 (95 keeps what an eye can see). Colour is not subsampled from 90 on.
+/// The bytes of a JPEG file at `quality` 1 to 100 (95 keeps what an eye can see). Color is not subsampled from 90 on.
 ///
 /// # Errors
 /// [`FormatError::NotRepresentable`] for an empty picture or one with a side above 65535.

@@ -25,11 +25,11 @@ pub struct ExifFocal {
 /// The tags a focal length was computed from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FocalSource {
-    /// The focal length in millimetres and the pixels per unit of the sensor (FocalPlaneXResolution). As good as the
+    /// The focal length in millimeters and the pixels per unit of the sensor (FocalPlaneXResolution). As good as the
     /// tags: commonly within 1 %, though focusing near lengthens it.
     SensorResolution,
     /// The 35 mm equivalent (FocalLengthIn35mmFilm), by equal diagonals as CIPA DCG-001 has it. It is a whole number
-    /// of millimetres, so a wide lens may be off by 2 %.
+    /// of millimeters, so a wide lens may be off by 2 %.
     Equivalent35mm,
 }
 

@@ -1,6 +1,6 @@
 //! Keypoints and descriptors as other programs read and write them: COLMAP's feature text and NumPy arrays.
 //!
-//! COLMAP's text starts with a line `count 128`; then a row per feature: `x y scale orientation d1 … d128`, the centre of the top-left pixel at (0.5, 0.5), the angle in
+//! COLMAP's text starts with a line `count 128`; then a row per feature: `x y scale orientation d1 … d128`, the center of the top-left pixel at (0.5, 0.5), the angle in
 //! radians, the descriptor as whole numbers 0 to 255 that are 512 times those of unit length. It has no strengths: they read as 0.
 
 use crate::files::{read_text, write_bytes};
@@ -19,7 +19,7 @@ const DIMENSION: usize = 128;
 /// Keypoints with a descriptor each.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct FeatureRows {
-    /// The points, pixel centres at integers.
+    /// The points, pixel centers at integers.
     pub keypoints: Vec<Keypoint>,
     /// Numbers in one descriptor.
     pub dimension: usize,

@@ -9,10 +9,10 @@ use crate::npy::NpyArray;
 use crate::pfm::Pfm;
 use crate::{FormatError, IoError, depth_png, npy, npz, pfm};
 
-/// Reads a map of one channel, telling by content: PFM, NumPy's `.npy` and `.npz` (its only two-dimensional array), or a grey picture
+/// Reads a map of one channel, telling by content: PFM, NumPy's `.npy` and `.npz` (its only two-dimensional array), or a gray picture
 /// whose values are `png_scale` times what they mean, with 0 for unknown.
 ///
-/// Without `png_scale` a grey picture of 16 bits is taken as KITTI's, 256 per pixel of disparity; one of 8 bits is refused, since its scale
+/// Without `png_scale` a gray picture of 16 bits is taken as KITTI's, 256 per pixel of disparity; one of 8 bits is refused, since its scale
 /// cannot be known. `png_scale` is ignored for the other formats. Unknown (infinite or NaN) becomes NaN.
 ///
 /// # Errors
@@ -31,7 +31,7 @@ pub fn decode_map(bytes: &[u8], png_scale: Option<f64>) -> Result<GrayF32, Forma
     let mut map = match bytes {
         [b'P', b'f' | b'F', b'\n' | b'\r' | b' ' | b'\t', ..] => match pfm::decode(bytes)? {
             Pfm::Gray(map) => map,
-            Pfm::Rgb(_) => return Err(FormatError::unsupported("PFM", "colour in the place of one channel")),
+            Pfm::Rgb(_) => return Err(FormatError::unsupported("PFM", "color in the place of one channel")),
         },
         [0x93, b'N', ..] => npy::decode(bytes)?.to_gray()?,
         [b'P', b'K', ..] => only_map(&npz::decode(bytes)?)?.to_gray()?,
@@ -90,11 +90,11 @@ mod tests {
     }
 
     #[test]
-    fn colour_is_not_a_map() {
-        let colour = crate::encode_png(Image::<u8, 3>::new(2, 2, [1, 2, 3]).view()).unwrap();
-        assert!(decode_map(&colour, Some(4.0)).is_err());
-        let grey = crate::encode_png(GrayU8::new(2, 2, [8]).view()).unwrap();
-        assert_eq!(decode_map(&grey, Some(4.0)).unwrap().at(0, 0), [2.0]);
+    fn color_is_not_a_map() {
+        let color = crate::encode_png(Image::<u8, 3>::new(2, 2, [1, 2, 3]).view()).unwrap();
+        assert!(decode_map(&color, Some(4.0)).is_err());
+        let gray = crate::encode_png(GrayU8::new(2, 2, [8]).view()).unwrap();
+        assert_eq!(decode_map(&gray, Some(4.0)).unwrap().at(0, 0), [2.0]);
         assert!(decode_map(b"", None).is_err() && decode_map(b"hello", Some(4.0)).is_err());
     }
 }

@@ -1,5 +1,5 @@
 //! Point correspondences as text: a row per match, `x1 y1 x2 y2` in pixels with an optional score, `#` to the end of a line is
-//! a comment. Pixel centres at integers.
+//! a comment. Pixel centers at integers.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -87,8 +87,8 @@ pub fn write_matches(path: impl AsRef<Path>, pairs: &[Correspondence], scores: O
         return Err(IoError::writing(path, FormatError::NotRepresentable { format: "a matches file", what }));
     }
     let mut text = String::from(match scores {
-        Some(_) => "# x1 y1 x2 y2 score (pixels, centres at integers)\n",
-        None => "# x1 y1 x2 y2 (pixels, centres at integers)\n",
+        Some(_) => "# x1 y1 x2 y2 score (pixels, centers at integers)\n",
+        None => "# x1 y1 x2 y2 (pixels, centers at integers)\n",
     });
     for (i, pair) in pairs.iter().enumerate() {
         let _ = write!(text, "{} {} {} {}", pair.a.x, pair.a.y, pair.b.x, pair.b.y);

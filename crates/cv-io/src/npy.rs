@@ -9,7 +9,7 @@ use crate::{FormatError, IoError};
 
 const NAME: &str = "npy";
 const MAGIC: &[u8] = b"\x93NUMPY";
-/// The most elements read: as many samples as the largest colour picture has.
+/// The most elements read: as many samples as the largest color picture has.
 const MAX_ELEMENTS: u64 = 3 * crate::DEFAULT_MAX_PIXELS;
 
 /// The values of an array, in C order.

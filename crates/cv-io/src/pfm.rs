@@ -121,7 +121,7 @@ pub fn read(path: impl AsRef<Path>) -> Result<GrayF32, IoError> {
     match decode(&read_bytes(path)?) {
         Ok(Pfm::Gray(image)) => Ok(image),
         Ok(Pfm::Rgb(_)) => {
-            Err(IoError::reading(path, FormatError::unsupported(NAME, "colour in the place of one channel")))
+            Err(IoError::reading(path, FormatError::unsupported(NAME, "color in the place of one channel")))
         }
         Err(reason) => Err(IoError::reading(path, reason)),
     }
@@ -136,7 +136,7 @@ pub fn read_rgb(path: impl AsRef<Path>) -> Result<RgbF32, IoError> {
     match decode(&read_bytes(path)?) {
         Ok(Pfm::Rgb(image)) => Ok(image),
         Ok(Pfm::Gray(_)) => {
-            Err(IoError::reading(path, FormatError::unsupported(NAME, "one channel in the place of colour")))
+            Err(IoError::reading(path, FormatError::unsupported(NAME, "one channel in the place of color")))
         }
         Err(reason) => Err(IoError::reading(path, reason)),
     }
@@ -200,7 +200,7 @@ mod tests {
         #[test]
         fn what_is_written_is_read(w in 0usize..7, h in 0usize..7, values in prop::collection::vec(prop::num::f32::ANY, 147)) {
             let image = RgbF32::from_fn(w, h, |x, y| std::array::from_fn(|c| values[(y * w + x) * 3 + c]));
-            let Ok(Pfm::Rgb(back)) = decode(&bytes_of(image.view())) else { return Err(TestCaseError::fail("colour")) };
+            let Ok(Pfm::Rgb(back)) = decode(&bytes_of(image.view())) else { return Err(TestCaseError::fail("color")) };
             prop_assert_eq!(back.size(), image.size());
             for (a, b) in image.as_slice().iter().zip(back.as_slice()) {
                 prop_assert!(a == b || (!a.is_finite() && b.is_nan()), "{} {}", a, b);

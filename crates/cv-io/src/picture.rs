@@ -18,7 +18,7 @@ pub const DEFAULT_MAX_PIXELS: u64 = 256 << 20;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ReadOptions {
     /// The most pixels a picture may have; its header is checked before anything is allocated. Default
-    /// [`DEFAULT_MAX_PIXELS`], more than the sensor of any camera sold and 768 MiB as 8-bit colour.
+    /// [`DEFAULT_MAX_PIXELS`], more than the sensor of any camera sold and 768 MiB as 8-bit color.
     pub max_pixels: u64,
 }
 
@@ -67,7 +67,7 @@ impl DynImage {
         }
     }
 
-    /// As RGB bytes: 16 bits are rounded to 8, grey is repeated, linear light is clipped to 0 to 1 and sRGB-encoded.
+    /// As RGB bytes: 16 bits are rounded to 8, gray is repeated, linear light is clipped to 0 to 1 and sRGB-encoded.
     pub fn into_rgb8(self) -> RgbU8 {
         match self.pixels {
             Pixels::Rgb8(image) => image,
@@ -79,7 +79,7 @@ impl DynImage {
         }
     }
 
-    /// As grey bytes: as [`DynImage::into_rgb8`], then luma by Rec. 601 (`0.299 R + 0.587 G + 0.114 B`, OpenCV's
+    /// As gray bytes: as [`DynImage::into_rgb8`], then luma by Rec. 601 (`0.299 R + 0.587 G + 0.114 B`, OpenCV's
     /// fixed-point weights and rounding).
     pub fn into_gray8(self) -> GrayU8 {
         match self.pixels {
@@ -108,8 +108,8 @@ fn srgb_byte(v: f32) -> u8 {
 /// Decodes the bytes of a PNG, JPEG, TIFF, BMP, PNM, OpenEXR or Radiance HDR file.
 ///
 /// The format is told by the content. The EXIF orientation is applied. An alpha channel is dropped, as OpenCV and COLMAP do:
-/// the colours under it are returned as they are stored. Palettes are resolved; CMYK and YCCK JPEGs become RGB by
-/// plain inversion, without a colour profile. Embedded profiles are ignored.
+/// the colors under it are returned as they are stored. Palettes are resolved; CMYK and YCCK JPEGs become RGB by
+/// plain inversion, without a color profile. Embedded profiles are ignored.
 ///
 /// # Errors
 /// [`FormatError`]: not a picture, damaged, cut short, or more pixels than `options` allow.
@@ -237,7 +237,7 @@ pub fn read_rgb(path: impl AsRef<Path>) -> Result<RgbU8, IoError> {
     read_image(path).map(DynImage::into_rgb8)
 }
 
-/// Reads a picture as grey bytes; see [`DynImage::into_gray8`].
+/// Reads a picture as gray bytes; see [`DynImage::into_gray8`].
 ///
 /// # Errors
 /// As [`read_image`].
@@ -245,7 +245,7 @@ pub fn read_gray_u8(path: impl AsRef<Path>) -> Result<GrayU8, IoError> {
     read_image(path).map(DynImage::into_gray8)
 }
 
-/// Reads a mask: true where the grey value is above the middle (128 to 255).
+/// Reads a mask: true where the gray value is above the middle (128 to 255).
 ///
 /// # Errors
 /// As [`read_image`].

@@ -9,12 +9,12 @@ use crate::{FormatError, IoError, write_atomic};
 
 const NAME: &str = "PLY";
 
-/// What a PLY file holds here: points, maybe coloured, maybe with normals, and line segments between them.
+/// What a PLY file holds here: points, maybe colored, maybe with normals, and line segments between them.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Cloud {
     /// Positions in the unit of the scene.
     pub points: Vec<[f32; 3]>,
-    /// One RGB colour per point, or empty.
+    /// One RGB color per point, or empty.
     pub colors: Vec<[u8; 3]>,
     /// One unit normal per point, or empty.
     pub normals: Vec<[f32; 3]>,
@@ -25,7 +25,7 @@ pub struct Cloud {
 /// How the numbers are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum PlyEncoding {
-    /// Little-endian binary: 15 bytes a coloured point. What every viewer reads.
+    /// Little-endian binary: 15 bytes a colored point. What every viewer reads.
     #[default]
     Binary,
     /// Text, about 3 times as large.
@@ -38,14 +38,14 @@ impl Cloud {
         Self { points, ..Self::default() }
     }
 
-    /// Points with a colour each.
+    /// Points with a color each.
     pub fn colored(points: Vec<[f32; 3]>, colors: Vec<[u8; 3]>) -> Self {
         Self { points, colors, ..Self::default() }
     }
 
-    /// Adds points of one colour joined by `edges`, whose indices count from the first added point.
+    /// Adds points of one color joined by `edges`, whose indices count from the first added point.
     ///
-    /// A cloud of points without colours stays without; normals, where there are some, are zero for the added points.
+    /// A cloud of points without colors stays without; normals, where there are some, are zero for the added points.
     pub fn add_wireframe(&mut self, corners: &[[f32; 3]], edges: &[[u32; 2]], color: [u8; 3]) {
         let first = self.points.len() as u32;
         let colored = self.points.is_empty() || !self.colors.is_empty();
@@ -60,7 +60,7 @@ impl Cloud {
         self.edges.extend(edges.iter().map(|e| e.map(|i| i + first)));
     }
 
-    /// Adds a camera's outline: its centre, and the corners of its picture `depth` in front of it.
+    /// Adds a camera's outline: its center, and the corners of its picture `depth` in front of it.
     pub fn add_camera(&mut self, camera: &Camera, pose: &Pose, depth: f64, color: [u8; 3]) {
         let (right, bottom) = (camera.width as f64 - 0.5, camera.height as f64 - 0.5);
         let to_world = pose.inverse();
@@ -79,7 +79,7 @@ impl Cloud {
         let n = self.points.len();
         let wrong = |what: String| Err(FormatError::NotRepresentable { format: NAME, what });
         if !self.colors.is_empty() && self.colors.len() != n {
-            return wrong(format!("{} colours for {n} points", self.colors.len()));
+            return wrong(format!("{} colors for {n} points", self.colors.len()));
         }
         if !self.normals.is_empty() && self.normals.len() != n {
             return wrong(format!("{} normals for {n} points", self.normals.len()));
@@ -94,7 +94,7 @@ impl Cloud {
 /// Encodes a cloud.
 ///
 /// # Errors
-/// [`FormatError::NotRepresentable`] where colours or normals are not as many as points, or an edge leads nowhere.
+/// [`FormatError::NotRepresentable`] where colors or normals are not as many as points, or an edge leads nowhere.
 pub fn encode(cloud: &Cloud, encoding: PlyEncoding, sink: &mut dyn Write) -> Result<(), FormatError> {
     cloud.check()?;
     let format = match encoding {

@@ -95,7 +95,7 @@ pub(crate) fn plausible(format: ImageFormat, bytes: &[u8], width: u64, height: u
 
 /// True where the markers of a JPEG lead to its end-of-image marker.
 ///
-/// The decoder fills what is missing with grey and says nothing.
+/// The decoder fills what is missing with gray and says nothing.
 fn jpeg_has_end(bytes: &[u8]) -> bool {
     // Inside the coded data this pair cannot occur.
     if bytes.ends_with(&[0xff, 0xd9]) {

@@ -69,7 +69,7 @@ pub trait LeastSquares {
 /// When [`levenberg_marquardt`] stops, and how it starts.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LmOptions {
-    /// Most linearisations. Default 25, where two-view problems have long converged.
+    /// Most linearizations. Default 25, where two-view problems have long converged.
     pub max_iterations: usize,
     /// Initial damping relative to the diagonal. Default 1e-3 (Marquardt 1963).
     pub initial_damping: f64,
@@ -94,16 +94,16 @@ pub struct LmReport<P> {
     pub initial_cost: f64,
     /// Cost of `params`, never above `initial_cost`.
     pub cost: f64,
-    /// Number of linearisations.
+    /// Number of linearizations.
     pub iterations: usize,
     /// True where a tolerance was met; false where the iterations ran out or no step could be taken.
     pub converged: bool,
 }
 
-/// Minimises `problem` from `initial` by Levenberg–Marquardt with Marquardt's diagonal scaling.
+/// Minimizes `problem` from `initial` by Levenberg–Marquardt with Marquardt's diagonal scaling.
 ///
 /// The result is never worse than the start. A start with a NaN cost is returned as it is.
-/// Each iteration costs one linearisation and one Cholesky factorisation of the Hessian, O(dim³).
+/// Each iteration costs one linearization and one Cholesky factorisation of the Hessian, O(dim³).
 pub fn levenberg_marquardt<T: LeastSquares>(problem: &T, initial: T::Params, options: &LmOptions) -> LmReport<T::Params>
 where
     DefaultAllocator: Allocator<T::Dim, T::Dim> + Allocator<T::Dim>,

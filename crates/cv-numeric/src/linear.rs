@@ -20,7 +20,7 @@ pub enum LinearError {
     NotPositiveDefinite,
 }
 
-/// The unit vector `v` that minimises `‖A v‖`: the right singular vector of the smallest singular value.
+/// The unit vector `v` that minimizes `‖A v‖`: the right singular vector of the smallest singular value.
 ///
 /// `A` is any m×n matrix with n ≥ 1, also with m < n. O(m n²).
 ///
@@ -101,7 +101,7 @@ pub fn symmetric_eigen<const N: usize>(m: &SMatrix<f64, N, N>) -> (SVector<f64, 
     (values, vectors)
 }
 
-/// The unit vector `v` that minimises `vᵀ M v` for a symmetric positive semi-definite `M` of fixed size, such as `AᵀA`.
+/// The unit vector `v` that minimizes `vᵀ M v` for a symmetric positive semi-definite `M` of fixed size, such as `AᵀA`.
 ///
 /// Only the lower triangle is read. Inverse iteration on a Cholesky factor, which takes a few hundred nanoseconds
 /// at 9×9, and [`symmetric_eigen`] where that does not settle (the two smallest eigenvalues nearly equal).

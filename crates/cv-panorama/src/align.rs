@@ -46,7 +46,7 @@ pub enum CameraMotion {
     /// [`Rotation`](Self::Rotation), unless [`Homography`](Self::Homography) explains the matches far better.
     #[default]
     Auto,
-    /// The camera turned about its centre: the panorama proper.
+    /// The camera turned about its center: the panorama proper.
     Rotation,
     /// The scene is flat (a wall, a page, the ground from above) and the camera moved anyhow.
     Homography,

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 /// What a photograph's matrix may be.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Motion {
-    /// The camera turned about its centre.
+    /// The camera turned about its center.
     Rotation,
     /// The scene is flat, the camera moved.
     Homography,
@@ -46,7 +46,7 @@ pub(crate) struct Overlap {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Lens {
     pub(crate) log_focal: f64,
-    /// Coefficient of r² in normalised coordinates.
+    /// Coefficient of r² in normalized coordinates.
     pub(crate) k1: f64,
 }
 
@@ -256,7 +256,7 @@ impl Problem<'_> {
             .sum()
     }
 
-    /// Minimises the reprojection error from `start`.
+    /// Minimizes the reprojection error from `start`.
     pub(crate) fn solve(&self, start: State, max_iterations: usize) -> (State, f64) {
         let options = LmOptions { max_iterations, cost_tolerance: 1e-7, ..LmOptions::default() };
         let report = levenberg_marquardt(self, start, &options);

@@ -1,4 +1,4 @@
-//! Normalised cross-correlation of a small square patch with all places of a window around where it is expected.
+//! Normalized cross-correlation of a small square patch with all places of a window around where it is expected.
 
 use fearless_simd::{Level, dispatch};
 
@@ -14,16 +14,16 @@ pub(crate) const PAD: usize = LANES - PLACES;
 /// A patch to look for: less its mean, row by row.
 pub(crate) struct Template {
     side: usize,
-    centred: Vec<f32>,
+    centered: Vec<f32>,
     energy: f32,
 }
 
 impl Template {
     pub(crate) fn new(side: usize, patch: &[f32]) -> Self {
         let mean = patch.iter().sum::<f32>() / patch.len() as f32;
-        let centred: Vec<f32> = patch.iter().map(|v| v - mean).collect();
-        let energy = centred.iter().map(|v| v * v).sum();
-        Self { side, centred, energy }
+        let centered: Vec<f32> = patch.iter().map(|v| v - mean).collect();
+        let energy = centered.iter().map(|v| v * v).sum();
+        Self { side, centered, energy }
     }
 
     /// Sum of the squares about the mean.
@@ -34,14 +34,14 @@ impl Template {
     /// The correlation with one place, given by its rows: −1 to 1; NaN where they are.
     pub(crate) fn score<'a>(&self, rows: impl Iterator<Item = &'a [f32]>) -> f32 {
         let (mut sum, mut squares, mut product) = (0.0_f32, 0.0_f32, 0.0_f32);
-        for (ours, theirs) in self.centred.chunks_exact(self.side).zip(rows) {
+        for (ours, theirs) in self.centered.chunks_exact(self.side).zip(rows) {
             for (a, b) in ours.iter().zip(theirs) {
                 sum += b;
                 squares += b * b;
                 product += a * b;
             }
         }
-        self.normalised(sum, squares, product)
+        self.normalized(sum, squares, product)
     }
 
     /// The correlations with all places of a window of `side + 2 REACH` on a side, followed by [`PAD`] numbers: row by row, the same as [`Self::score`] of
@@ -57,7 +57,7 @@ impl Template {
         let mut scores = [0.0; PLACES * PLACES];
         for (dy, out) in scores.chunks_exact_mut(PLACES).enumerate() {
             let (mut sum, mut squares, mut product) = ([0.0_f32; LANES], [0.0_f32; LANES], [0.0_f32; LANES]);
-            for (r, ours) in self.centred.chunks_exact(self.side).enumerate() {
+            for (r, ours) in self.centered.chunks_exact(self.side).enumerate() {
                 let row = &window[(r + dy) * wide..][..self.side - 1 + LANES];
                 for (a, theirs) in ours.iter().zip(row.windows(LANES)) {
                     for k in 0..LANES {
@@ -68,16 +68,16 @@ impl Template {
                 }
             }
             for (k, out) in out.iter_mut().enumerate() {
-                *out = self.normalised(sum[k], squares[k], product[k]);
+                *out = self.normalized(sum[k], squares[k], product[k]);
             }
         }
         scores
     }
 
     #[inline(always)]
-    fn normalised(&self, sum: f32, squares: f32, product: f32) -> f32 {
-        // Grey levels: below a thousandth there is nothing to compare, only rounding. (A NaN passes by way of the product.)
-        product / (self.energy * (squares - sum * sum / self.centred.len() as f32).max(1e-3)).sqrt()
+    fn normalized(&self, sum: f32, squares: f32, product: f32) -> f32 {
+        // Gray levels: below a thousandth there is nothing to compare, only rounding. (A NaN passes by way of the product.)
+        product / (self.energy * (squares - sum * sum / self.centered.len() as f32).max(1e-3)).sqrt()
     }
 }
 

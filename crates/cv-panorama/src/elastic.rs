@@ -154,7 +154,7 @@ struct Tie {
 
 /// Grid cells along the side of a photograph.
 const CELLS: f64 = 24.0;
-/// Weight of a difference between neighbouring vertices against a match.
+/// Weight of a difference between neighboring vertices against a match.
 const SMOOTH: f64 = 0.15;
 /// Weight of a displacement itself: what one place asks for fades out over √(SMOOTH / STAY) = 5 cells, a fifth of a photograph.
 const STAY: f64 = 0.006;
@@ -174,11 +174,11 @@ pub(crate) fn fields(photos: &[ImageView<'_, u8, 3>], layout: &Layout, alignment
     // Feature positions are good to a pixel or so of the photographs they were found on, patches to a fraction.
     solve(&mut fields, &ties, 3.0);
     let features = ties.len();
-    let greys: Vec<GrayU8> = photos.par_iter().map(|p| cv_imgproc::rgb_to_gray(*p)).collect();
+    let grays: Vec<GrayU8> = photos.par_iter().map(|p| cv_imgproc::rgb_to_gray(*p)).collect();
     // Twice: what the first round brings within reach, the second registers.
     for _ in 0..2 {
         ties.truncate(features);
-        ties.extend(patch_ties(&greys, layout, &fields, spacing));
+        ties.extend(patch_ties(&grays, layout, &fields, spacing));
         solve(&mut fields, &ties, 3.0);
     }
     for (field, placement) in fields.iter_mut().zip(&layout.placements) {
@@ -362,7 +362,7 @@ fn patch_ties(photos: &[GrayU8], layout: &Layout, fields: &[Field], spacing: f64
         .map(|&(p, q, c)| {
             let first = patch(photos, layout, &fields[p], p, c, HALF)?;
             let least = corner_strength(&first);
-            // Texture in both directions of two and a half grey levels a pixel: below that noise decides where the best place is.
+            // Texture in both directions of two and a half gray levels a pixel: below that noise decides where the best place is.
             if least < 6.0 {
                 return None;
             }
@@ -433,7 +433,7 @@ fn corner_strength(patch: &[f32]) -> f32 {
     (0.5 * (xx + yy) - (0.25 * (xx - yy) * (xx - yy) + xy * xy).sqrt()) / n
 }
 
-/// How far the content of `first` lies from the middle of the larger `second`, by normalised correlation with a parabola at its peak; `None` where nothing is
+/// How far the content of `first` lies from the middle of the larger `second`, by normalized correlation with a parabola at its peak; `None` where nothing is
 /// alike, or two places are.
 fn register(first: &[f32], mut second: Vec<f32>) -> Option<Vector2<f64>> {
     second.resize(second.len() + PAD, 0.0);

@@ -1,7 +1,7 @@
-//! Brightness and colour differences between photographs (after Brown & Lowe 2007, §6, and Goldman & Chen 2005).
+//! Brightness and color differences between photographs (after Brown & Lowe 2007, §6, and Goldman & Chen 2005).
 //!
 //! Where photographs overlap they saw the same light, so `log I_a + g_a + v(r_a) = log I_b + g_b + v(r_b)`, with a gain `g` per photograph
-//! and channel and one fall-off of brightness towards the corners, `v(r) = v₁ r² + v₂ r⁴`. In logarithms that is linear.
+//! and channel and one fall-off of brightness toward the corners, `v(r) = v₁ r² + v₂ r⁴`. In logarithms that is linear.
 
 use crate::preview::Preview;
 use nalgebra::{DMatrix, DVector};
@@ -14,7 +14,7 @@ pub enum Exposure {
     /// One factor per photograph and channel: exposure and white balance.
     #[default]
     Gain,
-    /// The same, and the fall-off of the lens towards the corners.
+    /// The same, and the fall-off of the lens toward the corners.
     GainAndVignetting,
 }
 
@@ -194,7 +194,7 @@ mod tests {
     use crate::warp::Warped;
     use cv_core::Image;
 
-    /// Three photographs of 60 x 40, 30 apart, of one scene, darkened by known factors and towards their corners.
+    /// Three photographs of 60 x 40, 30 apart, of one scene, darkened by known factors and toward their corners.
     fn preview(factors: &[[f64; 3]; 3], fall_off: f64, moved: bool) -> Preview {
         let scene = |x: usize, y: usize, c: usize| {
             60.0 + 100.0 * (0.5 + 0.5 * ((x * (c + 2)) as f64 * 0.07).sin() * (y as f64 * 0.11).cos())
@@ -238,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn the_fall_off_towards_the_corners_is_found() {
+    fn the_fall_off_toward_the_corners_is_found() {
         let found = estimate(&preview(&[[1.0; 3]; 3], 0.4, false), &[0, 1, 2], 3, Exposure::GainAndVignetting);
         let v = |r2: f32| r2 * (found.vignetting[0] + r2 * found.vignetting[1]);
         // Rounding to bytes again, now through differences of r² of up to 0.7.

@@ -64,16 +64,16 @@ pub(crate) struct Step {
 
 /// Breadth-first walk over the tree's edges from `root`.
 pub(crate) fn walk(n: usize, edges: &[Edge], tree: &[usize], root: usize) -> Vec<Step> {
-    let mut neighbours: Vec<Vec<(usize, usize)>> = vec![Vec::new(); n];
+    let mut neighbors: Vec<Vec<(usize, usize)>> = vec![Vec::new(); n];
     for &e in tree {
-        neighbours[edges[e].a].push((edges[e].b, e));
-        neighbours[edges[e].b].push((edges[e].a, e));
+        neighbors[edges[e].a].push((edges[e].b, e));
+        neighbors[edges[e].b].push((edges[e].a, e));
     }
     let mut seen = vec![false; n];
     seen[root] = true;
     let (mut steps, mut queue) = (Vec::new(), std::collections::VecDeque::from([root]));
     while let Some(parent) = queue.pop_front() {
-        for &(node, edge) in &neighbours[parent] {
+        for &(node, edge) in &neighbors[parent] {
             if !std::mem::replace(&mut seen[node], true) {
                 steps.push(Step { parent, node, edge });
                 queue.push_back(node);

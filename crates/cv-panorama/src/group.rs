@@ -17,7 +17,7 @@ pub(crate) struct Group<'a> {
     members: Vec<usize>,
     photos: Vec<Photo>,
     pub(crate) pairs: Vec<&'a VerifiedPair>,
-    /// Of `pairs`, in members' indices and centred pixels.
+    /// Of `pairs`, in members' indices and centered pixels.
     overlaps: Vec<Overlap>,
     edges: Vec<Edge>,
     tree: Vec<usize>,
@@ -25,8 +25,8 @@ pub(crate) struct Group<'a> {
     groups: Vec<Vec<usize>>,
 }
 
-/// Pixel centre of a photograph's middle, or its camera's principal point.
-fn centre(p: &Photo) -> Vector2<f64> {
+/// Pixel center of a photograph's middle, or its camera's principal point.
+fn center(p: &Photo) -> Vector2<f64> {
     match p.camera {
         Some(c) => Vector2::new(c.cx, c.cy),
         None => Vector2::new((p.width as f64 - 1.0) / 2.0, (p.height as f64 - 1.0) / 2.0),
@@ -37,7 +37,7 @@ fn centre(p: &Photo) -> Vector2<f64> {
 fn ideal(p: &Photo, pixel: Point2<f64>) -> Vector2<f64> {
     match p.camera {
         Some(c) => c.normalize(pixel).coords * c.fx,
-        None => pixel.coords - centre(p),
+        None => pixel.coords - center(p),
     }
 }
 
@@ -86,11 +86,11 @@ impl<'a> Group<'a> {
         (of, heads)
     }
 
-    /// The homography of an edge from member `from`, in centred pixels.
+    /// The homography of an edge from member `from`, in centered pixels.
     fn homography(&self, edge: usize, from: usize) -> Matrix3<f64> {
         let (pair, e) = (self.pairs[edge], self.edges[edge]);
         let shift = |v: Vector2<f64>| Matrix3::new(1.0, 0.0, v.x, 0.0, 1.0, v.y, 0.0, 0.0, 1.0);
-        let h = shift(-centre(&self.photos[e.b])) * pair.homography * shift(centre(&self.photos[e.a]));
+        let h = shift(-center(&self.photos[e.b])) * pair.homography * shift(center(&self.photos[e.a]));
         if from == e.a { h } else { h.try_inverse().unwrap_or_else(Matrix3::identity) }
     }
 

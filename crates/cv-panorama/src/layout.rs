@@ -247,7 +247,7 @@ fn on_surface(views: &[(usize, View)], surface: Surface, flat: bool, max_pixels:
     };
     let mut frame = Matrix3::identity();
     // The middle of the panorama goes to the Z axis.
-    let mut recentred = |m: Matrix3<f64>| -> Vec<(usize, View)> {
+    let mut recentered = |m: Matrix3<f64>| -> Vec<(usize, View)> {
         frame = m;
         views.iter().map(|&(i, v)| (i, View { from_world: v.from_world * m.transpose(), ..v })).collect()
     };
@@ -270,7 +270,7 @@ fn on_surface(views: &[(usize, View)], surface: Surface, flat: bool, max_pixels:
             } else {
                 Matrix3::identity()
             };
-            recentred(tilt * level)
+            recentered(tilt * level)
         }
         Some(period) => {
             let outlines: Option<Vec<Outline>> = views.iter().map(|(_, v)| outline(v, &surface)).collect();
@@ -278,7 +278,7 @@ fn on_surface(views: &[(usize, View)], surface: Surface, flat: bool, max_pixels:
             let (gap, middle) = largest_gap(&outlines, period);
             full_circle = gap < 1.0;
             // Around the whole horizon the middle stays where the views' own middle is.
-            if full_circle { views.to_vec() } else { recentred(turn(middle / surface.scale + PI)) }
+            if full_circle { views.to_vec() } else { recentered(turn(middle / surface.scale + PI)) }
         }
     };
     let outlines: Option<Vec<Outline>> = views.iter().map(|(_, v)| outline(v, &surface)).collect();

@@ -1,6 +1,6 @@
 //! Minimum cuts of four-connected pixel grids (Boykov & Kolmogorov 2004).
 
-/// Steps to the neighbours: right, left, down, up. Opposite directions differ in the last bit.
+/// Steps to the neighbors: right, left, down, up. Opposite directions differ in the last bit.
 const RIGHT: usize = 0;
 const DOWN: usize = 2;
 
@@ -13,7 +13,7 @@ const TERMINAL: u8 = 4;
 /// `parent` of a node that lost its way to a terminal.
 const ORPHAN: u8 = 5;
 
-/// All of a node beside each other: a step to a neighbour touches half a cache line.
+/// All of a node beside each other: a step to a neighbor touches half a cache line.
 #[derive(Clone, Copy)]
 struct Node {
     /// Residual capacity of the four outgoing arcs.
@@ -27,7 +27,7 @@ struct Node {
     is_active: bool,
 }
 
-/// A graph of `width × height` nodes with edges between four-neighbours and to two terminals.
+/// A graph of `width × height` nodes with edges between four-neighbors and to two terminals.
 ///
 /// Nodes that carry no capacity cost nothing, so that a region of any shape is cut in its bounding box.
 pub(crate) struct GridCut {
@@ -62,7 +62,7 @@ impl GridCut {
         (y + 1) * self.stride + x + 1
     }
 
-    fn neighbour(&self, node: usize, direction: usize) -> usize {
+    fn neighbor(&self, node: usize, direction: usize) -> usize {
         match direction {
             0 => node + 1,
             1 => node - 1,
@@ -77,19 +77,19 @@ impl GridCut {
         self.nodes[node].terminal += source - sink;
     }
 
-    /// Adds capacities between a pixel and its right neighbour: paid where this one is on the source's side and that one on the
+    /// Adds capacities between a pixel and its right neighbor: paid where this one is on the source's side and that one on the
     /// sink's, and the other way round.
     pub(crate) fn add_right(&mut self, x: usize, y: usize, forward: i32, backward: i32) {
         self.add_edge(self.node(x, y), RIGHT, forward, backward);
     }
 
-    /// As [`Self::add_right`], for the neighbour below.
+    /// As [`Self::add_right`], for the neighbor below.
     pub(crate) fn add_down(&mut self, x: usize, y: usize, forward: i32, backward: i32) {
         self.add_edge(self.node(x, y), DOWN, forward, backward);
     }
 
     fn add_edge(&mut self, node: usize, direction: usize, forward: i32, backward: i32) {
-        let other = self.neighbour(node, direction);
+        let other = self.neighbor(node, direction);
         self.nodes[node].capacity[direction] += forward;
         self.nodes[other].capacity[direction ^ 1] += backward;
     }
@@ -131,7 +131,7 @@ impl GridCut {
         }
     }
 
-    /// Whether flow can still pass along the tree edge between a node and its neighbour towards the leaves of that tree.
+    /// Whether flow can still pass along the tree edge between a node and its neighbor toward the leaves of that tree.
     fn open(&self, tree: u8, node: usize, direction: usize, other: usize) -> bool {
         if tree == SOURCE {
             self.nodes[node].capacity[direction] > 0
@@ -140,11 +140,11 @@ impl GridCut {
         }
     }
 
-    /// Lets the node's tree take its free neighbours; returns an arc from the source's tree to the sink's where they touch.
+    /// Lets the node's tree take its free neighbors; returns an arc from the source's tree to the sink's where they touch.
     fn grow(&mut self, node: usize) -> Option<(usize, usize)> {
         let tree = self.nodes[node].tree;
         for direction in 0..4 {
-            let other = self.neighbour(node, direction);
+            let other = self.neighbor(node, direction);
             if !self.open(tree, node, direction, other) {
                 continue;
             }
@@ -169,12 +169,12 @@ impl GridCut {
     }
 
     fn augment(&mut self, s: usize, direction: usize) {
-        let t = self.neighbour(s, direction);
+        let t = self.neighbor(s, direction);
         let mut flow = self.nodes[s].capacity[direction];
         let mut node = s;
         while self.nodes[node].parent != TERMINAL {
             let d = self.nodes[node].parent as usize;
-            let up = self.neighbour(node, d);
+            let up = self.neighbor(node, d);
             flow = flow.min(self.nodes[up].capacity[d ^ 1]);
             node = up;
         }
@@ -183,7 +183,7 @@ impl GridCut {
         while self.nodes[node].parent != TERMINAL {
             let d = self.nodes[node].parent as usize;
             flow = flow.min(self.nodes[node].capacity[d]);
-            node = self.neighbour(node, d);
+            node = self.neighbor(node, d);
         }
         flow = flow.min(-self.nodes[node].terminal);
 
@@ -192,7 +192,7 @@ impl GridCut {
         node = s;
         while self.nodes[node].parent != TERMINAL {
             let d = self.nodes[node].parent as usize;
-            let up = self.neighbour(node, d);
+            let up = self.neighbor(node, d);
             self.nodes[node].capacity[d] += flow;
             self.nodes[up].capacity[d ^ 1] -= flow;
             if self.nodes[up].capacity[d ^ 1] == 0 {
@@ -207,7 +207,7 @@ impl GridCut {
         node = t;
         while self.nodes[node].parent != TERMINAL {
             let d = self.nodes[node].parent as usize;
-            let up = self.neighbour(node, d);
+            let up = self.neighbor(node, d);
             self.nodes[up].capacity[d ^ 1] += flow;
             self.nodes[node].capacity[d] -= flow;
             if self.nodes[node].capacity[d] == 0 {
@@ -230,7 +230,7 @@ impl GridCut {
         let tree = self.nodes[node].tree;
         let mut best: Option<(u32, usize)> = None;
         for direction in 0..4 {
-            let other = self.neighbour(node, direction);
+            let other = self.neighbor(node, direction);
             // Flow runs from the other node to this one in the source's tree, the other way in the sink's.
             let open = if tree == SOURCE {
                 self.nodes[other].capacity[direction ^ 1] > 0
@@ -254,7 +254,7 @@ impl GridCut {
         }
         self.nodes[node].tree = FREE;
         for direction in 0..4 {
-            let other = self.neighbour(node, direction);
+            let other = self.neighbor(node, direction);
             if self.nodes[other].tree != tree {
                 continue;
             }
@@ -288,7 +288,7 @@ impl GridCut {
                 ORPHAN => return None,
                 direction => {
                     steps += 1;
-                    node = self.neighbour(node, usize::from(direction));
+                    node = self.neighbor(node, usize::from(direction));
                 }
             }
         };
@@ -297,7 +297,7 @@ impl GridCut {
             self.nodes[node].time = self.clock;
             self.nodes[node].distance = distance;
             distance -= 1;
-            node = self.neighbour(node, usize::from(self.nodes[node].parent));
+            node = self.neighbor(node, usize::from(self.nodes[node].parent));
         }
         Some(total)
     }
@@ -308,7 +308,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// Cost of a labelling (bit set: source side).
+    /// Cost of a labeling (bit set: source side).
     #[derive(Debug)]
     struct Plain {
         w: usize,
@@ -378,7 +378,7 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(600))]
         #[test]
-        fn no_labelling_costs_less_than_the_cut(p in problem()) {
+        fn no_labeling_costs_less_than_the_cut(p in problem()) {
             let cut = p.cut();
             let found = p.cost(|x, y| !cut.on_sink_side(x, y));
             let least = (0..1_u32 << (p.w * p.h)).map(|bits| p.cost(|x, y| bits >> (y * p.w + x) & 1 == 1)).min().unwrap();

@@ -1,5 +1,5 @@
 //! Where two photographs show the same thing at different places of the preview: near things against far ones, where no deformation is smooth enough
-//! to bring both together. A seam there cuts things in two however little the colours on it differ.
+//! to bring both together. A seam there cuts things in two however little the colors on it differ.
 
 use crate::correlation::{PAD, PLACES, REACH, Template};
 use crate::preview::{Piece, Preview};
@@ -10,7 +10,7 @@ use rayon::prelude::*;
 const HALF: usize = 4;
 /// Preview pixels between places looked at.
 const STEP: usize = 3;
-/// Least root mean square contrast of a patch, in grey levels: below it, what is cut in two is not seen.
+/// Least root mean square contrast of a patch, in gray levels: below it, what is cut in two is not seen.
 const CONTRAST: f32 = 4.0;
 /// Correlation at which two patches show the same thing.
 const ALIKE: f32 = 0.85;
@@ -83,7 +83,7 @@ fn compare(preview: &Preview, lumas: &[GrayF32], a: usize, b: usize) -> Option<P
     Some(Pair { left: common.left, top: common.top, columns, rows, pixels })
 }
 
-/// Places too near a border to be compared take the worst of their neighbours: a seam along the border cuts what those show. The others stay as they are.
+/// Places too near a border to be compared take the worst of their neighbors: a seam along the border cuts what those show. The others stay as they are.
 fn spread(pixels: &mut [f32], columns: usize) {
     // From the border to where a whole patch fits it is this many places.
     for _ in 0..HALF.div_ceil(STEP) + 1 {
@@ -181,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn places_at_the_border_take_the_worst_of_their_neighbours() {
+    fn places_at_the_border_take_the_worst_of_their_neighbors() {
         let nan = f32::NAN;
         let mut pixels = vec![nan, nan, nan, nan, nan, 2.0, 5.0, nan, nan, 1.0, 0.0, nan];
         spread(&mut pixels, 4);

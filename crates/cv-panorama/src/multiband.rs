@@ -1,7 +1,7 @@
 //! Multi-band blending (Burt & Adelson 1983): low frequencies over a wide transition, high ones over a narrow one.
 //!
 //! Pixels are `[red, green, blue, weight]`, one vector register each. A piece's weight is one where the labels name it and zero
-//! elsewhere; its pyramid is blurred and halved along with the colours. Outside a photograph its edge pixels are repeated (see `warp`), so no
+//! elsewhere; its pyramid is blurred and halved along with the colors. Outside a photograph its edge pixels are repeated (see `warp`), so no
 //! band knows of a border and nothing dark bleeds in.
 
 use crate::layout::Bounds;

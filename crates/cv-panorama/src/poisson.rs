@@ -2,7 +2,7 @@
 //!
 //! The picture's gradients are those of the photograph each pixel is from; across a seam, the mean of the two photographs' gradients there. What is solved
 //! for is the correction to the hard-seamed picture: it jumps by the mismatch at the seams and is as smooth as can be elsewhere. Nothing is asked of it
-//! at the border of the picture (Neumann), so nothing bleeds in from there; its mean is zero, so the colours stay where they are on average.
+//! at the border of the picture (Neumann), so nothing bleeds in from there; its mean is zero, so the colors stay where they are on average.
 
 use crate::seams::{Labels, NONE};
 use crate::warp::Warped;
@@ -11,7 +11,7 @@ use rayon::prelude::*;
 
 type Pixel = [f32; 4];
 
-/// Pull of the correction towards zero, relative to a pixel's own edges. It
+/// Pull of the correction toward zero, relative to a pixel's own edges. It
 /// is felt over 1/√λ = 1000 pixels: differences that would drift through a long panorama fade out instead.
 const SCREEN: f32 = 1e-6;
 /// Damping of the Jacobi smoother, best for the five-point Laplacian (Trottenberg, Multigrid, §2.1).
@@ -98,7 +98,7 @@ impl Grid {
             down: vec![0.0; w * h],
             screen: SCREEN,
         };
-        let colour = |label: u16, x: usize, y: usize| -> Option<[f32; 3]> {
+        let color = |label: u16, x: usize, y: usize| -> Option<[f32; 3]> {
             let p = pieces.get(usize::from(label))?.as_ref()?;
             let b = p.bounds;
             let inside = x >= b.left && y >= b.top && x < b.right && y < b.bottom;
@@ -122,8 +122,8 @@ impl Grid {
                     if own == other {
                         continue;
                     }
-                    let (Some(p), Some(q)) = (colour(own, x, y), colour(other, nx, ny)) else { continue };
-                    let (p2, q2) = (colour(other, x, y), colour(own, nx, ny));
+                    let (Some(p), Some(q)) = (color(own, x, y), color(other, nx, ny)) else { continue };
+                    let (p2, q2) = (color(other, x, y), color(own, nx, ny));
                     for c in 0..3 {
                         // The photographs' own steps over this edge; nothing where neither reaches over it.
                         let steps = [q2.map(|q2| p[c] - q2[c]), p2.map(|p2| p2[c] - q[c])];
@@ -183,7 +183,7 @@ impl Grid {
         coarse
     }
 
-    /// Calls `f` for every pixel with the sum of its edges, the weighted sum of its neighbours, and its index, and stores what it returns.
+    /// Calls `f` for every pixel with the sum of its edges, the weighted sum of its neighbors, and its index, and stores what it returns.
     fn stencil(&self, out: &mut [Pixel], f: impl Fn(usize, f32, Pixel) -> Pixel + Sync) {
         let (w, h) = (self.width, self.height);
         out.par_chunks_mut(w.max(1)).enumerate().for_each(|(y, row)| {

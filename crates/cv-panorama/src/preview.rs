@@ -52,7 +52,7 @@ impl Piece {
         }
     }
 
-    /// Colour at a preview pixel; `None` where the photograph does not reach.
+    /// Color at a preview pixel; `None` where the photograph does not reach.
     #[inline]
     pub(crate) fn at(&self, x: usize, y: usize) -> Option<[u8; 3]> {
         let b = self.warped.bounds;
@@ -91,7 +91,7 @@ impl Preview {
             .enumerate()
             .filter_map(|(k, p)| {
                 let photo = small.get(p.photo)?.as_ref()?;
-                // Pixel centres at integers: the middle of a step × step block of canvas pixels.
+                // Pixel centers at integers: the middle of a step × step block of canvas pixels.
                 let origin = p.origin.coords * s - nalgebra::Vector2::repeat(0.5 * s - 0.5);
                 let bounds = Bounds {
                     left: p.bounds.left / step,

@@ -38,7 +38,7 @@ pub struct RenderOptions {
     pub projection: Projection,
     /// Size of the panorama relative to the photographs: 1 draws the middle of a photograph of median focal length pixel for pixel. Above 0; default 1.
     pub resolution: f64,
-    /// Deform photographs slightly and smoothly so that they meet where the camera did not turn about its centre. Default true.
+    /// Deform photographs slightly and smoothly so that they meet where the camera did not turn about its center. Default true.
     pub elastic: bool,
     /// Exposure compensation. Default [`Exposure::Gain`].
     pub exposure: Exposure,

@@ -1,7 +1,7 @@
 //! Which photograph each canvas pixel is taken from: minimal cuts through the overlaps (Kwatra et al. 2003; Agarwala et al. 2004).
 //!
-//! A labelling costs, between neighbours `p` and `q` taken from photographs `a` and `b`, how much the two differ at both places, in colour
-//! and in gradient: a seam runs where they show the same, around what moved. Alpha expansion (Boykov, Veksler & Zabih 2001) finds a labelling
+//! A labeling costs, between neighbors `p` and `q` taken from photographs `a` and `b`, how much the two differ at both places, in color
+//! and in gradient: a seam runs where they show the same, around what moved. Alpha expansion (Boykov, Veksler & Zabih 2001) finds a labeling
 //! that no single photograph can improve by taking over pixels.
 
 use crate::layout::Bounds;
@@ -27,7 +27,7 @@ pub(crate) const NONE: u16 = u16::MAX;
 /// A photograph piece with brightness evened out, for comparing.
 pub(crate) struct Toned<'a> {
     warped: &'a Warped,
-    /// Values after the gain, per channel, in quarters of a grey level.
+    /// Values after the gain, per channel, in quarters of a gray level.
     tables: [[i16; 256]; 3],
 }
 
@@ -49,7 +49,7 @@ impl<'a> Toned<'a> {
     }
 }
 
-/// Cost of a seam through a pixel that only one of the two photographs shows, in the unit of [`difference`]: a difference of 15 grey levels
+/// Cost of a seam through a pixel that only one of the two photographs shows, in the unit of [`difference`]: a difference of 15 gray levels
 /// in every channel. Such seams follow the border of a photograph.
 const BORDER: i32 = 4 * 45;
 /// Cost of every step of a seam: between equals the shorter.
@@ -58,27 +58,27 @@ const STEP: i32 = 4 * 3;
 /// the photographs agree.
 const BORDER_PIXEL: f32 = 4.0;
 
-/// Cost of a seam through a pixel where the photographs disagree by a canvas pixel more than one, beyond the difference of colours: 15 grey levels in
+/// Cost of a seam through a pixel where the photographs disagree by a canvas pixel more than one, beyond the difference of colors: 15 gray levels in
 /// one channel.
 const MISALIGNED: f32 = 4.0 * 15.0;
-/// Canvas pixels of misalignment, beyond the first, after which nothing looks worse and the colours decide alone: then it costs as much as the border of a
+/// Canvas pixels of misalignment, beyond the first, after which nothing looks worse and the colors decide alone: then it costs as much as the border of a
 /// photograph.
 const FARTHEST: f32 = 3.0;
 
-/// How much two photographs differ at a pixel: sum over channels of the absolute difference, in quarters of a grey level, and the same of the
+/// How much two photographs differ at a pixel: sum over channels of the absolute difference, in quarters of a gray level, and the same of the
 /// gradients of brightness.
 fn difference(a: &Option<Toned<'_>>, b: &Option<Toned<'_>>, x: usize, y: usize) -> i32 {
     let (Some(a), Some(b)) = (a, b) else { return BORDER };
     let (Some(p), Some(q)) = (a.at(x, y), b.at(x, y)) else { return BORDER };
     let d: [i32; 3] = std::array::from_fn(|c| p[c] - q[c]);
-    let colour: i32 = d.iter().map(|d| d.abs()).sum();
+    let color: i32 = d.iter().map(|d| d.abs()).sum();
     let sum = |d: [i32; 3]| d[0] + d[1] + d[2];
     // The difference of gradients is the gradient of the difference.
     let gradient = |x: usize, y: usize| match (a.at(x, y), b.at(x, y)) {
         (Some(p), Some(q)) => (sum(d) - sum(std::array::from_fn(|c| p[c] - q[c]))).abs(),
         _ => 0,
     };
-    colour + gradient(x.wrapping_sub(1), y) + gradient(x, y.wrapping_sub(1))
+    color + gradient(x.wrapping_sub(1), y) + gradient(x, y.wrapping_sub(1))
 }
 
 /// A canvas-shaped map of labels (indices of pieces), row by row.
@@ -129,7 +129,7 @@ pub(crate) fn on_preview(preview: &Preview, gains: &[[f32; 3]], photo_of: &[usiz
     };
     let half = preview.halved();
     let mut coarse = nearest_middle(&half);
-    // The worst of four pixels: their mean colours would hide a pole that the seam cuts in two.
+    // The worst of four pixels: their mean colors would hide a pole that the seam cuts in two.
     let worst = |a: usize, b: usize, x: usize, y: usize| {
         let four = [(0, 0), (1, 0), (0, 1), (1, 1)];
         four.into_iter().map(|(i, j)| differ(a, b, 2 * x + i, 2 * y + j)).fold(0, i32::max)
@@ -268,7 +268,7 @@ fn expand(
     }
 }
 
-/// Whether two pieces reach a common pixel or neighbouring ones, going by their bounds.
+/// Whether two pieces reach a common pixel or neighboring ones, going by their bounds.
 fn touch(pieces: &[Option<&Warped>], a: usize, b: usize) -> bool {
     let (Some(a), Some(b)) = (pieces[a], pieces[b]) else { return false };
     a.bounds.grown(1, usize::MAX, usize::MAX).intersection(&b.bounds).is_some()
@@ -379,14 +379,14 @@ fn expand_one(
                         // Paid where the first keeps (source) and the second switches (sink).
                         if ny == y { cut.add_right(i, j, arc, 0) } else { cut.add_down(i, j, arc, 0) }
                     }
-                    // A fixed neighbour is a cost of the free one alone.
+                    // A fixed neighbor is a cost of the free one alone.
                     (true, false) => add_signed(&mut cut, i, j, first - keep),
                     (false, _) => add_signed(&mut cut, nx - b.left, ny - b.top, second - keep),
                 }
             }
         }
     }
-    // Neighbours to the left of and above the box are fixed too.
+    // Neighbors to the left of and above the box are fixed too.
     for (x, y, nx, ny) in (b.top..b.bottom)
         .filter(|_| b.left > 0)
         .map(|y| (b.left, y, b.left - 1, y))

@@ -6,11 +6,11 @@ use nalgebra::{Matrix3, Rotation3, Vector3};
 /// or two but tilt it up and down by fifteen; (1.5° / 15°)².
 const ROLL_TO_PITCH: f64 = 0.01;
 
-/// The rotation of the world after which the panorama is level, the right side up and centred on the Z axis (Brown & Lowe 2007, §5).
+/// The rotation of the world after which the panorama is level, the right side up and centered on the Z axis (Brown & Lowe 2007, §5).
 ///
 /// `rotations` are world to camera. Their horizontal axes should all lie in the horizon's plane, so its normal, "up", is the
 /// direction in which they vary least. Where they all agree (a camera tilted straight up and down, or hardly turned) that leaves a
-/// choice, which the views' own middle decides: `up` minimises `Σ (x_i·u)² + 0.01 Σ (z_i·u)²`.
+/// choice, which the views' own middle decides: `up` minimizes `Σ (x_i·u)² + 0.01 Σ (z_i·u)²`.
 ///
 /// The answer `S` is to be applied as `R_i ← R_i Sᵀ`: `S` takes old world directions to new ones.
 pub(crate) fn straighten(rotations: &[Matrix3<f64>]) -> Matrix3<f64> {
@@ -42,7 +42,7 @@ fn level(v: &Vector3<f64>, y: &Vector3<f64>) -> Option<Vector3<f64>> {
     (v - y * v.dot(y)).try_normalize(1e-3)
 }
 
-/// The turn about the vertical that brings longitude `angle` (from Z towards X) to the middle.
+/// The turn about the vertical that brings longitude `angle` (from Z toward X) to the middle.
 pub(crate) fn turn(angle: f64) -> Matrix3<f64> {
     Rotation3::from_axis_angle(&Vector3::y_axis(), -angle).into_inner()
 }

@@ -4,7 +4,7 @@ use cv_core::{Camera, Matrix3, Point2, Vector3};
 
 /// A photograph placed in the panorama's world: `pixel ~ camera(from_world · ray)`.
 ///
-/// `from_world` is a rotation where the camera turned about its centre, and any invertible 3×3 where the scene is flat and the
+/// `from_world` is a rotation where the camera turned about its center, and any invertible 3×3 where the scene is flat and the
 /// camera moved. World frame: X right, Y down, Z forward, the middle of the panorama on the Z axis.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct View {

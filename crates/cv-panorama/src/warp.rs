@@ -90,7 +90,7 @@ pub(crate) struct Map {
 enum Lens {
     /// M already ends in pixels.
     None,
-    /// M ends in normalised coordinates; beyond `limit` (squared radius) no pixel of the photograph lies.
+    /// M ends in normalized coordinates; beyond `limit` (squared radius) no pixel of the photograph lies.
     Radial { k1: f32, k2: f32, f: [f32; 2], c: [f32; 2], limit: f32 },
     /// As above, by the camera's own functions.
     Other { view: View, limit: f32 },
@@ -303,7 +303,7 @@ mod tests {
         }
     }
 
-    /// A smooth picture whose value at any point is known: interpolation errors stay under a grey level.
+    /// A smooth picture whose value at any point is known: interpolation errors stay under a gray level.
     fn wave(u: f64, v: f64) -> [f64; 3] {
         [128.0 + 90.0 * (u * 0.05).sin(), 128.0 + 90.0 * (v * 0.06).cos(), 128.0 + 60.0 * ((u + v) * 0.03).sin()]
     }

@@ -31,7 +31,7 @@ pub struct DepthResult {
     pub confidence: Option<GrayF32>,
     /// Standard deviation of each disparity in px, NaN where filled.
     pub sigma: GrayF32,
-    /// Stage names and their seconds. `match` is the matcher from the grey images to checked disparities; `prepare` is
+    /// Stage names and their seconds. `match` is the matcher from the gray images to checked disparities; `prepare` is
     /// the memory it asks for beforehand.
     pub stages: Vec<(&'static str, f64)>,
 }
@@ -170,10 +170,10 @@ mod tests {
             stereo_pair(&Scene::tabletop(2), &camera, &scene.viewpoint(), 0.25, &RenderOptions::default()).unwrap();
         let options =
             DepthOptions { stereo: StereoOptions { disparities: 64, ..Default::default() }, ..Default::default() };
-        let grey = Image::<u8, 3>::new(320, 240, [90; 3]);
+        let gray = Image::<u8, 3>::new(320, 240, [90; 3]);
         let (left, right) = (pair.left.image.view(), pair.right.image.view());
-        // One colour twice, one colour and a photograph, exchanged, of something else.
-        let pairs = [(grey.view(), grey.view()), (grey.view(), right), (right, left), (left, other.right.image.view())];
+        // One color twice, one color and a photograph, exchanged, of something else.
+        let pairs = [(gray.view(), gray.view()), (gray.view(), right), (right, left), (left, other.right.image.view())];
         for (i, (a, b)) in pairs.into_iter().enumerate() {
             let error = depth(a, b, None, &options, &Silent).map(|found| found.map.matched_fraction()).unwrap_err();
             let DepthError::NoPair { cause, .. } = error else { panic!("{i}: {error}") };

@@ -59,7 +59,7 @@ pub fn estimate(
 /// What [`estimate_calibrated`] found.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CalibratedResult {
-    /// The essential matrix (of normalised coordinates; singular values 1, 1, 0) and the matches that fit it, in pixels.
+    /// The essential matrix (of normalized coordinates; singular values 1, 1, 0) and the matches that fit it, in pixels.
     pub robust: RobustModel<Matrix3<f64>>,
     /// First camera frame to second; the translation has length one.
     pub pose: Pose,
@@ -80,9 +80,9 @@ pub fn estimate_calibrated(
 ) -> Result<CalibratedResult, EstimateError> {
     let mut watch = Stopwatch::new();
     progress.report("estimate", 0, 1);
-    let (normalised, unit) = normalize_matches(pairs, &cameras[0], &cameras[1]);
+    let (normalized, unit) = normalize_matches(pairs, &cameras[0], &cameras[1]);
     let found =
-        estimate_relative_pose(&normalised, &RobustOptions { threshold: options.threshold * unit, ..*options })?;
+        estimate_relative_pose(&normalized, &RobustOptions { threshold: options.threshold * unit, ..*options })?;
     progress.report("estimate", 1, 1);
     watch.lap("estimate");
     let robust = RobustModel {

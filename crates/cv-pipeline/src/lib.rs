@@ -80,10 +80,10 @@ pub mod stereo {
     };
 }
 
-/// What a caller of [`train_segment`] and [`segment()`] needs of the colour models: options, model, scores.
+/// What a caller of [`train_segment`] and [`segment()`] needs of the color models: options, model, scores.
 pub mod segmentation {
     pub use cv_segment::{
-        Cleanup, ColorModel, ColorSpace, Labelled, Regions, Rule, Scores, SegmentError, TrainOptions, Trained,
+        Cleanup, ColorModel, ColorSpace, Labeled, Regions, Rule, Scores, SegmentError, TrainOptions, Trained,
     };
 }
 

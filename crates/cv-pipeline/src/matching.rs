@@ -13,7 +13,7 @@ use cv_imgproc::resize_area;
 /// Which features to find.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum FeatureMethod {
-    /// Harris corners with upright 8×8 patches: fast, for neighbouring frames of a film or a slowly turned camera.
+    /// Harris corners with upright 8×8 patches: fast, for neighboring frames of a film or a slowly turned camera.
     Harris,
     /// Corners at all scales with oriented 8×8 patches: for photographs that turn and zoom a little, at half the time of SIFT.
     Mops,
@@ -67,7 +67,7 @@ pub struct MatchingOptions {
     pub mops: MopsOptions,
     /// Settings of SIFT. Of more features than asked for, the coarse ones stay by default (COLMAP's choice).
     pub sift: SiftOptions,
-    /// Largest ratio of the SSD of the best candidate to that of the second. 0 to 1; `None` keeps every nearest neighbour. Default 0.66, which is
+    /// Largest ratio of the SSD of the best candidate to that of the second. 0 to 1; `None` keeps every nearest neighbor. Default 0.66, which is
     /// 0.81 on distances.
     pub ratio: Option<f32>,
     /// Keep a match only where each feature is the other's nearest. Default true.
@@ -150,15 +150,15 @@ pub enum MatchingError {
     Match(#[from] MatchError),
 }
 
-/// Finds and describes the features of a photograph. Grey is Rec. 601 luma, 0 to 1.
+/// Finds and describes the features of a photograph. Gray is Rec. 601 luma, 0 to 1.
 ///
 /// # Errors
 /// [`FeatureError`] for a photograph smaller than the method's window and for options out of range. One without features is no error here.
 pub fn extract_features(photo: ImageView<'_, u8, 3>, options: &MatchingOptions) -> Result<PhotoFeatures, FeatureError> {
-    let grey = luma(photo);
+    let gray = luma(photo);
     match options.method {
         FeatureMethod::Harris => {
-            let corners = harris(grey.view(), &options.harris)?;
+            let corners = harris(gray.view(), &options.harris)?;
             let n = options.max_features.unwrap_or(500);
             let spaced = match options.spacing {
                 Spacing::Radius => anms(&corners, n, options.anms_robust),
@@ -166,7 +166,7 @@ pub fn extract_features(photo: ImageView<'_, u8, 3>, options: &MatchingOptions) 
                 Spacing::Tiles => anms_tiled(&corners, n, (8, 8)),
             };
             let spaced: Vec<_> = spaced.into_iter().map(|i| corners[i]).collect();
-            let mut described = describe_patches(grey.view(), &spaced, &options.patch)?;
+            let mut described = describe_patches(gray.view(), &spaced, &options.patch)?;
             described.beyond_limit = corners.len() - spaced.len();
             Ok(PhotoFeatures { described, found: corners.len(), candidates: corners })
         }
@@ -175,7 +175,7 @@ pub fn extract_features(photo: ImageView<'_, u8, 3>, options: &MatchingOptions) 
             if let Some(n) = options.max_features {
                 settings.max_features = n;
             }
-            let described = mops(grey.view(), &settings)?;
+            let described = mops(gray.view(), &settings)?;
             Ok(PhotoFeatures { found: accounted(&described), described, candidates: Vec::new() })
         }
         FeatureMethod::Sift => {
@@ -183,7 +183,7 @@ pub fn extract_features(photo: ImageView<'_, u8, 3>, options: &MatchingOptions) 
             if let Some(n) = options.max_features {
                 settings.max_features = n;
             }
-            let described = sift(grey.view(), &settings)?;
+            let described = sift(gray.view(), &settings)?;
             Ok(PhotoFeatures { found: accounted(&described), described, candidates: Vec::new() })
         }
     }
@@ -310,13 +310,13 @@ fn explained(pairs: &[Correspondence]) -> bool {
 /// Rec. 601 luma, 0 to 1, not rounded to bytes.
 fn luma(photo: ImageView<'_, u8, 3>) -> GrayF32 {
     let (w, h) = photo.size();
-    let mut grey = GrayF32::new(w, h, [0.0]);
+    let mut gray = GrayF32::new(w, h, [0.0]);
     for y in 0..h {
-        for (o, p) in grey.row_mut(y).iter_mut().zip(photo.row(y).as_chunks::<3>().0) {
+        for (o, p) in gray.row_mut(y).iter_mut().zip(photo.row(y).as_chunks::<3>().0) {
             *o = (0.299 * f32::from(p[0]) + 0.587 * f32::from(p[1]) + 0.114 * f32::from(p[2])) * (1.0 / 255.0);
         }
     }
-    grey
+    gray
 }
 
 /// [`match_photos`] in photographs reduced to a longer side of `max_size` where they are larger, in pixels of the photographs themselves.
@@ -338,7 +338,7 @@ pub(crate) fn match_reduced(
         let (x, y) = (ratio(photo.width(), view.width()), ratio(photo.height(), view.height()));
         let points = features.described.keypoints.iter_mut();
         for point in points.chain(&mut features.candidates) {
-            // The corners of the pictures meet, not the centres of their corner pixels.
+            // The corners of the pictures meet, not the centers of their corner pixels.
             point.position.x = (point.position.x + 0.5) * x - 0.5;
             point.position.y = (point.position.y + 0.5) * y - 0.5;
             point.scale *= (x * y).sqrt();
@@ -354,7 +354,7 @@ mod tests {
     use crate::Silent;
     use cv_core::RgbU8;
 
-    /// Coloured blobs of many sizes at places drawn from a fixed sequence.
+    /// Colored blobs of many sizes at places drawn from a fixed sequence.
     fn blobs(shift: (f32, f32)) -> RgbU8 {
         let mut state = 7u32;
         let mut random = || {

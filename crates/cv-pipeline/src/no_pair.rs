@@ -109,7 +109,7 @@ pub(crate) fn judge(matches: &[Correspondence], height: usize, tried: Option<(i3
     let common = in_common_rows(matches);
     // Wrong matches are few: most lie in common rows where the pair is rectified.
     if common.len() < NEEDED.max(n / 2) {
-        // Cameras that are not aligned shift neighbours alike; chance matches are anywhere.
+        // Cameras that are not aligned shift neighbors alike; chance matches are anywhere.
         let spread = apart[3 * n / 4] - apart[n / 4];
         if n < 2 * NEEDED || spread > SPREAD * height as f64 {
             return NoPairCause::Unrelated { matches: common.len() };

@@ -269,7 +269,7 @@ impl Prepared {
 /// A pair that was matched, and what verification left of it.
 type Tried = (PanoramaPair, Option<VerifiedPair>);
 
-/// Agreeing matches that hold two photographs together firmly. On sixteen rendered sets, whose links had 66 and more, neighbours then lie within 0.16 px of the
+/// Agreeing matches that hold two photographs together firmly. On sixteen rendered sets, whose links had 66 and more, neighbors then lie within 0.16 px of the
 /// truth (0.08 px median at 480 px, 0.05 px at 800 px); with those of the enlarged image too, within 0.08 px (0.04 px median), at twice the time for features.
 const FIRM: usize = 50;
 

@@ -1,10 +1,10 @@
-//! Finding an object by its colour: train on photographs with masks, then mark it in others.
+//! Finding an object by its color: train on photographs with masks, then mark it in others.
 
 use crate::{Progress, Stopwatch};
 use cv_core::{ImageView, Mask};
-use cv_segment::{ColorModel, Labelled, SegmentError, TrainOptions, Trained, train};
+use cv_segment::{ColorModel, Labeled, SegmentError, TrainOptions, Trained, train};
 
-/// What [`train_segment`] learnt.
+/// What [`train_segment`] learned.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SegmentTraining {
     /// The model and its scores on the training photographs.
@@ -24,12 +24,12 @@ pub struct SegmentResult {
     pub stages: Vec<(&'static str, f64)>,
 }
 
-/// Learns an object's colours from photographs and masks.
+/// Learns an object's colors from photographs and masks.
 ///
 /// # Errors
 /// [`SegmentError`]: nothing to train on, masks that do not fit or show nothing, options out of range.
 pub fn train_segment(
-    photos: &[Labelled<'_>],
+    photos: &[Labeled<'_>],
     options: &TrainOptions,
     progress: &dyn Progress,
 ) -> Result<SegmentTraining, SegmentError> {
@@ -66,8 +66,8 @@ mod tests {
         let camera = Camera::from_focal(240, 180, 220.0);
         for seed in [3] {
             let photos = ball_photos(seed, 8, &camera, &RenderOptions::default()).unwrap();
-            let labelled: Vec<Labelled<'_>> = photos.iter().map(|p| (p.view.image.view(), p.mask.view())).collect();
-            let half = |odd: usize| -> Vec<Labelled<'_>> { labelled.iter().copied().skip(odd).step_by(2).collect() };
+            let labeled: Vec<Labeled<'_>> = photos.iter().map(|p| (p.view.image.view(), p.mask.view())).collect();
+            let half = |odd: usize| -> Vec<Labeled<'_>> { labeled.iter().copied().skip(odd).step_by(2).collect() };
             for space in [ColorSpace::Hsv, ColorSpace::Rgb, ColorSpace::Lab] {
                 let options = TrainOptions { space, ..TrainOptions::default() };
                 let model = train_segment(&half(0), &options, &Silent).unwrap().trained.model;

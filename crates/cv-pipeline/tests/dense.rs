@@ -57,7 +57,7 @@ fn the_cloud_is_as_true_as_the_sparse_points_it_comes_from() {
         // Both hang on the same pose, whose error is most of the median; a disparity of 20 px or more, good to a third of a pixel, adds 1.5 %.
         assert!(at(&of_dense, 0.5) < at(&of_sparse, 0.5) + 0.015);
         assert!(at(&of_dense, 0.9) < at(&of_sparse, 0.9) + 0.03);
-        // A room is textured all over; a camera half a metre aside sees most of it.
+        // A room is textured all over; a camera half a meter aside sees most of it.
         assert!(dense.points.len() > 150_000 && dense.coverage > 0.5);
         // The depth map holds the same points: the depth of each pixel is the truth's too.
         let baseline = views.relative.translation.norm();

@@ -77,7 +77,7 @@ fn a_panorama_uses_every_photograph_and_aligns_within_a_fifth_of_a_pixel() {
         }
         let rms = f64::sqrt(sum / pairs);
         println!("seed {seed}: {rms:.3} px over {pairs} pairs, focal {:.2} px", views[0].camera.fx);
-        // Five photographs with a 45 % overlap: four pairs of neighbours, seen both ways, at least. Half a pixel at a seam
+        // Five photographs with a 45 % overlap: four pairs of neighbors, seen both ways, at least. Half a pixel at a seam
         // would show; thousands of matches place a view several times better.
         assert!(pairs >= 8.0 && rms <= 0.2, "seed {seed}: {rms} px over {pairs} pairs");
     }
@@ -118,7 +118,7 @@ fn two_views_give_the_turn_and_the_direction_of_travel() {
 }
 
 #[test]
-fn a_ball_is_found_by_its_colour() {
+fn a_ball_is_found_by_its_color() {
     // Eight photographs, each of a scene of its own: fewer seeds.
     for seed in 0..3 {
         let photos = ball_photos(seed, 8, &camera(), &RenderOptions::default()).unwrap();

@@ -69,7 +69,7 @@ fn a_turn_is_named_or_left_open() {
 
 #[test]
 fn a_camera_that_hardly_moved_is_told() {
-    // Two centimetres before a room of three to six metres: two pixels of parallax and less.
+    // Two centimeters before a room of three to six meters: two pixels of parallax and less.
     for seed in [3, 4] {
         let views = two_view(seed, &camera(), 0.02, &RenderOptions::default()).unwrap();
         match refusal(&views.a.image, &views.b.image, known()) {

@@ -4,10 +4,10 @@ use cv_core::{ImageView, RgbU8};
 
 use crate::font;
 
-/// An RGB colour, as stored in pictures (sRGB).
+/// An RGB color, as stored in pictures (sRGB).
 pub type Color = [u8; 3];
 
-/// Colours that stay apart for people with any colour vision (Okabe & Ito), and the greys.
+/// Colors that stay apart for people with any color vision (Okabe & Ito), and the grays.
 pub mod colors {
     use super::Color;
     /// Right, accepted.
@@ -32,14 +32,14 @@ pub mod colors {
     pub const UNKNOWN: Color = [104, 104, 108];
 }
 
-/// A picture to draw on. Positions are pixels with centres at integers; whatever falls outside is cut off.
+/// A picture to draw on. Positions are pixels with centers at integers; whatever falls outside is cut off.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Canvas {
     image: RgbU8,
 }
 
 impl Canvas {
-    /// A canvas of one colour.
+    /// A canvas of one color.
     ///
     /// # Panics
     /// Where `width × height × 3` overflows.
@@ -47,12 +47,12 @@ impl Canvas {
         Self { image: RgbU8::new(width, height, fill) }
     }
 
-    /// A copy of a colour picture.
+    /// A copy of a color picture.
     pub fn from_rgb(view: ImageView<'_, u8, 3>) -> Self {
         Self { image: view.to_image() }
     }
 
-    /// A copy of a grey picture.
+    /// A copy of a gray picture.
     pub fn from_gray(view: ImageView<'_, u8, 1>) -> Self {
         Self { image: view.to_image().map(|[v]| [v; 3]) }
     }
@@ -224,7 +224,7 @@ impl Canvas {
         font::draw(text, [x, y], size, font::weight(size), |x, y, alpha| self.blend(x, y, color, alpha));
     }
 
-    /// Text with a rim of another colour, readable on any picture.
+    /// Text with a rim of another color, readable on any picture.
     pub fn text_on_picture(&mut self, x: f32, y: f32, text: &str, size: f32, color: Color, rim: Color) {
         let weight = font::weight(size);
         font::draw(text, [x, y], size, weight * 2.2 + 1.5, |x, y, alpha| self.blend(x, y, rim, alpha * 0.75));

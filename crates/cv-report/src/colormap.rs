@@ -1,10 +1,10 @@
-//! Numbers to colours.
+//! Numbers to colors.
 
 use cv_core::{GrayF32, ImageView, RgbU8};
 
 use crate::canvas::{Canvas, Color, colors};
 
-/// A way from numbers to colours.
+/// A way from numbers to colors.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Colormap {
     /// Turbo (Mikhailov 2019): low blue, high red. For depth: near blue, far red.
@@ -12,7 +12,7 @@ pub enum Colormap {
     Turbo,
     /// Turbo the other way round. For disparity, so that near is blue as well.
     TurboReversed,
-    /// Viridis: even in lightness, so that it survives a grey print. For costs, confidences and densities.
+    /// Viridis: even in lightness, so that it survives a gray print. For costs, confidences and densities.
     Viridis,
     /// Magma: dark to light. For errors.
     Magma,
@@ -21,7 +21,7 @@ pub enum Colormap {
 }
 
 impl Colormap {
-    /// The colour at `t`, 0 to 1; [`colors::UNKNOWN`] for NaN.
+    /// The color at `t`, 0 to 1; [`colors::UNKNOWN`] for NaN.
     pub fn color(self, t: f32) -> Color {
         if t.is_nan() {
             return colors::UNKNOWN;
@@ -48,7 +48,7 @@ fn inside(t: f64) -> f64 {
     0.06 + 0.90 * t
 }
 
-/// Colours a map. Values outside `range` take the colour of its end; NaN and infinity are [`colors::UNKNOWN`].
+/// Colors a map. Values outside `range` take the color of its end; NaN and infinity are [`colors::UNKNOWN`].
 pub fn colorize(map: ImageView<'_, f32, 1>, range: (f32, f32), colormap: Colormap) -> RgbU8 {
     let table = colormap.table();
     let scale = if range.1 > range.0 { 255.0 / (range.1 - range.0) } else { 0.0 };
@@ -63,7 +63,7 @@ pub fn colorize(map: ImageView<'_, f32, 1>, range: (f32, f32), colormap: Colorma
 
 /// The `low` and `high` quantiles (0 to 1) of the finite values; `None` where there are none.
 ///
-/// A picture coloured from 0.01 to 0.99 is not ruled by a few wild values.
+/// A picture colored from 0.01 to 0.99 is not ruled by a few wild values.
 pub fn quantile_range(map: ImageView<'_, f32, 1>, low: f64, high: f64) -> Option<(f32, f32)> {
     let mut values: Vec<f32> = (0..map.height()).flat_map(|y| map.row(y)).copied().filter(|v| v.is_finite()).collect();
     let last = values.len().checked_sub(1)?;
@@ -96,7 +96,7 @@ pub(crate) fn ticks(range: (f64, f64), count: usize) -> Vec<f64> {
     (0..=(last - first) as i64).map(|i| (first + i as f64) * step).map(|t| if t == 0.0 { 0.0 } else { t }).collect()
 }
 
-/// A number in as few digits as tell it from its neighbours at distance `step`.
+/// A number in as few digits as tell it from its neighbors at distance `step`.
 pub(crate) fn tick_label(value: f64, step: f64) -> String {
     let decimals = (-step.abs().log10() - 1e-9).ceil().clamp(0.0, 9.0) as usize;
     if value != 0.0 && (value.abs() >= 1e6 || value.abs() < 1e-4) {
@@ -106,7 +106,7 @@ pub(crate) fn tick_label(value: f64, step: f64) -> String {
     }
 }
 
-/// A vertical colour bar with its scale, as tall as asked: low at the bottom, `label` (such as “depth (m)”) on top.
+/// A vertical color bar with its scale, as tall as asked: low at the bottom, `label` (such as “depth (m)”) on top.
 pub fn color_bar(height: usize, range: (f32, f32), colormap: Colormap, label: &str) -> RgbU8 {
     // Text grows with the picture, between the sizes that can be read and that do not shout.
     let size = (height as f32 / 40.0).clamp(8.0, 22.0);
@@ -141,9 +141,9 @@ pub fn color_bar(height: usize, range: (f32, f32), colormap: Colormap, label: &s
 /// How a map becomes a picture.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct MapStyle {
-    /// Values of the two ends of the colours; `None` (default): the 1 % and 99 % quantiles.
+    /// Values of the two ends of the colors; `None` (default): the 1 % and 99 % quantiles.
     pub range: Option<(f32, f32)>,
-    /// The colours. Default [`Colormap::Turbo`].
+    /// The colors. Default [`Colormap::Turbo`].
     pub colormap: Colormap,
     /// What the numbers are, with the unit. Default empty.
     pub label: String,
@@ -168,7 +168,7 @@ impl MapStyle {
     }
 }
 
-/// A map in colours with a colour bar at its right.
+/// A map in colors with a color bar at its right.
 pub fn draw_map(map: ImageView<'_, f32, 1>, style: &MapStyle) -> RgbU8 {
     let range = style.range.or_else(|| quantile_range(map, 0.01, 0.99)).unwrap_or((0.0, 1.0));
     // One value only: give it a scale around it.

@@ -1,4 +1,4 @@
-//! Overlays, colour maps, plots and the self-contained HTML report.
+//! Overlays, color maps, plots and the self-contained HTML report.
 //!
 //! Everything here turns results into pictures ([`cv_core::RgbU8`]), SVG or HTML text in memory. Encoding pictures as PNG and
 //! writing files is the caller's part.
@@ -13,7 +13,7 @@
 //!
 //! let mut report = Report::new("Depth of a ramp");
 //! report.headline("valid", "100 %").section("Result").note(Note::Good, "Every pixel is known.");
-//! report.plot(&Plot::new("Depth", "metres", "pixels").histogram("", &[1.0, 2.0, 2.5], 10), "How far things are.");
+//! report.plot(&Plot::new("Depth", "meters", "pixels").histogram("", &[1.0, 2.0, 2.5], 10), "How far things are.");
 //! assert!(report.to_html().starts_with("<!doctype html>"));
 //! ```
 //!

@@ -9,7 +9,7 @@ fn unit(width: usize, height: usize) -> f32 {
     (width.max(height) as f32 / 1000.0).clamp(0.8, 4.0)
 }
 
-/// Takes most of the colour and some of the light out of a picture, so that marks on it stand out.
+/// Takes most of the color and some of the light out of a picture, so that marks on it stand out.
 fn quiet(canvas: &mut Canvas) {
     canvas.map(|[r, g, b]| {
         let luma = (u32::from(r) * 77 + u32::from(g) * 150 + u32::from(b) * 29) >> 8;
@@ -34,7 +34,7 @@ pub fn draw_keypoints(view: ImageView<'_, u8, 3>, keypoints: &[Keypoint], color:
     canvas.into_image()
 }
 
-/// Pictures in a row on white, `gap` pixels apart, centred vertically.
+/// Pictures in a row on white, `gap` pixels apart, centered vertically.
 pub fn side_by_side(views: &[ImageView<'_, u8, 3>], gap: usize) -> RgbU8 {
     let (canvas, _) = row_of(views, gap);
     canvas.into_image()
@@ -56,7 +56,7 @@ fn row_of(views: &[ImageView<'_, u8, 3>], gap: usize) -> (Canvas, Vec<[f32; 2]>)
     (canvas, corners)
 }
 
-/// Colours that differ from one index to the next, for things that have no meaning by colour.
+/// Colors that differ from one index to the next, for things that have no meaning by color.
 fn cycle(index: usize) -> Color {
     // Steps of the golden angle around the hue circle, at full saturation and two lightnesses.
     let hue = (index as f32 * 0.618_034).fract() * 6.0;
@@ -89,7 +89,7 @@ impl Default for MatchStyle {
     }
 }
 
-/// Two pictures, greyed and side by side, with a line per match: inliers green over outliers red, or each in a colour of its own where
+/// Two pictures, grayed and side by side, with a line per match: inliers green over outliers red, or each in a color of its own where
 /// `inliers` is `None`. A pair beyond the end of `inliers` counts as an outlier.
 pub fn draw_matches(
     a: ImageView<'_, u8, 3>,
@@ -124,7 +124,7 @@ pub fn draw_matches(
     canvas.into_image()
 }
 
-/// Two pictures, greyed and side by side; up to `count` pairs, each with its epipolar lines in one colour: `F x_a` in the second picture
+/// Two pictures, grayed and side by side; up to `count` pairs, each with its epipolar lines in one color: `F x_a` in the second picture
 /// and `Fᵀ x_b` in the first, where `x_bᵀ F x_a = 0`.
 pub fn draw_epipolar_lines(
     a: ImageView<'_, u8, 3>,
@@ -190,7 +190,7 @@ pub fn overlay_mask(view: ImageView<'_, u8, 3>, mask: ImageView<'_, bool, 1>, co
     canvas.into_image()
 }
 
-/// A mask against the truth: right green, invented red, missed blue, on the greyed picture.
+/// A mask against the truth: right green, invented red, missed blue, on the grayed picture.
 pub fn overlay_comparison(
     view: ImageView<'_, u8, 3>,
     mask: ImageView<'_, bool, 1>,
@@ -241,10 +241,10 @@ pub fn tile_patches(values: &[f32], side: usize, columns: usize, zoom: usize) ->
     canvas.into_image()
 }
 
-/// A disparity or depth map against the truth: grey ramp up to `limit`, then red to yellow; black where there is no truth, blue where
+/// A disparity or depth map against the truth: gray ramp up to `limit`, then red to yellow; black where there is no truth, blue where
 /// the estimate is missing.
 ///
-/// The boundary between grey and colour is the threshold of “bad” pixels (2 px for bad-2.0).
+/// The boundary between gray and color is the threshold of “bad” pixels (2 px for bad-2.0).
 pub fn draw_error_map(estimate: ImageView<'_, f32, 1>, truth: ImageView<'_, f32, 1>, limit: f32) -> RgbU8 {
     let limit = if limit > 0.0 { limit } else { 1.0 };
     RgbU8::from_fn(estimate.width().min(truth.width()), estimate.height().min(truth.height()), |x, y| {
@@ -328,7 +328,7 @@ mod tests {
         let pairs = [Correspondence::new(10.0, 10.0, 20.0, 5.0), Correspondence::new(10.0, 25.0, 20.0, 15.0)];
         let picture = draw_matches(a.view(), b.view(), &pairs, Some(&[true, false]), &MatchStyle::default());
         assert_eq!(picture.size(), (90, 30));
-        // The second picture is centred: 5 pixels down, 40 to the right.
+        // The second picture is centered: 5 pixels down, 40 to the right.
         for (x, y, color) in
             [(10, 10, colors::GREEN), (60, 10, colors::GREEN), (10, 25, colors::RED), (60, 20, colors::RED)]
         {

@@ -1,4 +1,4 @@
-//! Plots as SVG, drawn in the colours of the page they stand in.
+//! Plots as SVG, drawn in the colors of the page they stand in.
 
 use std::fmt::Write as _;
 
@@ -132,7 +132,7 @@ impl Plot {
         (low, high)
     }
 
-    /// The plot as an `<svg>` element, 640 × 300 units, scaling with its container. Colours come from the report's style
+    /// The plot as an `<svg>` element, 640 × 300 units, scaling with its container. Colors come from the report's style
     /// sheet; alone in a file, they fall back to dark on transparent.
     pub fn to_svg(&self) -> String {
         let (low, high) = self.bounds();
@@ -242,7 +242,7 @@ impl Plot {
     }
 }
 
-/// The colour of the i-th layer, told apart with any colour vision.
+/// The color of the i-th layer, told apart with any color vision.
 fn series(i: usize) -> &'static str {
     ["#2f7fd6", "#e08a1e", "#1f9e77", "#cf4f9b", "#7a63c7", "#c9432f"][i % 6]
 }

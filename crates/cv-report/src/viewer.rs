@@ -16,11 +16,11 @@ pub struct PointScene {
     left_out: usize,
 }
 
-/// A camera's outline: its centre and the corners of its picture, in the world, at distance 1.
+/// A camera's outline: its center and the corners of its picture, in the world, at distance 1.
 #[derive(Debug, Clone, PartialEq)]
 struct Frustum {
     center: Point3<f64>,
-    /// From the centre to the corners, top left first, clockwise; `z` along the axis is 1.
+    /// From the center to the corners, top left first, clockwise; `z` along the axis is 1.
     rays: [[f64; 3]; 4],
     /// The direction of the optical axis.
     axis: [f64; 3],
@@ -31,7 +31,7 @@ impl PointScene {
     /// The most points kept; 16 bytes each in the file. A larger cloud is thinned evenly.
     pub const MAX_POINTS: usize = 400_000;
 
-    /// A scene of points with a colour each (white where there are too few colours). Points that are not finite are left out.
+    /// A scene of points with a color each (white where there are too few colors). Points that are not finite are left out.
     pub fn new(points: &[[f32; 3]], colors: &[Color]) -> Self {
         let usable: Vec<usize> = (0..points.len()).filter(|&i| points[i].iter().all(|v| v.is_finite())).collect();
         let kept = usable.len().min(Self::MAX_POINTS);
@@ -87,7 +87,7 @@ impl PointScene {
         (center, if radius > 0.0 && radius.is_finite() { radius } else { 1.0 })
     }
 
-    /// How far from its centre a camera's picture is drawn: a small part of the scene.
+    /// How far from its center a camera's picture is drawn: a small part of the scene.
     fn frustum_depth(&self) -> f32 {
         let (center, radius) = self.extent();
         let near = self
@@ -98,7 +98,7 @@ impl PointScene {
         0.12 * radius.max(near.min(4.0 * radius))
     }
 
-    /// The corners and the tip of every frustum as line segments with a colour.
+    /// The corners and the tip of every frustum as line segments with a color.
     fn segments(&self) -> Vec<([f32; 3], [f32; 3], Color)> {
         let depth = f64::from(self.frustum_depth());
         let mut out = Vec::new();
@@ -249,7 +249,7 @@ fn fit(
     Some(([(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0], scale))
 }
 
-/// Colours for cameras, in order.
+/// Colors for cameras, in order.
 pub fn camera_color(index: usize) -> Color {
     [colors::ORANGE, colors::CYAN, colors::MAGENTA, colors::GREEN, colors::YELLOW][index % 5]
 }
@@ -260,7 +260,7 @@ mod tests {
     use cv_core::{Rotation3, Vector3};
 
     #[test]
-    fn a_point_ahead_is_drawn_in_its_colour_and_wild_ones_are_left_out() {
+    fn a_point_ahead_is_drawn_in_its_color_and_wild_ones_are_left_out() {
         let points = [[0.0, 0.0, 5.0], [f32::NAN, 0.0, 1.0], [0.0, f32::INFINITY, 0.0]];
         let scene = PointScene::new(&points, &[[255, 0, 0]; 3]);
         assert_eq!(scene.points.len(), 1);

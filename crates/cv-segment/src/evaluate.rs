@@ -28,7 +28,7 @@ impl From<&Whitened> for Flat {
     }
 }
 
-/// Log odds of two mixtures in a colour space.
+/// Log odds of two mixtures in a color space.
 #[derive(Debug, Clone)]
 pub(crate) struct Evaluator {
     space: ColorSpace,
@@ -270,7 +270,7 @@ mod tests {
             for y in 0..2 {
                 for x in 0..width {
                     let p = space.coordinates(image.at(x, y), hue).map(f64::from);
-                    // At the cut opposite the mean hue a rounding decides on which side a colour falls.
+                    // At the cut opposite the mean hue a rounding decides on which side a color falls.
                     if space == ColorSpace::Hsv && p[0].abs() > f64::from(PI) - 1e-4 {
                         continue;
                     }

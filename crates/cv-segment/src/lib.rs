@@ -1,10 +1,10 @@
-//! Finding an object by its colour: Gaussian and mixture models of object and background, posterior odds, clean-up, and scores.
+//! Finding an object by its color: Gaussian and mixture models of object and background, posterior odds, clean-up, and scores.
 //!
 //! ```
 //! use cv_core::{Mask, RgbU8};
 //! use cv_segment::{Scores, TrainOptions, train};
 //!
-//! // An orange square on grey.
+//! // An orange square on gray.
 //! let inside = |x: usize, y: usize| (20..40).contains(&x) && (10..30).contains(&y);
 //! let photo = RgbU8::from_fn(64, 48, |x, y| if inside(x, y) { [230, 110, 30 + x as u8] } else { [90, 90, 80 + y as u8] });
 //! let mask = Mask::from_fn(64, 48, |x, y| [inside(x, y)]);
@@ -17,9 +17,9 @@
 //!
 //! # How it works
 //!
-//! Training counts the colours inside and outside the masks and fits a [`Mixture`] to each, in a [`ColorSpace`]. A pixel's score is the logarithm of
+//! Training counts the colors inside and outside the masks and fits a [`Mixture`] to each, in a [`ColorSpace`]. A pixel's score is the logarithm of
 //! the posterior odds of object against background; scores are smoothed a little, held against a threshold, and the mask is opened and closed by a small
-//! disc ([`Cleanup`]). The [`ColorModel`] holds all of it and serialises with serde.
+//! disc ([`Cleanup`]). The [`ColorModel`] holds all of it and serializes with serde.
 //!
 //! Everything is deterministic: the same photos, options and seed give the same model and the same masks on any number of threads.
 
@@ -38,4 +38,4 @@ pub use mixture::{Component, Mixture, MixtureError, MixtureOptions, WeightedSamp
 pub use model::{ColorModel, Rule};
 pub use scores::Scores;
 pub use space::ColorSpace;
-pub use train::{Labelled, Regions, TrainOptions, Trained, train};
+pub use train::{Labeled, Regions, TrainOptions, Trained, train};

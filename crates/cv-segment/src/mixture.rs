@@ -1,4 +1,4 @@
-//! Mixtures of Gaussians, fitted by expectation-maximisation.
+//! Mixtures of Gaussians, fitted by expectation-maximization.
 
 use nalgebra::{Matrix3, Vector3};
 use rand::{Rng, RngExt, SeedableRng};
@@ -41,10 +41,10 @@ pub struct MixtureOptions {
     /// Gaussians, 1 to 64. Fewer result where there are fewer distinct points.
     pub components: usize,
     /// Added to each variance, in units of the samples' own variance along that axis. Default 1e-6.
-    pub regularisation: f64,
+    pub regularization: f64,
     /// Standard deviations below which differences between points mean nothing; their squares are added to the variances. Default 0.
     pub resolution: [f64; 3],
-    /// Most rounds of expectation and maximisation. Default 200.
+    /// Most rounds of expectation and maximization. Default 200.
     pub max_iterations: usize,
     /// Stops when a round raises the mean log density by less. Default 1e-4 (a tenth of scikit-learn's).
     pub tolerance: f64,
@@ -56,7 +56,7 @@ impl Default for MixtureOptions {
     fn default() -> Self {
         Self {
             components: 1,
-            regularisation: 1e-6,
+            regularization: 1e-6,
             resolution: [0.0; 3],
             max_iterations: 200,
             tolerance: 1e-4,
@@ -118,7 +118,7 @@ impl Whitened {
 }
 
 impl Mixture {
-    /// Fits a mixture by expectation-maximisation (Dempster, Laird & Rubin 1977) on weighted samples, from a k-means++ start (Arthur & Vassilvitskii 2007) in
+    /// Fits a mixture by expectation-maximization (Dempster, Laird & Rubin 1977) on weighted samples, from a k-means++ start (Arthur & Vassilvitskii 2007) in
     /// coordinates scaled by the samples' standard deviations.
     ///
     /// Samples that are all one point give one Gaussian of the least width the options allow. Time is rounds × samples × components.
@@ -144,14 +144,14 @@ impl Mixture {
         let floor: [f64; 3] = std::array::from_fn(|i| {
             // Were everything one point and no resolution known, what rounding leaves of its size.
             let least = 1e-12 * (1.0 + mean[i] * mean[i]);
-            (options.regularisation * spread[(i, i)] + options.resolution[i].powi(2)).max(least)
+            (options.regularization * spread[(i, i)] + options.resolution[i].powi(2)).max(least)
         });
         let mut components = first_components(samples, k, &spread, &floor, options.seed);
         let mut last = f64::NEG_INFINITY;
         for _ in 0..options.max_iterations {
             let whitened: Vec<Whitened> = components.iter().filter_map(Whitened::new).collect();
             let (scatters, log_density) = expectation(samples, &whitened);
-            components = maximisation(&scatters, total, &floor);
+            components = maximization(&scatters, total, &floor);
             let now = log_density / total;
             if now - last < options.tolerance {
                 break;
@@ -256,26 +256,26 @@ fn first_components(
     let scale = Vector3::from_fn(|i, _| 1.0 / (spread[(i, i)].max(0.0) + floor[i]).sqrt());
     let points: Vec<Vector3<f64>> = samples.iter().map(|s| Vector3::from(s.point).component_mul(&scale)).collect();
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let mut centres: Vec<Vector3<f64>> = Vec::with_capacity(k);
+    let mut centers: Vec<Vector3<f64>> = Vec::with_capacity(k);
     let mut nearest: Vec<f64> = vec![1.0; samples.len()];
-    while centres.len() < k {
-        // With no centre yet every distance is one: the first is drawn by weight alone.
+    while centers.len() < k {
+        // With no center yet every distance is one: the first is drawn by weight alone.
         let chances = || samples.iter().zip(&nearest).map(|(s, d)| s.weight * d);
         let Some(chosen) = draw(chances, &mut rng) else { break };
-        let centre = points[chosen];
+        let center = points[chosen];
         for (d, p) in nearest.iter_mut().zip(&points) {
-            let distance = (p - centre).norm_squared();
-            *d = if centres.is_empty() { distance } else { d.min(distance) };
+            let distance = (p - center).norm_squared();
+            *d = if centers.is_empty() { distance } else { d.min(distance) };
         }
-        centres.push(centre);
+        centers.push(center);
     }
     let mut clusters = Vec::new();
     for round in 0..=10 {
-        clusters = vec![Scatter::ZERO; centres.len()];
+        clusters = vec![Scatter::ZERO; centers.len()];
         for (s, p) in samples.iter().zip(&points) {
             let mut best = (0, f64::INFINITY);
-            for (i, centre) in centres.iter().enumerate() {
-                let d = (p - centre).norm_squared();
+            for (i, center) in centers.iter().enumerate() {
+                let d = (p - center).norm_squared();
                 if d < best.1 {
                     best = (i, d);
                 }
@@ -283,15 +283,15 @@ fn first_components(
             clusters[best.0].add(&Vector3::from(s.point), s.weight);
         }
         if round < 10 {
-            for (centre, cluster) in centres.iter_mut().zip(&clusters) {
+            for (center, cluster) in centers.iter_mut().zip(&clusters) {
                 if cluster.weight > 0.0 {
-                    *centre = (cluster.sum / cluster.weight).component_mul(&scale);
+                    *center = (cluster.sum / cluster.weight).component_mul(&scale);
                 }
             }
         }
     }
     let total = samples.iter().map(|s| s.weight).sum();
-    maximisation(&clusters, total, floor)
+    maximization(&clusters, total, floor)
 }
 
 /// Draws an index by chances; `None` where all are zero.
@@ -349,7 +349,7 @@ fn expectation(samples: &[WeightedSample], components: &[Whitened]) -> (Vec<Scat
 }
 
 /// New components; those that hold no points go.
-fn maximisation(scatters: &[Scatter], total: f64, floor: &[f64; 3]) -> Vec<Component> {
+fn maximization(scatters: &[Scatter], total: f64, floor: &[f64; 3]) -> Vec<Component> {
     // A billionth of all points is no component.
     scatters.iter().filter(|s| s.weight > 1e-9 * total).map(|s| s.component(total, floor)).collect()
 }
@@ -380,7 +380,7 @@ mod tests {
             for j in 0..3 {
                 let covariance =
                     samples.iter().map(|s| (s.point[i] - mean(i)) * (s.point[j] - mean(j))).sum::<f64>() / n;
-                // The regularisation is a millionth of the variance, at most 4e-8.
+                // The regularization is a millionth of the variance, at most 4e-8.
                 assert!((c.covariance[i][j] - covariance).abs() < 5e-8);
             }
         }

@@ -5,13 +5,13 @@ use cv_core::{GrayF32, ImageView, Mask, Matrix3, Vector3};
 use cv_imgproc::gaussian_blur;
 use serde::{Deserialize, Serialize};
 
-/// The version of the model's serialised form.
+/// The version of the model's serialized form.
 const SCHEMA: u32 = 1;
 
 /// Scores are limited to this much on either side, in nats, before they are smoothed, so that one pixel cannot outvote many: e¹⁰ is 22,000 to 1.
 pub(crate) const LIMIT: f32 = 10.0;
 
-/// What a pixel's colour is judged by.
+/// What a pixel's color is judged by.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Rule {
@@ -25,7 +25,7 @@ pub enum Rule {
     Density,
 }
 
-/// A trained colour model. Serialises with serde; what is loaded is checked.
+/// A trained color model. Serializes with serde; what is loaded is checked.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(try_from = "ModelFile", into = "ModelFile")]
 pub struct ColorModel {
@@ -52,7 +52,7 @@ pub(crate) struct ModelFile {
     pub(crate) foreground: Mixture,
     /// None under [`Rule::Density`].
     pub(crate) background: Option<Mixture>,
-    /// The share of the background whose colours may be anything.
+    /// The share of the background whose colors may be anything.
     pub(crate) unknown: f64,
     /// The share of the object's pixels among all.
     pub(crate) prior: f64,
@@ -111,7 +111,7 @@ impl TryFrom<ModelFile> for ColorModel {
                     component.constant += (1.0 - file.unknown).ln();
                 }
                 if file.unknown > 0.0 {
-                    // Equally likely everywhere in the space of colours.
+                    // Equally likely everywhere in the space of colors.
                     let constant = (file.unknown / file.space.volume()).ln();
                     background.push(Whitened { constant, a: Matrix3::zeros(), b: Vector3::zeros() });
                 }
@@ -126,7 +126,7 @@ impl TryFrom<ModelFile> for ColorModel {
 }
 
 impl ColorModel {
-    /// Whether a serialised model with this `schema` can be read here.
+    /// Whether a serialized model with this `schema` can be read here.
     ///
     /// # Errors
     /// [`SegmentError::Schema`].
@@ -158,17 +158,17 @@ impl ColorModel {
         self.file.cleanup.apply(self.classify(photo).view())
     }
 
-    /// The colour space.
+    /// The color space.
     pub fn space(&self) -> ColorSpace {
         self.file.space
     }
 
-    /// The object's colours.
+    /// The object's colors.
     pub fn foreground(&self) -> &Mixture {
         &self.file.foreground
     }
 
-    /// The background's colours, where they are modelled.
+    /// The background's colors, where they are modeled.
     pub fn background(&self) -> Option<&Mixture> {
         self.file.background.as_ref()
     }
@@ -178,7 +178,7 @@ impl ColorModel {
         self.file.threshold
     }
 
-    /// What colours are judged by.
+    /// What colors are judged by.
     pub fn rule(&self) -> Rule {
         self.file.rule
     }

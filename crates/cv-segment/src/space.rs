@@ -1,15 +1,15 @@
-//! The coordinates in which colours are modelled.
+//! The coordinates in which colors are modeled.
 
 use cv_imgproc::{rgb_pixel_to_hsv, rgb_pixel_to_lab};
 use serde::{Deserialize, Serialize};
 use std::f32::consts::{PI, TAU};
 
-/// A colour space.
+/// A color space.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ColorSpace {
     /// Hue, saturation, value. Hue is circular: it is measured from the object's circular mean hue, −π to π, so that the cut lies opposite the object and
-    /// averages are right (Mardia & Jupp, Directional Statistics). Modelling `(S cos H, S sin H, V)` instead, which has no cut at all, was measured and is worse:
+    /// averages are right (Mardia & Jupp, Directional Statistics). Modeling `(S cos H, S sin H, V)` instead, which has no cut at all, was measured and is worse:
     /// its components are wide where saturation varies under highlights and shadow.
     #[default]
     Hsv,
@@ -20,7 +20,7 @@ pub enum ColorSpace {
 }
 
 impl ColorSpace {
-    /// The coordinates of a colour. `hue` is the hue from which hues are measured, in radians; only HSV uses it.
+    /// The coordinates of a color. `hue` is the hue from which hues are measured, in radians; only HSV uses it.
     #[inline]
     pub fn coordinates(self, rgb: [u8; 3], hue: f32) -> [f32; 3] {
         match self {
@@ -33,7 +33,7 @@ impl ColorSpace {
         }
     }
 
-    /// Standard deviations that a step of one grey level makes about: differences below them mean nothing. For hue, at half saturation and value.
+    /// Standard deviations that a step of one gray level makes about: differences below them mean nothing. For hue, at half saturation and value.
     pub(crate) fn resolution(self) -> [f64; 3] {
         const STEP: f64 = 1.0 / 255.0;
         match self {
@@ -43,7 +43,7 @@ impl ColorSpace {
         }
     }
 
-    /// The volume that the colours of the screen take up. (Lab: that of the sRGB gamut.)
+    /// The volume that the colors of the screen take up. (Lab: that of the sRGB gamut.)
     pub(crate) fn volume(self) -> f64 {
         match self {
             Self::Hsv => f64::from(TAU),
@@ -60,7 +60,7 @@ pub(crate) fn wrap(angle: f32) -> f32 {
     if down < -PI { down + TAU } else { down }
 }
 
-/// The circular mean of hues, each weighing its weight times its saturation (a grey has no hue), 0 to 2π; 0 where there is none.
+/// The circular mean of hues, each weighing its weight times its saturation (a gray has no hue), 0 to 2π; 0 where there is none.
 pub(crate) fn mean_hue(samples: impl Iterator<Item = ([u8; 3], f64)>) -> f32 {
     let (mut x, mut y, mut total) = (0.0f64, 0.0f64, 0.0f64);
     for (rgb, weight) in samples {

@@ -23,27 +23,27 @@ pub enum Regions {
 /// Settings of [`train`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainOptions {
-    /// Colour space. Default HSV.
+    /// Color space. Default HSV.
     pub space: ColorSpace,
-    /// Gaussians for the object's colours, 1 to 64. Default 5.
+    /// Gaussians for the object's colors, 1 to 64. Default 5.
     pub components: usize,
-    /// Gaussians for the background's, 1 to 63. Default 10: there are more colours in the background than in an object.
+    /// Gaussians for the background's, 1 to 63. Default 10: there are more colors in the background than in an object.
     pub background_components: usize,
-    /// What a pixel's colour is judged by. Default posterior odds with a tuned threshold.
+    /// What a pixel's color is judged by. Default posterior odds with a tuned threshold.
     pub rule: Rule,
-    /// The share of the background that may have any colour, so that one never seen is not taken for the object only because the background's Gaussians are even
+    /// The share of the background that may have any color, so that one never seen is not taken for the object only because the background's Gaussians are even
     /// farther away. 0 to below 1; default 0.01.
     pub unknown: f64,
-    /// Standard deviation in pixels of the Gaussian by which scores are smoothed before they are held against the threshold: neighbours are mostly of one kind.
+    /// Standard deviation in pixels of the Gaussian by which scores are smoothed before they are held against the threshold: neighbors are mostly of one kind.
     /// 0 to 100; default 1.
     pub smoothing: f32,
     /// Added to each variance, in units of the variance of the samples. Default 1e-6.
-    pub regularisation: f64,
+    pub regularization: f64,
     /// Radius in pixels of the disc by which masks are opened. 0 to 1000; default 2.
     pub open_radius: usize,
     /// Radius in pixels of the disc by which masks are closed. 0 to 1000; default 2.
     pub close_radius: usize,
-    /// Which regions are kept. Default: learnt from the masks.
+    /// Which regions are kept. Default: learned from the masks.
     pub regions: Regions,
     /// Seed of the mixtures' first means. Default 1.
     pub seed: u64,
@@ -59,7 +59,7 @@ impl Default for TrainOptions {
             rule: Rule::default(),
             unknown: 0.01,
             smoothing: 1.0,
-            regularisation: 1e-6,
+            regularization: 1e-6,
             open_radius,
             close_radius,
             regions: Regions::default(),
@@ -79,15 +79,15 @@ impl TrainOptions {
         check("background_components", b as f64, (1..=63).contains(&b), "from 1 to 63")?;
         check("unknown", self.unknown, (0.0..1.0).contains(&self.unknown), "from 0 to below 1")?;
         check("smoothing", self.smoothing.into(), (0.0..=100.0).contains(&self.smoothing), "from 0 to 100 px")?;
-        let regularisation = self.regularisation;
-        check("regularisation", regularisation, (0.0..=1.0).contains(&regularisation), "from 0 to 1")?;
+        let regularization = self.regularization;
+        check("regularization", regularization, (0.0..=1.0).contains(&regularization), "from 0 to 1")?;
         check("open_radius", self.open_radius as f64, self.open_radius <= 1000, "from 0 to 1000 px")?;
         check("close_radius", self.close_radius as f64, self.close_radius <= 1000, "from 0 to 1000 px")
     }
 }
 
 /// A photo and the mask of the object in it.
-pub type Labelled<'a> = (ImageView<'a, u8, 3>, ImageView<'a, bool, 1>);
+pub type Labeled<'a> = (ImageView<'a, u8, 3>, ImageView<'a, bool, 1>);
 
 /// A model and what is known about its training.
 #[derive(Debug, Clone, PartialEq)]
@@ -102,30 +102,30 @@ pub struct Trained {
     pub background_pixels: u64,
 }
 
-/// Learns the object's colours, the background's, and the threshold between them.
+/// Learns the object's colors, the background's, and the threshold between them.
 ///
-/// Colours are counted in bins of four grey levels a side, so the time of fitting depends on how many different colours there are, not on the number of
+/// Colors are counted in bins of four gray levels a side, so the time of fitting depends on how many different colors there are, not on the number of
 /// pixels. A photo without the object (an empty mask) is welcome: it shows what is not the object.
 ///
 /// # Errors
 /// [`SegmentError`]: no photos, a mask of another size than its photo, no or all pixels marked, an option out of range.
-pub fn train(photos: &[Labelled<'_>], options: &TrainOptions) -> Result<Trained, SegmentError> {
+pub fn train(photos: &[Labeled<'_>], options: &TrainOptions) -> Result<Trained, SegmentError> {
     options.validate()?;
     if photos.is_empty() {
         return Err(SegmentError::NoPhotos);
     }
-    let mut colours = [Bins::new(), Bins::new()];
+    let mut colors = [Bins::new(), Bins::new()];
     for (index, (photo, mask)) in photos.iter().enumerate() {
         if photo.size() != mask.size() {
             return Err(SegmentError::SizeMismatch { index, photo: photo.size(), mask: mask.size() });
         }
         for y in 0..photo.height() {
             for (&rgb, &m) in photo.row(y).as_chunks::<3>().0.iter().zip(mask.row(y)) {
-                colours[usize::from(m)].add(rgb);
+                colors[usize::from(m)].add(rgb);
             }
         }
     }
-    let [background, foreground] = &colours;
+    let [background, foreground] = &colors;
     let counts = [foreground.total(), background.total()];
     if counts[0] == 0 {
         return Err(SegmentError::NoForeground { photos: photos.len() });
@@ -133,15 +133,15 @@ pub fn train(photos: &[Labelled<'_>], options: &TrainOptions) -> Result<Trained,
     if counts[1] == 0 {
         return Err(SegmentError::NoBackground { photos: photos.len() });
     }
-    let hue = if options.space == ColorSpace::Hsv { mean_hue(foreground.colours()) } else { 0.0 };
+    let hue = if options.space == ColorSpace::Hsv { mean_hue(foreground.colors()) } else { 0.0 };
     let fit = |bins: &Bins, components| {
         let sample =
             |(rgb, weight)| WeightedSample { point: options.space.coordinates(rgb, hue).map(f64::from), weight };
-        let samples: Vec<WeightedSample> = bins.colours().map(sample).collect();
+        let samples: Vec<WeightedSample> = bins.colors().map(sample).collect();
         let resolution = options.space.resolution();
         let settings = MixtureOptions {
             components,
-            regularisation: options.regularisation,
+            regularization: options.regularization,
             resolution,
             seed: options.seed,
             ..Default::default()
@@ -174,7 +174,7 @@ pub fn train(photos: &[Labelled<'_>], options: &TrainOptions) -> Result<Trained,
 }
 
 /// The threshold with the best F1 over all pixels of the photos, before cleaning up; the middle of the range around it that is within a thousandth of the best.
-fn best_threshold(model: &ColorModel, photos: &[Labelled<'_>]) -> f32 {
+fn best_threshold(model: &ColorModel, photos: &[Labeled<'_>]) -> f32 {
     const BINS: usize = 2000;
     let width = 2.0 * LIMIT / BINS as f32;
     let mut counts = vec![[0u64; 2]; BINS + 1];
@@ -202,7 +202,7 @@ fn best_threshold(model: &ColorModel, photos: &[Labelled<'_>]) -> f32 {
     ((first + last) as f32 * 0.5 * width - LIMIT).clamp(-LIMIT, LIMIT)
 }
 
-/// Counts of colours in bins of four grey levels a side, with the sums of what fell in.
+/// Counts of colors in bins of four gray levels a side, with the sums of what fell in.
 struct Bins {
     bins: Vec<[u64; 4]>,
 }
@@ -225,8 +225,8 @@ impl Bins {
         self.bins.iter().map(|b| b[0]).sum()
     }
 
-    /// The mean colour of each bin that holds any, and how many it holds.
-    fn colours(&self) -> impl Iterator<Item = ([u8; 3], f64)> + '_ {
+    /// The mean color of each bin that holds any, and how many it holds.
+    fn colors(&self) -> impl Iterator<Item = ([u8; 3], f64)> + '_ {
         self.bins.iter().filter(|b| b[0] > 0).map(|b| {
             let mean = |sum: u64| ((sum + b[0] / 2) / b[0]) as u8;
             ([mean(b[1]), mean(b[2]), mean(b[3])], b[0] as f64)
@@ -239,7 +239,7 @@ mod tests {
     use super::*;
     use cv_core::{Mask, RgbU8};
 
-    /// A coloured square on a grey that varies.
+    /// A colored square on a gray that varies.
     fn scene(color: [u8; 3], ground: [u8; 3]) -> (RgbU8, Mask) {
         let inside = |x: usize, y: usize| (20..50).contains(&x) && (15..40).contains(&y);
         let shade = |c: [u8; 3], x: usize, y: usize| c.map(|v| v.saturating_add(((x * 7 + y * 13) % 17) as u8));
@@ -248,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn red_on_both_sides_of_the_hue_cut_is_one_colour() {
+    fn red_on_both_sides_of_the_hue_cut_is_one_color() {
         // Half of the square at hue 350°, half at 10°: an average that is not circular lies at 180°, cyan, which is the background here.
         let (_, mask) = scene([0; 3], [0; 3]);
         let photo = RgbU8::from_fn(80, 60, |x, y| {
@@ -301,7 +301,7 @@ mod tests {
             TrainOptions { background_components: 64, ..options.clone() },
             TrainOptions { smoothing: f32::NAN, ..options.clone() },
             TrainOptions { unknown: 1.0, ..options.clone() },
-            TrainOptions { regularisation: -1.0, ..options.clone() },
+            TrainOptions { regularization: -1.0, ..options.clone() },
             TrainOptions { open_radius: 1001, ..options.clone() },
         ] {
             let error = with(&mask, &wrong);
@@ -313,7 +313,7 @@ mod tests {
     }
 
     #[test]
-    fn one_colour_everywhere_is_learnt_as_that() {
+    fn one_color_everywhere_is_learned_as_that() {
         // Nothing tells object from background: the scores say so.
         let (_, mask) = scene([0; 3], [0; 3]);
         let photo = RgbU8::new(80, 60, [77; 3]);

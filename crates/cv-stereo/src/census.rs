@@ -1,4 +1,4 @@
-//! The census transform (Zabih & Woodfill, ECCV 1994): what a pixel's neighbourhood looks like, in bits that no
+//! The census transform (Zabih & Woodfill, ECCV 1994): what a pixel's neighborhood looks like, in bits that no
 //! change of exposure touches.
 
 use crate::layout::Layout;
@@ -7,18 +7,18 @@ use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
 use rayon::prelude::*;
 
-/// Columns by which a row of grey values is continued on both sides: the largest radius of a window.
+/// Columns by which a row of gray values is continued on both sides: the largest radius of a window.
 pub(crate) const MARGIN: usize = 4;
 
-/// Grey values 0 to 65535, each row continued by [`MARGIN`] copies of its first and last value.
+/// Gray values 0 to 65535, each row continued by [`MARGIN`] copies of its first and last value.
 #[derive(Debug, Default)]
-pub(crate) struct Grey {
+pub(crate) struct Gray {
     pub(crate) values: Vec<u16>,
     pub(crate) width: usize,
     pub(crate) height: usize,
 }
 
-impl Grey {
+impl Gray {
     pub(crate) fn stride(&self) -> usize {
         self.width + 2 * MARGIN
     }
@@ -46,36 +46,36 @@ pub(crate) fn planes(window: Census, blend: Blend) -> usize {
 }
 
 /// Describes every pixel, into `out` (resized): the bytes of a row one after the other. Bit `i` of the census tells
-/// whether the `i`-th neighbour, row by row, is darker than the centre.
-pub(crate) fn describe(level: Level, grey: &Grey, window: Census, blend: Blend, out: &mut Vec<u8>) {
-    let stride = grey.width * planes(window, blend);
-    out.resize(stride * grey.height, 0);
-    out.par_chunks_mut(stride).enumerate().for_each(|(y, row)| describe_row(level, grey, window, blend, y, row));
+/// whether the `i`-th neighbor, row by row, is darker than the center.
+pub(crate) fn describe(level: Level, gray: &Gray, window: Census, blend: Blend, out: &mut Vec<u8>) {
+    let stride = gray.width * planes(window, blend);
+    out.resize(stride * gray.height, 0);
+    out.par_chunks_mut(stride).enumerate().for_each(|(y, row)| describe_row(level, gray, window, blend, y, row));
 }
 
 /// As [`describe`], each row mirrored and dealt out to the phases of `layout`: element `j` is column
 /// `width − 1 − min_disparity − j`, zero outside the image.
 pub(crate) fn describe_mirrored(
     level: Level,
-    grey: &Grey,
+    gray: &Gray,
     window: Census,
     blend: Blend,
     min_disparity: i64,
     layout: Layout,
     out: &mut Vec<u8>,
 ) {
-    let (width, planes) = (grey.width, planes(window, blend));
+    let (width, planes) = (gray.width, planes(window, blend));
     let (n, phase, len) = (layout.vectors(), layout.phase(width), layout.right_row(width));
     // Element of the last column, and where it would be were the row long enough on both sides.
     let first = -min_disparity;
     let inside = first.clamp(0, len as i64) as usize..(first + width as i64).clamp(0, len as i64) as usize;
     // One past the column of the first element inside.
     let columns = (width as i64 + first - inside.start as i64).max(0) as usize;
-    out.resize(planes * len * grey.height, 0);
+    out.resize(planes * len * gray.height, 0);
     out.par_chunks_mut(planes * len).enumerate().for_each_init(
         || (vec![0; width * planes], vec![0; len + n]),
         |(described, mirrored), (y, row)| {
-            describe_row(level, grey, window, blend, y, described);
+            describe_row(level, gray, window, blend, y, described);
             for (p, plane) in described.chunks_exact(width).enumerate() {
                 for (to, from) in mirrored[inside.clone()].iter_mut().zip(plane[..columns].iter().rev()) {
                     *to = *from;
@@ -102,24 +102,24 @@ fn every<const N: usize>(from: &[u8], to: &mut [u8], first: impl Fn([u8; N]) -> 
 }
 
 /// The bytes of row `y`, one after the other.
-fn describe_row(level: Level, grey: &Grey, window: Census, blend: Blend, y: usize, out: &mut [u8]) {
+fn describe_row(level: Level, gray: &Gray, window: Census, blend: Blend, y: usize, out: &mut [u8]) {
     let bytes = planes(window, Blend::None);
-    for (plane, row) in out.chunks_exact_mut(grey.width).enumerate() {
+    for (plane, row) in out.chunks_exact_mut(gray.width).enumerate() {
         if plane < bytes {
-            dispatch!(level, simd => census_row(simd, grey, window, plane, y, row));
+            dispatch!(level, simd => census_row(simd, gray, window, plane, y, row));
         } else {
-            dispatch!(level, simd => blend_row(simd, grey, blend, y, row));
+            dispatch!(level, simd => blend_row(simd, gray, blend, y, row));
         }
     }
 }
 
 #[simd]
-fn blend_row<S: Simd>(_: S, grey: &Grey, blend: Blend, y: usize, out: &mut [u8]) {
-    let row = grey.row(y as isize);
-    let width = grey.width;
+fn blend_row<S: Simd>(_: S, gray: &Gray, blend: Blend, y: usize, out: &mut [u8]) {
+    let row = gray.row(y as isize);
+    let width = gray.width;
     match blend {
         Blend::None => {}
-        Blend::Grey { per_bit, .. } => {
+        Blend::Gray { per_bit, .. } => {
             // Rounded; at most 255.
             let step = u32::from(per_bit) * 257;
             for (byte, &v) in out.iter_mut().zip(&row[MARGIN..]) {
@@ -127,34 +127,34 @@ fn blend_row<S: Simd>(_: S, grey: &Grey, blend: Blend, y: usize, out: &mut [u8])
             }
         }
         Blend::Gradient { per_bit, .. } => {
-            // Half the difference of the neighbours, 128 for none.
+            // Half the difference of the neighbors, 128 for none.
             let step = i32::from(per_bit) * 514;
-            let neighbours = row[MARGIN - 1..].iter().zip(&row[MARGIN + 1..]);
-            for (byte, (&before, &after)) in out[..width].iter_mut().zip(neighbours) {
+            let neighbors = row[MARGIN - 1..].iter().zip(&row[MARGIN + 1..]);
+            for (byte, (&before, &after)) in out[..width].iter_mut().zip(neighbors) {
                 *byte = (128 + (i32::from(after) - i32::from(before)) / step).clamp(0, 255) as u8;
             }
         }
     }
 }
 
-/// The neighbours of bits `8·plane` to `8·plane + 7`, of every pixel of row `y`.
+/// The neighbors of bits `8·plane` to `8·plane + 7`, of every pixel of row `y`.
 #[simd]
-fn census_row<S: Simd>(_: S, grey: &Grey, window: Census, plane: usize, y: usize, out: &mut [u8]) {
+fn census_row<S: Simd>(_: S, gray: &Gray, window: Census, plane: usize, y: usize, out: &mut [u8]) {
     let (w, h) = window.size();
     let (rx, ry) = (w / 2, h / 2);
-    let centre = &grey.row(y as isize)[MARGIN..MARGIN + grey.width];
+    let center = &gray.row(y as isize)[MARGIN..MARGIN + gray.width];
     out.fill(0);
     for bit in 0..8 {
         let index = plane * 8 + bit;
         if index >= window.bits() {
             break;
         }
-        // The centre itself, at index bits / 2, has no bit.
+        // The center itself, at index bits / 2, has no bit.
         let at = index + usize::from(index >= window.bits() / 2);
         let (dx, dy) = (at % w, at / w);
-        let row = grey.row(y as isize + dy as isize - ry as isize);
-        let neighbours = &row[MARGIN + dx - rx..][..grey.width];
-        for ((byte, &c), &n) in out.iter_mut().zip(centre).zip(neighbours) {
+        let row = gray.row(y as isize + dy as isize - ry as isize);
+        let neighbors = &row[MARGIN + dx - rx..][..gray.width];
+        for ((byte, &c), &n) in out.iter_mut().zip(center).zip(neighbors) {
             *byte |= u8::from(n < c) << bit;
         }
     }

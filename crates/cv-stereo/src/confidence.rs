@@ -22,7 +22,7 @@ pub(crate) fn confidence(winner: &Winner, state: PixelState) -> f32 {
 /// Sums that rise by `rise` per pixel place their minimum to within the bits by which they are uncertain over the rise; but the sums are
 /// of paths that share their costs, and smoothing averages what is least sure the most. The form and its factor are those that describe
 /// errors best on nine generated scenes of four kinds (seeds 300 to 304), as they are, at one stop less, and with noise of 3 and 8
-/// grey levels added: of each of the 36 pairs 53 to 78 % of the errors lie within one standard deviation and 88 % of all within two;
+/// gray levels added: of each of the 36 pairs 53 to 78 % of the errors lie within one standard deviation and 88 % of all within two;
 /// their tails are heavier than a normal distribution's. Stronger noise makes it too small, down to half of the errors within one.
 pub(crate) fn sigma(winner: &Winner, state: PixelState) -> f32 {
     if state != PixelState::Matched {

@@ -28,8 +28,8 @@ pub(crate) struct Frame<'a> {
     pub(crate) given: Option<&'a [u8]>,
     /// The most that the blend adds to the bits.
     pub(crate) blend_cap: Option<u8>,
-    /// Grey values of the left image, 0 to 255.
-    pub(crate) grey: &'a [u8],
+    /// Gray values of the left image, 0 to 255.
+    pub(crate) gray: &'a [u8],
     pub(crate) p1: u8,
     pub(crate) p2: &'a Penalties,
     /// Whether [`crate::winner::Winner::second`] is wanted.
@@ -47,7 +47,7 @@ impl Frame<'_> {
     }
 
     /// Costs of the pixels `xs` of row `y` at every disparity; 255 beyond the last one, which keeps those lanes from ever
-    /// winning or lending to their neighbours, since additions saturate. Groups are of `BLOCKS` blocks, and there is but
+    /// winning or lending to their neighbors, since additions saturate. Groups are of `BLOCKS` blocks, and there is but
     /// one where `SINGLE`.
     #[inline(always)]
     pub(crate) fn costs<S: Simd, const BLOCKS: usize, const SINGLE: bool>(
@@ -178,7 +178,7 @@ fn borders<S: Simd, const BLOCKS: usize>(simd: S, frame: &Frame<'_>, inside: Ran
     }
 }
 
-/// P2 − P1 by the absolute difference of neighbouring grey values.
+/// P2 − P1 by the absolute difference of neighboring gray values.
 #[derive(Debug, Clone)]
 pub(crate) struct Penalties {
     table: [u8; 256],

@@ -48,7 +48,7 @@ pub enum GeometryError {
 pub struct CloudPoint {
     /// X right, Y down, Z forward from the left camera, in the unit of the baseline.
     pub position: [f32; 3],
-    /// Colour in the left image.
+    /// Color in the left image.
     pub color: [u8; 3],
 }
 
@@ -134,7 +134,7 @@ impl StereoGeometry {
         depth
     }
 
-    /// The pixels of a depth map as points in space, row by row, with their colours. Pixels without a depth are left
+    /// The pixels of a depth map as points in space, row by row, with their colors. Pixels without a depth are left
     /// out; where the images differ in size, so is what only one of them has.
     pub fn cloud(&self, depth: ImageView<'_, f32, 1>, color: ImageView<'_, u8, 3>) -> Vec<CloudPoint> {
         let (width, height) = (depth.width().min(color.width()), depth.height().min(color.height()));

@@ -1,6 +1,6 @@
-//! Any image to the 16-bit grey that the matcher works on.
+//! Any image to the 16-bit gray that the matcher works on.
 
-use crate::census::{Grey, MARGIN};
+use crate::census::{Gray, MARGIN};
 use cv_core::{ImageView, Sample};
 use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
@@ -42,9 +42,9 @@ impl Intensity for f32 {
     }
 }
 
-/// Grey of `view` into `out` (resized), Rec. 601 weights for three or more channels. Returns how many samples are no
+/// Gray of `view` into `out` (resized), Rec. 601 weights for three or more channels. Returns how many samples are no
 /// numbers.
-pub(crate) fn to_grey<T: Intensity, const C: usize>(level: Level, view: ImageView<'_, T, C>, out: &mut Grey) -> usize {
+pub(crate) fn to_gray<T: Intensity, const C: usize>(level: Level, view: ImageView<'_, T, C>, out: &mut Gray) -> usize {
     let (width, height) = view.size();
     (out.width, out.height) = (width, height);
     let stride = out.stride();
@@ -58,7 +58,7 @@ pub(crate) fn to_grey<T: Intensity, const C: usize>(level: Level, view: ImageVie
         .map(|(y, row)| {
             let samples = view.row(y);
             let pixels = samples.as_chunks::<C>().0;
-            dispatch!(level, simd => grey_row(simd, pixels, &mut row[MARGIN..MARGIN + width]));
+            dispatch!(level, simd => gray_row(simd, pixels, &mut row[MARGIN..MARGIN + width]));
             let (first, last) = (row[MARGIN], row[MARGIN + width - 1]);
             row[..MARGIN].fill(first);
             row[MARGIN + width..].fill(last);
@@ -67,12 +67,12 @@ pub(crate) fn to_grey<T: Intensity, const C: usize>(level: Level, view: ImageVie
         .sum()
 }
 
-/// Grey of a row; integers throughout, so that every instruction set gives the same.
+/// Gray of a row; integers throughout, so that every instruction set gives the same.
 #[simd]
-fn grey_row<S: Simd, T: Intensity, const C: usize>(_: S, pixels: &[[T; C]], out: &mut [u16]) {
-    for (pixel, grey) in pixels.iter().zip(out) {
-        *grey = if C >= 3 {
-            // The weights add up to 2¹⁶, so that a grey pixel keeps its value.
+fn gray_row<S: Simd, T: Intensity, const C: usize>(_: S, pixels: &[[T; C]], out: &mut [u16]) {
+    for (pixel, gray) in pixels.iter().zip(out) {
+        *gray = if C >= 3 {
+            // The weights add up to 2¹⁶, so that a gray pixel keeps its value.
             let [r, g, b] = [pixel[0], pixel[1], pixel[2]].map(|v| u32::from(v.to_u16()));
             ((r * 19595 + g * 38470 + b * 7471 + 32768) >> 16) as u16
         } else {
@@ -87,12 +87,12 @@ mod tests {
     use cv_core::Image;
 
     #[test]
-    fn grey_in_colour_is_the_same_grey() {
-        let grey = Image::<u8, 1>::from_fn(256, 1, |x, _| [x as u8]);
-        let rgb = grey.map(|[v]| [v; 3]);
-        let (mut a, mut b) = (Grey::default(), Grey::default());
-        to_grey(Level::new(), grey.view(), &mut a);
-        to_grey(Level::new(), rgb.view(), &mut b);
+    fn gray_in_color_is_the_same_gray() {
+        let gray = Image::<u8, 1>::from_fn(256, 1, |x, _| [x as u8]);
+        let rgb = gray.map(|[v]| [v; 3]);
+        let (mut a, mut b) = (Gray::default(), Gray::default());
+        to_gray(Level::new(), gray.view(), &mut a);
+        to_gray(Level::new(), rgb.view(), &mut b);
         assert_eq!(a.values, b.values);
         assert_eq!((a.values[MARGIN], a.values[MARGIN + 255]), (0, 65535));
     }
@@ -100,8 +100,8 @@ mod tests {
     #[test]
     fn what_is_not_a_number_is_counted() {
         let image = Image::<f32, 1>::from_vec(2, 2, vec![0.5, f32::NAN, f32::INFINITY, 2.0]).unwrap();
-        let mut out = Grey::default();
-        assert_eq!(to_grey(Level::new(), image.view(), &mut out), 2);
+        let mut out = Gray::default();
+        assert_eq!(to_gray(Level::new(), image.view(), &mut out), 2);
         assert_eq!((out.values[MARGIN], out.values[out.stride() + MARGIN + 1]), (32768, 65535));
     }
 }

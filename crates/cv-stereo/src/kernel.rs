@@ -195,7 +195,7 @@ fn penalties<S: Simd, const PATHS: usize>(
 ) {
     let (width, height) = (frame.width, frame.height);
     let last = width - 1;
-    let row = |y: usize| &frame.grey[y * width..][..width];
+    let row = |y: usize| &frame.gray[y * width..][..width];
     let here = row(y);
     let before = row(if mirrored { (y + 1).min(height - 1) } else { y.saturating_sub(1) });
     let between = |a: &[u8], b: &[u8], out: &mut [u8]| frame.p2.between(simd, a, b, out);
@@ -416,7 +416,7 @@ impl<S: Simd> Step<S> {
                 if start + group < cost.len() { load(slot, start + group) } else { S::u8s::splat(simd, u8::MAX) };
             self.first.slide::<1>(next)
         };
-        // Never above 255, unlike neighbours beyond the last disparity.
+        // Never above 255, unlike neighbors beyond the last disparity.
         let step = below.min(above).min(self.jump) + p1;
         let cheapest = step.min(here);
         let extended = (cheapest - self.least).saturating_add(load(cost, at));

@@ -1,6 +1,6 @@
 //! In which order the disparities of a pixel lie in memory.
 //!
-//! They come in groups of 64 or 128, and within a group neighbouring disparities lie in neighbouring vectors rather than
+//! They come in groups of 64 or 128, and within a group neighboring disparities lie in neighboring vectors rather than
 //! lanes: of `n` vectors, lane `l` of vector `v` holds disparity `l·n + v`. A path that looks one disparity up and one
 //! down then finds both in vectors it has at hand, and moves lanes only at the two ends of a group.
 

@@ -1,10 +1,10 @@
 //! From a rectified pair to checked disparities.
 
-use crate::census::{Grey, describe, describe_mirrored, planes};
+use crate::census::{Gray, describe, describe_mirrored, planes};
 use crate::confidence::{confidence, sigma};
 use crate::cost::{Frame, Penalties};
 use crate::fill::{Holes, fill_holes};
-use crate::input::to_grey;
+use crate::input::to_gray;
 use crate::layout::Layout;
 use crate::plane::{self, fill_planes};
 use crate::sgm::Aggregator;
@@ -94,8 +94,8 @@ impl DisparityMap {
 pub struct StereoMatcher {
     options: StereoOptions,
     level: Level,
-    grey: [Grey; 2],
-    grey8: Vec<u8>,
+    gray: [Gray; 2],
+    gray8: Vec<u8>,
     /// Census bits and what the blend compares, of both views.
     described: [Vec<u8>; 2],
     aggregator: Aggregator,
@@ -119,8 +119,8 @@ impl StereoMatcher {
         Ok(Self {
             options,
             level: Level::new(),
-            grey: Default::default(),
-            grey8: Vec::new(),
+            gray: Default::default(),
+            gray8: Vec::new(),
             described: Default::default(),
             aggregator: Aggregator::default(),
             strip: Aggregator::default(),
@@ -139,7 +139,7 @@ impl StereoMatcher {
     }
 
     /// Bytes that matching images of this size takes, outputs included: about one byte per pixel and disparity for the
-    /// sums, and sixty per pixel (grey values 6, bits 3 to 8 of each view, winners 12, labels up to 8, the planes of the
+    /// sums, and sixty per pixel (gray values 6, bits 3 to 8 of each view, winners 12, labels up to 8, the planes of the
     /// smoothing 16, outputs and scratch 9). Under [`StereoOptions::max_memory`] the sums are those of a strip.
     pub fn memory(&self, width: usize, height: usize) -> usize {
         let rows = self.strip_rows(width, height).unwrap_or(height);
@@ -153,7 +153,7 @@ impl StereoMatcher {
         let planes = planes(options.census, options.blend);
         let strip = if rows < height { (rows + 2 * OVERLAP).min(height) } else { 0 };
         let whole = if rows < height { 0 } else { height };
-        // Grey of both views in 16 bits, of one in 8; winners of both views; labels, scratch and outputs.
+        // Gray of both views in 16 bits, of one in 8; winners of both views; labels, scratch and outputs.
         let fixed = 5 + planes + size_of::<Winner>() + size_of::<u16>() + 8 + 4 + 5;
         let stride = self.layout().right_row(width);
         Aggregator::bytes(width, strip.max(whole), self.layout())
@@ -205,8 +205,8 @@ impl StereoMatcher {
         }
         self.check_size(width, height)?;
         let start = Instant::now();
-        for (side, view, grey) in [("left", left, 0), ("right", right, 1)] {
-            let count = to_grey(self.level, view, &mut self.grey[grey]);
+        for (side, view, gray) in [("left", left, 0), ("right", right, 1)] {
+            let count = to_gray(self.level, view, &mut self.gray[gray]);
             if count > 0 {
                 return Err(StereoError::NotFinite { side, count });
             }
@@ -220,7 +220,7 @@ impl StereoMatcher {
         self.check(map);
         self.refine(map);
         self.stages = [
-            ("grey", (prepared - start).as_secs_f64()),
+            ("gray", (prepared - start).as_secs_f64()),
             ("bits", (described - prepared).as_secs_f64()),
             ("aggregate", (aggregated - described).as_secs_f64()),
             ("check", aggregated.elapsed().as_secs_f64()),
@@ -228,7 +228,7 @@ impl StereoMatcher {
         Ok(())
     }
 
-    /// What the last pair took in seconds, stage by stage: grey values, description of the pixels, costs and path sums,
+    /// What the last pair took in seconds, stage by stage: gray values, description of the pixels, costs and path sums,
     /// checks and refinement.
     pub fn stages(&self) -> &[(&'static str, f64)] {
         &self.stages
@@ -298,9 +298,9 @@ impl StereoMatcher {
         let (level, layout) = (self.level, self.layout());
         let StereoOptions { census, blend, min_disparity, .. } = self.options;
         let [left, right] = &mut self.described;
-        describe(level, &self.grey[0], census, blend, left);
-        describe_mirrored(level, &self.grey[1], census, blend, i64::from(min_disparity), layout, right);
-        self.grey[0].to_bytes(&mut self.grey8);
+        describe(level, &self.gray[0], census, blend, left);
+        describe_mirrored(level, &self.gray[1], census, blend, i64::from(min_disparity), layout, right);
+        self.gray[0].to_bytes(&mut self.gray8);
     }
 
     /// Costs and path sums; winners of both views.
@@ -322,7 +322,7 @@ impl StereoMatcher {
                 right: &self.described[1][rows.start * stride..rows.end * stride],
                 given: None,
                 blend_cap: (options.blend != Blend::None).then(|| options.blend.cap()),
-                grey: &self.grey8[rows.start * width..rows.end * width],
+                gray: &self.gray8[rows.start * width..rows.end * width],
                 p1: options.p1,
                 p2: &p2,
                 second: options.confidence || options.uniqueness > 0,
@@ -375,7 +375,7 @@ impl StereoMatcher {
         remove_speckles(disparity, states, width, options.speckle_size, options.speckle_range, &mut self.speckles);
         if options.fill {
             fill_holes(self.level, disparity, states, width, &mut self.holes);
-            fill_planes(disparity, states, &self.grey8, width, &mut self.large_holes);
+            fill_planes(disparity, states, &self.gray8, width, &mut self.large_holes);
         }
         if options.median > 0 {
             median::median(self.level, disparity, width, options.median, &mut self.scratch);
@@ -384,7 +384,7 @@ impl StereoMatcher {
                 .zip(self.scratch.par_chunks(1 << 16))
                 .for_each(|(d, s)| d.copy_from_slice(s));
         }
-        smooth(self.level, options.smoothing, disparity, states, &self.grey8, width, &mut self.planes);
+        smooth(self.level, options.smoothing, disparity, states, &self.gray8, width, &mut self.planes);
     }
 }
 
@@ -467,10 +467,10 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_of_one_colour_matches_nowhere() {
-        let grey = GrayU8::new(60, 40, [77]);
+    fn a_picture_of_one_color_matches_nowhere() {
+        let gray = GrayU8::new(60, 40, [77]);
         let mut matcher = StereoMatcher::new(StereoOptions { disparities: 24, ..Default::default() }).unwrap();
-        let map = matcher.compute(grey.view(), grey.view()).unwrap();
+        let map = matcher.compute(gray.view(), gray.view()).unwrap();
         assert_eq!((map.matched_fraction(), map.valid_fraction()), (0.0, 0.0));
     }
 }

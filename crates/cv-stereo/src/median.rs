@@ -39,8 +39,8 @@ const BLOCK: usize = 32;
 
 /// The definition.
 fn median_at(disparity: &[f32], width: usize, height: usize, radius: usize, x: usize, y: usize) -> f32 {
-    let centre = disparity[y * width + x];
-    if centre.is_nan() {
+    let center = disparity[y * width + x];
+    if center.is_nan() {
         return f32::NAN;
     }
     let (top, bottom) = (y.saturating_sub(radius), (y + radius).min(height - 1));

@@ -2,7 +2,7 @@
 
 use crate::StereoError;
 
-/// The neighbourhood a pixel is described by: one bit per neighbour, set where it is darker than the centre.
+/// The neighborhood a pixel is described by: one bit per neighbor, set where it is darker than the center.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Census {
     /// 5×5, 24 bits: finest detail, least support in weak texture.
@@ -23,7 +23,7 @@ impl Census {
         }
     }
 
-    /// Number of neighbours compared.
+    /// Number of neighbors compared.
     pub fn bits(self) -> usize {
         let (w, h) = self.size();
         w * h - 1
@@ -36,16 +36,16 @@ impl Census {
 pub enum Blend {
     /// Nothing.
     None,
-    /// The absolute difference of their grey values (AD-Census; Mei et al., ICCV workshops 2011).
-    Grey {
-        /// Grey levels (of 255) that count as one bit; 1 or more.
+    /// The absolute difference of their gray values (AD-Census; Mei et al., ICCV workshops 2011).
+    Gray {
+        /// Gray levels (of 255) that count as one bit; 1 or more.
         per_bit: u8,
         /// The most that is added.
         cap: u8,
     },
     /// The absolute difference of their horizontal gradients, which a change of exposure only scales.
     Gradient {
-        /// Grey levels per pixel (of 255) that count as one bit; 1 or more.
+        /// Gray levels per pixel (of 255) that count as one bit; 1 or more.
         per_bit: u8,
         /// The most that is added.
         cap: u8,
@@ -57,7 +57,7 @@ impl Blend {
     pub fn cap(self) -> u8 {
         match self {
             Self::None => 0,
-            Self::Grey { cap, .. } | Self::Gradient { cap, .. } => cap,
+            Self::Gray { cap, .. } | Self::Gradient { cap, .. } => cap,
         }
     }
 }
@@ -91,7 +91,7 @@ pub enum Smoothing {
     None,
     /// Outlines move to the edges of the photograph, and pixels of a surface are averaged over 9×9 px.
     Bilateral {
-        /// Grey levels (of 255) between pixels at which they have no more to say to each other; positive. Default 24: on
+        /// Gray levels (of 255) between pixels at which they have no more to say to each other; positive. Default 24: on
         /// sixteen generated scenes of four kinds (rooms, tables, balls, posters; seeds 100 to 103, both cameras with noise,
         /// half at one stop less) 16 to 32 leave 1.64 % of errors above 1 px, 8 leaves 1.71 and 56 leaves 1.66.
         sigma: f32,
@@ -100,7 +100,7 @@ pub enum Smoothing {
     LeastSquares {
         /// How smooth; positive. OpenCV's default is 8000.
         lambda: f32,
-        /// Grey levels (of 255) between neighbours at which smoothing has fallen to 1/e; positive. OpenCV's default is
+        /// Gray levels (of 255) between neighbors at which smoothing has fallen to 1/e; positive. OpenCV's default is
         /// 1.5.
         sigma: f32,
     },
@@ -117,7 +117,7 @@ pub struct StereoOptions {
     pub census: Census,
     /// What is added to the differing bits. Default nothing.
     pub blend: Blend,
-    /// Penalty for a disparity step of one pixel between neighbours. Default 4 (Pandora's default for census 5×5).
+    /// Penalty for a disparity step of one pixel between neighbors. Default 4 (Pandora's default for census 5×5).
     pub p1: u8,
     /// Penalty for a larger step where the image is smooth. Default 20 (likewise).
     pub p2: u8,
@@ -125,7 +125,7 @@ pub struct StereoOptions {
     /// `p2_gradient` left the fewest errors of twelve settings on generated scenes (rooms, tables, a ball and a poster wall, seeds
     /// 300 to 305, half of them at one stop less).
     pub p2_min: u8,
-    /// Grey levels (of 255) between neighbours at which `p2` has fallen half way to `p2_min`; 0 keeps `p2` everywhere.
+    /// Gray levels (of 255) between neighbors at which `p2` has fallen half way to `p2_min`; 0 keeps `p2` everywhere.
     /// Default 8.
     pub p2_gradient: u8,
     /// Directions of aggregation. Default eight.
@@ -138,13 +138,13 @@ pub struct StereoOptions {
     pub left_right: Option<u16>,
     /// Connected patches of up to this many pixels are removed; 0 removes none. Default 100 (OpenCV's samples).
     pub speckle_size: usize,
-    /// Neighbours that differ by no more than this many px belong to one patch. Default 2.
+    /// Neighbors that differ by no more than this many px belong to one patch. Default 2.
     pub speckle_range: f32,
     /// Sub-pixel placement. Default [`Subpixel::CorrectedVFit`].
     pub subpixel: Subpixel,
     /// Radius in px of the median filter; 0 for none, 1 or 2. Default 1 (3×3).
     pub median: usize,
-    /// Edge-preserving smoothing, last of all. Default [`Smoothing::Bilateral`] of 24 grey levels: on rendered scenes and
+    /// Edge-preserving smoothing, last of all. Default [`Smoothing::Bilateral`] of 24 gray levels: on rendered scenes and
     /// on photographs, errors above 1 px fall by a tenth.
     pub smoothing: Smoothing,
     /// Whether rejected pixels get a disparity from their surroundings (background side where occluded, the plane of
@@ -211,7 +211,7 @@ impl StereoOptions {
                 "at most 254 less the bits of the census window and the cap of the blend",
             );
         }
-        if matches!(self.blend, Blend::Grey { per_bit: 0, .. } | Blend::Gradient { per_bit: 0, .. }) {
+        if matches!(self.blend, Blend::Gray { per_bit: 0, .. } | Blend::Gradient { per_bit: 0, .. }) {
             return bad("per_bit", 0.0, "1 or more");
         }
         if self.uniqueness > 99 {

@@ -19,34 +19,34 @@ pub struct PathSums {
     p2: Penalties,
     width: usize,
     height: usize,
-    grey: Vec<u8>,
+    gray: Vec<u8>,
     costs: Aligned<u8>,
     sums: [Aligned<u8>; 2],
     sweeps: [Sweep; 2],
 }
 
 impl PathSums {
-    /// Path sums of `cost(x, y, k)`, at index `k` of [`StereoOptions::disparities`], guided by `grey`. Costs may be as
+    /// Path sums of `cost(x, y, k)`, at index `k` of [`StereoOptions::disparities`], guided by `gray`. Costs may be as
     /// large as the bits of [`StereoOptions::census`].
     ///
     /// # Errors
     /// [`StereoError`] for options out of range.
     pub fn new(
         options: StereoOptions,
-        grey: ImageView<'_, u8, 1>,
+        gray: ImageView<'_, u8, 1>,
         cost: impl Fn(usize, usize, usize) -> u8,
     ) -> Result<Self, StereoError> {
-        Self::at_level(Level::new(), options, grey, cost)
+        Self::at_level(Level::new(), options, gray, cost)
     }
 
     fn at_level(
         level: Level,
         options: StereoOptions,
-        grey: ImageView<'_, u8, 1>,
+        gray: ImageView<'_, u8, 1>,
         cost: impl Fn(usize, usize, usize) -> u8,
     ) -> Result<Self, StereoError> {
         options.validate()?;
-        let (width, height) = grey.size();
+        let (width, height) = gray.size();
         let layout = Layout::new(level, options.disparities);
         let volume = || {
             let mut volume = Aligned::default();
@@ -59,7 +59,7 @@ impl PathSums {
                 costs[place(k, layout.group, layout.lanes)] = cost(i % width, i / width, k);
             }
         }
-        let grey = (0..height).flat_map(|y| (0..width).map(move |x| grey.at(x, y)[0])).collect();
+        let gray = (0..height).flat_map(|y| (0..width).map(move |x| gray.at(x, y)[0])).collect();
         let p2 = Penalties::new(&options);
         Ok(Self {
             options,
@@ -68,7 +68,7 @@ impl PathSums {
             p2,
             width,
             height,
-            grey,
+            gray,
             costs,
             sums: [volume(), volume()],
             sweeps: Default::default(),
@@ -88,7 +88,7 @@ impl PathSums {
             right: &[],
             given: Some(self.costs.as_mut_slice()),
             blend_cap: None,
-            grey: &self.grey,
+            gray: &self.gray,
             p1: self.options.p1,
             p2: &self.p2,
             second: false,
@@ -157,14 +157,14 @@ mod tests {
     fn path_sums_of_given_costs_are_those_by_definition_on_every_instruction_set() {
         let (width, height) = (37, 11);
         let cost = |x: usize, y: usize, k: usize| ((x * 7919 + y * 104_729 + k * 31 + x * k) % 97 % 25) as u8;
-        let grey = GrayU8::from_fn(width, height, |_, _| [100]);
+        let gray = GrayU8::from_fn(width, height, |_, _| [100]);
         // One group, with and without lanes that only pad, and two.
         for disparities in [50, 128, 256] {
             let options = StereoOptions { disparities, ..Default::default() };
             let (p1, p2) = (u16::from(options.p1), u16::from(options.p2));
             let expected = sums_plain((width as i64, height as i64), disparities, cost, p1, p2);
             for level in instruction_sets() {
-                let mut sums = PathSums::at_level(level, options.clone(), grey.view(), cost).unwrap();
+                let mut sums = PathSums::at_level(level, options.clone(), gray.view(), cost).unwrap();
                 // Twice, so that what a run leaves behind would show.
                 for _ in 0..2 {
                     sums.run();

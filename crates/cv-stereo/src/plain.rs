@@ -6,7 +6,7 @@ use crate::{Blend, Paths, StereoOptions};
 /// Winners of the left image and indices of the right one's, row by row.
 pub(crate) fn match_plain(
     options: &StereoOptions,
-    grey: &[u16],
+    gray: &[u16],
     left: &[u64],
     right: &[u64],
     blend: &[Vec<u8>; 2],
@@ -55,7 +55,7 @@ pub(crate) fn match_plain(
                     }
                 } else {
                     let (px, py) = (px as usize, py as usize);
-                    let step = (grey[y * width + x] >> 8).abs_diff(grey[py * width + px] >> 8);
+                    let step = (gray[y * width + x] >> 8).abs_diff(gray[py * width + px] >> 8);
                     let p2 = u32::from(table[usize::from(step)]);
                     let before: Vec<u32> = path[(py * width + px) * n..][..n].to_vec();
                     let least = before.iter().copied().min().unwrap_or(0);
@@ -110,7 +110,7 @@ pub(crate) fn match_plain(
 
 mod tests {
     use super::*;
-    use crate::census::{Grey, MARGIN, describe, describe_mirrored, planes};
+    use crate::census::{Gray, MARGIN, describe, describe_mirrored, planes};
     use crate::cost::{Frame, Penalties};
     use crate::layout::Layout;
     use crate::sgm::Aggregator;
@@ -119,10 +119,10 @@ mod tests {
     use proptest::prelude::*;
 
     /// Census bits by definition.
-    fn census_plain(grey: &[u16], width: usize, height: usize, window: Census) -> Vec<u64> {
+    fn census_plain(gray: &[u16], width: usize, height: usize, window: Census) -> Vec<u64> {
         let (w, h) = window.size();
         let at = |x: i64, y: i64| {
-            grey[y.clamp(0, height as i64 - 1) as usize * width + x.clamp(0, width as i64 - 1) as usize]
+            gray[y.clamp(0, height as i64 - 1) as usize * width + x.clamp(0, width as i64 - 1) as usize]
         };
         (0..width * height)
             .map(|i| {
@@ -143,30 +143,30 @@ mod tests {
     }
 
     /// What the blend compares, by definition.
-    fn blend_plain(grey: &[u16], width: usize, blend: Blend) -> Vec<u8> {
+    fn blend_plain(gray: &[u16], width: usize, blend: Blend) -> Vec<u8> {
         let value = |i: usize| {
-            let at = |x: usize| i32::from(grey[i / width * width + x]);
+            let at = |x: usize| i32::from(gray[i / width * width + x]);
             let x = i % width;
             match blend {
                 Blend::None => 0,
-                Blend::Grey { per_bit, .. } => (f64::from(at(x)) / 257.0 / f64::from(per_bit) + 1e-9).round() as u8,
+                Blend::Gray { per_bit, .. } => (f64::from(at(x)) / 257.0 / f64::from(per_bit) + 1e-9).round() as u8,
                 Blend::Gradient { per_bit, .. } => {
                     let slope = at((x + 1).min(width - 1)) - at(x.saturating_sub(1));
                     (128.0 + (f64::from(slope) / 514.0 / f64::from(per_bit)).trunc()).clamp(0.0, 255.0) as u8
                 }
             }
         };
-        (0..grey.len()).map(value).collect()
+        (0..gray.len()).map(value).collect()
     }
 
-    fn padded(values: &[u16], width: usize, height: usize) -> Grey {
-        let mut grey = Grey { values: Vec::new(), width, height };
+    fn padded(values: &[u16], width: usize, height: usize) -> Gray {
+        let mut gray = Gray { values: Vec::new(), width, height };
         for row in values.chunks_exact(width) {
-            grey.values.extend([row[0]; MARGIN]);
-            grey.values.extend_from_slice(row);
-            grey.values.extend([row[width - 1]; MARGIN]);
+            gray.values.extend([row[0]; MARGIN]);
+            gray.values.extend_from_slice(row);
+            gray.values.extend([row[width - 1]; MARGIN]);
         }
-        grey
+        gray
     }
 
     fn options() -> impl Strategy<Value = StereoOptions> {
@@ -175,7 +175,7 @@ mod tests {
         let disparities = prop_oneof![1usize..70, Just(64), Just(128), 120usize..300];
         let blend = prop_oneof![
             Just(Blend::None),
-            (1u8.., 0u8..40).prop_map(|(per_bit, cap)| Blend::Grey { per_bit, cap }),
+            (1u8.., 0u8..40).prop_map(|(per_bit, cap)| Blend::Gray { per_bit, cap }),
             (1u8.., 0u8..40).prop_map(|(per_bit, cap)| Blend::Gradient { per_bit, cap }),
         ];
         (window, disparities, -40i32..40, 0u8..30, 0u8..60, 0u8..60, 0u8..40, any::<bool>(), blend).prop_map(
@@ -203,14 +203,14 @@ mod tests {
             width in 9usize..40,
             height in 7usize..16,
             seed in any::<u64>(),
-            levels_of_grey in prop_oneof![Just(2u16), Just(5), Just(200)],
+            levels_of_gray in prop_oneof![Just(2u16), Just(5), Just(200)],
         ) {
             options.validate().unwrap();
             // A splitmix sequence: noise on the left, shifted noise on the right.
             let noise = |i: usize| {
                 let mut z = seed.wrapping_add((i as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15));
                 z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-                ((z >> 40) as u16 % levels_of_grey) * (65535 / levels_of_grey)
+                ((z >> 40) as u16 % levels_of_gray) * (65535 / levels_of_gray)
             };
             let left: Vec<u16> = (0..width * height).map(noise).collect();
             let right: Vec<u16> = (0..width * height).map(|i| noise(if i % 5 == 0 { i + 7 } else { i + 3 })).collect();
@@ -218,19 +218,19 @@ mod tests {
             let blended = [&left, &right].map(|g| blend_plain(g, width, options.blend));
             let expected = match_plain(&options, &left, &bits[0], &bits[1], &blended, width, height);
 
-            let grey = [padded(&left, width, height), padded(&right, width, height)];
+            let gray = [padded(&left, width, height), padded(&right, width, height)];
             let min_disparity = i64::from(options.min_disparity);
             let StereoOptions { census, blend, disparities, .. } = options;
             let p2 = Penalties::new(&options);
             for level in instruction_sets() {
                 let layout = Layout::new(level, disparities);
                 let (mut a, mut b, mut bytes) = (Vec::new(), Vec::new(), Vec::new());
-                describe(level, &grey[0], census, blend, &mut a);
-                describe_mirrored(level, &grey[1], census, blend, min_disparity, layout, &mut b);
-                grey[0].to_bytes(&mut bytes);
+                describe(level, &gray[0], census, blend, &mut a);
+                describe_mirrored(level, &gray[1], census, blend, min_disparity, layout, &mut b);
+                gray[0].to_bytes(&mut bytes);
                 let frame = Frame {
                     width, height, min_disparity, disparities, layout, planes: planes(census, blend),
-                    left: &a, right: &b, grey: &bytes,
+                    left: &a, right: &b, gray: &bytes,
                     given: None,
                     blend_cap: (blend != Blend::None).then_some(blend.cap()),
                     p1: options.p1, p2: &p2, second: options.confidence,

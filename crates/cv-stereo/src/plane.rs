@@ -16,7 +16,7 @@ const MAX_SAMPLES: usize = 128;
 const MIN_SAMPLES: usize = 12;
 /// Samples lie up to so many pixels beyond the hole.
 const RING: usize = 2;
-/// Grey levels up to which a pixel beside a hole looks like it.
+/// Gray levels up to which a pixel beside a hole looks like it.
 const ALIKE: u8 = 36;
 /// What counts as on the plane, in px.
 const ON_PLANE: f64 = 1.0;
@@ -66,11 +66,11 @@ struct Plane {
 }
 
 /// Fills those 4-connected holes of [`PixelState::Mismatched`] pixels that have 100 pixels or more and whose surroundings of
-/// the same grey lie on one plane. Linear in the number of pixels.
+/// the same gray lie on one plane. Linear in the number of pixels.
 pub(crate) fn fill_planes(
     disparity: &mut [f32],
     states: &[PixelState],
-    grey: &[u8],
+    gray: &[u8],
     width: usize,
     memory: &mut Planes,
 ) {
@@ -101,7 +101,7 @@ pub(crate) fn fill_planes(
     for (i, run) in runs.iter().enumerate() {
         let place = sizes[find(parents, i as u32) as usize];
         if let Some(samples) = samples.get_mut(place) {
-            collect(disparity, states, grey, width, run, samples);
+            collect(disparity, states, gray, width, run, samples);
         }
     }
     samples[..large].par_iter().map(|samples| fit(samples)).collect_into_vec(planes);
@@ -157,7 +157,7 @@ fn next(row: &[PixelState], x: usize) -> Option<usize> {
 fn collect(
     disparity: &[f32],
     states: &[PixelState],
-    grey: &[u8],
+    gray: &[u8],
     width: usize,
     &Run { y, start, end }: &Run,
     samples: &mut Vec<Sample>,
@@ -165,7 +165,7 @@ fn collect(
     let height = disparity.len() / width;
     let mut take = |x: usize, y: usize, beside: usize| {
         let at = y * width + x;
-        let alike = grey[at].abs_diff(grey[beside]) <= ALIKE;
+        let alike = gray[at].abs_diff(gray[beside]) <= ALIKE;
         if states[at] == PixelState::Matched && alike && disparity[at].is_finite() {
             samples.push(Sample { x: x as f64, y: y as f64, d: f64::from(disparity[at]) });
         }
@@ -293,14 +293,14 @@ mod tests {
         let states: Vec<PixelState> = (0..WIDTH * HEIGHT)
             .map(|i| if (20..35).contains(&(i / WIDTH)) { PixelState::Mismatched } else { PixelState::Matched })
             .collect();
-        let grey: Vec<u8> = (0..WIDTH * HEIGHT).map(|i| if i / WIDTH < 20 { 0 } else { 200 }).collect();
+        let gray: Vec<u8> = (0..WIDTH * HEIGHT).map(|i| if i / WIDTH < 20 { 0 } else { 200 }).collect();
         let value = |i: usize| match i / WIDTH {
             0..20 => 1.0,
             20..35 => f32::NAN,
             _ => 30.0,
         };
         let mut d: Vec<f32> = (0..WIDTH * HEIGHT).map(value).collect();
-        fill_planes(&mut d, &states, &grey, WIDTH, &mut Planes::default());
+        fill_planes(&mut d, &states, &gray, WIDTH, &mut Planes::default());
         // Exact but for the ridge, which holds the slope at the zero that it has.
         assert!(d[20 * WIDTH..35 * WIDTH].iter().all(|d| (d - 30.0).abs() < 1e-3));
     }

@@ -193,9 +193,9 @@ impl Rectification {
         if !(0.0..=1.0).contains(&options.alpha) {
             return Err(RectifyError::Option { name: "alpha", value: options.alpha, allowed: "from 0 to 1" });
         }
-        let centre = rig.right_from_left.center();
-        let vertical = centre.y.abs() > centre.x.abs();
-        let along = if vertical { centre.y } else { centre.x };
+        let center = rig.right_from_left.center();
+        let vertical = center.y.abs() > center.x.abs();
+        let along = if vertical { center.y } else { center.x };
         if along < 0.0 {
             return Err(RectifyError::Exchanged { distance: -along, vertical });
         }
@@ -244,7 +244,7 @@ impl Rectification {
     }
 }
 
-/// The direction from the left camera's centre to the right one's, in the left one's frame, and its length; the cameras are checked.
+/// The direction from the left camera's center to the right one's, in the left one's frame, and its length; the cameras are checked.
 pub(crate) fn along_the_baseline(rig: &StereoRig) -> Result<(Vector3<f64>, f64), RectifyError> {
     for (side, camera) in [("left", &rig.left), ("right", &rig.right)] {
         camera.validate().map_err(|error| RectifyError::Camera { side, error })?;
@@ -272,7 +272,7 @@ pub(crate) fn rotations(x: Vector3<f64>, relative: &Rotation3<f64>) -> Result<[R
     Ok([to_common, to_common * relative.inverse()])
 }
 
-/// A rectangle in normalised coordinates.
+/// A rectangle in normalized coordinates.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Rect {
     pub(crate) left: f64,
@@ -373,7 +373,7 @@ fn common_camera(
     };
     let inner = Point2::new(both.x + (x.0 + x.1) / 2.0, both.y + (y.0 + y.1) / 2.0);
     let inner = if reach_of_both(inner, 0).is_some() { inner } else { both };
-    // Pixel centres at the very corners.
+    // Pixel centers at the very corners.
     let (w, h) = ((width as f64 - 1.0).max(1.0), (height as f64 - 1.0).max(1.0));
     let camera = |focal: f64, middle: Point2<f64>| Camera {
         width,
@@ -414,13 +414,13 @@ mod tests {
     use cv_core::Pose;
     use proptest::prelude::*;
 
-    fn rig(angles: (f64, f64, f64), centre: Vector3<f64>, k1: f64) -> StereoRig {
+    fn rig(angles: (f64, f64, f64), center: Vector3<f64>, k1: f64) -> StereoRig {
         let mut left = Camera::pinhole(640, 480, 520.0, 515.0, 322.0, 236.0);
         left.distortion = Distortion::BrownConrady { k1, k2: 0.05, p1: 0.001, p2: -0.001, k3: 0.0 };
         let mut right = Camera::pinhole(640, 480, 530.0, 533.0, 310.0, 245.0);
         right.distortion = Distortion::Radial { k1: k1 * 0.9, k2: 0.03 };
         let rotation = Rotation3::from_euler_angles(angles.0, angles.1, angles.2);
-        StereoRig { left, right, right_from_left: Pose::new(rotation, -(rotation * centre)) }
+        StereoRig { left, right, right_from_left: Pose::new(rotation, -(rotation * center)) }
     }
 
     proptest! {
@@ -433,8 +433,8 @@ mod tests {
             k1 in -0.2..0.05f64,
             p in (-0.4..0.4f64, -0.3..0.3f64, 2.0..6.0f64),
         ) {
-            let centre = if vertical { Vector3::new(offset.0, 0.2, offset.1) } else { Vector3::new(0.2, offset.0, offset.1) };
-            let rig = rig(angles, centre, k1);
+            let center = if vertical { Vector3::new(offset.0, 0.2, offset.1) } else { Vector3::new(0.2, offset.0, offset.1) };
+            let rig = rig(angles, center, k1);
             let rectified = Rectification::new(&rig, &RectifyOptions { alpha, size: None }).unwrap();
             prop_assert_eq!(rectified.vertical, vertical);
             let point = Point3::new(p.0, p.1, p.2);
@@ -523,7 +523,7 @@ mod tests {
     #[test]
     fn rigs_that_are_none_are_refused_with_the_reason() {
         let refuse =
-            |angles, centre| Rectification::new(&rig(angles, centre, 0.0), &RectifyOptions::default()).unwrap_err();
+            |angles, center| Rectification::new(&rig(angles, center, 0.0), &RectifyOptions::default()).unwrap_err();
         assert!(matches!(refuse((0.0, 0.0, 0.0), Vector3::zeros()), RectifyError::NoBaseline { baseline: 0.0 }));
         assert!(matches!(
             refuse((0.0, 0.0, 0.0), Vector3::new(-0.2, 0.0, 0.0)),

@@ -61,7 +61,7 @@ impl SceneRectification {
         growth.sort_unstable_by(f64::total_cmp);
         let focal = 1.0 / growth[growth.len() / 2];
         let at = |share: f64| inverse[((inverse.len() - 1) as f64 * share).round() as usize];
-        // Normalised disparities: baseline over depth.
+        // Normalized disparities: baseline over depth.
         let (low, high) = (baseline * at(TAIL), baseline * at(1.0 - TAIL));
         let more = 0.25 * (high - low) + 4.0 / focal;
         let (low, high) = ((low - more).max(0.0), high + more);
@@ -104,12 +104,12 @@ mod tests {
     use cv_core::{Distortion, Pose, Rotation3, Vector3};
     use proptest::prelude::*;
 
-    fn rig(angles: [f64; 3], centre: Vector3<f64>) -> StereoRig {
+    fn rig(angles: [f64; 3], center: Vector3<f64>) -> StereoRig {
         let mut left = Camera::pinhole(640, 480, 520.0, 515.0, 322.0, 236.0);
         left.distortion = Distortion::Radial { k1: -0.1, k2: 0.02 };
         let right = Camera::pinhole(600, 500, 530.0, 533.0, 310.0, 245.0);
         let rotation = Rotation3::from_euler_angles(angles[0], angles[1], angles[2]);
-        StereoRig { left, right, right_from_left: Pose::new(rotation, -(rotation * centre)) }
+        StereoRig { left, right, right_from_left: Pose::new(rotation, -(rotation * center)) }
     }
 
     /// Points that both cameras see.
@@ -187,7 +187,7 @@ mod tests {
 
     #[test]
     fn what_cannot_be_rectified_is_refused_with_the_reason() {
-        let get = |centre, points: &[Point3<f64>]| SceneRectification::new(&rig([0.0; 3], centre), points).unwrap_err();
+        let get = |center, points: &[Point3<f64>]| SceneRectification::new(&rig([0.0; 3], center), points).unwrap_err();
         let point = [Point3::new(0.0, 0.0, 5.0)];
         assert!(
             matches!(get(Vector3::new(0.1, 0.0, 1.0), &point), RectifyError::TooFarTurned { degrees, .. } if degrees > 80.0)

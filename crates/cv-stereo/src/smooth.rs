@@ -19,7 +19,7 @@ const RIGHT: usize = REACH + 16;
 /// Weight of a filled pixel against a matched one. On the scenes of [`Smoothing::Bilateral`]'s sigma 0.05 to 0.4 differ by
 /// one bad pixel in fifty.
 const FILLED: f32 = 0.1;
-/// Neighbours that differ by more than so many px belong to different surfaces. On the same scenes 2 leaves 1.61 % of errors
+/// Neighbors that differ by more than so many px belong to different surfaces. On the same scenes 2 leaves 1.61 % of errors
 /// above 1 px and 0.62 % above 2 px; 1 leaves 1.78 and 0.68, 1.5 leaves 1.64 and 0.65, 3 leaves 1.68 and 0.60.
 const STEP: f32 = 2.0;
 
@@ -30,8 +30,8 @@ pub(crate) struct Planes {
     disparity: Vec<f32>,
     /// With outlines moved.
     moved: Vec<f32>,
-    /// Grey values 0 to 255.
-    grey: Vec<f32>,
+    /// Gray values 0 to 255.
+    gray: Vec<f32>,
     /// Weight of each pixel; 0 where the disparity is unknown.
     weight: Vec<f32>,
 }
@@ -51,7 +51,7 @@ pub(crate) fn smooth(
     smoothing: Smoothing,
     disparity: &mut [f32],
     states: &mut [PixelState],
-    grey: &[u8],
+    gray: &[u8],
     width: usize,
     planes: &mut Planes,
 ) {
@@ -60,21 +60,21 @@ pub(crate) fn smooth(
     }
     let height = disparity.len() / width;
     let stride = width + LEFT + RIGHT;
-    planes.fill(level, disparity, states, grey, width);
+    planes.fill(level, disparity, states, gray, width);
     match smoothing {
         Smoothing::None => {}
         Smoothing::Bilateral { sigma } => {
-            let Planes { disparity: before, moved, grey, weight } = planes;
-            let [before, grey, weight] = [before, grey, weight].map(|plane| plane.as_slice());
+            let Planes { disparity: before, moved, gray, weight } = planes;
+            let [before, gray, weight] = [before, gray, weight].map(|plane| plane.as_slice());
             let inside = &mut moved[REACH * stride..(REACH + height) * stride];
             inside.par_chunks_mut(stride).enumerate().for_each(|(y, out)| {
-                let rows = Rows { disparity: before, grey, weight, stride, y, scale: 1.0 / sigma };
+                let rows = Rows { disparity: before, gray, weight, stride, y, scale: 1.0 / sigma };
                 dispatch!(level, simd => move_outlines(simd, rows, &mut out[LEFT..LEFT + width.next_multiple_of(16)]));
             });
             disparity.par_chunks_mut(width).zip(states.par_chunks_mut(width)).enumerate().for_each_init(
                 || vec![0.0; width.next_multiple_of(16)],
                 |smoothed, (y, (out, states))| {
-                    let rows = Rows { disparity: moved, grey, weight, stride, y, scale: 1.0 / sigma };
+                    let rows = Rows { disparity: moved, gray, weight, stride, y, scale: 1.0 / sigma };
                     dispatch!(level, simd => average(simd, rows, smoothed));
                     let pixels = rows.at(0, REACH, REACH);
                     let pixels = before[pixels..pixels + width].iter().zip(&moved[pixels..pixels + width]);
@@ -105,10 +105,10 @@ pub(crate) fn smooth(
 }
 
 impl Planes {
-    fn fill(&mut self, level: Level, disparity: &[f32], states: &[PixelState], grey: &[u8], width: usize) {
+    fn fill(&mut self, level: Level, disparity: &[f32], states: &[PixelState], gray: &[u8], width: usize) {
         let stride = width + LEFT + RIGHT;
         let len = (disparity.len() / width + 2 * REACH) * stride;
-        for plane in [&mut self.disparity, &mut self.moved, &mut self.grey, &mut self.weight] {
+        for plane in [&mut self.disparity, &mut self.moved, &mut self.gray, &mut self.weight] {
             // Another size: the room around must be zero again.
             if plane.len() != len {
                 plane.clear();
@@ -119,12 +119,12 @@ impl Planes {
             let plane: &mut Vec<f32> = plane;
             plane.par_chunks_mut(stride).skip(REACH)
         };
-        let planes = rows(&mut self.disparity).zip(rows(&mut self.grey)).zip(rows(&mut self.weight));
-        let pixels = disparity.par_chunks(width).zip(states.par_chunks(width)).zip(grey.par_chunks(width));
-        planes.zip(pixels).for_each(|(((d, g), w), ((disparity, states), grey))| {
+        let planes = rows(&mut self.disparity).zip(rows(&mut self.gray)).zip(rows(&mut self.weight));
+        let pixels = disparity.par_chunks(width).zip(states.par_chunks(width)).zip(gray.par_chunks(width));
+        planes.zip(pixels).for_each(|(((d, g), w), ((disparity, states), gray))| {
             let inside = LEFT..LEFT + width;
             let out = [&mut d[inside.clone()], &mut g[inside.clone()], &mut w[inside]];
-            dispatch!(level, simd => fill_row(simd, out, disparity, states, grey));
+            dispatch!(level, simd => fill_row(simd, out, disparity, states, gray));
             // The last frame may have been of another width with the same number of pixels.
             for row in [d, g, w] {
                 row[..LEFT].fill(0.0);
@@ -134,13 +134,13 @@ impl Planes {
     }
 }
 
-/// Disparity, grey values and weights of a row, without its room.
+/// Disparity, gray values and weights of a row, without its room.
 #[simd]
-fn fill_row<S: Simd>(_: S, [d, g, w]: [&mut [f32]; 3], disparity: &[f32], states: &[PixelState], grey: &[u8]) {
+fn fill_row<S: Simd>(_: S, [d, g, w]: [&mut [f32]; 3], disparity: &[f32], states: &[PixelState], gray: &[u8]) {
     for (out, &value) in d.iter_mut().zip(disparity) {
         *out = if value.is_nan() { 0.0 } else { value };
     }
-    for (out, &value) in g.iter_mut().zip(grey) {
+    for (out, &value) in g.iter_mut().zip(gray) {
         *out = f32::from(value);
     }
     for ((out, &value), &state) in w.iter_mut().zip(disparity).zip(states) {
@@ -153,11 +153,11 @@ fn fill_row<S: Simd>(_: S, [d, g, w]: [&mut [f32]; 3], disparity: &[f32], states
 #[derive(Clone, Copy)]
 struct Rows<'a> {
     disparity: &'a [f32],
-    grey: &'a [f32],
+    gray: &'a [f32],
     weight: &'a [f32],
     stride: usize,
     y: usize,
-    /// Share of the weight lost per grey level of difference.
+    /// Share of the weight lost per gray level of difference.
     scale: f32,
 }
 
@@ -169,7 +169,7 @@ impl Rows<'_> {
     }
 }
 
-/// A pixel within [`STEP`] of whose disparity not all of its neighbours lie takes the disparity of the other side of the
+/// A pixel within [`STEP`] of whose disparity not all of its neighbors lie takes the disparity of the other side of the
 /// step where more of the pixels around that look like it are of the other side.
 #[simd]
 fn move_outlines<S: Simd>(simd: S, rows: Rows<'_>, out: &mut [f32]) {
@@ -177,8 +177,8 @@ fn move_outlines<S: Simd>(simd: S, rows: Rows<'_>, out: &mut [f32]) {
     let load = |plane: &[f32], at: usize| S::f32s::from_slice(simd, &plane[at..at + lanes]);
     let zero = S::f32s::splat(simd, 0.0);
     for x in (0..out.len()).step_by(lanes) {
-        let centre = rows.at(x, REACH, REACH);
-        let here = load(rows.disparity, centre);
+        let center = rows.at(x, REACH, REACH);
+        let here = load(rows.disparity, center);
         let (mut low, mut high) = (here, here);
         for (dx, dy) in [(2, 4), (3, 4), (5, 4), (6, 4), (4, 2), (4, 3), (4, 5), (4, 6)] {
             let at = rows.at(x, dx, dy);
@@ -190,13 +190,13 @@ fn move_outlines<S: Simd>(simd: S, rows: Rows<'_>, out: &mut [f32]) {
         let mut result = here;
         if step.any_true() {
             let middle = (low + high) * 0.5;
-            let grey = load(rows.grey, centre);
+            let gray = load(rows.gray, center);
             let [mut near, mut near_sum, mut all, mut all_sum] = [zero; 4];
             for dy in (0..=2 * REACH).step_by(SPACING) {
                 for dx in (0..=2 * REACH).step_by(SPACING) {
                     let at = rows.at(x, dx, dy);
                     let value = load(rows.disparity, at);
-                    let alike = (S::f32s::splat(simd, 1.0) - (load(rows.grey, at) - grey).abs() * rows.scale).max(zero);
+                    let alike = (S::f32s::splat(simd, 1.0) - (load(rows.gray, at) - gray).abs() * rows.scale).max(zero);
                     let weight = alike * load(rows.weight, at);
                     let nearer = value.simd_gt(middle).select(weight, zero);
                     all += weight;
@@ -225,14 +225,14 @@ fn average<S: Simd>(simd: S, rows: Rows<'_>, out: &mut [f32]) {
     let load = |plane: &[f32], at: usize| S::f32s::from_slice(simd, &plane[at..at + lanes]);
     let zero = S::f32s::splat(simd, 0.0);
     for x in (0..out.len()).step_by(lanes) {
-        let centre = rows.at(x, REACH, REACH);
-        let (here, grey) = (load(rows.disparity, centre), load(rows.grey, centre));
+        let center = rows.at(x, REACH, REACH);
+        let (here, gray) = (load(rows.disparity, center), load(rows.gray, center));
         let (mut all, mut sum) = (S::f32s::splat(simd, 1e-6), zero);
         for dy in (0..=2 * REACH).step_by(SPACING) {
             for dx in (0..=2 * REACH).step_by(SPACING) {
                 let at = rows.at(x, dx, dy);
                 let off = load(rows.disparity, at) - here;
-                let alike = (S::f32s::splat(simd, 1.0) - (load(rows.grey, at) - grey).abs() * rows.scale).max(zero);
+                let alike = (S::f32s::splat(simd, 1.0) - (load(rows.gray, at) - gray).abs() * rows.scale).max(zero);
                 let weight = off.abs().simd_le(S::f32s::splat(simd, STEP)).select(alike * load(rows.weight, at), zero);
                 all += weight;
                 sum += weight * off;
@@ -246,7 +246,7 @@ fn average<S: Simd>(simd: S, rows: Rows<'_>, out: &mut [f32]) {
 fn least_squares(planes: &mut Planes, width: usize, height: usize, lambda: f32, sigma: f32) {
     const ROUNDS: i32 = 3;
     let stride = width + LEFT + RIGHT;
-    let Planes { disparity, moved, grey, weight } = planes;
+    let Planes { disparity, moved, gray, weight } = planes;
     for (d, &w) in disparity.iter_mut().zip(weight.iter()) {
         *d *= w;
     }
@@ -254,7 +254,7 @@ fn least_squares(planes: &mut Planes, width: usize, height: usize, lambda: f32, 
     for round in 1..=ROUNDS {
         // Falls by four each round (equation 13 of the paper).
         let strength = 1.5 * 4f32.powi(ROUNDS - round) / (4f32.powi(ROUNDS) - 1.0) * lambda;
-        let rows = disparity.par_chunks_mut(stride).zip(weight.par_chunks_mut(stride)).zip(grey.par_chunks(stride));
+        let rows = disparity.par_chunks_mut(stride).zip(weight.par_chunks_mut(stride)).zip(gray.par_chunks(stride));
         rows.skip(REACH).take(height).for_each_init(
             || vec![0.0; width],
             |factors, ((d, w), g)| {
@@ -283,9 +283,9 @@ fn least_squares(planes: &mut Planes, width: usize, height: usize, lambda: f32, 
         for y in 0..height {
             for x in 0..width {
                 let at = row(y) + x;
-                let g = grey[at];
-                let before = if y > 0 { -strength * likeness(grey[at - stride], g) } else { 0.0 };
-                let after = if y + 1 < height { -strength * likeness(g, grey[at + stride]) } else { 0.0 };
+                let g = gray[at];
+                let before = if y > 0 { -strength * likeness(gray[at - stride], g) } else { 0.0 };
+                let after = if y + 1 < height { -strength * likeness(g, gray[at + stride]) } else { 0.0 };
                 let up = if y > 0 {
                     (factors[at - stride], disparity[at - stride], weight[at - stride])
                 } else {
@@ -313,7 +313,7 @@ mod tests {
     use proptest::prelude::*;
 
     /// The two passes of the bilateral smoother, pixel by pixel.
-    fn plain(d: &[f32], states: &[PixelState], grey: &[u8], width: usize, sigma: f32) -> (Vec<f32>, Vec<PixelState>) {
+    fn plain(d: &[f32], states: &[PixelState], gray: &[u8], width: usize, sigma: f32) -> (Vec<f32>, Vec<PixelState>) {
         let height = d.len() / width;
         let at = |x: i64, y: i64| {
             (x >= 0 && y >= 0 && x < width as i64 && y < height as i64).then(|| y as usize * width + x as usize)
@@ -326,7 +326,7 @@ mod tests {
             } else {
                 FILLED
             };
-            (1.0 - f32::from(grey[i].abs_diff(grey[j])) * (1.0 / sigma)).max(0.0) * known
+            (1.0 - f32::from(gray[i].abs_diff(gray[j])) * (1.0 / sigma)).max(0.0) * known
         };
         let around = |i: usize| {
             let (x, y) = ((i % width) as i64, (i / width) as i64);
@@ -398,9 +398,9 @@ mod tests {
         ) {
             let pixels = &pixels[..pixels.len() / width * width];
             let d: Vec<f32> = pixels.iter().map(|p| p.0).collect();
-            let grey: Vec<u8> = pixels.iter().map(|p| p.1).collect();
+            let gray: Vec<u8> = pixels.iter().map(|p| p.1).collect();
             let states: Vec<PixelState> = pixels.iter().map(|p| state(p.2)).collect();
-            let (expected, after) = plain(&d, &states, &grey, width, sigma);
+            let (expected, after) = plain(&d, &states, &gray, width, sigma);
             let expected: Vec<u32> = expected.iter().map(|v| v.to_bits()).collect();
             for level in instruction_sets() {
                 let mut planes = Planes::default();
@@ -408,7 +408,7 @@ mod tests {
                 for _ in 0..2 {
                     let mut out = d.clone();
                     let mut found = states.clone();
-                    smooth(level, Smoothing::Bilateral { sigma }, &mut out, &mut found, &grey, width, &mut planes);
+                    smooth(level, Smoothing::Bilateral { sigma }, &mut out, &mut found, &gray, width, &mut planes);
                     prop_assert_eq!(&found, &after, "{:?}", level);
                     let bits: Vec<u32> = out.iter().map(|v| v.to_bits()).collect();
                     prop_assert_eq!(&bits, &expected, "{:?}", level);
@@ -421,11 +421,11 @@ mod tests {
     fn an_outline_moves_to_the_edge_of_the_photograph() {
         // A near thing from column 20 on, matched two pixels too wide.
         let (width, height) = (40, 30);
-        let grey: Vec<u8> = (0..width * height).map(|i| if i % width < 20 { 60 } else { 180 }).collect();
+        let gray: Vec<u8> = (0..width * height).map(|i| if i % width < 20 { 60 } else { 180 }).collect();
         let mut d: Vec<f32> = (0..width * height).map(|i| if i % width < 18 { 5.0 } else { 12.0 }).collect();
         let mut states = vec![PixelState::Matched; d.len()];
         let options = Smoothing::Bilateral { sigma: 24.0 };
-        smooth(Level::new(), options, &mut d, &mut states, &grey, width, &mut Planes::default());
+        smooth(Level::new(), options, &mut d, &mut states, &gray, width, &mut Planes::default());
         for (i, d) in d.iter().enumerate() {
             let truth = if i % width < 20 { 5.0 } else { 12.0 };
             // Sums of 25 terms in f32.
@@ -438,14 +438,14 @@ mod tests {
     #[test]
     fn least_squares_smooths_a_surface_and_keeps_a_step_where_the_photograph_has_one() {
         let (width, height) = (48, 32);
-        let grey: Vec<u8> = (0..width * height).map(|i| if i % width < 24 { 60 } else { 180 }).collect();
+        let gray: Vec<u8> = (0..width * height).map(|i| if i % width < 24 { 60 } else { 180 }).collect();
         let truth = |i: usize| if i % width < 24 { 5.0 } else { 12.0 };
         let noisy = |i: usize| truth(i) + if (i * 7919 / 13).is_multiple_of(2) { 0.5 } else { -0.5 };
         let mut d: Vec<f32> = (0..width * height).map(noisy).collect();
         d[5 * width + 5] = f32::NAN;
         let mut states = vec![PixelState::Matched; d.len()];
         let options = Smoothing::LeastSquares { lambda: 100.0, sigma: 4.0 };
-        smooth(Level::new(), options, &mut d, &mut states, &grey, width, &mut Planes::default());
+        smooth(Level::new(), options, &mut d, &mut states, &gray, width, &mut Planes::default());
         assert!(d[5 * width + 5].is_nan());
         for (i, d) in d.iter().enumerate().filter(|(_, d)| !d.is_nan()) {
             // Noise of 0.5 px averaged over some 60 pixels (twice the square root of lambda along both axes), and

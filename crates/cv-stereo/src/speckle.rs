@@ -4,7 +4,7 @@ use crate::PixelState;
 use crate::forest::join;
 use rayon::prelude::*;
 
-/// Rows per strip: strips are labelled side by side, then joined. Small enough to occupy every core.
+/// Rows per strip: strips are labeled side by side, then joined. Small enough to occupy every core.
 const STRIP: usize = 64;
 
 /// Memory of [`remove_speckles`], kept between frames.
@@ -36,7 +36,7 @@ struct Run {
     end: u32,
 }
 
-/// Sets to NaN, and from matched to mismatched, every 4-connected patch of at most `max_size` pixels whose neighbours differ by no
+/// Sets to NaN, and from matched to mismatched, every 4-connected patch of at most `max_size` pixels whose neighbors differ by no
 /// more than `range`.
 ///
 /// Runs of each row are joined into a forest (union–find with path halving), counted, and the small ones cleared: linear

@@ -15,7 +15,7 @@ pub(crate) struct Winner {
     /// The smallest sum at indices not next to the winner; [`NO_SUM`] where there are none, and where nobody asked.
     pub(crate) second: u16,
     /// The sum one index below; [`NO_SUM`] at the end of the range. It is larger than [`Winner::cost`], since the first of
-    /// equals wins, but where the sums are flat: there both neighbours equal it.
+    /// equals wins, but where the sums are flat: there both neighbors equal it.
     pub(crate) below: u16,
     /// The sum one index above; [`NO_SUM`] at the end of the range.
     pub(crate) above: u16,
@@ -36,7 +36,7 @@ pub(crate) fn outside_cost(sum: u32, n: usize) -> u8 {
     (sum + n / 2).checked_div(n).unwrap_or(0) as u8
 }
 
-/// P2 by the absolute difference of neighbouring grey values (0 to 255).
+/// P2 by the absolute difference of neighboring gray values (0 to 255).
 pub(crate) fn p2_table(options: &StereoOptions) -> [u8; 256] {
     let (low, high) = (u32::from(options.p2_min), u32::from(options.p2));
     let half = u32::from(options.p2_gradient);

@@ -22,7 +22,7 @@ pub enum SynthError {
     /// A rectified pair needs a camera without distortion and a positive baseline.
     #[error("a rectified pair needs a pinhole and a positive baseline, not {baseline} m")]
     Stereo {
-        /// The baseline in metres.
+        /// The baseline in meters.
         baseline: f64,
     },
 }

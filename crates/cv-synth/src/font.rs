@@ -76,7 +76,7 @@ const WORDS: [&str; 64] = [
     "SEVEN",
     "DAYS",
     "WIND",
-    "COLOUR",
+    "COLOR",
     "FORM",
     "LINE",
     "EXHIBITION",
@@ -117,9 +117,9 @@ fn distance(glyph: usize, x: f32, y: f32) -> f32 {
     best.sqrt()
 }
 
-/// Ink (0 to 1) at `(u, v)` metres into a block of running text with capitals `size` metres high.
+/// Ink (0 to 1) at `(u, v)` meters into a block of running text with capitals `size` meters high.
 ///
-/// Lines are `1.8 × size` apart and end raggedly before `line` metres. `weight` is the stroke's half width on the
+/// Lines are `1.8 × size` apart and end raggedly before `line` meters. `weight` is the stroke's half width on the
 /// 4×6 grid: 0.4 is a regular face, 0.7 a bold one.
 pub(crate) fn text(u: f32, v: f32, size: f32, line: f32, weight: f32, seed: u32, width: f32) -> f32 {
     let unit_length = size / 6.0;
@@ -144,7 +144,7 @@ pub(crate) fn text(u: f32, v: f32, size: f32, line: f32, weight: f32, seed: u32,
         }
         (start, count) = (end + 1, count + 1);
     };
-    // Text too small to read is a grey.
+    // Text too small to read is a gray.
     if width > 2.5 * unit_length {
         return 0.35 * weight;
     }

@@ -25,8 +25,8 @@
 //!
 //! # Conventions
 //!
-//! Those of `cv-core`: pixel centres at integers, y down, poses world to camera. Worlds are in metres with y down.
-//! Truth belongs to the ray through the pixel's centre; colours are means over the pixel's area. The same seeds give
+//! Those of `cv-core`: pixel centers at integers, y down, poses world to camera. Worlds are in meters with y down.
+//! Truth belongs to the ray through the pixel's center; colors are means over the pixel's area. The same seeds give
 //! the same bytes at any number of threads.
 
 mod bvh;

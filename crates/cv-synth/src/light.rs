@@ -24,7 +24,7 @@ const HEMISPHERE: usize = 5;
 impl Map {
     fn empty(shape: &Shape) -> Self {
         let (u, v) = shape.extent();
-        // A shadow's edge is a few centimetres wide a metre from what throws it: finer grids show little more. Shadows
+        // A shadow's edge is a few centimeters wide a meter from what throws it: finer grids show little more. Shadows
         // fall on wide surfaces; the light on slender ones changes little but from end to end.
         let spacing = if u.min(v) < 0.3 { 0.11 } else { (u * v).sqrt().mul_add(0.014, 0.026).min(0.09) };
         let count = |length: f64, least: usize| ((length / spacing).ceil() as usize).clamp(least, 160);

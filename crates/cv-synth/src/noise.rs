@@ -51,7 +51,7 @@ pub(crate) fn noise3(p: [f32; 3], seed: u32) -> f32 {
     y(0) + f[2] * (y(1) - y(0))
 }
 
-/// How much of a pattern with `frequency` (per metre) a sample of `width` (metres) still shows: 1 to 0.
+/// How much of a pattern with `frequency` (per meter) a sample of `width` (meters) still shows: 1 to 0.
 #[inline]
 pub(crate) fn visible(frequency: f32, width: f32) -> f32 {
     // Full up to a fifth of a period per sample, gone at half of one.

@@ -5,7 +5,7 @@ use crate::noise::{edge, fbm, noise2};
 use crate::rng::Rng;
 use crate::texture::{Rgb, mix, scale, srgb};
 
-/// Inks of a poster: paper, dark, three colours.
+/// Inks of a poster: paper, dark, three colors.
 const PALETTES: [[u32; 5]; 6] = [
     [0xF1EDE2, 0x1F2A36, 0xC8402F, 0xE0A526, 0x2F6F8F],
     [0xE9E4D4, 0x27221F, 0x6B8E4E, 0xD98F4E, 0x3A506B],
@@ -49,7 +49,7 @@ pub struct Poster {
 }
 
 impl Poster {
-    /// A poster of `width` × `height` metres; the seed decides what is on it.
+    /// A poster of `width` × `height` meters; the seed decides what is on it.
     pub fn new(width: f32, height: f32, seed: u64) -> Self {
         let mut rng = Rng::new(seed, 0x706F_7374);
         let inks = rng.pick(PALETTES).map(srgb);
@@ -78,7 +78,7 @@ impl Poster {
         Self { width, height, print, inks, seed: rng.seed32() }
     }
 
-    /// Width and height in metres.
+    /// Width and height in meters.
     pub fn size(&self) -> (f32, f32) {
         (self.width, self.height)
     }

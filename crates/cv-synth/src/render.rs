@@ -9,7 +9,7 @@ use cv_core::{Camera, GrayF32, Image, Mask, Point2, Pose, RgbF32, RgbU8};
 use nalgebra::{Matrix2, Point3, Vector3};
 use rayon::prelude::*;
 
-/// A picture and what is true about it. Truth is that of the ray through each pixel's centre.
+/// A picture and what is true about it. Truth is that of the ray through each pixel's center.
 #[derive(Debug, Clone)]
 pub struct Rendered {
     /// The picture as a camera would store it: with noise, sRGB encoded.
@@ -17,7 +17,7 @@ pub struct Rendered {
     /// The light behind it, linear, 1 = white: blur, exposure, white balance and vignetting applied, no noise, not
     /// clipped.
     pub linear: RgbF32,
-    /// Z in the camera frame in metres; NaN where there is nothing, or where the lens lets no ray in.
+    /// Z in the camera frame in meters; NaN where there is nothing, or where the lens lets no ray in.
     pub depth: GrayF32,
     /// The number of the object (see [`Scene::object_id`]); 0 = none.
     pub ids: Image<u32, 1>,
@@ -33,7 +33,7 @@ impl Rendered {
         self.ids.map(|[id]| [id == object])
     }
 
-    /// The scene point a pixel's centre shows, in world coordinates; `None` outside or where there is nothing.
+    /// The scene point a pixel's center shows, in world coordinates; `None` outside or where there is nothing.
     ///
     /// As exact as the `f32` depth: 6e-8 of it. [`Scene::point_at`] is exact.
     pub fn world_point(&self, x: usize, y: usize) -> Option<Point3<f64>> {
@@ -52,7 +52,7 @@ pub fn render(scene: &Scene, camera: &Camera, pose: &Pose, options: &RenderOptio
     let (width, height) = check(camera, pose)?;
     let view = View::new(scene, scene.lighting(), camera, pose);
 
-    // Truth: one ray per pixel centre.
+    // Truth: one ray per pixel center.
     let mut centers: Vec<Option<Hit>> = vec![None; width * height];
     centers.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
         for (x, hit) in row.iter_mut().enumerate() {
@@ -94,7 +94,7 @@ pub(crate) fn check(camera: &Camera, pose: &Pose) -> Result<(usize, usize), Synt
     if finite { Ok((width, height)) } else { Err(SynthError::Pose) }
 }
 
-/// The exposure of a scene as a camera at its viewpoint would set it: the mean of the picture at a middle grey, unless
+/// The exposure of a scene as a camera at its viewpoint would set it: the mean of the picture at a middle gray, unless
 /// that would burn out more than a fiftieth of it. Lamps and windows do not count.
 pub(crate) fn meter(scene: &Scene, lighting: &Lighting) -> f32 {
     let camera = Camera::from_focal(40, 30, 33.0);
@@ -128,7 +128,7 @@ impl<'a> View<'a> {
         Self { scene, lighting, camera: *camera, center: pose.center(), to_world: pose.inverse() }
     }
 
-    /// The ray of normalised coordinates; its `t` is the depth.
+    /// The ray of normalized coordinates; its `t` is the depth.
     #[inline]
     fn through(&self, n: Point2<f64>) -> Ray {
         Ray { origin: self.center, dir: self.to_world.rotation * Vector3::new(n.x, n.y, 1.0) }

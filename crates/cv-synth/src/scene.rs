@@ -78,7 +78,7 @@ pub(crate) struct Lighting {
     pub(crate) gain: f32,
 }
 
-/// Textured surfaces under lights, in metres; X right, Y **down**, Z forward, the floor of the presets at y = 0.
+/// Textured surfaces under lights, in meters; X right, Y **down**, Z forward, the floor of the presets at y = 0.
 ///
 /// Light is worked out when the scene is put together and kept: diffuse direct light with soft shadows and one bounce.
 /// It depends on the scene only, so that every view sees the same.
@@ -150,7 +150,7 @@ impl Scene {
         &self.lighting
     }
 
-    /// Reflectance (or radiance) of a surface seen with a sample of `width` metres.
+    /// Reflectance (or radiance) of a surface seen with a sample of `width` meters.
     #[inline]
     pub(crate) fn albedo(&self, prim: usize, surface: &Surface, width: f32) -> Rgb {
         let Prim { shape, texture, .. } = &self.prims[prim];
@@ -220,7 +220,7 @@ impl Default for SceneBuilder {
 }
 
 impl SceneBuilder {
-    /// Nothing but an even grey ambient light.
+    /// Nothing but an even gray ambient light.
     pub fn new() -> Self {
         Self {
             prims: Vec::new(),

@@ -50,7 +50,7 @@ pub struct DepthScore {
     pub dense: f64,
 }
 
-/// The share of visible pixels with a true depth below `limit` metres whose estimate is within a share `tolerance` of
+/// The share of visible pixels with a true depth below `limit` meters whose estimate is within a share `tolerance` of
 /// it. A pixel without an estimate counts as wrong. `None` where the sizes differ or no pixel counts.
 pub fn depth_score(
     estimate: &GrayF32,

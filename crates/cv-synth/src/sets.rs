@@ -15,9 +15,9 @@ use nalgebra::{Matrix3, Point3, Rotation3, Vector3};
 pub struct StereoPair {
     /// The left view.
     pub left: Rendered,
-    /// The right view: the same orientation, `baseline` metres to the right.
+    /// The right view: the same orientation, `baseline` meters to the right.
     pub right: Rendered,
-    /// Distance between the two centres in metres.
+    /// Distance between the two centers in meters.
     pub baseline: f64,
     /// Disparity of the left view, `fx · baseline / Z`; NaN where there is nothing.
     pub disparity: GrayF32,
@@ -93,7 +93,7 @@ pub fn homography_pair(
     let second = looking(target + away, target, turn * rng.range(-0.35, 0.35));
     let a = render(&scene, camera, &first, options)?;
     let b = render(&scene, camera, &second, &options.clone().with_seed(options.seed ^ 0x40))?;
-    // The wall's plane is 3 m away from the first centre.
+    // The wall's plane is 3 m away from the first center.
     let homography = plane_homography((camera, &first), (camera, &second), &Wall::middle(), &Vector3::z());
     Ok(HomographyPair { a, b, homography: homography.unwrap_or_else(Matrix3::identity) })
 }
@@ -110,7 +110,7 @@ fn looking(eye: Point3<f64>, target: Point3<f64>, roll: f64) -> Pose {
 pub struct PanoramaOptions {
     /// Number of pictures. Default 5.
     pub views: usize,
-    /// Share of a picture's width that its neighbour sees too, 0.1 to 0.9. Default 0.45.
+    /// Share of a picture's width that its neighbor sees too, 0.1 to 0.9. Default 0.45.
     pub overlap: f64,
     /// Largest difference of a picture's exposure from the mean, in stops. Default 0.35.
     pub exposure_spread: f32,
@@ -206,11 +206,11 @@ pub struct TwoView {
     pub a: Rendered,
     /// Second view.
     pub b: Rendered,
-    /// From the camera frame of `a` to that of `b`, in metres: `x_b = R x_a + t`.
+    /// From the camera frame of `a` to that of `b`, in meters: `x_b = R x_a + t`.
     pub relative: Pose,
 }
 
-/// Two views of the living room, their centres `baseline` metres apart, mostly sideways, both looking at its middle.
+/// Two views of the living room, their centers `baseline` meters apart, mostly sideways, both looking at its middle.
 ///
 /// # Errors
 /// As [`render`].
@@ -236,7 +236,7 @@ pub struct BallPhoto {
     pub view: Rendered,
     /// Where the ball is.
     pub mask: Mask,
-    /// Distance from the camera to the ball's middle in metres.
+    /// Distance from the camera to the ball's middle in meters.
     pub distance: f64,
 }
 

@@ -2,7 +2,7 @@
 
 use nalgebra::{Point3, Vector3};
 
-/// A surface. Lengths in metres, directions of unit length.
+/// A surface. Lengths in meters, directions of unit length.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Shape {
     /// `corner + u·eu + v·ev`, `0 ≤ u ≤ size.0`, `0 ≤ v ≤ size.1`; u to the right and v down as seen
@@ -152,7 +152,7 @@ impl Shape {
         }
     }
 
-    /// Size of the surface in metres along its two coordinates.
+    /// Size of the surface in meters along its two coordinates.
     pub(crate) fn extent(&self) -> (f64, f64) {
         match self {
             Self::Rect { size, .. } => *size,

@@ -9,7 +9,7 @@ use std::sync::Arc;
 /// Linear RGB.
 pub type Rgb = [f32; 3];
 
-/// Linear RGB of an sRGB colour `0xRRGGBB`.
+/// Linear RGB of an sRGB color `0xRRGGBB`.
 pub fn srgb(hex: u32) -> Rgb {
     [16, 8, 0].map(|shift| {
         let c = ((hex >> shift) & 255) as f32 / 255.0;
@@ -27,35 +27,35 @@ pub(crate) fn scale(a: Rgb, s: f32) -> Rgb {
     a.map(|c| (c * s).max(0.0))
 }
 
-/// Where on a surface a colour is asked for.
+/// Where on a surface a color is asked for.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SurfacePoint {
-    /// Metres along the surface from its corner.
+    /// Meters along the surface from its corner.
     pub(crate) u: f32,
     pub(crate) v: f32,
-    /// Position relative to the centre of the shape, for solid textures.
+    /// Position relative to the center of the shape, for solid textures.
     pub(crate) local: [f32; 3],
-    /// Size of the surface in metres.
+    /// Size of the surface in meters.
     pub(crate) size: (f32, f32),
-    /// Width of the sample on the surface in metres.
+    /// Width of the sample on the surface in meters.
     pub(crate) width: f32,
 }
 
-/// What a surface looks like. Lengths are metres; colours are linear reflectances.
+/// What a surface looks like. Lengths are meters; colors are linear reflectances.
 #[derive(Debug, Clone)]
 pub enum Texture {
-    /// One colour.
+    /// One color.
     Plain(Rgb),
     /// Light of its own: a lamp or a window.
     Emissive(Rgb),
-    /// Squares of `square` metres, `colors[0]` at the corner.
+    /// Squares of `square` meters, `colors[0]` at the corner.
     Checker {
         /// Side of a square.
         square: f32,
-        /// The two colours.
+        /// The two colors.
         colors: [Rgb; 2],
     },
-    /// A calibration board: `squares` × `squares` of `square` metres, centred on a white sheet.
+    /// A calibration board: `squares` × `squares` of `square` meters, centered on a white sheet.
     Board {
         /// Columns and rows of squares.
         squares: (u32, u32),
@@ -64,12 +64,12 @@ pub enum Texture {
     },
     /// Rolled wall paint: faint mottling at every scale.
     Paint {
-        /// Mean colour.
+        /// Mean color.
         color: Rgb,
         /// Seed of the pattern.
         seed: u32,
     },
-    /// Rough plaster, concrete or stone: weak clouds, strong grain from centimetres down to millimetres.
+    /// Rough plaster, concrete or stone: weak clouds, strong grain from centimeters down to millimeters.
     Stone {
         /// Dark and light.
         colors: [Rgb; 2],
@@ -89,7 +89,7 @@ pub enum Texture {
     },
     /// A brick wall.
     Bricks {
-        /// Two brick colours.
+        /// Two brick colors.
         colors: [Rgb; 2],
         /// Mortar.
         mortar: Rgb,
@@ -147,9 +147,9 @@ pub enum Texture {
         /// Seed of the pattern.
         seed: u32,
     },
-    /// A solid ball of nearly one colour, dimpled.
+    /// A solid ball of nearly one color, dimpled.
     Ball {
-        /// Colour.
+        /// Color.
         color: Rgb,
         /// Seed of the pattern.
         seed: u32,
@@ -218,12 +218,12 @@ impl Texture {
 pub struct Collage {
     ground: Texture,
     posters: Vec<((f32, f32), Poster)>,
-    /// For each metre along u from 0, the posters that may show there.
+    /// For each meter along u from 0, the posters that may show there.
     columns: Vec<Vec<usize>>,
 }
 
 impl Collage {
-    /// Corner (u, v) of each poster in metres from the surface's corner; later ones on top.
+    /// Corner (u, v) of each poster in meters from the surface's corner; later ones on top.
     pub fn new(ground: Texture, posters: Vec<((f32, f32), Poster)>) -> Self {
         let reach = |&((left, _), ref poster): &((f32, f32), Poster)| {
             let column = |u: f32| u.clamp(0.0, 1e4) as usize;
@@ -261,7 +261,7 @@ impl Collage {
     }
 }
 
-/// 0 on the square at the corner, 1 on its neighbours; lengths in squares.
+/// 0 on the square at the corner, 1 on its neighbors; lengths in squares.
 fn checker(x: f32, y: f32, w: f32) -> f32 {
     // Each axis: a square wave of ±1 that is +1 just above even edges, box filtered about the nearest edge.
     let wave = |t: f32| {
@@ -337,7 +337,7 @@ fn wood(colors: &[Rgb; 2], seed: u32, u: f32, v: f32, w: f32) -> Rgb {
     let place = 34.0 * v + 2.4 * bend;
     let phase = place - floor(place) as f32;
     let ring = visible(34.0, w) * (phase * phase - 0.33);
-    // Fibres: streaks of every width down to the pores, a few centimetres long.
+    // Fibres: streaks of every width down to the pores, a few centimeters long.
     let fibre = fbm(u * 0.05, v, 55.0, 5, 0.8, seed ^ 3, w);
     let cloud = fbm(u * 0.4, v, 7.0, 3, 0.6, seed ^ 4, w);
     let t = 0.5 + 0.35 * ring + 0.20 * fibre + 0.22 * cloud + 0.15 * bend;
@@ -416,7 +416,7 @@ fn spine(colors: &[Rgb; 2], seed: u32, p: &SurfacePoint) -> Rgb {
     if h(4) < 0.4 {
         ink += band(0.88 * height, 0.0015) + band(0.12 * height, 0.0015);
     }
-    // Rounded: darker towards the sides.
+    // Rounded: darker toward the sides.
     let t = 2.0 * u / width.max(1e-4) - 1.0;
     scale(mix(colors[0], colors[1], ink.clamp(0.0, 1.0)), cloth * (1.0 - 0.35 * t * t * t * t))
 }

@@ -37,7 +37,7 @@ impl Scene {
         self.pixel_of(&b.camera, &b.pose, &point)
     }
 
-    /// The pixels of `a` whose centres `b` sees too: in its picture and not hidden.
+    /// The pixels of `a` whose centers `b` sees too: in its picture and not hidden.
     pub fn visible_in_both(&self, a: &Rendered, b: &Rendered) -> Mask {
         let (width, height) = a.depth.size();
         let mut mask = Image::new(width, height, [false]);
@@ -68,7 +68,7 @@ impl Scene {
 /// Cameras without distortion; with it, it relates undistorted pixels. Hartley & Zisserman, 2nd ed., equation 13.2:
 /// `H = K_b (R + t nᵀ / d) K_a⁻¹` with the plane `nᵀ X = d` in the frame of `a`. Entry (3, 3) is 1.
 ///
-/// `None` where the plane passes through the centre of `a`.
+/// `None` where the plane passes through the center of `a`.
 pub fn plane_homography(
     a: (&Camera, &Pose),
     b: (&Camera, &Pose),
@@ -82,19 +82,19 @@ pub fn plane_homography(
     }
     let relative = Pose::relative(a.1, b.1);
     let between = relative.rotation.matrix() + relative.translation * n.transpose() / d;
-    Some(normalised(b.0.matrix() * between * a.0.inverse_matrix()))
+    Some(normalized(b.0.matrix() * between * a.0.inverse_matrix()))
 }
 
-/// The homography from pixels of `a` to pixels of `b` between cameras with a common centre: `K_b R K_a⁻¹`.
+/// The homography from pixels of `a` to pixels of `b` between cameras with a common center: `K_b R K_a⁻¹`.
 ///
 /// Cameras without distortion; with it, it relates undistorted pixels. Entry (3, 3) is 1.
 pub fn rotation_homography(a: (&Camera, &Pose), b: (&Camera, &Pose)) -> Matrix3<f64> {
     let relative = Pose::relative(a.1, b.1);
-    normalised(b.0.matrix() * relative.rotation.matrix() * a.0.inverse_matrix())
+    normalized(b.0.matrix() * relative.rotation.matrix() * a.0.inverse_matrix())
 }
 
 /// Scaled so that entry (3, 3) is 1, or to unit norm where that entry is as good as zero.
-fn normalised(h: Matrix3<f64>) -> Matrix3<f64> {
+fn normalized(h: Matrix3<f64>) -> Matrix3<f64> {
     let norm = h.norm();
     if h[(2, 2)].abs() > 1e-9 * norm { h / h[(2, 2)] } else { h / norm }
 }

@@ -172,7 +172,7 @@ fn disparity_warps_each_view_onto_the_other() {
 }
 
 #[test]
-fn homographies_map_pixels_to_the_same_point_and_colour() {
+fn homographies_map_pixels_to_the_same_point_and_color() {
     let camera = Camera::from_focal(240, 180, 210.0);
     for seed in 0..4 {
         let pair = homography_pair(seed, &camera, 0.4, &RenderOptions::ideal()).unwrap();

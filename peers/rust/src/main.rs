@@ -16,14 +16,14 @@ fn main() -> Result<(), Box<dyn Error>> {
         return Err("usage: rust-peers IMAGE STAGE".into());
     };
     rayon::ThreadPoolBuilder::new().num_threads(2).build_global()?;
-    let grey = image::open(path)?.to_luma8();
-    let (width, height) = (grey.width() as usize, grey.height() as usize);
+    let gray = image::open(path)?.to_luma8();
+    let (width, height) = (gray.width() as usize, gray.height() as usize);
     let size = ImageSize { width, height };
-    let bytes = Image::<u8, 1>::from_size_slice(size, grey.as_raw())?;
+    let bytes = Image::<u8, 1>::from_size_slice(size, gray.as_raw())?;
     // The conversion from bytes counts where a stage takes floats, into a buffer that is there, as for ours.
     let mut float = Image::<f32, 1>::from_size_val(size, 0.0)?;
     let convert = |float: &mut Image<f32, 1>| {
-        float.as_slice_mut().iter_mut().zip(grey.as_raw()).for_each(|(f, b)| *f = f32::from(*b) * (1.0 / 255.0));
+        float.as_slice_mut().iter_mut().zip(gray.as_raw()).for_each(|(f, b)| *f = f32::from(*b) * (1.0 / 255.0));
     };
     let mut response = Image::<f32, 1>::from_size_val(size, 0.0)?;
     let seconds = match stage.as_str() {
@@ -39,8 +39,8 @@ fn main() -> Result<(), Box<dyn Error>> {
             let mut workspace = SiftWorkspace::new();
             let config = SiftConfig { n_features: 2000, ..SiftConfig::default() };
             fastest(5, || {
-                // Grey levels of 0 to 255 in floats, as it wants them.
-                float.as_slice_mut().iter_mut().zip(grey.as_raw()).for_each(|(f, b)| *f = f32::from(*b));
+                // Gray levels of 0 to 255 in floats, as it wants them.
+                float.as_slice_mut().iter_mut().zip(gray.as_raw()).for_each(|(f, b)| *f = f32::from(*b));
                 let all = usize::MAX;
                 let pixels = float.as_slice();
                 let found = sift_detect_and_compute(
@@ -67,9 +67,9 @@ fn main() -> Result<(), Box<dyn Error>> {
             })?
         }
         "imageproc FAST and BRIEF" => fastest(3, || {
-            let corners = oriented_fast(&grey, None, 2000, 17, Some(1));
+            let corners = oriented_fast(&gray, None, 2000, 17, Some(1));
             let points: Vec<Point<u32>> = corners.iter().map(|c| Point::new(c.corner.x, c.corner.y)).collect();
-            brief(&grey, &points, 256, None).map(black_box)
+            brief(&gray, &points, 256, None).map(black_box)
         })?,
         _ => return Err(format!("there is no stage {stage:?}").into()),
     };

@@ -112,7 +112,7 @@ fn views(fixtures: &Path) -> Result<Outcome> {
     Ok(Outcome {
         checks: vec![
             Check::at_least("photographs used", used as f64, 3.0),
-            Check::at_most("alignment error of neighbours, px", worst, 0.5),
+            Check::at_most("alignment error of neighbors, px", worst, 0.5),
             Check::at_most(
                 "error of the focal length, %",
                 100.0 * (focal / number(&known, "focal_px")? - 1.0).abs(),

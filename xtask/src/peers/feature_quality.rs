@@ -2,7 +2,7 @@
 //!
 //! Two features of two pictures correspond where the homography takes one to within 2.5 px of the other (times the local magnification, where that is over one) and
 //! their scales agree within a factor of √2. Repeatability: corresponding pairs, one to one, over the smaller number of features in the common part.
-//! Matching score: mutual nearest neighbours of which the positions correspond, over the same number.
+//! Matching score: mutual nearest neighbors of which the positions correspond, over the same number.
 
 use super::features::Random;
 use anyhow::{Context, Result, ensure};
@@ -382,7 +382,7 @@ fn warps(path: &Path, folder: &Path) -> Result<Vec<Case>> {
     Ok(cases)
 }
 
-/// The picture about its centre through `m`, in a frame that holds all of it; and the homography between the two.
+/// The picture about its center through `m`, in a frame that holds all of it; and the homography between the two.
 fn warp(base: &GrayU8, m: &Matrix3<f64>) -> Result<(GrayU8, Matrix3<f64>)> {
     let (w, h) = base.size();
     let (right, bottom) = (w as f64 - 1.0, h as f64 - 1.0);

@@ -55,8 +55,8 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<bool> {
     let script = crate::root().join("peers/features_opencv.py");
     let rust = rust_peers()?;
     let photo = data.join("panorama/weir/weir_1.jpg");
-    let grey = cv_io::read_gray_u8(&photo)?;
-    let (w, h) = grey.size();
+    let gray = cv_io::read_gray_u8(&photo)?;
+    let (w, h) = gray.size();
     let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().context("cannot start two threads")?;
     let options = HarrisOptions::default();
     let shi = HarrisOptions { measure: CornerMeasure::ShiTomasi, ..options.clone() };
@@ -77,7 +77,7 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<bool> {
     let buffer = Mutex::new(GrayF32::new(w, h, [0.0]));
     let float = |call: &dyn Fn(ImageView<'_, f32, 1>)| {
         let mut buffer = buffer.lock().unwrap_or_else(PoisonError::into_inner);
-        let rows = buffer.as_mut_slice().par_chunks_mut(64 * w).zip(grey.as_slice().par_chunks(64 * w));
+        let rows = buffer.as_mut_slice().par_chunks_mut(64 * w).zip(gray.as_slice().par_chunks(64 * w));
         rows.for_each(|(out, bytes)| out.iter_mut().zip(bytes).for_each(|(o, b)| *o = f32::from(*b) * (1.0 / 255.0)));
         call(buffer.view());
     };
@@ -200,7 +200,7 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<bool> {
     let recall = recall(&data.join("panorama/weir"), &settings, &nearest)?;
     let _ = writeln!(
         text,
-        "\nDescriptors in bytes (`ByteDescriptors`): of 2000 rootSIFT features of one photograph, {:.1} % have the same nearest neighbour among 2000 of the \
+        "\nDescriptors in bytes (`ByteDescriptors`): of 2000 rootSIFT features of one photograph, {:.1} % have the same nearest neighbor among 2000 of the \
          next as in f32.",
         100.0 * recall
     );
@@ -210,7 +210,7 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<bool> {
     Ok(bars.iter().all(|(_, figure, bar)| figure <= bar))
 }
 
-/// The share of features whose nearest neighbour stays the same when descriptors are rounded to bytes.
+/// The share of features whose nearest neighbor stays the same when descriptors are rounded to bytes.
 fn recall(folder: &Path, settings: &SiftOptions, nearest: &MatchOptions) -> Result<f64> {
     let mut sets = Vec::new();
     for name in ["weir_1.jpg", "weir_2.jpg"] {
@@ -237,7 +237,7 @@ fn page(
     // `fmt::Write` on a String cannot fail.
     let _ = writeln!(
         text,
-        "Written by `cargo xtask peers features`. {}. Two threads, {w}×{h} grey bytes in, ours and OpenCV {version} in turns, the fastest of \
+        "Written by `cargo xtask peers features`. {}. Two threads, {w}×{h} gray bytes in, ours and OpenCV {version} in turns, the fastest of \
          {ROUNDS} rounds of warm repeats.\n\n| stage | ours | OpenCV | ratio |\n|---|---|---|---|",
         super::machine()
     );

@@ -282,7 +282,7 @@ fn bandwidth(text: &mut String, folder: &Path, scene: &Scene) -> Result<()> {
         let ratio = stages.get(2).map_or(f64::NAN, |s| s.1 * rate / traffic);
         let _ = writeln!(text, "{name} paths: {}; the whole stage is {ratio:.1} times the streaming.", list.join(", "));
     }
-    let grey = cv_imgproc::rgb_to_gray(left.view());
+    let gray = cv_imgproc::rgb_to_gray(left.view());
     text.push_str(
         "\nAggregation alone: costs are given, and nobody picks winners. Each of the two sweeps reads the costs of all pixels, \
          extends its half of the paths and writes their sums.\n",
@@ -291,7 +291,7 @@ fn bandwidth(text: &mut String, folder: &Path, scene: &Scene) -> Result<()> {
         let options = StereoOptions { disparities: scene.disparities, paths, ..Default::default() };
         // As many values as census bits have; no time depends on them.
         let mut sums =
-            PathSums::new(options, grey.view(), |x, y, k| ((x * 7919 + y * 104_729 + k * 31) % 97 % 25) as u8)?;
+            PathSums::new(options, gray.view(), |x, y, k| ((x * 7919 + y * 104_729 + k * 31) % 97 % 25) as u8)?;
         let seconds = fastest(|| {
             sums.run();
             Ok(())

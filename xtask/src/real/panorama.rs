@@ -144,7 +144,7 @@ fn seam_displacements(photos: &[ImageView<'_, u8, 3>], result: &PanoramaResult) 
     displacements
 }
 
-/// The displacement between photographs `a` and `b` around a canvas pixel, by normalised cross-correlation; `None` where there is too little texture, or they
+/// The displacement between photographs `a` and `b` around a canvas pixel, by normalized cross-correlation; `None` where there is too little texture, or they
 /// show different things.
 fn displacement(
     photos: &[ImageView<'_, u8, 3>],
@@ -165,7 +165,7 @@ fn displacement(
     };
     let (first, second) = (patch(a, HALF)?, patch(b, HALF + REACH)?);
     let (side, wide) = ((2 * HALF + 1) as usize, (2 * (HALF + REACH) + 1) as usize);
-    // Corner strength: the lesser eigenvalue of the structure tensor, as a gradient in grey levels per pixel.
+    // Corner strength: the lesser eigenvalue of the structure tensor, as a gradient in gray levels per pixel.
     let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
     for r in 1..side - 1 {
         for c in 1..side - 1 {

@@ -1,4 +1,4 @@
-//! The ten pairs of neighbouring photographs of the castle of Sceaux, against the poses that COLMAP found from all eleven.
+//! The ten pairs of neighboring photographs of the castle of Sceaux, against the poses that COLMAP found from all eleven.
 
 use super::Check;
 use anyhow::{Context, Result, bail};
@@ -23,7 +23,7 @@ pub(crate) fn run(data: &Path) -> Result<Vec<Check>> {
     let mut first = read(0)?.into_rgb8();
     for i in 0..PAIRS {
         let second = read(i + 1)?.into_rgb8();
-        // The header holds COLMAP's camera, whose pixel centres the reader brings to ours.
+        // The header holds COLMAP's camera, whose pixel centers the reader brings to ours.
         let camera = cv_io::read_camera(&reference, Some(first.size()))?;
         let options =
             ReconstructOptions { intrinsics: Intrinsics::Known([camera; 2]), ..ReconstructOptions::default() };

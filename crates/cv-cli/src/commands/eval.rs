@@ -32,7 +32,7 @@ enum What {
     cv eval disparity --estimate d.pfm --truth disp2.png --truth-right disp6.png --truth-scale 4\n  \
     cv eval disparity --estimate d.png --truth truth.npz --error error.png --json\n\n\
     The ending of a file tells its format: .pfm, .npy, .npz (one array), else a picture: KITTI's 16-bit PNG without a scale,\n\
-    grey value / scale with one.")]
+    gray value / scale with one.")]
 struct Disparity {
     /// The disparity map to score.
     #[arg(long, value_name = "FILE")]
@@ -52,7 +52,7 @@ struct Disparity {
     /// Non-occluded pixels are white (255).
     #[arg(long, value_name = "FILE")]
     mask: Option<PathBuf>,
-    /// Where to write a picture of the errors: grey up to 2 px, red and yellow beyond, blue without an estimate.
+    /// Where to write a picture of the errors: gray up to 2 px, red and yellow beyond, blue without an estimate.
     #[arg(long, value_name = "PNG")]
     error: Option<PathBuf>,
 }
@@ -82,9 +82,9 @@ impl Disparity {
         let truth = read_map(&self.truth, self.truth_scale)?;
         let mask = match (&self.mask, &self.truth_right) {
             (Some(path), _) => {
-                let grey = cv_io::read_gray_u8(path)?;
+                let gray = cv_io::read_gray_u8(path)?;
                 // Middlebury marks occluded pixels 128 and unknown ones 0.
-                Some(Mask::from_fn(grey.width(), grey.height(), |x, y| [grey.at(x, y)[0] == 255]))
+                Some(Mask::from_fn(gray.width(), gray.height(), |x, y| [gray.at(x, y)[0] == 255]))
             }
             (None, Some(path)) => Some(non_occluded(truth.view(), read_map(path, self.truth_scale)?.view())?),
             (None, None) => None,
@@ -113,7 +113,7 @@ impl Disparity {
                 Figure::new(png(draw_map(truth.view(), &style))?, "Truth."),
                 Figure::new(
                     png(errors())?,
-                    "Errors: grey up to 2 px, red and yellow beyond, blue without an estimate, black without truth.",
+                    "Errors: gray up to 2 px, red and yellow beyond, blue without an estimate, black without truth.",
                 ),
             ]);
             page.section("Fractions").plot(

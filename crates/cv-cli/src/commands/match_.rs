@@ -19,7 +19,7 @@ enum Features {
     Sift,
     /// Corners at all scales with oriented 8×8 patches
     Mops,
-    /// Corners with upright 8×8 patches: neighbouring frames of a film or of a slowly turned camera
+    /// Corners with upright 8×8 patches: neighboring frames of a film or of a slowly turned camera
     Harris,
 }
 
@@ -255,7 +255,7 @@ impl Args {
         report.section("Matches");
         let style = MatchStyle::default();
         let before = draw_matches(a.view(), b.view(), &result.pairs, None, &style);
-        report.figure(picture(before, "Tentative matches, each in a colour of its own.")?);
+        report.figure(picture(before, "Tentative matches, each in a color of its own.")?);
         match model {
             Some(model) => {
                 let after = draw_matches(a.view(), b.view(), &result.pairs, Some(&inliers), &style);

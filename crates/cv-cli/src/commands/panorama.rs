@@ -201,7 +201,7 @@ fn failure(error: PanoramaError, paths: &[PathBuf]) -> Failure {
                 .filter_map(|(path, image)| image.reason.as_ref().map(|r| format!("{}: {r}", path.display())))
                 .collect();
             Failure::new(format!("{source} ({})", reasons.join("; ")))
-                .advice("photographs that share a third of their view with their neighbours, taken from one place")
+                .advice("photographs that share a third of their view with their neighbors, taken from one place")
         }
         PanoramaError::Render(source) => Failure::new(source).advice("--projection auto, or a smaller --scale"),
     }

@@ -25,7 +25,7 @@ enum Axes {
     Opengl,
 }
 
-/// Reconstruct a coloured cloud of points and the camera's motion from two photographs.
+/// Reconstruct a colored cloud of points and the camera's motion from two photographs.
 ///
 /// The cloud is in the first camera's frame; its unit is the distance between the two cameras, which photographs cannot tell. Without
 /// --camera and --focal, the focal length comes from the photographs' EXIF, and is estimated where they have none.
@@ -368,7 +368,7 @@ impl Args {
         let style = MatchStyle::default();
         let before = draw_matches(a.view(), b.view(), pairs, None, &style);
         let after = draw_matches(a.view(), b.view(), pairs, Some(&mask), &style);
-        report.figure(Figure::new(png(&before)?, "Tentative matches, each in a colour of its own."));
+        report.figure(Figure::new(png(&before)?, "Tentative matches, each in a color of its own."));
         report.figure(Figure::new(png(&after)?, "The same after the search for a motion: matches that agree green, others red."));
         let chosen: Vec<Correspondence> = result.inliers.iter().map(|&i| pairs[i]).collect();
         let lines = draw_epipolar_lines(a.view(), b.view(), &result.fundamental(), &chosen, 24);
@@ -411,7 +411,7 @@ fn dense_section(report: &mut Report, dense: &DenseResult, result: &ReconstructR
         100.0 * dense.coverage,
     ));
     let depth = draw_map(dense.depth.view(), &MapStyle::depth("distances between the cameras"));
-    report.figure(Figure::new(png(&depth)?, "Depth of the first photograph: near blue, far red, unknown grey."));
+    report.figure(Figure::new(png(&depth)?, "Depth of the first photograph: near blue, far red, unknown gray."));
     let (positions, colors): (Vec<_>, Vec<_>) = dense.points.iter().map(|p| (p.position, p.color)).unzip();
     let mut scene = PointScene::new(&positions, &colors);
     scene.camera(&result.cameras[0], &Pose::identity(), camera_color(0));

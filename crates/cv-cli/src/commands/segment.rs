@@ -1,11 +1,11 @@
-//! `cv segment`: an object by its colour.
+//! `cv segment`: an object by its color.
 
 mod files;
 
 use crate::common::{Context, Explain, Failure, Outcome, Run, create_dir, expand_images, same_file};
 use cv_core::{Mask, RgbU8};
 use cv_pipeline::segmentation::{
-    ColorModel, ColorSpace, Labelled, Regions, Rule, Scores, SegmentError, TrainOptions,
+    ColorModel, ColorSpace, Labeled, Regions, Rule, Scores, SegmentError, TrainOptions,
 };
 use cv_pipeline::{Progress, segment, train_segment};
 use cv_report::{Figure, Note, Report, colors, overlay_comparison, overlay_mask};
@@ -18,7 +18,7 @@ const REPORT_SIDE: usize = 800;
 /// Photographs shown in a report.
 const REPORT_PHOTOS: usize = 40;
 
-/// Find an object by its colour: learn it from masks, mark it in photographs, score the marks.
+/// Find an object by its color: learn it from masks, mark it in photographs, score the marks.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv segment train --images photos --masks masks --model ball.json\n  \
@@ -91,7 +91,7 @@ enum RegionsArg {
     All,
 }
 
-/// Learn an object's colours from photographs and masks.
+/// Learn an object's colors from photographs and masks.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv segment train --images photos --masks masks --model ball.json\n  \
@@ -102,16 +102,16 @@ struct Train {
     /// Where to write the model.
     #[arg(long, value_name = "JSON")]
     model: PathBuf,
-    /// Colour space.
+    /// Color space.
     #[arg(long, value_enum, default_value = "hsv")]
     space: Space,
-    /// Gaussians for the object's colours, 1 to 64 [default: 5].
+    /// Gaussians for the object's colors, 1 to 64 [default: 5].
     #[arg(long, value_name = "K", value_parser = clap::value_parser!(u16).range(1..=64))]
     components: Option<u16>,
-    /// Gaussians for the background's colours, 1 to 63 [default: 10].
+    /// Gaussians for the background's colors, 1 to 63 [default: 10].
     #[arg(long, value_name = "K", value_parser = clap::value_parser!(u16).range(1..=63))]
     background_components: Option<u16>,
-    /// What a pixel's colour is judged by.
+    /// What a pixel's color is judged by.
     #[arg(long, value_enum, default_value = "tuned")]
     rule: RuleArg,
     /// Which regions are kept.
@@ -164,15 +164,15 @@ impl Train {
             Progress::report(context, "read", i, pairs.len());
             photos.push(read_pair(pair, context)?);
         }
-        let labelled: Vec<Labelled<'_>> = photos.iter().map(|(photo, mask)| (photo.view(), mask.view())).collect();
+        let labeled: Vec<Labeled<'_>> = photos.iter().map(|(photo, mask)| (photo.view(), mask.view())).collect();
         let options = self.options(context);
-        let training = train_segment(&labelled, &options, context).map_err(|error| refused(error, &pairs))?;
+        let training = train_segment(&labeled, &options, context).map_err(|error| refused(error, &pairs))?;
         let trained = &training.trained;
         write_model(&self.model, &trained.model)?;
         let total: Scores = trained.scores.iter().copied().sum();
         if total.f1() < 0.5 {
             context.warn(format!(
-                "even on the photographs it was trained on, F1 is only {:.3}: the object's colours are not told from the background's",
+                "even on the photographs it was trained on, F1 is only {:.3}: the object's colors are not told from the background's",
                 total.f1()
             ));
         }
@@ -181,7 +181,7 @@ impl Train {
             headline(&mut page, &total, photos.len());
             page.note(Note::Info, "These are the scores on the photographs the model was trained on. On others they will be lower: use cv segment eval.");
             page.section("Model").facts(&[
-                ("colour space", format!("{:?}", options.space).to_uppercase()),
+                ("color space", format!("{:?}", options.space).to_uppercase()),
                 ("components of the object", trained.model.foreground().components.len().to_string()),
                 ("components of the background", trained.model.background().map_or(0, |b| b.components.len()).to_string()),
                 ("threshold", format!("{:.2} nats", trained.model.threshold())),

@@ -6,7 +6,7 @@ use cv_core::{Matrix3, Point3, Pose, Rotation3, Vector3};
 use cv_numeric::{svd3, symmetric_eigen};
 use nalgebra::{SMatrix, SVector};
 
-/// The pose, world to camera, of least algebraic error for six or more matches in normalised coordinates (the direct linear
+/// The pose, world to camera, of least algebraic error for six or more matches in normalized coordinates (the direct linear
 /// transformation, Hartley & Zisserman, §7.1, with the rotation made one by its singular values). One solution; refine it with
 /// [`refine_pose`](super::refine_pose).
 ///
@@ -16,14 +16,14 @@ use nalgebra::{SMatrix, SVector};
 pub fn pose_from_points(matches: &[WorldMatch]) -> Result<Pose, EstimateError> {
     check_world(matches, 6)?;
     let n = matches.len() as f64;
-    let centre = matches.iter().map(|m| m.world.coords).sum::<Vector3<f64>>() / n;
-    let spread = matches.iter().map(|m| (m.world.coords - centre).norm()).sum::<f64>() / n;
-    if spread <= 1e-14 * (1.0 + centre.norm()) {
+    let center = matches.iter().map(|m| m.world.coords).sum::<Vector3<f64>>() / n;
+    let spread = matches.iter().map(|m| (m.world.coords - center).norm()).sum::<f64>() / n;
+    if spread <= 1e-14 * (1.0 + center.norm()) {
         return Err(EstimateError::Degenerate { kind: Degeneracy::Coincident });
     }
     let mut ata = SMatrix::<f64, 12, 12>::zeros();
     for m in matches {
-        let p = (m.world.coords - centre) / spread;
+        let p = (m.world.coords - center) / spread;
         let q = [p.x, p.y, p.z, 1.0];
         for (row, at) in [(0, m.image.x), (4, m.image.y)] {
             let mut r = SVector::<f64, 12>::zeros();
@@ -49,7 +49,7 @@ pub fn pose_from_points(matches: &[WorldMatch]) -> Result<Pose, EstimateError> {
     let scale = sign * (svd.s[0] + svd.s[1] + svd.s[2].abs()) / 3.0;
     // With the sign taken out, all singular values are positive.
     let rotation = if sign > 0.0 { svd.u * svd.v.transpose() } else { flip(&svd.u) * svd.v.transpose() };
-    let translation = column / scale * spread - rotation * centre;
+    let translation = column / scale * spread - rotation * center;
     let pose = Pose::new(Rotation3::from_matrix_unchecked(rotation), translation);
     let front = matches.iter().filter(|m| pose.transform(&Point3::from(m.world.coords)).z > 0.0).count();
     if 2 * front < matches.len() { Err(planar) } else { Ok(pose) }

@@ -17,18 +17,18 @@ use cv_core::{Matrix3, Point2, Point3, Pose, Rotation3, Vector3};
 use cv_numeric::{LeastSquares, LmOptions, NormalEquations, levenberg_marquardt};
 use nalgebra::{Const, Matrix2x3, SVector};
 
-/// A point of the world and where a camera sees it, in normalised coordinates.
+/// A point of the world and where a camera sees it, in normalized coordinates.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct WorldMatch {
     /// In the world's frame.
     pub world: Point3<f64>,
-    /// Normalised: pixels through [`cv_core::Camera::normalize`].
+    /// Normalized: pixels through [`cv_core::Camera::normalize`].
     pub image: Point2<f64>,
 }
 
 /// The pose, world to camera, from matches of which many may be wrong.
 ///
-/// RANSAC over three-point samples with local optimisation on the reprojection error. `options.threshold` is in normalised units: pixels over
+/// RANSAC over three-point samples with local optimization on the reprojection error. `options.threshold` is in normalized units: pixels over
 /// the focal length. Inliers lie in front of the camera.
 ///
 /// # Errors
@@ -42,7 +42,7 @@ pub fn estimate_pose(matches: &[WorldMatch], options: &RobustOptions) -> Result<
     }
     let estimator = AbsoluteEstimator::new(matches);
     let found = ransac(&estimator, options)?;
-    let pose = estimator.uncentred(&found.model);
+    let pose = estimator.uncentered(&found.model);
     let (mut inliers, mut sum) = (Vec::new(), 0.0);
     for (i, m) in matches.iter().enumerate() {
         let r = reprojection(&pose, m);
@@ -57,7 +57,7 @@ pub fn estimate_pose(matches: &[WorldMatch], options: &RobustOptions) -> Result<
 
 /// Refines a pose on all `matches` within reach of it, to the least robust reprojection error.
 ///
-/// Returns the pose and its loss: each match adds 0 (exact) to 1 (beyond 2.5 thresholds, or behind the camera). `threshold` in normalised units.
+/// Returns the pose and its loss: each match adds 0 (exact) to 1 (beyond 2.5 thresholds, or behind the camera). `threshold` in normalized units.
 pub fn refine_pose(pose: &Pose, matches: &[WorldMatch], threshold: f64) -> (Pose, f64) {
     let problem = ReprojectionProblem { matches, scorer: &Marginal, threshold };
     let refined = refine(&problem, pose, 30).unwrap_or(*pose);
@@ -97,7 +97,7 @@ fn world_degeneracy(matches: &[WorldMatch]) -> Option<Degeneracy> {
     matches.iter().all(on_line).then_some(Degeneracy::Collinear)
 }
 
-/// Minimises `Σ ρ(reprojection² / threshold²)` over poses.
+/// Minimizes `Σ ρ(reprojection² / threshold²)` over poses.
 struct ReprojectionProblem<'a, C: Scorer> {
     matches: &'a [WorldMatch],
     scorer: &'a C,
@@ -179,7 +179,7 @@ impl WorldBlock {
 struct AbsoluteEstimator {
     /// With the world's origin amid the points, for the sake of f32.
     matches: Vec<WorldMatch>,
-    centre: Vector3<f64>,
+    center: Vector3<f64>,
     blocks: Vec<WorldBlock>,
 }
 
@@ -191,15 +191,15 @@ impl AbsoluteEstimator {
             let middle = v.len() / 2;
             *v.select_nth_unstable_by(middle, f64::total_cmp).1
         };
-        let centre = Vector3::new(median(0), median(1), median(2));
-        let moved = |m: &WorldMatch| WorldMatch { world: m.world - centre, image: m.image };
+        let center = Vector3::new(median(0), median(1), median(2));
+        let moved = |m: &WorldMatch| WorldMatch { world: m.world - center, image: m.image };
         let matches: Vec<WorldMatch> = matches.iter().map(moved).collect();
         let blocks = matches.chunks(LANES).map(WorldBlock::new).collect();
-        Self { matches, centre, blocks }
+        Self { matches, center, blocks }
     }
 
-    fn uncentred(&self, pose: &Pose) -> Pose {
-        Pose::new(pose.rotation, pose.translation - pose.rotation * self.centre)
+    fn uncentered(&self, pose: &Pose) -> Pose {
+        Pose::new(pose.rotation, pose.translation - pose.rotation * self.center)
     }
 }
 
@@ -276,7 +276,7 @@ mod tests {
         let matches = (0..n)
             .map(|_| {
                 let (p, pair) = views.point(None);
-                let image = views.normalise(&pair).b + nalgebra::Vector2::from_fn(|_, _| noise * gauss(&mut rng));
+                let image = views.normalize(&pair).b + nalgebra::Vector2::from_fn(|_, _| noise * gauss(&mut rng));
                 WorldMatch { world: p, image }
             })
             .collect();

@@ -4,7 +4,7 @@ use super::WorldMatch;
 use cv_core::{Matrix3, Pose, Rotation3, Vector3};
 use cv_numeric::{farthest_root_cubic, real_roots_quadratic};
 
-/// The poses (at most four), world to camera, that see three world points at three places, in normalised coordinates.
+/// The poses (at most four), world to camera, that see three world points at three places, in normalized coordinates.
 ///
 /// Calls `found` for each, all points in front of the camera; for none where the world points are on a line. The three squared
 /// distances between the points are quadratic in the depths; of their pencil of differences the degenerate member is a pair of planes, and
@@ -151,7 +151,7 @@ mod tests {
             let views = TwoViews::random(seed);
             let m = [(); 3].map(|()| {
                 let (p, pair) = views.point(None);
-                WorldMatch { world: p, image: views.normalise(&pair).b }
+                WorldMatch { world: p, image: views.normalize(&pair).b }
             });
             let (mut count, mut best) = (0, f64::INFINITY);
             pose_three_points(&m, |pose| {

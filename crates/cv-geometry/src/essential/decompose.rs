@@ -60,7 +60,7 @@ pub(crate) fn rotations_and_translation(e: &Matrix3<f64>) -> (Matrix3<f64>, Matr
     ((cofactors - across) / length2, (cofactors + across) / length2, direction)
 }
 
-/// Whether a match in normalised coordinates triangulates in front of both cameras.
+/// Whether a match in normalized coordinates triangulates in front of both cameras.
 #[inline]
 pub(crate) fn in_front(r: &Matrix3<f64>, t: &Vector3<f64>, a: &Vector3<f64>, b: &Vector3<f64>) -> bool {
     // λ₂ b = λ₁ R a + t, crossed with b and with R a.
@@ -81,7 +81,7 @@ pub struct RecoveredPose {
     pub runner_up: usize,
 }
 
-/// Chooses among the four poses of an essential matrix by cheirality. Matches in normalised coordinates.
+/// Chooses among the four poses of an essential matrix by cheirality. Matches in normalized coordinates.
 ///
 /// # Errors
 /// [`EstimateError`]: no matches, or E is zero or not finite.

@@ -22,7 +22,7 @@ type Basis = [[f64; 9]; 4];
 /// What elimination leaves of six of the ten cubics.
 type Reduced = [[f64; 10]; 6];
 
-/// The essential matrices (at most ten) with `bᵢᵀ E aᵢ = 0` for five matches in normalised coordinates, each of
+/// The essential matrices (at most ten) with `bᵢᵀ E aᵢ = 0` for five matches in normalized coordinates, each of
 /// Frobenius norm √2 (singular values 1, 1, 0).
 ///
 /// Calls `found` for each; for none where the points are degenerate. Nistér, "An efficient solution to the five-point relative pose

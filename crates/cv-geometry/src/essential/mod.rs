@@ -22,10 +22,10 @@ use cv_numeric::{LeastSquares, svd3};
 use decompose::rotations_and_translation;
 use nalgebra::{SMatrix, SVector};
 
-/// The relative pose of two calibrated cameras from matches in normalised coordinates, of which many may be wrong.
+/// The relative pose of two calibrated cameras from matches in normalized coordinates, of which many may be wrong.
 ///
-/// RANSAC over five-point samples with local optimisation of the pose on the Sampson error. The pose maps the first camera's
-/// coordinates to the second's; its translation has length one. `options.threshold` is in normalised units: pixels over the focal
+/// RANSAC over five-point samples with local optimization of the pose on the Sampson error. The pose maps the first camera's
+/// coordinates to the second's; its translation has length one. `options.threshold` is in normalized units: pixels over the focal
 /// length. Inliers lie in front of both cameras; in the search, a point that noise alone may have put behind one counts as in front.
 ///
 /// Five matches leave up to ten poses, so a sixth is needed to choose, and a plane leaves up to two (Longuet-Higgins, "The reconstruction of a plane
@@ -76,9 +76,9 @@ pub fn estimate_essential(
     Ok(found.map(|pose| essential_from_pose(&pose)))
 }
 
-/// Refines a relative pose on all `matches` (normalised) that are within reach of it, to the least robust Sampson error.
+/// Refines a relative pose on all `matches` (normalized) that are within reach of it, to the least robust Sampson error.
 ///
-/// Returns the pose and its loss: each match adds 0 (exact) to 1 (beyond 2.5 thresholds). `threshold` in normalised units.
+/// Returns the pose and its loss: each match adds 0 (exact) to 1 (beyond 2.5 thresholds). `threshold` in normalized units.
 pub fn refine_relative_pose(pose: &Pose, matches: &[Correspondence], threshold: f64) -> (Pose, f64) {
     let pairs: Vec<[f64; 4]> = matches.iter().map(|m| [m.a.x, m.a.y, m.b.x, m.b.y]).collect();
     let problem = SampsonProblem::new(&pairs, &Marginal, threshold);
@@ -92,7 +92,7 @@ fn straightened(pose: Pose) -> Option<Pose> {
 }
 
 /// The rotation that best turns the rays of the first camera into those of the second (Kabsch 1976 on unit rays, reweighted
-/// five times so that single matches count little), and the share of matches that it maps to within `threshold`. All in normalised
+/// five times so that single matches count little), and the share of matches that it maps to within `threshold`. All in normalized
 /// coordinates.
 ///
 /// A share near one means that the camera only turned, or that everything is far away: no translation can be told.
@@ -121,13 +121,13 @@ pub fn rotation_between(matches: &[Correspondence], threshold: f64) -> Result<(R
     Ok((rotation, share))
 }
 
-/// Matches in pixels as normalised coordinates of two cameras, and the factor from pixels to normalised units.
+/// Matches in pixels as normalized coordinates of two cameras, and the factor from pixels to normalized units.
 ///
 /// Points that a lens model does not reach become NaN: see [`Camera::normalize`].
 pub fn normalize_matches(matches: &[Correspondence], a: &Camera, b: &Camera) -> (Vec<Correspondence>, f64) {
-    let normalised = matches.iter().map(|m| Correspondence { a: a.normalize(m.a), b: b.normalize(m.b) }).collect();
+    let normalized = matches.iter().map(|m| Correspondence { a: a.normalize(m.a), b: b.normalize(m.b) }).collect();
     // The mean over both images and directions.
-    (normalised, 0.25 * (1.0 / a.fx + 1.0 / a.fy + 1.0 / b.fx + 1.0 / b.fy))
+    (normalized, 0.25 * (1.0 / a.fx + 1.0 / a.fy + 1.0 / b.fx + 1.0 / b.fy))
 }
 
 /// Relative poses by their five degrees of freedom: a rotation on the right of R, and the direction of t.
@@ -300,7 +300,7 @@ mod tests {
             }
             let (one, two, t) = rotations_and_translation(&e);
             prop_assert!([one, two].iter().any(|r| near(r, &t) || near(r, &-t)));
-            let m = views.normalised_matches(20, 0.0);
+            let m = views.normalized_matches(20, 0.0);
             let recovered = recover_pose(&e, &m).unwrap();
             prop_assert!(near(recovered.pose.rotation.matrix(), &recovered.pose.translation));
             prop_assert_eq!(recovered.in_front.len(), 20);
@@ -384,7 +384,7 @@ mod tests {
     fn one_of_the_five_point_solutions_is_the_truth_and_all_are_essential() {
         for seed in 0..1000 {
             let views = TwoViews::random(seed);
-            let m = views.normalised_matches(5, 0.0);
+            let m = views.normalized_matches(5, 0.0);
             let (a, b) = (std::array::from_fn(|i| m[i].a), std::array::from_fn(|i| m[i].b));
             let mut best = 0.0f64;
             let mut count = 0;
@@ -409,9 +409,9 @@ mod tests {
             let views = TwoViews::random(seed);
             let mut m = views.matches(150, 0.5);
             m.extend(views.wrong(150));
-            let (normalised, unit) = normalize_matches(&m, &views.camera, &views.camera);
+            let (normalized, unit) = normalize_matches(&m, &views.camera, &views.camera);
             let options = RobustOptions { threshold: 1.5 * unit, seed, ..RobustOptions::default() };
-            let found = estimate_relative_pose(&normalised, &options).unwrap();
+            let found = estimate_relative_pose(&normalized, &options).unwrap();
             errors.push(pose_difference(&found.model, &views.pose).map(f64::to_degrees));
             let right = found.inliers.iter().filter(|i| **i < 150).count();
             // 1.5 px is three standard deviations; a wrong match is that close to a line with a chance of about 3 in 480.
@@ -419,7 +419,7 @@ mod tests {
         }
         errors.sort_by(|a, b| (a[0] + a[1]).total_cmp(&(b[0] + b[1])));
         // Half a pixel at 500 px of focal length is 0.06 degrees for one ray; 150 of them fix rotation and direction to a few
-        // hundredths and tenths; the worst of forty has its points and its motion in the least favourable place.
+        // hundredths and tenths; the worst of forty has its points and its motion in the least favorable place.
         assert!(errors[20][0] < 0.3 && errors[20][1] < 1.0 && errors[39][1] < 5.0, "{errors:?}");
     }
 
@@ -431,9 +431,9 @@ mod tests {
             views.pose.translation *= 0.1;
             let mut m = views.matches(150, 0.2);
             m.extend(views.wrong(100));
-            let (normalised, unit) = normalize_matches(&m, &views.camera, &views.camera);
+            let (normalized, unit) = normalize_matches(&m, &views.camera, &views.camera);
             let options = RobustOptions { threshold: 1.5 * unit, seed, ..RobustOptions::essential() };
-            let found = estimate_relative_pose(&normalised, &options).unwrap();
+            let found = estimate_relative_pose(&normalized, &options).unwrap();
             errors.push(pose_difference(&found.model, &views.pose)[1].to_degrees());
         }
         errors.sort_by(f64::total_cmp);
@@ -446,7 +446,7 @@ mod tests {
     fn a_turn_is_told_from_a_move() {
         let views = TwoViews::random(4);
         let turn = Rotation3::new(Vector3::new(0.1, -0.2, 0.05));
-        let mut turned = views.normalised_matches(60, 0.0);
+        let mut turned = views.normalized_matches(60, 0.0);
         for m in &mut turned {
             m.b = Point2::from_homogeneous(turn * m.a.to_homogeneous()).unwrap();
         }
@@ -454,14 +454,14 @@ mod tests {
         let (rotation, share) = rotation_between(&turned, 1e-3).unwrap();
         // One wrong match of sixty keeps a weight of a three-hundredth.
         assert!(turn_between(&rotation, &turn) < 1e-4 && share == 59.0 / 60.0);
-        assert!(rotation_between(&views.normalised_matches(60, 0.0), 1e-3).unwrap().1 < 0.5);
+        assert!(rotation_between(&views.normalized_matches(60, 0.0), 1e-3).unwrap().1 < 0.5);
         assert!(rotation_between(&turned[..1], 1e-3).is_err());
     }
 
     #[test]
     fn refinement_finds_the_exact_pose() {
         let views = TwoViews::random(2);
-        let m = views.normalised_matches(60, 0.0);
+        let m = views.normalized_matches(60, 0.0);
         let start = Epipolar::step(&views.pose, &SVector::<f64, 5>::from([2e-3, -1e-3, 1e-3, 3e-3, 2e-3]));
         let (pose, loss) = refine_relative_pose(&start, &m, 4e-3);
         // An exact zero exists; Gauss and Newton's steps stop when the cost falls by less than a millionth.
@@ -472,7 +472,7 @@ mod tests {
     fn bad_input_gets_a_typed_answer() {
         let views = TwoViews::random(1);
         let options = RobustOptions { threshold: 1e-3, ..RobustOptions::default() };
-        let good = views.normalised_matches(20, 0.0);
+        let good = views.normalized_matches(20, 0.0);
         assert_eq!(
             estimate_relative_pose(&good[..5], &options).unwrap_err(),
             EstimateError::NotEnoughMatches { got: 5, needed: 6 }

@@ -24,7 +24,7 @@ pub fn pose_difference(a: &Pose, b: &Pose) -> [f64; 2] {
 ///
 /// A covariance from residuals supposes errors that know nothing of each other. Those of a lens that bends rays a little otherwise than
 /// its model says, of leaves in the wind, or of a repeated facade are alike all over a part of the image; where such a part moves
-/// the pose, this tells. `matches` in normalised coordinates, those that agree with `pose`; `threshold` as in [`refine_relative_pose`].
+/// the pose, this tells. `matches` in normalized coordinates, those that agree with `pose`; `threshold` as in [`refine_relative_pose`].
 pub fn pose_stability(pose: &Pose, matches: &[Correspondence], threshold: f64) -> [f64; 2] {
     let mut order: Vec<usize> = (0..matches.len()).collect();
     split(&mut order, matches, BLOCKS);
@@ -61,7 +61,7 @@ fn split(order: &mut [usize], matches: &[Correspondence], parts: usize) {
     split(right, matches, parts / 2);
 }
 
-/// Whether the matches (normalised) do not tell which of two poses is right: the difference of their losses is below twice its own
+/// Whether the matches (normalized) do not tell which of two poses is right: the difference of their losses is below twice its own
 /// standard deviation (Vuong, "Likelihood ratio tests for model selection and non-nested hypotheses", 1989).
 pub fn poses_are_rivals(a: &Pose, b: &Pose, matches: &[Correspondence], threshold: f64) -> bool {
     let (ea, eb) = (essential_from_pose(a), essential_from_pose(b));
@@ -85,7 +85,7 @@ mod tests {
     #[test]
     fn the_blocks_tell_of_a_part_that_disagrees() {
         let views = TwoViews::random(3);
-        let mut matches = views.normalised_matches(400, 2e-4);
+        let mut matches = views.normalized_matches(400, 2e-4);
         let fine = pose_stability(&refine_relative_pose(&views.pose, &matches, 4e-3).0, &matches, 4e-3);
         // A fifth of a pixel at 500 px on 400 points: hundredths of a degree for the rotation, tenths for the direction at most.
         assert!(fine[0] < 2e-3 && fine[1] < 1e-2, "{fine:?}");
@@ -100,7 +100,7 @@ mod tests {
     #[test]
     fn only_a_worse_pose_is_no_rival() {
         let views = TwoViews::random(5);
-        let matches = views.normalised_matches(100, 5e-4);
+        let matches = views.normalized_matches(100, 5e-4);
         let nearly =
             Pose::new(views.pose.rotation * Rotation3::new(Vector3::new(1e-6, 0.0, 0.0)), views.pose.translation);
         let other =

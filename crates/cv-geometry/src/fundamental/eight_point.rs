@@ -1,4 +1,4 @@
-//! The normalised eight-point algorithm.
+//! The normalized eight-point algorithm.
 
 use super::seven_point::epipolar_row;
 use crate::error::{Degeneracy, EstimateError};
@@ -7,7 +7,7 @@ use cv_core::{Correspondence, Matrix3};
 use cv_numeric::{null_space, smallest_eigenvector, svd3, symmetric_eigen};
 use nalgebra::{SMatrix, SVector};
 
-/// The fundamental matrix of least algebraic error through eight or more matches, by Hartley's normalised eight-point algorithm
+/// The fundamental matrix of least algebraic error through eight or more matches, by Hartley's normalized eight-point algorithm
 /// ("In defense of the eight-point algorithm", 1997), with the rank made 2 by its singular values.
 ///
 /// Of Frobenius norm 1, its largest entry positive; `bᵀ F a = 0`.

@@ -20,7 +20,7 @@ use rank_two::RankTwo;
 
 /// The fundamental matrix between two images of a rigid scene, from matches of which many may be wrong.
 ///
-/// RANSAC over seven-point samples with local optimisation on the Sampson error, and with recovery from samples that lie on one
+/// RANSAC over seven-point samples with local optimization on the Sampson error, and with recovery from samples that lie on one
 /// plane (DEGENSAC, Chum, Werner & Matas 2005). `bᵀ F a = 0`; Frobenius norm 1, the largest entry positive.
 ///
 /// # Errors
@@ -168,7 +168,7 @@ mod tests {
         #[test]
         fn one_of_the_seven_point_solutions_is_the_truth(seed: u64) {
             let views = TwoViews::random(seed);
-            let m = views.normalised_matches(7, 0.0);
+            let m = views.normalized_matches(7, 0.0);
             let (a, b) = points(&m);
             let mut best = 0.0f64;
             let mut count = 0;
@@ -189,7 +189,7 @@ mod tests {
         #[test]
         fn the_gradient_is_that_of_the_cost(seed: u64) {
             let views = TwoViews::random(seed);
-            let pairs: Vec<[f64; 4]> = views.normalised_matches(15, 1e-3).iter().map(|m| [m.a.x, m.a.y, m.b.x, m.b.y]).collect();
+            let pairs: Vec<[f64; 4]> = views.normalized_matches(15, 1e-3).iter().map(|m| [m.a.x, m.a.y, m.b.x, m.b.y]).collect();
             let problem = SampsonProblem::new(&pairs, &AllIn, 1.0);
             let start = RankTwo::new(&views.essential()).unwrap();
             let start = start.step(&nalgebra::SVector::from([0.01, -0.02, 0.01, 0.02, 0.01, -0.01, 0.02]));

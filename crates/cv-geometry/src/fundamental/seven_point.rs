@@ -8,7 +8,7 @@ use cv_numeric::{null_space, real_roots_cubic};
 /// (Hartley & Zisserman, §11.1.2).
 ///
 /// Calls `found` for each; for none where the points are degenerate. Coordinates should be of order one: see
-/// `estimate_fundamental`, which normalises them. The null space by elimination, the rank by a cubic.
+/// `estimate_fundamental`, which normalizes them. The null space by elimination, the rank by a cubic.
 #[inline]
 pub fn fundamental_seven_point(a: &[Point2<f64>; 7], b: &[Point2<f64>; 7], mut found: impl FnMut(Matrix3<f64>)) {
     let rows = std::array::from_fn(|i| epipolar_row(a[i], b[i]));

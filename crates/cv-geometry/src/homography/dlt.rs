@@ -1,4 +1,4 @@
-//! Homography through many points by the normalised direct linear transform.
+//! Homography through many points by the normalized direct linear transform.
 
 use crate::error::{Degeneracy, EstimateError};
 use crate::pairs::{check, hartley};

@@ -27,9 +27,9 @@ pub fn homography_residual(h: &Matrix3<f64>, m: &Correspondence) -> f64 {
     }
 }
 
-/// The homography between two images that share a plane or a camera centre, from matches of which many may be wrong.
+/// The homography between two images that share a plane or a camera center, from matches of which many may be wrong.
 ///
-/// RANSAC with local optimisation on the symmetric transfer error; the model is scaled to `H[2][2] = 1`.
+/// RANSAC with local optimization on the symmetric transfer error; the model is scaled to `H[2][2] = 1`.
 ///
 /// ```
 /// use cv_core::Correspondence;
@@ -80,13 +80,13 @@ pub fn estimate_homography(
 /// [`EstimateError`] as for [`homography_from_points`].
 pub fn refine_homography(h: &Matrix3<f64>, matches: &[Correspondence]) -> Result<Matrix3<f64>, EstimateError> {
     let set = PairSet::new(matches, 4)?;
-    let normalised = set.second.matrix() * h * set.first.inverse_matrix();
+    let normalized = set.second.matrix() * h * set.first.inverse_matrix();
     let problem = TransferProblem { pairs: &set.pairs, scorer: &AllIn, threshold: 1.0 };
-    let refined = refine_transfer(&problem, &normalised, 50).unwrap_or(normalised);
+    let refined = refine_transfer(&problem, &normalized, 50).unwrap_or(normalized);
     Ok(dlt::scaled(&(set.second.inverse_matrix() * refined * set.first.matrix())))
 }
 
-/// Refines `h` on the normalised pairs that it maps to within `threshold`.
+/// Refines `h` on the normalized pairs that it maps to within `threshold`.
 pub(crate) fn refine_on_plane(pairs: &[[f64; 4]], h: &Matrix3<f64>, threshold: f64) -> Matrix3<f64> {
     let problem = TransferProblem { pairs, scorer: &Marginal, threshold };
     refine_transfer(&problem, h, 10).unwrap_or(*h)
@@ -331,8 +331,8 @@ mod tests {
         fn vector_residuals_are_the_plain_ones(h in a_homography(), seed: u64) {
             let m = matches(&h, 40, 2.0, &mut ChaCha8Rng::seed_from_u64(seed));
             let set = PairSet::new(&m, 4).unwrap();
-            let normalised = set.second.matrix() * h * set.first.inverse_matrix();
-            let kernel = TransferKernel::new(&normalised);
+            let normalized = set.second.matrix() * h * set.first.inverse_matrix();
+            let kernel = TransferKernel::new(&normalized);
             let mut fast: Vec<f32> = set.blocks.iter().flat_map(|b| kernel.squared_residuals(b)).collect();
             fast.truncate(m.len());
             let mut plain: Vec<f64> = m.iter().map(|m| homography_residual(&h, m).powi(2) * set.first.scale.powi(2)).collect();

@@ -6,7 +6,7 @@ use cv_numeric::{LeastSquares, LmOptions, NormalEquations, levenberg_marquardt};
 use fearless_simd::{Level, dispatch};
 use nalgebra::{Const, SMatrix, SVector};
 
-/// Minimises `Σ ρ((d₁² + d₂²)/2 / threshold²)` over the eight entries beside `H[2][2] = 1`, with `d₂` the distance from
+/// Minimizes `Σ ρ((d₁² + d₂²)/2 / threshold²)` over the eight entries beside `H[2][2] = 1`, with `d₂` the distance from
 /// `b` to `H a` and `d₁` that from `a` to `H⁻¹ b`.
 pub(crate) struct TransferProblem<'a, C: Scorer> {
     pub(crate) pairs: &'a [[f64; 4]],

@@ -107,7 +107,7 @@ impl<'a, E: Estimator, C: Scorer> Judge<'a, E, C> {
         dispatch!(self.level, _simd => count_blocks::<E, N>(&kernel, blocks, scale))
     }
 
-    /// Local optimisation: the model after refinement, where that lowered its loss.
+    /// Local optimization: the model after refinement, where that lowered its loss.
     pub(super) fn improve(&self, found: &mut Found<E::Model>, iterations: usize) {
         if let Some(model) = self.estimator.refine(&found.model, self.scorer, self.threshold, iterations) {
             let score = self.score(&model, found.score.loss);
@@ -164,7 +164,7 @@ impl<'a, E: Estimator, C: Scorer> Judge<'a, E, C> {
         within.map(|(_, i)| *i).collect()
     }
 
-    /// Standard deviation of the residuals of right data in thresholds, by expectation maximisation on a mixture of a Gaussian and an even
+    /// Standard deviation of the residuals of right data in thresholds, by expectation maximization on a mixture of a Gaussian and an even
     /// background (MLESAC, Torr & Zisserman 2000); the background is what is found from 3 to 10 thresholds away. At most one threshold.
     pub(super) fn noise(&self, model: &E::Model) -> Option<f64> {
         let kernel = self.estimator.kernel(model);

@@ -20,7 +20,7 @@ use search::search;
 
 /// What a robust estimation has to know about a model.
 ///
-/// Distances are in the estimator's own (normalised) unit; [`Estimator::unit`] says how many of them a unit of the caller's is.
+/// Distances are in the estimator's own (normalized) unit; [`Estimator::unit`] says how many of them a unit of the caller's is.
 pub trait Estimator: Sync {
     /// The model.
     type Model: Clone + Send + Sync;
@@ -115,7 +115,7 @@ pub struct Consensus<M> {
 /// Draws samples until one without outliers was drawn with the stated confidence, keeps the model of least loss and refines it.
 ///
 /// This is the loop behind every `estimate_…` function, for models of one's own: RANSAC (Fischler & Bolles 1981) with
-/// a smooth loss (MSAC, Torr & Zisserman 2000; MAGSAC++, Barath et al. 2020) and local optimisation (LO-RANSAC, Chum et
+/// a smooth loss (MSAC, Torr & Zisserman 2000; MAGSAC++, Barath et al. 2020) and local optimization (LO-RANSAC, Chum et
 /// al. 2003) on the same loss. O(samples × data).
 ///
 /// # Errors

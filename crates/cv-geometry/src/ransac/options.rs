@@ -69,7 +69,7 @@ impl RobustOptions {
         Self { threshold: 1.0, max_iterations: 20_000, ..Self::default() }
     }
 
-    /// Defaults for essential matrices and poses: threshold 1, to be multiplied by one over the focal length where matches are in normalised
+    /// Defaults for essential matrices and poses: threshold 1, to be multiplied by one over the focal length where matches are in normalized
     /// coordinates; 20 000 samples at most (enough for four fifths of wrong matches), judged by [`Scoring::Msac`]: of the two losses that
     /// with the smaller errors on generated poses with up to 95 % of wrong matches.
     pub fn essential() -> Self {

@@ -14,7 +14,7 @@ const MOST: usize = 256;
 const PARALLEL_FROM: usize = 8192;
 /// Minimal models kept to be searched around, should the samples run out before the confidence is reached.
 const RUNNERS_UP: usize = 32;
-/// Steps of a local optimisation inside the loop, and at the end.
+/// Steps of a local optimization inside the loop, and at the end.
 pub(super) const LOCAL_STEPS: usize = 5;
 const FINAL_STEPS: usize = 20;
 /// The scale of Tukey's biweight, in standard deviations, at which it is 95 % as good as least squares on Gaussian errors (Huber &
@@ -33,8 +33,8 @@ struct Winner<M> {
     sample: [u32; 8],
 }
 
-/// Draws samples until enough were drawn. Every minimal model that is the best so far is locally optimised on the same loss it is judged by. (Not only
-/// one that beats the optimised: noise lets hardly any minimal model do that.) A model is given up as soon as its loss is too large to
+/// Draws samples until enough were drawn. Every minimal model that is the best so far is locally optimized on the same loss it is judged by. (Not only
+/// one that beats the optimized: noise lets hardly any minimal model do that.) A model is given up as soon as its loss is too large to
 /// matter, which never changes the result.
 ///
 /// Batches grow with the number of samples drawn, and each is judged by what was known before it, so the result does not depend on how it is
@@ -111,7 +111,7 @@ pub(super) fn search<E: Estimator, C: Scorer, S: Sampler>(
     Some(Consensus { model, score, iterations, log_nfa: None })
 }
 
-/// The minimal model or the best of its alternatives, both locally optimised.
+/// The minimal model or the best of its alternatives, both locally optimized.
 fn optimized<E: Estimator, C: Scorer>(
     judge: &Judge<'_, E, C>,
     winner: Winner<E::Model>,

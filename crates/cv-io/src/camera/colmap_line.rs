@@ -6,7 +6,7 @@ use crate::FormatError;
 
 const NAME: &str = "COLMAP camera";
 
-/// COLMAP's pixel centres are at +0.5.
+/// COLMAP's pixel centers are at +0.5.
 pub(crate) const CENTER: f64 = 0.5;
 
 /// The camera of `model` with COLMAP's `parameters`.

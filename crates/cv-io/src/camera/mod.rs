@@ -32,7 +32,7 @@ pub struct RigFile {
 /// their usual names for the matrix and the coefficients); a COLMAP camera, as in `cameras.txt` (`1 SIMPLE_RADIAL 640 480 …`), alone or
 /// behind `# camera:`; a calibration matrix of three rows of three numbers.
 ///
-/// COLMAP's principal points have pixel centres at +0.5 and are brought to ours, at integers; all others are taken as they are.
+/// COLMAP's principal points have pixel centers at +0.5 and are brought to ours, at integers; all others are taken as they are.
 ///
 /// `size` is used where the text has no picture size (a bare matrix, OpenCV's sample programs); else it is ignored.
 ///

@@ -142,7 +142,7 @@ fn push_camera(text: &mut String, camera: &Camera, indent: &str) -> Result<(), F
     let _ = writeln!(text, "{indent}width: {}\n{indent}height: {}", camera.width, camera.height);
     // Debug formatting of f64 is the shortest that reads back to the same bits, and always looks like a number.
     let _ = writeln!(text, "{indent}fx: {:?}\n{indent}fy: {:?}", camera.fx, camera.fy);
-    let _ = writeln!(text, "{indent}# principal point, centre of the top-left pixel at (0, 0)");
+    let _ = writeln!(text, "{indent}# principal point, center of the top-left pixel at (0, 0)");
     let _ = writeln!(text, "{indent}cx: {:?}\n{indent}cy: {:?}", camera.cx, camera.cy);
     let _ = writeln!(text, "{indent}distortion: {model}\n{indent}coefficients: {k:?}");
     Ok(())

@@ -59,7 +59,7 @@ fn colmap_lines_lose_their_half_pixel() {
         ..Camera::pinhole(2832, 2128, 2973.319797, 2973.319797, 1415.5, 1063.5)
     };
     for text in [
-        "# world-to-camera poses by COLMAP (SIFT)\n# camera: SIMPLE_RADIAL 2832x2128 params 2973.319797 1416.000000 1064.000000 -0.161960 (pixel centres at +0.5)\n# name qw\nA.JPG 1 0 0 0\n",
+        "# world-to-camera poses by COLMAP (SIFT)\n# camera: SIMPLE_RADIAL 2832x2128 params 2973.319797 1416.000000 1064.000000 -0.161960 (pixel centers at +0.5)\n# name qw\nA.JPG 1 0 0 0\n",
         "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 SIMPLE_RADIAL 2832 2128 2973.319797 1416 1064 -0.16196\n",
         "SIMPLE_RADIAL 2832 2128 2973.319797 1416 1064 -0.16196",
     ] {

@@ -6,7 +6,7 @@ use image::codecs::png::PngEncoder;
 use image::{ExtendedColorType, ImageEncoder};
 use proptest::prelude::*;
 
-/// A picture whose every pixel differs from its neighbours in a way that no flip keeps.
+/// A picture whose every pixel differs from its neighbors in a way that no flip keeps.
 fn ramp(width: usize, height: usize) -> RgbU8 {
     RgbU8::from_fn(width, height, |x, y| [(x * 20) as u8, (y * 30) as u8, (x * 7 + y * 11) as u8])
 }
@@ -33,7 +33,7 @@ fn samples() -> Vec<(&'static str, Vec<u8>)> {
     vec![
         ("png", encode_png(image.view()).unwrap()),
         ("png 16", encode_png(image.map(|p| p.map(|v| u16::from(v) * 257)).view()).unwrap()),
-        ("png grey alpha", encode_as(ImageFormat::Png, &rgb.to_luma_alpha8().into())),
+        ("png gray alpha", encode_as(ImageFormat::Png, &rgb.to_luma_alpha8().into())),
         ("jpeg", encode_jpeg(image.view(), 90).unwrap()),
         ("progressive", {
             let mut bytes = Vec::new();
@@ -110,7 +110,7 @@ fn every_orientation_is_applied_as_the_standard_defines_it() {
         |x, y, w, h| (h - 1 - y, w - 1 - x), // right, bottom
         |x, y, w, _| (y, w - 1 - x),         // left, bottom
     ];
-    // Blocks of 8 × 8 pixels, so that a JPEG keeps their colours.
+    // Blocks of 8 × 8 pixels, so that a JPEG keeps their colors.
     let stored = RgbU8::from_fn(24, 16, |x, y| ramp(3, 2).at(x / 8, y / 8).map(|v| v * 4));
     for (k, place) in places.iter().enumerate() {
         let fields = [(Tag::Orientation, Value::Short(vec![k as u16 + 1]))];
@@ -208,10 +208,10 @@ fn every_depth_and_kind_gives_the_same_picture() {
     assert_eq!(decoded(&encode_png(deep.view()).unwrap()).pixels, Pixels::Rgb16(deep));
     let deep = Image::<u16, 1>::from_fn(5, 3, |x, y| [x as u16 * 9999 + y as u16]);
     assert_eq!(decoded(&encode_png(deep.view()).unwrap()).pixels, Pixels::Gray16(deep));
-    let grey = image.map(|[r, _, _]| [r]);
-    assert_eq!(decoded(&encode_png(grey.view()).unwrap()).into_rgb8(), grey.map(|[v]| [v; 3]));
+    let gray = image.map(|[r, _, _]| [r]);
+    assert_eq!(decoded(&encode_png(gray.view()).unwrap()).into_rgb8(), gray.map(|[v]| [v; 3]));
     let alpha = image::GrayAlphaImage::from_fn(12, 7, |x, y| image::LumaA([(x * 20) as u8, y as u8]));
-    assert_eq!(decoded(&encode_as(ImageFormat::Png, &alpha.into())).into_gray8(), grey);
+    assert_eq!(decoded(&encode_as(ImageFormat::Png, &alpha.into())).into_gray8(), gray);
 }
 
 #[test]
@@ -237,7 +237,7 @@ fn four_inks_become_three_lights() {
     for color in [jpeg_encoder::ColorType::Cmyk, jpeg_encoder::ColorType::CmykAsYcck] {
         let back = decoded(&cmyk(&image, color)).into_rgb8();
         let worst = image.as_slice().iter().zip(back.as_slice()).map(|(a, b)| a.abs_diff(*b)).max();
-        // A smooth ramp at quality 95 is coded to a few grey levels.
+        // A smooth ramp at quality 95 is coded to a few gray levels.
         assert!(worst <= Some(12), "{worst:?}");
     }
 }
@@ -250,13 +250,13 @@ fn linear_light_is_encoded_for_the_eye() {
         vec![0.0, 1.0, 0.5, 0.0031308, 2.0, -1.0, 0.18, 0.18, 0.18, f32::NAN, 0.0, 1.0],
     );
     let bytes = encode_as(ImageFormat::OpenExr, &light.unwrap().into());
-    // IEC 61966-2-1 at 0.5, at its corner, and at the photographer's grey.
+    // IEC 61966-2-1 at 0.5, at its corner, and at the photographer's gray.
     let expected = [0, 255, 188, 10, 255, 0, 118, 118, 118, 0, 0, 255];
     assert_eq!(decoded(&bytes).into_rgb8().as_slice(), expected);
 }
 
 #[test]
-fn grey_is_opencvs() {
+fn gray_is_opencvs() {
     // cv2.cvtColor(…, COLOR_RGB2GRAY) of OpenCV 5.0.
     let image = RgbU8::from_vec(4, 1, vec![255, 0, 0, 0, 255, 0, 0, 0, 255, 10, 200, 90]).unwrap();
     assert_eq!(decoded(&encode_png(image.view()).unwrap()).into_gray8().as_slice(), [76, 150, 29, 131]);

@@ -80,15 +80,15 @@ fn calibrated(
     cameras: &[Camera; 2],
     options: &ReconstructOptions,
 ) -> Result<(Pose, Vec<usize>), ReconstructError> {
-    let (normalised, unit) = normalize_matches(pairs, &cameras[0], &cameras[1]);
+    let (normalized, unit) = normalize_matches(pairs, &cameras[0], &cameras[1]);
     // A pixel that no ray reaches (beyond the range of the lens model) is no match.
-    let usable: Vec<usize> = (0..normalised.len()).filter(|&i| normalised[i].is_finite()).collect();
-    let normalised: Vec<_> = usable.iter().map(|&i| normalised[i]).collect();
+    let usable: Vec<usize> = (0..normalized.len()).filter(|&i| normalized[i].is_finite()).collect();
+    let normalized: Vec<_> = usable.iter().map(|&i| normalized[i]).collect();
     let threshold = options.robust.threshold * unit;
     let search = |k: u64| {
         let seed = options.robust.seed.wrapping_add(k);
-        let found = estimate_relative_pose(&normalised, &RobustOptions { threshold, seed, ..options.robust })?;
-        let (pose, loss) = refine_relative_pose(&found.model, &normalised, threshold);
+        let found = estimate_relative_pose(&normalized, &RobustOptions { threshold, seed, ..options.robust })?;
+        let (pose, loss) = refine_relative_pose(&found.model, &normalized, threshold);
         Ok((RobustModel { model: pose, ..found }, loss))
     };
     let searches: Vec<_> = (0..SEARCHES).into_par_iter().map(search).collect();
@@ -100,7 +100,7 @@ fn calibrated(
     // As far as another search got, where the matches do not say that it got to a worse place.
     let apart = others
         .iter()
-        .filter(|other| poses_are_rivals(&best.model, &other.0.model, &normalised, threshold))
+        .filter(|other| poses_are_rivals(&best.model, &other.0.model, &normalized, threshold))
         .map(|other| pose_difference(&best.model, &other.0.model)[1])
         .fold(0.0, f64::max);
     if apart > options.max_deviation {

@@ -146,8 +146,8 @@ impl Search<'_> {
     /// The best pose of a search with a lens.
     fn searched(&self, lens: Lens) -> Option<Trial> {
         let [a, b] = self.cameras(&lens);
-        let (normalised, unit) = normalize_matches(self.pairs, &a, &b);
-        let usable: Vec<_> = normalised.into_iter().filter(Correspondence::is_finite).collect();
+        let (normalized, unit) = normalize_matches(self.pairs, &a, &b);
+        let usable: Vec<_> = normalized.into_iter().filter(Correspondence::is_finite).collect();
         let options = RobustOptions {
             threshold: self.robust.threshold * unit,
             max_iterations: SAMPLES[0].min(self.robust.max_iterations),
@@ -188,11 +188,11 @@ impl Search<'_> {
     /// The best pose near another.
     fn refined(&self, lens: Lens, pose: &Pose) -> Trial {
         let [a, b] = self.cameras(&lens);
-        let (normalised, unit) = normalize_matches(self.pairs, &a, &b);
+        let (normalized, unit) = normalize_matches(self.pairs, &a, &b);
         let threshold = self.robust.threshold * unit;
-        let usable: Vec<_> = normalised.iter().copied().filter(Correspondence::is_finite).collect();
+        let usable: Vec<_> = normalized.iter().copied().filter(Correspondence::is_finite).collect();
         let (pose, _) = refine_relative_pose(pose, &usable, threshold);
-        trial(lens, pose, &essential_from_pose(&pose), &normalised, threshold)
+        trial(lens, pose, &essential_from_pose(&pose), &normalized, threshold)
     }
 
     /// The best pose and focal length near others.
@@ -208,8 +208,8 @@ impl Search<'_> {
     fn straightened(&self, bend: f64) -> Vec<Correspondence> {
         let any = self.sizes[0].0.max(self.sizes[0].1) as f64;
         let [a, b] = self.cameras(&Lens { focal: [any; 2], bend });
-        let (normalised, _) = normalize_matches(self.pairs, &a, &b);
-        normalised.into_iter().map(|m| Correspondence { a: m.a * any, b: m.b * any }).collect()
+        let (normalized, _) = normalize_matches(self.pairs, &a, &b);
+        normalized.into_iter().map(|m| Correspondence { a: m.a * any, b: m.b * any }).collect()
     }
 
     /// Steps of the distortion, halved where none helps, down to a thousandth.

@@ -4,12 +4,12 @@ mod dense;
 mod error;
 mod initial;
 mod lens;
-mod neighbours;
+mod neighbors;
 
 pub use dense::{DenseError, DenseOptions, DenseResult, reconstruct_dense};
 pub use error::ReconstructError;
 use initial::{Initial, cameras, initial};
-use neighbours::like_their_neighbours;
+use neighbors::like_their_neighbors;
 
 use crate::guided::{GuidedOptions, match_along_lines};
 use crate::matching::match_reduced;
@@ -114,7 +114,7 @@ pub struct ReconstructResult {
     pub matching: MatchingResult,
     /// Indices of the matches that obey the epipolar geometry, ascending.
     pub inliers: Vec<usize>,
-    /// Matches found along the epipolar lines at the depth of their neighbours, those of `inliers` that came back included; 0 where that was not
+    /// Matches found along the epipolar lines at the depth of their neighbors, those of `inliers` that came back included; 0 where that was not
     /// asked for.
     pub guided: usize,
     /// The cameras, refined where they were not known.
@@ -196,9 +196,9 @@ pub fn reconstruct(
     progress.report("points", 0, 1);
     let mut fit = watch.time("bundle", || fit(&chosen, cameras, pose, &settings)).ok_or_else(|| too_few(0))?;
     // Before the matches along the lines: those agree with the pose because they were looked for where it says.
-    let (normalised, unit) = normalize_matches(&fit.observed, &fit.bundle.cameras[0], &fit.bundle.cameras[1]);
+    let (normalized, unit) = normalize_matches(&fit.observed, &fit.bundle.cameras[0], &fit.bundle.cameras[1]);
     let reach = options.robust.threshold * unit;
-    let stability = watch.time("stability", || pose_stability(&fit.bundle.pose, &normalised, reach));
+    let stability = watch.time("stability", || pose_stability(&fit.bundle.pose, &normalized, reach));
     let mut guided = 0;
     if options.guided {
         let [fa, fb] = &matching.features;
@@ -213,7 +213,7 @@ pub fn reconstruct(
         watch.lap("guided");
         let more = correspondences(fa, fb, &matches);
         let TwoViewBundle { cameras, pose, points } = &fit.bundle;
-        let more = like_their_neighbours(&more, &fit.observed, points, cameras, pose);
+        let more = like_their_neighbors(&more, &fit.observed, points, cameras, pose);
         guided = more.len();
         // Fewer would mean that the first matches were not what the lines say.
         if more.len() > chosen.len()
@@ -299,9 +299,9 @@ struct Fit {
 
 /// Triangulates and adjusts; `None` where nothing can be triangulated.
 fn fit(matches: &[Correspondence], cameras: [Camera; 2], pose: Pose, settings: &BundleOptions) -> Option<Fit> {
-    let (normalised, _) = normalize_matches(matches, &cameras[0], &cameras[1]);
+    let (normalized, _) = normalize_matches(matches, &cameras[0], &cameras[1]);
     let seen = |(m, n): (&Correspondence, &Correspondence)| Some((*m, triangulate(n, &pose).ok()?));
-    let (observed, points): (Vec<_>, Vec<_>) = matches.iter().zip(&normalised).filter_map(seen).unzip();
+    let (observed, points): (Vec<_>, Vec<_>) = matches.iter().zip(&normalized).filter_map(seen).unzip();
     let mut bundle = TwoViewBundle { cameras, pose, points };
     let report = adjust_two_views(&mut bundle, &observed, settings)?;
     if !settings.refine_focal {
@@ -354,8 +354,8 @@ impl Simple {
         if let Some([a, b]) = cameras {
             let on_plane: Vec<Correspondence> = h.inliers.iter().map(|&i| straight[i]).collect();
             let pinhole = |c: &Camera| Camera::pinhole(c.width, c.height, c.fx, c.fy, c.cx, c.cy);
-            let (normalised, unit) = normalize_matches(&on_plane, &pinhole(a), &pinhole(b));
-            if let Ok((rotation, share)) = rotation_between(&normalised, reach * unit) {
+            let (normalized, unit) = normalize_matches(&on_plane, &pinhole(a), &pinhole(b));
+            if let Ok((rotation, share)) = rotation_between(&normalized, reach * unit) {
                 simple.turned = (share * on_plane.len() as f64).round() as usize;
                 simple.degrees = Pose::new(rotation, Vector3::zeros()).rotation_angle().to_degrees();
             }
@@ -389,7 +389,7 @@ fn reprojection(bundle: &TwoViewBundle, point: &Point3<f64>, m: &Correspondence)
     Some([(first - m.a).norm(), (second - m.b).norm()])
 }
 
-/// The colour of the pixel nearest to a position.
+/// The color of the pixel nearest to a position.
 fn color_at(photo: ImageView<'_, u8, 3>, p: Point2<f64>) -> [u8; 3] {
     let near = |v: f64, n: usize| v.round().clamp(0.0, n.saturating_sub(1) as f64) as usize;
     photo.get(near(p.x, photo.width()), near(p.y, photo.height())).unwrap_or([0; 3])

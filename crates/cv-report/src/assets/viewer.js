@@ -1,4 +1,4 @@
-// A small viewer for coloured points and camera outlines: WebGL 2, no other file, no network.
+// A small viewer for colored points and camera outlines: WebGL 2, no other file, no network.
 (() => {
   const VERTEX = `#version 300 es
     in vec3 p; in vec4 c; uniform mat4 m; uniform float size; out vec4 color;
@@ -167,7 +167,7 @@
     button.type = "button";
     button.textContent = "Reset view";
     button.addEventListener("click", reset);
-    const labelled = (text, type, set) => {
+    const labeled = (text, type, set) => {
       const label = document.createElement("label"), input = document.createElement("input");
       input.type = type;
       set(input);
@@ -175,11 +175,11 @@
       label.append(text, input);
       return label;
     };
-    bar.append(button, labelled("Point size", "range", (i) => {
+    bar.append(button, labeled("Point size", "range", (i) => {
       [i.min, i.max, i.step, i.value] = [0.5, 10, 0.1, size];
       i.addEventListener("input", () => { size = Number(i.value); });
     }));
-    if (lines.count) bar.append(labelled("Cameras", "checkbox", (i) => {
+    if (lines.count) bar.append(labeled("Cameras", "checkbox", (i) => {
       i.checked = true;
       i.addEventListener("input", () => { showCameras = i.checked; });
     }));

@@ -64,7 +64,7 @@ pub(crate) fn wall_texture(kind: usize, rng: &mut Rng) -> Texture {
     }
 }
 
-/// A standing book, its back towards −z before it is turned by `yaw`, foot at the middle of its underside.
+/// A standing book, its back toward −z before it is turned by `yaw`, foot at the middle of its underside.
 pub(crate) fn book(b: &mut SceneBuilder, foot: Point3<f64>, size: [f64; 3], yaw: f64, rng: &mut Rng) {
     let colors = [cloth(rng), srgb(rng.pick([0xE8D9A0, 0xF4F1E8, 0x1E1E1E, 0xC9A24B]))];
     let seed = rng.seed32();
@@ -73,7 +73,7 @@ pub(crate) fn book(b: &mut SceneBuilder, foot: Point3<f64>, size: [f64; 3], yaw:
     b.block(foot, size, yaw, [&spine, &cover, &Texture::Pages { seed }]);
 }
 
-/// A shelf of `width` × `height` × `depth`, open towards −z before it is turned by `yaw` about `foot`.
+/// A shelf of `width` × `height` × `depth`, open toward −z before it is turned by `yaw` about `foot`.
 pub(crate) fn bookcase(b: &mut SceneBuilder, foot: Point3<f64>, size: [f64; 3], yaw: f64, rng: &mut Rng) {
     let [width, height, depth] = size;
     let turn = Rotation3::from_axis_angle(&Vector3::y_axis(), yaw);
@@ -186,7 +186,7 @@ pub(crate) fn mug(b: &mut SceneBuilder, foot: Point3<f64>, rng: &mut Rng) {
     }
 }
 
-/// A pot with stalks and leaves, `size` metres tall.
+/// A pot with stalks and leaves, `size` meters tall.
 pub(crate) fn plant(b: &mut SceneBuilder, foot: Point3<f64>, size: f64, rng: &mut Rng) {
     let r = 0.16 * size;
     let rim = foot - Vector3::y() * (0.26 * size);

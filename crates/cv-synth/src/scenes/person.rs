@@ -6,7 +6,7 @@ use crate::scene::{Scene, SceneBuilder};
 use crate::texture::{Texture, srgb};
 use nalgebra::{Point3, Rotation3, Vector3};
 
-/// The scene with a walker at `foot`, facing `yaw` (0 = towards −z), `phase` radians into the stride.
+/// The scene with a walker at `foot`, facing `yaw` (0 = toward −z), `phase` radians into the stride.
 ///
 /// The clothes follow from the seed alone: the same seed is the same person.
 pub(crate) fn walker(scene: &Scene, foot: Point3<f64>, yaw: f64, phase: f64, seed: u64) -> Scene {

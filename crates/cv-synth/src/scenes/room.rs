@@ -8,7 +8,7 @@ use cv_core::Pose;
 use nalgebra::{Rotation3, Vector3};
 use std::f64::consts::FRAC_PI_2;
 
-/// Width, height, length in metres.
+/// Width, height, length in meters.
 const SIZE: [f64; 3] = [6.0, 2.7, 9.0];
 
 impl Scene {

@@ -87,7 +87,7 @@ impl Scene {
         Self::ball_at(seed, seed, distance)
     }
 
-    /// The corner of seed `room` with the ball `distance` metres in front of the camera, somewhere in its view.
+    /// The corner of seed `room` with the ball `distance` meters in front of the camera, somewhere in its view.
     pub(crate) fn ball_at(room: u64, seed: u64, distance: f64) -> Scene {
         let mut rng = Rng::new(room, 4);
         let rng = &mut rng;

@@ -13,7 +13,7 @@ use std::sync::Arc;
 pub(crate) struct Wall;
 
 impl Wall {
-    /// Half the width and half the height in metres.
+    /// Half the width and half the height in meters.
     pub(crate) const HALF: (f64, f64) = (6.0, 4.0);
     /// Distance of the plane from the world's origin along z.
     pub(crate) const Z: f64 = 3.0;

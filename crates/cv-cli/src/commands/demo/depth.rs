@@ -8,9 +8,9 @@ use cv_pipeline::{DepthOptions, depth};
 use cv_report::{MapStyle, PointScene, Viewpoint, colors, draw_map, render_points};
 use cv_synth::{RenderOptions, Scene, depth_score, stereo_pair};
 
-/// Metres between the two cameras.
+/// Meters between the two cameras.
 const BASELINE: f64 = 0.2;
-/// The bar: within this share of the true depth, below this many metres.
+/// The bar: within this share of the true depth, below this many meters.
 const TOLERANCE: f32 = 0.05;
 const LIMIT: f32 = 10.0;
 
@@ -74,11 +74,11 @@ fn median(depth: &GrayF32, visible: &Mask) -> f32 {
 fn errors(photo: &RgbU8, found: &GrayF32, truth: &GrayF32, visible: &Mask) -> RgbU8 {
     RgbU8::from_fn(photo.width(), photo.height(), |x, y| {
         let ([f], [t]) = (found.at(x, y), truth.at(x, y));
-        let grey = photo.at(x, y).map(|c| u32::from(c) * 2 / 5);
-        let grey = [(grey.iter().sum::<u32>() / 3 + 20) as u8; 3];
+        let gray = photo.at(x, y).map(|c| u32::from(c) * 2 / 5);
+        let gray = [(gray.iter().sum::<u32>() / 3 + 20) as u8; 3];
         match visible.at(x, y)[0] {
             false => [30, 60, 130],
-            true if (f - t).abs() <= TOLERANCE * t || t >= LIMIT => grey,
+            true if (f - t).abs() <= TOLERANCE * t || t >= LIMIT => gray,
             true => colors::RED,
         }
     })

@@ -7,7 +7,7 @@ use cv_pipeline::{Intrinsics, ReconstructOptions, reconstruct};
 use cv_report::{MatchStyle, PointScene, Viewpoint, camera_color, draw_epipolar_lines, draw_matches, render_points};
 use cv_synth::{RenderOptions, direction_error, rotation_error, two_view};
 
-/// Metres between the two places.
+/// Meters between the two places.
 const BASELINE: f64 = 0.6;
 
 pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {

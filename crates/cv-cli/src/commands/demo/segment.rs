@@ -1,4 +1,4 @@
-//! An orange ball by its colour, trained on half of the photographs.
+//! An orange ball by its color, trained on half of the photographs.
 
 use super::{Check, Demo, Part};
 use crate::common::Failure;
@@ -11,8 +11,8 @@ const PHOTOS: usize = 8;
 
 pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let photos = ball_photos(demo.seed, PHOTOS, &demo.camera(), &RenderOptions::default())?;
-    let labelled: Vec<_> = photos.iter().step_by(2).map(|p| (p.view.image.view(), p.mask.view())).collect();
-    let model = match train_segment(&labelled, &Default::default(), demo.context) {
+    let labeled: Vec<_> = photos.iter().step_by(2).map(|p| (p.view.image.view(), p.mask.view())).collect();
+    let model = match train_segment(&labeled, &Default::default(), demo.context) {
         Ok(training) => training.trained.model,
         Err(error) => return Ok(Part::gave_up("segment", &error)),
     };
@@ -35,7 +35,7 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
         .of(pixels(score.both + score.truth_only), pixels(score.both + score.estimate_only));
     Ok(Part::new(vec![check], move |page| {
         page.section("Segmentation")
-            .paragraph("A colour model learns the ball from four photographs with masks, and marks it in four others. Green is right, red invented, blue missed.")
+            .paragraph("A color model learns the ball from four photographs with masks, and marks it in four others. Green is right, red invented, blue missed.")
             .figures(figures);
     }))
 }

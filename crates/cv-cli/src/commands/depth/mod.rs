@@ -35,7 +35,7 @@ pub(crate) use report::fractions;
     cv depth left right -o disparities\n  \
     cv depth left.jpg right.jpg --rig rig.yaml -o disparity.png --depth depth.png --report out\n\n\
     The ending of a file tells its format: .pfm (floats, +inf where unknown), .npy (floats, NaN), .png (disparity as KITTI's\n\
-    16-bit PNG, 256 steps a pixel; depth as 16-bit millimetres for a baseline in metres); 0 is unknown in both.")]
+    16-bit PNG, 256 steps a pixel; depth as 16-bit millimeters for a baseline in meters); 0 is unknown in both.")]
 pub(crate) struct Args {
     /// The left photograph, or a folder or quoted pattern ('left/*.png') of frames.
     left: PathBuf,
@@ -47,7 +47,7 @@ pub(crate) struct Args {
     /// Where to write the depth, in the unit of the baseline: .pfm, .png or .npy. Needs --rig, or --focal and --baseline.
     #[arg(long, value_name = "FILE")]
     depth: Option<PathBuf>,
-    /// Where to write a coloured point cloud, as PLY, in the frame of the left camera: x right, y down, z ahead. Needs what --depth
+    /// Where to write a colored point cloud, as PLY, in the frame of the left camera: x right, y down, z ahead. Needs what --depth
     /// needs.
     #[arg(long, value_name = "FILE")]
     cloud: Option<PathBuf>,
@@ -100,8 +100,8 @@ pub(crate) struct Args {
     /// Leave pixels without a match of their own unknown.
     #[arg(long)]
     no_fill: bool,
-    /// Add to the differing bits the absolute difference of grey values, or of horizontal gradients: sharper outlines.
-    #[arg(long, value_name = "WHAT", default_value = "none", value_parser = ["none", "grey", "gradient"])]
+    /// Add to the differing bits the absolute difference of gray values, or of horizontal gradients: sharper outlines.
+    #[arg(long, value_name = "WHAT", default_value = "none", value_parser = ["none", "gray", "gradient"])]
     blend: String,
     /// Edge-preserving smoothing: bilateral, wls (weighted least squares) or none.
     #[arg(long, value_name = "HOW", default_value = "bilateral", value_parser = ["none", "bilateral", "wls"])]
@@ -109,7 +109,7 @@ pub(crate) struct Args {
     /// Strength of --smoothing wls.
     #[arg(long, value_name = "L", default_value_t = 100.0)]
     lambda: f32,
-    /// Grey levels (of 255) across which --smoothing does not reach [default: 24; 1.5 for wls].
+    /// Gray levels (of 255) across which --smoothing does not reach [default: 24; 1.5 for wls].
     #[arg(long, value_name = "LEVELS")]
     sigma: Option<f32>,
     /// Most memory for matching, in MiB: where the whole does not fit, rows are matched in strips that overlap.
@@ -247,13 +247,13 @@ impl Args {
     fn write_quality(&self, job: &Job, context: &Context) -> Result<(), Failure> {
         let DepthResult { map, depth, confidence, sigma, .. } = &job.result;
         if let (Some(path), Some(confidence)) = (&self.confidence, confidence) {
-            let grey = |path: &Path, map: ImageView<'_, f32, 1>| {
+            let gray = |path: &Path, map: ImageView<'_, f32, 1>| {
                 let bytes = cv_core::GrayU8::from_fn(map.width(), map.height(), |x, y| {
                     [(map.at(x, y)[0] * 255.0 + 0.5) as u8]
                 });
                 cv_io::write_png(path, bytes.view()).map(|()| 0)
             };
-            write_map(path, confidence.view(), grey)?;
+            write_map(path, confidence.view(), gray)?;
         }
         if let Some(path) = &self.matched {
             let matched = map.state.map(|[state]| [if state == PixelState::Matched { 255u8 } else { 0 }]);

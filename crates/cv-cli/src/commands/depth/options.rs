@@ -68,7 +68,7 @@ impl Args {
                 fill: !self.no_fill,
                 blend: match self.blend.as_str() {
                     // Of the weights tried on rendered scenes and photographs, those that gave the fewest errors.
-                    "grey" => Blend::Grey { per_bit: 2, cap: 8 },
+                    "gray" => Blend::Gray { per_bit: 2, cap: 8 },
                     "gradient" => Blend::Gradient { per_bit: 1, cap: 6 },
                     _ => Blend::None,
                 },

@@ -29,7 +29,7 @@ pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResul
         if label == u16::MAX { [0; 3] } else { tint(result.image.at(x, y), label) }
     });
     let small = shrink_to_fit(sources.view(), 2000);
-    page.figure(Figure::new(jpeg(&small)?, "Which photograph each pixel is from: the seams run where the colour changes."));
+    page.figure(Figure::new(jpeg(&small)?, "Which photograph each pixel is from: the seams run where the color changes."));
 
     page.section("Photographs");
     let rows: Vec<Vec<String>> = result
@@ -71,7 +71,7 @@ pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResul
     Ok(page.to_html())
 }
 
-/// The pixel under a colour of its photograph's own; neighbours in number are far apart on the colour circle.
+/// The pixel under a color of its photograph's own; neighbors in number are far apart on the color circle.
 fn tint(pixel: [u8; 3], label: u16) -> [u8; 3] {
     const GOLDEN: f32 = 0.618_034;
     let hue = f32::from(label) * GOLDEN * std::f32::consts::TAU;

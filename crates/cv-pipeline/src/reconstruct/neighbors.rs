@@ -1,12 +1,12 @@
-//! Which of the matches found along epipolar lines lie where their neighbours do.
+//! Which of the matches found along epipolar lines lie where their neighbors do.
 
 use cv_core::{Camera, Correspondence, Point3, Pose};
 use cv_geometry::{normalize_matches, triangulate};
 use rayon::prelude::*;
 
-/// Neighbours that are asked.
-const NEIGHBOURS: usize = 8;
-/// How far beyond the inverse depths of its neighbours a point may lie, as a share of their range.
+/// Neighbors that are asked.
+const NEIGHBORS: usize = 8;
+/// How far beyond the inverse depths of its neighbors a point may lie, as a share of their range.
 const MORE: f64 = 0.5;
 /// And in radians of parallax: three pixels of a small photograph, a dozen of a large one.
 const PARALLAX: f64 = 0.005;
@@ -15,25 +15,25 @@ const PARALLAX: f64 = 0.005;
 ///
 /// A feature without a true partner finds one along its epipolar line now and then, at any depth; of matches that were found without a geometry,
 /// hardly any are such. On generated rooms this leaves out two in five of the wrong matches and one in a thousand of the right ones. A thin thing before a far ground that no known point is on is lost. O(more · matches).
-pub(super) fn like_their_neighbours(
+pub(super) fn like_their_neighbors(
     more: &[Correspondence],
     matches: &[Correspondence],
     points: &[Point3<f64>],
     cameras: &[Camera; 2],
     pose: &Pose,
 ) -> Vec<Correspondence> {
-    let (normalised, _) = normalize_matches(more, &cameras[0], &cameras[1]);
+    let (normalized, _) = normalize_matches(more, &cameras[0], &cameras[1]);
     let belongs = |(m, n): (&Correspondence, &Correspondence)| {
         // The nearest of the known ones in the first photograph, the nearest first.
-        let mut near = [(f64::INFINITY, 0.0); NEIGHBOURS];
+        let mut near = [(f64::INFINITY, 0.0); NEIGHBORS];
         for (known, point) in matches.iter().zip(points) {
             let distance = (known.a - m.a).norm_squared();
             if distance == 0.0 && known.b == m.b {
                 return true;
             }
-            if distance < near[NEIGHBOURS - 1].0 {
+            if distance < near[NEIGHBORS - 1].0 {
                 let at = near.partition_point(|other| other.0 <= distance);
-                near.copy_within(at..NEIGHBOURS - 1, at + 1);
+                near.copy_within(at..NEIGHBORS - 1, at + 1);
                 near[at] = (distance, 1.0 / point.z);
             }
         }
@@ -43,7 +43,7 @@ pub(super) fn like_their_neighbours(
         let reach = MORE * (high - low) + PARALLAX;
         (low - reach..=high + reach).contains(&(1.0 / point.z))
     };
-    let keep: Vec<bool> = more.par_iter().zip(&normalised).map(belongs).collect();
+    let keep: Vec<bool> = more.par_iter().zip(&normalized).map(belongs).collect();
     more.iter().zip(keep).filter(|(_, keep)| *keep).map(|(m, _)| *m).collect()
 }
 
@@ -66,9 +66,9 @@ mod tests {
         let grid = (0..100).map(|i| see(100.0 + 40.0 * f64::from(i % 10), 40.0 + 40.0 * f64::from(i / 10), 10.0));
         let (matches, points): (Vec<_>, Vec<_>) = grid.unzip();
         let more = [see(333.0, 222.0, 10.2).0, see(200.0, 210.0, 4.0).0, see(150.0, 111.0, 200.0).0, matches[7]];
-        let kept = like_their_neighbours(&more, &matches, &points, &[camera; 2], &pose);
+        let kept = like_their_neighbors(&more, &matches, &points, &[camera; 2], &pose);
         // One pixel of parallax off is as good as there; 75 and 47 px off are not.
         assert_eq!(kept, [more[0], more[3]]);
-        assert_eq!(like_their_neighbours(&more, &[], &[], &[camera; 2], &pose), []);
+        assert_eq!(like_their_neighbors(&more, &[], &[], &[camera; 2], &pose), []);
     }
 }
