@@ -33,36 +33,17 @@
 //! * The same input and options give the same bytes at any number of threads.
 
 mod align;
-mod bundle;
-mod correlation;
-mod crop;
-mod elastic;
-mod exposure;
-mod feather;
-mod focal;
-mod graph;
-mod group;
-mod layout;
-mod maxflow;
-mod misalignment;
-mod multiband;
-mod poisson;
-mod preview;
-mod projection;
+mod blend;
 mod render;
 mod seams;
-mod straighten;
-mod verify;
-mod view;
-mod warp;
+mod surface;
 
-pub use align::{AlignError, AlignOptions, AlignedPair, Alignment, CameraMotion, Photo, Unplaced, align};
+pub use align::{
+    AlignError, AlignOptions, AlignedPair, Alignment, CameraMotion, NotAPair, Photo, Unplaced, VerifiedPair,
+    VerifyOptions, View, align, verify_pair,
+};
+pub use blend::{Exposure, Gains};
 pub use cv_imgproc::Interpolation;
-pub use elastic::PhotoMap;
-pub use exposure::{Exposure, Gains};
-pub use layout::{Canvas, LayoutError};
-pub use projection::Projection;
 pub use render::{Blend, Panorama, RenderError, RenderOptions, render};
 pub use seams::Seams;
-pub use verify::{NotAPair, VerifiedPair, VerifyOptions, verify_pair};
-pub use view::View;
+pub use surface::{Canvas, LayoutError, PhotoMap, Projection};

@@ -1,17 +1,12 @@
 //! From aligned photographs to the picture.
 
 use crate::align::Alignment;
-use crate::crop::largest_rectangle;
-use crate::elastic::{self, PhotoMap};
-use crate::exposure::{self, Exposure, Gains};
-use crate::feather;
-use crate::layout::{self, Bounds, Canvas, Layout, LayoutError};
-use crate::multiband::Blender;
-use crate::poisson;
-use crate::preview::Preview;
-use crate::projection::Projection;
+use crate::blend::{self, Blender, Exposure, Gains};
 use crate::seams::{self, Labels, NONE, Seams, Toned};
-use crate::warp::{Tone, Warped, warp};
+use crate::surface::{
+    self, Bounds, Canvas, Layout, LayoutError, PhotoMap, Placement, Preview, Projection, Tone, Warped,
+    largest_rectangle, shrunk, shrunk_view, warp,
+};
 use cv_core::{Image, ImageView, Mask, RgbU8};
 use cv_imgproc::Interpolation;
 use rayon::prelude::*;
@@ -145,14 +140,14 @@ pub fn render(
             return Err(RenderError::WrongPhoto { index, width, height, expected_width, expected_height });
         }
     }
-    let layout = layout::layout(alignment, options.projection, options.resolution, options.max_pixels)?;
+    let layout = surface::layout(alignment, options.projection, options.resolution, options.max_pixels)?;
     let photo_of: Vec<usize> = layout.placements.iter().map(|p| p.photo).collect();
     let fields =
-        if options.elastic { elastic::fields(photos, &layout, alignment) } else { vec![None; layout.placements.len()] };
+        if options.elastic { surface::fields(photos, &layout, alignment) } else { vec![None; layout.placements.len()] };
     clock.lap("elastic");
     let preview = Preview::draw(photos, &layout, &fields, options.resolution, PREVIEW_PIXELS);
     clock.lap("preview");
-    let gains = exposure::estimate(&preview, &photo_of, photos.len(), options.exposure);
+    let gains = blend::estimate(&preview, &photo_of, photos.len(), options.exposure);
     clock.lap("exposure");
     let per_piece: Vec<[f32; 3]> = photo_of.iter().map(|&p| gains.gains[p]).collect();
     let coarse = seams::on_preview(&preview, &per_piece, &photo_of, options.seams);
@@ -186,9 +181,8 @@ pub fn render(
                     tone,
                 ));
             }
-            let small = crate::preview::shrunk(photo, shrink);
-            let placement =
-                layout::Placement { view: crate::preview::shrunk_view(placement, shrink, &small), ..*placement };
+            let small = shrunk(photo, shrink);
+            let placement = Placement { view: shrunk_view(placement, shrink, &small), ..*placement };
             let field = field.as_ref().map(|f| f.scaled(1.0, 1.0 / shrink as f64));
             Some(warp(small.view(), &placement, &layout.surface, region, field.as_ref(), options.interpolation, tone))
         })
@@ -211,9 +205,9 @@ pub fn render(
             }
             blender.finish(&labels)
         }
-        Blend::Poisson => poisson::blend(&pieces, &labels),
-        Blend::Feather => feather::blend(&pieces, &labels),
-        Blend::None => feather::copy(&pieces, &labels),
+        Blend::Poisson => blend::poisson(&pieces, &labels),
+        Blend::Feather => blend::feather(&pieces, &labels),
+        Blend::None => blend::copy(&pieces, &labels),
     };
     clock.lap("blend");
     let mask = Mask::from_vec(layout.width, layout.height, labels.data.iter().map(|l| *l != NONE).collect())

@@ -1,7 +1,7 @@
 //! Hard seams, and short linear transitions across them.
 
 use crate::seams::{Labels, NONE};
-use crate::warp::Warped;
+use crate::surface::Warped;
 use cv_core::RgbU8;
 use rayon::prelude::*;
 

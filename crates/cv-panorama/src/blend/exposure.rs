@@ -3,7 +3,7 @@
 //! Where photographs overlap they saw the same light, so `log I_a + g_a + v(r_a) = log I_b + g_b + v(r_b)`, with a gain `g` per photograph
 //! and channel and one fall-off of brightness toward the corners, `v(r) = v₁ r² + v₂ r⁴`. In logarithms that is linear.
 
-use crate::preview::Preview;
+use crate::surface::Preview;
 use nalgebra::{DMatrix, DVector};
 
 /// How exposure differences are evened out.
@@ -137,7 +137,7 @@ fn samples(preview: &Preview, photo_of: &[usize]) -> Vec<Sample> {
                     if !a.iter().chain(&b).all(|v| READABLE.contains(v)) {
                         continue;
                     }
-                    let r2 = |piece: &crate::preview::Piece| {
+                    let r2 = |piece: &crate::surface::Piece| {
                         let b = piece.warped.bounds;
                         f64::from(piece.radius[(y - b.top) * b.width() + x - b.left])
                     };
@@ -189,9 +189,9 @@ fn solve(samples: &[Sample], photos: usize, difference: impl Fn(&Sample) -> f64,
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::layout::Bounds;
-    use crate::preview::Piece;
-    use crate::warp::Warped;
+    use crate::surface::Bounds;
+    use crate::surface::Piece;
+    use crate::surface::Warped;
     use cv_core::Image;
 
     /// Three photographs of 60 x 40, 30 apart, of one scene, darkened by known factors and toward their corners.

@@ -4,9 +4,9 @@
 //! elsewhere; its pyramid is blurred and halved along with the colors. Outside a photograph its edge pixels are repeated (see `warp`), so no
 //! band knows of a border and nothing dark bleeds in.
 
-use crate::layout::Bounds;
 use crate::seams::Labels;
-use crate::warp::Warped;
+use crate::surface::Bounds;
+use crate::surface::Warped;
 use cv_core::{Image, RgbU8};
 use rayon::prelude::*;
 

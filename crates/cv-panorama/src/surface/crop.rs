@@ -1,6 +1,6 @@
 //! The largest upright rectangle inside a mask.
 
-use crate::layout::Bounds;
+use crate::surface::Bounds;
 use cv_core::ImageView;
 
 /// The rectangle of greatest area in which every pixel is true; `None` where no pixel is. O(pixels), by the stack of the largest rectangle under a

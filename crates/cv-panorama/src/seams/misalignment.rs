@@ -1,8 +1,8 @@
 //! Where two photographs show the same thing at different places of the preview: near things against far ones, where no deformation is smooth enough
 //! to bring both together. A seam there cuts things in two however little the colors on it differ.
 
-use crate::correlation::{PAD, PLACES, REACH, Template};
-use crate::preview::{Piece, Preview};
+use crate::surface::{PAD, PLACES, REACH, Template};
+use crate::surface::{Piece, Preview};
 use cv_core::GrayF32;
 use rayon::prelude::*;
 

@@ -1,12 +1,12 @@
 //! One group of connected photographs: cameras from a spanning tree, then all at once over all overlaps.
 
-use crate::align::{AlignError, AlignOptions, AlignedPair, Alignment, CameraMotion, Photo, Unplaced};
-use crate::bundle::{Lens, Motion, Overlap, Problem, State};
-use crate::focal::focals_from_homography;
-use crate::graph::{self, Edge};
-use crate::straighten::straighten;
-use crate::verify::VerifiedPair;
-use crate::view::View;
+use crate::align::bundle::{Lens, Motion, Overlap, Problem, State};
+use crate::align::focal::focals_from_homography;
+use crate::align::graph::{self, Edge};
+use crate::align::straighten::straighten;
+use crate::align::{
+    AlignError, AlignOptions, AlignedPair, Alignment, CameraMotion, Photo, Unplaced, VerifiedPair, View,
+};
 use cv_core::{Camera, Distortion, Point2};
 use cv_numeric::RobustLoss;
 use nalgebra::{Matrix3, Rotation3, Vector2};

@@ -1,5 +1,21 @@
 //! Surfaces a panorama is drawn on.
 
+mod correlation;
+mod crop;
+mod elastic;
+mod layout;
+mod preview;
+mod warp;
+
+pub(crate) use correlation::{PAD, PLACES, REACH, Template};
+pub(crate) use crop::largest_rectangle;
+pub use elastic::PhotoMap;
+pub(crate) use elastic::{Field, fields};
+pub(crate) use layout::{Bounds, Layout, Placement, layout};
+pub use layout::{Canvas, LayoutError};
+pub(crate) use preview::{Piece, Preview, shrunk, shrunk_view};
+pub(crate) use warp::{Map, Tone, Warped, warp};
+
 use cv_core::{Point2, Vector3};
 
 /// The surface a panorama is drawn on.

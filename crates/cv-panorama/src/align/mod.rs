@@ -1,8 +1,18 @@
 //! From verified overlaps to the place of every photograph.
 
-use crate::group::Group;
-use crate::verify::VerifiedPair;
-use crate::view::View;
+mod bundle;
+mod focal;
+mod graph;
+mod group;
+mod straighten;
+mod verify;
+mod view;
+
+pub(crate) use straighten::turn;
+pub use verify::{NotAPair, VerifiedPair, VerifyOptions, verify_pair};
+pub use view::View;
+
+use crate::align::group::Group;
 use cv_core::{Camera, Correspondence, Point2};
 
 /// What is known about a photograph before looking at its pixels.

@@ -1,9 +1,9 @@
 //! The canvas: which surface, how large, and where each photograph falls on it.
 
+use crate::align::View;
+use crate::align::turn;
 use crate::align::{Alignment, CameraMotion};
-use crate::projection::{Projection, Surface};
-use crate::straighten::turn;
-use crate::view::View;
+use crate::surface::{Projection, Surface};
 use cv_core::{Matrix3, Point2, Vector3};
 use nalgebra::Rotation3;
 use std::f64::consts::{FRAC_PI_2, PI, TAU};

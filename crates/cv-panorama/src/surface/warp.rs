@@ -3,10 +3,10 @@
 //! The three surfaces factor as `ray = (g(y)·ax(x), b(y), g(y)·az(x))` (see `projection`), so a canvas pixel's place in the photograph
 //! costs three multiply-adds per coordinate and one division.
 
-use crate::elastic::Field;
-use crate::layout::{Bounds, Placement};
-use crate::projection::Surface;
-use crate::view::View;
+use crate::align::View;
+use crate::surface::Field;
+use crate::surface::Surface;
+use crate::surface::{Bounds, Placement};
 use cv_core::{Distortion, Image, ImageView, Matrix3, Point2};
 use cv_imgproc::Interpolation;
 use fearless_simd::{Level, dispatch};
@@ -289,7 +289,7 @@ fn bicubic(s: &Source<'_>, u: f32, v: f32) -> [f32; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::projection::Projection;
+    use crate::surface::Projection;
     use cv_core::{Camera, RgbU8, Vector3};
     use nalgebra::Rotation3;
 

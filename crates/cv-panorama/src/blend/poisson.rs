@@ -5,7 +5,7 @@
 //! at the border of the picture (Neumann), so nothing bleeds in from there; its mean is zero, so the colors stay where they are on average.
 
 use crate::seams::{Labels, NONE};
-use crate::warp::Warped;
+use crate::surface::Warped;
 use cv_core::RgbU8;
 use rayon::prelude::*;
 
@@ -22,7 +22,7 @@ const SWEEPS: usize = 2;
 const CYCLES: usize = 4;
 
 pub(crate) fn blend(pieces: &[Option<Warped>], labels: &Labels) -> RgbU8 {
-    let mut image = crate::feather::copy(pieces, labels);
+    let mut image = crate::blend::copy(pieces, labels);
     let mut grids = vec![Grid::from_seams(pieces, labels)];
     if grids[0].right_side.iter().all(|b| *b == [0.0; 4]) {
         return image;
@@ -307,7 +307,7 @@ fn cycle(grids: &mut [Grid]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::layout::Bounds;
+    use crate::surface::Bounds;
     use cv_core::Image;
 
     fn piece(w: usize, h: usize, f: impl Fn(usize, usize) -> u8) -> Option<Warped> {
@@ -389,7 +389,7 @@ mod tests {
         // Relaxation alone lets the mean drift too.
         let covered: Vec<usize> = (0..w * h).filter(|i| labels.data[*i] != NONE).collect();
         let mean = covered.iter().map(|i| plain[*i]).sum::<f64>() / covered.len() as f64;
-        let hard = crate::feather::copy(&pieces, &labels);
+        let hard = crate::blend::copy(&pieces, &labels);
         let result = blend(&pieces, &labels);
         for i in covered {
             let want = f64::from(hard.at(i % w, i / w)[0]) + plain[i] - mean;
@@ -406,6 +406,6 @@ mod tests {
     fn without_seams_nothing_changes() {
         let pieces = [piece(30, 20, |x, y| (x * y % 200) as u8)];
         let labels = Labels { width: 30, height: 20, data: vec![0; 600] };
-        assert_eq!(blend(&pieces, &labels), crate::feather::copy(&pieces, &labels));
+        assert_eq!(blend(&pieces, &labels), crate::blend::copy(&pieces, &labels));
     }
 }

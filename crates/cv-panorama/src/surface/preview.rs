@@ -1,9 +1,9 @@
 //! The canvas at a fraction of its size, where exposure and seams are decided.
 
-use crate::elastic::Field;
-use crate::layout::{Bounds, Layout, Placement};
-use crate::projection::Surface;
-use crate::warp::{Map, Tone, Warped, warp};
+use crate::surface::Field;
+use crate::surface::Surface;
+use crate::surface::{Bounds, Layout, Placement};
+use crate::surface::{Map, Tone, Warped, warp};
 use cv_core::{Image, ImageView, Point2, RgbU8};
 use cv_imgproc::Interpolation;
 use rayon::prelude::*;
@@ -126,7 +126,7 @@ impl Preview {
 }
 
 /// A placement's view of the photograph that [`shrunk`] made.
-pub(crate) fn shrunk_view(p: &Placement, shrink: usize, small: &RgbU8) -> crate::view::View {
+pub(crate) fn shrunk_view(p: &Placement, shrink: usize, small: &RgbU8) -> crate::align::View {
     let mut view = p.view.scaled(1.0 / shrink as f64);
     // The blocks at the right and bottom that were not whole are gone.
     (view.camera.width, view.camera.height) = small.size();
@@ -184,9 +184,9 @@ fn distances(p: &Placement, surface: &Surface) -> (Vec<f32>, Vec<f32>) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::layout::Canvas;
-    use crate::projection::Projection;
-    use crate::view::View;
+    use crate::align::View;
+    use crate::surface::Canvas;
+    use crate::surface::Projection;
     use cv_core::{Camera, Matrix3};
 
     #[test]

@@ -5,9 +5,9 @@
 //! and zero where nothing asks for more. That is linear least squares, reweighted so that false matches count little.
 
 use crate::align::Alignment;
-use crate::correlation::{PAD, PLACES, REACH, Template};
-use crate::layout::{Bounds, Layout, Placement};
-use crate::projection::Surface;
+use crate::surface::Surface;
+use crate::surface::{Bounds, Layout, Placement};
+use crate::surface::{PAD, PLACES, REACH, Template};
 use cv_core::{GrayU8, ImageView, Point2, Vector2};
 use rayon::prelude::*;
 

@@ -4,11 +4,14 @@
 //! and in gradient: a seam runs where they show the same, around what moved. Alpha expansion (Boykov, Veksler & Zabih 2001) finds a labeling
 //! that no single photograph can improve by taking over pixels.
 
-use crate::layout::Bounds;
-use crate::maxflow::GridCut;
-use crate::misalignment::Misalignments;
-use crate::preview::Preview;
-use crate::warp::Warped;
+mod maxflow;
+mod misalignment;
+
+use crate::seams::maxflow::GridCut;
+use crate::seams::misalignment::Misalignments;
+use crate::surface::Bounds;
+use crate::surface::Preview;
+use crate::surface::Warped;
 use rayon::prelude::*;
 
 /// How seams are found.
@@ -179,7 +182,7 @@ fn nearest_middle(preview: &Preview) -> Labels {
     labels
 }
 
-fn eccentricity(piece: &crate::preview::Piece, x: usize, y: usize) -> f32 {
+fn eccentricity(piece: &crate::surface::Piece, x: usize, y: usize) -> f32 {
     let b = piece.warped.bounds;
     piece.eccentricity[(y - b.top) * b.width() + x - b.left]
 }
