@@ -253,8 +253,7 @@ fn orphans(folder: &Path) -> Result<Vec<String>> {
                 "mod" => file.parent().and_then(Path::file_name).unwrap_or_default().to_string_lossy().into_owned(),
                 _ => stem,
             };
-            // The second form is how cv-cli lists its commands.
-            !text.contains(&format!("mod {module};")) && !text.contains(&format!("({module}),"))
+            !text.contains(&format!("mod {module};"))
         })
         .map(|file| file.display().to_string())
         .collect())

@@ -20,7 +20,9 @@ use std::time::Instant;
 /// them as on anybody's photographs. Since the scenes are known exactly, so is the error of every result. Writes the
 /// photographs, the results and report.html into a folder. The exit code is 1 where an error is above its bar.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  cv demo\n  cv demo --out /tmp/demo --seed 7\n  cv demo --json --quiet > demo.json")]
+#[command(
+    after_help = "Examples:\n  cv demo\n  cv demo --out /tmp/demo --seed 7\n  cv demo --json --quiet > demo.json"
+)]
 pub(crate) struct Args {
     /// The folder to write into; made where it is not there.
     #[arg(short, long, value_name = "DIR", default_value = "cv-demo")]
@@ -220,7 +222,8 @@ fn table(checks: &[Check]) -> String {
         // Words to the left, figures to the right.
         for (column, cell) in row.iter().enumerate() {
             let pad = widths[column];
-            let _ = if matches!(column, 4 | 5) { write!(text, "{cell:>pad$}  ") } else { write!(text, "{cell:<pad$}  ") };
+            let _ =
+                if matches!(column, 4 | 5) { write!(text, "{cell:>pad$}  ") } else { write!(text, "{cell:<pad$}  ") };
         }
         text.truncate(text.trim_end().len());
         text.push('\n');

@@ -132,16 +132,17 @@ impl Run for Args {
         let pairs: &[Correspondence] = &matches.pairs;
         let result = match &cameras {
             None => estimate(pairs, kind, &options, context).map(|r| (r.robust, None, r.stages)),
-            Some(cameras) => estimate_calibrated(pairs, cameras, &options, context)
-                .map(|r| (r.robust, Some(r.pose), r.stages)),
+            Some(cameras) => {
+                estimate_calibrated(pairs, cameras, &options, context).map(|r| (r.robust, Some(r.pose), r.stages))
+            }
         };
         let result = result.map_err(|error| match error {
             EstimateError::BadOption { .. } => Failure::usage(error),
             _ => Failure::new(error),
         });
-        let (robust, pose, stages) = result.during(format!("no {name} from {}", self.matches.display())).advice(
-            "check the matches by eye with `cv match A B --report DIR`, or pass a larger --threshold",
-        )?;
+        let (robust, pose, stages) = result
+            .during(format!("no {name} from {}", self.matches.display()))
+            .advice("check the matches by eye with `cv match A B --report DIR`, or pass a larger --threshold")?;
         let model = rows(&robust.model);
         let total = pairs.len();
         let text: String = model.iter().map(|r| format!("{:>16.9e} {:>16.9e} {:>16.9e}\n", r[0], r[1], r[2])).collect();

@@ -3,8 +3,8 @@
 use super::depth::{fractions, read_map};
 use crate::common::{Context, Failure, Outcome, Run};
 use cv_core::Mask;
-use cv_report::{Figure, MapStyle, Report, draw_error_map, draw_map};
 use cv_pipeline::stereo::{BAD_THRESHOLDS, DisparityScores, evaluate_disparity, non_occluded};
+use cv_report::{Figure, MapStyle, Report, draw_error_map, draw_map};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 

@@ -166,7 +166,8 @@ impl Run for Args {
                 MatchingError::Features { index: 2, .. } | MatchingError::NoFeatures { index: 2, .. } => &self.second,
                 _ => &self.first,
             };
-            Failure::new(error).advice(format!("look at {}: is it sharp, with texture, and large enough?", path.display()))
+            Failure::new(error)
+                .advice(format!("look at {}: is it sharp, with texture, and large enough?", path.display()))
         })?;
         if result.pairs.is_empty() {
             return Err(Failure::new(format!(
@@ -196,12 +197,15 @@ impl Run for Args {
             .with("features", counts)
             .with("found", result.features.each_ref().map(|f| f.found))
             .with("dropped", dropped)
-            .with("method", match self.features {
-                _ if self.load_features.is_some() => "loaded",
-                Features::Sift => "sift",
-                Features::Mops => "mops",
-                Features::Harris => "harris",
-            })
+            .with(
+                "method",
+                match self.features {
+                    _ if self.load_features.is_some() => "loaded",
+                    Features::Sift => "sift",
+                    Features::Mops => "mops",
+                    Features::Harris => "harris",
+                },
+            )
             .with("beyond_limit", result.features.each_ref().map(|f| f.described.beyond_limit))
             .summary(format!(
                 "{} matches between {} and {} features ({} and {} points left out near the border or on flat patches)",
@@ -232,12 +236,17 @@ impl Args {
             if !features.candidates.is_empty() {
                 let some = thinned(&features.candidates);
                 let all = draw_keypoints(image.view(), &some, colors::RED);
-                let caption = format!("{name}: {} corners before spacing{}", features.candidates.len(), shown(some.len(), features.candidates.len()));
+                let caption = format!(
+                    "{name}: {} corners before spacing{}",
+                    features.candidates.len(),
+                    shown(some.len(), features.candidates.len())
+                );
                 figures.push(picture(all, &caption)?);
             }
             let some = thinned(kept);
             let spaced = draw_keypoints(image.view(), &some, colors::GREEN);
-            let caption = format!("{name}: {} features that are described{}", kept.len(), shown(some.len(), kept.len()));
+            let caption =
+                format!("{name}: {} features that are described{}", kept.len(), shown(some.len(), kept.len()));
             figures.push(picture(spaced, &caption)?);
             report.figures(figures);
         }
@@ -259,7 +268,10 @@ impl Args {
         match model {
             Some(model) => {
                 let after = draw_matches(a.view(), b.view(), &result.pairs, Some(&inliers), &style);
-                report.figure(picture(after, &format!("The same after RANSAC: those that fit one {model} green, others red."))?);
+                report.figure(picture(
+                    after,
+                    &format!("The same after RANSAC: those that fit one {model} green, others red."),
+                )?);
             }
             None => {
                 report.note(Note::Warning, "No homography and no fundamental matrix explains enough of these matches.");
@@ -354,14 +366,19 @@ fn statistics(report: &mut Report, result: &MatchingResult) {
         let [first, second] = result.features.each_ref().map(|f| count(f).to_string());
         vec![name.to_owned(), first, second]
     };
-    report.table("Features", &["", "first", "second"], &[
-        row("points found", &|f| f.found),
-        row("left out at the border or on flat patches", &|f| f.described.dropped.len()),
-        row("beyond the number asked for", &|f| f.described.beyond_limit),
-        row("described", &|f| f.described.keypoints.len()),
-    ]);
+    report.table(
+        "Features",
+        &["", "first", "second"],
+        &[
+            row("points found", &|f| f.found),
+            row("left out at the border or on flat patches", &|f| f.described.dropped.len()),
+            row("beyond the number asked for", &|f| f.described.beyond_limit),
+            row("described", &|f| f.described.keypoints.len()),
+        ],
+    );
     let ratios: Vec<f64> = result.matches.iter().map(|m| f64::from(m.ratio)).collect();
-    let plot = Plot::new("How sure the matches are", "ratio", "matches").histogram_within("matches", &ratios, 20, (0.0, 1.0));
+    let plot =
+        Plot::new("How sure the matches are", "ratio", "matches").histogram_within("matches", &ratios, 20, (0.0, 1.0));
     report.plot(&plot, "Ratio of the squared distance of the best candidate to that of the second: matches far to the left are unmistakable.");
     report.facts(&result.stages.iter().map(|(name, s)| (*name, format!("{s:.3} s"))).collect::<Vec<_>>());
 }

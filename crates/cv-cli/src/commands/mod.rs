@@ -1,6 +1,7 @@
 //! One file per subcommand.
 //!
-//! To add one, write `NAME.rs` with an `Args` struct that implements [`Run`], and add one line to the list below:
+//! To add one, write `NAME.rs` with an `Args` struct that implements [`Run`], declare it here, and add one line to the
+//! list of subcommands at the end:
 //!
 //! ```ignore
 //! /// What the command does, in one line: the first line of its help.
@@ -42,14 +43,25 @@
 
 use crate::common::{Context, Failure, Outcome, Run};
 
-/// Declares the modules and the enum of subcommands, and routes to them.
-macro_rules! commands {
-    ($($variant:ident($module:ident)),* $(,)?) => {
-        $(mod $module;)*
+mod completions;
+mod demo;
+mod depth;
+mod estimate;
+mod eval;
+mod man;
+mod match_;
+mod panorama;
+mod reconstruct;
+mod rectify;
+mod segment;
 
+/// Makes the enum of subcommands and routes to them. The modules are declared outside: rustfmt does not look for files in
+/// macros.
+macro_rules! subcommands {
+    ($($variant:ident($args:ty)),* $(,)?) => {
         #[derive(clap::Subcommand)]
         pub(crate) enum Command {
-            $($variant(Box<$module::Args>),)*
+            $($variant(Box<$args>),)*
         }
 
         impl Command {
@@ -66,16 +78,17 @@ macro_rules! commands {
     };
 }
 
-commands! {
-    Demo(demo),
-    Segment(segment),
-    Panorama(panorama),
-    Match(match_),
-    Estimate(estimate),
-    Reconstruct(reconstruct),
-    Depth(depth),
-    Rectify(rectify),
-    Eval(eval),
-    Completions(completions),
-    Man(man),
+// In the order of `cv --help`.
+subcommands! {
+    Demo(demo::Args),
+    Segment(segment::Args),
+    Panorama(panorama::Args),
+    Match(match_::Args),
+    Estimate(estimate::Args),
+    Reconstruct(reconstruct::Args),
+    Depth(depth::Args),
+    Rectify(rectify::Args),
+    Eval(eval::Args),
+    Completions(completions::Args),
+    Man(man::Args),
 }

@@ -11,8 +11,8 @@ use cv_pipeline::{
     reconstruct_dense,
 };
 use cv_report::{
-    Figure, MapStyle, MatchStyle, Note, PointScene, Report, Viewpoint, camera_color, draw_epipolar_lines, draw_keypoints,
-    draw_map, draw_matches, render_points,
+    Figure, MapStyle, MatchStyle, Note, PointScene, Report, Viewpoint, camera_color, draw_epipolar_lines,
+    draw_keypoints, draw_map, draw_matches, render_points,
 };
 use std::path::{Path, PathBuf};
 
@@ -153,7 +153,9 @@ const DOUBTFUL: f64 = 0.05;
 fn doubt(result: &ReconstructResult) -> Option<String> {
     let percent = 100.0 * result.focal_deviation;
     (result.focal_deviation > DOUBTFUL).then(|| {
-        format!("the focal length is known to ±{percent:.0} % only, and the depth of the cloud may be stretched by as much")
+        format!(
+            "the focal length is known to ±{percent:.0} % only, and the depth of the cloud may be stretched by as much"
+        )
     })
 }
 
@@ -173,9 +175,10 @@ impl Args {
         }
         let focal = photos.each_ref().map(|p| p.exif.focal.map(|f| f.pixels));
         match (self.ignore_exif, focal) {
-            (false, [Some(a), Some(b)]) => {
-                Ok((Intrinsics::Focal([a, b]), format!("focal length {a:.0} px from EXIF (--focal or --camera to change it)")))
-            }
+            (false, [Some(a), Some(b)]) => Ok((
+                Intrinsics::Focal([a, b]),
+                format!("focal length {a:.0} px from EXIF (--focal or --camera to change it)"),
+            )),
             _ => Ok((Intrinsics::Unknown, "focal length unknown: estimated from the matches".into())),
         }
     }
@@ -318,7 +321,11 @@ impl Args {
         let mut scene = PointScene::new(&positions, &colors);
         scene.camera(&result.cameras[0], &Pose::identity(), camera_color(0));
         scene.camera(&result.cameras[1], &result.pose, camera_color(1));
-        report.points(&scene, Some(png(&render_points(&scene, Viewpoint::Camera, 1200, 800))?), "The points and the two cameras.");
+        report.points(
+            &scene,
+            Some(png(&render_points(&scene, Viewpoint::Camera, 1200, 800))?),
+            "The points and the two cameras.",
+        );
         let top = Figure::new(png(&render_points(&scene, Viewpoint::Top, 900, 700))?, "From above: a map.");
         let side = Figure::new(png(&render_points(&scene, Viewpoint::Side, 900, 700))?, "From the side.");
         report.figures(vec![top, side]);
@@ -351,7 +358,10 @@ impl Args {
             report.note(Note::Warning, &format!("{}{}.", text[..1].to_uppercase(), &text[1..]));
         }
         if result.planar_share > 0.8 {
-            report.note(Note::Warning, "Most of the scene is nearly one plane: the motion is less certain than the deviations say.");
+            report.note(
+                Note::Warning,
+                "Most of the scene is nearly one plane: the motion is less certain than the deviations say.",
+            );
         }
 
         report.section("Features and matches");
@@ -359,7 +369,10 @@ impl Args {
         let shown = |k: &[cv_core::Keypoint]| k.iter().step_by((k.len() / 2000).max(1)).copied().collect::<Vec<_>>();
         let green = [0, 158, 115];
         report.figures(vec![
-            Figure::new(png(&draw_keypoints(a.view(), &shown(fa), green))?, &format!("{} features of the first photograph (at most 2000 drawn).", fa.len())),
+            Figure::new(
+                png(&draw_keypoints(a.view(), &shown(fa), green))?,
+                &format!("{} features of the first photograph (at most 2000 drawn).", fa.len()),
+            ),
             Figure::new(png(&draw_keypoints(b.view(), &shown(fb), green))?, &format!("{} of the second.", fb.len())),
         ]);
         let pairs = &result.matching.pairs;
@@ -369,7 +382,10 @@ impl Args {
         let before = draw_matches(a.view(), b.view(), pairs, None, &style);
         let after = draw_matches(a.view(), b.view(), pairs, Some(&mask), &style);
         report.figure(Figure::new(png(&before)?, "Tentative matches, each in a color of its own."));
-        report.figure(Figure::new(png(&after)?, "The same after the search for a motion: matches that agree green, others red."));
+        report.figure(Figure::new(
+            png(&after)?,
+            "The same after the search for a motion: matches that agree green, others red.",
+        ));
         let chosen: Vec<Correspondence> = result.inliers.iter().map(|&i| pairs[i]).collect();
         let lines = draw_epipolar_lines(a.view(), b.view(), &result.fundamental(), &chosen, 24);
         report.figure(Figure::new(png(&lines)?, "Points and their epipolar lines: each point of one photograph lies on its line in the other (up to the lens distortion, which bends lines)."));
@@ -378,7 +394,11 @@ impl Args {
         let errors: Vec<f32> = result.points.iter().map(|p| p.reprojection as f32).collect();
         let angles: Vec<f32> = result.points.iter().map(|p| p.angle.to_degrees() as f32).collect();
         let plot = |title: &str, unit: &str, values: &[f32]| {
-            cv_report::Plot::new(title, unit, "points").histogram("", &values.iter().map(|v| f64::from(*v)).collect::<Vec<_>>(), 30)
+            cv_report::Plot::new(title, unit, "points").histogram(
+                "",
+                &values.iter().map(|v| f64::from(*v)).collect::<Vec<_>>(),
+                30,
+            )
         };
         report.plots(&[
             (&plot("Reprojection error", "px", &errors), "How far the points are from where they were seen."),
@@ -430,4 +450,3 @@ fn dense_section(report: &mut Report, dense: &DenseResult, result: &ReconstructR
 fn position(p: &cv_pipeline::ScenePoint) -> [f32; 3] {
     [p.position.x as f32, p.position.y as f32, p.position.z as f32]
 }
-

@@ -113,8 +113,10 @@ impl Run for Args {
                 (None, Some(_)) => "unknown: see below".to_owned(),
                 (None, None) => "unknown: too few features".to_owned(),
             };
-            page.headline("vertical residual", &quality)
-                .headline("valid area", &format!("{:.1} % and {:.1} %", 100.0 * result.valid_area[0], 100.0 * result.valid_area[1]));
+            page.headline("vertical residual", &quality).headline(
+                "valid area",
+                &format!("{:.1} % and {:.1} %", 100.0 * result.valid_area[0], 100.0 * result.valid_area[1]),
+            );
             page.section("Rectified pair").figure(Figure::new(
                 cv_io::encode_png(with_rows(&result.images).view())?,
                 "Both photographs with common rows drawn through: what is on a line on the left is on it on the right.",
@@ -135,7 +137,10 @@ impl Run for Args {
             .with("q", q.row_iter().map(|row| row.iter().copied().collect::<Vec<f64>>()).collect::<Vec<_>>())
             .with("valid_area", json!({ "left": result.valid_area[0], "right": result.valid_area[1] }))
             .with("matches", result.matches)
-            .with("vertical_residual_px", result.vertical_px.map(|(median, p95)| json!({ "median": median, "p95": p95 })))
+            .with(
+                "vertical_residual_px",
+                result.vertical_px.map(|(median, p95)| json!({ "median": median, "p95": p95 })),
+            )
             .with("fault", result.fault.map(|cause| cause.to_string()))
             .summary(format!(
                 "{width}×{height} px; vertical residual {residual}; valid area {:.1} % left, {:.1} % right",

@@ -4,9 +4,7 @@ mod files;
 
 use crate::common::{Context, Explain, Failure, Outcome, Run, create_dir, expand_images, same_file};
 use cv_core::{Mask, RgbU8};
-use cv_pipeline::segmentation::{
-    ColorModel, ColorSpace, Labeled, Regions, Rule, Scores, SegmentError, TrainOptions,
-};
+use cv_pipeline::segmentation::{ColorModel, ColorSpace, Labeled, Regions, Rule, Scores, SegmentError, TrainOptions};
 use cv_pipeline::{Progress, segment, train_segment};
 use cv_report::{Figure, Note, Report, colors, overlay_comparison, overlay_mask};
 use files::{Pair, pair, read_pair, stem};
@@ -201,12 +199,8 @@ impl Train {
             page.section("Photographs").paragraph(LEGEND).figures(shown?);
             Ok(page.to_html())
         })?;
-        let summary = format!(
-            "{} photographs, F1 {:.3} on themselves; model: {}",
-            pairs.len(),
-            total.f1(),
-            self.model.display()
-        );
+        let summary =
+            format!("{} photographs, F1 {:.3} on themselves; model: {}", pairs.len(), total.f1(), self.model.display());
         Ok(with_scores(Outcome::new(training.stages), &pairs, &trained.scores)
             .with("model", &self.model)
             .with("foreground_pixels", trained.foreground_pixels)
@@ -289,7 +283,8 @@ impl Predict {
             page.section("Photographs").paragraph("What was marked, in green.").figures(figures);
             Ok(page.to_html())
         })?;
-        let summary = format!("{} photographs, the object found in {found}; masks: {}", photos.len(), self.out.display());
+        let summary =
+            format!("{} photographs, the object found in {found}; masks: {}", photos.len(), self.out.display());
         Ok(Outcome::new(stages).with("images", images).summary(summary))
     }
 }
@@ -413,8 +408,12 @@ fn refused(error: SegmentError, pairs: &[Pair]) -> Failure {
             mask.1
         ))
         .advice("a mask drawn on the photograph at its full size, turned the way a viewer shows it"),
-        SegmentError::NoForeground { .. } => Failure::from(error).advice("masks that are white (255) on the object and black elsewhere"),
-        SegmentError::NoBackground { .. } => Failure::from(error).advice("masks that are black (0) where the object is not"),
+        SegmentError::NoForeground { .. } => {
+            Failure::from(error).advice("masks that are white (255) on the object and black elsewhere")
+        }
+        SegmentError::NoBackground { .. } => {
+            Failure::from(error).advice("masks that are black (0) where the object is not")
+        }
         SegmentError::BadOption { .. } => Failure::usage(error),
         _ => error.into(),
     }

@@ -19,7 +19,10 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let camera = demo.camera();
     let pair = stereo_pair(&scene, &camera, &scene.viewpoint(), BASELINE, &RenderOptions::default())?;
     let geometry = StereoGeometry::from_focal(camera.width, camera.height, camera.fx, BASELINE)?;
-    let options = DepthOptions { stereo: StereoOptions { disparities: 96, ..StereoOptions::default() }, ..DepthOptions::default() };
+    let options = DepthOptions {
+        stereo: StereoOptions { disparities: 96, ..StereoOptions::default() },
+        ..DepthOptions::default()
+    };
     let (left, right) = (&pair.left.image, &pair.right.image);
     let result = match depth(left.view(), right.view(), Some(&geometry), &options, demo.context) {
         Ok(result) => result,
@@ -63,8 +66,13 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
 
 /// The median depth of the pixels that both cameras see.
 fn median(depth: &GrayF32, visible: &Mask) -> f32 {
-    let mut values: Vec<f32> =
-        depth.as_slice().iter().zip(visible.as_slice()).filter(|(d, v)| **v && d.is_finite()).map(|(d, _)| *d).collect();
+    let mut values: Vec<f32> = depth
+        .as_slice()
+        .iter()
+        .zip(visible.as_slice())
+        .filter(|(d, v)| **v && d.is_finite())
+        .map(|(d, _)| *d)
+        .collect();
     let middle = values.len() / 2;
     values.sort_by(f32::total_cmp);
     values.get(middle).copied().unwrap_or(f32::NAN)

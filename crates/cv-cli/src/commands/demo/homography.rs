@@ -46,11 +46,21 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
             "Both in one frame, in the squares of a chessboard: edges run through where the homography is right.",
         )?,
     ];
-    let matches = draw_matches(a.view(), b.view(), &found.pairs, Some(&inliers), &MatchStyle { limit: 160, ..MatchStyle::default() });
+    let matches = draw_matches(
+        a.view(),
+        b.view(),
+        &found.pairs,
+        Some(&inliers),
+        &MatchStyle { limit: 160, ..MatchStyle::default() },
+    );
     let matches = demo.photo(
         "homography-matches.png",
         &matches,
-        &format!("{} of {} matches agree with one homography (green); the rest are red.", model.inliers.len(), inliers.len()),
+        &format!(
+            "{} of {} matches agree with one homography (green); the rest are red.",
+            model.inliers.len(),
+            inliers.len()
+        ),
     )?;
     Ok(Part::new(vec![check], move |page| {
         page.section("Homography")

@@ -42,8 +42,13 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
         demo.photo(&format!("panorama-{}.png", i + 1), &view.image, "")?;
         row.push(view.image.view());
     }
-    let inputs = demo.photo("panorama-photographs.png", &side_by_side(&row, 8), "The photographs, each with its own exposure.")?;
-    let joined = demo.photo("panorama-result.png", &result.image, "The panorama. Seams run where the photographs agree, so that who walks is there whole or not at all.")?;
+    let inputs =
+        demo.photo("panorama-photographs.png", &side_by_side(&row, 8), "The photographs, each with its own exposure.")?;
+    let joined = demo.photo(
+        "panorama-result.png",
+        &result.image,
+        "The panorama. Seams run where the photographs agree, so that who walks is there whole or not at all.",
+    )?;
     Ok(Part::new(checks, move |page| {
         page.section("Panorama")
             .paragraph("Photographs taken by hand from one place, turning from left to right while somebody walks through. Their order, the focal length and the turns between them are found from the pictures alone.")

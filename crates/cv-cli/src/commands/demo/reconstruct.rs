@@ -38,7 +38,11 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let style = MatchStyle { limit: 160, ..MatchStyle::default() };
     let agree = format!("{} of {} matches agree with one motion (green).", result.inliers.len(), pairs.len());
     let figures = vec![
-        demo.photo("reconstruct-matches.png", &draw_matches(a.view(), b.view(), pairs, Some(&inliers), &style), &agree)?,
+        demo.photo(
+            "reconstruct-matches.png",
+            &draw_matches(a.view(), b.view(), pairs, Some(&inliers), &style),
+            &agree,
+        )?,
         demo.photo(
             "reconstruct-epipolar.png",
             &draw_epipolar_lines(

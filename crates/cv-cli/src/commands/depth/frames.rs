@@ -82,7 +82,9 @@ impl Args {
             }
             let start = std::time::Instant::now();
             matcher.compute_into(a.view(), b.view(), &mut map).during(left.display())?;
-            check_pair(&map, a.view(), b.view(), matcher.options(), context).map_err(|error| explained(error, false)).during(left.display())?;
+            check_pair(&map, a.view(), b.view(), matcher.options(), context)
+                .map_err(|error| explained(error, false))
+                .during(left.display())?;
             seconds += start.elapsed().as_secs_f64();
             valid += map.valid_fraction() / lefts.len() as f64;
             if i == 0 {

@@ -201,7 +201,8 @@ impl Run for Args {
         };
         let DepthResult { map, depth, .. } = &job.result;
         if let Some(lost) = write_map(&self.output, map.disparity.view(), |path, map| cv_io::kitti::write(path, map))? {
-            context.warn(format!("{lost} disparities do not fit KITTI's range of 0 to 256 px and are stored as unknown"));
+            context
+                .warn(format!("{lost} disparities do not fit KITTI's range of 0 to 256 px and are stored as unknown"));
         }
         if let (Some(path), Some(depth)) = (&self.depth, depth)
             && let Some(lost) = write_map(path, depth.view(), |path, map| cv_io::depth_mm::write(path, map))?
@@ -248,9 +249,8 @@ impl Args {
         let DepthResult { map, depth, confidence, sigma, .. } = &job.result;
         if let (Some(path), Some(confidence)) = (&self.confidence, confidence) {
             let gray = |path: &Path, map: ImageView<'_, f32, 1>| {
-                let bytes = cv_core::GrayU8::from_fn(map.width(), map.height(), |x, y| {
-                    [(map.at(x, y)[0] * 255.0 + 0.5) as u8]
-                });
+                let bytes =
+                    cv_core::GrayU8::from_fn(map.width(), map.height(), |x, y| [(map.at(x, y)[0] * 255.0 + 0.5) as u8]);
                 cv_io::write_png(path, bytes.view()).map(|()| 0)
             };
             write_map(path, confidence.view(), gray)?;
@@ -313,13 +313,18 @@ fn job(
 /// Tells what matching will take, before it is asked for.
 fn say_memory(matcher: &StereoMatcher, (width, height): (usize, usize), context: &Context) {
     let mib = matcher.memory(width, height) as f64 / f64::from(1 << 20);
-    context.note(format!("matching {width}×{height} px at {} disparities takes {mib:.1} MiB", matcher.options().disparities));
+    context.note(format!(
+        "matching {width}×{height} px at {} disparities takes {mib:.1} MiB",
+        matcher.options().disparities
+    ));
 }
 
 /// What to try where there is no depth; with a rig, the pair is as its calibration says.
 fn explained(error: DepthError, with_rig: bool) -> Failure {
     let advice = match &error {
-        DepthError::NoPair { cause: NoPairCause::Rows { .. } | NoPairCause::Exchanged { .. }, .. } if with_rig => rig::ADVICE,
+        DepthError::NoPair { cause: NoPairCause::Rows { .. } | NoPairCause::Exchanged { .. }, .. } if with_rig => {
+            rig::ADVICE
+        }
         DepthError::NoPair { cause, .. } => {
             let advice = cause.advice();
             return Failure::from(error).advice(advice);
@@ -341,4 +346,3 @@ fn matched<T: Intensity, const C: usize>(
     say_memory(&StereoMatcher::new(options.stereo.clone())?, left.size(), context);
     depth(left, right, geometry, options, context)
 }
-

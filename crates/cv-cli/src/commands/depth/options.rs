@@ -1,8 +1,8 @@
 //! What the arguments of `cv depth` mean to the matcher.
 
 use super::Args;
-use crate::rig;
 use crate::common::{Context, Explain, Failure};
+use crate::rig;
 use cv_core::RgbU8;
 use cv_pipeline::stereo::{Blend, Census, Paths, Smoothing, StereoOptions};
 use cv_pipeline::{DepthOptions, disparity_range};
@@ -31,12 +31,12 @@ impl Args {
         context: &Context,
     ) -> Result<(), Failure> {
         if self.disparities == Range::Auto {
-            let (min, n) = disparity_range(left.view(), right.view(), context)
-                .during("--disparities auto")
-                .advice(match self.rig {
+            let (min, n) = disparity_range(left.view(), right.view(), context).during("--disparities auto").advice(
+                match self.rig {
                     Some(_) => rig::ADVICE,
                     None => "rectify the pair (--rig, or `cv rectify`), or give the number of disparities",
-                })?;
+                },
+            )?;
             let end = min + n as i32;
             options.stereo.min_disparity = self.min_disparity.unwrap_or(min);
             options.stereo.disparities = (end - options.stereo.min_disparity).max(1) as usize;
@@ -61,7 +61,9 @@ impl Args {
                 },
                 p1: self.p1.unwrap_or(default.p1),
                 p2: self.p2.unwrap_or(default.p2),
-                p2_min: default.p2_min.clamp(self.p1.unwrap_or(0), self.p2.unwrap_or(u8::MAX).max(self.p1.unwrap_or(0))),
+                p2_min: default
+                    .p2_min
+                    .clamp(self.p1.unwrap_or(0), self.p2.unwrap_or(u8::MAX).max(self.p1.unwrap_or(0))),
                 paths: if self.paths == "4" { Paths::Four } else { Paths::Eight },
                 uniqueness: self.uniqueness.unwrap_or(default.uniqueness),
                 speckle_size: self.speckle_size.unwrap_or(default.speckle_size),

@@ -62,15 +62,13 @@ pub(super) fn report(job: &Job, points: &[CloudPoint]) -> Result<String, Failure
     } else {
         page.note(Note::Info, "No depth: the focal length and the baseline were not given.");
     }
-    page.section("Time").facts(
-        &stages.iter().map(|(stage, seconds)| (*stage, format!("{:.1} ms", 1e3 * seconds))).collect::<Vec<_>>(),
-    );
+    page.section("Time")
+        .facts(&stages.iter().map(|(stage, seconds)| (*stage, format!("{:.1} ms", 1e3 * seconds))).collect::<Vec<_>>());
     Ok(page.to_html())
 }
 
 /// How the fractions of disparities are spread.
 pub(crate) fn fractions(disparities: impl Iterator<Item = f32>) -> Plot {
-    let values: Vec<f64> =
-        disparities.filter(|d| d.is_finite()).map(|d| f64::from(d) - f64::from(d).floor()).collect();
+    let values: Vec<f64> = disparities.filter(|d| d.is_finite()).map(|d| f64::from(d) - f64::from(d).floor()).collect();
     Plot::new("Fractions of disparities", "fraction of a pixel", "pixels").histogram_within("", &values, 20, (0.0, 1.0))
 }

@@ -29,7 +29,10 @@ pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResul
         if label == u16::MAX { [0; 3] } else { tint(result.image.at(x, y), label) }
     });
     let small = shrink_to_fit(sources.view(), 2000);
-    page.figure(Figure::new(jpeg(&small)?, "Which photograph each pixel is from: the seams run where the color changes."));
+    page.figure(Figure::new(
+        jpeg(&small)?,
+        "Which photograph each pixel is from: the seams run where the color changes.",
+    ));
 
     page.section("Photographs");
     let rows: Vec<Vec<String>> = result

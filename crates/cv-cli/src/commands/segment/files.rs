@@ -55,11 +55,19 @@ pub(super) fn pair(images: &[PathBuf], masks: &Path, context: &Context) -> Resul
     }
     if pairs.is_empty() {
         let example = missing.first().map_or_else(|| "NAME".to_owned(), |path| stem(path));
-        return Err(Failure::new(format!("none of the {} photographs has a mask in {}", missing.len(), masks.display()))
-            .advice(format!("name the masks after the photographs: {example}_mask.png or {example}.png")));
+        return Err(Failure::new(format!(
+            "none of the {} photographs has a mask in {}",
+            missing.len(),
+            masks.display()
+        ))
+        .advice(format!("name the masks after the photographs: {example}_mask.png or {example}.png")));
     }
     if let Some(first) = missing.first() {
-        context.warn(format!("{} photographs have no mask and are left out, {} the first", missing.len(), first.display()));
+        context.warn(format!(
+            "{} photographs have no mask and are left out, {} the first",
+            missing.len(),
+            first.display()
+        ));
     }
     Ok(pairs)
 }
@@ -87,7 +95,8 @@ mod tests {
 
     #[test]
     fn masks_among_photographs_are_no_photographs() {
-        let paths = ["a/1.jpg", "a/1_mask.png", "a/gas_mask.jpg", "b/1_mask.png", "a/2.png"].map(PathBuf::from).to_vec();
+        let paths =
+            ["a/1.jpg", "a/1_mask.png", "a/gas_mask.jpg", "b/1_mask.png", "a/2.png"].map(PathBuf::from).to_vec();
         let left: Vec<String> = without_masks(paths).iter().map(|p| p.display().to_string()).collect();
         // No photograph "gas", and no photograph in b.
         assert_eq!(left, ["a/1.jpg", "a/gas_mask.jpg", "b/1_mask.png", "a/2.png"]);
