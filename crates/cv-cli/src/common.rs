@@ -2,7 +2,7 @@
 
 use clap::{Args, value_parser};
 use cv_io::IoError;
-use cv_pipeline::Progress;
+use cv_pipeline::{Cancelled, Progress};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 use serde_json::{Map, Value, json};
@@ -226,8 +226,9 @@ impl Context {
 }
 
 impl Progress for Context {
-    fn report(&self, stage: &'static str, done: usize, total: usize) {
+    fn report(&self, stage: &'static str, done: usize, total: usize) -> Result<(), Cancelled> {
         self.bar.show(stage, done, total);
+        Ok(())
     }
 }
 

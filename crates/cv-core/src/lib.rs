@@ -29,6 +29,7 @@ mod camera;
 mod features;
 mod image;
 mod pose;
+mod progress;
 mod rig;
 mod view;
 
@@ -36,6 +37,7 @@ pub use camera::{Camera, CameraError, Distortion};
 pub use features::{Correspondence, DMatch, Keypoint};
 pub use image::{GrayF32, GrayU8, Image, ImageError, Mask, RgbF32, RgbU8, Sample};
 pub use pose::Pose;
+pub use progress::{Cancelled, Progress, Silent, Stage};
 pub use rig::StereoRig;
 pub use view::{ImageView, ImageViewMut};
 

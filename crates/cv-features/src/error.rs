@@ -1,7 +1,7 @@
 //! What can be wrong with an image handed to a detector or descriptor.
 
 use crate::simd;
-use cv_core::ImageView;
+use cv_core::{Cancelled, ImageView};
 use rayon::prelude::*;
 
 /// Why an image has no features to give.
@@ -35,6 +35,9 @@ pub enum FeatureError {
         /// The range in words.
         range: &'static str,
     },
+    /// The job was stopped by its progress callback.
+    #[error("stopped")]
+    Cancelled(#[from] Cancelled),
 }
 
 /// Refuses images with a side below `needed` or with a sample that is not finite.

@@ -3,7 +3,7 @@
 use crate::descriptors::{DescriptorKind, Descriptors};
 use crate::nearest::nearest;
 use crate::simd;
-use cv_core::DMatch;
+use cv_core::{Cancelled, DMatch};
 
 /// Why two sets could not be matched.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
@@ -36,6 +36,9 @@ pub enum MatchError {
         /// The ratio.
         ratio: f32,
     },
+    /// The job was stopped by its progress callback.
+    #[error("stopped")]
+    Cancelled(#[from] Cancelled),
 }
 
 /// In which measure the ratio of best to second-best is taken, and distances are reported.

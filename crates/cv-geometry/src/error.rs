@@ -1,5 +1,7 @@
 //! Why an estimate could not be made.
 
+use cv_core::Cancelled;
+
 /// A configuration of points that does not determine a model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Degeneracy {
@@ -68,4 +70,7 @@ pub enum EstimateError {
         /// The value given.
         value: f64,
     },
+    /// The job was stopped by its progress callback.
+    #[error("stopped")]
+    Cancelled(#[from] Cancelled),
 }

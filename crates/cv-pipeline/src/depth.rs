@@ -2,7 +2,7 @@
 
 use crate::no_pair::{NoPairCause, cause};
 use crate::{Progress, Stopwatch};
-use cv_core::{GrayF32, ImageView};
+use cv_core::{Cancelled, GrayF32, ImageView};
 use cv_stereo::{DisparityMap, GeometryError, Intensity, StereoError, StereoGeometry, StereoMatcher, StereoOptions};
 
 /// Settings of [`depth`].
@@ -41,7 +41,7 @@ pub struct DepthResult {
 pub enum DepthError {
     /// The pair cannot be matched.
     #[error(transparent)]
-    Stereo(#[from] StereoError),
+    Stereo(StereoError),
     /// The geometry is none.
     #[error(transparent)]
     Geometry(#[from] GeometryError),
@@ -66,6 +66,18 @@ pub enum DepthError {
         /// Farthest depth kept.
         far: f32,
     },
+    /// The job was stopped by its progress callback.
+    #[error("stopped")]
+    Cancelled(#[from] Cancelled),
+}
+
+impl From<StereoError> for DepthError {
+    fn from(error: StereoError) -> Self {
+        match error {
+            StereoError::Cancelled(stop) => Self::Cancelled(stop),
+            other => Self::Stereo(other),
+        }
+    }
 }
 
 /// Share of the pixels that must be matched and confirmed. Of 56 generated pairs of four kinds (seeds 400 and 401: far things,
@@ -78,7 +90,7 @@ pub(crate) const LEAST_MATCHED: f64 = 0.18;
 /// to say why.
 ///
 /// # Errors
-/// [`DepthError::NoPair`].
+/// [`DepthError::NoPair`] and [`DepthError::Cancelled`].
 pub fn check_pair<T: Intensity, const C: usize>(
     map: &DisparityMap,
     left: ImageView<'_, T, C>,
@@ -90,7 +102,7 @@ pub fn check_pair<T: Intensity, const C: usize>(
     if matched >= LEAST_MATCHED {
         return Ok(());
     }
-    Err(DepthError::NoPair { matched, needed: LEAST_MATCHED, cause: cause(left, right, options, progress) })
+    Err(DepthError::NoPair { matched, needed: LEAST_MATCHED, cause: cause(left, right, options, progress)? })
 }
 
 /// Disparity of a rectified pair, and depth where its geometry is known.
@@ -118,11 +130,11 @@ pub fn depth<T: Intensity, const C: usize>(
     let mut map = DisparityMap::empty();
     matcher.prepare(left.width(), left.height(), &mut map)?;
     watch.lap("prepare");
-    progress.report("match", 0, 1);
+    progress.report("match", 0, 1)?;
     matcher.compute_into(left, right, &mut map)?;
     watch.lap("match");
     check_pair(&map, left, right, &options.stereo, progress)?;
-    progress.report("match", 1, 1);
+    progress.report("match", 1, 1)?;
     let depth = geometry.map(|geometry| geometry.depth_map(map.disparity.view(), options.range));
     let (confidence, sigma) = (matcher.confidence(&map), matcher.uncertainty(&map));
     watch.lap("depth");

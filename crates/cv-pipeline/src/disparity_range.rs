@@ -1,14 +1,14 @@
 //! Which disparities a pair shows, from sparse matches.
 
 use crate::{MatchingError, MatchingOptions, Progress, match_photos};
-use cv_core::{Correspondence, ImageView};
+use cv_core::{Cancelled, Correspondence, ImageView};
 
 /// Why no range was found.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum RangeError {
     /// No features to match.
     #[error(transparent)]
-    Matching(#[from] MatchingError),
+    Matching(MatchingError),
     /// Too few matches lie in the same row of both photographs.
     #[error("only {found} of {matches} matches lie in the same row of both photographs, {needed} are needed")]
     TooFew {
@@ -19,6 +19,18 @@ pub enum RangeError {
         /// How many are needed.
         needed: usize,
     },
+    /// The job was stopped by its progress callback.
+    #[error("stopped")]
+    Cancelled(#[from] Cancelled),
+}
+
+impl From<MatchingError> for RangeError {
+    fn from(error: MatchingError) -> Self {
+        match error {
+            MatchingError::Cancelled(stop) => Self::Cancelled(stop),
+            other => Self::Matching(other),
+        }
+    }
 }
 
 /// Fewer matches than this do not tell a range.

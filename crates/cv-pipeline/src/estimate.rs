@@ -46,12 +46,12 @@ pub fn estimate(
     progress: &dyn Progress,
 ) -> Result<EstimateResult, EstimateError> {
     let mut watch = Stopwatch::new();
-    progress.report("estimate", 0, 1);
+    progress.report("estimate", 0, 1)?;
     let robust = match kind {
         ModelKind::Homography => estimate_homography(pairs, options),
         ModelKind::Fundamental => estimate_fundamental(pairs, options),
     }?;
-    progress.report("estimate", 1, 1);
+    progress.report("estimate", 1, 1)?;
     watch.lap("estimate");
     Ok(EstimateResult { robust, stages: watch.into_stages() })
 }
@@ -79,11 +79,11 @@ pub fn estimate_calibrated(
     progress: &dyn Progress,
 ) -> Result<CalibratedResult, EstimateError> {
     let mut watch = Stopwatch::new();
-    progress.report("estimate", 0, 1);
+    progress.report("estimate", 0, 1)?;
     let (normalized, unit) = normalize_matches(pairs, &cameras[0], &cameras[1]);
     let found =
         estimate_relative_pose(&normalized, &RobustOptions { threshold: options.threshold * unit, ..*options })?;
-    progress.report("estimate", 1, 1);
+    progress.report("estimate", 1, 1)?;
     watch.lap("estimate");
     let robust = RobustModel {
         model: essential_from_pose(&found.model),

@@ -5,24 +5,26 @@
 //! other program.
 //!
 //! ```
-//! use cv_pipeline::{Progress, Silent, Stopwatch};
+//! use cv_pipeline::{Cancelled, Progress, Silent, Stopwatch};
 //!
-//! fn job(progress: &dyn Progress) -> Vec<(&'static str, f64)> {
+//! fn job(progress: &dyn Progress) -> Result<Vec<(&'static str, f64)>, Cancelled> {
 //!     let mut watch = Stopwatch::new();
 //!     for row in 0..10 {
-//!         progress.report("detect", row + 1, 10);
+//!         progress.report("detect", row + 1, 10)?;
 //!     }
 //!     watch.lap("detect");
-//!     watch.into_stages()
+//!     Ok(watch.into_stages())
 //! }
-//! assert_eq!(job(&Silent)[0].0, "detect");
+//! assert_eq!(job(&Silent)?[0].0, "detect");
+//! # Ok::<(), Cancelled>(())
 //! ```
 //!
 //! # Conventions
 //!
 //! * One file per job, holding `XOptions` (with `Default`), `XResult` and one function.
 //! * Every result has `stages: Vec<(&'static str, f64)>`, stage names and their seconds from a [`Stopwatch`].
-//! * Every job takes `&dyn Progress`; pass [`&Silent`](Silent) where nobody watches.
+//! * Every job takes `&dyn Progress`; pass [`&Silent`](Silent) where nobody watches. Where that says stop, the job gives back the
+//!   variant `Cancelled` of its error.
 //! * The same input, options and seed give the same result at any number of threads.
 
 mod depth;
@@ -32,13 +34,13 @@ mod guided;
 mod matching;
 mod no_pair;
 mod panorama;
-mod progress;
 mod reconstruct;
 mod rectify;
 mod segment;
 mod stopwatch;
 mod views;
 
+pub use cv_core::{Cancelled, Progress, Silent};
 pub use cv_geometry::{EstimateError, RobustModel, RobustOptions};
 pub use depth::{DepthError, DepthOptions, DepthResult, check_pair, depth};
 pub use disparity_range::{RangeError, disparity_range};
@@ -62,7 +64,6 @@ pub use panorama::{
 pub mod panorama_types {
     pub use cv_panorama::*;
 }
-pub use progress::{Progress, Silent};
 pub use reconstruct::{
     DenseError, DenseOptions, DenseResult, Intrinsics, ReconstructError, ReconstructOptions, ReconstructResult,
     ScenePoint, reconstruct, reconstruct_dense,

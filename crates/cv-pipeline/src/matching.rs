@@ -2,12 +2,13 @@
 
 use crate::views::match_slanted;
 use crate::{ModelKind, Progress, Silent, Stopwatch, estimate};
-use cv_core::{Correspondence, DMatch, GrayF32, ImageView, Keypoint, Point2};
+use cv_core::{Cancelled, Correspondence, DMatch, GrayF32, ImageView, Keypoint, Point2};
 use cv_features::{
     Described, DescriptorKind, FeatureError, GuidedOptions, HarrisOptions, MatchError, MatchOptions, MopsOptions,
     PatchOptions, SiftOptions, TwoViewModel, anms, anms_square_covering, anms_tiled, describe_patches, harris,
     match_descriptors, match_guided, mops, sift,
 };
+use cv_geometry::EstimateError;
 use cv_imgproc::resize_area;
 
 /// Which features to find.
@@ -147,7 +148,19 @@ pub enum MatchingError {
     },
     /// The descriptors cannot be compared.
     #[error(transparent)]
-    Match(#[from] MatchError),
+    Match(MatchError),
+    /// The job was stopped by its progress callback.
+    #[error("stopped")]
+    Cancelled(#[from] Cancelled),
+}
+
+impl From<MatchError> for MatchingError {
+    fn from(error: MatchError) -> Self {
+        match error {
+            MatchError::Cancelled(stop) => Self::Cancelled(stop),
+            other => Self::Match(other),
+        }
+    }
 }
 
 /// Finds and describes the features of a photograph. Gray is Rec. 601 luma, 0 to 1.
@@ -225,8 +238,11 @@ pub fn match_photos(
 ) -> Result<MatchingResult, MatchingError> {
     let mut watch = Stopwatch::new();
     let extract = |photo, index| {
-        progress.report("features", index - 1, 2);
-        let features = extract_features(photo, options).map_err(|source| MatchingError::Features { index, source })?;
+        progress.report("features", index - 1, 2)?;
+        let features = extract_features(photo, options).map_err(|error| match error {
+            FeatureError::Cancelled(stop) => stop.into(),
+            source => MatchingError::Features { index, source },
+        })?;
         if features.described.keypoints.is_empty() {
             let dropped = features.described.dropped.len();
             return Err(MatchingError::NoFeatures { index, found: features.found, dropped });
@@ -235,7 +251,7 @@ pub fn match_photos(
     };
     let mut features = [extract(a, 1)?, extract(b, 2)?];
     watch.lap("features");
-    progress.report("match", 0, 1);
+    progress.report("match", 0, 1)?;
     let mut matches = match_features(&features[0], &features[1], options)?;
     watch.lap("match");
     let slanted = match options.slanted {
@@ -244,7 +260,7 @@ pub fn match_photos(
         Slanted::Always => true,
     };
     if slanted && options.method == FeatureMethod::Sift {
-        progress.report("slanted views", 0, 1);
+        progress.report("slanted views", 0, 1)?;
         match_slanted([&luma(a), &luma(b)], &mut features, &mut matches, options);
         watch.lap("slanted views");
     }
@@ -277,7 +293,11 @@ fn finish(
     let mut pairs = correspondences(&features[0], &features[1], &matches);
     if let Some(kind) = options.guided {
         // Without a model there is nothing to be guided by: the tentative matches stay.
-        if let Ok(found) = estimate(&pairs, kind, &kind.options(), progress) {
+        let found = match estimate(&pairs, kind, &kind.options(), progress) {
+            Err(EstimateError::Cancelled(stop)) => return Err(stop.into()),
+            found => found.ok(),
+        };
+        if let Some(found) = found {
             let model = match kind {
                 ModelKind::Homography => TwoViewModel::Homography(found.robust.model),
                 ModelKind::Fundamental => TwoViewModel::Fundamental(found.robust.model),

@@ -1,8 +1,8 @@
 //! Why hardly any pixel of one photograph has a partner in the other, as far as feature matches tell.
 
 use crate::disparity_range::{NEEDED, in_common_rows, is_common_row, range_of};
-use crate::{MatchingOptions, Progress, match_photos};
-use cv_core::{Correspondence, ImageView, RgbU8};
+use crate::{MatchingError, MatchingOptions, Progress, match_photos};
+use cv_core::{Cancelled, Correspondence, ImageView, RgbU8};
 use cv_stereo::{Intensity, StereoOptions};
 
 /// What feature matches of a refused pair show.
@@ -83,18 +83,20 @@ pub(crate) fn cause<T: Intensity, const C: usize>(
     right: ImageView<'_, T, C>,
     options: &StereoOptions,
     progress: &dyn Progress,
-) -> NoPairCause {
+) -> Result<NoPairCause, Cancelled> {
     let [a, b] = [left, right].map(|view| {
         RgbU8::from_fn(view.width(), view.height(), |x, y| {
             let pixel = view.at(x, y);
             std::array::from_fn(|c| (pixel[if C >= 3 { c } else { 0 }].to_u16() >> 8) as u8)
         })
     });
-    let Ok(found) = match_photos(a.view(), b.view(), &MatchingOptions::default(), progress) else {
-        return NoPairCause::Unrelated { matches: 0 };
+    let found = match match_photos(a.view(), b.view(), &MatchingOptions::default(), progress) {
+        Ok(found) => found,
+        Err(MatchingError::Cancelled(stop)) => return Err(stop),
+        Err(_) => return Ok(NoPairCause::Unrelated { matches: 0 }),
     };
     let tried = (options.min_disparity, options.min_disparity + options.disparities as i32 - 1);
-    judge(&found.pairs, left.height(), Some(tried))
+    Ok(judge(&found.pairs, left.height(), Some(tried)))
 }
 
 /// What matches of two photographs of a height show, of which the disparities `tried` gave hardly any; [`NoPairCause::Unknown`] where

@@ -4,7 +4,7 @@ use crate::matching::{
     FeatureMethod, MatchingOptions, PhotoFeatures, correspondences, extract_features, match_features,
 };
 use crate::{Progress, Stopwatch};
-use cv_core::{Camera, Correspondence, Image, ImageView, Mask, Point2, RgbU8};
+use cv_core::{Camera, Cancelled, Correspondence, Image, ImageView, Mask, Point2, RgbU8};
 use cv_features::{Described, DescriptorKind, Descriptors, SiftOptions};
 use cv_panorama::{
     AlignError, AlignOptions, Alignment, CameraMotion, Canvas, NotAPair, Photo, PhotoMap, RenderError, RenderOptions,
@@ -133,6 +133,9 @@ pub enum PanoramaError {
     /// The panorama could not be drawn.
     #[error(transparent)]
     Render(#[from] RenderError),
+    /// The job was stopped by its progress callback.
+    #[error("stopped")]
+    Cancelled(#[from] Cancelled),
 }
 
 /// Joins overlapping photographs, in any order, to a panorama.
@@ -150,36 +153,36 @@ pub fn panorama(
     let mut watch = Stopwatch::new();
     let n = photos.len();
     let candidates: Vec<(usize, usize)> = (0..n).flat_map(|a| (a + 1..n).map(move |b| (a, b))).collect();
-    let mut look = |matching: &MatchingOptions| -> (Vec<Prepared>, Vec<Option<Tried>>) {
+    let mut look = |matching: &MatchingOptions| -> Result<(Vec<Prepared>, Vec<Option<Tried>>), Cancelled> {
         let done = AtomicUsize::new(0);
         let tick = |stage, total| progress.report(stage, done.fetch_add(1, Ordering::Relaxed) + 1, total);
-        progress.report("features", 0, n);
-        let extract = |p| {
+        progress.report("features", 0, n)?;
+        let extract = |p| -> Result<Prepared, Cancelled> {
             let prepared = Prepared::new(p, matching, options.registration_pixels);
-            tick("features", n);
-            prepared
+            tick("features", n)?;
+            Ok(prepared)
         };
-        let prepared: Vec<Prepared> = photos.par_iter().map(extract).collect();
+        let prepared: Vec<Prepared> = photos.par_iter().map(extract).collect::<Result<_, _>>()?;
         watch.lap("features");
         done.store(0, Ordering::Relaxed);
-        progress.report("match", 0, candidates.len());
-        let compare = |&(a, b): &(usize, usize)| {
+        progress.report("match", 0, candidates.len())?;
+        let compare = |&(a, b): &(usize, usize)| -> Result<Option<Tried>, Cancelled> {
             let pair = try_pair(&prepared, a, b, options);
-            tick("match", candidates.len());
-            pair
+            tick("match", candidates.len())?;
+            Ok(pair)
         };
-        let tried = candidates.par_iter().map(compare).collect();
+        let tried = candidates.par_iter().map(compare).collect::<Result<_, _>>()?;
         watch.lap("match");
-        (prepared, tried)
+        Ok((prepared, tried))
     };
     let matching = &options.matching;
     let plain = MatchingOptions { sift: SiftOptions { upsample: false, ..matching.sift.clone() }, ..matching.clone() };
     // The enlarged image is most of the work of SIFT, and seldom needed.
-    let (mut prepared, mut tried) = look(&plain);
+    let (mut prepared, mut tried) = look(&plain)?;
     if matching.method == FeatureMethod::Sift && matching.sift.upsample && !held_firmly(n, &tried) {
-        (prepared, tried) = look(matching);
+        (prepared, tried) = look(matching)?;
     }
-    progress.report("align", 0, 1);
+    progress.report("align", 0, 1)?;
     let (pairs, verified): (Vec<PanoramaPair>, Vec<Option<VerifiedPair>>) = tried.into_iter().flatten().unzip();
     let verified: Vec<VerifiedPair> = verified.into_iter().flatten().collect();
     let known: Vec<Photo> = prepared.iter().map(|p| p.photo).collect();
@@ -198,7 +201,7 @@ pub fn panorama(
     }
     watch.lap("align");
 
-    progress.report("draw", 0, 1);
+    progress.report("draw", 0, 1)?;
     let views: Vec<ImageView<'_, u8, 3>> = photos.iter().map(|p| p.image).collect();
     let drawn = render(&views, &alignment, &options.render)?;
     for (image, gain) in images.iter_mut().zip(&drawn.gains.gains) {
@@ -207,7 +210,7 @@ pub fn panorama(
     for (stage, seconds) in &drawn.stages {
         watch.add(stage, *seconds);
     }
-    progress.report("draw", 1, 1);
+    progress.report("draw", 1, 1)?;
     Ok(PanoramaResult {
         image: drawn.image,
         mask: drawn.mask,

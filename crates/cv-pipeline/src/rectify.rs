@@ -2,7 +2,7 @@
 
 use crate::matching::match_reduced;
 use crate::no_pair::judge;
-use crate::{MatchingOptions, NoPairCause, Progress, Stopwatch};
+use crate::{MatchingError, MatchingOptions, NoPairCause, Progress, Stopwatch};
 use cv_core::{ImageView, Mask, RgbU8, StereoRig};
 use cv_stereo::{Rectification, RectifyError, RectifyOptions};
 
@@ -41,16 +41,18 @@ pub fn rectify(
     progress: &dyn Progress,
 ) -> Result<RectifyResult, RectifyError> {
     let mut watch = Stopwatch::new();
-    progress.report("rectify", 0, 2);
+    progress.report("rectify", 0, 2)?;
     let rectification = Rectification::new(rig, options)?;
     let (left, mask_left) = rectification.left.apply(left)?;
     let (right, mask_right) = rectification.right.apply(right)?;
     watch.lap("rectify");
-    progress.report("rectify", 1, 2);
+    progress.report("rectify", 1, 2)?;
     // A pair without features is rectified all the same; only its quality stays unknown.
-    let pairs = match_reduced([left.view(), right.view()], LARGEST, &MatchingOptions::default(), progress)
-        .map(|found| found.pairs)
-        .unwrap_or_default();
+    let pairs = match match_reduced([left.view(), right.view()], LARGEST, &MatchingOptions::default(), progress) {
+        Ok(found) => found.pairs,
+        Err(MatchingError::Cancelled(stop)) => return Err(stop.into()),
+        Err(_) => Vec::new(),
+    };
     // A wrong match has any row; those beyond a few pixels say nothing of the calibration.
     let mut rows: Vec<f64> =
         pairs.iter().filter(|p| p.a.x >= p.b.x - 4.0).map(|p| (p.a.y - p.b.y).abs()).filter(|&dy| dy < 8.0).collect();
@@ -62,7 +64,7 @@ pub fn rectify(
     let quantile = |share: f64| rows[((rows.len() - 1) as f64 * share) as usize];
     let vertical_px = (rows.len() >= 8 && fault.is_none()).then(|| (quantile(0.5), quantile(0.95)));
     watch.lap("quality");
-    progress.report("rectify", 2, 2);
+    progress.report("rectify", 2, 2)?;
     let share = |mask: &Mask| {
         let m = mask.as_slice();
         m.iter().filter(|&&v| v).count() as f64 / m.len().max(1) as f64

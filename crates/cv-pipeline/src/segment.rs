@@ -34,9 +34,9 @@ pub fn train_segment(
     progress: &dyn Progress,
 ) -> Result<SegmentTraining, SegmentError> {
     let mut watch = Stopwatch::new();
-    progress.report("train", 0, 1);
+    progress.report("train", 0, 1)?;
     let trained = train(photos, options)?;
-    progress.report("train", 1, 1);
+    progress.report("train", 1, 1)?;
     watch.lap("train");
     Ok(SegmentTraining { trained, stages: watch.into_stages() })
 }

@@ -1,6 +1,7 @@
 //! What can go wrong.
 
 use crate::MixtureError;
+use cv_core::Cancelled;
 
 /// Why a model could not be trained, loaded, or scored.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -51,4 +52,7 @@ pub enum SegmentError {
         /// What is read here.
         known: u32,
     },
+    /// The job was stopped by its progress callback.
+    #[error("stopped")]
+    Cancelled(#[from] Cancelled),
 }

@@ -1,5 +1,7 @@
 //! What can be wrong with a stereo job.
 
+use cv_core::Cancelled;
+
 /// Why no disparity could be computed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum StereoError {
@@ -69,6 +71,9 @@ pub enum StereoError {
         /// Bytes allowed by `max_memory`.
         allowed: usize,
     },
+    /// The job was stopped by its progress callback.
+    #[error("stopped")]
+    Cancelled(#[from] Cancelled),
 }
 
 /// Bytes as MiB.

@@ -5,7 +5,9 @@
 //! stereo pairs", MVA 2000, for the axis).
 
 use crate::StereoGeometry;
-use cv_core::{Camera, CameraError, Distortion, Image, ImageView, Mask, Point2, Point3, Rotation3, StereoRig, Vector3};
+use cv_core::{
+    Camera, CameraError, Cancelled, Distortion, Image, ImageView, Mask, Point2, Point3, Rotation3, StereoRig, Vector3,
+};
 use cv_imgproc::{Pixel, RemapOptions, warp_with};
 use nalgebra::{Matrix3, Matrix4};
 
@@ -95,6 +97,9 @@ pub enum RectifyError {
         /// What would be accepted.
         allowed: &'static str,
     },
+    /// The job was stopped by its progress callback.
+    #[error("stopped")]
+    Cancelled(#[from] Cancelled),
 }
 
 /// A length as people read it.

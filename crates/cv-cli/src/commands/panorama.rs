@@ -204,6 +204,7 @@ fn failure(error: PanoramaError, paths: &[PathBuf]) -> Failure {
                 .advice("photographs that share a third of their view with their neighbors, taken from one place")
         }
         PanoramaError::Render(source) => Failure::new(source).advice("--projection auto, or a smaller --scale"),
+        PanoramaError::Cancelled(stop) => stop.into(),
     }
 }
 

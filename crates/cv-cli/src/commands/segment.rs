@@ -159,7 +159,7 @@ impl Train {
         let pairs = pair(&self.labels.images, &self.labels.masks, context)?;
         let mut photos = Vec::with_capacity(pairs.len());
         for (i, pair) in pairs.iter().enumerate() {
-            Progress::report(context, "read", i, pairs.len());
+            Progress::report(context, "read", i, pairs.len())?;
             photos.push(read_pair(pair, context)?);
         }
         let labeled: Vec<Labeled<'_>> = photos.iter().map(|(photo, mask)| (photo.view(), mask.view())).collect();
@@ -260,7 +260,7 @@ impl Predict {
         // Encoded masks are small: they wait until every photograph is done, so that a bad one leaves nothing behind.
         let mut masks = Vec::new();
         for (i, (path, output)) in photos.iter().zip(&outputs).enumerate() {
-            Progress::report(context, "predict", i, photos.len());
+            Progress::report(context, "predict", i, photos.len())?;
             let photo = cv_io::read_rgb(path)?;
             let result = segment(photo.view(), &model);
             masks.push(cv_io::encode_png(result.mask.view()).during(path.display())?);
@@ -309,7 +309,7 @@ impl Eval {
         let mut stages: Vec<(&'static str, f64)> = Vec::new();
         let (mut scores, mut figures) = (Vec::new(), Vec::new());
         for (i, pair) in pairs.iter().enumerate() {
-            Progress::report(context, "score", i, pairs.len());
+            Progress::report(context, "score", i, pairs.len())?;
             let (photo, truth) = read_pair(pair, context)?;
             if photo.size() != truth.size() {
                 let error = SegmentError::SizeMismatch { index: i, photo: photo.size(), mask: truth.size() };

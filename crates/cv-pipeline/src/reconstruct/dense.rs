@@ -3,7 +3,7 @@
 use super::ReconstructResult;
 use crate::depth::LEAST_MATCHED;
 use crate::{Progress, Stopwatch};
-use cv_core::{GrayF32, ImageView, Point2, Point3, StereoRig};
+use cv_core::{Cancelled, GrayF32, ImageView, Point2, Point3, StereoRig};
 use cv_imgproc::resize_area;
 use cv_stereo::{CloudPoint, PixelState, RectifyError, SceneRectification, StereoError, StereoMatcher, StereoOptions};
 use rayon::prelude::*;
@@ -51,10 +51,10 @@ pub struct DenseResult {
 pub enum DenseError {
     /// The photographs cannot be turned so that their rows coincide.
     #[error("the two photographs cannot be rectified: {0}")]
-    Rectify(#[from] RectifyError),
+    Rectify(#[source] RectifyError),
     /// The rectified photographs cannot be matched.
     #[error(transparent)]
-    Stereo(#[from] StereoError),
+    Stereo(StereoError),
     /// The other photograph confirms hardly any depth.
     #[error("only {:.1} % of what both photographs show was matched and confirmed; {:.0} % are the least that means anything", 100.0 * .coverage, 100.0 * .needed)]
     LittleConfirmed {
@@ -73,6 +73,27 @@ pub enum DenseError {
         /// What would be accepted.
         allowed: &'static str,
     },
+    /// The job was stopped by its progress callback.
+    #[error("stopped")]
+    Cancelled(#[from] Cancelled),
+}
+
+impl From<StereoError> for DenseError {
+    fn from(error: StereoError) -> Self {
+        match error {
+            StereoError::Cancelled(stop) => Self::Cancelled(stop),
+            other => Self::Stereo(other),
+        }
+    }
+}
+
+impl From<RectifyError> for DenseError {
+    fn from(error: RectifyError) -> Self {
+        match error {
+            RectifyError::Cancelled(stop) => Self::Cancelled(stop),
+            other => Self::Rectify(other),
+        }
+    }
 }
 
 impl DenseError {
@@ -93,6 +114,7 @@ impl DenseError {
                 "take photographs nearer to each other, of things with texture that stand still; the sparse cloud alone needs no --dense"
             }
             Self::Option { .. } => "see `cv reconstruct --help`",
+            Self::Cancelled(_) => "run it again",
         }
     }
 }
@@ -132,7 +154,7 @@ pub fn reconstruct_dense(
         }
     }
     let mut watch = Stopwatch::new();
-    progress.report("rectify", 0, 1);
+    progress.report("rectify", 0, 1)?;
     let longest = sparse.cameras.iter().map(|c| c.width.max(c.height)).max().unwrap_or(1);
     let factor = (options.max_size as f64 / longest as f64).min(1.0);
     let side = |n: usize| ((n as f64 * factor).round() as usize).max(1);
@@ -154,7 +176,7 @@ pub fn reconstruct_dense(
     }
     watch.lap("rectify");
 
-    progress.report("match", 0, 1);
+    progress.report("match", 0, 1)?;
     let stereo = StereoOptions {
         fill: options.fill,
         max_memory: Some(options.max_memory),
@@ -166,7 +188,7 @@ pub fn reconstruct_dense(
     let sigma = matcher.uncertainty(&map);
     watch.lap("match");
 
-    progress.report("cloud", 0, 1);
+    progress.report("cloud", 0, 1)?;
     let geometry = &scene.views.geometry;
     let (width, height) = size;
     // Depth in the rectified frame; seen and confirmed; seen by both at this depth at all.

@@ -1,7 +1,7 @@
 //! Why two photographs could not be reconstructed, and what to try.
 
 use crate::MatchingError;
-use cv_core::CameraError;
+use cv_core::{CameraError, Cancelled};
 use cv_geometry::EstimateError;
 
 /// Why two photographs could not be reconstructed.
@@ -9,7 +9,7 @@ use cv_geometry::EstimateError;
 pub enum ReconstructError {
     /// The photographs could not be matched at all.
     #[error(transparent)]
-    Matching(#[from] MatchingError),
+    Matching(MatchingError),
     /// A camera is not one.
     #[error("camera {index}: {source}")]
     Camera {
@@ -127,6 +127,18 @@ pub enum ReconstructError {
     /// The search for a model failed.
     #[error(transparent)]
     Estimate(EstimateError),
+    /// The job was stopped by its progress callback.
+    #[error("stopped")]
+    Cancelled(#[from] Cancelled),
+}
+
+impl From<MatchingError> for ReconstructError {
+    fn from(error: MatchingError) -> Self {
+        match error {
+            MatchingError::Cancelled(stop) => Self::Cancelled(stop),
+            other => Self::Matching(other),
+        }
+    }
 }
 
 impl ReconstructError {
@@ -179,6 +191,7 @@ impl ReconstructError {
                 );
             }
             Self::Estimate(_) => "check the matches with `cv match`",
+            Self::Cancelled(_) => "run it again",
         };
         words.to_owned()
     }

@@ -127,6 +127,7 @@ fn failed(error: EstimateError, matches: usize, options: &ReconstructOptions) ->
         EstimateError::NotEnoughMatches { got, .. } => {
             ReconstructError::TooFewMatches { got, needed: options.min_inliers }
         }
+        EstimateError::Cancelled(stop) => stop.into(),
         other => ReconstructError::Estimate(other),
     }
 }

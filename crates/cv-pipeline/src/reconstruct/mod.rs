@@ -167,7 +167,7 @@ pub fn reconstruct(
     if pairs.len() < options.min_inliers {
         return Err(ReconstructError::TooFewMatches { got: pairs.len(), needed: options.min_inliers });
     }
-    progress.report("pose", 0, 1);
+    progress.report("pose", 0, 1)?;
     let simple = watch.time("degeneracy", || Simple::new(pairs, prior.as_ref(), options));
     // Nothing can have more inliers than there are matches.
     simple.check(pairs.len(), options)?;
@@ -193,7 +193,7 @@ pub fn reconstruct(
         refine_radial: !matches!(options.intrinsics, Intrinsics::Known(_)),
         ..BundleOptions::default()
     };
-    progress.report("points", 0, 1);
+    progress.report("points", 0, 1)?;
     let mut fit = watch.time("bundle", || fit(&chosen, cameras, pose, &settings)).ok_or_else(|| too_few(0))?;
     // Before the matches along the lines: those agree with the pose because they were looked for where it says.
     let (normalized, unit) = normalize_matches(&fit.observed, &fit.bundle.cameras[0], &fit.bundle.cameras[1]);

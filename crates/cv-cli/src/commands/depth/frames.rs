@@ -74,7 +74,7 @@ impl Args {
         let mut said = (0, 0);
         let (mut seconds, mut valid) = (0.0, 0.0);
         for (i, (left, right)) in lefts.iter().zip(&rights).enumerate() {
-            Progress::report(context, "frames", i, lefts.len());
+            Progress::report(context, "frames", i, lefts.len())?;
             let (a, b) = (cv_io::read_rgb(left)?, cv_io::read_rgb(right)?);
             if a.size() != said {
                 said = a.size();
