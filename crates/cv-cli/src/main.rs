@@ -1,11 +1,11 @@
 //! The program `cv`: arguments, files and reports. The work itself is done by `cv-pipeline`.
 
 mod commands;
-mod common;
+mod frame;
 mod rig;
 
 use clap::Parser;
-use common::Globals;
+use frame::Globals;
 
 /// Classical computer vision: color segmentation, panoramas, two-view reconstruction and stereo depth.
 #[derive(Parser)]
@@ -21,5 +21,5 @@ struct Cli {
 
 fn main() -> std::process::ExitCode {
     let cli = Cli::parse();
-    common::run(&cli.globals, |context| cli.command.run(context))
+    frame::run(&cli.globals, |context| cli.command.run(context))
 }

@@ -1,6 +1,6 @@
 //! What commands with a calibrated rig share.
 
-use crate::common::{Failure, Outcome};
+use crate::frame::{Failure, Outcome};
 use cv_core::Camera;
 use cv_io::{FormatError, RigFile};
 use cv_pipeline::NoPairCause;

@@ -1,6 +1,6 @@
 //! `cv completions`: scripts that complete the command line.
 
-use crate::common::{Context, Failure, Outcome, Run};
+use crate::frame::{Context, Failure, Outcome, Run};
 use clap::CommandFactory;
 use clap_complete::Shell;
 

@@ -6,7 +6,7 @@ mod panorama;
 mod reconstruct;
 mod segment;
 
-use crate::common::{Context, Failure, Outcome, Run, create_dir};
+use crate::frame::{Context, Failure, Outcome, Run, create_dir};
 use cv_core::{Camera, RgbU8};
 use cv_report::{Figure, Note, Report};
 use serde::Serialize;

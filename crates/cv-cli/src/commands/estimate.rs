@@ -1,6 +1,6 @@
 //! `cv estimate`: a homography, fundamental or essential matrix from a matches file.
 
-use crate::common::{Context, Explain, Failure, Outcome, Run};
+use crate::frame::{Context, Explain, Failure, Outcome, Run};
 use clap::ValueEnum;
 use cv_core::nalgebra::Matrix3;
 use cv_core::{Camera, Correspondence};

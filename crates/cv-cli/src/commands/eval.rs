@@ -1,7 +1,7 @@
 //! `cv eval`: results against the truth.
 
 use super::depth::{fractions, read_map};
-use crate::common::{Context, Failure, Outcome, Run};
+use crate::frame::{Context, Failure, Outcome, Run};
 use cv_core::Mask;
 use cv_pipeline::stereo::{BAD_THRESHOLDS, DisparityScores, evaluate_disparity, non_occluded};
 use cv_report::{Figure, MapStyle, Report, draw_error_map, draw_map};

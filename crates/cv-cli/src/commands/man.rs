@@ -1,6 +1,6 @@
 //! `cv man`: the manual pages.
 
-use crate::common::{Context, Explain, Failure, Outcome, Run, create_dir};
+use crate::frame::{Context, Explain, Failure, Outcome, Run, create_dir};
 use clap::CommandFactory;
 use std::path::PathBuf;
 

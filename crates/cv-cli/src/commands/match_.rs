@@ -1,6 +1,6 @@
 //! `cv match`: tentative matches between two photographs.
 
-use crate::common::{Context, Explain, Failure, Outcome, Run};
+use crate::frame::{Context, Explain, Failure, Outcome, Run};
 use clap::ValueEnum;
 use cv_core::{Keypoint, RgbU8};
 use cv_io::FeatureRows;

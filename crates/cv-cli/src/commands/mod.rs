@@ -41,7 +41,7 @@
 //! Nothing else prints: stdout carries the one JSON object of `--json`, stderr the bar, [`Context::note`],
 //! [`Context::warn`] and the outcome's summary. Wrong usage that clap cannot see is `Failure::usage(..)`: exit code 2.
 
-use crate::common::{Context, Failure, Outcome, Run};
+use crate::frame::{Context, Failure, Outcome, Run};
 
 mod completions;
 mod demo;
@@ -69,7 +69,7 @@ macro_rules! subcommands {
             pub(crate) fn run(self, context: &Context) -> Result<Outcome, Failure> {
                 match self {
                     $(Self::$variant(args) => {
-                        crate::common::check_outputs(&args.outputs())?;
+                        crate::frame::check_outputs(&args.outputs())?;
                         (*args).run(context)
                     })*
                 }

@@ -2,7 +2,7 @@
 
 mod report;
 
-use crate::common::{Context, Failure, Outcome, Run, expand_images, picture_name};
+use crate::frame::{Context, Failure, Outcome, Run, expand_images, picture_name};
 use cv_core::Image;
 use cv_pipeline::panorama_types::{Blend, Exposure, Projection, Seams};
 use cv_pipeline::{FeatureMethod, PanoramaError, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama};

@@ -1,6 +1,6 @@
 //! `cv reconstruct`: points and camera poses from two photographs.
 
-use crate::common::{Context, Explain, Failure, Outcome, Run};
+use crate::frame::{Context, Explain, Failure, Outcome, Run};
 use cv_core::nalgebra::Matrix3;
 use cv_core::{Correspondence, Pose};
 use cv_io::DynImage;

@@ -1,6 +1,6 @@
 //! `cv rectify`: a pair as two cameras would have taken it whose rows coincide.
 
-use crate::common::{Context, Explain, Failure, Outcome, Run, create_dir, spare_inputs};
+use crate::frame::{Context, Explain, Failure, Outcome, Run, create_dir, spare_inputs};
 use crate::rig;
 use cv_core::{RgbU8, StereoRig};
 use cv_io::RigFile;

@@ -2,7 +2,7 @@
 
 mod files;
 
-use crate::common::{Context, Explain, Failure, Outcome, Run, create_dir, expand_images, same_file};
+use crate::frame::{Context, Explain, Failure, Outcome, Run, create_dir, expand_images, same_file};
 use cv_core::{Mask, RgbU8};
 use cv_pipeline::segmentation::{ColorModel, ColorSpace, Labeled, Regions, Rule, Scores, SegmentError, TrainOptions};
 use cv_pipeline::{Progress, segment, train_segment};

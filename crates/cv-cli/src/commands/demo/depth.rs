@@ -1,7 +1,7 @@
 //! Depth of a room from a rectified pair.
 
 use super::{Check, Demo, Part};
-use crate::common::Failure;
+use crate::frame::Failure;
 use cv_core::{GrayF32, Mask, RgbU8};
 use cv_pipeline::stereo::{StereoGeometry, StereoOptions};
 use cv_pipeline::{DepthOptions, depth};

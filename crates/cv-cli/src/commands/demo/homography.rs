@@ -1,7 +1,7 @@
 //! The homography between two views of a wall.
 
 use super::{Check, Demo, Part};
-use crate::common::Failure;
+use crate::frame::Failure;
 use cv_core::{ImageView, Matrix3, RgbU8, Vector3};
 use cv_pipeline::{MatchingOptions, ModelKind, estimate, match_photos};
 use cv_report::{MatchStyle, colors, draw_keypoints, draw_matches};

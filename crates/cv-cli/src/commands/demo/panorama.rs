@@ -1,7 +1,7 @@
 //! A panorama of a room in which someone walks about.
 
 use super::{Check, Demo, Part};
-use crate::common::Failure;
+use crate::frame::Failure;
 use cv_pipeline::{PanoramaOptions, PanoramaPhoto, panorama};
 use cv_report::side_by_side;
 use cv_synth::{RenderOptions, alignment_error, panorama_views};

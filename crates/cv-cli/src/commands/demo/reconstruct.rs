@@ -1,7 +1,7 @@
 //! Points and camera motion from two photographs of a room.
 
 use super::{Check, Demo, Part};
-use crate::common::Failure;
+use crate::frame::Failure;
 use cv_core::Pose;
 use cv_pipeline::{Intrinsics, ReconstructOptions, reconstruct};
 use cv_report::{MatchStyle, PointScene, Viewpoint, camera_color, draw_epipolar_lines, draw_matches, render_points};

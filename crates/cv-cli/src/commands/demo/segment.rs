@@ -1,7 +1,7 @@
 //! An orange ball by its color, trained on half of the photographs.
 
 use super::{Check, Demo, Part};
-use crate::common::Failure;
+use crate::frame::Failure;
 use cv_pipeline::{segment, train_segment};
 use cv_report::overlay_comparison;
 use cv_synth::{MaskScore, RenderOptions, ball_photos};

@@ -1,7 +1,7 @@
 //! `cv depth` on frames: one pair after the other with the same buffers.
 
 use super::{Args, Range, explained, say_memory};
-use crate::common::{Context, Explain, Failure, Outcome, expand_images};
+use crate::frame::{Context, Explain, Failure, Outcome, expand_images};
 use cv_pipeline::stereo::{DisparityMap, StereoMatcher};
 use cv_pipeline::{Progress, check_pair};
 use std::path::{Path, PathBuf};

@@ -1,6 +1,6 @@
 //! Maps of floats in files.
 
-use crate::common::{Explain, Failure};
+use crate::frame::{Explain, Failure};
 use cv_core::{GrayF32, ImageView};
 use std::path::Path;
 

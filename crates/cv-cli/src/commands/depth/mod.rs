@@ -5,7 +5,7 @@ mod maps;
 mod options;
 mod report;
 
-use crate::common::{Context, Failure, Outcome, Run};
+use crate::frame::{Context, Failure, Outcome, Run};
 use crate::rig;
 use cv_core::{GrayF32, ImageView, Point3, RgbU8, Rotation3};
 use cv_io::ply::{Cloud, PlyEncoding};

@@ -1,7 +1,7 @@
 //! What the arguments of `cv depth` mean to the matcher.
 
 use super::Args;
-use crate::common::{Context, Explain, Failure};
+use crate::frame::{Context, Explain, Failure};
 use crate::rig;
 use cv_core::RgbU8;
 use cv_pipeline::stereo::{Blend, Census, Paths, Smoothing, StereoOptions};

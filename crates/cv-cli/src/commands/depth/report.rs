@@ -1,7 +1,7 @@
 //! The report of `cv depth`.
 
 use super::Job;
-use crate::common::Failure;
+use crate::frame::Failure;
 use cv_core::{ImageView, RgbU8};
 use cv_pipeline::DepthResult;
 use cv_pipeline::stereo::{CloudPoint, PixelState};

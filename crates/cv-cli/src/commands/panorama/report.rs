@@ -1,6 +1,6 @@
 //! The report of `cv panorama`.
 
-use crate::common::Failure;
+use crate::frame::Failure;
 use cv_core::{Correspondence, Point2, RgbU8};
 use cv_pipeline::PanoramaResult;
 use cv_report::{Figure, MatchStyle, Note, Report, draw_matches, shrink_to_fit};

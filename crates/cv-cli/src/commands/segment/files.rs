@@ -1,6 +1,6 @@
 //! Which mask belongs to which photograph.
 
-use crate::common::{Context, Failure, expand_images};
+use crate::frame::{Context, Failure, expand_images};
 use cv_core::{Mask, RgbU8};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};

@@ -1,0 +1,67 @@
+//! What a running command knows about how it was called.
+
+use super::progress::Bar;
+use super::{Failure, Globals, create_dir};
+use cv_pipeline::{Cancelled, Progress};
+use std::{fmt::Display, path::PathBuf};
+
+/// What a running command knows about how it was called. It is also the [`Progress`] that pipelines report to.
+pub(crate) struct Context {
+    /// `--seed`, where given.
+    pub(crate) seed: Option<u64>,
+    quiet: bool,
+    report: Option<PathBuf>,
+    bar: Bar,
+}
+
+impl Context {
+    pub(super) fn new(globals: &Globals) -> Self {
+        let Globals { quiet, seed, .. } = *globals;
+        Self { seed, quiet, report: globals.report.clone(), bar: Bar::new(quiet) }
+    }
+
+    /// A line on stderr, whatever was asked for.
+    pub(super) fn say(&self, text: &str) {
+        self.bar.print(text);
+    }
+
+    /// Takes the bar off the screen.
+    pub(super) fn clear_bar(&self) {
+        self.bar.clear();
+    }
+
+    /// A message for people, on stderr; silent under `--quiet`.
+    pub(crate) fn note(&self, text: impl Display) {
+        if !self.quiet {
+            self.bar.print(&text.to_string());
+        }
+    }
+
+    /// Something the person should know about even under `--quiet`.
+    pub(crate) fn warn(&self, text: impl Display) {
+        self.bar.print(&format!("warning: {text}"));
+    }
+
+    /// Under `--report DIR`, writes `DIR/report.html`.
+    pub(crate) fn report(&self, html: impl FnOnce() -> Result<String, Failure>) -> Result<(), Failure> {
+        let Some(folder) = &self.report else { return Ok(()) };
+        let html = html()?;
+        create_dir(folder)?;
+        let path = folder.join("report.html");
+        cv_io::write_bytes(&path, html.as_bytes())?;
+        self.note(format!("report: {}", path.display()));
+        Ok(())
+    }
+
+    /// Whether `--report` was given: pictures for it are worth drawing.
+    pub(crate) fn wants_report(&self) -> bool {
+        self.report.is_some()
+    }
+}
+
+impl Progress for Context {
+    fn report(&self, stage: &'static str, done: usize, total: usize) -> Result<(), Cancelled> {
+        self.bar.show(stage, done, total);
+        Ok(())
+    }
+}

@@ -1,0 +1,106 @@
+//! The frame that runs every command: global arguments, exit codes, stdout and stderr.
+//!
+//! [`Outcome`] is what a command achieved and [`Failure`] why it did not; [`Context`] is what it knows of how it was called.
+
+mod context;
+mod failure;
+mod inputs;
+mod outcome;
+mod outputs;
+mod progress;
+
+pub(crate) use context::Context;
+pub(crate) use failure::{Explain, Failure};
+pub(crate) use inputs::expand_images;
+pub(crate) use outcome::Outcome;
+pub(crate) use outputs::{check_outputs, create_dir, picture_name, same_file, spare_inputs};
+
+use clap::{Args, value_parser};
+use std::{
+    io::{self, Write},
+    panic::{AssertUnwindSafe, catch_unwind},
+    path::{Path, PathBuf},
+    process::ExitCode,
+    time::Instant,
+};
+
+/// Arguments that every command takes.
+#[derive(Debug, Clone, Args)]
+#[command(next_help_heading = "Everywhere")]
+pub(crate) struct Globals {
+    /// Print one JSON object on stdout, and nothing else there.
+    #[arg(long, global = true)]
+    pub(crate) json: bool,
+    /// No progress bar, no summary; errors and warnings only.
+    #[arg(short, long, global = true)]
+    pub(crate) quiet: bool,
+    /// Threads to use [default: one per core]. The result is the same for any number.
+    #[arg(long, global = true, value_name = "N", value_parser = value_parser!(u16).range(1..=1024))]
+    pub(crate) threads: Option<u16>,
+    /// Seed of random choices [default: that of the pipeline]. The same seed gives the same result.
+    #[arg(long, global = true, value_name = "S")]
+    pub(crate) seed: Option<u64>,
+    /// Write DIR/report.html, one file with the pictures and figures of this run inside.
+    #[arg(long, global = true, value_name = "DIR")]
+    pub(crate) report: Option<PathBuf>,
+}
+
+/// A subcommand.
+pub(crate) trait Run: Args {
+    /// The files this run will write. The frame checks them before the work starts.
+    fn outputs(&self) -> Vec<&Path> {
+        Vec::new()
+    }
+
+    /// Does the job.
+    fn run(self, context: &Context) -> Result<Outcome, Failure>;
+}
+
+/// Runs a command under the global arguments and turns what comes of it into output and exit code.
+pub(crate) fn run(globals: &Globals, command: impl FnOnce(&Context) -> Result<Outcome, Failure>) -> ExitCode {
+    let start = Instant::now();
+    let context = Context::new(globals);
+    let result = start_threads(globals.threads).and_then(|()| {
+        // A bug in the program is reported like any failure: the person sees what to do, scripts see exit code 1.
+        catch_unwind(AssertUnwindSafe(|| command(&context))).unwrap_or_else(|_| {
+            Err(Failure::new("the program stopped at a bug of its own (see above)")
+                .advice("report it with the command line and, where you can, the input files"))
+        })
+    });
+    context.clear_bar();
+    let failure = match result {
+        Ok(mut outcome) => {
+            let but = outcome.take_but();
+            match finish(outcome, globals, start).err().or(but) {
+                None => return ExitCode::SUCCESS,
+                Some(failure) => failure,
+            }
+        }
+        Err(failure) => failure,
+    };
+    context.say(&failure.text());
+    failure.exit_code()
+}
+
+fn start_threads(threads: Option<u16>) -> Result<(), Failure> {
+    let mut pool = rayon::ThreadPoolBuilder::new();
+    if let Some(threads) = threads {
+        pool = pool.num_threads(threads.into());
+    }
+    pool.build_global().during("cannot start the threads")
+}
+
+/// Prints what the person asked to see.
+fn finish(outcome: Outcome, globals: &Globals, start: Instant) -> Result<(), Failure> {
+    if globals.json {
+        let object = outcome.into_json(start.elapsed().as_secs_f64())?;
+        writeln!(io::stdout(), "{object}").during("cannot write to stdout")?;
+        return Ok(());
+    }
+    io::stdout().write_all(outcome.stdout()).during("cannot write to stdout")?;
+    let summary = outcome.summary_text();
+    if !globals.quiet && !summary.is_empty() {
+        let _ = writeln!(io::stderr(), "{summary}");
+    }
+    Ok(())
+}
