@@ -1,5 +1,6 @@
 //! The vocabulary every other crate of the workspace speaks: images, cameras,
-//! poses, keypoints and matches. No input or output, no codecs, no thread pool.
+//! poses, keypoints, matches and point clouds, and what is needed everywhere: the clock of a job's stages, the error for a
+//! wrong option, luma, quantiles, union-find. No input or output, no codecs, no thread pool.
 //!
 //! ```
 //! use cv_core::{Image, Point2};
@@ -28,17 +29,29 @@
 mod camera;
 mod features;
 mod image;
+mod luma;
+mod option_error;
+mod point_cloud;
 mod pose;
 mod progress;
+mod quantile;
 mod rig;
+mod stage_clock;
+mod union_find;
 mod view;
 
 pub use camera::{Camera, CameraError, Distortion};
 pub use features::{Correspondence, DMatch, Keypoint};
 pub use image::{GrayF32, GrayU8, Image, ImageError, Mask, RgbF32, RgbU8, Sample};
+pub use luma::{luma_f32, luma_u8, luma_u16};
+pub use option_error::OptionError;
+pub use point_cloud::PointCloud;
 pub use pose::Pose;
 pub use progress::{Cancelled, Progress, Silent, Stage};
+pub use quantile::{TotalOrder, median, quantile};
 pub use rig::StereoRig;
+pub use stage_clock::StageClock;
+pub use union_find::UnionFind;
 pub use view::{ImageView, ImageViewMut};
 
 pub use nalgebra;

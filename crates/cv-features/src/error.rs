@@ -1,7 +1,7 @@
 //! What can be wrong with an image handed to a detector or descriptor.
 
 use crate::simd;
-use cv_core::{Cancelled, ImageView};
+use cv_core::{Cancelled, ImageView, OptionError};
 use rayon::prelude::*;
 
 /// Why an image has no features to give.
@@ -26,15 +26,8 @@ pub enum FeatureError {
         y: usize,
     },
     /// An option is outside its range.
-    #[error("option {name} = {value} is outside its range ({range})")]
-    BadOption {
-        /// Name of the field.
-        name: &'static str,
-        /// Its value.
-        value: f64,
-        /// The range in words.
-        range: &'static str,
-    },
+    #[error(transparent)]
+    Option(#[from] OptionError),
     /// The job was stopped by its progress callback.
     #[error("stopped")]
     Cancelled(#[from] Cancelled),
@@ -52,14 +45,4 @@ pub(crate) fn check_image(view: ImageView<'_, f32, 1>, needed: usize) -> Result<
         Some((x, y)) => Err(FeatureError::NotFinite { x, y }),
         None => Ok(()),
     }
-}
-
-/// Refuses an option outside `ok`.
-pub(crate) fn check_option(
-    name: &'static str,
-    value: f64,
-    range: &'static str,
-    ok: impl Fn(f64) -> bool,
-) -> Result<(), FeatureError> {
-    if ok(value) { Ok(()) } else { Err(FeatureError::BadOption { name, value, range }) }
 }

@@ -3,7 +3,7 @@
 use crate::descriptors::{Described, Descriptors};
 use crate::matching::MatchError;
 use crate::nearest::ssd;
-use cv_core::{DMatch, Keypoint};
+use cv_core::{DMatch, Keypoint, OptionError};
 use nalgebra::{Matrix3, Point2, Vector3};
 use rayon::prelude::*;
 
@@ -57,9 +57,7 @@ pub fn match_guided(
     if da.is_empty() || db.is_empty() {
         return Err(MatchError::Empty { query: da.len(), train: db.len() });
     }
-    if !(0.0..=1.0).contains(&options.ratio) {
-        return Err(MatchError::BadRatio { ratio: options.ratio });
-    }
+    OptionError::check("ratio", options.ratio.into(), "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
     let own = [a, b].map(|d| d.keypoints.iter().map(|k: &Keypoint| k.position).collect::<Vec<_>>());
     let [pa, pb] = positions.unwrap_or([&own[0], &own[1]]);
     if pa.len() != da.len() || pb.len() != db.len() {

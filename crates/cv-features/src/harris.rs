@@ -3,11 +3,11 @@
 //! Sources: C. Harris & M. Stephens, "A combined corner and edge detector", Alvey Vision Conference 1988; J. Shi & C. Tomasi, "Good features to
 //! track", CVPR 1994.
 
-use crate::error::{FeatureError, check_image, check_option};
+use crate::error::{FeatureError, check_image};
 use crate::ring::Ring;
 use crate::simd;
 use crate::structure::{Structure, Walk};
-use cv_core::{GrayF32, ImageView, Keypoint};
+use cv_core::{GrayF32, ImageView, Keypoint, OptionError};
 use cv_imgproc::gaussian_half_kernel;
 use fearless_simd::Level;
 use rayon::prelude::*;
@@ -45,12 +45,14 @@ impl Default for HarrisOptions {
 }
 
 impl HarrisOptions {
-    fn check(&self) -> Result<(), FeatureError> {
+    fn check(&self) -> Result<(), OptionError> {
         if let CornerMeasure::Harris { k } = self.measure {
-            check_option("k", k.into(), "0 to 0.25", |v| (0.0..=0.25).contains(&v))?;
+            OptionError::check("k", k.into(), "from 0 to 0.25", |v| (0.0..=0.25).contains(&v))?;
         }
-        check_option("window_sigma", self.window_sigma.into(), "0.3 to 20 px", |v| (0.3..=20.0).contains(&v))?;
-        check_option("threshold", self.threshold.into(), "0 to 1", |v| (0.0..=1.0).contains(&v))
+        OptionError::check("window_sigma", self.window_sigma.into(), "from 0.3 to 20 px", |v| {
+            (0.3..=20.0).contains(&v)
+        })?;
+        OptionError::check("threshold", self.threshold.into(), "from 0 to 1", |v| (0.0..=1.0).contains(&v))
     }
 
     fn plan<'a>(&self, view: ImageView<'a, f32, 1>, level: Level) -> Structure<'a> {
@@ -281,7 +283,7 @@ mod tests {
         let bad = HarrisOptions { window_sigma: f32::NAN, ..options };
         assert!(matches!(
             harris(Image::new(9, 9, [0.0]).view(), &bad),
-            Err(FeatureError::BadOption { name: "window_sigma", .. })
+            Err(FeatureError::Option(OptionError { name: "window_sigma", .. }))
         ));
     }
 

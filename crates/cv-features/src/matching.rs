@@ -3,7 +3,7 @@
 use crate::descriptors::{DescriptorKind, Descriptors};
 use crate::nearest::nearest;
 use crate::simd;
-use cv_core::{Cancelled, DMatch};
+use cv_core::{Cancelled, DMatch, OptionError};
 
 /// Why two sets could not be matched.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
@@ -30,12 +30,9 @@ pub enum MatchError {
         /// Descriptors in the set.
         got: usize,
     },
-    /// The ratio is not a number from 0 to 1.
-    #[error("the ratio {ratio} is not between 0 and 1")]
-    BadRatio {
-        /// The ratio.
-        ratio: f32,
-    },
+    /// An option is outside its range.
+    #[error(transparent)]
+    Option(#[from] OptionError),
     /// The job was stopped by its progress callback.
     #[error("stopped")]
     Cancelled(#[from] Cancelled),
@@ -96,8 +93,8 @@ pub fn match_descriptors(
     if let Some(got) = [query.len(), train.len()].into_iter().find(|&n| u32::try_from(n).is_err()) {
         return Err(MatchError::TooMany { got });
     }
-    if let Some(ratio) = options.ratio.filter(|r| !(0.0..=1.0).contains(r)) {
-        return Err(MatchError::BadRatio { ratio });
+    if let Some(ratio) = options.ratio {
+        OptionError::check("ratio", ratio.into(), "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
     }
     let (forward, backward) = nearest(simd::level(), query, train, options.mutual);
     let mut matches = Vec::new();
@@ -186,6 +183,6 @@ mod tests {
         assert_eq!(match_descriptors(&none, &a, &options), Err(MatchError::Empty { query: 0, train: 1 }));
         assert_eq!(match_descriptors(&a, &none, &options), Err(MatchError::Empty { query: 1, train: 0 }));
         let bad = MatchOptions { ratio: Some(f32::NAN), ..options };
-        assert!(matches!(match_descriptors(&a, &a, &bad), Err(MatchError::BadRatio { .. })));
+        assert!(matches!(match_descriptors(&a, &a, &bad), Err(MatchError::Option(_))));
     }
 }

@@ -4,13 +4,13 @@
 //! "Indexing based on scale invariant interest points", ICCV 2001 (Harris-Laplace).
 
 use crate::descriptors::{Described, DescriptorKind, Descriptors, DropReason, Dropped};
-use crate::error::{FeatureError, check_image, check_option};
+use crate::error::{FeatureError, check_image};
 use crate::harris::{CornerMeasure, corners};
 use crate::patch::{SIDE, normalize};
 use crate::pyramid::{FIRST_SIGMA, Pyramid};
 use crate::simd;
 use crate::structure::Structure;
-use cv_core::{ImageView, Keypoint};
+use cv_core::{ImageView, Keypoint, OptionError};
 use cv_imgproc::gaussian_half_kernel;
 use rayon::prelude::*;
 
@@ -115,21 +115,21 @@ pub fn describe_oriented_patches(
     Ok(describe(&Pyramid::new(view, options.corners.layers), view.size(), keypoints, &options))
 }
 
-fn check(options: &MultiScaleOptions) -> Result<(), FeatureError> {
+fn check(options: &MultiScaleOptions) -> Result<(), OptionError> {
     if let CornerMeasure::Harris { k } = options.measure {
-        check_option("k", k.into(), "0 to 0.25", |v| (0.0..=0.25).contains(&v))?;
+        OptionError::check("k", k.into(), "from 0 to 0.25", |v| (0.0..=0.25).contains(&v))?;
     }
-    check_option("layers", options.layers as f64, "1 to 6", |v| (1.0..=6.0).contains(&v))?;
-    check_option("threshold", options.threshold.into(), "0 to 1", |v| (0.0..=1.0).contains(&v))
+    OptionError::check("layers", options.layers as f64, "from 1 to 6", |v| (1.0..=6.0).contains(&v))?;
+    OptionError::check("threshold", options.threshold.into(), "from 0 to 1", |v| (0.0..=1.0).contains(&v))
 }
 
-fn check_patches(options: &MopsOptions) -> Result<(), FeatureError> {
-    check_option("max_features", options.max_features as f64, "1 or more", |v| v >= 1.0)?;
-    check_option("window", options.window.into(), "8 to 100 scales", |v| (8.0..=100.0).contains(&v))?;
-    check_option("orientation_sigma", options.orientation_sigma.into(), "1 to 20 scales", |v| {
+fn check_patches(options: &MopsOptions) -> Result<(), OptionError> {
+    OptionError::check("max_features", options.max_features as f64, "1 or more", |v| v >= 1.0)?;
+    OptionError::check("window", options.window.into(), "from 8 to 100 scales", |v| (8.0..=100.0).contains(&v))?;
+    OptionError::check("orientation_sigma", options.orientation_sigma.into(), "from 1 to 20 scales", |v| {
         (1.0..=20.0).contains(&v)
     })?;
-    check_option("min_deviation", options.min_deviation.into(), "0 or more", |v| v >= 0.0 && v.is_finite())
+    OptionError::check("min_deviation", options.min_deviation.into(), "0 or more", |v| v >= 0.0 && v.is_finite())
 }
 
 fn detect(pyramid: &Pyramid, options: &MultiScaleOptions) -> Vec<Keypoint> {
@@ -330,7 +330,7 @@ mod tests {
         assert_eq!(mops(image.view(), &options), Err(FeatureError::NotFinite { x: 3, y: 4 }));
         let bad = MopsOptions { window: f32::NAN, ..options.clone() };
         let image = GrayF32::new(64, 48, [0.7]);
-        assert!(matches!(mops(image.view(), &bad), Err(FeatureError::BadOption { name: "window", .. })));
+        assert!(matches!(mops(image.view(), &bad), Err(FeatureError::Option(OptionError { name: "window", .. }))));
         let wrong = [Keypoint { scale: f32::NAN, ..Keypoint::new(30.0, 30.0, 1.0) }, Keypoint::new(30.0, 20.0, 1.0)];
         let told = describe_oriented_patches(image.view(), &wrong, &options).unwrap();
         let reasons: Vec<_> = told.dropped.iter().map(|d| d.reason).collect();

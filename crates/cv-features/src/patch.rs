@@ -4,8 +4,8 @@
 //! without orientation.
 
 use crate::descriptors::{Described, DescriptorKind, Descriptors, DropReason, Dropped};
-use crate::error::{FeatureError, check_image, check_option};
-use cv_core::{GrayF32, ImageView, Keypoint};
+use crate::error::{FeatureError, check_image};
+use cv_core::{GrayF32, ImageView, Keypoint, OptionError};
 use cv_imgproc::gaussian_blur;
 use rayon::prelude::*;
 
@@ -42,9 +42,9 @@ pub fn describe_patches(
     keypoints: &[Keypoint],
     options: &PatchOptions,
 ) -> Result<Described, FeatureError> {
-    check_option("window", options.window.into(), "8 to 400 px", |v| (8.0..=400.0).contains(&v))?;
-    check_option("blur_sigma", options.blur_sigma.into(), "0.3 to 50 px", |v| (0.3..=50.0).contains(&v))?;
-    check_option("min_deviation", options.min_deviation.into(), "0 or more", |v| v >= 0.0 && v.is_finite())?;
+    OptionError::check("window", options.window.into(), "from 8 to 400 px", |v| (8.0..=400.0).contains(&v))?;
+    OptionError::check("blur_sigma", options.blur_sigma.into(), "from 0.3 to 50 px", |v| (0.3..=50.0).contains(&v))?;
+    OptionError::check("min_deviation", options.min_deviation.into(), "0 or more", |v| v >= 0.0 && v.is_finite())?;
     check_image(view, options.window.ceil() as usize)?;
     let smooth = gaussian_blur(view, options.blur_sigma);
     let patches: Vec<Result<[f32; SIDE * SIDE], DropReason>> =

@@ -9,11 +9,11 @@
 
 use crate::descriptors::{Described, DescriptorKind, Descriptors, DropReason, Dropped};
 use crate::dog::{Extremum, Search};
-use crate::error::{FeatureError, check_image, check_option};
+use crate::error::{FeatureError, check_image};
 use crate::histogram::{DIMENSION, describe, dominant_angles};
 use crate::scale_space::{Octave, scale_space};
 use crate::simd;
-use cv_core::{ImageView, Keypoint, Point2};
+use cv_core::{ImageView, Keypoint, OptionError, Point2};
 use rayon::prelude::*;
 
 /// Settings of [`sift`].
@@ -68,11 +68,11 @@ pub(crate) const SMALLEST: usize = 8;
 /// # Errors
 /// [`FeatureError`] for images below 8×8, samples that are not finite, options out of range.
 pub fn sift(view: ImageView<'_, f32, 1>, options: &SiftOptions) -> Result<Described, FeatureError> {
-    check_option("max_features", options.max_features as f64, "1 or more", |v| v >= 1.0)?;
-    check_option("layers", options.layers as f64, "1 to 8", |v| (1.0..=8.0).contains(&v))?;
-    check_option("sigma", options.sigma.into(), "0.8 to 4 px", |v| (0.8..=4.0).contains(&v))?;
-    check_option("contrast", options.contrast.into(), "0 or more", |v| v >= 0.0 && v.is_finite())?;
-    check_option("edge", options.edge.into(), "1 or more", |v| v >= 1.0 && v.is_finite())?;
+    OptionError::check("max_features", options.max_features as f64, "1 or more", |v| v >= 1.0)?;
+    OptionError::check("layers", options.layers as f64, "from 1 to 8", |v| (1.0..=8.0).contains(&v))?;
+    OptionError::check("sigma", options.sigma.into(), "from 0.8 to 4 px", |v| (0.8..=4.0).contains(&v))?;
+    OptionError::check("contrast", options.contrast.into(), "0 or more", |v| v >= 0.0 && v.is_finite())?;
+    OptionError::check("edge", options.edge.into(), "1 or more", |v| v >= 1.0 && v.is_finite())?;
     check_image(view, SMALLEST)?;
     let search = Search {
         layers: options.layers,
@@ -207,6 +207,6 @@ mod tests {
         image.set(3, 4, [f32::NAN]);
         assert_eq!(sift(image.view(), &options), Err(FeatureError::NotFinite { x: 3, y: 4 }));
         let bad = SiftOptions { layers: 0, ..options };
-        assert!(matches!(sift(image.view(), &bad), Err(FeatureError::BadOption { name: "layers", .. })));
+        assert!(matches!(sift(image.view(), &bad), Err(FeatureError::Option(OptionError { name: "layers", .. }))));
     }
 }

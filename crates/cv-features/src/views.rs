@@ -4,10 +4,10 @@
 //! under a slant is the frontal one turned, then compressed along one axis (the tilt); features of the compressed picture match those of the slanted one.
 
 use crate::descriptors::Described;
-use crate::error::{FeatureError, check_image, check_option};
+use crate::error::{FeatureError, check_image};
 use crate::sift::{SMALLEST, SiftOptions, sift};
 use crate::simd;
-use cv_core::{GrayF32, ImageView, Point2};
+use cv_core::{GrayF32, ImageView, OptionError, Point2};
 use cv_imgproc::{Border, RemapOptions, gaussian_half_kernel, mirror_ends, warp_with};
 use rayon::prelude::*;
 
@@ -17,7 +17,7 @@ use rayon::prelude::*;
 /// turn, and `tilt` at powers of √2.
 ///
 /// # Errors
-/// As [`sift`]; [`FeatureError::BadOption`] for a tilt outside its range or a rotation that is not finite; [`FeatureError::ImageTooSmall`] where the compressed image would be too
+/// As [`sift`]; [`FeatureError::Option`] for a tilt outside its range or a rotation that is not finite; [`FeatureError::ImageTooSmall`] where the compressed image would be too
 /// small.
 pub fn sift_tilted(
     view: ImageView<'_, f32, 1>,
@@ -25,8 +25,8 @@ pub fn sift_tilted(
     tilt: f32,
     rotation: f32,
 ) -> Result<Described, FeatureError> {
-    check_option("tilt", tilt.into(), "1 to 8", |v| (1.0..=8.0).contains(&v))?;
-    check_option("rotation", rotation.into(), "finite", f64::is_finite)?;
+    OptionError::check("tilt", tilt.into(), "from 1 to 8", |v| (1.0..=8.0).contains(&v))?;
+    OptionError::check("rotation", rotation.into(), "finite", f64::is_finite)?;
     check_image(view, SMALLEST)?;
     let (w, h) = view.size();
     let (sin, cos) = rotation.sin_cos();
@@ -164,7 +164,7 @@ mod tests {
         }
         for (tilt, rotation) in [(0.5, 0.0), (f32::NAN, 0.0), (2.0, f32::INFINITY)] {
             let error = sift_tilted(image.view(), &options, tilt, rotation);
-            assert!(matches!(error, Err(FeatureError::BadOption { .. })));
+            assert!(matches!(error, Err(FeatureError::Option(_))));
         }
         let narrow = GrayF32::new(30, 30, [0.5]);
         let error = sift_tilted(narrow.view(), &options, 8.0, 0.0).unwrap_err();

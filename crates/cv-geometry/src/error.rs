@@ -1,5 +1,7 @@
 //! Why an estimate could not be made.
 
+use cv_core::OptionError;
+
 use cv_core::Cancelled;
 
 /// A configuration of points that does not determine a model.
@@ -61,15 +63,8 @@ pub enum EstimateError {
         iterations: usize,
     },
     /// An option is out of range.
-    #[error("{name} must be {range}, not {value}")]
-    BadOption {
-        /// Name of the option.
-        name: &'static str,
-        /// The range it must be in.
-        range: &'static str,
-        /// The value given.
-        value: f64,
-    },
+    #[error(transparent)]
+    Option(#[from] OptionError),
     /// The job was stopped by its progress callback.
     #[error("stopped")]
     Cancelled(#[from] Cancelled),

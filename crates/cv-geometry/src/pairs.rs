@@ -1,7 +1,7 @@
 //! Correspondences, normalized and laid out for vector units.
 
 use crate::{EstimateError, error::Degeneracy};
-use cv_core::{Correspondence, Matrix3, Point2, Vector3};
+use cv_core::{Correspondence, Matrix3, Point2, Vector3, median};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
@@ -74,15 +74,15 @@ impl PairSet {
         let mut scratch = Vec::with_capacity(matches.len());
         let mut center = |of: fn(&Correspondence) -> Point2<f64>| {
             Point2::new(
-                median(&mut scratch, matches.iter().map(|m| of(m).x)),
-                median(&mut scratch, matches.iter().map(|m| of(m).y)),
+                median_of(&mut scratch, matches.iter().map(|m| of(m).x)),
+                median_of(&mut scratch, matches.iter().map(|m| of(m).y)),
             )
         };
         let (c1, c2) = (center(|m| m.a), center(|m| m.b));
         let distance = |m: &Correspondence| {
             (m.a.x - c1.x).abs() + (m.a.y - c1.y).abs() + (m.b.x - c2.x).abs() + (m.b.y - c2.y).abs()
         };
-        let mut spread = median(&mut scratch, matches.iter().map(distance));
+        let mut spread = median_of(&mut scratch, matches.iter().map(distance));
         if spread == 0.0 {
             // More than half of the matches coincide.
             spread = matches.iter().map(distance).sum::<f64>() / matches.len() as f64;
@@ -238,11 +238,10 @@ pub(crate) fn check(matches: &[Correspondence], needed: usize) -> Result<(), Est
     }
 }
 
-fn median(scratch: &mut Vec<f64>, values: impl Iterator<Item = f64>) -> f64 {
+fn median_of(scratch: &mut Vec<f64>, values: impl Iterator<Item = f64>) -> f64 {
     scratch.clear();
     scratch.extend(values);
-    let middle = scratch.len() / 2;
-    *scratch.select_nth_unstable_by(middle, f64::total_cmp).1
+    median(scratch).unwrap_or(0.0)
 }
 
 /// Hartley's normalization: centroid at the origin, mean distance √2. `None` where all points coincide.

@@ -1,6 +1,6 @@
 //! Connected components of a mask.
 
-use cv_core::{Image, ImageView, Mask, Point2};
+use cv_core::{Image, ImageView, Mask, Point2, UnionFind};
 
 /// Which pixels touch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -92,7 +92,7 @@ pub fn connected_components(view: ImageView<'_, bool, 1>, connectivity: Connecti
 /// The runs of a mask in scan order, and for each the index of the first run of its component.
 fn joined_runs(view: ImageView<'_, bool, 1>, connectivity: Connectivity) -> (Vec<Run>, Vec<u32>) {
     let mut runs: Vec<Run> = Vec::new();
-    let mut parent: Vec<u32> = Vec::new();
+    let mut sets = UnionFind::default();
     // Runs a and b of neighboring rows touch where a.start < b.end + reach and b.start < a.end + reach.
     let reach = usize::from(connectivity == Connectivity::Eight);
     let mut above = 0..0;
@@ -104,15 +104,14 @@ fn joined_runs(view: ImageView<'_, bool, 1>, connectivity: Connectivity) -> (Vec
         while let Some(skip) = row[x..].iter().position(|&p| p) {
             let start = x + skip;
             let end = row[start..].iter().position(|&p| !p).map_or(row.len(), |n| start + n);
-            let me = runs.len() as u32;
             runs.push(Run { y, start, end });
-            parent.push(me);
+            let me = sets.push();
             while candidate < above.end && runs[candidate].end + reach <= start {
                 candidate += 1;
             }
             let mut touching = candidate;
             while touching < above.end && runs[touching].start < end + reach {
-                union(&mut parent, touching as u32, me);
+                sets.union(touching as u32, me);
                 touching += 1;
             }
             // The last one above may reach over the gap to the next run.
@@ -121,26 +120,7 @@ fn joined_runs(view: ImageView<'_, bool, 1>, connectivity: Connectivity) -> (Vec
         }
         above = first..runs.len();
     }
-    for i in 0..parent.len() {
-        // Parents come before their children, so one step reaches the root.
-        parent[i] = parent[parent[i] as usize];
-    }
-    (runs, parent)
-}
-
-fn find(parent: &mut [u32], mut i: u32) -> u32 {
-    while parent[i as usize] != i {
-        // Path halving.
-        parent[i as usize] = parent[parent[i as usize] as usize];
-        i = parent[i as usize];
-    }
-    i
-}
-
-fn union(parent: &mut [u32], a: u32, b: u32) {
-    let (a, b) = (find(parent, a), find(parent, b));
-    // The earlier run is the root.
-    parent[a.max(b) as usize] = a.min(b);
+    (runs, sets.into_roots())
 }
 
 /// Only the largest component of a mask (of equally large ones the first); false everywhere where there is none.

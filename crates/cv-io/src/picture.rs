@@ -79,16 +79,14 @@ impl DynImage {
         }
     }
 
-    /// As gray bytes: as [`DynImage::into_rgb8`], then luma by Rec. 601 (`0.299 R + 0.587 G + 0.114 B`, OpenCV's
-    /// fixed-point weights and rounding).
+    /// As gray bytes: as [`DynImage::into_rgb8`], then Rec. 601 luma
+    /// ([`luma_u8`](cv_core::luma_u8)).
     pub fn into_gray8(self) -> GrayU8 {
         match self.pixels {
             Pixels::Gray8(image) => image,
             Pixels::Gray16(image) => image.map(|[v]| [to_byte(v)]),
             Pixels::GrayF32(image) => image.map(|[v]| [srgb_byte(v)]),
-            _ => self.into_rgb8().map(|[r, g, b]| {
-                [((u32::from(r) * 9798 + u32::from(g) * 19235 + u32::from(b) * 3735 + (1 << 14)) >> 15) as u8]
-            }),
+            _ => self.into_rgb8().map(|rgb| [cv_core::luma_u8(rgb)]),
         }
     }
 }

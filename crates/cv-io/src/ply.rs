@@ -3,24 +3,11 @@
 use std::io::Write;
 use std::path::Path;
 
-use cv_core::{Camera, Point3, Pose};
+use cv_core::PointCloud;
 
 use crate::{FormatError, IoError, write_atomic};
 
 const NAME: &str = "PLY";
-
-/// What a PLY file holds here: points, maybe colored, maybe with normals, and line segments between them.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct Cloud {
-    /// Positions in the unit of the scene.
-    pub points: Vec<[f32; 3]>,
-    /// One RGB color per point, or empty.
-    pub colors: Vec<[u8; 3]>,
-    /// One unit normal per point, or empty.
-    pub normals: Vec<[f32; 3]>,
-    /// Line segments as pairs of indices into `points`, such as the outline of a camera.
-    pub edges: Vec<[u32; 2]>,
-}
 
 /// How the numbers are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -32,62 +19,19 @@ pub enum PlyEncoding {
     Ascii,
 }
 
-impl Cloud {
-    /// Points without more.
-    pub fn from_points(points: Vec<[f32; 3]>) -> Self {
-        Self { points, ..Self::default() }
+/// Refuses a cloud that contradicts itself.
+fn check(cloud: &PointCloud) -> Result<(), FormatError> {
+    let n = cloud.len();
+    let wrong = |what: String| Err(FormatError::NotRepresentable { format: NAME, what });
+    if !cloud.colors.is_empty() && cloud.colors.len() != n {
+        return wrong(format!("{} colors for {n} points", cloud.colors.len()));
     }
-
-    /// Points with a color each.
-    pub fn colored(points: Vec<[f32; 3]>, colors: Vec<[u8; 3]>) -> Self {
-        Self { points, colors, ..Self::default() }
+    if !cloud.normals.is_empty() && cloud.normals.len() != n {
+        return wrong(format!("{} normals for {n} points", cloud.normals.len()));
     }
-
-    /// Adds points of one color joined by `edges`, whose indices count from the first added point.
-    ///
-    /// A cloud of points without colors stays without; normals, where there are some, are zero for the added points.
-    pub fn add_wireframe(&mut self, corners: &[[f32; 3]], edges: &[[u32; 2]], color: [u8; 3]) {
-        let first = self.points.len() as u32;
-        let colored = self.points.is_empty() || !self.colors.is_empty();
-        let with_normals = !self.normals.is_empty();
-        self.points.extend_from_slice(corners);
-        if colored {
-            self.colors.extend(std::iter::repeat_n(color, corners.len()));
-        }
-        if with_normals {
-            self.normals.extend(std::iter::repeat_n([0.0; 3], corners.len()));
-        }
-        self.edges.extend(edges.iter().map(|e| e.map(|i| i + first)));
-    }
-
-    /// Adds a camera's outline: its center, and the corners of its picture `depth` in front of it.
-    pub fn add_camera(&mut self, camera: &Camera, pose: &Pose, depth: f64, color: [u8; 3]) {
-        let (right, bottom) = (camera.width as f64 - 0.5, camera.height as f64 - 0.5);
-        let to_world = pose.inverse();
-        let corner = |x: f64, y: f64| {
-            // Without the lens: an outline has straight edges.
-            let ray = Point3::new((x - camera.cx) / camera.fx * depth, (y - camera.cy) / camera.fy * depth, depth);
-            to_world.transform(&ray)
-        };
-        let corners =
-            [pose.center(), corner(-0.5, -0.5), corner(right, -0.5), corner(right, bottom), corner(-0.5, bottom)];
-        let corners = corners.map(|p| [p.x as f32, p.y as f32, p.z as f32]);
-        self.add_wireframe(&corners, &[[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]], color);
-    }
-
-    fn check(&self) -> Result<(), FormatError> {
-        let n = self.points.len();
-        let wrong = |what: String| Err(FormatError::NotRepresentable { format: NAME, what });
-        if !self.colors.is_empty() && self.colors.len() != n {
-            return wrong(format!("{} colors for {n} points", self.colors.len()));
-        }
-        if !self.normals.is_empty() && self.normals.len() != n {
-            return wrong(format!("{} normals for {n} points", self.normals.len()));
-        }
-        match self.edges.iter().flatten().find(|&&i| i as usize >= n) {
-            Some(i) => wrong(format!("an edge to point {i} of {n}")),
-            None => Ok(()),
-        }
+    match cloud.edges.iter().flatten().find(|&&i| i as usize >= n) {
+        Some(i) => wrong(format!("an edge to point {i} of {n}")),
+        None => Ok(()),
     }
 }
 
@@ -95,13 +39,13 @@ impl Cloud {
 ///
 /// # Errors
 /// [`FormatError::NotRepresentable`] where colors or normals are not as many as points, or an edge leads nowhere.
-pub fn encode(cloud: &Cloud, encoding: PlyEncoding, sink: &mut dyn Write) -> Result<(), FormatError> {
-    cloud.check()?;
+pub fn encode(cloud: &PointCloud, encoding: PlyEncoding, sink: &mut dyn Write) -> Result<(), FormatError> {
+    check(cloud)?;
     let format = match encoding {
         PlyEncoding::Binary => "binary_little_endian",
         PlyEncoding::Ascii => "ascii",
     };
-    write!(sink, "ply\nformat {format} 1.0\nelement vertex {}\n", cloud.points.len())?;
+    write!(sink, "ply\nformat {format} 1.0\nelement vertex {}\n", cloud.positions.len())?;
     write!(sink, "property float x\nproperty float y\nproperty float z\n")?;
     if !cloud.normals.is_empty() {
         write!(sink, "property float nx\nproperty float ny\nproperty float nz\n")?;
@@ -113,7 +57,7 @@ pub fn encode(cloud: &Cloud, encoding: PlyEncoding, sink: &mut dyn Write) -> Res
         write!(sink, "element edge {}\nproperty int vertex1\nproperty int vertex2\n", cloud.edges.len())?;
     }
     writeln!(sink, "end_header")?;
-    for (i, point) in cloud.points.iter().enumerate() {
+    for (i, point) in cloud.positions.iter().enumerate() {
         let normal = cloud.normals.get(i);
         let color = cloud.colors.get(i);
         match encoding {
@@ -158,7 +102,7 @@ pub fn encode(cloud: &Cloud, encoding: PlyEncoding, sink: &mut dyn Write) -> Res
 ///
 /// # Errors
 /// As [`encode`] and [`write_atomic`].
-pub fn write_cloud(path: impl AsRef<Path>, cloud: &Cloud, encoding: PlyEncoding) -> Result<(), IoError> {
+pub fn write_cloud(path: impl AsRef<Path>, cloud: &PointCloud, encoding: PlyEncoding) -> Result<(), IoError> {
     write_atomic(path, |sink| encode(cloud, encoding, sink))
 }
 
@@ -168,7 +112,7 @@ mod tests {
     use proptest::prelude::*;
 
     /// Reads what [`encode`] writes, by the format's own description: a header that names every property, then the rows.
-    fn read_back(bytes: &[u8]) -> Cloud {
+    fn read_back(bytes: &[u8]) -> PointCloud {
         let end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
         let header = std::str::from_utf8(&bytes[..end]).unwrap();
         let binary = header.contains("format binary_little_endian 1.0");
@@ -192,7 +136,7 @@ mod tests {
                 word.parse().unwrap()
             }
         };
-        let mut cloud = Cloud::default();
+        let mut cloud = PointCloud::default();
         let mut lines = header.lines().peekable();
         while let Some(line) = lines.next() {
             let Some(element) = line.strip_prefix("element ") else { continue };
@@ -207,7 +151,7 @@ mod tests {
                 let get = |name: &str| row.iter().find(|(n, _)| *n == name).map(|(_, v)| *v);
                 match element {
                     "vertex" => {
-                        cloud.points.push(["x", "y", "z"].map(|n| get(n).unwrap() as f32));
+                        cloud.positions.push(["x", "y", "z"].map(|n| get(n).unwrap() as f32));
                         if get("red").is_some() {
                             cloud.colors.push(["red", "green", "blue"].map(|n| get(n).unwrap() as u8));
                         }
@@ -228,7 +172,7 @@ mod tests {
         #[test]
         fn clouds_read_back(points in prop::collection::vec(prop::array::uniform3(-1e6f32..1e6), 0..9), colored: bool, with_normals: bool, edge in 0u32..9) {
             let n = points.len();
-            let mut cloud = Cloud::from_points(points);
+            let mut cloud = PointCloud::from_positions(points);
             if colored {
                 cloud.colors = (0..n).map(|i| [i as u8, 200, 255]).collect();
             }
@@ -247,51 +191,13 @@ mod tests {
     }
 
     #[test]
-    fn wireframes_keep_the_cloud_consistent() {
-        let corners = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]];
-        for mut cloud in [
-            Cloud::default(),
-            Cloud::from_points(vec![[5.0; 3]]),
-            Cloud::colored(vec![[5.0; 3]], vec![[1, 2, 3]]),
-            Cloud { normals: vec![[0.0, 0.0, 1.0]], ..Cloud::from_points(vec![[5.0; 3]]) },
-        ] {
-            let first = cloud.points.len() as u32;
-            cloud.add_wireframe(&corners, &[[0, 1]], [255, 0, 0]);
-            assert_eq!(cloud.edges, [[first, first + 1]]);
-            encode(&cloud, PlyEncoding::Binary, &mut Vec::new()).unwrap();
-        }
-    }
-
-    #[test]
-    fn a_cameras_outline_is_what_it_sees() {
-        let camera = Camera::pinhole(200, 100, 100.0, 100.0, 99.5, 49.5);
-        let pose =
-            Pose::look_at(Point3::new(1.0, 2.0, 3.0), Point3::new(4.0, 2.0, 3.0), cv_core::Vector3::y()).unwrap();
-        let mut cloud = Cloud::default();
-        cloud.add_camera(&camera, &pose, 2.0, [9, 9, 9]);
-        assert_eq!(cloud.points[0], [1.0, 2.0, 3.0]);
-        let seen: Vec<_> = cloud.points[1..]
-            .iter()
-            .map(|p| {
-                camera
-                    .project(&pose.transform(&Point3::new(f64::from(p[0]), f64::from(p[1]), f64::from(p[2]))))
-                    .unwrap()
-            })
-            .collect();
-        let corners = [(-0.5, -0.5), (199.5, -0.5), (199.5, 99.5), (-0.5, 99.5)];
-        // The points are stored as f32, with seven digits.
-        assert!(seen.iter().zip(corners).all(|(p, (x, y))| (p.x - x).hypot(p.y - y) < 1e-3), "{seen:?}");
-        assert_eq!((cloud.edges.len(), cloud.colors.len()), (8, 5));
-    }
-
-    #[test]
     fn clouds_that_contradict_themselves_are_not_written() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("c.ply");
         for cloud in [
-            Cloud::colored(vec![[0.0; 3]; 2], vec![[0; 3]]),
-            Cloud { normals: vec![[0.0; 3]], ..Cloud::default() },
-            Cloud { edges: vec![[0, 1]], ..Cloud::from_points(vec![[0.0; 3]]) },
+            PointCloud::colored(vec![[0.0; 3]; 2], vec![[0; 3]]),
+            PointCloud { normals: vec![[0.0; 3]], ..PointCloud::default() },
+            PointCloud { edges: vec![[0, 1]], ..PointCloud::from_positions(vec![[0.0; 3]]) },
         ] {
             assert!(write_cloud(&path, &cloud, PlyEncoding::Binary).is_err());
             assert!(!path.exists());

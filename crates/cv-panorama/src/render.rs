@@ -7,10 +7,9 @@ use crate::surface::{
     self, Bounds, Canvas, Layout, LayoutError, PhotoMap, Placement, Preview, Projection, Tone, Warped,
     largest_rectangle, shrunk, shrunk_view, warp,
 };
-use cv_core::{Image, ImageView, Mask, RgbU8};
+use cv_core::{Image, ImageView, Mask, OptionError, RgbU8, StageClock};
 use cv_imgproc::Interpolation;
 use rayon::prelude::*;
-use std::time::Instant;
 
 /// How photographs are joined at the seams.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -85,12 +84,9 @@ pub enum RenderError {
         /// The height that was aligned.
         expected_height: usize,
     },
-    /// The resolution is not a positive number.
-    #[error("the resolution {resolution} is not a positive number")]
-    BadResolution {
-        /// The resolution.
-        resolution: f64,
-    },
+    /// An option is outside its range.
+    #[error(transparent)]
+    Option(#[from] OptionError),
 }
 
 /// A panorama.
@@ -129,10 +125,8 @@ pub fn render(
     alignment: &Alignment,
     options: &RenderOptions,
 ) -> Result<Panorama, RenderError> {
-    let mut clock = Clock { last: Instant::now(), stages: Vec::new() };
-    if !(options.resolution > 0.0 && options.resolution.is_finite()) {
-        return Err(RenderError::BadResolution { resolution: options.resolution });
-    }
+    let mut clock = StageClock::new();
+    OptionError::check("resolution", options.resolution, "a positive number", |v| v > 0.0 && v.is_finite())?;
     for (index, view) in alignment.used() {
         let (expected_width, expected_height) = (view.camera.width, view.camera.height);
         let (width, height) = photos.get(index).map_or((0, 0), ImageView::size);
@@ -228,25 +222,8 @@ pub fn render(
         crop(&mut panorama);
         clock.lap("crop");
     }
-    panorama.stages = clock.stages;
+    panorama.stages = clock.into_stages();
     Ok(panorama)
-}
-
-struct Clock {
-    last: Instant,
-    stages: Vec<(&'static str, f64)>,
-}
-
-impl Clock {
-    fn lap(&mut self, stage: &'static str) {
-        let now = Instant::now();
-        let seconds = now.duration_since(self.last).as_secs_f64();
-        match self.stages.iter_mut().find(|(name, _)| *name == stage) {
-            Some((_, sum)) => *sum += seconds,
-            None => self.stages.push((stage, seconds)),
-        }
-        self.last = now;
-    }
 }
 
 /// Bands of the blend: transitions of a 25th of a photograph, in either direction.

@@ -1,8 +1,8 @@
 //! Depth from a rectified pair.
 
+use crate::Progress;
 use crate::no_pair::{NoPairCause, cause};
-use crate::{Progress, Stopwatch};
-use cv_core::{Cancelled, GrayF32, ImageView};
+use cv_core::{Cancelled, GrayF32, ImageView, StageClock};
 use cv_stereo::{DisparityMap, GeometryError, Intensity, StereoError, StereoGeometry, StereoMatcher, StereoOptions};
 
 /// Settings of [`depth`].
@@ -125,20 +125,20 @@ pub fn depth<T: Intensity, const C: usize>(
     if let Some(geometry) = geometry {
         geometry.validate()?;
     }
-    let mut watch = Stopwatch::new();
+    let mut clock = StageClock::new();
     let mut matcher = StereoMatcher::new(options.stereo.clone())?;
     let mut map = DisparityMap::empty();
     matcher.prepare(left.width(), left.height(), &mut map)?;
-    watch.lap("prepare");
+    clock.lap("prepare");
     progress.report("match", 0, 1)?;
     matcher.compute_into(left, right, &mut map)?;
-    watch.lap("match");
+    clock.lap("match");
     check_pair(&map, left, right, &options.stereo, progress)?;
     progress.report("match", 1, 1)?;
     let depth = geometry.map(|geometry| geometry.depth_map(map.disparity.view(), options.range));
     let (confidence, sigma) = (matcher.confidence(&map), matcher.uncertainty(&map));
-    watch.lap("depth");
-    Ok(DepthResult { map, depth, confidence, sigma, stages: watch.into_stages() })
+    clock.lap("depth");
+    Ok(DepthResult { map, depth, confidence, sigma, stages: clock.into_stages() })
 }
 
 #[cfg(test)]

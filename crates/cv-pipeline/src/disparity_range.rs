@@ -1,7 +1,7 @@
 //! Which disparities a pair shows, from sparse matches.
 
 use crate::{MatchingError, MatchingOptions, Progress, match_photos};
-use cv_core::{Cancelled, Correspondence, ImageView};
+use cv_core::{Cancelled, Correspondence, ImageView, quantile};
 
 /// Why no range was found.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -67,8 +67,7 @@ pub fn disparity_range(
 
 /// The range of some disparities, of which there is at least one.
 pub(crate) fn range_of(mut disparities: Vec<f64>) -> (i32, usize) {
-    disparities.sort_unstable_by(f64::total_cmp);
-    let at = |share: f64| disparities[((disparities.len() - 1) as f64 * share).round() as usize];
+    let mut at = |share: f64| quantile(&mut disparities, share).unwrap_or(0.0);
     let (low, high) = (at(0.01), at(0.99));
     let more = (high - low) / 8.0 + 4.0;
     let min = (low - more).floor() as i32;

@@ -1,7 +1,7 @@
 //! A model of two views from matches.
 
-use crate::{Progress, Stopwatch};
-use cv_core::{Camera, Correspondence, Matrix3, Pose};
+use crate::Progress;
+use cv_core::{Camera, Correspondence, Matrix3, Pose, StageClock};
 use cv_geometry::{
     EstimateError, RobustModel, RobustOptions, essential_from_pose, estimate_fundamental, estimate_homography,
     estimate_relative_pose, normalize_matches,
@@ -45,15 +45,15 @@ pub fn estimate(
     options: &RobustOptions,
     progress: &dyn Progress,
 ) -> Result<EstimateResult, EstimateError> {
-    let mut watch = Stopwatch::new();
+    let mut clock = StageClock::new();
     progress.report("estimate", 0, 1)?;
     let robust = match kind {
         ModelKind::Homography => estimate_homography(pairs, options),
         ModelKind::Fundamental => estimate_fundamental(pairs, options),
     }?;
     progress.report("estimate", 1, 1)?;
-    watch.lap("estimate");
-    Ok(EstimateResult { robust, stages: watch.into_stages() })
+    clock.lap("estimate");
+    Ok(EstimateResult { robust, stages: clock.into_stages() })
 }
 
 /// What [`estimate_calibrated`] found.
@@ -78,13 +78,13 @@ pub fn estimate_calibrated(
     options: &RobustOptions,
     progress: &dyn Progress,
 ) -> Result<CalibratedResult, EstimateError> {
-    let mut watch = Stopwatch::new();
+    let mut clock = StageClock::new();
     progress.report("estimate", 0, 1)?;
     let (normalized, unit) = normalize_matches(pairs, &cameras[0], &cameras[1]);
     let found =
         estimate_relative_pose(&normalized, &RobustOptions { threshold: options.threshold * unit, ..*options })?;
     progress.report("estimate", 1, 1)?;
-    watch.lap("estimate");
+    clock.lap("estimate");
     let robust = RobustModel {
         model: essential_from_pose(&found.model),
         inliers: found.inliers,
@@ -92,5 +92,5 @@ pub fn estimate_calibrated(
         iterations: found.iterations,
         log_nfa: found.log_nfa,
     };
-    Ok(CalibratedResult { robust, pose: found.model, stages: watch.into_stages() })
+    Ok(CalibratedResult { robust, pose: found.model, stages: clock.into_stages() })
 }

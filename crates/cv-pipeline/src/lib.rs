@@ -5,14 +5,15 @@
 //! other program.
 //!
 //! ```
-//! use cv_pipeline::{Cancelled, Progress, Silent, Stopwatch};
+//! use cv_core::StageClock;
+//! use cv_pipeline::{Cancelled, Progress, Silent};
 //!
 //! fn job(progress: &dyn Progress) -> Result<Vec<(&'static str, f64)>, Cancelled> {
-//!     let mut watch = Stopwatch::new();
+//!     let mut clock = StageClock::new();
 //!     for row in 0..10 {
 //!         progress.report("detect", row + 1, 10)?;
 //!     }
-//!     watch.lap("detect");
+//!     clock.lap("detect");
 //!     Ok(watch.into_stages())
 //! }
 //! assert_eq!(job(&Silent)?[0].0, "detect");
@@ -22,7 +23,7 @@
 //! # Conventions
 //!
 //! * One file per job, holding `XOptions` (with `Default`), `XResult` and one function.
-//! * Every result has `stages: Vec<(&'static str, f64)>`, stage names and their seconds from a [`Stopwatch`].
+//! * Every result has `stages: Vec<(&'static str, f64)>`, stage names and their seconds from a [`StageClock`](cv_core::StageClock).
 //! * Every job takes `&dyn Progress`; pass [`&Silent`](Silent) where nobody watches. Where that says stop, the job gives back the
 //!   variant `Cancelled` of its error.
 //! * The same input, options and seed give the same result at any number of threads.
@@ -37,7 +38,6 @@ mod panorama;
 mod reconstruct;
 mod rectify;
 mod segment;
-mod stopwatch;
 mod views;
 
 pub use cv_core::{Cancelled, Progress, Silent};
@@ -70,14 +70,13 @@ pub use reconstruct::{
 };
 pub use rectify::{RectifyResult, rectify};
 pub use segment::{SegmentResult, SegmentTraining, segment, train_segment};
-pub use stopwatch::Stopwatch;
 
 /// What a caller of [`depth()`] needs of the stereo stage: its options and results, rectification, geometry and scores.
 pub mod stereo {
     pub use cv_stereo::{
-        BAD_THRESHOLDS, Blend, Census, CloudPoint, DisparityMap, DisparityScores, EvaluateError, GeometryError,
-        Intensity, Paths, PixelState, Rectification, RectifiedView, RectifyError, RectifyOptions, Smoothing,
-        StereoError, StereoGeometry, StereoMatcher, StereoOptions, Subpixel, evaluate_disparity, non_occluded,
+        BAD_THRESHOLDS, Blend, Census, DisparityMap, DisparityScores, EvaluateError, GeometryError, Intensity, Paths,
+        PixelState, Rectification, RectifiedView, RectifyError, RectifyOptions, Smoothing, StereoError, StereoGeometry,
+        StereoMatcher, StereoOptions, Subpixel, evaluate_disparity, non_occluded,
     };
 }
 

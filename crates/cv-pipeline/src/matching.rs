@@ -1,15 +1,15 @@
 //! Features of photographs, and tentative matches between two of them.
 
 use crate::views::match_slanted;
-use crate::{ModelKind, Progress, Silent, Stopwatch, estimate};
-use cv_core::{Cancelled, Correspondence, DMatch, GrayF32, ImageView, Keypoint, Point2};
+use crate::{ModelKind, Progress, Silent, estimate};
+use cv_core::{Cancelled, Correspondence, DMatch, ImageView, Keypoint, Point2, StageClock};
 use cv_features::{
     Described, DescriptorKind, FeatureError, GuidedOptions, HarrisOptions, MatchError, MatchOptions, MopsOptions,
     PatchOptions, SiftOptions, TwoViewModel, anms, anms_square_covering, anms_tiled, describe_patches, harris,
     match_descriptors, match_guided, mops, sift,
 };
 use cv_geometry::EstimateError;
-use cv_imgproc::resize_area;
+use cv_imgproc::{resize_area, rgb_to_gray_f32};
 
 /// Which features to find.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -168,7 +168,7 @@ impl From<MatchError> for MatchingError {
 /// # Errors
 /// [`FeatureError`] for a photograph smaller than the method's window and for options out of range. One without features is no error here.
 pub fn extract_features(photo: ImageView<'_, u8, 3>, options: &MatchingOptions) -> Result<PhotoFeatures, FeatureError> {
-    let gray = luma(photo);
+    let gray = rgb_to_gray_f32(photo);
     match options.method {
         FeatureMethod::Harris => {
             let corners = harris(gray.view(), &options.harris)?;
@@ -236,7 +236,7 @@ pub fn match_photos(
     options: &MatchingOptions,
     progress: &dyn Progress,
 ) -> Result<MatchingResult, MatchingError> {
-    let mut watch = Stopwatch::new();
+    let mut clock = StageClock::new();
     let extract = |photo, index| {
         progress.report("features", index - 1, 2)?;
         let features = extract_features(photo, options).map_err(|error| match error {
@@ -250,10 +250,10 @@ pub fn match_photos(
         Ok(features)
     };
     let mut features = [extract(a, 1)?, extract(b, 2)?];
-    watch.lap("features");
+    clock.lap("features");
     progress.report("match", 0, 1)?;
     let mut matches = match_features(&features[0], &features[1], options)?;
-    watch.lap("match");
+    clock.lap("match");
     let slanted = match options.slanted {
         Slanted::Never => false,
         Slanted::AsNeeded => !explained(&correspondences(&features[0], &features[1], &matches)),
@@ -261,10 +261,10 @@ pub fn match_photos(
     };
     if slanted && options.method == FeatureMethod::Sift {
         progress.report("slanted views", 0, 1)?;
-        match_slanted([&luma(a), &luma(b)], &mut features, &mut matches, options);
-        watch.lap("slanted views");
+        match_slanted([&rgb_to_gray_f32(a), &rgb_to_gray_f32(b)], &mut features, &mut matches, options);
+        clock.lap("slanted views");
     }
-    finish(features, matches, options, progress, watch)
+    finish(features, matches, options, progress, clock)
 }
 
 /// Tentative matches between features found elsewhere; those of other programs count as [`DescriptorKind::Foreign`](cv_features::DescriptorKind::Foreign).
@@ -276,10 +276,10 @@ pub fn match_extracted(
     options: &MatchingOptions,
     progress: &dyn Progress,
 ) -> Result<MatchingResult, MatchingError> {
-    let mut watch = Stopwatch::new();
+    let mut clock = StageClock::new();
     let matches = match_features(&features[0], &features[1], options)?;
-    watch.lap("match");
-    finish(features, matches, options, progress, watch)
+    clock.lap("match");
+    finish(features, matches, options, progress, clock)
 }
 
 /// Matches once more along a model, where asked for, and packs up.
@@ -288,7 +288,7 @@ fn finish(
     mut matches: Vec<DMatch>,
     options: &MatchingOptions,
     progress: &dyn Progress,
-    mut watch: Stopwatch,
+    mut clock: StageClock,
 ) -> Result<MatchingResult, MatchingError> {
     let mut pairs = correspondences(&features[0], &features[1], &matches);
     if let Some(kind) = options.guided {
@@ -314,9 +314,9 @@ fn finish(
             matches = match_guided(&features[0].described, &features[1].described, None, &model, &along)?;
             pairs = correspondences(&features[0], &features[1], &matches);
         }
-        watch.lap("guided");
+        clock.lap("guided");
     }
-    Ok(MatchingResult { features, matches, pairs, stages: watch.into_stages() })
+    Ok(MatchingResult { features, matches, pairs, stages: clock.into_stages() })
 }
 
 /// Whether a homography or a fundamental matrix explains enough of the matches: see [`Slanted::AsNeeded`].
@@ -325,18 +325,6 @@ fn explained(pairs: &[Correspondence]) -> bool {
         let model = estimate(pairs, kind, &kind.options(), &Silent);
         model.is_ok_and(|m| m.robust.inliers.len() as f64 > 8.0 + 0.3 * pairs.len() as f64)
     })
-}
-
-/// Rec. 601 luma, 0 to 1, not rounded to bytes.
-fn luma(photo: ImageView<'_, u8, 3>) -> GrayF32 {
-    let (w, h) = photo.size();
-    let mut gray = GrayF32::new(w, h, [0.0]);
-    for y in 0..h {
-        for (o, p) in gray.row_mut(y).iter_mut().zip(photo.row(y).as_chunks::<3>().0) {
-            *o = (0.299 * f32::from(p[0]) + 0.587 * f32::from(p[1]) + 0.114 * f32::from(p[2])) * (1.0 / 255.0);
-        }
-    }
-    gray
 }
 
 /// [`match_photos`] in photographs reduced to a longer side of `max_size` where they are larger, in pixels of the photographs themselves.

@@ -1,10 +1,10 @@
 //! Panoramas from overlapping photographs.
 
+use crate::Progress;
 use crate::matching::{
     FeatureMethod, MatchingOptions, PhotoFeatures, correspondences, extract_features, match_features,
 };
-use crate::{Progress, Stopwatch};
-use cv_core::{Camera, Cancelled, Correspondence, Image, ImageView, Mask, Point2, RgbU8};
+use cv_core::{Camera, Cancelled, Correspondence, Image, ImageView, Mask, Point2, RgbU8, StageClock};
 use cv_features::{Described, DescriptorKind, Descriptors, SiftOptions};
 use cv_panorama::{
     AlignError, AlignOptions, Alignment, CameraMotion, Canvas, NotAPair, Photo, PhotoMap, RenderError, RenderOptions,
@@ -150,7 +150,7 @@ pub fn panorama(
     options: &PanoramaOptions,
     progress: &dyn Progress,
 ) -> Result<PanoramaResult, PanoramaError> {
-    let mut watch = Stopwatch::new();
+    let mut clock = StageClock::new();
     let n = photos.len();
     let candidates: Vec<(usize, usize)> = (0..n).flat_map(|a| (a + 1..n).map(move |b| (a, b))).collect();
     let mut look = |matching: &MatchingOptions| -> Result<(Vec<Prepared>, Vec<Option<Tried>>), Cancelled> {
@@ -163,7 +163,7 @@ pub fn panorama(
             Ok(prepared)
         };
         let prepared: Vec<Prepared> = photos.par_iter().map(extract).collect::<Result<_, _>>()?;
-        watch.lap("features");
+        clock.lap("features");
         done.store(0, Ordering::Relaxed);
         progress.report("match", 0, candidates.len())?;
         let compare = |&(a, b): &(usize, usize)| -> Result<Option<Tried>, Cancelled> {
@@ -172,7 +172,7 @@ pub fn panorama(
             Ok(pair)
         };
         let tried = candidates.par_iter().map(compare).collect::<Result<_, _>>()?;
-        watch.lap("match");
+        clock.lap("match");
         Ok((prepared, tried))
     };
     let matching = &options.matching;
@@ -199,7 +199,7 @@ pub fn panorama(
     for (image, view) in images.iter_mut().zip(&alignment.views) {
         image.focal = view.as_ref().ok().filter(|_| alignment.motion == CameraMotion::Rotation).map(|v| v.camera.fx);
     }
-    watch.lap("align");
+    clock.lap("align");
 
     progress.report("draw", 0, 1)?;
     let views: Vec<ImageView<'_, u8, 3>> = photos.iter().map(|p| p.image).collect();
@@ -208,7 +208,7 @@ pub fn panorama(
         image.gain = *gain;
     }
     for (stage, seconds) in &drawn.stages {
-        watch.add(stage, *seconds);
+        clock.add(stage, *seconds);
     }
     progress.report("draw", 1, 1)?;
     Ok(PanoramaResult {
@@ -223,7 +223,7 @@ pub fn panorama(
         map: drawn.map,
         reprojection_rms_px: alignment.rms_px,
         alignment,
-        stages: watch.into_stages(),
+        stages: clock.into_stages(),
     })
 }
 

@@ -2,8 +2,8 @@
 
 use crate::matching::match_reduced;
 use crate::no_pair::judge;
-use crate::{MatchingError, MatchingOptions, NoPairCause, Progress, Stopwatch};
-use cv_core::{ImageView, Mask, RgbU8, StereoRig};
+use crate::{MatchingError, MatchingOptions, NoPairCause, Progress};
+use cv_core::{ImageView, Mask, RgbU8, StageClock, StereoRig, median, quantile};
 use cv_stereo::{Rectification, RectifyError, RectifyOptions};
 
 /// What [`rectify`] made.
@@ -40,12 +40,12 @@ pub fn rectify(
     options: &RectifyOptions,
     progress: &dyn Progress,
 ) -> Result<RectifyResult, RectifyError> {
-    let mut watch = Stopwatch::new();
+    let mut clock = StageClock::new();
     progress.report("rectify", 0, 2)?;
     let rectification = Rectification::new(rig, options)?;
     let (left, mask_left) = rectification.left.apply(left)?;
     let (right, mask_right) = rectification.right.apply(right)?;
-    watch.lap("rectify");
+    clock.lap("rectify");
     progress.report("rectify", 1, 2)?;
     // A pair without features is rectified all the same; only its quality stays unknown.
     let pairs = match match_reduced([left.view(), right.view()], LARGEST, &MatchingOptions::default(), progress) {
@@ -56,14 +56,13 @@ pub fn rectify(
     // A wrong match has any row; those beyond a few pixels say nothing of the calibration.
     let mut rows: Vec<f64> =
         pairs.iter().filter(|p| p.a.x >= p.b.x - 4.0).map(|p| (p.a.y - p.b.y).abs()).filter(|&dy| dy < 8.0).collect();
-    rows.sort_unstable_by(f64::total_cmp);
     // Unless they are most of them.
     let fault = (2 * rows.len() < pairs.len())
         .then(|| judge(&pairs, left.height(), None))
         .filter(|cause| *cause != NoPairCause::Unknown);
-    let quantile = |share: f64| rows[((rows.len() - 1) as f64 * share) as usize];
-    let vertical_px = (rows.len() >= 8 && fault.is_none()).then(|| (quantile(0.5), quantile(0.95)));
-    watch.lap("quality");
+    let quantiles = median(&mut rows).zip(quantile(&mut rows, 0.95));
+    let vertical_px = quantiles.filter(|_| rows.len() >= 8 && fault.is_none());
+    clock.lap("quality");
     progress.report("rectify", 2, 2)?;
     let share = |mask: &Mask| {
         let m = mask.as_slice();
@@ -77,7 +76,7 @@ pub fn rectify(
         vertical_px,
         matches: rows.len(),
         fault,
-        stages: watch.into_stages(),
+        stages: clock.into_stages(),
     })
 }
 
@@ -103,7 +102,7 @@ mod tests {
             match_reduced([large.view(), moved.view()], LARGEST, &MatchingOptions::default(), &Silent).unwrap().pairs;
         let mut shift =
             [pairs.iter().map(|p| p.a.x - p.b.x).collect::<Vec<_>>(), pairs.iter().map(|p| p.a.y - p.b.y).collect()];
-        let [x, y] = shift.each_mut().map(|d| *d.select_nth_unstable_by(pairs.len() / 2, f64::total_cmp).1);
+        let [x, y] = shift.each_mut().map(|d| median(d).unwrap());
         // Reduced by a tenth: a shift of 370 px would be 337 there. Features are placed to a few tenths of a pixel.
         assert!(pairs.len() > 50 && (x - 370.0).abs() < 1.0 && (y - 90.0).abs() < 1.0, "{x} {y} of {}", pairs.len());
     }

@@ -1,7 +1,7 @@
 //! Finding an object by its color: train on photographs with masks, then mark it in others.
 
-use crate::{Progress, Stopwatch};
-use cv_core::{ImageView, Mask};
+use crate::Progress;
+use cv_core::{ImageView, Mask, StageClock};
 use cv_segment::{ColorModel, Labeled, SegmentError, TrainOptions, Trained, train};
 
 /// What [`train_segment`] learned.
@@ -33,24 +33,24 @@ pub fn train_segment(
     options: &TrainOptions,
     progress: &dyn Progress,
 ) -> Result<SegmentTraining, SegmentError> {
-    let mut watch = Stopwatch::new();
+    let mut clock = StageClock::new();
     progress.report("train", 0, 1)?;
     let trained = train(photos, options)?;
     progress.report("train", 1, 1)?;
-    watch.lap("train");
-    Ok(SegmentTraining { trained, stages: watch.into_stages() })
+    clock.lap("train");
+    Ok(SegmentTraining { trained, stages: clock.into_stages() })
 }
 
 /// Marks the object in a photograph.
 pub fn segment(photo: ImageView<'_, u8, 3>, model: &ColorModel) -> SegmentResult {
-    let mut watch = Stopwatch::new();
+    let mut clock = StageClock::new();
     let raw = model.classify(photo);
-    watch.lap("classify");
+    clock.lap("classify");
     let mask = model.cleanup().apply(raw.view());
-    watch.lap("clean up");
+    clock.lap("clean up");
     let marked = mask.as_slice().iter().filter(|&&m| m).count();
     let fraction = marked as f64 / mask.as_slice().len().max(1) as f64;
-    SegmentResult { mask, fraction, stages: watch.into_stages() }
+    SegmentResult { mask, fraction, stages: clock.into_stages() }
 }
 
 #[cfg(test)]

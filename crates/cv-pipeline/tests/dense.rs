@@ -41,12 +41,12 @@ fn the_cloud_is_as_true_as_the_sparse_points_it_comes_from() {
         let (a, b) = (views.a.image.view(), views.b.image.view());
         let dense = reconstruct_dense(a, b, &sparse, &DenseOptions::default(), &Silent).unwrap();
         let position = |p: &[f32; 3]| Point3::new(f64::from(p[0]), f64::from(p[1]), f64::from(p[2]));
-        let of_dense = errors(&views, dense.points.iter().map(|p| position(&p.position)), &camera);
+        let of_dense = errors(&views, dense.cloud.positions.iter().map(position), &camera);
         let of_sparse = errors(&views, sparse.points.iter().map(|p| p.position), &camera);
         let at = |e: &[f64], share: f64| e[((e.len() - 1) as f64 * share) as usize];
         println!(
             "{seed}: {} points, coverage {:.2}, disparities {:?}; median error {:.4} (sparse {:.4}), 90 % {:.4} ({:.4})",
-            dense.points.len(),
+            dense.cloud.len(),
             dense.coverage,
             dense.disparities,
             at(&of_dense, 0.5),
@@ -58,7 +58,7 @@ fn the_cloud_is_as_true_as_the_sparse_points_it_comes_from() {
         assert!(at(&of_dense, 0.5) < at(&of_sparse, 0.5) + 0.015);
         assert!(at(&of_dense, 0.9) < at(&of_sparse, 0.9) + 0.03);
         // A room is textured all over; a camera half a meter aside sees most of it.
-        assert!(dense.points.len() > 150_000 && dense.coverage > 0.5);
+        assert!(dense.cloud.len() > 150_000 && dense.coverage > 0.5);
         // The depth map holds the same points: the depth of each pixel is the truth's too.
         let baseline = views.relative.translation.norm();
         let mut off: Vec<f64> = (0..480 * 640)
@@ -83,29 +83,28 @@ fn reduced_photographs_and_little_memory_give_the_same_scene() {
     let small = run(&DenseOptions { max_size: 320, ..DenseOptions::default() }).unwrap();
     assert_eq!(small.depth.size(), (320, 240));
     // A quarter of the pixels, give or take the ones at outlines.
-    let share = small.points.len() as f64 / whole.points.len() as f64;
+    let share = small.cloud.len() as f64 / whole.cloud.len() as f64;
     assert!((0.18..0.32).contains(&share), "{share}");
-    let median = |points: &[cv_pipeline::stereo::CloudPoint]| {
-        let mut z: Vec<f32> = points.iter().map(|p| p.position[2]).collect();
-        z.sort_by(f32::total_cmp);
-        z[z.len() / 2]
+    let median = |cloud: &cv_core::PointCloud| {
+        let mut z: Vec<f32> = cloud.positions.iter().map(|p| p[2]).collect();
+        cv_core::median(&mut z).unwrap()
     };
     // A tenth: which surfaces lose pixels at outlines moves the middle of a room of several depths.
-    assert!((median(&small.points) / median(&whole.points) - 1.0).abs() < 0.1);
+    assert!((median(&small.cloud) / median(&whole.cloud) - 1.0).abs() < 0.1);
     // In strips, at most one pixel in a thousand differs (see `StereoOptions::max_memory`); speckles are then cut otherwise.
     let strips = run(&DenseOptions { max_memory: 96 << 20, ..DenseOptions::default() }).unwrap();
-    assert!((strips.points.len() as f64 / whole.points.len() as f64 - 1.0).abs() < 0.01);
+    assert!((strips.cloud.len() as f64 / whole.cloud.len() as f64 - 1.0).abs() < 0.01);
     assert!(matches!(
         run(&DenseOptions { max_memory: 1 << 20, ..DenseOptions::default() }),
         Err(DenseError::Stereo(_))
     ));
     let filled = run(&DenseOptions { fill: true, ..DenseOptions::default() }).unwrap();
-    assert!(filled.points.len() > whole.points.len());
-    assert!(matches!(run(&DenseOptions { max_size: 8, ..DenseOptions::default() }), Err(DenseError::Option { .. })));
+    assert!(filled.cloud.len() > whole.cloud.len());
+    assert!(matches!(run(&DenseOptions { max_size: 8, ..DenseOptions::default() }), Err(DenseError::Option(_))));
     let other = views.a.image.view();
     let cropped = other.crop(0, 0, 600, 400).unwrap();
     let wrong = reconstruct_dense(cropped, other, &sparse, &DenseOptions::default(), &Silent);
-    assert!(matches!(wrong, Err(DenseError::Option { value: 600.0, .. })));
+    assert!(matches!(wrong, Err(DenseError::Rectify(RectifyError::ImageSize { image: (600, 400), .. }))));
 }
 
 #[test]
@@ -123,6 +122,6 @@ fn a_camera_that_went_ahead_is_refused_with_its_angle() {
         Err(error @ DenseError::Rectify(RectifyError::TooFarTurned { degrees, .. })) => {
             assert!(degrees > 80.0 && error.advice().contains("step aside"), "{error}");
         }
-        other => panic!("{:?}", other.map(|d| d.points.len())),
+        other => panic!("{:?}", other.map(|d| d.cloud.len())),
     }
 }

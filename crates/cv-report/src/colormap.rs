@@ -1,6 +1,6 @@
 //! Numbers to colors.
 
-use cv_core::{GrayF32, ImageView, RgbU8};
+use cv_core::{GrayF32, ImageView, RgbU8, quantile};
 
 use crate::canvas::{Canvas, Color, colors};
 
@@ -66,12 +66,7 @@ pub fn colorize(map: ImageView<'_, f32, 1>, range: (f32, f32), colormap: Colorma
 /// A picture colored from 0.01 to 0.99 is not ruled by a few wild values.
 pub fn quantile_range(map: ImageView<'_, f32, 1>, low: f64, high: f64) -> Option<(f32, f32)> {
     let mut values: Vec<f32> = (0..map.height()).flat_map(|y| map.row(y)).copied().filter(|v| v.is_finite()).collect();
-    let last = values.len().checked_sub(1)?;
-    let mut at = |q: f64| {
-        let index = (q.clamp(0.0, 1.0) * last as f64).round() as usize;
-        *values.select_nth_unstable_by(index, f32::total_cmp).1
-    };
-    Some((at(low), at(high)))
+    Some((quantile(&mut values, low)?, quantile(&mut values, high)?))
 }
 
 /// Round numbers within `range`, about `count` of them, at distances of 1, 2 or 5 times a power of ten.

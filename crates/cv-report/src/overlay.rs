@@ -1,6 +1,6 @@
 //! The field's usual pictures: keypoints, matches, epipolar lines, masks, patches.
 
-use cv_core::{Correspondence, ImageView, Keypoint, Matrix3, RgbU8};
+use cv_core::{Correspondence, ImageView, Keypoint, Matrix3, RgbU8, luma_u8};
 
 use crate::canvas::{Canvas, Color, colors};
 
@@ -12,7 +12,7 @@ fn unit(width: usize, height: usize) -> f32 {
 /// Takes most of the color and some of the light out of a picture, so that marks on it stand out.
 fn quiet(canvas: &mut Canvas) {
     canvas.map(|[r, g, b]| {
-        let luma = (u32::from(r) * 77 + u32::from(g) * 150 + u32::from(b) * 29) >> 8;
+        let luma = u32::from(luma_u8([r, g, b]));
         [r, g, b].map(|v| ((u32::from(v) + 3 * luma) * 45 / 256 + 20) as u8)
     });
 }

@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use cv_core::{Camera, Point2, Point3, Pose, RgbU8};
+use cv_core::{Camera, Point2, Point3, PointCloud, Pose, RgbU8, median, quantile};
 
 use crate::base64;
 use crate::canvas::{Canvas, Color, colors};
@@ -31,8 +31,9 @@ impl PointScene {
     /// The most points kept; 16 bytes each in the file. A larger cloud is thinned evenly.
     pub const MAX_POINTS: usize = 400_000;
 
-    /// A scene of points with a color each (white where there are too few colors). Points that are not finite are left out.
-    pub fn new(points: &[[f32; 3]], colors: &[Color]) -> Self {
+    /// A scene of the points of a cloud (white where there are too few colors; without its edges). Points that are not finite are left out.
+    pub fn new(cloud: &PointCloud) -> Self {
+        let (points, colors) = (&cloud.positions, &cloud.colors);
         let usable: Vec<usize> = (0..points.len()).filter(|&i| points[i].iter().all(|v| v.is_finite())).collect();
         let kept = usable.len().min(Self::MAX_POINTS);
         let chosen = (0..kept).map(|i| usable[(i as u64 * usable.len() as u64 / kept as u64) as usize]);
@@ -78,12 +79,14 @@ impl PointScene {
         if points.is_empty() {
             return ([0.0; 3], 1.0);
         }
-        let middle = points.len() / 2;
-        let center: [f32; 3] =
-            std::array::from_fn(|i| points.select_nth_unstable_by(middle, |a, b| a[i].total_cmp(&b[i])).1[i]);
+        let mut values = Vec::with_capacity(points.len());
+        let center = [0, 1, 2].map(|axis| {
+            values.clear();
+            values.extend(points.iter().map(|p| p[axis]));
+            median(&mut values).unwrap_or(0.0)
+        });
         let mut distances: Vec<f32> = points.iter().map(|&p| distance(p, center)).collect();
-        let most = (distances.len() * 9 / 10).min(distances.len() - 1);
-        let radius = *distances.select_nth_unstable_by(most, f32::total_cmp).1;
+        let radius = quantile(&mut distances, 0.9).unwrap_or(1.0);
         (center, if radius > 0.0 && radius.is_finite() { radius } else { 1.0 })
     }
 
@@ -262,7 +265,7 @@ mod tests {
     #[test]
     fn a_point_ahead_is_drawn_in_its_color_and_wild_ones_are_left_out() {
         let points = [[0.0, 0.0, 5.0], [f32::NAN, 0.0, 1.0], [0.0, f32::INFINITY, 0.0]];
-        let scene = PointScene::new(&points, &[[255, 0, 0]; 3]);
+        let scene = PointScene::new(&PointCloud::colored(points.to_vec(), vec![[255, 0, 0]; 3]));
         assert_eq!(scene.points.len(), 1);
         for view in [Viewpoint::Camera, Viewpoint::Top, Viewpoint::Side] {
             let picture = render_points(&scene, view, 101, 81);
@@ -280,7 +283,7 @@ mod tests {
         let mut ink = vec![[90, 90, 90]; 40];
         points.extend([[1.0, 0.0, 1.0]; 6]);
         ink.extend([[255, 0, 0]; 6]);
-        let scene = PointScene::new(&points, &ink);
+        let scene = PointScene::new(&PointCloud::colored(points, ink));
         let picture = render_points(&scene, Viewpoint::Top, 200, 200);
         let red: Vec<_> = (0..200)
             .flat_map(|y| (0..200).map(move |x| (x, y)))
@@ -293,7 +296,7 @@ mod tests {
     fn a_frustum_is_the_cameras_own() {
         let camera = Camera::pinhole(200, 100, 100.0, 100.0, 99.5, 49.5);
         let pose = Pose::new(Rotation3::identity(), Vector3::new(-1.0, 0.0, 0.0));
-        let mut scene = PointScene::new(&[[0.0, 0.0, 10.0]], &[]);
+        let mut scene = PointScene::new(&PointCloud::from_positions(vec![[0.0, 0.0, 10.0]]));
         scene.camera(&camera, &pose, colors::ORANGE);
         let f = &scene.frusta[0];
         assert_eq!(f.center, Point3::new(1.0, 0.0, 0.0));
@@ -306,7 +309,7 @@ mod tests {
     fn large_clouds_are_thinned_evenly() {
         let n = PointScene::MAX_POINTS + 1000;
         let points: Vec<_> = (0..n).map(|i| [i as f32, 0.0, 0.0]).collect();
-        let scene = PointScene::new(&points, &[]);
+        let scene = PointScene::new(&PointCloud::from_positions(points));
         assert_eq!((scene.points.len(), scene.left_out()), (PointScene::MAX_POINTS, 1000));
         assert!(scene.points.windows(2).all(|p| p[1][0] - p[0][0] <= 2.0));
     }

@@ -2,6 +2,7 @@
 
 use crate::MixtureError;
 use cv_core::Cancelled;
+use cv_core::OptionError;
 
 /// Why a model could not be trained, loaded, or scored.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -32,15 +33,8 @@ pub enum SegmentError {
         photos: usize,
     },
     /// An option is out of its range.
-    #[error("{name} is {value}; it must be {range}")]
-    BadOption {
-        /// Which.
-        name: &'static str,
-        /// Its value.
-        value: f64,
-        /// What it may be.
-        range: &'static str,
-    },
+    #[error(transparent)]
+    Option(#[from] OptionError),
     /// A mixture could not be fitted, or a loaded one is not one.
     #[error(transparent)]
     Mixture(#[from] MixtureError),

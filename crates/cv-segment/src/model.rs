@@ -1,7 +1,7 @@
 //! The trained model: two mixtures, a threshold, and what happens around them.
 
 use crate::{Cleanup, ColorSpace, Mixture, SegmentError, evaluate::Evaluator, mixture::Whitened};
-use cv_core::{GrayF32, ImageView, Mask, Matrix3, Vector3};
+use cv_core::{GrayF32, ImageView, Mask, Matrix3, OptionError, Vector3};
 use cv_imgproc::gaussian_blur;
 use serde::{Deserialize, Serialize};
 
@@ -91,16 +91,14 @@ impl TryFrom<ModelFile> for ColorModel {
 
     fn try_from(file: ModelFile) -> Result<Self, SegmentError> {
         Self::check_schema(Some(file.schema.into()))?;
-        let within = |name, value: f64, ok: bool, range| {
-            if ok { Ok(()) } else { Err(SegmentError::BadOption { name, value, range }) }
-        };
-        within("hue", file.hue.into(), file.hue.abs() <= 7.0, "an angle between −7 and 7 radians")?;
-        within("prior", file.prior, file.prior > 0.0 && file.prior < 1.0, "between 0 and 1")?;
-        within("unknown", file.unknown, (0.0..1.0).contains(&file.unknown), "from 0 to below 1")?;
-        within("smoothing", file.smoothing.into(), (0.0..=100.0).contains(&file.smoothing), "from 0 to 100 px")?;
-        within("threshold", file.threshold.into(), file.threshold.abs() <= LIMIT, "between −10 and 10")?;
+        use OptionError as E;
+        E::check("hue", file.hue.into(), "an angle between −7 and 7 radians", |v| v.abs() <= 7.0)?;
+        E::check("prior", file.prior, "between 0 and 1", |v| v > 0.0 && v < 1.0)?;
+        E::check("unknown", file.unknown, "from 0 to below 1", |v| (0.0..1.0).contains(&v))?;
+        E::check("smoothing", file.smoothing.into(), "from 0 to 100 px", |v| (0.0..=100.0).contains(&v))?;
+        E::check("threshold", file.threshold.into(), "between −10 and 10", |v| v.abs() <= f64::from(LIMIT))?;
         for (name, radius) in [("open_radius", file.cleanup.open_radius), ("close_radius", file.cleanup.close_radius)] {
-            within(name, radius as f64, radius <= 1000, "from 0 to 1000 px")?;
+            E::check(name, radius as f64, "from 0 to 1000 px", |v| v <= 1000.0)?;
         }
         let foreground = file.foreground.whitened()?;
         let mut background = Vec::new();
@@ -235,7 +233,7 @@ mod tests {
             ("hue", refused(&|f| f.hue = f32::INFINITY)),
             ("close_radius", refused(&|f| f.cleanup.close_radius = 1001)),
         ] {
-            assert!(matches!(error, SegmentError::BadOption { name: n, .. } if n == name), "{error:?}");
+            assert!(matches!(error, SegmentError::Option(e) if e.name == name), "{error:?}");
         }
         let error = refused(&|f| f.foreground.components[0].covariance[0][0] = -1.0);
         assert!(matches!(error, SegmentError::Mixture(_)), "{error:?}");

@@ -6,7 +6,7 @@ use crate::{
     model::{LIMIT, ModelFile},
     space::mean_hue,
 };
-use cv_core::ImageView;
+use cv_core::{ImageView, OptionError};
 
 /// Which regions of a mask are kept.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -70,19 +70,16 @@ impl Default for TrainOptions {
 
 impl TrainOptions {
     /// Before the work: a bad option is not worth waiting for.
-    fn validate(&self) -> Result<(), SegmentError> {
-        let check = |name, value: f64, ok: bool, range| {
-            if ok { Ok(()) } else { Err(SegmentError::BadOption { name, value, range }) }
-        };
-        let (k, b) = (self.components, self.background_components);
-        check("components", k as f64, (1..=64).contains(&k), "from 1 to 64")?;
-        check("background_components", b as f64, (1..=63).contains(&b), "from 1 to 63")?;
-        check("unknown", self.unknown, (0.0..1.0).contains(&self.unknown), "from 0 to below 1")?;
-        check("smoothing", self.smoothing.into(), (0.0..=100.0).contains(&self.smoothing), "from 0 to 100 px")?;
-        let regularization = self.regularization;
-        check("regularization", regularization, (0.0..=1.0).contains(&regularization), "from 0 to 1")?;
-        check("open_radius", self.open_radius as f64, self.open_radius <= 1000, "from 0 to 1000 px")?;
-        check("close_radius", self.close_radius as f64, self.close_radius <= 1000, "from 0 to 1000 px")
+    fn validate(&self) -> Result<(), OptionError> {
+        use OptionError as E;
+        let within = |low: f64, high: f64| move |v: f64| (low..=high).contains(&v);
+        E::check("components", self.components as f64, "from 1 to 64", within(1.0, 64.0))?;
+        E::check("background_components", self.background_components as f64, "from 1 to 63", within(1.0, 63.0))?;
+        E::check("unknown", self.unknown, "from 0 to below 1", |v| (0.0..1.0).contains(&v))?;
+        E::check("smoothing", self.smoothing.into(), "from 0 to 100 px", within(0.0, 100.0))?;
+        E::check("regularization", self.regularization, "from 0 to 1", within(0.0, 1.0))?;
+        E::check("open_radius", self.open_radius as f64, "from 0 to 1000 px", within(0.0, 1000.0))?;
+        E::check("close_radius", self.close_radius as f64, "from 0 to 1000 px", within(0.0, 1000.0))
     }
 }
 
@@ -305,7 +302,7 @@ mod tests {
             TrainOptions { open_radius: 1001, ..options.clone() },
         ] {
             let error = with(&mask, &wrong);
-            assert!(matches!(error, SegmentError::BadOption { .. }), "{wrong:?}: {error:?}");
+            assert!(matches!(error, SegmentError::Option(_)), "{wrong:?}: {error:?}");
         }
         let empty = (RgbU8::new(0, 0, [0; 3]), Mask::new(0, 0, [true]));
         let error = train(&[(empty.0.view(), empty.1.view())], &options).unwrap_err();

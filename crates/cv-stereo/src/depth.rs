@@ -1,6 +1,6 @@
 //! From disparity to depth, and back into space.
 
-use cv_core::{GrayF32, ImageView};
+use cv_core::{GrayF32, ImageView, PointCloud};
 use nalgebra::Matrix4;
 use rayon::prelude::*;
 
@@ -41,15 +41,6 @@ pub enum GeometryError {
         /// Offset of the right camera's.
         offset: f64,
     },
-}
-
-/// A point of a cloud.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct CloudPoint {
-    /// X right, Y down, Z forward from the left camera, in the unit of the baseline.
-    pub position: [f32; 3],
-    /// Color in the left image.
-    pub color: [u8; 3],
 }
 
 impl StereoGeometry {
@@ -134,21 +125,22 @@ impl StereoGeometry {
         depth
     }
 
-    /// The pixels of a depth map as points in space, row by row, with their colors. Pixels without a depth are left
-    /// out; where the images differ in size, so is what only one of them has.
-    pub fn cloud(&self, depth: ImageView<'_, f32, 1>, color: ImageView<'_, u8, 3>) -> Vec<CloudPoint> {
+    /// The pixels of a depth map as points in space (X right, Y down, Z forward from the left camera, in the unit of the baseline), row by row,
+    /// with their colors. Pixels without a depth are left out; where the images differ in size, so is what only one of them has.
+    pub fn cloud(&self, depth: ImageView<'_, f32, 1>, color: ImageView<'_, u8, 3>) -> PointCloud {
         let (width, height) = (depth.width().min(color.width()), depth.height().min(color.height()));
-        let mut points = Vec::new();
+        let mut cloud = PointCloud::default();
         for y in 0..height {
             for (x, (&z, rgb)) in depth.row(y).iter().zip(color.row(y).as_chunks::<3>().0).enumerate().take(width) {
                 if z.is_finite() {
                     let scale = f64::from(z) / self.focal;
                     let position = [((x as f64 - self.cx) * scale) as f32, ((y as f64 - self.cy) * scale) as f32, z];
-                    points.push(CloudPoint { position, color: *rgb });
+                    cloud.positions.push(position);
+                    cloud.colors.push(*rgb);
                 }
             }
         }
-        points
+        cloud
     }
 }
 
@@ -183,10 +175,9 @@ mod tests {
         let depth = GEOMETRY.depth_map(d.view(), (0.1, 100.0));
         let cloud = GEOMETRY.cloud(depth.view(), rgb.view());
         assert_eq!(cloud.len(), 6);
-        let last = cloud[5];
-        assert_eq!(last.color, [3, 1, 9]);
+        assert_eq!(cloud.colors[5], [3, 1, 9]);
         let h = GEOMETRY.q() * nalgebra::Vector4::new(3.0, 1.0, 27.0, 1.0);
-        for (axis, p) in last.position.iter().enumerate() {
+        for (axis, p) in cloud.positions[5].iter().enumerate() {
             // Six digits of f32 on a value of at most 2.
             assert!((f64::from(*p) - h[axis] / h.w).abs() < 1e-6);
         }

@@ -1,5 +1,7 @@
 //! What can be wrong with a stereo job.
 
+use cv_core::OptionError;
+
 use cv_core::Cancelled;
 
 /// Why no disparity could be computed.
@@ -46,15 +48,8 @@ pub enum StereoError {
         width: usize,
     },
     /// A penalty or threshold is out of its range.
-    #[error("option {name} is {value}; it must be {allowed}")]
-    Option {
-        /// Name of the option.
-        name: &'static str,
-        /// Its value.
-        value: f64,
-        /// What would be accepted.
-        allowed: &'static str,
-    },
+    #[error(transparent)]
+    Option(#[from] OptionError),
     /// A float image holds NaN or infinite values.
     #[error("{count} samples of the {side} image are NaN or infinite")]
     NotFinite {

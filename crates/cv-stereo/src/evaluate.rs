@@ -1,6 +1,6 @@
 //! Scores of a disparity map against the truth, as Middlebury and KITTI count them.
 
-use cv_core::{ImageView, Mask};
+use cv_core::{ImageView, Mask, quantile};
 
 /// Thresholds in px of the shares of bad pixels.
 pub const BAD_THRESHOLDS: [f32; 4] = [0.5, 1.0, 2.0, 4.0];
@@ -84,25 +84,23 @@ pub fn evaluate_disparity(
     if pixels == 0 {
         return Err(EvaluateError::NoTruth { total: size.0 * size.1 });
     }
-    errors.sort_unstable_by(f32::total_cmp);
     let n = errors.len() as f64;
-    let wrong = BAD_THRESHOLDS.map(|limit| (errors.len() - errors.partition_point(|&e| e <= limit)) as f64);
+    let wrong = BAD_THRESHOLDS.map(|limit| errors.iter().filter(|&&e| e > limit).count() as f64);
+    let average = errors.iter().map(|&e| f64::from(e)).sum::<f64>() / n;
+    let rms = (errors.iter().map(|&e| f64::from(e).powi(2)).sum::<f64>() / n).sqrt();
     let missing = (pixels - errors.len()) as f64;
-    // Nearest rank.
-    let quantile = |share: f64| {
-        let rank = (share * n).ceil() as usize;
-        errors.get(rank.saturating_sub(1)).map_or(f64::NAN, |&e| f64::from(e))
-    };
+    let mut at = |share: f64| quantile(&mut errors, share).map_or(f64::NAN, f64::from);
+    let [a50, a90, a95] = [0.5, 0.9, 0.95].map(&mut at);
     Ok(DisparityScores {
         pixels,
         density: n / pixels as f64,
         bad: wrong.map(|w| (w + missing) / pixels as f64),
         bad_of_valid: wrong.map(|w| w / n),
-        average: errors.iter().map(|&e| f64::from(e)).sum::<f64>() / n,
-        rms: (errors.iter().map(|&e| f64::from(e).powi(2)).sum::<f64>() / n).sqrt(),
-        a50: quantile(0.5),
-        a90: quantile(0.9),
-        a95: quantile(0.95),
+        average,
+        rms,
+        a50,
+        a90,
+        a95,
     })
 }
 

@@ -1,7 +1,7 @@
 //! Any image to the 16-bit gray that the matcher works on.
 
 use crate::census::{Gray, MARGIN};
-use cv_core::{ImageView, Sample};
+use cv_core::{ImageView, Sample, luma_u16};
 use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
 use rayon::prelude::*;
@@ -71,13 +71,7 @@ pub(crate) fn to_gray<T: Intensity, const C: usize>(level: Level, view: ImageVie
 #[simd]
 fn gray_row<S: Simd, T: Intensity, const C: usize>(_: S, pixels: &[[T; C]], out: &mut [u16]) {
     for (pixel, gray) in pixels.iter().zip(out) {
-        *gray = if C >= 3 {
-            // The weights add up to 2¹⁶, so that a gray pixel keeps its value.
-            let [r, g, b] = [pixel[0], pixel[1], pixel[2]].map(|v| u32::from(v.to_u16()));
-            ((r * 19595 + g * 38470 + b * 7471 + 32768) >> 16) as u16
-        } else {
-            pixel[0].to_u16()
-        };
+        *gray = if C >= 3 { luma_u16([pixel[0], pixel[1], pixel[2]].map(T::to_u16)) } else { pixel[0].to_u16() };
     }
 }
 

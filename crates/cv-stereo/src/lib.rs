@@ -26,7 +26,6 @@ mod depth;
 mod error;
 mod evaluate;
 mod fill;
-mod forest;
 mod input;
 mod kernel;
 mod layout;
@@ -45,7 +44,7 @@ mod smooth;
 mod speckle;
 mod winner;
 
-pub use depth::{CloudPoint, GeometryError, StereoGeometry};
+pub use depth::{GeometryError, StereoGeometry};
 pub use error::StereoError;
 pub use evaluate::{BAD_THRESHOLDS, DisparityScores, EvaluateError, evaluate_disparity, non_occluded};
 pub use input::Intensity;

@@ -12,10 +12,10 @@ use crate::smooth::{self, Planes, smooth};
 use crate::speckle::{Speckles, remove_speckles};
 use crate::winner::{NO_SUM, Winner};
 use crate::{Blend, Intensity, Paths, StereoError, StereoOptions, Subpixel, median};
-use cv_core::{GrayF32, Image, ImageView, Sample};
+use cv_core::{GrayF32, Image, ImageView, Sample, StageClock};
 use fearless_simd::Level;
 use rayon::prelude::*;
-use std::{ops::Range, time::Instant};
+use std::ops::Range;
 
 /// Rows beyond a strip that its paths start from: what lies farther away hardly matters.
 const OVERLAP: usize = 32;
@@ -106,7 +106,7 @@ pub struct StereoMatcher {
     holes: Holes,
     scratch: Vec<f32>,
     planes: Planes,
-    stages: [(&'static str, f64); 4],
+    stages: Vec<(&'static str, f64)>,
 }
 
 impl StereoMatcher {
@@ -129,7 +129,7 @@ impl StereoMatcher {
             holes: Holes::default(),
             scratch: Vec::new(),
             planes: Planes::default(),
-            stages: Default::default(),
+            stages: Vec::new(),
         })
     }
 
@@ -204,27 +204,23 @@ impl StereoMatcher {
             return Err(StereoError::SizeMismatch { left: left.size(), right: right.size() });
         }
         self.check_size(width, height)?;
-        let start = Instant::now();
+        let mut clock = StageClock::new();
         for (side, view, gray) in [("left", left, 0), ("right", right, 1)] {
             let count = to_gray(self.level, view, &mut self.gray[gray]);
             if count > 0 {
                 return Err(StereoError::NotFinite { side, count });
             }
         }
-        let prepared = Instant::now();
+        clock.lap("gray");
         self.bits();
-        let described = Instant::now();
+        clock.lap("bits");
         self.aggregate(width, height);
-        let aggregated = Instant::now();
+        clock.lap("aggregate");
         map.resize(width, height);
         self.check(map);
         self.refine(map);
-        self.stages = [
-            ("gray", (prepared - start).as_secs_f64()),
-            ("bits", (described - prepared).as_secs_f64()),
-            ("aggregate", (aggregated - described).as_secs_f64()),
-            ("check", aggregated.elapsed().as_secs_f64()),
-        ];
+        clock.lap("check");
+        self.stages = clock.into_stages();
         Ok(())
     }
 

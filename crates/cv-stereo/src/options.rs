@@ -1,6 +1,7 @@
 //! What a caller can choose.
 
 use crate::StereoError;
+use cv_core::OptionError;
 
 /// The neighborhood a pixel is described by: one bit per neighbor, set where it is darker than the center.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -197,42 +198,26 @@ impl StereoOptions {
         if self.disparities == 0 || self.disparities > MAX_DISPARITIES {
             return Err(StereoError::Range { disparities: self.disparities, max: MAX_DISPARITIES });
         }
-        let bad = |name, value: f64, allowed| Err(StereoError::Option { name, value, allowed });
-        if self.p2_min < self.p1 {
-            return bad("p2_min", f64::from(self.p2_min), "at least p1");
+        use OptionError as E;
+        let positive = |v: f64| v > 0.0 && v.is_finite();
+        E::check("p2_min", self.p2_min.into(), "at least p1", |_| self.p2_min >= self.p1)?;
+        E::check("p2", self.p2.into(), "at least p2_min", |_| self.p2 >= self.p2_min)?;
+        let room = (self.census.bits() + usize::from(self.blend.cap())) as f64;
+        let limit = "at most 254 less the bits of the census window and the cap of the blend";
+        E::check("p2", self.p2.into(), limit, |v| v + room <= 254.0)?;
+        if let Blend::Gray { per_bit, .. } | Blend::Gradient { per_bit, .. } = self.blend {
+            E::check("per_bit", per_bit.into(), "1 or more", |v| v >= 1.0)?;
         }
-        if self.p2 < self.p2_min {
-            return bad("p2", f64::from(self.p2), "at least p2_min");
+        E::check("uniqueness", self.uniqueness.into(), "from 0 to 99", |v| v <= 99.0)?;
+        E::check("speckle_range", self.speckle_range.into(), "a finite number, 0 or more", |v| {
+            v >= 0.0 && v.is_finite()
+        })?;
+        if let Smoothing::Bilateral { sigma } | Smoothing::LeastSquares { sigma, .. } = self.smoothing {
+            E::check("sigma", sigma.into(), "positive", positive)?;
         }
-        if usize::from(self.p2) + self.census.bits() + usize::from(self.blend.cap()) > 254 {
-            return bad(
-                "p2",
-                f64::from(self.p2),
-                "at most 254 less the bits of the census window and the cap of the blend",
-            );
+        if let Smoothing::LeastSquares { lambda, .. } = self.smoothing {
+            E::check("lambda", lambda.into(), "positive", positive)?;
         }
-        if matches!(self.blend, Blend::Gray { per_bit: 0, .. } | Blend::Gradient { per_bit: 0, .. }) {
-            return bad("per_bit", 0.0, "1 or more");
-        }
-        if self.uniqueness > 99 {
-            return bad("uniqueness", f64::from(self.uniqueness), "0 to 99");
-        }
-        if !(self.speckle_range >= 0.0 && self.speckle_range.is_finite()) {
-            return bad("speckle_range", f64::from(self.speckle_range), "a finite number, 0 or more");
-        }
-        let positive = |v: f32| v > 0.0 && v.is_finite();
-        match self.smoothing {
-            Smoothing::Bilateral { sigma } if !positive(sigma) => {
-                return bad("sigma", f64::from(sigma), "positive");
-            }
-            Smoothing::LeastSquares { lambda, sigma } if !(positive(sigma) && positive(lambda)) => {
-                return bad("lambda or sigma", f64::from(lambda.min(sigma)), "positive");
-            }
-            _ => {}
-        }
-        if self.median > 2 {
-            return bad("median", self.median as f64, "0, 1 or 2");
-        }
-        Ok(())
+        Ok(E::check("median", self.median as f64, "0, 1 or 2", |v| v <= 2.0)?)
     }
 }

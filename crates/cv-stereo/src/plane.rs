@@ -5,7 +5,7 @@
 //! [`crate::fill`] takes are a step on a slanted surface, and too far or too near where the hole reaches the border.
 
 use crate::PixelState;
-use crate::forest::{find, join};
+use cv_core::UnionFind;
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 
@@ -33,8 +33,8 @@ const MAX_SLOPE: f64 = 0.3;
 #[derive(Debug, Default)]
 pub(crate) struct Planes {
     runs: Vec<Run>,
-    /// An earlier run of the same hole, or the run itself.
-    parents: Vec<u32>,
+    /// Which runs are of one hole.
+    holes: UnionFind,
     /// Number of pixels of each hole, at its first run; then its place among the large ones.
     sizes: Vec<usize>,
     samples: Vec<Vec<Sample>>,
@@ -77,12 +77,13 @@ pub(crate) fn fill_planes(
     if width == 0 || disparity.is_empty() {
         return;
     }
-    let Planes { runs, parents, sizes, samples, planes } = memory;
-    find_runs(states, width, runs, parents);
+    let Planes { runs, holes, sizes, samples, planes } = memory;
+    find_runs(states, width, runs, holes);
+    let roots = holes.flatten();
     sizes.clear();
     sizes.resize(runs.len(), 0);
-    for (i, run) in runs.iter().enumerate() {
-        sizes[find(parents, i as u32) as usize] += run.end - run.start;
+    for (run, &root) in runs.iter().zip(roots) {
+        sizes[root as usize] += run.end - run.start;
     }
     let mut large = 0;
     for size in sizes.iter_mut() {
@@ -98,15 +99,15 @@ pub(crate) fn fill_planes(
     }
     samples.iter_mut().for_each(Vec::clear);
     samples.resize_with(large.max(samples.len()), Vec::new);
-    for (i, run) in runs.iter().enumerate() {
-        let place = sizes[find(parents, i as u32) as usize];
+    for (run, &root) in runs.iter().zip(roots) {
+        let place = sizes[root as usize];
         if let Some(samples) = samples.get_mut(place) {
             collect(disparity, states, gray, width, run, samples);
         }
     }
     samples[..large].par_iter().map(|samples| fit(samples)).collect_into_vec(planes);
-    for (i, &Run { y, start, end }) in runs.iter().enumerate() {
-        let place = sizes[find(parents, i as u32) as usize];
+    for (&Run { y, start, end }, &root) in runs.iter().zip(roots) {
+        let place = sizes[root as usize];
         let Some(Some(plane)) = planes.get(place) else { continue };
         let first = plane.slope.1 * (y as f64 - plane.origin.1) + plane.d;
         for (x, d) in disparity[y * width..][start..end].iter_mut().enumerate() {
@@ -117,16 +118,16 @@ pub(crate) fn fill_planes(
 }
 
 /// Runs of mismatched pixels, joined where they touch from row to row.
-fn find_runs(states: &[PixelState], width: usize, runs: &mut Vec<Run>, parents: &mut Vec<u32>) {
+fn find_runs(states: &[PixelState], width: usize, runs: &mut Vec<Run>, holes: &mut UnionFind) {
     runs.clear();
-    parents.clear();
+    holes.clear();
     let mut above = 0..0;
     for (y, row) in states.chunks_exact(width).enumerate() {
         let first = runs.len();
         let mut x = 0;
         while let Some(start) = next(row, x) {
             let end = row[start..].iter().position(|&s| s != PixelState::Mismatched).map_or(width, |n| start + n);
-            parents.push(runs.len() as u32);
+            holes.push();
             runs.push(Run { y, start, end });
             x = end;
         }
@@ -137,7 +138,7 @@ fn find_runs(states: &[PixelState], width: usize, runs: &mut Vec<Run>, parents: 
             }
             let mut other = up;
             while other < above.end && runs[other].start < runs[i].end {
-                join(parents, other as u32, i as u32);
+                holes.union(other as u32, i as u32);
                 other += 1;
             }
         }

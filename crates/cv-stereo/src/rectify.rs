@@ -6,7 +6,8 @@
 
 use crate::StereoGeometry;
 use cv_core::{
-    Camera, CameraError, Cancelled, Distortion, Image, ImageView, Mask, Point2, Point3, Rotation3, StereoRig, Vector3,
+    Camera, CameraError, Cancelled, Distortion, Image, ImageView, Mask, OptionError, Point2, Point3, Rotation3,
+    StereoRig, Vector3,
 };
 use cv_imgproc::{Pixel, RemapOptions, warp_with};
 use nalgebra::{Matrix3, Matrix4};
@@ -88,15 +89,8 @@ pub enum RectifyError {
         height: usize,
     },
     /// An option is out of range.
-    #[error("option {name} is {value}; it must be {allowed}")]
-    Option {
-        /// Name of the option.
-        name: &'static str,
-        /// Its value.
-        value: f64,
-        /// What would be accepted.
-        allowed: &'static str,
-    },
+    #[error(transparent)]
+    Option(#[from] OptionError),
     /// The job was stopped by its progress callback.
     #[error("stopped")]
     Cancelled(#[from] Cancelled),
@@ -195,9 +189,7 @@ impl Rectification {
     /// [`RectifyError`] with the reason why it cannot be done.
     pub fn new(rig: &StereoRig, options: &RectifyOptions) -> Result<Self, RectifyError> {
         let (x, baseline) = along_the_baseline(rig)?;
-        if !(0.0..=1.0).contains(&options.alpha) {
-            return Err(RectifyError::Option { name: "alpha", value: options.alpha, allowed: "from 0 to 1" });
-        }
+        OptionError::check("alpha", options.alpha, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
         let center = rig.right_from_left.center();
         let vertical = center.y.abs() > center.x.abs();
         let along = if vertical { center.y } else { center.x };
@@ -208,9 +200,7 @@ impl Rectification {
 
         let native = (rig.left.width, rig.left.height);
         let (width, height) = options.size.unwrap_or(if vertical { (native.1, native.0) } else { native });
-        if width == 0 || height == 0 {
-            return Err(RectifyError::Option { name: "size", value: 0.0, allowed: "at least 1×1 px" });
-        }
+        OptionError::check("size", width.min(height) as f64, "at least 1×1 px", |v| v >= 1.0)?;
         let sources = [(rig.left, rotations[0]), (rig.right, rotations[1])];
         let camera = common_camera(sources, (width, height), options.alpha)?;
         let view = |source, rotation| RectifiedView { source, camera, rotation };
@@ -549,7 +539,7 @@ mod tests {
         let fine = rig((0.0, 0.0, 0.0), Vector3::new(0.2, 0.0, 0.0), 0.0);
         assert!(matches!(
             Rectification::new(&fine, &RectifyOptions { alpha: 1.5, size: None }),
-            Err(RectifyError::Option { name: "alpha", .. })
+            Err(RectifyError::Option(OptionError { name: "alpha", .. }))
         ));
     }
 }

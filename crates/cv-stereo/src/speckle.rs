@@ -1,7 +1,7 @@
 //! Removal of small patches that agree only with themselves.
 
 use crate::PixelState;
-use crate::forest::join;
+use cv_core::UnionFind;
 use rayon::prelude::*;
 
 /// Rows per strip: strips are labeled side by side, then joined. Small enough to occupy every core.
@@ -11,8 +11,8 @@ const STRIP: usize = 64;
 #[derive(Debug, Default)]
 pub(crate) struct Speckles {
     strips: Vec<Strip>,
-    /// Parent of each run; a root is its own.
-    parents: Vec<u32>,
+    /// Which runs are of one patch.
+    patches: UnionFind,
     /// Pixels of each run, later of each patch.
     sizes: Vec<u32>,
 }
@@ -24,8 +24,8 @@ struct Strip {
     /// Where the runs of the last row begin, and where those of the first one end.
     last: usize,
     first_end: usize,
-    /// Parent of each run, counted from the first of the strip.
-    parents: Vec<u32>,
+    /// Which runs are of one patch, counted from the first of the strip.
+    patches: UnionFind,
 }
 
 /// Pixels beside each other of one surface: columns `start` to `end` of a row.
@@ -39,15 +39,14 @@ struct Run {
 /// Sets to NaN, and from matched to mismatched, every 4-connected patch of at most `max_size` pixels whose neighbors differ by no
 /// more than `range`.
 ///
-/// Runs of each row are joined into a forest (union–find with path halving), counted, and the small ones cleared: linear
-/// in the number of pixels.
+/// Runs of each row are joined by union-find, counted, and the small patches cleared: linear in the number of pixels.
 pub(crate) fn remove_speckles(
     disparity: &mut [f32],
     states: &mut [PixelState],
     width: usize,
     max_size: usize,
     range: f32,
-    Speckles { strips, parents, sizes }: &mut Speckles,
+    Speckles { strips, patches, sizes }: &mut Speckles,
 ) {
     if width == 0 || max_size == 0 || disparity.is_empty() {
         return;
@@ -55,11 +54,11 @@ pub(crate) fn remove_speckles(
     let strip = width * STRIP;
     strips.resize_with(disparity.len().div_ceil(strip), Strip::default);
     strips.par_iter_mut().zip(disparity.par_chunks(strip)).for_each(|(runs, rows)| runs.label(rows, width, range));
-    parents.clear();
+    patches.clear();
     sizes.clear();
     for (number, here) in strips.iter().enumerate() {
-        let offset = parents.len() as u32;
-        parents.extend(here.parents.iter().map(|&parent| parent + offset));
+        let offset = patches.len() as u32;
+        patches.append(&here.patches);
         sizes.extend(here.runs.iter().map(|run| run.end - run.start));
         if number > 0 {
             let above = &strips[number - 1];
@@ -70,19 +69,17 @@ pub(crate) fn remove_speckles(
                 runs: &above.runs[above.last..],
                 first: offset - (above.runs.len() - above.last) as u32,
             };
-            join_rows(last, Row { row, runs: &here.runs[..here.first_end], first: offset }, range, parents);
+            join_rows(last, Row { row, runs: &here.runs[..here.first_end], first: offset }, range, patches);
         }
     }
-    // Roots have the smallest index of their patch: counting from the end, every run is complete when it is added.
-    for run in (0..parents.len()).rev() {
-        let up = parents[run] as usize;
-        if up != run {
-            sizes[up] += sizes[run];
+    let roots = patches.flatten();
+    for (run, &root) in roots.iter().enumerate() {
+        if root as usize != run {
+            sizes[root as usize] += sizes[run];
         }
     }
-    // Parents come before their children: each takes over the size of its patch.
-    for run in 0..parents.len() {
-        sizes[run] = sizes[parents[run] as usize];
+    for (run, &root) in roots.iter().enumerate() {
+        sizes[run] = sizes[root as usize];
     }
     let runs =
         strips.iter().enumerate().flat_map(|(number, strip)| strip.runs.iter().map(move |run| (number * STRIP, run)));
@@ -100,9 +97,9 @@ pub(crate) fn remove_speckles(
 
 impl Strip {
     fn label(&mut self, disparity: &[f32], width: usize, range: f32) {
-        let Self { runs, last, first_end, parents } = self;
+        let Self { runs, last, first_end, patches } = self;
         runs.clear();
-        parents.clear();
+        patches.clear();
         let mut above = 0..0;
         for (y, row) in disparity.chunks_exact(width).enumerate() {
             let first = runs.len();
@@ -117,7 +114,7 @@ impl Strip {
                     x += 1;
                 }
                 if !before.is_nan() {
-                    parents.push(runs.len() as u32);
+                    patches.push();
                     runs.push(Run { y: y as u32, start: start as u32, end: x as u32 });
                 }
             }
@@ -126,7 +123,7 @@ impl Strip {
             } else {
                 let up = &disparity[(y - 1) * width..y * width];
                 let up = Row { row: up, runs: &runs[above.clone()], first: above.start as u32 };
-                join_rows(up, Row { row, runs: &runs[first..], first: first as u32 }, range, parents);
+                join_rows(up, Row { row, runs: &runs[first..], first: first as u32 }, range, patches);
             }
             *last = first;
             above = first..runs.len();
@@ -142,7 +139,7 @@ struct Row<'a> {
 }
 
 /// Joins the runs of two rows that touch where the disparities agree.
-fn join_rows(up: Row<'_>, here: Row<'_>, range: f32, parents: &mut [u32]) {
+fn join_rows(up: Row<'_>, here: Row<'_>, range: f32, patches: &mut UnionFind) {
     let mut next = 0;
     for (i, run) in here.runs.iter().enumerate() {
         while let Some(above) = up.runs.get(next).filter(|above| above.start < run.end) {
@@ -150,7 +147,7 @@ fn join_rows(up: Row<'_>, here: Row<'_>, range: f32, parents: &mut [u32]) {
             // Empty where the one above ends before this one starts.
             let mut pixels = shared.map(|x| (up.row[x] - here.row[x]).abs());
             if pixels.any(|difference| difference <= range) {
-                join(parents, up.first + next as u32, here.first + i as u32);
+                patches.union(up.first + next as u32, here.first + i as u32);
             }
             if above.end > run.end {
                 break;

@@ -3,7 +3,7 @@
 
 use super::Check;
 use anyhow::{Context, Result};
-use cv_core::{ImageView, Point2, RgbU8};
+use cv_core::{ImageView, Point2, RgbU8, luma_f32};
 use cv_pipeline::{PanoramaOptions, PanoramaPhoto, PanoramaResult, Silent, panorama};
 use std::path::Path;
 
@@ -220,8 +220,7 @@ fn luma(image: ImageView<'_, u8, 3>, p: Point2<f64>) -> f64 {
     let (x, y) = (p.x as usize, p.y as usize);
     let (fx, fy) = (p.x - x as f64, p.y - y as f64);
     let at = |x: usize, y: usize| {
-        let [r, g, b] = image.at(x.min(image.width() - 1), y.min(image.height() - 1)).map(f64::from);
-        0.299 * r + 0.587 * g + 0.114 * b
+        f64::from(luma_f32(image.at(x.min(image.width() - 1), y.min(image.height() - 1)).map(f32::from)))
     };
     (at(x, y) * (1.0 - fx) + at(x + 1, y) * fx) * (1.0 - fy) + (at(x, y + 1) * (1.0 - fx) + at(x + 1, y + 1) * fx) * fy
 }

@@ -137,7 +137,7 @@ impl Run for Args {
             }
         };
         let result = result.map_err(|error| match error {
-            EstimateError::BadOption { .. } => Failure::usage(error),
+            EstimateError::Option(_) => Failure::usage(error),
             _ => Failure::new(error),
         });
         let (robust, pose, stages) = result

@@ -2,10 +2,10 @@
 
 use crate::frame::{Context, Explain, Failure, Outcome, Run};
 use cv_core::nalgebra::Matrix3;
-use cv_core::{Correspondence, Pose};
+use cv_core::{Correspondence, PointCloud, Pose};
 use cv_io::DynImage;
 use cv_io::colmap::{Model, ModelImage, ModelPoint};
-use cv_io::ply::{Cloud, PlyEncoding};
+use cv_io::ply::PlyEncoding;
 use cv_pipeline::{
     DenseOptions, DenseResult, Intrinsics, ReconstructError, ReconstructOptions, ReconstructResult, reconstruct,
     reconstruct_dense,
@@ -123,10 +123,10 @@ impl Run for Args {
         };
         // Before anything is written: a dense cloud that cannot be had leaves no half of the outputs behind.
         let dense = self.dense(&a, &b, &result, context)?;
-        let cloud = self.cloud(result.points.iter().map(|p| (position(p), p.color)));
+        let cloud = self.turned(result.cloud());
         cv_io::ply::write_cloud(&self.output, &cloud, PlyEncoding::Binary)?;
         if let (Some(path), Some(dense)) = (&self.dense, &dense) {
-            let cloud = self.cloud(dense.points.iter().map(|p| (p.position, p.color)));
+            let cloud = self.turned(dense.cloud.clone());
             cv_io::ply::write_cloud(path, &cloud, PlyEncoding::Binary)?;
         }
         if let Some(folder) = &self.colmap {
@@ -183,17 +183,12 @@ impl Args {
         }
     }
 
-    /// A position in the frame that was asked for.
-    fn turned(&self, p: [f32; 3]) -> [f32; 3] {
-        match self.axes {
-            Axes::Opencv => p,
-            Axes::Opengl => [p[0], -p[1], -p[2]],
+    /// A cloud in the frame that was asked for.
+    fn turned(&self, mut cloud: PointCloud) -> PointCloud {
+        if matches!(self.axes, Axes::Opengl) {
+            cloud.positions.iter_mut().for_each(|p| *p = [p[0], -p[1], -p[2]]);
         }
-    }
-
-    fn cloud(&self, points: impl Iterator<Item = ([f32; 3], [u8; 3])>) -> Cloud {
-        let (positions, colors) = points.map(|(p, color)| (self.turned(p), color)).unzip();
-        Cloud::colored(positions, colors)
+        cloud
     }
 
     /// The dense cloud, where it is asked for.
@@ -286,9 +281,9 @@ impl Args {
         let (width, height) = dense.size;
         let (first, count) = dense.disparities;
         let share = 100.0 * dense.coverage;
-        summary += &format!("; {} dense points, {share:.0} % of what both photographs show", dense.points.len());
+        summary += &format!("; {} dense points, {share:.0} % of what both photographs show", dense.cloud.len());
         outcome
-            .with("dense_points", dense.points.len())
+            .with("dense_points", dense.cloud.len())
             .with("dense_coverage", dense.coverage)
             .with("dense_size", [width, height])
             .with("dense_disparities", [i64::from(first), i64::from(first) + count as i64 - 1])
@@ -316,9 +311,7 @@ impl Args {
             "Each point was seen in both photographs. The unit is the distance between the two cameras, which are drawn as pyramids. \
              Drag to turn, scroll to come nearer.",
         );
-        let positions: Vec<[f32; 3]> = result.points.iter().map(position).collect();
-        let colors: Vec<[u8; 3]> = result.points.iter().map(|p| p.color).collect();
-        let mut scene = PointScene::new(&positions, &colors);
+        let mut scene = PointScene::new(&result.cloud());
         scene.camera(&result.cameras[0], &Pose::identity(), camera_color(0));
         scene.camera(&result.cameras[1], &result.pose, camera_color(1));
         report.points(
@@ -427,13 +420,12 @@ fn dense_section(report: &mut Report, dense: &DenseResult, result: &ReconstructR
         "The photographs were rectified to {width}×{height} px and matched at {} disparities. {} points, {:.0} % of what both show, were confirmed \
          from both.",
         dense.disparities.1,
-        dense.points.len(),
+        dense.cloud.len(),
         100.0 * dense.coverage,
     ));
     let depth = draw_map(dense.depth.view(), &MapStyle::depth("distances between the cameras"));
     report.figure(Figure::new(png(&depth)?, "Depth of the first photograph: near blue, far red, unknown gray."));
-    let (positions, colors): (Vec<_>, Vec<_>) = dense.points.iter().map(|p| (p.position, p.color)).unzip();
-    let mut scene = PointScene::new(&positions, &colors);
+    let mut scene = PointScene::new(&dense.cloud);
     scene.camera(&result.cameras[0], &Pose::identity(), camera_color(0));
     scene.camera(&result.cameras[1], &result.pose, camera_color(1));
     let caption = match scene.left_out() {
@@ -445,8 +437,4 @@ fn dense_section(report: &mut Report, dense: &DenseResult, result: &ReconstructR
     let side = Figure::new(png(&render_points(&scene, Viewpoint::Side, 900, 700))?, "From the side.");
     report.figures(vec![top, side]);
     Ok(())
-}
-
-fn position(p: &cv_pipeline::ScenePoint) -> [f32; 3] {
-    [p.position.x as f32, p.position.y as f32, p.position.z as f32]
 }

@@ -414,7 +414,7 @@ fn refused(error: SegmentError, pairs: &[Pair]) -> Failure {
         SegmentError::NoBackground { .. } => {
             Failure::from(error).advice("masks that are black (0) where the object is not")
         }
-        SegmentError::BadOption { .. } => Failure::usage(error),
+        SegmentError::Option(_) => Failure::usage(error),
         _ => error.into(),
     }
 }

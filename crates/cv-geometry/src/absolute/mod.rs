@@ -13,7 +13,7 @@ use crate::pairs::{LANES, different};
 use crate::ransac::{Estimator, Marginal, RobustOptions, Scorer, ransac};
 use crate::robust::RobustModel;
 use crate::rotation::orthonormalized;
-use cv_core::{Matrix3, Point2, Point3, Pose, Rotation3, Vector3};
+use cv_core::{Matrix3, Point2, Point3, Pose, Rotation3, Vector3, median};
 use cv_numeric::{LeastSquares, LmOptions, NormalEquations, levenberg_marquardt};
 use nalgebra::{Const, Matrix2x3, SVector};
 
@@ -186,12 +186,11 @@ struct AbsoluteEstimator {
 impl AbsoluteEstimator {
     fn new(matches: &[WorldMatch]) -> Self {
         // Of medians, which no wild point moves.
-        let median = |k: usize| {
+        let middle = |k: usize| {
             let mut v: Vec<f64> = matches.iter().map(|m| m.world[k]).collect();
-            let middle = v.len() / 2;
-            *v.select_nth_unstable_by(middle, f64::total_cmp).1
+            median(&mut v).unwrap_or(0.0)
         };
-        let center = Vector3::new(median(0), median(1), median(2));
+        let center = Vector3::new(middle(0), middle(1), middle(2));
         let moved = |m: &WorldMatch| WorldMatch { world: m.world - center, image: m.image };
         let matches: Vec<WorldMatch> = matches.iter().map(moved).collect();
         let blocks = matches.chunks(LANES).map(WorldBlock::new).collect();

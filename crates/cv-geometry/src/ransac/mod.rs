@@ -119,7 +119,7 @@ pub struct Consensus<M> {
 /// al. 2003) on the same loss. O(samples × data).
 ///
 /// # Errors
-/// [`EstimateError::BadOption`], [`EstimateError::NotEnoughMatches`] with fewer data than a sample has, and
+/// [`EstimateError::Option`], [`EstimateError::NotEnoughMatches`] with fewer data than a sample has, and
 /// [`EstimateError::NoConsensus`] where no model fits more data than chance would make fit.
 pub fn ransac<E: Estimator>(estimator: &E, options: &RobustOptions) -> Result<Consensus<E::Model>, EstimateError> {
     options.check()?;

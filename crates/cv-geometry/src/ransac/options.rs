@@ -1,6 +1,6 @@
 //! Options of the robust estimators.
 
-use crate::EstimateError;
+use cv_core::OptionError;
 
 /// How the fit of a model to all matches is summed up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -76,18 +76,10 @@ impl RobustOptions {
         Self { threshold: 1.0, max_iterations: 20_000, scoring: Scoring::Msac, ..Self::default() }
     }
 
-    pub(crate) fn check(&self) -> Result<(), EstimateError> {
-        let bad = |name, range, value| Err(EstimateError::BadOption { name, range, value });
-        if !(self.threshold > 0.0 && self.threshold.is_finite()) {
-            return bad("threshold", "above 0", self.threshold);
-        }
-        if !(self.confidence > 0.0 && self.confidence < 1.0) {
-            return bad("confidence", "between 0 and 1", self.confidence);
-        }
-        if self.max_iterations == 0 {
-            return bad("max_iterations", "at least 1", 0.0);
-        }
-        Ok(())
+    pub(crate) fn check(&self) -> Result<(), OptionError> {
+        OptionError::check("threshold", self.threshold, "above 0 and finite", |v| v > 0.0 && v.is_finite())?;
+        OptionError::check("confidence", self.confidence, "between 0 and 1", |v| v > 0.0 && v < 1.0)?;
+        OptionError::check("max_iterations", self.max_iterations as f64, "at least 1", |v| v >= 1.0)
     }
 
     /// Samples needed where `inliers` of `n` matches are good: `log(1 − confidence) / log(1 − P(good sample))`.

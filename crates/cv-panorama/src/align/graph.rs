@@ -1,5 +1,6 @@
 //! The graph of photographs (nodes) and verified overlaps (edges): groups, spanning tree, middle.
 
+use cv_core::UnionFind;
 use std::cmp::Ordering;
 
 /// An overlap between nodes `a` and `b`.
@@ -13,45 +14,30 @@ pub(crate) struct Edge {
 /// The connected groups of nodes `0..n`, the largest first (of equals, the one with the greater sum of weights, then the one
 /// with the lowest node). Nodes ascend within a group.
 pub(crate) fn groups(n: usize, edges: &[Edge]) -> Vec<Vec<usize>> {
-    let mut parent: Vec<usize> = (0..n).collect();
+    let mut sets = UnionFind::new(n);
     for e in edges {
-        let (a, b) = (find(&mut parent, e.a), find(&mut parent, e.b));
-        parent[a.max(b)] = a.min(b);
+        sets.union(e.a as u32, e.b as u32);
     }
+    let roots = sets.into_roots();
     let mut members: Vec<(f64, Vec<usize>)> = vec![(0.0, Vec::new()); n];
     for i in 0..n {
-        members[find(&mut parent, i)].1.push(i);
+        members[roots[i] as usize].1.push(i);
     }
     for e in edges {
-        members[find(&mut parent, e.a)].0 += e.weight;
+        members[roots[e.a] as usize].0 += e.weight;
     }
     members.retain(|(_, m)| !m.is_empty());
     members.sort_by(|x, y| y.1.len().cmp(&x.1.len()).then(y.0.total_cmp(&x.0)).then(x.1.cmp(&y.1)));
     members.into_iter().map(|(_, m)| m).collect()
 }
 
-fn find(parent: &mut [usize], mut i: usize) -> usize {
-    while parent[i] != i {
-        parent[i] = parent[parent[i]];
-        i = parent[i];
-    }
-    i
-}
-
 /// The edges (as indices) of the spanning tree of greatest weight over the nodes that `edges` connect (Kruskal).
 pub(crate) fn maximum_spanning_tree(n: usize, edges: &[Edge]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..edges.len()).collect();
     order.sort_by(|&i, &j| edges[j].weight.total_cmp(&edges[i].weight).then(i.cmp(&j)));
-    let mut parent: Vec<usize> = (0..n).collect();
-    let mut tree = Vec::new();
-    for i in order {
-        let (a, b) = (find(&mut parent, edges[i].a), find(&mut parent, edges[i].b));
-        if a != b {
-            parent[a.max(b)] = a.min(b);
-            tree.push(i);
-        }
-    }
-    tree
+    let mut sets = UnionFind::new(n);
+    order.retain(|&i| sets.union(edges[i].a as u32, edges[i].b as u32));
+    order
 }
 
 /// One step of a walk over the tree: `node` is reached from `parent` through edge `edge`.

@@ -361,11 +361,7 @@ fn kind_of(motion: CameraMotion) -> Motion {
     }
 }
 
-/// The upper median; 0 of nothing.
+/// The median; 0 of nothing.
 fn median(mut values: Vec<f64>) -> f64 {
-    if values.is_empty() {
-        return 0.0;
-    }
-    let middle = values.len() / 2;
-    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+    cv_core::median(&mut values).unwrap_or(0.0)
 }

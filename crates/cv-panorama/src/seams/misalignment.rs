@@ -3,7 +3,7 @@
 
 use crate::surface::{PAD, PLACES, REACH, Template};
 use crate::surface::{Piece, Preview};
-use cv_core::GrayF32;
+use cv_core::{GrayF32, luma_f32};
 use rayon::prelude::*;
 
 /// Half the side of the patches compared, in preview pixels.
@@ -62,7 +62,7 @@ fn luma(piece: &Piece) -> GrayF32 {
     let (w, h) = piece.warped.pixels.size();
     GrayF32::from_fn(w, h, |x, y| {
         let [r, g, b, a] = piece.warped.pixels.at(x, y).map(f32::from);
-        [if a > 0.0 { 0.299 * r + 0.587 * g + 0.114 * b } else { f32::NAN }]
+        [if a > 0.0 { luma_f32([r, g, b]) } else { f32::NAN }]
     })
 }
 

@@ -1,11 +1,11 @@
 //! A dense cloud from two photographs whose geometry is known.
 
 use super::ReconstructResult;
+use crate::Progress;
 use crate::depth::LEAST_MATCHED;
-use crate::{Progress, Stopwatch};
-use cv_core::{Cancelled, GrayF32, ImageView, Point2, Point3, StereoRig};
+use cv_core::{Cancelled, GrayF32, ImageView, OptionError, Point2, Point3, PointCloud, StageClock, StereoRig};
 use cv_imgproc::resize_area;
-use cv_stereo::{CloudPoint, PixelState, RectifyError, SceneRectification, StereoError, StereoMatcher, StereoOptions};
+use cv_stereo::{PixelState, RectifyError, SceneRectification, StereoError, StereoMatcher, StereoOptions};
 use rayon::prelude::*;
 
 /// Settings of [`reconstruct_dense`].
@@ -33,7 +33,7 @@ impl Default for DenseOptions {
 #[derive(Debug, Clone, PartialEq)]
 pub struct DenseResult {
     /// The points, in the frame and the unit of the sparse ones: the first camera's, and the distance between the cameras.
-    pub points: Vec<CloudPoint>,
+    pub cloud: PointCloud,
     /// Depth along the first camera's axis for each pixel of the (reduced) first photograph, NaN where there is no point.
     pub depth: GrayF32,
     /// Width and height of the rectified photographs in pixels.
@@ -63,16 +63,9 @@ pub enum DenseError {
         /// The least that counts.
         needed: f64,
     },
-    /// A photograph is not the one that was reconstructed, or an option is out of range.
-    #[error("{name} is {value}; it must be {allowed}")]
-    Option {
-        /// What.
-        name: &'static str,
-        /// Its value.
-        value: f64,
-        /// What would be accepted.
-        allowed: &'static str,
-    },
+    /// An option is out of range.
+    #[error(transparent)]
+    Option(#[from] OptionError),
     /// The job was stopped by its progress callback.
     #[error("stopped")]
     Cancelled(#[from] Cancelled),
@@ -113,7 +106,7 @@ impl DenseError {
             Self::LittleConfirmed { .. } => {
                 "take photographs nearer to each other, of things with texture that stand still; the sparse cloud alone needs no --dense"
             }
-            Self::Option { .. } => "see `cv reconstruct --help`",
+            Self::Option(_) => "see `cv reconstruct --help`",
             Self::Cancelled(_) => "run it again",
         }
     }
@@ -140,20 +133,16 @@ pub fn reconstruct_dense(
     options: &DenseOptions,
     progress: &dyn Progress,
 ) -> Result<DenseResult, DenseError> {
-    let bad = |name, value, allowed| Err(DenseError::Option { name, value, allowed });
-    if options.max_size < 32 {
-        return bad("the size for dense matching", options.max_size as f64, "at least 32 px");
-    }
-    if options.max_deviation.is_nan() || options.max_deviation <= 0.0 {
-        return bad("the largest deviation", f64::from(options.max_deviation), "above 0");
-    }
+    OptionError::check("max_size", options.max_size as f64, "at least 32 px", |v| v >= 32.0)?;
+    OptionError::check("max_deviation", options.max_deviation.into(), "above 0", |v| v > 0.0)?;
     let photos = [a, b];
     for (photo, camera) in photos.iter().zip(&sparse.cameras) {
-        if photo.size() != (camera.width, camera.height) {
-            return bad("the width of a photograph", photo.width() as f64, "that of its camera");
+        let expected = (camera.width, camera.height);
+        if photo.size() != expected {
+            return Err(RectifyError::ImageSize { image: photo.size(), expected }.into());
         }
     }
-    let mut watch = Stopwatch::new();
+    let mut clock = StageClock::new();
     progress.report("rectify", 0, 1)?;
     let longest = sparse.cameras.iter().map(|c| c.width.max(c.height)).max().unwrap_or(1);
     let factor = (options.max_size as f64 / longest as f64).min(1.0);
@@ -174,7 +163,7 @@ pub fn reconstruct_dense(
             view.apply(*photo)?
         });
     }
-    watch.lap("rectify");
+    clock.lap("rectify");
 
     progress.report("match", 0, 1)?;
     let stereo = StereoOptions {
@@ -186,7 +175,7 @@ pub fn reconstruct_dense(
     let mut matcher = StereoMatcher::new(stereo)?;
     let map = matcher.compute(rectified[0].0.view(), rectified[1].0.view())?;
     let sigma = matcher.uncertainty(&map);
-    watch.lap("match");
+    clock.lap("match");
 
     progress.report("cloud", 0, 1)?;
     let geometry = &scene.views.geometry;
@@ -240,7 +229,7 @@ pub fn reconstruct_dense(
         return Err(DenseError::LittleConfirmed { coverage, needed: LEAST_MATCHED });
     }
     let back = views[0].rotation.inverse();
-    let points = rows
+    let (positions, colors) = rows
         .par_iter()
         .enumerate()
         .flat_map_iter(|(y, row)| {
@@ -248,10 +237,11 @@ pub fn reconstruct_dense(
             row.0.iter().enumerate().filter(|(_, z)| z.is_finite()).map(move |(x, z)| {
                 let n = view.camera.normalize(Point2::new(x as f64, y as f64));
                 let p = back * (Point3::new(n.x, n.y, 1.0) * f64::from(*z));
-                CloudPoint { position: [p.x as f32, p.y as f32, p.z as f32], color: image.at(x, y) }
+                ([p.x as f32, p.y as f32, p.z as f32], image.at(x, y))
             })
         })
-        .collect();
+        .unzip();
+    let cloud = PointCloud::colored(positions, colors);
     let at = |p: Point2<f64>| -> Option<f32> {
         let q = views[0].rectified_pixel(p)?;
         let (x, y) = (q.x.round(), q.y.round());
@@ -270,6 +260,6 @@ pub fn reconstruct_dense(
             }
         });
     }
-    watch.lap("cloud");
-    Ok(DenseResult { points, depth, size, disparities: scene.disparities, coverage, stages: watch.into_stages() })
+    clock.lap("cloud");
+    Ok(DenseResult { cloud, depth, size, disparities: scene.disparities, coverage, stages: clock.into_stages() })
 }

@@ -13,8 +13,10 @@ use neighbors::like_their_neighbors;
 
 use crate::guided::{GuidedOptions, match_along_lines};
 use crate::matching::match_reduced;
-use crate::{MatchingOptions, MatchingResult, Progress, Stopwatch, correspondences};
-use cv_core::{Camera, Correspondence, ImageView, Matrix3, Point2, Point3, Pose, Vector3};
+use crate::{MatchingOptions, MatchingResult, Progress, correspondences};
+use cv_core::{
+    Camera, Correspondence, ImageView, Matrix3, Point2, Point3, PointCloud, Pose, StageClock, Vector3, median,
+};
 use cv_features::SiftOptions;
 use cv_geometry::{
     BundleOptions, BundleReport, RobustLoss, RobustOptions, TwoViewBundle, adjust_two_views, essential_from_pose,
@@ -143,6 +145,13 @@ impl ReconstructResult {
     pub fn fundamental(&self) -> Matrix3<f64> {
         fundamental_of(&self.cameras, &self.pose)
     }
+
+    /// The points with their colors.
+    pub fn cloud(&self) -> PointCloud {
+        let position = |p: &ScenePoint| -> [f32; 3] { p.position.coords.cast().into() };
+        let (positions, colors) = self.points.iter().map(|p| (position(p), p.color)).unzip();
+        PointCloud::colored(positions, colors)
+    }
 }
 
 /// Reconstructs what two photographs show: features, matches, relative pose, points.
@@ -157,21 +166,21 @@ pub fn reconstruct(
     options: &ReconstructOptions,
     progress: &dyn Progress,
 ) -> Result<ReconstructResult, ReconstructError> {
-    let mut watch = Stopwatch::new();
+    let mut clock = StageClock::new();
     let prior = cameras(options.intrinsics, [a.size(), b.size()])?;
     let matching = match_reduced([a, b], options.max_size, &options.matching, progress)?;
     for &(stage, seconds) in &matching.stages {
-        watch.add(stage, seconds);
+        clock.add(stage, seconds);
     }
     let pairs = &matching.pairs;
     if pairs.len() < options.min_inliers {
         return Err(ReconstructError::TooFewMatches { got: pairs.len(), needed: options.min_inliers });
     }
     progress.report("pose", 0, 1)?;
-    let simple = watch.time("degeneracy", || Simple::new(pairs, prior.as_ref(), options));
+    let simple = clock.time("degeneracy", || Simple::new(pairs, prior.as_ref(), options));
     // Nothing can have more inliers than there are matches.
     simple.check(pairs.len(), options)?;
-    let found = watch.time("pose", || initial(pairs, [a.size(), b.size()], prior, options));
+    let found = clock.time("pose", || initial(pairs, [a.size(), b.size()], prior, options));
     // Of a turn, a search for a moving camera finds but a part: half of the points are behind whatever it supposes.
     if let Err(
         ReconstructError::TooFewInliers { inliers, .. }
@@ -194,11 +203,11 @@ pub fn reconstruct(
         ..BundleOptions::default()
     };
     progress.report("points", 0, 1)?;
-    let mut fit = watch.time("bundle", || fit(&chosen, cameras, pose, &settings)).ok_or_else(|| too_few(0))?;
+    let mut fit = clock.time("bundle", || fit(&chosen, cameras, pose, &settings)).ok_or_else(|| too_few(0))?;
     // Before the matches along the lines: those agree with the pose because they were looked for where it says.
     let (normalized, unit) = normalize_matches(&fit.observed, &fit.bundle.cameras[0], &fit.bundle.cameras[1]);
     let reach = options.robust.threshold * unit;
-    let stability = watch.time("stability", || pose_stability(&fit.bundle.pose, &normalized, reach));
+    let stability = clock.time("stability", || pose_stability(&fit.bundle.pose, &normalized, reach));
     let mut guided = 0;
     if options.guided {
         let [fa, fb] = &matching.features;
@@ -210,7 +219,7 @@ pub fn reconstruct(
             &fundamental_of(&fit.bundle.cameras, &fit.bundle.pose),
             &along,
         );
-        watch.lap("guided");
+        clock.lap("guided");
         let more = correspondences(fa, fb, &matches);
         let TwoViewBundle { cameras, pose, points } = &fit.bundle;
         let more = like_their_neighbors(&more, &fit.observed, points, cameras, pose);
@@ -221,7 +230,7 @@ pub fn reconstruct(
         {
             fit = better;
         }
-        watch.lap("bundle");
+        clock.lap("bundle");
     }
     let Fit { bundle, observed, report } = fit;
     let pose_deviation = [0, 1].map(|i| stability[i].max(report.pose_deviation[i]));
@@ -251,8 +260,7 @@ pub fn reconstruct(
         return Err(too_few(scene.len()));
     }
     let mut angles: Vec<f64> = scene.iter().map(|p| p.angle).collect();
-    let middle = angles.len() / 2;
-    let median_angle = *angles.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let median_angle = median(&mut angles).unwrap_or(0.0);
     if median_angle < options.min_median_angle {
         return Err(ReconstructError::LittleParallax {
             degrees: median_angle.to_degrees(),
@@ -268,7 +276,7 @@ pub fn reconstruct(
         });
     }
     let squares: f64 = scene.iter().map(|p| p.reprojection * p.reprojection).sum();
-    watch.lap("filter");
+    clock.lap("filter");
     Ok(ReconstructResult {
         inliers,
         guided,
@@ -281,7 +289,7 @@ pub fn reconstruct(
         focal_deviation,
         planar_share,
         matching,
-        stages: watch.into_stages(),
+        stages: clock.into_stages(),
     })
 }
 
@@ -310,8 +318,7 @@ fn fit(matches: &[Correspondence], cameras: [Camera; 2], pose: Pose, settings: &
     // Once more with the noise that these matches have, for which a pixel may be wide: what is near but wrong shows in the focal length first.
     let seen = bundle.points.iter().zip(&observed).filter_map(|(x, m)| reprojection(&bundle, x, m));
     let mut errors: Vec<f64> = seen.flatten().collect();
-    let middle = errors.len() / 2;
-    let median = if errors.is_empty() { 1.0 } else { *errors.select_nth_unstable_by(middle, f64::total_cmp).1 };
+    let median = median(&mut errors).unwrap_or(1.0);
     // The median of an absolute normal error is 0.6745 deviations; Cauchy's loss is 95 % as good as least squares on such errors at 2.385 of them (Huber & Ronchetti,
     // "Robust statistics", 2009).
     let loss = RobustLoss::Cauchy { scale: (2.385 / 0.6745 * median).clamp(0.1, 1.0) };

@@ -2,7 +2,7 @@
 
 use super::{Check, Demo, Part};
 use crate::frame::Failure;
-use cv_core::{GrayF32, Mask, RgbU8};
+use cv_core::{GrayF32, Mask, PointCloud, RgbU8};
 use cv_pipeline::stereo::{StereoGeometry, StereoOptions};
 use cv_pipeline::{DepthOptions, depth};
 use cv_report::{MapStyle, PointScene, Viewpoint, colors, draw_map, render_points};
@@ -51,9 +51,9 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
         )?,
     ];
     // Every third pixel is dense enough to look at, and keeps the report small.
-    let (points, colors): (Vec<_>, Vec<_>) =
-        geometry.cloud(found.view(), left.view()).into_iter().step_by(3).map(|p| (p.position, p.color)).unzip();
-    let cloud = PointScene::new(&points, &colors);
+    let all = geometry.cloud(found.view(), left.view());
+    let (positions, colors) = (0..all.len()).step_by(3).map(|i| (all.positions[i], all.colors[i])).unzip();
+    let cloud = PointScene::new(&PointCloud::colored(positions, colors));
     let still = cv_io::encode_png(render_points(&cloud, Viewpoint::Camera, 960, 600).view())?;
     Ok(Part::new(vec![check], move |page| {
         page.section("Depth")

@@ -55,12 +55,10 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
             "Each point with the line on which it must lie in the other photograph.",
         )?,
     ];
-    let positions: Vec<[f32; 3]> = result.points.iter().map(|p| p.position.coords.cast::<f32>().into()).collect();
-    let colors: Vec<[u8; 3]> = result.points.iter().map(|p| p.color).collect();
-    let mut cloud = PointScene::new(&positions, &colors);
+    let mut cloud = PointScene::new(&result.cloud());
     cloud.camera(&camera, &Pose::identity(), camera_color(0)).camera(&camera, found, camera_color(1));
     let still = cv_io::encode_png(render_points(&cloud, Viewpoint::Camera, 960, 600).view())?;
-    let caption = format!("{} points and the two cameras. Drag to turn.", positions.len());
+    let caption = format!("{} points and the two cameras. Drag to turn.", result.points.len());
     Ok(Part::new(checks, move |page| {
         page.section("Reconstruction")
             .paragraph("Two photographs from 60 cm apart. From the matches alone come the turn and the direction of travel of the camera, and the points in space.");

@@ -7,8 +7,8 @@ mod report;
 
 use crate::frame::{Context, Failure, Outcome, Run};
 use crate::rig;
-use cv_core::{GrayF32, ImageView, Point3, RgbU8, Rotation3};
-use cv_io::ply::{Cloud, PlyEncoding};
+use cv_core::{GrayF32, ImageView, PointCloud, Pose, RgbU8, Rotation3, Vector3};
+use cv_io::ply::PlyEncoding;
 use cv_io::{DynImage, Pixels};
 use cv_pipeline::stereo::{
     Intensity, PixelState, Rectification, RectifyOptions, StereoError, StereoGeometry, StereoMatcher,
@@ -210,22 +210,20 @@ impl Run for Args {
             context.warn(format!("{lost} depths do not fit 0 to 65.535 m and are stored as unknown"));
         }
         self.write_quality(&job, context)?;
-        let points = match (&job.geometry, depth) {
+        let cloud = match (&job.geometry, depth) {
             (Some(geometry), Some(depth)) if self.cloud.is_some() || context.wants_report() => {
-                let mut points = geometry.cloud(depth.view(), job.left.view());
+                let mut cloud = geometry.cloud(depth.view(), job.left.view());
                 if let Some(back) = job.to_camera {
-                    let turn = |p: [f32; 3]| (back * Point3::from(p.map(f64::from))).coords.map(|v| v as f32).into();
-                    points.iter_mut().for_each(|p| p.position = turn(p.position));
+                    cloud.transform(&Pose::new(back, Vector3::zeros()));
                 }
-                points
+                cloud
             }
-            _ => Vec::new(),
+            _ => PointCloud::default(),
         };
         if let Some(path) = &self.cloud {
-            let (positions, colors) = points.iter().map(|p| (p.position, p.color)).unzip();
-            cv_io::ply::write_cloud(path, &Cloud::colored(positions, colors), PlyEncoding::Binary)?;
+            cv_io::ply::write_cloud(path, &cloud, PlyEncoding::Binary)?;
         }
-        context.report(|| report::report(&job, &points))?;
+        context.report(|| report::report(&job, &cloud))?;
         let (valid, matched) = (map.valid_fraction(), map.matched_fraction());
         let (width, height) = map.disparity.size();
         Ok(Outcome::new(job.result.stages.clone())

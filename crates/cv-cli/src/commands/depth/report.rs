@@ -2,9 +2,9 @@
 
 use super::Job;
 use crate::frame::Failure;
-use cv_core::{ImageView, RgbU8};
+use cv_core::{ImageView, PointCloud, RgbU8};
 use cv_pipeline::DepthResult;
-use cv_pipeline::stereo::{CloudPoint, PixelState};
+use cv_pipeline::stereo::PixelState;
 use cv_report::{Figure, MapStyle, Note, Plot, PointScene, Report, Viewpoint, draw_map, render_points};
 
 /// Where each disparity comes from, over the darkened photograph.
@@ -21,7 +21,7 @@ fn draw_states(left: ImageView<'_, u8, 3>, states: ImageView<'_, PixelState, 1>)
     })
 }
 
-pub(super) fn report(job: &Job, points: &[CloudPoint]) -> Result<String, Failure> {
+pub(super) fn report(job: &Job, cloud: &PointCloud) -> Result<String, Failure> {
     let DepthResult { map, depth, stages, .. } = &job.result;
     let png = |image: &RgbU8| cv_io::encode_png(image.view());
     let mut page = Report::new("Depth");
@@ -55,8 +55,7 @@ pub(super) fn report(job: &Job, points: &[CloudPoint]) -> Result<String, Failure
             png(&draw_map(depth.view(), &MapStyle::depth("")))?,
             "Depth in the unit of the baseline: near blue, far red, unknown black.",
         ));
-        let (positions, colors): (Vec<_>, Vec<_>) = points.iter().map(|p| (p.position, p.color)).unzip();
-        let scene = PointScene::new(&positions, &colors);
+        let scene = PointScene::new(cloud);
         let still = png(&render_points(&scene, Viewpoint::Camera, 960, 640))?;
         page.section("Cloud").points(&scene, Some(still), "The depth map in space.");
     } else {
