@@ -114,8 +114,8 @@ mod tests {
                     sets.flatten();
                 }
             }
-            for i in 0..n {
-                prop_assert_eq!(sets.clone().find(i as u32), plain[i]);
+            for (i, root) in plain.iter().enumerate() {
+                prop_assert_eq!(sets.clone().find(i as u32), *root);
             }
             let mut flat = sets.clone();
             prop_assert_eq!(flat.flatten(), &plain[..]);
