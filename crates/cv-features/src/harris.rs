@@ -25,6 +25,8 @@ pub enum CornerMeasure {
     ShiTomasi,
 }
 
+cv_core::named!(CornerMeasure { Harris { k: 0.04 } = "harris", ShiTomasi = "shi-tomasi" });
+
 /// Settings of [`harris`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct HarrisOptions {

@@ -16,6 +16,11 @@ pub enum ModelKind {
     Fundamental,
 }
 
+cv_core::named!(ModelKind {
+    Homography = "homography": "a plane, or a camera that only turned: b ~ H a",
+    Fundamental = "fundamental": "a general scene: bᵀ F a = 0",
+});
+
 impl ModelKind {
     /// The defaults of the estimator: threshold 3 px for homographies, 1 px for fundamental matrices.
     pub fn options(self) -> RobustOptions {

@@ -23,6 +23,12 @@ pub enum FeatureMethod {
     Sift,
 }
 
+cv_core::named!(FeatureMethod {
+    Sift = "sift": "rootSIFT: photographs that turn, zoom, or change light or viewpoint",
+    Mops = "mops": "corners at all scales with oriented 8×8 patches",
+    Harris = "harris": "corners with upright 8×8 patches: neighboring frames of a film or of a slowly turned camera",
+});
+
 /// How Harris corners are spread over the photograph.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Spacing {
@@ -34,6 +40,12 @@ pub enum Spacing {
     /// As many from each of 8 × 8 tiles.
     Tiles,
 }
+
+cv_core::named!(Spacing {
+    Radius = "radius": "by suppression radius",
+    Squares = "squares": "by square covering: faster, nearly as even",
+    Tiles = "tiles": "as many from each of 8×8 tiles",
+});
 
 /// Whether [`match_photos`] also looks at simulated slanted views (Morel & Yu's ASIFT), with SIFT only: some ten times the time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -47,6 +59,12 @@ pub enum Slanted {
     /// Always.
     Always,
 }
+
+cv_core::named!(Slanted {
+    Never = "never",
+    AsNeeded = "as-needed": "where no model explains enough of the plain matches",
+    Always = "always",
+});
 
 /// Settings of [`extract_features`] and [`match_photos`].
 #[derive(Debug, Clone, PartialEq)]

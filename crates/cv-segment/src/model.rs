@@ -25,6 +25,12 @@ pub enum Rule {
     Density,
 }
 
+cv_core::named!(Rule {
+    Tuned = "tuned": "posterior odds, with the threshold that is best on the training photographs",
+    Posterior = "posterior": "posterior odds: marked where the object is likelier than not",
+    Density = "density": "the object's density alone, with the threshold that is best on the training photographs",
+});
+
 /// A trained color model. Serializes with serde; what is loaded is checked.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(try_from = "ModelFile", into = "ModelFile")]

@@ -19,6 +19,8 @@ pub enum ColorSpace {
     Lab,
 }
 
+cv_core::named!(ColorSpace { Hsv = "hsv", Rgb = "rgb", Lab = "lab" });
+
 impl ColorSpace {
     /// The coordinates of a color. `hue` is the hue from which hues are measured, in radians; only HSV uses it.
     #[inline]

@@ -20,6 +20,12 @@ pub enum Regions {
     All,
 }
 
+cv_core::named!(Regions {
+    Auto = "auto": "the largest only, where every mask shows one region",
+    Largest = "largest",
+    All = "all",
+});
+
 /// Settings of [`train`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainOptions {

@@ -1,38 +1,31 @@
 //! `cv estimate`: a homography, fundamental or essential matrix from a matches file.
 
-use crate::frame::{Context, Explain, Failure, Outcome, Run};
-use clap::ValueEnum;
+use crate::frame::{Context, Explain, Failure, Outcome, Run, named};
 use cv_core::nalgebra::Matrix3;
-use cv_core::{Camera, Correspondence};
+use cv_core::{Camera, Correspondence, Named, named};
 use cv_pipeline::{EstimateError, ModelKind, RobustOptions, estimate, estimate_calibrated};
 use std::path::PathBuf;
 
 /// Which model to estimate.
-#[derive(Debug, Clone, Copy, ValueEnum)]
+#[derive(Debug, Clone, Copy)]
 enum Model {
-    /// A plane, or a camera that only turned: b ~ H a
     Homography,
-    /// A general scene: bᵀ F a = 0
     Fundamental,
-    /// A general scene and calibrated cameras: needs --camera, or --focal and --size
     Essential,
 }
 
+named!(Model {
+    Homography = "homography": "a plane, or a camera that only turned: b ~ H a",
+    Fundamental = "fundamental": "a general scene: bᵀ F a = 0",
+    Essential = "essential": "a general scene and calibrated cameras: needs --camera, or --focal and --size",
+});
+
 impl Model {
-    fn name(self) -> &'static str {
+    fn words(self) -> &'static str {
         match self {
             Self::Homography => "homography",
             Self::Fundamental => "fundamental matrix",
             Self::Essential => "essential matrix",
-        }
-    }
-
-    /// In JSON.
-    fn key(self) -> &'static str {
-        match self {
-            Self::Homography => "homography",
-            Self::Fundamental => "fundamental",
-            Self::Essential => "essential",
         }
     }
 }
@@ -47,6 +40,7 @@ impl Model {
 The matches file has a row per match, `x1 y1 x2 y2` in pixels with an optional score; `#` starts a comment.")]
 pub(crate) struct Args {
     /// What the two views have in common.
+    #[arg(value_parser = named::<Model>())]
     model: Model,
     /// The matches.
     #[arg(long, value_name = "FILE")]
@@ -115,7 +109,7 @@ impl Run for Args {
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
         let matches = cv_io::read_matches(&self.matches)?;
         let cameras = self.cameras()?;
-        let name = self.model.name();
+        let name = self.model.words();
         let (kind, options) = match self.model {
             Model::Homography => (ModelKind::Homography, RobustOptions::homography()),
             Model::Fundamental => (ModelKind::Fundamental, RobustOptions::fundamental()),
@@ -147,7 +141,7 @@ impl Run for Args {
         let total = pairs.len();
         let text: String = model.iter().map(|r| format!("{:>16.9e} {:>16.9e} {:>16.9e}\n", r[0], r[1], r[2])).collect();
         let mut outcome = Outcome::new(stages)
-            .with("kind", self.model.key())
+            .with("kind", self.model.name())
             .with("model", model)
             .with("inliers", &robust.inliers)
             .with("matches", total)

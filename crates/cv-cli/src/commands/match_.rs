@@ -1,8 +1,7 @@
 //! `cv match`: tentative matches between two photographs.
 
-use crate::frame::{Context, Explain, Failure, Outcome, Run};
-use clap::ValueEnum;
-use cv_core::{Keypoint, RgbU8};
+use crate::frame::{Context, Explain, Failure, Outcome, Run, named};
+use cv_core::{Keypoint, Named, RgbU8};
 use cv_io::FeatureRows;
 use cv_pipeline::features::{CornerMeasure, Described, DescriptorKind, Descriptors};
 use cv_pipeline::{
@@ -11,51 +10,6 @@ use cv_pipeline::{
 };
 use cv_report::{Figure, MatchStyle, Note, Plot, Report, colors, draw_keypoints, draw_matches, tile_patches};
 use std::path::{Path, PathBuf};
-
-/// Which features to match.
-#[derive(Debug, Clone, Copy, ValueEnum)]
-enum Features {
-    /// rootSIFT: photographs that turn, zoom, or change light or viewpoint
-    Sift,
-    /// Corners at all scales with oriented 8×8 patches
-    Mops,
-    /// Corners with upright 8×8 patches: neighboring frames of a film or of a slowly turned camera
-    Harris,
-}
-
-/// What makes a corner.
-#[derive(Debug, Clone, Copy, ValueEnum)]
-enum Corners {
-    Harris,
-    ShiTomasi,
-}
-
-/// How upright corners are spread.
-#[derive(Debug, Clone, Copy, ValueEnum)]
-enum Spread {
-    /// By suppression radius
-    Radius,
-    /// By square covering: faster, nearly as even
-    Squares,
-    /// As many from each of 8×8 tiles
-    Tiles,
-}
-
-/// When to look at simulated slanted views.
-#[derive(Debug, Clone, Copy, ValueEnum)]
-enum Views {
-    Never,
-    /// Where no model explains enough of the plain matches
-    AsNeeded,
-    Always,
-}
-
-/// Along which model to match once more.
-#[derive(Debug, Clone, Copy, ValueEnum)]
-enum Guide {
-    Homography,
-    Fundamental,
-}
 
 /// Find the same points in two photographs.
 ///
@@ -84,20 +38,20 @@ pub(crate) struct Args {
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// Which features.
-    #[arg(long, value_name = "sift|mops|harris", default_value = "sift")]
-    features: Features,
+    #[arg(long, value_name = "KIND", value_parser = named::<FeatureMethod>(), default_value_t = FeatureMethod::Sift)]
+    features: FeatureMethod,
     /// What makes a corner, for mops and harris.
-    #[arg(long, value_name = "harris|shi-tomasi", default_value = "harris")]
-    corners: Corners,
+    #[arg(long, value_name = "MEASURE", value_parser = named::<CornerMeasure>(), default_value = "harris")]
+    corners: CornerMeasure,
     /// How the corners of harris are spread.
-    #[arg(long, value_name = "radius|squares|tiles", default_value = "radius")]
-    spacing: Spread,
+    #[arg(long, value_name = "HOW", value_parser = named::<Spacing>(), default_value_t = Spacing::Radius)]
+    spacing: Spacing,
     /// Look at simulated slanted views too, with sift: for photographs from very different directions; about ten times slower.
-    #[arg(long, value_name = "never|as-needed|always", default_value = "as-needed")]
-    slanted: Views,
+    #[arg(long, value_name = "WHEN", value_parser = named::<Slanted>(), default_value_t = Slanted::AsNeeded)]
+    slanted: Slanted,
     /// Find this model and match once more along it: more matches, nearly all right, and none that disagree.
-    #[arg(long, value_name = "homography|fundamental")]
-    guided: Option<Guide>,
+    #[arg(long, value_name = "MODEL", value_parser = named::<ModelKind>())]
+    guided: Option<ModelKind>,
     /// Write the features of both photographs to this folder, for other programs.
     #[arg(long, value_name = "DIR")]
     save_features: Option<PathBuf>,
@@ -126,34 +80,17 @@ impl Run for Args {
         }
         let (a, b) = (cv_io::read_rgb(&self.first)?, cv_io::read_rgb(&self.second)?);
         let mut options = MatchingOptions {
-            method: match self.features {
-                Features::Sift => FeatureMethod::Sift,
-                Features::Mops => FeatureMethod::Mops,
-                Features::Harris => FeatureMethod::Harris,
-            },
-            spacing: match self.spacing {
-                Spread::Radius => Spacing::Radius,
-                Spread::Squares => Spacing::Squares,
-                Spread::Tiles => Spacing::Tiles,
-            },
-            slanted: match self.slanted {
-                Views::Never => Slanted::Never,
-                Views::AsNeeded => Slanted::AsNeeded,
-                Views::Always => Slanted::Always,
-            },
-            guided: self.guided.map(|guide| match guide {
-                Guide::Homography => ModelKind::Homography,
-                Guide::Fundamental => ModelKind::Fundamental,
-            }),
+            method: self.features,
+            spacing: self.spacing,
+            slanted: self.slanted,
+            guided: self.guided,
             max_features: self.max_features.map(|n| n as usize),
             ratio: (self.ratio < 1.0).then_some(self.ratio),
             mutual: !self.one_way,
             ..MatchingOptions::default()
         };
-        if matches!(self.corners, Corners::ShiTomasi) {
-            options.harris.measure = CornerMeasure::ShiTomasi;
-            options.mops.corners.measure = CornerMeasure::ShiTomasi;
-        }
+        options.harris.measure = self.corners;
+        options.mops.corners.measure = self.corners;
         let result = match &self.load_features {
             Some(folder) => {
                 let features = [load_features(folder, &self.first)?, load_features(folder, &self.second)?];
@@ -197,15 +134,7 @@ impl Run for Args {
             .with("features", counts)
             .with("found", result.features.each_ref().map(|f| f.found))
             .with("dropped", dropped)
-            .with(
-                "method",
-                match self.features {
-                    _ if self.load_features.is_some() => "loaded",
-                    Features::Sift => "sift",
-                    Features::Mops => "mops",
-                    Features::Harris => "harris",
-                },
-            )
+            .with("method", if self.load_features.is_some() { "loaded" } else { self.features.name() })
             .with("beyond_limit", result.features.each_ref().map(|f| f.described.beyond_limit))
             .summary(format!(
                 "{} matches between {} and {} features ({} and {} points left out near the border or on flat patches)",

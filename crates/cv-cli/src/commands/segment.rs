@@ -2,8 +2,8 @@
 
 mod files;
 
-use crate::frame::{Context, Explain, Failure, Outcome, Run, create_dir, expand_images, same_file};
-use cv_core::{Mask, RgbU8};
+use crate::frame::{Context, Explain, Failure, Outcome, Run, create_dir, expand_images, named, same_file};
+use cv_core::{Mask, Named, RgbU8};
 use cv_pipeline::segmentation::{ColorModel, ColorSpace, Labeled, Regions, Rule, Scores, SegmentError, TrainOptions};
 use cv_pipeline::{Progress, segment, train_segment};
 use cv_report::{Figure, Note, Report, colors, overlay_comparison, overlay_mask};
@@ -62,33 +62,6 @@ struct Labels {
     masks: PathBuf,
 }
 
-#[derive(Debug, Clone, Copy, clap::ValueEnum)]
-enum Space {
-    Hsv,
-    Rgb,
-    Lab,
-}
-
-#[derive(Debug, Clone, Copy, clap::ValueEnum)]
-enum RuleArg {
-    /// Posterior odds, with the threshold that is best on the training photographs.
-    Tuned,
-    /// Posterior odds: marked where the object is likelier than not.
-    Posterior,
-    /// The object's density alone, with the threshold that is best on the training photographs.
-    Density,
-}
-
-#[derive(Debug, Clone, Copy, clap::ValueEnum)]
-enum RegionsArg {
-    /// The largest only, where every mask shows one region.
-    Auto,
-    /// The largest.
-    Largest,
-    /// All.
-    All,
-}
-
 /// Learn an object's colors from photographs and masks.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
@@ -101,8 +74,8 @@ struct Train {
     #[arg(long, value_name = "JSON")]
     model: PathBuf,
     /// Color space.
-    #[arg(long, value_enum, default_value = "hsv")]
-    space: Space,
+    #[arg(long, value_parser = named::<ColorSpace>(), default_value_t = ColorSpace::Hsv)]
+    space: ColorSpace,
     /// Gaussians for the object's colors, 1 to 64 [default: 5].
     #[arg(long, value_name = "K", value_parser = clap::value_parser!(u16).range(1..=64))]
     components: Option<u16>,
@@ -110,11 +83,11 @@ struct Train {
     #[arg(long, value_name = "K", value_parser = clap::value_parser!(u16).range(1..=63))]
     background_components: Option<u16>,
     /// What a pixel's color is judged by.
-    #[arg(long, value_enum, default_value = "tuned")]
-    rule: RuleArg,
+    #[arg(long, value_parser = named::<Rule>(), default_value_t = Rule::Tuned)]
+    rule: Rule,
     /// Which regions are kept.
-    #[arg(long, value_enum, default_value = "auto")]
-    regions: RegionsArg,
+    #[arg(long, value_parser = named::<Regions>(), default_value_t = Regions::Auto)]
+    regions: Regions,
     /// Radius of the disc that masks are opened by; 0 for not at all [default: 2].
     #[arg(long, value_name = "PX")]
     open: Option<usize>,
@@ -130,23 +103,11 @@ impl Train {
     fn options(&self, context: &Context) -> TrainOptions {
         let default = TrainOptions::default();
         TrainOptions {
-            space: match self.space {
-                Space::Hsv => ColorSpace::Hsv,
-                Space::Rgb => ColorSpace::Rgb,
-                Space::Lab => ColorSpace::Lab,
-            },
+            space: self.space,
             components: self.components.map_or(default.components, usize::from),
             background_components: self.background_components.map_or(default.background_components, usize::from),
-            rule: match self.rule {
-                RuleArg::Tuned => Rule::Tuned,
-                RuleArg::Posterior => Rule::Posterior,
-                RuleArg::Density => Rule::Density,
-            },
-            regions: match self.regions {
-                RegionsArg::Auto => Regions::Auto,
-                RegionsArg::Largest => Regions::Largest,
-                RegionsArg::All => Regions::All,
-            },
+            rule: self.rule,
+            regions: self.regions,
             open_radius: self.open.unwrap_or(default.open_radius),
             close_radius: self.close.unwrap_or(default.close_radius),
             smoothing: self.smoothing.unwrap_or(default.smoothing),
@@ -179,7 +140,7 @@ impl Train {
             headline(&mut page, &total, photos.len());
             page.note(Note::Info, "These are the scores on the photographs the model was trained on. On others they will be lower: use cv segment eval.");
             page.section("Model").facts(&[
-                ("color space", format!("{:?}", options.space).to_uppercase()),
+                ("color space", options.space.name().to_uppercase()),
                 ("components of the object", trained.model.foreground().components.len().to_string()),
                 ("components of the background", trained.model.background().map_or(0, |b| b.components.len()).to_string()),
                 ("threshold", format!("{:.2} nats", trained.model.threshold())),

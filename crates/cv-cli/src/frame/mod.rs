@@ -5,6 +5,7 @@
 mod context;
 mod failure;
 mod inputs;
+mod named;
 mod outcome;
 mod outputs;
 mod progress;
@@ -12,6 +13,7 @@ mod progress;
 pub(crate) use context::Context;
 pub(crate) use failure::{Explain, Failure};
 pub(crate) use inputs::expand_images;
+pub(crate) use named::named;
 pub(crate) use outcome::Outcome;
 pub(crate) use outputs::{check_outputs, create_dir, picture_name, same_file, spare_inputs};
 

@@ -5,13 +5,14 @@ mod maps;
 mod options;
 mod report;
 
-use crate::frame::{Context, Failure, Outcome, Run};
+use crate::frame::{Context, Failure, Outcome, Run, named};
 use crate::rig;
 use cv_core::{GrayF32, ImageView, PointCloud, Pose, RgbU8, Rotation3, Vector3};
 use cv_io::ply::PlyEncoding;
 use cv_io::{DynImage, Pixels};
 use cv_pipeline::stereo::{
-    Intensity, PixelState, Rectification, RectifyOptions, StereoError, StereoGeometry, StereoMatcher,
+    Blend, Census, Intensity, Paths, PixelState, Rectification, RectifyOptions, Smoothing, StereoError, StereoGeometry,
+    StereoMatcher,
 };
 use cv_pipeline::{DepthError, DepthOptions, DepthResult, NoPairCause, depth};
 use frames::is_sequence;
@@ -79,12 +80,12 @@ pub(crate) struct Args {
     /// Farthest depth to keep [default: all].
     #[arg(long, value_name = "Z")]
     far: Option<f32>,
-    /// Directions of cost aggregation: 8, or 4 for half the time.
-    #[arg(long, value_name = "4|8", default_value = "8", value_parser = ["4", "8"])]
-    paths: String,
-    /// Matching window: 5 (5×5), 7 (7×7) or 9 (9×7).
-    #[arg(long, value_name = "5|7|9", default_value = "5", value_parser = ["5", "7", "9"])]
-    census: String,
+    /// Directions of cost aggregation.
+    #[arg(long, value_name = "N", value_parser = named::<Paths>(), default_value_t = Paths::Eight)]
+    paths: Paths,
+    /// Matching window.
+    #[arg(long, value_name = "N", value_parser = named::<Census>(), default_value_t = Census::Window5x5)]
+    census: Census,
     /// Penalty for a disparity step of one pixel, in bits of the window [default: 4].
     #[arg(long, value_name = "BITS")]
     p1: Option<u8>,
@@ -100,15 +101,15 @@ pub(crate) struct Args {
     /// Leave pixels without a match of their own unknown.
     #[arg(long)]
     no_fill: bool,
-    /// Add to the differing bits the absolute difference of gray values, or of horizontal gradients: sharper outlines.
-    #[arg(long, value_name = "WHAT", default_value = "none", value_parser = ["none", "gray", "gradient"])]
-    blend: String,
-    /// Edge-preserving smoothing: bilateral, wls (weighted least squares) or none.
-    #[arg(long, value_name = "HOW", default_value = "bilateral", value_parser = ["none", "bilateral", "wls"])]
-    smoothing: String,
-    /// Strength of --smoothing wls.
-    #[arg(long, value_name = "L", default_value_t = 100.0)]
-    lambda: f32,
+    /// What to add to the number of differing bits: sharper outlines.
+    #[arg(long, value_name = "WHAT", value_parser = named::<Blend>(), default_value_t = Blend::None)]
+    blend: Blend,
+    /// Edge-preserving smoothing.
+    #[arg(long, value_name = "HOW", value_parser = named::<Smoothing>(), default_value = "bilateral")]
+    smoothing: Smoothing,
+    /// Strength of --smoothing wls [default: 100].
+    #[arg(long, value_name = "L")]
+    lambda: Option<f32>,
     /// Gray levels (of 255) across which --smoothing does not reach [default: 24; 1.5 for wls].
     #[arg(long, value_name = "LEVELS")]
     sigma: Option<f32>,

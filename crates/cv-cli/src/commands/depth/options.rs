@@ -4,7 +4,7 @@ use super::Args;
 use crate::frame::{Context, Explain, Failure};
 use crate::rig;
 use cv_core::RgbU8;
-use cv_pipeline::stereo::{Blend, Census, Paths, Smoothing, StereoOptions};
+use cv_pipeline::stereo::{Smoothing, StereoOptions};
 use cv_pipeline::{DepthOptions, disparity_range};
 
 /// `--disparities`.
@@ -54,30 +54,24 @@ impl Args {
                     Range::Number(n) => n,
                     Range::Auto => default.disparities,
                 },
-                census: match self.census.as_str() {
-                    "5" => Census::Window5x5,
-                    "7" => Census::Window7x7,
-                    _ => Census::Window9x7,
-                },
+                census: self.census,
                 p1: self.p1.unwrap_or(default.p1),
                 p2: self.p2.unwrap_or(default.p2),
                 p2_min: default
                     .p2_min
                     .clamp(self.p1.unwrap_or(0), self.p2.unwrap_or(u8::MAX).max(self.p1.unwrap_or(0))),
-                paths: if self.paths == "4" { Paths::Four } else { Paths::Eight },
+                paths: self.paths,
                 uniqueness: self.uniqueness.unwrap_or(default.uniqueness),
                 speckle_size: self.speckle_size.unwrap_or(default.speckle_size),
                 fill: !self.no_fill,
-                blend: match self.blend.as_str() {
-                    // Of the weights tried on rendered scenes and photographs, those that gave the fewest errors.
-                    "gray" => Blend::Gray { per_bit: 2, cap: 8 },
-                    "gradient" => Blend::Gradient { per_bit: 1, cap: 6 },
-                    _ => Blend::None,
-                },
-                smoothing: match self.smoothing.as_str() {
-                    "bilateral" => Smoothing::Bilateral { sigma: self.sigma.unwrap_or(24.0) },
-                    "wls" => Smoothing::LeastSquares { lambda: self.lambda, sigma: self.sigma.unwrap_or(1.5) },
-                    _ => Smoothing::None,
+                blend: self.blend,
+                smoothing: match self.smoothing {
+                    Smoothing::None => Smoothing::None,
+                    Smoothing::Bilateral { sigma } => Smoothing::Bilateral { sigma: self.sigma.unwrap_or(sigma) },
+                    Smoothing::LeastSquares { lambda, sigma } => Smoothing::LeastSquares {
+                        lambda: self.lambda.unwrap_or(lambda),
+                        sigma: self.sigma.unwrap_or(sigma),
+                    },
                 },
                 confidence: self.confidence.is_some(),
                 max_memory: self.max_memory.map(|mib| mib.saturating_mul(1 << 20)),

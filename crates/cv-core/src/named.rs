@@ -1,0 +1,131 @@
+//! Choices that people make by name.
+
+/// An enum whose values people choose by name: on a command line, in a script, in a file. [`named!`](crate::named) implements it.
+pub trait Named: Clone + Send + Sync + Sized + 'static {
+    /// Each value with its name, in the order in which they are listed. A variant with fields is there with its defaults.
+    const NAMES: &'static [(&'static str, Self)];
+
+    /// Other spellings, by name; they are understood but not listed.
+    const ALIASES: &'static [(&'static str, &'static str)];
+
+    /// The name, whatever the fields of the variant hold.
+    fn name(&self) -> &'static str;
+
+    /// What the value is for, in a few words; empty where its name says it.
+    fn about(&self) -> &'static str;
+
+    /// The value of a name or of another spelling of it.
+    ///
+    /// # Errors
+    /// [`UnknownName`] where no value has it.
+    fn from_name(name: &str) -> Result<Self, UnknownName> {
+        let name = Self::ALIASES.iter().find(|(alias, _)| *alias == name).map_or(name, |(_, listed)| listed);
+        let found = Self::NAMES.iter().find(|(listed, _)| *listed == name);
+        found.map(|(_, value)| value.clone()).ok_or_else(|| UnknownName {
+            name: name.to_owned(),
+            known: Self::NAMES.iter().map(|(listed, _)| *listed).collect::<Vec<_>>().join(", "),
+        })
+    }
+}
+
+/// No value has this name.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("“{name}” is none of {known}")]
+pub struct UnknownName {
+    /// The name.
+    pub name: String,
+    /// The names there are, joined by commas.
+    pub known: String,
+}
+
+/// Gives every variant of an enum its name: implements [`Named`](crate::Named), `Display` and `FromStr` for it. A variant without a
+/// name does not compile.
+///
+/// ```
+/// use cv_core::{Named, named};
+///
+/// #[derive(Debug, Clone, PartialEq)]
+/// enum Edges {
+///     Keep,
+///     Smooth { sigma: f32 },
+/// }
+///
+/// named!(Edges {
+///     Keep = "keep",
+///     // The fields' defaults, another spelling, and what it is for.
+///     Smooth { sigma: 1.5 } = "smooth" | "blur": "where there is noise",
+/// });
+///
+/// assert_eq!("blur".parse(), Ok(Edges::Smooth { sigma: 1.5 }));
+/// assert_eq!(Edges::Smooth { sigma: 9.0 }.to_string(), "smooth");
+/// assert_eq!(Edges::from_name("cut").unwrap_err().to_string(), "“cut” is none of keep, smooth");
+/// ```
+#[macro_export]
+macro_rules! named {
+    ($type:ident {
+        $($variant:ident $({ $($field:ident: $value:expr),+ $(,)? })? = $name:literal $(| $alias:literal)* $(: $about:literal)?),+ $(,)?
+    }) => {
+        impl $crate::Named for $type {
+            const NAMES: &'static [(&'static str, Self)] =
+                &[$(($name, Self::$variant $({ $($field: $value),+ })?)),+];
+            const ALIASES: &'static [(&'static str, &'static str)] = &[$($(($alias, $name),)*)+];
+
+            fn name(&self) -> &'static str {
+                match self {
+                    $(Self::$variant { .. } => $name),+
+                }
+            }
+
+            fn about(&self) -> &'static str {
+                match self {
+                    $(Self::$variant { .. } => concat!($($about)?)),+
+                }
+            }
+        }
+
+        impl ::std::fmt::Display for $type {
+            fn fmt(&self, f: &mut ::std::fmt::Formatter<'_>) -> ::std::fmt::Result {
+                f.pad($crate::Named::name(self))
+            }
+        }
+
+        impl ::std::str::FromStr for $type {
+            type Err = $crate::UnknownName;
+
+            fn from_str(name: &str) -> Result<Self, Self::Err> {
+                $crate::Named::from_name(name)
+            }
+        }
+    };
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(Debug, Clone, Copy, PartialEq)]
+    enum Blend {
+        None,
+        Gray { per_bit: u8 },
+    }
+
+    named!(Blend { None = "none", Gray { per_bit: 2 } = "gray" | "grey": "sharper outlines" });
+
+    #[test]
+    fn names_go_there_and_back() {
+        for (name, value) in Blend::NAMES {
+            assert_eq!((value.name(), value.to_string().as_str(), name.parse()), (*name, *name, Ok(*value)));
+        }
+        assert_eq!(Blend::NAMES.len(), 2);
+        assert_eq!((Blend::None.about(), Blend::Gray { per_bit: 9 }.about()), ("", "sharper outlines"));
+    }
+
+    #[test]
+    fn other_spellings_are_understood_and_not_listed() {
+        assert_eq!("grey".parse(), Ok(Blend::Gray { per_bit: 2 }));
+        assert!(Blend::NAMES.iter().all(|(name, _)| *name != "grey"));
+        // The width of a column is kept.
+        assert_eq!(format!("{:>6}", Blend::None), "  none");
+        assert_eq!("Gray".parse::<Blend>().unwrap_err().to_string(), "“Gray” is none of none, gray");
+    }
+}
