@@ -35,6 +35,14 @@ pub struct DMatch {
     pub ratio: f32,
 }
 
+impl DMatch {
+    /// Where its two keypoints are; `None` where a set has no keypoint of that index.
+    pub fn correspondence(&self, query: &[Keypoint], train: &[Keypoint]) -> Option<Correspondence> {
+        let (a, b) = (query.get(self.query as usize)?, train.get(self.train as usize)?);
+        Some(Correspondence { a: a.position.cast(), b: b.position.cast() })
+    }
+}
+
 /// The same scene point seen at `a` in a first image and at `b` in a second one, in pixels.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Correspondence {

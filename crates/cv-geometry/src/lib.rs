@@ -37,6 +37,7 @@ mod six_point;
 #[cfg(test)]
 mod testing;
 mod triangulation;
+mod two_view;
 mod unknown_focal;
 
 pub use absolute::{
@@ -63,4 +64,8 @@ pub use ransac::{
 pub use robust::RobustModel;
 pub use six_point::fundamental_six_point;
 pub use triangulation::{TriangulationError, correct_match, parallax_angle, triangulate, triangulate_linear};
+pub use two_view::{
+    Intrinsics, MatchedViews, TwoViewAdjustment, TwoViewError, TwoViewGeometry, TwoViewOptions, TwoViewPoint,
+    TwoViewReconstruction, estimate_two_view_geometry, reconstruct_two_views,
+};
 pub use unknown_focal::{FocalPose, estimate_focal_pose, refine_focal_pose};

@@ -57,7 +57,7 @@ pub fn disparity_range(
     right: ImageView<'_, u8, 3>,
     progress: &dyn Progress,
 ) -> Result<(i32, usize), RangeError> {
-    let pairs = match_photos(left, right, &MatchingOptions::default(), progress)?.pairs;
+    let pairs = match_photos(left, right, &MatchingOptions::default(), progress)?.pairs();
     let disparities = in_common_rows(&pairs);
     if disparities.len() < NEEDED {
         return Err(RangeError::TooFew { found: disparities.len(), matches: pairs.len(), needed: NEEDED });

@@ -41,13 +41,16 @@ mod segment;
 mod views;
 
 pub use cv_core::{Cancelled, Progress, Silent};
-pub use cv_geometry::{EstimateError, RobustModel, RobustOptions};
+pub use cv_geometry::{
+    EstimateError, Intrinsics, RobustModel, RobustOptions, TwoViewError, TwoViewOptions, TwoViewPoint,
+    TwoViewReconstruction,
+};
 pub use depth::{DepthError, DepthOptions, DepthResult, check_pair, depth};
 pub use disparity_range::{RangeError, disparity_range};
 pub use estimate::{CalibratedResult, EstimateResult, ModelKind, estimate, estimate_calibrated};
 pub use matching::{
-    FeatureMethod, MatchingError, MatchingOptions, MatchingResult, PhotoFeatures, Slanted, Spacing, correspondences,
-    extract_features, match_extracted, match_features, match_photos,
+    FeatureMethod, MatchingError, MatchingOptions, MatchingResult, PhotoFeatures, Slanted, Spacing, extract_features,
+    match_extracted, match_features, match_photos,
 };
 pub use no_pair::NoPairCause;
 /// What a caller of [`match_extracted`] needs to hand in features found elsewhere, and to choose among ours.
@@ -65,8 +68,8 @@ pub mod panorama_types {
     pub use cv_panorama::*;
 }
 pub use reconstruct::{
-    DenseError, DenseOptions, DenseResult, Intrinsics, ReconstructError, ReconstructOptions, ReconstructResult,
-    ScenePoint, reconstruct, reconstruct_dense,
+    DenseError, DenseOptions, DenseResult, ReconstructError, ReconstructOptions, ReconstructResult, reconstruct,
+    reconstruct_dense,
 };
 pub use rectify::{RectifyResult, rectify};
 pub use segment::{SegmentResult, SegmentTraining, segment, train_segment};

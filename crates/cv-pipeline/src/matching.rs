@@ -135,10 +135,23 @@ pub struct MatchingResult {
     pub features: [PhotoFeatures; 2],
     /// Matches by index of the features, in order of the first photograph's.
     pub matches: Vec<DMatch>,
-    /// The same matches as positions in pixels.
-    pub pairs: Vec<Correspondence>,
     /// Stage names and their seconds.
     pub stages: Vec<(&'static str, f64)>,
+}
+
+impl MatchingResult {
+    /// Where a match of these features is, in pixels.
+    ///
+    /// # Panics
+    /// For a match of other features.
+    pub fn pair(&self, m: &DMatch) -> Correspondence {
+        pair(&self.features[0], &self.features[1], m)
+    }
+
+    /// The matches as positions in pixels, in their order.
+    pub fn pairs(&self) -> Vec<Correspondence> {
+        correspondences(&self.features[0], &self.features[1], &self.matches)
+    }
 }
 
 /// Why photographs could not be matched.
@@ -239,9 +252,13 @@ pub fn match_features(
 }
 
 /// The positions of matched features, in the order of `matches`.
-pub fn correspondences(a: &PhotoFeatures, b: &PhotoFeatures, matches: &[DMatch]) -> Vec<Correspondence> {
+pub(crate) fn correspondences(a: &PhotoFeatures, b: &PhotoFeatures, matches: &[DMatch]) -> Vec<Correspondence> {
+    matches.iter().map(|m| pair(a, b, m)).collect()
+}
+
+fn pair(a: &PhotoFeatures, b: &PhotoFeatures, m: &DMatch) -> Correspondence {
     let at = |f: &PhotoFeatures, i: u32| -> Point2<f64> { f.described.keypoints[i as usize].position.cast() };
-    matches.iter().map(|m| Correspondence { a: at(a, m.query), b: at(b, m.train) }).collect()
+    Correspondence { a: at(a, m.query), b: at(b, m.train) }
 }
 
 /// Features of two photographs and the tentative matches between them.
@@ -308,8 +325,8 @@ fn finish(
     progress: &dyn Progress,
     mut clock: StageClock,
 ) -> Result<MatchingResult, MatchingError> {
-    let mut pairs = correspondences(&features[0], &features[1], &matches);
     if let Some(kind) = options.guided {
+        let pairs = correspondences(&features[0], &features[1], &matches);
         // Without a model there is nothing to be guided by: the tentative matches stay.
         let found = match estimate(&pairs, kind, &kind.options(), progress) {
             Err(EstimateError::Cancelled(stop)) => return Err(stop.into()),
@@ -330,11 +347,10 @@ fn finish(
             let along =
                 GuidedOptions { threshold: kind.options().threshold as f32, max_ssd, ..GuidedOptions::default() };
             matches = match_guided(&features[0].described, &features[1].described, None, &model, &along)?;
-            pairs = correspondences(&features[0], &features[1], &matches);
         }
         clock.lap("guided");
     }
-    Ok(MatchingResult { features, matches, pairs, stages: clock.into_stages() })
+    Ok(MatchingResult { features, matches, stages: clock.into_stages() })
 }
 
 /// Whether a homography or a fundamental matrix explains enough of the matches: see [`Slanted::AsNeeded`].
@@ -370,7 +386,6 @@ pub(crate) fn match_reduced(
             point.scale *= (x * y).sqrt();
         }
     }
-    matching.pairs = correspondences(&matching.features[0], &matching.features[1], &matching.matches);
     Ok(matching)
 }
 
@@ -405,20 +420,14 @@ mod tests {
         for method in [FeatureMethod::Harris, FeatureMethod::Mops, FeatureMethod::Sift] {
             let options = MatchingOptions { method, ..MatchingOptions::default() };
             let result = match_photos(a.view(), b.view(), &options, &Silent).unwrap();
-            let good = result
-                .pairs
-                .iter()
-                .filter(|p| (p.b.x - p.a.x - 6.5).abs() < 1.0 && (p.b.y - p.a.y + 4.0).abs() < 1.0)
-                .count();
+            let pairs = result.pairs();
+            let good =
+                pairs.iter().filter(|p| (p.b.x - p.a.x - 6.5).abs() < 1.0 && (p.b.y - p.a.y + 4.0).abs() < 1.0).count();
             // The images differ only by the shift and rounding to bytes; a pixel is what the top of a round blob may wander by that.
             // Oriented patches at all scales need a wide margin: few fit into this small image.
             let least = if method == FeatureMethod::Mops { 15 } else { 30 };
-            assert!(
-                good >= least && good * 10 >= result.pairs.len() * 9,
-                "{method:?}: {good} of {}",
-                result.pairs.len()
-            );
-            assert_eq!(result.matches.len(), result.pairs.len());
+            assert!(good >= least && good * 10 >= pairs.len() * 9, "{method:?}: {good} of {}", pairs.len());
+            assert_eq!(result.matches.len(), pairs.len());
         }
     }
 

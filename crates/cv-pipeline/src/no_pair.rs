@@ -96,7 +96,7 @@ pub(crate) fn cause<T: Intensity, const C: usize>(
         Err(_) => return Ok(NoPairCause::Unrelated { matches: 0 }),
     };
     let tried = (options.min_disparity, options.min_disparity + options.disparities as i32 - 1);
-    Ok(judge(&found.pairs, left.height(), Some(tried)))
+    Ok(judge(&found.pairs(), left.height(), Some(tried)))
 }
 
 /// What matches of two photographs of a height show, of which the disparities `tried` gave hardly any; [`NoPairCause::Unknown`] where

@@ -49,7 +49,7 @@ pub fn rectify(
     progress.report("rectify", 1, 2)?;
     // A pair without features is rectified all the same; only its quality stays unknown.
     let pairs = match match_reduced([left.view(), right.view()], LARGEST, &MatchingOptions::default(), progress) {
-        Ok(found) => found.pairs,
+        Ok(found) => found.pairs(),
         Err(MatchingError::Cancelled(stop)) => return Err(stop.into()),
         Err(_) => Vec::new(),
     };
@@ -99,7 +99,7 @@ mod tests {
         let large = cv_imgproc::resize(photo.view(), 4500, 900, cv_imgproc::Interpolation::Bilinear).unwrap();
         let moved = RgbU8::from_fn(4500, 900, |x, y| large.at((x + 370).min(4499), (y + 90).min(899)));
         let pairs =
-            match_reduced([large.view(), moved.view()], LARGEST, &MatchingOptions::default(), &Silent).unwrap().pairs;
+            match_reduced([large.view(), moved.view()], LARGEST, &MatchingOptions::default(), &Silent).unwrap().pairs();
         let mut shift =
             [pairs.iter().map(|p| p.a.x - p.b.x).collect::<Vec<_>>(), pairs.iter().map(|p| p.a.y - p.b.y).collect()];
         let [x, y] = shift.each_mut().map(|d| median(d).unwrap());

@@ -10,7 +10,7 @@ use cv_pipeline::{
 use cv_synth::{RenderOptions, Scene, TwoView, render, two_view};
 
 fn sparse(views: &TwoView, camera: &Camera) -> ReconstructResult {
-    let options = ReconstructOptions { intrinsics: Intrinsics::Known([*camera; 2]), ..ReconstructOptions::default() };
+    let options = ReconstructOptions::new(Intrinsics::Known([*camera; 2]));
     reconstruct(views.a.image.view(), views.b.image.view(), &options, &Silent).unwrap()
 }
 
@@ -42,7 +42,7 @@ fn the_cloud_is_as_true_as_the_sparse_points_it_comes_from() {
         let dense = reconstruct_dense(a, b, &sparse, &DenseOptions::default(), &Silent).unwrap();
         let position = |p: &[f32; 3]| Point3::new(f64::from(p[0]), f64::from(p[1]), f64::from(p[2]));
         let of_dense = errors(&views, dense.cloud.positions.iter().map(position), &camera);
-        let of_sparse = errors(&views, sparse.points.iter().map(|p| p.position), &camera);
+        let of_sparse = errors(&views, sparse.scene.points.iter().map(|p| p.position), &camera);
         let at = |e: &[f64], share: f64| e[((e.len() - 1) as f64 * share) as usize];
         println!(
             "{seed}: {} points, coverage {:.2}, disparities {:?}; median error {:.4} (sparse {:.4}), 90 % {:.4} ({:.4})",
@@ -115,7 +115,7 @@ fn a_camera_that_went_ahead_is_refused_with_its_angle() {
     // 60 cm straight ahead: the epipole is in the middle of both photographs.
     let second = Pose::new(first.rotation, first.translation - Vector3::new(0.03, 0.0, 0.6));
     let photos = [first, second].map(|pose| render(&scene, &camera, &pose, &RenderOptions::default()).unwrap().image);
-    let options = ReconstructOptions { intrinsics: Intrinsics::Known([camera; 2]), ..ReconstructOptions::default() };
+    let options = ReconstructOptions::new(Intrinsics::Known([camera; 2]));
     let (a, b) = (photos[0].view(), photos[1].view());
     let sparse = reconstruct(a, b, &options, &Silent).unwrap();
     match reconstruct_dense(a, b, &sparse, &DenseOptions::default(), &Silent) {

@@ -27,9 +27,9 @@ fn a_homographys_corners_are_within_three_tenths_of_a_pixel() {
         let options = MatchingOptions::default();
         let found = match_photos(pair.a.image.view(), pair.b.image.view(), &options, &Silent).unwrap();
         let kind = ModelKind::Homography;
-        let model = estimate(&found.pairs, kind, &kind.options(), &Silent).unwrap().robust;
+        let model = estimate(&found.pairs(), kind, &kind.options(), &Silent).unwrap().robust;
         let error = homography_corner_error(&model.model, &pair.homography, 640, 480);
-        println!("seed {seed}: {} matches, {} inliers, {error:.3} px", found.pairs.len(), model.inliers.len());
+        println!("seed {seed}: {} matches, {} inliers, {error:.3} px", found.matches.len(), model.inliers.len());
         assert!(error <= 0.3, "seed {seed}: {error} px");
     }
 }
@@ -89,15 +89,16 @@ fn two_views_give_the_turn_and_the_direction_of_travel() {
         let camera = camera();
         let pair = two_view(seed, &camera, 0.6, &RenderOptions::default()).unwrap();
         let known = Intrinsics::Known([camera; 2]);
-        let options = ReconstructOptions { intrinsics: known, ..ReconstructOptions::default() };
+        let options = ReconstructOptions::new(known);
         let found = reconstruct(pair.a.image.view(), pair.b.image.view(), &options, &Silent).unwrap();
-        let turn = rotation_error(&found.pose.rotation, &pair.relative.rotation).to_degrees();
-        let way = direction_error(&found.pose.translation, &pair.relative.translation).to_degrees();
-        println!("seed {seed}: {} points, rotation {turn:.4}°, direction {way:.3}°", found.points.len());
+        let turn = rotation_error(&found.scene.pose.rotation, &pair.relative.rotation).to_degrees();
+        let way = direction_error(&found.scene.pose.translation, &pair.relative.translation).to_degrees();
+        println!("seed {seed}: {} points, rotation {turn:.4}°, direction {way:.3}°", found.scene.points.len());
         assert!(turn <= 0.2 && way <= 1.0, "seed {seed}: rotation {turn}°, direction {way}°");
         // The points too, at the true scale: their median distance from the surface that their pixel shows.
-        let scale = pair.relative.translation.norm() / found.pose.translation.norm();
+        let scale = pair.relative.translation.norm() / found.scene.pose.translation.norm();
         let mut off: Vec<f64> = found
+            .scene
             .points
             .iter()
             .filter_map(|p| {

@@ -1,7 +1,7 @@
 //! Two-view reconstruction of generated scenes with exact truth, and the scenes it has to refuse.
 
 use cv_core::{Camera, Pose, RgbU8, Rotation3, Vector3};
-use cv_pipeline::{Intrinsics, ReconstructError, ReconstructOptions, Silent, reconstruct};
+use cv_pipeline::{Intrinsics, ReconstructError, ReconstructOptions, Silent, TwoViewError, reconstruct};
 use cv_synth::{RenderOptions, Scene, direction_error, render, rotation_error, two_view};
 
 fn camera() -> Camera {
@@ -9,27 +9,27 @@ fn camera() -> Camera {
 }
 
 fn known() -> ReconstructOptions {
-    ReconstructOptions { intrinsics: Intrinsics::Known([camera(); 2]), ..ReconstructOptions::default() }
+    ReconstructOptions::new(Intrinsics::Known([camera(); 2]))
 }
 
 #[test]
 fn a_room_comes_back_with_its_pose_and_depths() {
     let views = two_view(3, &camera(), 0.4, &RenderOptions::default()).unwrap();
     let result = reconstruct(views.a.image.view(), views.b.image.view(), &known(), &Silent).unwrap();
-    let turn = rotation_error(&result.pose.rotation, &views.relative.rotation).to_degrees();
-    let direction = direction_error(&result.pose.translation, &views.relative.translation).to_degrees();
+    let turn = rotation_error(&result.scene.pose.rotation, &views.relative.rotation).to_degrees();
+    let direction = direction_error(&result.scene.pose.translation, &views.relative.translation).to_degrees();
     // The bars of the project.
     assert!(turn <= 0.2 && direction <= 1.0, "{turn} {direction}");
-    assert!(result.points.len() >= 100 && result.reprojection_rms < 1.0);
+    assert!(result.scene.points.len() >= 100 && result.scene.reprojection_rms < 1.0);
     // Depths, in units of the base line of 0.4 m: within 5 % for most points, each at its own pixel.
     let baseline = views.relative.translation.norm();
-    let right = result.points.iter().filter(|p| {
-        let (x, y) = (p.pair.a.x.round() as usize, p.pair.a.y.round() as usize);
+    let right = result.scene.points.iter().filter(|p| {
+        let (x, y) = (result.pair(p).a.x.round() as usize, result.pair(p).a.y.round() as usize);
         let truth = f64::from(views.a.depth.at(x.min(639), y.min(479))[0]);
         (p.position.z * baseline / truth - 1.0).abs() < 0.05
     });
     // Points on outlines have the depth of either side.
-    let share = right.count() as f64 / result.points.len() as f64;
+    let share = right.count() as f64 / result.scene.points.len() as f64;
     assert!(share > 0.8, "{share}");
 }
 
@@ -39,10 +39,10 @@ fn an_unknown_lens_that_bends_lines_is_found() {
     lens.distortion = cv_core::Distortion::Radial { k1: -0.15, k2: 0.0 };
     let views = two_view(3, &lens, 0.4, &RenderOptions::default()).unwrap();
     let direction = |intrinsics| {
-        let options = ReconstructOptions { intrinsics, ..ReconstructOptions::default() };
+        let options = ReconstructOptions::new(intrinsics);
         let result = reconstruct(views.a.image.view(), views.b.image.view(), &options, &Silent).unwrap();
-        let off = direction_error(&result.pose.translation, &views.relative.translation).to_degrees();
-        (result.cameras[0].fx / 560.0 - 1.0, off)
+        let off = direction_error(&result.scene.pose.translation, &views.relative.translation).to_degrees();
+        (result.scene.cameras[0].fx / 560.0 - 1.0, off)
     };
     // The bars of the project: five per cent, three degrees.
     let (focal, off) = direction(Intrinsics::Unknown);
@@ -60,11 +60,11 @@ fn a_camera_that_only_turned_is_told() {
     let photos = [first, turn.compose(&first)]
         .map(|pose| render(&scene, &camera(), &pose, &RenderOptions::default()).unwrap().image);
     match reconstruct(photos[0].view(), photos[1].view(), &known(), &Silent) {
-        Err(ReconstructError::PureRotation { share, degrees }) => {
+        Err(ReconstructError::TwoView(TwoViewError::PureRotation { share, degrees })) => {
             // The angle of (0.02, 0.12, 0.01) is 7.0 degrees.
             assert!(share > 0.95 && (degrees - 7.0).abs() < 0.2, "{share} {degrees}");
         }
-        other => panic!("{:?}", other.map(|r| r.points.len())),
+        other => panic!("{:?}", other.map(|r| r.scene.points.len())),
     }
 }
 
@@ -79,17 +79,17 @@ fn too_little_is_told_with_its_numbers() {
     // Two rooms that have nothing in common.
     assert!(matches!(
         reconstruct(views[0].view(), views[1].view(), &known(), &Silent),
-        Err(ReconstructError::TooFewMatches { .. } | ReconstructError::TooFewInliers { .. })
+        Err(ReconstructError::TwoView(TwoViewError::TooFewMatches { .. } | TwoViewError::TooFewInliers { .. }))
     ));
     let other = Camera::from_focal(320, 240, 560.0);
-    let wrong = ReconstructOptions { intrinsics: Intrinsics::Known([other; 2]), ..ReconstructOptions::default() };
+    let wrong = ReconstructOptions::new(Intrinsics::Known([other; 2]));
     assert!(matches!(
         reconstruct(views[0].view(), views[1].view(), &wrong, &Silent),
-        Err(ReconstructError::CameraSize { index: 1, .. })
+        Err(ReconstructError::TwoView(TwoViewError::CameraSize { index: 1, .. }))
     ));
-    let negative = ReconstructOptions { intrinsics: Intrinsics::Focal([-1.0, 5.0]), ..ReconstructOptions::default() };
+    let negative = ReconstructOptions::new(Intrinsics::Focal([-1.0, 5.0]));
     assert!(matches!(
         reconstruct(views[0].view(), views[1].view(), &negative, &Silent),
-        Err(ReconstructError::Camera { index: 1, .. })
+        Err(ReconstructError::TwoView(TwoViewError::Camera { index: 1, .. }))
     ));
 }

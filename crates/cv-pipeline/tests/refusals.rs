@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
 use cv_core::{Camera, Pose, RgbU8, Rotation3, Vector3};
-use cv_pipeline::{Intrinsics, ReconstructError, ReconstructOptions, Silent, reconstruct};
+use cv_pipeline::{Intrinsics, ReconstructError, ReconstructOptions, Silent, TwoViewError, reconstruct};
 use cv_synth::{RenderOptions, Scene, homography_pair, render, two_view};
 
 const FOCAL: f64 = 560.0;
@@ -12,9 +12,16 @@ fn camera() -> Camera {
     Camera::from_focal(640, 480, FOCAL)
 }
 
-fn refusal(a: &RgbU8, b: &RgbU8, intrinsics: Intrinsics) -> ReconstructError {
-    let options = ReconstructOptions { intrinsics, ..ReconstructOptions::default() };
-    reconstruct(a.view(), b.view(), &options, &Silent).map(|r| (r.points.len(), r.cameras[0].fx)).unwrap_err()
+fn refusal(a: &RgbU8, b: &RgbU8, intrinsics: Intrinsics) -> TwoViewError {
+    let result = reconstruct(a.view(), b.view(), &ReconstructOptions::new(intrinsics), &Silent);
+    match result.map(|r| (r.scene.points.len(), r.scene.cameras[0].fx)).unwrap_err() {
+        ReconstructError::TwoView(error) => error,
+        other => panic!("{other}"),
+    }
+}
+
+fn advice(error: TwoViewError) -> String {
+    ReconstructError::from(error).advice()
 }
 
 fn known() -> Intrinsics {
@@ -29,15 +36,15 @@ fn a_plane_is_told_from_a_turn_where_the_focal_length_is_known() {
         for intrinsics in [known(), Intrinsics::Focal([FOCAL; 2])] {
             match refusal(a, b, intrinsics) {
                 // A wall is a plane to the last match.
-                error @ ReconstructError::Planar { share } => {
-                    assert!(share > 0.95 && error.advice().contains("in front of the plane"), "{error}");
+                error @ TwoViewError::Planar { share } => {
+                    assert!(share > 0.95 && advice(error).contains("in front of the plane"), "{error}");
                 }
                 other => panic!("{seed}: {other}"),
             }
         }
         match refusal(a, b, Intrinsics::Unknown) {
-            error @ ReconstructError::PlanarOrTurned { share } => {
-                assert!(share > 0.95 && error.advice().contains("--focal"), "{error}");
+            error @ TwoViewError::PlanarOrTurned { share } => {
+                assert!(share > 0.95 && advice(error).contains("--focal"), "{error}");
             }
             other => panic!("{seed}: {other}"),
         }
@@ -53,15 +60,15 @@ fn a_turn_is_named_or_left_open() {
         let [a, b] = [first, turn.compose(&first)]
             .map(|pose| render(&scene, &camera(), &pose, &RenderOptions::default()).unwrap().image);
         match refusal(&a, &b, Intrinsics::Focal([FOCAL; 2])) {
-            error @ ReconstructError::PureRotation { share, degrees } => {
+            error @ TwoViewError::PureRotation { share, degrees } => {
                 // The angle of (0.02, 0.12, 0.01) is 7.0 degrees.
                 assert!(share > 0.95 && (degrees - 7.0).abs() < 0.2, "{error}");
-                assert!(error.advice().contains("cv panorama"));
+                assert!(advice(error).contains("cv panorama"));
             }
             other => panic!("{seed}: {other}"),
         }
         match refusal(&a, &b, Intrinsics::Unknown) {
-            error @ ReconstructError::PlanarOrTurned { .. } => assert!(error.advice().contains("cv panorama")),
+            error @ TwoViewError::PlanarOrTurned { .. } => assert!(advice(error).contains("cv panorama")),
             other => panic!("{seed}: {other}"),
         }
     }
@@ -73,10 +80,10 @@ fn a_camera_that_hardly_moved_is_told() {
     for seed in [3, 4] {
         let views = two_view(seed, &camera(), 0.02, &RenderOptions::default()).unwrap();
         match refusal(&views.a.image, &views.b.image, known()) {
-            error @ ReconstructError::PureRotation { share, .. } => {
+            error @ TwoViewError::PureRotation { share, .. } => {
                 assert!(share > 0.95 && error.to_string().contains("hardly moved"), "{error}");
             }
-            ReconstructError::LittleParallax { degrees, needed } => assert!(degrees < needed && needed > 0.4),
+            TwoViewError::LittleParallax { degrees, needed } => assert!(degrees < needed && needed > 0.4),
             other => panic!("{seed}: {other}"),
         }
     }
@@ -90,19 +97,18 @@ fn a_focal_length_that_cannot_be_is_told_with_one_that_can() {
         // In another unit, and of a thumbnail. (Where one that is too long cannot be told from the right one, it passes.)
         for wrong in [35.0, 230.0] {
             match refusal(a, b, Intrinsics::Focal([wrong; 2])) {
-                error @ ReconstructError::WrongFocal { given, better, deviations, .. } => {
+                error @ TwoViewError::WrongFocal { given, better, deviations, .. } => {
                     assert!(given == wrong && deviations > 4.0, "{error}");
                     // The bar of an unknown focal length is five per cent, after the bundle; this is before.
-                    assert!((better / FOCAL).ln().abs() < 0.15 && error.advice().contains("--focal"), "{error}");
+                    assert!((better / FOCAL).ln().abs() < 0.15 && advice(error).contains("--focal"), "{error}");
                 }
                 other => panic!("{seed} {wrong}: {other}"),
             }
         }
         // An inaccurate one passes.
         for near in [500.0, 640.0] {
-            let options =
-                ReconstructOptions { intrinsics: Intrinsics::Focal([near; 2]), ..ReconstructOptions::default() };
-            assert!(reconstruct(a.view(), b.view(), &options, &Silent).unwrap().points.len() > 100);
+            let options = ReconstructOptions::new(Intrinsics::Focal([near; 2]));
+            assert!(reconstruct(a.view(), b.view(), &options, &Silent).unwrap().scene.points.len() > 100);
         }
     }
 }
@@ -117,10 +123,10 @@ fn too_few_matches_are_counted() {
     for intrinsics in [known(), Intrinsics::Unknown] {
         let error = refusal(&views[0], &views[1], intrinsics);
         match error {
-            ReconstructError::TooFewMatches { got, needed } => assert!(got < needed),
-            ReconstructError::TooFewInliers { inliers, needed, .. } => assert!(inliers < needed),
+            TwoViewError::TooFewMatches { got, needed } => assert!(got < needed),
+            TwoViewError::TooFewInliers { inliers, needed, .. } => assert!(inliers < needed),
             other => panic!("{other}"),
         }
-        assert!(error.advice().contains("share more of the scene"));
+        assert!(advice(error).contains("share more of the scene"));
     }
 }

@@ -15,20 +15,16 @@ fn depths_are_off_by_what_the_covariances_say_and_few_matches_are_wrong() {
         let views = two_view(seed, &camera, 0.4, &RenderOptions::default()).unwrap();
         let scale = views.relative.translation.norm();
         for guided in [false, true] {
-            let options = ReconstructOptions {
-                intrinsics: Intrinsics::Known([camera; 2]),
-                guided,
-                ..ReconstructOptions::default()
-            };
+            let options = ReconstructOptions { guided, ..ReconstructOptions::new(Intrinsics::Known([camera; 2])) };
             let result = reconstruct(views.a.image.view(), views.b.image.view(), &options, &Silent).unwrap();
             let (mut w, mut n, mut bad) = (0.0, 0.0, 0.0);
-            for p in &result.points {
+            for p in &result.scene.points {
                 // Where the surface is on the ray to the point, and where the second camera sees it.
                 let pixel = camera.project(&p.position).unwrap();
                 let Some(truth) = views.scene.point_at(&camera, &views.a.pose, pixel) else { continue };
                 let at = camera.project(&views.b.pose.transform(&truth));
                 // Farther off than three pixels is no noise of the position: it is another thing.
-                let miss = at.map_or(f64::INFINITY, |q| (q - p.pair.b).norm());
+                let miss = at.map_or(f64::INFINITY, |q| (q - result.pair(p).b).norm());
                 n += 1.0;
                 if miss > 3.0 {
                     bad += 1.0;

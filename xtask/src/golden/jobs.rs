@@ -74,13 +74,13 @@ fn plane(fixtures: &Path) -> Result<Outcome> {
     let known = matrix(&truth(fixtures, "plane.json")?["homography"])?;
     let found = match_photos(a.view(), b.view(), &MatchingOptions::default(), &Silent)?;
     let kind = ModelKind::Homography;
-    let model = estimate(&found.pairs, kind, &kind.options(), &Silent)?.robust;
+    let model = estimate(&found.pairs(), kind, &kind.options(), &Silent)?.robust;
     let error = homography_corner_error(&model.model, &known, a.width(), a.height());
     Ok(Outcome {
         checks: vec![Check::at_most("corner error, px", error, 0.3)],
         figures: vec![
             Figure { name: "corner_error_px", value: error, tolerance: 0.02 },
-            Figure { name: "matches", value: found.pairs.len() as f64, tolerance: 3.0 },
+            Figure { name: "matches", value: found.matches.len() as f64, tolerance: 3.0 },
             Figure { name: "inliers", value: model.inliers.len() as f64, tolerance: 3.0 },
         ],
     })
@@ -132,14 +132,14 @@ fn two_views(fixtures: &Path) -> Result<Outcome> {
     let (a, b) = (picture(fixtures, "two-view/a.jpg")?, picture(fixtures, "two-view/b.jpg")?);
     let known = truth(fixtures, "two-view.json")?;
     let camera = Camera::from_focal(a.width(), a.height(), number(&known, "focal_px")?);
-    let options = ReconstructOptions { intrinsics: Intrinsics::Known([camera; 2]), ..ReconstructOptions::default() };
+    let options = ReconstructOptions::new(Intrinsics::Known([camera; 2]));
     let found = reconstruct(a.view(), b.view(), &options, &Silent)?;
     let rotation = Rotation3::from_matrix_unchecked(matrix(&known["rotation"])?);
     let translation: Vec<f64> =
         known["translation_m"].as_array().into_iter().flatten().filter_map(Value::as_f64).collect();
     ensure!(translation.len() == 3, "no translation");
-    let turn = rotation_error(&found.pose.rotation, &rotation).to_degrees();
-    let way = direction_error(&found.pose.translation, &Vector3::from_column_slice(&translation)).to_degrees();
+    let turn = rotation_error(&found.scene.pose.rotation, &rotation).to_degrees();
+    let way = direction_error(&found.scene.pose.translation, &Vector3::from_column_slice(&translation)).to_degrees();
     Ok(Outcome {
         checks: vec![
             Check::at_most("error of the rotation, degrees", turn, 0.2),
@@ -148,8 +148,8 @@ fn two_views(fixtures: &Path) -> Result<Outcome> {
         figures: vec![
             Figure { name: "rotation_error_deg", value: turn, tolerance: 0.01 },
             Figure { name: "direction_error_deg", value: way, tolerance: 0.1 },
-            Figure { name: "points", value: found.points.len() as f64, tolerance: 10.0 },
-            Figure { name: "reprojection_rms_px", value: found.reprojection_rms, tolerance: 0.02 },
+            Figure { name: "points", value: found.scene.points.len() as f64, tolerance: 10.0 },
+            Figure { name: "reprojection_rms_px", value: found.scene.reprojection_rms, tolerance: 0.02 },
         ],
     })
 }

@@ -28,13 +28,13 @@ pub(super) fn run(data: &Path) -> Result<Vec<Check>> {
                     "{:6} {:6} features {:5} matches ",
                     m.features[0].described.keypoints.len(),
                     m.features[1].described.keypoints.len(),
-                    m.pairs.len()
+                    m.matches.len()
                 )),
                 Err(error) => line.push_str(&format!("{error} ")),
             }
             for (seed, errors) in errors.iter_mut().enumerate() {
                 let options = RobustOptions { seed: seed as u64, ..kind.options() };
-                let model = matched.as_ref().ok().and_then(|m| estimate(&m.pairs, kind, &options, &Silent).ok());
+                let model = matched.as_ref().ok().and_then(|m| estimate(&m.pairs(), kind, &options, &Silent).ok());
                 let error = model.map_or(f64::INFINITY, |m| annotated::rms(kind, &m.robust.model, &pair.checked));
                 line.push_str(&format!(" {error:7.2}"));
                 errors.push(error);

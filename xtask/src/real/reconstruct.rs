@@ -25,49 +25,48 @@ pub(crate) fn run(data: &Path) -> Result<Vec<Check>> {
         let second = read(i + 1)?.into_rgb8();
         // The header holds COLMAP's camera, whose pixel centers the reader brings to ours.
         let camera = cv_io::read_camera(&reference, Some(first.size()))?;
-        let options =
-            ReconstructOptions { intrinsics: Intrinsics::Known([camera; 2]), ..ReconstructOptions::default() };
+        let options = ReconstructOptions::new(Intrinsics::Known([camera; 2]));
         let result = reconstruct(first.view(), second.view(), &options, &Silent)
             .with_context(|| format!("{} and {}", name(i), name(i + 1)))?;
         let truth = Pose::relative(&pose(&text, &name(i))?, &pose(&text, &name(i + 1))?);
-        let turned = cv_synth::rotation_error(&result.pose.rotation, &truth.rotation).to_degrees();
-        let moved = cv_synth::direction_error(&result.pose.translation, &truth.translation).to_degrees();
-        let said = result.pose_deviation.map(f64::to_degrees);
+        let turned = cv_synth::rotation_error(&result.scene.pose.rotation, &truth.rotation).to_degrees();
+        let moved = cv_synth::direction_error(&result.scene.pose.translation, &truth.translation).to_degrees();
+        let said = result.scene.pose_deviation.map(f64::to_degrees);
         println!(
             "{} to {}: {} matches, {} agree, {} points, {:.3} px; rotation {turned:.3}° ({:.3}° by our own account), \
              direction {moved:.3}° ({:.3}°)",
             name(i),
             name(i + 1),
-            result.matching.pairs.len(),
-            result.inliers.len(),
-            result.points.len(),
-            result.reprojection_rms,
+            result.matching.matches.len(),
+            result.scene.inliers.len(),
+            result.scene.points.len(),
+            result.scene.reprojection_rms,
             said[0],
             said[1],
         );
         (turn, direction) = (turn.max(turned), direction.max(moved));
-        (rms, points) = (rms.max(result.reprojection_rms), points.min(result.points.len()));
+        (rms, points) = (rms.max(result.scene.reprojection_rms), points.min(result.scene.points.len()));
         // Without the camera: the focal length of EXIF, and the distortion that the matches show.
-        let options = ReconstructOptions { intrinsics: Intrinsics::Focal([focal; 2]), ..options };
+        let options = ReconstructOptions::new(Intrinsics::Focal([focal; 2]));
         let result = reconstruct(first.view(), second.view(), &options, &Silent)
             .with_context(|| format!("{} and {} by EXIF", name(i), name(i + 1)))?;
-        let moved = cv_synth::direction_error(&result.pose.translation, &truth.translation).to_degrees();
-        println!("  by EXIF: focal length {:.0} px, direction {moved:.3}°", result.cameras[0].fx);
+        let moved = cv_synth::direction_error(&result.scene.pose.translation, &truth.translation).to_degrees();
+        println!("  by EXIF: focal length {:.0} px, direction {moved:.3}°", result.scene.cameras[0].fx);
         exif_direction = exif_direction.max(moved);
-        exif_focal = exif_focal.max((result.cameras[0].fx / camera.fx - 1.0).abs());
+        exif_focal = exif_focal.max((result.scene.cameras[0].fx / camera.fx - 1.0).abs());
         // And without that: from the matches alone.
-        let options = ReconstructOptions { intrinsics: Intrinsics::Unknown, ..options };
+        let options = ReconstructOptions::new(Intrinsics::Unknown);
         let result = reconstruct(first.view(), second.view(), &options, &Silent)
             .with_context(|| format!("{} and {} by themselves", name(i), name(i + 1)))?;
-        let off = result.cameras[0].fx / camera.fx - 1.0;
+        let off = result.scene.cameras[0].fx / camera.fx - 1.0;
         println!(
             "  by themselves: focal length {:.0} px, off {:+.1} % ({:.1} % by our own account)",
-            result.cameras[0].fx,
+            result.scene.cameras[0].fx,
             100.0 * off,
-            100.0 * result.focal_deviation
+            100.0 * result.scene.focal_deviation
         );
         free_close += f64::from(u8::from(off.abs() <= 0.05));
-        free_squares += (off / result.focal_deviation).powi(2);
+        free_squares += (off / result.scene.focal_deviation).powi(2);
         first = second;
     }
     Ok(vec![

@@ -106,7 +106,7 @@ impl Run for Args {
             Failure::new(error)
                 .advice(format!("look at {}: is it sharp, with texture, and large enough?", path.display()))
         })?;
-        if result.pairs.is_empty() {
+        if result.matches.is_empty() {
             return Err(Failure::new(format!(
                 "no feature of {} ({} features) matches one of {} ({})",
                 self.first.display(),
@@ -124,13 +124,13 @@ impl Run for Args {
         }
         if let Some(path) = &self.output {
             let scores: Vec<f64> = result.matches.iter().map(|m| f64::from(m.ratio)).collect();
-            cv_io::write_matches(path, &result.pairs, Some(&scores))?;
+            cv_io::write_matches(path, &result.pairs(), Some(&scores))?;
         }
         context.report(|| self.html(&a, &b, &result, context.seed))?;
         let counts = result.features.each_ref().map(|f| f.described.keypoints.len());
         let dropped = result.features.each_ref().map(|f| f.described.dropped.len());
         Ok(Outcome::new(result.stages)
-            .with("matches", result.pairs.len())
+            .with("matches", result.matches.len())
             .with("features", counts)
             .with("found", result.features.each_ref().map(|f| f.found))
             .with("dropped", dropped)
@@ -138,7 +138,7 @@ impl Run for Args {
             .with("beyond_limit", result.features.each_ref().map(|f| f.described.beyond_limit))
             .summary(format!(
                 "{} matches between {} and {} features ({} and {} points left out near the border or on flat patches)",
-                result.pairs.len(),
+                result.matches.len(),
                 counts[0],
                 counts[1],
                 dropped[0],
@@ -156,7 +156,7 @@ impl Args {
         report.subtitle(&format!("{} and {}", self.first.display(), self.second.display()));
         let (model, inliers) = agreed(result, seed);
         report
-            .headline("matches", &result.pairs.len().to_string())
+            .headline("matches", &result.pairs().len().to_string())
             .headline("that agree", &inliers.iter().filter(|i| **i).count().to_string());
         report.section("Features");
         for (name, image, features) in [("first", a, &result.features[0]), ("second", b, &result.features[1])] {
@@ -192,11 +192,11 @@ impl Args {
         }
         report.section("Matches");
         let style = MatchStyle::default();
-        let before = draw_matches(a.view(), b.view(), &result.pairs, None, &style);
+        let before = draw_matches(a.view(), b.view(), &result.pairs(), None, &style);
         report.figure(picture(before, "Tentative matches, each in a color of its own.")?);
         match model {
             Some(model) => {
-                let after = draw_matches(a.view(), b.view(), &result.pairs, Some(&inliers), &style);
+                let after = draw_matches(a.view(), b.view(), &result.pairs(), Some(&inliers), &style);
                 report.figure(picture(
                     after,
                     &format!("The same after RANSAC: those that fit one {model} green, others red."),
@@ -317,7 +317,7 @@ fn statistics(report: &mut Report, result: &MatchingResult) {
 fn agreed(result: &MatchingResult, seed: Option<u64>) -> (Option<&'static str>, Vec<bool>) {
     let fit = |kind: ModelKind| {
         let options = RobustOptions { seed: seed.unwrap_or(RobustOptions::default().seed), ..kind.options() };
-        estimate(&result.pairs, kind, &options, &Silent).map(|r| r.robust.inliers).unwrap_or_default()
+        estimate(&result.pairs(), kind, &options, &Silent).map(|r| r.robust.inliers).unwrap_or_default()
     };
     let (h, f) = (fit(ModelKind::Homography), fit(ModelKind::Fundamental));
     let (model, inliers) = match (h.len(), f.len()) {
@@ -325,7 +325,7 @@ fn agreed(result: &MatchingResult, seed: Option<u64>) -> (Option<&'static str>, 
         (h_count, f_count) if h_count * 10 >= f_count * 9 => (Some("homography"), h),
         _ => (Some("fundamental matrix"), f),
     };
-    let mut mask = vec![false; result.pairs.len()];
+    let mut mask = vec![false; result.matches.len()];
     inliers.into_iter().for_each(|i| mask[i] = true);
     (model, mask)
 }

@@ -60,10 +60,10 @@ pub(crate) struct Args {
     #[arg(long, conflicts_with_all = ["camera", "focal"])]
     ignore_exif: bool,
     /// Largest distance of a match from its epipolar line, in pixels.
-    #[arg(long, value_name = "PX", default_value_t = ReconstructOptions::default().robust.threshold)]
+    #[arg(long, value_name = "PX", default_value_t = ReconstructOptions::default().two_view.robust.threshold)]
     threshold: f64,
     /// Largest reprojection error of a point that is kept, in pixels.
-    #[arg(long, value_name = "PX", default_value_t = ReconstructOptions::default().max_reprojection)]
+    #[arg(long, value_name = "PX", default_value_t = ReconstructOptions::default().two_view.max_reprojection)]
     max_error: f64,
     /// Smallest angle between the two rays of a point that is kept, in degrees.
     #[arg(long, value_name = "DEGREES", default_value_t = 0.1)]
@@ -108,13 +108,13 @@ impl Run for Args {
         let photos = [cv_io::read_image(&self.first)?, cv_io::read_image(&self.second)?];
         let (intrinsics, source) = self.intrinsics(&photos)?;
         context.note(&source);
-        let mut options = ReconstructOptions { intrinsics, ..ReconstructOptions::default() };
-        options.robust.threshold = self.threshold;
-        options.max_reprojection = self.max_error;
-        options.min_angle = self.min_angle.to_radians();
+        let mut options = ReconstructOptions::new(intrinsics);
+        options.two_view.robust.threshold = self.threshold;
+        options.two_view.max_reprojection = self.max_error;
+        options.two_view.min_angle = self.min_angle.to_radians();
         options.matching.max_features = self.features;
         if let Some(seed) = context.seed {
-            options.robust.seed = seed;
+            options.two_view.robust.seed = seed;
         }
         let [a, b] = photos.map(DynImage::into_rgb8);
         let result = match reconstruct(a.view(), b.view(), &options, context) {
@@ -151,8 +151,8 @@ const DOUBTFUL: f64 = 0.05;
 
 /// What to think of a focal length that the photographs hardly show.
 fn doubt(result: &ReconstructResult) -> Option<String> {
-    let percent = 100.0 * result.focal_deviation;
-    (result.focal_deviation > DOUBTFUL).then(|| {
+    let percent = 100.0 * result.scene.focal_deviation;
+    (result.scene.focal_deviation > DOUBTFUL).then(|| {
         format!(
             "the focal length is known to ±{percent:.0} % only, and the depth of the cloud may be stretched by as much"
         )
@@ -216,26 +216,26 @@ impl Args {
     }
 
     fn model(&self, result: &ReconstructResult) -> Model {
-        let same = result.cameras[0] == result.cameras[1];
+        let same = result.scene.cameras[0] == result.scene.cameras[1];
         let name = |path: &Path| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
         let mut model = Model::default();
-        model.cameras.insert(1, result.cameras[0]);
+        model.cameras.insert(1, result.scene.cameras[0]);
         if !same {
-            model.cameras.insert(2, result.cameras[1]);
+            model.cameras.insert(2, result.scene.cameras[1]);
         }
-        let pair = |i: usize| result.points[i].pair;
-        let points = 0..result.points.len();
+        let pair = |i: usize| result.pair(&result.scene.points[i]);
+        let points = 0..result.scene.points.len();
         let seen = |second: bool| {
             let at = |i| if second { pair(i).b } else { pair(i).a };
             points.clone().map(|i| (at(i), Some(i as u64 + 1))).collect()
         };
         let image = |path, camera, pose, points| ModelImage { name: name(path), camera, pose, points };
         model.images.insert(1, image(&self.first, 1, Pose::identity(), seen(false)));
-        model.images.insert(2, image(&self.second, if same { 1 } else { 2 }, result.pose, seen(true)));
-        for (i, p) in result.points.iter().enumerate() {
+        model.images.insert(2, image(&self.second, if same { 1 } else { 2 }, result.scene.pose, seen(true)));
+        for (i, (p, color)) in result.scene.points.iter().zip(&result.colors).enumerate() {
             let point = ModelPoint {
                 position: p.position,
-                color: p.color,
+                color: *color,
                 error: p.reprojection,
                 track: vec![(1, i as u32), (2, i as u32)],
             };
@@ -246,37 +246,37 @@ impl Args {
 
     fn outcome(&self, result: &ReconstructResult, dense: Option<&DenseResult>) -> Outcome {
         let rows = |m: &Matrix3<f64>| -> [[f64; 3]; 3] { std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)])) };
-        let t = result.pose.translation;
-        let degrees = result.pose_deviation.map(f64::to_degrees);
+        let t = result.scene.pose.translation;
+        let degrees = result.scene.pose_deviation.map(f64::to_degrees);
         let mut summary = format!(
             "{} points from {} of {} matches, {:.3} px RMS; turned by {:.2} degrees, median angle {:.2} degrees",
-            result.points.len(),
-            result.inliers.len(),
-            result.matching.pairs.len(),
-            result.reprojection_rms,
-            result.pose.rotation_angle().to_degrees(),
-            result.median_angle.to_degrees(),
+            result.scene.points.len(),
+            result.scene.inliers.len(),
+            result.matching.matches.len(),
+            result.scene.reprojection_rms,
+            result.scene.pose.rotation_angle().to_degrees(),
+            result.scene.median_angle.to_degrees(),
         );
-        if result.focal_deviation > 0.0 {
-            let (focal, percent) = (result.cameras[0].fx, 100.0 * result.focal_deviation);
+        if result.scene.focal_deviation > 0.0 {
+            let (focal, percent) = (result.scene.cameras[0].fx, 100.0 * result.scene.focal_deviation);
             summary += &format!("; focal length {focal:.0} px ± {percent:.1} %");
         }
         let mut stages = result.stages.clone();
         stages.extend(dense.iter().flat_map(|d| &d.stages).map(|(name, seconds)| (dense_stage(name), *seconds)));
         let outcome = Outcome::new(stages)
-            .with("points", result.points.len())
-            .with("matches", result.matching.pairs.len())
-            .with("inliers", result.inliers.len())
-            .with("guided", result.guided)
-            .with("reprojection_rms_px", result.reprojection_rms)
-            .with("rotation", rows(result.pose.rotation.matrix()))
+            .with("points", result.scene.points.len())
+            .with("matches", result.matching.matches.len())
+            .with("inliers", result.scene.inliers.len())
+            .with("guided", result.scene.guided)
+            .with("reprojection_rms_px", result.scene.reprojection_rms)
+            .with("rotation", rows(result.scene.pose.rotation.matrix()))
             .with("translation", [t.x, t.y, t.z])
             .with("rotation_deviation_degrees", degrees[0])
             .with("translation_deviation_degrees", degrees[1])
-            .with("focal_px", result.cameras.map(|c| c.fx))
-            .with("focal_deviation", result.focal_deviation)
-            .with("median_angle_degrees", result.median_angle.to_degrees())
-            .with("planar_share", result.planar_share);
+            .with("focal_px", result.scene.cameras.map(|c| c.fx))
+            .with("focal_deviation", result.scene.focal_deviation)
+            .with("median_angle_degrees", result.scene.median_angle.to_degrees())
+            .with("planar_share", result.scene.planar_share);
         let Some(dense) = dense else { return outcome.summary(summary) };
         let (width, height) = dense.size;
         let (first, count) = dense.disparities;
@@ -301,10 +301,13 @@ impl Args {
         let mut report = Report::new("Two-view reconstruction");
         report.subtitle(&format!("{} and {}", self.first.display(), self.second.display()));
         report
-            .headline("points", &result.points.len().to_string())
-            .headline("matches that agree", &format!("{} of {}", result.inliers.len(), result.matching.pairs.len()))
-            .headline("reprojection", &format!("{:.2} px", result.reprojection_rms))
-            .headline("median angle", &format!("{:.2}°", result.median_angle.to_degrees()));
+            .headline("points", &result.scene.points.len().to_string())
+            .headline(
+                "matches that agree",
+                &format!("{} of {}", result.scene.inliers.len(), result.matching.matches.len()),
+            )
+            .headline("reprojection", &format!("{:.2} px", result.scene.reprojection_rms))
+            .headline("median angle", &format!("{:.2}°", result.scene.median_angle.to_degrees()));
 
         report.section("The cloud");
         report.paragraph(
@@ -312,8 +315,8 @@ impl Args {
              Drag to turn, scroll to come nearer.",
         );
         let mut scene = PointScene::new(&result.cloud());
-        scene.camera(&result.cameras[0], &Pose::identity(), camera_color(0));
-        scene.camera(&result.cameras[1], &result.pose, camera_color(1));
+        scene.camera(&result.scene.cameras[0], &Pose::identity(), camera_color(0));
+        scene.camera(&result.scene.cameras[1], &result.scene.pose, camera_color(1));
         report.points(
             &scene,
             Some(png(&render_points(&scene, Viewpoint::Camera, 1200, 800))?),
@@ -327,30 +330,34 @@ impl Args {
         }
 
         report.section("The motion");
-        let angle = result.pose.rotation_angle();
-        let axis = result.pose.rotation.axis().map_or([0.0; 3], |axis| [axis.x, axis.y, axis.z].map(|v| v * angle));
-        let t = result.pose.translation;
+        let angle = result.scene.pose.rotation_angle();
+        let axis =
+            result.scene.pose.rotation.axis().map_or([0.0; 3], |axis| [axis.x, axis.y, axis.z].map(|v| v * angle));
+        let t = result.scene.pose.translation;
         let degrees = |v: f64| format!("{:.3}°", v.to_degrees());
-        let deviation = match result.focal_deviation {
+        let deviation = match result.scene.focal_deviation {
             0.0 => String::new(),
             share => format!(" ± {:.1} %", 100.0 * share),
         };
         report.facts(&[
             ("rotation", format!("{} about ({:.3}, {:.3}, {:.3})", degrees(angle), axis[0], axis[1], axis[2])),
             ("direction of the translation", format!("({:.4}, {:.4}, {:.4})", t.x, t.y, t.z)),
-            ("standard deviation of the rotation", degrees(result.pose_deviation[0])),
-            ("standard deviation of the direction", degrees(result.pose_deviation[1])),
-            ("matches along epipolar lines", result.guided.to_string()),
+            ("standard deviation of the rotation", degrees(result.scene.pose_deviation[0])),
+            ("standard deviation of the direction", degrees(result.scene.pose_deviation[1])),
+            ("matches along epipolar lines", result.scene.guided.to_string()),
             (
                 "focal lengths",
-                format!("{:.1} and {:.1} px{deviation} ({source})", result.cameras[0].fx, result.cameras[1].fx),
+                format!(
+                    "{:.1} and {:.1} px{deviation} ({source})",
+                    result.scene.cameras[0].fx, result.scene.cameras[1].fx
+                ),
             ),
-            ("explained by one plane", format!("{:.0} % of the matches that agree", 100.0 * result.planar_share)),
+            ("explained by one plane", format!("{:.0} % of the matches that agree", 100.0 * result.scene.planar_share)),
         ]);
         if let Some(text) = doubt(result) {
             report.note(Note::Warning, &format!("{}{}.", text[..1].to_uppercase(), &text[1..]));
         }
-        if result.planar_share > 0.8 {
+        if result.scene.planar_share > 0.8 {
             report.note(
                 Note::Warning,
                 "Most of the scene is nearly one plane: the motion is less certain than the deviations say.",
@@ -368,9 +375,9 @@ impl Args {
             ),
             Figure::new(png(&draw_keypoints(b.view(), &shown(fb), green))?, &format!("{} of the second.", fb.len())),
         ]);
-        let pairs = &result.matching.pairs;
+        let pairs = &result.matching.pairs();
         let mut mask = vec![false; pairs.len()];
-        result.inliers.iter().for_each(|&i| mask[i] = true);
+        result.scene.inliers.iter().for_each(|&i| mask[i] = true);
         let style = MatchStyle::default();
         let before = draw_matches(a.view(), b.view(), pairs, None, &style);
         let after = draw_matches(a.view(), b.view(), pairs, Some(&mask), &style);
@@ -379,13 +386,13 @@ impl Args {
             png(&after)?,
             "The same after the search for a motion: matches that agree green, others red.",
         ));
-        let chosen: Vec<Correspondence> = result.inliers.iter().map(|&i| pairs[i]).collect();
-        let lines = draw_epipolar_lines(a.view(), b.view(), &result.fundamental(), &chosen, 24);
+        let chosen: Vec<Correspondence> = result.scene.inliers.iter().map(|&i| pairs[i]).collect();
+        let lines = draw_epipolar_lines(a.view(), b.view(), &result.scene.fundamental(), &chosen, 24);
         report.figure(Figure::new(png(&lines)?, "Points and their epipolar lines: each point of one photograph lies on its line in the other (up to the lens distortion, which bends lines)."));
 
         report.section("Quality");
-        let errors: Vec<f32> = result.points.iter().map(|p| p.reprojection as f32).collect();
-        let angles: Vec<f32> = result.points.iter().map(|p| p.angle.to_degrees() as f32).collect();
+        let errors: Vec<f32> = result.scene.points.iter().map(|p| p.reprojection as f32).collect();
+        let angles: Vec<f32> = result.scene.points.iter().map(|p| p.angle.to_degrees() as f32).collect();
         let plot = |title: &str, unit: &str, values: &[f32]| {
             cv_report::Plot::new(title, unit, "points").histogram(
                 "",
@@ -426,8 +433,8 @@ fn dense_section(report: &mut Report, dense: &DenseResult, result: &ReconstructR
     let depth = draw_map(dense.depth.view(), &MapStyle::depth("distances between the cameras"));
     report.figure(Figure::new(png(&depth)?, "Depth of the first photograph: near blue, far red, unknown gray."));
     let mut scene = PointScene::new(&dense.cloud);
-    scene.camera(&result.cameras[0], &Pose::identity(), camera_color(0));
-    scene.camera(&result.cameras[1], &result.pose, camera_color(1));
+    scene.camera(&result.scene.cameras[0], &Pose::identity(), camera_color(0));
+    scene.camera(&result.scene.cameras[1], &result.scene.pose, camera_color(1));
     let caption = match scene.left_out() {
         0 => "The dense cloud.".to_owned(),
         n => format!("The dense cloud, thinned by {n} points; the file has all of them."),

@@ -136,7 +136,7 @@ pub fn reconstruct_dense(
     OptionError::check("max_size", options.max_size as f64, "at least 32 px", |v| v >= 32.0)?;
     OptionError::check("max_deviation", options.max_deviation.into(), "above 0", |v| v > 0.0)?;
     let photos = [a, b];
-    for (photo, camera) in photos.iter().zip(&sparse.cameras) {
+    for (photo, camera) in photos.iter().zip(&sparse.scene.cameras) {
         let expected = (camera.width, camera.height);
         if photo.size() != expected {
             return Err(RectifyError::ImageSize { image: photo.size(), expected }.into());
@@ -144,12 +144,12 @@ pub fn reconstruct_dense(
     }
     let mut clock = StageClock::new();
     progress.report("rectify", 0, 1)?;
-    let longest = sparse.cameras.iter().map(|c| c.width.max(c.height)).max().unwrap_or(1);
+    let longest = sparse.scene.cameras.iter().map(|c| c.width.max(c.height)).max().unwrap_or(1);
     let factor = (options.max_size as f64 / longest as f64).min(1.0);
     let side = |n: usize| ((n as f64 * factor).round() as usize).max(1);
-    let cameras = sparse.cameras.map(|camera| camera.resized(side(camera.width), side(camera.height)));
-    let rig = StereoRig { left: cameras[0], right: cameras[1], right_from_left: sparse.pose };
-    let positions: Vec<Point3<f64>> = sparse.points.iter().map(|p| p.position).collect();
+    let cameras = sparse.scene.cameras.map(|camera| camera.resized(side(camera.width), side(camera.height)));
+    let rig = StereoRig { left: cameras[0], right: cameras[1], right_from_left: sparse.scene.pose };
+    let positions: Vec<Point3<f64>> = sparse.scene.points.iter().map(|p| p.position).collect();
     let scene = SceneRectification::new(&rig, &positions)?;
     let views = [scene.views.left, scene.views.right];
     let size = (views[0].camera.width, views[0].camera.height);

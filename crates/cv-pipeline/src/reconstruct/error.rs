@@ -1,8 +1,8 @@
 //! Why two photographs could not be reconstructed, and what to try.
 
 use crate::MatchingError;
-use cv_core::{CameraError, Cancelled};
-use cv_geometry::EstimateError;
+use cv_core::Cancelled;
+use cv_geometry::TwoViewError;
 
 /// Why two photographs could not be reconstructed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -10,123 +10,9 @@ pub enum ReconstructError {
     /// The photographs could not be matched at all.
     #[error(transparent)]
     Matching(MatchingError),
-    /// A camera is not one.
-    #[error("camera {index}: {source}")]
-    Camera {
-        /// 1 or 2.
-        index: usize,
-        /// Why.
-        source: CameraError,
-    },
-    /// A camera is not that of its photograph.
-    #[error("camera {index} takes pictures of {camera:?} px, but its photograph is of {photo:?} px")]
-    CameraSize {
-        /// 1 or 2.
-        index: usize,
-        /// Width and height by the camera.
-        camera: (usize, usize),
-        /// Width and height of the photograph.
-        photo: (usize, usize),
-    },
-    /// Too few tentative matches.
-    #[error("{got} matches are too few: at least {needed} are needed")]
-    TooFewMatches {
-        /// Matches found.
-        got: usize,
-        /// Matches needed.
-        needed: usize,
-    },
-    /// Too few matches agree on a motion.
-    #[error("only {inliers} of {matches} matches ({:.0} %) agree on a camera motion; at least {needed} must", 100.0 * *inliers as f64 / *matches as f64)]
-    TooFewInliers {
-        /// Matches that agree.
-        inliers: usize,
-        /// Matches.
-        matches: usize,
-        /// Matches that must agree.
-        needed: usize,
-    },
-    /// The camera turned without moving.
-    #[error("the camera only turned, or hardly moved: a rotation by {degrees:.1} degrees explains {:.0} % of the matches", 100.0 * share)]
-    PureRotation {
-        /// Share of the inliers that the rotation explains.
-        share: f64,
-        /// Its angle in degrees.
-        degrees: f64,
-    },
-    /// All points lie on one plane.
-    #[error("the scene is one plane: a homography explains {:.0} % of the matches", 100.0 * share)]
-    Planar {
-        /// Share of the inliers that the homography explains.
-        share: f64,
-    },
-    /// A homography explains the matches, and the focal length, by which a plane and a turn could be told apart, is unknown.
-    #[error("the scene is one plane, or the camera only turned: a homography explains {:.0} % of the matches", 100.0 * share)]
-    PlanarOrTurned {
-        /// Share of the inliers that the homography explains.
-        share: f64,
-    },
-    /// The rays to the points are nearly parallel.
-    #[error(
-        "too little parallax: the median angle between the two rays of a point is {degrees:.2} degrees; {needed:.2} are needed"
-    )]
-    LittleParallax {
-        /// Median angle in degrees.
-        degrees: f64,
-        /// Angle needed, in degrees.
-        needed: f64,
-    },
-    /// The matches do not tell the motion well enough.
-    #[error(
-        "the motion is uncertain: {degrees:.1} degrees in its direction, {allowed:.1} are allowed ({inliers} of {matches} matches agree)"
-    )]
-    UncertainPose {
-        /// Standard deviation of the direction, or angle to another direction that fits as well, in degrees.
-        degrees: f64,
-        /// Angle allowed, in degrees.
-        allowed: f64,
-        /// Matches that agree.
-        inliers: usize,
-        /// Matches.
-        matches: usize,
-    },
-    /// Another focal length explains the matches far better than the one that was given.
-    #[error(
-        "the focal length given, {given:.0} px, fits the matches worse than one of about {better:.0} px, by {deviations:.0} standard deviations"
-    )]
-    WrongFocal {
-        /// Focal length given, in pixels.
-        given: f64,
-        /// One that fits better, in pixels.
-        better: f64,
-        /// By how much better, in standard deviations of the difference.
-        deviations: f64,
-        /// Matches that agree by the better one.
-        inliers: usize,
-    },
-    /// The longer the focal length is taken to be, the better it fits.
-    #[error(
-        "the focal length cannot be told from these photographs: they show no perspective (the subject is too far away, or the view too narrow)"
-    )]
-    NoPerspective {
-        /// Longer side of the photographs, in pixels.
-        side: usize,
-    },
-    /// Many focal lengths fit the matches as well as the best.
-    #[error(
-        "the focal length cannot be told from these photographs: none between {low:.0} and {high:.0} px fits better than the others"
-    )]
-    UnknownFocal {
-        /// Smallest that fits, in pixels; at the least that of a field of view of 170 degrees.
-        low: f64,
-        /// Largest that fits, in pixels; at the most that of a field of view of 3 degrees.
-        high: f64,
-        /// Longer side of the photographs, in pixels.
-        side: usize,
-    },
-    /// The search for a model failed.
+    /// The matches tell no motion, or no points.
     #[error(transparent)]
-    Estimate(EstimateError),
+    TwoView(TwoViewError),
     /// The job was stopped by its progress callback.
     #[error("stopped")]
     Cancelled(#[from] Cancelled),
@@ -141,60 +27,59 @@ impl From<MatchingError> for ReconstructError {
     }
 }
 
-impl ReconstructError {
-    /// Refuses a focal length (pixels) that no lens of a photograph has, and one with a relative standard deviation over a tenth: the depth of the
-    /// scene, which goes with it, may well be off by a fifth.
-    pub(super) fn check_focal(focal: f64, deviation: f64, side: usize) -> Result<(), Self> {
-        // Fields of view along the longer side of 170 degrees, and of 3 degrees: 690 mm before a film of 36 mm.
-        let [least, most] = [85f64, 1.5].map(|half| 0.5 * side as f64 / half.to_radians().tan());
-        if focal > most {
-            return Err(Self::NoPerspective { side });
+impl From<TwoViewError> for ReconstructError {
+    fn from(error: TwoViewError) -> Self {
+        match error {
+            TwoViewError::Cancelled(stop) => Self::Cancelled(stop),
+            other => Self::TwoView(other),
         }
-        if focal < least {
-            return Err(Self::UnknownFocal { low: least, high: most, side });
-        }
-        if deviation > 0.1 {
-            let (low, high) = ((focal / (1.0 + deviation)).max(least), (focal * (1.0 + deviation)).min(most));
-            return Err(Self::UnknownFocal { low, high, side });
-        }
-        Ok(())
     }
+}
 
+impl ReconstructError {
     /// What a person can do about it.
     pub fn advice(&self) -> String {
         let words = match self {
             Self::Matching(_) => "take sharper photographs with more texture",
-            Self::Camera { .. } | Self::CameraSize { .. } => "check the camera file",
-            Self::TooFewMatches { .. } | Self::TooFewInliers { .. } => {
-                "take photographs that share more of the scene, from places nearer to each other"
-            }
-            Self::PureRotation { .. } => {
-                "step aside between the photographs; to join photographs from one place use `cv panorama`"
-            }
-            Self::PlanarOrTurned { .. } => {
-                "step aside between the photographs and include things in front of the plane or behind it; --focal tells a plane from a turn; to join photographs from one place use `cv panorama`"
-            }
-            Self::Planar { .. } => "include things in front of the plane or behind it",
-            Self::UncertainPose { .. } => {
-                "take photographs that share more of the scene, with things near and far all over them, or find more features (--features)"
-            }
-            Self::LittleParallax { .. } => "take the photographs farther apart",
-            Self::WrongFocal { better, .. } => {
-                return format!(
-                    "check the focal length, which is in pixels of the photograph: --focal {better:.0}, or leave it out (--ignore-exif where the photograph has a wrong one)"
-                );
-            }
-            Self::NoPerspective { side } | Self::UnknownFocal { side, .. } => {
-                let phone = 0.8 * *side as f64;
-                return format!(
-                    "give the focal length in pixels: --focal {phone:.0} (a phone's main camera: about 0.8 times the longer side), or a camera file (--camera)"
-                );
-            }
-            Self::Estimate(_) => "check the matches with `cv match`",
+            Self::TwoView(error) => return advice(error),
             Self::Cancelled(_) => "run it again",
         };
         words.to_owned()
     }
+}
+
+fn advice(error: &TwoViewError) -> String {
+    let words = match error {
+        TwoViewError::Camera { .. } | TwoViewError::CameraSize { .. } => "check the camera file",
+        TwoViewError::TooFewMatches { .. } | TwoViewError::TooFewInliers { .. } => {
+            "take photographs that share more of the scene, from places nearer to each other"
+        }
+        TwoViewError::PureRotation { .. } => {
+            "step aside between the photographs; to join photographs from one place use `cv panorama`"
+        }
+        TwoViewError::PlanarOrTurned { .. } => {
+            "step aside between the photographs and include things in front of the plane or behind it; --focal tells a plane from a turn; to join photographs from one place use `cv panorama`"
+        }
+        TwoViewError::Planar { .. } => "include things in front of the plane or behind it",
+        TwoViewError::UncertainPose { .. } => {
+            "take photographs that share more of the scene, with things near and far all over them, or find more features (--features)"
+        }
+        TwoViewError::LittleParallax { .. } => "take the photographs farther apart",
+        TwoViewError::WrongFocal { better, .. } => {
+            return format!(
+                "check the focal length, which is in pixels of the photograph: --focal {better:.0}, or leave it out (--ignore-exif where the photograph has a wrong one)"
+            );
+        }
+        TwoViewError::NoPerspective { side } | TwoViewError::UnknownFocal { side, .. } => {
+            let phone = 0.8 * *side as f64;
+            return format!(
+                "give the focal length in pixels: --focal {phone:.0} (a phone's main camera: about 0.8 times the longer side), or a camera file (--camera)"
+            );
+        }
+        TwoViewError::Estimate(_) | TwoViewError::MatchOutOfRange { .. } => "check the matches with `cv match`",
+        TwoViewError::Cancelled(_) => "run it again",
+    };
+    words.to_owned()
 }
 
 #[cfg(test)]
@@ -202,16 +87,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_focal_length_is_told_or_the_reason_why_not() {
-        assert_eq!(ReconstructError::check_focal(1000.0, 0.05, 1200), Ok(()));
-        // Fifty times the longer side is a telescope's.
-        assert_eq!(
-            ReconstructError::check_focal(60_000.0, 0.05, 1200),
-            Err(ReconstructError::NoPerspective { side: 1200 })
-        );
-        let error = ReconstructError::check_focal(1000.0, 0.25, 1200).unwrap_err();
-        assert_eq!(error, ReconstructError::UnknownFocal { low: 800.0, high: 1250.0, side: 1200 });
+    fn a_focal_length_that_cannot_be_told_is_asked_for() {
+        let error = ReconstructError::from(TwoViewError::UnknownFocal { low: 800.0, high: 1250.0, side: 1200 });
         assert!(error.advice().contains("--focal 960"));
-        assert!(matches!(ReconstructError::check_focal(10.0, 0.0, 1200), Err(ReconstructError::UnknownFocal { .. })));
     }
 }

@@ -19,7 +19,8 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     if let Some(seed) = demo.context.seed {
         options.seed = seed;
     }
-    let model = match estimate(&found.pairs, ModelKind::Homography, &options, demo.context) {
+    let pairs = found.pairs();
+    let model = match estimate(&pairs, ModelKind::Homography, &options, demo.context) {
         Ok(result) => result.robust,
         Err(error) => return Ok(Part::gave_up("homography", &error)),
     };
@@ -28,7 +29,7 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let check = Check::at_most("homography", "mean error of the corners", error, 0.3, "px")
         .of(corner(&pair.homography, width, height), corner(&model.model, width, height));
 
-    let mut inliers = vec![false; found.pairs.len()];
+    let mut inliers = vec![false; pairs.len()];
     model.inliers.iter().for_each(|&i| inliers[i] = true);
     let keypoints = &found.features[0].described.keypoints;
     let strongest = &keypoints[..keypoints.len().min(600)];
@@ -46,13 +47,8 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
             "Both in one frame, in the squares of a chessboard: edges run through where the homography is right.",
         )?,
     ];
-    let matches = draw_matches(
-        a.view(),
-        b.view(),
-        &found.pairs,
-        Some(&inliers),
-        &MatchStyle { limit: 160, ..MatchStyle::default() },
-    );
+    let matches =
+        draw_matches(a.view(), b.view(), &pairs, Some(&inliers), &MatchStyle { limit: 160, ..MatchStyle::default() });
     let matches = demo.photo(
         "homography-matches.png",
         &matches,

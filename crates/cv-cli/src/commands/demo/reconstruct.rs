@@ -14,12 +14,12 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let camera = demo.camera();
     let pair = two_view(demo.seed, &camera, BASELINE, &RenderOptions::default())?;
     let (a, b) = (&pair.a.image, &pair.b.image);
-    let options = ReconstructOptions { intrinsics: Intrinsics::Known([camera; 2]), ..ReconstructOptions::default() };
+    let options = ReconstructOptions::new(Intrinsics::Known([camera; 2]));
     let result = match reconstruct(a.view(), b.view(), &options, demo.context) {
         Ok(result) => result,
         Err(error) => return Ok(Part::gave_up("reconstruct", &error)),
     };
-    let (truth, found) = (&pair.relative, &result.pose);
+    let (truth, found) = (&pair.relative, &result.scene.pose);
     let turn = |pose: &Pose| format!("{:.2}° in all", pose.rotation_angle().to_degrees());
     let way = |pose: &Pose| {
         let t = pose.translation.normalize();
@@ -32,11 +32,11 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
         Check::at_most("reconstruct", "direction of travel", direction, 1.0, "°").of(way(truth), way(found)),
     ];
 
-    let pairs = &result.matching.pairs;
+    let pairs = &result.matching.pairs();
     let mut inliers = vec![false; pairs.len()];
-    result.inliers.iter().for_each(|&i| inliers[i] = true);
+    result.scene.inliers.iter().for_each(|&i| inliers[i] = true);
     let style = MatchStyle { limit: 160, ..MatchStyle::default() };
-    let agree = format!("{} of {} matches agree with one motion (green).", result.inliers.len(), pairs.len());
+    let agree = format!("{} of {} matches agree with one motion (green).", result.scene.inliers.len(), pairs.len());
     let figures = vec![
         demo.photo(
             "reconstruct-matches.png",
@@ -48,8 +48,8 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
             &draw_epipolar_lines(
                 a.view(),
                 b.view(),
-                &result.fundamental(),
-                &result.inliers.iter().map(|&i| pairs[i]).collect::<Vec<_>>(),
+                &result.scene.fundamental(),
+                &result.scene.inliers.iter().map(|&i| pairs[i]).collect::<Vec<_>>(),
                 14,
             ),
             "Each point with the line on which it must lie in the other photograph.",
@@ -58,7 +58,7 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let mut cloud = PointScene::new(&result.cloud());
     cloud.camera(&camera, &Pose::identity(), camera_color(0)).camera(&camera, found, camera_color(1));
     let still = cv_io::encode_png(render_points(&cloud, Viewpoint::Camera, 960, 600).view())?;
-    let caption = format!("{} points and the two cameras. Drag to turn.", result.points.len());
+    let caption = format!("{} points and the two cameras. Drag to turn.", result.scene.points.len());
     Ok(Part::new(checks, move |page| {
         page.section("Reconstruction")
             .paragraph("Two photographs from 60 cm apart. From the matches alone come the turn and the direction of travel of the camera, and the points in space.");

@@ -1,53 +1,74 @@
-//! The cameras and the first pose, from all tentative matches.
+//! The cameras and the relative pose, from all tentative matches.
 
+use super::degeneracy::DegeneracyTest;
 use super::lens::{Found, Rival, find_lens};
-use super::{Intrinsics, ReconstructError, ReconstructOptions};
-use cv_core::{Camera, Correspondence, Pose};
-use cv_geometry::{
+use super::{Intrinsics, MatchedViews, TwoViewError, TwoViewOptions};
+use crate::{
     EstimateError, RobustModel, RobustOptions, estimate_relative_pose, normalize_matches, pose_difference,
     poses_are_rivals, refine_relative_pose,
 };
+use cv_core::{Camera, Correspondence, Pose, Progress};
 use rayon::prelude::*;
 
-/// The cameras, where they are known.
-pub(super) fn cameras(
-    intrinsics: Intrinsics,
-    sizes: [(usize, usize); 2],
-) -> Result<Option<[Camera; 2]>, ReconstructError> {
-    let cameras = match intrinsics {
-        Intrinsics::Unknown => return Ok(None),
-        Intrinsics::Known(cameras) => cameras,
-        Intrinsics::Focal(focal) => [0, 1].map(|i: usize| Camera::from_focal(sizes[i].0, sizes[i].1, focal[i])),
-    };
-    for (i, camera) in cameras.iter().enumerate() {
-        camera.validate().map_err(|source| ReconstructError::Camera { index: i + 1, source })?;
-        if (camera.width, camera.height) != sizes[i] {
-            return Err(ReconstructError::CameraSize {
-                index: i + 1,
-                camera: (camera.width, camera.height),
-                photo: sizes[i],
-            });
-        }
-    }
-    Ok(Some(cameras))
-}
-
-/// A first guess at the geometry.
-pub(super) struct Initial {
-    pub(super) cameras: [Camera; 2],
-    pub(super) pose: Pose,
-    /// The matches that agree, ascending.
-    pub(super) inliers: Vec<usize>,
+/// Cameras, relative pose, and the matches that agree with them. Not adjusted yet: see [`TwoViewAdjustment`](super::TwoViewAdjustment).
+#[derive(Debug, Clone, PartialEq)]
+pub struct TwoViewGeometry {
+    /// The cameras; focal lengths and radial distortion estimated where they were not known.
+    pub cameras: [Camera; 2],
+    /// First camera frame to second; the translation has length one.
+    pub pose: Pose,
+    /// Indices of the matches that obey the epipolar geometry, ascending.
+    pub inliers: Vec<usize>,
     /// Largest relative change of the focal length that the matches do not exclude; 0 where it was given.
-    pub(super) focal_range: f64,
+    pub focal_range: f64,
+    /// Share of the inliers that one homography explains.
+    pub planar_share: f64,
 }
 
-pub(super) fn initial(
+/// The cameras and the relative pose of two views, and which matches agree with them.
+///
+/// The lens is searched where it is not known, then the pose from several seeds; a scene that is one plane and a camera that only
+/// turned are refused, as are directions that the matches do not tell from others. O(samples × matches).
+///
+/// # Errors
+/// [`TwoViewError`], each with its numbers.
+pub fn estimate_two_view_geometry(
+    views: &MatchedViews<'_>,
+    options: &TwoViewOptions,
+    progress: &dyn Progress,
+) -> Result<TwoViewGeometry, TwoViewError> {
+    progress.report("pose", 0, 1)?;
+    let prior = options.intrinsics.cameras(views.sizes)?;
+    let pairs = &views.correspondences(views.matches)?;
+    if pairs.len() < options.min_inliers {
+        return Err(TwoViewError::TooFewMatches { got: pairs.len(), needed: options.min_inliers });
+    }
+    let degeneracy = DegeneracyTest::new(pairs, prior.as_ref(), options);
+    // Nothing can have more inliers than there are matches.
+    degeneracy.check(pairs.len(), options)?;
+    let found = search(pairs, views.sizes, prior, options);
+    // Of a turn, a search for a moving camera finds but a part: half of the points are behind whatever it supposes.
+    if let Err(
+        TwoViewError::TooFewInliers { inliers, .. }
+        | TwoViewError::UncertainPose { inliers, .. }
+        | TwoViewError::WrongFocal { inliers, .. },
+    ) = &found
+    {
+        degeneracy.check(*inliers, options)?;
+    }
+    let mut found = found?;
+    degeneracy.check(found.inliers.len(), options)?;
+    found.planar_share = degeneracy.planar as f64 / found.inliers.len() as f64;
+    Ok(found)
+}
+
+/// The lens where it is not known, and the pose.
+fn search(
     pairs: &[Correspondence],
     sizes: [(usize, usize); 2],
     prior: Option<[Camera; 2]>,
-    options: &ReconstructOptions,
-) -> Result<Initial, ReconstructError> {
+    options: &TwoViewOptions,
+) -> Result<TwoViewGeometry, TwoViewError> {
     let given = match (options.intrinsics, prior) {
         (Intrinsics::Known(_), Some(cameras)) => Some(Found { cameras, focal_range: 0.0, rival: None }),
         (Intrinsics::Focal(focal), _) => find_lens(pairs, sizes, Some(focal), &options.robust),
@@ -58,19 +79,19 @@ pub(super) fn initial(
     let ordinary = || sizes.map(|(width, height)| Camera::from_focal(width, height, 1.2 * longest));
     if let Some(Found { cameras, rival: Some(rival), .. }) = &given {
         let Rival { focal: better, deviations, inliers } = *rival;
-        return Err(ReconstructError::WrongFocal { given: cameras[0].fx, better, deviations, inliers });
+        return Err(TwoViewError::WrongFocal { given: cameras[0].fx, better, deviations, inliers });
     }
     let Found { cameras, focal_range, .. } =
         given.unwrap_or_else(|| Found { cameras: prior.unwrap_or_else(ordinary), focal_range: 0.0, rival: None });
     let (pose, inliers) = calibrated(pairs, &cameras, options)?;
-    Ok(Initial { cameras, pose, inliers, focal_range })
+    Ok(TwoViewGeometry { cameras, pose, inliers, focal_range, planar_share: 0.0 })
 }
 
 /// Refuses where fewer agree than were asked for.
-fn enough(inliers: usize, matches: usize, options: &ReconstructOptions) -> Result<(), ReconstructError> {
+fn enough(inliers: usize, matches: usize, options: &TwoViewOptions) -> Result<(), TwoViewError> {
     let needed = options.min_inliers.max((options.min_inlier_share * matches as f64).ceil() as usize);
     if inliers < needed {
-        return Err(ReconstructError::TooFewInliers { inliers, matches, needed });
+        return Err(TwoViewError::TooFewInliers { inliers, matches, needed });
     }
     Ok(())
 }
@@ -78,8 +99,8 @@ fn enough(inliers: usize, matches: usize, options: &ReconstructOptions) -> Resul
 fn calibrated(
     pairs: &[Correspondence],
     cameras: &[Camera; 2],
-    options: &ReconstructOptions,
-) -> Result<(Pose, Vec<usize>), ReconstructError> {
+    options: &TwoViewOptions,
+) -> Result<(Pose, Vec<usize>), TwoViewError> {
     let (normalized, unit) = normalize_matches(pairs, &cameras[0], &cameras[1]);
     // A pixel that no ray reaches (beyond the range of the lens model) is no match.
     let usable: Vec<usize> = (0..normalized.len()).filter(|&i| normalized[i].is_finite()).collect();
@@ -104,7 +125,7 @@ fn calibrated(
         .map(|other| pose_difference(&best.model, &other.0.model)[1])
         .fold(0.0, f64::max);
     if apart > options.max_deviation {
-        return Err(ReconstructError::UncertainPose {
+        return Err(TwoViewError::UncertainPose {
             degrees: apart.to_degrees(),
             allowed: options.max_deviation.to_degrees(),
             inliers: best.inliers.len(),
@@ -119,15 +140,13 @@ fn calibrated(
 const SEARCHES: u64 = 5;
 
 /// Too few matches that agree is the reason a person understands.
-fn failed(error: EstimateError, matches: usize, options: &ReconstructOptions) -> ReconstructError {
+fn failed(error: EstimateError, matches: usize, options: &TwoViewOptions) -> TwoViewError {
     match error {
         EstimateError::NoConsensus { inliers, .. } => {
-            ReconstructError::TooFewInliers { inliers, matches, needed: options.min_inliers }
+            TwoViewError::TooFewInliers { inliers, matches, needed: options.min_inliers }
         }
-        EstimateError::NotEnoughMatches { got, .. } => {
-            ReconstructError::TooFewMatches { got, needed: options.min_inliers }
-        }
+        EstimateError::NotEnoughMatches { got, .. } => TwoViewError::TooFewMatches { got, needed: options.min_inliers },
         EstimateError::Cancelled(stop) => stop.into(),
-        other => ReconstructError::Estimate(other),
+        other => TwoViewError::Estimate(other),
     }
 }

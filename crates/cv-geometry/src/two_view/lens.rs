@@ -1,10 +1,10 @@
 //! The lens that the matches themselves tell: focal length and radial distortion.
 
-use cv_core::{Camera, Correspondence, Distortion, Matrix3, Pose};
-use cv_geometry::{
+use crate::{
     FocalPose, Marginal, RobustOptions, Scorer, essential_from_pose, estimate_focal_pose, estimate_relative_pose,
     normalize_matches, refine_focal_pose, refine_relative_pose, sampson,
 };
+use cv_core::{Camera, Correspondence, Distortion, Matrix3, Pose};
 use rayon::prelude::*;
 
 /// Focal lengths in pixels, and by how much of their distance from the middle the corners are displaced.
@@ -112,7 +112,7 @@ pub(super) fn find_lens(
     Some(Found { cameras: search.cameras(&best.lens), focal_range, rival })
 }
 
-/// Vuong's test at two standard deviations: see [`cv_geometry::poses_are_rivals`].
+/// Vuong's test at two standard deviations: see [`crate::poses_are_rivals`].
 fn significantly_worse(a: &Trial, b: &Trial) -> bool {
     worse_by(a, b) > 2.0
 }
