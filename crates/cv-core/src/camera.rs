@@ -1,141 +1,11 @@
-//! Camera intrinsics and lens distortion.
+//! Camera intrinsics, and projection with its derivatives.
 
-use nalgebra::{Matrix2, Matrix3, Point2, Point3, Vector2};
+use nalgebra::{Matrix2, Matrix2x3, Matrix3, Point2, Point3, SMatrix, Vector2};
 
-/// Lens distortion, applied to normalized image coordinates `(x, y) = (X/Z, Y/Z)`.
-///
-/// The coefficients keep the names and order of OpenCV's `calib3d` and COLMAP's camera models.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub enum Distortion {
-    /// A pinhole.
-    #[default]
-    None,
-    /// `x' = x (1 + k1 r² + k2 r⁴)`. COLMAP's SIMPLE_RADIAL has `k2 = 0`.
-    Radial {
-        /// Coefficient of r².
-        k1: f64,
-        /// Coefficient of r⁴.
-        k2: f64,
-    },
-    /// Brown–Conrady: three radial and two tangential terms (OpenCV's default five, `k1 k2 p1 p2 k3`).
-    BrownConrady {
-        /// Coefficient of r².
-        k1: f64,
-        /// Coefficient of r⁴.
-        k2: f64,
-        /// First tangential coefficient.
-        p1: f64,
-        /// Second tangential coefficient.
-        p2: f64,
-        /// Coefficient of r⁶.
-        k3: f64,
-    },
-    /// Kannala–Brandt fisheye: `θ' = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)`, `θ = atan r`.
-    Fisheye {
-        /// Coefficient of θ².
-        k1: f64,
-        /// Coefficient of θ⁴.
-        k2: f64,
-        /// Coefficient of θ⁶.
-        k3: f64,
-        /// Coefficient of θ⁸.
-        k4: f64,
-    },
-}
+use crate::distortion::{Distortion, MAX_PARAMETERS};
 
-impl Distortion {
-    /// Ideal to distorted normalized coordinates.
-    pub fn distort(&self, p: Point2<f64>) -> Point2<f64> {
-        self.distort_with_jacobian(p).0
-    }
-
-    /// Ideal to distorted normalized coordinates, with the 2×2 derivative by the ideal ones.
-    pub fn distort_with_jacobian(&self, p: Point2<f64>) -> (Point2<f64>, Matrix2<f64>) {
-        let (x, y) = (p.x, p.y);
-        let r2 = x * x + y * y;
-        // A radial factor g(r²) and its derivative g' by r².
-        let radial = |g: f64, dg: f64| {
-            (
-                Point2::new(x * g, y * g),
-                Matrix2::new(g + 2.0 * x * x * dg, 2.0 * x * y * dg, 2.0 * x * y * dg, g + 2.0 * y * y * dg),
-            )
-        };
-        match *self {
-            Self::None => (p, Matrix2::identity()),
-            Self::Radial { k1, k2 } => radial(1.0 + r2 * (k1 + r2 * k2), k1 + 2.0 * k2 * r2),
-            Self::BrownConrady { k1, k2, p1, p2, k3 } => {
-                let g = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
-                let (mut q, mut j) = radial(g, k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2));
-                q.x += 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x);
-                q.y += p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y;
-                j[(0, 0)] += 2.0 * p1 * y + 6.0 * p2 * x;
-                j[(0, 1)] += 2.0 * p1 * x + 2.0 * p2 * y;
-                j[(1, 0)] += 2.0 * p1 * x + 2.0 * p2 * y;
-                j[(1, 1)] += 6.0 * p1 * y + 2.0 * p2 * x;
-                (q, j)
-            }
-            Self::Fisheye { k1, k2, k3, k4 } => {
-                let r = r2.sqrt();
-                if r < 1e-8 {
-                    return (p, Matrix2::identity());
-                }
-                let theta = r.atan();
-                let t2 = theta * theta;
-                let d = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))));
-                let dd = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)));
-                // g(r²) = d(θ)/r; by r²: (d'·θ'·r − d)/(2 r³) with θ' = 1/(1 + r²).
-                radial(d / r, (dd * r / (1.0 + r2) - d) / (2.0 * r2 * r))
-            }
-        }
-    }
-
-    /// Distorted to ideal normalized coordinates, by Newton's method from the distorted point.
-    ///
-    /// NaN where no ideal point near the image maps there (outside the range in which the model is monotonic).
-    pub fn undistort(&self, q: Point2<f64>) -> Point2<f64> {
-        const NONE: Point2<f64> = Point2::new(f64::NAN, f64::NAN);
-        if *self == Self::None {
-            return q;
-        }
-        let mut p = match *self {
-            // The radius of a fisheye grows as tan θ: start from the inverse of the equidistant part.
-            Self::Fisheye { .. } => {
-                let r = q.coords.norm();
-                let theta = r.min(1.5);
-                if r > 1e-12 { Point2::from(q.coords * (theta.tan() / r)) } else { q }
-            }
-            _ => q,
-        };
-        let mut residual = f64::INFINITY;
-        for _ in 0..50 {
-            let (d, j) = self.distort_with_jacobian(p);
-            let error: Vector2<f64> = d - q;
-            residual = error.norm();
-            // Ten digits below the smallest sub-pixel quantity of any real lens.
-            if residual < 1e-13 * (1.0 + q.coords.norm()) {
-                break;
-            }
-            let Some(step) = j.try_inverse().map(|inverse| inverse * error) else { return NONE };
-            // Damped, so that a step never leaves the neighborhood where the model means something.
-            let limit = 0.5 * (1.0 + p.coords.norm());
-            let norm = step.norm();
-            p -= if norm > limit { step * (limit / norm) } else { step };
-        }
-        let (_, j) = self.distort_with_jacobian(p);
-        // Beyond its turning point the polynomial folds back: such a solution is not what the lens did.
-        if residual < 1e-9 * (1.0 + q.coords.norm()) && j.determinant() > 0.0 && j.trace() > 0.0 { p } else { NONE }
-    }
-
-    /// True where every coefficient is finite.
-    pub fn is_finite(&self) -> bool {
-        match *self {
-            Self::None => true,
-            Self::Radial { k1, k2 } => k1.is_finite() && k2.is_finite(),
-            Self::BrownConrady { k1, k2, p1, p2, k3 } => [k1, k2, p1, p2, k3].iter().all(|v| v.is_finite()),
-            Self::Fisheye { k1, k2, k3, k4 } => [k1, k2, k3, k4].iter().all(|v| v.is_finite()),
-        }
-    }
-}
+/// The most intrinsics a camera has: fx, fy, cx, cy, and the distortion's parameters.
+pub const MAX_INTRINSICS: usize = 4 + MAX_PARAMETERS;
 
 /// Why a camera is not one.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
@@ -172,10 +42,21 @@ pub struct Camera {
     pub distortion: Distortion,
 }
 
+/// A point seen by a camera, with the derivatives of its pixel.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Projection {
+    /// The pixel.
+    pub pixel: Point2<f64>,
+    /// By the point in the camera's frame.
+    pub by_point: Matrix2x3<f64>,
+    /// By the intrinsics in the order of [`Camera::intrinsics`]: as many columns as the camera has, the others zero.
+    pub by_intrinsics: SMatrix<f64, 2, MAX_INTRINSICS>,
+}
+
 impl Camera {
     /// A camera without distortion.
     pub fn pinhole(width: usize, height: usize, fx: f64, fy: f64, cx: f64, cy: f64) -> Self {
-        Self { width, height, fx, fy, cx, cy, distortion: Distortion::None }
+        Self { width, height, fx, fy, cx, cy, distortion: Distortion::NONE }
     }
 
     /// A camera with square pixels and its principal point in the middle of the image.
@@ -209,13 +90,61 @@ impl Camera {
         Matrix3::new(1.0 / fx, 0.0, -self.cx / fx, 0.0, 1.0 / fy, -self.cy / fy, 0.0, 0.0, 1.0)
     }
 
-    /// Camera coordinates to pixels; `None` behind the camera or in its plane.
+    /// How many intrinsics the camera has: four and the distortion's parameters.
+    pub fn intrinsic_count(&self) -> usize {
+        4 + self.distortion.parameters().len()
+    }
+
+    /// The intrinsics as a vector: fx, fy, cx, cy, the distortion's parameters in its order, then zeros.
+    pub fn intrinsics(&self) -> [f64; MAX_INTRINSICS] {
+        let mut out = [0.0; MAX_INTRINSICS];
+        out[..4].copy_from_slice(&[self.fx, self.fy, self.cx, self.cy]);
+        let parameters = self.distortion.parameters();
+        out[4..4 + parameters.len()].copy_from_slice(parameters);
+        out
+    }
+
+    /// The same camera with other intrinsics, in the order of [`Self::intrinsics`]; those it does not have are left alone.
+    pub fn with_intrinsics(&self, values: &[f64; MAX_INTRINSICS]) -> Self {
+        let [fx, fy, cx, cy, ..] = *values;
+        let mut out = Self { fx, fy, cx, cy, ..*self };
+        out.distortion.parameters_mut().iter_mut().zip(&values[4..]).for_each(|(p, v)| *p = *v);
+        out
+    }
+
+    /// Camera coordinates to pixels; `None` behind the camera or in its plane. Whether the lens's range reaches so far out is not asked:
+    /// [`Distortion::distort_in_range`] does.
     #[inline]
     pub fn project(&self, p: &Point3<f64>) -> Option<Point2<f64>> {
         (p.z > 0.0).then(|| self.denormalize(Point2::new(p.x / p.z, p.y / p.z)))
     }
 
-    /// Pixel to the ideal normalized coordinates of its ray (distortion removed): the direction is `(x, y, 1)`.
+    /// As [`Self::project`], with the derivatives by the point and by the intrinsics.
+    #[inline]
+    pub fn project_with_jacobians(&self, p: &Point3<f64>) -> Option<Projection> {
+        if p.z <= 0.0 || p.z.is_nan() {
+            return None;
+        }
+        let inverse = 1.0 / p.z;
+        let ideal = Point2::new(p.x * inverse, p.y * inverse);
+        let (d, j, by_parameters) = self.distortion.distort_with_jacobians(ideal);
+        let scale = Matrix2::new(self.fx, 0.0, 0.0, self.fy);
+        let by_ideal = Matrix2x3::new(inverse, 0.0, -ideal.x * inverse, 0.0, inverse, -ideal.y * inverse);
+        let mut by_intrinsics = SMatrix::<f64, 2, MAX_INTRINSICS>::zeros();
+        by_intrinsics.set_column(0, &Vector2::new(d.x, 0.0));
+        by_intrinsics.set_column(1, &Vector2::new(0.0, d.y));
+        by_intrinsics.set_column(2, &Vector2::x());
+        by_intrinsics.set_column(3, &Vector2::y());
+        by_intrinsics.fixed_columns_mut::<MAX_PARAMETERS>(4).copy_from(&(scale * by_parameters));
+        Some(Projection {
+            pixel: Point2::new(self.fx * d.x + self.cx, self.fy * d.y + self.cy),
+            by_point: scale * j * by_ideal,
+            by_intrinsics,
+        })
+    }
+
+    /// Pixel to the ideal normalized coordinates of its ray (distortion removed): the direction is `(x, y, 1)`. NaN where the lens has no
+    /// ray for it ([`Distortion::undistort`]).
     #[inline]
     pub fn normalize(&self, pixel: Point2<f64>) -> Point2<f64> {
         self.distortion.undistort(Point2::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy))
@@ -226,6 +155,13 @@ impl Camera {
     pub fn denormalize(&self, ray: Point2<f64>) -> Point2<f64> {
         let d = self.distortion.distort(ray);
         Point2::new(self.fx * d.x + self.cx, self.fy * d.y + self.cy)
+    }
+
+    /// As [`Self::denormalize`], but `None` beyond the range in which the lens is monotonic, where rays fold back into the picture.
+    #[inline]
+    pub fn denormalize_in_range(&self, ray: Point2<f64>) -> Option<Point2<f64>> {
+        let d = self.distortion.distort_in_range(ray)?;
+        Some(Point2::new(self.fx * d.x + self.cx, self.fy * d.y + self.cy))
     }
 
     /// A pixel as the same camera without distortion would see it.
@@ -264,60 +200,32 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn models() -> impl Strategy<Value = Distortion> {
-        // Coefficients of the size real lenses have, small enough that the test's points stay in the monotonic range.
-        let k = -0.2..0.2f64;
-        let p = -0.01..0.01f64;
-        prop_oneof![
-            Just(Distortion::None),
-            (k.clone(), -0.05..0.05f64).prop_map(|(k1, k2)| Distortion::Radial { k1, k2 }),
-            (k, -0.05..0.05f64, p.clone(), p.clone(), -0.01..0.01f64)
-                .prop_map(|(k1, k2, p1, p2, k3)| Distortion::BrownConrady { k1, k2, p1, p2, k3 }),
-            (-0.05..0.05f64, p.clone(), -0.005..0.005f64, -0.001..0.001f64)
-                .prop_map(|(k1, k2, k3, k4)| Distortion::Fisheye { k1, k2, k3, k4 }),
-        ]
-    }
-
     proptest! {
         #[test]
-        fn undistorting_undoes_distorting(model in models(), x in -0.7..0.7f64, y in -0.6..0.6f64) {
-            let p = Point2::new(x, y);
-            let back = model.undistort(model.distort(p));
-            // Newton stops at 1e-13; the model's derivative here is between 0.5 and 2.
-            prop_assert!((back - p).norm() < 1e-11, "{back} for {p}");
-        }
-
-        #[test]
-        fn the_jacobian_is_the_derivative(model in models(), x in -0.7..0.7f64, y in -0.6..0.6f64) {
+        fn the_jacobians_are_the_derivatives(
+            distortion in crate::distortion::examples(), x in -0.5..0.5f64, y in -0.5..0.5f64, z in 1.0..3.0f64,
+        ) {
+            let camera = Camera { distortion, ..Camera::pinhole(640, 480, 500.0, 510.0, 310.0, 245.0) };
+            let point = Point3::new(x, y, z);
+            let seen = camera.project_with_jacobians(&point).unwrap();
+            prop_assert!((seen.pixel - camera.project(&point).unwrap()).norm() < 1e-10);
             let h = 1e-6;
-            let (_, j) = model.distort_with_jacobian(Point2::new(x, y));
-            for (column, d) in [Vector2::new(h, 0.0), Vector2::new(0.0, h)].into_iter().enumerate() {
-                let p = Point2::new(x, y);
-                let numeric = (model.distort(p + d) - model.distort(p - d)) / (2.0 * h);
-                // Central differences: h² truncation plus 1e-16/h rounding.
-                prop_assert!((numeric - j.column(column)).norm() < 1e-8);
+            // Pixels up to a thousand: rounding 1e-13/h, and h² of third derivatives of a few thousand.
+            let near = |analytic: Vector2<f64>, a: Point2<f64>, b: Point2<f64>, h: f64| ((a - b) / (2.0 * h) - analytic).norm() < 1e-6 * (1.0 + analytic.norm());
+            for axis in 0..3 {
+                let d = nalgebra::Vector3::ith(axis, h);
+                let (a, b) = (camera.project(&(point + d)).unwrap(), camera.project(&(point - d)).unwrap());
+                prop_assert!(near(seen.by_point.column(axis).into(), a, b, h), "axis {axis}");
+            }
+            for i in 0..MAX_INTRINSICS {
+                let moved = |d: f64| {
+                    let mut values = camera.intrinsics();
+                    values[i] += d;
+                    camera.with_intrinsics(&values).project(&point).unwrap()
+                };
+                prop_assert!(near(seen.by_intrinsics.column(i).into(), moved(h), moved(-h), h), "intrinsic {i}");
             }
         }
-    }
-
-    #[test]
-    fn a_point_no_ray_reaches_is_nan_not_a_wrong_number() {
-        // x(1 − 0.5 x²) peaks at 0.544 for x = 0.816: nothing maps to 0.7.
-        let model = Distortion::Radial { k1: -0.5, k2: 0.0 };
-        assert!(model.undistort(Point2::new(0.7, 0.0)).x.is_nan());
-        assert!((model.undistort(Point2::new(0.54, 0.0)).x - 0.7).abs() < 0.1);
-    }
-
-    #[test]
-    fn the_brown_conrady_terms_are_opencvs() {
-        // By hand from the formula in OpenCV's calib3d documentation at (0.3, −0.2), r² = 0.13.
-        let model = Distortion::BrownConrady { k1: 0.1, k2: 0.2, p1: 0.01, p2: 0.02, k3: 0.3 };
-        let radial = 1.0 + 0.1 * 0.13 + 0.2 * 0.0169 + 0.3 * 0.002197;
-        let x = 0.3 * radial + 2.0 * 0.01 * 0.3 * -0.2 + 0.02 * (0.13 + 2.0 * 0.09);
-        let y = -0.2 * radial + 0.01 * (0.13 + 2.0 * 0.04) + 2.0 * 0.02 * 0.3 * -0.2;
-        let q = model.distort(Point2::new(0.3, -0.2));
-        // The same arithmetic in another order.
-        assert!((q.x - x).abs() < 1e-15 && (q.y - y).abs() < 1e-15);
     }
 
     #[test]

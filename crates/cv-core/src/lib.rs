@@ -27,6 +27,7 @@
 //! * Angles are radians.
 
 mod camera;
+mod distortion;
 mod features;
 mod image;
 mod luma;
@@ -41,7 +42,11 @@ mod stage_clock;
 mod union_find;
 mod view;
 
-pub use camera::{Camera, CameraError, Distortion};
+pub use camera::{Camera, CameraError, MAX_INTRINSICS, Projection};
+pub use distortion::{
+    ByParameters, ColmapModel, Distortion, DistortionModel, LensInfo, LensProjection, MAX_PARAMETERS,
+    ParameterCountError,
+};
 pub use features::{Correspondence, DMatch, Keypoint};
 pub use image::{GrayF32, GrayU8, Image, ImageError, Mask, RgbF32, RgbU8, Sample};
 pub use luma::{luma_f32, luma_u8, luma_u16};

@@ -2,7 +2,7 @@
 
 use crate::essential::tangent_of;
 use crate::rotation::orthonormalized;
-use cv_core::{Camera, Correspondence, Distortion, Matrix3, Point2, Point3, Pose, Rotation3, Vector2, Vector3};
+use cv_core::{Camera, Correspondence, DistortionModel, Matrix3, Point2, Point3, Pose, Rotation3, Vector2, Vector3};
 use cv_numeric::{RobustLoss, solve_positive_definite};
 use nalgebra::{Matrix2, Matrix2x3, SMatrix, SVector};
 use rayon::prelude::*;
@@ -15,7 +15,7 @@ pub struct BundleOptions {
     pub loss: RobustLoss,
     /// Whether the focal lengths may change, by one common factor. Default false.
     pub refine_focal: bool,
-    /// Whether k1 and k2 of lenses with [`Distortion::Radial`] may change, by as much in both cameras. Default false.
+    /// Whether k1 and k2 of lenses with [`DistortionModel::Radial`] may change, by as much in both cameras. Default false.
     pub refine_radial: bool,
     /// Most linearizations. Default 200; without focal lengths it takes ten or so.
     pub max_iterations: usize,
@@ -112,7 +112,7 @@ struct Problem<'a> {
 
 impl<'a> Problem<'a> {
     fn new(matches: &'a [Correspondence], options: &'a BundleOptions, cameras: &[Camera; 2]) -> Self {
-        let radial = options.refine_radial && cameras.iter().all(|c| matches!(c.distortion, Distortion::Radial { .. }));
+        let radial = options.refine_radial && cameras.iter().all(|c| c.distortion.model() == DistortionModel::Radial);
         let camera = &cameras[0];
         let half = 0.5 * (camera.width as f64).hypot(camera.height as f64);
         let corner2 = (half / camera.fx).powi(2);
@@ -122,8 +122,8 @@ impl<'a> Problem<'a> {
 
     /// k1 and k2, 0 where they are held.
     fn lens(&self, b: &TwoViewBundle) -> [f64; 2] {
-        match b.cameras[0].distortion {
-            Distortion::Radial { k1, k2 } if self.radial => [k1, k2],
+        match *b.cameras[0].distortion.parameters() {
+            [k1, k2] if self.radial => [k1, k2],
             _ => [0.0; 2],
         }
     }
@@ -295,7 +295,7 @@ pub fn adjust_two_views(
         }
         if problem.radial {
             for camera in &mut moved.cameras {
-                if let Distortion::Radial { k1, k2 } = &mut camera.distortion {
+                if let [k1, k2] = camera.distortion.parameters_mut() {
                     (*k1, *k2) = (*k1 + step[6], *k2 + step[7]);
                 }
             }
@@ -378,7 +378,7 @@ mod tests {
     /// Matches of a distorting camera, the truth, and a start that is a little off.
     fn problem(seed: u64, n: usize, noise: f64) -> (Vec<Correspondence>, TwoViewBundle, TwoViewBundle) {
         let mut views = TwoViews::random(seed);
-        views.camera.distortion = Distortion::Radial { k1: -0.1, k2: 0.01 };
+        views.camera.distortion = Distortion::radial(-0.1, 0.01);
         let mut rng = ChaCha8Rng::seed_from_u64(seed + 1000);
         let (mut points, mut matches) = (Vec::new(), Vec::new());
         while points.len() < n {
@@ -424,8 +424,7 @@ mod tests {
                     5 => b.cameras.iter_mut().for_each(|c| (c.fx, c.fy) = (c.fx * h.exp(), c.fy * h.exp())),
                     6 | 7 => {
                         for camera in &mut b.cameras {
-                            let Distortion::Radial { k1, k2 } = &mut camera.distortion else { unreachable!() };
-                            *[k1, k2][i - 6] += h;
+                            camera.distortion.parameters_mut()[i - 6] += h;
                         }
                     }
                     8 => {
@@ -524,7 +523,7 @@ mod tests {
             let mut cameras = truth.cameras;
             let (k2, cx, cy, ratio) = (0.03 * e(), 4.0 * e(), 4.0 * e(), 0.002 * e());
             for (camera, sign) in cameras.iter_mut().zip([-0.5, 0.5]) {
-                camera.distortion = Distortion::Radial { k1: -0.1, k2 };
+                camera.distortion = Distortion::radial(-0.1, k2);
                 (camera.cx, camera.cy) = (camera.cx + cx, camera.cy + cy);
                 (camera.fx, camera.fy) = (camera.fx * f64::exp(sign * ratio), camera.fy * f64::exp(sign * ratio));
             }
@@ -536,7 +535,7 @@ mod tests {
                 points.push(*x);
             }
             let mut start = TwoViewBundle { points, ..truth.clone() };
-            start.cameras.iter_mut().for_each(|c| c.distortion = Distortion::Radial { k1: -0.1, k2: 0.0 });
+            start.cameras.iter_mut().for_each(|c| c.distortion = Distortion::radial(-0.1, 0.0));
             let options = BundleOptions { refine_focal: true, refine_radial: true, ..BundleOptions::default() };
             let report = adjust_two_views(&mut start, &matches, &options).unwrap();
             let off = (start.cameras[0].fx / truth.cameras[0].fx).ln();

@@ -214,9 +214,8 @@ pub fn undistort<T: Pixel, const C: usize>(
     let options = RemapOptions::default();
     let (image, _) = warp_with(view, view.size(), &options, |x, y| {
         let ray = Point2::new(k[(0, 0)] * x as f64 + k[(0, 2)], k[(1, 1)] * y as f64 + k[(1, 2)]);
-        // Past the turning point of its polynomial a model folds back and would show the border a second time.
-        let (_, j) = camera.distortion.distort_with_jacobian(ray);
-        (j.determinant() > 0.0 && j.trace() > 0.0).then(|| camera.denormalize(ray))
+        // Past its turning point a lens model folds back and would show the border a second time.
+        camera.denormalize_in_range(ray)
     })?;
     Ok(image)
 }
@@ -336,7 +335,7 @@ mod tests {
 
     #[test]
     fn undistorting_straightens_a_line() {
-        let distortion = Distortion::Radial { k1: -0.2, k2: 0.05 };
+        let distortion = Distortion::radial(-0.2, 0.05);
         let camera = Camera { distortion, ..Camera::from_focal(160, 120, 120.0) };
         // A picture of the ideal plane: value = ideal x, so that after undistortion each column has one value.
         let image =

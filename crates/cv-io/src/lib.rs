@@ -27,7 +27,7 @@
 //! | maps of floats | [`read_map`], [`pfm`], [`kitti`], [`depth_mm`], [`scaled`] |
 //! | arrays | [`npy`], [`npz`] |
 //! | clouds | [`ply`] |
-//! | cameras and rigs | [`read_camera`], [`write_camera`], [`read_rig`], [`write_rig`] |
+//! | cameras and rigs | [`read_camera`], [`write_camera`], [`read_rig`], [`write_rig`], [`CalibrationFormat`] |
 //! | sparse models | [`colmap`] |
 //! | matches | [`read_matches`], [`write_matches`] |
 
@@ -48,7 +48,7 @@ mod picture;
 pub mod ply;
 mod sniff;
 
-pub use camera::{RigFile, parse_camera, parse_rig, read_camera, read_rig, write_camera, write_rig};
+pub use camera::{CalibrationFormat, RigFile, parse_camera, parse_rig, read_camera, read_rig, write_camera, write_rig};
 pub use depth_png::{depth_mm, kitti, scaled};
 pub use encode::{JpegPixels, PngPixels, encode_jpeg, encode_png, write_image, write_jpeg, write_png};
 pub use error::{FormatError, IoError};

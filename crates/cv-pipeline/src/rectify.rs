@@ -111,7 +111,7 @@ mod tests {
     fn features_of_a_turned_and_distorted_pair_come_to_lie_in_the_same_rows() {
         let scene = Scene::room(2);
         let mut camera = Camera::from_focal(320, 240, 260.0);
-        camera.distortion = Distortion::Radial { k1: -0.12, k2: 0.02 };
+        camera.distortion = Distortion::radial(-0.12, 0.02);
         let relative = Pose::new(Rotation3::from_euler_angles(0.02, -0.03, 0.015), Vector3::new(-0.2, 0.01, 0.004));
         let first = scene.viewpoint();
         let options = RenderOptions::default();

@@ -33,7 +33,7 @@ fn errors(views: &TwoView, points: impl Iterator<Item = Point3<f64>>, camera: &C
 fn the_cloud_is_as_true_as_the_sparse_points_it_comes_from() {
     let plain = Camera::from_focal(640, 480, 560.0);
     let mut bent = plain;
-    bent.distortion = Distortion::Radial { k1: -0.12, k2: 0.02 };
+    bent.distortion = Distortion::radial(-0.12, 0.02);
     // The second camera left of the first one or right of it, and a little ahead or behind, as the seeds have it.
     for (seed, camera) in [(3, plain), (5, bent), (8, plain), (11, bent)] {
         let views = two_view(seed, &camera, 0.4, &RenderOptions::default()).unwrap();

@@ -156,7 +156,7 @@ fn the_order_of_the_photographs_moves_nothing() {
 
 #[test]
 fn a_calibrated_lens_is_taken_out() {
-    let bent = Camera { distortion: Distortion::Radial { k1: -0.25, k2: 0.05 }, ..camera() };
+    let bent = Camera { distortion: Distortion::radial(-0.25, 0.05), ..camera() };
     let options = cv_synth::PanoramaOptions { views: 3, ..cv_synth::PanoramaOptions::default() };
     let set = panorama_views(4, &bent, &options, &RenderOptions::default()).unwrap();
     let photos: Vec<_> =

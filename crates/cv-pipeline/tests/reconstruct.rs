@@ -36,7 +36,7 @@ fn a_room_comes_back_with_its_pose_and_depths() {
 #[test]
 fn an_unknown_lens_that_bends_lines_is_found() {
     let mut lens = camera();
-    lens.distortion = cv_core::Distortion::Radial { k1: -0.15, k2: 0.0 };
+    lens.distortion = cv_core::Distortion::radial(-0.15, 0.0);
     let views = two_view(3, &lens, 0.4, &RenderOptions::default()).unwrap();
     let direction = |intrinsics| {
         let options = ReconstructOptions::new(intrinsics);

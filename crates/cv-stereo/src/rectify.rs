@@ -123,10 +123,8 @@ impl RectifiedView {
         if ray.z <= 0.0 {
             return None;
         }
-        let (d, j) = self.source.distortion.distort_with_jacobian(Point2::new(ray.x / ray.z, ray.y / ray.z));
-        // Beyond its turning point a distortion polynomial folds rays from far outside back into the image.
-        let sound = j.determinant() > 0.0 && j.trace() > 0.0;
-        sound.then(|| Point2::new(self.source.fx * d.x + self.source.cx, self.source.fy * d.y + self.source.cy))
+        // Beyond its turning point a lens model folds rays from far outside back into the image.
+        self.source.denormalize_in_range(Point2::new(ray.x / ray.z, ray.y / ray.z))
     }
 
     /// The rectified image of an original, bilinear, and where it shows anything; black elsewhere.
@@ -377,7 +375,7 @@ fn common_camera(
         fy: focal,
         cx: (width as f64 - 1.0) / 2.0 - focal * middle.x,
         cy: (height as f64 - 1.0) / 2.0 - focal * middle.y,
-        distortion: Distortion::None,
+        distortion: Distortion::NONE,
     };
     let [room_a, room_b] = [0, 1].map(|i: usize| room(&outlines[i], inner, (w / 2.0, h / 2.0)));
     let mut tight = (1.0 + ROUNDING) / room_a.min(room_b);
@@ -411,9 +409,9 @@ mod tests {
 
     fn rig(angles: (f64, f64, f64), center: Vector3<f64>, k1: f64) -> StereoRig {
         let mut left = Camera::pinhole(640, 480, 520.0, 515.0, 322.0, 236.0);
-        left.distortion = Distortion::BrownConrady { k1, k2: 0.05, p1: 0.001, p2: -0.001, k3: 0.0 };
+        left.distortion = Distortion::radial_tangential4([k1, 0.05, 0.001, -0.001]);
         let mut right = Camera::pinhole(640, 480, 530.0, 533.0, 310.0, 245.0);
-        right.distortion = Distortion::Radial { k1: k1 * 0.9, k2: 0.03 };
+        right.distortion = Distortion::radial(k1 * 0.9, 0.03);
         let rotation = Rotation3::from_euler_angles(angles.0, angles.1, angles.2);
         StereoRig { left, right, right_from_left: Pose::new(rotation, -(rotation * center)) }
     }

@@ -106,7 +106,7 @@ mod tests {
 
     fn rig(angles: [f64; 3], center: Vector3<f64>) -> StereoRig {
         let mut left = Camera::pinhole(640, 480, 520.0, 515.0, 322.0, 236.0);
-        left.distortion = Distortion::Radial { k1: -0.1, k2: 0.02 };
+        left.distortion = Distortion::radial(-0.1, 0.02);
         let right = Camera::pinhole(600, 500, 530.0, 533.0, 310.0, 245.0);
         let rotation = Rotation3::from_euler_angles(angles[0], angles[1], angles[2]);
         StereoRig { left, right, right_from_left: Pose::new(rotation, -(rotation * center)) }

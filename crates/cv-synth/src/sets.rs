@@ -7,7 +7,7 @@ use crate::scene::Scene;
 use crate::scenes::{Wall, path, walker};
 use crate::sensor::RenderOptions;
 use crate::truth::{plane_homography, rotation_homography};
-use cv_core::{Camera, Distortion, GrayF32, Mask, Point2, Pose};
+use cv_core::{Camera, GrayF32, Mask, Point2, Pose};
 use nalgebra::{Matrix3, Point3, Rotation3, Vector3};
 
 /// A rectified pair.
@@ -47,7 +47,7 @@ pub fn stereo_pair(
     baseline: f64,
     options: &RenderOptions,
 ) -> Result<StereoPair, SynthError> {
-    if camera.distortion != Distortion::None || !(baseline > 0.0 && baseline.is_finite()) {
+    if !(camera.distortion.is_none() && baseline > 0.0 && baseline.is_finite()) {
         return Err(SynthError::Stereo { baseline });
     }
     let right_pose = Pose::new(pose.rotation, pose.translation - Vector3::new(baseline, 0.0, 0.0));

@@ -9,7 +9,7 @@ fn camera() -> Camera {
 }
 
 fn lens() -> Camera {
-    Camera { distortion: Distortion::BrownConrady { k1: -0.18, k2: 0.05, p1: 0.002, p2: -0.001, k3: 0.0 }, ..camera() }
+    Camera { distortion: Distortion::radial_tangential4([-0.18, 0.05, 0.002, -0.001]), ..camera() }
 }
 
 fn somewhere() -> Pose {
@@ -285,7 +285,7 @@ fn the_same_seed_is_the_same_bytes_at_any_number_of_threads() {
 fn a_distorted_picture_is_the_ideal_one_moved_by_the_lens() {
     let scene = Scene::poster_wall(6);
     let ideal = Camera::from_focal(240, 180, 210.0);
-    let lens = Camera { distortion: Distortion::Radial { k1: -0.2, k2: 0.03 }, ..ideal };
+    let lens = Camera { distortion: Distortion::radial(-0.2, 0.03), ..ideal };
     let options = RenderOptions { blur: 1.0, ..RenderOptions::ideal() };
     let a = render(&scene, &ideal, &scene.viewpoint(), &options).unwrap();
     let b = render(&scene, &lens, &scene.viewpoint(), &options).unwrap();

@@ -10,6 +10,29 @@ use cv_report::{Canvas, Figure, Note, Report, colors, side_by_side};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
+/// The examples, and how a rig file is written, its lenses out of the table.
+fn help() -> String {
+    let lenses: Vec<String> = (cv_core::DistortionModel::ALL.iter().map(|model| model.info()))
+        .filter(|lens| !lens.parameters.is_empty())
+        .map(|lens| format!("  distortion: {}, coefficients: [{}]", lens.name, lens.parameters.join(", ")))
+        .collect();
+    format!(
+        "Examples:\n  \
+        cv rectify left.jpg right.jpg --rig rig.yaml --out rectified\n  \
+        cv rectify left.jpg right.jpg --rig opencv-stereo.yml --alpha 1 --size 1280x960 --out rectified --report page\n\n\
+        A rig file is ours:\n  \
+        schema: cv-rig/1\n  \
+        unit: m\n  \
+        left: {{width: 640, height: 480, fx: 560, fy: 560, cx: 319.5, cy: 239.5}}\n  \
+        right: {{width: 640, height: 480, fx: 555, fy: 555, cx: 325, cy: 236}}\n  \
+        rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]   # x_right = rotation · x_left + translation\n  \
+        translation: [-0.12, 0, 0]                    # the right camera stands 0.12 m to the right\n\
+        A camera may also have a distortion:\n{}\n\
+        Or the file is OpenCV's YAML, with M1, D1, M2, D2, R and T in one.",
+        lenses.join("\n")
+    )
+}
+
 /// Rectify a pair of photographs taken by a calibrated rig: the same scene point comes to lie in the same row of both.
 ///
 /// Writes left.png, right.png, rig.yaml (the rectified cameras) and q.txt (the matrix that takes column, row, disparity, 1
@@ -18,19 +41,7 @@ use std::path::{Path, PathBuf};
 /// Where one camera stands below the other, both results are turned by a quarter, anticlockwise: down in the scene is to the
 /// right, and rows coincide all the same. The upper photograph becomes left.png.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  \
-    cv rectify left.jpg right.jpg --rig rig.yaml --out rectified\n  \
-    cv rectify left.jpg right.jpg --rig opencv-stereo.yml --alpha 1 --size 1280x960 --out rectified --report page\n\n\
-    A rig file is ours:\n  \
-    schema: cv-rig/1\n  \
-    unit: m\n  \
-    left: {width: 640, height: 480, fx: 560, fy: 560, cx: 319.5, cy: 239.5}\n  \
-    right: {width: 640, height: 480, fx: 555, fy: 555, cx: 325, cy: 236}\n  \
-    rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]   # x_right = rotation · x_left + translation\n  \
-    translation: [-0.12, 0, 0]                    # the right camera stands 0.12 m to the right\n\
-    A camera may also have distortion: radial, brown_conrady or fisheye, and its 2, 5 or 4\n\
-    coefficients: [k1, k2], [k1, k2, p1, p2, k3] or [k1, k2, k3, k4]. Or the file is OpenCV's YAML,\n\
-    with M1, D1, M2, D2, R and T in one.")]
+#[command(after_help = help())]
 pub(crate) struct Args {
     /// The left (or upper) photograph.
     left: PathBuf,

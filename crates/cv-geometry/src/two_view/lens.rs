@@ -137,7 +137,7 @@ impl Search<'_> {
             let corner = 0.5 * (width as f64).hypot(height as f64) / lens.focal[i];
             let mut camera = Camera::from_focal(width, height, lens.focal[i]);
             if lens.bend != 0.0 {
-                camera.distortion = Distortion::Radial { k1: lens.bend / (corner * corner), k2: 0.0 };
+                camera.distortion = Distortion::radial(lens.bend / (corner * corner), 0.0);
             }
             camera
         })

@@ -16,6 +16,7 @@ use cv_core::{Camera, Correspondence, DMatch, Keypoint, Progress};
 
 /// What is known of the cameras.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[expect(clippy::large_enum_variant, reason = "there is one of it in a job")]
 pub enum Intrinsics {
     /// Both cameras are calibrated.
     Known([Camera; 2]),

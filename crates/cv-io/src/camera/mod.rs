@@ -1,11 +1,20 @@
 //! Cameras and stereo rigs in files of several origins, told apart by content.
+//!
+//! # A calibration format: start here
+//!
+//! A format is one file of this folder, which ends in a [`format::Format`]: its name, how it is recognized, how a camera and a rig are
+//! read, and, where we write it, how they are written. Add the file's `mod` and its line in [`FORMATS`]; reading by content, checking,
+//! and choosing a format to write then know it. What a lens is called in it comes from the table of lenses
+//! ([`cv_core::LensInfo`]): no format lists lens models, so that a new lens is known to all of them.
 
-mod colmap_line;
+mod colmap;
+mod format;
+mod matrix;
 mod opencv;
 mod own;
 mod yaml;
 
-pub(crate) use colmap_line::{model_parameters, parse_model};
+pub(crate) use colmap::{CENTER, model_line, parse_model};
 
 use std::path::Path;
 
@@ -13,9 +22,79 @@ use cv_core::{Camera, StereoRig};
 
 use crate::files::{read_text, write_bytes};
 use crate::{FormatError, IoError};
+use format::Format;
+
+/// The table of formats, in the order in which a text is tried: the particular before the general.
+const FORMATS: &[&Format] = &[&own::FORMAT, &colmap::FORMAT, &matrix::FORMAT, &opencv::FORMAT];
 
 const EXPECTED: &str =
     "a camera: YAML (ours, OpenCV's or ROS's), a COLMAP camera line, or the nine numbers of a calibration matrix";
+
+/// A format of calibration files.
+#[derive(Clone, Copy)]
+pub struct CalibrationFormat(&'static Format);
+
+impl CalibrationFormat {
+    /// Our own YAML, which [`write_camera`] and [`write_rig`] write: every number reads back to the same value.
+    pub const OWN: Self = Self(&own::FORMAT);
+
+    /// All formats.
+    pub fn all() -> impl Iterator<Item = Self> {
+        FORMATS.iter().map(|f| Self(f))
+    }
+
+    /// The format of a name: `own`, `opencv`, `colmap`, ….
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::all().find(|f| f.name() == name)
+    }
+
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        self.0.name
+    }
+
+    /// Whether cameras are written in it; the others are only read.
+    pub fn writes_cameras(self) -> bool {
+        self.0.camera_text.is_some()
+    }
+
+    /// Whether rigs are written in it.
+    pub fn writes_rigs(self) -> bool {
+        self.0.rig_text.is_some()
+    }
+
+    /// A camera in this format. `notes` become comment lines.
+    ///
+    /// # Errors
+    /// [`FormatError::NotRepresentable`] where [`Camera::validate`] fails or the format does not have its lens;
+    /// [`FormatError::Unsupported`] where the format is only read.
+    pub fn camera_text(self, camera: &Camera, notes: &[&str]) -> Result<String, FormatError> {
+        let write = self.0.camera_text.ok_or_else(|| FormatError::unsupported(self.0.name, "writing a camera"))?;
+        write(&writable(camera, self.0.name)?, notes)
+    }
+
+    /// A rig in this format. `notes` become comment lines.
+    ///
+    /// # Errors
+    /// As [`Self::camera_text`]; also for a motion that is not finite.
+    pub fn rig_text(self, file: &RigFile, notes: &[&str]) -> Result<String, FormatError> {
+        let write = self.0.rig_text.ok_or_else(|| FormatError::unsupported(self.0.name, "writing a rig"))?;
+        writable(&file.rig.left, self.0.name)?;
+        writable(&file.rig.right, self.0.name)?;
+        let motion = &file.rig.right_from_left;
+        if !motion.rotation.matrix().iter().chain(motion.translation.iter()).all(|v| v.is_finite()) {
+            let what = "a motion that is not finite".to_owned();
+            return Err(FormatError::NotRepresentable { format: self.0.name, what });
+        }
+        write(file, notes)
+    }
+}
+
+impl std::fmt::Debug for CalibrationFormat {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_tuple("CalibrationFormat").field(&self.0.name).finish()
+    }
+}
 
 /// A stereo rig as a file has it.
 #[derive(Debug, Clone, PartialEq)]
@@ -39,12 +118,7 @@ pub struct RigFile {
 /// # Errors
 /// [`FormatError`] with the line or the entry that is wrong or absent, or for a distortion model without an equal here.
 pub fn parse_camera(text: &str, size: Option<(usize, usize)>) -> Result<Camera, FormatError> {
-    let camera = match kind(text)? {
-        Kind::Own => own::camera(&yaml::load(text)?)?,
-        Kind::OpenCv => opencv::camera(&yaml::load(text)?, size)?,
-        Kind::Colmap => colmap_line::find(text)?,
-        Kind::Matrix => matrix(text, size)?,
-    };
+    let camera = (format_of(text)?.camera)(text, size)?;
     checked(camera)
 }
 
@@ -63,7 +137,7 @@ pub fn read_camera(path: impl AsRef<Path>, size: Option<(usize, usize)>) -> Resu
 /// [`FormatError::NotRepresentable`] where [`Camera::validate`] fails; else as [`crate::write_atomic`].
 pub fn write_camera(path: impl AsRef<Path>, camera: &Camera, notes: &[&str]) -> Result<(), IoError> {
     let path = path.as_ref();
-    let text = own::camera_text(camera, notes).map_err(|reason| IoError::writing(path, reason))?;
+    let text = CalibrationFormat::OWN.camera_text(camera, notes).map_err(|reason| IoError::writing(path, reason))?;
     write_bytes(path, text.as_bytes())
 }
 
@@ -72,13 +146,10 @@ pub fn write_camera(path: impl AsRef<Path>, camera: &Camera, notes: &[&str]) -> 
 /// # Errors
 /// As [`parse_camera`]; also where R is not a rotation to within 1e-3.
 pub fn parse_rig(text: &str, size: Option<(usize, usize)>) -> Result<RigFile, FormatError> {
-    let file = match kind(text)? {
-        Kind::Own => own::rig(&yaml::load(text)?)?,
-        Kind::OpenCv => opencv::rig(&yaml::load(text)?, size)?,
-        Kind::Colmap | Kind::Matrix => {
-            return Err(FormatError::UnknownFormat { expected: "a stereo rig: YAML, ours or OpenCV's" });
-        }
+    let Some(read) = format_of(text)?.rig else {
+        return Err(FormatError::UnknownFormat { expected: "a stereo rig: YAML, ours or OpenCV's" });
     };
+    let file = read(text, size)?;
     checked(file.rig.left)?;
     checked(file.rig.right)?;
     let t = &file.rig.right_from_left.translation;
@@ -103,47 +174,23 @@ pub fn read_rig(path: impl AsRef<Path>, size: Option<(usize, usize)>) -> Result<
 /// As [`write_camera`].
 pub fn write_rig(path: impl AsRef<Path>, file: &RigFile, notes: &[&str]) -> Result<(), IoError> {
     let path = path.as_ref();
-    let text = own::rig_text(file, notes).map_err(|reason| IoError::writing(path, reason))?;
+    let text = CalibrationFormat::OWN.rig_text(file, notes).map_err(|reason| IoError::writing(path, reason))?;
     write_bytes(path, text.as_bytes())
 }
 
-enum Kind {
-    Own,
-    OpenCv,
-    Colmap,
-    Matrix,
-}
-
-fn kind(text: &str) -> Result<Kind, FormatError> {
+fn format_of(text: &str) -> Result<&'static Format, FormatError> {
     if text.trim().is_empty() {
         return Err(FormatError::Empty);
     }
     if text.trim_start().starts_with("<?xml") || text.trim_start().starts_with("<opencv_storage") {
         return Err(FormatError::unsupported("OpenCV's XML", "this way of storing a camera (its YAML is)"));
     }
-    if text.lines().any(|l| l.starts_with("schema:")) {
-        return Ok(Kind::Own);
-    }
-    if colmap_line::find(text).is_ok() {
-        return Ok(Kind::Colmap);
-    }
-    let words = || text.lines().filter(|l| !l.trim_start().starts_with('#')).flat_map(numbers_of);
-    if words().all(|w| w.parse::<f64>().is_ok()) && words().count() == 9 {
-        return Ok(Kind::Matrix);
-    }
-    if text.starts_with("%YAML") || text.contains(':') {
-        return Ok(Kind::OpenCv);
-    }
-    // A COLMAP line that is nearly right deserves its own reason.
-    match colmap_line::find(text) {
-        Err(error @ FormatError::Line { .. }) => Err(error),
-        _ => Err(FormatError::UnknownFormat { expected: EXPECTED }),
-    }
+    let found = FORMATS.iter().copied().find(|f| (f.is)(text));
+    found.ok_or(FormatError::UnknownFormat { expected: EXPECTED })
 }
 
-/// The words of a row of a matrix, without brackets.
-fn numbers_of(line: &str) -> impl Iterator<Item = &str> {
-    line.split([' ', '\t', ',', ';', '[', ']', '\r']).filter(|w| !w.is_empty())
+fn writable(camera: &Camera, format: &'static str) -> Result<Camera, FormatError> {
+    checked(*camera).map_err(|e| FormatError::NotRepresentable { format, what: e.to_string() })
 }
 
 fn checked(camera: Camera) -> Result<Camera, FormatError> {
@@ -161,32 +208,6 @@ fn checked(camera: Camera) -> Result<Camera, FormatError> {
 
 fn no_size(format: &'static str) -> FormatError {
     FormatError::missing(format, "picture size")
-}
-
-/// The bare calibration matrix.
-fn matrix(text: &str, size: Option<(usize, usize)>) -> Result<Camera, FormatError> {
-    let mut m = [0.0; 9];
-    let words = text.lines().filter(|l| !l.trim_start().starts_with('#')).flat_map(numbers_of);
-    for (cell, word) in m.iter_mut().zip(words) {
-        *cell = word
-            .parse()
-            .map_err(|_| FormatError::corrupt("calibration matrix", format!("“{word}” is not a number")))?;
-    }
-    let (width, height) = size.ok_or_else(|| no_size("calibration matrix"))?;
-    from_matrix("calibration matrix", m, width, height)
-}
-
-/// A pinhole from the nine numbers of K.
-fn from_matrix(format: &'static str, m: [f64; 9], width: usize, height: usize) -> Result<Camera, FormatError> {
-    let [fx, skew, cx, zero, fy, cy, a, b, one] = m;
-    let scale = fx.abs().max(fy.abs());
-    if one == 0.0 || ![zero, a, b].iter().all(|v| v.abs() <= 1e-9 * scale) {
-        return Err(FormatError::corrupt(format, "it does not have the form (fx 0 cx; 0 fy cy; 0 0 1)"));
-    }
-    if skew.abs() > 1e-6 * scale {
-        return Err(FormatError::unsupported(format, format!("a skew of {skew}")));
-    }
-    Ok(Camera::pinhole(width, height, fx / one, fy / one, cx / one, cy / one))
 }
 
 #[cfg(test)]

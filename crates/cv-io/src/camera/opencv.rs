@@ -3,11 +3,15 @@
 //! There is no one naming: each list below holds the names seen in OpenCV's samples and tutorials, ROS's `camera_info`,
 //! and the answers people copy from.
 
-use cv_core::{Camera, Distortion, StereoRig};
+use std::fmt::Write as _;
+
+use cv_core::{Camera, Distortion, DistortionModel, LensProjection, StereoRig};
 use saphyr::Yaml;
 
-use super::yaml::{get, number, numbers, pose, required, size_of};
-use super::{RigFile, from_matrix, no_size};
+use super::format::{Format, comments};
+use super::matrix::pinhole;
+use super::yaml::{get, load, number, numbers, pose, required, size_of};
+use super::{RigFile, no_size};
 use crate::FormatError;
 
 const NAME: &str = "OpenCV YAML";
@@ -39,13 +43,22 @@ const COEFFICIENTS: [&str; 12] = [
     "distCoeffs1",
 ];
 
-pub(super) fn camera(document: &Yaml<'_>, size: Option<(usize, usize)>) -> Result<Camera, FormatError> {
+pub(super) const FORMAT: Format = Format {
+    name: "opencv",
+    is: |text| text.starts_with("%YAML") || text.contains(':'),
+    camera: |text, size| camera(&load(text)?, size),
+    rig: Some(|text, size| rig(&load(text)?, size)),
+    camera_text: Some(camera_text),
+    rig_text: Some(rig_text),
+};
+
+fn camera(document: &Yaml<'_>, size: Option<(usize, usize)>) -> Result<Camera, FormatError> {
     let mut names: Vec<&str> = MATRIX.to_vec();
     names.extend(["cameraMatrix1", "camera_matrix_1", "left_camera_matrix"]);
     one(document, &names, &COEFFICIENTS, size)
 }
 
-pub(super) fn rig(document: &Yaml<'_>, size: Option<(usize, usize)>) -> Result<RigFile, FormatError> {
+fn rig(document: &Yaml<'_>, size: Option<(usize, usize)>) -> Result<RigFile, FormatError> {
     let left = one(
         document,
         &[
@@ -109,7 +122,7 @@ fn one(
 ) -> Result<Camera, FormatError> {
     let m: [f64; 9] = required(document, NAME, matrix)?;
     let (width, height) = image_size(document)?.or(size).ok_or_else(|| no_size(NAME))?;
-    let mut camera = from_matrix(NAME, m, width, height)?;
+    let mut camera = pinhole(NAME, m, (width, height))?;
     let k = match get(document, coefficients) {
         None => Vec::new(),
         Some(v) => {
@@ -117,10 +130,10 @@ fn one(
         }
     };
     let model = get(document, &["distortion_model", "camera_model", "model"]).and_then(|m| m.as_str()).unwrap_or("");
-    let fisheye = ["fisheye", "equidistant", "kannala_brandt"].contains(&model.to_lowercase().as_str())
-        // OpenCV's calibration sample writes its flag.
-        || get(document, &["fisheye_model"]).and_then(number).is_some_and(|v| v != 0.0);
-    camera.distortion = distortion(&k, fisheye)?;
+    // OpenCV's calibration sample writes its flag.
+    let flag = get(document, &["fisheye_model"]).and_then(number).is_some_and(|v| v != 0.0);
+    let projection = if flag { LensProjection::Fisheye } else { projection(&model.to_lowercase()) };
+    camera.distortion = distortion(&k, projection)?;
     Ok(camera)
 }
 
@@ -142,27 +155,92 @@ fn image_size(document: &Yaml<'_>) -> Result<Option<(usize, usize)>, FormatError
     }
 }
 
-/// OpenCV's order: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 τx τy; for a fisheye k1 k2 k3 k4.
-fn distortion(k: &[f64], fisheye: bool) -> Result<Distortion, FormatError> {
-    if k.iter().all(|v| *v == 0.0) {
-        return Ok(Distortion::None);
+/// What a model's name, ROS's or one that people use, says of the lens.
+fn projection(name: &str) -> LensProjection {
+    let named = DistortionModel::ALL.iter().map(|m| m.info()).find(|i| [i.ros, i.kalibr].contains(&Some(name)));
+    match named {
+        Some(info) => info.projection,
+        None if ["fisheye", "kannala_brandt"].contains(&name) => LensProjection::Fisheye,
+        None => LensProjection::Perspective,
     }
-    if fisheye {
-        return match *k {
-            [k1, k2, k3, k4] => Ok(Distortion::Fisheye { k1, k2, k3, k4 }),
-            _ => Err(FormatError::corrupt(NAME, format!("a fisheye has four coefficients, not {}", k.len()))),
-        };
+}
+
+/// The lenses whose parameters are OpenCV's coefficients.
+fn lenses(projection: LensProjection) -> impl Iterator<Item = DistortionModel> {
+    DistortionModel::ALL.iter().copied().filter(move |m| m.info().opencv && m.info().projection == projection)
+}
+
+/// OpenCV's coefficients: how many there are says which model it is. Coefficients that are zero are left out where a simpler model has
+/// the others: OpenCV's samples write fourteen zeros for a pinhole.
+fn distortion(k: &[f64], projection: LensProjection) -> Result<Distortion, FormatError> {
+    if k.iter().all(|v| *v == 0.0) && projection == LensProjection::Perspective {
+        return Ok(Distortion::NONE);
     }
-    let (main, rest) = k.split_at(k.len().min(5));
-    if rest.iter().any(|v| *v != 0.0) {
-        return Err(FormatError::unsupported(NAME, "a rational, thin prism or tilted lens model"));
+    // The tilted model's fourteen are the thin prism's twelve and two angles.
+    let most = lenses(projection).map(|m| m.parameter_count()).max().unwrap_or(0);
+    let (known, tilt) = k.split_at(k.len().min(most));
+    if tilt.iter().any(|v| *v != 0.0) {
+        return Err(FormatError::unsupported(NAME, format!("a lens with {} coefficients", k.len())));
     }
-    match *main {
-        [k1, k2, p1, p2] => Ok(Distortion::BrownConrady { k1, k2, p1, p2, k3: 0.0 }),
-        [k1, k2, p1, p2, k3] => Ok(Distortion::BrownConrady { k1, k2, p1, p2, k3 }),
-        _ => Err(FormatError::corrupt(
-            NAME,
-            format!("{} distortion coefficients (4, 5, 8, 12 or 14 are usual)", k.len()),
-        )),
+    let lens = lenses(projection).find(|m| m.parameter_count() == known.len());
+    match lens.map(|lens| Distortion::new(lens, known)) {
+        Some(Ok(distortion)) => Ok(distortion.simplified()),
+        _ => {
+            let counts: Vec<String> = lenses(projection).map(|m| m.parameter_count().to_string()).collect();
+            let kind = if projection == LensProjection::Fisheye { "a fisheye" } else { "a lens" };
+            let reason = format!("{kind} has {} coefficients, not {}", counts.join(" or "), k.len());
+            Err(FormatError::corrupt(NAME, reason))
+        }
     }
+}
+
+fn camera_text(camera: &Camera, notes: &[&str]) -> Result<String, FormatError> {
+    let mut text = format!("%YAML:1.0\n---\n{}", comments(notes));
+    let _ = writeln!(text, "image_width: {}\nimage_height: {}", camera.width, camera.height);
+    push_lens(&mut text, camera, ["camera_matrix", "distortion_coefficients"])?;
+    push_projection(&mut text, camera);
+    Ok(text)
+}
+
+fn rig_text(file: &RigFile, notes: &[&str]) -> Result<String, FormatError> {
+    let StereoRig { left, right, right_from_left } = &file.rig;
+    let (size, other) = ((left.width, left.height), (right.width, right.height));
+    let kind = |camera: &Camera| camera.distortion.model().info().projection;
+    if size != other || kind(left) != kind(right) {
+        let what = "a rig of two cameras of different sizes, or of a fisheye and another lens".to_owned();
+        return Err(FormatError::NotRepresentable { format: NAME, what });
+    }
+    let mut text = format!("%YAML:1.0\n---\n{}", comments(notes));
+    let _ = writeln!(text, "image_width: {}\nimage_height: {}", left.width, left.height);
+    push_lens(&mut text, left, ["M1", "D1"])?;
+    push_lens(&mut text, right, ["M2", "D2"])?;
+    push_matrix(&mut text, "R", 3, right_from_left.rotation.matrix().transpose().as_slice());
+    push_matrix(&mut text, "T", 1, right_from_left.translation.as_slice());
+    push_projection(&mut text, left);
+    Ok(text)
+}
+
+/// What OpenCV's calibration sample writes of a fisheye.
+fn push_projection(text: &mut String, camera: &Camera) {
+    if camera.distortion.model().info().projection == LensProjection::Fisheye {
+        text.push_str("fisheye_model: 1\n");
+    }
+}
+
+fn push_lens(text: &mut String, camera: &Camera, [matrix, coefficients]: [&str; 2]) -> Result<(), FormatError> {
+    let info = camera.distortion.model().info();
+    let held = lenses(info.projection).filter_map(|m| camera.distortion.converted(m));
+    let Some(distortion) = held.min_by_key(|d| d.parameters().len()) else {
+        let what = format!("a lens of the model {}", info.name);
+        return Err(FormatError::NotRepresentable { format: NAME, what });
+    };
+    push_matrix(text, matrix, 3, camera.matrix().transpose().as_slice());
+    push_matrix(text, coefficients, 1, distortion.parameters());
+    Ok(())
+}
+
+fn push_matrix(text: &mut String, name: &str, columns: usize, values: &[f64]) {
+    let rows = values.len() / columns;
+    let _ =
+        writeln!(text, "{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: {values:?}");
 }

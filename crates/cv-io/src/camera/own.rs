@@ -2,11 +2,12 @@
 
 use std::fmt::Write as _;
 
-use cv_core::{Camera, Distortion, StereoRig};
+use cv_core::{Camera, Distortion, DistortionModel, StereoRig};
 use saphyr::Yaml;
 
-use super::yaml::{get, number, numbers, pose, required, size_of};
-use super::{RigFile, checked};
+use super::RigFile;
+use super::format::{Format, comments, printable};
+use super::yaml::{get, load, number, numbers, pose, required, size_of};
 use crate::FormatError;
 
 const NAME: &str = "cv-camera/1";
@@ -14,12 +15,21 @@ const RIG: &str = "cv-rig/1";
 const CAMERA_KEYS: [&str; 9] = ["schema", "width", "height", "fx", "fy", "cx", "cy", "distortion", "coefficients"];
 const RIG_KEYS: [&str; 6] = ["schema", "unit", "left", "right", "rotation", "translation"];
 
-pub(super) fn camera(document: &Yaml<'_>) -> Result<Camera, FormatError> {
+pub(super) const FORMAT: Format = Format {
+    name: "own",
+    is: |text| text.lines().any(|l| l.starts_with("schema:")),
+    camera: |text, _| camera(&load(text)?),
+    rig: Some(|text, _| rig(&load(text)?)),
+    camera_text: Some(camera_text),
+    rig_text: Some(rig_text),
+};
+
+fn camera(document: &Yaml<'_>) -> Result<Camera, FormatError> {
     schema(document, NAME)?;
     fields(document)
 }
 
-pub(super) fn rig(document: &Yaml<'_>) -> Result<RigFile, FormatError> {
+fn rig(document: &Yaml<'_>) -> Result<RigFile, FormatError> {
     schema(document, RIG)?;
     known_keys(document, RIG, &RIG_KEYS)?;
     let side = |key| get(document, &[key]).ok_or_else(|| FormatError::missing(RIG, key)).and_then(fields);
@@ -63,22 +73,14 @@ fn fields(map: &Yaml<'_>) -> Result<Camera, FormatError> {
         None => Vec::new(),
         Some(v) => numbers(v).ok_or_else(|| FormatError::corrupt(NAME, "coefficients is not a list of numbers"))?,
     };
-    let distortion = match (model, &k[..]) {
-        ("none", []) => Distortion::None,
-        ("radial", &[k1, k2]) => Distortion::Radial { k1, k2 },
-        ("brown_conrady", &[k1, k2, p1, p2, k3]) => Distortion::BrownConrady { k1, k2, p1, p2, k3 },
-        ("fisheye", &[k1, k2, k3, k4]) => Distortion::Fisheye { k1, k2, k3, k4 },
-        ("none" | "radial" | "brown_conrady" | "fisheye", k) => {
-            return Err(FormatError::corrupt(
-                NAME,
-                format!("distortion {model} does not have {} coefficients", k.len()),
-            ));
-        }
-        _ => {
-            let what = format!("the distortion “{model}” (none, radial, brown_conrady or fisheye)");
-            return Err(FormatError::unsupported(NAME, what));
-        }
+    let Some(lens) = DistortionModel::from_name(model) else {
+        let names: Vec<&str> = DistortionModel::ALL.iter().map(|m| m.info().name).collect();
+        let what = format!("the distortion “{model}” (it is one of {})", names.join(", "));
+        return Err(FormatError::unsupported(NAME, what));
     };
+    let distortion = Distortion::new(lens, &k).map_err(|e| {
+        FormatError::corrupt(NAME, format!("distortion {model} has {} coefficients, not {}", e.needed, e.got))
+    })?;
     Ok(Camera {
         width: side("width")?,
         height: side("height")?,
@@ -90,27 +92,22 @@ fn fields(map: &Yaml<'_>) -> Result<Camera, FormatError> {
     })
 }
 
-pub(super) fn camera_text(camera: &Camera, notes: &[&str]) -> Result<String, FormatError> {
-    let mut text = String::new();
-    push_notes(&mut text, notes);
+fn camera_text(camera: &Camera, notes: &[&str]) -> Result<String, FormatError> {
+    let mut text = comments(notes);
     let _ = writeln!(text, "schema: {NAME}");
-    push_camera(&mut text, camera, "")?;
+    push_camera(&mut text, camera, "");
     Ok(text)
 }
 
-pub(super) fn rig_text(file: &RigFile, notes: &[&str]) -> Result<String, FormatError> {
-    let mut text = String::new();
-    push_notes(&mut text, notes);
+fn rig_text(file: &RigFile, notes: &[&str]) -> Result<String, FormatError> {
+    let mut text = comments(notes);
     let quoted: String = file.unit.chars().filter(|&c| printable(c) && !matches!(c, '"' | '\\')).collect();
     let _ = writeln!(text, "schema: {RIG}\nunit: \"{quoted}\"\nleft:");
-    push_camera(&mut text, &file.rig.left, "  ")?;
+    push_camera(&mut text, &file.rig.left, "  ");
     text.push_str("right:\n");
-    push_camera(&mut text, &file.rig.right, "  ")?;
+    push_camera(&mut text, &file.rig.right, "  ");
     let r = file.rig.right_from_left.rotation.matrix();
     let t = &file.rig.right_from_left.translation;
-    if !r.iter().chain(t.iter()).all(|v| v.is_finite()) {
-        return Err(FormatError::NotRepresentable { format: RIG, what: "a motion that is not finite".to_owned() });
-    }
     text.push_str("# x_right = rotation · x_left + translation, translation in the unit above\nrotation:\n");
     for row in r.row_iter() {
         let _ = writeln!(text, "  - [{:?}, {:?}, {:?}]", row[0], row[1], row[2]);
@@ -119,31 +116,15 @@ pub(super) fn rig_text(file: &RigFile, notes: &[&str]) -> Result<String, FormatE
     Ok(text)
 }
 
-/// True for what YAML lets stand anywhere, and that does not end a line.
-fn printable(c: char) -> bool {
-    !c.is_control() && !matches!(c, '\u{feff}' | '\u{fffe}' | '\u{ffff}' | '\u{2028}' | '\u{2029}')
-}
-
-fn push_notes(text: &mut String, notes: &[&str]) {
-    for line in notes.iter().flat_map(|n| n.lines()) {
-        let line: String = line.chars().filter(|&c| printable(c)).collect();
-        let _ = writeln!(text, "# {line}");
-    }
-}
-
-fn push_camera(text: &mut String, camera: &Camera, indent: &str) -> Result<(), FormatError> {
-    checked(*camera).map_err(|e| FormatError::NotRepresentable { format: NAME, what: e.to_string() })?;
-    let (model, k): (_, Vec<f64>) = match camera.distortion {
-        Distortion::None => ("none", vec![]),
-        Distortion::Radial { k1, k2 } => ("radial", vec![k1, k2]),
-        Distortion::BrownConrady { k1, k2, p1, p2, k3 } => ("brown_conrady", vec![k1, k2, p1, p2, k3]),
-        Distortion::Fisheye { k1, k2, k3, k4 } => ("fisheye", vec![k1, k2, k3, k4]),
-    };
+fn push_camera(text: &mut String, camera: &Camera, indent: &str) {
+    let (lens, k) = (camera.distortion.model().info(), camera.distortion.parameters());
     let _ = writeln!(text, "{indent}width: {}\n{indent}height: {}", camera.width, camera.height);
     // Debug formatting of f64 is the shortest that reads back to the same bits, and always looks like a number.
     let _ = writeln!(text, "{indent}fx: {:?}\n{indent}fy: {:?}", camera.fx, camera.fy);
     let _ = writeln!(text, "{indent}# principal point, center of the top-left pixel at (0, 0)");
     let _ = writeln!(text, "{indent}cx: {:?}\n{indent}cy: {:?}", camera.cx, camera.cy);
-    let _ = writeln!(text, "{indent}distortion: {model}\n{indent}coefficients: {k:?}");
-    Ok(())
+    if !k.is_empty() {
+        let _ = writeln!(text, "{indent}# coefficients: {}", lens.parameters.join(", "));
+    }
+    let _ = writeln!(text, "{indent}distortion: {}\n{indent}coefficients: {k:?}", lens.name);
 }

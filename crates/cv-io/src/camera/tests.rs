@@ -1,5 +1,5 @@
 use super::*;
-use cv_core::{Distortion, Pose, Rotation3, Vector3};
+use cv_core::{Distortion, DistortionModel, Point2, Pose, Rotation3, Vector3};
 use proptest::prelude::*;
 
 /// As OpenCV 5's FileStorage writes it.
@@ -25,7 +25,7 @@ avg_reprojection_error: .Nan
 
 fn example() -> Camera {
     Camera {
-        distortion: Distortion::BrownConrady { k1: -0.28, k2: 0.04, p1: 0.001, p2: -0.0002, k3: 0.1 },
+        distortion: Distortion::radial_tangential5([-0.28, 0.04, 0.001, -0.0002, 0.1]),
         ..Camera::pinhole(640, 480, 532.8, 532.9, 342.5, 233.9)
     }
 }
@@ -48,14 +48,14 @@ fn opencv_samples_without_a_size_take_the_pictures() {
 fn ros_camera_info() {
     let text = "image_width: 640\nimage_height: 480\ncamera_name: left\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: [500, 0, 320, 0, 501, 240, 0, 0, 1]\ndistortion_model: equidistant\ndistortion_coefficients:\n  rows: 1\n  cols: 4\n  data: [0.1, 0.2, 0.3, 0.4]\n";
     let camera = parse_camera(text, None).unwrap();
-    assert_eq!(camera.distortion, Distortion::Fisheye { k1: 0.1, k2: 0.2, k3: 0.3, k4: 0.4 });
+    assert_eq!(camera.distortion, Distortion::fisheye4([0.1, 0.2, 0.3, 0.4]));
     assert_eq!((camera.fx, camera.fy, camera.cx, camera.cy), (500.0, 501.0, 320.0, 240.0));
 }
 
 #[test]
 fn colmap_lines_lose_their_half_pixel() {
     let expected = Camera {
-        distortion: Distortion::Radial { k1: -0.16196, k2: 0.0 },
+        distortion: Distortion::simple_radial(-0.16196),
         ..Camera::pinhole(2832, 2128, 2973.319797, 2973.319797, 1415.5, 1063.5)
     };
     for text in [
@@ -67,7 +67,71 @@ fn colmap_lines_lose_their_half_pixel() {
     }
     let error = parse_camera("SIMPLE_RADIAL 2832 2128 2973.3 1416 1064", None).unwrap_err().to_string();
     assert!(error.contains("3 parameters"), "{error}");
-    assert!(parse_camera("1 THIN_PRISM_FISHEYE 9 9 1 1 1 1 1 1 1 1 1 1 1 1", None).is_err());
+    let error = parse_camera("1 THIN_PRISM_FISHEYE 9 9 1 1 1 1 1 1 1 1 1 1 1 1", None).unwrap_err().to_string();
+    assert!(error.contains("THIN_PRISM_FISHEYE is not supported"), "{error}");
+}
+
+#[test]
+fn opencvs_counts_are_its_models() {
+    let text = |k: &[f64], more: &str| {
+        format!(
+            "%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\nK: [500, 0, 320, 0, 501, 240, 0, 0, 1]\nD: {k:?}\n{more}"
+        )
+    };
+    let k: [f64; 12] = std::array::from_fn(|i| 0.01 * (i + 1) as f64);
+    let read = |n: usize, more: &str| parse_camera(&text(&k[..n], more), None).map(|c| c.distortion);
+    for (n, model) in [
+        (4, DistortionModel::RadialTangential4),
+        (5, DistortionModel::RadialTangential5),
+        (8, DistortionModel::Rational8),
+        (12, DistortionModel::ThinPrism12),
+    ] {
+        assert_eq!(read(n, "").unwrap(), Distortion::new(model, &k[..n]).unwrap());
+    }
+    let fisheye = Distortion::new(DistortionModel::Fisheye4, &k[..4]).unwrap();
+    for more in ["fisheye_model: 1", "distortion_model: equidistant", "camera_model: fisheye"] {
+        assert_eq!(read(4, more).unwrap(), fisheye, "{more}");
+    }
+    // A fisheye without coefficients is no pinhole.
+    assert_eq!(
+        parse_camera(&text(&[0.0; 4], "fisheye_model: 1"), None).unwrap().distortion,
+        Distortion::fisheye4([0.0; 4])
+    );
+    assert_eq!(parse_camera(&text(&[0.0; 5], ""), None).unwrap().distortion, Distortion::NONE);
+    for n in [1, 3, 6, 7, 9] {
+        let error = read(n, "").unwrap_err().to_string();
+        assert!(error.contains("4 or 5 or 8 or 12 coefficients, not"), "{n}: {error}");
+    }
+    assert!(read(5, "fisheye_model: 1").is_err());
+}
+
+#[test]
+fn colmap_models_are_lenses_of_the_table() {
+    // As in COLMAP's `models.h`: focal lengths, principal point, parameters.
+    for (line, distortion) in [
+        ("SIMPLE_PINHOLE 9 9 5 4 4", Distortion::NONE),
+        ("PINHOLE 9 9 5 6 4 4", Distortion::NONE),
+        ("SIMPLE_RADIAL 9 9 5 4 4 0.1", Distortion::simple_radial(0.1)),
+        ("RADIAL 9 9 5 4 4 0.1 0.2", Distortion::radial(0.1, 0.2)),
+        ("OPENCV 9 9 5 6 4 4 0.1 0.2 0.3 0.4", Distortion::radial_tangential4([0.1, 0.2, 0.3, 0.4])),
+        (
+            "FULL_OPENCV 9 9 5 6 4 4 0.1 0.2 0.3 0.4 0.5 0.6 0.7 0.8",
+            Distortion::rational8([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8]),
+        ),
+        ("SIMPLE_RADIAL_FISHEYE 9 9 5 4 4 0.1", Distortion::fisheye4([0.1, 0.0, 0.0, 0.0])),
+        ("RADIAL_FISHEYE 9 9 5 4 4 0.1 0.2", Distortion::fisheye4([0.1, 0.2, 0.0, 0.0])),
+        ("OPENCV_FISHEYE 9 9 5 6 4 4 0.1 0.2 0.3 0.4", Distortion::fisheye4([0.1, 0.2, 0.3, 0.4])),
+    ] {
+        let camera = parse_camera(line, None).unwrap();
+        let fy = if line.contains(" 5 6 ") { 6.0 } else { 5.0 };
+        assert_eq!(camera, Camera { distortion, ..Camera::pinhole(9, 9, 5.0, fy, 3.5, 3.5) });
+        // The same model is the one with the fewest numbers that holds it.
+        assert_eq!(model_line(&camera).unwrap(), line);
+        let [first, .., last] = line.split(' ').collect::<Vec<_>>()[..] else { unreachable!() };
+        assert!(parse_camera(&format!("{line} {last}"), None).unwrap_err().to_string().contains(first));
+    }
+    let prism = Camera { distortion: Distortion::thin_prism12([0.1; 12]), ..Camera::from_focal(9, 9, 5.0) };
+    assert!(matches!(model_line(&prism), Err(FormatError::NotRepresentable { .. })));
 }
 
 #[test]
@@ -99,11 +163,14 @@ fn a_stereo_rig_of_opencv() {
         matrix("T", 3, 1, "-3.3, 0.1, 0.2")
     );
     let file = parse_rig(&text, Some((640, 480))).unwrap();
-    assert_eq!(file.rig.left.distortion, Distortion::BrownConrady { k1: 0.1, k2: 0.0, p1: 0.0, p2: 0.0, k3: 0.0 });
-    assert_eq!(file.rig.right.distortion, Distortion::None);
+    assert_eq!(file.rig.left.distortion, Distortion::simple_radial(0.1));
+    assert_eq!(file.rig.right.distortion, Distortion::NONE);
     assert_eq!(file.rig.right_from_left, Pose::new(Rotation3::identity(), Vector3::new(-3.3, 0.1, 0.2)));
     let rational = text.replace("0.1, 0., 0., 0., 0., 0., 0.", "0.1, 0., 0., 0., 0., 0.5, 0.");
-    assert!(parse_rig(&rational, Some((640, 480))).unwrap_err().to_string().contains("rational"));
+    let expected = Distortion::rational8([0.1, 0.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0]);
+    assert_eq!(parse_rig(&rational, Some((640, 480))).unwrap().rig.left.distortion, expected);
+    let tilted = text.replace("0., 0., 0. ]\nM2", "0., 0.1, 0. ]\nM2");
+    assert!(parse_rig(&tilted, Some((640, 480))).unwrap_err().to_string().contains("14 coefficients"));
     let bent =
         text.replace("data: [ 1., 0., 0., 0., 1., 0., 0., 0., 1. ]", "data: [ 2., 0., 0., 0., 1., 0., 0., 0., 1. ]");
     assert!(parse_rig(&bent, Some((640, 480))).unwrap_err().to_string().contains("rotation"));
@@ -125,7 +192,7 @@ fn mistakes_are_named() {
         ("width: 4", "width: 4.5", "width"),
         ("width: 4", "width: 99999999999", "width"),
         ("cv-camera/1", "cv-camera/9", "cv-camera/9"),
-        ("cy: 1\n", "cy: 1\ndistortion: radial\n", "0 coefficients"),
+        ("cy: 1\n", "cy: 1\ndistortion: radial\n", "2 coefficients, not 0"),
         ("cy: 1\n", "cy: 1\ndistortion: odd\n", "“odd”"),
         ("cy: 1\n", "cy: [1\n", "YAML"),
     ] {
@@ -149,13 +216,11 @@ fn hostile_yaml_is_refused_and_not_obeyed() {
 }
 
 fn distortions() -> impl Strategy<Value = Distortion> {
-    let k = || prop::num::f64::NORMAL | prop::num::f64::ZERO;
-    prop_oneof![
-        Just(Distortion::None),
-        (k(), k()).prop_map(|(k1, k2)| Distortion::Radial { k1, k2 }),
-        (k(), k(), k(), k(), k()).prop_map(|(k1, k2, p1, p2, k3)| Distortion::BrownConrady { k1, k2, p1, p2, k3 }),
-        (k(), k(), k(), k()).prop_map(|(k1, k2, k3, k4)| Distortion::Fisheye { k1, k2, k3, k4 }),
-    ]
+    let k = prop::num::f64::NORMAL | prop::num::f64::ZERO;
+    (0..DistortionModel::ALL.len(), prop::array::uniform12(k)).prop_map(|(i, k)| {
+        let model = DistortionModel::ALL[i];
+        Distortion::new(model, &k[..model.parameter_count()]).unwrap()
+    })
 }
 
 prop_compose! {
@@ -184,5 +249,34 @@ proptest! {
         // Any unit at all still gives a file that reads.
         write_rig(&path, &RigFile { unit, ..file.clone() }, &[]).unwrap();
         prop_assert_eq!(read_rig(&path, None).unwrap().rig, file.rig);
+    }
+
+    #[test]
+    fn what_a_format_writes_it_reads_as_the_same_lens(camera in cameras(), other in cameras(), r in prop::array::uniform3(-3.0..3.0f64)) {
+        for format in CalibrationFormat::all().filter(|f| f.writes_cameras()) {
+            let Ok(text) = format.camera_text(&camera, &["a note: 1"]) else {
+                prop_assert_eq!(format.name(), "colmap");
+                prop_assert_eq!(camera.distortion.model(), DistortionModel::ThinPrism12);
+                continue;
+            };
+            let back = parse_camera(&text, None).unwrap();
+            prop_assert_eq!(back.distortion.simplified(), camera.distortion.simplified(), "{}", text);
+            prop_assert_eq!((back.width, back.height, back.fx, back.fy), (camera.width, camera.height, camera.fx, camera.fy));
+            // COLMAP's half pixel costs the last bits of a number up to 10⁴.
+            prop_assert!((Point2::new(back.cx, back.cy) - Point2::new(camera.cx, camera.cy)).norm() < 1e-11);
+        }
+        let right = Camera { width: camera.width, height: camera.height, ..other };
+        let right_from_left = Pose::new(Rotation3::from_euler_angles(r[0], r[1], r[2]), Vector3::x());
+        let file = RigFile { rig: StereoRig { left: camera, right, right_from_left }, unit: String::new() };
+        for format in CalibrationFormat::all().filter(|f| f.writes_rigs()) {
+            let Ok(text) = format.rig_text(&file, &[]) else {
+                let projections = [camera, right].map(|c| c.distortion.model().info().projection);
+                prop_assert!(format.name() == "opencv" && projections[0] != projections[1]);
+                continue;
+            };
+            let back = parse_rig(&text, None).unwrap();
+            prop_assert_eq!(back.rig.right_from_left, file.rig.right_from_left);
+            prop_assert_eq!(back.rig.right.distortion.simplified(), right.distortion.simplified());
+        }
     }
 }

@@ -291,7 +291,7 @@ impl<'a> Group<'a> {
         let lens = s.state.lenses[s.lens_of[i]];
         let p = &self.photos[i];
         let camera = p.camera.unwrap_or_else(|| Camera {
-            distortion: if lens.k1 == 0.0 { Distortion::None } else { Distortion::Radial { k1: lens.k1, k2: 0.0 } },
+            distortion: if lens.k1 == 0.0 { Distortion::NONE } else { Distortion::simple_radial(lens.k1) },
             ..Camera::from_focal(p.width, p.height, lens.log_focal.exp())
         });
         View { camera, from_world: s.state.motion[i] }

@@ -7,7 +7,7 @@ use crate::align::View;
 use crate::surface::Field;
 use crate::surface::Surface;
 use crate::surface::{Bounds, Placement};
-use cv_core::{Distortion, Image, ImageView, Matrix3, Point2};
+use cv_core::{DistortionModel, Image, ImageView, Matrix3, Point2};
 use cv_imgproc::Interpolation;
 use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
@@ -105,9 +105,11 @@ impl Map {
             let squared = view.border(64).into_iter().map(|p| camera.normalize(p).coords.norm_squared());
             1.05 * squared.filter(|v| v.is_finite()).fold(0.0, f64::max) as f32
         };
-        let (m, lens) = match camera.distortion {
-            Distortion::None => (camera.matrix() * view.from_world, Lens::None),
-            Distortion::Radial { k1, k2 } => {
+        // The radial lens has vector code here; all others go by the table.
+        let radial = camera.distortion.converted(DistortionModel::Radial);
+        let (m, lens) = match radial.as_ref().map(|lens| lens.parameters()) {
+            _ if camera.distortion.is_none() => (camera.matrix() * view.from_world, Lens::None),
+            Some(&[k1, k2]) => {
                 let lens = Lens::Radial {
                     k1: k1 as f32,
                     k2: k2 as f32,
@@ -117,9 +119,7 @@ impl Map {
                 };
                 (view.from_world, lens)
             }
-            Distortion::BrownConrady { .. } | Distortion::Fisheye { .. } => {
-                (view.from_world, Lens::Other { view, limit: limit() })
-            }
+            _ => (view.from_world, Lens::Other { view, limit: limit() }),
         };
         // The overall size of M cancels; one keeps the single-precision numbers in the middle of their range.
         let m: Matrix3<f64> = m / m.norm();
@@ -290,7 +290,7 @@ fn bicubic(s: &Source<'_>, u: f32, v: f32) -> [f32; 3] {
 mod tests {
     use super::*;
     use crate::surface::Projection;
-    use cv_core::{Camera, RgbU8, Vector3};
+    use cv_core::{Camera, Distortion, RgbU8, Vector3};
     use nalgebra::Rotation3;
 
     fn placement(camera: Camera, r: Rotation3<f64>, surface: &Surface, bounds: Bounds) -> Placement {
@@ -313,9 +313,10 @@ mod tests {
         let photo = RgbU8::from_fn(121, 91, |x, y| wave(x as f64, y as f64).map(|v| v.round() as u8));
         let bounds = Bounds { left: 3, top: 5, right: 118, bottom: 88 };
         for distortion in [
-            Distortion::None,
-            Distortion::Radial { k1: -0.1, k2: 0.02 },
-            Distortion::BrownConrady { k1: 0.05, k2: 0.0, p1: 0.002, p2: -0.001, k3: 0.0 },
+            Distortion::NONE,
+            Distortion::radial(-0.1, 0.02),
+            Distortion::radial_tangential4([0.05, 0.0, 0.002, -0.001]),
+            Distortion::rational8([0.3, 0.02, 0.002, -0.001, 0.0, 0.25, 0.0, 0.0]),
         ] {
             let camera = Camera { distortion, ..Camera::from_focal(121, 91, 110.0) };
             for projection in [Projection::Plane, Projection::Cylindrical, Projection::Spherical] {
@@ -358,11 +359,7 @@ mod tests {
         let photo = RgbU8::new(20, 10, [9, 80, 200]);
         let surface = Surface { projection: Projection::Spherical, scale: 20.0 };
         let bounds = Bounds { left: 0, top: 0, right: 126, bottom: 90 };
-        for distortion in [
-            Distortion::None,
-            Distortion::Radial { k1: -0.3, k2: 0.0 },
-            Distortion::Fisheye { k1: 0.0, k2: 0.0, k3: 0.0, k4: 0.0 },
-        ] {
+        for distortion in [Distortion::NONE, Distortion::simple_radial(-0.3), Distortion::fisheye4([0.0; 4])] {
             let camera = Camera { distortion, ..Camera::from_focal(20, 10, 20.0) };
             let p = placement(camera, Rotation3::identity(), &surface, bounds);
             let warped = warp(photo.view(), &p, &surface, bounds, None, Interpolation::Bicubic, Tone::NEUTRAL);

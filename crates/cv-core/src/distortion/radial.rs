@@ -1,0 +1,44 @@
+//! Two radial terms: `x' = x (1 + k1 r² + k2 r⁴)`.
+
+use nalgebra::Point2;
+
+use super::lens::{ByParameters, ColmapModel, Distorted, Lens, LensInfo, LensProjection, Parameters};
+use super::{Distortion, DistortionModel, terms};
+
+pub(super) struct Radial;
+
+impl Distortion {
+    /// Two radial terms: `x' = x (1 + k1 r² + k2 r⁴)`.
+    pub const fn radial(k1: f64, k2: f64) -> Self {
+        Self::of(DistortionModel::Radial, [k1, k2])
+    }
+}
+
+impl Lens for Radial {
+    const INFO: LensInfo = LensInfo {
+        name: "radial",
+        former_names: &[],
+        parameters: &["k1", "k2"],
+        projection: LensProjection::Perspective,
+        opencv: false,
+        ros: None,
+        kalibr: None,
+        colmap: &[ColmapModel { name: "RADIAL", focal_lengths: 1, parameters: 2 }],
+    };
+
+    type Slope = [f64; 3];
+
+    #[inline(always)]
+    fn slope(k: &Parameters) -> Self::Slope {
+        [1.0, 3.0 * k[0], 5.0 * k[1]]
+    }
+
+    #[inline(always)]
+    fn evaluate(k: &Parameters, p: Point2<f64>, by_parameters: Option<&mut ByParameters>) -> Distorted {
+        let r2 = terms::squared_radius(p);
+        if let Some(out) = by_parameters {
+            terms::by_radial(out, 0, 2, p, r2, 1.0);
+        }
+        terms::radial(p, terms::polynomial([k[0], k[1]], r2))
+    }
+}

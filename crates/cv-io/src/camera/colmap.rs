@@ -1,0 +1,127 @@
+//! A camera as COLMAP names and orders its parameters: a line of `cameras.txt`.
+
+use std::fmt::Write as _;
+
+use cv_core::{Camera, ColmapModel, Distortion, DistortionModel};
+
+use super::format::Format;
+use crate::FormatError;
+
+const NAME: &str = "COLMAP camera";
+
+/// COLMAP's pixel centers are at +0.5.
+pub(crate) const CENTER: f64 = 0.5;
+
+pub(super) const FORMAT: Format = Format {
+    name: "colmap",
+    is: |text| !matches!(find(text), Err(FormatError::UnknownFormat { .. })),
+    camera: |text, _| find(text),
+    rig: None,
+    camera_text: Some(camera_text),
+    rig_text: None,
+};
+
+/// COLMAP's models, each with the lens it is.
+fn models() -> impl Iterator<Item = (DistortionModel, &'static ColmapModel)> {
+    DistortionModel::ALL.iter().flat_map(|lens| lens.info().colmap.iter().map(|model| (*lens, model)))
+}
+
+/// The camera of `model` with COLMAP's `parameters`.
+pub(crate) fn parse_model(model: &str, width: usize, height: usize, parameters: &[f64]) -> Result<Camera, FormatError> {
+    let wrong_count = || FormatError::corrupt(NAME, format!("{model} does not have {} parameters", parameters.len()));
+    let Some((lens, form)) = models().find(|(_, m)| m.name == model) else {
+        return Err(FormatError::unsupported(NAME, format!("the model {model}")));
+    };
+    let (fx, fy, rest) = match (form.focal_lengths, parameters) {
+        (1, [f, rest @ ..]) => (*f, *f, rest),
+        (2, [fx, fy, rest @ ..]) => (*fx, *fy, rest),
+        _ => return Err(wrong_count()),
+    };
+    let [cx, cy, coefficients @ ..] = rest else { return Err(wrong_count()) };
+    if coefficients.len() != form.parameters {
+        return Err(wrong_count());
+    }
+    let mut all = coefficients.to_vec();
+    all.resize(lens.parameter_count(), 0.0);
+    let distortion = Distortion::new(lens, &all).map_err(|_| wrong_count())?;
+    Ok(Camera { distortion, ..Camera::pinhole(width, height, fx, fy, cx - CENTER, cy - CENTER) })
+}
+
+/// A camera as `MODEL width height parameters`, by COLMAP's model with the fewest numbers that holds it.
+pub(crate) fn model_line(camera: &Camera) -> Result<String, FormatError> {
+    let held = |(lens, form): (DistortionModel, &'static ColmapModel)| {
+        let distortion = camera.distortion.converted(lens)?;
+        let rest = distortion.parameters()[form.parameters..].iter();
+        let holds = (form.focal_lengths == 2 || camera.fx == camera.fy) && rest.into_iter().all(|v| *v == 0.0);
+        holds.then_some((form, distortion))
+    };
+    let (form, distortion) = models()
+        .filter_map(held)
+        .min_by_key(|(form, _)| form.focal_lengths + form.parameters)
+        .ok_or_else(|| FormatError::NotRepresentable {
+            format: NAME,
+            what: format!("a lens of the model {}", camera.distortion.model().info().name),
+        })?;
+    let mut line = format!("{} {} {}", form.name, camera.width, camera.height);
+    let focal = [camera.fx, camera.fy];
+    let center = [camera.cx + CENTER, camera.cy + CENTER];
+    for v in focal[..form.focal_lengths].iter().chain(&center).chain(&distortion.parameters()[..form.parameters]) {
+        let _ = write!(line, " {v}");
+    }
+    Ok(line)
+}
+
+fn camera_text(camera: &Camera, notes: &[&str]) -> Result<String, FormatError> {
+    let mut text = super::format::comments(notes);
+    let _ = writeln!(text, "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 {}", model_line(camera)?);
+    Ok(text)
+}
+
+/// The first camera in a text: a line of `cameras.txt`, a bare `MODEL w h parameters`, or either behind `# camera:`, with the size also
+/// as `w×h` and the word `params` before the parameters.
+fn find(text: &str) -> Result<Camera, FormatError> {
+    for (index, line) in text.lines().enumerate() {
+        let content = match line.trim().strip_prefix('#') {
+            Some(comment) => match comment.trim_start().strip_prefix("camera:") {
+                Some(rest) => rest,
+                None => continue,
+            },
+            None => line,
+        };
+        let words: Vec<&str> = content.split_whitespace().collect();
+        let is_model =
+            |w: &&str| w.len() > 3 && w.bytes().all(|b| b.is_ascii_uppercase() || b.is_ascii_digit() || b == b'_');
+        let words = match &words[..] {
+            [model, rest @ ..] if is_model(model) && model.parse::<f64>().is_err() => (*model, rest),
+            [id, model, rest @ ..] if id.parse::<u32>().is_ok() && is_model(model) => (*model, rest),
+            [] => continue,
+            _ => break,
+        };
+        return numbers(words.0, words.1).map_err(|e| match e {
+            FormatError::Corrupt { reason, .. } => FormatError::line(index + 1, reason),
+            other => other,
+        });
+    }
+    Err(FormatError::UnknownFormat { expected: "a COLMAP camera" })
+}
+
+fn numbers(model: &str, words: &[&str]) -> Result<Camera, FormatError> {
+    let no_size = || FormatError::corrupt(NAME, "no width and height behind the model");
+    let side = |w: &str| w.parse::<usize>().ok();
+    let (width, height, rest) = match words {
+        [both, rest @ ..] if both.contains(['x', '×']) => {
+            let (w, h) = both.split_once(['x', '×']).ok_or_else(no_size)?;
+            (side(w).ok_or_else(no_size)?, side(h).ok_or_else(no_size)?, rest)
+        }
+        [w, h, rest @ ..] => (side(w).ok_or_else(no_size)?, side(h).ok_or_else(no_size)?, rest),
+        _ => return Err(no_size()),
+    };
+    let rest = rest.strip_prefix(&["params"]).unwrap_or(rest);
+    // A remark in brackets may follow.
+    let parameters: Vec<f64> = rest
+        .iter()
+        .take_while(|w| !w.starts_with('('))
+        .map(|w| w.parse().map_err(|_| FormatError::corrupt(NAME, format!("“{w}” is not a number"))))
+        .collect::<Result<_, _>>()?;
+    parse_model(model, width, height, &parameters)
+}

@@ -1,0 +1,41 @@
+//! What a calibration format is: the interface that each format's file fills in.
+
+use cv_core::Camera;
+
+use super::RigFile;
+use crate::FormatError;
+
+/// Width and height of the pictures, for files that do not say.
+pub(super) type Size = Option<(usize, usize)>;
+
+/// Understands a text as a camera or a rig.
+type Read<T> = fn(&str, Size) -> Result<T, FormatError>;
+/// A camera or a rig as text; the notes become comments.
+type Write<T> = fn(&T, &[&str]) -> Result<String, FormatError>;
+
+/// A calibration format.
+pub(super) struct Format {
+    /// Its name for those who choose one to write.
+    pub(super) name: &'static str,
+    /// Whether a text is meant as this format. Asked in the order of the table.
+    pub(super) is: fn(&str) -> bool,
+    /// Reads a camera.
+    pub(super) camera: Read<Camera>,
+    /// Reads a rig, where the format has them.
+    pub(super) rig: Option<Read<RigFile>>,
+    /// Writes a valid camera, where the format is written.
+    pub(super) camera_text: Option<Write<Camera>>,
+    /// Writes a rig of valid cameras and a finite motion, where the format is written.
+    pub(super) rig_text: Option<Write<RigFile>>,
+}
+
+/// Notes as lines of comments.
+pub(super) fn comments(notes: &[&str]) -> String {
+    let printable = |line: &str| line.chars().filter(|&c| printable(c)).collect::<String>();
+    notes.iter().flat_map(|n| n.lines()).map(|line| format!("# {}\n", printable(line))).collect()
+}
+
+/// True for what YAML lets stand anywhere, and that does not end a line.
+pub(super) fn printable(c: char) -> bool {
+    !c.is_control() && !matches!(c, '\u{feff}' | '\u{fffe}' | '\u{ffff}' | '\u{2028}' | '\u{2029}')
+}
