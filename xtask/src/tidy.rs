@@ -1,5 +1,7 @@
 //! `cargo xtask tidy`: the rules of the workspace that no compiler checks. Also a test, so `cargo test` runs it.
 
+mod options_in_text;
+
 use anyhow::{Context, Result, ensure};
 use serde::Deserialize;
 use std::{
@@ -272,6 +274,14 @@ fn check_text(shown: &str, text: &str, found: &mut Found) {
             }
         }
     }
+    let library = shown.starts_with("crates/") && !shown.starts_with("crates/cv-cli/") && shown.contains("/src/");
+    if rust && library {
+        for number in options_in_text::lines(text) {
+            found.problems.push(format!(
+                "{shown}:{number}: a library names an option or a command of the program: put the numbers into its error, the words into cv-cli"
+            ));
+        }
+    }
     // Written in two halves, so that this file does not find itself.
     let unfinished =
         [["TO", "DO"], ["FIX", "ME"], ["to", "do!("], ["unimple", "mented!("]].map(|halves| halves.concat());
@@ -333,7 +343,7 @@ mod tests {
     #[test]
     fn each_rule_can_fail() {
         type Case<'a> = (&'a str, String, &'a [(&'a str, &'a str)]);
-        let cases: [Case; 9] = [
+        let cases: [Case; 10] = [
             ("lacks `[lints]", GOOD.replace("true\n[dep", "false\n[dep"), &[("src/lib.rs", LIB)]),
             ("must not use cv-features", format!("{GOOD}cv-features.workspace = true\n"), &[("src/lib.rs", LIB)]),
             ("must not use image", format!("{GOOD}image.workspace = true\n"), &[("src/lib.rs", LIB)]),
@@ -342,6 +352,11 @@ mod tests {
             ("does not open with", GOOD.to_owned(), &[("src/lib.rs", "//! Short.\nuse rayon::x;\n")]),
             ("never compiled", GOOD.to_owned(), &[("src/lib.rs", LIB), ("src/lost.rs", "\n")]),
             ("unfinished work", GOOD.to_owned(), &[("src/lib.rs", LIB), ("notes.md", concat!("FIX", "ME\n"))]),
+            (
+                "an option or a command",
+                GOOD.to_owned(),
+                &[("src/lib.rs", "//! ```\n//! ```\nuse rayon::prelude::*;\nconst A: &str = \"give --focal\";\n")],
+            ),
             ("a path of one machine", GOOD.to_owned(), &[("src/lib.rs", LIB), ("notes.md", concat!("/ho", "me/x\n"))]),
         ];
         for (expected, manifest, files) in cases {

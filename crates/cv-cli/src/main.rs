@@ -3,6 +3,7 @@
 mod commands;
 mod frame;
 mod rig;
+mod words;
 
 use clap::Parser;
 use frame::Globals;

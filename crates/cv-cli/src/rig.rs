@@ -1,15 +1,11 @@
 //! What commands with a calibrated rig share.
 
 use crate::frame::{Failure, Outcome};
+use crate::words;
 use cv_core::Camera;
 use cv_io::{FormatError, RigFile};
 use cv_pipeline::NoPairCause;
-use cv_pipeline::stereo::RectifyError;
 use std::path::Path;
-
-/// What to look at where a calibration and photographs contradict each other.
-pub(crate) const ADVICE: &str =
-    "check that the calibration is that of these photographs, and that they are in its order";
 
 /// Reads a calibration; with `exchange`, its second camera becomes the left one. `size` is for files that do not tell it.
 pub(crate) fn read(path: &Path, size: (usize, usize), exchange: bool) -> Result<RigFile, Failure> {
@@ -39,24 +35,11 @@ pub(crate) fn check_size(rig: &Path, photo: &Path, size: (usize, usize), camera:
     Err(Failure::new(what).advice("give photographs of the size they had for the calibration, in its order"))
 }
 
-/// What to try where a rig cannot be rectified.
-pub(crate) fn explained(error: RectifyError, rig: &Path, exchange: bool) -> Failure {
-    let advice = match error {
-        RectifyError::Exchanged { .. } if exchange => {
-            "leave out --exchange, and name the photographs in the other order"
-        }
-        RectifyError::Exchanged { .. } => "name the photographs in the other order, and give --exchange",
-        RectifyError::TooLarge { .. } => "a smaller --size",
-        _ => "check the calibration file",
-    };
-    Failure::new(format!("{}: {error}", rig.display())).advice(advice)
-}
-
 /// The outcome, or the outcome with a failure where features lie as they cannot if the calibration is that of the photographs.
 pub(crate) fn checked(outcome: Outcome, rig: &Path, fault: Option<NoPairCause>) -> Outcome {
     match fault {
         Some(cause @ (NoPairCause::Rows { .. } | NoPairCause::Exchanged { .. })) => {
-            outcome.but(Failure::new(format!("the photographs do not fit {}: {cause}", rig.display())).advice(ADVICE))
+            outcome.but(words::another_rig(rig, cause))
         }
         _ => outcome,
     }

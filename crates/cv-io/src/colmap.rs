@@ -9,50 +9,13 @@ use std::path::Path;
 use std::str::SplitWhitespace;
 
 use cv_core::nalgebra::{Quaternion, UnitQuaternion};
-use cv_core::{Camera, Point2, Point3, Pose, Vector3};
+use cv_core::{Camera, ModelImage, ModelPoint, Point2, Point3, Pose, SparseModel, Vector3};
 
 use crate::camera::{CENTER, model_line, parse_model};
 use crate::files::{read_text, write_bytes};
 use crate::{FormatError, IoError};
 
 const NAME: &str = "COLMAP text";
-
-/// A sparse model.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct Model {
-    /// Cameras by number.
-    pub cameras: BTreeMap<u32, Camera>,
-    /// Pictures by number.
-    pub images: BTreeMap<u32, ModelImage>,
-    /// Points by number.
-    pub points: BTreeMap<u64, ModelPoint>,
-}
-
-/// A registered picture.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ModelImage {
-    /// File name, relative to the pictures' folder.
-    pub name: String,
-    /// Number of its camera.
-    pub camera: u32,
-    /// World to camera.
-    pub pose: Pose,
-    /// Image points in pixels (centers at integers), and the scene point each belongs to, if any.
-    pub points: Vec<(Point2<f64>, Option<u64>)>,
-}
-
-/// A scene point.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ModelPoint {
-    /// Position in the world.
-    pub position: Point3<f64>,
-    /// RGB color.
-    pub color: [u8; 3],
-    /// Mean reprojection error in pixels; negative or NaN where unknown.
-    pub error: f64,
-    /// Where it is seen: number of the picture, index of the point in it.
-    pub track: Vec<(u32, u32)>,
-}
 
 /// Words of a line, with errors that name what was expected.
 struct Words<'a>(SplitWhitespace<'a>, usize);
@@ -176,13 +139,13 @@ pub fn parse_points(text: &str) -> Result<BTreeMap<u64, ModelPoint>, FormatError
 ///
 /// # Errors
 /// [`IoError`] for the file that cannot be read or parsed.
-pub fn read(folder: impl AsRef<Path>) -> Result<Model, IoError> {
+pub fn read(folder: impl AsRef<Path>) -> Result<SparseModel, IoError> {
     let folder = folder.as_ref();
     fn part<T>(path: &Path, parse: impl Fn(&str) -> Result<T, FormatError>) -> Result<T, IoError> {
         parse(&read_text(path)?).map_err(|reason| IoError::reading(path, reason))
     }
     let points_path = folder.join("points3D.txt");
-    Ok(Model {
+    Ok(SparseModel {
         cameras: part(&folder.join("cameras.txt"), parse_cameras)?,
         images: part(&folder.join("images.txt"), parse_images)?,
         points: if points_path.exists() { part(&points_path, parse_points)? } else { BTreeMap::new() },
@@ -194,7 +157,7 @@ pub fn read(folder: impl AsRef<Path>) -> Result<Model, IoError> {
 /// # Errors
 /// [`FormatError::NotRepresentable`] where COLMAP has no model for a camera's lens, where a picture's camera, or a track's picture or point, is not in the model, or a name has
 /// a line break; else as [`crate::write_atomic`].
-pub fn write(folder: impl AsRef<Path>, model: &Model) -> Result<(), IoError> {
+pub fn write(folder: impl AsRef<Path>, model: &SparseModel) -> Result<(), IoError> {
     let folder = folder.as_ref();
     check(model).map_err(|what| IoError::writing(folder, FormatError::NotRepresentable { format: NAME, what }))?;
     let mut text = String::from("# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n");
@@ -239,7 +202,7 @@ pub fn write(folder: impl AsRef<Path>, model: &Model) -> Result<(), IoError> {
     write_bytes(folder.join("points3D.txt"), text.as_bytes())
 }
 
-fn check(model: &Model) -> Result<(), String> {
+fn check(model: &SparseModel) -> Result<(), String> {
     for (id, camera) in &model.cameras {
         camera.validate().map_err(|e| format!("camera {id}: {e}"))?;
     }
@@ -319,7 +282,7 @@ mod tests {
             let pose = Pose::new(Rotation3::from_euler_angles(r[0], r[1], r[2]), Vector3::from(t));
             let image = ModelImage { name: "a b.jpg".into(), camera: 7, pose, points: vec![(Point2::new(xy[0], xy[1]), Some(9)), (Point2::new(1.0, 2.0), None)] };
             let point = ModelPoint { position: Point3::from(t), color: [1, 2, 3], error: 0.5, track: vec![(3, 0)] };
-            let model = Model { cameras: [(7, camera)].into(), images: [(3, image.clone())].into(), points: [(9, point.clone())].into() };
+            let model = SparseModel { cameras: [(7, camera)].into(), images: [(3, image.clone())].into(), points: [(9, point.clone())].into() };
             let folder = tempfile::tempdir().unwrap();
             write(folder.path(), &model).unwrap();
             let back = read(folder.path()).unwrap();
@@ -339,7 +302,7 @@ mod tests {
     fn what_hangs_in_the_air_is_not_written() {
         let folder = tempfile::tempdir().unwrap();
         let image = ModelImage { name: "a".into(), camera: 1, pose: Pose::identity(), points: vec![] };
-        let mut model = Model { images: [(1, image)].into(), ..Model::default() };
+        let mut model = SparseModel { images: [(1, image)].into(), ..SparseModel::default() };
         assert!(write(folder.path(), &model).is_err());
         model.cameras.insert(1, Camera::from_focal(4, 4, 4.0));
         assert!(write(folder.path(), &model).is_ok());

@@ -1,22 +1,39 @@
 //! Depth from a rectified pair.
 
-use crate::Progress;
 use crate::no_pair::{NoPairCause, cause};
-use cv_core::{Cancelled, GrayF32, ImageView, StageClock};
-use cv_stereo::{DisparityMap, GeometryError, Intensity, StereoError, StereoGeometry, StereoMatcher, StereoOptions};
+use crate::{Progress, RangeError, disparity_range};
+use cv_core::{Cancelled, GrayF32, ImageView, PointCloud, RgbU8, StageClock};
+use cv_stereo::{
+    DisparityMap, GeometryError, Intensity, RectifyError, StereoError, StereoGeometry, StereoMatcher, StereoOptions,
+};
+
+/// Which disparities are tried.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum DisparityRange {
+    /// Those of [`StereoOptions::min_disparity`] and [`StereoOptions::disparities`].
+    #[default]
+    Given,
+    /// Those that feature matches show ([`disparity_range`]), from `min` px up where it is given.
+    FromMatches {
+        /// Smallest disparity, in px.
+        min: Option<i32>,
+    },
+}
 
 /// Settings of [`depth`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct DepthOptions {
     /// Settings of the matcher.
     pub stereo: StereoOptions,
+    /// Which disparities are tried. Default those of `stereo`.
+    pub disparities: DisparityRange,
     /// Nearest and farthest depth kept, in the unit of the baseline. Default 0 to infinity: all.
     pub range: (f32, f32),
 }
 
 impl Default for DepthOptions {
     fn default() -> Self {
-        Self { stereo: StereoOptions::default(), range: (0.0, f32::INFINITY) }
+        Self { stereo: StereoOptions::default(), disparities: DisparityRange::Given, range: (0.0, f32::INFINITY) }
     }
 }
 
@@ -31,9 +48,29 @@ pub struct DepthResult {
     pub confidence: Option<GrayF32>,
     /// Standard deviation of each disparity in px, NaN where filled.
     pub sigma: GrayF32,
+    /// Smallest disparity tried, in px, and how many.
+    pub disparities: (i32, usize),
+    /// What made depth of disparity; `None` where it was not given.
+    pub geometry: Option<StereoGeometry>,
     /// Stage names and their seconds. `match` is the matcher from the gray images to checked disparities; `prepare` is
     /// the memory it asks for beforehand.
     pub stages: Vec<(&'static str, f64)>,
+}
+
+impl DepthResult {
+    /// The pixels with a depth as points in the frame of the (rectified) left camera, with the colors of its photograph; `None` without a
+    /// geometry.
+    pub fn cloud(&self, left: ImageView<'_, u8, 3>) -> Option<PointCloud> {
+        Some(self.geometry?.cloud(self.depth.as_ref()?.view(), left))
+    }
+
+    /// Standard deviation of each depth in the unit of the baseline, to first order, NaN where filled or unknown; `None` without a geometry.
+    pub fn depth_sigma(&self) -> Option<GrayF32> {
+        let (geometry, depth) = (self.geometry?, self.depth.as_ref()?);
+        Some(GrayF32::from_fn(depth.width(), depth.height(), |x, y| {
+            [geometry.depth_uncertainty(depth.at(x, y)[0], self.sigma.at(x, y)[0])]
+        }))
+    }
 }
 
 /// Why there is no depth.
@@ -58,6 +95,12 @@ pub enum DepthError {
         /// What features show.
         cause: NoPairCause,
     },
+    /// Features do not tell which disparities to try.
+    #[error("the range of disparities is unknown: {0}")]
+    NoRange(#[source] RangeError),
+    /// The photographs cannot be rectified.
+    #[error(transparent)]
+    Rectify(RectifyError),
     /// The range of depths is empty.
     #[error("the depth range {near} to {far} is empty")]
     Range {
@@ -80,6 +123,24 @@ impl From<StereoError> for DepthError {
     }
 }
 
+impl From<RangeError> for DepthError {
+    fn from(error: RangeError) -> Self {
+        match error {
+            RangeError::Cancelled(stop) => Self::Cancelled(stop),
+            other => Self::NoRange(other),
+        }
+    }
+}
+
+impl From<RectifyError> for DepthError {
+    fn from(error: RectifyError) -> Self {
+        match error {
+            RectifyError::Cancelled(stop) => Self::Cancelled(stop),
+            other => Self::Rectify(other),
+        }
+    }
+}
+
 /// Share of the pixels that must be matched and confirmed. Of 56 generated pairs of four kinds (seeds 400 and 401: far things,
 /// three and six times the usual distance of the cameras, much noise, little light, blur) every one has 20 % or more, the least
 /// where half of the photograph is not in the other. Photographs of different things, in 1792 pairings with 16 to 256 disparities,
@@ -91,7 +152,7 @@ pub(crate) const LEAST_MATCHED: f64 = 0.18;
 ///
 /// # Errors
 /// [`DepthError::NoPair`] and [`DepthError::Cancelled`].
-pub fn check_pair<T: Intensity, const C: usize>(
+pub(crate) fn check_pair<T: Intensity, const C: usize>(
     map: &DisparityMap,
     left: ImageView<'_, T, C>,
     right: ImageView<'_, T, C>,
@@ -103,6 +164,28 @@ pub fn check_pair<T: Intensity, const C: usize>(
         return Ok(());
     }
     Err(DepthError::NoPair { matched, needed: LEAST_MATCHED, cause: cause(left, right, options, progress)? })
+}
+
+/// A photograph as bytes of color, 16 bits rounded to 8.
+pub(crate) fn color_bytes<T: Intensity, const C: usize>(photo: ImageView<'_, T, C>) -> RgbU8 {
+    RgbU8::from_fn(photo.width(), photo.height(), |x, y| {
+        let pixel = photo.at(x, y);
+        std::array::from_fn(|c| ((u32::from(pixel[if C >= 3 { c } else { 0 }].to_u16()) + 128) / 257) as u8)
+    })
+}
+
+/// The matcher's options, with the disparities that the pair shows where they are asked for.
+fn matcher_options<T: Intensity, const C: usize>(
+    left: ImageView<'_, T, C>,
+    right: ImageView<'_, T, C>,
+    options: &DepthOptions,
+    progress: &dyn Progress,
+) -> Result<StereoOptions, DepthError> {
+    let DisparityRange::FromMatches { min } = options.disparities else { return Ok(options.stereo.clone()) };
+    let (first, count) = disparity_range(color_bytes(left).view(), color_bytes(right).view(), progress)?;
+    let min_disparity = min.unwrap_or(first);
+    let disparities = (i64::from(first) + count as i64 - i64::from(min_disparity)).max(1) as usize;
+    Ok(StereoOptions { min_disparity, disparities, ..options.stereo.clone() })
 }
 
 /// Disparity of a rectified pair, and depth where its geometry is known.
@@ -126,19 +209,25 @@ pub fn depth<T: Intensity, const C: usize>(
         geometry.validate()?;
     }
     let mut clock = StageClock::new();
-    let mut matcher = StereoMatcher::new(options.stereo.clone())?;
+    let stereo = matcher_options(left, right, options, progress)?;
+    if options.disparities != DisparityRange::Given {
+        clock.lap("range");
+    }
+    let disparities = (stereo.min_disparity, stereo.disparities);
+    let mut matcher = StereoMatcher::new(stereo)?;
     let mut map = DisparityMap::empty();
     matcher.prepare(left.width(), left.height(), &mut map)?;
     clock.lap("prepare");
     progress.report("match", 0, 1)?;
     matcher.compute_into(left, right, &mut map)?;
     clock.lap("match");
-    check_pair(&map, left, right, &options.stereo, progress)?;
+    check_pair(&map, left, right, matcher.options(), progress)?;
     progress.report("match", 1, 1)?;
     let depth = geometry.map(|geometry| geometry.depth_map(map.disparity.view(), options.range));
     let (confidence, sigma) = (matcher.confidence(&map), matcher.uncertainty(&map));
     clock.lap("depth");
-    Ok(DepthResult { map, depth, confidence, sigma, stages: clock.into_stages() })
+    let geometry = geometry.copied();
+    Ok(DepthResult { map, depth, confidence, sigma, disparities, geometry, stages: clock.into_stages() })
 }
 
 #[cfg(test)]

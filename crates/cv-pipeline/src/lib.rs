@@ -14,7 +14,7 @@
 //!         progress.report("detect", row + 1, 10)?;
 //!     }
 //!     clock.lap("detect");
-//!     Ok(watch.into_stages())
+//!     Ok(clock.into_stages())
 //! }
 //! assert_eq!(job(&Silent)?[0].0, "detect");
 //! # Ok::<(), Cancelled>(())
@@ -28,26 +28,33 @@
 //!   variant `Cancelled` of its error.
 //! * The same input, options and seed give the same result at any number of threads.
 
+mod advice;
+mod axes;
 mod depth;
 mod disparity_range;
 mod estimate;
+mod frame_depth;
 mod guided;
 mod matching;
 mod no_pair;
 mod panorama;
 mod reconstruct;
 mod rectify;
+mod rig_depth;
 mod segment;
 mod views;
 
+pub use advice::Advice;
+pub use axes::Axes;
 pub use cv_core::{Cancelled, Progress, Silent};
 pub use cv_geometry::{
     EstimateError, Intrinsics, RobustModel, RobustOptions, TwoViewError, TwoViewOptions, TwoViewPoint,
     TwoViewReconstruction,
 };
-pub use depth::{DepthError, DepthOptions, DepthResult, check_pair, depth};
+pub use depth::{DepthError, DepthOptions, DepthResult, DisparityRange, depth};
 pub use disparity_range::{RangeError, disparity_range};
 pub use estimate::{CalibratedResult, EstimateResult, ModelKind, estimate, estimate_calibrated};
+pub use frame_depth::FrameDepth;
 pub use matching::{
     FeatureMethod, MatchingError, MatchingOptions, MatchingResult, PhotoFeatures, Slanted, Spacing, extract_features,
     match_extracted, match_features, match_photos,
@@ -72,6 +79,7 @@ pub use reconstruct::{
     reconstruct_dense,
 };
 pub use rectify::{RectifyResult, rectify};
+pub use rig_depth::{RigDepthResult, depth_by_rig};
 pub use segment::{SegmentResult, SegmentTraining, segment, train_segment};
 
 /// What a caller of [`depth()`] needs of the stereo stage: its options and results, rectification, geometry and scores.

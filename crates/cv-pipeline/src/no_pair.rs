@@ -1,8 +1,9 @@
 //! Why hardly any pixel of one photograph has a partner in the other, as far as feature matches tell.
 
+use crate::depth::color_bytes;
 use crate::disparity_range::{NEEDED, in_common_rows, is_common_row, range_of};
 use crate::{MatchingError, MatchingOptions, Progress, match_photos};
-use cv_core::{Cancelled, Correspondence, ImageView, RgbU8};
+use cv_core::{Cancelled, Correspondence, ImageView};
 use cv_stereo::{Intensity, StereoOptions};
 
 /// What feature matches of a refused pair show.
@@ -55,24 +56,6 @@ impl std::fmt::Display for NoPairCause {
     }
 }
 
-impl NoPairCause {
-    /// What a person can do about it.
-    pub fn advice(&self) -> String {
-        match self {
-            Self::Unrelated { .. } => "take two photographs of the same things, with texture on them".to_owned(),
-            Self::Rows { .. } => "rectify the pair (--rig, or `cv rectify`)".to_owned(),
-            Self::Exchanged { range: (low, _) } => {
-                format!("exchange the two photographs; if they are in order, give --min-disparity {low}")
-            }
-            Self::Range { range: (low, high) } => format!(
-                "--disparities auto, or --min-disparity {low} --disparities {}",
-                i64::from(*high) - i64::from(*low) + 1
-            ),
-            Self::Unknown => "a larger window (--census 9), or more light".to_owned(),
-        }
-    }
-}
-
 /// Between the quartiles of chance matches' vertical distances lies about a third of the height; a pair whose rows are askew by ten
 /// degrees stays below this share of it.
 const SPREAD: f64 = 0.1;
@@ -84,12 +67,7 @@ pub(crate) fn cause<T: Intensity, const C: usize>(
     options: &StereoOptions,
     progress: &dyn Progress,
 ) -> Result<NoPairCause, Cancelled> {
-    let [a, b] = [left, right].map(|view| {
-        RgbU8::from_fn(view.width(), view.height(), |x, y| {
-            let pixel = view.at(x, y);
-            std::array::from_fn(|c| (pixel[if C >= 3 { c } else { 0 }].to_u16() >> 8) as u8)
-        })
-    });
+    let [a, b] = [left, right].map(color_bytes);
     let found = match match_photos(a.view(), b.view(), &MatchingOptions::default(), progress) {
         Ok(found) => found,
         Err(MatchingError::Cancelled(stop)) => return Err(stop),

@@ -1,5 +1,6 @@
 //! `cv estimate`: a homography, fundamental or essential matrix from a matches file.
 
+use super::size;
 use crate::frame::{Context, Explain, Failure, Outcome, Run, named};
 use cv_core::nalgebra::Matrix3;
 use cv_core::{Camera, Correspondence, Named, named};
@@ -66,12 +67,6 @@ pub(crate) struct Args {
     /// Width and height of both views in pixels, such as 2832x2128.
     #[arg(long, value_name = "WxH", value_parser = size)]
     size: Option<(usize, usize)>,
-}
-
-/// `640x480`.
-fn size(text: &str) -> Result<(usize, usize), String> {
-    let parts = text.split_once(['x', '×']).and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
-    parts.filter(|(w, h)| *w > 0 && *h > 0).ok_or_else(|| "a size is a width and a height, such as 640x480".into())
 }
 
 impl Args {

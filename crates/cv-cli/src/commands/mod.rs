@@ -55,6 +55,15 @@ mod reconstruct;
 mod rectify;
 mod segment;
 
+/// For `value_parser`: a width and a height in pixels, each from 1 to 16384, as `640x480`.
+fn size(text: &str) -> Result<(usize, usize), String> {
+    let (w, h) = text.split_once(['x', '×']).ok_or("give width and height as 1280x960")?;
+    match (w.parse(), h.parse()) {
+        (Ok(w), Ok(h)) if (1..=16_384).contains(&w) && (1..=16_384).contains(&h) => Ok((w, h)),
+        _ => Err("width and height are whole numbers from 1 to 16384".to_owned()),
+    }
+}
+
 /// Makes the enum of subcommands and routes to them. The modules are declared outside: rustfmt does not look for files in
 /// macros.
 macro_rules! subcommands {

@@ -1,29 +1,19 @@
 //! `cv reconstruct`: points and camera poses from two photographs.
 
-use crate::frame::{Context, Explain, Failure, Outcome, Run};
+use crate::frame::{Context, Explain, Failure, Outcome, Run, named};
+use crate::words;
 use cv_core::nalgebra::Matrix3;
 use cv_core::{Correspondence, PointCloud, Pose};
 use cv_io::DynImage;
-use cv_io::colmap::{Model, ModelImage, ModelPoint};
 use cv_io::ply::PlyEncoding;
 use cv_pipeline::{
-    DenseOptions, DenseResult, Intrinsics, ReconstructError, ReconstructOptions, ReconstructResult, reconstruct,
-    reconstruct_dense,
+    Axes, DenseOptions, DenseResult, Intrinsics, ReconstructOptions, ReconstructResult, reconstruct, reconstruct_dense,
 };
 use cv_report::{
     Figure, MapStyle, MatchStyle, Note, PointScene, Report, Viewpoint, camera_color, draw_epipolar_lines,
     draw_keypoints, draw_map, draw_matches, render_points,
 };
 use std::path::{Path, PathBuf};
-
-/// Which way the axes of the written cloud point.
-#[derive(Debug, Clone, Copy, clap::ValueEnum)]
-enum Axes {
-    /// X right, Y down, Z forward
-    Opencv,
-    /// X right, Y up, Z backward: Blender, MeshLab and most viewers look along −Z
-    Opengl,
-}
 
 /// Reconstruct a colored cloud of points and the camera's motion from two photographs.
 ///
@@ -72,7 +62,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N")]
     features: Option<usize>,
     /// Which way the axes of the cloud point.
-    #[arg(long, value_name = "opencv|opengl", default_value = "opencv")]
+    #[arg(long, value_name = "WHICH", value_parser = named::<Axes>(), default_value_t = Axes::Opencv)]
     axes: Axes,
     /// Where to write the cameras and points as a COLMAP text model: a folder.
     #[arg(long, value_name = "DIR")]
@@ -117,20 +107,21 @@ impl Run for Args {
             options.two_view.robust.seed = seed;
         }
         let [a, b] = photos.map(DynImage::into_rgb8);
-        let result = match reconstruct(a.view(), b.view(), &options, context) {
-            Ok(result) => result,
-            Err(error) => return Err(explained(&error, &self)),
-        };
+        let result = reconstruct(a.view(), b.view(), &options, context)
+            .map_err(|error| words::no_reconstruction(&error, [&self.first, &self.second]))?;
         // Before anything is written: a dense cloud that cannot be had leaves no half of the outputs behind.
         let dense = self.dense(&a, &b, &result, context)?;
-        let cloud = self.turned(result.cloud());
-        cv_io::ply::write_cloud(&self.output, &cloud, PlyEncoding::Binary)?;
+        let write = |path: &Path, mut cloud: PointCloud| {
+            self.axes.turn(&mut cloud);
+            cv_io::ply::write_cloud(path, &cloud, PlyEncoding::Binary)
+        };
+        write(&self.output, result.cloud())?;
         if let (Some(path), Some(dense)) = (&self.dense, &dense) {
-            let cloud = self.turned(dense.cloud.clone());
-            cv_io::ply::write_cloud(path, &cloud, PlyEncoding::Binary)?;
+            write(path, dense.cloud.clone())?;
         }
         if let Some(folder) = &self.colmap {
-            cv_io::colmap::write(folder, &self.model(&result))?;
+            let name = |path: &Path| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+            cv_io::colmap::write(folder, &result.model([name(&self.first), name(&self.second)]))?;
         }
         if let Some(text) = doubt(&result) {
             context.warn(format!("{text}; --focal or --camera if you know it"));
@@ -140,19 +131,10 @@ impl Run for Args {
     }
 }
 
-/// A failure with its reason and what to try.
-fn explained(error: &ReconstructError, args: &Args) -> Failure {
-    let failure = Failure::new(format!("{} and {}: {error}", args.first.display(), args.second.display()));
-    failure.advice(error.advice())
-}
-
-/// A relative standard deviation of an estimated focal length that is worth a word: the error of a usual EXIF entry.
-const DOUBTFUL: f64 = 0.05;
-
 /// What to think of a focal length that the photographs hardly show.
 fn doubt(result: &ReconstructResult) -> Option<String> {
     let percent = 100.0 * result.scene.focal_deviation;
-    (result.scene.focal_deviation > DOUBTFUL).then(|| {
+    result.focal_is_doubtful().then(|| {
         format!(
             "the focal length is known to ±{percent:.0} % only, and the depth of the cloud may be stretched by as much"
         )
@@ -173,22 +155,15 @@ impl Args {
         if let Some(focal) = self.focal {
             return Ok((Intrinsics::Focal([focal; 2]), format!("focal length {focal} px as given")));
         }
-        let focal = photos.each_ref().map(|p| p.exif.focal.map(|f| f.pixels));
-        match (self.ignore_exif, focal) {
-            (false, [Some(a), Some(b)]) => Ok((
-                Intrinsics::Focal([a, b]),
-                format!("focal length {a:.0} px from EXIF (--focal or --camera to change it)"),
-            )),
-            _ => Ok((Intrinsics::Unknown, "focal length unknown: estimated from the matches".into())),
-        }
-    }
-
-    /// A cloud in the frame that was asked for.
-    fn turned(&self, mut cloud: PointCloud) -> PointCloud {
-        if matches!(self.axes, Axes::Opengl) {
-            cloud.positions.iter_mut().for_each(|p| *p = [p[0], -p[1], -p[2]]);
-        }
-        cloud
+        let exif = photos.each_ref().map(|p| p.exif.focal.map(|f| f.pixels).filter(|_| !self.ignore_exif));
+        let intrinsics = Intrinsics::from_focal_lengths(exif);
+        let source = match intrinsics {
+            Intrinsics::Focal([a, _]) => {
+                format!("focal length {a:.0} px from EXIF (--focal or --camera to change it)")
+            }
+            _ => "focal length unknown: estimated from the matches".to_owned(),
+        };
+        Ok((intrinsics, source))
     }
 
     /// The dense cloud, where it is asked for.
@@ -209,39 +184,7 @@ impl Args {
             ..DenseOptions::default()
         };
         let dense = reconstruct_dense(a.view(), b.view(), sparse, &options, context);
-        dense.map(Some).map_err(|error| {
-            let words = format!("no dense cloud of {} and {}: {error}", self.first.display(), self.second.display());
-            Failure::new(words).advice(error.advice())
-        })
-    }
-
-    fn model(&self, result: &ReconstructResult) -> Model {
-        let same = result.scene.cameras[0] == result.scene.cameras[1];
-        let name = |path: &Path| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
-        let mut model = Model::default();
-        model.cameras.insert(1, result.scene.cameras[0]);
-        if !same {
-            model.cameras.insert(2, result.scene.cameras[1]);
-        }
-        let pair = |i: usize| result.pair(&result.scene.points[i]);
-        let points = 0..result.scene.points.len();
-        let seen = |second: bool| {
-            let at = |i| if second { pair(i).b } else { pair(i).a };
-            points.clone().map(|i| (at(i), Some(i as u64 + 1))).collect()
-        };
-        let image = |path, camera, pose, points| ModelImage { name: name(path), camera, pose, points };
-        model.images.insert(1, image(&self.first, 1, Pose::identity(), seen(false)));
-        model.images.insert(2, image(&self.second, if same { 1 } else { 2 }, result.scene.pose, seen(true)));
-        for (i, (p, color)) in result.scene.points.iter().zip(&result.colors).enumerate() {
-            let point = ModelPoint {
-                position: p.position,
-                color: *color,
-                error: p.reprojection,
-                track: vec![(1, i as u32), (2, i as u32)],
-            };
-            model.points.insert(i as u64 + 1, point);
-        }
-        model
+        dense.map(Some).map_err(|error| words::no_dense_cloud(&error, [&self.first, &self.second]))
     }
 
     fn outcome(&self, result: &ReconstructResult, dense: Option<&DenseResult>) -> Outcome {

@@ -1,7 +1,8 @@
 //! `cv rectify`: a pair as two cameras would have taken it whose rows coincide.
 
+use super::size;
 use crate::frame::{Context, Explain, Failure, Outcome, Run, create_dir, spare_inputs};
-use crate::rig;
+use crate::{rig, words};
 use cv_core::{RgbU8, StereoRig};
 use cv_io::RigFile;
 use cv_pipeline::rectify;
@@ -57,7 +58,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "A", default_value_t = 0.0, value_parser = parse_share)]
     alpha: f64,
     /// Width and height of the rectified photographs [default: as the left one, turned with it where the rig is vertical].
-    #[arg(long, value_name = "WxH", value_parser = parse_size)]
+    #[arg(long, value_name = "WxH", value_parser = size)]
     size: Option<(usize, usize)>,
     /// The rig file has the cameras in the other order: its first one took the right (or lower) photograph.
     #[arg(long)]
@@ -66,14 +67,6 @@ pub(crate) struct Args {
 
 fn parse_share(text: &str) -> Result<f64, String> {
     text.parse().ok().filter(|share| (0.0..=1.0).contains(share)).ok_or_else(|| "give a number from 0 to 1".to_owned())
-}
-
-fn parse_size(text: &str) -> Result<(usize, usize), String> {
-    let (w, h) = text.split_once('x').ok_or("give width and height as 1280x960")?;
-    match (w.parse(), h.parse()) {
-        (Ok(w), Ok(h)) if (1..=16_384).contains(&w) && (1..=16_384).contains(&h) => Ok((w, h)),
-        _ => Err("width and height are whole numbers from 1 to 16384".to_owned()),
-    }
 }
 
 /// The files that are written.
@@ -90,7 +83,7 @@ impl Run for Args {
         rig::check_size(&self.rig, &self.right, right.size(), &rig.right)?;
         let options = RectifyOptions { alpha: self.alpha, size: self.size };
         let result = rectify(left.view(), right.view(), &rig, &options, context)
-            .map_err(|error| rig::explained(error, &self.rig, exchange))?;
+            .map_err(|error| words::no_rectification(error, &self.rig, exchange))?;
         let r = &result.rectification;
         let rotation = cv_core::Rotation3::identity();
         let translation = cv_core::Vector3::new(-r.geometry.baseline, 0.0, 0.0);

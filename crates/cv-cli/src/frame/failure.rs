@@ -40,7 +40,7 @@ impl Failure {
     }
 
     /// The lines on stderr.
-    pub(super) fn text(&self) -> String {
+    pub(crate) fn text(&self) -> String {
         match &self.advice {
             Some(advice) => format!("error: {}; try: {advice}", self.what),
             None => format!("error: {}", self.what),

@@ -28,6 +28,14 @@ pub enum Intrinsics {
 }
 
 impl Intrinsics {
+    /// What focal lengths in pixels tell, of which each may be missing: nothing unless both are known.
+    pub fn from_focal_lengths(focal: [Option<f64>; 2]) -> Self {
+        match focal {
+            [Some(a), Some(b)] => Self::Focal([a, b]),
+            _ => Self::Unknown,
+        }
+    }
+
     /// The cameras of photographs of these sizes, where they are known: undistorted ones of which only the focal length is.
     ///
     /// # Errors

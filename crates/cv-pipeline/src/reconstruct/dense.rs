@@ -89,29 +89,6 @@ impl From<RectifyError> for DenseError {
     }
 }
 
-impl DenseError {
-    /// What a person can do about it.
-    pub fn advice(&self) -> &'static str {
-        match self {
-            Self::Rectify(RectifyError::TooFarTurned { .. }) => {
-                "step aside between the photographs rather than ahead; the sparse cloud alone needs no --dense"
-            }
-            Self::Rectify(_) => {
-                "take photographs that share more of the scene; the sparse cloud alone needs no --dense"
-            }
-            Self::Stereo(StereoError::Memory { .. }) => {
-                "allow more memory (--max-memory) or reduce the photographs further (--dense-size)"
-            }
-            Self::Stereo(_) => "reduce the photographs less (--dense-size)",
-            Self::LittleConfirmed { .. } => {
-                "take photographs nearer to each other, of things with texture that stand still; the sparse cloud alone needs no --dense"
-            }
-            Self::Option(_) => "see `cv reconstruct --help`",
-            Self::Cancelled(_) => "run it again",
-        }
-    }
-}
-
 /// Half a window of the matcher and more.
 const BORDER: i64 = 4;
 

@@ -2,6 +2,7 @@
 
 mod dense;
 mod error;
+mod model;
 
 pub use dense::{DenseError, DenseOptions, DenseResult, reconstruct_dense};
 pub use error::ReconstructError;
@@ -73,6 +74,12 @@ impl ReconstructResult {
     /// For a point of another scene.
     pub fn pair(&self, point: &TwoViewPoint) -> Correspondence {
         self.matching.pair(&self.scene.matches[point.match_index])
+    }
+
+    /// Whether an estimated focal length is known so badly that it is worth a word: the depth of the scene goes with it.
+    pub fn focal_is_doubtful(&self) -> bool {
+        // The error of a usual EXIF entry.
+        self.scene.focal_deviation > 0.05
     }
 
     /// The points with their colors.

@@ -1,9 +1,9 @@
 //! `cv depth` on frames: one pair after the other with the same buffers.
 
-use super::{Args, Range, explained, say_memory};
+use super::{Args, Range, say_memory};
 use crate::frame::{Context, Explain, Failure, Outcome, expand_images};
-use cv_pipeline::stereo::{DisparityMap, StereoMatcher};
-use cv_pipeline::{Progress, check_pair};
+use crate::words;
+use cv_pipeline::{FrameDepth, Progress};
 use std::path::{Path, PathBuf};
 
 /// True for a folder or a pattern.
@@ -69,21 +69,20 @@ impl Args {
             return Err(Failure::new(format!("{} is not a folder", self.output.display()))
                 .advice("give a folder for the disparities of the frames"));
         }
-        let mut matcher = StereoMatcher::new(self.options().stereo)?;
-        let mut map = DisparityMap::empty();
-        let mut said = (0, 0);
-        let (mut seconds, mut valid) = (0.0, 0.0);
+        let options = self.options().stereo;
+        let mut film = FrameDepth::new(options.clone())?;
+        let (mut size, mut seconds, mut valid) = ((0, 0), 0.0, 0.0);
         for (i, (left, right)) in lefts.iter().zip(&rights).enumerate() {
             Progress::report(context, "frames", i, lefts.len())?;
             let (a, b) = (cv_io::read_rgb(left)?, cv_io::read_rgb(right)?);
-            if a.size() != said {
-                said = a.size();
-                say_memory(&matcher, said, context);
+            if a.size() != size {
+                size = a.size();
+                say_memory(&options, size, context)?;
             }
             let start = std::time::Instant::now();
-            matcher.compute_into(a.view(), b.view(), &mut map).during(left.display())?;
-            check_pair(&map, a.view(), b.view(), matcher.options(), context)
-                .map_err(|error| explained(error, false))
+            let map = film
+                .next(a.view(), b.view(), context)
+                .map_err(|error| words::no_depth(error, false))
                 .during(left.display())?;
             seconds += start.elapsed().as_secs_f64();
             valid += map.valid_fraction() / lefts.len() as f64;
@@ -95,7 +94,7 @@ impl Args {
             cv_io::pfm::write(self.output.join(name), map.disparity.view())?;
         }
         let rate = lefts.len() as f64 / seconds;
-        let (width, height) = map.disparity.size();
+        let (width, height) = size;
         Ok(Outcome::new(vec![("match", seconds)])
             .with("frames", lefts.len())
             .with("frames_per_second", rate)

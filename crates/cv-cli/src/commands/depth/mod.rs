@@ -3,21 +3,23 @@
 mod frames;
 mod maps;
 mod options;
+mod photos;
 mod report;
 
+use super::size;
 use crate::frame::{Context, Failure, Outcome, Run, named};
-use crate::rig;
-use cv_core::{GrayF32, ImageView, PointCloud, Pose, RgbU8, Rotation3, Vector3};
+use crate::{rig, words};
+use cv_core::{ImageView, PointCloud};
 use cv_io::ply::PlyEncoding;
-use cv_io::{DynImage, Pixels};
 use cv_pipeline::stereo::{
-    Blend, Census, Intensity, Paths, PixelState, Rectification, RectifyOptions, Smoothing, StereoError, StereoGeometry,
-    StereoMatcher,
+    Blend, Census, Paths, PixelState, Rectification, RectifyOptions, Smoothing, StereoGeometry, StereoMatcher,
+    StereoOptions,
 };
-use cv_pipeline::{DepthError, DepthOptions, DepthResult, NoPairCause, depth};
+use cv_pipeline::{DepthError, DepthOptions, DepthResult, RigDepthResult, depth, depth_by_rig};
 use frames::is_sequence;
 use maps::{map_format, write_map};
 use options::{Range, parse_range};
+use photos::{Photos, at_own_depth};
 use std::path::{Path, PathBuf};
 
 pub(crate) use maps::read_map;
@@ -59,6 +61,9 @@ pub(crate) struct Args {
     /// The rig file has the cameras in the other order: its first one took the right (or lower) photograph.
     #[arg(long, requires = "rig")]
     exchange: bool,
+    /// Width and height of the rectified photographs, such as 1280x960 [default: as `cv rectify`].
+    #[arg(long, value_name = "WxH", value_parser = size, requires = "rig")]
+    size: Option<(usize, usize)>,
     /// Number of disparities to try, in pixels, or auto: from feature matches.
     #[arg(long, value_name = "N|auto", default_value = "128", value_parser = parse_range)]
     disparities: Range,
@@ -154,53 +159,16 @@ impl Run for Args {
             return Err(Failure::usage("depth needs the geometry of the cameras")
                 .advice("give --focal and --baseline, or --rig"));
         }
-        let left = cv_io::read_image(&self.left)?;
-        let right = cv_io::read_image(&self.right)?;
-        if left.size() != right.size() && self.rig.is_none() {
-            let ((lw, lh), (rw, rh)) = (left.size(), right.size());
-            return Err(Failure::new(format!(
-                "{} is {lw}×{lh} px, {} is {rw}×{rh} px: both must have the same size",
-                self.left.display(),
-                self.right.display()
-            )));
-        }
-        let mut options = self.options();
+        let photos = Photos::read(&self.left, &self.right)?;
+        let options = self.options();
         let job = match &self.rig {
-            Some(path) => {
-                let rig = rig::read(path, left.size(), self.exchange)?.rig;
-                rig::check_size(path, &self.left, left.size(), &rig.left)?;
-                rig::check_size(path, &self.right, right.size(), &rig.right)?;
-                let explain = |error| rig::explained(error, path, self.exchange);
-                let rectified = Rectification::new(&rig, &RectifyOptions::default()).map_err(explain)?;
-                let (left, _) = rectified.left.apply(left.into_rgb8().view()).map_err(explain)?;
-                let (right, _) = rectified.right.apply(right.into_rgb8().view()).map_err(explain)?;
-                if rectified.vertical {
-                    context.note("the rig is vertical: the maps are those of the photograph turned by a quarter, as `cv rectify` turns it");
-                }
-                self.set_range(&mut options, &left, &right, context)?;
-                let result = matched(left.view(), right.view(), Some(&rectified.geometry), &options, context)
-                    .map_err(|error| explained(error, true))?;
-                let to_camera = Some(rectified.left.rotation.inverse());
-                Job { left, right, geometry: Some(rectified.geometry), to_camera, result }
-            }
-            None => {
-                let (width, height) = left.size();
-                let geometry = match (self.focal, self.baseline) {
-                    (Some(focal), Some(baseline)) => {
-                        let geometry = StereoGeometry::from_focal(width, height, focal, baseline)
-                            .map_err(|error| Failure::usage(error).advice("give positive numbers"))?;
-                        Some(StereoGeometry { offset: self.offset, ..geometry })
-                    }
-                    _ => None,
-                };
-                if self.disparities == Range::Auto {
-                    let (a, b) = (left.clone().into_rgb8(), right.clone().into_rgb8());
-                    self.set_range(&mut options, &a, &b, context)?;
-                }
-                job(left, right, geometry, &options, context)?
-            }
+            Some(path) => self.by_rig(path, &photos, &options, context)?,
+            None => self.rectified(photos, &options, context)?,
         };
-        let DepthResult { map, depth, .. } = &job.result;
+        let DepthResult { map, depth, disparities, .. } = &job.maps;
+        if self.disparities == Range::Auto {
+            context.note(format!("disparities {} to {}", disparities.0, disparities.0 + disparities.1 as i32 - 1));
+        }
         if let Some(lost) = write_map(&self.output, map.disparity.view(), |path, map| cv_io::kitti::write(path, map))? {
             context
                 .warn(format!("{lost} disparities do not fit KITTI's range of 0 to 256 px and are stored as unknown"));
@@ -210,30 +178,20 @@ impl Run for Args {
         {
             context.warn(format!("{lost} depths do not fit 0 to 65.535 m and are stored as unknown"));
         }
-        self.write_quality(&job, context)?;
-        let cloud = match (&job.geometry, depth) {
-            (Some(geometry), Some(depth)) if self.cloud.is_some() || context.wants_report() => {
-                let mut cloud = geometry.cloud(depth.view(), job.left.view());
-                if let Some(back) = job.to_camera {
-                    cloud.transform(&Pose::new(back, Vector3::zeros()));
-                }
-                cloud
-            }
-            _ => PointCloud::default(),
-        };
+        self.write_quality(&job.maps, context)?;
         if let Some(path) = &self.cloud {
-            cv_io::ply::write_cloud(path, &cloud, PlyEncoding::Binary)?;
+            cv_io::ply::write_cloud(path, &job.cloud, PlyEncoding::Binary)?;
         }
-        context.report(|| report::report(&job, &cloud))?;
+        context.report(|| report::report(&job))?;
         let (valid, matched) = (map.valid_fraction(), map.matched_fraction());
         let (width, height) = map.disparity.size();
-        Ok(Outcome::new(job.result.stages.clone())
+        Ok(Outcome::new(job.maps.stages.clone())
             .with("width", width)
             .with("height", height)
             .with("valid_fraction", valid)
             .with("matched_fraction", matched)
-            .with("disparities", options.stereo.disparities)
-            .with("min_disparity", options.stereo.min_disparity)
+            .with("disparities", disparities.1)
+            .with("min_disparity", disparities.0)
             .summary(format!(
                 "{width}×{height} px, {:.1} % with a disparity, {:.1} % matched and confirmed",
                 100.0 * valid,
@@ -243,9 +201,71 @@ impl Run for Args {
 }
 
 impl Args {
+    /// Matches photographs that are rectified already.
+    fn rectified(&self, photos: Photos, options: &DepthOptions, context: &Context) -> Result<RigDepthResult, Failure> {
+        let [(width, height), right] = photos.sizes();
+        if (width, height) != right {
+            return Err(Failure::new(format!(
+                "{} is {width}×{height} px, {} is {}×{} px: both must have the same size",
+                self.left.display(),
+                self.right.display(),
+                right.0,
+                right.1
+            )));
+        }
+        let geometry = match (self.focal, self.baseline) {
+            (Some(focal), Some(baseline)) => {
+                let geometry = StereoGeometry::from_focal(width, height, focal, baseline)
+                    .map_err(|error| Failure::usage(error).advice("give positive numbers"))?;
+                Some(StereoGeometry { offset: self.offset, ..geometry })
+            }
+            _ => None,
+        };
+        self.say_memory(options, (width, height), context)?;
+        let maps = at_own_depth!(photos, |a, b| depth(a, b, geometry.as_ref(), options, context))
+            .map_err(|error| words::no_depth(error, false))?;
+        let images = photos.into_rgb();
+        let wanted = self.cloud.is_some() || context.wants_report();
+        let cloud = if wanted { maps.cloud(images[0].view()).unwrap_or_default() } else { PointCloud::default() };
+        Ok(RigDepthResult { images, maps, cloud })
+    }
+
+    /// Rectifies and matches photographs of a rig.
+    fn by_rig(
+        &self,
+        path: &Path,
+        photos: &Photos,
+        options: &DepthOptions,
+        context: &Context,
+    ) -> Result<RigDepthResult, Failure> {
+        let [left, right] = photos.sizes();
+        let rig = rig::read(path, left, self.exchange)?.rig;
+        rig::check_size(path, &self.left, left, &rig.left)?;
+        rig::check_size(path, &self.right, right, &rig.right)?;
+        let settings = RectifyOptions { size: self.size, ..RectifyOptions::default() };
+        let rectification =
+            Rectification::new(&rig, &settings).map_err(|error| words::no_rectification(error, path, self.exchange))?;
+        if rectification.vertical {
+            context.note("the rig is vertical: the maps are those of the photograph turned by a quarter, as `cv rectify` turns it");
+        }
+        let camera = &rectification.left.camera;
+        self.say_memory(options, (camera.width, camera.height), context)?;
+        at_own_depth!(photos, |a, b| depth_by_rig(a, b, &rectification, options, context)).map_err(
+            |error| match error {
+                DepthError::Rectify(error) => words::no_rectification(error, path, self.exchange),
+                error => words::no_depth(error, true),
+            },
+        )
+    }
+
+    /// Tells what matching will take, before it is asked for; of a range that is still to be found nothing can be told.
+    fn say_memory(&self, options: &DepthOptions, size: (usize, usize), context: &Context) -> Result<(), Failure> {
+        if self.disparities == Range::Auto { Ok(()) } else { say_memory(&options.stereo, size, context) }
+    }
+
     /// Confidence, origin and uncertainty, where asked for.
-    fn write_quality(&self, job: &Job, context: &Context) -> Result<(), Failure> {
-        let DepthResult { map, depth, confidence, sigma, .. } = &job.result;
+    fn write_quality(&self, maps: &DepthResult, context: &Context) -> Result<(), Failure> {
+        let DepthResult { map, confidence, sigma, .. } = maps;
         if let (Some(path), Some(confidence)) = (&self.confidence, confidence) {
             let gray = |path: &Path, map: ImageView<'_, f32, 1>| {
                 let bytes =
@@ -259,14 +279,9 @@ impl Args {
             cv_io::write_png(path, matched.view())?;
         }
         if let Some(path) = &self.uncertainty {
-            let lost = match (&job.geometry, depth) {
-                (Some(geometry), Some(depth)) => {
-                    let bars = GrayF32::from_fn(depth.width(), depth.height(), |x, y| {
-                        [geometry.depth_uncertainty(depth.at(x, y)[0], sigma.at(x, y)[0])]
-                    });
-                    write_map(path, bars.view(), |path, map| cv_io::depth_mm::write(path, map))?
-                }
-                _ => write_map(path, sigma.view(), |path, map| cv_io::kitti::write(path, map))?,
+            let lost = match maps.depth_sigma() {
+                Some(bars) => write_map(path, bars.view(), |path, map| cv_io::depth_mm::write(path, map))?,
+                None => write_map(path, sigma.view(), |path, map| cv_io::kitti::write(path, map))?,
             };
             if let Some(lost) = lost {
                 context.warn(format!("{lost} uncertainties do not fit the format and are stored as unknown"));
@@ -276,72 +291,10 @@ impl Args {
     }
 }
 
-/// A finished job with what the outputs need.
-struct Job {
-    left: RgbU8,
-    right: RgbU8,
-    geometry: Option<StereoGeometry>,
-    /// From the frame of the photographs to that of the left camera, where they were rectified.
-    to_camera: Option<Rotation3<f64>>,
-    result: DepthResult,
-}
-
-/// Matches at the full depth of the files.
-fn job(
-    left: DynImage,
-    right: DynImage,
-    geometry: Option<StereoGeometry>,
-    options: &DepthOptions,
-    context: &Context,
-) -> Result<Job, Failure> {
-    let geometry_ref = geometry.as_ref();
-    let result = match (&left.pixels, &right.pixels) {
-        (Pixels::Gray8(a), Pixels::Gray8(b)) => matched(a.view(), b.view(), geometry_ref, options, context),
-        (Pixels::Gray16(a), Pixels::Gray16(b)) => matched(a.view(), b.view(), geometry_ref, options, context),
-        (Pixels::Rgb16(a), Pixels::Rgb16(b)) => matched(a.view(), b.view(), geometry_ref, options, context),
-        (Pixels::Rgb8(a), Pixels::Rgb8(b)) => matched(a.view(), b.view(), geometry_ref, options, context),
-        _ => {
-            let (a, b) = (left.clone().into_rgb8(), right.clone().into_rgb8());
-            matched(a.view(), b.view(), geometry_ref, options, context)
-        }
-    }
-    .map_err(|error| explained(error, false))?;
-    Ok(Job { left: left.into_rgb8(), right: right.into_rgb8(), geometry, to_camera: None, result })
-}
-
 /// Tells what matching will take, before it is asked for.
-fn say_memory(matcher: &StereoMatcher, (width, height): (usize, usize), context: &Context) {
+fn say_memory(options: &StereoOptions, (width, height): (usize, usize), context: &Context) -> Result<(), Failure> {
+    let matcher = StereoMatcher::new(options.clone()).map_err(|error| words::no_depth(error.into(), false))?;
     let mib = matcher.memory(width, height) as f64 / f64::from(1 << 20);
-    context.note(format!(
-        "matching {width}×{height} px at {} disparities takes {mib:.1} MiB",
-        matcher.options().disparities
-    ));
-}
-
-/// What to try where there is no depth; with a rig, the pair is as its calibration says.
-fn explained(error: DepthError, with_rig: bool) -> Failure {
-    let advice = match &error {
-        DepthError::NoPair { cause: NoPairCause::Rows { .. } | NoPairCause::Exchanged { .. }, .. } if with_rig => {
-            rig::ADVICE
-        }
-        DepthError::NoPair { cause, .. } => {
-            let advice = cause.advice();
-            return Failure::from(error).advice(advice);
-        }
-        DepthError::Stereo(StereoError::TooSmall { .. }) => "take larger photographs",
-        DepthError::Stereo(StereoError::Memory { .. }) => "allow more memory (--max-memory), or fewer disparities",
-        _ => "see `cv depth --help` for the range of each option",
-    };
-    Failure::from(error).advice(advice)
-}
-
-fn matched<T: Intensity, const C: usize>(
-    left: ImageView<'_, T, C>,
-    right: ImageView<'_, T, C>,
-    geometry: Option<&StereoGeometry>,
-    options: &DepthOptions,
-    context: &Context,
-) -> Result<DepthResult, DepthError> {
-    say_memory(&StereoMatcher::new(options.stereo.clone())?, left.size(), context);
-    depth(left, right, geometry, options, context)
+    context.note(format!("matching {width}×{height} px at {} disparities takes {mib:.1} MiB", options.disparities));
+    Ok(())
 }

@@ -1,11 +1,8 @@
 //! What the arguments of `cv depth` mean to the matcher.
 
 use super::Args;
-use crate::frame::{Context, Explain, Failure};
-use crate::rig;
-use cv_core::RgbU8;
 use cv_pipeline::stereo::{Smoothing, StereoOptions};
-use cv_pipeline::{DepthOptions, disparity_range};
+use cv_pipeline::{DepthOptions, DisparityRange};
 
 /// `--disparities`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -22,29 +19,6 @@ pub(super) fn parse_range(text: &str) -> Result<Range, String> {
 }
 
 impl Args {
-    /// Under `--disparities auto`, the range that feature matches show.
-    pub(super) fn set_range(
-        &self,
-        options: &mut DepthOptions,
-        left: &RgbU8,
-        right: &RgbU8,
-        context: &Context,
-    ) -> Result<(), Failure> {
-        if self.disparities == Range::Auto {
-            let (min, n) = disparity_range(left.view(), right.view(), context).during("--disparities auto").advice(
-                match self.rig {
-                    Some(_) => rig::ADVICE,
-                    None => "rectify the pair (--rig, or `cv rectify`), or give the number of disparities",
-                },
-            )?;
-            let end = min + n as i32;
-            options.stereo.min_disparity = self.min_disparity.unwrap_or(min);
-            options.stereo.disparities = (end - options.stereo.min_disparity).max(1) as usize;
-            context.note(format!("disparities {} to {}", options.stereo.min_disparity, end - 1));
-        }
-        Ok(())
-    }
-
     pub(super) fn options(&self) -> DepthOptions {
         let default = StereoOptions::default();
         DepthOptions {
@@ -76,6 +50,10 @@ impl Args {
                 confidence: self.confidence.is_some(),
                 max_memory: self.max_memory.map(|mib| mib.saturating_mul(1 << 20)),
                 ..default
+            },
+            disparities: match self.disparities {
+                Range::Number(_) => DisparityRange::Given,
+                Range::Auto => DisparityRange::FromMatches { min: self.min_disparity },
             },
             range: (self.near, self.far.unwrap_or(f32::INFINITY)),
         }

@@ -1,10 +1,9 @@
 //! The report of `cv depth`.
 
-use super::Job;
 use crate::frame::Failure;
-use cv_core::{ImageView, PointCloud, RgbU8};
-use cv_pipeline::DepthResult;
+use cv_core::{ImageView, RgbU8};
 use cv_pipeline::stereo::PixelState;
+use cv_pipeline::{DepthResult, RigDepthResult};
 use cv_report::{Figure, MapStyle, Note, Plot, PointScene, Report, Viewpoint, draw_map, render_points};
 
 /// Where each disparity comes from, over the darkened photograph.
@@ -21,25 +20,24 @@ fn draw_states(left: ImageView<'_, u8, 3>, states: ImageView<'_, PixelState, 1>)
     })
 }
 
-pub(super) fn report(job: &Job, cloud: &PointCloud) -> Result<String, Failure> {
-    let DepthResult { map, depth, stages, .. } = &job.result;
+pub(super) fn report(job: &RigDepthResult) -> Result<String, Failure> {
+    let RigDepthResult { images: [left, right], maps, cloud } = job;
+    let DepthResult { map, depth, stages, .. } = maps;
     let png = |image: &RgbU8| cv_io::encode_png(image.view());
     let mut page = Report::new("Depth");
     let (width, height) = map.disparity.size();
     page.headline("size", &format!("{width}×{height}"))
         .headline("with a disparity", &format!("{:.1} %", 100.0 * map.valid_fraction()))
         .headline("matched and confirmed", &format!("{:.1} %", 100.0 * map.matched_fraction()));
-    page.section("Photographs").figures(vec![
-        Figure::new(png(&job.left)?, "Left photograph."),
-        Figure::new(png(&job.right)?, "Right photograph."),
-    ]);
+    page.section("Photographs")
+        .figures(vec![Figure::new(png(left)?, "Left photograph."), Figure::new(png(right)?, "Right photograph.")]);
     page.section("Disparity").figures(vec![
         Figure::new(
             png(&draw_map(map.disparity.view(), &MapStyle::disparity()))?,
-            "Disparity: near (large) blue, far (small) red, unknown black.",
+            "Disparity: near (large) blue, far (small) red, unknown gray.",
         ),
         Figure::new(
-            png(&draw_states(job.left.view(), map.state.view()))?,
+            png(&draw_states(left.view(), map.state.view()))?,
             "Filled pixels: blue hidden from the right camera, orange mismatched, violet outside the right photograph.",
         ),
     ]);
@@ -53,7 +51,7 @@ pub(super) fn report(job: &Job, cloud: &PointCloud) -> Result<String, Failure> {
     if let Some(depth) = depth {
         page.section("Depth").figure(Figure::new(
             png(&draw_map(depth.view(), &MapStyle::depth("")))?,
-            "Depth in the unit of the baseline: near blue, far red, unknown black.",
+            "Depth in the unit of the baseline: near blue, far red, unknown gray.",
         ));
         let scene = PointScene::new(cloud);
         let still = png(&render_points(&scene, Viewpoint::Camera, 960, 640))?;

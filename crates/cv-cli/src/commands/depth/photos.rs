@@ -1,0 +1,50 @@
+//! The two photographs, as deep as their files have them.
+
+use crate::frame::Failure;
+use cv_core::RgbU8;
+use cv_io::DynImage;
+use std::path::Path;
+
+/// A left and a right photograph.
+pub(super) struct Photos {
+    pub(super) left: DynImage,
+    pub(super) right: DynImage,
+}
+
+impl Photos {
+    pub(super) fn read(left: &Path, right: &Path) -> Result<Self, Failure> {
+        Ok(Self { left: cv_io::read_image(left)?, right: cv_io::read_image(right)? })
+    }
+
+    /// Width and height of each.
+    pub(super) fn sizes(&self) -> [(usize, usize); 2] {
+        [self.left.size(), self.right.size()]
+    }
+
+    /// As bytes of color.
+    pub(super) fn into_rgb(self) -> [RgbU8; 2] {
+        [self.left, self.right].map(DynImage::into_rgb8)
+    }
+}
+
+/// Evaluates an expression with views of both photographs, as deep as the files have them; as bytes of color where the two differ in kind or
+/// hold linear light.
+macro_rules! at_own_depth {
+    ($photos:expr, |$a:ident, $b:ident| $work:expr) => {
+        match (&$photos.left.pixels, &$photos.right.pixels) {
+            (cv_io::Pixels::Gray8(left), cv_io::Pixels::Gray8(right)) => at_own_depth!(left, right, $a, $b, $work),
+            (cv_io::Pixels::Gray16(left), cv_io::Pixels::Gray16(right)) => at_own_depth!(left, right, $a, $b, $work),
+            (cv_io::Pixels::Rgb8(left), cv_io::Pixels::Rgb8(right)) => at_own_depth!(left, right, $a, $b, $work),
+            (cv_io::Pixels::Rgb16(left), cv_io::Pixels::Rgb16(right)) => at_own_depth!(left, right, $a, $b, $work),
+            _ => {
+                let (left, right) = ($photos.left.clone().into_rgb8(), $photos.right.clone().into_rgb8());
+                at_own_depth!(left, right, $a, $b, $work)
+            }
+        }
+    };
+    ($left:ident, $right:ident, $a:ident, $b:ident, $work:expr) => {{
+        let ($a, $b) = ($left.view(), $right.view());
+        $work
+    }};
+}
+pub(super) use at_own_depth;
