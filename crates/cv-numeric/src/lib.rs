@@ -13,6 +13,7 @@
 //! # Ok::<(), cv_numeric::LinearError>(())
 //! ```
 
+pub mod adjust;
 mod eigen;
 mod levenberg_marquardt;
 mod linear;

@@ -137,7 +137,7 @@ pub fn smallest_eigenvector<const N: usize>(m: &SMatrix<f64, N, N>) -> Result<SV
 }
 
 /// The lower Cholesky factor of `m + shift·I`, its diagonal inverted.
-fn cholesky_lower<const N: usize>(m: &SMatrix<f64, N, N>, shift: f64) -> Option<SMatrix<f64, N, N>> {
+pub(crate) fn cholesky_lower<const N: usize>(m: &SMatrix<f64, N, N>, shift: f64) -> Option<SMatrix<f64, N, N>> {
     let mut l = *m;
     for j in 0..N {
         let mut pivot = l[(j, j)] + shift;

@@ -1,0 +1,383 @@
+//! Residuals of one kind: what they depend on, and their part of the normal equations.
+
+use super::manifold::Manifold;
+use super::structure::{Links, NONE};
+use crate::RobustLoss;
+use nalgebra::{SMatrix, SVector};
+use rayon::prelude::*;
+use std::ops::Range;
+
+/// Residuals of one kind: `R` numbers for each item, which depend on `B` blocks of parameters (1 to 4) with `C` degrees of freedom
+/// between them.
+///
+/// The sizes are known to the compiler, so that the loop over the items is compiled for each kind and allocates nothing. One
+/// block may be given twice to one residual.
+pub trait Residual<const R: usize, const B: usize, const C: usize>: Sync {
+    /// Degrees of freedom of each block; they add up to `C`.
+    const DIMS: [usize; B];
+
+    /// The residual of an item, given the numbers that store its blocks ([`Manifold::ambient`] of each). Where asked for, its
+    /// derivatives by the degrees of freedom of the blocks, side by side; `jacobian` comes filled with zeros.
+    ///
+    /// `None` where the residual is not defined, such as for a point behind a camera: a step there is not taken.
+    fn evaluate(
+        &self,
+        item: usize,
+        blocks: [&[f64]; B],
+        jacobian: Option<&mut SMatrix<f64, R, C>>,
+    ) -> Option<SVector<f64, R>>;
+}
+
+/// What is known of blocks of `N` numbers beforehand: residuals `(x − mean) · weight`, the weight one over the standard deviation in the
+/// unit of the other residuals.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Prior<const N: usize> {
+    /// Mean and weight of each number, of each item.
+    pub items: Vec<([f64; N], [f64; N])>,
+}
+
+impl<const N: usize> Residual<N, 1, N> for Prior<N> {
+    const DIMS: [usize; 1] = [N];
+
+    #[inline]
+    fn evaluate(
+        &self,
+        item: usize,
+        [x]: [&[f64]; 1],
+        jacobian: Option<&mut SMatrix<f64, N, N>>,
+    ) -> Option<SVector<f64, N>> {
+        let (mean, weight) = self.items.get(item)?;
+        if let Some(j) = jacobian {
+            for (k, weight) in weight.iter().enumerate() {
+                j[(k, k)] = *weight;
+            }
+        }
+        Some(SVector::from_fn(|i, _| (x[i] - mean[i]) * weight[i]))
+    }
+}
+
+/// The numbers of all blocks, by group.
+#[derive(Debug, Clone)]
+pub(super) struct Values {
+    pub(super) numbers: Vec<Vec<f64>>,
+    /// Numbers of a block, by group.
+    pub(super) ambient: Vec<usize>,
+}
+
+impl Values {
+    #[inline]
+    pub(super) fn block(&self, group: usize, index: usize) -> &[f64] {
+        let n = self.ambient[group];
+        &self.numbers[group][index * n..][..n]
+    }
+}
+
+/// Sums over the residuals of a kind.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct ResidualSums {
+    /// `Σ ρ(‖r‖²)`.
+    pub cost: f64,
+    /// `Σ w ‖r‖²`, the weights `w = ρ'(‖r‖²)`.
+    pub weighted_squares: f64,
+    /// `Σ w`, each residual counted with as many numbers as it has.
+    pub weights: f64,
+    /// Count of numbers.
+    pub count: usize,
+}
+
+impl ResidualSums {
+    pub(super) fn add(&mut self, other: &Self) {
+        self.cost += other.cost;
+        self.weighted_squares += other.weighted_squares;
+        self.weights += other.weights;
+        self.count += other.count;
+    }
+}
+
+/// Residuals and derivatives of all items of a kind, multiplied by the square roots of their weights.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Rows {
+    /// `R` numbers for each item.
+    residuals: Vec<f64>,
+    /// `R` rows of `C` numbers for each item. Columns of held parameters are left out, the free ones of a block moved together; of eliminated
+    /// blocks they are zero.
+    jacobians: Vec<f64>,
+}
+
+/// An eliminated block's part of the normal equations.
+pub(super) struct PointSums<'a> {
+    /// `E × E`.
+    pub(super) v: &'a mut [f64],
+    /// `E`.
+    pub(super) g: &'a mut [f64],
+    /// `E` rows, as long as the blocks that the point is seen with have columns.
+    pub(super) w: &'a mut [f64],
+}
+
+/// A block column of the reduced normal equations.
+pub(super) struct ColumnSums<'a> {
+    pub(super) block: u32,
+    /// Columns of `height` numbers.
+    pub(super) values: &'a mut [f64],
+    pub(super) height: usize,
+    /// First row of each block in this column.
+    pub(super) row: &'a [u32],
+    pub(super) gradient: &'a mut [f64],
+}
+
+/// Items that one task works on; sums of tasks are added in order, so that the number of threads changes nothing.
+const CHUNK: usize = 256;
+
+/// A kind of residuals, its type forgotten.
+pub(super) trait Kind: Sync {
+    fn name(&self) -> &str;
+    fn len(&self) -> usize;
+    /// Group of each block of a residual.
+    fn groups(&self) -> &[usize];
+    /// Number within its group of each block of an item.
+    fn blocks(&self, item: usize) -> &[u32];
+    /// `Σ ρ(‖r‖²)`, infinite where a residual is not defined.
+    fn cost(&self, values: &Values) -> f64;
+    /// Fills the rows. The first item that is not defined as the error.
+    fn linearize(&self, values: &Values, links: &Links, rows: &mut Rows) -> Result<ResidualSums, usize>;
+    /// Adds items that see one eliminated block.
+    fn add_to_point(&self, rows: &Rows, links: &Links, items: &[u32], point: PointSums<'_>);
+    /// Adds items that touch one block of the reduced system.
+    fn add_to_column(&self, rows: &Rows, links: &Links, items: &[u32], column: ColumnSums<'_>);
+    /// The numbers of an item and their common weight, for a plain reference.
+    #[cfg(test)]
+    fn plain(&self, values: &Values, item: usize) -> (Vec<f64>, f64);
+}
+
+/// A kind of residuals with the blocks that its items depend on.
+pub(super) struct Typed<T, const R: usize, const B: usize, const C: usize> {
+    pub(super) name: String,
+    pub(super) residual: T,
+    pub(super) groups: [usize; B],
+    pub(super) blocks: Vec<[u32; B]>,
+    pub(super) loss: RobustLoss,
+}
+
+impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Typed<T, R, B, C> {
+    /// First column of each block.
+    const FIRST: [usize; B] = {
+        let mut first = [0; B];
+        let mut k = 1;
+        while k < B {
+            first[k] = first[k - 1] + T::DIMS[k - 1];
+            k += 1;
+        }
+        assert!(B > 0 && first[B - 1] + T::DIMS[B - 1] == C, "C is the sum of DIMS");
+        first
+    };
+
+    #[inline]
+    fn at<'v>(&self, values: &'v Values, item: usize) -> [&'v [f64]; B] {
+        let blocks = &self.blocks[item];
+        std::array::from_fn(|k| values.block(self.groups[k], blocks[k] as usize))
+    }
+
+    fn cost_of(&self, values: &Values, items: Range<usize>) -> f64 {
+        let mut cost = 0.0;
+        for item in items {
+            match self.residual.evaluate(item, self.at(values, item), None) {
+                Some(r) => cost += self.loss.value(r.norm_squared()),
+                None => return f64::INFINITY,
+            }
+        }
+        cost
+    }
+
+    fn linearize_chunk(
+        &self,
+        values: &Values,
+        links: &Links,
+        first: usize,
+        (jacobians, residuals): (&mut [f64], &mut [f64]),
+    ) -> Result<ResidualSums, usize> {
+        let mut sums = ResidualSums { count: residuals.len(), ..ResidualSums::default() };
+        let rows = jacobians.chunks_exact_mut(R * C).zip(residuals.chunks_exact_mut(R));
+        for (item, (jacobian, residual)) in (first..).zip(rows) {
+            let mut j = SMatrix::<f64, R, C>::zeros();
+            let r = self.residual.evaluate(item, self.at(values, item), Some(&mut j)).ok_or(item)?;
+            let squared = r.norm_squared();
+            if !squared.is_finite() {
+                return Err(item);
+            }
+            let weight = self.loss.weight(squared);
+            sums.cost += self.loss.value(squared);
+            sums.weighted_squares += weight * squared;
+            sums.weights += weight * R as f64;
+            let root = weight.sqrt();
+            for row in 0..R {
+                residual[row] = root * r[row];
+                for column in 0..C {
+                    jacobian[row * C + column] = root * j[(row, column)];
+                }
+            }
+            if links.any_held {
+                self.leave_out_held(links, item, jacobian);
+            }
+        }
+        Ok(sums)
+    }
+
+    fn leave_out_held(&self, links: &Links, item: usize, jacobian: &mut [f64]) {
+        for k in 0..B {
+            let held = links.held(self.groups[k], self.blocks[item][k]);
+            if held == 0 {
+                continue;
+            }
+            let compact = links.eliminated != Some(k);
+            for row in jacobian.chunks_exact_mut(C) {
+                let mut to = Self::FIRST[k];
+                for c in 0..T::DIMS[k] {
+                    let value = row[Self::FIRST[k] + c];
+                    let free = held >> c & 1 == 0;
+                    if compact && free {
+                        row[to] = value;
+                        to += 1;
+                    } else if !compact && !free {
+                        row[Self::FIRST[k] + c] = 0.0;
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// `out[c * stride + a] += Σ_r left[r][a] · right[r][c]`, for rows `C` apart.
+#[inline(always)]
+fn add_product<const R: usize, const C: usize>(
+    j: &[f64],
+    (left, lefts): (usize, usize),
+    (right, rights): (usize, usize),
+    out: &mut [f64],
+    stride: usize,
+) {
+    for c in 0..rights {
+        let x: [f64; R] = std::array::from_fn(|r| j[r * C + right + c]);
+        let out = &mut out[c * stride..][..lefts];
+        let rows: [&[f64]; R] = std::array::from_fn(|r| &j[r * C + left..][..lefts]);
+        for (a, o) in out.iter_mut().enumerate() {
+            let mut sum = *o;
+            for r in 0..R {
+                sum += rows[r][a] * x[r];
+            }
+            *o = sum;
+        }
+    }
+}
+
+impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Kind for Typed<T, R, B, C> {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn len(&self) -> usize {
+        self.blocks.len()
+    }
+
+    fn groups(&self) -> &[usize] {
+        &self.groups
+    }
+
+    fn blocks(&self, item: usize) -> &[u32] {
+        &self.blocks[item]
+    }
+
+    fn cost(&self, values: &Values) -> f64 {
+        let chunks = self.len().div_ceil(CHUNK);
+        let of = |c: usize| self.cost_of(values, c * CHUNK..((c + 1) * CHUNK).min(self.len()));
+        (0..chunks).into_par_iter().map(of).collect::<Vec<f64>>().iter().sum()
+    }
+
+    fn linearize(&self, values: &Values, links: &Links, rows: &mut Rows) -> Result<ResidualSums, usize> {
+        rows.residuals.resize(self.len() * R, 0.0);
+        rows.jacobians.resize(self.len() * R * C, 0.0);
+        let chunks = rows.jacobians.par_chunks_mut(CHUNK * R * C).zip(rows.residuals.par_chunks_mut(CHUNK * R));
+        let parts: Vec<Result<ResidualSums, usize>> =
+            chunks.enumerate().map(|(c, out)| self.linearize_chunk(values, links, c * CHUNK, out)).collect();
+        let mut sums = ResidualSums::default();
+        for part in parts {
+            sums.add(&part?);
+        }
+        Ok(sums)
+    }
+
+    #[cfg(test)]
+    fn plain(&self, values: &Values, item: usize) -> (Vec<f64>, f64) {
+        let r = self.residual.evaluate(item, self.at(values, item), None).unwrap();
+        (r.as_slice().to_vec(), self.loss.weight(r.norm_squared()))
+    }
+
+    fn add_to_point(&self, rows: &Rows, links: &Links, items: &[u32], point: PointSums<'_>) {
+        let Some(e) = links.eliminated else { return };
+        let (size, first) = (T::DIMS[e], Self::FIRST[e]);
+        let length = point.w.len() / size;
+        for &item in items {
+            let item = item as usize;
+            let j = &rows.jacobians[item * R * C..][..R * C];
+            let r = &rows.residuals[item * R..][..R];
+            add_product::<R, C>(j, (first, size), (first, size), point.v, size);
+            for a in 0..size {
+                for row in 0..R {
+                    point.g[a] += j[row * C + first + a] * r[row];
+                }
+            }
+            for (k, target) in links.targets(item, B).iter().enumerate() {
+                if k != e && target.block != NONE {
+                    let width = target.width as usize;
+                    let out = &mut point.w[target.place as usize..];
+                    add_product::<R, C>(j, (Self::FIRST[k], width), (first, size), out, length);
+                }
+            }
+        }
+    }
+
+    fn add_to_column(&self, rows: &Rows, links: &Links, items: &[u32], column: ColumnSums<'_>) {
+        for &item in items {
+            let item = item as usize;
+            let j = &rows.jacobians[item * R * C..][..R * C];
+            let r = &rows.residuals[item * R..][..R];
+            let targets = links.targets(item, B);
+            for (k, right) in targets.iter().enumerate().filter(|(_, t)| t.block == column.block) {
+                let (within, width) = (right.within as usize, right.width as usize);
+                for c in 0..width {
+                    for row in 0..R {
+                        column.gradient[within + c] += j[row * C + Self::FIRST[k] + c] * r[row];
+                    }
+                }
+                for (l, left) in targets.iter().enumerate() {
+                    // The rest of the row is in the columns of the other blocks.
+                    if left.block != NONE && left.block >= column.block {
+                        let row = column.row[left.block as usize] as usize + left.within as usize;
+                        let out = &mut column.values[within * column.height + row..];
+                        let left = (Self::FIRST[l], left.width as usize);
+                        add_product::<R, C>(j, left, (Self::FIRST[k], width), out, column.height);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// A group of blocks: their name, how they move, and what of them is held.
+pub(super) struct Group<'a> {
+    pub(super) name: String,
+    pub(super) manifold: Box<dyn Manifold + 'a>,
+    pub(super) count: usize,
+    /// Degrees of freedom of a block.
+    pub(super) size: usize,
+    /// A bit for each degree of freedom that is held, of each block.
+    pub(super) held: Vec<u64>,
+    /// Blocks that are held but counted as uncertain in covariances: standard deviations of the degrees of freedom.
+    pub(super) considered: Vec<(usize, Vec<f64>)>,
+}
+
+impl Group<'_> {
+    /// All degrees of freedom.
+    pub(super) fn all(&self) -> u64 {
+        if self.size >= 64 { u64::MAX } else { (1 << self.size) - 1 }
+    }
+}

@@ -1,0 +1,293 @@
+//! Levenberg–Marquardt over blocks.
+
+use super::error::AdjustError;
+use super::factor::Factor;
+use super::normal::{FLOOR, Normal, Reduced};
+use super::residual::{ResidualSums, Values};
+use super::structure::Structure;
+use super::{Adjustment, GroupId};
+use rayon::prelude::*;
+use std::ops::ControlFlow;
+
+/// When [`Adjustment::solve`] stops, and how it starts.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AdjustOptions {
+    /// Most linearizations. Default 100, that of COLMAP.
+    pub max_iterations: usize,
+    /// Damping at the start, relative to the diagonal. Default 1e-4, as in Ceres.
+    pub initial_damping: f64,
+    /// Stop where a step lowers the cost by less than this share. Default 1e-9: parameters are then within about 3e-5 of their
+    /// standard deviations.
+    pub cost_tolerance: f64,
+    /// Stop where no residual changes with any parameter: the largest cosine of the angle between the residuals and a column of their
+    /// Jacobian. Default 1e-10.
+    pub gradient_tolerance: f64,
+    /// Stop where the largest entry of a step is below this, in the parameters' unit. Default 1e-14.
+    pub step_tolerance: f64,
+}
+
+impl Default for AdjustOptions {
+    fn default() -> Self {
+        Self {
+            max_iterations: 100,
+            initial_damping: 1e-4,
+            cost_tolerance: 1e-9,
+            gradient_tolerance: 1e-10,
+            step_tolerance: 1e-14,
+        }
+    }
+}
+
+/// Where an adjustment stands when it calls back, before each step is computed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AdjustIteration {
+    /// Steps tried so far.
+    pub steps: usize,
+    /// Linearizations so far, the first included.
+    pub iterations: usize,
+    /// Cost at the present parameters, the lowest so far.
+    pub cost: f64,
+    /// Damping of the next step, relative to the diagonal.
+    pub damping: f64,
+}
+
+/// Why an adjustment ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Termination {
+    /// The cost no longer went down by more than [`AdjustOptions::cost_tolerance`].
+    Cost,
+    /// The gradient was below [`AdjustOptions::gradient_tolerance`].
+    Gradient,
+    /// The step was below [`AdjustOptions::step_tolerance`].
+    Step,
+    /// No step went down, however short.
+    NoStep,
+    /// [`AdjustOptions::max_iterations`] were made.
+    Iterations,
+    /// The callback asked for it.
+    Stopped,
+}
+
+/// What [`Adjustment::solve`] did.
+#[derive(Debug, Clone, PartialEq)]
+pub struct AdjustReport {
+    /// `Σ ρ(‖r‖²)` at the start.
+    pub initial_cost: f64,
+    /// The same at the end, never above the start.
+    pub cost: f64,
+    /// Linearizations.
+    pub iterations: usize,
+    /// Steps tried.
+    pub steps: usize,
+    /// Why it ended.
+    pub termination: Termination,
+}
+
+impl AdjustReport {
+    /// Whether a minimum was reached, as near as asked for.
+    pub fn converged(&self) -> bool {
+        !matches!(self.termination, Termination::Iterations | Termination::Stopped)
+    }
+}
+
+/// What of a step is needed to judge it.
+pub(super) struct Step {
+    /// Of the reduced system's columns, and of the eliminated blocks.
+    pub(super) columns: Vec<f64>,
+    pub(super) points: Vec<f64>,
+    /// By how much the linear model goes down.
+    predicted: f64,
+    largest: f64,
+}
+
+/// Least and most damping.
+const DAMPING: [f64; 2] = [1e-16, 1e16];
+
+impl Adjustment<'_> {
+    /// Minimizes `Σ ρ(‖r‖²)` from the present values, which are moved.
+    ///
+    /// Levenberg–Marquardt with the damping of Nielsen ("Damping parameter in Marquardt's method", 1999) relative to the diagonal; robust losses by
+    /// iteratively reweighted least squares. Of the losses' second derivatives (Triggs's correction) no use is made: `Σ w JᵀJ` is never
+    /// indefinite, bounds the cost from above, needs no loss to be smooth, and is what covariances are read from.
+    /// The eliminated group's blocks are solved for by the Schur complement. Each iteration costs O(residuals) and the factorization
+    /// of the reduced system, O(n³) of n parameters where that is dense.
+    ///
+    /// `on_iteration` is called before every step, and may end the adjustment where it stands. The values are never worse than at the
+    /// start, and the same at any number of threads.
+    ///
+    /// # Errors
+    /// [`AdjustError::NoResiduals`]; [`AdjustError::NotFinite`] and [`AdjustError::Undefined`] of the start. The values are then as they were.
+    pub fn solve(
+        &mut self,
+        options: &AdjustOptions,
+        mut on_iteration: impl FnMut(&AdjustIteration) -> ControlFlow<()>,
+    ) -> Result<AdjustReport, AdjustError> {
+        self.check_start()?;
+        let structure = Structure::new(&self.groups, &self.kinds, self.eliminated, false);
+        let mut normal = Normal::default();
+        let mut reduced = Reduced::default();
+        normal.linearize(&self.kinds, &structure, &self.values).map_err(|u| self.undefined(u))?;
+        let initial_cost = normal.cost();
+        let (mut damping, mut growth) = (options.initial_damping, 2.0);
+        let mut moved = self.values.clone();
+        let mut report = AdjustReport {
+            initial_cost,
+            cost: initial_cost,
+            iterations: 1,
+            steps: 0,
+            termination: Termination::NoStep,
+        };
+        let end = |report: AdjustReport, termination| Ok(AdjustReport { termination, ..report });
+        if normal.cosine(structure.points.as_ref().map_or(0, |p| p.size), report.cost) <= options.gradient_tolerance {
+            return end(report, Termination::Gradient);
+        }
+        loop {
+            let state =
+                AdjustIteration { steps: report.steps, iterations: report.iterations, cost: report.cost, damping };
+            if on_iteration(&state).is_break() {
+                return end(report, Termination::Stopped);
+            }
+            report.steps += 1;
+            let step = normal.step(&structure, damping, &mut reduced);
+            let cost = match &step {
+                Some(step) if step.largest <= options.step_tolerance => return end(report, Termination::Step),
+                // What is left to gain is rounding.
+                Some(step) if step.predicted <= f64::EPSILON * report.cost => return end(report, Termination::Cost),
+                Some(step) => {
+                    self.move_by(&structure, step, &mut moved);
+                    self.kinds.iter().map(|k| k.cost(&moved)).sum()
+                }
+                None => f64::INFINITY,
+            };
+            let gain = report.cost - cost;
+            let Some(step) = step.filter(|_| gain > 0.0) else {
+                damping *= growth;
+                growth *= 2.0;
+                if damping > DAMPING[1] {
+                    return end(report, Termination::NoStep);
+                }
+                continue;
+            };
+            std::mem::swap(&mut self.values, &mut moved);
+            let done = gain < options.cost_tolerance * report.cost;
+            report.cost = cost;
+            if done || report.iterations >= options.max_iterations {
+                return end(report, if done { Termination::Cost } else { Termination::Iterations });
+            }
+            damping *= (1.0 - (2.0 * gain / step.predicted - 1.0).powi(3)).max(1.0 / 3.0);
+            damping = damping.max(DAMPING[0]);
+            growth = 2.0;
+            if normal.linearize(&self.kinds, &structure, &self.values).is_err() {
+                // The cost is finite here, so that only the derivatives can be at fault.
+                return end(report, Termination::NoStep);
+            }
+            report.iterations += 1;
+            let points = structure.points.as_ref().map_or(0, |p| p.size);
+            if normal.cosine(points, report.cost) <= options.gradient_tolerance {
+                return end(report, Termination::Gradient);
+            }
+        }
+    }
+
+    /// Sums over residuals at the present values, by kind in the order in which they were added.
+    ///
+    /// # Errors
+    /// As [`Adjustment::solve`].
+    pub fn residual_sums(&self) -> Result<Vec<ResidualSums>, AdjustError> {
+        self.check_start()?;
+        let structure = Structure::new(&self.groups, &self.kinds, self.eliminated, false);
+        let mut normal = Normal::default();
+        normal.linearize(&self.kinds, &structure, &self.values).map_err(|u| self.undefined(u))?;
+        Ok(normal.sums)
+    }
+
+    pub(super) fn check_start(&self) -> Result<(), AdjustError> {
+        if self.kinds.iter().all(|k| k.len() == 0) {
+            return Err(AdjustError::NoResiduals);
+        }
+        self.check_eliminated()?;
+        for (g, group) in self.groups.iter().enumerate() {
+            if let Some(i) = self.values.numbers[g].iter().position(|v| !v.is_finite()) {
+                let block = i / self.values.ambient[g];
+                return Err(AdjustError::NotFinite { group: group.name.clone(), block });
+            }
+        }
+        Ok(())
+    }
+
+    pub(super) fn undefined(&self, (kind, item): (usize, usize)) -> AdjustError {
+        AdjustError::Undefined { residuals: self.kinds[kind].name().to_owned(), item }
+    }
+
+    /// Writes the values moved by a step.
+    fn move_by(&self, structure: &Structure, step: &Step, moved: &mut Values) {
+        for block in &structure.blocks {
+            for member in &block.members {
+                let group = &self.groups[member.group];
+                let n = self.values.ambient[member.group];
+                let free = &step.columns[block.column + member.within..][..member.width];
+                let held = group.held[member.block as usize];
+                let mut delta = [0.0; 64];
+                let mut free = free.iter();
+                for (k, d) in delta[..group.size].iter_mut().enumerate() {
+                    if held >> k & 1 == 0 {
+                        *d = free.next().copied().unwrap_or(0.0);
+                    }
+                }
+                let x = self.values.block(member.group, member.block as usize);
+                let to = &mut moved.numbers[member.group][member.block as usize * n..][..n];
+                group.manifold.step(x, &delta[..group.size], to);
+            }
+        }
+        if let Some(points) = &structure.points {
+            let group = &self.groups[points.group];
+            let n = self.values.ambient[points.group];
+            let parts = moved.numbers[points.group].par_chunks_mut(n);
+            let parts =
+                parts.zip(self.values.numbers[points.group].par_chunks(n)).zip(step.points.par_chunks(points.size));
+            parts.with_min_len(512).for_each(|((to, x), delta)| group.manifold.step(x, delta, to));
+        }
+    }
+
+    /// The numbers of all blocks of a group, block after block.
+    pub fn values(&self, group: GroupId) -> &[f64] {
+        &self.values.numbers[group.0]
+    }
+}
+
+impl Normal {
+    /// The largest cosine of the angle between the residuals and a column of the Jacobian, `|g_i| / √(H_ii · cost)`.
+    fn cosine(&self, size: usize, cost: f64) -> f64 {
+        let of = |g: f64, h: f64| if g == 0.0 { 0.0 } else { g.abs() / (h * cost).sqrt() };
+        let columns = self.gradient.iter().zip(&self.diagonal).map(|(g, h)| of(*g, *h));
+        let points = self.point_gradient.iter().enumerate().map(|(i, g)| {
+            let (p, k) = (i / size, i % size);
+            of(*g, self.v[p * size * size + k * size + k])
+        });
+        columns.chain(points).fold(0.0, f64::max)
+    }
+
+    /// The damped step; `None` where the system is not positive definite.
+    pub(super) fn step(&self, structure: &Structure, damping: f64, reduced: &mut Reduced) -> Option<Step> {
+        self.reduce(structure, damping, reduced).ok()?;
+        let mut columns: Vec<f64> = reduced.gradient.iter().map(|g| -g).collect();
+        if !columns.is_empty() {
+            Factor::new(structure, &reduced.s)?.solve(columns.len(), &mut columns);
+        }
+        let mut points = Vec::new();
+        self.back_substitute(structure, reduced, &columns, &mut points);
+        // −2 gᵀδ − δᵀHδ of the damped system's solution (H + D) δ = −g is −gᵀδ + δᵀDδ.
+        let added = self.damped(damping);
+        let mut predicted: f64 =
+            columns.iter().zip(&self.gradient).zip(&added).map(|((d, g), a)| d * (a * d - g)).sum();
+        if let Some(e) = structure.points.as_ref().map(|p| p.size) {
+            for ((d, g), v) in points.chunks(e).zip(self.point_gradient.chunks(e)).zip(self.v.chunks(e * e)) {
+                let floor = FLOOR * (0..e).map(|k| v[k * e + k]).sum::<f64>();
+                predicted += (0..e).map(|k| d[k] * ((damping * v[k * e + k] + floor) * d[k] - g[k])).sum::<f64>();
+            }
+        }
+        let largest = columns.iter().chain(&points).fold(0.0, |m: f64, d| m.max(d.abs()));
+        let finite = predicted.is_finite() && largest.is_finite();
+        finite.then_some(Step { columns, points, predicted, largest })
+    }
+}
