@@ -4,7 +4,7 @@
 use anyhow::Result;
 use cv_core::{Camera, Matrix3, RgbU8};
 use cv_synth::{
-    PanoramaOptions, RenderOptions, Scene, ball_photos, homography_pair, panorama_views, stereo_pair, two_view,
+    PanoramaSetOptions, RenderOptions, Scene, ball_photos, homography_pair, panorama_views, stereo_pair, two_view,
 };
 use serde_json::{Value, json};
 use std::{fs, path::Path};
@@ -62,7 +62,7 @@ fn stereo(root: &Path) -> Result<()> {
 /// Three overlapping photographs from one point and the homographies between neighbors.
 fn panorama(root: &Path) -> Result<()> {
     let camera = Camera::from_focal(320, 240, 330.0);
-    let options = PanoramaOptions { views: 3, ..PanoramaOptions::default() };
+    let options = PanoramaSetOptions { views: 3, ..PanoramaSetOptions::default() };
     let set = panorama_views(SEED, &camera, &options, &RenderOptions::default())?;
     let to = folder(root, "panorama")?;
     for (i, view) in set.views.iter().enumerate() {

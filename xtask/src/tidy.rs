@@ -81,6 +81,7 @@ fn check(root: &Path) -> Result<Found> {
             found.problems.push(format!("Cargo.toml: no crate uses the workspace dependency {name}"));
         }
     }
+    check_type_names(root, &files, &mut found)?;
     for file in &files {
         let shown = file.strip_prefix(root).unwrap_or(file).display().to_string();
         // What is not text has no lines to look at.
@@ -95,6 +96,31 @@ fn check(root: &Path) -> Result<Found> {
         found.problems.push(format!("fixtures/ holds {size} bytes, more than {FIXTURES_BYTES}"));
     }
     Ok(found)
+}
+
+/// No two public types of the crates have one name: a reader who knows the name knows the type.
+fn check_type_names(root: &Path, files: &[PathBuf], found: &mut Found) -> Result<()> {
+    let mut types: BTreeMap<String, Vec<String>> = BTreeMap::new();
+    let crates = root.join("crates");
+    for file in files.iter().filter(|file| file.starts_with(&crates) && file.extension().is_some_and(|e| e == "rs")) {
+        let shown = file.strip_prefix(root).unwrap_or(file).display().to_string();
+        if !shown.contains("/src/") {
+            continue;
+        }
+        let text = fs::read_to_string(file)?;
+        for line in text.lines().take_while(|line| line.trim() != "#[cfg(test)]") {
+            let declared =
+                ["pub struct ", "pub enum ", "pub trait ", "pub type "].iter().find_map(|d| line.strip_prefix(d));
+            if let Some(rest) = declared {
+                let name: String = rest.chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect();
+                types.entry(name).or_default().push(shown.clone());
+            }
+        }
+    }
+    for (name, places) in types.iter().filter(|(_, places)| places.len() > 1) {
+        found.problems.push(format!("{name} is the name of {} public types: {}", places.len(), places.join(", ")));
+    }
+    Ok(())
 }
 
 /// Every file of the project, without build outputs and hidden folders other than `.ci` and `.cargo`.
@@ -261,6 +287,14 @@ fn orphans(folder: &Path) -> Result<Vec<String>> {
         .collect())
 }
 
+/// Whether a file belongs to the source of a library crate, where only `StageClock` looks at the time.
+fn clockless(shown: &str) -> bool {
+    shown.starts_with("crates/")
+        && shown.contains("/src/")
+        && !shown.starts_with("crates/cv-cli/")
+        && !shown.ends_with("cv-core/src/stage_clock.rs")
+}
+
 fn check_text(shown: &str, text: &str, found: &mut Found) {
     let rust = shown.ends_with(".rs");
     if rust {
@@ -288,6 +322,7 @@ fn check_text(shown: &str, text: &str, found: &mut Found) {
     let paths =
         [["/wo", "rk/"], ["/ho", "me/"], ["/ro", "ot/"], ["/Use", "rs/"], ["C:", "\\"]].map(|halves| halves.concat());
     let unstable = [["Std", "Rng"], ["thread", "_rng"]].map(|halves| halves.concat());
+    let clock = ["Instant", "::now()"].concat();
     for (number, line) in text.lines().enumerate() {
         let mut complain = |what: &str| found.problems.push(format!("{shown}:{}: {what}", number + 1));
         if unfinished.iter().any(|word| line.contains(word)) {
@@ -298,6 +333,9 @@ fn check_text(shown: &str, text: &str, found: &mut Found) {
         }
         if rust && unstable.iter().any(|name| line.contains(name.as_str())) {
             complain("a random generator whose stream may change: use ChaCha8Rng with a seed");
+        }
+        if rust && clockless(shown) && line.contains(&clock) {
+            complain("a clock outside cv_core::StageClock: it panics in a browser");
         }
         if rust && line.trim() == "#[ignore]" {
             complain("an ignored test without its reason");
@@ -342,8 +380,10 @@ mod tests {
 
     #[test]
     fn each_rule_can_fail() {
+        let two = format!("{LIB}pub struct Pixel;\nmod a {{ }}\npub enum Pixel {{}}\n");
+        let late = format!("{LIB}let t = {}{};\n", "Instant", "::now()");
         type Case<'a> = (&'a str, String, &'a [(&'a str, &'a str)]);
-        let cases: [Case; 10] = [
+        let cases: [Case; 12] = [
             ("lacks `[lints]", GOOD.replace("true\n[dep", "false\n[dep"), &[("src/lib.rs", LIB)]),
             ("must not use cv-features", format!("{GOOD}cv-features.workspace = true\n"), &[("src/lib.rs", LIB)]),
             ("must not use image", format!("{GOOD}image.workspace = true\n"), &[("src/lib.rs", LIB)]),
@@ -357,6 +397,8 @@ mod tests {
                 GOOD.to_owned(),
                 &[("src/lib.rs", "//! ```\n//! ```\nuse rayon::prelude::*;\nconst A: &str = \"give --focal\";\n")],
             ),
+            ("Pixel is the name of 2 public types", GOOD.to_owned(), &[("src/lib.rs", &two)]),
+            ("a clock outside", GOOD.to_owned(), &[("src/lib.rs", &late)]),
             ("a path of one machine", GOOD.to_owned(), &[("src/lib.rs", LIB), ("notes.md", concat!("/ho", "me/x\n"))]),
         ];
         for (expected, manifest, files) in cases {

@@ -107,7 +107,7 @@ fn matches_that_determine_nothing_are_refused_with_the_reason() {
     infinite[9][1] = f64::INFINITY;
     let cases: [Case<'_>; 12] = [
         ("three", &good[..3], ["3 matches are too few"; 3]),
-        ("seven", &good[..7], ["which chance would give", "7 matches are too few", ""]),
+        ("seven", &good[..7], ["as some model would if all were wrong", "7 matches are too few", ""]),
         ("seven wrong ones", &random(7, 0.0, 480.0), ["chance", "7 matches are too few", "chance"]),
         ("one again and again", &[good[0]; 30], ["too few different"; 3]),
         ("three again and again", &good[..3].repeat(10), ["too few different"; 3]),
@@ -156,7 +156,7 @@ fn wrong_matches_alone_are_no_more_than_chance() {
             args.extend(["--focal", "800", "--size", "640x480"]);
         }
         let said = refused(folder.path(), &args).stderr;
-        assert!(said.contains("which chance would give; at least "), "{model}: {said}");
+        assert!(said.contains("as some model would if all were wrong; at least "), "{model}: {said}");
         args[3] = "right.txt";
         if model != "homography" {
             // Of 160 right ones beside 40 wrong ones, chance gives one set in 10^100: each of those beyond a sample is near with one in a hundred.

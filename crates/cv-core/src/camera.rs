@@ -44,7 +44,7 @@ pub struct Camera {
 
 /// A point seen by a camera, with the derivatives of its pixel.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Projection {
+pub struct ProjectedPoint {
     /// The pixel.
     pub pixel: Point2<f64>,
     /// By the point in the camera's frame.
@@ -121,7 +121,7 @@ impl Camera {
 
     /// As [`Self::project`], with the derivatives by the point and by the intrinsics.
     #[inline]
-    pub fn project_with_jacobians(&self, p: &Point3<f64>) -> Option<Projection> {
+    pub fn project_with_jacobians(&self, p: &Point3<f64>) -> Option<ProjectedPoint> {
         if p.z <= 0.0 || p.z.is_nan() {
             return None;
         }
@@ -136,7 +136,7 @@ impl Camera {
         by_intrinsics.set_column(2, &Vector2::x());
         by_intrinsics.set_column(3, &Vector2::y());
         by_intrinsics.fixed_columns_mut::<MAX_PARAMETERS>(4).copy_from(&(scale * by_parameters));
-        Some(Projection {
+        Some(ProjectedPoint {
             pixel: Point2::new(self.fx * d.x + self.cx, self.fy * d.y + self.cy),
             by_point: scale * j * by_ideal,
             by_intrinsics,

@@ -43,7 +43,7 @@ mod stage_clock;
 mod union_find;
 mod view;
 
-pub use camera::{Camera, CameraError, MAX_INTRINSICS, Projection};
+pub use camera::{Camera, CameraError, MAX_INTRINSICS, ProjectedPoint};
 pub use distortion::{
     ByParameters, ColmapModel, Distortion, DistortionModel, LensInfo, LensProjection, MAX_PARAMETERS,
     ParameterCountError,

@@ -135,7 +135,7 @@ pub struct Dropped {
 
 /// Keypoints with descriptors, and what became of the rest.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Described {
+pub struct Features {
     /// The keypoints that have a descriptor, in the order they came.
     pub keypoints: Vec<Keypoint>,
     /// Descriptor `i` belongs to keypoint `i`.
@@ -146,7 +146,7 @@ pub struct Described {
     pub beyond_limit: usize,
 }
 
-impl Described {
+impl Features {
     /// Leaves the features for which `keep` is true.
     pub(crate) fn retain(&mut self, keep: &[bool]) {
         let d = self.descriptors.dimension();

@@ -2,7 +2,7 @@
 //!
 //! Source: D. Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 60(2), 2004, sections 3 and 4.
 
-use crate::ring::Ring;
+use crate::line_buffer::LineBuffer;
 use crate::simd;
 use fearless_simd::Level;
 use nalgebra::{Matrix3, Vector3};
@@ -47,7 +47,7 @@ pub(crate) struct Search {
 /// (the refined value may be that much larger).
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn find(
-    differences: &[Ring],
+    differences: &[LineBuffer],
     octave: usize,
     search: &Search,
     (w, h): (usize, usize),

@@ -1,8 +1,8 @@
 //! Matching once the geometry of two views is known: only candidates near where a feature must be.
 
-use crate::descriptors::{Described, Descriptors};
+use crate::descriptors::{Descriptors, Features};
 use crate::matching::MatchError;
-use crate::nearest::ssd;
+use crate::nearest_neighbors::ssd;
 use cv_core::{DMatch, Keypoint, OptionError};
 use nalgebra::{Matrix3, Point2, Vector3};
 use rayon::prelude::*;
@@ -44,8 +44,8 @@ impl Default for GuidedOptions {
 /// # Errors
 /// [`MatchError`] for sets of different kinds, empty sets, or positions that are not as many as the features.
 pub fn match_guided(
-    a: &Described,
-    b: &Described,
+    a: &Features,
+    b: &Features,
     positions: Option<[&[Point2<f32>]; 2]>,
     model: &TwoViewModel,
     options: &GuidedOptions,
@@ -150,9 +150,9 @@ mod tests {
     use super::*;
     use crate::descriptors::DescriptorKind;
 
-    fn described(points: &[(f32, f32)], values: &[f32]) -> Described {
+    fn described(points: &[(f32, f32)], values: &[f32]) -> Features {
         let data = values.iter().flat_map(|&v| std::iter::once(v).chain(std::iter::repeat_n(0.0, 63))).collect();
-        Described {
+        Features {
             keypoints: points.iter().map(|&(x, y)| Keypoint::new(x, y, 1.0)).collect(),
             descriptors: Descriptors::from_vec(DescriptorKind::Patch, data).unwrap(),
             dropped: Vec::new(),
@@ -174,7 +174,7 @@ mod tests {
         let h = Matrix3::new(1.0, 0.0, 5.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0);
         let found = match_guided(&a, &b, None, &TwoViewModel::Homography(h), &options).unwrap();
         assert_eq!(found.iter().map(|m| (m.query, m.train)).collect::<Vec<_>>(), [(0, 1)]);
-        let strange = Described { descriptors: Descriptors::new(DescriptorKind::Mops), ..a.clone() };
+        let strange = Features { descriptors: Descriptors::new(DescriptorKind::Mops), ..a.clone() };
         let error = match_guided(&strange, &b, None, &TwoViewModel::Homography(h), &options);
         assert!(matches!(error, Err(MatchError::KindsDiffer { .. })));
         let nothing = match_guided(&a, &b, None, &TwoViewModel::Homography(Matrix3::zeros()), &options);

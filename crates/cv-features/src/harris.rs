@@ -4,9 +4,9 @@
 //! track", CVPR 1994.
 
 use crate::error::{FeatureError, check_image};
-use crate::ring::Ring;
+use crate::line_buffer::LineBuffer;
 use crate::simd;
-use crate::structure::{Structure, Walk};
+use crate::structure_tensor::{StructureTensor, Walk};
 use cv_core::{GrayF32, ImageView, Keypoint, OptionError};
 use cv_imgproc::gaussian_half_kernel;
 use fearless_simd::Level;
@@ -57,8 +57,8 @@ impl HarrisOptions {
         OptionError::check("threshold", self.threshold.into(), "from 0 to 1", |v| (0.0..=1.0).contains(&v))
     }
 
-    fn plan<'a>(&self, view: ImageView<'a, f32, 1>, level: Level) -> Structure<'a> {
-        Structure { view, kernel: gaussian_half_kernel(self.window_sigma), measure: self.measure, level }
+    fn plan<'a>(&self, view: ImageView<'a, f32, 1>, level: Level) -> StructureTensor<'a> {
+        StructureTensor { view, kernel: gaussian_half_kernel(self.window_sigma), measure: self.measure, level }
     }
 }
 
@@ -83,7 +83,7 @@ pub fn harris_response(view: ImageView<'_, f32, 1>, options: &HarrisOptions) -> 
     Ok(response(&options.plan(view, simd::level())))
 }
 
-fn response(plan: &Structure<'_>) -> GrayF32 {
+fn response(plan: &StructureTensor<'_>) -> GrayF32 {
     let (w, h) = plan.view.size();
     let mut out = GrayF32::new(w, h, [0.0]);
     let rows = rows_of_a_task(h);
@@ -109,7 +109,7 @@ pub fn harris(view: ImageView<'_, f32, 1>, options: &HarrisOptions) -> Result<Ve
 }
 
 /// Local maxima of the measure of at least a share of the largest, in raster order.
-pub(crate) fn corners(plan: &Structure<'_>, threshold: f32) -> Vec<Keypoint> {
+pub(crate) fn corners(plan: &StructureTensor<'_>, threshold: f32) -> Vec<Keypoint> {
     let h = plan.view.height();
     let rows = rows_of_a_task(h);
     let strips: Vec<(f32, Vec<Keypoint>)> = (0..h.div_ceil(rows))
@@ -123,11 +123,11 @@ pub(crate) fn corners(plan: &Structure<'_>, threshold: f32) -> Vec<Keypoint> {
 }
 
 /// The largest response of some rows, and their corners above the threshold (against that largest response: a few too many).
-fn strip_corners(plan: &Structure<'_>, threshold: f32, rows: Range<usize>) -> (f32, Vec<Keypoint>) {
+fn strip_corners(plan: &StructureTensor<'_>, threshold: f32, rows: Range<usize>) -> (f32, Vec<Keypoint>) {
     let (w, h) = plan.view.size();
     let (first, last) = (rows.start.saturating_sub(1), (rows.end + 1).min(h));
     let mut walk = Walk::new(plan, first);
-    let mut ring = Ring::new(0..w, 3);
+    let mut ring = LineBuffer::new(0..w, 3);
     let (mut max, mut seen, mut found) = (0.0f32, Vec::new(), Vec::new());
     for y in first..last {
         walk.row(y, ring.row_mut(y));
@@ -173,7 +173,7 @@ pub(crate) fn quadratic_peak(v: [[f32; 3]; 3]) -> (f32, f32) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::structure::{harris_at, products_at, smaller_eigenvalue};
+    use crate::structure_tensor::{harris_at, products_at, smaller_eigenvalue};
     use cv_core::Image;
     use cv_imgproc::gaussian_blur;
     use cv_imgproc::mirror_index;

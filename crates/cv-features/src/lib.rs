@@ -36,35 +36,35 @@
 //! * Results do not depend on the number of threads.
 
 mod anms;
+mod asift;
+mod byte_descriptors;
 mod descriptors;
 mod dog;
 mod error;
+mod gradient_histogram;
 mod guided;
 mod harris;
-mod histogram;
+mod line_buffer;
 mod matching;
 mod mops;
-mod nearest;
+mod nearest_neighbors;
 mod patch;
 mod pyramid;
-mod quantized;
-mod ring;
 mod scale_space;
 mod sift;
 mod simd;
-mod spacing;
-mod structure;
-mod views;
+mod square_covering;
+mod structure_tensor;
 
 pub use anms::{anms, suppression_radii};
-pub use descriptors::{Described, DescriptorKind, Descriptors, DropReason, Dropped};
+pub use asift::sift_affine_view;
+pub use byte_descriptors::{ByteDescriptors, match_byte_descriptors};
+pub use descriptors::{DescriptorKind, Descriptors, DropReason, Dropped, Features};
 pub use error::FeatureError;
 pub use guided::{GuidedOptions, TwoViewModel, match_guided};
 pub use harris::{CornerMeasure, HarrisOptions, harris, harris_response};
 pub use matching::{MatchError, MatchOptions, RatioMeasure, match_descriptors};
 pub use mops::{MopsOptions, MultiScaleOptions, describe_oriented_patches, harris_laplace, mops};
 pub use patch::{PatchOptions, describe_patches};
-pub use quantized::{ByteDescriptors, match_byte_descriptors};
 pub use sift::{SiftOptions, sift};
-pub use spacing::{anms_square_covering, anms_tiled};
-pub use views::sift_tilted;
+pub use square_covering::{anms_square_covering, anms_tiled};

@@ -1,7 +1,7 @@
 //! Nearest-neighbor matching of descriptors.
 
 use crate::descriptors::{DescriptorKind, Descriptors};
-use crate::nearest::nearest;
+use crate::nearest_neighbors::nearest;
 use crate::simd;
 use cv_core::{Cancelled, DMatch, OptionError};
 

@@ -3,13 +3,13 @@
 //! Sources: M. Brown, R. Szeliski & S. Winder, "Multi-image matching using multi-scale oriented patches", CVPR 2005; K. Mikolajczyk & C. Schmid,
 //! "Indexing based on scale invariant interest points", ICCV 2001 (Harris-Laplace).
 
-use crate::descriptors::{Described, DescriptorKind, Descriptors, DropReason, Dropped};
+use crate::descriptors::{DescriptorKind, Descriptors, DropReason, Dropped, Features};
 use crate::error::{FeatureError, check_image};
 use crate::harris::{CornerMeasure, corners};
 use crate::patch::{SIDE, normalize};
 use crate::pyramid::{FIRST_SIGMA, Pyramid};
 use crate::simd;
-use crate::structure::Structure;
+use crate::structure_tensor::StructureTensor;
 use cv_core::{ImageView, Keypoint, OptionError};
 use cv_imgproc::gaussian_half_kernel;
 use rayon::prelude::*;
@@ -90,7 +90,7 @@ pub fn harris_laplace(view: ImageView<'_, f32, 1>, options: &MultiScaleOptions) 
 ///
 /// # Errors
 /// As [`harris_laplace`].
-pub fn mops(view: ImageView<'_, f32, 1>, options: &MopsOptions) -> Result<Described, FeatureError> {
+pub fn mops(view: ImageView<'_, f32, 1>, options: &MopsOptions) -> Result<Features, FeatureError> {
     check(&options.corners)?;
     check_patches(options)?;
     check_image(view, SMALLEST)?;
@@ -107,7 +107,7 @@ pub fn describe_oriented_patches(
     view: ImageView<'_, f32, 1>,
     keypoints: &[Keypoint],
     options: &MopsOptions,
-) -> Result<Described, FeatureError> {
+) -> Result<Features, FeatureError> {
     check(&options.corners)?;
     check_patches(options)?;
     check_image(view, SMALLEST)?;
@@ -136,7 +136,7 @@ fn detect(pyramid: &Pyramid, options: &MultiScaleOptions) -> Vec<Keypoint> {
     let levels = &pyramid.levels;
     let mut all: Vec<Keypoint> = Vec::new();
     for (i, level) in levels.iter().enumerate() {
-        let plan = Structure {
+        let plan = StructureTensor {
             view: level.image.view(),
             kernel: gaussian_half_kernel(WINDOW * level.sigma),
             measure: options.measure,
@@ -168,10 +168,10 @@ fn detect(pyramid: &Pyramid, options: &MultiScaleOptions) -> Vec<Keypoint> {
     all
 }
 
-fn describe(pyramid: &Pyramid, size: (usize, usize), keypoints: &[Keypoint], options: &MopsOptions) -> Described {
+fn describe(pyramid: &Pyramid, size: (usize, usize), keypoints: &[Keypoint], options: &MopsOptions) -> Features {
     let patches: Vec<Result<(f32, Patch), DropReason>> =
         keypoints.par_iter().with_min_len(32).map(|k| patch(pyramid, size, k, options)).collect();
-    let mut out = Described {
+    let mut out = Features {
         keypoints: Vec::new(),
         descriptors: Descriptors::new(DescriptorKind::Mops),
         dropped: Vec::new(),

@@ -3,7 +3,7 @@
 //! Source: M. Brown, R. Szeliski & S. Winder, "Multi-image matching using multi-scale oriented patches", CVPR 2005, section 4,
 //! without orientation.
 
-use crate::descriptors::{Described, DescriptorKind, Descriptors, DropReason, Dropped};
+use crate::descriptors::{DescriptorKind, Descriptors, DropReason, Dropped, Features};
 use crate::error::{FeatureError, check_image};
 use cv_core::{GrayF32, ImageView, Keypoint, OptionError};
 use cv_imgproc::gaussian_blur;
@@ -41,7 +41,7 @@ pub fn describe_patches(
     view: ImageView<'_, f32, 1>,
     keypoints: &[Keypoint],
     options: &PatchOptions,
-) -> Result<Described, FeatureError> {
+) -> Result<Features, FeatureError> {
     OptionError::check("window", options.window.into(), "from 8 to 400 px", |v| (8.0..=400.0).contains(&v))?;
     OptionError::check("blur_sigma", options.blur_sigma.into(), "from 0.3 to 50 px", |v| (0.3..=50.0).contains(&v))?;
     OptionError::check("min_deviation", options.min_deviation.into(), "0 or more", |v| v >= 0.0 && v.is_finite())?;
@@ -49,7 +49,7 @@ pub fn describe_patches(
     let smooth = gaussian_blur(view, options.blur_sigma);
     let patches: Vec<Result<[f32; SIDE * SIDE], DropReason>> =
         keypoints.par_iter().with_min_len(64).map(|k| patch(&smooth, k, options)).collect();
-    let mut described = Described {
+    let mut described = Features {
         keypoints: Vec::with_capacity(keypoints.len()),
         descriptors: Descriptors::new(DescriptorKind::Patch),
         dropped: Vec::new(),

@@ -6,7 +6,7 @@
 //! reach; results do not depend on how the image is cut.
 
 use crate::dog::{Extremum, REACH, Search, find};
-use crate::ring::Ring;
+use crate::line_buffer::LineBuffer;
 use crate::simd;
 use cv_core::{GrayF32, Image, ImageView};
 use cv_imgproc::{mirror_ends, mirror_index};
@@ -246,10 +246,10 @@ fn tile(plan: &Plan<'_>, strip: &mut Strip<'_>, columns: Range<usize>, found: &m
     let halo: Vec<usize> = (0..=last).map(|i| REACH + (i + 1..=last).map(radius).sum::<usize>()).collect();
     let delay: Vec<usize> = (0..=last).map(|i| (1..=i).map(radius).sum()).collect();
     let part = |by: usize| columns.start.saturating_sub(by)..(columns.end + by).min(w);
-    let mut scales: Vec<Ring> =
-        (0..=last).map(|i| Ring::new(part(halo[i]), if i < last { 2 * radius(i + 1) + 1 } else { 1 })).collect();
-    let mut differences: Vec<Ring> =
-        (0..last).map(|i| Ring::new(part(REACH), 2 * REACH + 1 + delay[last] - delay[i + 1])).collect();
+    let mut scales: Vec<LineBuffer> =
+        (0..=last).map(|i| LineBuffer::new(part(halo[i]), if i < last { 2 * radius(i + 1) + 1 } else { 1 })).collect();
+    let mut differences: Vec<LineBuffer> =
+        (0..last).map(|i| LineBuffer::new(part(REACH), 2 * REACH + 1 + delay[last] - delay[i + 1])).collect();
     let mut buffer = Buffer::default();
     let end = strip.y1 + REACH + delay[last];
     for step in strip.y0.saturating_sub(halo[0])..end {

@@ -7,10 +7,10 @@
 //! pixel. A descriptor is computed on a grid of 20×20 samples turned and scaled with the point (four to a histogram bin, as in Lowe's
 //! figure 7), not on every pixel under the window, so its cost does not depend on scale.
 
-use crate::descriptors::{Described, DescriptorKind, Descriptors, DropReason, Dropped};
+use crate::descriptors::{DescriptorKind, Descriptors, DropReason, Dropped, Features};
 use crate::dog::{Extremum, Search};
 use crate::error::{FeatureError, check_image};
-use crate::histogram::{DIMENSION, describe, dominant_angles};
+use crate::gradient_histogram::{DIMENSION, describe, dominant_angles};
 use crate::scale_space::{Octave, scale_space};
 use crate::simd;
 use cv_core::{ImageView, Keypoint, OptionError, Point2};
@@ -67,7 +67,7 @@ pub(crate) const SMALLEST: usize = 8;
 ///
 /// # Errors
 /// [`FeatureError`] for images below 8×8, samples that are not finite, options out of range.
-pub fn sift(view: ImageView<'_, f32, 1>, options: &SiftOptions) -> Result<Described, FeatureError> {
+pub fn sift(view: ImageView<'_, f32, 1>, options: &SiftOptions) -> Result<Features, FeatureError> {
     OptionError::check("max_features", options.max_features as f64, "1 or more", |v| v >= 1.0)?;
     OptionError::check("layers", options.layers as f64, "from 1 to 8", |v| (1.0..=8.0).contains(&v))?;
     OptionError::check("sigma", options.sigma.into(), "from 0.8 to 4 px", |v| (0.8..=4.0).contains(&v))?;
@@ -85,7 +85,7 @@ pub fn sift(view: ImageView<'_, f32, 1>, options: &SiftOptions) -> Result<Descri
     let (octaves, mut points) = scale_space(view, &search);
     let kind = if options.root { DescriptorKind::RootSift } else { DescriptorKind::Sift };
     let mut out =
-        Described { keypoints: Vec::new(), descriptors: Descriptors::new(kind), dropped: Vec::new(), beyond_limit: 0 };
+        Features { keypoints: Vec::new(), descriptors: Descriptors::new(kind), dropped: Vec::new(), beyond_limit: 0 };
     if options.coarse_first && points.len() > options.max_features {
         // Stable: contrast decides between equals.
         points.sort_by(|a, b| {

@@ -1,6 +1,6 @@
 //! The Sampson error of epipolar geometry, and its refinement.
 
-use crate::pairs::{LANES, PairBlock};
+use crate::match_blocks::{LANES, MatchBlock};
 use crate::ransac::Scorer;
 use cv_core::{Correspondence, Matrix3, Vector3};
 use cv_numeric::{LeastSquares, LmOptions, NormalEquations, levenberg_marquardt};
@@ -166,7 +166,7 @@ impl SampsonKernel {
 
     /// Squared Sampson distances.
     #[inline(always)]
-    pub(crate) fn squared_residuals(&self, block: &PairBlock) -> [f32; LANES] {
+    pub(crate) fn squared_residuals(&self, block: &MatchBlock) -> [f32; LANES] {
         let f = &self.0;
         let mut out = [0f32; LANES];
         for (i, r2) in out.iter_mut().enumerate() {

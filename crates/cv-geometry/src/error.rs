@@ -48,9 +48,9 @@ pub enum EstimateError {
         /// In which way.
         kind: Degeneracy,
     },
-    /// No model is supported by more matches than chance would give.
+    /// The number of false alarms of the best model is not below one: as many matches would fit some model if all were wrong.
     #[error(
-        "after {iterations} samples the best model fits {inliers} of {matches} matches, which chance would give; at least {needed} are needed"
+        "after {iterations} samples the best model fits {inliers} of {matches} matches, as some model would if all were wrong; at least {needed} are needed"
     )]
     NoConsensus {
         /// Matches that fit the best model.

@@ -1,7 +1,7 @@
 //! Relative poses of two views of one unknown focal length, through six points.
 
-use crate::basis::{mix, orthonormalize};
 use crate::fundamental::epipolar_row;
+use crate::null_space_basis::{mix, orthonormalize};
 use cv_core::{Matrix3, Point2};
 use cv_numeric::{kernel_vector, null_space, real_quadratic_eigenvalues};
 use nalgebra::DMatrix;

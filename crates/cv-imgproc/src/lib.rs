@@ -26,7 +26,7 @@
 //! * Rows are shared out between threads; results do not depend on their number, nor on the instruction set.
 
 mod color;
-mod components;
+mod connected_components;
 mod gaussian;
 mod integral;
 mod median;
@@ -44,7 +44,7 @@ pub use color::{
     f32_to_u8, gray_to_f32, gray_to_rgb, hsv_to_rgb, linear_rgb_to_lab, linear_to_srgb, rgb_pixel_to_hsv,
     rgb_pixel_to_lab, rgb_to_f32, rgb_to_gray, rgb_to_gray_f32, rgb_to_hsv, rgb_to_lab, srgb_to_linear, u8_to_f32,
 };
-pub use components::{
+pub use connected_components::{
     ComponentStats, Components, Connectivity, connected_components, fill_holes, largest_component,
     remove_small_components,
 };

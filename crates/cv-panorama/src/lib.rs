@@ -5,7 +5,7 @@
 //!
 //! ```
 //! use cv_core::{Correspondence, RgbU8};
-//! use cv_panorama::{AlignOptions, CameraMotion, Photo, RenderOptions, VerifyOptions, align, render, verify_pair};
+//! use cv_panorama::{AlignOptions, CameraMotion, Photo, CompositingOptions, VerifyOptions, align, render, verify_pair};
 //!
 //! // Two windows, 60 pixels apart, of one picture; matches on a grid.
 //! let scene = |x: usize, y: usize| [(x * 2 % 256) as u8, (y * 3 % 256) as u8, ((x * y) % 256) as u8];
@@ -20,7 +20,7 @@
 //! let photos = [Photo::new(160, 120), Photo::new(160, 120)];
 //! let options = AlignOptions { motion: CameraMotion::Homography, ..AlignOptions::default() };
 //! let alignment = align(&photos, &[pair], &options)?;
-//! let panorama = render(&[left.view(), right.view()], &alignment, &RenderOptions::default())?;
+//! let panorama = render(&[left.view(), right.view()], &alignment, &CompositingOptions::default())?;
 //! assert!(panorama.image.width().abs_diff(220) <= 1 && alignment.rms_px < 0.01);
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
@@ -44,6 +44,6 @@ pub use align::{
 };
 pub use blend::{Exposure, Gains};
 pub use cv_imgproc::Interpolation;
-pub use render::{Blend, Panorama, RenderError, RenderOptions, render};
+pub use render::{Blend, CompositingOptions, Panorama, RenderError, render};
 pub use seams::Seams;
 pub use surface::{Canvas, LayoutError, PhotoMap, Projection};

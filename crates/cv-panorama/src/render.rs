@@ -27,7 +27,7 @@ pub enum Blend {
 
 /// Options of [`render`].
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct RenderOptions {
+pub struct CompositingOptions {
     /// The surface. Default [`Projection::Auto`].
     pub projection: Projection,
     /// Size of the panorama relative to the photographs: 1 draws the middle of a photograph of median focal length pixel for pixel. Above 0; default 1.
@@ -48,7 +48,7 @@ pub struct RenderOptions {
     pub max_pixels: usize,
 }
 
-impl Default for RenderOptions {
+impl Default for CompositingOptions {
     fn default() -> Self {
         Self {
             projection: Projection::Auto,
@@ -123,7 +123,7 @@ const PREVIEW_PIXELS: usize = 300_000;
 pub fn render(
     photos: &[ImageView<'_, u8, 3>],
     alignment: &Alignment,
-    options: &RenderOptions,
+    options: &CompositingOptions,
 ) -> Result<Panorama, RenderError> {
     let mut clock = StageClock::new();
     OptionError::check("resolution", options.resolution, "a positive number", |v| v > 0.0 && v.is_finite())?;

@@ -29,6 +29,7 @@
 //! * The same input, options and seed give the same result at any number of threads.
 
 mod advice;
+mod asift;
 mod axes;
 mod depth;
 mod disparity_range;
@@ -42,7 +43,6 @@ mod reconstruct;
 mod rectify;
 mod rig_depth;
 mod segment;
-mod views;
 
 pub use advice::Advice;
 pub use axes::Axes;
@@ -56,14 +56,14 @@ pub use disparity_range::{RangeError, disparity_range};
 pub use estimate::{CalibratedResult, EstimateResult, ModelKind, estimate, estimate_calibrated};
 pub use frame_depth::FrameDepth;
 pub use matching::{
-    FeatureMethod, MatchingError, MatchingOptions, MatchingResult, PhotoFeatures, Slanted, Spacing, extract_features,
-    match_extracted, match_features, match_photos,
+    AffineSimulation, FeatureMethod, MatchingError, MatchingOptions, MatchingResult, PhotoFeatures, Suppression,
+    extract_features, match_extracted, match_features, match_photos,
 };
 pub use no_pair::NoPairCause;
 /// What a caller of [`match_extracted`] needs to hand in features found elsewhere, and to choose among ours.
 pub mod features {
     pub use cv_features::{
-        CornerMeasure, Described, DescriptorKind, Descriptors, DropReason, Dropped, HarrisOptions, MopsOptions,
+        CornerMeasure, DescriptorKind, Descriptors, DropReason, Dropped, Features, HarrisOptions, MopsOptions,
         MultiScaleOptions, SiftOptions,
     };
 }
@@ -85,16 +85,16 @@ pub use segment::{SegmentResult, SegmentTraining, segment, train_segment};
 /// What a caller of [`depth()`] needs of the stereo stage: its options and results, rectification, geometry and scores.
 pub mod stereo {
     pub use cv_stereo::{
-        BAD_THRESHOLDS, Blend, Census, DisparityMap, DisparityScores, EvaluateError, GeometryError, Intensity, Paths,
-        PixelState, Rectification, RectifiedView, RectifyError, RectifyOptions, Smoothing, StereoError, StereoGeometry,
-        StereoMatcher, StereoOptions, Subpixel, evaluate_disparity, non_occluded,
+        BAD_THRESHOLDS, Census, DisparityMap, DisparityScores, EvaluateError, GeometryError, Intensity, IntensityCost,
+        Paths, PixelState, Rectification, RectifiedView, RectifyError, RectifyOptions, Smoothing, StereoError,
+        StereoGeometry, StereoMatcher, StereoOptions, Subpixel, evaluate_disparity, non_occluded,
     };
 }
 
 /// What a caller of [`train_segment`] and [`segment()`] needs of the color models: options, model, scores.
 pub mod segmentation {
     pub use cv_segment::{
-        Cleanup, ColorModel, ColorSpace, Labeled, Regions, Rule, Scores, SegmentError, TrainOptions, Trained,
+        Cleanup, ColorModel, ColorSpace, ConfusionMatrix, Labeled, Regions, Rule, SegmentError, TrainOptions, Trained,
     };
 }
 

@@ -1,10 +1,10 @@
 //! Features of photographs, and tentative matches between two of them.
 
-use crate::views::match_slanted;
+use crate::asift::match_asift;
 use crate::{ModelKind, Progress, Silent, estimate};
 use cv_core::{Cancelled, Correspondence, DMatch, ImageView, Keypoint, Point2, StageClock};
 use cv_features::{
-    Described, DescriptorKind, FeatureError, GuidedOptions, HarrisOptions, MatchError, MatchOptions, MopsOptions,
+    DescriptorKind, FeatureError, Features, GuidedOptions, HarrisOptions, MatchError, MatchOptions, MopsOptions,
     PatchOptions, SiftOptions, TwoViewModel, anms, anms_square_covering, anms_tiled, describe_patches, harris,
     match_descriptors, match_guided, mops, sift,
 };
@@ -29,27 +29,27 @@ cv_core::named!(FeatureMethod {
     Harris = "harris": "corners with upright 8×8 patches: neighboring frames of a film or of a slowly turned camera",
 });
 
-/// How Harris corners are spread over the photograph.
+/// The non-maximal suppression that spreads Harris corners over the photograph.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Spacing {
+pub enum Suppression {
     /// By suppression radius (Brown, Szeliski & Winder).
     #[default]
     Radius,
     /// By square covering (Bailo et al.): faster, nearly as even.
-    Squares,
+    SquareCovering,
     /// As many from each of 8 × 8 tiles.
     Tiles,
 }
 
-cv_core::named!(Spacing {
+cv_core::named!(Suppression {
     Radius = "radius": "by suppression radius",
-    Squares = "squares": "by square covering: faster, nearly as even",
+    SquareCovering = "squares": "by square covering: faster, nearly as even",
     Tiles = "tiles": "as many from each of 8×8 tiles",
 });
 
-/// Whether [`match_photos`] also looks at simulated slanted views (Morel & Yu's ASIFT), with SIFT only: some ten times the time.
+/// Whether [`match_photos`] also looks at affine-simulated views (ASIFT, Morel & Yu 2009), with SIFT only: some ten times the time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Slanted {
+pub enum AffineSimulation {
     /// Never.
     Never,
     /// Where neither a homography nor a fundamental matrix explains enough of the plain matches: 8 and 30 % of them (Brown & Lowe's test of a true
@@ -60,7 +60,7 @@ pub enum Slanted {
     Always,
 }
 
-cv_core::named!(Slanted {
+cv_core::named!(AffineSimulation {
     Never = "never",
     AsNeeded = "as-needed": "where no model explains enough of the plain matches",
     Always = "always",
@@ -79,7 +79,7 @@ pub struct MatchingOptions {
     /// Robustness factor of the suppression. 0 to 1; default 0.9 (Brown, Szeliski & Winder).
     pub anms_robust: f32,
     /// How the corners are spread. Default by radius.
-    pub spacing: Spacing,
+    pub suppression: Suppression,
     /// Settings of the patches.
     pub patch: PatchOptions,
     /// Settings of the oriented patches and their corners.
@@ -91,8 +91,8 @@ pub struct MatchingOptions {
     pub ratio: Option<f32>,
     /// Keep a match only where each feature is the other's nearest. Default true.
     pub mutual: bool,
-    /// Simulated slanted views. Default where needed.
-    pub slanted: Slanted,
+    /// Affine-simulated views (ASIFT). Default where needed.
+    pub affine_simulation: AffineSimulation,
     /// Estimate this model from the matches and match once more along it: more matches, nearly all of them right, and none that disagree.
     /// Default none.
     pub guided: Option<ModelKind>,
@@ -105,13 +105,13 @@ impl Default for MatchingOptions {
             max_features: None,
             harris: HarrisOptions::default(),
             anms_robust: 0.9,
-            spacing: Spacing::default(),
+            suppression: Suppression::default(),
             patch: PatchOptions::default(),
             mops: MopsOptions::default(),
             sift: SiftOptions { coarse_first: true, ..SiftOptions::default() },
             ratio: Some(0.66),
             mutual: true,
-            slanted: Slanted::default(),
+            affine_simulation: AffineSimulation::default(),
             guided: None,
         }
     }
@@ -121,7 +121,7 @@ impl Default for MatchingOptions {
 #[derive(Debug, Clone, PartialEq)]
 pub struct PhotoFeatures {
     /// Keypoints, descriptors, and what was left out.
-    pub described: Described,
+    pub described: Features,
     /// Points found before spacing and limits.
     pub found: usize,
     /// The corners before spacing, for pictures; empty for methods that do not space their points.
@@ -204,10 +204,10 @@ pub fn extract_features(photo: ImageView<'_, u8, 3>, options: &MatchingOptions) 
         FeatureMethod::Harris => {
             let corners = harris(gray.view(), &options.harris)?;
             let n = options.max_features.unwrap_or(500);
-            let spaced = match options.spacing {
-                Spacing::Radius => anms(&corners, n, options.anms_robust),
-                Spacing::Squares => anms_square_covering(&corners, n),
-                Spacing::Tiles => anms_tiled(&corners, n, (8, 8)),
+            let spaced = match options.suppression {
+                Suppression::Radius => anms(&corners, n, options.anms_robust),
+                Suppression::SquareCovering => anms_square_covering(&corners, n),
+                Suppression::Tiles => anms_tiled(&corners, n, (8, 8)),
             };
             let spaced: Vec<_> = spaced.into_iter().map(|i| corners[i]).collect();
             let mut described = describe_patches(gray.view(), &spaced, &options.patch)?;
@@ -234,7 +234,7 @@ pub fn extract_features(photo: ImageView<'_, u8, 3>, options: &MatchingOptions) 
 }
 
 /// The features kept, dropped, and beyond the limit.
-fn accounted(described: &Described) -> usize {
+fn accounted(described: &Features) -> usize {
     described.keypoints.len() + described.dropped.len() + described.beyond_limit
 }
 
@@ -289,14 +289,14 @@ pub fn match_photos(
     progress.report("match", 0, 1)?;
     let mut matches = match_features(&features[0], &features[1], options)?;
     clock.lap("match");
-    let slanted = match options.slanted {
-        Slanted::Never => false,
-        Slanted::AsNeeded => !explained(&correspondences(&features[0], &features[1], &matches)),
-        Slanted::Always => true,
+    let affine_simulation = match options.affine_simulation {
+        AffineSimulation::Never => false,
+        AffineSimulation::AsNeeded => !explained(&correspondences(&features[0], &features[1], &matches)),
+        AffineSimulation::Always => true,
     };
-    if slanted && options.method == FeatureMethod::Sift {
+    if affine_simulation && options.method == FeatureMethod::Sift {
         progress.report("slanted views", 0, 1)?;
-        match_slanted([&rgb_to_gray_f32(a), &rgb_to_gray_f32(b)], &mut features, &mut matches, options);
+        match_asift([&rgb_to_gray_f32(a), &rgb_to_gray_f32(b)], &mut features, &mut matches, options);
         clock.lap("slanted views");
     }
     finish(features, matches, options, progress, clock)
@@ -353,7 +353,7 @@ fn finish(
     Ok(MatchingResult { features, matches, stages: clock.into_stages() })
 }
 
-/// Whether a homography or a fundamental matrix explains enough of the matches: see [`Slanted::AsNeeded`].
+/// Whether a homography or a fundamental matrix explains enough of the matches: see [`AffineSimulation::AsNeeded`].
 fn explained(pairs: &[Correspondence]) -> bool {
     [ModelKind::Homography, ModelKind::Fundamental].into_iter().any(|kind| {
         let model = estimate(pairs, kind, &kind.options(), &Silent);

@@ -5,10 +5,10 @@ use crate::matching::{
     FeatureMethod, MatchingOptions, PhotoFeatures, correspondences, extract_features, match_features,
 };
 use cv_core::{Camera, Cancelled, Correspondence, Image, ImageView, Mask, Point2, RgbU8, StageClock};
-use cv_features::{Described, DescriptorKind, Descriptors, SiftOptions};
+use cv_features::{DescriptorKind, Descriptors, Features, SiftOptions};
 use cv_panorama::{
-    AlignError, AlignOptions, Alignment, CameraMotion, Canvas, NotAPair, Photo, PhotoMap, RenderError, RenderOptions,
-    Unplaced, VerifiedPair, VerifyOptions, align, render, verify_pair,
+    AlignError, AlignOptions, Alignment, CameraMotion, Canvas, CompositingOptions, NotAPair, Photo, PhotoMap,
+    RenderError, Unplaced, VerifiedPair, VerifyOptions, align, render, verify_pair,
 };
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -45,7 +45,7 @@ pub struct PanoramaOptions {
     /// Alignment. `outlier_px` is in pixels of the reduced photographs.
     pub align: AlignOptions,
     /// Drawing.
-    pub render: RenderOptions,
+    pub render: CompositingOptions,
 }
 
 impl Default for PanoramaOptions {
@@ -55,7 +55,7 @@ impl Default for PanoramaOptions {
             registration_pixels: 800_000,
             verify: VerifyOptions::default(),
             align: AlignOptions::default(),
-            render: RenderOptions::default(),
+            render: CompositingOptions::default(),
         }
     }
 }
@@ -243,7 +243,7 @@ impl Prepared {
         let (w, h) = p.image.size();
         let factor = ((w * h) as f64 / registration_pixels.max(10_000) as f64).sqrt().max(1.0);
         let none = || PhotoFeatures {
-            described: Described {
+            described: Features {
                 keypoints: Vec::new(),
                 descriptors: Descriptors::new(DescriptorKind::RootSift),
                 dropped: Vec::new(),

@@ -58,7 +58,7 @@ mod tests {
     use super::*;
     use crate::Silent;
     use cv_core::{Camera, RgbU8};
-    use cv_segment::{ColorSpace, Scores};
+    use cv_segment::{ColorSpace, ConfusionMatrix};
     use cv_synth::{RenderOptions, ball_photos};
 
     #[test]
@@ -71,9 +71,9 @@ mod tests {
             for space in [ColorSpace::Hsv, ColorSpace::Rgb, ColorSpace::Lab] {
                 let options = TrainOptions { space, ..TrainOptions::default() };
                 let model = train_segment(&half(0), &options, &Silent).unwrap().trained.model;
-                let scores: Scores = half(1)
+                let scores: ConfusionMatrix = half(1)
                     .iter()
-                    .map(|(photo, mask)| Scores::new(segment(*photo, &model).mask.view(), *mask).unwrap())
+                    .map(|(photo, mask)| ConfusionMatrix::new(segment(*photo, &model).mask.view(), *mask).unwrap())
                     .sum();
                 // The bar for generated scenes.
                 assert!(scores.f1() >= 0.97, "seed {seed}, {space:?}: {} {scores:?}", scores.f1());

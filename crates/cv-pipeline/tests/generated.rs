@@ -61,7 +61,7 @@ fn a_panorama_uses_every_photograph_and_aligns_within_a_fifth_of_a_pixel() {
     for seed in 0..3 {
         let camera = camera();
         // Every other time somebody walks through.
-        let walk = cv_synth::PanoramaOptions { walker: seed % 2 == 0, ..cv_synth::PanoramaOptions::default() };
+        let walk = cv_synth::PanoramaSetOptions { walker: seed % 2 == 0, ..cv_synth::PanoramaSetOptions::default() };
         let set = panorama_views(seed, &camera, &walk, &RenderOptions::default()).unwrap();
         let photos: Vec<_> = set.views.iter().map(|v| PanoramaPhoto::new(v.image.view())).collect();
         let result = panorama(&photos, &PanoramaOptions::default(), &Silent).unwrap();

@@ -21,7 +21,7 @@ fn join(photos: &[ImageView<'_, u8, 3>], options: &PanoramaOptions) -> Result<Pa
 }
 
 fn views(seed: u64, count: usize) -> Vec<RgbU8> {
-    let options = cv_synth::PanoramaOptions { views: count, ..cv_synth::PanoramaOptions::default() };
+    let options = cv_synth::PanoramaSetOptions { views: count, ..cv_synth::PanoramaSetOptions::default() };
     let set = panorama_views(seed, &camera(), &options, &RenderOptions::default()).unwrap();
     set.views.into_iter().map(|v| v.image).collect()
 }
@@ -157,7 +157,7 @@ fn the_order_of_the_photographs_moves_nothing() {
 #[test]
 fn a_calibrated_lens_is_taken_out() {
     let bent = Camera { distortion: Distortion::radial(-0.25, 0.05), ..camera() };
-    let options = cv_synth::PanoramaOptions { views: 3, ..cv_synth::PanoramaOptions::default() };
+    let options = cv_synth::PanoramaSetOptions { views: 3, ..cv_synth::PanoramaSetOptions::default() };
     let set = panorama_views(4, &bent, &options, &RenderOptions::default()).unwrap();
     let photos: Vec<_> =
         set.views.iter().map(|v| PanoramaPhoto { camera: Some(bent), ..PanoramaPhoto::new(v.image.view()) }).collect();

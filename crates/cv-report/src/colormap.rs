@@ -2,7 +2,7 @@
 
 use cv_core::{GrayF32, ImageView, RgbU8, quantile};
 
-use crate::canvas::{Canvas, Color, colors};
+use crate::raster::{Color, Raster, colors};
 
 /// A way from numbers to colors.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -112,25 +112,25 @@ pub fn color_bar(height: usize, range: (f32, f32), colormap: Colormap, label: &s
     let marks = ticks(range64, ((length / (size * 3.2)) as usize).clamp(2, 10));
     let step = marks.windows(2).map(|w| w[1] - w[0]).next().unwrap_or(range64.1 - range64.0);
     let labels: Vec<_> = marks.iter().map(|&t| tick_label(t, step)).collect();
-    let widest = labels.iter().map(|l| Canvas::text_width(l, size)).fold(0.0, f32::max);
-    let width = (size + bar + size * 0.9 + widest + size).max(Canvas::text_width(label, size) + 2.0 * size);
-    let mut canvas = Canvas::new(width.ceil() as usize, height, colors::WHITE);
+    let widest = labels.iter().map(|l| Raster::text_width(l, size)).fold(0.0, f32::max);
+    let width = (size + bar + size * 0.9 + widest + size).max(Raster::text_width(label, size) + 2.0 * size);
+    let mut raster = Raster::new(width.ceil() as usize, height, colors::WHITE);
     let table = colormap.table();
     for row in 0..length as usize {
         let t = 1.0 - (row as f32 + 0.5) / length;
         let color = table[(t * 255.0).round() as usize];
-        canvas.fill_rect(size as i64, top as i64 + row as i64, bar as usize, 1, color);
+        raster.fill_rect(size as i64, top as i64 + row as i64, bar as usize, 1, color);
     }
     const INK: Color = [45, 48, 56];
     for (mark, label) in marks.iter().zip(&labels) {
         let t = ((mark - range64.0) / (range64.1 - range64.0)) as f32;
         let y = top + (1.0 - t) * (length - 1.0);
         let x = size + bar;
-        canvas.line([x + size * 0.15, y], [x + size * 0.5, y], 1.0, INK);
-        canvas.text(x + size * 0.9, y - size / 2.0, label, size, INK);
+        raster.line([x + size * 0.15, y], [x + size * 0.5, y], 1.0, INK);
+        raster.text(x + size * 0.9, y - size / 2.0, label, size, INK);
     }
-    canvas.text(size, size * 0.8, label, size, INK);
-    canvas.into_image()
+    raster.text(size, size * 0.8, label, size, INK);
+    raster.into_image()
 }
 
 /// How a map becomes a picture.
@@ -170,10 +170,10 @@ pub fn draw_map(map: ImageView<'_, f32, 1>, style: &MapStyle) -> RgbU8 {
     let range = if range.1 > range.0 { range } else { (range.0 - 0.5, range.0 + 0.5) };
     let picture = colorize(map, range, style.colormap);
     let bar = color_bar(picture.height().max(160), range, style.colormap, &style.label);
-    let mut canvas = Canvas::new(picture.width() + bar.width(), picture.height().max(bar.height()), colors::WHITE);
-    canvas.paste(picture.view(), 0, 0);
-    canvas.paste(bar.view(), picture.width() as i64, 0);
-    canvas.into_image()
+    let mut raster = Raster::new(picture.width() + bar.width(), picture.height().max(bar.height()), colors::WHITE);
+    raster.paste(picture.view(), 0, 0);
+    raster.paste(bar.view(), picture.width() as i64, 0);
+    raster.into_image()
 }
 
 /// The absolute difference of two maps; NaN where either is unknown.

@@ -4,7 +4,7 @@
 //! points, two characters each. The first is x, as a letter from A = 0: a capital is a point of the stroke, a small letter the
 //! control point of a quadratic curve. The second is y, in base 36 from the top of the capitals. Strokes are parted by blanks.
 
-use crate::canvas::for_each_near;
+use crate::raster::for_each_near;
 
 const CAP: f32 = 14.0;
 /// Between two glyphs, in units.

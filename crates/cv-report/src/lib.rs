@@ -19,7 +19,7 @@
 //!
 //! | what | where |
 //! |---|---|
-//! | drawing | [`Canvas`], [`colors`] |
+//! | drawing | [`Raster`], [`colors`] |
 //! | maps of numbers | [`colorize`], [`color_bar`], [`draw_map`], [`draw_error_map`] |
 //! | features and geometry | [`draw_keypoints`], [`draw_matches`], [`draw_epipolar_lines`], [`tile_patches`] |
 //! | arranging | [`side_by_side`], [`shrink_to_fit`] |
@@ -28,20 +28,20 @@
 //! | pages | [`Report`], [`Figure`], [`Plot`] |
 
 mod base64;
-mod canvas;
 mod colormap;
 mod font;
 mod overlay;
 mod plot;
+mod raster;
 mod report;
 mod viewer;
 
-pub use canvas::{Canvas, Color, colors};
 pub use colormap::{Colormap, MapStyle, absolute_difference, color_bar, colorize, draw_map, quantile_range};
 pub use overlay::{
     MatchStyle, draw_epipolar_lines, draw_error_map, draw_keypoints, draw_matches, overlay_comparison, overlay_mask,
     shrink_to_fit, side_by_side, tile_patches,
 };
 pub use plot::Plot;
+pub use raster::{Color, Raster, colors};
 pub use report::{Figure, Note, Report};
 pub use viewer::{PointScene, Viewpoint, camera_color, render_points};

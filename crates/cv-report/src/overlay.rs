@@ -2,7 +2,7 @@
 
 use cv_core::{Correspondence, ImageView, Keypoint, Matrix3, RgbU8, luma_u8};
 
-use crate::canvas::{Canvas, Color, colors};
+use crate::raster::{Color, Raster, colors};
 
 /// Line widths and marker sizes that suit a picture: 1 for one of about 1000 pixels.
 fn unit(width: usize, height: usize) -> f32 {
@@ -10,8 +10,8 @@ fn unit(width: usize, height: usize) -> f32 {
 }
 
 /// Takes most of the color and some of the light out of a picture, so that marks on it stand out.
-fn quiet(canvas: &mut Canvas) {
-    canvas.map(|[r, g, b]| {
+fn quiet(raster: &mut Raster) {
+    raster.map(|[r, g, b]| {
         let luma = u32::from(luma_u8([r, g, b]));
         [r, g, b].map(|v| ((u32::from(v) + 3 * luma) * 45 / 256 + 20) as u8)
     });
@@ -19,41 +19,41 @@ fn quiet(canvas: &mut Canvas) {
 
 /// Marks keypoints: a small ring, larger for larger scales, with a spoke where they have an orientation.
 pub fn draw_keypoints(view: ImageView<'_, u8, 3>, keypoints: &[Keypoint], color: Color) -> RgbU8 {
-    let mut canvas = Canvas::from_rgb(view);
+    let mut raster = Raster::from_rgb(view);
     let u = unit(view.width(), view.height());
     for point in keypoints {
         let center = [point.position.x, point.position.y];
         let radius = (3.6 * u).max(3.0 * point.scale.clamp(0.0, 100.0));
-        canvas.circle(center, radius, 2.9 * u, colors::BLACK);
-        canvas.circle(center, radius, 1.5 * u, color);
+        raster.circle(center, radius, 2.9 * u, colors::BLACK);
+        raster.circle(center, radius, 1.5 * u, color);
         if point.angle != 0.0 && point.angle.is_finite() {
             let end = [center[0] + radius * point.angle.cos(), center[1] + radius * point.angle.sin()];
-            canvas.line(center, end, 1.3 * u, color);
+            raster.line(center, end, 1.3 * u, color);
         }
     }
-    canvas.into_image()
+    raster.into_image()
 }
 
 /// Pictures in a row on white, `gap` pixels apart, centered vertically.
 pub fn side_by_side(views: &[ImageView<'_, u8, 3>], gap: usize) -> RgbU8 {
-    let (canvas, _) = row_of(views, gap);
-    canvas.into_image()
+    let (raster, _) = row_of(views, gap);
+    raster.into_image()
 }
 
 /// The row and the top-left corner of each picture in it.
-fn row_of(views: &[ImageView<'_, u8, 3>], gap: usize) -> (Canvas, Vec<[f32; 2]>) {
+fn row_of(views: &[ImageView<'_, u8, 3>], gap: usize) -> (Raster, Vec<[f32; 2]>) {
     let height = views.iter().map(ImageView::height).max().unwrap_or(0);
     let width = views.iter().map(ImageView::width).sum::<usize>() + gap * views.len().saturating_sub(1);
-    let mut canvas = Canvas::new(width, height, colors::WHITE);
+    let mut raster = Raster::new(width, height, colors::WHITE);
     let mut corners = Vec::with_capacity(views.len());
     let mut x = 0;
     for view in views {
         let y = (height - view.height()) / 2;
-        canvas.paste(*view, x as i64, y as i64);
+        raster.paste(*view, x as i64, y as i64);
         corners.push([x as f32, y as f32]);
         x += view.width() + gap;
     }
-    (canvas, corners)
+    (raster, corners)
 }
 
 /// Colors that differ from one index to the next, for things that have no meaning by color.
@@ -98,16 +98,16 @@ pub fn draw_matches(
     inliers: Option<&[bool]>,
     style: &MatchStyle,
 ) -> RgbU8 {
-    let (mut canvas, corners) = row_of(&[a, b], 0);
-    quiet(&mut canvas);
-    let u = unit(canvas.width() / 2, canvas.height());
+    let (mut raster, corners) = row_of(&[a, b], 0);
+    quiet(&mut raster);
+    let u = unit(raster.width() / 2, raster.height());
     let mut draw = |pair: &Correspondence, color: Color| {
         let from = [pair.a.x as f32 + corners[0][0], pair.a.y as f32 + corners[0][1]];
         let to = [pair.b.x as f32 + corners[1][0], pair.b.y as f32 + corners[1][1]];
-        canvas.line(from, to, 1.3 * u, color);
+        raster.line(from, to, 1.3 * u, color);
         for end in [from, to] {
-            canvas.disc(end, 3.4 * u, colors::BLACK);
-            canvas.disc(end, 2.4 * u, color);
+            raster.disc(end, 3.4 * u, colors::BLACK);
+            raster.disc(end, 2.4 * u, color);
         }
     };
     match inliers {
@@ -121,7 +121,7 @@ pub fn draw_matches(
             spread(good.len(), style.limit).for_each(|i| draw(&pairs[good[i]], colors::GREEN));
         }
     }
-    canvas.into_image()
+    raster.into_image()
 }
 
 /// Two pictures, grayed and side by side; up to `count` pairs, each with its epipolar lines in one color: `F x_a` in the second picture
@@ -133,7 +133,7 @@ pub fn draw_epipolar_lines(
     pairs: &[Correspondence],
     count: usize,
 ) -> RgbU8 {
-    let (mut left, mut right) = (Canvas::from_rgb(a), Canvas::from_rgb(b));
+    let (mut left, mut right) = (Raster::from_rgb(a), Raster::from_rgb(b));
     quiet(&mut left);
     quiet(&mut right);
     let u = unit(a.width(), a.height());
@@ -141,15 +141,15 @@ pub fn draw_epipolar_lines(
         let pair = &pairs[i];
         let color = cycle(n);
         let (xa, xb) = (pair.a.to_homogeneous(), pair.b.to_homogeneous());
-        for (canvas, line, point) in
+        for (raster, line, point) in
             [(&mut left, fundamental.transpose() * xb, pair.a), (&mut right, fundamental * xa, pair.b)]
         {
-            if let Some((from, to)) = across(line.x, line.y, line.z, canvas.width() as f64, canvas.height() as f64) {
-                canvas.line(from, to, 1.8 * u, color);
+            if let Some((from, to)) = across(line.x, line.y, line.z, raster.width() as f64, raster.height() as f64) {
+                raster.line(from, to, 1.8 * u, color);
             }
             let center = [point.x as f32, point.y as f32];
-            canvas.disc(center, 4.6 * u, colors::BLACK);
-            canvas.disc(center, 3.6 * u, color);
+            raster.disc(center, 4.6 * u, colors::BLACK);
+            raster.disc(center, 3.6 * u, color);
         }
     }
     let gap = (6.0 * u) as usize;
@@ -173,7 +173,7 @@ fn across(a: f64, b: f64, c: f64, width: f64, height: f64) -> Option<([f32; 2], 
 /// A mask laid over a picture: `color` mixed in by `alpha` (0 to 1) where true, with a solid outline. Beyond the mask's size nothing
 /// is marked.
 pub fn overlay_mask(view: ImageView<'_, u8, 3>, mask: ImageView<'_, bool, 1>, color: Color, alpha: f32) -> RgbU8 {
-    let mut canvas = Canvas::from_rgb(view);
+    let mut raster = Raster::from_rgb(view);
     let reach = unit(view.width(), view.height()).round() as i64;
     let on = |x: i64, y: i64| {
         usize::try_from(x).ok().zip(usize::try_from(y).ok()).and_then(|(x, y)| mask.get(x, y)).is_some_and(|[m]| m)
@@ -184,10 +184,10 @@ pub fn overlay_mask(view: ImageView<'_, u8, 3>, mask: ImageView<'_, bool, 1>, co
                 continue;
             }
             let edge = (1..=reach).any(|d| !on(x - d, y) || !on(x + d, y) || !on(x, y - d) || !on(x, y + d));
-            canvas.blend(x, y, color, if edge { 1.0 } else { alpha });
+            raster.blend(x, y, color, if edge { 1.0 } else { alpha });
         }
     }
-    canvas.into_image()
+    raster.into_image()
 }
 
 /// A mask against the truth: right green, invented red, missed blue, on the grayed picture.
@@ -196,8 +196,8 @@ pub fn overlay_comparison(
     mask: ImageView<'_, bool, 1>,
     truth: ImageView<'_, bool, 1>,
 ) -> RgbU8 {
-    let mut canvas = Canvas::from_rgb(view);
-    quiet(&mut canvas);
+    let mut raster = Raster::from_rgb(view);
+    quiet(&mut raster);
     for y in 0..view.height() {
         for x in 0..view.width() {
             let color = match (mask.get(x, y) == Some([true]), truth.get(x, y) == Some([true])) {
@@ -206,10 +206,10 @@ pub fn overlay_comparison(
                 (false, true) => colors::BLUE,
                 (false, false) => continue,
             };
-            canvas.blend(x as i64, y as i64, color, 0.55);
+            raster.blend(x as i64, y as i64, color, 0.55);
         }
     }
-    canvas.into_image()
+    raster.into_image()
 }
 
 /// Square patches, such as descriptors, as enlarged tiles: `side × side` values each, row by row, every tile stretched to
@@ -226,7 +226,7 @@ pub fn tile_patches(values: &[f32], side: usize, columns: usize, zoom: usize) ->
     let gap = (zoom * side / 12).max(2);
     let cell = zoom * side + gap;
     let used = columns.min(count);
-    let mut canvas = Canvas::new(used * cell + gap, count.div_ceil(columns) * cell + gap, [225, 227, 232]);
+    let mut raster = Raster::new(used * cell + gap, count.div_ceil(columns) * cell + gap, [225, 227, 232]);
     for (i, patch) in values.chunks_exact(area).enumerate() {
         let finite = || patch.iter().copied().filter(|v| v.is_finite());
         let (low, high) = (finite().fold(f32::INFINITY, f32::min), finite().fold(f32::NEG_INFINITY, f32::max));
@@ -235,10 +235,10 @@ pub fn tile_patches(values: &[f32], side: usize, columns: usize, zoom: usize) ->
         for (j, &v) in patch.iter().enumerate() {
             let color = if v.is_finite() { [(255.0 * (v - low) * scale) as u8; 3] } else { colors::UNKNOWN };
             let (x, y) = ((j % side * zoom) as i64, (j / side * zoom) as i64);
-            canvas.fill_rect(left + x, top + y, zoom, zoom, color);
+            raster.fill_rect(left + x, top + y, zoom, zoom, color);
         }
     }
-    canvas.into_image()
+    raster.into_image()
 }
 
 /// A disparity or depth map against the truth: gray ramp up to `limit`, then red to yellow; black where there is no truth, blue where

@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use cv_core::{Camera, Point2, Point3, PointCloud, Pose, RgbU8, median, quantile};
 
 use crate::base64;
-use crate::canvas::{Canvas, Color, colors};
+use crate::raster::{Color, Raster, colors};
 
 /// Points and cameras in one world (X right, Y down, Z forward, as the first camera sees it).
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -171,9 +171,9 @@ pub enum Viewpoint {
 /// A still picture of a scene on a dark ground, `width × height` pixels.
 pub fn render_points(scene: &PointScene, viewpoint: Viewpoint, width: usize, height: usize) -> RgbU8 {
     const GROUND: Color = [20, 22, 28];
-    let mut canvas = Canvas::new(width, height, GROUND);
+    let mut raster = Raster::new(width, height, GROUND);
     if width == 0 || height == 0 {
-        return canvas.into_image();
+        return raster.into_image();
     }
     let (center, radius) = scene.extent();
     let center = Point3::new(f64::from(center[0]), f64::from(center[1]), f64::from(center[2]));
@@ -191,7 +191,7 @@ pub fn render_points(scene: &PointScene, viewpoint: Viewpoint, width: usize, hei
     // A plan is drawn from far away, where lines that are parallel look it.
     let distance = if viewpoint == Viewpoint::Camera { 3.0 * radius } else { 60.0 * radius };
     let eye = center - forward * distance;
-    let Some(pose) = Pose::look_at(eye, center, -up) else { return canvas.into_image() };
+    let Some(pose) = Pose::look_at(eye, center, -up) else { return raster.into_image() };
     let project = |p: [f32; 3]| {
         let q = pose.transform(&Point3::new(f64::from(p[0]), f64::from(p[1]), f64::from(p[2])));
         (q.z > 0.02 * distance).then(|| ([(q.x / q.z) as f32, (q.y / q.z) as f32], q.z as f32))
@@ -202,7 +202,7 @@ pub fn render_points(scene: &PointScene, viewpoint: Viewpoint, width: usize, hei
     order.sort_by(|a, b| b.0.total_cmp(&a.0));
     let lines: Vec<_> =
         scene.segments().into_iter().filter_map(|(a, b, color)| Some((project(a)?.0, project(b)?.0, color))).collect();
-    let Some((middle, scale)) = fit(&order, &lines, width as f32, height as f32) else { return canvas.into_image() };
+    let Some((middle, scale)) = fit(&order, &lines, width as f32, height as f32) else { return raster.into_image() };
     let place = |q: [f32; 2]| {
         [(q[0] - middle[0]) * scale + width as f32 / 2.0, (q[1] - middle[1]) * scale + height as f32 / 2.0]
     };
@@ -210,18 +210,18 @@ pub fn render_points(scene: &PointScene, viewpoint: Viewpoint, width: usize, hei
     let side = (1.5 * size).round() as usize;
     for (_, q, color) in order {
         let corner = place(q).map(|v| (v - side as f32 / 2.0 + 0.5).floor() as i64);
-        canvas.fill_rect(corner[0], corner[1], side, side, color);
+        raster.fill_rect(corner[0], corner[1], side, side, color);
     }
     for (a, b, color) in lines {
-        canvas.line(place(a), place(b), 1.4 * size, color);
+        raster.line(place(a), place(b), 1.4 * size, color);
     }
     let name = match viewpoint {
         Viewpoint::Camera => "",
         Viewpoint::Top => "from above",
         Viewpoint::Side => "from the side",
     };
-    canvas.text(10.0 * size, 10.0 * size, name, 9.0 * size, [170, 176, 190]);
-    canvas.into_image()
+    raster.text(10.0 * size, 10.0 * size, name, 9.0 * size, [170, 176, 190]);
+    raster.into_image()
 }
 
 /// The middle and the scale that put the cameras and all but the outermost 2 % of the points inside the picture, with a margin.

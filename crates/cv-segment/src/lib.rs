@@ -2,7 +2,7 @@
 //!
 //! ```
 //! use cv_core::{Mask, RgbU8};
-//! use cv_segment::{Scores, TrainOptions, train};
+//! use cv_segment::{ConfusionMatrix, TrainOptions, train};
 //!
 //! // An orange square on gray.
 //! let inside = |x: usize, y: usize| (20..40).contains(&x) && (10..30).contains(&y);
@@ -11,7 +11,7 @@
 //!
 //! let trained = train(&[(photo.view(), mask.view())], &TrainOptions::default())?;
 //! let found = trained.model.predict(photo.view());
-//! assert!(Scores::new(found.view(), mask.view())?.f1() > 0.97);
+//! assert!(ConfusionMatrix::new(found.view(), mask.view())?.f1() > 0.97);
 //! # Ok::<(), cv_segment::SegmentError>(())
 //! ```
 //!
@@ -24,18 +24,18 @@
 //! Everything is deterministic: the same photos, options and seed give the same model and the same masks on any number of threads.
 
 mod cleanup;
+mod color_space;
+mod confusion_matrix;
 mod error;
-mod evaluate;
+mod log_odds;
 mod mixture;
 mod model;
-mod scores;
-mod space;
 mod train;
 
 pub use cleanup::Cleanup;
+pub use color_space::ColorSpace;
+pub use confusion_matrix::ConfusionMatrix;
 pub use error::SegmentError;
 pub use mixture::{Component, Mixture, MixtureError, MixtureOptions, WeightedSample};
 pub use model::{ColorModel, Rule};
-pub use scores::Scores;
-pub use space::ColorSpace;
 pub use train::{Labeled, Regions, TrainOptions, Trained, train};

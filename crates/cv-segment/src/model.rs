@@ -1,6 +1,6 @@
 //! The trained model: two mixtures, a threshold, and what happens around them.
 
-use crate::{Cleanup, ColorSpace, Mixture, SegmentError, evaluate::Evaluator, mixture::Whitened};
+use crate::{Cleanup, ColorSpace, Mixture, SegmentError, log_odds::LogOdds, mixture::Whitened};
 use cv_core::{GrayF32, ImageView, Mask, Matrix3, OptionError, Vector3};
 use cv_imgproc::gaussian_blur;
 use serde::{Deserialize, Serialize};
@@ -36,7 +36,7 @@ cv_core::named!(Rule {
 #[serde(try_from = "ModelFile", into = "ModelFile")]
 pub struct ColorModel {
     file: ModelFile,
-    evaluator: Evaluator,
+    evaluator: LogOdds,
     /// Added to the log odds.
     offset: f32,
 }
@@ -124,7 +124,7 @@ impl TryFrom<ModelFile> for ColorModel {
             // The highest peak is scored as high as the limit lets it.
             None => LIMIT - foreground.iter().map(|c| c.constant).fold(f64::NEG_INFINITY, f64::max) as f32,
         };
-        let evaluator = Evaluator::new(file.space, file.hue, &foreground, &background);
+        let evaluator = LogOdds::new(file.space, file.hue, &foreground, &background);
         Ok(Self { file, evaluator, offset })
     }
 }

@@ -1,10 +1,10 @@
 //! Learning a model from photos and masks.
 
 use crate::{
-    Cleanup, ColorModel, ColorSpace, Mixture, MixtureOptions, Rule, Scores, SegmentError, WeightedSample,
+    Cleanup, ColorModel, ColorSpace, ConfusionMatrix, Mixture, MixtureOptions, Rule, SegmentError, WeightedSample,
     cleanup::largest_share,
+    color_space::mean_hue,
     model::{LIMIT, ModelFile},
-    space::mean_hue,
 };
 use cv_core::{ImageView, OptionError};
 
@@ -98,7 +98,7 @@ pub struct Trained {
     /// The model.
     pub model: ColorModel,
     /// Its scores on the photos it was trained on, each by itself, after cleaning up. What it will do on others is less.
-    pub scores: Vec<Scores>,
+    pub scores: Vec<ConfusionMatrix>,
     /// Pixels of the object.
     pub foreground_pixels: u64,
     /// Other pixels.
@@ -171,8 +171,8 @@ pub fn train(photos: &[Labeled<'_>], options: &TrainOptions) -> Result<Trained, 
         file.threshold = best_threshold(&model, photos);
         model = ColorModel::try_from(file)?;
     }
-    let scores: Result<Vec<Scores>, SegmentError> =
-        photos.iter().map(|(photo, mask)| Scores::new(model.predict(*photo).view(), *mask)).collect();
+    let scores: Result<Vec<ConfusionMatrix>, SegmentError> =
+        photos.iter().map(|(photo, mask)| ConfusionMatrix::new(model.predict(*photo).view(), *mask)).collect();
     Ok(Trained { model, scores: scores?, foreground_pixels: counts[0], background_pixels: counts[1] })
 }
 

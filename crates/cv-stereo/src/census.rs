@@ -2,7 +2,7 @@
 //! change of exposure touches.
 
 use crate::layout::Layout;
-use crate::{Blend, Census};
+use crate::{Census, IntensityCost};
 use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
 use rayon::prelude::*;
@@ -40,17 +40,19 @@ impl Gray {
     }
 }
 
-/// Number of bytes that describe a pixel: its census bits, and what the blend compares.
-pub(crate) fn planes(window: Census, blend: Blend) -> usize {
-    window.bits().div_ceil(8) + usize::from(blend != Blend::None)
+/// Number of bytes that describe a pixel: its census bits, and what the intensity_cost compares.
+pub(crate) fn planes(window: Census, intensity_cost: IntensityCost) -> usize {
+    window.bits().div_ceil(8) + usize::from(intensity_cost != IntensityCost::None)
 }
 
 /// Describes every pixel, into `out` (resized): the bytes of a row one after the other. Bit `i` of the census tells
 /// whether the `i`-th neighbor, row by row, is darker than the center.
-pub(crate) fn describe(level: Level, gray: &Gray, window: Census, blend: Blend, out: &mut Vec<u8>) {
-    let stride = gray.width * planes(window, blend);
+pub(crate) fn describe(level: Level, gray: &Gray, window: Census, intensity_cost: IntensityCost, out: &mut Vec<u8>) {
+    let stride = gray.width * planes(window, intensity_cost);
     out.resize(stride * gray.height, 0);
-    out.par_chunks_mut(stride).enumerate().for_each(|(y, row)| describe_row(level, gray, window, blend, y, row));
+    out.par_chunks_mut(stride)
+        .enumerate()
+        .for_each(|(y, row)| describe_row(level, gray, window, intensity_cost, y, row));
 }
 
 /// As [`describe`], each row mirrored and dealt out to the phases of `layout`: element `j` is column
@@ -59,12 +61,12 @@ pub(crate) fn describe_mirrored(
     level: Level,
     gray: &Gray,
     window: Census,
-    blend: Blend,
+    intensity_cost: IntensityCost,
     min_disparity: i64,
     layout: Layout,
     out: &mut Vec<u8>,
 ) {
-    let (width, planes) = (gray.width, planes(window, blend));
+    let (width, planes) = (gray.width, planes(window, intensity_cost));
     let (n, phase, len) = (layout.vectors(), layout.phase(width), layout.right_row(width));
     // Element of the last column, and where it would be were the row long enough on both sides.
     let first = -min_disparity;
@@ -75,7 +77,7 @@ pub(crate) fn describe_mirrored(
     out.par_chunks_mut(planes * len).enumerate().for_each_init(
         || (vec![0; width * planes], vec![0; len + n]),
         |(described, mirrored), (y, row)| {
-            describe_row(level, gray, window, blend, y, described);
+            describe_row(level, gray, window, intensity_cost, y, described);
             for (p, plane) in described.chunks_exact(width).enumerate() {
                 for (to, from) in mirrored[inside.clone()].iter_mut().zip(plane[..columns].iter().rev()) {
                     *to = *from;
@@ -102,31 +104,31 @@ fn every<const N: usize>(from: &[u8], to: &mut [u8], first: impl Fn([u8; N]) -> 
 }
 
 /// The bytes of row `y`, one after the other.
-fn describe_row(level: Level, gray: &Gray, window: Census, blend: Blend, y: usize, out: &mut [u8]) {
-    let bytes = planes(window, Blend::None);
+fn describe_row(level: Level, gray: &Gray, window: Census, intensity_cost: IntensityCost, y: usize, out: &mut [u8]) {
+    let bytes = planes(window, IntensityCost::None);
     for (plane, row) in out.chunks_exact_mut(gray.width).enumerate() {
         if plane < bytes {
             dispatch!(level, simd => census_row(simd, gray, window, plane, y, row));
         } else {
-            dispatch!(level, simd => blend_row(simd, gray, blend, y, row));
+            dispatch!(level, simd => intensity_row(simd, gray, intensity_cost, y, row));
         }
     }
 }
 
 #[simd]
-fn blend_row<S: Simd>(_: S, gray: &Gray, blend: Blend, y: usize, out: &mut [u8]) {
+fn intensity_row<S: Simd>(_: S, gray: &Gray, intensity_cost: IntensityCost, y: usize, out: &mut [u8]) {
     let row = gray.row(y as isize);
     let width = gray.width;
-    match blend {
-        Blend::None => {}
-        Blend::Gray { per_bit, .. } => {
+    match intensity_cost {
+        IntensityCost::None => {}
+        IntensityCost::Gray { per_bit, .. } => {
             // Rounded; at most 255.
             let step = u32::from(per_bit) * 257;
             for (byte, &v) in out.iter_mut().zip(&row[MARGIN..]) {
                 *byte = ((u32::from(v) + step / 2) / step).min(255) as u8;
             }
         }
-        Blend::Gradient { per_bit, .. } => {
+        IntensityCost::Gradient { per_bit, .. } => {
             // Half the difference of the neighbors, 128 for none.
             let step = i32::from(per_bit) * 514;
             let neighbors = row[MARGIN - 1..].iter().zip(&row[MARGIN + 1..]);

@@ -16,7 +16,7 @@ pub(crate) struct Frame<'a> {
     /// Number of disparities asked for.
     pub(crate) disparities: usize,
     pub(crate) layout: Layout,
-    /// Bytes that describe a pixel: its census bits, then, with a cap, what the blend compares.
+    /// Bytes that describe a pixel: its census bits, then, with a cap, what the intensity_cost compares.
     pub(crate) planes: usize,
     /// The bytes of the left image, each row plane by plane.
     pub(crate) left: &'a [u8],
@@ -26,8 +26,8 @@ pub(crate) struct Frame<'a> {
     pub(crate) right: &'a [u8],
     /// The costs, pixel by pixel in the order of `layout`, where they are not made of the bytes.
     pub(crate) given: Option<&'a [u8]>,
-    /// The most that the blend adds to the bits.
-    pub(crate) blend_cap: Option<u8>,
+    /// The most that the intensity_cost adds to the bits.
+    pub(crate) intensity_cap: Option<u8>,
     /// Gray values of the left image, 0 to 255.
     pub(crate) gray: &'a [u8],
     pub(crate) p1: u8,
@@ -57,7 +57,7 @@ impl Frame<'_> {
         xs: Range<usize>,
         out: &mut [u8],
     ) {
-        match self.planes - usize::from(self.blend_cap.is_some()) {
+        match self.planes - usize::from(self.intensity_cap.is_some()) {
             3 => costs::<S, 3, BLOCKS, SINGLE>(simd, self, y, xs, out),
             6 => costs::<S, 6, BLOCKS, SINGLE>(simd, self, y, xs, out),
             _ => costs::<S, 8, BLOCKS, SINGLE>(simd, self, y, xs, out),
@@ -117,7 +117,7 @@ fn costs<S: Simd, const BITS: usize, const BLOCKS: usize, const SINGLE: bool>(
             }
         }
     }
-    if let Some(cap) = frame.blend_cap {
+    if let Some(cap) = frame.intensity_cap {
         let cap = S::u8s::splat(simd, cap);
         let plane = here(BITS);
         for (pixel, out) in out.chunks_exact_mut(groups * group).enumerate() {

@@ -9,7 +9,7 @@
 //!
 //! and adds them up. Two sweeps from opposite corners cover all directions.
 
-use crate::aligned::Aligned;
+use crate::aligned_buffer::AlignedBuffer;
 use crate::cost::Frame;
 use crate::layout::BLOCK;
 use crate::select::{Ends, Keys, Selection, ids, select};
@@ -27,16 +27,16 @@ pub(crate) struct Sweep {
     mirrored: bool,
     /// Path costs of the row before, pixel by pixel: from ahead, straight, from behind, in the sense of the sweep, or
     /// straight only. Beyond the last pixel zeros, for the path from ahead of the last one.
-    row: Aligned<u8>,
+    row: AlignedBuffer<u8>,
     /// The smallest of them: straight, from behind and from ahead, in the sense of the image.
     least: [Vec<u8>; 3],
     /// The smallest of those that pixels of this row look at.
     before: [Vec<u8>; 3],
     ongoing: Ongoing,
     /// Costs of a tile of pixels.
-    costs: Aligned<u8>,
+    costs: AlignedBuffer<u8>,
     /// Sums of these pixels.
-    sums: Aligned<u8>,
+    sums: AlignedBuffer<u8>,
     /// P2 − P1 of each pixel of the row from before; with the smallest before also straight, from behind and from ahead.
     p2: [Vec<u8>; 4],
     selection: Selection,
@@ -46,10 +46,10 @@ pub(crate) struct Sweep {
 #[derive(Debug, Default)]
 struct Ongoing {
     /// Path costs of the pixel before.
-    along: Aligned<u8>,
+    along: AlignedBuffer<u8>,
     along_least: u8,
     /// Path costs of the row before at the pixel before, whose place has been taken.
-    behind: Aligned<u8>,
+    behind: AlignedBuffer<u8>,
 }
 
 /// What becomes of the sums of a sweep.

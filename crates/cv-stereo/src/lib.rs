@@ -18,14 +18,15 @@
 //!
 //! Disparity is `x_left − x_right` in pixels, `f32`, NaN where there is none.
 
-mod aligned;
+mod aligned_buffer;
 mod census;
 mod confidence;
 mod cost;
 mod depth;
+mod edge_preserving;
 mod error;
 mod evaluate;
-mod fill;
+mod hole_filling;
 mod input;
 mod kernel;
 mod layout;
@@ -33,14 +34,13 @@ mod matcher;
 mod median;
 mod options;
 mod path_sums;
-#[cfg(test)]
-mod plain;
-mod plane;
+mod plane_fitting;
 mod rectify;
 mod rectify_scene;
+#[cfg(test)]
+mod reference;
 mod select;
 mod sgm;
-mod smooth;
 mod speckle;
 mod winner;
 
@@ -49,7 +49,7 @@ pub use error::StereoError;
 pub use evaluate::{BAD_THRESHOLDS, DisparityScores, EvaluateError, evaluate_disparity, non_occluded};
 pub use input::Intensity;
 pub use matcher::{DisparityMap, PixelState, StereoMatcher};
-pub use options::{Blend, Census, Paths, Smoothing, StereoOptions, Subpixel};
+pub use options::{Census, IntensityCost, Paths, Smoothing, StereoOptions, Subpixel};
 #[doc(hidden)]
 pub use path_sums::PathSums;
 pub use rectify::{Rectification, RectifiedView, RectifyError, RectifyOptions};

@@ -3,15 +3,15 @@
 use crate::census::{Gray, describe, describe_mirrored, planes};
 use crate::confidence::{confidence, sigma};
 use crate::cost::{Frame, Penalties};
-use crate::fill::{Holes, fill_holes};
+use crate::edge_preserving::{self, Planes, smooth};
+use crate::hole_filling::{Holes, fill_holes};
 use crate::input::to_gray;
 use crate::layout::Layout;
-use crate::plane::{self, fill_planes};
+use crate::plane_fitting::{self, fill_planes};
 use crate::sgm::Aggregator;
-use crate::smooth::{self, Planes, smooth};
 use crate::speckle::{Speckles, remove_speckles};
 use crate::winner::{NO_SUM, Winner};
-use crate::{Blend, Intensity, Paths, StereoError, StereoOptions, Subpixel, median};
+use crate::{Intensity, IntensityCost, Paths, StereoError, StereoOptions, Subpixel, median};
 use cv_core::{GrayF32, Image, ImageView, Sample, StageClock};
 use fearless_simd::Level;
 use rayon::prelude::*;
@@ -96,13 +96,13 @@ pub struct StereoMatcher {
     level: Level,
     gray: [Gray; 2],
     gray8: Vec<u8>,
-    /// Census bits and what the blend compares, of both views.
+    /// Census bits and what the intensity_cost compares, of both views.
     described: [Vec<u8>; 2],
     aggregator: Aggregator,
     /// For aggregation in strips.
     strip: Aggregator,
     speckles: Speckles,
-    large_holes: plane::Planes,
+    large_holes: plane_fitting::Planes,
     holes: Holes,
     scratch: Vec<f32>,
     planes: Planes,
@@ -125,7 +125,7 @@ impl StereoMatcher {
             aggregator: Aggregator::default(),
             strip: Aggregator::default(),
             speckles: Speckles::default(),
-            large_holes: plane::Planes::default(),
+            large_holes: plane_fitting::Planes::default(),
             holes: Holes::default(),
             scratch: Vec::new(),
             planes: Planes::default(),
@@ -150,7 +150,7 @@ impl StereoMatcher {
     fn memory_of(&self, width: usize, height: usize, rows: usize) -> usize {
         let options = &self.options;
         let pixels = width.saturating_mul(height);
-        let planes = planes(options.census, options.blend);
+        let planes = planes(options.census, options.intensity_cost);
         let strip = if rows < height { (rows + 2 * OVERLAP).min(height) } else { 0 };
         let whole = if rows < height { 0 } else { height };
         // Gray of both views in 16 bits, of one in 8; winners of both views; labels, scratch and outputs.
@@ -159,7 +159,7 @@ impl StereoMatcher {
         Aggregator::bytes(width, strip.max(whole), self.layout())
             .saturating_add(strip.saturating_mul(width).saturating_mul(size_of::<Winner>() + size_of::<u16>()))
             .saturating_add(pixels.saturating_mul(fixed))
-            .saturating_add(smooth::bytes(options.smoothing, width, height))
+            .saturating_add(edge_preserving::bytes(options.smoothing, width, height))
             .saturating_add(stride.saturating_mul(height).saturating_mul(planes))
     }
 
@@ -292,10 +292,10 @@ impl StereoMatcher {
     /// What costs are made of.
     fn bits(&mut self) {
         let (level, layout) = (self.level, self.layout());
-        let StereoOptions { census, blend, min_disparity, .. } = self.options;
+        let StereoOptions { census, intensity_cost, min_disparity, .. } = self.options;
         let [left, right] = &mut self.described;
-        describe(level, &self.gray[0], census, blend, left);
-        describe_mirrored(level, &self.gray[1], census, blend, i64::from(min_disparity), layout, right);
+        describe(level, &self.gray[0], census, intensity_cost, left);
+        describe_mirrored(level, &self.gray[1], census, intensity_cost, i64::from(min_disparity), layout, right);
         self.gray[0].to_bytes(&mut self.gray8);
     }
 
@@ -303,7 +303,7 @@ impl StereoMatcher {
     fn aggregate(&mut self, width: usize, height: usize) {
         let options = &self.options;
         let layout = self.layout();
-        let planes = planes(options.census, options.blend);
+        let planes = planes(options.census, options.intensity_cost);
         let stride = planes * layout.right_row(width);
         let p2 = Penalties::new(options);
         let run = |aggregator: &mut Aggregator, rows: Range<usize>| {
@@ -317,7 +317,7 @@ impl StereoMatcher {
                 left: &self.described[0][rows.start * width * planes..rows.end * width * planes],
                 right: &self.described[1][rows.start * stride..rows.end * stride],
                 given: None,
-                blend_cap: (options.blend != Blend::None).then(|| options.blend.cap()),
+                intensity_cap: (options.intensity_cost != IntensityCost::None).then(|| options.intensity_cost.cap()),
                 gray: &self.gray8[rows.start * width..rows.end * width],
                 p1: options.p1,
                 p2: &p2,

@@ -36,7 +36,7 @@ impl Census {
 /// What is added to the number of census bits in which two pixels differ, from the two pixels alone: sharper at the
 /// outlines of things than a window, but not indifferent to exposure.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Blend {
+pub enum IntensityCost {
     /// Nothing.
     None,
     /// The absolute difference of their gray values (AD-Census; Mei et al., ICCV workshops 2011).
@@ -56,13 +56,13 @@ pub enum Blend {
 }
 
 // Of the weights tried on rendered scenes and photographs, those that gave the fewest errors.
-cv_core::named!(Blend {
+cv_core::named!(IntensityCost {
     None = "none",
     Gray { per_bit: 2, cap: 8 } = "gray" | "grey": "the absolute difference of gray values",
     Gradient { per_bit: 1, cap: 6 } = "gradient": "that of horizontal gradients",
 });
 
-impl Blend {
+impl IntensityCost {
     /// The most that is added.
     pub fn cap(self) -> u8 {
         match self {
@@ -134,7 +134,7 @@ pub struct StereoOptions {
     /// Matching window. Default 5×5.
     pub census: Census,
     /// What is added to the differing bits. Default nothing.
-    pub blend: Blend,
+    pub intensity_cost: IntensityCost,
     /// Penalty for a disparity step of one pixel between neighbors. Default 4 (Pandora's default for census 5×5).
     pub p1: u8,
     /// Penalty for a larger step where the image is smooth. Default 20 (likewise).
@@ -183,7 +183,7 @@ impl Default for StereoOptions {
             min_disparity: 0,
             disparities: 128,
             census: Census::Window5x5,
-            blend: Blend::None,
+            intensity_cost: IntensityCost::None,
             p1: 4,
             p2: 20,
             p2_min: 4,
@@ -219,10 +219,10 @@ impl StereoOptions {
         let positive = |v: f64| v > 0.0 && v.is_finite();
         E::check("p2_min", self.p2_min.into(), "at least p1", |_| self.p2_min >= self.p1)?;
         E::check("p2", self.p2.into(), "at least p2_min", |_| self.p2 >= self.p2_min)?;
-        let room = (self.census.bits() + usize::from(self.blend.cap())) as f64;
-        let limit = "at most 254 less the bits of the census window and the cap of the blend";
+        let room = (self.census.bits() + usize::from(self.intensity_cost.cap())) as f64;
+        let limit = "at most 254 less the bits of the census window and the cap of the intensity_cost";
         E::check("p2", self.p2.into(), limit, |v| v + room <= 254.0)?;
-        if let Blend::Gray { per_bit, .. } | Blend::Gradient { per_bit, .. } = self.blend {
+        if let IntensityCost::Gray { per_bit, .. } | IntensityCost::Gradient { per_bit, .. } = self.intensity_cost {
             E::check("per_bit", per_bit.into(), "1 or more", |v| v >= 1.0)?;
         }
         E::check("uniqueness", self.uniqueness.into(), "from 0 to 99", |v| v <= 99.0)?;

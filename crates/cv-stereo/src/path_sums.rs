@@ -1,6 +1,6 @@
 //! Path sums by themselves, with costs that are given: what aggregation takes without costs and winners.
 
-use crate::aligned::Aligned;
+use crate::aligned_buffer::AlignedBuffer;
 use crate::cost::{Frame, Penalties};
 use crate::kernel::{Output, Sweep};
 use crate::layout::{Layout, place};
@@ -20,8 +20,8 @@ pub struct PathSums {
     width: usize,
     height: usize,
     gray: Vec<u8>,
-    costs: Aligned<u8>,
-    sums: [Aligned<u8>; 2],
+    costs: AlignedBuffer<u8>,
+    sums: [AlignedBuffer<u8>; 2],
     sweeps: [Sweep; 2],
 }
 
@@ -49,7 +49,7 @@ impl PathSums {
         let (width, height) = gray.size();
         let layout = Layout::new(level, options.disparities);
         let volume = || {
-            let mut volume = Aligned::default();
+            let mut volume = AlignedBuffer::default();
             volume.resize(width * height * layout.depth, u8::MAX);
             volume
         };
@@ -87,14 +87,14 @@ impl PathSums {
             left: &[],
             right: &[],
             given: Some(self.costs.as_mut_slice()),
-            blend_cap: None,
+            intensity_cap: None,
             gray: &self.gray,
             p1: self.options.p1,
             p2: &self.p2,
             second: false,
         };
         let eight = self.options.paths == Paths::Eight;
-        let run = |state: &mut Sweep, sums: &mut Aligned<u8>, mirrored| {
+        let run = |state: &mut Sweep, sums: &mut AlignedBuffer<u8>, mirrored| {
             state.start(&frame, mirrored);
             sweep(self.level, &frame, state, 0..frame.height, Output::Store(sums.as_mut_slice()), eight);
         };

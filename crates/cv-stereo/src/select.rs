@@ -4,7 +4,7 @@
 //! of the right image are met pixel by pixel of the left one, each time one index further: the best keys so far are held
 //! in vectors that move along by one index a pixel, and what leaves at the end is decided.
 
-use crate::aligned::Aligned;
+use crate::aligned_buffer::AlignedBuffer;
 use crate::cost::Frame;
 use crate::layout::{BLOCK, MAX_VECTORS, place};
 use crate::winner::{NO_SUM, Winner, is_flat};
@@ -21,7 +21,7 @@ const INDEX: u16 = (1 << KEY_BITS) - 1;
 pub(crate) struct Selection {
     /// Best keys of the right pixels that the current pixel looks at. Vector `r` of the `2n` of a group holds indices
     /// `2n·l + r`.
-    running: Aligned<u16>,
+    running: AlignedBuffer<u16>,
     /// Best keys of the right pixels that are decided, group by group: at `x + group − 1 − k` that of the pixel which `x`
     /// looks at with index `k`.
     decided: Vec<u16>,

@@ -6,7 +6,7 @@
 //! the volume of sums is written once and read once, costs are computed from the census bits where they are needed,
 //! and no two threads ever write to the same memory.
 
-use crate::aligned::Aligned;
+use crate::aligned_buffer::AlignedBuffer;
 use crate::cost::Frame;
 use crate::kernel::{Output, Sweep, sweep_rows};
 use crate::layout::Layout;
@@ -18,7 +18,7 @@ use std::ops::Range;
 /// Buffers of the aggregation, kept between frames.
 #[derive(Debug, Default)]
 pub(crate) struct Aggregator {
-    sums: Aligned<u8>,
+    sums: AlignedBuffer<u8>,
     sweeps: [Sweep; 2],
     pub(crate) winners: Vec<Winner>,
     pub(crate) right: Vec<u16>,

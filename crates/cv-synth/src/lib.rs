@@ -57,7 +57,7 @@ pub use score::{
 };
 pub use sensor::{RenderOptions, encode_srgb};
 pub use sets::{
-    BallPhoto, HomographyPair, PanoramaOptions, PanoramaViews, StereoPair, TwoView, ball_photos, homography_pair,
+    BallPhoto, HomographyPair, PanoramaSetOptions, PanoramaViews, StereoPair, TwoView, ball_photos, homography_pair,
     panorama_views, stereo_pair, two_view,
 };
 pub use texture::{Collage, Rgb, Texture, srgb};

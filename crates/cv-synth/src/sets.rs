@@ -107,7 +107,7 @@ fn looking(eye: Point3<f64>, target: Point3<f64>, roll: f64) -> Pose {
 
 /// How [`panorama_views`] takes its pictures.
 #[derive(Debug, Clone, PartialEq)]
-pub struct PanoramaOptions {
+pub struct PanoramaSetOptions {
     /// Number of pictures. Default 5.
     pub views: usize,
     /// Share of a picture's width that its neighbor sees too, 0.1 to 0.9. Default 0.45.
@@ -120,7 +120,7 @@ pub struct PanoramaOptions {
     pub walker: bool,
 }
 
-impl Default for PanoramaOptions {
+impl Default for PanoramaSetOptions {
     fn default() -> Self {
         Self { views: 5, overlap: 0.45, exposure_spread: 0.35, shake: 0.02, walker: false }
     }
@@ -161,7 +161,7 @@ impl PanoramaViews {
 pub fn panorama_views(
     seed: u64,
     camera: &Camera,
-    panorama: &PanoramaOptions,
+    panorama: &PanoramaSetOptions,
     options: &RenderOptions,
 ) -> Result<PanoramaViews, SynthError> {
     let scene = Scene::room(seed);

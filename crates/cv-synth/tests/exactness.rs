@@ -200,7 +200,7 @@ fn homographies_map_pixels_to_the_same_point_and_color() {
 #[test]
 fn a_panoramas_homographies_are_those_of_its_points() {
     let camera = Camera::from_focal(80, 60, 70.0);
-    let options = PanoramaOptions { views: 3, walker: true, ..PanoramaOptions::default() };
+    let options = PanoramaSetOptions { views: 3, walker: true, ..PanoramaSetOptions::default() };
     let set = panorama_views(4, &camera, &options, &RenderOptions::default()).unwrap();
     let scene = Scene::room(4);
     let h = set.homography(0, 1).unwrap();
@@ -212,7 +212,7 @@ fn a_panoramas_homographies_are_those_of_its_points() {
         assert!((set.transfer(0, 1, c.a).unwrap() - c.b).norm() < 1e-8);
     }
     // What is in front of one view is behind one that looks the other way.
-    let around = PanoramaOptions { views: 4, overlap: 0.1, ..PanoramaOptions::default() };
+    let around = PanoramaSetOptions { views: 4, overlap: 0.1, ..PanoramaSetOptions::default() };
     let around = panorama_views(4, &camera, &around, &RenderOptions::default()).unwrap();
     assert!(
         around.transfer(0, 3, Point2::new(39.5, 29.5)).is_none() && around.transfer(0, 4, Point2::origin()).is_none()

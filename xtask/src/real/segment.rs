@@ -4,7 +4,7 @@
 use super::Check;
 use anyhow::{Context, Result, ensure};
 use cv_core::{Mask, RgbU8};
-use cv_pipeline::segmentation::{ColorSpace, Labeled, Rule, Scores, TrainOptions};
+use cv_pipeline::segmentation::{ColorSpace, ConfusionMatrix, Labeled, Rule, TrainOptions};
 use cv_pipeline::{Silent, segment, train_segment};
 use std::{fs, path::Path, time::Instant};
 
@@ -62,17 +62,17 @@ fn load(folder: &Path) -> Result<Vec<(RgbU8, Mask)>> {
 }
 
 /// Trains on every other photograph from `first` on and scores the rest, all their pixels together; also the least seconds a photograph took.
-fn score(photos: &[(RgbU8, Mask)], first: usize, options: &TrainOptions) -> Result<(Scores, f64)> {
+fn score(photos: &[(RgbU8, Mask)], first: usize, options: &TrainOptions) -> Result<(ConfusionMatrix, f64)> {
     let half = |odd: usize| photos.iter().skip(odd).step_by(2);
     let labeled: Vec<Labeled<'_>> = half(first).map(|(photo, mask)| (photo.view(), mask.view())).collect();
     let model = train_segment(&labeled, options, &Silent)?.trained.model;
     let mut seconds = f64::INFINITY;
-    let scores: Result<Vec<Scores>> = half(1 - first)
+    let scores: Result<Vec<ConfusionMatrix>> = half(1 - first)
         .map(|(photo, mask)| {
             let start = Instant::now();
             let result = segment(photo.view(), &model);
             seconds = seconds.min(start.elapsed().as_secs_f64());
-            Ok(Scores::new(result.mask.view(), mask.view())?)
+            Ok(ConfusionMatrix::new(result.mask.view(), mask.view())?)
         })
         .collect();
     Ok((scores?.into_iter().sum(), seconds))

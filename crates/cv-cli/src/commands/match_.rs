@@ -3,10 +3,10 @@
 use crate::frame::{Context, Explain, Failure, Outcome, Run, named};
 use cv_core::{Keypoint, Named, RgbU8};
 use cv_io::FeatureRows;
-use cv_pipeline::features::{CornerMeasure, Described, DescriptorKind, Descriptors};
+use cv_pipeline::features::{CornerMeasure, DescriptorKind, Descriptors, Features};
 use cv_pipeline::{
-    FeatureMethod, MatchingError, MatchingOptions, MatchingResult, ModelKind, PhotoFeatures, RobustOptions, Silent,
-    Slanted, Spacing, estimate, match_extracted, match_photos,
+    AffineSimulation, FeatureMethod, MatchingError, MatchingOptions, MatchingResult, ModelKind, PhotoFeatures,
+    RobustOptions, Silent, Suppression, estimate, match_extracted, match_photos,
 };
 use cv_report::{Figure, MatchStyle, Note, Plot, Report, colors, draw_keypoints, draw_matches, tile_patches};
 use std::path::{Path, PathBuf};
@@ -44,11 +44,11 @@ pub(crate) struct Args {
     #[arg(long, value_name = "MEASURE", value_parser = named::<CornerMeasure>(), default_value = "harris")]
     corners: CornerMeasure,
     /// How the corners of harris are spread.
-    #[arg(long, value_name = "HOW", value_parser = named::<Spacing>(), default_value_t = Spacing::Radius)]
-    spacing: Spacing,
-    /// Look at simulated slanted views too, with sift: for photographs from very different directions; about ten times slower.
-    #[arg(long, value_name = "WHEN", value_parser = named::<Slanted>(), default_value_t = Slanted::AsNeeded)]
-    slanted: Slanted,
+    #[arg(long, value_name = "HOW", value_parser = named::<Suppression>(), default_value_t = Suppression::Radius)]
+    spacing: Suppression,
+    /// Look at affine-simulated views too (ASIFT), with sift: for photographs from very different directions; about ten times slower.
+    #[arg(long = "asift", alias = "slanted", value_name = "WHEN", value_parser = named::<AffineSimulation>(), default_value_t = AffineSimulation::AsNeeded)]
+    slanted: AffineSimulation,
     /// Find this model and match once more along it: more matches, nearly all right, and none that disagree.
     #[arg(long, value_name = "MODEL", value_parser = named::<ModelKind>())]
     guided: Option<ModelKind>,
@@ -81,8 +81,8 @@ impl Run for Args {
         let (a, b) = (cv_io::read_rgb(&self.first)?, cv_io::read_rgb(&self.second)?);
         let mut options = MatchingOptions {
             method: self.features,
-            spacing: self.spacing,
-            slanted: self.slanted,
+            suppression: self.spacing,
+            affine_simulation: self.slanted,
             guided: self.guided,
             max_features: self.max_features.map(|n| n as usize),
             ratio: (self.ratio < 1.0).then_some(self.ratio),
@@ -274,7 +274,7 @@ fn load_features(folder: &Path, photo: &Path) -> Result<PhotoFeatures, Failure> 
         );
         Failure::new(reason)
     })?;
-    let described = Described { keypoints: rows.keypoints, descriptors, dropped: Vec::new(), beyond_limit: 0 };
+    let described = Features { keypoints: rows.keypoints, descriptors, dropped: Vec::new(), beyond_limit: 0 };
     Ok(PhotoFeatures { found: counts.0, described, candidates: Vec::new() })
 }
 

@@ -7,7 +7,7 @@ use cv_core::{RgbU8, StereoRig};
 use cv_io::RigFile;
 use cv_pipeline::rectify;
 use cv_pipeline::stereo::RectifyOptions;
-use cv_report::{Canvas, Figure, Note, Report, colors, side_by_side};
+use cv_report::{Figure, Note, Raster, Report, colors, side_by_side};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
@@ -184,7 +184,7 @@ fn all_or_none(out: &Path, write: impl FnOnce(&Path) -> Result<(), Failure>) -> 
 /// Both views side by side with a line every sixteenth of the height.
 fn with_rows(images: &[RgbU8; 2]) -> RgbU8 {
     let joined = side_by_side(&[images[0].view(), images[1].view()], 4);
-    let mut canvas = Canvas::from_rgb(joined.view());
+    let mut canvas = Raster::from_rgb(joined.view());
     let (width, height) = (canvas.width() as f32, canvas.height() as f32);
     for line in 1..16 {
         let y = height * line as f32 / 16.0;

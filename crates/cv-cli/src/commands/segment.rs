@@ -4,7 +4,9 @@ mod files;
 
 use crate::frame::{Context, Explain, Failure, Outcome, Run, create_dir, expand_images, named, same_file};
 use cv_core::{Mask, Named, RgbU8};
-use cv_pipeline::segmentation::{ColorModel, ColorSpace, Labeled, Regions, Rule, Scores, SegmentError, TrainOptions};
+use cv_pipeline::segmentation::{
+    ColorModel, ColorSpace, ConfusionMatrix, Labeled, Regions, Rule, SegmentError, TrainOptions,
+};
 use cv_pipeline::{Progress, segment, train_segment};
 use cv_report::{Figure, Note, Report, colors, overlay_comparison, overlay_mask};
 use files::{Pair, pair, read_pair, stem};
@@ -128,7 +130,7 @@ impl Train {
         let training = train_segment(&labeled, &options, context).map_err(|error| refused(error, &pairs))?;
         let trained = &training.trained;
         write_model(&self.model, &trained.model)?;
-        let total: Scores = trained.scores.iter().copied().sum();
+        let total: ConfusionMatrix = trained.scores.iter().copied().sum();
         if total.f1() < 0.5 {
             context.warn(format!(
                 "even on the photographs it was trained on, F1 is only {:.3}: the object's colors are not told from the background's",
@@ -277,18 +279,18 @@ impl Eval {
                 return Err(refused(error, &pairs));
             }
             let result = segment(photo.view(), &model);
-            let score = Scores::new(result.mask.view(), truth.view())?;
+            let score = ConfusionMatrix::new(result.mask.view(), truth.view())?;
             if context.wants_report() && figures.len() < REPORT_PHOTOS {
                 figures.push(comparison(&pair.photo, &photo, &result.mask, &truth, &score)?);
             }
             scores.push(score);
             add_stages(&mut stages, &result.stages);
         }
-        let total: Scores = scores.iter().copied().sum();
+        let total: ConfusionMatrix = scores.iter().copied().sum();
         context.report(|| {
             let mut page = Report::new("Segmentation: scores");
             headline(&mut page, &total, pairs.len());
-            let row = |(pair, s): (&Pair, &Scores)| {
+            let row = |(pair, s): (&Pair, &ConfusionMatrix)| {
                 let number = |v: f64| format!("{v:.4}");
                 vec![pair.photo.display().to_string(), number(s.precision()), number(s.recall()), number(s.f1())]
             };
@@ -315,8 +317,8 @@ impl Eval {
 const LEGEND: &str = "Green: marked and right. Red: marked and wrong. Blue: missed.";
 
 /// The scores of all pixels together, and of each photograph.
-fn with_scores(outcome: Outcome, pairs: &[Pair], scores: &[Scores]) -> Outcome {
-    let total: Scores = scores.iter().copied().sum();
+fn with_scores(outcome: Outcome, pairs: &[Pair], scores: &[ConfusionMatrix]) -> Outcome {
+    let total: ConfusionMatrix = scores.iter().copied().sum();
     let images: Vec<Value> = pairs
         .iter()
         .zip(scores)
@@ -331,14 +333,20 @@ fn with_scores(outcome: Outcome, pairs: &[Pair], scores: &[Scores]) -> Outcome {
         .with("images", images)
 }
 
-fn headline(page: &mut Report, total: &Scores, photos: usize) {
+fn headline(page: &mut Report, total: &ConfusionMatrix, photos: usize) {
     page.headline("F1", &format!("{:.3}", total.f1()))
         .headline("precision", &format!("{:.3}", total.precision()))
         .headline("recall", &format!("{:.3}", total.recall()))
         .headline("photographs", &photos.to_string());
 }
 
-fn comparison(path: &Path, photo: &RgbU8, mask: &Mask, truth: &Mask, scores: &Scores) -> Result<Figure, Failure> {
+fn comparison(
+    path: &Path,
+    photo: &RgbU8,
+    mask: &Mask,
+    truth: &Mask,
+    scores: &ConfusionMatrix,
+) -> Result<Figure, Failure> {
     let picture = overlay_comparison(photo.view(), mask.view(), truth.view());
     figure(&picture, &format!("{}: F1 {:.3}", path.display(), scores.f1()))
 }

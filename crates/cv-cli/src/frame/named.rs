@@ -18,8 +18,8 @@ mod tests {
     use super::*;
     use cv_pipeline::features::CornerMeasure;
     use cv_pipeline::segmentation::{ColorSpace, Regions, Rule};
-    use cv_pipeline::stereo::{Blend, Census, Paths, Smoothing};
-    use cv_pipeline::{FeatureMethod, ModelKind, Slanted, Spacing};
+    use cv_pipeline::stereo::{Census, IntensityCost, Paths, Smoothing};
+    use cv_pipeline::{AffineSimulation, FeatureMethod, ModelKind, Suppression};
 
     /// What the command line makes of every name, and of every other spelling.
     fn goes_there_and_back<T: Named>() {
@@ -39,8 +39,8 @@ mod tests {
     #[test]
     fn every_choice_of_the_libraries_goes_there_and_back() {
         goes_there_and_back::<FeatureMethod>();
-        goes_there_and_back::<Spacing>();
-        goes_there_and_back::<Slanted>();
+        goes_there_and_back::<Suppression>();
+        goes_there_and_back::<AffineSimulation>();
         goes_there_and_back::<ModelKind>();
         goes_there_and_back::<CornerMeasure>();
         goes_there_and_back::<ColorSpace>();
@@ -48,7 +48,7 @@ mod tests {
         goes_there_and_back::<Regions>();
         goes_there_and_back::<Census>();
         goes_there_and_back::<Paths>();
-        goes_there_and_back::<Blend>();
+        goes_there_and_back::<IntensityCost>();
         goes_there_and_back::<Smoothing>();
     }
 }

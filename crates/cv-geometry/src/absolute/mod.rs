@@ -1,16 +1,16 @@
 //! The pose of a camera that sees known points.
 
-mod align;
 mod dlt;
 mod p3p;
+mod umeyama;
 
-pub use align::{Similarity, align_points};
 pub use dlt::pose_from_points;
 pub use p3p::pose_three_points;
+pub use umeyama::{Similarity, align_points};
 
 use crate::error::{Degeneracy, EstimateError};
-use crate::pairs::{LANES, different};
-use crate::ransac::{Estimator, Marginal, RobustOptions, Scorer, ransac};
+use crate::match_blocks::{LANES, different};
+use crate::ransac::{Estimator, RansacData, RobustOptions, Scorer, TukeyBiweight, ransac};
 use crate::robust::RobustModel;
 use crate::rotation::orthonormalized;
 use cv_core::{Matrix3, Point2, Point3, Pose, Rotation3, Vector3, median};
@@ -59,7 +59,7 @@ pub fn estimate_pose(matches: &[WorldMatch], options: &RobustOptions) -> Result<
 ///
 /// Returns the pose and its loss: each match adds 0 (exact) to 1 (beyond 2.5 thresholds, or behind the camera). `threshold` in normalized units.
 pub fn refine_pose(pose: &Pose, matches: &[WorldMatch], threshold: f64) -> (Pose, f64) {
-    let problem = ReprojectionProblem { matches, scorer: &Marginal, threshold };
+    let problem = ReprojectionProblem { matches, scorer: &TukeyBiweight, threshold };
     let refined = refine(&problem, pose, 30).unwrap_or(*pose);
     (refined, problem.cost(&refined))
 }
@@ -205,29 +205,37 @@ impl AbsoluteEstimator {
 /// A pose in f32, row by row.
 struct PoseKernel([[f32; 4]; 3]);
 
-impl Estimator for AbsoluteEstimator {
-    type Model = Pose;
+impl RansacData for AbsoluteEstimator {
     type Block = WorldBlock;
-    type Kernel = PoseKernel;
-    const SAMPLE: usize = 3;
-    const RESIDUAL_DIMENSION: i32 = 2;
 
     fn count(&self) -> usize {
         self.matches.len()
-    }
-
-    fn unit(&self) -> f64 {
-        1.0
     }
 
     fn blocks(&self) -> &[WorldBlock] {
         &self.blocks
     }
 
-    fn wrong(&self, most: usize) -> Vec<WorldBlock> {
+    fn background(&self, most: usize) -> Vec<WorldBlock> {
         let mixed = |(i, j): (usize, usize)| WorldMatch { world: self.matches[i].world, image: self.matches[j].image };
         let mixed: Vec<WorldMatch> = different(self.matches.len(), most).map(mixed).collect();
         mixed.chunks(LANES).map(WorldBlock::new).collect()
+    }
+}
+
+impl Estimator for AbsoluteEstimator {
+    type Model = Pose;
+    type Data = Self;
+    type Kernel = PoseKernel;
+    const SAMPLE: usize = 3;
+    const RESIDUAL_DIMENSION: i32 = 2;
+
+    fn data(&self) -> &Self {
+        self
+    }
+
+    fn unit(&self) -> f64 {
+        1.0
     }
 
     fn solve(&self, sample: &[u32], models: &mut Vec<Pose>) {
@@ -264,7 +272,7 @@ impl Estimator for AbsoluteEstimator {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ransac::AllIn;
+    use crate::ransac::LeastSquaresLoss;
     use crate::testing::{TwoViews, gauss, uniform};
     use rand_chacha::ChaCha8Rng;
     use rand_chacha::rand_core::SeedableRng;
@@ -299,7 +307,7 @@ mod tests {
     #[test]
     fn derivatives_are_those_of_the_cost() {
         let (views, m) = world(3, 20, 1e-2);
-        let problem = ReprojectionProblem { matches: &m, scorer: &AllIn, threshold: 1.0 };
+        let problem = ReprojectionProblem { matches: &m, scorer: &LeastSquaresLoss, threshold: 1.0 };
         let gradient = problem.linearize(&views.pose).gradient;
         let cost = |p: &Pose| m.iter().map(|m| reprojection(p, m).powi(2)).sum::<f64>();
         for i in 0..6 {

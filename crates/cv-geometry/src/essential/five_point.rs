@@ -1,7 +1,7 @@
 //! Essential matrices through five points.
 
-use crate::basis::{mix, orthonormalize};
 use crate::fundamental::epipolar_row;
+use crate::null_space_basis::{mix, orthonormalize};
 use cv_core::{Matrix3, Point2, Vector3};
 use cv_numeric::{null_space, real_roots};
 use fearless_simd::{Level, dispatch};

@@ -2,19 +2,19 @@
 
 mod decompose;
 mod five_point;
-mod stability;
+mod jackknife;
 
 pub(crate) use decompose::in_front;
 pub use decompose::{
     RecoveredPose, decompose_essential, essential_from_fundamental, essential_from_pose, recover_pose,
 };
 pub use five_point::essential_five_point;
-pub use stability::{pose_difference, pose_stability, poses_are_rivals};
+pub use jackknife::{jackknife_pose_deviation, pose_difference, poses_are_rivals};
 
 use crate::epipolar::{Epipolar, SampsonKernel, SampsonProblem, refine_sampson, sampson};
 use crate::error::{Degeneracy, EstimateError};
-use crate::pairs::{LANES, Normalizer, PairBlock, PairSet, check, ray_degeneracy};
-use crate::ransac::{Estimator, Marginal, RobustOptions, Scorer, ransac};
+use crate::match_blocks::{LANES, MatchBlock, NormalizedMatches, Normalizer, check, ray_degeneracy};
+use crate::ransac::{Estimator, RobustOptions, Scorer, TukeyBiweight, ransac};
 use crate::robust::RobustModel;
 use crate::rotation::orthonormalized;
 use cv_core::{Camera, Correspondence, Matrix3, Point2, Pose, Rotation3, Vector3};
@@ -34,14 +34,14 @@ use nalgebra::{SMatrix, SVector};
 ///
 /// # Errors
 /// [`EstimateError`]: fewer than six matches, a coordinate that is not finite, coincident or collinear points, or no model supported by more
-/// matches than chance would give.
+/// matches than the number of false alarms allows.
 pub fn estimate_relative_pose(
     matches: &[Correspondence],
     options: &RobustOptions,
 ) -> Result<RobustModel<Pose>, EstimateError> {
     options.check()?;
     check(matches, 6)?;
-    let set = PairSet::with(matches, Normalizer::IDENTITY, Normalizer::IDENTITY);
+    let set = NormalizedMatches::with(matches, Normalizer::IDENTITY, Normalizer::IDENTITY);
     let degenerate = |kind| EstimateError::Degenerate { kind };
     // Rays that are in a plane up to their own noise say nothing about what is beside it.
     let width = options.threshold / 3.0;
@@ -81,7 +81,7 @@ pub fn estimate_essential(
 /// Returns the pose and its loss: each match adds 0 (exact) to 1 (beyond 2.5 thresholds). `threshold` in normalized units.
 pub fn refine_relative_pose(pose: &Pose, matches: &[Correspondence], threshold: f64) -> (Pose, f64) {
     let pairs: Vec<[f64; 4]> = matches.iter().map(|m| [m.a.x, m.a.y, m.b.x, m.b.y]).collect();
-    let problem = SampsonProblem::new(&pairs, &Marginal, threshold);
+    let problem = SampsonProblem::new(&pairs, &TukeyBiweight, threshold);
     let refined = refine_sampson(&problem, *pose, 30).and_then(straightened).unwrap_or(*pose);
     (refined, problem.cost(&refined))
 }
@@ -166,7 +166,7 @@ pub(crate) fn tangent_of(t: &Vector3<f64>) -> [Vector3<f64>; 2] {
 }
 
 struct PoseEstimator {
-    set: PairSet,
+    set: NormalizedMatches,
     /// Threshold.
     reach: f64,
 }
@@ -191,7 +191,7 @@ impl PoseKernel {
     }
 
     #[inline(always)]
-    fn squared_residuals(&self, block: &PairBlock) -> [f32; LANES] {
+    fn squared_residuals(&self, block: &MatchBlock) -> [f32; LANES] {
         let mut out = self.sampson.squared_residuals(block);
         let (r, t) = (&self.r, &self.t);
         for (i, r2) in out.iter_mut().enumerate() {
@@ -215,31 +215,19 @@ impl PoseKernel {
 
 impl Estimator for PoseEstimator {
     type Model = Pose;
-    type Block = PairBlock;
+    type Data = NormalizedMatches;
     type Kernel = PoseKernel;
     const SAMPLE: usize = 5;
     const RESIDUAL_DIMENSION: i32 = 1;
     // From one and the same basin of the loss, the steps end in one place instead of several beside each other.
     const RESAMPLES: usize = 20;
 
-    fn count(&self) -> usize {
-        self.set.pairs.len()
+    fn data(&self) -> &NormalizedMatches {
+        &self.set
     }
 
     fn unit(&self) -> f64 {
         1.0
-    }
-
-    fn blocks(&self) -> &[PairBlock] {
-        &self.set.blocks
-    }
-
-    fn order(&self) -> &[u32] {
-        &self.set.order
-    }
-
-    fn wrong(&self, most: usize) -> Vec<PairBlock> {
-        self.set.wrong(most)
     }
 
     fn solve(&self, sample: &[u32], models: &mut Vec<Pose>) {
@@ -266,7 +254,7 @@ impl Estimator for PoseEstimator {
     }
 
     #[inline(always)]
-    fn squared_residuals(kernel: &PoseKernel, block: &PairBlock) -> [f32; LANES] {
+    fn squared_residuals(kernel: &PoseKernel, block: &MatchBlock) -> [f32; LANES] {
         kernel.squared_residuals(block)
     }
 
@@ -341,7 +329,7 @@ mod tests {
             let mut m = views.matches(30, 1.0);
             m.extend(views.wrong(30));
             let (m, unit) = normalize_matches(&m, &views.camera, &views.camera);
-            let set = PairSet::with(&m, Normalizer::IDENTITY, Normalizer::IDENTITY);
+            let set = NormalizedMatches::with(&m, Normalizer::IDENTITY, Normalizer::IDENTITY);
             let (r, t) = (views.pose.rotation.matrix(), &views.pose.translation);
             let kernel = PoseKernel::new(&views.pose, 2.0 * unit);
             let fast: Vec<f32> = set.blocks.iter().flat_map(|b| kernel.squared_residuals(b)).collect();

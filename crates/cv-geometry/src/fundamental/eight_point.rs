@@ -2,7 +2,7 @@
 
 use super::seven_point::epipolar_row;
 use crate::error::{Degeneracy, EstimateError};
-use crate::pairs::{check, hartley};
+use crate::match_blocks::{check, hartley};
 use cv_core::{Correspondence, Matrix3};
 use cv_numeric::{null_space, smallest_eigenvector, svd3, symmetric_eigen};
 use nalgebra::{SMatrix, SVector};

@@ -1,7 +1,7 @@
 //! Fundamental matrices.
 
+mod degensac;
 mod eight_point;
-mod plane;
 mod rank_two;
 mod seven_point;
 
@@ -12,7 +12,7 @@ pub use seven_point::fundamental_seven_point;
 use crate::epipolar::{Epipolar, SampsonKernel, SampsonProblem, refine_sampson, sampson, second_epipole};
 use crate::error::{Degeneracy, EstimateError};
 use crate::homography::{homography_from_points, homography_residual};
-use crate::pairs::{LANES, PairBlock, PairSet, point_degeneracy};
+use crate::match_blocks::{LANES, MatchBlock, NormalizedMatches, point_degeneracy};
 use crate::ransac::{Estimator, RobustOptions, Scorer, ransac};
 use crate::robust::RobustModel;
 use cv_core::{Correspondence, Matrix3, Point2};
@@ -25,13 +25,13 @@ use rank_two::RankTwo;
 ///
 /// # Errors
 /// [`EstimateError`]: fewer than eight matches, a coordinate that is not finite, coincident or collinear points, points on one plane, or no model supported by more
-/// matches than chance would give.
+/// matches than the number of false alarms allows.
 pub fn estimate_fundamental(
     matches: &[Correspondence],
     options: &RobustOptions,
 ) -> Result<RobustModel<Matrix3<f64>>, EstimateError> {
     options.check()?;
-    let set = PairSet::new(matches, 8)?;
+    let set = NormalizedMatches::new(matches, 8)?;
     let degenerate = |kind| EstimateError::Degenerate { kind };
     // All before the search, which would draw every sample it may and find none of use.
     let width = options.threshold / 3.0 * set.first.scale;
@@ -69,35 +69,23 @@ fn on_one_plane(matches: &[Correspondence], inliers: &[usize], threshold: f64) -
 }
 
 struct FundamentalEstimator {
-    set: PairSet,
+    set: NormalizedMatches,
 }
 
 impl Estimator for FundamentalEstimator {
     type Model = Matrix3<f64>;
-    type Block = PairBlock;
+    type Data = NormalizedMatches;
     type Kernel = SampsonKernel;
     const SAMPLE: usize = 7;
     const RESIDUAL_DIMENSION: i32 = 1;
     const RESAMPLES: usize = 20;
 
-    fn count(&self) -> usize {
-        self.set.pairs.len()
+    fn data(&self) -> &NormalizedMatches {
+        &self.set
     }
 
     fn unit(&self) -> f64 {
         self.set.first.scale
-    }
-
-    fn blocks(&self) -> &[PairBlock] {
-        &self.set.blocks
-    }
-
-    fn order(&self) -> &[u32] {
-        &self.set.order
-    }
-
-    fn wrong(&self, most: usize) -> Vec<PairBlock> {
-        self.set.wrong(most)
     }
 
     fn solve(&self, sample: &[u32], models: &mut Vec<Matrix3<f64>>) {
@@ -121,7 +109,7 @@ impl Estimator for FundamentalEstimator {
     }
 
     #[inline(always)]
-    fn squared_residuals(kernel: &SampsonKernel, block: &PairBlock) -> [f32; LANES] {
+    fn squared_residuals(kernel: &SampsonKernel, block: &MatchBlock) -> [f32; LANES] {
         kernel.squared_residuals(block)
     }
 
@@ -137,14 +125,14 @@ impl Estimator for FundamentalEstimator {
     }
 
     fn alternatives(&self, model: &Matrix3<f64>, sample: &[u32], threshold: f64, models: &mut Vec<Matrix3<f64>>) {
-        plane::alternatives(&self.set.pairs, model, sample, threshold, models);
+        degensac::alternatives(&self.set.pairs, model, sample, threshold, models);
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ransac::AllIn;
+    use crate::ransac::LeastSquaresLoss;
     use crate::testing::{TwoViews, cosine};
     use cv_numeric::LeastSquares as _;
     use proptest::prelude::*;
@@ -190,7 +178,7 @@ mod tests {
         fn the_gradient_is_that_of_the_cost(seed: u64) {
             let views = TwoViews::random(seed);
             let pairs: Vec<[f64; 4]> = views.normalized_matches(15, 1e-3).iter().map(|m| [m.a.x, m.a.y, m.b.x, m.b.y]).collect();
-            let problem = SampsonProblem::new(&pairs, &AllIn, 1.0);
+            let problem = SampsonProblem::new(&pairs, &LeastSquaresLoss, 1.0);
             let start = RankTwo::new(&views.essential()).unwrap();
             let start = start.step(&nalgebra::SVector::from([0.01, -0.02, 0.01, 0.02, 0.01, -0.01, 0.02]));
             let gradient = problem.linearize(&start).gradient;
@@ -211,7 +199,7 @@ mod tests {
         fn vector_residuals_are_the_plain_ones(seed: u64) {
             let views = TwoViews::random(seed);
             let m = views.matches(40, 1.0);
-            let set = PairSet::new(&m, 8).unwrap();
+            let set = NormalizedMatches::new(&m, 8).unwrap();
             let f = set.second.inverse_matrix().transpose() * views.fundamental() * set.first.inverse_matrix();
             let kernel = SampsonKernel::new(&f.normalize());
             let mut fast: Vec<f32> = set.blocks.iter().flat_map(|b| kernel.squared_residuals(b)).take(40).collect();

@@ -1,6 +1,6 @@
 //! Fundamental matrices through seven points.
 
-use crate::basis::mix;
+use crate::null_space_basis::mix;
 use cv_core::{Matrix3, Point2};
 use cv_numeric::{null_space, real_roots_cubic};
 

@@ -1,7 +1,7 @@
 //! Homography through many points by the normalized direct linear transform.
 
 use crate::error::{Degeneracy, EstimateError};
-use crate::pairs::{check, hartley};
+use crate::match_blocks::{check, hartley};
 use cv_core::{Correspondence, Matrix3};
 use cv_numeric::symmetric_eigen;
 use nalgebra::{SMatrix, SVector};

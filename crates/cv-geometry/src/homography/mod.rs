@@ -8,9 +8,9 @@ pub use dlt::homography_from_points;
 pub use four_point::homography_four_point;
 
 use crate::error::EstimateError;
-use crate::pairs::{LANES, PairBlock, PairSet, point_degeneracy};
-use crate::ransac::AllIn;
-use crate::ransac::{Estimator, Marginal, RobustOptions, Scorer, ransac};
+use crate::match_blocks::{LANES, MatchBlock, NormalizedMatches, point_degeneracy};
+use crate::ransac::LeastSquaresLoss;
+use crate::ransac::{Estimator, RobustOptions, Scorer, TukeyBiweight, ransac};
 use crate::robust::RobustModel;
 use cv_core::{Correspondence, Matrix3, Point2};
 use refine::{TransferProblem, refine_transfer};
@@ -49,13 +49,13 @@ pub fn homography_residual(h: &Matrix3<f64>, m: &Correspondence) -> f64 {
 ///
 /// # Errors
 /// [`EstimateError`]: fewer than four matches, a coordinate that is not finite, coincident or collinear points, or no model supported by more
-/// matches than chance would give (where there are more than four).
+/// matches than the number of false alarms allows (where there are more than four).
 pub fn estimate_homography(
     matches: &[Correspondence],
     options: &RobustOptions,
 ) -> Result<RobustModel<Matrix3<f64>>, EstimateError> {
     options.check()?;
-    let set = PairSet::new(matches, 4)?;
+    let set = NormalizedMatches::new(matches, 4)?;
     let degenerate = |kind| EstimateError::Degenerate { kind };
     // Points that are on a line up to their own noise say nothing about the plane beside it.
     let width = options.threshold / 3.0 * set.first.scale;
@@ -79,21 +79,21 @@ pub fn estimate_homography(
 /// # Errors
 /// [`EstimateError`] as for [`homography_from_points`].
 pub fn refine_homography(h: &Matrix3<f64>, matches: &[Correspondence]) -> Result<Matrix3<f64>, EstimateError> {
-    let set = PairSet::new(matches, 4)?;
+    let set = NormalizedMatches::new(matches, 4)?;
     let normalized = set.second.matrix() * h * set.first.inverse_matrix();
-    let problem = TransferProblem { pairs: &set.pairs, scorer: &AllIn, threshold: 1.0 };
+    let problem = TransferProblem { pairs: &set.pairs, scorer: &LeastSquaresLoss, threshold: 1.0 };
     let refined = refine_transfer(&problem, &normalized, 50).unwrap_or(normalized);
     Ok(dlt::scaled(&(set.second.inverse_matrix() * refined * set.first.matrix())))
 }
 
 /// Refines `h` on the normalized pairs that it maps to within `threshold`.
 pub(crate) fn refine_on_plane(pairs: &[[f64; 4]], h: &Matrix3<f64>, threshold: f64) -> Matrix3<f64> {
-    let problem = TransferProblem { pairs, scorer: &Marginal, threshold };
+    let problem = TransferProblem { pairs, scorer: &TukeyBiweight, threshold };
     refine_transfer(&problem, h, 10).unwrap_or(*h)
 }
 
 struct HomographyEstimator {
-    set: PairSet,
+    set: NormalizedMatches,
 }
 
 /// H and its inverse, both positive where the points are.
@@ -120,7 +120,7 @@ impl TransferKernel {
 
     /// `(d₁² + d₂²) / 2`, infinite behind the camera.
     #[inline(always)]
-    pub(crate) fn squared_residuals(&self, block: &PairBlock) -> [f32; LANES] {
+    pub(crate) fn squared_residuals(&self, block: &MatchBlock) -> [f32; LANES] {
         let (h, g) = (&self.h, &self.g);
         let mut out = [0f32; LANES];
         for (i, d2) in out.iter_mut().enumerate() {
@@ -141,29 +141,17 @@ impl TransferKernel {
 
 impl Estimator for HomographyEstimator {
     type Model = Matrix3<f64>;
-    type Block = PairBlock;
+    type Data = NormalizedMatches;
     type Kernel = TransferKernel;
     const SAMPLE: usize = 4;
     const RESIDUAL_DIMENSION: i32 = 2;
 
-    fn count(&self) -> usize {
-        self.set.pairs.len()
+    fn data(&self) -> &NormalizedMatches {
+        &self.set
     }
 
     fn unit(&self) -> f64 {
         self.set.first.scale
-    }
-
-    fn blocks(&self) -> &[PairBlock] {
-        &self.set.blocks
-    }
-
-    fn order(&self) -> &[u32] {
-        &self.set.order
-    }
-
-    fn wrong(&self, most: usize) -> Vec<PairBlock> {
-        self.set.wrong(most)
     }
 
     fn solve(&self, sample: &[u32], models: &mut Vec<Matrix3<f64>>) {
@@ -178,7 +166,7 @@ impl Estimator for HomographyEstimator {
     }
 
     #[inline(always)]
-    fn squared_residuals(kernel: &TransferKernel, block: &PairBlock) -> [f32; LANES] {
+    fn squared_residuals(kernel: &TransferKernel, block: &MatchBlock) -> [f32; LANES] {
         kernel.squared_residuals(block)
     }
 
@@ -252,7 +240,7 @@ mod tests {
     }
 
     /// The cost in f64, which the problem's own, with its f32 losses, is not precise enough for.
-    fn plain_cost(problem: &TransferProblem<'_, AllIn>, h: &Matrix3<f64>) -> f64 {
+    fn plain_cost(problem: &TransferProblem<'_, LeastSquaresLoss>, h: &Matrix3<f64>) -> f64 {
         let residual = |p: &[f64; 4]| homography_residual(h, &Correspondence::new(p[0], p[1], p[2], p[3]));
         problem.pairs.iter().map(|p| residual(p).powi(2)).sum()
     }
@@ -309,8 +297,8 @@ mod tests {
         #[test]
         fn the_gradient_and_hessian_are_those_of_the_cost(h in a_homography(), seed: u64) {
             let m = matches(&h, 12, 0.01, &mut ChaCha8Rng::seed_from_u64(seed));
-            let set = PairSet::new(&m, 4).unwrap();
-            let problem = TransferProblem { pairs: &set.pairs, scorer: &AllIn, threshold: 1.0 };
+            let set = NormalizedMatches::new(&m, 4).unwrap();
+            let problem = TransferProblem { pairs: &set.pairs, scorer: &LeastSquaresLoss, threshold: 1.0 };
             let start = set.second.matrix() * h * set.first.inverse_matrix();
             let start = start / start[(2, 2)];
             let start = problem.step(&start, &SVector::from([0.02, -0.01, 0.03, 0.01, 0.02, -0.03, 0.005, -0.004]));
@@ -330,7 +318,7 @@ mod tests {
         #[test]
         fn vector_residuals_are_the_plain_ones(h in a_homography(), seed: u64) {
             let m = matches(&h, 40, 2.0, &mut ChaCha8Rng::seed_from_u64(seed));
-            let set = PairSet::new(&m, 4).unwrap();
+            let set = NormalizedMatches::new(&m, 4).unwrap();
             let normalized = set.second.matrix() * h * set.first.inverse_matrix();
             let kernel = TransferKernel::new(&normalized);
             let mut fast: Vec<f32> = set.blocks.iter().flat_map(|b| kernel.squared_residuals(b)).collect();

@@ -1,22 +1,50 @@
 //! The one RANSAC driver.
 
-mod chance;
-mod judge;
+mod driver;
+mod false_alarms;
+mod local_optimization;
 mod options;
+mod quality;
 mod sampler;
 mod scorer;
-mod search;
 
 pub use options::{RobustOptions, Sampling, Scoring};
 pub use sampler::{Prosac, Sampler, Uniform};
-pub(crate) use scorer::AllIn;
-pub use scorer::{Marginal, Msac, Scorer};
+pub(crate) use scorer::LeastSquaresLoss;
+pub use scorer::{Msac, Scorer, TukeyBiweight};
 
 use crate::EstimateError;
-use crate::pairs::LANES;
-use chance::chance;
-use judge::Judge;
-use search::search;
+use crate::match_blocks::LANES;
+use driver::search;
+use false_alarms::false_alarms;
+use quality::Quality;
+
+/// The data of a robust estimation, in blocks for vector units.
+pub trait RansacData: Sync {
+    /// [`LANES`] data, coordinate by coordinate; missing data are NaN.
+    type Block: Sync;
+
+    /// Number of data.
+    fn count(&self) -> usize;
+
+    /// All data, in random order.
+    fn blocks(&self) -> &[Self::Block];
+
+    /// The datum of each lane of the blocks; those of [`Estimator::RESAMPLES`] that are 0 are not asked.
+    fn order(&self) -> &[u32] {
+        &[]
+    }
+
+    /// Up to some `most` data of the background model, wrong for certain: parts of different data put together. The number of false alarms comes from how
+    /// many of them fit a model. By default none, and no number of false alarms is computed.
+    fn background(&self, most: usize) -> Vec<Self::Block> {
+        let _ = most;
+        Vec::new()
+    }
+}
+
+/// The blocks of an estimator's data.
+type BlockOf<E> = <<E as Estimator>::Data as RansacData>::Block;
 
 /// What a robust estimation has to know about a model.
 ///
@@ -24,8 +52,8 @@ use search::search;
 pub trait Estimator: Sync {
     /// The model.
     type Model: Clone + Send + Sync;
-    /// [`LANES`] data, coordinate by coordinate; missing data are NaN.
-    type Block: Sync;
+    /// What models are fitted to.
+    type Data: RansacData;
     /// A model made ready for [`Estimator::squared_residuals`].
     type Kernel;
     /// Size of a minimal sample.
@@ -36,26 +64,11 @@ pub trait Estimator: Sync {
     /// and whose loss has many local minima. 0 by default.
     const RESAMPLES: usize = 0;
 
-    /// Number of data.
-    fn count(&self) -> usize;
+    /// The data.
+    fn data(&self) -> &Self::Data;
 
     /// Estimator units per unit of the caller's threshold.
     fn unit(&self) -> f64;
-
-    /// All data, in random order.
-    fn blocks(&self) -> &[Self::Block];
-
-    /// The datum of each lane of the blocks; those of [`Estimator::RESAMPLES`] that are 0 are not asked.
-    fn order(&self) -> &[u32] {
-        &[]
-    }
-
-    /// Up to some `most` data that are wrong for certain: parts of different data put together. Chance is judged by how many of them fit a model. By
-    /// default none, and chance is not asked.
-    fn wrong(&self, most: usize) -> Vec<Self::Block> {
-        let _ = most;
-        Vec::new()
-    }
 
     /// Appends the models through a minimal sample; none where the sample is degenerate or impossible.
     fn solve(&self, sample: &[u32], models: &mut Vec<Self::Model>);
@@ -64,7 +77,7 @@ pub trait Estimator: Sync {
     fn kernel(&self, model: &Self::Model) -> Self::Kernel;
 
     /// Squared residuals of a block. NaN means that the datum does not fit. Must be `#[inline(always)]`.
-    fn squared_residuals(kernel: &Self::Kernel, block: &Self::Block) -> [f32; LANES];
+    fn squared_residuals(kernel: &Self::Kernel, block: &BlockOf<Self>) -> [f32; LANES];
 
     /// Lowers the sum of `scorer`'s loss, starting at `model`, by at most `iterations` steps.
     ///
@@ -107,8 +120,8 @@ pub struct Consensus<M> {
     pub score: Score,
     /// Samples drawn.
     pub iterations: usize,
-    /// log₁₀ of the number of models as well supported that chance would make of so many data, all wrong; below 0. `None` where the estimator knows no
-    /// data that are wrong for certain ([`Estimator::wrong`]), or a sample is all there is.
+    /// log₁₀ of the number of false alarms: of models as well supported to be expected of so many data, all wrong; below 0. `None` where the estimator has no
+    /// background model ([`RansacData::background`]), or a sample is all there is.
     pub log_nfa: Option<f64>,
 }
 
@@ -120,12 +133,12 @@ pub struct Consensus<M> {
 ///
 /// # Errors
 /// [`EstimateError::Option`], [`EstimateError::NotEnoughMatches`] with fewer data than a sample has, and
-/// [`EstimateError::NoConsensus`] where no model fits more data than chance would make fit.
+/// [`EstimateError::NoConsensus`] where the number of false alarms of the best model is not below one.
 pub fn ransac<E: Estimator>(estimator: &E, options: &RobustOptions) -> Result<Consensus<E::Model>, EstimateError> {
     options.check()?;
     match options.scoring {
         Scoring::Msac => with_scorer(estimator, options, &Msac),
-        Scoring::Marginal => with_scorer(estimator, options, &Marginal),
+        Scoring::TukeyBiweight => with_scorer(estimator, options, &TukeyBiweight),
     }
 }
 
@@ -134,15 +147,15 @@ fn with_scorer<E: Estimator, C: Scorer>(
     options: &RobustOptions,
     scorer: &C,
 ) -> Result<Consensus<E::Model>, EstimateError> {
-    let n = estimator.count();
+    let n = estimator.data().count();
     if n < E::SAMPLE {
         return Err(EstimateError::NotEnoughMatches { got: n, needed: E::SAMPLE });
     }
-    let judge = Judge::new(estimator, scorer, options.threshold * estimator.unit());
+    let quality = Quality::new(estimator, scorer, options.threshold * estimator.unit());
     let found = match options.sampling {
-        Sampling::Uniform => search(&judge, &mut Uniform::new(n, options.seed), options),
+        Sampling::Uniform => search(&quality, &mut Uniform::new(n, options.seed), options),
         Sampling::Prosac => {
-            search(&judge, &mut Prosac::new(n, E::SAMPLE, options.max_iterations, options.seed), options)
+            search(&quality, &mut Prosac::new(n, E::SAMPLE, options.max_iterations, options.seed), options)
         }
     };
     // The sample itself always fits.
@@ -150,12 +163,12 @@ fn with_scorer<E: Estimator, C: Scorer>(
     let none = |inliers, needed, iterations| EstimateError::NoConsensus { inliers, matches: n, needed, iterations };
     let Some(mut found) = found else { return Err(none(0, needed, options.max_iterations)) };
     let inliers = found.score.inliers as usize;
-    let chance = chance(&judge, &found.model);
-    match &chance {
+    let alarms = false_alarms(&quality, &found.model);
+    match &alarms {
         Some(c) if c.log_nfa >= 0.0 => return Err(none(inliers, c.needed, found.iterations)),
         None if inliers < needed => return Err(none(inliers, needed, found.iterations)),
         _ => {}
     }
-    found.log_nfa = chance.map(|c| c.log_nfa);
+    found.log_nfa = alarms.map(|c| c.log_nfa);
     Ok(found)
 }

@@ -7,10 +7,9 @@ use cv_core::OptionError;
 pub enum Scoring {
     /// The squared residual, cut off at the threshold (MSAC, Torr & Zisserman 2000).
     Msac,
-    /// A loss that averages over noise levels instead of trusting one threshold, in the spirit of MAGSAC++
-    /// (Barath et al. 2020).
+    /// Tukey's biweight that ends at 2.5 thresholds: close to the average over noise levels (marginalization) of MAGSAC++ (Barath et al. 2020).
     #[default]
-    Marginal,
+    TukeyBiweight,
 }
 
 /// How samples are drawn.
@@ -38,7 +37,7 @@ pub struct RobustOptions {
     pub max_iterations: usize,
     /// Seed of the random samples. Default 0.
     pub seed: u64,
-    /// How models are compared. Default [`Scoring::Marginal`].
+    /// How models are compared. Default [`Scoring::TukeyBiweight`].
     pub scoring: Scoring,
     /// How samples are drawn. Default [`Sampling::Uniform`].
     pub sampling: Sampling,

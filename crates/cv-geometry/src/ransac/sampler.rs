@@ -1,6 +1,6 @@
 //! Minimal samples.
 
-use crate::pairs::below;
+use crate::match_blocks::below;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 

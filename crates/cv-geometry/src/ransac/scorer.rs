@@ -13,9 +13,9 @@ pub trait Scorer: Sync {
 }
 
 /// Plain least squares: for matches that are all taken to be right.
-pub(crate) struct AllIn;
+pub(crate) struct LeastSquaresLoss;
 
-impl Scorer for AllIn {
+impl Scorer for LeastSquaresLoss {
     #[inline(always)]
     fn loss(&self, u: f32) -> f32 {
         u
@@ -56,29 +56,29 @@ impl Scorer for Msac {
 /// Tukey's biweight that ends at 2.5 times the threshold: a smooth loss close to the average over noise levels
 /// that MAGSAC++ takes (Barath et al. 2020), without its table.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Marginal;
+pub struct TukeyBiweight;
 
 /// The square of 2.5: of 1, 1.5, 2, 2.5 and 3.5 that with the least errors on generated fundamental matrices of general scenes and of planes
 /// with a fifth of the points off them (noise 0.1 to 2 px, 20 to 80 % wrong); homographies want 3.5, but hardly.
-const MARGINAL_CUTOFF: f32 = 6.25;
+const BIWEIGHT_CUTOFF: f32 = 6.25;
 
-impl Scorer for Marginal {
+impl Scorer for TukeyBiweight {
     #[inline(always)]
     fn loss(&self, u: f32) -> f32 {
-        let v = u * (1.0 / MARGINAL_CUTOFF);
+        let v = u * (1.0 / BIWEIGHT_CUTOFF);
         let w = if v < 1.0 { 1.0 - v } else { 0.0 };
         1.0 - w * w * w
     }
 
     #[inline(always)]
     fn weight(&self, u: f64) -> f64 {
-        let w = (1.0 - u / f64::from(MARGINAL_CUTOFF)).max(0.0);
+        let w = (1.0 - u / f64::from(BIWEIGHT_CUTOFF)).max(0.0);
         w * w
     }
 
     #[inline(always)]
     fn cutoff(&self) -> f64 {
-        f64::from(MARGINAL_CUTOFF)
+        f64::from(BIWEIGHT_CUTOFF)
     }
 }
 
@@ -108,6 +108,6 @@ mod tests {
     #[test]
     fn losses_rise_from_nothing_to_one_and_weights_are_their_slopes() {
         check(&Msac);
-        check(&Marginal);
+        check(&TukeyBiweight);
     }
 }

@@ -3,8 +3,8 @@
 use super::neighbors::like_their_neighbors;
 use super::{Intrinsics, MatchedViews, TwoViewError, TwoViewGeometry, TwoViewOptions};
 use crate::{
-    BundleOptions, BundleReport, RobustLoss, TwoViewBundle, adjust_two_views, essential_from_pose, normalize_matches,
-    parallax_angle, pose_stability, triangulate,
+    BundleOptions, BundleReport, RobustLoss, TwoViewBundle, adjust_two_views, essential_from_pose,
+    jackknife_pose_deviation, normalize_matches, parallax_angle, triangulate,
 };
 use cv_core::{Camera, Correspondence, DMatch, Matrix3, Point3, Pose, Progress, median};
 
@@ -44,7 +44,7 @@ pub struct TwoViewReconstruction {
     /// Median angle between the two rays of a point, in radians.
     pub median_angle: f64,
     /// Standard deviations of the rotation and of the direction of the translation, in radians: the larger of what the residuals say
-    /// and of what leaving out one part of the photograph after the other does ([`pose_stability`]).
+    /// and of what leaving out one part of the photograph after the other does ([`jackknife_pose_deviation`]).
     pub pose_deviation: [f64; 2],
     /// Relative standard deviation of the focal length; 0 where it was given.
     pub focal_deviation: f64,
@@ -89,7 +89,7 @@ impl<'a> TwoViewAdjustment<'a> {
         // Before further matches: those agree with the pose because they were looked for where it says.
         let TwoViewBundle { cameras, pose, .. } = &fit.bundle;
         let (normalized, unit) = normalize_matches(&fit.observed, &cameras[0], &cameras[1]);
-        let stability = pose_stability(pose, &normalized, options.robust.threshold * unit);
+        let stability = jackknife_pose_deviation(pose, &normalized, options.robust.threshold * unit);
         Ok(Self { views: *views, geometry, options: *options, fit, stability, guided: 0 })
     }
 

@@ -1,8 +1,8 @@
 //! The lens that the matches themselves tell: focal length and radial distortion.
 
 use crate::{
-    FocalPose, Marginal, RobustOptions, Scorer, essential_from_pose, estimate_focal_pose, estimate_relative_pose,
-    normalize_matches, refine_focal_pose, refine_relative_pose, sampson,
+    RobustOptions, Scorer, SharedFocalPose, TukeyBiweight, essential_from_pose, estimate_relative_pose,
+    estimate_shared_focal_pose, normalize_matches, refine_relative_pose, refine_shared_focal_pose, sampson,
 };
 use cv_core::{Camera, Correspondence, Distortion, Matrix3, Pose};
 use rayon::prelude::*;
@@ -161,7 +161,7 @@ impl Search<'_> {
     fn searched_free(&self, bend: f64) -> Option<Trial> {
         let usable: Vec<_> = self.straightened(bend).into_iter().filter(Correspondence::is_finite).collect();
         let options = RobustOptions { max_iterations: SAMPLES[1].min(self.robust.max_iterations), ..*self.robust };
-        let found = estimate_focal_pose(&usable, &options).ok()?;
+        let found = estimate_shared_focal_pose(&usable, &options).ok()?;
         Some(self.refined_free(bend, &found.model))
     }
 
@@ -171,7 +171,7 @@ impl Search<'_> {
         let usual = (given.lens.focal[0] * given.lens.focal[1]).sqrt();
         let focal = other.lens.focal[0];
         let deviations = worse_by(given, &other);
-        let reach = f64::from(Marginal.loss(1.0));
+        let reach = f64::from(TukeyBiweight.loss(1.0));
         let inliers = other.losses.iter().filter(|loss| **loss < reach).count();
         ((focal / usual).ln().abs() > FAR && deviations > BEYOND_DOUBT).then_some(Rival { focal, deviations, inliers })
     }
@@ -179,7 +179,7 @@ impl Search<'_> {
     /// The best one near another with another distortion, the focal length too where it is free.
     fn near(&self, other: &Trial, bend: f64, free: bool) -> Trial {
         if free {
-            self.refined_free(bend, &FocalPose { pose: other.pose, focal: other.lens.focal[0] })
+            self.refined_free(bend, &SharedFocalPose { pose: other.pose, focal: other.lens.focal[0] })
         } else {
             self.refined(Lens { bend, ..other.lens }, &other.pose)
         }
@@ -196,10 +196,10 @@ impl Search<'_> {
     }
 
     /// The best pose and focal length near others.
-    fn refined_free(&self, bend: f64, start: &FocalPose) -> Trial {
+    fn refined_free(&self, bend: f64, start: &SharedFocalPose) -> Trial {
         let matches = self.straightened(bend);
         let usable: Vec<_> = matches.iter().copied().filter(Correspondence::is_finite).collect();
-        let (found, _) = refine_focal_pose(start, &usable, self.robust.threshold);
+        let (found, _) = refine_shared_focal_pose(start, &usable, self.robust.threshold);
         let lens = Lens { focal: [found.focal; 2], bend };
         trial(lens, found.pose, &found.fundamental(), &matches, self.robust.threshold)
     }
@@ -235,7 +235,7 @@ impl Search<'_> {
 fn trial(lens: Lens, pose: Pose, f: &Matrix3<f64>, matches: &[Correspondence], threshold: f64) -> Trial {
     let loss = |m: &Correspondence| {
         let r = sampson(f, m) / threshold;
-        f64::from(Marginal.loss((r * r) as f32))
+        f64::from(TukeyBiweight.loss((r * r) as f32))
     };
     let losses: Vec<f64> = matches.iter().map(loss).collect();
     let sum = losses.iter().sum();

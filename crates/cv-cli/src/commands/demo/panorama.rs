@@ -8,7 +8,7 @@ use cv_synth::{RenderOptions, alignment_error, panorama_views};
 
 pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let camera = demo.camera();
-    let walk = cv_synth::PanoramaOptions { walker: true, ..cv_synth::PanoramaOptions::default() };
+    let walk = cv_synth::PanoramaSetOptions { walker: true, ..cv_synth::PanoramaSetOptions::default() };
     let set = panorama_views(demo.seed, &camera, &walk, &RenderOptions::default())?;
     let photos: Vec<PanoramaPhoto<'_>> = set.views.iter().map(|v| PanoramaPhoto::new(v.image.view())).collect();
     let result = match panorama(&photos, &PanoramaOptions::default(), demo.context) {

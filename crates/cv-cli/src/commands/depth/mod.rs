@@ -12,7 +12,7 @@ use crate::{rig, words};
 use cv_core::{ImageView, PointCloud};
 use cv_io::ply::PlyEncoding;
 use cv_pipeline::stereo::{
-    Blend, Census, Paths, PixelState, Rectification, RectifyOptions, Smoothing, StereoGeometry, StereoMatcher,
+    Census, IntensityCost, Paths, PixelState, Rectification, RectifyOptions, Smoothing, StereoGeometry, StereoMatcher,
     StereoOptions,
 };
 use cv_pipeline::{DepthError, DepthOptions, DepthResult, RigDepthResult, depth, depth_by_rig};
@@ -107,8 +107,8 @@ pub(crate) struct Args {
     #[arg(long)]
     no_fill: bool,
     /// What to add to the number of differing bits: sharper outlines.
-    #[arg(long, value_name = "WHAT", value_parser = named::<Blend>(), default_value_t = Blend::None)]
-    blend: Blend,
+    #[arg(long, value_name = "WHAT", value_parser = named::<IntensityCost>(), default_value_t = IntensityCost::None)]
+    blend: IntensityCost,
     /// Edge-preserving smoothing.
     #[arg(long, value_name = "HOW", value_parser = named::<Smoothing>(), default_value = "bilateral")]
     smoothing: Smoothing,

@@ -38,7 +38,7 @@ impl Args {
                 uniqueness: self.uniqueness.unwrap_or(default.uniqueness),
                 speckle_size: self.speckle_size.unwrap_or(default.speckle_size),
                 fill: !self.no_fill,
-                blend: self.blend,
+                intensity_cost: self.blend,
                 smoothing: match self.smoothing {
                     Smoothing::None => Smoothing::None,
                     Smoothing::Bilateral { sigma } => Smoothing::Bilateral { sigma: self.sigma.unwrap_or(sigma) },

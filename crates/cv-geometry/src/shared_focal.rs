@@ -1,10 +1,10 @@
-//! Relative pose and focal length of two views of one unknown focal length, where many matches may be wrong.
+//! Relative pose and shared focal length of two views, where many matches may be wrong.
 
 use crate::epipolar::{Epipolar, SampsonKernel, SampsonProblem, refine_sampson, sampson};
 use crate::error::{Degeneracy, EstimateError};
 use crate::essential::{decompose_essential, essential_from_pose, in_front};
-use crate::pairs::{LANES, Normalizer, PairBlock, PairSet, check, point_degeneracy};
-use crate::ransac::{Estimator, Marginal, RobustOptions, Scorer, ransac};
+use crate::match_blocks::{LANES, MatchBlock, NormalizedMatches, Normalizer, check, point_degeneracy};
+use crate::ransac::{Estimator, RobustOptions, Scorer, TukeyBiweight, ransac};
 use crate::robust::RobustModel;
 use crate::rotation::orthonormalized;
 use crate::six_point::fundamental_six_point;
@@ -14,14 +14,14 @@ use nalgebra::{SMatrix, SVector};
 
 /// A relative pose, and the focal length of both cameras.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct FocalPose {
+pub struct SharedFocalPose {
     /// First camera frame to second; the translation has length one.
     pub pose: Pose,
     /// Focal length, in the unit of the matches.
     pub focal: f64,
 }
 
-impl FocalPose {
+impl SharedFocalPose {
     /// The fundamental matrix between coordinates relative to the principal points, times the squared focal length.
     pub fn fundamental(&self) -> Matrix3<f64> {
         let k = self.scaling();
@@ -46,11 +46,11 @@ impl FocalPose {
 ///
 /// # Errors
 /// [`EstimateError`]: fewer than seven matches, a coordinate that is not finite, coincident or collinear points, or no model supported by more
-/// matches than chance would give.
-pub fn estimate_focal_pose(
+/// matches than the number of false alarms allows.
+pub fn estimate_shared_focal_pose(
     matches: &[Correspondence],
     options: &RobustOptions,
-) -> Result<RobustModel<FocalPose>, EstimateError> {
+) -> Result<RobustModel<SharedFocalPose>, EstimateError> {
     options.check()?;
     check(matches, 7)?;
     let size = size(matches);
@@ -58,14 +58,14 @@ pub fn estimate_focal_pose(
         return Err(EstimateError::Degenerate { kind: Degeneracy::Coincident });
     }
     let normalizer = Normalizer { center: Point2::origin(), scale: 1.0 / size };
-    let set = PairSet::with(matches, normalizer, normalizer);
+    let set = NormalizedMatches::with(matches, normalizer, normalizer);
     if let Some(kind) = point_degeneracy(set.pairs.iter(), 7, 0.0) {
         return Err(EstimateError::Degenerate { kind });
     }
     let found = ransac(&FocalEstimator { set, scale: 1.0 / size }, options)?;
     let model = found.model.scaled(size);
     let f = model.fundamental();
-    let residual = |m: &FocalPose, pair: &Correspondence| {
+    let residual = |m: &SharedFocalPose, pair: &Correspondence| {
         let ray = |p: &Point2<f64>| Vector3::new(p.x, p.y, m.focal);
         let front = in_front(m.pose.rotation.matrix(), &m.pose.translation, &ray(&pair.a), &ray(&pair.b));
         if front { sampson(&f, pair) } else { f64::INFINITY }
@@ -77,11 +77,15 @@ pub fn estimate_focal_pose(
 /// Sampson error.
 ///
 /// Returns them and their loss: each match adds 0 (exact) to 1 (beyond 2.5 thresholds, in pixels).
-pub fn refine_focal_pose(start: &FocalPose, matches: &[Correspondence], threshold: f64) -> (FocalPose, f64) {
+pub fn refine_shared_focal_pose(
+    start: &SharedFocalPose,
+    matches: &[Correspondence],
+    threshold: f64,
+) -> (SharedFocalPose, f64) {
     let size = size(matches).max(f64::MIN_POSITIVE);
     let unit = |m: &Correspondence| [m.a.x / size, m.a.y / size, m.b.x / size, m.b.y / size];
     let pairs: Vec<[f64; 4]> = matches.iter().map(unit).collect();
-    let problem = SampsonProblem::new(&pairs, &Marginal, threshold / size);
+    let problem = SampsonProblem::new(&pairs, &TukeyBiweight, threshold / size);
     let start = start.scaled(1.0 / size);
     let refined = refine_sampson(&problem, start, 50).and_then(straightened).unwrap_or(start);
     (refined.scaled(size), problem.cost(&refined))
@@ -94,13 +98,13 @@ fn size(matches: &[Correspondence]) -> f64 {
 }
 
 /// With the rotation made one again after many small turns.
-fn straightened(model: FocalPose) -> Option<FocalPose> {
+fn straightened(model: SharedFocalPose) -> Option<SharedFocalPose> {
     let rotation = orthonormalized(&model.pose.rotation)?;
-    Some(FocalPose { pose: Pose::new(rotation, model.pose.translation), ..model })
+    Some(SharedFocalPose { pose: Pose::new(rotation, model.pose.translation), ..model })
 }
 
 /// Five degrees of freedom of the pose, and the logarithm of the focal length.
-impl Epipolar<6> for FocalPose {
+impl Epipolar<6> for SharedFocalPose {
     fn matrix(&self) -> Matrix3<f64> {
         self.fundamental()
     }
@@ -128,40 +132,28 @@ impl Epipolar<6> for FocalPose {
 }
 
 struct FocalEstimator {
-    set: PairSet,
+    set: NormalizedMatches,
     scale: f64,
 }
 
 impl Estimator for FocalEstimator {
-    type Model = FocalPose;
-    type Block = PairBlock;
+    type Model = SharedFocalPose;
+    type Data = NormalizedMatches;
     type Kernel = SampsonKernel;
     const SAMPLE: usize = 6;
     const RESIDUAL_DIMENSION: i32 = 1;
     // As for calibrated poses.
     const RESAMPLES: usize = 20;
 
-    fn count(&self) -> usize {
-        self.set.pairs.len()
+    fn data(&self) -> &NormalizedMatches {
+        &self.set
     }
 
     fn unit(&self) -> f64 {
         self.scale
     }
 
-    fn blocks(&self) -> &[PairBlock] {
-        &self.set.blocks
-    }
-
-    fn order(&self) -> &[u32] {
-        &self.set.order
-    }
-
-    fn wrong(&self, most: usize) -> Vec<PairBlock> {
-        self.set.wrong(most)
-    }
-
-    fn solve(&self, sample: &[u32], models: &mut Vec<FocalPose>) {
+    fn solve(&self, sample: &[u32], models: &mut Vec<SharedFocalPose>) {
         let pair = |i: usize| &self.set.pairs[sample[i] as usize];
         let a: [Point2<f64>; 6] = std::array::from_fn(|i| Point2::new(pair(i)[0], pair(i)[1]));
         let b: [Point2<f64>; 6] = std::array::from_fn(|i| Point2::new(pair(i)[2], pair(i)[3]));
@@ -172,23 +164,29 @@ impl Estimator for FocalEstimator {
                 let (r, t) = (pose.rotation.matrix(), &pose.translation);
                 // At most one of the four poses has all six in front, and for most wrong samples none.
                 if (0..6).all(|i| in_front(r, t, &ray(&a[i]), &ray(&b[i]))) {
-                    models.push(FocalPose { pose, focal });
+                    models.push(SharedFocalPose { pose, focal });
                     return;
                 }
             }
         });
     }
 
-    fn kernel(&self, model: &FocalPose) -> SampsonKernel {
+    fn kernel(&self, model: &SharedFocalPose) -> SampsonKernel {
         SampsonKernel::new(&model.fundamental())
     }
 
     #[inline(always)]
-    fn squared_residuals(kernel: &SampsonKernel, block: &PairBlock) -> [f32; LANES] {
+    fn squared_residuals(kernel: &SampsonKernel, block: &MatchBlock) -> [f32; LANES] {
         kernel.squared_residuals(block)
     }
 
-    fn refine<C: Scorer>(&self, model: &FocalPose, scorer: &C, threshold: f64, iterations: usize) -> Option<FocalPose> {
+    fn refine<C: Scorer>(
+        &self,
+        model: &SharedFocalPose,
+        scorer: &C,
+        threshold: f64,
+        iterations: usize,
+    ) -> Option<SharedFocalPose> {
         let problem = SampsonProblem::new(&self.set.pairs, scorer, threshold);
         refine_sampson(&problem, *model, iterations).and_then(straightened)
     }
@@ -209,7 +207,7 @@ mod tests {
     proptest! {
         #[test]
         fn the_tangent_is_the_derivative(seed: u64, focal in 0.3..3.0f64) {
-            let model = FocalPose { pose: TwoViews::random(seed).pose, focal };
+            let model = SharedFocalPose { pose: TwoViews::random(seed).pose, focal };
             let tangent = Epipolar::<6>::tangent(&model);
             for i in 0..6 {
                 let mut d = SVector::<f64, 6>::zeros();
@@ -231,9 +229,9 @@ mod tests {
             let mut m = centered(&views, views.matches(60, 0.0));
             let options = RobustOptions { threshold: 1.0, seed, ..RobustOptions::default() };
             let error = |m: &[Correspondence]| {
-                let found = estimate_focal_pose(m, &options).unwrap();
+                let found = estimate_shared_focal_pose(m, &options).unwrap();
                 assert!(found.inliers.len() >= 60);
-                (refine_focal_pose(&found.model, m, 1.0).0.focal / 500.0 - 1.0).abs()
+                (refine_shared_focal_pose(&found.model, m, 1.0).0.focal / 500.0 - 1.0).abs()
             };
             exact.push(error(&m));
             m.extend(centered(&views, views.wrong(40)));
@@ -253,7 +251,7 @@ mod tests {
         let views = TwoViews::random(1);
         let options = RobustOptions { threshold: 1.0, ..RobustOptions::default() };
         let good = centered(&views, views.matches(20, 0.0));
-        let get = |m: &[Correspondence]| estimate_focal_pose(m, &options).unwrap_err();
+        let get = |m: &[Correspondence]| estimate_shared_focal_pose(m, &options).unwrap_err();
         assert_eq!(get(&good[..6]), EstimateError::NotEnoughMatches { got: 6, needed: 7 });
         assert_eq!(
             get(&[Correspondence::new(0.0, 0.0, 0.0, 0.0); 9]),

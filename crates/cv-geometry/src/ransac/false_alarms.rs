@@ -1,8 +1,8 @@
-//! Whether more data fit a model than chance would make fit.
+//! The number of false alarms of a model (a contrario): whether more data fit it than would fit some model if all were wrong.
 
-use super::judge::Judge;
-use super::{Estimator, Scorer};
-use crate::pairs::LANES;
+use super::quality::Quality;
+use super::{Estimator, RansacData, Scorer};
+use crate::match_blocks::LANES;
 
 /// Wrong data that are looked at: enough for nearly all models, whose support leaves no doubt; and enough to count those of a homography of 3 px in a
 /// picture of ten megapixels.
@@ -12,9 +12,9 @@ const REACH: f64 = 4.0;
 /// Residuals up to which data are counted: the threshold, and half of it so many times.
 const LEVELS: usize = 7;
 
-/// How a model compares with those that chance makes.
-pub(super) struct Chance {
-    /// log₁₀ of the number of models as well supported that are to be expected among so many wrong data.
+/// How a model compares with those of the background model, in which all data are wrong.
+pub(super) struct FalseAlarms {
+    /// log₁₀ of the number of false alarms: of models as well supported that are to be expected among so many wrong data.
     pub(super) log_nfa: f64,
     /// Fewest data within the threshold of which that number would be below one; more than there are where no number of them would do. 0 where it is.
     pub(super) needed: usize,
@@ -22,18 +22,21 @@ pub(super) struct Chance {
 
 /// The number of false alarms of a model of `n` data (Moisan & Stival, "A probabilistic criterion to detect rigid point matches between two images", IJCV
 /// 2004; Moulon, Monasse & Marlet, "Adaptive structure from motion with a contrario model estimation", ACCV 2012): how many models, of all those
-/// through `sample` of the data, have `k` data so near if each is there by chance, with probability `p`.
+/// through `sample` of the data, have `k` data so near under the background model, where each is near with probability `p`.
 ///
 /// `None` where the estimator knows no wrong data, or a sample is all there is.
-pub(super) fn chance<E: Estimator, C: Scorer>(judge: &Judge<'_, E, C>, model: &E::Model) -> Option<Chance> {
-    let n = judge.estimator.count();
+pub(super) fn false_alarms<E: Estimator, C: Scorer>(
+    quality: &Quality<'_, E, C>,
+    model: &E::Model,
+) -> Option<FalseAlarms> {
+    let n = quality.estimator.data().count();
     if n <= E::SAMPLE {
         return None;
     }
-    let levels: [u32; LEVELS] = judge.counts(model, judge.estimator.blocks(), 1.0);
+    let levels: [u32; LEVELS] = quality.counts(model, quality.estimator.data().blocks(), 1.0);
     let of = |wrong: usize, deviations: f64| {
-        let wrong = judge.estimator.wrong(wrong);
-        let [fitting] = judge.counts(model, &wrong, REACH);
+        let wrong = quality.estimator.data().background(wrong);
+        let [fitting] = quality.counts(model, &wrong, REACH);
         // One more, or none found would be none possible.
         let fitting = f64::from(fitting + 1);
         let count = fitting + deviations * fitting.sqrt();
@@ -46,17 +49,17 @@ pub(super) fn chance<E: Estimator, C: Scorer>(judge: &Judge<'_, E, C>, model: &E
         };
         let log_nfa = levels.iter().enumerate().map(|(level, k)| log(*k as usize, level)).fold(f64::INFINITY, f64::min);
         let needed = || (E::SAMPLE + 1..=n).find(|k| log(*k, 0) < 0.0).unwrap_or(n + 1);
-        (!wrong.is_empty()).then(|| Chance { log_nfa, needed: if log_nfa < 0.0 { 0 } else { needed() } })
+        (!wrong.is_empty()).then(|| FalseAlarms { log_nfa, needed: if log_nfa < 0.0 { 0 } else { needed() } })
     };
     // A first look, at what the count may be at most.
     let [few, many] = WRONG;
     match of(few, 3.0) {
-        Some(chance) if chance.log_nfa >= 0.0 => of(many, 0.0),
+        Some(found) if found.log_nfa >= 0.0 => of(many, 0.0),
         other => other,
     }
 }
 
-/// log₁₀ of C(n, k) C(k, s) p^(k − s): sets of k of n data, samples among them, and the chance that the others fit too.
+/// log₁₀ of C(n, k) C(k, s) p^(k − s): sets of k of n data, samples among them, and the probability that the others fit too.
 fn log_false_alarms(n: usize, k: usize, s: usize, p: f64) -> f64 {
     if k < s {
         return f64::INFINITY;

@@ -1,15 +1,15 @@
-//! Semi-global matching as it is written down, with whole volumes and no tricks: what the fast matcher must equal.
+//! Reference implementation of semi-global matching, with whole cost volumes: what the fast matcher must equal.
 
 use crate::winner::{NO_SUM, Winner, outside_cost, p2_table};
-use crate::{Blend, Paths, StereoOptions};
+use crate::{IntensityCost, Paths, StereoOptions};
 
 /// Winners of the left image and indices of the right one's, row by row.
-pub(crate) fn match_plain(
+pub(crate) fn match_reference(
     options: &StereoOptions,
     gray: &[u16],
     left: &[u64],
     right: &[u64],
-    blend: &[Vec<u8>; 2],
+    intensity_cost: &[Vec<u8>; 2],
     width: usize,
     height: usize,
 ) -> (Vec<Winner>, Vec<u16>) {
@@ -19,8 +19,12 @@ pub(crate) fn match_plain(
         usize::try_from(xr).ok().filter(|&xr| xr < width)
     };
     let bits = |i: usize, j: usize| {
-        let more = if options.blend == Blend::None { 0 } else { blend[0][i].abs_diff(blend[1][j]) };
-        (left[i] ^ right[j]).count_ones() as u8 + more.min(options.blend.cap())
+        let more = if options.intensity_cost == IntensityCost::None {
+            0
+        } else {
+            intensity_cost[0][i].abs_diff(intensity_cost[1][j])
+        };
+        (left[i] ^ right[j]).count_ones() as u8 + more.min(options.intensity_cost.cap())
     };
     let costs: Vec<u8> = (0..width * height)
         .flat_map(|i| {
@@ -142,15 +146,17 @@ mod tests {
             .collect()
     }
 
-    /// What the blend compares, by definition.
-    fn blend_plain(gray: &[u16], width: usize, blend: Blend) -> Vec<u8> {
+    /// What the intensity_cost compares, by definition.
+    fn intensity_reference(gray: &[u16], width: usize, intensity_cost: IntensityCost) -> Vec<u8> {
         let value = |i: usize| {
             let at = |x: usize| i32::from(gray[i / width * width + x]);
             let x = i % width;
-            match blend {
-                Blend::None => 0,
-                Blend::Gray { per_bit, .. } => (f64::from(at(x)) / 257.0 / f64::from(per_bit) + 1e-9).round() as u8,
-                Blend::Gradient { per_bit, .. } => {
+            match intensity_cost {
+                IntensityCost::None => 0,
+                IntensityCost::Gray { per_bit, .. } => {
+                    (f64::from(at(x)) / 257.0 / f64::from(per_bit) + 1e-9).round() as u8
+                }
+                IntensityCost::Gradient { per_bit, .. } => {
                     let slope = at((x + 1).min(width - 1)) - at(x.saturating_sub(1));
                     (128.0 + (f64::from(slope) / 514.0 / f64::from(per_bit)).trunc()).clamp(0.0, 255.0) as u8
                 }
@@ -173,15 +179,15 @@ mod tests {
         let window = prop_oneof![Just(Census::Window5x5), Just(Census::Window7x7), Just(Census::Window9x7)];
         // Ranges below, at and above one block and one group; penalties that do and do not saturate.
         let disparities = prop_oneof![1usize..70, Just(64), Just(128), 120usize..300];
-        let blend = prop_oneof![
-            Just(Blend::None),
-            (1u8.., 0u8..40).prop_map(|(per_bit, cap)| Blend::Gray { per_bit, cap }),
-            (1u8.., 0u8..40).prop_map(|(per_bit, cap)| Blend::Gradient { per_bit, cap }),
+        let intensity_cost = prop_oneof![
+            Just(IntensityCost::None),
+            (1u8.., 0u8..40).prop_map(|(per_bit, cap)| IntensityCost::Gray { per_bit, cap }),
+            (1u8.., 0u8..40).prop_map(|(per_bit, cap)| IntensityCost::Gradient { per_bit, cap }),
         ];
-        (window, disparities, -40i32..40, 0u8..30, 0u8..60, 0u8..60, 0u8..40, any::<bool>(), blend).prop_map(
-            |(census, disparities, min_disparity, p1, more, most, p2_gradient, eight, blend)| StereoOptions {
+        (window, disparities, -40i32..40, 0u8..30, 0u8..60, 0u8..60, 0u8..40, any::<bool>(), intensity_cost).prop_map(
+            |(census, disparities, min_disparity, p1, more, most, p2_gradient, eight, intensity_cost)| StereoOptions {
                 census,
-                blend,
+                intensity_cost,
                 disparities,
                 min_disparity,
                 p1,
@@ -215,24 +221,24 @@ mod tests {
             let left: Vec<u16> = (0..width * height).map(noise).collect();
             let right: Vec<u16> = (0..width * height).map(|i| noise(if i % 5 == 0 { i + 7 } else { i + 3 })).collect();
             let bits = [&left, &right].map(|g| census_plain(g, width, height, options.census));
-            let blended = [&left, &right].map(|g| blend_plain(g, width, options.blend));
-            let expected = match_plain(&options, &left, &bits[0], &bits[1], &blended, width, height);
+            let blended = [&left, &right].map(|g| intensity_reference(g, width, options.intensity_cost));
+            let expected = match_reference(&options, &left, &bits[0], &bits[1], &blended, width, height);
 
             let gray = [padded(&left, width, height), padded(&right, width, height)];
             let min_disparity = i64::from(options.min_disparity);
-            let StereoOptions { census, blend, disparities, .. } = options;
+            let StereoOptions { census, intensity_cost, disparities, .. } = options;
             let p2 = Penalties::new(&options);
             for level in instruction_sets() {
                 let layout = Layout::new(level, disparities);
                 let (mut a, mut b, mut bytes) = (Vec::new(), Vec::new(), Vec::new());
-                describe(level, &gray[0], census, blend, &mut a);
-                describe_mirrored(level, &gray[1], census, blend, min_disparity, layout, &mut b);
+                describe(level, &gray[0], census, intensity_cost, &mut a);
+                describe_mirrored(level, &gray[1], census, intensity_cost, min_disparity, layout, &mut b);
                 gray[0].to_bytes(&mut bytes);
                 let frame = Frame {
-                    width, height, min_disparity, disparities, layout, planes: planes(census, blend),
+                    width, height, min_disparity, disparities, layout, planes: planes(census, intensity_cost),
                     left: &a, right: &b, gray: &bytes,
                     given: None,
-                    blend_cap: (blend != Blend::None).then_some(blend.cap()),
+                    intensity_cap: (intensity_cost != IntensityCost::None).then_some(intensity_cost.cap()),
                     p1: options.p1, p2: &p2, second: options.confidence,
                 };
                 let mut aggregator = Aggregator::default();

@@ -1,9 +1,9 @@
-//! SIFT on an image as it would look from a slanted direction.
+//! ASIFT: SIFT on affine-simulated views, the image as it would look from a slanted direction.
 //!
 //! Source: J.-M. Morel & G. Yu, "ASIFT: a new framework for fully affine invariant image comparison", SIAM J. Imaging Sciences 2(2), 2009. A picture of a plane seen
 //! under a slant is the frontal one turned, then compressed along one axis (the tilt); features of the compressed picture match those of the slanted one.
 
-use crate::descriptors::Described;
+use crate::descriptors::Features;
 use crate::error::{FeatureError, check_image};
 use crate::sift::{SMALLEST, SiftOptions, sift};
 use crate::simd;
@@ -19,12 +19,12 @@ use rayon::prelude::*;
 /// # Errors
 /// As [`sift`]; [`FeatureError::Option`] for a tilt outside its range or a rotation that is not finite; [`FeatureError::ImageTooSmall`] where the compressed image would be too
 /// small.
-pub fn sift_tilted(
+pub fn sift_affine_view(
     view: ImageView<'_, f32, 1>,
     options: &SiftOptions,
     tilt: f32,
     rotation: f32,
-) -> Result<Described, FeatureError> {
+) -> Result<Features, FeatureError> {
     OptionError::check("tilt", tilt.into(), "from 1 to 8", |v| (1.0..=8.0).contains(&v))?;
     OptionError::check("rotation", rotation.into(), "finite", f64::is_finite)?;
     check_image(view, SMALLEST)?;
@@ -127,8 +127,11 @@ mod tests {
             [f(p.x, p.y)]
         });
         let options = SiftOptions::default();
-        let a =
-            if simulated { sift_tilted(plane.view(), &options, tilt, rotation) } else { sift(plane.view(), &options) };
+        let a = if simulated {
+            sift_affine_view(plane.view(), &options, tilt, rotation)
+        } else {
+            sift(plane.view(), &options)
+        };
         let (a, b) = (a.unwrap(), sift(slanted.view(), &options).unwrap());
         assert_eq!(a.keypoints.len(), a.descriptors.len());
         let options = MatchOptions { mutual: true, ..MatchOptions::default() };
@@ -156,19 +159,19 @@ mod tests {
         let image = GrayF32::from_fn(150, 140, |x, y| [f(x as f32, y as f32)]);
         let options = SiftOptions::default();
         let (tilted, plain) =
-            (sift_tilted(image.view(), &options, 1.0, 0.0).unwrap(), sift(image.view(), &options).unwrap());
+            (sift_affine_view(image.view(), &options, 1.0, 0.0).unwrap(), sift(image.view(), &options).unwrap());
         assert_eq!(tilted.descriptors, plain.descriptors);
         for (a, b) in tilted.keypoints.iter().zip(&plain.keypoints) {
             // The angle went through its sine and back.
             assert!(a.position == b.position && a.scale == b.scale && (a.angle - b.angle).abs() < 1e-5, "{a:?} {b:?}");
         }
         for (tilt, rotation) in [(0.5, 0.0), (f32::NAN, 0.0), (2.0, f32::INFINITY)] {
-            let error = sift_tilted(image.view(), &options, tilt, rotation);
+            let error = sift_affine_view(image.view(), &options, tilt, rotation);
             assert!(matches!(error, Err(FeatureError::Option(_))));
         }
         let narrow = GrayF32::new(30, 30, [0.5]);
-        let error = sift_tilted(narrow.view(), &options, 8.0, 0.0).unwrap_err();
+        let error = sift_affine_view(narrow.view(), &options, 8.0, 0.0).unwrap_err();
         assert_eq!(error, FeatureError::ImageTooSmall { width: 4, height: 30, needed: 8 });
-        assert!(sift_tilted(GrayF32::new(0, 0, [0.0]).view(), &options, 2.0, 0.0).is_err());
+        assert!(sift_affine_view(GrayF32::new(0, 0, [0.0]).view(), &options, 2.0, 0.0).is_err());
     }
 }

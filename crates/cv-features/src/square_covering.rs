@@ -1,4 +1,4 @@
-//! Quicker ways to spread corners than [`anms`](crate::anms): square covering and tiles.
+//! Faster non-maximal suppression than [`anms`](crate::anms): suppression via square covering (SSC), and tiles.
 
 use crate::anms::usable;
 use cv_core::Keypoint;

@@ -34,12 +34,12 @@ pub mod colors {
 
 /// A picture to draw on. Positions are pixels with centers at integers; whatever falls outside is cut off.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Canvas {
+pub struct Raster {
     image: RgbU8,
 }
 
-impl Canvas {
-    /// A canvas of one color.
+impl Raster {
+    /// A raster of one color.
     ///
     /// # Panics
     /// Where `width × height × 3` overflows.
@@ -111,7 +111,7 @@ impl Canvas {
         });
     }
 
-    /// The part of a segment within `margin` of the canvas; `None` where there is none or it is not finite.
+    /// The part of a segment within `margin` of the raster; `None` where there is none or it is not finite.
     fn clip(&self, a: [f32; 2], b: [f32; 2], margin: f32) -> Option<([f32; 2], [f32; 2])> {
         if ![a[0], a[1], b[0], b[1]].iter().all(|v| v.is_finite()) {
             return None;
@@ -231,7 +231,7 @@ impl Canvas {
         font::draw(text, [x, y], size, weight, |x, y, alpha| self.blend(x, y, color, alpha));
     }
 
-    /// The width in pixels of [`Canvas::text`].
+    /// The width in pixels of [`Raster::text`].
     pub fn text_width(text: &str, size: f32) -> f32 {
         font::width(text, size)
     }
@@ -269,21 +269,21 @@ mod tests {
 
     #[test]
     fn a_line_covers_its_pixels_and_no_others() {
-        let mut canvas = Canvas::new(20, 9, colors::BLACK);
-        canvas.line([3.0, 4.0], [15.0, 4.0], 1.0, colors::WHITE);
+        let mut raster = Raster::new(20, 9, colors::BLACK);
+        raster.line([3.0, 4.0], [15.0, 4.0], 1.0, colors::WHITE);
         for x in 4..15 {
-            assert!(canvas.image().at(x, 4)[0] >= 254, "{x}");
-            assert_eq!((canvas.image().at(x, 2), canvas.image().at(x, 6)), ([0; 3], [0; 3]));
+            assert!(raster.image().at(x, 4)[0] >= 254, "{x}");
+            assert_eq!((raster.image().at(x, 2), raster.image().at(x, 6)), ([0; 3], [0; 3]));
         }
-        assert_eq!(canvas.image().at(1, 4), [0; 3]);
-        assert_eq!(canvas.image().at(18, 4), [0; 3]);
+        assert_eq!(raster.image().at(1, 4), [0; 3]);
+        assert_eq!(raster.image().at(18, 4), [0; 3]);
     }
 
     #[test]
     fn a_disc_has_the_area_of_one() {
-        let mut canvas = Canvas::new(64, 64, colors::BLACK);
-        canvas.disc([31.3, 32.7], 20.0, colors::WHITE);
-        let sum: f64 = canvas.image().pixels().map(|p| f64::from(p[0]) / 255.0).sum();
+        let mut raster = Raster::new(64, 64, colors::BLACK);
+        raster.disc([31.3, 32.7], 20.0, colors::WHITE);
+        let sum: f64 = raster.image().pixels().map(|p| f64::from(p[0]) / 255.0).sum();
         let area = std::f64::consts::PI * 400.0;
         // The rim is 126 pixels long; a linear ramp is off by far less than a tenth of a pixel on average.
         assert!((sum - area).abs() < 12.6, "{sum} {area}");
@@ -293,14 +293,14 @@ mod tests {
     fn pasting_and_filling_are_cut_at_the_border() {
         let stamp = RgbU8::new(4, 4, [9, 8, 7]);
         for (x, y) in [(-2, -2), (8, 8), (-100, 3), (i64::MAX, i64::MAX), (i64::MIN, 0), (3, 3)] {
-            let mut canvas = Canvas::new(10, 10, colors::BLACK);
-            canvas.paste(stamp.view(), x, y);
+            let mut raster = Raster::new(10, 10, colors::BLACK);
+            raster.paste(stamp.view(), x, y);
             let inside = |c: i64| (0..4).filter(|i| (0..10).contains(&c.saturating_add(*i))).count();
-            let count = canvas.image().pixels().filter(|p| *p == [9, 8, 7]).count();
+            let count = raster.image().pixels().filter(|p| *p == [9, 8, 7]).count();
             assert_eq!(count, inside(x) * inside(y), "{x} {y}");
-            let mut canvas = Canvas::new(10, 10, colors::BLACK);
-            canvas.fill_rect(x, y, 4, 4, [9, 8, 7]);
-            assert_eq!(canvas.image().pixels().filter(|p| *p == [9, 8, 7]).count(), count, "{x} {y}");
+            let mut raster = Raster::new(10, 10, colors::BLACK);
+            raster.fill_rect(x, y, 4, 4, [9, 8, 7]);
+            assert_eq!(raster.image().pixels().filter(|p| *p == [9, 8, 7]).count(), count, "{x} {y}");
         }
     }
 
@@ -311,15 +311,15 @@ mod tests {
             w in 0usize..12, h in 0usize..12,
         ) {
             // Ends anywhere, NaN and infinity among them: no panic, and no endless walk.
-            let mut canvas = Canvas::new(w, h, colors::BLACK);
-            canvas.line(a, b, 2.0, colors::WHITE);
-            canvas.line(b, [b[1], b[0]], r, colors::WHITE);
-            canvas.circle(b, r, 2.0, colors::RED);
-            canvas.circle(a, r, 2.0, colors::RED);
-            canvas.disc(b, r, colors::RED);
-            canvas.cross(a, r, 1.0, colors::RED);
-            canvas.text(b[0], b[1], "Ag", r, colors::WHITE);
-            canvas.text(a[0], a[1], "Ag", 10.0, colors::WHITE);
+            let mut raster = Raster::new(w, h, colors::BLACK);
+            raster.line(a, b, 2.0, colors::WHITE);
+            raster.line(b, [b[1], b[0]], r, colors::WHITE);
+            raster.circle(b, r, 2.0, colors::RED);
+            raster.circle(a, r, 2.0, colors::RED);
+            raster.disc(b, r, colors::RED);
+            raster.cross(a, r, 1.0, colors::RED);
+            raster.text(b[0], b[1], "Ag", r, colors::WHITE);
+            raster.text(a[0], a[1], "Ag", 10.0, colors::WHITE);
         }
     }
 }

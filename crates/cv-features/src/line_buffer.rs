@@ -1,10 +1,10 @@
-//! Rings of the last few rows.
+//! Line buffers: the last few rows of an image that is worked from top to bottom.
 
 use cv_imgproc::mirror_index;
 use std::ops::Range;
 
 /// The last rows of a part of an image.
-pub(crate) struct Ring {
+pub(crate) struct LineBuffer {
     data: Vec<f32>,
     /// First column.
     pub(crate) from: usize,
@@ -12,7 +12,7 @@ pub(crate) struct Ring {
     rows: usize,
 }
 
-impl Ring {
+impl LineBuffer {
     pub(crate) fn new(columns: Range<usize>, rows: usize) -> Self {
         Self { data: vec![0.0; columns.len() * rows], from: columns.start, width: columns.len(), rows }
     }

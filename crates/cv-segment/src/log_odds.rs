@@ -30,7 +30,7 @@ impl From<&Whitened> for Flat {
 
 /// Log odds of two mixtures in a color space.
 #[derive(Debug, Clone)]
-pub(crate) struct Evaluator {
+pub(crate) struct LogOdds {
     space: ColorSpace,
     hue: f32,
     foreground: Vec<Flat>,
@@ -40,7 +40,7 @@ pub(crate) struct Evaluator {
     linear: [f32; 256],
 }
 
-impl Evaluator {
+impl LogOdds {
     pub(crate) fn new(space: ColorSpace, hue: f32, foreground: &[Whitened], background: &[Whitened]) -> Self {
         let bytes = cv_core::GrayU8::from_fn(256, 1, |x, _| [x as u8]);
         let mut linear = [0.0; 256];
@@ -265,7 +265,7 @@ mod tests {
             };
             let (f, b) = (mixture(counts.0), mixture(counts.1));
             let background = if counts.1 == 0 { Vec::new() } else { b.whitened().unwrap() };
-            let evaluator = Evaluator::new(space, hue, &f.whitened().unwrap(), &background);
+            let evaluator = LogOdds::new(space, hue, &f.whitened().unwrap(), &background);
             let first = evaluator.log_odds(image.view());
             for y in 0..2 {
                 for x in 0..width {

@@ -1,11 +1,8 @@
-//! Scores and improves models of one estimator.
+//! The quality of models: losses and inliers over all data, and the noise of the inliers.
 
-use super::sampler::distinct;
-use super::search::{Found, LOCAL_STEPS};
-use super::{Estimator, Score, Scorer};
-use crate::pairs::LANES;
+use super::{BlockOf, Estimator, RansacData, Score, Scorer};
+use crate::match_blocks::LANES;
 use fearless_simd::{Level, dispatch};
-use rand_chacha::ChaCha8Rng;
 
 /// Sum of losses over all blocks, or [`Score::WORST`] as soon as it is certain to exceed `limit`.
 ///
@@ -13,7 +10,7 @@ use rand_chacha::ChaCha8Rng;
 #[inline(always)]
 fn score_blocks<E: Estimator, C: Scorer>(
     kernel: &E::Kernel,
-    blocks: &[E::Block],
+    blocks: &[BlockOf<E>],
     padding: usize,
     scorer: &C,
     inverse_threshold2: f32,
@@ -41,7 +38,7 @@ fn score_blocks<E: Estimator, C: Scorer>(
 
 /// Data with a residual within one over the root of `scale`, half of that, and so on.
 #[inline(always)]
-fn count_blocks<E: Estimator, const N: usize>(kernel: &E::Kernel, blocks: &[E::Block], scale: f32) -> [u32; N] {
+fn count_blocks<E: Estimator, const N: usize>(kernel: &E::Kernel, blocks: &[BlockOf<E>], scale: f32) -> [u32; N] {
     let mut counts = [[0u32; LANES]; N];
     for block in blocks {
         let r2 = E::squared_residuals(kernel, block);
@@ -65,23 +62,18 @@ fn sum(lanes: &[f32; LANES]) -> f32 {
     ((half[0] + half[4]) + (half[1] + half[5])) + ((half[2] + half[6]) + (half[3] + half[7]))
 }
 
-/// Most samples of [`Judge::explore`] on one model.
-const MOST_RESAMPLES: usize = 200;
-/// The factor by which a loss has to fall to count as a better minimum, not a better place in the same one.
-const BETTER: f32 = 0.9999;
-
 /// Scores models of one estimator against its data.
-pub(super) struct Judge<'a, E: Estimator, C: Scorer> {
+pub(super) struct Quality<'a, E: Estimator, C: Scorer> {
     pub(super) estimator: &'a E,
-    scorer: &'a C,
+    pub(super) scorer: &'a C,
     /// In estimator units.
     pub(super) threshold: f64,
     level: Level,
-    inverse_threshold2: f32,
+    pub(super) inverse_threshold2: f32,
     padding: usize,
 }
 
-impl<'a, E: Estimator, C: Scorer> Judge<'a, E, C> {
+impl<'a, E: Estimator, C: Scorer> Quality<'a, E, C> {
     pub(super) fn new(estimator: &'a E, scorer: &'a C, threshold: f64) -> Self {
         Self {
             estimator,
@@ -89,79 +81,22 @@ impl<'a, E: Estimator, C: Scorer> Judge<'a, E, C> {
             threshold,
             level: Level::new(),
             inverse_threshold2: (1.0 / (threshold * threshold)) as f32,
-            padding: estimator.blocks().len() * LANES - estimator.count(),
+            padding: estimator.data().blocks().len() * LANES - estimator.data().count(),
         }
     }
 
     /// The score, or [`Score::WORST`] where the loss is certain to exceed `limit`.
     pub(super) fn score(&self, model: &E::Model, limit: f32) -> Score {
         let kernel = self.estimator.kernel(model);
-        let (blocks, padding, scale) = (self.estimator.blocks(), self.padding, self.inverse_threshold2);
+        let (blocks, padding, scale) = (self.estimator.data().blocks(), self.padding, self.inverse_threshold2);
         dispatch!(self.level, _simd => score_blocks::<E, C>(&kernel, blocks, padding, self.scorer, scale, limit))
     }
 
     /// Data of `blocks` within `reach` thresholds, half of that, and so on.
-    pub(super) fn counts<const N: usize>(&self, model: &E::Model, blocks: &[E::Block], reach: f64) -> [u32; N] {
+    pub(super) fn counts<const N: usize>(&self, model: &E::Model, blocks: &[BlockOf<E>], reach: f64) -> [u32; N] {
         let kernel = self.estimator.kernel(model);
         let scale = self.inverse_threshold2 / (reach * reach) as f32;
         dispatch!(self.level, _simd => count_blocks::<E, N>(&kernel, blocks, scale))
-    }
-
-    /// Local optimization: the model after refinement, where that lowered its loss.
-    pub(super) fn improve(&self, found: &mut Found<E::Model>, iterations: usize) {
-        if let Some(model) = self.estimator.refine(&found.model, self.scorer, self.threshold, iterations) {
-            let score = self.score(&model, found.score.loss);
-            if score.loss < found.score.loss {
-                *found = Found { model, score };
-            }
-        }
-    }
-
-    /// The inner search of LO-RANSAC (Chum, Matas & Kittler, "Locally optimized RANSAC", 2003): samples of the data near the best model, which are
-    /// seldom wrong, until [`Estimator::RESAMPLES`] of them in a row led to nothing better.
-    ///
-    /// A minimal model with one wrong or noisy datum is in the basin of another minimum of the loss. Refinement does not leave it; this does.
-    pub(super) fn explore(&self, best: &mut Found<E::Model>, rng: &mut ChaCha8Rng, models: &mut Vec<E::Model>) {
-        let mut near = self.near(&best.model);
-        let mut left = E::RESAMPLES;
-        let mut limit = f32::INFINITY;
-        for _ in 0..MOST_RESAMPLES {
-            if left == 0 || near.len() <= E::SAMPLE {
-                return;
-            }
-            left -= 1;
-            let mut sample = [0u32; 8];
-            distinct(rng, near.len() as u32, &mut sample[..E::SAMPLE]);
-            sample[..E::SAMPLE].iter_mut().for_each(|i| *i = near[*i as usize]);
-            models.clear();
-            self.estimator.solve(&sample[..E::SAMPLE], models);
-            let mut candidate: Option<Found<E::Model>> = None;
-            for model in models.drain(..) {
-                let score = self.score(&model, limit);
-                if score.loss < limit {
-                    limit = score.loss;
-                    candidate = Some(Found { model, score });
-                }
-            }
-            if let Some(mut candidate) = candidate {
-                self.improve(&mut candidate, LOCAL_STEPS);
-                if candidate.score.loss < best.score.loss {
-                    if candidate.score.loss < BETTER * best.score.loss {
-                        near = self.near(&candidate.model);
-                        left = E::RESAMPLES;
-                    }
-                    *best = candidate;
-                }
-            }
-        }
-    }
-
-    /// Data within twice the threshold.
-    fn near(&self, model: &E::Model) -> Vec<u32> {
-        let kernel = self.estimator.kernel(model);
-        let residuals = self.estimator.blocks().iter().flat_map(|block| E::squared_residuals(&kernel, block));
-        let within = residuals.zip(self.estimator.order()).filter(|(r2, _)| *r2 * self.inverse_threshold2 < 4.0);
-        within.map(|(_, i)| *i).collect()
     }
 
     /// Standard deviation of the residuals of right data in thresholds, by expectation maximization on a mixture of a Gaussian and an even
@@ -171,6 +106,7 @@ impl<'a, E: Estimator, C: Scorer> Judge<'a, E, C> {
         let scale = self.inverse_threshold2;
         let near: Vec<f64> = self
             .estimator
+            .data()
             .blocks()
             .iter()
             .flat_map(|block| E::squared_residuals(&kernel, block))

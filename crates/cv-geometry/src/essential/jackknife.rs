@@ -1,9 +1,9 @@
-//! How far a relative pose can be trusted.
+//! The block jackknife of a relative pose: how far it can be trusted.
 
 use super::refine_relative_pose;
 use crate::epipolar::sampson;
 use crate::essential_from_pose;
-use crate::ransac::{Marginal, Scorer};
+use crate::ransac::{Scorer, TukeyBiweight};
 use cv_core::{Correspondence, Pose};
 use rayon::prelude::*;
 
@@ -25,7 +25,7 @@ pub fn pose_difference(a: &Pose, b: &Pose) -> [f64; 2] {
 /// A covariance from residuals supposes errors that know nothing of each other. Those of a lens that bends rays a little otherwise than
 /// its model says, of leaves in the wind, or of a repeated facade are alike all over a part of the image; where such a part moves
 /// the pose, this tells. `matches` in normalized coordinates, those that agree with `pose`; `threshold` as in [`refine_relative_pose`].
-pub fn pose_stability(pose: &Pose, matches: &[Correspondence], threshold: f64) -> [f64; 2] {
+pub fn jackknife_pose_deviation(pose: &Pose, matches: &[Correspondence], threshold: f64) -> [f64; 2] {
     let mut order: Vec<usize> = (0..matches.len()).collect();
     split(&mut order, matches, BLOCKS);
     let bounds: Vec<usize> = (0..=BLOCKS).map(|k| k * order.len() / BLOCKS).collect();
@@ -67,7 +67,7 @@ pub fn poses_are_rivals(a: &Pose, b: &Pose, matches: &[Correspondence], threshol
     let (ea, eb) = (essential_from_pose(a), essential_from_pose(b));
     let loss = |e, m| {
         let r = sampson(e, m) / threshold;
-        f64::from(Marginal.loss((r * r) as f32))
+        f64::from(TukeyBiweight.loss((r * r) as f32))
     };
     let (sum, squares) = matches.iter().fold((0.0, 0.0), |(s, q), m| {
         let d = loss(&ea, m) - loss(&eb, m);
@@ -86,14 +86,14 @@ mod tests {
     fn the_blocks_tell_of_a_part_that_disagrees() {
         let views = TwoViews::random(3);
         let mut matches = views.normalized_matches(400, 2e-4);
-        let fine = pose_stability(&refine_relative_pose(&views.pose, &matches, 4e-3).0, &matches, 4e-3);
+        let fine = jackknife_pose_deviation(&refine_relative_pose(&views.pose, &matches, 4e-3).0, &matches, 4e-3);
         // A fifth of a pixel at 500 px on 400 points: hundredths of a degree for the rotation, tenths for the direction at most.
         assert!(fine[0] < 2e-3 && fine[1] < 1e-2, "{fine:?}");
         // The left of the image is displaced by one pixel, five times the noise: the lens is not what its model says.
         for m in matches.iter_mut().filter(|m| m.a.x < -0.3) {
             m.b.y += 2e-3;
         }
-        let off = pose_stability(&refine_relative_pose(&views.pose, &matches, 4e-3).0, &matches, 4e-3);
+        let off = jackknife_pose_deviation(&refine_relative_pose(&views.pose, &matches, 4e-3).0, &matches, 4e-3);
         assert!(off[1] > 2.0 * fine[1], "{off:?} {fine:?}");
     }
 

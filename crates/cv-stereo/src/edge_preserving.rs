@@ -1,4 +1,4 @@
-//! Smoothing that stops where the photograph has an edge.
+//! Edge-preserving smoothing, guided by the photograph.
 //!
 //! Two ways. The bilateral one first moves the outlines of things to where the photograph has them: a window that
 //! straddles an outline sees the nearer side of it, so that matching draws things a pixel or two too wide. Then it

@@ -3,7 +3,7 @@
 
 use crate::epipolar::second_epipole;
 use crate::homography::refine_on_plane;
-use crate::pairs::below;
+use crate::match_blocks::below;
 use cv_core::{Matrix3, Vector3};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;

@@ -4,14 +4,14 @@
 //! leaves. Sums are in the order of whole-image passes (window down, then along), so the result is theirs to the last bit.
 
 use crate::harris::CornerMeasure;
-use crate::ring::Ring;
+use crate::line_buffer::LineBuffer;
 use crate::simd;
 use cv_core::ImageView;
 use cv_imgproc::{mirror_ends, mirror_index};
 use fearless_simd::{Level, dispatch, prelude::*};
 
 /// What all strips of an image share.
-pub(crate) struct Structure<'a> {
+pub(crate) struct StructureTensor<'a> {
     pub(crate) view: ImageView<'a, f32, 1>,
     /// The half-kernel of the window.
     pub(crate) kernel: Vec<f32>,
@@ -21,9 +21,9 @@ pub(crate) struct Structure<'a> {
 
 /// Walks down the rows of a strip.
 pub(crate) struct Walk<'a, 'b> {
-    plan: &'b Structure<'a>,
+    plan: &'b StructureTensor<'a>,
     /// Rows of gx², gx·gy, gy².
-    products: [Ring; 3],
+    products: [LineBuffer; 3],
     /// The next row of products.
     next: usize,
     padded: Vec<f32>,
@@ -32,12 +32,12 @@ pub(crate) struct Walk<'a, 'b> {
 
 impl<'a, 'b> Walk<'a, 'b> {
     /// A walk whose first row is `first`.
-    pub(crate) fn new(plan: &'b Structure<'a>, first: usize) -> Self {
+    pub(crate) fn new(plan: &'b StructureTensor<'a>, first: usize) -> Self {
         let w = plan.view.width();
         let r = plan.kernel.len() - 1;
         Self {
             plan,
-            products: [(); 3].map(|()| Ring::new(0..w, 2 * r + 1)),
+            products: [(); 3].map(|()| LineBuffer::new(0..w, 2 * r + 1)),
             next: first.saturating_sub(r),
             padded: vec![0.0; w + 2 * r],
             smooth: [(); 3].map(|()| vec![0.0; w]),

@@ -1,9 +1,9 @@
-//! More matches for photographs taken from very different directions: features of simulated slanted views.
+//! ASIFT (Morel & Yu 2009): more matches for photographs taken from very different directions, by SIFT features of affine-simulated views.
 
 use crate::PhotoFeatures;
 use crate::matching::{MatchingOptions, match_features};
 use cv_core::{DMatch, GrayF32};
-use cv_features::sift_tilted;
+use cv_features::sift_affine_view;
 use std::f32::consts::PI;
 
 /// Tilts that are simulated: with the √2 that SIFT itself bears on either side of each, up to a slant of 80°.
@@ -13,9 +13,9 @@ const STEP: f32 = 0.4 * PI;
 /// Two matches whose ends are nearer than this are the same, in pixels.
 const SAME: f32 = 2.0;
 
-/// Matches the slanted views of each photograph with the other as it is. The features that match are added to the photographs' own, and the matches to
+/// Matches the simulated views of each photograph with the other as it is. The features that match are added to the photographs' own, and the matches to
 /// `matches`, unless they are there already or the other photograph's feature has a match at a smaller distance.
-pub(crate) fn match_slanted(
+pub(crate) fn match_asift(
     photos: [&GrayF32; 2],
     features: &mut [PhotoFeatures; 2],
     matches: &mut Vec<DMatch>,
@@ -28,7 +28,9 @@ pub(crate) fn match_slanted(
             for i in 0..count {
                 let rotation = i as f32 * PI / count as f32;
                 // A view that is too small to look at has nothing to add.
-                let Ok(described) = sift_tilted(photos[side].view(), &options.sift, tilt, rotation) else { continue };
+                let Ok(described) = sift_affine_view(photos[side].view(), &options.sift, tilt, rotation) else {
+                    continue;
+                };
                 let view = PhotoFeatures { described, found: 0, candidates: Vec::new() };
                 // The view asks, the whole photograph answers: among the few features of a view, the second best would be far too often.
                 let Ok(more) = match_features(&view, &plain[1 - side], options) else { continue };

@@ -2,7 +2,7 @@
 
 /// A reusable buffer of `T` whose first element lies on a cache line.
 #[derive(Debug, Default)]
-pub(crate) struct Aligned<T> {
+pub(crate) struct AlignedBuffer<T> {
     data: Vec<T>,
     start: usize,
     len: usize,
@@ -10,7 +10,7 @@ pub(crate) struct Aligned<T> {
 
 const LINE: usize = 64;
 
-impl<T: Copy> Aligned<T> {
+impl<T: Copy> AlignedBuffer<T> {
     /// Makes the buffer `len` long. What it holds is unspecified where it was used before, else `fill`.
     pub(crate) fn resize(&mut self, len: usize, fill: T) {
         let needed = len + LINE / size_of::<T>();

@@ -1,5 +1,6 @@
-//! Correspondences, normalized and laid out for vector units.
+//! Correspondences, normalized and in blocks of lanes for vector units.
 
+use crate::ransac::RansacData;
 use crate::{EstimateError, error::Degeneracy};
 use cv_core::{Correspondence, Matrix3, Point2, Vector3, median};
 use rand_chacha::ChaCha8Rng;
@@ -10,7 +11,7 @@ pub const LANES: usize = 16;
 
 /// [`LANES`] correspondences, coordinate by coordinate. Lanes beyond the last match hold NaN, which fits no model.
 #[derive(Debug, Clone, Copy)]
-pub struct PairBlock {
+pub struct MatchBlock {
     /// x in the first image.
     pub x1: [f32; LANES],
     /// y in the first image.
@@ -54,11 +55,11 @@ impl Normalizer {
 /// The centers are medians and the scale is a median distance, so that a wild match cannot squeeze the others together;
 /// one scale for both images keeps every image distance in proportion to pixels.
 #[derive(Debug, Clone)]
-pub(crate) struct PairSet {
+pub(crate) struct NormalizedMatches {
     /// Normalized, in the caller's order: x1, y1, x2, y2.
     pub(crate) pairs: Vec<[f64; 4]>,
     /// The same, in random order: the first blocks are a fair sample of all matches.
-    pub(crate) blocks: Vec<PairBlock>,
+    pub(crate) blocks: Vec<MatchBlock>,
     /// The place in `pairs` of each lane of `blocks`.
     pub(crate) order: Vec<u32>,
     /// Of the first image.
@@ -67,7 +68,7 @@ pub(crate) struct PairSet {
     pub(crate) second: Normalizer,
 }
 
-impl PairSet {
+impl NormalizedMatches {
     /// Normalizes and checks `matches`.
     pub(crate) fn new(matches: &[Correspondence], needed: usize) -> Result<Self, EstimateError> {
         check(matches, needed)?;
@@ -115,17 +116,32 @@ impl PairSet {
         };
         let blocks = order
             .chunks(LANES)
-            .map(|c| PairBlock { x1: lane(c, 0), y1: lane(c, 1), x2: lane(c, 2), y2: lane(c, 3) })
+            .map(|c| MatchBlock { x1: lane(c, 0), y1: lane(c, 1), x2: lane(c, 2), y2: lane(c, 3) })
             .collect();
         Self { pairs, blocks, order, first, second }
     }
+}
 
-    /// First points with the second ones of other matches.
-    pub(crate) fn wrong(&self, most: usize) -> Vec<PairBlock> {
+impl RansacData for NormalizedMatches {
+    type Block = MatchBlock;
+
+    fn count(&self) -> usize {
+        self.pairs.len()
+    }
+
+    fn blocks(&self) -> &[MatchBlock] {
+        &self.blocks
+    }
+
+    fn order(&self) -> &[u32] {
+        &self.order
+    }
+
+    fn background(&self, most: usize) -> Vec<MatchBlock> {
         let mut pairs = different(self.order.len(), most);
         let mut blocks = Vec::with_capacity(most / LANES + 1);
         while let Some(first) = pairs.next() {
-            let mut block = PairBlock { x1: [0.0; LANES], y1: [0.0; LANES], x2: [0.0; LANES], y2: [0.0; LANES] };
+            let mut block = MatchBlock { x1: [0.0; LANES], y1: [0.0; LANES], x2: [0.0; LANES], y2: [0.0; LANES] };
             for (lane, (i, j)) in std::iter::once(first).chain(pairs.by_ref().take(LANES - 1)).enumerate() {
                 let (a, b) = (&self.pairs[self.order[i] as usize], &self.pairs[self.order[j] as usize]);
                 (block.x1[lane], block.y1[lane]) = (a[0] as f32, a[1] as f32);

@@ -1,12 +1,12 @@
-//! How well a mask agrees with the truth.
+//! The confusion matrix of a mask against the truth, and the scores made of it.
 
 use crate::SegmentError;
 use cv_core::ImageView;
 use std::iter::Sum;
 
-/// Pixels counted by what was said about them and what they are.
+/// Pixels counted by what was said about them and what they are; sums over photographs add up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Scores {
+pub struct ConfusionMatrix {
     /// Marked, rightly.
     pub true_positives: u64,
     /// Marked, wrongly.
@@ -17,7 +17,7 @@ pub struct Scores {
     pub true_negatives: u64,
 }
 
-impl Scores {
+impl ConfusionMatrix {
     /// Counts a mask against the true one.
     ///
     /// # Errors
@@ -62,7 +62,7 @@ fn share(part: u64, whole: u64) -> f64 {
 }
 
 /// Counts of several photos together, so that each pixel weighs the same.
-impl Sum for Scores {
+impl Sum for ConfusionMatrix {
     fn sum<I: Iterator<Item = Self>>(scores: I) -> Self {
         scores.fold(Self::default(), |a, b| Self {
             true_positives: a.true_positives + b.true_positives,
@@ -82,12 +82,12 @@ mod tests {
     fn counted_by_hand() {
         let mask = Mask::from_fn(4, 2, |x, y| [[[true, true, true, false], [false, false, true, false]][y][x]]);
         let truth = Mask::from_fn(4, 2, |x, y| [[[true, true, false, false], [true, false, true, false]][y][x]]);
-        let s = Scores::new(mask.view(), truth.view()).unwrap();
-        assert_eq!(s, Scores { true_positives: 3, false_positives: 1, false_negatives: 1, true_negatives: 3 });
+        let s = ConfusionMatrix::new(mask.view(), truth.view()).unwrap();
+        assert_eq!(s, ConfusionMatrix { true_positives: 3, false_positives: 1, false_negatives: 1, true_negatives: 3 });
         assert_eq!((s.precision(), s.recall(), s.f1(), s.iou()), (0.75, 0.75, 0.75, 0.6));
-        let twice: Scores = [s, s].into_iter().sum();
+        let twice: ConfusionMatrix = [s, s].into_iter().sum();
         assert_eq!((twice.true_negatives, twice.f1()), (6, 0.75));
-        assert_eq!(Scores::default().f1(), 1.0);
-        assert!(Scores::new(mask.view(), Mask::new(2, 4, [true]).view()).is_err());
+        assert_eq!(ConfusionMatrix::default().f1(), 1.0);
+        assert!(ConfusionMatrix::new(mask.view(), Mask::new(2, 4, [true]).view()).is_err());
     }
 }

@@ -1,7 +1,7 @@
-//! The loop.
+//! The RANSAC loop.
 
-use super::judge::Judge;
-use super::{Consensus, Estimator, Marginal, RobustOptions, Sampler, Score, Scorer};
+use super::quality::Quality;
+use super::{Consensus, Estimator, RansacData, RobustOptions, Sampler, Score, Scorer, TukeyBiweight};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use rayon::prelude::*;
@@ -22,14 +22,14 @@ const FINAL_STEPS: usize = 20;
 const BIWEIGHT: f64 = 4.685;
 
 /// A model and how well it fits.
-pub(super) struct Found<M> {
+pub(super) struct ScoredModel<M> {
     pub(super) model: M,
     pub(super) score: Score,
 }
 
 /// The best model of a chunk, and the sample it is made of.
 struct Winner<M> {
-    found: Found<M>,
+    found: ScoredModel<M>,
     sample: [u32; 8],
 }
 
@@ -40,12 +40,12 @@ struct Winner<M> {
 /// Batches grow with the number of samples drawn, and each is judged by what was known before it, so the result does not depend on how it is
 /// spread over threads.
 pub(super) fn search<E: Estimator, C: Scorer, S: Sampler>(
-    judge: &Judge<'_, E, C>,
+    quality: &Quality<'_, E, C>,
     sampler: &mut S,
     options: &RobustOptions,
 ) -> Option<Consensus<E::Model>> {
-    let n = judge.estimator.count();
-    let mut best: Option<Found<E::Model>> = None;
+    let n = quality.estimator.data().count();
+    let mut best: Option<ScoredModel<E::Model>> = None;
     let mut minimal = f32::INFINITY;
     let mut waiting: Vec<Winner<E::Model>> = Vec::new();
     let mut samples = Vec::with_capacity(MOST);
@@ -68,9 +68,9 @@ pub(super) fn search<E: Estimator, C: Scorer, S: Sampler>(
             None => minimal,
         };
         let winners: Vec<Winner<E::Model>> = if n < PARALLEL_FROM && count < MOST {
-            samples.chunks(CHUNK).filter_map(|chunk| best_of(judge, chunk, limit, &mut models)).collect()
+            samples.chunks(CHUNK).filter_map(|chunk| best_of(quality, chunk, limit, &mut models)).collect()
         } else {
-            samples.par_chunks(CHUNK).filter_map(|chunk| best_of(judge, chunk, limit, &mut Vec::new())).collect()
+            samples.par_chunks(CHUNK).filter_map(|chunk| best_of(quality, chunk, limit, &mut Vec::new())).collect()
         };
         for winner in winners {
             if winner.found.score.loss >= minimal {
@@ -82,8 +82,8 @@ pub(super) fn search<E: Estimator, C: Scorer, S: Sampler>(
                 continue;
             }
             minimal = winner.found.score.loss;
-            let mut found = optimized(judge, winner, &mut models);
-            judge.explore(&mut found, &mut rng, &mut models);
+            let mut found = optimized(quality, winner, &mut models);
+            quality.inner_ransac(&mut found, &mut rng, &mut models);
             if best.as_ref().is_none_or(|b| found.score.loss < b.score.loss) {
                 needed = options.needed(found.score.inliers as usize, n, E::SAMPLE).min(most);
                 best = Some(found);
@@ -95,41 +95,41 @@ pub(super) fn search<E: Estimator, C: Scorer, S: Sampler>(
         let searched = |(k, winner): (usize, Winner<E::Model>)| {
             let (mut rng, mut models) = (rng.clone(), Vec::new());
             rng.set_stream(k as u64 + 1);
-            let mut found = optimized(judge, winner, &mut models);
-            judge.explore(&mut found, &mut rng, &mut models);
+            let mut found = optimized(quality, winner, &mut models);
+            quality.inner_ransac(&mut found, &mut rng, &mut models);
             found
         };
-        let others: Vec<Found<E::Model>> = waiting.into_par_iter().enumerate().map(searched).collect();
+        let others: Vec<ScoredModel<E::Model>> = waiting.into_par_iter().enumerate().map(searched).collect();
         for found in others {
             if found.score.loss < best.score.loss {
                 best = found;
             }
         }
     }
-    let model = settle(judge, best, &mut rng, &mut models);
-    let score = judge.score(&model, f32::INFINITY);
+    let model = settle(quality, best, &mut rng, &mut models);
+    let score = quality.score(&model, f32::INFINITY);
     Some(Consensus { model, score, iterations, log_nfa: None })
 }
 
 /// The minimal model or the best of its alternatives, both locally optimized.
 fn optimized<E: Estimator, C: Scorer>(
-    judge: &Judge<'_, E, C>,
+    quality: &Quality<'_, E, C>,
     winner: Winner<E::Model>,
     models: &mut Vec<E::Model>,
-) -> Found<E::Model> {
+) -> ScoredModel<E::Model> {
     let Winner { mut found, sample } = winner;
     models.clear();
-    judge.estimator.alternatives(&found.model, &sample[..E::SAMPLE], judge.threshold, models);
-    judge.improve(&mut found, LOCAL_STEPS);
-    let mut other: Option<Found<E::Model>> = None;
+    quality.estimator.alternatives(&found.model, &sample[..E::SAMPLE], quality.threshold, models);
+    quality.refine_best(&mut found, LOCAL_STEPS);
+    let mut other: Option<ScoredModel<E::Model>> = None;
     for model in models.drain(..) {
-        let score = judge.score(&model, other.as_ref().map_or(f32::INFINITY, |o| o.score.loss));
+        let score = quality.score(&model, other.as_ref().map_or(f32::INFINITY, |o| o.score.loss));
         if other.as_ref().is_none_or(|o| score.loss < o.score.loss) {
-            other = Some(Found { model, score });
+            other = Some(ScoredModel { model, score });
         }
     }
     if let Some(mut other) = other {
-        judge.improve(&mut other, LOCAL_STEPS);
+        quality.refine_best(&mut other, LOCAL_STEPS);
         if other.score.loss < found.score.loss {
             found = other;
         }
@@ -141,26 +141,26 @@ fn optimized<E: Estimator, C: Scorer>(
 /// wrong data that happen to fit and for other minima, large noise loses right data. Twice: a third round changes the model by less than a
 /// tenth of its deviation.
 fn settle<E: Estimator, C: Scorer>(
-    judge: &Judge<'_, E, C>,
-    mut best: Found<E::Model>,
+    quality: &Quality<'_, E, C>,
+    mut best: ScoredModel<E::Model>,
     rng: &mut ChaCha8Rng,
     models: &mut Vec<E::Model>,
 ) -> E::Model {
     // The scale of the last round is the one to converge at.
     for steps in [LOCAL_STEPS, FINAL_STEPS] {
-        let Some(sigma) = judge.noise(&best.model) else {
+        let Some(sigma) = quality.noise(&best.model) else {
             // Too few data for a noise of their own.
-            best.score = judge.score(&best.model, f32::INFINITY);
-            judge.improve(&mut best, FINAL_STEPS);
+            best.score = quality.score(&best.model, f32::INFINITY);
+            quality.refine_best(&mut best, FINAL_STEPS);
             break;
         };
-        let threshold = BIWEIGHT * sigma * judge.threshold / Marginal.cutoff().sqrt();
-        let fine = Judge::new(judge.estimator, &Marginal, threshold);
+        let threshold = BIWEIGHT * sigma * quality.threshold / TukeyBiweight.cutoff().sqrt();
+        let fine = Quality::new(quality.estimator, &TukeyBiweight, threshold);
         best.score = fine.score(&best.model, f32::INFINITY);
-        fine.improve(&mut best, steps);
+        fine.refine_best(&mut best, steps);
         if E::RESAMPLES > 0 {
-            fine.explore(&mut best, rng, models);
-            fine.improve(&mut best, steps);
+            fine.inner_ransac(&mut best, rng, models);
+            fine.refine_best(&mut best, steps);
         }
     }
     best.model
@@ -168,7 +168,7 @@ fn settle<E: Estimator, C: Scorer>(
 
 /// The model of least loss below `limit` of all samples; the earliest of equals.
 fn best_of<E: Estimator, C: Scorer>(
-    judge: &Judge<'_, E, C>,
+    quality: &Quality<'_, E, C>,
     samples: &[[u32; 8]],
     mut limit: f32,
     models: &mut Vec<E::Model>,
@@ -176,12 +176,12 @@ fn best_of<E: Estimator, C: Scorer>(
     let mut best = None;
     for sample in samples {
         models.clear();
-        judge.estimator.solve(&sample[..E::SAMPLE], models);
+        quality.estimator.solve(&sample[..E::SAMPLE], models);
         for model in models.drain(..) {
-            let score = judge.score(&model, limit);
+            let score = quality.score(&model, limit);
             if score.loss < limit {
                 limit = score.loss;
-                best = Some(Winner { found: Found { model, score }, sample: *sample });
+                best = Some(Winner { found: ScoredModel { model, score }, sample: *sample });
             }
         }
     }
