@@ -11,7 +11,8 @@ use frame::Globals;
 /// Classical computer vision: color segmentation, panoramas, two-view reconstruction and stereo depth.
 #[derive(Parser)]
 #[command(name = "cv", version, propagate_version = true, arg_required_else_help = true, max_term_width = 100)]
-#[command(after_help = "Exit codes: 0 done; 1 the job could not be done (the reason is on stderr); 2 wrong usage.\n\
+#[command(after_help = "Exit codes: 0 done; 1 the job could not be done (the reason is on stderr); 2 wrong usage;\n\
+    130 stopped by Ctrl-C.\n\
     `cv COMMAND --help` shows examples of each command.")]
 struct Cli {
     #[command(flatten)]

@@ -1,6 +1,6 @@
 //! `cargo bench -p cv-features`: the stages on a generated 1333×750 image, and matching on generated descriptors.
 
-use cv_core::{GrayF32, Keypoint};
+use cv_core::{GrayF32, Keypoint, Silent};
 use cv_features::{
     DescriptorKind, Descriptors, HarrisOptions, MatchOptions, MopsOptions, SiftOptions, anms, anms_square_covering,
     harris, harris_response, match_descriptors, mops, sift,
@@ -29,7 +29,7 @@ fn detection() {
     let image = image();
     let options = HarrisOptions::default();
     bench("harris_response 1333x750", || harris_response(image.view(), &options));
-    bench("harris 1333x750", || harris(image.view(), &options));
+    bench("harris 1333x750", || harris(image.view(), &options, &Silent));
     let mut state = 1;
     let corners: Vec<Keypoint> = (0..20_000)
         .map(|_| Keypoint::new(1333.0 * random(&mut state), 750.0 * random(&mut state), random(&mut state).powi(3)))
@@ -37,8 +37,8 @@ fn detection() {
     bench("anms 20000 to 500", || anms(&corners, 500, 0.9));
     bench("anms_square_covering 20000 to 500", || anms_square_covering(&corners, 500));
     let (settings, oriented) = (SiftOptions { max_features: 2000, ..SiftOptions::default() }, MopsOptions::default());
-    bench("sift 2000 of 1333x750", || sift(image.view(), &settings));
-    bench("mops 2000 of 1333x750", || mops(image.view(), &oriented));
+    bench("sift 2000 of 1333x750", || sift(image.view(), &settings, &Silent));
+    bench("mops 2000 of 1333x750", || mops(image.view(), &oriented, &Silent));
 }
 
 fn matching() {
@@ -49,7 +49,7 @@ fn matching() {
         let empty = || Descriptors::new(kind);
         let pair = [set(), set()].map(|data| Descriptors::from_vec(kind, data).unwrap_or_else(empty));
         let name = format!("two nearest {count}x{count}x{}", kind.dimension());
-        bench(&name, || match_descriptors(&pair[0], &pair[1], &options));
+        bench(&name, || match_descriptors(&pair[0], &pair[1], &options, &Silent));
     }
 }
 

@@ -7,7 +7,7 @@ use crate::descriptors::Features;
 use crate::error::{FeatureError, check_image};
 use crate::sift::{SMALLEST, SiftOptions, sift};
 use crate::simd;
-use cv_core::{GrayF32, ImageView, OptionError, Point2};
+use cv_core::{GrayF32, ImageView, OptionError, Point2, Progress};
 use cv_imgproc::{Border, RemapOptions, gaussian_half_kernel, mirror_ends, warp_with};
 use rayon::prelude::*;
 
@@ -24,6 +24,7 @@ pub fn sift_affine_view(
     options: &SiftOptions,
     tilt: f32,
     rotation: f32,
+    progress: &dyn Progress,
 ) -> Result<Features, FeatureError> {
     OptionError::check("tilt", tilt.into(), "from 1 to 8", |v| (1.0..=8.0).contains(&v))?;
     OptionError::check("rotation", rotation.into(), "finite", f64::is_finite)?;
@@ -50,7 +51,8 @@ pub fn sift_affine_view(
     let Ok((straight, _)) = straight else {
         return Err(FeatureError::ImageTooSmall { width: w, height: h, needed: SMALLEST });
     };
-    let mut found = sift(compressed(&straight, tilt, width).view(), options)?;
+    progress.report("slanted view", 0, 0)?;
+    let mut found = sift(compressed(&straight, tilt, width).view(), options, progress)?;
     // Areas shrink by the tilt, so lengths by its root.
     let grow = tilt.sqrt();
     let keep: Vec<bool> = found
@@ -95,6 +97,7 @@ fn compressed(image: &GrayF32, tilt: f32, width: usize) -> GrayF32 {
 mod tests {
     use super::*;
     use crate::matching::{MatchOptions, match_descriptors};
+    use cv_core::Silent;
 
     /// Blobs of many sizes at fixed random places of a 300 × 260 plane.
     fn blobs() -> impl Fn(f32, f32) -> f32 {
@@ -128,14 +131,14 @@ mod tests {
         });
         let options = SiftOptions::default();
         let a = if simulated {
-            sift_affine_view(plane.view(), &options, tilt, rotation)
+            sift_affine_view(plane.view(), &options, tilt, rotation, &Silent)
         } else {
-            sift(plane.view(), &options)
+            sift(plane.view(), &options, &Silent)
         };
-        let (a, b) = (a.unwrap(), sift(slanted.view(), &options).unwrap());
+        let (a, b) = (a.unwrap(), sift(slanted.view(), &options, &Silent).unwrap());
         assert_eq!(a.keypoints.len(), a.descriptors.len());
         let options = MatchOptions { mutual: true, ..MatchOptions::default() };
-        let found = match_descriptors(&a.descriptors, &b.descriptors, &options).unwrap();
+        let found = match_descriptors(&a.descriptors, &b.descriptors, &options, &Silent).unwrap();
         let right = found.iter().filter(|m| {
             let (p, q) = (a.keypoints[m.query as usize].position, b.keypoints[m.train as usize].position);
             // Half a pixel of the slanted image is half a tilt along the slant.
@@ -158,20 +161,22 @@ mod tests {
         let f = blobs();
         let image = GrayF32::from_fn(150, 140, |x, y| [f(x as f32, y as f32)]);
         let options = SiftOptions::default();
-        let (tilted, plain) =
-            (sift_affine_view(image.view(), &options, 1.0, 0.0).unwrap(), sift(image.view(), &options).unwrap());
+        let (tilted, plain) = (
+            sift_affine_view(image.view(), &options, 1.0, 0.0, &Silent).unwrap(),
+            sift(image.view(), &options, &Silent).unwrap(),
+        );
         assert_eq!(tilted.descriptors, plain.descriptors);
         for (a, b) in tilted.keypoints.iter().zip(&plain.keypoints) {
             // The angle went through its sine and back.
             assert!(a.position == b.position && a.scale == b.scale && (a.angle - b.angle).abs() < 1e-5, "{a:?} {b:?}");
         }
         for (tilt, rotation) in [(0.5, 0.0), (f32::NAN, 0.0), (2.0, f32::INFINITY)] {
-            let error = sift_affine_view(image.view(), &options, tilt, rotation);
+            let error = sift_affine_view(image.view(), &options, tilt, rotation, &Silent);
             assert!(matches!(error, Err(FeatureError::Option(_))));
         }
         let narrow = GrayF32::new(30, 30, [0.5]);
-        let error = sift_affine_view(narrow.view(), &options, 8.0, 0.0).unwrap_err();
+        let error = sift_affine_view(narrow.view(), &options, 8.0, 0.0, &Silent).unwrap_err();
         assert_eq!(error, FeatureError::ImageTooSmall { width: 4, height: 30, needed: 8 });
-        assert!(sift_affine_view(GrayF32::new(0, 0, [0.0]).view(), &options, 2.0, 0.0).is_err());
+        assert!(sift_affine_view(GrayF32::new(0, 0, [0.0]).view(), &options, 2.0, 0.0, &Silent).is_err());
     }
 }

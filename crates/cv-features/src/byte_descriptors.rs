@@ -2,7 +2,7 @@
 
 use crate::descriptors::{DescriptorKind, Descriptors};
 use crate::matching::{MatchError, MatchOptions, match_descriptors};
-use cv_core::DMatch;
+use cv_core::{DMatch, Progress};
 
 /// Descriptors whose numbers are rounded to bytes, by a scale that belongs to their kind: sets made apart compare.
 ///
@@ -68,13 +68,15 @@ pub fn match_byte_descriptors(
     query: &ByteDescriptors,
     train: &ByteDescriptors,
     options: &MatchOptions,
+    progress: &dyn Progress,
 ) -> Result<Vec<DMatch>, MatchError> {
-    match_descriptors(&query.to_descriptors(), &train.to_descriptors(), options)
+    match_descriptors(&query.to_descriptors(), &train.to_descriptors(), options, progress)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cv_core::Silent;
 
     #[test]
     fn rounding_loses_half_a_step() {
@@ -92,7 +94,7 @@ mod tests {
                 assert!((a - b).abs() < 0.5 * step + 1e-6, "{a} {b}");
             }
             let all = MatchOptions { ratio: None, ..MatchOptions::default() };
-            let found = match_byte_descriptors(&bytes, &bytes, &all).unwrap();
+            let found = match_byte_descriptors(&bytes, &bytes, &all, &Silent).unwrap();
             assert!(found.iter().all(|m| m.distance == 0.0) && found.len() == 9);
         }
         let foreign = Descriptors::new(DescriptorKind::Foreign { dimension: 3 });
@@ -101,7 +103,7 @@ mod tests {
             .map(|kind| ByteDescriptors::new(&Descriptors::from_vec(kind, vec![0.1; 128]).unwrap()).unwrap())
             .into();
         assert!(matches!(
-            match_byte_descriptors(&a, &b, &MatchOptions::default()),
+            match_byte_descriptors(&a, &b, &MatchOptions::default(), &Silent),
             Err(MatchError::KindsDiffer { .. })
         ));
     }

@@ -3,7 +3,7 @@
 use crate::descriptors::{Descriptors, Features};
 use crate::matching::MatchError;
 use crate::nearest_neighbors::ssd;
-use cv_core::{DMatch, Keypoint, OptionError};
+use cv_core::{Cancelled, DMatch, Keypoint, OptionError, Progress, Stage};
 use nalgebra::{Matrix3, Point2, Vector3};
 use rayon::prelude::*;
 
@@ -49,6 +49,7 @@ pub fn match_guided(
     positions: Option<[&[Point2<f32>]; 2]>,
     model: &TwoViewModel,
     options: &GuidedOptions,
+    progress: &dyn Progress,
 ) -> Result<Vec<DMatch>, MatchError> {
     let (da, db) = (&a.descriptors, &b.descriptors);
     if da.kind() != db.kind() {
@@ -70,8 +71,9 @@ pub fn match_guided(
             None => return Ok(Vec::new()),
         },
     };
-    let forth = one_way((da, pa), (db, pb), model, options);
-    let back = one_way((db, pb), (da, pa), &turned, options);
+    let stage = Stage::new(progress, "guided", pa.len() + pb.len())?;
+    let forth = one_way((da, pa), (db, pb), model, options, &stage)?;
+    let back = one_way((db, pb), (da, pa), &turned, options, &stage)?;
     let mutual = |(i, best): (usize, &Option<Best>)| {
         let best = (*best)?;
         let other = back[best.index as usize]?;
@@ -99,7 +101,8 @@ fn one_way(
     (db, pb): (&Descriptors, &[Point2<f32>]),
     model: &TwoViewModel,
     options: &GuidedOptions,
-) -> Vec<Option<Best>> {
+    stage: &Stage<'_>,
+) -> Result<Vec<Option<Best>>, Cancelled> {
     let limit = options.threshold * options.threshold;
     let (TwoViewModel::Homography(m) | TwoViewModel::Fundamental(m)) = model;
     let m: Matrix3<f32> = m.cast::<f32>() * (1.0 / m.norm()) as f32;
@@ -142,13 +145,18 @@ fn one_way(
         let second = near.iter().filter(elsewhere).map(|n| n.1).fold(options.max_ssd, f32::min);
         Some(Best { index, ssd: best, second })
     };
-    (0..pa.len()).into_par_iter().map(one).collect()
+    let asked = |i: usize| {
+        stage.add(1)?;
+        Ok(one(i))
+    };
+    (0..pa.len()).into_par_iter().map(asked).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::descriptors::DescriptorKind;
+    use cv_core::Silent;
 
     fn described(points: &[(f32, f32)], values: &[f32]) -> Features {
         let data = values.iter().flat_map(|&v| std::iter::once(v).chain(std::iter::repeat_n(0.0, 63))).collect();
@@ -168,16 +176,16 @@ mod tests {
         // The best descriptor for the first is on another row; on its own row are two.
         let b = described(&[(90.0, 60.0), (15.0, 20.5), (70.0, 21.0), (5.0, 40.0)], &[0.5, 0.45, 0.0, 0.12]);
         let options = GuidedOptions::default();
-        let found = match_guided(&a, &b, None, &TwoViewModel::Fundamental(f), &options).unwrap();
+        let found = match_guided(&a, &b, None, &TwoViewModel::Fundamental(f), &options, &Silent).unwrap();
         assert_eq!(found.iter().map(|m| (m.query, m.train)).collect::<Vec<_>>(), [(0, 1), (1, 3)]);
         // The same through a shift of 5 px: the second goes elsewhere.
         let h = Matrix3::new(1.0, 0.0, 5.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0);
-        let found = match_guided(&a, &b, None, &TwoViewModel::Homography(h), &options).unwrap();
+        let found = match_guided(&a, &b, None, &TwoViewModel::Homography(h), &options, &Silent).unwrap();
         assert_eq!(found.iter().map(|m| (m.query, m.train)).collect::<Vec<_>>(), [(0, 1)]);
         let strange = Features { descriptors: Descriptors::new(DescriptorKind::Mops), ..a.clone() };
-        let error = match_guided(&strange, &b, None, &TwoViewModel::Homography(h), &options);
+        let error = match_guided(&strange, &b, None, &TwoViewModel::Homography(h), &options, &Silent);
         assert!(matches!(error, Err(MatchError::KindsDiffer { .. })));
-        let nothing = match_guided(&a, &b, None, &TwoViewModel::Homography(Matrix3::zeros()), &options);
+        let nothing = match_guided(&a, &b, None, &TwoViewModel::Homography(Matrix3::zeros()), &options, &Silent);
         assert_eq!(nothing, Ok(vec![]));
     }
 }

@@ -7,7 +7,7 @@ use crate::error::{FeatureError, check_image};
 use crate::line_buffer::LineBuffer;
 use crate::simd;
 use crate::structure_tensor::{StructureTensor, Walk};
-use cv_core::{GrayF32, ImageView, Keypoint, OptionError};
+use cv_core::{Cancelled, GrayF32, ImageView, Keypoint, OptionError, Progress, Stage};
 use cv_imgproc::gaussian_half_kernel;
 use fearless_simd::Level;
 use rayon::prelude::*;
@@ -102,34 +102,49 @@ fn response(plan: &StructureTensor<'_>) -> GrayF32 {
 ///
 /// # Errors
 /// As [`harris_response`].
-pub fn harris(view: ImageView<'_, f32, 1>, options: &HarrisOptions) -> Result<Vec<Keypoint>, FeatureError> {
+pub fn harris(
+    view: ImageView<'_, f32, 1>,
+    options: &HarrisOptions,
+    progress: &dyn Progress,
+) -> Result<Vec<Keypoint>, FeatureError> {
     options.check()?;
     check_image(view, SMALLEST)?;
-    Ok(corners(&options.plan(view, simd::level()), options.threshold))
+    Ok(corners(&options.plan(view, simd::level()), options.threshold, progress)?)
 }
 
 /// Local maxima of the measure of at least a share of the largest, in raster order.
-pub(crate) fn corners(plan: &StructureTensor<'_>, threshold: f32) -> Vec<Keypoint> {
+pub(crate) fn corners(
+    plan: &StructureTensor<'_>,
+    threshold: f32,
+    progress: &dyn Progress,
+) -> Result<Vec<Keypoint>, Cancelled> {
     let h = plan.view.height();
+    let stage = Stage::new(progress, "corners", h)?;
     let rows = rows_of_a_task(h);
     let strips: Vec<(f32, Vec<Keypoint>)> = (0..h.div_ceil(rows))
         .into_par_iter()
-        .map(|i| strip_corners(plan, threshold, i * rows..((i + 1) * rows).min(h)))
-        .collect();
+        .map(|i| strip_corners(plan, threshold, i * rows..((i + 1) * rows).min(h), &stage))
+        .collect::<Result<_, _>>()?;
     let max = strips.iter().fold(0.0f32, |m, s| m.max(s.0));
     let mut corners: Vec<Keypoint> = strips.into_iter().flat_map(|s| s.1).collect();
     corners.retain(|c| c.response >= threshold * max);
-    corners
+    Ok(corners)
 }
 
 /// The largest response of some rows, and their corners above the threshold (against that largest response: a few too many).
-fn strip_corners(plan: &StructureTensor<'_>, threshold: f32, rows: Range<usize>) -> (f32, Vec<Keypoint>) {
+fn strip_corners(
+    plan: &StructureTensor<'_>,
+    threshold: f32,
+    rows: Range<usize>,
+    stage: &Stage<'_>,
+) -> Result<(f32, Vec<Keypoint>), Cancelled> {
     let (w, h) = plan.view.size();
     let (first, last) = (rows.start.saturating_sub(1), (rows.end + 1).min(h));
     let mut walk = Walk::new(plan, first);
     let mut ring = LineBuffer::new(0..w, 3);
     let (mut max, mut seen, mut found) = (0.0f32, Vec::new(), Vec::new());
     for y in first..last {
+        stage.add(usize::from(rows.contains(&y)))?;
         walk.row(y, ring.row_mut(y));
         max = simd::maximum(plan.level, ring.row(y), max);
         if y < first + 2 {
@@ -148,7 +163,7 @@ fn strip_corners(plan: &StructureTensor<'_>, threshold: f32, rows: Range<usize>)
             }
         }
     }
-    (max, found)
+    Ok((max, found))
 }
 
 /// Offset from the middle of the maximum of the quadratic through 3×3 values (least squares for the cross term), each part held to ±0.5.
@@ -174,7 +189,7 @@ pub(crate) fn quadratic_peak(v: [[f32; 3]; 3]) -> (f32, f32) {
 mod tests {
     use super::*;
     use crate::structure_tensor::{harris_at, products_at, smaller_eigenvalue};
-    use cv_core::Image;
+    use cv_core::{Image, Silent};
     use cv_imgproc::gaussian_blur;
     use cv_imgproc::mirror_index;
     use cv_synth::instruction_sets;
@@ -238,7 +253,7 @@ mod tests {
             for level in instruction_sets() {
                 let plan = options.plan(image.view(), level);
                 prop_assert_eq!(&response(&plan), &expected, "{:?}", level);
-                prop_assert_eq!(&corners(&plan, options.threshold), &expected_corners, "{:?}", level);
+                prop_assert_eq!(&corners(&plan, options.threshold, &Silent).unwrap(), &expected_corners, "{:?}", level);
                 // Wherever the image is cut.
                 let mut walk = Walk::new(&plan, h / 2);
                 let mut row = vec![0.0; w];
@@ -254,7 +269,8 @@ mod tests {
             GrayF32::from_fn(40, 30, |x, y| [if (10..25).contains(&x) && (8..20).contains(&y) { 0.8 } else { 0.2 }]);
         for measure in [CornerMeasure::Harris { k: 0.04 }, CornerMeasure::ShiTomasi] {
             let mut corners =
-                harris(image.view(), &HarrisOptions { measure, threshold: 0.1, ..HarrisOptions::default() }).unwrap();
+                harris(image.view(), &HarrisOptions { measure, threshold: 0.1, ..HarrisOptions::default() }, &Silent)
+                    .unwrap();
             corners.sort_by(|a, b| b.response.total_cmp(&a.response));
             // Edges lie half-way between pixels: (9.5, 7.5) to (24.5, 19.5). The Harris maximum of a right angle smoothed by a window of
             // sigma about 1 lies inside the corner by less than that sigma.
@@ -270,21 +286,21 @@ mod tests {
     #[test]
     fn flat_images_have_none_and_bad_ones_are_refused() {
         let options = HarrisOptions::default();
-        assert_eq!(harris(GrayF32::new(20, 20, [0.3]).view(), &options), Ok(vec![]));
+        assert_eq!(harris(GrayF32::new(20, 20, [0.3]).view(), &options, &Silent), Ok(vec![]));
         for (w, h) in [(0, 0), (1, 1), (2, 50), (0, 9)] {
             assert_eq!(
-                harris(GrayF32::new(w, h, [0.5]).view(), &options),
+                harris(GrayF32::new(w, h, [0.5]).view(), &options, &Silent),
                 Err(FeatureError::ImageTooSmall { width: w, height: h, needed: 3 })
             );
         }
         for bad in [f32::NAN, f32::INFINITY] {
             let mut image = GrayF32::new(20, 20, [0.3]);
             image.set(7, 5, [bad]);
-            assert_eq!(harris(image.view(), &options), Err(FeatureError::NotFinite { x: 7, y: 5 }));
+            assert_eq!(harris(image.view(), &options, &Silent), Err(FeatureError::NotFinite { x: 7, y: 5 }));
         }
         let bad = HarrisOptions { window_sigma: f32::NAN, ..options };
         assert!(matches!(
-            harris(Image::new(9, 9, [0.0]).view(), &bad),
+            harris(Image::new(9, 9, [0.0]).view(), &bad, &Silent),
             Err(FeatureError::Option(OptionError { name: "window_sigma", .. }))
         ));
     }

@@ -3,7 +3,7 @@
 //! From two gray images to tentative matches, the classical way:
 //!
 //! ```
-//! use cv_core::GrayF32;
+//! use cv_core::{GrayF32, Silent};
 //! use cv_features::{anms, describe_patches, harris, match_descriptors, HarrisOptions, MatchOptions, PatchOptions};
 //!
 //! // A board of random gray squares, and the same board moved by (3, 2) pixels.
@@ -16,12 +16,12 @@
 //! let (a, b) = (board(0, 0), board(3, 2));
 //! let mut described = Vec::new();
 //! for image in [&a, &b] {
-//!     let corners = harris(image.view(), &HarrisOptions::default())?;
+//!     let corners = harris(image.view(), &HarrisOptions::default(), &Silent)?;
 //!     let spaced: Vec<_> = anms(&corners, 100, 0.9).into_iter().map(|i| corners[i]).collect();
 //!     described.push(describe_patches(image.view(), &spaced, &PatchOptions::default())?);
 //! }
 //! let options = MatchOptions { mutual: true, ..MatchOptions::default() };
-//! for m in match_descriptors(&described[0].descriptors, &described[1].descriptors, &options)? {
+//! for m in match_descriptors(&described[0].descriptors, &described[1].descriptors, &options, &Silent)? {
 //!     let (p, q) = (described[0].keypoints[m.query as usize], described[1].keypoints[m.train as usize]);
 //!     println!("{} -> {}, SSD {}", p.position, q.position, m.distance);
 //! }

@@ -3,7 +3,7 @@
 use crate::descriptors::{DescriptorKind, Descriptors};
 use crate::nearest_neighbors::nearest;
 use crate::simd;
-use cv_core::{Cancelled, DMatch, OptionError};
+use cv_core::{Cancelled, DMatch, OptionError, Progress};
 
 /// Why two sets could not be matched.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
@@ -83,6 +83,7 @@ pub fn match_descriptors(
     query: &Descriptors,
     train: &Descriptors,
     options: &MatchOptions,
+    progress: &dyn Progress,
 ) -> Result<Vec<DMatch>, MatchError> {
     if query.kind() != train.kind() {
         return Err(MatchError::KindsDiffer { query: query.kind(), train: train.kind() });
@@ -96,7 +97,7 @@ pub fn match_descriptors(
     if let Some(ratio) = options.ratio {
         OptionError::check("ratio", ratio.into(), "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
     }
-    let (forward, backward) = nearest(simd::level(), query, train, options.mutual);
+    let (forward, backward) = nearest(simd::level(), query, train, options.mutual, progress)?;
     let mut matches = Vec::new();
     for (i, two) in forward.iter().enumerate() {
         if options.mutual && backward[two.best as usize] as usize != i {
@@ -133,6 +134,7 @@ pub(crate) fn keep_nearest_of_each(matches: &mut Vec<DMatch>, train: usize) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cv_core::Silent;
 
     fn set(rows: &[&[f32]]) -> Descriptors {
         let mut data = Vec::new();
@@ -149,40 +151,40 @@ mod tests {
         let a = set(&[&[0.0, 0.0], &[10.0, 0.0], &[0.2, 0.0]]);
         let b = set(&[&[0.0, 1.0], &[0.0, 3.0], &[10.0, 1.0]]);
         let all = MatchOptions { ratio: None, ..MatchOptions::default() };
-        let found = match_descriptors(&a, &b, &all).unwrap();
+        let found = match_descriptors(&a, &b, &all, &Silent).unwrap();
         assert_eq!(found.iter().map(|m| (m.query, m.train)).collect::<Vec<_>>(), [(0, 0), (1, 2), (2, 0)]);
         assert_eq!((found[0].distance, found[0].ratio), (1.0, 1.0 / 9.0));
         let by_distance = MatchOptions { measure: RatioMeasure::Distance, ..all.clone() };
-        let found = match_descriptors(&a, &b, &by_distance).unwrap();
+        let found = match_descriptors(&a, &b, &by_distance, &Silent).unwrap();
         assert_eq!((found[0].distance, found[0].ratio), (1.0, 1.0 / 3.0));
         let mutual = MatchOptions { mutual: true, ..all.clone() };
-        let found = match_descriptors(&a, &b, &mutual).unwrap();
+        let found = match_descriptors(&a, &b, &mutual, &Silent).unwrap();
         assert_eq!(found.iter().map(|m| (m.query, m.train)).collect::<Vec<_>>(), [(0, 0), (1, 2)]);
         let single = MatchOptions { one_to_one: true, ..all.clone() };
-        assert_eq!(match_descriptors(&a, &b, &single).unwrap(), found);
+        assert_eq!(match_descriptors(&a, &b, &single, &Silent).unwrap(), found);
         let strict = MatchOptions { ratio: Some(0.05), ..MatchOptions::default() };
-        assert_eq!(match_descriptors(&a, &b, &strict).unwrap().len(), 1);
+        assert_eq!(match_descriptors(&a, &b, &strict, &Silent).unwrap().len(), 1);
     }
 
     #[test]
     fn duplicates_and_single_candidates_are_ambiguous() {
         let a = set(&[&[1.0]]);
         let twice = set(&[&[1.0], &[1.0]]);
-        assert_eq!(match_descriptors(&a, &twice, &MatchOptions::default()), Ok(vec![]));
-        assert_eq!(match_descriptors(&a, &a, &MatchOptions::default()), Ok(vec![]));
+        assert_eq!(match_descriptors(&a, &twice, &MatchOptions::default(), &Silent), Ok(vec![]));
+        assert_eq!(match_descriptors(&a, &a, &MatchOptions::default(), &Silent), Ok(vec![]));
         let all = MatchOptions { ratio: None, ..MatchOptions::default() };
         let expected = DMatch { query: 0, train: 0, distance: 0.0, ratio: 1.0 };
-        assert_eq!(match_descriptors(&a, &twice, &all), Ok(vec![expected]));
-        assert_eq!(match_descriptors(&a, &a, &all), Ok(vec![expected]));
+        assert_eq!(match_descriptors(&a, &twice, &all, &Silent), Ok(vec![expected]));
+        assert_eq!(match_descriptors(&a, &a, &all, &Silent), Ok(vec![expected]));
     }
 
     #[test]
     fn what_cannot_be_matched_is_refused() {
         let (a, none) = (set(&[&[1.0]]), set(&[]));
         let options = MatchOptions::default();
-        assert_eq!(match_descriptors(&none, &a, &options), Err(MatchError::Empty { query: 0, train: 1 }));
-        assert_eq!(match_descriptors(&a, &none, &options), Err(MatchError::Empty { query: 1, train: 0 }));
+        assert_eq!(match_descriptors(&none, &a, &options, &Silent), Err(MatchError::Empty { query: 0, train: 1 }));
+        assert_eq!(match_descriptors(&a, &none, &options, &Silent), Err(MatchError::Empty { query: 1, train: 0 }));
         let bad = MatchOptions { ratio: Some(f32::NAN), ..options };
-        assert!(matches!(match_descriptors(&a, &a, &bad), Err(MatchError::Option(_))));
+        assert!(matches!(match_descriptors(&a, &a, &bad, &Silent), Err(MatchError::Option(_))));
     }
 }

@@ -10,7 +10,7 @@ use crate::patch::{SIDE, normalize};
 use crate::pyramid::{FIRST_SIGMA, Pyramid};
 use crate::simd;
 use crate::structure_tensor::StructureTensor;
-use cv_core::{ImageView, Keypoint, OptionError};
+use cv_core::{Cancelled, ImageView, Keypoint, OptionError, Progress, Stage};
 use cv_imgproc::gaussian_half_kernel;
 use rayon::prelude::*;
 
@@ -77,10 +77,14 @@ const WINDOW: f32 = 1.5;
 ///
 /// # Errors
 /// [`FeatureError`] for images below 16×16, samples that are not finite, options out of range.
-pub fn harris_laplace(view: ImageView<'_, f32, 1>, options: &MultiScaleOptions) -> Result<Vec<Keypoint>, FeatureError> {
+pub fn harris_laplace(
+    view: ImageView<'_, f32, 1>,
+    options: &MultiScaleOptions,
+    progress: &dyn Progress,
+) -> Result<Vec<Keypoint>, FeatureError> {
     check(options)?;
     check_image(view, SMALLEST)?;
-    Ok(detect(&Pyramid::new(view, options.layers), options))
+    Ok(detect(&Pyramid::new(view, options.layers, progress)?, options, progress)?)
 }
 
 /// Finds corners at all scales and describes each by an 8×8 patch turned to its direction and sized to its scale; strongest first.
@@ -90,13 +94,17 @@ pub fn harris_laplace(view: ImageView<'_, f32, 1>, options: &MultiScaleOptions) 
 ///
 /// # Errors
 /// As [`harris_laplace`].
-pub fn mops(view: ImageView<'_, f32, 1>, options: &MopsOptions) -> Result<Features, FeatureError> {
+pub fn mops(
+    view: ImageView<'_, f32, 1>,
+    options: &MopsOptions,
+    progress: &dyn Progress,
+) -> Result<Features, FeatureError> {
     check(&options.corners)?;
     check_patches(options)?;
     check_image(view, SMALLEST)?;
-    let pyramid = Pyramid::new(view, options.corners.layers);
-    let found = detect(&pyramid, &options.corners);
-    Ok(describe(&pyramid, view.size(), &found, options))
+    let pyramid = Pyramid::new(view, options.corners.layers, progress)?;
+    let found = detect(&pyramid, &options.corners, progress)?;
+    Ok(describe(&pyramid, view.size(), &found, options, progress)?)
 }
 
 /// Describes given keypoints as [`mops`] does: their scale is used, their angle is replaced (unless `upright`).
@@ -107,12 +115,14 @@ pub fn describe_oriented_patches(
     view: ImageView<'_, f32, 1>,
     keypoints: &[Keypoint],
     options: &MopsOptions,
+    progress: &dyn Progress,
 ) -> Result<Features, FeatureError> {
     check(&options.corners)?;
     check_patches(options)?;
     check_image(view, SMALLEST)?;
     let options = MopsOptions { max_features: usize::MAX, ..options.clone() };
-    Ok(describe(&Pyramid::new(view, options.corners.layers), view.size(), keypoints, &options))
+    let pyramid = Pyramid::new(view, options.corners.layers, progress)?;
+    Ok(describe(&pyramid, view.size(), keypoints, &options, progress)?)
 }
 
 fn check(options: &MultiScaleOptions) -> Result<(), OptionError> {
@@ -132,8 +142,9 @@ fn check_patches(options: &MopsOptions) -> Result<(), OptionError> {
     OptionError::check("min_deviation", options.min_deviation.into(), "0 or more", |v| v >= 0.0 && v.is_finite())
 }
 
-fn detect(pyramid: &Pyramid, options: &MultiScaleOptions) -> Vec<Keypoint> {
+fn detect(pyramid: &Pyramid, options: &MultiScaleOptions, progress: &dyn Progress) -> Result<Vec<Keypoint>, Cancelled> {
     let levels = &pyramid.levels;
+    let stage = Stage::new(progress, "corners", levels.len())?;
     let mut all: Vec<Keypoint> = Vec::new();
     for (i, level) in levels.iter().enumerate() {
         let plan = StructureTensor {
@@ -142,7 +153,7 @@ fn detect(pyramid: &Pyramid, options: &MultiScaleOptions) -> Vec<Keypoint> {
             measure: options.measure,
             level: simd::level(),
         };
-        let found = corners(&plan, options.threshold);
+        let found = corners(&plan, options.threshold, &stage)?;
         // Two gradients to a product, and two products to Harris's measure.
         let power = if matches!(options.measure, CornerMeasure::ShiTomasi) { 2 } else { 4 };
         let gain = level.sigma.powi(power);
@@ -161,16 +172,28 @@ fn detect(pyramid: &Pyramid, options: &MultiScaleOptions) -> Vec<Keypoint> {
             }
             Some(Keypoint { scale, ..Keypoint::new(x, y, gain * corner.response) })
         }));
+        stage.add(1)?;
     }
     let strongest = all.iter().fold(0.0f32, |m, k| m.max(k.response));
     all.retain(|k| k.response >= options.threshold * strongest);
     all.sort_by(|a, b| b.response.total_cmp(&a.response));
-    all
+    Ok(all)
 }
 
-fn describe(pyramid: &Pyramid, size: (usize, usize), keypoints: &[Keypoint], options: &MopsOptions) -> Features {
+fn describe(
+    pyramid: &Pyramid,
+    size: (usize, usize),
+    keypoints: &[Keypoint],
+    options: &MopsOptions,
+    progress: &dyn Progress,
+) -> Result<Features, Cancelled> {
+    let stage = Stage::new(progress, "describe", keypoints.len())?;
+    let asked = |keypoint: &Keypoint| -> Result<_, Cancelled> {
+        stage.add(1)?;
+        Ok(patch(pyramid, size, keypoint, options))
+    };
     let patches: Vec<Result<(f32, Patch), DropReason>> =
-        keypoints.par_iter().with_min_len(32).map(|k| patch(pyramid, size, k, options)).collect();
+        keypoints.par_iter().with_min_len(32).map(asked).collect::<Result<_, _>>()?;
     let mut out = Features {
         keypoints: Vec::new(),
         descriptors: Descriptors::new(DescriptorKind::Mops),
@@ -187,7 +210,7 @@ fn describe(pyramid: &Pyramid, size: (usize, usize), keypoints: &[Keypoint], opt
             }
         }
     }
-    out
+    Ok(out)
 }
 
 type Patch = [f32; SIDE * SIDE];
@@ -235,7 +258,7 @@ fn patch(
 mod tests {
     use super::*;
     use crate::matching::{MatchOptions, match_descriptors};
-    use cv_core::GrayF32;
+    use cv_core::{GrayF32, Silent};
 
     /// A plane of random gray squares of three sizes, with soft edges.
     fn squares(x: f32, y: f32) -> f32 {
@@ -277,9 +300,9 @@ mod tests {
         for laplacian in [true, false] {
             let corners = MultiScaleOptions { laplacian, ..MultiScaleOptions::default() };
             let options = MopsOptions { corners, ..MopsOptions::default() };
-            let (fa, fb) = (mops(a.view(), &options).unwrap(), mops(b.view(), &options).unwrap());
+            let (fa, fb) = (mops(a.view(), &options, &Silent).unwrap(), mops(b.view(), &options, &Silent).unwrap());
             let settings = MatchOptions { mutual: true, ..MatchOptions::default() };
-            let found = match_descriptors(&fa.descriptors, &fb.descriptors, &settings).unwrap();
+            let found = match_descriptors(&fa.descriptors, &fb.descriptors, &settings, &Silent).unwrap();
             let mut right = 0;
             for m in &found {
                 let (p, q) = (fa.keypoints[m.query as usize], fb.keypoints[m.train as usize]);
@@ -300,8 +323,8 @@ mod tests {
     fn all_corners_are_accounted_for() {
         let image = GrayF32::from_fn(220, 200, |x, y| [squares(x as f32, y as f32)]);
         let options = MopsOptions { max_features: 20, ..MopsOptions::default() };
-        let found = harris_laplace(image.view(), &options.corners).unwrap();
-        let described = mops(image.view(), &options).unwrap();
+        let found = harris_laplace(image.view(), &options.corners, &Silent).unwrap();
+        let described = mops(image.view(), &options, &Silent).unwrap();
         assert_eq!(described.keypoints.len(), 20);
         assert_eq!(found.len(), 20 + described.dropped.len() + described.beyond_limit);
         assert!(found.windows(2).all(|k| k[0].response >= k[1].response));
@@ -319,20 +342,23 @@ mod tests {
     #[test]
     fn what_cannot_be_looked_at_is_refused() {
         let options = MopsOptions::default();
-        let flat = mops(GrayF32::new(64, 48, [0.7]).view(), &options).unwrap();
+        let flat = mops(GrayF32::new(64, 48, [0.7]).view(), &options, &Silent).unwrap();
         assert!(flat.keypoints.is_empty() && flat.dropped.is_empty());
         for (w, h) in [(0, 0), (1, 1), (15, 100)] {
-            let error = mops(GrayF32::new(w, h, [0.7]).view(), &options).unwrap_err();
+            let error = mops(GrayF32::new(w, h, [0.7]).view(), &options, &Silent).unwrap_err();
             assert_eq!(error, FeatureError::ImageTooSmall { width: w, height: h, needed: 16 });
         }
         let mut image = GrayF32::new(64, 48, [0.7]);
         image.set(3, 4, [f32::NAN]);
-        assert_eq!(mops(image.view(), &options), Err(FeatureError::NotFinite { x: 3, y: 4 }));
+        assert_eq!(mops(image.view(), &options, &Silent), Err(FeatureError::NotFinite { x: 3, y: 4 }));
         let bad = MopsOptions { window: f32::NAN, ..options.clone() };
         let image = GrayF32::new(64, 48, [0.7]);
-        assert!(matches!(mops(image.view(), &bad), Err(FeatureError::Option(OptionError { name: "window", .. }))));
+        assert!(matches!(
+            mops(image.view(), &bad, &Silent),
+            Err(FeatureError::Option(OptionError { name: "window", .. }))
+        ));
         let wrong = [Keypoint { scale: f32::NAN, ..Keypoint::new(30.0, 30.0, 1.0) }, Keypoint::new(30.0, 20.0, 1.0)];
-        let told = describe_oriented_patches(image.view(), &wrong, &options).unwrap();
+        let told = describe_oriented_patches(image.view(), &wrong, &options, &Silent).unwrap();
         let reasons: Vec<_> = told.dropped.iter().map(|d| d.reason).collect();
         assert!(matches!(reasons[..], [DropReason::NotFinite, DropReason::Flat { .. }]), "{reasons:?}");
     }

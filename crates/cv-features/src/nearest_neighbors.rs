@@ -6,6 +6,7 @@
 //! at distance zero.
 
 use crate::descriptors::Descriptors;
+use cv_core::{Cancelled, Progress, Stage};
 use fearless_simd::{Level, dispatch, prelude::*};
 use rayon::prelude::*;
 
@@ -22,6 +23,8 @@ pub(crate) struct TwoNearest {
 const QUERIES: usize = 6;
 /// Queries of a task: they and a panel fit the second-level cache.
 const TASK: usize = 16 * QUERIES;
+/// Panels that a task goes through without asking whether to go on: some milliseconds.
+const PANELS_UNASKED: usize = 128;
 /// No candidate.
 const NONE: u32 = u32::MAX;
 
@@ -33,8 +36,10 @@ pub(crate) fn nearest(
     query: &Descriptors,
     train: &Descriptors,
     both_ways: bool,
-) -> (Vec<TwoNearest>, Vec<u32>) {
-    dispatch!(level, simd => nearest_impl(simd, query, train, both_ways))
+    progress: &dyn Progress,
+) -> Result<(Vec<TwoNearest>, Vec<u32>), Cancelled> {
+    let stage = Stage::new(progress, "match", query.len().div_ceil(TASK))?;
+    dispatch!(level, simd => nearest_impl(simd, query, train, both_ways, &stage))
 }
 
 #[inline(always)]
@@ -43,12 +48,13 @@ fn nearest_impl<S: Simd>(
     query: &Descriptors,
     train: &Descriptors,
     both_ways: bool,
-) -> (Vec<TwoNearest>, Vec<u32>) {
+    stage: &Stage<'_>,
+) -> Result<(Vec<TwoNearest>, Vec<u32>), Cancelled> {
     // As many sums as the registers of the instruction set hold.
     if S::f32s::LEN >= 16 {
-        blocked::<S, 4>(simd, query, train, both_ways)
+        blocked::<S, 4>(simd, query, train, both_ways, stage)
     } else {
-        blocked::<S, 2>(simd, query, train, both_ways)
+        blocked::<S, 2>(simd, query, train, both_ways, stage)
     }
 }
 
@@ -95,7 +101,8 @@ fn blocked<S: Simd, const V: usize>(
     query: &Descriptors,
     train: &Descriptors,
     both_ways: bool,
-) -> (Vec<TwoNearest>, Vec<u32>) {
+    stage: &Stage<'_>,
+) -> Result<(Vec<TwoNearest>, Vec<u32>), Cancelled> {
     let d = query.dimension();
     let panels = Panels::new(train, V * S::f32s::LEN);
     let tasks: Vec<Task> = query
@@ -103,12 +110,14 @@ fn blocked<S: Simd, const V: usize>(
         .par_chunks(TASK * d)
         .enumerate()
         .map(|(task, rows)| {
-            simd.vectorize(
+            let found = simd.vectorize(
                 #[inline(always)]
-                || block::<S, V>(simd, rows, (task * TASK) as u32, d, train, &panels, both_ways),
-            )
+                || block::<S, V>(simd, rows, (task * TASK) as u32, d, train, &panels, both_ways, stage),
+            )?;
+            stage.add(1)?;
+            Ok(found)
         })
-        .collect();
+        .collect::<Result<_, Cancelled>>()?;
     let mut forward = Vec::with_capacity(query.len());
     let mut backward = vec![(f32::NEG_INFINITY, NONE); if both_ways { train.len() } else { 0 }];
     for (rows, columns) in tasks {
@@ -120,10 +129,11 @@ fn blocked<S: Simd, const V: usize>(
             }
         }
     }
-    (forward, backward.into_iter().map(|b| b.1).collect())
+    Ok((forward, backward.into_iter().map(|b| b.1).collect()))
 }
 
 /// The queries of a task against all panels.
+#[allow(clippy::too_many_arguments)]
 #[inline(always)]
 fn block<S: Simd, const V: usize>(
     simd: S,
@@ -133,7 +143,8 @@ fn block<S: Simd, const V: usize>(
     train: &Descriptors,
     panels: &Panels,
     both_ways: bool,
-) -> Task {
+    stage: &Stage<'_>,
+) -> Result<Task, Cancelled> {
     let n = S::f32s::LEN;
     let wide = panels.wide;
     let count = rows.len() / d;
@@ -160,6 +171,9 @@ fn block<S: Simd, const V: usize>(
     let lanes: Vec<u32> = (0..n as u32).collect();
     let lanes = S::u32s::from_slice(simd, &lanes);
     for (p, panel) in panels.data.chunks_exact(wide * d).enumerate() {
+        if p.is_multiple_of(PANELS_UNASKED) {
+            stage.check()?;
+        }
         let candidates = &panels.half_norms[p * wide..(p + 1) * wide];
         for (g, group) in packed.chunks_exact(QUERIES * d).enumerate() {
             let products = product::<S, V>(simd, group, panel);
@@ -215,7 +229,7 @@ fn block<S: Simd, const V: usize>(
             pick(row, train, firsts.chain(seconds))
         })
         .collect();
-    (two, columns)
+    Ok((two, columns))
 }
 
 /// Six queries times a panel of candidates.
@@ -287,6 +301,7 @@ fn dot(a: &[f32], b: &[f32]) -> f32 {
 mod tests {
     use super::*;
     use crate::descriptors::DescriptorKind;
+    use cv_core::Silent;
     use cv_synth::instruction_sets;
     use proptest::prelude::*;
 
@@ -332,7 +347,7 @@ mod tests {
             let back = plain(&train, &query);
             for level in instruction_sets() {
                 for both_ways in [false, true] {
-                    let (forward, backward) = nearest(level, &query, &train, both_ways);
+                    let (forward, backward) = nearest(level, &query, &train, both_ways, &Silent).unwrap();
                     for (f, e) in forward.iter().zip(&expected) {
                         prop_assert_eq!((f.best as usize, f64::from(f.ssd), f64::from(f.second_ssd)), *e, "{:?}", level);
                     }

@@ -1,8 +1,9 @@
 //! A Gaussian pyramid with several scales per octave, for corners and patches of any size.
 
-use cv_core::{GrayF32, ImageView};
+use cv_core::{Cancelled, GrayF32, ImageView, Progress, Stage};
 use cv_imgproc::gaussian_blur;
 use rayon::prelude::*;
+use std::iter::successors;
 
 /// σ that a photograph comes with, in its pixels (Lowe).
 const CAMERA_SIGMA: f32 = 0.5;
@@ -27,20 +28,29 @@ pub(crate) struct Pyramid {
 }
 
 impl Pyramid {
-    pub(crate) fn new(view: ImageView<'_, f32, 1>, per_octave: usize) -> Self {
+    pub(crate) fn new(
+        view: ImageView<'_, f32, 1>,
+        per_octave: usize,
+        progress: &dyn Progress,
+    ) -> Result<Self, Cancelled> {
+        let sides = successors(Some(view.width().min(view.height())), |side| Some(side.div_ceil(2)));
+        let octaves = 1 + sides.skip(1).take_while(|side| *side >= SMALLEST_SIDE).count();
+        let stage = Stage::new(progress, "pyramid", octaves * per_octave)?;
         let mut levels = Vec::new();
         let mut base = gaussian_blur(view, (FIRST_SIGMA * FIRST_SIGMA - CAMERA_SIGMA * CAMERA_SIGMA).sqrt());
         let mut pixel = 1.0;
         loop {
             let sigma = |i: usize| FIRST_SIGMA * 2f32.powf(i as f32 / per_octave as f32);
-            let from_base =
-                |i: usize| gaussian_blur(base.view(), (sigma(i) * sigma(i) - FIRST_SIGMA * FIRST_SIGMA).sqrt());
-            let next = half(&from_base(per_octave));
-            let further: Vec<GrayF32> = (1..per_octave).map(from_base).collect();
+            let from_base = |i: usize| -> Result<GrayF32, Cancelled> {
+                stage.add(1)?;
+                Ok(gaussian_blur(base.view(), (sigma(i) * sigma(i) - FIRST_SIGMA * FIRST_SIGMA).sqrt()))
+            };
+            let next = half(&from_base(per_octave)?);
+            let further: Vec<GrayF32> = (1..per_octave).map(from_base).collect::<Result<_, _>>()?;
             let images = std::iter::once(base).chain(further);
             levels.extend(images.enumerate().map(|(i, image)| Level { image, pixel, sigma: sigma(i) }));
             if next.width().min(next.height()) < SMALLEST_SIDE {
-                return Self { levels, per_octave };
+                return Ok(Self { levels, per_octave });
             }
             base = next;
             pixel *= 2.0;

@@ -8,16 +8,19 @@
 use crate::dog::{Extremum, REACH, Search, find};
 use crate::line_buffer::LineBuffer;
 use crate::simd;
-use cv_core::{GrayF32, Image, ImageView};
+use cv_core::{Cancelled, GrayF32, Image, ImageView, Progress, Stage};
 use cv_imgproc::{mirror_ends, mirror_index};
 use fearless_simd::Level;
 use rayon::prelude::*;
+use std::iter::successors;
 use std::ops::Range;
 
 /// Columns of a tile: the rows of all scales it needs (about 190 at the usual settings) then take under a megabyte.
 const COLUMNS: usize = 1024;
 /// Rows of a strip, at most: each costs some 30 more at its edges.
 const ROWS: usize = 512;
+/// Rows of a tile that are worked without asking whether to go on: some milliseconds.
+const ROWS_UNASKED: usize = 64;
 /// Octaves end before their shorter side is below this.
 const SMALLEST_SIDE: usize = 12;
 
@@ -138,7 +141,11 @@ struct Strip<'a> {
 }
 
 /// Builds all octaves and finds the extrema of their differences of Gaussians, strongest contrast first.
-pub(crate) fn scale_space(view: ImageView<'_, f32, 1>, search: &Search) -> (Vec<Octave>, Vec<Extremum>) {
+pub(crate) fn scale_space(
+    view: ImageView<'_, f32, 1>,
+    search: &Search,
+    progress: &dyn Progress,
+) -> Result<(Vec<Octave>, Vec<Extremum>), Cancelled> {
     let (dark, bright) = range(view);
     // A flat image has nothing to keep.
     let gain = if bright > dark { 65535.0 / (bright - dark) } else { 0.0 };
@@ -153,6 +160,9 @@ pub(crate) fn scale_space(view: ImageView<'_, f32, 1>, search: &Search) -> (Vec<
     } else {
         (Source::Ready(cv_imgproc::gaussian_blur(view, search.sigma)), 1.0)
     };
+    let halved = |&(w, h): &(usize, usize)| Some((w.div_ceil(2), h.div_ceil(2)));
+    let sizes = successors(Some(source.size()), halved).take_while(|&(w, h)| w.min(h) >= SMALLEST_SIDE);
+    let stage = Stage::new(progress, "scale space", sizes.map(|(w, h)| strips(h) * w.div_ceil(COLUMNS)).sum())?;
     let (mut octaves, mut extrema) = (Vec::new(), Vec::new());
     while source.size().0.min(source.size().1) >= SMALLEST_SIDE {
         let (width, height) = source.size();
@@ -167,7 +177,7 @@ pub(crate) fn scale_space(view: ImageView<'_, f32, 1>, search: &Search) -> (Vec<
             gain,
             level: simd::level(),
         };
-        let (scales, next, found) = octave(&plan);
+        let (scales, next, found) = octave(&plan, &stage)?;
         extrema.extend(found);
         octaves.push(Octave { scales, pixel });
         source = Source::Ready(next);
@@ -177,7 +187,7 @@ pub(crate) fn scale_space(view: ImageView<'_, f32, 1>, search: &Search) -> (Vec<
     extrema.sort_by(|a, b| b.contrast.total_cmp(&a.contrast).then(place(a).cmp(&place(b))));
     // Two pixels may lead to the same extremum.
     extrema.dedup_by(|a, b| place(a) == place(b));
-    (octaves, extrema)
+    Ok((octaves, extrema))
 }
 
 /// The smallest and the largest sample.
@@ -204,15 +214,22 @@ fn range(view: ImageView<'_, f32, 1>) -> (f32, f32) {
     rows.into_iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(a, b), (c, d)| (a.min(c), b.max(d)))
 }
 
-/// One octave: the kept scales, the image the next octave starts from, the extrema.
-fn octave(plan: &Plan<'_>) -> (Vec<Image<u16, 1>>, GrayF32, Vec<Extremum>) {
+/// As many strips for each thread.
+fn strips(height: usize) -> usize {
+    let threads = rayon::current_num_threads();
+    threads * height.div_ceil(threads * ROWS)
+}
+
+/// The kept scales of an octave, the image the next one starts from, the extrema.
+type Worked = (Vec<Image<u16, 1>>, GrayF32, Vec<Extremum>);
+
+/// Works one octave.
+fn octave(plan: &Plan<'_>, stage: &Stage<'_>) -> Result<Worked, Cancelled> {
     let (w, h) = (plan.width, plan.height);
     let mut scales: Vec<Image<u16, 1>> = (0..plan.search.layers).map(|_| Image::new(w, h, [0])).collect();
     let mut next = GrayF32::new(w.div_ceil(2), h.div_ceil(2), [0.0]);
-    // As many strips for each thread, of an even number of rows. The result does not depend on where the cuts are.
-    let threads = rayon::current_num_threads();
-    let strips = threads * h.div_ceil(threads * ROWS);
-    let rows = h.div_ceil(strips).next_multiple_of(2).max(2);
+    // Of an even number of rows. The result does not depend on where the cuts are.
+    let rows = h.div_ceil(strips(h)).next_multiple_of(2).max(2);
     let mut work: Vec<Strip<'_>> = next
         .as_mut_slice()
         .chunks_mut(rows / 2 * w.div_ceil(2))
@@ -229,16 +246,23 @@ fn octave(plan: &Plan<'_>) -> (Vec<Image<u16, 1>>, GrayF32, Vec<Extremum>) {
         .map(|mut strip| {
             let mut found = Vec::new();
             for x0 in (0..w).step_by(COLUMNS) {
-                tile(plan, &mut strip, x0..(x0 + COLUMNS).min(w), &mut found);
+                tile(plan, &mut strip, x0..(x0 + COLUMNS).min(w), &mut found, stage)?;
+                stage.add(1)?;
             }
-            found
+            Ok(found)
         })
-        .collect();
-    (scales, next, found.into_iter().flatten().collect())
+        .collect::<Result<_, Cancelled>>()?;
+    Ok((scales, next, found.into_iter().flatten().collect()))
 }
 
 /// Streams the rows of a tile through all scales.
-fn tile(plan: &Plan<'_>, strip: &mut Strip<'_>, columns: Range<usize>, found: &mut Vec<Extremum>) {
+fn tile(
+    plan: &Plan<'_>,
+    strip: &mut Strip<'_>,
+    columns: Range<usize>,
+    found: &mut Vec<Extremum>,
+    stage: &Stage<'_>,
+) -> Result<(), Cancelled> {
     let (w, h) = (plan.width, plan.height);
     let last = plan.kernels.len();
     let radius = |scale: usize| plan.kernels[scale - 1].len() - 1;
@@ -253,6 +277,9 @@ fn tile(plan: &Plan<'_>, strip: &mut Strip<'_>, columns: Range<usize>, found: &m
     let mut buffer = Buffer::default();
     let end = strip.y1 + REACH + delay[last];
     for step in strip.y0.saturating_sub(halo[0])..end {
+        if step.is_multiple_of(ROWS_UNASKED) {
+            stage.check()?;
+        }
         for i in 0..=last {
             let wanted = strip.y0.saturating_sub(halo[i])..(strip.y1 + halo[i]).min(h);
             let Some(y) = step.checked_sub(delay[i]).filter(|y| wanted.contains(y)) else { continue };
@@ -303,11 +330,13 @@ fn tile(plan: &Plan<'_>, strip: &mut Strip<'_>, columns: Range<usize>, found: &m
             find(&differences, plan.index, plan.search, (w, h), y, columns.clone(), plan.level, found);
         }
     }
+    Ok(())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cv_core::Silent;
 
     fn search(upsample: bool) -> Search {
         Search { layers: 3, sigma: 1.6, upsample, contrast: 5e-4, edge: 10.0 }
@@ -342,7 +371,7 @@ mod tests {
         for (w, h) in [(1100, 430), (61, 500), (40, 13), (13, 40)] {
             let image = noise(w, h);
             let s = search(false);
-            let (octaves, _) = scale_space(image.view(), &s);
+            let (octaves, _) = scale_space(image.view(), &s, &Silent).unwrap();
             let images = plain(cv_imgproc::gaussian_blur(image.view(), s.sigma), &s);
             let (dark, bright) = range(image.view());
             for (kept, whole) in octaves[0].scales.iter().zip(&images[1..]) {
@@ -360,7 +389,7 @@ mod tests {
         for (w, h, upsample) in [(1100, 420, false), (520, 90, true), (45, 300, false)] {
             let image = noise(w, h);
             let s = search(upsample);
-            let (octaves, extrema) = scale_space(image.view(), &s);
+            let (octaves, extrema) = scale_space(image.view(), &s, &Silent).unwrap();
             let first = if upsample {
                 let source = {
                     let even = half_kernel(s.sigma * 0.5);

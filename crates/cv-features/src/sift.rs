@@ -13,7 +13,7 @@ use crate::error::{FeatureError, check_image};
 use crate::gradient_histogram::{DIMENSION, describe, dominant_angles};
 use crate::scale_space::{Octave, scale_space};
 use crate::simd;
-use cv_core::{ImageView, Keypoint, OptionError, Point2};
+use cv_core::{Cancelled, ImageView, Keypoint, OptionError, Point2, Progress, Stage};
 use rayon::prelude::*;
 
 /// Settings of [`sift`].
@@ -67,7 +67,11 @@ pub(crate) const SMALLEST: usize = 8;
 ///
 /// # Errors
 /// [`FeatureError`] for images below 8×8, samples that are not finite, options out of range.
-pub fn sift(view: ImageView<'_, f32, 1>, options: &SiftOptions) -> Result<Features, FeatureError> {
+pub fn sift(
+    view: ImageView<'_, f32, 1>,
+    options: &SiftOptions,
+    progress: &dyn Progress,
+) -> Result<Features, FeatureError> {
     OptionError::check("max_features", options.max_features as f64, "1 or more", |v| v >= 1.0)?;
     OptionError::check("layers", options.layers as f64, "from 1 to 8", |v| (1.0..=8.0).contains(&v))?;
     OptionError::check("sigma", options.sigma.into(), "from 0.8 to 4 px", |v| (0.8..=4.0).contains(&v))?;
@@ -82,7 +86,7 @@ pub fn sift(view: ImageView<'_, f32, 1>, options: &SiftOptions) -> Result<Featur
         contrast: (options.contrast / options.layers as f32).max(1e-5),
         edge: options.edge,
     };
-    let (octaves, mut points) = scale_space(view, &search);
+    let (octaves, mut points) = scale_space(view, &search, progress)?;
     let kind = if options.root { DescriptorKind::RootSift } else { DescriptorKind::Sift };
     let mut out =
         Features { keypoints: Vec::new(), descriptors: Descriptors::new(kind), dropped: Vec::new(), beyond_limit: 0 };
@@ -100,6 +104,7 @@ pub fn sift(view: ImageView<'_, f32, 1>, options: &SiftOptions) -> Result<Featur
     // In the order of the image, so that neighbors find each other's pixels in the cache.
     let mut order: Vec<usize> = (0..points.len()).collect();
     order.sort_unstable_by_key(|&i| (points[i].octave, points[i].row / 16, points[i].column, i));
+    let stage = Stage::new(progress, "describe", order.len())?;
     let mut features: Vec<(usize, Vec<Feature>)> = order
         .into_par_iter()
         .with_min_len(16)
@@ -117,9 +122,10 @@ pub fn sift(view: ImageView<'_, f32, 1>, options: &SiftOptions) -> Result<Featur
                 let norm = normalize(&mut histogram, options.root);
                 (keypoint(point, octave, angle), histogram, norm)
             };
-            (index, angles.into_iter().map(describe).collect())
+            stage.add(1)?;
+            Ok((index, angles.into_iter().map(describe).collect()))
         })
-        .collect();
+        .collect::<Result<_, Cancelled>>()?;
     features.sort_unstable_by_key(|f| f.0);
     for (index, (keypoint, histogram, norm)) in features.into_iter().flat_map(|f| f.1).enumerate() {
         if norm <= 0.0 {
@@ -167,7 +173,7 @@ fn normalize(v: &mut [f32; DIMENSION], root: bool) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cv_core::GrayF32;
+    use cv_core::{GrayF32, Silent};
 
     fn image_of(w: usize, h: usize, f: impl Fn(f32, f32) -> f32) -> GrayF32 {
         GrayF32::from_fn(w, h, |x, y| [f(x as f32, y as f32)])
@@ -181,7 +187,7 @@ mod tests {
         for (x0, y0, s0) in [(60.3f32, 50.7f32, 4.0f32), (70.0, 60.5, 6.0), (64.25, 61.0, 2.5)] {
             let blob =
                 image_of(130, 120, |x, y| 0.1 + 0.8 * (-((x - x0).powi(2) + (y - y0).powi(2)) / (2.0 * s0 * s0)).exp());
-            let found = sift(blob.view(), &SiftOptions::default()).unwrap();
+            let found = sift(blob.view(), &SiftOptions::default(), &Silent).unwrap();
             let best = found.keypoints.iter().min_by(|a, b| {
                 let off = |k: &Keypoint| (k.scale / s0).ln().abs();
                 off(a).total_cmp(&off(b))
@@ -197,16 +203,19 @@ mod tests {
     #[test]
     fn nothing_to_find_and_nothing_to_look_at() {
         let options = SiftOptions::default();
-        let flat = sift(GrayF32::new(64, 48, [0.7]).view(), &options).unwrap();
+        let flat = sift(GrayF32::new(64, 48, [0.7]).view(), &options, &Silent).unwrap();
         assert!(flat.keypoints.is_empty() && flat.dropped.is_empty() && flat.beyond_limit == 0);
         for (w, h) in [(0, 0), (1, 1), (7, 100)] {
-            let error = sift(GrayF32::new(w, h, [0.7]).view(), &options).unwrap_err();
+            let error = sift(GrayF32::new(w, h, [0.7]).view(), &options, &Silent).unwrap_err();
             assert_eq!(error, FeatureError::ImageTooSmall { width: w, height: h, needed: 8 });
         }
         let mut image = GrayF32::new(64, 48, [0.7]);
         image.set(3, 4, [f32::NAN]);
-        assert_eq!(sift(image.view(), &options), Err(FeatureError::NotFinite { x: 3, y: 4 }));
+        assert_eq!(sift(image.view(), &options, &Silent), Err(FeatureError::NotFinite { x: 3, y: 4 }));
         let bad = SiftOptions { layers: 0, ..options };
-        assert!(matches!(sift(image.view(), &bad), Err(FeatureError::Option(OptionError { name: "layers", .. }))));
+        assert!(matches!(
+            sift(image.view(), &bad, &Silent),
+            Err(FeatureError::Option(OptionError { name: "layers", .. }))
+        ));
     }
 }

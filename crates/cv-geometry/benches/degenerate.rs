@@ -3,7 +3,7 @@
 #![allow(missing_docs, reason = "the entry point is criterion's")]
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use cv_core::{Camera, Correspondence};
+use cv_core::{Camera, Correspondence, Silent};
 use cv_geometry::{
     EstimateError, RobustOptions, estimate_fundamental, estimate_homography, estimate_relative_pose, normalize_matches,
 };
@@ -50,13 +50,13 @@ fn bench(c: &mut Criterion) {
     let essential = |m: &[Correspondence]| -> Result<usize, EstimateError> {
         let (m, unit) = normalize_matches(m, &camera, &camera);
         let options = RobustOptions { threshold: unit, ..RobustOptions::essential() };
-        estimate_relative_pose(&m, &options).map(|found| found.inliers.len())
+        estimate_relative_pose(&m, &options, &Silent).map(|found| found.inliers.len())
     };
     let mut group = c.benchmark_group("degenerate");
     group.sample_size(10);
     for (name, m) in inputs() {
-        let homography = |m: &[Correspondence]| estimate_homography(m, &RobustOptions::homography());
-        let fundamental = |m: &[Correspondence]| estimate_fundamental(m, &RobustOptions::fundamental());
+        let homography = |m: &[Correspondence]| estimate_homography(m, &RobustOptions::homography(), &Silent);
+        let fundamental = |m: &[Correspondence]| estimate_fundamental(m, &RobustOptions::fundamental(), &Silent);
         group.bench_function(format!("homography, {name}"), |b| b.iter(|| homography(black_box(&m)).is_ok()));
         group.bench_function(format!("fundamental, {name}"), |b| b.iter(|| fundamental(black_box(&m)).is_ok()));
         group.bench_function(format!("essential, {name}"), |b| b.iter(|| essential(black_box(&m)).is_ok()));

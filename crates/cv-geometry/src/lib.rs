@@ -3,13 +3,13 @@
 //! Takes matches, never images. Robust estimators come in pairs with the plain solvers that they are made of:
 //!
 //! ```
-//! use cv_core::Correspondence;
+//! use cv_core::{Correspondence, Silent};
 //! use cv_geometry::{RobustOptions, estimate_homography, homography_from_points};
 //!
 //! let corners = [(0.0, 0.0), (100.0, 0.0), (100.0, 100.0), (0.0, 100.0), (50.0, 20.0), (30.0, 70.0)];
 //! let matches = corners.map(|(x, y)| Correspondence::new(x, y, 2.0 * x + 5.0, 2.0 * y));
 //! let exact = homography_from_points(&matches)?;
-//! let robust = estimate_homography(&matches, &RobustOptions::homography())?;
+//! let robust = estimate_homography(&matches, &RobustOptions::homography(), &Silent)?;
 //! assert!((exact - robust.model).norm() < 1e-6 && (exact[(0, 0)] - 2.0).abs() < 1e-9);
 //! # Ok::<(), cv_geometry::EstimateError>(())
 //! ```

@@ -8,7 +8,7 @@ use crate::ransac::{Estimator, RobustOptions, Scorer, TukeyBiweight, ransac};
 use crate::robust::RobustModel;
 use crate::rotation::orthonormalized;
 use crate::six_point::fundamental_six_point;
-use cv_core::{Correspondence, Matrix3, Point2, Pose, Vector3};
+use cv_core::{Correspondence, Matrix3, Point2, Pose, Progress, Vector3};
 use cv_numeric::LeastSquares;
 use nalgebra::{SMatrix, SVector};
 
@@ -50,6 +50,7 @@ impl SharedFocalPose {
 pub fn estimate_shared_focal_pose(
     matches: &[Correspondence],
     options: &RobustOptions,
+    progress: &dyn Progress,
 ) -> Result<RobustModel<SharedFocalPose>, EstimateError> {
     options.check()?;
     check(matches, 7)?;
@@ -62,7 +63,7 @@ pub fn estimate_shared_focal_pose(
     if let Some(kind) = point_degeneracy(set.pairs.iter(), 7, 0.0) {
         return Err(EstimateError::Degenerate { kind });
     }
-    let found = ransac(&FocalEstimator { set, scale: 1.0 / size }, options)?;
+    let found = ransac(&FocalEstimator { set, scale: 1.0 / size }, options, progress)?;
     let model = found.model.scaled(size);
     let f = model.fundamental();
     let residual = |m: &SharedFocalPose, pair: &Correspondence| {
@@ -196,6 +197,7 @@ impl Estimator for FocalEstimator {
 mod tests {
     use super::*;
     use crate::testing::TwoViews;
+    use cv_core::Silent;
     use proptest::prelude::*;
 
     /// Relative to the principal point.
@@ -229,7 +231,7 @@ mod tests {
             let mut m = centered(&views, views.matches(60, 0.0));
             let options = RobustOptions { threshold: 1.0, seed, ..RobustOptions::default() };
             let error = |m: &[Correspondence]| {
-                let found = estimate_shared_focal_pose(m, &options).unwrap();
+                let found = estimate_shared_focal_pose(m, &options, &Silent).unwrap();
                 assert!(found.inliers.len() >= 60);
                 (refine_shared_focal_pose(&found.model, m, 1.0).0.focal / 500.0 - 1.0).abs()
             };
@@ -251,7 +253,7 @@ mod tests {
         let views = TwoViews::random(1);
         let options = RobustOptions { threshold: 1.0, ..RobustOptions::default() };
         let good = centered(&views, views.matches(20, 0.0));
-        let get = |m: &[Correspondence]| estimate_shared_focal_pose(m, &options).unwrap_err();
+        let get = |m: &[Correspondence]| estimate_shared_focal_pose(m, &options, &Silent).unwrap_err();
         assert_eq!(get(&good[..6]), EstimateError::NotEnoughMatches { got: 6, needed: 7 });
         assert_eq!(
             get(&[Correspondence::new(0.0, 0.0, 0.0, 0.0); 9]),

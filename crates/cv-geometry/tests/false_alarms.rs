@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
-use cv_core::{Camera, Correspondence, Point2, Point3, Pose, Rotation3, Vector3};
+use cv_core::{Camera, Correspondence, Point2, Point3, Pose, Rotation3, Silent, Vector3};
 use cv_geometry::{
     EstimateError, RobustOptions, estimate_fundamental, estimate_homography, estimate_relative_pose, normalize_matches,
 };
@@ -51,17 +51,17 @@ fn matches(model: Model, seed: u64, wrong: usize, right: usize) -> Vec<Correspon
 fn estimate(model: Model, m: &[Correspondence], seed: u64) -> Result<(Vec<usize>, f64), EstimateError> {
     let found = match model {
         Model::Homography => {
-            let found = estimate_homography(m, &RobustOptions { seed, ..RobustOptions::homography() })?;
+            let found = estimate_homography(m, &RobustOptions { seed, ..RobustOptions::homography() }, &Silent)?;
             (found.inliers, found.log_nfa)
         }
         Model::Fundamental => {
-            let found = estimate_fundamental(m, &RobustOptions { seed, ..RobustOptions::fundamental() })?;
+            let found = estimate_fundamental(m, &RobustOptions { seed, ..RobustOptions::fundamental() }, &Silent)?;
             (found.inliers, found.log_nfa)
         }
         Model::Essential => {
             let (m, unit) = normalize_matches(m, &camera(), &camera());
             let options = RobustOptions { threshold: unit, seed, ..RobustOptions::essential() };
-            let found = estimate_relative_pose(&m, &options)?;
+            let found = estimate_relative_pose(&m, &options, &Silent)?;
             (found.inliers, found.log_nfa)
         }
     };

@@ -155,7 +155,7 @@ fn matches_added_later_are_points_with_their_own_keypoints() {
     let geometry = estimate_two_view_geometry(&views, &scene.known(), &Silent).unwrap();
     let plain = TwoViewAdjustment::new(&views, geometry.clone(), &scene.known(), &Silent).unwrap();
     let mut guided = plain.clone();
-    guided.add_matches(&scene.matches).unwrap();
+    guided.add_matches(&scene.matches, &Silent).unwrap();
     let (before, after) = (plain.finish().unwrap(), guided.finish().unwrap());
     assert_eq!(before.inliers, after.inliers);
     // All right ones, and those of the wrong that lie at the depth of their neighbors by chance.
@@ -164,7 +164,7 @@ fn matches_added_later_are_points_with_their_own_keypoints() {
     assert!(few <= 100 && all >= 190 && within as f64 >= 0.89 * all as f64, "{few} {all} {within}");
     // Fewer than there were are not what was looked for: nothing changes.
     let mut same = TwoViewAdjustment::new(&views, geometry, &scene.known(), &Silent).unwrap();
-    same.add_matches(&scene.matches[..20]).unwrap();
+    same.add_matches(&scene.matches[..20], &Silent).unwrap();
     assert_eq!(same.finish().unwrap().points, before.points);
 }
 

@@ -4,6 +4,7 @@ use std::fs::{self, File};
 use std::io::{self, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
+use crate::pending::Pending;
 use crate::{FormatError, IoError};
 
 /// The largest file that is read into memory: 4 GiB, far above any photograph and below what would take a machine down.
@@ -96,7 +97,7 @@ fn write_atomic_inner(
         use std::os::unix::fs::PermissionsExt;
         builder.permissions(fs::Permissions::from_mode(0o666));
     }
-    let mut temporary = builder.tempfile_in(folder)?;
+    let (mut temporary, pending) = Pending::make(|| builder.tempfile_in(folder), |made| made.path())?;
     let mut sink = BufWriter::with_capacity(1 << 18, temporary.as_file_mut());
     content(&mut sink)?;
     sink.flush()?;
@@ -106,7 +107,7 @@ fn write_atomic_inner(
     }
     // A rename may reach the disk before the bytes do: the good file would be gone and the new one empty.
     temporary.as_file().sync_all()?;
-    temporary.persist(&target).map_err(|e| e.error)?;
+    pending.finish(|| temporary.persist(&target)).map_err(|e| e.error)?;
     Ok(())
 }
 

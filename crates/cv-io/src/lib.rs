@@ -17,7 +17,7 @@
 //!
 //! * What a file is, its content says, not its name.
 //! * Every reader is given untrusted bytes: a lie in a header is an error before memory is asked for, and nothing panics.
-//! * Every writer is atomic ([`write_atomic`]): the whole file, or what was there before.
+//! * Every writer is atomic ([`write_atomic`]): the whole file, or what was there before; several files likewise ([`write_together`]).
 //! * A failure says which file, why, and what to try ([`IoError`]); the same reasons without a path are [`FormatError`].
 //! * Unknown disparity and depth are NaN in memory, whatever the file's own sign for it.
 //!
@@ -43,6 +43,7 @@ mod maps;
 mod matches;
 pub mod npy;
 pub mod npz;
+mod pending;
 pub mod pfm;
 mod picture;
 pub mod ply;
@@ -60,6 +61,7 @@ pub use features::{
 pub use files::{MAX_FILE_BYTES, read_bytes, write_atomic, write_bytes};
 pub use maps::{decode_map, read_map};
 pub use matches::{Matches, parse_matches, read_matches, write_matches};
+pub use pending::{abandon_writes, write_together};
 pub use picture::{
     DEFAULT_MAX_PIXELS, DynImage, Pixels, ReadOptions, decode_image, exif_focal, read_gray_u8, read_image,
     read_image_info, read_image_with, read_mask, read_rgb,

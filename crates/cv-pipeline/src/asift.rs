@@ -2,8 +2,8 @@
 
 use crate::PhotoFeatures;
 use crate::matching::{MatchingOptions, match_features};
-use cv_core::{DMatch, GrayF32};
-use cv_features::sift_affine_view;
+use cv_core::{Cancelled, DMatch, GrayF32, Progress, Stage};
+use cv_features::{FeatureError, MatchError, sift_affine_view};
 use std::f32::consts::PI;
 
 /// Tilts that are simulated: with the √2 that SIFT itself bears on either side of each, up to a slant of 80°.
@@ -20,20 +20,28 @@ pub(crate) fn match_asift(
     features: &mut [PhotoFeatures; 2],
     matches: &mut Vec<DMatch>,
     options: &MatchingOptions,
-) {
+    progress: &dyn Progress,
+) -> Result<(), Cancelled> {
+    let count = |tilt: f32| (PI / (STEP / tilt)).round() as usize;
+    let stage = Stage::new(progress, "slanted views", 2 * TILTS.map(count).iter().sum::<usize>())?;
     let plain = features.clone();
     for side in [0, 1] {
         for tilt in TILTS {
-            let count = (PI / (STEP / tilt)).round() as usize;
-            for i in 0..count {
-                let rotation = i as f32 * PI / count as f32;
+            for i in 0..count(tilt) {
+                let rotation = i as f32 * PI / count(tilt) as f32;
                 // A view that is too small to look at has nothing to add.
-                let Ok(described) = sift_affine_view(photos[side].view(), &options.sift, tilt, rotation) else {
-                    continue;
+                let described = match sift_affine_view(photos[side].view(), &options.sift, tilt, rotation, &stage) {
+                    Err(FeatureError::Cancelled(stop)) => return Err(stop),
+                    Err(_) => continue,
+                    Ok(described) => described,
                 };
                 let view = PhotoFeatures { described, found: 0, candidates: Vec::new() };
                 // The view asks, the whole photograph answers: among the few features of a view, the second best would be far too often.
-                let Ok(more) = match_features(&view, &plain[1 - side], options) else { continue };
+                let more = match match_features(&view, &plain[1 - side], options, &stage) {
+                    Err(MatchError::Cancelled(stop)) => return Err(stop),
+                    Err(_) => continue,
+                    Ok(more) => more,
+                };
                 for m in more {
                     let new = view.described.keypoints[m.query as usize].position;
                     let old = plain[1 - side].described.keypoints[m.train as usize].position;
@@ -51,7 +59,9 @@ pub(crate) fn match_asift(
                     let (query, train) = if side == 0 { (added, m.train) } else { (m.train, added) };
                     matches.push(DMatch { query, train, ..m });
                 }
+                stage.add(1)?;
             }
         }
     }
+    Ok(())
 }

@@ -216,15 +216,16 @@ pub fn depth<T: Intensity, const C: usize>(
     let disparities = (stereo.min_disparity, stereo.disparities);
     let mut matcher = StereoMatcher::new(stereo)?;
     let mut map = DisparityMap::empty();
-    matcher.prepare(left.width(), left.height(), &mut map)?;
+    matcher.prepare(left.width(), left.height(), &mut map, progress)?;
     clock.lap("prepare");
-    progress.report("match", 0, 1)?;
-    matcher.compute_into(left, right, &mut map)?;
+    matcher.compute_into(left, right, &mut map, progress)?;
     clock.lap("match");
     check_pair(&map, left, right, matcher.options(), progress)?;
-    progress.report("match", 1, 1)?;
+    progress.report("depth", 0, 1)?;
     let depth = geometry.map(|geometry| geometry.depth_map(map.disparity.view(), options.range));
-    let (confidence, sigma) = (matcher.confidence(&map), matcher.uncertainty(&map));
+    let confidence = matcher.confidence(&map);
+    progress.report("depth", 0, 1)?;
+    let sigma = matcher.uncertainty(&map);
     clock.lap("depth");
     let geometry = geometry.copied();
     Ok(DepthResult { map, depth, confidence, sigma, disparities, geometry, stages: clock.into_stages() })

@@ -51,12 +51,10 @@ pub fn estimate(
     progress: &dyn Progress,
 ) -> Result<EstimateResult, EstimateError> {
     let mut clock = StageClock::new();
-    progress.report("estimate", 0, 1)?;
     let robust = match kind {
-        ModelKind::Homography => estimate_homography(pairs, options),
-        ModelKind::Fundamental => estimate_fundamental(pairs, options),
+        ModelKind::Homography => estimate_homography(pairs, options, progress),
+        ModelKind::Fundamental => estimate_fundamental(pairs, options, progress),
     }?;
-    progress.report("estimate", 1, 1)?;
     clock.lap("estimate");
     Ok(EstimateResult { robust, stages: clock.into_stages() })
 }
@@ -84,11 +82,9 @@ pub fn estimate_calibrated(
     progress: &dyn Progress,
 ) -> Result<CalibratedResult, EstimateError> {
     let mut clock = StageClock::new();
-    progress.report("estimate", 0, 1)?;
     let (normalized, unit) = normalize_matches(pairs, &cameras[0], &cameras[1]);
-    let found =
-        estimate_relative_pose(&normalized, &RobustOptions { threshold: options.threshold * unit, ..*options })?;
-    progress.report("estimate", 1, 1)?;
+    let options = RobustOptions { threshold: options.threshold * unit, ..*options };
+    let found = estimate_relative_pose(&normalized, &options, progress)?;
     clock.lap("estimate");
     let robust = RobustModel {
         model: essential_from_pose(&found.model),

@@ -31,7 +31,7 @@ impl FrameDepth {
         right: ImageView<'_, T, C>,
         progress: &dyn Progress,
     ) -> Result<&DisparityMap, DepthError> {
-        self.matcher.compute_into(left, right, &mut self.map)?;
+        self.matcher.compute_into(left, right, &mut self.map, progress)?;
         check_pair(&self.map, left, right, self.matcher.options(), progress)?;
         Ok(&self.map)
     }

@@ -1,7 +1,7 @@
 //! Features of photographs, and tentative matches between two of them.
 
 use crate::asift::match_asift;
-use crate::{ModelKind, Progress, Silent, estimate};
+use crate::{ModelKind, Progress, estimate};
 use cv_core::{Cancelled, Correspondence, DMatch, ImageView, Keypoint, Point2, StageClock};
 use cv_features::{
     DescriptorKind, FeatureError, Features, GuidedOptions, HarrisOptions, MatchError, MatchOptions, MopsOptions,
@@ -198,11 +198,15 @@ impl From<MatchError> for MatchingError {
 ///
 /// # Errors
 /// [`FeatureError`] for a photograph smaller than the method's window and for options out of range. One without features is no error here.
-pub fn extract_features(photo: ImageView<'_, u8, 3>, options: &MatchingOptions) -> Result<PhotoFeatures, FeatureError> {
+pub fn extract_features(
+    photo: ImageView<'_, u8, 3>,
+    options: &MatchingOptions,
+    progress: &dyn Progress,
+) -> Result<PhotoFeatures, FeatureError> {
     let gray = rgb_to_gray_f32(photo);
     match options.method {
         FeatureMethod::Harris => {
-            let corners = harris(gray.view(), &options.harris)?;
+            let corners = harris(gray.view(), &options.harris, progress)?;
             let n = options.max_features.unwrap_or(500);
             let spaced = match options.suppression {
                 Suppression::Radius => anms(&corners, n, options.anms_robust),
@@ -219,7 +223,7 @@ pub fn extract_features(photo: ImageView<'_, u8, 3>, options: &MatchingOptions) 
             if let Some(n) = options.max_features {
                 settings.max_features = n;
             }
-            let described = mops(gray.view(), &settings)?;
+            let described = mops(gray.view(), &settings, progress)?;
             Ok(PhotoFeatures { found: accounted(&described), described, candidates: Vec::new() })
         }
         FeatureMethod::Sift => {
@@ -227,7 +231,7 @@ pub fn extract_features(photo: ImageView<'_, u8, 3>, options: &MatchingOptions) 
             if let Some(n) = options.max_features {
                 settings.max_features = n;
             }
-            let described = sift(gray.view(), &settings)?;
+            let described = sift(gray.view(), &settings, progress)?;
             Ok(PhotoFeatures { found: accounted(&described), described, candidates: Vec::new() })
         }
     }
@@ -246,9 +250,10 @@ pub fn match_features(
     a: &PhotoFeatures,
     b: &PhotoFeatures,
     options: &MatchingOptions,
+    progress: &dyn Progress,
 ) -> Result<Vec<DMatch>, MatchError> {
     let settings = MatchOptions { ratio: options.ratio, mutual: options.mutual, ..MatchOptions::default() };
-    match_descriptors(&a.described.descriptors, &b.described.descriptors, &settings)
+    match_descriptors(&a.described.descriptors, &b.described.descriptors, &settings, progress)
 }
 
 /// The positions of matched features, in the order of `matches`.
@@ -273,8 +278,7 @@ pub fn match_photos(
 ) -> Result<MatchingResult, MatchingError> {
     let mut clock = StageClock::new();
     let extract = |photo, index| {
-        progress.report("features", index - 1, 2)?;
-        let features = extract_features(photo, options).map_err(|error| match error {
+        let features = extract_features(photo, options, progress).map_err(|error| match error {
             FeatureError::Cancelled(stop) => stop.into(),
             source => MatchingError::Features { index, source },
         })?;
@@ -286,17 +290,15 @@ pub fn match_photos(
     };
     let mut features = [extract(a, 1)?, extract(b, 2)?];
     clock.lap("features");
-    progress.report("match", 0, 1)?;
-    let mut matches = match_features(&features[0], &features[1], options)?;
+    let mut matches = match_features(&features[0], &features[1], options, progress)?;
     clock.lap("match");
     let affine_simulation = match options.affine_simulation {
         AffineSimulation::Never => false,
-        AffineSimulation::AsNeeded => !explained(&correspondences(&features[0], &features[1], &matches)),
+        AffineSimulation::AsNeeded => !explained(&correspondences(&features[0], &features[1], &matches), progress)?,
         AffineSimulation::Always => true,
     };
     if affine_simulation && options.method == FeatureMethod::Sift {
-        progress.report("slanted views", 0, 1)?;
-        match_asift([&rgb_to_gray_f32(a), &rgb_to_gray_f32(b)], &mut features, &mut matches, options);
+        match_asift([&rgb_to_gray_f32(a), &rgb_to_gray_f32(b)], &mut features, &mut matches, options, progress)?;
         clock.lap("slanted views");
     }
     finish(features, matches, options, progress, clock)
@@ -312,7 +314,7 @@ pub fn match_extracted(
     progress: &dyn Progress,
 ) -> Result<MatchingResult, MatchingError> {
     let mut clock = StageClock::new();
-    let matches = match_features(&features[0], &features[1], options)?;
+    let matches = match_features(&features[0], &features[1], options, progress)?;
     clock.lap("match");
     finish(features, matches, options, progress, clock)
 }
@@ -346,7 +348,7 @@ fn finish(
             };
             let along =
                 GuidedOptions { threshold: kind.options().threshold as f32, max_ssd, ..GuidedOptions::default() };
-            matches = match_guided(&features[0].described, &features[1].described, None, &model, &along)?;
+            matches = match_guided(&features[0].described, &features[1].described, None, &model, &along, progress)?;
         }
         clock.lap("guided");
     }
@@ -354,11 +356,15 @@ fn finish(
 }
 
 /// Whether a homography or a fundamental matrix explains enough of the matches: see [`AffineSimulation::AsNeeded`].
-fn explained(pairs: &[Correspondence]) -> bool {
-    [ModelKind::Homography, ModelKind::Fundamental].into_iter().any(|kind| {
-        let model = estimate(pairs, kind, &kind.options(), &Silent);
-        model.is_ok_and(|m| m.robust.inliers.len() as f64 > 8.0 + 0.3 * pairs.len() as f64)
-    })
+fn explained(pairs: &[Correspondence], progress: &dyn Progress) -> Result<bool, Cancelled> {
+    for kind in [ModelKind::Homography, ModelKind::Fundamental] {
+        match estimate(pairs, kind, &kind.options(), progress) {
+            Ok(m) if m.robust.inliers.len() as f64 > 8.0 + 0.3 * pairs.len() as f64 => return Ok(true),
+            Err(EstimateError::Cancelled(stop)) => return Err(stop),
+            _ => {}
+        }
+    }
+    Ok(false)
 }
 
 /// [`match_photos`] in photographs reduced to a longer side of `max_size` where they are larger, in pixels of the photographs themselves.

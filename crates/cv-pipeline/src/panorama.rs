@@ -4,14 +4,13 @@ use crate::Progress;
 use crate::matching::{
     FeatureMethod, MatchingOptions, PhotoFeatures, correspondences, extract_features, match_features,
 };
-use cv_core::{Camera, Cancelled, Correspondence, Image, ImageView, Mask, Point2, RgbU8, StageClock};
-use cv_features::{DescriptorKind, Descriptors, Features, SiftOptions};
+use cv_core::{Camera, Cancelled, Correspondence, Image, ImageView, Mask, Point2, RgbU8, Stage, StageClock};
+use cv_features::{DescriptorKind, Descriptors, FeatureError, Features, MatchError, SiftOptions};
 use cv_panorama::{
     AlignError, AlignOptions, Alignment, CameraMotion, Canvas, CompositingOptions, NotAPair, Photo, PhotoMap,
     RenderError, Unplaced, VerifiedPair, VerifyOptions, align, render, verify_pair,
 };
 use rayon::prelude::*;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// A photograph and what is known about its camera.
 #[derive(Debug, Clone, Copy)]
@@ -154,21 +153,18 @@ pub fn panorama(
     let n = photos.len();
     let candidates: Vec<(usize, usize)> = (0..n).flat_map(|a| (a + 1..n).map(move |b| (a, b))).collect();
     let mut look = |matching: &MatchingOptions| -> Result<(Vec<Prepared>, Vec<Option<Tried>>), Cancelled> {
-        let done = AtomicUsize::new(0);
-        let tick = |stage, total| progress.report(stage, done.fetch_add(1, Ordering::Relaxed) + 1, total);
-        progress.report("features", 0, n)?;
+        let stage = Stage::new(progress, "features", n)?;
         let extract = |p| -> Result<Prepared, Cancelled> {
-            let prepared = Prepared::new(p, matching, options.registration_pixels);
-            tick("features", n)?;
+            let prepared = Prepared::new(p, matching, options.registration_pixels, &stage)?;
+            stage.add(1)?;
             Ok(prepared)
         };
         let prepared: Vec<Prepared> = photos.par_iter().map(extract).collect::<Result<_, _>>()?;
         clock.lap("features");
-        done.store(0, Ordering::Relaxed);
-        progress.report("match", 0, candidates.len())?;
+        let stage = Stage::new(progress, "match", candidates.len())?;
         let compare = |&(a, b): &(usize, usize)| -> Result<Option<Tried>, Cancelled> {
-            let pair = try_pair(&prepared, a, b, options);
-            tick("match", candidates.len())?;
+            let pair = try_pair(&prepared, a, b, options, &stage)?;
+            stage.add(1)?;
             Ok(pair)
         };
         let tried = candidates.par_iter().map(compare).collect::<Result<_, _>>()?;
@@ -239,7 +235,12 @@ struct Prepared {
 }
 
 impl Prepared {
-    fn new(p: &PanoramaPhoto<'_>, matching: &MatchingOptions, registration_pixels: usize) -> Self {
+    fn new(
+        p: &PanoramaPhoto<'_>,
+        matching: &MatchingOptions,
+        registration_pixels: usize,
+        progress: &dyn Progress,
+    ) -> Result<Self, Cancelled> {
         let (w, h) = p.image.size();
         let factor = ((w * h) as f64 / registration_pixels.max(10_000) as f64).sqrt().max(1.0);
         let none = || PhotoFeatures {
@@ -258,14 +259,15 @@ impl Prepared {
             Some(small) => (small.view(), w as f64 / size.0 as f64),
             None => (p.image, 1.0),
         };
-        let (features, failure) = match extract_features(image, matching) {
+        let (features, failure) = match extract_features(image, matching, progress) {
             Ok(features) => (features, None),
+            Err(FeatureError::Cancelled(stop)) => return Err(stop),
             Err(error) => (none(), Some(error.to_string())),
         };
         let (width, height) = image.size();
         let camera = p.camera.map(|c| Camera { width, height, ..c.scaled(1.0 / factor) });
         let photo = Photo { width, height, focal: p.focal.map(|f| f / factor), camera };
-        Self { photo, factor, features, failure }
+        Ok(Self { photo, factor, features, failure })
     }
 }
 
@@ -288,9 +290,19 @@ fn held_firmly(n: usize, tried: &[Option<Tried>]) -> bool {
 }
 
 /// Matches and verifies a pair; `None` where one has no features.
-fn try_pair(prepared: &[Prepared], a: usize, b: usize, options: &PanoramaOptions) -> Option<Tried> {
+fn try_pair(
+    prepared: &[Prepared],
+    a: usize,
+    b: usize,
+    options: &PanoramaOptions,
+    progress: &dyn Progress,
+) -> Result<Option<Tried>, Cancelled> {
     let (p, q) = (&prepared[a], &prepared[b]);
-    let found = match_features(&p.features, &q.features, &options.matching).ok()?;
+    let found = match match_features(&p.features, &q.features, &options.matching, progress) {
+        Ok(found) => found,
+        Err(MatchError::Cancelled(stop)) => return Err(stop),
+        Err(_) => return Ok(None),
+    };
     let matches = correspondences(&p.features, &q.features, &found);
     let size = |p: &Prepared| (p.photo.width, p.photo.height);
     let verified = verify_pair((a, size(p)), (b, size(q)), &matches, &options.verify);
@@ -307,7 +319,7 @@ fn try_pair(prepared: &[Prepared], a: usize, b: usize, options: &PanoramaOptions
         Ok(pair) => (Some(pair), None),
         Err(reason) => (None, Some(reason)),
     };
-    Some((PanoramaPair { a, b, matches, inliers, rejected }, verified))
+    Ok(Some((PanoramaPair { a, b, matches, inliers, rejected }, verified)))
 }
 
 /// What to tell about each photograph.

@@ -41,12 +41,10 @@ pub fn rectify(
     progress: &dyn Progress,
 ) -> Result<RectifyResult, RectifyError> {
     let mut clock = StageClock::new();
-    progress.report("rectify", 0, 2)?;
     let rectification = Rectification::new(rig, options)?;
-    let (left, mask_left) = rectification.left.apply(left)?;
-    let (right, mask_right) = rectification.right.apply(right)?;
+    let (left, mask_left) = rectification.left.apply(left, progress)?;
+    let (right, mask_right) = rectification.right.apply(right, progress)?;
     clock.lap("rectify");
-    progress.report("rectify", 1, 2)?;
     // A pair without features is rectified all the same; only its quality stays unknown.
     let pairs = match match_reduced([left.view(), right.view()], LARGEST, &MatchingOptions::default(), progress) {
         Ok(found) => found.pairs(),
@@ -63,7 +61,6 @@ pub fn rectify(
     let quantiles = median(&mut rows).zip(quantile(&mut rows, 0.95));
     let vertical_px = quantiles.filter(|_| rows.len() >= 8 && fault.is_none());
     clock.lap("quality");
-    progress.report("rectify", 2, 2)?;
     let share = |mask: &Mask| {
         let m = mask.as_slice();
         m.iter().filter(|&&v| v).count() as f64 / m.len().max(1) as f64

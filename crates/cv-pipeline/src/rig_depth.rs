@@ -30,10 +30,8 @@ pub fn depth_by_rig<T: Intensity + Pixel, const C: usize>(
     progress: &dyn Progress,
 ) -> Result<RigDepthResult, DepthError> {
     let mut clock = StageClock::new();
-    progress.report("rectify", 0, 2)?;
-    let (left, _) = rectification.left.apply(left)?;
-    progress.report("rectify", 1, 2)?;
-    let (right, _) = rectification.right.apply(right)?;
+    let (left, _) = rectification.left.apply(left, progress)?;
+    let (right, _) = rectification.right.apply(right, progress)?;
     clock.lap("rectify");
     let mut maps = depth(left.view(), right.view(), Some(&rectification.geometry), options, progress)?;
     maps.stages.iter().for_each(|(stage, seconds)| clock.add(stage, *seconds));

@@ -1,7 +1,7 @@
 //! Finding an object by its color: train on photographs with masks, then mark it in others.
 
 use crate::Progress;
-use cv_core::{ImageView, Mask, StageClock};
+use cv_core::{Cancelled, ImageView, Mask, StageClock};
 use cv_segment::{ColorModel, Labeled, SegmentError, TrainOptions, Trained, train};
 
 /// What [`train_segment`] learned.
@@ -34,23 +34,28 @@ pub fn train_segment(
     progress: &dyn Progress,
 ) -> Result<SegmentTraining, SegmentError> {
     let mut clock = StageClock::new();
-    progress.report("train", 0, 1)?;
-    let trained = train(photos, options)?;
-    progress.report("train", 1, 1)?;
+    let trained = train(photos, options, progress)?;
     clock.lap("train");
     Ok(SegmentTraining { trained, stages: clock.into_stages() })
 }
 
 /// Marks the object in a photograph.
-pub fn segment(photo: ImageView<'_, u8, 3>, model: &ColorModel) -> SegmentResult {
+///
+/// # Errors
+/// [`Cancelled`].
+pub fn segment(
+    photo: ImageView<'_, u8, 3>,
+    model: &ColorModel,
+    progress: &dyn Progress,
+) -> Result<SegmentResult, Cancelled> {
     let mut clock = StageClock::new();
-    let raw = model.classify(photo);
+    let raw = model.classify(photo, progress)?;
     clock.lap("classify");
-    let mask = model.cleanup().apply(raw.view());
+    let mask = model.cleanup().apply(raw.view(), progress)?;
     clock.lap("clean up");
     let marked = mask.as_slice().iter().filter(|&&m| m).count();
     let fraction = marked as f64 / mask.as_slice().len().max(1) as f64;
-    SegmentResult { mask, fraction, stages: clock.into_stages() }
+    Ok(SegmentResult { mask, fraction, stages: clock.into_stages() })
 }
 
 #[cfg(test)]
@@ -73,7 +78,9 @@ mod tests {
                 let model = train_segment(&half(0), &options, &Silent).unwrap().trained.model;
                 let scores: ConfusionMatrix = half(1)
                     .iter()
-                    .map(|(photo, mask)| ConfusionMatrix::new(segment(*photo, &model).mask.view(), *mask).unwrap())
+                    .map(|(photo, mask)| {
+                        ConfusionMatrix::new(segment(*photo, &model, &Silent).unwrap().mask.view(), *mask).unwrap()
+                    })
                     .sum();
                 // The bar for generated scenes.
                 assert!(scores.f1() >= 0.97, "seed {seed}, {space:?}: {} {scores:?}", scores.f1());
@@ -87,9 +94,9 @@ mod tests {
         let mask = Mask::from_fn(8, 8, |x, _| [x < 4]);
         let model =
             train_segment(&[(photo.view(), mask.view())], &TrainOptions::default(), &Silent).unwrap().trained.model;
-        let result = segment(RgbU8::new(0, 0, [0; 3]).view(), &model);
+        let result = segment(RgbU8::new(0, 0, [0; 3]).view(), &model, &Silent).unwrap();
         assert!(result.mask.is_empty() && result.fraction == 0.0);
-        let one = segment(RgbU8::new(1, 1, [200, 90, 20]).view(), &model);
+        let one = segment(RgbU8::new(1, 1, [200, 90, 20]).view(), &model, &Silent).unwrap();
         assert_eq!((one.mask.at(0, 0), one.fraction), ([true], 1.0));
     }
 }

@@ -129,7 +129,7 @@ fn a_ball_is_found_by_its_color() {
             .iter()
             .skip(1)
             .step_by(2)
-            .map(|p| MaskScore::new(&segment(p.view.image.view(), &model).mask, &p.mask).unwrap())
+            .map(|p| MaskScore::new(&segment(p.view.image.view(), &model, &Silent).unwrap().mask, &p.mask).unwrap())
             .fold(MaskScore::default(), MaskScore::plus);
         println!("seed {seed}: F1 {:.4}", score.f1());
         assert!(score.f1() >= 0.97, "seed {seed}: {} {score:?}", score.f1());

@@ -5,7 +5,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
-use cv_core::{Camera, Pose};
+use cv_core::{Camera, Pose, Silent};
 use cv_stereo::{DisparityMap, PixelState, StereoError, StereoMatcher, StereoOptions};
 use cv_synth::{RenderOptions, Scene, SceneBuilder, StereoPair, Texture, srgb, stereo_pair};
 use nalgebra::Point3;
@@ -18,7 +18,7 @@ fn camera() -> Camera {
 
 fn matched(left: &StereoPair, right: &StereoPair) -> DisparityMap {
     let options = StereoOptions { disparities: 96, ..StereoOptions::default() };
-    StereoMatcher::new(options).unwrap().compute(left.left.image.view(), right.right.image.view()).unwrap()
+    StereoMatcher::new(options).unwrap().compute(left.left.image.view(), right.right.image.view(), &Silent).unwrap()
 }
 
 /// A room with a baseline of 20 cm and a table with one of 6 cm, so that both have about 50 px of disparity.
@@ -79,7 +79,7 @@ fn errors_are_as_large_as_the_stated_uncertainty() {
         let other = RenderOptions { exposure: -1.0, ..RenderOptions::default().with_seed(99) };
         let other = stereo_pair(&scene, &camera, &pose, baseline, &other).unwrap();
         let mut matcher = StereoMatcher::new(StereoOptions { disparities: 96, ..StereoOptions::default() }).unwrap();
-        let map = matcher.compute(pair.left.image.view(), other.right.image.view()).unwrap();
+        let map = matcher.compute(pair.left.image.view(), other.right.image.view(), &Silent).unwrap();
         let sigma = matcher.uncertainty(&map);
         for (y, x) in (0..480).flat_map(|y| (0..640).map(move |x| (y, x))).filter(|&(y, x)| pair.visible.at(x, y)[0]) {
             let (sigma, error) = (sigma.at(x, y)[0], (map.disparity.at(x, y)[0] - pair.disparity.at(x, y)[0]).abs());
@@ -110,7 +110,7 @@ fn strips_of_rows_take_less_memory_and_hardly_change_the_result() {
         let mut matcher =
             StereoMatcher::new(StereoOptions { max_memory: Some(all * 11 / 20), ..options.clone() }).unwrap();
         assert!(matcher.memory(640, 480) <= all * 11 / 20);
-        let strips = matcher.compute(pair.left.image.view(), pair.right.image.view()).unwrap();
+        let strips = matcher.compute(pair.left.image.view(), pair.right.image.view(), &Silent).unwrap();
         let pairs = whole.disparity.as_slice().iter().zip(strips.disparity.as_slice());
         let differ = pairs.filter(|(a, b)| a.is_nan() != b.is_nan() || (**a - **b).abs() > 0.5).count();
         println!("{name}: {differ} pixels differ");
@@ -118,7 +118,7 @@ fn strips_of_rows_take_less_memory_and_hardly_change_the_result() {
         assert!(differ * 1000 <= 640 * 480, "{name}: {differ}");
         let refused = StereoMatcher::new(StereoOptions { max_memory: Some(all / 10), ..options }).unwrap();
         assert!(matches!(
-            { refused }.compute(pair.left.image.view(), pair.right.image.view()),
+            { refused }.compute(pair.left.image.view(), pair.right.image.view(), &Silent),
             Err(StereoError::Memory { .. })
         ));
     }

@@ -1,6 +1,6 @@
 //! What turns marked pixels into regions.
 
-use cv_core::{ImageView, Mask};
+use cv_core::{Cancelled, ImageView, Mask, Progress, Stage};
 use cv_imgproc::{Connectivity, StructuringElement, close, connected_components, largest_component, open};
 use serde::{Deserialize, Serialize};
 
@@ -24,18 +24,24 @@ impl Default for Cleanup {
 
 impl Cleanup {
     /// Cleans up a mask.
-    pub fn apply(&self, mask: ImageView<'_, bool, 1>) -> Mask {
+    ///
+    /// # Errors
+    /// [`Cancelled`].
+    pub fn apply(&self, mask: ImageView<'_, bool, 1>, progress: &dyn Progress) -> Result<Mask, Cancelled> {
+        let stage = Stage::new(progress, "clean up", 3)?;
         let opened = if self.open_radius > 0 {
             open(mask, &StructuringElement::disc(self.open_radius))
         } else {
             mask.to_image()
         };
+        stage.add(1)?;
         let closed = if self.close_radius > 0 {
             close(opened.view(), &StructuringElement::disc(self.close_radius))
         } else {
             opened
         };
-        if self.largest { largest_component(closed.view(), Connectivity::Eight) } else { closed }
+        stage.add(1)?;
+        Ok(if self.largest { largest_component(closed.view(), Connectivity::Eight) } else { closed })
     }
 }
 
@@ -50,6 +56,7 @@ pub(crate) fn largest_share(mask: ImageView<'_, bool, 1>) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cv_core::Silent;
 
     #[test]
     fn specks_go_gaps_close_and_the_largest_stays() {
@@ -59,12 +66,12 @@ mod tests {
             [(disc(x, y, 15.0, 15.0, 8.0) && (x, y) != (15, 15)) || disc(x, y, 45.0, 15.0, 5.0) || (x, y) == (30, 3)]
         });
         // Opening first would widen the hole.
-        let cleaned = Cleanup { open_radius: 0, ..Default::default() }.apply(mask.view());
+        let cleaned = Cleanup { open_radius: 0, ..Default::default() }.apply(mask.view(), &Silent).unwrap();
         assert!(cleaned.at(15, 15)[0] && cleaned.at(45, 15)[0] && cleaned.at(30, 3)[0]);
-        let cleaned = Cleanup { largest: true, ..Default::default() }.apply(mask.view());
+        let cleaned = Cleanup { largest: true, ..Default::default() }.apply(mask.view(), &Silent).unwrap();
         assert!(cleaned.at(15, 12)[0] && !cleaned.at(45, 15)[0] && !cleaned.at(30, 3)[0]);
         let none = Cleanup { open_radius: 0, close_radius: 0, largest: false };
-        assert_eq!(none.apply(mask.view()), mask);
+        assert_eq!(none.apply(mask.view(), &Silent).unwrap(), mask);
         // 316 pixels of 398 or so: the first disc holds most, not all.
         let share = largest_share(mask.view());
         assert!(share > 0.6 && share < 0.8);
@@ -75,7 +82,7 @@ mod tests {
     fn nothing_stays_nothing() {
         for size in [(0, 0), (1, 1), (0, 9)] {
             let mask = Mask::new(size.0, size.1, [true]);
-            assert_eq!(Cleanup { largest: true, ..Default::default() }.apply(mask.view()), mask);
+            assert_eq!(Cleanup { largest: true, ..Default::default() }.apply(mask.view(), &Silent).unwrap(), mask);
         }
     }
 }

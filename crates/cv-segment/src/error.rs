@@ -37,7 +37,7 @@ pub enum SegmentError {
     Option(#[from] OptionError),
     /// A mixture could not be fitted, or a loaded one is not one.
     #[error(transparent)]
-    Mixture(#[from] MixtureError),
+    Mixture(MixtureError),
     /// A model was written by another version.
     #[error("the model has {}; this program reads schema {known}: train it again", found.map_or("no schema".to_owned(), |s| format!("schema {s}")))]
     Schema {
@@ -49,4 +49,13 @@ pub enum SegmentError {
     /// The job was stopped by its progress callback.
     #[error("stopped")]
     Cancelled(#[from] Cancelled),
+}
+
+impl From<MixtureError> for SegmentError {
+    fn from(error: MixtureError) -> Self {
+        match error {
+            MixtureError::Cancelled(stop) => Self::Cancelled(stop),
+            other => Self::Mixture(other),
+        }
+    }
 }

@@ -1,7 +1,7 @@
 //! Finding an object by its color: Gaussian and mixture models of object and background, posterior odds, clean-up, and scores.
 //!
 //! ```
-//! use cv_core::{Mask, RgbU8};
+//! use cv_core::{Mask, RgbU8, Silent};
 //! use cv_segment::{ConfusionMatrix, TrainOptions, train};
 //!
 //! // An orange square on gray.
@@ -9,8 +9,8 @@
 //! let photo = RgbU8::from_fn(64, 48, |x, y| if inside(x, y) { [230, 110, 30 + x as u8] } else { [90, 90, 80 + y as u8] });
 //! let mask = Mask::from_fn(64, 48, |x, y| [inside(x, y)]);
 //!
-//! let trained = train(&[(photo.view(), mask.view())], &TrainOptions::default())?;
-//! let found = trained.model.predict(photo.view());
+//! let trained = train(&[(photo.view(), mask.view())], &TrainOptions::default(), &Silent)?;
+//! let found = trained.model.predict(photo.view(), &Silent)?;
 //! assert!(ConfusionMatrix::new(found.view(), mask.view())?.f1() > 0.97);
 //! # Ok::<(), cv_segment::SegmentError>(())
 //! ```

@@ -4,7 +4,7 @@
 //! give the same bytes.
 
 use crate::{ColorSpace, mixture::Whitened};
-use cv_core::{GrayF32, ImageView};
+use cv_core::{Cancelled, GrayF32, ImageView, Progress, Stage};
 use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 use std::f32::consts::{PI, TAU};
@@ -50,22 +50,30 @@ impl LogOdds {
     }
 
     /// Natural logarithm of the ratio of the densities at each pixel.
-    pub(crate) fn log_odds(&self, view: ImageView<'_, u8, 3>) -> GrayF32 {
-        self.log_odds_at(Level::new(), view)
+    pub(crate) fn log_odds(&self, view: ImageView<'_, u8, 3>, progress: &dyn Progress) -> Result<GrayF32, Cancelled> {
+        self.log_odds_at(Level::new(), view, progress)
     }
 
-    fn log_odds_at(&self, level: Level, view: ImageView<'_, u8, 3>) -> GrayF32 {
+    fn log_odds_at(
+        &self,
+        level: Level,
+        view: ImageView<'_, u8, 3>,
+        progress: &dyn Progress,
+    ) -> Result<GrayF32, Cancelled> {
+        let stage = Stage::new(progress, "classify", view.height())?;
         let mut out = GrayF32::new(view.width(), view.height(), [0.0]);
         if out.is_empty() {
-            return out;
+            return Ok(out);
         }
         let rows = out.as_mut_slice().par_chunks_mut(view.width()).enumerate();
         let buffer = || vec![[0.0; LANES]; self.foreground.len().max(self.background.len())];
-        rows.with_min_len(4).for_each_init(buffer, |terms, (y, out)| {
+        rows.with_min_len(4).try_for_each_init(buffer, |terms, (y, out)| {
+            stage.add(1)?;
             let (pixels, _) = view.row(y).as_chunks::<3>();
             dispatch!(level, _simd => self.row(pixels, out, terms));
-        });
-        out
+            Ok::<(), Cancelled>(())
+        })?;
+        Ok(out)
     }
 
     #[inline(always)]
@@ -217,7 +225,7 @@ fn lab(pixels: &[[u8; 3]; LANES], linear: &[f32; 256], x: &mut [Block; 3]) {
 mod tests {
     use super::*;
     use crate::{Component, Mixture};
-    use cv_core::RgbU8;
+    use cv_core::{RgbU8, Silent};
     use cv_synth::instruction_sets;
     use proptest::prelude::*;
 
@@ -266,7 +274,7 @@ mod tests {
             let (f, b) = (mixture(counts.0), mixture(counts.1));
             let background = if counts.1 == 0 { Vec::new() } else { b.whitened().unwrap() };
             let evaluator = LogOdds::new(space, hue, &f.whitened().unwrap(), &background);
-            let first = evaluator.log_odds(image.view());
+            let first = evaluator.log_odds(image.view(), &Silent).unwrap();
             for y in 0..2 {
                 for x in 0..width {
                     let p = space.coordinates(image.at(x, y), hue).map(f64::from);
@@ -281,7 +289,7 @@ mod tests {
                 }
             }
             for level in instruction_sets() {
-                prop_assert_eq!(&evaluator.log_odds_at(level, image.view()), &first, "{:?}", level);
+                prop_assert_eq!(&evaluator.log_odds_at(level, image.view(), &Silent).unwrap(), &first, "{:?}", level);
             }
         }
     }

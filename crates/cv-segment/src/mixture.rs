@@ -1,5 +1,6 @@
 //! Mixtures of Gaussians, fitted by expectation-maximization.
 
+use cv_core::{Cancelled, Progress, Stage};
 use nalgebra::{Matrix3, Vector3};
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -89,6 +90,9 @@ pub enum MixtureError {
         /// Which.
         index: usize,
     },
+    /// The job was stopped by its progress callback.
+    #[error("stopped")]
+    Cancelled(#[from] Cancelled),
 }
 
 /// A component ready to evaluate: `log density = constant − ½ |A x + b|²`, `A` lower triangular.
@@ -125,7 +129,11 @@ impl Mixture {
     ///
     /// # Errors
     /// [`MixtureError`] for no or bad samples, or a bad count.
-    pub fn fit(samples: &[WeightedSample], options: &MixtureOptions) -> Result<Self, MixtureError> {
+    pub fn fit(
+        samples: &[WeightedSample],
+        options: &MixtureOptions,
+        progress: &dyn Progress,
+    ) -> Result<Self, MixtureError> {
         let k = options.components;
         if !(1..=64).contains(&k) {
             return Err(MixtureError::BadCount { components: k });
@@ -146,12 +154,14 @@ impl Mixture {
             let least = 1e-12 * (1.0 + mean[i] * mean[i]);
             (options.regularization * spread[(i, i)] + options.resolution[i].powi(2)).max(least)
         });
-        let mut components = first_components(samples, k, &spread, &floor, options.seed);
+        let mut components = first_components(samples, k, &spread, &floor, options.seed, progress)?;
         let mut last = f64::NEG_INFINITY;
+        let stage = Stage::new(progress, "fit", options.max_iterations)?;
         for _ in 0..options.max_iterations {
             let whitened: Vec<Whitened> = components.iter().filter_map(Whitened::new).collect();
-            let (scatters, log_density) = expectation(samples, &whitened);
+            let (scatters, log_density) = expectation(samples, &whitened, &stage)?;
             components = maximization(&scatters, total, &floor);
+            stage.add(1)?;
             let now = log_density / total;
             if now - last < options.tolerance {
                 break;
@@ -252,7 +262,10 @@ fn first_components(
     spread: &Matrix3<f64>,
     floor: &[f64; 3],
     seed: u64,
-) -> Vec<Component> {
+    progress: &dyn Progress,
+) -> Result<Vec<Component>, Cancelled> {
+    const ROUNDS: usize = 10;
+    let stage = Stage::new(progress, "clusters", k + ROUNDS + 1)?;
     let scale = Vector3::from_fn(|i, _| 1.0 / (spread[(i, i)].max(0.0) + floor[i]).sqrt());
     let points: Vec<Vector3<f64>> = samples.iter().map(|s| Vector3::from(s.point).component_mul(&scale)).collect();
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
@@ -268,11 +281,15 @@ fn first_components(
             *d = if centers.is_empty() { distance } else { d.min(distance) };
         }
         centers.push(center);
+        stage.add(1)?;
     }
     let mut clusters = Vec::new();
-    for round in 0..=10 {
+    for round in 0..=ROUNDS {
         clusters = vec![Scatter::ZERO; centers.len()];
-        for (s, p) in samples.iter().zip(&points) {
+        for (i, (s, p)) in samples.iter().zip(&points).enumerate() {
+            if i.is_multiple_of(CHUNK) {
+                stage.check()?;
+            }
             let mut best = (0, f64::INFINITY);
             for (i, center) in centers.iter().enumerate() {
                 let d = (p - center).norm_squared();
@@ -282,7 +299,8 @@ fn first_components(
             }
             clusters[best.0].add(&Vector3::from(s.point), s.weight);
         }
-        if round < 10 {
+        stage.add(1)?;
+        if round < ROUNDS {
             for (center, cluster) in centers.iter_mut().zip(&clusters) {
                 if cluster.weight > 0.0 {
                     *center = (cluster.sum / cluster.weight).component_mul(&scale);
@@ -291,7 +309,7 @@ fn first_components(
         }
     }
     let total = samples.iter().map(|s| s.weight).sum();
-    maximization(&clusters, total, floor)
+    Ok(maximization(&clusters, total, floor))
 }
 
 /// Draws an index by chances; `None` where all are zero.
@@ -311,13 +329,21 @@ fn draw<I: Iterator<Item = f64>>(chances: impl Fn() -> I, rng: &mut impl Rng) ->
     last
 }
 
+/// Samples that are worked on together, and without asking whether to go on.
+const CHUNK: usize = 1024;
+
 /// The points' shares in each component, as sums, and the log density of all.
-fn expectation(samples: &[WeightedSample], components: &[Whitened]) -> (Vec<Scatter>, f64) {
+fn expectation(
+    samples: &[WeightedSample],
+    components: &[Whitened],
+    stage: &Stage<'_>,
+) -> Result<(Vec<Scatter>, f64), Cancelled> {
     let zero = || (vec![Scatter::ZERO; components.len()], 0.0);
     // Chunks of fixed size, added up in order: the sums do not depend on the number of threads.
     let parts: Vec<(Vec<Scatter>, f64)> = samples
-        .par_chunks(1024)
+        .par_chunks(CHUNK)
         .map(|chunk| {
+            stage.check()?;
             let (mut scatters, mut log_density) = zero();
             let mut terms = vec![0.0; components.len()];
             for s in chunk {
@@ -340,12 +366,12 @@ fn expectation(samples: &[WeightedSample], components: &[Whitened]) -> (Vec<Scat
                     }
                 }
             }
-            (scatters, log_density)
+            Ok((scatters, log_density))
         })
-        .collect();
-    parts.iter().fold(zero(), |(sums, total), (scatters, log_density)| {
+        .collect::<Result<_, Cancelled>>()?;
+    Ok(parts.iter().fold(zero(), |(sums, total), (scatters, log_density)| {
         (sums.iter().zip(scatters).map(|(a, b)| a.plus(b)).collect(), total + log_density)
-    })
+    }))
 }
 
 /// New components; those that hold no points go.
@@ -357,6 +383,7 @@ fn maximization(scatters: &[Scatter], total: f64, floor: &[f64; 3]) -> Vec<Compo
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cv_core::Silent;
 
     /// Points of a Gaussian with the given mean and standard deviations, drawn by the sum of twelve uniform numbers.
     fn cloud(n: usize, mean: [f64; 3], deviation: [f64; 3], seed: u64) -> Vec<WeightedSample> {
@@ -370,7 +397,7 @@ mod tests {
     #[test]
     fn one_gaussian_has_the_moments_of_its_points() {
         let samples = cloud(5000, [1.0, -2.0, 0.5], [0.1, 0.2, 0.05], 3);
-        let fit = Mixture::fit(&samples, &MixtureOptions::default()).unwrap();
+        let fit = Mixture::fit(&samples, &MixtureOptions::default(), &Silent).unwrap();
         let n = samples.len() as f64;
         let mean = |i: usize| samples.iter().map(|s| s.point[i]).sum::<f64>() / n;
         let c = &fit.components[0];
@@ -392,7 +419,8 @@ mod tests {
         let samples: Vec<_> =
             truth.iter().zip(1u64..).flat_map(|(&(mean, n), seed)| cloud(n, mean, [0.2, 0.3, 0.1], seed)).collect();
         for seed in 0..10 {
-            let fit = Mixture::fit(&samples, &MixtureOptions { components: 3, seed, ..Default::default() }).unwrap();
+            let fit =
+                Mixture::fit(&samples, &MixtureOptions { components: 3, seed, ..Default::default() }, &Silent).unwrap();
             for (c, (mean, n)) in fit.components.iter().zip(truth) {
                 // Ten standard deviations apart: no point is shared. Standard error of a mean 0.3/√1000 = 0.01.
                 assert!((c.weight - n as f64 / 6000.0).abs() < 1e-3, "{seed} {fit:?}");
@@ -407,7 +435,8 @@ mod tests {
         let doubled: Vec<_> = points.iter().flat_map(|&s| [s, s, s]).collect();
         let weighted: Vec<_> = points.iter().map(|s| WeightedSample { weight: 3.0, ..*s }).collect();
         let options = MixtureOptions::default();
-        let (a, b) = (Mixture::fit(&doubled, &options).unwrap(), Mixture::fit(&weighted, &options).unwrap());
+        let (a, b) =
+            (Mixture::fit(&doubled, &options, &Silent).unwrap(), Mixture::fit(&weighted, &options, &Silent).unwrap());
         // The same sums in another order.
         assert!((a.log_density([0.3, 0.1, 1.0]) - b.log_density([0.3, 0.1, 1.0])).abs() < 1e-9);
     }
@@ -435,7 +464,7 @@ mod tests {
         let line: Vec<_> = (0..50).map(|i| at([f64::from(i), 2.0 * f64::from(i), 1.0])).collect();
         for (samples, distinct) in [(&point, 1), (&pair, 2), (&line, 50)] {
             for components in [1, 5] {
-                let fit = Mixture::fit(samples, &MixtureOptions { components, ..Default::default() }).unwrap();
+                let fit = Mixture::fit(samples, &MixtureOptions { components, ..Default::default() }, &Silent).unwrap();
                 assert!(!fit.components.is_empty() && fit.components.len() <= components.min(distinct));
                 assert!(fit.whitened().is_ok() && fit.log_density(samples[0].point).is_finite());
                 assert!((fit.components.iter().map(|c| c.weight).sum::<f64>() - 1.0).abs() < 1e-9);
@@ -447,7 +476,7 @@ mod tests {
     fn what_cannot_be_fitted_is_said() {
         let good = WeightedSample { point: [0.0; 3], weight: 1.0 };
         let fit = |samples: &[WeightedSample], components| {
-            Mixture::fit(samples, &MixtureOptions { components, ..Default::default() }).unwrap_err()
+            Mixture::fit(samples, &MixtureOptions { components, ..Default::default() }, &Silent).unwrap_err()
         };
         assert_eq!(fit(&[], 1), MixtureError::NoSamples);
         assert_eq!(fit(&[WeightedSample { weight: 0.0, ..good }], 1), MixtureError::NoSamples);

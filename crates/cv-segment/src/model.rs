@@ -1,7 +1,7 @@
 //! The trained model: two mixtures, a threshold, and what happens around them.
 
 use crate::{Cleanup, ColorSpace, Mixture, SegmentError, log_odds::LogOdds, mixture::Whitened};
-use cv_core::{GrayF32, ImageView, Mask, Matrix3, OptionError, Vector3};
+use cv_core::{Cancelled, GrayF32, ImageView, Mask, Matrix3, OptionError, Progress, Vector3};
 use cv_imgproc::gaussian_blur;
 use serde::{Deserialize, Serialize};
 
@@ -143,23 +143,33 @@ impl ColorModel {
 
     /// The score of each pixel in nats, limited to ±10 and smoothed: with a background model the log odds of object against background at the training photos'
     /// prior; without, the object's log density below its peak, plus 10. Pixels above [`ColorModel::threshold`] are marked.
-    pub fn score(&self, photo: ImageView<'_, u8, 3>) -> GrayF32 {
-        let mut score = self.evaluator.log_odds(photo);
+    ///
+    /// # Errors
+    /// [`Cancelled`].
+    pub fn score(&self, photo: ImageView<'_, u8, 3>, progress: &dyn Progress) -> Result<GrayF32, Cancelled> {
+        let mut score = self.evaluator.log_odds(photo, progress)?;
         for v in score.as_mut_slice() {
             *v = (*v + self.offset).clamp(-LIMIT, LIMIT);
         }
-        if self.file.smoothing > 0.0 { gaussian_blur(score.view(), self.file.smoothing) } else { score }
+        progress.report("smooth", 0, 1)?;
+        Ok(if self.file.smoothing > 0.0 { gaussian_blur(score.view(), self.file.smoothing) } else { score })
     }
 
     /// Where the object is, before cleaning up.
-    pub fn classify(&self, photo: ImageView<'_, u8, 3>) -> Mask {
+    ///
+    /// # Errors
+    /// [`Cancelled`].
+    pub fn classify(&self, photo: ImageView<'_, u8, 3>, progress: &dyn Progress) -> Result<Mask, Cancelled> {
         let threshold = self.file.threshold;
-        self.score(photo).map(|[v]| [v > threshold])
+        Ok(self.score(photo, progress)?.map(|[v]| [v > threshold]))
     }
 
     /// Where the object is.
-    pub fn predict(&self, photo: ImageView<'_, u8, 3>) -> Mask {
-        self.file.cleanup.apply(self.classify(photo).view())
+    ///
+    /// # Errors
+    /// [`Cancelled`].
+    pub fn predict(&self, photo: ImageView<'_, u8, 3>, progress: &dyn Progress) -> Result<Mask, Cancelled> {
+        self.file.cleanup.apply(self.classify(photo, progress)?.view(), progress)
     }
 
     /// The color space.
@@ -203,6 +213,7 @@ impl ColorModel {
 mod tests {
     use super::*;
     use crate::Component;
+    use cv_core::Silent;
 
     fn file() -> ModelFile {
         let at = |mean| Mixture {
@@ -253,6 +264,6 @@ mod tests {
         let x = [0.6, 0.4, 64.0 / 255.0];
         let odds = file().foreground.log_density(x) - file().background.unwrap().log_density(x) + (0.2f64 / 0.8).ln();
         // Squares of up to 4 in f32.
-        assert!((f64::from(model.score(photo.view()).at(0, 0)[0]) - odds).abs() < 1e-5);
+        assert!((f64::from(model.score(photo.view(), &Silent).unwrap().at(0, 0)[0]) - odds).abs() < 1e-5);
     }
 }

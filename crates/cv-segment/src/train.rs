@@ -6,7 +6,7 @@ use crate::{
     color_space::mean_hue,
     model::{LIMIT, ModelFile},
 };
-use cv_core::{ImageView, OptionError};
+use cv_core::{Cancelled, ImageView, OptionError, Progress, Stage};
 
 /// Which regions of a mask are kept.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -112,21 +112,24 @@ pub struct Trained {
 ///
 /// # Errors
 /// [`SegmentError`]: no photos, a mask of another size than its photo, no or all pixels marked, an option out of range.
-pub fn train(photos: &[Labeled<'_>], options: &TrainOptions) -> Result<Trained, SegmentError> {
+pub fn train(photos: &[Labeled<'_>], options: &TrainOptions, progress: &dyn Progress) -> Result<Trained, SegmentError> {
     options.validate()?;
     if photos.is_empty() {
         return Err(SegmentError::NoPhotos);
     }
     let mut colors = [Bins::new(), Bins::new()];
+    let stage = Stage::new(progress, "colors", photos.len())?;
     for (index, (photo, mask)) in photos.iter().enumerate() {
         if photo.size() != mask.size() {
             return Err(SegmentError::SizeMismatch { index, photo: photo.size(), mask: mask.size() });
         }
         for y in 0..photo.height() {
+            stage.check()?;
             for (&rgb, &m) in photo.row(y).as_chunks::<3>().0.iter().zip(mask.row(y)) {
                 colors[usize::from(m)].add(rgb);
             }
         }
+        stage.add(1)?;
     }
     let [background, foreground] = &colors;
     let counts = [foreground.total(), background.total()];
@@ -149,14 +152,14 @@ pub fn train(photos: &[Labeled<'_>], options: &TrainOptions) -> Result<Trained, 
             seed: options.seed,
             ..Default::default()
         };
-        Mixture::fit(&samples, &settings)
+        Mixture::fit(&samples, &settings, progress)
     };
     let object = fit(foreground, options.components)?;
     let rest = if options.rule == Rule::Density { None } else { Some(fit(background, options.background_components)?) };
     let largest = match options.regions {
         Regions::Largest => true,
         Regions::All => false,
-        Regions::Auto => photos.iter().all(|(_, mask)| largest_share(*mask) >= 0.95),
+        Regions::Auto => one_region_each(photos, progress)?,
     };
     let mut file = ModelFile {
         unknown: options.unknown,
@@ -168,26 +171,45 @@ pub fn train(photos: &[Labeled<'_>], options: &TrainOptions) -> Result<Trained, 
     };
     let mut model = ColorModel::try_from(file.clone())?;
     if options.rule != Rule::Posterior {
-        file.threshold = best_threshold(&model, photos);
+        file.threshold = best_threshold(&model, photos, progress)?;
         model = ColorModel::try_from(file)?;
     }
-    let scores: Result<Vec<ConfusionMatrix>, SegmentError> =
-        photos.iter().map(|(photo, mask)| ConfusionMatrix::new(model.predict(*photo).view(), *mask)).collect();
-    Ok(Trained { model, scores: scores?, foreground_pixels: counts[0], background_pixels: counts[1] })
+    let stage = Stage::new(progress, "scores", photos.len())?;
+    let score = |(photo, mask): &Labeled<'_>| -> Result<ConfusionMatrix, SegmentError> {
+        let scores = ConfusionMatrix::new(model.predict(*photo, &stage)?.view(), *mask)?;
+        stage.add(1)?;
+        Ok(scores)
+    };
+    let scores = photos.iter().map(score).collect::<Result<Vec<ConfusionMatrix>, SegmentError>>()?;
+    Ok(Trained { model, scores, foreground_pixels: counts[0], background_pixels: counts[1] })
+}
+
+/// Whether each mask shows one region, but for specks.
+fn one_region_each(photos: &[Labeled<'_>], progress: &dyn Progress) -> Result<bool, Cancelled> {
+    let stage = Stage::new(progress, "regions", photos.len())?;
+    for (_, mask) in photos {
+        if largest_share(*mask) < 0.95 {
+            return Ok(false);
+        }
+        stage.add(1)?;
+    }
+    Ok(true)
 }
 
 /// The threshold with the best F1 over all pixels of the photos, before cleaning up; the middle of the range around it that is within a thousandth of the best.
-fn best_threshold(model: &ColorModel, photos: &[Labeled<'_>]) -> f32 {
+fn best_threshold(model: &ColorModel, photos: &[Labeled<'_>], progress: &dyn Progress) -> Result<f32, Cancelled> {
     const BINS: usize = 2000;
     let width = 2.0 * LIMIT / BINS as f32;
     let mut counts = vec![[0u64; 2]; BINS + 1];
+    let stage = Stage::new(progress, "threshold", photos.len())?;
     for (photo, mask) in photos {
-        let score = model.score(*photo);
+        let score = model.score(*photo, &stage)?;
         for y in 0..score.height() {
             for (&v, &m) in score.row(y).iter().zip(mask.row(y)) {
                 counts[(((v + LIMIT) / width) as usize).min(BINS)][usize::from(m)] += 1;
             }
         }
+        stage.add(1)?;
     }
     let truth: u64 = counts.iter().map(|c| c[1]).sum();
     // F1 when everything from bin i on is marked.
@@ -202,7 +224,7 @@ fn best_threshold(model: &ColorModel, photos: &[Labeled<'_>]) -> f32 {
     let good = |i: &usize| f1[*i] >= f1[best] - 1e-3;
     let first = (0..best).rev().take_while(good).last().unwrap_or(best);
     let last = (best..=BINS).take_while(good).last().unwrap_or(best);
-    ((first + last) as f32 * 0.5 * width - LIMIT).clamp(-LIMIT, LIMIT)
+    Ok(((first + last) as f32 * 0.5 * width - LIMIT).clamp(-LIMIT, LIMIT))
 }
 
 /// Counts of colors in bins of four gray levels a side, with the sums of what fell in.
@@ -240,7 +262,7 @@ impl Bins {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cv_core::{Mask, RgbU8};
+    use cv_core::{Mask, RgbU8, Silent};
 
     /// A colored square on a gray that varies.
     fn scene(color: [u8; 3], ground: [u8; 3]) -> (RgbU8, Mask) {
@@ -266,7 +288,7 @@ mod tests {
             }
         });
         let options = TrainOptions { components: 1, background_components: 1, ..Default::default() };
-        let trained = train(&[(photo.view(), mask.view())], &options).unwrap();
+        let trained = train(&[(photo.view(), mask.view())], &options, &Silent).unwrap();
         let f1 = trained.scores[0].f1();
         assert!(f1 > 0.97, "{f1}");
         assert!(trained.model.foreground().components[0].mean[0].abs() < 0.1);
@@ -278,13 +300,13 @@ mod tests {
         for space in [ColorSpace::Hsv, ColorSpace::Rgb, ColorSpace::Lab] {
             for rule in [Rule::Tuned, Rule::Posterior, Rule::Density] {
                 let options = TrainOptions { space, rule, ..Default::default() };
-                let trained = train(&[(photo.view(), mask.view())], &options).unwrap();
+                let trained = train(&[(photo.view(), mask.view())], &options, &Silent).unwrap();
                 let f1 = trained.scores[0].f1();
                 // Smoothing by a pixel and rounding of corners cost a part of the 110 border pixels of 750.
                 assert!(f1 > 0.95, "{space:?} {rule:?} {f1}");
                 assert_eq!((trained.foreground_pixels, trained.background_pixels), (750, 4050));
                 assert!(trained.model.cleanup().largest);
-                assert_eq!(train(&[(photo.view(), mask.view())], &options).unwrap(), trained);
+                assert_eq!(train(&[(photo.view(), mask.view())], &options, &Silent).unwrap(), trained);
             }
         }
     }
@@ -293,8 +315,9 @@ mod tests {
     fn what_cannot_be_trained_on_is_said() {
         let (photo, mask) = scene([220, 110, 30], [90; 3]);
         let options = TrainOptions::default();
-        let with = |mask: &Mask, options: &TrainOptions| train(&[(photo.view(), mask.view())], options).unwrap_err();
-        assert_eq!(train(&[], &options).unwrap_err(), SegmentError::NoPhotos);
+        let with =
+            |mask: &Mask, options: &TrainOptions| train(&[(photo.view(), mask.view())], options, &Silent).unwrap_err();
+        assert_eq!(train(&[], &options, &Silent).unwrap_err(), SegmentError::NoPhotos);
         assert_eq!(with(&Mask::new(80, 60, [false]), &options), SegmentError::NoForeground { photos: 1 });
         assert_eq!(with(&Mask::new(80, 60, [true]), &options), SegmentError::NoBackground { photos: 1 });
         let error = SegmentError::SizeMismatch { index: 0, photo: (80, 60), mask: (60, 80) };
@@ -311,7 +334,7 @@ mod tests {
             assert!(matches!(error, SegmentError::Option(_)), "{wrong:?}: {error:?}");
         }
         let empty = (RgbU8::new(0, 0, [0; 3]), Mask::new(0, 0, [true]));
-        let error = train(&[(empty.0.view(), empty.1.view())], &options).unwrap_err();
+        let error = train(&[(empty.0.view(), empty.1.view())], &options, &Silent).unwrap_err();
         assert_eq!(error, SegmentError::NoForeground { photos: 1 });
     }
 
@@ -321,7 +344,8 @@ mod tests {
         let (_, mask) = scene([0; 3], [0; 3]);
         let photo = RgbU8::new(80, 60, [77; 3]);
         for rule in [Rule::Tuned, Rule::Posterior, Rule::Density] {
-            let trained = train(&[(photo.view(), mask.view())], &TrainOptions { rule, ..Default::default() }).unwrap();
+            let trained =
+                train(&[(photo.view(), mask.view())], &TrainOptions { rule, ..Default::default() }, &Silent).unwrap();
             assert!(trained.scores[0].f1() < 0.5);
         }
     }
@@ -332,6 +356,8 @@ mod tests {
         for y in 15..40 {
             mask.set(35, y, [false]);
         }
-        assert!(!train(&[(photo.view(), mask.view())], &TrainOptions::default()).unwrap().model.cleanup().largest);
+        assert!(
+            !train(&[(photo.view(), mask.view())], &TrainOptions::default(), &Silent).unwrap().model.cleanup().largest
+        );
     }
 }

@@ -4,7 +4,7 @@
 #![allow(clippy::unwrap_used, reason = "a benchmark that cannot go on has failed")]
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
-use cv_core::GrayU8;
+use cv_core::{GrayU8, Silent};
 use cv_stereo::{Census, DisparityMap, Paths, Smoothing, StereoMatcher, StereoOptions};
 use std::hint::black_box;
 
@@ -29,11 +29,13 @@ fn bench(c: &mut Criterion) {
         for (name, options) in &cases {
             let mut matcher = StereoMatcher::new(options.clone()).unwrap();
             let mut map = DisparityMap::empty();
-            matcher.compute_into(left.view(), right.view(), &mut map).unwrap();
+            matcher.compute_into(left.view(), right.view(), &mut map, &Silent).unwrap();
             let right_ones = map.disparity.as_slice().iter().filter(|d| (**d - 20.0).abs() < 0.5).count();
             assert!(right_ones * 10 > 9 * width * height, "{name}: {right_ones} of {}", width * height);
             group.bench_with_input(BenchmarkId::new(*name, format!("{width}x{height}")), name, |b, _| {
-                b.iter(|| matcher.compute_into(black_box(left.view()), black_box(right.view()), &mut map).unwrap());
+                b.iter(|| {
+                    matcher.compute_into(black_box(left.view()), black_box(right.view()), &mut map, &Silent).unwrap()
+                });
             });
         }
     }

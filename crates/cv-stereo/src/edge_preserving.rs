@@ -6,6 +6,7 @@
 //! weighted least squares", TIP 2014), weighted by what was matched, which OpenCV's users know as its WLS filter.
 
 use crate::{PixelState, Smoothing};
+use cv_core::{Cancelled, Stage};
 use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
 use rayon::prelude::*;
@@ -46,6 +47,7 @@ pub(crate) fn bytes(smoothing: Smoothing, width: usize, height: usize) -> usize 
 }
 
 /// Smooths a map; unknown pixels stay unknown, and those whose outline moves over them are no longer what was matched there.
+#[allow(clippy::too_many_arguments)]
 pub(crate) fn smooth(
     level: Level,
     smoothing: Smoothing,
@@ -54,9 +56,10 @@ pub(crate) fn smooth(
     gray: &[u8],
     width: usize,
     planes: &mut Planes,
-) {
+    stage: &Stage<'_>,
+) -> Result<(), Cancelled> {
     if width == 0 || disparity.is_empty() || smoothing == Smoothing::None {
-        return;
+        return Ok(());
     }
     let height = disparity.len() / width;
     let stride = width + LEFT + RIGHT;
@@ -67,13 +70,16 @@ pub(crate) fn smooth(
             let Planes { disparity: before, moved, gray, weight } = planes;
             let [before, gray, weight] = [before, gray, weight].map(|plane| plane.as_slice());
             let inside = &mut moved[REACH * stride..(REACH + height) * stride];
-            inside.par_chunks_mut(stride).enumerate().for_each(|(y, out)| {
+            inside.par_chunks_mut(stride).enumerate().try_for_each(|(y, out)| {
+                stage.check()?;
                 let rows = Rows { disparity: before, gray, weight, stride, y, scale: 1.0 / sigma };
                 dispatch!(level, simd => move_outlines(simd, rows, &mut out[LEFT..LEFT + width.next_multiple_of(16)]));
-            });
-            disparity.par_chunks_mut(width).zip(states.par_chunks_mut(width)).enumerate().for_each_init(
+                Ok(())
+            })?;
+            disparity.par_chunks_mut(width).zip(states.par_chunks_mut(width)).enumerate().try_for_each_init(
                 || vec![0.0; width.next_multiple_of(16)],
                 |smoothed, (y, (out, states))| {
+                    stage.check()?;
                     let rows = Rows { disparity: moved, gray, weight, stride, y, scale: 1.0 / sigma };
                     dispatch!(level, simd => average(simd, rows, smoothed));
                     let pixels = rows.at(0, REACH, REACH);
@@ -86,11 +92,12 @@ pub(crate) fn smooth(
                     for (d, &value) in out.iter_mut().zip(&*smoothed) {
                         *d = if d.is_nan() { f32::NAN } else { value };
                     }
+                    Ok(())
                 },
-            );
+            )?;
         }
         Smoothing::LeastSquares { lambda, sigma } => {
-            least_squares(planes, width, height, lambda, sigma);
+            least_squares(planes, width, height, lambda, sigma, stage)?;
             disparity.par_chunks_mut(width).enumerate().for_each(|(y, out)| {
                 let from = (REACH + y) * stride + LEFT;
                 let (value, weight) = (&planes.disparity[from..][..width], &planes.weight[from..][..width]);
@@ -102,6 +109,7 @@ pub(crate) fn smooth(
             });
         }
     }
+    Ok(())
 }
 
 impl Planes {
@@ -243,7 +251,14 @@ fn average<S: Simd>(simd: S, rows: Rows<'_>, out: &mut [f32]) {
 }
 
 /// Three rounds of exact one-dimensional smoothing along rows and columns, of weighted disparity and of the weights.
-fn least_squares(planes: &mut Planes, width: usize, height: usize, lambda: f32, sigma: f32) {
+fn least_squares(
+    planes: &mut Planes,
+    width: usize,
+    height: usize,
+    lambda: f32,
+    sigma: f32,
+    stage: &Stage<'_>,
+) -> Result<(), Cancelled> {
     const ROUNDS: i32 = 3;
     let stride = width + LEFT + RIGHT;
     let Planes { disparity, moved, gray, weight } = planes;
@@ -255,9 +270,10 @@ fn least_squares(planes: &mut Planes, width: usize, height: usize, lambda: f32, 
         // Falls by four each round (equation 13 of the paper).
         let strength = 1.5 * 4f32.powi(ROUNDS - round) / (4f32.powi(ROUNDS) - 1.0) * lambda;
         let rows = disparity.par_chunks_mut(stride).zip(weight.par_chunks_mut(stride)).zip(gray.par_chunks(stride));
-        rows.skip(REACH).take(height).for_each_init(
+        rows.skip(REACH).take(height).try_for_each_init(
             || vec![0.0; width],
             |factors, ((d, w), g)| {
+                stage.check()?;
                 let (d, w, g) = (&mut d[LEFT..LEFT + width], &mut w[LEFT..LEFT + width], &g[LEFT..LEFT + width]);
                 // Thomas' algorithm for the system 1 + A, of both right-hand sides at once.
                 let mut before = 0.0;
@@ -275,12 +291,14 @@ fn least_squares(planes: &mut Planes, width: usize, height: usize, lambda: f32, 
                     d[x] -= factors[x] * d[x + 1];
                     w[x] -= factors[x] * w[x + 1];
                 }
+                Ok(())
             },
-        );
+        )?;
         // Columns, a row of them at a time.
         let row = |y: usize| (REACH + y) * stride + LEFT;
         let factors = &mut moved[..];
         for y in 0..height {
+            stage.check()?;
             for x in 0..width {
                 let at = row(y) + x;
                 let g = gray[at];
@@ -298,17 +316,20 @@ fn least_squares(planes: &mut Planes, width: usize, height: usize, lambda: f32, 
             }
         }
         for y in (0..height.saturating_sub(1)).rev() {
+            stage.check()?;
             for at in row(y)..row(y) + width {
                 disparity[at] -= factors[at] * disparity[at + stride];
                 weight[at] -= factors[at] * weight[at + stride];
             }
         }
     }
+    Ok(())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cv_core::Silent;
     use cv_synth::instruction_sets;
     use proptest::prelude::*;
 
@@ -408,7 +429,7 @@ mod tests {
                 for _ in 0..2 {
                     let mut out = d.clone();
                     let mut found = states.clone();
-                    smooth(level, Smoothing::Bilateral { sigma }, &mut out, &mut found, &gray, width, &mut planes);
+                    smooth(level, Smoothing::Bilateral { sigma }, &mut out, &mut found, &gray, width, &mut planes, &Stage::new(&Silent, "", 0).unwrap()).unwrap();
                     prop_assert_eq!(&found, &after, "{:?}", level);
                     let bits: Vec<u32> = out.iter().map(|v| v.to_bits()).collect();
                     prop_assert_eq!(&bits, &expected, "{:?}", level);
@@ -425,7 +446,17 @@ mod tests {
         let mut d: Vec<f32> = (0..width * height).map(|i| if i % width < 18 { 5.0 } else { 12.0 }).collect();
         let mut states = vec![PixelState::Matched; d.len()];
         let options = Smoothing::Bilateral { sigma: 24.0 };
-        smooth(Level::new(), options, &mut d, &mut states, &gray, width, &mut Planes::default());
+        smooth(
+            Level::new(),
+            options,
+            &mut d,
+            &mut states,
+            &gray,
+            width,
+            &mut Planes::default(),
+            &Stage::new(&Silent, "", 0).unwrap(),
+        )
+        .unwrap();
         for (i, d) in d.iter().enumerate() {
             let truth = if i % width < 20 { 5.0 } else { 12.0 };
             // Sums of 25 terms in f32.
@@ -445,7 +476,17 @@ mod tests {
         d[5 * width + 5] = f32::NAN;
         let mut states = vec![PixelState::Matched; d.len()];
         let options = Smoothing::LeastSquares { lambda: 100.0, sigma: 4.0 };
-        smooth(Level::new(), options, &mut d, &mut states, &gray, width, &mut Planes::default());
+        smooth(
+            Level::new(),
+            options,
+            &mut d,
+            &mut states,
+            &gray,
+            width,
+            &mut Planes::default(),
+            &Stage::new(&Silent, "", 0).unwrap(),
+        )
+        .unwrap();
         assert!(d[5 * width + 5].is_nan());
         for (i, d) in d.iter().enumerate().filter(|(_, d)| !d.is_nan()) {
             // Noise of 0.5 px averaged over some 60 pixels (twice the square root of lambda along both axes), and

@@ -14,6 +14,7 @@ use crate::cost::Frame;
 use crate::layout::BLOCK;
 use crate::select::{Ends, Keys, Selection, ids, select};
 use crate::winner::{NO_SUM, Winner};
+use cv_core::{Cancelled, Stage};
 use fearless_simd::prelude::*;
 use fearless_simd_macros::simd;
 
@@ -90,6 +91,7 @@ impl Sweep {
 /// Runs `sweep` over `steps` rows from row `first` (both counted in its own sense). `output` covers the same rows, in
 /// the sense of the image.
 #[simd]
+#[allow(clippy::too_many_arguments)]
 pub(crate) fn sweep_rows<S: Simd>(
     simd: S,
     frame: &Frame<'_>,
@@ -98,18 +100,19 @@ pub(crate) fn sweep_rows<S: Simd>(
     steps: usize,
     output: &mut Output<'_>,
     eight: bool,
-) {
+    stage: &Stage<'_>,
+) -> Result<(), Cancelled> {
     // The usual numbers of disparities as constants: loops over them unroll, and indices need no checks.
     let single = frame.layout.groups() == 1;
     match (eight, frame.layout.group == BLOCK, single) {
-        (false, true, true) => rows::<S, 2, 1, true>(simd, frame, sweep, first, steps, output),
-        (false, false, true) => rows::<S, 2, 2, true>(simd, frame, sweep, first, steps, output),
-        (false, true, false) => rows::<S, 2, 1, false>(simd, frame, sweep, first, steps, output),
-        (false, false, false) => rows::<S, 2, 2, false>(simd, frame, sweep, first, steps, output),
-        (true, true, true) => rows::<S, 4, 1, true>(simd, frame, sweep, first, steps, output),
-        (true, false, true) => rows::<S, 4, 2, true>(simd, frame, sweep, first, steps, output),
-        (true, true, false) => rows::<S, 4, 1, false>(simd, frame, sweep, first, steps, output),
-        (true, false, false) => rows::<S, 4, 2, false>(simd, frame, sweep, first, steps, output),
+        (false, true, true) => rows::<S, 2, 1, true>(simd, frame, sweep, first, steps, output, stage),
+        (false, false, true) => rows::<S, 2, 2, true>(simd, frame, sweep, first, steps, output, stage),
+        (false, true, false) => rows::<S, 2, 1, false>(simd, frame, sweep, first, steps, output, stage),
+        (false, false, false) => rows::<S, 2, 2, false>(simd, frame, sweep, first, steps, output, stage),
+        (true, true, true) => rows::<S, 4, 1, true>(simd, frame, sweep, first, steps, output, stage),
+        (true, false, true) => rows::<S, 4, 2, true>(simd, frame, sweep, first, steps, output, stage),
+        (true, true, false) => rows::<S, 4, 1, false>(simd, frame, sweep, first, steps, output, stage),
+        (true, false, false) => rows::<S, 4, 2, false>(simd, frame, sweep, first, steps, output, stage),
     }
 }
 
@@ -121,7 +124,8 @@ fn rows<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool>(
     first: usize,
     steps: usize,
     output: &mut Output<'_>,
-) {
+    stage: &Stage<'_>,
+) -> Result<(), Cancelled> {
     let (width, height) = (frame.width, frame.height);
     let depth = if SINGLE { BLOCKS * BLOCK } else { frame.layout.depth };
     let Sweep { mirrored, row, least, before, ongoing, costs, sums, p2, selection } = sweep;
@@ -130,6 +134,7 @@ fn rows<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool>(
     let costs = &mut costs.as_mut_slice()[..TILE * depth];
     let sums = &mut sums.as_mut_slice()[..TILE * depth];
     for step in 0..steps {
+        stage.add(1)?;
         let t = first + step;
         let y = if mirrored { height - 1 - t } else { t };
         // Row of `output`.
@@ -182,6 +187,7 @@ fn rows<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool>(
             selection.finish(frame, last, &mut right[line * width..][..width]);
         }
     }
+    Ok(())
 }
 
 /// P2 of the pixels of row `y` for each path. At a border, where paths start from nothing, any value does.

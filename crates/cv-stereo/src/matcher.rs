@@ -12,7 +12,7 @@ use crate::sgm::Aggregator;
 use crate::speckle::{Speckles, remove_speckles};
 use crate::winner::{NO_SUM, Winner};
 use crate::{Intensity, IntensityCost, Paths, StereoError, StereoOptions, Subpixel, median};
-use cv_core::{GrayF32, Image, ImageView, Sample, StageClock};
+use cv_core::{Cancelled, GrayF32, Image, ImageView, Progress, Sample, Stage, StageClock};
 use fearless_simd::Level;
 use rayon::prelude::*;
 use std::ops::Range;
@@ -78,7 +78,7 @@ impl DisparityMap {
 /// A semi-global matcher (Hirschmüller, PAMI 2008) that keeps its buffers between pairs.
 ///
 /// ```
-/// use cv_core::Image;
+/// use cv_core::{Image, Silent};
 /// use cv_stereo::{StereoMatcher, StereoOptions};
 ///
 /// // A textured wall seen 5 px further left by the right camera.
@@ -86,7 +86,7 @@ impl DisparityMap {
 /// let left = Image::<u8, 1>::from_fn(64, 32, |x, y| [texture(x, y)]);
 /// let right = Image::<u8, 1>::from_fn(64, 32, |x, y| [texture(x + 5, y)]);
 /// let mut matcher = StereoMatcher::new(StereoOptions { disparities: 16, ..Default::default() })?;
-/// let map = matcher.compute(left.view(), right.view())?;
+/// let map = matcher.compute(left.view(), right.view(), &Silent)?;
 /// assert!((map.disparity.at(30, 16)[0] - 5.0).abs() < 0.1);
 /// # Ok::<(), cv_stereo::StereoError>(())
 /// ```
@@ -178,26 +178,28 @@ impl StereoMatcher {
     /// Disparities of `left`. The images are rectified: a scene point has the same y in both.
     ///
     /// # Errors
-    /// [`StereoError`] where the images do not fit together or the disparities do not fit the images.
+    /// [`StereoError`] where the images do not fit together or the disparities do not fit the images, and where `progress` says stop.
     pub fn compute<T: Intensity, const C: usize>(
         &mut self,
         left: ImageView<'_, T, C>,
         right: ImageView<'_, T, C>,
+        progress: &dyn Progress,
     ) -> Result<DisparityMap, StereoError> {
         let mut map = DisparityMap::empty();
-        self.compute_into(left, right, &mut map)?;
+        self.compute_into(left, right, &mut map, progress)?;
         Ok(map)
     }
 
     /// As [`StereoMatcher::compute`], into a map of any size, whose memory is used again where it has the right one.
     ///
     /// # Errors
-    /// As [`StereoMatcher::compute`]; `map` is then unchanged.
+    /// As [`StereoMatcher::compute`]; `map` is then unchanged, or, where the job was stopped, of no use.
     pub fn compute_into<T: Intensity, const C: usize>(
         &mut self,
         left: ImageView<'_, T, C>,
         right: ImageView<'_, T, C>,
         map: &mut DisparityMap,
+        progress: &dyn Progress,
     ) -> Result<(), StereoError> {
         let (width, height) = left.size();
         if left.size() != right.size() {
@@ -212,13 +214,15 @@ impl StereoMatcher {
             }
         }
         clock.lap("gray");
+        progress.report("bits", 0, 1)?;
         self.bits();
         clock.lap("bits");
-        self.aggregate(width, height);
+        self.aggregate(width, height, progress)?;
         clock.lap("aggregate");
         map.resize(width, height);
+        progress.report("check", 0, 1)?;
         self.check(map);
-        self.refine(map);
+        self.refine(map, progress)?;
         clock.lap("check");
         self.stages = clock.into_stages();
         Ok(())
@@ -272,12 +276,18 @@ impl StereoMatcher {
     ///
     /// # Errors
     /// [`StereoError`] where the disparities do not fit the images, or the memory is more than allowed.
-    pub fn prepare(&mut self, width: usize, height: usize, map: &mut DisparityMap) -> Result<(), StereoError> {
+    pub fn prepare(
+        &mut self,
+        width: usize,
+        height: usize,
+        map: &mut DisparityMap,
+        progress: &dyn Progress,
+    ) -> Result<(), StereoError> {
         self.check_size(width, height)?;
         match self.strip_rows(width, height) {
-            None => self.aggregator.prepare(width, height, self.layout()),
+            None => self.aggregator.prepare(width, height, self.layout(), progress)?,
             Some(rows) => {
-                self.strip.prepare(width, (rows + 2 * OVERLAP).min(height), self.layout());
+                self.strip.prepare(width, (rows + 2 * OVERLAP).min(height), self.layout(), progress)?;
             }
         }
         map.resize(width, height);
@@ -300,13 +310,17 @@ impl StereoMatcher {
     }
 
     /// Costs and path sums; winners of both views.
-    fn aggregate(&mut self, width: usize, height: usize) {
+    fn aggregate(&mut self, width: usize, height: usize, progress: &dyn Progress) -> Result<(), Cancelled> {
         let options = &self.options;
         let layout = self.layout();
         let planes = planes(options.census, options.intensity_cost);
         let stride = planes * layout.right_row(width);
         let p2 = Penalties::new(options);
-        let run = |aggregator: &mut Aggregator, rows: Range<usize>| {
+        let rows = self.strip_rows(width, height);
+        let strips = rows.map_or(1, |rows| height.div_ceil(rows));
+        // Each row twice, and some more where strips overlap.
+        let stage = Stage::new(progress, "aggregate", 2 * (height + 2 * OVERLAP * (strips - 1)))?;
+        let run = |aggregator: &mut Aggregator, rows: Range<usize>| -> Result<(), Cancelled> {
             let frame = Frame {
                 width,
                 height: rows.len(),
@@ -323,23 +337,21 @@ impl StereoMatcher {
                 p2: &p2,
                 second: options.confidence || options.uniqueness > 0,
             };
-            aggregator.run(self.level, &frame, options.paths == Paths::Eight);
+            aggregator.run(self.level, &frame, options.paths == Paths::Eight, &stage)
         };
-        let Some(rows) = self.strip_rows(width, height) else {
-            run(&mut self.aggregator, 0..height);
-            return;
-        };
+        let Some(rows) = rows else { return run(&mut self.aggregator, 0..height) };
         let Aggregator { winners, right, .. } = &mut self.aggregator;
         winners.resize(width * height, Winner::default());
         right.resize(width * height, 0);
         for start in (0..height).step_by(rows) {
             let end = (start + rows).min(height);
             let from = start.saturating_sub(OVERLAP);
-            run(&mut self.strip, from..(end + OVERLAP).min(height));
+            run(&mut self.strip, from..(end + OVERLAP).min(height))?;
             let inside = (start - from) * width..(end - from) * width;
             winners[start * width..end * width].copy_from_slice(&self.strip.winners[inside.clone()]);
             right[start * width..end * width].copy_from_slice(&self.strip.right[inside]);
         }
+        Ok(())
     }
 
     /// Uniqueness, view, left-right consistency; sub-pixel place of what passes.
@@ -364,14 +376,18 @@ impl StereoMatcher {
     }
 
     /// Speckles, holes, median.
-    fn refine(&mut self, map: &mut DisparityMap) {
+    fn refine(&mut self, map: &mut DisparityMap, progress: &dyn Progress) -> Result<(), Cancelled> {
+        let stage = Stage::new(progress, "refine", 5)?;
         let width = map.disparity.width();
         let options = &self.options;
         let (disparity, states) = (map.disparity.as_mut_slice(), map.state.as_mut_slice());
         remove_speckles(disparity, states, width, options.speckle_size, options.speckle_range, &mut self.speckles);
+        stage.add(1)?;
         if options.fill {
             fill_holes(self.level, disparity, states, width, &mut self.holes);
+            stage.add(1)?;
             fill_planes(disparity, states, &self.gray8, width, &mut self.large_holes);
+            stage.add(1)?;
         }
         if options.median > 0 {
             median::median(self.level, disparity, width, options.median, &mut self.scratch);
@@ -379,8 +395,10 @@ impl StereoMatcher {
                 .par_chunks_mut(1 << 16)
                 .zip(self.scratch.par_chunks(1 << 16))
                 .for_each(|(d, s)| d.copy_from_slice(s));
+            stage.add(1)?;
         }
-        smooth(self.level, options.smoothing, disparity, states, &self.gray8, width, &mut self.planes);
+        smooth(self.level, options.smoothing, disparity, states, &self.gray8, width, &mut self.planes, &stage)?;
+        stage.add(1)
     }
 }
 
@@ -424,7 +442,7 @@ fn subpixel(method: Subpixel, winner: &Winner) -> f32 {
 mod tests {
     use super::*;
     use crate::Smoothing;
-    use cv_core::GrayU8;
+    use cv_core::{GrayU8, Silent};
     use cv_synth::instruction_sets;
 
     /// A textured slope before a textured wall, with a patch without texture.
@@ -452,7 +470,7 @@ mod tests {
                     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
                     let mut matcher = StereoMatcher::new(options.clone()).unwrap();
                     matcher.level = level;
-                    let map = pool.install(|| matcher.compute(left.view(), right.view())).unwrap();
+                    let map = pool.install(|| matcher.compute(left.view(), right.view(), &Silent)).unwrap();
                     let bits = map.disparity.as_slice().iter().map(|d| d.to_bits()).collect();
                     let found = (bits, map.state.as_slice().to_vec());
                     let expected = first.get_or_insert_with(|| found.clone());
@@ -466,7 +484,7 @@ mod tests {
     fn a_picture_of_one_color_matches_nowhere() {
         let gray = GrayU8::new(60, 40, [77]);
         let mut matcher = StereoMatcher::new(StereoOptions { disparities: 24, ..Default::default() }).unwrap();
-        let map = matcher.compute(gray.view(), gray.view()).unwrap();
+        let map = matcher.compute(gray.view(), gray.view(), &Silent).unwrap();
         assert_eq!((map.matched_fraction(), map.valid_fraction()), (0.0, 0.0));
     }
 }

@@ -6,7 +6,7 @@ use crate::kernel::{Output, Sweep};
 use crate::layout::{Layout, place};
 use crate::sgm::sweep;
 use crate::{Paths, StereoError, StereoOptions};
-use cv_core::ImageView;
+use cv_core::{Cancelled, ImageView, Progress, Stage};
 use fearless_simd::Level;
 
 /// Semi-global path sums of costs that are given, for benchmarks: both sweeps over the whole image, each of which reads
@@ -76,7 +76,11 @@ impl PathSums {
     }
 
     /// Sums up all paths.
-    pub fn run(&mut self) {
+    ///
+    /// # Errors
+    /// [`Cancelled`].
+    pub fn run(&mut self, progress: &dyn Progress) -> Result<(), Cancelled> {
+        let stage = Stage::new(progress, "path sums", 2 * self.height)?;
         let frame = Frame {
             width: self.width,
             height: self.height,
@@ -96,10 +100,11 @@ impl PathSums {
         let eight = self.options.paths == Paths::Eight;
         let run = |state: &mut Sweep, sums: &mut AlignedBuffer<u8>, mirrored| {
             state.start(&frame, mirrored);
-            sweep(self.level, &frame, state, 0..frame.height, Output::Store(sums.as_mut_slice()), eight);
+            sweep(self.level, &frame, state, 0..frame.height, Output::Store(sums.as_mut_slice()), eight, &stage)
         };
         let ([down, up], [down_sums, up_sums]) = (&mut self.sweeps, &mut self.sums);
-        rayon::join(|| run(down, down_sums, false), || run(up, up_sums, true));
+        let (one, other) = rayon::join(|| run(down, down_sums, false), || run(up, up_sums, true));
+        one.and(other)
     }
 
     /// The sum of all paths at a pixel and index.
@@ -117,7 +122,7 @@ impl PathSums {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cv_core::GrayU8;
+    use cv_core::{GrayU8, Silent};
     use cv_synth::instruction_sets;
 
     /// Path sums by definition, with one P2.
@@ -167,7 +172,7 @@ mod tests {
                 let mut sums = PathSums::at_level(level, options.clone(), gray.view(), cost).unwrap();
                 // Twice, so that what a run leaves behind would show.
                 for _ in 0..2 {
-                    sums.run();
+                    sums.run(&Silent).unwrap();
                 }
                 for (i, &expected) in expected.iter().enumerate() {
                     let (x, y, k) = (i / disparities % width, i / disparities / width, i % disparities);

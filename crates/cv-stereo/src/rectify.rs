@@ -6,11 +6,12 @@
 
 use crate::StereoGeometry;
 use cv_core::{
-    Camera, CameraError, Cancelled, Distortion, Image, ImageView, Mask, OptionError, Point2, Point3, Rotation3,
-    StereoRig, Vector3,
+    Camera, CameraError, Cancelled, Distortion, Image, ImageView, Mask, OptionError, Point2, Point3, Progress,
+    Rotation3, Stage, StereoRig, Vector3,
 };
 use cv_imgproc::{Pixel, RemapOptions, warp_with};
 use nalgebra::{Matrix3, Matrix4};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Options of [`Rectification::new`].
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -130,18 +131,33 @@ impl RectifiedView {
     /// The rectified image of an original, bilinear, and where it shows anything; black elsewhere.
     ///
     /// # Errors
-    /// [`RectifyError::ImageSize`] where the image is not of the camera's size.
+    /// [`RectifyError::ImageSize`] where the image is not of the camera's size; [`RectifyError::Cancelled`].
     pub fn apply<T: Pixel, const C: usize>(
         &self,
         image: ImageView<'_, T, C>,
+        progress: &dyn Progress,
     ) -> Result<(Image<T, C>, Mask), RectifyError> {
         let expected = (self.source.width, self.source.height);
         if image.size() != expected {
             return Err(RectifyError::ImageSize { image: image.size(), expected });
         }
         let size = (self.camera.width, self.camera.height);
-        warp_with(image, size, &RemapOptions::default(), |x, y| self.source_pixel(Point2::new(x as f64, y as f64)))
-            .map_err(|_| RectifyError::TooLarge { width: size.0, height: size.1 })
+        let stage = Stage::new(progress, "rectify", size.1)?;
+        let stopped = AtomicBool::new(false);
+        let source = |x: usize, y: usize| {
+            // Once it was stopped, nothing is left to do for any pixel.
+            if stopped.load(Ordering::Relaxed) {
+                return None;
+            }
+            if x == 0 && stage.add(1).is_err() {
+                stopped.store(true, Ordering::Relaxed);
+                return None;
+            }
+            self.source_pixel(Point2::new(x as f64, y as f64))
+        };
+        let warped = warp_with(image, size, &RemapOptions::default(), source)
+            .map_err(|_| RectifyError::TooLarge { width: size.0, height: size.1 })?;
+        if stopped.into_inner() { Err(Cancelled.into()) } else { Ok(warped) }
     }
 
     /// How many px of the original the outermost pixel of the rectified image lies outside it; infinity where the camera does

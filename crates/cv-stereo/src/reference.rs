@@ -244,7 +244,8 @@ mod tests {
                 let mut aggregator = Aggregator::default();
                 // Twice, so that what a frame leaves behind would show.
                 for _ in 0..2 {
-                    aggregator.run(level, &frame, options.paths == Paths::Eight);
+                    let stage = cv_core::Stage::new(&cv_core::Silent, "", 0).unwrap();
+                    aggregator.run(level, &frame, options.paths == Paths::Eight, &stage).unwrap();
                     prop_assert_eq!(&aggregator.winners, &expected.0, "{:?}", level);
                     prop_assert_eq!(&aggregator.right, &expected.1, "{:?}", level);
                 }

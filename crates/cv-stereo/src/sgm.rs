@@ -11,6 +11,7 @@ use crate::cost::Frame;
 use crate::kernel::{Output, Sweep, sweep_rows};
 use crate::layout::Layout;
 use crate::winner::Winner;
+use cv_core::{Cancelled, Progress, Stage};
 use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 use std::ops::Range;
@@ -40,13 +41,31 @@ impl Aggregator {
     }
 
     /// Asks for the memory of a frame and touches every page of it.
-    pub(crate) fn prepare(&mut self, width: usize, height: usize, layout: Layout) {
+    pub(crate) fn prepare(
+        &mut self,
+        width: usize,
+        height: usize,
+        layout: Layout,
+        progress: &dyn Progress,
+    ) -> Result<(), Cancelled> {
+        const PART: usize = 1 << 20;
         self.resize(width, height, layout.depth);
-        self.sums.as_mut_slice().par_chunks_mut(1 << 20).for_each(|part| part.fill(0));
+        let sums = self.sums.as_mut_slice();
+        let stage = Stage::new(progress, "prepare", sums.len().div_ceil(PART))?;
+        sums.par_chunks_mut(PART).try_for_each(|part| {
+            part.fill(0);
+            stage.add(1)
+        })
     }
 
-    /// Fills [`Aggregator::winners`] and [`Aggregator::right`].
-    pub(crate) fn run(&mut self, level: Level, frame: &Frame<'_>, eight: bool) {
+    /// Fills [`Aggregator::winners`] and [`Aggregator::right`]. Twice as many units as rows.
+    pub(crate) fn run(
+        &mut self,
+        level: Level,
+        frame: &Frame<'_>,
+        eight: bool,
+        stage: &Stage<'_>,
+    ) -> Result<(), Cancelled> {
         let (width, height) = (frame.width, frame.height);
         let depth = frame.layout.depth;
         self.resize(width, height, depth);
@@ -57,20 +76,21 @@ impl Aggregator {
         let (sums_top, sums_bottom) = self.sums.as_mut_slice().split_at_mut(top * width * depth);
         let (winners_top, winners_bottom) = self.winners.split_at_mut(top * width);
         let (right_top, right_bottom) = self.right.split_at_mut(top * width);
-        let run = |state: &mut Sweep, first: usize, steps: usize, output: Output<'_>| {
-            sweep(level, frame, state, first..first + steps, output, eight);
+        let run = |state: &mut Sweep, first: usize, steps: usize, output: Output<'_>| -> Result<(), Cancelled> {
+            sweep(level, frame, state, first..first + steps, output, eight, stage)
         };
-        rayon::join(
+        let (one, other) = rayon::join(
             || {
                 down.start(frame, false);
-                run(down, 0, top, Output::Store(sums_top));
+                run(down, 0, top, Output::Store(sums_top))
             },
             || {
                 up.start(frame, true);
-                run(up, 0, bottom, Output::Store(sums_bottom));
+                run(up, 0, bottom, Output::Store(sums_bottom))
             },
         );
-        rayon::join(
+        one.and(other)?;
+        let (one, other) = rayon::join(
             || {
                 run(
                     down,
@@ -81,6 +101,7 @@ impl Aggregator {
             },
             || run(up, bottom, top, Output::Finish { other: sums_top, winners: winners_top, right: right_top }),
         );
+        one.and(other)
     }
 }
 
@@ -92,6 +113,7 @@ pub(crate) fn sweep(
     rows: Range<usize>,
     mut output: Output<'_>,
     eight: bool,
-) {
-    dispatch!(level, simd => sweep_rows(simd, frame, state, rows.start, rows.len(), &mut output, eight));
+    stage: &Stage<'_>,
+) -> Result<(), Cancelled> {
+    dispatch!(level, simd => sweep_rows(simd, frame, state, rows.start, rows.len(), &mut output, eight, stage))
 }

@@ -167,7 +167,9 @@ fn ball(fixtures: &Path) -> Result<Outcome> {
         .iter()
         .skip(1)
         .step_by(2)
-        .map(|(photo, mask)| MaskScore::new(&segment(photo.view(), &model).mask, mask).context("sizes differ"))
+        .map(|(photo, mask)| {
+            MaskScore::new(&segment(photo.view(), &model, &Silent)?.mask, mask).context("sizes differ")
+        })
         .try_fold(MaskScore::default(), |sum, score| score.map(|s| sum.plus(s)))?;
     Ok(Outcome {
         checks: vec![Check::at_least("F1", score.f1(), 0.97)],

@@ -6,7 +6,7 @@
 
 use super::features::Random;
 use anyhow::{Context, Result, ensure};
-use cv_core::{DMatch, GrayU8, ImageView, Keypoint, Matrix3, Point2, Vector3};
+use cv_core::{DMatch, GrayU8, ImageView, Keypoint, Matrix3, Point2, Silent, Vector3};
 use cv_features::{
     DescriptorKind, Descriptors, FeatureError, MatchOptions, MopsOptions, SiftOptions, match_descriptors, sift,
 };
@@ -103,7 +103,7 @@ pub(super) fn run(python: &Path, script: &Path, data: &Path) -> Result<Quality> 
     for path in pictures {
         let image = cv_io::read_gray_u8(&path)?;
         let float = cv_imgproc::gray_to_f32(image.view());
-        let of_sift = sift(float.view(), &SiftOptions { max_features: COUNT, ..SiftOptions::default() })?;
+        let of_sift = sift(float.view(), &SiftOptions { max_features: COUNT, ..SiftOptions::default() }, &Silent)?;
         let sets = vec![
             Set { keypoints: of_sift.keypoints, rows: Rows::Floats(of_sift.descriptors) },
             read(&features_of(&path, "sift"), false)?,
@@ -150,7 +150,7 @@ fn features_of(picture: &Path, name: &str) -> PathBuf {
 
 /// Our counterpart of ORB.
 pub(super) fn mops(image: ImageView<'_, f32, 1>, count: usize) -> Result<Set, FeatureError> {
-    let found = cv_features::mops(image, &MopsOptions { max_features: count, ..MopsOptions::default() })?;
+    let found = cv_features::mops(image, &MopsOptions { max_features: count, ..MopsOptions::default() }, &Silent)?;
     Ok(Set { keypoints: found.keypoints, rows: Rows::Floats(found.descriptors) })
 }
 
@@ -267,7 +267,7 @@ fn mutual(a: &Rows, b: &Rows) -> Vec<(usize, usize)> {
     match (a, b) {
         (Rows::Floats(a), Rows::Floats(b)) => {
             let options = MatchOptions { ratio: None, mutual: true, ..MatchOptions::default() };
-            let found: Vec<DMatch> = match_descriptors(a, b, &options).unwrap_or_default();
+            let found: Vec<DMatch> = match_descriptors(a, b, &options, &Silent).unwrap_or_default();
             found.into_iter().map(|m| (m.query as usize, m.train as usize)).collect()
         }
         (Rows::Bits(a), Rows::Bits(b)) => {

@@ -4,7 +4,7 @@
 
 use super::feature_quality::{self, Quality};
 use anyhow::{Context, Result, ensure};
-use cv_core::{GrayF32, ImageView, Keypoint};
+use cv_core::{GrayF32, ImageView, Keypoint, Silent};
 use cv_features::{
     ByteDescriptors, CornerMeasure, DescriptorKind, Descriptors, HarrisOptions, MatchOptions, SiftOptions, anms,
     harris, harris_response, match_byte_descriptors, match_descriptors, sift,
@@ -91,12 +91,12 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<bool> {
     };
     let detect = |options: &HarrisOptions| {
         float(&|view| {
-            let corners = harris(view, options).unwrap_or_default();
+            let corners = harris(view, options, &Silent).unwrap_or_default();
             black_box(anms(&corners, 500, 0.9));
         });
     };
     let two = |sets: &[Descriptors; 2]| {
-        black_box(match_descriptors(&sets[0], &sets[1], &nearest)).ok();
+        black_box(match_descriptors(&sets[0], &sets[1], &nearest, &Silent)).ok();
     };
     let mut stages = vec![
         stage(
@@ -131,7 +131,7 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<bool> {
             5,
             Box::new(|| {
                 float(&|view| {
-                    black_box(sift(view, &settings)).ok();
+                    black_box(sift(view, &settings, &Silent)).ok();
                 });
             }),
         ),
@@ -215,11 +215,11 @@ fn recall(folder: &Path, settings: &SiftOptions, nearest: &MatchOptions) -> Resu
     let mut sets = Vec::new();
     for name in ["weir_1.jpg", "weir_2.jpg"] {
         let image = cv_imgproc::gray_to_f32(cv_io::read_gray_u8(folder.join(name))?.view());
-        sets.push(sift(image.view(), settings)?.descriptors);
+        sets.push(sift(image.view(), settings, &Silent)?.descriptors);
     }
     let bytes = |d: &Descriptors| ByteDescriptors::new(d).context("bytes");
-    let exact = match_descriptors(&sets[0], &sets[1], nearest)?;
-    let rounded = match_byte_descriptors(&bytes(&sets[0])?, &bytes(&sets[1])?, nearest)?;
+    let exact = match_descriptors(&sets[0], &sets[1], nearest, &Silent)?;
+    let rounded = match_byte_descriptors(&bytes(&sets[0])?, &bytes(&sets[1])?, nearest, &Silent)?;
     let same = exact.iter().zip(&rounded).filter(|(a, b)| a.train == b.train).count();
     Ok(same as f64 / exact.len() as f64)
 }

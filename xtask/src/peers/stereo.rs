@@ -3,7 +3,7 @@
 
 use crate::real::depth::{SCENES, Scene, truth};
 use anyhow::{Context, Result, ensure};
-use cv_core::GrayU8;
+use cv_core::{GrayU8, Silent};
 use cv_pipeline::stereo::{DisparityMap, Paths, PixelState, StereoMatcher, StereoOptions, evaluate_disparity};
 use cv_stereo::PathSums;
 use serde::Deserialize;
@@ -143,7 +143,7 @@ fn ours(folder: &Path, scene: &Scene, mode: &str, paths: Paths) -> Result<Line> 
     let options = StereoOptions { disparities: scene.disparities, paths, ..Default::default() };
     let mut matcher = StereoMatcher::new(options)?;
     let mut map = DisparityMap::empty();
-    let seconds = fastest(|| Ok(matcher.compute_into(left.view(), right.view(), &mut map)?))?;
+    let seconds = fastest(|| Ok(matcher.compute_into(left.view(), right.view(), &mut map, &Silent)?))?;
     let all = evaluate_disparity(map.disparity.view(), truth.view(), Some(mask.view()))?;
     let matched = cv_core::Mask::from_fn(mask.width(), mask.height(), |x, y| {
         [mask.at(x, y)[0] && map.state.at(x, y)[0] == PixelState::Matched]
@@ -218,7 +218,8 @@ fn scaling(text: &mut String) -> Result<()> {
             for (paths, figure) in PATHS.into_iter().zip(figures) {
                 let mut matcher = StereoMatcher::new(StereoOptions { paths, ..Default::default() })?;
                 let mut map = DisparityMap::empty();
-                let seconds = fastest(|| Ok(matcher.compute_into(pair[0].view(), pair[1].view(), &mut map)?))?;
+                let seconds =
+                    fastest(|| Ok(matcher.compute_into(pair[0].view(), pair[1].view(), &mut map, &Silent)?))?;
                 *figure = figure.min(1e9 * seconds / (width * height * matcher.options().disparities) as f64);
             }
         }
@@ -271,7 +272,7 @@ fn bandwidth(text: &mut String, folder: &Path, scene: &Scene) -> Result<()> {
         let mut map = DisparityMap::empty();
         let mut best: Option<Vec<(&str, f64)>> = None;
         for _ in 0..12 {
-            matcher.compute_into(left.view(), right.view(), &mut map)?;
+            matcher.compute_into(left.view(), right.view(), &mut map, &Silent)?;
             let stages = matcher.stages().to_vec();
             if best.as_ref().is_none_or(|b| stages[2].1 < b[2].1) {
                 best = Some(stages);
@@ -293,7 +294,7 @@ fn bandwidth(text: &mut String, folder: &Path, scene: &Scene) -> Result<()> {
         let mut sums =
             PathSums::new(options, gray.view(), |x, y, k| ((x * 7919 + y * 104_729 + k * 31) % 97 % 25) as u8)?;
         let seconds = fastest(|| {
-            sums.run();
+            sums.run(&Silent)?;
             Ok(())
         })?;
         let (traffic, ratio) = (sums.traffic() as f64, seconds * rate / sums.traffic() as f64);

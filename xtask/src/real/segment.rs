@@ -70,7 +70,7 @@ fn score(photos: &[(RgbU8, Mask)], first: usize, options: &TrainOptions) -> Resu
     let scores: Result<Vec<ConfusionMatrix>> = half(1 - first)
         .map(|(photo, mask)| {
             let start = Instant::now();
-            let result = segment(photo.view(), &model);
+            let result = segment(photo.view(), &model, &Silent)?;
             seconds = seconds.min(start.elapsed().as_secs_f64());
             Ok(ConfusionMatrix::new(result.mask.view(), mask.view())?)
         })

@@ -7,7 +7,7 @@ mod reconstruct;
 mod segment;
 
 use crate::frame::{Context, Failure, Outcome, Run, create_dir};
-use cv_core::{Camera, RgbU8};
+use cv_core::{Camera, RgbU8, Stage};
 use cv_report::{Figure, Note, Report};
 use serde::Serialize;
 use std::fmt::Write as _;
@@ -128,10 +128,13 @@ impl Run for Args {
         create_dir(&self.out)?;
         let demo = Demo { context, seed: context.seed.unwrap_or(1), out: &self.out };
         let (mut checks, mut sections, mut stages) = (Vec::new(), Vec::new(), Vec::new());
+        let stage = Stage::new(context, "demo", JOBS.len())?;
         for (name, job) in JOBS {
             context.note(format!("{name} …"));
             let start = Instant::now();
             let part = job(&demo)?;
+            // A job that was stopped is no job that gave up.
+            stage.add(1)?;
             checks.extend(part.checks);
             sections.push(part.section);
             stages.push((name, start.elapsed().as_secs_f64()));

@@ -5,8 +5,8 @@ use cv_core::{Keypoint, Named, RgbU8};
 use cv_io::FeatureRows;
 use cv_pipeline::features::{CornerMeasure, DescriptorKind, Descriptors, Features};
 use cv_pipeline::{
-    AffineSimulation, FeatureMethod, MatchingError, MatchingOptions, MatchingResult, ModelKind, PhotoFeatures,
-    RobustOptions, Silent, Suppression, estimate, match_extracted, match_photos,
+    AffineSimulation, EstimateError, FeatureMethod, MatchingError, MatchingOptions, MatchingResult, ModelKind,
+    PhotoFeatures, RobustOptions, Suppression, estimate, match_extracted, match_photos,
 };
 use cv_report::{Figure, MatchStyle, Note, Plot, Report, colors, draw_keypoints, draw_matches, tile_patches};
 use std::path::{Path, PathBuf};
@@ -126,7 +126,7 @@ impl Run for Args {
             let scores: Vec<f64> = result.matches.iter().map(|m| f64::from(m.ratio)).collect();
             cv_io::write_matches(path, &result.pairs(), Some(&scores))?;
         }
-        context.report(|| self.html(&a, &b, &result, context.seed))?;
+        context.report(|| self.html(&a, &b, &result, context))?;
         let counts = result.features.each_ref().map(|f| f.described.keypoints.len());
         let dropped = result.features.each_ref().map(|f| f.described.dropped.len());
         Ok(Outcome::new(result.stages)
@@ -148,13 +148,13 @@ impl Run for Args {
 }
 
 impl Args {
-    fn html(&self, a: &RgbU8, b: &RgbU8, result: &MatchingResult, seed: Option<u64>) -> Result<String, Failure> {
+    fn html(&self, a: &RgbU8, b: &RgbU8, result: &MatchingResult, context: &Context) -> Result<String, Failure> {
         let picture = |image: RgbU8, caption: &str| -> Result<Figure, Failure> {
             Ok(Figure::new(cv_io::encode_jpeg(image.view(), 88).during("cannot encode a picture")?, caption))
         };
         let mut report = Report::new("Matches");
         report.subtitle(&format!("{} and {}", self.first.display(), self.second.display()));
-        let (model, inliers) = agreed(result, seed);
+        let (model, inliers) = agreed(result, context)?;
         report
             .headline("matches", &result.pairs().len().to_string())
             .headline("that agree", &inliers.iter().filter(|i| **i).count().to_string());
@@ -314,12 +314,15 @@ fn statistics(report: &mut Report, result: &MatchingResult) {
 
 /// The model that most matches agree on, and which those are. A fundamental matrix always fits somewhat more matches
 /// than a homography of the same scene: it must win clearly.
-fn agreed(result: &MatchingResult, seed: Option<u64>) -> (Option<&'static str>, Vec<bool>) {
+fn agreed(result: &MatchingResult, context: &Context) -> Result<(Option<&'static str>, Vec<bool>), Failure> {
     let fit = |kind: ModelKind| {
-        let options = RobustOptions { seed: seed.unwrap_or(RobustOptions::default().seed), ..kind.options() };
-        estimate(&result.pairs(), kind, &options, &Silent).map(|r| r.robust.inliers).unwrap_or_default()
+        let options = RobustOptions { seed: context.seed.unwrap_or(RobustOptions::default().seed), ..kind.options() };
+        match estimate(&result.pairs(), kind, &options, context) {
+            Err(EstimateError::Cancelled(stop)) => Err(Failure::from(stop)),
+            found => Ok(found.map(|r| r.robust.inliers).unwrap_or_default()),
+        }
     };
-    let (h, f) = (fit(ModelKind::Homography), fit(ModelKind::Fundamental));
+    let (h, f) = (fit(ModelKind::Homography)?, fit(ModelKind::Fundamental)?);
     let (model, inliers) = match (h.len(), f.len()) {
         (0, 0) => (None, h),
         (h_count, f_count) if h_count * 10 >= f_count * 9 => (Some("homography"), h),
@@ -327,5 +330,5 @@ fn agreed(result: &MatchingResult, seed: Option<u64>) -> (Option<&'static str>, 
     };
     let mut mask = vec![false; result.matches.len()];
     inliers.into_iter().for_each(|i| mask[i] = true);
-    (model, mask)
+    Ok((model, mask))
 }

@@ -1,7 +1,7 @@
 //! `cv rectify`: a pair as two cameras would have taken it whose rows coincide.
 
 use super::size;
-use crate::frame::{Context, Explain, Failure, Outcome, Run, create_dir, spare_inputs};
+use crate::frame::{Context, Failure, Outcome, Run, create_dir, spare_inputs};
 use crate::{rig, words};
 use cv_core::{RgbU8, StereoRig};
 use cv_io::RigFile;
@@ -96,7 +96,7 @@ impl Run for Args {
         let rows: Vec<String> =
             q.row_iter().map(|row| row.iter().map(f64::to_string).collect::<Vec<_>>().join(" ")).collect();
         create_dir(&self.out)?;
-        all_or_none(&self.out, |folder| {
+        cv_io::write_together(&self.out, &NAMES, |folder| -> Result<(), Failure> {
             cv_io::write_png(folder.join("left.png"), result.images[0].view())?;
             cv_io::write_png(folder.join("right.png"), result.images[1].view())?;
             cv_io::write_rig(folder.join("rig.yaml"), &RigFile { rig: rectified, unit }, &["rectified"])?;
@@ -157,28 +157,6 @@ impl Run for Args {
     fn outputs(&self) -> Vec<&Path> {
         Vec::new()
     }
-}
-
-/// Lets `write` write the files into a folder of its own inside `out`, and moves them up once all are there: where one
-/// cannot be written, or a folder stands where one is to go, nothing changes.
-fn all_or_none(out: &Path, write: impl FnOnce(&Path) -> Result<(), Failure>) -> Result<(), Failure> {
-    for name in NAMES {
-        let path = out.join(name);
-        if path.is_dir() {
-            return Err(Failure::new(format!("{} is a folder, not a file to write", path.display())));
-        }
-    }
-    let folder = out.join(format!(".cv-{}.part", std::process::id()));
-    create_dir(&folder)?;
-    let done = write(&folder).and_then(|()| {
-        for name in NAMES {
-            std::fs::rename(folder.join(name), out.join(name)).during(format!("cannot write {name}"))?;
-        }
-        Ok(())
-    });
-    // Of no use any more, whether or not it worked.
-    let _ = std::fs::remove_dir_all(&folder);
-    done
 }
 
 /// Both views side by side with a line every sixteenth of the height.

@@ -3,11 +3,11 @@
 mod files;
 
 use crate::frame::{Context, Explain, Failure, Outcome, Run, create_dir, expand_images, named, same_file};
-use cv_core::{Mask, Named, RgbU8};
+use cv_core::{Mask, Named, RgbU8, Stage};
 use cv_pipeline::segmentation::{
     ColorModel, ColorSpace, ConfusionMatrix, Labeled, Regions, Rule, SegmentError, TrainOptions,
 };
-use cv_pipeline::{Progress, segment, train_segment};
+use cv_pipeline::{segment, train_segment};
 use cv_report::{Figure, Note, Report, colors, overlay_comparison, overlay_mask};
 use files::{Pair, pair, read_pair, stem};
 use serde_json::{Value, json};
@@ -121,9 +121,10 @@ impl Train {
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
         let pairs = pair(&self.labels.images, &self.labels.masks, context)?;
         let mut photos = Vec::with_capacity(pairs.len());
-        for (i, pair) in pairs.iter().enumerate() {
-            Progress::report(context, "read", i, pairs.len())?;
+        let stage = Stage::new(context, "read", pairs.len())?;
+        for pair in &pairs {
             photos.push(read_pair(pair, context)?);
+            stage.add(1)?;
         }
         let labeled: Vec<Labeled<'_>> = photos.iter().map(|(photo, mask)| (photo.view(), mask.view())).collect();
         let options = self.options(context);
@@ -156,7 +157,7 @@ impl Train {
                 .zip(&trained.scores)
                 .take(REPORT_PHOTOS)
                 .map(|((pair, (photo, mask)), scores)| {
-                    comparison(&pair.photo, photo, &trained.model.predict(photo.view()), mask, scores)
+                    comparison(&pair.photo, photo, &trained.model.predict(photo.view(), context)?, mask, scores)
                 })
                 .collect();
             page.section("Photographs").paragraph(LEGEND).figures(shown?);
@@ -222,10 +223,10 @@ impl Predict {
         let (mut images, mut figures, mut found) = (Vec::new(), Vec::new(), 0);
         // Encoded masks are small: they wait until every photograph is done, so that a bad one leaves nothing behind.
         let mut masks = Vec::new();
-        for (i, (path, output)) in photos.iter().zip(&outputs).enumerate() {
-            Progress::report(context, "predict", i, photos.len())?;
+        let stage = Stage::new(context, "predict", photos.len())?;
+        for (path, output) in photos.iter().zip(&outputs) {
             let photo = cv_io::read_rgb(path)?;
-            let result = segment(photo.view(), &model);
+            let result = segment(photo.view(), &model, &stage)?;
             masks.push(cv_io::encode_png(result.mask.view()).during(path.display())?);
             found += usize::from(result.fraction > 0.0);
             images.push(json!({ "path": path, "mask": output, "fraction": result.fraction }));
@@ -235,6 +236,7 @@ impl Predict {
                 figures.push(figure(&overlay, &words)?);
             }
             add_stages(&mut stages, &result.stages);
+            stage.add(1)?;
         }
         create_dir(&self.out)?;
         for (output, mask) in outputs.iter().zip(&masks) {
@@ -271,20 +273,21 @@ impl Eval {
         let pairs = pair(&self.labels.images, &self.labels.masks, context)?;
         let mut stages: Vec<(&'static str, f64)> = Vec::new();
         let (mut scores, mut figures) = (Vec::new(), Vec::new());
+        let stage = Stage::new(context, "score", pairs.len())?;
         for (i, pair) in pairs.iter().enumerate() {
-            Progress::report(context, "score", i, pairs.len())?;
             let (photo, truth) = read_pair(pair, context)?;
             if photo.size() != truth.size() {
                 let error = SegmentError::SizeMismatch { index: i, photo: photo.size(), mask: truth.size() };
                 return Err(refused(error, &pairs));
             }
-            let result = segment(photo.view(), &model);
+            let result = segment(photo.view(), &model, &stage)?;
             let score = ConfusionMatrix::new(result.mask.view(), truth.view())?;
             if context.wants_report() && figures.len() < REPORT_PHOTOS {
                 figures.push(comparison(&pair.photo, &photo, &result.mask, &truth, &score)?);
             }
             scores.push(score);
             add_stages(&mut stages, &result.stages);
+            stage.add(1)?;
         }
         let total: ConfusionMatrix = scores.iter().copied().sum();
         context.report(|| {

@@ -1,9 +1,10 @@
 //! What a running command knows about how it was called.
 
 use super::progress::Bar;
+use super::stop::Stop;
 use super::{Failure, Globals, create_dir};
 use cv_pipeline::{Cancelled, Progress};
-use std::{fmt::Display, path::PathBuf};
+use std::{fmt::Display, path::PathBuf, sync::Arc};
 
 /// What a running command knows about how it was called. It is also the [`Progress`] that pipelines report to.
 pub(crate) struct Context {
@@ -11,13 +12,15 @@ pub(crate) struct Context {
     pub(crate) seed: Option<u64>,
     quiet: bool,
     report: Option<PathBuf>,
-    bar: Bar,
+    bar: Arc<Bar>,
+    pub(super) stop: Stop,
 }
 
 impl Context {
     pub(super) fn new(globals: &Globals) -> Self {
         let Globals { quiet, seed, .. } = *globals;
-        Self { seed, quiet, report: globals.report.clone(), bar: Bar::new(quiet) }
+        let bar = Arc::new(Bar::new(quiet));
+        Self { seed, quiet, report: globals.report.clone(), stop: Stop::listen(&bar), bar }
     }
 
     /// A line on stderr, whatever was asked for.
@@ -61,6 +64,7 @@ impl Context {
 
 impl Progress for Context {
     fn report(&self, stage: &'static str, done: usize, total: usize) -> Result<(), Cancelled> {
+        self.stop.check()?;
         self.bar.show(stage, done, total);
         Ok(())
     }

@@ -9,6 +9,7 @@ mod named;
 mod outcome;
 mod outputs;
 mod progress;
+mod stop;
 
 pub(crate) use context::Context;
 pub(crate) use failure::{Explain, Failure};
@@ -78,6 +79,7 @@ pub(crate) fn run(globals: &Globals, command: impl FnOnce(&Context) -> Result<Ou
                 Some(failure) => failure,
             }
         }
+        Err(_) if context.stop.check().is_err() => return context.stop.tell(),
         Err(failure) => failure,
     };
     context.say(&failure.text());

@@ -13,7 +13,7 @@ use crate::match_blocks::{LANES, different};
 use crate::ransac::{Estimator, RansacData, RobustOptions, Scorer, TukeyBiweight, ransac};
 use crate::robust::RobustModel;
 use crate::rotation::orthonormalized;
-use cv_core::{Matrix3, Point2, Point3, Pose, Rotation3, Vector3, median};
+use cv_core::{Matrix3, Point2, Point3, Pose, Progress, Rotation3, Vector3, median};
 use cv_numeric::{LeastSquares, LmOptions, NormalEquations, levenberg_marquardt};
 use nalgebra::{Const, Matrix2x3, SVector};
 
@@ -34,14 +34,18 @@ pub struct WorldMatch {
 /// # Errors
 /// [`EstimateError`]: fewer than four matches, a coordinate that is not finite, points on a line or coincident, or no consensus of more than
 /// three matches.
-pub fn estimate_pose(matches: &[WorldMatch], options: &RobustOptions) -> Result<RobustModel<Pose>, EstimateError> {
+pub fn estimate_pose(
+    matches: &[WorldMatch],
+    options: &RobustOptions,
+    progress: &dyn Progress,
+) -> Result<RobustModel<Pose>, EstimateError> {
     options.check()?;
     check_world(matches, 4)?;
     if let Some(kind) = world_degeneracy(matches) {
         return Err(EstimateError::Degenerate { kind });
     }
     let estimator = AbsoluteEstimator::new(matches);
-    let found = ransac(&estimator, options)?;
+    let found = ransac(&estimator, options, progress)?;
     let pose = estimator.uncentered(&found.model);
     let (mut inliers, mut sum) = (Vec::new(), 0.0);
     for (i, m) in matches.iter().enumerate() {
@@ -274,6 +278,7 @@ mod tests {
     use super::*;
     use crate::ransac::LeastSquaresLoss;
     use crate::testing::{TwoViews, gauss, uniform};
+    use cv_core::Silent;
     use rand_chacha::ChaCha8Rng;
     use rand_chacha::rand_core::SeedableRng;
 
@@ -329,7 +334,7 @@ mod tests {
                 m.image = Point2::new(1.2 * uniform(&mut rng) - 0.6, uniform(&mut rng) - 0.5);
             }
             let options = RobustOptions { threshold: 4e-3, seed, ..RobustOptions::default() };
-            let found = estimate_pose(&m, &options).unwrap();
+            let found = estimate_pose(&m, &options, &Silent).unwrap();
             let least_squares = refine_pose(&views.pose, &m[..40], 1.0).0;
             let ([r, t], [r0, t0]) = (error(&found.model, &views.pose), error(&least_squares, &views.pose));
             // As good as least squares on the right ones, give or take; forty points of that noise fix a rotation to a thousandth.
@@ -344,7 +349,7 @@ mod tests {
     fn bad_input_gets_a_typed_answer() {
         let (_, good) = world(1, 20, 0.0);
         let options = RobustOptions { threshold: 1e-3, ..RobustOptions::default() };
-        let get = |m: &[WorldMatch]| estimate_pose(m, &options).unwrap_err();
+        let get = |m: &[WorldMatch]| estimate_pose(m, &options, &Silent).unwrap_err();
         assert_eq!(get(&good[..3]), EstimateError::NotEnoughMatches { got: 3, needed: 4 });
         assert_eq!(get(&[good[0]; 9]), EstimateError::Degenerate { kind: Degeneracy::Coincident });
         let line: Vec<_> = (0..9)
@@ -355,7 +360,7 @@ mod tests {
         bad[4].world.z = f64::NAN;
         assert_eq!(get(&bad), EstimateError::NotFinite { index: 4 });
         bad[4].world.z = 1e9;
-        assert_eq!(estimate_pose(&bad, &options).unwrap().inliers.len(), 19);
+        assert_eq!(estimate_pose(&bad, &options, &Silent).unwrap().inliers.len(), 19);
         let flat: Vec<_> =
             good.iter().map(|m| WorldMatch { world: Point3::new(m.world.x, m.world.y, 5.0), ..*m }).collect();
         assert_eq!(pose_from_points(&flat), Err(EstimateError::Degenerate { kind: Degeneracy::Planar }));

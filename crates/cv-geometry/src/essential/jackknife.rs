@@ -4,7 +4,7 @@ use super::refine_relative_pose;
 use crate::epipolar::sampson;
 use crate::essential_from_pose;
 use crate::ransac::{Scorer, TukeyBiweight};
-use cv_core::{Correspondence, Pose};
+use cv_core::{Cancelled, Correspondence, Pose, Progress, Stage};
 use rayon::prelude::*;
 
 /// Parts of the first image that are left out in turn.
@@ -25,7 +25,16 @@ pub fn pose_difference(a: &Pose, b: &Pose) -> [f64; 2] {
 /// A covariance from residuals supposes errors that know nothing of each other. Those of a lens that bends rays a little otherwise than
 /// its model says, of leaves in the wind, or of a repeated facade are alike all over a part of the image; where such a part moves
 /// the pose, this tells. `matches` in normalized coordinates, those that agree with `pose`; `threshold` as in [`refine_relative_pose`].
-pub fn jackknife_pose_deviation(pose: &Pose, matches: &[Correspondence], threshold: f64) -> [f64; 2] {
+///
+/// # Errors
+/// [`Cancelled`].
+pub fn jackknife_pose_deviation(
+    pose: &Pose,
+    matches: &[Correspondence],
+    threshold: f64,
+    progress: &dyn Progress,
+) -> Result<[f64; 2], Cancelled> {
+    let stage = Stage::new(progress, "stability", BLOCKS)?;
     let mut order: Vec<usize> = (0..matches.len()).collect();
     split(&mut order, matches, BLOCKS);
     let bounds: Vec<usize> = (0..=BLOCKS).map(|k| k * order.len() / BLOCKS).collect();
@@ -35,11 +44,12 @@ pub fn jackknife_pose_deviation(pose: &Pose, matches: &[Correspondence], thresho
             let kept = order[..bounds[k]].iter().chain(&order[bounds[k + 1]..]);
             let rest: Vec<Correspondence> = kept.map(|&i| matches[i]).collect();
             let (other, _) = refine_relative_pose(pose, &rest, threshold);
-            pose_difference(&other, pose).map(|d| d * d)
+            stage.add(1)?;
+            Ok(pose_difference(&other, pose).map(|d| d * d))
         })
-        .collect();
+        .collect::<Result<_, Cancelled>>()?;
     let factor = (BLOCKS - 1) as f64 / BLOCKS as f64;
-    [0, 1].map(|i| (factor * squares.iter().map(|s| s[i]).sum::<f64>()).sqrt())
+    Ok([0, 1].map(|i| (factor * squares.iter().map(|s| s[i]).sum::<f64>()).sqrt()))
 }
 
 /// Orders `order` so that `parts` (a power of two) equal stretches of it are compact in the first image: halves across the longer side.
@@ -80,20 +90,24 @@ pub fn poses_are_rivals(a: &Pose, b: &Pose, matches: &[Correspondence], threshol
 mod tests {
     use super::*;
     use crate::testing::TwoViews;
-    use cv_core::{Rotation3, Vector3};
+    use cv_core::{Rotation3, Silent, Vector3};
 
     #[test]
     fn the_blocks_tell_of_a_part_that_disagrees() {
         let views = TwoViews::random(3);
         let mut matches = views.normalized_matches(400, 2e-4);
-        let fine = jackknife_pose_deviation(&refine_relative_pose(&views.pose, &matches, 4e-3).0, &matches, 4e-3);
+        let fine =
+            jackknife_pose_deviation(&refine_relative_pose(&views.pose, &matches, 4e-3).0, &matches, 4e-3, &Silent)
+                .unwrap();
         // A fifth of a pixel at 500 px on 400 points: hundredths of a degree for the rotation, tenths for the direction at most.
         assert!(fine[0] < 2e-3 && fine[1] < 1e-2, "{fine:?}");
         // The left of the image is displaced by one pixel, five times the noise: the lens is not what its model says.
         for m in matches.iter_mut().filter(|m| m.a.x < -0.3) {
             m.b.y += 2e-3;
         }
-        let off = jackknife_pose_deviation(&refine_relative_pose(&views.pose, &matches, 4e-3).0, &matches, 4e-3);
+        let off =
+            jackknife_pose_deviation(&refine_relative_pose(&views.pose, &matches, 4e-3).0, &matches, 4e-3, &Silent)
+                .unwrap();
         assert!(off[1] > 2.0 * fine[1], "{off:?} {fine:?}");
     }
 

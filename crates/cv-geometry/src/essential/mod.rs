@@ -17,7 +17,7 @@ use crate::match_blocks::{LANES, MatchBlock, NormalizedMatches, Normalizer, chec
 use crate::ransac::{Estimator, RobustOptions, Scorer, TukeyBiweight, ransac};
 use crate::robust::RobustModel;
 use crate::rotation::orthonormalized;
-use cv_core::{Camera, Correspondence, Matrix3, Point2, Pose, Rotation3, Vector3};
+use cv_core::{Camera, Correspondence, Matrix3, Point2, Pose, Progress, Rotation3, Vector3};
 use cv_numeric::{LeastSquares, svd3};
 use decompose::rotations_and_translation;
 use nalgebra::{SMatrix, SVector};
@@ -38,6 +38,7 @@ use nalgebra::{SMatrix, SVector};
 pub fn estimate_relative_pose(
     matches: &[Correspondence],
     options: &RobustOptions,
+    progress: &dyn Progress,
 ) -> Result<RobustModel<Pose>, EstimateError> {
     options.check()?;
     check(matches, 6)?;
@@ -50,7 +51,7 @@ pub fn estimate_relative_pose(
         return Err(degenerate(kind));
     }
     let estimator = PoseEstimator { set, reach: options.threshold };
-    let found = ransac(&estimator, options)?;
+    let found = ransac(&estimator, options, progress)?;
     let pose = found.model;
     let e = essential_from_pose(&pose);
     let residual = |_: &Pose, m: &Correspondence| {
@@ -71,8 +72,9 @@ pub fn estimate_relative_pose(
 pub fn estimate_essential(
     matches: &[Correspondence],
     options: &RobustOptions,
+    progress: &dyn Progress,
 ) -> Result<RobustModel<Matrix3<f64>>, EstimateError> {
-    let found = estimate_relative_pose(matches, options)?;
+    let found = estimate_relative_pose(matches, options, progress)?;
     Ok(found.map(|pose| essential_from_pose(&pose)))
 }
 
@@ -268,6 +270,7 @@ impl Estimator for PoseEstimator {
 mod tests {
     use super::*;
     use crate::testing::{TwoViews, cosine};
+    use cv_core::Silent;
     use proptest::prelude::*;
 
     fn turn_between(a: &Rotation3<f64>, b: &Rotation3<f64>) -> f64 {
@@ -360,7 +363,7 @@ mod tests {
         let run = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             let options = RobustOptions { threshold: 1.5 * unit, ..RobustOptions::essential() };
-            pool.install(|| estimate_relative_pose(&m, &options).unwrap())
+            pool.install(|| estimate_relative_pose(&m, &options, &Silent).unwrap())
         };
         let (one, four) = (run(1), run(4));
         assert!(one.iterations > 2048 + 256, "{}", one.iterations);
@@ -399,7 +402,7 @@ mod tests {
             m.extend(views.wrong(150));
             let (normalized, unit) = normalize_matches(&m, &views.camera, &views.camera);
             let options = RobustOptions { threshold: 1.5 * unit, seed, ..RobustOptions::default() };
-            let found = estimate_relative_pose(&normalized, &options).unwrap();
+            let found = estimate_relative_pose(&normalized, &options, &Silent).unwrap();
             errors.push(pose_difference(&found.model, &views.pose).map(f64::to_degrees));
             let right = found.inliers.iter().filter(|i| **i < 150).count();
             // 1.5 px is three standard deviations; a wrong match is that close to a line with a chance of about 3 in 480.
@@ -421,7 +424,7 @@ mod tests {
             m.extend(views.wrong(100));
             let (normalized, unit) = normalize_matches(&m, &views.camera, &views.camera);
             let options = RobustOptions { threshold: 1.5 * unit, seed, ..RobustOptions::essential() };
-            let found = estimate_relative_pose(&normalized, &options).unwrap();
+            let found = estimate_relative_pose(&normalized, &options, &Silent).unwrap();
             errors.push(pose_difference(&found.model, &views.pose)[1].to_degrees());
         }
         errors.sort_by(f64::total_cmp);
@@ -462,17 +465,17 @@ mod tests {
         let options = RobustOptions { threshold: 1e-3, ..RobustOptions::default() };
         let good = views.normalized_matches(20, 0.0);
         assert_eq!(
-            estimate_relative_pose(&good[..5], &options).unwrap_err(),
+            estimate_relative_pose(&good[..5], &options, &Silent).unwrap_err(),
             EstimateError::NotEnoughMatches { got: 5, needed: 6 }
         );
         let same = vec![good[0]; 20];
         assert_eq!(
-            estimate_relative_pose(&same, &options).unwrap_err(),
+            estimate_relative_pose(&same, &options, &Silent).unwrap_err(),
             EstimateError::Degenerate { kind: Degeneracy::Coincident }
         );
         let mut bad = good.clone();
         bad[2].b.x = f64::NAN;
-        assert_eq!(estimate_essential(&bad, &options).unwrap_err(), EstimateError::NotFinite { index: 2 });
+        assert_eq!(estimate_essential(&bad, &options, &Silent).unwrap_err(), EstimateError::NotFinite { index: 2 });
         assert!(decompose_essential(&Matrix3::zeros()).is_err());
         assert!(decompose_essential(&Matrix3::from_element(f64::NAN)).is_err());
         assert!(recover_pose(&views.essential(), &[]).is_err());

@@ -15,7 +15,7 @@ use crate::homography::{homography_from_points, homography_residual};
 use crate::match_blocks::{LANES, MatchBlock, NormalizedMatches, point_degeneracy};
 use crate::ransac::{Estimator, RobustOptions, Scorer, ransac};
 use crate::robust::RobustModel;
-use cv_core::{Correspondence, Matrix3, Point2};
+use cv_core::{Correspondence, Matrix3, Point2, Progress};
 use rank_two::RankTwo;
 
 /// The fundamental matrix between two images of a rigid scene, from matches of which many may be wrong.
@@ -29,6 +29,7 @@ use rank_two::RankTwo;
 pub fn estimate_fundamental(
     matches: &[Correspondence],
     options: &RobustOptions,
+    progress: &dyn Progress,
 ) -> Result<RobustModel<Matrix3<f64>>, EstimateError> {
     options.check()?;
     let set = NormalizedMatches::new(matches, 8)?;
@@ -43,7 +44,7 @@ pub fn estimate_fundamental(
         return Err(degenerate(Degeneracy::Planar));
     }
     let estimator = FundamentalEstimator { set };
-    let found = ransac(&estimator, options)?;
+    let found = ransac(&estimator, options, progress)?;
     let set = &estimator.set;
     let f = eight_point::unit(&(set.second.matrix().transpose() * found.model * set.first.matrix()));
     let result = RobustModel::new(f, matches, options.threshold, &found, sampson);
@@ -134,6 +135,7 @@ mod tests {
     use super::*;
     use crate::ransac::LeastSquaresLoss;
     use crate::testing::{TwoViews, cosine};
+    use cv_core::Silent;
     use cv_numeric::LeastSquares as _;
     use proptest::prelude::*;
 
@@ -221,7 +223,8 @@ mod tests {
             let views = TwoViews::random(seed);
             let mut m = views.matches(150, 0.3);
             m.extend(views.wrong(100));
-            let found = estimate_fundamental(&m, &RobustOptions { seed, ..RobustOptions::fundamental() }).unwrap();
+            let found =
+                estimate_fundamental(&m, &RobustOptions { seed, ..RobustOptions::fundamental() }, &Silent).unwrap();
             // The judge is exact points that were not used.
             errors.push(views.exact_rms(&found.model));
             linear.push(views.exact_rms(&fundamental_eight_point(&m[..150]).unwrap()));
@@ -244,7 +247,8 @@ mod tests {
             let mut m = views.planar_matches(180, 0.3);
             m.extend(views.matches(20, 0.3));
             m.extend(views.wrong(40));
-            let found = estimate_fundamental(&m, &RobustOptions { seed, ..RobustOptions::fundamental() }).unwrap();
+            let found =
+                estimate_fundamental(&m, &RobustOptions { seed, ..RobustOptions::fundamental() }, &Silent).unwrap();
             errors.push(views.exact_rms(&found.model));
         }
         errors.sort_by(f64::total_cmp);
@@ -258,7 +262,7 @@ mod tests {
         for seed in 0..10 {
             let views = TwoViews::random(seed);
             let m = views.planar_matches(100, 0.1);
-            let found = estimate_fundamental(&m, &RobustOptions { seed, ..RobustOptions::fundamental() });
+            let found = estimate_fundamental(&m, &RobustOptions { seed, ..RobustOptions::fundamental() }, &Silent);
             assert_eq!(
                 found.map(|r| r.inliers.len()),
                 Err(EstimateError::Degenerate { kind: Degeneracy::Planar }),
@@ -278,8 +282,9 @@ mod tests {
     #[test]
     fn bad_input_gets_a_typed_answer() {
         let views = TwoViews::random(1);
-        let get =
-            |m: &[Correspondence]| estimate_fundamental(m, &RobustOptions::fundamental()).map(|r| r.inliers.len());
+        let get = |m: &[Correspondence]| {
+            estimate_fundamental(m, &RobustOptions::fundamental(), &Silent).map(|r| r.inliers.len())
+        };
         let good = views.matches(30, 0.0);
         assert_eq!(get(&good[..7]), Err(EstimateError::NotEnoughMatches { got: 7, needed: 8 }));
         assert_eq!(get(&vec![good[0]; 30]), Err(EstimateError::Degenerate { kind: Degeneracy::Coincident }));

@@ -12,7 +12,7 @@ use crate::match_blocks::{LANES, MatchBlock, NormalizedMatches, point_degeneracy
 use crate::ransac::LeastSquaresLoss;
 use crate::ransac::{Estimator, RobustOptions, Scorer, TukeyBiweight, ransac};
 use crate::robust::RobustModel;
-use cv_core::{Correspondence, Matrix3, Point2};
+use cv_core::{Correspondence, Matrix3, Point2, Progress};
 use refine::{TransferProblem, refine_transfer};
 
 /// The root mean square of the distances from `b` to `H a` and from `a` to `H⁻¹ b`, in pixels.
@@ -32,7 +32,7 @@ pub fn homography_residual(h: &Matrix3<f64>, m: &Correspondence) -> f64 {
 /// RANSAC with local optimization on the symmetric transfer error; the model is scaled to `H[2][2] = 1`.
 ///
 /// ```
-/// use cv_core::Correspondence;
+/// use cv_core::{Correspondence, Silent};
 /// use cv_geometry::{RobustOptions, estimate_homography};
 ///
 /// // A shift by (10, 5), and one wrong match.
@@ -41,7 +41,7 @@ pub fn homography_residual(h: &Matrix3<f64>, m: &Correspondence) -> f64 {
 ///     .map(|(x, y)| Correspondence::new(x, y, x + 10.0, y + 5.0))
 ///     .collect();
 /// matches.push(Correspondence::new(50.0, 50.0, 300.0, 20.0));
-/// let found = estimate_homography(&matches, &RobustOptions::homography())?;
+/// let found = estimate_homography(&matches, &RobustOptions::homography(), &Silent)?;
 /// assert_eq!(found.inliers, (0..20).collect::<Vec<_>>());
 /// assert!((found.model[(0, 2)] - 10.0).abs() < 1e-6);
 /// # Ok::<(), cv_geometry::EstimateError>(())
@@ -53,6 +53,7 @@ pub fn homography_residual(h: &Matrix3<f64>, m: &Correspondence) -> f64 {
 pub fn estimate_homography(
     matches: &[Correspondence],
     options: &RobustOptions,
+    progress: &dyn Progress,
 ) -> Result<RobustModel<Matrix3<f64>>, EstimateError> {
     options.check()?;
     let set = NormalizedMatches::new(matches, 4)?;
@@ -64,7 +65,7 @@ pub fn estimate_homography(
         return Err(degenerate(kind));
     }
     let estimator = HomographyEstimator { set };
-    let found = ransac(&estimator, options)?;
+    let found = ransac(&estimator, options, progress)?;
     let set = &estimator.set;
     let h = dlt::scaled(&(set.second.inverse_matrix() * found.model * set.first.matrix()));
     let result = RobustModel::new(h, matches, options.threshold, &found, homography_residual);
@@ -186,6 +187,7 @@ impl Estimator for HomographyEstimator {
 mod tests {
     use super::*;
     use crate::error::Degeneracy;
+    use cv_core::Silent;
     use cv_numeric::LeastSquares;
     use nalgebra::SVector;
     use proptest::prelude::*;
@@ -284,7 +286,7 @@ mod tests {
             for _ in 0..100 {
                 m.push(Correspondence::new(640.0 * uniform(&mut rng), 480.0 * uniform(&mut rng), 640.0 * uniform(&mut rng), 480.0 * uniform(&mut rng)));
             }
-            let found = estimate_homography(&m, &RobustOptions { seed, ..RobustOptions::homography() }).unwrap();
+            let found = estimate_homography(&m, &RobustOptions { seed, ..RobustOptions::homography() }, &Silent).unwrap();
             prop_assert_eq!(found.model[(2, 2)], 1.0);
             // As good as least squares on the right matches alone, give or take the few wrong ones that happen to fit.
             let oracle = refine_homography(&h, &m[..100]).unwrap();
@@ -357,14 +359,14 @@ mod tests {
     fn mirrored_images_are_homographies_too() {
         let h = Matrix3::new(-1.0, 0.0, 639.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0);
         let m = matches(&h, 20, 0.0, &mut ChaCha8Rng::seed_from_u64(5));
-        let found = estimate_homography(&m, &RobustOptions::homography()).unwrap();
+        let found = estimate_homography(&m, &RobustOptions::homography(), &Silent).unwrap();
         assert!(corner_error(&found.model, &h) < 1e-6);
     }
 
     #[test]
     fn bad_input_gets_a_typed_answer() {
         let options = RobustOptions::homography();
-        let get = |m: &[Correspondence]| estimate_homography(m, &options).map(|r| r.model);
+        let get = |m: &[Correspondence]| estimate_homography(m, &options, &Silent).map(|r| r.model);
         let good = matches(&Matrix3::identity(), 20, 0.0, &mut ChaCha8Rng::seed_from_u64(1));
         assert_eq!(get(&good[..3]), Err(EstimateError::NotEnoughMatches { got: 3, needed: 4 }));
         assert_eq!(get(&[]), Err(EstimateError::NotEnoughMatches { got: 0, needed: 4 }));
@@ -395,7 +397,7 @@ mod tests {
         assert!(homography_from_points(&repeated).is_err());
         for (threshold, confidence) in [(0.0, 0.99), (f64::NAN, 0.99), (3.0, 1.0), (3.0, f64::NAN)] {
             let options = RobustOptions { threshold, confidence, ..options };
-            assert!(matches!(estimate_homography(&good, &options), Err(EstimateError::Option(_))));
+            assert!(matches!(estimate_homography(&good, &options, &Silent), Err(EstimateError::Option(_))));
         }
     }
 
@@ -416,8 +418,12 @@ mod tests {
         let run = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             pool.install(|| {
-                estimate_homography(&m, &RobustOptions { scoring: crate::Scoring::Msac, ..RobustOptions::homography() })
-                    .unwrap()
+                estimate_homography(
+                    &m,
+                    &RobustOptions { scoring: crate::Scoring::Msac, ..RobustOptions::homography() },
+                    &Silent,
+                )
+                .unwrap()
             })
         };
         let (one, four) = (run(1), run(4));

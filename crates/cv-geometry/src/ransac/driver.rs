@@ -2,6 +2,7 @@
 
 use super::quality::Quality;
 use super::{Consensus, Estimator, RansacData, RobustOptions, Sampler, Score, Scorer, TukeyBiweight};
+use cv_core::{Cancelled, Progress, Stage};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use rayon::prelude::*;
@@ -43,7 +44,8 @@ pub(super) fn search<E: Estimator, C: Scorer, S: Sampler>(
     quality: &Quality<'_, E, C>,
     sampler: &mut S,
     options: &RobustOptions,
-) -> Option<Consensus<E::Model>> {
+    progress: &dyn Progress,
+) -> Result<Option<Consensus<E::Model>>, Cancelled> {
     let n = quality.estimator.data().count();
     let mut best: Option<ScoredModel<E::Model>> = None;
     let mut minimal = f32::INFINITY;
@@ -61,6 +63,8 @@ pub(super) fn search<E: Estimator, C: Scorer, S: Sampler>(
         for sample in &mut samples {
             sampler.draw(&mut sample[..E::SAMPLE]);
         }
+        // As far as this confidence: a better model may end it sooner.
+        let stage = Samples { progress, drawn: iterations, needed };
         iterations += count;
         let limit = match waiting.get(RUNNERS_UP - 1) {
             Some(last) => last.found.score.loss,
@@ -68,9 +72,12 @@ pub(super) fn search<E: Estimator, C: Scorer, S: Sampler>(
             None => minimal,
         };
         let winners: Vec<Winner<E::Model>> = if n < PARALLEL_FROM && count < MOST {
-            samples.chunks(CHUNK).filter_map(|chunk| best_of(quality, chunk, limit, &mut models)).collect()
+            let winners = samples.chunks(CHUNK).map(|chunk| best_of(quality, chunk, limit, &mut models, &stage));
+            winners.filter_map(Result::transpose).collect::<Result<_, _>>()?
         } else {
-            samples.par_chunks(CHUNK).filter_map(|chunk| best_of(quality, chunk, limit, &mut Vec::new())).collect()
+            let winners =
+                samples.par_chunks(CHUNK).map(|chunk| best_of(quality, chunk, limit, &mut Vec::new(), &stage));
+            winners.filter_map(Result::transpose).collect::<Result<_, _>>()?
         };
         for winner in winners {
             if winner.found.score.loss >= minimal {
@@ -82,33 +89,49 @@ pub(super) fn search<E: Estimator, C: Scorer, S: Sampler>(
                 continue;
             }
             minimal = winner.found.score.loss;
-            let mut found = optimized(quality, winner, &mut models);
-            quality.inner_ransac(&mut found, &mut rng, &mut models);
+            let mut found = optimized(quality, winner, &mut models, &stage)?;
+            quality.inner_ransac(&mut found, &mut rng, &mut models, &stage)?;
             if best.as_ref().is_none_or(|b| found.score.loss < b.score.loss) {
                 needed = options.needed(found.score.inliers as usize, n, E::SAMPLE).min(most);
                 best = Some(found);
             }
         }
     }
-    let mut best = best?;
+    let Some(mut best) = best else { return Ok(None) };
+    let stage = Stage::new(progress, "best models", waiting.len())?;
     if iterations == most {
         let searched = |(k, winner): (usize, Winner<E::Model>)| {
             let (mut rng, mut models) = (rng.clone(), Vec::new());
             rng.set_stream(k as u64 + 1);
-            let mut found = optimized(quality, winner, &mut models);
-            quality.inner_ransac(&mut found, &mut rng, &mut models);
-            found
+            let mut found = optimized(quality, winner, &mut models, &stage)?;
+            quality.inner_ransac(&mut found, &mut rng, &mut models, &stage)?;
+            stage.add(1)?;
+            Ok(found)
         };
-        let others: Vec<ScoredModel<E::Model>> = waiting.into_par_iter().enumerate().map(searched).collect();
+        let others: Vec<ScoredModel<E::Model>> =
+            waiting.into_par_iter().enumerate().map(searched).collect::<Result<_, Cancelled>>()?;
         for found in others {
             if found.score.loss < best.score.loss {
                 best = found;
             }
         }
     }
-    let model = settle(quality, best, &mut rng, &mut models);
+    let model = settle(quality, best, &mut rng, &mut models, &stage)?;
     let score = quality.score(&model, f32::INFINITY);
-    Some(Consensus { model, score, iterations, log_nfa: None })
+    Ok(Some(Consensus { model, score, iterations, log_nfa: None }))
+}
+
+/// Samples drawn of those needed so far; whatever is done for one of them shows as that.
+struct Samples<'a> {
+    progress: &'a dyn Progress,
+    drawn: usize,
+    needed: usize,
+}
+
+impl Progress for Samples<'_> {
+    fn report(&self, _: &'static str, _: usize, _: usize) -> Result<(), Cancelled> {
+        self.progress.report("samples", self.drawn, self.needed)
+    }
 }
 
 /// The minimal model or the best of its alternatives, both locally optimized.
@@ -116,8 +139,10 @@ fn optimized<E: Estimator, C: Scorer>(
     quality: &Quality<'_, E, C>,
     winner: Winner<E::Model>,
     models: &mut Vec<E::Model>,
-) -> ScoredModel<E::Model> {
+    progress: &dyn Progress,
+) -> Result<ScoredModel<E::Model>, Cancelled> {
     let Winner { mut found, sample } = winner;
+    progress.report("local optimization", 0, 1)?;
     models.clear();
     quality.estimator.alternatives(&found.model, &sample[..E::SAMPLE], quality.threshold, models);
     quality.refine_best(&mut found, LOCAL_STEPS);
@@ -134,7 +159,7 @@ fn optimized<E: Estimator, C: Scorer>(
             found = other;
         }
     }
-    found
+    Ok(found)
 }
 
 /// Searches on, near the model, with the noise that the data show instead of the threshold they were searched with: small noise leaves room for
@@ -145,9 +170,11 @@ fn settle<E: Estimator, C: Scorer>(
     mut best: ScoredModel<E::Model>,
     rng: &mut ChaCha8Rng,
     models: &mut Vec<E::Model>,
-) -> E::Model {
+    progress: &dyn Progress,
+) -> Result<E::Model, Cancelled> {
     // The scale of the last round is the one to converge at.
     for steps in [LOCAL_STEPS, FINAL_STEPS] {
+        progress.report("local optimization", 0, 1)?;
         let Some(sigma) = quality.noise(&best.model) else {
             // Too few data for a noise of their own.
             best.score = quality.score(&best.model, f32::INFINITY);
@@ -159,11 +186,11 @@ fn settle<E: Estimator, C: Scorer>(
         best.score = fine.score(&best.model, f32::INFINITY);
         fine.refine_best(&mut best, steps);
         if E::RESAMPLES > 0 {
-            fine.inner_ransac(&mut best, rng, models);
+            fine.inner_ransac(&mut best, rng, models, progress)?;
             fine.refine_best(&mut best, steps);
         }
     }
-    best.model
+    Ok(best.model)
 }
 
 /// The model of least loss below `limit` of all samples; the earliest of equals.
@@ -172,9 +199,15 @@ fn best_of<E: Estimator, C: Scorer>(
     samples: &[[u32; 8]],
     mut limit: f32,
     models: &mut Vec<E::Model>,
-) -> Option<Winner<E::Model>> {
+    progress: &dyn Progress,
+) -> Result<Option<Winner<E::Model>>, Cancelled> {
+    // Of much data, each sample takes its time.
+    let every = if quality.estimator.data().count() < PARALLEL_FROM { CHUNK } else { 1 };
     let mut best = None;
-    for sample in samples {
+    for (i, sample) in samples.iter().enumerate() {
+        if i.is_multiple_of(every) {
+            progress.report("samples", 0, 0)?;
+        }
         models.clear();
         quality.estimator.solve(&sample[..E::SAMPLE], models);
         for model in models.drain(..) {
@@ -185,5 +218,5 @@ fn best_of<E: Estimator, C: Scorer>(
             }
         }
     }
-    best
+    Ok(best)
 }

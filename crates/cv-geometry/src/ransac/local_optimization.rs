@@ -4,6 +4,7 @@ use super::driver::{LOCAL_STEPS, ScoredModel};
 use super::quality::Quality;
 use super::sampler::distinct;
 use super::{Estimator, RansacData, Scorer};
+use cv_core::{Cancelled, Progress};
 use rand_chacha::ChaCha8Rng;
 
 /// Most samples of [`Quality::inner_ransac`] on one model.
@@ -31,14 +32,16 @@ impl<E: Estimator, C: Scorer> Quality<'_, E, C> {
         best: &mut ScoredModel<E::Model>,
         rng: &mut ChaCha8Rng,
         models: &mut Vec<E::Model>,
-    ) {
+        progress: &dyn Progress,
+    ) -> Result<(), Cancelled> {
         let mut near = self.near(&best.model);
         let mut left = E::RESAMPLES;
         let mut limit = f32::INFINITY;
         for _ in 0..MOST_RESAMPLES {
             if left == 0 || near.len() <= E::SAMPLE {
-                return;
+                return Ok(());
             }
+            progress.report("local samples", E::RESAMPLES - left, E::RESAMPLES)?;
             left -= 1;
             let mut sample = [0u32; 8];
             distinct(rng, near.len() as u32, &mut sample[..E::SAMPLE]);
@@ -64,6 +67,7 @@ impl<E: Estimator, C: Scorer> Quality<'_, E, C> {
                 }
             }
         }
+        Ok(())
     }
 
     /// Data within twice the threshold.

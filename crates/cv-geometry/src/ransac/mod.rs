@@ -15,6 +15,7 @@ pub use scorer::{Msac, Scorer, TukeyBiweight};
 
 use crate::EstimateError;
 use crate::match_blocks::LANES;
+use cv_core::Progress;
 use driver::search;
 use false_alarms::false_alarms;
 use quality::Quality;
@@ -129,16 +130,20 @@ pub struct Consensus<M> {
 ///
 /// This is the loop behind every `estimate_…` function, for models of one's own: RANSAC (Fischler & Bolles 1981) with
 /// a smooth loss (MSAC, Torr & Zisserman 2000; MAGSAC++, Barath et al. 2020) and local optimization (LO-RANSAC, Chum et
-/// al. 2003) on the same loss. O(samples × data).
+/// al. 2003) on the same loss. O(samples × data). Reports the samples drawn.
 ///
 /// # Errors
 /// [`EstimateError::Option`], [`EstimateError::NotEnoughMatches`] with fewer data than a sample has, and
-/// [`EstimateError::NoConsensus`] where the number of false alarms of the best model is not below one.
-pub fn ransac<E: Estimator>(estimator: &E, options: &RobustOptions) -> Result<Consensus<E::Model>, EstimateError> {
+/// [`EstimateError::NoConsensus`] where the number of false alarms of the best model is not below one; [`EstimateError::Cancelled`].
+pub fn ransac<E: Estimator>(
+    estimator: &E,
+    options: &RobustOptions,
+    progress: &dyn Progress,
+) -> Result<Consensus<E::Model>, EstimateError> {
     options.check()?;
     match options.scoring {
-        Scoring::Msac => with_scorer(estimator, options, &Msac),
-        Scoring::TukeyBiweight => with_scorer(estimator, options, &TukeyBiweight),
+        Scoring::Msac => with_scorer(estimator, options, &Msac, progress),
+        Scoring::TukeyBiweight => with_scorer(estimator, options, &TukeyBiweight, progress),
     }
 }
 
@@ -146,6 +151,7 @@ fn with_scorer<E: Estimator, C: Scorer>(
     estimator: &E,
     options: &RobustOptions,
     scorer: &C,
+    progress: &dyn Progress,
 ) -> Result<Consensus<E::Model>, EstimateError> {
     let n = estimator.data().count();
     if n < E::SAMPLE {
@@ -153,9 +159,9 @@ fn with_scorer<E: Estimator, C: Scorer>(
     }
     let quality = Quality::new(estimator, scorer, options.threshold * estimator.unit());
     let found = match options.sampling {
-        Sampling::Uniform => search(&quality, &mut Uniform::new(n, options.seed), options),
+        Sampling::Uniform => search(&quality, &mut Uniform::new(n, options.seed), options, progress)?,
         Sampling::Prosac => {
-            search(&quality, &mut Prosac::new(n, E::SAMPLE, options.max_iterations, options.seed), options)
+            search(&quality, &mut Prosac::new(n, E::SAMPLE, options.max_iterations, options.seed), options, progress)?
         }
     };
     // The sample itself always fits.

@@ -81,7 +81,7 @@ impl<'a> TwoViewAdjustment<'a> {
         options: &TwoViewOptions,
         progress: &dyn Progress,
     ) -> Result<Self, TwoViewError> {
-        progress.report("points", 0, 1)?;
+        progress.report("adjust", 0, 1)?;
         let matches: Vec<DMatch> = geometry.inliers.iter().filter_map(|&i| views.matches.get(i)).copied().collect();
         let pairs = views.correspondences(&matches)?;
         let fit = Fit::new(&matches, &pairs, geometry.cameras, geometry.pose, options)
@@ -89,7 +89,7 @@ impl<'a> TwoViewAdjustment<'a> {
         // Before further matches: those agree with the pose because they were looked for where it says.
         let TwoViewBundle { cameras, pose, .. } = &fit.bundle;
         let (normalized, unit) = normalize_matches(&fit.observed, &cameras[0], &cameras[1]);
-        let stability = jackknife_pose_deviation(pose, &normalized, options.robust.threshold * unit);
+        let stability = jackknife_pose_deviation(pose, &normalized, options.robust.threshold * unit, progress)?;
         Ok(Self { views: *views, geometry, options: *options, fit, stability, guided: 0 })
     }
 
@@ -112,11 +112,12 @@ impl<'a> TwoViewAdjustment<'a> {
     /// neighbors than there were inliers, and adjusts again. O(more · matches).
     ///
     /// # Errors
-    /// [`TwoViewError::MatchOutOfRange`].
-    pub fn add_matches(&mut self, more: &[DMatch]) -> Result<(), TwoViewError> {
+    /// [`TwoViewError::MatchOutOfRange`]; [`TwoViewError::Cancelled`].
+    pub fn add_matches(&mut self, more: &[DMatch], progress: &dyn Progress) -> Result<(), TwoViewError> {
         let pairs = self.views.correspondences(more)?;
         let TwoViewBundle { cameras, pose, points } = &self.fit.bundle;
-        let kept = like_their_neighbors(&pairs, &self.fit.observed, points, cameras, pose);
+        let kept = like_their_neighbors(&pairs, &self.fit.observed, points, cameras, pose, progress)?;
+        progress.report("adjust", 0, 1)?;
         self.guided = kept.len();
         // Fewer would mean that the first matches were not what the lines say.
         if kept.len() > self.geometry.inliers.len() {

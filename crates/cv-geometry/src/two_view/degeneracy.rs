@@ -1,8 +1,8 @@
 //! Simpler explanations of matches than a moving camera and a scene with depth: a plane, and a camera that only turned.
 
 use super::{TwoViewError, TwoViewOptions};
-use crate::{RobustOptions, estimate_homography, normalize_matches, rotation_between};
-use cv_core::{Camera, Correspondence, Pose, Vector3};
+use crate::{EstimateError, RobustOptions, estimate_homography, normalize_matches, rotation_between};
+use cv_core::{Camera, Cancelled, Correspondence, Pose, Progress, Vector3};
 
 /// How many of the matches a homography and a rotation explain.
 pub(super) struct DegeneracyTest {
@@ -16,7 +16,12 @@ pub(super) struct DegeneracyTest {
 }
 
 impl DegeneracyTest {
-    pub(super) fn new(pairs: &[Correspondence], cameras: Option<&[Camera; 2]>, options: &TwoViewOptions) -> Self {
+    pub(super) fn new(
+        pairs: &[Correspondence],
+        cameras: Option<&[Camera; 2]>,
+        options: &TwoViewOptions,
+        progress: &dyn Progress,
+    ) -> Result<Self, Cancelled> {
         // Distances in two dimensions and two photographs, where the epipolar one is in one.
         let reach = 2.0 * options.robust.threshold;
         let straight: Vec<Correspondence> = match cameras {
@@ -29,7 +34,11 @@ impl DegeneracyTest {
         };
         let robust = RobustOptions { threshold: reach, ..options.robust };
         let mut found = Self { planar: 0, calibrated: cameras.is_some(), turned: 0, degrees: 0.0 };
-        let Ok(h) = estimate_homography(&straight, &robust) else { return found };
+        let h = match estimate_homography(&straight, &robust, progress) {
+            Ok(h) => h,
+            Err(EstimateError::Cancelled(stop)) => return Err(stop),
+            Err(_) => return Ok(found),
+        };
         found.planar = h.inliers.len();
         if let Some([a, b]) = cameras {
             let on_plane: Vec<Correspondence> = h.inliers.iter().map(|&i| straight[i]).collect();
@@ -40,7 +49,7 @@ impl DegeneracyTest {
                 found.degrees = Pose::new(rotation, Vector3::zeros()).rotation_angle().to_degrees();
             }
         }
-        found
+        Ok(found)
     }
 
     /// Names a camera that only turned and a scene that is one plane, beside `inliers` matches that a general motion explains.

@@ -7,7 +7,7 @@ use crate::{
     EstimateError, RobustModel, RobustOptions, estimate_relative_pose, normalize_matches, pose_difference,
     poses_are_rivals, refine_relative_pose,
 };
-use cv_core::{Camera, Correspondence, Pose, Progress};
+use cv_core::{Camera, Correspondence, Pose, Progress, Stage};
 use rayon::prelude::*;
 
 /// Cameras, relative pose, and the matches that agree with them. Not adjusted yet: see [`TwoViewAdjustment`](super::TwoViewAdjustment).
@@ -37,16 +37,15 @@ pub fn estimate_two_view_geometry(
     options: &TwoViewOptions,
     progress: &dyn Progress,
 ) -> Result<TwoViewGeometry, TwoViewError> {
-    progress.report("pose", 0, 1)?;
     let prior = options.intrinsics.cameras(views.sizes)?;
     let pairs = &views.correspondences(views.matches)?;
     if pairs.len() < options.min_inliers {
         return Err(TwoViewError::TooFewMatches { got: pairs.len(), needed: options.min_inliers });
     }
-    let degeneracy = DegeneracyTest::new(pairs, prior.as_ref(), options);
+    let degeneracy = DegeneracyTest::new(pairs, prior.as_ref(), options, progress)?;
     // Nothing can have more inliers than there are matches.
     degeneracy.check(pairs.len(), options)?;
-    let found = search(pairs, views.sizes, prior, options);
+    let found = search(pairs, views.sizes, prior, options, progress);
     // Of a turn, a search for a moving camera finds but a part: half of the points are behind whatever it supposes.
     if let Err(
         TwoViewError::TooFewInliers { inliers, .. }
@@ -68,11 +67,12 @@ fn search(
     sizes: [(usize, usize); 2],
     prior: Option<[Camera; 2]>,
     options: &TwoViewOptions,
+    progress: &dyn Progress,
 ) -> Result<TwoViewGeometry, TwoViewError> {
     let given = match (options.intrinsics, prior) {
         (Intrinsics::Known(_), Some(cameras)) => Some(Found { cameras, focal_range: 0.0, rival: None }),
-        (Intrinsics::Focal(focal), _) => find_lens(pairs, sizes, Some(focal), &options.robust),
-        _ => find_lens(pairs, sizes, None, &options.robust),
+        (Intrinsics::Focal(focal), _) => find_lens(pairs, sizes, Some(focal), &options.robust, progress)?,
+        _ => find_lens(pairs, sizes, None, &options.robust, progress)?,
     };
     // Where no lens has a pose, the search with an ordinary one says why.
     let longest = sizes[0].0.max(sizes[0].1) as f64;
@@ -83,7 +83,7 @@ fn search(
     }
     let Found { cameras, focal_range, .. } =
         given.unwrap_or_else(|| Found { cameras: prior.unwrap_or_else(ordinary), focal_range: 0.0, rival: None });
-    let (pose, inliers) = calibrated(pairs, &cameras, options)?;
+    let (pose, inliers) = calibrated(pairs, &cameras, options, progress)?;
     Ok(TwoViewGeometry { cameras, pose, inliers, focal_range, planar_share: 0.0 })
 }
 
@@ -100,16 +100,20 @@ fn calibrated(
     pairs: &[Correspondence],
     cameras: &[Camera; 2],
     options: &TwoViewOptions,
+    progress: &dyn Progress,
 ) -> Result<(Pose, Vec<usize>), TwoViewError> {
     let (normalized, unit) = normalize_matches(pairs, &cameras[0], &cameras[1]);
     // A pixel that no ray reaches (beyond the range of the lens model) is no match.
     let usable: Vec<usize> = (0..normalized.len()).filter(|&i| normalized[i].is_finite()).collect();
     let normalized: Vec<_> = usable.iter().map(|&i| normalized[i]).collect();
     let threshold = options.robust.threshold * unit;
+    let stage = Stage::new(progress, "pose", SEARCHES as usize)?;
     let search = |k: u64| {
         let seed = options.robust.seed.wrapping_add(k);
-        let found = estimate_relative_pose(&normalized, &RobustOptions { threshold, seed, ..options.robust })?;
+        let options = RobustOptions { threshold, seed, ..options.robust };
+        let found = estimate_relative_pose(&normalized, &options, &stage)?;
         let (pose, loss) = refine_relative_pose(&found.model, &normalized, threshold);
+        stage.add(1)?;
         Ok((RobustModel { model: pose, ..found }, loss))
     };
     let searches: Vec<_> = (0..SEARCHES).into_par_iter().map(search).collect();

@@ -1,10 +1,10 @@
 //! The lens that the matches themselves tell: focal length and radial distortion.
 
 use crate::{
-    RobustOptions, Scorer, SharedFocalPose, TukeyBiweight, essential_from_pose, estimate_relative_pose,
+    EstimateError, RobustOptions, Scorer, SharedFocalPose, TukeyBiweight, essential_from_pose, estimate_relative_pose,
     estimate_shared_focal_pose, normalize_matches, refine_relative_pose, refine_shared_focal_pose, sampson,
 };
-use cv_core::{Camera, Correspondence, Distortion, Matrix3, Pose};
+use cv_core::{Camera, Cancelled, Correspondence, Distortion, Matrix3, Pose, Progress, Stage};
 use rayon::prelude::*;
 
 /// Focal lengths in pixels, and by how much of their distance from the middle the corners are displaced.
@@ -66,25 +66,33 @@ pub(super) fn find_lens(
     sizes: [(usize, usize); 2],
     given: Option<[f64; 2]>,
     robust: &RobustOptions,
-) -> Option<Found> {
-    let search = Search { pairs, sizes, robust };
+    progress: &dyn Progress,
+) -> Result<Option<Found>, Cancelled> {
+    let stage = Stage::new(progress, "lens", BENDS.len())?;
+    let search = Search { pairs, sizes, robust, stage: &stage };
     let free = given.is_none();
     let least = |trials: &[Trial]| trials.iter().min_by(|a, b| a.sum.total_cmp(&b.sum)).cloned();
-    let searched = |bend: &f64| match given {
-        Some(focal) => search.searched(Lens { focal, bend: *bend }),
-        None => search.searched_free(*bend),
+    let searched = |bend: &f64| -> Result<Option<Trial>, Cancelled> {
+        let trial = match given {
+            Some(focal) => search.searched(Lens { focal, bend: *bend }),
+            None => search.searched_free(*bend),
+        }?;
+        stage.add(1)?;
+        Ok(trial)
     };
-    let mut trials: Vec<Trial> = BENDS.par_iter().filter_map(searched).collect();
-    let best = least(&trials)?;
+    let trials: Vec<Option<Trial>> = BENDS.par_iter().map(searched).collect::<Result<_, _>>()?;
+    let mut trials: Vec<Trial> = trials.into_iter().flatten().collect();
+    let Some(first) = least(&trials) else { return Ok(None) };
     // From the best one's pose too: a search now and then ends elsewhere.
     for trial in &mut trials {
-        let other = search.near(&best, trial.lens.bend, free);
+        stage.check()?;
+        let other = search.near(&first, trial.lens.bend, free);
         if other.sum < trial.sum {
             *trial = other;
         }
     }
     let straight = trials.iter().find(|t| t.lens.bend == 0.0).cloned();
-    let bent = search.narrow(least(&trials)?, free);
+    let bent = search.narrow(least(&trials).unwrap_or(first), free)?;
     let (best, bends) = match straight {
         Some(straight) if !significantly_worse(&straight, &bent) => (straight, false),
         _ => (bent, true),
@@ -95,11 +103,12 @@ pub(super) fn find_lens(
             // Up to a half, and from the last pose on, so that each starts in the right place.
             let mut at = best.clone();
             for k in 1..=8 {
+                stage.check()?;
                 let factor = 1.05f64.powf(direction * f64::from(k));
                 let lens = Lens { focal: best.lens.focal.map(|f| f * factor), bend: at.lens.bend };
                 at = search.refined(lens, &at.pose);
                 if bends {
-                    at = search.narrow(at, false);
+                    at = search.narrow(at, false)?;
                 }
                 if significantly_worse(&at, &best) {
                     break;
@@ -108,8 +117,8 @@ pub(super) fn find_lens(
             }
         }
     }
-    let rival = if free { None } else { search.rival(&best) };
-    Some(Found { cameras: search.cameras(&best.lens), focal_range, rival })
+    let rival = if free { None } else { search.rival(&best)? };
+    Ok(Some(Found { cameras: search.cameras(&best.lens), focal_range, rival }))
 }
 
 /// Vuong's test at two standard deviations: see [`crate::poses_are_rivals`].
@@ -128,6 +137,7 @@ struct Search<'a> {
     pairs: &'a [Correspondence],
     sizes: [(usize, usize); 2],
     robust: &'a RobustOptions,
+    stage: &'a Stage<'a>,
 }
 
 impl Search<'_> {
@@ -144,7 +154,7 @@ impl Search<'_> {
     }
 
     /// The best pose of a search with a lens.
-    fn searched(&self, lens: Lens) -> Option<Trial> {
+    fn searched(&self, lens: Lens) -> Result<Option<Trial>, Cancelled> {
         let [a, b] = self.cameras(&lens);
         let (normalized, unit) = normalize_matches(self.pairs, &a, &b);
         let usable: Vec<_> = normalized.into_iter().filter(Correspondence::is_finite).collect();
@@ -153,27 +163,28 @@ impl Search<'_> {
             max_iterations: SAMPLES[0].min(self.robust.max_iterations),
             ..*self.robust
         };
-        let found = estimate_relative_pose(&usable, &options).ok()?;
-        Some(self.refined(lens, &found.model))
+        let found = unless_stopped(estimate_relative_pose(&usable, &options, self.stage))?;
+        Ok(found.map(|found| self.refined(lens, &found.model)))
     }
 
     /// The best pose and focal length of a search with a distortion.
-    fn searched_free(&self, bend: f64) -> Option<Trial> {
+    fn searched_free(&self, bend: f64) -> Result<Option<Trial>, Cancelled> {
         let usable: Vec<_> = self.straightened(bend).into_iter().filter(Correspondence::is_finite).collect();
         let options = RobustOptions { max_iterations: SAMPLES[1].min(self.robust.max_iterations), ..*self.robust };
-        let found = estimate_shared_focal_pose(&usable, &options).ok()?;
-        Some(self.refined_free(bend, &found.model))
+        let found = unless_stopped(estimate_shared_focal_pose(&usable, &options, self.stage))?;
+        Ok(found.map(|found| self.refined_free(bend, &found.model)))
     }
 
     /// A focal length far from the given one that is better beyond doubt.
-    fn rival(&self, given: &Trial) -> Option<Rival> {
-        let other = self.searched_free(given.lens.bend)?;
+    fn rival(&self, given: &Trial) -> Result<Option<Rival>, Cancelled> {
+        let Some(other) = self.searched_free(given.lens.bend)? else { return Ok(None) };
         let usual = (given.lens.focal[0] * given.lens.focal[1]).sqrt();
         let focal = other.lens.focal[0];
         let deviations = worse_by(given, &other);
         let reach = f64::from(TukeyBiweight.loss(1.0));
         let inliers = other.losses.iter().filter(|loss| **loss < reach).count();
-        ((focal / usual).ln().abs() > FAR && deviations > BEYOND_DOUBT).then_some(Rival { focal, deviations, inliers })
+        let rival = Rival { focal, deviations, inliers };
+        Ok(((focal / usual).ln().abs() > FAR && deviations > BEYOND_DOUBT).then_some(rival))
     }
 
     /// The best one near another with another distortion, the focal length too where it is free.
@@ -213,12 +224,13 @@ impl Search<'_> {
     }
 
     /// Steps of the distortion, halved where none helps, down to a thousandth.
-    fn narrow(&self, mut best: Trial, free: bool) -> Trial {
+    fn narrow(&self, mut best: Trial, free: bool) -> Result<Trial, Cancelled> {
         let mut step = 1.0;
         for _ in 0..MAX_STEPS {
             if step <= 0.05 {
                 break;
             }
+            self.stage.check()?;
             let bends =
                 [-1.0, 1.0].map(|sign| (best.lens.bend + 0.015 * sign * step).clamp(BEND_RANGE.0, BEND_RANGE.1));
             let trials: Vec<Trial> = bends.par_iter().map(|bend| self.near(&best, *bend, free)).collect();
@@ -227,7 +239,15 @@ impl Search<'_> {
                 _ => step *= 0.5,
             }
         }
-        best
+        Ok(best)
+    }
+}
+
+/// What was found, if anything, unless the search was stopped.
+fn unless_stopped<T>(found: Result<T, EstimateError>) -> Result<Option<T>, Cancelled> {
+    match found {
+        Err(EstimateError::Cancelled(stop)) => Err(stop),
+        found => Ok(found.ok()),
     }
 }
 

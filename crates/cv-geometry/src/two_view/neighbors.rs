@@ -1,7 +1,7 @@
 //! Which of the matches found along epipolar lines lie where their neighbors do.
 
 use crate::{normalize_matches, triangulate};
-use cv_core::{Camera, Correspondence, Point3, Pose};
+use cv_core::{Camera, Cancelled, Correspondence, Point3, Pose, Progress, Stage};
 use rayon::prelude::*;
 
 /// Neighbors that are asked.
@@ -21,7 +21,9 @@ pub(super) fn like_their_neighbors(
     points: &[Point3<f64>],
     cameras: &[Camera; 2],
     pose: &Pose,
-) -> Vec<usize> {
+    progress: &dyn Progress,
+) -> Result<Vec<usize>, Cancelled> {
+    let stage = Stage::new(progress, "neighbors", more.len())?;
     let (normalized, _) = normalize_matches(more, &cameras[0], &cameras[1]);
     let belongs = |(m, n): (&Correspondence, &Correspondence)| {
         // The nearest of the known ones in the first photograph, the nearest first.
@@ -43,14 +45,18 @@ pub(super) fn like_their_neighbors(
         let reach = MORE * (high - low) + PARALLAX;
         (low - reach..=high + reach).contains(&(1.0 / point.z))
     };
-    let keep: Vec<bool> = more.par_iter().zip(&normalized).map(belongs).collect();
-    (0..more.len()).filter(|&i| keep[i]).collect()
+    let asked = |pair: (&Correspondence, &Correspondence)| {
+        stage.add(1)?;
+        Ok(belongs(pair))
+    };
+    let keep: Vec<bool> = more.par_iter().zip(&normalized).map(asked).collect::<Result<_, Cancelled>>()?;
+    Ok((0..more.len()).filter(|&i| keep[i]).collect())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cv_core::{Point2, Rotation3, Vector3};
+    use cv_core::{Point2, Rotation3, Silent, Vector3};
 
     #[test]
     fn a_point_at_another_depth_than_all_around_it_is_left_out() {
@@ -66,9 +72,9 @@ mod tests {
         let grid = (0..100).map(|i| see(100.0 + 40.0 * f64::from(i % 10), 40.0 + 40.0 * f64::from(i / 10), 10.0));
         let (matches, points): (Vec<_>, Vec<_>) = grid.unzip();
         let more = [see(333.0, 222.0, 10.2).0, see(200.0, 210.0, 4.0).0, see(150.0, 111.0, 200.0).0, matches[7]];
-        let kept = like_their_neighbors(&more, &matches, &points, &[camera; 2], &pose);
+        let kept = like_their_neighbors(&more, &matches, &points, &[camera; 2], &pose, &Silent).unwrap();
         // One pixel of parallax off is as good as there; 75 and 47 px off are not.
         assert_eq!(kept, [0, 3]);
-        assert_eq!(like_their_neighbors(&more, &[], &[], &[camera; 2], &pose), [0usize; 0]);
+        assert_eq!(like_their_neighbors(&more, &[], &[], &[camera; 2], &pose, &Silent), Ok(vec![]));
     }
 }

@@ -1,6 +1,6 @@
 //! Which pairs of photographs really overlap (Brown & Lowe 2007, §3.2).
 
-use cv_core::{Correspondence, Matrix3, Point2, Vector3};
+use cv_core::{Correspondence, Matrix3, Point2, Silent, Vector3};
 use cv_geometry::{EstimateError, RobustOptions, estimate_homography};
 
 /// Options of [`verify_pair`].
@@ -71,7 +71,7 @@ pub fn verify_pair(
     options: &VerifyOptions,
 ) -> Result<VerifiedPair, NotAPair> {
     let robust = RobustOptions { threshold: options.threshold, seed: options.seed, ..RobustOptions::homography() };
-    let found = estimate_homography(matches, &robust)?;
+    let found = estimate_homography(matches, &robust, &Silent)?;
     let h = found.model;
     let Some(inverse) = h.try_inverse() else { return Err(NotAPair::Impossible) };
     let sees = |m: &Matrix3<f64>, p: Point2<f64>, (w, height): (usize, usize)| {

@@ -3,7 +3,7 @@
 use super::ReconstructResult;
 use crate::Progress;
 use crate::depth::LEAST_MATCHED;
-use cv_core::{Cancelled, GrayF32, ImageView, OptionError, Point2, Point3, PointCloud, StageClock, StereoRig};
+use cv_core::{Cancelled, GrayF32, ImageView, OptionError, Point2, Point3, PointCloud, Stage, StageClock, StereoRig};
 use cv_imgproc::resize_area;
 use cv_stereo::{PixelState, RectifyError, SceneRectification, StereoError, StereoMatcher, StereoOptions};
 use rayon::prelude::*;
@@ -120,7 +120,6 @@ pub fn reconstruct_dense(
         }
     }
     let mut clock = StageClock::new();
-    progress.report("rectify", 0, 1)?;
     let longest = sparse.scene.cameras.iter().map(|c| c.width.max(c.height)).max().unwrap_or(1);
     let factor = (options.max_size as f64 / longest as f64).min(1.0);
     let side = |n: usize| ((n as f64 * factor).round() as usize).max(1);
@@ -135,14 +134,13 @@ pub fn reconstruct_dense(
     for ((photo, view), camera) in photos.iter().zip(&views).zip(&cameras) {
         rectified.push(if factor < 1.0 {
             let small = resize_area(*photo, camera.width, camera.height).map_err(|_| too_large)?;
-            view.apply(small.view())?
+            view.apply(small.view(), progress)?
         } else {
-            view.apply(*photo)?
+            view.apply(*photo, progress)?
         });
     }
     clock.lap("rectify");
 
-    progress.report("match", 0, 1)?;
     let stereo = StereoOptions {
         fill: options.fill,
         max_memory: Some(options.max_memory),
@@ -150,11 +148,11 @@ pub fn reconstruct_dense(
         ..scene.stereo_options()
     };
     let mut matcher = StereoMatcher::new(stereo)?;
-    let map = matcher.compute(rectified[0].0.view(), rectified[1].0.view())?;
+    let map = matcher.compute(rectified[0].0.view(), rectified[1].0.view(), progress)?;
     let sigma = matcher.uncertainty(&map);
     clock.lap("match");
 
-    progress.report("cloud", 0, 1)?;
+    let stage = Stage::new(progress, "cloud", size.1 + cameras[0].height)?;
     let geometry = &scene.views.geometry;
     let (width, height) = size;
     // Depth in the rectified frame; seen and confirmed; seen by both at this depth at all.
@@ -195,11 +193,12 @@ pub fn reconstruct_dense(
     let rows: Vec<(Vec<f32>, usize, usize)> = (0..height)
         .into_par_iter()
         .map(|y| {
+            stage.add(1)?;
             let row: Vec<_> = (0..width).map(|x| examine(x, y)).collect();
             let count = |f: &dyn Fn(&(f32, bool, bool)) -> bool| row.iter().filter(|p| f(p)).count();
-            (row.iter().map(|p| p.0).collect(), count(&|p| p.1), count(&|p| p.2))
+            Ok((row.iter().map(|p| p.0).collect(), count(&|p| p.1), count(&|p| p.2)))
         })
-        .collect();
+        .collect::<Result<_, Cancelled>>()?;
     let (confirmed, common) = rows.iter().fold((0, 0), |(a, b), row| (a + row.1, b + row.2));
     let coverage = confirmed as f64 / common.max(1) as f64;
     if coverage < LEAST_MATCHED {
@@ -231,11 +230,13 @@ pub fn reconstruct_dense(
     let (small_width, small_height) = (cameras[0].width, cameras[0].height);
     let mut depth = GrayF32::new(small_width, small_height, [f32::NAN]);
     if !depth.is_empty() {
-        depth.as_mut_slice().par_chunks_mut(small_width).enumerate().for_each(|(y, row)| {
+        depth.as_mut_slice().par_chunks_mut(small_width).enumerate().try_for_each(|(y, row)| {
+            stage.add(1)?;
             for (x, z) in row.iter_mut().enumerate() {
                 *z = at(Point2::new(x as f64, y as f64)).unwrap_or(f32::NAN);
             }
-        });
+            Ok::<(), Cancelled>(())
+        })?;
     }
     clock.lap("cloud");
     Ok(DenseResult { cloud, depth, size, disparities: scene.disparities, coverage, stages: clock.into_stages() })

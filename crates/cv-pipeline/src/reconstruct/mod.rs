@@ -118,9 +118,9 @@ pub fn reconstruct(
     if options.guided {
         let threshold = options.two_view.robust.threshold as f32;
         let along = GuidedOptions { threshold, ..GuidedOptions::default() };
-        let more = match_along_lines(fa, fb, adjustment.cameras(), &adjustment.fundamental(), &along);
+        let more = match_along_lines(fa, fb, adjustment.cameras(), &adjustment.fundamental(), &along, progress)?;
         clock.lap("guided");
-        adjustment.add_matches(&more)?;
+        adjustment.add_matches(&more, progress)?;
         clock.lap("bundle");
     }
     let scene = adjustment.finish()?;

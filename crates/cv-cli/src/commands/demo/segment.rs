@@ -23,7 +23,7 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
         if i % 2 == 0 {
             continue;
         }
-        let found = segment(photo.view.image.view(), &model).mask;
+        let found = segment(photo.view.image.view(), &model, demo.context)?.mask;
         let one = MaskScore::new(&found, &photo.mask).unwrap_or_default();
         score = score.plus(one);
         let caption = format!("The ball {:.2} m away: F1 {:.3}.", photo.distance, one.f1());

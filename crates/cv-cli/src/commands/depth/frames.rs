@@ -3,7 +3,8 @@
 use super::{Args, Range, say_memory};
 use crate::frame::{Context, Explain, Failure, Outcome, expand_images};
 use crate::words;
-use cv_pipeline::{FrameDepth, Progress};
+use cv_core::Stage;
+use cv_pipeline::FrameDepth;
 use std::path::{Path, PathBuf};
 
 /// True for a folder or a pattern.
@@ -72,8 +73,8 @@ impl Args {
         let options = self.options().stereo;
         let mut film = FrameDepth::new(options.clone())?;
         let (mut size, mut seconds, mut valid) = ((0, 0), 0.0, 0.0);
+        let stage = Stage::new(context, "frames", lefts.len())?;
         for (i, (left, right)) in lefts.iter().zip(&rights).enumerate() {
-            Progress::report(context, "frames", i, lefts.len())?;
             let (a, b) = (cv_io::read_rgb(left)?, cv_io::read_rgb(right)?);
             if a.size() != size {
                 size = a.size();
@@ -81,7 +82,7 @@ impl Args {
             }
             let start = std::time::Instant::now();
             let map = film
-                .next(a.view(), b.view(), context)
+                .next(a.view(), b.view(), &stage)
                 .map_err(|error| words::no_depth(error, false))
                 .during(left.display())?;
             seconds += start.elapsed().as_secs_f64();
@@ -92,6 +93,7 @@ impl Args {
             }
             let name = Path::new(left.file_stem().unwrap_or_default()).with_extension("pfm");
             cv_io::pfm::write(self.output.join(name), map.disparity.view())?;
+            stage.add(1)?;
         }
         let rate = lefts.len() as f64 / seconds;
         let (width, height) = size;

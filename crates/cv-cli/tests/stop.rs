@@ -1,0 +1,188 @@
+//! Ctrl-C, seen from outside: how soon the program ends, how it says so, and what it leaves behind.
+
+#![cfg(target_os = "linux")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
+
+mod support;
+
+use cv_core::{Mask, RgbU8};
+use std::{
+    fs,
+    path::Path,
+    process::{Child, Command, Output, Stdio},
+    thread::sleep,
+    time::{Duration, Instant},
+};
+use support::{cv, snapshot};
+
+/// The bar is 200 ms on a machine that is not busy; tests run beside others, ten to a core where several suites do.
+const SOON: Duration = Duration::from_secs(2);
+
+/// Texture that is alike nowhere.
+fn texture(x: usize, y: usize) -> u8 {
+    let cell = |size: usize| {
+        let mut v =
+            ((x / size) as u32).wrapping_mul(0x9E37_79B9) ^ ((y / size + size) as u32).wrapping_mul(0x85EB_CA6B);
+        v = (v ^ (v >> 15)).wrapping_mul(0x2C1B_3C6D);
+        ((v ^ (v >> 12)) >> 24) as u8
+    };
+    [3, 7, 17].map(|size| cell(size) / 3).iter().sum()
+}
+
+/// Two pictures of a textured wall, `shift` pixels apart, and a mask.
+fn write_inputs(folder: &Path, (width, height): (usize, usize), shift: usize) {
+    for (name, shift) in [("left.ppm", 0), ("right.ppm", shift)] {
+        let image = RgbU8::from_fn(width, height, |x, y| [texture(x + shift, y), texture(y, x + shift), 90]);
+        let mut ppm = format!("P6\n{width} {height}\n255\n").into_bytes();
+        ppm.extend_from_slice(image.as_slice());
+        fs::write(folder.join(name), ppm).unwrap();
+    }
+    fs::create_dir_all(folder.join("masks")).unwrap();
+    let mask = Mask::from_fn(width, height, |x, y| [texture(x, y) > 150]);
+    cv_io::write_png(folder.join("masks/left.png"), mask.view()).unwrap();
+}
+
+const RIG: &str = "schema: cv-rig/1\nunit: m\n\
+    left: {width: 2400, height: 1800, fx: 2400, fy: 2400, cx: 1199.5, cy: 899.5}\n\
+    right: {width: 2400, height: 1800, fx: 2400, fy: 2400, cx: 1199.5, cy: 899.5}\n\
+    rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\ntranslation: [-0.12, 0, 0]\n";
+
+/// Starts the program and waits until it listens to signals.
+fn start(folder: &Path, args: &[&str]) -> Child {
+    let mut command = cv(folder);
+    command.args(args).args(["--threads", "1"]).stdout(Stdio::piped()).stderr(Stdio::piped());
+    let mut child = command.spawn().unwrap();
+    let status = format!("/proc/{}/status", child.id());
+    // SIGINT is signal 2: the second bit of the signals that are caught.
+    let listens = |status: &str| {
+        let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:"));
+        caught.is_some_and(|mask| u64::from_str_radix(mask.trim(), 16).unwrap() & 2 != 0)
+    };
+    while !listens(&fs::read_to_string(&status).unwrap_or_default()) {
+        assert!(child.try_wait().unwrap().is_none(), "cv {args:?} ended");
+        sleep(Duration::from_millis(1));
+    }
+    child
+}
+
+fn signal(child: &Child, name: &str) {
+    let sent = Command::new("sh").args(["-c", &format!("kill -{name} {}", child.id())]).status().unwrap();
+    assert!(sent.success());
+}
+
+/// Waits for the end that follows a signal.
+fn stopped(child: Child, what: &str) {
+    let since = Instant::now();
+    let Output { status, stdout, stderr } = child.wait_with_output().unwrap();
+    let took = since.elapsed();
+    let stderr = String::from_utf8(stderr).unwrap();
+    assert_eq!(status.code(), Some(130), "{what}: {stderr}");
+    assert_eq!(stderr.lines().last(), Some("stopped"), "{what}: {stderr}");
+    assert!(!stderr.contains("error"), "{what}: {stderr}");
+    assert!(stdout.is_empty(), "{what}");
+    assert!(took < SOON, "{what}: {took:?}");
+}
+
+#[test]
+fn a_stopped_command_leaves_everything_as_it_was() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    // Each of these takes a second and more.
+    write_inputs(folder, (2400, 1800), 30);
+    fs::write(folder.join("rig.yaml"), RIG).unwrap();
+    for name in ["d.pfm", "c.png", "m.txt", "model.json"] {
+        fs::write(folder.join(name), "old").unwrap();
+    }
+    let commands: [&[&str]; 4] = [
+        &["depth", "left.ppm", "right.ppm", "-o", "d.pfm", "--confidence", "c.png"],
+        &["match", "left.ppm", "right.ppm", "-o", "m.txt", "--save-features", "features"],
+        &["rectify", "left.ppm", "right.ppm", "--rig", "rig.yaml", "--out", "rectified"],
+        &["segment", "train", "--images", "left.ppm", "--masks", "masks", "--model", "model.json"],
+    ];
+    let before = snapshot(folder);
+    for args in commands {
+        for (wait, name) in [(0, "INT"), (150, "TERM"), (400, "INT")] {
+            let child = start(folder, args);
+            sleep(Duration::from_millis(wait));
+            signal(&child, name);
+            let what = format!("cv {args:?} after {wait} ms");
+            stopped(child, &what);
+            assert!(snapshot(folder) == before, "{what}");
+        }
+    }
+}
+
+/// Names of all there is in a folder.
+fn names(folder: &Path) -> Vec<String> {
+    let mut names: Vec<String> =
+        fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+    names.sort();
+    names
+}
+
+#[test]
+fn what_is_being_written_is_removed() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    write_inputs(folder, (2400, 1800), 30);
+    fs::write(folder.join("rig.yaml"), RIG).unwrap();
+    let out = folder.join("rectified");
+    fs::create_dir(&out).unwrap();
+    fs::write(out.join("left.png"), "old").unwrap();
+    let args = ["rectify", "left.ppm", "right.ppm", "--rig", "rig.yaml", "--out", "rectified"];
+    for twice in [false, true] {
+        let mut child = start(folder, &args);
+        // Pictures of four megapixels are being encoded: no callback is asked meanwhile.
+        while names(&out).len() < 2 {
+            assert!(child.try_wait().unwrap().is_none());
+            sleep(Duration::from_millis(1));
+        }
+        signal(&child, "INT");
+        if twice {
+            signal(&child, "INT");
+        }
+        stopped(child, "cv rectify while it writes");
+        assert_eq!(names(&out), ["left.png"]);
+        assert_eq!(fs::read(out.join("left.png")).unwrap(), b"old");
+    }
+}
+
+#[test]
+fn frames_that_are_done_stay_and_are_whole() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    write_inputs(folder, (640, 480), 20);
+    for side in ["left", "right"] {
+        fs::create_dir(folder.join(side)).unwrap();
+        for i in 0..200 {
+            fs::copy(folder.join(format!("{side}.ppm")), folder.join(format!("{side}/{i}.ppm"))).unwrap();
+        }
+    }
+    let mut child = start(folder, &["depth", "left", "right", "-o", "out"]);
+    let out = folder.join("out");
+    while !out.join("1.pfm").exists() {
+        assert!(child.try_wait().unwrap().is_none());
+        sleep(Duration::from_millis(1));
+    }
+    signal(&child, "INT");
+    stopped(child, "cv depth on frames");
+    let names = names(&out);
+    assert!(names.len() < 200, "{names:?}");
+    for name in names {
+        assert_eq!(cv_io::read_map(out.join(&name), None).unwrap().size(), (640, 480), "{name}");
+    }
+}
+
+#[test]
+fn the_demo_stops_within_its_jobs() {
+    let folder = tempfile::tempdir().unwrap();
+    for wait in [50, 700] {
+        let child = start(folder.path(), &["demo"]);
+        sleep(Duration::from_millis(wait));
+        signal(&child, "INT");
+        stopped(child, "cv demo");
+        let out = folder.path().join("cv-demo");
+        let names = if out.exists() { names(&out) } else { Vec::new() };
+        assert!(names.iter().all(|name| name.ends_with(".png") && !name.starts_with('.')), "{names:?}");
+    }
+}

@@ -1,0 +1,80 @@
+//! How long a job goes on without asking whether to. Alone in its file: what is measured is the time of the whole process.
+
+#![cfg(target_os = "linux")]
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+mod stopping;
+
+use cv_core::{Cancelled, Progress};
+use std::sync::Mutex;
+use std::time::{Duration, Instant};
+use stopping::{End, jobs};
+
+const PIXELS: usize = 4_000_000;
+const THREADS: usize = 2;
+/// Seconds that the threads together may compute between two reports: 200 ms on each of two, for pictures of 12 megapixels, of which these have a third; half as much
+/// again because tests check for overflow. (The clock of a machine that does other things too would measure those.)
+const LONGEST: f64 = 1.5 * 0.2 * THREADS as f64 / 3.0;
+/// The clock is read again after so long: it takes some microseconds.
+const FINE: Duration = Duration::from_millis(5);
+
+/// Seconds that all threads of this process have computed.
+fn computed() -> f64 {
+    let tasks = std::fs::read_dir("/proc/self/task").unwrap();
+    let nanoseconds = |task: std::io::Result<std::fs::DirEntry>| -> f64 {
+        // A thread may have ended meanwhile.
+        let text = std::fs::read_to_string(task.unwrap().path().join("schedstat")).unwrap_or_default();
+        text.split_whitespace().next().and_then(|n| n.parse().ok()).unwrap_or(0.0)
+    };
+    tasks.map(nanoseconds).sum::<f64>() * 1e-9
+}
+
+struct Gaps(Mutex<State>);
+
+struct State {
+    read: Instant,
+    computed: f64,
+    stage: &'static str,
+    longest: (f64, &'static str, &'static str),
+}
+
+impl Gaps {
+    fn new() -> Self {
+        let now = State { read: Instant::now(), computed: computed(), stage: "start", longest: (0.0, "", "") };
+        Self(Mutex::new(now))
+    }
+
+    /// Notes the gap that ends now. What it says may be too long by [`FINE`] on each thread, never too short.
+    fn note(&self, stage: &'static str) {
+        let mut state = self.0.lock().unwrap();
+        if state.read.elapsed() >= FINE {
+            let now = computed();
+            let gap = now - state.computed;
+            if gap > state.longest.0 {
+                state.longest = (gap, state.stage, stage);
+            }
+            (state.read, state.computed) = (Instant::now(), now);
+        }
+        state.stage = stage;
+    }
+}
+
+impl Progress for Gaps {
+    fn report(&self, stage: &'static str, _: usize, _: usize) -> Result<(), Cancelled> {
+        self.note(stage);
+        Ok(())
+    }
+}
+
+#[test]
+fn no_job_goes_on_for_long_without_asking() {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(THREADS).build().unwrap();
+    for (name, job) in jobs(PIXELS) {
+        let gaps = Gaps::new();
+        assert_eq!(pool.install(|| job(&gaps)), End::Done, "{name}");
+        gaps.note("end");
+        let (longest, from, to) = gaps.0.lock().unwrap().longest;
+        println!("{name}: {:.0} ms from {from} to {to}", 1e3 * longest);
+        assert!(longest <= LONGEST, "{name}: {longest:.3} s of computing from {from} to {to}");
+    }
+}
