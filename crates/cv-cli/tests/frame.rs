@@ -97,3 +97,33 @@ fn a_closed_stdout_is_a_failure_and_not_a_crash() {
     assert!(matches!(output.status.code(), Some(0 | 1)), "{output:?}");
     assert!(!String::from_utf8_lossy(&output.stderr).contains("panicked"), "{output:?}");
 }
+
+/// A global option that a command takes changes what it does, or it is refused: `--seed` and `--report` mean nothing to some.
+#[test]
+fn options_that_mean_nothing_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let matches: String = (0..40)
+        .map(|i| (f64::from(i * 37 % 97), f64::from(i * 53 % 89)))
+        .map(|(x, y)| format!("{x} {y} {} {y}\n", x + 7.0))
+        .collect();
+    std::fs::write(folder.path().join("m.txt"), matches).unwrap();
+    let cases: [(&[&str], bool, bool); 4] = [
+        (&["completions", "bash"], false, false),
+        (&["man", "--out", "pages"], false, false),
+        (&["estimate", "homography", "--matches", "m.txt"], true, true),
+        (&["eval", "disparity", "--estimate", "d.pfm", "--truth", "t.pfm"], false, true),
+    ];
+    for name in ["d.pfm", "t.pfm"] {
+        cv_io::pfm::write(folder.path().join(name), cv_core::GrayF32::new(9, 9, [2.0]).view()).unwrap();
+    }
+    for (args, seed, report) in cases {
+        for (option, taken) in [(["--seed", "3"], seed), (["--report", "page"], report)] {
+            let ran = run(folder.path(), &[args, &option].concat());
+            assert_eq!(ran.code, Some(if taken { 0 } else { 2 }), "cv {args:?} {option:?}: {ran:?}");
+            assert_eq!(ran.stderr.contains("means nothing here"), !taken, "cv {args:?} {option:?}: {ran:?}");
+        }
+        let page = folder.path().join("page/report.html");
+        assert_eq!(page.exists(), report, "cv {args:?}");
+        let _ = std::fs::remove_file(page);
+    }
+}

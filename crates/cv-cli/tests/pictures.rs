@@ -152,3 +152,32 @@ fn a_fully_transparent_picture_is_read_by_its_colors() {
         run(folder.path(), &strs(&job.args(&inputs)));
     }
 }
+
+/// Each photograph is read once: from a pipe there is nothing to be had the second time.
+#[cfg(unix)]
+#[test]
+fn photographs_are_read_once() {
+    use std::process::{Command, Stdio};
+    use std::time::{Duration, Instant};
+    for job in JOBS {
+        let (folder, inputs) = job.folder();
+        for input in &inputs {
+            let path = folder.path().join(input);
+            let bytes = fs::read(&path).unwrap();
+            fs::remove_file(&path).unwrap();
+            assert!(Command::new("mkfifo").arg(&path).status().unwrap().success());
+            // Ends when all of it has been read; who opens the pipe after that waits for ever.
+            std::thread::spawn(move || fs::write(path, bytes));
+        }
+        let mut command = support::cv(folder.path());
+        let mut child = command.args(job.args(&inputs)).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        let start = Instant::now();
+        // Far longer than a job on pictures this small takes on a machine that is busy.
+        while child.try_wait().unwrap().is_none() && start.elapsed() < Duration::from_secs(240) {
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        let ended = child.try_wait().unwrap();
+        let _ = child.kill();
+        assert!(ended.is_some_and(|status| status.success()), "{}: {ended:?}", job.name);
+    }
+}

@@ -1,7 +1,7 @@
 //! A model of two views from matches.
 
 use crate::Progress;
-use cv_core::{Camera, Correspondence, Matrix3, Pose, StageClock};
+use cv_core::{Camera, Cancelled, Correspondence, Matrix3, Pose, StageClock};
 use cv_geometry::{
     EstimateError, RobustModel, RobustOptions, essential_from_pose, estimate_fundamental, estimate_homography,
     estimate_relative_pose, normalize_matches,
@@ -57,6 +57,36 @@ pub fn estimate(
     }?;
     clock.lap("estimate");
     Ok(EstimateResult { robust, stages: clock.into_stages() })
+}
+
+/// The model that most matches agree on, and which those are.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PrevailingModel {
+    /// Which.
+    pub kind: ModelKind,
+    /// The model and the matches that fit it.
+    pub robust: RobustModel<Matrix3<f64>>,
+}
+
+/// The model that most matches agree on, by the default options and a seed; `None` where neither can be estimated. A fundamental matrix always
+/// fits somewhat more matches than a homography of the same scene: it must fit a tenth more.
+///
+/// # Errors
+/// [`Cancelled`] where `progress` says so.
+pub fn prevailing_model(
+    pairs: &[Correspondence],
+    seed: u64,
+    progress: &dyn Progress,
+) -> Result<Option<PrevailingModel>, Cancelled> {
+    let fit = |kind: ModelKind| match estimate(pairs, kind, &RobustOptions { seed, ..kind.options() }, progress) {
+        Ok(found) => Ok(Some(PrevailingModel { kind, robust: found.robust })),
+        Err(EstimateError::Cancelled(stop)) => Err(stop),
+        Err(_) => Ok(None),
+    };
+    Ok(match (fit(ModelKind::Homography)?, fit(ModelKind::Fundamental)?) {
+        (Some(h), Some(f)) => Some(if h.robust.inliers.len() * 10 >= f.robust.inliers.len() * 9 { h } else { f }),
+        (h, f) => h.or(f),
+    })
 }
 
 /// What [`estimate_calibrated`] found.

@@ -53,7 +53,9 @@ pub use cv_geometry::{
 };
 pub use depth::{DepthError, DepthOptions, DepthResult, DisparityRange, depth};
 pub use disparity_range::{RangeError, disparity_range};
-pub use estimate::{CalibratedResult, EstimateResult, ModelKind, estimate, estimate_calibrated};
+pub use estimate::{
+    CalibratedResult, EstimateResult, ModelKind, PrevailingModel, estimate, estimate_calibrated, prevailing_model,
+};
 pub use frame_depth::FrameDepth;
 pub use matching::{
     AffineSimulation, FeatureMethod, MatchingError, MatchingOptions, MatchingResult, PhotoFeatures, Suppression,

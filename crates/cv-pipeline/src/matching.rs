@@ -1,7 +1,7 @@
 //! Features of photographs, and tentative matches between two of them.
 
 use crate::asift::match_asift;
-use crate::{ModelKind, Progress, estimate};
+use crate::{ModelKind, Progress, RobustOptions, estimate};
 use cv_core::{Cancelled, Correspondence, DMatch, ImageView, Keypoint, Point2, StageClock};
 use cv_features::{
     DescriptorKind, FeatureError, Features, GuidedOptions, HarrisOptions, MatchError, MatchOptions, MopsOptions,
@@ -96,6 +96,8 @@ pub struct MatchingOptions {
     /// Estimate this model from the matches and match once more along it: more matches, nearly all of them right, and none that disagree.
     /// Default none.
     pub guided: Option<ModelKind>,
+    /// Seed of the searches for a model that `affine_simulation` and `guided` make. Default that of [`RobustOptions`].
+    pub seed: u64,
 }
 
 impl Default for MatchingOptions {
@@ -113,6 +115,7 @@ impl Default for MatchingOptions {
             mutual: true,
             affine_simulation: AffineSimulation::default(),
             guided: None,
+            seed: RobustOptions::default().seed,
         }
     }
 }
@@ -294,7 +297,9 @@ pub fn match_photos(
     clock.lap("match");
     let affine_simulation = match options.affine_simulation {
         AffineSimulation::Never => false,
-        AffineSimulation::AsNeeded => !explained(&correspondences(&features[0], &features[1], &matches), progress)?,
+        AffineSimulation::AsNeeded => {
+            !explained(&correspondences(&features[0], &features[1], &matches), options.seed, progress)?
+        }
         AffineSimulation::Always => true,
     };
     if affine_simulation && options.method == FeatureMethod::Sift {
@@ -330,7 +335,7 @@ fn finish(
     if let Some(kind) = options.guided {
         let pairs = correspondences(&features[0], &features[1], &matches);
         // Without a model there is nothing to be guided by: the tentative matches stay.
-        let found = match estimate(&pairs, kind, &kind.options(), progress) {
+        let found = match estimate(&pairs, kind, &RobustOptions { seed: options.seed, ..kind.options() }, progress) {
             Err(EstimateError::Cancelled(stop)) => return Err(stop.into()),
             found => found.ok(),
         };
@@ -356,9 +361,9 @@ fn finish(
 }
 
 /// Whether a homography or a fundamental matrix explains enough of the matches: see [`AffineSimulation::AsNeeded`].
-fn explained(pairs: &[Correspondence], progress: &dyn Progress) -> Result<bool, Cancelled> {
+fn explained(pairs: &[Correspondence], seed: u64, progress: &dyn Progress) -> Result<bool, Cancelled> {
     for kind in [ModelKind::Homography, ModelKind::Fundamental] {
-        match estimate(pairs, kind, &kind.options(), progress) {
+        match estimate(pairs, kind, &RobustOptions { seed, ..kind.options() }, progress) {
             Ok(m) if m.robust.inliers.len() as f64 > 8.0 + 0.3 * pairs.len() as f64 => return Ok(true),
             Err(EstimateError::Cancelled(stop)) => return Err(stop),
             _ => {}

@@ -1,6 +1,6 @@
 //! `cv completions`: scripts that complete the command line.
 
-use crate::frame::{Context, Failure, Outcome, Run};
+use crate::frame::{Context, Failure, Global, Outcome, Run};
 use clap::CommandFactory;
 use clap_complete::Shell;
 
@@ -15,6 +15,10 @@ pub(crate) struct Args {
 }
 
 impl Run for Args {
+    fn has_no_use_for(&self) -> &'static [Global] {
+        &[Global::Seed, Global::Report]
+    }
+
     fn run(self, _: &Context) -> Result<Outcome, Failure> {
         let mut script = Vec::new();
         clap_complete::generate(self.shell, &mut crate::Cli::command(), "cv", &mut script);

@@ -3,9 +3,10 @@
 use super::size;
 use crate::frame::{Context, Explain, Failure, Outcome, Run, named};
 use cv_core::nalgebra::Matrix3;
-use cv_core::{Camera, Correspondence, Named, named};
-use cv_pipeline::{EstimateError, ModelKind, RobustOptions, estimate, estimate_calibrated};
-use std::path::PathBuf;
+use cv_core::{Camera, Correspondence, Named, RgbU8, named};
+use cv_pipeline::{EstimateError, ModelKind, RobustModel, RobustOptions, estimate, estimate_calibrated};
+use cv_report::{Figure, Raster, Report, colors};
+use std::path::{Path, PathBuf};
 
 /// Which model to estimate.
 #[derive(Debug, Clone, Copy)]
@@ -73,8 +74,8 @@ impl Args {
     /// The cameras that an essential matrix needs; `None` for the other models.
     fn cameras(&self) -> Result<Option<[Camera; 2]>, Failure> {
         if !matches!(self.model, Model::Essential) {
-            if self.camera.is_some() || self.focal.is_some() {
-                return Err(Failure::usage("only an essential matrix has use for --camera or --focal"));
+            if self.camera.is_some() || self.focal.is_some() || self.size.is_some() {
+                return Err(Failure::usage("only an essential matrix has use for --camera, --focal or --size"));
             }
             return Ok(None);
         }
@@ -135,6 +136,7 @@ impl Run for Args {
         let model = rows(&robust.model);
         let total = pairs.len();
         let text: String = model.iter().map(|r| format!("{:>16.9e} {:>16.9e} {:>16.9e}\n", r[0], r[1], r[2])).collect();
+        context.report(|| report(&self.matches, name, pairs, &robust))?;
         let mut outcome = Outcome::new(stages)
             .with("kind", self.model.name())
             .with("model", model)
@@ -155,4 +157,50 @@ impl Run for Args {
             robust.iterations
         )))
     }
+}
+
+/// The page: how many agree, and where.
+fn report(
+    file: &Path,
+    name: &str,
+    pairs: &[Correspondence],
+    found: &RobustModel<Matrix3<f64>>,
+) -> Result<String, Failure> {
+    let mut page = Report::new(&format!("Estimate: {name}"));
+    page.subtitle(&file.display().to_string())
+        .headline("matches that agree", &format!("{} of {}", found.inliers.len(), pairs.len()))
+        .headline("residuals", &format!("{:.3} px RMS", found.rms))
+        .headline("samples drawn", &found.iterations.to_string());
+    let rows: Vec<Vec<String>> =
+        rows(&found.model).iter().map(|row| row.iter().map(|v| format!("{v:.9e}")).collect()).collect();
+    page.section("Model").table("", &["", "", ""], &rows);
+    page.section("Matches").figure(Figure::new(
+        cv_io::encode_png(flow(pairs, &found.inliers).view())?,
+        "Each line leads from a point of the first view to where it lies in the second: those that agree green, others red.",
+    ));
+    Ok(page.to_html())
+}
+
+/// Every match as a line from its place in the first view to that in the second, both in one frame; of at most 1000 px a side.
+fn flow(pairs: &[Correspondence], inliers: &[usize]) -> RgbU8 {
+    let mut agrees = vec![false; pairs.len()];
+    inliers.iter().for_each(|&i| agrees[i] = true);
+    // The frame is that of the matches that agree: a wild one may lie anywhere.
+    let ends = inliers.iter().flat_map(|&i| [pairs[i].a, pairs[i].b]);
+    let mut frame = [f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY, f64::NEG_INFINITY];
+    ends.for_each(|p| frame = [frame[0].min(p.x), frame[1].min(p.y), frame[2].max(p.x), frame[3].max(p.y)]);
+    let (width, height) = (frame[2] - frame[0], frame[3] - frame[1]);
+    let scale = (1000.0 / width.max(height).max(1.0)).min(1.0);
+    let side = |length: f64| ((length * scale).ceil() as usize).clamp(1, 1000) + 20;
+    let background = RgbU8::new(side(width), side(height), [24; 3]);
+    let mut raster = Raster::from_rgb(background.view());
+    // Those that agree over the others.
+    for good in [false, true] {
+        for (m, _) in pairs.iter().zip(&agrees).filter(|(_, agrees)| **agrees == good) {
+            let at = |x: f64, y: f64| [((x - frame[0]) * scale + 10.0) as f32, ((y - frame[1]) * scale + 10.0) as f32];
+            let color = if good { colors::GREEN } else { colors::RED };
+            raster.line(at(m.a.x, m.a.y), at(m.b.x, m.b.y), 1.0, color);
+        }
+    }
+    raster.into_image()
 }

@@ -1,7 +1,7 @@
 //! `cv eval`: results against the truth.
 
 use super::depth::{fractions, read_map};
-use crate::frame::{Context, Failure, Outcome, Run};
+use crate::frame::{Context, Failure, Global, Outcome, Run};
 use cv_core::Mask;
 use cv_pipeline::stereo::{BAD_THRESHOLDS, DisparityScores, evaluate_disparity, non_occluded};
 use cv_report::{Figure, MapStyle, Report, draw_error_map, draw_map};
@@ -62,6 +62,10 @@ impl Run for Args {
         match &self.what {
             What::Disparity(args) => args.error.iter().map(|p| &**p).collect(),
         }
+    }
+
+    fn has_no_use_for(&self) -> &'static [Global] {
+        &[Global::Seed]
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {

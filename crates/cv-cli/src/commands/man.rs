@@ -1,6 +1,6 @@
 //! `cv man`: the manual pages.
 
-use crate::frame::{Context, Explain, Failure, Outcome, Run, create_dir};
+use crate::frame::{Context, Explain, Failure, Global, Outcome, Run, create_dir};
 use clap::CommandFactory;
 use std::path::PathBuf;
 
@@ -14,6 +14,10 @@ pub(crate) struct Args {
 }
 
 impl Run for Args {
+    fn has_no_use_for(&self) -> &'static [Global] {
+        &[Global::Seed, Global::Report]
+    }
+
     fn run(self, _: &Context) -> Result<Outcome, Failure> {
         create_dir(&self.out)?;
         let mut root = crate::Cli::command().disable_help_subcommand(true);

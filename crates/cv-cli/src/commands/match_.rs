@@ -5,8 +5,8 @@ use cv_core::{Keypoint, Named, RgbU8};
 use cv_io::FeatureRows;
 use cv_pipeline::features::{CornerMeasure, DescriptorKind, Descriptors, Features};
 use cv_pipeline::{
-    AffineSimulation, EstimateError, FeatureMethod, MatchingError, MatchingOptions, MatchingResult, ModelKind,
-    PhotoFeatures, RobustOptions, Suppression, estimate, match_extracted, match_photos,
+    AffineSimulation, FeatureMethod, MatchingError, MatchingOptions, MatchingResult, ModelKind, PhotoFeatures,
+    Suppression, match_extracted, match_photos, prevailing_model,
 };
 use cv_report::{Figure, MatchStyle, Note, Plot, Report, colors, draw_keypoints, draw_matches, tile_patches};
 use std::path::{Path, PathBuf};
@@ -38,16 +38,16 @@ pub(crate) struct Args {
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// Which features.
-    #[arg(long, value_name = "KIND", value_parser = named::<FeatureMethod>(), default_value_t = FeatureMethod::Sift)]
+    #[arg(long, value_name = "KIND", value_parser = named::<FeatureMethod>(), default_value_t = MatchingOptions::default().method)]
     features: FeatureMethod,
     /// What makes a corner, for mops and harris.
-    #[arg(long, value_name = "MEASURE", value_parser = named::<CornerMeasure>(), default_value = "harris")]
+    #[arg(long, value_name = "MEASURE", value_parser = named::<CornerMeasure>(), default_value_t = MatchingOptions::default().harris.measure)]
     corners: CornerMeasure,
     /// How the corners of harris are spread.
-    #[arg(long, value_name = "HOW", value_parser = named::<Suppression>(), default_value_t = Suppression::Radius)]
+    #[arg(long, value_name = "HOW", value_parser = named::<Suppression>(), default_value_t = MatchingOptions::default().suppression)]
     spacing: Suppression,
     /// Look at affine-simulated views too (ASIFT), with sift: for photographs from very different directions; about ten times slower.
-    #[arg(long = "asift", alias = "slanted", value_name = "WHEN", value_parser = named::<AffineSimulation>(), default_value_t = AffineSimulation::AsNeeded)]
+    #[arg(long = "asift", alias = "slanted", value_name = "WHEN", value_parser = named::<AffineSimulation>(), default_value_t = MatchingOptions::default().affine_simulation)]
     slanted: AffineSimulation,
     /// Find this model and match once more along it: more matches, nearly all right, and none that disagree.
     #[arg(long, value_name = "MODEL", value_parser = named::<ModelKind>())]
@@ -89,6 +89,7 @@ impl Run for Args {
             mutual: !self.one_way,
             ..MatchingOptions::default()
         };
+        options.seed = context.seed.unwrap_or(options.seed);
         options.harris.measure = self.corners;
         options.mops.corners.measure = self.corners;
         let result = match &self.load_features {
@@ -126,7 +127,7 @@ impl Run for Args {
             let scores: Vec<f64> = result.matches.iter().map(|m| f64::from(m.ratio)).collect();
             cv_io::write_matches(path, &result.pairs(), Some(&scores))?;
         }
-        context.report(|| self.html(&a, &b, &result, context))?;
+        context.report(|| self.html([&a, &b], &result, options.seed, context))?;
         let counts = result.features.each_ref().map(|f| f.described.keypoints.len());
         let dropped = result.features.each_ref().map(|f| f.described.dropped.len());
         Ok(Outcome::new(result.stages)
@@ -148,15 +149,29 @@ impl Run for Args {
 }
 
 impl Args {
-    fn html(&self, a: &RgbU8, b: &RgbU8, result: &MatchingResult, context: &Context) -> Result<String, Failure> {
+    fn html(
+        &self,
+        [a, b]: [&RgbU8; 2],
+        result: &MatchingResult,
+        seed: u64,
+        context: &Context,
+    ) -> Result<String, Failure> {
         let picture = |image: RgbU8, caption: &str| -> Result<Figure, Failure> {
             Ok(Figure::new(cv_io::encode_jpeg(image.view(), 88).during("cannot encode a picture")?, caption))
         };
         let mut report = Report::new("Matches");
         report.subtitle(&format!("{} and {}", self.first.display(), self.second.display()));
-        let (model, inliers) = agreed(result, context)?;
+        let pairs = result.pairs();
+        let mut inliers = vec![false; pairs.len()];
+        let model = prevailing_model(&pairs, seed, context)?.map(|found| {
+            found.robust.inliers.iter().for_each(|&i| inliers[i] = true);
+            match found.kind {
+                ModelKind::Homography => "homography",
+                ModelKind::Fundamental => "fundamental matrix",
+            }
+        });
         report
-            .headline("matches", &result.pairs().len().to_string())
+            .headline("matches", &pairs.len().to_string())
             .headline("that agree", &inliers.iter().filter(|i| **i).count().to_string());
         report.section("Features");
         for (name, image, features) in [("first", a, &result.features[0]), ("second", b, &result.features[1])] {
@@ -192,11 +207,11 @@ impl Args {
         }
         report.section("Matches");
         let style = MatchStyle::default();
-        let before = draw_matches(a.view(), b.view(), &result.pairs(), None, &style);
+        let before = draw_matches(a.view(), b.view(), &pairs, None, &style);
         report.figure(picture(before, "Tentative matches, each in a color of its own.")?);
         match model {
             Some(model) => {
-                let after = draw_matches(a.view(), b.view(), &result.pairs(), Some(&inliers), &style);
+                let after = draw_matches(a.view(), b.view(), &pairs, Some(&inliers), &style);
                 report.figure(picture(
                     after,
                     &format!("The same after RANSAC: those that fit one {model} green, others red."),
@@ -310,25 +325,4 @@ fn statistics(report: &mut Report, result: &MatchingResult) {
         Plot::new("How sure the matches are", "ratio", "matches").histogram_within("matches", &ratios, 20, (0.0, 1.0));
     report.plot(&plot, "Ratio of the squared distance of the best candidate to that of the second: matches far to the left are unmistakable.");
     report.facts(&result.stages.iter().map(|(name, s)| (*name, format!("{s:.3} s"))).collect::<Vec<_>>());
-}
-
-/// The model that most matches agree on, and which those are. A fundamental matrix always fits somewhat more matches
-/// than a homography of the same scene: it must win clearly.
-fn agreed(result: &MatchingResult, context: &Context) -> Result<(Option<&'static str>, Vec<bool>), Failure> {
-    let fit = |kind: ModelKind| {
-        let options = RobustOptions { seed: context.seed.unwrap_or(RobustOptions::default().seed), ..kind.options() };
-        match estimate(&result.pairs(), kind, &options, context) {
-            Err(EstimateError::Cancelled(stop)) => Err(Failure::from(stop)),
-            found => Ok(found.map(|r| r.robust.inliers).unwrap_or_default()),
-        }
-    };
-    let (h, f) = (fit(ModelKind::Homography)?, fit(ModelKind::Fundamental)?);
-    let (model, inliers) = match (h.len(), f.len()) {
-        (0, 0) => (None, h),
-        (h_count, f_count) if h_count * 10 >= f_count * 9 => (Some("homography"), h),
-        _ => (Some("fundamental matrix"), f),
-    };
-    let mut mask = vec![false; result.matches.len()];
-    inliers.into_iter().for_each(|i| mask[i] = true);
-    Ok((model, mask))
 }

@@ -13,6 +13,9 @@
 //!     /// Where to write the result.
 //!     #[arg(short, long)]
 //!     output: PathBuf,
+//!     /// How to average. (An enum of the library; its names are beside it, in `cv_core::named!`.)
+//!     #[arg(long, value_parser = named::<Filter>(), default_value_t = ShrinkOptions::default().filter)]
+//!     filter: Filter,
 //! }
 //!
 //! impl Run for Args {
@@ -21,12 +24,14 @@
 //!         vec![&self.output]
 //!     }
 //!
+//!     // Global options that would do nothing are refused.
+//!     fn has_no_use_for(&self) -> &'static [Global] {
+//!         &[Global::Seed]
+//!     }
+//!
 //!     fn run(self, context: &Context) -> Result<Outcome, Failure> {
 //!         let image = cv_io::read_rgb(&self.image)?; // any error becomes a Failure: exit code 1
-//!         let mut options = ShrinkOptions::default();
-//!         if let Some(seed) = context.seed {
-//!             options.seed = seed; // --seed; --threads has been applied already
-//!         }
+//!         let options = ShrinkOptions { filter: self.filter, ..ShrinkOptions::default() }; // --threads has been applied already
 //!         let result = cv_pipeline::shrink(image.view(), &options, context) // `&Context` is the `&dyn Progress`
 //!             .advice("take a larger photograph")?; // becomes "; try: take a larger photograph"
 //!         cv_io::write_png(&self.output, result.image.view())?; // whole or not at all
@@ -74,10 +79,11 @@ macro_rules! subcommands {
         }
 
         impl Command {
-            /// Checks the outputs, then runs the command.
+            /// Checks the global options and the outputs, then runs the command.
             pub(crate) fn run(self, context: &Context) -> Result<Outcome, Failure> {
                 match self {
                     $(Self::$variant(args) => {
+                        context.refuse(args.has_no_use_for())?;
                         crate::frame::check_outputs(&args.outputs())?;
                         (*args).run(context)
                     })*

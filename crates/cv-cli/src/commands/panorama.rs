@@ -8,6 +8,7 @@ use cv_pipeline::panorama_types::{Blend, Exposure, Projection, Seams};
 use cv_pipeline::{FeatureMethod, PanoramaError, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama};
 use rayon::prelude::*;
 use serde_json::json;
+use std::collections::btree_map::{BTreeMap, Entry};
 use std::path::{Path, PathBuf};
 
 /// Join overlapping photographs to one picture.
@@ -145,18 +146,28 @@ impl Run for Args {
         let paths = expand_images(&self.images)?;
         let pictures = paths
             .par_iter()
-            .map(|path| Ok((cv_io::exif_focal(path)?, cv_io::read_rgb(path)?)))
+            .map(|path| {
+                let picture = cv_io::read_image(path)?;
+                Ok((picture.exif.focal.as_ref().map(|focal| focal.pixels), picture.into_rgb8()))
+            })
             .collect::<Result<Vec<_>, cv_io::IoError>>()?;
+        // Of photographs of one size the camera is read once.
+        let mut cameras = BTreeMap::new();
+        if let Some(path) = &self.camera {
+            for (_, image) in &pictures {
+                if let Entry::Vacant(place) = cameras.entry(image.size()) {
+                    place.insert(cv_io::read_camera(path, Some(image.size()))?);
+                }
+            }
+        }
         let photos: Vec<PanoramaPhoto<'_>> = pictures
             .iter()
-            .map(|(focal, image)| {
-                let camera = match &self.camera {
-                    Some(path) => Some(cv_io::read_camera(path, Some(image.size()))?),
-                    None => None,
-                };
-                Ok(PanoramaPhoto { image: image.view(), focal: focal.as_ref().map(|f| f.pixels), camera })
+            .map(|(focal, image)| PanoramaPhoto {
+                image: image.view(),
+                focal: *focal,
+                camera: cameras.get(&image.size()).copied(),
             })
-            .collect::<Result<_, cv_io::IoError>>()?;
+            .collect();
         let result = panorama(&photos, &self.options(context), context).map_err(|error| failure(error, &paths))?;
         if self.alpha {
             cv_io::write_png(&self.output, transparent(&result).view())?;

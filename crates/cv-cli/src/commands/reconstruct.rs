@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 /// Reconstruct a colored cloud of points and the camera's motion from two photographs.
 ///
 /// The cloud is in the first camera's frame; its unit is the distance between the two cameras, which photographs cannot tell. Without
-/// --camera and --focal, the focal length comes from the photographs' EXIF, and is estimated where they have none.
+/// --camera and --focal, the focal length comes from the photographs' EXIF, and is estimated where one of them has none.
 ///
 /// With --dense, the photographs are also rectified by the geometry found and matched pixel by pixel; what both confirm becomes a second, dense
 /// cloud in the same frame and unit.
@@ -58,7 +58,7 @@ pub(crate) struct Args {
     /// Smallest angle between the two rays of a point that is kept, in degrees.
     #[arg(long, value_name = "DEGREES", default_value_t = 0.1)]
     min_angle: f64,
-    /// Most features in a photograph.
+    /// Most features in a photograph [default: 8192].
     #[arg(long, value_name = "N")]
     features: Option<usize>,
     /// Which way the axes of the cloud point.

@@ -1,7 +1,7 @@
 //! `cv rectify`: a pair as two cameras would have taken it whose rows coincide.
 
 use super::size;
-use crate::frame::{Context, Failure, Outcome, Run, create_dir, spare_inputs};
+use crate::frame::{Context, Failure, Global, Outcome, Run, create_dir, spare_inputs};
 use crate::{rig, words};
 use cv_core::{RgbU8, StereoRig};
 use cv_io::RigFile;
@@ -73,6 +73,10 @@ fn parse_share(text: &str) -> Result<f64, String> {
 const NAMES: [&str; 4] = ["left.png", "right.png", "rig.yaml", "q.txt"];
 
 impl Run for Args {
+    fn has_no_use_for(&self) -> &'static [Global] {
+        &[Global::Seed]
+    }
+
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
         let exchange = self.exchange;
         spare_inputs(&NAMES.map(|name| self.out.join(name)), &[&self.left, &self.right, &self.rig])?;

@@ -2,7 +2,7 @@
 
 mod files;
 
-use crate::frame::{Context, Explain, Failure, Outcome, Run, create_dir, expand_images, named, same_file};
+use crate::frame::{Context, Explain, Failure, Global, Outcome, Run, create_dir, expand_images, named, same_file};
 use cv_core::{Mask, Named, RgbU8, Stage};
 use cv_pipeline::segmentation::{
     ColorModel, ColorSpace, ConfusionMatrix, Labeled, Regions, Rule, SegmentError, TrainOptions,
@@ -44,6 +44,13 @@ impl Run for Args {
         }
     }
 
+    fn has_no_use_for(&self) -> &'static [Global] {
+        match &self.what {
+            What::Train(_) => &[],
+            What::Predict(_) | What::Eval(_) => &[Global::Seed],
+        }
+    }
+
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
         match self.what {
             What::Train(args) => args.run(context),
@@ -76,29 +83,29 @@ struct Train {
     #[arg(long, value_name = "JSON")]
     model: PathBuf,
     /// Color space.
-    #[arg(long, value_parser = named::<ColorSpace>(), default_value_t = ColorSpace::Hsv)]
+    #[arg(long, value_parser = named::<ColorSpace>(), default_value_t = TrainOptions::default().space)]
     space: ColorSpace,
-    /// Gaussians for the object's colors, 1 to 64 [default: 5].
-    #[arg(long, value_name = "K", value_parser = clap::value_parser!(u16).range(1..=64))]
-    components: Option<u16>,
-    /// Gaussians for the background's colors, 1 to 63 [default: 10].
-    #[arg(long, value_name = "K", value_parser = clap::value_parser!(u16).range(1..=63))]
-    background_components: Option<u16>,
+    /// Gaussians for the object's colors, 1 to 64.
+    #[arg(long, value_name = "K", default_value_t = TrainOptions::default().components)]
+    components: usize,
+    /// Gaussians for the background's colors, 1 to 63.
+    #[arg(long, value_name = "K", default_value_t = TrainOptions::default().background_components)]
+    background_components: usize,
     /// What a pixel's color is judged by.
-    #[arg(long, value_parser = named::<Rule>(), default_value_t = Rule::Tuned)]
+    #[arg(long, value_parser = named::<Rule>(), default_value_t = TrainOptions::default().rule)]
     rule: Rule,
     /// Which regions are kept.
-    #[arg(long, value_parser = named::<Regions>(), default_value_t = Regions::Auto)]
+    #[arg(long, value_parser = named::<Regions>(), default_value_t = TrainOptions::default().regions)]
     regions: Regions,
-    /// Radius of the disc that masks are opened by; 0 for not at all [default: 2].
-    #[arg(long, value_name = "PX")]
-    open: Option<usize>,
-    /// Radius of the disc that masks are closed by; 0 for not at all [default: 2].
-    #[arg(long, value_name = "PX")]
-    close: Option<usize>,
-    /// Standard deviation by which scores are smoothed [default: 1].
-    #[arg(long, value_name = "PX")]
-    smoothing: Option<f32>,
+    /// Radius of the disc that masks are opened by; 0 for not at all.
+    #[arg(long, value_name = "PX", default_value_t = TrainOptions::default().open_radius)]
+    open: usize,
+    /// Radius of the disc that masks are closed by; 0 for not at all.
+    #[arg(long, value_name = "PX", default_value_t = TrainOptions::default().close_radius)]
+    close: usize,
+    /// Standard deviation by which scores are smoothed.
+    #[arg(long, value_name = "PX", default_value_t = TrainOptions::default().smoothing)]
+    smoothing: f32,
 }
 
 impl Train {
@@ -106,13 +113,13 @@ impl Train {
         let default = TrainOptions::default();
         TrainOptions {
             space: self.space,
-            components: self.components.map_or(default.components, usize::from),
-            background_components: self.background_components.map_or(default.background_components, usize::from),
+            components: self.components,
+            background_components: self.background_components,
             rule: self.rule,
             regions: self.regions,
-            open_radius: self.open.unwrap_or(default.open_radius),
-            close_radius: self.close.unwrap_or(default.close_radius),
-            smoothing: self.smoothing.unwrap_or(default.smoothing),
+            open_radius: self.open,
+            close_radius: self.close,
+            smoothing: self.smoothing,
             seed: context.seed.unwrap_or(default.seed),
             ..default
         }

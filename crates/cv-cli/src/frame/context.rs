@@ -2,7 +2,7 @@
 
 use super::progress::Bar;
 use super::stop::Stop;
-use super::{Failure, Globals, create_dir};
+use super::{Failure, Global, Globals, create_dir};
 use cv_pipeline::{Cancelled, Progress};
 use std::{fmt::Display, path::PathBuf, sync::Arc};
 
@@ -21,6 +21,19 @@ impl Context {
         let Globals { quiet, seed, .. } = *globals;
         let bar = Arc::new(Bar::new(quiet));
         Self { seed, quiet, report: globals.report.clone(), stop: Stop::listen(&bar), bar }
+    }
+
+    /// Refuses global options that the command has no use for.
+    pub(crate) fn refuse(&self, without_use: &[Global]) -> Result<(), Failure> {
+        let given = |option: &Global| match option {
+            Global::Seed => self.seed.is_some(),
+            Global::Report => self.report.is_some(),
+        };
+        match without_use.iter().find(|option| given(option)) {
+            Some(Global::Seed) => Err(Failure::usage("--seed means nothing here: nothing is chosen at random")),
+            Some(Global::Report) => Err(Failure::usage("--report means nothing here: there is nothing to show")),
+            None => Ok(()),
+        }
     }
 
     /// A line on stderr, whatever was asked for.

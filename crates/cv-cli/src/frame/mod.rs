@@ -40,7 +40,8 @@ pub(crate) struct Globals {
     /// Threads to use [default: one per core]. The result is the same for any number.
     #[arg(long, global = true, value_name = "N", value_parser = value_parser!(u16).range(1..=1024))]
     pub(crate) threads: Option<u16>,
-    /// Seed of random choices [default: that of the pipeline]. The same seed gives the same result.
+    /// Seed of random choices [default: that of the pipeline]. The same seed gives the same result; commands that choose nothing at random
+    /// refuse it.
     #[arg(long, global = true, value_name = "S")]
     pub(crate) seed: Option<u64>,
     /// Write DIR/report.html, one file with the pictures and figures of this run inside.
@@ -48,11 +49,25 @@ pub(crate) struct Globals {
     pub(crate) report: Option<PathBuf>,
 }
 
+/// A global option that not every command has a use for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Global {
+    /// `--seed`
+    Seed,
+    /// `--report`
+    Report,
+}
+
 /// A subcommand.
 pub(crate) trait Run: Args {
     /// The files this run will write. The frame checks them before the work starts.
     fn outputs(&self) -> Vec<&Path> {
         Vec::new()
+    }
+
+    /// Those of the global options that mean nothing to it: given all the same, they are wrong usage.
+    fn has_no_use_for(&self) -> &'static [Global] {
+        &[]
     }
 
     /// Does the job.

@@ -138,6 +138,8 @@ pub(crate) struct Job {
     pub(crate) inputs: &'static [&'static str],
     /// The arguments, `{0}` standing for the first input and so on. Paths are relative to the folder it runs in.
     pub(crate) args: &'static str,
+    /// Whether it makes random choices, and so takes a seed.
+    pub(crate) random: bool,
     /// The files it writes.
     pub(crate) outputs: &'static [&'static str],
 }
@@ -233,36 +235,42 @@ pub(crate) const JOBS: &[Job] = &[
         name: "depth",
         inputs: &["stereo/left.jpg", "stereo/right.jpg"],
         args: "depth {0} {1} -o d.pfm --disparities 64 --focal 380 --baseline 0.12 --depth depth.pfm --cloud cloud.ply",
+        random: false,
         outputs: &["d.pfm", "depth.pfm", "cloud.ply"],
     },
     Job {
         name: "panorama",
         inputs: &["panorama/view0.jpg", "panorama/view1.jpg", "panorama/view2.jpg"],
         args: "panorama {0} {1} {2} -o pano.png",
+        random: true,
         outputs: &["pano.png"],
     },
     Job {
         name: "match",
         inputs: &["plane/a.jpg", "plane/b.jpg"],
         args: "match {0} {1} -o matches.txt",
+        random: true,
         outputs: &["matches.txt"],
     },
     Job {
         name: "reconstruct",
         inputs: &["two-view/a.jpg", "two-view/b.jpg"],
         args: "reconstruct {0} {1} --focal 440 -o cloud.ply",
+        random: true,
         outputs: &["cloud.ply"],
     },
     Job {
         name: "segment train",
         inputs: &["ball/ball0.jpg", "ball/ball1.jpg"],
         args: "segment train --images {0} {1} --masks masks --model trained.json",
+        random: true,
         outputs: &["trained.json"],
     },
     Job {
         name: "segment predict",
         inputs: &["ball/ball2.jpg", "ball/ball3.jpg"],
         args: "segment predict --model ball.json {0} {1} --out found",
+        random: false,
         outputs: &["found/"],
     },
 ];

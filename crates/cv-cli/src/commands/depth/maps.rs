@@ -51,7 +51,8 @@ pub(crate) fn read_map(path: &Path, scale: Option<f64>) -> Result<GrayF32, Failu
         _ => {
             return match scale {
                 Some(scale) => Ok(cv_io::scaled::read(path, scale)?),
-                None => Ok(cv_io::kitti::read(path).advice("for other pictures give the scale (--truth-scale)")?),
+                None => Ok(cv_io::kitti::read(path)
+                    .advice("for other pictures give the scale (--truth-scale, --estimate-scale)")?),
             };
         }
     };

@@ -7,7 +7,7 @@ mod photos;
 mod report;
 
 use super::size;
-use crate::frame::{Context, Failure, Outcome, Run, named};
+use crate::frame::{Context, Failure, Global, Outcome, Run, named};
 use crate::{rig, words};
 use cv_core::{ImageView, PointCloud};
 use cv_io::ply::PlyEncoding;
@@ -86,31 +86,31 @@ pub(crate) struct Args {
     #[arg(long, value_name = "Z")]
     far: Option<f32>,
     /// Directions of cost aggregation.
-    #[arg(long, value_name = "N", value_parser = named::<Paths>(), default_value_t = Paths::Eight)]
+    #[arg(long, value_name = "N", value_parser = named::<Paths>(), default_value_t = StereoOptions::default().paths)]
     paths: Paths,
     /// Matching window.
-    #[arg(long, value_name = "N", value_parser = named::<Census>(), default_value_t = Census::Window5x5)]
+    #[arg(long, value_name = "N", value_parser = named::<Census>(), default_value_t = StereoOptions::default().census)]
     census: Census,
-    /// Penalty for a disparity step of one pixel, in bits of the window [default: 4].
-    #[arg(long, value_name = "BITS")]
-    p1: Option<u8>,
-    /// Penalty for a larger step where the photograph has no edge, in bits of the window [default: 20].
-    #[arg(long, value_name = "BITS")]
-    p2: Option<u8>,
-    /// By how many percent the best match must beat the rest [default: 0].
-    #[arg(long, value_name = "PERCENT")]
-    uniqueness: Option<u8>,
-    /// Remove patches of up to this many pixels; 0 for none [default: 100].
-    #[arg(long, value_name = "PIXELS")]
-    speckle_size: Option<usize>,
+    /// Penalty for a disparity step of one pixel, in bits of the window.
+    #[arg(long, value_name = "BITS", default_value_t = StereoOptions::default().p1)]
+    p1: u8,
+    /// Penalty for a larger step where the photograph has no edge, in bits of the window.
+    #[arg(long, value_name = "BITS", default_value_t = StereoOptions::default().p2)]
+    p2: u8,
+    /// By how many percent the best match must beat the rest.
+    #[arg(long, value_name = "PERCENT", default_value_t = StereoOptions::default().uniqueness)]
+    uniqueness: u8,
+    /// Remove patches of up to this many pixels; 0 for none.
+    #[arg(long, value_name = "PIXELS", default_value_t = StereoOptions::default().speckle_size)]
+    speckle_size: usize,
     /// Leave pixels without a match of their own unknown.
     #[arg(long)]
     no_fill: bool,
     /// What to add to the number of differing bits: sharper outlines.
-    #[arg(long, value_name = "WHAT", value_parser = named::<IntensityCost>(), default_value_t = IntensityCost::None)]
+    #[arg(long, value_name = "WHAT", value_parser = named::<IntensityCost>(), default_value_t = StereoOptions::default().intensity_cost)]
     blend: IntensityCost,
     /// Edge-preserving smoothing.
-    #[arg(long, value_name = "HOW", value_parser = named::<Smoothing>(), default_value = "bilateral")]
+    #[arg(long, value_name = "HOW", value_parser = named::<Smoothing>(), default_value_t = StereoOptions::default().smoothing)]
     smoothing: Smoothing,
     /// Strength of --smoothing wls [default: 100].
     #[arg(long, value_name = "L")]
@@ -140,6 +140,10 @@ impl Run for Args {
         }
         let more = [&self.depth, &self.cloud, &self.confidence, &self.matched, &self.uncertainty];
         std::iter::once(&self.output).chain(more.into_iter().flatten()).map(|p| &**p).collect()
+    }
+
+    fn has_no_use_for(&self) -> &'static [Global] {
+        &[Global::Seed]
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {

@@ -29,14 +29,9 @@ impl Args {
                     Range::Auto => default.disparities,
                 },
                 census: self.census,
-                p1: self.p1.unwrap_or(default.p1),
-                p2: self.p2.unwrap_or(default.p2),
-                p2_min: default
-                    .p2_min
-                    .clamp(self.p1.unwrap_or(0), self.p2.unwrap_or(u8::MAX).max(self.p1.unwrap_or(0))),
                 paths: self.paths,
-                uniqueness: self.uniqueness.unwrap_or(default.uniqueness),
-                speckle_size: self.speckle_size.unwrap_or(default.speckle_size),
+                uniqueness: self.uniqueness,
+                speckle_size: self.speckle_size,
                 fill: !self.no_fill,
                 intensity_cost: self.blend,
                 smoothing: match self.smoothing {
@@ -50,7 +45,8 @@ impl Args {
                 confidence: self.confidence.is_some(),
                 max_memory: self.max_memory.map(|mib| mib.saturating_mul(1 << 20)),
                 ..default
-            },
+            }
+            .with_penalties(self.p1, self.p2),
             disparities: match self.disparities {
                 Range::Number(_) => DisparityRange::Given,
                 Range::Auto => DisparityRange::FromMatches { min: self.min_disparity },
