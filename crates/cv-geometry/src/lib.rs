@@ -30,6 +30,7 @@ mod fundamental;
 mod homography;
 mod match_blocks;
 mod null_space_basis;
+mod pair_graph;
 mod ransac;
 mod robust;
 mod rotation;
@@ -39,6 +40,7 @@ mod six_point;
 mod testing;
 mod triangulation;
 mod two_view;
+mod verified_pair;
 
 pub use absolute::{
     Similarity, WorldMatch, align_points, estimate_pose, pose_from_points, pose_three_points, refine_pose,
@@ -57,6 +59,7 @@ pub use homography::{
     estimate_homography, homography_four_point, homography_from_points, homography_residual, refine_homography,
 };
 pub use match_blocks::{LANES, MatchBlock};
+pub use pair_graph::{NoSuchNode, PairEdge, PairGraph, TreeStep};
 pub use ransac::{
     Consensus, Estimator, Msac, Prosac, RansacData, RobustOptions, Sampler, Sampling, Score, Scorer, Scoring,
     TukeyBiweight, Uniform, ransac,
@@ -69,3 +72,4 @@ pub use two_view::{
     Intrinsics, MatchedViews, TwoViewAdjustment, TwoViewError, TwoViewGeometry, TwoViewOptions, TwoViewPoint,
     TwoViewReconstruction, estimate_two_view_geometry, reconstruct_two_views,
 };
+pub use verified_pair::{NotAPair, VerifiedPair, VerifyOptions, verify_pair};

@@ -4,7 +4,7 @@
 //! [`verify_pair`], [`align`], [`render`]:
 //!
 //! ```
-//! use cv_core::{Correspondence, RgbU8};
+//! use cv_core::{Correspondence, RgbU8, Silent};
 //! use cv_panorama::{AlignOptions, CameraMotion, Photo, CompositingOptions, VerifyOptions, align, render, verify_pair};
 //!
 //! // Two windows, 60 pixels apart, of one picture; matches on a grid.
@@ -19,8 +19,8 @@
 //! let pair = verify_pair((0, left.size()), (1, right.size()), &matches, &VerifyOptions::default())?;
 //! let photos = [Photo::new(160, 120), Photo::new(160, 120)];
 //! let options = AlignOptions { motion: CameraMotion::Homography, ..AlignOptions::default() };
-//! let alignment = align(&photos, &[pair], &options)?;
-//! let panorama = render(&[left.view(), right.view()], &alignment, &CompositingOptions::default())?;
+//! let alignment = align(&photos, &[pair], &options, &Silent)?;
+//! let panorama = render(&[left.view(), right.view()], &alignment, &CompositingOptions::default(), &Silent)?;
 //! assert!(panorama.image.width().abs_diff(220) <= 1 && alignment.rms_px < 0.01);
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
@@ -35,15 +35,16 @@
 mod align;
 mod blend;
 mod render;
+mod rows;
 mod seams;
 mod surface;
+#[cfg(test)]
+mod testing;
 
-pub use align::{
-    AlignError, AlignOptions, AlignedPair, Alignment, CameraMotion, NotAPair, Photo, Unplaced, VerifiedPair,
-    VerifyOptions, View, align, verify_pair,
-};
-pub use blend::{Exposure, Gains};
+pub use align::{AlignError, AlignOptions, AlignedPair, Alignment, CameraMotion, Photo, Unplaced, View, align};
+pub use blend::{BlendMode, Blender, Composition, Exposure, Gains, NO_PHOTO};
+pub use cv_geometry::{NotAPair, VerifiedPair, VerifyOptions, verify_pair};
 pub use cv_imgproc::Interpolation;
-pub use render::{Blend, CompositingOptions, Panorama, RenderError, render};
+pub use render::{CompositingOptions, Panorama, RenderError, render, render_with};
 pub use seams::Seams;
-pub use surface::{Canvas, LayoutError, PhotoMap, Projection};
+pub use surface::{Bounds, Canvas, LayoutError, PhotoMap, Projection, WarpedPhoto};

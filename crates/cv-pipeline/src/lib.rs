@@ -70,7 +70,8 @@ pub mod features {
     };
 }
 pub use panorama::{
-    PanoramaError, PanoramaImage, PanoramaOptions, PanoramaPair, PanoramaPhoto, PanoramaResult, panorama,
+    LeftOut, NearestPair, PanoramaError, PanoramaImage, PanoramaOptions, PanoramaPair, PanoramaPhoto, PanoramaResult,
+    panorama,
 };
 /// The options of the panorama's stages.
 pub mod panorama_types {

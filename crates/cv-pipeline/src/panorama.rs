@@ -4,7 +4,9 @@ use crate::Progress;
 use crate::matching::{
     FeatureMethod, MatchingOptions, PhotoFeatures, correspondences, extract_features, match_features,
 };
-use cv_core::{Camera, Cancelled, Correspondence, Image, ImageView, Mask, Point2, RgbU8, Stage, StageClock};
+use cv_core::{
+    Camera, Cancelled, Correspondence, DMatch, Image, ImageView, Mask, Point2, RgbU8, Stage, StageClock, UnionFind,
+};
 use cv_features::{DescriptorKind, Descriptors, FeatureError, Features, MatchError, SiftOptions};
 use cv_panorama::{
     AlignError, AlignOptions, Alignment, CameraMotion, Canvas, CompositingOptions, NotAPair, Photo, PhotoMap,
@@ -59,13 +61,47 @@ impl Default for PanoramaOptions {
     }
 }
 
+/// Why a photograph is not in the panorama.
+#[derive(Debug, Clone, PartialEq)]
+pub enum LeftOut {
+    /// Features could not be looked for on it.
+    Features(FeatureError),
+    /// No features were found on it.
+    NoFeatures,
+    /// It overlaps no other photograph.
+    NoOverlap {
+        /// The pair with another photograph that came nearest to being one, where one came near.
+        nearest: Option<NearestPair>,
+    },
+    /// It overlaps only photographs that do not overlap those of the panorama.
+    OtherComponent {
+        /// Photographs in that group, itself included.
+        size: usize,
+    },
+    /// Its overlaps contradict those of the other photographs.
+    Inconsistent,
+}
+
+/// A pair of photographs of which too few matches agree.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct NearestPair {
+    /// The other photograph.
+    pub other: usize,
+    /// Matches that agree.
+    pub agree: usize,
+    /// Matches where the two photographs overlap by the homography.
+    pub in_overlap: usize,
+    /// The number that chance explains; more would have to agree.
+    pub needed: f64,
+}
+
 /// What became of a photograph.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PanoramaImage {
     /// Whether it is in the panorama.
     pub used: bool,
     /// Why not, where it is not.
-    pub reason: Option<String>,
+    pub reason: Option<LeftOut>,
     /// Features found on it.
     pub features: usize,
     /// Its focal length in pixels, where it is used.
@@ -81,8 +117,8 @@ pub struct PanoramaPair {
     pub a: usize,
     /// Second photograph.
     pub b: usize,
-    /// Tentative matches, in pixels of the photographs.
-    pub matches: Vec<Correspondence>,
+    /// Tentative matches, by the indices of the two photographs' features; see [`PanoramaResult::correspondences`].
+    pub matches: Vec<DMatch>,
     /// Which of them agree with a common homography; empty where the pair was rejected.
     pub inliers: Vec<bool>,
     /// Why the pair was rejected.
@@ -118,10 +154,30 @@ pub struct PanoramaResult {
     pub stages: Vec<(&'static str, f64)>,
 }
 
+/// Share of a photograph's longer side by which matches disagree when the camera clearly moved: 5 px of 1,000. Features are good to a pixel or two; parallax
+/// is what is left.
+const PARALLAX: f64 = 0.005;
+
+impl PanoramaResult {
+    /// Where the matches of a pair are, in pixels of the photographs.
+    pub fn correspondences(&self, pair: &PanoramaPair) -> Vec<Correspondence> {
+        let (fa, fb) = (self.reduced[pair.a], self.reduced[pair.b]);
+        let enlarge = |p: Point2<f64>, factor: f64| ((p.coords.add_scalar(0.5)) * factor).add_scalar(-0.5).into();
+        let found = correspondences(&self.features[pair.a], &self.features[pair.b], &pair.matches);
+        found.iter().map(|c| Correspondence { a: enlarge(c.a, fa), b: enlarge(c.b, fb) }).collect()
+    }
+
+    /// Whether the photographs fit each other so badly that they must have been taken from different places: what is near may then be cut in two at the seams.
+    pub fn shows_parallax(&self) -> bool {
+        let longest = self.alignment.used().map(|(_, view)| view.camera.width.max(view.camera.height)).max();
+        self.reprojection_rms_px > PARALLAX * longest.unwrap_or(0) as f64
+    }
+}
+
 /// Why there is no panorama.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum PanoramaError {
-    /// The photographs could not be aligned. `reasons` says for each what is the matter with it.
+    /// The photographs could not be aligned. `images` says for each what is the matter with it.
     #[error("{source}")]
     Align {
         /// Why.
@@ -131,10 +187,19 @@ pub enum PanoramaError {
     },
     /// The panorama could not be drawn.
     #[error(transparent)]
-    Render(#[from] RenderError),
+    Render(RenderError),
     /// The job was stopped by its progress callback.
     #[error("stopped")]
     Cancelled(#[from] Cancelled),
+}
+
+impl From<RenderError> for PanoramaError {
+    fn from(error: RenderError) -> Self {
+        match error {
+            RenderError::Cancelled(stop) => Self::Cancelled(stop),
+            error => Self::Render(error),
+        }
+    }
 }
 
 /// Joins overlapping photographs, in any order, to a panorama.
@@ -178,14 +243,14 @@ pub fn panorama(
     if matching.method == FeatureMethod::Sift && matching.sift.upsample && !held_firmly(n, &tried) {
         (prepared, tried) = look(matching)?;
     }
-    progress.report("align", 0, 1)?;
     let (pairs, verified): (Vec<PanoramaPair>, Vec<Option<VerifiedPair>>) = tried.into_iter().flatten().unzip();
     let verified: Vec<VerifiedPair> = verified.into_iter().flatten().collect();
     let known: Vec<Photo> = prepared.iter().map(|p| p.photo).collect();
-    let alignment = match align(&known, &verified, &options.align) {
+    let alignment = match align(&known, &verified, &options.align, progress) {
         Ok(alignment) => alignment,
+        Err(AlignError::Cancelled(stop)) => return Err(stop.into()),
         Err(source) => {
-            let views = vec![Err(Unplaced::Alone); n];
+            let views = vec![Err(Unplaced::NoOverlap); n];
             return Err(PanoramaError::Align { source, images: describe(&prepared, &views, &pairs) });
         }
     };
@@ -197,16 +262,14 @@ pub fn panorama(
     }
     clock.lap("align");
 
-    progress.report("draw", 0, 1)?;
     let views: Vec<ImageView<'_, u8, 3>> = photos.iter().map(|p| p.image).collect();
-    let drawn = render(&views, &alignment, &options.render)?;
+    let drawn = render(&views, &alignment, &options.render, progress)?;
     for (image, gain) in images.iter_mut().zip(&drawn.gains.gains) {
         image.gain = *gain;
     }
     for (stage, seconds) in &drawn.stages {
         clock.add(stage, *seconds);
     }
-    progress.report("draw", 1, 1)?;
     Ok(PanoramaResult {
         image: drawn.image,
         mask: drawn.mask,
@@ -231,7 +294,7 @@ struct Prepared {
     factor: f64,
     features: PhotoFeatures,
     /// Why it has no features.
-    failure: Option<String>,
+    failure: Option<FeatureError>,
 }
 
 impl Prepared {
@@ -262,7 +325,7 @@ impl Prepared {
         let (features, failure) = match extract_features(image, matching, progress) {
             Ok(features) => (features, None),
             Err(FeatureError::Cancelled(stop)) => return Err(stop),
-            Err(error) => (none(), Some(error.to_string())),
+            Err(error) => (none(), Some(error)),
         };
         let (width, height) = image.size();
         let camera = p.camera.map(|c| Camera { width, height, ..c.scaled(1.0 / factor) });
@@ -280,13 +343,10 @@ const FIRM: usize = 50;
 
 /// Whether all photographs hang together by links that are firm.
 fn held_firmly(n: usize, tried: &[Option<Tried>]) -> bool {
-    let mut group: Vec<usize> = (0..n).collect();
     let verified = tried.iter().flatten().filter_map(|(_, verified)| verified.as_ref());
-    for link in verified.filter(|v| v.inliers.len() >= FIRM) {
-        let (to, from) = (group[link.a], group[link.b]);
-        group.iter_mut().filter(|g| **g == from).for_each(|g| *g = to);
-    }
-    group.iter().all(|g| *g == group[0])
+    let firm = verified.filter(|v| v.inliers.len() >= FIRM);
+    let mut sets = UnionFind::new(n);
+    firm.filter(|v| sets.union(v.a as u32, v.b as u32)).count() + 1 >= n
 }
 
 /// Matches and verifies a pair; `None` where one has no features.
@@ -306,20 +366,19 @@ fn try_pair(
     let matches = correspondences(&p.features, &q.features, &found);
     let size = |p: &Prepared| (p.photo.width, p.photo.height);
     let verified = verify_pair((a, size(p)), (b, size(q)), &matches, &options.verify);
-    // Both lists are in the order of the matches.
-    let mut rest = verified.as_ref().map(|v| v.inliers.as_slice()).unwrap_or_default().iter().peekable();
     let inliers = match &verified {
-        Ok(_) => matches.iter().map(|m| rest.next_if(|i| *i == m).is_some()).collect(),
+        Ok(pair) => {
+            let mut agrees = vec![false; matches.len()];
+            pair.inliers.iter().for_each(|&i| agrees[i] = true);
+            agrees
+        }
         Err(_) => Vec::new(),
     };
-    let enlarge = |p: Point2<f64>, factor: f64| ((p.coords.add_scalar(0.5)) * factor).add_scalar(-0.5).into();
-    let matches =
-        matches.iter().map(|c| Correspondence { a: enlarge(c.a, p.factor), b: enlarge(c.b, q.factor) }).collect();
     let (verified, rejected) = match verified {
         Ok(pair) => (Some(pair), None),
         Err(reason) => (None, Some(reason)),
     };
-    Ok(Some((PanoramaPair { a, b, matches, inliers, rejected }, verified)))
+    Ok(Some((PanoramaPair { a, b, matches: found, inliers, rejected }, verified)))
 }
 
 /// What to tell about each photograph.
@@ -328,27 +387,21 @@ fn describe(
     views: &[Result<cv_panorama::View, Unplaced>],
     pairs: &[PanoramaPair],
 ) -> Vec<PanoramaImage> {
-    let reason = |i: usize, why: Unplaced| match (why, &prepared[i].failure) {
-        (_, Some(failure)) => failure.clone(),
-        (Unplaced::OtherGroup { size }, _) => format!("overlaps only with a smaller group of {size} photographs"),
-        (Unplaced::Contradicts, _) => "its overlaps contradict those of the other photographs".to_owned(),
-        (Unplaced::Alone, _) => {
-            let own = pairs.iter().filter(|p| p.a == i || p.b == i);
-            let agree = |p: &&PanoramaPair| match &p.rejected {
-                Some(NotAPair::TooFewAgree { agree, .. }) => *agree,
-                _ => 0,
-            };
-            match own.max_by_key(agree) {
-                _ if prepared[i].features.described.keypoints.is_empty() => "no features found on it".to_owned(),
-                Some(PanoramaPair { a, b, rejected: Some(rejected @ NotAPair::TooFewAgree { .. }), .. }) => {
-                    format!(
-                        "overlaps with no other photograph: with the likeliest, number {}, {rejected}",
-                        if *a == i { b + 1 } else { a + 1 }
-                    )
-                }
-                _ => "overlaps with no other photograph".to_owned(),
+    let nearest = |i: usize| {
+        let miss = |p: &PanoramaPair| match p.rejected {
+            Some(NotAPair::TooFewAgree { agree, in_overlap, needed }) if p.a == i || p.b == i => {
+                Some(NearestPair { other: if p.a == i { p.b } else { p.a }, agree, in_overlap, needed })
             }
-        }
+            _ => None,
+        };
+        pairs.iter().filter_map(miss).max_by_key(|miss| miss.agree)
+    };
+    let reason = |i: usize, why: Unplaced| match (why, &prepared[i].failure) {
+        (_, Some(failure)) => LeftOut::Features(*failure),
+        (Unplaced::OtherComponent { size }, _) => LeftOut::OtherComponent { size },
+        (Unplaced::Inconsistent, _) => LeftOut::Inconsistent,
+        (Unplaced::NoOverlap, _) if prepared[i].features.described.keypoints.is_empty() => LeftOut::NoFeatures,
+        (Unplaced::NoOverlap, _) => LeftOut::NoOverlap { nearest: nearest(i) },
     };
     views
         .iter()
@@ -372,8 +425,8 @@ mod tests {
     fn photographs_hold_firmly_where_firm_links_connect_them_all() {
         let link = |a: usize, b: usize, agree: usize| {
             let pair = PanoramaPair { a, b, matches: Vec::new(), inliers: Vec::new(), rejected: None };
-            let inliers = vec![Correspondence::new(0.0, 0.0, 0.0, 0.0); agree];
-            Some((pair, Some(VerifiedPair { a, b, homography: Matrix3::identity(), inliers })))
+            let (inliers, matches) = ((0..agree).collect(), vec![Correspondence::new(0.0, 0.0, 0.0, 0.0); agree]);
+            Some((pair, Some(VerifiedPair { a, b, homography: Matrix3::identity(), inliers, matches })))
         };
         let rejected = || {
             let pair = PanoramaPair { a: 0, b: 1, matches: Vec::new(), inliers: Vec::new(), rejected: None };

@@ -87,7 +87,7 @@ fn join(set: &str, paths: &[std::path::PathBuf]) -> Result<Figures> {
     let times: Vec<String> = result.stages.iter().map(|(s, t)| format!("{s} {:.0} ms", 1000.0 * t)).collect();
     println!(
         "{set}: {w}x{h} {}, {} places on seams, displacement median {:.2} px, 95 % {:.2} px; {}",
-        result.canvas.projection.name(),
+        result.canvas.projection,
         seams.len(),
         quantile(0.5),
         quantile(0.95),

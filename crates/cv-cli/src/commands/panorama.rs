@@ -2,10 +2,10 @@
 
 mod report;
 
-use crate::frame::{Context, Failure, Outcome, Run, expand_images, picture_name};
+use crate::frame::{Context, Failure, Outcome, Run, expand_images, named, picture_name};
 use cv_core::Image;
-use cv_pipeline::panorama_types::{Blend, Exposure, Projection, Seams};
-use cv_pipeline::{FeatureMethod, PanoramaError, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama};
+use cv_pipeline::panorama_types::{BlendMode, Exposure, Projection, Seams};
+use cv_pipeline::{FeatureMethod, LeftOut, PanoramaError, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama};
 use rayon::prelude::*;
 use serde_json::json;
 use std::collections::btree_map::{BTreeMap, Entry};
@@ -27,17 +27,17 @@ pub(crate) struct Args {
     #[arg(short, long, value_name = "FILE", value_parser = picture_name)]
     output: PathBuf,
     /// The surface to draw on; auto: a plane up to 90 degrees across, then a cylinder, a sphere where it is also high.
-    #[arg(long, value_enum, default_value_t = ProjectionArg::Auto)]
-    projection: ProjectionArg,
+    #[arg(long, value_name = "SURFACE", value_parser = named::<Projection>(), default_value_t = Projection::Auto)]
+    projection: Projection,
     /// How to join photographs at the seams.
-    #[arg(long, value_enum, default_value_t = BlendArg::Multiband)]
-    blend: BlendArg,
+    #[arg(long, value_name = "MODE", value_parser = named::<BlendMode>(), default_value_t = BlendMode::Multiband)]
+    blend: BlendMode,
     /// Where seams run: where the photographs agree, or half-way between their middles.
-    #[arg(long, value_enum, default_value_t = SeamsArg::Graphcut)]
-    seams: SeamsArg,
+    #[arg(long, value_name = "WHERE", value_parser = named::<Seams>(), default_value_t = Seams::GraphCut)]
+    seams: Seams,
     /// What to even out between photographs.
-    #[arg(long, value_enum, default_value_t = ExposureArg::Gain)]
-    exposure: ExposureArg,
+    #[arg(long, value_name = "WHAT", value_parser = named::<Exposure>(), default_value_t = Exposure::Gain)]
+    exposure: Exposure,
     /// Cut the result to the largest rectangle without empty pixels.
     #[arg(long)]
     crop: bool,
@@ -48,88 +48,30 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0)]
     scale: f64,
     /// Features to match: sift for any photographs, harris for speed where they are all upright and of one size.
-    #[arg(long, value_enum, default_value_t = FeaturesArg::Sift)]
-    features: FeaturesArg,
+    #[arg(long, value_name = "KIND", value_parser = named::<FeatureMethod>(), default_value_t = FeatureMethod::Sift)]
+    features: FeatureMethod,
     /// The calibrated camera that took all of them (ours, OpenCV's or ROS's YAML, COLMAP's cameras.txt): its focal length is believed and its distortion
     /// taken out. Without, the focal length is estimated, from EXIF on.
     #[arg(long, value_name = "FILE")]
     camera: Option<PathBuf>,
 }
 
-#[derive(Debug, Clone, Copy, clap::ValueEnum)]
-enum ProjectionArg {
-    Auto,
-    Plane,
-    Cylindrical,
-    Spherical,
-}
-
-#[derive(Debug, Clone, Copy, clap::ValueEnum)]
-enum BlendArg {
-    Multiband,
-    Poisson,
-    Feather,
-    None,
-}
-
-#[derive(Debug, Clone, Copy, clap::ValueEnum)]
-enum SeamsArg {
-    Graphcut,
-    Middle,
-}
-
-#[derive(Debug, Clone, Copy, clap::ValueEnum)]
-enum ExposureArg {
-    None,
-    Gain,
-    Vignetting,
-}
-
-#[derive(Debug, Clone, Copy, clap::ValueEnum)]
-enum FeaturesArg {
-    Sift,
-    Harris,
-}
-
 impl Args {
     fn options(&self, context: &Context) -> PanoramaOptions {
         let mut options = PanoramaOptions::default();
-        options.render.projection = match self.projection {
-            ProjectionArg::Auto => Projection::Auto,
-            ProjectionArg::Plane => Projection::Plane,
-            ProjectionArg::Cylindrical => Projection::Cylindrical,
-            ProjectionArg::Spherical => Projection::Spherical,
-        };
-        options.render.blend = match self.blend {
-            BlendArg::Multiband => Blend::Multiband,
-            BlendArg::Poisson => Blend::Poisson,
-            BlendArg::Feather => Blend::Feather,
-            BlendArg::None => Blend::None,
-        };
-        options.render.seams = match self.seams {
-            SeamsArg::Graphcut => Seams::GraphCut,
-            SeamsArg::Middle => Seams::Middle,
-        };
-        options.render.exposure = match self.exposure {
-            ExposureArg::None => Exposure::None,
-            ExposureArg::Gain => Exposure::Gain,
-            ExposureArg::Vignetting => Exposure::GainAndVignetting,
-        };
+        options.render.projection = self.projection;
+        options.render.blend = self.blend;
+        options.render.seams = self.seams;
+        options.render.exposure = self.exposure;
         options.render.crop = self.crop;
         options.render.resolution = self.scale;
-        options.matching.method = match self.features {
-            FeaturesArg::Sift => FeatureMethod::Sift,
-            FeaturesArg::Harris => FeatureMethod::Harris,
-        };
+        options.matching.method = self.features;
         if let Some(seed) = context.seed {
             options.verify.seed = seed;
         }
         options
     }
 }
-
-/// Share of a photograph's side by which matches disagree when the camera clearly moved: 5 px of 1,000.
-const MUCH: f64 = 0.005;
 
 impl Run for Args {
     fn outputs(&self) -> Vec<&Path> {
@@ -176,12 +118,11 @@ impl Run for Args {
         }
         for (path, image) in paths.iter().zip(&result.images) {
             if let Some(reason) = &image.reason {
-                context.warn(format!("{} is not in the panorama: {reason}", path.display()));
+                context.warn(format!("{} is not in the panorama: {}", path.display(), words(reason, &paths)));
             }
         }
-        // Features are good to a pixel or two; parallax is what is left.
-        let (rms, long) = (result.reprojection_rms_px, pictures.iter().map(|(_, p)| p.width().max(p.height())).max());
-        if rms > MUCH * long.unwrap_or(0) as f64 {
+        if result.shows_parallax() {
+            let rms = result.reprojection_rms_px;
             context.warn(format!(
                 "the photographs agree only to {rms:.1} px: they were taken from different places, and what is near may be cut in two at the seams"
             ));
@@ -203,13 +144,33 @@ fn transparent(result: &PanoramaResult) -> Image<u8, 4> {
     })
 }
 
+/// Why a photograph was left out.
+fn words(reason: &LeftOut, paths: &[PathBuf]) -> String {
+    match reason {
+        LeftOut::Features(error) => error.to_string(),
+        LeftOut::NoFeatures => "no features found on it".to_owned(),
+        LeftOut::NoOverlap { nearest: None } => "overlaps with no other photograph".to_owned(),
+        LeftOut::NoOverlap { nearest: Some(pair) } => format!(
+            "overlaps with no other photograph: with the likeliest, {}, {} of {} matches in the overlap agree, more than {:.0} are needed",
+            paths[pair.other].display(),
+            pair.agree,
+            pair.in_overlap,
+            pair.needed
+        ),
+        LeftOut::OtherComponent { size } => format!("overlaps only with a smaller group of {size} photographs"),
+        LeftOut::Inconsistent => "its overlaps contradict those of the other photographs".to_owned(),
+    }
+}
+
 fn failure(error: PanoramaError, paths: &[PathBuf]) -> Failure {
     match error {
         PanoramaError::Align { source, images } => {
             let reasons: Vec<String> = paths
                 .iter()
                 .zip(&images)
-                .filter_map(|(path, image)| image.reason.as_ref().map(|r| format!("{}: {r}", path.display())))
+                .filter_map(|(path, image)| {
+                    image.reason.as_ref().map(|r| format!("{}: {}", path.display(), words(r, paths)))
+                })
                 .collect();
             Failure::new(format!("{source} ({})", reasons.join("; ")))
                 .advice("photographs that share a third of their view with their neighbors, taken from one place")
@@ -224,7 +185,8 @@ fn outcome(paths: &[PathBuf], result: &PanoramaResult) -> Outcome {
         .iter()
         .zip(&result.images)
         .map(|(path, image)| {
-            json!({ "path": path, "used": image.used, "reason": image.reason, "focal_px": image.focal, "gain": image.gain })
+            let reason = image.reason.as_ref().map(|r| words(r, paths));
+            json!({ "path": path, "used": image.used, "reason": reason, "focal_px": image.focal, "gain": image.gain })
         })
         .collect();
     let used = result.images.iter().filter(|i| i.used).count();
@@ -233,11 +195,11 @@ fn outcome(paths: &[PathBuf], result: &PanoramaResult) -> Outcome {
         .with("images", images)
         .with("size", [w, h])
         .with("reprojection_rms_px", result.reprojection_rms_px)
-        .with("projection", result.canvas.projection.name())
+        .with("projection", result.canvas.projection.to_string())
         .summary(format!(
             "{used} of {} photographs, {w} x {h} pixels, {}, matches agree to {:.2} px (RMS)",
             paths.len(),
-            result.canvas.projection.name(),
+            result.canvas.projection,
             result.reprojection_rms_px
         ))
 }

@@ -1,13 +1,11 @@
-//! One group of connected photographs: cameras from a spanning tree, then all at once over all overlaps.
+//! One connected component of the match graph: cameras from a spanning tree, then all at once over all overlaps.
 
 use crate::align::bundle::{Lens, Motion, Overlap, Problem, State};
 use crate::align::focal::focals_from_homography;
-use crate::align::graph::{self, Edge};
 use crate::align::straighten::straighten;
-use crate::align::{
-    AlignError, AlignOptions, AlignedPair, Alignment, CameraMotion, Photo, Unplaced, VerifiedPair, View,
-};
-use cv_core::{Camera, Distortion, Point2};
+use crate::align::{AlignError, AlignOptions, AlignedPair, Alignment, CameraMotion, Photo, Unplaced, View};
+use cv_core::{Camera, Cancelled, Distortion, Point2, Stage};
+use cv_geometry::{PairEdge, PairGraph, VerifiedPair};
 use cv_numeric::RobustLoss;
 use nalgebra::{Matrix3, Rotation3, Vector2};
 
@@ -19,10 +17,10 @@ pub(crate) struct Group<'a> {
     pub(crate) pairs: Vec<&'a VerifiedPair>,
     /// Of `pairs`, in members' indices and centered pixels.
     overlaps: Vec<Overlap>,
-    edges: Vec<Edge>,
+    graph: PairGraph,
     tree: Vec<usize>,
     reference: usize,
-    groups: Vec<Vec<usize>>,
+    components: Vec<Vec<usize>>,
 }
 
 /// Pixel center of a photograph's middle, or its camera's principal point.
@@ -44,31 +42,34 @@ fn ideal(p: &Photo, pixel: Point2<f64>) -> Vector2<f64> {
 impl<'a> Group<'a> {
     pub(crate) fn largest(photos: &[Photo], pairs: &[&'a VerifiedPair]) -> Result<Self, AlignError> {
         let n = photos.len();
-        let all: Vec<Edge> = pairs.iter().map(|p| Edge { a: p.a, b: p.b, weight: p.inliers.len() as f64 }).collect();
-        let groups = graph::groups(n, &all);
-        let members = groups.first().cloned().unwrap_or_default();
+        let edge = |p: &&VerifiedPair| PairEdge { a: p.a, b: p.b, weight: p.matches.len() as f64 };
+        let graph = |nodes: usize, edges: Vec<PairEdge>| {
+            PairGraph::new(nodes, edges).map_err(|e| AlignError::BadPair { a: e.a, b: e.b, photos: n })
+        };
+        let components = graph(n, pairs.iter().map(edge).collect())?.connected_components();
+        let members = components.first().cloned().unwrap_or_default();
         if members.len() < 2 {
             return Err(AlignError::NoOverlap { photos: n });
         }
         let index = |photo: usize| members.binary_search(&photo).ok();
         let (mut kept, mut overlaps, mut edges) = (Vec::new(), Vec::new(), Vec::new());
-        for (pair, edge) in pairs.iter().zip(&all) {
+        for pair in pairs {
             let (Some(i), Some(j)) = (index(pair.a), index(pair.b)) else { continue };
             let points = pair
-                .inliers
+                .matches
                 .iter()
                 .map(|c| (ideal(&photos[pair.a], c.a), ideal(&photos[pair.b], c.b)))
                 .filter(|(a, b)| a.iter().chain(b.iter()).all(|v| v.is_finite()))
                 .collect();
             kept.push(*pair);
             overlaps.push(Overlap { i, j, points });
-            edges.push(Edge { a: i, b: j, weight: edge.weight });
+            edges.push(PairEdge { a: i, b: j, ..edge(pair) });
         }
-        let tree = graph::maximum_spanning_tree(members.len(), &edges);
-        let own: Vec<usize> = (0..members.len()).collect();
-        let reference = graph::middle(members.len(), &edges, &tree, &own).unwrap_or(0);
+        let graph = graph(members.len(), edges)?;
+        let tree = graph.maximum_spanning_forest();
+        let reference = graph.center(&tree).unwrap_or(0);
         let photos = members.iter().map(|&m| photos[m]).collect();
-        Ok(Self { members, photos, pairs: kept, overlaps, edges, tree, reference, groups })
+        Ok(Self { members, photos, pairs: kept, overlaps, graph, tree, reference, components })
     }
 
     /// Photographs to lenses, and a representative photograph of each lens.
@@ -88,7 +89,7 @@ impl<'a> Group<'a> {
 
     /// The homography of an edge from member `from`, in centered pixels.
     fn homography(&self, edge: usize, from: usize) -> Matrix3<f64> {
-        let (pair, e) = (self.pairs[edge], self.edges[edge]);
+        let (pair, e) = (self.pairs[edge], self.graph.edges()[edge]);
         let shift = |v: Vector2<f64>| Matrix3::new(1.0, 0.0, v.x, 0.0, 1.0, v.y, 0.0, 0.0, 1.0);
         let h = shift(-center(&self.photos[e.b])) * pair.homography * shift(center(&self.photos[e.a]));
         if from == e.a { h } else { h.try_inverse().unwrap_or_else(Matrix3::identity) }
@@ -98,8 +99,7 @@ impl<'a> Group<'a> {
     fn focal_guesses(&self, heads: &[usize]) -> Vec<(f64, f64)> {
         // Focal lengths over long sides, so that photographs of other sizes can lend theirs.
         let mut estimates: Vec<f64> = Vec::new();
-        for edge in 0..self.edges.len() {
-            let (a, b) = (self.edges[edge].a, self.edges[edge].b);
+        for (edge, &PairEdge { a, b, .. }) in self.graph.edges().iter().enumerate() {
             let (fa, fb) = focals_from_homography(&self.homography(edge, a));
             estimates.extend(fa.map(|f| f / self.photos[a].long_side()));
             estimates.extend(fb.map(|f| f / self.photos[b].long_side()));
@@ -121,12 +121,12 @@ impl<'a> Group<'a> {
             .collect()
     }
 
-    /// Motions chained along the spanning tree.
-    fn chain(&self, kind: Motion, lens_of: &[usize], lenses: &[Lens]) -> Vec<Matrix3<f64>> {
+    /// Motions composed along the spanning tree.
+    fn compose(&self, kind: Motion, lens_of: &[usize], lenses: &[Lens]) -> Vec<Matrix3<f64>> {
         let mut motion = vec![Matrix3::identity(); self.photos.len()];
         let focal = |i: usize| lenses[lens_of[i]].log_focal.exp();
         let k = |f: f64| Matrix3::new(f, 0.0, 0.0, 0.0, f, 0.0, 0.0, 0.0, 1.0);
-        for step in graph::walk(self.photos.len(), &self.edges, &self.tree, self.reference) {
+        for step in self.graph.breadth_first(&self.tree, self.reference) {
             let h = self.homography(step.edge, step.parent);
             let m = k(1.0 / focal(step.node)) * h * k(focal(step.parent));
             let m = m / m.determinant().cbrt();
@@ -153,17 +153,21 @@ impl<'a> Group<'a> {
         }
     }
 
-    pub(crate) fn solve(&self, options: &AlignOptions) -> (Solution, CameraMotion) {
-        let rotation = (options.motion != CameraMotion::Homography).then(|| self.solve_rotation(options));
-        let flat = || self.solve_homography(options);
-        match (options.motion, rotation) {
+    pub(crate) fn solve(
+        &self,
+        options: &AlignOptions,
+        stage: &Stage<'_>,
+    ) -> Result<(Solution, CameraMotion), Cancelled> {
+        let rotation = (options.motion != CameraMotion::Homography).then(|| self.solve_rotation(options, stage));
+        let flat = || self.solve_homography(options, stage);
+        Ok(match (options.motion, rotation.transpose()?) {
             (CameraMotion::Auto, Some(rotation)) => {
                 let typical = self.median_error(Motion::Rotation, &rotation);
                 // Matches fit a turn to the σ of the loss: no need to look for another explanation.
                 if typical <= 0.75 * options.outlier_px {
-                    return (rotation, CameraMotion::Rotation);
+                    return Ok((rotation, CameraMotion::Rotation));
                 }
-                let flat = flat();
+                let flat = flat()?;
                 // Five more unknowns per photograph always fit better: only a far better fit means a flat scene.
                 let better = self.median_error(Motion::Homography, &flat) < 0.4 * typical;
                 if better && self.in_front(&flat) {
@@ -173,12 +177,12 @@ impl<'a> Group<'a> {
                 }
             }
             (_, Some(rotation)) => (rotation, CameraMotion::Rotation),
-            (_, None) => (flat(), CameraMotion::Homography),
-        }
+            (_, None) => (flat()?, CameraMotion::Homography),
+        })
     }
 
     /// Turning cameras: shared lenses first, from several focal lengths where none is known, then what the matches ask for.
-    fn solve_rotation(&self, options: &AlignOptions) -> Solution {
+    fn solve_rotation(&self, options: &AlignOptions, stage: &Stage<'_>) -> Result<Solution, Cancelled> {
         let (lens_of, heads) = self.lenses();
         let prior = self.focal_guesses(&heads);
         let known = heads.iter().all(|&h| self.photos[h].camera.is_some() || self.photos[h].focal.is_some());
@@ -193,18 +197,22 @@ impl<'a> Group<'a> {
                     Lens { log_focal: p.0 + if free { factor.ln() } else { 0.0 }, k1: 0.0 }
                 })
                 .collect();
-            let motion = self.chain(Motion::Rotation, &lens_of, &lenses);
-            wide.solve(State { motion, lenses }, 30)
+            let motion = self.compose(Motion::Rotation, &lens_of, &lenses);
+            stage.check()?;
+            Ok(wide.solve(State { motion, lenses }, 30))
         };
-        let Some((state, _)) = factors.iter().map(start).min_by(|x, y| x.1.total_cmp(&y.1)) else {
-            return Solution { lens_of, prior, state: State { motion: Vec::new(), lenses: Vec::new() } };
+        let starts: Vec<(State, f64)> = factors.iter().map(start).collect::<Result<_, Cancelled>>()?;
+        let Some((state, _)) = starts.into_iter().min_by(|x, y| x.1.total_cmp(&y.1)) else {
+            return Ok(Solution { lens_of, prior, state: State { motion: Vec::new(), lenses: Vec::new() } });
         };
+        stage.check()?;
         let mut problem = self.problem(Motion::Rotation, &lens_of, &prior, options.outlier_px);
         let (mut state, mut cost) = problem.solve(state, 50);
         // A coefficient earns its place by a twentieth of the cost: less is what parallax gives to any new unknown.
         let earns = |new: f64, old: f64| new < 0.95 * old - 20.0 * options.outlier_px.powi(2);
         let calibrated = self.photos.iter().any(|p| p.camera.is_some());
         if options.refine_distortion && !calibrated {
+            stage.check()?;
             let radial = Problem { free_k1: true, ..problem.clone() };
             let (with, new) = radial.solve(state.clone(), 50);
             if earns(new, cost) {
@@ -213,6 +221,7 @@ impl<'a> Group<'a> {
             }
         }
         if !calibrated && lens_of.len() > heads.len() {
+            stage.check()?;
             let own: Vec<usize> = (0..lens_of.len()).collect();
             // Zoomed between photographs: each has a focal length of its own, near the common one.
             let own_prior: Vec<(f64, f64)> = lens_of.iter().map(|&l| (state.lenses[l].log_focal, prior[l].1)).collect();
@@ -220,13 +229,13 @@ impl<'a> Group<'a> {
             let apart = Problem { lens_of: &own, focal_prior: &own_prior, ..problem.clone() };
             let (with, new) = apart.solve(State { motion: state.motion.clone(), lenses }, 50);
             if earns(new, cost) && new < 0.8 * cost {
-                return Solution { lens_of: own, prior: own_prior, state: with };
+                return Ok(Solution { lens_of: own, prior: own_prior, state: with });
             }
         }
-        Solution { lens_of, prior, state }
+        Ok(Solution { lens_of, prior, state })
     }
 
-    fn solve_homography(&self, options: &AlignOptions) -> Solution {
+    fn solve_homography(&self, options: &AlignOptions, stage: &Stage<'_>) -> Result<Solution, Cancelled> {
         let (lens_of, heads) = self.lenses();
         let prior = self.focal_guesses(&heads);
         // Any focal length will do, as the homographies take up the difference; this one keeps the numbers near one.
@@ -237,12 +246,13 @@ impl<'a> Group<'a> {
                 k1: 0.0,
             })
             .collect();
-        let motion = self.chain(Motion::Homography, &lens_of, &lenses);
+        let motion = self.compose(Motion::Homography, &lens_of, &lenses);
         let wide = self.problem(Motion::Homography, &lens_of, &prior, 10.0 * options.outlier_px);
         let (state, _) = wide.solve(State { motion, lenses }, 30);
+        stage.check()?;
         let problem = self.problem(Motion::Homography, &lens_of, &prior, options.outlier_px);
         let (state, _) = problem.solve(state, 50);
-        Solution { lens_of, prior, state }
+        Ok(Solution { lens_of, prior, state })
     }
 
     fn errors(&self, kind: Motion, s: &Solution) -> Vec<Vec<f64>> {
@@ -267,8 +277,8 @@ impl<'a> Group<'a> {
         })
     }
 
-    /// The overlap that the solution contradicts most, where it contradicts one outright.
-    pub(crate) fn worst_contradiction(
+    /// The pair that is least consistent with the solution, where one is not at all.
+    pub(crate) fn worst_inconsistency(
         &self,
         s: &Solution,
         motion: CameraMotion,
@@ -302,7 +312,7 @@ impl<'a> Group<'a> {
         photos: &[Photo],
         solution: &Solution,
         motion: CameraMotion,
-        contradicting: &[bool],
+        inconsistent: &[bool],
         options: &AlignOptions,
     ) -> Result<Alignment, AlignError> {
         if !solution.state.motion.iter().all(|m| m.iter().all(|v| v.is_finite())) {
@@ -310,11 +320,11 @@ impl<'a> Group<'a> {
         }
         let mut views: Vec<Result<View, Unplaced>> = (0..photos.len())
             .map(|i| {
-                let size = self.groups.iter().find(|g| g.contains(&i)).map_or(1, Vec::len);
+                let size = self.components.iter().find(|g| g.contains(&i)).map_or(1, Vec::len);
                 Err(match size {
-                    _ if contradicting[i] => Unplaced::Contradicts,
-                    1 => Unplaced::Alone,
-                    size => Unplaced::OtherGroup { size },
+                    _ if inconsistent[i] => Unplaced::Inconsistent,
+                    1 => Unplaced::NoOverlap,
+                    size => Unplaced::OtherComponent { size },
                 })
             })
             .collect();
@@ -333,7 +343,13 @@ impl<'a> Group<'a> {
             .pairs
             .iter()
             .zip(&errors)
-            .map(|(p, e)| AlignedPair { a: p.a, b: p.b, matches: p.inliers.clone(), rms_px: rms(e) })
+            .map(|(p, e)| AlignedPair {
+                a: p.a,
+                b: p.b,
+                inliers: p.inliers.clone(),
+                matches: p.matches.clone(),
+                rms_px: rms(e),
+            })
             .collect();
         let all: Vec<f64> = errors.concat();
         Ok(Alignment {

@@ -2,18 +2,16 @@
 
 mod bundle;
 mod focal;
-mod graph;
 mod group;
 mod straighten;
-mod verify;
 mod view;
 
 pub(crate) use straighten::turn;
-pub use verify::{NotAPair, VerifiedPair, VerifyOptions, verify_pair};
 pub use view::View;
 
-use crate::align::group::Group;
-use cv_core::{Camera, Correspondence, Point2};
+use cv_core::{Camera, Cancelled, Correspondence, Point2, Progress, Stage};
+use cv_geometry::VerifiedPair;
+use group::Group;
 
 /// What is known about a photograph before looking at its pixels.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -113,6 +111,9 @@ pub enum AlignError {
         /// Which.
         index: usize,
     },
+    /// The work was stopped by its progress callback.
+    #[error(transparent)]
+    Cancelled(#[from] Cancelled),
     /// No placement explains the matches.
     #[error("the overlaps of the {photos} photographs contradict each other")]
     Inconsistent {
@@ -125,14 +126,14 @@ pub enum AlignError {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unplaced {
     /// It overlaps no other photograph.
-    Alone,
-    /// It belongs to another, smaller group of photographs.
-    OtherGroup {
-        /// Photographs in that group.
+    NoOverlap,
+    /// It belongs to another, smaller component of the match graph.
+    OtherComponent {
+        /// Photographs in that component.
         size: usize,
     },
     /// Its overlaps contradict those of the others.
-    Contradicts,
+    Inconsistent,
 }
 
 /// An overlap that holds in the whole.
@@ -142,7 +143,9 @@ pub struct AlignedPair {
     pub a: usize,
     /// Second photograph.
     pub b: usize,
-    /// Matches, in pixels.
+    /// Indices of its matches among the tentative ones, as in [`VerifiedPair::inliers`].
+    pub inliers: Vec<usize>,
+    /// The matches, in pixels.
     pub matches: Vec<Correspondence>,
     /// Root mean square of their errors, in pixels.
     pub rms_px: f64,
@@ -204,11 +207,17 @@ impl Alignment {
 /// overlaps under a robust loss, then the world turned level.
 ///
 /// The largest group of connected photographs is placed. Focal lengths come from the cameras, the hints, or the homographies
-/// themselves. Costs O(matches · iterations + photographs³).
+/// themselves. Costs O(matches · iterations + photographs³). Reports as the stage "align", whose length is unknown.
 ///
 /// # Errors
 /// [`AlignError`].
-pub fn align(photos: &[Photo], pairs: &[VerifiedPair], options: &AlignOptions) -> Result<Alignment, AlignError> {
+pub fn align(
+    photos: &[Photo],
+    pairs: &[VerifiedPair],
+    options: &AlignOptions,
+    progress: &dyn Progress,
+) -> Result<Alignment, AlignError> {
+    let stage = Stage::new(progress, "align", 0)?;
     let n = photos.len();
     if n < 2 {
         return Err(AlignError::TooFewPhotos { got: n });
@@ -223,22 +232,227 @@ pub fn align(photos: &[Photo], pairs: &[VerifiedPair], options: &AlignOptions) -
         return Err(AlignError::BadPair { a: bad.a, b: bad.b, photos: n });
     }
     // In an order of their own, so that the order of the pairs changes nothing.
-    let mut pairs: Vec<&VerifiedPair> = pairs.iter().filter(|p| !p.inliers.is_empty()).collect();
+    let mut pairs: Vec<&VerifiedPair> = pairs.iter().filter(|p| !p.matches.is_empty()).collect();
     pairs.sort_by_key(|p| (p.a.min(p.b), p.a.max(p.b)));
-    let mut contradicting = vec![false; n];
+    let mut inconsistent = vec![false; n];
     loop {
         let group = Group::largest(photos, &pairs)?;
-        let (solution, motion) = group.solve(options);
-        let bad = group.worst_contradiction(&solution, motion, options);
+        let (solution, motion) = group.solve(options, &stage)?;
+        let bad = group.worst_inconsistency(&solution, motion, options);
         if let Some(bad) = bad {
             // One at a time: a false overlap bends the true ones around it.
             let pair = group.pairs[bad];
             pairs.retain(|p| !std::ptr::eq(*p, pair));
             for i in [pair.a, pair.b] {
-                contradicting[i] = true;
+                inconsistent[i] = true;
             }
             continue;
         }
-        return group.finish(photos, &solution, motion, &contradicting, options);
+        return group.finish(photos, &solution, motion, &inconsistent, options);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::StopAt;
+    use cv_core::{Matrix3, Silent, Vector3};
+    use nalgebra::Rotation3;
+
+    /// Views turned by these yaws, pitches and rolls, at a focal length.
+    fn views(turns: &[(f64, f64, f64)], focal: f64) -> Vec<View> {
+        let turned = |&(yaw, pitch, roll): &(f64, f64, f64)| View {
+            camera: Camera::from_focal(600, 400, focal),
+            from_world: (Rotation3::from_axis_angle(&Vector3::z_axis(), roll)
+                * Rotation3::from_axis_angle(&Vector3::x_axis(), pitch)
+                * Rotation3::from_axis_angle(&Vector3::y_axis(), -yaw))
+            .into_inner(),
+        };
+        turns.iter().map(turned).collect()
+    }
+
+    fn sweep() -> Vec<View> {
+        views(&[(-0.5, 0.02, 0.01), (0.0, -0.03, 0.0), (0.45, 0.05, -0.02), (0.9, 0.0, 0.01)], 550.0)
+    }
+
+    /// Exact matches of what two views both see, a pixel of the first every 40; `None` where that is little.
+    fn pair(a: usize, b: usize, views: &[View]) -> Option<VerifiedPair> {
+        let grid =
+            (0..10).flat_map(|y| (0..15).map(move |x| Point2::new(20.0 + 40.0 * x as f64, 20.0 + 40.0 * y as f64)));
+        let seen = |p: Point2<f64>| {
+            let q = views[b].project(&views[a].ray(p)?)?;
+            views[b].contains(q).then_some(Correspondence { a: p, b: q })
+        };
+        let matches: Vec<Correspondence> = grid.filter_map(seen).collect();
+        let h = views[b].camera.matrix()
+            * views[b].from_world
+            * views[a].from_world.try_inverse()?
+            * views[a].camera.matrix().try_inverse()?;
+        let inliers = (0..matches.len()).collect();
+        (matches.len() > 20).then(|| VerifiedPair { a, b, homography: h / h[(2, 2)], inliers, matches })
+    }
+
+    fn pairs(views: &[View]) -> Vec<VerifiedPair> {
+        let all = (0..views.len()).flat_map(|a| (a + 1..views.len()).map(move |b| (a, b)));
+        all.filter_map(|(a, b)| pair(a, b, views)).collect()
+    }
+
+    fn photos(n: usize) -> Vec<Photo> {
+        vec![Photo::new(600, 400); n]
+    }
+
+    /// Largest angle, in radians, between relative rotations as found and as they are.
+    fn rotation_error(found: &Alignment, truth: &[View]) -> f64 {
+        let used: Vec<(usize, &View)> = found.used().collect();
+        let relative = |a: &View, b: &View| b.from_world * a.from_world.transpose();
+        let errors =
+            used.iter().flat_map(|&(i, a)| used.iter().map(move |&(j, b)| (i, a, j, b))).map(|(i, a, j, b)| {
+                let off = relative(a, b) * relative(&truth[i], &truth[j]).transpose();
+                // The angle from the skew part: exact for small ones.
+                Vector3::new(off[(2, 1)], off[(0, 2)], off[(1, 0)]).norm()
+            });
+        errors.fold(0.0, f64::max)
+    }
+
+    #[test]
+    fn exact_matches_give_the_views_back_with_their_focal_length() {
+        let truth = sweep();
+        let pairs = pairs(&truth);
+        assert!(pairs.len() >= 3);
+        let found = align(&photos(4), &pairs, &AlignOptions::default(), &Silent).unwrap();
+        assert_eq!((found.motion, found.pairs.len(), found.used().count()), (CameraMotion::Rotation, pairs.len(), 4));
+        // The prior on the focal length (0.7 in its logarithm, against hundreds of matches of 2 px) moves it by 1e-5 or so.
+        assert!(rotation_error(&found, &truth) < 1e-4, "{}", rotation_error(&found, &truth));
+        for (_, view) in found.used() {
+            assert!((view.camera.fx / 550.0 - 1.0).abs() < 1e-3, "{}", view.camera.fx);
+        }
+        assert!(found.rms_px < 0.05 && found.median_px <= found.rms_px);
+        // Level: the vertical of the world is seen as vertical but for what rolls and pitches leave open.
+        let up = found.used().map(|(_, v)| v.from_world.column(1).y).fold(f64::INFINITY, f64::min);
+        assert!(up > 0.99, "{up}");
+    }
+
+    #[test]
+    fn photographs_that_overlap_with_none_or_few_say_so() {
+        // Two that overlap each other far away from three others, and one alone.
+        let turns =
+            [(0.0, 0.0, 0.0), (3.0, 0.0, 0.0), (0.4, 0.0, 0.0), (-1.6, 0.0, 0.0), (0.8, 0.0, 0.0), (3.3, 0.0, 0.0)];
+        let truth = views(&turns, 550.0);
+        let found = align(&photos(6), &pairs(&truth), &AlignOptions::default(), &Silent).unwrap();
+        let used: Vec<usize> = found.used().map(|(i, _)| i).collect();
+        assert_eq!(used, [0, 2, 4]);
+        assert_eq!(found.reference, 2);
+        assert_eq!(found.views[1], Err(Unplaced::OtherComponent { size: 2 }));
+        assert_eq!(found.views[5], Err(Unplaced::OtherComponent { size: 2 }));
+        assert_eq!(found.views[3], Err(Unplaced::NoOverlap));
+    }
+
+    #[test]
+    fn a_false_overlap_is_left_out_and_the_others_hold() {
+        let truth = sweep();
+        let mut pairs = pairs(&truth);
+        // The first and the last, which show nothing in common, "match" like two neighbors: repeated windows.
+        let mut wrong = pair(0, 1, &truth).unwrap();
+        (wrong.a, wrong.b) = (0, 3);
+        wrong.matches.truncate(30);
+        let count = pairs.len();
+        pairs.push(wrong);
+        let found = align(&photos(4), &pairs, &AlignOptions::default(), &Silent).unwrap();
+        assert_eq!((found.pairs.len(), found.used().count()), (count, 4));
+        assert!(rotation_error(&found, &truth) < 1e-3, "{}", rotation_error(&found, &truth));
+    }
+
+    #[test]
+    fn a_flat_scene_is_told_from_a_turned_camera() {
+        // A wall seen from three places: homographies that no rotation explains.
+        let pose = |x: f64, skew: f64| Matrix3::new(1.0, 0.02, x, 0.01, 1.0, 0.0, skew, 0.0, 1.0);
+        let truth: Vec<View> = [pose(0.0, 0.0), pose(-0.35, 0.15), pose(-0.7, -0.12)]
+            .iter()
+            .map(|m| View { camera: Camera::from_focal(600, 400, 550.0), from_world: *m })
+            .collect();
+        let pairs = pairs(&truth);
+        assert!(pairs.len() >= 2);
+        let found = align(&photos(3), &pairs, &AlignOptions::default(), &Silent).unwrap();
+        assert_eq!(found.motion, CameraMotion::Homography);
+        // Exact matches of exact homographies.
+        assert!(found.rms_px < 0.01, "{}", found.rms_px);
+        let forced = AlignOptions { motion: CameraMotion::Rotation, ..AlignOptions::default() };
+        // (At several pixels a pair may also be left out as inconsistent.)
+        let turned = align(&photos(3), &pairs, &forced, &Silent).unwrap();
+        assert!(turned.rms_px > 1.0 || turned.used().count() < 3, "{}", turned.rms_px);
+    }
+
+    #[test]
+    fn a_calibrated_camera_is_believed_and_a_hint_is_not_when_it_is_wrong() {
+        let truth = sweep();
+        let pairs = pairs(&truth);
+        let camera = truth[0].camera;
+        let known: Vec<Photo> = photos(4).into_iter().map(|p| Photo { camera: Some(camera), ..p }).collect();
+        let found = align(&known, &pairs, &AlignOptions::default(), &Silent).unwrap();
+        assert!(found.used().all(|(_, v)| v.camera == camera));
+        assert!(rotation_error(&found, &truth) < 1e-6);
+        // A hint off by a third: hundreds of exact matches weigh more than a prior of 0.2.
+        let hinted: Vec<Photo> = photos(4).into_iter().map(|p| Photo { focal: Some(750.0), ..p }).collect();
+        let found = align(&hinted, &pairs, &AlignOptions::default(), &Silent).unwrap();
+        assert!(found.used().all(|(_, v)| (v.camera.fx / 550.0 - 1.0).abs() < 0.01));
+    }
+
+    #[test]
+    fn the_order_of_the_pairs_and_which_photograph_comes_first_in_them_change_nothing() {
+        let truth = sweep();
+        let one = pairs(&truth);
+        let mut two = one.clone();
+        two.reverse();
+        let first = align(&photos(4), &one, &AlignOptions::default(), &Silent).unwrap();
+        let second = align(&photos(4), &two, &AlignOptions::default(), &Silent).unwrap();
+        assert_eq!(first.views, second.views);
+    }
+
+    #[test]
+    fn resizing_keeps_directions_and_scales_errors() {
+        let truth = sweep();
+        let small = align(&photos(4), &pairs(&truth), &AlignOptions::default(), &Silent).unwrap();
+        let large = small.resized(&[(2.5, (1500, 1000)); 4]);
+        for ((_, a), (_, b)) in small.used().zip(large.used()) {
+            assert_eq!((b.camera.width, b.camera.height), (1500, 1000));
+            // Pixel centers at integers: (x + ½) scales.
+            let (p, q) = (Point2::new(100.0, 300.0), Point2::new(100.5 * 2.5 - 0.5, 300.5 * 2.5 - 0.5));
+            assert!((a.ray(p).unwrap() - b.ray(q).unwrap()).norm() < 1e-12);
+        }
+        assert!((large.rms_px - 2.5 * small.rms_px).abs() < 1e-12);
+        assert!((large.pairs[0].matches[0].a.x - ((small.pairs[0].matches[0].a.x + 0.5) * 2.5 - 0.5)).abs() < 1e-9);
+    }
+
+    #[test]
+    fn what_cannot_be_aligned_says_why() {
+        let truth = sweep();
+        let pairs = pairs(&truth);
+        let go = |photos: &[Photo], pairs: &[VerifiedPair]| {
+            align(photos, pairs, &AlignOptions::default(), &Silent).unwrap_err()
+        };
+        assert_eq!(go(&photos(1), &[]), AlignError::TooFewPhotos { got: 1 });
+        assert_eq!(go(&photos(3), &[]), AlignError::NoOverlap { photos: 3 });
+        assert_eq!(go(&photos(2), &pairs), AlignError::BadPair { a: 1, b: 2, photos: 2 });
+        let itself = VerifiedPair { b: 0, ..pairs[0].clone() };
+        assert_eq!(go(&photos(4), &[itself]), AlignError::BadPair { a: 0, b: 0, photos: 4 });
+        let mut empty = photos(4);
+        empty[2].width = 0;
+        assert_eq!(go(&empty, &pairs), AlignError::BadPhoto { index: 2 });
+        let mut other = photos(4);
+        other[1].camera = Some(Camera::from_focal(601, 400, 500.0));
+        assert_eq!(go(&other, &pairs), AlignError::BadPhoto { index: 1 });
+    }
+
+    #[test]
+    fn at_whatever_report_it_is_stopped_it_says_so() {
+        let truth = sweep();
+        let pairs = pairs(&truth);
+        let watched = StopAt::never();
+        align(&photos(4), &pairs, &AlignOptions::default(), &watched).unwrap();
+        assert!(watched.reports() >= 6);
+        for at in 1..=watched.reports() {
+            let stopped = align(&photos(4), &pairs, &AlignOptions::default(), &StopAt::report(at));
+            assert_eq!(stopped.unwrap_err(), AlignError::Cancelled(Cancelled), "{at}");
+        }
     }
 }

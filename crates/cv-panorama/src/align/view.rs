@@ -52,3 +52,35 @@ impl View {
             .collect()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cv_core::Distortion;
+    use nalgebra::Rotation3;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn a_ray_is_seen_at_the_pixel_it_is_of(x in 0.0..639.0_f64, y in 0.0..479.0_f64, yaw in -3.0..3.0_f64, k1 in -0.1..0.1_f64) {
+            let camera = Camera { distortion: Distortion::simple_radial(k1), ..Camera::from_focal(640, 480, 600.0) };
+            let view = View { camera, from_world: Rotation3::from_euler_angles(0.2, yaw, -0.1).into_inner() };
+            let ray = view.ray(Point2::new(x, y)).unwrap();
+            prop_assert!((ray.norm() - 1.0).abs() < 1e-12);
+            // Undistortion iterates to 1e-10 or so of the normalized coordinates.
+            prop_assert!((view.project(&(ray * 7.0)).unwrap() - Point2::new(x, y)).norm() < 1e-6);
+            prop_assert_eq!(view.project(&-ray), None);
+        }
+    }
+
+    #[test]
+    fn the_border_goes_once_around_and_a_scaled_view_sees_the_same() {
+        let view = View { camera: Camera::from_focal(30, 20, 25.0), from_world: Matrix3::identity() };
+        let border = view.border(5);
+        assert_eq!((border.len(), border[0], border[10]), (20, Point2::new(0.0, 0.0), Point2::new(29.0, 19.0)));
+        assert!(border.iter().all(|p| view.contains(*p)));
+        assert!(!view.contains(Point2::new(29.1, 5.0)) && !view.contains(Point2::new(5.0, -0.1)));
+        let half = view.scaled(0.5);
+        assert!((half.ray(Point2::new(2.0, 3.0)).unwrap() - view.ray(Point2::new(4.5, 6.5)).unwrap()).norm() < 1e-12);
+    }
+}

@@ -1,9 +1,10 @@
 //! Brightness and color differences between photographs (after Brown & Lowe 2007, §6, and Goldman & Chen 2005).
 //!
 //! Where photographs overlap they saw the same light, so `log I_a + g_a + v(r_a) = log I_b + g_b + v(r_b)`, with a gain `g` per photograph
-//! and channel and one fall-off of brightness toward the corners, `v(r) = v₁ r² + v₂ r⁴`. In logarithms that is linear.
+//! and channel and one vignetting toward the corners, `v(r) = v₁ r² + v₂ r⁴`. In logarithms that is linear.
 
-use crate::surface::Preview;
+use crate::surface::{Piece, Preview};
+use cv_core::{Cancelled, Progress, Stage, named};
 use nalgebra::{DMatrix, DVector};
 
 /// How exposure differences are evened out.
@@ -14,9 +15,11 @@ pub enum Exposure {
     /// One factor per photograph and channel: exposure and white balance.
     #[default]
     Gain,
-    /// The same, and the fall-off of the lens toward the corners.
+    /// The same, and the vignetting of the lens.
     GainAndVignetting,
 }
+
+named!(Exposure { None = "none", Gain = "gain", GainAndVignetting = "vignetting" });
 
 /// What to multiply each photograph with.
 #[derive(Debug, Clone, PartialEq)]
@@ -53,19 +56,27 @@ const SCALE: f64 = 0.1;
 const PRIOR: f64 = 1.0;
 
 /// Gains from the overlaps on the preview.
-pub(crate) fn estimate(preview: &Preview, photo_of: &[usize], photos: usize, exposure: Exposure) -> Gains {
+pub(crate) fn estimate_gains(
+    preview: &Preview,
+    photo_of: &[usize],
+    photos: usize,
+    exposure: Exposure,
+    progress: &dyn Progress,
+) -> Result<Gains, Cancelled> {
     let mut gains = Gains::none(photos);
     if exposure == Exposure::None {
-        return gains;
-    }
-    let samples = samples(preview, photo_of);
-    if samples.is_empty() {
-        return gains;
+        return Ok(gains);
     }
     let vignetting = exposure == Exposure::GainAndVignetting;
+    let stage = Stage::new(progress, "exposure", 3 + usize::from(vignetting))?;
+    let samples = samples(preview, photo_of, &stage)?;
+    if samples.is_empty() {
+        return Ok(gains);
+    }
     let mut fall_off = [0.0; 2];
     if vignetting {
-        let solution = solve(&samples, photos, |s| s.difference.iter().sum::<f64>() / 3.0, true);
+        let solution = solve(&samples, photos, |s| s.difference.iter().sum::<f64>() / 3.0, true, &stage)?;
+        stage.add(1)?;
         // Corners are darkened, never by more than a factor of four; what says otherwise is not a lens.
         let (v1, v2) = (solution[photos], solution[photos + 1]);
         if (0.0..1.4).contains(&(v1 + v2)) {
@@ -78,18 +89,19 @@ pub(crate) fn estimate(preview: &Preview, photo_of: &[usize], photos: usize, exp
             let v = |r2: f64| r2 * (fall_off[0] + r2 * fall_off[1]);
             s.difference[channel] + v(s.radius[0]) - v(s.radius[1])
         };
-        let solution = solve(&samples, photos, correction, false);
+        let solution = solve(&samples, photos, correction, false, &stage)?;
+        stage.add(1)?;
         for (gain, log) in gains.gains.iter_mut().zip(solution.iter()) {
             gain[channel] = log.clamp(-2.0, 2.0).exp() as f32;
         }
     }
-    spare_highlights(preview, photo_of, &mut gains);
-    gains
+    limit_clipping(preview, photo_of, &mut gains);
+    Ok(gains)
 }
 
 /// Darkens all photographs alike until hardly any pixel is clipped that was not before: a gain brightens the darkest photographs, which are often those with
 /// the brightest things in them.
-fn spare_highlights(preview: &Preview, photo_of: &[usize], gains: &mut Gains) {
+fn limit_clipping(preview: &Preview, photo_of: &[usize], gains: &mut Gains) {
     /// Share of the pixels that may be clipped.
     const CLIPPED: usize = 50;
     /// Never darker than this: a panorama is not ruined for one bright window.
@@ -122,9 +134,10 @@ fn spare_highlights(preview: &Preview, photo_of: &[usize], gains: &mut Gains) {
     }
 }
 
-fn samples(preview: &Preview, photo_of: &[usize]) -> Vec<Sample> {
+fn samples(preview: &Preview, photo_of: &[usize], stage: &Stage<'_>) -> Result<Vec<Sample>, Cancelled> {
     let mut samples = Vec::new();
     for (i, p) in preview.pieces.iter().enumerate() {
+        stage.check()?;
         for (j, q) in preview.pieces.iter().enumerate().skip(i + 1) {
             let Some(common) = p.warped.bounds.intersection(&q.warped.bounds) else { continue };
             if photo_of[i] == photo_of[j] {
@@ -133,11 +146,11 @@ fn samples(preview: &Preview, photo_of: &[usize]) -> Vec<Sample> {
             let step = ((common.width() * common.height()) as f64 / PER_OVERLAP as f64).sqrt().ceil().max(1.0) as usize;
             for y in (common.top..common.bottom).step_by(step) {
                 for x in (common.left..common.right).step_by(step) {
-                    let (Some(a), Some(b)) = (p.at(x, y), q.at(x, y)) else { continue };
+                    let (Some(a), Some(b)) = (p.warped.color(x, y), q.warped.color(x, y)) else { continue };
                     if !a.iter().chain(&b).all(|v| READABLE.contains(v)) {
                         continue;
                     }
-                    let r2 = |piece: &crate::surface::Piece| {
+                    let r2 = |piece: &Piece| {
                         let b = piece.warped.bounds;
                         f64::from(piece.radius[(y - b.top) * b.width() + x - b.left])
                     };
@@ -151,14 +164,21 @@ fn samples(preview: &Preview, photo_of: &[usize]) -> Vec<Sample> {
             }
         }
     }
-    samples
+    Ok(samples)
 }
 
-/// Gains (and two fall-off coefficients) by least squares, reweighted so that what moved or does not fit counts little.
-fn solve(samples: &[Sample], photos: usize, difference: impl Fn(&Sample) -> f64, vignetting: bool) -> DVector<f64> {
+/// Gains (and two coefficients of vignetting) by iteratively reweighted least squares, so that what moved or does not fit counts little.
+fn solve(
+    samples: &[Sample],
+    photos: usize,
+    difference: impl Fn(&Sample) -> f64,
+    vignetting: bool,
+    stage: &Stage<'_>,
+) -> Result<DVector<f64>, Cancelled> {
     let n = photos + if vignetting { 2 } else { 0 };
     let mut solution = DVector::zeros(n);
     for round in 0..12 {
+        stage.check()?;
         let mut normal = DMatrix::<f64>::zeros(n, n);
         let mut right = DVector::<f64>::zeros(n);
         for s in samples {
@@ -183,16 +203,14 @@ fn solve(samples: &[Sample], photos: usize, difference: impl Fn(&Sample) -> f64,
         let Some(factor) = normal.cholesky() else { break };
         solution = factor.solve(&right);
     }
-    solution
+    Ok(solution)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::surface::Bounds;
-    use crate::surface::Piece;
-    use crate::surface::Warped;
-    use cv_core::Image;
+    use crate::surface::{Bounds, WarpedPhoto};
+    use cv_core::{Image, Silent};
 
     /// Three photographs of 60 x 40, 30 apart, of one scene, darkened by known factors and toward their corners.
     fn preview(factors: &[[f64; 3]; 3], fall_off: f64, moved: bool) -> Preview {
@@ -214,7 +232,7 @@ mod tests {
                     let value = |c: usize| if person { 30.0 } else { scene(30 * k + x, y, c) * factors[k][c] * dim };
                     [value(0).round() as u8, value(1).round() as u8, value(2).round() as u8, 255]
                 });
-                Piece { warped: Warped { bounds, pixels }, eccentricity: radius.clone(), radius }
+                Piece { warped: WarpedPhoto { bounds, pixels }, eccentricity: radius.clone(), radius }
             })
             .collect();
         Preview { step: 1, width: 120, height: 40, pieces }
@@ -223,7 +241,7 @@ mod tests {
     #[test]
     fn factors_on_exposure_and_white_balance_are_undone_though_somebody_walked_through() {
         let factors = [[1.0, 1.0, 1.0], [0.7, 0.75, 0.8], [1.3, 1.2, 1.25]];
-        let found = estimate(&preview(&factors, 0.0, true), &[0, 1, 2], 3, Exposure::Gain);
+        let found = estimate_gains(&preview(&factors, 0.0, true), &[0, 1, 2], 3, Exposure::Gain, &Silent).unwrap();
         for c in 0..3 {
             let common = f64::from(found.gains[0][c]) * factors[0][c];
             for (gain, factor) in found.gains.iter().zip(&factors) {
@@ -239,7 +257,9 @@ mod tests {
 
     #[test]
     fn the_fall_off_toward_the_corners_is_found() {
-        let found = estimate(&preview(&[[1.0; 3]; 3], 0.4, false), &[0, 1, 2], 3, Exposure::GainAndVignetting);
+        let found =
+            estimate_gains(&preview(&[[1.0; 3]; 3], 0.4, false), &[0, 1, 2], 3, Exposure::GainAndVignetting, &Silent)
+                .unwrap();
         let v = |r2: f32| r2 * (found.vignetting[0] + r2 * found.vignetting[1]);
         // Rounding to bytes again, now through differences of r² of up to 0.7.
         assert!((v(1.0) - 0.4).abs() < 0.04 && (v(0.5) - 0.2).abs() < 0.03, "{:?}", found.vignetting);
@@ -249,7 +269,38 @@ mod tests {
     fn nothing_in_common_changes_nothing() {
         let mut apart = preview(&[[1.0; 3]; 3], 0.0, false);
         apart.pieces.remove(1);
-        let found = estimate(&apart, &[0, 2], 3, Exposure::Gain);
+        let found = estimate_gains(&apart, &[0, 2], 3, Exposure::Gain, &Silent).unwrap();
         assert_eq!(found, Gains::none(3));
+    }
+
+    #[test]
+    fn the_gains_of_exact_samples_are_those_that_made_them() {
+        let logs = [0.2, -0.35, 0.1, 0.05];
+        let sample = |a: usize, b: usize| Sample { a, b, difference: [logs[b] - logs[a]; 3], radius: [0.3, 0.6] };
+        let pairs = [(0, 1), (1, 2), (2, 3), (0, 3)];
+        let samples: Vec<Sample> = (0..2000).map(|i| sample(pairs[i % 4].0, pairs[i % 4].1)).collect();
+        let solution = solve(&samples, 4, |s| s.difference[0], false, &crate::testing::stage()).unwrap();
+        // The prior (one sample's weight against a thousand) pulls logarithms of up to 0.35 by some 1e-3 of that.
+        for i in 0..4 {
+            assert!((solution[i] - logs[i]).abs() < 1e-3, "{solution}");
+        }
+    }
+
+    #[test]
+    fn what_would_be_clipped_darkens_all_alike() {
+        let mut bright = preview(&[[1.0; 3]; 3], 0.0, false);
+        for p in &mut bright.pieces[1].warped.pixels.as_mut_slice().as_chunks_mut::<4>().0[..1200] {
+            *p = [230, 230, 230, 255];
+        }
+        let mut gains = Gains { gains: vec![[1.0; 3], [1.3; 3], [0.9; 3]], vignetting: [0.0; 2] };
+        limit_clipping(&bright, &[0, 1, 2], &mut gains);
+        // 230 · 1.3 = 299 is 1.17 times white; a bin of the histogram is 0.0104 wide.
+        let ratio = 1.3 / gains.gains[1][0];
+        assert!((1.172..1.195).contains(&ratio), "{ratio}");
+        assert!((gains.gains[0][0] - 1.0 / ratio).abs() < 1e-6 && (gains.gains[2][2] - 0.9 / ratio).abs() < 1e-6);
+        // A handful of such pixels does not.
+        let mut few = gains.clone();
+        limit_clipping(&preview(&[[1.0; 3]; 3], 0.0, false), &[0, 1, 2], &mut few);
+        assert_eq!(few, gains);
     }
 }

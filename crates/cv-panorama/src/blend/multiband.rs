@@ -1,14 +1,13 @@
 //! Multi-band blending (Burt & Adelson 1983): low frequencies over a wide transition, high ones over a narrow one.
 //!
-//! Pixels are `[red, green, blue, weight]`, one vector register each. A piece's weight is one where the labels name it and zero
+//! Pixels are `[red, green, blue, weight]`, one vector register each. A photograph's weight is one where the labels name it and zero
 //! elsewhere; its pyramid is blurred and halved along with the colors. Outside a photograph its edge pixels are repeated (see `warp`), so no
 //! band knows of a border and nothing dark bleeds in.
 
-use crate::seams::Labels;
-use crate::surface::Bounds;
-use crate::surface::Warped;
-use cv_core::{Image, RgbU8};
-use rayon::prelude::*;
+use crate::blend::{Blender, Composition, NO_PHOTO};
+use crate::rows::{for_each_row, for_each_row_with};
+use crate::surface::WarpedPhoto;
+use cv_core::{Cancelled, Image, Progress, RgbU8, Stage};
 
 type Pixel = [f32; 4];
 
@@ -31,88 +30,100 @@ impl Level {
     }
 }
 
-/// The canvas as a pyramid of weighted sums of bands.
-pub(crate) struct Blender {
-    levels: Vec<Level>,
-    width: usize,
-    height: usize,
+/// Multi-band blending with transitions of a 25th of a photograph in either direction.
+pub(crate) struct Multiband;
+
+impl Blender for Multiband {
+    fn pyramid_levels(&self, typical_side: f64) -> usize {
+        ((0.04 * typical_side).max(1.0).log2().round() as usize).clamp(1, 8)
+    }
+
+    fn blend(&self, composition: &Composition<'_>, progress: &dyn Progress) -> Result<RgbU8, Cancelled> {
+        let stage = Stage::new(progress, "blend", composition.photos.len() + 1)?;
+        let (width, height) = composition.labels.size();
+        let mut pyramid = Pyramid::new(width, height, self.pyramid_levels(composition.typical_side));
+        for (label, photo) in composition.photos.iter().enumerate() {
+            if let Some(photo) = photo {
+                pyramid.add(photo, composition.labels, label as u16, &stage)?;
+            }
+            stage.add(1)?;
+        }
+        let image = pyramid.collapse(composition.labels, &stage)?;
+        stage.add(1)?;
+        Ok(image)
+    }
 }
 
-impl Blender {
+/// The canvas as a Laplacian pyramid of weighted sums.
+struct Pyramid {
+    levels: Vec<Level>,
+}
+
+impl Pyramid {
     /// For a canvas of this size and `bands` bands above the residual.
-    pub(crate) fn new(width: usize, height: usize, bands: usize) -> Self {
+    fn new(width: usize, height: usize, bands: usize) -> Self {
         let levels = (0..=bands).map(|l| Level::new(0, 0, width.div_ceil(1 << l), height.div_ceil(1 << l))).collect();
-        Self { levels, width, height }
+        Self { levels }
     }
 
-    /// Pixels around a label's own that its piece needs, so that its bands reach as far as they blend.
-    pub(crate) fn margin(bands: usize) -> usize {
-        2 << bands
-    }
-
-    /// The region to warp for a label whose pixels lie within `b`: grown by the margin, aligned with every level of the pyramid.
-    pub(crate) fn region(b: &Bounds, bands: usize, width: usize, height: usize) -> Bounds {
-        let unit = 1 << bands;
-        let grown = b.grown(Self::margin(bands), width, height);
-        Bounds {
-            left: grown.left / unit * unit,
-            top: grown.top / unit * unit,
-            right: grown.right.next_multiple_of(unit).min(width),
-            bottom: grown.bottom.next_multiple_of(unit).min(height),
-        }
-    }
-
-    /// Adds a piece where `labels` say `label`.
-    pub(crate) fn add(&mut self, piece: &Warped, labels: &Labels, label: u16) {
-        let b = piece.bounds;
+    /// Adds a photograph where `labels` say `label`.
+    fn add(
+        &mut self,
+        photo: &WarpedPhoto,
+        labels: &Image<u16, 1>,
+        label: u16,
+        stage: &Stage<'_>,
+    ) -> Result<(), Cancelled> {
+        let b = photo.bounds;
         let (w, h) = (b.width(), b.height());
         let mut level = Level::new(b.left, b.top, w, h);
-        level.data.par_chunks_mut(w.max(1)).enumerate().for_each(|(y, row)| {
-            let (pixels, _) = piece.pixels.row(y).as_chunks::<4>();
-            let start = (b.top + y) * labels.width + b.left;
-            for ((out, p), l) in row.iter_mut().zip(pixels).zip(&labels.data[start..start + w]) {
+        for_each_row(&mut level.data, w, stage, |y, row| {
+            let (pixels, _) = photo.pixels.row(y).as_chunks::<4>();
+            for ((out, p), l) in row.iter_mut().zip(pixels).zip(&labels.row(b.top + y)[b.left..]) {
                 *out = [p[0].into(), p[1].into(), p[2].into(), if *l == label { 1.0 } else { 0.0 }];
             }
-        });
+        })?;
         let last = self.levels.len() - 1;
         for l in 0..last {
-            let smaller = halve(&level);
-            add_band(&mut self.levels[l], &level, Some(&smaller));
+            let smaller = halve(&level, stage)?;
+            add_band(&mut self.levels[l], &level, Some(&smaller), stage)?;
             level = smaller;
         }
-        add_band(&mut self.levels[last], &level, None);
+        add_band(&mut self.levels[last], &level, None, stage)
     }
 
-    /// The blended canvas; black where no label names a piece.
-    pub(crate) fn finish(mut self, labels: &Labels) -> RgbU8 {
+    /// The blended canvas; black where no label names a photograph.
+    fn collapse(mut self, labels: &Image<u16, 1>, stage: &Stage<'_>) -> Result<RgbU8, Cancelled> {
         for level in &mut self.levels {
-            level.data.par_iter_mut().for_each(|p| {
-                // A thousandth of a pixel's weight lies beyond every photograph's blending range.
-                let scale = if p[3] > 1e-3 { 1.0 / p[3] } else { 0.0 };
-                *p = [p[0] * scale, p[1] * scale, p[2] * scale, 0.0];
-            });
+            for_each_row(&mut level.data, level.width, stage, |_, row| {
+                for p in row {
+                    // A thousandth of a pixel's weight lies beyond every photograph's blending range.
+                    let scale = if p[3] > 1e-3 { 1.0 / p[3] } else { 0.0 };
+                    *p = [p[0] * scale, p[1] * scale, p[2] * scale, 0.0];
+                }
+            })?;
         }
         while self.levels.len() > 1 {
             let (Some(smaller), Some(larger)) = (self.levels.pop(), self.levels.last_mut()) else { break };
-            larger.data.par_chunks_mut(larger.width.max(1)).enumerate().for_each_init(Vec::new, |buffer, (y, row)| {
+            for_each_row_with(&mut larger.data, larger.width, stage, Vec::new, |buffer, y, row| {
                 enlarged_row(&smaller, 0, 0, y, row.len(), buffer, |x, up| {
                     for c in 0..3 {
                         row[x][c] += up[c];
                     }
                 });
-            });
+            })?;
         }
-        let mut image: RgbU8 = Image::new(self.width, self.height, [0; 3]);
-        let Some(base) = self.levels.first() else { return image };
-        image.as_mut_slice().par_chunks_mut(3 * self.width.max(1)).enumerate().for_each(|(y, row)| {
-            let labels = &labels.data[y * labels.width..];
-            for ((out, p), l) in row.as_chunks_mut::<3>().0.iter_mut().zip(base.row(y)).zip(labels) {
-                if *l != crate::seams::NONE {
+        let (width, height) = labels.size();
+        let mut image: RgbU8 = Image::new(width, height, [0; 3]);
+        let Some(base) = self.levels.first() else { return Ok(image) };
+        for_each_row(image.as_mut_slice(), 3 * width, stage, |y, row| {
+            for ((out, p), l) in row.as_chunks_mut::<3>().0.iter_mut().zip(base.row(y)).zip(labels.row(y)) {
+                if *l != NO_PHOTO {
                     *out = [(p[0] + 0.5) as u8, (p[1] + 0.5) as u8, (p[2] + 0.5) as u8];
                 }
             }
-        });
-        image
+        })?;
+        Ok(image)
     }
 }
 
@@ -122,13 +133,16 @@ fn kernel(a: Pixel, b: Pixel, c: Pixel, d: Pixel, e: Pixel) -> Pixel {
 }
 
 /// The next level: blurred, every second pixel of every second row. Edges are repeated.
-fn halve(level: &Level) -> Level {
+fn halve(level: &Level, stage: &Stage<'_>) -> Result<Level, Cancelled> {
     let (w, h) = (level.width, level.height);
     let mut half = Level::new(level.left / 2, level.top / 2, w.div_ceil(2), h.div_ceil(2));
     let width = half.width;
-    half.data.par_chunks_mut(width.max(1)).enumerate().for_each_init(
+    for_each_row_with(
+        &mut half.data,
+        width,
+        stage,
         || vec![[0.0; 4]; w],
-        |column, (y, row)| {
+        |column, y, row| {
             let at = |dy: isize| level.row((2 * y as isize + dy).clamp(0, h as isize - 1) as usize);
             let (a, b, c, d, e) = (at(-2), at(-1), at(0), at(1), at(2));
             for x in 0..w {
@@ -145,8 +159,8 @@ fn halve(level: &Level) -> Level {
                 };
             }
         },
-    );
-    half
+    )?;
+    Ok(half)
 }
 
 /// Hands every pixel of one row of the level twice as large to `put`: `x` from 0 to `width`, for the rectangle whose corner lies at `(left, top)` of that
@@ -191,11 +205,10 @@ fn enlarged_row(
 }
 
 /// Adds `weight · (level − enlarged(smaller))` and the weight.
-fn add_band(sum: &mut Level, level: &Level, smaller: Option<&Level>) {
-    let (left, width) = (level.left, level.width);
-    let row_width = sum.width;
-    let rows = sum.data.par_chunks_mut(row_width.max(1)).skip(level.top).take(level.height).enumerate();
-    rows.for_each_init(Vec::new, |buffer, (y, row)| {
+fn add_band(sum: &mut Level, level: &Level, smaller: Option<&Level>, stage: &Stage<'_>) -> Result<(), Cancelled> {
+    let (left, width, row_width) = (level.left, level.width, sum.width);
+    let rows = &mut sum.data[level.top * row_width..][..level.height * row_width];
+    for_each_row_with(rows, row_width, stage, Vec::new, |buffer, y, row| {
         let source = level.row(y);
         let row = &mut row[left..left + width];
         match smaller {
@@ -214,20 +227,22 @@ fn add_band(sum: &mut Level, level: &Level, smaller: Option<&Level>) {
                     [out[0] + w * (p[0] - up[0]), out[1] + w * (p[1] - up[1]), out[2] + w * (p[2] - up[2]), out[3] + w];
             }),
         }
-    });
+    })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::seams::NONE;
+    use crate::surface::Bounds;
+    use crate::testing::{drawn, stage};
 
-    fn piece(bounds: Bounds, f: impl Fn(usize, usize) -> [u8; 3]) -> Warped {
-        let pixels = Image::from_fn(bounds.width(), bounds.height(), |x, y| {
-            let [r, g, b] = f(bounds.left + x, bounds.top + y);
-            [r, g, b, 255]
-        });
-        Warped { bounds, pixels }
+    /// Photographs of the whole canvas joined with so many bands.
+    fn joined(photos: &[WarpedPhoto], labels: &Image<u16, 1>, bands: usize) -> RgbU8 {
+        let mut pyramid = Pyramid::new(labels.width(), labels.height(), bands);
+        for (label, photo) in photos.iter().enumerate() {
+            pyramid.add(photo, labels, label as u16, &stage()).unwrap();
+        }
+        pyramid.collapse(labels, &stage()).unwrap()
     }
 
     fn scene(x: usize, y: usize) -> [u8; 3] {
@@ -235,17 +250,12 @@ mod tests {
     }
 
     #[test]
-    fn pieces_of_one_picture_give_that_picture_back_at_any_size_and_depth() {
+    fn photographs_of_one_picture_give_that_picture_back_at_any_size_and_depth() {
         for (w, h) in [(97, 61), (64, 64), (33, 18), (5, 3), (1, 1)] {
             for bands in 0..5 {
-                let labels =
-                    Labels { width: w, height: h, data: (0..w * h).map(|i| u16::from(i % w > w / 2)).collect() };
-                let mut blender = Blender::new(w, h, bands);
+                let labels = Image::from_fn(w, h, |x, _| [u16::from(x > w / 2)]);
                 let whole = Bounds { left: 0, top: 0, right: w, bottom: h };
-                for label in 0..2 {
-                    blender.add(&piece(whole, scene), &labels, label);
-                }
-                let result = blender.finish(&labels);
+                let result = joined(&[drawn(whole, scene), drawn(whole, scene)], &labels, bands);
                 for y in 0..h {
                     for x in 0..w {
                         // Bands are taken off and put back in f32: exact but for rounding, far from half a level.
@@ -257,20 +267,21 @@ mod tests {
     }
 
     #[test]
-    fn a_piece_that_ends_at_its_margin_still_gives_the_picture_back() {
+    fn a_photograph_that_ends_at_its_margin_still_gives_the_picture_back() {
         let (w, h, bands) = (300, 40, 3);
-        let labels = Labels { width: w, height: h, data: (0..w * h).map(|i| u16::from(i % w >= 150)).collect() };
-        let mut blender = Blender::new(w, h, bands);
-        for (label, b) in labels.bounds(2).into_iter().enumerate() {
-            let region = Blender::region(&b.unwrap(), bands, w, h);
+        let labels = Image::from_fn(w, h, |x, _| [u16::from(x >= 150)]);
+        let halves =
+            [Bounds { left: 0, top: 0, right: 150, bottom: h }, Bounds { left: 150, top: 0, right: w, bottom: h }];
+        let photos = halves.map(|b| {
+            let region = b.for_pyramid(bands, w, h);
             assert!(region.width() < 200);
-            blender.add(&piece(region, scene), &labels, label as u16);
-        }
-        let result = blender.finish(&labels);
+            drawn(region, scene)
+        });
+        let result = joined(&photos, &labels, bands);
         for y in 0..h {
             for x in 0..w {
                 for (got, want) in result.at(x, y).into_iter().zip(scene(x, y)) {
-                    // Beyond the margin a piece repeats its edge; the weights there are the tail of the kernel.
+                    // Beyond the margin a photograph repeats its edge; the weights there are the tail of the kernel.
                     assert!(got.abs_diff(want) <= 1, "{x} {y}: {got} {want}");
                 }
             }
@@ -280,12 +291,9 @@ mod tests {
     #[test]
     fn a_step_in_brightness_becomes_a_slope_and_stays_between_its_sides() {
         let (w, h, bands) = (256, 32, 4);
-        let labels = Labels { width: w, height: h, data: (0..w * h).map(|i| u16::from(i % w >= 128)).collect() };
-        let mut blender = Blender::new(w, h, bands);
+        let labels = Image::from_fn(w, h, |x, _| [u16::from(x >= 128)]);
         let whole = Bounds { left: 0, top: 0, right: w, bottom: h };
-        blender.add(&piece(whole, |_, _| [100; 3]), &labels, 0);
-        blender.add(&piece(whole, |_, _| [140; 3]), &labels, 1);
-        let result = blender.finish(&labels);
+        let result = joined(&[drawn(whole, |_, _| [100; 3]), drawn(whole, |_, _| [140; 3])], &labels, bands);
         let row: Vec<u8> = (0..w).map(|x| result.at(x, 16)[0]).collect();
         assert_eq!((row[0], row[255]), (100, 140));
         assert!(row.windows(2).all(|p| p[1] >= p[0] && p[1] - p[0] <= 3), "{row:?}");
@@ -295,14 +303,12 @@ mod tests {
     #[test]
     fn what_nobody_covers_is_black_and_darkens_nothing() {
         let (w, h, bands) = (120, 60, 4);
-        let inside = |i: usize| (i % w > 20) && (i % w < 100) && (i / w > 9) && (i / w < 50);
-        let labels =
-            Labels { width: w, height: h, data: (0..w * h).map(|i| if inside(i) { 0 } else { NONE }).collect() };
-        let mut blender = Blender::new(w, h, bands);
-        blender.add(&piece(Bounds { left: 0, top: 0, right: w, bottom: h }, |_, _| [90, 180, 45]), &labels, 0);
-        let result = blender.finish(&labels);
-        for i in 0..w * h {
-            assert_eq!(result.at(i % w, i / w), if inside(i) { [90, 180, 45] } else { [0; 3] });
+        let inside = |x: usize, y: usize| (21..100).contains(&x) && (10..50).contains(&y);
+        let labels = Image::from_fn(w, h, |x, y| [if inside(x, y) { 0 } else { NO_PHOTO }]);
+        let whole = Bounds { left: 0, top: 0, right: w, bottom: h };
+        let result = joined(&[drawn(whole, |_, _| [90, 180, 45])], &labels, bands);
+        for (x, y) in (0..h).flat_map(|y| (0..w).map(move |x| (x, y))) {
+            assert_eq!(result.at(x, y), if inside(x, y) { [90, 180, 45] } else { [0; 3] });
         }
     }
 }

@@ -4,15 +4,16 @@
 //! for is the correction to the hard-seamed picture: it jumps by the mismatch at the seams and is as smooth as can be elsewhere. Nothing is asked of it
 //! at the border of the picture (Neumann), so nothing bleeds in from there; its mean is zero, so the colors stay where they are on average.
 
-use crate::seams::{Labels, NONE};
-use crate::surface::Warped;
-use cv_core::RgbU8;
+use crate::blend::hard_seams::copy;
+use crate::blend::{Blender, Composition, NO_PHOTO};
+use crate::rows::{asks, for_each_row};
+use cv_core::{Cancelled, Progress, RgbU8, Stage};
 use rayon::prelude::*;
 
 type Pixel = [f32; 4];
 
-/// Pull of the correction toward zero, relative to a pixel's own edges. It
-/// is felt over 1/√λ = 1000 pixels: differences that would drift through a long panorama fade out instead.
+/// Weight of the screening term, which pulls the correction toward zero, relative to a pixel's own edges. It is felt over 1/√λ = 1000 pixels:
+/// differences that would drift through a long panorama fade out instead.
 const SCREEN: f32 = 1e-6;
 /// Damping of the Jacobi smoother, best for the five-point Laplacian (Trottenberg, Multigrid, §2.1).
 const OMEGA: f32 = 0.8;
@@ -21,58 +22,75 @@ const SWEEPS: usize = 2;
 /// Cycles on the full grid, after the start from coarse to fine. Each leaves about a seventh of the error.
 const CYCLES: usize = 4;
 
-pub(crate) fn blend(pieces: &[Option<Warped>], labels: &Labels) -> RgbU8 {
-    let mut image = crate::blend::copy(pieces, labels);
-    let mut grids = vec![Grid::from_seams(pieces, labels)];
-    if grids[0].right_side.iter().all(|b| *b == [0.0; 4]) {
-        return image;
+/// Gradient-domain blending.
+pub(crate) struct Poisson;
+
+impl Blender for Poisson {
+    fn blend(&self, composition: &Composition<'_>, progress: &dyn Progress) -> Result<RgbU8, Cancelled> {
+        // Cycles on the full grid are most of the work.
+        let stage = Stage::new(progress, "blend", CYCLES + 2)?;
+        let mut image = copy(composition, &stage)?;
+        let mut grids = vec![Grid::from_seams(composition, &stage)?];
+        stage.add(1)?;
+        if grids[0].right_side.iter().all(|b| *b == [0.0; 4]) {
+            stage.add(CYCLES + 1)?;
+            return Ok(image);
+        }
+        // Down to a handful of cells, which a few sweeps solve.
+        while let Some(last) = grids.last()
+            && last.width.max(last.height) > 2
+        {
+            let next = last.coarser(&stage)?;
+            grids.push(next);
+        }
+        solve(&mut grids, &stage)?;
+        let (w, correction, labels) = (composition.labels.width(), &grids[0].value, composition.labels);
+        // Interpolation between levels lets the mean drift, and the screening is far too weak to bring it back.
+        let rows: Vec<[f64; 4]> = correction
+            .par_chunks(w.max(1))
+            .zip(labels.as_slice().par_chunks(w.max(1)))
+            .map(|(row, labels)| {
+                let mut sum = [0.0; 4];
+                for (c, _) in row.iter().zip(labels).filter(|(_, l)| **l != NO_PHOTO) {
+                    sum = [sum[0] + f64::from(c[0]), sum[1] + f64::from(c[1]), sum[2] + f64::from(c[2]), sum[3] + 1.0];
+                }
+                sum
+            })
+            .collect();
+        let total = rows.iter().fold([0.0; 4], |t, r| std::array::from_fn(|i| t[i] + r[i]));
+        let mean: [f32; 3] = std::array::from_fn(|i| (total[i] / total[3].max(1.0)) as f32);
+        for_each_row(image.as_mut_slice(), 3 * w, &stage, |y, row| {
+            let (labels, correction) = (labels.row(y), &correction[y * w..]);
+            for ((out, l), c) in row.as_chunks_mut::<3>().0.iter_mut().zip(labels).zip(correction) {
+                if *l != NO_PHOTO {
+                    *out = std::array::from_fn(|i| (f32::from(out[i]) + c[i] - mean[i] + 0.5) as u8);
+                }
+            }
+        })?;
+        stage.add(1)?;
+        Ok(image)
     }
-    // Down to a handful of cells, which a few sweeps solve.
-    while let Some(last) = grids.last()
-        && last.width.max(last.height) > 2
-    {
-        let next = last.coarser();
-        grids.push(next);
-    }
-    // From coarse to fine: restricted right sides, then one cycle on every level from the enlarged coarser solution.
+}
+
+/// Full multigrid on `grids`, the finest first (Trottenberg, Multigrid, §2.6): from coarse to fine, restricted right sides, then one cycle on
+/// every level from the interpolated coarser solution, several on the finest.
+fn solve(grids: &mut [Grid], stage: &Stage<'_>) -> Result<(), Cancelled> {
     for level in 1..grids.len() {
         let (fine, coarse) = grids.split_at_mut(level);
-        coarse[0].right_side = fine[level - 1].restrict(&fine[level - 1].right_side);
+        coarse[0].right_side = fine[level - 1].restrict(&fine[level - 1].right_side, stage)?;
     }
     for level in (0..grids.len()).rev() {
         let cycles = if level == 0 { CYCLES } else { 1 };
         for _ in 0..cycles {
-            cycle(&mut grids[level..]);
+            cycle(&mut grids[level..], stage)?;
+            stage.add(usize::from(level == 0))?;
         }
         if level > 0 {
             let (fine, coarse) = grids.split_at_mut(level);
-            fine[level - 1].add_enlarged(&coarse[0]);
+            fine[level - 1].add_interpolated(&coarse[0], stage)?;
         }
     }
-    let (w, correction) = (labels.width, &grids[0].value);
-    // Interpolation between levels lets the mean drift, and the screening is far too weak to bring it back.
-    let rows: Vec<[f64; 4]> = correction
-        .par_chunks(w.max(1))
-        .zip(labels.data.par_chunks(w.max(1)))
-        .map(|(row, labels)| {
-            let mut sum = [0.0; 4];
-            for (c, _) in row.iter().zip(labels).filter(|(_, l)| **l != NONE) {
-                sum = [sum[0] + f64::from(c[0]), sum[1] + f64::from(c[1]), sum[2] + f64::from(c[2]), sum[3] + 1.0];
-            }
-            sum
-        })
-        .collect();
-    let total = rows.iter().fold([0.0; 4], |t, r| std::array::from_fn(|i| t[i] + r[i]));
-    let mean: [f32; 3] = std::array::from_fn(|i| (total[i] / total[3].max(1.0)) as f32);
-    image.as_mut_slice().par_chunks_mut(3 * w.max(1)).enumerate().for_each(|(y, row)| {
-        let (labels, correction) = (&labels.data[y * w..], &correction[y * w..]);
-        for ((out, l), c) in row.as_chunks_mut::<3>().0.iter_mut().zip(labels).zip(correction) {
-            if *l != NONE {
-                *out = std::array::from_fn(|i| (f32::from(out[i]) + c[i] - mean[i] + 0.5) as u8);
-            }
-        }
-    });
-    image
+    Ok(())
 }
 
 /// One level: unknowns, right side, and the weights of the edges to the right and below (zero where there is none).
@@ -87,29 +105,28 @@ struct Grid {
 }
 
 impl Grid {
-    fn from_seams(pieces: &[Option<Warped>], labels: &Labels) -> Self {
-        let (w, h) = (labels.width, labels.height);
-        let mut grid = Self {
-            width: w,
-            height: h,
-            value: vec![[0.0; 4]; w * h],
-            right_side: vec![[0.0; 4]; w * h],
-            right: vec![0.0; w * h],
-            down: vec![0.0; w * h],
-            screen: SCREEN,
-        };
+    fn empty(width: usize, height: usize, screen: f32) -> Self {
+        let n = width * height;
+        let (value, right_side) = (vec![[0.0; 4]; n], vec![[0.0; 4]; n]);
+        Self { width, height, value, right_side, right: vec![0.0; n], down: vec![0.0; n], screen }
+    }
+
+    fn from_seams(composition: &Composition<'_>, stage: &Stage<'_>) -> Result<Self, Cancelled> {
+        let (w, h) = composition.labels.size();
+        let labels = composition.labels.as_slice();
+        let mut grid = Self::empty(w, h, SCREEN);
         let color = |label: u16, x: usize, y: usize| -> Option<[f32; 3]> {
-            let p = pieces.get(usize::from(label))?.as_ref()?;
-            let b = p.bounds;
-            let inside = x >= b.left && y >= b.top && x < b.right && y < b.bottom;
-            let [r, g, b, a] = inside.then(|| p.pixels.at(x - b.left, y - b.top))?;
-            (a > 0).then(|| [r, g, b].map(f32::from))
+            let p = composition.photos.get(usize::from(label))?.as_ref()?;
+            p.color(x, y).map(|c| c.map(f32::from))
         };
         for y in 0..h {
+            if asks(y, w) {
+                stage.check()?;
+            }
             for x in 0..w {
-                let own = labels.at(x, y);
+                let own = labels[y * w + x];
                 for (nx, ny) in [(x + 1, y), (x, y + 1)] {
-                    if own == NONE || nx >= w || ny >= h || labels.at(nx, ny) == NONE {
+                    if own == NO_PHOTO || nx >= w || ny >= h || labels[ny * w + nx] == NO_PHOTO {
                         continue;
                     }
                     let (i, j) = (y * w + x, ny * w + nx);
@@ -118,7 +135,7 @@ impl Grid {
                     } else {
                         grid.down[i] = 1.0
                     }
-                    let other = labels.at(nx, ny);
+                    let other = labels[j];
                     if own == other {
                         continue;
                     }
@@ -136,23 +153,18 @@ impl Grid {
                 }
             }
         }
-        grid
+        Ok(grid)
     }
 
     /// Half the size. An edge between two cells is half the sum of the fine edges between them: their number over the doubled distance.
-    fn coarser(&self) -> Self {
+    fn coarser(&self, stage: &Stage<'_>) -> Result<Self, Cancelled> {
         let (w, h) = (self.width.div_ceil(2), self.height.div_ceil(2));
-        let mut grid = Self {
-            width: w,
-            height: h,
-            value: vec![[0.0; 4]; w * h],
-            right_side: vec![[0.0; 4]; w * h],
-            right: vec![0.0; w * h],
-            down: vec![0.0; w * h],
-            // A cell stands for four pixels.
-            screen: 4.0 * self.screen,
-        };
+        // A cell stands for four pixels.
+        let mut grid = Self::empty(w, h, 4.0 * self.screen);
         for y in 0..self.height {
+            if asks(y, self.width) {
+                stage.check()?;
+            }
             for x in 0..self.width {
                 let (i, cell) = (y * self.width + x, y / 2 * w + x / 2);
                 if x % 2 == 1 {
@@ -163,14 +175,14 @@ impl Grid {
                 }
             }
         }
-        grid
+        Ok(grid)
     }
 
     /// Sums of 2 × 2 blocks.
-    fn restrict(&self, fine: &[Pixel]) -> Vec<Pixel> {
+    fn restrict(&self, fine: &[Pixel], stage: &Stage<'_>) -> Result<Vec<Pixel>, Cancelled> {
         let (w, h) = (self.width.div_ceil(2), self.height.div_ceil(2));
         let mut coarse = vec![[0.0; 4]; w * h];
-        coarse.par_chunks_mut(w.max(1)).enumerate().for_each(|(y, row)| {
+        for_each_row(&mut coarse, w, stage, |y, row| {
             for fine_y in 2 * y..(2 * y + 2).min(self.height) {
                 for (x, v) in fine[fine_y * self.width..(fine_y + 1) * self.width].iter().enumerate() {
                     let sum: &mut Pixel = &mut row[x / 2];
@@ -179,14 +191,19 @@ impl Grid {
                     }
                 }
             }
-        });
-        coarse
+        })?;
+        Ok(coarse)
     }
 
-    /// Calls `f` for every pixel with the sum of its edges, the weighted sum of its neighbors, and its index, and stores what it returns.
-    fn stencil(&self, out: &mut [Pixel], f: impl Fn(usize, f32, Pixel) -> Pixel + Sync) {
+    /// What `f` gives for every pixel from its index, the sum of its edges' weights and the weighted sum of its neighbors.
+    fn stencil(
+        &self,
+        stage: &Stage<'_>,
+        f: impl Fn(usize, f32, Pixel) -> Pixel + Sync,
+    ) -> Result<Vec<Pixel>, Cancelled> {
         let (w, h) = (self.width, self.height);
-        out.par_chunks_mut(w.max(1)).enumerate().for_each(|(y, row)| {
+        let mut out = vec![[0.0; 4]; self.value.len()];
+        for_each_row(&mut out, w, stage, |y, row| {
             for (x, out) in row.iter_mut().enumerate() {
                 let i = y * w + x;
                 let (mut total, mut sum) = (self.screen, [0.0_f32; 4]);
@@ -211,39 +228,38 @@ impl Grid {
                 }
                 *out = f(i, total, sum);
             }
-        });
+        })?;
+        Ok(out)
     }
 
-    fn smooth(&mut self) {
-        let mut next = vec![[0.0; 4]; self.value.len()];
-        self.stencil(&mut next, |i, total, sum| {
+    /// One sweep of damped Jacobi.
+    fn smooth(&mut self, stage: &Stage<'_>) -> Result<(), Cancelled> {
+        self.value = self.stencil(stage, |i, total, sum| {
             let (v, b) = (self.value[i], self.right_side[i]);
             // A pixel without edges has nothing to correct.
             if total <= self.screen {
                 return [0.0; 4];
             }
             std::array::from_fn(|c| v[c] + OMEGA * ((b[c] + sum[c]) / total - v[c]))
-        });
-        self.value = next;
+        })?;
+        Ok(())
     }
 
-    fn residual(&self) -> Vec<Pixel> {
-        let mut out = vec![[0.0; 4]; self.value.len()];
-        self.stencil(&mut out, |i, total, sum| {
+    fn residual(&self, stage: &Stage<'_>) -> Result<Vec<Pixel>, Cancelled> {
+        self.stencil(stage, |i, total, sum| {
             let (v, b) = (self.value[i], self.right_side[i]);
             if total <= self.screen {
                 return [0.0; 4];
             }
             std::array::from_fn(|c| b[c] + sum[c] - total * v[c])
-        });
-        out
+        })
     }
 
     /// Adds the coarser grid's values, interpolated between the middles of its cells that are part of the picture.
-    fn add_enlarged(&mut self, coarse: &Self) {
+    fn add_interpolated(&mut self, coarse: &Self, stage: &Stage<'_>) -> Result<(), Cancelled> {
         let w = self.width;
         let inside: Vec<f32> = (0..coarse.value.len()).map(|i| if coarse.has_edges(i) { 1.0 } else { 0.0 }).collect();
-        self.value.par_chunks_mut(w.max(1)).enumerate().for_each(|(y, row)| {
+        for_each_row(&mut self.value, w, stage, |y, row| {
             let place = |v: usize, n: usize| {
                 let near = v / 2;
                 let far = if v.is_multiple_of(2) { near.saturating_sub(1) } else { (near + 1).min(n - 1) };
@@ -270,7 +286,7 @@ impl Grid {
                     }
                 }
             }
-        });
+        })
     }
 
     fn has_edges(&self, i: usize) -> bool {
@@ -283,36 +299,37 @@ impl Grid {
 }
 
 /// One V-cycle on the first of `grids`.
-fn cycle(grids: &mut [Grid]) {
-    let Some((fine, coarser)) = grids.split_first_mut() else { return };
+fn cycle(grids: &mut [Grid], stage: &Stage<'_>) -> Result<(), Cancelled> {
+    let Some((fine, coarser)) = grids.split_first_mut() else { return Ok(()) };
     for _ in 0..SWEEPS {
-        fine.smooth();
+        fine.smooth(stage)?;
     }
     if let Some(coarse) = coarser.first_mut() {
         // The right side of the coarse start is not needed any more once a cycle comes by.
-        coarse.right_side = fine.restrict(&fine.residual());
+        coarse.right_side = fine.restrict(&fine.residual(stage)?, stage)?;
         coarse.value.fill([0.0; 4]);
-        cycle(coarser);
-        fine.add_enlarged(&coarser[0]);
+        cycle(coarser, stage)?;
+        fine.add_interpolated(&coarser[0], stage)?;
     } else {
         for _ in 0..8 {
-            fine.smooth();
+            fine.smooth(stage)?;
         }
     }
     for _ in 0..SWEEPS {
-        fine.smooth();
+        fine.smooth(stage)?;
     }
+    Ok(())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::surface::Bounds;
-    use cv_core::Image;
+    use crate::surface::{Bounds, WarpedPhoto};
+    use crate::testing::{drawn, stage};
+    use cv_core::{Image, Silent};
 
-    fn piece(w: usize, h: usize, f: impl Fn(usize, usize) -> u8) -> Option<Warped> {
-        let pixels = Image::from_fn(w, h, |x, y| [f(x, y), f(x, y), f(x, y), 255]);
-        Some(Warped { bounds: Bounds { left: 0, top: 0, right: w, bottom: h }, pixels })
+    fn gray(w: usize, h: usize, f: impl Fn(usize, usize) -> u8) -> Option<WarpedPhoto> {
+        Some(drawn(Bounds { left: 0, top: 0, right: w, bottom: h }, |x, y| [f(x, y); 3]))
     }
 
     /// A picture whose parts differ by constants is put together without any step, whatever the shape of the seam and of the picture.
@@ -320,21 +337,18 @@ mod tests {
     fn constant_differences_vanish_and_the_mean_stays() {
         let (w, h) = (150, 90);
         let texture = |x: usize, y: usize| 90.0 + 25.0 * ((x as f64 * 0.3).sin() + (y as f64 * 0.23).cos());
-        let pieces = [piece(w, h, |x, y| texture(x, y) as u8), piece(w, h, |x, y| texture(x, y) as u8 + 40)];
+        let photos = [gray(w, h, |x, y| texture(x, y) as u8), gray(w, h, |x, y| texture(x, y) as u8 + 40)];
         // A wavy seam, a hole, and a corner that is not there.
-        let data: Vec<u16> = (0..w * h)
-            .map(|i| {
-                let (x, y) = (i % w, i / w);
-                let hole = (x as i32 - 40).pow(2) + (y as i32 - 30).pow(2) < 150;
-                if hole || x + y < 25 { NONE } else { u16::from(x as f64 > 75.0 + 20.0 * (y as f64 * 0.1).sin()) }
-            })
-            .collect();
-        let labels = Labels { width: w, height: h, data };
-        let result = blend(&pieces, &labels);
+        let labels = Image::from_fn(w, h, |x, y| {
+            let hole = (x as i32 - 40).pow(2) + (y as i32 - 30).pow(2) < 150;
+            [if hole || x + y < 25 { NO_PHOTO } else { u16::from(x as f64 > 75.0 + 20.0 * (y as f64 * 0.1).sin()) }]
+        });
+        let composition = Composition { photos: &photos, labels: &labels, typical_side: 100.0 };
+        let result = Poisson.blend(&composition, &Silent).unwrap();
         let mut offsets = Vec::new();
         for y in 0..h {
             for x in 0..w {
-                if labels.at(x, y) != NONE {
+                if labels.at(x, y)[0] != NO_PHOTO {
                     offsets.push(f64::from(result.at(x, y)[0]) - texture(x, y).floor());
                 } else {
                     assert_eq!(result.at(x, y), [0; 3]);
@@ -342,7 +356,7 @@ mod tests {
             }
         }
         let mean = offsets.iter().sum::<f64>() / offsets.len() as f64;
-        let share = labels.data.iter().filter(|l| **l == 1).count() as f64 / offsets.len() as f64;
+        let share = labels.as_slice().iter().filter(|l| **l == 1).count() as f64 / offsets.len() as f64;
         // The hard-seamed picture is 40 brighter on the second label's share.
         assert!((mean - 40.0 * share).abs() < 1.0, "{mean} {share}");
         // Rounding to bytes, half a level, and what four cycles leave of 40 levels: 40 / 7⁴ = 0.02; the screening adds a slope of a
@@ -355,13 +369,11 @@ mod tests {
     #[test]
     fn the_multigrid_finds_what_plain_relaxation_finds() {
         let (w, h) = (24, 17);
-        let pieces =
-            [piece(w, h, |x, y| (40 + x * 3 + y) as u8), piece(w, h, |x, y| (70 + x * 2 + 3 * y + (x * y) % 7) as u8)];
-        let data: Vec<u16> = (0..w * h)
-            .map(|i| if i % w < 3 && i / w > 10 { NONE } else { u16::from(i % w + i / w / 2 > 14) })
-            .collect();
-        let labels = Labels { width: w, height: h, data };
-        let grid = Grid::from_seams(&pieces, &labels);
+        let photos =
+            [gray(w, h, |x, y| (40 + x * 3 + y) as u8), gray(w, h, |x, y| (70 + x * 2 + 3 * y + (x * y) % 7) as u8)];
+        let labels = Image::from_fn(w, h, |x, y| [if x < 3 && y > 10 { NO_PHOTO } else { u16::from(x + y / 2 > 14) }]);
+        let composition = Composition { photos: &photos, labels: &labels, typical_side: 20.0 };
+        let grid = Grid::from_seams(&composition, &stage()).unwrap();
         let mut plain = vec![0.0_f64; w * h];
         for _ in 0..20_000 {
             for i in 0..w * h {
@@ -387,10 +399,10 @@ mod tests {
             }
         }
         // Relaxation alone lets the mean drift too.
-        let covered: Vec<usize> = (0..w * h).filter(|i| labels.data[*i] != NONE).collect();
+        let covered: Vec<usize> = (0..w * h).filter(|i| labels.as_slice()[*i] != NO_PHOTO).collect();
         let mean = covered.iter().map(|i| plain[*i]).sum::<f64>() / covered.len() as f64;
-        let hard = crate::blend::copy(&pieces, &labels);
-        let result = blend(&pieces, &labels);
+        let hard = copy(&composition, &stage()).unwrap();
+        let result = Poisson.blend(&composition, &Silent).unwrap();
         for i in covered {
             let want = f64::from(hard.at(i % w, i / w)[0]) + plain[i] - mean;
             // Half a level of rounding and a quarter for unfinished cycles.
@@ -404,8 +416,10 @@ mod tests {
 
     #[test]
     fn without_seams_nothing_changes() {
-        let pieces = [piece(30, 20, |x, y| (x * y % 200) as u8)];
-        let labels = Labels { width: 30, height: 20, data: vec![0; 600] };
-        assert_eq!(blend(&pieces, &labels), crate::blend::copy(&pieces, &labels));
+        let photos = [gray(30, 20, |x, y| (x * y % 200) as u8)];
+        let labels = Image::new(30, 20, [0]);
+        let composition = Composition { photos: &photos, labels: &labels, typical_side: 20.0 };
+        let result = Poisson.blend(&composition, &Silent).unwrap();
+        assert_eq!(result, copy(&composition, &stage()).unwrap());
     }
 }

@@ -1,5 +1,8 @@
 //! Minimum cuts of four-connected pixel grids (Boykov & Kolmogorov 2004).
 
+use crate::rows::asks;
+use cv_core::{Cancelled, Stage};
+
 /// Steps to the neighbors: right, left, down, up. Opposite directions differ in the last bit.
 const RIGHT: usize = 0;
 const DOWN: usize = 2;
@@ -42,19 +45,26 @@ pub(crate) struct GridCut {
 }
 
 impl GridCut {
-    pub(crate) fn new(width: usize, height: usize) -> Self {
+    pub(crate) fn new(width: usize, height: usize, stage: &Stage<'_>) -> Result<Self, Cancelled> {
         let (stride, rows) = (width + 2, height + 2);
         let node =
             Node { capacity: [0; 4], terminal: 0, time: 0, distance: 0, tree: FREE, parent: ORPHAN, is_active: false };
-        Self {
+        let mut nodes = Vec::with_capacity(stride * rows);
+        for row in 0..rows {
+            if asks(row, stride) {
+                stage.check()?;
+            }
+            nodes.resize((row + 1) * stride, node);
+        }
+        Ok(Self {
             width,
             stride,
             height,
-            nodes: vec![node; stride * rows],
+            nodes,
             active: std::collections::VecDeque::new(),
             orphans: std::collections::VecDeque::new(),
             clock: 0,
-        }
+        })
     }
 
     fn node(&self, x: usize, y: usize) -> usize {
@@ -100,8 +110,11 @@ impl GridCut {
     }
 
     /// Finds a minimum cut.
-    pub(crate) fn solve(&mut self) {
+    pub(crate) fn solve(&mut self, stage: &Stage<'_>) -> Result<(), Cancelled> {
         for node in 0..self.nodes.len() {
+            if node % (1 << 20) == 0 {
+                stage.check()?;
+            }
             let t = self.nodes[node].terminal;
             if t != 0 {
                 self.nodes[node].tree = if t > 0 { SOURCE } else { SINK };
@@ -121,8 +134,13 @@ impl GridCut {
                 while let Some(orphan) = self.orphans.pop_front() {
                     self.adopt(orphan as usize);
                 }
+                // A path and its orphans: some microseconds.
+                if self.clock.is_multiple_of(4096) {
+                    stage.check()?;
+                }
             }
         }
+        Ok(())
     }
 
     fn activate(&mut self, node: usize) {
@@ -306,6 +324,7 @@ impl GridCut {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::stage;
     use proptest::prelude::*;
 
     /// Cost of a labeling (bit set: source side).
@@ -343,7 +362,7 @@ mod tests {
         }
 
         fn cut(&self) -> GridCut {
-            let mut g = GridCut::new(self.w, self.h);
+            let mut g = GridCut::new(self.w, self.h, &stage()).unwrap();
             for y in 0..self.h {
                 for x in 0..self.w {
                     let i = y * self.w + x;
@@ -356,7 +375,7 @@ mod tests {
                     }
                 }
             }
-            g.solve();
+            g.solve(&stage()).unwrap();
             g
         }
     }
@@ -391,7 +410,7 @@ mod tests {
         // Left column source, right column sink, every edge 10 but those over a winding line, 1 each.
         let (w, h) = (60, 40);
         let line = |y: usize| 20 + (y as f64 * 0.4).sin().mul_add(8.0, 0.0) as usize;
-        let mut g = GridCut::new(w, h);
+        let mut g = GridCut::new(w, h, &stage()).unwrap();
         for y in 0..h {
             g.add_terminal(0, y, 1000, 0);
             g.add_terminal(w - 1, y, 0, 1000);
@@ -403,7 +422,7 @@ mod tests {
                 g.add_down(x, y, 1, 1);
             }
         }
-        g.solve();
+        g.solve(&stage()).unwrap();
         for y in 0..h {
             for x in 0..w {
                 assert_eq!(g.on_sink_side(x, y), x > line(y), "{x} {y}");

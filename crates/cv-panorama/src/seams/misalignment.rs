@@ -1,9 +1,8 @@
 //! Where two photographs show the same thing at different places of the preview: near things against far ones, where no deformation is smooth enough
 //! to bring both together. A seam there cuts things in two however little the colors on it differ.
 
-use crate::surface::{PAD, PLACES, REACH, Template};
-use crate::surface::{Piece, Preview};
-use cv_core::{GrayF32, luma_f32};
+use crate::surface::{PAD, PLACES, Piece, Preview, REACH, Template};
+use cv_core::{Cancelled, GrayF32, Stage, luma_f32};
 use rayon::prelude::*;
 
 /// Half the side of the patches compared, in preview pixels.
@@ -33,17 +32,17 @@ struct Pair {
 
 impl Misalignments {
     /// Compares all overlapping pieces. O(overlap · reach² · patch) where they disagree, O(overlap · patch) where not.
-    pub(crate) fn find(preview: &Preview, photo_of: &[usize]) -> Self {
+    pub(crate) fn find(preview: &Preview, photo_of: &[usize], stage: &Stage<'_>) -> Result<Self, Cancelled> {
         let lumas: Vec<GrayF32> = preview.pieces.par_iter().map(luma).collect();
         let n = preview.pieces.len();
         let pairs = (0..n * n)
             .into_par_iter()
             .map(|k| {
                 let (a, b) = (k / n, k % n);
-                (a < b && photo_of[a] != photo_of[b]).then(|| compare(preview, &lumas, a, b)).flatten()
+                if a < b && photo_of[a] != photo_of[b] { compare(preview, &lumas, a, b, stage) } else { Ok(None) }
             })
-            .collect();
-        Self { pieces: n, pairs }
+            .collect::<Result<_, _>>()?;
+        Ok(Self { pieces: n, pairs })
     }
 
     /// By how many preview pixels two pieces disagree about a preview pixel; 0 where that is not known.
@@ -66,25 +65,34 @@ fn luma(piece: &Piece) -> GrayF32 {
     })
 }
 
-fn compare(preview: &Preview, lumas: &[GrayF32], a: usize, b: usize) -> Option<Pair> {
+fn compare(
+    preview: &Preview,
+    lumas: &[GrayF32],
+    a: usize,
+    b: usize,
+    stage: &Stage<'_>,
+) -> Result<Option<Pair>, Cancelled> {
     let (first, second) = (preview.pieces[a].warped.bounds, preview.pieces[b].warped.bounds);
-    let common = first.intersection(&second)?;
+    let Some(common) = first.intersection(&second) else { return Ok(None) };
     let (columns, rows) = (common.width() / STEP, common.height() / STEP);
     let mut pixels = vec![0.0; columns * rows];
-    pixels.par_chunks_mut(columns.max(1)).enumerate().for_each(|(row, out)| {
+    pixels.par_chunks_mut(columns.max(1)).enumerate().try_for_each(|(row, out)| {
+        // A row of a few hundred places, each compared with some three hundred: milliseconds.
+        stage.check()?;
         for (column, out) in out.iter_mut().enumerate() {
             let (x, y) = (common.left + column * STEP + STEP / 2, common.top + row * STEP + STEP / 2);
             let p = ((x - first.left) as isize, (y - first.top) as isize);
             let q = ((x - second.left) as isize, (y - second.top) as isize);
             *out = displacement(&lumas[a], p, &lumas[b], q);
         }
-    });
-    spread(&mut pixels, columns);
-    Some(Pair { left: common.left, top: common.top, columns, rows, pixels })
+        Ok(())
+    })?;
+    extend_to_borders(&mut pixels, columns);
+    Ok(Some(Pair { left: common.left, top: common.top, columns, rows, pixels }))
 }
 
 /// Places too near a border to be compared take the worst of their neighbors: a seam along the border cuts what those show. The others stay as they are.
-fn spread(pixels: &mut [f32], columns: usize) {
+fn extend_to_borders(pixels: &mut [f32], columns: usize) {
     // From the border to where a whole patch fits it is this many places.
     for _ in 0..HALF.div_ceil(STEP) + 1 {
         let before = pixels.to_vec();
@@ -184,7 +192,7 @@ mod tests {
     fn places_at_the_border_take_the_worst_of_their_neighbors() {
         let nan = f32::NAN;
         let mut pixels = vec![nan, nan, nan, nan, nan, 2.0, 5.0, nan, nan, 1.0, 0.0, nan];
-        spread(&mut pixels, 4);
+        extend_to_borders(&mut pixels, 4);
         assert_eq!(pixels, [2.0, 5.0, 5.0, 5.0, 2.0, 2.0, 5.0, 5.0, 2.0, 1.0, 0.0, 5.0]);
     }
 }

@@ -1,11 +1,12 @@
 //! The largest upright rectangle inside a mask.
 
+use crate::rows::asks;
 use crate::surface::Bounds;
-use cv_core::ImageView;
+use cv_core::{Cancelled, ImageView, Stage};
 
 /// The rectangle of greatest area in which every pixel is true; `None` where no pixel is. O(pixels), by the stack of the largest rectangle under a
 /// histogram, row by row.
-pub(crate) fn largest_rectangle(mask: ImageView<'_, bool, 1>) -> Option<Bounds> {
+pub(crate) fn largest_rectangle(mask: ImageView<'_, bool, 1>, stage: &Stage<'_>) -> Result<Option<Bounds>, Cancelled> {
     let (w, h) = mask.size();
     let mut heights = vec![0_usize; w];
     let mut best: Option<Bounds> = None;
@@ -13,6 +14,9 @@ pub(crate) fn largest_rectangle(mask: ImageView<'_, bool, 1>) -> Option<Bounds> 
     // Columns where bars start, and their heights, ascending.
     let mut stack: Vec<(usize, usize)> = Vec::with_capacity(w);
     for y in 0..h {
+        if asks(y, 4 * w) {
+            stage.check()?;
+        }
         for (height, inside) in heights.iter_mut().zip(mask.row(y)) {
             *height = if *inside { *height + 1 } else { 0 };
         }
@@ -33,7 +37,7 @@ pub(crate) fn largest_rectangle(mask: ImageView<'_, bool, 1>) -> Option<Bounds> 
             stack.push((start, height));
         }
     }
-    best
+    Ok(best)
 }
 
 #[cfg(test)]
@@ -60,7 +64,7 @@ mod tests {
                     }
                 }
             }
-            match largest_rectangle(mask.view()) {
+            match largest_rectangle(mask.view(), &crate::testing::stage()).unwrap() {
                 None => prop_assert_eq!(largest, 0),
                 Some(b) => {
                     prop_assert!(full(&b));

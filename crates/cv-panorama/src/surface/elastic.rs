@@ -1,151 +1,16 @@
 //! Small smooth deformations that bring photographs together where turning the camera cannot: taken by hand, near things move against far ones
 //! (after Shum & Szeliski 2000, "local alignment", and Li et al. 2018, elastic warping).
 //!
-//! Each photograph on the canvas gets a field of displacements on a coarse grid. Matched points are to be drawn at one place; the fields are to be smooth,
+//! Each photograph on the canvas gets a field of displacements on a coarse grid. Tie points are to be drawn at one place; the fields are to be smooth,
 //! and zero where nothing asks for more. That is linear least squares, reweighted so that false matches count little.
 
 use crate::align::Alignment;
-use crate::surface::Surface;
-use crate::surface::{Bounds, Layout, Placement};
-use crate::surface::{PAD, PLACES, REACH, Template};
-use cv_core::{GrayU8, ImageView, Point2, Vector2};
+use crate::surface::{DisplacementField, Layout, PAD, PLACES, Placement, REACH, Surface, Template};
+use cv_core::{Cancelled, GrayU8, ImageView, Point2, Progress, Stage, Vector2};
 use rayon::prelude::*;
 
-/// Displacements of one photograph on a grid over its part of the canvas.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Field {
-    /// Canvas position of the first vertex.
-    left: f64,
-    top: f64,
-    /// Canvas pixels between vertices.
-    spacing: f64,
-    columns: usize,
-    rows: usize,
-    /// Canvas pixels by which what the photograph shows is moved.
-    moved: Vec<Vector2<f64>>,
-    /// The same as a change of the photograph's pixel to look at.
-    shift: Vec<[f32; 2]>,
-}
-
-impl Field {
-    fn over(b: &Bounds, spacing: f64) -> Self {
-        let columns = (b.width() as f64 / spacing).ceil() as usize + 2;
-        let rows = (b.height() as f64 / spacing).ceil() as usize + 2;
-        let (left, top) = (b.left as f64 - 0.5 * spacing, b.top as f64 - 0.5 * spacing);
-        Self {
-            left,
-            top,
-            spacing,
-            columns,
-            rows,
-            moved: vec![Vector2::zeros(); columns * rows],
-            shift: vec![[0.0; 2]; columns * rows],
-        }
-    }
-
-    /// The four vertices around a canvas position and their weights; outside the grid those of the nearest position on it.
-    fn around(&self, p: Point2<f64>) -> [(usize, f64); 4] {
-        let place = |v: f64, n: usize| {
-            let v = v.clamp(0.0, n as f64 - 1.0001);
-            (v as usize, v - v.floor())
-        };
-        let (x, fx) = place((p.x - self.left) / self.spacing, self.columns);
-        let (y, fy) = place((p.y - self.top) / self.spacing, self.rows);
-        let i = y * self.columns + x;
-        let j = i + self.columns;
-        [(i, (1.0 - fx) * (1.0 - fy)), (i + 1, fx * (1.0 - fy)), (j, (1.0 - fx) * fy), (j + 1, fx * fy)]
-    }
-
-    /// How far what the photograph shows at a canvas position is moved.
-    fn at(&self, p: Point2<f64>) -> Vector2<f64> {
-        self.around(p).iter().map(|&(i, w)| self.moved[i] * w).sum()
-    }
-
-    /// The same field on a canvas and a photograph of other sizes.
-    pub(crate) fn scaled(&self, canvas: f64, photo: f64) -> Self {
-        let place = |v: f64| (v + 0.5) * canvas - 0.5;
-        Self {
-            left: place(self.left),
-            top: place(self.top),
-            spacing: self.spacing * canvas,
-            shift: self.shift.iter().map(|s| s.map(|v| v * photo as f32)).collect(),
-            moved: self.moved.iter().map(|m| m * canvas).collect(),
-            ..*self
-        }
-    }
-
-    /// Adds the change of the photograph's pixel to coordinates of one canvas row, from column `left` on.
-    pub(crate) fn add_row(&self, y: f64, left: f64, us: &mut [f32], vs: &mut [f32]) {
-        let v = ((y - self.top) / self.spacing).clamp(0.0, self.rows as f64 - 1.0001);
-        let (row, fy) = (v as usize * self.columns, v.fract() as f32);
-        let vertex = |x: usize| -> [f32; 2] {
-            let (a, b) = (self.shift[row + x], self.shift[row + self.columns + x]);
-            [a[0] + (b[0] - a[0]) * fy, a[1] + (b[1] - a[1]) * fy]
-        };
-        let (start, step) = (((left - self.left) / self.spacing) as f32, (1.0 / self.spacing) as f32);
-        let last = self.columns as f32 - 1.0001;
-        let mut cell = usize::MAX;
-        let (mut a, mut b) = ([0.0; 2], [0.0; 2]);
-        for (i, (u, v)) in us.iter_mut().zip(vs).enumerate() {
-            let x = (start + i as f32 * step).clamp(0.0, last);
-            if x as usize != cell {
-                cell = x as usize;
-                (a, b) = (vertex(cell), vertex(cell + 1));
-            }
-            let f = x - cell as f32;
-            *u += a[0] + (b[0] - a[0]) * f;
-            *v += a[1] + (b[1] - a[1]) * f;
-        }
-    }
-
-    /// Works out `shift` from `moved`.
-    fn settle(&mut self, placement: &Placement, surface: &Surface) {
-        for y in 0..self.rows {
-            for x in 0..self.columns {
-                let i = y * self.columns + x;
-                let p = Point2::new(self.left + x as f64 * self.spacing, self.top + y as f64 * self.spacing);
-                let look = |p: Point2<f64>| placement.view.project(&surface.inverse(p + placement.origin.coords));
-                self.shift[i] = match (look(p), look(p - self.moved[i])) {
-                    (Some(a), Some(b)) => [(b.x - a.x) as f32, (b.y - a.y) as f32],
-                    _ => [0.0; 2],
-                };
-            }
-        }
-    }
-}
-
-/// Where in its photograph each pixel of a panorama comes from, deformations included.
-#[derive(Debug, Clone)]
-pub struct PhotoMap {
-    surface: Surface,
-    /// Pixel (0, 0) of the panorama on the canvas it was drawn on.
-    corner: Vector2<f64>,
-    pieces: Vec<(Placement, Option<Field>)>,
-}
-
-impl PhotoMap {
-    pub(crate) fn new(layout: &Layout, fields: Vec<Option<Field>>) -> Self {
-        let pieces = layout.placements.iter().copied().zip(fields).collect();
-        Self { surface: layout.surface, corner: Vector2::zeros(), pieces }
-    }
-
-    pub(crate) fn crop(&mut self, left: usize, top: usize) {
-        self.corner += Vector2::new(left as f64, top as f64);
-    }
-
-    /// The pixel of `photo` that is shown at a pixel of the panorama, were the panorama taken from that photograph there; `None` where it does not reach.
-    pub fn source(&self, photo: usize, pixel: Point2<f64>) -> Option<Point2<f64>> {
-        let p = pixel + self.corner;
-        self.pieces.iter().filter(|(placement, _)| placement.photo == photo).find_map(|(placement, field)| {
-            let moved = field.as_ref().map_or_else(Vector2::zeros, |f| f.at(p));
-            let ray = self.surface.inverse(p - moved + placement.origin.coords);
-            placement.view.project(&ray).filter(|q| placement.view.contains(*q))
-        })
-    }
-}
-
-/// Two placements' positions of one thing on the canvas, before anything is moved.
-struct Tie {
+/// Two placements' positions of one thing on the canvas, before anything is displaced.
+struct TiePoint {
     p: usize,
     q: usize,
     a: Point2<f64>,
@@ -154,40 +19,50 @@ struct Tie {
 
 /// Grid cells along the side of a photograph.
 const CELLS: f64 = 24.0;
-/// Weight of a difference between neighboring vertices against a match.
-const SMOOTH: f64 = 0.15;
-/// Weight of a displacement itself: what one place asks for fades out over √(SMOOTH / STAY) = 5 cells, a fifth of a photograph.
-const STAY: f64 = 0.006;
+/// Weight of a difference between neighboring vertices against a tie point.
+const SMOOTHNESS: f64 = 0.15;
+/// Weight of a displacement itself: what one place asks for fades out over √(SMOOTHNESS / DAMPING) = 5 cells, a fifth of a photograph.
+const DAMPING: f64 = 0.006;
 /// Matches farther apart than this share of a photograph's side are no parallax.
 const FARTHEST: f64 = 0.04;
 
-/// Displacements for every placement; none where the photographs agree as they are.
-pub(crate) fn fields(photos: &[ImageView<'_, u8, 3>], layout: &Layout, alignment: &Alignment) -> Vec<Option<Field>> {
-    let n = layout.placements.len();
-    let mut sides: Vec<f64> =
-        layout.placements.iter().map(|p| ((p.bounds.width() * p.bounds.height()) as f64).sqrt()).collect();
-    sides.sort_by(f64::total_cmp);
-    let Some(&side) = sides.get(n / 2) else { return vec![None; n] };
+/// Displacements for every placement.
+pub(crate) fn displacements(
+    photos: &[ImageView<'_, u8, 3>],
+    layout: &Layout,
+    alignment: &Alignment,
+    progress: &dyn Progress,
+) -> Result<Vec<Option<DisplacementField>>, Cancelled> {
+    // A unit per photograph, and one for every solution and every registration of patches.
+    let stage = Stage::new(progress, "elastic", photos.len() + 5)?;
+    let side = layout.typical_side();
     let spacing = (side / CELLS).max(8.0);
-    let mut fields: Vec<Field> = layout.placements.iter().map(|p| Field::over(&p.bounds, spacing)).collect();
-    let mut ties = feature_ties(layout, alignment, FARTHEST * side);
+    let mut fields: Vec<_> = layout.placements.iter().map(|p| DisplacementField::over(&p.bounds, spacing)).collect();
+    let mut ties = feature_ties(layout, alignment, FARTHEST * side, &stage)?;
     // Feature positions are good to a pixel or so of the photographs they were found on, patches to a fraction.
-    solve(&mut fields, &ties, 3.0);
+    solve(&mut fields, &ties, 3.0, &stage)?;
+    stage.add(1)?;
     let features = ties.len();
-    let grays: Vec<GrayU8> = photos.par_iter().map(|p| cv_imgproc::rgb_to_gray(*p)).collect();
+    let gray = |p: &ImageView<'_, u8, 3>| {
+        let gray = cv_imgproc::rgb_to_gray(*p);
+        stage.add(1).map(|()| gray)
+    };
+    let grays: Vec<GrayU8> = photos.par_iter().map(gray).collect::<Result<_, _>>()?;
     // Twice: what the first round brings within reach, the second registers.
     for _ in 0..2 {
         ties.truncate(features);
-        ties.extend(patch_ties(&grays, layout, &fields, spacing));
-        solve(&mut fields, &ties, 3.0);
+        ties.extend(patch_ties(&grays, layout, &fields, spacing, &stage)?);
+        stage.add(1)?;
+        solve(&mut fields, &ties, 3.0, &stage)?;
+        stage.add(1)?;
     }
     for (field, placement) in fields.iter_mut().zip(&layout.placements) {
-        field.settle(placement, &layout.surface);
+        field.update_source_shift(placement, &layout.surface);
     }
-    fields.into_iter().map(Some).collect()
+    Ok(fields.into_iter().map(Some).collect())
 }
 
-/// Where a placement draws a pixel of its photograph, before anything is moved.
+/// Where a placement draws a pixel of its photograph, before anything is displaced.
 fn drawn(placement: &Placement, surface: &Surface, pixel: Point2<f64>) -> Option<Point2<f64>> {
     let mut p = surface.forward(&placement.view.ray(pixel)?)? - placement.origin.coords;
     if let Some(period) = surface.period() {
@@ -197,9 +72,16 @@ fn drawn(placement: &Placement, surface: &Surface, pixel: Point2<f64>) -> Option
     Some(p)
 }
 
-fn feature_ties(layout: &Layout, alignment: &Alignment, farthest: f64) -> Vec<Tie> {
+/// Tie points from the matches of the alignment, without those that lie too far apart to be parallax.
+fn feature_ties(
+    layout: &Layout,
+    alignment: &Alignment,
+    farthest: f64,
+    stage: &Stage<'_>,
+) -> Result<Vec<TiePoint>, Cancelled> {
     let mut ties = Vec::new();
     for pair in &alignment.pairs {
+        stage.check()?;
         for (p, first) in layout.placements.iter().enumerate().filter(|(_, p)| p.photo == pair.a) {
             for (q, second) in layout.placements.iter().enumerate().filter(|(_, q)| q.photo == pair.b) {
                 for m in &pair.matches {
@@ -208,20 +90,20 @@ fn feature_ties(layout: &Layout, alignment: &Alignment, farthest: f64) -> Vec<Ti
                         continue;
                     };
                     if (a - b).norm() < farthest {
-                        ties.push(Tie { p, q, a, b });
+                        ties.push(TiePoint { p, q, a, b });
                     }
                 }
             }
         }
     }
-    ties
+    Ok(ties)
 }
 
-/// Least squares by conjugate gradients, reweighted: a tie off by `scale` pixels counts half.
-fn solve(fields: &mut [Field], ties: &[Tie], scale: f64) {
+/// Iteratively reweighted least squares, by conjugate gradients: a tie point off by `scale` pixels counts half (Cauchy's weight).
+fn solve(fields: &mut [DisplacementField], ties: &[TiePoint], scale: f64, stage: &Stage<'_>) -> Result<(), Cancelled> {
     let mut offsets = vec![0];
     for f in fields.iter() {
-        offsets.push(offsets[offsets.len() - 1] + f.moved.len());
+        offsets.push(offsets[offsets.len() - 1] + f.displacement.len());
     }
     let n = offsets[fields.len()];
     /// Of a tie: eight vertices and their signed weights, and what is to be closed.
@@ -250,7 +132,7 @@ fn solve(fields: &mut [Field], ties: &[Tie], scale: f64) {
             }
         }
     }
-    let mut d: Vec<Vector2<f64>> = fields.iter().flat_map(|f| f.moved.iter().copied()).collect();
+    let mut d: Vec<Vector2<f64>> = fields.iter().flat_map(|f| f.displacement.iter().copied()).collect();
     let left = |d: &[Vector2<f64>], t: &[(usize, f64); 8]| -> Vector2<f64> { t.iter().map(|&(i, w)| d[i] * w).sum() };
     for round in 0..5 {
         // From wide to narrow, so that no false match decides what counts as one.
@@ -258,9 +140,9 @@ fn solve(fields: &mut [Field], ties: &[Tie], scale: f64) {
         let weights: Vec<f64> =
             terms.iter().map(|(t, want)| 1.0 / (1.0 + (left(&d, t) - want).norm_squared() / (scale * scale))).collect();
         let apply = |x: &[Vector2<f64>]| {
-            let mut out: Vec<Vector2<f64>> = x.iter().map(|v| v * STAY).collect();
+            let mut out: Vec<Vector2<f64>> = x.iter().map(|v| v * DAMPING).collect();
             for &(i, j) in &edges {
-                let pull = (x[i] - x[j]) * SMOOTH;
+                let pull = (x[i] - x[j]) * SMOOTHNESS;
                 out[i] += pull;
                 out[j] -= pull;
             }
@@ -273,10 +155,10 @@ fn solve(fields: &mut [Field], ties: &[Tie], scale: f64) {
             out
         };
         let mut right = vec![Vector2::zeros(); n];
-        let mut diagonal = vec![STAY; n];
+        let mut diagonal = vec![DAMPING; n];
         for &(i, j) in &edges {
-            diagonal[i] += SMOOTH;
-            diagonal[j] += SMOOTH;
+            diagonal[i] += SMOOTHNESS;
+            diagonal[j] += SMOOTHNESS;
         }
         for ((t, want), w) in terms.iter().zip(&weights) {
             for &(i, c) in t {
@@ -284,20 +166,23 @@ fn solve(fields: &mut [Field], ties: &[Tie], scale: f64) {
                 diagonal[i] += c * c * w;
             }
         }
-        conjugate_gradients(apply, &right, &diagonal, &mut d);
+        conjugate_gradients(apply, &right, &diagonal, &mut d, stage)?;
     }
     for (f, offset) in fields.iter_mut().zip(&offsets) {
-        let len = f.moved.len();
-        f.moved.copy_from_slice(&d[*offset..offset + len]);
+        let len = f.displacement.len();
+        f.displacement.copy_from_slice(&d[*offset..offset + len]);
     }
+    Ok(())
 }
 
+/// Conjugate gradients with the diagonal as preconditioner, from `x` on.
 fn conjugate_gradients(
     apply: impl Fn(&[Vector2<f64>]) -> Vec<Vector2<f64>>,
     right: &[Vector2<f64>],
     diagonal: &[f64],
     x: &mut [Vector2<f64>],
-) {
+    stage: &Stage<'_>,
+) -> Result<(), Cancelled> {
     // The two axes are two problems with one matrix: products are taken per axis.
     let dot = |a: &[Vector2<f64>], b: &[Vector2<f64>]| -> Vector2<f64> {
         a.iter().zip(b).map(|(a, b)| a.component_mul(b)).sum()
@@ -310,7 +195,11 @@ fn conjugate_gradients(
     let mut rz = dot(&r, &z);
     // Against the right side, not against the first residual: what a former solution leaves may be small already.
     let whole = dot(right, &scaled(right));
-    for _ in 0..200 {
+    for iteration in 0..200 {
+        // An iteration on a hundred thousand matches is some milliseconds.
+        if iteration % 8 == 0 {
+            stage.check()?;
+        }
         // A thousandth of the error a pixel leaves is enough.
         if rz.x <= 1e-8 * whole.x.max(1e-6) && rz.y <= 1e-8 * whole.y.max(1e-6) {
             break;
@@ -330,6 +219,7 @@ fn conjugate_gradients(
         }
         rz = next;
     }
+    Ok(())
 }
 
 /// Half the side of the patches that are compared.
@@ -337,8 +227,14 @@ const HALF: usize = 8;
 /// Patches tried in each overlap at most.
 const PER_OVERLAP: usize = 800;
 
-/// Ties between patches of the photographs as drawn with the fields so far.
-fn patch_ties(photos: &[GrayU8], layout: &Layout, fields: &[Field], spacing: f64) -> Vec<Tie> {
+/// Tie points between patches of the photographs as drawn with the fields so far.
+fn patch_ties(
+    photos: &[GrayU8],
+    layout: &Layout,
+    fields: &[DisplacementField],
+    spacing: f64,
+    stage: &Stage<'_>,
+) -> Result<Vec<TiePoint>, Cancelled> {
     let mut tries = Vec::new();
     for (p, first) in layout.placements.iter().enumerate() {
         for (q, second) in layout.placements.iter().enumerate().skip(p + 1) {
@@ -357,26 +253,40 @@ fn patch_ties(photos: &[GrayU8], layout: &Layout, fields: &[Field], spacing: f64
             }
         }
     }
-    let found: Vec<Option<Tie>> = tries
+    let register_patch = |&(p, q, c): &(usize, usize, Point2<f64>)| {
+        let first = patch(photos, layout, &fields[p], p, c, HALF)?;
+        let least = corner_strength(&first);
+        // Texture in both directions of two and a half gray levels a pixel: below that noise decides where the best place is.
+        if least < 6.0 {
+            return None;
+        }
+        let second = patch(photos, layout, &fields[q], q, c, HALF + REACH)?;
+        let offset = register(&first, second)?;
+        let other = c + offset;
+        Some(TiePoint { p, q, a: c - fields[p].at(c), b: other - fields[q].at(other) })
+    };
+    let found: Vec<Option<TiePoint>> = tries
         .par_iter()
-        .map(|&(p, q, c)| {
-            let first = patch(photos, layout, &fields[p], p, c, HALF)?;
-            let least = corner_strength(&first);
-            // Texture in both directions of two and a half gray levels a pixel: below that noise decides where the best place is.
-            if least < 6.0 {
-                return None;
+        .enumerate()
+        .map(|(i, place)| {
+            if i % 64 == 0 {
+                stage.check()?;
             }
-            let second = patch(photos, layout, &fields[q], q, c, HALF + REACH)?;
-            let offset = register(&first, second)?;
-            let other = c + offset;
-            Some(Tie { p, q, a: c - fields[p].at(c), b: other - fields[q].at(other) })
+            Ok(register_patch(place))
         })
-        .collect();
-    found.into_iter().flatten().collect()
+        .collect::<Result<_, Cancelled>>()?;
+    Ok(found.into_iter().flatten().collect())
 }
 
 /// A placement as drawn around a canvas pixel, `2 half + 1` on a side; `None` where it is not wholly inside the photograph.
-fn patch(photos: &[GrayU8], layout: &Layout, field: &Field, p: usize, c: Point2<f64>, half: usize) -> Option<Vec<f32>> {
+fn patch(
+    photos: &[GrayU8],
+    layout: &Layout,
+    field: &DisplacementField,
+    p: usize,
+    c: Point2<f64>,
+    half: usize,
+) -> Option<Vec<f32>> {
     let placement = &layout.placements[p];
     let photo = photos.get(placement.photo)?;
     let look =
@@ -458,4 +368,161 @@ fn register(first: &[f32], mut second: Vec<f32>) -> Option<Vector2<f64>> {
     let fx = parabola(scores[best - 1], score, scores[best + 1]);
     let fy = parabola(scores[best - PLACES], score, scores[best + PLACES]);
     Some(Vector2::new(x as f64 + fx - REACH as f64, y as f64 + fy - REACH as f64))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::align::{CameraMotion, View};
+    use crate::surface::{PhotoMap, Projection, layout};
+    use crate::testing::{StopAt, photograph, sky, stage};
+    use cv_core::{Camera, Correspondence, Silent, Vector3};
+    use nalgebra::{DMatrix, DVector, Rotation3};
+
+    fn view(yaw: f64) -> View {
+        let turn = Rotation3::from_axis_angle(&Vector3::y_axis(), -yaw);
+        View { camera: Camera::from_focal(240, 180, 260.0), from_world: turn.into_inner() }
+    }
+
+    fn alignment(views: &[View]) -> Alignment {
+        Alignment {
+            views: views.iter().map(|v| Ok(*v)).collect(),
+            reference: 0,
+            motion: CameraMotion::Rotation,
+            pairs: Vec::new(),
+            rms_px: 0.0,
+            median_px: 0.0,
+        }
+    }
+
+    /// By how many pixels the second photograph is bent: what it shows at `p` belongs to `p + bend(p)`.
+    fn bend(p: Point2<f64>) -> Vector2<f64> {
+        Vector2::new(2.5 * (p.y / 40.0).sin(), 2.0 * (p.x / 50.0).cos())
+    }
+
+    /// Root mean square distance, over the overlap, between the places of one direction in the second photograph: as the map says and as the bend is.
+    fn misfit(map: &PhotoMap, views: &[View], size: (usize, usize)) -> f64 {
+        let (mut sum, mut n) = (0.0, 0.0);
+        for (x, y) in (0..size.1).step_by(5).flat_map(|y| (0..size.0).step_by(5).map(move |x| (x, y))) {
+            let c = Point2::new(x as f64, y as f64);
+            let (Some(a), Some(b)) = (map.source(0, c), map.source(1, c)) else { continue };
+            // Patches of a radius of 8 pixels end that far from the border.
+            let inner = |p: Point2<f64>| p.x > 20.0 && p.y > 20.0 && p.x < 220.0 && p.y < 160.0;
+            if inner(a) && inner(b) {
+                let truth = views[1].project(&views[0].ray(a).unwrap()).unwrap();
+                sum += (b + bend(b) - truth).norm_squared();
+                n += 1.0;
+            }
+        }
+        assert!(n > 200.0);
+        (sum / n).sqrt()
+    }
+
+    #[test]
+    fn a_bent_photograph_is_brought_to_where_the_other_shows_the_same() {
+        let views = [view(-0.2), view(0.2)];
+        let first = photograph(&views[0], sky);
+        let second = cv_core::RgbU8::from_fn(240, 180, |x, y| {
+            let p = Point2::new(x as f64, y as f64);
+            sky(&views[1].ray(p + bend(p)).unwrap()).map(|v| v.round() as u8)
+        });
+        let alignment = alignment(&views);
+        let layout = layout(&alignment, Projection::Cylindrical, 1.0, 1_000_000).unwrap();
+        let photos = [first.view(), second.view()];
+        let fields = displacements(&photos, &layout, &alignment, &Silent).unwrap();
+        let size = (layout.width, layout.height);
+        let before = misfit(&PhotoMap::new(&layout, vec![None, None]), &views, size);
+        let after = misfit(&PhotoMap::new(&layout, fields), &views, size);
+        // The bend is 2.3 px (RMS); a grid of 10 px with smoothing over 5 cells follows waves of 250 px to a tenth of their height or so.
+        assert!(before > 1.8 && after < 0.45, "{before} {after}");
+        // Stopped at any report, in any of its parts, it is stopped.
+        let watched = StopAt::never();
+        displacements(&photos, &layout, &alignment, &watched).unwrap();
+        for at in (1..=watched.reports()).step_by(watched.reports().div_ceil(12)) {
+            let stop = StopAt::report(at);
+            assert!(displacements(&photos, &layout, &alignment, &stop).is_err(), "{at}");
+        }
+    }
+
+    #[test]
+    fn photographs_that_fit_are_left_as_they_are() {
+        let views = [view(-0.2), view(0.2)];
+        let photos = [photograph(&views[0], sky), photograph(&views[1], sky)];
+        let alignment = alignment(&views);
+        let layout = layout(&alignment, Projection::Cylindrical, 1.0, 1_000_000).unwrap();
+        let fields = displacements(&[photos[0].view(), photos[1].view()], &layout, &alignment, &Silent).unwrap();
+        for field in fields.iter().flatten() {
+            // What registering patches of rounded gray levels is good to.
+            assert!(field.displacement.iter().all(|d| d.norm() < 0.1), "{:?}", field.displacement);
+        }
+    }
+
+    #[test]
+    fn matches_become_tie_points_unless_they_lie_too_far_apart() {
+        let views = [view(-0.2), view(0.2)];
+        let mut set = alignment(&views);
+        let ray = Vector3::new(0.05, 0.1, 1.0);
+        let [a, b] = [0, 1].map(|i| views[i].project(&ray).unwrap());
+        let matches = vec![Correspondence { a, b }, Correspondence { a, b: b + Vector2::new(30.0, 0.0) }];
+        set.pairs = vec![crate::AlignedPair { a: 0, b: 1, inliers: vec![0, 1], matches, rms_px: 0.0 }];
+        let layout = layout(&set, Projection::Spherical, 1.0, 1_000_000).unwrap();
+        let ties = feature_ties(&layout, &set, 10.0, &stage()).unwrap();
+        assert_eq!(ties.len(), 1);
+        // One direction is drawn at one place.
+        assert!((ties[0].a - ties[0].b).norm() < 1e-9 && (ties[0].p, ties[0].q) == (0, 1));
+        assert_eq!(feature_ties(&layout, &set, 40.0, &stage()).unwrap().len(), 2);
+    }
+
+    #[test]
+    fn conjugate_gradients_find_the_direct_solution() {
+        // A chain of springs of different strength, each vertex tied to zero.
+        let n = 40;
+        let mut matrix = DMatrix::<f64>::from_diagonal_element(n, n, 0.3);
+        for i in 0..n - 1 {
+            let k = 1.0 + (i % 7) as f64;
+            for (r, c, v) in [(i, i, k), (i + 1, i + 1, k), (i, i + 1, -k), (i + 1, i, -k)] {
+                matrix[(r, c)] += v;
+            }
+        }
+        let right: Vec<Vector2<f64>> =
+            (0..n).map(|i| Vector2::new((i as f64).sin(), (2.0 * i as f64).cos() * 10.0)).collect();
+        let apply = |x: &[Vector2<f64>]| -> Vec<Vector2<f64>> {
+            (0..n).map(|i| (0..n).map(|j| x[j] * matrix[(i, j)]).sum()).collect()
+        };
+        let diagonal: Vec<f64> = (0..n).map(|i| matrix[(i, i)]).collect();
+        let mut x = vec![Vector2::new(0.5, -0.5); n];
+        conjugate_gradients(apply, &right, &diagonal, &mut x, &stage()).unwrap();
+        for axis in 0..2 {
+            let b = DVector::from_iterator(n, right.iter().map(|r| r[axis]));
+            let direct = matrix.clone().cholesky().unwrap().solve(&b);
+            for i in 0..n {
+                // Stops at 1e-4 of the right side in the norm of the matrix, whose least eigenvalue is 0.3.
+                assert!((x[i][axis] - direct[i]).abs() < 1e-3 * direct.amax(), "{i}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_patch_is_registered_to_a_fraction_of_a_pixel() {
+        let value =
+            |x: f64, y: f64| (128.0 + 50.0 * (x * 0.4 + y * 0.1).sin() + 40.0 * (y * 0.35 - x * 0.07).cos()) as f32;
+        let patch = |half: usize, at: Vector2<f64>| -> Vec<f32> {
+            let h = half as i32;
+            let rows = (-h..=h).flat_map(|j| (-h..=h).map(move |i| (i, j)));
+            rows.map(|(i, j)| value(f64::from(i) + at.x, f64::from(j) + at.y)).collect()
+        };
+        let first = patch(HALF, Vector2::zeros());
+        for offset in [Vector2::new(0.0, 0.0), Vector2::new(3.3, -2.6), Vector2::new(-4.5, 1.2)] {
+            // The content of the first lies at `offset` in the second.
+            let found = register(&first, patch(HALF + REACH, -offset)).unwrap();
+            // A patch is about one wave long, so its mean and energy change with its place: that moves the peak by up to a tenth.
+            assert!((found - offset).norm() < 0.12, "{found} {offset}");
+        }
+        // Farther than the reach, and where nothing is alike.
+        assert_eq!(register(&first, patch(HALF + REACH, Vector2::new(-9.5, 0.0))), None);
+        assert!(corner_strength(&first) > 6.0);
+        // One direction only: the lesser eigenvalue of the structure tensor is zero.
+        let edge: Vec<f32> = (0..17 * 17).map(|i| if i % 17 < 8 { 10.0 } else { 200.0 }).collect();
+        assert!(corner_strength(&edge).abs() < 1e-2);
+    }
 }

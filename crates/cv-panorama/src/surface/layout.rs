@@ -3,7 +3,7 @@
 use crate::align::View;
 use crate::align::turn;
 use crate::align::{Alignment, CameraMotion};
-use crate::surface::{Projection, Surface};
+use crate::surface::{Bounds, Projection, Surface};
 use cv_core::{Matrix3, Point2, Vector3};
 use nalgebra::Rotation3;
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
@@ -15,7 +15,7 @@ pub enum LayoutError {
     #[error("there is no photograph to draw")]
     Nothing,
     /// The canvas would be too large.
-    #[error("the {} canvas would be {width:.0} x {height:.0} pixels, more than the limit of {max_pixels}", projection.name())]
+    #[error("the {projection} canvas would be {width:.0} x {height:.0} pixels, more than the limit of {max_pixels}")]
     TooLarge {
         /// Width in pixels.
         width: f64,
@@ -27,7 +27,7 @@ pub enum LayoutError {
         projection: Projection,
     },
     /// The photographs reach beyond what the surface can hold.
-    #[error("the photographs span {degrees:.0} degrees, more than the {} projection can hold", projection.name())]
+    #[error("the photographs span {degrees:.0} degrees, more than the {projection} projection can hold")]
     TooWide {
         /// Angle between the middle and the farthest point, doubled, in degrees.
         degrees: f64,
@@ -75,46 +75,6 @@ pub(crate) struct Placement {
     pub(crate) origin: Point2<f64>,
 }
 
-/// A rectangle of canvas pixels, right and bottom exclusive.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Bounds {
-    pub(crate) left: usize,
-    pub(crate) top: usize,
-    pub(crate) right: usize,
-    pub(crate) bottom: usize,
-}
-
-impl Bounds {
-    pub(crate) fn width(&self) -> usize {
-        self.right - self.left
-    }
-
-    pub(crate) fn height(&self) -> usize {
-        self.bottom - self.top
-    }
-
-    /// The common part; `None` where there is none.
-    pub(crate) fn intersection(&self, other: &Self) -> Option<Self> {
-        let b = Self {
-            left: self.left.max(other.left),
-            top: self.top.max(other.top),
-            right: self.right.min(other.right),
-            bottom: self.bottom.min(other.bottom),
-        };
-        (b.left < b.right && b.top < b.bottom).then_some(b)
-    }
-
-    /// Grown by `by` pixels to all sides, within a canvas.
-    pub(crate) fn grown(&self, by: usize, width: usize, height: usize) -> Self {
-        Self {
-            left: self.left.saturating_sub(by),
-            top: self.top.saturating_sub(by),
-            right: (self.right + by).min(width),
-            bottom: (self.bottom + by).min(height),
-        }
-    }
-}
-
 /// The canvas and everything on it.
 #[derive(Debug, Clone)]
 pub(crate) struct Layout {
@@ -127,10 +87,16 @@ pub(crate) struct Layout {
     pub(crate) canvas: Canvas,
 }
 
-/// Half the angle up to which a plane is chosen: there it stretches lengths by 1/cos² = 2.
-const PLANE_HALF_ANGLE: f64 = 45.0 * PI / 180.0;
-/// Half the vertical angle up to which a cylinder is chosen.
-const CYLINDER_HALF_ANGLE: f64 = 50.0 * PI / 180.0;
+impl Layout {
+    /// Median of the square roots of the placements' areas, in pixels.
+    pub(crate) fn typical_side(&self) -> f64 {
+        let mut sides: Vec<f64> =
+            self.placements.iter().map(|p| ((p.bounds.width() * p.bounds.height()) as f64).sqrt()).collect();
+        sides.sort_by(f64::total_cmp);
+        sides.get(sides.len() / 2).copied().unwrap_or(1.0)
+    }
+}
+
 /// A plane tilts up or down with its photographs from this pitch on; below it stands upright and keeps verticals parallel.
 const UPRIGHT_PITCH: f64 = 25.0 * PI / 180.0;
 /// Samples along each side of a photograph when its outline is drawn.
@@ -156,14 +122,14 @@ pub(crate) fn layout(
         Projection::Auto if flat => attempt(Projection::Plane),
         Projection::Auto => {
             let (across, up) = extent(&views, scale);
-            let mut surfaces = Vec::new();
-            if across <= 2.0 * PLANE_HALF_ANGLE && up <= PLANE_HALF_ANGLE {
-                surfaces.push(Projection::Plane);
+            let mut result = Err(LayoutError::Nothing);
+            for projection in Projection::suitable(across, up) {
+                result = attempt(projection);
+                if result.is_ok() {
+                    break;
+                }
             }
-            if up <= CYLINDER_HALF_ANGLE {
-                surfaces.push(Projection::Cylindrical);
-            }
-            surfaces.into_iter().find_map(|s| attempt(s).ok()).map_or_else(|| attempt(Projection::Spherical), Ok)
+            result
         }
         chosen => attempt(chosen),
     }
@@ -175,7 +141,7 @@ struct Outline {
     max: Point2<f64>,
 }
 
-/// `None` where part of the border falls where the surface does not reach.
+/// The outline of a view; `None` where part of its border falls where the surface does not reach.
 fn outline(view: &View, surface: &Surface) -> Option<Outline> {
     let axis = surface.forward(&view.ray(Point2::new(view.camera.cx, view.camera.cy))?)?;
     let (mut min, mut max) = (axis, axis);
@@ -195,7 +161,7 @@ fn outline(view: &View, surface: &Surface) -> Option<Outline> {
     if let (Some(period), Some(first)) = (surface.period(), first) {
         // A border that goes once around the vertical has a pole inside.
         if (last - first).abs() > 0.5 * period || max.x - min.x > 0.98 * period {
-            if surface.projection == Projection::Cylindrical {
+            if !surface.holds_poles() {
                 return None;
             }
             (min.x, max.x) = (-0.5 * period, 0.5 * period);

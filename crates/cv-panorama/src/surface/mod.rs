@@ -1,22 +1,32 @@
-//! Surfaces a panorama is drawn on.
+//! The canvas: surfaces to draw on, the place of each photograph on them, and the drawing of it.
+//!
+//! A projection is one file of this folder with a `Model`, and a variant of [`Projection`] with its name and its line in `SURFACES`.
 
+mod bounds;
 mod correlation;
 mod crop;
+mod cylindrical;
+mod displacement;
 mod elastic;
 mod layout;
+mod plane;
 mod preview;
+mod spherical;
 mod warp;
 
+pub use bounds::Bounds;
 pub(crate) use correlation::{PAD, PLACES, REACH, Template};
 pub(crate) use crop::largest_rectangle;
-pub use elastic::PhotoMap;
-pub(crate) use elastic::{Field, fields};
-pub(crate) use layout::{Bounds, Layout, Placement, layout};
+pub(crate) use displacement::DisplacementField;
+pub use displacement::PhotoMap;
+pub(crate) use elastic::displacements;
 pub use layout::{Canvas, LayoutError};
-pub(crate) use preview::{Piece, Preview, shrunk, shrunk_view};
-pub(crate) use warp::{Map, Tone, Warped, warp};
+pub(crate) use layout::{Layout, Placement, layout};
+pub(crate) use preview::{Piece, Preview, box_shrunk, shrunk_view};
+pub use warp::WarpedPhoto;
+pub(crate) use warp::{ExposureCorrection, Map, WarpSettings, warp};
 
-use cv_core::{Point2, Vector3};
+use cv_core::{Point2, Vector3, named};
 
 /// The surface a panorama is drawn on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -33,15 +43,48 @@ pub enum Projection {
     Spherical,
 }
 
+named!(Projection { Auto = "auto", Plane = "plane", Cylindrical = "cylindrical", Spherical = "spherical" });
+
+/// A surface, in units of its scale: world directions to surface coordinates, the Z axis at (0, 0).
+///
+/// All factor as `ray = (g·ax, b, g·az)`: `ax` and `az` depend on x alone, `g` and `b` on y alone, so that warping needs no trigonometry per
+/// pixel.
+trait Model: Sync {
+    /// Where the direction falls, times the scale; `None` for directions the surface does not hold. Longitude is in (−π, π] times the scale.
+    fn forward(&self, ray: &Vector3<f64>, scale: f64) -> Option<Point2<f64>>;
+
+    /// `ax` and `az` at x.
+    fn column(&self, x: f64) -> (f64, f64);
+
+    /// `g` and `b` at y.
+    fn row(&self, y: f64) -> (f64, f64);
+
+    /// Whether x is the longitude, so that the surface closes after 2π.
+    fn is_periodic(&self) -> bool;
+
+    /// Whether the directions straight up and down lie on it.
+    fn holds_poles(&self) -> bool;
+
+    /// Whether it distorts little enough for views that span `across` horizontally and reach `up` from the horizon, in radians.
+    fn suits(&self, across: f64, up: f64) -> bool;
+}
+
+/// Every surface, in the order in which they are preferred.
+const SURFACES: [(Projection, &dyn Model); 3] = [
+    (Projection::Plane, &plane::Plane),
+    (Projection::Cylindrical, &cylindrical::Cylindrical),
+    (Projection::Spherical, &spherical::Spherical),
+];
+
 impl Projection {
-    /// The name used on the command line and in reports.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Auto => "auto",
-            Self::Plane => "plane",
-            Self::Cylindrical => "cylindrical",
-            Self::Spherical => "spherical",
-        }
+    /// The surfaces that suit views of this extent, the preferred one first.
+    fn suitable(across: f64, up: f64) -> impl Iterator<Item = Self> {
+        SURFACES.iter().filter(move |(_, model)| model.suits(across, up)).map(|(projection, _)| *projection)
+    }
+
+    /// The surface; a plane for [`Projection::Auto`], which is none.
+    fn model(self) -> &'static dyn Model {
+        SURFACES.iter().find(|(projection, _)| *projection == self).map_or(&plane::Plane, |(_, model)| *model)
     }
 }
 
@@ -56,19 +99,7 @@ pub(crate) struct Surface {
 impl Surface {
     /// Where the direction falls; `None` for directions the surface does not hold. Longitude is in (−π, π] times the scale.
     pub(crate) fn forward(&self, ray: &Vector3<f64>) -> Option<Point2<f64>> {
-        let s = self.scale;
-        let horizontal = ray.x.hypot(ray.z);
-        match self.projection {
-            Projection::Plane | Projection::Auto => {
-                (ray.z > 1e-6 * ray.norm()).then(|| Point2::new(s * ray.x / ray.z, s * ray.y / ray.z))
-            }
-            Projection::Cylindrical => {
-                (horizontal > 1e-6 * ray.norm()).then(|| Point2::new(s * ray.x.atan2(ray.z), s * ray.y / horizontal))
-            }
-            Projection::Spherical => {
-                (ray.norm() > 0.0).then(|| Point2::new(s * ray.x.atan2(ray.z), s * ray.y.atan2(horizontal)))
-            }
-        }
+        self.projection.model().forward(ray, self.scale)
     }
 
     /// The direction at a point of the surface.
@@ -78,39 +109,31 @@ impl Surface {
         Vector3::new(g * ax, b, g * az)
     }
 
-    /// All three surfaces factor as `ray = (g·ax, b, g·az)`, `ax` and `az` depending on x alone ...
+    /// `ax` and `az` of `ray = (g·ax, b, g·az)` at x ...
     pub(crate) fn column(&self, x: f64) -> (f64, f64) {
-        let t = x / self.scale;
-        match self.projection {
-            Projection::Plane | Projection::Auto => (t, 1.0),
-            Projection::Cylindrical | Projection::Spherical => t.sin_cos(),
-        }
+        self.projection.model().column(x / self.scale)
     }
 
-    /// ... and `g` and `b` on y alone, so that warping needs no trigonometry per pixel.
+    /// ... and `g` and `b` at y.
     pub(crate) fn row(&self, y: f64) -> (f64, f64) {
-        let t = y / self.scale;
-        match self.projection {
-            Projection::Plane | Projection::Auto | Projection::Cylindrical => (1.0, t),
-            Projection::Spherical => {
-                let (sin, cos) = t.sin_cos();
-                (cos, sin)
-            }
-        }
+        self.projection.model().row(y / self.scale)
     }
 
     /// Surface width of a full turn, where there is one.
     pub(crate) fn period(&self) -> Option<f64> {
-        match self.projection {
-            Projection::Plane | Projection::Auto => None,
-            Projection::Cylindrical | Projection::Spherical => Some(std::f64::consts::TAU * self.scale),
-        }
+        self.projection.model().is_periodic().then_some(std::f64::consts::TAU * self.scale)
+    }
+
+    /// Whether the directions straight up and down lie on the surface.
+    pub(crate) fn holds_poles(&self) -> bool {
+        self.projection.model().holds_poles()
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cv_core::Named;
     use proptest::prelude::*;
 
     proptest! {
@@ -118,7 +141,7 @@ mod tests {
         fn going_to_the_surface_and_back_is_the_same_direction(x in -1.0..1.0f64, y in -0.9..0.9f64, z in -1.0..1.0f64, s in 10.0..5000.0f64) {
             let ray = Vector3::new(x, y, z);
             prop_assume!(ray.norm() > 0.1 && ray.x.hypot(ray.z) > 0.05);
-            for projection in [Projection::Plane, Projection::Cylindrical, Projection::Spherical] {
+            for (projection, _) in SURFACES {
                 let surface = Surface { projection, scale: s };
                 if let Some(p) = surface.forward(&ray) {
                     let back = surface.inverse(p).normalize();
@@ -133,11 +156,40 @@ mod tests {
 
     #[test]
     fn a_radian_at_the_middle_is_the_scale_on_every_surface() {
-        for projection in [Projection::Plane, Projection::Cylindrical, Projection::Spherical] {
+        for (projection, _) in SURFACES {
             let surface = Surface { projection, scale: 1000.0 };
             let p = surface.forward(&Vector3::new(1e-4, 2e-4, 1.0)).unwrap();
             // tan t = t + O(t³): 1e-12 × 1000.
             assert!((p - Point2::new(0.1, 0.2)).norm() < 1e-8, "{projection:?}: {p}");
         }
+    }
+
+    #[test]
+    fn what_the_surfaces_say_of_themselves_is_what_their_formulas_do() {
+        for (projection, model) in SURFACES {
+            let surface = Surface { projection, scale: 100.0 };
+            // Behind the camera there is only what goes around.
+            assert_eq!(surface.forward(&Vector3::new(0.0, 0.1, -1.0)).is_some(), surface.period().is_some());
+            let near_pole = surface.forward(&Vector3::new(0.0, 1.0, 1e-9));
+            assert_eq!(near_pole.is_some(), surface.holds_poles(), "{projection:?}");
+            if let Some(period) = surface.period() {
+                let (a, b) =
+                    (surface.inverse(Point2::new(30.0, 5.0)), surface.inverse(Point2::new(30.0 + period, 5.0)));
+                assert!((a - b).norm() < 1e-12, "{projection:?}");
+            }
+            assert_eq!(surface.holds_poles(), model.holds_poles());
+        }
+        // Every projection but the choice among them has its surface.
+        assert_eq!(Projection::NAMES.len(), SURFACES.len() + 1);
+    }
+
+    #[test]
+    fn the_wider_and_the_higher_the_fewer_surfaces_suit() {
+        let suitable =
+            |across: f64, up: f64| Projection::suitable(across.to_radians(), up.to_radians()).collect::<Vec<_>>();
+        assert_eq!(suitable(89.0, 44.0), [Projection::Plane, Projection::Cylindrical, Projection::Spherical]);
+        assert_eq!(suitable(91.0, 44.0), [Projection::Cylindrical, Projection::Spherical]);
+        assert_eq!(suitable(80.0, 49.0), [Projection::Cylindrical, Projection::Spherical]);
+        assert_eq!(suitable(80.0, 51.0), [Projection::Spherical]);
     }
 }

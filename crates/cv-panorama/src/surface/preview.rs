@@ -1,10 +1,11 @@
 //! The canvas at a fraction of its size, where exposure and seams are decided.
 
-use crate::surface::Field;
-use crate::surface::Surface;
-use crate::surface::{Bounds, Layout, Placement};
-use crate::surface::{Map, Tone, Warped, warp};
-use cv_core::{Image, ImageView, Point2, RgbU8};
+use crate::align::View;
+use crate::rows::asks;
+use crate::surface::{
+    Bounds, DisplacementField, ExposureCorrection, Layout, Map, Placement, Surface, WarpSettings, WarpedPhoto, warp,
+};
+use cv_core::{Cancelled, Image, ImageView, Point2, Progress, RgbU8, Stage};
 use cv_imgproc::Interpolation;
 use rayon::prelude::*;
 
@@ -20,7 +21,7 @@ pub(crate) struct Preview {
 
 /// A placement on the preview.
 pub(crate) struct Piece {
-    pub(crate) warped: Warped,
+    pub(crate) warped: WarpedPhoto,
     /// Square of each pixel's distance from the photograph's middle, measured so that it is 1 all along the border.
     pub(crate) eccentricity: Vec<f32>,
     /// Square of each pixel's distance from the photograph's middle, 1 at the corners.
@@ -46,21 +47,10 @@ impl Piece {
             places.map(|(x, y)| values[y * b.width() + x]).collect()
         };
         Self {
-            warped: Warped { bounds, pixels },
+            warped: WarpedPhoto { bounds, pixels },
             eccentricity: at_corners(&self.eccentricity),
             radius: at_corners(&self.radius),
         }
-    }
-
-    /// Color at a preview pixel; `None` where the photograph does not reach.
-    #[inline]
-    pub(crate) fn at(&self, x: usize, y: usize) -> Option<[u8; 3]> {
-        let b = self.warped.bounds;
-        if x < b.left || y < b.top || x >= b.right || y >= b.bottom {
-            return None;
-        }
-        let [r, g, b, a] = self.warped.pixels.at(x - b.left, y - b.top);
-        (a > 0).then_some([r, g, b])
     }
 }
 
@@ -69,10 +59,12 @@ impl Preview {
     pub(crate) fn draw(
         photos: &[ImageView<'_, u8, 3>],
         layout: &Layout,
-        fields: &[Option<Field>],
+        fields: &[Option<DisplacementField>],
         resolution: f64,
         max_pixels: usize,
-    ) -> Self {
+        progress: &dyn Progress,
+    ) -> Result<Self, Cancelled> {
+        let stage = Stage::new(progress, "preview", photos.len() + layout.placements.len())?;
         let ratio = (layout.width as f64 * layout.height as f64 / max_pixels.max(1) as f64).sqrt();
         let step = (ratio.ceil() as usize).max(1);
         let s = 1.0 / step as f64;
@@ -80,42 +72,39 @@ impl Preview {
         let (width, height) = (layout.width.div_ceil(step), layout.height.div_ceil(step));
         // A photograph drawn smaller is averaged first, or fine texture would alias.
         let shrink = ((step as f64 / resolution.max(1e-9)).round() as usize).max(1);
-        let small: Vec<Option<RgbU8>> = photos
-            .par_iter()
-            .enumerate()
-            .map(|(i, p)| layout.placements.iter().any(|q| q.photo == i).then(|| shrunk(*p, shrink)))
-            .collect();
-        let pieces = layout
-            .placements
-            .par_iter()
-            .enumerate()
-            .filter_map(|(k, p)| {
-                let photo = small.get(p.photo)?.as_ref()?;
-                // Pixel centers at integers: the middle of a step × step block of canvas pixels.
-                let origin = p.origin.coords * s - nalgebra::Vector2::repeat(0.5 * s - 0.5);
-                let bounds = Bounds {
-                    left: p.bounds.left / step,
-                    top: p.bounds.top / step,
-                    right: p.bounds.right.div_ceil(step).min(width),
-                    bottom: p.bounds.bottom.div_ceil(step).min(height),
-                };
-                let field = fields.get(k).and_then(Option::as_ref).map(|f| f.scaled(s, 1.0 / shrink as f64));
-                let view = shrunk_view(p, shrink, photo);
-                let small = Placement { view, bounds, origin: Point2::from(origin), ..*p };
-                let warped = warp(
-                    photo.view(),
-                    &small,
-                    &surface,
-                    bounds,
-                    field.as_ref(),
-                    Interpolation::Bilinear,
-                    Tone::NEUTRAL,
-                );
-                let (eccentricity, radius) = distances(&small, &surface);
-                Some(Piece { warped, eccentricity, radius })
-            })
-            .collect();
-        Self { step, width, height, pieces }
+        let small = |(i, photo): (usize, &ImageView<'_, u8, 3>)| {
+            let is_placed = layout.placements.iter().any(|p| p.photo == i);
+            let small = is_placed.then(|| box_shrunk(*photo, shrink, &stage)).transpose()?;
+            stage.add(1)?;
+            Ok(small)
+        };
+        let small: Vec<Option<RgbU8>> = photos.par_iter().enumerate().map(small).collect::<Result<_, Cancelled>>()?;
+        let draw = |(k, p): (usize, &Placement)| {
+            let Some(Some(photo)) = small.get(p.photo) else { return Ok(None) };
+            // Pixel centers at integers: the middle of a step × step block of canvas pixels.
+            let origin = p.origin.coords * s - nalgebra::Vector2::repeat(0.5 * s - 0.5);
+            let bounds = Bounds {
+                left: p.bounds.left / step,
+                top: p.bounds.top / step,
+                right: p.bounds.right.div_ceil(step).min(width),
+                bottom: p.bounds.bottom.div_ceil(step).min(height),
+            };
+            let field = fields.get(k).and_then(Option::as_ref).map(|f| f.scaled(s, 1.0 / shrink as f64));
+            let view = shrunk_view(p, shrink, photo);
+            let small = Placement { view, bounds, origin: Point2::from(origin), ..*p };
+            let settings = WarpSettings {
+                displacement: field.as_ref(),
+                interpolation: Interpolation::Bilinear,
+                correction: ExposureCorrection::NONE,
+            };
+            let warped = warp(photo.view(), &small, &surface, bounds, settings, &stage)?;
+            let (eccentricity, radius) = distances(&small, &surface);
+            stage.add(1)?;
+            Ok(Some(Piece { warped, eccentricity, radius }))
+        };
+        let pieces: Vec<Option<Piece>> =
+            layout.placements.par_iter().enumerate().map(draw).collect::<Result<_, Cancelled>>()?;
+        Ok(Self { step, width, height, pieces: pieces.into_iter().flatten().collect() })
     }
 
     /// The same at half the size.
@@ -125,8 +114,8 @@ impl Preview {
     }
 }
 
-/// A placement's view of the photograph that [`shrunk`] made.
-pub(crate) fn shrunk_view(p: &Placement, shrink: usize, small: &RgbU8) -> crate::align::View {
+/// A placement's view of the photograph that [`box_shrunk`] made.
+pub(crate) fn shrunk_view(p: &Placement, shrink: usize, small: &RgbU8) -> View {
     let mut view = p.view.scaled(1.0 / shrink as f64);
     // The blocks at the right and bottom that were not whole are gone.
     (view.camera.width, view.camera.height) = small.size();
@@ -134,9 +123,9 @@ pub(crate) fn shrunk_view(p: &Placement, shrink: usize, small: &RgbU8) -> crate:
 }
 
 /// Means of `step × step` blocks; incomplete blocks at the right and bottom are dropped unless nothing would be left.
-pub(crate) fn shrunk(photo: ImageView<'_, u8, 3>, step: usize) -> RgbU8 {
+pub(crate) fn box_shrunk(photo: ImageView<'_, u8, 3>, step: usize, stage: &Stage<'_>) -> Result<RgbU8, Cancelled> {
     if step == 1 {
-        return photo.to_image();
+        return Ok(photo.to_image());
     }
     let (width, height) = ((photo.width() / step).max(1), (photo.height() / step).max(1));
     let (bw, bh) = (step.min(photo.width()), step.min(photo.height()));
@@ -144,6 +133,9 @@ pub(crate) fn shrunk(photo: ImageView<'_, u8, 3>, step: usize) -> RgbU8 {
     let area = (bw * bh) as u32;
     let mut sums = vec![0_u32; 3 * width];
     for y in 0..height {
+        if asks(y, 3 * photo.width() * bh) {
+            stage.check()?;
+        }
         sums.fill(0);
         for row in y * bh..(y + 1) * bh {
             let row = photo.row(row);
@@ -159,7 +151,7 @@ pub(crate) fn shrunk(photo: ImageView<'_, u8, 3>, step: usize) -> RgbU8 {
             *out = ((sum + area / 2) / area) as u8;
         }
     }
-    small
+    Ok(small)
 }
 
 /// Both distances of every pixel from the middle of its photograph.
@@ -184,10 +176,9 @@ fn distances(p: &Placement, surface: &Surface) -> (Vec<f32>, Vec<f32>) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::align::View;
-    use crate::surface::Canvas;
-    use crate::surface::Projection;
-    use cv_core::{Camera, Matrix3};
+    use crate::surface::{Canvas, Projection};
+    use crate::testing::stage;
+    use cv_core::{Camera, Matrix3, Silent};
 
     #[test]
     fn the_preview_is_the_canvas_averaged() {
@@ -210,11 +201,11 @@ mod tests {
                 frame: Matrix3::identity(),
             },
         };
-        let preview = Preview::draw(&[photo.view()], &layout, &[], 1.0, 64 * 48 / 16);
+        let preview = Preview::draw(&[photo.view()], &layout, &[], 1.0, 64 * 48 / 16, &Silent).unwrap();
         assert_eq!((preview.step, preview.width, preview.height), (4, 16, 12));
         for y in 0..12 {
             for x in 0..16 {
-                let [r, g, b] = preview.pieces[0].at(x, y).unwrap();
+                let [r, g, b] = preview.pieces[0].warped.color(x, y).unwrap();
                 // The mean of a ramp over a block is its value at the block's middle, rounded.
                 assert!((f64::from(r) - 3.0 * (4.0 * x as f64 + 1.5)).abs() <= 1.0, "{x} {y} {r}");
                 assert!((f64::from(g) - 5.0 * (4.0 * y as f64 + 1.5)).abs() <= 1.0);
@@ -232,13 +223,13 @@ mod tests {
         let pixels =
             Image::from_fn(7, 5, |x, y| [(10 * x) as u8, (20 * y) as u8, 7, if (x, y) == (4, 2) { 0 } else { 255 }]);
         let numbered: Vec<f32> = (0..35).map(|i| i as f32).collect();
-        let piece = Piece { warped: Warped { bounds, pixels }, eccentricity: numbered.clone(), radius: numbered };
+        let piece = Piece { warped: WarpedPhoto { bounds, pixels }, eccentricity: numbered.clone(), radius: numbered };
         let half = piece.halved();
         assert_eq!(half.warped.bounds, Bounds { left: 2, top: 1, right: 5, bottom: 3 });
         // Canvas pixels 4 and 5 of rows 2 and 3: the piece's columns 1 and 2, rows 0 and 1.
-        assert_eq!(half.at(2, 1), Some([15, 10, 7]));
-        assert_eq!(half.at(3, 2), None);
-        assert_eq!(half.at(4, 2), Some([55, 50, 7]));
+        assert_eq!(half.warped.color(2, 1), Some([15, 10, 7]));
+        assert_eq!(half.warped.color(3, 2), None);
+        assert_eq!(half.warped.color(4, 2), Some([55, 50, 7]));
         assert_eq!(half.eccentricity, [1.0, 3.0, 5.0, 15.0, 17.0, 19.0]);
     }
 
@@ -246,14 +237,15 @@ mod tests {
     fn halving_a_pixel_leaves_nothing() {
         let bounds = Bounds { left: 3, top: 2, right: 4, bottom: 3 };
         let pixels = Image::new(1, 1, [9, 9, 9, 255]);
-        let half = Piece { warped: Warped { bounds, pixels }, eccentricity: vec![0.0], radius: vec![0.0] }.halved();
+        let half =
+            Piece { warped: WarpedPhoto { bounds, pixels }, eccentricity: vec![0.0], radius: vec![0.0] }.halved();
         assert!(half.warped.pixels.is_empty() && half.radius.is_empty());
     }
 
     #[test]
     fn shrinking_keeps_means_and_something_of_every_photograph() {
         let photo = RgbU8::from_fn(5, 3, |x, _| [(10 * x) as u8, 0, 255]);
-        assert_eq!(shrunk(photo.view(), 2).as_slice(), [5, 0, 255, 25, 0, 255]);
-        assert_eq!(shrunk(photo.view(), 100).as_slice(), [20, 0, 255]);
+        assert_eq!(box_shrunk(photo.view(), 2, &stage()).unwrap().as_slice(), [5, 0, 255, 25, 0, 255]);
+        assert_eq!(box_shrunk(photo.view(), 100, &stage()).unwrap().as_slice(), [20, 0, 255]);
     }
 }

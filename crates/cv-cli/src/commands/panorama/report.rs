@@ -1,5 +1,6 @@
 //! The report of `cv panorama`.
 
+use super::words;
 use crate::frame::Failure;
 use cv_core::{Correspondence, Point2, RgbU8};
 use cv_pipeline::PanoramaResult;
@@ -22,7 +23,7 @@ pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResul
     let small = shrink_to_fit(result.image.view(), 2000);
     page.section("Panorama").figure(Figure::new(
         jpeg(&small)?,
-        &format!("{} projection; black where no photograph reaches.", result.canvas.projection.name()),
+        &format!("{} projection; black where no photograph reaches.", result.canvas.projection),
     ));
     let sources = RgbU8::from_fn(width, height, |x, y| {
         let label = result.labels.at(x, y)[0];
@@ -41,14 +42,14 @@ pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResul
         .enumerate()
         .map(|(i, image)| {
             let focal = image.focal.map_or_else(|| "–".to_owned(), |f| format!("{f:.0} px"));
-            let fate = image.reason.clone().unwrap_or_else(|| "used".to_owned());
+            let fate = image.reason.as_ref().map_or_else(|| "used".to_owned(), |r| words(r, paths));
             vec![name(i), fate, image.features.to_string(), focal]
         })
         .collect();
     page.table("", &["file", "used or why not", "features", "focal length"], &rows);
     for (i, image) in result.images.iter().enumerate() {
         if let Some(reason) = &image.reason {
-            page.note(Note::Warning, &format!("{} is not in the panorama: {reason}", name(i)));
+            page.note(Note::Warning, &format!("{} is not in the panorama: {}", name(i), words(reason, paths)));
         }
     }
 
@@ -61,8 +62,11 @@ pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResul
             let (x, y) = (small.width() as f64 / photo.width() as f64, small.height() as f64 / photo.height() as f64);
             Point2::new((p.x + 0.5) * x - 0.5, (p.y + 0.5) * y - 0.5)
         };
-        let matches: Vec<Correspondence> =
-            pair.matches.iter().map(|m| Correspondence { a: at(m.a, photo_a, &a), b: at(m.b, photo_b, &b) }).collect();
+        let matches: Vec<Correspondence> = result
+            .correspondences(pair)
+            .iter()
+            .map(|m| Correspondence { a: at(m.a, photo_a, &a), b: at(m.b, photo_b, &b) })
+            .collect();
         let picture = draw_matches(a.view(), b.view(), &matches, Some(&pair.inliers), &MatchStyle::default());
         let good = pair.inliers.iter().filter(|&&inlier| inlier).count();
         let words =

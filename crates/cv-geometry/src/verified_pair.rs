@@ -1,7 +1,7 @@
-//! Which pairs of photographs really overlap (Brown & Lowe 2007, §3.2).
+//! Which pairs of photographs really overlap, taken from one place or of something flat (Brown & Lowe 2007, §3.2).
 
+use crate::{EstimateError, RobustOptions, estimate_homography};
 use cv_core::{Correspondence, Matrix3, Point2, Silent, Vector3};
-use cv_geometry::{EstimateError, RobustOptions, estimate_homography};
 
 /// Options of [`verify_pair`].
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -32,8 +32,10 @@ pub struct VerifiedPair {
     pub b: usize,
     /// Pixels of `a` to pixels of `b`.
     pub homography: Matrix3<f64>,
-    /// The matches that agree with the homography.
-    pub inliers: Vec<Correspondence>,
+    /// Indices of the tentative matches that agree with the homography, ascending.
+    pub inliers: Vec<usize>,
+    /// Those matches, in pixels.
+    pub matches: Vec<Correspondence>,
 }
 
 /// Why a pair of photographs is taken not to overlap.
@@ -87,13 +89,13 @@ pub fn verify_pair(
     if agree as f64 <= needed {
         return Err(NotAPair::TooFewAgree { agree, in_overlap, needed });
     }
-    let inliers: Vec<Correspondence> = found.inliers.iter().map(|&i| matches[i]).collect();
+    let agreeing: Vec<Correspondence> = found.inliers.iter().map(|&i| matches[i]).collect();
     // How much area grows at each match: positive where nothing is mirrored, within what lenses and zooms do.
     let growth = |c: &Correspondence| h.determinant() / (h * Vector3::new(c.a.x, c.a.y, 1.0)).z.powi(3);
-    if !inliers.iter().all(|c| (1.0 / 64.0..64.0).contains(&growth(c))) {
+    if !agreeing.iter().all(|c| (1.0 / 64.0..64.0).contains(&growth(c))) {
         return Err(NotAPair::Impossible);
     }
-    Ok(VerifiedPair { a, b, homography: h, inliers })
+    Ok(VerifiedPair { a, b, homography: h, inliers: found.inliers, matches: agreeing })
 }
 
 #[cfg(test)]
@@ -121,9 +123,11 @@ mod tests {
 
     #[test]
     fn a_true_overlap_is_accepted_with_its_homography() {
-        let pair = verify_pair((4, SIZE), (2, SIZE), &matches(60, 60), &VerifyOptions::default()).unwrap();
+        let matches = matches(60, 60);
+        let pair = verify_pair((4, SIZE), (2, SIZE), &matches, &VerifyOptions::default()).unwrap();
         assert_eq!((pair.a, pair.b), (4, 2));
-        assert!(pair.inliers.len() >= 60);
+        assert!(pair.inliers.len() >= 60 && pair.inliers.is_sorted());
+        assert_eq!(pair.inliers.iter().map(|&i| matches[i]).collect::<Vec<_>>(), pair.matches);
         // Exact matches; the chance agreement of a random one within 3 px may pull by a fraction of that.
         assert!((pair.homography[(0, 2)] + 80.0).abs() < 0.5 && (pair.homography[(1, 2)] + 10.0).abs() < 0.5);
     }

@@ -1,0 +1,334 @@
+//! Alpha expansion (Boykov, Veksler & Zabih 2001): every label in turn takes over the pixels that lower the total cost, by a minimum cut, until none gains.
+
+use crate::blend::NO_PHOTO;
+use crate::rows::{asks, for_each_row};
+use crate::seams::maxflow::GridCut;
+use crate::surface::{Bounds, WarpedPhoto};
+use cv_core::{Cancelled, Image, Stage};
+use rayon::prelude::*;
+
+/// Cost of every step of a seam: between equals the shorter.
+const STEP: i32 = 4 * 3;
+/// A labeling problem: what each label costs at a pixel, and what a seam costs there.
+pub(super) struct Labeling<'a, U, D, F> {
+    /// The photograph of each label, which limits where it may be taken.
+    pub(super) photos: &'a [Option<&'a WarpedPhoto>],
+    /// Cost of taking pixel (x, y) from a label: `unary(label, x, y)`.
+    pub(super) unary: U,
+    /// How much two labels differ at a pixel: `difference(a, b, x, y)`. A seam between two neighbors costs `STEP` and the differences at both.
+    pub(super) difference: D,
+    /// Whether a pixel may change its label.
+    pub(super) free: F,
+}
+
+/// Capacity that no cut can afford.
+const NEVER: i32 = 1 << 28;
+
+impl<U, D, F> Labeling<'_, U, D, F>
+where
+    U: Fn(usize, usize, usize) -> i32 + Sync,
+    D: Fn(usize, usize, usize, usize) -> i32 + Sync,
+    F: Fn(usize, usize) -> bool + Sync,
+{
+    /// Lets every label in turn take over the pixels that lower the total cost, until none gains or `rounds` are over.
+    pub(super) fn expand(&self, labels: &mut Image<u16, 1>, rounds: usize, stage: &Stage<'_>) -> Result<(), Cancelled> {
+        let groups = independent_groups(self.photos);
+        // A label need not be tried again unless something changed since.
+        let mut stale = vec![true; self.photos.len()];
+        for _ in 0..rounds {
+            for group in &groups {
+                let turn: Vec<usize> =
+                    group.iter().copied().filter(|&k| std::mem::replace(&mut stale[k], false)).collect();
+                let snapshot = &*labels;
+                let changes: Vec<Vec<usize>> =
+                    turn.par_iter().map(|&alpha| self.expand_one(snapshot, alpha, stage)).collect::<Result<_, _>>()?;
+                for (&alpha, changed) in turn.iter().zip(&changes).filter(|(_, changed)| !changed.is_empty()) {
+                    changed.iter().for_each(|&i| labels.as_mut_slice()[i] = alpha as u16);
+                    for (other, s) in stale.iter_mut().enumerate() {
+                        *s |= other != alpha && touch(self.photos, other, alpha);
+                    }
+                }
+            }
+            if !stale.contains(&true) {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    /// The pixels that `alpha` should take over, by index.
+    fn expand_one(&self, labels: &Image<u16, 1>, alpha: usize, stage: &Stage<'_>) -> Result<Vec<usize>, Cancelled> {
+        let (width, height) = labels.size();
+        let Some(own) = self.photos[alpha] else { return Ok(Vec::new()) };
+        let Some(b) = own.bounds.intersection(&Bounds { left: 0, top: 0, right: width, bottom: height }) else {
+            return Ok(Vec::new());
+        };
+        let names = labels.as_slice();
+        let label_at = |x: usize, y: usize| names[y * width + x];
+        let differ = &self.difference;
+        // A pixel may switch where it is free, alpha reaches it, and it shows something else.
+        let may = |x: usize, y: usize| {
+            let label = label_at(x, y);
+            label != NO_PHOTO && usize::from(label) != alpha && (self.free)(x, y) && own.reaches(x, y)
+        };
+        let mut any: Option<Bounds> = None;
+        for y in b.top..b.bottom {
+            if asks(y, b.width()) {
+                stage.check()?;
+            }
+            for x in b.left..b.right {
+                if may(x, y) {
+                    let a = any.get_or_insert(Bounds { left: x, top: y, right: x + 1, bottom: y + 1 });
+                    (a.left, a.right, a.bottom) = (a.left.min(x), a.right.max(x + 1), y + 1);
+                }
+            }
+        }
+        let Some(b) = any else { return Ok(Vec::new()) };
+        let (w, h) = (b.width(), b.height());
+        // How alpha and what is shown differ at each pixel: most edges run between pixels of one label and need just this.
+        let mut shown = vec![0; w * h];
+        for_each_row(&mut shown, w, stage, |row, out| {
+            let y = b.top + row;
+            for (x, out) in (b.left..).zip(out) {
+                let label = label_at(x, y);
+                if label != NO_PHOTO && usize::from(label) != alpha {
+                    *out = differ(alpha, usize::from(label), x, y);
+                }
+            }
+        })?;
+        let from_alpha = |c: usize, x: usize, y: usize| {
+            let inside = x >= b.left && y >= b.top && x < b.right && y < b.bottom;
+            if inside && usize::from(label_at(x, y)) == c {
+                shown[(y - b.top) * w + x - b.left]
+            } else {
+                differ(alpha, c, x, y)
+            }
+        };
+        let mut cut = GridCut::new(w, h, stage)?;
+        // Source side: keeps its label. Sink side: becomes alpha.
+        for y in b.top..b.bottom {
+            if asks(y, 8 * w) {
+                stage.check()?;
+            }
+            for x in b.left..b.right {
+                let mine = may(x, y);
+                let label = label_at(x, y);
+                let (i, j) = (x - b.left, y - b.top);
+                if mine {
+                    cut.add_terminal(i, j, (self.unary)(alpha, x, y), (self.unary)(usize::from(label), x, y));
+                }
+                for (nx, ny) in [(x + 1, y), (x, y + 1)] {
+                    if nx >= width || ny >= height {
+                        continue;
+                    }
+                    let other = label_at(nx, ny);
+                    if label == NO_PHOTO || other == NO_PHOTO {
+                        continue;
+                    }
+                    let inside = nx < b.right && ny < b.bottom;
+                    let theirs = inside && may(nx, ny);
+                    if !mine && !theirs {
+                        continue;
+                    }
+                    let (p, q) = (usize::from(label), usize::from(other));
+                    let keep = if p == q { 0 } else { STEP + differ(p, q, x, y) + differ(p, q, nx, ny) };
+                    let pay =
+                        |c: usize| if c == alpha { 0 } else { STEP + from_alpha(c, x, y) + from_alpha(c, nx, ny) };
+                    // Cost where only the first, or only the second, becomes alpha.
+                    let (first, second) = (pay(q), pay(p));
+                    match (mine, theirs) {
+                        (true, true) => {
+                            // E(keep, keep) ≤ E(alpha, keep) + E(keep, alpha) holds for differences; at borders it is made to.
+                            let (first, second) =
+                                if keep > first + second { (first, keep - first) } else { (first, second) };
+                            // E = keep·[both keep] + first·[first only] + second·[second only], as terminals and one arc:
+                            // first's switching costs (first − keep), second's then costs −first, and splitting pays the rest.
+                            add_signed(&mut cut, i, j, first - keep);
+                            add_signed(&mut cut, nx - b.left, ny - b.top, -first);
+                            let arc = first + second - keep;
+                            // Paid where the first keeps (source) and the second switches (sink).
+                            if ny == y { cut.add_right(i, j, arc, 0) } else { cut.add_down(i, j, arc, 0) }
+                        }
+                        // A fixed neighbor is a cost of the free one alone.
+                        (true, false) => add_signed(&mut cut, i, j, first - keep),
+                        (false, _) => add_signed(&mut cut, nx - b.left, ny - b.top, second - keep),
+                    }
+                }
+            }
+        }
+        // Neighbors to the left of and above the box are fixed too.
+        for (x, y, nx, ny) in (b.top..b.bottom)
+            .filter(|_| b.left > 0)
+            .map(|y| (b.left, y, b.left - 1, y))
+            .chain((b.left..b.right).filter(|_| b.top > 0).map(|x| (x, b.top, x, b.top - 1)))
+        {
+            let (label, other) = (label_at(x, y), label_at(nx, ny));
+            if !may(x, y) || other == NO_PHOTO {
+                continue;
+            }
+            let pay = |a: usize, c: usize| {
+                if a == c { 0 } else { STEP + differ(a, c, x, y) + differ(a, c, nx, ny) }
+            };
+            add_signed(
+                &mut cut,
+                x - b.left,
+                y - b.top,
+                pay(alpha, usize::from(other)) - pay(usize::from(label), usize::from(other)),
+            );
+        }
+        cut.solve(stage)?;
+        let mut changed = Vec::new();
+        for y in b.top..b.bottom {
+            for x in b.left..b.right {
+                if may(x, y) && cut.on_sink_side(x - b.left, y - b.top) {
+                    changed.push(y * width + x);
+                }
+            }
+        }
+        Ok(changed)
+    }
+}
+
+/// Whether two photographs reach a common pixel or neighboring ones, going by their bounds.
+fn touch(photos: &[Option<&WarpedPhoto>], a: usize, b: usize) -> bool {
+    let (Some(a), Some(b)) = (photos[a], photos[b]) else { return false };
+    a.bounds.grown(1, usize::MAX, usize::MAX).intersection(&b.bounds).is_some()
+}
+
+/// The photographs in groups that do not touch each other: in a group, what one takes over changes nothing for the others, so that they may all be tried at once.
+fn independent_groups(photos: &[Option<&WarpedPhoto>]) -> Vec<Vec<usize>> {
+    let mut groups: Vec<Vec<usize>> = Vec::new();
+    for k in 0..photos.len() {
+        match groups.iter_mut().find(|group| group.iter().all(|&other| !touch(photos, k, other))) {
+            Some(group) => group.push(k),
+            None => groups.push(vec![k]),
+        }
+    }
+    groups
+}
+
+/// A cost (of either sign) of switching to alpha, that is, of being on the sink's side.
+fn add_signed(cut: &mut GridCut, x: usize, y: usize, cost: i32) {
+    cut.add_terminal(x, y, cost.clamp(0, NEVER), (-cost).clamp(0, NEVER));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{drawn, stage};
+    use proptest::prelude::*;
+
+    /// Three labels on 3 × 3 pixels: colors, whose differences are a metric, unary costs, and which pixels may change.
+    #[derive(Debug, Clone)]
+    struct Tiny {
+        colors: Vec<i32>,
+        unary: Vec<i32>,
+        start: Vec<u16>,
+        free: Vec<bool>,
+    }
+
+    const N: usize = 9;
+
+    fn tiny() -> impl Strategy<Value = Tiny> {
+        let lists = (
+            proptest::collection::vec(0..60_i32, 3 * N),
+            proptest::collection::vec(0..40_i32, 3 * N),
+            proptest::collection::vec(0..3_u16, N),
+            proptest::collection::vec(proptest::bool::weighted(0.8), N),
+        );
+        lists.prop_map(|(colors, unary, start, free)| Tiny { colors, unary, start, free })
+    }
+
+    impl Tiny {
+        fn unary(&self, label: usize, x: usize, y: usize) -> i32 {
+            self.unary[label * N + 3 * y + x]
+        }
+
+        fn difference(&self, a: usize, b: usize, x: usize, y: usize) -> i32 {
+            (self.colors[a * N + 3 * y + x] - self.colors[b * N + 3 * y + x]).abs()
+        }
+
+        /// The definition of the cost.
+        fn cost(&self, labels: &[u16]) -> i32 {
+            let at = |x: usize, y: usize| usize::from(labels[3 * y + x]);
+            let mut cost = 0;
+            for (x, y) in (0..3).flat_map(|y| (0..3).map(move |x| (x, y))) {
+                cost += self.unary(at(x, y), x, y);
+                for (nx, ny) in [(x + 1, y), (x, y + 1)] {
+                    if nx < 3 && ny < 3 && at(x, y) != at(nx, ny) {
+                        let (p, q) = (at(x, y), at(nx, ny));
+                        cost += STEP + self.difference(p, q, x, y) + self.difference(p, q, nx, ny);
+                    }
+                }
+            }
+            cost
+        }
+
+        fn expanded(&self, labels: usize, rounds: usize) -> Vec<u16> {
+            let whole = Bounds { left: 0, top: 0, right: 3, bottom: 3 };
+            let photos: Vec<WarpedPhoto> = (0..labels).map(|_| drawn(whole, |_, _| [0; 3])).collect();
+            let photos: Vec<Option<&WarpedPhoto>> = photos.iter().map(Some).collect();
+            let mut found = Image::from_fn(3, 3, |x, y| [self.start[3 * y + x].min(labels as u16 - 1)]);
+            let labeling = Labeling {
+                photos: &photos,
+                unary: |l, x, y| self.unary(l, x, y),
+                difference: |a, b, x, y| self.difference(a, b, x, y),
+                free: |x: usize, y: usize| self.free[3 * y + x],
+            };
+            labeling.expand(&mut found, rounds, &stage()).unwrap();
+            found.into_vec()
+        }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(200))]
+
+        #[test]
+        fn of_two_labels_the_cheapest_labeling_is_found(problem in tiny()) {
+            let found = problem.expanded(2, 20);
+            let start: Vec<u16> = problem.start.iter().map(|l| (*l).min(1)).collect();
+            let mut least = i32::MAX;
+            for bits in 0..1_u32 << N {
+                let labels: Vec<u16> =
+                    (0..N).map(|i| if problem.free[i] { (bits >> i & 1) as u16 } else { start[i] }).collect();
+                least = least.min(problem.cost(&labels));
+            }
+            // An expansion of one label of two may take any set of pixels: after one of each, none is cheaper to take.
+            prop_assert!(problem.cost(&found) <= problem.cost(&start));
+            for (i, free) in problem.free.iter().enumerate() {
+                prop_assert!(*free || found[i] == start[i]);
+            }
+            prop_assert_eq!(problem.cost(&found), least);
+        }
+
+        #[test]
+        fn no_label_of_three_can_lower_the_cost_by_taking_over_pixels(problem in tiny()) {
+            let found = problem.expanded(3, 50);
+            let cost = problem.cost(&found);
+            for alpha in 0..3_u16 {
+                for bits in 0..1_u32 << N {
+                    let taken = |i: usize| bits >> i & 1 == 1 && problem.free[i];
+                    let labels: Vec<u16> = (0..N).map(|i| if taken(i) { alpha } else { found[i] }).collect();
+                    prop_assert!(problem.cost(&labels) >= cost, "{alpha} {bits:b}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn photographs_that_touch_are_never_tried_at_once() {
+        let at =
+            |left: usize, top: usize| drawn(Bounds { left, top, right: left + 10, bottom: top + 10 }, |_, _| [0; 3]);
+        let photos = [at(0, 0), at(10, 0), at(21, 0), at(0, 11), at(40, 40)];
+        let photos: Vec<Option<&WarpedPhoto>> = photos.iter().map(Some).chain([None]).collect();
+        let groups = independent_groups(&photos);
+        assert_eq!(groups.iter().map(Vec::len).sum::<usize>(), photos.len());
+        for group in &groups {
+            for (i, a) in group.iter().enumerate() {
+                assert!(group[i + 1..].iter().all(|b| !touch(&photos, *a, *b)), "{groups:?}");
+            }
+        }
+        // The first two are neighbors, the others lie apart from the first.
+        assert_eq!(groups, [vec![0, 2, 3, 4, 5], vec![1]]);
+    }
+}

@@ -1,0 +1,102 @@
+//! The labels of the preview in full size.
+
+use crate::blend::NO_PHOTO;
+use crate::rows::for_each_row;
+use crate::surface::WarpedPhoto;
+use cv_core::{Cancelled, Image, Stage};
+
+/// Labels of a canvas of `size`, `step` times as large as theirs: interpolated so that seams are smooth, where the photograph reaches; else another that
+/// reaches.
+pub(crate) fn upsample(
+    coarse: &Image<u16, 1>,
+    step: usize,
+    (w, h): (usize, usize),
+    photos: &[Option<WarpedPhoto>],
+    stage: &Stage<'_>,
+) -> Result<Image<u16, 1>, Cancelled> {
+    let reaches = |label: u16, x: usize, y: usize| {
+        photos.get(usize::from(label)).and_then(Option::as_ref).is_some_and(|p| p.reaches(x, y))
+    };
+    let mut labels = Image::new(w, h, [NO_PHOTO]);
+    let (cw, ch) = coarse.size();
+    // The preview pixel at or before a canvas pixel, and how far behind it that lies.
+    let place = |v: usize, n: usize| {
+        let t = ((v as f32 + 0.5) / step as f32 - 0.5).max(0.0);
+        let i = (t as usize).min(n - 1);
+        (i, (i + 1).min(n - 1), t - i as f32)
+    };
+    let columns: Vec<(usize, usize, f32)> = (0..w).map(|x| place(x, cw)).collect();
+    for_each_row(labels.as_mut_slice(), w, stage, |y, row| {
+        let (y0, y1, fy) = place(y, ch);
+        for (x, out) in row.iter_mut().enumerate() {
+            let (x0, x1, fx) = columns[x];
+            let near = [(x0, y0), (x1, y0), (x0, y1), (x1, y1)].map(|(x, y)| coarse.at(x, y)[0]);
+            let first = near[0];
+            if first != NO_PHOTO && near.iter().all(|l| *l == first) && reaches(first, x, y) {
+                *out = first;
+                continue;
+            }
+            let weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
+            let mut best = (0.0, NO_PHOTO);
+            for label in near {
+                let weight: f32 = near.iter().zip(weights).filter(|(l, _)| **l == label).map(|(_, w)| w).sum();
+                if label != NO_PHOTO && weight >= best.0 && weight > 0.0 && reaches(label, x, y) {
+                    best = (weight + 1e-6, label);
+                }
+            }
+            if best.1 == NO_PHOTO {
+                let any = (0..photos.len() as u16).find(|&l| reaches(l, x, y));
+                best.1 = any.unwrap_or(NO_PHOTO);
+            }
+            *out = best.1;
+        }
+    })?;
+    Ok(labels)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::surface::Bounds;
+    use crate::testing::{drawn, stage};
+
+    #[test]
+    fn a_slanted_seam_becomes_a_smooth_one_and_blocks_stay_where_they_are() {
+        let step = 8;
+        let coarse = Image::from_fn(12, 10, |x, y| [u16::from(x > y)]);
+        let whole = Bounds { left: 0, top: 0, right: 96, bottom: 80 };
+        let photos = [Some(drawn(whole, |_, _| [0; 3])), Some(drawn(whole, |_, _| [0; 3]))];
+        let labels = upsample(&coarse, step, (96, 80), &photos, &stage()).unwrap();
+        for (x, y) in (0..80).flat_map(|y| (0..96).map(move |x| (x, y))) {
+            // The seam runs half-way between the middles of the blocks (y, y) and (y + 1, y): x = y + 4. Bilinear weights follow it to within
+            // half a block.
+            let off = x as f64 - (y as f64 + 4.0);
+            if off.abs() > 4.0 {
+                assert_eq!(labels.at(x, y)[0], u16::from(off > 0.0), "{x} {y}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_label_is_taken_only_where_its_photograph_reaches() {
+        let coarse = Image::from_fn(4, 3, |x, _| {
+            [if x < 2 {
+                0
+            } else if x == 2 {
+                1
+            } else {
+                NO_PHOTO
+            }]
+        });
+        let left = drawn(Bounds { left: 0, top: 0, right: 6, bottom: 12 }, |_, _| [0; 3]);
+        let right = drawn(Bounds { left: 5, top: 2, right: 14, bottom: 12 }, |_, _| [0; 3]);
+        let labels = upsample(&coarse, 4, (16, 12), &[Some(left.clone()), Some(right.clone())], &stage()).unwrap();
+        for (x, y) in (0..12).flat_map(|y| (0..16).map(move |x| (x, y))) {
+            match labels.at(x, y)[0] {
+                0 => assert!(left.reaches(x, y)),
+                1 => assert!(right.reaches(x, y)),
+                _ => assert!(!left.reaches(x, y) && !right.reaches(x, y), "{x} {y}"),
+            }
+        }
+    }
+}

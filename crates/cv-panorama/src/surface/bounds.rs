@@ -1,0 +1,88 @@
+//! Rectangles of canvas pixels.
+
+/// A rectangle of canvas pixels, right and bottom exclusive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Bounds {
+    /// First column.
+    pub left: usize,
+    /// First row.
+    pub top: usize,
+    /// Column after the last.
+    pub right: usize,
+    /// Row after the last.
+    pub bottom: usize,
+}
+
+impl Bounds {
+    /// Columns.
+    pub fn width(&self) -> usize {
+        self.right - self.left
+    }
+
+    /// Rows.
+    pub fn height(&self) -> usize {
+        self.bottom - self.top
+    }
+
+    /// Whether a canvas pixel lies inside.
+    #[inline]
+    pub fn contains(&self, x: usize, y: usize) -> bool {
+        x >= self.left && y >= self.top && x < self.right && y < self.bottom
+    }
+
+    /// The common part; `None` where there is none.
+    pub fn intersection(&self, other: &Self) -> Option<Self> {
+        let b = Self {
+            left: self.left.max(other.left),
+            top: self.top.max(other.top),
+            right: self.right.min(other.right),
+            bottom: self.bottom.min(other.bottom),
+        };
+        (b.left < b.right && b.top < b.bottom).then_some(b)
+    }
+
+    /// Grown by `by` pixels to all sides, within a canvas.
+    pub(crate) fn grown(&self, by: usize, width: usize, height: usize) -> Self {
+        Self {
+            left: self.left.saturating_sub(by),
+            top: self.top.saturating_sub(by),
+            right: (self.right + by).min(width),
+            bottom: (self.bottom + by).min(height),
+        }
+    }
+
+    /// Grown as far as a pyramid of so many levels above its base blends, and rounded out to its pixels on every level.
+    pub(crate) fn for_pyramid(&self, levels: usize, width: usize, height: usize) -> Self {
+        let unit = 1 << levels;
+        let grown = self.grown(2 * unit, width, height);
+        Self {
+            left: grown.left / unit * unit,
+            top: grown.top / unit * unit,
+            right: grown.right.next_multiple_of(unit).min(width),
+            bottom: grown.bottom.next_multiple_of(unit).min(height),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_rectangle_meets_another_and_grows_within_the_canvas() {
+        let b = Bounds { left: 5, top: 2, right: 20, bottom: 9 };
+        assert_eq!((b.width(), b.height()), (15, 7));
+        assert!(b.contains(5, 8) && !b.contains(20, 8) && !b.contains(5, 9));
+        let other = Bounds { left: 18, top: 0, right: 40, bottom: 3 };
+        assert_eq!(b.intersection(&other), Some(Bounds { left: 18, top: 2, right: 20, bottom: 3 }));
+        assert_eq!(b.intersection(&Bounds { left: 20, ..other }), None);
+        assert_eq!(b.grown(3, 22, 100), Bounds { left: 2, top: 0, right: 22, bottom: 12 });
+    }
+
+    #[test]
+    fn for_a_pyramid_a_rectangle_starts_at_whole_pixels_of_every_level() {
+        let b = Bounds { left: 37, top: 70, right: 50, bottom: 75 };
+        // Grown by 16, rounded out to multiples of 8.
+        assert_eq!(b.for_pyramid(3, 1000, 90), Bounds { left: 16, top: 48, right: 72, bottom: 90 });
+    }
+}

@@ -1,0 +1,34 @@
+//! A plane at right angles to the Z axis: the perspective projection.
+
+use super::Model;
+use cv_core::{Point2, Vector3};
+use std::f64::consts::FRAC_PI_4;
+
+pub(super) struct Plane;
+
+impl Model for Plane {
+    fn forward(&self, ray: &Vector3<f64>, scale: f64) -> Option<Point2<f64>> {
+        (ray.z > 1e-6 * ray.norm()).then(|| Point2::new(scale * ray.x / ray.z, scale * ray.y / ray.z))
+    }
+
+    fn column(&self, x: f64) -> (f64, f64) {
+        (x, 1.0)
+    }
+
+    fn row(&self, y: f64) -> (f64, f64) {
+        (1.0, y)
+    }
+
+    fn is_periodic(&self) -> bool {
+        false
+    }
+
+    fn holds_poles(&self) -> bool {
+        false
+    }
+
+    /// Up to 45° from the middle: there it stretches lengths by 1/cos² = 2.
+    fn suits(&self, across: f64, up: f64) -> bool {
+        across <= 2.0 * FRAC_PI_4 && up <= FRAC_PI_4
+    }
+}

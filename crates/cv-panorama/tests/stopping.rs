@@ -1,0 +1,127 @@
+//! A panorama stops within 200 ms of being told to, in its longest stages too.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
+use cv_core::{Camera, Cancelled, ImageView, Named, Progress, RgbU8, Vector3};
+use cv_panorama::{AlignedPair, Alignment, BlendMode, CameraMotion, CompositingOptions, RenderError, View, render};
+use nalgebra::Rotation3;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
+
+/// Remembers when it was asked, and in which stage; stops at a given number of questions.
+struct Asked {
+    stop_at: usize,
+    count: AtomicUsize,
+    times: Mutex<Vec<(&'static str, Instant)>>,
+}
+
+impl Asked {
+    fn new(stop_at: usize) -> Self {
+        let times = Mutex::new(vec![("begin", Instant::now())]);
+        Self { stop_at, count: AtomicUsize::new(0), times }
+    }
+
+    /// Time between one question and the next, with the stage of the next, and from the last until now.
+    fn gaps(self) -> Vec<(&'static str, Duration)> {
+        let mut times = self.times.into_inner().unwrap();
+        times.push(("end", Instant::now()));
+        times.windows(2).map(|w| (w[1].0, w[1].1 - w[0].1)).collect()
+    }
+}
+
+impl Progress for Asked {
+    fn report(&self, stage: &'static str, _: usize, _: usize) -> Result<(), Cancelled> {
+        self.times.lock().unwrap().push((stage, Instant::now()));
+        if self.count.fetch_add(1, Ordering::Relaxed) + 1 >= self.stop_at { Err(Cancelled) } else { Ok(()) }
+    }
+}
+
+/// Photographs `width` wide, each 30 degrees to the right of the last and 50 degrees across, all showing the same texture: what does not fit at the seams
+/// makes the cuts hard.
+struct Set {
+    photo: RgbU8,
+    count: usize,
+    alignment: Alignment,
+}
+
+impl Set {
+    fn new(count: usize, width: usize) -> Self {
+        let height = width * 3 / 4;
+        let photo = RgbU8::from_fn(width, height, |x, y| {
+            let coarse = ((x / 37) * 7919 + (y / 29) * 104_729) % 97;
+            let fine = ((x * 31) ^ (y * 17)) % 23;
+            [(60 + coarse + fine) as u8, (90 + coarse / 2 + fine) as u8, (40 + 2 * fine + coarse) as u8]
+        });
+        let camera = Camera::from_focal(width, height, width as f64 / (2.0 * 25_f64.to_radians().tan()));
+        let turn = |i: usize| Rotation3::from_axis_angle(&Vector3::y_axis(), -(i as f64) * 30_f64.to_radians());
+        let views = (0..count).map(|i| Ok(View { camera, from_world: turn(i).into_inner() })).collect();
+        let pairs = (1..count)
+            .map(|b| AlignedPair { a: b - 1, b, inliers: Vec::new(), matches: Vec::new(), rms_px: 0.0 })
+            .collect();
+        let motion = CameraMotion::Rotation;
+        let alignment = Alignment { views, reference: 0, motion, pairs, rms_px: 0.0, median_px: 0.0 };
+        Self { photo, count, alignment }
+    }
+
+    fn render(&self, blend: BlendMode, progress: &dyn Progress) -> Result<(), RenderError> {
+        let options = CompositingOptions { blend, crop: true, ..CompositingOptions::default() };
+        let photos: Vec<ImageView<'_, u8, 3>> = (0..self.count).map(|_| self.photo.view()).collect();
+        render(&photos, &self.alignment, &options, progress).map(|panorama| assert!(!panorama.image.is_empty()))
+    }
+
+    /// The longest time between two questions, by stage. One thread asks in the same order every time: of `runs` the shortest time counts, so that what else
+    /// the machine does is left out.
+    fn longest_gap(&self, blend: BlendMode, runs: usize) -> (&'static str, Duration) {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+        let gaps = |_| {
+            let asked = Asked::new(usize::MAX);
+            pool.install(|| self.render(blend, &asked)).unwrap();
+            asked.gaps()
+        };
+        let all: Vec<Vec<(&'static str, Duration)>> = (0..runs).map(gaps).collect();
+        assert!(all.iter().all(|gaps| gaps.len() == all[0].len()), "the order of the questions is not the same");
+        let least =
+            (0..all[0].len()).map(|i| (all[0][i].0, all.iter().map(|gaps| gaps[i].1).min().unwrap_or_default()));
+        least.max_by_key(|(_, gap)| *gap).unwrap()
+    }
+}
+
+/// The bound on a machine that is not busy. Rows between two questions do not grow with the photographs; what does (the preview's averages, a photograph
+/// turned gray) is some ten nanoseconds a pixel.
+const BOUND: Duration = Duration::from_millis(200);
+
+#[test]
+fn no_stage_goes_on_for_long_without_asking() {
+    let set = Set::new(8, 1000);
+    for &(_, blend) in BlendMode::NAMES {
+        let (stage, gap) = set.longest_gap(blend, 3);
+        println!("{blend:?}: {} ms before a question of {stage}", gap.as_millis());
+        assert!(gap < BOUND / 2, "{blend:?}: {gap:?} before {stage}");
+    }
+}
+
+#[test]
+#[ignore = "8 photographs of 12 megapixels: a minute and 4 GB"]
+fn no_stage_of_large_photographs_goes_on_for_long_without_asking() {
+    let set = Set::new(8, 4000);
+    for &(_, blend) in BlendMode::NAMES {
+        let (stage, gap) = set.longest_gap(blend, 2);
+        println!("{blend:?}: {} ms before a question of {stage}", gap.as_millis());
+        assert!(gap < BOUND, "{blend:?}: {gap:?} before {stage}");
+    }
+}
+
+#[test]
+fn once_told_to_stop_no_thread_asks_more_than_once() {
+    let set = Set::new(4, 500);
+    let whole = Asked::new(usize::MAX);
+    set.render(BlendMode::Multiband, &whole).unwrap();
+    let asked = whole.count.into_inner();
+    for share in 1..20 {
+        let progress = Asked::new((asked * share / 20).max(1));
+        assert_eq!(set.render(BlendMode::Multiband, &progress), Err(RenderError::Cancelled(Cancelled)));
+        let count = progress.count.load(Ordering::Relaxed);
+        assert!(count <= progress.stop_at + rayon::current_num_threads(), "{count} after {}", progress.stop_at);
+    }
+}
