@@ -220,3 +220,22 @@ fn depth_by_a_rig_keeps_the_bits_of_the_photographs() {
     assert_eq!(cv_io::pfm::read(at("d.pfm")).unwrap().size(), (200, 150));
     assert_eq!(run(folder.path(), &["depth", "a.png", "b.png", "-o", "d.pfm", "--size", "200x150"]).code, Some(2));
 }
+
+#[test]
+fn a_picture_of_depths_is_in_millimeters_whatever_the_unit_of_the_rig() {
+    let folder = rig(false);
+    let at = |name: &str| folder.path().join(name);
+    let in_meters = cv_io::read_rig(at("rig.yaml"), None).unwrap();
+    let mut in_millimeters = RigFile { unit: "mm".to_owned(), ..in_meters };
+    in_millimeters.rig.right_from_left.translation *= 1000.0;
+    cv_io::write_rig(at("mm.yaml"), &in_millimeters, &[]).unwrap();
+    let depth = |rig: &str| {
+        let args = ["depth", "a.png", "b.png", "--rig", rig, "-o", "d.pfm", "--disparities", "64", "--depth", "z.png"];
+        done(folder.path(), &args);
+        cv_io::depth_mm::read(at("z.png")).unwrap()
+    };
+    let (m, mm) = (depth("rig.yaml"), depth("mm.yaml"));
+    // Steps of a millimeter, and rounding to either side of one.
+    let near = m.as_slice().iter().zip(mm.as_slice()).filter(|(a, b)| (**a - **b).abs() < 0.0015).count();
+    assert!(near * 100 > m.as_slice().len() * 99, "{near} of {}", m.as_slice().len());
+}

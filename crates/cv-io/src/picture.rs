@@ -251,16 +251,6 @@ pub fn read_mask(path: impl AsRef<Path>) -> Result<Mask, IoError> {
     Ok(read_gray_u8(path)?.map(|[v]| [v > 127]))
 }
 
-/// The focal length by the EXIF block of a picture, in pixels of the picture as [`read_image`] returns it.
-///
-/// # Errors
-/// As [`read_image`]: the picture's header must be readable.
-pub fn exif_focal(path: impl AsRef<Path>) -> Result<Option<crate::ExifFocal>, IoError> {
-    let path = path.as_ref();
-    let bytes = read_bytes(path)?;
-    header(&bytes).map_err(|reason| IoError::reading(path, reason)).map(|(_, exif)| exif.focal)
-}
-
 /// The size (after orientation) and EXIF facts of a picture, without decoding its pixels.
 ///
 /// # Errors

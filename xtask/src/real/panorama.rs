@@ -71,7 +71,11 @@ struct Figures {
 fn join(set: &str, paths: &[std::path::PathBuf]) -> Result<Figures> {
     let photos: Vec<(RgbU8, Option<f64>)> = paths
         .iter()
-        .map(|p| Ok((cv_io::read_rgb(p)?, cv_io::exif_focal(p)?.map(|f| f.pixels))))
+        .map(|p| {
+            let picture = cv_io::read_image(p)?;
+            let focal = picture.exif.focal.as_ref().map(|f| f.pixels);
+            Ok((picture.into_rgb8(), focal))
+        })
         .collect::<Result<_>>()?;
     let inputs: Vec<PanoramaPhoto<'_>> = photos
         .iter()

@@ -105,6 +105,18 @@ pub struct RigFile {
     pub unit: String,
 }
 
+impl RigFile {
+    /// Meters in one unit of the translation; `None` where the unit is none of m, cm and mm.
+    pub fn meters_per_unit(&self) -> Option<f64> {
+        match self.unit.trim() {
+            "m" => Some(1.0),
+            "cm" => Some(0.01),
+            "mm" => Some(0.001),
+            _ => None,
+        }
+    }
+}
+
 /// Parses a camera.
 ///
 /// Understood, by content: our own YAML (`schema: cv-camera/1`); OpenCV's FileStorage and ROS's `camera_info` YAML (under any of

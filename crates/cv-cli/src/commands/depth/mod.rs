@@ -38,7 +38,7 @@ pub(crate) use report::fractions;
     cv depth left right -o disparities\n  \
     cv depth left.jpg right.jpg --rig rig.yaml -o disparity.png --depth depth.png --report out\n\n\
     The ending of a file tells its format: .pfm (floats, +inf where unknown), .npy (floats, NaN), .png (disparity as KITTI's\n\
-    16-bit PNG, 256 steps a pixel; depth as 16-bit millimeters for a baseline in meters); 0 is unknown in both.")]
+    16-bit PNG, 256 steps a pixel; depth as 16-bit millimeters, where the baseline is in meters or the rig file tells its unit); 0 is unknown in both.")]
 pub(crate) struct Args {
     /// The left photograph, or a folder or quoted pattern ('left/*.png') of frames.
     left: PathBuf,
@@ -165,9 +165,13 @@ impl Run for Args {
         }
         let photos = Photos::read(&self.left, &self.right)?;
         let options = self.options();
-        let job = match &self.rig {
+        // A baseline that is given by itself counts as one in meters.
+        let (job, meters) = match &self.rig {
             Some(path) => self.by_rig(path, &photos, &options, context)?,
-            None => self.rectified(photos, &options, context)?,
+            None => (self.rectified(photos, &options, context)?, 1.0),
+        };
+        let write_depth = |path: &Path, map: ImageView<'_, f32, 1>| {
+            cv_io::depth_mm::write(path, map.to_image().map(|[z]| [(f64::from(z) * meters) as f32]).view())
         };
         let DepthResult { map, depth, disparities, .. } = &job.maps;
         if self.disparities == Range::Auto {
@@ -178,11 +182,11 @@ impl Run for Args {
                 .warn(format!("{lost} disparities do not fit KITTI's range of 0 to 256 px and are stored as unknown"));
         }
         if let (Some(path), Some(depth)) = (&self.depth, depth)
-            && let Some(lost) = write_map(path, depth.view(), |path, map| cv_io::depth_mm::write(path, map))?
+            && let Some(lost) = write_map(path, depth.view(), write_depth)?
         {
             context.warn(format!("{lost} depths do not fit 0 to 65.535 m and are stored as unknown"));
         }
-        self.write_quality(&job.maps, context)?;
+        self.write_quality(&job.maps, write_depth, context)?;
         if let Some(path) = &self.cloud {
             cv_io::ply::write_cloud(path, &job.cloud, PlyEncoding::Binary)?;
         }
@@ -234,16 +238,17 @@ impl Args {
         Ok(RigDepthResult { images, maps, cloud })
     }
 
-    /// Rectifies and matches photographs of a rig.
+    /// Rectifies and matches photographs of a rig. Also tells how many meters its unit has.
     fn by_rig(
         &self,
         path: &Path,
         photos: &Photos,
         options: &DepthOptions,
         context: &Context,
-    ) -> Result<RigDepthResult, Failure> {
+    ) -> Result<(RigDepthResult, f64), Failure> {
         let [left, right] = photos.sizes();
-        let rig = rig::read(path, left, self.exchange)?.rig;
+        let file = rig::read(path, left, self.exchange)?;
+        let (meters, rig) = (file.meters_per_unit().unwrap_or(1.0), file.rig);
         rig::check_size(path, &self.left, left, &rig.left)?;
         rig::check_size(path, &self.right, right, &rig.right)?;
         let settings = RectifyOptions { size: self.size, ..RectifyOptions::default() };
@@ -254,12 +259,12 @@ impl Args {
         }
         let camera = &rectification.left.camera;
         self.say_memory(options, (camera.width, camera.height), context)?;
-        at_own_depth!(photos, |a, b| depth_by_rig(a, b, &rectification, options, context)).map_err(
-            |error| match error {
+        at_own_depth!(photos, |a, b| depth_by_rig(a, b, &rectification, options, context))
+            .map(|result| (result, meters))
+            .map_err(|error| match error {
                 DepthError::Rectify(error) => words::no_rectification(error, path, self.exchange),
                 error => words::no_depth(error, true),
-            },
-        )
+            })
     }
 
     /// Tells what matching will take, before it is asked for; of a range that is still to be found nothing can be told.
@@ -268,7 +273,12 @@ impl Args {
     }
 
     /// Confidence, origin and uncertainty, where asked for.
-    fn write_quality(&self, maps: &DepthResult, context: &Context) -> Result<(), Failure> {
+    fn write_quality(
+        &self,
+        maps: &DepthResult,
+        write_depth: impl FnOnce(&Path, ImageView<'_, f32, 1>) -> Result<usize, cv_io::IoError>,
+        context: &Context,
+    ) -> Result<(), Failure> {
         let DepthResult { map, confidence, sigma, .. } = maps;
         if let (Some(path), Some(confidence)) = (&self.confidence, confidence) {
             let gray = |path: &Path, map: ImageView<'_, f32, 1>| {
@@ -284,7 +294,7 @@ impl Args {
         }
         if let Some(path) = &self.uncertainty {
             let lost = match maps.depth_sigma() {
-                Some(bars) => write_map(path, bars.view(), |path, map| cv_io::depth_mm::write(path, map))?,
+                Some(bars) => write_map(path, bars.view(), write_depth)?,
                 None => write_map(path, sigma.view(), |path, map| cv_io::kitti::write(path, map))?,
             };
             if let Some(lost) = lost {
