@@ -2,6 +2,7 @@
 
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Point2, Point3, SMatrix, Vector2};
 
+use crate::Scaling;
 use crate::distortion::{Distortion, MAX_PARAMETERS};
 
 /// The most intrinsics a camera has: fx, fy, cx, cy, and the distortion's parameters.
@@ -174,22 +175,23 @@ impl Camera {
     /// number of pixels, [`Self::resized`] says what it shows to the last digit.
     pub fn scaled(&self, factor: f64) -> Self {
         let side = |n: usize| (n as f64 * factor).round() as usize;
-        self.stretched((side(self.width), side(self.height)), factor, factor)
+        self.stretched((side(self.width), side(self.height)), Scaling::uniform(factor))
     }
 
-    /// The same camera behind an image resized to `width × height`: the corners of the pictures meet, not the centers of their corner pixels.
+    /// The same camera behind an image resized to `width × height`: the edges of the pictures meet ([`Scaling`]).
     pub fn resized(&self, width: usize, height: usize) -> Self {
-        self.stretched((width, height), width as f64 / self.width as f64, height as f64 / self.height as f64)
+        self.stretched((width, height), Scaling::between((self.width, self.height), (width, height)))
     }
 
-    fn stretched(&self, (width, height): (usize, usize), x: f64, y: f64) -> Self {
+    fn stretched(&self, (width, height): (usize, usize), scaling: Scaling) -> Self {
+        let center = scaling.point(Point2::new(self.cx, self.cy));
         Self {
             width,
             height,
-            fx: self.fx * x,
-            fy: self.fy * y,
-            cx: (self.cx + 0.5) * x - 0.5,
-            cy: (self.cy + 0.5) * y - 0.5,
+            fx: self.fx * scaling.x,
+            fy: self.fy * scaling.y,
+            cx: center.x,
+            cy: center.y,
             distortion: self.distortion,
         }
     }

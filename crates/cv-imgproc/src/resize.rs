@@ -1,7 +1,7 @@
 //! Changing the size of an image.
 
 use crate::{Interpolation, Pixel, RemapOptions, WarpError, rows::for_rows_with, warp_with};
-use cv_core::{Image, ImageError, ImageView, Point2};
+use cv_core::{Image, ImageError, ImageView, Point2, Scaling};
 
 /// Resamples to `width × height`; the corners of the image areas match, so pixel center `x` comes from `(x + ½) w / width − ½` (as OpenCV's `resize`).
 ///
@@ -15,14 +15,13 @@ pub fn resize<T: Pixel, const C: usize>(
     height: usize,
     interpolation: Interpolation,
 ) -> Result<Image<T, C>, ImageError> {
-    let scale = |from: usize, to: usize| from as f64 / to.max(1) as f64;
-    let (sx, sy) = (scale(view.width(), width), scale(view.height(), height));
+    let to_source = Scaling::between((width.max(1), height.max(1)), view.size());
     let last = |n: usize| n.saturating_sub(1) as f64;
     let (last_x, last_y) = (last(view.width()), last(view.height()));
     let options = RemapOptions { interpolation, ..Default::default() };
     let result = warp_with(view, (width, height), &options, |x, y| {
-        let source = |v: usize, scale: f64, last: f64| ((v as f64 + 0.5) * scale - 0.5).clamp(0.0, last);
-        Some(Point2::new(source(x, sx, last_x), source(y, sy, last_y)))
+        let source = to_source.point(Point2::new(x as f64, y as f64));
+        Some(Point2::new(source.x.clamp(0.0, last_x), source.y.clamp(0.0, last_y)))
     });
     match result {
         Ok((image, _)) => Ok(image),

@@ -2,7 +2,7 @@
 
 use crate::asift::match_asift;
 use crate::{ModelKind, Progress, RobustOptions, estimate};
-use cv_core::{Cancelled, Correspondence, DMatch, ImageView, Keypoint, Point2, StageClock};
+use cv_core::{Cancelled, Correspondence, DMatch, ImageView, Keypoint, Point2, Scaling, StageClock};
 use cv_features::{
     DescriptorKind, FeatureError, Features, GuidedOptions, HarrisOptions, MatchError, MatchOptions, MopsOptions,
     PatchOptions, SiftOptions, TwoViewModel, anms, anms_square_covering, anms_tiled, describe_patches, harris,
@@ -387,14 +387,11 @@ pub(crate) fn match_reduced(
     let views = [0, 1].map(|i: usize| reduced[i].as_ref().map_or(photos[i], |r| r.view()));
     let mut matching = match_photos(views[0], views[1], options, progress)?;
     for ((features, view), photo) in matching.features.iter_mut().zip(&views).zip(&photos) {
-        let ratio = |a: usize, b: usize| a as f32 / b as f32;
-        let (x, y) = (ratio(photo.width(), view.width()), ratio(photo.height(), view.height()));
+        let scaling = Scaling::between(view.size(), photo.size());
         let points = features.described.keypoints.iter_mut();
         for point in points.chain(&mut features.candidates) {
-            // The corners of the pictures meet, not the centers of their corner pixels.
-            point.position.x = (point.position.x + 0.5) * x - 0.5;
-            point.position.y = (point.position.y + 0.5) * y - 0.5;
-            point.scale *= (x * y).sqrt();
+            point.position = scaling.point_f32(point.position);
+            point.scale *= scaling.length() as f32;
         }
     }
     Ok(matching)

@@ -5,7 +5,7 @@ use crate::matching::{
     FeatureMethod, MatchingOptions, PhotoFeatures, correspondences, extract_features, match_features,
 };
 use cv_core::{
-    Camera, Cancelled, Correspondence, DMatch, Image, ImageView, Mask, Point2, RgbU8, Stage, StageClock, UnionFind,
+    Camera, Cancelled, Correspondence, DMatch, Image, ImageView, Mask, RgbU8, Scaling, Stage, StageClock, UnionFind,
 };
 use cv_features::{DescriptorKind, Descriptors, FeatureError, Features, MatchError, SiftOptions};
 use cv_panorama::{
@@ -161,10 +161,9 @@ const PARALLAX: f64 = 0.005;
 impl PanoramaResult {
     /// Where the matches of a pair are, in pixels of the photographs.
     pub fn correspondences(&self, pair: &PanoramaPair) -> Vec<Correspondence> {
-        let (fa, fb) = (self.reduced[pair.a], self.reduced[pair.b]);
-        let enlarge = |p: Point2<f64>, factor: f64| ((p.coords.add_scalar(0.5)) * factor).add_scalar(-0.5).into();
+        let [a, b] = [pair.a, pair.b].map(|i| Scaling::uniform(self.reduced[i]));
         let found = correspondences(&self.features[pair.a], &self.features[pair.b], &pair.matches);
-        found.iter().map(|c| Correspondence { a: enlarge(c.a, fa), b: enlarge(c.b, fb) }).collect()
+        found.iter().map(|c| Correspondence { a: a.point(c.a), b: b.point(c.b) }).collect()
     }
 
     /// Whether the photographs fit each other so badly that they must have been taken from different places: what is near may then be cut in two at the seams.

@@ -29,7 +29,7 @@ fn help() -> String {
         rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]   # x_right = rotation · x_left + translation\n  \
         translation: [-0.12, 0, 0]                    # the right camera stands 0.12 m to the right\n\
         A camera may also have a distortion:\n{}\n\
-        Or the file is OpenCV's YAML, with M1, D1, M2, D2, R and T in one.",
+        Or the file is OpenCV's YAML, with M1, D1, M2, D2, R and T in one, or Kalibr's camchain.yaml.",
         lenses.join("\n")
     )
 }
@@ -48,7 +48,7 @@ pub(crate) struct Args {
     left: PathBuf,
     /// The right (or lower) photograph.
     right: PathBuf,
-    /// Calibration of the rig: ours or OpenCV's YAML.
+    /// Calibration of the rig: ours, OpenCV's or Kalibr's YAML.
     #[arg(long, value_name = "FILE")]
     rig: PathBuf,
     /// The folder for the results; made where it is missing.

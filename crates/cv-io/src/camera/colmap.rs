@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use cv_core::{Camera, ColmapModel, Distortion, DistortionModel};
 
-use super::format::Format;
+use super::format::{Format, comments, no_lens};
 use crate::FormatError;
 
 const NAME: &str = "COLMAP camera";
@@ -58,10 +58,7 @@ pub(crate) fn model_line(camera: &Camera) -> Result<String, FormatError> {
     let (form, distortion) = models()
         .filter_map(held)
         .min_by_key(|(form, _)| form.focal_lengths + form.parameters)
-        .ok_or_else(|| FormatError::NotRepresentable {
-            format: NAME,
-            what: format!("a lens of the model {}", camera.distortion.model().info().name),
-        })?;
+        .ok_or_else(|| no_lens(camera, NAME))?;
     let mut line = format!("{} {} {}", form.name, camera.width, camera.height);
     let focal = [camera.fx, camera.fy];
     let center = [camera.cx + CENTER, camera.cy + CENTER];
@@ -72,7 +69,7 @@ pub(crate) fn model_line(camera: &Camera) -> Result<String, FormatError> {
 }
 
 fn camera_text(camera: &Camera, notes: &[&str]) -> Result<String, FormatError> {
-    let mut text = super::format::comments(notes);
+    let mut text = comments(notes);
     let _ = writeln!(text, "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 {}", model_line(camera)?);
     Ok(text)
 }

@@ -1,6 +1,6 @@
 //! What a calibration format is: the interface that each format's file fills in.
 
-use cv_core::Camera;
+use cv_core::{Camera, Distortion, DistortionModel};
 
 use super::RigFile;
 use crate::FormatError;
@@ -27,6 +27,24 @@ pub(super) struct Format {
     pub(super) camera_text: Option<Write<Camera>>,
     /// Writes a rig of valid cameras and a finite motion, where the format is written.
     pub(super) rig_text: Option<Write<RigFile>>,
+}
+
+/// A camera's lens by the smallest of the lens models that a format has.
+pub(super) fn smallest(
+    camera: &Camera,
+    format: &'static str,
+    models: impl Iterator<Item = DistortionModel>,
+) -> Result<Distortion, FormatError> {
+    let held = models.filter_map(|model| camera.distortion.converted(model));
+    held.min_by_key(|distortion| distortion.parameters().len()).ok_or_else(|| no_lens(camera, format))
+}
+
+/// A format does not have a camera's lens.
+pub(super) fn no_lens(camera: &Camera, format: &'static str) -> FormatError {
+    FormatError::NotRepresentable {
+        format,
+        what: format!("a lens of the model {}", camera.distortion.model().info().name),
+    }
 }
 
 /// Notes as lines of comments.

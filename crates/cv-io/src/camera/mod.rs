@@ -9,6 +9,7 @@
 
 mod colmap;
 mod format;
+mod kalibr;
 mod matrix;
 mod opencv;
 mod own;
@@ -25,10 +26,9 @@ use crate::{FormatError, IoError};
 use format::Format;
 
 /// The table of formats, in the order in which a text is tried: the particular before the general.
-const FORMATS: &[&Format] = &[&own::FORMAT, &colmap::FORMAT, &matrix::FORMAT, &opencv::FORMAT];
+const FORMATS: &[&Format] = &[&own::FORMAT, &kalibr::FORMAT, &colmap::FORMAT, &matrix::FORMAT, &opencv::FORMAT];
 
-const EXPECTED: &str =
-    "a camera: YAML (ours, OpenCV's or ROS's), a COLMAP camera line, or the nine numbers of a calibration matrix";
+const EXPECTED: &str = "a camera: YAML (ours, OpenCV's, ROS's or Kalibr's), a COLMAP camera line, or the nine numbers of a calibration matrix";
 
 /// A format of calibration files.
 #[derive(Clone, Copy)]
@@ -120,7 +120,7 @@ impl RigFile {
 /// Parses a camera.
 ///
 /// Understood, by content: our own YAML (`schema: cv-camera/1`); OpenCV's FileStorage and ROS's `camera_info` YAML (under any of
-/// their usual names for the matrix and the coefficients); a COLMAP camera, as in `cameras.txt` (`1 SIMPLE_RADIAL 640 480 …`), alone or
+/// their usual names for the matrix and the coefficients); the first camera of Kalibr's `camchain.yaml`; a COLMAP camera, as in `cameras.txt` (`1 SIMPLE_RADIAL 640 480 …`), alone or
 /// behind `# camera:`; a calibration matrix of three rows of three numbers.
 ///
 /// COLMAP's principal points have pixel centers at +0.5 and are brought to ours, at integers; all others are taken as they are.
@@ -153,13 +153,14 @@ pub fn write_camera(path: impl AsRef<Path>, camera: &Camera, notes: &[&str]) -> 
     write_bytes(path, text.as_bytes())
 }
 
-/// Parses a stereo rig: our own YAML (`schema: cv-rig/1`) or OpenCV's, with both cameras, R and T in one file.
+/// Parses a stereo rig: our own YAML (`schema: cv-rig/1`); OpenCV's, with both cameras, R and T in one file; the first two cameras of
+/// Kalibr's `camchain.yaml`.
 ///
 /// # Errors
 /// As [`parse_camera`]; also where R is not a rotation to within 1e-3.
 pub fn parse_rig(text: &str, size: Option<(usize, usize)>) -> Result<RigFile, FormatError> {
     let Some(read) = format_of(text)?.rig else {
-        return Err(FormatError::UnknownFormat { expected: "a stereo rig: YAML, ours or OpenCV's" });
+        return Err(FormatError::UnknownFormat { expected: "a stereo rig: YAML, ours, OpenCV's or Kalibr's" });
     };
     let file = read(text, size)?;
     checked(file.rig.left)?;

@@ -8,7 +8,7 @@ use std::fmt::Write as _;
 use cv_core::{Camera, Distortion, DistortionModel, LensProjection, StereoRig};
 use saphyr::Yaml;
 
-use super::format::{Format, comments};
+use super::format::{Format, comments, smallest};
 use super::matrix::pinhole;
 use super::yaml::{get, load, number, numbers, pose, required, size_of};
 use super::{RigFile, no_size};
@@ -228,12 +228,7 @@ fn push_projection(text: &mut String, camera: &Camera) {
 }
 
 fn push_lens(text: &mut String, camera: &Camera, [matrix, coefficients]: [&str; 2]) -> Result<(), FormatError> {
-    let info = camera.distortion.model().info();
-    let held = lenses(info.projection).filter_map(|m| camera.distortion.converted(m));
-    let Some(distortion) = held.min_by_key(|d| d.parameters().len()) else {
-        let what = format!("a lens of the model {}", info.name);
-        return Err(FormatError::NotRepresentable { format: NAME, what });
-    };
+    let distortion = smallest(camera, NAME, lenses(camera.distortion.model().info().projection))?;
     push_matrix(text, matrix, 3, camera.matrix().transpose().as_slice());
     push_matrix(text, coefficients, 1, distortion.parameters());
     Ok(())

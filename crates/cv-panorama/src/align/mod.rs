@@ -9,7 +9,7 @@ mod view;
 pub(crate) use straighten::turn;
 pub use view::View;
 
-use cv_core::{Camera, Cancelled, Correspondence, Point2, Progress, Stage};
+use cv_core::{Camera, Cancelled, Correspondence, Progress, Scaling, Stage};
 use cv_geometry::VerifiedPair;
 use group::Group;
 
@@ -181,7 +181,7 @@ impl Alignment {
             }
         }
         let factor = |i: usize| sizes.get(i).map_or(1.0, |s| s.0);
-        let place = |p: Point2<f64>, f: f64| Point2::from((p.coords.add_scalar(0.5) * f).add_scalar(-0.5));
+        let place = |p, f| Scaling::uniform(f).point(p);
         for pair in &mut out.pairs {
             let (fa, fb) = (factor(pair.a), factor(pair.b));
             pair.rms_px *= 0.5 * (fa + fb);
@@ -256,7 +256,7 @@ pub fn align(
 mod tests {
     use super::*;
     use crate::testing::StopAt;
-    use cv_core::{Matrix3, Silent, Vector3};
+    use cv_core::{Matrix3, Point2, Silent, Vector3};
     use nalgebra::Rotation3;
 
     /// Views turned by these yaws, pitches and rolls, at a focal length.

@@ -3,7 +3,7 @@
 use crate::blend::NO_PHOTO;
 use crate::rows::for_each_row;
 use crate::surface::WarpedPhoto;
-use cv_core::{Cancelled, Image, Stage};
+use cv_core::{Cancelled, Image, Scaling, Stage};
 
 /// Labels of a canvas of `size`, `step` times as large as theirs: interpolated so that seams are smooth, where the photograph reaches; else another that
 /// reaches.
@@ -21,7 +21,7 @@ pub(crate) fn upsample(
     let (cw, ch) = coarse.size();
     // The preview pixel at or before a canvas pixel, and how far behind it that lies.
     let place = |v: usize, n: usize| {
-        let t = ((v as f32 + 0.5) / step as f32 - 0.5).max(0.0);
+        let t = Scaling::coordinate(v as f64, 1.0 / step as f64).max(0.0) as f32;
         let i = (t as usize).min(n - 1);
         (i, (i + 1).min(n - 1), t - i as f32)
     };

@@ -1,7 +1,7 @@
 //! Fields of displacements, and with them where in its photograph each pixel of a panorama comes from.
 
 use crate::surface::{Bounds, Layout, Placement, Surface};
-use cv_core::{Point2, Vector2};
+use cv_core::{Point2, Scaling, Vector2};
 
 /// Displacements of one photograph on a grid over its part of the canvas.
 #[derive(Debug, Clone, PartialEq)]
@@ -56,7 +56,7 @@ impl DisplacementField {
 
     /// The same field on a canvas and a photograph of other sizes.
     pub(crate) fn scaled(&self, canvas: f64, photo: f64) -> Self {
-        let place = |v: f64| (v + 0.5) * canvas - 0.5;
+        let place = |v: f64| Scaling::coordinate(v, canvas);
         Self {
             left: place(self.left),
             top: place(self.top),

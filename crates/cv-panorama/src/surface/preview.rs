@@ -5,7 +5,7 @@ use crate::rows::asks;
 use crate::surface::{
     Bounds, DisplacementField, ExposureCorrection, Layout, Map, Placement, Surface, WarpSettings, WarpedPhoto, warp,
 };
-use cv_core::{Cancelled, Image, ImageView, Point2, Progress, RgbU8, Stage};
+use cv_core::{Cancelled, Image, ImageView, Progress, RgbU8, Scaling, Stage};
 use cv_imgproc::Interpolation;
 use rayon::prelude::*;
 
@@ -81,8 +81,8 @@ impl Preview {
         let small: Vec<Option<RgbU8>> = photos.par_iter().enumerate().map(small).collect::<Result<_, Cancelled>>()?;
         let draw = |(k, p): (usize, &Placement)| {
             let Some(Some(photo)) = small.get(p.photo) else { return Ok(None) };
-            // Pixel centers at integers: the middle of a step × step block of canvas pixels.
-            let origin = p.origin.coords * s - nalgebra::Vector2::repeat(0.5 * s - 0.5);
+            // Where the surface's origin lies among the canvas pixels is −origin.
+            let origin = -Scaling::uniform(s).point(-p.origin);
             let bounds = Bounds {
                 left: p.bounds.left / step,
                 top: p.bounds.top / step,
@@ -91,7 +91,7 @@ impl Preview {
             };
             let field = fields.get(k).and_then(Option::as_ref).map(|f| f.scaled(s, 1.0 / shrink as f64));
             let view = shrunk_view(p, shrink, photo);
-            let small = Placement { view, bounds, origin: Point2::from(origin), ..*p };
+            let small = Placement { view, bounds, origin, ..*p };
             let settings = WarpSettings {
                 displacement: field.as_ref(),
                 interpolation: Interpolation::Bilinear,
@@ -178,7 +178,7 @@ mod tests {
     use super::*;
     use crate::surface::{Canvas, Projection};
     use crate::testing::stage;
-    use cv_core::{Camera, Matrix3, Silent};
+    use cv_core::{Camera, Matrix3, Point2, Silent};
 
     #[test]
     fn the_preview_is_the_canvas_averaged() {

@@ -2,7 +2,7 @@
 
 use super::words;
 use crate::frame::Failure;
-use cv_core::{Correspondence, Point2, RgbU8};
+use cv_core::{Correspondence, Point2, RgbU8, Scaling};
 use cv_pipeline::PanoramaResult;
 use cv_report::{Figure, MatchStyle, Note, Report, draw_matches, shrink_to_fit};
 use std::path::PathBuf;
@@ -58,10 +58,7 @@ pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResul
     for pair in accepted.take(PAIRS) {
         let (photo_a, photo_b) = (&photos[pair.a], &photos[pair.b]);
         let (a, b) = (shrink_to_fit(photo_a.view(), 700), shrink_to_fit(photo_b.view(), 700));
-        let at = |p: Point2<f64>, photo: &RgbU8, small: &RgbU8| {
-            let (x, y) = (small.width() as f64 / photo.width() as f64, small.height() as f64 / photo.height() as f64);
-            Point2::new((p.x + 0.5) * x - 0.5, (p.y + 0.5) * y - 0.5)
-        };
+        let at = |p: Point2<f64>, photo: &RgbU8, small: &RgbU8| Scaling::between(photo.size(), small.size()).point(p);
         let matches: Vec<Correspondence> = result
             .correspondences(pair)
             .iter()

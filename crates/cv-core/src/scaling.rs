@@ -1,0 +1,81 @@
+//! The half-pixel rule.
+
+use nalgebra::Point2;
+
+/// What becomes of positions when a picture is resized.
+///
+/// The edges of the pictures meet, not the centers of their corner pixels: with pixel centers at integers, a picture of width `w` covers
+/// −½ … w − ½, and so `x` becomes `(x + ½) s − ½`. This type is the one place where that is written; cameras follow it by
+/// [`crate::Camera::scaled`] and [`crate::Camera::resized`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Scaling {
+    /// Width of the result over that of the original.
+    pub x: f64,
+    /// Height of the result over that of the original.
+    pub y: f64,
+}
+
+impl Scaling {
+    /// By the same factor in both directions.
+    pub const fn uniform(factor: f64) -> Self {
+        Self { x: factor, y: factor }
+    }
+
+    /// From pictures of one size, width and height, to those of another. Not finite where `from` is empty.
+    pub fn between(from: (usize, usize), to: (usize, usize)) -> Self {
+        Self { x: to.0 as f64 / from.0 as f64, y: to.1 as f64 / from.1 as f64 }
+    }
+
+    /// Back from the result to the original.
+    pub fn inverse(&self) -> Self {
+        Self { x: 1.0 / self.x, y: 1.0 / self.y }
+    }
+
+    /// What becomes of lengths without a direction: the geometric mean of both factors.
+    pub fn length(&self) -> f64 {
+        (self.x * self.y).sqrt()
+    }
+
+    /// One coordinate of a position, scaled by `factor`.
+    #[inline(always)]
+    pub fn coordinate(v: f64, factor: f64) -> f64 {
+        (v + 0.5) * factor - 0.5
+    }
+
+    /// Where a position of the original lies in the result.
+    #[inline(always)]
+    pub fn point(&self, p: Point2<f64>) -> Point2<f64> {
+        Point2::new(Self::coordinate(p.x, self.x), Self::coordinate(p.y, self.y))
+    }
+
+    /// As [`Self::point`], for positions in single precision.
+    #[inline(always)]
+    pub fn point_f32(&self, p: Point2<f32>) -> Point2<f32> {
+        self.point(p.cast()).cast()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn edges_meet_and_a_pixel_of_half_the_size_lies_between_four() {
+        let halved = Scaling::between((640, 480), (320, 240));
+        assert_eq!(halved, Scaling::uniform(0.5));
+        for edge in [-0.5, 639.5] {
+            assert_eq!(halved.point(Point2::new(edge, -0.5)).x, if edge < 0.0 { -0.5 } else { 319.5 });
+        }
+        // The pixels 0 and 1 become pixel 0: its center is between theirs.
+        assert_eq!(halved.point(Point2::new(0.5, 1.0)), Point2::new(0.0, 0.25));
+        assert_eq!(halved.point_f32(Point2::new(0.5, 1.0)), Point2::new(0.0, 0.25));
+    }
+
+    #[test]
+    fn the_inverse_leads_back() {
+        let scaling = Scaling::between((641, 479), (100, 75));
+        let p = Point2::new(17.25, 401.0);
+        // Six roundings of numbers below a thousand.
+        assert!((scaling.inverse().point(scaling.point(p)) - p).norm() < 1e-12);
+    }
+}
