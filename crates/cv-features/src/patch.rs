@@ -6,7 +6,7 @@
 use crate::descriptors::{DescriptorKind, Descriptors, DropReason, Dropped, Features};
 use crate::error::{FeatureError, check_image};
 use cv_core::{GrayF32, ImageView, Keypoint, OptionError};
-use cv_imgproc::gaussian_blur;
+use cv_imgproc::{bilinear_at, gaussian_blur};
 use rayon::prelude::*;
 
 /// Samples on a side of a patch.
@@ -14,6 +14,8 @@ pub(crate) const SIDE: usize = 8;
 
 /// Settings of [`describe_patches`].
 #[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
 pub struct PatchOptions {
     /// Side of the window in pixels; its 64 samples lie `window / 8` apart. 8 to 400; default 40 (Brown, Szeliski & Winder).
     pub window: f32,
@@ -91,11 +93,8 @@ fn patch(smooth: &GrayF32, keypoint: &Keypoint, options: &PatchOptions) -> Resul
     let mut values = [0.0f32; SIDE * SIDE];
     for (j, out) in values.chunks_exact_mut(SIDE).enumerate() {
         let (row, fy) = place(y, j, h);
-        let (top, bottom) = (smooth.row(row), smooth.row(row + 1));
         for (o, (column, fx)) in out.iter_mut().zip(columns) {
-            let a = top[column] + fx * (top[column + 1] - top[column]);
-            let b = bottom[column] + fx * (bottom[column + 1] - bottom[column]);
-            *o = a + fy * (b - a);
+            [*o] = bilinear_at(smooth.view(), column, row, fx, fy);
         }
     }
     normalize(&mut values, options.min_deviation)?;

@@ -1,7 +1,7 @@
 //! A Gaussian pyramid with several scales per octave, for corners and patches of any size.
 
 use cv_core::{Cancelled, GrayF32, ImageView, Progress, Stage};
-use cv_imgproc::gaussian_blur;
+use cv_imgproc::{bilinear_at, gaussian_blur};
 use rayon::prelude::*;
 use std::iter::successors;
 
@@ -74,10 +74,7 @@ impl Level {
             (cell, v - cell as f32)
         };
         let ((column, fx), (row, fy)) = (place(x, w), place(y, h));
-        let (top, bottom) = (self.image.row(row), self.image.row(row + 1));
-        let a = top[column] + fx * (top[column + 1] - top[column]);
-        let b = bottom[column] + fx * (bottom[column + 1] - bottom[column]);
-        a + fy * (b - a)
+        bilinear_at(self.image.view(), column, row, fx, fy)[0]
     }
 
     /// σ² times the Laplacian, at a position in input pixels.

@@ -1,4 +1,4 @@
-//! Values between pixels.
+//! Values between pixels: the one place of the workspace where they are found.
 
 use crate::Pixel;
 use cv_core::ImageView;
@@ -44,9 +44,11 @@ fn sampled<T: Pixel, const C: usize>(
     Some(at(view, ix, iy, fx, fy))
 }
 
-/// Bilinear interpolation from the base pixel `(ix, iy)` by the fractions `fx`, `fy`.
+/// Bilinear interpolation from the base pixel `(ix, iy)`, which lies in the image, by the fractions `fx`, `fy` in 0 to 1; see [`sample_bilinear`].
+///
+/// For loops that place their samples themselves.
 #[inline(always)]
-pub(crate) fn bilinear_at<T: Pixel, const C: usize>(
+pub fn bilinear_at<T: Pixel, const C: usize>(
     view: ImageView<'_, T, C>,
     ix: usize,
     iy: usize,
@@ -82,26 +84,36 @@ fn keys(t: f32) -> [f32; 4] {
     [0.5 * (-t3 + 2.0 * t2 - t), 0.5 * (3.0 * t3 - 5.0 * t2 + 2.0), 0.5 * (-3.0 * t3 + 4.0 * t2 + t), 0.5 * (t3 - t2)]
 }
 
-/// Bicubic interpolation from the base pixel `(ix, iy)` by the fractions `fx`, `fy`.
+/// Bicubic interpolation from the base pixel `(ix, iy)`, which lies in the image, by the fractions `fx`, `fy` in 0 to 1; see [`sample_bicubic`].
+///
+/// For loops that place their samples themselves. Down the columns first, so that whole rows of samples are added up at once.
 #[inline(always)]
-pub(crate) fn bicubic_at<T: Pixel, const C: usize>(
+pub fn bicubic_at<T: Pixel, const C: usize>(
     view: ImageView<'_, T, C>,
     ix: usize,
     iy: usize,
     fx: f32,
     fy: f32,
 ) -> [f32; C] {
+    let (w, h) = view.size();
     let (wx, wy) = (keys(fx), keys(fy));
-    let columns: [usize; 4] = std::array::from_fn(|i| (ix + i).saturating_sub(1).min(view.width() - 1) * C);
-    let mut sum = [0.0; C];
+    let mut sums = [[0f32; C]; 4];
     for (j, wy) in wy.into_iter().enumerate() {
-        let row = view.row((iy + j).saturating_sub(1).min(view.height() - 1));
-        for (c, sum) in sum.iter_mut().enumerate() {
-            let along = columns.iter().zip(wx).map(|(x, wx)| wx * row[x + c].to_f32()).sum::<f32>();
-            *sum += wy * along;
+        let row = view.row((iy + j).saturating_sub(1).min(h - 1));
+        if ix >= 1 && ix + 2 < w {
+            for (sum, v) in sums.as_flattened_mut().iter_mut().zip(&row[(ix - 1) * C..(ix + 3) * C]) {
+                *sum += wy * v.to_f32();
+            }
+        } else {
+            for (i, sum) in sums.iter_mut().enumerate() {
+                let x = (ix + i).saturating_sub(1).min(w - 1) * C;
+                for (sum, v) in sum.iter_mut().zip(&row[x..x + C]) {
+                    *sum += wy * v.to_f32();
+                }
+            }
         }
     }
-    sum
+    std::array::from_fn(|c| wx[0] * sums[0][c] + wx[1] * sums[1][c] + wx[2] * sums[2][c] + wx[3] * sums[3][c])
 }
 
 #[cfg(test)]

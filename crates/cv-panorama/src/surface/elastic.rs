@@ -7,6 +7,7 @@
 use crate::align::Alignment;
 use crate::surface::{DisplacementField, Layout, PAD, PLACES, Placement, REACH, Surface, Template};
 use cv_core::{Cancelled, GrayU8, ImageView, Point2, Progress, Stage, Vector2};
+use cv_imgproc::bilinear_at;
 use rayon::prelude::*;
 
 /// Two placements' positions of one thing on the canvas, before anything is displaced.
@@ -307,7 +308,7 @@ fn patch(
         }
     }
     let side = 2 * half + 1;
-    let (width, pixels) = (photo.width(), photo.as_slice());
+    let (width, height) = photo.size();
     let (ux, uy) = (ux.cast::<f32>(), uy.cast::<f32>());
     let mut values = Vec::with_capacity(side * side);
     for j in 0..side {
@@ -315,12 +316,9 @@ fn patch(
         for i in 0..side {
             let at = start + ux * (i as f32 - half as f32);
             // Rounding to single precision may reach the last column or row.
-            let (x, y) = ((at.x as usize).min(width - 2), (at.y as usize).min(photo.height() - 2));
+            let (x, y) = ((at.x as usize).min(width - 2), (at.y as usize).min(height - 2));
             let (fx, fy) = (at.x - x as f32, at.y - y as f32);
-            let four = &pixels[y * width + x..][..width + 2];
-            let [a, b, c, d] = [four[0], four[1], four[width], four[width + 1]].map(f32::from);
-            let (top, bottom) = (a + (b - a) * fx, c + (d - c) * fx);
-            values.push(top + (bottom - top) * fy);
+            values.extend(bilinear_at(photo.view(), x, y, fx, fy));
         }
     }
     Some(values)

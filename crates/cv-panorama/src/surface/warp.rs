@@ -7,7 +7,7 @@ use crate::align::View;
 use crate::rows::for_each_row_with;
 use crate::surface::{Bounds, DisplacementField, Placement, Surface};
 use cv_core::{Cancelled, DistortionModel, Image, ImageView, Matrix3, Point2, Stage};
-use cv_imgproc::Interpolation;
+use cv_imgproc::{Interpolation, bicubic_at, bilinear_at};
 use fearless_simd::{Level, dispatch};
 
 /// A photograph drawn on a part of the canvas.
@@ -210,10 +210,9 @@ fn sample_row(
     vs: &[f32],
     row: &mut [u8],
     correction: ExposureCorrection,
-    sample: impl Fn(&Source<'_>, f32, f32) -> [f32; 3],
+    sample: impl Fn(ImageView<'_, u8, 3>, f32, f32) -> [f32; 3],
 ) {
-    let source = Source::new(photo);
-    let (right, bottom) = (source.right as f32, source.bottom as f32);
+    let (right, bottom) = ((photo.width() - 1) as f32, (photo.height() - 1) as f32);
     let corner = 4.0 / ((right + 1.0).powi(2) + (bottom + 1.0).powi(2));
     let flat = correction.vignetting == [0.0; 2];
     let (pixels, _) = row.as_chunks_mut::<4>();
@@ -228,27 +227,8 @@ fn sample_row(
             let lift = (r2 * (correction.vignetting[0] + r2 * correction.vignetting[1])).exp();
             gain = gain.map(|g| g * lift);
         }
-        let [r, g, b] = sample(&source, u, v);
+        let [r, g, b] = sample(photo, u, v);
         *pixel = [round(gain[0] * r), round(gain[1] * g), round(gain[2] * b), if inside { 255 } else { 0 }];
-    }
-}
-
-/// The photograph with what every sample needs worked out once.
-struct Source<'a> {
-    photo: ImageView<'a, u8, 3>,
-    right: usize,
-    bottom: usize,
-}
-
-impl<'a> Source<'a> {
-    fn new(photo: ImageView<'a, u8, 3>) -> Self {
-        Self { photo, right: photo.width() - 1, bottom: photo.height() - 1 }
-    }
-
-    fn pixel(&self, x: isize, y: isize) -> [f32; 3] {
-        let x = x.clamp(0, self.right as isize) as usize;
-        let y = y.clamp(0, self.bottom as isize) as usize;
-        self.photo.at(x, y).map(f32::from)
     }
 }
 
@@ -257,60 +237,28 @@ fn round(v: f32) -> u8 {
     (v + 0.5) as u8
 }
 
+/// The base pixel of a place inside the photograph, and the fractions beyond it.
 #[inline(always)]
-fn nearest(s: &Source<'_>, u: f32, v: f32) -> [f32; 3] {
-    s.photo.at((u + 0.5) as usize, (v + 0.5) as usize).map(f32::from)
-}
-
-#[inline(always)]
-fn bilinear(s: &Source<'_>, u: f32, v: f32) -> [f32; 3] {
+fn split(u: f32, v: f32) -> (usize, usize, f32, f32) {
     let (x, y) = (u as usize, v as usize);
-    let (x1, y1) = ((x + 1).min(s.right), (y + 1).min(s.bottom));
-    let (fx, fy) = (u - x as f32, v - y as f32);
-    let (top, bottom) = (s.photo.row(y), s.photo.row(y1));
-    std::array::from_fn(|c| {
-        let (a, b) = (f32::from(top[3 * x + c]), f32::from(top[3 * x1 + c]));
-        let (d, e) = (f32::from(bottom[3 * x + c]), f32::from(bottom[3 * x1 + c]));
-        let (t, l) = (a + (b - a) * fx, d + (e - d) * fx);
-        t + (l - t) * fy
-    })
-}
-
-/// Keys' weights with a = −0.5 for the pixels at −1, 0, 1, 2 from the floor.
-#[inline(always)]
-fn keys(t: f32) -> [f32; 4] {
-    let (t2, t3) = (t * t, t * t * t);
-    [0.5 * (-t3 + 2.0 * t2 - t), 0.5 * (3.0 * t3 - 5.0 * t2 + 2.0), 0.5 * (-3.0 * t3 + 4.0 * t2 + t), 0.5 * (t3 - t2)]
+    (x, y, u - x as f32, v - y as f32)
 }
 
 #[inline(always)]
-fn bicubic(s: &Source<'_>, u: f32, v: f32) -> [f32; 3] {
-    let (x, y) = (u as usize, v as usize);
-    let (wx, wy) = (keys(u - x as f32), keys(v - y as f32));
-    if x >= 1 && y >= 1 && x + 2 <= s.right && y + 2 <= s.bottom {
-        let start = 3 * (x - 1);
-        let mut sums = [0.0_f32; 12];
-        for (r, w) in wy.iter().enumerate() {
-            let row = &s.photo.row(y + r - 1)[start..start + 12];
-            for (sum, &p) in sums.iter_mut().zip(row) {
-                *sum += w * f32::from(p);
-            }
-        }
-        return std::array::from_fn(|c| {
-            wx[0] * sums[c] + wx[1] * sums[3 + c] + wx[2] * sums[6 + c] + wx[3] * sums[9 + c]
-        });
-    }
-    let (x, y) = (x as isize, y as isize);
-    let mut sum = [0.0_f32; 3];
-    for (r, wy) in wy.iter().enumerate() {
-        for (q, wx) in wx.iter().enumerate() {
-            let p = s.pixel(x + q as isize - 1, y + r as isize - 1);
-            for c in 0..3 {
-                sum[c] += wx * wy * p[c];
-            }
-        }
-    }
-    sum
+fn nearest(photo: ImageView<'_, u8, 3>, u: f32, v: f32) -> [f32; 3] {
+    photo.at((u + 0.5) as usize, (v + 0.5) as usize).map(f32::from)
+}
+
+#[inline(always)]
+fn bilinear(photo: ImageView<'_, u8, 3>, u: f32, v: f32) -> [f32; 3] {
+    let (x, y, fx, fy) = split(u, v);
+    bilinear_at(photo, x, y, fx, fy)
+}
+
+#[inline(always)]
+fn bicubic(photo: ImageView<'_, u8, 3>, u: f32, v: f32) -> [f32; 3] {
+    let (x, y, fx, fy) = split(u, v);
+    bicubic_at(photo, x, y, fx, fy)
 }
 
 #[cfg(test)]
