@@ -1,5 +1,6 @@
 //! Owned images.
 
+use crate::size::size_accessors;
 use crate::{ImageView, ImageViewMut};
 
 /// A channel value of an image.
@@ -118,29 +119,7 @@ impl<T: Sample, const C: usize> Image<T, C> {
         Ok(Self { data, width, height })
     }
 
-    /// Width in pixels.
-    #[inline]
-    pub fn width(&self) -> usize {
-        self.width
-    }
-
-    /// Height in pixels.
-    #[inline]
-    pub fn height(&self) -> usize {
-        self.height
-    }
-
-    /// Width and height in pixels.
-    #[inline]
-    pub fn size(&self) -> (usize, usize) {
-        (self.width, self.height)
-    }
-
-    /// True where there are no pixels.
-    #[inline]
-    pub fn is_empty(&self) -> bool {
-        self.data.is_empty()
-    }
+    size_accessors!();
 
     /// All samples, row after row.
     #[inline]

@@ -39,6 +39,7 @@ mod progress;
 mod quantile;
 mod rig;
 mod scaling;
+mod size;
 mod sparse_model;
 mod stage_clock;
 mod union_find;

@@ -1,5 +1,6 @@
 //! Borrowed, strided windows into images.
 
+use crate::size::size_accessors;
 use crate::{Image, Sample};
 
 /// A borrowed window: rows of `width × C` samples, `stride` samples apart.
@@ -28,29 +29,7 @@ impl<'a, T: Sample, const C: usize> ImageView<'a, T, C> {
         (stride >= row && data.len() >= needed).then_some(Self { data, width, height, stride })
     }
 
-    /// Width in pixels.
-    #[inline]
-    pub fn width(&self) -> usize {
-        self.width
-    }
-
-    /// Height in pixels.
-    #[inline]
-    pub fn height(&self) -> usize {
-        self.height
-    }
-
-    /// Width and height in pixels.
-    #[inline]
-    pub fn size(&self) -> (usize, usize) {
-        (self.width, self.height)
-    }
-
-    /// True where there are no pixels.
-    #[inline]
-    pub fn is_empty(&self) -> bool {
-        self.width == 0 || self.height == 0
-    }
+    size_accessors!();
 
     /// The samples of row `y`.
     ///
@@ -111,17 +90,7 @@ impl<'a, T: Sample, const C: usize> ImageViewMut<'a, T, C> {
         Self { data, width, height, stride }
     }
 
-    /// Width in pixels.
-    #[inline]
-    pub fn width(&self) -> usize {
-        self.width
-    }
-
-    /// Height in pixels.
-    #[inline]
-    pub fn height(&self) -> usize {
-        self.height
-    }
+    size_accessors!();
 
     /// The samples of row `y`.
     ///

@@ -81,7 +81,8 @@ fn wrong_matches_alone_have_no_model() {
                         refused += 1;
                     }
                     Err(error) => panic!("{model:?} {n}: {error}"),
-                    Ok((_, log_nfa)) => assert!(log_nfa < 0.0),
+                    // Of sets of wrong matches, a share of ε has a model with fewer than ε false alarms: none of 60 has one of a millionth.
+                    Ok((_, log_nfa)) => assert!(log_nfa > -6.0, "{model:?} {n}: {log_nfa}"),
                 }
             }
         }
@@ -105,8 +106,7 @@ fn few_right_matches_among_many_wrong_ones_are_no_chance() {
             match estimate(model, &m, seed) {
                 Err(EstimateError::NoConsensus { .. }) => lost += 1,
                 Err(error) => panic!("{model:?}: {error}"),
-                Ok((inliers, log_nfa)) => {
-                    assert!(log_nfa < 0.0);
+                Ok((inliers, _)) => {
                     found += usize::from(2 * inliers.iter().filter(|i| **i >= wrong).count() > right);
                 }
             }

@@ -222,7 +222,7 @@ impl Fit {
     ) -> Option<Self> {
         let settings = BundleOptions {
             refine_focal: options.intrinsics == Intrinsics::Unknown,
-            // Where it was found to bend; the search knows k1 only, and not to its last digit.
+            // Where it was found to distort; the search knows k1 only, and not to its last digit.
             refine_radial: !matches!(options.intrinsics, Intrinsics::Known(_)),
             ..BundleOptions::default()
         };

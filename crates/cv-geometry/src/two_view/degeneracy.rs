@@ -24,7 +24,7 @@ impl DegeneracyTest {
     ) -> Result<Self, Cancelled> {
         // Distances in two dimensions and two photographs, where the epipolar one is in one.
         let reach = 2.0 * options.robust.threshold;
-        let straight: Vec<Correspondence> = match cameras {
+        let undistorted: Vec<Correspondence> = match cameras {
             Some([a, b]) => pairs
                 .iter()
                 .map(|m| Correspondence { a: a.undistort_pixel(m.a), b: b.undistort_pixel(m.b) })
@@ -34,14 +34,14 @@ impl DegeneracyTest {
         };
         let robust = RobustOptions { threshold: reach, ..options.robust };
         let mut found = Self { planar: 0, calibrated: cameras.is_some(), turned: 0, degrees: 0.0 };
-        let h = match estimate_homography(&straight, &robust, progress) {
+        let h = match estimate_homography(&undistorted, &robust, progress) {
             Ok(h) => h,
             Err(EstimateError::Cancelled(stop)) => return Err(stop),
             Err(_) => return Ok(found),
         };
         found.planar = h.inliers.len();
         if let Some([a, b]) = cameras {
-            let on_plane: Vec<Correspondence> = h.inliers.iter().map(|&i| straight[i]).collect();
+            let on_plane: Vec<Correspondence> = h.inliers.iter().map(|&i| undistorted[i]).collect();
             let pinhole = |c: &Camera| Camera::pinhole(c.width, c.height, c.fx, c.fy, c.cx, c.cy);
             let (normalized, unit) = normalize_matches(&on_plane, &pinhole(a), &pinhole(b));
             if let Ok((rotation, share)) = rotation_between(&normalized, reach * unit) {

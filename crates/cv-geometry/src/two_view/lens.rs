@@ -11,7 +11,7 @@ use rayon::prelude::*;
 #[derive(Clone, Copy)]
 struct Lens {
     focal: [f64; 2],
-    bend: f64,
+    distortion: f64,
 }
 
 /// A lens, the pose that goes with it, and what each match loses by them.
@@ -49,10 +49,10 @@ const FAR: f64 = 0.405;
 
 /// Displacements of the corners that are tried: from the barrel of a wide angle to the pincushion of a long lens. The steps between them are
 /// narrowed down.
-const BENDS: [f64; 5] = [-0.09, -0.06, -0.03, 0.0, 0.03];
-/// Displacements that a search may end at: a fisheye bends more, and is no lens for this model. Without an end, forward motion, whose flow a
-/// bent lens can imitate, leads on and on.
-const BEND_RANGE: (f64, f64) = (-0.3, 0.15);
+const DISTORTIONS: [f64; 5] = [-0.09, -0.06, -0.03, 0.0, 0.03];
+/// Displacements that a search may end at: a fisheye distorts more, and is no lens for this model. Without an end, forward motion, whose flow a
+/// distorting lens can imitate, leads on and on.
+const DISTORTION_RANGE: (f64, f64) = (-0.3, 0.15);
 /// Most steps of a search; from the grid to the optimum it takes ten or so.
 const MAX_STEPS: usize = 40;
 /// Samples for each of them: enough to find a pose among half wrong matches, of five (the focal length given) or six; the right lens needs
@@ -68,34 +68,34 @@ pub(super) fn find_lens(
     robust: &RobustOptions,
     progress: &dyn Progress,
 ) -> Result<Option<Found>, Cancelled> {
-    let stage = Stage::new(progress, "lens", BENDS.len())?;
+    let stage = Stage::new(progress, "lens", DISTORTIONS.len())?;
     let search = Search { pairs, sizes, robust, stage: &stage };
     let free = given.is_none();
     let least = |trials: &[Trial]| trials.iter().min_by(|a, b| a.sum.total_cmp(&b.sum)).cloned();
-    let searched = |bend: &f64| -> Result<Option<Trial>, Cancelled> {
+    let searched = |distortion: &f64| -> Result<Option<Trial>, Cancelled> {
         let trial = match given {
-            Some(focal) => search.searched(Lens { focal, bend: *bend }),
-            None => search.searched_free(*bend),
+            Some(focal) => search.searched(Lens { focal, distortion: *distortion }),
+            None => search.searched_free(*distortion),
         }?;
         stage.add(1)?;
         Ok(trial)
     };
-    let trials: Vec<Option<Trial>> = BENDS.par_iter().map(searched).collect::<Result<_, _>>()?;
+    let trials: Vec<Option<Trial>> = DISTORTIONS.par_iter().map(searched).collect::<Result<_, _>>()?;
     let mut trials: Vec<Trial> = trials.into_iter().flatten().collect();
     let Some(first) = least(&trials) else { return Ok(None) };
     // From the best one's pose too: a search now and then ends elsewhere.
     for trial in &mut trials {
         stage.check()?;
-        let other = search.near(&first, trial.lens.bend, free);
+        let other = search.near(&first, trial.lens.distortion, free);
         if other.sum < trial.sum {
             *trial = other;
         }
     }
-    let straight = trials.iter().find(|t| t.lens.bend == 0.0).cloned();
-    let bent = search.narrow(least(&trials).unwrap_or(first), free)?;
-    let (best, bends) = match straight {
-        Some(straight) if !significantly_worse(&straight, &bent) => (straight, false),
-        _ => (bent, true),
+    let pinhole = trials.iter().find(|t| t.lens.distortion == 0.0).cloned();
+    let distorted = search.narrow(least(&trials).unwrap_or(first), free)?;
+    let (best, has_distortion) = match pinhole {
+        Some(pinhole) if !significantly_worse(&pinhole, &distorted) => (pinhole, false),
+        _ => (distorted, true),
     };
     let mut focal_range = 0.0f64;
     if free {
@@ -105,9 +105,9 @@ pub(super) fn find_lens(
             for k in 1..=8 {
                 stage.check()?;
                 let factor = 1.05f64.powf(direction * f64::from(k));
-                let lens = Lens { focal: best.lens.focal.map(|f| f * factor), bend: at.lens.bend };
+                let lens = Lens { focal: best.lens.focal.map(|f| f * factor), distortion: at.lens.distortion };
                 at = search.refined(lens, &at.pose);
-                if bends {
+                if has_distortion {
                     at = search.narrow(at, false)?;
                 }
                 if significantly_worse(&at, &best) {
@@ -146,8 +146,8 @@ impl Search<'_> {
             let (width, height) = self.sizes[i];
             let corner = 0.5 * (width as f64).hypot(height as f64) / lens.focal[i];
             let mut camera = Camera::from_focal(width, height, lens.focal[i]);
-            if lens.bend != 0.0 {
-                camera.distortion = Distortion::radial(lens.bend / (corner * corner), 0.0);
+            if lens.distortion != 0.0 {
+                camera.distortion = Distortion::radial(lens.distortion / (corner * corner), 0.0);
             }
             camera
         })
@@ -168,16 +168,16 @@ impl Search<'_> {
     }
 
     /// The best pose and focal length of a search with a distortion.
-    fn searched_free(&self, bend: f64) -> Result<Option<Trial>, Cancelled> {
-        let usable: Vec<_> = self.straightened(bend).into_iter().filter(Correspondence::is_finite).collect();
+    fn searched_free(&self, distortion: f64) -> Result<Option<Trial>, Cancelled> {
+        let usable: Vec<_> = self.undistorted(distortion).into_iter().filter(Correspondence::is_finite).collect();
         let options = RobustOptions { max_iterations: SAMPLES[1].min(self.robust.max_iterations), ..*self.robust };
         let found = unless_stopped(estimate_shared_focal_pose(&usable, &options, self.stage))?;
-        Ok(found.map(|found| self.refined_free(bend, &found.model)))
+        Ok(found.map(|found| self.refined_free(distortion, &found.model)))
     }
 
     /// A focal length far from the given one that is better beyond doubt.
     fn rival(&self, given: &Trial) -> Result<Option<Rival>, Cancelled> {
-        let Some(other) = self.searched_free(given.lens.bend)? else { return Ok(None) };
+        let Some(other) = self.searched_free(given.lens.distortion)? else { return Ok(None) };
         let usual = (given.lens.focal[0] * given.lens.focal[1]).sqrt();
         let focal = other.lens.focal[0];
         let deviations = worse_by(given, &other);
@@ -188,11 +188,11 @@ impl Search<'_> {
     }
 
     /// The best one near another with another distortion, the focal length too where it is free.
-    fn near(&self, other: &Trial, bend: f64, free: bool) -> Trial {
+    fn near(&self, other: &Trial, distortion: f64, free: bool) -> Trial {
         if free {
-            self.refined_free(bend, &SharedFocalPose { pose: other.pose, focal: other.lens.focal[0] })
+            self.refined_free(distortion, &SharedFocalPose { pose: other.pose, focal: other.lens.focal[0] })
         } else {
-            self.refined(Lens { bend, ..other.lens }, &other.pose)
+            self.refined(Lens { distortion, ..other.lens }, &other.pose)
         }
     }
 
@@ -207,18 +207,18 @@ impl Search<'_> {
     }
 
     /// The best pose and focal length near others.
-    fn refined_free(&self, bend: f64, start: &SharedFocalPose) -> Trial {
-        let matches = self.straightened(bend);
+    fn refined_free(&self, distortion: f64, start: &SharedFocalPose) -> Trial {
+        let matches = self.undistorted(distortion);
         let usable: Vec<_> = matches.iter().copied().filter(Correspondence::is_finite).collect();
         let (found, _) = refine_shared_focal_pose(start, &usable, self.robust.threshold);
-        let lens = Lens { focal: [found.focal; 2], bend };
+        let lens = Lens { focal: [found.focal; 2], distortion };
         trial(lens, found.pose, &found.fundamental(), &matches, self.robust.threshold)
     }
 
     /// Matches in pixels from the principal points with the distortion taken out: it is a share of the picture, whatever the focal length.
-    fn straightened(&self, bend: f64) -> Vec<Correspondence> {
+    fn undistorted(&self, distortion: f64) -> Vec<Correspondence> {
         let any = self.sizes[0].0.max(self.sizes[0].1) as f64;
-        let [a, b] = self.cameras(&Lens { focal: [any; 2], bend });
+        let [a, b] = self.cameras(&Lens { focal: [any; 2], distortion });
         let (normalized, _) = normalize_matches(self.pairs, &a, &b);
         normalized.into_iter().map(|m| Correspondence { a: m.a * any, b: m.b * any }).collect()
     }
@@ -231,9 +231,9 @@ impl Search<'_> {
                 break;
             }
             self.stage.check()?;
-            let bends =
-                [-1.0, 1.0].map(|sign| (best.lens.bend + 0.015 * sign * step).clamp(BEND_RANGE.0, BEND_RANGE.1));
-            let trials: Vec<Trial> = bends.par_iter().map(|bend| self.near(&best, *bend, free)).collect();
+            let distortions =
+                [-1.0, 1.0].map(|sign| (best.lens.distortion + 0.015 * sign * step).clamp(DISTORTION_RANGE.0, DISTORTION_RANGE.1));
+            let trials: Vec<Trial> = distortions.par_iter().map(|distortion| self.near(&best, *distortion, free)).collect();
             match trials.into_iter().min_by(|a, b| a.sum.total_cmp(&b.sum)) {
                 Some(trial) if trial.sum < best.sum => best = trial,
                 _ => step *= 0.5,

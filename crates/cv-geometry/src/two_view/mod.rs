@@ -16,6 +16,8 @@ use cv_core::{Camera, Correspondence, DMatch, Keypoint, Progress};
 
 /// What is known of the cameras.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 #[expect(clippy::large_enum_variant, reason = "there is one of it in a job")]
 pub enum Intrinsics {
     /// Both cameras are calibrated.
@@ -59,6 +61,8 @@ impl Intrinsics {
 
 /// Settings of [`reconstruct_two_views`].
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
 pub struct TwoViewOptions {
     /// What is known of the cameras. Default unknown.
     pub intrinsics: Intrinsics,
