@@ -26,6 +26,7 @@ pub enum CameraError {
 
 /// A camera: image size, pinhole intrinsics and lens distortion.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Camera {
     /// Image width in pixels.
     pub width: usize,

@@ -4,6 +4,7 @@ use nalgebra::Point2;
 
 /// A detected point, in the spirit of `cv::KeyPoint`.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Keypoint {
     /// Sub-pixel position, pixel centers at integers.
     pub position: Point2<f32>,
@@ -24,6 +25,7 @@ impl Keypoint {
 
 /// A match between descriptor `query` of a first set and descriptor `train` of a second one (`cv::DMatch`).
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct DMatch {
     /// Index in the first set.
     pub query: u32,
@@ -45,6 +47,7 @@ impl DMatch {
 
 /// The same scene point seen at `a` in a first image and at `b` in a second one, in pixels.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Correspondence {
     /// Position in the first image.
     pub a: Point2<f64>,

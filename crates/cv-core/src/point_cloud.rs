@@ -4,6 +4,8 @@ use crate::{Camera, Point3, Pose};
 
 /// Points, maybe with colors and normals, and line segments between them: what a PLY file holds.
 #[derive(Debug, Clone, PartialEq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
 pub struct PointCloud {
     /// Positions in the unit of the scene.
     pub positions: Vec<[f32; 3]>,

@@ -4,6 +4,7 @@ use nalgebra::{Matrix3x4, Point3, Rotation3, Vector3};
 
 /// A rigid motion from world to camera coordinates: `x_cam = R x_world + t`.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Pose {
     /// R, world to camera.
     pub rotation: Rotation3<f64>,

@@ -4,6 +4,7 @@ use crate::{Camera, Pose};
 
 /// A stereo rig: two cameras and where the right one stands.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct StereoRig {
     /// The left (or upper) camera.
     pub left: Camera,

@@ -4,6 +4,8 @@ use cv_core::Keypoint;
 
 /// What the numbers of a descriptor mean. Sets of different kinds are never compared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum DescriptorKind {
     /// 8×8 upright patches, zero mean and unit variance ([`describe_patches`](crate::describe_patches)).
     Patch,

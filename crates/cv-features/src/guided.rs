@@ -9,6 +9,8 @@ use rayon::prelude::*;
 
 /// The geometry of two views, in pixels.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum TwoViewModel {
     /// `b ~ H a`. The distance is that from `H a` to `b`.
     Homography(Matrix3<f64>),
@@ -18,6 +20,8 @@ pub enum TwoViewModel {
 
 /// Settings of [`match_guided`].
 #[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
 pub struct GuidedOptions {
     /// Largest distance from the geometry, in pixels. Above 0; default 2.
     pub threshold: f32,

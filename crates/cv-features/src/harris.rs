@@ -15,6 +15,8 @@ use std::ops::Range;
 
 /// What makes a pixel a corner, from the two eigenvalues λ₁ ≤ λ₂ of its structure tensor.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum CornerMeasure {
     /// λ₁λ₂ − k·(λ₁ + λ₂)² (Harris & Stephens).
     Harris {
@@ -29,6 +31,8 @@ cv_core::named!(CornerMeasure { Harris { k: 0.04 } = "harris", ShiTomasi = "shi-
 
 /// Settings of [`harris`].
 #[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
 pub struct HarrisOptions {
     /// The corner measure. Default Harris with `k` = 0.04.
     pub measure: CornerMeasure,

@@ -40,6 +40,8 @@ pub enum MatchError {
 
 /// In which measure the ratio of best to second-best is taken, and distances are reported.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum RatioMeasure {
     /// Sum of squared differences. 0.66 here is 0.81 on distances.
     #[default]
@@ -50,6 +52,8 @@ pub enum RatioMeasure {
 
 /// Settings of [`match_descriptors`].
 #[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
 pub struct MatchOptions {
     /// A match stays where best / second-best is below this; `None` keeps all. 0 to 1; default 0.66 on SSD (Brown & Lowe's 0.8 on distances, squared
     /// and rounded).

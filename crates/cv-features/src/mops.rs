@@ -16,6 +16,8 @@ use rayon::prelude::*;
 
 /// Settings of [`harris_laplace`].
 #[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
 pub struct MultiScaleOptions {
     /// The corner measure. Default Harris with `k` = 0.04.
     pub measure: CornerMeasure,
@@ -36,6 +38,8 @@ impl Default for MultiScaleOptions {
 
 /// Settings of [`mops`].
 #[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
 pub struct MopsOptions {
     /// Largest number of features; the strongest stay. 1 or more; default 2000.
     pub max_features: usize,

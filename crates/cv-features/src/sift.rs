@@ -18,6 +18,8 @@ use rayon::prelude::*;
 
 /// Settings of [`sift`].
 #[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
 pub struct SiftOptions {
     /// Largest number of features; those with the strongest contrast stay (or those of the largest scale, see `coarse_first`). 1 or
     /// more; default 8192 (COLMAP's).

@@ -5,6 +5,7 @@ use cv_core::Correspondence;
 
 /// A model and the matches that fit it.
 #[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct RobustModel<M> {
     /// The model.
     pub model: M,

@@ -14,6 +14,7 @@ use nalgebra::{SMatrix, SVector};
 
 /// A relative pose, and the focal length of both cameras.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct SharedFocalPose {
     /// First camera frame to second; the translation has length one.
     pub pose: Pose,

@@ -4,6 +4,8 @@ use cv_core::{Image, ImageView, Mask, Point2, UnionFind};
 
 /// Which pixels touch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Connectivity {
     /// Across sides.
     Four,

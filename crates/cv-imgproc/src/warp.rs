@@ -9,6 +9,8 @@ use cv_core::{Camera, CameraError, Image, ImageError, ImageView, Mask, Matrix3, 
 
 /// How values between pixels are found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Interpolation {
     /// The nearest pixel.
     Nearest,
@@ -21,6 +23,8 @@ pub enum Interpolation {
 
 /// What a pixel gets that maps outside the source.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Border {
     /// Zero.
     #[default]
@@ -33,6 +37,8 @@ pub enum Border {
 
 /// Options of the warps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
 pub struct RemapOptions {
     /// How values between pixels are found. Default bilinear.
     pub interpolation: Interpolation,

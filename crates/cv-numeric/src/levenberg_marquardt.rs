@@ -68,6 +68,8 @@ pub trait LeastSquares {
 
 /// When [`levenberg_marquardt`] stops, and how it starts.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
 pub struct LmOptions {
     /// Most linearizations. Default 25, where two-view problems have long converged.
     pub max_iterations: usize,

@@ -4,6 +4,8 @@
 ///
 /// `scale` is the residual, in its own unit, at which a loss starts to bend.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum RobustLoss {
     /// `ρ(s) = s`: plain least squares.
     #[default]

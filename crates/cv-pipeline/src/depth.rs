@@ -9,6 +9,8 @@ use cv_stereo::{
 
 /// Which disparities are tried.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum DisparityRange {
     /// Those of [`StereoOptions::min_disparity`] and [`StereoOptions::disparities`].
     #[default]
@@ -22,18 +24,37 @@ pub enum DisparityRange {
 
 /// Settings of [`depth`].
 #[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
 pub struct DepthOptions {
     /// Settings of the matcher.
     pub stereo: StereoOptions,
     /// Which disparities are tried. Default those of `stereo`.
     pub disparities: DisparityRange,
-    /// Nearest and farthest depth kept, in the unit of the baseline. Default 0 to infinity: all.
+    /// Nearest and farthest depth kept, in the unit of the baseline. Default 0 to infinity: all. (As data, a farthest depth of `null` is
+    /// infinity, which JSON does not know.)
+    #[cfg_attr(feature = "serde", serde(with = "open_range"))]
     pub range: (f32, f32),
 }
 
 impl Default for DepthOptions {
     fn default() -> Self {
         Self { stereo: StereoOptions::default(), disparities: DisparityRange::Given, range: (0.0, f32::INFINITY) }
+    }
+}
+
+/// A range whose upper end may be infinite, which is written as none.
+#[cfg(feature = "serde")]
+mod open_range {
+    use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+    pub(super) fn serialize<S: Serializer>(&(near, far): &(f32, f32), to: S) -> Result<S::Ok, S::Error> {
+        (near, far.is_finite().then_some(far)).serialize(to)
+    }
+
+    pub(super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<(f32, f32), D::Error> {
+        let (near, far) = <(f32, Option<f32>)>::deserialize(from)?;
+        Ok((near, far.unwrap_or(f32::INFINITY)))
     }
 }
 

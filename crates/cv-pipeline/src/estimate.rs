@@ -9,6 +9,8 @@ use cv_geometry::{
 
 /// Which model of two views.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum ModelKind {
     /// `b ~ H a`: a plane, or a camera that only turned. Residual: symmetric transfer error.
     Homography,
@@ -33,6 +35,7 @@ impl ModelKind {
 
 /// What [`estimate`] found.
 #[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub struct EstimateResult {
     /// The model and the matches that fit it.
     pub robust: RobustModel<Matrix3<f64>>,
@@ -91,6 +94,7 @@ pub fn prevailing_model(
 
 /// What [`estimate_calibrated`] found.
 #[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub struct CalibratedResult {
     /// The essential matrix (of normalized coordinates; singular values 1, 1, 0) and the matches that fit it, in pixels.
     pub robust: RobustModel<Matrix3<f64>>,

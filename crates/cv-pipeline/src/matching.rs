@@ -13,6 +13,8 @@ use cv_imgproc::{resize_area, rgb_to_gray_f32};
 
 /// Which features to find.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum FeatureMethod {
     /// Harris corners with upright 8×8 patches: fast, for neighboring frames of a film or a slowly turned camera.
     Harris,
@@ -31,6 +33,8 @@ cv_core::named!(FeatureMethod {
 
 /// The non-maximal suppression that spreads Harris corners over the photograph.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Suppression {
     /// By suppression radius (Brown, Szeliski & Winder).
     #[default]
@@ -49,6 +53,8 @@ cv_core::named!(Suppression {
 
 /// Whether [`match_photos`] also looks at affine-simulated views (ASIFT, Morel & Yu 2009), with SIFT only: some ten times the time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum AffineSimulation {
     /// Never.
     Never,
@@ -68,6 +74,8 @@ cv_core::named!(AffineSimulation {
 
 /// Settings of [`extract_features`] and [`match_photos`].
 #[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
 pub struct MatchingOptions {
     /// Which features. Default SIFT, which works on a stranger's photographs without knowing anything about them.
     pub method: FeatureMethod,

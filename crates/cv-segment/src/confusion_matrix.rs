@@ -6,6 +6,7 @@ use std::iter::Sum;
 
 /// Pixels counted by what was said about them and what they are; sums over photographs add up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct ConfusionMatrix {
     /// Marked, rightly.
     pub true_positives: u64,

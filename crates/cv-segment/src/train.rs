@@ -10,6 +10,8 @@ use cv_core::{Cancelled, ImageView, OptionError, Progress, Stage};
 
 /// Which regions of a mask are kept.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Regions {
     /// The largest only, where every training mask shows one region (that holds 95 % of what is marked); else all.
     #[default]
@@ -28,6 +30,8 @@ cv_core::named!(Regions {
 
 /// Settings of [`train`].
 #[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
 pub struct TrainOptions {
     /// Color space. Default HSV.
     pub space: ColorSpace,

@@ -6,6 +6,7 @@ use rayon::prelude::*;
 
 /// What turns disparities of a rectified pair into lengths.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct StereoGeometry {
     /// Focal length of both rectified cameras in px.
     pub focal: f64,

@@ -7,6 +7,7 @@ pub const BAD_THRESHOLDS: [f32; 4] = [0.5, 1.0, 2.0, 4.0];
 
 /// Errors over a set of pixels with known truth.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct DisparityScores {
     /// Pixels with known truth.
     pub pixels: usize,

@@ -5,6 +5,8 @@ use cv_core::OptionError;
 
 /// The neighborhood a pixel is described by: one bit per neighbor, set where it is darker than the center.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Census {
     /// 5×5, 24 bits: finest detail, least support in weak texture.
     Window5x5,
@@ -36,6 +38,8 @@ impl Census {
 /// What is added to the number of census bits in which two pixels differ, from the two pixels alone: sharper at the
 /// outlines of things than a window, but not indifferent to exposure.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum IntensityCost {
     /// Nothing.
     None,
@@ -74,6 +78,8 @@ impl IntensityCost {
 
 /// Along how many directions costs are aggregated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Paths {
     /// Horizontal and vertical, both ways: half the sums, 0.85 of the time, slightly streaky on slanted surfaces.
     Four,
@@ -85,6 +91,8 @@ cv_core::named!(Paths { Four = "4": "0.85 of the time, slightly streaky on slant
 
 /// How the disparity is placed between whole pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Subpixel {
     /// Whole pixels.
     None,
@@ -98,6 +106,8 @@ pub enum Subpixel {
 
 /// How disparities are smoothed along surfaces, with the left photograph as the guide.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Smoothing {
     /// Not at all.
     None,
@@ -126,6 +136,8 @@ cv_core::named!(Smoothing {
 
 /// Options of [`crate::StereoMatcher`]. Costs count census bits.
 #[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
 pub struct StereoOptions {
     /// Smallest disparity in px; may be negative. Default 0 (points at infinity of a rectified pair).
     pub min_disparity: i32,

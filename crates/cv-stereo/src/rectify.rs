@@ -15,6 +15,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Options of [`Rectification::new`].
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
 pub struct RectifyOptions {
     /// From 0, where both rectified images show the scene in every pixel, to 1, where they show every pixel of the
     /// originals. Default 0 (OpenCV's usual choice).
@@ -107,6 +109,7 @@ const MAX_TURN_DEGREES: f64 = 60.0;
 
 /// One view of a rectified rig.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct RectifiedView {
     /// The camera that took the original.
     pub source: Camera,
@@ -184,6 +187,7 @@ impl RectifiedView {
 
 /// A rectified rig: both views, and what makes depth of their disparities.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Rectification {
     /// The left (or upper) view.
     pub left: RectifiedView,

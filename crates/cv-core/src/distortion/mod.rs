@@ -27,6 +27,8 @@ mod radial_tangential5;
 mod range;
 mod rational8;
 mod simple_radial;
+#[cfg(feature = "serde")]
+mod stored;
 mod terms;
 mod thin_prism12;
 
@@ -127,6 +129,8 @@ pub struct ParameterCountError {
 
 /// Lens distortion, applied to normalized image coordinates `(x, y) = (X/Z, Y/Z)`: a model and its parameters.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(into = "stored::Stored", try_from = "stored::Stored"))]
 pub struct Distortion {
     model: DistortionModel,
     /// Zero beyond the model's count.

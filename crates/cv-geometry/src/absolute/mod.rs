@@ -19,6 +19,7 @@ use nalgebra::{Const, Matrix2x3, SVector};
 
 /// A point of the world and where a camera sees it, in normalized coordinates.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct WorldMatch {
     /// In the world's frame.
     pub world: Point3<f64>,

@@ -6,6 +6,7 @@ use cv_numeric::svd3;
 
 /// `b = scale · R a + t`.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Similarity {
     /// Above 0.
     pub scale: f64,

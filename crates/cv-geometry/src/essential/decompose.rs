@@ -71,6 +71,7 @@ pub(crate) fn in_front(r: &Matrix3<f64>, t: &Vector3<f64>, a: &Vector3<f64>, b: 
 
 /// The pose that puts most points in front of both cameras.
 #[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct RecoveredPose {
     /// First camera frame to second, translation of length one.
     pub pose: Pose,

@@ -4,6 +4,8 @@ use cv_core::OptionError;
 
 /// How the fit of a model to all matches is summed up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Scoring {
     /// The squared residual, cut off at the threshold (MSAC, Torr & Zisserman 2000).
     Msac,
@@ -14,6 +16,8 @@ pub enum Scoring {
 
 /// How samples are drawn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Sampling {
     /// Every sample is equally likely.
     #[default]
@@ -24,6 +28,8 @@ pub enum Sampling {
 
 /// Options of `estimate_homography`, `estimate_fundamental` and their siblings.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
 pub struct RobustOptions {
     /// Largest error of an inlier, in the unit of the matches (pixels). Above 0. Default 3, the usual value for
     /// homographies (OpenCV's `findHomography`); [`RobustOptions::fundamental`] has 1.

@@ -11,6 +11,8 @@ use std::ops::ControlFlow;
 
 /// When [`Adjustment::solve`] stops, and how it starts.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
 pub struct AdjustOptions {
     /// Most linearizations. Default 100, that of COLMAP.
     pub max_iterations: usize,

@@ -10,6 +10,8 @@ use rayon::prelude::*;
 
 /// Settings of [`reconstruct_dense`].
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
 pub struct DenseOptions {
     /// Photographs whose longer side is above this are reduced to it first, in pixels. 32 or more; default 1600: a million points or so, and
     /// half a gigabyte of costs. (COLMAP matches at 2000.)

@@ -19,6 +19,8 @@ use cv_geometry::{
 
 /// Settings of [`reconstruct`].
 #[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
 pub struct ReconstructOptions {
     /// Features and matches. Default as of [`MatchingOptions`], but the coarsest SIFT features are kept, not the strongest.
     pub matching: MatchingOptions,
