@@ -231,9 +231,10 @@ impl Search<'_> {
                 break;
             }
             self.stage.check()?;
-            let distortions =
-                [-1.0, 1.0].map(|sign| (best.lens.distortion + 0.015 * sign * step).clamp(DISTORTION_RANGE.0, DISTORTION_RANGE.1));
-            let trials: Vec<Trial> = distortions.par_iter().map(|distortion| self.near(&best, *distortion, free)).collect();
+            let distortions = [-1.0, 1.0]
+                .map(|sign| (best.lens.distortion + 0.015 * sign * step).clamp(DISTORTION_RANGE.0, DISTORTION_RANGE.1));
+            let trials: Vec<Trial> =
+                distortions.par_iter().map(|distortion| self.near(&best, *distortion, free)).collect();
             match trials.into_iter().min_by(|a, b| a.sum.total_cmp(&b.sum)) {
                 Some(trial) if trial.sum < best.sum => best = trial,
                 _ => step *= 0.5,
