@@ -1,5 +1,5 @@
 //! Learns the colors of a ball from four photographs with masks, and finds it in two others.
-use cv_core::Camera;
+use cv_core::{Camera, Silent};
 use cv_segment::{ConfusionMatrix, TrainOptions, train};
 use cv_synth::{RenderOptions, ball_photos};
 
@@ -8,9 +8,9 @@ pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
     let labeled: Vec<_> = photos.iter().map(|p| (p.view.image.view(), p.mask.view())).collect();
     let (known, new) = labeled.split_at(4);
 
-    let model = train(known, &TrainOptions::default())?.model;
+    let model = train(known, &TrainOptions::default(), &Silent)?.model;
     for (photo, truth) in new {
-        let mask = model.predict(*photo);
+        let mask = model.predict(*photo, &Silent)?;
         let scores = ConfusionMatrix::new(mask.view(), *truth)?;
         println!("precision {:.3}, recall {:.3}, F1 {:.3}", scores.precision(), scores.recall(), scores.f1());
     }

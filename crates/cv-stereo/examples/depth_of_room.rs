@@ -1,5 +1,5 @@
 //! Depth and a point cloud from a rectified pair, against the truth.
-use cv_core::Camera;
+use cv_core::{Camera, Silent};
 use cv_stereo::{StereoGeometry, StereoMatcher, StereoOptions, evaluate_disparity};
 use cv_synth::{RenderOptions, Scene, stereo_pair};
 
@@ -8,7 +8,7 @@ pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
     let pair = stereo_pair(&scene, &camera, &scene.viewpoint(), 0.25, &RenderOptions::default())?;
 
     let mut matcher = StereoMatcher::new(StereoOptions { disparities: 64, ..StereoOptions::default() })?;
-    let map = matcher.compute(pair.left.image.view(), pair.right.image.view())?;
+    let map = matcher.compute(pair.left.image.view(), pair.right.image.view(), &Silent)?;
     let scores = evaluate_disparity(map.disparity.view(), pair.disparity.view(), Some(pair.visible.view()))?;
     println!("median error {:.2} px, {:.1} % off by more than 2 px", scores.a50, 100.0 * scores.bad[2]);
 

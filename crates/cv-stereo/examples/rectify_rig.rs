@@ -1,5 +1,5 @@
 //! Rectifies the photographs of a rig whose cameras are turned and whose lenses distort.
-use cv_core::{Camera, Distortion, Pose, Rotation3, StereoRig, Vector3};
+use cv_core::{Camera, Distortion, Pose, Rotation3, Silent, StereoRig, Vector3};
 use cv_stereo::{Rectification, RectifyOptions};
 use cv_synth::{RenderOptions, Scene, render};
 
@@ -13,7 +13,7 @@ pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
     let rectification = Rectification::new(&rig, &RectifyOptions::default())?;
     for (view, pose) in [&rectification.left, &rectification.right].into_iter().zip(poses) {
         let photo = render(&scene, &lens, &pose, &RenderOptions::default())?.image;
-        let (image, inside) = view.apply(photo.view())?;
+        let (image, inside) = view.apply(photo.view(), &Silent)?;
         let seen = inside.as_slice().iter().filter(|&&inside| inside).count();
         println!("{}×{} px, {seen} of them seen", image.width(), image.height());
     }
