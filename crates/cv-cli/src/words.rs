@@ -2,9 +2,9 @@
 
 use crate::frame::Failure;
 use cv_pipeline::stereo::RectifyError;
-use cv_pipeline::{Advice, DenseError, DepthError, NoPairCause, ReconstructError};
+use cv_pipeline::{Advice, DenseError, DepthError, LeftOut, NoPairCause, PanoramaError, ReconstructError};
 use std::fmt::Display;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// What to look at where a calibration and photographs contradict each other.
 pub(crate) const CHECK_CALIBRATION: &str =
@@ -106,6 +106,43 @@ pub(crate) fn no_rectification(error: RectifyError, rig: &Path, exchanged: bool)
 /// A rig that is not that of the photographs.
 pub(crate) fn another_rig(rig: &Path, cause: impl Display) -> Failure {
     Failure::new(format!("the photographs do not fit {}: {cause}", rig.display())).advice(CHECK_CALIBRATION)
+}
+
+/// Why a photograph is not in the panorama.
+pub(crate) fn left_out(reason: &LeftOut, paths: &[PathBuf]) -> String {
+    match reason {
+        LeftOut::Features(error) => error.to_string(),
+        LeftOut::NoFeatures => "no features found on it".to_owned(),
+        LeftOut::NoOverlap { nearest: None } => "overlaps with no other photograph".to_owned(),
+        LeftOut::NoOverlap { nearest: Some(pair) } => format!(
+            "overlaps with no other photograph: with the likeliest, {}, {} of {} matches in the overlap agree, more than {:.0} are needed",
+            paths[pair.other].display(),
+            pair.agree,
+            pair.in_overlap,
+            pair.needed
+        ),
+        LeftOut::OtherComponent { size } => format!("overlaps only with a smaller group of {size} photographs"),
+        LeftOut::Inconsistent => "its overlaps contradict those of the other photographs".to_owned(),
+    }
+}
+
+/// Why there is no panorama.
+pub(crate) fn no_panorama(error: PanoramaError, paths: &[PathBuf]) -> Failure {
+    match error {
+        PanoramaError::Align { source, images } => {
+            let reasons: Vec<String> = paths
+                .iter()
+                .zip(&images)
+                .filter_map(|(path, image)| {
+                    image.reason.as_ref().map(|r| format!("{}: {}", path.display(), left_out(r, paths)))
+                })
+                .collect();
+            Failure::new(format!("{source} ({})", reasons.join("; ")))
+                .advice("photographs that share a third of their view with their neighbors, taken from one place")
+        }
+        PanoramaError::Render(source) => Failure::new(source).advice("--projection auto, or a smaller --scale"),
+        PanoramaError::Cancelled(stop) => stop.into(),
+    }
 }
 
 #[cfg(test)]

@@ -3,9 +3,10 @@
 mod report;
 
 use crate::frame::{Context, Failure, Outcome, Run, expand_images, named, picture_name};
+use crate::words;
 use cv_core::Image;
 use cv_pipeline::panorama_types::{BlendMode, Exposure, Projection, Seams};
-use cv_pipeline::{FeatureMethod, LeftOut, PanoramaError, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama};
+use cv_pipeline::{FeatureMethod, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama};
 use rayon::prelude::*;
 use serde_json::json;
 use std::collections::btree_map::{BTreeMap, Entry};
@@ -27,16 +28,16 @@ pub(crate) struct Args {
     #[arg(short, long, value_name = "FILE", value_parser = picture_name)]
     output: PathBuf,
     /// The surface to draw on; auto: a plane up to 90 degrees across, then a cylinder, a sphere where it is also high.
-    #[arg(long, value_name = "SURFACE", value_parser = named::<Projection>(), default_value_t = Projection::Auto)]
+    #[arg(long, value_name = "SURFACE", value_parser = named::<Projection>(), default_value_t = PanoramaOptions::default().render.projection)]
     projection: Projection,
     /// How to join photographs at the seams.
-    #[arg(long, value_name = "MODE", value_parser = named::<BlendMode>(), default_value_t = BlendMode::Multiband)]
+    #[arg(long, value_name = "MODE", value_parser = named::<BlendMode>(), default_value_t = PanoramaOptions::default().render.blend)]
     blend: BlendMode,
     /// Where seams run: where the photographs agree, or half-way between their middles.
-    #[arg(long, value_name = "WHERE", value_parser = named::<Seams>(), default_value_t = Seams::GraphCut)]
+    #[arg(long, value_name = "WHERE", value_parser = named::<Seams>(), default_value_t = PanoramaOptions::default().render.seams)]
     seams: Seams,
     /// What to even out between photographs.
-    #[arg(long, value_name = "WHAT", value_parser = named::<Exposure>(), default_value_t = Exposure::Gain)]
+    #[arg(long, value_name = "WHAT", value_parser = named::<Exposure>(), default_value_t = PanoramaOptions::default().render.exposure)]
     exposure: Exposure,
     /// Cut the result to the largest rectangle without empty pixels.
     #[arg(long)]
@@ -48,7 +49,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0)]
     scale: f64,
     /// Features to match: sift for any photographs, harris for speed where they are all upright and of one size.
-    #[arg(long, value_name = "KIND", value_parser = named::<FeatureMethod>(), default_value_t = FeatureMethod::Sift)]
+    #[arg(long, value_name = "KIND", value_parser = named::<FeatureMethod>(), default_value_t = PanoramaOptions::default().matching.method)]
     features: FeatureMethod,
     /// The calibrated camera that took all of them (ours, OpenCV's or ROS's YAML, COLMAP's cameras.txt): its focal length is believed and its distortion
     /// taken out. Without, the focal length is estimated, from EXIF on.
@@ -110,7 +111,8 @@ impl Run for Args {
                 camera: cameras.get(&image.size()).copied(),
             })
             .collect();
-        let result = panorama(&photos, &self.options(context), context).map_err(|error| failure(error, &paths))?;
+        let result =
+            panorama(&photos, &self.options(context), context).map_err(|error| words::no_panorama(error, &paths))?;
         if self.alpha {
             cv_io::write_png(&self.output, transparent(&result).view())?;
         } else {
@@ -118,7 +120,7 @@ impl Run for Args {
         }
         for (path, image) in paths.iter().zip(&result.images) {
             if let Some(reason) = &image.reason {
-                context.warn(format!("{} is not in the panorama: {}", path.display(), words(reason, &paths)));
+                context.warn(format!("{} is not in the panorama: {}", path.display(), words::left_out(reason, &paths)));
             }
         }
         if result.shows_parallax() {
@@ -144,48 +146,12 @@ fn transparent(result: &PanoramaResult) -> Image<u8, 4> {
     })
 }
 
-/// Why a photograph was left out.
-fn words(reason: &LeftOut, paths: &[PathBuf]) -> String {
-    match reason {
-        LeftOut::Features(error) => error.to_string(),
-        LeftOut::NoFeatures => "no features found on it".to_owned(),
-        LeftOut::NoOverlap { nearest: None } => "overlaps with no other photograph".to_owned(),
-        LeftOut::NoOverlap { nearest: Some(pair) } => format!(
-            "overlaps with no other photograph: with the likeliest, {}, {} of {} matches in the overlap agree, more than {:.0} are needed",
-            paths[pair.other].display(),
-            pair.agree,
-            pair.in_overlap,
-            pair.needed
-        ),
-        LeftOut::OtherComponent { size } => format!("overlaps only with a smaller group of {size} photographs"),
-        LeftOut::Inconsistent => "its overlaps contradict those of the other photographs".to_owned(),
-    }
-}
-
-fn failure(error: PanoramaError, paths: &[PathBuf]) -> Failure {
-    match error {
-        PanoramaError::Align { source, images } => {
-            let reasons: Vec<String> = paths
-                .iter()
-                .zip(&images)
-                .filter_map(|(path, image)| {
-                    image.reason.as_ref().map(|r| format!("{}: {}", path.display(), words(r, paths)))
-                })
-                .collect();
-            Failure::new(format!("{source} ({})", reasons.join("; ")))
-                .advice("photographs that share a third of their view with their neighbors, taken from one place")
-        }
-        PanoramaError::Render(source) => Failure::new(source).advice("--projection auto, or a smaller --scale"),
-        PanoramaError::Cancelled(stop) => stop.into(),
-    }
-}
-
 fn outcome(paths: &[PathBuf], result: &PanoramaResult) -> Outcome {
     let images: Vec<_> = paths
         .iter()
         .zip(&result.images)
         .map(|(path, image)| {
-            let reason = image.reason.as_ref().map(|r| words(r, paths));
+            let reason = image.reason.as_ref().map(|r| words::left_out(r, paths));
             json!({ "path": path, "used": image.used, "reason": reason, "focal_px": image.focal, "gain": image.gain })
         })
         .collect();

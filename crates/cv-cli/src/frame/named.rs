@@ -17,9 +17,10 @@ pub(crate) fn named<T: Named>() -> impl TypedValueParser<Value = T> {
 mod tests {
     use super::*;
     use cv_pipeline::features::CornerMeasure;
+    use cv_pipeline::panorama_types::{BlendMode, Exposure, Projection, Seams};
     use cv_pipeline::segmentation::{ColorSpace, Regions, Rule};
     use cv_pipeline::stereo::{Census, IntensityCost, Paths, Smoothing};
-    use cv_pipeline::{AffineSimulation, FeatureMethod, ModelKind, Suppression};
+    use cv_pipeline::{AffineSimulation, Axes, FeatureMethod, ModelKind, Suppression};
 
     /// What the command line makes of every name, and of every other spelling.
     fn goes_there_and_back<T: Named>() {
@@ -50,5 +51,10 @@ mod tests {
         goes_there_and_back::<Paths>();
         goes_there_and_back::<IntensityCost>();
         goes_there_and_back::<Smoothing>();
+        goes_there_and_back::<Projection>();
+        goes_there_and_back::<BlendMode>();
+        goes_there_and_back::<Seams>();
+        goes_there_and_back::<Exposure>();
+        goes_there_and_back::<Axes>();
     }
 }

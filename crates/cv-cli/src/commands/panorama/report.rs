@@ -1,7 +1,7 @@
 //! The report of `cv panorama`.
 
-use super::words;
 use crate::frame::Failure;
+use crate::words;
 use cv_core::{Correspondence, Point2, RgbU8, Scaling};
 use cv_pipeline::PanoramaResult;
 use cv_report::{Figure, MatchStyle, Note, Report, draw_matches, shrink_to_fit};
@@ -42,14 +42,17 @@ pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResul
         .enumerate()
         .map(|(i, image)| {
             let focal = image.focal.map_or_else(|| "–".to_owned(), |f| format!("{f:.0} px"));
-            let fate = image.reason.as_ref().map_or_else(|| "used".to_owned(), |r| words(r, paths));
+            let fate = image.reason.as_ref().map_or_else(|| "used".to_owned(), |r| words::left_out(r, paths));
             vec![name(i), fate, image.features.to_string(), focal]
         })
         .collect();
     page.table("", &["file", "used or why not", "features", "focal length"], &rows);
     for (i, image) in result.images.iter().enumerate() {
         if let Some(reason) = &image.reason {
-            page.note(Note::Warning, &format!("{} is not in the panorama: {}", name(i), words(reason, paths)));
+            page.note(
+                Note::Warning,
+                &format!("{} is not in the panorama: {}", name(i), words::left_out(reason, paths)),
+            );
         }
     }
 
@@ -66,9 +69,9 @@ pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResul
             .collect();
         let picture = draw_matches(a.view(), b.view(), &matches, Some(&pair.inliers), &MatchStyle::default());
         let good = pair.inliers.iter().filter(|&&inlier| inlier).count();
-        let words =
+        let caption =
             format!("{} and {}: {good} of {} matches agree (green).", name(pair.a), name(pair.b), matches.len());
-        page.figure(Figure::new(jpeg(&picture)?, &words));
+        page.figure(Figure::new(jpeg(&picture)?, &caption));
     }
     let seconds: Vec<_> = result.stages.iter().map(|(stage, s)| (*stage, format!("{s:.2} s"))).collect();
     page.section("Time").facts(&seconds);
