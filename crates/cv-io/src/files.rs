@@ -97,7 +97,7 @@ fn write_atomic_inner(
         use std::os::unix::fs::PermissionsExt;
         builder.permissions(fs::Permissions::from_mode(0o666));
     }
-    let (mut temporary, pending) = Pending::make(|| builder.tempfile_in(folder), |made| made.path())?;
+    let (pending, mut temporary) = Pending::make(|| builder.tempfile_in(folder), |made| made.path())?;
     let mut sink = BufWriter::with_capacity(1 << 18, temporary.as_file_mut());
     content(&mut sink)?;
     sink.flush()?;

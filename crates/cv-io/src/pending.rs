@@ -17,16 +17,17 @@ fn all() -> MutexGuard<'static, BTreeSet<PathBuf>> {
 pub(crate) struct Pending(PathBuf);
 
 impl Pending {
-    /// Makes it. To [`abandon_writes`] it is there from the first moment, or not at all.
+    /// Makes it. To [`abandon_writes`] it is there from the first moment, or not at all. (Of the two results the second is dropped first, and so removed
+    /// while it is still known.)
     pub(crate) fn make<T>(
         make: impl FnOnce() -> io::Result<T>,
         path: impl FnOnce(&T) -> &Path,
-    ) -> io::Result<(T, Self)> {
+    ) -> io::Result<(Self, T)> {
         let mut all = all();
         let made = make()?;
         let path = path(&made).to_owned();
         all.insert(path.clone());
-        Ok((made, Self(path)))
+        Ok((Self(path), made))
     }
 
     /// Gives it its place. To [`abandon_writes`] it is still temporary, or all in its place.
@@ -77,13 +78,15 @@ pub fn write_together<E: From<IoError>>(
         }
     }
     let make = || tempfile::Builder::new().prefix(".cv-").suffix(".part").tempdir_in(folder);
-    let (temporary, pending) = Pending::make(make, |made| made.path()).map_err(|error| fail(folder, error))?;
+    let (pending, temporary) = Pending::make(make, |made| made.path()).map_err(|error| fail(folder, error))?;
     write(temporary.path())?;
     pending.finish(|| {
         names.iter().try_for_each(|name| {
             let path = folder.join(name);
             fs::rename(temporary.path().join(name), &path).map_err(|error| fail(&path, error))
-        })
+        })?;
+        // Empty now.
+        temporary.close().map_err(|error| fail(folder, error))
     })?;
     Ok(())
 }
@@ -129,11 +132,11 @@ mod tests {
         let path = folder.path().join("a.part");
         let known = || all().contains(&path);
         let make = || fs::write(&path, "half").map(|()| path.clone());
-        let (_, pending) = Pending::make(make, |path| path).unwrap();
+        let (pending, _) = Pending::make(make, |path| path).unwrap();
         assert!(known());
         drop(pending);
         assert!(!known());
-        let (_, pending) = Pending::make(make, |path| path).unwrap();
+        let (pending, _) = Pending::make(make, |path| path).unwrap();
         // The lock is held: nobody sees the moment between.
         assert!(pending.finish(|| ALL.try_lock().is_err()) && !known());
         assert!(Pending::make(|| Err::<PathBuf, _>(io::Error::other("no")), |path| path).is_err());
