@@ -126,7 +126,10 @@ fn a_box_shows_the_face_that_is_hit() {
 fn unprojecting_depth_gives_the_point_the_pose_projects_back() {
     let scene = Scene::room(3);
     let pose = scene.viewpoint();
-    for camera in [camera(), lens()] {
+    let with = |distortion| Camera { distortion, ..camera() };
+    let fisheye = with(Distortion::fisheye4([0.05, -0.01, 0.0, 0.0]));
+    let prism = [0.3, 0.02, 0.001, 0.002, 0.0, 0.4, 0.0, 0.0, 0.003, 0.0, -0.002, 0.0];
+    for camera in [camera(), lens(), fisheye, with(Distortion::thin_prism12(prism))] {
         let view = render(&scene, &camera, &pose, &RenderOptions::ideal()).unwrap();
         for (x, y) in (0..72).step_by(7).flat_map(|y| (0..96).step_by(5).map(move |x| (x, y))) {
             let p = view.world_point(x, y).unwrap();

@@ -51,7 +51,7 @@ pub(crate) struct Args {
     /// Features to match: sift for any photographs, harris for speed where they are all upright and of one size.
     #[arg(long, value_name = "KIND", value_parser = named::<FeatureMethod>(), default_value_t = PanoramaOptions::default().matching.method)]
     features: FeatureMethod,
-    /// The calibrated camera that took all of them (ours, OpenCV's or ROS's YAML, COLMAP's cameras.txt): its focal length is believed and its distortion
+    /// The calibrated camera that took all of them (ours, OpenCV's, ROS's or Kalibr's YAML, COLMAP's cameras.txt): its focal length is believed and its distortion
     /// taken out. Without, the focal length is estimated, from EXIF on.
     #[arg(long, value_name = "FILE")]
     camera: Option<PathBuf>,

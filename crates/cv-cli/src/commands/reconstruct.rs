@@ -28,7 +28,7 @@ use std::path::{Path, PathBuf};
     cv reconstruct a.jpg b.jpg --camera cam.yaml -o cloud.ply --report out\n  \
     cv reconstruct a.jpg b.jpg --focal 2900 -o cloud.ply --axes opengl --colmap model\n  \
     cv reconstruct a.jpg b.jpg -o sparse.ply --dense dense.ply --dense-size 2400\n\n\
-    A camera file is ours, OpenCV's or ROS's YAML, a line of COLMAP's cameras.txt, or a 3×3 matrix.")]
+    A camera file is ours, OpenCV's, ROS's or Kalibr's YAML, a line of COLMAP's cameras.txt, or a 3×3 matrix.")]
 pub(crate) struct Args {
     /// The first photograph.
     first: PathBuf,

@@ -238,7 +238,7 @@ impl Distortion {
 
     /// The radius in ideal normalized coordinates up to which the lens is monotonic: where the distorted radius first turns back, or has a
     /// pole (rational models), exact up to rounding. Infinity where it nowhere does, or (fisheye) not before 90°. Terms that are not radial
-    /// (tangential, prism) are left out of it. A microsecond or two: for many points see [`Self::distort_in_range`].
+    /// (tangential, prism) are left out of it. Less than a microsecond; for many points see [`Self::distort_in_range`].
     pub fn max_radius(&self) -> f64 {
         let end = self.end();
         match self.model.info().projection {

@@ -5,6 +5,8 @@
 //! Bernstein basis: coefficients without a negative one have no root between, and what has one is halved (Farin, "Curves and Surfaces
 //! for CAGD", 4.3 and 6.10). Both answers are exact up to rounding; the usual "none" costs a few additions.
 
+use std::f64::consts::FRAC_PI_2;
+
 use nalgebra::Point2;
 
 use super::lens::{Lens, LensProjection, Parameters};
@@ -15,14 +17,34 @@ const MAX: usize = 10;
 /// Halvings of an interval: as many as a number has bits.
 const DEPTH: u32 = 52;
 
+/// One over the binomial coefficients of each degree.
+const INVERSE_BINOMIALS: [[f64; MAX]; MAX] = {
+    let mut out = [[0.0; MAX]; MAX];
+    let mut n = 0;
+    while n < MAX {
+        let (mut i, mut binomial) = (0, 1);
+        while i <= n {
+            out[n][i] = 1.0 / binomial as f64;
+            binomial = binomial * (n - i) / (i + 1);
+            i += 1;
+        }
+        n += 1;
+    }
+    out
+};
+
 /// Whether a polynomial, positive at 0, has no root in `0 ..= x`.
 #[inline(always)]
 fn positive_up_to(c: &[f64], x: f64) -> bool {
     let n = c.len() - 1;
+    // What the negative terms take away at the end, they do not take away before it. This is the whole answer for most points.
+    if c[0] + x * c[1..].iter().rev().fold(0.0, |sum, &c| sum * x + if c > 0.0 { 0.0 } else { c }) > 0.0 {
+        return true;
+    }
     let mut b = [0.0; MAX];
     let mut power = 1.0;
     for (i, c) in c.iter().enumerate() {
-        b[i] = c * power / binomial(n, i);
+        b[i] = c * power * INVERSE_BINOMIALS[n][i];
         power *= x;
     }
     to_bernstein(&mut b, n);
@@ -39,17 +61,12 @@ fn first_positive_root(c: &[f64]) -> Option<f64> {
     // x = t/(1 − t): (1 − t)ⁿ times the polynomial has these Bernstein coefficients over t in 0 … 1.
     let mut b = [0.0; MAX];
     for i in 0..=n {
-        b[i] = c[i] / binomial(n, i);
+        b[i] = c[i] * INVERSE_BINOMIALS[n][i];
     }
     if b.iter().any(|v| v.is_nan()) {
         return Some(0.0);
     }
     first_root(b, n, (0.0, 1.0), DEPTH).map(|t| t / (1.0 - t))
-}
-
-#[inline(always)]
-fn binomial(n: usize, i: usize) -> f64 {
-    (0..i).fold(1.0, |b, j| b * (n - j) as f64 / (j + 1) as f64)
 }
 
 /// Coefficients of powers on 0 … 1, each divided by its binomial, to those of the Bernstein basis.
@@ -86,11 +103,16 @@ fn first_root(b: [f64; MAX], n: usize, (low, high): (f64, f64), depth: u32) -> O
 #[inline(always)]
 pub(super) fn contains<L: Lens>(k: &Parameters, p: Point2<f64>, determinant: f64) -> bool {
     let r2 = squared_radius(p);
-    let x = match L::INFO.projection {
-        LensProjection::Perspective => r2,
-        LensProjection::Fisheye => r2.sqrt().atan().powi(2),
-    };
-    determinant > 0.0 && positive_up_to(L::slope(k).as_ref(), x)
+    let slope = L::slope(k);
+    let positive = |x: f64| positive_up_to(slope.as_ref(), x);
+    determinant > 0.0
+        && match L::INFO.projection {
+            LensProjection::Perspective => positive(r2),
+            // A fisheye that is monotonic up to 90° needs no angle.
+            LensProjection::Fisheye => {
+                r2.is_finite() && (positive(FRAC_PI_2.powi(2)) || positive(r2.sqrt().atan().powi(2)))
+            }
+        }
 }
 
 /// Where the radial part stops to be monotonic, as a distance from the axis (perspective) or an angle (fisheye); infinity where it nowhere does.

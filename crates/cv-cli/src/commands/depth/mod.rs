@@ -54,7 +54,7 @@ pub(crate) struct Args {
     /// needs.
     #[arg(long, value_name = "FILE")]
     cloud: Option<PathBuf>,
-    /// Calibration of the rig, ours or OpenCV's YAML (see `cv rectify --help`): the photographs are rectified first, and the maps
+    /// Calibration of the rig, ours, OpenCV's or Kalibr's YAML (see `cv rectify --help`): the photographs are rectified first, and the maps
     /// are those of the rectified left (or upper) one, which `cv rectify` writes.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["focal", "baseline"])]
     rig: Option<PathBuf>,
