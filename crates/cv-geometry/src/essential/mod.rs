@@ -18,6 +18,7 @@ use crate::ransac::{Estimator, RobustOptions, Scorer, TukeyBiweight, ransac};
 use crate::robust::RobustModel;
 use crate::rotation::orthonormalized;
 use cv_core::{Camera, Correspondence, Matrix3, Point2, Pose, Progress, Rotation3, Vector3};
+use cv_numeric::adjust::UnitVector;
 use cv_numeric::{LeastSquares, svd3};
 use decompose::rotations_and_translation;
 use nalgebra::{SMatrix, SVector};
@@ -141,7 +142,7 @@ impl Epipolar<5> for Pose {
     fn tangent(&self) -> SMatrix<f64, 9, 5> {
         let flat = |m: Matrix3<f64>| SVector::<f64, 9>::from_fn(|i, _| m[(i / 3, i % 3)]);
         let (e, r) = (essential_from_pose(self), self.rotation.matrix());
-        let [u, v] = tangent_of(&self.translation);
+        let [u, v] = UnitVector::basis(&self.translation);
         SMatrix::from_columns(&[
             flat(e * Vector3::x().cross_matrix()),
             flat(e * Vector3::y().cross_matrix()),
@@ -152,19 +153,12 @@ impl Epipolar<5> for Pose {
     }
 
     fn step(&self, d: &SVector<f64, 5>) -> Self {
-        let [u, v] = tangent_of(&self.translation);
+        let [u, v] = UnitVector::basis(&self.translation);
         Self::new(
             self.rotation * Rotation3::new(Vector3::new(d[0], d[1], d[2])),
             (self.translation + u * d[3] + v * d[4]).normalize(),
         )
     }
-}
-
-/// Two unit vectors perpendicular to a unit vector and to each other.
-pub(crate) fn tangent_of(t: &Vector3<f64>) -> [Vector3<f64>; 2] {
-    let axis = if t.x.abs() < 0.6 { Vector3::x() } else { Vector3::y() };
-    let u = t.cross(&axis).normalize();
-    [u, t.cross(&u)]
 }
 
 struct PoseEstimator {

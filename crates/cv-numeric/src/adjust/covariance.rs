@@ -46,6 +46,10 @@ impl Adjustment<'_> {
     /// As [`Adjustment::solve`], and [`AdjustError::RankDeficient`] where the residuals leave the blocks free that are not eliminated.
     pub fn covariance(&self, variance: f64) -> Result<Covariance<'_>, AdjustError> {
         self.check_start()?;
+        rayon::scope(|_| self.normal_covariance(variance))
+    }
+
+    fn normal_covariance(&self, variance: f64) -> Result<Covariance<'_>, AdjustError> {
         let structure = Structure::new(&self.groups, &self.kinds, self.eliminated, true);
         let mut normal = Normal::default();
         normal.linearize(&self.kinds, &structure, &self.values).map_err(|u| self.undefined(u))?;

@@ -8,7 +8,7 @@ use nalgebra::{Matrix3, Rotation3, Vector3};
 /// coordinates around the point where it is (Hertzberg et al., "Integrating generic sensor fusion algorithms with sound state
 /// representations through encapsulation of manifolds", Information Fusion 2013). Derivatives of residuals are by the tangent
 /// coordinates at zero.
-pub trait Manifold: Sync {
+pub trait Manifold: Send + Sync {
     /// Numbers that store a block.
     fn ambient(&self) -> usize;
     /// Degrees of freedom of a block, at most 64.

@@ -227,16 +227,17 @@ impl Normal {
 /// `out[c][a] −= Σ_k wide[k][a] · y[c][k]` for columns `height` apart.
 #[inline(always)]
 fn subtract<const E: usize, const A: usize>(wide: [&[f64]; E], y: &[[f64; E]], out: &mut [f64], height: usize) {
-    let wide: [[f64; A]; E] = std::array::from_fn(|k| std::array::from_fn(|a| wide[k][a]));
+    // Of a size that is known, so that the sums stay in vector registers.
+    let wide: [[f64; A]; E] = wide.map(|row| std::array::from_fn(|a| row[a]));
     for (c, y) in y.iter().enumerate() {
         let out = &mut out[c * height..][..A];
-        for (a, o) in out.iter_mut().enumerate() {
-            let mut sum = *o;
-            for k in 0..E {
-                sum -= wide[k][a] * y[k];
+        let mut sum: [f64; A] = std::array::from_fn(|a| out[a]);
+        for (row, y) in wide.iter().zip(y) {
+            for (sum, w) in sum.iter_mut().zip(row) {
+                *sum -= w * y;
             }
-            *o = sum;
         }
+        out.copy_from_slice(&sum);
     }
 }
 
@@ -244,12 +245,10 @@ fn subtract<const E: usize, const A: usize>(wide: [&[f64]; E], y: &[[f64; E]], o
 fn subtract_any<const E: usize>(wide: [&[f64]; E], y: &[[f64; E]], out: &mut [f64], height: usize) {
     for (c, y) in y.iter().enumerate() {
         let out = &mut out[c * height..][..wide[0].len()];
-        for (a, o) in out.iter_mut().enumerate() {
-            let mut sum = *o;
-            for k in 0..E {
-                sum -= wide[k][a] * y[k];
+        for (row, y) in wide.iter().zip(y) {
+            for (o, w) in out.iter_mut().zip(*row) {
+                *o -= w * y;
             }
-            *o = sum;
         }
     }
 }

@@ -12,7 +12,7 @@ use std::ops::Range;
 ///
 /// The sizes are known to the compiler, so that the loop over the items is compiled for each kind and allocates nothing. One
 /// block may be given twice to one residual.
-pub trait Residual<const R: usize, const B: usize, const C: usize>: Sync {
+pub trait Residual<const R: usize, const B: usize, const C: usize>: Send + Sync {
     /// Degrees of freedom of each block; they add up to `C`.
     const DIMS: [usize; B];
 
@@ -86,12 +86,32 @@ pub struct ResidualSums {
 }
 
 impl ResidualSums {
-    pub(super) fn add(&mut self, other: &Self) {
+    /// Adds a residual of `numbers` numbers; its weight, or `None` where it is not finite.
+    #[inline]
+    fn count_in(&mut self, loss: &RobustLoss, squared: f64, numbers: usize) -> Option<f64> {
+        let weight = loss.weight(squared);
+        self.cost += loss.value(squared);
+        self.weighted_squares += weight * squared;
+        self.weights += weight * numbers as f64;
+        self.count += numbers;
+        squared.is_finite().then_some(weight)
+    }
+
+    fn add(&mut self, other: &Self) {
         self.cost += other.cost;
         self.weighted_squares += other.weighted_squares;
         self.weights += other.weights;
         self.count += other.count;
     }
+}
+
+/// The sum of parts in their order.
+fn total(parts: Vec<Result<ResidualSums, usize>>) -> Result<ResidualSums, usize> {
+    let mut sums = ResidualSums::default();
+    for part in parts {
+        sums.add(&part?);
+    }
+    Ok(sums)
 }
 
 /// Residuals and derivatives of all items of a kind, multiplied by the square roots of their weights.
@@ -129,7 +149,7 @@ pub(super) struct ColumnSums<'a> {
 const CHUNK: usize = 256;
 
 /// A kind of residuals, its type forgotten.
-pub(super) trait Kind: Sync {
+pub(super) trait Kind: Send + Sync {
     fn name(&self) -> &str;
     fn len(&self) -> usize;
     /// Group of each block of a residual.
@@ -140,6 +160,8 @@ pub(super) trait Kind: Sync {
     fn cost(&self, values: &Values) -> f64;
     /// Fills the rows. The first item that is not defined as the error.
     fn linearize(&self, values: &Values, links: &Links, rows: &mut Rows) -> Result<ResidualSums, usize>;
+    /// Sums over the items. The first item that is not defined as the error.
+    fn sums(&self, values: &Values) -> Result<ResidualSums, usize>;
     /// Adds items that see one eliminated block.
     fn add_to_point(&self, rows: &Rows, links: &Links, items: &[u32], point: PointSums<'_>);
     /// Adds items that touch one block of the reduced system.
@@ -195,20 +217,12 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Typed
         first: usize,
         (jacobians, residuals): (&mut [f64], &mut [f64]),
     ) -> Result<ResidualSums, usize> {
-        let mut sums = ResidualSums { count: residuals.len(), ..ResidualSums::default() };
+        let mut sums = ResidualSums::default();
         let rows = jacobians.chunks_exact_mut(R * C).zip(residuals.chunks_exact_mut(R));
         for (item, (jacobian, residual)) in (first..).zip(rows) {
             let mut j = SMatrix::<f64, R, C>::zeros();
             let r = self.residual.evaluate(item, self.at(values, item), Some(&mut j)).ok_or(item)?;
-            let squared = r.norm_squared();
-            if !squared.is_finite() {
-                return Err(item);
-            }
-            let weight = self.loss.weight(squared);
-            sums.cost += self.loss.value(squared);
-            sums.weighted_squares += weight * squared;
-            sums.weights += weight * R as f64;
-            let root = weight.sqrt();
+            let root = sums.count_in(&self.loss, r.norm_squared(), R).ok_or(item)?.sqrt();
             for row in 0..R {
                 residual[row] = root * r[row];
                 for column in 0..C {
@@ -248,7 +262,7 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Typed
 
 /// `out[c * stride + a] += Σ_r left[r][a] · right[r][c]`, for rows `C` apart.
 #[inline(always)]
-fn add_product<const R: usize, const C: usize>(
+fn add_product<const C: usize>(
     j: &[f64],
     (left, lefts): (usize, usize),
     (right, rights): (usize, usize),
@@ -256,15 +270,12 @@ fn add_product<const R: usize, const C: usize>(
     stride: usize,
 ) {
     for c in 0..rights {
-        let x: [f64; R] = std::array::from_fn(|r| j[r * C + right + c]);
         let out = &mut out[c * stride..][..lefts];
-        let rows: [&[f64]; R] = std::array::from_fn(|r| &j[r * C + left..][..lefts]);
-        for (a, o) in out.iter_mut().enumerate() {
-            let mut sum = *o;
-            for r in 0..R {
-                sum += rows[r][a] * x[r];
+        for row in j.chunks_exact(C) {
+            let x = row[right + c];
+            for (o, l) in out.iter_mut().zip(&row[left..][..lefts]) {
+                *o += l * x;
             }
-            *o = sum;
         }
     }
 }
@@ -298,11 +309,19 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Kind 
         let chunks = rows.jacobians.par_chunks_mut(CHUNK * R * C).zip(rows.residuals.par_chunks_mut(CHUNK * R));
         let parts: Vec<Result<ResidualSums, usize>> =
             chunks.enumerate().map(|(c, out)| self.linearize_chunk(values, links, c * CHUNK, out)).collect();
-        let mut sums = ResidualSums::default();
-        for part in parts {
-            sums.add(&part?);
-        }
-        Ok(sums)
+        total(parts)
+    }
+
+    fn sums(&self, values: &Values) -> Result<ResidualSums, usize> {
+        let chunk = |c: usize| {
+            let mut sums = ResidualSums::default();
+            for item in c * CHUNK..((c + 1) * CHUNK).min(self.len()) {
+                let r = self.residual.evaluate(item, self.at(values, item), None).ok_or(item)?;
+                sums.count_in(&self.loss, r.norm_squared(), R).ok_or(item)?;
+            }
+            Ok(sums)
+        };
+        total((0..self.len().div_ceil(CHUNK)).into_par_iter().map(chunk).collect())
     }
 
     #[cfg(test)]
@@ -319,7 +338,7 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Kind 
             let item = item as usize;
             let j = &rows.jacobians[item * R * C..][..R * C];
             let r = &rows.residuals[item * R..][..R];
-            add_product::<R, C>(j, (first, size), (first, size), point.v, size);
+            add_product::<C>(j, (first, size), (first, size), point.v, size);
             for a in 0..size {
                 for row in 0..R {
                     point.g[a] += j[row * C + first + a] * r[row];
@@ -329,7 +348,7 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Kind 
                 if k != e && target.block != NONE {
                     let width = target.width as usize;
                     let out = &mut point.w[target.place as usize..];
-                    add_product::<R, C>(j, (Self::FIRST[k], width), (first, size), out, length);
+                    add_product::<C>(j, (Self::FIRST[k], width), (first, size), out, length);
                 }
             }
         }
@@ -354,7 +373,7 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Kind 
                         let row = column.row[left.block as usize] as usize + left.within as usize;
                         let out = &mut column.values[within * column.height + row..];
                         let left = (Self::FIRST[l], left.width as usize);
-                        add_product::<R, C>(j, left, (Self::FIRST[k], width), out, column.height);
+                        add_product::<C>(j, left, (Self::FIRST[k], width), out, column.height);
                     }
                 }
             }

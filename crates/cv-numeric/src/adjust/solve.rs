@@ -122,9 +122,18 @@ impl Adjustment<'_> {
     pub fn solve(
         &mut self,
         options: &AdjustOptions,
-        mut on_iteration: impl FnMut(&AdjustIteration) -> ControlFlow<()>,
+        mut on_iteration: impl FnMut(&AdjustIteration) -> ControlFlow<()> + Send,
     ) -> Result<AdjustReport, AdjustError> {
         self.check_start()?;
+        // On a thread of the pool, so that not every loop has to be handed over to it.
+        rayon::scope(|_| self.iterate(options, &mut on_iteration))
+    }
+
+    fn iterate(
+        &mut self,
+        options: &AdjustOptions,
+        on_iteration: &mut (dyn FnMut(&AdjustIteration) -> ControlFlow<()> + Send),
+    ) -> Result<AdjustReport, AdjustError> {
         let structure = Structure::new(&self.groups, &self.kinds, self.eliminated, false);
         let mut normal = Normal::default();
         let mut reduced = Reduced::default();
@@ -197,10 +206,8 @@ impl Adjustment<'_> {
     /// As [`Adjustment::solve`].
     pub fn residual_sums(&self) -> Result<Vec<ResidualSums>, AdjustError> {
         self.check_start()?;
-        let structure = Structure::new(&self.groups, &self.kinds, self.eliminated, false);
-        let mut normal = Normal::default();
-        normal.linearize(&self.kinds, &structure, &self.values).map_err(|u| self.undefined(u))?;
-        Ok(normal.sums)
+        let sum = |k: usize| self.kinds[k].sums(&self.values).map_err(|item| self.undefined((k, item)));
+        rayon::scope(|_| (0..self.kinds.len()).map(sum).collect())
     }
 
     pub(super) fn check_start(&self) -> Result<(), AdjustError> {

@@ -474,6 +474,7 @@ fn a_callback_ends_it_where_it_stands() {
     assert!(report.termination == Termination::Stopped && !report.converged());
     assert_eq!((report.iterations, costs.last()), (3, Some(&report.cost)));
     assert!(costs.windows(2).all(|c| c[1] <= c[0]));
+    // The same residuals in the same order, chunk by chunk.
     assert_eq!(problem.residual_sums().unwrap()[0].cost, report.cost);
 }
 

@@ -5,9 +5,14 @@
 //! carried from `i` to `j` by `M_j M_i⁻¹` and compared in pixels, and the other way round. `M` moves by
 //! `M ← (I + Σ δ_k G_k) M`: the `G_k` are the three generators of rotations, or eight of homographies.
 
-use cv_numeric::{LeastSquares, LmOptions, NormalEquations, RobustLoss, levenberg_marquardt};
-use nalgebra::{DVector, Dyn, Matrix2, Matrix3, Rotation3, Vector2, Vector3};
-use rayon::prelude::*;
+use cv_core::{Distortion, Point2};
+use cv_numeric::RobustLoss;
+use cv_numeric::adjust::{
+    AdjustError, AdjustOptions, AdjustReport, Adjustment, Euclidean, GroupId, Manifold, Prior, Residual,
+    RotationManifold,
+};
+use nalgebra::{Matrix3, SMatrix, Vector2, Vector3};
+use std::ops::ControlFlow;
 
 /// What a photograph's matrix may be.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -18,19 +23,22 @@ pub(crate) enum Motion {
     Homography,
 }
 
-impl Motion {
-    fn generators(self) -> Vec<Matrix3<f64>> {
-        match self {
-            Self::Rotation => (0..3).map(|k| Vector3::ith(k, 1.0).cross_matrix()).collect(),
-            // All entries but the last: the scale of a homography means nothing.
-            Self::Homography => (0..8)
-                .map(|k| {
-                    let mut g = Matrix3::zeros();
-                    g[(k / 3, k % 3)] = 1.0;
-                    g
-                })
-                .collect(),
-        }
+/// Homographies up to scale: nine numbers by columns, eight degrees of freedom, all entries of the factor but the last.
+struct HomographyManifold;
+
+impl Manifold for HomographyManifold {
+    fn ambient(&self) -> usize {
+        9
+    }
+
+    fn tangent(&self) -> usize {
+        8
+    }
+
+    fn step(&self, x: &[f64], delta: &[f64], moved: &mut [f64]) {
+        let change = Matrix3::from_fn(|i, j| delta.get(3 * i + j).copied().unwrap_or(0.0));
+        let to = (Matrix3::identity() + change) * Matrix3::from_column_slice(x);
+        moved.copy_from_slice((to / to.norm()).as_slice());
     }
 }
 
@@ -48,6 +56,19 @@ pub(crate) struct Lens {
     pub(crate) log_focal: f64,
     /// Coefficient of r² in normalized coordinates.
     pub(crate) k1: f64,
+}
+
+impl Lens {
+    fn distortion(&self) -> Distortion {
+        Distortion::simple_radial(self.k1)
+    }
+
+    /// The ray of a pixel, `None` out of the lens's reach.
+    fn ray(&self, pixel: Vector2<f64>) -> Option<Point2<f64>> {
+        let q = Point2::from(pixel / self.log_focal.exp());
+        let p = if self.k1 == 0.0 { q } else { self.distortion().undistort(q) };
+        p.x.is_finite().then_some(p)
+    }
 }
 
 /// All unknowns.
@@ -78,206 +99,59 @@ pub(crate) struct Problem<'a> {
 const K1_SIGMA: f64 = 0.1;
 /// Residual in pixels that stands for a point behind the camera or out of the lens's reach.
 const LOST: f64 = 1e4;
-/// The widest row: two motions of eight and two lenses of two.
-const MAX_LOCAL: usize = 20;
 
-/// A transferred point and its derivatives by: motion of the source, of the target, lens of the source, of the target.
-struct Transfer {
-    point: Vector2<f64>,
-    by_source: [Vector2<f64>; 8],
-    by_target: [Vector2<f64>; 8],
-    by_source_lens: [Vector2<f64>; 2],
-    by_target_lens: [Vector2<f64>; 2],
+/// Matches carried from one photograph to another: motions of `M` degrees of freedom of the source and the target, and their lenses.
+struct Transfers<const M: usize, const C: usize> {
+    kind: Motion,
+    generators: [Matrix3<f64>; M],
+    matches: Vec<(Vector2<f64>, Vector2<f64>)>,
 }
 
-/// Inverse of `x (1 + k1 |x|²)`; `None` beyond its turning point.
-fn undistort(q: Vector2<f64>, k1: f64) -> Option<Vector2<f64>> {
-    if k1 == 0.0 {
-        return Some(q);
-    }
-    let rd = q.norm();
-    let mut r = rd;
-    for _ in 0..20 {
-        let slope = 1.0 + 3.0 * k1 * r * r;
-        if slope <= 0.05 {
-            return None;
-        }
-        let step = (r * (1.0 + k1 * r * r) - rd) / slope;
-        r -= step;
-        if step.abs() < 1e-14 * (1.0 + rd) {
-            break;
-        }
-    }
-    if rd > 0.0 { Some(q * (r / rd)) } else { Some(q) }
-}
+impl<const M: usize, const C: usize> Residual<2, 4, C> for Transfers<M, C> {
+    const DIMS: [usize; 4] = [M, M, 2, 2];
 
-fn distortion_jacobian(p: Vector2<f64>, k1: f64) -> Matrix2<f64> {
-    Matrix2::identity() * (1.0 + k1 * p.norm_squared()) + p * p.transpose() * (2.0 * k1)
-}
-
-impl Problem<'_> {
-    fn motion_dof(&self) -> usize {
-        match self.kind {
-            Motion::Rotation => 3,
-            Motion::Homography => 8,
-        }
-    }
-
-    fn lens_dof(&self) -> usize {
-        usize::from(self.free_focal) + usize::from(self.free_k1)
-    }
-
-    /// First column of a photograph's motion, `None` for the fixed one.
-    fn motion_column(&self, i: usize) -> Option<usize> {
-        (i != self.fixed).then(|| self.motion_dof() * (i - usize::from(i > self.fixed)))
-    }
-
-    fn lens_column(&self, lens: usize) -> usize {
-        self.motion_dof() * (self.lens_of.len() - 1) + self.lens_dof() * lens
-    }
-
-    fn columns(&self) -> usize {
-        self.lens_column(self.focal_prior.len())
-    }
-
-    /// Pixels of photograph `i` (from its principal point) to those of `j`.
-    pub(crate) fn transfer(&self, s: &State, i: usize, j: usize, a: Vector2<f64>) -> Option<Vector2<f64>> {
-        let (from, to) = (s.lenses[self.lens_of[i]], s.lenses[self.lens_of[j]]);
-        let p = undistort(a / from.log_focal.exp(), from.k1)?;
-        let y = s.motion[j] * inverse(self.kind, &s.motion[i]) * Vector3::new(p.x, p.y, 1.0);
-        finish(&y, to).map(|(n, f)| n * (f * (1.0 + to.k1 * n.norm_squared())))
-    }
-
-    fn transfer_with_jacobian(
+    #[inline]
+    fn evaluate(
         &self,
-        generators: &[Matrix3<f64>],
-        s: &State,
-        i: usize,
-        j: usize,
-        a: Vector2<f64>,
-    ) -> Option<Transfer> {
-        let (from, to) = (s.lenses[self.lens_of[i]], s.lenses[self.lens_of[j]]);
-        let q = a / from.log_focal.exp();
-        let p = undistort(q, from.k1)?;
-        let relative = s.motion[j] * inverse(self.kind, &s.motion[i]);
-        let x = Vector3::new(p.x, p.y, 1.0);
+        item: usize,
+        [source, target, from, to]: [&[f64]; 4],
+        jacobian: Option<&mut SMatrix<f64, 2, C>>,
+    ) -> Option<Vector2<f64>> {
+        let (a, b) = self.matches[item];
+        let [from, to] = [from, to].map(|l| Lens { log_focal: l[0], k1: l[1] });
+        let relative = Matrix3::from_column_slice(target) * inverse(self.kind, &Matrix3::from_column_slice(source));
+        let lost = Some(Vector2::new(LOST, 0.0));
+        let Some(p) = from.ray(a) else { return lost };
+        let x = p.to_homogeneous();
         let y = relative * x;
-        let (n, f) = finish(&y, to)?;
-        let r2 = n.norm_squared();
-        // Derivative of the pixel by n, then by y.
-        let by_n = distortion_jacobian(n, to.k1) * f;
-        let by_y = |dy: Vector3<f64>| by_n * Vector2::new(dy.x - n.x * dy.z, dy.y - n.y * dy.z) / y.z;
-        let zero = Vector2::zeros();
-        let (mut by_source, mut by_target) = ([zero; 8], [zero; 8]);
-        for (k, g) in generators.iter().enumerate() {
-            by_target[k] = by_y(g * y);
-            by_source[k] = by_y(-(relative * (g * x)));
+        let Some(seen) = see(&y, to) else { return lost };
+        let Some(j) = jacobian else { return Some(seen - b) };
+        let n = Point2::new(y.x / y.z, y.y / y.z);
+        let f = to.log_focal.exp();
+        let (_, by_n, by_lens) = to.distortion().distort_with_jacobians(n);
+        let by_y = |dy: Vector3<f64>| by_n * Vector2::new(dy.x - n.x * dy.z, dy.y - n.y * dy.z) * (f / y.z);
+        for (k, g) in self.generators.iter().enumerate() {
+            j.set_column(k, &by_y(-(relative * (g * x))));
+            j.set_column(M + k, &by_y(g * y));
         }
-        let inverse_lens = distortion_jacobian(p, from.k1).try_inverse()?;
-        let by_p = |dp: Vector2<f64>| by_y(relative * Vector3::new(dp.x, dp.y, 0.0));
-        let point = n * (f * (1.0 + to.k1 * r2));
-        Some(Transfer {
-            point,
-            by_source,
-            by_target,
-            by_source_lens: [by_p(-(inverse_lens * q)), by_p(-(inverse_lens * (p * p.norm_squared())))],
-            by_target_lens: [point, n * (f * r2)],
-        })
-    }
-
-    fn overlap_cost(&self, s: &State, o: &Overlap) -> f64 {
-        let one = |i, j, a, b: Vector2<f64>| {
-            let squared = self.transfer(s, i, j, a).map_or(LOST * LOST, |p| (p - b).norm_squared());
-            self.loss.value(squared)
-        };
-        o.points.iter().map(|&(a, b)| one(o.i, o.j, a, b) + one(o.j, o.i, b, a)).sum()
-    }
-
-    /// Global columns of the local ones: motion of i, motion of j, lens of i, lens of j.
-    fn local_columns(&self, i: usize, j: usize) -> Vec<Option<usize>> {
-        let (m, l) = (self.motion_dof(), self.lens_dof());
-        let mut columns = Vec::with_capacity(MAX_LOCAL);
-        for photo in [i, j] {
-            let first = self.motion_column(photo);
-            columns.extend((0..m).map(|k| first.map(|c| c + k)));
-        }
-        for photo in [i, j] {
-            let first = self.lens_column(self.lens_of[photo]);
-            columns.extend((0..l).map(|k| Some(first + k)));
-        }
-        columns
-    }
-
-    fn linearize_overlap(&self, generators: &[Matrix3<f64>], s: &State, o: &Overlap) -> NormalEquations<Dyn> {
-        let (m, l) = (self.motion_dof(), self.lens_dof());
-        let n = 2 * (m + l);
-        let mut normal = NormalEquations::zeros(Dyn(n));
-        let mut rows = [DVector::zeros(n), DVector::zeros(n)];
-        // Which of the two lens derivatives are in use.
-        let lens: Vec<usize> =
-            [(0, self.free_focal), (1, self.free_k1)].iter().filter(|(_, f)| *f).map(|(k, _)| *k).collect();
-        for &(a, b) in &o.points {
-            for forward in [true, false] {
-                let (i, j, from, to) = if forward { (o.i, o.j, a, b) } else { (o.j, o.i, b, a) };
-                let Some(t) = self.transfer_with_jacobian(generators, s, i, j, from) else {
-                    normal.cost += self.loss.value(LOST * LOST);
-                    continue;
-                };
-                let r = t.point - to;
-                let squared = r.norm_squared();
-                normal.cost += self.loss.value(squared);
-                let weight = self.loss.weight(squared);
-                let (source, target) = if forward { (0, 1) } else { (1, 0) };
-                for (axis, row) in rows.iter_mut().enumerate() {
-                    for k in 0..m {
-                        row[source * m + k] = t.by_source[k][axis];
-                        row[target * m + k] = t.by_target[k][axis];
-                    }
-                    for (k, &which) in lens.iter().enumerate() {
-                        row[2 * m + source * l + k] = t.by_source_lens[which][axis];
-                        row[2 * m + target * l + k] = t.by_target_lens[which][axis];
-                    }
-                    normal.add(r[axis], row, weight);
-                }
-            }
-        }
-        normal
-    }
-
-    fn prior_cost(&self, s: &State) -> f64 {
-        s.lenses
-            .iter()
-            .zip(self.focal_prior)
-            .map(|(lens, &(mean, sigma))| {
-                let f = if self.free_focal { ((lens.log_focal - mean) / sigma).powi(2) } else { 0.0 };
-                let k = if self.free_k1 { (lens.k1 / K1_SIGMA).powi(2) } else { 0.0 };
-                f + k
-            })
-            .sum()
-    }
-
-    /// Minimizes the reprojection error from `start`.
-    pub(crate) fn solve(&self, start: State, max_iterations: usize) -> (State, f64) {
-        let options = LmOptions { max_iterations, cost_tolerance: 1e-7, ..LmOptions::default() };
-        let report = levenberg_marquardt(self, start, &options);
-        (report.params, report.cost)
-    }
-
-    /// Squared error in pixels of every match of an overlap, the mean of the two directions.
-    pub(crate) fn squared_errors(&self, s: &State, o: &Overlap) -> Vec<f64> {
-        let one = |i, j, a, b: Vector2<f64>| self.transfer(s, i, j, a).map_or(LOST * LOST, |p| (p - b).norm_squared());
-        o.points.iter().map(|&(a, b)| 0.5 * (one(o.i, o.j, a, b) + one(o.j, o.i, b, a))).collect()
+        let (q, by_p, by_k1) = from.distortion().distort_with_jacobians(p);
+        let Some(inverse_lens) = by_p.try_inverse() else { return lost };
+        let by_ray = |dp: Vector2<f64>| by_y(relative * Vector3::new(dp.x, dp.y, 0.0));
+        j.set_column(2 * M, &by_ray(-(inverse_lens * q.coords)));
+        j.set_column(2 * M + 1, &by_ray(-(inverse_lens * by_k1.column(0))));
+        j.set_column(2 * M + 2, &seen);
+        j.set_column(2 * M + 3, &(by_lens.column(0) * f));
+        Some(seen - b)
     }
 }
 
-/// The camera-plane point and the focal length; `None` behind the camera.
-fn finish(y: &Vector3<f64>, lens: Lens) -> Option<(Vector2<f64>, f64)> {
+/// Where a ray is seen, from the principal point; `None` behind the camera, and beyond the turning point of the lens, where a pixel means nothing.
+fn see(y: &Vector3<f64>, lens: Lens) -> Option<Vector2<f64>> {
     if y.z <= 1e-6 * y.norm() {
         return None;
     }
-    let n = Vector2::new(y.x / y.z, y.y / y.z);
-    // Beyond the turning point of the lens polynomial a pixel means nothing.
-    (1.0 + 3.0 * lens.k1 * n.norm_squared() > 0.05).then(|| (n, lens.log_focal.exp()))
+    let n = Point2::new(y.x / y.z, y.y / y.z);
+    lens.distortion().distort_in_range(n).map(|d| d.coords * lens.log_focal.exp())
 }
 
 fn inverse(kind: Motion, m: &Matrix3<f64>) -> Matrix3<f64> {
@@ -287,92 +161,110 @@ fn inverse(kind: Motion, m: &Matrix3<f64>) -> Matrix3<f64> {
     }
 }
 
-impl LeastSquares for Problem<'_> {
-    type Dim = Dyn;
-    type Params = State;
+fn generators_of_rotations() -> [Matrix3<f64>; 3] {
+    std::array::from_fn(|k| Vector3::ith(k, 1.0).cross_matrix())
+}
 
-    fn dim(&self) -> Dyn {
-        Dyn(self.columns())
+/// All entries but the last: the scale of a homography means nothing.
+fn generators_of_homographies() -> [Matrix3<f64>; 8] {
+    std::array::from_fn(|k| {
+        let mut g = Matrix3::zeros();
+        g[(k / 3, k % 3)] = 1.0;
+        g
+    })
+}
+
+impl Problem<'_> {
+    /// Pixels of photograph `i` (from its principal point) to those of `j`.
+    pub(crate) fn transfer(&self, s: &State, i: usize, j: usize, a: Vector2<f64>) -> Option<Vector2<f64>> {
+        let (from, to) = (s.lenses[self.lens_of[i]], s.lenses[self.lens_of[j]]);
+        see(&(s.motion[j] * inverse(self.kind, &s.motion[i]) * from.ray(a)?.to_homogeneous()), to)
     }
 
-    fn cost(&self, s: &State) -> f64 {
-        // Collected before summing: the order of a parallel sum would change the last bits.
-        let costs: Vec<f64> = self.overlaps.par_iter().map(|o| self.overlap_cost(s, o)).collect();
-        costs.iter().sum::<f64>() + self.prior_cost(s)
+    /// Minimizes the reprojection error from `start`. A start that is not finite is returned with an infinite cost.
+    pub(crate) fn solve(&self, start: State, max_iterations: usize) -> (State, f64) {
+        let mut state = start.clone();
+        match self.adjust(&mut state, max_iterations) {
+            Ok(report) => (state, report.cost),
+            Err(_) => (start, f64::INFINITY),
+        }
     }
 
-    fn linearize(&self, s: &State) -> NormalEquations<Dyn> {
-        let generators = self.kind.generators();
-        let locals: Vec<NormalEquations<Dyn>> =
-            self.overlaps.par_iter().map(|o| self.linearize_overlap(&generators, s, o)).collect();
-        let mut normal = NormalEquations::zeros(self.dim());
-        for (o, local) in self.overlaps.iter().zip(&locals) {
-            let columns = self.local_columns(o.i, o.j);
-            normal.cost += local.cost;
-            for (q, column) in columns.iter().enumerate() {
-                let Some(column) = *column else { continue };
-                normal.gradient[column] += local.gradient[q];
-                for (p, row) in columns.iter().enumerate() {
-                    let Some(row) = *row else { continue };
-                    if row >= column {
-                        normal.hessian[(row, column)] += local.hessian[(p.max(q), p.min(q))];
-                    }
-                }
+    fn adjust(&self, state: &mut State, max_iterations: usize) -> Result<AdjustReport, AdjustError> {
+        let mut problem = Adjustment::default();
+        let numbers = state.motion.iter().flat_map(|m| m.iter().copied()).collect();
+        let lenses = state.lenses.iter().flat_map(|l| [l.log_focal, l.k1]).collect();
+        let lenses = problem.add_group("lenses", Euclidean(2), lenses)?;
+        let motions = match self.kind {
+            Motion::Rotation => {
+                let motions = problem.add_group("rotations", RotationManifold, numbers)?;
+                self.add_matches::<3, 10>(&mut problem, motions, lenses, generators_of_rotations())?;
+                motions
             }
+            Motion::Homography => {
+                let motions = problem.add_group("homographies", HomographyManifold, numbers)?;
+                self.add_matches::<8, 20>(&mut problem, motions, lenses, generators_of_homographies())?;
+                motions
+            }
+        };
+        problem.hold(motions, self.fixed)?;
+        for lens in 0..state.lenses.len() {
+            let held: Vec<usize> = [(0, self.free_focal), (1, self.free_k1)]
+                .into_iter()
+                .filter(|(_, free)| !free)
+                .map(|(k, _)| k)
+                .collect();
+            problem.hold_parameters(lenses, lens, &held)?;
         }
-        for (lens, (value, &(mean, sigma))) in s.lenses.iter().zip(self.focal_prior).enumerate() {
-            let mut column = self.lens_column(lens);
-            let mut add = |on: bool, error: f64, sigma: f64| {
-                if on {
-                    normal.hessian[(column, column)] += 1.0 / (sigma * sigma);
-                    normal.gradient[column] += error / (sigma * sigma);
-                    column += 1;
-                }
-            };
-            add(self.free_focal, value.log_focal - mean, sigma);
-            add(self.free_k1, value.k1, K1_SIGMA);
+        let weight = |free: bool, sigma: f64| if free { 1.0 / sigma } else { 0.0 };
+        let known = |&(mean, sigma): &(f64, f64)| {
+            ([mean, 0.0], [weight(self.free_focal, sigma), weight(self.free_k1, K1_SIGMA)])
+        };
+        let prior = Prior { items: self.focal_prior.iter().map(known).collect() };
+        let blocks = (0..self.focal_prior.len() as u32).map(|l| [l]).collect();
+        problem.add_residuals("lens priors", prior, [lenses], blocks, RobustLoss::Trivial)?;
+        let options = AdjustOptions { max_iterations, cost_tolerance: 1e-7, ..AdjustOptions::default() };
+        let report = problem.solve(&options, |_| ControlFlow::Continue(()))?;
+        for (motion, x) in state.motion.iter_mut().zip(problem.values(motions).chunks_exact(9)) {
+            motion.copy_from_slice(x);
         }
-        normal.cost += self.prior_cost(s);
-        normal
+        for (lens, x) in state.lenses.iter_mut().zip(problem.values(lenses).chunks_exact(2)) {
+            (lens.log_focal, lens.k1) = (x[0], x[1]);
+        }
+        Ok(report)
     }
 
-    fn step(&self, s: &State, delta: &DVector<f64>) -> State {
-        let generators = self.kind.generators();
-        let mut next = s.clone();
-        for (i, motion) in next.motion.iter_mut().enumerate() {
-            let Some(column) = self.motion_column(i) else { continue };
-            *motion = match self.kind {
-                Motion::Rotation => {
-                    let moved = Rotation3::new(Vector3::new(delta[column], delta[column + 1], delta[column + 2]))
-                        .into_inner()
-                        * *motion;
-                    // Products of rotations drift off the group by rounding.
-                    Rotation3::from_matrix_eps(&moved, 1e-15, 10, Rotation3::from_matrix_unchecked(moved)).into_inner()
-                }
-                Motion::Homography => {
-                    let change: Matrix3<f64> = generators.iter().enumerate().map(|(k, g)| g * delta[column + k]).sum();
-                    let moved = (Matrix3::identity() + change) * *motion;
-                    moved / moved.norm()
-                }
-            };
-        }
-        for lens in 0..next.lenses.len() {
-            let mut column = self.lens_column(lens);
-            if self.free_focal {
-                next.lenses[lens].log_focal += delta[column];
-                column += 1;
-            }
-            if self.free_k1 {
-                next.lenses[lens].k1 += delta[column];
+    /// Every match in both directions.
+    fn add_matches<const M: usize, const C: usize>(
+        &self,
+        problem: &mut Adjustment<'_>,
+        motions: GroupId,
+        lenses: GroupId,
+        generators: [Matrix3<f64>; M],
+    ) -> Result<(), AdjustError> {
+        let (mut matches, mut blocks) = (Vec::new(), Vec::new());
+        for o in self.overlaps {
+            let [i, j, from, to] = [o.i, o.j, self.lens_of[o.i], self.lens_of[o.j]].map(|n| n as u32);
+            for &(a, b) in &o.points {
+                matches.extend([(a, b), (b, a)]);
+                blocks.extend([[i, j, from, to], [j, i, to, from]]);
             }
         }
-        next
+        let transfers = Transfers::<M, C> { kind: self.kind, generators, matches };
+        problem.add_residuals("matches", transfers, [motions, motions, lenses, lenses], blocks, self.loss)
+    }
+
+    /// Squared error in pixels of every match of an overlap, the mean of the two directions.
+    pub(crate) fn squared_errors(&self, s: &State, o: &Overlap) -> Vec<f64> {
+        let one = |i, j, a, b: Vector2<f64>| self.transfer(s, i, j, a).map_or(LOST * LOST, |p| (p - b).norm_squared());
+        o.points.iter().map(|&(a, b)| 0.5 * (one(o.i, o.j, a, b) + one(o.j, o.i, b, a))).collect()
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use nalgebra::Rotation3;
 
     /// Points that two cameras turned by `angles` see, the lens `focal`, `k1`.
     fn overlaps(rotations: &[Rotation3<f64>], focal: f64, k1: f64) -> Vec<Overlap> {
@@ -409,45 +301,53 @@ mod tests {
             .collect()
     }
 
+    /// Derivatives of all residuals against central differences.
+    fn check<const M: usize, const C: usize>(
+        transfers: &Transfers<M, C>,
+        manifold: &impl Manifold,
+        motions: [Matrix3<f64>; 2],
+    ) {
+        let lenses = [[6.5, -0.04], [6.6, 0.03]];
+        let at = |item: usize, c: usize, h: f64| {
+            let (mut motions, mut lenses) = (motions, lenses);
+            if c < 2 * M {
+                let mut delta = [0.0; 8];
+                delta[c % M] = h;
+                let before = motions[c / M];
+                manifold.step(before.as_slice(), &delta[..M], motions[c / M].as_mut_slice());
+            } else {
+                lenses[(c - 2 * M) / 2][(c - 2 * M) % 2] += h;
+            }
+            let blocks = [motions[0].as_slice(), motions[1].as_slice(), &lenses[0], &lenses[1]];
+            transfers.evaluate(item, blocks, None).unwrap()
+        };
+        for item in 0..transfers.matches.len() {
+            let blocks = [motions[0].as_slice(), motions[1].as_slice(), &lenses[0], &lenses[1]];
+            let mut jacobian = SMatrix::zeros();
+            transfers.evaluate(item, blocks, Some(&mut jacobian)).unwrap();
+            for c in 0..C {
+                let numeric = (at(item, c, 1e-5) - at(item, c, -1e-5)) / 2e-5;
+                let exact = jacobian.column(c);
+                // Pixels of some hundreds: 1e-13 of rounding by 1e-5, and h² of truncation by derivatives of some thousands.
+                assert!((numeric - exact).norm() < 1e-5 * (1.0 + exact.norm()), "{item} {c}: {numeric} {exact}");
+            }
+        }
+    }
+
     #[test]
     fn jacobians_are_the_derivatives() {
         let rotations = turns();
-        let overlaps = overlaps(&rotations, 700.0, 0.0);
-        for kind in [Motion::Rotation, Motion::Homography] {
-            let free = kind == Motion::Rotation;
-            let problem = Problem {
-                kind,
-                overlaps: &overlaps,
-                lens_of: &[0, 1, 0, 1],
-                fixed: 1,
-                free_focal: free,
-                free_k1: free,
-                focal_prior: &[(6.5, 0.3), (6.5, 0.3)],
-                loss: RobustLoss::Trivial,
-            };
-            let state = State {
-                motion: rotations
-                    .iter()
-                    .map(|r| (Rotation3::new(Vector3::new(0.01, -0.02, 0.01)) * r).into_inner())
-                    .collect(),
-                lenses: vec![Lens { log_focal: 6.5, k1: -0.04 }, Lens { log_focal: 6.6, k1: 0.03 }],
-            };
-            let normal = problem.linearize(&state);
-            let h = 1e-6;
-            for column in 0..problem.columns() {
-                let mut d = DVector::zeros(problem.columns());
-                d[column] = h;
-                let forward = problem.cost(&problem.step(&state, &d));
-                d[column] = -h;
-                let numeric = (forward - problem.cost(&problem.step(&state, &d))) / (4.0 * h);
-                // Central differences of a cost of 1e7: h² truncation and 1e-16·1e7/h rounding, against gradients of 1e6.
-                let analytic = normal.gradient[column];
-                assert!(
-                    (numeric - analytic).abs() < 1e-4 * (1e3 + analytic.abs()),
-                    "{kind:?} {column}: {numeric} {analytic}"
-                );
-            }
-        }
+        let overlap = overlaps(&rotations, 700.0, 0.0).swap_remove(0);
+        let matches: Vec<_> = overlap.points.into_iter().step_by(9).collect();
+        assert!(matches.len() > 20);
+        let motions = [overlap.i, overlap.j]
+            .map(|i| (Rotation3::new(Vector3::new(0.01, -0.02, 0.01)) * rotations[i]).into_inner());
+        let generators = generators_of_rotations();
+        let transfers = Transfers::<3, 10> { kind: Motion::Rotation, generators, matches: matches.clone() };
+        check(&transfers, &RotationManifold, motions);
+        let generators = generators_of_homographies();
+        let transfers = Transfers::<8, 20> { kind: Motion::Homography, generators, matches };
+        check(&transfers, &HomographyManifold, motions);
     }
 
     #[test]
