@@ -553,8 +553,8 @@ mod tests {
                 let stop = StopAt::of_stage(stage, at);
                 let result = render(&set.views(), &set.alignment, &options, &stop);
                 assert_eq!(result.unwrap_err(), RenderError::Cancelled(Cancelled), "{stage} {at}");
-                // Each thread asks once more at most.
-                assert!(stop.reports() <= at + rayon::current_num_threads(), "{stage} {at}: {}", stop.reports());
+                // A thread that waits for others may begin another piece of work: it asks, and ends that too.
+                assert!(stop.reports() <= at + 4 * rayon::current_num_threads(), "{stage} {at}: {}", stop.reports());
             }
         }
     }
