@@ -98,9 +98,9 @@ pub(crate) fn jobs(pixels: usize) -> Vec<Job> {
         let [left, right] = walls(width, height, 23);
         let mut stereo = StereoOptions { smoothing, confidence: true, ..StereoOptions::default() };
         if strips {
-            // Half of the memory of the whole: rows are aggregated in strips.
+            // Less memory than for the whole: rows are aggregated in strips.
             let matcher = cv_pipeline::stereo::StereoMatcher::new(stereo.clone()).unwrap();
-            stereo.max_memory = Some(matcher.memory(width, height) / 2);
+            stereo.max_memory = Some(matcher.memory(width, height) * 3 / 4);
         }
         let options = DepthOptions { stereo, ..DepthOptions::default() };
         jobs.push((
