@@ -2,17 +2,12 @@
 
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");
-    for (name, present) in [("sse4_2", sse4_2()), ("avx2", avx2()), ("avx512", avx512())] {
+    for (name, present) in [("avx2", avx2()), ("avx512", avx512())] {
         println!("cargo::rustc-check-cfg=cfg(without_{name})");
         if !present {
             println!("cargo::rustc-cfg=without_{name}");
         }
     }
-}
-
-#[cfg(target_arch = "x86_64")]
-fn sse4_2() -> bool {
-    std::arch::is_x86_feature_detected!("sse4.2")
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -27,11 +22,6 @@ fn avx512() -> bool {
         && std::arch::is_x86_feature_detected!("avx512bw")
         && std::arch::is_x86_feature_detected!("avx512vbmi2")
         && std::arch::is_x86_feature_detected!("avx512vpopcntdq")
-}
-
-#[cfg(not(target_arch = "x86_64"))]
-fn sse4_2() -> bool {
-    false
 }
 
 #[cfg(not(target_arch = "x86_64"))]

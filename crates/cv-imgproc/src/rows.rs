@@ -17,16 +17,21 @@ pub(crate) fn for_rows_with<T: Sample, const C: usize, S>(
         return;
     }
     let rows = (BAND / stride).max(1);
-    let band = |(i, band): (usize, &mut [T])| {
+    in_bands(image.as_mut_slice(), stride * rows, &|i, band| {
         let mut state = init();
         for (j, row) in band.chunks_exact_mut(stride).enumerate() {
             f(&mut state, i * rows + j, row);
         }
-    };
-    if image.height() <= rows {
-        band((0, image.as_mut_slice()));
+    });
+}
+
+/// Calls `f(i, band)` for each band of `size` samples, in parallel. Not generic over what is called: the machinery of the
+/// thread pool is compiled once for each type of sample and not for each filter.
+fn in_bands<T: Sample>(samples: &mut [T], size: usize, f: &(dyn Fn(usize, &mut [T]) + Sync)) {
+    if samples.len() <= size {
+        f(0, samples);
     } else {
-        image.as_mut_slice().par_chunks_mut(stride * rows).enumerate().for_each(band);
+        samples.par_chunks_mut(size).enumerate().for_each(|(i, band)| f(i, band));
     }
 }
 

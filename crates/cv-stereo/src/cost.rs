@@ -47,26 +47,19 @@ impl Frame<'_> {
     }
 
     /// Costs of the pixels `xs` of row `y` at every disparity; 255 beyond the last one, which keeps those lanes from ever
-    /// winning or lending to their neighbors, since additions saturate. Groups are of `BLOCKS` blocks, and there is but
-    /// one where `SINGLE`.
+    /// winning or lending to their neighbors, since additions saturate. Groups are of `BLOCKS` blocks.
     #[inline(always)]
-    pub(crate) fn costs<S: Simd, const BLOCKS: usize, const SINGLE: bool>(
-        &self,
-        simd: S,
-        y: usize,
-        xs: Range<usize>,
-        out: &mut [u8],
-    ) {
+    pub(crate) fn costs<S: Simd, const BLOCKS: usize>(&self, simd: S, y: usize, xs: Range<usize>, out: &mut [u8]) {
         match self.planes - usize::from(self.intensity_cap.is_some()) {
-            3 => costs::<S, 3, BLOCKS, SINGLE>(simd, self, y, xs, out),
-            6 => costs::<S, 6, BLOCKS, SINGLE>(simd, self, y, xs, out),
-            _ => costs::<S, 8, BLOCKS, SINGLE>(simd, self, y, xs, out),
+            3 => costs::<S, 3, BLOCKS>(simd, self, y, xs, out),
+            6 => costs::<S, 6, BLOCKS>(simd, self, y, xs, out),
+            _ => costs::<S, 8, BLOCKS>(simd, self, y, xs, out),
         }
     }
 }
 
 #[simd]
-fn costs<S: Simd, const BITS: usize, const BLOCKS: usize, const SINGLE: bool>(
+fn costs<S: Simd, const BITS: usize, const BLOCKS: usize>(
     simd: S,
     frame: &Frame<'_>,
     y: usize,
@@ -76,7 +69,7 @@ fn costs<S: Simd, const BITS: usize, const BLOCKS: usize, const SINGLE: bool>(
     let lanes = S::u8s::LEN;
     let group = BLOCKS * BLOCK;
     let n = group / lanes;
-    let groups = if SINGLE { 1 } else { frame.layout.groups() };
+    let groups = frame.layout.groups();
     let (width, planes) = (frame.width, frame.planes);
     let (count, phase) = (xs.len(), frame.layout.phase(width));
     let left = &frame.left[y * width * planes..][..width * planes];

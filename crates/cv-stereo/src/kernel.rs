@@ -156,7 +156,7 @@ fn rows<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool>(
             let costs = match frame.given {
                 Some(given) => &given[y * width * depth..][columns.start * depth..columns.end * depth],
                 None => {
-                    frame.costs::<S, BLOCKS, SINGLE>(simd, y, columns.clone(), costs);
+                    frame.costs::<S, BLOCKS>(simd, y, columns.clone(), costs);
                     &costs[..span.len()]
                 }
             };

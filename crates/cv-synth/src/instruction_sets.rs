@@ -10,9 +10,8 @@ pub fn instruction_sets() -> Vec<Level> {
     #[cfg(target_arch = "x86_64")]
     {
         let best = Level::new();
-        let more =
-            [best.as_sse4_2().map(Level::Sse4_2), best.as_avx2().map(Level::Avx2), best.as_avx512().map(Level::Avx512)];
-        all.extend(more.into_iter().flatten());
+        // SSE4.2 is left out of the build: see .cargo/config.toml.
+        all.extend([best.as_avx2().map(Level::Avx2), best.as_avx512().map(Level::Avx512)].into_iter().flatten());
     }
     all
 }
@@ -23,15 +22,6 @@ mod tests {
 
     fn has(name: &str) -> bool {
         instruction_sets().iter().any(|level| format!("{level:?}").starts_with(name))
-    }
-
-    #[test]
-    #[cfg_attr(
-        without_sse4_2,
-        ignore = "this machine has no SSE4.2: whatever goes through the instruction sets left it out"
-    )]
-    fn sse4_2_is_tested() {
-        assert!(has("Sse4_2"));
     }
 
     #[test]

@@ -40,9 +40,9 @@ struct Winner<M> {
 ///
 /// Batches grow with the number of samples drawn, and each is judged by what was known before it, so the result does not depend on how it is
 /// spread over threads.
-pub(super) fn search<E: Estimator, C: Scorer, S: Sampler>(
+pub(super) fn search<E: Estimator, C: Scorer>(
     quality: &Quality<'_, E, C>,
-    sampler: &mut S,
+    sampler: &mut dyn Sampler,
     options: &RobustOptions,
     progress: &dyn Progress,
 ) -> Result<Option<Consensus<E::Model>>, Cancelled> {

@@ -158,12 +158,11 @@ fn with_scorer<E: Estimator, C: Scorer>(
         return Err(EstimateError::NotEnoughMatches { got: n, needed: E::SAMPLE });
     }
     let quality = Quality::new(estimator, scorer, options.threshold * estimator.unit());
-    let found = match options.sampling {
-        Sampling::Uniform => search(&quality, &mut Uniform::new(n, options.seed), options, progress)?,
-        Sampling::Prosac => {
-            search(&quality, &mut Prosac::new(n, E::SAMPLE, options.max_iterations, options.seed), options, progress)?
-        }
+    let sampler: &mut dyn Sampler = match options.sampling {
+        Sampling::Uniform => &mut Uniform::new(n, options.seed),
+        Sampling::Prosac => &mut Prosac::new(n, E::SAMPLE, options.max_iterations, options.seed),
     };
+    let found = search(&quality, sampler, options, progress)?;
     // The sample itself always fits.
     let needed = if n > E::SAMPLE { E::SAMPLE + 1 } else { E::SAMPLE };
     let none = |inliers, needed, iterations| EstimateError::NoConsensus { inliers, matches: n, needed, iterations };
