@@ -1,5 +1,6 @@
 //! Chores of the workspace. This file only routes: `cargo xtask --help` lists them.
 
+mod checks;
 mod fixtures;
 mod golden;
 mod peers;
@@ -33,12 +34,12 @@ enum Chore {
     },
     /// Run the pipelines on real photographs with known truth and hold each figure against its bar.
     Real {
-        /// Only this job.
+        /// Only this job; `all` or none: every one.
         job: Option<String>,
     },
     /// Run other systems and ours on the same inputs, side by side.
     Peers {
-        /// Only this job.
+        /// Only this job; `all` or none: every one.
         job: Option<String>,
     },
 }

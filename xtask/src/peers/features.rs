@@ -3,6 +3,7 @@
 //! Writes the section "Features" of `docs/benchmarks.md`.
 
 use super::feature_quality::{self, Quality};
+use crate::checks::Check;
 use anyhow::{Context, Result, ensure};
 use cv_core::{GrayF32, ImageView, Keypoint, Silent};
 use cv_features::{
@@ -51,7 +52,7 @@ struct Stage<'a> {
     best: [f64; 2],
 }
 
-pub(crate) fn run(python: &Path, data: &Path) -> Result<bool> {
+pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
     let script = crate::root().join("peers/features_opencv.py");
     let rust = rust_peers()?;
     let photo = data.join("panorama/weir/weir_1.jpg");
@@ -206,8 +207,7 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<bool> {
     );
     print!("{text}");
     super::write_section("Features", &text)?;
-    // NaN meets no bar.
-    Ok(bars.iter().all(|(_, figure, bar)| figure <= bar))
+    Ok(bars.into_iter().map(|(name, figure, bar)| Check::at_most(name, figure, bar)).collect())
 }
 
 /// The share of features whose nearest neighbor stays the same when descriptors are rounded to bytes.

@@ -1,31 +1,29 @@
 //! Other systems and ours on the same inputs, side by side.
 //!
 //! One file per job; its scripts and the pinned versions live in `peers/` at the root, whose `.venv` is made on the first
-//! run. Register a job with one line in `JOBS`; it returns whether ours meets its bars.
+//! run. Register a job with one line in `JOBS`; it returns its figures with their bars.
 
 mod feature_quality;
 mod features;
 mod geometry;
 mod stereo;
 
-use anyhow::{Context, Result, bail, ensure};
+use crate::checks::{self, Check};
+use anyhow::{Context, Result, ensure};
 use std::{
     path::{Path, PathBuf},
     process::Command,
 };
 
-/// A job: its name on the command line and what it does with the Python of the peers and the data folder.
-type Job = (&'static str, fn(&Path, &Path) -> Result<bool>);
+/// What a job does with the Python of the peers and the data folder.
+type Job = fn(&Path, &Path) -> Result<Vec<Check>>;
 
-const JOBS: &[Job] = &[("stereo", stereo::run), ("features", features::run), ("geometry", geometry::run)];
+const JOBS: &[checks::Named<Job>] =
+    &[("stereo", stereo::run), ("features", features::run), ("geometry", geometry::run)];
 
 /// Runs all jobs, or the one named; true where ours meets every bar.
 pub(crate) fn run(only: Option<&str>) -> Result<bool> {
-    let jobs: Vec<&Job> = JOBS.iter().filter(|(name, _)| only.is_none_or(|only| only == *name)).collect();
-    if jobs.is_empty() {
-        let names: Vec<&str> = JOBS.iter().map(|(name, _)| *name).collect();
-        bail!("there is no such job; try: {}", names.join(", "));
-    }
+    let jobs = checks::select(JOBS, only)?;
     let Some(data) = crate::data_dir() else {
         println!(
             "peers: skipped, there is no data: set CV_DATA_DIR to the folder that holds it (see docs/real-data.md)"
@@ -33,12 +31,7 @@ pub(crate) fn run(only: Option<&str>) -> Result<bool> {
         return Ok(true);
     };
     let python = python()?;
-    let mut ok = true;
-    for (name, job) in jobs {
-        println!("== {name}");
-        ok &= job(&python, &data).with_context(|| (*name).to_owned())?;
-    }
-    Ok(ok)
+    Ok(checks::run(&jobs, |job| job(&python, &data)))
 }
 
 /// The Python that has the peers: `CV_PEERS_PYTHON`, else that of `peers/.venv`, made where it is missing.
