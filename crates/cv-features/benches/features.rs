@@ -5,7 +5,10 @@ use cv_features::{
     DescriptorKind, Descriptors, HarrisOptions, MatchOptions, MopsOptions, SiftOptions, anms, anms_square_covering,
     harris, harris_response, match_descriptors, mops, sift,
 };
-use std::{hint::black_box, time::Instant};
+use timing::time;
+
+#[path = "../../../benches/timing.rs"]
+mod timing;
 
 /// Squares of random gray at several sizes: corners and blobs at all scales.
 fn image() -> GrayF32 {
@@ -28,17 +31,17 @@ fn random(state: &mut u32) -> f32 {
 fn detection() {
     let image = image();
     let options = HarrisOptions::default();
-    bench("harris_response 1333x750", || harris_response(image.view(), &options));
-    bench("harris 1333x750", || harris(image.view(), &options, &Silent));
+    time("harris_response 1333x750", || harris_response(image.view(), &options));
+    time("harris 1333x750", || harris(image.view(), &options, &Silent));
     let mut state = 1;
     let corners: Vec<Keypoint> = (0..20_000)
         .map(|_| Keypoint::new(1333.0 * random(&mut state), 750.0 * random(&mut state), random(&mut state).powi(3)))
         .collect();
-    bench("anms 20000 to 500", || anms(&corners, 500, 0.9));
-    bench("anms_square_covering 20000 to 500", || anms_square_covering(&corners, 500));
+    time("anms 20000 to 500", || anms(&corners, 500, 0.9));
+    time("anms_square_covering 20000 to 500", || anms_square_covering(&corners, 500));
     let (settings, oriented) = (SiftOptions { max_features: 2000, ..SiftOptions::default() }, MopsOptions::default());
-    bench("sift 2000 of 1333x750", || sift(image.view(), &settings, &Silent));
-    bench("mops 2000 of 1333x750", || mops(image.view(), &oriented, &Silent));
+    time("sift 2000 of 1333x750", || sift(image.view(), &settings, &Silent));
+    time("mops 2000 of 1333x750", || mops(image.view(), &oriented, &Silent));
 }
 
 fn matching() {
@@ -49,29 +52,13 @@ fn matching() {
         let empty = || Descriptors::new(kind);
         let pair = [set(), set()].map(|data| Descriptors::from_vec(kind, data).unwrap_or_else(empty));
         let name = format!("two nearest {count}x{count}x{}", kind.dimension());
-        bench(&name, || match_descriptors(&pair[0], &pair[1], &options, &Silent));
+        time(&name, || match_descriptors(&pair[0], &pair[1], &options, &Silent));
     }
-}
-
-/// The fastest and the middle one of some warm runs. (No benchmark library: criterion needs a C compiler.)
-fn bench<R>(name: &str, call: impl Fn() -> R) {
-    black_box(call());
-    let mut times: Vec<f64> = (0..15)
-        .map(|_| {
-            let start = Instant::now();
-            black_box(call());
-            1e3 * start.elapsed().as_secs_f64()
-        })
-        .collect();
-    times.sort_by(f64::total_cmp);
-    println!("{name:44} {:8.3} ms, middle {:8.3} ms", times[0], times[times.len() / 2]);
 }
 
 fn main() {
-    // `cargo bench` says so; `cargo test --all-targets` only asks whether it builds and starts.
-    if !std::env::args().any(|a| a == "--bench") {
-        return;
+    if timing::asked() {
+        detection();
+        matching();
     }
-    detection();
-    matching();
 }

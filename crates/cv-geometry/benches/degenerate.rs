@@ -1,8 +1,5 @@
 //! Time of a refusal: matches that determine no model, from the first look to the typed answer. Bar: 50 ms each.
 
-#![allow(missing_docs, reason = "the entry point is criterion's")]
-
-use criterion::{Criterion, criterion_group, criterion_main};
 use cv_core::{Camera, Correspondence, Silent};
 use cv_geometry::{
     EstimateError, RobustOptions, estimate_fundamental, estimate_homography, estimate_relative_pose, normalize_matches,
@@ -10,6 +7,10 @@ use cv_geometry::{
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 use std::hint::black_box;
+use timing::time;
+
+#[path = "../../../benches/timing.rs"]
+mod timing;
 
 const MATCHES: usize = 300;
 
@@ -45,24 +46,21 @@ fn inputs() -> Vec<(&'static str, Vec<Correspondence>)> {
     ]
 }
 
-fn bench(c: &mut Criterion) {
+fn main() {
+    if !timing::asked() {
+        return;
+    }
     let camera = Camera::from_focal(900, 900, 1000.0);
     let essential = |m: &[Correspondence]| -> Result<usize, EstimateError> {
         let (m, unit) = normalize_matches(m, &camera, &camera);
         let options = RobustOptions { threshold: unit, ..RobustOptions::essential() };
         estimate_relative_pose(&m, &options, &Silent).map(|found| found.inliers.len())
     };
-    let mut group = c.benchmark_group("degenerate");
-    group.sample_size(10);
+    let homography = |m: &[Correspondence]| estimate_homography(m, &RobustOptions::homography(), &Silent);
+    let fundamental = |m: &[Correspondence]| estimate_fundamental(m, &RobustOptions::fundamental(), &Silent);
     for (name, m) in inputs() {
-        let homography = |m: &[Correspondence]| estimate_homography(m, &RobustOptions::homography(), &Silent);
-        let fundamental = |m: &[Correspondence]| estimate_fundamental(m, &RobustOptions::fundamental(), &Silent);
-        group.bench_function(format!("homography, {name}"), |b| b.iter(|| homography(black_box(&m)).is_ok()));
-        group.bench_function(format!("fundamental, {name}"), |b| b.iter(|| fundamental(black_box(&m)).is_ok()));
-        group.bench_function(format!("essential, {name}"), |b| b.iter(|| essential(black_box(&m)).is_ok()));
+        time(&format!("homography, {name}"), || homography(black_box(&m)).is_ok());
+        time(&format!("fundamental, {name}"), || fundamental(black_box(&m)).is_ok());
+        time(&format!("essential, {name}"), || essential(black_box(&m)).is_ok());
     }
-    group.finish();
 }
-
-criterion_group!(benches, bench);
-criterion_main!(benches);

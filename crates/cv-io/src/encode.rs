@@ -3,17 +3,16 @@
 use std::path::Path;
 
 use cv_core::ImageView;
-use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-use image::{ExtendedColorType, ImageEncoder};
+use png::{BitDepth, ColorType, Compression, Filter};
 
 use crate::files::write_bytes;
 use crate::{FormatError, IoError};
 
 /// What a PNG can hold here: views of 1, 3 or 4 channels of `u8` or `u16`, and masks.
 pub trait PngPixels: sealed::Sealed {
-    /// Width, height, color type and the rows, big-endian, without padding.
+    /// Width, height, color type, bits and the rows, big-endian, without padding.
     #[doc(hidden)]
-    fn parts(&self) -> (usize, usize, ExtendedColorType, Vec<u8>);
+    fn parts(&self) -> (usize, usize, ColorType, BitDepth, Vec<u8>);
 }
 
 mod sealed {
@@ -21,41 +20,44 @@ mod sealed {
 }
 
 macro_rules! png_pixels {
-    ($sample:ty, $channels:literal, $color:ident, $push:expr) => {
+    ($sample:ty, $channels:literal, $color:ident, $depth:ident, $push:expr) => {
         impl sealed::Sealed for ImageView<'_, $sample, $channels> {}
         impl PngPixels for ImageView<'_, $sample, $channels> {
-            fn parts(&self) -> (usize, usize, ExtendedColorType, Vec<u8>) {
+            fn parts(&self) -> (usize, usize, ColorType, BitDepth, Vec<u8>) {
                 let mut bytes = Vec::with_capacity(self.width() * self.height() * $channels * size_of::<$sample>());
                 let push: fn(&mut Vec<u8>, &[$sample]) = $push;
                 (0..self.height()).for_each(|y| push(&mut bytes, self.row(y)));
-                (self.width(), self.height(), ExtendedColorType::$color, bytes)
+                (self.width(), self.height(), ColorType::$color, BitDepth::$depth, bytes)
             }
         }
     };
 }
 
-png_pixels!(u8, 1, L8, |out, row| out.extend_from_slice(row));
-png_pixels!(u8, 3, Rgb8, |out, row| out.extend_from_slice(row));
-png_pixels!(u8, 4, Rgba8, |out, row| out.extend_from_slice(row));
-png_pixels!(bool, 1, L8, |out, row| out.extend(row.iter().map(|&v| if v { 255u8 } else { 0 })));
-// The encoder takes 16-bit samples in the machine's byte order.
-png_pixels!(u16, 1, L16, |out, row| out.extend(row.iter().flat_map(|v| v.to_ne_bytes())));
-png_pixels!(u16, 3, Rgb16, |out, row| out.extend(row.iter().flat_map(|v| v.to_ne_bytes())));
+png_pixels!(u8, 1, Grayscale, Eight, |out, row| out.extend_from_slice(row));
+png_pixels!(u8, 3, Rgb, Eight, |out, row| out.extend_from_slice(row));
+png_pixels!(u8, 4, Rgba, Eight, |out, row| out.extend_from_slice(row));
+png_pixels!(bool, 1, Grayscale, Eight, |out, row| out.extend(row.iter().map(|&v| if v { 255u8 } else { 0 })));
+png_pixels!(u16, 1, Grayscale, Sixteen, |out, row| out.extend(row.iter().flat_map(|v| v.to_be_bytes())));
+png_pixels!(u16, 3, Rgb, Sixteen, |out, row| out.extend(row.iter().flat_map(|v| v.to_be_bytes())));
 
 /// The bytes of a PNG file.
 ///
 /// # Errors
 /// [`FormatError::NotRepresentable`] for an empty picture or one whose sides exceed 2³¹ − 1.
 pub fn encode_png(view: impl PngPixels) -> Result<Vec<u8>, FormatError> {
-    let (width, height, color, pixels) = view.parts();
+    let (width, height, color, depth, pixels) = view.parts();
     let side = |n: usize| u32::try_from(n).ok().filter(|&n| n > 0 && n <= i32::MAX as u32);
     let (Some(w), Some(h)) = (side(width), side(height)) else {
         return Err(FormatError::NotRepresentable { format: "PNG", what: format!("a picture of {width}×{height}") });
     };
     let mut bytes = Vec::new();
-    PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive)
-        .write_image(&pixels, w, h, color)
-        .map_err(|e| FormatError::corrupt("PNG", e.to_string()))?;
+    let mut encoder = png::Encoder::new(&mut bytes, w, h);
+    encoder.set_color(color);
+    encoder.set_depth(depth);
+    encoder.set_compression(Compression::Fast);
+    encoder.set_filter(Filter::Adaptive);
+    let write = || encoder.write_header()?.write_image_data(&pixels);
+    write().map_err(|e| FormatError::corrupt("PNG", e.to_string()))?;
     Ok(bytes)
 }
 
@@ -78,13 +80,13 @@ impl JpegPixels for ImageView<'_, u8, 3> {}
 /// # Errors
 /// [`FormatError::NotRepresentable`] for an empty picture or one with a side above 65535.
 pub fn encode_jpeg(view: impl JpegPixels, quality: u8) -> Result<Vec<u8>, FormatError> {
-    let (width, height, color, pixels) = view.parts();
+    let (width, height, color, _, pixels) = view.parts();
     let side = |n: usize| u16::try_from(n).ok().filter(|&n| n > 0);
     let (Some(w), Some(h)) = (side(width), side(height)) else {
         return Err(FormatError::NotRepresentable { format: "JPEG", what: format!("a picture of {width}×{height}") });
     };
     let color =
-        if color == ExtendedColorType::L8 { jpeg_encoder::ColorType::Luma } else { jpeg_encoder::ColorType::Rgb };
+        if color == ColorType::Grayscale { jpeg_encoder::ColorType::Luma } else { jpeg_encoder::ColorType::Rgb };
     let mut bytes = Vec::new();
     jpeg_encoder::Encoder::new(&mut bytes, quality.clamp(1, 100))
         .encode(&pixels, w, h, color)

@@ -3,7 +3,7 @@
 use exif::{Context, Exif, In, Tag, Value};
 
 /// Facts from a picture's EXIF block, as far as geometry needs them.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct ExifInfo {
     /// The orientation tag, 1 to 8; 1 where there is none. Already applied to the pixels.
     pub orientation: u8,
@@ -38,25 +38,32 @@ const DIAGONAL_35MM: f64 = 43.266_615_305_567_87;
 /// The widths of real sensors, in mm, from a small telephone's to larger than full frame.
 const SENSOR_WIDTHS: std::ops::RangeInclusive<f64> = 2.0..=60.0;
 
+impl Default for ExifInfo {
+    fn default() -> Self {
+        Self { orientation: 1, focal: None, camera: None }
+    }
+}
+
 impl ExifInfo {
     /// From the raw EXIF block (TIFF structure) of a picture of `width` × `height` stored pixels.
     ///
     /// Damaged blocks give what could be read: a bad tag never costs the picture.
-    pub(crate) fn parse(block: Vec<u8>, width: usize, height: usize, orientation: u8) -> Self {
+    pub(crate) fn parse(block: Vec<u8>, width: usize, height: usize) -> Self {
         let mut reader = exif::Reader::new();
         reader.continue_on_error(true);
         let parsed = match reader.read_raw(block) {
             Ok(exif) => Some(exif),
             Err(error) => error.distill_partial_result(|_| ()).ok(),
         };
-        let Some(exif) = parsed else { return Self { orientation, ..Self::default() } };
+        let Some(exif) = parsed else { return Self::default() };
         let text = |tag| match exif.get_field(tag, In::PRIMARY).map(|f| &f.value) {
             Some(Value::Ascii(lines)) => lines.first().map(|l| String::from_utf8_lossy(l).trim().to_owned()),
             _ => None,
         };
         let camera = [text(Tag::Make), text(Tag::Model)].into_iter().flatten().collect::<Vec<_>>().join(" ");
+        let orientation = exif.get_field(Tag::Orientation, In::PRIMARY).and_then(|field| field.value.get_uint(0));
         Self {
-            orientation,
+            orientation: orientation.filter(|tag| (1..=8).contains(tag)).map_or(1, |tag| tag as u8),
             focal: focal(&exif, width as f64, height as f64),
             camera: (!camera.is_empty()).then_some(camera),
         }

@@ -32,6 +32,7 @@
 //! | matches | [`read_matches`], [`write_matches`] |
 
 mod camera;
+mod codec;
 pub mod colmap;
 mod depth_png;
 mod encode;

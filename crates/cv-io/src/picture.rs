@@ -1,12 +1,11 @@
 //! Reading pictures of any of the supported formats.
 
-use std::io::Cursor;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
 use cv_core::{GrayF32, GrayU8, Image, Mask, RgbF32, RgbU8, Sample};
-use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Limits};
 
+use crate::codec::{Format, Header, Raster, Samples};
 use crate::exif_info::is_raw_preview;
 use crate::files::read_bytes;
 use crate::{ExifInfo, FormatError, IoError, sniff};
@@ -113,101 +112,83 @@ fn srgb_byte(v: f32) -> u8 {
 /// [`FormatError`]: not a picture, damaged, cut short, or more pixels than `options` allow.
 pub fn decode_image(bytes: &[u8], options: &ReadOptions) -> Result<DynImage, FormatError> {
     let format = sniff::picture_format(bytes)?;
-    let name = sniff::name(format);
+    let name = format.name();
     // The codecs are other people's code: should one panic, that is this file's error and not the program's end.
     catch_unwind(AssertUnwindSafe(|| decode(bytes, format, options)))
         .unwrap_or_else(|_| Err(FormatError::corrupt(name, "the decoder gave up on it")))
 }
 
-fn decode(bytes: &[u8], format: ImageFormat, options: &ReadOptions) -> Result<DynImage, FormatError> {
-    let fail = |error| from_image_error(format, error);
-    if format == ImageFormat::Tiff && is_raw_preview(bytes) {
+fn decode(bytes: &[u8], format: Format, options: &ReadOptions) -> Result<DynImage, FormatError> {
+    if format == Format::Tiff && is_raw_preview(bytes) {
         return Err(FormatError::unsupported_picture("camera raw", "undeveloped sensor data"));
     }
-    let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
-    // Enough for any header's own allocations; the pixels are allowed for once their number is known.
-    reader.limits(limits(64 << 20));
-    let mut decoder = reader.into_decoder().map_err(fail)?;
-    let (width, height) = decoder.dimensions();
-    let (w, h) = (u64::from(width), u64::from(height));
+    let header = format.header(bytes)?;
+    let (w, h) = (header.width as u64, header.height as u64);
     if w.saturating_mul(h) > options.max_pixels {
         return Err(FormatError::TooManyPixels { width: w, height: h, limit: options.max_pixels });
     }
     if w == 0 || h == 0 {
-        return Err(FormatError::corrupt(sniff::name(format), format!("the picture is {w}×{h}")));
+        return Err(FormatError::corrupt(format.name(), format!("the picture is {w}×{h}")));
     }
     sniff::plausible(format, bytes, w, h)?;
-    // Room for the pixels and for a decoder's working copy of them, and as much again as any header needs.
-    decoder.set_limits(limits(decoder.total_bytes().saturating_mul(3).saturating_add(64 << 20))).map_err(fail)?;
-    let orientation = decoder.orientation().unwrap_or(image::metadata::Orientation::NoTransforms);
-    let exif = decoder.exif_metadata().ok().flatten();
-    let mut picture = DynamicImage::from_decoder(decoder).map_err(fail)?;
-    picture.apply_orientation(orientation);
-    let exif = match exif {
-        Some(block) => ExifInfo::parse(block, width as usize, height as usize, orientation.to_exif()),
-        None => ExifInfo { orientation: orientation.to_exif(), ..ExifInfo::default() },
+    let raster = format.raster(bytes, &header)?;
+    let exif = exif_of(&header);
+    let pixels = pixels(raster, header.width, header.height, exif.orientation)?;
+    Ok(DynImage { pixels, exif })
+}
+
+fn exif_of(header: &Header) -> ExifInfo {
+    let mut info = match &header.exif {
+        Some(block) => ExifInfo::parse(block.clone(), header.width, header.height),
+        None => ExifInfo::default(),
     };
-    Ok(DynImage { pixels: pixels(picture)?, exif })
+    if let Some(orientation) = header.orientation.filter(|tag| (1..=8).contains(tag)) {
+        info.orientation = orientation;
+    }
+    info
 }
 
-fn limits(max_alloc: u64) -> Limits {
-    let mut limits = Limits::default();
-    limits.max_alloc = Some(max_alloc);
-    limits
-}
-
-fn pixels(picture: DynamicImage) -> Result<Pixels, FormatError> {
-    let (w, h) = (picture.width() as usize, picture.height() as usize);
-    Ok(match picture {
-        DynamicImage::ImageLuma8(i) => Pixels::Gray8(owned(w, h, i.into_raw())?),
-        DynamicImage::ImageRgb8(i) => Pixels::Rgb8(owned(w, h, i.into_raw())?),
-        DynamicImage::ImageLuma16(i) => Pixels::Gray16(owned(w, h, i.into_raw())?),
-        DynamicImage::ImageRgb16(i) => Pixels::Rgb16(owned(w, h, i.into_raw())?),
-        DynamicImage::ImageRgb32F(i) => Pixels::RgbF32(owned(w, h, i.into_raw())?),
-        DynamicImage::ImageLumaA8(i) => Pixels::Gray8(owned(w, h, without_alpha::<_, 1>(&i.into_raw()))?),
-        DynamicImage::ImageRgba8(i) => Pixels::Rgb8(owned(w, h, without_alpha::<_, 3>(&i.into_raw()))?),
-        DynamicImage::ImageLumaA16(i) => Pixels::Gray16(owned(w, h, without_alpha::<_, 1>(&i.into_raw()))?),
-        DynamicImage::ImageRgba16(i) => Pixels::Rgb16(owned(w, h, without_alpha::<_, 3>(&i.into_raw()))?),
-        DynamicImage::ImageRgba32F(i) => Pixels::RgbF32(owned(w, h, without_alpha::<_, 3>(&i.into_raw()))?),
-        other => {
-            return Err(FormatError::unsupported_picture("picture", format!("the pixel type {:?}", other.color())));
-        }
+/// Without alpha, and turned the right way up.
+fn pixels(raster: Raster, width: usize, height: usize, orientation: u8) -> Result<Pixels, FormatError> {
+    let (size, channels) = ((width, height), raster.channels);
+    let gray = channels < 3;
+    Ok(match raster.samples {
+        Samples::U8(data) if gray => Pixels::Gray8(upright(data, channels, size, orientation)?),
+        Samples::U8(data) => Pixels::Rgb8(upright(data, channels, size, orientation)?),
+        Samples::U16(data) if gray => Pixels::Gray16(upright(data, channels, size, orientation)?),
+        Samples::U16(data) => Pixels::Rgb16(upright(data, channels, size, orientation)?),
+        Samples::F32(data) if gray => Pixels::GrayF32(upright(data, channels, size, orientation)?),
+        Samples::F32(data) => Pixels::RgbF32(upright(data, channels, size, orientation)?),
     })
 }
 
-fn owned<T: Sample, const C: usize>(width: usize, height: usize, data: Vec<T>) -> Result<Image<T, C>, FormatError> {
-    Image::from_vec(width, height, data).map_err(|e| FormatError::corrupt("picture", e.to_string()))
-}
-
-fn without_alpha<T: Copy, const C: usize>(data: &[T]) -> Vec<T> {
-    data.chunks_exact(C + 1).flat_map(|p| &p[..C]).copied().collect()
-}
-
-fn from_image_error(format: ImageFormat, error: ImageError) -> FormatError {
-    use image::error::UnsupportedErrorKind as Kind;
-    let name = sniff::name(format);
-    match error {
-        ImageError::IoError(e) if e.kind() == std::io::ErrorKind::UnexpectedEof => {
-            FormatError::Truncated { format: name }
-        }
-        ImageError::IoError(e) => FormatError::corrupt(name, e.to_string()),
-        ImageError::Unsupported(e) => FormatError::unsupported_picture(
-            name,
-            match e.kind() {
-                Kind::Color(color) => format!("the pixel type {color:?}"),
-                Kind::Format(_) => "this variant".to_owned(),
-                Kind::GenericFeature(feature) => format!("“{feature}”"),
-                other => format!("{other:?}"),
-            },
-        ),
-        ImageError::Limits(e) => FormatError::corrupt(name, format!("it would take too much memory: {e}")),
-        // The decoder's own words, without those of the layers around it.
-        ImageError::Decoding(e) => {
-            let own = std::error::Error::source(&e).map(ToString::to_string);
-            FormatError::corrupt(name, own.unwrap_or_else(|| e.to_string()))
-        }
-        error => FormatError::corrupt(name, error.to_string()),
-    }
+fn upright<T: Sample, const C: usize>(
+    data: Vec<T>,
+    channels: usize,
+    (width, height): (usize, usize),
+    orientation: u8,
+) -> Result<Image<T, C>, FormatError> {
+    let data =
+        if channels == C { data } else { data.chunks_exact(channels).flat_map(|pixel| &pixel[..C]).copied().collect() };
+    let stored =
+        Image::<T, C>::from_vec(width, height, data).map_err(|e| FormatError::corrupt("picture", e.to_string()))?;
+    // Where the pixel to be seen at (x, y) is stored: EXIF 2.32, tag 274.
+    let (right, bottom) = (width - 1, height - 1);
+    let at: fn(usize, usize, usize, usize) -> (usize, usize) = match orientation {
+        2 => |x, y, right, _| (right - x, y),
+        3 => |x, y, right, bottom| (right - x, bottom - y),
+        4 => |x, y, _, bottom| (x, bottom - y),
+        5 => |x, y, _, _| (y, x),
+        6 => |x, y, _, bottom| (y, bottom - x),
+        7 => |x, y, right, bottom| (right - y, bottom - x),
+        8 => |x, y, right, _| (right - y, x),
+        _ => return Ok(stored),
+    };
+    let (seen_width, seen_height) = if orientation >= 5 { (height, width) } else { (width, height) };
+    Ok(Image::from_fn(seen_width, seen_height, |x, y| {
+        let (x, y) = at(x, y, right, bottom);
+        stored.at(x, y)
+    }))
 }
 
 /// Reads a picture at full depth; see [`decode_image`] for what is understood and how.
@@ -263,20 +244,11 @@ pub fn read_image_info(path: impl AsRef<Path>) -> Result<((usize, usize), ExifIn
 
 fn header(bytes: &[u8]) -> Result<((usize, usize), ExifInfo), FormatError> {
     let format = sniff::picture_format(bytes)?;
-    let read = || {
-        let reader = ImageReader::with_format(Cursor::new(bytes), format);
-        let mut decoder = reader.into_decoder().map_err(|e| from_image_error(format, e))?;
-        let (width, height) = decoder.dimensions();
-        let (width, height) = (width as usize, height as usize);
-        let orientation = decoder.orientation().unwrap_or(image::metadata::Orientation::NoTransforms).to_exif();
-        let exif = match decoder.exif_metadata().ok().flatten() {
-            Some(block) => ExifInfo::parse(block, width, height, orientation),
-            None => ExifInfo { orientation, ..ExifInfo::default() },
-        };
-        Ok((if orientation >= 5 { (height, width) } else { (width, height) }, exif))
-    };
-    catch_unwind(AssertUnwindSafe(read))
-        .unwrap_or_else(|_| Err(FormatError::corrupt(sniff::name(format), "the decoder gave up on it")))
+    let header = catch_unwind(AssertUnwindSafe(|| format.header(bytes)))
+        .unwrap_or_else(|_| Err(FormatError::corrupt(format.name(), "the decoder gave up on it")))?;
+    let exif = exif_of(&header);
+    let (width, height) = (header.width, header.height);
+    Ok((if exif.orientation >= 5 { (height, width) } else { (width, height) }, exif))
 }
 
 #[cfg(test)]

@@ -1,13 +1,12 @@
 //! What a file is by its first bytes. File names are not trusted.
 
-use image::ImageFormat;
-
 use crate::FormatError;
+use crate::codec::Format;
 
 pub(crate) const PICTURES: &str = "a PNG, JPEG, TIFF, BMP, PNM, OpenEXR or Radiance HDR picture";
 
 /// The picture format of `bytes`, or an error that names what they are instead.
-pub(crate) fn picture_format(bytes: &[u8]) -> Result<ImageFormat, FormatError> {
+pub(crate) fn picture_format(bytes: &[u8]) -> Result<Format, FormatError> {
     if bytes.is_empty() {
         return Err(FormatError::Empty);
     }
@@ -26,6 +25,7 @@ pub(crate) fn picture_format(bytes: &[u8]) -> Result<ImageFormat, FormatError> {
         [0, 0, 0, 0x0c, b'j', b'P', ..] | [0xff, 0x4f, 0xff, 0x51, ..] => Some(("JPEG 2000", "this picture format")),
         [b'8', b'B', b'P', b'S', ..] => Some(("PSD", "this picture format")),
         [b'%', b'P', b'D', b'F', ..] => Some(("PDF", "a document")),
+        [b'P', b'7', b'\n' | b'\r' | b' ', ..] => Some(("PAM", "this picture format")),
         [b'P', b'F' | b'f', b'\n' | b'\r' | b' ', ..] => Some(("PFM", "a float map in the place of a picture")),
         [0x93, b'N', b'U', b'M', b'P', b'Y', ..] => Some(("npy", "an array in the place of a picture")),
         [b'P', b'K', 3, 4, ..] => Some(("ZIP or npz", "an archive in the place of a picture")),
@@ -36,49 +36,29 @@ pub(crate) fn picture_format(bytes: &[u8]) -> Result<ImageFormat, FormatError> {
         return Err(FormatError::unsupported_picture(format, what));
     }
     match bytes {
-        // Radiance files begin with either of two words.
-        [b'#', b'?', b'R', b'G', b'B', b'E', ..] => return Ok(ImageFormat::Hdr),
-        // BigTIFF: the same format with 64-bit offsets.
-        [b'I', b'I', b'+', 0, ..] | [b'M', b'M', 0, b'+', ..] => return Ok(ImageFormat::Tiff),
-        _ => {}
-    }
-    match image::guess_format(bytes) {
-        Ok(
-            format @ (ImageFormat::Png
-            | ImageFormat::Jpeg
-            | ImageFormat::Tiff
-            | ImageFormat::Bmp
-            | ImageFormat::Pnm
-            | ImageFormat::OpenExr
-            | ImageFormat::Hdr),
-        ) => Ok(format),
+        [0x89, b'P', b'N', b'G', b'\r', b'\n', 0x1a, b'\n', ..] => Ok(Format::Png),
+        [0xff, 0xd8, 0xff, ..] => Ok(Format::Jpeg),
+        // The second word is BigTIFF's: the same format with 64-bit offsets.
+        [b'I', b'I', b'*' | b'+', 0, ..] | [b'M', b'M', 0, b'*' | b'+', ..] => Ok(Format::Tiff),
+        [b'B', b'M', ..] => Ok(Format::Bmp),
+        [b'P', b'1'..=b'6', space, ..] if space.is_ascii_whitespace() || *space == b'#' => Ok(Format::Pnm),
+        [0x76, 0x2f, 0x31, 0x01, ..] => Ok(Format::OpenExr),
+        [b'#', b'?', b'R', b'A', b'D', b'I', b'A', b'N', b'C', b'E', ..] | [b'#', b'?', b'R', b'G', b'B', b'E', ..] => {
+            Ok(Format::Hdr)
+        }
         _ => Err(FormatError::UnknownFormat { expected: PICTURES }),
     }
 }
 
-/// The name of a format as a person writes it.
-pub(crate) fn name(format: ImageFormat) -> &'static str {
-    match format {
-        ImageFormat::Png => "PNG",
-        ImageFormat::Jpeg => "JPEG",
-        ImageFormat::Tiff => "TIFF",
-        ImageFormat::Bmp => "BMP",
-        ImageFormat::Pnm => "PNM",
-        ImageFormat::OpenExr => "OpenEXR",
-        ImageFormat::Hdr => "Radiance HDR",
-        _ => "picture",
-    }
-}
-
 /// Cheap checks that a file can hold what its header promises, before anything is allocated for it.
-pub(crate) fn plausible(format: ImageFormat, bytes: &[u8], width: u64, height: u64) -> Result<(), FormatError> {
-    let name = name(format);
+pub(crate) fn plausible(format: Format, bytes: &[u8], width: u64, height: u64) -> Result<(), FormatError> {
+    let name = format.name();
     let len = bytes.len() as u64;
     let possible = match format {
         // Deflate packs at most 1032 to 1; the least a row takes is one bit a pixel.
-        ImageFormat::Png => len.saturating_mul(1032 * 8),
+        Format::Png => len.saturating_mul(1032 * 8),
         // Every 8×8 block of the first component costs at least one bit.
-        ImageFormat::Jpeg => len.saturating_mul(8 * 64 * 4),
+        Format::Jpeg => len.saturating_mul(8 * 64 * 4),
         _ => u64::MAX,
     };
     if width.saturating_mul(height) > possible {
@@ -87,7 +67,7 @@ pub(crate) fn plausible(format: ImageFormat, bytes: &[u8], width: u64, height: u
             format!("{len} bytes cannot hold the {width}×{height} pixels promised"),
         ));
     }
-    if format == ImageFormat::Jpeg && !jpeg_has_end(bytes) {
+    if format == Format::Jpeg && !jpeg_has_end(bytes) {
         return Err(FormatError::Truncated { format: name });
     }
     Ok(())

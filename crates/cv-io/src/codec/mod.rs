@@ -1,0 +1,119 @@
+//! What each picture format must be able to do, and which there are.
+//!
+//! A codec is one file with two functions: `header` reads what is known before any pixel, `raster` the pixels. A heavy
+//! one is behind a feature of this crate.
+
+mod bmp;
+#[cfg(feature = "exr")]
+mod exr;
+mod hdr;
+mod jpeg;
+mod png;
+mod pnm;
+#[cfg(feature = "tiff")]
+mod tiff;
+
+use crate::FormatError;
+
+/// Memory that a header may ask for before the number of pixels has been allowed, in bytes.
+const HEADER_BYTES: usize = 64 << 20;
+
+/// A picture format.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Format {
+    Png,
+    Jpeg,
+    Tiff,
+    Bmp,
+    Pnm,
+    OpenExr,
+    Hdr,
+}
+
+/// What a file says before its first pixel.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Header {
+    /// Stored pixels, before any turn.
+    pub(crate) width: usize,
+    pub(crate) height: usize,
+    /// The EXIF block (a TIFF structure).
+    pub(crate) exif: Option<Vec<u8>>,
+    /// The orientation tag, 1 to 8, where it stands outside an EXIF block.
+    pub(crate) orientation: Option<u8>,
+}
+
+/// The samples of a picture: interleaved, row by row, 1 to 4 `channels`: gray, gray and alpha, RGB, RGB and alpha.
+#[derive(Debug, Clone)]
+pub(crate) struct Raster {
+    pub(crate) channels: usize,
+    pub(crate) samples: Samples,
+}
+
+/// Samples as deep as the file has them.
+#[derive(Debug, Clone)]
+pub(crate) enum Samples {
+    U8(Vec<u8>),
+    U16(Vec<u16>),
+    F32(Vec<f32>),
+}
+
+impl Format {
+    /// The name as a person writes it.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::Png => "PNG",
+            Self::Jpeg => "JPEG",
+            Self::Tiff => "TIFF",
+            Self::Bmp => "BMP",
+            Self::Pnm => "PNM",
+            Self::OpenExr => "OpenEXR",
+            Self::Hdr => "Radiance HDR",
+        }
+    }
+
+    pub(crate) fn header(self, bytes: &[u8]) -> Result<Header, FormatError> {
+        match self {
+            Self::Png => png::header(bytes),
+            Self::Jpeg => jpeg::header(bytes),
+            Self::Bmp => bmp::header(bytes),
+            Self::Pnm => pnm::header(bytes),
+            Self::Hdr => hdr::header(bytes),
+            #[cfg(feature = "tiff")]
+            Self::Tiff => tiff::header(bytes),
+            #[cfg(feature = "exr")]
+            Self::OpenExr => exr::header(bytes),
+            #[cfg(not(all(feature = "tiff", feature = "exr")))]
+            _ => Err(self.left_out()),
+        }
+    }
+
+    /// The pixels of a file whose `header` has been read and allowed.
+    pub(crate) fn raster(self, bytes: &[u8], header: &Header) -> Result<Raster, FormatError> {
+        match self {
+            Self::Png => png::raster(bytes),
+            Self::Jpeg => jpeg::raster(bytes),
+            Self::Bmp => bmp::raster(bytes),
+            Self::Pnm => pnm::raster(bytes),
+            Self::Hdr => hdr::raster(bytes, header),
+            #[cfg(feature = "tiff")]
+            Self::Tiff => tiff::raster(bytes),
+            #[cfg(feature = "exr")]
+            Self::OpenExr => exr::raster(bytes, header),
+            #[cfg(not(all(feature = "tiff", feature = "exr")))]
+            _ => Err(self.left_out()),
+        }
+    }
+
+    #[cfg(not(all(feature = "tiff", feature = "exr")))]
+    fn left_out(self) -> FormatError {
+        FormatError::unsupported_picture(self.name(), "a format left out of this build")
+    }
+}
+
+/// `width × height × channels`, where memory has room for as many.
+fn count(format: Format, width: usize, height: usize, channels: usize) -> Result<usize, FormatError> {
+    width
+        .checked_mul(height)
+        .and_then(|pixels| pixels.checked_mul(channels))
+        .ok_or_else(|| FormatError::corrupt(format.name(), format!("the picture is {width}×{height}")))
+}

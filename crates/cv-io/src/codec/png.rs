@@ -1,0 +1,56 @@
+//! PNG, through the `png` crate.
+
+use super::{Format, HEADER_BYTES, Header, Raster, Samples};
+use crate::FormatError;
+use png::{BitDepth, ColorType, Decoder, DecodingError, Limits, Reader, Transformations};
+use std::io::{Cursor, ErrorKind};
+
+pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
+    let reader = reader(bytes)?;
+    let info = reader.info();
+    Ok(Header {
+        width: info.width as usize,
+        height: info.height as usize,
+        exif: info.exif_metadata.as_ref().map(|block| block.to_vec()),
+        orientation: None,
+    })
+}
+
+pub(super) fn raster(bytes: &[u8]) -> Result<Raster, FormatError> {
+    let mut reader = reader(bytes)?;
+    let (color, depth) = reader.output_color_type();
+    let channels = match color {
+        ColorType::Grayscale => 1,
+        ColorType::GrayscaleAlpha => 2,
+        ColorType::Rgb => 3,
+        ColorType::Rgba => 4,
+        ColorType::Indexed => return Err(FormatError::corrupt(Format::Png.name(), "it has no palette")),
+    };
+    let size =
+        reader.output_buffer_size().ok_or_else(|| FormatError::corrupt(Format::Png.name(), "it is too large"))?;
+    let mut samples = vec![0; size];
+    reader.next_frame(&mut samples).map_err(fail)?;
+    let samples = match depth {
+        BitDepth::Sixteen => Samples::U16(samples.chunks_exact(2).map(|b| u16::from_be_bytes([b[0], b[1]])).collect()),
+        _ => Samples::U8(samples),
+    };
+    Ok(Raster { channels, samples })
+}
+
+/// Palettes become colors, less than 8 bits become 8.
+fn reader(bytes: &[u8]) -> Result<Reader<Cursor<&[u8]>>, FormatError> {
+    let mut decoder = Decoder::new_with_limits(Cursor::new(bytes), Limits { bytes: HEADER_BYTES });
+    decoder.set_ignore_text_chunk(true);
+    decoder.set_ignore_iccp_chunk(true);
+    decoder.set_transformations(Transformations::EXPAND);
+    decoder.read_info().map_err(fail)
+}
+
+fn fail(error: DecodingError) -> FormatError {
+    match error {
+        DecodingError::IoError(e) if e.kind() == ErrorKind::UnexpectedEof => {
+            FormatError::Truncated { format: Format::Png.name() }
+        }
+        error => FormatError::corrupt(Format::Png.name(), error.to_string()),
+    }
+}

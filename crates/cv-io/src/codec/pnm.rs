@@ -1,0 +1,98 @@
+//! PBM, PGM and PPM in text and binary: P1 to P6 of Netpbm.
+
+use super::{Format, Header, Raster, Samples, count};
+use crate::FormatError;
+
+const NAME: &str = "PNM";
+
+/// The first line, and where the samples begin.
+struct Start {
+    kind: u8,
+    width: usize,
+    height: usize,
+    /// The sample that is white.
+    white: u32,
+    at: usize,
+}
+
+pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
+    let start = start(bytes)?;
+    Ok(Header { width: start.width, height: start.height, ..Header::default() })
+}
+
+pub(super) fn raster(bytes: &[u8]) -> Result<Raster, FormatError> {
+    let start = start(bytes)?;
+    let channels = if matches!(start.kind, b'3' | b'6') { 3 } else { 1 };
+    let n = count(Format::Pnm, start.width, start.height, channels)?;
+    let cut = || FormatError::Truncated { format: NAME };
+    let stored = &bytes[start.at..];
+    let samples: Vec<u32> = match start.kind {
+        // A digit a pixel, with or without white space.
+        b'1' => {
+            let bits = stored.iter().filter(|b| !b.is_ascii_whitespace()).take(n);
+            bits.map(|&b| if b == b'0' || b == b'1' { Ok(u32::from(b == b'0')) } else { Err(bad("a bit")) })
+                .collect::<Result<_, _>>()?
+        }
+        b'2' | b'3' => {
+            let mut at = start.at;
+            let left = bytes.len() - at;
+            // A sample takes a digit and a space.
+            (0..n.min(left)).map(|_| number(bytes, &mut at)).collect::<Result<_, _>>()?
+        }
+        b'4' => {
+            let row = start.width.div_ceil(8);
+            let rows = stored.chunks_exact(row).take(start.height);
+            rows.flat_map(|row| (0..start.width).map(|x| u32::from(row[x / 8] >> (7 - x % 8) & 1 == 0))).collect()
+        }
+        _ if start.white < 256 => stored.iter().take(n).map(|&b| u32::from(b)).collect(),
+        _ => stored.chunks_exact(2).take(n).map(|b| u32::from(u16::from_be_bytes([b[0], b[1]]))).collect(),
+    };
+    if samples.len() < n {
+        return Err(cut());
+    }
+    // To the full range of 8 or 16 bits.
+    let scaled = |v: u32, full: u32| (v.min(start.white) * full + start.white / 2) / start.white;
+    let samples = if start.white < 256 {
+        Samples::U8(samples.into_iter().map(|v| scaled(v, 255) as u8).collect())
+    } else {
+        Samples::U16(samples.into_iter().map(|v| scaled(v, 65535) as u16).collect())
+    };
+    Ok(Raster { channels, samples })
+}
+
+fn start(bytes: &[u8]) -> Result<Start, FormatError> {
+    let kind = bytes.get(1).copied().unwrap_or(0);
+    let mut at = 2;
+    let width = number(bytes, &mut at)? as usize;
+    let height = number(bytes, &mut at)? as usize;
+    let white = if matches!(kind, b'1' | b'4') { 1 } else { number(bytes, &mut at)? };
+    if !(1..65536).contains(&white) {
+        return Err(bad("the largest sample"));
+    }
+    // One white space ends the header.
+    if !bytes.get(at).is_some_and(u8::is_ascii_whitespace) {
+        return Err(FormatError::Truncated { format: NAME });
+    }
+    Ok(Start { kind, width, height, white, at: at + 1 })
+}
+
+/// The next number, behind white space and comments.
+fn number(bytes: &[u8], at: &mut usize) -> Result<u32, FormatError> {
+    loop {
+        match bytes.get(*at) {
+            Some(b'#') => *at += bytes[*at..].iter().take_while(|&&b| b != b'\n').count(),
+            Some(b) if b.is_ascii_whitespace() => *at += 1,
+            Some(b) if b.is_ascii_digit() => break,
+            Some(_) => return Err(bad("a number")),
+            None => return Err(FormatError::Truncated { format: NAME }),
+        }
+    }
+    let digits = bytes[*at..].iter().take_while(|b| b.is_ascii_digit()).count();
+    let text = std::str::from_utf8(&bytes[*at..*at + digits]).unwrap_or_default();
+    *at += digits;
+    text.parse().map_err(|_| bad("a number"))
+}
+
+fn bad(what: &str) -> FormatError {
+    FormatError::corrupt(NAME, format!("{what} is wrong"))
+}

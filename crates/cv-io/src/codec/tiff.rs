@@ -1,0 +1,93 @@
+//! TIFF, through the `tiff` crate: gray, RGB and CMYK of 8 and 16 bits and floats, interleaved or in planes.
+
+use super::{Format, HEADER_BYTES, Header, Raster, Samples, count};
+use crate::FormatError;
+use std::io::{Cursor, ErrorKind};
+use tiff::decoder::{Decoder, DecodingResult, Limits};
+use tiff::tags::Tag;
+use tiff::{ColorType, TiffError};
+
+const NAME: &str = "TIFF";
+
+pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
+    let mut decoder = open(bytes)?;
+    let (width, height) = decoder.dimensions().map_err(fail)?;
+    let orientation = decoder.find_tag_unsigned::<u16>(Tag::Orientation).map_err(fail)?;
+    let orientation = orientation.and_then(|tag| u8::try_from(tag).ok());
+    Ok(Header { width: width as usize, height: height as usize, exif: None, orientation })
+}
+
+pub(super) fn raster(bytes: &[u8]) -> Result<Raster, FormatError> {
+    let mut decoder = open(bytes)?;
+    let (width, height) = decoder.dimensions().map_err(fail)?;
+    let (width, height) = (width as usize, height as usize);
+    let color = decoder.colortype().map_err(fail)?;
+    let stored = match color {
+        ColorType::Gray(1 | 8 | 16 | 32) => 1,
+        ColorType::GrayA(8 | 16) => 2,
+        ColorType::RGB(8 | 16 | 32) => 3,
+        ColorType::RGBA(8 | 16 | 32) | ColorType::CMYK(8 | 16) => 4,
+        other => return Err(FormatError::unsupported_picture(NAME, format!("the pixel type {other:?}"))),
+    };
+    // Room for the samples, and as much again as any strip and header need.
+    let mut limits = Limits::default();
+    limits.decoding_buffer_size = count(Format::Tiff, width, height, 4 * stored)?;
+    limits.intermediate_buffer_size = limits.decoding_buffer_size.saturating_add(HEADER_BYTES);
+    limits.ifd_value_size = limits.intermediate_buffer_size;
+    let mut decoder = decoder.with_limits(limits);
+    let mut result = DecodingResult::U8(Vec::new());
+    let layout = decoder.read_image_to_buffer(&mut result).map_err(fail)?;
+    if result.as_buffer(0).as_bytes().len() < layout.complete_len {
+        return Err(FormatError::corrupt(NAME, "it would take too much memory"));
+    }
+    let planes = layout.planes;
+    let cmyk = matches!(color, ColorType::CMYK(_));
+    let samples = match result {
+        DecodingResult::U8(bits) if color == ColorType::Gray(1) => Samples::U8(bytes_of_bits(&bits, width)),
+        DecodingResult::U8(v) if cmyk => Samples::U8(lights(&interleaved(v, planes), 255.0, |light| light as u8)),
+        DecodingResult::U16(v) if cmyk => Samples::U16(lights(&interleaved(v, planes), 65535.0, |light| light as u16)),
+        DecodingResult::U8(v) => Samples::U8(interleaved(v, planes)),
+        DecodingResult::U16(v) => Samples::U16(interleaved(v, planes)),
+        DecodingResult::F32(v) => Samples::F32(interleaved(v, planes)),
+        _ => return Err(FormatError::unsupported_picture(NAME, "samples other than unsigned bytes, words and floats")),
+    };
+    Ok(Raster { channels: if cmyk { 3 } else { stored }, samples })
+}
+
+fn open(bytes: &[u8]) -> Result<Decoder<Cursor<&[u8]>>, FormatError> {
+    Decoder::new(Cursor::new(bytes)).map_err(fail)
+}
+
+/// One bit a pixel, rows padded to bytes; set is white.
+fn bytes_of_bits(bits: &[u8], width: usize) -> Vec<u8> {
+    let row =
+        |row: &[u8]| (0..width).map(|x| if row[x / 8] >> (7 - x % 8) & 1 == 1 { 255 } else { 0 }).collect::<Vec<_>>();
+    bits.chunks_exact(width.div_ceil(8)).flat_map(row).collect()
+}
+
+/// Planes of a channel each become pixels.
+fn interleaved<T: Copy>(samples: Vec<T>, planes: usize) -> Vec<T> {
+    if planes < 2 {
+        return samples;
+    }
+    let size = samples.len() / planes;
+    (0..size * planes).map(|i| samples[i % planes * size + i / planes]).collect()
+}
+
+/// Cyan, magenta, yellow and black to RGB, without a color profile.
+fn lights<T: Copy + Into<f32>>(inks: &[T], full: f32, store: fn(f32) -> T) -> Vec<T> {
+    let pixel = |ink: &[T]| {
+        let black = 1.0 - ink[3].into() / full;
+        [ink[0], ink[1], ink[2]].map(|ink| store((full - ink.into()) * black))
+    };
+    inks.chunks_exact(4).flat_map(pixel).collect()
+}
+
+fn fail(error: TiffError) -> FormatError {
+    match error {
+        TiffError::IoError(e) if e.kind() == ErrorKind::UnexpectedEof => FormatError::Truncated { format: NAME },
+        TiffError::UnsupportedError(what) => FormatError::unsupported_picture(NAME, format!("“{what}”")),
+        TiffError::LimitsExceeded => FormatError::corrupt(NAME, "it would take too much memory"),
+        error => FormatError::corrupt(NAME, error.to_string()),
+    }
+}

@@ -1,0 +1,223 @@
+//! What comes from others: how many packages, from where, under which license. `deny.toml` holds the lists; `cargo deny`
+//! reads the same ones and adds the advisories, which come from the network.
+
+use super::Found;
+use super::manifests::table;
+use anyhow::{Context, Result, bail, ensure};
+use serde::Deserialize;
+use serde_json::Value;
+use std::{path::Path, process::Command};
+
+/// Packages in `Cargo.lock`: each one is compiled, read and trusted.
+const MOST_PACKAGES: usize = 190;
+
+/// Holds `Cargo.lock`, and the packages that this machine compiles, against `deny.toml`.
+pub(super) fn check(root: &Path, found: &mut Found) -> Result<()> {
+    let deny = Deny::deserialize(Value::Object(table(&root.join("deny.toml"))?)).context("deny.toml")?;
+    let lock = Lock::deserialize(Value::Object(table(&root.join("Cargo.lock"))?)).context("Cargo.lock")?;
+    check_lock(&lock, &deny, found);
+    check_licenses(&packages(root)?, &deny, found);
+    Ok(())
+}
+
+#[derive(Deserialize)]
+struct Lock {
+    package: Vec<Package>,
+}
+
+#[derive(Deserialize)]
+struct Package {
+    name: String,
+    version: String,
+    /// None for the crates of the workspace.
+    source: Option<String>,
+    /// Not in `Cargo.lock`.
+    license: Option<String>,
+}
+
+#[derive(Deserialize)]
+struct Deny {
+    licenses: Licenses,
+    bans: Bans,
+    sources: Sources,
+}
+
+#[derive(Deserialize)]
+struct Licenses {
+    allow: Vec<String>,
+    exceptions: Vec<Exception>,
+}
+
+#[derive(Deserialize)]
+struct Exception {
+    #[serde(rename = "crate")]
+    name: String,
+    allow: Vec<String>,
+}
+
+#[derive(Deserialize)]
+struct Bans {
+    deny: Vec<Ban>,
+}
+
+#[derive(Deserialize)]
+struct Ban {
+    #[serde(rename = "crate")]
+    name: String,
+    /// Only a second version is refused.
+    #[serde(default, rename = "deny-multiple-versions")]
+    only_twice: bool,
+}
+
+#[derive(Deserialize)]
+struct Sources {
+    #[serde(rename = "allow-registry")]
+    allow_registry: Vec<String>,
+}
+
+fn check_lock(lock: &Lock, deny: &Deny, found: &mut Found) {
+    let count = lock.package.len();
+    found.notes.push(format!("Cargo.lock has {count} packages, of at most {MOST_PACKAGES}"));
+    if count > MOST_PACKAGES {
+        found.problems.push(format!("Cargo.lock has {count} packages, more than {MOST_PACKAGES}"));
+    }
+    for ban in &deny.bans.deny {
+        let versions: Vec<&str> =
+            lock.package.iter().filter(|package| package.name == ban.name).map(|p| p.version.as_str()).collect();
+        if versions.len() > usize::from(ban.only_twice) {
+            found.problems.push(format!("Cargo.lock: {} {} is refused by deny.toml", ban.name, versions.join(", ")));
+        }
+    }
+    for package in &lock.package {
+        let Some(source) = &package.source else { continue };
+        if !deny.sources.allow_registry.iter().any(|registry| source.strip_prefix("registry+") == Some(registry)) {
+            found.problems.push(format!("Cargo.lock: {} comes from {source}", package.name));
+        }
+    }
+}
+
+fn check_licenses(packages: &[Package], deny: &Deny, found: &mut Found) {
+    for package in packages {
+        let own = deny.licenses.exceptions.iter().filter(|exception| exception.name == package.name);
+        let allowed: Vec<&str> =
+            deny.licenses.allow.iter().chain(own.flat_map(|own| &own.allow)).map(String::as_str).collect();
+        let license = package.license.as_deref().unwrap_or("none");
+        if !permits(license, &allowed) {
+            found.problems.push(format!("{} {}: its license is {license}", package.name, package.version));
+        }
+    }
+}
+
+/// The packages of `Cargo.lock` that this machine compiles.
+fn packages(root: &Path) -> Result<Vec<Package>> {
+    #[derive(Deserialize)]
+    struct Metadata {
+        packages: Vec<Package>,
+    }
+    let output = |command: &mut Command| -> Result<String> {
+        let output = command.current_dir(root).output().with_context(|| format!("{command:?}"))?;
+        ensure!(output.status.success(), "{command:?}: {}", String::from_utf8_lossy(&output.stderr));
+        Ok(String::from_utf8(output.stdout)?)
+    };
+    let version = output(Command::new("rustc").arg("-vV"))?;
+    let Some(host) = version.lines().find_map(|line| line.strip_prefix("host: ")) else { bail!("rustc has no host") };
+    let cargo = std::env::var_os("CARGO").unwrap_or("cargo".into());
+    let arguments = ["metadata", "--format-version", "1", "--locked", "--filter-platform", host];
+    let metadata: Metadata = serde_json::from_str(&output(Command::new(cargo).args(arguments))?)?;
+    Ok(metadata.packages)
+}
+
+/// Whether an SPDX expression can be met by allowed licenses.
+fn permits(expression: &str, allowed: &[&str]) -> bool {
+    // An old way to write OR.
+    let spaced = expression.replace('/', " OR ").replace('(', " ( ").replace(')', " ) ");
+    let words: Vec<&str> = spaced.split_whitespace().collect();
+    let (met, rest) = either(&words, allowed);
+    met && rest.is_empty()
+}
+
+/// Alternatives, and the words behind them.
+fn either<'a, 'b>(words: &'a [&'b str], allowed: &[&str]) -> (bool, &'a [&'b str]) {
+    let (mut met, mut rest) = all(words, allowed);
+    while let ["OR", after @ ..] = rest {
+        let (other, after) = all(after, allowed);
+        (met, rest) = (met | other, after);
+    }
+    (met, rest)
+}
+
+/// Licenses that hold together, and the words behind them.
+fn all<'a, 'b>(words: &'a [&'b str], allowed: &[&str]) -> (bool, &'a [&'b str]) {
+    let (mut met, mut rest) = one(words, allowed);
+    while let ["AND", after @ ..] = rest {
+        let (other, after) = one(after, allowed);
+        (met, rest) = (met & other, after);
+    }
+    (met, rest)
+}
+
+fn one<'a, 'b>(words: &'a [&'b str], allowed: &[&str]) -> (bool, &'a [&'b str]) {
+    match words {
+        ["(", inner @ ..] => match either(inner, allowed) {
+            (met, [")", rest @ ..]) => (met, rest),
+            (_, rest) => (false, rest),
+        },
+        [license, "WITH", exception, rest @ ..] => {
+            (allowed.contains(&format!("{license} WITH {exception}").as_str()), rest)
+        }
+        [license, rest @ ..] => (allowed.contains(license), rest),
+        [] => (false, words),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn license_expressions_are_read() {
+        let allowed = ["MIT", "Zlib", "Apache-2.0 WITH LLVM-exception"];
+        for good in
+            ["MIT", "GPL-3.0 OR MIT", "MIT/Apache-2.0", "(MIT OR GPL-3.0) AND Zlib", "Apache-2.0 WITH LLVM-exception"]
+        {
+            assert!(permits(good, &allowed), "{good}");
+        }
+        for bad in ["", "none", "Apache-2.0", "MIT AND GPL-3.0", "(MIT", "MIT MIT", "(MIT OR GPL-3.0) AND Apache-2.0"] {
+            assert!(!permits(bad, &allowed), "{bad}");
+        }
+    }
+
+    #[test]
+    fn each_rule_can_fail() {
+        let deny: Deny = basic_toml::from_str(
+            "[licenses]\nallow = [\"MIT\"]\nexceptions = [{ crate = \"a\", allow = [\"IJG\"] }]\n\
+             [bans]\ndeny = [{ crate = \"cc\" }, { crate = \"once\", deny-multiple-versions = true }]\n\
+             [sources]\nallow-registry = [\"https://crates\"]\n",
+        )
+        .unwrap();
+        let package = |name: &str, source: Option<&str>, license: Option<&str>| Package {
+            name: name.to_owned(),
+            version: "1.0.0".to_owned(),
+            source: source.map(str::to_owned),
+            license: license.map(str::to_owned),
+        };
+        let locked = |names: &[&str]| {
+            let package = names.iter().map(|name| package(name, Some("registry+https://crates"), None)).collect();
+            let mut found = Found::default();
+            check_lock(&Lock { package }, &deny, &mut found);
+            found.problems
+        };
+        assert_eq!(locked(&["a", "once"]), [""; 0]);
+        assert!(locked(&["cc"])[0].contains("refused"));
+        assert!(locked(&["once", "once"])[0].contains("refused"));
+        assert!(locked(&["a"; MOST_PACKAGES + 1])[0].contains("more than"));
+        let mut found = Found::default();
+        check_lock(&Lock { package: vec![package("a", Some("git+https://crates"), None)] }, &deny, &mut found);
+        assert!(found.problems[0].contains("comes from"));
+        let licensed =
+            [package("a", None, Some("IJG AND MIT")), package("b", None, Some("IJG")), package("c", None, None)];
+        let mut found = Found::default();
+        check_licenses(&licensed, &deny, &mut found);
+        assert_eq!(found.problems, ["b 1.0.0: its license is IJG", "c 1.0.0: its license is none"]);
+    }
+}
