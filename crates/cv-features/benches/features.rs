@@ -2,8 +2,8 @@
 
 use cv_core::{GrayF32, Keypoint, Silent};
 use cv_features::{
-    DescriptorKind, Descriptors, HarrisOptions, MatchOptions, MopsOptions, SiftOptions, anms, anms_square_covering,
-    harris, harris_response, match_descriptors, mops, sift,
+    DescriptorKind, Descriptors, HarrisOptions, MatchOptions, MopsOptions, RatioTest, SiftOptions, anms,
+    anms_square_covering, harris, harris_response, match_descriptors, mops, sift,
 };
 use timing::time;
 
@@ -46,12 +46,12 @@ fn detection() {
 
 fn matching() {
     let mut state = 1;
-    let options = MatchOptions { ratio: None, ..MatchOptions::default() };
-    for (count, kind) in [(2000, DescriptorKind::Patch), (8192, DescriptorKind::RootSift)] {
-        let mut set = || (0..count * kind.dimension()).map(|_| random(&mut state)).collect::<Vec<f32>>();
+    let options = MatchOptions { ratio: RatioTest::Off, ..MatchOptions::default() };
+    for (count, kind) in [(2000, DescriptorKind::PATCH), (8192, DescriptorKind::ROOT_SIFT)] {
+        let mut set = || (0..count * kind.dimension).map(|_| random(&mut state)).collect::<Vec<f32>>();
         let empty = || Descriptors::new(kind);
         let pair = [set(), set()].map(|data| Descriptors::from_vec(kind, data).unwrap_or_else(empty));
-        let name = format!("two nearest {count}x{count}x{}", kind.dimension());
+        let name = format!("two nearest {count}x{count}x{}", kind.dimension);
         time(&name, || match_descriptors(&pair[0], &pair[1], &options, &Silent));
     }
 }

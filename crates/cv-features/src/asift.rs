@@ -3,7 +3,7 @@
 //! Source: J.-M. Morel & G. Yu, "ASIFT: a new framework for fully affine invariant image comparison", SIAM J. Imaging Sciences 2(2), 2009. A picture of a plane seen
 //! under a slant is the frontal one turned, then compressed along one axis (the tilt); features of the compressed picture match those of the slanted one.
 
-use crate::descriptors::Features;
+use crate::Features;
 use crate::error::{FeatureError, check_image};
 use crate::sift::{SMALLEST, SiftOptions, sift};
 use crate::simd;

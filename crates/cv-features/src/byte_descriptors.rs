@@ -1,35 +1,25 @@
 //! Descriptors in bytes: a quarter of the memory.
 
-use crate::descriptors::{DescriptorKind, Descriptors};
 use crate::matching::{MatchError, MatchOptions, match_descriptors};
+use crate::{ByteScale, DescriptorKind, Descriptors};
 use cv_core::{DMatch, Progress};
 
 /// Descriptors whose numbers are rounded to bytes, by a scale that belongs to their kind: sets made apart compare.
 ///
 /// Of 2000 rootSIFT features of a photograph, the nearest in a neighboring one is the same as without rounding for 99 % (`cargo xtask peers features` measures it).
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct ByteDescriptors {
     kind: DescriptorKind,
+    scale: ByteScale,
     data: Vec<u8>,
 }
 
-/// A byte is `(number + offset) · scale`.
-fn scale_of(kind: DescriptorKind) -> Option<(f32, f32)> {
-    match kind {
-        // COLMAP's: no number of a unit vector that was clipped at 0.2 comes near 0.5.
-        DescriptorKind::Sift | DescriptorKind::RootSift => Some((0.0, 512.0)),
-        // Four standard deviations to each side.
-        DescriptorKind::Patch | DescriptorKind::Mops => Some((4.0, 255.0 / 8.0)),
-        DescriptorKind::Foreign { .. } => None,
-    }
-}
-
 impl ByteDescriptors {
-    /// Rounds; `None` for foreign descriptors, whose range is not known.
+    /// Rounds; `None` for a kind without [`DescriptorKind::bytes`].
     pub fn new(descriptors: &Descriptors) -> Option<Self> {
-        let (offset, scale) = scale_of(descriptors.kind())?;
-        let byte = |v: &f32| ((v + offset) * scale).round().clamp(0.0, 255.0) as u8;
-        Some(Self { kind: descriptors.kind(), data: descriptors.as_slice().iter().map(byte).collect() })
+        let kind = descriptors.kind();
+        let scale = kind.bytes?;
+        Some(Self { kind, scale, data: descriptors.as_slice().iter().map(|v| scale.to_byte(*v)).collect() })
     }
 
     /// What the numbers mean.
@@ -39,7 +29,7 @@ impl ByteDescriptors {
 
     /// Number of descriptors.
     pub fn len(&self) -> usize {
-        self.data.len() / self.kind.dimension()
+        self.data.len() / self.kind.dimension
     }
 
     /// True where there are none.
@@ -54,8 +44,7 @@ impl ByteDescriptors {
 
     /// The numbers, as far as the bytes tell.
     pub fn to_descriptors(&self) -> Descriptors {
-        let (offset, scale) = scale_of(self.kind).unwrap_or((0.0, 1.0));
-        let data = self.data.iter().map(|&b| f32::from(b) / scale - offset).collect();
+        let data = self.data.iter().map(|&b| self.scale.to_number(b)).collect();
         Descriptors::from_vec(self.kind, data).unwrap_or(Descriptors::new(self.kind))
     }
 }
@@ -76,6 +65,7 @@ pub fn match_byte_descriptors(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::RatioTest;
     use cv_core::Silent;
 
     #[test]
@@ -83,8 +73,8 @@ mod tests {
         let unit = |k: usize| ((k * 7919 % 101) as f32 / 101.0) * 0.25;
         let patch = |k: usize| ((k * 7919 % 101) as f32 / 101.0) * 7.0 - 3.5;
         for (kind, data, step) in [
-            (DescriptorKind::RootSift, (0..128 * 9).map(unit).collect::<Vec<f32>>(), 1.0 / 512.0),
-            (DescriptorKind::Mops, (0..64 * 9).map(patch).collect(), 8.0 / 255.0),
+            (DescriptorKind::ROOT_SIFT, (0..128 * 9).map(unit).collect::<Vec<f32>>(), 1.0 / 512.0),
+            (DescriptorKind::MOPS, (0..64 * 9).map(patch).collect(), 8.0 / 255.0),
         ] {
             let exact = Descriptors::from_vec(kind, data).unwrap();
             let bytes = ByteDescriptors::new(&exact).unwrap();
@@ -93,13 +83,13 @@ mod tests {
                 // Half a step, and f32 rounding.
                 assert!((a - b).abs() < 0.5 * step + 1e-6, "{a} {b}");
             }
-            let all = MatchOptions { ratio: None, ..MatchOptions::default() };
+            let all = MatchOptions { ratio: RatioTest::Off, ..MatchOptions::default() };
             let found = match_byte_descriptors(&bytes, &bytes, &all, &Silent).unwrap();
             assert!(found.iter().all(|m| m.distance == 0.0) && found.len() == 9);
         }
-        let foreign = Descriptors::new(DescriptorKind::Foreign { dimension: 3 });
+        let foreign = Descriptors::new(DescriptorKind::foreign(3));
         assert_eq!(ByteDescriptors::new(&foreign), None);
-        let (a, b) = ([DescriptorKind::Sift, DescriptorKind::Patch])
+        let (a, b) = ([DescriptorKind::SIFT, DescriptorKind::PATCH])
             .map(|kind| ByteDescriptors::new(&Descriptors::from_vec(kind, vec![0.1; 128]).unwrap()).unwrap())
             .into();
         assert!(matches!(

@@ -1,52 +1,7 @@
 //! Sets of descriptors that know what they are.
 
+use crate::DescriptorKind;
 use cv_core::Keypoint;
-
-/// What the numbers of a descriptor mean. Sets of different kinds are never compared.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
-pub enum DescriptorKind {
-    /// 8×8 upright patches, zero mean and unit variance ([`describe_patches`](crate::describe_patches)).
-    Patch,
-    /// 8×8 patches turned to the keypoint's direction and sized to its scale, zero mean and unit variance ([`mops`](crate::mops)).
-    Mops,
-    /// SIFT gradient histograms of unit length ([`sift`](crate::sift) with `root: false`).
-    Sift,
-    /// The square roots of SIFT histograms that sum to one ([`sift`](crate::sift)); unit length.
-    RootSift,
-    /// Rows of another program, compared by their Euclidean distance.
-    Foreign {
-        /// Numbers in one descriptor.
-        dimension: usize,
-    },
-}
-
-impl DescriptorKind {
-    /// Numbers in one descriptor.
-    pub fn dimension(self) -> usize {
-        match self {
-            Self::Patch | Self::Mops => 64,
-            Self::Sift | Self::RootSift => 128,
-            Self::Foreign { dimension } => dimension,
-        }
-    }
-}
-
-impl std::fmt::Display for DescriptorKind {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        if let Self::Foreign { dimension } = self {
-            return write!(f, "foreign {dimension}-number");
-        }
-        f.write_str(match self {
-            Self::Foreign { .. } => "foreign",
-            Self::Patch => "8×8 patch",
-            Self::Mops => "MOPS",
-            Self::Sift => "SIFT",
-            Self::RootSift => "rootSIFT",
-        })
-    }
-}
 
 /// Descriptors of one kind, one row of [`DescriptorKind::dimension`] numbers each.
 #[derive(Debug, Clone, PartialEq)]
@@ -63,7 +18,7 @@ impl Descriptors {
 
     /// Takes over rows of numbers; `None` where the length is not a multiple of the kind's dimension, or that is zero.
     pub fn from_vec(kind: DescriptorKind, data: Vec<f32>) -> Option<Self> {
-        let whole = kind.dimension() > 0 && data.len().is_multiple_of(kind.dimension());
+        let whole = kind.dimension > 0 && data.len().is_multiple_of(kind.dimension);
         whole.then_some(Self { kind, data })
     }
 
@@ -79,7 +34,7 @@ impl Descriptors {
 
     /// Numbers in one descriptor.
     pub fn dimension(&self) -> usize {
-        self.kind.dimension()
+        self.kind.dimension
     }
 
     /// Number of descriptors.
@@ -146,9 +101,27 @@ pub struct Features {
     pub dropped: Vec<Dropped>,
     /// Features left out only because there are more than the options allow. With this, everything handed in or found is accounted for.
     pub beyond_limit: usize,
+    /// The points before they were spaced evenly, for pictures; empty for methods that do not space theirs.
+    pub candidates: Vec<Keypoint>,
 }
 
 impl Features {
+    /// No features.
+    pub fn new(kind: DescriptorKind) -> Self {
+        Self {
+            keypoints: Vec::new(),
+            descriptors: Descriptors::new(kind),
+            dropped: Vec::new(),
+            beyond_limit: 0,
+            candidates: Vec::new(),
+        }
+    }
+
+    /// Points found, or handed in: those kept, dropped, and beyond the limit.
+    pub fn found(&self) -> usize {
+        self.keypoints.len() + self.dropped.len() + self.beyond_limit
+    }
+
     /// Leaves the features for which `keep` is true.
     pub(crate) fn retain(&mut self, keep: &[bool]) {
         let d = self.descriptors.dimension();
@@ -156,6 +129,16 @@ impl Features {
         self.keypoints.retain(|_| which.next() == Some(&true));
         let rows = self.descriptors.data.chunks_exact(d).zip(keep).filter(|(_, keep)| **keep);
         self.descriptors.data = rows.flat_map(|(row, _)| row).copied().collect();
+    }
+
+    /// Adds a feature with its descriptor; false, and nothing added, where the descriptor has not as many numbers as the kind.
+    pub fn push(&mut self, keypoint: Keypoint, descriptor: &[f32]) -> bool {
+        let fits = descriptor.len() == self.descriptors.dimension();
+        if fits {
+            self.keypoints.push(keypoint);
+            self.descriptors.push(descriptor);
+        }
+        fits
     }
 
     /// Adds a feature of another set of the same kind; `None` where the kinds differ or there is no such feature.

@@ -1,8 +1,8 @@
 //! Matching once the geometry of two views is known: only candidates near where a feature must be.
 
-use crate::descriptors::{Descriptors, Features};
-use crate::matching::MatchError;
+use crate::matching::{MatchError, same_kind};
 use crate::nearest_neighbors::ssd;
+use crate::{Descriptors, Features};
 use cv_core::{Cancelled, DMatch, Keypoint, OptionError, Progress, Stage};
 use nalgebra::{Matrix3, Point2, Vector3};
 use rayon::prelude::*;
@@ -28,15 +28,15 @@ pub struct GuidedOptions {
     /// Largest ratio of the SSD of the best candidate to that of the second. 0 to 1; default 0.8, looser than without a geometry: there are far fewer candidates, so far
     /// fewer chances to be wrong.
     pub ratio: f32,
-    /// Largest SSD, in the descriptors' unit. Default 0.49 for unit descriptors: COLMAP's distance of 0.7.
-    pub max_ssd: f32,
+    /// Largest SSD, in the descriptors' unit. Default `None`: [`DescriptorKind::max_ssd`](crate::DescriptorKind::max_ssd).
+    pub max_ssd: Option<f32>,
     /// A second candidate nearer than this to the best one is the same point, in pixels. Default 2.
     pub same: f32,
 }
 
 impl Default for GuidedOptions {
     fn default() -> Self {
-        Self { threshold: 2.0, ratio: 0.8, max_ssd: 0.49, same: 2.0 }
+        Self { threshold: 2.0, ratio: 0.8, max_ssd: None, same: 2.0 }
     }
 }
 
@@ -56,9 +56,7 @@ pub fn match_guided(
     progress: &dyn Progress,
 ) -> Result<Vec<DMatch>, MatchError> {
     let (da, db) = (&a.descriptors, &b.descriptors);
-    if da.kind() != db.kind() {
-        return Err(MatchError::KindsDiffer { query: da.kind(), train: db.kind() });
-    }
+    same_kind(da, db)?;
     if da.is_empty() || db.is_empty() {
         return Err(MatchError::Empty { query: da.len(), train: db.len() });
     }
@@ -78,10 +76,11 @@ pub fn match_guided(
     let stage = Stage::new(progress, "guided", pa.len() + pb.len())?;
     let forth = one_way((da, pa), (db, pb), model, options, &stage)?;
     let back = one_way((db, pb), (da, pa), &turned, options, &stage)?;
+    let max_ssd = options.max_ssd.unwrap_or(da.kind().max_ssd);
     let mutual = |(i, best): (usize, &Option<Best>)| {
         let best = (*best)?;
         let other = back[best.index as usize]?;
-        let sure = best.ssd <= options.ratio * best.second && best.ssd <= options.max_ssd;
+        let sure = best.ssd <= options.ratio * best.second && best.ssd <= max_ssd;
         (other.index as usize == i && sure).then(|| DMatch {
             query: i as u32,
             train: best.index,
@@ -108,6 +107,7 @@ fn one_way(
     stage: &Stage<'_>,
 ) -> Result<Vec<Option<Best>>, Cancelled> {
     let limit = options.threshold * options.threshold;
+    let max_ssd = options.max_ssd.unwrap_or(da.kind().max_ssd);
     let (TwoViewModel::Homography(m) | TwoViewModel::Fundamental(m)) = model;
     let m: Matrix3<f32> = m.cast::<f32>() * (1.0 / m.norm()) as f32;
     // The part of Sampson's denominator that belongs to the second point, for every one of them.
@@ -146,7 +146,7 @@ fn one_way(
         let at = pb[index as usize];
         let elsewhere = |&&(j, _): &&(u32, f32)| (pb[j as usize] - at).norm() > options.same;
         // A lone candidate has to be good by itself.
-        let second = near.iter().filter(elsewhere).map(|n| n.1).fold(options.max_ssd, f32::min);
+        let second = near.iter().filter(elsewhere).map(|n| n.1).fold(max_ssd, f32::min);
         Some(Best { index, ssd: best, second })
     };
     let asked = |i: usize| {
@@ -159,16 +159,15 @@ fn one_way(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::descriptors::DescriptorKind;
+    use crate::DescriptorKind;
     use cv_core::Silent;
 
     fn described(points: &[(f32, f32)], values: &[f32]) -> Features {
         let data = values.iter().flat_map(|&v| std::iter::once(v).chain(std::iter::repeat_n(0.0, 63))).collect();
         Features {
             keypoints: points.iter().map(|&(x, y)| Keypoint::new(x, y, 1.0)).collect(),
-            descriptors: Descriptors::from_vec(DescriptorKind::Patch, data).unwrap(),
-            dropped: Vec::new(),
-            beyond_limit: 0,
+            descriptors: Descriptors::from_vec(DescriptorKind::PATCH, data).unwrap(),
+            ..Features::new(DescriptorKind::PATCH)
         }
     }
 
@@ -186,7 +185,7 @@ mod tests {
         let h = Matrix3::new(1.0, 0.0, 5.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0);
         let found = match_guided(&a, &b, None, &TwoViewModel::Homography(h), &options, &Silent).unwrap();
         assert_eq!(found.iter().map(|m| (m.query, m.train)).collect::<Vec<_>>(), [(0, 1)]);
-        let strange = Features { descriptors: Descriptors::new(DescriptorKind::Mops), ..a.clone() };
+        let strange = Features { descriptors: Descriptors::new(DescriptorKind::MOPS), ..a.clone() };
         let error = match_guided(&strange, &b, None, &TwoViewModel::Homography(h), &options, &Silent);
         assert!(matches!(error, Err(MatchError::KindsDiffer { .. })));
         let nothing = match_guided(&a, &b, None, &TwoViewModel::Homography(Matrix3::zeros()), &options, &Silent);

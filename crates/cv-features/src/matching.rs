@@ -1,6 +1,6 @@
 //! Nearest-neighbor matching of descriptors.
 
-use crate::descriptors::{DescriptorKind, Descriptors};
+use crate::Descriptors;
 use crate::nearest_neighbors::nearest;
 use crate::simd;
 use cv_core::{Cancelled, DMatch, OptionError, Progress};
@@ -9,12 +9,12 @@ use cv_core::{Cancelled, DMatch, OptionError, Progress};
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum MatchError {
     /// The sets hold different kinds of descriptors.
-    #[error("a set of {query} descriptors cannot be compared with one of {train} descriptors")]
+    #[error("{} {} descriptors cannot be compared with {} {} ones", query.1, query.0, train.1, train.0)]
     KindsDiffer {
-        /// Kind of the first set.
-        query: DescriptorKind,
-        /// Kind of the second set.
-        train: DescriptorKind,
+        /// Name and dimension of the first set's kind.
+        query: (&'static str, usize),
+        /// Name and dimension of the second set's kind.
+        train: (&'static str, usize),
     },
     /// A set is empty.
     #[error("there is nothing to match: {query} descriptors against {train}")]
@@ -50,14 +50,27 @@ pub enum RatioMeasure {
     Distance,
 }
 
+/// How ambiguous a match may be: the ratio of the best candidate's distance to that of the second.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
+pub enum RatioTest {
+    /// Below [`DescriptorKind::ratio`](crate::DescriptorKind::ratio).
+    #[default]
+    Kind,
+    /// Below this, in the measure of the options. 0 to 1.
+    Below(f32),
+    /// Every nearest neighbor stays.
+    Off,
+}
+
 /// Settings of [`match_descriptors`].
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct MatchOptions {
-    /// A match stays where best / second-best is below this; `None` keeps all. 0 to 1; default 0.66 on SSD (Brown & Lowe's 0.8 on distances, squared
-    /// and rounded).
-    pub ratio: Option<f32>,
+    /// Which matches stay by how ambiguous they are. Default as of the kind of the descriptors.
+    pub ratio: RatioTest,
     /// The measure of `ratio`, and of the distances returned. Default SSD.
     pub measure: RatioMeasure,
     /// Keep a match only where each is the other's nearest. Default off.
@@ -69,14 +82,14 @@ pub struct MatchOptions {
 
 impl Default for MatchOptions {
     fn default() -> Self {
-        Self { ratio: Some(0.66), measure: RatioMeasure::Ssd, mutual: false, one_to_one: false }
+        Self { ratio: RatioTest::Kind, measure: RatioMeasure::Ssd, mutual: false, one_to_one: false }
     }
 }
 
 /// The nearest descriptor in `train` for each one in `query`, kept where the ratio test (and mutual check) passes, in the order of `query`.
 ///
 /// Exact: every pair is compared. Of equally near descriptors the first counts as the best, so that a duplicate gives ratio 1. Where `train`
-/// has a single descriptor nothing can be said about ambiguity: the ratio is 1, and only `ratio: None` keeps such a match. O(query · train · dimension).
+/// has a single descriptor nothing can be said about ambiguity: the ratio is 1, and only [`RatioTest::Off`] keeps such a match. O(query · train · dimension).
 ///
 /// There is no approximate index: at 20,000 descriptors of 128 numbers on each side OpenCV's forest of k-d trees is faster by a half at most (see
 /// `docs/benchmarks.md`) and does not always find the nearest.
@@ -89,17 +102,21 @@ pub fn match_descriptors(
     options: &MatchOptions,
     progress: &dyn Progress,
 ) -> Result<Vec<DMatch>, MatchError> {
-    if query.kind() != train.kind() {
-        return Err(MatchError::KindsDiffer { query: query.kind(), train: train.kind() });
-    }
+    same_kind(query, train)?;
     if query.is_empty() || train.is_empty() {
         return Err(MatchError::Empty { query: query.len(), train: train.len() });
     }
     if let Some(got) = [query.len(), train.len()].into_iter().find(|&n| u32::try_from(n).is_err()) {
         return Err(MatchError::TooMany { got });
     }
-    if let Some(ratio) = options.ratio {
-        OptionError::check("ratio", ratio.into(), "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
+    let limit = match (options.ratio, options.measure) {
+        (RatioTest::Kind, RatioMeasure::Ssd) => Some(query.kind().ratio),
+        (RatioTest::Kind, RatioMeasure::Distance) => Some(query.kind().ratio.sqrt()),
+        (RatioTest::Below(limit), _) => Some(limit),
+        (RatioTest::Off, _) => None,
+    };
+    if let Some(limit) = limit {
+        OptionError::check("ratio", limit.into(), "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
     }
     let (forward, backward) = nearest(simd::level(), query, train, options.mutual, progress)?;
     let mut matches = Vec::new();
@@ -111,7 +128,7 @@ pub fn match_descriptors(
         let (distance, second) = (of_ssd(two.ssd), of_ssd(two.second_ssd));
         // Two exact copies are ambiguous, not 0/0.
         let ratio = if second > 0.0 && second.is_finite() { distance / second } else { 1.0 };
-        if options.ratio.is_none_or(|limit| ratio < limit) {
+        if limit.is_none_or(|limit| ratio < limit) {
             matches.push(DMatch { query: i as u32, train: two.best, distance, ratio });
         }
     }
@@ -119,6 +136,15 @@ pub fn match_descriptors(
         keep_nearest_of_each(&mut matches, train.len());
     }
     Ok(matches)
+}
+
+/// Refuses sets of different kinds.
+pub(crate) fn same_kind(query: &Descriptors, train: &Descriptors) -> Result<(), MatchError> {
+    let (a, b) = (query.kind(), train.kind());
+    if a == b {
+        return Ok(());
+    }
+    Err(MatchError::KindsDiffer { query: (a.name, a.dimension), train: (b.name, b.dimension) })
 }
 
 /// Leaves one match for each descriptor of the second set: that with the smallest distance, of equals the first.
@@ -138,6 +164,7 @@ pub(crate) fn keep_nearest_of_each(matches: &mut Vec<DMatch>, train: usize) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::DescriptorKind;
     use cv_core::Silent;
 
     fn set(rows: &[&[f32]]) -> Descriptors {
@@ -147,14 +174,14 @@ mod tests {
             padded[..row.len()].copy_from_slice(row);
             data.extend_from_slice(&padded);
         }
-        Descriptors::from_vec(DescriptorKind::Patch, data).unwrap()
+        Descriptors::from_vec(DescriptorKind::PATCH, data).unwrap()
     }
 
     #[test]
     fn ratio_and_mutual_tests_do_what_they_say() {
         let a = set(&[&[0.0, 0.0], &[10.0, 0.0], &[0.2, 0.0]]);
         let b = set(&[&[0.0, 1.0], &[0.0, 3.0], &[10.0, 1.0]]);
-        let all = MatchOptions { ratio: None, ..MatchOptions::default() };
+        let all = MatchOptions { ratio: RatioTest::Off, ..MatchOptions::default() };
         let found = match_descriptors(&a, &b, &all, &Silent).unwrap();
         assert_eq!(found.iter().map(|m| (m.query, m.train)).collect::<Vec<_>>(), [(0, 0), (1, 2), (2, 0)]);
         assert_eq!((found[0].distance, found[0].ratio), (1.0, 1.0 / 9.0));
@@ -166,7 +193,7 @@ mod tests {
         assert_eq!(found.iter().map(|m| (m.query, m.train)).collect::<Vec<_>>(), [(0, 0), (1, 2)]);
         let single = MatchOptions { one_to_one: true, ..all.clone() };
         assert_eq!(match_descriptors(&a, &b, &single, &Silent).unwrap(), found);
-        let strict = MatchOptions { ratio: Some(0.05), ..MatchOptions::default() };
+        let strict = MatchOptions { ratio: RatioTest::Below(0.05), ..MatchOptions::default() };
         assert_eq!(match_descriptors(&a, &b, &strict, &Silent).unwrap().len(), 1);
     }
 
@@ -176,7 +203,7 @@ mod tests {
         let twice = set(&[&[1.0], &[1.0]]);
         assert_eq!(match_descriptors(&a, &twice, &MatchOptions::default(), &Silent), Ok(vec![]));
         assert_eq!(match_descriptors(&a, &a, &MatchOptions::default(), &Silent), Ok(vec![]));
-        let all = MatchOptions { ratio: None, ..MatchOptions::default() };
+        let all = MatchOptions { ratio: RatioTest::Off, ..MatchOptions::default() };
         let expected = DMatch { query: 0, train: 0, distance: 0.0, ratio: 1.0 };
         assert_eq!(match_descriptors(&a, &twice, &all, &Silent), Ok(vec![expected]));
         assert_eq!(match_descriptors(&a, &a, &all, &Silent), Ok(vec![expected]));
@@ -188,7 +215,7 @@ mod tests {
         let options = MatchOptions::default();
         assert_eq!(match_descriptors(&none, &a, &options, &Silent), Err(MatchError::Empty { query: 0, train: 1 }));
         assert_eq!(match_descriptors(&a, &none, &options, &Silent), Err(MatchError::Empty { query: 1, train: 0 }));
-        let bad = MatchOptions { ratio: Some(f32::NAN), ..options };
+        let bad = MatchOptions { ratio: RatioTest::Below(f32::NAN), ..options };
         assert!(matches!(match_descriptors(&a, &a, &bad, &Silent), Err(MatchError::Option(_))));
     }
 }

@@ -3,13 +3,14 @@
 //! Sources: M. Brown, R. Szeliski & S. Winder, "Multi-image matching using multi-scale oriented patches", CVPR 2005; K. Mikolajczyk & C. Schmid,
 //! "Indexing based on scale invariant interest points", ICCV 2001 (Harris-Laplace).
 
-use crate::descriptors::{DescriptorKind, Descriptors, DropReason, Dropped, Features};
 use crate::error::{FeatureError, check_image};
+use crate::extractor::FeatureExtractor;
 use crate::harris::{CornerMeasure, corners};
 use crate::patch::{SIDE, normalize};
 use crate::pyramid::{FIRST_SIGMA, Pyramid};
 use crate::simd;
 use crate::structure_tensor::StructureTensor;
+use crate::{DescriptorKind, DropReason, Dropped, Features};
 use cv_core::{Cancelled, ImageView, Keypoint, OptionError, Progress, Stage};
 use cv_imgproc::gaussian_half_kernel;
 use rayon::prelude::*;
@@ -33,6 +34,21 @@ pub struct MultiScaleOptions {
 impl Default for MultiScaleOptions {
     fn default() -> Self {
         Self { measure: CornerMeasure::Harris { k: 0.04 }, layers: 3, threshold: 1e-3, laplacian: true }
+    }
+}
+
+impl DescriptorKind {
+    /// 8×8 patches turned to the keypoint's direction and sized to its scale, zero mean and unit variance ([`mops`]).
+    pub const MOPS: Self = Self { name: "mops", ..Self::PATCH };
+}
+
+impl FeatureExtractor for MopsOptions {
+    fn extract(&self, image: ImageView<'_, f32, 1>, progress: &dyn Progress) -> Result<Features, FeatureError> {
+        mops(image, self, progress)
+    }
+
+    fn kind(&self) -> DescriptorKind {
+        DescriptorKind::MOPS
     }
 }
 
@@ -198,12 +214,7 @@ fn describe(
     };
     let patches: Vec<Result<(f32, Patch), DropReason>> =
         keypoints.par_iter().with_min_len(32).map(asked).collect::<Result<_, _>>()?;
-    let mut out = Features {
-        keypoints: Vec::new(),
-        descriptors: Descriptors::new(DescriptorKind::Mops),
-        dropped: Vec::new(),
-        beyond_limit: 0,
-    };
+    let mut out = Features::new(DescriptorKind::MOPS);
     for (index, (keypoint, patch)) in keypoints.iter().zip(patches).enumerate() {
         match patch {
             Err(reason) => out.dropped.push(Dropped { index, reason }),

@@ -5,7 +5,7 @@
 //! of each candidate. The distances of what was picked are then computed anew as sums of squared differences, so equal descriptors are
 //! at distance zero.
 
-use crate::descriptors::Descriptors;
+use crate::Descriptors;
 use cv_core::{Cancelled, Progress, Stage};
 use fearless_simd::{Level, dispatch, prelude::*};
 use rayon::prelude::*;
@@ -300,7 +300,7 @@ fn dot(a: &[f32], b: &[f32]) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::descriptors::DescriptorKind;
+    use crate::DescriptorKind;
     use cv_core::Silent;
     use cv_synth::instruction_sets;
     use proptest::prelude::*;
@@ -340,7 +340,7 @@ mod tests {
                         if k % d < 3 { (state >> 16) as f32 % values as f32 } else { 1.0 }
                     })
                     .collect();
-                Descriptors::from_vec(DescriptorKind::Foreign { dimension: d }, data).unwrap()
+                Descriptors::from_vec(DescriptorKind::foreign(d), data).unwrap()
             };
             let (query, train) = (set(nq), set(nt));
             let expected = plain(&query, &train);

@@ -3,14 +3,29 @@
 //! Source: M. Brown, R. Szeliski & S. Winder, "Multi-image matching using multi-scale oriented patches", CVPR 2005, section 4,
 //! without orientation.
 
-use crate::descriptors::{DescriptorKind, Descriptors, DropReason, Dropped, Features};
 use crate::error::{FeatureError, check_image};
+use crate::kind::{ByteScale, MAX_SSD, RATIO};
+use crate::{DescriptorKind, DropReason, Dropped, Features};
 use cv_core::{GrayF32, ImageView, Keypoint, OptionError};
 use cv_imgproc::{bilinear_at, gaussian_blur};
 use rayon::prelude::*;
 
 /// Samples on a side of a patch.
 pub(crate) const SIDE: usize = 8;
+
+impl DescriptorKind {
+    /// 8×8 upright patches, zero mean and unit variance ([`describe_patches`]).
+    pub const PATCH: Self = Self {
+        name: "patch",
+        dimension: SIDE * SIDE,
+        ratio: RATIO,
+        // As for descriptors of unit length: these have that of their number.
+        max_ssd: MAX_SSD * (SIDE * SIDE) as f32,
+        // Four standard deviations to each side.
+        bytes: Some(ByteScale { offset: 4.0, factor: 255.0 / 8.0 }),
+        patch: Some(SIDE),
+    };
+}
 
 /// Settings of [`describe_patches`].
 #[derive(Debug, Clone, PartialEq)]
@@ -51,12 +66,7 @@ pub fn describe_patches(
     let smooth = gaussian_blur(view, options.blur_sigma);
     let patches: Vec<Result<[f32; SIDE * SIDE], DropReason>> =
         keypoints.par_iter().with_min_len(64).map(|k| patch(&smooth, k, options)).collect();
-    let mut described = Features {
-        keypoints: Vec::with_capacity(keypoints.len()),
-        descriptors: Descriptors::new(DescriptorKind::Patch),
-        dropped: Vec::new(),
-        beyond_limit: 0,
-    };
+    let mut described = Features::new(DescriptorKind::PATCH);
     for (index, (keypoint, patch)) in keypoints.iter().zip(patches).enumerate() {
         match patch {
             Ok(values) => {

@@ -7,12 +7,14 @@
 //! pixel. A descriptor is computed on a grid of 20×20 samples turned and scaled with the point (four to a histogram bin, as in Lowe's
 //! figure 7), not on every pixel under the window, so its cost does not depend on scale.
 
-use crate::descriptors::{DescriptorKind, Descriptors, DropReason, Dropped, Features};
 use crate::dog::{Extremum, Search};
 use crate::error::{FeatureError, check_image};
+use crate::extractor::FeatureExtractor;
 use crate::gradient_histogram::{DIMENSION, describe, dominant_angles};
+use crate::kind::{ByteScale, MAX_SSD, RATIO};
 use crate::scale_space::{Octave, scale_space};
 use crate::simd;
+use crate::{DescriptorKind, DropReason, Dropped, Features};
 use cv_core::{Cancelled, ImageView, Keypoint, OptionError, Point2, Progress, Stage};
 use rayon::prelude::*;
 
@@ -59,6 +61,32 @@ impl Default for SiftOptions {
     }
 }
 
+impl DescriptorKind {
+    /// SIFT gradient histograms of unit length ([`sift`] with `root: false`).
+    pub const SIFT: Self = Self {
+        name: "sift",
+        dimension: DIMENSION,
+        ratio: RATIO,
+        max_ssd: MAX_SSD,
+        // COLMAP's: no number of a unit vector that was clipped at 0.2 comes near 0.5.
+        bytes: Some(ByteScale { offset: 0.0, factor: 512.0 }),
+        patch: None,
+    };
+
+    /// The square roots of SIFT histograms that sum to one ([`sift`]); unit length.
+    pub const ROOT_SIFT: Self = Self { name: "rootsift", ..Self::SIFT };
+}
+
+impl FeatureExtractor for SiftOptions {
+    fn extract(&self, image: ImageView<'_, f32, 1>, progress: &dyn Progress) -> Result<Features, FeatureError> {
+        sift(image, self, progress)
+    }
+
+    fn kind(&self) -> DescriptorKind {
+        if self.root { DescriptorKind::ROOT_SIFT } else { DescriptorKind::SIFT }
+    }
+}
+
 /// The smallest image the scale space can be built on.
 pub(crate) const SMALLEST: usize = 8;
 
@@ -89,9 +117,7 @@ pub fn sift(
         edge: options.edge,
     };
     let (octaves, mut points) = scale_space(view, &search, progress)?;
-    let kind = if options.root { DescriptorKind::RootSift } else { DescriptorKind::Sift };
-    let mut out =
-        Features { keypoints: Vec::new(), descriptors: Descriptors::new(kind), dropped: Vec::new(), beyond_limit: 0 };
+    let mut out = Features::new(options.kind());
     if options.coarse_first && points.len() > options.max_features {
         // Stable: contrast decides between equals.
         points.sort_by(|a, b| {

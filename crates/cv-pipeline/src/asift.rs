@@ -1,9 +1,8 @@
 //! ASIFT (Morel & Yu 2009): more matches for photographs taken from very different directions, by SIFT features of affine-simulated views.
 
-use crate::PhotoFeatures;
 use crate::matching::{MatchingOptions, match_features};
 use cv_core::{Cancelled, DMatch, GrayF32, Progress, Stage};
-use cv_features::{FeatureError, MatchError, sift_affine_view};
+use cv_features::{FeatureError, Features, MatchError, SiftOptions, sift_affine_view};
 use std::f32::consts::PI;
 
 /// Tilts that are simulated: with the √2 that SIFT itself bears on either side of each, up to a slant of 80°.
@@ -17,7 +16,8 @@ const SAME: f32 = 2.0;
 /// `matches`, unless they are there already or the other photograph's feature has a match at a smaller distance.
 pub(crate) fn match_asift(
     photos: [&GrayF32; 2],
-    features: &mut [PhotoFeatures; 2],
+    sift: &SiftOptions,
+    features: &mut [Features; 2],
     matches: &mut Vec<DMatch>,
     options: &MatchingOptions,
     progress: &dyn Progress,
@@ -30,12 +30,11 @@ pub(crate) fn match_asift(
             for i in 0..count(tilt) {
                 let rotation = i as f32 * PI / count(tilt) as f32;
                 // A view that is too small to look at has nothing to add.
-                let described = match sift_affine_view(photos[side].view(), &options.sift, tilt, rotation, &stage) {
+                let view = match sift_affine_view(photos[side].view(), sift, tilt, rotation, &stage) {
                     Err(FeatureError::Cancelled(stop)) => return Err(stop),
                     Err(_) => continue,
-                    Ok(described) => described,
+                    Ok(view) => view,
                 };
-                let view = PhotoFeatures { described, found: 0, candidates: Vec::new() };
                 // The view asks, the whole photograph answers: among the few features of a view, the second best would be far too often.
                 let more = match match_features(&view, &plain[1 - side], options, &stage) {
                     Err(MatchError::Cancelled(stop)) => return Err(stop),
@@ -43,10 +42,10 @@ pub(crate) fn match_asift(
                     Ok(more) => more,
                 };
                 for m in more {
-                    let new = view.described.keypoints[m.query as usize].position;
-                    let old = plain[1 - side].described.keypoints[m.train as usize].position;
+                    let new = view.keypoints[m.query as usize].position;
+                    let old = plain[1 - side].keypoints[m.train as usize].position;
                     let known = matches.iter().any(|n| {
-                        let at = |side: usize, i: u32| features[side].described.keypoints[i as usize].position;
+                        let at = |side: usize, i: u32| features[side].keypoints[i as usize].position;
                         let ends = [at(0, n.query), at(1, n.train)];
                         (ends[side] - new).norm() < SAME && (ends[1 - side] - old).norm() < SAME
                     });
@@ -55,7 +54,7 @@ pub(crate) fn match_asift(
                     if known || taken {
                         continue;
                     }
-                    let Some(added) = features[side].described.add(&view.described, m.query as usize) else { continue };
+                    let Some(added) = features[side].add(&view, m.query as usize) else { continue };
                     let (query, train) = if side == 0 { (added, m.train) } else { (m.train, added) };
                     matches.push(DMatch { query, train, ..m });
                 }

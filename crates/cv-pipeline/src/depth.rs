@@ -4,7 +4,8 @@ use crate::no_pair::{NoPairCause, cause};
 use crate::{Progress, RangeError, disparity_range};
 use cv_core::{Cancelled, GrayF32, ImageView, PointCloud, RgbU8, StageClock};
 use cv_stereo::{
-    DisparityMap, GeometryError, Intensity, RectifyError, StereoError, StereoGeometry, StereoMatcher, StereoOptions,
+    DisparityMap, DisparityMatcher, GeometryError, Intensity, RectifyError, StereoError, StereoGeometry, StereoMatcher,
+    StereoOptions,
 };
 
 /// Which disparities are tried.
@@ -177,14 +178,14 @@ pub(crate) fn check_pair<T: Intensity, const C: usize>(
     map: &DisparityMap,
     left: ImageView<'_, T, C>,
     right: ImageView<'_, T, C>,
-    options: &StereoOptions,
+    disparities: (i32, usize),
     progress: &dyn Progress,
 ) -> Result<(), DepthError> {
     let matched = map.matched_fraction();
     if matched >= LEAST_MATCHED {
         return Ok(());
     }
-    Err(DepthError::NoPair { matched, needed: LEAST_MATCHED, cause: cause(left, right, options, progress)? })
+    Err(DepthError::NoPair { matched, needed: LEAST_MATCHED, cause: cause(left, right, disparities, progress)? })
 }
 
 /// A photograph as bytes of color, 16 bits rounded to 8.
@@ -221,35 +222,56 @@ pub fn depth<T: Intensity, const C: usize>(
     options: &DepthOptions,
     progress: &dyn Progress,
 ) -> Result<DepthResult, DepthError> {
-    let (near, far) = options.range;
-    // NaN fails as well.
-    if near.partial_cmp(&far) != Some(std::cmp::Ordering::Less) {
-        return Err(DepthError::Range { near, far });
-    }
-    if let Some(geometry) = geometry {
-        geometry.validate()?;
-    }
+    check_range(options.range, geometry)?;
     let mut clock = StageClock::new();
     let stereo = matcher_options(left, right, options, progress)?;
     if options.disparities != DisparityRange::Given {
         clock.lap("range");
     }
-    let disparities = (stereo.min_disparity, stereo.disparities);
     let mut matcher = StereoMatcher::new(stereo)?;
-    let mut map = DisparityMap::empty();
-    matcher.prepare(left.width(), left.height(), &mut map, progress)?;
+    matcher.prepare(left.width(), left.height(), &mut DisparityMap::empty(), progress)?;
     clock.lap("prepare");
+    let mut result = depth_with(&mut matcher, left, right, geometry, options.range, progress)?;
+    result.stages.splice(0..0, clock.into_stages());
+    Ok(result)
+}
+
+/// As [`depth`], by any matcher. `range` is the nearest and the farthest depth kept, in the unit of the baseline.
+///
+/// # Errors
+/// As [`depth`].
+pub fn depth_with<T: Intensity, const C: usize>(
+    matcher: &mut dyn DisparityMatcher<T, C>,
+    left: ImageView<'_, T, C>,
+    right: ImageView<'_, T, C>,
+    geometry: Option<&StereoGeometry>,
+    range: (f32, f32),
+    progress: &dyn Progress,
+) -> Result<DepthResult, DepthError> {
+    check_range(range, geometry)?;
+    let mut clock = StageClock::new();
+    let mut map = DisparityMap::empty();
     matcher.compute_into(left, right, &mut map, progress)?;
     clock.lap("match");
-    check_pair(&map, left, right, matcher.options(), progress)?;
+    let disparities = matcher.disparities();
+    check_pair(&map, left, right, disparities, progress)?;
     progress.report("depth", 0, 1)?;
-    let depth = geometry.map(|geometry| geometry.depth_map(map.disparity.view(), options.range));
+    let depth = geometry.map(|geometry| geometry.depth_map(map.disparity.view(), range));
     let confidence = matcher.confidence(&map);
     progress.report("depth", 0, 1)?;
     let sigma = matcher.uncertainty(&map);
     clock.lap("depth");
     let geometry = geometry.copied();
     Ok(DepthResult { map, depth, confidence, sigma, disparities, geometry, stages: clock.into_stages() })
+}
+
+/// Refuses an empty range of depths and a geometry that is none.
+fn check_range((near, far): (f32, f32), geometry: Option<&StereoGeometry>) -> Result<(), DepthError> {
+    // NaN fails as well.
+    if near.partial_cmp(&far) != Some(std::cmp::Ordering::Less) {
+        return Err(DepthError::Range { near, far });
+    }
+    Ok(geometry.map_or(Ok(()), StereoGeometry::validate)?)
 }
 
 #[cfg(test)]

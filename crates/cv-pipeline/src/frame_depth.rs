@@ -32,7 +32,8 @@ impl FrameDepth {
         progress: &dyn Progress,
     ) -> Result<&DisparityMap, DepthError> {
         self.matcher.compute_into(left, right, &mut self.map, progress)?;
-        check_pair(&self.map, left, right, self.matcher.options(), progress)?;
+        let StereoOptions { min_disparity, disparities, .. } = *self.matcher.options();
+        check_pair(&self.map, left, right, (min_disparity, disparities), progress)?;
         Ok(&self.map)
     }
 }

@@ -47,26 +47,27 @@ mod segment;
 pub use advice::Advice;
 pub use axes::Axes;
 pub use cv_core::{Cancelled, Progress, Silent};
+pub use cv_features::{FeatureExtractor, FeatureMethod, FeatureOptions, Features};
 pub use cv_geometry::{
     EstimateError, Intrinsics, RobustModel, RobustOptions, TwoViewError, TwoViewOptions, TwoViewPoint,
     TwoViewReconstruction,
 };
-pub use depth::{DepthError, DepthOptions, DepthResult, DisparityRange, depth};
+pub use depth::{DepthError, DepthOptions, DepthResult, DisparityRange, depth, depth_with};
 pub use disparity_range::{RangeError, disparity_range};
 pub use estimate::{
     CalibratedResult, EstimateResult, ModelKind, PrevailingModel, estimate, estimate_calibrated, prevailing_model,
 };
 pub use frame_depth::FrameDepth;
 pub use matching::{
-    AffineSimulation, FeatureMethod, MatchingError, MatchingOptions, MatchingResult, PhotoFeatures, Suppression,
-    extract_features, match_extracted, match_features, match_photos,
+    AffineSimulation, MatchingError, MatchingOptions, MatchingResult, extract_features, match_extracted,
+    match_features, match_photos,
 };
 pub use no_pair::NoPairCause;
-/// What a caller of [`match_extracted`] needs to hand in features found elsewhere, and to choose among ours.
+/// What a caller of [`match_extracted`] needs to hand in features found elsewhere, and the settings of ours.
 pub mod features {
     pub use cv_features::{
-        CornerMeasure, DescriptorKind, Descriptors, DropReason, Dropped, Features, HarrisOptions, MopsOptions,
-        MultiScaleOptions, SiftOptions,
+        ByteScale, CornerMeasure, DescriptorKind, Descriptors, DropReason, Dropped, FeatureError, HarrisFeatures,
+        HarrisOptions, MopsOptions, MultiScaleOptions, PatchOptions, RatioTest, SiftOptions, Suppression,
     };
 }
 pub use panorama::{
@@ -88,9 +89,10 @@ pub use segment::{SegmentResult, SegmentTraining, segment, train_segment};
 /// What a caller of [`depth()`] needs of the stereo stage: its options and results, rectification, geometry and scores.
 pub mod stereo {
     pub use cv_stereo::{
-        BAD_THRESHOLDS, Census, DisparityMap, DisparityScores, EvaluateError, GeometryError, Intensity, IntensityCost,
-        Paths, PixelState, Rectification, RectifiedView, RectifyError, RectifyOptions, Smoothing, StereoError,
-        StereoGeometry, StereoMatcher, StereoOptions, Subpixel, evaluate_disparity, non_occluded,
+        BAD_THRESHOLDS, Census, DisparityMap, DisparityMatcher, DisparityScores, EvaluateError, GeometryError,
+        Intensity, IntensityCost, Paths, PixelState, Rectification, RectifiedView, RectifyError, RectifyOptions,
+        Smoothing, StereoError, StereoGeometry, StereoMatcher, StereoOptions, Subpixel, evaluate_disparity,
+        non_occluded,
     };
 }
 

@@ -2,54 +2,13 @@
 
 use crate::asift::match_asift;
 use crate::{ModelKind, Progress, RobustOptions, estimate};
-use cv_core::{Cancelled, Correspondence, DMatch, ImageView, Keypoint, Point2, Scaling, StageClock};
+use cv_core::{Cancelled, Correspondence, DMatch, ImageView, Point2, Scaling, StageClock};
 use cv_features::{
-    DescriptorKind, FeatureError, Features, GuidedOptions, HarrisOptions, MatchError, MatchOptions, MopsOptions,
-    PatchOptions, SiftOptions, TwoViewModel, anms, anms_square_covering, anms_tiled, describe_patches, harris,
-    match_descriptors, match_guided, mops, sift,
+    FeatureError, FeatureOptions, Features, GuidedOptions, MatchError, MatchOptions, RatioTest, TwoViewModel,
+    match_descriptors, match_guided,
 };
 use cv_geometry::EstimateError;
 use cv_imgproc::{resize_area, rgb_to_gray_f32};
-
-/// Which features to find.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
-pub enum FeatureMethod {
-    /// Harris corners with upright 8×8 patches: fast, for neighboring frames of a film or a slowly turned camera.
-    Harris,
-    /// Corners at all scales with oriented 8×8 patches: for photographs that turn and zoom a little, at half the time of SIFT.
-    Mops,
-    /// rootSIFT: for photographs that turn, zoom, or change light or viewpoint.
-    #[default]
-    Sift,
-}
-
-cv_core::named!(FeatureMethod {
-    Sift = "sift": "rootSIFT: photographs that turn, zoom, or change light or viewpoint",
-    Mops = "mops": "corners at all scales with oriented 8×8 patches",
-    Harris = "harris": "corners with upright 8×8 patches: neighboring frames of a film or of a slowly turned camera",
-});
-
-/// The non-maximal suppression that spreads Harris corners over the photograph.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
-pub enum Suppression {
-    /// By suppression radius (Brown, Szeliski & Winder).
-    #[default]
-    Radius,
-    /// By square covering (Bailo et al.): faster, nearly as even.
-    SquareCovering,
-    /// As many from each of 8 × 8 tiles.
-    Tiles,
-}
-
-cv_core::named!(Suppression {
-    Radius = "radius": "by suppression radius",
-    SquareCovering = "squares": "by square covering: faster, nearly as even",
-    Tiles = "tiles": "as many from each of 8×8 tiles",
-});
 
 /// Whether [`match_photos`] also looks at affine-simulated views (ASIFT, Morel & Yu 2009), with SIFT only: some ten times the time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -72,31 +31,15 @@ cv_core::named!(AffineSimulation {
     Always = "always",
 });
 
-/// Settings of [`extract_features`] and [`match_photos`].
+/// Settings of [`match_photos`].
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct MatchingOptions {
-    /// Which features. Default SIFT, which works on a stranger's photographs without knowing anything about them.
-    pub method: FeatureMethod,
-    /// Most features per photograph; `None` takes the method's default: 500 well-spread corners (Brown, Szeliski & Winder), 2000 oriented
-    /// patches, or 8192 SIFT features (COLMAP's).
-    pub max_features: Option<usize>,
-    /// Settings of the corners.
-    pub harris: HarrisOptions,
-    /// Robustness factor of the suppression. 0 to 1; default 0.9 (Brown, Szeliski & Winder).
-    pub anms_robust: f32,
-    /// How the corners are spread. Default by radius.
-    pub suppression: Suppression,
-    /// Settings of the patches.
-    pub patch: PatchOptions,
-    /// Settings of the oriented patches and their corners.
-    pub mops: MopsOptions,
-    /// Settings of SIFT. Of more features than asked for, the coarse ones stay by default (COLMAP's choice).
-    pub sift: SiftOptions,
-    /// Largest ratio of the SSD of the best candidate to that of the second. 0 to 1; `None` keeps every nearest neighbor. Default 0.66, which is
-    /// 0.81 on distances.
-    pub ratio: Option<f32>,
+    /// Which features, and their settings. Default SIFT.
+    pub features: FeatureOptions,
+    /// Which matches stay by how ambiguous they are. Default as of the kind of the descriptors.
+    pub ratio: RatioTest,
     /// Keep a match only where each feature is the other's nearest. Default true.
     pub mutual: bool,
     /// Affine-simulated views (ASIFT). Default where needed.
@@ -111,15 +54,8 @@ pub struct MatchingOptions {
 impl Default for MatchingOptions {
     fn default() -> Self {
         Self {
-            method: FeatureMethod::default(),
-            max_features: None,
-            harris: HarrisOptions::default(),
-            anms_robust: 0.9,
-            suppression: Suppression::default(),
-            patch: PatchOptions::default(),
-            mops: MopsOptions::default(),
-            sift: SiftOptions { coarse_first: true, ..SiftOptions::default() },
-            ratio: Some(0.66),
+            features: FeatureOptions::default(),
+            ratio: RatioTest::Kind,
             mutual: true,
             affine_simulation: AffineSimulation::default(),
             guided: None,
@@ -128,22 +64,11 @@ impl Default for MatchingOptions {
     }
 }
 
-/// The features of a photograph.
-#[derive(Debug, Clone, PartialEq)]
-pub struct PhotoFeatures {
-    /// Keypoints, descriptors, and what was left out.
-    pub described: Features,
-    /// Points found before spacing and limits.
-    pub found: usize,
-    /// The corners before spacing, for pictures; empty for methods that do not space their points.
-    pub candidates: Vec<Keypoint>,
-}
-
 /// What [`match_photos`] found.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MatchingResult {
     /// The features of both photographs.
-    pub features: [PhotoFeatures; 2],
+    pub features: [Features; 2],
     /// Matches by index of the features, in order of the first photograph's.
     pub matches: Vec<DMatch>,
     /// Stage names and their seconds.
@@ -211,46 +136,10 @@ impl From<MatchError> for MatchingError {
 /// [`FeatureError`] for a photograph smaller than the method's window and for options out of range. One without features is no error here.
 pub fn extract_features(
     photo: ImageView<'_, u8, 3>,
-    options: &MatchingOptions,
+    options: &FeatureOptions,
     progress: &dyn Progress,
-) -> Result<PhotoFeatures, FeatureError> {
-    let gray = rgb_to_gray_f32(photo);
-    match options.method {
-        FeatureMethod::Harris => {
-            let corners = harris(gray.view(), &options.harris, progress)?;
-            let n = options.max_features.unwrap_or(500);
-            let spaced = match options.suppression {
-                Suppression::Radius => anms(&corners, n, options.anms_robust),
-                Suppression::SquareCovering => anms_square_covering(&corners, n),
-                Suppression::Tiles => anms_tiled(&corners, n, (8, 8)),
-            };
-            let spaced: Vec<_> = spaced.into_iter().map(|i| corners[i]).collect();
-            let mut described = describe_patches(gray.view(), &spaced, &options.patch)?;
-            described.beyond_limit = corners.len() - spaced.len();
-            Ok(PhotoFeatures { described, found: corners.len(), candidates: corners })
-        }
-        FeatureMethod::Mops => {
-            let mut settings = options.mops.clone();
-            if let Some(n) = options.max_features {
-                settings.max_features = n;
-            }
-            let described = mops(gray.view(), &settings, progress)?;
-            Ok(PhotoFeatures { found: accounted(&described), described, candidates: Vec::new() })
-        }
-        FeatureMethod::Sift => {
-            let mut settings = options.sift.clone();
-            if let Some(n) = options.max_features {
-                settings.max_features = n;
-            }
-            let described = sift(gray.view(), &settings, progress)?;
-            Ok(PhotoFeatures { found: accounted(&described), described, candidates: Vec::new() })
-        }
-    }
-}
-
-/// The features kept, dropped, and beyond the limit.
-fn accounted(described: &Features) -> usize {
-    described.keypoints.len() + described.dropped.len() + described.beyond_limit
+) -> Result<Features, FeatureError> {
+    options.extractor().extract(rgb_to_gray_f32(photo).view(), progress)
 }
 
 /// Tentative matches between the features of two photographs.
@@ -258,22 +147,22 @@ fn accounted(described: &Features) -> usize {
 /// # Errors
 /// [`MatchError`] where one has no features, or they are of different kinds.
 pub fn match_features(
-    a: &PhotoFeatures,
-    b: &PhotoFeatures,
+    a: &Features,
+    b: &Features,
     options: &MatchingOptions,
     progress: &dyn Progress,
 ) -> Result<Vec<DMatch>, MatchError> {
     let settings = MatchOptions { ratio: options.ratio, mutual: options.mutual, ..MatchOptions::default() };
-    match_descriptors(&a.described.descriptors, &b.described.descriptors, &settings, progress)
+    match_descriptors(&a.descriptors, &b.descriptors, &settings, progress)
 }
 
 /// The positions of matched features, in the order of `matches`.
-pub(crate) fn correspondences(a: &PhotoFeatures, b: &PhotoFeatures, matches: &[DMatch]) -> Vec<Correspondence> {
+pub(crate) fn correspondences(a: &Features, b: &Features, matches: &[DMatch]) -> Vec<Correspondence> {
     matches.iter().map(|m| pair(a, b, m)).collect()
 }
 
-fn pair(a: &PhotoFeatures, b: &PhotoFeatures, m: &DMatch) -> Correspondence {
-    let at = |f: &PhotoFeatures, i: u32| -> Point2<f64> { f.described.keypoints[i as usize].position.cast() };
+fn pair(a: &Features, b: &Features, m: &DMatch) -> Correspondence {
+    let at = |f: &Features, i: u32| -> Point2<f64> { f.keypoints[i as usize].position.cast() };
     Correspondence { a: at(a, m.query), b: at(b, m.train) }
 }
 
@@ -289,13 +178,13 @@ pub fn match_photos(
 ) -> Result<MatchingResult, MatchingError> {
     let mut clock = StageClock::new();
     let extract = |photo, index| {
-        let features = extract_features(photo, options, progress).map_err(|error| match error {
+        let features = extract_features(photo, &options.features, progress).map_err(|error| match error {
             FeatureError::Cancelled(stop) => stop.into(),
             source => MatchingError::Features { index, source },
         })?;
-        if features.described.keypoints.is_empty() {
-            let dropped = features.described.dropped.len();
-            return Err(MatchingError::NoFeatures { index, found: features.found, dropped });
+        if features.keypoints.is_empty() {
+            let dropped = features.dropped.len();
+            return Err(MatchingError::NoFeatures { index, found: features.found(), dropped });
         }
         Ok(features)
     };
@@ -310,19 +199,20 @@ pub fn match_photos(
         }
         AffineSimulation::Always => true,
     };
-    if affine_simulation && options.method == FeatureMethod::Sift {
-        match_asift([&rgb_to_gray_f32(a), &rgb_to_gray_f32(b)], &mut features, &mut matches, options, progress)?;
+    if affine_simulation && let FeatureOptions::Sift(sift) = &options.features {
+        let gray = [&rgb_to_gray_f32(a), &rgb_to_gray_f32(b)];
+        match_asift(gray, sift, &mut features, &mut matches, options, progress)?;
         clock.lap("slanted views");
     }
     finish(features, matches, options, progress, clock)
 }
 
-/// Tentative matches between features found elsewhere; those of other programs count as [`DescriptorKind::Foreign`](cv_features::DescriptorKind::Foreign).
+/// Tentative matches between features found elsewhere; those of other programs are of the kind [`DescriptorKind::foreign`](cv_features::DescriptorKind::foreign).
 ///
 /// # Errors
 /// [`MatchingError`] where there are none, or they are of different kinds.
 pub fn match_extracted(
-    features: [PhotoFeatures; 2],
+    features: [Features; 2],
     options: &MatchingOptions,
     progress: &dyn Progress,
 ) -> Result<MatchingResult, MatchingError> {
@@ -334,7 +224,7 @@ pub fn match_extracted(
 
 /// Matches once more along a model, where asked for, and packs up.
 fn finish(
-    features: [PhotoFeatures; 2],
+    features: [Features; 2],
     mut matches: Vec<DMatch>,
     options: &MatchingOptions,
     progress: &dyn Progress,
@@ -352,16 +242,8 @@ fn finish(
                 ModelKind::Homography => TwoViewModel::Homography(found.robust.model),
                 ModelKind::Fundamental => TwoViewModel::Fundamental(found.robust.model),
             };
-            // Patches are of unit variance, 64 numbers: the limit for unit vectors times 64.
-            let unit = features[0].described.descriptors.kind();
-            let max_ssd = match unit {
-                DescriptorKind::Patch | DescriptorKind::Mops => 64.0 * GuidedOptions::default().max_ssd,
-                DescriptorKind::Foreign { .. } => f32::INFINITY,
-                DescriptorKind::Sift | DescriptorKind::RootSift => GuidedOptions::default().max_ssd,
-            };
-            let along =
-                GuidedOptions { threshold: kind.options().threshold as f32, max_ssd, ..GuidedOptions::default() };
-            matches = match_guided(&features[0].described, &features[1].described, None, &model, &along, progress)?;
+            let along = GuidedOptions { threshold: kind.options().threshold as f32, ..GuidedOptions::default() };
+            matches = match_guided(&features[0], &features[1], None, &model, &along, progress)?;
         }
         clock.lap("guided");
     }
@@ -380,6 +262,14 @@ fn explained(pairs: &[Correspondence], seed: u64, progress: &dyn Progress) -> Re
     Ok(false)
 }
 
+/// To pixels of the photograph as it is when scaled.
+pub(crate) fn rescale(features: &mut Features, scaling: Scaling) {
+    for point in features.keypoints.iter_mut().chain(&mut features.candidates) {
+        point.position = scaling.point_f32(point.position);
+        point.scale *= scaling.length() as f32;
+    }
+}
+
 /// [`match_photos`] in photographs reduced to a longer side of `max_size` where they are larger, in pixels of the photographs themselves.
 pub(crate) fn match_reduced(
     photos: [ImageView<'_, u8, 3>; 2],
@@ -395,12 +285,7 @@ pub(crate) fn match_reduced(
     let views = [0, 1].map(|i: usize| reduced[i].as_ref().map_or(photos[i], |r| r.view()));
     let mut matching = match_photos(views[0], views[1], options, progress)?;
     for ((features, view), photo) in matching.features.iter_mut().zip(&views).zip(&photos) {
-        let scaling = Scaling::between(view.size(), photo.size());
-        let points = features.described.keypoints.iter_mut();
-        for point in points.chain(&mut features.candidates) {
-            point.position = scaling.point_f32(point.position);
-            point.scale *= scaling.length() as f32;
-        }
+        rescale(features, Scaling::between(view.size(), photo.size()));
     }
     Ok(matching)
 }
@@ -408,7 +293,7 @@ pub(crate) fn match_reduced(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Silent;
+    use crate::{FeatureMethod, Silent};
     use cv_core::RgbU8;
 
     /// Colored blobs of many sizes at places drawn from a fixed sequence.
@@ -434,7 +319,7 @@ mod tests {
     fn both_methods_find_a_shift() {
         let (a, b) = (blobs((0.0, 0.0)), blobs((6.5, -4.0)));
         for method in [FeatureMethod::Harris, FeatureMethod::Mops, FeatureMethod::Sift] {
-            let options = MatchingOptions { method, ..MatchingOptions::default() };
+            let options = MatchingOptions { features: method.into(), ..MatchingOptions::default() };
             let result = match_photos(a.view(), b.view(), &options, &Silent).unwrap();
             let pairs = result.pairs();
             let good =
@@ -452,7 +337,7 @@ mod tests {
         let flat = RgbU8::new(100, 80, [9; 3]);
         let good = blobs((0.0, 0.0));
         for method in [FeatureMethod::Harris, FeatureMethod::Mops, FeatureMethod::Sift] {
-            let options = MatchingOptions { method, ..MatchingOptions::default() };
+            let options = MatchingOptions { features: method.into(), ..MatchingOptions::default() };
             let error = match_photos(good.view(), flat.view(), &options, &Silent).unwrap_err();
             assert_eq!(error, MatchingError::NoFeatures { index: 2, found: 0, dropped: 0 });
             let tiny = RgbU8::new(1, 1, [9; 3]);

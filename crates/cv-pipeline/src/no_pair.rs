@@ -4,7 +4,7 @@ use crate::depth::color_bytes;
 use crate::disparity_range::{NEEDED, in_common_rows, is_common_row, range_of};
 use crate::{MatchingError, MatchingOptions, Progress, match_photos};
 use cv_core::{Cancelled, Correspondence, ImageView};
-use cv_stereo::{Intensity, StereoOptions};
+use cv_stereo::Intensity;
 
 /// What feature matches of a refused pair show.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -64,7 +64,7 @@ const SPREAD: f64 = 0.1;
 pub(crate) fn cause<T: Intensity, const C: usize>(
     left: ImageView<'_, T, C>,
     right: ImageView<'_, T, C>,
-    options: &StereoOptions,
+    (first, count): (i32, usize),
     progress: &dyn Progress,
 ) -> Result<NoPairCause, Cancelled> {
     let [a, b] = [left, right].map(color_bytes);
@@ -73,7 +73,7 @@ pub(crate) fn cause<T: Intensity, const C: usize>(
         Err(MatchingError::Cancelled(stop)) => return Err(stop),
         Err(_) => return Ok(NoPairCause::Unrelated { matches: 0 }),
     };
-    let tried = (options.min_disparity, options.min_disparity + options.disparities as i32 - 1);
+    let tried = (first, first.saturating_add(count as i32 - 1));
     Ok(judge(&found.pairs(), left.height(), Some(tried)))
 }
 

@@ -1,13 +1,11 @@
 //! Panoramas from overlapping photographs.
 
 use crate::Progress;
-use crate::matching::{
-    FeatureMethod, MatchingOptions, PhotoFeatures, correspondences, extract_features, match_features,
-};
+use crate::matching::{MatchingOptions, correspondences, extract_features, match_features, rescale};
 use cv_core::{
     Camera, Cancelled, Correspondence, DMatch, Image, ImageView, Mask, RgbU8, Scaling, Stage, StageClock, UnionFind,
 };
-use cv_features::{DescriptorKind, Descriptors, FeatureError, Features, MatchError, SiftOptions};
+use cv_features::{FeatureError, FeatureOptions, Features, MatchError, SiftOptions};
 use cv_panorama::{
     AlignError, AlignOptions, Alignment, CameraMotion, Canvas, CompositingOptions, NotAPair, Photo, PhotoMap,
     RenderError, Unplaced, VerifiedPair, VerifyOptions, align, render, verify_pair,
@@ -35,7 +33,7 @@ impl<'a> PanoramaPhoto<'a> {
 /// Settings of [`panorama`].
 #[derive(Debug, Clone)]
 pub struct PanoramaOptions {
-    /// Features and matching. SIFT starts from the enlarged image (`sift.upsample`) only where the features of the plain one do not hold the photographs
+    /// Features and matching. SIFT starts from the enlarged image ([`SiftOptions::upsample`]) only where the features of the plain one do not hold the photographs
     /// together firmly.
     pub matching: MatchingOptions,
     /// Pixels that photographs are reduced to (about) for features and alignment. 10,000 or more; default 800,000, in the range that OpenCV's stitcher
@@ -52,7 +50,10 @@ pub struct PanoramaOptions {
 impl Default for PanoramaOptions {
     fn default() -> Self {
         Self {
-            matching: MatchingOptions { max_features: Some(2000), ..MatchingOptions::default() },
+            matching: MatchingOptions {
+                features: FeatureOptions::default().at_most(2000),
+                ..MatchingOptions::default()
+            },
             registration_pixels: 800_000,
             verify: VerifyOptions::default(),
             align: AlignOptions::default(),
@@ -119,8 +120,8 @@ pub struct PanoramaPair {
     pub b: usize,
     /// Tentative matches, by the indices of the two photographs' features; see [`PanoramaResult::correspondences`].
     pub matches: Vec<DMatch>,
-    /// Which of them agree with a common homography; empty where the pair was rejected.
-    pub inliers: Vec<bool>,
+    /// Indices of those that agree with a common homography, ascending; none where the pair was rejected.
+    pub inliers: Vec<usize>,
     /// Why the pair was rejected.
     pub rejected: Option<NotAPair>,
 }
@@ -138,10 +139,8 @@ pub struct PanoramaResult {
     pub images: Vec<PanoramaImage>,
     /// All pairs that had matches.
     pub pairs: Vec<PanoramaPair>,
-    /// Features of each photograph, in pixels of the reduced photographs (see `reduced`).
-    pub features: Vec<PhotoFeatures>,
-    /// By how much each photograph was reduced for features.
-    pub reduced: Vec<f64>,
+    /// Features of each photograph, in its own pixels.
+    pub features: Vec<Features>,
     /// The views, in full size.
     pub alignment: Alignment,
     /// The surface drawn on, and where each pixel of the picture looks.
@@ -160,10 +159,11 @@ const PARALLAX: f64 = 0.005;
 
 impl PanoramaResult {
     /// Where the matches of a pair are, in pixels of the photographs.
+    ///
+    /// # Panics
+    /// For a pair of another panorama.
     pub fn correspondences(&self, pair: &PanoramaPair) -> Vec<Correspondence> {
-        let [a, b] = [pair.a, pair.b].map(|i| Scaling::uniform(self.reduced[i]));
-        let found = correspondences(&self.features[pair.a], &self.features[pair.b], &pair.matches);
-        found.iter().map(|c| Correspondence { a: a.point(c.a), b: b.point(c.b) }).collect()
+        correspondences(&self.features[pair.a], &self.features[pair.b], &pair.matches)
     }
 
     /// Whether the photographs fit each other so badly that they must have been taken from different places: what is near may then be cut in two at the seams.
@@ -236,10 +236,16 @@ pub fn panorama(
         Ok((prepared, tried))
     };
     let matching = &options.matching;
-    let plain = MatchingOptions { sift: SiftOptions { upsample: false, ..matching.sift.clone() }, ..matching.clone() };
     // The enlarged image is most of the work of SIFT, and seldom needed.
-    let (mut prepared, mut tried) = look(&plain)?;
-    if matching.method == FeatureMethod::Sift && matching.sift.upsample && !held_firmly(n, &tried) {
+    let plain = match &matching.features {
+        FeatureOptions::Sift(sift) if sift.upsample => {
+            let features = FeatureOptions::Sift(SiftOptions { upsample: false, ..sift.clone() });
+            Some(MatchingOptions { features, ..matching.clone() })
+        }
+        _ => None,
+    };
+    let (mut prepared, mut tried) = look(plain.as_ref().unwrap_or(matching))?;
+    if plain.is_some() && !held_firmly(n, &tried) {
         (prepared, tried) = look(matching)?;
     }
     let (pairs, verified): (Vec<PanoramaPair>, Vec<Option<VerifiedPair>>) = tried.into_iter().flatten().unzip();
@@ -275,8 +281,7 @@ pub fn panorama(
         labels: drawn.labels,
         images,
         pairs,
-        reduced: prepared.iter().map(|p| p.factor).collect(),
-        features: prepared.into_iter().map(|p| p.features).collect(),
+        features: prepared.into_iter().map(Prepared::into_features).collect(),
         canvas: drawn.canvas,
         map: drawn.map,
         reprojection_rms_px: alignment.rms_px,
@@ -291,7 +296,7 @@ struct Prepared {
     photo: Photo,
     /// Size of the photograph over that of the reduced one.
     factor: f64,
-    features: PhotoFeatures,
+    features: Features,
     /// Why it has no features.
     failure: Option<FeatureError>,
 }
@@ -305,31 +310,27 @@ impl Prepared {
     ) -> Result<Self, Cancelled> {
         let (w, h) = p.image.size();
         let factor = ((w * h) as f64 / registration_pixels.max(10_000) as f64).sqrt().max(1.0);
-        let none = || PhotoFeatures {
-            described: Features {
-                keypoints: Vec::new(),
-                descriptors: Descriptors::new(DescriptorKind::RootSift),
-                dropped: Vec::new(),
-                beyond_limit: 0,
-            },
-            found: 0,
-            candidates: Vec::new(),
-        };
         let size = ((w as f64 / factor).round() as usize, (h as f64 / factor).round() as usize);
         let reduced = (factor > 1.2).then(|| cv_imgproc::resize_area(p.image, size.0, size.1).ok()).flatten();
         let (image, factor) = match &reduced {
             Some(small) => (small.view(), w as f64 / size.0 as f64),
             None => (p.image, 1.0),
         };
-        let (features, failure) = match extract_features(image, matching, progress) {
+        let (features, failure) = match extract_features(image, &matching.features, progress) {
             Ok(features) => (features, None),
             Err(FeatureError::Cancelled(stop)) => return Err(stop),
-            Err(error) => (none(), Some(error)),
+            Err(error) => (Features::new(matching.features.extractor().kind()), Some(error)),
         };
         let (width, height) = image.size();
         let camera = p.camera.map(|c| Camera { width, height, ..c.scaled(1.0 / factor) });
         let photo = Photo { width, height, focal: p.focal.map(|f| f / factor), camera };
         Ok(Self { photo, factor, features, failure })
+    }
+
+    /// In pixels of the photograph.
+    fn into_features(mut self) -> Features {
+        rescale(&mut self.features, Scaling::uniform(self.factor));
+        self.features
     }
 }
 
@@ -357,27 +358,20 @@ fn try_pair(
     progress: &dyn Progress,
 ) -> Result<Option<Tried>, Cancelled> {
     let (p, q) = (&prepared[a], &prepared[b]);
-    let found = match match_features(&p.features, &q.features, &options.matching, progress) {
-        Ok(found) => found,
+    let matches = match match_features(&p.features, &q.features, &options.matching, progress) {
+        Ok(matches) => matches,
         Err(MatchError::Cancelled(stop)) => return Err(stop),
         Err(_) => return Ok(None),
     };
-    let matches = correspondences(&p.features, &q.features, &found);
+    let pixels = correspondences(&p.features, &q.features, &matches);
     let size = |p: &Prepared| (p.photo.width, p.photo.height);
-    let verified = verify_pair((a, size(p)), (b, size(q)), &matches, &options.verify);
-    let inliers = match &verified {
-        Ok(pair) => {
-            let mut agrees = vec![false; matches.len()];
-            pair.inliers.iter().for_each(|&i| agrees[i] = true);
-            agrees
-        }
-        Err(_) => Vec::new(),
-    };
+    let verified = verify_pair((a, size(p)), (b, size(q)), &pixels, &options.verify);
     let (verified, rejected) = match verified {
         Ok(pair) => (Some(pair), None),
         Err(reason) => (None, Some(reason)),
     };
-    Ok(Some((PanoramaPair { a, b, matches: found, inliers, rejected }, verified)))
+    let inliers = verified.as_ref().map(|v| v.inliers.clone()).unwrap_or_default();
+    Ok(Some((PanoramaPair { a, b, matches, inliers, rejected }, verified)))
 }
 
 /// What to tell about each photograph.
@@ -399,7 +393,7 @@ fn describe(
         (_, Some(failure)) => LeftOut::Features(*failure),
         (Unplaced::OtherComponent { size }, _) => LeftOut::OtherComponent { size },
         (Unplaced::Inconsistent, _) => LeftOut::Inconsistent,
-        (Unplaced::NoOverlap, _) if prepared[i].features.described.keypoints.is_empty() => LeftOut::NoFeatures,
+        (Unplaced::NoOverlap, _) if prepared[i].features.keypoints.is_empty() => LeftOut::NoFeatures,
         (Unplaced::NoOverlap, _) => LeftOut::NoOverlap { nearest: nearest(i) },
     };
     views
@@ -408,7 +402,7 @@ fn describe(
         .map(|(i, view)| PanoramaImage {
             used: view.is_ok(),
             reason: view.as_ref().err().map(|why| reason(i, *why)),
-            features: prepared[i].features.described.keypoints.len(),
+            features: prepared[i].features.keypoints.len(),
             focal: None,
             gain: [1.0; 3],
         })

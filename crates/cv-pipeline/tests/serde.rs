@@ -5,7 +5,8 @@ use cv_core::{Camera, Correspondence, Distortion, Keypoint, Point2, Pose, Rotati
 use cv_pipeline::segmentation::TrainOptions;
 use cv_pipeline::stereo::{RectifyOptions, StereoOptions};
 use cv_pipeline::{
-    DenseOptions, DepthOptions, MatchingOptions, ModelKind, ReconstructOptions, RobustOptions, Silent, estimate,
+    DenseOptions, DepthOptions, FeatureOptions, MatchingOptions, ModelKind, ReconstructOptions, RobustOptions, Silent,
+    estimate,
 };
 use serde::{Serialize, de::DeserializeOwned};
 use std::fmt::Debug;
@@ -31,8 +32,10 @@ fn options_come_back_and_missing_fields_take_their_defaults() {
     options::<RectifyOptions>();
     options::<RobustOptions>();
     options::<TrainOptions>();
-    let some: MatchingOptions = serde_json::from_str(r#"{ "max_features": 300, "sift": { "layers": 2 } }"#).unwrap();
-    assert_eq!((some.max_features, some.sift.layers, some.mutual), (Some(300), 2, true));
+    let some: MatchingOptions =
+        serde_json::from_str(r#"{ "features": { "sift": { "max_features": 300, "layers": 2 } } }"#).unwrap();
+    let FeatureOptions::Sift(sift) = &some.features else { panic!("{some:?}") };
+    assert_eq!((sift.max_features, sift.layers, some.mutual), (300, 2, true));
     let far: DepthOptions = serde_json::from_str(r#"{ "range": [0.5, null] }"#).unwrap();
     assert_eq!(far.range, (0.5, f32::INFINITY));
 }

@@ -23,6 +23,7 @@ mod census;
 mod confidence;
 mod cost;
 mod depth;
+mod disparity_matcher;
 mod edge_preserving;
 mod error;
 mod evaluate;
@@ -45,6 +46,7 @@ mod speckle;
 mod winner;
 
 pub use depth::{GeometryError, StereoGeometry};
+pub use disparity_matcher::DisparityMatcher;
 pub use error::StereoError;
 pub use evaluate::{BAD_THRESHOLDS, DisparityScores, EvaluateError, evaluate_disparity, non_occluded};
 pub use input::Intensity;

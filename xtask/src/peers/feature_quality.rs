@@ -8,7 +8,8 @@ use super::features::Random;
 use anyhow::{Context, Result, ensure};
 use cv_core::{DMatch, GrayU8, ImageView, Keypoint, Matrix3, Point2, Silent, Vector3};
 use cv_features::{
-    DescriptorKind, Descriptors, FeatureError, MatchOptions, MopsOptions, SiftOptions, match_descriptors, sift,
+    DescriptorKind, Descriptors, FeatureError, MatchOptions, MopsOptions, RatioTest, SiftOptions, match_descriptors,
+    sift,
 };
 use cv_imgproc::{Interpolation, RemapOptions};
 use rayon::prelude::*;
@@ -204,7 +205,7 @@ fn read(path: &Path, bits: bool) -> Result<Set> {
         Rows::Bits(rows().map(|r| [0, 1, 2, 3].map(|i| word(&r[5 + 8 * i..13 + 8 * i]))).collect())
     } else {
         let data = rows().flat_map(|r| &r[5..]).copied().collect();
-        Rows::Floats(Descriptors::from_vec(DescriptorKind::Sift, data).context("descriptors")?)
+        Rows::Floats(Descriptors::from_vec(DescriptorKind::SIFT, data).context("descriptors")?)
     };
     Ok(Set { keypoints, rows })
 }
@@ -266,7 +267,7 @@ fn score(a: &Set, b: &Set, h: &Matrix3<f64>, size_a: (usize, usize), size_b: (us
 fn mutual(a: &Rows, b: &Rows) -> Vec<(usize, usize)> {
     match (a, b) {
         (Rows::Floats(a), Rows::Floats(b)) => {
-            let options = MatchOptions { ratio: None, mutual: true, ..MatchOptions::default() };
+            let options = MatchOptions { ratio: RatioTest::Off, mutual: true, ..MatchOptions::default() };
             let found: Vec<DMatch> = match_descriptors(a, b, &options, &Silent).unwrap_or_default();
             found.into_iter().map(|m| (m.query as usize, m.train as usize)).collect()
         }

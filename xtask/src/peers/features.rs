@@ -7,8 +7,8 @@ use crate::checks::Check;
 use anyhow::{Context, Result, ensure};
 use cv_core::{GrayF32, ImageView, Keypoint, Silent};
 use cv_features::{
-    ByteDescriptors, CornerMeasure, DescriptorKind, Descriptors, HarrisOptions, MatchOptions, SiftOptions, anms,
-    harris, harris_response, match_byte_descriptors, match_descriptors, sift,
+    ByteDescriptors, CornerMeasure, DescriptorKind, Descriptors, HarrisOptions, MatchOptions, RatioTest, SiftOptions,
+    anms, harris, harris_response, match_byte_descriptors, match_descriptors, sift,
 };
 use rayon::prelude::*;
 use serde::Deserialize;
@@ -62,15 +62,15 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
     let options = HarrisOptions::default();
     let shi = HarrisOptions { measure: CornerMeasure::ShiTomasi, ..options.clone() };
     let settings = SiftOptions { max_features: 2000, ..SiftOptions::default() };
-    let nearest = MatchOptions { ratio: None, ..MatchOptions::default() };
+    let nearest = MatchOptions { ratio: RatioTest::Off, ..MatchOptions::default() };
     let mut random = Random(1);
     let mut set = |kind: DescriptorKind, n: usize| {
-        let data = (0..n * kind.dimension()).map(|_| random.next()).collect();
+        let data = (0..n * kind.dimension).map(|_| random.next()).collect();
         Descriptors::from_vec(kind, data).context("descriptors")
     };
-    let small = [set(DescriptorKind::Patch, 2000)?, set(DescriptorKind::Patch, 2000)?];
-    let large = [set(DescriptorKind::RootSift, 8192)?, set(DescriptorKind::RootSift, 8192)?];
-    let huge = [set(DescriptorKind::RootSift, 20_000)?, set(DescriptorKind::RootSift, 20_000)?];
+    let small = [set(DescriptorKind::PATCH, 2000)?, set(DescriptorKind::PATCH, 2000)?];
+    let large = [set(DescriptorKind::ROOT_SIFT, 8192)?, set(DescriptorKind::ROOT_SIFT, 8192)?];
+    let huge = [set(DescriptorKind::ROOT_SIFT, 20_000)?, set(DescriptorKind::ROOT_SIFT, 20_000)?];
     let corners: Vec<Keypoint> = (0..20_000)
         .map(|_| Keypoint::new(1333.0 * random.next(), 750.0 * random.next(), random.next().powi(3)))
         .collect();

@@ -26,8 +26,8 @@ pub(super) fn run(data: &Path) -> Result<Vec<Check>> {
             match &matched {
                 Ok(m) => line.push_str(&format!(
                     "{:6} {:6} features {:5} matches ",
-                    m.features[0].described.keypoints.len(),
-                    m.features[1].described.keypoints.len(),
+                    m.features[0].keypoints.len(),
+                    m.features[1].keypoints.len(),
                     m.matches.len()
                 )),
                 Err(error) => line.push_str(&format!("{error} ")),

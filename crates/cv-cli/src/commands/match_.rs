@@ -3,10 +3,10 @@
 use crate::frame::{Context, Explain, Failure, Outcome, Run, named};
 use cv_core::{Keypoint, Named, RgbU8};
 use cv_io::FeatureRows;
-use cv_pipeline::features::{CornerMeasure, DescriptorKind, Descriptors, Features};
+use cv_pipeline::features::{CornerMeasure, DescriptorKind, Descriptors, HarrisFeatures, RatioTest, Suppression};
 use cv_pipeline::{
-    AffineSimulation, FeatureMethod, MatchingError, MatchingOptions, MatchingResult, ModelKind, PhotoFeatures,
-    Suppression, match_extracted, match_photos, prevailing_model,
+    AffineSimulation, FeatureMethod, FeatureOptions, Features, MatchingError, MatchingOptions, MatchingResult,
+    ModelKind, match_extracted, match_photos, prevailing_model,
 };
 use cv_report::{Figure, MatchStyle, Note, Plot, Report, colors, draw_keypoints, draw_matches, tile_patches};
 use std::path::{Path, PathBuf};
@@ -38,13 +38,13 @@ pub(crate) struct Args {
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// Which features.
-    #[arg(long, value_name = "KIND", value_parser = named::<FeatureMethod>(), default_value_t = MatchingOptions::default().method)]
+    #[arg(long, value_name = "KIND", value_parser = named::<FeatureMethod>(), default_value_t)]
     features: FeatureMethod,
     /// What makes a corner, for mops and harris.
-    #[arg(long, value_name = "MEASURE", value_parser = named::<CornerMeasure>(), default_value_t = MatchingOptions::default().harris.measure)]
+    #[arg(long, value_name = "MEASURE", value_parser = named::<CornerMeasure>(), default_value_t = HarrisFeatures::default().corners.measure)]
     corners: CornerMeasure,
     /// How the corners of harris are spread.
-    #[arg(long, value_name = "HOW", value_parser = named::<Suppression>(), default_value_t = MatchingOptions::default().suppression)]
+    #[arg(long, value_name = "HOW", value_parser = named::<Suppression>(), default_value_t = Suppression::default())]
     spacing: Suppression,
     /// Look at affine-simulated views too (ASIFT), with sift: for photographs from very different directions; about ten times slower.
     #[arg(long = "asift", alias = "slanted", value_name = "WHEN", value_parser = named::<AffineSimulation>(), default_value_t = MatchingOptions::default().affine_simulation)]
@@ -61,9 +61,9 @@ pub(crate) struct Args {
     /// Most features per photograph [default: 8192 SIFT features, 2000 MOPS, 500 corners].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     max_features: Option<u32>,
-    /// Largest ratio of the squared distance of the best candidate to that of the second; 1 keeps all.
-    #[arg(long, value_name = "R", default_value_t = 0.66)]
-    ratio: f32,
+    /// Largest ratio of the squared distance of the best candidate to that of the second; 1 keeps all [default: 0.66].
+    #[arg(long, value_name = "R")]
+    ratio: Option<f32>,
     /// Keep matches that are only nearest from the first photograph to the second.
     #[arg(long)]
     one_way: bool,
@@ -75,23 +75,35 @@ impl Run for Args {
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
-        if !(0.0..=1.0).contains(&self.ratio) {
-            return Err(Failure::usage(format!("--ratio must be from 0 to 1, not {}", self.ratio)));
+        if let Some(ratio) = self.ratio.filter(|ratio| !(0.0..=1.0).contains(ratio)) {
+            return Err(Failure::usage(format!("--ratio must be from 0 to 1, not {ratio}")));
         }
         let (a, b) = (cv_io::read_rgb(&self.first)?, cv_io::read_rgb(&self.second)?);
-        let mut options = MatchingOptions {
-            method: self.features,
-            suppression: self.spacing,
+        let mut features = FeatureOptions::from(self.features);
+        match &mut features {
+            FeatureOptions::Harris(harris) => {
+                harris.corners.measure = self.corners;
+                harris.suppression = self.spacing;
+            }
+            FeatureOptions::Mops(mops) => mops.corners.measure = self.corners,
+            FeatureOptions::Sift(_) | FeatureOptions::Other(_) => {}
+        }
+        if let Some(n) = self.max_features {
+            features = features.at_most(n as usize);
+        }
+        let ratio = match self.ratio {
+            None => RatioTest::Kind,
+            Some(ratio) if ratio < 1.0 => RatioTest::Below(ratio),
+            Some(_) => RatioTest::Off,
+        };
+        let options = MatchingOptions {
+            features,
+            ratio,
+            mutual: !self.one_way,
             affine_simulation: self.slanted,
             guided: self.guided,
-            max_features: self.max_features.map(|n| n as usize),
-            ratio: (self.ratio < 1.0).then_some(self.ratio),
-            mutual: !self.one_way,
-            ..MatchingOptions::default()
+            seed: context.seed.unwrap_or(MatchingOptions::default().seed),
         };
-        options.seed = context.seed.unwrap_or(options.seed);
-        options.harris.measure = self.corners;
-        options.mops.corners.measure = self.corners;
         let result = match &self.load_features {
             Some(folder) => {
                 let features = [load_features(folder, &self.first)?, load_features(folder, &self.second)?];
@@ -111,9 +123,9 @@ impl Run for Args {
             return Err(Failure::new(format!(
                 "no feature of {} ({} features) matches one of {} ({})",
                 self.first.display(),
-                result.features[0].described.keypoints.len(),
+                result.features[0].keypoints.len(),
                 self.second.display(),
-                result.features[1].described.keypoints.len()
+                result.features[1].keypoints.len()
             ))
             .advice("a larger --ratio, --features sift, or photographs that show more of the same"));
         }
@@ -128,15 +140,15 @@ impl Run for Args {
             cv_io::write_matches(path, &result.pairs(), Some(&scores))?;
         }
         context.report(|| self.html([&a, &b], &result, options.seed, context))?;
-        let counts = result.features.each_ref().map(|f| f.described.keypoints.len());
-        let dropped = result.features.each_ref().map(|f| f.described.dropped.len());
+        let counts = result.features.each_ref().map(|f| f.keypoints.len());
+        let dropped = result.features.each_ref().map(|f| f.dropped.len());
         Ok(Outcome::new(result.stages)
             .with("matches", result.matches.len())
             .with("features", counts)
-            .with("found", result.features.each_ref().map(|f| f.found))
+            .with("found", result.features.each_ref().map(|f| f.found()))
             .with("dropped", dropped)
             .with("method", if self.load_features.is_some() { "loaded" } else { self.features.name() })
-            .with("beyond_limit", result.features.each_ref().map(|f| f.described.beyond_limit))
+            .with("beyond_limit", result.features.each_ref().map(|f| f.beyond_limit))
             .summary(format!(
                 "{} matches between {} and {} features ({} and {} points left out near the border or on flat patches)",
                 result.matches.len(),
@@ -175,7 +187,7 @@ impl Args {
             .headline("that agree", &inliers.iter().filter(|i| **i).count().to_string());
         report.section("Features");
         for (name, image, features) in [("first", a, &result.features[0]), ("second", b, &result.features[1])] {
-            let kept = &features.described.keypoints;
+            let kept = &features.keypoints;
             let mut figures = Vec::new();
             if !features.candidates.is_empty() {
                 let some = thinned(&features.candidates);
@@ -194,14 +206,14 @@ impl Args {
             figures.push(picture(spaced, &caption)?);
             report.figures(figures);
         }
-        if result.features.iter().all(|f| f.described.descriptors.dimension() == 64) {
-            let tiles = |f: &PhotoFeatures| {
-                let n = f.described.descriptors.as_slice().len().min(120 * 64);
-                tile_patches(&f.described.descriptors.as_slice()[..n], 8, 24, 4)
+        if let Some(side) = result.features[0].descriptors.kind().patch {
+            let tiles = |f: &Features| {
+                let n = f.descriptors.as_slice().len().min(120 * side * side);
+                tile_patches(&f.descriptors.as_slice()[..n], side, 24, 4)
             };
             report.section("Descriptors");
             report.figures(vec![
-                picture(tiles(&result.features[0]), "8×8 patches of the first photograph (the first 120)")?,
+                picture(tiles(&result.features[0]), "patches of the first photograph (the first 120)")?,
                 picture(tiles(&result.features[1]), "and of the second")?,
             ]);
         }
@@ -226,14 +238,6 @@ impl Args {
     }
 }
 
-/// Kinds of descriptors and their names in files.
-const KINDS: [(DescriptorKind, &str); 4] = [
-    (DescriptorKind::RootSift, "rootsift"),
-    (DescriptorKind::Sift, "sift"),
-    (DescriptorKind::Mops, "mops"),
-    (DescriptorKind::Patch, "patch"),
-];
-
 /// `FOLDER/STEM.ending` for a photograph.
 fn beside(folder: &Path, photo: &Path, ending: &str) -> PathBuf {
     let mut name = photo.file_stem().unwrap_or_default().to_owned();
@@ -242,13 +246,13 @@ fn beside(folder: &Path, photo: &Path, ending: &str) -> PathBuf {
     folder.join(name)
 }
 
-fn save_features(folder: &Path, photo: &Path, features: &PhotoFeatures) -> Result<(), Failure> {
-    let (keypoints, descriptors) = (&features.described.keypoints, &features.described.descriptors);
-    let name = KINDS.iter().find(|k| k.0 == descriptors.kind()).map_or("descriptors", |k| k.1);
+fn save_features(folder: &Path, photo: &Path, features: &Features) -> Result<(), Failure> {
+    let (keypoints, descriptors) = (&features.keypoints, &features.descriptors);
+    let name = if DescriptorKind::OWN.contains(&descriptors.kind()) { descriptors.kind().name } else { "descriptors" };
     cv_io::npy::write(beside(folder, photo, "keypoints.npy"), &cv_io::keypoints_to_npy(keypoints))?;
     let array = cv_io::descriptors_to_npy(descriptors.dimension(), descriptors.as_slice());
     cv_io::npy::write(beside(folder, photo, &format!("{name}.npy")), &array)?;
-    if matches!(descriptors.kind(), DescriptorKind::Sift | DescriptorKind::RootSift) {
+    if [DescriptorKind::SIFT, DescriptorKind::ROOT_SIFT].contains(&descriptors.kind()) {
         let rows = FeatureRows {
             keypoints: keypoints.clone(),
             dimension: descriptors.dimension(),
@@ -259,12 +263,13 @@ fn save_features(folder: &Path, photo: &Path, features: &PhotoFeatures) -> Resul
     Ok(())
 }
 
-fn load_features(folder: &Path, photo: &Path) -> Result<PhotoFeatures, Failure> {
+fn load_features(folder: &Path, photo: &Path) -> Result<Features, Failure> {
     let points = beside(folder, photo, "keypoints.npy");
     let (rows, kind, path) = if points.exists() {
         let keypoints = cv_io::keypoints_from_npy(&cv_io::npy::read(&points)?).during(points.display().to_string())?;
-        let named = KINDS.iter().map(|(kind, name)| (Some(*kind), beside(folder, photo, &format!("{name}.npy"))));
+        let named = DescriptorKind::OWN.map(|kind| (Some(kind), beside(folder, photo, &format!("{}.npy", kind.name))));
         let (kind, path) = named
+            .into_iter()
             .chain([(None, beside(folder, photo, "descriptors.npy"))])
             .find(|(_, path)| path.exists())
             .ok_or_else(|| Failure::new(format!("there are no descriptors beside {}", points.display())))?;
@@ -275,10 +280,10 @@ fn load_features(folder: &Path, photo: &Path) -> Result<PhotoFeatures, Failure> 
         let path = beside(folder, photo, "txt");
         (cv_io::read_colmap_features(&path)?, None, path)
     };
-    let kind = kind.unwrap_or(DescriptorKind::Foreign { dimension: rows.dimension });
+    let kind = kind.unwrap_or(DescriptorKind::foreign(rows.dimension));
     let counts = (rows.keypoints.len(), rows.descriptors.len().checked_div(rows.dimension).unwrap_or(0));
     let finite = rows.descriptors.iter().all(|v| v.is_finite());
-    let fits = kind.dimension() == rows.dimension && counts.0 == counts.1 && finite;
+    let fits = kind.dimension == rows.dimension && counts.0 == counts.1 && finite;
     let descriptors = Descriptors::from_vec(kind, rows.descriptors).filter(|_| fits).ok_or_else(|| {
         let reason = format!(
             "{}: {} keypoints and {} descriptors of {} numbers do not make {kind} features (or a number is not finite)",
@@ -289,8 +294,7 @@ fn load_features(folder: &Path, photo: &Path) -> Result<PhotoFeatures, Failure> 
         );
         Failure::new(reason)
     })?;
-    let described = Features { keypoints: rows.keypoints, descriptors, dropped: Vec::new(), beyond_limit: 0 };
-    Ok(PhotoFeatures { found: counts.0, described, candidates: Vec::new() })
+    Ok(Features { keypoints: rows.keypoints, descriptors, ..Features::new(kind) })
 }
 
 /// At most 1000 points, evenly taken: more would hide the picture.
@@ -306,7 +310,7 @@ fn shown(some: usize, all: usize) -> String {
 /// Counts of both photographs, how sure the matches are, and the times.
 fn statistics(report: &mut Report, result: &MatchingResult) {
     report.section("Statistics");
-    let row = |name: &str, count: &dyn Fn(&PhotoFeatures) -> usize| {
+    let row = |name: &str, count: &dyn Fn(&Features) -> usize| {
         let [first, second] = result.features.each_ref().map(|f| count(f).to_string());
         vec![name.to_owned(), first, second]
     };
@@ -314,10 +318,10 @@ fn statistics(report: &mut Report, result: &MatchingResult) {
         "Features",
         &["", "first", "second"],
         &[
-            row("points found", &|f| f.found),
-            row("left out at the border or on flat patches", &|f| f.described.dropped.len()),
-            row("beyond the number asked for", &|f| f.described.beyond_limit),
-            row("described", &|f| f.described.keypoints.len()),
+            row("points found", &|f| f.found()),
+            row("left out at the border or on flat patches", &|f| f.dropped.len()),
+            row("beyond the number asked for", &|f| f.beyond_limit),
+            row("described", &|f| f.keypoints.len()),
         ],
     );
     let ratios: Vec<f64> = result.matches.iter().map(|m| f64::from(m.ratio)).collect();

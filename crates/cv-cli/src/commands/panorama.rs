@@ -6,7 +6,7 @@ use crate::frame::{Context, Failure, Outcome, Run, expand_images, named, picture
 use crate::words;
 use cv_core::Image;
 use cv_pipeline::panorama_types::{BlendMode, Exposure, Projection, Seams};
-use cv_pipeline::{FeatureMethod, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama};
+use cv_pipeline::{FeatureMethod, FeatureOptions, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama};
 use rayon::prelude::*;
 use serde_json::json;
 use std::collections::btree_map::{BTreeMap, Entry};
@@ -49,7 +49,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0)]
     scale: f64,
     /// Features to match: sift for any photographs, harris for speed where they are all upright and of one size.
-    #[arg(long, value_name = "KIND", value_parser = named::<FeatureMethod>(), default_value_t = PanoramaOptions::default().matching.method)]
+    #[arg(long, value_name = "KIND", value_parser = named::<FeatureMethod>(), default_value_t)]
     features: FeatureMethod,
     /// The calibrated camera that took all of them (ours, OpenCV's, ROS's or Kalibr's YAML, COLMAP's cameras.txt): its focal length is believed and its distortion
     /// taken out. Without, the focal length is estimated, from EXIF on.
@@ -66,7 +66,7 @@ impl Args {
         options.render.exposure = self.exposure;
         options.render.crop = self.crop;
         options.render.resolution = self.scale;
-        options.matching.method = self.features;
+        options.matching.features = FeatureOptions::from(self.features).at_most(2000);
         if let Some(seed) = context.seed {
             options.verify.seed = seed;
         }

@@ -102,7 +102,9 @@ impl Run for Args {
         options.two_view.robust.threshold = self.threshold;
         options.two_view.max_reprojection = self.max_error;
         options.two_view.min_angle = self.min_angle.to_radians();
-        options.matching.max_features = self.features;
+        if let Some(n) = self.features {
+            options.matching.features = options.matching.features.at_most(n);
+        }
         if let Some(seed) = context.seed {
             options.two_view.robust.seed = seed;
         }
@@ -308,7 +310,7 @@ impl Args {
         }
 
         report.section("Features and matches");
-        let [fa, fb] = result.matching.features.each_ref().map(|f| &f.described.keypoints);
+        let [fa, fb] = result.matching.features.each_ref().map(|f| &f.keypoints);
         let shown = |k: &[cv_core::Keypoint]| k.iter().step_by((k.len() / 2000).max(1)).copied().collect::<Vec<_>>();
         let green = [0, 158, 115];
         report.figures(vec![

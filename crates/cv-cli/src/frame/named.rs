@@ -16,11 +16,11 @@ pub(crate) fn named<T: Named>() -> impl TypedValueParser<Value = T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cv_pipeline::features::CornerMeasure;
+    use cv_pipeline::features::{CornerMeasure, Suppression};
     use cv_pipeline::panorama_types::{BlendMode, Exposure, Projection, Seams};
     use cv_pipeline::segmentation::{ColorSpace, Regions, Rule};
     use cv_pipeline::stereo::{Census, IntensityCost, Paths, Smoothing};
-    use cv_pipeline::{AffineSimulation, Axes, FeatureMethod, ModelKind, Suppression};
+    use cv_pipeline::{AffineSimulation, Axes, FeatureMethod, ModelKind};
 
     /// What the command line makes of every name, and of every other spelling.
     fn goes_there_and_back<T: Named>() {

@@ -144,6 +144,7 @@ pub fn ransac<E: Estimator>(
     match options.scoring {
         Scoring::Msac => with_scorer(estimator, options, &Msac, progress),
         Scoring::TukeyBiweight => with_scorer(estimator, options, &TukeyBiweight, progress),
+        Scoring::Other(scorer) => with_scorer(estimator, options, &scorer, progress),
     }
 }
 

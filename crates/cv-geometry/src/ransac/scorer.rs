@@ -1,8 +1,8 @@
 //! The loss that models are judged by.
 
 /// A loss of `u = (residual / threshold)²`, from 0 at `u = 0` to 1 for outliers (and for NaN).
-pub trait Scorer: Sync {
-    /// The loss. Must be `#[inline(always)]`: it runs inside vector code.
+pub trait Scorer: std::fmt::Debug + Sync {
+    /// The loss. Those of this crate are `#[inline(always)]`: they run inside vector code.
     fn loss(&self, u: f32) -> f32;
 
     /// The derivative of the loss by `u`, scaled to 1 at `u = 0`: the weight of a residual in iteratively reweighted least squares.
@@ -12,7 +12,23 @@ pub trait Scorer: Sync {
     fn cutoff(&self) -> f64;
 }
 
+/// A loss of another crate ([`Scoring::Other`](super::Scoring::Other)).
+impl Scorer for &dyn Scorer {
+    fn loss(&self, u: f32) -> f32 {
+        (**self).loss(u)
+    }
+
+    fn weight(&self, u: f64) -> f64 {
+        (**self).weight(u)
+    }
+
+    fn cutoff(&self) -> f64 {
+        (**self).cutoff()
+    }
+}
+
 /// Plain least squares: for matches that are all taken to be right.
+#[derive(Debug)]
 pub(crate) struct LeastSquaresLoss;
 
 impl Scorer for LeastSquaresLoss {

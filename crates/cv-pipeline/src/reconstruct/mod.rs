@@ -11,7 +11,6 @@ use crate::guided::{GuidedOptions, match_along_lines};
 use crate::matching::match_reduced;
 use crate::{MatchingOptions, MatchingResult, Progress};
 use cv_core::{Correspondence, ImageView, Point2, PointCloud, StageClock};
-use cv_features::SiftOptions;
 use cv_geometry::{
     Intrinsics, MatchedViews, TwoViewAdjustment, TwoViewOptions, TwoViewPoint, TwoViewReconstruction,
     estimate_two_view_geometry,
@@ -22,7 +21,7 @@ use cv_geometry::{
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct ReconstructOptions {
-    /// Features and matches. Default as of [`MatchingOptions`], but the coarsest SIFT features are kept, not the strongest.
+    /// Features and matches.
     pub matching: MatchingOptions,
     /// Photographs whose longer side is above this are reduced to it before features are looked for, in pixels; positions are given in
     /// pixels of the photograph all the same. 8 or more; default 2400 (COLMAP's high quality); finer
@@ -44,15 +43,7 @@ impl ReconstructOptions {
 
 impl Default for ReconstructOptions {
     fn default() -> Self {
-        Self {
-            matching: MatchingOptions {
-                sift: SiftOptions { coarse_first: true, ..SiftOptions::default() },
-                ..MatchingOptions::default()
-            },
-            max_size: 2400,
-            guided: true,
-            two_view: TwoViewOptions::default(),
-        }
+        Self { matching: MatchingOptions::default(), max_size: 2400, guided: true, two_view: TwoViewOptions::default() }
     }
 }
 
@@ -112,7 +103,7 @@ pub fn reconstruct(
         clock.add(stage, seconds);
     }
     let [fa, fb] = &matching.features;
-    let keypoints = [&fa.described.keypoints[..], &fb.described.keypoints];
+    let keypoints = [&fa.keypoints[..], &fb.keypoints];
     let views = MatchedViews { sizes, keypoints, matches: &matching.matches };
     let geometry = clock.time("pose", || estimate_two_view_geometry(&views, &options.two_view, progress))?;
     let mut adjustment =

@@ -7,9 +7,9 @@ use cv_core::{Camera, Correspondence, Mask, Pose, Progress, RgbU8, Rotation3, St
 use cv_pipeline::segmentation::TrainOptions;
 use cv_pipeline::stereo::{Smoothing, StereoOptions};
 use cv_pipeline::{
-    AffineSimulation, DenseOptions, DepthError, DepthOptions, EstimateError, FeatureMethod, Intrinsics, MatchingError,
-    MatchingOptions, ModelKind, ReconstructError, ReconstructOptions, TwoViewOptions, depth, estimate, match_photos,
-    reconstruct, reconstruct_dense, rectify, segment, train_segment,
+    AffineSimulation, DenseOptions, DepthError, DepthOptions, EstimateError, FeatureMethod, FeatureOptions, Intrinsics,
+    MatchingError, MatchingOptions, ModelKind, ReconstructError, ReconstructOptions, TwoViewOptions, depth, estimate,
+    match_photos, reconstruct, reconstruct_dense, rectify, segment, train_segment,
 };
 use cv_synth::{RenderOptions, two_view};
 
@@ -65,10 +65,10 @@ pub(crate) fn jobs(pixels: usize) -> Vec<Job> {
         // Thirty-odd slanted views of each photograph: of small ones.
         let part = if views == AffineSimulation::Always { 3 } else { 1 };
         let [a, b] = walls(width / part, height / part, 40);
-        let max_features = (views == AffineSimulation::Always).then_some(500);
+        let features = FeatureOptions::from(method);
+        let features = if affine_simulation == AffineSimulation::Always { features.at_most(500) } else { features };
         let guided = (method == FeatureMethod::Harris).then_some(ModelKind::Homography);
-        let options =
-            MatchingOptions { method, affine_simulation: views, guided, max_features, ..MatchingOptions::default() };
+        let options = MatchingOptions { features, affine_simulation, guided, ..MatchingOptions::default() };
         jobs.push((
             name,
             Box::new(move |progress| {

@@ -31,7 +31,7 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
 
     let mut inliers = vec![false; pairs.len()];
     model.inliers.iter().for_each(|&i| inliers[i] = true);
-    let keypoints = &found.features[0].described.keypoints;
+    let keypoints = &found.features[0].keypoints;
     let strongest = &keypoints[..keypoints.len().min(600)];
     let photos = vec![
         demo.photo("homography-a.png", a, "First photograph.")?,

@@ -67,8 +67,10 @@ pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResul
             .iter()
             .map(|m| Correspondence { a: at(m.a, photo_a, &a), b: at(m.b, photo_b, &b) })
             .collect();
-        let picture = draw_matches(a.view(), b.view(), &matches, Some(&pair.inliers), &MatchStyle::default());
-        let good = pair.inliers.iter().filter(|&&inlier| inlier).count();
+        let mut agree = vec![false; matches.len()];
+        pair.inliers.iter().for_each(|&i| agree[i] = true);
+        let picture = draw_matches(a.view(), b.view(), &matches, Some(&agree), &MatchStyle::default());
+        let good = pair.inliers.len();
         let caption =
             format!("{} and {}: {good} of {} matches agree (green).", name(pair.a), name(pair.b), matches.len());
         page.figure(Figure::new(jpeg(&picture)?, &caption));
