@@ -21,7 +21,7 @@ impl Scorer for L1 {
 
 pub fn main() -> Result<(), Box<dyn std::error::Error>> {
     let number = |i: u32, n: u32| f64::from(i % n);
-    let place = |i| (number(37 * i, 600), number(53 * i, 400), 5.0 + number(i * i, 23));
+    let place = |i: u32| (number(37 * i, 600), number(53 * i, 400), 5.0 + number(i * i, 23));
     let matches: Vec<_> = (0..60).map(place).map(|(x, y, d)| Correspondence::new(x, y, x - d, y)).collect();
     let options = RobustOptions { scoring: Scoring::Other(&L1), ..RobustOptions::fundamental() };
     let found = estimate_fundamental(&matches, &options, &Silent)?;
