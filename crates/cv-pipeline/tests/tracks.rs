@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
-use cv_core::{Camera, Pose, Rotation3, Vector3};
+use cv_core::{Camera, Point2, Pose, Rotation3, Vector3};
 use cv_pipeline::{MatchingOptions, PanoramaOptions, PanoramaPhoto, Silent, match_photos, panorama};
 use cv_synth::{RenderOptions, Rendered, Scene, panorama_views, render};
 
@@ -44,7 +44,7 @@ fn tracks_over_three_photographs_come_from_two_results_by_index_alone() {
         };
         let [a, b, c] = [0, 1, 2].map(|view| at(view).position.cast::<f64>());
         let Some(point) = scene.point_at(&camera, &views[0].pose, a) else { return false };
-        let near = |view: usize, p| {
+        let near = |view: usize, p: Point2<f64>| {
             let truth = camera.project(&views[view].pose.transform(&point));
             truth.is_some_and(|q| (q - p).norm() < 3.0)
         };
