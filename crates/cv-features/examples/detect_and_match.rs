@@ -3,7 +3,7 @@
 use cv_core::{GrayF32, Silent};
 use cv_features::{MatchOptions, SiftOptions, match_descriptors, sift};
 
-pub fn main() -> Result<(), Box<dyn std::error::Error>> {
+pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
     // Blobs at places of their own, and the same moved by (6, 4) pixels.
     let scene = |dx: f32, dy: f32| {
         let spots =

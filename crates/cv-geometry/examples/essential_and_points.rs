@@ -3,7 +3,7 @@
 use cv_core::{Camera, Correspondence, Point3, Pose, Rotation3, Silent, Vector3};
 use cv_geometry::{RobustOptions, estimate_relative_pose, normalize_matches, triangulate};
 
-pub fn main() -> Result<(), Box<dyn std::error::Error>> {
+pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
     let camera = Camera::from_focal(640, 480, 500.0);
     let truth = Pose::new(Rotation3::new(Vector3::new(0.02, 0.1, 0.0)), Vector3::new(-0.8, 0.0, 0.6));
     let point = |i: i32| {

@@ -19,7 +19,7 @@ impl Scorer for L1 {
     }
 }
 
-pub fn main() -> Result<(), Box<dyn std::error::Error>> {
+pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
     let number = |i: u32, n: u32| f64::from(i % n);
     let place = |i: u32| (number(37 * i, 600), number(53 * i, 400), 5.0 + number(i * i, 23));
     let matches: Vec<_> = (0..60).map(place).map(|(x, y, d)| Correspondence::new(x, y, x - d, y)).collect();

@@ -3,7 +3,7 @@
 use cv_core::{Correspondence, Matrix3, Point2, Silent};
 use cv_geometry::{RobustOptions, estimate_homography};
 
-pub fn main() -> Result<(), Box<dyn std::error::Error>> {
+pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
     let truth = Matrix3::new(0.9, -0.1, 40.0, 0.12, 1.05, -15.0, 1e-4, -5e-5, 1.0);
     let matches: Vec<Correspondence> = (0..90)
         .map(|i| {
