@@ -66,9 +66,9 @@ pub(crate) fn jobs(pixels: usize) -> Vec<Job> {
         let part = if views == AffineSimulation::Always { 3 } else { 1 };
         let [a, b] = walls(width / part, height / part, 40);
         let features = FeatureOptions::from(method);
-        let features = if affine_simulation == AffineSimulation::Always { features.at_most(500) } else { features };
+        let features = if views == AffineSimulation::Always { features.at_most(500) } else { features };
         let guided = (method == FeatureMethod::Harris).then_some(ModelKind::Homography);
-        let options = MatchingOptions { features, affine_simulation, guided, ..MatchingOptions::default() };
+        let options = MatchingOptions { features, affine_simulation: views, guided, ..MatchingOptions::default() };
         jobs.push((
             name,
             Box::new(move |progress| {
