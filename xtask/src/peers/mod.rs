@@ -3,6 +3,7 @@
 //! One file per job; its scripts and the pinned versions live in `peers/` at the root, whose `.venv` is made on the first
 //! run. Register a job with one line in `JOBS`; it returns its figures with their bars.
 
+mod adjust;
 mod feature_quality;
 mod features;
 mod geometry;
@@ -19,7 +20,7 @@ use std::{
 type Job = fn(&Path, &Path) -> Result<Vec<Check>>;
 
 const JOBS: &[checks::Named<Job>] =
-    &[("stereo", stereo::run), ("features", features::run), ("geometry", geometry::run)];
+    &[("stereo", stereo::run), ("features", features::run), ("geometry", geometry::run), ("adjust", adjust::run)];
 
 /// Runs all jobs, or the one named; true where ours meets every bar.
 pub(crate) fn run(only: Option<&str>) -> Result<bool> {

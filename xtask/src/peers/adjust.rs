@@ -1,0 +1,265 @@
+//! Ceres, through COLMAP's bundle adjustment, and ours on a generated problem: 100 photographs, each with a focal length and a radial
+//! coefficient of its own, 20,000 points, 100,000 observations. Writes the section “Adjustment” of `docs/benchmarks.md`.
+
+use crate::checks::Check;
+use anyhow::{Context, Result, ensure};
+use cv_numeric::RobustLoss;
+use cv_numeric::adjust::{AdjustOptions, AdjustReport, Adjustment, Euclidean, Manifold, Residual, RigidMotion};
+use nalgebra::{Matrix2, Matrix2x3, Rotation3, SMatrix, UnitQuaternion, Vector2, Vector3};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng, SeedableRng};
+use serde::Deserialize;
+use std::{fmt::Write as _, ops::ControlFlow, path::Path, process::Command, time::Instant};
+
+const PHOTOGRAPHS: usize = 100;
+const POINTS: usize = 20_000;
+const SIGHTS: usize = 5;
+/// Cameras near enough to see a point, of which it is found in [`SIGHTS`].
+const NEAR: usize = 20;
+const SIZE: [f64; 2] = [1600.0, 1200.0];
+const THREADS: usize = 2;
+/// Both stop at a step that lowers the cost by less than this share.
+const TOLERANCE: f64 = 1e-8;
+/// Costs are equal up to this share.
+const EQUAL: f64 = 1e-6;
+/// Pixels at which Cauchy's loss bends.
+const SCALE: f64 = 1.0;
+/// Repeats of which the fastest counts.
+const REPEATS: usize = 3;
+const BAR: f64 = 0.5;
+
+/// One run of the peer.
+#[derive(Debug, Clone, Deserialize)]
+struct Peer {
+    loss: String,
+    solver: String,
+    initial_cost: f64,
+    cost: f64,
+    iterations: usize,
+    seconds: f64,
+}
+
+pub(crate) fn run(python: &Path, _data: &Path) -> Result<Vec<Check>> {
+    let scene = Scene::new(1);
+    let folder = tempfile::tempdir()?;
+    scene.write(folder.path())?;
+    println!("peers");
+    let script = crate::root().join("peers/adjust_ceres.py");
+    let numbers = [THREADS.to_string(), TOLERANCE.to_string(), SCALE.to_string()];
+    let output =
+        Command::new(python).arg(&script).arg(folder.path()).args(&numbers).output().context("cannot start Python")?;
+    ensure!(output.status.success(), "{}: {}", script.display(), String::from_utf8_lossy(&output.stderr));
+    let output = String::from_utf8(output.stdout)?;
+    let versions = output.lines().find_map(|l| l.strip_prefix("{\"versions\": \"")).unwrap_or_default();
+    let peers: Vec<Peer> = output
+        .lines()
+        .filter(|line| line.starts_with("{\"loss\""))
+        .map(|line| serde_json::from_str(line).with_context(|| line.to_owned()))
+        .collect::<Result<_>>()?;
+    println!("ours");
+    let mut text = format!(
+        "Written by `cargo xtask peers adjust`; one run, {THREADS} threads each, {}, {}. {PHOTOGRAPHS} photographs with a focal length and a radial coefficient each, {POINTS} points, {} \
+         observations with half a pixel of noise; the same start, losses and tolerance ({TOLERANCE:e} of the cost). Times: Ceres's own or of the call, whichever is less, without the construction of \
+         the problem; ours with it.\n\n| loss | solver | cost | iterations | seconds |\n|---|---|---|---|---|\n",
+        super::machine(),
+        versions.trim_end_matches("\"}"),
+        scene.seen.len(),
+    );
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(THREADS).build()?;
+    let (mut checks, mut times) = (Vec::new(), String::new());
+    for (name, loss) in [("TRIVIAL", RobustLoss::Trivial), ("CAUCHY", RobustLoss::Cauchy { scale: SCALE })] {
+        let (mut seconds, mut report) = (f64::INFINITY, None);
+        for _ in 0..REPEATS {
+            let start = Instant::now();
+            report = Some(pool.install(|| scene.adjust(loss))?);
+            seconds = seconds.min(start.elapsed().as_secs_f64());
+        }
+        let Some(report) = report else { continue };
+        let _ = writeln!(text, "| {name} | ours | {:.6} | {} | {seconds:.3} |", report.cost, report.steps);
+        let mut best = f64::INFINITY;
+        for peer in peers.iter().filter(|p| p.loss == name) {
+            ensure!(
+                (peer.initial_cost / report.initial_cost - 1.0).abs() < EQUAL,
+                "the starts differ: {peer:?} {report:?}"
+            );
+            let _ = writeln!(
+                text,
+                "| {name} | Ceres, {} | {:.6} | {} | {:.3} |",
+                peer.solver, peer.cost, peer.iterations, peer.seconds
+            );
+            // Whoever stops above the other's cost has not done the same work.
+            let cost = format!("{name}: cost / that of Ceres, {}, less one", peer.solver);
+            checks.push(Check::at_most(cost, report.cost / peer.cost - 1.0, EQUAL));
+            if peer.cost <= report.cost * (1.0 + EQUAL) {
+                best = best.min(peer.seconds);
+            }
+        }
+        // Without one that came down to our cost there is nothing to compare with, and the bar is missed.
+        let ratio = if best.is_finite() { seconds / best } else { f64::NAN };
+        checks.push(Check::at_most(format!("{name}: time / fastest of Ceres at equal cost"), ratio, BAR));
+        let _ = writeln!(times, "| {name}: ours / fastest of Ceres at equal cost | {ratio:.3} | {BAR} |");
+    }
+    let _ = writeln!(text, "\n| ratio of times | measured | at most |\n|---|---|---|\n{times}");
+    print!("{text}");
+    super::write_section("Adjustment", &text)?;
+    Ok(checks)
+}
+
+/// Photographs around a cloud of points, and what is taken for their poses, lenses and points at the start.
+struct Scene {
+    /// Numbers of [`RigidMotion`].
+    poses: Vec<f64>,
+    /// Focal length and radial coefficient.
+    lenses: Vec<f64>,
+    points: Vec<f64>,
+    /// Photograph and point of each observation, and where it is seen.
+    seen: Vec<(u32, u32, Vector2<f64>)>,
+}
+
+impl Scene {
+    fn new(seed: u64) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut u = || 2.0 * f64::from(rng.next_u32()) / 4294967296.0 - 1.0;
+        let mut scene = Self { poses: Vec::new(), lenses: Vec::new(), points: Vec::new(), seen: Vec::new() };
+        for i in 0..PHOTOGRAPHS {
+            let angle = std::f64::consts::TAU * i as f64 / PHOTOGRAPHS as f64;
+            let turn = Rotation3::new(Vector3::new(0.05 * u(), 0.05 * u(), 0.05 * u()))
+                * Rotation3::new(Vector3::new(0.0, angle, 0.0));
+            scene.poses.extend(RigidMotion::store(&turn, &Vector3::new(0.3 * u(), 0.3 * u(), 10.0 + 0.3 * u())));
+            scene.lenses.extend([1400.0 + 30.0 * u(), -0.05 + 0.02 * u()]);
+        }
+        // On a wall around the middle, seen from outside by the cameras next to it.
+        for p in 0..POINTS {
+            let angle = std::f64::consts::PI * u();
+            let radius = 2.5 + 0.3 * u();
+            let point = [-radius * angle.sin(), 2.0 * u(), -radius * angle.cos()];
+            scene.points.extend(point);
+            let middle = (-angle / std::f64::consts::TAU * PHOTOGRAPHS as f64).round() as i64;
+            let mut near: Vec<i64> = (0..NEAR as i64).map(|k| middle + k - NEAR as i64 / 2).collect();
+            for k in 0..SIGHTS {
+                let other = k + ((u() + 1.0) / 2.0 * (NEAR - k) as f64) as usize;
+                near.swap(k, other.min(NEAR - 1));
+                let photograph = near[k].rem_euclid(PHOTOGRAPHS as i64) as u32;
+                scene.seen.push((photograph, p as u32, Vector2::zeros()));
+            }
+        }
+        let ideal: Vec<Vector2<f64>> = scene.seen.iter().filter_map(|s| scene.view(s, None)).collect();
+        let mut g = || {
+            let v = (u() + 1.0) / 2.0;
+            (-2.0 * v.max(1e-12).ln()).sqrt() * (std::f64::consts::PI * u()).cos()
+        };
+        for (s, pixel) in scene.seen.iter_mut().zip(ideal) {
+            s.2 = pixel + Vector2::new(0.5 * g(), 0.5 * g());
+        }
+        for pose in scene.poses.chunks_exact_mut(12).skip(1) {
+            let delta: [f64; 6] = std::array::from_fn(|k| if k < 3 { 0.005 * g() } else { 0.03 * g() });
+            let before = pose.to_vec();
+            RigidMotion.step(&before, &delta, pose);
+        }
+        scene.lenses.chunks_exact_mut(2).for_each(|l| (l[0], l[1]) = (l[0] * (1.0 + 0.01 * g()), 0.0));
+        scene.points.iter_mut().for_each(|x| *x += 0.03 * g());
+        scene
+    }
+
+    fn view(
+        &self,
+        &(c, p, pixel): &(u32, u32, Vector2<f64>),
+        j: Option<&mut SMatrix<f64, 2, 11>>,
+    ) -> Option<Vector2<f64>> {
+        let (c, p) = (c as usize, p as usize);
+        project([&self.poses[12 * c..][..12], &self.lenses[2 * c..][..2], &self.points[3 * p..][..3]], pixel, j)
+    }
+
+    /// A model in COLMAP's text files.
+    fn write(&self, folder: &Path) -> Result<()> {
+        let (mut cameras, mut images, mut points) = (String::new(), String::new(), String::new());
+        let mut tracks: Vec<String> = vec![String::new(); POINTS];
+        for c in 0..PHOTOGRAPHS {
+            let id = c + 1;
+            let [f, k] = [self.lenses[2 * c], self.lenses[2 * c + 1]];
+            writeln!(
+                cameras,
+                "{id} SIMPLE_RADIAL {} {} {f:?} {} {} {k:?}",
+                SIZE[0],
+                SIZE[1],
+                SIZE[0] / 2.0,
+                SIZE[1] / 2.0
+            )?;
+            let (rotation, t) = RigidMotion::load(&self.poses[12 * c..][..12]);
+            let q = UnitQuaternion::from_rotation_matrix(&rotation);
+            writeln!(
+                images,
+                "{id} {:?} {:?} {:?} {:?} {:?} {:?} {:?} {id} {id}.png",
+                q.w, q.i, q.j, q.k, t.x, t.y, t.z
+            )?;
+            for (i, (_, p, pixel)) in self.seen.iter().filter(|s| s.0 as usize == c).enumerate() {
+                write!(images, "{:?} {:?} {} ", pixel.x + SIZE[0] / 2.0, pixel.y + SIZE[1] / 2.0, p + 1)?;
+                write!(tracks[*p as usize], " {id} {i}")?;
+            }
+            images.push('\n');
+        }
+        for (p, (x, track)) in self.points.chunks_exact(3).zip(&tracks).enumerate() {
+            writeln!(points, "{} {:?} {:?} {:?} 0 0 0 0{track}", p + 1, x[0], x[1], x[2])?;
+        }
+        for (name, text) in [("cameras", cameras), ("images", images), ("points3D", points)] {
+            std::fs::write(folder.join(format!("{name}.txt")), text)?;
+        }
+        Ok(())
+    }
+
+    fn adjust(&self, loss: RobustLoss) -> Result<AdjustReport> {
+        let mut problem = Adjustment::default();
+        let poses = problem.add_group("poses", RigidMotion, self.poses.clone())?;
+        let lenses = problem.add_group("lenses", Euclidean(2), self.lenses.clone())?;
+        let points = problem.add_group("points", Euclidean(3), self.points.clone())?;
+        let pixels = Reprojection(self.seen.iter().map(|s| s.2).collect());
+        let blocks = self.seen.iter().map(|&(c, p, _)| [c, c, p]).collect();
+        problem.add_residuals("observations", pixels, [poses, lenses, points], blocks, loss)?;
+        problem.eliminate(points)?;
+        problem.hold(poses, 0)?;
+        problem.hold_parameters(poses, PHOTOGRAPHS / 4, &[3])?;
+        let options = AdjustOptions { cost_tolerance: TOLERANCE, gradient_tolerance: 0.0, ..AdjustOptions::default() };
+        Ok(problem.solve(&options, |_| ControlFlow::Continue(()))?)
+    }
+}
+
+/// Pixels from the principal point.
+struct Reprojection(Vec<Vector2<f64>>);
+
+impl Residual<2, 3, 11> for Reprojection {
+    const DIMS: [usize; 3] = [6, 2, 3];
+
+    #[inline]
+    fn evaluate(&self, item: usize, blocks: [&[f64]; 3], j: Option<&mut SMatrix<f64, 2, 11>>) -> Option<Vector2<f64>> {
+        project(blocks, self.0[item], j)
+    }
+}
+
+/// What a point is seen at, less `pixel`.
+#[inline]
+fn project(
+    [pose, lens, point]: [&[f64]; 3],
+    pixel: Vector2<f64>,
+    j: Option<&mut SMatrix<f64, 2, 11>>,
+) -> Option<Vector2<f64>> {
+    let (rotation, translation) = RigidMotion::load(pose);
+    let turned = rotation * Vector3::from_column_slice(point);
+    let p = turned + translation;
+    if p.z <= 0.0 {
+        return None;
+    }
+    let [f, k] = [lens[0], lens[1]];
+    let n = Vector2::new(p.x, p.y) / p.z;
+    let r2 = n.norm_squared();
+    let radial = 1.0 + k * r2;
+    if let Some(j) = j {
+        let by_n = (Matrix2::identity() * radial + n * n.transpose() * (2.0 * k)) * f;
+        let by_p = by_n * Matrix2x3::new(1.0, 0.0, -n.x, 0.0, 1.0, -n.y) / p.z;
+        j.fixed_columns_mut::<3>(0).copy_from(&(-by_p * turned.cross_matrix()));
+        j.fixed_columns_mut::<3>(3).copy_from(&by_p);
+        j.set_column(6, &(n * radial));
+        j.set_column(7, &(n * (f * r2)));
+        j.fixed_columns_mut::<3>(8).copy_from(&(by_p * rotation.matrix()));
+    }
+    Some(n * (f * radial) - pixel)
+}
