@@ -12,8 +12,8 @@ const NAME: &str = "TIFF";
 pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
     let mut decoder = open(bytes)?;
     let (width, height) = decoder.dimensions().map_err(fail)?;
-    let orientation = decoder.find_tag_unsigned::<u16>(Tag::Orientation).map_err(fail)?;
-    let orientation = orientation.and_then(|tag| u8::try_from(tag).ok());
+    // A damaged tag does not cost the picture.
+    let orientation = decoder.find_tag_unsigned::<u8>(Tag::Orientation).ok().flatten();
     Ok(Header { width: width as usize, height: height as usize, exif: None, orientation })
 }
 

@@ -20,8 +20,7 @@ fn bmp(image: &RgbU8) -> Vec<u8> {
     let mut bytes = bmp_header(w, h, 24, 0, 54);
     for y in (0..h).rev() {
         (0..w).for_each(|x| bytes.extend(image.at(x, y).iter().rev()));
-        bytes.resize(bytes.len().next_multiple_of(4) + 54 % 4, 0);
-        bytes.truncate(54 + (h - y) * (3 * w).next_multiple_of(4));
+        bytes.resize(54 + (h - y) * (3 * w).next_multiple_of(4), 0);
     }
     bytes
 }
