@@ -1,14 +1,11 @@
-//! Time of the matcher by paths, window and size: `cargo bench -p cv-stereo`.
+//! Time of the matcher by paths, window and size: `cargo bench --manifest-path benches/Cargo.toml --bench stereo`.
 
 #![allow(clippy::unwrap_used, reason = "a benchmark that cannot go on has failed")]
 
+use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use cv_core::{GrayU8, Silent};
 use cv_stereo::{Census, DisparityMap, Paths, Smoothing, StereoMatcher, StereoOptions};
 use std::hint::black_box;
-use timing::time;
-
-#[path = "../../../benches/timing.rs"]
-mod timing;
 
 /// A wall of noise 20 px nearer to the left in the right picture; most of it must come out right.
 fn pair(width: usize, height: usize) -> [GrayU8; 2] {
@@ -16,10 +13,8 @@ fn pair(width: usize, height: usize) -> [GrayU8; 2] {
     [0, 20].map(|shift| GrayU8::from_fn(width, height, |x, y| [noise((x + shift) / 3, y / 3) as u8]))
 }
 
-fn main() {
-    if !timing::asked() {
-        return;
-    }
+fn bench(c: &mut Criterion) {
+    let mut group = c.benchmark_group("match");
     let default = StereoOptions::default;
     let cases = [
         ("8 paths", default()),
@@ -29,17 +24,26 @@ fn main() {
     ];
     for (width, height) in [(366, 274), (742, 500), (1634, 1224)] {
         let [left, right] = pair(width, height);
+        group.throughput(Throughput::Elements((width * height * default().disparities) as u64));
         for (name, options) in &cases {
             let mut matcher = StereoMatcher::new(options.clone()).unwrap();
             let mut map = DisparityMap::empty();
             matcher.compute_into(left.view(), right.view(), &mut map, &Silent).unwrap();
             let right_ones = map.disparity.as_slice().iter().filter(|d| (**d - 20.0).abs() < 0.5).count();
             assert!(right_ones * 10 > 9 * width * height, "{name}: {right_ones} of {}", width * height);
-            let seconds = time(&format!("{name}, {width}x{height}"), || {
-                matcher.compute_into(black_box(left.view()), black_box(right.view()), &mut map, &Silent).unwrap();
+            group.bench_function(BenchmarkId::new(*name, format!("{width}x{height}")), |b| {
+                b.iter(|| {
+                    matcher.compute_into(black_box(left.view()), black_box(right.view()), &mut map, &Silent).unwrap();
+                });
             });
-            let work = (width * height * options.disparities) as f64;
-            println!("{:48} {:7.3} ns per pixel and disparity", "", 1e9 * seconds / work);
         }
     }
+    group.finish();
 }
+
+criterion_group! {
+    name = benches;
+    config = Criterion::default().sample_size(10);
+    targets = bench
+}
+criterion_main!(benches);

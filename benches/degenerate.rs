@@ -1,5 +1,7 @@
 //! Time of a refusal: matches that determine no model, from the first look to the typed answer. Bar: 50 ms each.
+//! `cargo bench --manifest-path benches/Cargo.toml --bench degenerate`.
 
+use criterion::{Criterion, criterion_group, criterion_main};
 use cv_core::{Camera, Correspondence, Silent};
 use cv_geometry::{
     EstimateError, RobustOptions, estimate_fundamental, estimate_homography, estimate_relative_pose, normalize_matches,
@@ -7,10 +9,6 @@ use cv_geometry::{
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 use std::hint::black_box;
-use timing::time;
-
-#[path = "../../../benches/timing.rs"]
-mod timing;
 
 const MATCHES: usize = 300;
 
@@ -46,10 +44,9 @@ fn inputs() -> Vec<(&'static str, Vec<Correspondence>)> {
     ]
 }
 
-fn main() {
-    if !timing::asked() {
-        return;
-    }
+fn bench(c: &mut Criterion) {
+    let mut group = c.benchmark_group("degenerate");
+    group.sample_size(10);
     let camera = Camera::from_focal(900, 900, 1000.0);
     let essential = |m: &[Correspondence]| -> Result<usize, EstimateError> {
         let (m, unit) = normalize_matches(m, &camera, &camera);
@@ -59,8 +56,12 @@ fn main() {
     let homography = |m: &[Correspondence]| estimate_homography(m, &RobustOptions::homography(), &Silent);
     let fundamental = |m: &[Correspondence]| estimate_fundamental(m, &RobustOptions::fundamental(), &Silent);
     for (name, m) in inputs() {
-        time(&format!("homography, {name}"), || homography(black_box(&m)).is_ok());
-        time(&format!("fundamental, {name}"), || fundamental(black_box(&m)).is_ok());
-        time(&format!("essential, {name}"), || essential(black_box(&m)).is_ok());
+        group.bench_function(format!("homography, {name}"), |b| b.iter(|| homography(black_box(&m)).is_ok()));
+        group.bench_function(format!("fundamental, {name}"), |b| b.iter(|| fundamental(black_box(&m)).is_ok()));
+        group.bench_function(format!("essential, {name}"), |b| b.iter(|| essential(black_box(&m)).is_ok()));
     }
+    group.finish();
 }
+
+criterion_group!(benches, bench);
+criterion_main!(benches);

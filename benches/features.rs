@@ -1,14 +1,11 @@
-//! `cargo bench -p cv-features`: the stages on a generated 1333×750 image, and matching on generated descriptors.
+//! `cargo bench --manifest-path benches/Cargo.toml --bench features`: the stages on a generated 1333×750 image, and matching on generated descriptors.
 
+use criterion::{Criterion, criterion_group, criterion_main};
 use cv_core::{GrayF32, Keypoint, Silent};
 use cv_features::{
     DescriptorKind, Descriptors, HarrisOptions, MatchOptions, MopsOptions, RatioTest, SiftOptions, anms,
     anms_square_covering, harris, harris_response, match_descriptors, mops, sift,
 };
-use timing::time;
-
-#[path = "../../../benches/timing.rs"]
-mod timing;
 
 /// Squares of random gray at several sizes: corners and blobs at all scales.
 fn image() -> GrayF32 {
@@ -28,23 +25,23 @@ fn random(state: &mut u32) -> f32 {
     (*state >> 8) as f32 / (1 << 24) as f32
 }
 
-fn detection() {
+fn detection(c: &mut Criterion) {
     let image = image();
     let options = HarrisOptions::default();
-    time("harris_response 1333x750", || harris_response(image.view(), &options));
-    time("harris 1333x750", || harris(image.view(), &options, &Silent));
+    c.bench_function("harris_response 1333x750", |b| b.iter(|| harris_response(image.view(), &options)));
+    c.bench_function("harris 1333x750", |b| b.iter(|| harris(image.view(), &options, &Silent)));
     let mut state = 1;
     let corners: Vec<Keypoint> = (0..20_000)
         .map(|_| Keypoint::new(1333.0 * random(&mut state), 750.0 * random(&mut state), random(&mut state).powi(3)))
         .collect();
-    time("anms 20000 to 500", || anms(&corners, 500, 0.9));
-    time("anms_square_covering 20000 to 500", || anms_square_covering(&corners, 500));
+    c.bench_function("anms 20000 to 500", |b| b.iter(|| anms(&corners, 500, 0.9)));
+    c.bench_function("anms_square_covering 20000 to 500", |b| b.iter(|| anms_square_covering(&corners, 500)));
     let (settings, oriented) = (SiftOptions { max_features: 2000, ..SiftOptions::default() }, MopsOptions::default());
-    time("sift 2000 of 1333x750", || sift(image.view(), &settings, &Silent));
-    time("mops 2000 of 1333x750", || mops(image.view(), &oriented, &Silent));
+    c.bench_function("sift 2000 of 1333x750", |b| b.iter(|| sift(image.view(), &settings, &Silent)));
+    c.bench_function("mops 2000 of 1333x750", |b| b.iter(|| mops(image.view(), &oriented, &Silent)));
 }
 
-fn matching() {
+fn matching(c: &mut Criterion) {
     let mut state = 1;
     let options = MatchOptions { ratio: RatioTest::Off, ..MatchOptions::default() };
     for (count, kind) in [(2000, DescriptorKind::PATCH), (8192, DescriptorKind::ROOT_SIFT)] {
@@ -52,13 +49,13 @@ fn matching() {
         let empty = || Descriptors::new(kind);
         let pair = [set(), set()].map(|data| Descriptors::from_vec(kind, data).unwrap_or_else(empty));
         let name = format!("two nearest {count}x{count}x{}", kind.dimension);
-        time(&name, || match_descriptors(&pair[0], &pair[1], &options, &Silent));
+        c.bench_function(&name, |b| b.iter(|| match_descriptors(&pair[0], &pair[1], &options, &Silent)));
     }
 }
 
-fn main() {
-    if timing::asked() {
-        detection();
-        matching();
-    }
+criterion_group! {
+    name = benches;
+    config = Criterion::default().sample_size(15);
+    targets = detection, matching
 }
+criterion_main!(benches);
