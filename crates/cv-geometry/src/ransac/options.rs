@@ -5,6 +5,8 @@ use cv_core::OptionError;
 
 /// How the fit of a model to all matches is summed up.
 #[derive(Debug, Clone, Copy, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Scoring {
     /// The squared residual, cut off at the threshold (MSAC, Torr & Zisserman 2000).
     Msac,
