@@ -1,7 +1,7 @@
 //! How well parameters are known.
 
 use super::error::AdjustError;
-use super::factor::Factor;
+use super::factor::{Analysis, Factor};
 use super::normal::{Normal, Reduced, determined};
 use super::structure::{NONE, Structure};
 use super::{Adjustment, GroupId};
@@ -119,8 +119,9 @@ impl Adjustment<'_> {
         if let Some(column) = scale.iter().position(|d| d.is_nan() || *d <= 0.0) {
             return Err(name(column));
         }
+        let Some(analysis) = Analysis::new(structure) else { return Err(name(0)) };
         // A ridge far below what counts as singular makes a factor of a singular system too.
-        let factor = Factor::new(structure, &reduced.s).map(|f| (f, false)).or_else(|| {
+        let factor = analysis.factor(structure, &reduced.s).map(|f| (f, false)).or_else(|| {
             let mut ridge = reduced.s.clone();
             for (b, block) in structure.blocks.iter().enumerate().take_while(|(_, b)| b.column < free) {
                 for c in 0..block.size {
@@ -128,7 +129,7 @@ impl Adjustment<'_> {
                     ridge[at] += 0.1 * SINGULAR * scale[block.column + c];
                 }
             }
-            Factor::new(structure, &ridge).map(|f| (f, true))
+            analysis.factor(structure, &ridge).map(|f| (f, true))
         });
         let Some((factor, singular)) = factor else { return Err(name(0)) };
         // Inverse iteration for the least eigenvalue of S x = λ diag(U) x. No coordinate axis as the start: those may be eigenvectors.

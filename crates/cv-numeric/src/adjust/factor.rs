@@ -1,28 +1,93 @@
-//! Cholesky factors of the reduced system.
+//! Cholesky factors of the reduced system: dense where it is small or full, else faer's sparse one, analyzed once.
 
 use super::structure::{Pattern, Structure};
 use faer::linalg::solvers::{Llt, Solve};
+use faer::sparse::linalg::solvers::{Llt as SparseLlt, SymbolicLlt};
+use faer::sparse::{SparseColMatRef, SymbolicSparseColMat};
 use faer::{Mat, MatMut, Side};
 
-/// A factor `L Lᵀ` of the free columns.
-pub(super) struct Factor(Llt<f64>);
+/// The pattern of a reduced system, analyzed: order of elimination and fill-in.
+pub(super) enum Analysis {
+    Dense,
+    /// Lower triangle by columns, and its symbolic factor.
+    Sparse {
+        symbolic: SymbolicSparseColMat<usize>,
+        factor: SymbolicLlt<usize>,
+    },
+}
 
-impl Factor {
-    /// Of the free columns of `s`; `None` where they are not positive definite.
-    pub(super) fn new(structure: &Structure, s: &[f64]) -> Option<Self> {
+/// A factor `L Lᵀ`.
+pub(super) enum Factor {
+    Dense(Llt<f64>),
+    Sparse(SparseLlt<usize, f64>),
+}
+
+impl Analysis {
+    /// Of the free columns of the reduced system; `None` where memory is short.
+    pub(super) fn new(structure: &Structure) -> Option<Self> {
+        if structure.pattern.dense {
+            return Some(Self::Dense);
+        }
         let free = structure.free;
-        let mut full = Mat::<f64>::zeros(free, free);
-        for_columns(structure, s, |column, values| {
-            full.col_as_slice_mut(column)[column..].copy_from_slice(&values[..free - column]);
-        });
-        Llt::new(full.as_ref(), Side::Lower).ok().map(Self)
+        let mut start = Vec::with_capacity(free + 1);
+        start.push(0);
+        let mut rows = Vec::new();
+        for (b, block) in structure.blocks.iter().enumerate().take_while(|(_, b)| b.column < free) {
+            let first = rows.len();
+            for &(other, _) in &structure.pattern.rows[b] {
+                let other = &structure.blocks[other as usize];
+                if other.column < free {
+                    rows.extend(other.column..other.column + other.size);
+                }
+            }
+            let all = rows[first..].to_vec();
+            rows.truncate(first);
+            for c in 0..block.size {
+                rows.extend_from_slice(&all[c..]);
+                start.push(rows.len());
+            }
+        }
+        let symbolic = SymbolicSparseColMat::new_checked(free, free, start, None, rows);
+        let factor = SymbolicLlt::try_new(symbolic.as_ref(), Side::Lower).ok()?;
+        Some(Self::Sparse { symbolic, factor })
     }
 
+    /// The factor of the free columns of `s`; `None` where it is not positive definite.
+    pub(super) fn factor(&self, structure: &Structure, s: &[f64]) -> Option<Factor> {
+        match self {
+            Self::Dense => {
+                let free = structure.free;
+                let mut full = Mat::<f64>::zeros(free, free);
+                for_columns(structure, s, |column, values| {
+                    let height = free - column;
+                    full.col_as_slice_mut(column)[column..].copy_from_slice(&values[..height]);
+                });
+                Llt::new(full.as_ref(), Side::Lower).ok().map(Factor::Dense)
+            }
+            Self::Sparse { symbolic, factor } => {
+                let mut values = Vec::with_capacity(symbolic.row_idx().len());
+                let starts = symbolic.col_ptr();
+                for_columns(structure, s, |column, of| {
+                    // Considered rows are the last ones.
+                    values.extend_from_slice(&of[..starts[column + 1] - starts[column]]);
+                });
+                let matrix = SparseColMatRef::new(symbolic.as_ref(), &values);
+                SparseLlt::try_new_with_symbolic(factor.clone(), matrix, Side::Lower).ok().map(Factor::Sparse)
+            }
+        }
+    }
+}
+
+impl Factor {
     /// Solves `S x = b` for as many right sides as there are, in place.
     pub(super) fn solve(&self, columns: usize, b: &mut [f64]) {
-        if columns > 0 && !b.is_empty() {
-            let right = b.len() / columns;
-            self.0.solve_in_place(MatMut::from_column_major_slice_mut(b, columns, right));
+        if columns == 0 || b.is_empty() {
+            return;
+        }
+        let b = MatMut::from_column_major_slice_mut(b, columns, b.len() / columns);
+        match self {
+            Self::Dense(factor) => factor.solve_in_place(b),
+            Self::Sparse(factor) => factor.solve_in_place(b),
         }
     }
 }

@@ -1,7 +1,7 @@
 //! Levenberg–Marquardt over blocks.
 
 use super::error::AdjustError;
-use super::factor::Factor;
+use super::factor::Analysis;
 use super::normal::{FLOOR, Normal, Reduced};
 use super::residual::{ResidualSums, Values};
 use super::structure::Structure;
@@ -135,6 +135,7 @@ impl Adjustment<'_> {
         on_iteration: &mut (dyn FnMut(&AdjustIteration) -> ControlFlow<()> + Send),
     ) -> Result<AdjustReport, AdjustError> {
         let structure = Structure::new(&self.groups, &self.kinds, self.eliminated, false);
+        let analysis = Analysis::new(&structure);
         let mut normal = Normal::default();
         let mut reduced = Reduced::default();
         normal.linearize(&self.kinds, &structure, &self.values).map_err(|u| self.undefined(u))?;
@@ -159,7 +160,7 @@ impl Adjustment<'_> {
                 return end(report, Termination::Stopped);
             }
             report.steps += 1;
-            let step = normal.step(&structure, damping, &mut reduced);
+            let step = analysis.as_ref().and_then(|a| normal.step(&structure, a, damping, &mut reduced));
             let cost = match &step {
                 Some(step) if step.largest <= options.step_tolerance => return end(report, Termination::Step),
                 // What is left to gain is rounding.
@@ -277,11 +278,11 @@ impl Normal {
     }
 
     /// The damped step; `None` where the system is not positive definite.
-    pub(super) fn step(&self, structure: &Structure, damping: f64, reduced: &mut Reduced) -> Option<Step> {
+    pub(super) fn step(&self, structure: &Structure, analysis: &Analysis, damping: f64, reduced: &mut Reduced) -> Option<Step> {
         self.reduce(structure, damping, reduced).ok()?;
         let mut columns: Vec<f64> = reduced.gradient.iter().map(|g| -g).collect();
         if !columns.is_empty() {
-            Factor::new(structure, &reduced.s)?.solve(columns.len(), &mut columns);
+            analysis.factor(structure, &reduced.s)?.solve(columns.len(), &mut columns);
         }
         let mut points = Vec::new();
         self.back_substitute(structure, reduced, &columns, &mut points);

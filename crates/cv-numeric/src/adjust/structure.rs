@@ -7,6 +7,10 @@ use std::collections::HashMap;
 pub(super) const NONE: u32 = u32::MAX;
 /// Most columns of a block of the reduced system that is made of several.
 const MOST_MERGED: usize = 64;
+/// Below this size a dense factorization is faster whatever the pattern.
+const SMALL: usize = 400;
+/// Above this share of the reduced system's blocks, its factor is about full.
+const FULL: f64 = 0.3;
 
 /// Lists of different lengths, one after the other.
 #[derive(Debug, Clone, Default)]
@@ -131,6 +135,8 @@ pub(super) struct Pattern {
     pub(super) height: Vec<usize>,
     /// Block and first row of each block of a column, ascending.
     pub(super) rows: Vec<Vec<(u32, u32)>>,
+    /// Whether all blocks are there.
+    pub(super) dense: bool,
 }
 
 /// All of it.
@@ -261,7 +267,7 @@ impl Structure {
                 targets,
             });
         }
-        let pattern = pattern(&blocks);
+        let pattern = pattern(&blocks, kinds, &links, &cells, &seen, columns);
         let points = eliminated.map(|group| {
             let held = groups[group].held.clone();
             Points { group, size, count: points, held, cells, start }
@@ -372,10 +378,44 @@ fn merged(groups: &[Group<'_>], units: &[Unit], unit_of: &[Vec<u32>], witnesses:
     (blocks, place, sets.into_iter().map(|s| s.0).collect())
 }
 
-fn pattern(blocks: &[ReducedBlock]) -> Pattern {
+fn pattern(
+    blocks: &[ReducedBlock],
+    kinds: &[Box<dyn Kind + '_>],
+    links: &[Links],
+    cells: &Lists<Cell>,
+    seen: &Lists<(u32, u32)>,
+    columns: usize,
+) -> Pattern {
     let n = blocks.len();
-    let rows: Vec<Vec<u32>> = (0..n).map(|b| (b as u32..n as u32).collect()).collect();
-    let mut pattern = Pattern { start: vec![0], ..Pattern::default() };
+    let mut rows: Vec<Vec<u32>> = Vec::with_capacity(n);
+    let mut mark = vec![NONE; n];
+    for b in 0..n {
+        let mut list = vec![b as u32];
+        mark[b] = b as u32;
+        let mut add = |block: u32| {
+            if block != NONE && block as usize > b && mark[block as usize] != b as u32 {
+                mark[block as usize] = b as u32;
+                list.push(block);
+            }
+        };
+        for &(p, i) in seen.of(b) {
+            cells.of(p as usize)[i as usize..].iter().for_each(|c| add(c.block));
+        }
+        for (kind, link) in kinds.iter().zip(links) {
+            let width = kind.groups().len();
+            for &item in link.of_block.of(b) {
+                link.targets(item as usize, width).iter().for_each(|t| add(t.block));
+            }
+        }
+        list.sort_unstable();
+        rows.push(list);
+    }
+    let filled = rows.iter().map(Vec::len).sum::<usize>() as f64;
+    let dense = columns <= SMALL || filled > FULL * 0.5 * (n * (n + 1)) as f64;
+    if dense {
+        rows = (0..n).map(|b| (b as u32..n as u32).collect()).collect();
+    }
+    let mut pattern = Pattern { start: vec![0], dense, ..Pattern::default() };
     for (block, rows) in blocks.iter().zip(rows) {
         let mut height = 0;
         let placed = rows

@@ -1,5 +1,6 @@
 //! The adjuster against plain references: dense normal equations from numeric derivatives, inverses, repeated noise.
 
+use super::factor::Analysis;
 use super::normal::{Normal, Reduced};
 use super::structure::Structure;
 use super::*;
@@ -216,7 +217,7 @@ fn a_step_with_points_eliminated_is_that_of_the_whole_system() {
         let structure = Structure::new(&problem.groups, &problem.kinds, problem.eliminated, false);
         let (mut normal, mut reduced) = (Normal::default(), Reduced::default());
         normal.linearize(&problem.kinds, &structure, &problem.values).unwrap();
-        let step = normal.step(&structure, 1e-3, &mut reduced).unwrap();
+        let step = normal.step(&structure, &Analysis::Dense, 1e-3, &mut reduced).unwrap();
         let mut ours = Vec::new();
         for group in &groups[..2] {
             for &(block, member) in &structure.place[group.0] {
@@ -365,8 +366,10 @@ fn chain(n: u32) -> (Adjustment<'static>, GroupId) {
 }
 
 #[test]
-fn a_chain_has_the_solution_and_covariance_of_its_whole_system() {
+fn a_sparse_system_has_the_solution_and_covariance_of_the_dense_one() {
     let (mut problem, positions) = chain(300);
+    let structure = Structure::new(&problem.groups, &problem.kinds, None, false);
+    assert!(!structure.pattern.dense);
     let (h, g) = plain(&problem);
     let inverse = h.try_inverse().unwrap();
     let exact = &inverse * -g;
