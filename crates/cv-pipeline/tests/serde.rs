@@ -1,5 +1,6 @@
 //! Options and results as JSON, with the feature `serde`: `cargo test -p cv-pipeline --features serde --test serde`.
 #![cfg(feature = "serde")]
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
 use cv_core::{Camera, Correspondence, Distortion, Keypoint, Point2, Pose, Rotation3, StereoRig, Vector3};
 use cv_pipeline::segmentation::TrainOptions;

@@ -278,7 +278,13 @@ impl Normal {
     }
 
     /// The damped step; `None` where the system is not positive definite.
-    pub(super) fn step(&self, structure: &Structure, analysis: &Analysis, damping: f64, reduced: &mut Reduced) -> Option<Step> {
+    pub(super) fn step(
+        &self,
+        structure: &Structure,
+        analysis: &Analysis,
+        damping: f64,
+        reduced: &mut Reduced,
+    ) -> Option<Step> {
         self.reduce(structure, damping, reduced).ok()?;
         let mut columns: Vec<f64> = reduced.gradient.iter().map(|g| -g).collect();
         if !columns.is_empty() {
