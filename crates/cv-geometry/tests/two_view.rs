@@ -112,9 +112,9 @@ fn points_come_back_each_with_its_keypoints() {
         let mut truth = scene.pose;
         truth.translation.normalize_mut();
         let [turn, direction] = pose_difference(&found.pose, &truth).map(f64::to_degrees);
-        // Two hundred points of 0.3 px at a focal length of 560 px: 0.03 degrees each, a tenth of it for the mean, several times that where rotation and direction go
-        // together.
-        assert!(turn < 0.1 && direction < 1.0, "{seed}: {turn} {direction}");
+        // Two hundred points of 0.3 px at a focal length of 560 px: 0.03 degrees each, 0.002 for their mean; the rotation that a change of direction makes up for
+        // is known some twenty times worse, and the worst of four scenes has up to four deviations.
+        assert!(turn < 0.2 && direction < 1.0, "{seed}: {turn} {direction}");
         let (right, within) = scene.right(&found);
         // A wrong match lies within two pixels of its epipolar line in one of a hundred cases.
         assert!(right >= 195 && found.points.len() - right <= 3, "{seed}: {right} of {}", found.points.len());
