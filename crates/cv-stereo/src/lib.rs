@@ -1,7 +1,7 @@
 //! Stereo: from a rectified pair of images to disparity and depth.
 //!
 //! ```
-//! use cv_core::GrayU8;
+//! use cv_core::{GrayU8, Silent};
 //! use cv_stereo::{StereoMatcher, StereoOptions};
 //!
 //! // A wall of random bricks five pixels to the left in the right image.
@@ -9,7 +9,7 @@
 //!     GrayU8::from_fn(96, 64, |x, y| [(((x + shift) / 3 * 7919 + y / 4 * 104_729) * 2_654_435 >> 9) as u8])
 //! };
 //! let mut matcher = StereoMatcher::new(StereoOptions { disparities: 16, ..StereoOptions::default() })?;
-//! let map = matcher.compute(wall(0).view(), wall(5).view())?;
+//! let map = matcher.compute(wall(0).view(), wall(5).view(), &Silent)?;
 //! assert!((map.disparity.at(60, 30)[0] - 5.0).abs() < 0.5);
 //! # Ok::<(), cv_stereo::StereoError>(())
 //! ```
