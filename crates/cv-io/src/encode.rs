@@ -8,11 +8,13 @@ use png::{BitDepth, ColorType, Compression, Filter};
 use crate::files::write_bytes;
 use crate::{FormatError, IoError};
 
+/// Width, height, color type, bits and the rows, big-endian, without padding.
+type Parts = (usize, usize, ColorType, BitDepth, Vec<u8>);
+
 /// What a PNG can hold here: views of 1, 3 or 4 channels of `u8` or `u16`, and masks.
 pub trait PngPixels: sealed::Sealed {
-    /// Width, height, color type, bits and the rows, big-endian, without padding.
     #[doc(hidden)]
-    fn parts(&self) -> (usize, usize, ColorType, BitDepth, Vec<u8>);
+    fn parts(&self) -> Parts;
 }
 
 mod sealed {
@@ -23,7 +25,7 @@ macro_rules! png_pixels {
     ($sample:ty, $channels:literal, $color:ident, $depth:ident, $push:expr) => {
         impl sealed::Sealed for ImageView<'_, $sample, $channels> {}
         impl PngPixels for ImageView<'_, $sample, $channels> {
-            fn parts(&self) -> (usize, usize, ColorType, BitDepth, Vec<u8>) {
+            fn parts(&self) -> Parts {
                 let mut bytes = Vec::with_capacity(self.width() * self.height() * $channels * size_of::<$sample>());
                 let push: fn(&mut Vec<u8>, &[$sample]) = $push;
                 (0..self.height()).for_each(|y| push(&mut bytes, self.row(y)));
@@ -45,7 +47,11 @@ png_pixels!(u16, 3, Rgb, Sixteen, |out, row| out.extend(row.iter().flat_map(|v| 
 /// # Errors
 /// [`FormatError::NotRepresentable`] for an empty picture or one whose sides exceed 2³¹ − 1.
 pub fn encode_png(view: impl PngPixels) -> Result<Vec<u8>, FormatError> {
-    let (width, height, color, depth, pixels) = view.parts();
+    png_file(view.parts())
+}
+
+/// The encoders are compiled once, not where they are called and not for each kind of pixel.
+fn png_file((width, height, color, depth, pixels): Parts) -> Result<Vec<u8>, FormatError> {
     let side = |n: usize| u32::try_from(n).ok().filter(|&n| n > 0 && n <= i32::MAX as u32);
     let (Some(w), Some(h)) = (side(width), side(height)) else {
         return Err(FormatError::NotRepresentable { format: "PNG", what: format!("a picture of {width}×{height}") });
@@ -80,7 +86,10 @@ impl JpegPixels for ImageView<'_, u8, 3> {}
 /// # Errors
 /// [`FormatError::NotRepresentable`] for an empty picture or one with a side above 65535.
 pub fn encode_jpeg(view: impl JpegPixels, quality: u8) -> Result<Vec<u8>, FormatError> {
-    let (width, height, color, _, pixels) = view.parts();
+    jpeg_file(view.parts(), quality)
+}
+
+fn jpeg_file((width, height, color, _, pixels): Parts, quality: u8) -> Result<Vec<u8>, FormatError> {
     let side = |n: usize| u16::try_from(n).ok().filter(|&n| n > 0);
     let (Some(w), Some(h)) = (side(width), side(height)) else {
         return Err(FormatError::NotRepresentable { format: "JPEG", what: format!("a picture of {width}×{height}") });

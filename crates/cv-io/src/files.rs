@@ -62,12 +62,14 @@ pub fn write_atomic<R: Into<FormatError>>(
     content: impl FnOnce(&mut dyn Write) -> Result<(), R>,
 ) -> Result<(), IoError> {
     let path = path.as_ref();
-    write_atomic_inner(path, |sink| content(sink).map_err(Into::into)).map_err(|reason| IoError::writing(path, reason))
+    let mut content = Some(content);
+    let mut once = |sink: &mut dyn Write| content.take().map_or(Ok(()), |content| content(sink).map_err(Into::into));
+    write_atomic_inner(path, &mut once).map_err(|reason| IoError::writing(path, reason))
 }
 
 fn write_atomic_inner(
     path: &Path,
-    content: impl FnOnce(&mut dyn Write) -> Result<(), FormatError>,
+    content: &mut dyn FnMut(&mut dyn Write) -> Result<(), FormatError>,
 ) -> Result<(), FormatError> {
     let target: PathBuf = if path.is_symlink() { fs::canonicalize(path)? } else { path.to_owned() };
     let existing = fs::metadata(&target).ok();

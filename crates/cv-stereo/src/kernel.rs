@@ -17,6 +17,7 @@ use crate::winner::{NO_SUM, Winner};
 use cv_core::{Cancelled, Stage};
 use fearless_simd::prelude::*;
 use fearless_simd_macros::simd;
+use std::ops::Range;
 
 /// Pixels whose costs are computed at a time: 4 KiB at 128 disparities, which stay in the first cache.
 pub(crate) const TILE: usize = 32;
@@ -151,8 +152,8 @@ fn rows<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool>(
             let columns = if mirrored { width - end..width - begin } else { begin..end };
             let pixels = line * width + columns.start..line * width + columns.end;
             let span = pixels.start * depth..pixels.end * depth;
-            let jumps = p2.each_ref().map(|jumps| &jumps[columns.clone()]);
-            let before = before.each_ref().map(|before| &before[columns.clone()]);
+            let jumps = cut(p2, &columns);
+            let before = cut(before, &columns);
             let costs = match frame.given {
                 Some(given) => &given[y * width * depth..][columns.start * depth..columns.end * depth],
                 None => {
@@ -162,7 +163,8 @@ fn rows<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool>(
             };
             let tile = Tile { costs, p1: frame.p1, jumps, before, mirrored };
             let row = &mut row[begin * (PATHS - 1) * depth..];
-            let least = least.each_mut().map(|least| &mut least[columns.clone()]);
+            let [straight, behind, ahead] = &mut *least;
+            let least = [&mut straight[columns.clone()], &mut behind[columns.clone()], &mut ahead[columns.clone()]];
             match output {
                 Output::Store(out) => {
                     let ends = Ends { other: &[], running: &mut [], decided: &mut [], best: &mut [], stride: 0 };
@@ -188,6 +190,11 @@ fn rows<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool>(
         }
     }
     Ok(())
+}
+
+/// Some columns of each row. (`map` with a closure would be compiled once more for each kind of sweep.)
+fn cut<'a, const N: usize>(rows: &'a [Vec<u8>; N], columns: &Range<usize>) -> [&'a [u8]; N] {
+    std::array::from_fn(|i| &rows[i][columns.clone()])
 }
 
 /// P2 of the pixels of row `y` for each path. At a border, where paths start from nothing, any value does.
@@ -287,8 +294,10 @@ fn extend<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool, 
     // A pixel of the row before.
     let stride = (PATHS - 1) * depth;
     let count = tile.jumps[0].len();
-    let jumps = tile.jumps.map(|jumps| &jumps[..count]);
-    let before = tile.before.map(|before| &before[..count]);
+    let [along_jumps, straight_jumps, behind_jumps, ahead_jumps] = tile.jumps;
+    let jumps = [&along_jumps[..count], &straight_jumps[..count], &behind_jumps[..count], &ahead_jumps[..count]];
+    let [straight_before, behind_before, ahead_before] = tile.before;
+    let before = [&straight_before[..count], &behind_before[..count], &ahead_before[..count]];
     let splat = |value: u8| S::u8s::splat(simd, value);
     let p1 = splat(tile.p1);
     let Ends { other, running, decided, best, stride: decided_stride } = ends;

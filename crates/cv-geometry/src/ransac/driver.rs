@@ -3,9 +3,9 @@
 use super::quality::Quality;
 use super::{Consensus, Estimator, RansacData, RobustOptions, Sampler, Score, Scorer, TukeyBiweight};
 use cv_core::{Cancelled, Progress, Stage};
+use cv_numeric::parallel_map;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
-use rayon::prelude::*;
 
 /// Samples that are judged together, by one thread.
 const CHUNK: usize = 16;
@@ -23,12 +23,14 @@ const FINAL_STEPS: usize = 20;
 const BIWEIGHT: f64 = 4.685;
 
 /// A model and how well it fits.
+#[derive(Clone)]
 pub(super) struct ScoredModel<M> {
     pub(super) model: M,
     pub(super) score: Score,
 }
 
 /// The best model of a chunk, and the sample it is made of.
+#[derive(Clone)]
 struct Winner<M> {
     found: ScoredModel<M>,
     sample: [u32; 8],
@@ -71,15 +73,14 @@ pub(super) fn search<E: Estimator, C: Scorer>(
             None if E::RESAMPLES > 0 => f32::INFINITY,
             None => minimal,
         };
-        let winners: Vec<Winner<E::Model>> = if n < PARALLEL_FROM && count < MOST {
-            let winners = samples.chunks(CHUNK).map(|chunk| best_of(quality, chunk, limit, &mut models, &stage));
-            winners.filter_map(Result::transpose).collect::<Result<_, _>>()?
+        let winners: Vec<Result<Option<Winner<E::Model>>, Cancelled>> = if n < PARALLEL_FROM && count < MOST {
+            samples.chunks(CHUNK).map(|chunk| best_of(quality, chunk, limit, &mut models, &stage)).collect()
         } else {
-            let winners =
-                samples.par_chunks(CHUNK).map(|chunk| best_of(quality, chunk, limit, &mut Vec::new(), &stage));
-            winners.filter_map(Result::transpose).collect::<Result<_, _>>()?
+            let chunks: Vec<&[[u32; 8]]> = samples.chunks(CHUNK).collect();
+            parallel_map(chunks.len(), &|i| best_of(quality, chunks[i], limit, &mut Vec::new(), &stage))
         };
         for winner in winners {
+            let Some(winner) = winner? else { continue };
             if winner.found.score.loss >= minimal {
                 if E::RESAMPLES > 0 {
                     let at = waiting.partition_point(|w| w.found.score.loss <= winner.found.score.loss);
@@ -100,17 +101,16 @@ pub(super) fn search<E: Estimator, C: Scorer>(
     let Some(mut best) = best else { return Ok(None) };
     let stage = Stage::new(progress, "best models", waiting.len())?;
     if iterations == most {
-        let searched = |(k, winner): (usize, Winner<E::Model>)| {
+        let searched = |k: usize| {
             let (mut rng, mut models) = (rng.clone(), Vec::new());
             rng.set_stream(k as u64 + 1);
-            let mut found = optimized(quality, winner, &mut models, &stage)?;
+            let mut found = optimized(quality, waiting[k].clone(), &mut models, &stage)?;
             quality.inner_ransac(&mut found, &mut rng, &mut models, &stage)?;
             stage.add(1)?;
             Ok(found)
         };
-        let others: Vec<ScoredModel<E::Model>> =
-            waiting.into_par_iter().enumerate().map(searched).collect::<Result<_, Cancelled>>()?;
-        for found in others {
+        for found in parallel_map(waiting.len(), &searched) {
+            let found: ScoredModel<E::Model> = found?;
             if found.score.loss < best.score.loss {
                 best = found;
             }

@@ -3,6 +3,7 @@
 use super::manifold::Manifold;
 use super::structure::{Links, NONE};
 use crate::RobustLoss;
+use crate::parallel_map;
 use nalgebra::{SMatrix, SVector};
 use rayon::prelude::*;
 use std::ops::Range;
@@ -300,7 +301,7 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Kind 
     fn cost(&self, values: &Values) -> f64 {
         let chunks = self.len().div_ceil(CHUNK);
         let of = |c: usize| self.cost_of(values, c * CHUNK..((c + 1) * CHUNK).min(self.len()));
-        (0..chunks).into_par_iter().map(of).collect::<Vec<f64>>().iter().sum()
+        parallel_map(chunks, &of).iter().sum()
     }
 
     fn linearize(&self, values: &Values, links: &Links, rows: &mut Rows) -> Result<ResidualSums, usize> {
@@ -321,7 +322,7 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Kind 
             }
             Ok(sums)
         };
-        total((0..self.len().div_ceil(CHUNK)).into_par_iter().map(chunk).collect())
+        total(parallel_map(self.len().div_ceil(CHUNK), &chunk))
     }
 
     #[cfg(test)]
