@@ -2,6 +2,7 @@
 //! mutual information", PAMI 2008, section 2.6.4).
 
 use crate::PixelState;
+use cv_core::{Cancelled, Stage};
 use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
 use rayon::prelude::*;
@@ -25,9 +26,10 @@ pub(crate) fn fill_holes(
     states: &[PixelState],
     width: usize,
     Holes { seen, first }: &mut Holes,
-) {
+    stage: &Stage<'_>,
+) -> Result<(), Cancelled> {
     if width == 0 || disparity.is_empty() {
-        return;
+        return Ok(());
     }
     let mut count = 0;
     first.clear();
@@ -42,6 +44,7 @@ pub(crate) fn fill_holes(
         || dispatch!(level, simd => rays(simd, view, width, count, false, down)),
         || dispatch!(level, simd => rays(simd, view, width, count, true, up)),
     );
+    stage.check()?;
     // The median and the second smallest take the places of the first two rays.
     let [a, b, c, d] = down;
     let ahead = a.par_chunks_mut(PART).zip(b.par_chunks_mut(PART)).zip(c.par_chunks(PART).zip(d.par_chunks(PART)));
@@ -49,6 +52,7 @@ pub(crate) fn fill_holes(
         let up = [0, 1, 2, 3].map(|ray| &up[ray][part * PART..][..c.len()]);
         dispatch!(level, simd => ranks(simd, [a, b], [c, d], up));
     });
+    stage.check()?;
     let (median, second) = (&*a, &*b);
     let rows = disparity.par_chunks_mut(width).zip(states.par_chunks(width)).zip(first);
     rows.for_each(|((row, states), &mut first)| {
@@ -61,6 +65,7 @@ pub(crate) fn fill_holes(
             *d = if value == f32::INFINITY { f32::NAN } else { value };
         }
     });
+    stage.check()
 }
 
 /// Holes per task; a whole number of vectors of any instruction set.
@@ -154,11 +159,13 @@ fn rays<S: Simd>(_: S, disparity: &[f32], width: usize, count: usize, mirrored: 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cv_core::Silent;
     use cv_synth::instruction_sets;
     use proptest::prelude::*;
 
     fn fill(disparity: &mut [f32], states: &[PixelState], width: usize) {
-        fill_holes(Level::new(), disparity, states, width, &mut Holes::default());
+        fill_holes(Level::new(), disparity, states, width, &mut Holes::default(), &Stage::new(&Silent, "", 0).unwrap())
+            .unwrap();
     }
 
     #[test]

@@ -384,7 +384,7 @@ impl StereoMatcher {
         remove_speckles(disparity, states, width, options.speckle_size, options.speckle_range, &mut self.speckles);
         stage.add(1)?;
         if options.fill {
-            fill_holes(self.level, disparity, states, width, &mut self.holes);
+            fill_holes(self.level, disparity, states, width, &mut self.holes, &stage)?;
             stage.add(1)?;
             fill_planes(disparity, states, &self.gray8, width, &mut self.large_holes);
             stage.add(1)?;

@@ -128,6 +128,7 @@ pub fn reconstruct_dense(
     let cameras = sparse.scene.cameras.map(|camera| camera.resized(side(camera.width), side(camera.height)));
     let rig = StereoRig { left: cameras[0], right: cameras[1], right_from_left: sparse.scene.pose };
     let positions: Vec<Point3<f64>> = sparse.scene.points.iter().map(|p| p.position).collect();
+    progress.report("rectify", 0, 1)?;
     let scene = SceneRectification::new(&rig, &positions)?;
     let views = [scene.views.left, scene.views.right];
     let size = (views[0].camera.width, views[0].camera.height);
@@ -135,6 +136,7 @@ pub fn reconstruct_dense(
     let mut rectified = Vec::new();
     for ((photo, view), camera) in photos.iter().zip(&views).zip(&cameras) {
         rectified.push(if factor < 1.0 {
+            progress.report("reduce", 0, 1)?;
             let small = resize_area(*photo, camera.width, camera.height).map_err(|_| too_large)?;
             view.apply(small.view(), progress)?
         } else {

@@ -116,6 +116,7 @@ pub fn reconstruct(
         adjustment.add_matches(&more, progress)?;
         clock.lap("bundle");
     }
+    progress.report("filter", 0, 1)?;
     let scene = adjustment.finish()?;
     let at = |p: &TwoViewPoint| color_at(a, matching.pair(&scene.matches[p.match_index]).a);
     let colors = scene.points.iter().map(at).collect();
