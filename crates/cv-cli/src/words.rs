@@ -2,7 +2,9 @@
 
 use crate::frame::Failure;
 use cv_pipeline::stereo::RectifyError;
-use cv_pipeline::{Advice, DenseError, DepthError, LeftOut, NoPairCause, PanoramaError, ReconstructError};
+use cv_pipeline::{
+    Advice, DenseError, DepthError, LeftOut, MatchingError, NoPairCause, PanoramaError, ReconstructError,
+};
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
@@ -24,6 +26,9 @@ fn words(advice: Advice) -> String {
         }
         Advice::StepAsideNotAhead => "step aside between the photographs rather than ahead",
         Advice::LeaveThePlane => "include things in front of the plane or behind it",
+        Advice::SameFeatures => {
+            "take the features of both photographs from the same detector, or leave out --load-features"
+        }
         Advice::FartherApart => "take the photographs farther apart",
         Advice::MoreDepthOrFeatures => {
             "take photographs that share more of the scene, with things near and far all over them, or find more features (--features)"
@@ -47,6 +52,10 @@ fn words(advice: Advice) -> String {
         Advice::TryDisparities { min, count } => {
             return format!("--disparities auto, or --min-disparity {min} --disparities {count}");
         }
+        Advice::KeepDepths { near, far } => {
+            return format!("choose --near and --far so that they include depths from {near:.3} to {far:.3}");
+        }
+        Advice::CheckOffset => "check --offset, the difference of the principal points, or the calibration",
         Advice::GiveDisparities => "rectify the pair (--rig, or `cv rectify`), or give the number of disparities",
         Advice::LargerWindow => "a larger window (--census 9), or more light",
         Advice::MoreMemory { needed } => {
@@ -57,6 +66,11 @@ fn words(advice: Advice) -> String {
         Advice::RunAgain => "run it again",
     };
     words.to_owned()
+}
+
+/// Why two photographs have no matches.
+pub(crate) fn no_matches(error: MatchingError, photos: [&Path; 2]) -> Failure {
+    Failure::new(format!("{} and {}: {error}", photos[0].display(), photos[1].display())).advice(words(error.advice()))
 }
 
 /// Why there is no reconstruction of two photographs.

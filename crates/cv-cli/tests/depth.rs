@@ -120,6 +120,51 @@ fn the_range_can_be_found_from_the_pictures() {
 }
 
 #[test]
+fn an_exchanged_pair_is_no_pair_whoever_finds_the_range() {
+    let folder = pair();
+    for range in ["auto", "48"] {
+        let depth =
+            ["--disparities", range, "--focal", "210", "--baseline", "0.25", "--depth", "z.pfm", "--cloud", "c.ply"];
+        let text =
+            refused(folder.path(), &[&["depth", "right.png", "left.png", "-o", "d.pfm"], &depth[..]].concat()).stderr;
+        assert!(text.contains("exchange"), "{text}");
+        assert!(["d.pfm", "z.pfm", "c.ply"].iter().all(|name| !folder.path().join(name).exists()));
+    }
+    // An empty cloud is no success: the room ends at a few meters.
+    let far = ["--disparities", "48", "--focal", "210", "--baseline", "0.25", "--near", "1000", "--cloud", "c.ply"];
+    let text = refused(folder.path(), &[&["depth", "left.png", "right.png", "-o", "d.pfm"], &far[..]].concat()).stderr;
+    assert!(text.contains("--near"), "{text}");
+    assert!(!folder.path().join("c.ply").exists());
+}
+
+#[test]
+fn frames_of_other_moments_are_not_paired() {
+    let folder = pair();
+    let at = |name: &str| folder.path().join(name);
+    for (side, first) in [("left", 1), ("right", 2)] {
+        std::fs::create_dir(at(side)).unwrap();
+        for frame in first..first + 4 {
+            std::fs::copy(at(&format!("{side}.png")), at(side).join(format!("frame_{frame:04}.png"))).unwrap();
+        }
+    }
+    let frames = ["depth", "left", "right", "-o", "out", "--disparities", "48"];
+    let text = refused(folder.path(), &frames).stderr;
+    assert!(["frame_0001", "frame_0005", "--pair-by order"].iter().all(|part| text.contains(part)), "{text}");
+    assert!(!at("out").exists());
+    assert_eq!(json(folder.path(), &[&frames[..], &["--pair-by", "order"]].concat())["frames"], 4);
+    // Those that both have, by a pattern.
+    let some = ["depth", "left/frame_%04d.png", "right/frame_000[x]*", "-o", "out"];
+    refused(folder.path(), &some);
+    let value = json(
+        folder.path(),
+        &["depth", "left/frame_0002*", "right/frame_%03d2.png", "-o", "two", "--disparities", "48"],
+    );
+    assert_eq!(value["frames"], 1);
+    let two = run(folder.path(), &["depth", "left.png", "right.png", "-o", "d.pfm", "--pair-by", "name"]);
+    assert_eq!(two.code, Some(2), "{two:?}");
+}
+
+#[test]
 fn the_result_is_the_same_for_any_number_of_threads() {
     let folder = pair();
     let maps = ["1", "2", "4"].map(|threads| {

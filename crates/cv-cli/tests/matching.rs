@@ -110,6 +110,33 @@ fn guided_matching_finds_more_and_leaves_out_what_disagrees() {
 }
 
 #[test]
+fn photographs_of_different_things_have_no_model() {
+    let (folder, _) = pair("plane");
+    let (other, _) = pair("two-view");
+    fs::copy(other.path().join("b.jpg"), folder.path().join("other.jpg")).unwrap();
+    // What matches there are agree on nothing, and that is said.
+    let ran = done(folder.path(), &["match", "a.jpg", "other.jpg", "-o", "m.txt"]);
+    assert!(ran.stderr.contains("no homography and no fundamental matrix explains"), "{ran:?}");
+    let value = json(folder.path(), &["match", "a.jpg", "other.jpg", "-o", "m.txt"]);
+    assert!(value["model"].is_null() && value["agree"] == 0 && value["matches"].as_u64().unwrap() > 0, "{value}");
+    let value = json(folder.path(), &["match", "a.jpg", "b.jpg", "-o", "m.txt"]);
+    assert!(
+        value["model"] == "homography" && 2 * value["agree"].as_u64().unwrap() > value["matches"].as_u64().unwrap()
+    );
+    // Nor is anything guided by it, or made of it.
+    for model in ["homography", "fundamental"] {
+        let ran = refused(folder.path(), &["match", "a.jpg", "other.jpg", "-o", "guided.txt", "--guided", model]);
+        assert!(
+            ran.stderr.contains("no model to be guided by") && !folder.path().join("guided.txt").exists(),
+            "{ran:?}"
+        );
+        fs::rename(folder.path().join("m.txt"), folder.path().join("right.txt")).unwrap();
+        done(folder.path(), &["match", "a.jpg", "other.jpg", "-o", "m.txt"]);
+        refused(folder.path(), &["estimate", model, "--matches", "m.txt"]);
+    }
+}
+
+#[test]
 fn features_go_to_files_and_back() {
     let (folder, _) = pair("plane");
     let at = |name: &str| -> PathBuf { folder.path().join(name) };

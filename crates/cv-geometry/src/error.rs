@@ -48,7 +48,7 @@ pub enum EstimateError {
         /// In which way.
         kind: Degeneracy,
     },
-    /// The number of false alarms of the best model is not below one: as many matches would fit some model if all were wrong.
+    /// The number of false alarms of the best model is not below a hundredth: as many matches would fit some model if all were wrong.
     #[error(
         "after {iterations} samples the best model fits {inliers} of {matches} matches, as some model would if all were wrong; at least {needed} are needed"
     )]

@@ -18,7 +18,7 @@
 //!
 //! * A homography maps the first image to the second, `b ~ H a`, scaled to `H[2][2] = 1`.
 //! * Thresholds and residuals are in the unit of the matches, that is, pixels.
-//! * A robust estimate is refused where its number of false alarms is one or more (`RobustModel::log_nfa`).
+//! * A robust estimate is refused where its number of false alarms is a hundredth or more (`RobustModel::log_nfa`).
 //! * The same matches, options and seed give the same bytes on any number of threads and with any vector unit.
 
 mod absolute;

@@ -15,7 +15,7 @@ pub struct RobustModel<M> {
     pub rms: f64,
     /// Samples drawn.
     pub iterations: usize,
-    /// log₁₀ of the number of false alarms: of models as well supported to be expected of so many wrong matches, below 0: −20 says that one in 10²⁰ such sets has
+    /// log₁₀ of the number of false alarms: of models as well supported to be expected of so many wrong matches, below −2: −20 says that one in 10²⁰ such sets has
     /// one. `None` where there are no more matches than a sample takes.
     pub log_nfa: Option<f64>,
 }

@@ -25,6 +25,8 @@ pub enum Advice {
     StepAsideNotAhead,
     /// Things in front of the plane or behind it.
     LeaveThePlane,
+    /// Features of one kind for both photographs.
+    SameFeatures,
     /// Photographs taken farther apart.
     FartherApart,
     /// Things near and far all over the photographs, or more features.
@@ -57,6 +59,15 @@ pub enum Advice {
         /// How many.
         count: usize,
     },
+    /// Other depths are to be kept.
+    KeepDepths {
+        /// The nearest there is, in the unit of the baseline.
+        near: f32,
+        /// The farthest there is.
+        far: f32,
+    },
+    /// The principal points are not those of the photographs.
+    CheckOffset,
     /// The number of disparities is to be given, or the pair to be rectified.
     GiveDisparities,
     /// A larger matching window, or more light.
@@ -108,7 +119,10 @@ impl MatchingError {
     pub fn advice(&self) -> Advice {
         match self {
             Self::Cancelled(_) => Advice::RunAgain,
-            _ => Advice::SharperPhotographs,
+            Self::NoModel { .. } => Advice::SameScene,
+            Self::Features { .. } | Self::NoFeatures { .. } => Advice::SharperPhotographs,
+            // Features of two kinds, from elsewhere.
+            Self::Match(_) => Advice::SameFeatures,
         }
     }
 }
@@ -134,6 +148,8 @@ impl DepthError {
         match self {
             Self::NoPair { cause, .. } => cause.advice(),
             Self::NoRange(error) => error.advice(),
+            Self::NoDepth { found: Some((near, far)), .. } => Advice::KeepDepths { near: *near, far: *far },
+            Self::NoDepth { found: None, .. } => Advice::CheckOffset,
             Self::Stereo(StereoError::TooSmall { .. }) => Advice::LargerPhotographs,
             Self::Stereo(StereoError::Memory { needed, .. }) => Advice::MoreMemory { needed: *needed },
             Self::Rectify(_) => Advice::CheckCamera,
@@ -163,7 +179,8 @@ impl RangeError {
     pub fn advice(&self) -> Advice {
         match self {
             Self::Cancelled(_) => Advice::RunAgain,
-            _ => Advice::GiveDisparities,
+            Self::Exchanged { range: (low, _) } => Advice::Exchange { min_disparity: *low },
+            Self::Matching(_) | Self::TooFew { .. } => Advice::GiveDisparities,
         }
     }
 }

@@ -1,5 +1,6 @@
 //! Depth from a rectified pair.
 
+use crate::disparity_range::is_exchanged;
 use crate::no_pair::{NoPairCause, cause};
 use crate::{Progress, RangeError, disparity_range};
 use cv_core::{Cancelled, GrayF32, ImageView, PointCloud, RgbU8, StageClock};
@@ -123,6 +124,17 @@ pub enum DepthError {
     /// The photographs cannot be rectified.
     #[error(transparent)]
     Rectify(RectifyError),
+    /// No disparity has a depth that is kept.
+    #[error("no disparity has a depth from {} to {}: {}", .kept.0, .kept.1, match .found {
+        Some((near, far)) => format!("those there are lie between {near} and {far}"),
+        None => "none is in front of the cameras".to_owned(),
+    })]
+    NoDepth {
+        /// Nearest and farthest depth kept, in the unit of the baseline.
+        kept: (f32, f32),
+        /// Nearest and farthest depth there is; `None` where no disparity, with the offset of the principal points, is above zero.
+        found: Option<(f32, f32)>,
+    },
     /// The range of depths is empty.
     #[error("the depth range {near} to {far} is empty")]
     Range {
@@ -205,6 +217,10 @@ fn matcher_options<T: Intensity, const C: usize>(
 ) -> Result<StereoOptions, DepthError> {
     let DisparityRange::FromMatches { min } = options.disparities else { return Ok(options.stereo.clone()) };
     let (first, count) = disparity_range(color_bytes(left).view(), color_bytes(right).view(), progress)?;
+    let range = (first, first + count as i32 - 1);
+    if min.is_none() && is_exchanged(range) {
+        return Err(RangeError::Exchanged { range }.into());
+    }
     let min_disparity = min.unwrap_or(first);
     let disparities = (i64::from(first) + count as i64 - i64::from(min_disparity)).max(1) as usize;
     Ok(StereoOptions { min_disparity, disparities, ..options.stereo.clone() })
@@ -256,13 +272,25 @@ pub fn depth_with<T: Intensity, const C: usize>(
     let disparities = matcher.disparities();
     check_pair(&map, left, right, disparities, progress)?;
     progress.report("depth", 0, 1)?;
-    let depth = geometry.map(|geometry| geometry.depth_map(map.disparity.view(), range));
+    let depth = geometry.map(|geometry| kept_depth(geometry, &map, range)).transpose()?;
     let confidence = matcher.confidence(&map);
     progress.report("depth", 0, 1)?;
     let sigma = matcher.uncertainty(&map);
     clock.lap("depth");
     let geometry = geometry.copied();
     Ok(DepthResult { map, depth, confidence, sigma, disparities, geometry, stages: clock.into_stages() })
+}
+
+/// The depths in `range`, of which there is at least one.
+fn kept_depth(geometry: &StereoGeometry, map: &DisparityMap, range: (f32, f32)) -> Result<GrayF32, DepthError> {
+    let depth = geometry.depth_map(map.disparity.view(), range);
+    if depth.as_slice().iter().any(|z| z.is_finite()) {
+        return Ok(depth);
+    }
+    let all = geometry.depth_map(map.disparity.view(), (0.0, f32::INFINITY));
+    let finite = || all.as_slice().iter().copied().filter(|z| z.is_finite());
+    let found = finite().reduce(f32::min).zip(finite().reduce(f32::max));
+    Err(DepthError::NoDepth { kept: range, found })
 }
 
 /// Refuses an empty range of depths and a geometry that is none.
@@ -327,6 +355,14 @@ mod tests {
                 _ => assert!(matches!(cause, NoPairCause::Unrelated { .. }), "{i}: {cause:?}"),
             }
         }
+        // Exchanged, and the range left to the features: negative disparities are depths of nothing.
+        let auto = DepthOptions { disparities: DisparityRange::FromMatches { min: None }, ..Default::default() };
+        let error = depth(right, left, None, &auto, &Silent).map(|_| ()).unwrap_err();
+        assert!(matches!(error, DepthError::NoRange(RangeError::Exchanged { range: (..-8, ..9) })), "{error}");
+        // Who says that they are negative gets them.
+        let min = auto_min(depth(left, right, None, &auto, &Silent).unwrap().disparities);
+        let below = DepthOptions { disparities: DisparityRange::FromMatches { min: Some(min) }, ..Default::default() };
+        assert!(depth(right, left, None, &below, &Silent).unwrap().map.matched_fraction() > 0.5);
         // Ten rows lower, and a range that ends before the nearest wall begins.
         let lower = pair.right.image.view().crop(0, 10, 320, 230).unwrap();
         let error =
@@ -337,6 +373,37 @@ mod tests {
         let error = depth(left, right, None, &DepthOptions { stereo: far, ..Default::default() }, &Silent).unwrap_err();
         assert!(matches!(error, DepthError::NoPair { cause: NoPairCause::Range { .. }, .. }), "{error}");
         assert!(depth(left, right, None, &options, &Silent).unwrap().map.matched_fraction() > 0.5);
+    }
+
+    /// Smallest disparity of the exchanged pair.
+    fn auto_min((first, count): (i32, usize)) -> i32 {
+        -(first + count as i32 - 1)
+    }
+
+    #[test]
+    fn a_map_without_a_depth_is_no_success() {
+        let scene = Scene::room(1);
+        let camera = Camera::from_focal(320, 240, 280.0);
+        let pair = stereo_pair(&scene, &camera, &scene.viewpoint(), 0.25, &RenderOptions::default()).unwrap();
+        let run = |offset: f64, range: (f32, f32)| {
+            let geometry = StereoGeometry { offset, ..StereoGeometry::from_focal(320, 240, 280.0, 0.25).unwrap() };
+            let options = DepthOptions {
+                stereo: StereoOptions { disparities: 64, ..Default::default() },
+                range,
+                ..Default::default()
+            };
+            depth(pair.left.image.view(), pair.right.image.view(), Some(&geometry), &options, &Silent)
+        };
+        assert!(run(0.0, (0.0, f32::INFINITY)).is_ok());
+        // The room ends at a few meters.
+        let error = run(0.0, (1000.0, 2000.0)).unwrap_err();
+        let DepthError::NoDepth { kept: (1000.0, 2000.0), found: Some((near, far)) } = error else { panic!("{error}") };
+        let truth = pair.left.depth.as_slice();
+        let farthest = truth.iter().copied().fold(0.0, f32::max);
+        assert!(near > 0.0 && near < far && far < 3.0 * farthest, "{near} {far} {farthest}");
+        // Principal points so far apart that everything lies behind the cameras.
+        let error = run(-200.0, (0.0, f32::INFINITY)).unwrap_err();
+        assert!(matches!(error, DepthError::NoDepth { found: None, .. }), "{error}");
     }
 
     #[test]

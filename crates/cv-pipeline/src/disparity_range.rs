@@ -19,6 +19,12 @@ pub enum RangeError {
         /// How many are needed.
         needed: usize,
     },
+    /// The disparities are negative: the first photograph is the right one.
+    #[error("features show disparities {} to {}: left and right are exchanged", .range.0, .range.1)]
+    Exchanged {
+        /// Smallest and largest disparity of the matches in px.
+        range: (i32, i32),
+    },
     /// The job was stopped by its progress callback.
     #[error("stopped")]
     Cancelled(#[from] Cancelled),
@@ -63,6 +69,12 @@ pub fn disparity_range(
         return Err(RangeError::TooFew { found: disparities.len(), matches: pairs.len(), needed: NEEDED });
     }
     Ok(range_of(disparities))
+}
+
+/// Whether disparities from the smallest to the largest are those of a pair whose photographs are exchanged: none but a few pixels
+/// above zero, as far things have them where the rows are aligned and the principal points are not, and some far below.
+pub(crate) fn is_exchanged((low, high): (i32, i32)) -> bool {
+    high <= 8 && low < -8
 }
 
 /// The range of some disparities, of which there is at least one.

@@ -116,6 +116,14 @@ pub enum MatchingError {
     /// The descriptors cannot be compared.
     #[error(transparent)]
     Match(MatchError),
+    /// There is no model for guided matching to go by.
+    #[error("there is no model to be guided by: {source}")]
+    NoModel {
+        /// Which was asked for.
+        kind: ModelKind,
+        /// Why there is none.
+        source: EstimateError,
+    },
     /// The job was stopped by its progress callback.
     #[error("stopped")]
     Cancelled(#[from] Cancelled),
@@ -232,19 +240,18 @@ fn finish(
 ) -> Result<MatchingResult, MatchingError> {
     if let Some(kind) = options.guided {
         let pairs = correspondences(&features[0], &features[1], &matches);
-        // Without a model there is nothing to be guided by: the tentative matches stay.
-        let found = match estimate(&pairs, kind, &RobustOptions { seed: options.seed, ..kind.options() }, progress) {
+        let found = estimate(&pairs, kind, &RobustOptions { seed: options.seed, ..kind.options() }, progress);
+        let robust = match found {
+            Ok(found) => found.robust,
             Err(EstimateError::Cancelled(stop)) => return Err(stop.into()),
-            found => found.ok(),
+            Err(source) => return Err(MatchingError::NoModel { kind, source }),
         };
-        if let Some(found) = found {
-            let model = match kind {
-                ModelKind::Homography => TwoViewModel::Homography(found.robust.model),
-                ModelKind::Fundamental => TwoViewModel::Fundamental(found.robust.model),
-            };
-            let along = GuidedOptions { threshold: kind.options().threshold as f32, ..GuidedOptions::default() };
-            matches = match_guided(&features[0], &features[1], None, &model, &along, progress)?;
-        }
+        let model = match kind {
+            ModelKind::Homography => TwoViewModel::Homography(robust.model),
+            ModelKind::Fundamental => TwoViewModel::Fundamental(robust.model),
+        };
+        let along = GuidedOptions { threshold: kind.options().threshold as f32, ..GuidedOptions::default() };
+        matches = match_guided(&features[0], &features[1], None, &model, &along, progress)?;
         clock.lap("guided");
     }
     Ok(MatchingResult { features, matches, stages: clock.into_stages() })

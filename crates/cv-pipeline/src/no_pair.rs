@@ -1,7 +1,7 @@
 //! Why hardly any pixel of one photograph has a partner in the other, as far as feature matches tell.
 
 use crate::depth::color_bytes;
-use crate::disparity_range::{NEEDED, in_common_rows, is_common_row, range_of};
+use crate::disparity_range::{NEEDED, in_common_rows, is_common_row, is_exchanged, range_of};
 use crate::{MatchingError, MatchingOptions, Progress, match_photos};
 use cv_core::{Cancelled, Correspondence, ImageView};
 use cv_stereo::Intensity;
@@ -100,7 +100,7 @@ pub(crate) fn judge(matches: &[Correspondence], height: usize, tried: Option<(i3
     }
     let (min, n) = range_of(common);
     let (low, high) = (min, min + n as i32 - 1);
-    if high <= 8 && low < -8 && tried.is_none_or(|tried| tried.0 >= 0) {
+    if is_exchanged((low, high)) && tried.is_none_or(|tried| tried.0 >= 0) {
         return NoPairCause::Exchanged { range: (low, high) };
     }
     let Some(tried) = tried else { return NoPairCause::Unknown };

@@ -1,12 +1,13 @@
 //! `cv match`: tentative matches between two photographs.
 
 use crate::frame::{Context, Explain, Failure, Outcome, Run, named};
+use crate::words;
 use cv_core::{Keypoint, Named, RgbU8};
 use cv_io::FeatureRows;
 use cv_pipeline::features::{CornerMeasure, DescriptorKind, Descriptors, HarrisFeatures, RatioTest, Suppression};
 use cv_pipeline::{
     AffineSimulation, FeatureMethod, FeatureOptions, Features, MatchingError, MatchingOptions, MatchingResult,
-    ModelKind, match_extracted, match_photos, prevailing_model,
+    ModelKind, PrevailingModel, match_extracted, match_photos, prevailing_model,
 };
 use cv_report::{Figure, MatchStyle, Note, Plot, Report, colors, draw_keypoints, draw_matches, tile_patches};
 use std::path::{Path, PathBuf};
@@ -111,14 +112,18 @@ impl Run for Args {
             }
             None => match_photos(a.view(), b.view(), &options, context),
         };
-        let result = result.map_err(|error| {
-            let path = match &error {
-                MatchingError::Features { index: 2, .. } | MatchingError::NoFeatures { index: 2, .. } => &self.second,
-                _ => &self.first,
-            };
-            Failure::new(error)
-                .advice(format!("look at {}: is it sharp, with texture, and large enough?", path.display()))
-        })?;
+        let result =
+            result.map_err(|error| {
+                let path =
+                    match &error {
+                        MatchingError::Features { index, .. } | MatchingError::NoFeatures { index, .. } => {
+                            if *index == 2 { &self.second } else { &self.first }
+                        }
+                        _ => return words::no_matches(error, [&self.first, &self.second]),
+                    };
+                Failure::new(error)
+                    .advice(format!("look at {}: is it sharp, with texture, and large enough?", path.display()))
+            })?;
         if result.matches.is_empty() {
             return Err(Failure::new(format!(
                 "no feature of {} ({} features) matches one of {} ({})",
@@ -139,18 +144,32 @@ impl Run for Args {
             let scores: Vec<f64> = result.matches.iter().map(|m| f64::from(m.ratio)).collect();
             cv_io::write_matches(path, &result.pairs(), Some(&scores))?;
         }
-        context.report(|| self.html([&a, &b], &result, options.seed, context))?;
+        let agreed = prevailing_model(&result.pairs(), options.seed, context)?;
+        if agreed.is_none() {
+            context.warn(format!(
+                "no homography and no fundamental matrix explains more of the {} matches than chance would: do the photographs show the same things?",
+                result.matches.len()
+            ));
+        }
+        context.report(|| self.html([&a, &b], &result, agreed.as_ref()))?;
+        let share = agreed.as_ref().map_or_else(String::new, |model| {
+            format!(", {} of which agree on a {}", model.robust.inliers.len(), model_words(model.kind))
+        });
+        let unsaved = self.output.is_none() && self.save_features.is_none() && !context.wants_report();
+        let unsaved = if unsaved { "; nothing was written (-o FILE)" } else { "" };
         let counts = result.features.each_ref().map(|f| f.keypoints.len());
         let dropped = result.features.each_ref().map(|f| f.dropped.len());
         Ok(Outcome::new(result.stages)
             .with("matches", result.matches.len())
+            .with("model", agreed.as_ref().map(|model| model.kind.name()))
+            .with("agree", agreed.as_ref().map_or(0, |model| model.robust.inliers.len()))
             .with("features", counts)
             .with("found", result.features.each_ref().map(|f| f.found()))
             .with("dropped", dropped)
             .with("method", if self.load_features.is_some() { "loaded" } else { self.features.name() })
             .with("beyond_limit", result.features.each_ref().map(|f| f.beyond_limit))
             .summary(format!(
-                "{} matches between {} and {} features ({} and {} points left out near the border or on flat patches)",
+                "{} matches{share}, between {} and {} features ({} and {} points left out near the border or on flat patches){unsaved}",
                 result.matches.len(),
                 counts[0],
                 counts[1],
@@ -165,8 +184,7 @@ impl Args {
         &self,
         [a, b]: [&RgbU8; 2],
         result: &MatchingResult,
-        seed: u64,
-        context: &Context,
+        agreed: Option<&PrevailingModel>,
     ) -> Result<String, Failure> {
         let picture = |image: RgbU8, caption: &str| -> Result<Figure, Failure> {
             Ok(Figure::new(cv_io::encode_jpeg(image.view(), 88).during("cannot encode a picture")?, caption))
@@ -175,12 +193,9 @@ impl Args {
         report.subtitle(&format!("{} and {}", self.first.display(), self.second.display()));
         let pairs = result.pairs();
         let mut inliers = vec![false; pairs.len()];
-        let model = prevailing_model(&pairs, seed, context)?.map(|found| {
+        let model = agreed.map(|found| {
             found.robust.inliers.iter().for_each(|&i| inliers[i] = true);
-            match found.kind {
-                ModelKind::Homography => "homography",
-                ModelKind::Fundamental => "fundamental matrix",
-            }
+            model_words(found.kind)
         });
         report
             .headline("matches", &pairs.len().to_string())
@@ -235,6 +250,13 @@ impl Args {
         }
         statistics(&mut report, result);
         Ok(report.to_html())
+    }
+}
+
+fn model_words(kind: ModelKind) -> &'static str {
+    match kind {
+        ModelKind::Homography => "homography",
+        ModelKind::Fundamental => "fundamental matrix",
     }
 }
 

@@ -1,7 +1,7 @@
 //! The number of false alarms of a model (a contrario): whether more data fit it than would fit some model if all were wrong.
 
 use super::quality::Quality;
-use super::{Estimator, RansacData, Scorer};
+use super::{Estimator, MOST_FALSE_ALARMS, RansacData, Scorer};
 use crate::match_blocks::LANES;
 
 /// Wrong data that are looked at: enough for nearly all models, whose support leaves no doubt; and enough to count those of a homography of 3 px in a
@@ -16,7 +16,7 @@ const LEVELS: usize = 7;
 pub(super) struct FalseAlarms {
     /// log₁₀ of the number of false alarms: of models as well supported that are to be expected among so many wrong data.
     pub(super) log_nfa: f64,
-    /// Fewest data within the threshold of which that number would be below one; more than there are where no number of them would do. 0 where it is.
+    /// Fewest data within the threshold of which that number would be small enough; more than there are where no number of them would do. 0 where it is.
     pub(super) needed: usize,
 }
 
@@ -48,13 +48,14 @@ pub(super) fn false_alarms<E: Estimator, C: Scorer>(
             log_false_alarms(n, k, E::SAMPLE, p * half.powi(E::RESIDUAL_DIMENSION)) - (0.5 * half).log10()
         };
         let log_nfa = levels.iter().enumerate().map(|(level, k)| log(*k as usize, level)).fold(f64::INFINITY, f64::min);
-        let needed = || (E::SAMPLE + 1..=n).find(|k| log(*k, 0) < 0.0).unwrap_or(n + 1);
-        (!wrong.is_empty()).then(|| FalseAlarms { log_nfa, needed: if log_nfa < 0.0 { 0 } else { needed() } })
+        let needed = || (E::SAMPLE + 1..=n).find(|k| log(*k, 0) < MOST_FALSE_ALARMS).unwrap_or(n + 1);
+        (!wrong.is_empty())
+            .then(|| FalseAlarms { log_nfa, needed: if log_nfa < MOST_FALSE_ALARMS { 0 } else { needed() } })
     };
     // A first look, at what the count may be at most.
     let [few, many] = WRONG;
     match of(few, 3.0) {
-        Some(found) if found.log_nfa >= 0.0 => of(many, 0.0),
+        Some(found) if found.log_nfa >= MOST_FALSE_ALARMS => of(many, 0.0),
         other => other,
     }
 }

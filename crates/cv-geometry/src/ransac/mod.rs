@@ -20,6 +20,10 @@ use driver::search;
 use false_alarms::false_alarms;
 use quality::Quality;
 
+/// log₁₀ of the number of false alarms from which on a model is refused: of a hundred sets of wrong data, one at the most has a model. Below one, as
+/// usual, would allow one such model in every set.
+const MOST_FALSE_ALARMS: f64 = -2.0;
+
 /// The data of a robust estimation, in blocks for vector units.
 pub trait RansacData: Sync {
     /// [`LANES`] data, coordinate by coordinate; missing data are NaN.
@@ -121,7 +125,7 @@ pub struct Consensus<M> {
     pub score: Score,
     /// Samples drawn.
     pub iterations: usize,
-    /// log₁₀ of the number of false alarms: of models as well supported to be expected of so many data, all wrong; below 0. `None` where the estimator has no
+    /// log₁₀ of the number of false alarms: of models as well supported to be expected of so many data, all wrong; below −2. `None` where the estimator has no
     /// background model ([`RansacData::background`]), or a sample is all there is.
     pub log_nfa: Option<f64>,
 }
@@ -134,7 +138,7 @@ pub struct Consensus<M> {
 ///
 /// # Errors
 /// [`EstimateError::Option`], [`EstimateError::NotEnoughMatches`] with fewer data than a sample has, and
-/// [`EstimateError::NoConsensus`] where the number of false alarms of the best model is not below one; [`EstimateError::Cancelled`].
+/// [`EstimateError::NoConsensus`] where the number of false alarms of the best model is not below a hundredth; [`EstimateError::Cancelled`].
 pub fn ransac<E: Estimator>(
     estimator: &E,
     options: &RobustOptions,
@@ -171,7 +175,7 @@ fn with_scorer<E: Estimator, C: Scorer>(
     let inliers = found.score.inliers as usize;
     let alarms = false_alarms(&quality, &found.model);
     match &alarms {
-        Some(c) if c.log_nfa >= 0.0 => return Err(none(inliers, c.needed, found.iterations)),
+        Some(c) if c.log_nfa >= MOST_FALSE_ALARMS => return Err(none(inliers, c.needed, found.iterations)),
         None if inliers < needed => return Err(none(inliers, needed, found.iterations)),
         _ => {}
     }

@@ -1,5 +1,6 @@
 //! `cv depth` on frames: one pair after the other with the same buffers.
 
+use super::pairing::pair;
 use super::{Args, Range, say_memory};
 use crate::frame::{Context, Explain, Failure, Outcome, expand_images};
 use crate::words;
@@ -9,7 +10,8 @@ use std::path::{Path, PathBuf};
 
 /// True for a folder or a pattern.
 pub(super) fn is_sequence(path: &Path) -> bool {
-    path.is_dir() || (!path.exists() && path.to_string_lossy().contains('*'))
+    let text = path.to_string_lossy();
+    path.is_dir() || (!path.exists() && (text.contains('*') || numbering(&text).is_some()))
 }
 
 /// The frames of a folder or pattern, in the order of their numbers.
@@ -30,8 +32,26 @@ fn frames(path: &Path) -> Result<Vec<PathBuf>, Failure> {
     Ok(found)
 }
 
-/// Whether a name fits a pattern in which `*` stands for anything.
+/// The first number in the manner of C (`%d`, `%04d`) in a pattern: what stands before it, its least number of digits, and
+/// what follows.
+fn numbering(pattern: &str) -> Option<(&str, usize, &str)> {
+    pattern.match_indices('%').find_map(|(at, _)| {
+        let rest = &pattern[at + 1..];
+        let width = rest.find('d')?;
+        let digits = &rest[..width];
+        let width = if digits.is_empty() { 1 } else { digits.parse().ok().filter(|_| digits.starts_with('0'))? };
+        Some((&pattern[..at], width, &rest[digits.len() + 1..]))
+    })
+}
+
+/// Whether a name fits a pattern in which `*` stands for anything and `%04d` for a number of at least four digits.
 fn matches(pattern: &str, name: &str) -> bool {
+    if let Some((head, width, rest)) = numbering(pattern).filter(|(head, ..)| !head.contains('*')) {
+        return name.strip_prefix(head).is_some_and(|name| {
+            let digits = name.len() - name.trim_start_matches(|c: char| c.is_ascii_digit()).len();
+            (width..=digits).any(|n| matches(rest, &name[n..]))
+        });
+    }
     match pattern.split_once('*') {
         None => pattern == name,
         Some((head, rest)) => name.strip_prefix(head).is_some_and(|name| {
@@ -62,19 +82,16 @@ impl Args {
                 .advice("leave out --rig, --depth, --cloud, --confidence, --matched, --uncertainty and --report, and give the number of disparities"));
         }
         let (lefts, rights) = (frames(&self.left)?, frames(&self.right)?);
-        if lefts.len() != rights.len() {
-            return Err(Failure::new(format!("{} left frames and {} right ones", lefts.len(), rights.len()))
-                .advice("give as many of each"));
-        }
+        let pairs = pair(&lefts, &rights, self.pair_by)?;
         if self.output.exists() && !self.output.is_dir() {
             return Err(Failure::new(format!("{} is not a folder", self.output.display()))
                 .advice("give a folder for the disparities of the frames"));
         }
         let options = self.options().stereo;
         let mut film = FrameDepth::new(options.clone())?;
-        let (mut size, mut seconds, mut valid) = ((0, 0), 0.0, 0.0);
-        let stage = Stage::new(context, "frames", lefts.len())?;
-        for (i, (left, right)) in lefts.iter().zip(&rights).enumerate() {
+        let (mut size, mut seconds, mut valid, mut matched) = ((0, 0), 0.0, 0.0, 0.0);
+        let stage = Stage::new(context, "frames", pairs.len())?;
+        for (i, (left, right)) in pairs.iter().enumerate() {
             let (a, b) = (cv_io::read_rgb(left)?, cv_io::read_rgb(right)?);
             if a.size() != size {
                 size = a.size();
@@ -86,7 +103,8 @@ impl Args {
                 .map_err(|error| words::no_depth(error, false))
                 .during(left.display())?;
             seconds += start.elapsed().as_secs_f64();
-            valid += map.valid_fraction() / lefts.len() as f64;
+            valid += map.valid_fraction() / pairs.len() as f64;
+            matched += map.matched_fraction() / pairs.len() as f64;
             if i == 0 {
                 // Not before there is something to put there.
                 std::fs::create_dir_all(&self.output).during(self.output.display())?;
@@ -95,14 +113,37 @@ impl Args {
             cv_io::pfm::write(self.output.join(name), map.disparity.view())?;
             stage.add(1)?;
         }
-        let rate = lefts.len() as f64 / seconds;
+        let rate = pairs.len() as f64 / seconds;
         let (width, height) = size;
         Ok(Outcome::new(vec![("match", seconds)])
-            .with("frames", lefts.len())
+            .with("frames", pairs.len())
             .with("frames_per_second", rate)
             .with("width", width)
             .with("height", height)
             .with("valid_fraction", valid)
-            .summary(format!("{} frames of {width}×{height} px, {rate:.1} frames per second of matching", lefts.len())))
+            .with("matched_fraction", matched)
+            .summary(format!(
+                "{} frames of {width}×{height} px, {:.1} % matched and confirmed, {rate:.1} frames per second of matching",
+                pairs.len(),
+                100.0 * matched
+            )))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn patterns_are_those_of_a_shell_and_of_c() {
+        let fits = |pattern: &str, names: &[&str]| names.iter().map(|name| matches(pattern, name)).collect::<Vec<_>>();
+        assert_eq!(fits("f*.png", &["f1.png", "f.png", "g1.png", "f1.jpg"]), [true, true, false, false]);
+        let names = ["frame_0001.png", "frame_12345.png", "frame_001.png", "frame_00x1.png", "frame_0001.png.bak"];
+        assert_eq!(fits("frame_%04d.png", &names), [true, true, false, false, false]);
+        assert_eq!(fits("f%d*.png", &["f7.png", "f7_left.png", "f.png"]), [true, true, false]);
+        assert_eq!(fits("*_%02d.png", &["a_07.png", "a_7.png"]), [true, false]);
+        // Not a number: the name of a file.
+        assert!(!is_sequence(Path::new("100%.png")) && !is_sequence(Path::new("50%4d.png")));
+        assert!(is_sequence(Path::new("nowhere/frame_%04d.png")));
     }
 }

@@ -3,6 +3,7 @@
 mod frames;
 mod maps;
 mod options;
+mod pairing;
 mod photos;
 mod report;
 
@@ -19,6 +20,7 @@ use cv_pipeline::{DepthError, DepthOptions, DepthResult, RigDepthResult, depth, 
 use frames::is_sequence;
 use maps::{map_format, write_map};
 use options::{Range, parse_range};
+use pairing::PairBy;
 use photos::{Photos, at_own_depth};
 use std::path::{Path, PathBuf};
 
@@ -40,13 +42,17 @@ pub(crate) use report::fractions;
     The ending of a file tells its format: .pfm (floats, +inf where unknown), .npy (floats, NaN), .png (disparity as KITTI's\n\
     16-bit PNG, 256 steps a pixel; depth as 16-bit millimeters, where the baseline is in meters or the rig file tells its unit); 0 is unknown in both.")]
 pub(crate) struct Args {
-    /// The left photograph, or a folder or quoted pattern ('left/*.png') of frames.
+    /// The left photograph, or a folder or quoted pattern ('left/*.png', 'left_%04d.png') of frames.
     left: PathBuf,
     /// The right photograph, or as many frames.
     right: PathBuf,
     /// Where to write the disparity: .pfm, .png or .npy; for frames a folder, which gets NAME.pfm of each.
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
+    /// How frames are paired [default: by name where the names are the same, else by number]. Frames without a partner are
+    /// refused.
+    #[arg(long, value_name = "HOW", value_parser = named::<PairBy>())]
+    pair_by: Option<PairBy>,
     /// Where to write the depth, in the unit of the baseline: .pfm, .png or .npy. Needs --rig, or --focal and --baseline.
     #[arg(long, value_name = "FILE")]
     depth: Option<PathBuf>,
@@ -150,6 +156,9 @@ impl Run for Args {
         if is_sequence(&self.left) || is_sequence(&self.right) {
             return self.run_frames(context);
         }
+        if self.pair_by.is_some() {
+            return Err(Failure::usage("--pair-by is for frames, and these are two photographs"));
+        }
         let maps = [Some(&self.output), self.depth.as_ref(), self.confidence.as_ref(), self.uncertainty.as_ref()];
         for path in maps.into_iter().flatten() {
             map_format(path)?;
@@ -201,9 +210,9 @@ impl Run for Args {
             .with("disparities", disparities.1)
             .with("min_disparity", disparities.0)
             .summary(format!(
-                "{width}×{height} px, {:.1} % with a disparity, {:.1} % matched and confirmed",
-                100.0 * valid,
-                100.0 * matched
+                "{width}×{height} px, {:.1} % matched and confirmed, {:.1} % with a disparity",
+                100.0 * matched,
+                100.0 * valid
             )))
     }
 }

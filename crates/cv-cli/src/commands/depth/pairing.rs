@@ -1,0 +1,156 @@
+//! Which frame of the right camera belongs to which of the left one.
+
+use crate::frame::Failure;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// How frames are paired.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum PairBy {
+    Name,
+    Number,
+    Order,
+}
+
+cv_core::named!(PairBy {
+    Name = "name": "frames of the same file name, without its ending",
+    Number = "number": "frames whose names have the same last number: left_0007 and right_0007",
+    Order = "order": "the first with the first and so on, whatever they are called",
+});
+
+/// The pairs of frames, in the order of the left ones. Without `by`, by name where the names are the same and by number
+/// where they are not. A frame without a partner is refused: a pair of frames from two moments gives disparities that look
+/// right and are not.
+pub(super) fn pair(
+    lefts: &[PathBuf],
+    rights: &[PathBuf],
+    by: Option<PairBy>,
+) -> Result<Vec<(PathBuf, PathBuf)>, Failure> {
+    match by {
+        Some(PairBy::Order) => in_order(lefts, rights),
+        Some(PairBy::Name) => by_key(lefts, rights, "name", name),
+        Some(PairBy::Number) => by_key(lefts, rights, "number", number),
+        None => {
+            let named = by_key(lefts, rights, "name", name);
+            // What is wrong with the names is the better reason where there are no numbers.
+            named.or_else(|reason| {
+                let numbered = lefts.iter().chain(rights).all(|frame| number(frame).is_some());
+                if numbered { by_key(lefts, rights, "number", number) } else { Err(reason) }
+            })
+        }
+    }
+}
+
+fn in_order(lefts: &[PathBuf], rights: &[PathBuf]) -> Result<Vec<(PathBuf, PathBuf)>, Failure> {
+    if lefts.len() != rights.len() {
+        return Err(Failure::new(format!("{} left frames and {} right ones", lefts.len(), rights.len()))
+            .advice("give as many of each"));
+    }
+    Ok(lefts.iter().cloned().zip(rights.iter().cloned()).collect())
+}
+
+fn name(frame: &Path) -> Option<String> {
+    Some(frame.file_stem()?.to_string_lossy().into_owned())
+}
+
+/// The last number in the name, without leading zeros.
+fn number(frame: &Path) -> Option<String> {
+    let name = frame.file_stem()?.to_string_lossy().into_owned();
+    let end = name.rfind(|c: char| c.is_ascii_digit())? + 1;
+    let start = name[..end]
+        .rfind(|c: char| !c.is_ascii_digit())
+        .map_or(0, |at| at + name[at..].chars().next().map_or(1, char::len_utf8));
+    let digits = name[start..end].trim_start_matches('0');
+    Some(if digits.is_empty() { "0".to_owned() } else { digits.to_owned() })
+}
+
+fn by_key(
+    lefts: &[PathBuf],
+    rights: &[PathBuf],
+    what: &str,
+    key: impl Fn(&Path) -> Option<String>,
+) -> Result<Vec<(PathBuf, PathBuf)>, Failure> {
+    const ADVICE: &str = "select the frames of the same moments by patterns ('left/frame_00*.png'), or rename them; \
+                          --pair-by order pairs them as they are sorted";
+    let index = |frames: &[PathBuf]| -> Result<BTreeMap<String, PathBuf>, Failure> {
+        let mut found: BTreeMap<String, PathBuf> = BTreeMap::new();
+        for frame in frames {
+            let Some(key) = key(frame) else {
+                return Err(Failure::new(format!("there is no {what} in {}", frame.display())).advice(ADVICE));
+            };
+            if let Some(other) = found.insert(key, frame.clone()) {
+                return Err(Failure::new(format!("{} and {} have the same {what}", other.display(), frame.display()))
+                    .advice(ADVICE));
+            }
+        }
+        Ok(found)
+    };
+    let (left, right) = (index(lefts)?, index(rights)?);
+    let alone = |ours: &BTreeMap<String, PathBuf>, others: &BTreeMap<String, PathBuf>| {
+        ours.iter().filter(|(key, _)| !others.contains_key(*key)).map(|(_, frame)| frame.clone()).collect::<Vec<_>>()
+    };
+    let (left_alone, right_alone) = (alone(&left, &right), alone(&right, &left));
+    if left_alone.is_empty() && right_alone.is_empty() {
+        // In the order of the left ones, which is not that of the keys: numbers are compared as text there.
+        let partner = |frame: &PathBuf| Some((frame.clone(), right.get(&key(frame)?)?.clone()));
+        return Ok(lefts.iter().filter_map(partner).collect());
+    }
+    let list = |side: &str, alone: &[PathBuf]| match alone {
+        [] => None,
+        [one] => Some(format!("{} has no {side} frame of the same {what}", one.display())),
+        [first, .., last] => Some(format!(
+            "{} left without a {side} frame of the same {what}: {} to {}",
+            alone.len(),
+            first.display(),
+            last.display()
+        )),
+    };
+    let reasons: Vec<String> = [list("right", &left_alone), list("left", &right_alone)].into_iter().flatten().collect();
+    Err(Failure::new(format!("{} left and {} right frames: {}", lefts.len(), rights.len(), reasons.join("; ")))
+        .advice(ADVICE))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn paths(names: &[&str]) -> Vec<PathBuf> {
+        names.iter().map(PathBuf::from).collect()
+    }
+
+    fn paired(left: &[&str], right: &[&str], by: Option<PairBy>) -> Result<Vec<(String, String)>, String> {
+        let text = |path: PathBuf| path.display().to_string();
+        pair(&paths(left), &paths(right), by)
+            .map(|pairs| pairs.into_iter().map(|(a, b)| (text(a), text(b))).collect())
+            .map_err(|failure| failure.text())
+    }
+
+    #[test]
+    fn frames_of_the_same_moment_are_paired() {
+        let pairs = |list: &[(&str, &str)]| list.iter().map(|(a, b)| ((*a).into(), (*b).into())).collect::<Vec<_>>();
+        let same = paired(&["l/f2.png", "l/f10.png"], &["r/f10.jpg", "r/f2.jpg"], None).unwrap();
+        assert_eq!(same, pairs(&[("l/f2.png", "r/f2.jpg"), ("l/f10.png", "r/f10.jpg")]));
+        // The names tell the side, the numbers the moment; leading zeros do not matter.
+        let numbered = paired(&["left_0009.png", "left_0010.png"], &["right_9.png", "right_10.png"], None).unwrap();
+        assert_eq!(numbered, pairs(&[("left_0009.png", "right_9.png"), ("left_0010.png", "right_10.png")]));
+        // KITTI's names end in the same number everywhere.
+        let kitti = paired(&["l/000001_10.png", "l/000002_10.png"], &["r/000001_10.png", "r/000002_10.png"], None);
+        assert_eq!(kitti.unwrap().len(), 2);
+        assert_eq!(paired(&["é0.png"], &["ü00.png"], None).unwrap().len(), 1);
+        let ordered = paired(&["a.png", "b.png"], &["x.png", "y.png"], Some(PairBy::Order)).unwrap();
+        assert_eq!(ordered, pairs(&[("a.png", "x.png"), ("b.png", "y.png")]));
+    }
+
+    #[test]
+    fn frames_of_other_moments_are_refused_by_name() {
+        let (left, right) = (["l/f1.png", "l/f2.png", "l/f3.png"], ["r/f2.png", "r/f3.png", "r/f4.png"]);
+        for by in [None, Some(PairBy::Name), Some(PairBy::Number)] {
+            let text = paired(&left, &right, by).unwrap_err();
+            assert!(["l/f1.png", "r/f4.png", "--pair-by order"].iter().all(|part| text.contains(part)), "{text}");
+        }
+        assert!(paired(&["a1.png", "b1.png"], &["c1.png", "d1.png"], None).unwrap_err().contains("same number"));
+        assert!(paired(&["a.png"], &["b.png"], None).unwrap_err().contains("same name"));
+        assert!(paired(&["a.png"], &["b.png"], Some(PairBy::Number)).unwrap_err().contains("no number"));
+        assert!(paired(&["a.png"], &["b.png", "c.png"], Some(PairBy::Order)).is_err());
+    }
+}
