@@ -257,7 +257,11 @@ fn warp_all(
     let shrink = ((1.0 / options.resolution).floor() as usize).max(1);
     let draw = |placement: &Placement, region: Bounds, field: Option<&DisplacementField>| {
         let photo = photos[placement.photo];
-        let correction = ExposureCorrection { gain: gains.gains[placement.photo], vignetting: gains.vignetting };
+        let correction = ExposureCorrection {
+            gain: gains.gains[placement.photo],
+            vignetting: gains.vignetting,
+            white: gains.white(),
+        };
         let settings = WarpSettings { displacement: field, interpolation: options.interpolation, correction };
         if shrink == 1 {
             return warp(photo, placement, &layout.surface, region, settings, &stage);
@@ -461,6 +465,37 @@ mod tests {
             "{:?}",
             panorama.gains
         );
+    }
+
+    #[test]
+    fn exposures_far_apart_neither_darken_the_panorama_nor_gray_its_whites() {
+        let mut set = Set::three();
+        for (photo, factor) in set.photos.iter_mut().zip([2.2_f32, 1.0, 0.45]) {
+            for v in photo.as_mut_slice() {
+                *v = (f32::from(*v) * factor).round() as u8;
+            }
+        }
+        let panorama = set.render(&CompositingOptions { exposure: Exposure::Gain, blend: BlendMode::None, ..plain() });
+        let mean = |sum: f64, n: usize| sum / n as f64;
+        let level = |p: [u8; 3]| p.into_iter().map(f64::from).sum::<f64>() / 3.0;
+        let photos = set
+            .photos
+            .iter()
+            .map(|photo| mean(photo.as_slice().iter().map(|v| f64::from(*v)).sum(), photo.as_slice().len()));
+        let darkest = photos.fold(f64::INFINITY, f64::min);
+        let (mut sum, mut n, mut white) = (0.0, 0, 0);
+        let (w, h) = panorama.image.size();
+        for (x, y) in (0..h).flat_map(|y| (0..w).map(move |x| (x, y))).filter(|&(x, y)| panorama.mask.at(x, y)[0]) {
+            sum += level(panorama.image.at(x, y));
+            n += 1;
+            let truth = sky(&panorama.canvas.ray(Point2::new(x as f64, y as f64)));
+            // Where the first photograph is clipped in all channels, by more than interpolation rings.
+            if panorama.labels.at(x, y)[0] == 0 && truth.iter().all(|v| 2.2 * v > 262.0) {
+                white += 1;
+                assert!(panorama.image.at(x, y).iter().all(|v| *v >= 250), "{x} {y} {:?}", panorama.image.at(x, y));
+            }
+        }
+        assert!(mean(sum, n) >= darkest && white > 100, "{} {darkest} {white}", mean(sum, n));
     }
 
     #[test]

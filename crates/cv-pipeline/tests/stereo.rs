@@ -9,6 +9,7 @@ use cv_core::{Camera, Pose, Silent};
 use cv_stereo::{DisparityMap, PixelState, StereoError, StereoMatcher, StereoOptions};
 use cv_synth::{RenderOptions, Scene, SceneBuilder, StereoPair, Texture, srgb, stereo_pair};
 use nalgebra::Point3;
+use std::sync::LazyLock;
 
 const SEEDS: std::ops::Range<u64> = 0..4;
 
@@ -21,31 +22,45 @@ fn matched(left: &StereoPair, right: &StereoPair) -> DisparityMap {
     StereoMatcher::new(options).unwrap().compute(left.left.image.view(), right.right.image.view(), &Silent).unwrap()
 }
 
-/// A room with a baseline of 20 cm and a table with one of 6 cm, so that both have about 50 px of disparity.
-fn scenes() -> impl Iterator<Item = (String, Scene, f64)> {
-    SEEDS.flat_map(|seed| {
-        [(format!("room {seed}"), Scene::room(seed), 0.2), (format!("table {seed}"), Scene::tabletop(seed), 0.06)]
-    })
+/// A scene seen by a rectified pair.
+struct Seen {
+    name: String,
+    baseline: f64,
+    pair: StereoPair,
+    /// The same at half the light, with noise of its own.
+    darker: StereoPair,
 }
+
+/// A room with a baseline of 20 cm and a table with one of 6 cm, so that both have about 50 px of disparity. Rendered once for all tests.
+static SCENES: LazyLock<Vec<Seen>> = LazyLock::new(|| {
+    let seen = |name: String, scene: Scene, baseline: f64| {
+        let pair =
+            |options: &RenderOptions| stereo_pair(&scene, &camera(), &scene.viewpoint(), baseline, options).unwrap();
+        let options = RenderOptions::default();
+        let dark = RenderOptions { exposure: -1.0, ..options.clone().with_seed(99) };
+        Seen { name, baseline, pair: pair(&options), darker: pair(&dark) }
+    };
+    SEEDS
+        .flat_map(|seed| {
+            [
+                seen(format!("room {seed}"), Scene::room(seed), 0.2),
+                seen(format!("table {seed}"), Scene::tabletop(seed), 0.06),
+            ]
+        })
+        .collect()
+});
 
 #[test]
 fn depth_is_within_five_percent_and_exposure_does_not_matter() {
     // Pixels counted, and good ones.
     let (mut depth, mut exposed) = ([0u32; 2], [0u32; 2]);
-    for (name, scene, baseline) in scenes() {
-        let camera = camera();
-        let pose = scene.viewpoint();
-        let options = RenderOptions::default();
-        let pair = stereo_pair(&scene, &camera, &pose, baseline, &options).unwrap();
-        // The right camera at half the light, with noise of its own.
-        let dark = RenderOptions { exposure: -1.0, ..options.with_seed(99) };
-        let darker = stereo_pair(&scene, &camera, &pose, baseline, &dark).unwrap();
-        let (even, uneven) = (matched(&pair, &pair), matched(&pair, &darker));
+    for Seen { name, baseline, pair, darker } in &*SCENES {
+        let (even, uneven) = (matched(pair, pair), matched(pair, darker));
         let (mut here, mut here_exposed) = ([0u32; 2], [0u32; 2]);
         for (y, x) in (0..480).flat_map(|y| (0..640).map(move |x| (y, x))).filter(|&(y, x)| pair.visible.at(x, y)[0]) {
             let (z, truth) = (pair.left.depth.at(x, y)[0], pair.disparity.at(x, y)[0]);
             if z < 10.0 {
-                let found = (camera.fx * baseline) as f32 / even.disparity.at(x, y)[0];
+                let found = (camera().fx * baseline) as f32 / even.disparity.at(x, y)[0];
                 here[0] += 1;
                 here[1] += u32::from((found - z).abs() <= 0.05 * z);
             }
@@ -73,11 +88,7 @@ fn depth_is_within_five_percent_and_exposure_does_not_matter() {
 fn errors_are_as_large_as_the_stated_uncertainty() {
     // Errors within one and within two standard deviations, of those stated below and above 0.15 px, which halves them.
     let mut counts = [[0u32; 3]; 2];
-    for (name, scene, baseline) in scenes() {
-        let (camera, pose) = (camera(), scene.viewpoint());
-        let pair = stereo_pair(&scene, &camera, &pose, baseline, &RenderOptions::default()).unwrap();
-        let other = RenderOptions { exposure: -1.0, ..RenderOptions::default().with_seed(99) };
-        let other = stereo_pair(&scene, &camera, &pose, baseline, &other).unwrap();
+    for Seen { name, pair, darker: other, .. } in &*SCENES {
         let mut matcher = StereoMatcher::new(StereoOptions { disparities: 96, ..StereoOptions::default() }).unwrap();
         let map = matcher.compute(pair.left.image.view(), other.right.image.view(), &Silent).unwrap();
         let sigma = matcher.uncertainty(&map);
@@ -102,9 +113,8 @@ fn errors_are_as_large_as_the_stated_uncertainty() {
 
 #[test]
 fn strips_of_rows_take_less_memory_and_hardly_change_the_result() {
-    for (name, scene, baseline) in scenes().take(2) {
-        let pair = stereo_pair(&scene, &camera(), &scene.viewpoint(), baseline, &RenderOptions::default()).unwrap();
-        let whole = matched(&pair, &pair);
+    for Seen { name, pair, .. } in SCENES.iter().take(2) {
+        let whole = matched(pair, pair);
         let options = StereoOptions { disparities: 96, ..StereoOptions::default() };
         let all = StereoMatcher::new(options.clone()).unwrap().memory(640, 480);
         let mut matcher =

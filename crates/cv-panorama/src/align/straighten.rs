@@ -2,30 +2,33 @@
 
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
-/// How surely photographers hold the camera: the variance of roll over that of pitch. People level the picture's sides to a degree
-/// or two but tilt it up and down by fifteen; (1.5° / 15°)².
-const ROLL_TO_PITCH: f64 = 0.01;
+/// Standard deviation of the roll of a photograph: people level its sides to a degree or two. In radians, as the sines that are compared.
+const ROLL: f64 = 1.5 * std::f64::consts::PI / 180.0;
+/// That of its pitch: they tilt the camera up and down.
+const PITCH: f64 = 15.0 * std::f64::consts::PI / 180.0;
+/// Deviations of the roll up to which a photograph counts as held level: beyond, it was taken on its side or aslant and tells nothing of the horizon. Less
+/// than what a view straight up or down costs (1 / 0.26² = 15 for its pitch), or one photograph on its side would turn another's optical axis upright.
+const LEVEL: f64 = 3.5;
+/// Pairs of photographs whose common horizon is tried at the most.
+const MOST_PAIRS: usize = 2000;
 
 /// The rotation of the world after which the panorama is level, the right side up and centered on the Z axis (Brown & Lowe 2007, §5).
 ///
-/// `rotations` are world to camera. Their horizontal axes should all lie in the horizon's plane, so its normal, "up", is the
+/// `rotations` are world to camera. The horizontal axes of photographs that were held level lie in the horizon's plane, so its normal, "up", is the
 /// direction in which they vary least. Where they all agree (a camera tilted straight up and down, or hardly turned) that leaves a
-/// choice, which the views' own middle decides: `up` minimizes `Σ (x_i·u)² + 0.01 Σ (z_i·u)²`.
+/// choice, which the views' own middle decides: `up` minimizes `Σ min((x_i·u)² / σ_r², 3.5²) + Σ (z_i·u)² / σ_p²`. The truncation leaves out photographs on
+/// their side. O(n) hypotheses of two photographs each, O(n²) altogether, up to a bound.
 ///
 /// The answer `S` is to be applied as `R_i ← R_i Sᵀ`: `S` takes old world directions to new ones.
 pub(crate) fn straighten(rotations: &[Matrix3<f64>]) -> Matrix3<f64> {
-    let mut spread = Matrix3::zeros();
-    let (mut down, mut ahead) = (Vector3::zeros(), Vector3::zeros());
-    for r in rotations {
-        // Rows of a world-to-camera rotation are the camera's axes in the world.
-        let (x, y, z) = (r.row(0).transpose(), r.row(1).transpose(), r.row(2).transpose());
-        spread += x * x.transpose() + ROLL_TO_PITCH * z * z.transpose();
-        down += y;
-        ahead += z;
-    }
-    let eigen = spread.symmetric_eigen();
-    let least = eigen.eigenvalues.imin();
-    let mut y: Vector3<f64> = eigen.eigenvectors.column(least).into_owned();
+    let level_ones = level_photographs(rotations);
+    let mut y = normal(level_ones.iter().map(|&i| &rotations[i]));
+    // Rows of a world-to-camera rotation are the camera's axes in the world.
+    let sum = |axis: usize, of: &mut dyn Iterator<Item = &Matrix3<f64>>| -> Vector3<f64> {
+        of.map(|r| r.row(axis).transpose()).sum()
+    };
+    let down = sum(1, &mut level_ones.iter().map(|&i| &rotations[i]));
+    let ahead = sum(2, &mut rotations.iter());
     if y.dot(&down) < 0.0 {
         y = -y;
     }
@@ -35,6 +38,56 @@ pub(crate) fn straighten(rotations: &[Matrix3<f64>]) -> Matrix3<f64> {
         .unwrap_or_else(|| level(&Vector3::x(), &y).unwrap_or_else(Vector3::z));
     let x = y.cross(&z);
     Matrix3::from_rows(&[x.transpose(), y.transpose(), z.transpose()])
+}
+
+/// The vertical of some photographs, up or down, as if all were held level.
+fn normal<'a>(rotations: impl Iterator<Item = &'a Matrix3<f64>>) -> Vector3<f64> {
+    let mut spread = Matrix3::zeros();
+    for r in rotations {
+        let (x, z) = (r.row(0).transpose(), r.row(2).transpose());
+        spread += x * x.transpose() + (ROLL / PITCH).powi(2) * z * z.transpose();
+    }
+    let eigen = spread.symmetric_eigen();
+    eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned()
+}
+
+/// The photographs that were held level: most of them, and those that agree best where they do not all agree.
+fn level_photographs(rotations: &[Matrix3<f64>]) -> Vec<usize> {
+    let n = rotations.len();
+    let roll = |r: &Matrix3<f64>, u: &Vector3<f64>| (r.row(0).transpose().dot(u) / ROLL).powi(2);
+    let cost = |u: &Vector3<f64>| -> f64 {
+        let pitch = |r: &Matrix3<f64>| (r.row(2).transpose().dot(u) / PITCH).powi(2);
+        rotations.iter().map(|r| roll(r, u).min(LEVEL * LEVEL) + pitch(r)).sum()
+    };
+    let level =
+        |u: &Vector3<f64>| -> Vec<usize> { (0..n).filter(|&i| roll(&rotations[i], u) < LEVEL * LEVEL).collect() };
+    let mut best = normal(rotations.iter());
+    let mut least = cost(&best);
+    // The first of equals: where all are level, all of them say where the horizon is.
+    let mut consider = |u: Vector3<f64>| {
+        let cost = cost(&u);
+        if cost < least * (1.0 - 1e-9) {
+            (best, least) = (u, cost);
+        }
+    };
+    let stride = (n * n.saturating_sub(1) / 2).div_ceil(MOST_PAIRS).max(1);
+    let pairs = (0..n).flat_map(|i| (i..n).map(move |j| (i, j)));
+    for (_, (i, j)) in pairs.enumerate().filter(|(k, (i, j))| i == j || k % stride == 0) {
+        consider(normal([&rotations[i], &rotations[j]].into_iter()));
+    }
+    // All that agree with the best hypothesis have a say.
+    for _ in 0..4 {
+        let refined = normal(level(&best).iter().map(|&i| &rotations[i]));
+        let cost = cost(&refined);
+        if cost >= least {
+            break;
+        }
+        (best, least) = (refined, cost);
+    }
+    match level(&best) {
+        none if none.is_empty() => (0..n).collect(),
+        some => some,
+    }
 }
 
 /// The part of `v` at right angles to `y`, of unit length.
@@ -89,6 +142,29 @@ mod tests {
         for (r, truth) in result.iter().zip(&cameras) {
             // Symmetric about the horizon: exact but for rounding in the eigenvectors.
             assert!((r - truth).norm() < 1e-7, "{r} {truth}");
+        }
+    }
+
+    #[test]
+    fn photographs_on_their_side_tell_nothing_of_the_horizon() {
+        use std::f64::consts::FRAC_PI_2;
+        let degrees = |angle: f64| angle * std::f64::consts::PI / 180.0;
+        for odd in [FRAC_PI_2, -FRAC_PI_2, degrees(30.0), degrees(-30.0), 2.0 * FRAC_PI_2] {
+            for (count, turned) in [(2, 1), (3, 0), (3, 1), (5, 4), (9, 3)] {
+                // A little roll in the others, as hands have it.
+                let roll = |k: usize| if k == turned { odd } else { 0.012 * [1.0, -1.0, 0.5][k % 3] };
+                let yaw = |k: usize| 0.35 * k as f64;
+                let cameras: Vec<_> = (0..count).map(|k| camera(0.05, yaw(k), roll(k))).collect();
+                let tilt = Rotation3::new(Vector3::new(0.4, -0.3, 1.1));
+                let result = straightened(&cameras, &tilt);
+                // Two horizons 0.35 rad apart whose rolls differ by 0.024 cross 0.024 / sin 0.35 = 0.07 rad off; a single level photograph has its pitch of
+                // 0.05 besides.
+                let world: Vec<_> = result.iter().zip(&cameras).map(|(r, truth)| r.transpose() * truth).collect();
+                for w in &world {
+                    let down = (w * Vector3::y()).y;
+                    assert!(down > 0.07_f64.cos(), "{odd} {count} {turned}: {}", down.acos());
+                }
+            }
         }
     }
 

@@ -31,6 +31,12 @@ pub struct Gains {
 }
 
 impl Gains {
+    /// The level that becomes white, 255 or more: the brightest that a photograph's own white comes to. What a gain lifts above 255 is compressed, not
+    /// cut off: the photographs that are brightened are often those with the brightest things in them.
+    pub(crate) fn white(&self) -> f32 {
+        255.0 * self.gains.iter().flatten().copied().fold(1.0, f32::max)
+    }
+
     pub(crate) fn none(photos: usize) -> Self {
         Self { gains: vec![[1.0; 3]; photos], vignetting: [0.0; 2] }
     }
@@ -95,43 +101,7 @@ pub(crate) fn estimate_gains(
             gain[channel] = log.clamp(-2.0, 2.0).exp() as f32;
         }
     }
-    limit_clipping(preview, photo_of, &mut gains);
     Ok(gains)
-}
-
-/// Darkens all photographs alike until hardly any pixel is clipped that was not before: a gain brightens the darkest photographs, which are often those with
-/// the brightest things in them.
-fn limit_clipping(preview: &Preview, photo_of: &[usize], gains: &mut Gains) {
-    /// Share of the pixels that may be clipped.
-    const CLIPPED: usize = 50;
-    /// Never darker than this: a panorama is not ruined for one bright window.
-    const DARKEST: f32 = 0.6;
-    // How far each pixel lies over white, as a histogram of ratios from 1 to 1 / DARKEST.
-    let mut over = [0_usize; 64];
-    let mut total = 0;
-    let bin_of = |ratio: f32| (((ratio - 1.0) / (1.0 / DARKEST - 1.0) * 64.0) as usize).min(63);
-    for (piece, photo) in preview.pieces.iter().zip(photo_of) {
-        let gain = gains.gains[*photo];
-        for p in piece.warped.pixels.pixels().step_by(7).filter(|p| p[3] > 0) {
-            total += 1;
-            let before = p[0].max(p[1]).max(p[2]);
-            let after = (0..3).map(|c| gain[c] * f32::from(p[c]) / 255.0).fold(0.0, f32::max);
-            if before < 250 && after > 1.0 {
-                over[bin_of(after)] += 1;
-            }
-        }
-    }
-    let mut clipped = 0;
-    for (bin, count) in over.iter().enumerate().rev() {
-        clipped += count;
-        if clipped * CLIPPED > total {
-            let ratio = 1.0 + (bin + 1) as f32 / 64.0 * (1.0 / DARKEST - 1.0);
-            for gain in gains.gains.iter_mut().flatten() {
-                *gain /= ratio;
-            }
-            return;
-        }
-    }
 }
 
 fn samples(preview: &Preview, photo_of: &[usize], stage: &Stage<'_>) -> Result<Vec<Sample>, Cancelled> {
@@ -250,6 +220,7 @@ mod tests {
                 assert!((f64::from(gain[c]) * factor[c] / common - 1.0).abs() < 0.01, "{:?}", found.gains);
             }
         }
+        assert_eq!(found.white(), 255.0 * found.gains.iter().flatten().copied().fold(1.0, f32::max));
         // The common factor stays where the photographs' own mean is.
         let product: f32 = found.gains.iter().map(|g| g[0]).product();
         assert!((product - 1.0).abs() < 0.02, "{product}");
@@ -284,23 +255,5 @@ mod tests {
         for i in 0..4 {
             assert!((solution[i] - logs[i]).abs() < 1e-3, "{solution}");
         }
-    }
-
-    #[test]
-    fn what_would_be_clipped_darkens_all_alike() {
-        let mut bright = preview(&[[1.0; 3]; 3], 0.0, false);
-        for p in &mut bright.pieces[1].warped.pixels.as_mut_slice().as_chunks_mut::<4>().0[..1200] {
-            *p = [230, 230, 230, 255];
-        }
-        let mut gains = Gains { gains: vec![[1.0; 3], [1.3; 3], [0.9; 3]], vignetting: [0.0; 2] };
-        limit_clipping(&bright, &[0, 1, 2], &mut gains);
-        // 230 · 1.3 = 299 is 1.17 times white; a bin of the histogram is 0.0104 wide.
-        let ratio = 1.3 / gains.gains[1][0];
-        assert!((1.172..1.195).contains(&ratio), "{ratio}");
-        assert!((gains.gains[0][0] - 1.0 / ratio).abs() < 1e-6 && (gains.gains[2][2] - 0.9 / ratio).abs() < 1e-6);
-        // A handful of such pixels does not.
-        let mut few = gains.clone();
-        limit_clipping(&preview(&[[1.0; 3]; 3], 0.0, false), &[0, 1, 2], &mut few);
-        assert_eq!(few, gains);
     }
 }

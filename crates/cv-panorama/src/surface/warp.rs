@@ -44,10 +44,37 @@ impl WarpedPhoto {
 pub(crate) struct ExposureCorrection {
     pub(crate) gain: [f32; 3],
     pub(crate) vignetting: [f32; 2],
+    /// The product that becomes white, 255 or more: the same for all photographs of a panorama.
+    pub(crate) white: f32,
 }
 
 impl ExposureCorrection {
-    pub(crate) const NONE: Self = Self { gain: [1.0; 3], vignetting: [0.0; 2] };
+    pub(crate) const NONE: Self = Self { gain: [1.0; 3], vignetting: [0.0; 2], white: 255.0 };
+
+    /// The products of gains and a color as levels.
+    ///
+    /// Below the knee they stay; from there to `white` they are compressed to 255 by a rational curve with a continuous slope (Reinhard et al., "Photographic
+    /// tone reproduction for digital images", 2002, with a straight part). A color whose channels were all clipped is a bound, not a measurement: it
+    /// stays white whatever its gain.
+    #[inline(always)]
+    fn levels(&self, color: [f32; 3], product: [f32; 3]) -> [f32; 3] {
+        const KNEE: f32 = 190.0;
+        /// Smallest channel from which on a color counts as clipped, more and more up to the second.
+        const CLIPPED: [f32; 2] = [235.0, 252.0];
+        let brightest = product[0].max(product[1]).max(product[2]);
+        let least = color[0].min(color[1]).min(color[2]);
+        if self.white <= 255.0 && brightest <= 255.0 && least < CLIPPED[0] || brightest <= KNEE && least < CLIPPED[0] {
+            return product;
+        }
+        let a = (self.white - KNEE) / (255.0 - KNEE);
+        let share = ((least - CLIPPED[0]) / (CLIPPED[1] - CLIPPED[0])).clamp(0.0, 1.0);
+        let clipped = share * share * (3.0 - 2.0 * share);
+        product.map(|s| {
+            let t = ((s - KNEE) / (self.white - KNEE)).clamp(0.0, 1.0);
+            let tone = if s <= KNEE { s } else { KNEE + (255.0 - KNEE) * a * t / (1.0 + (a - 1.0) * t) };
+            tone + clipped * (255.0 - tone)
+        })
+    }
 }
 
 /// How a photograph is drawn.
@@ -227,8 +254,9 @@ fn sample_row(
             let lift = (r2 * (correction.vignetting[0] + r2 * correction.vignetting[1])).exp();
             gain = gain.map(|g| g * lift);
         }
-        let [r, g, b] = sample(photo, u, v);
-        *pixel = [round(gain[0] * r), round(gain[1] * g), round(gain[2] * b), if inside { 255 } else { 0 }];
+        let color = sample(photo, u, v);
+        let [r, g, b] = correction.levels(color, [gain[0] * color[0], gain[1] * color[1], gain[2] * color[2]]);
+        *pixel = [round(r), round(g), round(b), if inside { 255 } else { 0 }];
     }
 }
 
@@ -385,6 +413,26 @@ mod tests {
     }
 
     #[test]
+    fn tones_rise_keep_what_is_dark_and_reach_white() {
+        for (gain, white) in [(0.4, 255.0), (1.0, 255.0), (0.5, 459.0), (1.0, 459.0), (1.8, 459.0)] {
+            let correction = ExposureCorrection { gain: [gain; 3], white, ..ExposureCorrection::NONE };
+            let tone = |v: u16| correction.levels([f32::from(v); 3], [gain * f32::from(v); 3])[0];
+            for v in 0..255 {
+                // A curve of slope gain or less, but for the last levels, which go to white.
+                let (here, next) = (tone(v), tone(v + 1));
+                assert!(next > here || v >= 252 && here == 255.0, "{gain} {white} {v}: {here} {next}");
+                let product = gain * f32::from(v);
+                assert!(v >= 235 || product > 190.0 || here == product, "{gain} {white} {v}: {here}");
+            }
+            // Clipped stays clipped.
+            assert!((tone(255) - 255.0).abs() < 1e-3 && tone(0) == 0.0, "{gain} {white}: {}", tone(255));
+        }
+        // A saturated color is no white.
+        let dim = ExposureCorrection { gain: [0.5; 3], ..ExposureCorrection::NONE };
+        assert_eq!(dim.levels([255.0, 120.0, 0.0], [127.5, 60.0, 0.0]), [127.5, 60.0, 0.0]);
+    }
+
+    #[test]
     fn every_pixel_is_the_plain_sample_at_the_displaced_position_corrected() {
         let photo = RgbU8::from_fn(97, 73, |x, y| {
             let noise = |k: usize| ((x * 7919 + y * 104_729 + k * 1299) % 251) as u8;
@@ -398,7 +446,7 @@ mod tests {
             *d = cv_core::Vector2::new(0.7 * (i as f64 * 0.9).sin(), 0.6 * (i as f64 * 1.7).cos());
         }
         field.update_source_shift(&p, &surface);
-        let correction = ExposureCorrection { gain: [0.8, 1.2, 1.5], vignetting: [0.2, 0.1] };
+        let correction = ExposureCorrection { gain: [0.6, 0.7, 0.5], vignetting: [0.2, 0.1], white: 255.0 };
         let settings = WarpSettings { displacement: Some(&field), correction, ..PLAIN };
         let warped = warp(photo.view(), &p, &surface, bounds, settings, &stage()).unwrap();
         let mut seen = 0;
