@@ -201,6 +201,12 @@ impl Run for Args {
         }
         context.report(|| report::report(&job))?;
         let (valid, matched) = (map.valid_fraction(), map.matched_fraction());
+        if job.maps.is_mostly_filled() {
+            context.warn(format!(
+                "only {:.1} % of the pixels were matched; the others are filled in from around, and of such pixels about four in ten are wrong (--no-fill leaves them unknown)",
+                100.0 * matched
+            ));
+        }
         let (width, height) = map.disparity.size();
         Ok(Outcome::new(job.maps.stages.clone())
             .with("width", width)

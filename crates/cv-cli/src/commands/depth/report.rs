@@ -27,8 +27,14 @@ pub(super) fn report(job: &RigDepthResult) -> Result<String, Failure> {
     let mut page = Report::new("Depth");
     let (width, height) = map.disparity.size();
     page.headline("size", &format!("{width}×{height}"))
-        .headline("with a disparity", &format!("{:.1} %", 100.0 * map.valid_fraction()))
-        .headline("matched and confirmed", &format!("{:.1} %", 100.0 * map.matched_fraction()));
+        .headline("matched and confirmed", &format!("{:.1} %", 100.0 * map.matched_fraction()))
+        .headline("with a disparity", &format!("{:.1} %", 100.0 * map.valid_fraction()));
+    if maps.is_mostly_filled() {
+        page.note(
+            Note::Warning,
+            "Most of this map is not matched but filled in from around; of such pixels about four in ten are wrong.",
+        );
+    }
     page.section("Photographs")
         .figures(vec![Figure::new(png(left)?, "Left photograph."), Figure::new(png(right)?, "Right photograph.")]);
     page.section("Disparity").figures(vec![
