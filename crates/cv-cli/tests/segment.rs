@@ -46,6 +46,24 @@ fn trained_predicted_and_scored() {
     let share = found["images"][0]["fraction"].as_f64().unwrap();
     assert!((share - 616.0 / 6144.0).abs() < 0.01, "{share}");
     assert_eq!(cv_io::read_mask(folder.join("new/found/p0_mask.png")).unwrap().size(), (96, 64));
+    // A disc of radius 14 around (40, 30), without a part of its border.
+    let object = &found["images"][0];
+    assert_eq!(object["found"], true);
+    let number = |value: &serde_json::Value| value.as_f64().unwrap();
+    assert!(number(&object["score"]) > 0.5, "{object}");
+    for (key, i, truth, tolerance) in [
+        ("center", 0, 40.0, 0.5),
+        ("center", 1, 30.0, 0.5),
+        ("axes", 0, 14.0, 1.0),
+        ("axes", 1, 14.0, 1.0),
+        ("box", 0, 27.0, 1.0),
+        ("box", 1, 17.0, 1.0),
+        ("box", 2, 27.0, 2.0),
+        ("box", 3, 27.0, 2.0),
+    ] {
+        assert!((number(&object[key][i]) - truth).abs() <= tolerance, "{key} {i}: {object}");
+    }
+    assert!((number(&object["area"]) - 616.0).abs() < 60.0 && object["angle"].is_number(), "{object}");
     // The same model at any number of threads.
     done(folder, &["segment", "train", "--images", "train", "--masks", "train", "--model", "n.json", "--threads", "1"]);
     assert_eq!(fs::read(folder.join("m.json")).unwrap(), fs::read(folder.join("n.json")).unwrap());
@@ -102,4 +120,46 @@ fn bad_models_and_arguments_are_refused() {
     }
     assert_eq!(fs::read(folder.join("test/p0_mask.png")).unwrap(), drawn);
     refused(folder, &["segment", "predict", "--model", "m.json", "test/p0.png", "train/p0.png", "--out", "f"]);
+}
+
+#[test]
+fn another_shape_of_the_color_is_not_found() {
+    let discs = discs();
+    let folder = discs.path();
+    done(folder, &["segment", "train", "--images", "train", "--masks", "train", "--model", "m.json"]);
+    // A bar of the disc's color, 48 by 8 pixels, and nothing.
+    let scene = |bar: bool| {
+        RgbU8::from_fn(96, 64, |x, y| {
+            let shade = ((x * 7 + y * 13) % 19) as u8;
+            let inside = bar && (24..72).contains(&x) && (28..36).contains(&y);
+            if inside { [225, 100 + shade, 20 + shade] } else { [90 + shade; 3] }
+        })
+    };
+    cv_io::write_png(folder.join("bar.png"), scene(true).view()).unwrap();
+    cv_io::write_png(folder.join("none.png"), scene(false).view()).unwrap();
+    let predict = ["segment", "predict", "--model", "m.json", "bar.png", "none.png"];
+    let found = json(folder, &[&predict[..], &["--out", "f", "--report", "r"]].concat());
+    let [bar, none] = [0, 1].map(|i| &found["images"][i]);
+    assert!(bar["found"] == false && bar["score"].as_f64().unwrap() < 1e-3 && bar["box"].is_null(), "{bar}");
+    assert!(bar["fraction"] == 0.0 && bar["objects"][0]["axis_ratio"].as_f64().unwrap() < 0.25, "{bar}");
+    assert!(none["found"] == false && none["score"].is_null() && none["objects"].as_array().unwrap().is_empty());
+    let mask = cv_io::read_mask(folder.join("f/bar_mask.png")).unwrap();
+    assert!(mask.as_slice().iter().all(|&m| !m));
+    assert!(fs::read_to_string(folder.join("r/report.html")).unwrap().contains("not found"));
+    let ran = done(folder, &[&predict[..], &["--out", "g"]].concat());
+    assert!(ran.stderr.contains("found in 0") && ran.stderr.contains("bar.png"), "{}", ran.stderr);
+    let all = json(folder, &[&predict[..], &["--out", "h", "--min-score", "0"]].concat());
+    assert!(all["images"][0]["found"] == true && all["images"][1]["found"] == false, "{all}");
+    for wrong in ["-1", "1.5", "nan"] {
+        let least = format!("--min-score={wrong}");
+        assert_eq!(run(folder, &[&predict[..], &["--out", "i", &least]].concat()).code, Some(2), "{wrong}");
+    }
+    // A model of before there were statistics of objects: no score, everything marked is found.
+    let text = fs::read_to_string(folder.join("m.json")).unwrap();
+    let mut model: serde_json::Value = serde_json::from_str(&text).unwrap();
+    assert!(model.as_object_mut().unwrap().remove("objects").is_some());
+    fs::write(folder.join("m.json"), model.to_string()).unwrap();
+    let old = json(folder, &[&predict[..], &["--out", "j"]].concat());
+    let bar = &old["images"][0];
+    assert!(bar["found"] == true && bar["score"].is_null() && bar["fraction"].as_f64().unwrap() > 0.05, "{bar}");
 }

@@ -84,7 +84,7 @@ pub use reconstruct::{
 };
 pub use rectify::{RectifyResult, rectify};
 pub use rig_depth::{RigDepthResult, depth_by_rig};
-pub use segment::{SegmentResult, SegmentTraining, segment, train_segment};
+pub use segment::{DetectResult, SegmentResult, SegmentTraining, detect, segment, train_segment};
 
 /// What a caller of [`depth()`] needs of the stereo stage: its options and results, rectification, geometry and scores.
 pub mod stereo {
@@ -99,7 +99,9 @@ pub mod stereo {
 /// What a caller of [`train_segment`] and [`segment()`] needs of the color models: options, model, scores.
 pub mod segmentation {
     pub use cv_segment::{
-        Cleanup, ColorModel, ColorSpace, ConfusionMatrix, Labeled, Regions, Rule, SegmentError, TrainOptions, Trained,
+        Cleanup, ColorModel, ColorSpace, ConfusionMatrix, DetectOptions, Detection, Detections, FeatureStatistics,
+        Labeled, MIN_SCORE, ObjectStatistics, Region, Regions, Rule, SegmentError, ShapeStatistics, TrainOptions,
+        Trained,
     };
 }
 

@@ -2,7 +2,7 @@
 
 use crate::Progress;
 use cv_core::{Cancelled, ImageView, Mask, StageClock};
-use cv_segment::{ColorModel, Labeled, SegmentError, TrainOptions, Trained, train};
+use cv_segment::{ColorModel, DetectOptions, Detection, Labeled, SegmentError, TrainOptions, Trained, train};
 
 /// What [`train_segment`] learned.
 #[derive(Debug, Clone, PartialEq)]
@@ -20,6 +20,19 @@ pub struct SegmentResult {
     pub mask: Mask,
     /// The share of the photograph's pixels that are marked, 0 to 1; 0 for an empty photograph.
     pub fraction: f64,
+    /// Stage names and their seconds.
+    pub stages: Vec<(&'static str, f64)>,
+}
+
+/// What [`detect`] found in a photograph.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DetectResult {
+    /// Where the found objects are; false everywhere where none is.
+    pub mask: Mask,
+    /// The share of the photograph's pixels that are marked, 0 to 1; 0 for an empty photograph.
+    pub fraction: f64,
+    /// The regions in the object's color, found or not, the best score first.
+    pub objects: Vec<Detection>,
     /// Stage names and their seconds.
     pub stages: Vec<(&'static str, f64)>,
 }
@@ -58,6 +71,31 @@ pub fn segment(
     Ok(SegmentResult { mask, fraction, stages: clock.into_stages() })
 }
 
+/// Finds the object in a photograph: the regions that [`segment`] marks, each measured and scored by its agreement with the training objects in color and
+/// shape. What scores too low is not marked.
+///
+/// # Errors
+/// [`SegmentError`]: an option out of range, or stopped.
+pub fn detect(
+    photo: ImageView<'_, u8, 3>,
+    model: &ColorModel,
+    options: &DetectOptions,
+    progress: &dyn Progress,
+) -> Result<DetectResult, SegmentError> {
+    options.validate()?;
+    let mut clock = StageClock::new();
+    let score = model.score(photo, progress)?;
+    let raw = model.mark(score.view());
+    clock.lap("classify");
+    let cleaned = model.cleanup().apply(raw.view(), progress)?;
+    clock.lap("clean up");
+    let found = model.detect(cleaned.view(), score.view(), options, progress)?;
+    clock.lap("detect");
+    let marked: usize = found.objects.iter().filter(|o| o.found).map(|o| o.region.area).sum();
+    let fraction = marked as f64 / found.mask.as_slice().len().max(1) as f64;
+    Ok(DetectResult { mask: found.mask, fraction, objects: found.objects, stages: clock.into_stages() })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -89,6 +127,56 @@ mod tests {
     }
 
     #[test]
+    fn what_has_the_color_but_not_the_shape_is_not_found() {
+        let camera = Camera::from_focal(240, 180, 220.0);
+        let photos = ball_photos(5, 10, &camera, &RenderOptions::default()).unwrap();
+        let labeled: Vec<Labeled<'_>> = photos.iter().map(|p| (p.view.image.view(), p.mask.view())).collect();
+        let half = |odd: usize| -> Vec<Labeled<'_>> { labeled.iter().copied().skip(odd).step_by(2).collect() };
+        let model = train_segment(&half(0), &TrainOptions::default(), &Silent).unwrap().trained.model;
+        for (photo, mask) in half(1) {
+            let ball = detect(photo, &model, &DetectOptions::default(), &Silent).unwrap();
+            let best = ball.objects[0];
+            println!("ball {:?} {:?}", best.score, best.region);
+            assert!(best.found, "{best:?}");
+            assert_eq!(ball.mask, segment(photo, &model, &Silent).unwrap().mask);
+            // The center of the ball's true pixels.
+            let (mut sum, mut count) = ([0.0; 2], 0.0);
+            for y in 0..mask.height() {
+                for x in (0..mask.width()).filter(|&x| mask.row(y)[x]) {
+                    sum = [sum[0] + x as f64, sum[1] + y as f64];
+                    count += 1.0;
+                }
+            }
+            let center = best.region.center;
+            // A border lost on one side, one pixel wide, moves the center by less than a pixel.
+            assert!((center.x - sum[0] / count).hypot(center.y - sum[1] / count) < 1.0, "{best:?}");
+            assert!((best.region.area as f64 / count - 1.0).abs() < 0.15, "{best:?}");
+            // The ball's pixels in rows of a bar, on gray: the same colors, another shape.
+            let colors: Vec<[u8; 3]> = (0..mask.height())
+                .flat_map(|y| (0..mask.width()).map(move |x| (x, y)))
+                .filter(|&(x, y)| mask.row(y)[x])
+                .map(|(x, y)| photo.row(y).as_chunks::<3>().0[x])
+                .collect();
+            let bar_height = ((colors.len() as f64 / 5.0).sqrt() as usize).max(6);
+            let bar_width = 5 * bar_height;
+            let bar = RgbU8::from_fn(bar_width + 40, bar_height + 40, |x, y| {
+                let inside = (20..20 + bar_width).contains(&x) && (20..20 + bar_height).contains(&y);
+                if inside { colors[((y - 20) * bar_width + x - 20) % colors.len()] } else { [120, 118, 116] }
+            });
+            assert!(segment(bar.view(), &model, &Silent).unwrap().fraction > 0.0);
+            let result = detect(bar.view(), &model, &DetectOptions::default(), &Silent).unwrap();
+            println!("bar {:?} {:?}", result.objects[0].score, result.objects[0].region);
+            assert!(!result.objects.is_empty() && result.objects.iter().all(|o| !o.found), "{:?}", result.objects);
+            assert!(result.fraction == 0.0 && result.mask.as_slice().iter().all(|&m| !m));
+            // Who asks for no score at all has every region.
+            let all = detect(bar.view(), &model, &DetectOptions { min_score: 0.0 }, &Silent).unwrap();
+            assert_eq!(all.mask, segment(bar.view(), &model, &Silent).unwrap().mask);
+        }
+        let wrong = detect(labeled[0].0, &model, &DetectOptions { min_score: f64::NAN }, &Silent);
+        assert!(matches!(wrong, Err(SegmentError::Option(e)) if e.name == "min_score"));
+    }
+
+    #[test]
     fn an_empty_photograph_has_an_empty_mask() {
         let photo = RgbU8::from_fn(8, 8, |x, _| if x < 4 { [200, 90, 20] } else { [40, 90, 200] });
         let mask = Mask::from_fn(8, 8, |x, _| [x < 4]);
@@ -96,6 +184,8 @@ mod tests {
             train_segment(&[(photo.view(), mask.view())], &TrainOptions::default(), &Silent).unwrap().trained.model;
         let result = segment(RgbU8::new(0, 0, [0; 3]).view(), &model, &Silent).unwrap();
         assert!(result.mask.is_empty() && result.fraction == 0.0);
+        let none = detect(RgbU8::new(0, 0, [0; 3]).view(), &model, &DetectOptions::default(), &Silent).unwrap();
+        assert!(none.mask.is_empty() && none.fraction == 0.0 && none.objects.is_empty());
         let one = segment(RgbU8::new(1, 1, [200, 90, 20]).view(), &model, &Silent).unwrap();
         assert_eq!((one.mask.at(0, 0), one.fraction), ([true], 1.0));
     }

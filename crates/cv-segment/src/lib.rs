@@ -21,11 +21,15 @@
 //! the posterior odds of object against background; scores are smoothed a little, held against a threshold, and the mask is opened and closed by a small
 //! disc ([`Cleanup`]). The [`ColorModel`] holds all of it and serializes with serde.
 //!
+//! [`ColorModel::detect`] measures the regions of a mask (bounding box, moments) and scores each by how far its color and shape lie from those of the training
+//! objects ([`ObjectStatistics`]); what scores too low is not the object.
+//!
 //! Everything is deterministic: the same photos, options and seed give the same model and the same masks on any number of threads.
 
 mod cleanup;
 mod color_space;
 mod confusion_matrix;
+mod detection;
 mod error;
 mod log_odds;
 mod mixture;
@@ -35,6 +39,9 @@ mod train;
 pub use cleanup::Cleanup;
 pub use color_space::ColorSpace;
 pub use confusion_matrix::ConfusionMatrix;
+pub use detection::{
+    DetectOptions, Detection, Detections, FeatureStatistics, MIN_SCORE, ObjectStatistics, Region, ShapeStatistics,
+};
 pub use error::SegmentError;
 pub use mixture::{Component, Mixture, MixtureError, MixtureOptions, WeightedSample};
 pub use model::{ColorModel, Rule};

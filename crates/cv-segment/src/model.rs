@@ -1,6 +1,6 @@
 //! The trained model: two mixtures, a threshold, and what happens around them.
 
-use crate::{Cleanup, ColorSpace, Mixture, SegmentError, log_odds::LogOdds, mixture::Whitened};
+use crate::{Cleanup, ColorSpace, Mixture, ObjectStatistics, SegmentError, log_odds::LogOdds, mixture::Whitened};
 use cv_core::{Cancelled, GrayF32, ImageView, Mask, Matrix3, OptionError, Progress, Vector3};
 use cv_imgproc::gaussian_blur;
 use serde::{Deserialize, Serialize};
@@ -66,6 +66,9 @@ pub(crate) struct ModelFile {
     pub(crate) smoothing: f32,
     pub(crate) threshold: f32,
     pub(crate) cleanup: Cleanup,
+    /// Files of before there were statistics have none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) objects: Option<ObjectStatistics>,
 }
 
 impl ModelFile {
@@ -82,6 +85,7 @@ impl ModelFile {
             smoothing: 0.0,
             threshold: 0.0,
             cleanup: Cleanup::default(),
+            objects: None,
         }
     }
 }
@@ -105,6 +109,9 @@ impl TryFrom<ModelFile> for ColorModel {
         E::check("threshold", file.threshold.into(), "between −10 and 10", |v| v.abs() <= f64::from(LIMIT))?;
         for (name, radius) in [("open_radius", file.cleanup.open_radius), ("close_radius", file.cleanup.close_radius)] {
             E::check(name, radius as f64, "from 0 to 1000 px", |v| v <= 1000.0)?;
+        }
+        if let Some(objects) = &file.objects {
+            objects.validate()?;
         }
         let foreground = file.foreground.whitened()?;
         let mut background = Vec::new();
@@ -160,8 +167,19 @@ impl ColorModel {
     /// # Errors
     /// [`Cancelled`].
     pub fn classify(&self, photo: ImageView<'_, u8, 3>, progress: &dyn Progress) -> Result<Mask, Cancelled> {
+        Ok(self.mark(self.score(photo, progress)?.view()))
+    }
+
+    /// Where a score ([`ColorModel::score`]) is above the threshold.
+    pub fn mark(&self, score: ImageView<'_, f32, 1>) -> Mask {
         let threshold = self.file.threshold;
-        Ok(self.score(photo, progress)?.map(|[v]| [v > threshold]))
+        let mut mask = Mask::new(score.width(), score.height(), [false]);
+        for y in 0..score.height() {
+            for (mark, &v) in mask.row_mut(y).iter_mut().zip(score.row(y)) {
+                *mark = v > threshold;
+            }
+        }
+        mask
     }
 
     /// Where the object is.
@@ -197,6 +215,11 @@ impl ColorModel {
         self.file.rule
     }
 
+    /// What the training objects have in common; None in models written before there were such statistics.
+    pub fn statistics(&self) -> Option<&ObjectStatistics> {
+        self.file.objects.as_ref()
+    }
+
     /// How masks are cleaned up.
     pub fn cleanup(&self) -> Cleanup {
         self.file.cleanup
@@ -230,7 +253,14 @@ mod tests {
     fn what_is_written_is_read_back() {
         let model = ColorModel::try_from(file()).unwrap();
         let text = serde_json::to_string(&model).unwrap();
+        // As it was before there were statistics of objects.
+        assert!(!text.contains("objects"));
         assert_eq!(serde_json::from_str::<ColorModel>(&text).unwrap(), model);
+        let color = crate::FeatureStatistics { mean: 3.0, deviation: 1.5 };
+        let objects = Some(ObjectStatistics { color, shape: None });
+        let model = ColorModel::try_from(ModelFile { objects, ..file() }).unwrap();
+        let text = serde_json::to_string(&model).unwrap();
+        assert_eq!(serde_json::from_str::<ColorModel>(&text).unwrap().statistics(), objects.as_ref());
     }
 
     #[test]
@@ -248,6 +278,13 @@ mod tests {
             ("threshold", refused(&|f| f.threshold = f32::NAN)),
             ("smoothing", refused(&|f| f.smoothing = -1.0)),
             ("hue", refused(&|f| f.hue = f32::INFINITY)),
+            (
+                "color",
+                refused(&|f| {
+                    let color = crate::FeatureStatistics { mean: 3.0, deviation: 0.0 };
+                    f.objects = Some(ObjectStatistics { color, shape: None });
+                }),
+            ),
             ("close_radius", refused(&|f| f.cleanup.close_radius = 1001)),
         ] {
             assert!(matches!(error, SegmentError::Option(e) if e.name == name), "{error:?}");

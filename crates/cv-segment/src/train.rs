@@ -4,6 +4,7 @@ use crate::{
     Cleanup, ColorModel, ColorSpace, ConfusionMatrix, Mixture, MixtureOptions, Rule, SegmentError, WeightedSample,
     cleanup::largest_share,
     color_space::mean_hue,
+    detection::ObjectFeatures,
     model::{LIMIT, ModelFile},
 };
 use cv_core::{Cancelled, ImageView, OptionError, Progress, Stage};
@@ -176,15 +177,20 @@ pub fn train(photos: &[Labeled<'_>], options: &TrainOptions, progress: &dyn Prog
     let mut model = ColorModel::try_from(file.clone())?;
     if options.rule != Rule::Posterior {
         file.threshold = best_threshold(&model, photos, progress)?;
-        model = ColorModel::try_from(file)?;
+        model = ColorModel::try_from(file.clone())?;
     }
     let stage = Stage::new(progress, "scores", photos.len())?;
-    let score = |(photo, mask): &Labeled<'_>| -> Result<ConfusionMatrix, SegmentError> {
-        let scores = ConfusionMatrix::new(model.predict(*photo, &stage)?.view(), *mask)?;
+    let mut scores = Vec::with_capacity(photos.len());
+    let mut objects = ObjectFeatures::default();
+    for (photo, mask) in photos {
+        let score = model.score(*photo, &stage)?;
+        let found = model.cleanup().apply(model.mark(score.view()).view(), &stage)?;
+        scores.push(ConfusionMatrix::new(found.view(), *mask)?);
+        objects.add(*mask, score.view());
         stage.add(1)?;
-        Ok(scores)
-    };
-    let scores = photos.iter().map(score).collect::<Result<Vec<ConfusionMatrix>, SegmentError>>()?;
+    }
+    file.objects = objects.statistics();
+    let model = ColorModel::try_from(file)?;
     Ok(Trained { model, scores, foreground_pixels: counts[0], background_pixels: counts[1] })
 }
 

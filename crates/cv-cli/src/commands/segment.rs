@@ -5,9 +5,10 @@ mod files;
 use crate::frame::{Context, Explain, Failure, Global, Outcome, Run, create_dir, expand_images, named, same_file};
 use cv_core::{Mask, Named, RgbU8, Stage};
 use cv_pipeline::segmentation::{
-    ColorModel, ColorSpace, ConfusionMatrix, Labeled, Regions, Rule, SegmentError, TrainOptions,
+    ColorModel, ColorSpace, ConfusionMatrix, DetectOptions, Detection, Labeled, Regions, Rule, SegmentError,
+    TrainOptions,
 };
-use cv_pipeline::{segment, train_segment};
+use cv_pipeline::{detect, segment, train_segment};
 use cv_report::{Figure, Note, Report, colors, overlay_comparison, overlay_mask};
 use files::{Pair, pair, read_pair, stem};
 use serde_json::{Value, json};
@@ -182,13 +183,15 @@ impl Train {
     }
 }
 
-/// Mark the object in photographs.
+/// Find the object in photographs, mark and measure it.
 ///
-/// The mask of NAME.jpg is written as NAME_mask.png, white where the object is.
+/// The mask of NAME.jpg is written as NAME_mask.png, white where the object is; all black where it is not found. A region in the object's color is the object
+/// where its score, the agreement with the training objects in color and shape, reaches --min-score.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv segment predict --model ball.json a.jpg b.jpg --out found\n  \
-    cv segment predict --model ball.json photos --out found --report found")]
+    cv segment predict --model ball.json photos --out found --report found\n  \
+    cv segment predict --model ball.json photos --out found --min-score 0")]
 struct Predict {
     /// The model.
     #[arg(long, value_name = "JSON")]
@@ -199,10 +202,15 @@ struct Predict {
     /// The folder to write the masks into; made where it is not there.
     #[arg(short, long, value_name = "DIR")]
     out: PathBuf,
+    /// Least score of an object, 0 to 1: the share of trained objects that may be missed, were their features Gaussian. 0 takes every region for the object.
+    #[arg(long, value_name = "P", default_value_t = DetectOptions::default().min_score)]
+    min_score: f64,
 }
 
 impl Predict {
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
+        let options = DetectOptions { min_score: self.min_score };
+        options.validate().map_err(Failure::usage)?;
         let model = read_model(&self.model)?;
         let given = expand_images(&self.images)?;
         let photos = files::without_masks(given.clone());
@@ -227,19 +235,40 @@ impl Predict {
             }
         }
         let mut stages: Vec<(&'static str, f64)> = Vec::new();
-        let (mut images, mut figures, mut found) = (Vec::new(), Vec::new(), 0);
+        let (mut images, mut figures, mut rows, mut found) = (Vec::new(), Vec::new(), Vec::new(), 0);
+        let mut missing = Vec::new();
         // Encoded masks are small: they wait until every photograph is done, so that a bad one leaves nothing behind.
         let mut masks = Vec::new();
         let stage = Stage::new(context, "predict", photos.len())?;
         for (path, output) in photos.iter().zip(&outputs) {
             let photo = cv_io::read_rgb(path)?;
-            let result = segment(photo.view(), &model, &stage)?;
+            let result = detect(photo.view(), &model, &options, &stage)?;
             masks.push(cv_io::encode_png(result.mask.view()).during(path.display())?);
-            found += usize::from(result.fraction > 0.0);
-            images.push(json!({ "path": path, "mask": output, "fraction": result.fraction }));
+            let is_found = result.objects.iter().any(|o| o.found);
+            found += usize::from(is_found);
+            let mut image = json!({ "path": path, "mask": output, "fraction": result.fraction, "found": is_found });
+            let best = result.objects.first();
+            image["score"] = json!(best.and_then(|b| b.score));
+            image["objects"] = result.objects.iter().map(measured).collect();
+            // Of the best; null where there is none, so that no one takes what is not found for the object.
+            for key in ["box", "center", "area", "axes", "angle"] {
+                image[key] = if is_found { image["objects"][0][key].clone() } else { Value::Null };
+            }
+            images.push(image);
+            rows.push(row(path, best));
+            if let (false, Some(score)) = (is_found, best.and_then(|b| b.score)) {
+                missing.push(format!("{} (best score {score:.1e})", path.display()));
+            } else if !is_found {
+                missing.push(path.display().to_string());
+            }
             if context.wants_report() && figures.len() < REPORT_PHOTOS {
                 let overlay = overlay_mask(photo.view(), result.mask.view(), colors::GREEN, 0.35);
-                let words = format!("{}: {:.2} % marked", path.display(), 100.0 * result.fraction);
+                let score = best.and_then(|b| b.score).map_or_else(String::new, |s| format!(", score {s:.3}"));
+                let words = if is_found {
+                    format!("{}: {:.2} % marked{score}", path.display(), 100.0 * result.fraction)
+                } else {
+                    format!("{}: not found{score}", path.display())
+                };
                 figures.push(figure(&overlay, &words)?);
             }
             add_stages(&mut stages, &result.stages);
@@ -252,13 +281,62 @@ impl Predict {
         context.report(|| {
             let mut page = Report::new("Segmentation");
             page.headline("photographs", &photos.len().to_string()).headline("with the object", &found.to_string());
+            page.section("Objects").table(
+                "The best region of each photograph; axes are semi-axes.",
+                &["photograph", "result", "score", "center, px", "area, px", "axes, px", "angle"],
+                &rows,
+            );
             page.section("Photographs").paragraph("What was marked, in green.").figures(figures);
             Ok(page.to_html())
         })?;
-        let summary =
+        let mut summary =
             format!("{} photographs, the object found in {found}; masks: {}", photos.len(), self.out.display());
+        if let [first, rest @ ..] = missing.as_slice() {
+            summary.push_str(&format!("; not found in {first}"));
+            if !rest.is_empty() {
+                summary.push_str(&format!(" and {} more", rest.len()));
+            }
+        }
         Ok(Outcome::new(stages).with("images", images).summary(summary))
     }
+}
+
+/// A row of the report's table of objects.
+fn row(path: &Path, best: Option<&Detection>) -> Vec<String> {
+    let mut row = vec![path.display().to_string()];
+    let Some(best) = best else {
+        row.push("not found".to_owned());
+        row.resize(7, String::new());
+        return row;
+    };
+    let region = &best.region;
+    row.extend([
+        if best.found { "found" } else { "not found" }.to_owned(),
+        best.score.map_or_else(|| "not known".to_owned(), |score| format!("{score:.3}")),
+        format!("{:.1}, {:.1}", region.center.x, region.center.y),
+        region.area.to_string(),
+        format!("{:.1}, {:.1}", region.axes[0], region.axes[1]),
+        format!("{:.0}°", region.angle.to_degrees()),
+    ]);
+    row
+}
+
+/// A region in JSON: box `[x, y, width, height]`, center, area and semi-axes in pixels, angle in radians, color in nats, extent and axis ratio as shares.
+fn measured(object: &Detection) -> Value {
+    let region = &object.region;
+    json!({
+        "found": object.found,
+        "score": object.score,
+        "box": [region.left, region.top, region.width, region.height],
+        "center": [region.center.x, region.center.y],
+        "area": region.area,
+        "axes": region.axes,
+        "angle": region.angle,
+        "truncated": region.truncated,
+        "color": object.color,
+        "extent": region.extent(),
+        "axis_ratio": region.axis_ratio(),
+    })
 }
 
 /// Score a model on photographs with masks: precision, recall and F1.
