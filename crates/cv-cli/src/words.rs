@@ -1,6 +1,7 @@
 //! What the program says about failures, and which of its options help: the one place where the reasons of the libraries are worded.
 
 use crate::frame::Failure;
+use cv_io::FormatError;
 use cv_pipeline::stereo::RectifyError;
 use cv_pipeline::{
     Advice, DenseError, DepthError, LeftOut, MatchingError, NoPairCause, PanoramaError, ReconstructError,
@@ -66,6 +67,17 @@ fn words(advice: Advice) -> String {
         Advice::RunAgain => "run it again",
     };
     words.to_owned()
+}
+
+/// What to do about a file that cannot be read or written.
+pub(crate) fn unreadable(reason: &FormatError) -> Option<String> {
+    match reason {
+        FormatError::TooMuchMemory { needed, size, .. } => {
+            let what = if size.is_some() { ", or a smaller picture" } else { "" };
+            Some(format!("--max-memory {}{what}", needed.div_ceil(1 << 20)))
+        }
+        other => other.hint().map(str::to_owned),
+    }
 }
 
 /// Why two photographs have no matches.
@@ -176,6 +188,13 @@ mod tests {
         });
         let failure = no_reconstruction(&error, [Path::new("a.jpg"), Path::new("b.jpg")]);
         assert!(failure.text().starts_with("error: a.jpg and b.jpg: ") && failure.text().contains("--focal 561,"));
+    }
+
+    #[test]
+    fn a_file_too_large_is_read_with_the_memory_named() {
+        let reason = FormatError::TooMuchMemory { needed: (9 << 20) + 1, allowed: 1 << 20, size: Some((2000, 1000)) };
+        assert_eq!(unreadable(&reason).unwrap(), "--max-memory 10, or a smaller picture");
+        assert!(unreadable(&FormatError::Empty).unwrap().contains("export"));
     }
 
     #[test]

@@ -4,7 +4,7 @@
 
 mod support;
 
-use support::{cv, done, json, run};
+use support::{cv, done, json, refused, run};
 
 /// The names in the list of commands.
 fn commands() -> Vec<String> {
@@ -126,4 +126,22 @@ fn options_that_mean_nothing_are_refused() {
         assert_eq!(page.exists(), report, "cv {args:?}");
         let _ = std::fs::remove_file(page);
     }
+}
+
+#[test]
+fn a_file_beyond_the_memory_allowed_is_refused_with_a_number_that_suffices() {
+    let folder = tempfile::tempdir().unwrap();
+    // 2 MB as a file, as much again as a picture.
+    let mut map = b"Pf\n800 700\n-1\n".to_vec();
+    map.resize(map.len() + 4 * 800 * 700, 0x3f);
+    std::fs::write(folder.path().join("a.pfm"), map).unwrap();
+    let args = ["eval", "disparity", "--estimate", "a.pfm", "--truth", "a.pfm", "--max-memory"];
+    for too_little in ["1", "3"] {
+        let ran = refused(folder.path(), &[&args[..], &[too_little]].concat());
+        assert!(ran.stderr.contains("MiB") && ran.stderr.contains("try: --max-memory"), "{ran:?}");
+        if too_little == "3" {
+            assert!(ran.stderr.contains("800×700") && ran.stderr.contains("--max-memory 5, or a smaller"), "{ran:?}");
+        }
+    }
+    done(folder.path(), &[&args[..], &["5"]].concat());
 }

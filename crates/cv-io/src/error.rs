@@ -80,6 +80,26 @@ pub enum FormatError {
         /// The limit in bytes.
         limit: u64,
     },
+    /// Reading the file would take more memory than allowed.
+    #[error("{}it takes {} MiB of memory to read, {} MiB are allowed", sized(*size), needed.div_ceil(1 << 20), allowed >> 20)]
+    TooMuchMemory {
+        /// The most bytes held at one time, by the header: the file, what decoding holds, and the result.
+        needed: u64,
+        /// Bytes allowed.
+        allowed: u64,
+        /// Width and height in pixels by the header, of a picture or map.
+        size: Option<(u64, u64)>,
+    },
+    /// An archive that does not hold the number of arrays wanted.
+    #[error("{format}: it holds {got} arrays, not {wanted}")]
+    ArrayCount {
+        /// Name of the format.
+        format: &'static str,
+        /// Arrays in the archive, by its directory.
+        got: usize,
+        /// Arrays wanted.
+        wanted: usize,
+    },
     /// A value that the format cannot hold.
     #[error("{format} cannot hold {what}")]
     NotRepresentable {
@@ -134,9 +154,15 @@ impl FormatError {
             Self::UnknownFormat { expected } if *expected == PICTURES => Some(CONVERT),
             Self::TooManyPixels { .. } => Some("make the image smaller, or raise the limit if the size is meant"),
             Self::TooManyBytes { .. } => Some("raise the limit if the size is meant"),
+            Self::TooMuchMemory { .. } => Some("make it smaller, or allow more memory"),
             _ => None,
         }
     }
+}
+
+/// The size in front of a sentence, where there is one.
+fn sized(size: Option<(u64, u64)>) -> String {
+    size.map_or_else(String::new, |(width, height)| format!("{width}×{height} pixels: "))
 }
 
 /// A failure to read or write one file: which, why, and what to try.

@@ -5,18 +5,28 @@ use std::io::{self, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
 use crate::pending::Pending;
-use crate::{FormatError, IoError};
+use crate::{FormatError, IoError, memory};
 
 /// The largest file that is read into memory: 4 GiB, far above any photograph and below what would take a machine down.
 pub const MAX_FILE_BYTES: u64 = 4 << 30;
 
-/// The bytes of a file, of at most [`MAX_FILE_BYTES`].
+/// The bytes of a file, of at most [`MAX_FILE_BYTES`] and [`default_max_memory`](crate::default_max_memory).
 ///
 /// # Errors
 /// [`IoError`]: cannot be opened or read, is a folder, is too large.
 pub fn read_bytes(path: impl AsRef<Path>) -> Result<Vec<u8>, IoError> {
-    let path = path.as_ref();
+    read_bytes_within(path.as_ref(), memory::default_max_memory())
+}
+
+/// [`read_bytes`] of a file of at most `max_memory` bytes.
+pub(crate) fn read_bytes_within(path: &Path, max_memory: u64) -> Result<Vec<u8>, IoError> {
     let fail = |reason: FormatError| IoError::reading(path, reason);
+    let judge = |bytes: u64| {
+        if bytes > MAX_FILE_BYTES {
+            return Err(fail(FormatError::TooManyBytes { bytes, limit: MAX_FILE_BYTES }));
+        }
+        memory::allow(bytes, max_memory, None).map_err(fail)
+    };
     let file = File::open(path).map_err(|e| fail(e.into()))?;
     let metadata = file.metadata().map_err(|e| fail(e.into()))?;
     if metadata.is_dir() {
@@ -24,16 +34,13 @@ pub fn read_bytes(path: impl AsRef<Path>) -> Result<Vec<u8>, IoError> {
     }
     let mut bytes = Vec::new();
     if metadata.is_file() {
-        if metadata.len() > MAX_FILE_BYTES {
-            return Err(fail(FormatError::TooManyBytes { bytes: metadata.len(), limit: MAX_FILE_BYTES }));
-        }
+        judge(metadata.len())?;
         bytes.reserve_exact(metadata.len() as usize);
     }
     // A pipe or a growing file has no honest length: stop just past the limit.
-    file.take(MAX_FILE_BYTES + 1).read_to_end(&mut bytes).map_err(|e| fail(e.into()))?;
-    if bytes.len() as u64 > MAX_FILE_BYTES {
-        return Err(fail(FormatError::TooManyBytes { bytes: bytes.len() as u64, limit: MAX_FILE_BYTES }));
-    }
+    let most = MAX_FILE_BYTES.min(max_memory).saturating_add(1);
+    file.take(most).read_to_end(&mut bytes).map_err(|e| fail(e.into()))?;
+    judge(bytes.len() as u64)?;
     if bytes.is_empty() { Err(fail(FormatError::Empty)) } else { Ok(bytes) }
 }
 

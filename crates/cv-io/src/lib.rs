@@ -17,6 +17,7 @@
 //!
 //! * What a file is, its content says, not its name.
 //! * Every reader is given untrusted bytes: a lie in a header is an error before memory is asked for, and nothing panics.
+//! * What reading a file will take is judged by its header against [`ReadOptions::max_memory`] before a pixel or value exists.
 //! * Every writer is atomic ([`write_atomic`]): the whole file, or what was there before; several files likewise ([`write_together`]).
 //! * A failure says which file, why, and what to try ([`IoError`]); the same reasons without a path are [`FormatError`].
 //! * Unknown disparity and depth are NaN in memory, whatever the file's own sign for it.
@@ -42,6 +43,7 @@ mod features;
 mod files;
 mod maps;
 mod matches;
+mod memory;
 pub mod npy;
 pub mod npz;
 mod pending;
@@ -49,6 +51,7 @@ pub mod pfm;
 mod picture;
 pub mod ply;
 mod sniff;
+mod srgb;
 
 pub use camera::{CalibrationFormat, RigFile, parse_camera, parse_rig, read_camera, read_rig, write_camera, write_rig};
 pub use depth_png::{depth_mm, kitti, scaled};
@@ -62,6 +65,7 @@ pub use features::{
 pub use files::{MAX_FILE_BYTES, read_bytes, write_atomic, write_bytes};
 pub use maps::{decode_map, read_map};
 pub use matches::{Matches, parse_matches, read_matches, write_matches};
+pub use memory::{DEFAULT_MAX_MEMORY, default_max_memory, set_default_max_memory};
 pub use pending::{abandon_writes, write_together};
 pub use picture::{
     DEFAULT_MAX_PIXELS, DynImage, Pixels, ReadOptions, decode_image, read_gray_u8, read_image, read_image_info,

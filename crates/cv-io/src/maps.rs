@@ -5,9 +5,8 @@ use std::path::Path;
 use cv_core::GrayF32;
 
 use crate::files::read_bytes;
-use crate::npy::NpyArray;
 use crate::pfm::Pfm;
-use crate::{FormatError, IoError, depth_png, npy, npz, pfm};
+use crate::{FormatError, IoError, ReadOptions, depth_png, npy, npz, pfm};
 
 /// Reads a map of one channel, telling by content: PFM, NumPy's `.npy` and `.npz` (its only two-dimensional array), or a gray picture
 /// whose values are `png_scale` times what they mean, with 0 for unknown.
@@ -33,8 +32,8 @@ pub fn decode_map(bytes: &[u8], png_scale: Option<f64>) -> Result<GrayF32, Forma
             Pfm::Gray(map) => map,
             Pfm::Rgb(_) => return Err(FormatError::unsupported("PFM", "color in the place of one channel")),
         },
-        [0x93, b'N', ..] => npy::decode(bytes)?.to_gray()?,
-        [b'P', b'K', ..] => only_map(&npz::decode(bytes)?)?.to_gray()?,
+        [0x93, b'N', ..] => npy::decode(bytes)?.into_gray()?,
+        [b'P', b'K', ..] => npz::decode_map(bytes, &ReadOptions::default())?.into_gray()?,
         _ => return depth_png::decode(bytes, png_scale),
     };
     for v in map.as_mut_slice() {
@@ -45,22 +44,10 @@ pub fn decode_map(bytes: &[u8], png_scale: Option<f64>) -> Result<GrayF32, Forma
     Ok(map)
 }
 
-/// The array of an archive that is a map, if there is one and no other.
-fn only_map(arrays: &[(String, NpyArray)]) -> Result<&NpyArray, FormatError> {
-    let mut maps = arrays.iter().filter(|(_, a)| matches!(a.shape[..], [_, _] | [_, _, 1]));
-    match (maps.next(), maps.next()) {
-        (Some((_, map)), None) => Ok(map),
-        (None, _) => Err(FormatError::missing("npz", "two-dimensional array")),
-        (Some((a, _)), Some((b, _))) => {
-            Err(FormatError::unsupported("npz", format!("more than one map in a file ({a}, {b})")))
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::npy::NpyData;
+    use crate::npy::{NpyArray, NpyData};
     use cv_core::{GrayU8, Image};
 
     #[test]

@@ -5,12 +5,15 @@ use std::path::Path;
 use cv_core::{GrayF32, Image, ImageView};
 
 use crate::files::{read_bytes, write_bytes};
-use crate::{FormatError, IoError};
+use crate::{FormatError, IoError, ReadOptions, memory};
 
 const NAME: &str = "npy";
 const MAGIC: &[u8] = b"\x93NUMPY";
 /// The most elements read: as many samples as the largest color picture has.
 const MAX_ELEMENTS: u64 = 3 * crate::DEFAULT_MAX_PIXELS;
+/// The longest axis of an array without values. Whoever loops over the rows of one must not do so for minutes; descriptors
+/// and maps are far below.
+pub(crate) const MAX_EMPTY_SIDE: u64 = 65_535;
 
 /// The values of an array, in C order.
 #[derive(Debug, Clone, PartialEq)]
@@ -105,20 +108,58 @@ impl NpyArray {
     /// # Errors
     /// [`FormatError::Unsupported`] for another shape.
     pub fn to_gray(&self) -> Result<GrayF32, FormatError> {
-        let (height, width) = match self.shape[..] {
-            [height, width] | [height, width, 1] => (height, width),
-            _ => {
-                return Err(FormatError::unsupported(
-                    NAME,
-                    format!("an array of shape {:?} as one channel", self.shape),
-                ));
-            }
-        };
+        let (width, height) = self.gray_size()?;
         let data = match &self.data {
             NpyData::F32(v) => v.clone(),
-            _ => self.to_f64().into_iter().map(|v| v as f32).collect(),
+            _ => each!(&self.data, v => v.iter().map(|&v| v.to_f32()).collect()),
         };
         Image::from_vec(width, height, data).map_err(|e| FormatError::corrupt(NAME, e.to_string()))
+    }
+
+    /// [`NpyArray::to_gray`] that keeps the memory of an array of `f32`.
+    ///
+    /// # Errors
+    /// As [`NpyArray::to_gray`].
+    pub fn into_gray(self) -> Result<GrayF32, FormatError> {
+        let (width, height) = self.gray_size()?;
+        let data = match self.data {
+            NpyData::F32(v) => v,
+            other => each!(&other, v => v.iter().map(|&v| v.to_f32()).collect()),
+        };
+        Image::from_vec(width, height, data).map_err(|e| FormatError::corrupt(NAME, e.to_string()))
+    }
+
+    /// Width and height of the array as one channel.
+    fn gray_size(&self) -> Result<(usize, usize), FormatError> {
+        match self.shape[..] {
+            [height, width] | [height, width, 1] => Ok((width, height)),
+            _ => {
+                let what = format!("an array of shape {:?} as one channel", self.shape);
+                Err(FormatError::unsupported(NAME, what))
+            }
+        }
+    }
+}
+
+/// Values as `f32`, by way of `f64`.
+trait ToF32: Copy {
+    fn to_f32(self) -> f32;
+}
+
+macro_rules! to_f32 {
+    ($($type:ty),*) => {
+        $(impl ToF32 for $type {
+            fn to_f32(self) -> f32 {
+                self as f64 as f32
+            }
+        })*
+    };
+}
+to_f32!(u8, i8, u16, i16, u32, i32, u64, i64, f32, f64);
+
+impl ToF32 for bool {
+    fn to_f32(self) -> f32 {
+        f32::from(u8::from(self))
     }
 }
 
@@ -127,30 +168,34 @@ impl NpyArray {
 /// # Errors
 /// [`FormatError`]: not such a file, a dtype that is not a plain number, or fewer or more bytes than the shape takes.
 pub fn decode(bytes: &[u8]) -> Result<NpyArray, FormatError> {
+    decode_with(bytes, &ReadOptions::default())
+}
+
+/// [`decode`] with options.
+///
+/// # Errors
+/// As [`decode`], and [`FormatError::TooMuchMemory`].
+pub fn decode_with(bytes: &[u8], options: &ReadOptions) -> Result<NpyArray, FormatError> {
     let corrupt = |reason: &str| FormatError::corrupt(NAME, reason);
+    let (Header { dtype, fortran, shape }, body) = header(bytes)?;
     let cut = || FormatError::Truncated { format: NAME };
-    if !bytes.starts_with(MAGIC) {
-        return Err(FormatError::UnknownFormat { expected: "a NumPy array (.npy)" });
-    }
-    let (start, len) = match *bytes.get(6..12).ok_or_else(cut)? {
-        [1, _, a, b, _, _] => (10, usize::from(u16::from_le_bytes([a, b]))),
-        [2 | 3, _, a, b, c, d] => (12, u32::from_le_bytes([a, b, c, d]) as usize),
-        [major, minor, ..] => return Err(FormatError::unsupported(NAME, format!("version {major}.{minor}"))),
-        _ => return Err(cut()),
-    };
-    let header = bytes.get(start..).and_then(|b| b.get(..len)).ok_or_else(cut)?;
-    let header = std::str::from_utf8(header).map_err(|_| corrupt("the header is not text"))?;
-    let Header { dtype, fortran, shape } = parse_header(header).ok_or_else(|| corrupt("the header does not parse"))?;
     let count =
         shape.iter().try_fold(1u64, |n, &s| n.checked_mul(s as u64)).filter(|&n| n <= MAX_ELEMENTS).ok_or_else(
             || FormatError::corrupt(NAME, format!("a shape of {shape:?} is more than {MAX_ELEMENTS} values")),
         )? as usize;
+    if count == 0 && shape.iter().any(|&side| side as u64 > MAX_EMPTY_SIDE) {
+        return Err(FormatError::corrupt(NAME, format!("a shape of {shape:?} has no values")));
+    }
+    let size = dtype.get(2..).and_then(|size| size.parse::<u64>().ok()).unwrap_or(1);
+    // In another order than stored, the values are there twice for a while.
+    let copies = if fortran || dtype.ends_with("b1") { 2 } else { 1 };
+    let values = memory::product(&[count as u64, size, copies]);
+    memory::allow(values.saturating_add(bytes.len() as u64), options.max_memory, None)?;
     let (big_endian, kind) = match dtype.split_at_checked(1) {
         Some(("<" | "|" | "=", kind)) => (false, kind),
         Some((">", kind)) => (true, kind),
         _ => return Err(FormatError::unsupported(NAME, format!("the dtype {dtype}"))),
     };
-    let body = &bytes[start + len..];
     macro_rules! values {
         ($variant:ident, $type:ty) => {{
             const SIZE: usize = size_of::<$type>();
@@ -187,6 +232,30 @@ pub fn decode(bytes: &[u8]) -> Result<NpyArray, FormatError> {
         _ => return Err(FormatError::unsupported(NAME, format!("the dtype {dtype}"))),
     };
     Ok(NpyArray { shape, data })
+}
+
+/// The header of the bytes of a file, and what follows it.
+fn header(bytes: &[u8]) -> Result<(Header, &[u8]), FormatError> {
+    let corrupt = |reason: &str| FormatError::corrupt(NAME, reason);
+    let cut = || FormatError::Truncated { format: NAME };
+    if !bytes.starts_with(MAGIC) {
+        return Err(FormatError::UnknownFormat { expected: "a NumPy array (.npy)" });
+    }
+    let (start, len) = match *bytes.get(6..12).ok_or_else(cut)? {
+        [1, _, a, b, _, _] => (10, usize::from(u16::from_le_bytes([a, b]))),
+        [2 | 3, _, a, b, c, d] => (12, u32::from_le_bytes([a, b, c, d]) as usize),
+        [major, minor, ..] => return Err(FormatError::unsupported(NAME, format!("version {major}.{minor}"))),
+        _ => return Err(cut()),
+    };
+    let header = bytes.get(start..).and_then(|b| b.get(..len)).ok_or_else(cut)?;
+    let header = std::str::from_utf8(header).map_err(|_| corrupt("the header is not text"))?;
+    let header = parse_header(header).ok_or_else(|| corrupt("the header does not parse"))?;
+    Ok((header, &bytes[start + len..]))
+}
+
+/// The shape by the beginning of a file that may go on, where its header is whole.
+pub(crate) fn shape_of(bytes: &[u8]) -> Result<Vec<usize>, FormatError> {
+    header(bytes).map(|(header, _)| header.shape)
 }
 
 /// From first axis fastest to last axis fastest.
@@ -367,6 +436,30 @@ mod tests {
             assert!(matches!(with(">i2", dtype), Err(FormatError::Unsupported { .. })), "{dtype}");
         }
         assert!(with("True", "1").is_err() && with("shape", "shpe").is_err());
+    }
+
+    #[test]
+    fn an_array_is_judged_by_its_header() {
+        let array = NpyArray { shape: vec![100, 200], data: NpyData::F32(vec![1.0; 20_000]) };
+        let bytes = encode(&array).unwrap();
+        let within = |max_memory| decode_with(&bytes, &ReadOptions { max_memory, ..ReadOptions::default() });
+        let needed = bytes.len() as u64 + 80_000;
+        assert_eq!(within(needed).unwrap(), array);
+        let error = within(needed - 1).unwrap_err();
+        assert!(matches!(error, FormatError::TooMuchMemory { needed: n, .. } if n == needed), "{error}");
+        assert_eq!(array.to_gray().unwrap(), array.clone().into_gray().unwrap());
+    }
+
+    #[test]
+    fn an_axis_beside_none_is_not_believed() {
+        let empty = |shape: &[usize]| {
+            decode(&encode(&NpyArray { shape: shape.to_vec(), data: NpyData::F32(Vec::new()) }).unwrap())
+        };
+        for shape in [[40_000_000_000, 0], [0, 40_000_000_000]] {
+            assert!(matches!(empty(&shape), Err(FormatError::Corrupt { .. })), "{shape:?}");
+        }
+        assert_eq!(empty(&[0, 512]).unwrap().shape, [0, 512]);
+        assert!(matches!(crate::pfm::decode(b"Pf\n0 4294967295\n-1\n"), Err(FormatError::Corrupt { .. })));
     }
 
     proptest! {

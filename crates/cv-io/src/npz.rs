@@ -4,7 +4,9 @@ use std::path::Path;
 
 use crate::files::{MAX_FILE_BYTES, read_bytes, write_bytes};
 use crate::npy::{self, NpyArray};
-use crate::{FormatError, IoError};
+use crate::{FormatError, IoError, ReadOptions, memory};
+use miniz_oxide::inflate::TINFLStatus;
+use miniz_oxide::inflate::core::{DecompressorOxide, decompress, inflate_flags};
 
 const NAME: &str = "npz";
 /// The most that one array, or all of them together, may unpack to.
@@ -53,25 +55,69 @@ struct Entry<'a> {
 ///
 /// # Errors
 /// [`FormatError`]: not an archive, encrypted or packed by another method than deflate, damaged (by its checksum), larger than
-/// [`MAX_FILE_BYTES`] when unpacked, or as [`npy::decode`].
+/// [`MAX_FILE_BYTES`] or [`default_max_memory`](crate::default_max_memory) when unpacked, or as [`npy::decode`].
 pub fn decode(bytes: &[u8]) -> Result<Vec<(String, NpyArray)>, FormatError> {
-    if !bytes.starts_with(b"PK") {
-        return Err(FormatError::UnknownFormat { expected: "a NumPy archive (.npz)" });
-    }
+    decode_with(bytes, &ReadOptions::default())
+}
+
+/// [`decode`] with options: all arrays together, and the bytes of the largest beside them, must be within the memory allowed.
+///
+/// # Errors
+/// As [`decode`].
+pub fn decode_with(bytes: &[u8], options: &ReadOptions) -> Result<Vec<(String, NpyArray)>, FormatError> {
     let entries = directory(bytes)?;
     let total = entries.iter().fold(0u64, |sum, e| sum.saturating_add(e.unpacked));
     if total > MAX_UNPACKED {
         return Err(FormatError::TooManyBytes { bytes: total, limit: MAX_UNPACKED });
     }
-    let arrays = entries.iter().map(|entry| {
-        let name = entry.name.strip_suffix(".npy").unwrap_or(&entry.name).to_owned();
-        Ok((name, npy::decode(&unpack(entry)?)?))
-    });
-    arrays.collect()
+    let largest = entries.iter().map(|e| e.unpacked).max().unwrap_or(0);
+    let held = total.saturating_add(bytes.len() as u64);
+    memory::allow(held.saturating_add(largest), options.max_memory, None)?;
+    entries.iter().map(|entry| Ok((entry.array_name().to_owned(), entry.array(options)?))).collect()
+}
+
+/// Decodes the array of an archive that holds one. How many it holds, its directory says: nothing is unpacked before.
+///
+/// # Errors
+/// [`FormatError::ArrayCount`] where there is none or more than one, or as [`decode`].
+pub fn decode_only(bytes: &[u8], options: &ReadOptions) -> Result<NpyArray, FormatError> {
+    match directory(bytes)?.as_slice() {
+        [entry] => entry.array(options),
+        entries => Err(FormatError::ArrayCount { format: NAME, got: entries.len(), wanted: 1 }),
+    }
+}
+
+/// Reads the array of an archive that holds one; see [`decode_only`].
+///
+/// # Errors
+/// [`IoError`]: cannot be opened, or as [`decode_only`] with default [`ReadOptions`].
+pub fn read_only(path: impl AsRef<Path>) -> Result<NpyArray, IoError> {
+    let path = path.as_ref();
+    decode_only(&read_bytes(path)?, &ReadOptions::default()).map_err(|reason| IoError::reading(path, reason))
+}
+
+/// The array of an archive that is a map, if there is one and no other; of the others the headers alone are unpacked.
+pub(crate) fn decode_map(bytes: &[u8], options: &ReadOptions) -> Result<NpyArray, FormatError> {
+    let entries = directory(bytes)?;
+    let mut map: Option<&Entry<'_>> = None;
+    for entry in &entries {
+        if !matches!(npy::shape_of(&entry.beginning()?)?[..], [_, _] | [_, _, 1]) {
+            continue;
+        }
+        if let Some(first) = map {
+            let names = format!("more than one map in a file ({}, {})", first.array_name(), entry.array_name());
+            return Err(FormatError::unsupported(NAME, names));
+        }
+        map = Some(entry);
+    }
+    map.ok_or_else(|| FormatError::missing(NAME, "two-dimensional array"))?.array(options)
 }
 
 /// The entries of the central directory.
 fn directory(bytes: &[u8]) -> Result<Vec<Entry<'_>>, FormatError> {
+    if !bytes.starts_with(b"PK") {
+        return Err(FormatError::UnknownFormat { expected: "a NumPy archive (.npz)" });
+    }
     // The record at the end, behind which a comment of up to 65535 bytes may stand.
     let earliest = bytes.len().saturating_sub(22 + 65_535);
     let end = bytes[earliest..]
@@ -139,32 +185,73 @@ fn widen(entry: &mut Entry<'_>, mut extra: &[u8]) -> Result<(), FormatError> {
     Ok(())
 }
 
-/// The bytes of an entry, checked against its checksum.
-fn unpack(entry: &Entry<'_>) -> Result<Vec<u8>, FormatError> {
-    let local = Fields::at(entry.archive, entry.offset, 30)?;
-    if local.0[..4] != *b"PK\x03\x04" {
-        return Err(FormatError::corrupt(NAME, format!("{}: no file where the directory says", entry.name)));
+/// The bytes of a header that are unpacked to tell the shape: longer than any that NumPy writes.
+const BEGINNING: usize = 4096;
+
+impl Entry<'_> {
+    /// Without the ending.
+    fn array_name(&self) -> &str {
+        self.name.strip_suffix(".npy").unwrap_or(&self.name)
     }
-    let start = entry.offset + 30 + u64::from(local.u16(26)) + u64::from(local.u16(28));
-    let packed = usize::try_from(entry.packed).map_err(|_| FormatError::Truncated { format: NAME })?;
-    let data = Fields::at(entry.archive, start, packed)?.0;
-    let bytes = match entry.method {
-        0 => data.to_vec(),
-        8 => {
-            // Deflate packs at most 1032 to 1: a header that promises more lies, and is not given the memory.
-            if entry.unpacked > 1032 * (entry.packed + 1) {
-                return Err(FormatError::corrupt(NAME, format!("{}: it cannot unpack to what it says", entry.name)));
-            }
-            let limit = usize::try_from(entry.unpacked).unwrap_or(usize::MAX);
-            miniz_oxide::inflate::decompress_to_vec_with_limit(data, limit)
-                .map_err(|e| FormatError::corrupt(NAME, format!("{}: {e}", entry.name)))?
+
+    /// The array, where it and its bytes are within the memory allowed.
+    fn array(&self, options: &ReadOptions) -> Result<NpyArray, FormatError> {
+        let held = memory::product(&[2, self.unpacked]).saturating_add(self.archive.len() as u64);
+        memory::allow(held, options.max_memory, None)?;
+        npy::decode_with(&self.unpack()?, options)
+    }
+
+    /// The bytes as they are packed.
+    fn packed(&self) -> Result<&[u8], FormatError> {
+        let local = Fields::at(self.archive, self.offset, 30)?;
+        if local.0[..4] != *b"PK\x03\x04" {
+            return Err(FormatError::corrupt(NAME, format!("{}: no file where the directory says", self.name)));
         }
-        method => return Err(FormatError::unsupported(NAME, format!("packing method {method}"))),
-    };
-    if bytes.len() as u64 != entry.unpacked || crc32fast::hash(&bytes) != entry.crc {
-        return Err(FormatError::corrupt(NAME, format!("{}: the checksum does not agree", entry.name)));
+        let start = self.offset + 30 + u64::from(local.u16(26)) + u64::from(local.u16(28));
+        let packed = usize::try_from(self.packed).map_err(|_| FormatError::Truncated { format: NAME })?;
+        Ok(Fields::at(self.archive, start, packed)?.0)
     }
-    Ok(bytes)
+
+    /// At most `limit` of the first bytes.
+    fn unpack_up_to(&self, limit: usize) -> Result<Vec<u8>, FormatError> {
+        let data = self.packed()?;
+        match self.method {
+            0 => Ok(data[..limit.min(data.len())].to_vec()),
+            8 => {
+                // Deflate packs at most 1032 to 1: no more is asked for. The rest of what is promised, if it comes, is left.
+                let possible = data.len().saturating_add(1).saturating_mul(1032);
+                let mut bytes = vec![0; limit.min(possible)];
+                let flags = inflate_flags::TINFL_FLAG_USING_NON_WRAPPING_OUTPUT_BUF;
+                let (status, _, length) = decompress(&mut DecompressorOxide::new(), data, &mut bytes, 0, flags);
+                if !matches!(status, TINFLStatus::Done | TINFLStatus::HasMoreOutput) {
+                    return Err(FormatError::corrupt(NAME, format!("{}: it does not unpack ({status:?})", self.name)));
+                }
+                bytes.truncate(length);
+                Ok(bytes)
+            }
+            method => Err(FormatError::unsupported(NAME, format!("packing method {method}"))),
+        }
+    }
+
+    /// The first bytes, not checked.
+    fn beginning(&self) -> Result<Vec<u8>, FormatError> {
+        self.unpack_up_to(BEGINNING)
+    }
+
+    /// All bytes, checked against the checksum.
+    fn unpack(&self) -> Result<Vec<u8>, FormatError> {
+        let length = usize::try_from(self.unpacked).unwrap_or(usize::MAX);
+        let possible = self.packed.saturating_add(1).saturating_mul(1032);
+        if self.method == 8 && self.unpacked > possible {
+            return Err(FormatError::corrupt(NAME, format!("{}: it cannot unpack to what it says", self.name)));
+        }
+        // One byte more than promised shows that there is more.
+        let bytes = self.unpack_up_to(length.saturating_add(1))?;
+        if bytes.len() as u64 != self.unpacked || crc32fast::hash(&bytes) != self.crc {
+            return Err(FormatError::corrupt(NAME, format!("{}: the checksum does not agree", self.name)));
+        }
+        Ok(bytes)
+    }
 }
 
 /// Encodes arrays under names (without `.npy`), deflated where `compress`.
@@ -281,6 +368,39 @@ mod tests {
         let mut bad = good;
         bad[at + 24..at + 28].copy_from_slice(&0xfff0_0000u32.to_le_bytes());
         assert!(decode(&bad).is_err());
+    }
+
+    #[test]
+    fn how_many_arrays_there_are_is_told_before_any_is_unpacked() {
+        let large = NpyArray { shape: vec![1 << 16], data: NpyData::U8(vec![0; 1 << 16]) };
+        let names: Vec<String> = (0..60).map(|i| format!("a{i}")).collect();
+        let arrays: Vec<_> = names.iter().map(|name| (name.as_str(), &large)).collect();
+        let bytes = encode(&arrays, true).unwrap();
+        // Too little for one of them.
+        let little = ReadOptions { max_memory: 1 << 16, ..ReadOptions::default() };
+        let error = decode_only(&bytes, &little).unwrap_err();
+        assert!(matches!(error, FormatError::ArrayCount { got: 60, wanted: 1, .. }), "{error}");
+        let error = decode_with(&bytes, &ReadOptions { max_memory: 32 << 16, ..little }).unwrap_err();
+        assert!(matches!(error, FormatError::TooMuchMemory { needed, .. } if needed > 61 << 16), "{error}");
+        let one = encode(&arrays[..1], true).unwrap();
+        assert!(matches!(decode_only(&one, &little), Err(FormatError::TooMuchMemory { .. })));
+        assert_eq!(decode_only(&one, &ReadOptions { max_memory: 3 << 16, ..little }).unwrap(), large);
+        // A map beside them is found by the headers.
+        let map = NpyArray { shape: vec![2, 2], data: NpyData::F32(vec![1.0; 4]) };
+        let mixed: Vec<_> = arrays.iter().copied().chain([("map", &map)]).collect();
+        for compress in [false, true] {
+            let bytes = encode(&mixed, compress).unwrap();
+            assert_eq!(decode_map(&bytes, &ReadOptions { max_memory: 62 << 16, ..little }).unwrap(), map);
+        }
+    }
+
+    #[test]
+    fn more_than_the_directory_says_is_not_unpacked() {
+        let (a, _) = arrays();
+        let mut bytes = encode(&[("a", &a)], true).unwrap();
+        let at = bytes.windows(4).position(|w| w == b"PK\x01\x02").unwrap();
+        bytes[at + 24..at + 28].copy_from_slice(&100u32.to_le_bytes());
+        assert!(matches!(decode(&bytes), Err(FormatError::Corrupt { .. })));
     }
 
     proptest! {

@@ -10,7 +10,8 @@ use std::path::Path;
 use cv_core::{GrayF32, Image, ImageView, RgbF32};
 
 use crate::files::read_bytes;
-use crate::{DEFAULT_MAX_PIXELS, FormatError, IoError, write_atomic};
+use crate::npy::MAX_EMPTY_SIDE;
+use crate::{FormatError, IoError, ReadOptions, memory, write_atomic};
 
 const NAME: &str = "PFM";
 
@@ -27,8 +28,16 @@ pub enum Pfm {
 ///
 /// # Errors
 /// [`FormatError`] where the header does not parse, the samples are fewer or more than it promises, or it promises more than
-/// [`DEFAULT_MAX_PIXELS`].
+/// [`DEFAULT_MAX_PIXELS`](crate::DEFAULT_MAX_PIXELS) or [`default_max_memory`](crate::default_max_memory).
 pub fn decode(bytes: &[u8]) -> Result<Pfm, FormatError> {
+    decode_with(bytes, &ReadOptions::default())
+}
+
+/// [`decode`] with options.
+///
+/// # Errors
+/// As [`decode`].
+pub fn decode_with(bytes: &[u8], options: &ReadOptions) -> Result<Pfm, FormatError> {
     let corrupt = |reason: &str| FormatError::corrupt(NAME, reason);
     let mut rest = bytes;
     let channels = match token(&mut rest) {
@@ -41,8 +50,11 @@ pub fn decode(bytes: &[u8]) -> Result<Pfm, FormatError> {
         return Err(corrupt("the width and height are not whole numbers"));
     };
     let (w, h) = (u64::from(width), u64::from(height));
-    if w * h > DEFAULT_MAX_PIXELS {
-        return Err(FormatError::TooManyPixels { width: w, height: h, limit: DEFAULT_MAX_PIXELS });
+    if w * h > options.max_pixels {
+        return Err(FormatError::TooManyPixels { width: w, height: h, limit: options.max_pixels });
+    }
+    if w * h == 0 && w.max(h) > MAX_EMPTY_SIDE {
+        return Err(corrupt(&format!("a map of {width}×{height} has no pixels")));
     }
     let scale = token(&mut rest)
         .and_then(|t| t.parse::<f64>().ok())
@@ -62,6 +74,7 @@ pub fn decode(bytes: &[u8]) -> Result<Pfm, FormatError> {
         let extra = samples.len() - needed;
         return Err(corrupt(&format!("{extra} bytes more than {width}×{height}×{channels} samples take")));
     }
+    memory::allow((needed + bytes.len()) as u64, options.max_memory, Some((w, h)))?;
     let row = width as usize * channels * 4;
     let mut data = Vec::with_capacity(needed / 4);
     let known = |v: f32| if v.is_infinite() { f32::NAN } else { v };
@@ -194,6 +207,16 @@ mod tests {
             let error = decode(&file).unwrap_err().to_string();
             assert!(error.contains(what), "{header:?}: {error}");
         }
+    }
+
+    #[test]
+    fn a_map_is_judged_by_its_header() {
+        let bytes = bytes_of(GrayF32::new(300, 200, [0.5]).view());
+        let within = |max_memory| decode_with(&bytes, &ReadOptions { max_memory, ..ReadOptions::default() });
+        let needed = bytes.len() as u64 + 4 * 300 * 200;
+        assert!(within(needed).is_ok());
+        let error = within(needed - 1).unwrap_err();
+        assert!(matches!(error, FormatError::TooMuchMemory { size: Some((300, 200)), .. }), "{error}");
     }
 
     proptest! {

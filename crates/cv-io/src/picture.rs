@@ -7,23 +7,26 @@ use cv_core::{GrayF32, GrayU8, Image, Mask, RgbF32, RgbU8, Sample};
 
 use crate::codec::{Format, Header, Raster, Samples};
 use crate::exif_info::is_raw_preview;
-use crate::files::read_bytes;
-use crate::{ExifInfo, FormatError, IoError, sniff};
+use crate::files::{read_bytes, read_bytes_within};
+use crate::{ExifInfo, FormatError, IoError, memory, sniff, srgb};
 
 /// The default for [`ReadOptions::max_pixels`]: 256 Mpx.
 pub const DEFAULT_MAX_PIXELS: u64 = 256 << 20;
 
-/// How pictures are read.
+/// How pictures, maps and arrays are read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ReadOptions {
     /// The most pixels a picture may have; its header is checked before anything is allocated. Default
     /// [`DEFAULT_MAX_PIXELS`], more than the sensor of any camera sold and 768 MiB as 8-bit color.
     pub max_pixels: u64,
+    /// The most memory that reading one file may take, in bytes: the file, what decoding holds beside the result, and the result,
+    /// judged by the header before anything is allocated. Default [`default_max_memory`](crate::default_max_memory).
+    pub max_memory: u64,
 }
 
 impl Default for ReadOptions {
     fn default() -> Self {
-        Self { max_pixels: DEFAULT_MAX_PIXELS }
+        Self { max_pixels: DEFAULT_MAX_PIXELS, max_memory: memory::default_max_memory() }
     }
 }
 
@@ -73,8 +76,8 @@ impl DynImage {
             Pixels::Gray8(image) => image.map(|[v]| [v; 3]),
             Pixels::Gray16(image) => image.map(|[v]| [to_byte(v); 3]),
             Pixels::Rgb16(image) => image.map(|p| p.map(to_byte)),
-            Pixels::GrayF32(image) => image.map(|[v]| [srgb_byte(v); 3]),
-            Pixels::RgbF32(image) => image.map(|p| p.map(srgb_byte)),
+            Pixels::GrayF32(image) => image.map(|[v]| [srgb::byte(v); 3]),
+            Pixels::RgbF32(image) => image.map(|p| p.map(srgb::byte)),
         }
     }
 
@@ -84,7 +87,7 @@ impl DynImage {
         match self.pixels {
             Pixels::Gray8(image) => image,
             Pixels::Gray16(image) => image.map(|[v]| [to_byte(v)]),
-            Pixels::GrayF32(image) => image.map(|[v]| [srgb_byte(v)]),
+            Pixels::GrayF32(image) => image.map(|[v]| [srgb::byte(v)]),
             _ => self.into_rgb8().map(|rgb| [cv_core::luma_u8(rgb)]),
         }
     }
@@ -94,14 +97,6 @@ fn to_byte(v: u16) -> u8 {
     ((u32::from(v) + 128) / 257) as u8
 }
 
-/// Linear light to an sRGB byte (IEC 61966-2-1).
-fn srgb_byte(v: f32) -> u8 {
-    // NaN becomes black.
-    let v = v.clamp(0.0, 1.0);
-    let encoded = if v <= 0.003_130_8 { 12.92 * v } else { 1.055 * v.powf(1.0 / 2.4) - 0.055 };
-    (encoded * 255.0).round() as u8
-}
-
 /// Decodes the bytes of a PNG, JPEG, TIFF, BMP, PNM, OpenEXR or Radiance HDR file.
 ///
 /// The format is told by the content. The EXIF orientation is applied. An alpha channel is dropped, as OpenCV and COLMAP do:
@@ -109,7 +104,7 @@ fn srgb_byte(v: f32) -> u8 {
 /// plain inversion, without a color profile. Embedded profiles are ignored.
 ///
 /// # Errors
-/// [`FormatError`]: not a picture, damaged, cut short, or more pixels than `options` allow.
+/// [`FormatError`]: not a picture, damaged, cut short, or more pixels or memory than `options` allow.
 pub fn decode_image(bytes: &[u8], options: &ReadOptions) -> Result<DynImage, FormatError> {
     let format = sniff::picture_format(bytes)?;
     let name = format.name();
@@ -131,8 +126,9 @@ fn decode(bytes: &[u8], format: Format, options: &ReadOptions) -> Result<DynImag
         return Err(FormatError::corrupt(format.name(), format!("the picture is {w}×{h}")));
     }
     sniff::plausible(format, bytes, w, h)?;
-    let raster = format.raster(bytes, &header)?;
     let exif = exif_of(&header);
+    memory::allow(header.memory(bytes.len(), exif.orientation >= 5), options.max_memory, Some((w, h)))?;
+    let raster = format.raster(bytes, &header)?;
     let pixels = pixels(raster, header.width, header.height, exif.orientation)?;
     Ok(DynImage { pixels, exif })
 }
@@ -163,32 +159,54 @@ fn pixels(raster: Raster, width: usize, height: usize, orientation: u8) -> Resul
 }
 
 fn upright<T: Sample, const C: usize>(
-    data: Vec<T>,
+    mut data: Vec<T>,
     channels: usize,
     (width, height): (usize, usize),
     orientation: u8,
 ) -> Result<Image<T, C>, FormatError> {
-    let data =
-        if channels == C { data } else { data.chunks_exact(channels).flat_map(|pixel| &pixel[..C]).copied().collect() };
-    let stored =
+    if channels != C {
+        // In place: a copy without alpha would take as much again.
+        let pixels = data.len() / channels;
+        for i in 0..pixels {
+            data.copy_within(i * channels..i * channels + C, i * C);
+        }
+        data.truncate(pixels * C);
+    }
+    let mut stored =
         Image::<T, C>::from_vec(width, height, data).map_err(|e| FormatError::corrupt("picture", e.to_string()))?;
-    // Where the pixel to be seen at (x, y) is stored: EXIF 2.32, tag 274.
+    // Where the pixel to be seen at (x, y) is stored: EXIF 2.32, tag 274. The first three in place.
     let (right, bottom) = (width - 1, height - 1);
     let at: fn(usize, usize, usize, usize) -> (usize, usize) = match orientation {
-        2 => |x, y, right, _| (right - x, y),
-        3 => |x, y, right, bottom| (right - x, bottom - y),
-        4 => |x, y, _, bottom| (x, bottom - y),
+        2 => {
+            (0..height).for_each(|y| reverse_pixels::<T, C>(stored.row_mut(y)));
+            return Ok(stored);
+        }
+        3 => {
+            reverse_pixels::<T, C>(stored.as_mut_slice());
+            return Ok(stored);
+        }
+        4 => {
+            let row = width * C;
+            let (top, rest) = stored.as_mut_slice().split_at_mut(height / 2 * row);
+            top.chunks_exact_mut(row).zip(rest.chunks_exact_mut(row).rev()).for_each(|(a, b)| a.swap_with_slice(b));
+            return Ok(stored);
+        }
         5 => |x, y, _, _| (y, x),
         6 => |x, y, _, bottom| (y, bottom - x),
         7 => |x, y, right, bottom| (right - y, bottom - x),
         8 => |x, y, right, _| (right - y, x),
         _ => return Ok(stored),
     };
-    let (seen_width, seen_height) = if orientation >= 5 { (height, width) } else { (width, height) };
-    Ok(Image::from_fn(seen_width, seen_height, |x, y| {
+    // On its side.
+    Ok(Image::from_fn(height, width, |x, y| {
         let (x, y) = at(x, y, right, bottom);
         stored.at(x, y)
     }))
+}
+
+/// The last pixel first.
+fn reverse_pixels<T: Sample, const C: usize>(samples: &mut [T]) {
+    samples.as_chunks_mut::<C>().0.reverse();
 }
 
 /// Reads a picture at full depth; see [`decode_image`] for what is understood and how.
@@ -205,7 +223,8 @@ pub fn read_image(path: impl AsRef<Path>) -> Result<DynImage, IoError> {
 /// As [`read_image`].
 pub fn read_image_with(path: impl AsRef<Path>, options: &ReadOptions) -> Result<DynImage, IoError> {
     let path = path.as_ref();
-    decode_image(&read_bytes(path)?, options).map_err(|reason| IoError::reading(path, reason))
+    decode_image(&read_bytes_within(path, options.max_memory)?, options)
+        .map_err(|reason| IoError::reading(path, reason))
 }
 
 /// Reads a picture as RGB bytes; see [`DynImage::into_rgb8`].

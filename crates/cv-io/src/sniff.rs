@@ -59,6 +59,10 @@ pub(crate) fn plausible(format: Format, bytes: &[u8], width: u64, height: u64) -
         Format::Png => len.saturating_mul(1032 * 8),
         // Every 8×8 block of the first component costs at least one bit.
         Format::Jpeg => len.saturating_mul(8 * 64 * 4),
+        // Without compression, at least one bit a pixel.
+        Format::Bmp | Format::Pnm => len.saturating_mul(8),
+        // A row begins with a pixel, or four bytes that say how it is packed.
+        Format::Hdr => (len / 4).saturating_mul(width),
         _ => u64::MAX,
     };
     if width.saturating_mul(height) > possible {

@@ -76,9 +76,6 @@ pub(crate) struct Args {
     /// Give pixels that the other photograph does not confirm a depth from around them.
     #[arg(long, requires = "dense")]
     dense_fill: bool,
-    /// Most memory for dense matching, in MiB.
-    #[arg(long, value_name = "MIB", default_value_t = DenseOptions::default().max_memory >> 20, requires = "dense")]
-    max_memory: usize,
 }
 
 impl Run for Args {
@@ -179,11 +176,12 @@ impl Args {
         if self.dense.is_none() {
             return Ok(None);
         }
+        let default = DenseOptions::default();
         let options = DenseOptions {
             max_size: self.dense_size,
             fill: self.dense_fill,
-            max_memory: self.max_memory.saturating_mul(1 << 20),
-            ..DenseOptions::default()
+            max_memory: context.max_memory.unwrap_or(default.max_memory),
+            ..default
         };
         let dense = reconstruct_dense(a.view(), b.view(), sparse, &options, context);
         dense.map(Some).map_err(|error| words::no_dense_cloud(&error, [&self.first, &self.second]))

@@ -10,6 +10,8 @@ use std::{fmt::Display, path::PathBuf, sync::Arc};
 pub(crate) struct Context {
     /// `--seed`, where given.
     pub(crate) seed: Option<u64>,
+    /// `--max-memory`, where given, in bytes.
+    pub(crate) max_memory: Option<usize>,
     quiet: bool,
     report: Option<PathBuf>,
     bar: Arc<Bar>,
@@ -20,7 +22,8 @@ impl Context {
     pub(super) fn new(globals: &Globals) -> Self {
         let Globals { quiet, seed, .. } = *globals;
         let bar = Arc::new(Bar::new(quiet));
-        Self { seed, quiet, report: globals.report.clone(), stop: Stop::listen(&bar), bar }
+        let max_memory = globals.max_memory.map(|mib| usize::try_from(u64::from(mib) << 20).unwrap_or(usize::MAX));
+        Self { seed, max_memory, quiet, report: globals.report.clone(), stop: Stop::listen(&bar), bar }
     }
 
     /// Refuses global options that the command has no use for.

@@ -1,6 +1,7 @@
 //! Why a command ends without its result, and what to try.
 
-use cv_io::IoError;
+use crate::words;
+use cv_io::{FormatError, IoError};
 use std::{fmt::Display, process::ExitCode};
 
 /// Why a command ends without its result.
@@ -56,7 +57,10 @@ impl<E: std::error::Error + 'static> From<E> for Failure {
         if let Some(IoError { path, writing, reason }) = error.downcast_ref() {
             let verb = if *writing { "write" } else { "read" };
             let failure = Self::new(format!("cannot {verb} {}: {reason}", path.display()));
-            return Self { advice: reason.hint().map(str::to_owned), ..failure };
+            return Self { advice: words::unreadable(reason), ..failure };
+        }
+        if let Some(reason) = error.downcast_ref::<FormatError>() {
+            return Self { advice: words::unreadable(reason), ..Self::new(reason) };
         }
         let mut what = error.to_string();
         let mut source = error.source();

@@ -5,6 +5,7 @@
 mod context;
 mod failure;
 mod inputs;
+mod memory;
 mod named;
 mod outcome;
 mod outputs;
@@ -40,6 +41,10 @@ pub(crate) struct Globals {
     /// Threads to use [default: one per core]. The result is the same for any number.
     #[arg(long, global = true, value_name = "N", value_parser = value_parser!(u16).range(1..=1024))]
     pub(crate) threads: Option<u16>,
+    /// Most memory, in MiB, for reading one file (judged by its header) [default: half of the machine's], and for matching pixel by
+    /// pixel: where that does not fit, rows are matched in strips that overlap [default: as much as it takes; 1024 for a dense cloud].
+    #[arg(long, global = true, value_name = "MIB", value_parser = value_parser!(u32).range(1..))]
+    pub(crate) max_memory: Option<u32>,
     /// Seed of random choices [default: that of the pipeline]. The same seed gives the same result; commands that choose nothing at random
     /// refuse it.
     #[arg(long, global = true, value_name = "S")]
@@ -77,6 +82,9 @@ pub(crate) trait Run: Args {
 /// Runs a command under the global arguments and turns what comes of it into output and exit code.
 pub(crate) fn run(globals: &Globals, command: impl FnOnce(&Context) -> Result<Outcome, Failure>) -> ExitCode {
     let start = Instant::now();
+    let limit = globals.max_memory.map_or_else(memory::default_limit, |mib| u64::from(mib) << 20);
+    // Nothing has set it before: this is the only place.
+    let _ = cv_io::set_default_max_memory(limit);
     let context = Context::new(globals);
     let result = start_threads(globals.threads).and_then(|()| {
         // A bug in the program is reported like any failure: the person sees what to do, scripts see exit code 1.

@@ -21,7 +21,7 @@ struct Start {
 
 pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
     let start = start(bytes)?;
-    Ok(Header { width: start.width, height: start.height, ..Header::default() })
+    Ok(Header { width: start.width, height: start.height, channels: 3, depth: 1, ..Header::default() })
 }
 
 pub(super) fn raster(bytes: &[u8]) -> Result<Raster, FormatError> {

@@ -10,8 +10,11 @@ use std::io::Cursor;
 const NAME: &str = "OpenEXR";
 
 pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
-    let size = window(&open(bytes)?)?.1;
-    Ok(Header { width: size.0, height: size.1, ..Header::default() })
+    let reader = open(bytes)?;
+    let (width, height) = window(&reader)?.1;
+    // A block as it is packed, unpacked, and as samples.
+    let block = reader.headers().iter().map(|layer| layer.max_block_byte_size() as u64).max().unwrap_or(0);
+    Ok(Header { width, height, channels: 3, depth: 4, beside: block.saturating_mul(3), ..Header::default() })
 }
 
 pub(super) fn raster(bytes: &[u8], header: &Header) -> Result<Raster, FormatError> {

@@ -13,6 +13,9 @@ pub(super) fn raster(bytes: &[u8], header: &Header) -> Result<Raster, FormatErro
     let (_, at) = start(bytes)?;
     let mut rest = &bytes[at..];
     let mut samples = Vec::with_capacity(count(Format::Hdr, header.width, header.height, 3)?);
+    // The mantissas are fractions of 256, the exponent is 128 too large.
+    let scales: [f32; 256] =
+        std::array::from_fn(|exponent| if exponent == 0 { 0.0 } else { (exponent as f32 - 136.0).exp2() });
     let mut row = vec![[0u8; 4]; header.width];
     for _ in 0..header.height {
         rest = match rest {
@@ -25,8 +28,7 @@ pub(super) fn raster(bytes: &[u8], header: &Header) -> Result<Raster, FormatErro
             _ => pixels(rest, &mut row)?,
         };
         samples.extend(row.iter().flat_map(|&[r, g, b, exponent]| {
-            // The mantissas are fractions of 256, the exponent is 128 too large.
-            let scale = if exponent == 0 { 0.0 } else { (f32::from(exponent) - 136.0).exp2() };
+            let scale = scales[usize::from(exponent)];
             [r, g, b].map(|mantissa| f32::from(mantissa) * scale)
         }));
     }
@@ -111,7 +113,7 @@ fn start(bytes: &[u8]) -> Result<(Header, usize), FormatError> {
             let side =
                 |text: &str| text.parse::<u32>().map_err(|_| FormatError::corrupt(NAME, "the size is no number"));
             let (width, height) = (side(width)? as usize, side(height)? as usize);
-            Ok((Header { width, height, ..Header::default() }, at))
+            Ok((Header { width, height, channels: 3, depth: 4, beside: 4 * width as u64, ..Header::default() }, at))
         }
         _ => Err(FormatError::unsupported_picture(NAME, format!("the order of pixels “{size}”"))),
     }

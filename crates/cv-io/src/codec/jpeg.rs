@@ -1,7 +1,7 @@
 //! JPEG, through zune-jpeg.
 
 use super::{Format, Header, Raster, Samples};
-use crate::FormatError;
+use crate::{FormatError, memory};
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::errors::DecodeErrors;
 use zune_jpeg::zune_core::bytestream::ZCursor;
@@ -12,7 +12,56 @@ pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
     let decoder = decoder(bytes, DecoderOptions::default())?;
     let size = decoder.dimensions();
     let (width, height) = size.ok_or_else(|| FormatError::corrupt(Format::Jpeg.name(), "it has no size"))?;
-    Ok(Header { width, height, exif: decoder.exif().cloned(), orientation: None })
+    let channels = if decoder.input_colorspace() == Some(ColorSpace::Luma) { 1 } else { 3 };
+    // One scan of all components is decoded row by row; of several, the coefficients (16 bits) are kept until the last. Blocks
+    // are filled up to units of at most 32×32 pixels.
+    let components = decoder.info().map_or(4, |info| info.components);
+    let side = |pixels: usize| pixels.next_multiple_of(32) as u64;
+    let beside = if scan_of_all(bytes, components) {
+        0
+    } else {
+        memory::product(&[side(width), side(height), 2 * u64::from(components)])
+    };
+    Ok(Header { width, height, channels, depth: 1, beside, exif: decoder.exif().cloned(), orientation: None })
+}
+
+/// The pixels of the largest frame that the markers before the first scan announce.
+#[cfg(feature = "tiff")]
+pub(super) fn frame_pixels(bytes: &[u8]) -> u64 {
+    let (mut at, mut pixels) = (0, 0);
+    while let Some(&[marker, kind, high, low]) = bytes.get(at..at + 4) {
+        at += match (marker, kind) {
+            (0..=0xfe, _) | (0xff, 0xff) => 1,
+            (0xff, 0x00 | 0x01 | 0xd0..=0xd8) => 2,
+            (0xff, 0xda) => break,
+            _ => {
+                let is_frame = matches!(kind, 0xc0..=0xcf) && !matches!(kind, 0xc4 | 0xc8 | 0xcc);
+                if let (true, Some(&[h1, h2, w1, w2])) = (is_frame, bytes.get(at + 5..at + 9)) {
+                    let side = |high, low| u64::from(u16::from_be_bytes([high, low]));
+                    pixels = pixels.max(side(h1, h2) * side(w1, w2));
+                }
+                2 + usize::from(u16::from_be_bytes([high, low])).max(2)
+            }
+        };
+    }
+    pixels
+}
+
+/// True where the file is not progressive and its first scan holds all `components`.
+fn scan_of_all(bytes: &[u8], components: u8) -> bool {
+    let mut at = 2;
+    while let Some(&[marker, kind, high, low, first]) = bytes.get(at..at + 5) {
+        match (marker, kind) {
+            // Stray and filling bytes between segments.
+            (0..=0xfe, _) | (0xff, 0xff) => at += 1,
+            (0xff, 0x00 | 0x01 | 0xd0..=0xd8) => at += 2,
+            // A start of frame other than the sequential ones.
+            (0xff, 0xc2 | 0xc3 | 0xc5..=0xc7 | 0xc9..=0xcb | 0xcd..=0xcf) => return false,
+            (0xff, 0xda) => return first == components,
+            _ => at += 2 + usize::from(u16::from_be_bytes([high, low])).max(2),
+        }
+    }
+    false
 }
 
 pub(super) fn raster(bytes: &[u8]) -> Result<Raster, FormatError> {

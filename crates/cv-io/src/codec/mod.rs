@@ -13,7 +13,7 @@ mod pnm;
 #[cfg(feature = "tiff")]
 mod tiff;
 
-use crate::FormatError;
+use crate::{FormatError, memory};
 
 /// Memory that a header may ask for before the number of pixels has been allowed, in bytes.
 const HEADER_BYTES: usize = 64 << 20;
@@ -36,6 +36,12 @@ pub(crate) struct Header {
     /// Stored pixels, before any turn.
     pub(crate) width: usize,
     pub(crate) height: usize,
+    /// Samples of a pixel of the [`Raster`], 1 to 4.
+    pub(crate) channels: usize,
+    /// Bytes of a sample of the [`Raster`]: 1, 2 or 4.
+    pub(crate) depth: usize,
+    /// The most bytes that decoding holds beside the file and the [`Raster`], single rows left out.
+    pub(crate) beside: u64,
     /// The EXIF block (a TIFF structure).
     pub(crate) exif: Option<Vec<u8>>,
     /// The orientation tag, 1 to 8, where it stands outside an EXIF block.
@@ -55,6 +61,19 @@ pub(crate) enum Samples {
     U8(Vec<u8>),
     U16(Vec<u16>),
     F32(Vec<f32>),
+}
+
+impl Header {
+    /// The most bytes held at one time from the file in memory to the picture in colors of 8 bits: the file, what decoding holds
+    /// beside the samples, the samples, and the copy that turning them by a quarter or reducing their depth takes.
+    pub(crate) fn memory(&self, file: usize, quarter: bool) -> u64 {
+        let bytes = |pixel: usize| memory::product(&[self.width as u64, self.height as u64, pixel as u64]);
+        let raster = bytes(self.channels * self.depth);
+        let turned = if quarter { raster } else { 0 };
+        let reduced = if self.channels > 2 && self.depth == 1 { 0 } else { bytes(3) };
+        let most = self.beside.max(turned).saturating_add(file as u64).max(reduced);
+        raster.saturating_add(most)
+    }
 }
 
 impl Format {

@@ -1,16 +1,25 @@
 //! PNG, through the `png` crate.
 
 use super::{Format, HEADER_BYTES, Header, Raster, Samples};
-use crate::FormatError;
+use crate::{FormatError, memory};
 use png::{BitDepth, ColorType, Decoder, DecodingError, Limits, Reader, Transformations};
 use std::io::{Cursor, ErrorKind};
 
 pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
     let reader = reader(bytes)?;
     let info = reader.info();
+    let (width, height) = (info.width as usize, info.height as usize);
+    let (color, depth) = reader.output_color_type();
+    let (channels, deep) = (color.samples(), depth == BitDepth::Sixteen);
+    // Interlaced words are decoded as bytes first.
+    let beside =
+        if deep && info.interlaced { memory::product(&[width as u64, height as u64, 2 * channels as u64]) } else { 0 };
     Ok(Header {
-        width: info.width as usize,
-        height: info.height as usize,
+        width,
+        height,
+        channels,
+        depth: if deep { 2 } else { 1 },
+        beside,
         exif: info.exif_metadata.as_ref().map(|block| block.to_vec()),
         orientation: None,
     })
@@ -28,11 +37,21 @@ pub(super) fn raster(bytes: &[u8]) -> Result<Raster, FormatError> {
     };
     let size =
         reader.output_buffer_size().ok_or_else(|| FormatError::corrupt(Format::Png.name(), "it is too large"))?;
-    let mut samples = vec![0; size];
-    reader.next_frame(&mut samples).map_err(fail)?;
-    let samples = match depth {
-        BitDepth::Sixteen => Samples::U16(samples.chunks_exact(2).map(|b| u16::from_be_bytes([b[0], b[1]])).collect()),
-        _ => Samples::U8(samples),
+    let word = |b: &[u8; 2]| u16::from_be_bytes(*b);
+    let samples = if depth == BitDepth::Sixteen && !reader.info().interlaced {
+        // Row by row: the whole as bytes would take as much again.
+        let mut words = Vec::with_capacity(size / 2);
+        while let Some(row) = reader.next_row().map_err(fail)? {
+            words.extend(row.data().as_chunks::<2>().0.iter().map(word));
+        }
+        Samples::U16(words)
+    } else {
+        let mut samples = vec![0; size];
+        reader.next_frame(&mut samples).map_err(fail)?;
+        match depth {
+            BitDepth::Sixteen => Samples::U16(samples.as_chunks::<2>().0.iter().map(word).collect()),
+            _ => Samples::U8(samples),
+        }
     };
     Ok(Raster { channels, samples })
 }

@@ -15,49 +15,62 @@ struct Start {
     at: usize,
 }
 
+impl Start {
+    fn channels(&self) -> usize {
+        if matches!(self.kind, b'3' | b'6') { 3 } else { 1 }
+    }
+
+    /// A sample as a share of `full`.
+    fn scaled(&self, v: u32, full: u32) -> u32 {
+        (v.min(self.white) * full + self.white / 2) / self.white
+    }
+}
+
 pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
     let start = start(bytes)?;
-    Ok(Header { width: start.width, height: start.height, ..Header::default() })
+    let depth = if start.white < 256 { 1 } else { 2 };
+    Ok(Header { width: start.width, height: start.height, channels: start.channels(), depth, ..Header::default() })
 }
 
 pub(super) fn raster(bytes: &[u8]) -> Result<Raster, FormatError> {
     let start = start(bytes)?;
-    let channels = if matches!(start.kind, b'3' | b'6') { 3 } else { 1 };
+    let channels = start.channels();
     let n = count(Format::Pnm, start.width, start.height, channels)?;
-    let cut = || FormatError::Truncated { format: NAME };
+    let samples = if start.white < 256 {
+        Samples::U8(samples(bytes, &start, n, |v| start.scaled(v, 255) as u8)?)
+    } else {
+        Samples::U16(samples(bytes, &start, n, |v| start.scaled(v, 65535) as u16)?)
+    };
+    Ok(Raster { channels, samples })
+}
+
+/// The `n` samples, each stored at the full range of its type.
+fn samples<T>(bytes: &[u8], start: &Start, n: usize, store: impl Fn(u32) -> T) -> Result<Vec<T>, FormatError> {
     let stored = &bytes[start.at..];
-    let samples: Vec<u32> = match start.kind {
+    let samples: Vec<T> = match start.kind {
         // A digit a pixel, with or without white space.
         b'1' => {
             let bits = stored.iter().filter(|b| !b.is_ascii_whitespace()).take(n);
-            bits.map(|&b| if b == b'0' || b == b'1' { Ok(u32::from(b == b'0')) } else { Err(bad("a bit")) })
-                .collect::<Result<_, _>>()?
+            let bit =
+                |&b: &u8| if b == b'0' || b == b'1' { Ok(store(u32::from(b == b'0'))) } else { Err(bad("a bit")) };
+            bits.map(bit).collect::<Result<_, _>>()?
         }
         b'2' | b'3' => {
             let mut at = start.at;
             let left = bytes.len() - at;
             // A sample takes a digit and a space.
-            (0..n.min(left)).map(|_| number(bytes, &mut at)).collect::<Result<_, _>>()?
+            (0..n.min(left)).map(|_| number(bytes, &mut at).map(&store)).collect::<Result<_, _>>()?
         }
         b'4' => {
             let row = start.width.div_ceil(8);
             let rows = stored.chunks_exact(row).take(start.height);
-            rows.flat_map(|row| (0..start.width).map(|x| u32::from(row[x / 8] >> (7 - x % 8) & 1 == 0))).collect()
+            let bit = |row: &[u8], x: usize| store(u32::from(row[x / 8] >> (7 - x % 8) & 1 == 0));
+            rows.flat_map(|row| (0..start.width).map(move |x| (row, x))).map(|(row, x)| bit(row, x)).collect()
         }
-        _ if start.white < 256 => stored.iter().take(n).map(|&b| u32::from(b)).collect(),
-        _ => stored.chunks_exact(2).take(n).map(|b| u32::from(u16::from_be_bytes([b[0], b[1]]))).collect(),
+        _ if start.white < 256 => stored.iter().take(n).map(|&b| store(u32::from(b))).collect(),
+        _ => stored.chunks_exact(2).take(n).map(|b| store(u32::from(u16::from_be_bytes([b[0], b[1]])))).collect(),
     };
-    if samples.len() < n {
-        return Err(cut());
-    }
-    // To the full range of 8 or 16 bits.
-    let scaled = |v: u32, full: u32| (v.min(start.white) * full + start.white / 2) / start.white;
-    let samples = if start.white < 256 {
-        Samples::U8(samples.into_iter().map(|v| scaled(v, 255) as u8).collect())
-    } else {
-        Samples::U16(samples.into_iter().map(|v| scaled(v, 65535) as u16).collect())
-    };
-    Ok(Raster { channels, samples })
+    if samples.len() < n { Err(FormatError::Truncated { format: NAME }) } else { Ok(samples) }
 }
 
 fn start(bytes: &[u8]) -> Result<Start, FormatError> {

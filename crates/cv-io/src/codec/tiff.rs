@@ -1,7 +1,7 @@
 //! TIFF, through the `tiff` crate: gray, RGB and CMYK of 8 and 16 bits and floats, interleaved or in planes.
 
 use super::{Format, HEADER_BYTES, Header, Raster, Samples, count};
-use crate::FormatError;
+use crate::{FormatError, memory};
 use std::io::{Cursor, ErrorKind};
 use tiff::decoder::{Decoder, DecodingResult, Limits};
 use tiff::tags::Tag;
@@ -14,7 +14,49 @@ pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
     let (width, height) = decoder.dimensions().map_err(fail)?;
     // A damaged tag does not cost the picture.
     let orientation = decoder.find_tag_unsigned::<u8>(Tag::Orientation).ok().flatten();
-    Ok(Header { width: width as usize, height: height as usize, exif: None, orientation })
+    // Pixels that are not read are refused with them.
+    let (channels, depth, planes) = kind(&mut decoder).unwrap_or((4, 4, false));
+    let inks = decoder.colortype().is_ok_and(|color| matches!(color, ColorType::CMYK(_)));
+    let copy = memory::product(&[u64::from(width), u64::from(height), (channels * depth) as u64]);
+    // Planes and inks are copied to become pixels; a strip or tile of JPEG is unpacked whole.
+    let chunk = jpeg_chunk(&mut decoder, bytes);
+    let beside = chunk.max(copy.saturating_mul(u64::from(planes) + u64::from(inks)));
+    let channels = if inks { 3 } else { channels };
+    Ok(Header { width: width as usize, height: height as usize, channels, depth, beside, exif: None, orientation })
+}
+
+/// The most bytes that a strip or tile of JPEG takes, by its own header, which need not be that of the picture: four bytes a pixel and
+/// as many coefficients of 16 bits. 0 where nothing is packed so.
+fn jpeg_chunk(decoder: &mut Decoder<Cursor<&[u8]>>, bytes: &[u8]) -> u64 {
+    if decoder.find_tag_unsigned::<u16>(Tag::Compression).ok().flatten() != Some(7) {
+        return 0;
+    }
+    let mut list = |tag: Tag| decoder.find_tag_unsigned_vec::<u64>(tag).ok().flatten().unwrap_or_default();
+    let mut chunks = list(Tag::StripOffsets);
+    chunks.extend(list(Tag::TileOffsets));
+    let mut lengths = list(Tag::StripByteCounts);
+    lengths.extend(list(Tag::TileByteCounts));
+    let part = |(at, length): (&u64, &u64)| {
+        let start = usize::try_from(*at).unwrap_or(usize::MAX).min(bytes.len());
+        &bytes[start..][..usize::try_from(*length).unwrap_or(usize::MAX).min(bytes.len() - start)]
+    };
+    let most = chunks.iter().zip(&lengths).map(|chunk| super::jpeg::frame_pixels(part(chunk))).max().unwrap_or(0);
+    let tables = decoder.find_tag(Tag::JPEGTables).ok().flatten().and_then(|tables| tables.into_u8_vec().ok());
+    most.max(tables.map_or(0, |tables| super::jpeg::frame_pixels(&tables))).saturating_mul(12)
+}
+
+/// Stored samples of a pixel, bytes of each in memory, and whether they are stored in planes.
+fn kind(decoder: &mut Decoder<Cursor<&[u8]>>) -> Result<(usize, usize, bool), FormatError> {
+    let (channels, bits) = match decoder.colortype().map_err(fail)? {
+        ColorType::Gray(bits @ (1 | 8 | 16 | 32)) => (1, bits),
+        ColorType::GrayA(bits @ (8 | 16)) => (2, bits),
+        ColorType::RGB(bits @ (8 | 16 | 32)) => (3, bits),
+        ColorType::RGBA(bits @ (8 | 16 | 32)) => (4, bits),
+        ColorType::CMYK(bits @ (8 | 16)) => (4, bits),
+        other => return Err(FormatError::unsupported_picture(NAME, format!("the pixel type {other:?}"))),
+    };
+    let planes = decoder.find_tag_unsigned::<u16>(Tag::PlanarConfiguration).ok().flatten() == Some(2);
+    Ok((channels, usize::from(bits).div_ceil(8), planes))
 }
 
 pub(super) fn raster(bytes: &[u8]) -> Result<Raster, FormatError> {
@@ -22,13 +64,7 @@ pub(super) fn raster(bytes: &[u8]) -> Result<Raster, FormatError> {
     let (width, height) = decoder.dimensions().map_err(fail)?;
     let (width, height) = (width as usize, height as usize);
     let color = decoder.colortype().map_err(fail)?;
-    let stored = match color {
-        ColorType::Gray(1 | 8 | 16 | 32) => 1,
-        ColorType::GrayA(8 | 16) => 2,
-        ColorType::RGB(8 | 16 | 32) => 3,
-        ColorType::RGBA(8 | 16 | 32) | ColorType::CMYK(8 | 16) => 4,
-        other => return Err(FormatError::unsupported_picture(NAME, format!("the pixel type {other:?}"))),
-    };
+    let stored = kind(&mut decoder)?.0;
     // Room for the samples, and as much again as any strip and header need.
     let mut limits = Limits::default();
     limits.decoding_buffer_size = count(Format::Tiff, width, height, 4 * stored)?;

@@ -416,11 +416,11 @@ fn a_file_cut_anywhere_is_an_error_and_never_half_a_picture() {
 
 #[test]
 fn too_many_pixels_are_refused_by_the_header() {
-    let limit = ReadOptions { max_pixels: 83 };
+    let limit = ReadOptions { max_pixels: 83, ..ReadOptions::default() };
     for (name, bytes) in samples() {
         let error = decode_image(&bytes, &limit).unwrap_err();
         assert!(matches!(error, FormatError::TooManyPixels { width: 12, height: 7, limit: 83 }), "{name}: {error}");
-        assert!(decode_image(&bytes, &ReadOptions { max_pixels: 84 }).is_ok(), "{name}");
+        assert!(decode_image(&bytes, &ReadOptions { max_pixels: 84, ..limit }).is_ok(), "{name}");
     }
 }
 
@@ -486,7 +486,7 @@ proptest! {
             bytes.truncate(usize::from(cut) % len);
         }
         let limit = 1 << 16;
-        if let Ok(picture) = decode_image(&bytes, &ReadOptions { max_pixels: limit }) {
+        if let Ok(picture) = decode_image(&bytes, &ReadOptions { max_pixels: limit, ..ReadOptions::default() }) {
             let (w, h) = picture.size();
             prop_assert!((w * h) as u64 <= limit && w * h > 0, "{}: {}×{}", name, w, h);
         }
@@ -505,4 +505,102 @@ proptest! {
             prop_assert_eq!(decoded(&encode_png(window).unwrap()).into_rgb8(), window.to_image());
         }
     }
+}
+
+/// Plain files of `w × h` pixels for every format, of one color.
+fn plain(w: usize, h: usize) -> Vec<(&'static str, Vec<u8>)> {
+    let image = RgbU8::new(w, h, [10, 200, 90]);
+    vec![
+        ("png", encode_png(image.view()).unwrap()),
+        ("png 16", encode_png(image.map(|p| p.map(|v| u16::from(v) * 257)).view()).unwrap()),
+        ("jpeg", encode_jpeg(image.view(), 90).unwrap()),
+        ("progressive", {
+            let mut bytes = Vec::new();
+            let mut encoder = jpeg_encoder::Encoder::new(&mut bytes, 90);
+            encoder.set_progressive(true);
+            encoder.encode(image.as_slice(), w as u16, h as u16, jpeg_encoder::ColorType::Rgb).unwrap();
+            bytes
+        }),
+        #[cfg(feature = "tiff")]
+        ("tiff", tiff::<tiff::encoder::colortype::RGB8>(w, h, image.as_slice())),
+        ("bmp", bmp(&image)),
+        ("pnm", ppm(&image)),
+        ("hdr", hdr_of_runs(w, h)),
+        #[cfg(feature = "exr")]
+        ("exr", exr(w, h, |_, _| [0.1, 0.2, 0.3])),
+    ]
+}
+
+/// Rows of one pixel and its repetitions, in the older run-length code: as small as a file of the format gets.
+fn hdr_of_runs(w: usize, h: usize) -> Vec<u8> {
+    let mut row = vec![128, 64, 32, 129];
+    let mut left = w - 1;
+    while left > 0 {
+        row.extend([1, 1, 1, (left % 256) as u8]);
+        left /= 256;
+    }
+    let mut bytes = format!("#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {h} +X {w}\n").into_bytes();
+    bytes.extend(row.repeat(h));
+    bytes
+}
+
+/// What reading would take, by the error under a limit of one byte.
+fn judged(bytes: &[u8]) -> u64 {
+    match decode_image(bytes, &ReadOptions { max_memory: 1, ..ReadOptions::default() }) {
+        Err(FormatError::TooMuchMemory { needed, allowed: 1, .. }) => needed,
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn memory_is_judged_by_the_header_in_every_format() {
+    let within = |max_memory| ReadOptions { max_memory, ..ReadOptions::default() };
+    for (name, bytes) in plain(640, 480) {
+        let needed = judged(&bytes);
+        let pixels = 640 * 480;
+        // No less than the file and the samples, no more than three copies of the deepest samples.
+        assert!(needed >= bytes.len() as u64 + 3 * pixels, "{name}: {needed}");
+        assert!(needed <= bytes.len() as u64 + 3 * 12 * pixels, "{name}: {needed}");
+        assert!(decode_image(&bytes, &within(needed)).is_ok(), "{name}");
+        let error = decode_image(&bytes, &within(needed - 1)).unwrap_err();
+        assert!(
+            matches!(error, FormatError::TooMuchMemory { allowed, size: Some((640, 480)), .. } if allowed == needed - 1),
+            "{name}: {error}"
+        );
+    }
+    // Coefficients are kept until the last scan.
+    let files = plain(640, 480);
+    let of = |name: &str| judged(&files.iter().find(|(n, _)| *n == name).unwrap().1);
+    assert!(of("progressive") > of("jpeg") + 640 * 480 * 3);
+}
+
+#[test]
+fn a_small_file_of_many_pixels_is_refused_at_once() {
+    let start = std::time::Instant::now();
+    let bytes = hdr_of_runs(16_000, 16_000);
+    let limit = ReadOptions { max_memory: 1 << 30, ..ReadOptions::default() };
+    let error = decode_image(&bytes, &limit).unwrap_err();
+    let FormatError::TooMuchMemory { needed, size: Some((16_000, 16_000)), .. } = error else { panic!("{error}") };
+    assert!(needed > 16_000 * 16_000 * 12);
+    // Rows that are not there are no matter of memory.
+    let lie = b"#?RADIANCE\n\n-Y 16000 +X 16000\n\x80\x40\x20\x81";
+    assert!(matches!(decode_image(lie, &limit), Err(FormatError::Corrupt { .. })));
+    for w in [20_000usize, 60_000] {
+        let header = bmp_header(w, 8000, 24, 0, 54);
+        assert!(decode_image(&header, &limit).is_err());
+        assert!(decode_image(format!("P6 {w} 8000 255\n").as_bytes(), &limit).is_err());
+    }
+    assert!(start.elapsed().as_secs_f64() < 1.0);
+}
+
+#[test]
+fn the_file_itself_counts() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.bmp");
+    std::fs::write(&path, bmp(&ramp(100, 100))).unwrap();
+    let error = read_image_with(&path, &ReadOptions { max_memory: 30_000, ..ReadOptions::default() }).unwrap_err();
+    assert!(matches!(error.reason, FormatError::TooMuchMemory { size: None, .. }), "{error}");
+    assert!(error.to_string().contains("allow more memory"), "{error}");
+    let error = read_image_with(&path, &ReadOptions { max_memory: 60_000, ..ReadOptions::default() }).unwrap_err();
+    assert!(matches!(error.reason, FormatError::TooMuchMemory { size: Some((100, 100)), .. }), "{error}");
 }

@@ -87,7 +87,7 @@ impl Args {
             return Err(Failure::new(format!("{} is not a folder", self.output.display()))
                 .advice("give a folder for the disparities of the frames"));
         }
-        let options = self.options().stereo;
+        let options = self.options(context).stereo;
         let mut film = FrameDepth::new(options.clone())?;
         let (mut size, mut seconds, mut valid, mut matched) = ((0, 0), 0.0, 0.0, 0.0);
         let stage = Stage::new(context, "frames", pairs.len())?;

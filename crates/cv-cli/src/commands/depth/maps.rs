@@ -2,6 +2,7 @@
 
 use crate::frame::{Explain, Failure};
 use cv_core::{GrayF32, ImageView};
+use cv_io::FormatError;
 use std::path::Path;
 
 /// The formats a map can be written in.
@@ -39,20 +40,21 @@ pub(super) fn write_map(
 pub(crate) fn read_map(path: &Path, scale: Option<f64>) -> Result<GrayF32, Failure> {
     let map = match path.extension().unwrap_or_default().to_string_lossy().to_lowercase().as_str() {
         "pfm" => cv_io::pfm::read(path)?,
-        "npy" => gray(path, cv_io::npy::read(path)?.to_gray())?,
-        "npz" => {
-            let arrays = cv_io::npz::read(path)?;
-            let [(_, array)] = arrays.as_slice() else {
-                return Err(Failure::new(format!("{} holds {} arrays, not one", path.display(), arrays.len())));
-            };
-            gray(path, array.to_gray())?
-        }
+        "npy" => gray(path, cv_io::npy::read(path)?.into_gray())?,
+        "npz" => gray(path, cv_io::npz::read_only(path)?.into_gray())?,
         // Pictures, whatever they are called.
         _ => {
             return match scale {
                 Some(scale) => Ok(cv_io::scaled::read(path, scale)?),
-                None => Ok(cv_io::kitti::read(path)
-                    .advice("for other pictures give the scale (--truth-scale, --estimate-scale)")?),
+                None => cv_io::kitti::read(path).map_err(|error| {
+                    let too_large = matches!(error.reason, FormatError::TooMuchMemory { .. });
+                    let failure = Failure::from(error);
+                    if too_large {
+                        failure
+                    } else {
+                        failure.advice("for other pictures give the scale (--truth-scale, --estimate-scale)")
+                    }
+                }),
             };
         }
     };
@@ -62,6 +64,6 @@ pub(crate) fn read_map(path: &Path, scale: Option<f64>) -> Result<GrayF32, Failu
     })
 }
 
-fn gray(path: &Path, map: Result<GrayF32, cv_io::FormatError>) -> Result<GrayF32, Failure> {
+fn gray(path: &Path, map: Result<GrayF32, FormatError>) -> Result<GrayF32, Failure> {
     map.during(format!("cannot read {}", path.display()))
 }

@@ -124,9 +124,6 @@ pub(crate) struct Args {
     /// Gray levels (of 255) across which --smoothing does not reach [default: 24; 1.5 for wls].
     #[arg(long, value_name = "LEVELS")]
     sigma: Option<f32>,
-    /// Most memory for matching, in MiB: where the whole does not fit, rows are matched in strips that overlap.
-    #[arg(long, value_name = "MIB")]
-    max_memory: Option<usize>,
     /// Where to write how sure each disparity is, from 0 to 1 (0 where filled): .pfm, .npy or .png (0 to 255).
     #[arg(long, value_name = "FILE")]
     confidence: Option<PathBuf>,
@@ -173,7 +170,7 @@ impl Run for Args {
                 .advice("give --focal and --baseline, or --rig"));
         }
         let photos = Photos::read(&self.left, &self.right)?;
-        let options = self.options();
+        let options = self.options(context);
         // A baseline that is given by itself counts as one in meters.
         let (job, meters) = match &self.rig {
             Some(path) => self.by_rig(path, &photos, &options, context)?,

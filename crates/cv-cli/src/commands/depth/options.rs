@@ -1,6 +1,7 @@
 //! What the arguments of `cv depth` mean to the matcher.
 
 use super::Args;
+use crate::frame::Context;
 use cv_pipeline::stereo::{Smoothing, StereoOptions};
 use cv_pipeline::{DepthOptions, DisparityRange};
 
@@ -19,7 +20,7 @@ pub(super) fn parse_range(text: &str) -> Result<Range, String> {
 }
 
 impl Args {
-    pub(super) fn options(&self) -> DepthOptions {
+    pub(super) fn options(&self, context: &Context) -> DepthOptions {
         let default = StereoOptions::default();
         DepthOptions {
             stereo: StereoOptions {
@@ -43,7 +44,7 @@ impl Args {
                     },
                 },
                 confidence: self.confidence.is_some(),
-                max_memory: self.max_memory.map(|mib| mib.saturating_mul(1 << 20)),
+                max_memory: context.max_memory,
                 ..default
             }
             .with_penalties(self.p1, self.p2),
