@@ -107,7 +107,7 @@ fn matches_that_determine_nothing_are_refused_with_the_reason() {
     infinite[9][1] = f64::INFINITY;
     let cases: [Case<'_>; 12] = [
         ("three", &good[..3], ["3 matches are too few"; 3]),
-        ("seven", &good[..7], ["as some model would if all were wrong", "7 matches are too few", ""]),
+        ("seven", &good[..7], ["as some model would if all were wrong", "7 matches are too few", "if all were wrong"]),
         (
             "seven wrong ones",
             &random(7, 0.0, 480.0),

@@ -146,8 +146,8 @@ const SEARCHES: u64 = 5;
 /// Too few matches that agree is the reason a person understands.
 fn failed(error: EstimateError, matches: usize, options: &TwoViewOptions) -> TwoViewError {
     match error {
-        EstimateError::NoConsensus { inliers, .. } => {
-            TwoViewError::TooFewInliers { inliers, matches, needed: options.min_inliers }
+        EstimateError::NoConsensus { inliers, needed, .. } => {
+            TwoViewError::TooFewInliers { inliers, matches, needed: needed.max(options.min_inliers) }
         }
         EstimateError::NotEnoughMatches { got, .. } => TwoViewError::TooFewMatches { got, needed: options.min_inliers },
         EstimateError::Cancelled(stop) => stop.into(),
