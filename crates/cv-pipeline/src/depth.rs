@@ -82,8 +82,7 @@ pub struct DepthResult {
 
 impl DepthResult {
     /// Whether fewer than half of the pixels were matched and most of the others filled in from around: of generated pairs like that, three to five of
-    /// ten filled pixels are off by more than 2 px, of others one to three (`tests/filled.rs`). Where the cameras stand unusually far apart, half of the filled pixels are wrong however many were matched:
-    /// there is more behind things to be guessed.
+    /// ten filled pixels are off by more than 2 px, of others one to three (`tests/filled.rs`).
     pub fn is_mostly_filled(&self) -> bool {
         let matched = self.map.matched_fraction();
         matched < 0.5 && self.map.valid_fraction() - matched > 0.5 * (1.0 - matched)

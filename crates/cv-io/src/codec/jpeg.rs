@@ -25,40 +25,46 @@ pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
     Ok(Header { width, height, channels, depth: 1, beside, exif: decoder.exif().cloned(), orientation: None })
 }
 
+/// The segments of a file by their markers: the second byte of each, and what follows its length. Stray and filling bytes between them are passed over.
+fn segments(bytes: &[u8]) -> impl Iterator<Item = (u8, &[u8])> {
+    let mut at = 0;
+    std::iter::from_fn(move || {
+        while let Some(&[marker, kind, high, low]) = bytes.get(at..at + 4) {
+            match (marker, kind) {
+                (0..=0xfe, _) | (0xff, 0xff) => at += 1,
+                (0xff, 0x00 | 0x01 | 0xd0..=0xd8) => at += 2,
+                _ => {
+                    let content = &bytes[at + 4..];
+                    at += 2 + usize::from(u16::from_be_bytes([high, low])).max(2);
+                    return Some((kind, content));
+                }
+            }
+        }
+        None
+    })
+}
+
 /// The pixels of the largest frame that the markers before the first scan announce.
 #[cfg(feature = "tiff")]
 pub(super) fn frame_pixels(bytes: &[u8]) -> u64 {
-    let (mut at, mut pixels) = (0, 0);
-    while let Some(&[marker, kind, high, low]) = bytes.get(at..at + 4) {
-        at += match (marker, kind) {
-            (0..=0xfe, _) | (0xff, 0xff) => 1,
-            (0xff, 0x00 | 0x01 | 0xd0..=0xd8) => 2,
-            (0xff, 0xda) => break,
-            _ => {
-                let is_frame = matches!(kind, 0xc0..=0xcf) && !matches!(kind, 0xc4 | 0xc8 | 0xcc);
-                if let (true, Some(&[h1, h2, w1, w2])) = (is_frame, bytes.get(at + 5..at + 9)) {
-                    let side = |high, low| u64::from(u16::from_be_bytes([high, low]));
-                    pixels = pixels.max(side(h1, h2) * side(w1, w2));
-                }
-                2 + usize::from(u16::from_be_bytes([high, low])).max(2)
-            }
-        };
-    }
-    pixels
+    let side = |high, low| u64::from(u16::from_be_bytes([high, low]));
+    let frames = segments(bytes).take_while(|(kind, _)| *kind != 0xda);
+    let pixels = frames.filter_map(|(kind, content)| match (kind, content) {
+        (0xc4 | 0xc8 | 0xcc, _) => None,
+        (0xc0..=0xcf, &[_, h1, h2, w1, w2, ..]) => Some(side(h1, h2) * side(w1, w2)),
+        _ => None,
+    });
+    pixels.max().unwrap_or(0)
 }
 
 /// True where the file is not progressive and its first scan holds all `components`.
 fn scan_of_all(bytes: &[u8], components: u8) -> bool {
-    let mut at = 2;
-    while let Some(&[marker, kind, high, low, first]) = bytes.get(at..at + 5) {
-        match (marker, kind) {
-            // Stray and filling bytes between segments.
-            (0..=0xfe, _) | (0xff, 0xff) => at += 1,
-            (0xff, 0x00 | 0x01 | 0xd0..=0xd8) => at += 2,
+    for (kind, content) in segments(bytes) {
+        match kind {
             // A start of frame other than the sequential ones.
-            (0xff, 0xc2 | 0xc3 | 0xc5..=0xc7 | 0xc9..=0xcb | 0xcd..=0xcf) => return false,
-            (0xff, 0xda) => return first == components,
-            _ => at += 2 + usize::from(u16::from_be_bytes([high, low])).max(2),
+            0xc2 | 0xc3 | 0xc5..=0xc7 | 0xc9..=0xcb | 0xcd..=0xcf => return false,
+            0xda => return content.first() == Some(&components),
+            _ => {}
         }
     }
     false

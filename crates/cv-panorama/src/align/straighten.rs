@@ -17,18 +17,15 @@ const MOST_PAIRS: usize = 2000;
 /// `rotations` are world to camera. The horizontal axes of photographs that were held level lie in the horizon's plane, so its normal, "up", is the
 /// direction in which they vary least. Where they all agree (a camera tilted straight up and down, or hardly turned) that leaves a
 /// choice, which the views' own middle decides: `up` minimizes `Σ min((x_i·u)² / σ_r², 3.5²) + Σ (z_i·u)² / σ_p²`. The truncation leaves out photographs on
-/// their side. O(n) hypotheses of two photographs each, O(n²) altogether, up to a bound.
+/// their side. Hypotheses are of one or two photographs, at most 2000 + n, each compared with all: O(n³) for few photographs, O(n²) for many.
 ///
 /// The answer `S` is to be applied as `R_i ← R_i Sᵀ`: `S` takes old world directions to new ones.
 pub(crate) fn straighten(rotations: &[Matrix3<f64>]) -> Matrix3<f64> {
     let level_ones = level_photographs(rotations);
     let mut y = normal(level_ones.iter().map(|&i| &rotations[i]));
     // Rows of a world-to-camera rotation are the camera's axes in the world.
-    let sum = |axis: usize, of: &mut dyn Iterator<Item = &Matrix3<f64>>| -> Vector3<f64> {
-        of.map(|r| r.row(axis).transpose()).sum()
-    };
-    let down = sum(1, &mut level_ones.iter().map(|&i| &rotations[i]));
-    let ahead = sum(2, &mut rotations.iter());
+    let down: Vector3<f64> = level_ones.iter().map(|&i| rotations[i].row(1).transpose()).sum();
+    let ahead: Vector3<f64> = rotations.iter().map(|r| r.row(2).transpose()).sum();
     if y.dot(&down) < 0.0 {
         y = -y;
     }

@@ -390,7 +390,7 @@ mod tests {
         }
     }
 
-    /// Samples per pixel by the definition: Keys' cubic convolution with a = −0.5 over all sixteen neighbors, edges repeated, then gains.
+    /// Samples per pixel by the definition: Keys' cubic convolution with a = −0.5 over all sixteen neighbors, edges repeated, then gains and the tone curve.
     fn plain(photo: &RgbU8, q: Point2<f64>, correction: ExposureCorrection) -> [f64; 3] {
         let (w, h) = (photo.width() as f64 - 1.0, photo.height() as f64 - 1.0);
         let kernel = |t: f64| match t.abs() {
@@ -400,7 +400,7 @@ mod tests {
         };
         let r2 = ((q.x - 0.5 * w).powi(2) + (q.y - 0.5 * h).powi(2)) * 4.0 / ((w + 1.0).powi(2) + (h + 1.0).powi(2));
         let [v1, v2] = correction.vignetting.map(f64::from);
-        std::array::from_fn(|c| {
+        let color: [f64; 3] = std::array::from_fn(|c| {
             let mut sum = 0.0;
             for y in (q.y.floor() as i64 - 1)..=(q.y.floor() as i64 + 2) {
                 for x in (q.x.floor() as i64 - 1)..=(q.x.floor() as i64 + 2) {
@@ -408,8 +408,11 @@ mod tests {
                     sum += kernel(q.x - x as f64) * kernel(q.y - y as f64) * f64::from(near[c]);
                 }
             }
-            (sum * f64::from(correction.gain[c]) * (r2 * (v1 + r2 * v2)).exp()).clamp(0.0, 255.0)
-        })
+            sum
+        });
+        let lift = (r2 * (v1 + r2 * v2)).exp();
+        let product = std::array::from_fn(|c| (color[c] * f64::from(correction.gain[c]) * lift) as f32);
+        correction.levels(color.map(|v| v as f32), product).map(|v| f64::from(v).clamp(0.0, 255.0))
     }
 
     #[test]
@@ -446,7 +449,7 @@ mod tests {
             *d = cv_core::Vector2::new(0.7 * (i as f64 * 0.9).sin(), 0.6 * (i as f64 * 1.7).cos());
         }
         field.update_source_shift(&p, &surface);
-        let correction = ExposureCorrection { gain: [0.6, 0.7, 0.5], vignetting: [0.2, 0.1], white: 255.0 };
+        let correction = ExposureCorrection { gain: [0.8, 1.2, 1.5], vignetting: [0.2, 0.1], white: 382.5 };
         let settings = WarpSettings { displacement: Some(&field), correction, ..PLAIN };
         let warped = warp(photo.view(), &p, &surface, bounds, settings, &stage()).unwrap();
         let mut seen = 0;
