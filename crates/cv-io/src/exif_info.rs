@@ -1,5 +1,6 @@
 //! What a camera wrote beside the picture: which way is up, and the focal length.
 
+use crate::sensor_width::sensor_width;
 use exif::{Context, Exif, In, Tag, Value};
 
 /// Facts from a picture's EXIF block, as far as geometry needs them.
@@ -31,6 +32,8 @@ pub enum FocalSource {
     /// The 35 mm equivalent (FocalLengthIn35mmFilm), by equal diagonals as CIPA DCG-001 has it. It is a whole number
     /// of millimeters, so a wide lens may be off by 2 %.
     Equivalent35mm,
+    /// The focal length in millimeters and the width of the sensor by the camera's model, from a table. The picture is taken to be the camera's whole one.
+    SensorTable,
 }
 
 /// Diagonal of the 36 × 24 mm frame.
@@ -56,11 +59,8 @@ impl ExifInfo {
             Err(error) => error.distill_partial_result(|_| ()).ok(),
         };
         let Some(exif) = parsed else { return Self::default() };
-        let text = |tag| match exif.get_field(tag, In::PRIMARY).map(|f| &f.value) {
-            Some(Value::Ascii(lines)) => lines.first().map(|l| String::from_utf8_lossy(l).trim().to_owned()),
-            _ => None,
-        };
-        let camera = [text(Tag::Make), text(Tag::Model)].into_iter().flatten().collect::<Vec<_>>().join(" ");
+        let camera =
+            [text(&exif, Tag::Make), text(&exif, Tag::Model)].into_iter().flatten().collect::<Vec<_>>().join(" ");
         let orientation = exif.get_field(Tag::Orientation, In::PRIMARY).and_then(|field| field.value.get_uint(0));
         Self {
             orientation: orientation.filter(|tag| (1..=8).contains(tag)).map_or(1, |tag| tag as u8),
@@ -78,6 +78,13 @@ pub(crate) fn is_raw_preview(bytes: &[u8]) -> bool {
     let first = |tag| fields.iter().find(|f| f.ifd_num == In::PRIMARY && f.tag == tag);
     first(DNG_VERSION).is_some()
         || first(NEW_SUBFILE_TYPE).and_then(|f| f.value.get_uint(0)).is_some_and(|kind| kind & 1 == 1)
+}
+
+fn text(exif: &Exif, tag: Tag) -> Option<String> {
+    match &exif.get_field(tag, In::PRIMARY)?.value {
+        Value::Ascii(lines) => lines.first().map(|line| String::from_utf8_lossy(line).trim().to_owned()),
+        _ => None,
+    }
 }
 
 fn number(exif: &Exif, tag: Tag) -> Option<f64> {
@@ -103,7 +110,10 @@ fn focal(exif: &Exif, width: f64, height: f64) -> Option<ExifFocal> {
         }
         (Some(pixels), _) => Some(ExifFocal { pixels, source: FocalSource::SensorResolution }),
         (None, Some(pixels)) => Some(ExifFocal { pixels, source: FocalSource::Equivalent35mm }),
-        (None, None) => None,
+        (None, None) => {
+            let pixels = number(exif, Tag::FocalLength)? / sensor_width(&text(exif, Tag::Model)?)? * width.max(height);
+            Some(ExifFocal { pixels, source: FocalSource::SensorTable })
+        }
     }
 }
 

@@ -50,10 +50,14 @@ mod pending;
 pub mod pfm;
 mod picture;
 pub mod ply;
+mod sensor_width;
 mod sniff;
 mod srgb;
 
-pub use camera::{CalibrationFormat, RigFile, parse_camera, parse_rig, read_camera, read_rig, write_camera, write_rig};
+pub use camera::{
+    CalibrationFormat, CameraFile, RigFile, parse_camera, parse_rig, read_camera, read_camera_file, read_rig,
+    write_camera, write_rig,
+};
 pub use depth_png::{depth_mm, kitti, scaled};
 pub use encode::{JpegPixels, PngPixels, encode_jpeg, encode_png, write_image, write_jpeg, write_png};
 pub use error::{FormatError, IoError};

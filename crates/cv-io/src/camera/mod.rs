@@ -96,6 +96,15 @@ impl std::fmt::Debug for CalibrationFormat {
     }
 }
 
+/// A camera as a file has it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CameraFile {
+    /// The camera.
+    pub camera: Camera,
+    /// Whether the file says what the lens's distortion is, be it none. A bare calibration matrix does not; its camera has none.
+    pub distortion_known: bool,
+}
+
 /// A stereo rig as a file has it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RigFile {
@@ -141,6 +150,18 @@ pub fn parse_camera(text: &str, size: Option<(usize, usize)>) -> Result<Camera, 
 pub fn read_camera(path: impl AsRef<Path>, size: Option<(usize, usize)>) -> Result<Camera, IoError> {
     let path = path.as_ref();
     parse_camera(&read_text(path)?, size).map_err(|reason| IoError::reading(path, reason))
+}
+
+/// Reads a camera and what the file leaves open; see [`parse_camera`].
+///
+/// # Errors
+/// As [`read_camera`].
+pub fn read_camera_file(path: impl AsRef<Path>, size: Option<(usize, usize)>) -> Result<CameraFile, IoError> {
+    let path = path.as_ref();
+    let text = read_text(path)?;
+    let file = parse_camera(&text, size)
+        .and_then(|camera| Ok(CameraFile { camera, distortion_known: format_of(&text)?.name != matrix::FORMAT.name }));
+    file.map_err(|reason| IoError::reading(path, reason))
 }
 
 /// Writes a camera as our own YAML; every number reads back to the same value. `notes` become comment lines.

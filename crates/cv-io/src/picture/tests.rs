@@ -256,7 +256,12 @@ fn the_focal_length_comes_from_the_better_tag() {
     wrong.push(equivalent);
     near(focal(&wrong), truth, FocalSource::Equivalent35mm);
     assert_eq!(focal(&by(2, 72, 1)), None);
-    assert_eq!(focal(&[mm]), None);
+    assert_eq!(focal(std::slice::from_ref(&mm)), None);
+    // Millimeters alone: the sensor is that of the model, where it is known.
+    let model = |name: &str| (Tag::Model, Value::Ascii(vec![name.as_bytes().to_vec()]));
+    near(focal(&[mm.clone(), model("Canon EOS 5D")]), truth, FocalSource::SensorTable);
+    near(focal(&[mm.clone(), model("NIKON D90")]), 50.0 * 600.0 / 23.6, FocalSource::SensorTable);
+    assert_eq!(focal(&[mm, model("No such camera")]), None);
     assert_eq!(focal(&[(Tag::FocalLengthIn35mmFilm, Value::Short(vec![0]))]), None);
     assert_eq!(focal(&[(Tag::FocalLength, rational(50, 0)), (Tag::FocalPlaneXResolution, rational(0, 0))]), None);
 }
