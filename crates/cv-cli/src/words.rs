@@ -39,10 +39,8 @@ fn words(advice: Advice) -> String {
                 "check the focal length, which is in pixels of the photograph: --focal {px:.0}, or leave it out (--ignore-exif where the photograph has a wrong one)"
             );
         }
-        Advice::GiveFocal { px } => {
-            return format!(
-                "give the focal length in pixels: --focal {px:.0} (a phone's main camera: about 0.8 times the longer side), or a camera file (--camera)"
-            );
+        Advice::LeaveOutFocal => {
+            "give the focal length in pixels of the photograph (millimeters × its width in pixels / the sensor's width in millimeters), or leave it out (--ignore-exif where the photograph has a wrong one)"
         }
         Advice::CheckCamera => "check the camera file",
         Advice::CheckMatches => "check the matches with `cv match`",
@@ -178,7 +176,6 @@ mod tests {
 
     #[test]
     fn advice_names_options_with_their_numbers() {
-        assert!(words(Advice::GiveFocal { px: 960.0 }).contains("--focal 960 "));
         assert!(words(Advice::TryDisparities { min: -7, count: 64 }).contains("--min-disparity -7 --disparities 64"));
         let error = ReconstructError::from(TwoViewError::WrongFocal {
             given: 35.0,

@@ -102,7 +102,15 @@ fn a_focal_length_that_was_estimated_is_said_with_its_deviation() {
         said.contains("warning: the focal length") == doubtful
             && html.contains("The focal length is known") == doubtful
     );
-    // None where the focal length is given.
-    let said = run(folder.path(), &[&args[..], &["--focal", "440"]].concat()).stderr;
+    // One that is given is a start: it is good to a few per cent.
+    let given = json(folder.path(), &[&args[..], &["--focal", "430"]].concat());
+    let (focal, deviation) = (given["focal_px"][0].as_f64().unwrap(), given["focal_deviation"].as_f64().unwrap());
+    assert!((focal - 440.0).abs() < 10.0 && deviation < 0.05, "{focal}");
+    // A calibration matrix leaves the lens open; none is stated where there is none, or where the file tells of it.
+    fs::write(folder.path().join("K.txt"), "440 0 239.5\n0 440 179.5\n0 0 1\n").unwrap();
+    let matrix = [&args[..], &["--camera", "K.txt"]].concat();
+    let said = run(folder.path(), &matrix).stderr;
+    assert!(said.contains("--undistorted") && said.contains("±"), "{said}");
+    let said = run(folder.path(), &[&matrix[..], &["--undistorted"]].concat()).stderr;
     assert!(!said.contains("±") && !said.contains("warning"), "{said}");
 }

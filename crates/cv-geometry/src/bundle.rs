@@ -1,12 +1,15 @@
 //! Two-view bundle adjustment.
 
-use cv_core::{Camera, Correspondence, Distortion, DistortionModel, Matrix3, Point2, Point3, Pose, Vector3};
+use cv_core::{
+    Camera, Cancelled, Correspondence, Distortion, DistortionModel, Matrix3, Point2, Point3, Pose, Progress, Stage,
+    Vector3,
+};
 use cv_numeric::RobustLoss;
 use cv_numeric::adjust::{
-    AdjustError, AdjustOptions, AdjustReport, Adjustment, Euclidean, GroupId, Manifold, Prior, RelativeMotion,
-    Residual, RigidMotion, UnitVector,
+    AdjustError, AdjustIteration, AdjustOptions, AdjustReport, Adjustment, Euclidean, GroupId, Manifold,
+    RelativeMotion, Residual, RigidMotion, UnitVector,
 };
-use nalgebra::{DMatrix, Matrix2, Matrix2x3, SMatrix, Vector2};
+use nalgebra::{DMatrix, Matrix2, Matrix2x3, SMatrix, SVector, Vector2};
 use std::ops::ControlFlow;
 
 /// Settings of [`adjust_two_views`].
@@ -15,8 +18,8 @@ pub struct BundleOptions {
     /// Loss of the reprojection error of a point in one image, in pixels. Default Cauchy with scale 1 px: SIFT points are good
     /// to about that.
     pub loss: RobustLoss,
-    /// Whether the focal lengths may change, by one common factor. Default false.
-    pub refine_focal: bool,
+    /// What is known of the focal lengths where they may change, by one common factor; held where `None`. Default `None`.
+    pub focal: Option<FocalPrior>,
     /// Whether k1 and k2 of lenses with [`DistortionModel::Radial`] may change, by as much in both cameras. Default false.
     pub refine_radial: bool,
     /// Most linearizations. Default 200; without focal lengths it takes ten or so.
@@ -25,8 +28,24 @@ pub struct BundleOptions {
 
 impl Default for BundleOptions {
     fn default() -> Self {
-        Self { loss: RobustLoss::Cauchy { scale: 1.0 }, refine_focal: false, refine_radial: false, max_iterations: 200 }
+        Self { loss: RobustLoss::Cauchy { scale: 1.0 }, focal: None, refine_radial: false, max_iterations: 200 }
     }
+}
+
+/// What is known of the focal lengths of two cameras before any match was seen: a normal distribution of the logarithm.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FocalPrior {
+    /// The likeliest focal length of the first camera, in pixels; the second's has the same share of what it is at the start.
+    pub focal: f64,
+    /// Relative standard deviation of the common factor; infinite where nothing is known.
+    pub deviation: f64,
+    /// Relative standard deviation of the ratio of the two. It is not adjusted: the deviations of the result allow for it.
+    pub ratio: f64,
+}
+
+impl FocalPrior {
+    /// Relative standard deviation of the ratio for two pictures by one lens: one of 50 mm that is focused at 10 m and then at 7 m changes its focal length by as much.
+    pub const REFOCUSED: f64 = 0.002;
 }
 
 /// Two cameras and the points they see.
@@ -51,10 +70,13 @@ pub struct BundleReport {
     /// the base line, which nothing determines, counts as exact. Of generated points with normal noise, 93 to 95 in a hundred lie within the
     /// ellipsoid of 95 %.
     pub covariances: Vec<Matrix3<f64>>,
-    /// Standard deviations in radians: of the rotation (about the axis it is worst known about) and of the direction of the translation.
+    /// Standard deviations in radians: of the rotation (about the axis it is worst known about) and of the direction of the translation. Whatever is free or
+    /// uncertain of the lens is in them.
     pub pose_deviation: [f64; 2],
+    /// The same if the focal lengths and the radial distortion were exactly what was found.
+    pub pose_deviation_given_lens: [f64; 2],
     /// Standard deviation of the common factor of the focal lengths; 0 where they were held. Where they are free, the noise is not all there is to it: so it
-    /// and the other deviations suppose that the two focal lengths may differ by 0.2 % (the camera focused anew), that the principal points are off the middle by 1 % of
+    /// and the other deviations suppose that the two focal lengths may differ ([`FocalPrior::ratio`]), that the principal points are off the middle by 1 % of
     /// half the diagonal, and off each other by 0.2 % (stabilized pictures).
     pub focal_deviation: f64,
 }
@@ -64,9 +86,10 @@ const LENS: usize = 3;
 /// Beside those, what is held at its most likely value and may be otherwise: logarithm of the ratio of the focal lengths, principal points of both, and of the
 /// second against the first.
 const HELD: usize = 5;
-/// Standard deviations before any match was seen, of k1, k2 and of what is held. Displacements of the corners by k1 and k2, and of the principal points, as
-/// shares of half the diagonal: a strong barrel has 0.1. A lens of 50 mm that is focused at 10 m and then at 7 m changes its focal length by 0.2 %.
-const PRIOR: [f64; 2 + HELD] = [0.1, 0.1, 0.002, 0.01, 0.01, 0.002, 0.002];
+/// Standard deviations before any match was seen: displacements of the corners by k1 and k2, as shares of half the diagonal. A strong barrel has 0.1.
+const RADIAL_PRIOR: [f64; 2] = [0.1, 0.1];
+/// And of the principal points, of both and of the second against the first, as shares of half the diagonal.
+const CENTER_PRIOR: [f64; 2] = [0.01, 0.002];
 /// Square pixels: the noise of a SIFT point, by which the priors are weighed against the residuals.
 const NOISE: f64 = 0.25;
 
@@ -84,6 +107,28 @@ impl Manifold for CommonLens {
 
     fn step(&self, x: &[f64], delta: &[f64], moved: &mut [f64]) {
         moved.copy_from_slice(&[x[0] * delta[0].exp(), x[1] + delta[1], x[2] + delta[2]]);
+    }
+}
+
+/// What is known of the common change of both lenses before any match was seen: residuals of the logarithm of the factor, of k1 and of k2, each with its mean
+/// and its weight.
+struct LensPrior([(f64, f64); LENS]);
+
+impl Residual<LENS, 1, LENS> for LensPrior {
+    const DIMS: [usize; 1] = [LENS];
+
+    #[inline]
+    fn evaluate(
+        &self,
+        _: usize,
+        [x]: [&[f64]; 1],
+        jacobian: Option<&mut SMatrix<f64, LENS, LENS>>,
+    ) -> Option<SVector<f64, LENS>> {
+        if let Some(j) = jacobian {
+            (0..LENS).for_each(|i| j[(i, i)] = self.0[i].1);
+        }
+        let value = [x[0].ln(), x[1], x[2]];
+        Some(SVector::from_fn(|i, _| (value[i] - self.0[i].0) * self.0[i].1))
     }
 }
 
@@ -222,9 +267,6 @@ impl Problem<'_> {
             options.refine_radial && bundle.cameras.iter().all(|c| c.distortion.model() == DistortionModel::Radial);
         let half = 0.5 * (first.width as f64).hypot(first.height as f64);
         let corner2 = (half / first.fx).powi(2);
-        // Standard deviations in the units of the degrees of freedom.
-        let unit = [1.0 / corner2, 1.0 / (corner2 * corner2), 1.0, half, half, half, half];
-        let prior: [f64; 2 + HELD] = std::array::from_fn(|i| PRIOR[i] * unit[i]);
 
         let seen = bundle.points.iter().zip(matches);
         let n = seen.len() as u32;
@@ -243,21 +285,26 @@ impl Problem<'_> {
         adjustment.add_residuals("first view", one, [lens, held, points], blocks, options.loss)?;
         let blocks = (0..n).map(|i| [0, 0, 0, i]).collect();
         adjustment.add_residuals("second view", two, [pose, lens, held, points], blocks, options.loss)?;
-        if !options.refine_focal {
+        // The weight of what has this standard deviation beforehand, in the unit of its degree of freedom.
+        let weight = |deviation: f64| noise.sqrt() / deviation;
+        let mut prior = [(0.0, 0.0); LENS];
+        if let Some(FocalPrior { focal, deviation, ratio }) = options.focal {
+            prior[0] = ((focal / first.fx).ln(), weight(deviation));
+            let [both, apart] = CENTER_PRIOR.map(|share| share * half);
+            adjustment.consider(held, 0, &[ratio, both, both, apart, apart])?;
+        } else {
             adjustment.hold_parameters(lens, 0, &[0])?;
+            adjustment.hold(held, 0)?;
         }
         if radial {
             let k = first.distortion.parameters();
-            let weight = |i: usize| noise.sqrt() / prior[i];
-            let items = vec![([1.0, -k[0], -k[1]], [0.0, weight(0), weight(1)])];
-            adjustment.add_residuals("prior", Prior { items }, [lens], vec![[0]], RobustLoss::Trivial)?;
+            prior[1] = (-k[0], weight(RADIAL_PRIOR[0] / corner2));
+            prior[2] = (-k[1], weight(RADIAL_PRIOR[1] / (corner2 * corner2)));
         } else {
             adjustment.hold_parameters(lens, 0, &[1, 2])?;
         }
-        if options.refine_focal {
-            adjustment.consider(held, 0, &prior[2..])?;
-        } else {
-            adjustment.hold(held, 0)?;
+        if radial || options.focal.is_some() {
+            adjustment.add_residuals("prior", LensPrior(prior), [lens], vec![[0]], RobustLoss::Trivial)?;
         }
         Ok(Self { adjustment, pose, lens, points, radial })
     }
@@ -288,21 +335,25 @@ impl Problem<'_> {
         let points = covariance.of_group(self.points).into_iter();
         let pose = covariance.of(self.pose, 0)?;
         let worst = |m: DMatrix<f64>| m.symmetric_eigenvalues().max().max(0.0).sqrt();
+        let deviations = |pose: &DMatrix<f64>| {
+            [worst(pose.view((0, 0), (3, 3)).into_owned()), worst(pose.view((3, 3), (2, 2)).into_owned())]
+        };
+        // The covariance of the pose under the condition that the lens is known, by Schur's complement; the lens's own is singular where a part of it is held.
+        let lens = covariance.of(self.lens, 0)?;
+        let across = covariance.between((self.pose, 0), (self.lens, 0))?;
+        let scale = DMatrix::from_diagonal(&lens.diagonal().map(|v| if v > 0.0 { 1.0 / v.sqrt() } else { 0.0 }));
+        let given_lens = (&scale * &lens * &scale)
+            .pseudo_inverse(1e-12)
+            .map_or_else(|_| pose.clone(), |inverse| &pose - &across * &scale * inverse * &scale * across.transpose());
         Ok(BundleReport {
             cost: [solved.initial_cost, solved.cost],
             iterations: solved.iterations,
             covariances: points
                 .map(|c| c.map(|c| Matrix3::from_column_slice(c.as_slice())))
                 .collect::<Result<_, _>>()?,
-            pose_deviation: [
-                worst(pose.view((0, 0), (3, 3)).into_owned()),
-                worst(pose.view((3, 3), (2, 2)).into_owned()),
-            ],
-            focal_deviation: if options.refine_focal {
-                covariance.of(self.lens, 0)?[(0, 0)].max(0.0).sqrt()
-            } else {
-                0.0
-            },
+            pose_deviation: deviations(&pose),
+            pose_deviation_given_lens: deviations(&given_lens),
+            focal_deviation: if options.focal.is_some() { lens[(0, 0)].max(0.0).sqrt() } else { 0.0 },
         })
     }
 }
@@ -313,26 +364,38 @@ impl Problem<'_> {
 /// `matches` are in pixels, one for each point of the bundle; more of either are left alone. By [`cv_numeric::adjust`] with the points
 /// eliminated, O(points) for each iteration. Never worse than the start. `None` where a point starts behind a
 /// camera or a residual is not finite.
+///
+/// # Errors
+/// [`Cancelled`]; the bundle is then as far as it was adjusted.
 pub fn adjust_two_views(
     bundle: &mut TwoViewBundle,
     matches: &[Correspondence],
     options: &BundleOptions,
-) -> Option<BundleReport> {
-    let mut problem = Problem::new(bundle, matches, options, NOISE).ok()?;
+    progress: &dyn Progress,
+) -> Result<Option<BundleReport>, Cancelled> {
+    let stage = Stage::new(progress, "adjust", options.max_iterations)?;
+    let Ok(mut problem) = Problem::new(bundle, matches, options, NOISE) else { return Ok(None) };
     let settings = AdjustOptions {
         max_iterations: options.max_iterations,
         // Focal length, distortion and motion nearly make up for each other: a step of a hundred-millionth may be followed by a thousand like it.
         cost_tolerance: 1e-9,
         ..AdjustOptions::default()
     };
-    let solved = problem.adjustment.solve(&settings, |_| ControlFlow::Continue(())).ok()?;
+    let next = |_: &AdjustIteration| match stage.add(1) {
+        Ok(()) => ControlFlow::Continue(()),
+        Err(Cancelled) => ControlFlow::Break(()),
+    };
+    let Ok(solved) = problem.adjustment.solve(&settings, next) else { return Ok(None) };
     problem.write(bundle);
-    let sums = problem.adjustment.residual_sums().ok()?;
+    stage.check()?;
+    let Ok(sums) = problem.adjustment.residual_sums() else { return Ok(None) };
     let (squares, weights) = sums.iter().take(2).fold((0.0, 0.0), |s, k| (s.0 + k.weighted_squares, s.1 + k.weights));
     // Two residuals to a view, four to a point, three of which the point takes up and five the pose.
     let n = bundle.points.len().min(matches.len()) as f64;
     let variance = squares / (weights * (n - 5.0) / (4.0 * n)).max(1.0);
-    Problem::new(bundle, matches, options, variance).ok()?.report(variance, options, &solved).ok()
+    let report = Problem::new(bundle, matches, options, variance).and_then(|p| p.report(variance, options, &solved));
+    stage.check()?;
+    Ok(report.ok())
 }
 
 #[cfg(test)]
@@ -340,9 +403,12 @@ mod tests {
     use super::*;
     use crate::testing::{TwoViews, gauss, uniform};
     use crate::{pose_difference, triangulate};
-    use cv_core::Rotation3;
+    use cv_core::{Rotation3, Silent};
     use rand_chacha::ChaCha8Rng;
     use rand_chacha::rand_core::SeedableRng;
+
+    /// Nothing is known but that both pictures are by one lens.
+    const UNKNOWN: FocalPrior = FocalPrior { focal: 500.0, deviation: f64::INFINITY, ratio: FocalPrior::REFOCUSED };
 
     /// Matches of a distorting camera, the truth, and a start that is a little off.
     fn problem(seed: u64, n: usize, noise: f64) -> (Vec<Correspondence>, TwoViewBundle, TwoViewBundle) {
@@ -424,14 +490,14 @@ mod tests {
 
     #[test]
     fn exact_matches_lead_to_the_exact_scene() {
-        for refine_focal in [false, true] {
+        for focal in [None, Some(UNKNOWN)] {
             for seed in 0..30 {
                 let (matches, truth, mut start) = problem(seed, 60, 0.0);
-                if refine_focal {
+                if focal.is_some() {
                     start.cameras.iter_mut().for_each(|c| (c.fx, c.fy) = (c.fx * 1.01, c.fy * 1.01));
                 }
-                let options = BundleOptions { refine_focal, max_iterations: 200, ..BundleOptions::default() };
-                let report = adjust_two_views(&mut start, &matches, &options).unwrap();
+                let options = BundleOptions { focal, max_iterations: 200, ..BundleOptions::default() };
+                let report = adjust_two_views(&mut start, &matches, &options, &Silent).unwrap().unwrap();
                 // Rounding of pixels: 1e-13 of a few hundred, squared, over 240 residuals; Newton's method goes on until it is all that is left.
                 assert!(report.cost[1] < 1e-17, "{report:?}");
                 let [turn, shift] = pose_difference(&start.pose, &truth.pose);
@@ -459,7 +525,7 @@ mod tests {
                     *x = triangulate(&m, &truth.pose).unwrap();
                 }
                 let options = BundleOptions { loss, ..BundleOptions::default() };
-                let report = adjust_two_views(&mut start, &matches, &options).unwrap();
+                let report = adjust_two_views(&mut start, &matches, &options, &Silent).unwrap().unwrap();
                 for ((x, t), c) in start.points.iter().zip(&truth.points).zip(&report.covariances) {
                     let d = x - t;
                     let squared = d.dot(&(c.try_inverse().unwrap() * d));
@@ -509,8 +575,8 @@ mod tests {
             }
             let mut start = TwoViewBundle { points, ..truth.clone() };
             start.cameras.iter_mut().for_each(|c| c.distortion = Distortion::radial(-0.1, 0.0));
-            let options = BundleOptions { refine_focal: true, refine_radial: true, ..BundleOptions::default() };
-            let report = adjust_two_views(&mut start, &matches, &options).unwrap();
+            let options = BundleOptions { focal: Some(UNKNOWN), refine_radial: true, ..BundleOptions::default() };
+            let report = adjust_two_views(&mut start, &matches, &options, &Silent).unwrap().unwrap();
             let off = (start.cameras[0].fx / truth.cameras[0].fx).ln();
             squares.push((off / report.focal_deviation).powi(2));
         }
@@ -524,7 +590,7 @@ mod tests {
     fn a_wrong_match_bends_nothing() {
         let (mut matches, truth, mut start) = problem(3, 80, 0.2);
         matches[7].b.x += 40.0;
-        adjust_two_views(&mut start, &matches, &BundleOptions::default()).unwrap();
+        adjust_two_views(&mut start, &matches, &BundleOptions::default(), &Silent).unwrap();
         let turn = pose_difference(&start.pose, &truth.pose)[0];
         // 0.2 px is 4e-4 rad for one ray, much less for 80; 40 px undamped would be 0.08 rad for one.
         assert!(turn < 2e-3, "{turn}");
@@ -534,8 +600,8 @@ mod tests {
     fn a_point_behind_a_camera_is_no_start() {
         let (matches, _, mut start) = problem(3, 20, 0.2);
         start.points[4].z = -1.0;
-        assert!(adjust_two_views(&mut start, &matches, &BundleOptions::default()).is_none());
+        assert_eq!(adjust_two_views(&mut start, &matches, &BundleOptions::default(), &Silent), Ok(None));
         start.points.clear();
-        assert!(adjust_two_views(&mut start, &matches, &BundleOptions::default()).is_none());
+        assert_eq!(adjust_two_views(&mut start, &matches, &BundleOptions::default(), &Silent), Ok(None));
     }
 }

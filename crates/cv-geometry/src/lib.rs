@@ -45,7 +45,7 @@ mod verified_pair;
 pub use absolute::{
     Similarity, WorldMatch, align_points, estimate_pose, pose_from_points, pose_three_points, refine_pose,
 };
-pub use bundle::{BundleOptions, BundleReport, TwoViewBundle, adjust_two_views};
+pub use bundle::{BundleOptions, BundleReport, FocalPrior, TwoViewBundle, adjust_two_views};
 pub use cv_numeric::RobustLoss;
 pub use epipolar::sampson;
 pub use error::{Degeneracy, EstimateError};

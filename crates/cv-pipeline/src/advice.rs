@@ -36,11 +36,8 @@ pub enum Advice {
         /// In pixels.
         px: f64,
     },
-    /// The focal length must be given; that of a phone's main camera would be this.
-    GiveFocal {
-        /// In pixels: 0.8 times the longer side.
-        px: f64,
-    },
+    /// The focal length is to be left out, or given in pixels.
+    LeaveOutFocal,
     /// The camera is not that of the photographs.
     CheckCamera,
     /// The matches are to be looked at.
@@ -106,9 +103,7 @@ fn two_view(error: &TwoViewError) -> Advice {
         TwoViewError::UncertainPose { .. } => Advice::MoreDepthOrFeatures,
         TwoViewError::LittleParallax { .. } => Advice::FartherApart,
         TwoViewError::WrongFocal { better, .. } => Advice::FocalBetter { px: *better },
-        TwoViewError::NoPerspective { side } | TwoViewError::UnknownFocal { side, .. } => {
-            Advice::GiveFocal { px: 0.8 * *side as f64 }
-        }
+        TwoViewError::ImplausibleFocal { .. } => Advice::LeaveOutFocal,
         TwoViewError::Estimate(_) | TwoViewError::MatchOutOfRange { .. } => Advice::CheckMatches,
         TwoViewError::Cancelled(_) => Advice::RunAgain,
     }
@@ -191,9 +186,13 @@ mod tests {
 
     #[test]
     fn advice_carries_the_numbers() {
-        let error = ReconstructError::from(TwoViewError::UnknownFocal { low: 800.0, high: 1250.0, side: 1200 });
-        // A phone's main camera: 26 to 29 mm before a film of 36 mm, 0.72 to 0.8 times the longer side.
-        assert_eq!(error.advice(), Advice::GiveFocal { px: 960.0 });
+        let error = ReconstructError::from(TwoViewError::WrongFocal {
+            given: 35.0,
+            better: 960.0,
+            deviations: 9.0,
+            inliers: 80,
+        });
+        assert_eq!(error.advice(), Advice::FocalBetter { px: 960.0 });
         let cause = NoPairCause::Range { range: (-7, 56) };
         let error = DepthError::NoPair { matched: 0.1, needed: 0.18, cause };
         assert_eq!(error.advice(), Advice::TryDisparities { min: -7, count: 64 });

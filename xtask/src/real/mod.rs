@@ -5,6 +5,7 @@
 
 pub(crate) mod depth;
 pub(crate) mod estimate;
+mod focal;
 mod matching;
 mod panorama;
 mod reconstruct;
@@ -21,6 +22,7 @@ type Job = fn(&Path) -> Result<Vec<Check>>;
 const JOBS: &[checks::Named<Job>] = &[
     ("depth", depth::run),
     ("estimate", estimate::run),
+    ("focal", focal::run),
     ("matching", matching::run),
     ("panorama", panorama::run),
     ("reconstruct", reconstruct::run),

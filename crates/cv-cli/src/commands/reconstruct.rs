@@ -43,7 +43,10 @@ pub(crate) struct Args {
     /// Camera of the second photograph, where it is another one.
     #[arg(long, value_name = "FILE", requires = "camera")]
     camera2: Option<PathBuf>,
-    /// Focal length of both photographs in pixels.
+    /// The photographs are free of lens distortion, of which a calibration matrix does not tell.
+    #[arg(long, requires = "camera")]
+    undistorted: bool,
+    /// About what focal length in pixels both photographs have.
     #[arg(long, value_name = "PX")]
     focal: Option<f64>,
     /// Estimate the focal length even where the photographs' EXIF has one.
@@ -133,9 +136,11 @@ impl Run for Args {
 /// What to think of a focal length that the photographs hardly show.
 fn doubt(result: &ReconstructResult) -> Option<String> {
     let percent = 100.0 * result.scene.focal_deviation;
+    let degrees = result.scene.pose_deviation[1].to_degrees();
     result.focal_is_doubtful().then(|| {
         format!(
-            "the focal length is known to ±{percent:.0} % only, and the depth of the cloud may be stretched by as much"
+            "the focal length is known to ±{percent:.0} % only, and the depth of the cloud may be stretched by as much; the direction of the motion is known to \
+             ±{degrees:.1} degrees"
         )
     })
 }
@@ -144,21 +149,31 @@ impl Args {
     /// What is known of the cameras, and how.
     fn intrinsics(&self, photos: &[DynImage; 2]) -> Result<(Intrinsics, String), Failure> {
         if let Some(path) = &self.camera {
-            let first = cv_io::read_camera(path, Some(photos[0].size()))?;
+            let first = cv_io::read_camera_file(path, Some(photos[0].size()))?;
             let second = match &self.camera2 {
-                Some(path) => cv_io::read_camera(path, Some(photos[1].size()))?,
+                Some(path) => cv_io::read_camera_file(path, Some(photos[1].size()))?,
                 None => first,
             };
-            return Ok((Intrinsics::Known([first, second]), format!("camera from {}", path.display())));
+            let cameras = [first.camera, second.camera];
+            let source = format!("camera from {}", path.display());
+            return Ok(if self.undistorted || (first.distortion_known && second.distortion_known) {
+                (Intrinsics::Known(cameras), source)
+            } else {
+                let open = "a matrix without the lens: its distortion is estimated (--undistorted where there is none)";
+                (Intrinsics::Matrix(cameras), format!("{source}, {open}"))
+            });
         }
         if let Some(focal) = self.focal {
-            return Ok((Intrinsics::Focal([focal; 2]), format!("focal length {focal} px as given")));
+            let source = format!("focal length about {focal} px as given, refined by the matches");
+            return Ok((Intrinsics::Focal([focal; 2]), source));
         }
         let exif = photos.each_ref().map(|p| p.exif.focal.map(|f| f.pixels).filter(|_| !self.ignore_exif));
         let intrinsics = Intrinsics::from_focal_lengths(exif);
         let source = match intrinsics {
             Intrinsics::Focal([a, _]) => {
-                format!("focal length {a:.0} px from EXIF (--focal or --camera to change it)")
+                format!(
+                    "focal length about {a:.0} px from EXIF, refined by the matches (--focal or --camera to change it)"
+                )
             }
             _ => "focal length unknown: estimated from the matches".to_owned(),
         };

@@ -6,7 +6,7 @@ use crate::{
     BundleOptions, BundleReport, RobustLoss, TwoViewBundle, adjust_two_views, essential_from_pose,
     jackknife_pose_deviation, normalize_matches, parallax_angle, triangulate,
 };
-use cv_core::{Camera, Correspondence, DMatch, Matrix3, Point3, Pose, Progress, median};
+use cv_core::{Camera, Cancelled, Correspondence, DMatch, Matrix3, Point3, Pose, Progress, median};
 
 /// A point of a [`TwoViewReconstruction`].
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -43,10 +43,12 @@ pub struct TwoViewReconstruction {
     pub reprojection_rms: f64,
     /// Median angle between the two rays of a point, in radians.
     pub median_angle: f64,
-    /// Standard deviations of the rotation and of the direction of the translation, in radians: the larger of what the residuals say
-    /// and of what leaving out one part of the photograph after the other does ([`jackknife_pose_deviation`]).
+    /// Standard deviations of the rotation and of the direction of the translation, in radians: the larger of what the residuals say, with whatever is
+    /// uncertain of the lens, and of what leaving out one part of the photograph after the other does ([`jackknife_pose_deviation`]).
     pub pose_deviation: [f64; 2],
-    /// Relative standard deviation of the focal length; 0 where it was given.
+    /// The same if focal length and radial distortion were exactly what was found: what is left is the motion's own.
+    pub pose_deviation_given_lens: [f64; 2],
+    /// Relative standard deviation of the focal length; 0 where the cameras were given.
     pub focal_deviation: f64,
     /// Share of the inliers that one homography explains.
     pub planar_share: f64,
@@ -84,7 +86,7 @@ impl<'a> TwoViewAdjustment<'a> {
         progress.report("adjust", 0, 1)?;
         let matches: Vec<DMatch> = geometry.inliers.iter().filter_map(|&i| views.matches.get(i)).copied().collect();
         let pairs = views.correspondences(&matches)?;
-        let fit = Fit::new(&matches, &pairs, geometry.cameras, geometry.pose, options)
+        let fit = Fit::new(&matches, &pairs, geometry.cameras, geometry.pose, views, options, progress)?
             .ok_or_else(|| too_few(0, views, options))?;
         // Before further matches: those agree with the pose because they were looked for where it says.
         let TwoViewBundle { cameras, pose, .. } = &fit.bundle;
@@ -122,7 +124,7 @@ impl<'a> TwoViewAdjustment<'a> {
         // Fewer would mean that the first matches were not what the lines say.
         if kept.len() > self.geometry.inliers.len() {
             let (matches, pairs): (Vec<_>, Vec<_>) = kept.iter().map(|&i| (more[i], pairs[i])).unzip();
-            if let Some(better) = Fit::new(&matches, &pairs, *cameras, *pose, &self.options) {
+            if let Some(better) = Fit::new(&matches, &pairs, *cameras, *pose, &self.views, &self.options, progress)? {
                 self.fit = better;
             }
         }
@@ -137,11 +139,8 @@ impl<'a> TwoViewAdjustment<'a> {
         let Self { views, geometry, options, fit, stability, guided } = self;
         let Fit { bundle, matches, observed, report } = fit;
         let pose_deviation = [0, 1].map(|i| stability[i].max(report.pose_deviation[i]));
+        let pose_deviation_given_lens = [0, 1].map(|i| stability[i].max(report.pose_deviation_given_lens[i]));
         let focal_deviation = report.focal_deviation.max(geometry.focal_range / 2.0);
-        if options.intrinsics == Intrinsics::Unknown {
-            let side = views.sizes.iter().map(|(width, height)| *width.max(height)).max().unwrap_or(0);
-            TwoViewError::check_focal(bundle.cameras[0].fx, focal_deviation, side)?;
-        }
         let mut points = Vec::new();
         for (match_index, (point, m)) in bundle.points.iter().zip(&observed).enumerate() {
             let Some(errors) = reprojection(&bundle, point, m) else { continue };
@@ -167,9 +166,9 @@ impl<'a> TwoViewAdjustment<'a> {
                 needed: options.min_median_angle.to_degrees(),
             });
         }
-        if pose_deviation[1] > options.max_deviation {
+        if pose_deviation_given_lens[1] > options.max_deviation {
             return Err(TwoViewError::UncertainPose {
-                degrees: pose_deviation[1].to_degrees(),
+                degrees: pose_deviation_given_lens[1].to_degrees(),
                 allowed: options.max_deviation.to_degrees(),
                 inliers: points.len(),
                 matches: views.matches.len().max(guided),
@@ -186,6 +185,7 @@ impl<'a> TwoViewAdjustment<'a> {
             points,
             median_angle,
             pose_deviation,
+            pose_deviation_given_lens,
             focal_deviation,
             planar_share: geometry.planar_share,
         })
@@ -218,11 +218,12 @@ impl Fit {
         pairs: &[Correspondence],
         cameras: [Camera; 2],
         pose: Pose,
+        views: &MatchedViews<'_>,
         options: &TwoViewOptions,
-    ) -> Option<Self> {
+        progress: &dyn Progress,
+    ) -> Result<Option<Self>, Cancelled> {
         let settings = BundleOptions {
-            refine_focal: options.intrinsics == Intrinsics::Unknown,
-            // Where it was found to distort; the search knows k1 only, and not to its last digit.
+            focal: options.intrinsics.focal_prior(views.sizes),
             refine_radial: !matches!(options.intrinsics, Intrinsics::Known(_)),
             ..BundleOptions::default()
         };
@@ -236,8 +237,8 @@ impl Fit {
             }
         }
         let mut bundle = TwoViewBundle { cameras, pose, points };
-        let mut report = adjust_two_views(&mut bundle, &observed, &settings)?;
-        if settings.refine_focal {
+        let Some(mut report) = adjust_two_views(&mut bundle, &observed, &settings, progress)? else { return Ok(None) };
+        if settings.focal.is_some() {
             // Once more with the noise that these matches have, for which a pixel may be wide: what is near but wrong shows in the focal length first.
             let errors = bundle.points.iter().zip(&observed).filter_map(|(x, m)| reprojection(&bundle, x, m));
             let mut errors: Vec<f64> = errors.flatten().collect();
@@ -245,9 +246,13 @@ impl Fit {
             // The median of an absolute normal error is 0.6745 deviations; Cauchy's loss is 95 % as good as least squares on such errors at 2.385 of them (Huber & Ronchetti,
             // "Robust statistics", 2009).
             let loss = RobustLoss::Cauchy { scale: (2.385 / 0.6745 * median).clamp(0.1, 1.0) };
-            report = adjust_two_views(&mut bundle, &observed, &BundleOptions { loss, ..settings })?;
+            let again = BundleOptions { loss, ..settings };
+            report = match adjust_two_views(&mut bundle, &observed, &again, progress)? {
+                Some(report) => report,
+                None => return Ok(None),
+            };
         }
-        Some(Self { bundle, matches: seen, observed, report })
+        Ok(Some(Self { bundle, matches: seen, observed, report }))
     }
 }
 

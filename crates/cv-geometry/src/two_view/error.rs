@@ -112,25 +112,17 @@ pub enum TwoViewError {
         /// Matches that agree by the better one.
         inliers: usize,
     },
-    /// The longer the focal length is taken to be, the better it fits.
+    /// A focal length that no photograph has.
     #[error(
-        "the focal length cannot be told from these photographs: they show no perspective (the subject is too far away, or the view too narrow)"
+        "the focal length given, {given:.0} px, is none of a photograph of this size: {low:.0} to {high:.0} px are"
     )]
-    NoPerspective {
-        /// Longer side of the photographs, in pixels.
-        side: usize,
-    },
-    /// Many focal lengths fit the matches as well as the best.
-    #[error(
-        "the focal length cannot be told from these photographs: none between {low:.0} and {high:.0} px fits better than the others"
-    )]
-    UnknownFocal {
-        /// Smallest that fits, in pixels; at the least that of a field of view of 170 degrees.
+    ImplausibleFocal {
+        /// Focal length given, in pixels.
+        given: f64,
+        /// That of a field of view of 136 degrees, in pixels.
         low: f64,
-        /// Largest that fits, in pixels; at the most that of a field of view of 3 degrees.
+        /// That of a field of view of 3 degrees, in pixels.
         high: f64,
-        /// Longer side of the photographs, in pixels.
-        side: usize,
     },
     /// The search for a model failed.
     #[error(transparent)]
@@ -141,22 +133,11 @@ pub enum TwoViewError {
 }
 
 impl TwoViewError {
-    /// Refuses a focal length (pixels) that no lens of a photograph has, and one with a relative standard deviation over a tenth: the depth of the
-    /// scene, which goes with it, may well be off by a fifth.
-    pub(super) fn check_focal(focal: f64, deviation: f64, side: usize) -> Result<(), Self> {
-        // Fields of view along the longer side of 170 degrees, and of 3 degrees: 690 mm before a film of 36 mm.
-        let [least, most] = [85f64, 1.5].map(|half| 0.5 * side as f64 / half.to_radians().tan());
-        if focal > most {
-            return Err(Self::NoPerspective { side });
-        }
-        if focal < least {
-            return Err(Self::UnknownFocal { low: least, high: most, side });
-        }
-        if deviation > 0.1 {
-            let (low, high) = ((focal / (1.0 + deviation)).max(least), (focal * (1.0 + deviation)).min(most));
-            return Err(Self::UnknownFocal { low, high, side });
-        }
-        Ok(())
+    /// Refuses a focal length (pixels) that no lens of a photograph has, whose longer side is of `side` pixels.
+    pub(super) fn check_focal(given: f64, side: usize) -> Result<(), Self> {
+        // Fields of view along the longer side of 136 degrees, beyond which lenses are fisheyes, and of 3 degrees: 690 mm before a film of 36 mm.
+        let [low, high] = [68f64, 1.5].map(|half| 0.5 * side as f64 / half.to_radians().tan());
+        if (low..=high).contains(&given) { Ok(()) } else { Err(Self::ImplausibleFocal { given, low, high }) }
     }
 }
 
@@ -165,12 +146,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_focal_length_is_told_or_the_reason_why_not() {
-        assert_eq!(TwoViewError::check_focal(1000.0, 0.05, 1200), Ok(()));
-        // Fifty times the longer side is a telescope's.
-        assert_eq!(TwoViewError::check_focal(60_000.0, 0.05, 1200), Err(TwoViewError::NoPerspective { side: 1200 }));
-        let error = TwoViewError::check_focal(1000.0, 0.25, 1200).unwrap_err();
-        assert_eq!(error, TwoViewError::UnknownFocal { low: 800.0, high: 1250.0, side: 1200 });
-        assert!(matches!(TwoViewError::check_focal(10.0, 0.0, 1200), Err(TwoViewError::UnknownFocal { .. })));
+    fn a_focal_length_of_millimeters_is_told() {
+        assert_eq!(TwoViewError::check_focal(1000.0, 1200), Ok(()));
+        // A millimeter's number, and a telescope's.
+        for given in [35.0, 60_000.0] {
+            let error = TwoViewError::check_focal(given, 1200).unwrap_err();
+            assert!(
+                matches!(error, TwoViewError::ImplausibleFocal { low, high, .. } if low > 200.0 && high < 30_000.0)
+            );
+        }
     }
 }

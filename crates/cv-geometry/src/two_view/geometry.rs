@@ -1,13 +1,13 @@
 //! The cameras and the relative pose, from all tentative matches.
 
 use super::degeneracy::DegeneracyTest;
-use super::lens::{Found, Rival, find_lens};
+use super::lens::{Found, Rival, USUAL_FOCALS, find_lens};
 use super::{Intrinsics, MatchedViews, TwoViewError, TwoViewOptions};
 use crate::{
     EstimateError, RobustModel, RobustOptions, estimate_relative_pose, normalize_matches, pose_difference,
     poses_are_rivals, refine_relative_pose,
 };
-use cv_core::{Camera, Correspondence, Pose, Progress, Stage};
+use cv_core::{Camera, Correspondence, Distortion, Pose, Progress, Stage};
 use rayon::prelude::*;
 
 /// Cameras, relative pose, and the matches that agree with them. Not adjusted yet: see [`TwoViewAdjustment`](super::TwoViewAdjustment).
@@ -42,7 +42,7 @@ pub fn estimate_two_view_geometry(
     if pairs.len() < options.min_inliers {
         return Err(TwoViewError::TooFewMatches { got: pairs.len(), needed: options.min_inliers });
     }
-    let degeneracy = DegeneracyTest::new(pairs, prior.as_ref(), options, progress)?;
+    let degeneracy = DegeneracyTest::new(pairs, views.sizes, prior, options, progress)?;
     // Nothing can have more inliers than there are matches.
     degeneracy.check(pairs.len(), options)?;
     let found = search(pairs, views.sizes, prior, options, progress);
@@ -69,22 +69,78 @@ fn search(
     options: &TwoViewOptions,
     progress: &dyn Progress,
 ) -> Result<TwoViewGeometry, TwoViewError> {
-    let given = match (options.intrinsics, prior) {
-        (Intrinsics::Known(_), Some(cameras)) => Some(Found { cameras, focal_range: 0.0, rival: None }),
-        (Intrinsics::Focal(focal), _) => find_lens(pairs, sizes, Some(focal), &options.robust, progress)?,
-        _ => find_lens(pairs, sizes, None, &options.robust, progress)?,
-    };
-    // Where no lens has a pose, the search with an ordinary one says why.
-    let longest = sizes[0].0.max(sizes[0].1) as f64;
-    let ordinary = || sizes.map(|(width, height)| Camera::from_focal(width, height, 1.2 * longest));
-    if let Some(Found { cameras, rival: Some(rival), .. }) = &given {
-        let Rival { focal: better, deviations, inliers } = *rival;
-        return Err(TwoViewError::WrongFocal { given: cameras[0].fx, better, deviations, inliers });
+    match (options.intrinsics, prior) {
+        (Intrinsics::Known(_), Some(cameras)) => calibrated(pairs, cameras, options, progress),
+        (_, Some(cameras)) => with_cameras(pairs, cameras, options, progress, MOST_RIVALS),
+        (_, None) => without_focal(pairs, sizes, options, progress),
     }
-    let Found { cameras, focal_range, .. } =
-        given.unwrap_or_else(|| Found { cameras: prior.unwrap_or_else(ordinary), focal_range: 0.0, rival: None });
-    let (pose, inliers) = calibrated(pairs, &cameras, options, progress)?;
-    Ok(TwoViewGeometry { cameras, pose, inliers, focal_range, planar_share: 0.0 })
+}
+
+/// Focal lengths that are tried in turn where each fits worse than the next: what is advised must hold when it is given.
+const MOST_RIVALS: usize = 2;
+
+/// Cameras whose distortion is to be found, and whose focal length may be wrong altogether.
+fn with_cameras(
+    pairs: &[Correspondence],
+    cameras: [Camera; 2],
+    options: &TwoViewOptions,
+    progress: &dyn Progress,
+    rivals: usize,
+) -> Result<TwoViewGeometry, TwoViewError> {
+    let found = find_lens(pairs, cameras, false, &options.robust, progress)?;
+    let Some(Found { cameras: with_lens, rival, .. }) = found else {
+        return calibrated(pairs, cameras, options, progress);
+    };
+    if let (Some(Rival { focal, deviations, inliers }), 1..) = (rival, rivals) {
+        // As it will be given.
+        let better = focal.round();
+        let other = cameras.map(|c| Camera { fx: better, fy: better * (c.fy / c.fx), ..c });
+        match with_cameras(pairs, other, options, progress, rivals - 1) {
+            Ok(_) => return Err(TwoViewError::WrongFocal { given: cameras[0].fx, better, deviations, inliers }),
+            Err(TwoViewError::WrongFocal { better, deviations, inliers, .. }) => {
+                return Err(TwoViewError::WrongFocal { given: cameras[0].fx, better, deviations, inliers });
+            }
+            Err(TwoViewError::Cancelled(stop)) => return Err(stop.into()),
+            // Nothing better can be advised.
+            Err(_) => {}
+        }
+    }
+    TwoViewError::check_focal(cameras[0].fx, cameras[0].width.max(cameras[0].height))?;
+    calibrated(pairs, with_lens, options, progress)
+}
+
+/// Photographs of one unknown focal length.
+fn without_focal(
+    pairs: &[Correspondence],
+    sizes: [(usize, usize); 2],
+    options: &TwoViewOptions,
+    progress: &dyn Progress,
+) -> Result<TwoViewGeometry, TwoViewError> {
+    let longest = sizes[0].0.max(sizes[0].1) as f64;
+    let of = |share: f64| {
+        let camera = |(width, height)| Camera::from_focal(width, height, share * longest);
+        sizes.map(camera).map(|camera| Camera { distortion: Distortion::radial(0.0, 0.0), ..camera })
+    };
+    let found =
+        find_lens(pairs, sizes.map(|(w, h)| Camera::from_focal(w, h, longest)), true, &options.robust, progress)?;
+    let first = match found {
+        Some(Found { cameras, focal_range, .. }) => {
+            calibrated(pairs, cameras, options, progress).map(|found| TwoViewGeometry { focal_range, ..found })
+        }
+        // Where no lens has a pose, the search with an ordinary one says why.
+        None => calibrated(pairs, of(1.2), options, progress),
+    };
+    let Err(uncertain @ TwoViewError::UncertainPose { .. }) = first else { return first };
+    // Where two poses fit as well with the best focal length, another may tell them apart.
+    let mut best: Option<TwoViewGeometry> = None;
+    for share in USUAL_FOCALS {
+        match calibrated(pairs, of(share), options, progress) {
+            Ok(found) if best.as_ref().is_none_or(|b| found.inliers.len() > b.inliers.len()) => best = Some(found),
+            Err(TwoViewError::Cancelled(stop)) => return Err(stop.into()),
+            _ => {}
+        }
+    }
+    best.map(|found| TwoViewGeometry { focal_range: 1.0, ..found }).ok_or(uncertain)
 }
 
 /// Refuses where fewer agree than were asked for.
@@ -96,12 +152,13 @@ fn enough(inliers: usize, matches: usize, options: &TwoViewOptions) -> Result<()
     Ok(())
 }
 
+/// The pose of two cameras that are known, from several seeds.
 fn calibrated(
     pairs: &[Correspondence],
-    cameras: &[Camera; 2],
+    cameras: [Camera; 2],
     options: &TwoViewOptions,
     progress: &dyn Progress,
-) -> Result<(Pose, Vec<usize>), TwoViewError> {
+) -> Result<TwoViewGeometry, TwoViewError> {
     let (normalized, unit) = normalize_matches(pairs, &cameras[0], &cameras[1]);
     // A pixel that no ray reaches (beyond the range of the lens model) is no match.
     let usable: Vec<usize> = (0..normalized.len()).filter(|&i| normalized[i].is_finite()).collect();
@@ -136,7 +193,8 @@ fn calibrated(
             matches: pairs.len(),
         });
     }
-    Ok((best.model, best.inliers.iter().map(|&i| usable[i]).collect()))
+    let inliers = best.inliers.iter().map(|&i| usable[i]).collect();
+    Ok(TwoViewGeometry { cameras, pose: best.model, inliers, focal_range: 0.0, planar_share: 0.0 })
 }
 
 /// Searches from different seeds. Where the matches determine a pose, all find it; five miss a second one that is found as often as
