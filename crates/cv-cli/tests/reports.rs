@@ -5,19 +5,25 @@
 mod support;
 
 use cv_core::{Camera, GrayF32};
+use serde_json::Value;
 use std::{
-    fmt::Write as _,
     fs,
-    io::Write as _,
+    io::{BufRead as _, BufReader, Read as _, Write as _},
+    net::{TcpListener, TcpStream},
     path::{Path, PathBuf},
     process::{Command, Stdio},
+    sync::mpsc::{Sender, channel},
+    time::Duration,
 };
 use support::{done, fixture, run};
 
 /// Widths of a phone and of a screen, in CSS pixels.
 const WIDTHS: [u32; 2] = [420, 1400];
 
-/// What every framed page finds out about itself and tells the page around it, a while after it has loaded. The errors are those of its
+/// The reports that are looked at in dark mode too.
+const DARK: [&str; 3] = ["depth", "reconstruct", "match"];
+
+/// What every page finds out about itself and tells the test, a while after it has loaded. The errors are those of its
 /// scripts. Clicks go from the middle of the cloud outwards until one
 /// meets a point.
 const PROBE: &str = r#"<script>
@@ -51,12 +57,14 @@ addEventListener("load", () => setTimeout(async () => {
   const style = (what) => getComputedStyle(document.querySelector(what));
   const bare = [...document.querySelectorAll("table")].filter((t) => !document.getElementById(t.getAttribute("aria-labelledby"))?.textContent.trim());
   const heads = [...document.querySelectorAll("thead th")].filter((th) => !th.textContent.trim());
-  parent.postMessage({
-    page: NAME, width: innerWidth, wide: document.documentElement.scrollWidth, errors, clouds, ground: style("body").backgroundColor,
+  await fetch("/answer", { method: "POST", body: JSON.stringify({
+    page: location.pathname.slice(1), width: innerWidth, wide: document.documentElement.scrollWidth, errors, clouds,
+    ground: style("body").backgroundColor,
     ink: document.querySelector("svg.plot text") ? getComputedStyle(document.querySelector("svg.plot text")).fill : "",
     broken: [...document.images].filter((i) => i.src && i.complete && i.naturalWidth === 0).length, bare: bare.length + heads.length,
-  }, "*");
-}, 100));
+  }) });
+  parent.next();
+}, 20));
 </script>"#;
 
 /// The browser: `CHROMIUM`, or `chromium` on the path.
@@ -66,20 +74,69 @@ fn chromium() -> Option<PathBuf> {
     given.or_else(|| std::env::split_paths(&path).map(|folder| folder.join("chromium")).find(|file| file.is_file()))
 }
 
-/// The page as text once all frames have answered, and what the browser complained about.
-fn opened(browser: &Path, folder: &Path, page: &Path, dark: bool) -> (String, String) {
-    let output = Command::new(browser)
+/// Answers a browser that asks for a file of the folder, and hands on what it posts.
+fn serve(mut stream: TcpStream, folder: &Path, answers: &Sender<Value>) -> Option<()> {
+    let mut reader = BufReader::new(stream.try_clone().ok()?);
+    let mut line = String::new();
+    reader.read_line(&mut line).ok()?;
+    let path = line.split(' ').nth(1)?.split('?').next()?.trim_start_matches('/').to_owned();
+    let mut length = 0;
+    loop {
+        let mut header = String::new();
+        reader.read_line(&mut header).ok()?;
+        if let Some(value) = header.to_ascii_lowercase().strip_prefix("content-length:") {
+            length = value.trim().parse().ok()?;
+        }
+        if header.trim().is_empty() {
+            break;
+        }
+    }
+    let mut body = vec![0; length];
+    reader.read_exact(&mut body).ok()?;
+    let text = if path == "answer" {
+        answers.send(serde_json::from_slice(&body).ok()?).ok()?;
+        Vec::new()
+    } else {
+        fs::read(folder.join(path).with_extension("html")).ok()?
+    };
+    let head = format!(
+        "HTTP/1.1 200 OK\r\nContent-Type: text/html\r\nContent-Length: {}\r\nConnection: close\r\n\r\n",
+        text.len()
+    );
+    stream.write_all(head.as_bytes()).ok()?;
+    stream.write_all(&text).ok()
+}
+
+/// Has the browser open `around` and waits for as many answers.
+fn opened(browser: &Path, folder: &Path, dark: bool, count: usize) -> Vec<Value> {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap();
+    let (sender, receiver) = channel();
+    let files = folder.to_owned();
+    std::thread::spawn(move || {
+        for stream in listener.incoming().flatten() {
+            let (files, sender) = (files.clone(), sender.clone());
+            std::thread::spawn(move || serve(stream, &files, &sender));
+        }
+    });
+    let log = folder.join("browser.log");
+    let mut child = Command::new(browser)
         .args(["--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"])
         .args(["--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync"])
         .arg(format!("--user-data-dir={}", folder.join(if dark { "dark" } else { "light" }).display()))
         .arg(format!("--blink-settings=preferredColorScheme={}", if dark { 0 } else { 1 }))
-        .args(["--window-size=1500,1000", "--virtual-time-budget=20000", "--enable-logging=stderr", "--dump-dom"])
-        .arg(format!("file://{}", page.display()))
+        .args(["--window-size=1500,1000", &format!("http://{address}/around-{dark}")])
         .stdin(Stdio::null())
-        .output()
+        .stdout(Stdio::null())
+        .stderr(fs::File::create(&log).unwrap())
+        .spawn()
         .unwrap();
-    let [out, err] = [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
-    (out, err)
+    // A machine may be slow; a page that never answers is told from that by half a minute of silence.
+    let answers: Vec<Value> = (0..count).map_while(|_| receiver.recv_timeout(Duration::from_secs(30)).ok()).collect();
+    let _ = child.kill();
+    let _ = child.wait();
+    assert_eq!(answers.len(), count, "{answers:#?}\n{}", fs::read_to_string(log).unwrap());
+    answers
 }
 
 /// Makes one report of each kind from the fixtures. Gives back their names.
@@ -118,30 +175,25 @@ fn make_reports(folder: &Path) -> Vec<&'static str> {
     .to_vec()
 }
 
-/// The reports in frames, one over the other: a browser draws nothing in a frame that is out of sight.
-fn framed(names: &[&str], widths: &[u32]) -> String {
-    let mut frames = String::new();
-    for (name, width) in names.iter().flat_map(|name| widths.iter().map(move |width| (name, width))) {
-        let style = "position:fixed;left:0;top:0;border:0";
-        let _ =
-            write!(frames, "<iframe src=\"{name}.html\" width=\"{width}\" height=\"800\" style=\"{style}\"></iframe>");
-    }
-    frames
-}
-
-/// What the frames found out about themselves.
-fn answers(dom: &str) -> Vec<serde_json::Value> {
-    dom.lines()
-        .filter_map(|line| line.strip_prefix("PAGE "))
-        .map(|line| {
-            let line = line.split("</pre>").next().unwrap();
-            serde_json::from_str(&line.replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&")).unwrap()
-        })
-        .collect()
+/// A page that opens the reports in a frame, one after the other at each width.
+fn around(names: &[&str], widths: &[u32]) -> String {
+    let visits: Vec<(&str, u32)> =
+        names.iter().flat_map(|name| widths.iter().map(move |width| (*name, *width))).collect();
+    format!(
+        "<!doctype html><meta name=\"color-scheme\" content=\"light dark\"><iframe height=\"800\" style=\"border:0\"></iframe><script>
+        const frame = document.querySelector(\"iframe\"), visits = {};
+        function next() {{
+          const visit = visits.shift();
+          if (visit) [frame.width, frame.src] = [visit[1], \"/\" + visit[0] + \"?\" + visit[1]];
+        }}
+        next();
+        </script>",
+        serde_json::to_string(&visits).unwrap()
+    )
 }
 
 /// What must hold of every report at every width.
-fn check(answer: &serde_json::Value) {
+fn check(answer: &Value) {
     assert!(answer["errors"].as_array().unwrap().is_empty(), "{answer}");
     assert!(answer["wide"].as_u64() <= answer["width"].as_u64(), "it scrolls sideways: {answer}");
     assert_eq!((answer["broken"].as_u64(), answer["bare"].as_u64()), (Some(0), Some(0)), "{answer}");
@@ -170,37 +222,27 @@ fn reports_work_in_a_browser() {
     let names = make_reports(folder.path());
     for name in &names {
         let html = fs::read_to_string(folder.path().join(name).join("report.html")).unwrap();
-        let asked = html.replacen("<head>", &format!("<head>{PROBE}"), 1).replacen(
-            "</body>",
-            &format!("{}</body>", ASK.replace("NAME", &format!("{name:?}"))),
-            1,
-        );
+        let asked =
+            html.replacen("<head>", &format!("<head>{PROBE}"), 1).replacen("</body>", &format!("{ASK}</body>"), 1);
         fs::write(folder.path().join(format!("{name}.html")), asked).unwrap();
     }
-    let mut seen = Vec::new();
-    // The width has nothing to do with the colors: dark, the narrow one suffices.
-    for (dark, widths) in [(false, &WIDTHS[..]), (true, &WIDTHS[..1])] {
-        let frames = framed(&names, widths);
-        let page = format!(
-            "<!doctype html><meta name=\"color-scheme\" content=\"light dark\"><pre id=\"all\"></pre>{frames}<script>\
-             addEventListener(\"message\", (e) => {{ document.getElementById(\"all\").textContent += \"\\nPAGE \" + JSON.stringify(e.data); }});</script>"
-        );
-        let around = folder.path().join("around.html");
-        fs::write(&around, page).unwrap();
-        let (dom, complaints) = opened(&browser, folder.path(), &around, dark);
-        let answers = answers(&dom);
-        assert_eq!(answers.len(), names.len() * widths.len(), "dark {dark}: {complaints}\n{answers:#?}");
-        for answer in &answers {
-            check(answer);
-            let name = answer["page"].as_str().unwrap().to_owned();
-            seen.push((name, dark, answer["ground"].clone(), answer["ink"].clone()));
-        }
-    }
+    // All pages have one style sheet: dark, those with clouds and plots suffice, and the narrow width.
+    let runs = [(false, &names[..], &WIDTHS[..]), (true, &DARK[..], &WIDTHS[..1])];
+    let answers: Vec<(bool, Vec<Value>)> = std::thread::scope(|scope| {
+        let (browser, folder) = (&browser, folder.path());
+        let runs = runs.map(|(dark, names, widths)| {
+            fs::write(folder.join(format!("around-{dark}.html")), around(names, widths)).unwrap();
+            (dark, scope.spawn(move || opened(browser, folder, dark, names.len() * widths.len())))
+        });
+        runs.into_iter().map(|(dark, run)| (dark, run.join().unwrap())).collect()
+    });
+    answers.iter().flat_map(|(_, answers)| answers).for_each(check);
     // Dark is dark, in the plots too: no color of the page's is the same in both.
-    let (light, dark): (Vec<_>, Vec<_>) = seen.into_iter().partition(|(_, dark, ..)| !dark);
-    for (name, _, ground, ink) in light {
-        let other = dark.iter().find(|(n, ..)| *n == name).unwrap();
-        assert!(ground != other.2 && (ink == "" || ink != other.3), "{name}: {ground} {ink} {other:?}");
+    for dark in &answers[1].1 {
+        let light = answers[0].1.iter().find(|light| light["page"] == dark["page"]).unwrap();
+        for color in ["ground", "ink"] {
+            assert!(dark[color] != "" && dark[color] != light[color], "{color}: {light} {dark}");
+        }
     }
 }
 

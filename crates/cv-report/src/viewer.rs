@@ -119,7 +119,7 @@ impl PointScene {
             .iter()
             .map(|f| distance([f.center.x as f32, f.center.y as f32, f.center.z as f32], center))
             .fold(f32::INFINITY, f32::min);
-        0.08 * radius.max(near.min(4.0 * radius))
+        0.05 * radius.max(near.min(4.0 * radius))
     }
 
     /// The corners and the tip of every frustum as line segments with a color.

@@ -173,7 +173,7 @@ fn report(
         .headline("residuals", &format!("{:.3} px RMS", found.rms))
         .headline("samples drawn", &found.iterations.to_string());
     let rows: Vec<Vec<String>> =
-        rows(&found.model).iter().map(|row| row.iter().map(|v| format!("{v:.9e}")).collect()).collect();
+        rows(&found.model).iter().map(|row| row.iter().map(|v| format!("{v:.5e}")).collect()).collect();
     page.section("Model").table(&format!("The {name}, row by row."), &["column 1", "column 2", "column 3"], &rows);
     page.section("Matches").figure(picture(
         &flow(pairs, &found.inliers),

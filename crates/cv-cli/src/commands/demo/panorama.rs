@@ -39,7 +39,7 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
 
     let mut row = Vec::new();
     for (i, view) in set.views.iter().enumerate() {
-        demo.figure(&format!("panorama-{}.png", i + 1), &view.image, "")?;
+        cv_io::write_png(demo.out.join(format!("panorama-{}.png", i + 1)), view.image.view())?;
         row.push(view.image.view());
     }
     let inputs = demo.figure(

@@ -19,7 +19,7 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let mut score = MaskScore::default();
     let mut figures = Vec::new();
     for (i, photo) in photos.iter().enumerate() {
-        demo.figure(&format!("segment-{}.png", i + 1), &photo.view.image, "")?;
+        cv_io::write_png(demo.out.join(format!("segment-{}.png", i + 1)), photo.view.image.view())?;
         cv_io::write_png(demo.out.join(format!("segment-{}_mask.png", i + 1)), photo.mask.view())?;
         if i % 2 == 0 {
             continue;
