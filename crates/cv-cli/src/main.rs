@@ -2,11 +2,12 @@
 
 mod commands;
 mod frame;
+mod pictures;
 mod rig;
 mod words;
 
-use clap::Parser;
-use frame::Globals;
+use clap::{CommandFactory, FromArgMatches, Parser};
+use frame::{Called, Globals};
 
 /// Classical computer vision: color segmentation, panoramas, two-view reconstruction and stereo depth.
 #[derive(Parser)]
@@ -22,6 +23,8 @@ struct Cli {
 }
 
 fn main() -> std::process::ExitCode {
-    let cli = Cli::parse();
-    frame::run(&cli.globals, |context| cli.command.run(context))
+    let mut command = Cli::command();
+    let matches = command.get_matches_mut();
+    let cli = Cli::from_arg_matches(&matches).unwrap_or_else(|error| error.format(&mut command).exit());
+    frame::run(&cli.globals, Called::new(&command, &matches), |context| cli.command.run(context))
 }

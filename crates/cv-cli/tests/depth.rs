@@ -61,7 +61,9 @@ fn a_generated_pair_becomes_disparity_depth_and_cloud() {
     let eval = ["eval", "disparity", "--estimate", "d.pfm", "--truth", "truth.pfm", "--truth-right", "truth_right.pfm"];
     let scores = json(folder.path(), &[&eval[..], &["--error", "error.png", "--report", "scores"]].concat());
     let page = std::fs::read_to_string(at("scores/report.html")).unwrap();
-    assert!(["bad-0.5", "A95", "non-occluded", "Fractions of the truth"].iter().all(|words| page.contains(words)));
+    assert!(
+        ["bad-0.5", "A95", "non-occluded", "The same of the true disparities"].iter().all(|words| page.contains(words))
+    );
     assert_eq!(cv_io::read_rgb(at("error.png")).unwrap().size(), (240, 180));
     // A wrong sign, unit or row order would be off everywhere; a sound matcher is wrong at a few outlines.
     assert!(scores["non_occluded"]["bad"]["2.0"].as_f64().unwrap() < 0.1, "{scores}");

@@ -3,6 +3,7 @@
 use cv_core::{GrayF32, ImageView, RgbU8, quantile};
 
 use crate::raster::{Color, Raster, colors};
+use crate::report::escape;
 
 /// A way from numbers to colors.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -156,6 +157,20 @@ impl MapStyle {
         Self { colormap: Colormap::TurboReversed, label: "disparity (px)".to_owned(), ..Self::default() }
     }
 
+    /// The values of the two ends of the colors for a map.
+    fn ends(&self, map: ImageView<'_, f32, 1>) -> (f32, f32) {
+        let range = self.range.or_else(|| quantile_range(map, 0.01, 0.99)).unwrap_or((0.0, 1.0));
+        // One value only: give it a scale around it.
+        if range.1 > range.0 { range } else { (range.0 - 0.5, range.0 + 0.5) }
+    }
+
+    /// A map in colors, and the scale that belongs below it on a page.
+    pub fn colored(&self, map: ImageView<'_, f32, 1>) -> (RgbU8, ColorScale) {
+        let range = self.ends(map);
+        let scale = ColorScale { range, colormap: self.colormap, label: self.label.clone() };
+        (colorize(map, range, self.colormap), scale)
+    }
+
     /// The same with the ends given.
     #[must_use]
     pub fn with_range(self, low: f32, high: f32) -> Self {
@@ -163,11 +178,40 @@ impl MapStyle {
     }
 }
 
+/// Which color stands for which number, as a page shows it: in the page's own colors, light or dark.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ColorScale {
+    range: (f32, f32),
+    colormap: Colormap,
+    label: String,
+}
+
+impl ColorScale {
+    /// A bar from low to high with its numbers below it.
+    pub(crate) fn to_html(&self) -> String {
+        let (low, high) = (f64::from(self.range.0), f64::from(self.range.1));
+        let stops: Vec<String> = (0..=16)
+            .map(|i| {
+                let [r, g, b] = self.colormap.color(i as f32 / 16.0);
+                format!("#{r:02x}{g:02x}{b:02x}")
+            })
+            .collect();
+        let marks = ticks((low, high), 5);
+        let step = marks.windows(2).map(|w| w[1] - w[0]).next().unwrap_or(high - low);
+        let marks: String = marks
+            .iter()
+            .map(|t| format!("<i style=\"left:{:.1}%\">{}</i>", 100.0 * (t - low) / (high - low), tick_label(*t, step)))
+            .collect();
+        let (label, stops) = (escape(&self.label), stops.join(","));
+        format!(
+            "<div class=\"scale\"><span>{label}</span><div><b style=\"background:linear-gradient(90deg,{stops})\"></b>{marks}</div></div>"
+        )
+    }
+}
+
 /// A map in colors with a color bar at its right.
 pub fn draw_map(map: ImageView<'_, f32, 1>, style: &MapStyle) -> RgbU8 {
-    let range = style.range.or_else(|| quantile_range(map, 0.01, 0.99)).unwrap_or((0.0, 1.0));
-    // One value only: give it a scale around it.
-    let range = if range.1 > range.0 { range } else { (range.0 - 0.5, range.0 + 0.5) };
+    let range = style.ends(map);
     let picture = colorize(map, range, style.colormap);
     let bar = color_bar(picture.height().max(160), range, style.colormap, &style.label);
     let mut raster = Raster::new(picture.width() + bar.width(), picture.height().max(bar.height()), colors::WHITE);

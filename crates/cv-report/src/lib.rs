@@ -20,7 +20,7 @@
 //! | what | where |
 //! |---|---|
 //! | drawing | [`Raster`], [`colors`] |
-//! | maps of numbers | [`colorize`], [`color_bar`], [`draw_map`], [`draw_error_map`] |
+//! | maps of numbers | [`colorize`], [`color_bar`], [`draw_map`], [`MapStyle::colored`], [`draw_error_map`] |
 //! | features and geometry | [`draw_keypoints`], [`draw_matches`], [`draw_epipolar_lines`], [`tile_patches`] |
 //! | arranging | [`side_by_side`], [`shrink_to_fit`] |
 //! | masks | [`overlay_mask`], [`overlay_comparison`] |
@@ -36,7 +36,9 @@ mod raster;
 mod report;
 mod viewer;
 
-pub use colormap::{Colormap, MapStyle, absolute_difference, color_bar, colorize, draw_map, quantile_range};
+pub use colormap::{
+    ColorScale, Colormap, MapStyle, absolute_difference, color_bar, colorize, draw_map, quantile_range,
+};
 pub use overlay::{
     MatchStyle, draw_epipolar_lines, draw_error_map, draw_keypoints, draw_matches, overlay_comparison, overlay_mask,
     shrink_to_fit, side_by_side, tile_patches,

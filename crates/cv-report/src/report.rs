@@ -3,6 +3,7 @@
 use std::fmt::Write as _;
 
 use crate::base64;
+use crate::colormap::ColorScale;
 use crate::plot::Plot;
 use crate::viewer::PointScene;
 
@@ -34,18 +35,25 @@ pub struct Figure {
     bytes: Vec<u8>,
     alt: String,
     caption: String,
+    scale: Option<ColorScale>,
 }
 
 impl Figure {
     /// `bytes` are those of a PNG or JPEG file. `caption` is printed below the picture, and read out in its place.
     pub fn new(bytes: Vec<u8>, caption: &str) -> Self {
-        Self { bytes, alt: caption.to_owned(), caption: caption.to_owned() }
+        Self { bytes, alt: caption.to_owned(), caption: caption.to_owned(), scale: None }
     }
 
     /// With a description for those who cannot see the picture, other than its caption.
     #[must_use]
     pub fn alt(self, alt: &str) -> Self {
         Self { alt: alt.to_owned(), ..self }
+    }
+
+    /// With the scale of its colors below it.
+    #[must_use]
+    pub fn scale(self, scale: ColorScale) -> Self {
+        Self { scale: Some(scale), ..self }
     }
 
     /// Width and height by the header of a PNG.
@@ -79,12 +87,12 @@ pub struct Report {
     title: String,
     subtitle: String,
     headline: Vec<(String, String)>,
+    warnings: Vec<String>,
     sections: Vec<String>,
     body: String,
     figures: usize,
     tables: usize,
     has_viewer: bool,
-    footer: String,
 }
 
 impl Report {
@@ -94,12 +102,12 @@ impl Report {
             title: title.to_owned(),
             subtitle: String::new(),
             headline: Vec::new(),
+            warnings: Vec::new(),
             sections: Vec::new(),
             body: String::new(),
             figures: 0,
             tables: 0,
             has_viewer: false,
-            footer: String::new(),
         }
     }
 
@@ -109,9 +117,12 @@ impl Report {
         self
     }
 
-    /// A line at the end, such as version and command.
-    pub fn footer(&mut self, text: &str) -> &mut Self {
-        self.footer = text.to_owned();
+    /// Something to be careful about in all that follows: it stands at the top, wherever it is said.
+    pub fn warn(&mut self, text: &str) -> &mut Self {
+        let mut rest = text.chars();
+        let first = rest.next().map(|c| c.to_uppercase().to_string());
+        let stop = if text.ends_with('.') { "" } else { "." };
+        self.warnings.push(format!("{}{}{stop}", first.unwrap_or_default(), rest.as_str()));
         self
     }
 
@@ -136,54 +147,70 @@ impl Report {
 
     /// A paragraph that stands out.
     pub fn note(&mut self, kind: Note, text: &str) -> &mut Self {
-        let (class, word) = match kind {
-            Note::Good => ("good", "Good"),
-            Note::Info => ("info", "Note"),
-            Note::Warning => ("warning", "Careful"),
-            Note::Failure => ("failure", "Failed"),
-        };
-        let _ = write!(self.body, "<p class=\"note {class}\"><strong>{word}.</strong> {}</p>", escape(text));
+        self.body.push_str(&note(kind, text));
         self
+    }
+
+    /// What `build` adds, behind a line that opens it: for what few will look at.
+    pub fn folded(&mut self, summary: &str, build: impl FnOnce(&mut Self)) -> &mut Self {
+        let _ = write!(self.body, "<details><summary>{}</summary>", escape(summary));
+        build(self);
+        self.body.push_str("</details>");
+        self
+    }
+
+    /// The seconds that each stage took.
+    pub fn times(&mut self, stages: &[(&str, f64)]) -> &mut Self {
+        let rows: Vec<[String; 2]> = stages.iter().map(|(name, s)| [(*name).to_owned(), format!("{s:.3} s")]).collect();
+        self.table("What took how long.", &["stage", "time"], &rows)
     }
 
     /// A table of names and values.
-    pub fn facts<K: AsRef<str>, V: AsRef<str>>(&mut self, rows: &[(K, V)]) -> &mut Self {
-        self.body.push_str("<table class=\"facts\"><tbody>");
+    pub fn facts<K: AsRef<str>, V: AsRef<str>>(&mut self, caption: &str, rows: &[(K, V)]) -> &mut Self {
+        self.begin_table(caption);
+        self.body.push_str("<tbody>");
         for (key, value) in rows {
             let _ = write!(
                 self.body,
-                "<tr><th scope=\"row\">{}</th><td>{}</td></tr>",
+                "<tr><th scope=\"row\">{}</th><td{}>{}</td></tr>",
                 escape(key.as_ref()),
+                breaks(value.as_ref()),
                 escape(value.as_ref())
             );
         }
-        self.body.push_str("</tbody></table>");
+        self.body.push_str("</tbody></table></div>");
         self
     }
 
-    /// A table with a head. Cells that read as numbers are set flush right.
-    pub fn table<S: AsRef<str>>(&mut self, caption: &str, head: &[&str], rows: &[Vec<S>]) -> &mut Self {
+    fn begin_table(&mut self, caption: &str) {
         self.tables += 1;
-        let numeric = |column: usize| {
-            rows.iter().all(|r| r.get(column).is_none_or(|c| is_numeric(c.as_ref())))
-                && rows.iter().any(|r| r.get(column).is_some_and(|c| !c.as_ref().is_empty()))
-        };
-        let numeric: Vec<bool> = (0..head.len()).map(numeric).collect();
-        let class = |column: usize| if numeric.get(column) == Some(&true) { " class=\"n\"" } else { "" };
         let _ = write!(
             self.body,
-            "<div class=\"scroll\"><table><caption><b>Table {}.</b> {}</caption><thead><tr>",
+            "<p class=\"caption\" id=\"t{0}\"><b>Table {0}.</b> {1}</p><div class=\"scroll\"><table aria-labelledby=\"t{0}\">",
             self.tables,
             escape(caption)
         );
+    }
+
+    /// A table with a head. Cells that read as numbers are set flush right.
+    pub fn table<R: AsRef<[S]>, S: AsRef<str>>(&mut self, caption: &str, head: &[&str], rows: &[R]) -> &mut Self {
+        let cell = |row: &R, column: usize| row.as_ref().get(column).map_or(String::new(), |c| c.as_ref().to_owned());
+        let numeric = |column: usize| {
+            rows.iter().all(|r| is_numeric(&cell(r, column))) && rows.iter().any(|r| !cell(r, column).is_empty())
+        };
+        let numeric: Vec<bool> = (0..head.len()).map(numeric).collect();
+        let class = |column: usize| if numeric.get(column) == Some(&true) { " class=\"n\"" } else { "" };
+        self.begin_table(caption);
+        self.body.push_str("<thead><tr>");
         for (i, cell) in head.iter().enumerate() {
             let _ = write!(self.body, "<th scope=\"col\"{}>{}</th>", class(i), escape(cell));
         }
         self.body.push_str("</tr></thead><tbody>");
         for row in rows {
             self.body.push_str("<tr>");
-            for (i, cell) in row.iter().enumerate() {
-                let _ = write!(self.body, "<td{}>{}</td>", class(i), escape(cell.as_ref()));
+            for (i, cell) in row.as_ref().iter().enumerate() {
+                let class = if numeric.get(i) == Some(&true) { class(i) } else { breaks(cell.as_ref()) };
+                let _ = write!(self.body, "<td{class}>{}</td>", escape(cell.as_ref()));
             }
             self.body.push_str("</tr>");
         }
@@ -222,6 +249,7 @@ impl Report {
             escape(&figure.alt),
             base64::encode(&figure.bytes)
         );
+        self.body.extend(figure.scale.as_ref().map(ColorScale::to_html));
         self.push_caption(&figure.caption);
         self.body.push_str("</figure>");
     }
@@ -290,6 +318,7 @@ impl Report {
             }
             html.push_str("</dl>");
         }
+        self.warnings.iter().for_each(|text| html.push_str(&note(Note::Warning, text)));
         html.push_str("</header>\n");
         if self.sections.len() > 2 {
             html.push_str("<nav aria-label=\"Contents\"><ol>");
@@ -298,7 +327,7 @@ impl Report {
             }
             html.push_str("</ol></nav>\n");
         }
-        let _ = write!(html, "<main>{}</main>\n<footer>{}</footer>\n", self.body, escape(&self.footer));
+        let _ = writeln!(html, "<main>{}</main>", self.body);
         let _ = write!(html, "<script>{SCRIPT}</script>");
         if self.has_viewer {
             let _ = write!(html, "<script>{VIEWER}</script>");
@@ -306,6 +335,22 @@ impl Report {
         html.push_str("</body></html>\n");
         html
     }
+}
+
+/// A paragraph that stands out.
+fn note(kind: Note, text: &str) -> String {
+    let (class, word) = match kind {
+        Note::Good => ("good", "Good"),
+        Note::Info => ("info", "Note"),
+        Note::Warning => ("warning", "Careful"),
+        Note::Failure => ("failure", "Failed"),
+    };
+    format!("<p class=\"note {class}\"><strong>{word}.</strong> {}</p>", escape(text))
+}
+
+/// The class of a cell whose words are too long for a column, as those of paths are: they may break anywhere.
+fn breaks(cell: &str) -> &'static str {
+    if cell.split_whitespace().any(|word| word.chars().count() > 18) { " class=\"long\"" } else { "" }
 }
 
 /// True for a number, maybe behind a sign such as ≤ and before a unit, and for the dash that stands for none.
@@ -329,13 +374,16 @@ mod tests {
             .section("s' <i>")
             .paragraph("x < y\u{0}")
             .note(Note::Warning, "<u>")
-            .facts(&[("k<", "v>")])
+            .facts("f<", &[("k<", "v>")])
             .table("c<", &["h<"], &[vec!["d<"]])
             .figure(Figure::new(vec![1, 2, 3], "\" onload=\"alert(2)"))
-            .footer("<hr>");
+            .warn("<hr>")
+            .folded("<em>", |page| {
+                page.paragraph("<tt>");
+            });
         let html = report.to_html();
         let body = &html[html.find("<body>").unwrap()..html.find("<script>").unwrap()];
-        for bad in ["alert(1)<", "<i>", "<u>", "\" onload", "<hr>", "x < y", "\u{0}"] {
+        for bad in ["alert(1)<", "<i>", "<u>", "\" onload", "<hr>", "<em>", "<tt>", "x < y", "\u{0}"] {
             assert!(!body.contains(bad), "{bad}");
         }
         assert!(body.contains("x &lt; y") && body.contains("&quot; onload"));
@@ -355,13 +403,27 @@ mod tests {
     }
 
     #[test]
+    fn warnings_stand_above_all_sections() {
+        let mut report = Report::new("t");
+        report.section("first").warn("mind the gap");
+        let html = report.to_html();
+        assert!(html.find("Mind the gap.").unwrap() < html.find("<main>").unwrap());
+    }
+
+    #[test]
     fn figures_and_tables_are_numbered_in_order() {
         let mut report = Report::new("t");
         report.figures(vec![Figure::new(vec![0], "one"), Figure::new(vec![0], "two")]);
         report.plot(&Plot::new("p", "x", "y"), "three");
-        report.table("first", &["a", "b"], &[vec!["x", "≤ 1.5 px"], vec!["y", "–"]]);
+        report.table("first", &["a", "b"], &[["x", "≤ 1.5 px"], ["y", "–"]]).facts("second", &[("a", "b")]);
         let html = report.to_html();
-        for text in ["Figure 1.</b> one", "Figure 2.</b> two", "Figure 3.</b> three", "Table 1.</b> first"] {
+        for text in [
+            "Figure 1.</b> one",
+            "Figure 2.</b> two",
+            "Figure 3.</b> three",
+            "Table 1.</b> first",
+            "Table 2.</b> second",
+        ] {
             assert!(html.contains(text), "{text}");
         }
         assert!(html.contains("<td class=\"n\">≤ 1.5 px</td>") && html.contains("<td>x</td>"));

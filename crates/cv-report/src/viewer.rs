@@ -12,8 +12,21 @@ use crate::raster::{Color, Raster, colors};
 pub struct PointScene {
     points: Vec<[f32; 3]>,
     colors: Vec<Color>,
+    /// Which point of the cloud each is.
+    indices: Vec<usize>,
     frusta: Vec<Frustum>,
+    photos: Vec<Sightings>,
     left_out: usize,
+}
+
+/// Where a photograph shows the points.
+#[derive(Debug, Clone, PartialEq)]
+struct Sightings {
+    photo: String,
+    /// Of the photograph's longer side.
+    side: usize,
+    /// In the order of the points.
+    pixels: Vec<Option<Point2<f64>>>,
 }
 
 /// A camera's outline: its center and the corners of its picture, in the world, at distance 1.
@@ -28,17 +41,39 @@ struct Frustum {
 }
 
 impl PointScene {
-    /// The most points kept; 16 bytes each in the file. A larger cloud is thinned evenly.
-    pub const MAX_POINTS: usize = 400_000;
+    /// The most points kept: of a larger cloud they are taken evenly. Each takes 12 bytes in the file, and 5 for each photograph it was seen in.
+    pub const MAX_POINTS: usize = 100_000;
+    /// How far from the middle points are kept, in radii that hold 90 % of them: what lies farther, nobody would look at, and 16 bits
+    /// would be too few for what does not.
+    const REACH: f32 = 10.0;
 
-    /// A scene of the points of a cloud (white where there are too few colors; without its edges). Points that are not finite are left out.
+    /// A scene of the points of a cloud (white where there are too few colors; without its edges). Points that are not finite or far from all
+    /// others are left out.
     pub fn new(cloud: &PointCloud) -> Self {
         let (points, colors) = (&cloud.positions, &cloud.colors);
-        let usable: Vec<usize> = (0..points.len()).filter(|&i| points[i].iter().all(|v| v.is_finite())).collect();
+        let mut usable: Vec<usize> = (0..points.len()).filter(|&i| points[i].iter().all(|v| v.is_finite())).collect();
+        let finite = usable.len();
+        if let Some((center, radius)) = extent(usable.iter().map(|&i| points[i])) {
+            usable.retain(|&i| distance(points[i], center) <= Self::REACH * radius);
+        }
         let kept = usable.len().min(Self::MAX_POINTS);
-        let chosen = (0..kept).map(|i| usable[(i as u64 * usable.len() as u64 / kept as u64) as usize]);
-        let (points, colors) = chosen.map(|i| (points[i], colors.get(i).copied().unwrap_or([255; 3]))).unzip();
-        Self { points, colors, frusta: Vec::new(), left_out: usable.len() - kept }
+        let indices: Vec<usize> =
+            (0..kept).map(|i| usable[(i as u64 * usable.len() as u64 / kept as u64) as usize]).collect();
+        let (points, colors) = indices.iter().map(|&i| (points[i], colors.get(i).copied().unwrap_or([255; 3]))).unzip();
+        Self { points, colors, indices, frusta: Vec::new(), photos: Vec::new(), left_out: finite - kept }
+    }
+
+    /// Says where a photograph of `size` pixels shows the points: a click on a point tells. `pixel` is asked with the index of the point in the
+    /// cloud that the scene was made of, and answers with a position in pixels.
+    pub fn seen_in(
+        &mut self,
+        photo: &str,
+        size: (usize, usize),
+        pixel: impl Fn(usize) -> Option<Point2<f64>>,
+    ) -> &mut Self {
+        let pixels = self.indices.iter().map(|&i| pixel(i)).collect();
+        self.photos.push(Sightings { photo: photo.to_owned(), side: size.0.max(size.1), pixels });
+        self
     }
 
     /// Adds a camera.
@@ -65,29 +100,15 @@ impl PointScene {
         self
     }
 
-    /// How many points were thinned out.
+    /// How many points of the cloud are not in the scene, though they are finite.
     pub fn left_out(&self) -> usize {
         self.left_out
     }
 
-    /// The middle of the points (median by axis) and the distance from it that 90 % of them keep. Without points, of the cameras.
+    /// The extent of the points; without any, of the cameras.
     fn extent(&self) -> ([f32; 3], f32) {
-        let mut points = self.points.clone();
-        if points.is_empty() {
-            points = self.frusta.iter().map(|f| [f.center.x as f32, f.center.y as f32, f.center.z as f32]).collect();
-        }
-        if points.is_empty() {
-            return ([0.0; 3], 1.0);
-        }
-        let mut values = Vec::with_capacity(points.len());
-        let center = [0, 1, 2].map(|axis| {
-            values.clear();
-            values.extend(points.iter().map(|p| p[axis]));
-            median(&mut values).unwrap_or(0.0)
-        });
-        let mut distances: Vec<f32> = points.iter().map(|&p| distance(p, center)).collect();
-        let radius = quantile(&mut distances, 0.9).unwrap_or(1.0);
-        (center, if radius > 0.0 && radius.is_finite() { radius } else { 1.0 })
+        let centers = self.frusta.iter().map(|f| [f.center.x as f32, f.center.y as f32, f.center.z as f32]);
+        extent(self.points.iter().copied()).or_else(|| extent(centers)).unwrap_or(([0.0; 3], 1.0))
     }
 
     /// How far from its center a camera's picture is drawn: a small part of the scene.
@@ -98,7 +119,7 @@ impl PointScene {
             .iter()
             .map(|f| distance([f.center.x as f32, f.center.y as f32, f.center.z as f32], center))
             .fold(f32::INFINITY, f32::min);
-        0.12 * radius.max(near.min(4.0 * radius))
+        0.05 * radius.max(near.min(4.0 * radius))
     }
 
     /// The corners and the tip of every frustum as line segments with a color.
@@ -119,34 +140,83 @@ impl PointScene {
         out
     }
 
-    /// What the viewer's script reads: the box of the scene, the first camera, and the points as base64 of 16 bytes each
-    /// (x, y, z as little-endian `f32`; red, green, blue, 255), lines likewise.
+    /// What the viewer's script reads. Numbers in base64 are little-endian: positions as three `u16` over the box of the points, colors as red,
+    /// green, blue, sightings as two `u16` for each photograph in steps of its own (0xffff: not seen), ends of lines as three `f32`.
     pub(crate) fn to_json(&self) -> String {
         let (center, radius) = self.extent();
-        let mut points = Vec::with_capacity(self.points.len() * 16);
-        let push = |bytes: &mut Vec<u8>, p: [f32; 3], c: Color| {
-            p.iter().for_each(|v| bytes.extend_from_slice(&v.to_le_bytes()));
-            bytes.extend_from_slice(&[c[0], c[1], c[2], 255]);
+        let bound =
+            |axis: usize, pick: fn(f32, f32) -> f32| self.points.iter().map(|p| p[axis]).reduce(pick).unwrap_or(0.0);
+        let low = [0, 1, 2].map(|axis| bound(axis, f32::min));
+        let size = [0, 1, 2].map(|axis| bound(axis, f32::max) - low[axis]);
+        let short = |bytes: &mut Vec<u8>, share: f64| {
+            bytes.extend_from_slice(&((share * 65_535.0).round() as u16).to_le_bytes());
         };
-        self.points.iter().zip(&self.colors).for_each(|(p, c)| push(&mut points, *p, *c));
-        let mut lines = Vec::new();
+        let (mut positions, mut sightings) = (Vec::new(), Vec::new());
+        for (i, p) in self.points.iter().enumerate() {
+            for axis in 0..3 {
+                short(&mut positions, f64::from(p[axis] - low[axis]) / f64::from(size[axis].max(f32::MIN_POSITIVE)));
+            }
+            for photo in &self.photos {
+                // From half a pixel beyond the border on; the last number stands for none.
+                let share = |v: f64| ((v + 0.5) / photo.side as f64).clamp(0.0, 1.0) * 65_534.0 / 65_535.0;
+                let pixel = photo.pixels[i].map_or([1.0; 2], |p| [share(p.x), share(p.y)]);
+                pixel.iter().for_each(|v| short(&mut sightings, *v));
+            }
+        }
+        let (mut ends, mut line_colors) = (Vec::new(), Vec::new());
         for (a, b, color) in self.segments() {
-            push(&mut lines, a, color);
-            push(&mut lines, b, color);
+            a.iter().chain(&b).for_each(|v| ends.extend_from_slice(&v.to_le_bytes()));
+            line_colors.extend([color, color].concat());
         }
-        let mut json = format!("{{\"center\":[{},{},{}],\"radius\":{radius}", center[0], center[1], center[2]);
+        let mut json = format!("{{\"center\":{center:?},\"radius\":{radius:?},\"low\":{low:?},\"size\":{size:?}");
         if let Some(f) = self.frusta.first() {
-            let _ = write!(json, ",\"eye\":[{},{},{}]", f.center.x as f32, f.center.y as f32, f.center.z as f32);
+            let _ = write!(json, ",\"axis\":{:?}", f.axis);
         }
+        let photos: Vec<String> = (self.photos.iter())
+            .map(|photo| format!("{{\"name\":{},\"side\":{}}}", json_text(&photo.photo), photo.side))
+            .collect();
         let _ = write!(
             json,
-            ",\"count\":{},\"points\":\"{}\",\"lines\":\"{}\"}}",
+            ",\"count\":{},\"positions\":\"{}\",\"colors\":\"{}\",\"photos\":[{}],\"sightings\":\"{}\",\"ends\":\"{}\",\"lineColors\":\"{}\"}}",
             self.points.len(),
-            base64::encode(&points),
-            base64::encode(&lines)
+            base64::encode(&positions),
+            base64::encode(self.colors.as_flattened()),
+            photos.join(","),
+            base64::encode(&sightings),
+            base64::encode(&ends),
+            base64::encode(&line_colors)
         );
         json
     }
+}
+
+/// Text as JSON writes it.
+fn json_text(text: &str) -> String {
+    let mut out = String::from("\"");
+    for c in text.chars() {
+        match c {
+            '"' | '\\' => out.extend(['\\', c]),
+            c if c.is_control() => out.push('\u{fffd}'),
+            c => out.push(c),
+        }
+    }
+    out.push('"');
+    out
+}
+
+/// The middle of points (median by axis) and the distance from it that 90 % of them keep.
+fn extent(points: impl Iterator<Item = [f32; 3]>) -> Option<([f32; 3], f32)> {
+    let points: Vec<[f32; 3]> = points.collect();
+    let mut values = Vec::with_capacity(points.len());
+    let mut center = [0.0; 3];
+    for axis in 0..3 {
+        values.clear();
+        values.extend(points.iter().map(|p| p[axis]));
+        center[axis] = median(&mut values)?;
+    }
+    let mut distances: Vec<f32> = points.iter().map(|&p| distance(p, center)).collect();
+    let radius = quantile(&mut distances, 0.9)?;
+    Some((center, if radius > 0.0 && radius.is_finite() { radius } else { 1.0 }))
 }
 
 fn nalgebra_vector(n: Point2<f64>) -> cv_core::Vector3<f64> {
@@ -312,5 +382,25 @@ mod tests {
         let scene = PointScene::new(&PointCloud::from_positions(points));
         assert_eq!((scene.points.len(), scene.left_out()), (PointScene::MAX_POINTS, 1000));
         assert!(scene.points.windows(2).all(|p| p[1][0] - p[0][0] <= 2.0));
+    }
+
+    #[test]
+    fn one_wild_point_does_not_take_the_bits_of_the_others() {
+        let mut points: Vec<_> = (0..50).map(|i| [i as f32 * 0.1, 0.0, 5.0]).collect();
+        points.push([0.0, 0.0, 1e6]);
+        let scene = PointScene::new(&PointCloud::from_positions(points));
+        assert_eq!((scene.points.len(), scene.left_out()), (50, 1));
+        assert!(scene.to_json().contains("\"low\":[0.0, 0.0, 5.0],\"size\":[4.9, 0.0, 0.0]"), "{}", scene.to_json());
+    }
+
+    #[test]
+    fn sightings_keep_to_their_points_when_others_are_left_out() {
+        let points = vec![[f32::NAN; 3], [0.0, 0.0, 1.0], [1.0, 0.0, 1.0]];
+        let mut scene = PointScene::new(&PointCloud::from_positions(points));
+        scene.seen_in("a \"b\".jpg", (100, 50), |i| (i == 2).then(|| Point2::new(49.5, 24.5)));
+        let json = scene.to_json();
+        // Not seen, then half and a quarter of 0xfffe in little-endian: ff ff ff ff ff 7f 00 40.
+        assert!(json.contains("\"sightings\":\"//////9/AEA=\""), "{json}");
+        assert!(json.contains(r#""photos":[{"name":"a \"b\".jpg","side":100}]"#), "{json}");
     }
 }

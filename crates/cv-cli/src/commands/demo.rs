@@ -7,8 +7,9 @@ mod reconstruct;
 mod segment;
 
 use crate::frame::{Context, Failure, Outcome, Run, create_dir};
-use cv_core::{Camera, RgbU8, Stage};
-use cv_report::{Figure, Note, Report};
+use crate::pictures::{Width, map, picture};
+use cv_core::{Camera, GrayF32, RgbU8, Stage};
+use cv_report::{Figure, MapStyle, Note, Report, draw_map};
 use serde::Serialize;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -139,10 +140,11 @@ impl Run for Args {
             sections.push(part.section);
             stages.push((name, start.elapsed().as_secs_f64()));
         }
-        let html = demo.page(&checks, sections);
+        let page = demo.page(&checks, sections);
+        let html = context.page(page.clone());
         let path = self.out.join("report.html");
         cv_io::write_bytes(&path, html.as_bytes())?;
-        context.report(|| Ok(html))?;
+        context.report(|| Ok(page))?;
         let missed = checks.iter().filter(|c| !c.passed).count();
         let outcome = Outcome::new(stages)
             .summary(format!("\n{}\nreport: {}", table(&checks), path.display()))
@@ -167,19 +169,18 @@ impl Demo<'_> {
 
     /// Writes a picture into the folder and returns it as a figure of the report.
     fn figure(&self, name: &str, image: &RgbU8, caption: &str) -> Result<Figure, Failure> {
-        let bytes = cv_io::encode_png(image.view())?;
-        cv_io::write_bytes(self.out.join(name), &bytes)?;
-        Ok(Figure::new(bytes, caption))
+        cv_io::write_png(self.out.join(name), image.view())?;
+        picture(image, Width::Full, caption)
     }
 
-    /// The same with a JPEG inside the report: a photograph with noise is several times smaller so.
-    fn photo(&self, name: &str, image: &RgbU8, caption: &str) -> Result<Figure, Failure> {
-        cv_io::write_png(self.out.join(name), image.view())?;
-        Ok(Figure::new(cv_io::encode_jpeg(image.view(), 90)?, caption))
+    /// The same of a map of numbers in colors.
+    fn map(&self, name: &str, values: &GrayF32, style: &MapStyle, caption: &str) -> Result<Figure, Failure> {
+        cv_io::write_png(self.out.join(name), draw_map(values.view(), style).view())?;
+        map(values.view(), style, Width::Full, caption)
     }
 
     /// The report: all checks first, then the sections of the jobs.
-    fn page(&self, checks: &[Check], sections: Vec<Section>) -> String {
+    fn page(&self, checks: &[Check], sections: Vec<Section>) -> Report {
         let missed = checks.iter().filter(|c| !c.passed).count();
         let mut page = Report::new("cv demo");
         page.subtitle(&format!("Every pipeline on generated photographs with exact truth · seed {}", self.seed));
@@ -195,12 +196,11 @@ impl Demo<'_> {
             n => page.note(Note::Failure, &format!("{n} of the results missed their bar.")),
         };
         sections.into_iter().for_each(|section| section(&mut page));
-        page.footer(&format!("cv {} · cv demo --seed {}", env!("CARGO_PKG_VERSION"), self.seed));
-        page.to_html()
+        page
     }
 }
 
-const HEAD: [&str; 7] = ["Job", "Measure", "Truth", "Result", "Measured", "Bar", ""];
+const HEAD: [&str; 7] = ["Job", "Measure", "Truth", "Result", "Measured", "Bar", "Held"];
 
 fn row(check: &Check) -> Vec<String> {
     vec![

@@ -2,10 +2,11 @@
 
 use super::size;
 use crate::frame::{Context, Explain, Failure, Outcome, Run, named};
+use crate::pictures::{Width, picture};
 use cv_core::nalgebra::Matrix3;
 use cv_core::{Camera, Correspondence, Named, RgbU8, named};
 use cv_pipeline::{EstimateError, ModelKind, RobustModel, RobustOptions, estimate, estimate_calibrated};
-use cv_report::{Figure, Raster, Report, colors};
+use cv_report::{Raster, Report, colors};
 use std::path::{Path, PathBuf};
 
 /// Which model to estimate.
@@ -165,20 +166,21 @@ fn report(
     name: &str,
     pairs: &[Correspondence],
     found: &RobustModel<Matrix3<f64>>,
-) -> Result<String, Failure> {
+) -> Result<Report, Failure> {
     let mut page = Report::new(&format!("Estimate: {name}"));
     page.subtitle(&file.display().to_string())
         .headline("matches that agree", &format!("{} of {}", found.inliers.len(), pairs.len()))
         .headline("residuals", &format!("{:.3} px RMS", found.rms))
         .headline("samples drawn", &found.iterations.to_string());
     let rows: Vec<Vec<String>> =
-        rows(&found.model).iter().map(|row| row.iter().map(|v| format!("{v:.9e}")).collect()).collect();
-    page.section("Model").table("", &["", "", ""], &rows);
-    page.section("Matches").figure(Figure::new(
-        cv_io::encode_png(flow(pairs, &found.inliers).view())?,
+        rows(&found.model).iter().map(|row| row.iter().map(|v| format!("{v:.5e}")).collect()).collect();
+    page.section("Model").table(&format!("The {name}, row by row."), &["column 1", "column 2", "column 3"], &rows);
+    page.section("Matches").figure(picture(
+        &flow(pairs, &found.inliers),
+        Width::Full,
         "Each line leads from a point of the first view to where it lies in the second: those that agree green, others red.",
-    ));
-    Ok(page.to_html())
+    )?);
+    Ok(page)
 }
 
 /// Every match as a line from its place in the first view to that in the second, both in one frame; of at most 1000 px a side.

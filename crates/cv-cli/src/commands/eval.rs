@@ -2,9 +2,10 @@
 
 use super::depth::{fractions, read_map};
 use crate::frame::{Context, Failure, Global, Outcome, Run};
+use crate::pictures::{Width, map, picture};
 use cv_core::Mask;
 use cv_pipeline::stereo::{BAD_THRESHOLDS, DisparityScores, evaluate_disparity, non_occluded};
-use cv_report::{Figure, MapStyle, Report, draw_error_map, draw_map};
+use cv_report::{MapStyle, Report, draw_error_map};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -103,7 +104,6 @@ impl Disparity {
             cv_io::write_png(path, errors().view())?;
         }
         context.report(|| {
-            let png = |image: cv_core::RgbU8| cv_io::encode_png(image.view());
             let style = MapStyle::disparity();
             let range = cv_report::quantile_range(truth.view(), 0.0, 1.0);
             let style = range.map_or(style.clone(), |(low, high)| style.with_range(low, high));
@@ -111,23 +111,37 @@ impl Disparity {
             page.headline("bad-2.0", &format!("{:.2} %", 100.0 * all.bad[2]))
                 .headline("average", &format!("{:.3} px", all.average))
                 .headline("density", &format!("{:.2} %", 100.0 * all.density));
-            page.section("Scores").table("", &HEAD, &rows(&all, visible.as_ref()));
-            page.section("Maps").figures(vec![
-                Figure::new(png(draw_map(estimate.view(), &style))?, "Estimate."),
-                Figure::new(png(draw_map(truth.view(), &style))?, "Truth."),
-                Figure::new(
-                    png(errors())?,
-                    "Errors: gray up to 2 px, red and yellow beyond, blue without an estimate, black without truth.",
-                ),
-            ]);
-            page.section("Fractions").plot(
-                &fractions(estimate.as_slice().iter().copied()),
-                "How often the estimate has each fraction of a pixel. Whole pixels that stand out (pixel locking) betray a poor \
-                 fit between pixels, unless the truth stands out likewise.",
+            // A measure per row: a phone has no room for twelve columns.
+            let columns = rows(&all, visible.as_ref());
+            let head: Vec<&str> = std::iter::once("measure").chain(columns.iter().map(|c| c[0].as_str())).collect();
+            let measures: Vec<Vec<&str>> = (1..HEAD.len())
+                .map(|i| std::iter::once(HEAD[i]).chain(columns.iter().map(|c| c[i].as_str())).collect())
+                .collect();
+            page.section("Scores").table(
+                "Shares of bad pixels are of all with known truth, averages and quantiles of those with an estimate.",
+                &head,
+                &measures,
             );
-            page.section("Fractions of the truth")
-                .plot(&fractions(truth.as_slice().iter().copied()), "The same of the true disparities.");
-            Ok(page.to_html())
+            page.section("Maps").figures(vec![
+                map(estimate.view(), &style, Width::Half, "Estimate.")?,
+                map(truth.view(), &style, Width::Half, "Truth.")?,
+                picture(
+                    &errors(),
+                    Width::Half,
+                    "Errors: gray up to 2 px, red and yellow beyond, blue without an estimate, black without truth.",
+                )?,
+            ]);
+            page.folded("Fractions of a pixel", |page| {
+                page.plots(&[
+                    (
+                        &fractions(estimate.as_slice().iter().copied()),
+                        "How often the estimate has each fraction of a pixel. Whole pixels that stand out (pixel locking) betray a \
+                         poor fit between pixels, unless the truth stands out likewise.",
+                    ),
+                    (&fractions(truth.as_slice().iter().copied()), "The same of the true disparities."),
+                ]);
+            });
+            Ok(page)
         })?;
         let mut outcome = Outcome::default().with("all", object(&all));
         if let Some(visible) = &visible {

@@ -1,6 +1,7 @@
 //! `cv match`: tentative matches between two photographs.
 
 use crate::frame::{Context, Explain, Failure, Outcome, Run, named};
+use crate::pictures::{Width, picture};
 use crate::words;
 use cv_core::{Keypoint, Named, RgbU8};
 use cv_io::FeatureRows;
@@ -9,7 +10,7 @@ use cv_pipeline::{
     AffineSimulation, FeatureMethod, FeatureOptions, Features, MatchingError, MatchingOptions, MatchingResult,
     ModelKind, PrevailingModel, match_extracted, match_photos, prevailing_model,
 };
-use cv_report::{Figure, MatchStyle, Note, Plot, Report, colors, draw_keypoints, draw_matches, tile_patches};
+use cv_report::{MatchStyle, Plot, Report, colors, draw_keypoints, draw_matches, tile_patches};
 use std::path::{Path, PathBuf};
 
 /// Find the same points in two photographs.
@@ -185,10 +186,7 @@ impl Args {
         [a, b]: [&RgbU8; 2],
         result: &MatchingResult,
         agreed: Option<&PrevailingModel>,
-    ) -> Result<String, Failure> {
-        let picture = |image: RgbU8, caption: &str| -> Result<Figure, Failure> {
-            Ok(Figure::new(cv_io::encode_jpeg(image.view(), 88).during("cannot encode a picture")?, caption))
-        };
+    ) -> Result<Report, Failure> {
         let mut report = Report::new("Matches");
         report.subtitle(&format!("{} and {}", self.first.display(), self.second.display()));
         let pairs = result.pairs();
@@ -212,13 +210,13 @@ impl Args {
                     features.candidates.len(),
                     shown(some.len(), features.candidates.len())
                 );
-                figures.push(picture(all, &caption)?);
+                figures.push(picture(&all, Width::Half, &caption)?);
             }
             let some = thinned(kept);
             let spaced = draw_keypoints(image.view(), &some, colors::GREEN);
             let caption =
                 format!("{name}: {} features that are described{}", kept.len(), shown(some.len(), kept.len()));
-            figures.push(picture(spaced, &caption)?);
+            figures.push(picture(&spaced, Width::Half, &caption)?);
             report.figures(figures);
         }
         if let Some(side) = result.features[0].descriptors.kind().patch {
@@ -228,28 +226,21 @@ impl Args {
             };
             report.section("Descriptors");
             report.figures(vec![
-                picture(tiles(&result.features[0]), "patches of the first photograph (the first 120)")?,
-                picture(tiles(&result.features[1]), "and of the second")?,
+                picture(&tiles(&result.features[0]), Width::Half, "patches of the first photograph (the first 120)")?,
+                picture(&tiles(&result.features[1]), Width::Half, "and of the second")?,
             ]);
         }
         report.section("Matches");
         let style = MatchStyle::default();
         let before = draw_matches(a.view(), b.view(), &pairs, None, &style);
-        report.figure(picture(before, "Tentative matches, each in a color of its own.")?);
-        match model {
-            Some(model) => {
-                let after = draw_matches(a.view(), b.view(), &pairs, Some(&inliers), &style);
-                report.figure(picture(
-                    after,
-                    &format!("The same after RANSAC: those that fit one {model} green, others red."),
-                )?);
-            }
-            None => {
-                report.note(Note::Warning, "No homography and no fundamental matrix explains enough of these matches.");
-            }
+        report.figure(picture(&before, Width::Full, "Tentative matches, each in a color of its own.")?);
+        if let Some(model) = model {
+            let after = draw_matches(a.view(), b.view(), &pairs, Some(&inliers), &style);
+            let caption = format!("The same after RANSAC: those that fit one {model} green, others red.");
+            report.figure(picture(&after, Width::Full, &caption)?);
         }
         statistics(&mut report, result);
-        Ok(report.to_html())
+        Ok(report)
     }
 }
 
@@ -338,7 +329,7 @@ fn statistics(report: &mut Report, result: &MatchingResult) {
     };
     report.table(
         "Features",
-        &["", "first", "second"],
+        &["number of", "first", "second"],
         &[
             row("points found", &|f| f.found()),
             row("left out at the border or on flat patches", &|f| f.dropped.len()),
@@ -350,5 +341,5 @@ fn statistics(report: &mut Report, result: &MatchingResult) {
     let plot =
         Plot::new("How sure the matches are", "ratio", "matches").histogram_within("matches", &ratios, 20, (0.0, 1.0));
     report.plot(&plot, "Ratio of the squared distance of the best candidate to that of the second: matches far to the left are unmistakable.");
-    report.facts(&result.stages.iter().map(|(name, s)| (*name, format!("{s:.3} s"))).collect::<Vec<_>>());
+    report.times(&result.stages);
 }

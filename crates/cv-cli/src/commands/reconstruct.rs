@@ -1,17 +1,17 @@
 //! `cv reconstruct`: points and camera poses from two photographs.
 
-use crate::frame::{Context, Explain, Failure, Outcome, Run, named};
+mod report;
+
+pub(crate) use report::sparse;
+
+use crate::frame::{Context, Failure, Outcome, Run, named};
 use crate::words;
+use cv_core::PointCloud;
 use cv_core::nalgebra::Matrix3;
-use cv_core::{Correspondence, PointCloud, Pose};
 use cv_io::DynImage;
 use cv_io::ply::PlyEncoding;
 use cv_pipeline::{
     Axes, DenseOptions, DenseResult, Intrinsics, ReconstructOptions, ReconstructResult, reconstruct, reconstruct_dense,
-};
-use cv_report::{
-    Figure, MapStyle, MatchStyle, Note, PointScene, Report, Viewpoint, camera_color, draw_epipolar_lines,
-    draw_keypoints, draw_map, draw_matches, render_points,
 };
 use std::path::{Path, PathBuf};
 
@@ -128,7 +128,7 @@ impl Run for Args {
         if let Some(text) = doubt(&result) {
             context.warn(format!("{text}; --focal or --camera if you know it"));
         }
-        context.report(|| self.html([&a, &b], &result, dense.as_ref(), &source))?;
+        context.report(|| report::report([&self.first, &self.second], [&a, &b], &result, dense.as_ref(), &source))?;
         Ok(self.outcome(&result, dense.as_ref()))
     }
 }
@@ -220,7 +220,7 @@ impl Args {
             summary += &format!("; focal length {focal:.0} px ± {percent:.1} %");
         }
         let mut stages = result.stages.clone();
-        stages.extend(dense.iter().flat_map(|d| &d.stages).map(|(name, seconds)| (dense_stage(name), *seconds)));
+        stages.extend(dense.iter().flat_map(|d| dense_stages(d)));
         let outcome = Outcome::new(stages)
             .with("points", result.scene.points.len())
             .with("matches", result.matching.matches.len())
@@ -247,159 +247,14 @@ impl Args {
             .with("dense_disparities", [i64::from(first), i64::from(first) + count as i64 - 1])
             .summary(summary)
     }
-
-    fn html(
-        &self,
-        [a, b]: [&cv_core::RgbU8; 2],
-        result: &ReconstructResult,
-        dense: Option<&DenseResult>,
-        source: &str,
-    ) -> Result<String, Failure> {
-        let png = |image: &cv_core::RgbU8| cv_io::encode_jpeg(image.view(), 88).during("cannot encode a picture");
-        let mut report = Report::new("Two-view reconstruction");
-        report.subtitle(&format!("{} and {}", self.first.display(), self.second.display()));
-        report
-            .headline("points", &result.scene.points.len().to_string())
-            .headline(
-                "matches that agree",
-                &format!("{} of {}", result.scene.inliers.len(), result.matching.matches.len()),
-            )
-            .headline("reprojection", &format!("{:.2} px", result.scene.reprojection_rms))
-            .headline("median angle", &format!("{:.2}°", result.scene.median_angle.to_degrees()));
-
-        report.section("The cloud");
-        report.paragraph(
-            "Each point was seen in both photographs. The unit is the distance between the two cameras, which are drawn as pyramids. \
-             Drag to turn, scroll to come nearer.",
-        );
-        let mut scene = PointScene::new(&result.cloud());
-        scene.camera(&result.scene.cameras[0], &Pose::identity(), camera_color(0));
-        scene.camera(&result.scene.cameras[1], &result.scene.pose, camera_color(1));
-        report.points(
-            &scene,
-            Some(png(&render_points(&scene, Viewpoint::Camera, 1200, 800))?),
-            "The points and the two cameras.",
-        );
-        let top = Figure::new(png(&render_points(&scene, Viewpoint::Top, 900, 700))?, "From above: a map.");
-        let side = Figure::new(png(&render_points(&scene, Viewpoint::Side, 900, 700))?, "From the side.");
-        report.figures(vec![top, side]);
-        if let Some(dense) = dense {
-            dense_section(&mut report, dense, result)?;
-        }
-
-        report.section("The motion");
-        let angle = result.scene.pose.rotation_angle();
-        let axis =
-            result.scene.pose.rotation.axis().map_or([0.0; 3], |axis| [axis.x, axis.y, axis.z].map(|v| v * angle));
-        let t = result.scene.pose.translation;
-        let degrees = |v: f64| format!("{:.3}°", v.to_degrees());
-        let deviation = match result.scene.focal_deviation {
-            0.0 => String::new(),
-            share => format!(" ± {:.1} %", 100.0 * share),
-        };
-        report.facts(&[
-            ("rotation", format!("{} about ({:.3}, {:.3}, {:.3})", degrees(angle), axis[0], axis[1], axis[2])),
-            ("direction of the translation", format!("({:.4}, {:.4}, {:.4})", t.x, t.y, t.z)),
-            ("standard deviation of the rotation", degrees(result.scene.pose_deviation[0])),
-            ("standard deviation of the direction", degrees(result.scene.pose_deviation[1])),
-            ("matches along epipolar lines", result.scene.guided.to_string()),
-            (
-                "focal lengths",
-                format!(
-                    "{:.1} and {:.1} px{deviation} ({source})",
-                    result.scene.cameras[0].fx, result.scene.cameras[1].fx
-                ),
-            ),
-            ("explained by one plane", format!("{:.0} % of the matches that agree", 100.0 * result.scene.planar_share)),
-        ]);
-        if let Some(text) = doubt(result) {
-            report.note(Note::Warning, &format!("{}{}.", text[..1].to_uppercase(), &text[1..]));
-        }
-        if result.scene.planar_share > 0.8 {
-            report.note(
-                Note::Warning,
-                "Most of the scene is nearly one plane: the motion is less certain than the deviations say.",
-            );
-        }
-
-        report.section("Features and matches");
-        let [fa, fb] = result.matching.features.each_ref().map(|f| &f.keypoints);
-        let shown = |k: &[cv_core::Keypoint]| k.iter().step_by((k.len() / 2000).max(1)).copied().collect::<Vec<_>>();
-        let green = [0, 158, 115];
-        report.figures(vec![
-            Figure::new(
-                png(&draw_keypoints(a.view(), &shown(fa), green))?,
-                &format!("{} features of the first photograph (at most 2000 drawn).", fa.len()),
-            ),
-            Figure::new(png(&draw_keypoints(b.view(), &shown(fb), green))?, &format!("{} of the second.", fb.len())),
-        ]);
-        let pairs = &result.matching.pairs();
-        let mut mask = vec![false; pairs.len()];
-        result.scene.inliers.iter().for_each(|&i| mask[i] = true);
-        let style = MatchStyle::default();
-        let before = draw_matches(a.view(), b.view(), pairs, None, &style);
-        let after = draw_matches(a.view(), b.view(), pairs, Some(&mask), &style);
-        report.figure(Figure::new(png(&before)?, "Tentative matches, each in a color of its own."));
-        report.figure(Figure::new(
-            png(&after)?,
-            "The same after the search for a motion: matches that agree green, others red.",
-        ));
-        let chosen: Vec<Correspondence> = result.scene.inliers.iter().map(|&i| pairs[i]).collect();
-        let lines = draw_epipolar_lines(a.view(), b.view(), &result.scene.fundamental(), &chosen, 24);
-        report.figure(Figure::new(png(&lines)?, "Points and their epipolar lines: each point of one photograph lies on its line in the other (up to the lens distortion, which bends lines)."));
-
-        report.section("Quality");
-        let errors: Vec<f32> = result.scene.points.iter().map(|p| p.reprojection as f32).collect();
-        let angles: Vec<f32> = result.scene.points.iter().map(|p| p.angle.to_degrees() as f32).collect();
-        let plot = |title: &str, unit: &str, values: &[f32]| {
-            cv_report::Plot::new(title, unit, "points").histogram(
-                "",
-                &values.iter().map(|v| f64::from(*v)).collect::<Vec<_>>(),
-                30,
-            )
-        };
-        report.plots(&[
-            (&plot("Reprojection error", "px", &errors), "How far the points are from where they were seen."),
-            (&plot("Angle between the rays", "degrees", &angles), "Small angles make uncertain depths."),
-        ]);
-        report.facts(&result.stages.iter().map(|(name, s)| (*name, format!("{s:.3} s"))).collect::<Vec<_>>());
-        Ok(report.to_html())
-    }
 }
 
-/// The stage names of the dense cloud, told from those of the sparse one.
-fn dense_stage(name: &str) -> &'static str {
-    match name {
+/// The stages of the dense cloud under names that tell them from those of the sparse one.
+fn dense_stages(dense: &DenseResult) -> impl Iterator<Item = (&'static str, f64)> {
+    let name = |name: &str| match name {
         "rectify" => "dense_rectify",
         "match" => "dense_match",
         _ => "dense_cloud",
-    }
-}
-
-/// Depth and cloud of the dense matching.
-fn dense_section(report: &mut Report, dense: &DenseResult, result: &ReconstructResult) -> Result<(), Failure> {
-    let png = |image: &cv_core::RgbU8| cv_io::encode_jpeg(image.view(), 88).during("cannot encode a picture");
-    report.section("The dense cloud");
-    let (width, height) = dense.size;
-    report.paragraph(&format!(
-        "The photographs were rectified to {width}×{height} px and matched at {} disparities. {} points, {:.0} % of what both show, were confirmed \
-         from both.",
-        dense.disparities.1,
-        dense.cloud.len(),
-        100.0 * dense.coverage,
-    ));
-    let depth = draw_map(dense.depth.view(), &MapStyle::depth("distances between the cameras"));
-    report.figure(Figure::new(png(&depth)?, "Depth of the first photograph: near blue, far red, unknown gray."));
-    let mut scene = PointScene::new(&dense.cloud);
-    scene.camera(&result.scene.cameras[0], &Pose::identity(), camera_color(0));
-    scene.camera(&result.scene.cameras[1], &result.scene.pose, camera_color(1));
-    let caption = match scene.left_out() {
-        0 => "The dense cloud.".to_owned(),
-        n => format!("The dense cloud, thinned by {n} points; the file has all of them."),
     };
-    report.points(&scene, Some(png(&render_points(&scene, Viewpoint::Camera, 1200, 800))?), &caption);
-    let top = Figure::new(png(&render_points(&scene, Viewpoint::Top, 900, 700))?, "From above: a map.");
-    let side = Figure::new(png(&render_points(&scene, Viewpoint::Side, 900, 700))?, "From the side.");
-    report.figures(vec![top, side]);
-    Ok(())
+    dense.stages.iter().map(move |(stage, seconds)| (name(stage), *seconds))
 }

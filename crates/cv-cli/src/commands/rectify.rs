@@ -2,12 +2,13 @@
 
 use super::size;
 use crate::frame::{Context, Failure, Global, Outcome, Run, create_dir, spare_inputs};
+use crate::pictures::{Width, picture};
 use crate::{rig, words};
 use cv_core::{RgbU8, StereoRig};
 use cv_io::RigFile;
 use cv_pipeline::rectify;
 use cv_pipeline::stereo::RectifyOptions;
-use cv_report::{Figure, Note, Raster, Report, colors, side_by_side};
+use cv_report::{Raster, Report, colors, side_by_side};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
@@ -125,14 +126,16 @@ impl Run for Args {
                 "valid area",
                 &format!("{:.1} % and {:.1} %", 100.0 * result.valid_area[0], 100.0 * result.valid_area[1]),
             );
-            page.section("Rectified pair").figure(Figure::new(
-                cv_io::encode_png(with_rows(&result.images).view())?,
+            page.section("Rectified pair").figure(picture(
+                &with_rows(&result.images),
+                Width::Full,
                 "Both photographs with common rows drawn through: what is on a line on the left is on it on the right.",
-            ));
+            )?);
             if let Some(cause) = &result.fault {
-                page.note(Note::Warning, &format!("What the photographs show: {cause}."));
+                page.warn(&format!("what the photographs show: {cause}"));
             }
-            Ok(page.to_html())
+            page.section("Time").times(&result.stages);
+            Ok(page)
         })?;
         let (width, height) = result.images[0].size();
         let outcome = Outcome::new(result.stages)

@@ -3,6 +3,7 @@
 mod files;
 
 use crate::frame::{Context, Explain, Failure, Global, Outcome, Run, create_dir, expand_images, named, same_file};
+use crate::pictures::{Width, picture};
 use cv_core::{Mask, Named, RgbU8, Stage};
 use cv_pipeline::segmentation::{
     ColorModel, ColorSpace, ConfusionMatrix, DetectOptions, Detection, Labeled, Regions, Rule, SegmentError,
@@ -14,8 +15,6 @@ use files::{Pair, pair, read_pair, stem};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
-/// Longest side of the pictures in reports, in pixels.
-const REPORT_SIDE: usize = 800;
 /// Photographs shown in a report.
 const REPORT_PHOTOS: usize = 40;
 
@@ -150,7 +149,7 @@ impl Train {
             let mut page = Report::new("Segmentation: training");
             headline(&mut page, &total, photos.len());
             page.note(Note::Info, "These are the scores on the photographs the model was trained on. On others they will be lower: use cv segment eval.");
-            page.section("Model").facts(&[
+            page.section("Model").facts("What was learned, and how it judges.", &[
                 ("color space", options.space.name().to_uppercase()),
                 ("components of the object", trained.model.foreground().components.len().to_string()),
                 ("components of the background", trained.model.background().map_or(0, |b| b.components.len()).to_string()),
@@ -169,7 +168,7 @@ impl Train {
                 })
                 .collect();
             page.section("Photographs").paragraph(LEGEND).figures(shown?);
-            Ok(page.to_html())
+            Ok(page)
         })?;
         let summary =
             format!("{} photographs, F1 {:.3} on themselves; model: {}", pairs.len(), total.f1(), self.model.display());
@@ -265,11 +264,11 @@ impl Predict {
                 let overlay = overlay_mask(photo.view(), result.mask.view(), colors::GREEN, 0.35);
                 let score = best.and_then(|b| b.score).map_or_else(String::new, |s| format!(", score {s:.3}"));
                 let words = if is_found {
-                    format!("{}: {:.2} % marked{score}", path.display(), 100.0 * result.fraction)
+                    format!("{}: {:.2} % marked{score}", name(path), 100.0 * result.fraction)
                 } else {
-                    format!("{}: not found{score}", path.display())
+                    format!("{}: not found{score}", name(path))
                 };
-                figures.push(figure(&overlay, &words)?);
+                figures.push(picture(&overlay, Width::Half, &words)?);
             }
             add_stages(&mut stages, &result.stages);
             stage.add(1)?;
@@ -287,7 +286,7 @@ impl Predict {
                 &rows,
             );
             page.section("Photographs").paragraph("What was marked, in green.").figures(figures);
-            Ok(page.to_html())
+            Ok(page)
         })?;
         let mut summary =
             format!("{} photographs, the object found in {found}; masks: {}", photos.len(), self.out.display());
@@ -301,9 +300,14 @@ impl Predict {
     }
 }
 
+/// The name of a file, for tables: its folder stands in the command line.
+fn name(path: &Path) -> String {
+    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+}
+
 /// A row of the report's table of objects.
 fn row(path: &Path, best: Option<&Detection>) -> Vec<String> {
-    let mut row = vec![path.display().to_string()];
+    let mut row = vec![name(path)];
     let Some(best) = best else {
         row.push("not found".to_owned());
         row.resize(7, String::new());
@@ -380,7 +384,7 @@ impl Eval {
             headline(&mut page, &total, pairs.len());
             let row = |(pair, s): (&Pair, &ConfusionMatrix)| {
                 let number = |v: f64| format!("{v:.4}");
-                vec![pair.photo.display().to_string(), number(s.precision()), number(s.recall()), number(s.f1())]
+                vec![name(&pair.photo), number(s.precision()), number(s.recall()), number(s.f1())]
             };
             let rows: Vec<Vec<String>> = pairs.iter().zip(&scores).map(row).collect();
             page.section("Scores").table(
@@ -389,7 +393,7 @@ impl Eval {
                 &rows,
             );
             page.section("Photographs").paragraph(LEGEND).figures(figures);
-            Ok(page.to_html())
+            Ok(page)
         })?;
         let summary = format!(
             "{} photographs: precision {:.4}, recall {:.4}, F1 {:.4}",
@@ -435,12 +439,8 @@ fn comparison(
     truth: &Mask,
     scores: &ConfusionMatrix,
 ) -> Result<Figure, Failure> {
-    let picture = overlay_comparison(photo.view(), mask.view(), truth.view());
-    figure(&picture, &format!("{}: F1 {:.3}", path.display(), scores.f1()))
-}
-
-fn figure(picture: &RgbU8, words: &str) -> Result<Figure, Failure> {
-    Ok(Figure::new(cv_io::encode_png(cv_report::shrink_to_fit(picture.view(), REPORT_SIDE).view())?, words))
+    let drawn = overlay_comparison(photo.view(), mask.view(), truth.view());
+    picture(&drawn, Width::Half, &format!("{}: F1 {:.3}", name(path), scores.f1()))
 }
 
 fn add_stages(sums: &mut Vec<(&'static str, f64)>, stages: &[(&'static str, f64)]) {

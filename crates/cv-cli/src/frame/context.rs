@@ -2,9 +2,14 @@
 
 use super::progress::Bar;
 use super::stop::Stop;
-use super::{Failure, Global, Globals, create_dir};
+use super::{Called, Failure, Global, Globals, create_dir};
 use cv_pipeline::{Cancelled, Progress};
-use std::{fmt::Display, path::PathBuf, sync::Arc};
+use cv_report::Report;
+use std::{
+    fmt::Display,
+    path::PathBuf,
+    sync::{Arc, Mutex, PoisonError},
+};
 
 /// What a running command knows about how it was called. It is also the [`Progress`] that pipelines report to.
 pub(crate) struct Context {
@@ -14,16 +19,20 @@ pub(crate) struct Context {
     pub(crate) max_memory: Option<usize>,
     quiet: bool,
     report: Option<PathBuf>,
+    called: Called,
+    /// What was warned of so far.
+    warnings: Mutex<Vec<String>>,
     bar: Arc<Bar>,
     pub(super) stop: Stop,
 }
 
 impl Context {
-    pub(super) fn new(globals: &Globals) -> Self {
+    pub(super) fn new(globals: &Globals, called: Called) -> Self {
         let Globals { quiet, seed, .. } = *globals;
         let bar = Arc::new(Bar::new(quiet));
         let max_memory = globals.max_memory.map(|mib| usize::try_from(u64::from(mib) << 20).unwrap_or(usize::MAX));
-        Self { seed, max_memory, quiet, report: globals.report.clone(), stop: Stop::listen(&bar), bar }
+        let (report, stop) = (globals.report.clone(), Stop::listen(&bar));
+        Self { seed, max_memory, quiet, report, called, warnings: Mutex::default(), bar, stop }
     }
 
     /// Refuses global options that the command has no use for.
@@ -56,15 +65,26 @@ impl Context {
         }
     }
 
-    /// Something the person should know about even under `--quiet`.
+    /// Something the person should know about even under `--quiet`. It stands in a report that is made later, too.
     pub(crate) fn warn(&self, text: impl Display) {
+        let text = text.to_string();
         self.bar.print(&format!("warning: {text}"));
+        self.warnings.lock().unwrap_or_else(PoisonError::into_inner).push(text);
     }
 
-    /// Under `--report DIR`, writes `DIR/report.html`.
-    pub(crate) fn report(&self, html: impl FnOnce() -> Result<String, Failure>) -> Result<(), Failure> {
+    /// The file of a report: with the warnings of this run at the top and how it was called at the end.
+    pub(crate) fn page(&self, mut report: Report) -> String {
+        for text in self.warnings.lock().unwrap_or_else(PoisonError::into_inner).iter() {
+            report.warn(text);
+        }
+        self.called.tell(&mut report);
+        report.to_html()
+    }
+
+    /// Under `--report DIR`, writes `DIR/report.html`. Comes after the warnings.
+    pub(crate) fn report(&self, build: impl FnOnce() -> Result<Report, Failure>) -> Result<(), Failure> {
         let Some(folder) = &self.report else { return Ok(()) };
-        let html = html()?;
+        let html = self.page(build()?);
         create_dir(folder)?;
         let path = folder.join("report.html");
         cv_io::write_bytes(&path, html.as_bytes())?;

@@ -2,6 +2,7 @@
 //!
 //! [`Outcome`] is what a command achieved and [`Failure`] why it did not; [`Context`] is what it knows of how it was called.
 
+mod called;
 mod context;
 mod failure;
 mod inputs;
@@ -12,6 +13,7 @@ mod outputs;
 mod progress;
 mod stop;
 
+pub(crate) use called::Called;
 pub(crate) use context::Context;
 pub(crate) use failure::{Explain, Failure};
 pub(crate) use inputs::expand_images;
@@ -80,12 +82,16 @@ pub(crate) trait Run: Args {
 }
 
 /// Runs a command under the global arguments and turns what comes of it into output and exit code.
-pub(crate) fn run(globals: &Globals, command: impl FnOnce(&Context) -> Result<Outcome, Failure>) -> ExitCode {
+pub(crate) fn run(
+    globals: &Globals,
+    called: Called,
+    command: impl FnOnce(&Context) -> Result<Outcome, Failure>,
+) -> ExitCode {
     let start = Instant::now();
     let limit = globals.max_memory.map_or_else(memory::default_limit, |mib| u64::from(mib) << 20);
     // Nothing has set it before: this is the only place.
     let _ = cv_io::set_default_max_memory(limit);
-    let context = Context::new(globals);
+    let context = Context::new(globals, called);
     let result = start_threads(globals.threads).and_then(|()| {
         // A bug in the program is reported like any failure: the person sees what to do, scripts see exit code 1.
         catch_unwind(AssertUnwindSafe(|| command(&context))).unwrap_or_else(|_| {

@@ -1,11 +1,13 @@
 //! Depth of a room from a rectified pair.
 
 use super::{Check, Demo, Part};
+use crate::commands::depth::scene as scene_of;
 use crate::frame::Failure;
-use cv_core::{GrayF32, Mask, PointCloud, RgbU8};
+use crate::pictures::still;
+use cv_core::{GrayF32, Mask, RgbU8};
 use cv_pipeline::stereo::{StereoGeometry, StereoOptions};
 use cv_pipeline::{DepthOptions, depth};
-use cv_report::{MapStyle, PointScene, Viewpoint, colors, draw_map, render_points};
+use cv_report::{MapStyle, colors};
 use cv_synth::{RenderOptions, Scene, depth_score, stereo_pair};
 
 /// Meters between the two cameras.
@@ -38,23 +40,20 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let range = (0.0, LIMIT);
     let style = MapStyle::depth("m").with_range(range.0, range.1);
     let photos = vec![
-        demo.photo("depth-left.png", left, "Left photograph.")?,
-        demo.photo("depth-right.png", right, "Right photograph, 20 cm to the right.")?,
+        demo.figure("depth-left.png", left, "Left photograph.")?,
+        demo.figure("depth-right.png", right, "Right photograph, 20 cm to the right.")?,
     ];
     let maps = vec![
-        demo.figure("depth-result.png", &draw_map(found.view(), &style), "Depth by the pipeline: near blue, far red.")?,
-        demo.figure("depth-truth.png", &draw_map(truth.view(), &style), "True depth.")?,
+        demo.map("depth-result.png", &found, &style, "Depth by the pipeline: near blue, far red.")?,
+        demo.map("depth-truth.png", truth, &style, "True depth.")?,
         demo.figure(
             "depth-errors.png",
             &errors(left, &found, truth, &pair.visible),
             "Off by more than 5 %: red. Seen by one camera only, where no method can measure: blue.",
         )?,
     ];
-    // Every third pixel is dense enough to look at, and keeps the report small.
-    let all = geometry.cloud(found.view(), left.view());
-    let (positions, colors) = (0..all.len()).step_by(3).map(|i| (all.positions[i], all.colors[i])).unzip();
-    let cloud = PointScene::new(&PointCloud::colored(positions, colors));
-    let still = cv_io::encode_png(render_points(&cloud, Viewpoint::Camera, 960, 600).view())?;
+    let cloud = scene_of(&geometry.cloud(found.view(), left.view()), &geometry, found.size());
+    let still = still(&cloud)?;
     Ok(Part::new(vec![check], move |page| {
         page.section("Depth")
             .paragraph("A room photographed with two cameras side by side. The semi-global matcher finds how far each pixel shifts from left to right, and from that how far away it is.")

@@ -34,14 +34,14 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let keypoints = &found.features[0].keypoints;
     let strongest = &keypoints[..keypoints.len().min(600)];
     let photos = vec![
-        demo.photo("homography-a.png", a, "First photograph.")?,
-        demo.photo("homography-b.png", b, "Second photograph.")?,
-        demo.photo(
+        demo.figure("homography-a.png", a, "First photograph.")?,
+        demo.figure("homography-b.png", b, "Second photograph.")?,
+        demo.figure(
             "homography-features.png",
             &draw_keypoints(a.view(), strongest, colors::YELLOW),
             &format!("Features of the first: {} of {}.", strongest.len(), keypoints.len()),
         )?,
-        demo.photo(
+        demo.figure(
             "homography-warped.png",
             &checkered(a.view(), b.view(), &model.model),
             "Both in one frame, in the squares of a chessboard: edges run through where the homography is right.",
@@ -49,7 +49,7 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     ];
     let matches =
         draw_matches(a.view(), b.view(), &pairs, Some(&inliers), &MatchStyle { limit: 160, ..MatchStyle::default() });
-    let matches = demo.photo(
+    let matches = demo.figure(
         "homography-matches.png",
         &matches,
         &format!(

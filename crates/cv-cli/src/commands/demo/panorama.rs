@@ -39,12 +39,15 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
 
     let mut row = Vec::new();
     for (i, view) in set.views.iter().enumerate() {
-        demo.photo(&format!("panorama-{}.png", i + 1), &view.image, "")?;
+        cv_io::write_png(demo.out.join(format!("panorama-{}.png", i + 1)), view.image.view())?;
         row.push(view.image.view());
     }
-    let inputs =
-        demo.photo("panorama-photographs.png", &side_by_side(&row, 8), "The photographs, each with its own exposure.")?;
-    let joined = demo.photo(
+    let inputs = demo.figure(
+        "panorama-photographs.png",
+        &side_by_side(&row, 8),
+        "The photographs, each with its own exposure.",
+    )?;
+    let joined = demo.figure(
         "panorama-result.png",
         &result.image,
         "The panorama. Seams run where the photographs agree, so that who walks is there whole or not at all.",

@@ -1,10 +1,12 @@
 //! Points and camera motion from two photographs of a room.
 
 use super::{Check, Demo, Part};
+use crate::commands::reconstruct::sparse;
 use crate::frame::Failure;
+use crate::pictures::still;
 use cv_core::Pose;
 use cv_pipeline::{Intrinsics, ReconstructOptions, reconstruct};
-use cv_report::{MatchStyle, PointScene, Viewpoint, camera_color, draw_epipolar_lines, draw_matches, render_points};
+use cv_report::{MatchStyle, draw_epipolar_lines, draw_matches};
 use cv_synth::{RenderOptions, direction_error, rotation_error, two_view};
 
 /// Meters between the two places.
@@ -14,6 +16,9 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let camera = demo.camera();
     let pair = two_view(demo.seed, &camera, BASELINE, &RenderOptions::default())?;
     let (a, b) = (&pair.a.image, &pair.b.image);
+    for (name, photo) in [("reconstruct-a.png", a), ("reconstruct-b.png", b)] {
+        cv_io::write_png(demo.out.join(name), photo.view())?;
+    }
     let options = ReconstructOptions::new(Intrinsics::Known([camera; 2]));
     let result = match reconstruct(a.view(), b.view(), &options, demo.context) {
         Ok(result) => result,
@@ -38,12 +43,12 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let style = MatchStyle { limit: 160, ..MatchStyle::default() };
     let agree = format!("{} of {} matches agree with one motion (green).", result.scene.inliers.len(), pairs.len());
     let figures = vec![
-        demo.photo(
+        demo.figure(
             "reconstruct-matches.png",
             &draw_matches(a.view(), b.view(), pairs, Some(&inliers), &style),
             &agree,
         )?,
-        demo.photo(
+        demo.figure(
             "reconstruct-epipolar.png",
             &draw_epipolar_lines(
                 a.view(),
@@ -55,9 +60,8 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
             "Each point with the line on which it must lie in the other photograph.",
         )?,
     ];
-    let mut cloud = PointScene::new(&result.cloud());
-    cloud.camera(&camera, &Pose::identity(), camera_color(0)).camera(&camera, found, camera_color(1));
-    let still = cv_io::encode_png(render_points(&cloud, Viewpoint::Camera, 960, 600).view())?;
+    let cloud = sparse(&result, ["first", "second"]);
+    let still = still(&cloud)?;
     let caption = format!("{} points and the two cameras. Drag to turn.", result.scene.points.len());
     Ok(Part::new(checks, move |page| {
         page.section("Reconstruction")

@@ -19,7 +19,8 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let mut score = MaskScore::default();
     let mut figures = Vec::new();
     for (i, photo) in photos.iter().enumerate() {
-        demo.photo(&format!("segment-{}.png", i + 1), &photo.view.image, "")?;
+        cv_io::write_png(demo.out.join(format!("segment-{}.png", i + 1)), photo.view.image.view())?;
+        cv_io::write_png(demo.out.join(format!("segment-{}_mask.png", i + 1)), photo.mask.view())?;
         if i % 2 == 0 {
             continue;
         }
@@ -28,7 +29,7 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
         score = score.plus(one);
         let caption = format!("The ball {:.2} m away: F1 {:.3}.", photo.distance, one.f1());
         let picture = overlay_comparison(photo.view.image.view(), found.view(), photo.mask.view());
-        figures.push(demo.photo(&format!("segment-{}-result.png", i + 1), &picture, &caption)?);
+        figures.push(demo.figure(&format!("segment-{}-result.png", i + 1), &picture, &caption)?);
     }
     let pixels = |n: usize| format!("{n} px of ball");
     let check = Check::at_least("segment", "F1 over all test pixels", score.f1(), 0.97, "")

@@ -25,7 +25,7 @@ use photos::{Photos, at_own_depth};
 use std::path::{Path, PathBuf};
 
 pub(crate) use maps::read_map;
-pub(crate) use report::fractions;
+pub(crate) use report::{fractions, scene};
 
 /// Compute disparity, and depth where the geometry is known, from a left and a right photograph.
 ///
@@ -196,7 +196,6 @@ impl Run for Args {
         if let Some(path) = &self.cloud {
             cv_io::ply::write_cloud(path, &job.cloud, PlyEncoding::Binary)?;
         }
-        context.report(|| report::report(&job))?;
         let (valid, matched) = (map.valid_fraction(), map.matched_fraction());
         if job.maps.is_mostly_filled() {
             context.warn(format!(
@@ -204,6 +203,7 @@ impl Run for Args {
                 100.0 * matched
             ));
         }
+        context.report(|| report::report(&job))?;
         let (width, height) = map.disparity.size();
         Ok(Outcome::new(job.maps.stages.clone())
             .with("width", width)

@@ -1,10 +1,11 @@
 //! The report of `cv depth`.
 
 use crate::frame::Failure;
-use cv_core::{ImageView, RgbU8};
-use cv_pipeline::stereo::PixelState;
+use crate::pictures::{Width, map as colored, picture, turning};
+use cv_core::{Camera, ImageView, Point3, PointCloud, Pose, RgbU8, Rotation3, Vector3};
+use cv_pipeline::stereo::{PixelState, StereoGeometry};
 use cv_pipeline::{DepthResult, RigDepthResult};
-use cv_report::{Figure, MapStyle, Note, Plot, PointScene, Report, Viewpoint, draw_map, render_points};
+use cv_report::{MapStyle, Note, Plot, PointScene, Report, camera_color};
 
 /// Where each disparity comes from, over the darkened photograph.
 fn draw_states(left: ImageView<'_, u8, 3>, states: ImageView<'_, PixelState, 1>) -> RgbU8 {
@@ -20,54 +21,70 @@ fn draw_states(left: ImageView<'_, u8, 3>, states: ImageView<'_, PixelState, 1>)
     })
 }
 
-pub(super) fn report(job: &RigDepthResult) -> Result<String, Failure> {
+pub(super) fn report(job: &RigDepthResult) -> Result<Report, Failure> {
     let RigDepthResult { images: [left, right], maps, cloud } = job;
-    let DepthResult { map, depth, stages, .. } = maps;
-    let png = |image: &RgbU8| cv_io::encode_png(image.view());
+    let DepthResult { map, depth, geometry, stages, .. } = maps;
     let mut page = Report::new("Depth");
     let (width, height) = map.disparity.size();
     page.headline("size", &format!("{width}×{height}"))
         .headline("matched and confirmed", &format!("{:.1} %", 100.0 * map.matched_fraction()))
         .headline("with a disparity", &format!("{:.1} %", 100.0 * map.valid_fraction()));
-    if maps.is_mostly_filled() {
-        page.note(
-            Note::Warning,
-            "Most of this map is not matched but filled in from around; of such pixels about four in ten are wrong.",
-        );
-    }
-    page.section("Photographs")
-        .figures(vec![Figure::new(png(left)?, "Left photograph."), Figure::new(png(right)?, "Right photograph.")]);
+    page.section("Photographs").figures(vec![
+        picture(left, Width::Half, "Left photograph.")?,
+        picture(right, Width::Half, "Right photograph.")?,
+    ]);
     page.section("Disparity").figures(vec![
-        Figure::new(
-            png(&draw_map(map.disparity.view(), &MapStyle::disparity()))?,
+        colored(
+            map.disparity.view(),
+            &MapStyle::disparity(),
+            Width::Half,
             "Disparity: near (large) blue, far (small) red, unknown gray.",
-        ),
-        Figure::new(
-            png(&draw_states(left.view(), map.state.view()))?,
+        )?,
+        picture(
+            &draw_states(left.view(), map.state.view()),
+            Width::Half,
             "Filled pixels: blue hidden from the right camera, orange mismatched, violet outside the right photograph.",
-        ),
+        )?,
     ]);
     let pixels = map.disparity.as_slice().iter().zip(map.state.as_slice());
     let matched = pixels.filter(|(_, state)| **state == PixelState::Matched);
-    page.section("Fractions").plot(
-        &fractions(matched.map(|(&d, _)| d)),
-        "How often matched disparities have each fraction. Whole pixels that stand out (pixel locking) betray a poor fit \
-         between pixels, unless the scene is of few planes that face the cameras.",
-    );
-    if let Some(depth) = depth {
-        page.section("Depth").figure(Figure::new(
-            png(&draw_map(depth.view(), &MapStyle::depth("")))?,
+    let fractions = fractions(matched.map(|(&d, _)| d));
+    page.folded("Fractions of a pixel", |page| {
+        page.plot(
+            &fractions,
+            "How often matched disparities have each fraction. Whole pixels that stand out (pixel locking) betray a poor fit \
+             between pixels, unless the scene is of few planes that face the cameras.",
+        );
+    });
+    if let (Some(depth), Some(geometry)) = (depth, geometry) {
+        page.section("Depth").figure(colored(
+            depth.view(),
+            &MapStyle::depth(""),
+            Width::Full,
             "Depth in the unit of the baseline: near blue, far red, unknown gray.",
-        ));
-        let scene = PointScene::new(cloud);
-        let still = png(&render_points(&scene, Viewpoint::Camera, 960, 640))?;
-        page.section("Cloud").points(&scene, Some(still), "The depth map in space.");
+        )?);
+        page.section("Cloud");
+        turning(&mut page, &scene(cloud, geometry, (width, height)), "The depth map in space, and the two cameras.")?;
     } else {
         page.note(Note::Info, "No depth: the focal length and the baseline were not given.");
     }
-    page.section("Time")
-        .facts(&stages.iter().map(|(stage, seconds)| (*stage, format!("{:.1} ms", 1e3 * seconds))).collect::<Vec<_>>());
-    Ok(page.to_html())
+    page.section("Time").times(stages);
+    Ok(page)
+}
+
+/// The cloud of a depth map with both cameras, and where each photograph of `width × height` pixels shows the points.
+pub(crate) fn scene(cloud: &PointCloud, geometry: &StereoGeometry, (width, height): (usize, usize)) -> PointScene {
+    let mut scene = PointScene::new(cloud);
+    let focal = geometry.focal;
+    let eyes = [("left", 0.0, 0.0), ("right", geometry.offset, -geometry.baseline)];
+    for (i, (name, offset, shift)) in eyes.into_iter().enumerate() {
+        let camera = Camera::pinhole(width, height, focal, focal, geometry.cx + offset, geometry.cy);
+        let pose = Pose::new(Rotation3::identity(), Vector3::new(shift, 0.0, 0.0));
+        scene.camera(&camera, &pose, camera_color(i)).seen_in(name, (width, height), |i| {
+            camera.project(&pose.transform(&Point3::from(cloud.positions[i].map(f64::from))))
+        });
+    }
+    scene
 }
 
 /// How the fractions of disparities are spread.

@@ -1,18 +1,18 @@
 //! The report of `cv panorama`.
 
 use crate::frame::Failure;
+use crate::pictures::{Width, picture};
 use crate::words;
 use cv_core::{Correspondence, Point2, RgbU8, Scaling};
 use cv_pipeline::PanoramaResult;
-use cv_report::{Figure, MatchStyle, Note, Report, draw_matches, shrink_to_fit};
+use cv_report::{MatchStyle, Report, draw_matches, shrink_to_fit};
 use std::path::PathBuf;
 
 /// Pairs whose matches are drawn: more than these nobody looks at.
 const PAIRS: usize = 12;
 
 /// The page: the panorama, which photograph is where, and what became of each photograph and each overlap.
-pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResult) -> Result<String, Failure> {
-    let jpeg = |image: &RgbU8| cv_io::encode_jpeg(image.view(), 88);
+pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResult) -> Result<Report, Failure> {
     let name = |i: usize| paths[i].file_name().unwrap_or_default().to_string_lossy().into_owned();
     let used = result.images.iter().filter(|image| image.used).count();
     let (width, height) = result.image.size();
@@ -20,20 +20,14 @@ pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResul
     page.headline("photographs used", &format!("{used} of {}", paths.len()))
         .headline("size", &format!("{width}×{height}"))
         .headline("matches agree to", &format!("{:.2} px", result.reprojection_rms_px));
-    let small = shrink_to_fit(result.image.view(), 2000);
-    page.section("Panorama").figure(Figure::new(
-        jpeg(&small)?,
-        &format!("{} projection; black where no photograph reaches.", result.canvas.projection),
-    ));
+    let caption = format!("{} projection; black where no photograph reaches.", result.canvas.projection);
+    page.section("Panorama").figure(picture(&result.image, Width::Full, &caption)?);
     let sources = RgbU8::from_fn(width, height, |x, y| {
         let label = result.labels.at(x, y)[0];
         if label == u16::MAX { [0; 3] } else { tint(result.image.at(x, y), label) }
     });
-    let small = shrink_to_fit(sources.view(), 2000);
-    page.figure(Figure::new(
-        jpeg(&small)?,
-        "Which photograph each pixel is from: the seams run where the color changes.",
-    ));
+    let caption = "Which photograph each pixel is from: the seams run where the color changes.";
+    page.figure(picture(&sources, Width::Full, caption)?);
 
     page.section("Photographs");
     let rows: Vec<Vec<String>> = result
@@ -46,15 +40,7 @@ pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResul
             vec![name(i), fate, image.features.to_string(), focal]
         })
         .collect();
-    page.table("", &["file", "used or why not", "features", "focal length"], &rows);
-    for (i, image) in result.images.iter().enumerate() {
-        if let Some(reason) = &image.reason {
-            page.note(
-                Note::Warning,
-                &format!("{} is not in the panorama: {}", name(i), words::left_out(reason, paths)),
-            );
-        }
-    }
+    page.table("What became of each photograph.", &["file", "used or why not", "features", "focal length"], &rows);
 
     page.section("Overlaps");
     let accepted = result.pairs.iter().filter(|pair| pair.rejected.is_none());
@@ -69,15 +55,14 @@ pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResul
             .collect();
         let mut agree = vec![false; matches.len()];
         pair.inliers.iter().for_each(|&i| agree[i] = true);
-        let picture = draw_matches(a.view(), b.view(), &matches, Some(&agree), &MatchStyle::default());
+        let drawn = draw_matches(a.view(), b.view(), &matches, Some(&agree), &MatchStyle::default());
         let good = pair.inliers.len();
         let caption =
             format!("{} and {}: {good} of {} matches agree (green).", name(pair.a), name(pair.b), matches.len());
-        page.figure(Figure::new(jpeg(&picture)?, &caption));
+        page.figure(picture(&drawn, Width::Full, &caption)?);
     }
-    let seconds: Vec<_> = result.stages.iter().map(|(stage, s)| (*stage, format!("{s:.2} s"))).collect();
-    page.section("Time").facts(&seconds);
-    Ok(page.to_html())
+    page.section("Time").times(&result.stages);
+    Ok(page)
 }
 
 /// The pixel under a color of its photograph's own; neighbors in number are far apart on the color circle.
