@@ -13,6 +13,7 @@ use frame::Globals;
 #[command(name = "cv", version, propagate_version = true, arg_required_else_help = true, max_term_width = 100)]
 #[command(after_help = "Exit codes: 0 done; 1 the job could not be done (the reason is on stderr); 2 wrong usage;\n\
     130 stopped by Ctrl-C.\n\
+    Folders of outputs are made. An output file named - is stdout, in the first of the formats it may have.\n\
     `cv COMMAND --help` shows examples of each command.")]
 struct Cli {
     #[command(flatten)]

@@ -1,12 +1,12 @@
 //! `cv eval`: results against the truth.
 
 use super::depth::{fractions, read_map};
-use crate::frame::{Context, Failure, Global, Outcome, Run};
+use crate::frame::{Context, Failure, Global, Outcome, Output, PNG, Run};
 use cv_core::Mask;
 use cv_pipeline::stereo::{BAD_THRESHOLDS, DisparityScores, evaluate_disparity, non_occluded};
 use cv_report::{Figure, MapStyle, Report, draw_error_map, draw_map};
 use serde_json::{Value, json};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Compare a result with the truth.
 #[derive(Debug, clap::Args)]
@@ -58,9 +58,9 @@ struct Disparity {
 }
 
 impl Run for Args {
-    fn outputs(&self) -> Vec<&Path> {
+    fn outputs(&self) -> Vec<Output<'_>> {
         match &self.what {
-            What::Disparity(args) => args.error.iter().map(|p| &**p).collect(),
+            What::Disparity(args) => args.error.iter().map(|path| Output::File(path, PNG)).collect(),
         }
     }
 
@@ -100,7 +100,7 @@ impl Disparity {
         };
         let errors = || draw_error_map(estimate.view(), truth.view(), 2.0);
         if let Some(path) = &self.error {
-            cv_io::write_png(path, errors().view())?;
+            context.write(Output::File(path, PNG), |path| cv_io::write_png(path, errors().view()))?;
         }
         context.report(|| {
             let png = |image: cv_core::RgbU8| cv_io::encode_png(image.view());

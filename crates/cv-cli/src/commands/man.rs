@@ -1,6 +1,6 @@
 //! `cv man`: the manual pages.
 
-use crate::frame::{Context, Explain, Failure, Global, Outcome, Run, create_dir};
+use crate::frame::{Context, Explain, Failure, Global, Outcome, Output, Run};
 use clap::CommandFactory;
 use std::path::PathBuf;
 
@@ -18,16 +18,19 @@ impl Run for Args {
         &[Global::Seed, Global::Report]
     }
 
-    fn run(self, _: &Context) -> Result<Outcome, Failure> {
-        create_dir(&self.out)?;
+    fn outputs(&self) -> Vec<Output<'_>> {
+        vec![Output::Folder(&self.out)]
+    }
+
+    fn run(self, context: &Context) -> Result<Outcome, Failure> {
         let mut root = crate::Cli::command().disable_help_subcommand(true);
         root.build();
         let mut pages = Vec::new();
         collect(&root, &mut pages)?;
         let count = pages.len();
-        for (name, page) in pages {
-            cv_io::write_bytes(self.out.join(name), &page)?;
-        }
+        context.write(Output::Folder(&self.out), |out| {
+            pages.iter().try_for_each(|(name, page)| cv_io::write_bytes(out.join(name), page))
+        })?;
         Ok(Outcome::default().with("pages", count).summary(format!("{count} pages in {}", self.out.display())))
     }
 }

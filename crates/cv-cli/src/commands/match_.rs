@@ -1,6 +1,6 @@
 //! `cv match`: tentative matches between two photographs.
 
-use crate::frame::{Context, Explain, Failure, Outcome, Run, named};
+use crate::frame::{Context, Explain, Failure, Outcome, Output, Run, TEXT, named};
 use crate::words;
 use cv_core::{Keypoint, Named, RgbU8};
 use cv_io::FeatureRows;
@@ -71,8 +71,9 @@ pub(crate) struct Args {
 }
 
 impl Run for Args {
-    fn outputs(&self) -> Vec<&Path> {
-        self.output.iter().map(PathBuf::as_path).collect()
+    fn outputs(&self) -> Vec<Output<'_>> {
+        let matches = self.output.iter().map(|path| Output::File(path, TEXT));
+        matches.chain(self.save_features.iter().map(|folder| Output::Folder(folder))).collect()
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
@@ -135,14 +136,15 @@ impl Run for Args {
             .advice("a larger --ratio, --features sift, or photographs that show more of the same"));
         }
         if let Some(folder) = &self.save_features {
-            std::fs::create_dir_all(folder).during(format!("cannot make {}", folder.display()))?;
-            for (photo, features) in [&self.first, &self.second].into_iter().zip(&result.features) {
-                save_features(folder, photo, features)?;
-            }
+            context.write(Output::Folder(folder), |folder| {
+                let photos = [&self.first, &self.second].into_iter().zip(&result.features);
+                photos.into_iter().try_for_each(|(photo, features)| save_features(folder, photo, features))
+            })?;
         }
         if let Some(path) = &self.output {
             let scores: Vec<f64> = result.matches.iter().map(|m| f64::from(m.ratio)).collect();
-            cv_io::write_matches(path, &result.pairs(), Some(&scores))?;
+            context
+                .write(Output::File(path, TEXT), |path| cv_io::write_matches(path, &result.pairs(), Some(&scores)))?;
         }
         let agreed = prevailing_model(&result.pairs(), options.seed, context)?;
         if agreed.is_none() {

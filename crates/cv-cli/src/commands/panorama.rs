@@ -2,7 +2,7 @@
 
 mod report;
 
-use crate::frame::{Context, Failure, Outcome, Run, expand_images, named, picture_name};
+use crate::frame::{Context, Failure, Outcome, Output, PICTURE, Run, expand_images, named};
 use crate::words;
 use cv_core::Image;
 use cv_pipeline::panorama_types::{BlendMode, Exposure, Projection, Seams};
@@ -10,7 +10,7 @@ use cv_pipeline::{FeatureMethod, FeatureOptions, PanoramaOptions, PanoramaPhoto,
 use rayon::prelude::*;
 use serde_json::json;
 use std::collections::btree_map::{BTreeMap, Entry};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Join overlapping photographs to one picture.
 #[derive(Debug, clap::Args)]
@@ -25,7 +25,7 @@ pub(crate) struct Args {
     #[arg(required = true, value_name = "IMAGES")]
     images: Vec<PathBuf>,
     /// Where to write the panorama: .png or .jpg.
-    #[arg(short, long, value_name = "FILE", value_parser = picture_name)]
+    #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// The surface to draw on; auto: a plane up to 90 degrees across, then a cylinder, a sphere where it is also high.
     #[arg(long, value_name = "SURFACE", value_parser = named::<Projection>(), default_value_t = PanoramaOptions::default().render.projection)]
@@ -75,15 +75,16 @@ impl Args {
 }
 
 impl Run for Args {
-    fn outputs(&self) -> Vec<&Path> {
-        vec![&self.output]
+    fn outputs(&self) -> Vec<Output<'_>> {
+        vec![Output::File(&self.output, PICTURE)]
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
         if !(self.scale > 0.0 && self.scale <= 10.0) {
             return Err(Failure::usage(format!("--scale {} is not between 0 and 10", self.scale)));
         }
-        if self.alpha && !self.output.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("png")) {
+        let ending = self.output.extension().unwrap_or_default();
+        if self.alpha && ["jpg", "jpeg"].iter().any(|jpeg| ending.eq_ignore_ascii_case(jpeg)) {
             return Err(Failure::usage("--alpha needs a .png: JPEG has no transparency"));
         }
         let paths = expand_images(&self.images)?;
@@ -113,11 +114,13 @@ impl Run for Args {
             .collect();
         let result =
             panorama(&photos, &self.options(context), context).map_err(|error| words::no_panorama(error, &paths))?;
-        if self.alpha {
-            cv_io::write_png(&self.output, transparent(&result).view())?;
-        } else {
-            cv_io::write_image(&self.output, result.image.view())?;
-        }
+        context.write(Output::File(&self.output, PICTURE), |path| {
+            if self.alpha {
+                cv_io::write_png(path, transparent(&result).view())
+            } else {
+                cv_io::write_image(path, result.image.view())
+            }
+        })?;
         for (path, image) in paths.iter().zip(&result.images) {
             if let Some(reason) = &image.reason {
                 context.warn(format!("{} is not in the panorama: {}", path.display(), words::left_out(reason, &paths)));

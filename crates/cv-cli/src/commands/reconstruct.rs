@@ -1,6 +1,6 @@
 //! `cv reconstruct`: points and camera poses from two photographs.
 
-use crate::frame::{Context, Explain, Failure, Outcome, Run, named};
+use crate::frame::{CLOUD, Context, Explain, Failure, Outcome, Output, Run, named};
 use crate::words;
 use cv_core::nalgebra::Matrix3;
 use cv_core::{Correspondence, PointCloud, Pose};
@@ -79,8 +79,9 @@ pub(crate) struct Args {
 }
 
 impl Run for Args {
-    fn outputs(&self) -> Vec<&Path> {
-        std::iter::once(&self.output).chain(&self.dense).map(PathBuf::as_path).collect()
+    fn outputs(&self) -> Vec<Output<'_>> {
+        let clouds = std::iter::once(&self.output).chain(&self.dense).map(|path| Output::File(path, CLOUD));
+        clouds.chain(self.colmap.iter().map(|folder| Output::Folder(folder))).collect()
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
@@ -112,7 +113,8 @@ impl Run for Args {
         let dense = self.dense(&a, &b, &result, context)?;
         let write = |path: &Path, mut cloud: PointCloud| {
             self.axes.turn(&mut cloud);
-            cv_io::ply::write_cloud(path, &cloud, PlyEncoding::Binary)
+            let cloud = |path: &Path| cv_io::ply::write_cloud(path, &cloud, PlyEncoding::Binary);
+            context.write(Output::File(path, CLOUD), cloud)
         };
         write(&self.output, result.cloud())?;
         if let (Some(path), Some(dense)) = (&self.dense, &dense) {
@@ -120,7 +122,8 @@ impl Run for Args {
         }
         if let Some(folder) = &self.colmap {
             let name = |path: &Path| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
-            cv_io::colmap::write(folder, &result.model([name(&self.first), name(&self.second)]))?;
+            let model = result.model([name(&self.first), name(&self.second)]);
+            context.write(Output::Folder(folder), |folder| cv_io::colmap::write(folder, &model))?;
         }
         if let Some(text) = doubt(&result) {
             context.warn(format!("{text}; --focal or --camera if you know it"));

@@ -1,7 +1,7 @@
 //! `cv rectify`: a pair as two cameras would have taken it whose rows coincide.
 
 use super::size;
-use crate::frame::{Context, Failure, Global, Outcome, Run, create_dir, spare_inputs};
+use crate::frame::{Context, Failure, Global, Outcome, Output, Run, spare_inputs};
 use crate::{rig, words};
 use cv_core::{RgbU8, StereoRig};
 use cv_io::RigFile;
@@ -9,7 +9,7 @@ use cv_pipeline::rectify;
 use cv_pipeline::stereo::RectifyOptions;
 use cv_report::{Figure, Note, Raster, Report, colors, side_by_side};
 use serde_json::json;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// The examples, and how a rig file is written, its lenses out of the table.
 fn help() -> String {
@@ -99,13 +99,13 @@ impl Run for Args {
         let q = r.q();
         let rows: Vec<String> =
             q.row_iter().map(|row| row.iter().map(f64::to_string).collect::<Vec<_>>().join(" ")).collect();
-        create_dir(&self.out)?;
-        cv_io::write_together(&self.out, &NAMES, |folder| -> Result<(), Failure> {
-            cv_io::write_png(folder.join("left.png"), result.images[0].view())?;
-            cv_io::write_png(folder.join("right.png"), result.images[1].view())?;
-            cv_io::write_rig(folder.join("rig.yaml"), &RigFile { rig: rectified, unit }, &["rectified"])?;
-            cv_io::write_bytes(folder.join("q.txt"), format!("{}\n", rows.join("\n")).as_bytes())?;
-            Ok(())
+        context.write(Output::Folder(&self.out), |out| {
+            cv_io::write_together(out, &NAMES, |folder| {
+                cv_io::write_png(folder.join("left.png"), result.images[0].view())?;
+                cv_io::write_png(folder.join("right.png"), result.images[1].view())?;
+                cv_io::write_rig(folder.join("rig.yaml"), &RigFile { rig: rectified, unit }, &["rectified"])?;
+                cv_io::write_bytes(folder.join("q.txt"), format!("{}\n", rows.join("\n")).as_bytes())
+            })
         })?;
         let residual = match (result.vertical_px, &result.fault) {
             (Some((median, p95)), _) => {
@@ -158,8 +158,8 @@ impl Run for Args {
         Ok(rig::checked(outcome, &self.rig, result.fault))
     }
 
-    fn outputs(&self) -> Vec<&Path> {
-        Vec::new()
+    fn outputs(&self) -> Vec<Output<'_>> {
+        vec![Output::Folder(&self.out)]
     }
 }
 

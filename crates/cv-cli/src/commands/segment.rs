@@ -2,7 +2,7 @@
 
 mod files;
 
-use crate::frame::{Context, Explain, Failure, Global, Outcome, Run, create_dir, expand_images, named, same_file};
+use crate::frame::{Context, Explain, Failure, Global, JSON, Outcome, Output, Run, expand_images, named, same_file};
 use cv_core::{Mask, Named, RgbU8, Stage};
 use cv_pipeline::segmentation::{
     ColorModel, ColorSpace, ConfusionMatrix, DetectOptions, Detection, Labeled, Regions, Rule, SegmentError,
@@ -38,10 +38,11 @@ enum What {
 }
 
 impl Run for Args {
-    fn outputs(&self) -> Vec<&Path> {
+    fn outputs(&self) -> Vec<Output<'_>> {
         match &self.what {
-            What::Train(args) => vec![&args.model],
-            What::Predict(_) | What::Eval(_) => Vec::new(),
+            What::Train(args) => vec![Output::File(&args.model, JSON)],
+            What::Predict(args) => vec![Output::Folder(&args.out)],
+            What::Eval(_) => Vec::new(),
         }
     }
 
@@ -138,7 +139,7 @@ impl Train {
         let options = self.options(context);
         let training = train_segment(&labeled, &options, context).map_err(|error| refused(error, &pairs))?;
         let trained = &training.trained;
-        write_model(&self.model, &trained.model)?;
+        context.write(Output::File(&self.model, JSON), |path| write_model(path, &trained.model))?;
         let total: ConfusionMatrix = trained.scores.iter().copied().sum();
         if total.f1() < 0.5 {
             context.warn(format!(
@@ -274,10 +275,9 @@ impl Predict {
             add_stages(&mut stages, &result.stages);
             stage.add(1)?;
         }
-        create_dir(&self.out)?;
-        for (output, mask) in outputs.iter().zip(&masks) {
-            cv_io::write_bytes(output, mask)?;
-        }
+        context.write(Output::Folder(&self.out), |_| {
+            outputs.iter().zip(&masks).try_for_each(|(output, mask)| cv_io::write_bytes(output, mask))
+        })?;
         context.report(|| {
             let mut page = Report::new("Segmentation");
             page.headline("photographs", &photos.len().to_string()).headline("with the object", &found.to_string());

@@ -2,9 +2,13 @@
 
 use super::progress::Bar;
 use super::stop::Stop;
-use super::{Failure, Global, Globals, create_dir};
+use super::{Failure, Global, Globals, Output, outputs};
 use cv_pipeline::{Cancelled, Progress};
-use std::{fmt::Display, path::PathBuf, sync::Arc};
+use std::{
+    fmt::Display,
+    path::PathBuf,
+    sync::{Arc, Mutex, PoisonError},
+};
 
 /// What a running command knows about how it was called. It is also the [`Progress`] that pipelines report to.
 pub(crate) struct Context {
@@ -13,6 +17,9 @@ pub(crate) struct Context {
     /// `--max-memory`, where given, in bytes.
     pub(crate) max_memory: Option<usize>,
     quiet: bool,
+    json: bool,
+    /// What goes to stdout once the command is done.
+    stdout: Mutex<Vec<u8>>,
     report: Option<PathBuf>,
     bar: Arc<Bar>,
     pub(super) stop: Stop,
@@ -20,10 +27,11 @@ pub(crate) struct Context {
 
 impl Context {
     pub(super) fn new(globals: &Globals) -> Self {
-        let Globals { quiet, seed, .. } = *globals;
+        let Globals { quiet, json, seed, .. } = *globals;
         let bar = Arc::new(Bar::new(quiet));
         let max_memory = globals.max_memory.map(|mib| usize::try_from(u64::from(mib) << 20).unwrap_or(usize::MAX));
-        Self { seed, max_memory, quiet, report: globals.report.clone(), stop: Stop::listen(&bar), bar }
+        let report = globals.report.clone();
+        Self { seed, max_memory, quiet, json, stdout: Mutex::default(), report, stop: Stop::listen(&bar), bar }
     }
 
     /// Refuses global options that the command has no use for.
@@ -37,6 +45,21 @@ impl Context {
             Some(Global::Report) => Err(Failure::usage("--report means nothing here: there is nothing to show")),
             None => Ok(()),
         }
+    }
+
+    /// Finds out before the work whether the results can be written.
+    pub(crate) fn check(&self, outputs: &[Output<'_>]) -> Result<(), Failure> {
+        outputs::check(outputs, self.report.as_deref(), self.json)
+    }
+
+    /// Keeps an output for stdout until the command is done.
+    pub(super) fn keep_for_stdout(&self, bytes: Vec<u8>) {
+        *self.stdout.lock().unwrap_or_else(PoisonError::into_inner) = bytes;
+    }
+
+    /// The output for stdout.
+    pub(super) fn take_stdout(&self) -> Vec<u8> {
+        std::mem::take(&mut *self.stdout.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
     /// A line on stderr, whatever was asked for.
@@ -65,9 +88,8 @@ impl Context {
     pub(crate) fn report(&self, html: impl FnOnce() -> Result<String, Failure>) -> Result<(), Failure> {
         let Some(folder) = &self.report else { return Ok(()) };
         let html = html()?;
-        create_dir(folder)?;
         let path = folder.join("report.html");
-        cv_io::write_bytes(&path, html.as_bytes())?;
+        self.write(Output::Folder(folder), |_| cv_io::write_bytes(&path, html.as_bytes()))?;
         self.note(format!("report: {}", path.display()));
         Ok(())
     }

@@ -17,13 +17,13 @@ pub(crate) use failure::{Explain, Failure};
 pub(crate) use inputs::expand_images;
 pub(crate) use named::named;
 pub(crate) use outcome::Outcome;
-pub(crate) use outputs::{check_outputs, create_dir, picture_name, same_file, spare_inputs};
+pub(crate) use outputs::{CLOUD, JSON, MAP, Output, PICTURE, PNG, TEXT, same_file, spare_inputs};
 
 use clap::{Args, value_parser};
 use std::{
     io::{self, Write},
     panic::{AssertUnwindSafe, catch_unwind},
-    path::{Path, PathBuf},
+    path::PathBuf,
     process::ExitCode,
     time::Instant,
 };
@@ -65,8 +65,8 @@ pub(crate) enum Global {
 
 /// A subcommand.
 pub(crate) trait Run: Args {
-    /// The files this run will write. The frame checks them before the work starts.
-    fn outputs(&self) -> Vec<&Path> {
+    /// What this run will write. The frame checks before the work starts whether it can be written.
+    fn outputs(&self) -> Vec<Output<'_>> {
         Vec::new()
     }
 
@@ -97,7 +97,7 @@ pub(crate) fn run(globals: &Globals, command: impl FnOnce(&Context) -> Result<Ou
     let failure = match result {
         Ok(mut outcome) => {
             let but = outcome.take_but();
-            match finish(outcome, globals, start).err().or(but) {
+            match finish(outcome, context.take_stdout(), globals, start).err().or(but) {
                 None => return ExitCode::SUCCESS,
                 Some(failure) => failure,
             }
@@ -118,13 +118,15 @@ fn start_threads(threads: Option<u16>) -> Result<(), Failure> {
 }
 
 /// Prints what the person asked to see.
-fn finish(outcome: Outcome, globals: &Globals, start: Instant) -> Result<(), Failure> {
+fn finish(outcome: Outcome, output: Vec<u8>, globals: &Globals, start: Instant) -> Result<(), Failure> {
     if globals.json {
         let object = outcome.into_json(start.elapsed().as_secs_f64())?;
         writeln!(io::stdout(), "{object}").during("cannot write to stdout")?;
         return Ok(());
     }
-    io::stdout().write_all(outcome.stdout()).during("cannot write to stdout")?;
+    let mut stdout = io::stdout();
+    let written = stdout.write_all(outcome.stdout()).and_then(|()| stdout.write_all(&output));
+    written.and_then(|()| stdout.flush()).during("cannot write to stdout")?;
     let summary = outcome.summary_text();
     if !globals.quiet && !summary.is_empty() {
         let _ = writeln!(io::stderr(), "{summary}");

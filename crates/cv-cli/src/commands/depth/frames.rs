@@ -2,7 +2,7 @@
 
 use super::pairing::pair;
 use super::{Args, Range, say_memory};
-use crate::frame::{Context, Explain, Failure, Outcome, expand_images};
+use crate::frame::{Context, Explain, Failure, Outcome, Output, expand_images};
 use crate::words;
 use cv_core::Stage;
 use cv_pipeline::FrameDepth;
@@ -83,15 +83,11 @@ impl Args {
         }
         let (lefts, rights) = (frames(&self.left)?, frames(&self.right)?);
         let pairs = pair(&lefts, &rights, self.pair_by)?;
-        if self.output.exists() && !self.output.is_dir() {
-            return Err(Failure::new(format!("{} is not a folder", self.output.display()))
-                .advice("give a folder for the disparities of the frames"));
-        }
         let options = self.options(context).stereo;
         let mut film = FrameDepth::new(options.clone())?;
         let (mut size, mut seconds, mut valid, mut matched) = ((0, 0), 0.0, 0.0, 0.0);
         let stage = Stage::new(context, "frames", pairs.len())?;
-        for (i, (left, right)) in pairs.iter().enumerate() {
+        for (left, right) in &pairs {
             let (a, b) = (cv_io::read_rgb(left)?, cv_io::read_rgb(right)?);
             if a.size() != size {
                 size = a.size();
@@ -105,12 +101,9 @@ impl Args {
             seconds += start.elapsed().as_secs_f64();
             valid += map.valid_fraction() / pairs.len() as f64;
             matched += map.matched_fraction() / pairs.len() as f64;
-            if i == 0 {
-                // Not before there is something to put there.
-                std::fs::create_dir_all(&self.output).during(self.output.display())?;
-            }
             let name = Path::new(left.file_stem().unwrap_or_default()).with_extension("pfm");
-            cv_io::pfm::write(self.output.join(name), map.disparity.view())?;
+            let disparity = |out: &Path| cv_io::pfm::write(out.join(name), map.disparity.view());
+            context.write(Output::Folder(&self.output), disparity)?;
             stage.add(1)?;
         }
         let rate = pairs.len() as f64 / seconds;

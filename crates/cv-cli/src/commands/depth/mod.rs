@@ -8,7 +8,7 @@ mod photos;
 mod report;
 
 use super::size;
-use crate::frame::{Context, Failure, Global, Outcome, Run, named};
+use crate::frame::{CLOUD, Context, Failure, Global, MAP, Outcome, Output, PNG, Run, named};
 use crate::{rig, words};
 use cv_core::{ImageView, PointCloud};
 use cv_io::ply::PlyEncoding;
@@ -18,7 +18,7 @@ use cv_pipeline::stereo::{
 };
 use cv_pipeline::{DepthError, DepthOptions, DepthResult, RigDepthResult, depth, depth_by_rig};
 use frames::is_sequence;
-use maps::{map_format, write_map};
+use maps::write_map;
 use options::{Range, parse_range};
 use pairing::PairBy;
 use photos::{Photos, at_own_depth};
@@ -137,12 +137,15 @@ pub(crate) struct Args {
 }
 
 impl Run for Args {
-    fn outputs(&self) -> Vec<&Path> {
+    fn outputs(&self) -> Vec<Output<'_>> {
         if is_sequence(&self.left) {
-            return Vec::new();
+            return vec![Output::Folder(&self.output)];
         }
-        let more = [&self.depth, &self.cloud, &self.confidence, &self.matched, &self.uncertainty];
-        std::iter::once(&self.output).chain(more.into_iter().flatten()).map(|p| &**p).collect()
+        let maps = [Some(&self.output), self.depth.as_ref(), self.confidence.as_ref(), self.uncertainty.as_ref()];
+        let maps = maps.into_iter().flatten().map(|path| Output::File(path, MAP));
+        let others = [(&self.cloud, CLOUD), (&self.matched, PNG)];
+        maps.chain(others.into_iter().filter_map(|(path, endings)| Some(Output::File(path.as_ref()?, endings))))
+            .collect()
     }
 
     fn has_no_use_for(&self) -> &'static [Global] {
@@ -155,15 +158,6 @@ impl Run for Args {
         }
         if self.pair_by.is_some() {
             return Err(Failure::usage("--pair-by is for frames, and these are two photographs"));
-        }
-        let maps = [Some(&self.output), self.depth.as_ref(), self.confidence.as_ref(), self.uncertainty.as_ref()];
-        for path in maps.into_iter().flatten() {
-            map_format(path)?;
-        }
-        if let Some(path) = &self.matched
-            && !path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("png"))
-        {
-            return Err(Failure::usage(format!("{} is not a .png", path.display())).advice("end it with .png"));
         }
         if (self.depth.is_some() || self.cloud.is_some()) && self.rig.is_none() && self.focal.is_none() {
             return Err(Failure::usage("depth needs the geometry of the cameras")
@@ -183,18 +177,21 @@ impl Run for Args {
         if self.disparities == Range::Auto {
             context.note(format!("disparities {} to {}", disparities.0, disparities.0 + disparities.1 as i32 - 1));
         }
-        if let Some(lost) = write_map(&self.output, map.disparity.view(), |path, map| cv_io::kitti::write(path, map))? {
+        if let Some(lost) =
+            write_map(context, &self.output, map.disparity.view(), |path, map| cv_io::kitti::write(path, map))?
+        {
             context
                 .warn(format!("{lost} disparities do not fit KITTI's range of 0 to 256 px and are stored as unknown"));
         }
         if let (Some(path), Some(depth)) = (&self.depth, depth)
-            && let Some(lost) = write_map(path, depth.view(), write_depth)?
+            && let Some(lost) = write_map(context, path, depth.view(), write_depth)?
         {
             context.warn(format!("{lost} depths do not fit 0 to 65.535 m and are stored as unknown"));
         }
         self.write_quality(&job.maps, write_depth, context)?;
         if let Some(path) = &self.cloud {
-            cv_io::ply::write_cloud(path, &job.cloud, PlyEncoding::Binary)?;
+            let cloud = |path: &Path| cv_io::ply::write_cloud(path, &job.cloud, PlyEncoding::Binary);
+            context.write(Output::File(path, CLOUD), cloud)?;
         }
         context.report(|| report::report(&job))?;
         let (valid, matched) = (map.valid_fraction(), map.matched_fraction());
@@ -298,16 +295,16 @@ impl Args {
                     cv_core::GrayU8::from_fn(map.width(), map.height(), |x, y| [(map.at(x, y)[0] * 255.0 + 0.5) as u8]);
                 cv_io::write_png(path, bytes.view()).map(|()| 0)
             };
-            write_map(path, confidence.view(), gray)?;
+            write_map(context, path, confidence.view(), gray)?;
         }
         if let Some(path) = &self.matched {
             let matched = map.state.map(|[state]| [if state == PixelState::Matched { 255u8 } else { 0 }]);
-            cv_io::write_png(path, matched.view())?;
+            context.write(Output::File(path, PNG), |path| cv_io::write_png(path, matched.view()))?;
         }
         if let Some(path) = &self.uncertainty {
             let lost = match maps.depth_sigma() {
-                Some(bars) => write_map(path, bars.view(), write_depth)?,
-                None => write_map(path, sigma.view(), |path, map| cv_io::kitti::write(path, map))?,
+                Some(bars) => write_map(context, path, bars.view(), write_depth)?,
+                None => write_map(context, path, sigma.view(), |path, map| cv_io::kitti::write(path, map))?,
             };
             if let Some(lost) = lost {
                 context.warn(format!("{lost} uncertainties do not fit the format and are stored as unknown"));
