@@ -20,13 +20,11 @@ use std::time::Instant;
 /// them as on anybody's photographs. Since the scenes are known exactly, so is the error of every result. Writes the
 /// photographs, the results and report.html into a folder. The exit code is 1 where an error is above its bar.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  cv demo\n  cv demo --out /tmp/demo --seed 7\n  cv demo --json --quiet > demo.json"
-)]
+#[command(after_help = "Examples:\n  cv demo\n  cv demo -o /tmp/demo --seed 7\n  cv demo --json --quiet > demo.json")]
 pub(crate) struct Args {
     /// The folder to write into; made where it is not there.
-    #[arg(short, long, value_name = "DIR", default_value = "cv-demo")]
-    out: PathBuf,
+    #[arg(short, long, visible_alias = "out", value_name = "DIR", default_value = "cv-demo")]
+    output: PathBuf,
 }
 
 /// A result against the truth.
@@ -125,11 +123,11 @@ const JOBS: [(&str, Job); 5] = [
 
 impl Run for Args {
     fn outputs(&self) -> Vec<Output<'_>> {
-        vec![Output::Folder(&self.out)]
+        vec![Output::Folder(&self.output)]
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
-        context.write(Output::Folder(&self.out), |out| run(out, context))
+        context.write(Output::Folder(&self.output), |out| run(out, context))
     }
 }
 

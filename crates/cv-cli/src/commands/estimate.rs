@@ -44,9 +44,12 @@ pub(crate) struct Args {
     /// What the two views have in common.
     #[arg(value_parser = named::<Model>())]
     model: Model,
+    /// Photographs: their matches are what is needed.
+    #[arg(hide = true)]
+    photographs: Vec<PathBuf>,
     /// The matches.
-    #[arg(long, value_name = "FILE")]
-    matches: PathBuf,
+    #[arg(long, value_name = "FILE", required_unless_present = "photographs")]
+    matches: Option<PathBuf>,
     /// Largest error of an inlier in pixels [default: 3 for a homography, 1 otherwise].
     #[arg(long, value_name = "PX")]
     threshold: Option<f64>,
@@ -103,7 +106,11 @@ fn rows(m: &Matrix3<f64>) -> [[f64; 3]; 3] {
 
 impl Run for Args {
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
-        let matches = cv_io::read_matches(&self.matches)?;
+        let (Some(file), []) = (&self.matches, &self.photographs[..]) else {
+            return Err(Failure::usage("models are estimated from matches, not from photographs")
+                .advice("cv match A B -o matches.txt, then --matches matches.txt"));
+        };
+        let matches = cv_io::read_matches(file)?;
         let cameras = self.cameras()?;
         let name = self.model.words();
         let (kind, options) = match self.model {
@@ -131,12 +138,12 @@ impl Run for Args {
             _ => Failure::new(error),
         });
         let (robust, pose, stages) = result
-            .during(format!("no {name} from {}", self.matches.display()))
+            .during(format!("no {name} from {}", file.display()))
             .advice("check the matches by eye with `cv match A B --report DIR`, or pass a larger --threshold")?;
         let model = rows(&robust.model);
         let total = pairs.len();
         let text: String = model.iter().map(|r| format!("{:>16.9e} {:>16.9e} {:>16.9e}\n", r[0], r[1], r[2])).collect();
-        context.report(|| report(&self.matches, name, pairs, &robust))?;
+        context.report(|| report(file, name, pairs, &robust))?;
         let mut outcome = Outcome::new(stages)
             .with("kind", self.model.name())
             .with("model", model)

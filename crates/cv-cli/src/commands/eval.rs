@@ -53,7 +53,7 @@ struct Disparity {
     #[arg(long, value_name = "FILE")]
     mask: Option<PathBuf>,
     /// Where to write a picture of the errors: gray up to 2 px, red and yellow beyond, blue without an estimate.
-    #[arg(long, value_name = "PNG")]
+    #[arg(short = 'o', long, visible_alias = "output", value_name = "PNG")]
     error: Option<PathBuf>,
 }
 

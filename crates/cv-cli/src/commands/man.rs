@@ -6,11 +6,11 @@ use std::path::PathBuf;
 
 /// Write manual pages: cv.1 and one page per command.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  cv man --out ~/.local/share/man/man1")]
+#[command(after_help = "Examples:\n  cv man -o ~/.local/share/man/man1")]
 pub(crate) struct Args {
     /// The folder to write to; made where it is missing.
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
+    #[arg(short, long, visible_alias = "out", value_name = "DIR")]
+    output: PathBuf,
 }
 
 impl Run for Args {
@@ -19,7 +19,7 @@ impl Run for Args {
     }
 
     fn outputs(&self) -> Vec<Output<'_>> {
-        vec![Output::Folder(&self.out)]
+        vec![Output::Folder(&self.output)]
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
@@ -28,10 +28,10 @@ impl Run for Args {
         let mut pages = Vec::new();
         collect(&root, &mut pages)?;
         let count = pages.len();
-        context.write(Output::Folder(&self.out), |out| {
+        context.write(Output::Folder(&self.output), |out| {
             pages.iter().try_for_each(|(name, page)| cv_io::write_bytes(out.join(name), page))
         })?;
-        Ok(Outcome::default().with("pages", count).summary(format!("{count} pages in {}", self.out.display())))
+        Ok(Outcome::default().with("pages", count).summary(format!("{count} pages in {}", self.output.display())))
     }
 }
 

@@ -1,6 +1,6 @@
 //! `cv match`: tentative matches between two photographs.
 
-use crate::frame::{Context, Explain, Failure, Outcome, Output, Run, TEXT, named};
+use crate::frame::{Context, Explain, Failure, Outcome, Output, Run, TEXT, named, two_images};
 use crate::words;
 use cv_core::{Keypoint, Named, RgbU8};
 use cv_io::FeatureRows;
@@ -31,9 +31,12 @@ a score (smaller is surer).
 for SIFT, left.txt in COLMAP's words. --load-features reads left.keypoints.npy with left.KIND.npy or
 left.descriptors.npy, else left.txt.")]
 pub(crate) struct Args {
-    /// The first photograph.
+    /// Two photographs, or a folder or quoted pattern of two.
+    #[arg(required = true, value_name = "PHOTOGRAPHS")]
+    photographs: Vec<PathBuf>,
+    #[arg(skip)]
     first: PathBuf,
-    /// The second photograph.
+    #[arg(skip)]
     second: PathBuf,
     /// Where to write the matches.
     #[arg(short, long, value_name = "FILE")]
@@ -76,7 +79,8 @@ impl Run for Args {
         matches.chain(self.save_features.iter().map(|folder| Output::Folder(folder))).collect()
     }
 
-    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+    fn run(mut self, context: &Context) -> Result<Outcome, Failure> {
+        [self.first, self.second] = two_images(&self.photographs)?;
         if let Some(ratio) = self.ratio.filter(|ratio| !(0.0..=1.0).contains(ratio)) {
             return Err(Failure::usage(format!("--ratio must be from 0 to 1, not {ratio}")));
         }

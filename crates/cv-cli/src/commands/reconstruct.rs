@@ -1,6 +1,6 @@
 //! `cv reconstruct`: points and camera poses from two photographs.
 
-use crate::frame::{CLOUD, Context, Explain, Failure, Outcome, Output, Run, named};
+use crate::frame::{CLOUD, Context, Explain, Failure, Outcome, Output, Run, named, two_images};
 use crate::words;
 use cv_core::nalgebra::Matrix3;
 use cv_core::{Correspondence, PointCloud, Pose};
@@ -30,9 +30,12 @@ use std::path::{Path, PathBuf};
     cv reconstruct a.jpg b.jpg -o sparse.ply --dense dense.ply --dense-size 2400\n\n\
     A camera file is ours, OpenCV's, ROS's or Kalibr's YAML, a line of COLMAP's cameras.txt, or a 3×3 matrix.")]
 pub(crate) struct Args {
-    /// The first photograph.
+    /// Two photographs, or a folder or quoted pattern of two.
+    #[arg(required = true, value_name = "PHOTOGRAPHS")]
+    photographs: Vec<PathBuf>,
+    #[arg(skip)]
     first: PathBuf,
-    /// The second photograph.
+    #[arg(skip)]
     second: PathBuf,
     /// Where to write the cloud, as PLY.
     #[arg(short, long, value_name = "FILE")]
@@ -84,7 +87,8 @@ impl Run for Args {
         clouds.chain(self.colmap.iter().map(|folder| Output::Folder(folder))).collect()
     }
 
-    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+    fn run(mut self, context: &Context) -> Result<Outcome, Failure> {
+        [self.first, self.second] = two_images(&self.photographs)?;
         for (name, value) in [("--threshold", self.threshold), ("--max-error", self.max_error)] {
             if !(value > 0.0 && value.is_finite()) {
                 return Err(Failure::usage(format!("{name} must be above 0, not {value}")));

@@ -1,7 +1,7 @@
 //! `cv rectify`: a pair as two cameras would have taken it whose rows coincide.
 
 use super::size;
-use crate::frame::{Context, Failure, Global, Outcome, Output, Run, spare_inputs};
+use crate::frame::{Context, Failure, Global, Outcome, Output, Run, spare_inputs, two_images};
 use crate::{rig, words};
 use cv_core::{RgbU8, StereoRig};
 use cv_io::RigFile;
@@ -19,8 +19,8 @@ fn help() -> String {
         .collect();
     format!(
         "Examples:\n  \
-        cv rectify left.jpg right.jpg --rig rig.yaml --out rectified\n  \
-        cv rectify left.jpg right.jpg --rig opencv-stereo.yml --alpha 1 --size 1280x960 --out rectified --report page\n\n\
+        cv rectify left.jpg right.jpg --rig rig.yaml -o rectified\n  \
+        cv rectify left.jpg right.jpg --rig opencv-stereo.yml --alpha 1 --size 1280x960 -o rectified --report page\n\n\
         A rig file is ours:\n  \
         schema: cv-rig/1\n  \
         unit: m\n  \
@@ -44,16 +44,19 @@ fn help() -> String {
 #[derive(Debug, clap::Args)]
 #[command(after_help = help())]
 pub(crate) struct Args {
-    /// The left (or upper) photograph.
+    /// The left (or upper) photograph and the right (or lower) one, or a folder or quoted pattern of the two.
+    #[arg(required = true, value_name = "LEFT RIGHT")]
+    photographs: Vec<PathBuf>,
+    #[arg(skip)]
     left: PathBuf,
-    /// The right (or lower) photograph.
+    #[arg(skip)]
     right: PathBuf,
     /// Calibration of the rig: ours, OpenCV's or Kalibr's YAML.
     #[arg(long, value_name = "FILE")]
     rig: PathBuf,
     /// The folder for the results; made where it is missing.
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
+    #[arg(short, long, visible_alias = "out", value_name = "DIR")]
+    output: PathBuf,
     /// From 0 (no pixel without content) to 1 (no pixel lost).
     #[arg(long, value_name = "A", default_value_t = 0.0, value_parser = parse_share)]
     alpha: f64,
@@ -77,9 +80,10 @@ impl Run for Args {
         &[Global::Seed]
     }
 
-    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+    fn run(mut self, context: &Context) -> Result<Outcome, Failure> {
+        [self.left, self.right] = two_images(&self.photographs)?;
         let exchange = self.exchange;
-        spare_inputs(&NAMES.map(|name| self.out.join(name)), &[&self.left, &self.right, &self.rig])?;
+        spare_inputs(&NAMES.map(|name| self.output.join(name)), &[&self.left, &self.right, &self.rig])?;
         let left = cv_io::read_rgb(&self.left)?;
         let right = cv_io::read_rgb(&self.right)?;
         let RigFile { rig, unit, .. } = rig::read(&self.rig, left.size(), exchange)?;
@@ -99,7 +103,7 @@ impl Run for Args {
         let q = r.q();
         let rows: Vec<String> =
             q.row_iter().map(|row| row.iter().map(f64::to_string).collect::<Vec<_>>().join(" ")).collect();
-        context.write(Output::Folder(&self.out), |out| {
+        context.write(Output::Folder(&self.output), |out| {
             cv_io::write_together(out, &NAMES, |folder| {
                 cv_io::write_png(folder.join("left.png"), result.images[0].view())?;
                 cv_io::write_png(folder.join("right.png"), result.images[1].view())?;
@@ -159,7 +163,7 @@ impl Run for Args {
     }
 
     fn outputs(&self) -> Vec<Output<'_>> {
-        vec![Output::Folder(&self.out)]
+        vec![Output::Folder(&self.output)]
     }
 }
 

@@ -34,12 +34,6 @@ impl Failure {
         ExitCode::from(if self.usage { 2 } else { 1 })
     }
 
-    /// Whether it is wrong usage.
-    #[cfg(test)]
-    pub(super) fn is_usage(&self) -> bool {
-        self.usage
-    }
-
     /// The lines on stderr.
     pub(crate) fn text(&self) -> String {
         match &self.advice {

@@ -8,7 +8,7 @@ mod photos;
 mod report;
 
 use super::size;
-use crate::frame::{CLOUD, Context, Failure, Global, MAP, Outcome, Output, PNG, Run, named};
+use crate::frame::{CLOUD, Context, Failure, Global, MAP, Outcome, Output, PNG, Run, named, stands_for_many};
 use crate::{rig, words};
 use cv_core::{ImageView, PointCloud};
 use cv_io::ply::PlyEncoding;
@@ -17,7 +17,6 @@ use cv_pipeline::stereo::{
     StereoOptions,
 };
 use cv_pipeline::{DepthError, DepthOptions, DepthResult, RigDepthResult, depth, depth_by_rig};
-use frames::is_sequence;
 use maps::write_map;
 use options::{Range, parse_range};
 use pairing::PairBy;
@@ -46,6 +45,9 @@ pub(crate) struct Args {
     left: PathBuf,
     /// The right photograph, or as many frames.
     right: PathBuf,
+    /// What a shell makes of a pattern without quotes.
+    #[arg(hide = true)]
+    more: Vec<PathBuf>,
     /// Where to write the disparity: .pfm, .png or .npy; for frames a folder, which gets NAME.pfm of each.
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
@@ -138,7 +140,7 @@ pub(crate) struct Args {
 
 impl Run for Args {
     fn outputs(&self) -> Vec<Output<'_>> {
-        if is_sequence(&self.left) {
+        if stands_for_many(&self.left) {
             return vec![Output::Folder(&self.output)];
         }
         let maps = [Some(&self.output), self.depth.as_ref(), self.confidence.as_ref(), self.uncertainty.as_ref()];
@@ -153,7 +155,14 @@ impl Run for Args {
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
-        if is_sequence(&self.left) || is_sequence(&self.right) {
+        if !self.more.is_empty() {
+            return Err(Failure::usage(format!(
+                "a left and a right photograph are needed, not {}",
+                2 + self.more.len()
+            ))
+            .advice("for frames give two folders, or two patterns in quotes: 'left/*.png' 'right/*.png'"));
+        }
+        if stands_for_many(&self.left) || stands_for_many(&self.right) {
             return self.run_frames(context);
         }
         if self.pair_by.is_some() {
