@@ -53,7 +53,10 @@ pub mod ply;
 mod sniff;
 mod srgb;
 
-pub use camera::{CalibrationFormat, RigFile, parse_camera, parse_rig, read_camera, read_rig, write_camera, write_rig};
+pub use camera::{
+    CalibrationFormat, CalibrationNote, RigFile, parse_camera, parse_rig, read_camera, read_camera_with_notes,
+    read_rig, read_rig_with_notes, write_camera, write_rig,
+};
 pub use depth_png::{depth_mm, kitti, scaled};
 pub use encode::{JpegPixels, PngPixels, encode_jpeg, encode_png, write_image, write_jpeg, write_png};
 pub use error::{FormatError, IoError};

@@ -2,6 +2,7 @@
 
 use super::size;
 use crate::frame::{Context, Explain, Failure, Outcome, Run, named};
+use crate::rig;
 use cv_core::nalgebra::Matrix3;
 use cv_core::{Camera, Correspondence, Named, RgbU8, named};
 use cv_pipeline::{EstimateError, ModelKind, RobustModel, RobustOptions, estimate, estimate_calibrated};
@@ -75,7 +76,7 @@ pub(crate) struct Args {
 
 impl Args {
     /// The cameras that an essential matrix needs; `None` for the other models.
-    fn cameras(&self) -> Result<Option<[Camera; 2]>, Failure> {
+    fn cameras(&self, context: &Context) -> Result<Option<[Camera; 2]>, Failure> {
         if !matches!(self.model, Model::Essential) {
             if self.camera.is_some() || self.focal.is_some() || self.size.is_some() {
                 return Err(Failure::usage("only an essential matrix has use for --camera, --focal or --size"));
@@ -83,9 +84,9 @@ impl Args {
             return Ok(None);
         }
         if let Some(path) = &self.camera {
-            let first = cv_io::read_camera(path, self.size)?;
+            let first = rig::camera(path, self.size, context)?;
             let second = match &self.camera2 {
-                Some(path) => cv_io::read_camera(path, self.size)?,
+                Some(path) => rig::camera(path, self.size, context)?,
                 None => first,
             };
             return Ok(Some([first, second]));
@@ -111,7 +112,7 @@ impl Run for Args {
                 .advice("cv match A B -o matches.txt, then --matches matches.txt"));
         };
         let matches = cv_io::read_matches(file)?;
-        let cameras = self.cameras()?;
+        let cameras = self.cameras(context)?;
         let name = self.model.words();
         let (kind, options) = match self.model {
             Model::Homography => (ModelKind::Homography, RobustOptions::homography()),

@@ -3,7 +3,7 @@
 mod report;
 
 use crate::frame::{Context, Failure, Outcome, Output, PICTURE, Run, expand_images, named};
-use crate::words;
+use crate::{rig, words};
 use cv_core::Image;
 use cv_pipeline::panorama_types::{BlendMode, Exposure, Projection, Seams};
 use cv_pipeline::{FeatureMethod, FeatureOptions, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama};
@@ -100,7 +100,7 @@ impl Run for Args {
         if let Some(path) = &self.camera {
             for (_, image) in &pictures {
                 if let Entry::Vacant(place) = cameras.entry(image.size()) {
-                    place.insert(cv_io::read_camera(path, Some(image.size()))?);
+                    place.insert(rig::camera(path, Some(image.size()), context)?);
                 }
             }
         }

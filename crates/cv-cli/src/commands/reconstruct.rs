@@ -1,7 +1,7 @@
 //! `cv reconstruct`: points and camera poses from two photographs.
 
 use crate::frame::{CLOUD, Context, Explain, Failure, Outcome, Output, Run, named, two_images};
-use crate::words;
+use crate::{rig, words};
 use cv_core::nalgebra::Matrix3;
 use cv_core::{Correspondence, PointCloud, Pose};
 use cv_io::DynImage;
@@ -98,7 +98,7 @@ impl Run for Args {
             return Err(Failure::usage("--focal must be above 0"));
         }
         let photos = [cv_io::read_image(&self.first)?, cv_io::read_image(&self.second)?];
-        let (intrinsics, source) = self.intrinsics(&photos)?;
+        let (intrinsics, source) = self.intrinsics(&photos, context)?;
         context.note(&source);
         let mut options = ReconstructOptions::new(intrinsics);
         options.two_view.robust.threshold = self.threshold;
@@ -149,11 +149,11 @@ fn doubt(result: &ReconstructResult) -> Option<String> {
 
 impl Args {
     /// What is known of the cameras, and how.
-    fn intrinsics(&self, photos: &[DynImage; 2]) -> Result<(Intrinsics, String), Failure> {
+    fn intrinsics(&self, photos: &[DynImage; 2], context: &Context) -> Result<(Intrinsics, String), Failure> {
         if let Some(path) = &self.camera {
-            let first = cv_io::read_camera(path, Some(photos[0].size()))?;
+            let first = rig::camera(path, Some(photos[0].size()), context)?;
             let second = match &self.camera2 {
-                Some(path) => cv_io::read_camera(path, Some(photos[1].size()))?,
+                Some(path) => rig::camera(path, Some(photos[1].size()), context)?,
                 None => first,
             };
             return Ok((Intrinsics::Known([first, second]), format!("camera from {}", path.display())));

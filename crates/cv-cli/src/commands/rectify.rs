@@ -9,7 +9,7 @@ use cv_pipeline::rectify;
 use cv_pipeline::stereo::RectifyOptions;
 use cv_report::{Figure, Note, Raster, Report, colors, side_by_side};
 use serde_json::json;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// The examples, and how a rig file is written, its lenses out of the table.
 fn help() -> String {
@@ -29,7 +29,8 @@ fn help() -> String {
         rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]   # x_right = rotation · x_left + translation\n  \
         translation: [-0.12, 0, 0]                    # the right camera stands 0.12 m to the right\n\
         A camera may also have a distortion:\n{}\n\
-        Or the file is OpenCV's YAML, with M1, D1, M2, D2, R and T in one, or Kalibr's camchain.yaml.",
+        Or the file is OpenCV's YAML, with M1, D1, M2, D2, R and T in one or in two (--rig intrinsics.yml --rig extrinsics.yml), or Kalibr's\n\
+        camchain.yaml. A skew that moves no pixel by more than 0.25 px is left out.",
         lenses.join("\n")
     )
 }
@@ -51,9 +52,9 @@ pub(crate) struct Args {
     left: PathBuf,
     #[arg(skip)]
     right: PathBuf,
-    /// Calibration of the rig: ours, OpenCV's or Kalibr's YAML.
-    #[arg(long, value_name = "FILE")]
-    rig: PathBuf,
+    /// Calibration of the rig: ours, OpenCV's or Kalibr's YAML; twice for OpenCV's two files.
+    #[arg(long, value_name = "FILE", required = true)]
+    rig: Vec<PathBuf>,
     /// The folder for the results; made where it is missing.
     #[arg(short, long, visible_alias = "out", value_name = "DIR")]
     output: PathBuf,
@@ -83,15 +84,17 @@ impl Run for Args {
     fn run(mut self, context: &Context) -> Result<Outcome, Failure> {
         [self.left, self.right] = two_images(&self.photographs)?;
         let exchange = self.exchange;
-        spare_inputs(&NAMES.map(|name| self.output.join(name)), &[&self.left, &self.right, &self.rig])?;
+        let inputs: Vec<&Path> = [&self.left, &self.right].into_iter().chain(&self.rig).map(PathBuf::as_path).collect();
+        spare_inputs(&NAMES.map(|name| self.output.join(name)), &inputs)?;
         let left = cv_io::read_rgb(&self.left)?;
         let right = cv_io::read_rgb(&self.right)?;
-        let RigFile { rig, unit, .. } = rig::read(&self.rig, left.size(), exchange)?;
-        rig::check_size(&self.rig, &self.left, left.size(), &rig.left)?;
-        rig::check_size(&self.rig, &self.right, right.size(), &rig.right)?;
+        let RigFile { rig, unit, .. } = rig::read(&self.rig, left.size(), exchange, context)?;
+        let calibration: &Path = &self.rig[0];
+        rig::check_size(calibration, &self.left, left.size(), &rig.left)?;
+        rig::check_size(calibration, &self.right, right.size(), &rig.right)?;
         let options = RectifyOptions { alpha: self.alpha, size: self.size };
         let result = rectify(left.view(), right.view(), &rig, &options, context)
-            .map_err(|error| words::no_rectification(error, &self.rig, exchange))?;
+            .map_err(|error| words::no_rectification(error, calibration, exchange))?;
         let r = &result.rectification;
         let rotation = cv_core::Rotation3::identity();
         let translation = cv_core::Vector3::new(-r.geometry.baseline, 0.0, 0.0);
@@ -159,7 +162,7 @@ impl Run for Args {
                 100.0 * result.valid_area[0],
                 100.0 * result.valid_area[1]
             ));
-        Ok(rig::checked(outcome, &self.rig, result.fault))
+        Ok(rig::checked(outcome, calibration, result.fault))
     }
 
     fn outputs(&self) -> Vec<Output<'_>> {

@@ -20,7 +20,7 @@ impl Args {
         if self.disparities == Range::Auto
             || self.depth.is_some()
             || self.cloud.is_some()
-            || self.rig.is_some()
+            || !self.rig.is_empty()
             || self.confidence.is_some()
             || self.matched.is_some()
             || self.uncertainty.is_some()

@@ -62,10 +62,10 @@ pub(crate) struct Args {
     /// needs.
     #[arg(long, value_name = "FILE")]
     cloud: Option<PathBuf>,
-    /// Calibration of the rig, ours, OpenCV's or Kalibr's YAML (see `cv rectify --help`): the photographs are rectified first, and the maps
+    /// Calibration of the rig, ours, OpenCV's or Kalibr's YAML, twice for OpenCV's two files (see `cv rectify --help`): the photographs are rectified first, and the maps
     /// are those of the rectified left (or upper) one, which `cv rectify` writes.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["focal", "baseline"])]
-    rig: Option<PathBuf>,
+    rig: Vec<PathBuf>,
     /// The rig file has the cameras in the other order: its first one took the right (or lower) photograph.
     #[arg(long, requires = "rig")]
     exchange: bool,
@@ -168,14 +168,14 @@ impl Run for Args {
         if self.pair_by.is_some() {
             return Err(Failure::usage("--pair-by is for frames, and these are two photographs"));
         }
-        if (self.depth.is_some() || self.cloud.is_some()) && self.rig.is_none() && self.focal.is_none() {
+        if (self.depth.is_some() || self.cloud.is_some()) && self.rig.is_empty() && self.focal.is_none() {
             return Err(Failure::usage("depth needs the geometry of the cameras")
                 .advice("give --focal and --baseline, or --rig"));
         }
         let photos = Photos::read(&self.left, &self.right)?;
         let options = self.options(context);
         // A baseline that is given by itself counts as one in meters.
-        let (job, meters) = match &self.rig {
+        let (job, meters) = match self.rig.first() {
             Some(path) => self.by_rig(path, &photos, &options, context)?,
             None => (self.rectified(photos, &options, context)?, 1.0),
         };
@@ -265,7 +265,7 @@ impl Args {
         context: &Context,
     ) -> Result<(RigDepthResult, f64), Failure> {
         let [left, right] = photos.sizes();
-        let file = rig::read(path, left, self.exchange)?;
+        let file = rig::read(&self.rig, left, self.exchange, context)?;
         let (meters, rig) = (file.meters_per_unit().unwrap_or(1.0), file.rig);
         rig::check_size(path, &self.left, left, &rig.left)?;
         rig::check_size(path, &self.right, right, &rig.right)?;
