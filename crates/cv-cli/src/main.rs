@@ -2,6 +2,7 @@
 
 mod commands;
 mod frame;
+mod photos;
 mod rig;
 mod words;
 

@@ -5,6 +5,7 @@ mod report;
 use crate::frame::{Context, Failure, Outcome, Output, PICTURE, Run, expand_images, named};
 use crate::{rig, words};
 use cv_core::Image;
+use cv_io::Metadata;
 use cv_pipeline::panorama_types::{BlendMode, Exposure, Projection, Seams};
 use cv_pipeline::{FeatureMethod, FeatureOptions, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama};
 use rayon::prelude::*;
@@ -92,13 +93,14 @@ impl Run for Args {
             .par_iter()
             .map(|path| {
                 let picture = cv_io::read_image(path)?;
-                Ok((picture.exif.focal.as_ref().map(|focal| focal.pixels), picture.into_rgb8()))
+                let metadata = picture.metadata.clone();
+                Ok((picture.exif.focal.as_ref().map(|focal| focal.pixels), metadata, picture.into_rgb8()))
             })
             .collect::<Result<Vec<_>, cv_io::IoError>>()?;
         // Of photographs of one size the camera is read once.
         let mut cameras = BTreeMap::new();
         if let Some(path) = &self.camera {
-            for (_, image) in &pictures {
+            for (.., image) in &pictures {
                 if let Entry::Vacant(place) = cameras.entry(image.size()) {
                     place.insert(rig::camera(path, Some(image.size()), context)?);
                 }
@@ -106,7 +108,7 @@ impl Run for Args {
         }
         let photos: Vec<PanoramaPhoto<'_>> = pictures
             .iter()
-            .map(|(focal, image)| PanoramaPhoto {
+            .map(|(focal, _, image)| PanoramaPhoto {
                 image: image.view(),
                 focal: *focal,
                 camera: cameras.get(&image.size()).copied(),
@@ -114,11 +116,13 @@ impl Run for Args {
             .collect();
         let result =
             panorama(&photos, &self.options(context), context).map_err(|error| words::no_panorama(error, &paths))?;
+        let files: Vec<&Metadata> = pictures.iter().map(|(_, metadata, _)| metadata).collect();
+        let metadata = metadata(&files, &result);
         context.write(Output::File(&self.output, PICTURE), |path| {
             if self.alpha {
-                cv_io::write_png(path, transparent(&result).view())
+                cv_io::write_png_with(path, transparent(&result).view(), &metadata)
             } else {
-                cv_io::write_image(path, result.image.view())
+                cv_io::write_image(path, result.image.view(), &metadata)
             }
         })?;
         for (path, image) in paths.iter().zip(&result.images) {
@@ -133,11 +137,19 @@ impl Run for Args {
             ));
         }
         context.report(|| {
-            let photos: Vec<_> = pictures.into_iter().map(|(_, image)| image).collect();
+            let photos: Vec<_> = pictures.into_iter().map(|(.., image)| image).collect();
             report::report(&paths, &photos, &result)
         })?;
         Ok(outcome(&paths, &result))
     }
+}
+
+/// The metadata of the photograph that all others are aligned to; the color profile only where those used have the same.
+fn metadata(files: &[&Metadata], result: &PanoramaResult) -> Metadata {
+    let Some(reference) = files.get(result.alignment.reference) else { return Metadata::default() };
+    let mut used = files.iter().zip(&result.images).filter(|(_, image)| image.used);
+    let icc = reference.icc.clone().filter(|_| used.all(|(file, _)| file.icc == reference.icc));
+    Metadata { exif: reference.exif.clone(), icc }
 }
 
 /// The picture with an opacity of 255 where a photograph reaches and 0 elsewhere.

@@ -2,9 +2,10 @@
 
 use super::size;
 use crate::frame::{Context, Failure, Global, Outcome, Output, Run, spare_inputs, two_images};
+use crate::photos::{Photos, at_own_depth};
 use crate::{rig, words};
 use cv_core::{RgbU8, StereoRig};
-use cv_io::RigFile;
+use cv_io::{DynImage, ExifInfo, IoError, Metadata, Pixels, RigFile};
 use cv_pipeline::rectify;
 use cv_pipeline::stereo::RectifyOptions;
 use cv_report::{Figure, Note, Raster, Report, colors, side_by_side};
@@ -38,7 +39,8 @@ fn help() -> String {
 /// Rectify a pair of photographs taken by a calibrated rig: the same scene point comes to lie in the same row of both.
 ///
 /// Writes left.png, right.png, rig.yaml (the rectified cameras) and q.txt (the matrix that takes column, row, disparity, 1
-/// to space) to a folder. The vertical residual is measured on features found in both rectified photographs.
+/// to space) to a folder. The vertical residual is measured on features found in both rectified photographs. Photographs
+/// of 16 bits stay so, and their EXIF (without turn and thumbnail) and color profiles are kept.
 ///
 /// Where one camera stands below the other, both results are turned by a quarter, anticlockwise: down in the scene is to the
 /// right, and rows coincide all the same. The upper photograph becomes left.png.
@@ -86,15 +88,18 @@ impl Run for Args {
         let exchange = self.exchange;
         let inputs: Vec<&Path> = [&self.left, &self.right].into_iter().chain(&self.rig).map(PathBuf::as_path).collect();
         spare_inputs(&NAMES.map(|name| self.output.join(name)), &inputs)?;
-        let left = cv_io::read_rgb(&self.left)?;
-        let right = cv_io::read_rgb(&self.right)?;
-        let RigFile { rig, unit, .. } = rig::read(&self.rig, left.size(), exchange, context)?;
+        let photos = Photos::read(&self.left, &self.right)?;
+        let [left, right] = photos.sizes();
+        let RigFile { rig, unit, .. } = rig::read(&self.rig, left, exchange, context)?;
         let calibration: &Path = &self.rig[0];
-        rig::check_size(calibration, &self.left, left.size(), &rig.left)?;
-        rig::check_size(calibration, &self.right, right.size(), &rig.right)?;
+        rig::check_size(calibration, &self.left, left, &rig.left)?;
+        rig::check_size(calibration, &self.right, right, &rig.right)?;
         let options = RectifyOptions { alpha: self.alpha, size: self.size };
-        let result = rectify(left.view(), right.view(), &rig, &options, context)
-            .map_err(|error| words::no_rectification(error, calibration, exchange))?;
+        let rectified = |pixels| DynImage { pixels, exif: ExifInfo::default(), metadata: Metadata::default() };
+        let result = at_own_depth!(photos, |a, b| {
+            rectify(a, b, &rig, &options, context).map(|result| result.map_images(|image| rectified(image.into())))
+        })
+        .map_err(|error| words::no_rectification(error, calibration, exchange))?;
         let r = &result.rectification;
         let rotation = cv_core::Rotation3::identity();
         let translation = cv_core::Vector3::new(-r.geometry.baseline, 0.0, 0.0);
@@ -108,8 +113,8 @@ impl Run for Args {
             q.row_iter().map(|row| row.iter().map(f64::to_string).collect::<Vec<_>>().join(" ")).collect();
         context.write(Output::Folder(&self.output), |out| {
             cv_io::write_together(out, &NAMES, |folder| {
-                cv_io::write_png(folder.join("left.png"), result.images[0].view())?;
-                cv_io::write_png(folder.join("right.png"), result.images[1].view())?;
+                write_picture(&folder.join("left.png"), &result.images[0], &photos.left.metadata)?;
+                write_picture(&folder.join("right.png"), &result.images[1], &photos.right.metadata)?;
                 cv_io::write_rig(folder.join("rig.yaml"), &RigFile { rig: rectified, unit }, &["rectified"])?;
                 cv_io::write_bytes(folder.join("q.txt"), format!("{}\n", rows.join("\n")).as_bytes())
             })
@@ -133,7 +138,7 @@ impl Run for Args {
                 &format!("{:.1} % and {:.1} %", 100.0 * result.valid_area[0], 100.0 * result.valid_area[1]),
             );
             page.section("Rectified pair").figure(Figure::new(
-                cv_io::encode_png(with_rows(&result.images).view())?,
+                cv_io::encode_png(with_rows(&result.images.clone().map(DynImage::into_rgb8)).view())?,
                 "Both photographs with common rows drawn through: what is on a line on the left is on it on the right.",
             ));
             if let Some(cause) = &result.fault {
@@ -167,6 +172,16 @@ impl Run for Args {
 
     fn outputs(&self) -> Vec<Output<'_>> {
         vec![Output::Folder(&self.output)]
+    }
+}
+
+/// Writes a rectified photograph as deep as it is, with what the file of the original says beside its pixels.
+fn write_picture(path: &Path, picture: &DynImage, metadata: &Metadata) -> Result<(), IoError> {
+    match &picture.pixels {
+        Pixels::Gray8(image) => cv_io::write_png_with(path, image.view(), metadata),
+        Pixels::Gray16(image) => cv_io::write_png_with(path, image.view(), metadata),
+        Pixels::Rgb16(image) => cv_io::write_png_with(path, image.view(), metadata),
+        _ => cv_io::write_png_with(path, picture.clone().into_rgb8().view(), metadata),
     }
 }
 

@@ -44,6 +44,8 @@ pub(crate) struct Header {
     pub(crate) beside: u64,
     /// The EXIF block (a TIFF structure).
     pub(crate) exif: Option<Vec<u8>>,
+    /// The ICC color profile.
+    pub(crate) icc: Option<Vec<u8>>,
     /// The orientation tag, 1 to 8, where it stands outside an EXIF block.
     pub(crate) orientation: Option<u8>,
 }

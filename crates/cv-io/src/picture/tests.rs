@@ -343,8 +343,11 @@ fn four_inks_become_three_lights() {
 #[test]
 fn linear_light_is_encoded_for_the_eye() {
     let light = [[0.0, 1.0, 0.5], [0.0, 0.003_130_8, 2.0], [-1.0, 0.18, 0.18], [f32::NAN, 0.0, 1.0]];
-    let picture =
-        DynImage { pixels: Pixels::RgbF32(RgbF32::from_fn(4, 1, |x, _| light[x])), exif: ExifInfo::default() };
+    let picture = DynImage {
+        pixels: Pixels::RgbF32(RgbF32::from_fn(4, 1, |x, _| light[x])),
+        exif: ExifInfo::default(),
+        metadata: Metadata::default(),
+    };
     // IEC 61966-2-1 at 0.5, at its corner, and at the photographer's gray.
     let expected = [0, 255, 188, 0, 10, 255, 0, 118, 118, 0, 0, 255];
     assert_eq!(picture.into_rgb8().as_slice(), expected);

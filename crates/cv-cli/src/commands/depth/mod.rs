@@ -4,11 +4,11 @@ mod frames;
 mod maps;
 mod options;
 mod pairing;
-mod photos;
 mod report;
 
 use super::size;
 use crate::frame::{CLOUD, Context, Failure, Global, MAP, Outcome, Output, PNG, Run, named, stands_for_many};
+use crate::photos::{Photos, at_own_depth};
 use crate::{rig, words};
 use cv_core::{ImageView, PointCloud};
 use cv_io::ply::PlyEncoding;
@@ -20,7 +20,6 @@ use cv_pipeline::{DepthError, DepthOptions, DepthResult, RigDepthResult, depth, 
 use maps::write_map;
 use options::{Range, parse_range};
 use pairing::PairBy;
-use photos::{Photos, at_own_depth};
 use std::path::{Path, PathBuf};
 
 pub(crate) use maps::read_map;
