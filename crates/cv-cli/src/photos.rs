@@ -1,7 +1,6 @@
 //! Two photographs, as deep as their files have them.
 
 use crate::frame::Failure;
-use cv_core::RgbU8;
 use cv_io::DynImage;
 use std::path::Path;
 
@@ -19,11 +18,6 @@ impl Photos {
     /// Width and height of each.
     pub(crate) fn sizes(&self) -> [(usize, usize); 2] {
         [self.left.size(), self.right.size()]
-    }
-
-    /// As bytes of color.
-    pub(crate) fn into_rgb(self) -> [RgbU8; 2] {
-        [self.left, self.right].map(DynImage::into_rgb8)
     }
 }
 

@@ -5,6 +5,7 @@ use cv_core::{ImageView, RgbU8};
 use cv_pipeline::stereo::PixelState;
 use cv_pipeline::{DepthResult, RigDepthResult};
 use cv_report::{Figure, MapStyle, Note, Plot, PointScene, Report, Viewpoint, draw_map, render_points};
+use std::path::PathBuf;
 
 /// Where each disparity comes from, over the darkened photograph.
 fn draw_states(left: ImageView<'_, u8, 3>, states: ImageView<'_, PixelState, 1>) -> RgbU8 {
@@ -20,7 +21,8 @@ fn draw_states(left: ImageView<'_, u8, 3>, states: ImageView<'_, PixelState, 1>)
     })
 }
 
-pub(super) fn report(job: &RigDepthResult) -> Result<String, Failure> {
+/// The page of a pair; with `frames`, their names and the shares of pixels that were matched and that have a disparity, of the first of them.
+pub(super) fn report(job: &RigDepthResult, frames: &[(PathBuf, f64, f64)]) -> Result<String, Failure> {
     let RigDepthResult { images: [left, right], maps, cloud } = job;
     let DepthResult { map, depth, stages, .. } = maps;
     let png = |image: &RgbU8| cv_io::encode_png(image.view());
@@ -33,6 +35,21 @@ pub(super) fn report(job: &RigDepthResult) -> Result<String, Failure> {
         page.note(
             Note::Warning,
             "Most of this map is not matched but filled in from around; of such pixels about four in ten are wrong.",
+        );
+    }
+    if !frames.is_empty() {
+        let rows: Vec<Vec<String>> = frames
+            .iter()
+            .map(|(path, matched, valid)| {
+                let percent = |share: f64| format!("{:.1} %", 100.0 * share);
+                vec![path.display().to_string(), percent(*matched), percent(*valid)]
+            })
+            .collect();
+        page.headline("frames", &frames.len().to_string());
+        page.section("Frames").table(
+            "What follows is the first frame.",
+            &["frame", "matched and confirmed", "with a disparity"],
+            &rows,
         );
     }
     page.section("Photographs")
