@@ -118,7 +118,7 @@ fn to_byte(v: u16) -> u8 {
     ((u32::from(v) + 128) / 257) as u8
 }
 
-/// Decodes the bytes of a PNG, JPEG, TIFF, BMP, PNM, OpenEXR or Radiance HDR file.
+/// Decodes the bytes of a PNG, JPEG, TIFF, WebP, BMP, PNM, OpenEXR or Radiance HDR file.
 ///
 /// The format is told by the content. The EXIF orientation is applied. An alpha channel is dropped, as OpenCV and COLMAP do:
 /// the colors under it are returned as they are stored. Palettes are resolved; CMYK and YCCK JPEGs become RGB by

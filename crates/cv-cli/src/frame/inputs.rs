@@ -4,8 +4,10 @@ use super::{Explain, Failure};
 use std::{cmp::Ordering, fs, path::Path, path::PathBuf};
 
 /// The endings of photographs in a folder.
-const ENDINGS: [&str; 16] =
-    ["png", "jpg", "jpeg", "jpe", "tif", "tiff", "bmp", "pnm", "ppm", "pgm", "pbm", "pam", "exr", "hdr", "pic", "jfif"];
+const ENDINGS: [&str; 17] = [
+    "png", "jpg", "jpeg", "jpe", "tif", "tiff", "bmp", "pnm", "ppm", "pgm", "pbm", "pam", "exr", "hdr", "pic", "jfif",
+    "webp",
+];
 
 /// The most digits that a number in a file's name is looked for with.
 const MOST_DIGITS: usize = 12;

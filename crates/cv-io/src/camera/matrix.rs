@@ -50,8 +50,7 @@ pub(super) fn pinhole(
         // The row farthest from the principal point moves most.
         let rows = (cy / one).abs().max((height as f64 - 1.0 - cy / one).abs());
         let (skew, px) = (skew / one, (skew / fy).abs() * rows);
-        // NaN fails as well.
-        if !(px <= LARGEST_SKEW) {
+        if px.is_nan() || px > LARGEST_SKEW {
             let what = format!(
                 "a skew of {skew}, which moves pixels by up to {px:.2} px (at most {LARGEST_SKEW} px are left out),"
             );

@@ -12,6 +12,8 @@ mod png;
 mod pnm;
 #[cfg(feature = "tiff")]
 mod tiff;
+#[cfg(feature = "webp")]
+mod webp;
 
 use crate::{FormatError, memory};
 
@@ -28,6 +30,7 @@ pub(crate) enum Format {
     Pnm,
     OpenExr,
     Hdr,
+    WebP,
 }
 
 /// What a file says before its first pixel.
@@ -89,6 +92,7 @@ impl Format {
             Self::Pnm => "PNM",
             Self::OpenExr => "OpenEXR",
             Self::Hdr => "Radiance HDR",
+            Self::WebP => "WebP",
         }
     }
 
@@ -103,7 +107,9 @@ impl Format {
             Self::Tiff => tiff::header(bytes),
             #[cfg(feature = "exr")]
             Self::OpenExr => exr::header(bytes),
-            #[cfg(not(all(feature = "tiff", feature = "exr")))]
+            #[cfg(feature = "webp")]
+            Self::WebP => webp::header(bytes),
+            #[cfg(not(all(feature = "tiff", feature = "exr", feature = "webp")))]
             _ => Err(self.left_out()),
         }
     }
@@ -120,12 +126,14 @@ impl Format {
             Self::Tiff => tiff::raster(bytes),
             #[cfg(feature = "exr")]
             Self::OpenExr => exr::raster(bytes, header),
-            #[cfg(not(all(feature = "tiff", feature = "exr")))]
+            #[cfg(feature = "webp")]
+            Self::WebP => webp::raster(bytes),
+            #[cfg(not(all(feature = "tiff", feature = "exr", feature = "webp")))]
             _ => Err(self.left_out()),
         }
     }
 
-    #[cfg(not(all(feature = "tiff", feature = "exr")))]
+    #[cfg(not(all(feature = "tiff", feature = "exr", feature = "webp")))]
     fn left_out(self) -> FormatError {
         FormatError::unsupported_picture(self.name(), "a format left out of this build")
     }

@@ -450,7 +450,7 @@ fn names_do_not_matter_and_other_formats_are_named() {
     assert_eq!(read_rgb(&path).unwrap(), ramp(4, 3));
     for (bytes, word) in [
         (&b"GIF89a____________"[..], "GIF"),
-        (b"RIFF____WEBPVP8 ", "WebP"),
+        (b"RIFF\x08\0\0\0WEBPVP8 ", "WebP"),
         (b"\0\0\0\x20ftypheic\0\0\0\0", "HEIC"),
         (b"%PDF-1.7", "PDF"),
         (b"Pf\n2 2\n-1\n", "PFM"),
