@@ -6,7 +6,7 @@ mod photos;
 mod rig;
 mod words;
 
-use clap::Parser;
+use clap::{CommandFactory, Parser};
 use frame::Globals;
 
 /// Classical computer vision: color segmentation, panoramas, two-view reconstruction and stereo depth.
@@ -24,6 +24,22 @@ struct Cli {
 }
 
 fn main() -> std::process::ExitCode {
-    let cli = Cli::parse();
-    frame::run(&cli.globals, |context| cli.command.run(context))
+    let completed = match frame::complete(&Cli::command(), std::env::args_os().collect()) {
+        Ok(completed) => completed,
+        Err(failure) => {
+            eprintln!("{}", failure.text());
+            return failure.exit_code();
+        }
+    };
+    if let Some(text) = completed.printed {
+        print!("{text}");
+        return std::process::ExitCode::SUCCESS;
+    }
+    let cli = Cli::parse_from(completed.args);
+    frame::run(&cli.globals, |context| {
+        if let Some(said) = completed.said {
+            context.note(said);
+        }
+        cli.command.run(context)
+    })
 }

@@ -30,7 +30,7 @@ impl Failure {
     }
 
     /// 2 for wrong usage, 1 else.
-    pub(super) fn exit_code(&self) -> ExitCode {
+    pub(crate) fn exit_code(&self) -> ExitCode {
         ExitCode::from(if self.usage { 2 } else { 1 })
     }
 

@@ -2,6 +2,7 @@
 //!
 //! [`Outcome`] is what a command achieved and [`Failure`] why it did not; [`Context`] is what it knows of how it was called.
 
+mod config;
 mod context;
 mod failure;
 mod inputs;
@@ -12,6 +13,7 @@ mod outputs;
 mod progress;
 mod stop;
 
+pub(crate) use config::complete;
 pub(crate) use context::Context;
 pub(crate) use failure::{Explain, Failure};
 pub(crate) use inputs::{expand_images, stands_for_many, two_images};
@@ -52,6 +54,13 @@ pub(crate) struct Globals {
     /// Write DIR/report.html, one file with the pictures and figures of this run inside.
     #[arg(long, global = true, value_name = "DIR")]
     pub(crate) report: Option<PathBuf>,
+    /// Take options from this file [default: cv.toml, where the current folder has one]: a table for each command, such as [segment.train], with the long
+    /// names of its options as keys. The command line wins.
+    #[arg(long, global = true, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+    /// Print the options that hold, as a file for --config, and do nothing.
+    #[arg(long, global = true)]
+    pub(crate) print_config: bool,
 }
 
 /// A global option that not every command has a use for.
