@@ -1,20 +1,60 @@
-//! What commands with a calibrated rig share.
+//! What commands with calibrated cameras share.
 
-use crate::frame::{Failure, Outcome};
+use crate::frame::{Context, Failure, Outcome};
 use crate::words;
 use cv_core::Camera;
-use cv_io::{FormatError, RigFile};
+use cv_io::{CalibrationNote, FormatError, RigFile};
 use cv_pipeline::NoPairCause;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-/// Reads a calibration; with `exchange`, its second camera becomes the left one. `size` is for files that do not tell it.
-pub(crate) fn read(path: &Path, size: (usize, usize), exchange: bool) -> Result<RigFile, Failure> {
-    let file = cv_io::read_rig(path, Some(size)).map_err(|error| {
-        // What the file lacks is best told by one that has it all.
-        let content = !matches!(error.reason, FormatError::Os(_));
+/// Reads the calibration of a camera and says what of it is not taken as it stands. `size` is for files that do not tell it.
+pub(crate) fn camera(path: &Path, size: Option<(usize, usize)>, context: &Context) -> Result<Camera, Failure> {
+    camera_and_lens(path, size, context).map(|(camera, _)| camera)
+}
+
+/// The same, and whether the file tells the distortion of the lens.
+pub(crate) fn camera_and_lens(
+    path: &Path,
+    size: Option<(usize, usize)>,
+    context: &Context,
+) -> Result<(Camera, bool), Failure> {
+    let (camera, notes) = cv_io::read_camera_with_notes(path, size).map_err(|error| {
+        let no_size = size.is_none() && matches!(error.reason, FormatError::Missing { .. });
         let failure = Failure::from(error);
-        if content { failure.advice("see `cv rectify --help` for what a rig file holds") } else { failure }
+        if no_size { failure.advice("give the size of the pictures, such as --size 640x480") } else { failure }
     })?;
+    notes.iter().for_each(|note| context.note(format!("{}: {note}", path.display())));
+    Ok((camera, !notes.contains(&CalibrationNote::DistortionUnknown)))
+}
+
+/// Reads the calibration of a rig from its file or its two files; with `exchange`, its second camera becomes the left one. `size` is for files that do
+/// not tell it.
+pub(crate) fn read(
+    paths: &[PathBuf],
+    size: (usize, usize),
+    exchange: bool,
+    context: &Context,
+) -> Result<RigFile, Failure> {
+    if paths.len() > 2 {
+        return Err(Failure::usage(format!("--rig is given {} times", paths.len()))
+            .advice("one file, or OpenCV's two: --rig intrinsics.yml --rig extrinsics.yml"));
+    }
+    let (file, notes) = cv_io::read_rig_with_notes(paths, Some(size)).map_err(|error| {
+        // What the file lacks is best told by one that has it all.
+        let (content, lacks) = match error.reason {
+            FormatError::Os(_) => (false, false),
+            FormatError::Missing { .. } => (true, paths.len() == 1),
+            _ => (true, false),
+        };
+        match Failure::from(error) {
+            failure if lacks => failure.advice(
+                "see `cv rectify --help` for what a rig file holds; of OpenCV's two files give both: --rig intrinsics.yml --rig extrinsics.yml",
+            ),
+            failure if content => failure.advice("see `cv rectify --help` for what a rig file holds"),
+            failure => failure,
+        }
+    })?;
+    notes.iter().for_each(|note| context.note(note));
     Ok(if exchange { RigFile { rig: file.rig.exchanged(), ..file } } else { file })
 }
 

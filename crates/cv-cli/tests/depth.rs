@@ -111,6 +111,61 @@ fn frames_come_out_as_pairs_do() {
     assert!(!at("nowhere").exists());
 }
 
+/// Everything that a pair gives, frames give too.
+#[test]
+fn frames_of_a_rig_come_out_whole() {
+    let folder = pair();
+    let at = |name: &str| folder.path().join(name);
+    let camera = "{width: 240, height: 180, fx: 210, fy: 210, cx: 119.5, cy: 89.5, distortion: radial, coefficients: [-0.05, 0.01]}";
+    let rig = format!(
+        "schema: cv-rig/1\nunit: m\nleft: {camera}\nright: {camera}\nrotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n\
+         translation: [-0.25, 0, 0]\n"
+    );
+    std::fs::write(at("rig.yaml"), rig).unwrap();
+    for side in ["left", "right"] {
+        std::fs::create_dir(at(side)).unwrap();
+        for frame in 1..=2 {
+            std::fs::copy(at(&format!("{side}.png")), at(side).join(format!("f{frame}.png"))).unwrap();
+        }
+    }
+    let args = |names: [&'static str; 8]| {
+        let [left, right, disparity, depth, cloud, confidence, matched, uncertainty] = names;
+        let outputs = ["--depth", depth, "--cloud", cloud, "--confidence", confidence, "--matched", matched];
+        let inputs = ["depth", left, right, "-o", disparity, "--uncertainty", uncertainty, "--rig", "rig.yaml"];
+        [&inputs[..], &outputs, &["--disparities", "auto"]].concat()
+    };
+    let one =
+        json(folder.path(), &args(["left.png", "right.png", "d.pfm", "z.pfm", "c.ply", "s.pfm", "m.png", "u.pfm"]));
+    let frames = [&args(["left/f%d.png", "right", "d", "z", "c", "s", "m", "u"])[..], &["--report", "page"]].concat();
+    let value = json(folder.path(), &frames);
+    assert_eq!(value["frames"], 2);
+    for key in ["disparities", "min_disparity", "width", "height"] {
+        assert_eq!(value[key], one[key], "{key}");
+    }
+    for key in ["frames_per_second", "frames_per_second_with_files"] {
+        assert!(value[key].as_f64().unwrap() > 0.0, "{value}");
+    }
+    for file in ["d.pfm", "z.pfm", "c.ply", "s.pfm", "m.png", "u.pfm"] {
+        let (folder, ending) = file.split_once('.').unwrap();
+        let expected = std::fs::read(at(file)).unwrap();
+        for frame in ["f1", "f2"] {
+            let name = format!("{folder}/{frame}.{ending}");
+            assert!(std::fs::read(at(&name)).unwrap() == expected, "{name}");
+        }
+    }
+    let page = std::fs::read_to_string(at("page/report.html")).unwrap();
+    assert!(page.contains("left/f1.png") && page.contains("left/f2.png"));
+    // Frames that would be written to one file.
+    std::fs::copy(at("left.png"), at("left/f2.bmp")).unwrap();
+    let text = refused(folder.path(), &["depth", "left", "right", "-o", "two", "--pair-by", "order"]).stderr;
+    assert!(text.contains("left frames and") || text.contains("one file"), "{text}");
+    assert!(!at("two").exists());
+    // A frame of another size than its camera's.
+    cv_io::write_png(at("left/f2.png"), RgbU8::new(120, 90, [99; 3]).view()).unwrap();
+    let text = refused(folder.path(), &["depth", "left/*.png", "right", "-o", "two", "--rig", "rig.yaml"]).stderr;
+    assert!(text.contains("left/f2.png is 120×90 px"), "{text}");
+}
+
 #[test]
 fn the_range_can_be_found_from_the_pictures() {
     let folder = pair();
@@ -355,7 +410,7 @@ fn what_is_no_pair_is_refused_with_what_to_try() {
 
 /// Peak resident memory of a command in KiB, as the kernel counts it.
 #[cfg(target_os = "linux")]
-fn peak_of_frames(frames: usize) -> f64 {
+fn peak_of_frames(frames: usize, more: &[&str]) -> f64 {
     let folder = pair();
     for side in ["left", "right"] {
         std::fs::create_dir(folder.path().join(side)).unwrap();
@@ -367,6 +422,7 @@ fn peak_of_frames(frames: usize) -> f64 {
     std::fs::create_dir(folder.path().join("out")).unwrap();
     let mut child = support::cv(folder.path())
         .args(["depth", "left", "right", "-o", "out", "--quiet", "--threads", "2"])
+        .args(more)
         .spawn()
         .unwrap();
     let status = format!("/proc/{}/status", child.id());
@@ -385,8 +441,11 @@ fn peak_of_frames(frames: usize) -> f64 {
 #[test]
 #[cfg(target_os = "linux")]
 fn many_frames_take_the_memory_of_few() {
-    let (few, many) = (peak_of_frames(6), peak_of_frames(60));
-    // A frame's buffers are 9 MB, its pictures 0.3 MB: 54 further frames would add 16 MB at the least if anything of
-    // them were kept.
-    assert!(few > 1000.0 && many < few + 8192.0, "{few} and {many} KiB");
+    let whole = ["--focal", "210", "--baseline", "0.25", "--depth", "z", "--cloud", "c", "--disparities", "64"];
+    for more in [&[][..], &whole] {
+        let (few, many) = (peak_of_frames(6, more), peak_of_frames(60, more));
+        // A frame's buffers are 9 MB, its pictures 0.3 MB: 54 further frames would add 16 MB at the least if anything of
+        // them were kept.
+        assert!(few > 1000.0 && many < few + 8192.0, "{few} and {many} KiB");
+    }
 }

@@ -88,10 +88,10 @@ fn an_output_that_cannot_be_written_is_told_before_the_work() {
             let (folder, inputs) = job.folder();
             let mut args = job.args(&inputs);
             let place = args.iter().position(|word| *word == output).unwrap();
-            args[place] = format!("no/such/folder/{output}");
+            fs::write(folder.path().join("file"), "no folder").unwrap();
+            args[place] = format!("file/in/{output}");
             let ran = refused(folder.path(), &strs(&args));
-            assert!(ran.stderr.contains("no/such/folder"), "{}: {}", job.name, ran.stderr);
-            assert!(!folder.path().join("no").exists(), "{}", job.name);
+            assert!(ran.stderr.contains("file is not a folder"), "{}: {}", job.name, ran.stderr);
 
             args[place] = format!("folder-{output}");
             fs::create_dir(folder.path().join(&args[place])).unwrap();
@@ -99,6 +99,98 @@ fn an_output_that_cannot_be_written_is_told_before_the_work() {
             assert!(ran.stderr.contains("folder"), "{}: {}", job.name, ran.stderr);
         }
     }
+}
+
+/// The arguments of a job with its outputs in a folder `new/deep` that is not there.
+fn in_new_folder(args: &[String], outputs: &[&str]) -> Vec<String> {
+    let moved = |word: &String| match outputs.iter().any(|output| output.trim_end_matches('/') == word) {
+        true => format!("new/deep/{word}"),
+        false => word.clone(),
+    };
+    args.iter().map(moved).collect()
+}
+
+#[test]
+fn folders_of_outputs_are_made_by_a_job_that_succeeds_and_by_no_other() {
+    for job in JOBS {
+        let (folder, inputs) = job.folder();
+        let args = in_new_folder(&job.args(&inputs), job.outputs);
+        fs::write(folder.path().join("cut.png"), b"\x89PNG\r\n\x1a\n").unwrap();
+        let mut broken = inputs.clone();
+        *broken.last_mut().unwrap() = "cut.png".to_owned();
+        refused(folder.path(), &strs(&in_new_folder(&job.args(&broken), job.outputs)));
+        assert!(!folder.path().join("new").exists(), "{}", job.name);
+        done(folder.path(), &strs(&args));
+        for output in job.outputs {
+            assert!(folder.path().join("new/deep").join(output).exists(), "{}: {output}", job.name);
+        }
+    }
+}
+
+#[test]
+fn endings_that_tell_no_format_are_refused_before_the_work() {
+    for job in JOBS {
+        for output in job.files() {
+            let (folder, inputs) = job.folder();
+            let stem = output.split('.').next().unwrap();
+            for name in [format!("{stem}.obj"), stem.to_owned()] {
+                let mut args = job.args(&inputs);
+                let place = args.iter().position(|word| *word == output).unwrap();
+                args[place].clone_from(&name);
+                let ran = run(folder.path(), &strs(&args));
+                let format = output.rsplit('.').next().unwrap();
+                let said = ran.stderr.contains(&name) && ran.stderr.contains(&format!(".{format}"));
+                assert!(ran.code == Some(2) && said, "{}: {name}: {ran:?}", job.name);
+                assert!(!folder.path().join(&name).exists(), "{}", job.name);
+            }
+        }
+    }
+}
+
+#[test]
+fn one_file_may_go_to_stdout() {
+    for job in JOBS {
+        let (folder, inputs) = job.folder();
+        let args = job.args(&inputs);
+        done(folder.path(), &strs(&args));
+        let written = job.files().into_iter().map(|name| (name, fs::read(folder.path().join(name)).unwrap()));
+        for (output, expected) in written.collect::<Vec<_>>() {
+            let mut args = args.clone();
+            let place = args.iter().position(|word| *word == output).unwrap();
+            args[place] = "-".to_owned();
+            let ran = cv(folder.path()).args(&args).output().unwrap();
+            let stderr = String::from_utf8_lossy(&ran.stderr);
+            assert!(ran.status.success() && ran.stdout == expected, "{}: {output}: {stderr}", job.name);
+            assert!(!folder.path().join("-").exists(), "{}", job.name);
+            let ran = run(folder.path(), &[&strs(&args)[..], &["--json"]].concat());
+            assert!(ran.code == Some(2) && ran.stdout.is_empty(), "{}: {ran:?}", job.name);
+            if let Some(other) = args.iter().position(|word| word != output && job.files().contains(&&word[..])) {
+                args[other] = "-".to_owned();
+                let ran = run(folder.path(), &strs(&args));
+                assert!(ran.code == Some(2) && ran.stderr.contains("two outputs"), "{}: {ran:?}", job.name);
+            }
+        }
+    }
+    let (folder, inputs) = JOBS[2].folder();
+    for option in [["--report", "-"], ["--save-features", "-"]] {
+        let ran = run(folder.path(), &[&strs(&JOBS[2].args(&inputs))[..], &option].concat());
+        assert!(ran.code == Some(2) && ran.stderr.contains("stdout"), "{option:?}: {ran:?}");
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn a_device_takes_what_a_file_would() {
+    for (job, outputs) in [(&JOBS[0], ["d.pfm", "cloud.ply"]), (&JOBS[3], ["cloud.ply", "cloud.ply"])] {
+        let (folder, inputs) = job.folder();
+        let args = job.args(&inputs).into_iter();
+        let args: Vec<String> =
+            args.map(|word| if outputs.contains(&&word[..]) { "/dev/null".to_owned() } else { word }).collect();
+        // Two outputs of one name are refused, whatever it is.
+        let code = if outputs[0] == outputs[1] { 0 } else { 2 };
+        assert_eq!(run(folder.path(), &strs(&args)).code, Some(code), "{}", job.name);
+    }
+    assert!(fs::metadata("/dev/null").is_ok_and(|data| !data.is_file()));
 }
 
 #[cfg(unix)]

@@ -142,6 +142,32 @@ fn names_with_spaces_and_other_scripts_work() {
 }
 
 #[test]
+fn webp_is_read_whole_and_what_is_none_is_refused() {
+    let job = JOBS.iter().find(|job| job.name == "match").unwrap();
+    let (folder, good) = job.folder();
+    let mut inputs = Vec::new();
+    for (i, picture) in job.pictures().iter().enumerate() {
+        // The same picture without loss.
+        cv_io::write_png(folder.path().join(&good[i]), picture.view()).unwrap();
+        let (mut bytes, size) = (Vec::new(), (picture.width() as u32, picture.height() as u32));
+        let encoder = image_webp::WebPEncoder::new(&mut bytes);
+        encoder.encode(picture.as_slice(), size.0, size.1, image_webp::ColorType::Rgb8).unwrap();
+        inputs.push(format!("in{i}.webp"));
+        fs::write(folder.path().join(&inputs[i]), &bytes).unwrap();
+        fs::write(folder.path().join("cut.webp"), &bytes[..bytes.len() / 2]).unwrap();
+        fs::write(folder.path().join("head.webp"), &bytes[..24]).unwrap();
+    }
+    done(folder.path(), &strs(&job.args(&good)));
+    let expected = job.written(folder.path());
+    done(folder.path(), &strs(&job.args(&inputs)));
+    assert!(job.written(folder.path()) == expected);
+    for broken in ["cut.webp", "head.webp"] {
+        let ran = refused(folder.path(), &strs(&job.args(&[good[0].clone(), broken.to_owned()])));
+        assert!(ran.stderr.contains(broken) && ran.stderr.contains("WebP"), "{ran:?}");
+    }
+}
+
+#[test]
 fn a_fully_transparent_picture_is_read_by_its_colors() {
     let clear: Image<u8, 4> = Image::new(32, 32, [10, 20, 30, 0]);
     for job in JOBS {

@@ -6,7 +6,7 @@ use cv_core::ImageView;
 use png::{BitDepth, ColorType, Compression, Filter};
 
 use crate::files::write_bytes;
-use crate::{FormatError, IoError};
+use crate::{FormatError, IoError, Metadata};
 
 /// Width, height, color type, bits and the rows, big-endian, without padding.
 type Parts = (usize, usize, ColorType, BitDepth, Vec<u8>);
@@ -47,23 +47,27 @@ png_pixels!(u16, 3, Rgb, Sixteen, |out, row| out.extend(row.iter().flat_map(|v| 
 /// # Errors
 /// [`FormatError::NotRepresentable`] for an empty picture or one whose sides exceed 2³¹ − 1.
 pub fn encode_png(view: impl PngPixels) -> Result<Vec<u8>, FormatError> {
-    png_file(view.parts())
+    png_file(view.parts(), &Metadata::default())
 }
 
 /// The encoders are compiled once, not where they are called and not for each kind of pixel.
-fn png_file((width, height, color, depth, pixels): Parts) -> Result<Vec<u8>, FormatError> {
+fn png_file((width, height, color, depth, pixels): Parts, metadata: &Metadata) -> Result<Vec<u8>, FormatError> {
     let side = |n: usize| u32::try_from(n).ok().filter(|&n| n > 0 && n <= i32::MAX as u32);
     let (Some(w), Some(h)) = (side(width), side(height)) else {
         return Err(FormatError::NotRepresentable { format: "PNG", what: format!("a picture of {width}×{height}") });
     };
     let mut bytes = Vec::new();
-    let mut encoder = png::Encoder::new(&mut bytes, w, h);
+    let mut info = png::Info::with_size(w, h);
+    info.exif_metadata = metadata.exif_for(w, h).map(Into::into);
+    info.icc_profile = metadata.icc_for(color.samples()).map(Into::into);
+    let fail = |e: png::EncodingError| FormatError::corrupt("PNG", e.to_string());
+    let mut encoder = png::Encoder::with_info(&mut bytes, info).map_err(fail)?;
     encoder.set_color(color);
     encoder.set_depth(depth);
     encoder.set_compression(Compression::Fast);
     encoder.set_filter(Filter::Adaptive);
     let write = || encoder.write_header()?.write_image_data(&pixels);
-    write().map_err(|e| FormatError::corrupt("PNG", e.to_string()))?;
+    write().map_err(fail)?;
     Ok(bytes)
 }
 
@@ -72,8 +76,17 @@ fn png_file((width, height, color, depth, pixels): Parts) -> Result<Vec<u8>, For
 /// # Errors
 /// As [`encode_png`] and [`crate::write_atomic`].
 pub fn write_png(path: impl AsRef<Path>, view: impl PngPixels) -> Result<(), IoError> {
+    write_png_with(path, view, &Metadata::default())
+}
+
+/// [`write_png`] of a picture made of one with this metadata. Kept are the EXIF block, without thumbnail, turn and what else no longer holds, and
+/// a color profile for as many channels.
+///
+/// # Errors
+/// As [`write_png`].
+pub fn write_png_with(path: impl AsRef<Path>, view: impl PngPixels, metadata: &Metadata) -> Result<(), IoError> {
     let path = path.as_ref();
-    write_bytes(path, &encode_png(view).map_err(|reason| IoError::writing(path, reason))?)
+    write_bytes(path, &png_file(view.parts(), metadata).map_err(|reason| IoError::writing(path, reason))?)
 }
 
 /// What a JPEG can hold here: views of 1 or 3 channels of bytes.
@@ -86,22 +99,38 @@ impl JpegPixels for ImageView<'_, u8, 3> {}
 /// # Errors
 /// [`FormatError::NotRepresentable`] for an empty picture or one with a side above 65535.
 pub fn encode_jpeg(view: impl JpegPixels, quality: u8) -> Result<Vec<u8>, FormatError> {
-    jpeg_file(view.parts(), quality)
+    jpeg_file(view.parts(), quality, &Metadata::default())
 }
 
-fn jpeg_file((width, height, color, _, pixels): Parts, quality: u8) -> Result<Vec<u8>, FormatError> {
+fn jpeg_file(
+    (width, height, color, _, pixels): Parts,
+    quality: u8,
+    metadata: &Metadata,
+) -> Result<Vec<u8>, FormatError> {
     let side = |n: usize| u16::try_from(n).ok().filter(|&n| n > 0);
     let (Some(w), Some(h)) = (side(width), side(height)) else {
         return Err(FormatError::NotRepresentable { format: "JPEG", what: format!("a picture of {width}×{height}") });
     };
+    let channels = color.samples();
     let color =
         if color == ColorType::Grayscale { jpeg_encoder::ColorType::Luma } else { jpeg_encoder::ColorType::Rgb };
     let mut bytes = Vec::new();
-    jpeg_encoder::Encoder::new(&mut bytes, quality.clamp(1, 100))
-        .encode(&pixels, w, h, color)
-        .map_err(|e| FormatError::corrupt("JPEG", e.to_string()))?;
+    let mut encoder = jpeg_encoder::Encoder::new(&mut bytes, quality.clamp(1, 100));
+    let fail = |e: jpeg_encoder::EncodingError| FormatError::corrupt("JPEG", e.to_string());
+    let exif = metadata.exif_for(w.into(), h.into()).map(|block| [&b"Exif\0\0"[..], &block].concat());
+    // A segment holds no more; a camera's block without its thumbnail is far below.
+    if let Some(exif) = exif.filter(|exif| exif.len() <= 65_533) {
+        encoder.add_app_segment(1, exif).map_err(fail)?;
+    }
+    if let Some(profile) = metadata.icc_for(channels) {
+        encoder.add_icc_profile(profile).map_err(fail)?;
+    }
+    encoder.encode(&pixels, w, h, color).map_err(fail)?;
     Ok(bytes)
 }
+
+/// Quality of JPEG files.
+const QUALITY: u8 = 95;
 
 /// Writes a JPEG at quality 95.
 ///
@@ -109,19 +138,23 @@ fn jpeg_file((width, height, color, _, pixels): Parts, quality: u8) -> Result<Ve
 /// As [`encode_jpeg`] and [`crate::write_atomic`].
 pub fn write_jpeg(path: impl AsRef<Path>, view: impl JpegPixels) -> Result<(), IoError> {
     let path = path.as_ref();
-    write_bytes(path, &encode_jpeg(view, 95).map_err(|reason| IoError::writing(path, reason))?)
+    write_bytes(path, &encode_jpeg(view, QUALITY).map_err(|reason| IoError::writing(path, reason))?)
 }
 
-/// Writes a picture in the format that the file name's ending asks for: `.jpg` or `.jpeg`, or `.png`.
+/// Writes a picture in the format that the file name's ending asks for: `.jpg` or `.jpeg`, or `.png`. Of `metadata` is kept what [`write_png_with`]
+/// keeps.
 ///
 /// # Errors
 /// [`FormatError::Unsupported`] for another ending; else as [`write_png`] and [`write_jpeg`].
-pub fn write_image(path: impl AsRef<Path>, view: impl JpegPixels) -> Result<(), IoError> {
+pub fn write_image(path: impl AsRef<Path>, view: impl JpegPixels, metadata: &Metadata) -> Result<(), IoError> {
     let path = path.as_ref();
     let ending = path.extension().map(|e| e.to_string_lossy().to_lowercase());
     match ending.as_deref() {
-        Some("png") => write_png(path, view),
-        Some("jpg" | "jpeg") => write_jpeg(path, view),
+        Some("png") => write_png_with(path, view, metadata),
+        Some("jpg" | "jpeg") => {
+            let bytes = jpeg_file(view.parts(), QUALITY, metadata).map_err(|reason| IoError::writing(path, reason))?;
+            write_bytes(path, &bytes)
+        }
         _ => Err(IoError::writing(
             path,
             FormatError::unsupported("the file name", "an ending other than .png, .jpg and .jpeg"),

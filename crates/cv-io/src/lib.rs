@@ -44,6 +44,7 @@ mod files;
 mod maps;
 mod matches;
 mod memory;
+mod metadata;
 pub mod npy;
 pub mod npz;
 mod pending;
@@ -55,11 +56,11 @@ mod sniff;
 mod srgb;
 
 pub use camera::{
-    CalibrationFormat, CameraFile, RigFile, parse_camera, parse_rig, read_camera, read_camera_file, read_rig,
-    write_camera, write_rig,
+    CalibrationFormat, CalibrationNote, RigFile, parse_camera, parse_rig, read_camera, read_camera_with_notes,
+    read_rig, read_rig_with_notes, write_camera, write_rig,
 };
 pub use depth_png::{depth_mm, kitti, scaled};
-pub use encode::{JpegPixels, PngPixels, encode_jpeg, encode_png, write_image, write_jpeg, write_png};
+pub use encode::{JpegPixels, PngPixels, encode_jpeg, encode_png, write_image, write_jpeg, write_png, write_png_with};
 pub use error::{FormatError, IoError};
 pub use exif_info::{ExifFocal, ExifInfo, FocalSource};
 pub use features::{
@@ -70,6 +71,7 @@ pub use files::{MAX_FILE_BYTES, read_bytes, write_atomic, write_bytes};
 pub use maps::{decode_map, read_map};
 pub use matches::{Matches, parse_matches, read_matches, write_matches};
 pub use memory::{DEFAULT_MAX_MEMORY, default_max_memory, set_default_max_memory};
+pub use metadata::Metadata;
 pub use pending::{abandon_writes, write_together};
 pub use picture::{
     DEFAULT_MAX_PIXELS, DynImage, Pixels, ReadOptions, decode_image, read_gray_u8, read_image, read_image_info,

@@ -8,7 +8,7 @@ use cv_core::{GrayF32, GrayU8, Image, Mask, RgbF32, RgbU8, Sample};
 use crate::codec::{Format, Header, Raster, Samples};
 use crate::exif_info::is_raw_preview;
 use crate::files::{read_bytes, read_bytes_within};
-use crate::{ExifInfo, FormatError, IoError, memory, sniff, srgb};
+use crate::{ExifInfo, FormatError, IoError, Metadata, memory, sniff, srgb};
 
 /// The default for [`ReadOptions::max_pixels`]: 256 Mpx.
 pub const DEFAULT_MAX_PIXELS: u64 = 256 << 20;
@@ -54,6 +54,27 @@ pub struct DynImage {
     pub pixels: Pixels,
     /// What the camera said; `focal` is in pixels of this picture.
     pub exif: ExifInfo,
+    /// What the file says beside the pixels, for pictures made of this one.
+    pub metadata: Metadata,
+}
+
+macro_rules! pixels_from {
+    ($($image:ty => $kind:ident),* $(,)?) => {
+        $(impl From<$image> for Pixels {
+            fn from(image: $image) -> Self {
+                Self::$kind(image)
+            }
+        })*
+    };
+}
+
+pixels_from! {
+    GrayU8 => Gray8,
+    Image<u16, 1> => Gray16,
+    RgbU8 => Rgb8,
+    Image<u16, 3> => Rgb16,
+    GrayF32 => GrayF32,
+    RgbF32 => RgbF32,
 }
 
 impl DynImage {
@@ -97,11 +118,11 @@ fn to_byte(v: u16) -> u8 {
     ((u32::from(v) + 128) / 257) as u8
 }
 
-/// Decodes the bytes of a PNG, JPEG, TIFF, BMP, PNM, OpenEXR or Radiance HDR file.
+/// Decodes the bytes of a PNG, JPEG, TIFF, WebP, BMP, PNM, OpenEXR or Radiance HDR file.
 ///
 /// The format is told by the content. The EXIF orientation is applied. An alpha channel is dropped, as OpenCV and COLMAP do:
 /// the colors under it are returned as they are stored. Palettes are resolved; CMYK and YCCK JPEGs become RGB by
-/// plain inversion, without a color profile. Embedded profiles are ignored.
+/// plain inversion, without a color profile. Embedded profiles are not applied.
 ///
 /// # Errors
 /// [`FormatError`]: not a picture, damaged, cut short, or more pixels or memory than `options` allow.
@@ -117,7 +138,7 @@ fn decode(bytes: &[u8], format: Format, options: &ReadOptions) -> Result<DynImag
     if format == Format::Tiff && is_raw_preview(bytes) {
         return Err(FormatError::unsupported_picture("camera raw", "undeveloped sensor data"));
     }
-    let header = format.header(bytes)?;
+    let mut header = format.header(bytes)?;
     let (w, h) = (header.width as u64, header.height as u64);
     if w.saturating_mul(h) > options.max_pixels {
         return Err(FormatError::TooManyPixels { width: w, height: h, limit: options.max_pixels });
@@ -130,7 +151,8 @@ fn decode(bytes: &[u8], format: Format, options: &ReadOptions) -> Result<DynImag
     memory::allow(header.memory(bytes.len(), exif.orientation >= 5), options.max_memory, Some((w, h)))?;
     let raster = format.raster(bytes, &header)?;
     let pixels = pixels(raster, header.width, header.height, exif.orientation)?;
-    Ok(DynImage { pixels, exif })
+    let metadata = Metadata { exif: header.exif.take(), icc: header.icc.take() };
+    Ok(DynImage { pixels, exif, metadata })
 }
 
 fn exif_of(header: &Header) -> ExifInfo {

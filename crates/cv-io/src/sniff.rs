@@ -3,7 +3,7 @@
 use crate::FormatError;
 use crate::codec::Format;
 
-pub(crate) const PICTURES: &str = "a PNG, JPEG, TIFF, BMP, PNM, OpenEXR or Radiance HDR picture";
+pub(crate) const PICTURES: &str = "a PNG, JPEG, TIFF, WebP, BMP, PNM, OpenEXR or Radiance HDR picture";
 
 /// The picture format of `bytes`, or an error that names what they are instead.
 pub(crate) fn picture_format(bytes: &[u8]) -> Result<Format, FormatError> {
@@ -20,7 +20,6 @@ pub(crate) fn picture_format(bytes: &[u8]) -> Result<Format, FormatError> {
         _ if brand.is_some() => Some(("MP4", "a film")),
         [b'I', b'I', b'*', 0, _, _, _, _, b'C', b'R', ..] => Some(("CR2", "a camera's raw data")),
         [b'G', b'I', b'F', b'8', ..] => Some(("GIF", "this picture format")),
-        [b'R', b'I', b'F', b'F', _, _, _, _, b'W', b'E', b'B', b'P', ..] => Some(("WebP", "this picture format")),
         [0xff, 0x0a, ..] | [0, 0, 0, 0x0c, b'J', b'X', b'L', b' ', ..] => Some(("JPEG XL", "this picture format")),
         [0, 0, 0, 0x0c, b'j', b'P', ..] | [0xff, 0x4f, 0xff, 0x51, ..] => Some(("JPEG 2000", "this picture format")),
         [b'8', b'B', b'P', b'S', ..] => Some(("PSD", "this picture format")),
@@ -46,6 +45,7 @@ pub(crate) fn picture_format(bytes: &[u8]) -> Result<Format, FormatError> {
         [b'#', b'?', b'R', b'A', b'D', b'I', b'A', b'N', b'C', b'E', ..] | [b'#', b'?', b'R', b'G', b'B', b'E', ..] => {
             Ok(Format::Hdr)
         }
+        [b'R', b'I', b'F', b'F', _, _, _, _, b'W', b'E', b'B', b'P', ..] => Ok(Format::WebP),
         _ => Err(FormatError::UnknownFormat { expected: PICTURES }),
     }
 }

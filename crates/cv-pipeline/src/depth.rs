@@ -216,7 +216,7 @@ pub(crate) fn color_bytes<T: Intensity, const C: usize>(photo: ImageView<'_, T, 
 }
 
 /// The matcher's options, with the disparities that the pair shows where they are asked for.
-fn matcher_options<T: Intensity, const C: usize>(
+pub(crate) fn matcher_options<T: Intensity, const C: usize>(
     left: ImageView<'_, T, C>,
     right: ImageView<'_, T, C>,
     options: &DepthOptions,
@@ -301,7 +301,7 @@ fn kept_depth(geometry: &StereoGeometry, map: &DisparityMap, range: (f32, f32)) 
 }
 
 /// Refuses an empty range of depths and a geometry that is none.
-fn check_range((near, far): (f32, f32), geometry: Option<&StereoGeometry>) -> Result<(), DepthError> {
+pub(crate) fn check_range((near, far): (f32, f32), geometry: Option<&StereoGeometry>) -> Result<(), DepthError> {
     // NaN fails as well.
     if near.partial_cmp(&far) != Some(std::cmp::Ordering::Less) {
         return Err(DepthError::Range { near, far });

@@ -1,39 +1,125 @@
-//! Disparities of the frames of a film, one pair after the other.
+//! Disparity and depth of the frames of a film, one pair after the other.
 
-use crate::depth::check_pair;
-use crate::{DepthError, Progress};
-use cv_core::ImageView;
-use cv_stereo::{DisparityMap, Intensity, StereoError, StereoMatcher, StereoOptions};
+use crate::depth::{check_pair, check_range, color_bytes, matcher_options};
+use crate::{DepthError, DepthOptions, DisparityRange, Progress, RigDepthResult, depth_with};
+use cv_core::{Image, ImageView, PointCloud, Pose, StageClock, Vector3};
+use cv_imgproc::Pixel;
+use cv_stereo::{DisparityMap, Intensity, Rectification, StereoGeometry, StereoMatcher, StereoOptions};
 
-/// Matches frame after frame of rectified pairs with the same memory.
+/// Matches frame after frame with the same memory and the same disparities: where those are to be found
+/// ([`DisparityRange::FromMatches`]), the first frame shows them for all.
 #[derive(Debug)]
 pub struct FrameDepth {
-    matcher: StereoMatcher,
+    options: DepthOptions,
+    rectification: Option<Rectification>,
+    geometry: Option<StereoGeometry>,
+    matcher: Option<StereoMatcher>,
     map: DisparityMap,
 }
 
 impl FrameDepth {
-    /// A matcher for frames.
+    /// For rectified pairs; there is depth where their geometry is known.
     ///
     /// # Errors
-    /// [`StereoError`] where an option is out of range.
-    pub fn new(options: StereoOptions) -> Result<Self, StereoError> {
-        Ok(Self { matcher: StereoMatcher::new(options)?, map: DisparityMap::empty() })
+    /// [`DepthError`] where an option is out of range or the geometry is none.
+    pub fn new(options: DepthOptions, geometry: Option<StereoGeometry>) -> Result<Self, DepthError> {
+        check_range(options.range, geometry.as_ref())?;
+        // What is wrong with the options is told before the first frame.
+        let matcher = Some(StereoMatcher::new(options.stereo.clone())?);
+        let matcher = matcher.filter(|_| options.disparities == DisparityRange::Given);
+        Ok(Self { options, rectification: None, geometry, matcher, map: DisparityMap::empty() })
     }
 
-    /// Disparities of the next frame's left image. The map stays until the frame after it.
+    /// For the photographs of a rig, which are rectified first.
+    ///
+    /// # Errors
+    /// As [`FrameDepth::new`].
+    pub fn of_rig(options: DepthOptions, rectification: &Rectification) -> Result<Self, DepthError> {
+        let frames = Self::new(options, Some(rectification.geometry))?;
+        Ok(Self { rectification: Some(*rectification), ..frames })
+    }
+
+    /// Smallest disparity and number of them that are tried; `None` while the first frame has not shown them.
+    pub fn disparities(&self) -> Option<(i32, usize)> {
+        self.matcher.as_ref().map(|matcher| (matcher.options().min_disparity, matcher.options().disparities))
+    }
+
+    /// Disparities of the next frame's left image alone. The map stays until the frame after it.
     ///
     /// # Errors
     /// [`DepthError`] as of [`depth()`](crate::depth()).
-    pub fn next<T: Intensity, const C: usize>(
+    pub fn next<T: Intensity + Pixel, const C: usize>(
         &mut self,
         left: ImageView<'_, T, C>,
         right: ImageView<'_, T, C>,
         progress: &dyn Progress,
     ) -> Result<&DisparityMap, DepthError> {
-        self.matcher.compute_into(left, right, &mut self.map, progress)?;
-        let StereoOptions { min_disparity, disparities, .. } = *self.matcher.options();
+        let rectified = self.rectified([left, right], progress)?;
+        let [left, right] = rectified.as_ref().map_or([left, right], |pair| pair.each_ref().map(|image| image.view()));
+        let matcher = matcher(&mut self.matcher, &self.options, [left, right], progress)?;
+        matcher.compute_into(left, right, &mut self.map, progress)?;
+        let StereoOptions { min_disparity, disparities, .. } = *matcher.options();
         check_pair(&self.map, left, right, (min_disparity, disparities), progress)?;
         Ok(&self.map)
     }
+
+    /// All that there is of the next frame; the points only where they are `wanted`.
+    ///
+    /// # Errors
+    /// [`DepthError`] as of [`depth()`](crate::depth()), and [`DepthError::Rectify`] where a photograph is not of its camera's size.
+    pub fn next_depth<T: Intensity + Pixel, const C: usize>(
+        &mut self,
+        left: ImageView<'_, T, C>,
+        right: ImageView<'_, T, C>,
+        wanted: bool,
+        progress: &dyn Progress,
+    ) -> Result<RigDepthResult, DepthError> {
+        let mut clock = StageClock::new();
+        let rectified = self.rectified([left, right], progress)?;
+        let [left, right] = rectified.as_ref().map_or([left, right], |pair| pair.each_ref().map(|image| image.view()));
+        if rectified.is_some() {
+            clock.lap("rectify");
+        }
+        let unknown = self.matcher.is_none();
+        let matcher = matcher(&mut self.matcher, &self.options, [left, right], progress)?;
+        if unknown {
+            clock.lap("range");
+        }
+        matcher.prepare(left.width(), left.height(), &mut self.map, progress)?;
+        clock.lap("prepare");
+        let mut maps = depth_with(matcher, left, right, self.geometry.as_ref(), self.options.range, progress)?;
+        maps.stages.iter().for_each(|(stage, seconds)| clock.add(stage, *seconds));
+        maps.stages = clock.into_stages();
+        let images = [color_bytes(left), color_bytes(right)];
+        let cloud = if wanted { maps.cloud(images[0].view()) } else { None };
+        let mut cloud: PointCloud = cloud.unwrap_or_default();
+        if let Some(rectification) = &self.rectification {
+            cloud.transform(&Pose::new(rectification.left.rotation.inverse(), Vector3::zeros()));
+        }
+        Ok(RigDepthResult { images, maps, cloud })
+    }
+
+    /// The photographs of a rig as they are rectified; `None` where they are already.
+    fn rectified<T: Pixel, const C: usize>(
+        &self,
+        [left, right]: [ImageView<'_, T, C>; 2],
+        progress: &dyn Progress,
+    ) -> Result<Option<[Image<T, C>; 2]>, DepthError> {
+        let Some(rectification) = &self.rectification else { return Ok(None) };
+        Ok(Some([rectification.left.apply(left, progress)?.0, rectification.right.apply(right, progress)?.0]))
+    }
+}
+
+/// The matcher; made where there is none yet, for the disparities that this pair shows.
+fn matcher<'m, T: Intensity, const C: usize>(
+    matcher: &'m mut Option<StereoMatcher>,
+    options: &DepthOptions,
+    [left, right]: [ImageView<'_, T, C>; 2],
+    progress: &dyn Progress,
+) -> Result<&'m mut StereoMatcher, DepthError> {
+    let made = match matcher.take() {
+        Some(made) => made,
+        None => StereoMatcher::new(matcher_options(left, right, options, progress)?)?,
+    };
+    Ok(matcher.insert(made))
 }

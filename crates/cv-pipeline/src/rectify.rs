@@ -1,18 +1,20 @@
 //! Rectification of a pair of photographs, with what tells whether it is any good.
 
+use crate::depth::color_bytes;
 use crate::matching::match_reduced;
 use crate::no_pair::judge;
 use crate::{MatchingError, MatchingOptions, NoPairCause, Progress};
-use cv_core::{ImageView, Mask, RgbU8, StageClock, StereoRig, median, quantile};
-use cv_stereo::{Rectification, RectifyError, RectifyOptions};
+use cv_core::{Image, ImageView, Mask, StageClock, StereoRig, median, quantile};
+use cv_imgproc::Pixel;
+use cv_stereo::{Intensity, Rectification, RectifyError, RectifyOptions};
 
-/// What [`rectify`] made.
+/// What [`rectify`] made; `P` is a photograph.
 #[derive(Debug, Clone, PartialEq)]
-pub struct RectifyResult {
+pub struct RectifyResult<P> {
     /// Both rectified views and their geometry.
     pub rectification: Rectification,
-    /// The rectified photographs, left and right.
-    pub images: [RgbU8; 2],
+    /// The rectified photographs, left and right, as deep as they came.
+    pub images: [P; 2],
     /// Where they show anything.
     pub masks: [Mask; 2],
     /// Share of pixels that show anything, left and right.
@@ -29,24 +31,42 @@ pub struct RectifyResult {
     pub stages: Vec<(&'static str, f64)>,
 }
 
-/// Rectifies a pair taken by `rig`.
+impl<P> RectifyResult<P> {
+    /// The same with other photographs.
+    pub fn map_images<Q>(self, map: impl Fn(P) -> Q) -> RectifyResult<Q> {
+        RectifyResult {
+            rectification: self.rectification,
+            images: self.images.map(map),
+            masks: self.masks,
+            valid_area: self.valid_area,
+            vertical_px: self.vertical_px,
+            matches: self.matches,
+            fault: self.fault,
+            stages: self.stages,
+        }
+    }
+}
+
+/// Rectifies a pair taken by `rig`, as deep as it is: 16 bits stay 16 bits.
 ///
 /// # Errors
 /// [`RectifyError`] where the rig cannot be rectified, or the photographs are not of its cameras' sizes.
-pub fn rectify(
-    left: ImageView<'_, u8, 3>,
-    right: ImageView<'_, u8, 3>,
+pub fn rectify<T: Intensity + Pixel, const C: usize>(
+    left: ImageView<'_, T, C>,
+    right: ImageView<'_, T, C>,
     rig: &StereoRig,
     options: &RectifyOptions,
     progress: &dyn Progress,
-) -> Result<RectifyResult, RectifyError> {
+) -> Result<RectifyResult<Image<T, C>>, RectifyError> {
     let mut clock = StageClock::new();
     let rectification = Rectification::new(rig, options)?;
     let (left, mask_left) = rectification.left.apply(left, progress)?;
     let (right, mask_right) = rectification.right.apply(right, progress)?;
     clock.lap("rectify");
     // A pair without features is rectified all the same; only its quality stays unknown.
-    let pairs = match match_reduced([left.view(), right.view()], LARGEST, &MatchingOptions::default(), progress) {
+    let colors = [color_bytes(left.view()), color_bytes(right.view())];
+    let pairs = match match_reduced(colors.each_ref().map(|c| c.view()), LARGEST, &MatchingOptions::default(), progress)
+    {
         Ok(found) => found.pairs(),
         Err(MatchingError::Cancelled(stop)) => return Err(stop.into()),
         Err(_) => Vec::new(),
@@ -85,7 +105,7 @@ const LARGEST: usize = 4096;
 mod tests {
     use super::*;
     use crate::Silent;
-    use cv_core::{Camera, Distortion, Pose, Rotation3, Vector3};
+    use cv_core::{Camera, Distortion, Pose, RgbU8, Rotation3, Vector3};
     use cv_synth::{RenderOptions, Scene, render};
 
     #[test]

@@ -1,17 +1,16 @@
 //! Depth from the photographs of a calibrated rig: rectified first, at their own depth of bits.
 
-use crate::depth::color_bytes;
-use crate::{DepthError, DepthOptions, DepthResult, Progress, depth};
-use cv_core::{ImageView, PointCloud, Pose, RgbU8, StageClock, Vector3};
+use crate::{DepthError, DepthOptions, DepthResult, FrameDepth, Progress};
+use cv_core::{ImageView, PointCloud, RgbU8};
 use cv_imgproc::Pixel;
 use cv_stereo::{Intensity, Rectification};
 
-/// What [`depth_by_rig`] found.
+/// What [`depth_by_rig`] and [`FrameDepth`] found.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RigDepthResult {
-    /// The rectified photographs, left (or upper) and right, as bytes of color.
+    /// The photographs, of a rig rectified, left (or upper) and right, as bytes of color.
     pub images: [RgbU8; 2],
-    /// The maps of the left one. Its `stages` begin with `rectify`.
+    /// The maps of the left one. Of a rig, the `stages` begin with `rectify`.
     pub maps: DepthResult,
     /// The colored points in the frame of the left camera as it stood, not of the rectified one; in the unit of the rig.
     pub cloud: PointCloud,
@@ -29,24 +28,15 @@ pub fn depth_by_rig<T: Intensity + Pixel, const C: usize>(
     options: &DepthOptions,
     progress: &dyn Progress,
 ) -> Result<RigDepthResult, DepthError> {
-    let mut clock = StageClock::new();
-    let (left, _) = rectification.left.apply(left, progress)?;
-    let (right, _) = rectification.right.apply(right, progress)?;
-    clock.lap("rectify");
-    let mut maps = depth(left.view(), right.view(), Some(&rectification.geometry), options, progress)?;
-    maps.stages.iter().for_each(|(stage, seconds)| clock.add(stage, *seconds));
-    maps.stages = clock.into_stages();
-    let images = [color_bytes(left.view()), color_bytes(right.view())];
-    let mut cloud = maps.cloud(images[0].view()).unwrap_or_default();
-    cloud.transform(&Pose::new(rectification.left.rotation.inverse(), Vector3::zeros()));
-    Ok(RigDepthResult { images, maps, cloud })
+    FrameDepth::of_rig(options.clone(), rectification)?.next_depth(left, right, true, progress)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::Silent;
-    use cv_core::{Camera, Image, Rotation3, StereoRig};
+    use crate::depth::color_bytes;
+    use cv_core::{Camera, Image, Pose, Rotation3, StereoRig, Vector3};
     use cv_stereo::{PixelState, RectifyOptions, StereoOptions};
     use cv_synth::{RenderOptions, Scene, render};
 

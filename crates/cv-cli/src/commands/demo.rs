@@ -6,7 +6,7 @@ mod panorama;
 mod reconstruct;
 mod segment;
 
-use crate::frame::{Context, Failure, Outcome, Run, create_dir};
+use crate::frame::{Context, Failure, Outcome, Output, Run};
 use crate::pictures::{Width, map, picture};
 use cv_core::{Camera, GrayF32, RgbU8, Stage};
 use cv_report::{Figure, MapStyle, Note, Report, draw_map};
@@ -21,13 +21,11 @@ use std::time::Instant;
 /// them as on anybody's photographs. Since the scenes are known exactly, so is the error of every result. Writes the
 /// photographs, the results and report.html into a folder. The exit code is 1 where an error is above its bar.
 #[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  cv demo\n  cv demo --out /tmp/demo --seed 7\n  cv demo --json --quiet > demo.json"
-)]
+#[command(after_help = "Examples:\n  cv demo\n  cv demo -o /tmp/demo --seed 7\n  cv demo --json --quiet > demo.json")]
 pub(crate) struct Args {
     /// The folder to write into; made where it is not there.
-    #[arg(short, long, value_name = "DIR", default_value = "cv-demo")]
-    out: PathBuf,
+    #[arg(short, long, visible_alias = "out", value_name = "DIR", default_value = "cv-demo")]
+    output: PathBuf,
 }
 
 /// A result against the truth.
@@ -125,40 +123,47 @@ const JOBS: [(&str, Job); 5] = [
 ];
 
 impl Run for Args {
-    fn run(self, context: &Context) -> Result<Outcome, Failure> {
-        create_dir(&self.out)?;
-        let demo = Demo { context, seed: context.seed.unwrap_or(1), out: &self.out };
-        let (mut checks, mut sections, mut stages) = (Vec::new(), Vec::new(), Vec::new());
-        let stage = Stage::new(context, "demo", JOBS.len())?;
-        for (name, job) in JOBS {
-            context.note(format!("{name} …"));
-            let start = Instant::now();
-            let part = job(&demo)?;
-            // A job that was stopped is no job that gave up.
-            stage.add(1)?;
-            checks.extend(part.checks);
-            sections.push(part.section);
-            stages.push((name, start.elapsed().as_secs_f64()));
-        }
-        let page = demo.page(&checks, sections);
-        let html = context.page(page.clone());
-        let path = self.out.join("report.html");
-        cv_io::write_bytes(&path, html.as_bytes())?;
-        context.report(|| Ok(page))?;
-        let missed = checks.iter().filter(|c| !c.passed).count();
-        let outcome = Outcome::new(stages)
-            .summary(format!("\n{}\nreport: {}", table(&checks), path.display()))
-            .with("passed", missed == 0)
-            .with("seed", demo.seed)
-            .with("checks", checks);
-        Ok(match missed {
-            0 => outcome,
-            n => outcome.but(
-                Failure::new(format!("{n} of the results missed their bar"))
-                    .advice(format!("look at {}", path.display())),
-            ),
-        })
+    fn outputs(&self) -> Vec<Output<'_>> {
+        vec![Output::Folder(&self.output)]
     }
+
+    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+        context.write(Output::Folder(&self.output), |out| run(out, context))
+    }
+}
+
+/// All jobs, with what they write.
+fn run(out: &Path, context: &Context) -> Result<Outcome, Failure> {
+    let demo = Demo { context, seed: context.seed.unwrap_or(1), out };
+    let (mut checks, mut sections, mut stages) = (Vec::new(), Vec::new(), Vec::new());
+    let stage = Stage::new(context, "demo", JOBS.len())?;
+    for (name, job) in JOBS {
+        context.note(format!("{name} …"));
+        let start = Instant::now();
+        let part = job(&demo)?;
+        // A job that was stopped is no job that gave up.
+        stage.add(1)?;
+        checks.extend(part.checks);
+        sections.push(part.section);
+        stages.push((name, start.elapsed().as_secs_f64()));
+    }
+    let page = demo.page(&checks, sections);
+    let html = context.page(page.clone());
+    let path = out.join("report.html");
+    cv_io::write_bytes(&path, html.as_bytes())?;
+    context.report(|| Ok(page))?;
+    let missed = checks.iter().filter(|c| !c.passed).count();
+    let outcome = Outcome::new(stages)
+        .summary(format!("\n{}\nreport: {}", table(&checks), path.display()))
+        .with("passed", missed == 0)
+        .with("seed", demo.seed)
+        .with("checks", checks);
+    Ok(match missed {
+        0 => outcome,
+        n => outcome.but(
+            Failure::new(format!("{n} of the results missed their bar")).advice(format!("look at {}", path.display())),
+        ),
+    })
 }
 
 impl Demo<'_> {

@@ -3,6 +3,7 @@
 use super::size;
 use crate::frame::{Context, Explain, Failure, Outcome, Run, named};
 use crate::pictures::{Width, picture};
+use crate::rig;
 use cv_core::nalgebra::Matrix3;
 use cv_core::{Camera, Correspondence, Named, RgbU8, named};
 use cv_pipeline::{EstimateError, ModelKind, RobustModel, RobustOptions, estimate, estimate_calibrated};
@@ -45,9 +46,12 @@ pub(crate) struct Args {
     /// What the two views have in common.
     #[arg(value_parser = named::<Model>())]
     model: Model,
+    /// Photographs: their matches are what is needed.
+    #[arg(hide = true)]
+    photographs: Vec<PathBuf>,
     /// The matches.
-    #[arg(long, value_name = "FILE")]
-    matches: PathBuf,
+    #[arg(long, value_name = "FILE", required_unless_present = "photographs")]
+    matches: Option<PathBuf>,
     /// Largest error of an inlier in pixels [default: 3 for a homography, 1 otherwise].
     #[arg(long, value_name = "PX")]
     threshold: Option<f64>,
@@ -73,7 +77,7 @@ pub(crate) struct Args {
 
 impl Args {
     /// The cameras that an essential matrix needs; `None` for the other models.
-    fn cameras(&self) -> Result<Option<[Camera; 2]>, Failure> {
+    fn cameras(&self, context: &Context) -> Result<Option<[Camera; 2]>, Failure> {
         if !matches!(self.model, Model::Essential) {
             if self.camera.is_some() || self.focal.is_some() || self.size.is_some() {
                 return Err(Failure::usage("only an essential matrix has use for --camera, --focal or --size"));
@@ -81,9 +85,9 @@ impl Args {
             return Ok(None);
         }
         if let Some(path) = &self.camera {
-            let first = cv_io::read_camera(path, self.size)?;
+            let first = rig::camera(path, self.size, context)?;
             let second = match &self.camera2 {
-                Some(path) => cv_io::read_camera(path, self.size)?,
+                Some(path) => rig::camera(path, self.size, context)?,
                 None => first,
             };
             return Ok(Some([first, second]));
@@ -104,8 +108,12 @@ fn rows(m: &Matrix3<f64>) -> [[f64; 3]; 3] {
 
 impl Run for Args {
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
-        let matches = cv_io::read_matches(&self.matches)?;
-        let cameras = self.cameras()?;
+        let (Some(file), []) = (&self.matches, &self.photographs[..]) else {
+            return Err(Failure::usage("models are estimated from matches, not from photographs")
+                .advice("cv match A B -o matches.txt, then --matches matches.txt"));
+        };
+        let matches = cv_io::read_matches(file)?;
+        let cameras = self.cameras(context)?;
         let name = self.model.words();
         let (kind, options) = match self.model {
             Model::Homography => (ModelKind::Homography, RobustOptions::homography()),
@@ -132,12 +140,12 @@ impl Run for Args {
             _ => Failure::new(error),
         });
         let (robust, pose, stages) = result
-            .during(format!("no {name} from {}", self.matches.display()))
+            .during(format!("no {name} from {}", file.display()))
             .advice("check the matches by eye with `cv match A B --report DIR`, or pass a larger --threshold")?;
         let model = rows(&robust.model);
         let total = pairs.len();
         let text: String = model.iter().map(|r| format!("{:>16.9e} {:>16.9e} {:>16.9e}\n", r[0], r[1], r[2])).collect();
-        context.report(|| report(&self.matches, name, pairs, &robust))?;
+        context.report(|| report(file, name, pairs, &robust))?;
         let mut outcome = Outcome::new(stages)
             .with("kind", self.model.name())
             .with("model", model)

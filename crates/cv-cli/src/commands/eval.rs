@@ -1,13 +1,13 @@
 //! `cv eval`: results against the truth.
 
 use super::depth::{fractions, read_map};
-use crate::frame::{Context, Failure, Global, Outcome, Run};
+use crate::frame::{Context, Failure, Global, Outcome, Output, PNG, Run};
 use crate::pictures::{Width, map, picture};
 use cv_core::Mask;
 use cv_pipeline::stereo::{BAD_THRESHOLDS, DisparityScores, evaluate_disparity, non_occluded};
 use cv_report::{MapStyle, Report, draw_error_map};
 use serde_json::{Value, json};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Compare a result with the truth.
 #[derive(Debug, clap::Args)]
@@ -54,14 +54,14 @@ struct Disparity {
     #[arg(long, value_name = "FILE")]
     mask: Option<PathBuf>,
     /// Where to write a picture of the errors: gray up to 2 px, red and yellow beyond, blue without an estimate.
-    #[arg(long, value_name = "PNG")]
+    #[arg(short = 'o', long, visible_alias = "output", value_name = "PNG")]
     error: Option<PathBuf>,
 }
 
 impl Run for Args {
-    fn outputs(&self) -> Vec<&Path> {
+    fn outputs(&self) -> Vec<Output<'_>> {
         match &self.what {
-            What::Disparity(args) => args.error.iter().map(|p| &**p).collect(),
+            What::Disparity(args) => args.error.iter().map(|path| Output::File(path, PNG)).collect(),
         }
     }
 
@@ -101,7 +101,7 @@ impl Disparity {
         };
         let errors = || draw_error_map(estimate.view(), truth.view(), 2.0);
         if let Some(path) = &self.error {
-            cv_io::write_png(path, errors().view())?;
+            context.write(Output::File(path, PNG), |path| cv_io::write_png(path, errors().view()))?;
         }
         context.report(|| {
             let style = MapStyle::disparity();

@@ -1,16 +1,16 @@
 //! `cv man`: the manual pages.
 
-use crate::frame::{Context, Explain, Failure, Global, Outcome, Run, create_dir};
+use crate::frame::{Context, Explain, Failure, Global, Outcome, Output, Run};
 use clap::CommandFactory;
 use std::path::PathBuf;
 
 /// Write manual pages: cv.1 and one page per command.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  cv man --out ~/.local/share/man/man1")]
+#[command(after_help = "Examples:\n  cv man -o ~/.local/share/man/man1")]
 pub(crate) struct Args {
     /// The folder to write to; made where it is missing.
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
+    #[arg(short, long, visible_alias = "out", value_name = "DIR")]
+    output: PathBuf,
 }
 
 impl Run for Args {
@@ -18,17 +18,20 @@ impl Run for Args {
         &[Global::Seed, Global::Report]
     }
 
-    fn run(self, _: &Context) -> Result<Outcome, Failure> {
-        create_dir(&self.out)?;
+    fn outputs(&self) -> Vec<Output<'_>> {
+        vec![Output::Folder(&self.output)]
+    }
+
+    fn run(self, context: &Context) -> Result<Outcome, Failure> {
         let mut root = crate::Cli::command().disable_help_subcommand(true);
         root.build();
         let mut pages = Vec::new();
         collect(&root, &mut pages)?;
         let count = pages.len();
-        for (name, page) in pages {
-            cv_io::write_bytes(self.out.join(name), &page)?;
-        }
-        Ok(Outcome::default().with("pages", count).summary(format!("{count} pages in {}", self.out.display())))
+        context.write(Output::Folder(&self.output), |out| {
+            pages.iter().try_for_each(|(name, page)| cv_io::write_bytes(out.join(name), page))
+        })?;
+        Ok(Outcome::default().with("pages", count).summary(format!("{count} pages in {}", self.output.display())))
     }
 }
 

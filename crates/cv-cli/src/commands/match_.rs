@@ -1,6 +1,6 @@
 //! `cv match`: tentative matches between two photographs.
 
-use crate::frame::{Context, Explain, Failure, Outcome, Run, named};
+use crate::frame::{Context, Explain, Failure, Outcome, Output, Run, TEXT, named, two_images};
 use crate::pictures::{Width, picture};
 use crate::words;
 use cv_core::{Keypoint, Named, RgbU8};
@@ -32,9 +32,12 @@ a score (smaller is surer).
 for SIFT, left.txt in COLMAP's words. --load-features reads left.keypoints.npy with left.KIND.npy or
 left.descriptors.npy, else left.txt.")]
 pub(crate) struct Args {
-    /// The first photograph.
+    /// Two photographs, or a folder or quoted pattern of two.
+    #[arg(required = true, value_name = "PHOTOGRAPHS")]
+    photographs: Vec<PathBuf>,
+    #[arg(skip)]
     first: PathBuf,
-    /// The second photograph.
+    #[arg(skip)]
     second: PathBuf,
     /// Where to write the matches.
     #[arg(short, long, value_name = "FILE")]
@@ -72,11 +75,13 @@ pub(crate) struct Args {
 }
 
 impl Run for Args {
-    fn outputs(&self) -> Vec<&Path> {
-        self.output.iter().map(PathBuf::as_path).collect()
+    fn outputs(&self) -> Vec<Output<'_>> {
+        let matches = self.output.iter().map(|path| Output::File(path, TEXT));
+        matches.chain(self.save_features.iter().map(|folder| Output::Folder(folder))).collect()
     }
 
-    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+    fn run(mut self, context: &Context) -> Result<Outcome, Failure> {
+        [self.first, self.second] = two_images(&self.photographs)?;
         if let Some(ratio) = self.ratio.filter(|ratio| !(0.0..=1.0).contains(ratio)) {
             return Err(Failure::usage(format!("--ratio must be from 0 to 1, not {ratio}")));
         }
@@ -136,14 +141,15 @@ impl Run for Args {
             .advice("a larger --ratio, --features sift, or photographs that show more of the same"));
         }
         if let Some(folder) = &self.save_features {
-            std::fs::create_dir_all(folder).during(format!("cannot make {}", folder.display()))?;
-            for (photo, features) in [&self.first, &self.second].into_iter().zip(&result.features) {
-                save_features(folder, photo, features)?;
-            }
+            context.write(Output::Folder(folder), |folder| {
+                let photos = [&self.first, &self.second].into_iter().zip(&result.features);
+                photos.into_iter().try_for_each(|(photo, features)| save_features(folder, photo, features))
+            })?;
         }
         if let Some(path) = &self.output {
             let scores: Vec<f64> = result.matches.iter().map(|m| f64::from(m.ratio)).collect();
-            cv_io::write_matches(path, &result.pairs(), Some(&scores))?;
+            context
+                .write(Output::File(path, TEXT), |path| cv_io::write_matches(path, &result.pairs(), Some(&scores)))?;
         }
         let agreed = prevailing_model(&result.pairs(), options.seed, context)?;
         if agreed.is_none() {

@@ -19,9 +19,9 @@
 //! }
 //!
 //! impl Run for Args {
-//!     // Checked before `run`: the folder is there and can be written to, no file is named twice.
-//!     fn outputs(&self) -> Vec<&Path> {
-//!         vec![&self.output]
+//!     // Checked before `run`: the ending tells a format, the folder can be made and written to, nothing is named twice.
+//!     fn outputs(&self) -> Vec<Output<'_>> {
+//!         vec![Output::File(&self.output, PNG)]
 //!     }
 //!
 //!     // Global options that would do nothing are refused.
@@ -34,7 +34,8 @@
 //!         let options = ShrinkOptions { filter: self.filter, ..ShrinkOptions::default() }; // --threads has been applied already
 //!         let result = cv_pipeline::shrink(image.view(), &options, context) // `&Context` is the `&dyn Progress`
 //!             .advice("take a larger photograph")?; // becomes "; try: take a larger photograph"
-//!         cv_io::write_png(&self.output, result.image.view())?; // whole or not at all
+//!         // Whole or not at all; the folder is made, and `-` is stdout.
+//!         context.write(Output::File(&self.output, PNG), |path| cv_io::write_png(path, result.image.view()))?;
 //!         context.report(|| html_of(&result))?; // called and written only under --report DIR
 //!         Ok(Outcome::new(result.stages) // `seconds`, `threads` and `version` are added by the frame
 //!             .with("width", result.image.width())
@@ -84,7 +85,7 @@ macro_rules! subcommands {
                 match self {
                     $(Self::$variant(args) => {
                         context.refuse(args.has_no_use_for())?;
-                        crate::frame::check_outputs(&args.outputs())?;
+                        context.check(&args.outputs())?;
                         (*args).run(context)
                     })*
                 }

@@ -2,15 +2,16 @@
 
 mod report;
 
-use crate::frame::{Context, Failure, Outcome, Run, expand_images, named, picture_name};
-use crate::words;
+use crate::frame::{Context, Failure, Outcome, Output, PICTURE, Run, expand_images, named};
+use crate::{rig, words};
 use cv_core::Image;
+use cv_io::Metadata;
 use cv_pipeline::panorama_types::{BlendMode, Exposure, Projection, Seams};
 use cv_pipeline::{FeatureMethod, FeatureOptions, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama};
 use rayon::prelude::*;
 use serde_json::json;
 use std::collections::btree_map::{BTreeMap, Entry};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Join overlapping photographs to one picture.
 #[derive(Debug, clap::Args)]
@@ -25,7 +26,7 @@ pub(crate) struct Args {
     #[arg(required = true, value_name = "IMAGES")]
     images: Vec<PathBuf>,
     /// Where to write the panorama: .png or .jpg.
-    #[arg(short, long, value_name = "FILE", value_parser = picture_name)]
+    #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// The surface to draw on; auto: a plane up to 90 degrees across, then a cylinder, a sphere where it is also high.
     #[arg(long, value_name = "SURFACE", value_parser = named::<Projection>(), default_value_t = PanoramaOptions::default().render.projection)]
@@ -75,15 +76,16 @@ impl Args {
 }
 
 impl Run for Args {
-    fn outputs(&self) -> Vec<&Path> {
-        vec![&self.output]
+    fn outputs(&self) -> Vec<Output<'_>> {
+        vec![Output::File(&self.output, PICTURE)]
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
         if !(self.scale > 0.0 && self.scale <= 10.0) {
             return Err(Failure::usage(format!("--scale {} is not between 0 and 10", self.scale)));
         }
-        if self.alpha && !self.output.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("png")) {
+        let ending = self.output.extension().unwrap_or_default();
+        if self.alpha && ["jpg", "jpeg"].iter().any(|jpeg| ending.eq_ignore_ascii_case(jpeg)) {
             return Err(Failure::usage("--alpha needs a .png: JPEG has no transparency"));
         }
         let paths = expand_images(&self.images)?;
@@ -91,21 +93,22 @@ impl Run for Args {
             .par_iter()
             .map(|path| {
                 let picture = cv_io::read_image(path)?;
-                Ok((picture.exif.focal.as_ref().map(|focal| focal.pixels), picture.into_rgb8()))
+                let metadata = picture.metadata.clone();
+                Ok((picture.exif.focal.as_ref().map(|focal| focal.pixels), metadata, picture.into_rgb8()))
             })
             .collect::<Result<Vec<_>, cv_io::IoError>>()?;
         // Of photographs of one size the camera is read once.
         let mut cameras = BTreeMap::new();
         if let Some(path) = &self.camera {
-            for (_, image) in &pictures {
+            for (.., image) in &pictures {
                 if let Entry::Vacant(place) = cameras.entry(image.size()) {
-                    place.insert(cv_io::read_camera(path, Some(image.size()))?);
+                    place.insert(rig::camera(path, Some(image.size()), context)?);
                 }
             }
         }
         let photos: Vec<PanoramaPhoto<'_>> = pictures
             .iter()
-            .map(|(focal, image)| PanoramaPhoto {
+            .map(|(focal, _, image)| PanoramaPhoto {
                 image: image.view(),
                 focal: *focal,
                 camera: cameras.get(&image.size()).copied(),
@@ -113,11 +116,15 @@ impl Run for Args {
             .collect();
         let result =
             panorama(&photos, &self.options(context), context).map_err(|error| words::no_panorama(error, &paths))?;
-        if self.alpha {
-            cv_io::write_png(&self.output, transparent(&result).view())?;
-        } else {
-            cv_io::write_image(&self.output, result.image.view())?;
-        }
+        let files: Vec<&Metadata> = pictures.iter().map(|(_, metadata, _)| metadata).collect();
+        let metadata = metadata(&files, &result);
+        context.write(Output::File(&self.output, PICTURE), |path| {
+            if self.alpha {
+                cv_io::write_png_with(path, transparent(&result).view(), &metadata)
+            } else {
+                cv_io::write_image(path, result.image.view(), &metadata)
+            }
+        })?;
         for (path, image) in paths.iter().zip(&result.images) {
             if let Some(reason) = &image.reason {
                 context.warn(format!("{} is not in the panorama: {}", path.display(), words::left_out(reason, &paths)));
@@ -130,11 +137,19 @@ impl Run for Args {
             ));
         }
         context.report(|| {
-            let photos: Vec<_> = pictures.into_iter().map(|(_, image)| image).collect();
+            let photos: Vec<_> = pictures.into_iter().map(|(.., image)| image).collect();
             report::report(&paths, &photos, &result)
         })?;
         Ok(outcome(&paths, &result))
     }
+}
+
+/// The metadata of the photograph that all others are aligned to; the color profile only where those used have the same.
+fn metadata(files: &[&Metadata], result: &PanoramaResult) -> Metadata {
+    let Some(reference) = files.get(result.alignment.reference) else { return Metadata::default() };
+    let mut used = files.iter().zip(&result.images).filter(|(_, image)| image.used);
+    let icc = reference.icc.clone().filter(|_| used.all(|(file, _)| file.icc == reference.icc));
+    Metadata { exif: reference.exif.clone(), icc }
 }
 
 /// The picture with an opacity of 255 where a photograph reaches and 0 elsewhere.

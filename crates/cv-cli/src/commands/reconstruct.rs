@@ -4,8 +4,8 @@ mod report;
 
 pub(crate) use report::sparse;
 
-use crate::frame::{Context, Failure, Outcome, Run, named};
-use crate::words;
+use crate::frame::{CLOUD, Context, Failure, Outcome, Output, Run, named, two_images};
+use crate::{rig, words};
 use cv_core::PointCloud;
 use cv_core::nalgebra::Matrix3;
 use cv_io::DynImage;
@@ -30,9 +30,12 @@ use std::path::{Path, PathBuf};
     cv reconstruct a.jpg b.jpg -o sparse.ply --dense dense.ply --dense-size 2400\n\n\
     A camera file is ours, OpenCV's, ROS's or Kalibr's YAML, a line of COLMAP's cameras.txt, or a 3×3 matrix.")]
 pub(crate) struct Args {
-    /// The first photograph.
+    /// Two photographs, or a folder or quoted pattern of two.
+    #[arg(required = true, value_name = "PHOTOGRAPHS")]
+    photographs: Vec<PathBuf>,
+    #[arg(skip)]
     first: PathBuf,
-    /// The second photograph.
+    #[arg(skip)]
     second: PathBuf,
     /// Where to write the cloud, as PLY.
     #[arg(short, long, value_name = "FILE")]
@@ -82,11 +85,13 @@ pub(crate) struct Args {
 }
 
 impl Run for Args {
-    fn outputs(&self) -> Vec<&Path> {
-        std::iter::once(&self.output).chain(&self.dense).map(PathBuf::as_path).collect()
+    fn outputs(&self) -> Vec<Output<'_>> {
+        let clouds = std::iter::once(&self.output).chain(&self.dense).map(|path| Output::File(path, CLOUD));
+        clouds.chain(self.colmap.iter().map(|folder| Output::Folder(folder))).collect()
     }
 
-    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+    fn run(mut self, context: &Context) -> Result<Outcome, Failure> {
+        [self.first, self.second] = two_images(&self.photographs)?;
         for (name, value) in [("--threshold", self.threshold), ("--max-error", self.max_error)] {
             if !(value > 0.0 && value.is_finite()) {
                 return Err(Failure::usage(format!("{name} must be above 0, not {value}")));
@@ -96,7 +101,7 @@ impl Run for Args {
             return Err(Failure::usage("--focal must be above 0"));
         }
         let photos = [cv_io::read_image(&self.first)?, cv_io::read_image(&self.second)?];
-        let (intrinsics, source) = self.intrinsics(&photos)?;
+        let (intrinsics, source) = self.intrinsics(&photos, context)?;
         context.note(&source);
         let mut options = ReconstructOptions::new(intrinsics);
         options.two_view.robust.threshold = self.threshold;
@@ -115,7 +120,8 @@ impl Run for Args {
         let dense = self.dense(&a, &b, &result, context)?;
         let write = |path: &Path, mut cloud: PointCloud| {
             self.axes.turn(&mut cloud);
-            cv_io::ply::write_cloud(path, &cloud, PlyEncoding::Binary)
+            let cloud = |path: &Path| cv_io::ply::write_cloud(path, &cloud, PlyEncoding::Binary);
+            context.write(Output::File(path, CLOUD), cloud)
         };
         write(&self.output, result.cloud())?;
         if let (Some(path), Some(dense)) = (&self.dense, &dense) {
@@ -123,7 +129,8 @@ impl Run for Args {
         }
         if let Some(folder) = &self.colmap {
             let name = |path: &Path| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
-            cv_io::colmap::write(folder, &result.model([name(&self.first), name(&self.second)]))?;
+            let model = result.model([name(&self.first), name(&self.second)]);
+            context.write(Output::Folder(folder), |folder| cv_io::colmap::write(folder, &model))?;
         }
         if let Some(text) = doubt(&result) {
             context.warn(format!("{text}; --focal or --camera if you know it"));
@@ -147,16 +154,16 @@ fn doubt(result: &ReconstructResult) -> Option<String> {
 
 impl Args {
     /// What is known of the cameras, and how.
-    fn intrinsics(&self, photos: &[DynImage; 2]) -> Result<(Intrinsics, String), Failure> {
+    fn intrinsics(&self, photos: &[DynImage; 2], context: &Context) -> Result<(Intrinsics, String), Failure> {
         if let Some(path) = &self.camera {
-            let first = cv_io::read_camera_file(path, Some(photos[0].size()))?;
-            let second = match &self.camera2 {
-                Some(path) => cv_io::read_camera_file(path, Some(photos[1].size()))?,
-                None => first,
+            let (first, first_known) = rig::camera_and_lens(path, Some(photos[0].size()), context)?;
+            let (second, second_known) = match &self.camera2 {
+                Some(path) => rig::camera_and_lens(path, Some(photos[1].size()), context)?,
+                None => (first, first_known),
             };
-            let cameras = [first.camera, second.camera];
+            let cameras = [first, second];
             let source = format!("camera from {}", path.display());
-            return Ok(if self.undistorted || (first.distortion_known && second.distortion_known) {
+            return Ok(if self.undistorted || (first_known && second_known) {
                 (Intrinsics::Known(cameras), source)
             } else {
                 let open = "a matrix without the lens: its distortion is estimated (--undistorted where there is none)";

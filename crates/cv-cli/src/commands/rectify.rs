@@ -1,11 +1,12 @@
 //! `cv rectify`: a pair as two cameras would have taken it whose rows coincide.
 
 use super::size;
-use crate::frame::{Context, Failure, Global, Outcome, Run, create_dir, spare_inputs};
+use crate::frame::{Context, Failure, Global, Outcome, Output, Run, spare_inputs, two_images};
+use crate::photos::{Photos, at_own_depth};
 use crate::pictures::{Width, picture};
 use crate::{rig, words};
 use cv_core::{RgbU8, StereoRig};
-use cv_io::RigFile;
+use cv_io::{DynImage, ExifInfo, IoError, Metadata, Pixels, RigFile};
 use cv_pipeline::rectify;
 use cv_pipeline::stereo::RectifyOptions;
 use cv_report::{Raster, Report, colors, side_by_side};
@@ -20,8 +21,8 @@ fn help() -> String {
         .collect();
     format!(
         "Examples:\n  \
-        cv rectify left.jpg right.jpg --rig rig.yaml --out rectified\n  \
-        cv rectify left.jpg right.jpg --rig opencv-stereo.yml --alpha 1 --size 1280x960 --out rectified --report page\n\n\
+        cv rectify left.jpg right.jpg --rig rig.yaml -o rectified\n  \
+        cv rectify left.jpg right.jpg --rig opencv-stereo.yml --alpha 1 --size 1280x960 -o rectified --report page\n\n\
         A rig file is ours:\n  \
         schema: cv-rig/1\n  \
         unit: m\n  \
@@ -30,7 +31,8 @@ fn help() -> String {
         rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]   # x_right = rotation · x_left + translation\n  \
         translation: [-0.12, 0, 0]                    # the right camera stands 0.12 m to the right\n\
         A camera may also have a distortion:\n{}\n\
-        Or the file is OpenCV's YAML, with M1, D1, M2, D2, R and T in one, or Kalibr's camchain.yaml.",
+        Or the file is OpenCV's YAML, with M1, D1, M2, D2, R and T in one or in two (--rig intrinsics.yml --rig extrinsics.yml), or Kalibr's\n\
+        camchain.yaml. A skew that moves no pixel by more than 0.25 px is left out.",
         lenses.join("\n")
     )
 }
@@ -38,23 +40,27 @@ fn help() -> String {
 /// Rectify a pair of photographs taken by a calibrated rig: the same scene point comes to lie in the same row of both.
 ///
 /// Writes left.png, right.png, rig.yaml (the rectified cameras) and q.txt (the matrix that takes column, row, disparity, 1
-/// to space) to a folder. The vertical residual is measured on features found in both rectified photographs.
+/// to space) to a folder. The vertical residual is measured on features found in both rectified photographs. Photographs
+/// of 16 bits stay so, and their EXIF (without turn and thumbnail) and color profiles are kept.
 ///
 /// Where one camera stands below the other, both results are turned by a quarter, anticlockwise: down in the scene is to the
 /// right, and rows coincide all the same. The upper photograph becomes left.png.
 #[derive(Debug, clap::Args)]
 #[command(after_help = help())]
 pub(crate) struct Args {
-    /// The left (or upper) photograph.
+    /// The left (or upper) photograph and the right (or lower) one, or a folder or quoted pattern of the two.
+    #[arg(required = true, value_name = "LEFT RIGHT")]
+    photographs: Vec<PathBuf>,
+    #[arg(skip)]
     left: PathBuf,
-    /// The right (or lower) photograph.
+    #[arg(skip)]
     right: PathBuf,
-    /// Calibration of the rig: ours, OpenCV's or Kalibr's YAML.
-    #[arg(long, value_name = "FILE")]
-    rig: PathBuf,
+    /// Calibration of the rig: ours, OpenCV's or Kalibr's YAML; twice for OpenCV's two files.
+    #[arg(long, value_name = "FILE", required = true)]
+    rig: Vec<PathBuf>,
     /// The folder for the results; made where it is missing.
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
+    #[arg(short, long, visible_alias = "out", value_name = "DIR")]
+    output: PathBuf,
     /// From 0 (no pixel without content) to 1 (no pixel lost).
     #[arg(long, value_name = "A", default_value_t = 0.0, value_parser = parse_share)]
     alpha: f64,
@@ -78,17 +84,23 @@ impl Run for Args {
         &[Global::Seed]
     }
 
-    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+    fn run(mut self, context: &Context) -> Result<Outcome, Failure> {
+        [self.left, self.right] = two_images(&self.photographs)?;
         let exchange = self.exchange;
-        spare_inputs(&NAMES.map(|name| self.out.join(name)), &[&self.left, &self.right, &self.rig])?;
-        let left = cv_io::read_rgb(&self.left)?;
-        let right = cv_io::read_rgb(&self.right)?;
-        let RigFile { rig, unit, .. } = rig::read(&self.rig, left.size(), exchange)?;
-        rig::check_size(&self.rig, &self.left, left.size(), &rig.left)?;
-        rig::check_size(&self.rig, &self.right, right.size(), &rig.right)?;
+        let inputs: Vec<&Path> = [&self.left, &self.right].into_iter().chain(&self.rig).map(PathBuf::as_path).collect();
+        spare_inputs(&NAMES.map(|name| self.output.join(name)), &inputs)?;
+        let photos = Photos::read(&self.left, &self.right)?;
+        let [left, right] = photos.sizes();
+        let RigFile { rig, unit, .. } = rig::read(&self.rig, left, exchange, context)?;
+        let calibration: &Path = &self.rig[0];
+        rig::check_size(calibration, &self.left, left, &rig.left)?;
+        rig::check_size(calibration, &self.right, right, &rig.right)?;
         let options = RectifyOptions { alpha: self.alpha, size: self.size };
-        let result = rectify(left.view(), right.view(), &rig, &options, context)
-            .map_err(|error| words::no_rectification(error, &self.rig, exchange))?;
+        let rectified = |pixels| DynImage { pixels, exif: ExifInfo::default(), metadata: Metadata::default() };
+        let result = at_own_depth!(photos, |a, b| {
+            rectify(a, b, &rig, &options, context).map(|result| result.map_images(|image| rectified(image.into())))
+        })
+        .map_err(|error| words::no_rectification(error, calibration, exchange))?;
         let r = &result.rectification;
         let rotation = cv_core::Rotation3::identity();
         let translation = cv_core::Vector3::new(-r.geometry.baseline, 0.0, 0.0);
@@ -100,13 +112,13 @@ impl Run for Args {
         let q = r.q();
         let rows: Vec<String> =
             q.row_iter().map(|row| row.iter().map(f64::to_string).collect::<Vec<_>>().join(" ")).collect();
-        create_dir(&self.out)?;
-        cv_io::write_together(&self.out, &NAMES, |folder| -> Result<(), Failure> {
-            cv_io::write_png(folder.join("left.png"), result.images[0].view())?;
-            cv_io::write_png(folder.join("right.png"), result.images[1].view())?;
-            cv_io::write_rig(folder.join("rig.yaml"), &RigFile { rig: rectified, unit }, &["rectified"])?;
-            cv_io::write_bytes(folder.join("q.txt"), format!("{}\n", rows.join("\n")).as_bytes())?;
-            Ok(())
+        context.write(Output::Folder(&self.output), |out| {
+            cv_io::write_together(out, &NAMES, |folder| {
+                write_picture(&folder.join("left.png"), &result.images[0], &photos.left.metadata)?;
+                write_picture(&folder.join("right.png"), &result.images[1], &photos.right.metadata)?;
+                cv_io::write_rig(folder.join("rig.yaml"), &RigFile { rig: rectified, unit }, &["rectified"])?;
+                cv_io::write_bytes(folder.join("q.txt"), format!("{}\n", rows.join("\n")).as_bytes())
+            })
         })?;
         let residual = match (result.vertical_px, &result.fault) {
             (Some((median, p95)), _) => {
@@ -127,7 +139,7 @@ impl Run for Args {
                 &format!("{:.1} % and {:.1} %", 100.0 * result.valid_area[0], 100.0 * result.valid_area[1]),
             );
             page.section("Rectified pair").figure(picture(
-                &with_rows(&result.images),
+                &with_rows(&result.images.clone().map(DynImage::into_rgb8)),
                 Width::Full,
                 "Both photographs with common rows drawn through: what is on a line on the left is on it on the right.",
             )?);
@@ -158,11 +170,21 @@ impl Run for Args {
                 100.0 * result.valid_area[0],
                 100.0 * result.valid_area[1]
             ));
-        Ok(rig::checked(outcome, &self.rig, result.fault))
+        Ok(rig::checked(outcome, calibration, result.fault))
     }
 
-    fn outputs(&self) -> Vec<&Path> {
-        Vec::new()
+    fn outputs(&self) -> Vec<Output<'_>> {
+        vec![Output::Folder(&self.output)]
+    }
+}
+
+/// Writes a rectified photograph as deep as it is, with what the file of the original says beside its pixels.
+fn write_picture(path: &Path, picture: &DynImage, metadata: &Metadata) -> Result<(), IoError> {
+    match &picture.pixels {
+        Pixels::Gray8(image) => cv_io::write_png_with(path, image.view(), metadata),
+        Pixels::Gray16(image) => cv_io::write_png_with(path, image.view(), metadata),
+        Pixels::Rgb16(image) => cv_io::write_png_with(path, image.view(), metadata),
+        _ => cv_io::write_png_with(path, picture.clone().into_rgb8().view(), metadata),
     }
 }
 

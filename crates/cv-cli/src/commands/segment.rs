@@ -2,7 +2,7 @@
 
 mod files;
 
-use crate::frame::{Context, Explain, Failure, Global, Outcome, Run, create_dir, expand_images, named, same_file};
+use crate::frame::{Context, Explain, Failure, Global, JSON, Outcome, Output, Run, expand_images, named, same_file};
 use crate::pictures::{Width, picture};
 use cv_core::{Mask, Named, RgbU8, Stage};
 use cv_pipeline::segmentation::{
@@ -22,7 +22,7 @@ const REPORT_PHOTOS: usize = 40;
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv segment train --images photos --masks masks --model ball.json\n  \
-    cv segment predict --model ball.json new/*.jpg --out found\n  \
+    cv segment predict --model ball.json new/*.jpg -o found\n  \
     cv segment eval --model ball.json --images test --masks test-masks")]
 pub(crate) struct Args {
     #[command(subcommand)]
@@ -37,10 +37,11 @@ enum What {
 }
 
 impl Run for Args {
-    fn outputs(&self) -> Vec<&Path> {
+    fn outputs(&self) -> Vec<Output<'_>> {
         match &self.what {
-            What::Train(args) => vec![&args.model],
-            What::Predict(_) | What::Eval(_) => Vec::new(),
+            What::Train(args) => vec![Output::File(&args.model, JSON)],
+            What::Predict(args) => vec![Output::Folder(&args.output)],
+            What::Eval(_) => Vec::new(),
         }
     }
 
@@ -80,7 +81,7 @@ struct Train {
     #[command(flatten)]
     labels: Labels,
     /// Where to write the model.
-    #[arg(long, value_name = "JSON")]
+    #[arg(short = 'o', long, visible_alias = "output", value_name = "JSON")]
     model: PathBuf,
     /// Color space.
     #[arg(long, value_parser = named::<ColorSpace>(), default_value_t = TrainOptions::default().space)]
@@ -137,7 +138,7 @@ impl Train {
         let options = self.options(context);
         let training = train_segment(&labeled, &options, context).map_err(|error| refused(error, &pairs))?;
         let trained = &training.trained;
-        write_model(&self.model, &trained.model)?;
+        context.write(Output::File(&self.model, JSON), |path| write_model(path, &trained.model))?;
         let total: ConfusionMatrix = trained.scores.iter().copied().sum();
         if total.f1() < 0.5 {
             context.warn(format!(
@@ -188,9 +189,9 @@ impl Train {
 /// where its score, the agreement with the training objects in color and shape, reaches --min-score.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
-    cv segment predict --model ball.json a.jpg b.jpg --out found\n  \
-    cv segment predict --model ball.json photos --out found --report found\n  \
-    cv segment predict --model ball.json photos --out found --min-score 0")]
+    cv segment predict --model ball.json a.jpg b.jpg -o found\n  \
+    cv segment predict --model ball.json photos -o found --report found\n  \
+    cv segment predict --model ball.json photos -o found --min-score 0")]
 struct Predict {
     /// The model.
     #[arg(long, value_name = "JSON")]
@@ -199,8 +200,8 @@ struct Predict {
     #[arg(required = true)]
     images: Vec<PathBuf>,
     /// The folder to write the masks into; made where it is not there.
-    #[arg(short, long, value_name = "DIR")]
-    out: PathBuf,
+    #[arg(short, long, visible_alias = "out", value_name = "DIR")]
+    output: PathBuf,
     /// Least score of an object, 0 to 1: the share of trained objects that may be missed, were their features Gaussian. 0 takes every region for the object.
     #[arg(long, value_name = "P", default_value_t = DetectOptions::default().min_score)]
     min_score: f64,
@@ -213,7 +214,7 @@ impl Predict {
         let model = read_model(&self.model)?;
         let given = expand_images(&self.images)?;
         let photos = files::without_masks(given.clone());
-        let outputs: Vec<PathBuf> = photos.iter().map(|p| self.out.join(format!("{}_mask.png", stem(p)))).collect();
+        let outputs: Vec<PathBuf> = photos.iter().map(|p| self.output.join(format!("{}_mask.png", stem(p)))).collect();
         for (i, output) in outputs.iter().enumerate() {
             if let Some(same) = outputs[..i].iter().position(|o| o == output) {
                 return Err(Failure::new(format!(
@@ -227,10 +228,10 @@ impl Predict {
             // Masks drawn by hand often lie beside their photographs.
             // A bare name has the empty folder: joined to the current one it is that.
             let folder = Path::new(".").join(photos[i].parent().unwrap_or(Path::new("")));
-            let beside = output.exists() && same_file(&folder, &self.out);
+            let beside = output.exists() && same_file(&folder, &self.output);
             if beside || given.iter().any(|path| same_file(path, output)) {
                 return Err(Failure::new(format!("{} is there already and would be overwritten", output.display()))
-                    .advice("name another folder with --out"));
+                    .advice("name another folder with -o"));
             }
         }
         let mut stages: Vec<(&'static str, f64)> = Vec::new();
@@ -273,10 +274,9 @@ impl Predict {
             add_stages(&mut stages, &result.stages);
             stage.add(1)?;
         }
-        create_dir(&self.out)?;
-        for (output, mask) in outputs.iter().zip(&masks) {
-            cv_io::write_bytes(output, mask)?;
-        }
+        context.write(Output::Folder(&self.output), |_| {
+            outputs.iter().zip(&masks).try_for_each(|(output, mask)| cv_io::write_bytes(output, mask))
+        })?;
         context.report(|| {
             let mut page = Report::new("Segmentation");
             page.headline("photographs", &photos.len().to_string()).headline("with the object", &found.to_string());
@@ -289,7 +289,7 @@ impl Predict {
             Ok(page)
         })?;
         let mut summary =
-            format!("{} photographs, the object found in {found}; masks: {}", photos.len(), self.out.display());
+            format!("{} photographs, the object found in {found}; masks: {}", photos.len(), self.output.display());
         if let [first, rest @ ..] = missing.as_slice() {
             summary.push_str(&format!("; not found in {first}"));
             if !rest.is_empty() {

@@ -2,7 +2,7 @@
 
 use super::progress::Bar;
 use super::stop::Stop;
-use super::{Called, Failure, Global, Globals, create_dir};
+use super::{Called, Failure, Global, Globals, Output, outputs};
 use cv_pipeline::{Cancelled, Progress};
 use cv_report::Report;
 use std::{
@@ -18,6 +18,9 @@ pub(crate) struct Context {
     /// `--max-memory`, where given, in bytes.
     pub(crate) max_memory: Option<usize>,
     quiet: bool,
+    json: bool,
+    /// What goes to stdout once the command is done.
+    stdout: Mutex<Vec<u8>>,
     report: Option<PathBuf>,
     called: Called,
     /// What was warned of so far.
@@ -28,11 +31,12 @@ pub(crate) struct Context {
 
 impl Context {
     pub(super) fn new(globals: &Globals, called: Called) -> Self {
-        let Globals { quiet, seed, .. } = *globals;
+        let Globals { quiet, json, seed, .. } = *globals;
         let bar = Arc::new(Bar::new(quiet));
         let max_memory = globals.max_memory.map(|mib| usize::try_from(u64::from(mib) << 20).unwrap_or(usize::MAX));
         let (report, stop) = (globals.report.clone(), Stop::listen(&bar));
-        Self { seed, max_memory, quiet, report, called, warnings: Mutex::default(), bar, stop }
+        let (stdout, warnings) = (Mutex::default(), Mutex::default());
+        Self { seed, max_memory, quiet, json, stdout, report, called, warnings, bar, stop }
     }
 
     /// Refuses global options that the command has no use for.
@@ -46,6 +50,21 @@ impl Context {
             Some(Global::Report) => Err(Failure::usage("--report means nothing here: there is nothing to show")),
             None => Ok(()),
         }
+    }
+
+    /// Finds out before the work whether the results can be written.
+    pub(crate) fn check(&self, outputs: &[Output<'_>]) -> Result<(), Failure> {
+        outputs::check(outputs, self.report.as_deref(), self.json)
+    }
+
+    /// Keeps an output for stdout until the command is done.
+    pub(super) fn keep_for_stdout(&self, bytes: Vec<u8>) {
+        *self.stdout.lock().unwrap_or_else(PoisonError::into_inner) = bytes;
+    }
+
+    /// The output for stdout.
+    pub(super) fn take_stdout(&self) -> Vec<u8> {
+        std::mem::take(&mut *self.stdout.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
     /// A line on stderr, whatever was asked for.
@@ -85,9 +104,8 @@ impl Context {
     pub(crate) fn report(&self, build: impl FnOnce() -> Result<Report, Failure>) -> Result<(), Failure> {
         let Some(folder) = &self.report else { return Ok(()) };
         let html = self.page(build()?);
-        create_dir(folder)?;
         let path = folder.join("report.html");
-        cv_io::write_bytes(&path, html.as_bytes())?;
+        self.write(Output::Folder(folder), |_| cv_io::write_bytes(&path, html.as_bytes()))?;
         self.note(format!("report: {}", path.display()));
         Ok(())
     }

@@ -30,14 +30,8 @@ impl Failure {
     }
 
     /// 2 for wrong usage, 1 else.
-    pub(super) fn exit_code(&self) -> ExitCode {
+    pub(crate) fn exit_code(&self) -> ExitCode {
         ExitCode::from(if self.usage { 2 } else { 1 })
-    }
-
-    /// Whether it is wrong usage.
-    #[cfg(test)]
-    pub(super) fn is_usage(&self) -> bool {
-        self.usage
     }
 
     /// The lines on stderr.

@@ -1,38 +1,106 @@
-//! Files to read.
+//! Photographs to read: files, folders and patterns.
 
 use super::{Explain, Failure};
-use std::{cmp::Ordering, fs, path::PathBuf};
+use std::{cmp::Ordering, fs, path::Path, path::PathBuf};
 
-/// The image files among the arguments: a file stands for itself, a folder for the images in it, by name
-/// (`img2` before `img10`).
+/// The endings of photographs in a folder.
+const ENDINGS: [&str; 17] = [
+    "png", "jpg", "jpeg", "jpe", "tif", "tiff", "bmp", "pnm", "ppm", "pgm", "pbm", "pam", "exr", "hdr", "pic", "jfif",
+    "webp",
+];
+
+/// The most digits that a number in a file's name is looked for with.
+const MOST_DIGITS: usize = 12;
+
+/// The photographs among the arguments: a file stands for itself, a folder for the photographs in it, a pattern (`*`, `?`, `[a-z]`, `%04d`) for
+/// those that fit it, by name (`img2` before `img10`).
 pub(crate) fn expand_images(paths: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
-    const ENDINGS: [&str; 16] = [
-        "png", "jpg", "jpeg", "jpe", "tif", "tiff", "bmp", "pnm", "ppm", "pgm", "pbm", "pam", "exr", "hdr", "pic",
-        "jfif",
-    ];
     let mut images = Vec::new();
     for path in paths {
-        if !path.is_dir() {
+        if !stands_for_many(path) {
             images.push(path.clone());
             continue;
         }
-        let mut found = Vec::new();
-        for entry in fs::read_dir(path).during(format!("cannot list {}", path.display()))? {
-            let file = entry.during(format!("cannot list {}", path.display()))?.path();
-            let ending = file.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-            let hidden = file.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.'));
-            if ENDINGS.contains(&ending.as_str()) && !hidden && file.is_file() {
-                found.push(file);
-            }
-        }
-        if found.is_empty() {
-            return Err(Failure::new(format!("there are no images in {}", path.display()))
-                .advice(format!("a folder with files that end in {}", ENDINGS[..3].join(", "))));
-        }
+        let mut found = if path.is_dir() { in_folder(path)? } else { like(path)? };
         found.sort_by(|a, b| natural_order(&a.to_string_lossy(), &b.to_string_lossy()));
         images.append(&mut found);
     }
     Ok(images)
+}
+
+/// The two photographs that the arguments stand for, by name, folder or pattern.
+pub(crate) fn two_images(paths: &[PathBuf]) -> Result<[PathBuf; 2], Failure> {
+    <[PathBuf; 2]>::try_from(expand_images(paths)?).map_err(|images| match &images[..] {
+        [one] => Failure::usage(format!("two photographs are needed, and {} is one", one.display()))
+            .advice("name a second one"),
+        more => Failure::usage(format!("two photographs are taken at a time, not {}", more.len()))
+            .advice("run it on two of them after the other; `cv panorama` joins many that were taken from one place"),
+    })
+}
+
+/// True for a folder or a pattern.
+pub(crate) fn stands_for_many(path: &Path) -> bool {
+    let text = path.to_string_lossy();
+    path.is_dir() || (!path.exists() && (text.contains(['*', '?', '[']) || numbering(&text).is_some()))
+}
+
+/// The photographs in a folder.
+fn in_folder(path: &Path) -> Result<Vec<PathBuf>, Failure> {
+    let mut found = Vec::new();
+    for entry in fs::read_dir(path).during(format!("cannot list {}", path.display()))? {
+        let file = entry.during(format!("cannot list {}", path.display()))?.path();
+        let hidden = file.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.'));
+        if is_named_as_image(&file) && !hidden && file.is_file() {
+            found.push(file);
+        }
+    }
+    if found.is_empty() {
+        return Err(Failure::new(format!("there are no images in {}", path.display()))
+            .advice(format!("a folder with files that end in {}", ENDINGS[..3].join(", "))));
+    }
+    Ok(found)
+}
+
+fn is_named_as_image(file: &Path) -> bool {
+    let ending = file.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+    ENDINGS.contains(&ending.as_str())
+}
+
+/// The files that fit a pattern: the photographs among them by their names, all where none is named as one.
+fn like(path: &Path) -> Result<Vec<PathBuf>, Failure> {
+    let text = path.to_string_lossy();
+    let patterns = match numbering(&text) {
+        None => vec![text.to_string()],
+        Some((head, width, rest)) => {
+            (width..=width.max(MOST_DIGITS)).map(|n| format!("{head}{}{rest}", "[0-9]".repeat(n))).collect()
+        }
+    };
+    let options = glob::MatchOptions { require_literal_leading_dot: true, ..glob::MatchOptions::new() };
+    let mut found = Vec::new();
+    for pattern in patterns {
+        let files = glob::glob_with(&pattern, options).map_err(Failure::usage).during(path.display())?;
+        // What cannot be looked at is no photograph.
+        found.extend(files.flatten().filter(|file| file.is_file()));
+    }
+    if found.iter().any(|file| is_named_as_image(file)) {
+        found.retain(|file| is_named_as_image(file));
+    }
+    match found.is_empty() {
+        true => Err(Failure::new(format!("there are no images like {}", path.display())).advice("check the pattern")),
+        false => Ok(found),
+    }
+}
+
+/// The first number in the manner of C (`%d`, `%04d`) in a pattern: what stands before it, its least number of digits, and
+/// what follows.
+fn numbering(pattern: &str) -> Option<(&str, usize, &str)> {
+    pattern.match_indices('%').find_map(|(at, _)| {
+        let rest = &pattern[at + 1..];
+        let width = rest.find('d')?;
+        let digits = &rest[..width];
+        let width = if digits.is_empty() { 1 } else { digits.parse().ok().filter(|_| digits.starts_with('0'))? };
+        (width <= MOST_DIGITS).then(|| (&pattern[..at], width, &rest[digits.len() + 1..]))
+    })
 }
 
 /// Compares names with their runs of digits as numbers.
@@ -74,5 +142,36 @@ mod tests {
         let mut names = ["img10.png", "img2.png", "img1.png", "img02.png", "a.png", "img2b.png", "img.png"];
         names.sort_by(|a, b| natural_order(a, b));
         assert_eq!(names, ["a.png", "img.png", "img1.png", "img02.png", "img2.png", "img2b.png", "img10.png"]);
+    }
+
+    #[test]
+    fn patterns_are_those_of_a_shell_and_of_c() {
+        let folder = tempfile::tempdir().unwrap();
+        let make = |names: &[&str]| {
+            for name in names {
+                fs::write(folder.path().join(name), "x").unwrap();
+            }
+        };
+        let fits = |pattern: &str| -> Vec<String> {
+            let found = expand_images(&[folder.path().join(pattern)]).unwrap_or_default();
+            found.iter().map(|path| path.strip_prefix(folder.path()).unwrap().display().to_string()).collect()
+        };
+        make(&["f1.png", "f.png", "g1.png", "f1.txt", ".f2.png", "x1.raw", "x2.raw"]);
+        assert_eq!(fits("f*"), ["f.png", "f1.png"]);
+        assert_eq!(fits("[fg]?.png"), ["f1.png", "g1.png"]);
+        assert_eq!(fits("x*"), ["x1.raw", "x2.raw"]);
+        make(&["frame_12345.png", "frame_0001.png", "frame_001.png", "frame_00x1.png", "frame_0001.png.bak"]);
+        assert_eq!(fits("frame_%04d.png"), ["frame_0001.png", "frame_12345.png"]);
+        make(&["f7_left.png", "a_07.png", "a_7.png"]);
+        assert_eq!(fits("f%d*.png"), ["f1.png", "f7_left.png"]);
+        assert_eq!(fits("a*_%02d.png"), ["a_07.png"]);
+        fs::create_dir(folder.path().join("sub")).unwrap();
+        make(&["sub/c1.png", "sub/c[1].png"]);
+        assert_eq!(fits("s*/c%d.png"), ["sub/c1.png"]);
+        // Names of files that are there, whatever they look like, and what is no number.
+        assert_eq!(fits("sub/c[1].png"), ["sub/c[1].png"]);
+        assert!(!stands_for_many(Path::new("100%.png")) && !stands_for_many(Path::new("50%4d.png")));
+        assert!(stands_for_many(Path::new("nowhere/frame_%04d.png")));
+        assert!(expand_images(&[folder.path().join("no*.png")]).unwrap_err().text().contains("no*.png"));
     }
 }

@@ -3,6 +3,7 @@
 //! [`Outcome`] is what a command achieved and [`Failure`] why it did not; [`Context`] is what it knows of how it was called.
 
 mod called;
+mod config;
 mod context;
 mod failure;
 mod inputs;
@@ -14,18 +15,19 @@ mod progress;
 mod stop;
 
 pub(crate) use called::Called;
+pub(crate) use config::complete;
 pub(crate) use context::Context;
 pub(crate) use failure::{Explain, Failure};
-pub(crate) use inputs::expand_images;
+pub(crate) use inputs::{expand_images, stands_for_many, two_images};
 pub(crate) use named::named;
 pub(crate) use outcome::Outcome;
-pub(crate) use outputs::{check_outputs, create_dir, picture_name, same_file, spare_inputs};
+pub(crate) use outputs::{CLOUD, JSON, MAP, Output, PICTURE, PNG, TEXT, same_file, spare_inputs};
 
 use clap::{Args, value_parser};
 use std::{
     io::{self, Write},
     panic::{AssertUnwindSafe, catch_unwind},
-    path::{Path, PathBuf},
+    path::PathBuf,
     process::ExitCode,
     time::Instant,
 };
@@ -54,6 +56,13 @@ pub(crate) struct Globals {
     /// Write DIR/report.html, one file with the pictures and figures of this run inside.
     #[arg(long, global = true, value_name = "DIR")]
     pub(crate) report: Option<PathBuf>,
+    /// Take options from this file [default: cv.toml, where the current folder has one]: a table for each command, such as [segment.train], with the long
+    /// names of its options as keys. The command line wins.
+    #[arg(long, global = true, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+    /// Print the options that hold, as a file for --config, and do nothing.
+    #[arg(long, global = true)]
+    pub(crate) print_config: bool,
 }
 
 /// A global option that not every command has a use for.
@@ -67,8 +76,8 @@ pub(crate) enum Global {
 
 /// A subcommand.
 pub(crate) trait Run: Args {
-    /// The files this run will write. The frame checks them before the work starts.
-    fn outputs(&self) -> Vec<&Path> {
+    /// What this run will write. The frame checks before the work starts whether it can be written.
+    fn outputs(&self) -> Vec<Output<'_>> {
         Vec::new()
     }
 
@@ -103,7 +112,7 @@ pub(crate) fn run(
     let failure = match result {
         Ok(mut outcome) => {
             let but = outcome.take_but();
-            match finish(outcome, globals, start).err().or(but) {
+            match finish(outcome, context.take_stdout(), globals, start).err().or(but) {
                 None => return ExitCode::SUCCESS,
                 Some(failure) => failure,
             }
@@ -124,13 +133,15 @@ fn start_threads(threads: Option<u16>) -> Result<(), Failure> {
 }
 
 /// Prints what the person asked to see.
-fn finish(outcome: Outcome, globals: &Globals, start: Instant) -> Result<(), Failure> {
+fn finish(outcome: Outcome, output: Vec<u8>, globals: &Globals, start: Instant) -> Result<(), Failure> {
     if globals.json {
         let object = outcome.into_json(start.elapsed().as_secs_f64())?;
         writeln!(io::stdout(), "{object}").during("cannot write to stdout")?;
         return Ok(());
     }
-    io::stdout().write_all(outcome.stdout()).during("cannot write to stdout")?;
+    let mut stdout = io::stdout();
+    let written = stdout.write_all(outcome.stdout()).and_then(|()| stdout.write_all(&output));
+    written.and_then(|()| stdout.flush()).during("cannot write to stdout")?;
     let summary = outcome.summary_text();
     if !globals.quiet && !summary.is_empty() {
         let _ = writeln!(io::stderr(), "{summary}");

@@ -30,7 +30,8 @@ fn models() -> impl Iterator<Item = (DistortionModel, &'static ColmapModel)> {
 pub(crate) fn parse_model(model: &str, width: usize, height: usize, parameters: &[f64]) -> Result<Camera, FormatError> {
     let wrong_count = || FormatError::corrupt(NAME, format!("{model} does not have {} parameters", parameters.len()));
     let Some((lens, form)) = models().find(|(_, m)| m.name == model) else {
-        return Err(FormatError::unsupported(NAME, format!("the model {model}")));
+        let names: Vec<&str> = models().map(|(_, m)| m.name).collect();
+        return Err(FormatError::unsupported(NAME, format!("the model {model} (it is one of {})", names.join(", "))));
     };
     let (fx, fy, rest) = match (form.focal_lengths, parameters) {
         (1, [f, rest @ ..]) => (*f, *f, rest),
@@ -87,7 +88,7 @@ fn find(text: &str) -> Result<Camera, FormatError> {
         };
         let words: Vec<&str> = content.split_whitespace().collect();
         let is_model =
-            |w: &&str| w.len() > 3 && w.bytes().all(|b| b.is_ascii_uppercase() || b.is_ascii_digit() || b == b'_');
+            |w: &&str| w.len() > 2 && w.bytes().all(|b| b.is_ascii_uppercase() || b.is_ascii_digit() || b == b'_');
         let words = match &words[..] {
             [model, rest @ ..] if is_model(model) && model.parse::<f64>().is_err() => (*model, rest),
             [id, model, rest @ ..] if id.parse::<u32>().is_ok() && is_model(model) => (*model, rest),

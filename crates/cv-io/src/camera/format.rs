@@ -1,15 +1,36 @@
 //! What a calibration format is: the interface that each format's file fills in.
 
+use std::cell::RefCell;
+
 use cv_core::{Camera, Distortion, DistortionModel};
 
-use super::RigFile;
+use super::{CalibrationNote, RigFile};
 use crate::FormatError;
 
-/// Width and height of the pictures, for files that do not say.
-pub(super) type Size = Option<(usize, usize)>;
+/// What a reader is given beside the text, and what it has to say of it.
+pub(super) struct Given {
+    /// Width and height of the pictures, for files that do not say.
+    pub(super) size: Option<(usize, usize)>,
+    /// What is not taken as it stands.
+    notes: RefCell<Vec<CalibrationNote>>,
+}
+
+impl Given {
+    pub(super) fn new(size: Option<(usize, usize)>) -> Self {
+        Self { size, notes: RefCell::default() }
+    }
+
+    pub(super) fn note(&self, note: CalibrationNote) {
+        self.notes.borrow_mut().push(note);
+    }
+
+    pub(super) fn into_notes(self) -> Vec<CalibrationNote> {
+        self.notes.into_inner()
+    }
+}
 
 /// Understands a text as a camera or a rig.
-type Read<T> = fn(&str, Size) -> Result<T, FormatError>;
+type Read<T> = fn(&str, &Given) -> Result<T, FormatError>;
 /// A camera or a rig as text; the notes become comments.
 type Write<T> = fn(&T, &[&str]) -> Result<String, FormatError>;
 

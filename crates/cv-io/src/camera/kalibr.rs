@@ -6,7 +6,7 @@ use cv_core::{Camera, Distortion, DistortionModel, StereoRig};
 use saphyr::Yaml;
 
 use super::RigFile;
-use super::format::{Format, Size, comments, smallest};
+use super::format::{Format, Given, comments, smallest};
 use super::yaml::{get, load, numbers, pose, required, size_of};
 use crate::FormatError;
 
@@ -25,11 +25,15 @@ fn one(document: &Yaml<'_>, key: &str) -> Result<Camera, FormatError> {
     let map = get(document, &[key]).ok_or_else(|| FormatError::missing(NAME, key))?;
     let word = |key| get(map, &[key]).and_then(|v| v.as_str()).ok_or_else(|| FormatError::missing(NAME, key));
     if word("camera_model")? != "pinhole" {
-        return Err(FormatError::unsupported(NAME, format!("the camera model {}", word("camera_model")?)));
+        let what = format!("the camera model {} (it is pinhole)", word("camera_model")?);
+        return Err(FormatError::unsupported(NAME, what));
     }
     let name = word("distortion_model")?;
     let lens = DistortionModel::ALL.iter().find(|m| m.info().kalibr == Some(name));
-    let lens = *lens.ok_or_else(|| FormatError::unsupported(NAME, format!("the distortion model {name}")))?;
+    let lens = *lens.ok_or_else(|| {
+        let names: Vec<&str> = DistortionModel::ALL.iter().filter_map(|m| m.info().kalibr).collect();
+        FormatError::unsupported(NAME, format!("the distortion model {name} (it is one of {})", names.join(", ")))
+    })?;
     let coefficients = get(map, &["distortion_coeffs"]).and_then(numbers);
     let coefficients = coefficients.ok_or_else(|| FormatError::missing(NAME, "distortion_coeffs"))?;
     // For a pinhole zeros may stand there.
@@ -45,7 +49,7 @@ fn one(document: &Yaml<'_>, key: &str) -> Result<Camera, FormatError> {
     Ok(Camera { distortion, ..Camera::pinhole(width, height, fx, fy, cx, cy) })
 }
 
-fn rig(text: &str, _: Size) -> Result<RigFile, FormatError> {
+fn rig(text: &str, _: &Given) -> Result<RigFile, FormatError> {
     let document = load(text)?;
     let [left, right] = [one(&document, "cam0")?, one(&document, "cam1")?];
     let second = get(&document, &["cam1"]).ok_or_else(|| FormatError::missing(NAME, "cam1"))?;

@@ -23,7 +23,7 @@ use cv_core::{Camera, StereoRig};
 
 use crate::files::{read_text, write_bytes};
 use crate::{FormatError, IoError};
-use format::Format;
+use format::{Format, Given};
 
 /// The table of formats, in the order in which a text is tried: the particular before the general.
 const FORMATS: &[&Format] = &[&own::FORMAT, &kalibr::FORMAT, &colmap::FORMAT, &matrix::FORMAT, &opencv::FORMAT];
@@ -96,15 +96,6 @@ impl std::fmt::Debug for CalibrationFormat {
     }
 }
 
-/// A camera as a file has it.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct CameraFile {
-    /// The camera.
-    pub camera: Camera,
-    /// Whether the file says what the lens's distortion is, be it none. A bare calibration matrix does not; its camera has none.
-    pub distortion_known: bool,
-}
-
 /// A stereo rig as a file has it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RigFile {
@@ -126,6 +117,32 @@ impl RigFile {
     }
 }
 
+/// Something of a calibration that is not taken as it stands.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub enum CalibrationNote {
+    /// The axes of the picture are taken to be at right angles.
+    SkewLeftOut {
+        /// The skew of the matrix, in px.
+        skew: f64,
+        /// The most that leaving it out moves a pixel of the picture, in px.
+        px: f64,
+    },
+    /// The file does not tell the distortion of the lens: a bare calibration matrix. The camera has none.
+    DistortionUnknown,
+}
+
+impl std::fmt::Display for CalibrationNote {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::SkewLeftOut { skew, px } => {
+                write!(f, "the skew of {skew} px is left out, which moves no pixel by more than {px:.3} px")
+            }
+            Self::DistortionUnknown => f.write_str("the distortion of the lens is not told"),
+        }
+    }
+}
+
 /// Parses a camera.
 ///
 /// Understood, by content: our own YAML (`schema: cv-camera/1`); OpenCV's FileStorage and ROS's `camera_info` YAML (under any of
@@ -134,13 +151,19 @@ impl RigFile {
 ///
 /// COLMAP's principal points have pixel centers at +0.5 and are brought to ours, at integers; all others are taken as they are.
 ///
-/// `size` is used where the text has no picture size (a bare matrix, OpenCV's sample programs); else it is ignored.
+/// `size` is used where the text has no picture size (a bare matrix, OpenCV's sample programs); else it is ignored. A skew that moves no
+/// pixel of the picture by more than a quarter of one is left out.
 ///
 /// # Errors
 /// [`FormatError`] with the line or the entry that is wrong or absent, or for a distortion model without an equal here.
 pub fn parse_camera(text: &str, size: Option<(usize, usize)>) -> Result<Camera, FormatError> {
-    let camera = (format_of(text)?.camera)(text, size)?;
-    checked(camera)
+    camera_and_notes(text, size).map(|(camera, _)| camera)
+}
+
+fn camera_and_notes(text: &str, size: Option<(usize, usize)>) -> Result<(Camera, Vec<CalibrationNote>), FormatError> {
+    let given = Given::new(size);
+    let camera = checked((format_of(text)?.camera)(text, &given)?)?;
+    Ok((camera, given.into_notes()))
 }
 
 /// Reads a camera; see [`parse_camera`].
@@ -148,20 +171,19 @@ pub fn parse_camera(text: &str, size: Option<(usize, usize)>) -> Result<Camera, 
 /// # Errors
 /// [`IoError`]: cannot be read as text, or as [`parse_camera`].
 pub fn read_camera(path: impl AsRef<Path>, size: Option<(usize, usize)>) -> Result<Camera, IoError> {
-    let path = path.as_ref();
-    parse_camera(&read_text(path)?, size).map_err(|reason| IoError::reading(path, reason))
+    read_camera_with_notes(path, size).map(|(camera, _)| camera)
 }
 
-/// Reads a camera and what the file leaves open; see [`parse_camera`].
+/// Reads a camera, and what of it is not taken as it stands; see [`parse_camera`].
 ///
 /// # Errors
 /// As [`read_camera`].
-pub fn read_camera_file(path: impl AsRef<Path>, size: Option<(usize, usize)>) -> Result<CameraFile, IoError> {
+pub fn read_camera_with_notes(
+    path: impl AsRef<Path>,
+    size: Option<(usize, usize)>,
+) -> Result<(Camera, Vec<CalibrationNote>), IoError> {
     let path = path.as_ref();
-    let text = read_text(path)?;
-    let file = parse_camera(&text, size)
-        .and_then(|camera| Ok(CameraFile { camera, distortion_known: format_of(&text)?.name != matrix::FORMAT.name }));
-    file.map_err(|reason| IoError::reading(path, reason))
+    camera_and_notes(&read_text(path)?, size).map_err(|reason| IoError::reading(path, reason))
 }
 
 /// Writes a camera as our own YAML; every number reads back to the same value. `notes` become comment lines.
@@ -180,17 +202,22 @@ pub fn write_camera(path: impl AsRef<Path>, camera: &Camera, notes: &[&str]) -> 
 /// # Errors
 /// As [`parse_camera`]; also where R is not a rotation to within 1e-3.
 pub fn parse_rig(text: &str, size: Option<(usize, usize)>) -> Result<RigFile, FormatError> {
+    rig_and_notes(text, size).map(|(file, _)| file)
+}
+
+fn rig_and_notes(text: &str, size: Option<(usize, usize)>) -> Result<(RigFile, Vec<CalibrationNote>), FormatError> {
     let Some(read) = format_of(text)?.rig else {
         return Err(FormatError::UnknownFormat { expected: "a stereo rig: YAML, ours, OpenCV's or Kalibr's" });
     };
-    let file = read(text, size)?;
+    let given = Given::new(size);
+    let file = read(text, &given)?;
     checked(file.rig.left)?;
     checked(file.rig.right)?;
     let t = &file.rig.right_from_left.translation;
     if !(t.norm() > 0.0 && t.norm().is_finite()) {
         return Err(FormatError::corrupt("rig", "the translation between the cameras is zero or not finite"));
     }
-    Ok(file)
+    Ok((file, given.into_notes()))
 }
 
 /// Reads a stereo rig; see [`parse_rig`].
@@ -198,8 +225,37 @@ pub fn parse_rig(text: &str, size: Option<(usize, usize)>) -> Result<RigFile, Fo
 /// # Errors
 /// [`IoError`]: cannot be read as text, or as [`parse_rig`].
 pub fn read_rig(path: impl AsRef<Path>, size: Option<(usize, usize)>) -> Result<RigFile, IoError> {
-    let path = path.as_ref();
-    parse_rig(&read_text(path)?, size).map_err(|reason| IoError::reading(path, reason))
+    read_rig_with_notes(&[path], size).map(|(file, _)| file)
+}
+
+/// Reads a stereo rig that is in one file or in several (OpenCV's sample writes `intrinsics.yml` and `extrinsics.yml`), and what of it is not
+/// taken as it stands; see [`parse_rig`].
+///
+/// # Errors
+/// As [`read_rig`], of the first file where they are wrong together.
+pub fn read_rig_with_notes(
+    paths: &[impl AsRef<Path>],
+    size: Option<(usize, usize)>,
+) -> Result<(RigFile, Vec<CalibrationNote>), IoError> {
+    let texts = paths.iter().map(|path| read_text(path.as_ref())).collect::<Result<Vec<_>, _>>()?;
+    rig_and_notes(&joined(texts), size)
+        .map_err(|reason| IoError::reading(paths.first().map_or(Path::new(""), AsRef::as_ref), reason))
+}
+
+/// The entries of several documents as those of one.
+fn joined(texts: Vec<String>) -> String {
+    let mut texts = texts.into_iter();
+    let mut all = texts.next().unwrap_or_default();
+    for text in texts {
+        all.push('\n');
+        let entries =
+            text.lines().filter(|line| !(line.starts_with("%YAML") || ["---", "..."].contains(&line.trim_end())));
+        entries.for_each(|line| {
+            all.push_str(line);
+            all.push('\n');
+        });
+    }
+    all
 }
 
 /// Writes a stereo rig as our own YAML. `notes` become comment lines.

@@ -8,7 +8,7 @@ use std::fmt::Write as _;
 use cv_core::{Camera, Distortion, DistortionModel, LensProjection, StereoRig};
 use saphyr::Yaml;
 
-use super::format::{Format, comments, smallest};
+use super::format::{Format, Given, comments, smallest};
 use super::matrix::pinhole;
 use super::yaml::{get, load, number, numbers, pose, required, size_of};
 use super::{RigFile, no_size};
@@ -46,19 +46,19 @@ const COEFFICIENTS: [&str; 12] = [
 pub(super) const FORMAT: Format = Format {
     name: "opencv",
     is: |text| text.starts_with("%YAML") || text.contains(':'),
-    camera: |text, size| camera(&load(text)?, size),
-    rig: Some(|text, size| rig(&load(text)?, size)),
+    camera: |text, given| camera(&load(text)?, given),
+    rig: Some(|text, given| rig(&load(text)?, given)),
     camera_text: Some(camera_text),
     rig_text: Some(rig_text),
 };
 
-fn camera(document: &Yaml<'_>, size: Option<(usize, usize)>) -> Result<Camera, FormatError> {
+fn camera(document: &Yaml<'_>, given: &Given) -> Result<Camera, FormatError> {
     let mut names: Vec<&str> = MATRIX.to_vec();
     names.extend(["cameraMatrix1", "camera_matrix_1", "left_camera_matrix"]);
-    one(document, &names, &COEFFICIENTS, size)
+    one(document, &names, &COEFFICIENTS, given)
 }
 
-fn rig(document: &Yaml<'_>, size: Option<(usize, usize)>) -> Result<RigFile, FormatError> {
+fn rig(document: &Yaml<'_>, given: &Given) -> Result<RigFile, FormatError> {
     let left = one(
         document,
         &[
@@ -82,7 +82,7 @@ fn rig(document: &Yaml<'_>, size: Option<(usize, usize)>) -> Result<RigFile, For
             "dist_left",
             "distCoeffsL",
         ],
-        size,
+        given,
     )?;
     let right = one(
         document,
@@ -107,33 +107,24 @@ fn rig(document: &Yaml<'_>, size: Option<(usize, usize)>) -> Result<RigFile, For
             "dist_right",
             "distCoeffsR",
         ],
-        size,
+        given,
     )?;
     let r = required(document, NAME, &["R", "rotation", "rotation_matrix", "Rot"])?;
     let t = required(document, NAME, &["T", "translation", "translation_vector", "Trns", "t"])?;
     Ok(RigFile { rig: StereoRig { left, right, right_from_left: pose(NAME, r, t)? }, unit: String::new() })
 }
 
-fn one(
-    document: &Yaml<'_>,
-    matrix: &[&str],
-    coefficients: &[&str],
-    size: Option<(usize, usize)>,
-) -> Result<Camera, FormatError> {
+fn one(document: &Yaml<'_>, matrix: &[&str], coefficients: &[&str], given: &Given) -> Result<Camera, FormatError> {
     let m: [f64; 9] = required(document, NAME, matrix)?;
-    let (width, height) = image_size(document)?.or(size).ok_or_else(|| no_size(NAME))?;
-    let mut camera = pinhole(NAME, m, (width, height))?;
+    let (width, height) = image_size(document)?.or(given.size).ok_or_else(|| no_size(NAME))?;
+    let mut camera = pinhole(NAME, m, (width, height), given)?;
     let k = match get(document, coefficients) {
         None => Vec::new(),
         Some(v) => {
             numbers(v).ok_or_else(|| FormatError::corrupt(NAME, "the distortion coefficients are not numbers"))?
         }
     };
-    let model = get(document, &["distortion_model", "camera_model", "model"]).and_then(|m| m.as_str()).unwrap_or("");
-    // OpenCV's calibration sample writes its flag.
-    let flag = get(document, &["fisheye_model"]).and_then(number).is_some_and(|v| v != 0.0);
-    let projection = if flag { LensProjection::Fisheye } else { projection(&model.to_lowercase()) };
-    camera.distortion = distortion(&k, projection)?;
+    camera.distortion = distortion(&k, projection_of(document)?)?;
     Ok(camera)
 }
 
@@ -155,13 +146,39 @@ fn image_size(document: &Yaml<'_>) -> Result<Option<(usize, usize)>, FormatError
     }
 }
 
-/// What a model's name, ROS's or one that people use, says of the lens.
-fn projection(name: &str) -> LensProjection {
+/// What a document says of the lens's projection.
+fn projection_of(document: &Yaml<'_>) -> Result<LensProjection, FormatError> {
+    // OpenCV's calibration sample writes its flag.
+    let mut fisheye = get(document, &["fisheye_model"]).and_then(number).is_some_and(|v| v != 0.0);
+    for key in ["distortion_model", "camera_model", "model_type", "model"] {
+        let Some(name) = get(document, &[key]).and_then(|m| m.as_str()) else { continue };
+        match projection(&name.to_lowercase()) {
+            Some(projection) => fisheye |= projection == LensProjection::Fisheye,
+            // Of the camera, perhaps.
+            None if key == "model" => {}
+            None => {
+                let known: Vec<&str> =
+                    DistortionModel::ALL.iter().filter_map(|m| m.info().ros).chain(FISHEYE).collect();
+                let what = format!("the {key} {name} (it is pinhole or one of {})", known.join(", "));
+                return Err(FormatError::unsupported(NAME, what));
+            }
+        }
+    }
+    Ok(if fisheye { LensProjection::Fisheye } else { LensProjection::Perspective })
+}
+
+/// Names that people use beside ROS's and Kalibr's.
+const FISHEYE: [&str; 2] = ["fisheye", "kannala_brandt"];
+const PERSPECTIVE: [&str; 9] =
+    ["", "pinhole", "perspective", "opencv", "standard", "brown", "brown_conrady", "rational", "thin_prism"];
+
+/// What a model's name says of the lens.
+fn projection(name: &str) -> Option<LensProjection> {
     let named = DistortionModel::ALL.iter().map(|m| m.info()).find(|i| [i.ros, i.kalibr].contains(&Some(name)));
     match named {
-        Some(info) => info.projection,
-        None if ["fisheye", "kannala_brandt"].contains(&name) => LensProjection::Fisheye,
-        None => LensProjection::Perspective,
+        Some(info) => Some(info.projection),
+        None if FISHEYE.contains(&name) => Some(LensProjection::Fisheye),
+        None => PERSPECTIVE.contains(&name).then_some(LensProjection::Perspective),
     }
 }
 

@@ -68,7 +68,7 @@ fn colmap_lines_lose_their_half_pixel() {
     let error = parse_camera("SIMPLE_RADIAL 2832 2128 2973.3 1416 1064", None).unwrap_err().to_string();
     assert!(error.contains("3 parameters"), "{error}");
     let error = parse_camera("1 THIN_PRISM_FISHEYE 9 9 1 1 1 1 1 1 1 1 1 1 1 1", None).unwrap_err().to_string();
-    assert!(error.contains("THIN_PRISM_FISHEYE is not supported"), "{error}");
+    assert!(error.contains("THIN_PRISM_FISHEYE") && error.contains("OPENCV_FISHEYE"), "{error}");
 }
 
 #[test]

@@ -22,7 +22,16 @@ pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
     } else {
         memory::product(&[side(width), side(height), 2 * u64::from(components)])
     };
-    Ok(Header { width, height, channels, depth: 1, beside, exif: decoder.exif().cloned(), orientation: None })
+    Ok(Header {
+        width,
+        height,
+        channels,
+        depth: 1,
+        beside,
+        exif: decoder.exif().cloned(),
+        icc: decoder.icc_profile(),
+        orientation: None,
+    })
 }
 
 /// The segments of a file by their markers: the second byte of each, and what follows its length. Stray and filling bytes between them are passed over.

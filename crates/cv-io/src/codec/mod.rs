@@ -12,6 +12,8 @@ mod png;
 mod pnm;
 #[cfg(feature = "tiff")]
 mod tiff;
+#[cfg(feature = "webp")]
+mod webp;
 
 use crate::{FormatError, memory};
 
@@ -28,6 +30,7 @@ pub(crate) enum Format {
     Pnm,
     OpenExr,
     Hdr,
+    WebP,
 }
 
 /// What a file says before its first pixel.
@@ -44,6 +47,8 @@ pub(crate) struct Header {
     pub(crate) beside: u64,
     /// The EXIF block (a TIFF structure).
     pub(crate) exif: Option<Vec<u8>>,
+    /// The ICC color profile.
+    pub(crate) icc: Option<Vec<u8>>,
     /// The orientation tag, 1 to 8, where it stands outside an EXIF block.
     pub(crate) orientation: Option<u8>,
 }
@@ -87,6 +92,7 @@ impl Format {
             Self::Pnm => "PNM",
             Self::OpenExr => "OpenEXR",
             Self::Hdr => "Radiance HDR",
+            Self::WebP => "WebP",
         }
     }
 
@@ -101,7 +107,9 @@ impl Format {
             Self::Tiff => tiff::header(bytes),
             #[cfg(feature = "exr")]
             Self::OpenExr => exr::header(bytes),
-            #[cfg(not(all(feature = "tiff", feature = "exr")))]
+            #[cfg(feature = "webp")]
+            Self::WebP => webp::header(bytes),
+            #[cfg(not(all(feature = "tiff", feature = "exr", feature = "webp")))]
             _ => Err(self.left_out()),
         }
     }
@@ -118,12 +126,14 @@ impl Format {
             Self::Tiff => tiff::raster(bytes),
             #[cfg(feature = "exr")]
             Self::OpenExr => exr::raster(bytes, header),
-            #[cfg(not(all(feature = "tiff", feature = "exr")))]
+            #[cfg(feature = "webp")]
+            Self::WebP => webp::raster(bytes),
+            #[cfg(not(all(feature = "tiff", feature = "exr", feature = "webp")))]
             _ => Err(self.left_out()),
         }
     }
 
-    #[cfg(not(all(feature = "tiff", feature = "exr")))]
+    #[cfg(not(all(feature = "tiff", feature = "exr", feature = "webp")))]
     fn left_out(self) -> FormatError {
         FormatError::unsupported_picture(self.name(), "a format left out of this build")
     }

@@ -21,6 +21,7 @@ pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
         depth: if deep { 2 } else { 1 },
         beside,
         exif: info.exif_metadata.as_ref().map(|block| block.to_vec()),
+        icc: info.icc_profile.as_ref().map(|profile| profile.to_vec()),
         orientation: None,
     })
 }
@@ -60,7 +61,6 @@ pub(super) fn raster(bytes: &[u8]) -> Result<Raster, FormatError> {
 fn reader(bytes: &[u8]) -> Result<Reader<Cursor<&[u8]>>, FormatError> {
     let mut decoder = Decoder::new_with_limits(Cursor::new(bytes), Limits { bytes: HEADER_BYTES });
     decoder.set_ignore_text_chunk(true);
-    decoder.set_ignore_iccp_chunk(true);
     decoder.set_transformations(Transformations::EXPAND);
     decoder.read_info().map_err(fail)
 }

@@ -14,6 +14,7 @@ pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
     let (width, height) = decoder.dimensions().map_err(fail)?;
     // A damaged tag does not cost the picture.
     let orientation = decoder.find_tag_unsigned::<u8>(Tag::Orientation).ok().flatten();
+    let icc = decoder.find_tag(Tag::IccProfile).ok().flatten().and_then(|profile| profile.into_u8_vec().ok());
     // Pixels that are not read are refused with them.
     let (channels, depth, planes) = kind(&mut decoder).unwrap_or((4, 4, false));
     let inks = decoder.colortype().is_ok_and(|color| matches!(color, ColorType::CMYK(_)));
@@ -22,7 +23,7 @@ pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
     let chunk = jpeg_chunk(&mut decoder, bytes);
     let beside = chunk.max(copy.saturating_mul(u64::from(planes) + u64::from(inks)));
     let channels = if inks { 3 } else { channels };
-    Ok(Header { width: width as usize, height: height as usize, channels, depth, beside, exif: None, orientation })
+    Ok(Header { width: width as usize, height: height as usize, channels, depth, beside, exif: None, icc, orientation })
 }
 
 /// The most bytes that a strip or tile of JPEG takes, by its own header, which need not be that of the picture: four bytes a pixel and

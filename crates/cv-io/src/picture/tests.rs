@@ -348,8 +348,11 @@ fn four_inks_become_three_lights() {
 #[test]
 fn linear_light_is_encoded_for_the_eye() {
     let light = [[0.0, 1.0, 0.5], [0.0, 0.003_130_8, 2.0], [-1.0, 0.18, 0.18], [f32::NAN, 0.0, 1.0]];
-    let picture =
-        DynImage { pixels: Pixels::RgbF32(RgbF32::from_fn(4, 1, |x, _| light[x])), exif: ExifInfo::default() };
+    let picture = DynImage {
+        pixels: Pixels::RgbF32(RgbF32::from_fn(4, 1, |x, _| light[x])),
+        exif: ExifInfo::default(),
+        metadata: Metadata::default(),
+    };
     // IEC 61966-2-1 at 0.5, at its corner, and at the photographer's gray.
     let expected = [0, 255, 188, 0, 10, 255, 0, 118, 118, 0, 0, 255];
     assert_eq!(picture.into_rgb8().as_slice(), expected);
@@ -452,7 +455,7 @@ fn names_do_not_matter_and_other_formats_are_named() {
     assert_eq!(read_rgb(&path).unwrap(), ramp(4, 3));
     for (bytes, word) in [
         (&b"GIF89a____________"[..], "GIF"),
-        (b"RIFF____WEBPVP8 ", "WebP"),
+        (b"RIFF\x08\0\0\0WEBPVP8 ", "WebP"),
         (b"\0\0\0\x20ftypheic\0\0\0\0", "HEIC"),
         (b"%PDF-1.7", "PDF"),
         (b"Pf\n2 2\n-1\n", "PFM"),

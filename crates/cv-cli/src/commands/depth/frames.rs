@@ -1,149 +1,132 @@
-//! `cv depth` on frames: one pair after the other with the same buffers.
+//! `cv depth` on frames: one pair after the other with the same memory.
 
 use super::pairing::pair;
-use super::{Args, Range, say_memory};
-use crate::frame::{Context, Explain, Failure, Outcome, expand_images};
-use crate::words;
+use super::{Args, Film, report};
+use crate::frame::{Context, Explain, Failure, Outcome, expand_images, stands_for_many};
+use crate::photos::{Photos, at_own_depth};
 use cv_core::Stage;
-use cv_pipeline::FrameDepth;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-
-/// True for a folder or a pattern.
-pub(super) fn is_sequence(path: &Path) -> bool {
-    let text = path.to_string_lossy();
-    path.is_dir() || (!path.exists() && (text.contains('*') || numbering(&text).is_some()))
-}
-
-/// The frames of a folder or pattern, in the order of their numbers.
-fn frames(path: &Path) -> Result<Vec<PathBuf>, Failure> {
-    if path.is_dir() {
-        return expand_images(&[path.to_owned()]);
-    }
-    let pattern = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let folder = match path.parent() {
-        Some(folder) if !folder.as_os_str().is_empty() => folder.to_owned(),
-        _ => PathBuf::from("."),
-    };
-    let mut found = expand_images(&[folder])?;
-    found.retain(|file| matches(&pattern, &file.file_name().unwrap_or_default().to_string_lossy()));
-    if found.is_empty() {
-        return Err(Failure::new(format!("there are no images like {}", path.display())).advice("check the pattern"));
-    }
-    Ok(found)
-}
-
-/// The first number in the manner of C (`%d`, `%04d`) in a pattern: what stands before it, its least number of digits, and
-/// what follows.
-fn numbering(pattern: &str) -> Option<(&str, usize, &str)> {
-    pattern.match_indices('%').find_map(|(at, _)| {
-        let rest = &pattern[at + 1..];
-        let width = rest.find('d')?;
-        let digits = &rest[..width];
-        let width = if digits.is_empty() { 1 } else { digits.parse().ok().filter(|_| digits.starts_with('0'))? };
-        Some((&pattern[..at], width, &rest[digits.len() + 1..]))
-    })
-}
-
-/// Whether a name fits a pattern in which `*` stands for anything and `%04d` for a number of at least four digits.
-fn matches(pattern: &str, name: &str) -> bool {
-    if let Some((head, width, rest)) = numbering(pattern).filter(|(head, ..)| !head.contains('*')) {
-        return name.strip_prefix(head).is_some_and(|name| {
-            let digits = name.len() - name.trim_start_matches(|c: char| c.is_ascii_digit()).len();
-            (width..=digits).any(|n| matches(rest, &name[n..]))
-        });
-    }
-    match pattern.split_once('*') {
-        None => pattern == name,
-        Some((head, rest)) => name.strip_prefix(head).is_some_and(|name| {
-            (0..=name.len()).filter(|&i| name.is_char_boundary(i)).any(|i| matches(rest, &name[i..]))
-        }),
-    }
-}
+use std::time::Instant;
 
 impl Args {
-    /// Frame after frame with the same buffers.
+    /// Frame after frame. Of each only what is written stays, and of the first what the report shows.
     pub(super) fn run_frames(&self, context: &Context) -> Result<Outcome, Failure> {
         for (path, other) in [(&self.left, &self.right), (&self.right, &self.left)] {
-            if !is_sequence(path) {
+            if !stands_for_many(path) {
                 return Err(Failure::new(format!("{} is one image, {} is not", path.display(), other.display()))
                     .advice("give two images, or two folders or patterns of frames"));
             }
         }
-        if self.disparities == Range::Auto
-            || self.depth.is_some()
+        let [lefts, rights] = [&self.left, &self.right].map(|path| expand_images(std::slice::from_ref(path)));
+        let pairs = pair(&lefts?, &rights?, self.pair_by)?;
+        one_name_each(&pairs)?;
+        let whole = context.wants_report()
             || self.cloud.is_some()
-            || self.rig.is_some()
-            || self.confidence.is_some()
             || self.matched.is_some()
-            || self.uncertainty.is_some()
-            || context.wants_report()
-        {
-            return Err(Failure::usage("frames give disparities only")
-                .advice("leave out --rig, --depth, --cloud, --confidence, --matched, --uncertainty and --report, and give the number of disparities"));
-        }
-        let (lefts, rights) = (frames(&self.left)?, frames(&self.right)?);
-        let pairs = pair(&lefts, &rights, self.pair_by)?;
-        if self.output.exists() && !self.output.is_dir() {
-            return Err(Failure::new(format!("{} is not a folder", self.output.display()))
-                .advice("give a folder for the disparities of the frames"));
-        }
-        let options = self.options(context).stereo;
-        let mut film = FrameDepth::new(options.clone())?;
-        let (mut size, mut seconds, mut valid, mut matched) = ((0, 0), 0.0, 0.0, 0.0);
+            || [&self.depth, &self.confidence, &self.uncertainty].iter().any(|map| map.is_some());
+        let started = Instant::now();
+        let (mut film, mut size): (Option<Film>, _) = (None, [(0, 0); 2]);
+        let (mut seconds, mut frames, mut first) = (0.0, Vec::with_capacity(pairs.len()), None);
         let stage = Stage::new(context, "frames", pairs.len())?;
-        for (i, (left, right)) in pairs.iter().enumerate() {
-            let (a, b) = (cv_io::read_rgb(left)?, cv_io::read_rgb(right)?);
-            if a.size() != size {
-                size = a.size();
-                say_memory(&options, size, context)?;
+        for (left, right) in &pairs {
+            let photos = Photos::read(left, right)?;
+            // Frames of another size begin another film.
+            if size != photos.sizes() {
+                film = None;
+                size = photos.sizes();
             }
-            let start = std::time::Instant::now();
-            let map = film
-                .next(a.view(), b.view(), &stage)
-                .map_err(|error| words::no_depth(error, false))
-                .during(left.display())?;
-            seconds += start.elapsed().as_secs_f64();
-            valid += map.valid_fraction() / pairs.len() as f64;
-            matched += map.matched_fraction() / pairs.len() as f64;
-            if i == 0 {
-                // Not before there is something to put there.
-                std::fs::create_dir_all(&self.output).during(self.output.display())?;
+            let film = match &mut film {
+                Some(film) => film,
+                None => film.insert(self.film(&photos, [left, right], context)?),
+            };
+            let one = self.of_frame(left);
+            let start = Instant::now();
+            let told = |error| self.refused(error);
+            let shares = if whole {
+                let job =
+                    at_own_depth!(photos, |a, b| film.frames.next_depth(a, b, self.wants_points(context), &stage));
+                let job = job.map_err(told).during(left.display())?;
+                seconds += start.elapsed().as_secs_f64();
+                one.write(&job, film.meters, context)?;
+                let shares = (job.maps.map.matched_fraction(), job.maps.map.valid_fraction());
+                if context.wants_report() && first.is_none() {
+                    first = Some(job);
+                }
+                shares
+            } else {
+                let map = at_own_depth!(photos, |a, b| film.frames.next(a, b, &stage));
+                let map = map.map_err(told).during(left.display())?;
+                seconds += start.elapsed().as_secs_f64();
+                one.write_disparity(map, context)?;
+                (map.matched_fraction(), map.valid_fraction())
+            };
+            if frames.is_empty() {
+                self.say_range(film, context);
             }
-            let name = Path::new(left.file_stem().unwrap_or_default()).with_extension("pfm");
-            cv_io::pfm::write(self.output.join(name), map.disparity.view())?;
+            frames.push((left.clone(), shares.0, shares.1));
             stage.add(1)?;
         }
-        let rate = pairs.len() as f64 / seconds;
-        let (width, height) = size;
+        let count = frames.len() as f64;
+        let mean = |share: fn(&(PathBuf, f64, f64)) -> f64| frames.iter().map(share).sum::<f64>() / count;
+        let (matched, valid) = (mean(|frame| frame.1), mean(|frame| frame.2));
+        let (rate, total) = (count / seconds, count / started.elapsed().as_secs_f64());
+        if let Some(job) = &first {
+            super::warn_of_filling(&job.maps, context);
+            context.report(|| report::report(job, &frames))?;
+        }
+        let (width, height) = film.as_ref().map_or((0, 0), |film| film.size);
+        let disparities = film.as_ref().and_then(|film| film.frames.disparities());
         Ok(Outcome::new(vec![("match", seconds)])
-            .with("frames", pairs.len())
+            .with("frames", frames.len())
             .with("frames_per_second", rate)
+            .with("frames_per_second_with_files", total)
             .with("width", width)
             .with("height", height)
             .with("valid_fraction", valid)
             .with("matched_fraction", matched)
+            .with("disparities", disparities.map(|(_, count)| count))
+            .with("min_disparity", disparities.map(|(first, _)| first))
             .summary(format!(
-                "{} frames of {width}×{height} px, {:.1} % matched and confirmed, {rate:.1} frames per second of matching",
-                pairs.len(),
+                "{} frames of {width}×{height} px, {:.1} % matched and confirmed, {rate:.1} frames per second of matching, {total:.1} with reading and writing",
+                frames.len(),
                 100.0 * matched
             )))
     }
+
+    /// The arguments for one frame: its files in the folders that are named as outputs.
+    fn of_frame(&self, left: &Path) -> Self {
+        let file = |folder: &PathBuf, ending: &str| {
+            let mut name = left.file_stem().unwrap_or_default().to_owned();
+            name.push(".");
+            name.push(ending);
+            folder.join(name)
+        };
+        let map = |folder: &Option<PathBuf>| folder.as_ref().map(|folder| file(folder, "pfm"));
+        Self {
+            output: file(&self.output, "pfm"),
+            depth: map(&self.depth),
+            cloud: self.cloud.as_ref().map(|folder| file(folder, "ply")),
+            confidence: map(&self.confidence),
+            matched: self.matched.as_ref().map(|folder| file(folder, "png")),
+            uncertainty: map(&self.uncertainty),
+            ..self.clone()
+        }
+    }
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn patterns_are_those_of_a_shell_and_of_c() {
-        let fits = |pattern: &str, names: &[&str]| names.iter().map(|name| matches(pattern, name)).collect::<Vec<_>>();
-        assert_eq!(fits("f*.png", &["f1.png", "f.png", "g1.png", "f1.jpg"]), [true, true, false, false]);
-        let names = ["frame_0001.png", "frame_12345.png", "frame_001.png", "frame_00x1.png", "frame_0001.png.bak"];
-        assert_eq!(fits("frame_%04d.png", &names), [true, true, false, false, false]);
-        assert_eq!(fits("f%d*.png", &["f7.png", "f7_left.png", "f.png"]), [true, true, false]);
-        assert_eq!(fits("*_%02d.png", &["a_07.png", "a_7.png"]), [true, false]);
-        // Not a number: the name of a file.
-        assert!(!is_sequence(Path::new("100%.png")) && !is_sequence(Path::new("50%4d.png")));
-        assert!(is_sequence(Path::new("nowhere/frame_%04d.png")));
+/// Refuses frames whose results would have one name.
+fn one_name_each(pairs: &[(PathBuf, PathBuf)]) -> Result<(), Failure> {
+    let mut known = BTreeMap::new();
+    for (left, _) in pairs {
+        if let Some(other) = known.insert(left.file_stem(), left) {
+            return Err(Failure::new(format!(
+                "{} and {} would be written to one file",
+                other.display(),
+                left.display()
+            ))
+            .advice("select frames of different names by a pattern"));
+        }
     }
+    Ok(())
 }

@@ -1,39 +1,25 @@
 //! Maps of floats in files.
 
-use crate::frame::{Explain, Failure};
+use crate::frame::{Context, Explain, Failure, MAP, Output};
 use cv_core::{GrayF32, ImageView};
 use cv_io::FormatError;
 use std::path::Path;
 
-/// The formats a map can be written in.
-pub(super) enum MapFormat {
-    Pfm,
-    Png,
-    Npy,
-}
-
-pub(super) fn map_format(path: &Path) -> Result<MapFormat, Failure> {
-    match path.extension().unwrap_or_default().to_string_lossy().to_lowercase().as_str() {
-        "pfm" => Ok(MapFormat::Pfm),
-        "png" => Ok(MapFormat::Png),
-        "npy" => Ok(MapFormat::Npy),
-        _ => Err(Failure::usage(format!("{} does not tell a format by its ending", path.display()))
-            .advice("end it with .pfm, .png or .npy")),
-    }
-}
-
-/// Writes a map. `Some` count where values did not fit the format.
-pub(super) fn write_map(
+/// Writes a map as the ending of its name says, by `png` where that is one. `Some` count where values did not fit the format.
+pub(super) fn write_map<'m>(
+    context: &Context,
     path: &Path,
-    map: ImageView<'_, f32, 1>,
-    png: impl FnOnce(&Path, ImageView<'_, f32, 1>) -> Result<usize, cv_io::IoError>,
+    map: ImageView<'m, f32, 1>,
+    png: impl FnOnce(&Path, ImageView<'m, f32, 1>) -> Result<usize, cv_io::IoError>,
 ) -> Result<Option<usize>, Failure> {
-    match map_format(path)? {
-        MapFormat::Pfm => cv_io::pfm::write(path, map)?,
-        MapFormat::Npy => cv_io::npy::write(path, &cv_io::npy::NpyArray::from_view(map))?,
-        MapFormat::Png => return Ok(Some(png(path, map)?).filter(|&lost| lost > 0)),
-    }
-    Ok(None)
+    let lost = context.write(Output::File(path, MAP), |path| {
+        match path.extension().unwrap_or_default().to_string_lossy().to_lowercase().as_str() {
+            "npy" => cv_io::npy::write(path, &cv_io::npy::NpyArray::from_view(map)).map(|()| 0),
+            "png" => png(path, map),
+            _ => cv_io::pfm::write(path, map).map(|()| 0),
+        }
+    })?;
+    Ok(Some(lost).filter(|&lost| lost > 0))
 }
 
 /// A map of any of the formats that truth and estimates come in: PFM, KITTI's PNG or (with `scale`) another one, NumPy's.

@@ -4,24 +4,22 @@ mod frames;
 mod maps;
 mod options;
 mod pairing;
-mod photos;
 mod report;
 
 use super::size;
-use crate::frame::{Context, Failure, Global, Outcome, Run, named};
+use crate::frame::{CLOUD, Context, Failure, Global, MAP, Outcome, Output, PNG, Run, named, stands_for_many};
+use crate::photos::{Photos, at_own_depth};
 use crate::{rig, words};
-use cv_core::{ImageView, PointCloud};
+use cv_core::ImageView;
 use cv_io::ply::PlyEncoding;
 use cv_pipeline::stereo::{
-    Census, IntensityCost, Paths, PixelState, Rectification, RectifyOptions, Smoothing, StereoGeometry, StereoMatcher,
-    StereoOptions,
+    Census, DisparityMap, IntensityCost, Paths, PixelState, Rectification, RectifyOptions, Smoothing, StereoGeometry,
+    StereoMatcher, StereoOptions,
 };
-use cv_pipeline::{DepthError, DepthOptions, DepthResult, RigDepthResult, depth, depth_by_rig};
-use frames::is_sequence;
-use maps::{map_format, write_map};
+use cv_pipeline::{DepthError, DepthOptions, DepthResult, FrameDepth, RigDepthResult};
+use maps::write_map;
 use options::{Range, parse_range};
 use pairing::PairBy;
-use photos::{Photos, at_own_depth};
 use std::path::{Path, PathBuf};
 
 pub(crate) use maps::read_map;
@@ -32,7 +30,7 @@ pub(crate) use report::{fractions, scene};
 /// Without --rig the photographs must be rectified: the same scene point lies in the same row of both. Disparity is the
 /// column in the left photograph minus that in the right one. Pixels that only the left camera sees are filled from their
 /// surroundings unless --no-fill is given.
-#[derive(Debug, clap::Args)]
+#[derive(Debug, Clone, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv depth left.png right.png -o disparity.pfm\n  \
     cv depth left.png right.png -o d.pfm --focal 1000 --baseline 0.12 --depth depth.pfm --cloud cloud.ply\n  \
@@ -46,7 +44,11 @@ pub(crate) struct Args {
     left: PathBuf,
     /// The right photograph, or as many frames.
     right: PathBuf,
-    /// Where to write the disparity: .pfm, .png or .npy; for frames a folder, which gets NAME.pfm of each.
+    /// What a shell makes of a pattern without quotes.
+    #[arg(hide = true)]
+    more: Vec<PathBuf>,
+    /// Where to write the disparity: .pfm, .png or .npy; for frames a folder, which gets NAME.pfm of each. So with all other outputs: of frames they
+    /// are folders, which get NAME.pfm, NAME.ply of the cloud, or NAME.png of --matched.
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// How frames are paired [default: by name where the names are the same, else by number]. Frames without a partner are
@@ -60,17 +62,17 @@ pub(crate) struct Args {
     /// needs.
     #[arg(long, value_name = "FILE")]
     cloud: Option<PathBuf>,
-    /// Calibration of the rig, ours, OpenCV's or Kalibr's YAML (see `cv rectify --help`): the photographs are rectified first, and the maps
+    /// Calibration of the rig, ours, OpenCV's or Kalibr's YAML, twice for OpenCV's two files (see `cv rectify --help`): the photographs are rectified first, and the maps
     /// are those of the rectified left (or upper) one, which `cv rectify` writes.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["focal", "baseline"])]
-    rig: Option<PathBuf>,
+    rig: Vec<PathBuf>,
     /// The rig file has the cameras in the other order: its first one took the right (or lower) photograph.
     #[arg(long, requires = "rig")]
     exchange: bool,
     /// Width and height of the rectified photographs, such as 1280x960 [default: as `cv rectify`].
     #[arg(long, value_name = "WxH", value_parser = size, requires = "rig")]
     size: Option<(usize, usize)>,
-    /// Number of disparities to try, in pixels, or auto: from feature matches.
+    /// Number of disparities to try, in pixels, or auto: from feature matches; of frames, from those of the first pair for all.
     #[arg(long, value_name = "N|auto", default_value = "128", value_parser = parse_range)]
     disparities: Range,
     /// Smallest disparity to try, in pixels; may be negative [default: 0, or that of auto].
@@ -137,12 +139,15 @@ pub(crate) struct Args {
 }
 
 impl Run for Args {
-    fn outputs(&self) -> Vec<&Path> {
-        if is_sequence(&self.left) {
-            return Vec::new();
-        }
-        let more = [&self.depth, &self.cloud, &self.confidence, &self.matched, &self.uncertainty];
-        std::iter::once(&self.output).chain(more.into_iter().flatten()).map(|p| &**p).collect()
+    fn outputs(&self) -> Vec<Output<'_>> {
+        let maps = [Some(&self.output), self.depth.as_ref(), self.confidence.as_ref(), self.uncertainty.as_ref()];
+        let maps = maps.into_iter().flatten().map(|path| (path, MAP));
+        let others = [(&self.cloud, CLOUD), (&self.matched, PNG)];
+        let others = others.into_iter().filter_map(|(path, endings)| Some((path.as_ref()?, endings)));
+        // Frames have a file each.
+        let many = stands_for_many(&self.left);
+        let output = |(path, endings)| if many { Output::Folder(path) } else { Output::File(path, endings) };
+        maps.chain(others).map(|(path, endings): (&PathBuf, _)| output((path.as_path(), endings))).collect()
     }
 
     fn has_no_use_for(&self) -> &'static [Global] {
@@ -150,60 +155,34 @@ impl Run for Args {
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
-        if is_sequence(&self.left) || is_sequence(&self.right) {
+        if !self.more.is_empty() {
+            return Err(Failure::usage(format!(
+                "a left and a right photograph are needed, not {}",
+                2 + self.more.len()
+            ))
+            .advice("for frames give two folders, or two patterns in quotes: 'left/*.png' 'right/*.png'"));
+        }
+        if (self.depth.is_some() || self.cloud.is_some()) && self.rig.is_empty() && self.focal.is_none() {
+            return Err(Failure::usage("depth needs the geometry of the cameras")
+                .advice("give --focal and --baseline, or --rig"));
+        }
+        if stands_for_many(&self.left) || stands_for_many(&self.right) {
             return self.run_frames(context);
         }
         if self.pair_by.is_some() {
             return Err(Failure::usage("--pair-by is for frames, and these are two photographs"));
         }
-        let maps = [Some(&self.output), self.depth.as_ref(), self.confidence.as_ref(), self.uncertainty.as_ref()];
-        for path in maps.into_iter().flatten() {
-            map_format(path)?;
-        }
-        if let Some(path) = &self.matched
-            && !path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("png"))
-        {
-            return Err(Failure::usage(format!("{} is not a .png", path.display())).advice("end it with .png"));
-        }
-        if (self.depth.is_some() || self.cloud.is_some()) && self.rig.is_none() && self.focal.is_none() {
-            return Err(Failure::usage("depth needs the geometry of the cameras")
-                .advice("give --focal and --baseline, or --rig"));
-        }
         let photos = Photos::read(&self.left, &self.right)?;
-        let options = self.options(context);
-        // A baseline that is given by itself counts as one in meters.
-        let (job, meters) = match &self.rig {
-            Some(path) => self.by_rig(path, &photos, &options, context)?,
-            None => (self.rectified(photos, &options, context)?, 1.0),
-        };
-        let write_depth = |path: &Path, map: ImageView<'_, f32, 1>| {
-            cv_io::depth_mm::write(path, map.to_image().map(|[z]| [(f64::from(z) * meters) as f32]).view())
-        };
-        let DepthResult { map, depth, disparities, .. } = &job.maps;
-        if self.disparities == Range::Auto {
-            context.note(format!("disparities {} to {}", disparities.0, disparities.0 + disparities.1 as i32 - 1));
-        }
-        if let Some(lost) = write_map(&self.output, map.disparity.view(), |path, map| cv_io::kitti::write(path, map))? {
-            context
-                .warn(format!("{lost} disparities do not fit KITTI's range of 0 to 256 px and are stored as unknown"));
-        }
-        if let (Some(path), Some(depth)) = (&self.depth, depth)
-            && let Some(lost) = write_map(path, depth.view(), write_depth)?
-        {
-            context.warn(format!("{lost} depths do not fit 0 to 65.535 m and are stored as unknown"));
-        }
-        self.write_quality(&job.maps, write_depth, context)?;
-        if let Some(path) = &self.cloud {
-            cv_io::ply::write_cloud(path, &job.cloud, PlyEncoding::Binary)?;
-        }
+        let mut film = self.film(&photos, [&self.left, &self.right], context)?;
+        let points = self.wants_points(context);
+        let job = at_own_depth!(photos, |a, b| film.frames.next_depth(a, b, points, context));
+        let job = job.map_err(|error| self.refused(error))?;
+        self.say_range(&film, context);
+        self.write(&job, film.meters, context)?;
+        let DepthResult { map, disparities, .. } = &job.maps;
         let (valid, matched) = (map.valid_fraction(), map.matched_fraction());
-        if job.maps.is_mostly_filled() {
-            context.warn(format!(
-                "only {:.1} % of the pixels were matched; the others are filled in from around, and of such pixels about four in ten are wrong (--no-fill leaves them unknown)",
-                100.0 * matched
-            ));
-        }
-        context.report(|| report::report(&job))?;
+        warn_of_filling(&job.maps, context);
+        context.report(|| report::report(&job, &[]))?;
         let (width, height) = map.disparity.size();
         Ok(Outcome::new(job.maps.stages.clone())
             .with("width", width)
@@ -220,68 +199,128 @@ impl Run for Args {
     }
 }
 
-impl Args {
-    /// Matches photographs that are rectified already.
-    fn rectified(&self, photos: Photos, options: &DepthOptions, context: &Context) -> Result<RigDepthResult, Failure> {
-        let [(width, height), right] = photos.sizes();
-        if (width, height) != right {
-            return Err(Failure::new(format!(
-                "{} is {width}×{height} px, {} is {}×{} px: both must have the same size",
-                self.left.display(),
-                self.right.display(),
-                right.0,
-                right.1
-            )));
-        }
-        let geometry = match (self.focal, self.baseline) {
-            (Some(focal), Some(baseline)) => {
-                let geometry = StereoGeometry::from_focal(width, height, focal, baseline)
-                    .map_err(|error| Failure::usage(error).advice("give positive numbers"))?;
-                Some(StereoGeometry { offset: self.offset, ..geometry })
-            }
-            _ => None,
-        };
-        self.say_memory(options, (width, height), context)?;
-        let maps = at_own_depth!(photos, |a, b| depth(a, b, geometry.as_ref(), options, context))
-            .map_err(|error| words::no_depth(error, false))?;
-        let images = photos.into_rgb();
-        let wanted = self.cloud.is_some() || context.wants_report();
-        let cloud = if wanted { maps.cloud(images[0].view()).unwrap_or_default() } else { PointCloud::default() };
-        Ok(RigDepthResult { images, maps, cloud })
+/// Warns where most of a map was guessed.
+fn warn_of_filling(maps: &DepthResult, context: &Context) {
+    if maps.is_mostly_filled() {
+        context.warn(format!(
+            "only {:.1} % of the pixels were matched; the others are filled in from around, and of such pixels about four in ten are wrong (--no-fill leaves them unknown)",
+            100.0 * maps.map.matched_fraction()
+        ));
     }
+}
 
-    /// Rectifies and matches photographs of a rig. Also tells how many meters its unit has.
-    fn by_rig(
-        &self,
-        path: &Path,
-        photos: &Photos,
-        options: &DepthOptions,
-        context: &Context,
-    ) -> Result<(RigDepthResult, f64), Failure> {
+/// What is matched in the same way: two photographs, or frame after frame.
+struct Film {
+    frames: FrameDepth,
+    /// Width and height of the maps.
+    size: (usize, usize),
+    /// Meters in a unit of the depth.
+    meters: f64,
+}
+
+impl Args {
+    /// The matcher of these photographs and of those that follow them, of the same sizes.
+    fn film(&self, photos: &Photos, paths: [&Path; 2], context: &Context) -> Result<Film, Failure> {
+        let options = self.options(context);
         let [left, right] = photos.sizes();
-        let file = rig::read(path, left, self.exchange)?;
+        let refused = |error| self.refused(error);
+        let Some(path) = self.rig.first() else {
+            if left != right {
+                return Err(Failure::new(format!(
+                    "{} is {}×{} px, {} is {}×{} px: both must have the same size",
+                    paths[0].display(),
+                    left.0,
+                    left.1,
+                    paths[1].display(),
+                    right.0,
+                    right.1
+                )));
+            }
+            let geometry = match (self.focal, self.baseline) {
+                (Some(focal), Some(baseline)) => {
+                    let geometry = StereoGeometry::from_focal(left.0, left.1, focal, baseline)
+                        .map_err(|error| Failure::usage(error).advice("give positive numbers"))?;
+                    Some(StereoGeometry { offset: self.offset, ..geometry })
+                }
+                _ => None,
+            };
+            self.say_memory(&options, left, context)?;
+            let frames = FrameDepth::new(options, geometry).map_err(refused)?;
+            // A baseline that is given by itself counts as one in meters.
+            return Ok(Film { frames, size: left, meters: 1.0 });
+        };
+        let file = rig::read(&self.rig, left, self.exchange, context)?;
         let (meters, rig) = (file.meters_per_unit().unwrap_or(1.0), file.rig);
-        rig::check_size(path, &self.left, left, &rig.left)?;
-        rig::check_size(path, &self.right, right, &rig.right)?;
+        rig::check_size(path, paths[0], left, &rig.left)?;
+        rig::check_size(path, paths[1], right, &rig.right)?;
         let settings = RectifyOptions { size: self.size, ..RectifyOptions::default() };
         let rectification =
             Rectification::new(&rig, &settings).map_err(|error| words::no_rectification(error, path, self.exchange))?;
         if rectification.vertical {
             context.note("the rig is vertical: the maps are those of the photograph turned by a quarter, as `cv rectify` turns it");
         }
-        let camera = &rectification.left.camera;
-        self.say_memory(options, (camera.width, camera.height), context)?;
-        at_own_depth!(photos, |a, b| depth_by_rig(a, b, &rectification, options, context))
-            .map(|result| (result, meters))
-            .map_err(|error| match error {
-                DepthError::Rectify(error) => words::no_rectification(error, path, self.exchange),
-                error => words::no_depth(error, true),
-            })
+        let size = (rectification.left.camera.width, rectification.left.camera.height);
+        self.say_memory(&options, size, context)?;
+        Ok(Film { frames: FrameDepth::of_rig(options, &rectification).map_err(refused)?, size, meters })
+    }
+
+    /// Why there is no depth.
+    fn refused(&self, error: DepthError) -> Failure {
+        match (error, self.rig.first()) {
+            (DepthError::Rectify(error), Some(path)) => words::no_rectification(error, path, self.exchange),
+            (error, rig) => words::no_depth(error, rig.is_some()),
+        }
+    }
+
+    fn wants_points(&self, context: &Context) -> bool {
+        self.cloud.is_some() || context.wants_report()
+    }
+
+    /// Tells the disparities that the photographs have shown.
+    fn say_range(&self, film: &Film, context: &Context) {
+        if let (Range::Auto, Some((first, count))) = (self.disparities, film.frames.disparities()) {
+            context.note(format!("disparities {first} to {}", first + count as i32 - 1));
+        }
+    }
+
+    /// All files that are asked for, the report aside. `meters` are in a unit of the depth.
+    fn write(&self, job: &RigDepthResult, meters: f64, context: &Context) -> Result<(), Failure> {
+        let write_depth = |path: &Path, map: ImageView<'_, f32, 1>| {
+            cv_io::depth_mm::write(path, map.to_image().map(|[z]| [(f64::from(z) * meters) as f32]).view())
+        };
+        self.write_disparity(&job.maps.map, context)?;
+        if let (Some(path), Some(depth)) = (&self.depth, &job.maps.depth)
+            && let Some(lost) = write_map(context, path, depth.view(), write_depth)?
+        {
+            context.warn(format!("{lost} depths do not fit 0 to 65.535 m and are stored as unknown"));
+        }
+        self.write_quality(&job.maps, write_depth, context)?;
+        if let Some(path) = &self.cloud {
+            let cloud = |path: &Path| cv_io::ply::write_cloud(path, &job.cloud, PlyEncoding::Binary);
+            context.write(Output::File(path, CLOUD), cloud)?;
+        }
+        Ok(())
+    }
+
+    fn write_disparity(&self, map: &DisparityMap, context: &Context) -> Result<(), Failure> {
+        let kitti = |path: &Path, map: ImageView<'_, f32, 1>| cv_io::kitti::write(path, map);
+        if let Some(lost) = write_map(context, &self.output, map.disparity.view(), kitti)? {
+            context
+                .warn(format!("{lost} disparities do not fit KITTI's range of 0 to 256 px and are stored as unknown"));
+        }
+        Ok(())
     }
 
     /// Tells what matching will take, before it is asked for; of a range that is still to be found nothing can be told.
     fn say_memory(&self, options: &DepthOptions, size: (usize, usize), context: &Context) -> Result<(), Failure> {
-        if self.disparities == Range::Auto { Ok(()) } else { say_memory(&options.stereo, size, context) }
+        if self.disparities == Range::Auto {
+            return Ok(());
+        }
+        let matcher = StereoMatcher::new(options.stereo.clone()).map_err(|error| self.refused(error.into()))?;
+        let mib = matcher.memory(size.0, size.1) as f64 / f64::from(1 << 20);
+        let disparities = options.stereo.disparities;
+        context.note(format!("matching {}×{} px at {disparities} disparities takes {mib:.1} MiB", size.0, size.1));
+        Ok(())
     }
 
     /// Confidence, origin and uncertainty, where asked for.
@@ -298,16 +337,16 @@ impl Args {
                     cv_core::GrayU8::from_fn(map.width(), map.height(), |x, y| [(map.at(x, y)[0] * 255.0 + 0.5) as u8]);
                 cv_io::write_png(path, bytes.view()).map(|()| 0)
             };
-            write_map(path, confidence.view(), gray)?;
+            write_map(context, path, confidence.view(), gray)?;
         }
         if let Some(path) = &self.matched {
             let matched = map.state.map(|[state]| [if state == PixelState::Matched { 255u8 } else { 0 }]);
-            cv_io::write_png(path, matched.view())?;
+            context.write(Output::File(path, PNG), |path| cv_io::write_png(path, matched.view()))?;
         }
         if let Some(path) = &self.uncertainty {
             let lost = match maps.depth_sigma() {
-                Some(bars) => write_map(path, bars.view(), write_depth)?,
-                None => write_map(path, sigma.view(), |path, map| cv_io::kitti::write(path, map))?,
+                Some(bars) => write_map(context, path, bars.view(), write_depth)?,
+                None => write_map(context, path, sigma.view(), |path, map| cv_io::kitti::write(path, map))?,
             };
             if let Some(lost) = lost {
                 context.warn(format!("{lost} uncertainties do not fit the format and are stored as unknown"));
@@ -315,12 +354,4 @@ impl Args {
         }
         Ok(())
     }
-}
-
-/// Tells what matching will take, before it is asked for.
-fn say_memory(options: &StereoOptions, (width, height): (usize, usize), context: &Context) -> Result<(), Failure> {
-    let matcher = StereoMatcher::new(options.clone()).map_err(|error| words::no_depth(error.into(), false))?;
-    let mib = matcher.memory(width, height) as f64 / f64::from(1 << 20);
-    context.note(format!("matching {width}×{height} px at {} disparities takes {mib:.1} MiB", options.disparities));
-    Ok(())
 }

@@ -6,6 +6,7 @@ use cv_core::{Camera, ImageView, Point3, PointCloud, Pose, RgbU8, Rotation3, Vec
 use cv_pipeline::stereo::{PixelState, StereoGeometry};
 use cv_pipeline::{DepthResult, RigDepthResult};
 use cv_report::{MapStyle, Note, Plot, PointScene, Report, camera_color};
+use std::path::PathBuf;
 
 /// Where each disparity comes from, over the darkened photograph.
 fn draw_states(left: ImageView<'_, u8, 3>, states: ImageView<'_, PixelState, 1>) -> RgbU8 {
@@ -21,7 +22,8 @@ fn draw_states(left: ImageView<'_, u8, 3>, states: ImageView<'_, PixelState, 1>)
     })
 }
 
-pub(super) fn report(job: &RigDepthResult) -> Result<Report, Failure> {
+/// The page of a pair; with `frames`, their names and the shares of pixels that were matched and that have a disparity, of the first of them.
+pub(super) fn report(job: &RigDepthResult, frames: &[(PathBuf, f64, f64)]) -> Result<Report, Failure> {
     let RigDepthResult { images: [left, right], maps, cloud } = job;
     let DepthResult { map, depth, geometry, stages, .. } = maps;
     let mut page = Report::new("Depth");
@@ -29,6 +31,21 @@ pub(super) fn report(job: &RigDepthResult) -> Result<Report, Failure> {
     page.headline("size", &format!("{width}×{height}"))
         .headline("matched and confirmed", &format!("{:.1} %", 100.0 * map.matched_fraction()))
         .headline("with a disparity", &format!("{:.1} %", 100.0 * map.valid_fraction()));
+    if !frames.is_empty() {
+        let rows: Vec<Vec<String>> = frames
+            .iter()
+            .map(|(path, matched, valid)| {
+                let percent = |share: f64| format!("{:.1} %", 100.0 * share);
+                vec![path.display().to_string(), percent(*matched), percent(*valid)]
+            })
+            .collect();
+        page.headline("frames", &frames.len().to_string());
+        page.section("Frames").table(
+            "What follows is the first frame.",
+            &["frame", "matched and confirmed", "with a disparity"],
+            &rows,
+        );
+    }
     page.section("Photographs").figures(vec![
         picture(left, Width::Half, "Left photograph.")?,
         picture(right, Width::Half, "Right photograph.")?,

@@ -1,29 +1,23 @@
-//! The two photographs, as deep as their files have them.
+//! Two photographs, as deep as their files have them.
 
 use crate::frame::Failure;
-use cv_core::RgbU8;
 use cv_io::DynImage;
 use std::path::Path;
 
 /// A left and a right photograph.
-pub(super) struct Photos {
-    pub(super) left: DynImage,
-    pub(super) right: DynImage,
+pub(crate) struct Photos {
+    pub(crate) left: DynImage,
+    pub(crate) right: DynImage,
 }
 
 impl Photos {
-    pub(super) fn read(left: &Path, right: &Path) -> Result<Self, Failure> {
+    pub(crate) fn read(left: &Path, right: &Path) -> Result<Self, Failure> {
         Ok(Self { left: cv_io::read_image(left)?, right: cv_io::read_image(right)? })
     }
 
     /// Width and height of each.
-    pub(super) fn sizes(&self) -> [(usize, usize); 2] {
+    pub(crate) fn sizes(&self) -> [(usize, usize); 2] {
         [self.left.size(), self.right.size()]
-    }
-
-    /// As bytes of color.
-    pub(super) fn into_rgb(self) -> [RgbU8; 2] {
-        [self.left, self.right].map(DynImage::into_rgb8)
     }
 }
 
@@ -47,4 +41,4 @@ macro_rules! at_own_depth {
         $work
     }};
 }
-pub(super) use at_own_depth;
+pub(crate) use at_own_depth;
