@@ -16,11 +16,11 @@ pub struct RigDepthResult {
     pub cloud: PointCloud,
 }
 
-/// Rectifies the photographs of a rig and finds disparity and depth, as [`depth()`] does. The photographs are resampled and matched as deep
+/// Rectifies the photographs of a rig and finds disparity and depth, as [`depth()`](crate::depth()) does. The photographs are resampled and matched as deep
 /// as they are: 16 bits stay 16 bits.
 ///
 /// # Errors
-/// [`DepthError`]: as [`depth()`], and [`DepthError::Rectify`] where a photograph is not of its camera's size.
+/// [`DepthError`]: as [`depth()`](crate::depth()), and [`DepthError::Rectify`] where a photograph is not of its camera's size.
 pub fn depth_by_rig<T: Intensity + Pixel, const C: usize>(
     left: ImageView<'_, T, C>,
     right: ImageView<'_, T, C>,

@@ -13,7 +13,7 @@ use cv_synth::{
     panorama_views, rotation_error, two_view,
 };
 
-const SEEDS: std::ops::Range<u64> = 0..6;
+const SEEDS: std::ops::Range<u64> = 0..4;
 
 fn camera() -> Camera {
     Camera::from_focal(640, 480, 520.0)
