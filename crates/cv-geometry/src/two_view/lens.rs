@@ -1,6 +1,6 @@
 //! The lens that the matches themselves tell: focal length and radial distortion.
 
-use super::{PLAUSIBLE_FOCAL, TwoViewError};
+use super::{PLAUSIBLE_FOCAL, TwoViewError, usual_focal};
 use crate::{
     EstimateError, RobustOptions, Scorer, SharedFocalPose, TukeyBiweight, essential_from_pose, estimate_relative_pose,
     estimate_shared_focal_pose, normalize_matches, refine_relative_pose, refine_shared_focal_pose, sampson,
@@ -149,8 +149,8 @@ fn longer_side(camera: &Camera) -> usize {
 
 /// By how many standard deviations a focal length must fit better before it is believed: four, or by as many as it is from those that photographs have.
 fn doubt(focal: f64, camera: &Camera) -> f64 {
-    let (low, high) = PLAUSIBLE_FOCAL;
-    let from_usual = (focal / longer_side(camera) as f64 / (low * high).sqrt()).ln() / ((high / low).ln() / 4.0);
+    let (share, deviation) = usual_focal();
+    let from_usual = (focal / longer_side(camera) as f64 / share).ln() / deviation;
     from_usual.abs().max(BEYOND_DOUBT)
 }
 

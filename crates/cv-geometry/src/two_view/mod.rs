@@ -75,9 +75,9 @@ impl Intrinsics {
             Self::Matrix([a, b]) => Some(of([a.fx, b.fx], MATRIX_DEVIATION, a == b)),
             Self::Focal(focal) => Some(of(focal, EXIF_DEVIATION, focal[0] == focal[1] && sizes[0] == sizes[1])),
             Self::Unknown => {
-                let (low, high) = PLAUSIBLE_FOCAL;
-                let focal = (low * high).sqrt() * sizes[0].0.max(sizes[0].1) as f64;
-                Some(FocalPrior { focal, deviation: (high / low).ln() / 4.0, ratio: FocalPrior::REFOCUSED })
+                let (share, deviation) = usual_focal();
+                let focal = share * sizes[0].0.max(sizes[0].1) as f64;
+                Some(FocalPrior { focal, deviation, ratio: FocalPrior::REFOCUSED })
             }
         }
     }
@@ -89,6 +89,12 @@ const EXIF_DEVIATION: f64 = 0.03;
 const MATRIX_DEVIATION: f64 = 0.02;
 /// What focal lengths of photographs are, as shares of the longer side: an unknown one is between these with 95 % (fields of view of 103 and of 19 degrees).
 const PLAUSIBLE_FOCAL: (f64, f64) = (0.4, 3.0);
+
+/// The middle of [`PLAUSIBLE_FOCAL`] as a share of the longer side, and the standard deviation of its logarithm.
+fn usual_focal() -> (f64, f64) {
+    let (low, high) = PLAUSIBLE_FOCAL;
+    ((low * high).sqrt(), (high / low).ln() / 4.0)
+}
 
 /// Settings of [`reconstruct_two_views`].
 #[derive(Debug, Clone, Copy, PartialEq)]
