@@ -47,6 +47,11 @@ impl BoardSize {
         Self { columns: self.rows, rows: self.columns }
     }
 
+    /// The longer side along the rows.
+    pub fn landscape(self) -> Self {
+        if self.rows > self.columns { self.transposed() } else { self }
+    }
+
     /// Position of corner `index` (row-major) on the board, in the unit of `square`; the first corner is the origin.
     pub fn point(self, index: usize, square: f64) -> Point2<f64> {
         let columns = self.columns.max(1);
