@@ -57,7 +57,9 @@ pub fn calibrate(
         }
         let holdout = options.holdout && cameras == 1;
         let mono = choose(&own, &usable, options.lens, limits, holdout, progress).map_err(|e| of_camera(e, camera))?;
-        check_determined(&own, &mono.fit, camera)?;
+        if cameras > 1 {
+            check_determined(&mono.fit, camera, covariance_of(&own, &mono.fit).ok())?;
+        }
         alone.push((mono, views));
     }
     let usable = usable_corners(data, &refused);
@@ -113,18 +115,24 @@ fn usable_corners(data: &Sightings, refused: &[Vec<Option<PictureOutcome>>]) -> 
     data.views.iter().zip(refused).map(|(v, r)| v.iter().zip(r).map(picture).collect()).collect()
 }
 
-/// Refuses a focal length that the views leave open.
-fn check_determined(data: &Sightings, fit: &Fit, camera: usize) -> Result<(), CalibrateError> {
+/// Covariance of everything but the poses of the views, and the variance of a coordinate.
+fn covariance_of(data: &Sightings, fit: &Fit) -> Result<(DMatrix<f64>, f64), cv_numeric::adjust::AdjustError> {
     let free = Free { shape: fit.shape == ShapeState::Adjusted, ..Free::ALL };
-    let relative = Problem::new(data, &fit.estimate, &fit.used, free, RobustLoss::Trivial)
-        .and_then(|p| p.covariance())
-        .map(|(covariance, variance)| {
-            // Exact corners too: as if they had noise of a tenth of a pixel.
-            let more = (1e-2 / variance.max(f64::MIN_POSITIVE)).max(1.0);
-            (covariance[(0, 0)] * more).sqrt() / fit.estimate.cameras[0].fx
-        });
-    if relative.is_ok_and(|r| r <= UNKNOWN_FOCAL) {
-        return Ok(());
+    Problem::new(data, &fit.estimate, &fit.used, free, RobustLoss::Trivial)?.covariance()
+}
+
+/// Refuses a focal length that the views leave open. `covariance`: where there is one, that of the camera before others.
+fn check_determined(
+    fit: &Fit,
+    camera: usize,
+    covariance: Option<(DMatrix<f64>, f64)>,
+) -> Result<(DMatrix<f64>, f64), CalibrateError> {
+    if let Some((covariance, variance)) = covariance {
+        // Exact corners too: as if they had noise of a tenth of a pixel.
+        let more = (1e-2 / variance.max(f64::MIN_POSITIVE)).max(1.0);
+        if (covariance[(0, 0)] * more).sqrt() <= UNKNOWN_FOCAL * fit.estimate.cameras[0].fx {
+            return Ok((covariance, variance));
+        }
     }
     let tilt = |pose: &Pose| pose.rotation.matrix()[(2, 2)].abs().min(1.0).acos().to_degrees();
     let largest = fit.estimate.poses.iter().flatten().map(tilt).fold(0.0, f64::max);
@@ -209,10 +217,7 @@ fn report(
     refused: &[Vec<Option<PictureOutcome>>],
 ) -> Result<Calibration, CalibrateError> {
     let free = Free { shape: fit.shape == ShapeState::Adjusted, ..Free::ALL };
-    let degenerate = CalibrateError::Degenerate { camera: 0, largest_tilt_degrees: f64::NAN };
-    let (covariance, variance) = Problem::new(data, &fit.estimate, &fit.used, free, RobustLoss::Trivial)
-        .and_then(|p| p.covariance())
-        .map_err(|_| degenerate)?;
+    let (covariance, variance) = check_determined(&fit, 0, covariance_of(data, &fit).ok())?;
     let limit_px = options.outlier_deviations * fit.deviation;
     let views: Vec<CalibratedView> = (0..data.views.len()).map(|v| view(data, &fit, v, refused, limit_px)).collect();
     let mut cameras = Vec::with_capacity(alone.len());

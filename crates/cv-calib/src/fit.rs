@@ -12,6 +12,8 @@ const MEDIAN_LENGTH: f64 = 1.1774;
 const LEAST_DEVIATION: f64 = 1e-4;
 /// Times that outliers are looked for.
 const ROUNDS: usize = 4;
+/// Of many views so many, evenly, are fitted robustly first; from what they give, all need a few steps.
+const FIRST_VIEWS: usize = 30;
 /// Relative change of the cost at which an adjustment ends.
 const TOLERANCE: f64 = 1e-7;
 /// Deflections must be known to this share of the target's longer side to be adjusted.
@@ -81,30 +83,19 @@ pub(crate) fn fit(
     limits: Limits,
     progress: &dyn Progress,
 ) -> Result<Fit, Failure> {
-    let mut estimate = start.clone();
-    let mut state = if limits.board_shape { ShapeState::Adjusted } else { ShapeState::NotAsked };
-    // Bending is small, and a shape that is not determined would lead astray: at first the target is flat.
-    estimate.shape = if limits.board_shape { start.shape } else { [0.0; 2] };
-    let flat = Free { shape: false, ..Free::ALL };
-    let mut typical = deviation(&residuals(data, &estimate), usable);
-    for _ in 0..3 {
-        let before = typical;
-        adjust(data, &mut estimate, usable, (flat, cauchy(typical)), (40, 1e-3), progress)?;
-        typical = deviation(&residuals(data, &estimate), usable);
-        if typical > 0.7 * before {
-            break;
-        }
-    }
-    let mut free = flat;
-    if limits.board_shape {
-        if shape_is_known(data, &estimate, usable) {
-            free = Free::ALL;
-            adjust(data, &mut estimate, usable, (free, cauchy(typical)), (40, 1e-4), progress)?;
-        } else {
-            state = ShapeState::Undetermined;
-            estimate.shape = [0.0; 2];
-        }
-    }
+    let n = data.views.len();
+    let (mut estimate, free, state) = if n > 2 * FIRST_VIEWS {
+        let few: Vec<usize> = (0..FIRST_VIEWS).map(|i| i * n / FIRST_VIEWS).collect();
+        let corners: Used = few.iter().map(|v| usable[*v].clone()).collect();
+        let (found, free, state) = robust(&data.subset(&few), start.subset(&few), &corners, limits, progress)?;
+        let mut all = Estimate { poses: start.poses.clone(), ..found };
+        let loss = cauchy(deviation(&residuals(data, &all), usable));
+        adjust(data, &mut all, usable, (Free::POSES, loss), (30, 1e-3), progress)?;
+        (all, free, state)
+    } else {
+        robust(data, start.clone(), usable, limits, progress)?
+    };
+    let mut typical = 0.0;
     let mut used = Used::new();
     for round in 0..=ROUNDS {
         let residuals = residuals(data, &estimate);
@@ -117,6 +108,39 @@ pub(crate) fn fit(
         adjust(data, &mut estimate, &used, (free, RobustLoss::Trivial), (100, TOLERANCE), progress)?;
     }
     Ok(Fit { estimate, used, shape: state, deviation: typical })
+}
+
+/// The robust part of a fit; what of it is free, and why the target's shape is or is not.
+fn robust(
+    data: &Sightings,
+    mut estimate: Estimate,
+    usable: &Used,
+    limits: Limits,
+    progress: &dyn Progress,
+) -> Result<(Estimate, Free, ShapeState), Failure> {
+    // Bending is small, and a shape that is not determined would lead astray: at first the target is flat.
+    if !limits.board_shape {
+        estimate.shape = [0.0; 2];
+    }
+    let flat = Free { shape: false, ..Free::ALL };
+    let mut typical = deviation(&residuals(data, &estimate), usable);
+    for _ in 0..3 {
+        let before = typical;
+        adjust(data, &mut estimate, usable, (flat, cauchy(typical)), (40, 1e-3), progress)?;
+        typical = deviation(&residuals(data, &estimate), usable);
+        if typical > 0.7 * before {
+            break;
+        }
+    }
+    if !limits.board_shape {
+        return Ok((estimate, flat, ShapeState::NotAsked));
+    }
+    if !shape_is_known(data, &estimate, usable) {
+        estimate.shape = [0.0; 2];
+        return Ok((estimate, flat, ShapeState::Undetermined));
+    }
+    adjust(data, &mut estimate, usable, (Free::ALL, cauchy(typical)), (40, 1e-4), progress)?;
+    Ok((estimate, Free::ALL, ShapeState::Adjusted))
 }
 
 /// Whether the corners determine the target's deflections well enough to adjust them.
