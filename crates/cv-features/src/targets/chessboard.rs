@@ -213,7 +213,7 @@ fn complete(
     // In any direction as far as the asked board can reach.
     let (across, down) = ((side - (x1 - x0 + 1)).max(1), (side - (y1 - y0 + 1)).max(1));
     grid.fill(view, [x0 - across, x1 + across, y0 - down, y1 + down], stage)?;
-    loop {
+    while !grid.nodes.is_empty() {
         let [x0, x1, y0, y1] = grid.bounds();
         let seen = Part([x0, x1, y0, y1]).size();
         let on = |p: &(i32, i32), column: bool, at: i32| if column { p.0 == at } else { p.1 == at };
@@ -237,9 +237,10 @@ fn complete(
         if left < 0.5 || (left < 1.0 && needless) || (left < 0.75 && size.is_none()) {
             grid.nodes.retain(|p, _| !on(p, column, at));
         } else {
-            return Ok(());
+            break;
         }
     }
+    Ok(())
 }
 
 /// The largest rectangle of a grid without a gap. Time: cells of its bounds times its columns.

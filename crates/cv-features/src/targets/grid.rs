@@ -259,8 +259,11 @@ impl Grid {
         Some(self.nodes.get(&at)?.corner.position)
     }
 
-    /// First and last column, first and last row.
+    /// First and last column, first and last row; of an empty grid the last come before the first.
     pub(crate) fn bounds(&self) -> [i32; 4] {
+        if self.nodes.is_empty() {
+            return [0, -1, 0, -1];
+        }
         self.nodes.keys().fold([i32::MAX, i32::MIN, i32::MAX, i32::MIN], |b, &(x, y)| {
             [b[0].min(x), b[1].max(x), b[2].min(y), b[3].max(y)]
         })
