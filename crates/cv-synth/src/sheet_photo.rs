@@ -65,6 +65,12 @@ impl Sheet {
         let (_, jacobian) = camera.distortion.distort_with_jacobian(middle);
         let inverse = jacobian.try_inverse().unwrap_or_else(Matrix2::identity);
         let origin = Point3::from(to_sheet.translation);
+        // What is behind the sheet is smooth over a pixel by itself, and nobody looks at it that closely.
+        let n = if self.is_beside(&origin, &(to_sheet.rotation * Vector3::new(middle.x, middle.y, 1.0)), camera.fx) {
+            1
+        } else {
+            n
+        };
         let mut sum = [0.0; 3];
         for j in 0..n {
             for i in 0..n {
@@ -76,6 +82,16 @@ impl Sheet {
             }
         }
         sum.map(|c| c / (n * n) as f32)
+    }
+
+    /// Whether the sheet is further than some two pixels from a ray.
+    fn is_beside(&self, origin: &Point3<f64>, ray: &Vector3<f64>, focal: f64) -> bool {
+        let t = -origin.z / ray.z;
+        let (u, v) = (origin.x + t * ray.x, origin.y + t * ray.y);
+        let slant = (ray.z / ray.norm()).abs().max(0.04);
+        let far = 2.0 * self.bend.abs() / slant + 3.0 * t.abs() / (focal * slant);
+        let inside = |v: f64, size: f64| v > -far && v < size + far;
+        !(inside(u, self.size.0) && inside(v, self.size.1))
     }
 
     /// The light along a ray; `width` is that of a sample at distance 1.

@@ -152,7 +152,7 @@ pub fn find_chessboard(
     for mut grid in grids(&corners, smooth.view(), BoardSize::LEAST * 2, &stage)? {
         // A board that lacks more than half its corners is not completed, only told of.
         if size.is_none_or(|asked| 2 * grid.nodes.len() >= asked.corners()) {
-            complete(&mut grid, view, size, &stage)?;
+            complete(&mut grid, smooth.view(), size, &stage)?;
         } else if refusal.is_some() {
             continue;
         }
@@ -176,7 +176,7 @@ pub fn find_chessboard(
     }
     let Some((size, places)) = boards.pop() else { return Err(refusal.map_or(none, |r| r.1)) };
     stage.check()?;
-    located(view, size, &places, options.largest_window).ok_or(none)
+    located(smooth.view(), size, &places, options.largest_window).ok_or(none)
 }
 
 /// A corner before its last refinement, and the distance to its nearest neighbor.
@@ -344,7 +344,9 @@ fn located(view: ImageView<'_, f32, 1>, size: BoardSize, places: &[Place], large
         .map(|&(start, spacing)| {
             let window = (WINDOW * spacing).min(largest_window.into()).max(2.0);
             let found = saddle(view, start, window, 2e-4)?;
-            Some((found.position, found.deviation))
+            // The start is exact to a tenth of a pixel where a corner is a corner.
+            let stays = (found.position - start).norm() < (0.1 * spacing).max(1.0);
+            stays.then_some((found.position, found.deviation))
         })
         .collect();
     let (corners, deviations) = found?.into_iter().unzip();

@@ -254,6 +254,18 @@ pub(crate) fn grids(
     Ok(out)
 }
 
+/// The two edges through a place and the contrast around it, on a circle that suits the distance to the next corner.
+fn crossing(view: ImageView<'_, f32, 1>, at: Point2<f64>, step: f64) -> Option<([f64; 2], f32)> {
+    let radius = (0.3 * step).clamp(2.0, 10.0);
+    let angle = |i: usize| i as f64 * (TAU / 16.0);
+    let mut values = [0.0f32; 16];
+    for (i, v) in values.iter_mut().enumerate() {
+        let (sin, cos) = angle(i).sin_cos();
+        [*v] = sample_bilinear(view, at.x + radius * cos, at.y + radius * sin)?;
+    }
+    edges(&values, angle)
+}
+
 impl Grid {
     pub(crate) fn position(&self, at: (i32, i32)) -> Option<Point2<f64>> {
         Some(self.nodes.get(&at)?.corner.position)
@@ -292,19 +304,35 @@ impl Grid {
         (weight > 0.0).then(|| (Point2::from(sum / weight), step))
     }
 
-    /// Moves every corner to its exact place, and drops those that have none.
+    /// Moves every corner to its exact place, and drops those that have none, or lie where their neighbors say that they cannot.
     pub(crate) fn settle(&mut self, view: ImageView<'_, f32, 1>) {
         let steps: HashMap<(i32, i32), f64> = self.nodes.keys().map(|&p| (p, self.step(p))).collect();
         self.nodes.retain(|p, node| {
-            let window = (0.3 * steps[p]).clamp(2.0, 10.0);
-            match saddle(view, node.corner.position, window, ROUGH) {
-                Some(found) if (found.position - node.corner.position).norm() < 0.3 * steps[p] => {
-                    node.corner.position = found.position;
-                    true
-                }
-                _ => false,
-            }
+            let (step, corner) = (steps[p], &mut node.corner);
+            // Wide enough to see edges from where a coarse octave put it.
+            let window = (0.3 * step).clamp(2.0, (0.5 * corner.radius).max(4.0));
+            let Some(found) = saddle(view, corner.position, window, ROUGH) else { return false };
+            let near = (found.position - corner.position).norm() < 0.3 * step;
+            let same = |axes: [f64; 2]| (0..2).all(|i| between_lines(axes[i], corner.axes[i]) < 0.6);
+            let good = near && crossing(view, found.position, step).is_some_and(|(axes, _)| same(axes));
+            corner.position = found.position;
+            good
         });
+        let wrong: Vec<(i32, i32)> = self
+            .nodes
+            .iter()
+            .filter(|(place, node)| {
+                let expected = self.expected(**place);
+                expected.is_some_and(|(p, step)| (p - node.corner.position).norm() > 0.3 * step + 1.0)
+            })
+            .map(|(place, _)| *place)
+            .collect();
+        // One wrong corner makes its neighbors look wrong as well: all go, and are looked up again from the rest.
+        if 2 * wrong.len() < self.nodes.len() {
+            wrong.iter().for_each(|place| {
+                self.nodes.remove(place);
+            });
+        }
     }
 
     /// Distance from a corner to its nearest neighbor.
@@ -367,15 +395,8 @@ impl Grid {
         if (found.position - expected).norm() > 0.3 * step {
             return None;
         }
-        let radius = (0.3 * step).clamp(2.0, 10.0);
-        let angle = |i: usize| i as f64 * (TAU / 16.0);
-        let mut values = [0.0f32; 16];
-        for (i, v) in values.iter_mut().enumerate() {
-            let p = found.position + Vector2::new(angle(i).cos(), angle(i).sin()) * radius;
-            [*v] = sample_bilinear(view, p.x, p.y)?;
-        }
-        let (axes, seen) = edges(&values, angle)?;
-        let corner = XCorner { position: found.position, axes, contrast: seen, radius };
+        let (axes, seen) = crossing(view, found.position, step)?;
+        let corner = XCorner { position: found.position, axes, contrast: seen, radius: (0.3 * step).clamp(2.0, 10.0) };
         // Its edge of the second kind runs along the neighbor's of the first.
         let flipped = between_lines(axes[1], neighbor.corner.axes[0]) < 0.5
             && between_lines(axes[0], neighbor.corner.axes[1]) < 0.5;

@@ -5,7 +5,9 @@
 //! Least squares over a Gaussian window gives p; the window follows it until it rests. Edges are straight under any perspective, and a change of contrast does
 //! not move the place, so neither tilt nor the camera's tone curve makes an error.
 
+use crate::simd;
 use cv_core::{ImageView, Point2};
+use fearless_simd::{Level, dispatch, prelude::*};
 
 /// Where a corner is.
 #[derive(Debug, Clone, Copy)]
@@ -57,11 +59,13 @@ pub(crate) fn saddle(view: ImageView<'_, f32, 1>, start: Point2<f64>, window: f6
     let reach = window.clamp(1.0, 64.0).round() as usize;
     let mut patch = Patch { values: Vec::new(), side: 0 };
     // As wide as its half-width: the rim weighs e⁻¹ along each axis.
-    let weights: Vec<f64> = (0..=2 * reach).map(|i| (-((i as f64 - reach as f64) / window).powi(2)).exp()).collect();
+    let weights: Vec<f32> =
+        (0..=2 * reach).map(|i| (-((i as f64 - reach as f64) / window).powi(2)).exp() as f32).collect();
+    let level = simd::level();
     let mut at = start;
     for _ in 0..ROUNDS {
         patch.sample(view, at, reach + 1)?;
-        let normal = normal_equations(&patch, reach, &weights);
+        let normal = normal_equations(level, &patch, reach, &weights);
         let step = normal.solve()?;
         at = Point2::new(at.x + step[0], at.y + step[1]);
         let off = (at - start).norm();
@@ -85,27 +89,48 @@ struct NormalEquations {
     by: f64,
 }
 
-fn normal_equations(patch: &Patch, reach: usize, weights: &[f64]) -> NormalEquations {
-    let side = patch.side;
-    let mut n = NormalEquations { xx: 0.0, xy: 0.0, yy: 0.0, bx: 0.0, by: 0.0 };
-    for j in 0..=2 * reach {
-        let row = &patch.values[(j + 1) * side..(j + 2) * side];
-        let (above, below) = (&patch.values[j * side..], &patch.values[(j + 2) * side..]);
-        let y = j as f64 - reach as f64;
-        for i in 0..=2 * reach {
-            let gx = f64::from(row[i + 2] - row[i]);
-            let gy = f64::from(below[i + 1] - above[i + 1]);
-            let x = i as f64 - reach as f64;
-            let w = weights[i] * weights[j];
-            let (xx, xy, yy) = (w * gx * gx, w * gx * gy, w * gy * gy);
-            n.xx += xx;
-            n.xy += xy;
-            n.yy += yy;
-            n.bx += xx * x + xy * y;
-            n.by += xy * x + yy * y;
+fn normal_equations(level: Level, patch: &Patch, reach: usize, weights: &[f32]) -> NormalEquations {
+    dispatch!(level, simd => normal_equations_impl(simd, patch, reach, weights))
+}
+
+#[inline(always)]
+fn normal_equations_impl<S: Simd>(_: S, patch: &Patch, reach: usize, weights: &[f32]) -> NormalEquations {
+    let (side, n) = (patch.side, 2 * reach + 1);
+    let mut sums = [0.0f64; 5];
+    for j in 0..n {
+        let row = &patch.values[(j + 1) * side..][..side];
+        let above = &patch.values[j * side + 1..][..n];
+        let below = &patch.values[(j + 2) * side + 1..][..n];
+        let (left, right) = (&row[..n], &row[2..][..n]);
+        let y = j as f32 - reach as f32;
+        // Eight sums side by side of each kind, in an order that does not depend on the machine.
+        let mut lanes = [[0.0f32; 8]; 5];
+        for start in (0..n).step_by(8) {
+            let count = (n - start).min(8);
+            let mut gx = [0.0f32; 8];
+            let mut gy = [0.0f32; 8];
+            let mut w = [0.0f32; 8];
+            for i in 0..count {
+                gx[i] = right[start + i] - left[start + i];
+                gy[i] = below[start + i] - above[start + i];
+                w[i] = weights[start + i] * weights[j];
+            }
+            for i in 0..8 {
+                let x = (start + i) as f32 - reach as f32;
+                let (xx, xy, yy) = (w[i] * gx[i] * gx[i], w[i] * gx[i] * gy[i], w[i] * gy[i] * gy[i]);
+                lanes[0][i] += xx;
+                lanes[1][i] += xy;
+                lanes[2][i] += yy;
+                lanes[3][i] += xx * x + xy * y;
+                lanes[4][i] += xy * x + yy * y;
+            }
+        }
+        for (sum, lanes) in sums.iter_mut().zip(&lanes) {
+            *sum += lanes.iter().map(|&v| f64::from(v)).sum::<f64>();
         }
     }
-    n
+    let [xx, xy, yy, bx, by] = sums;
+    NormalEquations { xx, xy, yy, bx, by }
 }
 
 impl NormalEquations {

@@ -12,30 +12,8 @@ use cv_imgproc::{mirror_ends, mirror_index, pyr_down};
 use fearless_simd::{Level, dispatch, prelude::*};
 use rayon::prelude::*;
 
-/// A circle of 16 samples, clockwise on screen from the top.
-type Ring = [(isize, isize); 16];
-
-/// The circle of the paper.
-const WIDE: Ring = [
-    (0, -5),
-    (2, -5),
-    (3, -3),
-    (5, -2),
-    (5, 0),
-    (5, 2),
-    (3, 3),
-    (2, 5),
-    (0, 5),
-    (-2, 5),
-    (-3, 3),
-    (-5, 2),
-    (-5, 0),
-    (-5, -2),
-    (-3, -3),
-    (-2, -5),
-];
-/// For squares of less than some 12 pixels.
-const NARROW: Ring = [
+/// The circle: 16 samples, clockwise on screen from the top. The paper's has a radius of 5; on a pyramid a smaller one does, which has room in small squares.
+const RING: [(isize, isize); 16] = [
     (0, -3),
     (1, -3),
     (2, -2),
@@ -53,9 +31,13 @@ const NARROW: Ring = [
     (-2, -2),
     (-1, -3),
 ];
-
+/// How far it reaches.
+const R: usize = 3;
 /// The middle.
 const MIDDLE: [(isize, isize); 5] = [(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)];
+
+/// Least share of the response of an ideal corner of the same contrast. One that is tilted by 60° keeps half, noise and blur take some more.
+const SHAPE: f32 = 0.2;
 
 /// Most candidates of one octave: the strongest are kept. A board of 200×200 is too much for one picture anyway; what counts is that a picture of gravel
 /// takes no longer than this.
@@ -83,15 +65,14 @@ pub(crate) fn x_corners(
 ) -> Result<(Vec<XCorner>, GrayF32), Cancelled> {
     let level = simd::level();
     let smooth = smoothed(view, level);
-    let mut found = octave(&smooth, &NARROW, 1.0, least_contrast, progress)?;
-    found.extend(octave(&smooth, &WIDE, 1.0, least_contrast, progress)?);
+    let mut found = octave(&smooth, 1.0, least_contrast, progress)?;
     let mut image = pyr_down(view);
-    for scale in [2.0, 4.0, 8.0] {
+    for scale in [2.0, 4.0, 8.0, 16.0] {
         // Below this a board has no room beside its circles.
-        if image.width().min(image.height()) < 40 {
+        if image.width().min(image.height()) < 30 {
             break;
         }
-        found.extend(octave(&image, &WIDE, scale, least_contrast, progress)?);
+        found.extend(octave(&image, scale, least_contrast, progress)?);
         image = pyr_down(image.view());
     }
     Ok((each_once(found), smooth))
@@ -117,20 +98,18 @@ fn smoothed(view: ImageView<'_, f32, 1>, level: Level) -> GrayF32 {
 /// The candidates of one octave.
 fn octave(
     image: &GrayF32,
-    ring: &Ring,
     scale: f64,
     least_contrast: f32,
     progress: &dyn Progress,
 ) -> Result<Vec<XCorner>, Cancelled> {
     let (w, h) = image.size();
-    let r = ring.iter().map(|o| o.0.unsigned_abs()).max().unwrap_or(0);
-    if w <= 2 * r + 4 || h <= 2 * r + 4 {
+    if w <= 2 * R + 4 || h <= 2 * R + 4 {
         return Ok(Vec::new());
     }
     let level = simd::level();
     // Of an ideal corner the response is eight times the contrast; a strongly tilted or blurred one keeps about a third of it.
     let floor = 8.0 * 0.3 * least_contrast.max(1e-4);
-    let (first, last) = (r, h - r);
+    let (first, last) = (R, h - R);
     let rows = (last - first).div_ceil(4 * rayon::current_num_threads()).max(48);
     let stage = Stage::new(progress, "corners", (last - first).div_ceil(rows))?;
     let mut found: Vec<(f32, XCorner)> = (0..(last - first).div_ceil(rows))
@@ -138,11 +117,12 @@ fn octave(
         .map(|i| {
             stage.add(1)?;
             let (from, to) = (first + i * rows, (first + (i + 1) * rows).min(last));
-            Ok(strip(image, ring, r, from..to, floor, level)
+            Ok(strip(image, from..to, floor, level)
                 .into_iter()
                 .filter_map(|(x, y, dx, dy, response)| {
-                    let corner = looked_at(image, ring, (x, y), (dx, dy), scale)?;
-                    (corner.contrast >= least_contrast).then_some((response, corner))
+                    let corner = looked_at(image, (x, y), (dx, dy), scale)?;
+                    let fits = corner.contrast >= least_contrast && response >= 8.0 * SHAPE * corner.contrast;
+                    fits.then_some((response, corner))
                 })
                 .collect::<Vec<_>>())
         })
@@ -158,19 +138,17 @@ fn octave(
 /// Peaks of the response in some rows: column, row, offset to the peak between pixels, response.
 fn strip(
     image: &GrayF32,
-    ring: &Ring,
-    r: usize,
     rows: std::ops::Range<usize>,
     floor: f32,
     level: Level,
 ) -> Vec<(usize, usize, f32, f32, f32)> {
     let (w, h) = image.size();
-    let mut ring_rows = LineBuffer::new(0..w - 2 * r, 3);
+    let mut ring_rows = LineBuffer::new(0..w - 2 * R, 3);
     let (mut columns, mut found) = (Vec::new(), Vec::new());
-    let (first, last) = (rows.start.saturating_sub(1).max(r), (rows.end + 1).min(h - r));
+    let (first, last) = (rows.start.saturating_sub(1).max(R), (rows.end + 1).min(h - R));
     for y in first..last {
-        let around: [&[f32]; 11] = std::array::from_fn(|i| image.row((y + i).saturating_sub(5).min(h - 1)));
-        respond(level, around, ring, r, ring_rows.row_mut(y));
+        let around: [&[f32]; 2 * R + 1] = std::array::from_fn(|i| image.row(y + i - R));
+        respond(level, around, ring_rows.row_mut(y));
         if y < first + 2 {
             continue;
         }
@@ -181,26 +159,26 @@ fn strip(
             let v = here[x];
             if v > above[x - 1] && v > above[x] && v > above[x + 1] && v > here[x - 1] {
                 let (dx, dy) = crate::harris::quadratic_peak([above, here, below].map(|r| [r[x - 1], r[x], r[x + 1]]));
-                found.push((x + r, y - 1, dx, dy, v));
+                found.push((x + R, y - 1, dx, dy, v));
             }
         }
     }
     found
 }
 
-/// The response of a row: eleven rows of the image, the middle one its own; `out` begins at column `r`.
-fn respond(level: Level, rows: [&[f32]; 11], ring: &Ring, r: usize, out: &mut [f32]) {
-    dispatch!(level, simd => respond_impl(simd, rows, ring, r, out));
+/// The response of a row: seven rows of the image, the middle one its own; `out` begins at column 3.
+fn respond(level: Level, rows: [&[f32]; 2 * R + 1], out: &mut [f32]) {
+    dispatch!(level, simd => respond_impl(simd, rows, out));
 }
 
 #[inline(always)]
-fn respond_impl<S: Simd>(simd: S, rows: [&[f32]; 11], ring: &Ring, r: usize, out: &mut [f32]) {
+fn respond_impl<S: Simd>(simd: S, rows: [&[f32]; 2 * R + 1], out: &mut [f32]) {
     let n = S::f32s::LEN;
     let width = out.len();
     // Each sample's row, cut so that index x is its value for out[x].
     let mut samples: [&[f32]; 21] = [&[]; 21];
-    for (sample, &(dx, dy)) in samples.iter_mut().zip(ring.iter().chain(&MIDDLE)) {
-        *sample = &rows[(5 + dy) as usize][(r as isize + dx) as usize..][..width];
+    for (sample, &(dx, dy)) in samples.iter_mut().zip(RING.iter().chain(&MIDDLE)) {
+        *sample = &rows[(R as isize + dy) as usize][(R as isize + dx) as usize..][..width];
     }
     if width < n {
         for x in 0..width {
@@ -251,22 +229,15 @@ fn response_at(v: [f32; 21]) -> f32 {
 }
 
 /// The corner at a peak of the response, where the circle around it shows two straight edges.
-fn looked_at(
-    image: &GrayF32,
-    ring: &Ring,
-    (x, y): (usize, usize),
-    (dx, dy): (f32, f32),
-    scale: f64,
-) -> Option<XCorner> {
-    let values = ring.map(|(i, j)| image.at((x as isize + i) as usize, (y as isize + j) as usize)[0]);
-    let angle = |k: usize| (ring[k].1 as f64 - f64::from(dy)).atan2(ring[k].0 as f64 - f64::from(dx));
+fn looked_at(image: &GrayF32, (x, y): (usize, usize), (dx, dy): (f32, f32), scale: f64) -> Option<XCorner> {
+    let values = RING.map(|(i, j)| image.at((x as isize + i) as usize, (y as isize + j) as usize)[0]);
+    let angle = |k: usize| (RING[k].1 as f64 - f64::from(dy)).atan2(RING[k].0 as f64 - f64::from(dx));
     let (axes, contrast) = edges(&values, angle)?;
-    let radius = ring.iter().map(|&(i, j)| (i as f64).hypot(j as f64)).sum::<f64>() / 16.0;
     Some(XCorner {
         position: Point2::new(x as f64 + f64::from(dx), y as f64 + f64::from(dy)) * scale,
         axes,
         contrast,
-        radius: radius * scale,
+        radius: R as f64 * scale,
     })
 }
 
