@@ -356,7 +356,7 @@ fn notes(data: &Sightings, of: &Calibration) -> Vec<CaptureNote> {
         }
         if let Some((index, pixels)) = c.uncertainty.worst().filter(|(_, pixels)| *pixels > UNCERTAIN_PX[0]) {
             let p = c.uncertainty.position(index, data.sizes[camera]);
-            notes.push(CaptureNote::Uncertain { camera, pixels, x: p.x, y: p.y });
+            notes.push(CaptureNote::Uncertain { camera, pixels, x: p.x, y: p.y, median_px: c.uncertainty.median() });
         }
         if c.holdout_rms_px > HOLDOUT_RATIO[0] * c.rms_px {
             let (rms_px, holdout_rms_px) = (c.rms_px, c.holdout_rms_px);

@@ -60,6 +60,8 @@ pub enum CaptureNote {
         x: f64,
         /// Where, in pixels.
         y: f64,
+        /// Median over the picture, in pixels.
+        median_px: f64,
     },
     /// Views that had no part in the fit are much worse: the lens model or the target does not hold everywhere.
     HoldOut {
@@ -126,8 +128,8 @@ pub(crate) const ENOUGH_VIEWS: usize = 10;
 pub(crate) const EMPTY: f64 = 0.25;
 /// Degrees between the extreme positions of the target below which a focal length is badly known.
 pub(crate) const PARALLEL_DEGREES: f64 = 20.0;
-/// Standard deviations of the projection, in pixels, that are worth a note, and that make a calibration poor.
-pub(crate) const UNCERTAIN_PX: [f64; 2] = [0.5, 3.0];
+/// Standard deviations of the projection, in pixels: that of the worst place that is worth a note, and the median that makes a calibration poor.
+pub(crate) const UNCERTAIN_PX: [f64; 2] = [0.5, 1.0];
 /// Ratios of hold-out error to that of the fit that are worth a note, and that make a calibration poor.
 pub(crate) const HOLDOUT_RATIO: [f64; 2] = [1.5, 4.0];
 /// Deflection as a share of the target's side that is worth a note.
@@ -144,7 +146,7 @@ impl Verdict {
         let poor = match *note {
             CaptureNote::FewViews { got, .. } => got < 5,
             CaptureNote::ParallelTargets { spread_degrees, .. } => spread_degrees < PARALLEL_DEGREES / 2.0,
-            CaptureNote::Uncertain { pixels, .. } => pixels.is_nan() || pixels > UNCERTAIN_PX[1],
+            CaptureNote::Uncertain { median_px, .. } => median_px.is_nan() || median_px > UNCERTAIN_PX[1],
             CaptureNote::HoldOut { rms_px, holdout_rms_px, .. } => holdout_rms_px > HOLDOUT_RATIO[1] * rms_px,
             CaptureNote::LeftOut { pictures, of, .. } => 2 * pictures > of,
             CaptureNote::FewShared { got, .. } => got < 3,

@@ -232,42 +232,43 @@ fn rectified_rows(calibration: &Calibration, sightings: &Sightings) -> Option<(f
 mod tests {
     use super::*;
     use crate::Silent;
-    use cv_core::{Camera, Distortion, Pose, Rotation3, Vector3};
+    use cv_core::{Camera, Distortion, Pose, Rotation3, Vector3, luma_u8};
+    use cv_synth::{RenderOptions, Sheet, Texture};
 
-    /// A camera's picture of a chessboard of 8 × 6 squares of 30 mm with a white rim, nine rays to a pixel.
+    /// Meters.
+    const SQUARE: f64 = 0.03;
+
+    /// A photograph of a chessboard of 8 × 6 squares on a sheet of 260 × 200 mm.
     fn photograph(camera: &Camera, pose: &Pose) -> GrayF32 {
-        let back = pose.inverse();
-        let center = back.translation;
-        let shade = |x: f64, y: f64| {
-            let ray = back.rotation * camera.normalize(cv_core::Point2::new(x, y)).to_homogeneous();
-            let hit = center - ray * (center.z / ray.z);
-            let (u, v) = ((hit.x / 30.0 + 1.0).floor(), (hit.y / 30.0 + 1.0).floor());
-            let inside = (0.0..8.0).contains(&u) && (0.0..6.0).contains(&v);
-            if inside && (u + v).rem_euclid(2.0) == 0.0 { 0.1 } else { 0.8 }
+        let sheet = Sheet {
+            texture: Texture::Board { squares: (8, 6), square: SQUARE as f32 },
+            size: (0.26, 0.2),
+            bend: 0.0,
+            behind: Texture::Paint { color: [0.4; 3], seed: 1 },
+            light: [0.1, -0.1],
+            glare: None,
         };
-        GrayF32::from_fn(camera.width, camera.height, |x, y| {
-            let at = |i: i32| (x as f64 + f64::from(i % 3 - 1) / 3.0, y as f64 + f64::from(i / 3 - 1) / 3.0);
-            [(0..9).map(|i| shade(at(i).0, at(i).1)).sum::<f64>() as f32 / 9.0]
-        })
+        let options = RenderOptions { samples: 2, ..RenderOptions::default() };
+        sheet.photo(camera, pose, &options).unwrap().map(|c| [f32::from(luma_u8(c)) / 255.0])
     }
 
     fn pose(i: usize) -> Pose {
         let i = i as f64;
-        let turn = Rotation3::new(Vector3::new(0.45 * i.sin(), 0.45 * i.cos(), 0.1 * i.sin()));
-        let middle = Vector3::new(50.0 * (1.7 * i).sin(), 35.0 * (2.3 * i).cos(), 330.0 + 10.0 * i);
-        Pose::new(turn, middle - turn * Vector3::new(90.0, 60.0, 0.0))
+        let turn = Rotation3::new(Vector3::new(0.45 * (2.4 * i).sin(), 0.45 * (2.4 * i).cos(), 0.1 * i.sin()));
+        let middle = Vector3::new(0.02 + 0.03 * (1.7 * i).sin(), 0.03 * (2.3 * i).cos(), 0.34 + 0.01 * i);
+        Pose::new(turn, middle - turn * Vector3::new(0.13, 0.1, 0.0))
     }
 
     #[test]
     fn photographs_of_a_board_give_the_rig() {
-        let lens = |k| Camera { distortion: Distortion::radial(k, 0.0), ..Camera::from_focal(480, 360, 420.0) };
-        let cameras = [lens(-0.15), Camera { cx: 250.0, ..lens(-0.1) }];
-        let mount = Pose::new(Rotation3::new(Vector3::new(0.0, 0.05, 0.01)), Vector3::new(-60.0, 1.0, 2.0));
+        let lens = |k| Camera { distortion: Distortion::radial(k, 0.0), ..Camera::from_focal(400, 300, 350.0) };
+        let cameras = [lens(-0.15), Camera { cx: 205.0, ..lens(-0.1) }];
+        let mount = Pose::new(Rotation3::new(Vector3::new(0.0, 0.05, 0.01)), Vector3::new(-0.05, 0.001, 0.002));
         let photo = |view: usize, camera: usize| {
             // The right camera has no photograph of view 3, and in view 4 no board.
             match (view, camera) {
                 (3, 1) => None,
-                (4, 1) => Some(GrayF32::new(480, 360, [0.5])),
+                (4, 1) => Some(GrayF32::new(400, 300, [0.5])),
                 _ => {
                     let pose = if camera == 0 { pose(view) } else { mount.compose(&pose(view)) };
                     Some(photograph(&cameras[camera], &pose))
@@ -275,8 +276,8 @@ mod tests {
             }
         };
         let solve = CalibrateOptions { lens: cv_calib::LensChoice::RadialTangential4, ..CalibrateOptions::default() };
-        let options = BoardCalibrationOptions { square: 30.0, solve, ..BoardCalibrationOptions::default() };
-        let found = calibrate((8, 2), photo, &options, &Silent).unwrap();
+        let options = BoardCalibrationOptions { square: SQUARE, solve, ..BoardCalibrationOptions::default() };
+        let found = calibrate((7, 2), photo, &options, &Silent).unwrap();
         assert_eq!(found.board, BoardSize::new(7, 5));
         // Corners of such pictures are good to some hundredths of a pixel.
         assert!(found.calibration.rms_px < 0.1, "{}", found.calibration.rms_px);
@@ -284,7 +285,7 @@ mod tests {
             assert!((camera.camera.fx / truth.fx - 1.0).abs() < 3e-3, "{:?}", camera.camera);
         }
         let rig = found.calibration.stereo().unwrap();
-        assert!((rig.right_from_left.translation - mount.translation).norm() < 0.5, "{:?}", rig.right_from_left);
+        assert!((rig.right_from_left.translation - mount.translation).norm() < 5e-4, "{:?}", rig.right_from_left);
         assert!(found.rectified_dy_px.unwrap().0 < 0.1);
         assert_eq!(found.refusals[3][1], Some(PhotoRefusal::NoPhoto));
         assert!(matches!(found.refusals[4][1], Some(PhotoRefusal::Board(ChessboardError::NoBoard { .. }))));

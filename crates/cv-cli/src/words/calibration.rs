@@ -119,7 +119,7 @@ pub(crate) fn note(note: &CaptureNote, names: &[&str]) -> String {
             "{}all boards are nearly parallel, within {spread_degrees:.0}°; tilt the board by 30° to 45° to all sides",
             name(camera)
         ),
-        CaptureNote::Uncertain { camera, pixels, x, y } => format!(
+        CaptureNote::Uncertain { camera, pixels, x, y, .. } => format!(
             "{}around ({x:.0}, {y:.0}) the projection is uncertain by {pixels:.1} px; photograph the board there",
             name(camera)
         ),

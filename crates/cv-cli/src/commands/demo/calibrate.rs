@@ -14,7 +14,7 @@ const SQUARE: f64 = 0.025;
 /// The margin around the squares, in meters.
 const MARGIN: f64 = 0.012;
 /// Pairs of photographs.
-const PAIRS: usize = 10;
+const PAIRS: usize = 8;
 
 /// The sheet with its board, its middle bent by a millimeter.
 fn sheet(seed: u64) -> Sheet {
