@@ -140,7 +140,6 @@ fn check_determined(
 }
 
 /// What one camera saw, put back among the views in which it saw nothing.
-#[expect(clippy::type_complexity, reason = "three results of one step")]
 fn expand(
     data: &Sightings,
     (mut mono, views): (Mono, Vec<usize>),

@@ -157,10 +157,7 @@ fn wrong_corners_and_views_are_left_out_and_said_to_be() {
     // One view is of points shifted by a column, one mirrored, one of a line, one of three corners, one of nothing.
     let pose = studio.pose();
     let mut shuffled = studio.view(&pose, 0.1);
-    let n = shuffled[0].len();
-    for i in 0..n {
-        shuffled[0][i].point = (shuffled[0][i].point * 37 + 11) % 88;
-    }
+    shuffled[0].iter_mut().for_each(|c| c.point = (c.point * 37 + 11) % 88);
     let mut mirrored = data.views[0].clone();
     mirrored[0].iter_mut().for_each(|c| c.pixel.x = 1279.0 - c.pixel.x);
     let line = vec![data.views[1][0].iter().filter(|c| c.point / 11 == 4).copied().collect::<Vec<_>>()];

@@ -96,7 +96,7 @@ struct Looked {
 
 /// Finds the board on photographs of one camera or of several, and calibrates them.
 ///
-/// `photo(view, camera)` is called once for each photograph, from several threads, and gives it in gray from 0 to 1, or `None` where there is none; no more of them
+/// `photo(view, camera)` is called once for each photograph (once more for those that show another board than most, where no size was asked for), from several threads, and gives it in gray from 0 to 1, or `None` where there is none; no more of them
 /// are in memory than there are threads. The photographs of one view were taken at the same time.
 ///
 /// # Errors
@@ -109,11 +109,23 @@ pub fn calibrate(
 ) -> Result<BoardCalibration, BoardCalibrationError> {
     OptionError::check("square", options.square, "a number above 0", |v| v > 0.0 && v.is_finite())?;
     let mut clock = StageClock::new();
-    let looked = look(views, cameras, &photo, options, progress)?;
+    let everything = vec![vec![true; cameras]; views];
+    let mut looked = look(&everything, &photo, options, progress)?;
+    let seen = looked.iter().flatten().flatten().filter_map(|l| l.found.as_ref().ok());
+    let board = options.board.or_else(|| most_frequent(seen.map(|b| b.size.landscape())));
+    if let (None, Some(board)) = (options.board, board) {
+        // What is known of the board helps where more or less than it was seen.
+        let other = |l: &Option<Looked>| l.as_ref().is_some_and(|l| !l.found.as_ref().is_ok_and(|b| b.size == board));
+        let again: Vec<Vec<bool>> = looked.iter().map(|v| v.iter().map(other).collect()).collect();
+        let options = BoardCalibrationOptions { board: Some(board), ..options.clone() };
+        let second = look(&again, &photo, &options, progress)?;
+        for (old, new) in looked.iter_mut().flatten().zip(second.into_iter().flatten()) {
+            if new.is_some() {
+                *old = new;
+            }
+        }
+    }
     clock.lap("boards");
-    let all = || looked.iter().flatten().flatten();
-    let seen = || all().filter_map(|l| l.found.as_ref().ok());
-    let board = options.board.or_else(|| most_frequent(seen().map(|b| b.size.landscape())));
     let firsts: Vec<Option<(usize, usize)>> =
         (0..cameras).map(|c| looked.iter().find_map(|v| v[c].as_ref().map(|l| l.size))).collect();
     let mut refusals = vec![vec![Some(PhotoRefusal::NoPhoto); cameras]; views];
@@ -170,17 +182,22 @@ pub fn calibrate(
     Ok(BoardCalibration { calibration, sightings, board, refusals, rectified_dy_px, stages: clock.into_stages() })
 }
 
+/// Looks for the board on some of the photographs.
 fn look(
-    views: usize,
-    cameras: usize,
+    which: &[Vec<bool>],
     photo: &(impl Fn(usize, usize) -> Option<GrayF32> + Sync),
     options: &BoardCalibrationOptions,
     progress: &dyn Progress,
 ) -> Result<Vec<Vec<Option<Looked>>>, Cancelled> {
-    let stage = Stage::new(progress, "boards", views * cameras)?;
+    let (views, cameras) = (which.len(), which.first().map_or(0, Vec::len));
+    let stage = Stage::new(progress, "boards", which.iter().flatten().filter(|w| **w).count())?;
     let one = |i: usize| -> Result<Option<Looked>, Cancelled> {
+        let (view, camera) = (i / cameras, i % cameras);
+        if !which[view][camera] {
+            return Ok(None);
+        }
         stage.check()?;
-        let looked = match photo(i / cameras, i % cameras) {
+        let looked = match photo(view, camera) {
             None => None,
             Some(gray) => {
                 let found = find_chessboard(gray.view(), options.board, &options.chessboard, &stage);

@@ -64,14 +64,14 @@ const ENDINGS: &[&str] = &["yaml", "yml", "txt", "xml", "json", "cameramodel"];
 /// What a file holds.
 enum Held {
     Camera(Camera),
-    Rig(RigFile),
+    Rig(Box<RigFile>),
 }
 
 impl Input {
     /// A rig where the file is one, else a camera.
     fn read(&self, context: &Context) -> Result<(Held, Vec<CalibrationNote>), Failure> {
         match cv_io::read_rig_with_notes(&self.files, self.size) {
-            Ok((file, notes)) => Ok((Held::Rig(file), notes)),
+            Ok((file, notes)) => Ok((Held::Rig(Box::new(file)), notes)),
             Err(error) if self.files.len() > 1 => Err(error.into()),
             // What it is as a camera is the better reason, too.
             Err(_) => Ok((Held::Camera(rig::camera(&self.files[0], self.size, context)?), Vec::new())),

@@ -32,6 +32,11 @@ pub(crate) fn refusal(refusal: &PhotoRefusal) -> String {
     }
 }
 
+/// So many photographs.
+fn photographs(count: usize) -> String {
+    if count == 1 { "1 photograph".to_owned() } else { format!("{count} photographs") }
+}
+
 /// Why there is no calibration.
 pub(crate) fn no_calibration(error: BoardCalibrationError, names: &[&str], found: &str) -> Failure {
     let name = |camera: usize| match names.get(camera) {
@@ -45,11 +50,11 @@ pub(crate) fn no_calibration(error: BoardCalibrationError, names: &[&str], found
         BoardCalibrationError::Calibrate { source, .. } => {
             let (what, advice) = match source {
                 CalibrateError::TooFewViews { camera, got, needed, mirrored, .. } if mirrored > 0 => (
-                    format!("{}{mirrored} photographs show the board mirrored, {got} can be used, {needed} are needed", name(camera)),
+                    format!("{}photographs show the board mirrored ({mirrored} of them); {got} can be used, {needed} are needed", name(camera)),
                     "photographs that are not mirrored (cameras for the desk often mirror what they show)",
                 ),
                 CalibrateError::TooFewViews { camera, got, needed, .. } => (
-                    format!("{}the board can be used on {got} photographs, {needed} are needed{found}", name(camera)),
+                    format!("{}the board can be used on {}, {needed} are needed{found}", name(camera), photographs(got)),
                     "more photographs, ten or twenty, of the whole board at different tilts",
                 ),
                 CalibrateError::Degenerate { camera, largest_tilt_degrees } => (
@@ -104,7 +109,7 @@ pub(crate) fn note(note: &CaptureNote, names: &[&str]) -> String {
     };
     match *note {
         CaptureNote::FewViews { camera, got, wanted } => {
-            format!("{}{got} photographs are few; take {wanted} or more", name(camera))
+            format!("{}{} are few; take {wanted} or more", name(camera), photographs(got))
         }
         CaptureNote::EmptySide { camera, side, .. } => {
             let quarter = match side {
@@ -152,6 +157,6 @@ mod tests {
         let few = CalibrateError::TooFewViews { camera: 0, got: 1, needed: 3, small: 0, mirrored: 0 };
         let error = BoardCalibrationError::Calibrate { source: few, refusals: Vec::new() };
         let text = no_calibration(error, &["camera"], "").text();
-        assert!(text.contains("on 1 photographs, 3 are needed") && text.contains("different tilts"), "{text}");
+        assert!(text.contains("on 1 photograph, 3 are needed") && text.contains("different tilts"), "{text}");
     }
 }
