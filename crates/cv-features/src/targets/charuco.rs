@@ -69,7 +69,7 @@ pub fn find_charuco(
             let Some(found) = saddle(smooth.view(), start, window, 2e-4) else { continue };
             if (found.position - start).norm() < (0.1 * step).max(1.0) {
                 let id = y as usize * size.columns + x as usize;
-                points.push(BoardPoint { id, position: found.position, deviation: found.deviation });
+                points.push(BoardPoint { id, position: found.position, deviation: found.deviation_unsmoothed() });
             }
         }
         if points.len() > best.len() {

@@ -77,8 +77,8 @@ impl Dictionary {
         match self {
             Self::Aruco4x4x50 | Self::Aruco4x4x100 | Self::Aruco4x4x250 => ARUCO_4X4.get(id).copied(),
             Self::Aruco5x5x50 | Self::Aruco5x5x100 | Self::Aruco5x5x250 => ARUCO_5X5.get(id).copied(),
-            Self::Aruco6x6x50 | Self::Aruco6x6x100 | Self::Aruco6x6x250 => ARUCO_6X6.get(id).copied(),
-            Self::AprilTag36h11 => APRILTAG_36H11.get(id).copied(),
+            Self::Aruco6x6x50 | Self::Aruco6x6x100 | Self::Aruco6x6x250 => halves(&ARUCO_6X6, id),
+            Self::AprilTag36h11 => halves(&APRILTAG_36H11, id),
             Self::ArucoOriginal => {
                 // Two bits of the number choose the word of a row, the highest two that of the first.
                 const WORDS: [u64; 4] = [0b10000, 0b10111, 0b01001, 0b01110];
@@ -113,6 +113,12 @@ impl Dictionary {
         }
         best.map(|(_, id, turns)| (id, turns))
     }
+}
+
+/// Bits that are stored as two halves of 18.
+fn halves(stored: &[u32], id: usize) -> Option<u64> {
+    let (high, low) = (stored.get(2 * id)?, stored.get(2 * id + 1)?);
+    Some((u64::from(*high) << 18) | u64::from(*low))
 }
 
 /// The inner squares as they look after a quarter turn counterclockwise, which undoes one clockwise.

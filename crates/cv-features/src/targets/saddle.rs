@@ -17,6 +17,14 @@ pub(crate) struct Saddle {
     pub(crate) deviation: f64,
 }
 
+impl Saddle {
+    /// The deviation of a corner found in a picture that was smoothed by `[1 2 1]/4` both ways: noise had 1 / 0.375 times the size before, and the sampling of sharp edges
+    /// adds 0.018 px. So stated, the deviations are those of generated photographs (0.02 px on clean ones, 0.05 px on noisy ones) to a third.
+    pub(crate) fn deviation_unsmoothed(&self) -> f64 {
+        (self.deviation / 0.375).hypot(0.018)
+    }
+}
+
 /// Rounds before a window that does not come to rest is given up.
 const ROUNDS: usize = 30;
 
