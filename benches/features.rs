@@ -3,8 +3,8 @@
 use criterion::{Criterion, criterion_group, criterion_main};
 use cv_core::{GrayF32, Keypoint, Silent};
 use cv_features::{
-    DescriptorKind, Descriptors, HarrisOptions, MatchOptions, MopsOptions, RatioTest, SiftOptions, anms,
-    anms_square_covering, harris, harris_response, match_descriptors, mops, sift,
+    BoardSize, ChessboardOptions, DescriptorKind, Descriptors, HarrisOptions, MatchOptions, MopsOptions, RatioTest,
+    SiftOptions, anms, anms_square_covering, find_chessboard, harris, harris_response, match_descriptors, mops, sift,
 };
 
 /// Squares of random gray at several sizes: corners and blobs at all scales.
@@ -37,6 +37,16 @@ fn detection(c: &mut Criterion) {
     c.bench_function("anms 20000 to 500", |b| b.iter(|| anms(&corners, 500, 0.9)));
     c.bench_function("anms_square_covering 20000 to 500", |b| b.iter(|| anms_square_covering(&corners, 500)));
     let (settings, oriented) = (SiftOptions { max_features: 2000, ..SiftOptions::default() }, MopsOptions::default());
+    let board = GrayF32::from_fn(1333, 750, |x, y| {
+        // Ten by seven squares of 80 pixels, turned by 20°.
+        let (u, v) = (x as f32 * 0.94 + y as f32 * 0.34 - 350.0, y as f32 * 0.94 - x as f32 * 0.34 + 150.0);
+        let inside = (0.0..800.0).contains(&u) && (0.0..560.0).contains(&v);
+        [if inside && ((u / 80.0) as u32 + (v / 80.0) as u32) % 2 == 0 { 0.1 } else { 0.8 }]
+    });
+    let (size, seek) = (Some(BoardSize::new(9, 6)), ChessboardOptions::default());
+    assert!(find_chessboard(board.view(), size, &seek, &Silent).is_ok());
+    c.bench_function("chessboard 9x6 in 1333x750", |b| b.iter(|| find_chessboard(board.view(), size, &seek, &Silent)));
+    c.bench_function("no chessboard in 1333x750", |b| b.iter(|| find_chessboard(image.view(), size, &seek, &Silent)));
     c.bench_function("sift 2000 of 1333x750", |b| b.iter(|| sift(image.view(), &settings, &Silent)));
     c.bench_function("mops 2000 of 1333x750", |b| b.iter(|| mops(image.view(), &oriented, &Silent)));
 }

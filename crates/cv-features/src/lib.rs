@@ -75,4 +75,7 @@ pub use mops::{MopsOptions, MultiScaleOptions, describe_oriented_patches, harris
 pub use patch::{PatchOptions, describe_patches};
 pub use sift::{SiftOptions, sift};
 pub use square_covering::{anms_square_covering, anms_tiled};
-pub use targets::{BoardPoint, BoardSize, Chessboard, ChessboardError, ChessboardOptions, find_chessboard};
+pub use targets::{
+    BoardPoint, BoardSize, CharucoBoard, Chessboard, ChessboardError, ChessboardOptions, Dictionary, find_charuco,
+    find_chessboard,
+};

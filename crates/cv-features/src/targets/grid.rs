@@ -30,6 +30,8 @@ pub(crate) struct Node {
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Grid {
     pub(crate) nodes: HashMap<(i32, i32), Node>,
+    /// How far from a corner, in steps to the next, its four squares are plain.
+    pub(crate) clear: f64,
 }
 
 const STEPS: [(i32, i32); 4] = [(1, 0), (0, 1), (-1, 0), (0, -1)];
@@ -104,10 +106,17 @@ impl Buckets {
 }
 
 /// Whether the straight line between two corners has white on one side and black on the other, all along: white clockwise of its direction where `clockwise`.
-fn is_edge(view: ImageView<'_, f32, 1>, from: Point2<f64>, to: Point2<f64>, clockwise: bool, contrast: f32) -> bool {
+fn is_edge(
+    view: ImageView<'_, f32, 1>,
+    from: Point2<f64>,
+    to: Point2<f64>,
+    clockwise: bool,
+    contrast: f32,
+    clear: f64,
+) -> bool {
     let along = to - from;
     let length = along.norm();
-    let across = Vector2::new(-along.y, along.x) / length * (0.15 * length).clamp(1.5, 12.0);
+    let across = Vector2::new(-along.y, along.x) / length * (0.5 * clear * length).clamp(1.5, 12.0);
     let sign = if clockwise { 1.0 } else { -1.0 };
     let (mut sum, mut n) = (0.0f32, 0);
     for t in [0.3, 0.4, 0.5, 0.6, 0.7] {
@@ -128,7 +137,12 @@ fn is_edge(view: ImageView<'_, f32, 1>, from: Point2<f64>, to: Point2<f64>, cloc
 type Chosen = [Option<(usize, usize)>; 4];
 
 /// For each corner its nearest neighbor along each of its four directions.
-fn choose(corners: &[XCorner], view: ImageView<'_, f32, 1>, stage: &Stage<'_>) -> Result<Vec<Chosen>, Cancelled> {
+fn choose(
+    corners: &[XCorner],
+    view: ImageView<'_, f32, 1>,
+    clear: f64,
+    stage: &Stage<'_>,
+) -> Result<Vec<Chosen>, Cancelled> {
     let buckets = Buckets::new(corners, view.size());
     let axes: Vec<[Vector2<f64>; 2]> = corners.iter().map(|c| c.axes.map(|a| Vector2::new(a.cos(), a.sin()))).collect();
     (0..corners.len())
@@ -138,7 +152,7 @@ fn choose(corners: &[XCorner], view: ImageView<'_, f32, 1>, stage: &Stage<'_>) -
             if i % 256 == 0 {
                 stage.check()?;
             }
-            Ok(chosen_by(i, corners, &axes, &buckets, view))
+            Ok(chosen_by(i, corners, &axes, &buckets, view, clear))
         })
         .collect()
 }
@@ -155,6 +169,7 @@ fn chosen_by(
     axes: &[[Vector2<f64>; 2]],
     buckets: &Buckets,
     view: ImageView<'_, f32, 1>,
+    clear: f64,
 ) -> Chosen {
     let (corner, own) = (&corners[i], axes[i]);
     // Cost, index.
@@ -179,7 +194,7 @@ fn chosen_by(
             && theirs[axis].perp(&own[1 - axis]).abs() < OFF_ACROSS
             && other.contrast < 5.0 * corner.contrast
             && corner.contrast < 5.0 * other.contrast
-            && is_edge(view, corner.position, other.position, axis == 0, corner.contrast.min(other.contrast));
+            && is_edge(view, corner.position, other.position, axis == 0, corner.contrast.min(other.contrast), clear);
         if fits {
             now[k] = Some((cost, j));
             best.set(now);
@@ -198,14 +213,15 @@ fn chosen_by(
     })
 }
 
-/// The grids that the corners form, the largest first; of fewer than `least` corners none.
+/// The grids that the corners form, the largest first; of fewer than `least` corners none. `clear`: see [`Grid`].
 pub(crate) fn grids(
     corners: &[XCorner],
     view: ImageView<'_, f32, 1>,
     least: usize,
+    clear: f64,
     stage: &Stage<'_>,
 ) -> Result<Vec<Grid>, Cancelled> {
-    let chosen = choose(corners, view, stage)?;
+    let chosen = choose(corners, view, clear, stage)?;
     let mutual = |i: usize, k: usize| {
         let (j, back) = chosen[i][k]?;
         (chosen[j][back].map(|c| c.0) == Some(i)).then_some((j, back))
@@ -222,7 +238,7 @@ pub(crate) fn grids(
             continue;
         }
         stage.check()?;
-        let mut grid = Grid::default();
+        let mut grid = Grid { clear, ..Grid::default() };
         let mut members = Vec::new();
         let mut queue = VecDeque::from([(seed, (0i32, 0i32), 0usize)]);
         used[seed] = true;
@@ -254,9 +270,9 @@ pub(crate) fn grids(
     Ok(out)
 }
 
-/// The two edges through a place and the contrast around it, on a circle that suits the distance to the next corner.
-fn crossing(view: ImageView<'_, f32, 1>, at: Point2<f64>, step: f64) -> Option<([f64; 2], f32)> {
-    let radius = (0.3 * step).clamp(2.0, 10.0);
+/// The two edges through a place and the contrast around it, on a circle of 2 to 10 pixels.
+fn crossing(view: ImageView<'_, f32, 1>, at: Point2<f64>, radius: f64) -> Option<([f64; 2], f32)> {
+    let radius = radius.clamp(2.0, 10.0);
     let angle = |i: usize| i as f64 * (TAU / 16.0);
     let mut values = [0.0f32; 16];
     for (i, v) in values.iter_mut().enumerate() {
@@ -306,15 +322,16 @@ impl Grid {
 
     /// Moves every corner to its exact place, and drops those that have none, or lie where their neighbors say that they cannot.
     pub(crate) fn settle(&mut self, view: ImageView<'_, f32, 1>) {
+        let clear = self.clear;
         let steps: HashMap<(i32, i32), f64> = self.nodes.keys().map(|&p| (p, self.step(p))).collect();
         self.nodes.retain(|p, node| {
             let (step, corner) = (steps[p], &mut node.corner);
             // Wide enough to see edges from where a coarse octave put it.
-            let window = (0.3 * step).clamp(2.0, (0.5 * corner.radius).max(4.0));
+            let window = (clear * step).clamp(2.0, (0.5 * corner.radius).max(4.0));
             let Some(found) = saddle(view, corner.position, window, ROUGH) else { return false };
             let near = (found.position - corner.position).norm() < 0.3 * step;
             let same = |axes: [f64; 2]| (0..2).all(|i| between_lines(axes[i], corner.axes[i]) < 0.6);
-            let good = near && crossing(view, found.position, step).is_some_and(|(axes, _)| same(axes));
+            let good = near && crossing(view, found.position, clear * step).is_some_and(|(axes, _)| same(axes));
             corner.position = found.position;
             good
         });
@@ -391,12 +408,13 @@ impl Grid {
         let near: Vec<&Node> = STEPS.iter().filter_map(|(dx, dy)| self.nodes.get(&(x + dx, y + dy))).collect();
         let contrast = near.iter().map(|n| n.corner.contrast).fold(f32::INFINITY, f32::min);
         let neighbor = near.first()?;
-        let found = saddle(view, expected, (0.3 * step).clamp(2.0, 8.0), ROUGH)?;
+        let found = saddle(view, expected, (self.clear * step).clamp(2.0, 8.0), ROUGH)?;
         if (found.position - expected).norm() > 0.3 * step {
             return None;
         }
-        let (axes, seen) = crossing(view, found.position, step)?;
-        let corner = XCorner { position: found.position, axes, contrast: seen, radius: (0.3 * step).clamp(2.0, 10.0) };
+        let radius = (self.clear * step).clamp(2.0, 10.0);
+        let (axes, seen) = crossing(view, found.position, radius)?;
+        let corner = XCorner { position: found.position, axes, contrast: seen, radius };
         // Its edge of the second kind runs along the neighbor's of the first.
         let flipped = between_lines(axes[1], neighbor.corner.axes[0]) < 0.5
             && between_lines(axes[0], neighbor.corner.axes[1]) < 0.5;

@@ -2,7 +2,7 @@
 //!
 //! Source: W. Förstner & E. Gülch, "A fast operator for detection and precise location of distinct points, corners and centres of circular features", ISPRS
 //! intercommission workshop 1987. The gradient at every pixel x of a window is at right angles to the edge it lies on, and the edge goes through the corner p: gᵀ(p − x) = 0.
-//! Least squares over a Gaussian window gives p; the window follows it until it rests. Edges are straight under any perspective, and a change of contrast does
+//! Least squares over a window that fades to its rim gives p; the window follows it until it rests. Edges are straight under any perspective, and a change of contrast does
 //! not move the place, so neither tilt nor the camera's tone curve makes an error.
 
 use crate::simd;
@@ -15,6 +15,14 @@ pub(crate) struct Saddle {
     pub(crate) position: Point2<f64>,
     /// Standard deviation along either axis, in pixels.
     pub(crate) deviation: f64,
+}
+
+impl Saddle {
+    /// The deviation of a corner found in a picture that was smoothed by `[1 2 1]/4` both ways: noise had 1 / 0.375 times the size before, and the sampling of sharp edges
+    /// adds 0.018 px. So stated, the deviations are those of generated photographs (0.02 px on clean ones, 0.05 px on noisy ones) to a third.
+    pub(crate) fn deviation_unsmoothed(&self) -> f64 {
+        (self.deviation / 0.375).hypot(0.018)
+    }
 }
 
 /// Rounds before a window that does not come to rest is given up.
@@ -56,23 +64,34 @@ impl Patch {
 /// The corner near `start`: the window reaches `window` pixels to each side (at least 1), and has come to rest where it moves by less than `rest` pixels. `None` where it leaves the picture, wanders off further than
 /// its own reach, or sees no two edges.
 pub(crate) fn saddle(view: ImageView<'_, f32, 1>, start: Point2<f64>, window: f64, rest: f64) -> Option<Saddle> {
-    let reach = window.clamp(1.0, 64.0).round() as usize;
+    let reach = (1.25 * window.clamp(1.0, 64.0)).round() as usize;
     let mut patch = Patch { values: Vec::new(), side: 0 };
-    // As wide as its half-width: the rim weighs e⁻¹ along each axis.
-    let weights: Vec<f32> =
-        (0..=2 * reach).map(|i| (-((i as f64 - reach as f64) / window).powi(2)).exp() as f32).collect();
     let level = simd::level();
     let mut at = start;
+    let mut middle = Point2::new(f64::NAN, f64::NAN);
     for _ in 0..ROUNDS {
-        patch.sample(view, at, reach + 1)?;
+        // The pixels themselves: values between them would be smoothed more to one side than to the other, which moves a sharp edge.
+        let near = (at.x - middle.x).abs().max((at.y - middle.y).abs()) < 0.8;
+        if !near {
+            middle = Point2::new(at.x.round(), at.y.round());
+            patch.sample(view, middle, reach + 1)?;
+        }
+        let off = at - middle;
+        // Biweights along each axis, about as wide as a Gaussian that is down to e⁻¹ at the half-width, and nothing at the rim, where pixels come and go.
+        let weights = [off.x, off.y].map(|off| -> Vec<f32> {
+            let to = |i: usize| (i as f64 - reach as f64 - off) / (reach + 1) as f64;
+            (0..=2 * reach).map(|i| (1.0 - to(i).powi(2)).max(0.0).powi(2) as f32).collect()
+        });
         let normal = normal_equations(level, &patch, reach, &weights);
-        let step = normal.solve()?;
-        at = Point2::new(at.x + step[0], at.y + step[1]);
+        let place = normal.solve()?;
+        let step = [place[0] - off.x, place[1] - off.y];
+        at = Point2::new(middle.x + place[0], middle.y + place[1]);
         let off = (at - start).norm();
         if off > window.max(1.5) || !off.is_finite() {
             return None;
         }
         if step[0].hypot(step[1]) < rest {
+            patch.sample(view, at, reach + 1)?;
             return Some(Saddle { position: at, deviation: normal.deviation(&patch) });
         }
     }
@@ -89,12 +108,12 @@ struct NormalEquations {
     by: f64,
 }
 
-fn normal_equations(level: Level, patch: &Patch, reach: usize, weights: &[f32]) -> NormalEquations {
+fn normal_equations(level: Level, patch: &Patch, reach: usize, weights: &[Vec<f32>; 2]) -> NormalEquations {
     dispatch!(level, simd => normal_equations_impl(simd, patch, reach, weights))
 }
 
 #[inline(always)]
-fn normal_equations_impl<S: Simd>(_: S, patch: &Patch, reach: usize, weights: &[f32]) -> NormalEquations {
+fn normal_equations_impl<S: Simd>(_: S, patch: &Patch, reach: usize, weights: &[Vec<f32>; 2]) -> NormalEquations {
     let (side, n) = (patch.side, 2 * reach + 1);
     let mut sums = [0.0f64; 5];
     for j in 0..n {
@@ -113,7 +132,7 @@ fn normal_equations_impl<S: Simd>(_: S, patch: &Patch, reach: usize, weights: &[
             for i in 0..count {
                 gx[i] = right[start + i] - left[start + i];
                 gy[i] = below[start + i] - above[start + i];
-                w[i] = weights[start + i] * weights[j];
+                w[i] = weights[0][start + i] * weights[1][j];
             }
             for i in 0..8 {
                 let x = (start + i) as f32 - reach as f32;
@@ -152,5 +171,32 @@ impl NormalEquations {
         let det = self.xx * self.yy - self.xy * self.xy;
         // Gradients here are differences over two pixels: twice the slope.
         (variance * 4.0 * 0.5 * (self.xx + self.yy) / det).sqrt()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cv_core::GrayF32;
+
+    #[test]
+    fn the_place_of_a_smooth_crossing_is_exact() {
+        // tanh of the distances to two lines: an X-corner blurred by about a pixel and a half, edges at 60° to each other.
+        let truth = Point2::new(20.3, 18.6);
+        let side = |x: usize, y: usize, angle: f64| {
+            let (sin, cos) = angle.sin_cos();
+            (((y as f64 - truth.y) * cos - (x as f64 - truth.x) * sin) / 1.5).tanh()
+        };
+        let image = GrayF32::from_fn(40, 40, |x, y| [(0.5 + 0.4 * side(x, y, 0.2) * side(x, y, 1.25)) as f32]);
+        for start in [Point2::new(20.0, 19.0), Point2::new(21.5, 17.5)] {
+            let found = saddle(image.view(), start, 6.0, 1e-4).unwrap();
+            // Sums over pixels are as good as integrals at this blur.
+            assert!((found.position - truth).norm() < 0.002 && found.deviation < 0.02, "{found:?}");
+        }
+        // A straight edge has no corner, nor has a flat picture; and none is looked for outside.
+        let edge = GrayF32::from_fn(40, 40, |x, _| [(x > 20) as u8 as f32]);
+        for (image, at) in [(&edge, 20.0), (&GrayF32::new(40, 40, [0.5]), 20.0), (&image, 1.0), (&image, f64::NAN)] {
+            assert!(saddle(image.view(), Point2::new(at, 20.0), 5.0, 1e-4).is_none());
+        }
     }
 }

@@ -316,3 +316,58 @@ fn each_once(mut found: Vec<XCorner>) -> Vec<XCorner> {
     }
     kept
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cv_core::Silent;
+    use cv_synth::instruction_sets;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn every_instruction_set_gives_the_plain_response(width in 1usize..70, seed in any::<u32>()) {
+            let mut state = seed | 1;
+            let rows: Vec<Vec<f32>> = (0..7)
+                .map(|_| {
+                    (0..width + 6)
+                        .map(|_| {
+                            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                            (state >> 8) as f32 / (1 << 24) as f32
+                        })
+                        .collect()
+                })
+                .collect();
+            let around: [&[f32]; 7] = std::array::from_fn(|i| &rows[i][..]);
+            let sample = |(dx, dy): (isize, isize), x: usize| rows[(3 + dy) as usize][(3 + x as isize + dx) as usize];
+            let plain: Vec<f32> = (0..width)
+                .map(|x| response_at(std::array::from_fn(|i| if i < 16 { sample(RING[i], x) } else { sample(MIDDLE[i - 16], x) })))
+                .collect();
+            for level in instruction_sets() {
+                let mut out = vec![0.0; width];
+                respond(level, around, &mut out);
+                prop_assert_eq!(&out, &plain, "{:?}", level);
+            }
+        }
+    }
+
+    #[test]
+    fn a_crossing_knows_its_edges_and_a_line_is_none() {
+        // White between 0.3 and 1.5 radians, clockwise on screen, and opposite.
+        let at = |x: usize, y: usize| {
+            let angle = (y as f64 - 20.0).atan2(x as f64 - 20.0).rem_euclid(std::f64::consts::PI);
+            [if (0.3..1.5).contains(&angle) { 0.8 } else { 0.1 }]
+        };
+        let image = GrayF32::from_fn(41, 41, at);
+        let (found, _) = x_corners(image.view(), 0.03, &Silent).unwrap();
+        let best = found.iter().min_by(|a, b| {
+            let to = |c: &XCorner| (c.position - Point2::new(20.0, 20.0)).norm();
+            to(a).total_cmp(&to(b))
+        });
+        let best = best.unwrap();
+        // Sixteen samples on a circle of three pixels: a fifth of a step of 22°, and the jagged edge as much.
+        assert!((best.axes[0] - 0.3).abs() < 0.15 && (best.axes[1] - 1.5).abs() < 0.15, "{best:?}");
+        let line = GrayF32::from_fn(41, 41, |x, _| [(x == 20) as u8 as f32]);
+        assert!(x_corners(line.view(), 0.03, &Silent).unwrap().0.is_empty());
+    }
+}
