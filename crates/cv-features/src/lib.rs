@@ -58,6 +58,7 @@ mod sift;
 mod simd;
 mod square_covering;
 mod structure_tensor;
+mod targets;
 
 pub use anms::{anms, suppression_radii};
 pub use asift::sift_affine_view;
@@ -74,3 +75,4 @@ pub use mops::{MopsOptions, MultiScaleOptions, describe_oriented_patches, harris
 pub use patch::{PatchOptions, describe_patches};
 pub use sift::{SiftOptions, sift};
 pub use square_covering::{anms_square_covering, anms_tiled};
+pub use targets::{BoardPoint, BoardSize, Chessboard, ChessboardError, ChessboardOptions, find_chessboard};

@@ -17,6 +17,7 @@
 //!   seed; [`SceneBuilder`] for one's own.
 //! * One picture: [`render`] with a [`cv_core::Camera`] (distortion included), a pose and [`RenderOptions`].
 //! * Sets with their truth: [`stereo_pair`], [`homography_pair`], [`panorama_views`], [`two_view`], [`ball_photos`].
+//! * Photographs of one flat sheet, a calibration board say: [`Sheet`], [`chessboard_photo`], [`photo_without_board`].
 //! * Further truth: [`Scene::correspondences`], [`Scene::visible_in_both`], [`Scene::point_at`], [`Scene::pixel_of`],
 //!   [`plane_homography`], [`rotation_homography`].
 //! * Measures against it: [`homography_corner_error`], [`alignment_error`], [`rotation_error`], [`direction_error`],
@@ -46,6 +47,7 @@ mod score;
 mod sensor;
 mod sets;
 mod shape;
+mod sheet_photo;
 mod texture;
 mod truth;
 
@@ -63,5 +65,6 @@ pub use sets::{
     BallPhoto, HomographyPair, PanoramaSetOptions, PanoramaViews, StereoPair, TwoView, ball_photos, homography_pair,
     panorama_views, stereo_pair, two_view,
 };
+pub use sheet_photo::{ChessboardPhoto, ChessboardTrial, Sheet, chessboard_photo, photo_without_board};
 pub use texture::{Collage, Rgb, Texture, srgb};
 pub use truth::{plane_homography, rotation_homography};

@@ -20,6 +20,8 @@ pub(crate) const MAP: &[&str] = &["pfm", "npy", "png"];
 pub(crate) const CLOUD: &[&str] = &["ply"];
 /// Rows of numbers.
 pub(crate) const TEXT: &[&str] = &["txt"];
+/// Cameras and rigs.
+pub(crate) const YAML: &[&str] = &["yaml", "yml"];
 /// Models.
 pub(crate) const JSON: &[&str] = &["json"];
 
