@@ -6,6 +6,7 @@ mod golden;
 mod peers;
 mod real;
 mod tidy;
+mod trust;
 
 use clap::{Parser, Subcommand};
 use std::{
@@ -37,6 +38,17 @@ enum Chore {
         /// Only this job; `all` or none: every one.
         job: Option<String>,
     },
+    /// Damage the inputs of every command, kill it, and run it on other processors; see docs/trust.md.
+    Trust {
+        /// Only this job; `all` or none: every one.
+        job: Option<String>,
+        /// How many runs [default: 10000 damaged inputs, 200 kills].
+        #[arg(long)]
+        count: Option<u64>,
+        /// Of the random choices.
+        #[arg(long, default_value_t = 1)]
+        seed: u64,
+    },
     /// Run other systems and ours on the same inputs, side by side.
     Peers {
         /// Only this job; `all` or none: every one.
@@ -50,6 +62,7 @@ fn main() -> ExitCode {
         Chore::Tidy => tidy::run(),
         Chore::Golden { check } => golden::run(check),
         Chore::Real { job } => real::run(job.as_deref()),
+        Chore::Trust { job, count, seed } => trust::run(job.as_deref(), &trust::Options { count, seed }),
         Chore::Peers { job } => peers::run(job.as_deref()),
     };
     match result {

@@ -5,15 +5,21 @@
 mod support;
 
 use cv_core::{Camera, Image, RgbU8};
-use cv_synth::{RenderOptions, Scene, stereo_pair};
+use cv_synth::{RenderOptions, Scene, StereoPair, stereo_pair};
+use std::sync::LazyLock;
 use support::{done, json, refused, run};
 
-/// A small generated pair and its truth as files in a new folder.
-fn pair() -> tempfile::TempDir {
-    let folder = tempfile::tempdir().unwrap();
+/// A small generated pair and its truth.
+static PAIR: LazyLock<StereoPair> = LazyLock::new(|| {
     let scene = Scene::room(5);
     let camera = Camera::from_focal(240, 180, 210.0);
-    let pair = stereo_pair(&scene, &camera, &scene.viewpoint(), 0.25, &RenderOptions::default()).unwrap();
+    stereo_pair(&scene, &camera, &scene.viewpoint(), 0.25, &RenderOptions::default()).unwrap()
+});
+
+/// [`PAIR`] as files in a new folder.
+fn pair() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let pair = &*PAIR;
     let at = |name: &str| folder.path().join(name);
     cv_io::write_png(at("left.png"), pair.left.image.view()).unwrap();
     cv_io::write_png(at("right.png"), pair.right.image.view()).unwrap();

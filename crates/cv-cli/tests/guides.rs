@@ -12,7 +12,7 @@ use std::{
 use support::done;
 
 /// In the order in which they run: each may use what those before it have written.
-const GUIDES: [&str; 10] = [
+const GUIDES: [&str; 11] = [
     "first-hour.md",
     "jobs/panorama.md",
     "jobs/depth.md",
@@ -20,6 +20,7 @@ const GUIDES: [&str; 10] = [
     "jobs/reconstruction.md",
     "jobs/segmentation.md",
     "jobs/matching.md",
+    "jobs/calibration.md",
     "parameters.md",
     "from-opencv.md",
     "when-it-fails.md",
@@ -86,7 +87,15 @@ fn every_command_of_the_guides_does_what_they_say() {
         }
     }
     assert!(commands >= 30, "{commands} commands: guides have gone");
-    for page in ["pano-report", "depth-report", "motion-report", "rectify-report", "found-report", "match-report"] {
+    for page in [
+        "pano-report",
+        "depth-report",
+        "motion-report",
+        "rectify-report",
+        "found-report",
+        "match-report",
+        "calibration-report",
+    ] {
         assert!(folder.path().join(page).join("report.html").is_file(), "{page}");
     }
     assert!(
@@ -169,6 +178,10 @@ fn the_options_in_the_tables_are_there() {
         "reconstruct",
         "depth",
         "rectify",
+        "calibrate mono",
+        "calibrate stereo",
+        "calibration convert",
+        "undistort",
         "eval disparity",
     ]
     .iter()

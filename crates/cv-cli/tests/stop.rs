@@ -186,3 +186,37 @@ fn the_demo_stops_within_its_jobs() {
         assert!(names.iter().all(|name| name.ends_with(".png") && !name.starts_with('.')), "{names:?}");
     }
 }
+
+/// A pipe into which nobody writes keeps a command where no callback is asked; the program ends all the same.
+#[test]
+fn a_command_that_waits_for_its_input_stops_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    write_inputs(folder, (64, 48), 3);
+    fs::write(folder.join("left_mask.png"), "mask").unwrap();
+    let made = Command::new("mkfifo").arg(folder.join("pipe.png")).arg(folder.join("pipe_mask.png")).status().unwrap();
+    assert!(made.success());
+    fs::write(folder.join("d.pfm"), "old").unwrap();
+    let commands = [
+        "depth left.ppm pipe.png -o d.pfm",
+        "match pipe.png left.ppm -o m.txt",
+        "panorama left.ppm pipe.png -o p.png",
+        "reconstruct pipe.png left.ppm -o c.ply",
+        "rectify left.ppm right.ppm --rig pipe.png -o r",
+        "segment train --images pipe.png --masks masks -o m.json",
+        "segment predict --model pipe.png left.ppm -o found",
+        "segment eval --model pipe.png --images left.ppm --masks masks",
+        "estimate homography --matches pipe.png",
+        "eval disparity --estimate pipe.png --truth pipe.png",
+    ];
+    fs::copy(folder.join("masks/left.png"), folder.join("masks/pipe.png")).unwrap();
+    let names_before = names(folder);
+    let children: Vec<Child> =
+        commands.iter().map(|args| start(folder, &args.split(' ').collect::<Vec<_>>())).collect();
+    children.iter().for_each(|child| signal(child, "INT"));
+    for (child, args) in children.into_iter().zip(commands) {
+        stopped(child, args);
+    }
+    assert_eq!(names(folder), names_before);
+    assert_eq!(fs::read(folder.join("d.pfm")).unwrap(), b"old");
+}

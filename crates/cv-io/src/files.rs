@@ -4,7 +4,7 @@ use std::fs::{self, File};
 use std::io::{self, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
-use crate::pending::Pending;
+use crate::pending::{PREFIX, Pending, SUFFIX};
 use crate::{FormatError, IoError, memory};
 
 /// The largest file that is read into memory: 4 GiB, far above any photograph and below what would take a machine down.
@@ -99,7 +99,7 @@ fn write_atomic_inner(
         return Err(io::Error::new(io::ErrorKind::NotFound, reason).into());
     }
     let mut builder = tempfile::Builder::new();
-    builder.prefix(".cv-").suffix(".part");
+    builder.prefix(PREFIX).suffix(SUFFIX);
     // A temporary file is private by default; an output is as open as any other file the user makes.
     #[cfg(unix)]
     {

@@ -72,7 +72,7 @@ pub use maps::{decode_map, read_map};
 pub use matches::{Matches, parse_matches, read_matches, write_matches};
 pub use memory::{DEFAULT_MAX_MEMORY, default_max_memory, set_default_max_memory};
 pub use metadata::Metadata;
-pub use pending::{abandon_writes, write_together};
+pub use pending::{abandon_writes, remove_abandoned, write_together};
 pub use picture::{
     DEFAULT_MAX_PIXELS, DynImage, Pixels, ReadOptions, decode_image, read_gray_u8, read_image, read_image_info,
     read_image_with, read_mask, read_rgb,

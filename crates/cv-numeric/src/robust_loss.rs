@@ -94,6 +94,34 @@ impl RobustLoss {
             }
         }
     }
+
+    /// `1 + 2 s ρ''(s) / ρ'(s)`: the curvature of the loss along the residual as a share of that across it, 1 near zero, negative where the loss bends
+    /// downward (Triggs et al., §4.3). 1 where the weight is zero.
+    #[inline]
+    pub fn curvature(&self, s: f64) -> f64 {
+        match *self {
+            Self::Trivial | Self::Truncated { .. } => 1.0,
+            Self::Huber { scale } => {
+                if s <= scale * scale {
+                    1.0
+                } else {
+                    0.0
+                }
+            }
+            Self::Cauchy { scale } => {
+                let u = s / (scale * scale);
+                (1.0 - u) / (1.0 + u)
+            }
+            Self::Tukey { scale } => {
+                let u = s / (scale * scale);
+                if u < 1.0 { (1.0 - 5.0 * u) / (1.0 - u) } else { 1.0 }
+            }
+            Self::GemanMcClure { scale } => {
+                let u = s / (scale * scale);
+                (1.0 - 3.0 * u) / (1.0 + u)
+            }
+        }
+    }
 }
 
 #[cfg(test)]
@@ -123,6 +151,21 @@ mod tests {
                 let numeric = (loss.value(s + h) - loss.value((s - h).max(0.0))) / (s + h - (s - h).max(0.0));
                 // A one-sided difference at s = 0 is off by h/2 times a second derivative of order 1/scale².
                 prop_assert!((numeric - loss.weight(s)).abs() < 1e-5, "{loss:?} at {s}");
+            }
+        }
+
+        #[test]
+        fn the_curvature_is_that_of_the_loss_along_the_residual(scale in 0.1..10.0f64, ratio in 0.05..3.0f64) {
+            prop_assume!((ratio - 1.0).abs() > 1e-3);
+            let r = ratio * scale;
+            let h = 1e-4 * scale;
+            for loss in losses(scale) {
+                let value = |r: f64| loss.value(r * r);
+                // Half the second derivative of ρ(r²).
+                let numeric = (value(r + h) - 2.0 * value(r) + value(r - h)) / (2.0 * h * h);
+                let exact = loss.weight(r * r) * loss.curvature(r * r);
+                // Rounding of ρ over h² and h² of fourth derivatives of some tens over scale².
+                prop_assert!((numeric - exact).abs() < 1e-5, "{loss:?} at {r}: {numeric} {exact}");
             }
         }
     }

@@ -1,7 +1,7 @@
 //! One call per job, in memory: photographs and options in, result and timings out.
 //!
 //! This crate joins the stages of the crates below it (`cv-features`, `cv-geometry`, `cv-stereo`, `cv-segment`,
-//! `cv-panorama`) into the jobs a person asks for. It reads and writes no files: `cv-cli` does that, and so can any
+//! `cv-panorama`, `cv-calib`) into the jobs a person asks for. It reads and writes no files: `cv-cli` does that, and so can any
 //! other program.
 //!
 //! ```
@@ -31,6 +31,7 @@
 mod advice;
 mod asift;
 mod axes;
+mod calibrate;
 mod depth;
 mod disparity_range;
 mod estimate;
@@ -46,6 +47,7 @@ mod segment;
 
 pub use advice::Advice;
 pub use axes::Axes;
+pub use calibrate::{BoardCalibration, BoardCalibrationError, BoardCalibrationOptions, PhotoRefusal, calibrate};
 pub use cv_core::{Cancelled, Progress, Silent};
 pub use cv_features::{FeatureExtractor, FeatureMethod, FeatureOptions, Features};
 pub use cv_geometry::{
@@ -103,6 +105,12 @@ pub mod segmentation {
         Labeled, MIN_SCORE, ObjectStatistics, Region, Regions, Rule, SegmentError, ShapeStatistics, TrainOptions,
         Trained,
     };
+}
+
+/// What a caller of [`calibrate()`] needs of targets and of calibration: sizes of boards, options, results, verdicts.
+pub mod calibration {
+    pub use cv_calib::*;
+    pub use cv_features::{BoardSize, Chessboard, ChessboardError, ChessboardOptions};
 }
 
 /// The examples of the README, run as tests.

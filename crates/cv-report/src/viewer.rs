@@ -140,6 +140,50 @@ impl PointScene {
         out
     }
 
+    /// The nearest eye looking along `forward` that has every camera and all but the outermost points in its picture of this aspect ratio, as the viewer's
+    /// script finds it: first its distance from what it looks at, then the target that leaves as much room on the left as on the right, and above as below. A point at
+    /// (u, v, w) from `center` along the eye's axes is in a picture of half width k where |u − shift| ≤ k (w + distance).
+    fn frame(
+        &self,
+        center: &Point3<f64>,
+        forward: &cv_core::Vector3<f64>,
+        up: &cv_core::Vector3<f64>,
+        aspect: f64,
+    ) -> Option<(Point3<f64>, f64)> {
+        const FOCAL: f64 = 2.2;
+        const SHOWN: f64 = 0.98;
+        let right = forward.cross(up).try_normalize(1e-9)?;
+        let axes = [right, forward.cross(&right), *forward];
+        let along = |p: &[f32; 3]| {
+            let d = Point3::from(p.map(f64::from)) - center;
+            axes.map(|axis| axis.dot(&d))
+        };
+        let step = (self.points.len() / 2000).max(1);
+        let dots: Vec<[f64; 3]> = self.points.iter().step_by(step).map(along).collect();
+        let corners: Vec<[f64; 3]> = self.segments().iter().flat_map(|(a, b, _)| [along(a), along(b)]).collect();
+        let most = |reach: &dyn Fn(&[f64; 3]) -> f64| {
+            let mut values: Vec<f64> = dots.iter().map(reach).collect();
+            let inner = quantile(&mut values, SHOWN).unwrap_or(f64::NEG_INFINITY);
+            corners.iter().map(reach).fold(inner, f64::max)
+        };
+        let needed = [aspect, 1.0].into_iter().enumerate().map(|(i, side)| {
+            let k = 0.92 * side / FOCAL;
+            (most(&|p| p[i] - k * p[2]) + most(&|p| -p[i] - k * p[2])) / (2.0 * k)
+        });
+        let distance = Some(needed.fold(0.0, f64::max)).filter(|d| *d > 0.0 && d.is_finite())?;
+        let mut target = *center;
+        for i in [0, 1] {
+            let (mut low, mut high) = (-2.0 * distance, 2.0 * distance);
+            for _ in 0..24 {
+                let shift = (low + high) / 2.0;
+                let reach = |sign: f64| most(&|p| sign * (p[i] - shift) / (p[2] + distance).max(1e-9));
+                if reach(1.0) > reach(-1.0) { low = shift } else { high = shift }
+            }
+            target += axes[i] * ((low + high) / 2.0);
+        }
+        Some((target, distance))
+    }
+
     /// What the viewer's script reads. Numbers in base64 are little-endian: positions as three `u16` over the box of the points, colors as red,
     /// green, blue, sightings as two `u16` for each photograph in steps of its own (0xffff: not seen), ends of lines as three `f32`.
     pub(crate) fn to_json(&self) -> String {
@@ -259,9 +303,14 @@ pub fn render_points(scene: &PointScene, viewpoint: Viewpoint, width: usize, hei
     };
     let forward = forward.try_normalize(1e-9).unwrap_or_else(cv_core::Vector3::z);
     // A plan is drawn from far away, where lines that are parallel look it.
-    let distance = if viewpoint == Viewpoint::Camera { 3.0 * radius } else { 60.0 * radius };
-    let eye = center - forward * distance;
-    let Some(pose) = Pose::look_at(eye, center, -up) else { return raster.into_image() };
+    let (target, distance) = match viewpoint {
+        Viewpoint::Camera => {
+            scene.frame(&center, &forward, &up, width as f64 / height as f64).unwrap_or((center, 3.0 * radius))
+        }
+        Viewpoint::Top | Viewpoint::Side => (center, 60.0 * radius),
+    };
+    let eye = target - forward * distance;
+    let Some(pose) = Pose::look_at(eye, target, -up) else { return raster.into_image() };
     let project = |p: [f32; 3]| {
         let q = pose.transform(&Point3::new(f64::from(p[0]), f64::from(p[1]), f64::from(p[2])));
         (q.z > 0.02 * distance).then(|| ([(q.x / q.z) as f32, (q.y / q.z) as f32], q.z as f32))
@@ -373,6 +422,29 @@ mod tests {
         assert_eq!(f.rays[0], [-1.0, -0.5, 1.0]);
         assert_eq!(f.rays[2], [1.0, 0.5, 1.0]);
         assert_eq!(scene.segments().len(), 8);
+    }
+
+    #[test]
+    fn a_small_thing_far_from_its_cameras_is_still_seen() {
+        // A facade of 2 × 2 units eight units ahead of two cameras one unit apart.
+        let points: Vec<_> = (0..400)
+            .map(|i| [(i % 20) as f32 * 0.1 - 1.0, (i / 20) as f32 * 0.1 - 1.0, 8.0 + (i % 3) as f32 * 0.1])
+            .collect();
+        let mut scene = PointScene::new(&PointCloud::colored(points, vec![[255, 0, 0]; 400]));
+        let camera = Camera::from_focal(400, 300, 400.0);
+        for (x, color) in [(0.0, colors::ORANGE), (1.0, colors::CYAN)] {
+            let pose = Pose::new(Rotation3::identity(), Vector3::new(-x, 0.0, 0.0));
+            scene.camera(&camera, &pose, color);
+        }
+        let picture = render_points(&scene, Viewpoint::Camera, 480, 300);
+        let span = |of: Color| {
+            let columns = (0..480).filter(|&x| (0..300).any(|y| picture.at(x, y) == of));
+            columns.clone().max().unwrap_or(0) - columns.min().unwrap_or(480).min(480)
+        };
+        // From behind the cameras, about nine units from it, it is as wide as a quarter of what a lens of 2.2 half widths shows there; an outline, 0.4 units wide and nearly as far
+        // away as one unit, no more than a half.
+        let [red, one, other] = [[255, 0, 0], colors::ORANGE, colors::CYAN].map(span);
+        assert!(red > 80 && (1..240).contains(&one) && (1..240).contains(&other), "{red} {one} {other}");
     }
 
     #[test]

@@ -38,7 +38,7 @@ pub enum RectifyError {
     /// A camera is none.
     #[error("the {side} camera: {error}")]
     Camera {
-        /// `left` or `right`.
+        /// `left` or `right`; `only` of a camera by itself.
         side: &'static str,
         /// What is wrong with it.
         error: CameraError,
@@ -120,6 +120,20 @@ pub struct RectifiedView {
 }
 
 impl RectifiedView {
+    /// One camera as it would be without distortion, looking where it does: square pixels, and of the picture as much as `options` say.
+    ///
+    /// # Errors
+    /// [`RectifyError`] where the camera is none, an option is out of range, or the picture has no middle part that the lens reaches.
+    pub fn undistorted(source: &Camera, options: &RectifyOptions) -> Result<Self, RectifyError> {
+        source.validate().map_err(|error| RectifyError::Camera { side: "only", error })?;
+        OptionError::check("alpha", options.alpha, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
+        let (width, height) = options.size.unwrap_or((source.width, source.height));
+        OptionError::check("size", width.min(height) as f64, "at least 1×1 px", |v| v >= 1.0)?;
+        let rotation = Rotation3::identity();
+        let camera = common_camera([(*source, rotation); 2], (width, height), options.alpha)?;
+        Ok(Self { source: *source, camera, rotation })
+    }
+
     /// Where a pixel of the rectified image lies in the original; `None` where the original's camera does not look.
     pub fn source_pixel(&self, pixel: Point2<f64>) -> Option<Point2<f64>> {
         let n = self.camera.normalize(pixel);

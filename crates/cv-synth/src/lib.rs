@@ -22,6 +22,7 @@
 //!   [`plane_homography`], [`rotation_homography`].
 //! * Measures against it: [`homography_corner_error`], [`alignment_error`], [`rotation_error`], [`direction_error`],
 //!   [`depth_score`], [`MaskScore`].
+//! * Damaged files, for tests that no input does harm: [`corrupt`].
 //! * The instruction sets that tests of vector code go through: [`instruction_sets`].
 //!
 //! # Conventions
@@ -31,6 +32,7 @@
 //! the same bytes at any number of threads.
 
 mod bvh;
+mod corrupt;
 mod error;
 mod font;
 mod instruction_sets;
@@ -49,6 +51,7 @@ mod sheet_photo;
 mod texture;
 mod truth;
 
+pub use corrupt::corrupt;
 pub use error::SynthError;
 pub use instruction_sets::instruction_sets;
 pub use poster::Poster;

@@ -3,6 +3,7 @@
 //! One file per job. A job is a function from the data folder to its [`Check`]s; register it with one line in `JOBS`.
 //! A figure that is off its bar fails the run; so does an error. Jobs print what else a person wants to see.
 
+mod calibration;
 pub(crate) mod depth;
 pub(crate) mod estimate;
 mod focal;
@@ -20,6 +21,7 @@ use std::path::Path;
 type Job = fn(&Path) -> Result<Vec<Check>>;
 
 const JOBS: &[checks::Named<Job>] = &[
+    ("calibration", calibration::run),
     ("depth", depth::run),
     ("estimate", estimate::run),
     ("focal", focal::run),

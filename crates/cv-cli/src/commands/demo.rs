@@ -1,5 +1,6 @@
 //! `cv demo`: every pipeline on generated scenes, whose truth is known exactly.
 
+mod calibrate;
 mod depth;
 mod homography;
 mod panorama;
@@ -114,12 +115,13 @@ impl Part {
 type Job = fn(&Demo<'_>) -> Result<Part, Failure>;
 
 /// In the order in which a reader learns them.
-const JOBS: [(&str, Job); 5] = [
+const JOBS: [(&str, Job); 6] = [
     ("segment", segment::run),
     ("homography", homography::run),
     ("panorama", panorama::run),
     ("reconstruct", reconstruct::run),
     ("depth", depth::run),
+    ("calibrate", calibrate::run),
 ];
 
 impl Run for Args {

@@ -49,6 +49,8 @@
 
 use crate::frame::{Context, Failure, Outcome, Run};
 
+mod calibrate;
+mod calibration;
 mod completions;
 mod demo;
 mod depth;
@@ -60,6 +62,7 @@ mod panorama;
 mod reconstruct;
 mod rectify;
 mod segment;
+mod undistort;
 
 /// For `value_parser`: a width and a height in pixels, each from 1 to 16384, as `640x480`.
 fn size(text: &str) -> Result<(usize, usize), String> {
@@ -104,6 +107,9 @@ subcommands! {
     Reconstruct(reconstruct::Args),
     Depth(depth::Args),
     Rectify(rectify::Args),
+    Calibrate(calibrate::Args),
+    Calibration(calibration::Args),
+    Undistort(undistort::Args),
     Eval(eval::Args),
     Completions(completions::Args),
     Man(man::Args),

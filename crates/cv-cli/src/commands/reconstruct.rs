@@ -144,10 +144,15 @@ impl Run for Args {
 fn doubt(result: &ReconstructResult) -> Option<String> {
     let percent = 100.0 * result.scene.focal_deviation;
     let degrees = result.scene.pose_deviation[1].to_degrees();
-    result.focal_is_doubtful().then(|| {
+    let unusual = result.scene.unusual_focal().map_or_else(String::new, |share| {
+        format!(
+            "; at {share:.1} times the photograph's longer side it is unusual (0.4 to 3 are usual), which matches that hardly show perspective lead to"
+        )
+    });
+    (result.focal_is_doubtful() || !unusual.is_empty()).then(|| {
         format!(
             "the focal length is known to ±{percent:.0} % only, and the depth of the cloud may be stretched by as much; the direction of the motion is known to \
-             ±{degrees:.1} degrees"
+             ±{degrees:.1} degrees{unusual}"
         )
     })
 }

@@ -72,7 +72,7 @@ pub(crate) struct Args {
     exchange: bool,
 }
 
-fn parse_share(text: &str) -> Result<f64, String> {
+pub(super) fn parse_share(text: &str) -> Result<f64, String> {
     text.parse().ok().filter(|share| (0.0..=1.0).contains(share)).ok_or_else(|| "give a number from 0 to 1".to_owned())
 }
 
@@ -179,7 +179,7 @@ impl Run for Args {
 }
 
 /// Writes a rectified photograph as deep as it is, with what the file of the original says beside its pixels.
-fn write_picture(path: &Path, picture: &DynImage, metadata: &Metadata) -> Result<(), IoError> {
+pub(super) fn write_picture(path: &Path, picture: &DynImage, metadata: &Metadata) -> Result<(), IoError> {
     match &picture.pixels {
         Pixels::Gray8(image) => cv_io::write_png_with(path, image.view(), metadata),
         Pixels::Gray16(image) => cv_io::write_png_with(path, image.view(), metadata),
@@ -189,7 +189,7 @@ fn write_picture(path: &Path, picture: &DynImage, metadata: &Metadata) -> Result
 }
 
 /// Both views side by side with a line every sixteenth of the height.
-fn with_rows(images: &[RgbU8; 2]) -> RgbU8 {
+pub(super) fn with_rows(images: &[RgbU8; 2]) -> RgbU8 {
     let joined = side_by_side(&[images[0].view(), images[1].view()], 4);
     let mut canvas = Raster::from_rgb(joined.view());
     let (width, height) = (canvas.width() as f32, canvas.height() as f32);

@@ -8,7 +8,6 @@ use std::{
     fs,
     io::Write,
     path::{Path, PathBuf},
-    time::{Duration, SystemTime},
 };
 
 /// Pictures for people.
@@ -21,6 +20,8 @@ pub(crate) const MAP: &[&str] = &["pfm", "npy", "png"];
 pub(crate) const CLOUD: &[&str] = &["ply"];
 /// Rows of numbers.
 pub(crate) const TEXT: &[&str] = &["txt"];
+/// Cameras and rigs.
+pub(crate) const YAML: &[&str] = &["yaml", "yml"];
 /// Models.
 pub(crate) const JSON: &[&str] = &["json"];
 
@@ -122,7 +123,8 @@ pub(super) fn check(outputs: &[Output<'_>], report: Option<&Path>, json: bool) -
     for output in outputs.iter().copied().chain(report.map(Output::Folder)) {
         output.check()?;
         if output.has_name() {
-            remove_stale(output.folder());
+            // Of runs that were killed while they wrote.
+            cv_io::remove_abandoned(output.folder());
         }
     }
     Ok(())
@@ -191,45 +193,5 @@ pub(crate) fn spare_inputs(outputs: &[PathBuf], inputs: &[&Path]) -> Result<(), 
         Some(path) => Err(Failure::new(format!("{} would be written over, and is read", path.display()))
             .advice("give another folder for the results")),
         None => Ok(()),
-    }
-}
-
-/// Removes what a run left behind that was killed while it wrote: `cv_io`'s temporary files, and folders of several. A write
-/// takes seconds, so one that is an hour old belongs to nobody.
-fn remove_stale(folder: &Path) {
-    let Ok(entries) = fs::read_dir(folder) else { return };
-    for entry in entries.flatten() {
-        let name = entry.file_name();
-        let ours = name.to_str().is_some_and(|name| name.starts_with(".cv-") && name.ends_with(".part"));
-        let age = || SystemTime::now().duration_since(entry.metadata().ok()?.modified().ok()?).ok();
-        if ours && age().is_some_and(|age| age > Duration::from_secs(3600)) {
-            let folder = entry.file_type().is_ok_and(|kind| kind.is_dir());
-            // Not ours to worry about where it cannot be removed.
-            let _ = if folder { fs::remove_dir_all(entry.path()) } else { fs::remove_file(entry.path()) };
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn only_old_leftovers_are_removed() {
-        let folder = tempfile::tempdir().unwrap();
-        let [old, new, foreign] = [".cv-old.part", ".cv-new.part", ".x.part"].map(|name| folder.path().join(name));
-        for path in [&old, &new, &foreign] {
-            fs::write(path, "half").unwrap();
-        }
-        for path in [&old, &foreign] {
-            let file = fs::File::options().write(true).open(path).unwrap();
-            file.set_modified(SystemTime::now() - Duration::from_secs(4000)).unwrap();
-        }
-        let several = folder.path().join(".cv-several.part");
-        fs::create_dir(&several).unwrap();
-        fs::write(several.join("left.png"), "half").unwrap();
-        fs::File::open(&several).unwrap().set_modified(SystemTime::now() - Duration::from_secs(4000)).unwrap();
-        check(&[Output::File(&folder.path().join("out.txt"), TEXT)], None, false).unwrap();
-        assert!(!old.exists() && !several.exists() && new.exists() && foreign.exists());
     }
 }

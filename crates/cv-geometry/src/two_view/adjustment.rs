@@ -1,7 +1,7 @@
 //! Points of two views, adjusted together with the pose and what is unknown of the cameras.
 
 use super::neighbors::like_their_neighbors;
-use super::{Intrinsics, MatchedViews, TwoViewError, TwoViewGeometry, TwoViewOptions};
+use super::{Intrinsics, MatchedViews, PLAUSIBLE_FOCAL, TwoViewError, TwoViewGeometry, TwoViewOptions};
 use crate::{
     BundleOptions, BundleReport, RobustLoss, TwoViewBundle, adjust_two_views, essential_from_pose,
     jackknife_pose_deviation, normalize_matches, parallax_angle, triangulate,
@@ -58,6 +58,15 @@ impl TwoViewReconstruction {
     /// The fundamental matrix between undistorted pixels.
     pub fn fundamental(&self) -> Matrix3<f64> {
         fundamental_of(&self.cameras, &self.pose)
+    }
+
+    /// An estimated focal length as a share of the photograph's longer side, where it is none that photographs usually have (0.4 to 3): matches that hardly show
+    /// perspective, or wrong ones, lead there.
+    pub fn unusual_focal(&self) -> Option<f64> {
+        let Camera { fx, width, height, .. } = self.cameras[0];
+        let share = fx / width.max(height) as f64;
+        let (low, high) = PLAUSIBLE_FOCAL;
+        (self.focal_deviation > 0.0 && !(low..=high).contains(&share)).then_some(share)
     }
 }
 

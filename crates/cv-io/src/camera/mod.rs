@@ -11,8 +11,11 @@ mod colmap;
 mod format;
 mod kalibr;
 mod matrix;
+mod mrcal;
 mod opencv;
+mod opencv_xml;
 mod own;
+mod ros;
 mod yaml;
 
 pub(crate) use colmap::{CENTER, model_line, parse_model};
@@ -26,9 +29,18 @@ use crate::{FormatError, IoError};
 use format::{Format, Given};
 
 /// The table of formats, in the order in which a text is tried: the particular before the general.
-const FORMATS: &[&Format] = &[&own::FORMAT, &kalibr::FORMAT, &colmap::FORMAT, &matrix::FORMAT, &opencv::FORMAT];
+const FORMATS: &[&Format] = &[
+    &own::FORMAT,
+    &opencv_xml::FORMAT,
+    &mrcal::FORMAT,
+    &kalibr::FORMAT,
+    &colmap::FORMAT,
+    &matrix::FORMAT,
+    &ros::FORMAT,
+    &opencv::FORMAT,
+];
 
-const EXPECTED: &str = "a camera: YAML (ours, OpenCV's, ROS's or Kalibr's), a COLMAP camera line, or the nine numbers of a calibration matrix";
+const EXPECTED: &str = "a camera: YAML (ours, OpenCV's, ROS's or Kalibr's), OpenCV's XML, mrcal's model, a COLMAP camera line, or the nine numbers of a calibration matrix";
 
 /// A format of calibration files.
 #[derive(Clone, Copy)]
@@ -145,8 +157,8 @@ impl std::fmt::Display for CalibrationNote {
 
 /// Parses a camera.
 ///
-/// Understood, by content: our own YAML (`schema: cv-camera/1`); OpenCV's FileStorage and ROS's `camera_info` YAML (under any of
-/// their usual names for the matrix and the coefficients); the first camera of Kalibr's `camchain.yaml`; a COLMAP camera, as in `cameras.txt` (`1 SIMPLE_RADIAL 640 480 …`), alone or
+/// Understood, by content: our own YAML (`schema: cv-camera/1`); OpenCV's FileStorage (YAML, JSON and XML) and ROS's `camera_info` YAML (under any of
+/// their usual names for the matrix and the coefficients); mrcal's `.cameramodel` where its lens is one of OpenCV's; the first camera of Kalibr's `camchain.yaml`; a COLMAP camera, as in `cameras.txt` (`1 SIMPLE_RADIAL 640 480 …`), alone or
 /// behind `# camera:`; a calibration matrix of three rows of three numbers.
 ///
 /// COLMAP's principal points have pixel centers at +0.5 and are brought to ours, at integers; all others are taken as they are.
@@ -271,9 +283,6 @@ pub fn write_rig(path: impl AsRef<Path>, file: &RigFile, notes: &[&str]) -> Resu
 fn format_of(text: &str) -> Result<&'static Format, FormatError> {
     if text.trim().is_empty() {
         return Err(FormatError::Empty);
-    }
-    if text.trim_start().starts_with("<?xml") || text.trim_start().starts_with("<opencv_storage") {
-        return Err(FormatError::unsupported("OpenCV's XML", "this way of storing a camera (its YAML is)"));
     }
     let found = FORMATS.iter().copied().find(|f| (f.is)(text));
     found.ok_or(FormatError::UnknownFormat { expected: EXPECTED })

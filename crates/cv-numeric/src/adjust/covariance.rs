@@ -3,6 +3,7 @@
 use super::error::AdjustError;
 use super::factor::{Analysis, Factor};
 use super::normal::{Normal, Reduced, determined};
+use super::residual::LossModel;
 use super::structure::{NONE, Structure};
 use super::{Adjustment, GroupId};
 use nalgebra::{DMatrix, DVector};
@@ -52,7 +53,7 @@ impl Adjustment<'_> {
     fn normal_covariance(&self, variance: f64) -> Result<Covariance<'_>, AdjustError> {
         let structure = Structure::new(&self.groups, &self.kinds, self.eliminated, true);
         let mut normal = Normal::default();
-        normal.linearize(&self.kinds, &structure, &self.values).map_err(|u| self.undefined(u))?;
+        normal.linearize(&self.kinds, &structure, &self.values, LossModel::Weight).map_err(|u| self.undefined(u))?;
         let mut reduced = Reduced::default();
         normal.reduce(&structure, 0.0, &mut reduced).map_err(|block| self.deficient_point(block))?;
         let (free, all) = (structure.free, structure.columns);

@@ -40,6 +40,7 @@ mod error;
 mod factor;
 mod manifold;
 mod normal;
+mod plain_cholesky;
 mod residual;
 mod solve;
 mod structure;

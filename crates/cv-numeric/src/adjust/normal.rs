@@ -1,6 +1,6 @@
 //! The normal equations of a problem where it stands, and the reduced system that is left of them without the eliminated blocks.
 
-use super::residual::{ColumnSums, Kind, PointSums, ResidualSums, Rows, Values};
+use super::residual::{ColumnSums, Kind, LossModel, PointSums, ResidualSums, Rows, Values};
 use super::structure::{Points, Structure};
 use crate::linear::cholesky_lower;
 use nalgebra::{Cholesky, DMatrix, SMatrix};
@@ -45,11 +45,12 @@ impl Normal {
         kinds: &[Box<dyn Kind + '_>],
         structure: &Structure,
         values: &Values,
+        model: LossModel,
     ) -> Result<(), (usize, usize)> {
         self.rows.resize_with(kinds.len(), Rows::default);
         self.sums.clear();
         for (k, (kind, rows)) in kinds.iter().zip(&mut self.rows).enumerate() {
-            let sums = kind.linearize(values, &structure.links[k], rows).map_err(|item| (k, item))?;
+            let sums = kind.linearize(values, &structure.links[k], model, rows).map_err(|item| (k, item))?;
             self.sums.push(sums);
         }
         if let Some(points) = &structure.points {

@@ -115,6 +115,19 @@ fn total(parts: Vec<Result<ResidualSums, usize>>) -> Result<ResidualSums, usize>
     Ok(sums)
 }
 
+/// How a robust loss enters the normal equations. The gradient is the same.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum LossModel {
+    /// By its weight alone (iteratively reweighted least squares): a parabola that lies above the loss.
+    Weight,
+    /// By its weight across the residual, and along it by its curvature, as far as that is positive.
+    Curvature,
+}
+
+/// Least curvature along a residual, as a share of that across it: a loss that bends downward would make the normal equations indefinite, and one that is nearly straight
+/// makes steps too long. On a generated block of 100 photographs with Cauchy's loss 0.3 takes 17 iterations, 0.05 takes 22, and weights alone take 32.
+const LEAST_CURVATURE: f64 = 0.3;
+
 /// Residuals and derivatives of all items of a kind, multiplied by the square roots of their weights.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Rows {
@@ -160,7 +173,13 @@ pub(super) trait Kind: Send + Sync {
     /// `Σ ρ(‖r‖²)`, infinite where a residual is not defined.
     fn cost(&self, values: &Values) -> f64;
     /// Fills the rows. The first item that is not defined as the error.
-    fn linearize(&self, values: &Values, links: &Links, rows: &mut Rows) -> Result<ResidualSums, usize>;
+    fn linearize(
+        &self,
+        values: &Values,
+        links: &Links,
+        model: LossModel,
+        rows: &mut Rows,
+    ) -> Result<ResidualSums, usize>;
     /// Sums over the items. The first item that is not defined as the error.
     fn sums(&self, values: &Values) -> Result<ResidualSums, usize>;
     /// Adds items that see one eliminated block.
@@ -215,6 +234,7 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Typed
         &self,
         values: &Values,
         links: &Links,
+        model: LossModel,
         first: usize,
         (jacobians, residuals): (&mut [f64], &mut [f64]),
     ) -> Result<ResidualSums, usize> {
@@ -222,8 +242,18 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Typed
         let rows = jacobians.chunks_exact_mut(R * C).zip(residuals.chunks_exact_mut(R));
         for (item, (jacobian, residual)) in (first..).zip(rows) {
             let mut j = SMatrix::<f64, R, C>::zeros();
-            let r = self.residual.evaluate(item, self.at(values, item), Some(&mut j)).ok_or(item)?;
-            let root = sums.count_in(&self.loss, r.norm_squared(), R).ok_or(item)?.sqrt();
+            let mut r = self.residual.evaluate(item, self.at(values, item), Some(&mut j)).ok_or(item)?;
+            let squared = r.norm_squared();
+            let root = sums.count_in(&self.loss, squared, R).ok_or(item)?.sqrt();
+            if model == LossModel::Curvature {
+                let along = self.loss.curvature(squared).max(LEAST_CURVATURE).sqrt();
+                if along != 1.0 && squared > 0.0 {
+                    // J − (1 − β) r̂ r̂ᵀ J and r / β (Triggs et al., §4.3).
+                    let by_residual = r.transpose() * j * ((1.0 - along) / squared);
+                    j -= r * by_residual;
+                    r /= along;
+                }
+            }
             for row in 0..R {
                 residual[row] = root * r[row];
                 for column in 0..C {
@@ -304,12 +334,18 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Kind 
         parallel_map(chunks, &of).iter().sum()
     }
 
-    fn linearize(&self, values: &Values, links: &Links, rows: &mut Rows) -> Result<ResidualSums, usize> {
+    fn linearize(
+        &self,
+        values: &Values,
+        links: &Links,
+        model: LossModel,
+        rows: &mut Rows,
+    ) -> Result<ResidualSums, usize> {
         rows.residuals.resize(self.len() * R, 0.0);
         rows.jacobians.resize(self.len() * R * C, 0.0);
         let chunks = rows.jacobians.par_chunks_mut(CHUNK * R * C).zip(rows.residuals.par_chunks_mut(CHUNK * R));
         let parts: Vec<Result<ResidualSums, usize>> =
-            chunks.enumerate().map(|(c, out)| self.linearize_chunk(values, links, c * CHUNK, out)).collect();
+            chunks.enumerate().map(|(c, out)| self.linearize_chunk(values, links, model, c * CHUNK, out)).collect();
         total(parts)
     }
 

@@ -3,7 +3,7 @@
 use super::error::AdjustError;
 use super::factor::Analysis;
 use super::normal::{FLOOR, Normal, Reduced};
-use super::residual::{ResidualSums, Values};
+use super::residual::{LossModel, ResidualSums, Values};
 use super::structure::Structure;
 use super::{Adjustment, GroupId};
 use rayon::prelude::*;
@@ -102,15 +102,18 @@ pub(super) struct Step {
     largest: f64,
 }
 
+/// A step that lowers the cost by less than this share ends near a minimum: residuals hardly change any more, so that the curvature of their losses can be relied on.
+const NEAR: f64 = 0.01;
 /// Least and most damping.
 const DAMPING: [f64; 2] = [1e-16, 1e16];
 
 impl Adjustment<'_> {
     /// Minimizes `Σ ρ(‖r‖²)` from the present values, which are moved.
     ///
-    /// Levenberg–Marquardt with the damping of Nielsen ("Damping parameter in Marquardt's method", 1999) relative to the diagonal; robust losses by
-    /// iteratively reweighted least squares. Of the losses' second derivatives (Triggs's correction) no use is made: `Σ w JᵀJ` is never
-    /// indefinite, bounds the cost from above, needs no loss to be smooth, and is what covariances are read from.
+    /// Levenberg–Marquardt with the damping of Nielsen ("Damping parameter in Marquardt's method", 1999) relative to the diagonal. Robust losses enter by their weights
+    /// (iteratively reweighted least squares), whose parabola lies above the cost wherever the start is; near the minimum, where that converges linearly only, by their curvature
+    /// along the residual as well (Triggs et al., "Bundle adjustment — a modern synthesis", 2000, §4.3), bounded so that `Σ JᵀJ` stays definite. Covariances are read from
+    /// the weights.
     /// The eliminated group's blocks are solved for by the Schur complement. Each iteration costs O(residuals) and the factorization
     /// of the reduced system, O(n³) of n parameters where that is dense.
     ///
@@ -138,7 +141,7 @@ impl Adjustment<'_> {
         let analysis = Analysis::new(&structure);
         let mut normal = Normal::default();
         let mut reduced = Reduced::default();
-        normal.linearize(&self.kinds, &structure, &self.values).map_err(|u| self.undefined(u))?;
+        normal.linearize(&self.kinds, &structure, &self.values, LossModel::Weight).map_err(|u| self.undefined(u))?;
         let initial_cost = normal.cost();
         let (mut damping, mut growth) = (options.initial_damping, 2.0);
         let mut moved = self.values.clone();
@@ -189,7 +192,8 @@ impl Adjustment<'_> {
             damping *= (1.0 - (2.0 * gain / step.predicted - 1.0).powi(3)).max(1.0 / 3.0);
             damping = damping.max(DAMPING[0]);
             growth = 2.0;
-            if normal.linearize(&self.kinds, &structure, &self.values).is_err() {
+            let model = if gain < NEAR * report.cost { LossModel::Curvature } else { LossModel::Weight };
+            if normal.linearize(&self.kinds, &structure, &self.values, model).is_err() {
                 // The cost is finite here, so that only the derivatives can be at fault.
                 return end(report, Termination::NoStep);
             }

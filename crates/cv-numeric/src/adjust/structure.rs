@@ -8,7 +8,7 @@ pub(super) const NONE: u32 = u32::MAX;
 /// Most columns of a block of the reduced system that is made of several.
 const MOST_MERGED: usize = 64;
 /// Below this size a dense factorization is faster whatever the pattern.
-const SMALL: usize = 400;
+pub(super) const SMALL: usize = 400;
 /// Above this share of the reduced system's blocks, its factor is about full.
 const FULL: f64 = 0.3;
 

@@ -2,6 +2,7 @@
 
 use super::factor::Analysis;
 use super::normal::{Normal, Reduced};
+use super::residual::LossModel;
 use super::structure::Structure;
 use super::*;
 use nalgebra::{DMatrix, DVector, Rotation3, SMatrix, SVector, Vector2, Vector3};
@@ -216,7 +217,7 @@ fn a_step_with_points_eliminated_is_that_of_the_whole_system() {
         let exact = h.cholesky().unwrap().solve(&-g);
         let structure = Structure::new(&problem.groups, &problem.kinds, problem.eliminated, false);
         let (mut normal, mut reduced) = (Normal::default(), Reduced::default());
-        normal.linearize(&problem.kinds, &structure, &problem.values).unwrap();
+        normal.linearize(&problem.kinds, &structure, &problem.values, LossModel::Weight).unwrap();
         let step = normal.step(&structure, &Analysis::Dense, 1e-3, &mut reduced).unwrap();
         let mut ours = Vec::new();
         for group in &groups[..2] {

@@ -6,8 +6,8 @@ use crate::align::straighten::straighten;
 use crate::align::{AlignError, AlignOptions, AlignedPair, Alignment, CameraMotion, Photo, Unplaced, View};
 use cv_core::{Camera, Cancelled, Distortion, Point2, Stage};
 use cv_geometry::{PairEdge, PairGraph, VerifiedPair};
-use cv_numeric::RobustLoss;
-use nalgebra::{Matrix3, Rotation3, Vector2};
+use cv_numeric::{RobustLoss, svd3};
+use nalgebra::{Matrix3, Vector2};
 
 /// The connected photographs to be placed, under indices of their own.
 pub(crate) struct Group<'a> {
@@ -21,6 +21,13 @@ pub(crate) struct Group<'a> {
     tree: Vec<usize>,
     reference: usize,
     components: Vec<Vec<usize>>,
+}
+
+/// The rotation nearest to a matrix; the identity where the matrix tells none. (nalgebra's own search for it does not end where the distance to the matrix stays
+/// the same about an axis, as with those of rank one that focal lengths far from the truth make.)
+fn nearest_rotation(m: &Matrix3<f64>) -> Matrix3<f64> {
+    let nearest = svd3(m).map(|svd| svd.u * svd.v.transpose());
+    nearest.ok().filter(|r| r.iter().all(|v| v.is_finite())).unwrap_or_else(Matrix3::identity)
 }
 
 /// Pixel center of a photograph's middle, or its camera's principal point.
@@ -132,7 +139,7 @@ impl<'a> Group<'a> {
             let m = m / m.determinant().cbrt();
             let m = if m.iter().all(|v| v.is_finite()) { m } else { Matrix3::identity() };
             let relative = match kind {
-                Motion::Rotation => Rotation3::from_matrix_eps(&m, 1e-10, 100, Rotation3::identity()).into_inner(),
+                Motion::Rotation => nearest_rotation(&m),
                 Motion::Homography => m,
             };
             motion[step.node] = relative * motion[step.parent];
@@ -380,4 +387,32 @@ fn kind_of(motion: CameraMotion) -> Motion {
 /// The median; 0 of nothing.
 fn median(mut values: Vec<f64>) -> f64 {
     cv_core::median(&mut values).unwrap_or(0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{Rotation3, Vector3};
+
+    #[test]
+    fn the_nearest_rotation_is_found_and_every_matrix_has_one() {
+        let turned = Rotation3::new(Vector3::new(0.3, -2.0, 0.4)).into_inner();
+        // Stretched alike in all directions it is still the nearest; rounding of a few products.
+        for scale in [1e-200, 1e-3, 1.0, 50.0, 1e100] {
+            assert!((nearest_rotation(&(turned * scale)) - turned).norm() < 1e-14, "{scale}");
+        }
+        let one = |r: usize, c: usize, v: f64| Matrix3::from_fn(|i, j| if (i, j) == (r, c) { v } else { 0.0 });
+        let strange = [
+            Matrix3::zeros(),
+            one(0, 0, 1e300),
+            one(2, 1, -1e-300),
+            Matrix3::repeat(1e200),
+            Matrix3::from_diagonal(&Vector3::new(1e150, 1e-150, -1.0)),
+            Matrix3::repeat(f64::NAN),
+        ];
+        for m in strange {
+            let r = nearest_rotation(&m);
+            assert!((r * r.transpose() - Matrix3::identity()).norm() < 1e-12 && r.determinant() > 0.0, "{m}{r}");
+        }
+    }
 }

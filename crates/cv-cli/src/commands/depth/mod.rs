@@ -3,7 +3,7 @@
 mod frames;
 mod maps;
 mod options;
-mod pairing;
+pub(super) mod pairing;
 mod report;
 
 use super::size;

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 /// How frames are paired.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum PairBy {
+pub(in crate::commands) enum PairBy {
     Name,
     Number,
     Order,
@@ -21,7 +21,7 @@ cv_core::named!(PairBy {
 /// The pairs of frames, in the order of the left ones. Without `by`, by name where the names are the same and by number
 /// where they are not. A frame without a partner is refused: a pair of frames from two moments gives disparities that look
 /// right and are not.
-pub(super) fn pair(
+pub(in crate::commands) fn pair(
     lefts: &[PathBuf],
     rights: &[PathBuf],
     by: Option<PairBy>,
@@ -39,6 +39,45 @@ pub(super) fn pair(
             })
         }
     }
+}
+
+/// A frame of the left camera, one of the right camera, or both of one moment.
+pub(in crate::commands) type Moment = (Option<PathBuf>, Option<PathBuf>);
+
+/// As [`pair`], but frames without a partner stand alone: those of the left camera in their order, then those of the right one that are left.
+pub(in crate::commands) fn join(
+    lefts: &[PathBuf],
+    rights: &[PathBuf],
+    by: Option<PairBy>,
+) -> Result<Vec<Moment>, Failure> {
+    let both = |pairs: Vec<(PathBuf, PathBuf)>| pairs.into_iter().map(|(l, r)| (Some(l), Some(r))).collect();
+    let reason = match pair(lefts, rights, by) {
+        Ok(pairs) => return Ok(both(pairs)),
+        Err(reason) => reason,
+    };
+    let shared = |key: &dyn Fn(&Path) -> Option<String>| -> Option<Vec<Moment>> {
+        let keys = |frames: &[PathBuf]| -> Option<BTreeMap<String, PathBuf>> {
+            let found: BTreeMap<String, PathBuf> =
+                frames.iter().map(|f| Some((key(f)?, f.clone()))).collect::<Option<_>>()?;
+            (found.len() == frames.len()).then_some(found)
+        };
+        let (left, mut right) = (keys(lefts)?, keys(rights)?);
+        if !left.keys().any(|k| right.contains_key(k)) {
+            return None;
+        }
+        let mut moments: Vec<Moment> =
+            lefts.iter().map(|frame| (Some(frame.clone()), key(frame).and_then(|k| right.remove(&k)))).collect();
+        let rest = rights.iter().filter(|f| key(f).is_some_and(|k| right.contains_key(&k)));
+        moments.extend(rest.map(|frame| (None, Some(frame.clone()))));
+        Some(moments)
+    };
+    let joined = match by {
+        Some(PairBy::Order) => None,
+        Some(PairBy::Name) => shared(&name),
+        Some(PairBy::Number) => shared(&number),
+        None => shared(&name).or_else(|| shared(&number)),
+    };
+    joined.ok_or(reason)
 }
 
 fn in_order(lefts: &[PathBuf], rights: &[PathBuf]) -> Result<Vec<(PathBuf, PathBuf)>, Failure> {
@@ -139,6 +178,23 @@ mod tests {
         assert_eq!(paired(&["é0.png"], &["ü00.png"], None).unwrap().len(), 1);
         let ordered = paired(&["a.png", "b.png"], &["x.png", "y.png"], Some(PairBy::Order)).unwrap();
         assert_eq!(ordered, pairs(&[("a.png", "x.png"), ("b.png", "y.png")]));
+    }
+
+    #[test]
+    fn frames_without_a_partner_can_stand_alone() {
+        let joined = |left: &[&str], right: &[&str], by| {
+            let text = |path: Option<PathBuf>| path.map(|p| p.display().to_string()).unwrap_or_default();
+            let found = join(&paths(left), &paths(right), by);
+            found.map(|all| all.into_iter().map(|(a, b)| (text(a), text(b))).collect::<Vec<_>>()).map_err(|f| f.text())
+        };
+        let own = |list: &[(&str, &str)]| {
+            list.iter().map(|(a, b)| ((*a).into(), (*b).into())).collect::<Vec<(String, String)>>()
+        };
+        let some = joined(&["left1.png", "left3.png"], &["right2.png", "right3.png"], None).unwrap();
+        assert_eq!(some, own(&[("left1.png", ""), ("left3.png", "right3.png"), ("", "right2.png")]));
+        assert_eq!(joined(&["l/a.png"], &["r/a.png"], None).unwrap(), own(&[("l/a.png", "r/a.png")]));
+        assert!(joined(&["left1.png"], &["right2.png"], None).unwrap_err().contains("left1.png"));
+        assert!(joined(&["a1.png", "b1.png"], &["c1.png"], None).is_err());
     }
 
     #[test]

@@ -1,0 +1,86 @@
+//! The pose of a flat target from one picture of it.
+
+use crate::target::{TargetCorner, TargetPoints};
+use cv_core::{Camera, Correspondence, Matrix3, Pose, Rotation3, Vector3};
+use cv_geometry::homography_from_points;
+use cv_numeric::svd3;
+
+/// Whether a picture shows the target mirrored; `None` where its corners are on a line or too few. By the best affine map.
+pub(crate) fn is_mirrored(target: &TargetPoints, corners: &[TargetCorner]) -> Option<bool> {
+    let n = corners.len() as f64;
+    let position = |c: &TargetCorner| target.points()[c.point].coords;
+    let board = corners.iter().map(position).sum::<nalgebra::Vector2<f64>>() / n;
+    let picture = corners.iter().map(|c| c.pixel.coords).sum::<nalgebra::Vector2<f64>>() / n;
+    let (mut aa, mut ba) = (nalgebra::Matrix2::zeros(), nalgebra::Matrix2::zeros());
+    for c in corners {
+        let (a, b) = (position(c) - board, c.pixel.coords - picture);
+        aa += a * a.transpose();
+        ba += b * a.transpose();
+    }
+    let map = ba * aa.try_inverse()?;
+    // A determinant far below the product of the lengths is that of a target seen from its edge.
+    let flat = 1e-3 * map.norm_squared();
+    (map.determinant().abs() > flat && aa.determinant() > 1e-9 * aa.norm_squared()).then(|| map.determinant() < 0.0)
+}
+
+/// The pose that the homography from the target's plane to ideal coordinates says, target to camera. `None` where fewer than four corners have rays, they are on
+/// a line, or some would be behind the camera.
+pub(crate) fn plane_pose(camera: &Camera, target: &TargetPoints, corners: &[TargetCorner]) -> Option<Pose> {
+    let rays: Vec<Correspondence> = corners
+        .iter()
+        .map(|c| Correspondence { a: target.points()[c.point], b: camera.normalize(c.pixel) })
+        .filter(|m| m.b.x.is_finite() && m.b.y.is_finite())
+        .collect();
+    pose_from_homography(&homography_from_points(&rays).ok()?, &rays)
+}
+
+/// The rotation nearest to the scaled columns, the translation by their scale.
+fn pose_from_homography(h: &Matrix3<f64>, rays: &[Correspondence]) -> Option<Pose> {
+    let depth: f64 = rays.iter().map(|m| (h * m.a.to_homogeneous()).z.signum()).sum();
+    let scale = depth.signum() * 2.0 / (h.column(0).norm() + h.column(1).norm());
+    let (a, b, t): (Vector3<f64>, Vector3<f64>, Vector3<f64>) =
+        ((h.column(0) * scale), (h.column(1) * scale), (h.column(2) * scale));
+    let svd = svd3(&Matrix3::from_columns(&[a, b, a.cross(&b)])).ok()?;
+    let rotation = Rotation3::from_matrix_unchecked(svd.u * svd.v.transpose());
+    let pose = Pose::new(rotation, t);
+    let in_front = rays.iter().all(|m| pose.transform(&nalgebra::Point3::new(m.a.x, m.a.y, 0.0)).z > 0.0);
+    (t.iter().all(|v| v.is_finite()) && in_front).then_some(pose)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cv_core::{Distortion, Point2};
+
+    fn seen(camera: &Camera, target: &TargetPoints, pose: &Pose) -> Vec<TargetCorner> {
+        let at = |point| camera.project(&pose.transform(&target.bent(point, [0.0; 2]))).unwrap();
+        (0..target.points().len()).map(|point| TargetCorner { point, pixel: at(point) }).collect()
+    }
+
+    #[test]
+    fn exact_corners_give_the_pose() {
+        let target = TargetPoints::grid(9, 6, 1.0).unwrap();
+        for distortion in [Distortion::NONE, Distortion::fisheye4([0.05, 0.0, 0.0, 0.0])] {
+            let camera = Camera { distortion, ..Camera::from_focal(640, 480, 500.0) };
+            let pose = Pose::new(Rotation3::new(Vector3::new(0.4, -0.3, 2.0)), Vector3::new(1.0, -2.0, 11.0));
+            let corners = seen(&camera, &target, &pose);
+            let found = plane_pose(&camera, &target, &corners).unwrap();
+            // Squaring in the direct linear transform leaves eight digits of numbers of order ten.
+            assert!((found.matrix() - pose.matrix()).norm() < 1e-6, "{found:?}");
+            assert_eq!(is_mirrored(&target, &corners), Some(false));
+        }
+    }
+
+    #[test]
+    fn mirrored_targets_and_lines_are_known() {
+        let target = TargetPoints::grid(9, 6, 1.0).unwrap();
+        let corner = |point: usize, x: f64, y: f64| TargetCorner { point, pixel: Point2::new(x, y) };
+        let p = |i: usize| target.points()[i];
+        let mirrored: Vec<_> = (0..54).map(|i| corner(i, 500.0 - 30.0 * p(i).x, 30.0 * p(i).y)).collect();
+        assert_eq!(is_mirrored(&target, &mirrored), Some(true));
+        let line: Vec<_> = (0..9).map(|i| corner(i, 30.0 * p(i).x, 10.0 * p(i).x)).collect();
+        assert_eq!(is_mirrored(&target, &line), None);
+        assert_eq!(plane_pose(&Camera::from_focal(640, 480, 500.0), &target, &line), None);
+        assert_eq!(is_mirrored(&target, &[]), None);
+    }
+}

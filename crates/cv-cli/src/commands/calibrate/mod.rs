@@ -1,0 +1,326 @@
+//! `cv calibrate`: cameras and rigs from photographs of a chessboard.
+
+mod json;
+mod report;
+
+use super::depth::pairing::{PairBy, join};
+use crate::frame::{Context, Failure, Global, Outcome, Output, Run, YAML, expand_images, named, spare_inputs};
+use crate::words::calibration::{no_calibration, note, refusal};
+use cv_core::GrayF32;
+use cv_io::{IoError, RigFile};
+use cv_pipeline::calibration::{BoardSize, CalibrateOptions, LensChoice};
+use cv_pipeline::{BoardCalibration, BoardCalibrationError, BoardCalibrationOptions, PhotoRefusal, calibrate};
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
+
+/// Calibrate a camera, or the two cameras of a rig, from photographs of a chessboard.
+///
+/// Finds the board, chooses the lens model, adjusts lenses, poses and the shape of the board together, leaves out what does not fit and says why, and tells how far
+/// the result can be trusted and what to photograph next.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cv calibrate mono --board 9x6 --square 25 photos/*.jpg -o camera.yaml --report out\n  \
+    cv calibrate stereo --board 9x6 --square 25 --left left --right right -o rig.yaml")]
+pub(crate) struct Args {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum What {
+    Mono(Mono),
+    Stereo(Stereo),
+}
+
+/// The board, and how cameras are fitted to it.
+#[derive(Debug, clap::Args)]
+struct Board {
+    /// Inner corners of the board, columns by rows: 9x6 for a board of 10 by 7 squares. `auto`: what most photographs show.
+    #[arg(long, value_name = "CxR|auto", default_value = "auto", value_parser = parse_board)]
+    board: Size,
+    /// Side of a square [default: 1, and distances are in squares].
+    #[arg(long, value_name = "LENGTH")]
+    square: Option<f64>,
+    /// Unit of --square.
+    #[arg(long, value_name = "UNIT", default_value = "mm", value_parser = ["mm", "cm", "m"])]
+    unit: String,
+    /// Lens model.
+    #[arg(long, value_parser = named::<LensChoice>(), default_value_t)]
+    lens: LensChoice,
+    /// Take the board as flat; else two numbers of its shape are adjusted, as paper bends.
+    #[arg(long)]
+    flat: bool,
+    /// Leave out corners that are more than so many standard deviations from where they should be.
+    #[arg(long, value_name = "N", default_value_t = CalibrateOptions::default().outlier_deviations)]
+    outliers: f64,
+}
+
+/// A size, or that it is to be found.
+#[derive(Debug, Clone, Copy)]
+struct Size(Option<BoardSize>);
+
+fn parse_board(text: &str) -> Result<Size, String> {
+    if text == "auto" {
+        return Ok(Size(None));
+    }
+    let sides = text.split_once(['x', '×']).and_then(|(c, r)| Some(BoardSize::new(c.parse().ok()?, r.parse().ok()?)));
+    let valid = sides.filter(|size| size.is_valid()).map(|size| Size(Some(size)));
+    valid.ok_or_else(|| {
+        format!("give the inner corners as 9x6, {} to {} on a side, or auto", BoardSize::LEAST, BoardSize::MOST)
+    })
+}
+
+impl Board {
+    fn options(&self) -> BoardCalibrationOptions {
+        let solve = CalibrateOptions {
+            lens: self.lens,
+            board_shape: !self.flat,
+            outlier_deviations: self.outliers,
+            ..CalibrateOptions::default()
+        };
+        BoardCalibrationOptions {
+            board: self.board.0,
+            square: self.square.unwrap_or(1.0),
+            solve,
+            ..BoardCalibrationOptions::default()
+        }
+    }
+
+    /// The unit of distances.
+    fn unit(&self) -> &str {
+        if self.square.is_some() { &self.unit } else { "squares" }
+    }
+}
+
+/// Calibrate one camera.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cv calibrate mono --board 9x6 --square 25 photos -o camera.yaml\n  \
+    cv calibrate mono photos/*.jpg -o camera.yaml --lens fisheye4 --report out")]
+struct Mono {
+    /// Photographs of the board, or folders or quoted patterns of them.
+    #[arg(required = true, value_name = "IMAGES")]
+    images: Vec<PathBuf>,
+    #[command(flatten)]
+    board: Board,
+    /// Where to write the camera.
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+}
+
+/// Calibrate two cameras that are fixed to each other.
+///
+/// Photographs are paired by name, or by the last number in the name. A photograph without a partner serves for its own camera.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cv calibrate stereo --board 9x6 --square 25 --left left --right right -o rig.yaml\n  \
+    cv calibrate stereo --left 'left*.jpg' --right 'right*.jpg' -o rig.yaml --report out")]
+struct Stereo {
+    /// Photographs of the left (or upper) camera, or folders or quoted patterns of them.
+    #[arg(long, value_name = "FILES", num_args = 1.., required = true)]
+    left: Vec<PathBuf>,
+    /// Photographs of the right (or lower) camera.
+    #[arg(long, value_name = "FILES", num_args = 1.., required = true)]
+    right: Vec<PathBuf>,
+    /// How photographs are paired [default: by name where the names are the same, else by number].
+    #[arg(long, value_name = "HOW", value_parser = named::<PairBy>())]
+    pair_by: Option<PairBy>,
+    #[command(flatten)]
+    board: Board,
+    /// Where to write the rig.
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+}
+
+impl Run for Args {
+    fn outputs(&self) -> Vec<Output<'_>> {
+        match &self.what {
+            What::Mono(args) => vec![Output::File(&args.output, YAML)],
+            What::Stereo(args) => vec![Output::File(&args.output, YAML)],
+        }
+    }
+
+    fn has_no_use_for(&self) -> &'static [Global] {
+        &[Global::Seed]
+    }
+
+    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+        match self.what {
+            What::Mono(args) => args.run(context),
+            What::Stereo(args) => args.run(context),
+        }
+    }
+}
+
+/// The photographs of each view, by camera.
+type Views = Vec<Vec<Option<PathBuf>>>;
+
+/// A job that is done, with what it was done on.
+struct Job {
+    found: BoardCalibration,
+    views: Views,
+    names: &'static [&'static str],
+    unit: String,
+}
+
+impl Mono {
+    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+        let images = expand_images(&self.images)?;
+        let views: Views = images.into_iter().map(|path| vec![Some(path)]).collect();
+        let job = work(views, &["camera"], &self.board, &self.output, context)?;
+        let camera = &job.found.calibration.cameras[0].camera;
+        let notes = job.origin();
+        context.write(Output::File(&self.output, YAML), |path| cv_io::write_camera(path, camera, &[&notes]))?;
+        job.finish(context)
+    }
+}
+
+impl Stereo {
+    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+        let views = join(&expand_images(&self.left)?, &expand_images(&self.right)?, self.pair_by)?;
+        let views: Views = views.into_iter().map(|(left, right)| vec![left, right]).collect();
+        let alone = views.iter().filter(|view| view.iter().any(Option::is_none)).count();
+        if alone > 0 {
+            context.note(format!("{alone} photographs have no partner and serve for their own camera only"));
+        }
+        let job = work(views, &["left", "right"], &self.board, &self.output, context)?;
+        let Some(rig) = job.found.calibration.stereo() else { return Err(Failure::new("there is no rig")) };
+        let notes = job.origin();
+        let file = RigFile { rig, unit: job.unit.clone() };
+        context.write(Output::File(&self.output, YAML), |path| cv_io::write_rig(path, &file, &[&notes]))?;
+        job.finish(context)
+    }
+}
+
+/// Reads photographs one after the other, finds the boards and calibrates.
+fn work(
+    views: Views,
+    names: &'static [&'static str],
+    board: &Board,
+    output: &Path,
+    context: &Context,
+) -> Result<Job, Failure> {
+    let inputs: Vec<&Path> = views.iter().flatten().flatten().map(PathBuf::as_path).collect();
+    spare_inputs(&[output.to_owned()], &inputs)?;
+    let unreadable: Mutex<Vec<(usize, usize, IoError)>> = Mutex::default();
+    let photo = |view: usize, camera: usize| -> Option<GrayF32> {
+        let path = views[view][camera].as_ref()?;
+        match cv_io::read_gray_u8(path) {
+            Ok(gray) => Some(gray.map(|p| [f32::from(p[0]) / 255.0])),
+            Err(error) => {
+                unreadable.lock().unwrap_or_else(PoisonError::into_inner).push((view, camera, error));
+                None
+            }
+        }
+    };
+    let found = calibrate((views.len(), names.len()), photo, &board.options(), context);
+    let mut unreadable = unreadable.into_inner().unwrap_or_else(PoisonError::into_inner);
+    unreadable.sort_by_key(|(view, camera, _)| (*view, *camera));
+    if let Some((_, _, error)) = unreadable.into_iter().next() {
+        return Err(error.into());
+    }
+    match found {
+        Ok(found) => Ok(Job { found, views, names, unit: board.unit().to_owned() }),
+        Err(error) => {
+            let reasons = match &error {
+                BoardCalibrationError::NoBoards { refusals } | BoardCalibrationError::Calibrate { refusals, .. } => {
+                    commonest(refusals)
+                }
+                _ => String::new(),
+            };
+            Err(no_calibration(error, names, &reasons))
+        }
+    }
+}
+
+/// The reason that most photographs are left out for, in parentheses; empty where none is.
+fn commonest(refusals: &[Vec<Option<PhotoRefusal>>]) -> String {
+    let mut counts: Vec<(String, usize)> = Vec::new();
+    for refused in refusals.iter().flatten().flatten().filter(|r| **r != PhotoRefusal::NoPhoto) {
+        let text = refusal(refused);
+        match counts.iter_mut().find(|(known, _)| *known == text) {
+            Some((_, count)) => *count += 1,
+            None => counts.push((text, 1)),
+        }
+    }
+    let most = counts.iter().rev().max_by_key(|(_, count)| *count);
+    most.map_or(String::new(), |(text, count)| {
+        if *count > 1 { format!(" ({count} of them: {text})") } else { format!(" (one of them: {text})") }
+    })
+}
+
+impl Job {
+    /// Where a calibration comes from: a comment in its file.
+    fn origin(&self) -> String {
+        let c = &self.found.calibration;
+        let used = c.views.iter().filter(|v| v.pose.is_some()).count();
+        let holdout = if c.holdout_rms_px.is_nan() {
+            String::new()
+        } else {
+            format!(", {:.3} px on views that had no part in the fit", c.holdout_rms_px)
+        };
+        format!(
+            "calibrated from {used} views of a board of {} corners; rms {:.3} px{holdout}",
+            self.found.board, c.rms_px
+        )
+    }
+
+    /// The path of a photograph.
+    fn path(&self, view: usize, camera: usize) -> Option<&Path> {
+        self.views[view][camera].as_deref()
+    }
+
+    /// What is told of the job.
+    fn finish(&self, context: &Context) -> Result<Outcome, Failure> {
+        let c = &self.found.calibration;
+        for (view, cameras) in self.found.refusals.iter().enumerate() {
+            for (camera, refused) in cameras.iter().enumerate() {
+                if let (Some(refused), Some(path)) = (refused, self.path(view, camera)) {
+                    context.note(format!("{}: left out: {}", path.display(), refusal(refused)));
+                }
+            }
+        }
+        context.report(|| report::report(self))?;
+        let mut summary = Vec::new();
+        for (camera, name) in c.cameras.iter().zip(self.names) {
+            let whose = if self.names.len() > 1 { format!("{name}: ") } else { String::new() };
+            let holdout = if camera.holdout_rms_px.is_nan() {
+                String::new()
+            } else {
+                format!(", {:.3} px on views held out", camera.holdout_rms_px)
+            };
+            summary.push(format!(
+                "{whose}{} lens, focal length {:.2} px, rms {:.3} px{holdout}; projection known to {:.2} px (median over the picture)",
+                camera.camera.distortion.model().info().name,
+                camera.camera.fx,
+                camera.rms_px,
+                camera.uncertainty.median(),
+            ));
+        }
+        if let Some(rig) = c.stereo() {
+            let rows = self
+                .found
+                .rectified_dy_px
+                .map_or(String::new(), |(mean, _)| format!(", rectified rows {mean:.3} px apart"));
+            summary.push(format!("baseline {:.4} {}{rows}", rig.baseline(), self.unit));
+        }
+        let used = c.views.iter().filter(|v| v.pose.is_some()).count();
+        summary.push(format!("{used} of {} views used; the calibration is {}", c.views.len(), c.verdict.trust));
+        summary.extend(c.verdict.notes.iter().map(|n| format!("  {}", note(n, self.names))));
+        Ok(json::outcome(self).summary(summary.join("\n")))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_of_boards_are_two_numbers_or_auto() {
+        assert_eq!(parse_board("9x6").unwrap().0, Some(BoardSize::new(9, 6)));
+        assert_eq!(parse_board("auto").unwrap().0, None);
+        for text in ["9", "9x", "2x6", "x", "9x6x2", "-9x6", "999x6"] {
+            assert!(parse_board(text).is_err(), "{text}");
+        }
+    }
+}

@@ -1,0 +1,185 @@
+//! `cv calibration`: calibration files of other programs.
+
+use crate::frame::{Context, Failure, Global, Outcome, Output, Run, spare_inputs};
+use crate::rig;
+use cv_core::Camera;
+use cv_io::{CalibrationFormat, CalibrationNote, RigFile};
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+
+/// Show a calibration file, or write it in the format of another program.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cv calibration show camera.yaml\n  \
+    cv calibration convert camchain.yaml -o rig.yml --format opencv")]
+pub(crate) struct Args {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum What {
+    Convert(Convert),
+    Show(Show),
+}
+
+/// Write a camera or a rig in another format; every number reads back to the same value.
+#[derive(Debug, clap::Args)]
+struct Convert {
+    #[command(flatten)]
+    input: Input,
+    /// Where to write it.
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// The format to write.
+    #[arg(long, value_name = "FORMAT", value_parser = written())]
+    format: String,
+}
+
+/// Say what a calibration file holds.
+#[derive(Debug, clap::Args)]
+struct Show {
+    #[command(flatten)]
+    input: Input,
+}
+
+#[derive(Debug, clap::Args)]
+struct Input {
+    /// The file; twice for OpenCV's two files of a rig.
+    #[arg(required = true, num_args = 1..=2, value_name = "FILE")]
+    files: Vec<PathBuf>,
+    /// Width and height of the pictures, for files that do not tell.
+    #[arg(long, value_name = "WxH", value_parser = super::size)]
+    size: Option<(usize, usize)>,
+}
+
+/// The formats that are written.
+fn written() -> Vec<&'static str> {
+    CalibrationFormat::all().filter(|f| f.writes_cameras() || f.writes_rigs()).map(CalibrationFormat::name).collect()
+}
+
+/// The endings of the formats that are written.
+const ENDINGS: &[&str] = &["yaml", "yml", "txt", "xml", "json", "cameramodel"];
+
+/// What a file holds.
+enum Held {
+    Camera(Camera),
+    Rig(Box<RigFile>),
+}
+
+impl Input {
+    /// A rig where the file is one, else a camera.
+    fn read(&self, context: &Context) -> Result<(Held, Vec<CalibrationNote>), Failure> {
+        match cv_io::read_rig_with_notes(&self.files, self.size) {
+            Ok((file, notes)) => Ok((Held::Rig(Box::new(file)), notes)),
+            Err(error) if self.files.len() > 1 => Err(error.into()),
+            // What it is as a camera is the better reason, too.
+            Err(_) => Ok((Held::Camera(rig::camera(&self.files[0], self.size, context)?), Vec::new())),
+        }
+    }
+}
+
+impl Run for Args {
+    fn outputs(&self) -> Vec<Output<'_>> {
+        match &self.what {
+            What::Convert(args) => vec![Output::File(&args.output, ENDINGS)],
+            What::Show(_) => Vec::new(),
+        }
+    }
+
+    fn has_no_use_for(&self) -> &'static [Global] {
+        &[Global::Seed, Global::Report]
+    }
+
+    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+        let input = match &self.what {
+            What::Convert(args) => &args.input,
+            What::Show(args) => &args.input,
+        };
+        let (held, notes) = input.read(context)?;
+        notes.iter().for_each(|note| context.note(note));
+        let outcome = match &held {
+            Held::Camera(camera) => Outcome::new(Vec::new()).with("kind", "camera").with("camera", told(camera)),
+            Held::Rig(file) => Outcome::new(Vec::new())
+                .with("kind", "rig")
+                .with("left", told(&file.rig.left))
+                .with("right", told(&file.rig.right))
+                .with("rotation", rows(file))
+                .with("translation", file.rig.right_from_left.translation.as_slice())
+                .with("baseline", file.rig.baseline())
+                .with("unit", &file.unit),
+        };
+        match self.what {
+            What::Show(_) => Ok(outcome.summary(words(&held))),
+            What::Convert(args) => {
+                let inputs: Vec<&Path> = args.input.files.iter().map(PathBuf::as_path).collect();
+                spare_inputs(std::slice::from_ref(&args.output), &inputs)?;
+                let format = CalibrationFormat::from_name(&args.format);
+                let Some(format) = format else { return Err(Failure::usage("there is no such format")) };
+                let text = match &held {
+                    Held::Camera(camera) => format.camera_text(camera, &[])?,
+                    Held::Rig(file) => format.rig_text(file, &[])?,
+                };
+                context.write(Output::File(&args.output, ENDINGS), |path| cv_io::write_bytes(path, text.as_bytes()))?;
+                Ok(outcome.with("format", format.name()).summary(words(&held)))
+            }
+        }
+    }
+}
+
+fn rows(file: &RigFile) -> Vec<Vec<f64>> {
+    file.rig.right_from_left.rotation.matrix().row_iter().map(|r| r.iter().copied().collect()).collect()
+}
+
+fn told(camera: &Camera) -> Value {
+    let model = camera.distortion.model().info();
+    let coefficients: serde_json::Map<String, Value> = (model.parameters.iter())
+        .zip(camera.distortion.parameters())
+        .map(|(name, value)| ((*name).to_owned(), json!(value)))
+        .collect();
+    json!({
+        "width": camera.width,
+        "height": camera.height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "lens": model.name,
+        "coefficients": coefficients,
+    })
+}
+
+fn words(held: &Held) -> String {
+    let camera = |c: &Camera| {
+        let model = c.distortion.model().info();
+        let numbers: Vec<String> =
+            model.parameters.iter().zip(c.distortion.parameters()).map(|(n, v)| format!("{n} {v:.6}")).collect();
+        let lens = if numbers.is_empty() {
+            "no distortion".to_owned()
+        } else {
+            format!("{}: {}", model.name, numbers.join(", "))
+        };
+        let across = 2.0 * (c.width as f64 / (2.0 * c.fx)).atan().to_degrees();
+        format!(
+            "{}×{} px, focal length {:.3} × {:.3} px ({across:.0}° across without distortion), principal point ({:.3}, {:.3}); {lens}",
+            c.width, c.height, c.fx, c.fy, c.cx, c.cy
+        )
+    };
+    match held {
+        Held::Camera(c) => camera(c),
+        Held::Rig(file) => {
+            let t = file.rig.right_from_left.translation;
+            let turn = file.rig.right_from_left.rotation_angle().to_degrees();
+            format!(
+                "left: {}\nright: {}\nbaseline {:.6} {} ({:.6}, {:.6}, {:.6}), turned by {turn:.3}°",
+                camera(&file.rig.left),
+                camera(&file.rig.right),
+                file.rig.baseline(),
+                file.unit,
+                t.x,
+                t.y,
+                t.z
+            )
+        }
+    }
+}

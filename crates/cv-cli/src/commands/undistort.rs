@@ -1,0 +1,125 @@
+//! `cv undistort`: photographs without the distortion of their lens.
+
+use super::rectify::{parse_share, write_picture};
+use super::size;
+use crate::frame::{Context, Explain, Failure, Global, Outcome, Output, Run, expand_images, spare_inputs};
+use crate::rig;
+use cv_core::Stage;
+use cv_io::{DynImage, ExifInfo, Metadata, Pixels};
+use cv_pipeline::stereo::{RectifiedView, RectifyError, RectifyOptions};
+use serde_json::json;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+/// Take the distortion of a calibrated lens out of photographs.
+///
+/// Writes NAME.png of each photograph, and camera.yaml, the camera that would have taken them: the same place and direction, square pixels, no distortion. What the
+/// lens does not reach is black. Photographs of 16 bits stay so.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cv undistort photos/*.jpg --camera camera.yaml -o straight\n  \
+    cv undistort photos --camera camera.yaml --alpha 1 --size 1280x960 -o straight")]
+pub(crate) struct Args {
+    /// The photographs, or folders or quoted patterns of them.
+    #[arg(required = true, value_name = "IMAGES")]
+    images: Vec<PathBuf>,
+    /// The calibration of the camera: ours, OpenCV's, ROS's, Kalibr's or COLMAP's.
+    #[arg(long, value_name = "FILE")]
+    camera: PathBuf,
+    /// The folder for the results; made where it is missing.
+    #[arg(short, long, visible_alias = "out", value_name = "DIR")]
+    output: PathBuf,
+    /// From 0 (no pixel without content) to 1 (no pixel lost).
+    #[arg(long, value_name = "A", default_value_t = 0.0, value_parser = parse_share)]
+    alpha: f64,
+    /// Width and height of the results [default: those of the photographs].
+    #[arg(long, value_name = "WxH", value_parser = size)]
+    size: Option<(usize, usize)>,
+}
+
+impl Args {
+    /// Where the result of a photograph goes.
+    fn result(&self, photo: &Path) -> PathBuf {
+        self.output.join(photo.file_stem().unwrap_or_default()).with_extension("png")
+    }
+}
+
+impl Run for Args {
+    fn outputs(&self) -> Vec<Output<'_>> {
+        vec![Output::Folder(&self.output)]
+    }
+
+    fn has_no_use_for(&self) -> &'static [Global] {
+        &[Global::Seed, Global::Report]
+    }
+
+    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+        let images = expand_images(&self.images)?;
+        let mut results: Vec<PathBuf> = images.iter().map(|path| self.result(path)).collect();
+        results.push(self.output.join("camera.yaml"));
+        let inputs: Vec<&Path> = images.iter().chain([&self.camera]).map(PathBuf::as_path).collect();
+        spare_inputs(&results, &inputs)?;
+        let mut names: Vec<&PathBuf> = results.iter().collect();
+        names.sort();
+        if let Some(pair) = names.windows(2).find(|pair| pair[0] == pair[1]) {
+            return Err(Failure::usage(format!("two photographs would become {}", pair[0].display()))
+                .advice("give one folder at a time"));
+        }
+        let mut view: Option<RectifiedView> = None;
+        let (mut seconds, mut done) = (0.0, Vec::new());
+        let stage = Stage::new(context, "undistort", images.len())?;
+        for (path, result) in images.iter().zip(&results) {
+            let photo = cv_io::read_image(path)?;
+            let view = match &view {
+                Some(view) => view,
+                None => {
+                    let camera = rig::camera(&self.camera, Some(photo.size()), context)?;
+                    let options = RectifyOptions { alpha: self.alpha, size: self.size };
+                    let made = RectifiedView::undistorted(&camera, &options)
+                        .during(self.camera.display())
+                        .map_err(|f| f.advice("check the calibration file"))?;
+                    view.insert(made)
+                }
+            };
+            rig::check_size(&self.camera, path, photo.size(), &view.source)?;
+            let start = Instant::now();
+            let pixels = straight(&photo.pixels, view, &stage)?;
+            seconds += start.elapsed().as_secs_f64();
+            let straight = DynImage { pixels, exif: ExifInfo::default(), metadata: Metadata::default() };
+            context.write(Output::Folder(&self.output), |_| write_picture(result, &straight, &photo.metadata))?;
+            done.push(json!({ "path": path.display().to_string(), "output": result.display().to_string() }));
+            stage.add(1)?;
+        }
+        let Some(view) = view else { return Err(Failure::usage("there is no photograph")) };
+        let note = "without the distortion of the lens";
+        context.write(Output::Folder(&self.output), |folder| {
+            cv_io::write_camera(folder.join("camera.yaml"), &view.camera, &[note])
+        })?;
+        let (width, height) = (view.camera.width, view.camera.height);
+        Ok(Outcome::new(vec![("undistort", seconds)])
+            .with("images", done)
+            .with("width", width)
+            .with("height", height)
+            .with("focal_px", view.camera.fx)
+            .summary(format!(
+                "{} photographs of {width}×{height} px with a focal length of {:.2} px in {}",
+                images.len(),
+                view.camera.fx,
+                self.output.display()
+            )))
+    }
+}
+
+/// A picture as deep as it is; linear light as bytes of color.
+fn straight(pixels: &Pixels, view: &RectifiedView, stage: &Stage<'_>) -> Result<Pixels, RectifyError> {
+    Ok(match pixels {
+        Pixels::Gray8(image) => view.apply(image.view(), stage)?.0.into(),
+        Pixels::Gray16(image) => view.apply(image.view(), stage)?.0.into(),
+        Pixels::Rgb8(image) => view.apply(image.view(), stage)?.0.into(),
+        Pixels::Rgb16(image) => view.apply(image.view(), stage)?.0.into(),
+        other => {
+            let image = DynImage { pixels: other.clone(), exif: ExifInfo::default(), metadata: Metadata::default() };
+            view.apply(image.into_rgb8().view(), stage)?.0.into()
+        }
+    })
+}

@@ -1,0 +1,169 @@
+//! OpenCV's FileStorage as XML: read as the YAML that says the same.
+
+use std::fmt::Write as _;
+
+use super::format::Format;
+use super::opencv;
+use crate::FormatError;
+
+const NAME: &str = "OpenCV XML";
+/// Camera files take a few kilobytes.
+const MAX_BYTES: usize = 4 << 20;
+
+pub(super) const FORMAT: Format = Format {
+    name: "opencv-xml",
+    is: |text| {
+        let text = text.trim_start();
+        text.starts_with("<?xml") || text.starts_with("<opencv_storage")
+    },
+    camera: |text, given| (opencv::FORMAT.camera)(&as_yaml(text)?, given),
+    rig: Some(|text, given| match opencv::FORMAT.rig {
+        Some(rig) => rig(&as_yaml(text)?, given),
+        None => Err(FormatError::unsupported(NAME, "a rig")),
+    }),
+    camera_text: Some(|camera, notes| as_xml(opencv::FORMAT.camera_text.map(|write| write(camera, &[])), notes)),
+    rig_text: Some(|file, notes| as_xml(opencv::FORMAT.rig_text.map(|write| write(file, &[])), notes)),
+};
+
+/// An element: its name, its content, and what follows it. Comments and declarations are passed over; nothing is ever expanded.
+fn element(text: &str) -> Result<Option<(&str, &str, &str)>, FormatError> {
+    let broken = |what: &str| FormatError::corrupt(NAME, what.to_owned());
+    let mut rest = text;
+    loop {
+        let Some(at) = rest.find('<') else { return Ok(None) };
+        rest = &rest[at..];
+        let end = if rest.starts_with("<!--") {
+            rest.find("-->").map(|e| e + 3)
+        } else if rest.starts_with("<?") {
+            rest.find("?>").map(|e| e + 2)
+        } else if rest.starts_with("<!") {
+            // A document type may define entities, which a calibration has no use for.
+            return Err(FormatError::unsupported(NAME, "a document type"));
+        } else {
+            break;
+        };
+        rest = &rest[end.ok_or_else(|| broken("a comment or declaration does not end"))?..];
+    }
+    let end = rest.find('>').ok_or_else(|| broken("a tag does not end"))?;
+    let tag = &rest[1..end];
+    let name = tag.split(|c: char| c.is_whitespace() || c == '/').next().unwrap_or_default();
+    if name.is_empty() || !name.chars().all(|c| c.is_ascii_alphanumeric() || "_-.".contains(c)) {
+        return Err(broken("a tag has no name"));
+    }
+    let body = &rest[end + 1..];
+    if tag.ends_with('/') {
+        return Ok(Some((name, "", body)));
+    }
+    let close = format!("</{name}>");
+    let at = body.find(&close).ok_or_else(|| broken("a tag is not closed"))?;
+    Ok(Some((name, &body[..at], &body[at + close.len()..])))
+}
+
+fn as_yaml(text: &str) -> Result<String, FormatError> {
+    if text.len() > MAX_BYTES {
+        return Err(FormatError::TooManyBytes { bytes: text.len() as u64, limit: MAX_BYTES as u64 });
+    }
+    let (root, mut rest) = match element(text)? {
+        Some((root, content, _)) => (root, content),
+        None => return Err(FormatError::Empty),
+    };
+    if root != "opencv_storage" {
+        return Err(FormatError::unsupported(NAME, format!("the document {root} (it is opencv_storage)")));
+    }
+    let mut out = String::new();
+    while let Some((name, content, next)) = element(rest)? {
+        rest = next;
+        let list = |text: &str| text.split_whitespace().collect::<Vec<_>>().join(", ");
+        let mut inner = content;
+        let (mut rows, mut cols, mut data) = (None, None, None);
+        while let Some((key, value, after)) = element(inner)? {
+            inner = after;
+            match key {
+                "rows" => rows = Some(value.trim()),
+                "cols" => cols = Some(value.trim()),
+                "data" => data = Some(list(value)),
+                _ => {}
+            }
+        }
+        // What is no number does not become YAML of its own.
+        let plain = |text: &str| text.chars().all(|c| c.is_ascii_alphanumeric() || "+-._, ".contains(c));
+        match (rows, cols, data) {
+            (Some(rows), Some(cols), Some(data)) if plain(rows) && plain(cols) && plain(&data) => {
+                let _ = writeln!(out, "{name}: {{rows: {rows}, cols: {cols}, data: [{data}]}}");
+            }
+            (None, None, None) => {
+                let text = list(content.trim().trim_matches('"'));
+                if plain(&text) && !text.is_empty() && !content.contains('<') {
+                    let value = if text.contains(',') { format!("[{text}]") } else { text };
+                    let _ = writeln!(out, "{name}: {value}");
+                }
+            }
+            _ => return Err(FormatError::corrupt(NAME, format!("{name} is no matrix"))),
+        }
+    }
+    Ok(out)
+}
+
+/// The YAML that we write, whose shape is known, as XML.
+fn as_xml(yaml: Option<Result<String, FormatError>>, notes: &[&str]) -> Result<String, FormatError> {
+    let yaml = yaml.ok_or_else(|| FormatError::unsupported(NAME, "writing"))??;
+    let mut out = "<?xml version=\"1.0\"?>\n<opencv_storage>\n".to_owned();
+    for line in notes.iter().flat_map(|n| n.lines()) {
+        let safe: String = line.chars().filter(|c| !c.is_control() && !"<>&-".contains(*c)).collect();
+        let _ = writeln!(out, "<!-- {safe} -->");
+    }
+    let mut open = "";
+    for line in yaml.lines().filter(|l| !l.starts_with(['%', '-', '#'])) {
+        let Some((key, value)) = line.split_once(':') else { continue };
+        match (line.starts_with(' '), value.trim()) {
+            (false, "!!opencv-matrix") => {
+                open = key;
+                let _ = writeln!(out, "<{key} type_id=\"opencv-matrix\">");
+            }
+            (true, value) => {
+                let key = key.trim();
+                let numbers = value.trim_matches(['[', ']']).replace(',', "");
+                let _ = writeln!(out, "  <{key}>{numbers}</{key}>");
+                if key == "data" {
+                    let _ = writeln!(out, "</{open}>");
+                }
+            }
+            (false, value) => {
+                let _ = writeln!(out, "<{key}>{value}</{key}>");
+            }
+        }
+    }
+    out.push_str("</opencv_storage>\n");
+    Ok(out)
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::{FormatError, parse_camera};
+
+    const FILE: &str = "<?xml version=\"1.0\"?>\n<opencv_storage>\n<calibration_time>\"Mon 01 Jan 2024\"</calibration_time>\n\
+        <!-- a <comment> -->\n<image_width>640</image_width>\n<image_height>480</image_height>\n\
+        <camera_matrix type_id=\"opencv-matrix\">\n  <rows>3</rows>\n  <cols>3</cols>\n  <dt>d</dt>\n  <data>\n    5.3e+02 0. 3.425e+02 0. 5.31e+02\n    2.33e+02 0. 0. 1.</data></camera_matrix>\n\
+        <distortion_coefficients type_id=\"opencv-matrix\">\n  <rows>5</rows>\n  <cols>1</cols>\n  <dt>d</dt>\n  <data>\n    -0.28 0.06 1e-3 -2e-4 0.1</data></distortion_coefficients>\n\
+        <avg_reprojection_error>0.2</avg_reprojection_error>\n</opencv_storage>\n";
+
+    #[test]
+    fn a_file_of_opencv_is_read() {
+        let camera = parse_camera(FILE, None).unwrap();
+        assert_eq!((camera.width, camera.height, camera.fx, camera.cy), (640, 480, 530.0, 233.0));
+        assert_eq!(camera.distortion.parameters(), [-0.28, 0.06, 1e-3, -2e-4, 0.1]);
+    }
+
+    #[test]
+    fn what_is_broken_or_a_bomb_is_refused() {
+        let bomb = FILE.replacen("<opencv_storage>", "<!DOCTYPE a [<!ENTITY b \"c\">]><opencv_storage>", 1);
+        assert!(matches!(parse_camera(&bomb, None), Err(FormatError::Unsupported { .. })));
+        for (from, to) in [("</data>", ""), ("<rows>3</rows>", ""), ("5.3e+02 ", ""), ("opencv_storage", "storage")] {
+            assert!(parse_camera(&FILE.replace(from, to), None).is_err(), "{from}");
+        }
+        for cut in 1..FILE.len() {
+            // Never a panic, whatever is missing.
+            let _ = parse_camera(FILE.get(..cut).unwrap_or_default(), None);
+        }
+    }
+}

@@ -1,0 +1,322 @@
+//! From photographs of a chessboard to calibrated cameras.
+
+use crate::Progress;
+use cv_calib::{CalibrateError, CalibrateOptions, Calibration, PictureOutcome, Sightings, TargetCorner, TargetPoints};
+use cv_core::{Cancelled, GrayF32, OptionError, Stage, StageClock};
+use cv_features::{BoardSize, Chessboard, ChessboardError, ChessboardOptions, FeatureError, find_chessboard};
+use cv_stereo::{Rectification, RectifyOptions};
+use rayon::prelude::*;
+
+/// Settings of [`calibrate`].
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
+pub struct BoardCalibrationOptions {
+    /// Inner corners of the chessboard; `None`: of the size that most photographs show. Default `None`.
+    pub board: Option<BoardSize>,
+    /// Side of a square, in the unit that distances are wanted in. Above 0; default 1: distances are in squares.
+    pub square: f64,
+    /// How boards are found.
+    pub chessboard: ChessboardOptions,
+    /// How cameras are adjusted.
+    pub solve: CalibrateOptions,
+}
+
+impl Default for BoardCalibrationOptions {
+    fn default() -> Self {
+        Self { board: None, square: 1.0, chessboard: ChessboardOptions::default(), solve: CalibrateOptions::default() }
+    }
+}
+
+/// Why a photograph is not part of a calibration.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum PhotoRefusal {
+    /// There is no photograph of this view by this camera.
+    NoPhoto,
+    /// No board was found on it.
+    Board(ChessboardError),
+    /// It is of another size than the camera's first one.
+    OtherPictureSize {
+        /// Width and height of it.
+        seen: (usize, usize),
+        /// Width and height of the first one.
+        first: (usize, usize),
+    },
+    /// Its corners were not used.
+    Corners(PictureOutcome),
+}
+
+/// What [`calibrate`] found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BoardCalibration {
+    /// Cameras, poses, errors, verdict.
+    pub calibration: Calibration,
+    /// The corners it is made of.
+    pub sightings: Sightings,
+    /// Size of the board.
+    pub board: BoardSize,
+    /// By view and camera: why the photograph was not used, `None` where it was.
+    pub refusals: Vec<Vec<Option<PhotoRefusal>>>,
+    /// Mean and largest difference in px of the rows of one corner in both rectified pictures, of the first two cameras; of the corners that were used.
+    pub rectified_dy_px: Option<(f64, f64)>,
+    /// Stage names and their seconds.
+    pub stages: Vec<(&'static str, f64)>,
+}
+
+/// Why there is no calibration.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum BoardCalibrationError {
+    /// No photograph shows the board.
+    #[error("no board was found on any of {} photographs", refusals.iter().flatten().flatten().count())]
+    NoBoards {
+        /// By view and camera: why.
+        refusals: Vec<Vec<Option<PhotoRefusal>>>,
+    },
+    /// The boards do not determine the cameras.
+    #[error("{source}")]
+    Calibrate {
+        /// Why.
+        source: CalibrateError,
+        /// By view and camera: why photographs have no board.
+        refusals: Vec<Vec<Option<PhotoRefusal>>>,
+    },
+    /// An option is out of range.
+    #[error(transparent)]
+    Option(#[from] OptionError),
+    /// The job was stopped by its progress callback.
+    #[error("stopped")]
+    Cancelled(#[from] Cancelled),
+}
+
+/// A photograph and the board on it.
+struct Looked {
+    size: (usize, usize),
+    found: Result<Chessboard, ChessboardError>,
+}
+
+/// Finds the board on photographs of one camera or of several, and calibrates them.
+///
+/// `photo(view, camera)` is called once for each photograph (once more for those that show another board than most, where no size was asked for), from several threads, and gives it in gray from 0 to 1, or `None` where there is none; no more of them
+/// are in memory than there are threads. The photographs of one view were taken at the same time.
+///
+/// # Errors
+/// [`BoardCalibrationError`].
+pub fn calibrate(
+    (views, cameras): (usize, usize),
+    photo: impl Fn(usize, usize) -> Option<GrayF32> + Sync,
+    options: &BoardCalibrationOptions,
+    progress: &dyn Progress,
+) -> Result<BoardCalibration, BoardCalibrationError> {
+    OptionError::check("square", options.square, "a number above 0", |v| v > 0.0 && v.is_finite())?;
+    let mut clock = StageClock::new();
+    let everything = vec![vec![true; cameras]; views];
+    let mut looked = look(&everything, &photo, options, progress)?;
+    let seen = looked.iter().flatten().flatten().filter_map(|l| l.found.as_ref().ok());
+    let board = options.board.or_else(|| most_frequent(seen.map(|b| b.size.landscape())));
+    if let (None, Some(board)) = (options.board, board) {
+        // What is known of the board helps where more or less than it was seen.
+        let other = |l: &Option<Looked>| l.as_ref().is_some_and(|l| !l.found.as_ref().is_ok_and(|b| b.size == board));
+        let again: Vec<Vec<bool>> = looked.iter().map(|v| v.iter().map(other).collect()).collect();
+        let options = BoardCalibrationOptions { board: Some(board), ..options.clone() };
+        let second = look(&again, &photo, &options, progress)?;
+        for (old, new) in looked.iter_mut().flatten().zip(second.into_iter().flatten()) {
+            if new.is_some() {
+                *old = new;
+            }
+        }
+    }
+    clock.lap("boards");
+    let firsts: Vec<Option<(usize, usize)>> =
+        (0..cameras).map(|c| looked.iter().find_map(|v| v[c].as_ref().map(|l| l.size))).collect();
+    let mut refusals = vec![vec![Some(PhotoRefusal::NoPhoto); cameras]; views];
+    let mut corners = vec![vec![Vec::new(); cameras]; views];
+    for (v, c) in (0..views).flat_map(|v| (0..cameras).map(move |c| (v, c))) {
+        let Some(looked) = &looked[v][c] else { continue };
+        refusals[v][c] = match (&looked.found, board, firsts[c]) {
+            (Err(error), ..) => Some(PhotoRefusal::Board(*error)),
+            (_, _, Some(first)) if first != looked.size => {
+                Some(PhotoRefusal::OtherPictureSize { seen: looked.size, first })
+            }
+            (Ok(found), Some(asked), _) if found.size != asked => {
+                Some(PhotoRefusal::Board(ChessboardError::OtherSize { seen: found.size, asked }))
+            }
+            (Ok(found), ..) => {
+                corners[v][c] =
+                    found.corners.iter().enumerate().map(|(point, p)| TargetCorner { point, pixel: *p }).collect();
+                None
+            }
+        };
+    }
+    let (Some(board), true) = (board, corners.iter().flatten().any(|c| !c.is_empty())) else {
+        return Err(BoardCalibrationError::NoBoards { refusals });
+    };
+    let sizes = firsts.into_iter().map(|f| f.unwrap_or((0, 0))).collect();
+    let failed = |source, refusals| match source {
+        CalibrateError::Cancelled(stop) => BoardCalibrationError::Cancelled(stop),
+        source => BoardCalibrationError::Calibrate { source, refusals },
+    };
+    let points = (0..board.corners()).map(|i| board.point(i, options.square)).collect();
+    let target = match TargetPoints::new(points) {
+        Ok(target) => target,
+        Err(error) => return Err(failed(error, refusals)),
+    };
+    // A camera without photographs has no size, and no views either.
+    if let Some(camera) = (0..cameras).find(|c| corners.iter().all(|v| v[*c].is_empty())) {
+        let none = CalibrateError::TooFewViews { camera, got: 0, needed: 3, small: 0, mirrored: 0 };
+        return Err(failed(none, refusals));
+    }
+    let sightings = Sightings { target, sizes, views: corners };
+    let calibration = match cv_calib::calibrate(&sightings, &options.solve, progress) {
+        Ok(calibration) => calibration,
+        Err(error) => return Err(failed(error, refusals)),
+    };
+    for (refusals, view) in refusals.iter_mut().zip(&calibration.views) {
+        for (refusal, picture) in refusals.iter_mut().zip(&view.pictures) {
+            if refusal.is_none() && !picture.outcome.is_used() {
+                *refusal = Some(PhotoRefusal::Corners(picture.outcome));
+            }
+        }
+    }
+    let rectified_dy_px = rectified_rows(&calibration, &sightings);
+    clock.lap("solve");
+    Ok(BoardCalibration { calibration, sightings, board, refusals, rectified_dy_px, stages: clock.into_stages() })
+}
+
+/// Looks for the board on some of the photographs.
+fn look(
+    which: &[Vec<bool>],
+    photo: &(impl Fn(usize, usize) -> Option<GrayF32> + Sync),
+    options: &BoardCalibrationOptions,
+    progress: &dyn Progress,
+) -> Result<Vec<Vec<Option<Looked>>>, Cancelled> {
+    let (views, cameras) = (which.len(), which.first().map_or(0, Vec::len));
+    let stage = Stage::new(progress, "boards", which.iter().flatten().filter(|w| **w).count())?;
+    let one = |i: usize| -> Result<Option<Looked>, Cancelled> {
+        let (view, camera) = (i / cameras, i % cameras);
+        if !which[view][camera] {
+            return Ok(None);
+        }
+        stage.check()?;
+        let looked = match photo(view, camera) {
+            None => None,
+            Some(gray) => {
+                let found = find_chessboard(gray.view(), options.board, &options.chessboard, &stage);
+                if let Err(ChessboardError::Feature(FeatureError::Cancelled(stop))) = found {
+                    return Err(stop);
+                }
+                Some(Looked { size: gray.size(), found })
+            }
+        };
+        stage.add(1)?;
+        Ok(looked)
+    };
+    let all = (0..views * cameras).into_par_iter().map(one).collect::<Result<Vec<_>, Cancelled>>()?;
+    let mut all = all.into_iter();
+    Ok((0..views).map(|_| all.by_ref().take(cameras).collect()).collect())
+}
+
+/// The first of those that come most often.
+fn most_frequent(sizes: impl Iterator<Item = BoardSize>) -> Option<BoardSize> {
+    let mut counts: Vec<(BoardSize, usize)> = Vec::new();
+    for size in sizes {
+        match counts.iter_mut().find(|(s, _)| *s == size) {
+            Some((_, count)) => *count += 1,
+            None => counts.push((size, 1)),
+        }
+    }
+    counts.iter().rev().max_by_key(|(_, count)| *count).map(|(size, _)| *size)
+}
+
+/// Differences of the rows of corners in the rectified pictures of the first two cameras: mean and largest.
+fn rectified_rows(calibration: &Calibration, sightings: &Sightings) -> Option<(f64, f64)> {
+    let rectification = Rectification::new(&calibration.stereo()?, &RectifyOptions::default()).ok()?;
+    let (mut sum, mut count, mut largest) = (0.0, 0, 0.0f64);
+    for (view, found) in sightings.views.iter().zip(&calibration.views) {
+        let used = |c: usize| view[c].iter().zip(&found.pictures[c].corners).filter(|(_, f)| f.used).map(|(c, _)| c);
+        for left in used(0) {
+            let Some(right) = used(1).find(|r| r.point == left.point) else { continue };
+            let rows =
+                rectification.left.rectified_pixel(left.pixel).zip(rectification.right.rectified_pixel(right.pixel));
+            let Some((l, r)) = rows else { continue };
+            let off = (l.y - r.y).abs();
+            (sum, count, largest) = (sum + off, count + 1, largest.max(off));
+        }
+    }
+    (count > 0).then(|| (sum / f64::from(count), largest))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Silent;
+    use cv_core::{Camera, Distortion, Pose, Rotation3, Vector3, luma_u8};
+    use cv_synth::{RenderOptions, Sheet, Texture};
+
+    /// Meters.
+    const SQUARE: f64 = 0.03;
+
+    /// A photograph of a chessboard of 8 × 6 squares on a sheet of 260 × 200 mm.
+    fn photograph(camera: &Camera, pose: &Pose) -> GrayF32 {
+        let sheet = Sheet {
+            texture: Texture::Board { squares: (8, 6), square: SQUARE as f32 },
+            size: (0.26, 0.2),
+            bend: 0.0,
+            behind: Texture::Paint { color: [0.4; 3], seed: 1 },
+            light: [0.1, -0.1],
+            glare: None,
+        };
+        let options = RenderOptions { samples: 2, ..RenderOptions::default() };
+        sheet.photo(camera, pose, &options).unwrap().map(|c| [f32::from(luma_u8(c)) / 255.0])
+    }
+
+    fn pose(i: usize) -> Pose {
+        let i = i as f64;
+        let turn = Rotation3::new(Vector3::new(0.45 * (2.4 * i).sin(), 0.45 * (2.4 * i).cos(), 0.1 * i.sin()));
+        let middle = Vector3::new(0.02 + 0.03 * (1.7 * i).sin(), 0.03 * (2.3 * i).cos(), 0.34 + 0.01 * i);
+        Pose::new(turn, middle - turn * Vector3::new(0.13, 0.1, 0.0))
+    }
+
+    #[test]
+    fn photographs_of_a_board_give_the_rig() {
+        let lens = |k| Camera { distortion: Distortion::radial(k, 0.0), ..Camera::from_focal(400, 300, 350.0) };
+        let cameras = [lens(-0.15), Camera { cx: 205.0, ..lens(-0.1) }];
+        let mount = Pose::new(Rotation3::new(Vector3::new(0.0, 0.05, 0.01)), Vector3::new(-0.05, 0.001, 0.002));
+        let photo = |view: usize, camera: usize| {
+            // The right camera has no photograph of view 3, and in view 4 no board.
+            match (view, camera) {
+                (3, 1) => None,
+                (4, 1) => Some(GrayF32::new(400, 300, [0.5])),
+                _ => {
+                    let pose = if camera == 0 { pose(view) } else { mount.compose(&pose(view)) };
+                    Some(photograph(&cameras[camera], &pose))
+                }
+            }
+        };
+        let solve = CalibrateOptions { lens: cv_calib::LensChoice::RadialTangential4, ..CalibrateOptions::default() };
+        let options = BoardCalibrationOptions { square: SQUARE, solve, ..BoardCalibrationOptions::default() };
+        let found = calibrate((7, 2), photo, &options, &Silent).unwrap();
+        assert_eq!(found.board, BoardSize::new(7, 5));
+        // Corners of such pictures are good to some hundredths of a pixel.
+        assert!(found.calibration.rms_px < 0.1, "{}", found.calibration.rms_px);
+        for (camera, truth) in found.calibration.cameras.iter().zip(&cameras) {
+            assert!((camera.camera.fx / truth.fx - 1.0).abs() < 3e-3, "{:?}", camera.camera);
+        }
+        let rig = found.calibration.stereo().unwrap();
+        assert!((rig.right_from_left.translation - mount.translation).norm() < 5e-4, "{:?}", rig.right_from_left);
+        assert!(found.rectified_dy_px.unwrap().0 < 0.1);
+        assert_eq!(found.refusals[3][1], Some(PhotoRefusal::NoPhoto));
+        assert!(matches!(found.refusals[4][1], Some(PhotoRefusal::Board(ChessboardError::NoBoard { .. }))));
+        assert_eq!(found.refusals[0], [None, None]);
+    }
+
+    #[test]
+    fn photographs_without_boards_are_told_of() {
+        let empty = |_: usize, _: usize| Some(GrayF32::new(64, 48, [0.5]));
+        let error = calibrate((3, 1), empty, &BoardCalibrationOptions::default(), &Silent).unwrap_err();
+        assert!(matches!(error, BoardCalibrationError::NoBoards { refusals } if refusals.len() == 3));
+        let none = calibrate((0, 1), empty, &BoardCalibrationOptions::default(), &Silent).unwrap_err();
+        assert_eq!(none, BoardCalibrationError::NoBoards { refusals: Vec::new() });
+        let options = BoardCalibrationOptions { square: -1.0, ..BoardCalibrationOptions::default() };
+        assert!(matches!(calibrate((1, 1), empty, &options, &Silent), Err(BoardCalibrationError::Option(_))));
+    }
+}

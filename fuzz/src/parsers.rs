@@ -1,0 +1,188 @@
+//! Bytes or text, as a file would hold them, to the readers of `cv-io`.
+
+use crate::only_if;
+use arbitrary::Arbitrary;
+use cv_core::{PointCloud, RgbU8};
+use cv_io::{CalibrationFormat, DynImage, Pixels, ReadOptions, npy, npz, pfm, ply};
+use libfuzzer_sys::Corpus;
+
+/// Small enough that thousands of pictures a second are decoded.
+const OPTIONS: ReadOptions = ReadOptions { max_pixels: 1 << 18, max_memory: 32 << 20 };
+
+/// A picture of the format that has this name.
+pub fn picture(format: &str, bytes: &[u8]) -> Corpus {
+    let magic = match format {
+        "png" => bytes.starts_with(b"\x89PNG\r\n\x1a\n"),
+        "jpeg" => bytes.starts_with(b"\xff\xd8\xff"),
+        "tiff" => bytes.starts_with(b"II") || bytes.starts_with(b"MM"),
+        "bmp" => bytes.starts_with(b"BM"),
+        "pnm" => bytes.first() == Some(&b'P'),
+        "exr" => bytes.starts_with(b"\x76\x2f\x31\x01"),
+        "hdr" => bytes.starts_with(b"#?"),
+        "webp" => bytes.starts_with(b"RIFF"),
+        _ => true,
+    };
+    if magic && let Ok(image) = cv_io::decode_image(bytes, &OPTIONS) {
+        check(&image);
+        write_and_read(image);
+    }
+    only_if(magic)
+}
+
+fn check(image: &DynImage) {
+    let (w, h) = image.size();
+    assert!(w > 0 && h > 0 && (w * h) as u64 <= OPTIONS.max_pixels, "{w}×{h}");
+    let focal = image.exif.focal.map(|focal| focal.pixels);
+    assert!(focal.is_none_or(|px| px.is_finite() && px > 0.0), "{focal:?}");
+}
+
+/// What is read can be written, and is read back alike.
+fn write_and_read(image: DynImage) {
+    let (w, h) = image.size();
+    if w * h <= 1 << 10 {
+        let written = match &image.pixels {
+            Pixels::Gray16(deep) => cv_io::encode_png(deep.view()),
+            Pixels::Rgb16(deep) => cv_io::encode_png(deep.view()),
+            _ => cv_io::encode_png(image.clone().into_rgb8().view()),
+        };
+        let again = cv_io::decode_image(&written.expect("it can be written"), &OPTIONS).expect("it can be read");
+        assert!(again.into_rgb8() == image.clone().into_rgb8(), "another picture");
+    }
+    assert!(image.into_gray8().size() == (w, h));
+}
+
+/// A block of EXIF, in a JPEG and in a PNG.
+pub fn exif(block: &[u8]) -> Corpus {
+    if block.len() > 60_000 {
+        return Corpus::Reject;
+    }
+    let image = RgbU8::new(8, 6, [90, 120, 30]);
+    let jpeg = cv_io::encode_jpeg(image.view(), 80).expect("a small picture");
+    let length = (block.len() + 8) as u16;
+    let segment = [&[0xff, 0xe1], &length.to_be_bytes()[..], b"Exif\0\0", block].concat();
+    let mut info = png::Info::with_size(8, 6);
+    info.exif_metadata = Some(block.to_vec().into());
+    let mut png = Vec::new();
+    let mut encoder = png::Encoder::with_info(&mut png, info).expect("a size");
+    encoder.set_color(png::ColorType::Rgb);
+    let mut writer = encoder.write_header().expect("in memory");
+    writer.write_image_data(image.as_slice()).expect("in memory");
+    writer.finish().expect("in memory");
+    for bytes in [[&jpeg[..2], &segment, &jpeg[2..]].concat(), png] {
+        // A camera may say what it likes: the pixels are there.
+        check(&cv_io::decode_image(&bytes, &OPTIONS).expect("a whole picture"));
+    }
+    Corpus::Keep
+}
+
+/// A map of floats, whatever its format, with and without a scale.
+pub fn map(bytes: &[u8]) -> Corpus {
+    for scale in [None, Some(4.0)] {
+        if let Ok(map) = cv_io::decode_map(bytes, scale) {
+            assert_eq!(map.width() * map.height(), map.as_slice().len());
+        }
+    }
+    Corpus::Keep
+}
+
+pub fn pfm_map(bytes: &[u8]) -> Corpus {
+    if let Ok(pfm::Pfm::Gray(map)) = pfm::decode_with(bytes, &OPTIONS) {
+        let mut again = Vec::new();
+        pfm::encode(map.view(), &mut again).expect("in memory");
+        let Ok(pfm::Pfm::Gray(read)) = pfm::decode(&again) else { panic!("what was written is not read") };
+        let same = |(a, b): (&f32, &f32)| a == b || (a.is_nan() && b.is_nan());
+        assert!(map.as_slice().iter().zip(read.as_slice()).all(same));
+    }
+    only_if(bytes.starts_with(b"P"))
+}
+
+pub fn npy_array(bytes: &[u8]) -> Corpus {
+    if let Ok(array) = npy::decode_with(bytes, &OPTIONS) {
+        let again = npy::encode(&array).expect("it was read");
+        assert_eq!(npy::encode(&npy::decode(&again).expect("it was written")).ok(), Some(again));
+        let _ = (array.to_gray(), cv_io::keypoints_from_npy(&array), cv_io::descriptors_from_npy(&array));
+    }
+    only_if(bytes.starts_with(b"\x93NUMPY"))
+}
+
+pub fn npz_arrays(bytes: &[u8]) -> Corpus {
+    let _ = npz::decode_only(bytes, &OPTIONS);
+    if let Ok(arrays) = npz::decode_with(bytes, &OPTIONS) {
+        let arrays: Vec<_> = arrays.iter().map(|(name, array)| (name.as_str(), array)).collect();
+        if let Ok(again) = npz::encode(&arrays, true) {
+            assert_eq!(npz::decode(&again).expect("it was written").len(), arrays.len());
+        }
+    }
+    only_if(bytes.starts_with(b"PK"))
+}
+
+/// Any cloud is written; the header counts what follows.
+pub fn ply_cloud(bytes: &[u8]) -> Corpus {
+    let mut input = arbitrary::Unstructured::new(bytes);
+    let Ok((positions, colors, normals, edges)) = Arbitrary::arbitrary(&mut input) else { return Corpus::Reject };
+    let cloud = PointCloud { positions, colors, normals, edges };
+    for encoding in [ply::PlyEncoding::Ascii, ply::PlyEncoding::Binary] {
+        let mut file = Vec::new();
+        if ply::encode(&cloud, encoding, &mut file).is_ok() {
+            let end = file.windows(11).position(|w| w == b"end_header\n").expect("a header") + 11;
+            let header = String::from_utf8_lossy(&file[..end]);
+            assert!(header.contains(&format!("element vertex {}\n", cloud.len())), "{header}");
+            if encoding == ply::PlyEncoding::Ascii {
+                let lines = file[end..].iter().filter(|b| **b == b'\n').count();
+                assert_eq!(lines, cloud.len() + cloud.edges.len());
+            }
+        }
+    }
+    Corpus::Keep
+}
+
+/// A calibration of one camera, in every format: what is understood is written in each and read back.
+pub fn camera(bytes: &[u8]) -> Corpus {
+    let Ok(text) = std::str::from_utf8(bytes) else { return Corpus::Reject };
+    for size in [None, Some((640, 480))] {
+        let Ok(camera) = cv_io::parse_camera(text, size) else { continue };
+        camera.validate().expect("a camera that is read is one");
+        for format in CalibrationFormat::all().filter(|format| format.writes_cameras()) {
+            let Ok(written) = format.camera_text(&camera, &[]) else { continue };
+            let again = cv_io::parse_camera(&written, Some((camera.width, camera.height)));
+            assert!(again.is_ok(), "{}: {again:?}\n{written}", format.name());
+        }
+    }
+    Corpus::Keep
+}
+
+pub fn rig(bytes: &[u8]) -> Corpus {
+    let Ok(text) = std::str::from_utf8(bytes) else { return Corpus::Reject };
+    for size in [None, Some((640, 480))] {
+        let Ok(file) = cv_io::parse_rig(text, size) else { continue };
+        for format in CalibrationFormat::all().filter(|format| format.writes_rigs()) {
+            let Ok(written) = format.rig_text(&file, &[]) else { continue };
+            let again = cv_io::parse_rig(&written, Some((file.rig.left.width, file.rig.left.height)));
+            assert!(again.is_ok(), "{}: {again:?}\n{written}", format.name());
+        }
+    }
+    Corpus::Keep
+}
+
+/// The three files of a COLMAP model.
+pub fn colmap(bytes: &[u8]) -> Corpus {
+    let Ok(text) = std::str::from_utf8(bytes) else { return Corpus::Reject };
+    let _ = cv_io::colmap::parse_cameras(text);
+    let _ = cv_io::colmap::parse_images(text);
+    let _ = cv_io::colmap::parse_points(text);
+    Corpus::Keep
+}
+
+pub fn matches(bytes: &[u8]) -> Corpus {
+    let Ok(text) = std::str::from_utf8(bytes) else { return Corpus::Reject };
+    if let Ok(matches) = cv_io::parse_matches(text) {
+        assert!(matches.scores.as_ref().is_none_or(|scores| scores.len() == matches.pairs.len()));
+    }
+    Corpus::Keep
+}
+
+pub fn features(bytes: &[u8]) -> Corpus {
+    let Ok(text) = std::str::from_utf8(bytes) else { return Corpus::Reject };
+    let _ = cv_io::parse_colmap_features(text);
+    Corpus::Keep
+}
