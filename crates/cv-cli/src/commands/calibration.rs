@@ -25,6 +25,10 @@ enum What {
 
 /// Write a camera or a rig in another format; every number reads back to the same value.
 #[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cv calibration convert camchain.yaml -o rig.yml --format opencv\n  \
+    cv calibration convert intrinsics.yml extrinsics.yml -o rig.yaml --format own\n  \
+    cv calibration convert camera.yaml -o cam.cameramodel --format mrcal")]
 struct Convert {
     #[command(flatten)]
     input: Input,
@@ -38,6 +42,9 @@ struct Convert {
 
 /// Say what a calibration file holds.
 #[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cv calibration show camera.yaml\n  \
+    cv calibration show K.txt --size 1920x1080")]
 struct Show {
     #[command(flatten)]
     input: Input,
