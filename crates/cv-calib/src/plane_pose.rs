@@ -1,7 +1,7 @@
 //! The pose of a flat target from one picture of it.
 
 use crate::target::{TargetCorner, TargetPoints};
-use cv_core::{Camera, Correspondence, Matrix3, Pose, Rotation3, Vector3};
+use cv_core::{Camera, Correspondence, Matrix3, Pose, Vector3};
 use cv_geometry::homography_from_points;
 use cv_numeric::svd3;
 
@@ -40,8 +40,7 @@ fn pose_from_homography(h: &Matrix3<f64>, rays: &[Correspondence]) -> Option<Pos
     let scale = depth.signum() * 2.0 / (h.column(0).norm() + h.column(1).norm());
     let (a, b, t): (Vector3<f64>, Vector3<f64>, Vector3<f64>) =
         ((h.column(0) * scale), (h.column(1) * scale), (h.column(2) * scale));
-    let svd = svd3(&Matrix3::from_columns(&[a, b, a.cross(&b)])).ok()?;
-    let rotation = Rotation3::from_matrix_unchecked(svd.u * svd.v.transpose());
+    let rotation = svd3(&Matrix3::from_columns(&[a, b, a.cross(&b)])).ok()?.nearest_rotation();
     let pose = Pose::new(rotation, t);
     let in_front = rays.iter().all(|m| pose.transform(&nalgebra::Point3::new(m.a.x, m.a.y, 0.0)).z > 0.0);
     (t.iter().all(|v| v.is_finite()) && in_front).then_some(pose)
@@ -50,7 +49,7 @@ fn pose_from_homography(h: &Matrix3<f64>, rays: &[Correspondence]) -> Option<Pos
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cv_core::{Distortion, Point2};
+    use cv_core::{Distortion, Point2, Rotation3};
 
     fn seen(camera: &Camera, target: &TargetPoints, pose: &Pose) -> Vec<TargetCorner> {
         let at = |point| camera.project(&pose.transform(&target.bent(point, [0.0; 2]))).unwrap();

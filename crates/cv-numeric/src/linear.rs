@@ -1,7 +1,7 @@
 //! Small dense linear algebra: null vectors, 3×3 SVD, symmetric eigenvectors.
 
 use faer::Side;
-use nalgebra::{DMatrix, DVector, Matrix3, SMatrix, SVector, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix3, Rotation3, SMatrix, SVector, Vector3};
 
 /// Why a decomposition did not succeed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
@@ -203,6 +203,13 @@ pub struct Svd3 {
     pub s: Vector3<f64>,
     /// Right singular vectors as columns, `det V = 1`.
     pub v: Matrix3<f64>,
+}
+
+impl Svd3 {
+    /// The rotation nearest to the matrix in the Frobenius norm, `U Vᵀ` (orthogonal Procrustes problem).
+    pub fn nearest_rotation(&self) -> Rotation3<f64> {
+        Rotation3::from_matrix_unchecked(self.u * self.v.transpose())
+    }
 }
 
 /// Singular value decomposition of a 3×3 matrix by one-sided Jacobi rotations, accurate also for tiny singular values.

@@ -57,7 +57,7 @@ pub fn align_points(a: &[Point3<f64>], b: &[Point3<f64>], with_scale: bool) -> R
         return Err(EstimateError::Degenerate { kind: Degeneracy::Collinear });
     }
     // U and V are proper rotations: the last singular value carries the sign.
-    let rotation = Rotation3::from_matrix_unchecked(svd.u * svd.v.transpose());
+    let rotation = svd.nearest_rotation();
     let scale = if with_scale { svd.s.sum() / spread } else { 1.0 };
     Ok(Similarity { scale, rotation, translation: mb - rotation * ma * scale })
 }

@@ -111,7 +111,7 @@ pub fn rotation_between(matches: &[Correspondence], threshold: f64) -> Result<(R
     for _ in 0..6 {
         let sum: Matrix3<f64> = rays.iter().zip(&weights).map(|((a, b), w)| b * a.transpose() * *w).sum();
         let svd = svd3(&sum).map_err(|_| EstimateError::Degenerate { kind: Degeneracy::Coincident })?;
-        rotation = Rotation3::from_matrix_unchecked(svd.u * svd.v.transpose());
+        rotation = svd.nearest_rotation();
         for ((a, b), w) in rays.iter().zip(&mut weights) {
             *w = 1.0 / ((rotation * a - b).norm() / threshold).max(1.0);
         }

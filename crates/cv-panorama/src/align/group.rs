@@ -26,7 +26,7 @@ pub(crate) struct Group<'a> {
 /// The rotation nearest to a matrix; the identity where the matrix tells none. (nalgebra's own search for it does not end where the distance to the matrix stays
 /// the same about an axis, as with those of rank one that focal lengths far from the truth make.)
 fn nearest_rotation(m: &Matrix3<f64>) -> Matrix3<f64> {
-    let nearest = svd3(m).map(|svd| svd.u * svd.v.transpose());
+    let nearest = svd3(m).map(|svd| svd.nearest_rotation().into_inner());
     nearest.ok().filter(|r| r.iter().all(|v| v.is_finite())).unwrap_or_else(Matrix3::identity)
 }
 
