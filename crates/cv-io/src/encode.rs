@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use cv_core::ImageView;
+use jpeg_encoder::JpegColorType;
 use png::{BitDepth, ColorType, Compression, Filter};
 
 use crate::files::write_bytes;
@@ -112,8 +113,6 @@ fn jpeg_file(
         return Err(FormatError::NotRepresentable { format: "JPEG", what: format!("a picture of {width}×{height}") });
     };
     let channels = color.samples();
-    let color =
-        if color == ColorType::Grayscale { jpeg_encoder::ColorType::Luma } else { jpeg_encoder::ColorType::Rgb };
     let mut bytes = Vec::new();
     let mut encoder = jpeg_encoder::Encoder::new(&mut bytes, quality.clamp(1, 100));
     let fail = |e: jpeg_encoder::EncodingError| FormatError::corrupt("JPEG", e.to_string());
@@ -125,8 +124,47 @@ fn jpeg_file(
     if let Some(profile) = metadata.icc_for(channels) {
         encoder.add_icc_profile(profile).map_err(fail)?;
     }
-    encoder.encode(&pixels, w, h, color).map_err(fail)?;
+    encoder.encode_image(JpegRows { width: w, height: h, channels, pixels: &pixels }).map_err(fail)?;
     Ok(bytes)
+}
+
+/// Pixels as the encoder takes them. (Its own `encode` is compiled for nine kinds of pixels.)
+struct JpegRows<'a> {
+    width: u16,
+    height: u16,
+    /// 1 or 3.
+    channels: usize,
+    pixels: &'a [u8],
+}
+
+impl jpeg_encoder::ImageBuffer for JpegRows<'_> {
+    fn get_jpeg_color_type(&self) -> JpegColorType {
+        if self.channels == 1 { JpegColorType::Luma } else { JpegColorType::Ycbcr }
+    }
+
+    fn width(&self) -> u16 {
+        self.width
+    }
+
+    fn height(&self) -> u16 {
+        self.height
+    }
+
+    fn fill_buffers(&self, y: u16, buffers: &mut [Vec<u8>; 4]) {
+        let row = self.channels * usize::from(self.width);
+        let row = &self.pixels[usize::from(y) * row..][..row];
+        let [luma, blue, red, _] = buffers;
+        if self.channels == 1 {
+            luma.extend_from_slice(row);
+        } else {
+            for &[r, g, b] in row.as_chunks().0 {
+                let ycc = jpeg_encoder::rgb_to_ycbcr(r, g, b);
+                luma.push(ycc.0);
+                blue.push(ycc.1);
+                red.push(ycc.2);
+            }
+        }
+    }
 }
 
 /// Quality of JPEG files.
