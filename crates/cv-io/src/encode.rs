@@ -6,6 +6,7 @@ use cv_core::ImageView;
 use jpeg_encoder::JpegColorType;
 use png::{BitDepth, ColorType, Compression, Filter};
 
+use crate::encode_tiff::{Samples, tiff_file};
 use crate::files::write_bytes;
 use crate::{FormatError, IoError, Metadata};
 
@@ -179,23 +180,40 @@ pub fn write_jpeg(path: impl AsRef<Path>, view: impl JpegPixels) -> Result<(), I
     write_bytes(path, &encode_jpeg(view, QUALITY).map_err(|reason| IoError::writing(path, reason))?)
 }
 
-/// Writes a picture in the format that the file name's ending asks for: `.jpg` or `.jpeg`, or `.png`. Of `metadata` is kept what [`write_png_with`]
+/// The bytes of a TIFF file, packed by Deflate.
+///
+/// # Errors
+/// [`FormatError::NotRepresentable`] for an empty picture or one of more than 4 GB.
+pub fn encode_tiff(view: impl PngPixels) -> Result<Vec<u8>, FormatError> {
+    tiff_of(view.parts(), &Metadata::default())
+}
+
+fn tiff_of((width, height, color, depth, bytes): Parts, metadata: &Metadata) -> Result<Vec<u8>, FormatError> {
+    let depth = if depth == BitDepth::Sixteen { 2 } else { 1 };
+    tiff_file(&Samples { width, height, channels: color.samples(), depth, bytes: &bytes }, metadata)
+}
+
+/// Writes a picture in the format that the file name's ending asks for: `.png`, `.tif` or `.tiff`, or `.jpg` or `.jpeg`. Of `metadata` is kept what [`write_png_with`]
 /// keeps.
 ///
 /// # Errors
-/// [`FormatError::Unsupported`] for another ending; else as [`write_png`] and [`write_jpeg`].
-pub fn write_image(path: impl AsRef<Path>, view: impl JpegPixels, metadata: &Metadata) -> Result<(), IoError> {
+/// [`FormatError::Unsupported`] for another ending; [`FormatError::NotRepresentable`] for a JPEG of 16 bits or with opacity; else as [`encode_png`], [`encode_tiff`],
+/// [`encode_jpeg`] and [`crate::write_atomic`].
+pub fn write_image(path: impl AsRef<Path>, view: impl PngPixels, metadata: &Metadata) -> Result<(), IoError> {
     let path = path.as_ref();
     let ending = path.extension().map(|e| e.to_string_lossy().to_lowercase());
-    match ending.as_deref() {
-        Some("png") => write_png_with(path, view, metadata),
-        Some("jpg" | "jpeg") => {
-            let bytes = jpeg_file(view.parts(), QUALITY, metadata).map_err(|reason| IoError::writing(path, reason))?;
-            write_bytes(path, &bytes)
+    let parts = view.parts();
+    let bytes = match ending.as_deref() {
+        Some("png") => png_file(parts, metadata),
+        Some("tif" | "tiff") => tiff_of(parts, metadata),
+        Some("jpg" | "jpeg") if parts.3 == BitDepth::Eight && parts.2 != ColorType::Rgba => {
+            jpeg_file(parts, QUALITY, metadata)
         }
-        _ => Err(IoError::writing(
-            path,
-            FormatError::unsupported("the file name", "an ending other than .png, .jpg and .jpeg"),
-        )),
-    }
+        Some("jpg" | "jpeg") => {
+            let what = if parts.3 == BitDepth::Eight { "opacity" } else { "samples of 16 bits" };
+            Err(FormatError::NotRepresentable { format: "JPEG", what: what.to_owned() })
+        }
+        _ => Err(FormatError::unsupported("the file name", "an ending other than .png, .tif, .tiff, .jpg and .jpeg")),
+    };
+    write_bytes(path, &bytes.map_err(|reason| IoError::writing(path, reason))?)
 }

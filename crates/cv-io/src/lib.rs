@@ -37,6 +37,7 @@ mod codec;
 pub mod colmap;
 mod depth_png;
 mod encode;
+mod encode_tiff;
 mod error;
 mod exif_info;
 mod features;
@@ -60,7 +61,9 @@ pub use camera::{
     read_rig, read_rig_with_notes, write_camera, write_rig,
 };
 pub use depth_png::{depth_mm, kitti, scaled};
-pub use encode::{JpegPixels, PngPixels, encode_jpeg, encode_png, write_image, write_jpeg, write_png, write_png_with};
+pub use encode::{
+    JpegPixels, PngPixels, encode_jpeg, encode_png, encode_tiff, write_image, write_jpeg, write_png, write_png_with,
+};
 pub use error::{FormatError, IoError};
 pub use exif_info::{ExifFocal, ExifInfo, FocalSource};
 pub use features::{

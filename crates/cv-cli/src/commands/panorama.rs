@@ -86,7 +86,7 @@ impl Run for Args {
         }
         let ending = self.output.extension().unwrap_or_default();
         if self.alpha && ["jpg", "jpeg"].iter().any(|jpeg| ending.eq_ignore_ascii_case(jpeg)) {
-            return Err(Failure::usage("--alpha needs a .png: JPEG has no transparency"));
+            return Err(Failure::usage("--alpha needs a .png or .tif: JPEG has no transparency"));
         }
         let paths = expand_images(&self.images)?;
         let pictures = paths
@@ -120,7 +120,7 @@ impl Run for Args {
         let metadata = metadata(&files, &result);
         context.write(Output::File(&self.output, PICTURE), |path| {
             if self.alpha {
-                cv_io::write_png_with(path, transparent(&result).view(), &metadata)
+                cv_io::write_image(path, transparent(&result).view(), &metadata)
             } else {
                 cv_io::write_image(path, result.image.view(), &metadata)
             }

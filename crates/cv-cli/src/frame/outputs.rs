@@ -11,7 +11,7 @@ use std::{
 };
 
 /// Pictures for people.
-pub(crate) const PICTURE: &[&str] = &["png", "jpg", "jpeg"];
+pub(crate) const PICTURE: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff"];
 /// Pictures whose values must stay as they are.
 pub(crate) const PNG: &[&str] = &["png"];
 /// Maps of numbers.

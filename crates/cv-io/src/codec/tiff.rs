@@ -1,6 +1,7 @@
 //! TIFF, through the `tiff` crate: gray, RGB and CMYK of 8 and 16 bits and floats, interleaved or in planes.
 
 use super::{Format, HEADER_BYTES, Header, Raster, Samples, count};
+use crate::metadata::exif_of_tiff;
 use crate::{FormatError, memory};
 use std::io::{Cursor, ErrorKind};
 use tiff::decoder::{Decoder, DecodingResult, Limits};
@@ -23,7 +24,16 @@ pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
     let chunk = jpeg_chunk(&mut decoder, bytes);
     let beside = chunk.max(copy.saturating_mul(u64::from(planes) + u64::from(inks)));
     let channels = if inks { 3 } else { channels };
-    Ok(Header { width: width as usize, height: height as usize, channels, depth, beside, exif: None, icc, orientation })
+    Ok(Header {
+        width: width as usize,
+        height: height as usize,
+        channels,
+        depth,
+        beside,
+        exif: exif_of_tiff(bytes),
+        icc,
+        orientation,
+    })
 }
 
 /// The most bytes that a strip or tile of JPEG takes, by its own header, which need not be that of the picture: four bytes a pixel and

@@ -1,5 +1,5 @@
 use super::*;
-use crate::{ExifFocal, FocalSource, encode_jpeg, encode_png};
+use crate::{ExifFocal, FocalSource, Metadata, encode_jpeg, encode_png, encode_tiff};
 use exif::experimental::Writer;
 use exif::{Field, Rational, Tag, Value};
 use proptest::prelude::*;
@@ -469,6 +469,52 @@ fn names_do_not_matter_and_other_formats_are_named() {
     }
 }
 
+/// Read by another decoder than is told by the fields we wrote: strips that do not fill the last one, and opacity.
+#[test]
+fn a_tiff_of_many_strips_with_opacity_is_what_was_written() {
+    let image = Image::<u8, 4>::from_fn(700, 301, |x, y| [x as u8, y as u8, (x * y) as u8, (x + y) as u8]);
+    let bytes = encode_tiff(image.view()).unwrap();
+    let mut decoder = tiff::decoder::Decoder::new(Cursor::new(&bytes)).unwrap();
+    assert_eq!(decoder.colortype().unwrap(), tiff::ColorType::RGBA(8));
+    // 2800 bytes a row: 93 rows a strip.
+    assert_eq!(decoder.strip_count().unwrap(), 4);
+    let tiff::decoder::DecodingResult::U8(samples) = decoder.read_image().unwrap() else { panic!("other samples") };
+    assert_eq!(samples, image.as_slice());
+    assert!(encode_tiff(GrayU8::new(3, 0, [0]).view()).is_err());
+}
+
+/// What a JPEG's file says goes into a TIFF and comes out of it again.
+#[test]
+fn a_tiff_keeps_the_camera_the_focal_length_and_the_profile() {
+    let mut icc = vec![3; 300];
+    icc[16..20].copy_from_slice(b"RGB ");
+    // The compression is that of a thumbnail nobody has.
+    let exif = exif_block(&[
+        (Tag::Make, Value::Ascii(vec![b"Testmaker".to_vec()])),
+        (Tag::Orientation, Value::Short(vec![6])),
+        (Tag::Compression, Value::Short(vec![6])),
+        (Tag::ISOSpeed, Value::Long(vec![400])),
+        (Tag::FocalLength, Value::Rational(vec![Rational { num: 50, denom: 1 }])),
+        (Tag::FocalPlaneXResolution, Value::Rational(vec![Rational { num: 1, denom: 2 }])),
+        // Per millimeter: the sensor is 24 mm wide.
+        (Tag::FocalPlaneResolutionUnit, Value::Short(vec![4])),
+    ]);
+    let metadata = Metadata { exif: Some(exif), icc: Some(icc.clone()) };
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.tif");
+    crate::write_image(&path, ramp(12, 7).view(), &metadata).unwrap();
+    let read = read_image(&path).unwrap();
+    assert_eq!(read.metadata.icc, Some(icc));
+    assert_eq!(read.exif.camera.as_deref(), Some("Testmaker"));
+    assert_eq!(read.exif.focal, Some(ExifFocal { pixels: 25.0, source: FocalSource::SensorResolution }));
+    let again = exif::Reader::new().read_raw(read.metadata.exif.unwrap()).unwrap();
+    let field = |tag| again.get_field(tag, exif::In::PRIMARY).map(|f| f.value.get_uint(0));
+    assert_eq!(field(Tag::ISOSpeed), Some(Some(400)));
+    assert_eq!([field(Tag::PixelXDimension), field(Tag::Compression)], [Some(Some(12)), None]);
+    let refused = crate::write_image(folder.path().join("a.jpg"), Image::<u16, 1>::new(2, 2, [0]).view(), &metadata);
+    assert!(refused.unwrap_err().to_string().contains("16 bits"));
+}
+
 #[test]
 fn the_smallest_pictures() {
     let one = RgbU8::new(1, 1, [9, 8, 7]);
@@ -501,10 +547,16 @@ proptest! {
     }
 
     #[test]
-    fn png_keeps_every_sample(w in 1usize..9, h in 1usize..9, data in prop::collection::vec(any::<u16>(), 192)) {
+    fn png_and_tiff_keep_every_sample(w in 1usize..9, h in 1usize..9, data in prop::collection::vec(any::<u16>(), 192)) {
         let deep = Image::<u16, 3>::from_fn(w, h, |x, y| std::array::from_fn(|c| data[(y * 8 + x) * 3 + c]));
         prop_assert_eq!(decoded(&encode_png(deep.view()).unwrap()).pixels, Pixels::Rgb16(deep.clone()));
+        prop_assert_eq!(decoded(&encode_tiff(deep.view()).unwrap()).pixels, Pixels::Rgb16(deep.clone()));
+        let gray = deep.map(|p| [p[0]]);
+        prop_assert_eq!(decoded(&encode_tiff(gray.view()).unwrap()).pixels, Pixels::Gray16(gray));
         let bytes = deep.map(|p| p.map(|v| v as u8));
+        prop_assert_eq!(decoded(&encode_tiff(bytes.view()).unwrap()).into_rgb8(), bytes.clone());
+        let gray = bytes.map(|p| [p[0]]);
+        prop_assert_eq!(decoded(&encode_tiff(gray.view()).unwrap()).pixels, Pixels::Gray8(gray));
         let png = encode_png(bytes.view()).unwrap();
         prop_assert_eq!(decoded(&png).into_rgb8(), bytes.clone());
         // A window into the middle, whose rows lie apart in memory.
