@@ -7,7 +7,7 @@ mod panorama;
 mod reconstruct;
 mod segment;
 
-use crate::frame::{Context, Failure, Outcome, Output, Run};
+use crate::frame::{Context, Failure, Outcome, Output, Run, Step, steps};
 use crate::pictures::{Width, map, picture};
 use cv_core::{Camera, GrayF32, RgbU8, Stage};
 use cv_report::{Figure, MapStyle, Note, Report, draw_map};
@@ -127,6 +127,10 @@ const JOBS: [(&str, Job); 6] = [
 impl Run for Args {
     fn outputs(&self) -> Vec<Output<'_>> {
         vec![Output::Folder(&self.output)]
+    }
+
+    fn steps(&self) -> Vec<Step> {
+        vec![steps::DEMO]
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {

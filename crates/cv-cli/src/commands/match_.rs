@@ -1,6 +1,6 @@
 //! `cv match`: tentative matches between two photographs.
 
-use crate::frame::{Context, Explain, Failure, Outcome, Output, Run, TEXT, named, two_images};
+use crate::frame::{Context, Explain, Failure, Outcome, Output, Run, Step, TEXT, named, steps, two_images};
 use crate::pictures::{Width, picture};
 use crate::words;
 use cv_core::{Keypoint, Named, RgbU8};
@@ -78,6 +78,11 @@ impl Run for Args {
     fn outputs(&self) -> Vec<Output<'_>> {
         let matches = self.output.iter().map(|path| Output::File(path, TEXT));
         matches.chain(self.save_features.iter().map(|folder| Output::Folder(folder))).collect()
+    }
+
+    fn steps(&self) -> Vec<Step> {
+        let guided = self.guided.map(|_| steps::GUIDED);
+        [steps::FEATURES, steps::MATCH].into_iter().chain(guided).collect()
     }
 
     fn run(mut self, context: &Context) -> Result<Outcome, Failure> {

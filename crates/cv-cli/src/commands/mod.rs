@@ -24,6 +24,11 @@
 //!         vec![Output::File(&self.output, PNG)]
 //!     }
 //!
+//!     // Of which the progress bar tells the number: `frame/steps.rs`.
+//!     fn steps(&self) -> Vec<Step> {
+//!         vec![steps::READ, steps::SHRINK]
+//!     }
+//!
 //!     // Global options that would do nothing are refused.
 //!     fn has_no_use_for(&self) -> &'static [Global] {
 //!         &[Global::Seed]
@@ -89,6 +94,7 @@ macro_rules! subcommands {
                     $(Self::$variant(args) => {
                         context.refuse(args.has_no_use_for())?;
                         context.check(&args.outputs())?;
+                        context.expect(args.steps());
                         (*args).run(context)
                     })*
                 }

@@ -2,7 +2,7 @@
 
 mod report;
 
-use crate::frame::{Context, Failure, Outcome, Output, PICTURE, Run, expand_images, named};
+use crate::frame::{Context, Failure, Outcome, Output, PICTURE, Run, Step, expand_images, named, steps};
 use crate::{rig, words};
 use cv_core::Image;
 use cv_io::Metadata;
@@ -78,6 +78,11 @@ impl Args {
 impl Run for Args {
     fn outputs(&self) -> Vec<Output<'_>> {
         vec![Output::File(&self.output, PICTURE)]
+    }
+
+    fn steps(&self) -> Vec<Step> {
+        let found = [steps::FEATURES, steps::MATCH, steps::ALIGN];
+        found.into_iter().chain([steps::EXPOSURE, steps::SEAMS, steps::WARP, steps::BLEND]).collect()
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {

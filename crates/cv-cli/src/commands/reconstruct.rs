@@ -4,7 +4,7 @@ mod report;
 
 pub(crate) use report::sparse;
 
-use crate::frame::{CLOUD, Context, Failure, Outcome, Output, Run, named, two_images};
+use crate::frame::{CLOUD, Context, Failure, Outcome, Output, Run, Step, named, steps, two_images};
 use crate::{rig, words};
 use cv_core::PointCloud;
 use cv_core::nalgebra::Matrix3;
@@ -88,6 +88,14 @@ impl Run for Args {
     fn outputs(&self) -> Vec<Output<'_>> {
         let clouds = std::iter::once(&self.output).chain(&self.dense).map(|path| Output::File(path, CLOUD));
         clouds.chain(self.colmap.iter().map(|folder| Output::Folder(folder))).collect()
+    }
+
+    fn steps(&self) -> Vec<Step> {
+        let mut all = vec![steps::FEATURES, steps::MATCH, steps::POSE, steps::ADJUST, steps::GUIDED, steps::POINTS];
+        if self.dense.is_some() {
+            all.extend([steps::RECTIFY, steps::DISPARITIES, steps::CLOUD]);
+        }
+        all
     }
 
     fn run(mut self, context: &Context) -> Result<Outcome, Failure> {

@@ -1,7 +1,7 @@
 //! `cv rectify`: a pair as two cameras would have taken it whose rows coincide.
 
 use super::size;
-use crate::frame::{Context, Failure, Global, Outcome, Output, Run, spare_inputs, two_images};
+use crate::frame::{Context, Failure, Global, Outcome, Output, Run, Step, spare_inputs, steps, two_images};
 use crate::photos::{Photos, at_own_depth};
 use crate::pictures::{Width, picture};
 use crate::{rig, words};
@@ -82,6 +82,10 @@ const NAMES: [&str; 4] = ["left.png", "right.png", "rig.yaml", "q.txt"];
 impl Run for Args {
     fn has_no_use_for(&self) -> &'static [Global] {
         &[Global::Seed]
+    }
+
+    fn steps(&self) -> Vec<Step> {
+        vec![steps::RECTIFY, steps::FEATURES, steps::MATCH]
     }
 
     fn run(mut self, context: &Context) -> Result<Outcome, Failure> {

@@ -2,7 +2,9 @@
 
 mod files;
 
-use crate::frame::{Context, Explain, Failure, Global, JSON, Outcome, Output, Run, expand_images, named, same_file};
+use crate::frame::{
+    Context, Explain, Failure, Global, JSON, Outcome, Output, Run, Step, expand_images, named, same_file, steps,
+};
 use crate::pictures::{Width, picture};
 use cv_core::{Mask, Named, RgbU8, Stage};
 use cv_pipeline::segmentation::{
@@ -49,6 +51,14 @@ impl Run for Args {
         match &self.what {
             What::Train(_) => &[],
             What::Predict(_) | What::Eval(_) => &[Global::Seed],
+        }
+    }
+
+    fn steps(&self) -> Vec<Step> {
+        match &self.what {
+            What::Train(_) => vec![steps::READ, steps::COLORS, steps::REGIONS, steps::THRESHOLD],
+            What::Predict(_) => vec![steps::PREDICT],
+            What::Eval(_) => vec![steps::SCORE],
         }
     }
 

@@ -1,6 +1,6 @@
 //! What a running command knows about how it was called.
 
-use super::progress::Bar;
+use super::progress::{Bar, Step};
 use super::stop::Stop;
 use super::{Called, Failure, Global, Globals, Output, outputs};
 use cv_pipeline::{Cancelled, Progress};
@@ -55,6 +55,11 @@ impl Context {
     /// Finds out before the work whether the results can be written.
     pub(crate) fn check(&self, outputs: &[Output<'_>]) -> Result<(), Failure> {
         outputs::check(outputs, self.report.as_deref(), self.json)
+    }
+
+    /// Says which steps will come.
+    pub(crate) fn expect(&self, steps: Vec<Step>) {
+        self.bar.expect(steps);
     }
 
     /// Keeps an output for stdout until the command is done.

@@ -12,6 +12,7 @@ mod named;
 mod outcome;
 mod outputs;
 mod progress;
+pub(crate) mod steps;
 mod stop;
 
 pub(crate) use called::Called;
@@ -22,6 +23,7 @@ pub(crate) use inputs::{expand_images, stands_for_many, two_images};
 pub(crate) use named::named;
 pub(crate) use outcome::Outcome;
 pub(crate) use outputs::{CLOUD, JSON, MAP, Output, PICTURE, PNG, TEXT, YAML, same_file, spare_inputs};
+pub(crate) use progress::Step;
 
 use clap::{Args, value_parser};
 use std::{
@@ -78,6 +80,11 @@ pub(crate) enum Global {
 pub(crate) trait Run: Args {
     /// What this run will write. The frame checks before the work starts whether it can be written.
     fn outputs(&self) -> Vec<Output<'_>> {
+        Vec::new()
+    }
+
+    /// The steps of the work, in order, of which the progress bar tells the number.
+    fn steps(&self) -> Vec<Step> {
         Vec::new()
     }
 

@@ -4,7 +4,9 @@ mod json;
 mod report;
 
 use super::depth::pairing::{PairBy, join};
-use crate::frame::{Context, Failure, Global, Outcome, Output, Run, YAML, expand_images, named, spare_inputs};
+use crate::frame::{
+    Context, Failure, Global, Outcome, Output, Run, Step, YAML, expand_images, named, spare_inputs, steps,
+};
 use crate::words::calibration::{no_calibration, note, refusal};
 use cv_core::GrayF32;
 use cv_io::{IoError, RigFile};
@@ -142,6 +144,10 @@ impl Run for Args {
 
     fn has_no_use_for(&self) -> &'static [Global] {
         &[Global::Seed]
+    }
+
+    fn steps(&self) -> Vec<Step> {
+        vec![steps::BOARDS, steps::LENS, steps::ADJUST]
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {

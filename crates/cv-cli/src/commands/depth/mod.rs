@@ -7,7 +7,9 @@ pub(super) mod pairing;
 mod report;
 
 use super::size;
-use crate::frame::{CLOUD, Context, Failure, Global, MAP, Outcome, Output, PNG, Run, named, stands_for_many};
+use crate::frame::{
+    CLOUD, Context, Failure, Global, MAP, Outcome, Output, PNG, Run, Step, named, stands_for_many, steps,
+};
 use crate::photos::{Photos, at_own_depth};
 use crate::{rig, words};
 use cv_core::ImageView;
@@ -152,6 +154,15 @@ impl Run for Args {
 
     fn has_no_use_for(&self) -> &'static [Global] {
         &[Global::Seed]
+    }
+
+    fn steps(&self) -> Vec<Step> {
+        if stands_for_many(&self.left) {
+            return vec![steps::FRAMES];
+        }
+        let rectified = (!self.rig.is_empty()).then_some(steps::RECTIFY);
+        let range = [steps::FEATURES, steps::MATCH].into_iter().filter(|_| self.disparities == Range::Auto);
+        rectified.into_iter().chain(range).chain([steps::DISPARITIES, steps::DEPTH]).collect()
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {

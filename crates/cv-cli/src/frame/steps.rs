@@ -1,0 +1,37 @@
+//! The steps of commands, by the stages that the libraries report.
+
+use super::progress::Step;
+
+macro_rules! steps {
+    ($($constant:ident = $name:literal: [$($stage:literal),*];)*) => {
+        $(pub(crate) const $constant: Step = Step { name: $name, stages: &[$($stage),*] };)*
+    };
+}
+
+steps! {
+    FEATURES = "features": ["features", "scale space", "pyramid", "corners", "describe"];
+    MATCH = "match": ["match", "slanted views", "slanted view"];
+    GUIDED = "guided": ["guided", "neighbors"];
+    POSE = "pose": ["plane", "lens", "pose"];
+    ADJUST = "adjust": ["adjust", "stability"];
+    POINTS = "points": ["filter"];
+    ALIGN = "align": ["align", "elastic"];
+    EXPOSURE = "exposure": ["preview", "exposure"];
+    SEAMS = "seams": ["seams"];
+    WARP = "warp": ["warp"];
+    BLEND = "blend": ["blend", "crop"];
+    RECTIFY = "rectify": ["rectify", "reduce"];
+    DISPARITIES = "disparities": ["prepare", "bits", "path sums", "aggregate", "check", "refine"];
+    DEPTH = "depth": ["depth"];
+    CLOUD = "cloud": ["cloud"];
+    FRAMES = "frames": ["frames"];
+    READ = "read": ["read"];
+    COLORS = "colors": ["colors", "clusters", "fit"];
+    REGIONS = "regions": ["regions"];
+    THRESHOLD = "threshold": ["threshold", "scores"];
+    PREDICT = "predict": ["predict"];
+    SCORE = "score": ["score"];
+    BOARDS = "boards": ["boards"];
+    LENS = "lens": ["start", "lens"];
+    DEMO = "demo": ["demo"];
+}
