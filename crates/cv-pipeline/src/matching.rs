@@ -10,7 +10,7 @@ use cv_features::{
 use cv_geometry::EstimateError;
 use cv_imgproc::{resize_area, rgb_to_gray_f32};
 
-/// Whether [`match_photos`] also looks at affine-simulated views (ASIFT, Morel & Yu 2009), with SIFT only: some ten times the time.
+/// Whether [`match_photos`] also looks at affine-simulated views (ASIFT, Morel & Yu 2009), with SIFT only: some five times the time. Of large photographs, a third of the size tells which views to look at in full.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
