@@ -51,7 +51,7 @@ pub use calibrate::{BoardCalibration, BoardCalibrationError, BoardCalibrationOpt
 pub use cv_core::{Cancelled, Progress, Silent};
 pub use cv_features::{FeatureExtractor, FeatureMethod, FeatureOptions, Features};
 pub use cv_geometry::{
-    EstimateError, Intrinsics, RobustModel, RobustOptions, TwoViewError, TwoViewOptions, TwoViewPoint,
+    EstimateError, Intrinsics, PLAUSIBLE_FOCAL, RobustModel, RobustOptions, TwoViewError, TwoViewOptions, TwoViewPoint,
     TwoViewReconstruction,
 };
 pub use depth::{DepthError, DepthOptions, DepthResult, DisparityRange, depth, depth_with};

@@ -51,7 +51,7 @@ pub(crate) struct Args {
     /// How the corners of harris are spread.
     #[arg(long, value_name = "HOW", value_parser = named::<Suppression>(), default_value_t = Suppression::default())]
     spacing: Suppression,
-    /// Look at affine-simulated views too (ASIFT), with sift: for photographs from very different directions; about ten times slower.
+    /// Look at affine-simulated views too (ASIFT), with sift: for photographs from very different directions; about five times slower.
     #[arg(long = "asift", alias = "slanted", value_name = "WHEN", value_parser = named::<AffineSimulation>(), default_value_t = MatchingOptions::default().affine_simulation)]
     slanted: AffineSimulation,
     /// Find this model and match once more along it: more matches, nearly all right, and none that disagree.

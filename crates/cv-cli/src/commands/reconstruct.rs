@@ -11,7 +11,8 @@ use cv_core::nalgebra::Matrix3;
 use cv_io::DynImage;
 use cv_io::ply::PlyEncoding;
 use cv_pipeline::{
-    Axes, DenseOptions, DenseResult, Intrinsics, ReconstructOptions, ReconstructResult, reconstruct, reconstruct_dense,
+    Axes, DenseOptions, DenseResult, Intrinsics, PLAUSIBLE_FOCAL, ReconstructOptions, ReconstructResult, reconstruct,
+    reconstruct_dense,
 };
 use std::path::{Path, PathBuf};
 
@@ -152,9 +153,10 @@ impl Run for Args {
 fn doubt(result: &ReconstructResult) -> Option<String> {
     let percent = 100.0 * result.scene.focal_deviation;
     let degrees = result.scene.pose_deviation[1].to_degrees();
+    let (low, high) = PLAUSIBLE_FOCAL;
     let unusual = result.scene.unusual_focal().map_or_else(String::new, |share| {
         format!(
-            "; at {share:.1} times the photograph's longer side it is unusual (0.4 to 3 are usual), which matches that hardly show perspective lead to"
+            "; at {share:.1} times the photograph's longer side it is unusual ({low} to {high} are usual), which matches that hardly show perspective lead to"
         )
     });
     (result.focal_is_doubtful() || !unusual.is_empty()).then(|| {

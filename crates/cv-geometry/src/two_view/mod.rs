@@ -88,7 +88,7 @@ const EXIF_DEVIATION: f64 = 0.03;
 /// And of a calibration matrix that came without its lens: the focal length of a fit without distortion takes up some of it (of Sceaux's, 2.3 %).
 const MATRIX_DEVIATION: f64 = 0.02;
 /// What focal lengths of photographs are, as shares of the longer side: an unknown one is between these with 95 % (fields of view of 103 and of 19 degrees).
-const PLAUSIBLE_FOCAL: (f64, f64) = (0.4, 3.0);
+pub const PLAUSIBLE_FOCAL: (f64, f64) = (0.4, 3.0);
 
 /// The middle of [`PLAUSIBLE_FOCAL`] as a share of the longer side, and the standard deviation of its logarithm.
 fn usual_focal() -> (f64, f64) {
