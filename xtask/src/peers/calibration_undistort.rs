@@ -100,19 +100,15 @@ pub(super) fn run(python: &Path, page: &mut Page) -> Result<()> {
          {:.2} (RGB) levels on average: OpenCV's maps count in 1/32 px.\n\n| pixels | threads | ours, ms | OpenCV `remap`, ms | ratio |\n|---|---|---|---|---|",
         SIZE.0, SIZE.1, means[0], means[1]
     );
-    for (kind, name) in ["gray", "RGB"].into_iter().enumerate() {
-        for threads in 0..2 {
-            let [ours, theirs] = [best[0][kind][threads], best[1][kind][threads]];
-            let _ = writeln!(
-                page.text,
-                "| {name} | {} | {:.2} | {:.2} | {:.3} |",
-                threads + 1,
-                1e3 * ours,
-                1e3 * theirs,
-                ours / theirs
-            );
-            let name = format!("undistorting a pair of 1 Mpx, {name}, {} threads / remap", threads + 1);
-            page.checks.push(Check::at_most(name, ours / theirs, 0.6));
+    let kinds = ["gray", "RGB"].into_iter().zip(best[0].iter().zip(&best[1]));
+    for (name, (ours, theirs)) in kinds {
+        for (threads, (ours, theirs)) in (1..).zip(ours.iter().zip(theirs)) {
+            let ratio = ours / theirs;
+            let _ =
+                writeln!(page.text, "| {name} | {threads} | {:.2} | {:.2} | {ratio:.3} |", 1e3 * ours, 1e3 * theirs);
+            let plural = if threads == 1 { "thread" } else { "threads" };
+            let name = format!("undistorting a pair of 1 Mpx, {name}, {threads} {plural} / remap");
+            page.checks.push(Check::at_most(name, ratio, 0.6));
         }
     }
     Ok(())
