@@ -171,7 +171,8 @@ def remap(width, height, out):
     k = np.array([[900 * scale, 0, 650 * scale], [0, 902 * scale, 390 * scale], [0, 0, 1]])
     d = np.array([-0.3, 0.1, 1e-3, -5e-4, 0.0])
     turn = cv2.Rodrigues(np.array([0.01, 0.02, 0.005]))[0]
-    maps = cv2.initUndistortRectifyMap(k, d, turn, k, (width, height), cv2.CV_16SC2)
+    # Of each camera its own, as a rig has.
+    maps = [cv2.initUndistortRectifyMap(k, d, turn, k, (width, height), cv2.CV_16SC2) for _ in range(2)]
     for channels, name in ((1, "gray"), (3, "rgb")):
         shape = (height, width) if channels == 1 else (height, width, 3)
         pair = [np.fromfile(f"{out}/{name}{i}.bytes", np.uint8).reshape(shape) for i in (0, 1)]
@@ -181,8 +182,8 @@ def remap(width, height, out):
             best = float("inf")
             for _ in range(100):
                 start = time.perf_counter()
-                for image, result in zip(pair, results):
-                    cv2.remap(image, *maps, cv2.INTER_LINEAR, dst=result)
+                for image, result, both in zip(pair, results, maps):
+                    cv2.remap(image, *both, cv2.INTER_LINEAR, dst=result)
                 best = min(best, time.perf_counter() - start)
             print(json.dumps({"kind": name, "threads": threads, "seconds": best, "version": VERSION}), flush=True)
         results[0].tofile(f"{out}/{name}.result")
