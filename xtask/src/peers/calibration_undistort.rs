@@ -14,7 +14,7 @@ use std::time::Instant;
 const SIZE: (usize, usize) = (1280, 800);
 const REPEATS: usize = 100;
 /// Times that both take turns.
-const ROUNDS: usize = 2;
+const ROUNDS: usize = 4;
 
 #[derive(Debug, Deserialize)]
 struct Remap {
