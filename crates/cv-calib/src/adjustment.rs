@@ -310,6 +310,12 @@ impl From<AdjustError> for Failure {
     }
 }
 
+/// Damping at the start of least squares, which begins where a robust adjustment ended: the usual one would hold back what is determined least, such as a focal
+/// length against the distances, for a few steps.
+const NEAR_DAMPING: f64 = 1e-7;
+/// Most distortion parameters of lenses that begin so. Those of a rational lens make up for each other: without damping they run away together.
+const MOST_NEAR: usize = 5;
+
 /// Adjusts an estimate, which is never worse afterwards. Square root of the mean cost of a corner, in pixels.
 pub(crate) fn adjust(
     data: &Sightings,
@@ -320,7 +326,10 @@ pub(crate) fn adjust(
     progress: &dyn Progress,
 ) -> Result<f64, Failure> {
     let mut problem = Problem::new(data, estimate, used, free, loss)?;
-    let options = AdjustOptions { max_iterations, cost_tolerance, ..AdjustOptions::default() };
+    let mut options = AdjustOptions { max_iterations, cost_tolerance, ..AdjustOptions::default() };
+    if loss == RobustLoss::Trivial && estimate.cameras.iter().all(|c| c.distortion.parameters().len() <= MOST_NEAR) {
+        options.initial_damping = NEAR_DAMPING;
+    }
     let mut stopped = Ok(());
     let next = |_: &AdjustIteration| {
         stopped = progress.report("adjust", 0, 0);

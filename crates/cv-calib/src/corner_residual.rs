@@ -1,7 +1,7 @@
 //! The reprojection error of a corner, with its derivatives.
 
 use crate::target::{TargetCorner, TargetPoints};
-use cv_core::{Camera, MAX_INTRINSICS, Point2, Point3, Vector3};
+use cv_core::{Camera, Point2, Point3, Vector3};
 use cv_numeric::adjust::{Residual, RigidMotion};
 use nalgebra::{Matrix2x3, SMatrix, Vector2};
 
@@ -24,11 +24,12 @@ impl Corner {
     }
 }
 
+/// As [`Camera::with_intrinsics`], in place for each residual.
 #[inline]
 fn with_lens<const N: usize>(camera: &Camera, lens: &[f64]) -> Camera {
-    let mut values = [0.0; MAX_INTRINSICS];
-    values[..N].copy_from_slice(&lens[..N]);
-    camera.with_intrinsics(&values)
+    let mut camera = Camera { fx: lens[0], fy: lens[1], cx: lens[2], cy: lens[3], ..*camera };
+    camera.distortion.parameters_mut().iter_mut().zip(&lens[4..N]).for_each(|(p, v)| *p = *v);
+    camera
 }
 
 /// Writes the columns of a motion `x ↦ turned + t`: those of the turn, then those of t.

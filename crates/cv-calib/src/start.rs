@@ -28,11 +28,26 @@ pub(crate) struct Start {
     pub(crate) error: f64,
 }
 
-/// Median distance of the corners from where a camera and the poses by their homographies have them; infinite where more than half have none.
+/// Corners of a view that candidates are compared on: a homography and a median over them are near enough to those over all.
+const CORNERS: usize = 24;
+
+/// So many of the corners: every so many-th by the golden ratio, which is no multiple of the length of any row.
+fn some(corners: &[TargetCorner]) -> Vec<TargetCorner> {
+    let n = corners.len();
+    if n <= CORNERS {
+        return corners.to_vec();
+    }
+    let mut chosen: Vec<usize> = (0..CORNERS).map(|k| (((k as f64 * 0.618_034).fract()) * n as f64) as usize).collect();
+    chosen.sort_unstable();
+    chosen.dedup();
+    chosen.into_iter().map(|i| corners[i]).collect()
+}
+
+/// Median distance of some of the corners from where a camera and the poses by their homographies have them; infinite where more than half have none.
 fn median_error(camera: &Camera, data: &Sightings, views: &[usize]) -> f64 {
     let mut errors = Vec::new();
     for &v in views {
-        let corners = &data.views[v][0];
+        let corners = &some(&data.views[v][0]);
         let pose = plane_pose(camera, &data.target, corners);
         errors.extend(corners.iter().map(|c| {
             let seen = pose.and_then(|pose| camera.project(&pose.transform(&data.target.bent(c.point, [0.0; 2]))));

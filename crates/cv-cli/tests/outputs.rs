@@ -269,3 +269,20 @@ fn the_report_is_one_file_that_needs_no_network() {
         assert!(html.contains("data:image/") || html.contains("<svg"), "{}: no pictures", job.name);
     }
 }
+
+#[test]
+fn two_photographs_that_would_become_one_output_are_wrong_usage() {
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["a/same.png", "b/same.jpg"] {
+        let path = folder.path().join(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        // Never read: the names are judged first.
+        fs::write(path, "").unwrap();
+    }
+    for command in [&["undistort", "--camera", "none.yaml"][..], &["segment", "predict", "--model", "none.json"]] {
+        let ran = run(folder.path(), &[command, &["a/same.png", "b/same.jpg", "-o", "out"]].concat());
+        assert_eq!(ran.code, Some(2), "{ran:?}");
+        assert!(ran.stderr.contains("a/same.png and b/same.jpg would both be written to out/same"), "{ran:?}");
+    }
+    assert!(!folder.path().join("out").exists());
+}

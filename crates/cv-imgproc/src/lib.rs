@@ -39,6 +39,7 @@ mod rows;
 mod sample;
 mod simd;
 mod warp;
+mod warp_map;
 
 pub use color::{
     f32_to_u8, gray_to_f32, gray_to_rgb, hsv_to_rgb, linear_rgb_to_lab, linear_to_srgb, rgb_pixel_to_hsv,
@@ -58,3 +59,4 @@ pub use pyramid::{gaussian_pyramid, pyr_down, pyr_up};
 pub use resize::{resize, resize_area};
 pub use sample::{bicubic_at, bilinear_at, sample_bicubic, sample_bilinear};
 pub use warp::{Border, Interpolation, RemapOptions, WarpError, remap, undistort, warp_perspective, warp_with};
+pub use warp_map::WarpMap;

@@ -1,6 +1,6 @@
 //! Channel types that can be interpolated.
 
-use cv_core::Sample;
+use cv_core::{ImageView, Sample};
 
 /// A channel value that interpolation can compute with.
 pub trait Pixel: Sample {
@@ -8,6 +8,16 @@ pub trait Pixel: Sample {
     fn to_f32(self) -> f32;
     /// The nearest value of this type; integers saturate, and take NaN to 0.
     fn from_f32(value: f32) -> Self;
+    /// The same picture where it is one of bytes, for what computes with those in integers.
+    #[inline(always)]
+    fn as_bytes<const C: usize>(_: ImageView<'_, Self, C>) -> Option<ImageView<'_, u8, C>> {
+        None
+    }
+    /// The same samples where they are bytes.
+    #[inline(always)]
+    fn as_bytes_mut(_: &mut [Self]) -> Option<&mut [u8]> {
+        None
+    }
 }
 
 impl Pixel for f32 {
@@ -29,6 +39,14 @@ impl Pixel for u8 {
     #[inline(always)]
     fn from_f32(value: f32) -> Self {
         (value + 0.5) as u8
+    }
+    #[inline(always)]
+    fn as_bytes<const C: usize>(view: ImageView<'_, Self, C>) -> Option<ImageView<'_, u8, C>> {
+        Some(view)
+    }
+    #[inline(always)]
+    fn as_bytes_mut(samples: &mut [Self]) -> Option<&mut [u8]> {
+        Some(samples)
     }
 }
 

@@ -61,6 +61,22 @@ pub enum WarpError {
     /// The result would not fit into memory.
     #[error(transparent)]
     Size(#[from] ImageError),
+    /// A picture is not of the size that a map is for.
+    #[error("the picture is {}×{} px, the map is for {}×{} px", got.0, got.1, expected.0, expected.1)]
+    SourceSize {
+        /// Width and height of the picture.
+        got: (usize, usize),
+        /// Width and height that the map is for.
+        expected: (usize, usize),
+    },
+    /// The image for a result is not of its size.
+    #[error("the image for the result is {}×{} px, the result {}×{} px", got.0, got.1, expected.0, expected.1)]
+    ResultSize {
+        /// Width and height of the image.
+        got: (usize, usize),
+        /// Width and height of the result.
+        expected: (usize, usize),
+    },
 }
 
 /// The source seen through interpolation and border rule.

@@ -3,8 +3,9 @@
 use crate::depth::{check_pair, check_range, color_bytes, matcher_options};
 use crate::{DepthError, DepthOptions, DisparityRange, Progress, RigDepthResult, depth_with};
 use cv_core::{Image, ImageView, PointCloud, Pose, StageClock, Vector3};
-use cv_imgproc::Pixel;
-use cv_stereo::{DisparityMap, Intensity, Rectification, StereoGeometry, StereoMatcher, StereoOptions};
+use cv_imgproc::{Pixel, WarpMap};
+use cv_stereo::{DisparityMap, Intensity, Rectification, RectifyError, StereoGeometry, StereoMatcher, StereoOptions};
+use std::any::Any;
 
 /// Matches frame after frame with the same memory and the same disparities: where those are to be found
 /// ([`DisparityRange::FromMatches`]), the first frame shows them for all.
@@ -12,6 +13,10 @@ use cv_stereo::{DisparityMap, Intensity, Rectification, StereoGeometry, StereoMa
 pub struct FrameDepth {
     options: DepthOptions,
     rectification: Option<Rectification>,
+    /// Of both views of the rectification, made with the first frame.
+    maps: Option<[WarpMap; 2]>,
+    /// The rectified photographs of the last frame, whose memory the next one's take: two images of the frames' type.
+    rectified: Option<Box<dyn Any + Send + Sync>>,
     geometry: Option<StereoGeometry>,
     matcher: Option<StereoMatcher>,
     map: DisparityMap,
@@ -27,7 +32,15 @@ impl FrameDepth {
         // What is wrong with the options is told before the first frame.
         let matcher = Some(StereoMatcher::new(options.stereo.clone())?);
         let matcher = matcher.filter(|_| options.disparities == DisparityRange::Given);
-        Ok(Self { options, rectification: None, geometry, matcher, map: DisparityMap::empty() })
+        Ok(Self {
+            options,
+            rectification: None,
+            maps: None,
+            rectified: None,
+            geometry,
+            matcher,
+            map: DisparityMap::empty(),
+        })
     }
 
     /// For the photographs of a rig, which are rectified first.
@@ -55,11 +68,12 @@ impl FrameDepth {
         progress: &dyn Progress,
     ) -> Result<&DisparityMap, DepthError> {
         let rectified = self.rectified([left, right], progress)?;
-        let [left, right] = rectified.as_ref().map_or([left, right], |pair| pair.each_ref().map(|image| image.view()));
+        let [left, right] = rectified.as_ref().map_or([left, right], |pair| pair.each_ref().map(Image::view));
         let matcher = matcher(&mut self.matcher, &self.options, [left, right], progress)?;
         matcher.compute_into(left, right, &mut self.map, progress)?;
         let StereoOptions { min_disparity, disparities, .. } = *matcher.options();
         check_pair(&self.map, left, right, (min_disparity, disparities), progress)?;
+        self.keep(rectified);
         Ok(&self.map)
     }
 
@@ -76,7 +90,7 @@ impl FrameDepth {
     ) -> Result<RigDepthResult, DepthError> {
         let mut clock = StageClock::new();
         let rectified = self.rectified([left, right], progress)?;
-        let [left, right] = rectified.as_ref().map_or([left, right], |pair| pair.each_ref().map(|image| image.view()));
+        let [left, right] = rectified.as_ref().map_or([left, right], |pair| pair.each_ref().map(Image::view));
         if rectified.is_some() {
             clock.lap("rectify");
         }
@@ -96,17 +110,43 @@ impl FrameDepth {
         if let Some(rectification) = &self.rectification {
             cloud.transform(&Pose::new(rectification.left.rotation.inverse(), Vector3::zeros()));
         }
+        self.keep(rectified);
         Ok(RigDepthResult { images, maps, cloud })
+    }
+
+    /// Keeps the memory of rectified photographs for those of the next frame.
+    fn keep<T: Pixel, const C: usize>(&mut self, rectified: Option<Box<[Image<T, C>; 2]>>) {
+        self.rectified = rectified.map(|pair| -> Box<dyn Any + Send + Sync> { pair });
     }
 
     /// The photographs of a rig as they are rectified; `None` where they are already.
     fn rectified<T: Pixel, const C: usize>(
-        &self,
-        [left, right]: [ImageView<'_, T, C>; 2],
+        &mut self,
+        photographs: [ImageView<'_, T, C>; 2],
         progress: &dyn Progress,
-    ) -> Result<Option<[Image<T, C>; 2]>, DepthError> {
+    ) -> Result<Option<Box<[Image<T, C>; 2]>>, DepthError> {
         let Some(rectification) = &self.rectification else { return Ok(None) };
-        Ok(Some([rectification.left.apply(left, progress)?.0, rectification.right.apply(right, progress)?.0]))
+        let views = [&rectification.left, &rectification.right];
+        for (view, photograph) in views.into_iter().zip(&photographs) {
+            let expected = (view.source.width, view.source.height);
+            if photograph.size() != expected {
+                return Err(RectifyError::ImageSize { image: photograph.size(), expected }.into());
+            }
+        }
+        let maps = match self.maps.take() {
+            Some(maps) => maps,
+            None => [views[0].map(progress)?, views[1].map(progress)?],
+        };
+        let maps = self.maps.insert(maps);
+        // Of frames of another type, or the first one's, there is none.
+        let kept = self.rectified.take().and_then(|kept| kept.downcast::<[Image<T, C>; 2]>().ok());
+        let empty = || maps.each_ref().map(|map| Image::new(map.size().0, map.size().1, [T::default(); C]));
+        let mut pair = kept.unwrap_or_else(|| Box::new(empty()));
+        for ((map, photograph), image) in maps.iter().zip(photographs).zip(pair.iter_mut()) {
+            let (width, height) = map.size();
+            map.compute_into(photograph, image).map_err(|_| RectifyError::TooLarge { width, height })?;
+        }
+        Ok(Some(pair))
     }
 }
 

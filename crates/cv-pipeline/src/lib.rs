@@ -90,6 +90,7 @@ pub use segment::{DetectResult, SegmentResult, SegmentTraining, detect, segment,
 
 /// What a caller of [`depth()`] needs of the stereo stage: its options and results, rectification, geometry and scores.
 pub mod stereo {
+    pub use cv_imgproc::{WarpError, WarpMap};
     pub use cv_stereo::{
         BAD_THRESHOLDS, Census, DisparityMap, DisparityMatcher, DisparityScores, EvaluateError, GeometryError,
         Intensity, IntensityCost, Paths, PixelState, Rectification, RectifiedView, RectifyError, RectifyOptions,

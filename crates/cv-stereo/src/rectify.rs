@@ -9,7 +9,7 @@ use cv_core::{
     Camera, CameraError, Cancelled, Distortion, Image, ImageView, Mask, OptionError, Point2, Point3, Progress,
     Rotation3, Stage, StereoRig, Vector3,
 };
-use cv_imgproc::{Pixel, RemapOptions, warp_with};
+use cv_imgproc::{Pixel, WarpError, WarpMap};
 use nalgebra::{Matrix3, Matrix4};
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -145,19 +145,11 @@ impl RectifiedView {
         self.source.denormalize_in_range(Point2::new(ray.x / ray.z, ray.y / ray.z))
     }
 
-    /// The rectified image of an original, bilinear, and where it shows anything; black elsewhere.
+    /// Where every pixel of the rectified image comes from, for many originals. The lens is asked for each pixel here, once.
     ///
     /// # Errors
-    /// [`RectifyError::ImageSize`] where the image is not of the camera's size; [`RectifyError::Cancelled`].
-    pub fn apply<T: Pixel, const C: usize>(
-        &self,
-        image: ImageView<'_, T, C>,
-        progress: &dyn Progress,
-    ) -> Result<(Image<T, C>, Mask), RectifyError> {
-        let expected = (self.source.width, self.source.height);
-        if image.size() != expected {
-            return Err(RectifyError::ImageSize { image: image.size(), expected });
-        }
+    /// [`RectifyError::TooLarge`], [`RectifyError::Cancelled`].
+    pub fn map(&self, progress: &dyn Progress) -> Result<WarpMap, RectifyError> {
         let size = (self.camera.width, self.camera.height);
         let stage = Stage::new(progress, "rectify", size.1)?;
         let stopped = AtomicBool::new(false);
@@ -172,9 +164,33 @@ impl RectifiedView {
             }
             self.source_pixel(Point2::new(x as f64, y as f64))
         };
-        let warped = warp_with(image, size, &RemapOptions::default(), source)
-            .map_err(|_| RectifyError::TooLarge { width: size.0, height: size.1 })?;
-        if stopped.into_inner() { Err(Cancelled.into()) } else { Ok(warped) }
+        let map = WarpMap::new((self.source.width, self.source.height), size, source).map_err(|e| self.failed(&e))?;
+        if stopped.into_inner() { Err(Cancelled.into()) } else { Ok(map) }
+    }
+
+    /// The rectified image of an original, bilinear, and where it shows anything; black elsewhere. Of many originals, make the [`map`](Self::map) once.
+    ///
+    /// # Errors
+    /// [`RectifyError::ImageSize`] where the image is not of the camera's size; [`RectifyError::Cancelled`].
+    pub fn apply<T: Pixel, const C: usize>(
+        &self,
+        image: ImageView<'_, T, C>,
+        progress: &dyn Progress,
+    ) -> Result<(Image<T, C>, Mask), RectifyError> {
+        let expected = (self.source.width, self.source.height);
+        if image.size() != expected {
+            return Err(RectifyError::ImageSize { image: image.size(), expected });
+        }
+        let map = self.map(progress)?;
+        Ok((map.compute(image).map_err(|e| self.failed(&e))?, map.inside()))
+    }
+
+    /// Why no image was made by a map.
+    fn failed(&self, error: &WarpError) -> RectifyError {
+        match *error {
+            WarpError::SourceSize { got, expected } => RectifyError::ImageSize { image: got, expected },
+            _ => RectifyError::TooLarge { width: self.camera.width, height: self.camera.height },
+        }
     }
 
     /// How many px of the original the outermost pixel of the rectified image lies outside it; infinity where the camera does

@@ -4,6 +4,9 @@
 //! run. Register a job with one line in `JOBS`; it returns its figures with their bars.
 
 mod adjust;
+mod calibration;
+mod calibration_boards;
+mod calibration_undistort;
 mod feature_quality;
 mod features;
 mod geometry;
@@ -19,8 +22,13 @@ use std::{
 /// What a job does with the Python of the peers and the data folder.
 type Job = fn(&Path, &Path) -> Result<Vec<Check>>;
 
-const JOBS: &[checks::Named<Job>] =
-    &[("stereo", stereo::run), ("features", features::run), ("geometry", geometry::run), ("adjust", adjust::run)];
+const JOBS: &[checks::Named<Job>] = &[
+    ("stereo", stereo::run),
+    ("features", features::run),
+    ("geometry", geometry::run),
+    ("adjust", adjust::run),
+    ("calibration", calibration::run),
+];
 
 /// Runs all jobs, or the one named; true where ours meets every bar.
 pub(crate) fn run(only: Option<&str>) -> Result<bool> {

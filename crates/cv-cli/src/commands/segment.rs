@@ -3,7 +3,8 @@
 mod files;
 
 use crate::frame::{
-    Context, Explain, Failure, Global, JSON, Outcome, Output, Run, Step, expand_images, named, same_file, steps,
+    Context, Explain, Failure, Global, JSON, Outcome, Output, Run, Step, expand_images, named, one_each, same_file,
+    steps,
 };
 use crate::pictures::{Width, picture};
 use cv_core::{Mask, Named, RgbU8, Stage};
@@ -221,20 +222,12 @@ impl Predict {
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
         let options = DetectOptions { min_score: self.min_score };
         options.validate().map_err(Failure::usage)?;
-        let model = read_model(&self.model)?;
         let given = expand_images(&self.images)?;
         let photos = files::without_masks(given.clone());
         let outputs: Vec<PathBuf> = photos.iter().map(|p| self.output.join(format!("{}_mask.png", stem(p)))).collect();
+        one_each(&photos, &outputs)?;
+        let model = read_model(&self.model)?;
         for (i, output) in outputs.iter().enumerate() {
-            if let Some(same) = outputs[..i].iter().position(|o| o == output) {
-                return Err(Failure::new(format!(
-                    "{} and {} would both be written to {}",
-                    photos[same].display(),
-                    photos[i].display(),
-                    output.display()
-                ))
-                .advice("run them into different folders"));
-            }
             // Masks drawn by hand often lie beside their photographs.
             // A bare name has the empty folder: joined to the current one it is that.
             let folder = Path::new(".").join(photos[i].parent().unwrap_or(Path::new("")));

@@ -2,11 +2,11 @@
 
 use super::rectify::{parse_share, write_picture};
 use super::size;
-use crate::frame::{Context, Explain, Failure, Global, Outcome, Output, Run, expand_images, spare_inputs};
+use crate::frame::{Context, Explain, Failure, Global, Outcome, Output, Run, expand_images, one_each, spare_inputs};
 use crate::rig;
 use cv_core::Stage;
 use cv_io::{DynImage, ExifInfo, Metadata, Pixels};
-use cv_pipeline::stereo::{RectifiedView, RectifyError, RectifyOptions};
+use cv_pipeline::stereo::{RectifiedView, RectifyOptions, WarpError, WarpMap};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -59,38 +59,37 @@ impl Run for Args {
         results.push(self.output.join("camera.yaml"));
         let inputs: Vec<&Path> = images.iter().chain([&self.camera]).map(PathBuf::as_path).collect();
         spare_inputs(&results, &inputs)?;
-        let mut names: Vec<&PathBuf> = results.iter().collect();
-        names.sort();
-        if let Some(pair) = names.windows(2).find(|pair| pair[0] == pair[1]) {
-            return Err(Failure::usage(format!("two photographs would become {}", pair[0].display()))
-                .advice("give one folder at a time"));
-        }
-        let mut view: Option<RectifiedView> = None;
+        one_each(&images, &results)?;
+        let mut made: Option<(RectifiedView, WarpMap)> = None;
         let (mut seconds, mut done) = (0.0, Vec::new());
         let stage = Stage::new(context, "undistort", images.len())?;
         for (path, result) in images.iter().zip(&results) {
             let photo = cv_io::read_image(path)?;
-            let view = match &view {
-                Some(view) => view,
+            let (view, map) = match &made {
+                Some(made) => made,
                 None => {
                     let camera = rig::camera(&self.camera, Some(photo.size()), context)?;
                     let options = RectifyOptions { alpha: self.alpha, size: self.size };
-                    let made = RectifiedView::undistorted(&camera, &options)
+                    let view = RectifiedView::undistorted(&camera, &options)
                         .during(self.camera.display())
                         .map_err(|f| f.advice("check the calibration file"))?;
-                    view.insert(made)
+                    rig::check_size(&self.camera, path, photo.size(), &view.source)?;
+                    let start = Instant::now();
+                    let map = view.map(&stage)?;
+                    seconds += start.elapsed().as_secs_f64();
+                    made.insert((view, map))
                 }
             };
             rig::check_size(&self.camera, path, photo.size(), &view.source)?;
             let start = Instant::now();
-            let pixels = straight(&photo.pixels, view, &stage)?;
+            let pixels = straight(&photo.pixels, map)?;
             seconds += start.elapsed().as_secs_f64();
             let straight = DynImage { pixels, exif: ExifInfo::default(), metadata: Metadata::default() };
             context.write(Output::Folder(&self.output), |_| write_picture(result, &straight, &photo.metadata))?;
             done.push(json!({ "path": path.display().to_string(), "output": result.display().to_string() }));
             stage.add(1)?;
         }
-        let Some(view) = view else { return Err(Failure::usage("there is no photograph")) };
+        let Some((view, _)) = made else { return Err(Failure::usage("there is no photograph")) };
         let note = "without the distortion of the lens";
         context.write(Output::Folder(&self.output), |folder| {
             cv_io::write_camera(folder.join("camera.yaml"), &view.camera, &[note])
@@ -111,15 +110,15 @@ impl Run for Args {
 }
 
 /// A picture as deep as it is; linear light as bytes of color.
-fn straight(pixels: &Pixels, view: &RectifiedView, stage: &Stage<'_>) -> Result<Pixels, RectifyError> {
+fn straight(pixels: &Pixels, map: &WarpMap) -> Result<Pixels, WarpError> {
     Ok(match pixels {
-        Pixels::Gray8(image) => view.apply(image.view(), stage)?.0.into(),
-        Pixels::Gray16(image) => view.apply(image.view(), stage)?.0.into(),
-        Pixels::Rgb8(image) => view.apply(image.view(), stage)?.0.into(),
-        Pixels::Rgb16(image) => view.apply(image.view(), stage)?.0.into(),
+        Pixels::Gray8(image) => map.compute(image.view())?.into(),
+        Pixels::Gray16(image) => map.compute(image.view())?.into(),
+        Pixels::Rgb8(image) => map.compute(image.view())?.into(),
+        Pixels::Rgb16(image) => map.compute(image.view())?.into(),
         other => {
             let image = DynImage { pixels: other.clone(), exif: ExifInfo::default(), metadata: Metadata::default() };
-            view.apply(image.into_rgb8().view(), stage)?.0.into()
+            map.compute(image.into_rgb8().view())?.into()
         }
     })
 }

@@ -187,6 +187,22 @@ pub(crate) fn same_file(a: &Path, b: &Path) -> bool {
     matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b)
 }
 
+/// Refuses two inputs that would become one output; `outputs[i]` is that of `inputs[i]`.
+pub(crate) fn one_each(inputs: &[PathBuf], outputs: &[PathBuf]) -> Result<(), Failure> {
+    let mut order: Vec<usize> = (0..inputs.len().min(outputs.len())).collect();
+    order.sort_by_key(|i| &outputs[*i]);
+    match order.windows(2).find(|pair| outputs[pair[0]] == outputs[pair[1]]) {
+        Some(pair) => Err(Failure::usage(format!(
+            "{} and {} would both be written to {}",
+            inputs[pair[0]].display(),
+            inputs[pair[1]].display(),
+            outputs[pair[0]].display()
+        ))
+        .advice("run them into different folders")),
+        None => Ok(()),
+    }
+}
+
 /// Refuses to write over what is read: outputs whose names the person did not type.
 pub(crate) fn spare_inputs(outputs: &[PathBuf], inputs: &[&Path]) -> Result<(), Failure> {
     match outputs.iter().find(|output| inputs.iter().any(|input| same_file(output, input))) {
