@@ -80,6 +80,9 @@ const RIG: &str = "schema: cv-rig/1\nunit: m\n\
     right: {width: 200, height: 150, fx: 150, fy: 150, cx: 99.5, cy: 74.5, distortion: radial, coefficients: [-0.1, 0.01]}\n\
     rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\ntranslation: [-0.12, 0, 0]\n";
 
+const CAMERA: &str = "schema: cv-camera/1\nwidth: 200\nheight: 150\nfx: 150\nfy: 150\ncx: 99.5\ncy: 74.5\n\
+    distortion: radial\ncoefficients: [-0.1, 0.01]\n";
+
 #[test]
 fn sixteen_bits_stay_sixteen_and_what_the_file_says_stays() {
     let folder = tempfile::tempdir().unwrap();
@@ -101,6 +104,13 @@ fn sixteen_bits_stay_sixteen_and_what_the_file_says_stays() {
         let steps = image.row(75).chunks_exact(3).map(|p| p[0]).collect::<std::collections::BTreeSet<_>>();
         assert!(steps.len() > 150, "{} values in a row", steps.len());
     }
+    // A TIFF stays a TIFF.
+    let metadata = read_image(at("a.png")).unwrap().metadata;
+    cv_io::write_image(at("deep.tif"), deep.view(), &metadata).unwrap();
+    fs::write(at("camera.yaml"), CAMERA).unwrap();
+    done(folder.path(), &["undistort", "deep.tif", "--camera", "camera.yaml", "-o", "straight"]);
+    let image = check_exif(&at("straight/deep.tif"));
+    assert!(matches!(image.pixels, Pixels::Rgb16(_)) && image.metadata.icc == Some(profile(7)));
     // Bytes stay bytes; a photograph on its side is turned once.
     let bytes = RgbU8::from_fn(150, 200, |x, y| [x as u8, y as u8, 90]);
     for name in ["a.jpg", "b.jpg"] {
@@ -119,7 +129,7 @@ fn a_panorama_has_the_exif_of_one_photograph_and_the_profile_of_all() {
         for (i, view) in views.iter().enumerate() {
             write_jpeg(&folder.path().join(format!("in{i}.jpg")), view, 1, profiles[i]);
         }
-        for output in ["pano.jpg", "pano.png"] {
+        for output in ["pano.jpg", "pano.png", "pano.tif"] {
             done(folder.path(), &["panorama", "in0.jpg", "in1.jpg", "-o", output]);
             assert_eq!(check_exif(&folder.path().join(output)).metadata.icc, kept, "{output}");
         }

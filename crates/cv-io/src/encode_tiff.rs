@@ -1,4 +1,4 @@
-//! Writing TIFF: strips packed by Deflate after horizontal differencing (TIFF 6.0, section 14, and Adobe's technical note on Deflate), big-endian.
+//! Writing TIFF: strips packed by Deflate after horizontal differencing (TIFF 6.0, section 14, and Adobe's technical note on Deflate), little-endian.
 
 use crate::{FormatError, Metadata};
 use exif::experimental::Writer;
@@ -75,7 +75,7 @@ pub(crate) fn tiff_file(samples: &Samples<'_>, metadata: &Metadata) -> Result<Ve
     fields.iter().for_each(|field| writer.push_field(field));
     writer.set_strips(&strips, In::PRIMARY);
     let mut file = Cursor::new(Vec::new());
-    writer.write(&mut file, false).map_err(|e| FormatError::corrupt("TIFF", e.to_string()))?;
+    writer.write(&mut file, true).map_err(|e| FormatError::corrupt("TIFF", e.to_string()))?;
     Ok(file.into_inner())
 }
 
@@ -86,11 +86,11 @@ fn differences(row: &mut [u8], channels: usize) {
     }
 }
 
-/// The same of samples of two bytes.
+/// The same of samples of two bytes, which become little-endian.
 fn differences_of_words(row: &mut [u8], channels: usize) {
     let words = row.as_chunks_mut::<2>().0;
-    for i in (channels..words.len()).rev() {
-        let difference = u16::from_be_bytes(words[i]).wrapping_sub(u16::from_be_bytes(words[i - channels]));
-        words[i] = difference.to_be_bytes();
+    for i in (0..words.len()).rev() {
+        let before = i.checked_sub(channels).map_or(0, |j| u16::from_be_bytes(words[j]));
+        words[i] = u16::from_be_bytes(words[i]).wrapping_sub(before).to_le_bytes();
     }
 }

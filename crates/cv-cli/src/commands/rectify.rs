@@ -185,10 +185,10 @@ impl Run for Args {
 /// Writes a rectified photograph as deep as it is, with what the file of the original says beside its pixels.
 pub(super) fn write_picture(path: &Path, picture: &DynImage, metadata: &Metadata) -> Result<(), IoError> {
     match &picture.pixels {
-        Pixels::Gray8(image) => cv_io::write_png_with(path, image.view(), metadata),
-        Pixels::Gray16(image) => cv_io::write_png_with(path, image.view(), metadata),
-        Pixels::Rgb16(image) => cv_io::write_png_with(path, image.view(), metadata),
-        _ => cv_io::write_png_with(path, picture.clone().into_rgb8().view(), metadata),
+        Pixels::Gray8(image) => cv_io::write_image(path, image.view(), metadata),
+        Pixels::Gray16(image) => cv_io::write_image(path, image.view(), metadata),
+        Pixels::Rgb16(image) => cv_io::write_image(path, image.view(), metadata),
+        _ => cv_io::write_image(path, picture.clone().into_rgb8().view(), metadata),
     }
 }
 

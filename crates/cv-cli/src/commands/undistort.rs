@@ -13,7 +13,7 @@ use std::time::Instant;
 
 /// Take the distortion of a calibrated lens out of photographs.
 ///
-/// Writes NAME.png of each photograph, and camera.yaml, the camera that would have taken them: the same place and direction, square pixels, no distortion. What the
+/// Writes NAME.png of each photograph (NAME.tif of a TIFF), and camera.yaml, the camera that would have taken them: the same place and direction, square pixels, no distortion. What the
 /// lens does not reach is black. Photographs of 16 bits stay so.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
@@ -38,9 +38,12 @@ pub(crate) struct Args {
 }
 
 impl Args {
-    /// Where the result of a photograph goes.
+    /// Where the result of a photograph goes: a TIFF stays one.
     fn result(&self, photo: &Path) -> PathBuf {
-        self.output.join(photo.file_stem().unwrap_or_default()).with_extension("png")
+        let is_tiff =
+            photo.extension().is_some_and(|e| ["tif", "tiff"].iter().any(|tiff| e.eq_ignore_ascii_case(tiff)));
+        let ending = if is_tiff { "tif" } else { "png" };
+        self.output.join(photo.file_stem().unwrap_or_default()).with_extension(ending)
     }
 }
 
