@@ -4,7 +4,7 @@ use super::Check;
 use anyhow::Result;
 use cv_core::GrayF32;
 use cv_pipeline::calibration::{BoardSize, CalibrateOptions, LensChoice};
-use cv_pipeline::{BoardCalibration, BoardCalibrationOptions, Silent, calibrate};
+use cv_pipeline::{BoardCalibration, BoardCalibrationOptions, BoardChoice, Silent, calibrate};
 use std::path::{Path, PathBuf};
 
 /// OpenCV on the pairs, classic corners: RMS of both cameras by themselves, of the rig, and its baseline in squares.
@@ -40,7 +40,11 @@ fn solved(
         let gray = cv_io::read_gray_u8(&views[view][camera]).ok()?;
         Some(gray.map(|p| [f32::from(p[0]) / 255.0]))
     };
-    let options = BoardCalibrationOptions { board: Some(board), solve, ..BoardCalibrationOptions::default() };
+    let options = BoardCalibrationOptions {
+        board: BoardChoice::chessboard(Some(board), 1.0),
+        solve,
+        ..BoardCalibrationOptions::default()
+    };
     let found = calibrate((views.len(), cameras), photo, &options, &Silent)?;
     let used = found.refusals.iter().filter(|v| v.iter().all(Option::is_none)).count();
     Ok((found, used))
