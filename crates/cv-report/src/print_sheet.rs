@@ -221,7 +221,7 @@ mod tests {
             assert!(pdf[offset..].starts_with(&format!("{} 0 obj\n", i + 1)), "{row}");
         }
         let length: usize = pdf.split("/Length ").nth(1).unwrap().split(' ').next().unwrap().parse().unwrap();
-        let stream = pdf.split("stream\n").nth(1).unwrap().split("endstream").next().unwrap();
+        let stream = pdf.split("\nstream\n").nth(1).unwrap().split("endstream").next().unwrap();
         assert_eq!(stream.len(), length);
     }
 

@@ -13,9 +13,9 @@ use std::path::PathBuf;
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv board -o board.pdf --board 9x6 --square 25 --paper a4\n  \
-    cv board -o board.pdf --kind charuco --board 8x6 --square 30 --marker 22 --paper a4\n  \
-    cv board -o grid.svg --kind aruco-grid --board 5x7 --marker 30 --dictionary 6x6_250\n  \
-    cv board -o tags.png --kind aprilgrid --board 6x6 --marker 55 --paper a2 --dpi 600")]
+    cv board -o board.pdf --kind charuco --board 7x5 --square 35 --marker 26 --paper a4\n  \
+    cv board -o grid.svg --kind aruco-grid --board 4x6 --marker 30 --dictionary 6x6_250\n  \
+    cv board -o tags.png --kind aprilgrid --board 6x6 --marker 45 --paper a2 --dpi 600")]
 pub(crate) struct Args {
     /// Where to write it: .pdf, .svg or .png.
     #[arg(short, long, value_name = "FILE")]
@@ -68,9 +68,9 @@ fn parse_paper(text: &str) -> Result<Paper, String> {
 }
 
 /// White at the rim of the paper, where printers do not print, and around the board.
-const MARGIN: f64 = 10.0;
+const MARGIN: f64 = 8.0;
 /// Room for the ruler and the text below the board.
-const FOOT: f64 = 18.0;
+const FOOT: f64 = 16.0;
 
 /// What a paper has room for.
 fn room((width, height): (f64, f64)) -> (f64, f64) {
@@ -216,9 +216,9 @@ mod tests {
         let paper = parse_paper("letter").unwrap();
         let board = |square| Board::Chessboard { size: BoardSize::new(9, 6), square };
         let text = sheet(&board(30.0), &paper).unwrap_err().text();
-        // 279.4 − 20 over ten squares; 215.9 − 38 over seven.
-        assert!(text.contains("300.0×210.0 mm") && text.contains("--square 25.4 at most"), "{text}");
-        assert!(sheet(&board(25.4), &paper).is_ok() && sheet(&board(25.5), &paper).is_err());
+        // 279.4 − 16 over ten squares; 215.9 − 32 over seven.
+        assert!(text.contains("300.0×210.0 mm") && text.contains("--square 26.2 at most"), "{text}");
+        assert!(sheet(&board(26.2), &paper).is_ok() && sheet(&board(26.3), &paper).is_err());
         assert_eq!(parse_paper("300x200").unwrap().size, (300.0, 200.0));
         for text in ["a9", "10x10", "300", "300x-2", "NaNx300"] {
             assert!(parse_paper(text).is_err(), "{text}");

@@ -14,7 +14,7 @@ use super::saddle::saddle;
 use super::x_corner::smoothed;
 use crate::error::check_image;
 use crate::simd;
-use cv_core::{ImageView, Matrix3, Point2, Progress, Stage, UnionFind};
+use cv_core::{ImageView, Matrix3, Point2, Progress, Stage, UnionFind, median};
 
 /// A marker that was read.
 struct Seen {
@@ -157,7 +157,26 @@ fn agreeing<'a>(seen: &'a [Seen], board: &MarkerGrid) -> Result<Vec<&'a Seen>, B
             all.extend(group);
         }
     }
-    Ok(all)
+    // Of two quadrilaterals that read as one marker the one that lies where the others have it.
+    let off = |marker: &Seen| {
+        let mut all: Vec<f64> =
+            all.iter().filter(|other| other.id != marker.id).filter_map(|other| off(board, other, marker)).collect();
+        median(&mut all).unwrap_or(f64::INFINITY)
+    };
+    let mut once: Vec<(f64, &Seen)> = all.iter().map(|marker| (off(marker), *marker)).collect();
+    once.sort_by(|a, b| (a.1.id, a.0).partial_cmp(&(b.1.id, b.0)).unwrap_or(std::cmp::Ordering::Equal));
+    once.dedup_by_key(|marker| marker.1.id);
+    Ok(once.into_iter().map(|marker| marker.1).collect())
+}
+
+/// Mean distance of a marker's corners from where another marker, at most two away, has them.
+fn off(board: &MarkerGrid, from: &Seen, to: &Seen) -> Option<f64> {
+    let (a, b) = (board.cell(from.id), board.cell(to.id));
+    let step = |a: usize, b: usize| (1.0 + board.spacing) * (b as f64 - a as f64);
+    let near = a.0.abs_diff(b.0).max(a.1.abs_diff(b.1)) <= 2;
+    let unit = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)];
+    let place = |(x, y): (f64, f64)| mapped(&from.map, x + step(a.0, b.0), y + step(a.1, b.1));
+    near.then(|| unit.iter().zip(&to.corners).map(|(u, seen)| (place(*u) - seen).norm()).sum::<f64>() / 4.0)
 }
 
 #[cfg(test)]

@@ -105,5 +105,7 @@ pub(super) fn what_else(
         return Some(super::BoardError::Mirrored { markers, dictionary: asked });
     }
     let seen = LARGEST.into_iter().map(|d| (count(d, false), d)).max_by_key(|c| c.0)?;
-    enough(seen.0).then_some(super::BoardError::OtherDictionary { seen: seen.1, markers: seen.0, asked })
+    // Markers of the board that do not lie as on it are not those of another dictionary.
+    let other = seen.0 > 2 * count(asked, false);
+    (enough(seen.0) && other).then_some(super::BoardError::OtherDictionary { seen: seen.1, markers: seen.0, asked })
 }

@@ -22,7 +22,7 @@ use std::sync::{Mutex, PoisonError};
 #[command(after_help = "Examples:\n  \
     cv calibrate mono --board 9x6 --square 25 photos/*.jpg -o camera.yaml --report out\n  \
     cv calibrate stereo --board 9x6 --square 25 --left left --right right -o rig.yaml\n  \
-    cv calibrate rig --kind aprilgrid --board 6x6 --marker 55 --cameras left right third -o rig.yaml")]
+    cv calibrate rig --kind aprilgrid --board 6x6 --marker 45 --cameras left right third -o rig.yaml")]
 pub(crate) struct Args {
     #[command(subcommand)]
     what: What,
@@ -76,8 +76,8 @@ impl Board {
 #[command(after_help = "Examples:\n  \
     cv calibrate mono --board 9x6 --square 25 photos -o camera.yaml\n  \
     cv calibrate mono photos/*.jpg -o camera.yaml --lens fisheye4 --report out\n  \
-    cv calibrate mono --kind charuco --board 8x6 --square 30 --marker 22 photos -o camera.yaml\n  \
-    cv calibrate mono --kind aprilgrid --board 6x6 --marker 55 photos -o camera.yaml")]
+    cv calibrate mono --kind charuco --board 7x5 --square 35 --marker 26 photos -o camera.yaml\n  \
+    cv calibrate mono --kind aprilgrid --board 6x6 --marker 45 photos -o camera.yaml")]
 struct Mono {
     /// Photographs of the board, or folders or quoted patterns of them.
     #[arg(required = true, value_name = "IMAGES")]
@@ -120,7 +120,7 @@ struct Stereo {
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv calibrate rig --board 9x6 --square 25 --cameras left right third -o rig.yaml\n  \
-    cv calibrate rig --kind aprilgrid --board 6x6 --marker 0.055 --unit m --cameras 'cam0/*.png' 'cam1/*.png' 'cam2/*.png' -o rig.yaml")]
+    cv calibrate rig --kind aprilgrid --board 6x6 --marker 0.045 --unit m --cameras 'cam0/*.png' 'cam1/*.png' 'cam2/*.png' -o rig.yaml")]
 struct Rig {
     /// The photographs of each camera: a folder or a quoted pattern for each, the first camera's first.
     #[arg(long, value_name = "FOLDER", num_args = 1.., required = true)]
