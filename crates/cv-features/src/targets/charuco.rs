@@ -104,8 +104,10 @@ pub fn find_charuco(
     Ok(boards.swap_remove(0))
 }
 
-/// The white squares of a grid: the place of their first corner, and all four, clockwise from it.
-fn white_squares(grid: &Grid) -> Vec<((i32, i32), [Point2<f64>; 4])> {
+/// A white square of a grid: the place of its first corner, and all four, clockwise from it.
+type White = ((i32, i32), [Point2<f64>; 4]);
+
+fn white_squares(grid: &Grid) -> Vec<White> {
     let square = |(&(x, y), node): (&(i32, i32), &super::grid::Node)| {
         // Even: the square to the right and below is white.
         let corner = |dx: i32, dy: i32| grid.position((x + dx, y + dy)).filter(|_| node.turns & 1 == 0);
@@ -117,11 +119,7 @@ fn white_squares(grid: &Grid) -> Vec<((i32, i32), [Point2<f64>; 4])> {
 }
 
 /// Where a grid lies on the board by its markers: where at least two of them, and more than half of those that can be read, agree.
-fn placed(
-    whites: &[((i32, i32), [Point2<f64>; 4])],
-    view: ImageView<'_, f32, 1>,
-    board: &CharucoBoard,
-) -> Option<Placement> {
+fn placed(whites: &[White], view: ImageView<'_, f32, 1>, board: &CharucoBoard) -> Option<Placement> {
     let mut votes: BTreeMap<Placement, usize> = BTreeMap::new();
     let mut read = 0;
     for &((x, y), corners) in whites {
