@@ -9,7 +9,7 @@ use crate::fit::{Fit, Limits, ShapeState, fit};
 use crate::holdout::{HoldOut, hold_out};
 use crate::lens_choice::{Mono, choose, folds, rms};
 use crate::plane_pose::is_mirrored;
-use crate::rig_start::mounts;
+use crate::rig_start::{mounts, turns_of_views};
 use crate::target::Sightings;
 use crate::uncertainty::{CoverageMap, uncertainty};
 use crate::verdict::{
@@ -62,16 +62,39 @@ pub fn calibrate(
         }
         alone.push((mono, views));
     }
+    if cameras == 1 {
+        let (fit, holdout, mono) = expand(data, alone.remove(0))?;
+        return report(data, options, fit, holdout, vec![mono], &refused);
+    }
     let usable = usable_corners(data, &refused);
-    let (fit, holdout) = if cameras == 1 {
-        expand(data, alone.remove(0)).map(|(fit, holdout, mono)| {
-            alone.push((mono, Vec::new()));
-            (fit, holdout)
-        })?
-    } else {
-        joint(data, &alone, &usable, limits, options.holdout, progress)?
-    };
-    report(data, options, fit, holdout, alone.into_iter().map(|a| a.0).collect(), &refused)
+    let turns = data.target.turns();
+    let mut poses = own_poses(data.views.len(), &alone);
+    let mounts = mounts(&poses, &turns)?;
+    // What cameras numbered otherwise gets the numbers of the first camera's picture.
+    let numbered = turns_of_views(&poses, &mounts, &turns);
+    let mut same = data.clone();
+    for (v, c) in (0..numbered.len()).flat_map(|v| (0..cameras).map(move |c| (v, c))) {
+        let turn = numbered[v][c];
+        same.views[v][c].iter_mut().for_each(|corner| corner.point = data.target.turned(corner.point, turn));
+        poses[c][v] = poses[c][v].map(|pose| pose.compose(&turns[turn].inverse()));
+    }
+    let (fit, holdout) = joint(&same, &alone, (&mounts, &poses), &usable, limits, options.holdout, progress)?;
+    let mut found = report(&same, options, fit, holdout, alone.into_iter().map(|a| a.0).collect(), &refused)?;
+    for (view, turns) in found.views.iter_mut().zip(numbered) {
+        view.pictures.iter_mut().zip(turns).for_each(|(picture, turn)| picture.turn = turn);
+    }
+    Ok(found)
+}
+
+/// The poses of the views as each camera has them by itself, by camera and view.
+fn own_poses(views: usize, alone: &[(Mono, Vec<usize>)]) -> Vec<Vec<Option<Pose>>> {
+    let mut poses = vec![vec![None; views]; alone.len()];
+    for ((mono, views), poses) in alone.iter().zip(&mut poses) {
+        for (i, v) in views.iter().enumerate() {
+            poses[*v] = mono.fit.estimate.poses[i].filter(|_| mono.fit.used[i].iter().flatten().any(|u| *u));
+        }
+    }
+    poses
 }
 
 /// The error of a camera by itself as that of a camera of several.
@@ -161,22 +184,16 @@ fn expand(
 fn joint(
     data: &Sightings,
     alone: &[(Mono, Vec<usize>)],
+    (mounts, poses): (&[Pose], &[Vec<Option<Pose>>]),
     usable: &Used,
     limits: Limits,
     holdout: bool,
     progress: &dyn Progress,
 ) -> Result<(Fit, Option<HoldOut>), CalibrateError> {
     let n = data.views.len();
-    let mut poses = vec![vec![None; n]; alone.len()];
-    for ((mono, views), poses) in alone.iter().zip(&mut poses) {
-        for (i, v) in views.iter().enumerate() {
-            poses[*v] = mono.fit.estimate.poses[i].filter(|_| mono.fit.used[i].iter().flatten().any(|u| *u));
-        }
-    }
-    let mounts = mounts(&poses)?;
     let of_view = |v: usize| {
         // Where cameras do not agree, the residuals will tell.
-        let seen = mounts.iter().zip(&poses).find_map(|(m, poses)| poses[v].map(|p| m.inverse().compose(&p)))?;
+        let seen = mounts.iter().zip(poses).find_map(|(m, poses)| poses[v].map(|p| m.inverse().compose(&p)))?;
         Some(seen)
     };
     let shapes = alone.iter().map(|(m, _)| m.fit.estimate.shape);
@@ -184,7 +201,7 @@ fn joint(
     let shape = shapes.fold([0.0; 2], |s, x| [s[0] + x[0] / count, s[1] + x[1] / count]);
     let estimate = Estimate {
         cameras: alone.iter().map(|(m, _)| m.fit.estimate.cameras[0]).collect(),
-        mounts: mounts.clone(),
+        mounts: mounts.to_vec(),
         poses: (0..n).map(of_view).collect(),
         shape,
     };
@@ -287,7 +304,7 @@ fn view(
         let (squares, n) = counted.fold((0.0, 0), |s, r| (s.0 + r.norm_squared(), s.1 + 1));
         let corners = residuals.iter().zip(used).map(|(r, u)| CalibratedCorner { residual: *r, used: *u }).collect();
         let rms_px = if n == 0 { f64::NAN } else { (squares / f64::from(n)).sqrt() };
-        CalibratedPicture { outcome, rms_px, corners }
+        CalibratedPicture { outcome, rms_px, corners, turn: 0 }
     };
     let pictures: Vec<CalibratedPicture> = (0..data.sizes.len()).map(picture).collect();
     let seen = pictures.iter().any(|p| p.outcome.is_used());

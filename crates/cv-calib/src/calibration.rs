@@ -90,6 +90,9 @@ pub struct CalibratedPicture {
     pub rms_px: f64,
     /// Each corner in the order given.
     pub corners: Vec<CalibratedCorner>,
+    /// By which of the turns after which the target looks the same its points were numbered otherwise than in the first camera's picture
+    /// ([`TargetPoints::with_equal_turns`](crate::TargetPoints::with_equal_turns)); 0: by none.
+    pub turn: usize,
 }
 
 /// What became of a corner.

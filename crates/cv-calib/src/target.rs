@@ -1,7 +1,7 @@
 //! The flat target and what cameras see of it.
 
 use crate::CalibrateError;
-use cv_core::{Point2, Point3, Vector2};
+use cv_core::{Point2, Point3, Pose, Rotation3, Vector2, Vector3};
 
 /// The points of a flat calibration target, such as the inner corners of a chessboard.
 ///
@@ -12,6 +12,8 @@ pub struct TargetPoints {
     points: Vec<Point2<f64>>,
     middle: Point2<f64>,
     half: Vector2<f64>,
+    /// Each further turn after which the target looks the same, in radians from x to y, and what each point becomes.
+    turns: Vec<(f64, Vec<usize>)>,
 }
 
 impl TargetPoints {
@@ -32,7 +34,7 @@ impl TargetPoints {
         if half.x <= 0.0 || half.y <= 0.0 {
             return Err(bad);
         }
-        Ok(Self { points, middle: low + half, half })
+        Ok(Self { points, middle: low + half, half, turns: Vec::new() })
     }
 
     /// A grid of `columns × rows` points, row by row, `spacing` apart.
@@ -46,6 +48,41 @@ impl TargetPoints {
         }
         let at = |i: usize| Point2::new((i % columns) as f64 * spacing, (i / columns) as f64 * spacing);
         Self::new((0..count).map(at).collect())
+    }
+
+    /// Says that the target looks the same after each of `count` equal parts of a whole turn: 2 for a board that cannot be told from itself upside down, 4 for
+    /// one that looks the same after a quarter turn. Then cameras may have numbered its points differently in one view, which [`calibrate`](crate::calibrate) puts right. Turns
+    /// that do not take points to points are left out.
+    pub fn with_equal_turns(mut self, count: usize) -> Self {
+        let near = 1e-6 * self.half.norm();
+        let turned = |turn: usize| -> Option<(f64, Vec<usize>)> {
+            let angle = turn as f64 * std::f64::consts::TAU / count as f64;
+            let (sin, cos) = angle.sin_cos();
+            let place = |p: &Point2<f64>| {
+                let d = p - self.middle;
+                self.middle + Vector2::new(cos * d.x - sin * d.y, sin * d.x + cos * d.y)
+            };
+            let index = |p: Point2<f64>| self.points.iter().position(|q| (p - q).norm() <= near);
+            Some((angle, self.points.iter().map(|p| index(place(p))).collect::<Option<_>>()?))
+        };
+        self.turns = (1..count).filter_map(turned).collect();
+        self
+    }
+
+    /// The turns after which the target looks the same, as motions of its plane; the first is none.
+    pub(crate) fn turns(&self) -> Vec<Pose> {
+        let of = |angle: f64| {
+            let turn = Rotation3::new(Vector3::new(0.0, 0.0, angle));
+            let middle = Vector3::new(self.middle.x, self.middle.y, 0.0);
+            Pose::new(turn, middle - turn * middle)
+        };
+        std::iter::once(0.0).chain(self.turns.iter().map(|turn| turn.0)).map(of).collect()
+    }
+
+    /// The number of a point after turn `turn` ([`CalibratedPicture::turn`](crate::CalibratedPicture::turn)); itself after turn 0.
+    pub fn turned(&self, point: usize, turn: usize) -> usize {
+        let turned = turn.checked_sub(1).and_then(|turn| self.turns.get(turn)?.1.get(point));
+        turned.copied().unwrap_or(point)
     }
 
     /// The positions on a flat target.
@@ -155,6 +192,24 @@ mod tests {
         assert_eq!(target.bent(0, [0.5, 0.25]), Point3::new(0.0, 0.0, 0.0));
         assert_eq!(target.bent(2, [0.5, 0.25]), Point3::new(4.0, 0.0, 0.5));
         assert_eq!(target.deflection(1), [0.75, 0.0]);
+    }
+
+    #[test]
+    fn points_change_places_by_the_turns_of_a_target() {
+        let target = TargetPoints::grid(4, 3, 2.0).unwrap();
+        assert_eq!((target.turned(1, 0), target.turned(1, 1)), (1, 1));
+        let half = target.clone().with_equal_turns(2);
+        assert_eq!((0..12).map(|i| half.turned(i, 1)).collect::<Vec<_>>(), (0..12).rev().collect::<Vec<_>>());
+        let turns = half.turns();
+        for (i, p) in target.points().iter().enumerate() {
+            let q = target.points()[half.turned(i, 1)];
+            let moved = turns[1].transform(&Point3::new(p.x, p.y, 0.0));
+            // A rotation of lengths below ten.
+            assert!((moved - Point3::new(q.x, q.y, 0.0)).norm() < 1e-12);
+        }
+        // A quarter turn takes no oblong grid to itself, and a square one four times.
+        assert_eq!(target.with_equal_turns(4).turns().len(), 2);
+        assert_eq!(TargetPoints::grid(3, 3, 1.0).unwrap().with_equal_turns(4).turns().len(), 4);
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! The program `cv`: arguments, files and reports. The work itself is done by `cv-pipeline`.
 
+mod boards;
 mod commands;
 mod frame;
 mod photos;

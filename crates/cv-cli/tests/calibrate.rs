@@ -63,3 +63,42 @@ fn a_camera_goes_through_every_format_and_takes_the_lens_out() {
     let again = run(folder.path(), &["undistort", "photo.png", "--camera", "cam.yaml", "-o", "."]);
     assert_eq!(again.code, Some(1), "{}", again.stderr);
 }
+
+#[test]
+fn boards_are_drawn_the_same_each_time_in_every_format() {
+    let folder = tempfile::tempdir().unwrap();
+    let draw = |file: &str, more: &[&str]| {
+        let args = [&["board", "-o", file, "--board", "9x6", "--square", "20"], more].concat();
+        let told = json(folder.path(), &args);
+        assert_eq!((told["points"].as_u64(), told["options"].as_str()), (Some(54), Some("--board 9x6 --square 20")));
+        fs::read(folder.path().join(file)).unwrap()
+    };
+    for (file, begins) in [("a.pdf", &b"%PDF-1.4"[..]), ("a.svg", b"<svg "), ("a.png", b"\x89PNG")] {
+        let first = draw(file, &[]);
+        assert!(first.starts_with(begins) && first == draw(file, &[]), "{file}");
+    }
+    // Its resolution: 11811 dots to the meter both ways, and that the unit is the meter.
+    let png = draw("a.png", &["--paper", "letter"]);
+    let at = png.windows(4).position(|w| w == b"pHYs").unwrap();
+    assert_eq!(png[at + 4..at + 13], [0, 0, 0x2e, 0x23, 0, 0, 0x2e, 0x23, 1]);
+    let large = refused(folder.path(), &["board", "-o", "b.pdf", "--board", "9x6", "--square", "40"]);
+    assert!(large.stderr.contains("--square 25.4 at most"), "{}", large.stderr);
+    for wrong in [&["--kind", "charuco"][..], &["--dpi", "300"], &["--marker", "3"], &["--paper", "a9"]] {
+        let args = [&["board", "-o", "c.pdf", "--board", "9x6", "--square", "20"], wrong].concat();
+        assert_eq!(run(folder.path(), &args).code, Some(2), "{wrong:?}");
+    }
+    assert!(!folder.path().join("b.pdf").exists() && !folder.path().join("c.pdf").exists());
+}
+
+#[test]
+fn a_sheet_that_was_drawn_is_no_rig_and_one_camera_none_either() {
+    let folder = tempfile::tempdir().unwrap();
+    let board = ["--kind", "aprilgrid", "--board", "3x2", "--marker", "40"];
+    support::done(folder.path(), &[&["board", "-o", "1.png", "--dpi", "60"], &board[..]].concat());
+    let rig = [&["calibrate", "rig", "-o", "rig.yaml", "--cameras", "1.png", "1.png", "1.png"], &board[..]].concat();
+    // It is found on all three, and one view is too few.
+    let said = refused(folder.path(), &rig).stderr;
+    assert!(said.contains("on 1 photograph, 3 are needed"), "{said}");
+    let one = [&["calibrate", "rig", "-o", "rig.yaml", "--cameras", "1.png"], &board[..]].concat();
+    assert_eq!(run(folder.path(), &one).code, Some(2));
+}

@@ -180,6 +180,8 @@ fn the_options_in_the_tables_are_there() {
         "rectify",
         "calibrate mono",
         "calibrate stereo",
+        "calibrate rig",
+        "board",
         "calibration convert",
         "undistort",
         "eval disparity",

@@ -76,6 +76,6 @@ pub use patch::{PatchOptions, describe_patches};
 pub use sift::{SiftOptions, sift};
 pub use square_covering::{anms_square_covering, anms_tiled};
 pub use targets::{
-    BoardPoint, BoardSize, CharucoBoard, Chessboard, ChessboardError, ChessboardOptions, Dictionary, find_charuco,
-    find_chessboard,
+    BlackRectangle, Board, BoardError, BoardKind, BoardPoint, BoardSize, CharucoBoard, Chessboard, ChessboardOptions,
+    Dictionary, GridStyle, MarkerGrid, find_board, find_charuco, find_chessboard, find_marker_grid,
 };

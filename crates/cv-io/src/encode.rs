@@ -49,11 +49,15 @@ png_pixels!(u16, 3, Rgb, Sixteen, |out, row| out.extend(row.iter().flat_map(|v| 
 /// # Errors
 /// [`FormatError::NotRepresentable`] for an empty picture or one whose sides exceed 2³¹ − 1.
 pub fn encode_png(view: impl PngPixels) -> Result<Vec<u8>, FormatError> {
-    png_file(view.parts(), &Metadata::default())
+    png_file(view.parts(), &Metadata::default(), None)
 }
 
 /// The encoders are compiled once, not where they are called and not for each kind of pixel.
-fn png_file((width, height, color, depth, pixels): Parts, metadata: &Metadata) -> Result<Vec<u8>, FormatError> {
+fn png_file(
+    (width, height, color, depth, pixels): Parts,
+    metadata: &Metadata,
+    dpi: Option<f64>,
+) -> Result<Vec<u8>, FormatError> {
     let side = |n: usize| u32::try_from(n).ok().filter(|&n| n > 0 && n <= i32::MAX as u32);
     let (Some(w), Some(h)) = (side(width), side(height)) else {
         return Err(FormatError::NotRepresentable { format: "PNG", what: format!("a picture of {width}×{height}") });
@@ -62,6 +66,10 @@ fn png_file((width, height, color, depth, pixels): Parts, metadata: &Metadata) -
     let mut info = png::Info::with_size(w, h);
     info.exif_metadata = metadata.exif_for(w, h).map(Into::into);
     info.icc_profile = metadata.icc_for(color.samples()).map(Into::into);
+    info.pixel_dims = dpi.map(|dpi| {
+        let per_meter = (dpi / 0.0254).round() as u32;
+        png::PixelDimensions { xppu: per_meter, yppu: per_meter, unit: png::Unit::Meter }
+    });
     let fail = |e: png::EncodingError| FormatError::corrupt("PNG", e.to_string());
     let mut encoder = png::Encoder::with_info(&mut bytes, info).map_err(fail)?;
     encoder.set_color(color);
@@ -88,7 +96,17 @@ pub fn write_png(path: impl AsRef<Path>, view: impl PngPixels) -> Result<(), IoE
 /// As [`write_png`].
 pub fn write_png_with(path: impl AsRef<Path>, view: impl PngPixels, metadata: &Metadata) -> Result<(), IoError> {
     let path = path.as_ref();
-    write_bytes(path, &png_file(view.parts(), metadata).map_err(|reason| IoError::writing(path, reason))?)
+    write_bytes(path, &png_file(view.parts(), metadata, None).map_err(|reason| IoError::writing(path, reason))?)
+}
+
+/// [`write_png`] of a picture to print, with its resolution in dots per inch: programs that print it know its size on paper.
+///
+/// # Errors
+/// As [`write_png`].
+pub fn write_png_to_print(path: impl AsRef<Path>, view: impl PngPixels, dpi: f64) -> Result<(), IoError> {
+    let path = path.as_ref();
+    let bytes = png_file(view.parts(), &Metadata::default(), Some(dpi));
+    write_bytes(path, &bytes.map_err(|reason| IoError::writing(path, reason))?)
 }
 
 /// What a JPEG can hold here: views of 1 or 3 channels of bytes.
@@ -204,7 +222,7 @@ pub fn write_image(path: impl AsRef<Path>, view: impl PngPixels, metadata: &Meta
     let ending = path.extension().map(|e| e.to_string_lossy().to_lowercase());
     let parts = view.parts();
     let bytes = match ending.as_deref() {
-        Some("png") => png_file(parts, metadata),
+        Some("png") => png_file(parts, metadata, None),
         Some("tif" | "tiff") => tiff_of(parts, metadata),
         Some("jpg" | "jpeg") if parts.3 == BitDepth::Eight && parts.2 != ColorType::Rgba => {
             jpeg_file(parts, QUALITY, metadata)

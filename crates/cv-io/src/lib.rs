@@ -28,7 +28,7 @@
 //! | maps of floats | [`read_map`], [`pfm`], [`kitti`], [`depth_mm`], [`scaled`] |
 //! | arrays | [`npy`], [`npz`] |
 //! | clouds | [`ply`] |
-//! | cameras and rigs | [`read_camera`], [`write_camera`], [`read_rig`], [`write_rig`], [`CalibrationFormat`] |
+//! | cameras and rigs | [`read_camera`], [`write_camera`], [`read_rig`], [`write_rig`], [`read_camera_array`], [`write_camera_array`], [`CalibrationFormat`] |
 //! | sparse models | [`colmap`] |
 //! | matches | [`read_matches`], [`write_matches`] |
 
@@ -57,12 +57,14 @@ mod sniff;
 mod srgb;
 
 pub use camera::{
-    CalibrationFormat, CalibrationNote, RigFile, parse_camera, parse_rig, read_camera, read_camera_with_notes,
-    read_rig, read_rig_with_notes, write_camera, write_rig,
+    ArrayCamera, CalibrationFormat, CalibrationNote, CameraArray, RigFile, parse_camera, parse_camera_array, parse_rig,
+    read_camera, read_camera_array, read_camera_with_notes, read_rig, read_rig_with_notes, write_camera,
+    write_camera_array, write_rig,
 };
 pub use depth_png::{depth_mm, kitti, scaled};
 pub use encode::{
-    JpegPixels, PngPixels, encode_jpeg, encode_png, encode_tiff, write_image, write_jpeg, write_png, write_png_with,
+    JpegPixels, PngPixels, encode_jpeg, encode_png, encode_tiff, write_image, write_jpeg, write_png,
+    write_png_to_print, write_png_with,
 };
 pub use error::{FormatError, IoError};
 pub use exif_info::{ExifFocal, ExifInfo, FocalSource};

@@ -47,7 +47,9 @@ mod segment;
 
 pub use advice::Advice;
 pub use axes::Axes;
-pub use calibrate::{BoardCalibration, BoardCalibrationError, BoardCalibrationOptions, PhotoRefusal, calibrate};
+pub use calibrate::{
+    BoardCalibration, BoardCalibrationError, BoardCalibrationOptions, BoardChoice, PhotoRefusal, calibrate,
+};
 pub use cv_core::{Cancelled, Progress, Silent};
 pub use cv_features::{FeatureExtractor, FeatureMethod, FeatureOptions, Features};
 pub use cv_geometry::{
@@ -111,7 +113,10 @@ pub mod segmentation {
 /// What a caller of [`calibrate()`] needs of targets and of calibration: sizes of boards, options, results, verdicts.
 pub mod calibration {
     pub use cv_calib::*;
-    pub use cv_features::{BoardSize, Chessboard, ChessboardError, ChessboardOptions};
+    pub use cv_features::{
+        BlackRectangle, Board, BoardError, BoardKind, BoardPoint, BoardSize, CharucoBoard, Chessboard,
+        ChessboardOptions, Dictionary, GridStyle, MarkerGrid, find_board,
+    };
 }
 
 /// The examples of the README, run as tests.

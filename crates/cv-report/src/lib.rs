@@ -26,12 +26,14 @@
 //! | masks | [`overlay_mask`], [`overlay_comparison`] |
 //! | points and cameras | [`PointScene`], [`render_points`] |
 //! | pages | [`Report`], [`Figure`], [`Plot`] |
+//! | sheets to print at their true size | [`PrintSheet`] |
 
 mod base64;
 mod colormap;
 mod font;
 mod overlay;
 mod plot;
+mod print_sheet;
 mod raster;
 mod report;
 mod viewer;
@@ -44,6 +46,7 @@ pub use overlay::{
     shrink_to_fit, side_by_side, tile_patches,
 };
 pub use plot::Plot;
+pub use print_sheet::PrintSheet;
 pub use raster::{Color, Raster, colors};
 pub use report::{Figure, Note, Report};
 pub use viewer::{PointScene, Viewpoint, camera_color, render_points};

@@ -39,6 +39,7 @@ mod instruction_sets;
 mod light;
 mod noise;
 mod poster;
+mod print;
 mod render;
 mod rng;
 mod scene;
@@ -55,6 +56,7 @@ pub use corrupt::corrupt;
 pub use error::SynthError;
 pub use instruction_sets::instruction_sets;
 pub use poster::Poster;
+pub use print::Print;
 pub use render::{Rendered, render};
 pub use scene::{Scene, SceneBuilder};
 pub use score::{

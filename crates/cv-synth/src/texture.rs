@@ -3,6 +3,7 @@
 use crate::font::text;
 use crate::noise::{edge, fbm, fbm3, floor, noise2, visible};
 use crate::poster::Poster;
+use crate::print::Print;
 use crate::rng::{hash2, unit};
 use std::sync::Arc;
 
@@ -62,6 +63,8 @@ pub enum Texture {
         /// Side of a square.
         square: f32,
     },
+    /// A printed calibration board of any kind.
+    Print(Arc<Print>),
     /// Rolled wall paint: faint mottling at every scale.
     Paint {
         /// Mean color.
@@ -175,6 +178,7 @@ impl Texture {
                 let inside = edge(x, w) * edge(n - x, w) * edge(y, w) * edge(m - y, w);
                 mix([0.85; 3], [0.03; 3], inside * (1.0 - checker(x, y, w)))
             }
+            Self::Print(print) => mix([0.85; 3], [0.03; 3], print.black(u, v, w)),
             Self::Paint { color, seed } => {
                 let mottle = 0.030 * fbm(u, v, 1.3, 4, 0.7, *seed, w);
                 let roller = 0.055 * fbm(u, v, 45.0, 3, 0.8, seed ^ 7, w);

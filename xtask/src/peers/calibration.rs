@@ -7,7 +7,7 @@ use anyhow::{Context, Result, ensure};
 use cv_core::{GrayF32, ImageView};
 use cv_features::{BoardSize, Chessboard, ChessboardOptions, find_chessboard};
 use cv_pipeline::calibration::{CalibrateOptions, LensChoice};
-use cv_pipeline::{BoardCalibration, BoardCalibrationOptions, Silent, calibrate};
+use cv_pipeline::{BoardCalibration, BoardCalibrationOptions, BoardChoice, Silent, calibrate};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use std::ffi::OsStr;
@@ -103,7 +103,11 @@ fn looked(photos: &[GrayF32], size: BoardSize) -> Result<(Vec<bool>, f64)> {
 }
 
 fn solved(views: &[Vec<&GrayF32>], board: BoardSize, solve: CalibrateOptions) -> Result<BoardCalibration> {
-    let options = BoardCalibrationOptions { board: Some(board), solve, ..BoardCalibrationOptions::default() };
+    let options = BoardCalibrationOptions {
+        board: BoardChoice::chessboard(Some(board), 1.0),
+        solve,
+        ..BoardCalibrationOptions::default()
+    };
     let cameras = views.first().map_or(0, Vec::len);
     Ok(calibrate((views.len(), cameras), |v, c| Some(views[v][c].clone()), &options, &Silent)?)
 }

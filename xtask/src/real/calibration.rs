@@ -1,10 +1,10 @@
 //! `calibrate` on photographs of chessboards: thirteen pairs of OpenCV's samples, and a wide lens.
 
 use super::Check;
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use cv_core::{GrayF32, Matrix3, Point2, Vector3, median};
-use cv_pipeline::calibration::{BoardSize, CalibrateOptions, LensChoice};
-use cv_pipeline::{BoardCalibration, BoardCalibrationOptions, Silent, calibrate};
+use cv_pipeline::calibration::{Board, BoardSize, CalibrateOptions, LensChoice};
+use cv_pipeline::{BoardCalibration, BoardCalibrationOptions, BoardChoice, Silent, calibrate};
 use cv_stereo::{Rectification, RectifyOptions, StereoMatcher, StereoOptions};
 use std::path::{Path, PathBuf};
 
@@ -41,7 +41,11 @@ fn solved(
         let gray = cv_io::read_gray_u8(&views[view][camera]).ok()?;
         Some(gray.map(|p| [f32::from(p[0]) / 255.0]))
     };
-    let options = BoardCalibrationOptions { board: Some(board), solve, ..BoardCalibrationOptions::default() };
+    let options = BoardCalibrationOptions {
+        board: BoardChoice::chessboard(Some(board), 1.0),
+        solve,
+        ..BoardCalibrationOptions::default()
+    };
     let found = calibrate((views.len(), cameras), photo, &options, &Silent)?;
     let used = found.refusals.iter().filter(|v| v.iter().all(Option::is_none)).count();
     Ok((found, used))
@@ -87,7 +91,9 @@ fn pairs(folder: &Path) -> Result<Vec<Check>> {
 fn flatness(views: &[Vec<PathBuf>], found: &BoardCalibration) -> Result<[Vec<f64>; 2]> {
     let rig = found.calibration.stereo().context("a rig")?;
     let rectification = Rectification::new(&rig, &RectifyOptions::default())?;
-    let (columns, rows) = (found.board.columns, found.board.rows);
+    let Board::Chessboard { size: BoardSize { columns, rows }, .. } = found.board else {
+        bail!("another board than was asked for")
+    };
     let mut shares = [Vec::new(), Vec::new()];
     for (v, pair) in views.iter().enumerate() {
         let corners = &found.sightings.views[v][0];

@@ -3,7 +3,8 @@
 use anyhow::{Context, Result};
 use cv_core::{Camera, Distortion, DistortionModel, GrayF32, Image, Mask, Pose, RgbU8, Rotation3, StereoRig, Vector3};
 use cv_imgproc::resize_area;
-use cv_io::{CalibrationFormat, Metadata, RigFile, npy, npz, pfm};
+use cv_io::{ArrayCamera, CalibrationFormat, CameraArray, Metadata, RigFile, npy, npz, pfm};
+use cv_synth::{RenderOptions, Sheet, Texture};
 use std::{
     fs,
     path::{Path, PathBuf},
@@ -58,6 +59,25 @@ pub(crate) const CASES: &[Case] = &[
         &["opencv.yml", "left.jpg"],
     ),
     case("rectify, Kalibr", "rectify in/left.jpg in/right.png --rig in/kalibr.yaml -o out/rectified", &["kalibr.yaml"]),
+    case("undistort", "undistort in/left.jpg --camera in/lens.yaml -o out/straight", &["left.jpg", "lens.yaml"]),
+    case("calibration of a rig", "calibration convert in/rig.yaml -o out/rig.yml --format opencv", &["rig.yaml"]),
+    case(
+        "calibration of three cameras",
+        "calibration convert in/three.yaml -o out/c.yaml --format kalibr",
+        &["three.yaml"],
+    ),
+    case("board", "board -o out/b.pdf --board 9x6 --square 20", &[]),
+    case("board, PNG", "board -o out/b.png --kind aprilgrid --board 4x3 --marker 30 --dpi 60", &[]),
+    case(
+        "calibrate mono",
+        "calibrate mono --board 7x5 --square 30 in/board1.png in/board2.png in/board3.png in/board4.png -o out/camera.yaml",
+        &["board1.png", "board2.png"],
+    ),
+    case(
+        "calibrate stereo",
+        "calibrate stereo --board 7x5 --left in/board1.png in/board2.png in/board3.png --right in/board1.png in/board2.png in/board3.png -o out/rig.yaml",
+        &["board3.png"],
+    ),
     case("match", "match in/a.jpg in/b.jpg -o out/m.txt --save-features out/features", &["a.jpg", "b.jpg"]),
     case(
         "match of stored features",
@@ -141,6 +161,7 @@ pub(crate) fn prepare(folder: &Path, program: &Path) -> Result<()> {
         [format!("P6\n{} {}\n255\n", right.width(), right.height()).as_bytes(), right.as_slice()].concat(),
     )?;
     rigs(&to, left.size())?;
+    boards(&to)?;
 
     for (name, of_data, of_fixtures, width) in [
         ("a", "sfm/sceaux/100_7101.JPG", "two-view/a.jpg", 480),
@@ -208,6 +229,32 @@ fn rigs(to: &Path, (w, h): (usize, usize)) -> Result<()> {
     for (name, of) in [("rig.yaml", "own"), ("opencv.yml", "opencv"), ("kalibr.yaml", "kalibr")] {
         fs::write(to.join(name), format(of)?.rig_text(&file, &[])?)?;
     }
+    fs::write(to.join("lens.yaml"), format("own")?.camera_text(&rig.right, &[])?)?;
+    let one = |name: &str, camera, from_first| ArrayCamera { name: name.to_owned(), camera, from_first };
+    let far = Pose::new(pose.rotation, 2.0 * pose.translation);
+    let cameras = vec![one("a", rig.left, Pose::identity()), one("b", rig.right, pose), one("c", rig.left, far)];
+    let file = CameraArray { cameras, unit: "m".to_owned() };
+    Ok(fs::write(to.join("three.yaml"), format("own")?.array_text(&file, &[])?)?)
+}
+
+/// Photographs of a chessboard of 8 by 6 squares by one camera.
+fn boards(to: &Path) -> Result<()> {
+    let sheet = Sheet {
+        texture: Texture::Board { squares: (8, 6), square: 0.03 },
+        size: (0.27, 0.21),
+        bend: 0.0,
+        behind: Texture::Paint { color: [0.4; 3], seed: 1 },
+        light: [0.1, -0.1],
+        glare: None,
+    };
+    let camera = Camera::from_focal(320, 240, 280.0);
+    for i in 1..=4 {
+        let angle = 1.6 * f64::from(i);
+        let turn = Rotation3::new(Vector3::new(0.5 * angle.sin(), 0.5 * angle.cos(), 0.1));
+        let pose = Pose::new(turn, Vector3::new(0.0, 0.0, 0.36) - turn * Vector3::new(0.135, 0.105, 0.0));
+        let photo = sheet.photo(&camera, &pose, &RenderOptions::default())?;
+        cv_io::write_png(to.join(format!("board{i}.png")), photo.view())?;
+    }
     Ok(())
 }
 
@@ -270,6 +317,7 @@ pub(crate) fn fault(path: &Path, bytes: &[u8]) -> Option<String> {
         Some("png" | "jpg") => cv_io::decode_image(bytes, &cv_io::ReadOptions::default()).is_ok(),
         Some("pfm") => pfm::decode(bytes).is_ok(),
         Some("npy") => npy::decode(bytes).is_ok(),
+        Some("pdf") => bytes.trim_ascii_end().ends_with(b"%%EOF"),
         Some("json") => serde_json::from_slice::<serde_json::Value>(bytes).is_ok(),
         Some("html") => bytes.trim_ascii_end().ends_with(b"</html>"),
         Some("ply") => ply_is_whole(bytes),

@@ -2,8 +2,8 @@
 
 use crate::frame::{Context, Failure, Global, Outcome, Output, Run, spare_inputs};
 use crate::rig;
-use cv_core::Camera;
-use cv_io::{CalibrationFormat, CalibrationNote, RigFile};
+use cv_core::{Camera, Pose};
+use cv_io::{CalibrationFormat, CalibrationNote, CameraArray, RigFile};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -72,11 +72,19 @@ const ENDINGS: &[&str] = &["yaml", "yml", "txt", "xml", "json", "cameramodel"];
 enum Held {
     Camera(Camera),
     Rig(Box<RigFile>),
+    /// More than two cameras.
+    Array(CameraArray),
 }
 
 impl Input {
     /// A rig where the file is one, else a camera.
     fn read(&self, context: &Context) -> Result<(Held, Vec<CalibrationNote>), Failure> {
+        if let [file] = self.files.as_slice()
+            && let Ok(array) = cv_io::read_camera_array(file)
+            && array.cameras.len() > 2
+        {
+            return Ok((Held::Array(array), Vec::new()));
+        }
         match cv_io::read_rig_with_notes(&self.files, self.size) {
             Ok((file, notes)) => Ok((Held::Rig(Box::new(file)), notes)),
             Err(error) if self.files.len() > 1 => Err(error.into()),
@@ -111,10 +119,24 @@ impl Run for Args {
                 .with("kind", "rig")
                 .with("left", told(&file.rig.left))
                 .with("right", told(&file.rig.right))
-                .with("rotation", rows(file))
+                .with("rotation", rows(&file.rig.right_from_left))
                 .with("translation", file.rig.right_from_left.translation.as_slice())
                 .with("baseline", file.rig.baseline())
                 .with("unit", &file.unit),
+            Held::Array(file) => {
+                let one = |c: &cv_io::ArrayCamera| {
+                    json!({
+                        "name": c.name,
+                        "camera": told(&c.camera),
+                        "rotation": rows(&c.from_first),
+                        "translation": c.from_first.translation.as_slice(),
+                    })
+                };
+                Outcome::new(Vec::new())
+                    .with("kind", "rig")
+                    .with("cameras", file.cameras.iter().map(one).collect::<Vec<_>>())
+                    .with("unit", &file.unit)
+            }
         };
         match self.what {
             What::Show(_) => Ok(outcome.summary(words(&held))),
@@ -126,6 +148,7 @@ impl Run for Args {
                 let text = match &held {
                     Held::Camera(camera) => format.camera_text(camera, &[])?,
                     Held::Rig(file) => format.rig_text(file, &[])?,
+                    Held::Array(file) => format.array_text(file, &[])?,
                 };
                 context.write(Output::File(&args.output, ENDINGS), |path| cv_io::write_bytes(path, text.as_bytes()))?;
                 Ok(outcome.with("format", format.name()).summary(words(&held)))
@@ -134,8 +157,8 @@ impl Run for Args {
     }
 }
 
-fn rows(file: &RigFile) -> Vec<Vec<f64>> {
-    file.rig.right_from_left.rotation.matrix().row_iter().map(|r| r.iter().copied().collect()).collect()
+fn rows(motion: &Pose) -> Vec<Vec<f64>> {
+    motion.rotation.matrix().row_iter().map(|r| r.iter().copied().collect()).collect()
 }
 
 fn told(camera: &Camera) -> Value {
@@ -174,6 +197,15 @@ fn words(held: &Held) -> String {
     };
     match held {
         Held::Camera(c) => camera(c),
+        Held::Array(file) => {
+            let one = |c: &cv_io::ArrayCamera| {
+                let far = c.from_first.inverse().translation.norm();
+                let turn = c.from_first.rotation_angle().to_degrees();
+                let place = format!("{far:.6} {} from the first, turned by {turn:.3}°", file.unit);
+                format!("{}: {}\n  {place}", c.name, camera(&c.camera))
+            };
+            file.cameras.iter().map(one).collect::<Vec<_>>().join("\n")
+        }
         Held::Rig(file) => {
             let t = file.rig.right_from_left.translation;
             let turn = file.rig.right_from_left.rotation_angle().to_degrees();

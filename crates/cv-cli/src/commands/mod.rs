@@ -54,6 +54,7 @@
 
 use crate::frame::{Context, Failure, Outcome, Run};
 
+mod board;
 mod calibrate;
 mod calibration;
 mod completions;
@@ -113,6 +114,7 @@ subcommands! {
     Reconstruct(reconstruct::Args),
     Depth(depth::Args),
     Rectify(rectify::Args),
+    Board(board::Args),
     Calibrate(calibrate::Args),
     Calibration(calibration::Args),
     Undistort(undistort::Args),

@@ -2,7 +2,7 @@
 
 use super::Failure;
 use cv_pipeline::calibration::{
-    CalibrateError, CaptureNote, ChessboardError, LensTrial, LensVerdict, PictureOutcome, PictureSide,
+    BoardError, CalibrateError, CaptureNote, LensTrial, LensVerdict, PictureOutcome, PictureSide,
 };
 use cv_pipeline::{BoardCalibrationError, PhotoRefusal};
 
@@ -10,7 +10,7 @@ use cv_pipeline::{BoardCalibrationError, PhotoRefusal};
 pub(crate) fn refusal(refusal: &PhotoRefusal) -> String {
     match refusal {
         PhotoRefusal::NoPhoto => "there is no photograph".to_owned(),
-        PhotoRefusal::Board(ChessboardError::OtherSize { seen, asked }) => {
+        PhotoRefusal::Board(BoardError::OtherSize { seen, asked }) => {
             format!("shows a board of {seen} inner corners, not {asked}")
         }
         PhotoRefusal::Board(error) => error.to_string(),
@@ -38,14 +38,14 @@ fn photographs(count: usize) -> String {
 }
 
 /// Why there is no calibration.
-pub(crate) fn no_calibration(error: BoardCalibrationError, names: &[&str], found: &str) -> Failure {
+pub(crate) fn no_calibration(error: BoardCalibrationError, names: &[impl AsRef<str>], found: &str) -> Failure {
     let name = |camera: usize| match names.get(camera) {
-        Some(name) if names.len() > 1 => format!("{name} camera: "),
+        Some(name) if names.len() > 1 => format!("{} camera: ", name.as_ref()),
         _ => String::new(),
     };
     match error {
         BoardCalibrationError::NoBoards { .. } => Failure::new(format!("{error}{found}")).advice(
-            "sharp photographs of the whole board, and its number of inner corners (--board 9x6 for one of 10 by 7 squares), or --board auto",
+            "sharp photographs of the whole board, and its number of inner corners (--board 9x6 for one of 10 by 7 squares), or --board auto; of other boards than chessboards their --kind, and what `cv board` printed on them",
         ),
         BoardCalibrationError::Calibrate { source, .. } => {
             let (what, advice) = match source {
@@ -83,6 +83,7 @@ pub(crate) fn no_calibration(error: BoardCalibrationError, names: &[&str], found
             };
             Failure::new(what).advice(advice)
         }
+        BoardCalibrationError::Board(error) => Failure::usage(error),
         BoardCalibrationError::Option(error) => Failure::usage(error),
         BoardCalibrationError::Cancelled(stop) => stop.into(),
     }
@@ -102,9 +103,9 @@ pub(crate) fn lens(trial: &LensTrial) -> String {
 }
 
 /// What is to be known of the photographs, and what to photograph next.
-pub(crate) fn note(note: &CaptureNote, names: &[&str]) -> String {
+pub(crate) fn note(note: &CaptureNote, names: &[impl AsRef<str>]) -> String {
     let name = |camera: usize| match names.get(camera) {
-        Some(name) if names.len() > 1 => format!("{name} camera: "),
+        Some(name) if names.len() > 1 => format!("{} camera: ", name.as_ref()),
         _ => String::new(),
     };
     match *note {
@@ -136,7 +137,10 @@ pub(crate) fn note(note: &CaptureNote, names: &[&str]) -> String {
             format!("{}{pictures} of {of} photographs with a board are left out", name(camera))
         }
         CaptureNote::FewShared { camera, got, wanted } => {
-            format!("{}{got} pairs show the board to both cameras, which is few; take {wanted} or more", name(camera))
+            format!(
+                "{}{got} views show the board to it and to another camera, which is few; take {wanted} or more",
+                name(camera)
+            )
         }
         CaptureNote::BentTarget { share } => {
             format!("the board is bent by {:.1} % of its longer side, which is allowed for", 100.0 * share)

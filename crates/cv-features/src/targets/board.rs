@@ -3,6 +3,7 @@
 //! A board lies in its own plane: x along its columns, y along its rows, in the unit of its squares (millimeters, meters: the caller's), z away
 //! from whoever looks at it. So x right, y down, z forward, as in a camera's frame.
 
+use super::board_error::BoardError;
 use super::dictionary::Dictionary;
 use cv_core::Point2;
 
@@ -82,14 +83,17 @@ pub struct CharucoBoard {
 }
 
 impl CharucoBoard {
-    /// Whether there is such a board: enough squares, markers for all white ones, and room for them.
-    pub fn is_valid(&self) -> bool {
+    /// What is wrong with it, if anything: too few squares, too few markers in the dictionary, or no room for them.
+    ///
+    /// # Errors
+    /// [`BoardError::Layout`], [`BoardError::TooManyMarkers`].
+    pub fn check(&self) -> Result<(), BoardError> {
         let share = self.marker / self.square;
-        self.corners().is_valid()
-            && self.markers() <= self.dictionary.markers()
-            && self.square > 0.0
-            && self.square.is_finite()
-            && (0.3..=0.9).contains(&share)
+        let sized = self.square > 0.0 && self.square.is_finite() && (0.3..=0.9).contains(&share);
+        if !(self.corners().is_valid() && sized) {
+            return Err(BoardError::Layout { columns: self.squares.0, rows: self.squares.1, share });
+        }
+        BoardError::check_markers(self.markers(), self.dictionary)
     }
 
     /// Its inner corners.

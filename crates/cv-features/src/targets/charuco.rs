@@ -3,14 +3,15 @@
 //! The chessboard's corners are found and joined first, as those of a plain board are. Then the markers are read, which needs no search: each white square with its
 //! four corners says where its marker's bits lie. Every marker that is read votes for where the grid lies on the board.
 
+use super::BoardError;
 use super::board::{BoardPoint, CharucoBoard};
+use super::chessboard::ChessboardOptions;
 use super::grid::{Grid, grids};
+use super::marker::{MarkerShape, read_bits, square_to_picture, what_else};
 use super::saddle::saddle;
 use super::x_corner::x_corners;
-use super::{ChessboardError, ChessboardOptions};
 use crate::error::check_image;
-use cv_core::{ImageView, Matrix3, Point2, Progress, Stage, Vector3};
-use cv_imgproc::sample_bilinear;
+use cv_core::{ImageView, Matrix3, Point2, Progress, Stage};
 use std::collections::BTreeMap;
 
 /// Where a grid lies on a board: quarter turns, then the shift of columns and rows.
@@ -30,31 +31,36 @@ fn turned((x, y): (i32, i32), turns: usize) -> (i32, i32) {
 /// `view` is gray, 0 to 1. The points are in the order of their ids, which are those of [`CharucoBoard::point`]; at least four.
 ///
 /// # Errors
-/// [`ChessboardError`]; `NoBoard` too where no marker of the board can be read.
+/// [`BoardError`]; where no marker of the board can be read, it says what was seen in their place.
 pub fn find_charuco(
     view: ImageView<'_, f32, 1>,
     board: &CharucoBoard,
     options: &ChessboardOptions,
     progress: &dyn Progress,
-) -> Result<Vec<BoardPoint>, ChessboardError> {
+) -> Result<Vec<BoardPoint>, BoardError> {
     options.check()?;
-    if !board.is_valid() {
-        return Err(ChessboardError::Size { asked: board.corners() });
-    }
+    board.check()?;
     check_image(view, 16)?;
     let (corners, smooth) = x_corners(view, options.least_contrast, progress)?;
     let stage = Stage::new(progress, "grid", 0)?;
     // White around a marker, in squares.
     let clear = 0.45 * (1.0 - board.marker / board.square);
-    let mut best: Vec<BoardPoint> = Vec::new();
+    let mut boards: Vec<Vec<BoardPoint>> = Vec::new();
+    // White squares of the largest grid that could not be placed.
+    let mut unread: Option<Vec<[Point2<f64>; 4]>> = None;
     for mut grid in grids(&corners, smooth.view(), 4, clear, &stage)? {
-        if grid.nodes.len() <= best.len() {
+        // A part of a board that is smaller than half of what is found already tells nothing new.
+        if boards.first().is_some_and(|best| 2 * grid.nodes.len() < best.len()) {
             break;
         }
         grid.settle(smooth.view());
         let [x0, x1, y0, y1] = grid.bounds();
         grid.fill(smooth.view(), [x0 - 2, x1 + 2, y0 - 2, y1 + 2], &stage)?;
-        let Some(placement) = placed(&grid, view, board) else { continue };
+        let whites = white_squares(&grid);
+        let Some(placement) = placed(&whites, view, board) else {
+            unread.get_or_insert_with(|| whites.into_iter().map(|white| white.1).collect());
+            continue;
+        };
         let size = board.corners();
         let mut points: Vec<BoardPoint> = Vec::new();
         for (&place, node) in &grid.nodes {
@@ -72,31 +78,53 @@ pub fn find_charuco(
                 points.push(BoardPoint { id, position: found.position, deviation: found.deviation_unsmoothed() });
             }
         }
-        if points.len() > best.len() {
-            best = points;
+        points.sort_by_key(|p| p.id);
+        if points.len() >= 4 {
+            boards.push(points);
         }
     }
-    if best.len() < 4 {
-        return Err(ChessboardError::NoBoard { corners: corners.len() });
+    boards.sort_by_key(|points| std::cmp::Reverse(points.len()));
+    let Some(best) = boards.first() else {
+        let none = BoardError::NoBoard { corners: corners.len() };
+        let Some(whites) = unread else { return Err(none) };
+        let read = |i: usize, side: usize| read_in_square(view, whites[i], board.marker / board.square, side);
+        let seen = BoardError::NoMarkers { dictionary: board.dictionary, seen: whites.len() };
+        return Err(what_else(whites.len().min(60), board.dictionary, read).unwrap_or(seen));
+    };
+    // Parts of one board, which something lies across, have different corners, or the same ones in the same places.
+    let elsewhere = |p: &BoardPoint| {
+        let known = best.binary_search_by_key(&p.id, |q| q.id).ok().map(|i| best[i].position);
+        known.is_some_and(|q| (q - p.position).norm() > 3.0)
+    };
+    let again = |points: &&Vec<BoardPoint>| points.iter().filter(|p| elsewhere(p)).count() >= 4;
+    let several = boards.iter().filter(again).count();
+    if several > 0 {
+        return Err(BoardError::SeveralBoards { boards: 1 + several });
     }
-    best.sort_by_key(|p| p.id);
-    Ok(best)
+    Ok(boards.swap_remove(0))
+}
+
+/// A white square of a grid: the place of its first corner, and all four, clockwise from it.
+type White = ((i32, i32), [Point2<f64>; 4]);
+
+fn white_squares(grid: &Grid) -> Vec<White> {
+    let square = |(&(x, y), node): (&(i32, i32), &super::grid::Node)| {
+        // Even: the square to the right and below is white.
+        let corner = |dx: i32, dy: i32| grid.position((x + dx, y + dy)).filter(|_| node.turns & 1 == 0);
+        Some(((x, y), [corner(0, 0)?, corner(1, 0)?, corner(1, 1)?, corner(0, 1)?]))
+    };
+    let mut all: Vec<_> = grid.nodes.iter().filter_map(square).collect();
+    all.sort_by_key(|white| white.0);
+    all
 }
 
 /// Where a grid lies on the board by its markers: where at least two of them, and more than half of those that can be read, agree.
-fn placed(grid: &Grid, view: ImageView<'_, f32, 1>, board: &CharucoBoard) -> Option<Placement> {
+fn placed(whites: &[White], view: ImageView<'_, f32, 1>, board: &CharucoBoard) -> Option<Placement> {
     let mut votes: BTreeMap<Placement, usize> = BTreeMap::new();
     let mut read = 0;
-    for (&(x, y), node) in &grid.nodes {
-        // Even: the square to the right and below is white.
-        if node.turns & 1 != 0 {
-            continue;
-        }
-        let corner = |dx: i32, dy: i32| grid.position((x + dx, y + dy));
-        let (Some(a), Some(b), Some(c), Some(d)) = (corner(0, 0), corner(1, 0), corner(1, 1), corner(0, 1)) else {
-            continue;
-        };
-        let Some((id, turns)) = marker(view, [a, b, c, d], board) else { continue };
+    for &((x, y), corners) in whites {
+        let bits = read_in_square(view, corners, board.marker / board.square, board.dictionary.side());
+        let Some((id, turns)) = bits.and_then(|bits| board.dictionary.read(bits, board.markers())) else { continue };
         let Some((column, row)) = board.square_of(id) else { continue };
         read += 1;
         // The square's middle, in twice its coordinates, turns as the marker must be turned back: to the corner (column, row) of squares belongs the
@@ -110,67 +138,19 @@ fn placed(grid: &Grid, view: ImageView<'_, f32, 1>, board: &CharucoBoard) -> Opt
     (agreed >= 2 && 2 * agreed > read).then_some(placement)
 }
 
-/// The marker in a white square with these corners (clockwise from the grid's first), and its quarter turns clockwise against the grid.
-fn marker(view: ImageView<'_, f32, 1>, corners: [Point2<f64>; 4], board: &CharucoBoard) -> Option<(usize, usize)> {
-    let map = square_to_picture(corners)?;
-    let side = board.dictionary.side() + 2;
-    let cell = board.marker / board.square / side as f64;
-    let first = 0.5 * (1.0 - board.marker / board.square);
-    let at = |u: f64, v: f64| {
-        let p = map * Vector3::new(u, v, 1.0);
-        sample_bilinear(view, p.x / p.z, p.y / p.z).map(|[v]| v)
-    };
-    let mut values = Vec::with_capacity(side * side);
-    for row in 0..side {
-        for column in 0..side {
-            let (mut sum, mut n) = (0.0, 0.0f32);
-            for dv in [-0.2, 0.0, 0.2] {
-                for du in [-0.2, 0.0, 0.2] {
-                    let (u, v) = (column as f64 + 0.5 + du, row as f64 + 0.5 + dv);
-                    sum += at(first + u * cell, first + v * cell)?;
-                    n += 1.0;
-                }
-            }
-            values.push(sum / n);
-        }
-    }
-    // White is that of the square's rim, black that of the marker's frame.
-    let mut white = 0.0;
-    for k in 0..8 {
-        let (t, e) = (0.15 + 0.1 * k as f64, 0.5 * first);
-        white += (at(t, e)? + at(t, 1.0 - e)? + at(e, t)? + at(1.0 - e, t)?) / 32.0;
-    }
-    let on_frame = |i: usize| {
-        let (row, column) = (i / side, i % side);
-        row == 0 || column == 0 || row + 1 == side || column + 1 == side
-    };
-    let frame: Vec<f32> = (0..side * side).filter(|&i| on_frame(i)).map(|i| values[i]).collect();
-    let black = frame.iter().sum::<f32>() / frame.len() as f32;
-    let level = 0.5 * (white + black);
-    let lit = frame.iter().filter(|&&v| v > level).count();
-    if white - black < 0.02 || lit > 1 {
-        return None;
-    }
-    let bits =
-        (0..side * side).filter(|&i| !on_frame(i)).fold(0u64, |bits, i| (bits << 1) | u64::from(values[i] > level));
-    board.dictionary.read(bits, board.markers())
-}
-
-/// The homography from the unit square, corners clockwise from the origin, to four points (P. Heckbert, "Fundamentals of texture mapping and image warping", 1989).
-fn square_to_picture([a, b, c, d]: [Point2<f64>; 4]) -> Option<Matrix3<f64>> {
-    let (s, d1, d2) = ((a - b) + (c - d), b - c, d - c);
-    let det = d1.perp(&d2);
-    let (g, h) = (s.perp(&d2) / det, d1.perp(&s) / det);
-    let (ab, ad) = (b - a + b.coords * g, d - a + d.coords * h);
-    let map = Matrix3::new(ab.x, ad.x, a.x, ab.y, ad.y, a.y, g, h, 1.0);
-    map.iter().all(|v| v.is_finite()).then_some(map)
+/// The bits of a marker in the middle of a white square with these corners; it is `share` of the square wide.
+fn read_in_square(view: ImageView<'_, f32, 1>, corners: [Point2<f64>; 4], share: f64, side: usize) -> Option<u64> {
+    let first = 0.5 * (1.0 - share);
+    let within = Matrix3::new(share, 0.0, first, 0.0, share, first, 0.0, 0.0, 1.0);
+    let map = square_to_picture(corners)? * within;
+    read_bits(view, &map, MarkerShape { side, frame: 1, rim: 0.5 * first / share })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::targets::Dictionary;
-    use cv_core::{GrayF32, Silent};
+    use cv_core::{GrayF32, Silent, Vector3};
 
     /// A picture of a board through a homography from board to picture, four samples to a pixel each way.
     fn picture(board: &CharucoBoard, map: &Matrix3<f64>, (w, h): (usize, usize)) -> GrayF32 {
@@ -214,9 +194,21 @@ mod tests {
                 let off = (point.position - place(point.id)).norm();
                 assert!(off < 0.3, "{dictionary} {}: {off}", point.id);
             }
+            let two = GrayF32::from_fn(720, 300, |x, y| image.at(x % 360, y));
+            assert_eq!(
+                find_charuco(two.view(), &board, &ChessboardOptions::default(), &Silent),
+                Err(BoardError::SeveralBoards { boards: 2 })
+            );
             // No marker of another dictionary is there.
             let other = CharucoBoard { dictionary: Dictionary::Aruco5x5x50, ..board };
-            assert!(find_charuco(image.view(), &other, &ChessboardOptions::default(), &Silent).is_err());
+            let find =
+                |image: &GrayF32, board| find_charuco(image.view(), board, &ChessboardOptions::default(), &Silent);
+            assert!(matches!(
+                find(&image, &other),
+                Err(BoardError::OtherDictionary { markers: 5.., asked: Dictionary::Aruco5x5x50, .. })
+            ));
+            let mirrored = GrayF32::from_fn(360, 300, |x, y| image.at(359 - x, y));
+            assert!(matches!(find(&mirrored, &board), Err(BoardError::Mirrored { markers: 5.., .. })));
         }
     }
 }

@@ -1,11 +1,12 @@
 //! Chessboards in photographs.
 
 use super::board::{BoardPoint, BoardSize};
+use super::board_error::BoardError;
 use super::grid::{Grid, grids};
 use super::saddle::saddle;
 use super::x_corner::x_corners;
-use crate::error::{FeatureError, check_image};
-use cv_core::{Cancelled, ImageView, OptionError, Point2, Progress, Stage};
+use crate::error::check_image;
+use cv_core::{ImageView, OptionError, Point2, Progress, Stage};
 use rayon::prelude::*;
 
 /// Half-width of the window for a corner's position, in distances to its nearest neighbor: away from the neighbor's own edges, which do not go through the corner.
@@ -66,90 +67,30 @@ impl Chessboard {
     }
 }
 
-/// Why a picture gave no chessboard.
-#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-pub enum ChessboardError {
-    /// The size that was asked for is no size of a chessboard.
-    #[error("a board of {asked} inner corners: each side takes {} to {}", BoardSize::LEAST, BoardSize::MOST)]
-    Size {
-        /// The size.
-        asked: BoardSize,
-    },
-    /// Nothing in the picture is a chessboard.
-    #[error("no chessboard among the {corners} corners where black and white squares meet")]
-    NoBoard {
-        /// Corners between black and white squares that were seen, in a board or not.
-        corners: usize,
-    },
-    /// There is a chessboard, and it has another size.
-    #[error("saw a board of {seen}, not {asked} inner corners")]
-    OtherSize {
-        /// Size of the board in the picture.
-        seen: BoardSize,
-        /// Size that was asked for.
-        asked: BoardSize,
-    },
-    /// A part of a board: it is cut off by the frame, covered, or burnt out.
-    #[error("saw {found} of the {} corners of a {asked} board, {seen} where they are whole", asked.corners())]
-    Partial {
-        /// Corners found.
-        found: usize,
-        /// Largest whole grid among them.
-        seen: BoardSize,
-        /// Size that was asked for.
-        asked: BoardSize,
-        /// Whether the board reaches the frame of the picture, so that the rest may lie outside.
-        cut_off: bool,
-    },
-    /// More than one board of the asked size.
-    #[error("saw {boards} boards of {size} inner corners")]
-    SeveralBoards {
-        /// How many.
-        boards: usize,
-        /// Their size.
-        size: BoardSize,
-    },
-    /// The picture cannot be worked on, or an option is out of range, or the job was stopped.
-    #[error(transparent)]
-    Feature(#[from] FeatureError),
-}
-
-impl From<Cancelled> for ChessboardError {
-    fn from(cancelled: Cancelled) -> Self {
-        Self::Feature(cancelled.into())
-    }
-}
-
-impl From<OptionError> for ChessboardError {
-    fn from(error: OptionError) -> Self {
-        Self::Feature(error.into())
-    }
-}
-
 /// Finds the chessboard of `size` inner corners, or with `None` the largest one of any size.
 ///
 /// `view` is gray, 0 to 1. Where no size is asked for, what the picture shows of a board that is cut off counts as a board: over several pictures the size that most of them show is the right one.
 /// A board of 9×6 is found as one of 6×9 too if that is asked for: its rows are then its columns.
 ///
 /// # Errors
-/// [`ChessboardError`].
+/// [`BoardError`].
 pub fn find_chessboard(
     view: ImageView<'_, f32, 1>,
     size: Option<BoardSize>,
     options: &ChessboardOptions,
     progress: &dyn Progress,
-) -> Result<Chessboard, ChessboardError> {
+) -> Result<Chessboard, BoardError> {
     options.check()?;
     if let Some(asked) = size.filter(|size| !size.is_valid()) {
-        return Err(ChessboardError::Size { asked });
+        return Err(BoardError::Size { asked });
     }
     check_image(view, 16)?;
     let (corners, smooth) = x_corners(view, options.least_contrast, progress)?;
     let stage = Stage::new(progress, "grid", 0)?;
-    let none = ChessboardError::NoBoard { corners: corners.len() };
+    let none = BoardError::NoBoard { corners: corners.len() };
     let mut boards = Vec::new();
     // What to say where there is none: of the largest grid.
-    let mut refusal: Option<(usize, ChessboardError)> = None;
+    let mut refusal: Option<(usize, BoardError)> = None;
     for mut grid in grids(&corners, smooth.view(), BoardSize::LEAST * 2, WINDOW, &stage)? {
         // A board that lacks more than half its corners is not completed, only told of.
         if size.is_none_or(|asked| 2 * grid.nodes.len() >= asked.corners()) {
@@ -173,7 +114,7 @@ pub fn find_chessboard(
         }
     }
     if boards.len() > 1 {
-        return Err(ChessboardError::SeveralBoards { boards: boards.len(), size: size.unwrap_or(boards[0].0) });
+        return Err(BoardError::SeveralBoards { boards: boards.len() });
     }
     let Some((size, places)) = boards.pop() else { return Err(refusal.map_or(none, |r| r.1)) };
     stage.check()?;
@@ -204,7 +145,7 @@ fn complete(
     view: ImageView<'_, f32, 1>,
     size: Option<BoardSize>,
     stage: &Stage<'_>,
-) -> Result<(), ChessboardError> {
+) -> Result<(), BoardError> {
     grid.settle(view);
     let [x0, x1, y0, y1] = grid.bounds();
     if x1 < x0 {
@@ -274,7 +215,7 @@ fn whole_part(grid: &Grid) -> Option<Part> {
 }
 
 /// Why a grid is not the board that was asked for.
-fn refused(grid: &Grid, part: Part, size: Option<BoardSize>, (w, h): (usize, usize)) -> ChessboardError {
+fn refused(grid: &Grid, part: Part, size: Option<BoardSize>, (w, h): (usize, usize)) -> BoardError {
     let [x0, x1, y0, y1] = grid.bounds();
     let seen = BoardSize::new((x1 - x0 + 1) as usize, (y1 - y0 + 1) as usize).landscape();
     let asked = size.unwrap_or(seen);
@@ -290,9 +231,9 @@ fn refused(grid: &Grid, part: Part, size: Option<BoardSize>, (w, h): (usize, usi
     let fits = |a: BoardSize| seen.columns <= a.columns && seen.rows <= a.rows;
     if (fits(asked) || fits(asked.transposed())) && (!whole || cut_off) {
         let found = grid.nodes.len();
-        ChessboardError::Partial { found, seen: part.size().landscape(), asked, cut_off }
+        BoardError::Partial { found, seen: part.size().landscape(), asked, cut_off }
     } else {
-        ChessboardError::OtherSize { seen, asked }
+        BoardError::OtherSize { seen, asked }
     }
 }
 
@@ -357,7 +298,8 @@ fn located(view: ImageView<'_, f32, 1>, size: BoardSize, places: &[Place], large
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cv_core::{GrayF32, Silent};
+    use crate::error::FeatureError;
+    use cv_core::{Cancelled, GrayF32, Silent};
     use cv_imgproc::{gray_to_f32, rgb_to_gray};
     use cv_synth::{ChessboardPhoto, ChessboardTrial, chessboard_photo, photo_without_board};
 
@@ -368,7 +310,7 @@ mod tests {
         (gray_to_f32(rgb_to_gray(photo.image.view()).view()), photo)
     }
 
-    fn find(gray: &GrayF32, size: Option<BoardSize>) -> Result<Chessboard, ChessboardError> {
+    fn find(gray: &GrayF32, size: Option<BoardSize>) -> Result<Chessboard, BoardError> {
         find_chessboard(gray.view(), size, &ChessboardOptions::default(), &Silent)
     }
 
@@ -410,10 +352,10 @@ mod tests {
         let first_row = turned.corners[..6].to_vec();
         assert!(first_row == last_column || first_row.iter().eq((0..6).map(|r| &board.corners[9 * r + 8])));
         let asked = BoardSize::new(7, 5);
-        assert_eq!(find(&gray, Some(asked)), Err(ChessboardError::OtherSize { seen: SIZE, asked }));
+        assert_eq!(find(&gray, Some(asked)), Err(BoardError::OtherSize { seen: SIZE, asked }));
         assert_eq!(find(&gray, Some(asked)).unwrap_err().to_string(), "saw a board of 9×6, not 7×5 inner corners");
         let asked = BoardSize::new(2, 5);
-        assert_eq!(find(&gray, Some(asked)), Err(ChessboardError::Size { asked }));
+        assert_eq!(find(&gray, Some(asked)), Err(BoardError::Size { asked }));
         // Half a turn of the picture leaves the order on the board as it is.
         let (w, h) = gray.size();
         let upside_down = GrayF32::from_fn(w, h, |x, y| gray.at(w - 1 - x, h - 1 - y));
@@ -429,12 +371,24 @@ mod tests {
             let (gray, photo) = photo(ChessboardTrial::Cut, seed);
             let visible = photo.corners.iter().flatten().count();
             match find(&gray, Some(SIZE)) {
-                Err(ChessboardError::Partial { found, cut_off, .. }) => {
+                Err(BoardError::Partial { found, cut_off, .. }) => {
                     assert!(cut_off && found <= visible && 2 * found > visible, "{seed}: {found} of {visible}");
                 }
                 other => panic!("{seed}: {other:?}, {visible} corners visible"),
             }
         }
+    }
+
+    #[test]
+    fn two_boards_in_one_picture_are_told_of() {
+        // 10 by 7 squares of 20 px, twice, 40 px of white between them and around.
+        let image = GrayF32::from_fn(560, 220, |x, y| {
+            let (i, j) = ((x as i64 % 260 - 40).div_euclid(20), (y as i64 - 40).div_euclid(20));
+            let black = (0..10).contains(&i) && (0..7).contains(&j) && (i + j) % 2 == 0 && x < 510;
+            [if black { 0.1 } else { 0.9 }]
+        });
+        assert_eq!(find(&image, Some(SIZE)), Err(BoardError::SeveralBoards { boards: 2 }));
+        assert_eq!(find(&image, None).map(|board| board.size), Ok(SIZE));
     }
 
     #[test]
@@ -462,7 +416,7 @@ mod tests {
         }
         let options = ChessboardOptions { largest_window: 1.0, ..ChessboardOptions::default() };
         let refused = find_chessboard(image.view(), None, &options, &Silent);
-        assert!(matches!(refused, Err(ChessboardError::Feature(FeatureError::Option(_)))));
+        assert!(matches!(refused, Err(BoardError::Feature(FeatureError::Option(_)))));
         struct Stop;
         impl Progress for Stop {
             fn report(&self, _: &'static str, _: usize, _: usize) -> Result<(), Cancelled> {

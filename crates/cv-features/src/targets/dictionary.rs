@@ -115,6 +115,14 @@ impl Dictionary {
     }
 }
 
+impl Dictionary {
+    /// Whether `bits` are those of a marker in one of its turns, all of them right.
+    pub(super) fn read_exactly(self, bits: u64) -> bool {
+        let turns = std::iter::successors(Some(bits), |bits| Some(turn(*bits, self.side())));
+        turns.take(4).any(|bits| (0..self.markers()).any(|id| self.bits(id) == Some(bits)))
+    }
+}
+
 /// Bits that are stored as two halves of 18.
 fn halves(stored: &[u32], id: usize) -> Option<u64> {
     let (high, low) = (stored.get(2 * id)?, stored.get(2 * id + 1)?);

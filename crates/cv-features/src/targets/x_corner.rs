@@ -79,7 +79,7 @@ pub(crate) fn x_corners(
 }
 
 /// `[1 2 1]/4` both ways.
-fn smoothed(view: ImageView<'_, f32, 1>, level: Level) -> GrayF32 {
+pub(super) fn smoothed(view: ImageView<'_, f32, 1>, level: Level) -> GrayF32 {
     let (w, h) = view.size();
     let mut out = GrayF32::new(w, h, [0.0]);
     let kernel = [0.5, 0.25];

@@ -4,7 +4,7 @@ use std::cell::RefCell;
 
 use cv_core::{Camera, Distortion, DistortionModel};
 
-use super::{CalibrationNote, RigFile};
+use super::{CalibrationNote, CameraArray, RigFile};
 use crate::FormatError;
 
 /// What a reader is given beside the text, and what it has to say of it.
@@ -48,6 +48,10 @@ pub(super) struct Format {
     pub(super) camera_text: Option<Write<Camera>>,
     /// Writes a rig of valid cameras and a finite motion, where the format is written.
     pub(super) rig_text: Option<Write<RigFile>>,
+    /// Reads any number of cameras, where the format has them.
+    pub(super) array: Option<Read<CameraArray>>,
+    /// Writes any number of valid cameras and finite motions, where the format holds them.
+    pub(super) array_text: Option<Write<CameraArray>>,
 }
 
 /// A camera's lens by the smallest of the lens models that a format has.

@@ -2,12 +2,12 @@
 
 use std::fmt::Write as _;
 
-use cv_core::{Camera, Distortion, DistortionModel, StereoRig};
+use cv_core::{Camera, Distortion, DistortionModel, Pose, StereoRig};
 use saphyr::Yaml;
 
-use super::RigFile;
 use super::format::{Format, Given, comments, smallest};
 use super::yaml::{get, load, numbers, pose, required, size_of};
+use super::{ArrayCamera, CameraArray, RigFile};
 use crate::FormatError;
 
 const NAME: &str = "Kalibr";
@@ -19,6 +19,8 @@ pub(super) const FORMAT: Format = Format {
     rig: Some(rig),
     camera_text: Some(camera_text),
     rig_text: Some(rig_text),
+    array: Some(array),
+    array_text: Some(array_text),
 };
 
 fn one(document: &Yaml<'_>, key: &str) -> Result<Camera, FormatError> {
@@ -52,16 +54,58 @@ fn one(document: &Yaml<'_>, key: &str) -> Result<Camera, FormatError> {
 fn rig(text: &str, _: &Given) -> Result<RigFile, FormatError> {
     let document = load(text)?;
     let [left, right] = [one(&document, "cam0")?, one(&document, "cam1")?];
-    let second = get(&document, &["cam1"]).ok_or_else(|| FormatError::missing(NAME, "cam1"))?;
-    let m: [f64; 16] = required(second, NAME, &["T_cn_cnm1"])?;
+    let right_from_left = from_previous(&document, "cam1")?;
+    // Kalibr's boards are in meters.
+    Ok(RigFile { rig: StereoRig { left, right, right_from_left }, unit: "m".to_owned() })
+}
+
+/// The motion from the camera before a camera to it.
+fn from_previous(document: &Yaml<'_>, key: &str) -> Result<Pose, FormatError> {
+    let map = get(document, &[key]).ok_or_else(|| FormatError::missing(NAME, key))?;
+    let m: [f64; 16] = required(map, NAME, &["T_cn_cnm1"])?;
     let [r0, r1, r2, last] = [0, 4, 8, 12].map(|i| [m[i], m[i + 1], m[i + 2], m[i + 3]]);
     if last != [0.0, 0.0, 0.0, 1.0] {
         return Err(FormatError::corrupt(NAME, "the last row of T_cn_cnm1 is not 0 0 0 1"));
     }
     let rotation = [r0[0], r0[1], r0[2], r1[0], r1[1], r1[2], r2[0], r2[1], r2[2]];
-    let right_from_left = pose(NAME, rotation, [r0[3], r1[3], r2[3]])?;
-    // Kalibr's boards are in meters.
-    Ok(RigFile { rig: StereoRig { left, right, right_from_left }, unit: "m".to_owned() })
+    pose(NAME, rotation, [r0[3], r1[3], r2[3]])
+}
+
+fn array(text: &str, _: &Given) -> Result<CameraArray, FormatError> {
+    let document = load(text)?;
+    let mut cameras =
+        vec![ArrayCamera { name: "cam0".to_owned(), camera: one(&document, "cam0")?, from_first: Pose::identity() }];
+    loop {
+        let name = format!("cam{}", cameras.len());
+        if get(&document, &[name.as_str()]).is_none() {
+            return Ok(CameraArray { cameras, unit: "m".to_owned() });
+        }
+        let before = cameras.last().map_or(Pose::identity(), |c| c.from_first);
+        let from_first = from_previous(&document, &name)?.compose(&before);
+        cameras.push(ArrayCamera { camera: one(&document, &name)?, from_first, name });
+    }
+}
+
+fn array_text(file: &CameraArray, notes: &[&str]) -> Result<String, FormatError> {
+    in_meters(&file.unit)?;
+    let mut text = comments(notes);
+    let mut before = Pose::identity();
+    for (i, ArrayCamera { camera, from_first, .. }) in file.cameras.iter().enumerate() {
+        push(&mut text, &format!("cam{i}"), camera)?;
+        if i > 0 {
+            push_motion(&mut text, &from_first.compose(&before.inverse()));
+        }
+        before = *from_first;
+    }
+    Ok(text)
+}
+
+/// Kalibr's lengths are meters.
+fn in_meters(unit: &str) -> Result<(), FormatError> {
+    if ["", "m"].contains(&unit) {
+        return Ok(());
+    }
+    Err(FormatError::NotRepresentable { format: NAME, what: format!("a rig whose unit is {unit}, not the meter") })
 }
 
 fn camera_text(camera: &Camera, notes: &[&str]) -> Result<String, FormatError> {
@@ -71,20 +115,20 @@ fn camera_text(camera: &Camera, notes: &[&str]) -> Result<String, FormatError> {
 }
 
 fn rig_text(file: &RigFile, notes: &[&str]) -> Result<String, FormatError> {
-    if !["", "m"].contains(&file.unit.as_str()) {
-        let what = format!("a rig whose unit is {}, not the meter", file.unit);
-        return Err(FormatError::NotRepresentable { format: NAME, what });
-    }
+    in_meters(&file.unit)?;
     let mut text = comments(notes);
     push(&mut text, "cam0", &file.rig.left)?;
     push(&mut text, "cam1", &file.rig.right)?;
+    push_motion(&mut text, &file.rig.right_from_left);
+    Ok(text)
+}
+
+fn push_motion(text: &mut String, motion: &Pose) {
     text.push_str("  T_cn_cnm1:\n");
-    let motion = &file.rig.right_from_left;
     for (r, t) in motion.rotation.matrix().row_iter().zip(motion.translation.iter()) {
         let _ = writeln!(text, "  - [{:?}, {:?}, {:?}, {t:?}]", r[0], r[1], r[2]);
     }
     text.push_str("  - [0.0, 0.0, 0.0, 1.0]\n");
-    Ok(text)
 }
 
 fn push(text: &mut String, key: &str, camera: &Camera) -> Result<(), FormatError> {

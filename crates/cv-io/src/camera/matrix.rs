@@ -15,6 +15,8 @@ pub(super) const FORMAT: Format = Format {
     rig: None,
     camera_text: None,
     rig_text: None,
+    array: None,
+    array_text: None,
 };
 
 /// The numbers, without brackets.

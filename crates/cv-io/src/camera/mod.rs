@@ -22,7 +22,7 @@ pub(crate) use colmap::{CENTER, model_line, parse_model};
 
 use std::path::Path;
 
-use cv_core::{Camera, StereoRig};
+use cv_core::{Camera, Pose, StereoRig};
 
 use crate::files::{read_text, write_bytes};
 use crate::{FormatError, IoError};
@@ -85,6 +85,33 @@ impl CalibrationFormat {
         write(&writable(camera, self.0.name)?, notes)
     }
 
+    /// Whether rigs of more than two cameras are written in it.
+    pub fn writes_arrays(self) -> bool {
+        self.0.array_text.is_some()
+    }
+
+    /// Cameras that are fixed to each other, in this format. `notes` become comment lines.
+    ///
+    /// # Errors
+    /// As [`Self::rig_text`]; [`FormatError::NotRepresentable`], which names the formats that hold them, where this one does not hold so many.
+    pub fn array_text(self, file: &CameraArray, notes: &[&str]) -> Result<String, FormatError> {
+        let not = |what: String| FormatError::NotRepresentable { format: self.0.name, what };
+        let Some(write) = self.0.array_text else {
+            let names: Vec<&str> = Self::all().filter(|f| f.writes_arrays()).map(Self::name).collect();
+            return Err(not(format!("a rig of {} cameras, which {} hold", file.cameras.len(), names.join(" and "))));
+        };
+        if file.cameras.len() < 2 {
+            return Err(not("a rig of less than two cameras".to_owned()));
+        }
+        for ArrayCamera { camera, from_first, .. } in &file.cameras {
+            writable(camera, self.0.name)?;
+            if !from_first.rotation.matrix().iter().chain(from_first.translation.iter()).all(|v| v.is_finite()) {
+                return Err(not("a motion that is not finite".to_owned()));
+            }
+        }
+        write(file, notes)
+    }
+
     /// A rig in this format. `notes` become comment lines.
     ///
     /// # Errors
@@ -127,6 +154,26 @@ impl RigFile {
             _ => None,
         }
     }
+}
+
+/// A camera of several that are fixed to each other.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ArrayCamera {
+    /// What it is called.
+    pub name: String,
+    /// The camera.
+    pub camera: Camera,
+    /// Takes the first camera's frame to this one's.
+    pub from_first: Pose,
+}
+
+/// Two or more cameras that are fixed to each other, as a file has them.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CameraArray {
+    /// The cameras; the first one's pose is the identity.
+    pub cameras: Vec<ArrayCamera>,
+    /// The unit of the translations, as in [`RigFile`].
+    pub unit: String,
 }
 
 /// Something of a calibration that is not taken as it stands.
@@ -208,7 +255,7 @@ pub fn write_camera(path: impl AsRef<Path>, camera: &Camera, notes: &[&str]) -> 
     write_bytes(path, text.as_bytes())
 }
 
-/// Parses a stereo rig: our own YAML (`schema: cv-rig/1`); OpenCV's, with both cameras, R and T in one file; the first two cameras of
+/// Parses a stereo rig: our own YAML (`schema: cv-rig/1`, and the first two cameras of `cv-rig/2`); OpenCV's, with both cameras, R and T in one file; the first two cameras of
 /// Kalibr's `camchain.yaml`.
 ///
 /// # Errors
@@ -268,6 +315,43 @@ fn joined(texts: Vec<String>) -> String {
         });
     }
     all
+}
+
+/// Parses two or more cameras that are fixed to each other: our own YAML (`schema: cv-rig/2`) and Kalibr's `camchain.yaml`.
+///
+/// # Errors
+/// As [`parse_rig`].
+pub fn parse_camera_array(text: &str) -> Result<CameraArray, FormatError> {
+    let Some(read) = format_of(text)?.array else {
+        return Err(FormatError::UnknownFormat { expected: "a rig of cameras: YAML, ours or Kalibr's" });
+    };
+    let file = read(text, &Given::new(None))?;
+    for camera in &file.cameras {
+        checked(camera.camera)?;
+    }
+    if file.cameras.len() < 2 {
+        return Err(FormatError::corrupt("rig", "it has less than two cameras"));
+    }
+    Ok(file)
+}
+
+/// Reads two or more cameras that are fixed to each other; see [`parse_camera_array`].
+///
+/// # Errors
+/// [`IoError`]: cannot be read as text, or as [`parse_camera_array`].
+pub fn read_camera_array(path: impl AsRef<Path>) -> Result<CameraArray, IoError> {
+    let path = path.as_ref();
+    parse_camera_array(&read_text(path)?).map_err(|reason| IoError::reading(path, reason))
+}
+
+/// Writes two or more cameras that are fixed to each other as our own YAML. `notes` become comment lines.
+///
+/// # Errors
+/// As [`write_camera`].
+pub fn write_camera_array(path: impl AsRef<Path>, file: &CameraArray, notes: &[&str]) -> Result<(), IoError> {
+    let path = path.as_ref();
+    let text = CalibrationFormat::OWN.array_text(file, notes).map_err(|reason| IoError::writing(path, reason))?;
+    write_bytes(path, text.as_bytes())
 }
 
 /// Writes a stereo rig as our own YAML. `notes` become comment lines.

@@ -25,6 +25,8 @@ pub(super) const FORMAT: Format = Format {
     rig: None,
     camera_text: Some(camera_text),
     rig_text: None,
+    array: None,
+    array_text: None,
 };
 
 /// OpenCV's perspective lenses.

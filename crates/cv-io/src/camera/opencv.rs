@@ -50,6 +50,8 @@ pub(super) const FORMAT: Format = Format {
     rig: Some(|text, given| rig(&load(text)?, given)),
     camera_text: Some(camera_text),
     rig_text: Some(rig_text),
+    array: None,
+    array_text: None,
 };
 
 fn camera(document: &Yaml<'_>, given: &Given) -> Result<Camera, FormatError> {

@@ -23,6 +23,8 @@ pub(super) const FORMAT: Format = Format {
     }),
     camera_text: Some(|camera, notes| as_xml(opencv::FORMAT.camera_text.map(|write| write(camera, &[])), notes)),
     rig_text: Some(|file, notes| as_xml(opencv::FORMAT.rig_text.map(|write| write(file, &[])), notes)),
+    array: None,
+    array_text: None,
 };
 
 /// An element: its name, its content, and what follows it. Comments and declarations are passed over; nothing is ever expanded.

@@ -1,18 +1,22 @@
-//! Our own YAML: `schema: cv-camera/1` and `schema: cv-rig/1`.
+//! Our own YAML: `schema: cv-camera/1`, `schema: cv-rig/1` of two cameras, `schema: cv-rig/2` of any number.
 
 use std::fmt::Write as _;
 
-use cv_core::{Camera, Distortion, DistortionModel, StereoRig};
+use cv_core::{Camera, Distortion, DistortionModel, Pose, StereoRig};
 use saphyr::Yaml;
 
-use super::RigFile;
 use super::format::{Format, comments, printable};
 use super::yaml::{get, load, number, numbers, pose, required, size_of};
+use super::{ArrayCamera, CameraArray, RigFile};
 use crate::FormatError;
 
 const NAME: &str = "cv-camera/1";
 const RIG: &str = "cv-rig/1";
 const CAMERA_KEYS: [&str; 9] = ["schema", "width", "height", "fx", "fy", "cx", "cy", "distortion", "coefficients"];
+const ARRAY: &str = "cv-rig/2";
+const ARRAY_KEYS: [&str; 3] = ["schema", "unit", "cameras"];
+/// What a camera of an array has beside what every camera has.
+const MOUNT_KEYS: [&str; 3] = ["name", "rotation", "translation"];
 const RIG_KEYS: [&str; 6] = ["schema", "unit", "left", "right", "rotation", "translation"];
 
 pub(super) const FORMAT: Format = Format {
@@ -22,21 +26,82 @@ pub(super) const FORMAT: Format = Format {
     rig: Some(|text, _| rig(&load(text)?)),
     camera_text: Some(camera_text),
     rig_text: Some(rig_text),
+    array: Some(|text, _| array(&load(text)?)),
+    array_text: Some(array_text),
 };
 
 fn camera(document: &Yaml<'_>) -> Result<Camera, FormatError> {
     schema(document, NAME)?;
+    known_keys(document, NAME, &CAMERA_KEYS)?;
     fields(document)
 }
 
 fn rig(document: &Yaml<'_>) -> Result<RigFile, FormatError> {
+    if schema(document, ARRAY).is_ok() {
+        let CameraArray { cameras, unit } = array(document)?;
+        let [left, right, ..] = cameras.as_slice() else {
+            return Err(FormatError::corrupt(ARRAY, "it has less than two cameras"));
+        };
+        let right_from_left = right.from_first.compose(&left.from_first.inverse());
+        return Ok(RigFile { rig: StereoRig { left: left.camera, right: right.camera, right_from_left }, unit });
+    }
     schema(document, RIG)?;
     known_keys(document, RIG, &RIG_KEYS)?;
-    let side = |key| get(document, &[key]).ok_or_else(|| FormatError::missing(RIG, key)).and_then(fields);
+    let side = |key| {
+        let map = get(document, &[key]).ok_or_else(|| FormatError::missing(RIG, key))?;
+        known_keys(map, NAME, &CAMERA_KEYS)?;
+        fields(map)
+    };
     let right_from_left =
         pose(RIG, required(document, RIG, &["rotation"])?, required(document, RIG, &["translation"])?)?;
     let unit = get(document, &["unit"]).and_then(|u| u.as_str()).unwrap_or("").to_owned();
     Ok(RigFile { rig: StereoRig { left: side("left")?, right: side("right")?, right_from_left }, unit })
+}
+
+/// Any number of cameras, of which the first gives the frame.
+fn array(document: &Yaml<'_>) -> Result<CameraArray, FormatError> {
+    schema(document, ARRAY)?;
+    known_keys(document, ARRAY, &ARRAY_KEYS)?;
+    let list = get(document, &["cameras"]).ok_or_else(|| FormatError::missing(ARRAY, "cameras"))?;
+    let list = list.as_sequence().ok_or_else(|| FormatError::corrupt(ARRAY, "cameras is not a list"))?;
+    let known: Vec<&str> = CAMERA_KEYS.iter().chain(&MOUNT_KEYS).copied().collect();
+    let one = |map: &Yaml<'_>| {
+        known_keys(map, ARRAY, &known)?;
+        let name = get(map, &["name"]).and_then(|n| n.as_str());
+        let name = name.ok_or_else(|| FormatError::missing(ARRAY, "name"))?.to_owned();
+        let from_first = pose(ARRAY, required(map, ARRAY, &["rotation"])?, required(map, ARRAY, &["translation"])?)?;
+        Ok(ArrayCamera { name, camera: fields(map)?, from_first })
+    };
+    let cameras = list.iter().map(one).collect::<Result<Vec<_>, FormatError>>()?;
+    // Numbers may be rounded.
+    let moved = |first: &ArrayCamera| (first.from_first.matrix() - Pose::identity().matrix()).norm() > 1e-6;
+    if cameras.first().is_some_and(moved) {
+        return Err(FormatError::corrupt(ARRAY, "the first camera is not where the frame is"));
+    }
+    let unit = get(document, &["unit"]).and_then(|u| u.as_str()).unwrap_or("").to_owned();
+    Ok(CameraArray { cameras, unit })
+}
+
+fn array_text(file: &CameraArray, notes: &[&str]) -> Result<String, FormatError> {
+    let mut text = comments(notes);
+    let _ = writeln!(text, "schema: {ARRAY}\nunit: \"{}\"", quotable(&file.unit));
+    text.push_str("# x_camera = rotation · x_first + translation, translation in the unit above\ncameras:\n");
+    for ArrayCamera { name, camera, from_first } in &file.cameras {
+        let _ = writeln!(text, "  - name: \"{}\"", quotable(name));
+        push_camera(&mut text, camera, "    ");
+        text.push_str("    rotation:\n");
+        for row in from_first.rotation.matrix().row_iter() {
+            let _ = writeln!(text, "      - [{:?}, {:?}, {:?}]", row[0], row[1], row[2]);
+        }
+        let t = &from_first.translation;
+        let _ = writeln!(text, "    translation: [{:?}, {:?}, {:?}]", t.x, t.y, t.z);
+    }
+    Ok(text)
+}
+
+/// What may stand between quotes.
+fn quotable(text: &str) -> String {
+    text.chars().filter(|&c| printable(c) && !matches!(c, '"' | '\\')).collect()
 }
 
 fn schema(document: &Yaml<'_>, expected: &'static str) -> Result<(), FormatError> {
@@ -57,7 +122,6 @@ fn known_keys(map: &Yaml<'_>, format: &'static str, known: &[&str]) -> Result<()
 }
 
 fn fields(map: &Yaml<'_>) -> Result<Camera, FormatError> {
-    known_keys(map, NAME, &CAMERA_KEYS)?;
     let entry = |key| get(map, &[key]).ok_or_else(|| FormatError::missing(NAME, key));
     let real = |key| {
         entry(key).and_then(|v| number(v).ok_or_else(|| FormatError::corrupt(NAME, format!("{key} is not a number"))))
@@ -101,8 +165,7 @@ fn camera_text(camera: &Camera, notes: &[&str]) -> Result<String, FormatError> {
 
 fn rig_text(file: &RigFile, notes: &[&str]) -> Result<String, FormatError> {
     let mut text = comments(notes);
-    let quoted: String = file.unit.chars().filter(|&c| printable(c) && !matches!(c, '"' | '\\')).collect();
-    let _ = writeln!(text, "schema: {RIG}\nunit: \"{quoted}\"\nleft:");
+    let _ = writeln!(text, "schema: {RIG}\nunit: \"{}\"\nleft:", quotable(&file.unit));
     push_camera(&mut text, &file.rig.left, "  ");
     text.push_str("right:\n");
     push_camera(&mut text, &file.rig.right, "  ");

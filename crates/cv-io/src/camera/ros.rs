@@ -18,6 +18,8 @@ pub(super) const FORMAT: Format = Format {
     rig: None,
     camera_text: Some(camera_text),
     rig_text: None,
+    array: None,
+    array_text: None,
 };
 
 fn camera_text(camera: &Camera, notes: &[&str]) -> Result<String, FormatError> {

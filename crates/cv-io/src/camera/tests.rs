@@ -260,6 +260,57 @@ prop_compose! {
     }
 }
 
+#[test]
+fn three_cameras_are_held_by_our_own_format_and_kalibr_alone() {
+    let camera = Camera {
+        distortion: Distortion::radial_tangential4([-0.2, 0.05, 0.001, 0.0]),
+        ..Camera::from_focal(640, 480, 500.0)
+    };
+    let mount = |turn: f64, x: f64| {
+        Pose::new(Rotation3::from_euler_angles(0.0, turn, 0.01 * x), Vector3::new(x, 0.002, 0.1 * turn))
+    };
+    let one = |name: &str, camera, from_first| ArrayCamera { name: name.to_owned(), camera, from_first };
+    let cameras = vec![
+        one("left", camera, Pose::identity()),
+        one("mid", Camera { cx: 300.5, ..camera }, mount(0.1, -0.25)),
+        one("far \"3\"", camera, mount(-0.2, -0.5)),
+    ];
+    let file = CameraArray { cameras, unit: "m".to_owned() };
+    let mut held = Vec::new();
+    for format in CalibrationFormat::all().filter(|f| f.writes_rigs()) {
+        let text = match format.array_text(&file, &["three"]) {
+            Ok(text) => text,
+            Err(error) => {
+                assert!(error.to_string().contains("a rig of 3 cameras, which own and kalibr hold"), "{error}");
+                continue;
+            }
+        };
+        held.push(format.name());
+        let back = parse_camera_array(&text).unwrap();
+        assert_eq!(back.unit, "m");
+        for (a, b) in back.cameras.iter().zip(&file.cameras) {
+            assert_eq!(a.camera, b.camera);
+            // Kalibr's motions are from one camera to the next: products of two rotations and lengths below one.
+            assert!((a.from_first.matrix() - b.from_first.matrix()).norm() < 1e-14, "{text}");
+        }
+        // A stereo rig is the first two.
+        let pair = parse_rig(&text, None).unwrap().rig;
+        assert!((pair.right_from_left.matrix() - file.cameras[1].from_first.matrix()).norm() < 1e-14);
+    }
+    assert_eq!(held, ["own", "kalibr"]);
+    let millimeters = CameraArray { unit: "mm".to_owned(), ..file.clone() };
+    let kalibr = CalibrationFormat::from_name("kalibr").unwrap();
+    assert!(kalibr.array_text(&millimeters, &[]).unwrap_err().to_string().contains("unit is mm"));
+    let own = CalibrationFormat::OWN.array_text(&file, &[]).unwrap();
+    for (from, to) in [
+        ("translation: [0.0, 0.0, 0.0]", "translation: [0.0, 0.5, 0.0]"),
+        ("name: \"mid\"", "nick: mid"),
+        ("cameras:", "kameras:"),
+    ] {
+        assert!(own.contains(from) && parse_camera_array(&own.replacen(from, to, 1)).is_err(), "{to}");
+    }
+}
+
 proptest! {
     #[test]
     fn a_camera_reads_back_to_the_bit(camera in cameras(), note in ".*") {

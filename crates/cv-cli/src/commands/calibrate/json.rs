@@ -1,15 +1,16 @@
 //! The JSON object of a calibration.
 
 use super::Job;
+use crate::boards::options;
 use crate::frame::Outcome;
 use crate::words::calibration::{lens, note, refusal};
 use serde_json::{Map, Value, json};
 
 /// Values of each camera under its name; of one camera its value.
 fn by_camera(job: &Job, of: impl Fn(usize) -> Value) -> Value {
-    match job.names {
+    match job.names.as_slice() {
         [_] => of(0),
-        names => Value::Object(names.iter().enumerate().map(|(c, name)| ((*name).to_owned(), of(c))).collect()),
+        names => Value::Object(names.iter().enumerate().map(|(c, name)| (name.clone(), of(c))).collect()),
     }
 }
 
@@ -20,9 +21,9 @@ pub(super) fn outcome(job: &Job) -> Outcome {
         let own = c.parameters.iter().filter(|p| p.camera == of);
         own.map(|p| (p.name.to_owned(), json!({ "value": p.value, "deviation": p.deviation }))).collect()
     };
-    let mut all = match job.names {
+    let mut all = match job.names.as_slice() {
         [_] => parameters(Some(0)),
-        names => names.iter().enumerate().map(|(i, n)| ((*n).to_owned(), parameters(Some(i)).into())).collect(),
+        names => names.iter().enumerate().map(|(i, n)| (n.clone(), parameters(Some(i)).into())).collect(),
     };
     let board = parameters(None);
     if !board.is_empty() {
@@ -48,11 +49,11 @@ pub(super) fn outcome(job: &Job) -> Outcome {
         })
     };
     let views: Vec<Value> = (0..c.views.len())
-        .map(|view| match job.names {
+        .map(|view| match job.names.as_slice() {
             [_] => picture(view, 0),
             names => {
                 let mut all: Map<String, Value> =
-                    names.iter().enumerate().map(|(i, name)| ((*name).to_owned(), picture(view, i))).collect();
+                    names.iter().enumerate().map(|(i, name)| (name.clone(), picture(view, i))).collect();
                 let used = found.refusals[view].iter().all(Option::is_none);
                 let corners = c.views[view].pictures.iter().flat_map(|p| &p.corners).filter(|c| c.used);
                 let (sum, n) =
@@ -88,7 +89,15 @@ pub(super) fn outcome(job: &Job) -> Outcome {
         .with("lens", by_camera(job, |i| json!(c.cameras[i].camera.distortion.model().info().name)))
         .with("lenses", by_camera(job, lenses))
         .with("parameters", all)
-        .with("board", json!({ "columns": found.board.columns, "rows": found.board.rows }))
+        .with(
+            "board",
+            json!({
+                "kind": found.board.kind().to_string(),
+                "columns": found.board.counts().0,
+                "rows": found.board.counts().1,
+                "options": options(&found.board),
+            }),
+        )
         .with("board_deflection", json!({ "x": c.target_shape.deflection[0], "y": c.target_shape.deflection[1], "adjusted": c.target_shape.adjusted }))
         .with("unit", &job.unit)
         .with(
@@ -102,10 +111,25 @@ pub(super) fn outcome(job: &Job) -> Outcome {
             "verdict",
             json!({
                 "trust": c.verdict.trust.to_string(),
-                "notes": c.verdict.notes.iter().map(|n| note(n, job.names)).collect::<Vec<_>>(),
+                "notes": c.verdict.notes.iter().map(|n| note(n, &job.names)).collect::<Vec<_>>(),
             }),
         )
-        .with(if job.names.len() == 1 { "images" } else { "pairs" }, views);
+        .with(
+            match job.names.len() {
+                1 => "images",
+                2 => "pairs",
+                _ => "views",
+            },
+            views,
+        );
+    if job.names.len() > 2 {
+        let rows = |i: usize| -> Vec<Vec<f64>> {
+            c.cameras[i].from_first.rotation.matrix().row_iter().map(|r| r.iter().copied().collect()).collect()
+        };
+        return outcome
+            .with("rotation", by_camera(job, |i| json!(rows(i))))
+            .with("translation", by_camera(job, |i| json!(c.cameras[i].from_first.translation.as_slice())));
+    }
     match c.stereo() {
         None => outcome,
         Some(rig) => outcome

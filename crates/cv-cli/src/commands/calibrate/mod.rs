@@ -1,28 +1,30 @@
-//! `cv calibrate`: cameras and rigs from photographs of a chessboard.
+//! `cv calibrate`: cameras and rigs from photographs of a board.
 
 mod json;
 mod report;
 
 use super::depth::pairing::{PairBy, join};
+use crate::boards::{BoardArgs, told};
 use crate::frame::{
     Context, Failure, Global, Outcome, Output, Run, Step, YAML, expand_images, named, spare_inputs, steps,
 };
 use crate::words::calibration::{no_calibration, note, refusal};
 use cv_core::GrayF32;
-use cv_io::{IoError, RigFile};
-use cv_pipeline::calibration::{BoardSize, CalibrateOptions, LensChoice};
+use cv_io::{ArrayCamera, CameraArray, IoError, RigFile};
+use cv_pipeline::calibration::{CalibrateOptions, LensChoice};
 use cv_pipeline::{BoardCalibration, BoardCalibrationError, BoardCalibrationOptions, PhotoRefusal, calibrate};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
-/// Calibrate a camera, or the two cameras of a rig, from photographs of a chessboard.
+/// Calibrate a camera, or the cameras of a rig, from photographs of a board (chessboard, ChArUco, ArUco grid, AprilGrid).
 ///
 /// Finds the board, chooses the lens model, adjusts lenses, poses and the shape of the board together, leaves out what does not fit and says why, and tells how far
 /// the result can be trusted and what to photograph next.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv calibrate mono --board 9x6 --square 25 photos/*.jpg -o camera.yaml --report out\n  \
-    cv calibrate stereo --board 9x6 --square 25 --left left --right right -o rig.yaml")]
+    cv calibrate stereo --board 9x6 --square 25 --left left --right right -o rig.yaml\n  \
+    cv calibrate rig --kind aprilgrid --board 6x6 --marker 45 --cameras left right third -o rig.yaml")]
 pub(crate) struct Args {
     #[command(subcommand)]
     what: What,
@@ -32,18 +34,15 @@ pub(crate) struct Args {
 enum What {
     Mono(Mono),
     Stereo(Stereo),
+    Rig(Rig),
 }
 
 /// The board, and how cameras are fitted to it.
 #[derive(Debug, clap::Args)]
 struct Board {
-    /// Inner corners of the board, columns by rows: 9x6 for a board of 10 by 7 squares. `auto`: what most photographs show.
-    #[arg(long, value_name = "CxR|auto", default_value = "auto", value_parser = parse_board)]
-    board: Size,
-    /// Side of a square [default: 1, and distances are in squares].
-    #[arg(long, value_name = "LENGTH")]
-    square: Option<f64>,
-    /// Unit of --square.
+    #[command(flatten)]
+    board: BoardArgs,
+    /// Unit of --square and --marker; without them distances are in squares.
     #[arg(long, value_name = "UNIT", default_value = "mm", value_parser = ["mm", "cm", "m"])]
     unit: String,
     /// Lens model.
@@ -57,40 +56,20 @@ struct Board {
     outliers: f64,
 }
 
-/// A size, or that it is to be found.
-#[derive(Debug, Clone, Copy)]
-struct Size(Option<BoardSize>);
-
-fn parse_board(text: &str) -> Result<Size, String> {
-    if text == "auto" {
-        return Ok(Size(None));
-    }
-    let sides = text.split_once(['x', '×']).and_then(|(c, r)| Some(BoardSize::new(c.parse().ok()?, r.parse().ok()?)));
-    let valid = sides.filter(|size| size.is_valid()).map(|size| Size(Some(size)));
-    valid.ok_or_else(|| {
-        format!("give the inner corners as 9x6, {} to {} on a side, or auto", BoardSize::LEAST, BoardSize::MOST)
-    })
-}
-
 impl Board {
-    fn options(&self) -> BoardCalibrationOptions {
+    fn options(&self) -> Result<BoardCalibrationOptions, Failure> {
         let solve = CalibrateOptions {
             lens: self.lens,
             board_shape: !self.flat,
             outlier_deviations: self.outliers,
             ..CalibrateOptions::default()
         };
-        BoardCalibrationOptions {
-            board: self.board.0,
-            square: self.square.unwrap_or(1.0),
-            solve,
-            ..BoardCalibrationOptions::default()
-        }
+        Ok(BoardCalibrationOptions { board: self.board.choice()?, solve, ..BoardCalibrationOptions::default() })
     }
 
     /// The unit of distances.
     fn unit(&self) -> &str {
-        if self.square.is_some() { &self.unit } else { "squares" }
+        if self.board.has_lengths() { &self.unit } else { "squares" }
     }
 }
 
@@ -98,7 +77,9 @@ impl Board {
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv calibrate mono --board 9x6 --square 25 photos -o camera.yaml\n  \
-    cv calibrate mono photos/*.jpg -o camera.yaml --lens fisheye4 --report out")]
+    cv calibrate mono photos/*.jpg -o camera.yaml --lens fisheye4 --report out\n  \
+    cv calibrate mono --kind charuco --board 7x5 --square 35 --marker 26 photos -o camera.yaml\n  \
+    cv calibrate mono --kind aprilgrid --board 6x6 --marker 45 photos -o camera.yaml")]
 struct Mono {
     /// Photographs of the board, or folders or quoted patterns of them.
     #[arg(required = true, value_name = "IMAGES")]
@@ -134,11 +115,34 @@ struct Stereo {
     output: PathBuf,
 }
 
+/// Calibrate two or more cameras that are fixed to each other.
+///
+/// Photographs of one moment are told by the same name, or by the last number in the name. A camera need not share moments with the first one, only with another that does. Two
+/// cameras are written as by `cv calibrate stereo`; what more than two are written to, `cv calibration convert` takes to Kalibr.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cv calibrate rig --board 9x6 --square 25 --cameras left right third -o rig.yaml\n  \
+    cv calibrate rig --kind aprilgrid --board 6x6 --marker 0.045 --unit m --cameras 'cam0/*.png' 'cam1/*.png' 'cam2/*.png' -o rig.yaml")]
+struct Rig {
+    /// The photographs of each camera: a folder or a quoted pattern for each, the first camera's first.
+    #[arg(long, value_name = "FOLDER", num_args = 1.., required = true)]
+    cameras: Vec<PathBuf>,
+    /// How photographs are put together [default: by name where the names are the same, else by number].
+    #[arg(long, value_name = "HOW", value_parser = named::<PairBy>())]
+    pair_by: Option<PairBy>,
+    #[command(flatten)]
+    board: Board,
+    /// Where to write the rig.
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+}
+
 impl Run for Args {
     fn outputs(&self) -> Vec<Output<'_>> {
         match &self.what {
             What::Mono(args) => vec![Output::File(&args.output, YAML)],
             What::Stereo(args) => vec![Output::File(&args.output, YAML)],
+            What::Rig(args) => vec![Output::File(&args.output, YAML)],
         }
     }
 
@@ -154,6 +158,7 @@ impl Run for Args {
         match self.what {
             What::Mono(args) => args.run(context),
             What::Stereo(args) => args.run(context),
+            What::Rig(args) => args.run(context),
         }
     }
 }
@@ -165,7 +170,8 @@ type Views = Vec<Vec<Option<PathBuf>>>;
 struct Job {
     found: BoardCalibration,
     views: Views,
-    names: &'static [&'static str],
+    /// Of the cameras.
+    names: Vec<String>,
     unit: String,
 }
 
@@ -173,7 +179,7 @@ impl Mono {
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
         let images = expand_images(&self.images)?;
         let views: Views = images.into_iter().map(|path| vec![Some(path)]).collect();
-        let job = work(views, &["camera"], &self.board, &self.output, context)?;
+        let job = work(views, vec!["camera".to_owned()], &self.board, &self.output, context)?;
         let camera = &job.found.calibration.cameras[0].camera;
         let notes = job.origin();
         context.write(Output::File(&self.output, YAML), |path| cv_io::write_camera(path, camera, &[&notes]))?;
@@ -183,31 +189,57 @@ impl Mono {
 
 impl Stereo {
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
-        let views = join(&expand_images(&self.left)?, &expand_images(&self.right)?, self.pair_by)?;
-        let views: Views = views.into_iter().map(|(left, right)| vec![left, right]).collect();
+        let images = [expand_images(&self.left)?, expand_images(&self.right)?];
+        let views = join(&images, self.pair_by)?;
         let alone = views.iter().filter(|view| view.iter().any(Option::is_none)).count();
         if alone > 0 {
             context.note(format!("{alone} photographs have no partner and serve for their own camera only"));
         }
-        let job = work(views, &["left", "right"], &self.board, &self.output, context)?;
-        let Some(rig) = job.found.calibration.stereo() else { return Err(Failure::new("there is no rig")) };
-        let notes = job.origin();
-        let file = RigFile { rig, unit: job.unit.clone() };
-        context.write(Output::File(&self.output, YAML), |path| cv_io::write_rig(path, &file, &[&notes]))?;
+        let names = ["left", "right"].map(str::to_owned).to_vec();
+        let job = work(views, names, &self.board, &self.output, context)?;
+        job.write(&self.output, context)?;
+        job.finish(context)
+    }
+}
+
+impl Rig {
+    fn run(self, context: &Context) -> Result<Outcome, Failure> {
+        let count = self.cameras.len();
+        if count < 2 {
+            return Err(Failure::usage("a rig has two cameras or more, and one is given")
+                .advice("a folder for each camera, --cameras left right third, or `cv calibrate mono`"));
+        }
+        let images: Vec<Vec<PathBuf>> =
+            self.cameras.iter().map(|of| expand_images(std::slice::from_ref(of))).collect::<Result<_, _>>()?;
+        let views = join(&images, self.pair_by)?;
+        let alone = views.iter().filter(|view| view.iter().flatten().count() < 2).count();
+        if alone > 0 {
+            context.note(format!(
+                "{alone} photographs are the only ones of their moment and serve for their own camera only"
+            ));
+        }
+        // The folders' names, where they tell cameras apart.
+        let mut names: Vec<String> = (self.cameras.iter())
+            .map(|path| path.file_name().filter(|_| path.is_dir()).unwrap_or_default().to_string_lossy().into_owned())
+            .collect();
+        let told = |name: &String| {
+            let plain = name.chars().all(|c| c.is_ascii_alphanumeric() || "_-".contains(c));
+            plain && !name.is_empty() && names.iter().filter(|other| *other == name).count() == 1
+        };
+        if !names.iter().all(told) {
+            names = (0..count).map(|i| format!("cam{i}")).collect();
+        }
+        let job = work(views, names, &self.board, &self.output, context)?;
+        job.write(&self.output, context)?;
         job.finish(context)
     }
 }
 
 /// Reads photographs one after the other, finds the boards and calibrates.
-fn work(
-    views: Views,
-    names: &'static [&'static str],
-    board: &Board,
-    output: &Path,
-    context: &Context,
-) -> Result<Job, Failure> {
+fn work(views: Views, names: Vec<String>, board: &Board, output: &Path, context: &Context) -> Result<Job, Failure> {
     let inputs: Vec<&Path> = views.iter().flatten().flatten().map(PathBuf::as_path).collect();
     spare_inputs(&[output.to_owned()], &inputs)?;
+    let options = board.options()?;
     let unreadable: Mutex<Vec<(usize, usize, IoError)>> = Mutex::default();
     let photo = |view: usize, camera: usize| -> Option<GrayF32> {
         let path = views[view][camera].as_ref()?;
@@ -219,7 +251,7 @@ fn work(
             }
         }
     };
-    let found = calibrate((views.len(), names.len()), photo, &board.options(), context);
+    let found = calibrate((views.len(), names.len()), photo, &options, context);
     let mut unreadable = unreadable.into_inner().unwrap_or_else(PoisonError::into_inner);
     unreadable.sort_by_key(|(view, camera, _)| (*view, *camera));
     if let Some((_, _, error)) = unreadable.into_iter().next() {
@@ -234,7 +266,7 @@ fn work(
                 }
                 _ => String::new(),
             };
-            Err(no_calibration(error, names, &reasons))
+            Err(no_calibration(error, &names, &reasons))
         }
     }
 }
@@ -266,9 +298,29 @@ impl Job {
             format!(", {:.3} px on views that had no part in the fit", c.holdout_rms_px)
         };
         format!(
-            "calibrated from {used} views of a board of {} corners; rms {:.3} px{holdout}",
-            self.found.board, c.rms_px
+            "calibrated from {used} views of a {}; rms {:.3} px{holdout}",
+            told(&self.found.board, &self.unit),
+            c.rms_px
         )
+    }
+
+    /// Writes the rig: of two cameras as a stereo rig, which all of the program takes.
+    fn write(&self, output: &Path, context: &Context) -> Result<(), Failure> {
+        let (c, notes, unit) = (&self.found.calibration, self.origin(), self.unit.clone());
+        let output = Output::File(output, YAML);
+        match c.stereo().filter(|_| c.cameras.len() == 2) {
+            Some(rig) => {
+                let file = RigFile { rig, unit };
+                context.write(output, |path| cv_io::write_rig(path, &file, &[&notes]))
+            }
+            None => {
+                let cameras = (c.cameras.iter().zip(&self.names))
+                    .map(|(c, name)| ArrayCamera { name: name.clone(), camera: c.camera, from_first: c.from_first })
+                    .collect();
+                let file = CameraArray { cameras, unit };
+                context.write(output, |path| cv_io::write_camera_array(path, &file, &[&notes]))
+            }
+        }
     }
 
     /// The path of a photograph.
@@ -288,7 +340,7 @@ impl Job {
         }
         context.report(|| report::report(self))?;
         let mut summary = Vec::new();
-        for (camera, name) in c.cameras.iter().zip(self.names) {
+        for (camera, name) in c.cameras.iter().zip(&self.names) {
             let whose = if self.names.len() > 1 { format!("{name}: ") } else { String::new() };
             let holdout = if camera.holdout_rms_px.is_nan() {
                 String::new()
@@ -303,7 +355,11 @@ impl Job {
                 camera.uncertainty.median(),
             ));
         }
-        if let Some(rig) = c.stereo() {
+        for (camera, name) in c.cameras.iter().zip(&self.names).skip(1).filter(|_| c.cameras.len() > 2) {
+            let (far, first) = (camera.from_first.inverse().translation.norm(), &self.names[0]);
+            summary.push(format!("{name}: {far:.4} {} from {first}", self.unit));
+        }
+        if let Some(rig) = c.stereo().filter(|_| c.cameras.len() == 2) {
             let rows = self
                 .found
                 .rectified_dy_px
@@ -312,21 +368,7 @@ impl Job {
         }
         let used = c.views.iter().filter(|v| v.pose.is_some()).count();
         summary.push(format!("{used} of {} views used; the calibration is {}", c.views.len(), c.verdict.trust));
-        summary.extend(c.verdict.notes.iter().map(|n| format!("  {}", note(n, self.names))));
+        summary.extend(c.verdict.notes.iter().map(|n| format!("  {}", note(n, &self.names))));
         Ok(json::outcome(self).summary(summary.join("\n")))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn sizes_of_boards_are_two_numbers_or_auto() {
-        assert_eq!(parse_board("9x6").unwrap().0, Some(BoardSize::new(9, 6)));
-        assert_eq!(parse_board("auto").unwrap().0, None);
-        for text in ["9", "9x", "2x6", "x", "9x6x2", "-9x6", "999x6"] {
-            assert!(parse_board(text).is_err(), "{text}");
-        }
     }
 }

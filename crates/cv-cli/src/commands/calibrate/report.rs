@@ -34,12 +34,12 @@ pub(super) fn report(job: &Job) -> Result<Report, Failure> {
     }
     for n in &c.verdict.notes {
         let kind = if c.verdict.trust == Trust::Poor { Note::Warning } else { Note::Info };
-        page.note(kind, &capital(&note(n, job.names)));
+        page.note(kind, &capital(&note(n, &job.names)));
     }
     for (i, camera) in c.cameras.iter().enumerate() {
-        let title = match job.names {
+        let title = match job.names.as_slice() {
             [_] => "Camera".to_owned(),
-            names => format!("{} camera", capital(names[i])),
+            names => format!("{} camera", capital(&names[i])),
         };
         page.section(&title);
         of_camera(&mut page, job, i, camera)?;
@@ -228,7 +228,7 @@ fn pair(page: &mut Report, job: &Job) -> Result<(), Failure> {
 fn parameters(page: &mut Report, job: &Job) {
     let c = &job.found.calibration;
     page.section("Parameters");
-    let whose = |camera: Option<usize>| camera.map_or("board", |i| job.names[i]).to_owned();
+    let whose = |camera: Option<usize>| camera.map_or_else(|| "board".to_owned(), |i| job.names[i].clone());
     let rows: Vec<[String; 4]> = c
         .parameters
         .iter()

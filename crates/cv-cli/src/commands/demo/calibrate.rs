@@ -5,7 +5,7 @@ use crate::frame::Failure;
 use crate::words::calibration::no_calibration;
 use cv_core::{Camera, Distortion, GrayF32, Pose, RgbU8, Rotation3, Vector3, luma_u8};
 use cv_pipeline::calibration::{BoardSize, CalibrateOptions, LensChoice};
-use cv_pipeline::{BoardCalibrationOptions, calibrate};
+use cv_pipeline::{BoardCalibrationOptions, BoardChoice, calibrate};
 use cv_synth::{RenderOptions, Sheet, Texture};
 
 /// Inner corners of the board, and the side of a square in meters.
@@ -63,8 +63,8 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
         photos.push(pair);
     }
     let solve = CalibrateOptions { lens: LensChoice::RadialTangential4, ..CalibrateOptions::default() };
-    let options =
-        BoardCalibrationOptions { board: Some(BOARD), square: SQUARE, solve, ..BoardCalibrationOptions::default() };
+    let board = BoardChoice::chessboard(Some(BOARD), SQUARE);
+    let options = BoardCalibrationOptions { board, solve, ..BoardCalibrationOptions::default() };
     let source = |view: usize, camera: usize| Some(gray(&photos[view][camera]));
     let found = match calibrate((PAIRS, 2), source, &options, demo.context) {
         Ok(found) => found,

@@ -41,43 +41,51 @@ pub(in crate::commands) fn pair(
     }
 }
 
-/// A frame of the left camera, one of the right camera, or both of one moment.
-pub(in crate::commands) type Moment = (Option<PathBuf>, Option<PathBuf>);
+/// The frames of one moment, by camera.
+pub(in crate::commands) type Moment = Vec<Option<PathBuf>>;
 
-/// As [`pair`], but frames without a partner stand alone: those of the left camera in their order, then those of the right one that are left.
-pub(in crate::commands) fn join(
-    lefts: &[PathBuf],
-    rights: &[PathBuf],
-    by: Option<PairBy>,
-) -> Result<Vec<Moment>, Failure> {
-    let both = |pairs: Vec<(PathBuf, PathBuf)>| pairs.into_iter().map(|(l, r)| (Some(l), Some(r))).collect();
-    let reason = match pair(lefts, rights, by) {
-        Ok(pairs) => return Ok(both(pairs)),
-        Err(reason) => reason,
-    };
+/// As [`pair`], but of any number of cameras, and frames that other cameras do not have stand alone: moments of the first camera in its order, then those of the
+/// second that are left, and so on.
+pub(in crate::commands) fn join(cameras: &[Vec<PathBuf>], by: Option<PairBy>) -> Result<Vec<Moment>, Failure> {
     let shared = |key: &dyn Fn(&Path) -> Option<String>| -> Option<Vec<Moment>> {
-        let keys = |frames: &[PathBuf]| -> Option<BTreeMap<String, PathBuf>> {
+        let keys = |frames: &Vec<PathBuf>| -> Option<BTreeMap<String, PathBuf>> {
             let found: BTreeMap<String, PathBuf> =
                 frames.iter().map(|f| Some((key(f)?, f.clone()))).collect::<Option<_>>()?;
             (found.len() == frames.len()).then_some(found)
         };
-        let (left, mut right) = (keys(lefts)?, keys(rights)?);
-        if !left.keys().any(|k| right.contains_key(k)) {
+        let found: Vec<BTreeMap<String, PathBuf>> = cameras.iter().map(keys).collect::<Option<_>>()?;
+        // Every camera has a moment with another one.
+        let joined = |i: usize| found[i].keys().any(|k| found.iter().filter(|of| of.contains_key(k)).count() > 1);
+        if !(0..found.len()).all(joined) {
             return None;
         }
-        let mut moments: Vec<Moment> =
-            lefts.iter().map(|frame| (Some(frame.clone()), key(frame).and_then(|k| right.remove(&k)))).collect();
-        let rest = rights.iter().filter(|f| key(f).is_some_and(|k| right.contains_key(&k)));
-        moments.extend(rest.map(|frame| (None, Some(frame.clone()))));
-        Some(moments)
+        let mut seen = std::collections::BTreeSet::new();
+        let order = cameras.iter().flatten().filter_map(|frame| key(frame)).filter(|k| seen.insert(k.clone()));
+        Some(order.map(|k| found.iter().map(|of| of.get(&k).cloned()).collect()).collect())
+    };
+    let (Some(first), Some(second)) = (cameras.first(), cameras.get(1)) else {
+        return Err(Failure::usage("frames of two cameras or more are needed"));
     };
     let joined = match by {
-        Some(PairBy::Order) => None,
+        Some(PairBy::Order) => {
+            // All have as many as the first.
+            for other in &cameras[1..] {
+                in_order(first, other)?;
+            }
+            let moment = |i: usize| cameras.iter().map(|of| of.get(i).cloned()).collect();
+            return Ok((0..first.len()).map(moment).collect());
+        }
         Some(PairBy::Name) => shared(&name),
         Some(PairBy::Number) => shared(&number),
         None => shared(&name).or_else(|| shared(&number)),
     };
-    joined.ok_or(reason)
+    // Why two of them cannot be paired is the best reason.
+    joined.ok_or_else(|| {
+        let others = cameras[1..].iter().find_map(|other| pair(first, other, by).err());
+        others
+            .or_else(|| pair(first, second, by).err())
+            .unwrap_or_else(|| Failure::new("no two cameras have a frame of the same moment"))
+    })
 }
 
 fn in_order(lefts: &[PathBuf], rights: &[PathBuf]) -> Result<Vec<(PathBuf, PathBuf)>, Failure> {
@@ -184,8 +192,9 @@ mod tests {
     fn frames_without_a_partner_can_stand_alone() {
         let joined = |left: &[&str], right: &[&str], by| {
             let text = |path: Option<PathBuf>| path.map(|p| p.display().to_string()).unwrap_or_default();
-            let found = join(&paths(left), &paths(right), by);
-            found.map(|all| all.into_iter().map(|(a, b)| (text(a), text(b))).collect::<Vec<_>>()).map_err(|f| f.text())
+            let found = join(&[paths(left), paths(right)], by);
+            let both = |all: Moment| (text(all[0].clone()), text(all[1].clone()));
+            found.map(|all| all.into_iter().map(both).collect::<Vec<_>>()).map_err(|f| f.text())
         };
         let own = |list: &[(&str, &str)]| {
             list.iter().map(|(a, b)| ((*a).into(), (*b).into())).collect::<Vec<(String, String)>>()
@@ -195,6 +204,22 @@ mod tests {
         assert_eq!(joined(&["l/a.png"], &["r/a.png"], None).unwrap(), own(&[("l/a.png", "r/a.png")]));
         assert!(joined(&["left1.png"], &["right2.png"], None).unwrap_err().contains("left1.png"));
         assert!(joined(&["a1.png", "b1.png"], &["c1.png"], None).is_err());
+    }
+
+    #[test]
+    fn frames_of_three_cameras_are_put_together_by_moments() {
+        let frames = [paths(&["a/1.png", "a/2.png"]), paths(&["b/2.png", "b/3.png"]), paths(&["c/3.png", "c/1.png"])];
+        let found = join(&frames, None).unwrap();
+        let seen: Vec<Vec<bool>> = found.iter().map(|moment| moment.iter().map(Option::is_some).collect()).collect();
+        assert_eq!(seen, [[true, false, true], [true, true, false], [false, true, true]]);
+        assert_eq!(found[2][2].as_deref(), Some(Path::new("c/3.png")));
+        // The third shares nothing with anyone.
+        let alone = join(&[frames[0].clone(), frames[0].clone(), paths(&["c/9.png"])], None);
+        assert!(alone.unwrap_err().text().contains("c/9.png"));
+        assert!(
+            join(&[paths(&["1.png"]), paths(&["x.png"]), paths(&["y.png", "z.png"])], Some(PairBy::Order)).is_err()
+        );
+        assert!(join(&frames[..1], None).is_err());
     }
 
     #[test]
