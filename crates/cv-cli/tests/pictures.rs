@@ -97,7 +97,13 @@ fn tiny_and_featureless_pictures_get_an_answer() {
                 let mut inputs = good.clone();
                 match inputs.get_mut(place) {
                     Some(input) => input.clone_from(&(*name).to_owned()),
-                    None => inputs.fill((*name).to_owned()),
+                    // Each in a file of its own: the same file twice is wrong usage where each has a result.
+                    None => {
+                        for (i, input) in inputs.iter_mut().enumerate() {
+                            *input = format!("{i}-{name}");
+                            cv_io::write_png(folder.path().join(&input), picture.view()).unwrap();
+                        }
+                    }
                 }
                 // `run` holds that the program does not stop at a bug of its own.
                 let ran = run(folder.path(), &strs(&job.args(&inputs)));
