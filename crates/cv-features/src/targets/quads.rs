@@ -5,7 +5,7 @@
 //! until four are left. Then each side is a straight line through the steps from white to black along it. Time: pixels, and corners of hulls squared.
 
 use cv_core::{Cancelled, GrayF32, ImageView, Mask, Point2, Stage, Vector2};
-use cv_imgproc::{Connectivity, connected_components, pyr_down, sample_bilinear};
+use cv_imgproc::{Connectivity, StructuringElement, connected_components, erode, pyr_down, sample_bilinear};
 use rayon::prelude::*;
 
 /// Pixels that are looked at for black regions; a larger picture is halved before, and its sides are then taken from the whole one.
@@ -44,11 +44,7 @@ pub(super) fn quads(
     stage.check()?;
     let mut rough = regions(black.view());
     // Once more without the rim of what is black: markers that touch each other, or a black square, at a corner come apart.
-    let apart = Mask::from_fn(black.width(), black.height(), |x, y| {
-        let around = |i: usize, n: usize| i.saturating_sub(1)..=(i + 1).min(n - 1);
-        let mut near = around(y, black.height()).flat_map(|j| around(x, black.width()).map(move |i| (i, j)));
-        [black.at(x, y)[0] && near.all(|(i, j)| black.at(i, j)[0])]
-    });
+    let apart = erode(black.view(), &StructuringElement::square(1));
     stage.check()?;
     rough.extend(regions(apart.view()));
     let exact: Vec<Option<[Point2<f64>; 4]>> = rough
