@@ -44,6 +44,7 @@ mod reconstruct;
 mod rectify;
 mod rig_depth;
 mod segment;
+mod sfm;
 
 pub use advice::Advice;
 pub use axes::Axes;
@@ -89,6 +90,7 @@ pub use reconstruct::{
 pub use rectify::{RectifyResult, rectify};
 pub use rig_depth::{RigDepthResult, depth_by_rig};
 pub use segment::{DetectResult, SegmentResult, SegmentTraining, detect, segment, train_segment};
+pub use sfm::{SfmCamera, SfmJobError, SfmJobOptions, SfmPhoto, SfmResult, sfm, sfm_photo};
 
 /// What a caller of [`depth()`] needs of the stereo stage: its options and results, rectification, geometry and scores.
 pub mod stereo {
@@ -108,6 +110,11 @@ pub mod segmentation {
         Labeled, MIN_SCORE, ObjectStatistics, Region, Regions, Rule, SegmentError, ShapeStatistics, TrainOptions,
         Trained,
     };
+}
+
+/// What a caller of [`sfm()`] needs of many views: what is known of cameras, options, models.
+pub mod many_views {
+    pub use cv_sfm::*;
 }
 
 /// What a caller of [`calibrate()`] needs of targets and of calibration: sizes of boards, options, results, verdicts.

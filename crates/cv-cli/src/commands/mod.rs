@@ -68,6 +68,7 @@ mod panorama;
 mod reconstruct;
 mod rectify;
 mod segment;
+mod sfm;
 mod undistort;
 
 /// For `value_parser`: a width and a height in pixels, each from 1 to 16384, as `640x480`.
@@ -112,6 +113,7 @@ subcommands! {
     Match(match_::Args),
     Estimate(estimate::Args),
     Reconstruct(reconstruct::Args),
+    Sfm(sfm::Args),
     Depth(depth::Args),
     Rectify(rectify::Args),
     Board(board::Args),

@@ -33,5 +33,8 @@ steps! {
     SCORE = "score": ["score"];
     BOARDS = "boards": ["boards"];
     LENS = "lens": ["start", "lens"];
+    PHOTOGRAPHS = "photographs": ["photographs"];
+    PAIRS = "pairs": ["match"];
+    MODEL = "model": ["register"];
     DEMO = "demo": ["demo"];
 }

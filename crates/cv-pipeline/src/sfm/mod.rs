@@ -1,0 +1,148 @@
+//! Cameras and points from many photographs.
+
+mod model;
+mod pairs;
+mod photo;
+
+pub use photo::{SfmPhoto, sfm_photo};
+
+use crate::{MatchingOptions, Progress};
+use cv_core::{Camera, Cancelled, Keypoint, OptionError, StageClock};
+use cv_sfm::{
+    CameraKnowledge, PairMatches, SfmError, SfmInput, SfmModel, SfmView, ViewOutcome, ViewPairModel, ViewPairOptions,
+    reconstruct_views,
+};
+
+/// Settings of [`sfm`].
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
+pub struct SfmJobOptions {
+    /// Features and matches. Default SIFT, 12,000 in a photograph at most.
+    pub matching: MatchingOptions,
+    /// Features of the largest scale that a pair is tried with first. Default 2,048.
+    pub first_features: usize,
+    /// Which pairs of photographs hold.
+    pub pairs: ViewPairOptions,
+    /// The solution.
+    pub solve: cv_sfm::SfmOptions,
+}
+
+impl Default for SfmJobOptions {
+    fn default() -> Self {
+        let matching = MatchingOptions::default();
+        let matching = MatchingOptions { features: matching.features.clone().at_most(12_000), ..matching };
+        Self { matching, first_features: 2048, pairs: ViewPairOptions::default(), solve: cv_sfm::SfmOptions::default() }
+    }
+}
+
+/// A camera of some photographs.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct SfmCamera {
+    /// Size, and parameters as far as they are known.
+    pub camera: Camera,
+    /// What is known of it.
+    pub knowledge: CameraKnowledge,
+}
+
+/// What [`sfm`] found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SfmResult {
+    /// The models, the one with most photographs first.
+    pub models: Vec<SfmModel>,
+    /// What became of each photograph.
+    pub outcomes: Vec<ViewOutcome>,
+    /// The pairs of photographs that hold, and their matches.
+    pub pairs: Vec<PairMatches>,
+    /// Stage names and their seconds.
+    pub stages: Vec<(&'static str, f64)>,
+}
+
+/// Why many photographs could not be reconstructed.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum SfmJobError {
+    /// A photograph has another size than its camera.
+    #[error("photograph {index} has {photo:?} pixels where its camera has {camera:?}")]
+    CameraSize {
+        /// Index of the photograph.
+        index: usize,
+        /// Its width and height.
+        photo: (usize, usize),
+        /// The camera's.
+        camera: (usize, usize),
+    },
+    /// A photograph names a camera that there is not.
+    #[error("photograph {index} names camera {camera} of {cameras}")]
+    NoCamera {
+        /// Index of the photograph.
+        index: usize,
+        /// Index of the camera.
+        camera: usize,
+        /// Number of cameras.
+        cameras: usize,
+    },
+    /// No two photographs show the same.
+    #[error("of {photos} photographs no two show enough of the same")]
+    NoPairs {
+        /// Number of photographs.
+        photos: usize,
+    },
+    /// The pairs give no model.
+    #[error(transparent)]
+    Solve(SfmError),
+    /// An option is outside its range.
+    #[error(transparent)]
+    Option(#[from] OptionError),
+    /// The job was stopped by its progress callback.
+    #[error("stopped")]
+    Cancelled(#[from] Cancelled),
+}
+
+impl From<SfmError> for SfmJobError {
+    fn from(error: SfmError) -> Self {
+        match error {
+            SfmError::Cancelled(stop) => Self::Cancelled(stop),
+            other => Self::Solve(other),
+        }
+    }
+}
+
+/// Reconstructs cameras and points from the features of many photographs ([`sfm_photo`]): pairs that hold, then [`reconstruct_views`].
+///
+/// # Errors
+/// [`SfmJobError`].
+pub fn sfm(
+    photos: &[SfmPhoto],
+    cameras: &[SfmCamera],
+    options: &SfmJobOptions,
+    progress: &dyn Progress,
+) -> Result<SfmResult, SfmJobError> {
+    for (index, photo) in photos.iter().enumerate() {
+        let Some(SfmCamera { camera, .. }) = cameras.get(photo.camera) else {
+            return Err(SfmJobError::NoCamera { index, camera: photo.camera, cameras: cameras.len() });
+        };
+        if photo.size != (camera.width, camera.height) {
+            return Err(SfmJobError::CameraSize { index, photo: photo.size, camera: (camera.width, camera.height) });
+        }
+    }
+    let mut clock = StageClock::new();
+    let (pairs, geometry): (Vec<PairMatches>, Vec<ViewPairModel>) =
+        pairs::match_pairs(photos, cameras, options, progress)?.into_iter().unzip();
+    clock.lap("match");
+    if pairs.is_empty() {
+        return Err(SfmJobError::NoPairs { photos: photos.len() });
+    }
+    let views: Vec<SfmView<'_>> =
+        photos.iter().map(|p| SfmView { camera: p.camera, keypoints: keypoints(p) }).collect();
+    let (lenses, knowledge): (Vec<Camera>, Vec<CameraKnowledge>) =
+        cameras.iter().map(|c| (c.camera, c.knowledge)).unzip();
+    let input = SfmInput { views: &views, cameras: &lenses, knowledge: &knowledge, pairs: &pairs, geometry: &geometry };
+    let found = reconstruct_views(&input, &options.solve, progress)?;
+    clock.lap("solve");
+    Ok(SfmResult { models: found.models, outcomes: found.views, pairs, stages: clock.into_stages() })
+}
+
+fn keypoints(photo: &SfmPhoto) -> &[Keypoint] {
+    &photo.features.keypoints
+}

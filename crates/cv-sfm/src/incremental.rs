@@ -1,0 +1,367 @@
+//! Incremental reconstruction: from two views on, one view after the other (Snavely, Seitz & Szeliski, "Photo tourism", 2006; Schönberger & Frahm, "Structure-from-motion
+//! revisited", CVPR 2016).
+
+use crate::bundle::{BundlePlan, LensFreedom, adjust};
+use crate::focal_length::focal_length;
+use crate::initial_pair::{Start, initial_pairs};
+use crate::model::{SfmModel, ViewOutcome};
+use crate::registration::{Registration, register, visible};
+use crate::scene::Scene;
+use crate::triangulate_track::{PointLimits, update_tracks};
+use crate::{CameraKnowledge, PairMatches, SfmView, Tracks, ViewPairModel};
+use cv_core::{Camera, Cancelled, OptionError, Pose, Progress, Stage, quantile};
+
+/// Settings of [`reconstruct_views`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(default))]
+pub struct SfmOptions {
+    /// Largest reprojection error of an observation that agrees with its point, in pixels. Default 4, COLMAP's.
+    pub max_error: f64,
+    /// Smallest angle between two rays of a point, in radians. Default 1.5 degrees, COLMAP's.
+    pub min_angle: f64,
+    /// Fewest points that must agree with the pose of a view. Default 20 (COLMAP: 30).
+    pub min_pose_inliers: usize,
+    /// Smallest share of the points it sees that must agree, 0 to 1. Default 0.25, COLMAP's.
+    pub min_pose_share: f64,
+    /// Fewest views of a model. Default 3.
+    pub min_model_size: usize,
+    /// All points are adjusted again when the model has grown by this factor. Above 1; default 1.2.
+    pub growth: f64,
+    /// Seed of the random samples. Default 0.
+    pub seed: u64,
+}
+
+impl Default for SfmOptions {
+    fn default() -> Self {
+        Self {
+            max_error: 4.0,
+            min_angle: 1.5f64.to_radians(),
+            min_pose_inliers: 20,
+            min_pose_share: 0.25,
+            min_model_size: 3,
+            growth: 1.2,
+            seed: 0,
+        }
+    }
+}
+
+/// Views, their cameras, and the pairs among them that hold.
+#[derive(Debug, Clone, Copy)]
+pub struct SfmInput<'a> {
+    /// The views.
+    pub views: &'a [SfmView<'a>],
+    /// The cameras, as far as they are known: size, and a focal length to begin with.
+    pub cameras: &'a [Camera],
+    /// What is known of each.
+    pub knowledge: &'a [CameraKnowledge],
+    /// Matches that agree with the geometry of their pair.
+    pub pairs: &'a [PairMatches],
+    /// The geometry of each pair.
+    pub geometry: &'a [ViewPairModel],
+}
+
+/// What [`reconstruct_views`] found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SfmOutcome {
+    /// The models, the one with most views first.
+    pub models: Vec<SfmModel>,
+    /// What became of each view.
+    pub views: Vec<ViewOutcome>,
+}
+
+/// Why nothing was reconstructed.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum SfmError {
+    /// Fewer than two views.
+    #[error("{got} views are too few: 2 are needed")]
+    TooFewViews {
+        /// Number of views.
+        got: usize,
+    },
+    /// A view's camera, or a pair's view or geometry, is not there.
+    #[error("{what} {index} names a {of} that there is not")]
+    Missing {
+        /// What names it.
+        what: &'static str,
+        /// Its index.
+        index: usize,
+        /// What is missing.
+        of: &'static str,
+    },
+    /// No pair of views is good to start from.
+    #[error("none of {pairs} pairs of views shows enough points from two places")]
+    NoInitialPair {
+        /// Pairs that share matches.
+        pairs: usize,
+    },
+    /// An option is outside its range.
+    #[error(transparent)]
+    Option(#[from] OptionError),
+    /// The job was stopped by its progress callback.
+    #[error("stopped")]
+    Cancelled(#[from] Cancelled),
+}
+
+/// Cameras, poses and points of views from the matches of their pairs.
+///
+/// Each model starts from the pair that shows most points at wide angles; the view that sees most points, spread over its picture, is added next. Points are triangulated
+/// from whole tracks, and adjusted with the poses: those near a new view at once, all of them when the model has grown. Views that no model takes up start another.
+/// O(observations) for each adjustment; a model of n views is adjusted O(log n) times as a whole.
+///
+/// # Errors
+/// [`SfmError`].
+pub fn reconstruct_views(
+    input: &SfmInput<'_>,
+    options: &SfmOptions,
+    progress: &dyn Progress,
+) -> Result<SfmOutcome, SfmError> {
+    check(input, options)?;
+    let cameras = start_cameras(input);
+    let keypoints: Vec<_> = input.views.iter().map(|v| v.keypoints).collect();
+    let tracks = Tracks::build(&keypoints, input.pairs);
+    let mut scene = Scene::new(input.views, &cameras, input.knowledge, &tracks);
+    let mut paired = vec![false; input.views.len()];
+    input.pairs.iter().for_each(|p| (paired[p.a], paired[p.b]) = (true, true));
+    let unseen = |paired: &bool| match paired {
+        true => ViewOutcome::TooFewPoints { seen: 0, needed: options.min_pose_inliers },
+        false => ViewOutcome::NoPairs,
+    };
+    let mut outcomes: Vec<ViewOutcome> = paired.iter().map(unseen).collect();
+    let mut models: Vec<SfmModel> = Vec::new();
+    let mut taken = vec![false; input.views.len()];
+    let stage = Stage::new(progress, "register", input.views.len())?;
+    loop {
+        scene.clear();
+        scene.cameras.copy_from_slice(&cameras);
+        scene.cameras_changed();
+        let left: Vec<PairMatches> = input.pairs.iter().filter(|p| !taken[p.a] && !taken[p.b]).cloned().collect();
+        let mut best: Option<(SfmModel, Vec<ViewOutcome>)> = None;
+        for start in initial_pairs(&scene, &left, options, progress)?.iter().take(MOST_STARTS) {
+            scene.clear();
+            scene.cameras.copy_from_slice(&cameras);
+            scene.cameras_changed();
+            let mut found = outcomes.clone();
+            grow(&mut scene, start, &taken, options, &mut found, &stage)?;
+            let model = SfmModel::of(&scene);
+            let free = taken.iter().filter(|t| !**t).count();
+            let whole = 2 * model.registered() >= free;
+            if best.as_ref().is_none_or(|b| model.registered() > b.0.registered()) {
+                best = Some((model, found));
+            }
+            if whole {
+                break;
+            }
+        }
+        let Some((model, found)) = best else { break };
+        if model.registered() < options.min_model_size.min(input.views.len()) {
+            break;
+        }
+        outcomes = found;
+        for (v, _) in model.poses.iter().enumerate().filter(|(_, p)| p.is_some()) {
+            taken[v] = true;
+            outcomes[v] = ViewOutcome::Registered { model: models.len() };
+        }
+        models.push(model);
+    }
+    if models.is_empty() {
+        return Err(SfmError::NoInitialPair { pairs: input.pairs.len() });
+    }
+    Ok(SfmOutcome { models, views: outcomes })
+}
+
+/// Starts that are tried where the first ones lead to less than half of the views.
+const MOST_STARTS: usize = 4;
+/// Rounds of adjustment and filtering at the end, at most.
+const FINAL_ROUNDS: usize = 4;
+/// Views that are adjusted with a new one.
+const NEAR_VIEWS: usize = 6;
+
+fn check(input: &SfmInput<'_>, options: &SfmOptions) -> Result<(), SfmError> {
+    OptionError::check("max_error", options.max_error, "above 0 and finite", |v| v > 0.0 && v.is_finite())?;
+    OptionError::check("min_angle", options.min_angle, "from 0 to 1 radian", |v| (0.0..=1.0).contains(&v))?;
+    OptionError::check("growth", options.growth, "above 1 and finite", |v| v > 1.0 && v.is_finite())?;
+    if input.views.len() < 2 {
+        return Err(SfmError::TooFewViews { got: input.views.len() });
+    }
+    let missing = |what, index, of| Err(SfmError::Missing { what, index, of });
+    if let Some(i) = input.views.iter().position(|v| v.camera >= input.cameras.len().min(input.knowledge.len())) {
+        return missing("view", i, "camera");
+    }
+    if let Some(i) = input.pairs.iter().position(|p| p.a.max(p.b) >= input.views.len() || p.a == p.b) {
+        return missing("pair", i, "view");
+    }
+    if input.geometry.len() < input.pairs.len() {
+        return missing("pair", input.geometry.len(), "geometry");
+    }
+    Ok(())
+}
+
+/// The cameras with a focal length of the view graph, where nothing is known of it.
+fn start_cameras(input: &SfmInput<'_>) -> Vec<Camera> {
+    let mut cameras = input.cameras.to_vec();
+    for (c, camera) in cameras.iter_mut().enumerate() {
+        if input.knowledge[c] != CameraKnowledge::Unknown {
+            continue;
+        }
+        let own = |i: &usize| {
+            let pair = &input.pairs[*i];
+            input.views[pair.a].camera == c && input.views[pair.b].camera == c
+        };
+        let of = |i: usize| match input.geometry[i] {
+            ViewPairModel::Fundamental(f) => Some((f, input.pairs[i].matches.len() as f64)),
+            _ => None,
+        };
+        let pairs: Vec<_> = (0..input.pairs.len()).filter(own).filter_map(of).collect();
+        if let Some(focal) = focal_length(camera, &pairs) {
+            (camera.fx, camera.fy) = (focal, focal);
+        }
+    }
+    cameras
+}
+
+fn limits(options: &SfmOptions) -> PointLimits {
+    PointLimits { error: options.max_error, angle: options.min_angle }
+}
+
+/// Grows a model from a pair, as far as it goes.
+fn grow(
+    scene: &mut Scene<'_>,
+    start: &Start,
+    taken: &[bool],
+    options: &SfmOptions,
+    outcomes: &mut [ViewOutcome],
+    stage: &Stage<'_>,
+) -> Result<(), Cancelled> {
+    scene.poses[start.a] = Some(Pose::identity());
+    scene.poses[start.b] = Some(start.pose);
+    let tracks: Vec<usize> = scene.of_view(start.a).map(|i| scene.track_of(i)).collect();
+    update_tracks(scene, limits(options), &tracks);
+    let all: Vec<usize> = (0..scene.tracks.len()).collect();
+    let quick = BundlePlan { free: None, lens: LensFreedom::Held, scale: 1.0, max_iterations: 10, tolerance: 1e-4 };
+    adjust(scene, &quick, stage)?;
+    update_tracks(scene, limits(options), &tracks);
+    let mut adjusted = 2;
+    // Where a pose was refused: how many points were seen, so that it is tried again when there are more.
+    let mut refused = vec![0usize; scene.views.len()];
+    loop {
+        stage.check()?;
+        let mut next = None;
+        for candidate in visible(scene).into_iter().filter(|c| !taken[c.view]) {
+            let Registered { seen, needed } = Registered { seen: candidate.count, needed: options.min_pose_inliers };
+            if seen < needed {
+                outcomes[candidate.view] = ViewOutcome::TooFewPoints { seen, needed };
+                continue;
+            }
+            if seen * 10 < refused[candidate.view] * 11 {
+                continue;
+            }
+            match register(scene, candidate.view, options, stage)? {
+                Registration::Found(pose) => {
+                    next = Some((candidate.view, pose));
+                    break;
+                }
+                Registration::Refused(agree) => {
+                    refused[candidate.view] = seen;
+                    outcomes[candidate.view] = ViewOutcome::NoPose { seen, agree, needed };
+                }
+            }
+        }
+        let Some((view, pose)) = next else { break };
+        scene.poses[view] = Some(pose);
+        let tracks: Vec<usize> = scene.of_view(view).map(|i| scene.track_of(i)).collect();
+        update_tracks(scene, limits(options), &tracks);
+        let near = near_views(scene, view);
+        let local = BundlePlan { free: Some(&near), max_iterations: 5, tolerance: 1e-3, ..quick };
+        let registered = scene.registered().len();
+        if registered as f64 >= adjusted as f64 * options.growth || registered < 6 {
+            let refinable = registered > 2 && scene.knowledge.iter().any(|k| !k.is_calibrated());
+            let lens = if refinable { LensFreedom::Distortion } else { LensFreedom::Held };
+            adjust(scene, &BundlePlan { lens, ..quick }, stage)?;
+            update_tracks(scene, limits(options), &all);
+            adjusted = registered;
+        } else {
+            adjust(scene, &local, stage)?;
+            update_tracks(scene, limits(options), &tracks);
+        }
+        stage.add(1)?;
+    }
+    finish(scene, options, stage)
+}
+
+struct Registered {
+    seen: usize,
+    needed: usize,
+}
+
+/// The view and those that share most points with it.
+fn near_views(scene: &Scene<'_>, view: usize) -> Vec<usize> {
+    let mut shared = vec![0usize; scene.views.len()];
+    for i in scene.of_view(view).filter(|i| scene.active[*i]) {
+        for j in scene.tracks.range(scene.track_of(i)).filter(|j| scene.active[*j]) {
+            shared[scene.view_of(j)] += 1;
+        }
+    }
+    let mut order: Vec<usize> = (0..shared.len()).filter(|v| *v != view && shared[*v] > 0).collect();
+    order.sort_by(|a, b| shared[*b].cmp(&shared[*a]).then(a.cmp(b)));
+    order.truncate(NEAR_VIEWS);
+    order.push(view);
+    order
+}
+
+/// By how much the median error must go down with a distortion before a matrix that came without one is taken to have one.
+const CALLS_FOR_LENS: f64 = 0.9;
+
+/// Adjusts all, completes and filters, until little changes.
+fn finish(scene: &mut Scene<'_>, options: &SfmOptions, progress: &dyn Progress) -> Result<(), Cancelled> {
+    let free = scene.knowledge.iter().any(|k| !k.is_calibrated());
+    refine(scene, if free { LensFreedom::Center } else { LensFreedom::Held }, options, progress)?;
+    if free || !scene.knowledge.contains(&CameraKnowledge::Matrix) {
+        return Ok(());
+    }
+    let held = scene.solution();
+    let before = noise_scale(scene);
+    refine(scene, LensFreedom::Center, options, progress)?;
+    if noise_scale(scene) > CALLS_FOR_LENS * before {
+        scene.restore(held);
+    }
+    Ok(())
+}
+
+/// Adjustment, completion and filtering, in turn.
+fn refine(
+    scene: &mut Scene<'_>,
+    lens: LensFreedom,
+    options: &SfmOptions,
+    progress: &dyn Progress,
+) -> Result<(), Cancelled> {
+    let all: Vec<usize> = (0..scene.tracks.len()).collect();
+    for round in 0..FINAL_ROUNDS {
+        update_tracks(scene, limits(options), &all);
+        let before = scene.counts();
+        let lens = if round == 0 { lens.min(LensFreedom::Distortion) } else { lens };
+        let plan = BundlePlan { free: None, lens, scale: noise_scale(scene), max_iterations: 50, tolerance: 1e-6 };
+        adjust(scene, &plan, progress)?;
+        update_tracks(scene, limits(options), &all);
+        let after = scene.counts();
+        if round > 0 && after.1.abs_diff(before.1) * 2000 < after.1 {
+            break;
+        }
+    }
+    Ok(())
+}
+
+/// The scale of Cauchy's loss for the noise that the observations have, in pixels.
+fn noise_scale(scene: &Scene<'_>) -> f64 {
+    let mut errors: Vec<f64> = Vec::new();
+    for (track, point) in scene.points.iter().enumerate() {
+        let Some(point) = point else { continue };
+        for i in scene.tracks.range(track).filter(|i| scene.active[*i]) {
+            if let Some(pose) = &scene.poses[scene.view_of(i)] {
+                errors.push(scene.error(i, pose, point));
+            }
+        }
+    }
+    // The median length of a normal error in the plane is 1.1774 deviations; Cauchy's loss is 95 % as good as least squares on normal errors at 2.385 of them.
+    quantile(&mut errors, 0.5).map_or(1.0, |median| (2.385 / 1.1774 * median).clamp(0.1, 2.0))
+}

@@ -1,0 +1,156 @@
+//! What is known of the scene while it is being solved.
+
+use crate::{CameraKnowledge, SfmView, Tracks};
+use cv_core::{Camera, Point2, Point3, Pose};
+use rayon::prelude::*;
+
+/// Cameras, poses, points, and which observations agree with them.
+pub(crate) struct Scene<'a> {
+    pub(crate) views: &'a [SfmView<'a>],
+    pub(crate) knowledge: &'a [CameraKnowledge],
+    pub(crate) tracks: &'a Tracks,
+    pub(crate) cameras: Vec<Camera>,
+    pub(crate) poses: Vec<Option<Pose>>,
+    /// Of each track.
+    pub(crate) points: Vec<Option<Point3<f64>>>,
+    /// Of each observation: whether it agrees with the point.
+    pub(crate) active: Vec<bool>,
+    /// Of each observation: normalized coordinates.
+    rays: Vec<Point2<f64>>,
+    /// Of each observation.
+    track_of: Vec<u32>,
+    /// Where the observations of each view start in `by_view`, and the end.
+    start: Vec<usize>,
+    by_view: Vec<u32>,
+}
+
+impl<'a> Scene<'a> {
+    pub(crate) fn new(
+        views: &'a [SfmView<'a>],
+        cameras: &[Camera],
+        knowledge: &'a [CameraKnowledge],
+        tracks: &'a Tracks,
+    ) -> Self {
+        let observations = tracks.observations();
+        let mut track_of = vec![0; observations.len()];
+        for t in 0..tracks.len() {
+            track_of[tracks.range(t)].fill(t as u32);
+        }
+        let mut start = vec![0usize; views.len() + 1];
+        for o in observations {
+            start[o.view as usize + 1] += 1;
+        }
+        for v in 0..views.len() {
+            start[v + 1] += start[v];
+        }
+        let mut next = start.clone();
+        let mut by_view = vec![0; observations.len()];
+        for (i, o) in observations.iter().enumerate() {
+            by_view[next[o.view as usize]] = i as u32;
+            next[o.view as usize] += 1;
+        }
+        let mut scene = Self {
+            views,
+            knowledge,
+            tracks,
+            cameras: cameras.to_vec(),
+            poses: vec![None; views.len()],
+            points: vec![None; tracks.len()],
+            active: vec![false; observations.len()],
+            rays: Vec::new(),
+            track_of,
+            start,
+            by_view,
+        };
+        scene.cameras_changed();
+        scene
+    }
+
+    /// To be called where `cameras` were changed.
+    pub(crate) fn cameras_changed(&mut self) {
+        let ray = |i: usize| self.camera_of(self.tracks.observations()[i].view as usize).normalize(self.pixel(i));
+        self.rays = (0..self.active.len()).into_par_iter().map(ray).collect();
+    }
+
+    pub(crate) fn camera_of(&self, view: usize) -> &Camera {
+        &self.cameras[self.views[view].camera]
+    }
+
+    /// Where an observation is in its picture.
+    #[inline]
+    pub(crate) fn pixel(&self, observation: usize) -> Point2<f64> {
+        let o = self.tracks.observations()[observation];
+        self.views[o.view as usize].keypoints[o.keypoint as usize].position.cast()
+    }
+
+    #[inline]
+    pub(crate) fn ray(&self, observation: usize) -> Point2<f64> {
+        self.rays[observation]
+    }
+
+    #[inline]
+    pub(crate) fn view_of(&self, observation: usize) -> usize {
+        self.tracks.observations()[observation].view as usize
+    }
+
+    #[inline]
+    pub(crate) fn track_of(&self, observation: usize) -> usize {
+        self.track_of[observation] as usize
+    }
+
+    /// The observations of a view.
+    pub(crate) fn of_view(&self, view: usize) -> impl Iterator<Item = usize> + '_ {
+        self.by_view[self.start[view]..self.start[view + 1]].iter().map(|i| *i as usize)
+    }
+
+    /// The views that have a pose.
+    pub(crate) fn registered(&self) -> Vec<usize> {
+        (0..self.views.len()).filter(|v| self.poses[*v].is_some()).collect()
+    }
+
+    /// The observations of a track in views that have a pose.
+    pub(crate) fn seen(&self, track: usize) -> impl Iterator<Item = (usize, &Pose)> + '_ {
+        self.tracks.range(track).filter_map(|i| Some((i, self.poses[self.view_of(i)].as_ref()?)))
+    }
+
+    /// Distance in pixels between an observation and the projection of a point; infinite behind the camera.
+    #[inline]
+    pub(crate) fn error(&self, observation: usize, pose: &Pose, point: &Point3<f64>) -> f64 {
+        let camera = self.camera_of(self.view_of(observation));
+        camera.project(&pose.transform(point)).map_or(f64::INFINITY, |p| (p - self.pixel(observation)).norm())
+    }
+
+    /// Count of points, and of observations that agree with them.
+    pub(crate) fn counts(&self) -> (usize, usize) {
+        let points = self.points.iter().flatten().count();
+        (points, self.active.iter().filter(|a| **a).count())
+    }
+
+    /// What was found so far.
+    pub(crate) fn solution(&self) -> Solution {
+        let Self { cameras, poses, points, active, .. } = self;
+        Solution { cameras: cameras.clone(), poses: poses.clone(), points: points.clone(), active: active.clone() }
+    }
+
+    /// Back to what was found before.
+    pub(crate) fn restore(&mut self, solution: Solution) {
+        let Solution { cameras, poses, points, active } = solution;
+        (self.cameras, self.poses, self.points, self.active) = (cameras, poses, points, active);
+        self.cameras_changed();
+    }
+
+    /// Forgets poses and points.
+    pub(crate) fn clear(&mut self) {
+        self.poses.fill(None);
+        self.points.fill(None);
+        self.active.fill(false);
+    }
+}
+
+/// Everything that a [`Scene`] solves for.
+pub(crate) struct Solution {
+    cameras: Vec<Camera>,
+    poses: Vec<Option<Pose>>,
+    points: Vec<Option<Point3<f64>>>,
+    active: Vec<bool>,
+}
