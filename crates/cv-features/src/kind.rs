@@ -1,5 +1,7 @@
 //! What the numbers of a descriptor mean.
 
+use crate::simd::round;
+
 /// What the numbers of a descriptor mean, and what belongs to that. Sets of different kinds are never compared; those of one kind are by the sum of their squared
 /// differences (SSD).
 ///
@@ -39,8 +41,12 @@ pub struct ByteScale {
 
 impl ByteScale {
     /// The nearest byte.
+    #[inline]
     pub fn to_byte(self, number: f32) -> u8 {
-        ((number + self.offset) * self.factor).round().clamp(0.0, 255.0) as u8
+        let v = (number + self.offset) * self.factor;
+        // As comparisons, which vectorize; NaN becomes 0.
+        let v = if v > 0.0 { v } else { 0.0 };
+        round(if v < 255.0 { v } else { 255.0 }) as u8
     }
 
     /// The number in the middle of those that become this byte.

@@ -38,6 +38,7 @@
 mod anms;
 mod asift;
 mod byte_descriptors;
+mod byte_neighbors;
 mod descriptors;
 mod dog;
 mod error;
@@ -62,11 +63,11 @@ mod targets;
 
 pub use anms::{anms, suppression_radii};
 pub use asift::sift_affine_view;
-pub use byte_descriptors::{ByteDescriptors, match_byte_descriptors};
+pub use byte_descriptors::{ByteDescriptors, match_byte_descriptors, match_largest};
 pub use descriptors::{Descriptors, DropReason, Dropped, Features};
 pub use error::FeatureError;
 pub use extractor::{FeatureExtractor, FeatureMethod, FeatureOptions};
-pub use guided::{GuidedOptions, TwoViewModel, match_guided};
+pub use guided::{GuidedOptions, TwoViewModel, match_guided, match_guided_bytes};
 pub use harris::{CornerMeasure, HarrisOptions, harris, harris_response};
 pub use harris_features::{HarrisFeatures, Suppression};
 pub use kind::{ByteScale, DescriptorKind};

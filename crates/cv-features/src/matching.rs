@@ -1,8 +1,8 @@
 //! Nearest-neighbor matching of descriptors.
 
-use crate::Descriptors;
-use crate::nearest_neighbors::nearest;
+use crate::nearest_neighbors::{TwoNearest, nearest};
 use crate::simd;
+use crate::{DescriptorKind, Descriptors};
 use cv_core::{Cancelled, DMatch, OptionError, Progress};
 
 /// Why two sets could not be matched.
@@ -102,23 +102,37 @@ pub fn match_descriptors(
     options: &MatchOptions,
     progress: &dyn Progress,
 ) -> Result<Vec<DMatch>, MatchError> {
+    select(query.kind(), train.kind(), [query.len(), train.len()], options, || {
+        nearest(simd::level(), query, train, options.mutual, progress)
+    })
+}
+
+/// The matches that pass the tests of `options`, of the two nearest neighbors that `search` finds of each query and, for mutual matches, the nearest query of
+/// each candidate.
+pub(crate) fn select(
+    query: DescriptorKind,
+    train: DescriptorKind,
+    [queries, candidates]: [usize; 2],
+    options: &MatchOptions,
+    search: impl FnOnce() -> Result<(Vec<TwoNearest>, Vec<u32>), Cancelled>,
+) -> Result<Vec<DMatch>, MatchError> {
     same_kind(query, train)?;
-    if query.is_empty() || train.is_empty() {
-        return Err(MatchError::Empty { query: query.len(), train: train.len() });
+    if queries == 0 || candidates == 0 {
+        return Err(MatchError::Empty { query: queries, train: candidates });
     }
-    if let Some(got) = [query.len(), train.len()].into_iter().find(|&n| u32::try_from(n).is_err()) {
+    if let Some(got) = [queries, candidates].into_iter().find(|&n| u32::try_from(n).is_err()) {
         return Err(MatchError::TooMany { got });
     }
     let limit = match (options.ratio, options.measure) {
-        (RatioTest::Kind, RatioMeasure::Ssd) => Some(query.kind().ratio),
-        (RatioTest::Kind, RatioMeasure::Distance) => Some(query.kind().ratio.sqrt()),
+        (RatioTest::Kind, RatioMeasure::Ssd) => Some(query.ratio),
+        (RatioTest::Kind, RatioMeasure::Distance) => Some(query.ratio.sqrt()),
         (RatioTest::Below(limit), _) => Some(limit),
         (RatioTest::Off, _) => None,
     };
     if let Some(limit) = limit {
         OptionError::check("ratio", limit.into(), "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
     }
-    let (forward, backward) = nearest(simd::level(), query, train, options.mutual, progress)?;
+    let (forward, backward) = search()?;
     let mut matches = Vec::new();
     for (i, two) in forward.iter().enumerate() {
         if options.mutual && backward[two.best as usize] as usize != i {
@@ -133,14 +147,13 @@ pub fn match_descriptors(
         }
     }
     if options.one_to_one {
-        keep_nearest_of_each(&mut matches, train.len());
+        keep_nearest_of_each(&mut matches, candidates);
     }
     Ok(matches)
 }
 
 /// Refuses sets of different kinds.
-pub(crate) fn same_kind(query: &Descriptors, train: &Descriptors) -> Result<(), MatchError> {
-    let (a, b) = (query.kind(), train.kind());
+pub(crate) fn same_kind(a: DescriptorKind, b: DescriptorKind) -> Result<(), MatchError> {
     if a == b {
         return Ok(());
     }
@@ -164,7 +177,6 @@ pub(crate) fn keep_nearest_of_each(matches: &mut Vec<DMatch>, train: usize) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::DescriptorKind;
     use cv_core::Silent;
 
     fn set(rows: &[&[f32]]) -> Descriptors {

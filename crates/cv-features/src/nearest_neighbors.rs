@@ -26,7 +26,7 @@ const TASK: usize = 16 * QUERIES;
 /// Panels that a task goes through without asking whether to go on: some milliseconds.
 const PANELS_UNASKED: usize = 128;
 /// No candidate.
-const NONE: u32 = u32::MAX;
+pub(crate) const NONE: u32 = u32::MAX;
 
 /// For each query its two nearest candidates and, where asked for, for each candidate its nearest query. Of equally near ones the first counts.
 ///
@@ -274,6 +274,7 @@ fn pick(row: &[f32], train: &Descriptors, found: impl Iterator<Item = (f32, u32)
 }
 
 /// Sum of squared differences, over 16 running sums so that it vectorizes.
+#[inline]
 pub(crate) fn ssd(a: &[f32], b: &[f32]) -> f32 {
     let mut sums = [0.0f32; 16];
     let ((a, rest_a), (b, rest_b)) = (a.as_chunks::<16>(), b.as_chunks::<16>());

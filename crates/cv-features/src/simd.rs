@@ -3,6 +3,7 @@
 //! All arithmetic is plain multiplications and additions in a fixed order (never fused), lane by lane, so every instruction set gives the
 //! same bytes; the tests hold each one to the plain loops beside them.
 
+use crate::ByteScale;
 use fearless_simd::{Level, dispatch, prelude::*};
 
 /// The widest instruction set of this machine.
@@ -158,6 +159,18 @@ fn quantize_impl<S: Simd>(_: S, out: &mut [u16], values: &[f32], dark: f32, gain
         let v = if v > 0.0 { v } else { 0.0 };
         let v = if v < 65535.0 { v } else { 65535.0 };
         *o = round(v) as u16;
+    }
+}
+
+/// [`ByteScale::to_byte`] of each value.
+pub(crate) fn to_bytes(level: Level, out: &mut [u8], values: &[f32], scale: ByteScale) {
+    dispatch!(level, simd => to_bytes_impl(simd, out, values, scale));
+}
+
+#[inline(always)]
+fn to_bytes_impl<S: Simd>(_: S, out: &mut [u8], values: &[f32], scale: ByteScale) {
+    for (o, v) in out.iter_mut().zip(values) {
+        *o = scale.to_byte(*v);
     }
 }
 

@@ -4,8 +4,8 @@ use crate::asift::match_asift;
 use crate::{ModelKind, Progress, RobustOptions, estimate};
 use cv_core::{Cancelled, Correspondence, DMatch, ImageView, Point2, Scaling, StageClock};
 use cv_features::{
-    FeatureError, FeatureOptions, Features, GuidedOptions, MatchError, MatchOptions, RatioTest, TwoViewModel,
-    match_descriptors, match_guided,
+    ByteDescriptors, FeatureError, FeatureOptions, Features, GuidedOptions, MatchError, MatchOptions, RatioTest,
+    TwoViewModel, match_byte_descriptors, match_descriptors, match_guided,
 };
 use cv_geometry::EstimateError;
 use cv_imgproc::{resize_area, rgb_to_gray_f32};
@@ -150,7 +150,7 @@ pub fn extract_features(
     options.extractor().extract(rgb_to_gray_f32(photo).view(), progress)
 }
 
-/// Tentative matches between the features of two photographs.
+/// Tentative matches between the features of two photographs. Descriptors are compared as bytes where their kind says how.
 ///
 /// # Errors
 /// [`MatchError`] where one has no features, or they are of different kinds.
@@ -161,7 +161,10 @@ pub fn match_features(
     progress: &dyn Progress,
 ) -> Result<Vec<DMatch>, MatchError> {
     let settings = MatchOptions { ratio: options.ratio, mutual: options.mutual, ..MatchOptions::default() };
-    match_descriptors(&a.descriptors, &b.descriptors, &settings, progress)
+    match (ByteDescriptors::new(&a.descriptors), ByteDescriptors::new(&b.descriptors)) {
+        (Some(a), Some(b)) => match_byte_descriptors(&a, &b, &settings, progress),
+        _ => match_descriptors(&a.descriptors, &b.descriptors, &settings, progress),
+    }
 }
 
 /// The positions of matched features, in the order of `matches`.
