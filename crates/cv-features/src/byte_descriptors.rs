@@ -53,7 +53,10 @@ impl ByteDescriptors {
     }
 
     /// The descriptors of these indices.
-    fn rows(&self, indices: &[usize]) -> Self {
+    ///
+    /// # Panics
+    /// Where there are not so many.
+    pub fn select(&self, indices: &[usize]) -> Self {
         Self { data: indices.iter().flat_map(|&i| self.row(i)).copied().collect(), ..*self }
     }
 
@@ -95,34 +98,11 @@ pub fn match_byte_descriptors(
     })
 }
 
-/// As [`match_byte_descriptors`], between the `count` features of largest scale of both sets: whether two photographs of a large set have anything in common
-/// costs a hundredth of matching all. Indices are those of the whole sets, and matches in order of the first; of features of one scale the earlier count.
-///
-/// Coarse features are few, so each covers much of a photograph, and they are seen again from further away (Wu, "Towards linear-time incremental structure from
-/// motion", 3DV 2013, section 3: "preemptive matching").
-///
-/// # Errors
-/// As [`match_byte_descriptors`]; [`MatchError::Empty`] too where keypoints and descriptors are not equally many.
-pub fn match_largest(
-    (query_keypoints, query): (&[Keypoint], &ByteDescriptors),
-    (train_keypoints, train): (&[Keypoint], &ByteDescriptors),
-    count: usize,
-    options: &MatchOptions,
-    progress: &dyn Progress,
-) -> Result<Vec<DMatch>, MatchError> {
-    if query_keypoints.len() != query.len() || train_keypoints.len() != train.len() {
-        return Err(MatchError::Empty { query: query_keypoints.len(), train: train_keypoints.len() });
-    }
-    let (a, b) = (largest(query_keypoints, count), largest(train_keypoints, count));
-    let mut matches = match_byte_descriptors(&query.rows(&a), &train.rows(&b), options, progress)?;
-    for m in &mut matches {
-        (m.query, m.train) = (a[m.query as usize] as u32, b[m.train as usize] as u32);
-    }
-    Ok(matches)
-}
-
 /// The indices of the `count` keypoints of largest scale, ascending; of equal ones the first.
-fn largest(keypoints: &[Keypoint], count: usize) -> Vec<usize> {
+///
+/// Coarse features are few, so each covers much of a photograph, and they are seen again from further away: matching those alone tells whether two photographs of a large set have
+/// anything in common (Wu, "Towards linear-time incremental structure from motion", 3DV 2013, section 3: "preemptive matching").
+pub fn largest_keypoints(keypoints: &[Keypoint], count: usize) -> Vec<usize> {
     let mut order: Vec<usize> = (0..keypoints.len()).collect();
     order.sort_by(|&i, &j| keypoints[j].scale.total_cmp(&keypoints[i].scale));
     order.truncate(count);
@@ -167,28 +147,14 @@ mod tests {
     }
 
     #[test]
-    fn the_largest_are_matched_under_their_own_indices() {
-        let kind = DescriptorKind::SIFT;
-        let row = |k: usize| (0..kind.dimension).map(move |i| if i == k { 0.4 } else { 0.05 });
-        let set = |order: &[usize]| {
-            let data = order.iter().flat_map(|&k| row(k)).collect();
-            ByteDescriptors::new(&Descriptors::from_vec(kind, data).unwrap()).unwrap()
-        };
-        let keypoints = |scales: &[f32]| -> Vec<Keypoint> {
-            scales.iter().map(|&scale| Keypoint { scale, ..Keypoint::new(0.0, 0.0, 1.0) }).collect()
-        };
-        let (a, b) = (set(&[0, 1, 2, 3]), set(&[3, 2, 1, 0, 9]));
-        let (ka, kb) = (keypoints(&[5.0, 1.0, 4.0, 4.0]), keypoints(&[4.0, 1.0, 9.0, 5.0, 8.0]));
-        let options = MatchOptions { mutual: true, ..MatchOptions::default() };
-        let found = match_largest((&ka, &a), (&kb, &b), 4, &options, &Silent).unwrap();
-        // The third of the first set has its twin among the small ones of the second.
-        assert_eq!(found.iter().map(|m| (m.query, m.train)).collect::<Vec<_>>(), [(0, 3), (1, 2), (3, 0)]);
-        // Of two of one scale the first stays.
-        let found = match_largest((&ka, &a), (&kb, &b), 2, &options, &Silent).unwrap();
-        assert_eq!(found, []);
-        let all: Vec<usize> = largest(&ka, 2);
-        assert_eq!(all, [0, 2]);
-        let uneven = match_largest((&ka[1..], &a), (&kb, &b), 4, &options, &Silent);
-        assert_eq!(uneven, Err(MatchError::Empty { query: 3, train: 5 }));
+    fn the_largest_come_in_order_and_the_first_of_equal_ones() {
+        let keypoints: Vec<Keypoint> =
+            [5.0, 1.0, 4.0, 4.0].map(|scale| Keypoint { scale, ..Keypoint::new(0.0, 0.0, 1.0) }).into();
+        assert_eq!(largest_keypoints(&keypoints, 2), [0, 2]);
+        assert_eq!(largest_keypoints(&keypoints, 9), [0, 1, 2, 3]);
+        let data: Vec<f32> = (0..4).flat_map(|k| vec![0.1 * k as f32; DescriptorKind::SIFT.dimension]).collect();
+        let bytes = ByteDescriptors::new(&Descriptors::from_vec(DescriptorKind::SIFT, data).unwrap()).unwrap();
+        let some = bytes.select(&[0, 2]);
+        assert_eq!((some.len(), some.row(1)), (2, bytes.row(2)));
     }
 }

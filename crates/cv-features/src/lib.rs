@@ -63,7 +63,7 @@ mod targets;
 
 pub use anms::{anms, suppression_radii};
 pub use asift::sift_affine_view;
-pub use byte_descriptors::{ByteDescriptors, match_byte_descriptors, match_largest};
+pub use byte_descriptors::{ByteDescriptors, largest_keypoints, match_byte_descriptors};
 pub use descriptors::{Descriptors, DropReason, Dropped, Features};
 pub use error::FeatureError;
 pub use extractor::{FeatureExtractor, FeatureMethod, FeatureOptions};

@@ -340,7 +340,7 @@ fn refine(
         update_tracks(scene, limits(options), &all);
         let before = scene.counts();
         let lens = if round == 0 { lens.min(LensFreedom::Distortion) } else { lens };
-        let plan = BundlePlan { free: None, lens, scale: noise_scale(scene), max_iterations: 50, tolerance: 1e-6 };
+        let plan = BundlePlan { free: None, lens, scale: noise_scale(scene), max_iterations: 30, tolerance: 1e-5 };
         adjust(scene, &plan, progress)?;
         update_tracks(scene, limits(options), &all);
         let after = scene.counts();

@@ -72,7 +72,7 @@ impl Run for Args {
         let mut options = SfmJobOptions::default();
         options.solve.max_error = self.max_error;
         if let Some(n) = self.features {
-            options.matching.features = options.matching.features.clone().at_most(n);
+            options.features = options.features.at_most(n);
         }
         if let Some(seed) = context.seed {
             (options.pairs.seed, options.solve.seed) = (seed, seed);
@@ -85,7 +85,7 @@ impl Run for Args {
             let camera = cameras.of(path, &image, &self, context)?;
             let rgb = image.into_rgb8();
             let one = OnePhotograph { context, done: i, total: paths.len() };
-            photos.push(sfm_photo(rgb.view(), name, camera, &options.matching.features, &one)?);
+            photos.push(sfm_photo(rgb.view(), name, camera, &options.features, &one)?);
         }
         clock.lap("features");
         let result = sfm(&photos, &cameras.list, &options, context)?;

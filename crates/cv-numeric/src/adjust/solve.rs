@@ -144,6 +144,7 @@ impl Adjustment<'_> {
         normal.linearize(&self.kinds, &structure, &self.values, LossModel::Weight).map_err(|u| self.undefined(u))?;
         let initial_cost = normal.cost();
         let (mut damping, mut growth) = (options.initial_damping, 2.0);
+        let mut model = LossModel::Weight;
         let mut moved = self.values.clone();
         let mut report = AdjustReport {
             initial_cost,
@@ -176,6 +177,15 @@ impl Adjustment<'_> {
             };
             let gain = report.cost - cost;
             let Some(step) = step.filter(|_| gain > 0.0) else {
+                // The weights' parabola lies above the cost, so that its step goes down where the other's did not.
+                if model == LossModel::Curvature {
+                    model = LossModel::Weight;
+                    if normal.linearize(&self.kinds, &structure, &self.values, model).is_ok() {
+                        report.iterations += 1;
+                        continue;
+                    }
+                    return end(report, Termination::NoStep);
+                }
                 damping *= growth;
                 growth *= 2.0;
                 if damping > DAMPING[1] {
@@ -189,10 +199,13 @@ impl Adjustment<'_> {
             if done || report.iterations >= options.max_iterations {
                 return end(report, if done { Termination::Cost } else { Termination::Iterations });
             }
-            damping *= (1.0 - (2.0 * gain / step.predicted - 1.0).powi(3)).max(1.0 / 3.0);
+            let kept = gain / step.predicted;
+            damping *= (1.0 - (2.0 * kept - 1.0).powi(3)).max(1.0 / 3.0);
             damping = damping.max(DAMPING[0]);
             growth = 2.0;
-            let model = if gain < NEAR * report.cost { LossModel::Curvature } else { LossModel::Weight };
+            // Where the curvature promised more than there was, residuals are not where it can be relied on.
+            let near = gain < NEAR * report.cost && kept > 0.75;
+            model = if near { LossModel::Curvature } else { LossModel::Weight };
             if normal.linearize(&self.kinds, &structure, &self.values, model).is_err() {
                 // The cost is finite here, so that only the derivatives can be at fault.
                 return end(report, Termination::NoStep);

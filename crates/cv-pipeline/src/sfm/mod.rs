@@ -4,12 +4,14 @@ mod model;
 mod pairs;
 mod photo;
 
-pub use photo::{SfmPhoto, sfm_photo};
+pub use pairs::sfm_pairs;
+pub use photo::{SfmPhoto, SfmPhotoError, sfm_photo};
 
-use crate::{MatchingOptions, Progress};
-use cv_core::{Camera, Cancelled, Keypoint, OptionError, StageClock};
+use crate::Progress;
+use cv_core::{Camera, Cancelled, OptionError, StageClock};
+use cv_features::{FeatureOptions, RatioTest};
 use cv_sfm::{
-    CameraKnowledge, PairMatches, SfmError, SfmInput, SfmModel, SfmView, ViewOutcome, ViewPairModel, ViewPairOptions,
+    CameraKnowledge, PairMatches, SfmError, SfmInput, SfmModel, SfmView, ViewOutcome, ViewPairOptions,
     reconstruct_views,
 };
 
@@ -18,8 +20,10 @@ use cv_sfm::{
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct SfmJobOptions {
-    /// Features and matches. Default SIFT, 12,000 in a photograph at most.
-    pub matching: MatchingOptions,
+    /// Features. Default SIFT, 12,000 in a photograph at most.
+    pub features: FeatureOptions,
+    /// Which matches stay by how ambiguous they are. Default as of the kind of the descriptors.
+    pub ratio: RatioTest,
     /// Features of the largest scale that a pair is tried with first. Default 2,048.
     pub first_features: usize,
     /// Which pairs of photographs hold.
@@ -30,9 +34,13 @@ pub struct SfmJobOptions {
 
 impl Default for SfmJobOptions {
     fn default() -> Self {
-        let matching = MatchingOptions::default();
-        let matching = MatchingOptions { features: matching.features.clone().at_most(12_000), ..matching };
-        Self { matching, first_features: 2048, pairs: ViewPairOptions::default(), solve: cv_sfm::SfmOptions::default() }
+        Self {
+            features: FeatureOptions::default().at_most(12_000),
+            ratio: RatioTest::Kind,
+            first_features: 2048,
+            pairs: ViewPairOptions::default(),
+            solve: cv_sfm::SfmOptions::default(),
+        }
     }
 }
 
@@ -127,22 +135,17 @@ pub fn sfm(
         }
     }
     let mut clock = StageClock::new();
-    let (pairs, geometry): (Vec<PairMatches>, Vec<ViewPairModel>) =
-        pairs::match_pairs(photos, cameras, options, progress)?.into_iter().unzip();
+    let (pairs, geometry) = sfm_pairs(photos, cameras, options, progress)?;
     clock.lap("match");
     if pairs.is_empty() {
         return Err(SfmJobError::NoPairs { photos: photos.len() });
     }
     let views: Vec<SfmView<'_>> =
-        photos.iter().map(|p| SfmView { camera: p.camera, keypoints: keypoints(p) }).collect();
+        photos.iter().map(|p| SfmView { camera: p.camera, keypoints: &p.keypoints }).collect();
     let (lenses, knowledge): (Vec<Camera>, Vec<CameraKnowledge>) =
         cameras.iter().map(|c| (c.camera, c.knowledge)).unzip();
     let input = SfmInput { views: &views, cameras: &lenses, knowledge: &knowledge, pairs: &pairs, geometry: &geometry };
     let found = reconstruct_views(&input, &options.solve, progress)?;
     clock.lap("solve");
     Ok(SfmResult { models: found.models, outcomes: found.views, pairs, stages: clock.into_stages() })
-}
-
-fn keypoints(photo: &SfmPhoto) -> &[Keypoint] {
-    &photo.features.keypoints
 }

@@ -1,6 +1,6 @@
 //! A model as the rest of the world reads it.
 
-use super::{SfmPhoto, SfmResult, keypoints};
+use super::{SfmPhoto, SfmResult};
 use cv_core::{ModelImage, ModelPoint, SparseModel};
 
 impl SfmResult {
@@ -11,7 +11,7 @@ impl SfmResult {
         let mut out = SparseModel::default();
         for (i, (photo, pose)) in photos.iter().zip(&model.poses).enumerate() {
             let Some(pose) = pose else { continue };
-            let points = keypoints(photo).iter().map(|k| (k.position.cast(), None)).collect();
+            let points = photo.keypoints.iter().map(|k| (k.position.cast(), None)).collect();
             let camera = photo.camera as u32 + 1;
             out.cameras.insert(camera, *model.cameras.get(photo.camera)?);
             out.images.insert(i as u32 + 1, ModelImage { name: photo.name.clone(), camera, pose: *pose, points });
