@@ -60,6 +60,15 @@ impl ByteDescriptors {
         Self { data: indices.iter().flat_map(|&i| self.row(i)).copied().collect(), ..*self }
     }
 
+    /// The sum of squared differences between descriptor `i` and descriptor `j` of another set, in the unit of the kind.
+    ///
+    /// # Panics
+    /// Where there are not so many.
+    pub fn ssd(&self, i: usize, other: &Self, j: usize) -> f32 {
+        let squared = |(a, b): (&u8, &u8)| u32::from(a.abs_diff(*b)).pow(2);
+        self.row(i).iter().zip(other.row(j)).map(squared).sum::<u32>() as f32 * self.unit()
+    }
+
     /// A difference of one byte in the unit of the numbers, squared.
     pub(crate) fn unit(&self) -> f32 {
         1.0 / (self.scale.factor * self.scale.factor)

@@ -10,6 +10,7 @@
 //! * The same input, options and seed give the same bytes at any number of threads.
 
 mod bundle;
+mod complete;
 mod focal_length;
 mod incremental;
 mod initial_pair;
@@ -20,6 +21,7 @@ mod tracks;
 mod triangulate_track;
 mod view_pair;
 
+pub use complete::FeatureDistance;
 pub use incremental::{SfmError, SfmInput, SfmOptions, SfmOutcome, reconstruct_views};
 pub use model::{SfmModel, SfmPoint, ViewOutcome};
 pub use tracks::{Observation, PairMatches, Tracks};

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 pub(crate) struct Scene<'a> {
     pub(crate) views: &'a [SfmView<'a>],
     pub(crate) knowledge: &'a [CameraKnowledge],
-    pub(crate) tracks: &'a Tracks,
+    pub(crate) tracks: Tracks,
     pub(crate) cameras: Vec<Camera>,
     pub(crate) poses: Vec<Option<Pose>>,
     /// Of each track.
@@ -29,41 +29,49 @@ impl<'a> Scene<'a> {
         views: &'a [SfmView<'a>],
         cameras: &[Camera],
         knowledge: &'a [CameraKnowledge],
-        tracks: &'a Tracks,
+        tracks: Tracks,
     ) -> Self {
-        let observations = tracks.observations();
-        let mut track_of = vec![0; observations.len()];
-        for t in 0..tracks.len() {
-            track_of[tracks.range(t)].fill(t as u32);
-        }
-        let mut start = vec![0usize; views.len() + 1];
-        for o in observations {
-            start[o.view as usize + 1] += 1;
-        }
-        for v in 0..views.len() {
-            start[v + 1] += start[v];
-        }
-        let mut next = start.clone();
-        let mut by_view = vec![0; observations.len()];
-        for (i, o) in observations.iter().enumerate() {
-            by_view[next[o.view as usize]] = i as u32;
-            next[o.view as usize] += 1;
-        }
         let mut scene = Self {
             views,
             knowledge,
-            tracks,
+            tracks: Tracks::default(),
             cameras: cameras.to_vec(),
             poses: vec![None; views.len()],
-            points: vec![None; tracks.len()],
-            active: vec![false; observations.len()],
+            points: Vec::new(),
+            active: Vec::new(),
             rays: Vec::new(),
-            track_of,
-            start,
-            by_view,
+            track_of: Vec::new(),
+            start: Vec::new(),
+            by_view: Vec::new(),
         };
-        scene.cameras_changed();
+        scene.set_tracks(tracks);
         scene
+    }
+
+    /// Other tracks, none of which has a point yet.
+    pub(crate) fn set_tracks(&mut self, tracks: Tracks) {
+        let observations = tracks.observations();
+        self.track_of = vec![0; observations.len()];
+        for t in 0..tracks.len() {
+            self.track_of[tracks.range(t)].fill(t as u32);
+        }
+        self.start = vec![0usize; self.views.len() + 1];
+        for o in observations {
+            self.start[o.view as usize + 1] += 1;
+        }
+        for v in 0..self.views.len() {
+            self.start[v + 1] += self.start[v];
+        }
+        let mut next = self.start.clone();
+        self.by_view = vec![0; observations.len()];
+        for (i, o) in observations.iter().enumerate() {
+            self.by_view[next[o.view as usize]] = i as u32;
+            next[o.view as usize] += 1;
+        }
+        self.points = vec![None; tracks.len()];
+        self.active = vec![false; observations.len()];
+        self.tracks = tracks;
+        self.cameras_changed();
     }
 
     /// To be called where `cameras` were changed.
@@ -128,27 +136,30 @@ impl<'a> Scene<'a> {
 
     /// What was found so far.
     pub(crate) fn solution(&self) -> Solution {
-        let Self { cameras, poses, points, active, .. } = self;
-        Solution { cameras: cameras.clone(), poses: poses.clone(), points: points.clone(), active: active.clone() }
+        let Self { tracks, cameras, poses, points, active, .. } = self;
+        let (cameras, poses, points, active) = (cameras.clone(), poses.clone(), points.clone(), active.clone());
+        Solution { tracks: tracks.clone(), cameras, poses, points, active }
     }
 
     /// Back to what was found before.
     pub(crate) fn restore(&mut self, solution: Solution) {
-        let Solution { cameras, poses, points, active } = solution;
-        (self.cameras, self.poses, self.points, self.active) = (cameras, poses, points, active);
-        self.cameras_changed();
+        let Solution { tracks, cameras, poses, points, active } = solution;
+        (self.cameras, self.poses) = (cameras, poses);
+        self.set_tracks(tracks);
+        (self.points, self.active) = (points, active);
     }
 
-    /// Forgets poses and points.
-    pub(crate) fn clear(&mut self) {
+    /// Forgets everything but the tracks.
+    pub(crate) fn clear(&mut self, cameras: &[Camera], tracks: &Tracks) {
+        self.cameras.copy_from_slice(cameras);
         self.poses.fill(None);
-        self.points.fill(None);
-        self.active.fill(false);
+        self.set_tracks(tracks.clone());
     }
 }
 
 /// Everything that a [`Scene`] solves for.
 pub(crate) struct Solution {
+    tracks: Tracks,
     cameras: Vec<Camera>,
     poses: Vec<Option<Pose>>,
     points: Vec<Option<Point3<f64>>>,

@@ -45,55 +45,17 @@ impl Tracks {
     /// Joins matched keypoints to tracks of two and more views.
     ///
     /// The surest matches (by distance) come first, and one that would put two places of a view into one track is left out: that is how a wrong match between
-    /// two right tracks costs itself alone. Features at one place (of several orientations) count as one. Matches of views or keypoints that there are not are
+    /// two right tracks costs itself alone. Features at one place (of several orientations or scales) count as one. Matches of views or keypoints that there are not are
     /// left out. O(m log m) of m matches.
     pub fn build(views: &[&[Keypoint]], pairs: &[PairMatches]) -> Self {
-        let mut first = Vec::with_capacity(views.len() + 1);
-        let mut total = 0u32;
-        for view in views {
-            first.push(total);
-            total += view.len() as u32;
+        let mut joiner = TrackJoiner::new(views);
+        let mut joins = Vec::with_capacity(pairs.iter().map(|p| p.matches.len()).sum());
+        for pair in pairs.iter().filter(|p| p.a != p.b) {
+            let of = |view: usize, keypoint: u32| Observation { view: view as u32, keypoint };
+            joins.extend(pair.matches.iter().map(|m| (m.distance, of(pair.a, m.query), of(pair.b, m.train))));
         }
-        let place = places(views, &first);
-        let mut edges: Vec<(f32, u32, u32)> = Vec::with_capacity(pairs.iter().map(|p| p.matches.len()).sum());
-        for pair in pairs {
-            let known = pair.a < views.len() && pair.b < views.len() && pair.a != pair.b;
-            for m in pair.matches.iter().filter(|_| known) {
-                if (m.query as usize) < views[pair.a].len() && (m.train as usize) < views[pair.b].len() {
-                    let of = |view: usize, keypoint: u32| place[(first[view] + keypoint) as usize];
-                    let (i, j) = (of(pair.a, m.query), of(pair.b, m.train));
-                    edges.push((m.distance, i.min(j), i.max(j)));
-                }
-            }
-        }
-        edges.sort_unstable_by(|x, y| x.0.total_cmp(&y.0).then((x.1, x.2).cmp(&(y.1, y.2))));
-
-        let view_of = |item: u32| first.partition_point(|f| *f <= item) - 1;
-        let mut sets = UnionFind::new(total as usize);
-        // The items of each set of two and more, ascending, and so by view: kept with the root.
-        let mut members: Vec<Vec<u32>> = vec![Vec::new(); total as usize];
-        for (_, i, j) in edges {
-            let (i, j) = (sets.find(i), sets.find(j));
-            if i == j {
-                continue;
-            }
-            let (one, two) = (std::mem::take(&mut members[i as usize]), std::mem::take(&mut members[j as usize]));
-            let own = |list: Vec<u32>, item: u32| if list.is_empty() { vec![item] } else { list };
-            let (one, two) = (own(one, i), own(two, j));
-            match merged(&one, &two, view_of) {
-                Some(all) => {
-                    sets.union(i, j);
-                    members[i.min(j) as usize] = all;
-                }
-                None => (members[i as usize], members[j as usize]) = (one, two),
-            }
-        }
-        let observation = |item: u32| {
-            let view = view_of(item);
-            Observation { view: view as u32, keypoint: item - first[view] }
-        };
-        let lists = members.into_iter().filter(|list| list.len() > 1);
-        Self::from_lists(lists.map(|list| list.into_iter().map(observation).collect()))
+        joiner.join(&joins);
+        joiner.finish()
     }
 
     /// Number of tracks.
@@ -120,6 +82,84 @@ impl Tracks {
     }
 }
 
+/// Two features of a view that are nearer than this are of one place, in pixels: of several orientations, or of neighboring scales.
+const SAME_PLACE: f32 = 1.0;
+
+/// Sets of observations that grow by joining.
+pub(crate) struct TrackJoiner<'v> {
+    views: &'v [&'v [Keypoint]],
+    /// The number of the first keypoint of each view, where all are counted on.
+    first: Vec<u32>,
+    /// Of each keypoint the first of its view at exactly its place.
+    place: Vec<u32>,
+    sets: UnionFind,
+    /// The keypoints of each set of two and more, ascending, and so by view: kept with the root.
+    members: Vec<Vec<u32>>,
+}
+
+impl<'v> TrackJoiner<'v> {
+    /// Every keypoint in a set of its own.
+    pub(crate) fn new(views: &'v [&'v [Keypoint]]) -> Self {
+        let mut first = Vec::with_capacity(views.len());
+        let mut total = 0u32;
+        for view in views {
+            first.push(total);
+            total += view.len() as u32;
+        }
+        let place = places(views, &first);
+        let sets = UnionFind::new(total as usize);
+        Self { views, first, place, sets, members: vec![Vec::new(); total as usize] }
+    }
+
+    /// Joins the sets of two observations each, the surest (least number) first, where no view comes to have two places in a set. Observations that there are not are left out.
+    pub(crate) fn join(&mut self, joins: &[(f32, Observation, Observation)]) {
+        let item = |o: Observation| {
+            let known = self.views.get(o.view as usize).is_some_and(|view| (o.keypoint as usize) < view.len());
+            known.then(|| self.place[(self.first[o.view as usize] + o.keypoint) as usize])
+        };
+        let known = joins.iter().filter_map(|(distance, a, b)| Some((*distance, item(*a)?, item(*b)?)));
+        let mut edges: Vec<(f32, u32, u32)> = known.map(|(d, a, b)| (d, a.min(b), a.max(b))).collect();
+        edges.sort_unstable_by(|x, y| x.0.total_cmp(&y.0).then((x.1, x.2).cmp(&(y.1, y.2))));
+        for (_, i, j) in edges {
+            let (i, j) = (self.sets.find(i), self.sets.find(j));
+            if i == j {
+                continue;
+            }
+            let take = |list: &mut Vec<u32>, item: u32| if list.is_empty() { vec![item] } else { std::mem::take(list) };
+            let (one, two) = (take(&mut self.members[i as usize], i), take(&mut self.members[j as usize], j));
+            match merged(&one, &two, |item| self.view_of(item), |i, j| self.near(i, j)) {
+                Some(all) => {
+                    self.sets.union(i, j);
+                    self.members[i.min(j) as usize] = all;
+                }
+                None => (self.members[i as usize], self.members[j as usize]) = (one, two),
+            }
+        }
+    }
+
+    /// The sets of two observations and more.
+    pub(crate) fn finish(self) -> Tracks {
+        let observation = |item: u32| {
+            let view = self.view_of(item);
+            Observation { view: view as u32, keypoint: item - self.first[view] }
+        };
+        let lists = self.members.iter().filter(|list| list.len() > 1);
+        Tracks::from_lists(lists.map(|list| list.iter().map(|item| observation(*item)).collect()))
+    }
+
+    fn view_of(&self, item: u32) -> usize {
+        self.first.partition_point(|f| *f <= item) - 1
+    }
+
+    fn near(&self, i: u32, j: u32) -> bool {
+        let at = |item: u32| {
+            let view = self.view_of(item);
+            self.views[view][(item - self.first[view]) as usize].position
+        };
+        (at(i) - at(j)).norm() <= SAME_PLACE
+    }
+}
+
 /// Of each keypoint the first of its view at the same place.
 fn places(views: &[&[Keypoint]], first: &[u32]) -> Vec<u32> {
     let mut place = Vec::with_capacity(views.iter().map(|v| v.len()).sum());
@@ -140,22 +180,28 @@ fn places(views: &[&[Keypoint]], first: &[u32]) -> Vec<u32> {
     place
 }
 
-/// Two ascending lists as one, unless a view is in both.
-fn merged(one: &[u32], two: &[u32], view_of: impl Fn(u32) -> usize) -> Option<Vec<u32>> {
-    let mut all = Vec::with_capacity(one.len() + two.len());
+/// Two lists, ascending by view, as one; `None` where a view is in both at two places. Where its places are near each other, that of the longer list stays.
+fn merged(
+    one: &[u32],
+    two: &[u32],
+    view_of: impl Fn(u32) -> usize,
+    near: impl Fn(u32, u32) -> bool,
+) -> Option<Vec<u32>> {
+    let (long, short) = if one.len() >= two.len() { (one, two) } else { (two, one) };
+    let mut all = Vec::with_capacity(long.len() + short.len());
     let (mut i, mut j) = (0, 0);
-    while i < one.len() && j < two.len() {
-        if one[i] < two[j] {
-            all.push(one[i]);
-            i += 1;
-        } else {
-            all.push(two[j]);
-            j += 1;
+    while i < long.len() && j < short.len() {
+        let (a, b) = (view_of(long[i]), view_of(short[j]));
+        if a == b && !near(long[i], short[j]) {
+            return None;
         }
+        all.push(if a <= b { long[i] } else { short[j] });
+        i += usize::from(a <= b);
+        j += usize::from(b <= a);
     }
-    all.extend_from_slice(&one[i..]);
-    all.extend_from_slice(&two[j..]);
-    all.windows(2).all(|w| view_of(w[0]) != view_of(w[1])).then_some(all)
+    all.extend_from_slice(&long[i..]);
+    all.extend_from_slice(&short[j..]);
+    Some(all)
 }
 
 #[cfg(test)]
@@ -163,7 +209,7 @@ mod tests {
     use super::*;
 
     fn view(n: usize) -> Vec<Keypoint> {
-        (0..n).map(|i| Keypoint::new(i as f32, 0.0, 1.0)).collect()
+        (0..n).map(|i| Keypoint::new(10.0 * i as f32, 0.0, 1.0)).collect()
     }
 
     fn matches(a: usize, b: usize, list: &[(u32, u32, f32)]) -> PairMatches {
