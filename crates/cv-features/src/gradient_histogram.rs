@@ -41,17 +41,19 @@ pub(crate) fn dominant_angles(level: Level, image: &Image<u16, 1>, (px, py): (f3
     peaks.iter().take(MOST_ANGLES).map(|p| p.1).collect()
 }
 
-/// The largest window: 4.5σ to each side at σ = 2^(4/3) · 4, the largest that the options allow.
-const WIDEST: usize = 128;
+/// The largest window: 4.5σ to each side at σ = 2^(4/3) · 4 / 2, the largest that the options allow at half the resolution of an octave.
+const WIDEST: usize = 64;
 
-/// Adds each pixel of the window to the bin of its gradient's direction.
+/// Shares the gradient of each square of four pixels of the window between the two bins nearest to its direction. There are few of them: were each to go into one
+/// bin, the peaks would depend on how the pixels happen to lie.
 #[inline(always)]
 fn vote<S: Simd>(_: S, image: &Image<u16, 1>, (px, py): (f32, f32), sigma: f32, bins: &mut [f32; BINS]) {
     let radius = ((3.0 * sigma + 0.5) as isize).min(WIDEST as isize / 2 - 1);
     let (w, h) = image.size();
+    // Squares of four pixels, whose middles lie half-way between theirs.
     let reach = |p: f32, n: usize| {
-        let c = (p + 0.5) as isize;
-        ((c - radius).max(1) as usize, (c + radius + 1).min(n as isize - 1).max(1) as usize)
+        let c = p as isize;
+        ((c - radius).max(0) as usize, (c + radius + 1).min(n as isize - 1).max(0) as usize)
     };
     let ((x0, x1), (y0, y1)) = (reach(px, w), reach(py, h));
     if x1 <= x0 {
@@ -61,34 +63,35 @@ fn vote<S: Simd>(_: S, image: &Image<u16, 1>, (px, py): (f32, f32), sigma: f32, 
     let falloff = -0.5 / (sigma * sigma);
     let mut weights = [0.0f32; WIDEST];
     for (i, weight) in weights[..n].iter_mut().enumerate() {
-        let d = (x0 + i) as f32 - px;
+        let d = (x0 + i) as f32 + 0.5 - px;
         *weight = (falloff * d * d).exp();
     }
-    let (mut votes, mut places) = ([0.0f32; WIDEST], [0u32; WIDEST]);
-    // Two histograms in turn, so that one addition need not wait for the other; a last bin for directions just below a full turn.
+    let (mut votes, mut places, mut shares) = ([0.0f32; WIDEST], [0u32; WIDEST], [0.0f32; WIDEST]);
+    // For the bin below a direction and for the one above, so that one addition need not wait for the other; a last one for a full turn.
     let mut sums = [[0.0f32; BINS + 1]; 2];
     for y in y0..y1 {
-        let d = y as f32 - py;
+        let d = y as f32 + 0.5 - py;
         let weight = (falloff * d * d).exp();
-        let above = &image.row(y - 1)[x0..x1];
-        let below = &image.row(y + 1)[x0..x1];
-        let (left, right) = (&image.row(y)[x0 - 1..x1 - 1], &image.row(y)[x0 + 1..x1 + 1]);
+        let (above, below) = (&image.row(y)[x0..x1 + 1], &image.row(y + 1)[x0..x1 + 1]);
         for i in 0..n {
-            let gx = right[i] as f32 - left[i] as f32;
-            let gy = below[i] as f32 - above[i] as f32;
+            let (rise, fall) = (below[i + 1] as f32 - above[i] as f32, below[i] as f32 - above[i + 1] as f32);
+            let (gx, gy) = (rise - fall, rise + fall);
             votes[i] = weight * weights[i] * (gx * gx + gy * gy).sqrt();
-            places[i] = round(turn(gy, gx) * BINS as f32);
+            let place = turn(gy, gx) * BINS as f32;
+            places[i] = place as u32;
+            shares[i] = votes[i] * (place - places[i] as f32);
         }
-        for (pair, votes) in places[..n].chunks(2).zip(votes[..n].chunks(2)) {
-            for ((sums, place), vote) in sums.iter_mut().zip(pair).zip(votes) {
-                sums[(*place as usize).min(BINS)] += vote;
-            }
+        for i in 0..n {
+            let at = (places[i] as usize).min(BINS);
+            sums[0][at] += votes[i] - shares[i];
+            sums[1][at] += shares[i];
         }
     }
     for (i, bin) in bins.iter_mut().enumerate() {
-        *bin = sums[0][i] + sums[1][i];
+        *bin = sums[0][i] + sums[1][(i + BINS - 1) % BINS];
     }
-    bins[0] += sums[0][BINS] + sums[1][BINS];
+    bins[0] += sums[0][BINS];
+    bins[1] += sums[1][BINS];
 }
 
 /// Histogram cells on a side.

@@ -54,6 +54,7 @@ mod mops;
 mod nearest_neighbors;
 mod patch;
 mod pyramid;
+mod scale_recipes;
 mod scale_space;
 mod sift;
 mod simd;

@@ -17,6 +17,12 @@ impl LineBuffer {
         Self { data: vec![0.0; columns.len() * rows], from: columns.start, width: columns.len(), rows }
     }
 
+    /// Makes room for the rows of another part; what they held is left in them.
+    pub(crate) fn fit(&mut self, columns: Range<usize>, rows: usize) {
+        (self.from, self.width, self.rows) = (columns.start, columns.len(), rows);
+        self.data.resize(self.width * rows, 0.0);
+    }
+
     /// Row `y` of the image, from column `from` on.
     #[inline]
     pub(crate) fn row(&self, y: usize) -> &[f32] {
@@ -29,25 +35,25 @@ impl LineBuffer {
         &mut self.data[start..start + self.width]
     }
 
-    /// Columns `a..b` of the rows `y − r` to `y + r` of an image of `h` rows, mirrored at its ends.
+    /// Columns `a..b` of `count` rows from row `first` on, of an image of `h` rows, mirrored at its ends.
     pub(crate) fn window<'a>(
         &'a self,
-        y: usize,
-        r: usize,
+        first: isize,
+        count: usize,
         h: usize,
         columns: &Range<usize>,
         rows: &mut Vec<&'a [f32]>,
     ) {
         let (a, b) = (columns.start - self.from, columns.end - self.from);
         rows.clear();
-        if y >= r && y + r < h {
-            let mut slot = (y - r) % self.rows;
-            for _ in 0..=2 * r {
+        if first >= 0 && first as usize + count <= h {
+            let mut slot = first as usize % self.rows;
+            for _ in 0..count {
                 rows.push(&self.data[slot * self.width..][a..b]);
                 slot = if slot + 1 == self.rows { 0 } else { slot + 1 };
             }
         } else {
-            rows.extend((0..=2 * r).map(|d| &self.row(mirror_index((y + d) as isize - r as isize, h))[a..b]));
+            rows.extend((0..count).map(|d| &self.row(mirror_index(first + d as isize, h))[a..b]));
         }
     }
 }

@@ -1,12 +1,12 @@
 //! The Gaussian scale space of an image and its differences, computed in one pass per octave.
 //!
-//! An octave is worked in tiles. Within a tile, rows stream through all scales at once: each scale keeps only the rows that the next one's
-//! window needs, the differences only those that the search for extrema looks at, so a tile lives in the cache. What is kept of an octave are the
-//! scales that descriptors read (as 16-bit numbers) and the image the next octave starts from. Tiles overlap by what the windows
-//! reach; results do not depend on how the image is cut.
+//! An octave is worked in tiles. Within a tile, pairs of rows stream through all scales at once: each scale keeps only the rows that are looked back at,
+//! so a tile lives in the cache. Scales are made from every second pixel of smoother ones (see `scale_recipes.rs`), and at that resolution they are kept for descriptors,
+//! whose samples lie 1.5 pixels of the octave apart or more. Tiles overlap by what the windows reach; results do not depend on how the image is cut.
 
-use crate::dog::{Extremum, REACH, Search, find};
+use crate::dog::{Extremum, Search, find};
 use crate::line_buffer::LineBuffer;
+use crate::scale_recipes::{Needs, REACH_PAIRS, Recipe, recipes};
 use crate::simd;
 use cv_core::{Cancelled, GrayF32, Image, ImageView, Progress, Stage};
 use cv_imgproc::{mirror_ends, mirror_index};
@@ -15,90 +15,37 @@ use rayon::prelude::*;
 use std::iter::successors;
 use std::ops::Range;
 
-/// Columns of a tile: the rows of all scales it needs (about 190 at the usual settings) then take under a megabyte.
+/// Columns of a tile: the rows of all scales it needs (about 170 at the usual settings) then take under a megabyte.
 const COLUMNS: usize = 1024;
-/// Rows of a strip, at most: each costs some 30 more at its edges.
+/// Rows of a strip, at most: each costs some 20 more at its edges.
 const ROWS: usize = 512;
-/// Rows of a tile that are worked without asking whether to go on: some milliseconds.
-const ROWS_UNASKED: usize = 64;
+/// Pairs of rows of a tile that are worked without asking whether to go on: some milliseconds.
+const PAIRS_UNASKED: usize = 32;
 /// Octaves end before their shorter side is below this.
 const SMALLEST_SIDE: usize = 12;
 
 /// The scales of an octave that descriptors read: 1 to `layers`.
 pub(crate) struct Octave {
-    /// Scale `i + 1`: σ = `sigma · 2^((i + 1) / layers)` octave pixels, 0 to 65535 from the darkest to the brightest sample of the image.
+    /// Every second pixel of every second row of scale `i + 1`: σ = `sigma · 2^((i + 1) / layers) / 2` of its own pixels, 0 to 65535 from the darkest to the brightest
+    /// sample of the image.
     pub(crate) scales: Vec<Image<u16, 1>>,
-    /// Size of this octave's pixel in input pixels.
+    /// Size of this octave's pixel in input pixels; those of `scales` are twice as large.
     pub(crate) pixel: f32,
 }
 
-/// The half of a sampled Gaussian from its center outwards to three standard deviations, the whole summing to one.
-fn half_kernel(sigma: f32) -> Vec<f32> {
-    let radius = (3.0 * sigma).ceil().max(1.0) as usize;
-    let weight = |i: usize| (-0.5 * (i as f64 / f64::from(sigma)).powi(2)).exp();
-    let sum = weight(0) + 2.0 * (1..=radius).map(weight).sum::<f64>();
-    (0..=radius).map(|i| (weight(i) / sum) as f32).collect()
-}
-
-/// The half-kernel at phase ½: the samples at ½, 1½, … of each side.
-fn half_kernel_between(sigma: f32, len: usize) -> Vec<f32> {
-    let weight = |i: usize| (-0.5 * ((i as f64 + 0.5) / f64::from(sigma)).powi(2)).exp();
-    let sum = 2.0 * (0..len).map(weight).sum::<f64>();
-    (0..len).map(|i| (weight(i) / sum) as f32).collect()
-}
-
-/// Where the rows of the first scale of an octave come from.
+/// What an octave begins with.
 enum Source<'a> {
-    /// Twice the size of this image, smoothed: pixel `u` of the octave lies at `u / 2`. The Gaussian is sampled at the two phases 0 and ½, so
-    /// smoothing is the interpolation; no bilinear step blurs one pixel more than the next.
-    Doubled { view: ImageView<'a, f32, 1>, even: Vec<f32>, odd: Vec<f32> },
-    /// This image.
+    /// An image of half its size: pixel `u` of the octave lies at `u / 2`.
+    Doubled(ImageView<'a, f32, 1>),
+    /// Its scale 0.
     Ready(GrayF32),
 }
 
 impl Source<'_> {
     fn size(&self) -> (usize, usize) {
         match self {
-            Self::Doubled { view, .. } => (2 * view.width(), 2 * view.height()),
+            Self::Doubled(view) => (2 * view.width(), 2 * view.height()),
             Self::Ready(image) => image.size(),
-        }
-    }
-
-    /// Columns `from..from + out.len()` of row `y`.
-    fn row(&self, level: Level, y: usize, from: usize, out: &mut [f32], buffer: &mut Buffer) {
-        match self {
-            Self::Ready(image) => out.copy_from_slice(&image.row(y)[from..from + out.len()]),
-            Self::Doubled { view, even, odd } => {
-                let (w, h) = view.size();
-                let to = from + out.len();
-                // The source columns that the window reaches, and those of them there are.
-                let pad = even.len();
-                let (first, last) = (from / 2, (to - 1) / 2 + 1);
-                let (a, b) = (first.saturating_sub(pad), (last + pad).min(w));
-                let (left, right) = (a + pad - first, last + pad - b);
-                let count = last - first;
-                let Buffer { padded, phases: [evens, odds, both] } = buffer;
-                padded.resize(count + 2 * pad, 0.0);
-                let middle = &mut padded[left..left + b - a];
-                let row = |d: isize| &view.row(mirror_index((y / 2) as isize + d, h))[a..b];
-                let mut rows: Vec<&[f32]> = Vec::with_capacity(2 * pad);
-                let r = pad as isize - 1;
-                if y.is_multiple_of(2) {
-                    rows.extend((-r..=r).map(row));
-                    simd::vertical(level, middle, &rows, even);
-                } else {
-                    rows.extend((-r..=r + 1).map(row));
-                    simd::vertical_between(level, middle, &rows, odd);
-                }
-                mirror_ends::<1>(padded, left, right);
-                evens.resize(count, 0.0);
-                odds.resize(count, 0.0);
-                both.resize(2 * count, 0.0);
-                simd::horizontal(level, evens, &padded[1..count + 2 * pad - 1], even);
-                simd::horizontal_between(level, odds, &padded[1..], odd);
-                simd::interleave(level, both, evens, odds);
-                out.copy_from_slice(&both[from % 2..from % 2 + out.len()]);
-            }
         }
     }
 }
@@ -106,15 +53,8 @@ impl Source<'_> {
 /// Buffers of a tile that rows pass through.
 #[derive(Default)]
 struct Buffer {
-    padded: Vec<f32>,
+    padded: [Vec<f32>; 2],
     phases: [Vec<f32>; 3],
-}
-
-impl Buffer {
-    fn padded(&mut self, len: usize) -> &mut [f32] {
-        self.padded.resize(len, 0.0);
-        &mut self.padded
-    }
 }
 
 /// What all tiles of an octave share.
@@ -122,8 +62,8 @@ struct Plan<'a> {
     source: &'a Source<'a>,
     search: &'a Search,
     index: usize,
-    /// Half-kernel from each scale to the next.
-    kernels: &'a [Vec<f32>],
+    recipes: Vec<Recipe>,
+    needs: Needs,
     width: usize,
     height: usize,
     dark: f32,
@@ -131,12 +71,12 @@ struct Plan<'a> {
     level: Level,
 }
 
-/// The rows that a strip writes to.
+/// The rows that a strip writes to: every second of its own, which begin at an even one.
 struct Strip<'a> {
     y0: usize,
     y1: usize,
     scales: Vec<&'a mut [u16]>,
-    /// Every second pixel of every second row of scale `layers`.
+    /// Those of scale `layers`.
     next: &'a mut [f32],
 }
 
@@ -149,14 +89,8 @@ pub(crate) fn scale_space(
     let (dark, bright) = range(view);
     // A flat image has nothing to keep.
     let gain = if bright > dark { 65535.0 / (bright - dark) } else { 0.0 };
-    let scale = |i: usize| search.sigma * 2f32.powf(i as f32 / search.layers as f32);
-    let kernels: Vec<Vec<f32>> = (1..search.layers + 3)
-        .map(|i| half_kernel((scale(i) * scale(i) - scale(i - 1) * scale(i - 1)).sqrt()))
-        .collect();
     let (mut source, mut pixel) = if search.upsample {
-        let even = half_kernel(search.sigma * 0.5);
-        let odd = half_kernel_between(search.sigma * 0.5, even.len());
-        (Source::Doubled { view, even, odd }, 0.5)
+        (Source::Doubled(view), 0.5)
     } else {
         (Source::Ready(cv_imgproc::gaussian_blur(view, search.sigma)), 1.0)
     };
@@ -166,11 +100,13 @@ pub(crate) fn scale_space(
     let (mut octaves, mut extrema) = (Vec::new(), Vec::new());
     while source.size().0.min(source.size().1) >= SMALLEST_SIDE {
         let (width, height) = source.size();
+        let recipes = recipes(search.layers, search.sigma, matches!(source, Source::Doubled(_)));
         let plan = Plan {
             source: &source,
             search,
             index: octaves.len(),
-            kernels: &kernels,
+            needs: Needs::new(&recipes),
+            recipes,
             width,
             height,
             dark,
@@ -226,18 +162,19 @@ type Worked = (Vec<Image<u16, 1>>, GrayF32, Vec<Extremum>);
 /// Works one octave.
 fn octave(plan: &Plan<'_>, stage: &Stage<'_>) -> Result<Worked, Cancelled> {
     let (w, h) = (plan.width, plan.height);
-    let mut scales: Vec<Image<u16, 1>> = (0..plan.search.layers).map(|_| Image::new(w, h, [0])).collect();
-    let mut next = GrayF32::new(w.div_ceil(2), h.div_ceil(2), [0.0]);
+    let (half_w, half_h) = (w.div_ceil(2), h.div_ceil(2));
+    let mut scales: Vec<Image<u16, 1>> = (0..plan.search.layers).map(|_| Image::new(half_w, half_h, [0])).collect();
+    let mut next = GrayF32::new(half_w, half_h, [0.0]);
     // Of an even number of rows. The result does not depend on where the cuts are.
     let rows = h.div_ceil(strips(h)).next_multiple_of(2).max(2);
     let mut work: Vec<Strip<'_>> = next
         .as_mut_slice()
-        .chunks_mut(rows / 2 * w.div_ceil(2))
+        .chunks_mut(rows / 2 * half_w)
         .enumerate()
         .map(|(i, next)| Strip { y0: i * rows, y1: ((i + 1) * rows).min(h), scales: Vec::new(), next })
         .collect();
     for image in &mut scales {
-        for (strip, part) in work.iter_mut().zip(image.as_mut_slice().chunks_mut(rows * w)) {
+        for (strip, part) in work.iter_mut().zip(image.as_mut_slice().chunks_mut(rows / 2 * half_w)) {
             strip.scales.push(part);
         }
     }
@@ -245,8 +182,9 @@ fn octave(plan: &Plan<'_>, stage: &Stage<'_>) -> Result<Worked, Cancelled> {
         .into_par_iter()
         .map(|mut strip| {
             let mut found = Vec::new();
+            let mut tile = Tile::new(plan, &strip);
             for x0 in (0..w).step_by(COLUMNS) {
-                tile(plan, &mut strip, x0..(x0 + COLUMNS).min(w), &mut found, stage)?;
+                tile.run(x0..(x0 + COLUMNS).min(w), &mut strip, &mut found, stage)?;
                 stage.add(1)?;
             }
             Ok(found)
@@ -255,82 +193,206 @@ fn octave(plan: &Plan<'_>, stage: &Stage<'_>) -> Result<Worked, Cancelled> {
     Ok((scales, next, found.into_iter().flatten().collect()))
 }
 
-/// Streams the rows of a tile through all scales.
-fn tile(
-    plan: &Plan<'_>,
-    strip: &mut Strip<'_>,
+/// A part of a strip, and the rows of its scales that are looked back at.
+struct Tile<'a> {
+    plan: &'a Plan<'a>,
     columns: Range<usize>,
-    found: &mut Vec<Extremum>,
-    stage: &Stage<'_>,
-) -> Result<(), Cancelled> {
-    let (w, h) = (plan.width, plan.height);
-    let last = plan.kernels.len();
-    let radius = |scale: usize| plan.kernels[scale - 1].len() - 1;
-    // Scale i is needed this far beyond the tile, and runs this many rows behind scale 0.
-    let halo: Vec<usize> = (0..=last).map(|i| REACH + (i + 1..=last).map(radius).sum::<usize>()).collect();
-    let delay: Vec<usize> = (0..=last).map(|i| (1..=i).map(radius).sum()).collect();
-    let part = |by: usize| columns.start.saturating_sub(by)..(columns.end + by).min(w);
-    let mut scales: Vec<LineBuffer> =
-        (0..=last).map(|i| LineBuffer::new(part(halo[i]), if i < last { 2 * radius(i + 1) + 1 } else { 1 })).collect();
-    let mut differences: Vec<LineBuffer> =
-        (0..last).map(|i| LineBuffer::new(part(REACH), 2 * REACH + 1 + delay[last] - delay[i + 1])).collect();
-    let mut buffer = Buffer::default();
-    let end = strip.y1 + REACH + delay[last];
-    for step in strip.y0.saturating_sub(halo[0])..end {
-        if step.is_multiple_of(ROWS_UNASKED) {
-            stage.check()?;
-        }
-        for i in 0..=last {
-            let wanted = strip.y0.saturating_sub(halo[i])..(strip.y1 + halo[i]).min(h);
-            let Some(y) = step.checked_sub(delay[i]).filter(|y| wanted.contains(y)) else { continue };
-            if i == 0 {
-                let ring = &mut scales[0];
-                let from = ring.from;
-                plan.source.row(plan.level, y, from, ring.row_mut(y), &mut buffer);
-                continue;
-            }
-            let (before, after) = scales.split_at_mut(i);
-            let (previous, ring) = (&before[i - 1], &mut after[0]);
-            let kernel = &plan.kernels[i - 1];
-            let r = kernel.len() - 1;
-            // What the horizontal window of this scale's columns covers, and the part of it there is.
-            let (from, to) = (ring.from, ring.from + ring.width);
-            let (a, b) = (from.saturating_sub(r), (to + r).min(w));
-            let padded = buffer.padded(to - from + 2 * r);
-            let (left, right) = (a + r - from, to + r - b);
-            let mut rows = Vec::with_capacity(2 * r + 1);
-            previous.window(y, r, h, &(a..b), &mut rows);
-            simd::vertical(plan.level, &mut padded[left..left + b - a], &rows, kernel);
-            mirror_ends::<1>(padded, left, right);
-            simd::horizontal(plan.level, ring.row_mut(y), padded, kernel);
+    /// The strip's pairs of rows.
+    pairs: Range<usize>,
+    fine: Vec<LineBuffer>,
+    /// Every second pixel of every second row; its columns are counted so too.
+    coarse: Vec<LineBuffer>,
+    differences: Vec<LineBuffer>,
+    buffer: Buffer,
+}
 
-            let difference = &mut differences[i - 1];
-            if (strip.y0.saturating_sub(REACH)..strip.y1 + REACH).contains(&y) {
-                let from = difference.from;
-                simd::subtract(
-                    plan.level,
-                    difference.row_mut(y),
-                    &ring.row(y)[from - ring.from..],
-                    &previous.row(y)[from - previous.from..],
-                );
+impl<'a> Tile<'a> {
+    fn new(plan: &'a Plan<'a>, strip: &Strip<'_>) -> Self {
+        let buffers = |n: usize| (0..n).map(|_| LineBuffer::new(0..0, 1)).collect::<Vec<_>>();
+        let scales = plan.recipes.len();
+        Self {
+            plan,
+            columns: 0..0,
+            pairs: strip.y0 / 2..strip.y1.div_ceil(2),
+            fine: buffers(scales),
+            coarse: buffers(scales),
+            differences: buffers(scales - 1),
+            buffer: Buffer::default(),
+        }
+    }
+
+    /// Turns to other columns.
+    fn fit(&mut self, columns: Range<usize>) {
+        let (w, needs) = (self.plan.width, &self.plan.needs);
+        let (left, right) = (columns.start / 2, columns.end.div_ceil(2));
+        let coarse = |by: usize| left.saturating_sub(by)..(right + by).min(w.div_ceil(2));
+        let fine = |by: usize| 2 * left.saturating_sub(by)..(2 * (right + by)).min(w);
+        for i in 0..self.plan.recipes.len() {
+            self.fine[i].fit(fine(needs.fine[i]), needs.fine_rows[i]);
+            self.coarse[i].fit(coarse(needs.beyond(i)), needs.coarse_rows[i]);
+        }
+        for (difference, rows) in self.differences.iter_mut().zip(&needs.difference_rows) {
+            difference.fit(fine(REACH_PAIRS), *rows);
+        }
+        self.columns = columns;
+    }
+
+    /// Whether pair `pair` lies at most `by` pairs beyond the tile.
+    fn within(&self, pair: usize, by: usize) -> bool {
+        (self.pairs.start.saturating_sub(by)..self.pairs.end + by).contains(&pair) && 2 * pair < self.plan.height
+    }
+
+    /// Streams the rows of these columns through all scales.
+    fn run(
+        &mut self,
+        columns: Range<usize>,
+        strip: &mut Strip<'_>,
+        found: &mut Vec<Extremum>,
+        stage: &Stage<'_>,
+    ) -> Result<(), Cancelled> {
+        self.fit(columns);
+        let Plan { needs, search, .. } = self.plan;
+        let (w, h) = (self.plan.width, self.plan.height);
+        let beyond = (0..self.plan.recipes.len()).map(|i| needs.beyond(i)).max().unwrap_or(0);
+        for step in self.pairs.start.saturating_sub(beyond)..self.pairs.end + needs.search {
+            if step.is_multiple_of(PAIRS_UNASKED) {
+                stage.check()?;
             }
-            if i <= plan.search.layers && (strip.y0..strip.y1).contains(&y) {
-                let own = &ring.row(y)[columns.start - ring.from..][..columns.len()];
-                let at = (y - strip.y0) * w + columns.start;
-                simd::quantize(plan.level, &mut strip.scales[i - 1][at..at + columns.len()], own, plan.dark, plan.gain);
-                if i == plan.search.layers && y % 2 == 0 {
-                    // Tiles start at even columns.
-                    let at = (y - strip.y0) / 2 * w.div_ceil(2) + columns.start / 2;
-                    strip.next[at..].iter_mut().zip(own.iter().step_by(2)).for_each(|(o, v)| *o = *v);
+            for i in 0..self.plan.recipes.len() {
+                let Some(pair) = step.checked_sub(needs.delay[i]).filter(|&p| self.within(p, needs.beyond(i))) else {
+                    continue;
+                };
+                let whole = self.within(pair, needs.fine[i]);
+                self.make(i, pair, whole);
+                if i > 0 && self.within(pair, REACH_PAIRS) {
+                    self.subtract(i, pair);
+                }
+                if (1..=search.layers).contains(&i) && self.pairs.contains(&pair) {
+                    self.keep(i, pair, strip);
+                }
+            }
+            // The differences now reach `REACH` rows below this pair, or to the end of the image.
+            if let Some(pair) = step.checked_sub(needs.search).filter(|p| self.pairs.contains(p)) {
+                for y in 2 * pair..(2 * pair + 2).min(h) {
+                    let columns = self.columns.clone();
+                    find(&self.differences, self.plan.index, search, (w, h), y, columns, self.plan.level, found);
                 }
             }
         }
-        // The differences now reach `REACH` rows below this one, or to the end of the image.
-        if let Some(y) = step.checked_sub(delay[last] + REACH).filter(|y| (strip.y0..strip.y1).contains(y)) {
-            find(&differences, plan.index, plan.search, (w, h), y, columns.clone(), plan.level, found);
+        Ok(())
+    }
+
+    /// A pair of rows of scale `i`: only every second pixel of the first, or `whole`.
+    fn make(&mut self, i: usize, pair: usize, whole: bool) {
+        let Plan { source, recipes, width: w, height: h, level, .. } = self.plan;
+        let (w, h, level) = (*w, *h, *level);
+        let (fine_before, fine) = self.fine.split_at_mut(i);
+        let (coarse_before, coarse) = self.coarse.split_at_mut(i);
+        let (fine, coarse) = (&mut fine[0], &mut coarse[0]);
+        let rows = 2 * pair..(2 * pair + 2).min(h);
+        match &recipes[i] {
+            Recipe::Given => {
+                // Only the image of an octave that is not doubled.
+                let Source::Ready(image) = source else { return };
+                for y in rows {
+                    let from = fine.from;
+                    let width = fine.width;
+                    fine.row_mut(y).copy_from_slice(&image.row(y)[from..from + width]);
+                }
+                thin(fine, coarse, pair);
+            }
+            Recipe::Blur(kernel) => {
+                let (previous, r) = (&fine_before[i - 1], kernel.len() - 1);
+                let (from, to) = (fine.from, fine.from + fine.width);
+                // What the window covers, and the part of it there is.
+                let (a, b) = (from.saturating_sub(r), (to + r).min(w));
+                let (left, right) = (a + r - from, to + r - b);
+                let padded = &mut self.buffer.padded[0];
+                padded.resize(to - from + 2 * r, 0.0);
+                let mut window = Vec::with_capacity(2 * r + 1);
+                for y in rows {
+                    previous.window(y as isize - r as isize, 2 * r + 1, h, &(a..b), &mut window);
+                    simd::vertical(level, &mut padded[left..left + b - a], &window, kernel);
+                    mirror_ends::<1>(padded, left, right);
+                    simd::horizontal(level, fine.row_mut(y), padded, kernel);
+                }
+                thin(fine, coarse, pair);
+            }
+            Recipe::Polyphase { from: source_scale, even, odd } => {
+                let r = even.len() - 1;
+                let (half_w, half_h) = (w.div_ceil(2), h.div_ceil(2));
+                let (from, to) = (coarse.from, coarse.from + coarse.width);
+                let (a, b) = (from.saturating_sub(r), (to + r + 1).min(half_w));
+                let (left, right) = (a + r - from, to + r + 1 - b);
+                let mut window = Vec::with_capacity(2 * r + 2);
+                let first = pair as isize - r as isize;
+                match (source_scale, source) {
+                    (Some(j), _) => coarse_before[*j].window(first, 2 * r + 2, half_h, &(a..b), &mut window),
+                    (None, Source::Doubled(view)) => {
+                        let row = |d: usize| &view.row(mirror_index(first + d as isize, half_h))[a..b];
+                        window.extend((0..2 * r + 2).map(row));
+                    }
+                    // Only an octave that is doubled has a scale without a source.
+                    (None, Source::Ready(_)) => return,
+                }
+                let Buffer { padded: [upper, lower], phases: [odds, low_evens, low_odds] } = &mut self.buffer;
+                let len = to - from + 2 * r + 1;
+                upper.resize(len, 0.0);
+                let evens = coarse.row_mut(pair);
+                if !whole {
+                    simd::vertical(level, &mut upper[left..left + b - a], &window[..2 * r + 1], even);
+                    mirror_ends::<1>(upper, left, right);
+                    simd::horizontal(level, evens, &upper[..len - 1], even);
+                    return;
+                }
+                lower.resize(len, 0.0);
+                let middles = [&mut upper[left..left + b - a], &mut lower[left..left + b - a]];
+                simd::vertical_phases(level, middles, &window, even, odd);
+                for phase in [&mut *odds, &mut *low_evens, &mut *low_odds] {
+                    phase.resize(to - from, 0.0);
+                }
+                let skip = fine.from / 2 - from;
+                mirror_ends::<1>(upper, left, right);
+                simd::horizontal_phases(level, [&mut *evens, &mut *odds], upper, even, odd);
+                simd::interleave(level, fine.row_mut(2 * pair), &evens[skip..], &odds[skip..]);
+                if rows.len() == 2 {
+                    mirror_ends::<1>(lower, left, right);
+                    simd::horizontal_phases(level, [&mut *low_evens, &mut *low_odds], lower, even, odd);
+                    simd::interleave(level, fine.row_mut(2 * pair + 1), &low_evens[skip..], &low_odds[skip..]);
+                }
+            }
         }
     }
-    Ok(())
+
+    /// The difference of scales `i` and `i − 1` in a pair of rows.
+    fn subtract(&mut self, i: usize, pair: usize) {
+        for y in 2 * pair..(2 * pair + 2).min(self.plan.height) {
+            let difference = &mut self.differences[i - 1];
+            let from = difference.from;
+            let [row, before] = [i, i - 1].map(|i| &self.fine[i].row(y)[from - self.fine[i].from..]);
+            simd::subtract(self.plan.level, difference.row_mut(y), row, before);
+        }
+    }
+
+    /// Keeps every second pixel of the first of two rows of scale `i`.
+    fn keep(&self, i: usize, pair: usize, strip: &mut Strip<'_>) {
+        let (left, right) = (self.columns.start / 2, self.columns.end.div_ceil(2));
+        let own = &self.coarse[i].row(pair)[left - self.coarse[i].from..][..right - left];
+        let at = (pair - self.pairs.start) * self.plan.width.div_ceil(2) + left;
+        let kept = &mut strip.scales[i - 1][at..at + own.len()];
+        simd::quantize(self.plan.level, kept, own, self.plan.dark, self.plan.gain);
+        if i == self.plan.search.layers {
+            strip.next[at..at + own.len()].copy_from_slice(own);
+        }
+    }
+}
+
+/// Every second pixel of the first row of a pair.
+fn thin(fine: &LineBuffer, coarse: &mut LineBuffer, pair: usize) {
+    // A scale that is made at full resolution is needed there wherever it is needed at half.
+    let skip = 2 * coarse.from - fine.from;
+    let row = fine.row(2 * pair)[skip..].iter().step_by(2);
+    coarse.row_mut(pair).iter_mut().zip(row).for_each(|(o, v)| *o = *v);
 }
 
 #[cfg(test)]
@@ -354,13 +416,40 @@ mod tests {
         GrayF32::from_fn(w, h, |x, y| [[1, 3, 7, 13].map(|size| cell(x, y, size)).iter().sum::<f32>() / 4.0])
     }
 
-    /// The scales by whole-image blurs, one after the other.
-    fn plain(first: GrayF32, search: &Search) -> Vec<GrayF32> {
-        let scale = |i: usize| search.sigma * 2f32.powf(i as f32 / search.layers as f32);
-        let mut images = vec![first];
-        for i in 1..search.layers + 3 {
-            let kernel = half_kernel((scale(i) * scale(i) - scale(i - 1) * scale(i - 1)).sqrt());
-            images.push(cv_imgproc::separable_symmetric(images[i - 1].view(), &kernel));
+    fn thinned(image: &GrayF32) -> GrayF32 {
+        let (w, h) = image.size();
+        GrayF32::from_fn(w.div_ceil(2), h.div_ceil(2), |x, y| image.at(2 * x, 2 * y))
+    }
+
+    /// The image of size `(w, h)` whose every second pixel of every second row `coarse` is, blurred: the sums as they stand, along columns and then along rows.
+    fn polyphase(coarse: &GrayF32, (w, h): (usize, usize), even: &[f32], odd: &[f32]) -> GrayF32 {
+        let sum = |at: &dyn Fn(isize) -> f32, u: usize| {
+            let x = (u / 2) as isize;
+            let (kernel, gap) = if u % 2 == 0 { (even, 0) } else { (odd, 1) };
+            let mut sum = if gap == 0 { at(x) * kernel[0] } else { 0.0 };
+            for (t, weight) in kernel.iter().enumerate().skip(1 - gap) {
+                sum += (at(x - t as isize) + at(x + (gap + t) as isize)) * weight;
+            }
+            sum
+        };
+        let (cw, ch) = coarse.size();
+        let columns = GrayF32::from_fn(cw, h, |x, v| [sum(&|y| coarse.at(x, mirror_index(y, ch))[0], v)]);
+        GrayF32::from_fn(w, h, |u, v| [sum(&|x| columns.at(mirror_index(x, cw), v)[0], u)])
+    }
+
+    /// The scales of the first octave by passes over whole images.
+    fn plain(view: &GrayF32, search: &Search) -> Vec<GrayF32> {
+        let (w, h) = view.size();
+        let size = if search.upsample { (2 * w, 2 * h) } else { (w, h) };
+        let mut images: Vec<GrayF32> = Vec::new();
+        for recipe in recipes(search.layers, search.sigma, search.upsample) {
+            images.push(match recipe {
+                Recipe::Given => cv_imgproc::gaussian_blur(view.view(), search.sigma),
+                Recipe::Blur(kernel) => cv_imgproc::separable_symmetric(images[images.len() - 1].view(), &kernel),
+                Recipe::Polyphase { from, even, odd } => {
+                    polyphase(&from.map_or_else(|| view.clone(), |j| thinned(&images[j])), size, &even, &odd)
+                }
+            });
         }
         images
     }
@@ -368,13 +457,14 @@ mod tests {
     #[test]
     fn tiles_add_up_to_whole_images() {
         // Wider than a tile and higher than a strip, and smaller than a window.
-        for (w, h) in [(1100, 430), (61, 500), (40, 13), (13, 40)] {
+        for (w, h, upsample) in [(1100, 530, false), (61, 500, true), (40, 13, false), (13, 41, false), (9, 12, true)] {
             let image = noise(w, h);
-            let s = search(false);
+            let s = search(upsample);
             let (octaves, _) = scale_space(image.view(), &s, &Silent).unwrap();
-            let images = plain(cv_imgproc::gaussian_blur(image.view(), s.sigma), &s);
             let (dark, bright) = range(image.view());
-            for (kept, whole) in octaves[0].scales.iter().zip(&images[1..]) {
+            for (kept, whole) in octaves[0].scales.iter().zip(&plain(&image, &s)[1..]) {
+                let whole = thinned(whole);
+                assert_eq!(kept.size(), whole.size());
                 for (q, v) in kept.as_slice().iter().zip(whole.as_slice()) {
                     let back = dark + f32::from(*q) * (bright - dark) / 65535.0;
                     // Half a step of the 16-bit numbers, and f32 rounding.
@@ -386,27 +476,12 @@ mod tests {
 
     #[test]
     fn extrema_are_those_of_whole_images_by_definition() {
-        for (w, h, upsample) in [(1100, 420, false), (520, 90, true), (45, 300, false)] {
+        for (w, h, upsample) in [(1100, 421, false), (520, 90, true), (45, 301, false)] {
             let image = noise(w, h);
             let s = search(upsample);
             let (octaves, extrema) = scale_space(image.view(), &s, &Silent).unwrap();
-            let first = if upsample {
-                let source = {
-                    let even = half_kernel(s.sigma * 0.5);
-                    let odd = half_kernel_between(s.sigma * 0.5, even.len());
-                    Source::Doubled { view: image.view(), even, odd }
-                };
-                let mut whole = GrayF32::new(2 * w, 2 * h, [0.0]);
-                for y in 0..2 * h {
-                    source.row(simd::level(), y, 0, whole.row_mut(y), &mut Buffer::default());
-                }
-                whole
-            } else {
-                cv_imgproc::gaussian_blur(image.view(), s.sigma)
-            };
             assert!(!octaves.is_empty());
-            let images = plain(first, &s);
-            let expected = crate::dog::tests::plain(&images, 0, &s);
+            let expected = crate::dog::tests::plain(&plain(&image, &s), 0, &s);
             let mut got: Vec<_> =
                 extrema.iter().filter(|e| e.octave == 0).map(|e| (e.layer, e.row, e.column)).collect();
             got.sort_unstable();
@@ -416,21 +491,52 @@ mod tests {
     }
 
     #[test]
+    fn scales_made_from_thinned_ones_are_those_of_long_gaussians() {
+        let image = noise(150, 120);
+        for upsample in [false, true] {
+            let s = search(upsample);
+            let images = plain(&image, &s);
+            // From the image itself by Gaussians cut off at six standard deviations, whose squares add up; at the pixels of the image where it is doubled.
+            let step = if upsample { 2 } else { 1 };
+            let edge = 20;
+            for (i, made) in images.iter().enumerate() {
+                let sigma = s.sigma * 2f32.powf(i as f32 / 3.0) / step as f32;
+                let radius = (6.0 * sigma) as usize;
+                let weights: Vec<f32> = (0..=radius).map(|k| (-0.5 * (k as f32 / sigma).powi(2)).exp()).collect();
+                let sum = 2.0 * weights.iter().sum::<f32>() - weights[0];
+                let kernel: Vec<f32> = weights.iter().map(|w| w / sum).collect();
+                let truth = cv_imgproc::separable_symmetric(image.view(), &kernel);
+                let (mut square, mut signal, mut count) = (0.0f64, 0.0f64, 0);
+                let mean = truth.as_slice().iter().sum::<f32>() / truth.as_slice().len() as f32;
+                for y in edge..120 - edge {
+                    for x in edge..150 - edge {
+                        let d = made.at(step * x, step * y)[0] - truth.at(x, y)[0];
+                        square += f64::from(d * d);
+                        signal += f64::from(truth.at(x, y)[0] - mean).powi(2);
+                        count += 1;
+                    }
+                }
+                assert!(count > 0);
+                // A kernel of three standard deviations lacks 0.3 % of its mass, for which it is a little wider; the errors of up to four passes add up.
+                assert!((square / signal).sqrt() < 0.01, "scale {i}: {}", (square / signal).sqrt());
+            }
+        }
+    }
+
+    #[test]
     fn doubling_keeps_the_phase_of_a_wave() {
-        // exp(−σ²ω²/2) is the gain of a Gaussian; cut off at 3σ it differs by less than its missing mass, 0.3 %.
-        let (omega, sigma) = (0.35f32, 0.8f32);
-        let gain = (-sigma * sigma * omega * omega / 2.0).exp();
+        // exp(−σ²ω²/2) is the gain of a Gaussian; cut off at about 3σ it differs by less than its missing mass, 0.3 %, in each of two passes.
+        let omega = 0.35f32;
         let image = GrayF32::from_fn(90, 70, |x, y| [(omega * x as f32).sin() + 0.5 * (omega * y as f32).cos()]);
-        let even = half_kernel(sigma);
-        let odd = half_kernel_between(sigma, even.len());
-        let source = Source::Doubled { view: image.view(), even, odd };
-        for (y, from, len) in [(60, 0, 180), (61, 7, 100), (62, 100, 80), (63, 121, 1)] {
-            let mut out = vec![0.0; len];
-            source.row(simd::level(), y, from, &mut out, &mut Buffer::default());
-            for (i, v) in out.iter().enumerate().filter(|(i, _)| (8..172).contains(&(from + i))) {
-                let (x, y) = ((from + i) as f32 / 2.0, y as f32 / 2.0);
+        let s = search(true);
+        for (i, made) in plain(&image, &s).iter().enumerate() {
+            let sigma = 0.8 * 2f32.powf(i as f32 / 3.0);
+            let gain = (-sigma * sigma * omega * omega / 2.0).exp();
+            for (u, v) in [(60, 61), (61, 60), (62, 62), (63, 63), (100, 77)] {
+                let (x, y) = (u as f32 / 2.0, v as f32 / 2.0);
                 let expected = gain * ((omega * x).sin() + 0.5 * (omega * y).cos());
-                assert!((v - expected).abs() < 5e-3, "({x}, {y}): {v} not {expected}");
+                let got = made.at(u, v)[0];
+                assert!((got - expected).abs() < 6e-3, "scale {i} ({x}, {y}): {got} not {expected}");
             }
         }
     }

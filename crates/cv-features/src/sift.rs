@@ -140,13 +140,11 @@ pub fn sift(
             let point = &points[index];
             let octave = &octaves[point.octave];
             let image = &octave.scales[point.layer - 1];
-            let angles = if options.upright {
-                vec![0.0]
-            } else {
-                dominant_angles(level, image, (point.x, point.y), point.sigma)
-            };
+            // In pixels of the image, which are twice those of the octave.
+            let (at, sigma) = ((0.5 * point.x, 0.5 * point.y), 0.5 * point.sigma);
+            let angles = if options.upright { vec![0.0] } else { dominant_angles(level, image, at, sigma) };
             let describe = |angle| {
-                let mut histogram = describe(level, image, (point.x, point.y), point.sigma, angle);
+                let mut histogram = describe(level, image, at, sigma, angle);
                 let norm = normalize(&mut histogram, options.root);
                 (keypoint(point, octave, angle), histogram, norm)
             };

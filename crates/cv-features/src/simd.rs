@@ -15,25 +15,35 @@ pub(crate) fn level() -> Level {
 /// `out[x] = k[0]·rows[r][x] + Σ k[t]·(rows[r−t][x] + rows[r+t][x])`, `t` from 1 to `r = k.len() − 1`.
 pub(crate) fn vertical(level: Level, out: &mut [f32], rows: &[&[f32]], kernel: &[f32]) {
     debug_assert!(rows.len() == 2 * kernel.len() - 1 && rows.iter().all(|r| r.len() == out.len()));
-    dispatch!(level, simd => symmetric::<_, _, false>(simd, out, kernel, Down { rows }));
+    dispatch!(level, simd => symmetric(simd, out, kernel, Down { rows }));
 }
 
-/// `out[x] = Σ k[t]·(rows[r−t][x] + rows[r+1+t][x])`, `t` from 0 to `r = k.len() − 1`: half-way between rows `r` and `r + 1`.
-pub(crate) fn vertical_between(level: Level, out: &mut [f32], rows: &[&[f32]], kernel: &[f32]) {
-    debug_assert!(rows.len() == 2 * kernel.len() && rows.iter().all(|r| r.len() == out.len()));
-    dispatch!(level, simd => symmetric::<_, _, true>(simd, out, kernel, Down { rows }));
+/// Two rows at once: `even` half-way along an odd number of rows, as [`vertical`] of all but the last, and `odd` half-way between rows `r` and `r + 1`, as
+/// `Σ o[t]·(rows[r−t][x] + rows[r+1+t][x])`, `t` from 0 to `r`. Both kernels have `r + 1` numbers.
+pub(crate) fn vertical_phases(
+    level: Level,
+    [even, odd]: [&mut [f32]; 2],
+    rows: &[&[f32]],
+    evens: &[f32],
+    odds: &[f32],
+) {
+    debug_assert!(rows.len() == 2 * evens.len() && rows.iter().all(|r| r.len() == even.len()));
+    debug_assert!(evens.len() == odds.len() && even.len() == odd.len());
+    dispatch!(level, simd => phases(simd, [even, odd], evens, odds, Down { rows }));
 }
 
 /// `out[x] = k[0]·row[x+r] + Σ k[t]·(row[x+r−t] + row[x+r+t])`, `t` from 1 to `r = k.len() − 1`.
 pub(crate) fn horizontal(level: Level, out: &mut [f32], row: &[f32], kernel: &[f32]) {
     debug_assert_eq!(row.len(), out.len() + 2 * (kernel.len() - 1));
-    dispatch!(level, simd => symmetric::<_, _, false>(simd, out, kernel, Along { row }));
+    dispatch!(level, simd => symmetric(simd, out, kernel, Along { row }));
 }
 
-/// `out[x] = Σ k[t]·(row[x+r−t] + row[x+r+1+t])`, `t` from 0 to `r = k.len() − 1`: half-way between two samples.
-pub(crate) fn horizontal_between(level: Level, out: &mut [f32], row: &[f32], kernel: &[f32]) {
-    debug_assert_eq!(row.len() + 1, out.len() + 2 * kernel.len());
-    dispatch!(level, simd => symmetric::<_, _, true>(simd, out, kernel, Along { row }));
+/// Two phases at once: `even` at the samples, as [`horizontal`] of all but the last, and `odd` half-way to the next ones, as
+/// `Σ o[t]·(row[x+r−t] + row[x+r+1+t])`, `t` from 0 to `r`. Both kernels have `r + 1` numbers.
+pub(crate) fn horizontal_phases(level: Level, [even, odd]: [&mut [f32]; 2], row: &[f32], evens: &[f32], odds: &[f32]) {
+    debug_assert!(row.len() + 1 == even.len() + 2 * evens.len());
+    debug_assert!(evens.len() == odds.len() && even.len() == odd.len());
+    dispatch!(level, simd => phases(simd, [even, odd], evens, odds, Along { row }));
 }
 
 /// The samples that tap `tap` of a window multiplies.
@@ -67,25 +77,22 @@ impl Taps for Along<'_> {
     }
 }
 
-/// Symmetric windows about a sample, or (`BETWEEN`) about the place between two.
+/// Symmetric windows about a sample.
 #[inline(always)]
-fn symmetric<S: Simd, T: Taps, const BETWEEN: bool>(simd: S, out: &mut [f32], kernel: &[f32], taps: T) {
+fn symmetric<S: Simd, T: Taps>(simd: S, out: &mut [f32], kernel: &[f32], taps: T) {
     let n = S::f32s::LEN;
     let width = out.len();
     let r = kernel.len() - 1;
-    let gap = usize::from(BETWEEN);
     let mut x = 0;
     // Four vectors at a time: their sums stay in registers over all taps.
     while x + 4 * n <= width {
         let mut sums = [S::f32s::splat(simd, 0.0); 4];
-        if !BETWEEN {
-            let middle = taps.at(r, x, 4 * n);
-            for i in 0..4 {
-                sums[i] = S::f32s::from_slice(simd, &middle[i * n..(i + 1) * n]) * kernel[0];
-            }
+        let middle = taps.at(r, x, 4 * n);
+        for i in 0..4 {
+            sums[i] = S::f32s::from_slice(simd, &middle[i * n..(i + 1) * n]) * kernel[0];
         }
-        for (t, &weight) in kernel.iter().enumerate().skip(1 - gap) {
-            let (before, after) = (taps.at(r - t, x, 4 * n), taps.at(r + gap + t, x, 4 * n));
+        for (t, &weight) in kernel.iter().enumerate().skip(1) {
+            let (before, after) = (taps.at(r - t, x, 4 * n), taps.at(r + t, x, 4 * n));
             for i in 0..4 {
                 let a = S::f32s::from_slice(simd, &before[i * n..(i + 1) * n]);
                 let b = S::f32s::from_slice(simd, &after[i * n..(i + 1) * n]);
@@ -101,13 +108,10 @@ fn symmetric<S: Simd, T: Taps, const BETWEEN: bool>(simd: S, out: &mut [f32], ke
     while x < width && width >= n {
         // The last vector overlaps the one before.
         x = x.min(width - n);
-        let mut sum = S::f32s::splat(simd, 0.0);
-        if !BETWEEN {
-            sum = S::f32s::from_slice(simd, taps.at(r, x, n)) * kernel[0];
-        }
-        for (t, &weight) in kernel.iter().enumerate().skip(1 - gap) {
+        let mut sum = S::f32s::from_slice(simd, taps.at(r, x, n)) * kernel[0];
+        for (t, &weight) in kernel.iter().enumerate().skip(1) {
             let a = S::f32s::from_slice(simd, taps.at(r - t, x, n));
-            let b = S::f32s::from_slice(simd, taps.at(r + gap + t, x, n));
+            let b = S::f32s::from_slice(simd, taps.at(r + t, x, n));
             sum += (a + b) * weight;
         }
         sum.store_slice(&mut out[x..x + n]);
@@ -115,23 +119,116 @@ fn symmetric<S: Simd, T: Taps, const BETWEEN: bool>(simd: S, out: &mut [f32], ke
     }
     if width < n {
         for (x, o) in out.iter_mut().enumerate() {
-            *o = if BETWEEN { 0.0 } else { taps.at(r, x, 1)[0] * kernel[0] };
-            for (t, &weight) in kernel.iter().enumerate().skip(1 - gap) {
-                *o += (taps.at(r - t, x, 1)[0] + taps.at(r + gap + t, x, 1)[0]) * weight;
+            *o = taps.at(r, x, 1)[0] * kernel[0];
+            for (t, &weight) in kernel.iter().enumerate().skip(1) {
+                *o += (taps.at(r - t, x, 1)[0] + taps.at(r + t, x, 1)[0]) * weight;
             }
         }
     }
 }
 
-/// `out = [a0, b0, a1, b1, …]`.
+/// [`phases_of_length`], with the lengths that scale spaces have known to the compiler.
+#[inline(always)]
+fn phases<S: Simd, T: Taps>(simd: S, out: [&mut [f32]; 2], evens: &[f32], odds: &[f32], taps: T) {
+    match evens.len() {
+        4 => phases_of_length::<S, T, 4>(simd, out, evens, odds, taps),
+        5 => phases_of_length::<S, T, 5>(simd, out, evens, odds, taps),
+        6 => phases_of_length::<S, T, 6>(simd, out, evens, odds, taps),
+        _ => phases_of_length::<S, T, 0>(simd, out, evens, odds, taps),
+    }
+}
+
+/// Symmetric windows about a sample and about the place between it and the next: the samples of both are the same, and loaded once. Kernels have `LEN` numbers, or
+/// where that is 0 any number.
+#[inline(always)]
+fn phases_of_length<S: Simd, T: Taps, const LEN: usize>(
+    simd: S,
+    [even, odd]: [&mut [f32]; 2],
+    evens: &[f32],
+    odds: &[f32],
+    taps: T,
+) {
+    let n = S::f32s::LEN;
+    let width = even.len();
+    let len = if LEN > 0 { LEN } else { evens.len() };
+    let (evens, odds) = (&evens[..len], &odds[..len]);
+    let mut x = 0;
+    while x < width && width >= n {
+        if x + 2 * n <= width {
+            phases_of::<S, T, 2>(simd, [even, odd], evens, odds, taps, x);
+            x += 2 * n;
+        } else {
+            // The last vector overlaps the one before.
+            phases_of::<S, T, 1>(simd, [even, odd], evens, odds, taps, x.min(width - n));
+            x += n;
+        }
+    }
+    let r = len - 1;
+    if width < n {
+        for x in 0..width {
+            let mut sums = [taps.at(r, x, 1)[0] * evens[0], 0.0];
+            for t in 0..=r {
+                let before = taps.at(r - t, x, 1)[0];
+                if t > 0 {
+                    sums[0] += (before + taps.at(r + t, x, 1)[0]) * evens[t];
+                }
+                sums[1] += (before + taps.at(r + 1 + t, x, 1)[0]) * odds[t];
+            }
+            [even[x], odd[x]] = sums;
+        }
+    }
+}
+
+/// [`phases`] of `V` vectors from column `x` on.
+#[inline(always)]
+fn phases_of<S: Simd, T: Taps, const V: usize>(
+    simd: S,
+    [even, odd]: [&mut [f32]; 2],
+    evens: &[f32],
+    odds: &[f32],
+    taps: T,
+    x: usize,
+) {
+    let n = S::f32s::LEN;
+    let r = evens.len() - 1;
+    let mut sums = [[S::f32s::splat(simd, 0.0); V]; 2];
+    let mut after = [S::f32s::splat(simd, 0.0); V];
+    let (middle, next) = (taps.at(r, x, V * n), taps.at(r + 1, x, V * n));
+    for i in 0..V {
+        let v = S::f32s::from_slice(simd, &middle[i * n..(i + 1) * n]);
+        after[i] = S::f32s::from_slice(simd, &next[i * n..(i + 1) * n]);
+        sums[0][i] = v * evens[0];
+        sums[1][i] += (v + after[i]) * odds[0];
+    }
+    for t in 1..=r {
+        let (before, next) = (taps.at(r - t, x, V * n), taps.at(r + 1 + t, x, V * n));
+        for i in 0..V {
+            let before = S::f32s::from_slice(simd, &before[i * n..(i + 1) * n]);
+            sums[0][i] += (before + after[i]) * evens[t];
+            after[i] = S::f32s::from_slice(simd, &next[i * n..(i + 1) * n]);
+            sums[1][i] += (before + after[i]) * odds[t];
+        }
+    }
+    let (even, odd) = (&mut even[x..x + V * n], &mut odd[x..x + V * n]);
+    for i in 0..V {
+        sums[0][i].store_slice(&mut even[i * n..(i + 1) * n]);
+        sums[1][i].store_slice(&mut odd[i * n..(i + 1) * n]);
+    }
+}
+
+/// `out = [a0, b0, a1, b1, …]`, as long as `out` is.
 pub(crate) fn interleave(level: Level, out: &mut [f32], a: &[f32], b: &[f32]) {
     dispatch!(level, simd => interleave_impl(simd, out, a, b));
 }
 
 #[inline(always)]
 fn interleave_impl<S: Simd>(_: S, out: &mut [f32], a: &[f32], b: &[f32]) {
-    for ((o, a), b) in out.as_chunks_mut::<2>().0.iter_mut().zip(a).zip(b) {
+    let (pairs, last) = out.as_chunks_mut::<2>();
+    for ((o, a), b) in pairs.iter_mut().zip(a).zip(b) {
         *o = [*a, *b];
+    }
+    if let ([last], Some(a)) = (last, a.get(pairs.len())) {
+        *last = *a;
     }
 }
 
@@ -354,15 +451,19 @@ mod tests {
                 prop_assert_eq!(&out, &expected[0][0], "{:?}", level);
                 horizontal(level, &mut out, &data[0][..width + 2 * r], &kernel);
                 prop_assert_eq!(&out, &expected[0][1], "{:?}", level);
-                vertical_between(level, &mut out, &rows, &kernel);
-                prop_assert_eq!(&out, &expected[1][0], "{:?}", level);
-                horizontal_between(level, &mut out, &data[0], &kernel);
-                prop_assert_eq!(&out, &expected[1][1], "{:?}", level);
+                let mut odd = vec![0.0; width];
+                vertical_phases(level, [&mut out, &mut odd], &rows, &kernel, &kernel);
+                prop_assert_eq!([&out, &odd], [&expected[0][0], &expected[1][0]], "{:?}", level);
+                horizontal_phases(level, [&mut out, &mut odd], &data[0], &kernel, &kernel);
+                prop_assert_eq!([&out, &odd], [&expected[0][1], &expected[1][1]], "{:?}", level);
                 let mut found = Vec::new();
                 extremes(level, nine, 1..width + 1, 4.0, &mut found);
                 prop_assert_eq!(&found, &extreme, "{:?}", level);
                 let mut twice = vec![0.0; 2 * width];
                 interleave(level, &mut twice, rows[0], rows[1]);
+                let mut uneven = vec![0.0; 2 * width - 1];
+                interleave(level, &mut uneven, rows[0], rows[1]);
+                prop_assert_eq!(&uneven, &twice[..2 * width - 1]);
                 subtract(level, &mut out, rows[0], rows[1]);
                 let mut small = vec![0u16; width];
                 quantize(level, &mut small, rows[0], -0.25, 120_000.0);

@@ -57,7 +57,7 @@ impl<'a, 'b> Walk<'a, 'b> {
         }
         let mut rows = Vec::with_capacity(2 * r + 1);
         for (product, smooth) in products.iter().zip(smooth.iter_mut()) {
-            product.window(y, r, h, &(0..w), &mut rows);
+            product.window(y as isize - r as isize, 2 * r + 1, h, &(0..w), &mut rows);
             simd::vertical(plan.level, &mut padded[r..r + w], &rows, &plan.kernel);
             mirror_ends::<1>(padded, r, r);
             simd::horizontal(plan.level, smooth, padded, &plan.kernel);
