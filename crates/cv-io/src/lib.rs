@@ -29,7 +29,7 @@
 //! | arrays | [`npy`], [`npz`] |
 //! | clouds | [`ply`] |
 //! | cameras and rigs | [`read_camera`], [`write_camera`], [`read_rig`], [`write_rig`], [`read_camera_array`], [`write_camera_array`], [`CalibrationFormat`] |
-//! | sparse models | [`colmap`] |
+//! | sparse models | [`colmap`], text and binary |
 //! | matches | [`read_matches`], [`write_matches`] |
 
 mod camera;
