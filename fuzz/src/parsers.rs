@@ -167,11 +167,8 @@ pub fn rig(bytes: &[u8]) -> Corpus {
 /// The three files of a COLMAP model, binary and as text.
 pub fn colmap(bytes: &[u8]) -> Corpus {
     use cv_io::colmap::{parse_cameras_binary, parse_images_binary, parse_points_binary};
-    let binary = [
-        parse_cameras_binary(bytes).is_ok(),
-        parse_images_binary(bytes).is_ok(),
-        parse_points_binary(bytes).is_ok(),
-    ];
+    let binary =
+        [parse_cameras_binary(bytes).is_ok(), parse_images_binary(bytes).is_ok(), parse_points_binary(bytes).is_ok()];
     if binary.contains(&true) {
         return Corpus::Keep;
     }
