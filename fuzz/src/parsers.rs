@@ -164,8 +164,14 @@ pub fn rig(bytes: &[u8]) -> Corpus {
     Corpus::Keep
 }
 
-/// The three files of a COLMAP model.
+/// The three files of a COLMAP model, binary and as text.
 pub fn colmap(bytes: &[u8]) -> Corpus {
+    use cv_io::colmap::{parse_cameras_binary, parse_images_binary, parse_points_binary};
+    let binary =
+        [parse_cameras_binary(bytes).is_ok(), parse_images_binary(bytes).is_ok(), parse_points_binary(bytes).is_ok()];
+    if binary.contains(&true) {
+        return Corpus::Keep;
+    }
     let Ok(text) = std::str::from_utf8(bytes) else { return Corpus::Reject };
     let _ = cv_io::colmap::parse_cameras(text);
     let _ = cv_io::colmap::parse_images(text);

@@ -8,10 +8,11 @@ mod real;
 mod tidy;
 mod trust;
 
+use anyhow::Context;
 use clap::{Parser, Subcommand};
 use std::{
     path::{Path, PathBuf},
-    process::ExitCode,
+    process::{Command, ExitCode},
 };
 
 #[derive(Parser)]
@@ -87,4 +88,21 @@ fn data_dir() -> Option<PathBuf> {
         None => root().join("../shared/data"),
     };
     folder.is_dir().then_some(folder)
+}
+
+/// The folder that the build goes into.
+fn target_dir() -> anyhow::Result<PathBuf> {
+    let program = std::env::current_exe()?;
+    Ok(program.ancestors().nth(2).context("the program lies in no target folder")?.to_owned())
+}
+
+/// Our program as it is given away, built where it is not.
+fn release_program() -> anyhow::Result<PathBuf> {
+    let target = target_dir()?;
+    peers::check(
+        Command::new("cargo")
+            .args(["build", "--release", "--quiet", "--locked", "--package", "cv-cli", "--bin", "cv", "--target-dir"])
+            .arg(&target),
+    )?;
+    Ok(target.join("release").join(format!("cv{}", std::env::consts::EXE_SUFFIX)))
 }

@@ -29,6 +29,7 @@
 mod camera;
 mod distortion;
 mod features;
+mod geodetic;
 mod image;
 mod luma;
 mod named;
@@ -51,6 +52,7 @@ pub use distortion::{
     ParameterCountError,
 };
 pub use features::{Correspondence, DMatch, Keypoint};
+pub use geodetic::{GeodeticPoint, east_north_up};
 pub use image::{GrayF32, GrayU8, Image, ImageError, Mask, RgbF32, RgbU8, Sample};
 pub use luma::{luma_f32, luma_u8, luma_u16};
 pub use named::{Named, UnknownName};

@@ -1,6 +1,7 @@
-//! What a camera wrote beside the picture: which way is up, and the focal length.
+//! What a camera wrote beside the picture: which way is up, the focal length, and where it was.
 
 use crate::sensor_width::sensor_width;
+use cv_core::GeodeticPoint;
 use exif::{Context, Exif, In, Tag, Value};
 
 /// Facts from a picture's EXIF block, as far as geometry needs them.
@@ -12,6 +13,29 @@ pub struct ExifInfo {
     pub focal: Option<ExifFocal>,
     /// Maker and model, as written.
     pub camera: Option<String>,
+    /// Where it was taken, where both coordinates are told.
+    pub gps: Option<ExifGps>,
+}
+
+/// Where a picture was taken.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ExifGps {
+    /// Radians, north positive (WGS 84; the tag of another datum is not looked at).
+    pub latitude: f64,
+    /// Radians, east positive.
+    pub longitude: f64,
+    /// Meters above the sea, or above the ellipsoid where the camera says so (EXIF 3.0); receivers often leave that open.
+    pub altitude: Option<f64>,
+    /// Dilution of precision: the error of the position is about this times that of a satellite's distance, some meters.
+    pub dilution: Option<f64>,
+}
+
+impl ExifGps {
+    /// The position; one without an altitude is at 0.
+    pub fn position(&self) -> GeodeticPoint {
+        let Self { latitude, longitude, altitude, .. } = *self;
+        GeodeticPoint { latitude, longitude, altitude: altitude.unwrap_or(0.0) }
+    }
 }
 
 /// A focal length in pixels of the picture as it was read, and how it was found.
@@ -43,7 +67,7 @@ const SENSOR_WIDTHS: std::ops::RangeInclusive<f64> = 2.0..=60.0;
 
 impl Default for ExifInfo {
     fn default() -> Self {
-        Self { orientation: 1, focal: None, camera: None }
+        Self { orientation: 1, focal: None, camera: None, gps: None }
     }
 }
 
@@ -66,6 +90,7 @@ impl ExifInfo {
             orientation: orientation.filter(|tag| (1..=8).contains(tag)).map_or(1, |tag| tag as u8),
             focal: focal(&exif, width as f64, height as f64),
             camera: (!camera.is_empty()).then_some(camera),
+            gps: gps(&exif),
         }
     }
 }
@@ -94,6 +119,43 @@ fn number(exif: &Exif, tag: Tag) -> Option<f64> {
         other => f64::from(other.get_uint(0)?),
     };
     (value.is_finite() && value > 0.0).then_some(value)
+}
+
+fn gps(exif: &Exif) -> Option<ExifGps> {
+    let altitude = || {
+        let Value::Rational(v) = &exif.get_field(Tag::GPSAltitude, In::PRIMARY)?.value else { return None };
+        // Below the sea by 1, below the ellipsoid by 3 (EXIF 3.0).
+        let reference = match &exif.get_field(Tag::GPSAltitudeRef, In::PRIMARY).map(|field| &field.value) {
+            Some(Value::Byte(bytes)) => bytes.first().copied().unwrap_or(0),
+            _ => 0,
+        };
+        let meters = v.first()?.to_f64() * if matches!(reference, 1 | 3) { -1.0 } else { 1.0 };
+        meters.is_finite().then_some(meters)
+    };
+    Some(ExifGps {
+        latitude: coordinate(exif, Tag::GPSLatitude, Tag::GPSLatitudeRef, ["N", "S"], 90.0)?,
+        longitude: coordinate(exif, Tag::GPSLongitude, Tag::GPSLongitudeRef, ["E", "W"], 180.0)?,
+        altitude: altitude(),
+        dilution: number(exif, Tag::GPSDOP),
+    })
+}
+
+/// Degrees, minutes and seconds as radians, by the hemisphere of `reference`; `None` where that is not told, or for more degrees than `most`.
+fn coordinate(exif: &Exif, tag: Tag, reference: Tag, [plus, minus]: [&str; 2], most: f64) -> Option<f64> {
+    let Value::Rational(parts) = &exif.get_field(tag, In::PRIMARY)?.value else { return None };
+    let reference = text(exif, reference)?;
+    let sign = if reference.eq_ignore_ascii_case(plus) {
+        1.0
+    } else if reference.eq_ignore_ascii_case(minus) {
+        -1.0
+    } else {
+        return None;
+    };
+    // Cameras leave out seconds, or write 0/0 where there is no fix: no number, which is not below any.
+    let [degrees, rest @ ..] = &parts[..] else { return None };
+    let degrees =
+        rest.iter().take(2).zip([60.0, 3600.0]).fold(degrees.to_f64(), |sum, (v, unit)| sum + v.to_f64() / unit);
+    (degrees <= most).then(|| (sign * degrees).to_radians())
 }
 
 fn focal(exif: &Exif, width: f64, height: f64) -> Option<ExifFocal> {

@@ -29,7 +29,7 @@
 //! | arrays | [`npy`], [`npz`] |
 //! | clouds | [`ply`] |
 //! | cameras and rigs | [`read_camera`], [`write_camera`], [`read_rig`], [`write_rig`], [`read_camera_array`], [`write_camera_array`], [`CalibrationFormat`] |
-//! | sparse models | [`colmap`] |
+//! | sparse models | [`colmap`], text and binary; [`write_transforms`] |
 //! | matches | [`read_matches`], [`write_matches`] |
 
 mod camera;
@@ -55,6 +55,7 @@ pub mod ply;
 mod sensor_width;
 mod sniff;
 mod srgb;
+mod transforms;
 
 pub use camera::{
     ArrayCamera, CalibrationFormat, CalibrationNote, CameraArray, RigFile, parse_camera, parse_camera_array, parse_rig,
@@ -67,7 +68,7 @@ pub use encode::{
     write_png_to_print, write_png_with,
 };
 pub use error::{FormatError, IoError};
-pub use exif_info::{ExifFocal, ExifInfo, FocalSource};
+pub use exif_info::{ExifFocal, ExifGps, ExifInfo, FocalSource};
 pub use features::{
     FeatureRows, descriptors_from_npy, descriptors_to_npy, keypoints_from_npy, keypoints_to_npy, parse_colmap_features,
     read_colmap_features, write_colmap_features,
@@ -82,3 +83,4 @@ pub use picture::{
     DEFAULT_MAX_PIXELS, DynImage, Pixels, ReadOptions, decode_image, read_gray_u8, read_image, read_image_info,
     read_image_with, read_mask, read_rgb,
 };
+pub use transforms::{transforms_json, write_transforms};

@@ -25,6 +25,7 @@
 //! | arranging | [`side_by_side`], [`shrink_to_fit`] |
 //! | masks | [`overlay_mask`], [`overlay_comparison`] |
 //! | points and cameras | [`PointScene`], [`render_points`] |
+//! | models of many views | [`PointScene::of_model`], [`draw_view_graph`], [`Report::registered_photographs`] |
 //! | pages | [`Report`], [`Figure`], [`Plot`] |
 //! | sheets to print at their true size | [`PrintSheet`] |
 
@@ -36,6 +37,7 @@ mod plot;
 mod print_sheet;
 mod raster;
 mod report;
+mod sparse_model;
 mod viewer;
 
 pub use colormap::{
@@ -49,4 +51,5 @@ pub use plot::Plot;
 pub use print_sheet::PrintSheet;
 pub use raster::{Color, Raster, colors};
 pub use report::{Figure, Note, Report};
+pub use sparse_model::draw_view_graph;
 pub use viewer::{PointScene, Viewpoint, camera_color, render_points};

@@ -111,7 +111,7 @@ impl PointScene {
         extent(self.points.iter().copied()).or_else(|| extent(centers)).unwrap_or(([0.0; 3], 1.0))
     }
 
-    /// How far from its center a camera's picture is drawn: a small part of the scene.
+    /// How far from its center a camera's picture is drawn: a small part of the scene, and where there are many cameras not far beyond the next one.
     fn frustum_depth(&self) -> f32 {
         let (center, radius) = self.extent();
         let near = self
@@ -119,7 +119,13 @@ impl PointScene {
             .iter()
             .map(|f| distance([f.center.x as f32, f.center.y as f32, f.center.z as f32], center))
             .fold(f32::INFINITY, f32::min);
-        0.05 * radius.max(near.min(4.0 * radius))
+        let depth = 0.05 * radius.max(near.min(4.0 * radius));
+        let mut steps: Vec<f32> =
+            self.frusta.windows(2).map(|pair| (pair[1].center - pair[0].center).norm() as f32).collect();
+        match median(&mut steps) {
+            Some(step) if steps.len() > 1 => depth.min((1.5 * step).max(0.2 * depth)),
+            _ => depth,
+        }
     }
 
     /// The corners and the tip of every frustum as line segments with a color.

@@ -13,8 +13,9 @@
 //! # Ok::<(), cv_synth::SynthError>(())
 //! ```
 //!
-//! * Scenes: [`Scene::room`], [`Scene::tabletop`], [`Scene::ball`], [`Scene::poster_wall`], each laid out anew by its
+//! * Scenes: [`Scene::room`], [`Scene::street`], [`Scene::tabletop`], [`Scene::ball`], [`Scene::poster_wall`], each laid out anew by its
 //!   seed; [`SceneBuilder`] for one's own.
+//! * Many views: [`Scene::room_walk`] and [`Scene::street_walk`] are poses to render; [`FeatureViews`] are keypoints and matches of any number of views without pictures.
 //! * One picture: [`render`] with a [`cv_core::Camera`] (distortion included), a pose and [`RenderOptions`].
 //! * Sets with their truth: [`stereo_pair`], [`homography_pair`], [`panorama_views`], [`two_view`], [`ball_photos`].
 //! * Photographs of one flat sheet, a calibration board say: [`Sheet`], [`chessboard_photo`], [`photo_without_board`].
@@ -34,6 +35,7 @@
 mod bvh;
 mod corrupt;
 mod error;
+mod feature_views;
 mod font;
 mod instruction_sets;
 mod light;
@@ -54,6 +56,7 @@ mod truth;
 
 pub use corrupt::corrupt;
 pub use error::SynthError;
+pub use feature_views::{FeatureViews, FeatureViewsOptions};
 pub use instruction_sets::instruction_sets;
 pub use poster::Poster;
 pub use print::Print;

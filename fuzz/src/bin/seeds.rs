@@ -273,14 +273,33 @@ fn texts() -> Result<Seeds> {
     ];
     let matches = ["# x1 y1 x2 y2\n10 20 30 40\n1.5 2.5 3.5 4.5\n", "1 2 3 4 0.9\n5,6,7,8,0.5\n", "1e3 -2 nan 4\n"];
     let features = ["2 4\n10 20 1.5 0.3 1 2 3 4\n11 21 2.5 -0.3 5 6 7 255\n", "0 128\n"];
-    let bytes = |texts: &[&str]| texts.iter().map(|text| text.as_bytes().to_vec()).collect();
+    let bytes = |texts: &[&str]| -> Vec<Vec<u8>> { texts.iter().map(|text| text.as_bytes().to_vec()).collect() };
     Ok(vec![
         ("camera", cameras),
         ("rig", rigs),
-        ("colmap", bytes(&colmap)),
+        ("colmap", bytes(&colmap).into_iter().chain(binary_model()?).collect()),
         ("matches", bytes(&matches)),
         ("features", bytes(&features)),
     ])
+}
+
+/// COLMAP's three binary files: two cameras, two pictures, a point.
+fn binary_model() -> Result<Vec<Vec<u8>>> {
+    let text = std::env::temp_dir().join(format!("cv-seeds-{}", std::process::id()));
+    std::fs::create_dir_all(&text)?;
+    std::fs::write(
+        text.join("cameras.txt"),
+        "1 PINHOLE 640 480 500 500 320 240\n2 SIMPLE_RADIAL 640 480 500 320 240 0.1\n",
+    )?;
+    std::fs::write(
+        text.join("images.txt"),
+        "1 1 0 0 0 0.1 0.2 0.3 1 a.jpg\n10.5 20.5 1 30.5 40.5 -1\n2 0.7 0.7 0 0 0 0 0 2 b c.jpg\n\n",
+    )?;
+    std::fs::write(text.join("points3D.txt"), "1 0.5 0.25 3 255 128 0 0.4 1 0\n")?;
+    cv_io::colmap::write_binary(&text, &cv_io::colmap::read(&text)?)?;
+    let files = ["cameras.bin", "images.bin", "points3D.bin"].map(|name| std::fs::read(text.join(name)));
+    std::fs::remove_dir_all(&text)?;
+    files.into_iter().map(|file| Ok(file?)).collect()
 }
 
 #[cfg(feature = "pipelines")]

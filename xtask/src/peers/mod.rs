@@ -10,6 +10,8 @@ mod calibration_undistort;
 mod feature_quality;
 mod features;
 mod geometry;
+mod sfm;
+mod sfm_score;
 mod stereo;
 
 use crate::checks::{self, Check};
@@ -28,6 +30,7 @@ const JOBS: &[checks::Named<Job>] = &[
     ("geometry", geometry::run),
     ("adjust", adjust::run),
     ("calibration", calibration::run),
+    ("sfm", sfm::run),
 ];
 
 /// Runs all jobs, or the one named; true where ours meets every bar.

@@ -26,9 +26,9 @@ impl Lens for Fisheye4 {
         ros: Some("equidistant"),
         kalibr: Some("equidistant"),
         colmap: &[
-            ColmapModel { name: "SIMPLE_RADIAL_FISHEYE", focal_lengths: 1, parameters: 1 },
-            ColmapModel { name: "RADIAL_FISHEYE", focal_lengths: 1, parameters: 2 },
-            ColmapModel { name: "OPENCV_FISHEYE", focal_lengths: 2, parameters: 4 },
+            ColmapModel { name: "SIMPLE_RADIAL_FISHEYE", id: 8, focal_lengths: 1, parameters: 1 },
+            ColmapModel { name: "RADIAL_FISHEYE", id: 9, focal_lengths: 1, parameters: 2 },
+            ColmapModel { name: "OPENCV_FISHEYE", id: 5, focal_lengths: 2, parameters: 4 },
         ],
     };
 

@@ -28,6 +28,8 @@ pub enum LensProjection {
 pub struct ColmapModel {
     /// Its name in `cameras.txt`.
     pub name: &'static str,
+    /// Its number in `cameras.bin`.
+    pub id: i32,
     /// Focal lengths: 1 or 2.
     pub focal_lengths: usize,
     /// How many parameters follow the principal point; the lens's others are zero.

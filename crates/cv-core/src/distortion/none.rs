@@ -16,8 +16,8 @@ impl Lens for Pinhole {
         ros: None,
         kalibr: Some("none"),
         colmap: &[
-            ColmapModel { name: "SIMPLE_PINHOLE", focal_lengths: 1, parameters: 0 },
-            ColmapModel { name: "PINHOLE", focal_lengths: 2, parameters: 0 },
+            ColmapModel { name: "SIMPLE_PINHOLE", id: 0, focal_lengths: 1, parameters: 0 },
+            ColmapModel { name: "PINHOLE", id: 1, focal_lengths: 2, parameters: 0 },
         ],
     };
 

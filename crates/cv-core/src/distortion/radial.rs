@@ -23,7 +23,7 @@ impl Lens for Radial {
         opencv: false,
         ros: None,
         kalibr: None,
-        colmap: &[ColmapModel { name: "RADIAL", focal_lengths: 1, parameters: 2 }],
+        colmap: &[ColmapModel { name: "RADIAL", id: 3, focal_lengths: 1, parameters: 2 }],
     };
 
     type Slope = [f64; 3];

@@ -23,7 +23,7 @@ impl Lens for RadialTangential4 {
         opencv: true,
         ros: None,
         kalibr: Some("radtan"),
-        colmap: &[ColmapModel { name: "OPENCV", focal_lengths: 2, parameters: 4 }],
+        colmap: &[ColmapModel { name: "OPENCV", id: 4, focal_lengths: 2, parameters: 4 }],
     };
 
     type Slope = [f64; 3];

@@ -44,7 +44,7 @@ impl Lens for Rational8 {
         opencv: true,
         ros: Some("rational_polynomial"),
         kalibr: None,
-        colmap: &[ColmapModel { name: "FULL_OPENCV", focal_lengths: 2, parameters: 8 }],
+        colmap: &[ColmapModel { name: "FULL_OPENCV", id: 6, focal_lengths: 2, parameters: 8 }],
     };
 
     type Slope = [f64; 10];

@@ -23,7 +23,7 @@ impl Lens for SimpleRadial {
         opencv: false,
         ros: None,
         kalibr: None,
-        colmap: &[ColmapModel { name: "SIMPLE_RADIAL", focal_lengths: 1, parameters: 1 }],
+        colmap: &[ColmapModel { name: "SIMPLE_RADIAL", id: 2, focal_lengths: 1, parameters: 1 }],
     };
 
     type Slope = [f64; 2];

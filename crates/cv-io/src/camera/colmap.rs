@@ -30,11 +30,36 @@ fn models() -> impl Iterator<Item = (DistortionModel, &'static ColmapModel)> {
 
 /// The camera of `model` with COLMAP's `parameters`.
 pub(crate) fn parse_model(model: &str, width: usize, height: usize, parameters: &[f64]) -> Result<Camera, FormatError> {
-    let wrong_count = || FormatError::corrupt(NAME, format!("{model} does not have {} parameters", parameters.len()));
-    let Some((lens, form)) = models().find(|(_, m)| m.name == model) else {
-        let names: Vec<&str> = models().map(|(_, m)| m.name).collect();
-        return Err(FormatError::unsupported(NAME, format!("the model {model} (it is one of {})", names.join(", "))));
-    };
+    let found = models().find(|(_, m)| m.name == model);
+    camera(found.ok_or_else(|| unknown(model))?, width, height, parameters)
+}
+
+/// The camera of the model that has the number `id` in `cameras.bin`, its parameters taken from `next`.
+pub(crate) fn camera_by_id(
+    id: i32,
+    width: usize,
+    height: usize,
+    mut next: impl FnMut() -> Result<f64, FormatError>,
+) -> Result<Camera, FormatError> {
+    let found = models().find(|(_, m)| m.id == id).ok_or_else(|| unknown(&format!("number {id}")))?;
+    let count = found.1.focal_lengths + 2 + found.1.parameters;
+    let parameters: Vec<f64> = (0..count).map(|_| next()).collect::<Result<_, _>>()?;
+    camera(found, width, height, &parameters)
+}
+
+fn unknown(model: &str) -> FormatError {
+    let names: Vec<&str> = models().map(|(_, m)| m.name).collect();
+    FormatError::unsupported(NAME, format!("the model {model} (it is one of {})", names.join(", ")))
+}
+
+fn camera(
+    (lens, form): (DistortionModel, &'static ColmapModel),
+    width: usize,
+    height: usize,
+    parameters: &[f64],
+) -> Result<Camera, FormatError> {
+    let wrong_count =
+        || FormatError::corrupt(NAME, format!("{} does not have {} parameters", form.name, parameters.len()));
     let (fx, fy, rest) = match (form.focal_lengths, parameters) {
         (1, [f, rest @ ..]) => (*f, *f, rest),
         (2, [fx, fy, rest @ ..]) => (*fx, *fy, rest),
@@ -50,8 +75,8 @@ pub(crate) fn parse_model(model: &str, width: usize, height: usize, parameters: 
     Ok(Camera { distortion, ..Camera::pinhole(width, height, fx, fy, cx - CENTER, cy - CENTER) })
 }
 
-/// A camera as `MODEL width height parameters`, by COLMAP's model with the fewest numbers that holds it.
-pub(crate) fn model_line(camera: &Camera) -> Result<String, FormatError> {
+/// COLMAP's model with the fewest numbers that holds a camera, and those numbers.
+pub(crate) fn model_of(camera: &Camera) -> Result<(&'static ColmapModel, Vec<f64>), FormatError> {
     let held = |(lens, form): (DistortionModel, &'static ColmapModel)| {
         let distortion = camera.distortion.converted(lens)?;
         let rest = distortion.parameters()[form.parameters..].iter();
@@ -62,10 +87,17 @@ pub(crate) fn model_line(camera: &Camera) -> Result<String, FormatError> {
         .filter_map(held)
         .min_by_key(|(form, _)| form.focal_lengths + form.parameters)
         .ok_or_else(|| no_lens(camera, NAME))?;
-    let mut line = format!("{} {} {}", form.name, camera.width, camera.height);
     let focal = [camera.fx, camera.fy];
     let center = [camera.cx + CENTER, camera.cy + CENTER];
-    for v in focal[..form.focal_lengths].iter().chain(&center).chain(&distortion.parameters()[..form.parameters]) {
+    let coefficients = &distortion.parameters()[..form.parameters];
+    Ok((form, [&focal[..form.focal_lengths], &center, coefficients].concat()))
+}
+
+/// A camera as `MODEL width height parameters`.
+pub(crate) fn model_line(camera: &Camera) -> Result<String, FormatError> {
+    let (form, parameters) = model_of(camera)?;
+    let mut line = format!("{} {} {}", form.name, camera.width, camera.height);
+    for v in parameters {
         let _ = write!(line, " {v}");
     }
     Ok(line)

@@ -18,7 +18,7 @@ mod own;
 mod ros;
 mod yaml;
 
-pub(crate) use colmap::{CENTER, model_line, parse_model};
+pub(crate) use colmap::{CENTER, camera_by_id, model_line, model_of, parse_model};
 
 use std::path::Path;
 

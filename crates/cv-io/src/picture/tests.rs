@@ -223,6 +223,54 @@ fn every_orientation_is_applied_as_the_standard_defines_it() {
 }
 
 #[test]
+fn the_position_is_in_degrees_minutes_and_seconds_by_hemisphere() {
+    let image = ramp(4, 4);
+    let degrees = |d: u32, m: u32, s: u32| {
+        Value::Rational([(d, 1), (m, 1), (s, 100)].map(|(num, denom)| Rational { num, denom }).to_vec())
+    };
+    let letter = |letter: &str| Value::Ascii(vec![letter.as_bytes().to_vec()]);
+    let fields = |latitude: Value, reference: &str| {
+        vec![
+            (Tag::GPSLatitudeRef, letter(reference)),
+            (Tag::GPSLatitude, latitude),
+            (Tag::GPSLongitudeRef, letter("W")),
+            (Tag::GPSLongitude, degrees(8, 30, 3600)),
+        ]
+    };
+    let gps = |fields: &[(Tag, Value)]| {
+        let found = decoded(&jpeg_with_exif(&image, fields)).exif.gps;
+        assert_eq!(found, decoded(&png_with_exif(&image, fields)).exif.gps);
+        found
+    };
+    let mut north = fields(degrees(47, 15, 1800), "N");
+    let found = gps(&north).unwrap();
+    // 47° 15′ 18″ and 8° 30′ 36″ west.
+    assert!((found.latitude.to_degrees() - 47.255).abs() < 1e-12, "{found:?}");
+    assert!((found.longitude.to_degrees() + 8.51).abs() < 1e-12, "{found:?}");
+    assert_eq!((found.altitude, found.dilution, found.position().altitude), (None, None, 0.0));
+
+    north.extend([(Tag::GPSAltitude, rational(4125, 10)), (Tag::GPSDOP, rational(21, 10))]);
+    let found = gps(&north).unwrap();
+    assert_eq!((found.altitude, found.dilution, found.position().altitude), (Some(412.5), Some(2.1), 412.5));
+    north.push((Tag::GPSAltitudeRef, Value::Byte(vec![1])));
+    assert_eq!(gps(&north).unwrap().altitude, Some(-412.5));
+
+    assert!(gps(&fields(degrees(47, 15, 1800), "S")).unwrap().latitude < 0.0);
+    // Decimal degrees alone, and degrees with decimal minutes.
+    let parts =
+        |parts: &[(u32, u32)]| Value::Rational(parts.iter().map(|&(num, denom)| Rational { num, denom }).collect());
+    for value in [parts(&[(47_255, 1000)]), parts(&[(47, 1), (153, 10)])] {
+        assert!((gps(&fields(value, "N")).unwrap().latitude.to_degrees() - 47.255).abs() < 1e-12);
+    }
+    // No hemisphere, no fix, beyond the pole, nothing, another type.
+    let none = [(degrees(47, 15, 0), "?"), (parts(&[(0, 0), (0, 0), (0, 0)]), "N"), (degrees(90, 0, 1), "N")];
+    for (value, reference) in none.into_iter().chain([(parts(&[]), "N"), (Value::Short(vec![47]), "N")]) {
+        assert_eq!(gps(&fields(value.clone(), reference)), None, "{value:?}");
+    }
+    assert_eq!(gps(&north[1..]), None);
+}
+
+#[test]
 fn the_focal_length_comes_from_the_better_tag() {
     let image = ramp(600, 400);
     let mm = (Tag::FocalLength, rational(50, 1));

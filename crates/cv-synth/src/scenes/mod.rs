@@ -4,6 +4,7 @@ mod furniture;
 mod person;
 mod room;
 mod small;
+mod street;
 mod wall;
 
 pub(crate) use person::{path, walker};

@@ -1,21 +1,15 @@
-//! COLMAP's text models: `cameras.txt`, `images.txt`, `points3D.txt` in one folder.
-//!
-//! COLMAP puts the center of the top-left pixel at (0.5, 0.5). Principal points and image points are brought to our convention, integers,
-//! when read, and back when written. Poses are world to camera in both.
+//! COLMAP's text: `cameras.txt`, `images.txt`, `points3D.txt`.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
-use std::path::Path;
 use std::str::SplitWhitespace;
 
-use cv_core::nalgebra::{Quaternion, UnitQuaternion};
-use cv_core::{Camera, ModelImage, ModelPoint, Point2, Point3, Pose, SparseModel, Vector3};
+use cv_core::nalgebra::UnitQuaternion;
+use cv_core::{Camera, ModelImage, ModelPoint, Point2, Point3};
 
+use super::{check_camera, pose};
+use crate::FormatError;
 use crate::camera::{CENTER, model_line, parse_model};
-use crate::files::{read_text, write_bytes};
-use crate::{FormatError, IoError};
-
-const NAME: &str = "COLMAP text";
 
 /// Words of a line, with errors that name what was expected.
 struct Words<'a>(SplitWhitespace<'a>, usize);
@@ -51,7 +45,7 @@ pub fn parse_cameras(text: &str) -> Result<BTreeMap<u32, Camera>, FormatError> {
         let model: String = words.next("a camera model")?;
         let (width, height) = (words.next("the width")?, words.next("the height")?);
         let camera = parse_model(&model, width, height, &words.rest("a parameter")?)?;
-        camera.validate().map_err(|e| FormatError::line(number, e.to_string()))?;
+        check_camera(id, &camera).map_err(|reason| FormatError::line(number, reason))?;
         if cameras.insert(id, camera).is_some() {
             return Err(FormatError::line(number, format!("camera {id} is there twice")));
         }
@@ -104,13 +98,6 @@ pub fn parse_images(text: &str) -> Result<BTreeMap<u32, ModelImage>, FormatError
     Ok(images)
 }
 
-/// The pose of COLMAP's quaternion (w first) and translation.
-fn pose(q: [f64; 4], t: [f64; 3]) -> Option<Pose> {
-    let quaternion = Quaternion::new(q[0], q[1], q[2], q[3]);
-    let fine = quaternion.norm() > 1e-9 && quaternion.norm().is_finite() && t.iter().all(|v| v.is_finite());
-    fine.then(|| Pose::new(UnitQuaternion::from_quaternion(quaternion).to_rotation_matrix(), Vector3::from(t)))
-}
-
 /// Parses `points3D.txt`.
 ///
 /// # Errors
@@ -135,41 +122,20 @@ pub fn parse_points(text: &str) -> Result<BTreeMap<u64, ModelPoint>, FormatError
     Ok(points)
 }
 
-/// Reads the model in a folder. `points3D.txt` may be absent: cameras and poses alone are a model too.
-///
-/// # Errors
-/// [`IoError`] for the file that cannot be read or parsed.
-pub fn read(folder: impl AsRef<Path>) -> Result<SparseModel, IoError> {
-    let folder = folder.as_ref();
-    fn part<T>(path: &Path, parse: impl Fn(&str) -> Result<T, FormatError>) -> Result<T, IoError> {
-        parse(&read_text(path)?).map_err(|reason| IoError::reading(path, reason))
+/// `cameras.txt`.
+pub(super) fn cameras_text(cameras: &BTreeMap<u32, Camera>) -> Result<String, FormatError> {
+    let mut text = String::from("# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n");
+    for (id, camera) in cameras {
+        let _ = writeln!(text, "{id} {}", model_line(camera)?);
     }
-    let points_path = folder.join("points3D.txt");
-    Ok(SparseModel {
-        cameras: part(&folder.join("cameras.txt"), parse_cameras)?,
-        images: part(&folder.join("images.txt"), parse_images)?,
-        points: if points_path.exists() { part(&points_path, parse_points)? } else { BTreeMap::new() },
-    })
+    Ok(text)
 }
 
-/// Writes a model into an existing folder: the three files COLMAP imports.
-///
-/// # Errors
-/// [`FormatError::NotRepresentable`] where COLMAP has no model for a camera's lens, where a picture's camera, or a track's picture or point, is not in the model, or a name has
-/// a line break; else as [`crate::write_atomic`].
-pub fn write(folder: impl AsRef<Path>, model: &SparseModel) -> Result<(), IoError> {
-    let folder = folder.as_ref();
-    check(model).map_err(|what| IoError::writing(folder, FormatError::NotRepresentable { format: NAME, what }))?;
-    let mut text = String::from("# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n");
-    for (id, camera) in &model.cameras {
-        let line = model_line(camera).map_err(|reason| IoError::writing(folder, reason))?;
-        let _ = writeln!(text, "{id} {line}");
-    }
-    write_bytes(folder.join("cameras.txt"), text.as_bytes())?;
-
+/// `images.txt`.
+pub(super) fn images_text(images: &BTreeMap<u32, ModelImage>) -> String {
     let mut text =
         String::from("# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n");
-    for (id, image) in &model.images {
+    for (id, image) in images {
         let q = UnitQuaternion::from_rotation_matrix(&image.pose.rotation);
         let t = image.pose.translation;
         let _ = writeln!(
@@ -187,10 +153,13 @@ pub fn write(folder: impl AsRef<Path>, model: &SparseModel) -> Result<(), IoErro
         }
         text.push('\n');
     }
-    write_bytes(folder.join("images.txt"), text.as_bytes())?;
+    text
+}
 
+/// `points3D.txt`.
+pub(super) fn points_text(points: &BTreeMap<u64, ModelPoint>) -> String {
     let mut text = String::from("# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n");
-    for (id, point) in &model.points {
+    for (id, point) in points {
         let (p, [r, g, b]) = (point.position, point.color);
         let error = if point.error.is_finite() { point.error } else { -1.0 };
         let _ = write!(text, "{id} {} {} {} {r} {g} {b} {error}", p.x, p.y, p.z);
@@ -199,37 +168,13 @@ pub fn write(folder: impl AsRef<Path>, model: &SparseModel) -> Result<(), IoErro
         });
         text.push('\n');
     }
-    write_bytes(folder.join("points3D.txt"), text.as_bytes())
-}
-
-fn check(model: &SparseModel) -> Result<(), String> {
-    for (id, camera) in &model.cameras {
-        camera.validate().map_err(|e| format!("camera {id}: {e}"))?;
-    }
-    for (id, image) in &model.images {
-        if !model.cameras.contains_key(&image.camera) {
-            return Err(format!("picture {id}, whose camera {} is not there", image.camera));
-        }
-        // A name that is cut at other white space would come back as another one.
-        if image.name.is_empty() || image.name.split_whitespace().collect::<Vec<_>>().join(" ") != image.name {
-            return Err(format!("the name of picture {id}: {:?}", image.name));
-        }
-    }
-    for (id, point) in &model.points {
-        let seen =
-            |&(image, index): &(u32, u32)| model.images.get(&image).is_some_and(|i| (index as usize) < i.points.len());
-        if let Some((image, index)) = point.track.iter().find(|t| !seen(t)) {
-            return Err(format!("point {id}, seen as point {index} of picture {image}, which is not there"));
-        }
-    }
-    Ok(())
+    text
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cv_core::{Distortion, Rotation3};
-    use proptest::prelude::*;
+    use cv_core::Distortion;
 
     const CAMERAS: &str = "# Camera list\n# Number of cameras: 2\n1 SIMPLE_RADIAL 3072 2304 2559.81 1536 1152 -0.0218531\n2 PINHOLE 3072 2304 2560.56 2560.56 1536 1152\n";
     const IMAGES: &str = "# Image list\n1 0.851773 0.0165051 0.503764 -0.142941 -0.737434 1.02973 3.74354 1 P1180141.JPG\n2362.39 248.498 58396 1784.7 268.254 59027 1784.7 268.254 -1\n2 0.851773 0.0165051 0.503764 -0.142941 -0.737434 1.02973 3.74354 2 my photo.JPG\n\n";
@@ -273,41 +218,5 @@ mod tests {
         assert!(parse_points("1 0 0 0 1 1 1 0 5\n").is_err());
         assert!(parse_cameras("1 PINHOLE 3 4 1 1 1\n").is_err());
         assert!(parse_cameras("1 PINHOLE 3 4 1 1 1 1\n1 PINHOLE 3 4 1 1 1 1\n").is_err());
-    }
-
-    proptest! {
-        #[test]
-        fn a_model_reads_back(r in prop::array::uniform3(-3.0..3.0f64), t in prop::array::uniform3(-1e3..1e3f64), xy in prop::array::uniform2(0.0..4000.0f64), k in -0.5..0.5f64) {
-            let camera = Camera { distortion: Distortion::radial_tangential5([k, 0.1, 0.0, 0.01, k]), ..Camera::pinhole(4000, 3000, 2500.0, 2501.0, xy[0], xy[1]) };
-            let pose = Pose::new(Rotation3::from_euler_angles(r[0], r[1], r[2]), Vector3::from(t));
-            let image = ModelImage { name: "a b.jpg".into(), camera: 7, pose, points: vec![(Point2::new(xy[0], xy[1]), Some(9)), (Point2::new(1.0, 2.0), None)] };
-            let point = ModelPoint { position: Point3::from(t), color: [1, 2, 3], error: 0.5, track: vec![(3, 0)] };
-            let model = SparseModel { cameras: [(7, camera)].into(), images: [(3, image.clone())].into(), points: [(9, point.clone())].into() };
-            let folder = tempfile::tempdir().unwrap();
-            write(folder.path(), &model).unwrap();
-            let back = read(folder.path()).unwrap();
-            prop_assert_eq!(&back.points[&9], &point);
-            let b = &back.images[&3];
-            prop_assert_eq!((&b.name, b.camera, b.points[1]), (&image.name, 7, image.points[1]));
-            // Half a pixel added and taken away costs the last bits of a number up to 4000; a rotation through a quaternion likewise.
-            prop_assert!((b.points[0].0 - image.points[0].0).norm() < 1e-11);
-            prop_assert!((b.pose.rotation.matrix() - pose.rotation.matrix()).norm() < 1e-13);
-            prop_assert_eq!(b.pose.translation, pose.translation);
-            let c = &back.cameras[&7];
-            prop_assert!((c.cx - camera.cx).abs() < 1e-11 && c.distortion.simplified() == camera.distortion.simplified() && c.fx == camera.fx);
-        }
-    }
-
-    #[test]
-    fn what_hangs_in_the_air_is_not_written() {
-        let folder = tempfile::tempdir().unwrap();
-        let image = ModelImage { name: "a".into(), camera: 1, pose: Pose::identity(), points: vec![] };
-        let mut model = SparseModel { images: [(1, image)].into(), ..SparseModel::default() };
-        assert!(write(folder.path(), &model).is_err());
-        model.cameras.insert(1, Camera::from_focal(4, 4, 4.0));
-        assert!(write(folder.path(), &model).is_ok());
-        let point = ModelPoint { position: Point3::origin(), color: [0; 3], error: f64::NAN, track: vec![(1, 0)] };
-        model.points.insert(1, point);
-        assert!(write(folder.path(), &model).unwrap_err().to_string().contains("point 1"));
     }
 }
