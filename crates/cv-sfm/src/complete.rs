@@ -13,7 +13,7 @@ pub trait FeatureDistance: Sync {
 }
 
 /// How far from its projection a point is looked for, in pixels.
-const REACH: f64 = 3.0;
+const REACH: f64 = 2.0;
 /// Largest angle between two rays of a point at which a feature still looks alike, in radians (Mikolajczyk & Schmid, "A performance evaluation of local descriptors", PAMI 2005: half of the
 /// matches are lost at about 50 degrees).
 const ALIKE: f64 = 0.8;
@@ -64,7 +64,7 @@ impl Grid {
     }
 }
 
-/// Tracks with what can be found of their points in views that lack them, joined where two turn out to be one. Observations that do not agree with their point become tracks of their own.
+/// Tracks with what can be found of their points in views that lack them, joined where two turn out to be one.
 /// O(points · views).
 pub(crate) fn complete(scene: &Scene<'_>, alike: &dyn FeatureDistance) -> Tracks {
     let keypoints: Vec<&[Keypoint]> = scene.views.iter().map(|v| v.keypoints).collect();
@@ -87,7 +87,6 @@ pub(crate) fn complete(scene: &Scene<'_>, alike: &dyn FeatureDistance) -> Tracks
         };
         if scene.points[t].is_some() {
             chain(&|i| scene.active[i]);
-            chain(&|i| !scene.active[i]);
         } else {
             chain(&|_| true);
         }

@@ -172,8 +172,16 @@ pub fn reconstruct_views(
 
 /// Starts that are tried where the first ones lead to less than half of the views.
 const MOST_STARTS: usize = 4;
-/// Rounds of adjustment and filtering at the end, at most.
-const FINAL_ROUNDS: usize = 4;
+/// Rounds of adjustment and filtering, the most iterations of each, and the share of the cost below which one ends: to find out what agrees, and at the end. (On fountain-P11, iterations
+/// beyond those of [`FINE`] lower the cost by less than 0.1 % and move the AUC at 1 degree by 0.02.)
+struct Effort {
+    rounds: usize,
+    max_iterations: usize,
+    tolerance: f64,
+}
+
+const ROUGH: Effort = Effort { rounds: 1, max_iterations: 8, tolerance: 1e-3 };
+const FINE: Effort = Effort { rounds: 3, max_iterations: 15, tolerance: 1e-4 };
 /// Views that are adjusted with a new one.
 const NEAR_VIEWS: usize = 6;
 
@@ -238,7 +246,7 @@ fn grow(
     let tracks: Vec<usize> = scene.of_view(start.a).map(|i| scene.track_of(i)).collect();
     update_tracks(scene, limits(options), &tracks);
     let all: Vec<usize> = (0..scene.tracks.len()).collect();
-    let quick = BundlePlan { free: None, lens: LensFreedom::Held, scale: 1.0, max_iterations: 10, tolerance: 1e-4 };
+    let quick = BundlePlan { free: None, lens: LensFreedom::Held, scale: 1.0, max_iterations: 6, tolerance: 1e-3 };
     adjust(scene, &quick, stage)?;
     update_tracks(scene, limits(options), &tracks);
     let mut adjusted = 2;
@@ -272,7 +280,7 @@ fn grow(
         let tracks: Vec<usize> = scene.of_view(view).map(|i| scene.track_of(i)).collect();
         update_tracks(scene, limits(options), &tracks);
         let near = near_views(scene, view);
-        let local = BundlePlan { free: Some(&near), max_iterations: 5, tolerance: 1e-3, ..quick };
+        let local = BundlePlan { free: Some(&near), max_iterations: 3, ..quick };
         let registered = scene.registered().len();
         if registered as f64 >= adjusted as f64 * options.growth || registered < 6 {
             let refinable = registered > 2 && scene.knowledge.iter().any(|k| !k.is_calibrated());
@@ -321,12 +329,12 @@ fn finish(
 ) -> Result<(), Cancelled> {
     let free = scene.knowledge.iter().any(|k| !k.is_calibrated());
     let lens = if free { LensFreedom::Distortion } else { LensFreedom::Held };
-    refine(scene, lens, 1, options, progress)?;
+    refine(scene, lens, ROUGH, options, progress)?;
     if let Some(alike) = alike {
         let tracks = complete(scene, alike);
         scene.set_tracks(tracks);
     }
-    refine(scene, lens, FINAL_ROUNDS, options, progress)?;
+    refine(scene, lens, FINE, options, progress)?;
     let called_for = match free {
         true => LensFreedom::Center,
         false if scene.knowledge.contains(&CameraKnowledge::Matrix) => LensFreedom::Distortion,
@@ -334,12 +342,12 @@ fn finish(
     };
     let held = scene.solution();
     let before = noise_scale(scene);
-    refine(scene, called_for, FINAL_ROUNDS, options, progress)?;
-    let better = match free {
-        true => scene.cameras.iter().all(center_is_plausible),
-        false => noise_scale(scene) < CALLS_FOR_LENS * before,
-    };
-    if !better {
+    refine(scene, called_for, ROUGH, options, progress)?;
+    let better = free || noise_scale(scene) < CALLS_FOR_LENS * before;
+    if better {
+        refine(scene, called_for, FINE, options, progress)?;
+    }
+    if !better || free && !scene.cameras.iter().all(center_is_plausible) {
         scene.restore(held);
     }
     Ok(())
@@ -357,15 +365,16 @@ fn center_is_plausible(camera: &Camera) -> bool {
 fn refine(
     scene: &mut Scene<'_>,
     lens: LensFreedom,
-    rounds: usize,
+    effort: Effort,
     options: &SfmOptions,
     progress: &dyn Progress,
 ) -> Result<(), Cancelled> {
+    let Effort { rounds, max_iterations, tolerance } = effort;
     let all: Vec<usize> = (0..scene.tracks.len()).collect();
     update_tracks(scene, limits(options), &all);
     for _ in 0..rounds {
         let before = scene.counts();
-        let plan = BundlePlan { free: None, lens, scale: noise_scale(scene), max_iterations: 30, tolerance: 1e-5 };
+        let plan = BundlePlan { free: None, lens, scale: noise_scale(scene), max_iterations, tolerance };
         adjust(scene, &plan, progress)?;
         update_tracks(scene, limits(options), &all);
         if scene.counts().1.abs_diff(before.1) * 1000 < before.1 {

@@ -124,7 +124,7 @@ impl Pair<'_> {
         let agreeing =
             |pair: &ViewPair, matches: &[DMatch]| pair.inliers.iter().map(|i| matches[*i]).collect::<Vec<_>>();
         if firm {
-            let along = self.along(&pair.model)?;
+            let along = self.along(&pair)?;
             if let Some(better) = self.verify(&along)?.filter(|better| better.inliers.len() > pair.inliers.len()) {
                 return Ok(Some((agreeing(&better, &along), better.model)));
             }
@@ -133,16 +133,18 @@ impl Pair<'_> {
     }
 
     /// Matches of all features along a geometry.
-    fn along(&self, model: &ViewPairModel) -> Result<Vec<DMatch>, Cancelled> {
+    fn along(&self, pair: &ViewPair) -> Result<Vec<DMatch>, Cancelled> {
         let [a, b] = self.sides;
         let known = self.sides.iter().all(|s| s.camera.knowledge == CameraKnowledge::Known);
         let pixels = if known { self.options.pairs.threshold } else { self.options.pairs.threshold_uncalibrated };
-        let options = GuidedOptions { threshold: pixels as f32, ratio: GUIDED_RATIO, ..GuidedOptions::default() };
+        // Three standard deviations of what agrees.
+        let threshold = (3.0 * pair.rms).clamp(1.0, pixels.max(1.0)) as f32;
+        let options = GuidedOptions { threshold, ratio: GUIDED_RATIO, ..GuidedOptions::default() };
         let cameras: [&Camera; 2] = self.sides.map(|s| &s.camera.camera);
-        let model = match model {
+        let model = match &pair.model {
             ViewPairModel::Homography(h) => TwoViewModel::Homography(*h),
             ViewPairModel::Fundamental(f) => TwoViewModel::Fundamental(*f),
-            ViewPairModel::Pose(_) => match model.fundamental(cameras) {
+            model @ ViewPairModel::Pose(_) => match model.fundamental(cameras) {
                 Some(f) => TwoViewModel::Fundamental(f),
                 None => return Ok(Vec::new()),
             },
