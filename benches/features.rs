@@ -1,10 +1,11 @@
 //! `cargo bench --manifest-path benches/Cargo.toml --bench features`: the stages on a generated 1333×750 image, and matching on generated descriptors.
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use cv_core::{GrayF32, Keypoint, Silent};
+use cv_core::{GrayF32, Keypoint, Matrix3, Silent};
 use cv_features::{
-    BoardSize, ChessboardOptions, DescriptorKind, Descriptors, HarrisOptions, MatchOptions, MopsOptions, RatioTest,
-    SiftOptions, anms, anms_square_covering, find_chessboard, harris, harris_response, match_descriptors, mops, sift,
+    BoardSize, ByteDescriptors, ChessboardOptions, DescriptorKind, Descriptors, Features, GuidedOptions, HarrisOptions,
+    MatchOptions, MopsOptions, RatioTest, SiftOptions, TwoViewModel, anms, anms_square_covering, find_chessboard,
+    harris, harris_response, match_byte_descriptors, match_descriptors, match_guided, mops, sift,
 };
 
 /// Squares of random gray at several sizes: corners and blobs at all scales.
@@ -60,7 +61,26 @@ fn matching(c: &mut Criterion) {
         let pair = [set(), set()].map(|data| Descriptors::from_vec(kind, data).unwrap_or_else(empty));
         let name = format!("two nearest {count}x{count}x{}", kind.dimension);
         c.bench_function(&name, |b| b.iter(|| match_descriptors(&pair[0], &pair[1], &options, &Silent)));
+        if let [Some(x), Some(y)] = [0, 1].map(|i| ByteDescriptors::new(&pair[i])) {
+            let name = format!("{name} of bytes");
+            c.bench_function(&name, |b| b.iter(|| match_byte_descriptors(&x, &y, &options, &Silent)));
+        }
     }
+    // Sideways motion: the lines are the rows.
+    let rows = TwoViewModel::Fundamental(Matrix3::new(0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0));
+    let kind = DescriptorKind::ROOT_SIFT;
+    let features = [0, 1].map(|_| {
+        let mut features = Features::new(kind);
+        for _ in 0..12_000 {
+            let row: Vec<f32> = (0..kind.dimension).map(|_| 0.2 * random(&mut state)).collect();
+            features.push(Keypoint::new(3072.0 * random(&mut state), 2048.0 * random(&mut state), 1.0), &row);
+        }
+        features
+    });
+    let along = GuidedOptions::default();
+    c.bench_function("guided 12000x12000", |b| {
+        b.iter(|| match_guided(&features[0], &features[1], None, &rows, &along, &Silent));
+    });
 }
 
 criterion_group! {

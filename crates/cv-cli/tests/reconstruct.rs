@@ -92,8 +92,9 @@ fn a_focal_length_that_was_estimated_is_said_with_its_deviation() {
     let said = run(folder.path(), &args).stderr;
     let value = json(folder.path(), &args);
     let (focal, deviation) = (value["focal_px"][0].as_f64().unwrap(), value["focal_deviation"].as_f64().unwrap());
-    // The photographs were rendered at 440 px; three deviations hold all but one in three hundred.
-    assert!((focal / 440.0 - 1.0).abs() < 3.0 * deviation && deviation < 0.1, "{focal} {deviation}");
+    // The photographs were rendered at 440 px; three deviations hold all but one in three hundred. Where the matches exclude no focal length that is tried, up to
+    // eight steps of 5 %, the deviation is half of that, 0.24.
+    assert!((focal / 440.0 - 1.0).abs() < 3.0 * deviation && deviation < 0.2, "{focal} {deviation}");
     assert!(said.contains(&format!("focal length {focal:.0} px ± {:.1} %", 100.0 * deviation)), "{said}");
     // A warning from 5 % on, in the report too.
     let doubtful = deviation > 0.05;

@@ -198,6 +198,7 @@ fn blocked<S: Simd, P: Products<S>, const V: usize>(
 
 /// The queries of a task against all panels.
 #[allow(clippy::too_many_arguments)]
+#[allow(clippy::needless_range_loop, reason = "over columns of an array of rows")]
 #[inline(always)]
 fn block<S: Simd, P: Products<S>, const V: usize>(
     simd: S,

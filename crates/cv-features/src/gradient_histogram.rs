@@ -17,7 +17,10 @@ const MOST_ANGLES: usize = 4;
 /// The peaks of the histogram of gradient directions around a point, weighted by magnitude and a Gaussian of 1.5σ: one to four angles, strongest first.
 pub(crate) fn dominant_angles(level: Level, image: &Image<u16, 1>, (px, py): (f32, f32), sigma: f32) -> Vec<f32> {
     let mut bins = [0.0f32; BINS];
-    dispatch!(level, simd => vote(simd, image, (px, py), 1.5 * sigma, &mut bins));
+    dispatch!(level, simd => {
+        vote::<_, false>(simd, image, (px, py), 1.5 * sigma, &mut bins);
+        vote::<_, true>(simd, image, (px, py), 1.5 * sigma, &mut bins);
+    });
     let raw = |i: usize| bins[i % BINS];
     let smooth: [f32; BINS] = std::array::from_fn(|i| {
         let i = i + BINS;
@@ -44,16 +47,22 @@ pub(crate) fn dominant_angles(level: Level, image: &Image<u16, 1>, (px, py): (f3
 /// The largest window: 4.5σ to each side at σ = 2^(4/3) · 4 / 2, the largest that the options allow at half the resolution of an octave.
 const WIDEST: usize = 64;
 
-/// Shares the gradient of each square of four pixels of the window between the two bins nearest to its direction. There are few of them: were each to go into one
-/// bin, the peaks would depend on how the pixels happen to lie.
+/// Shares the gradients of the window at its pixels, or at the `MIDDLES` of each four of them, between the two bins nearest to their directions. At half the
+/// resolution of an octave pixels are few: of one of the two, and with whole votes, the lesser peaks would depend on how the pixels happen to lie.
 #[inline(always)]
-fn vote<S: Simd>(_: S, image: &Image<u16, 1>, (px, py): (f32, f32), sigma: f32, bins: &mut [f32; BINS]) {
+fn vote<S: Simd, const MIDDLES: bool>(
+    _: S,
+    image: &Image<u16, 1>,
+    (px, py): (f32, f32),
+    sigma: f32,
+    bins: &mut [f32; BINS],
+) {
     let radius = ((3.0 * sigma + 0.5) as isize).min(WIDEST as isize / 2 - 1);
     let (w, h) = image.size();
-    // Squares of four pixels, whose middles lie half-way between theirs.
+    let (shift, border) = if MIDDLES { (0.5, 0) } else { (0.0, 1) };
     let reach = |p: f32, n: usize| {
-        let c = p as isize;
-        ((c - radius).max(0) as usize, (c + radius + 1).min(n as isize - 1).max(0) as usize)
+        let c = (p + 0.5 - shift) as isize;
+        ((c - radius).max(border) as usize, (c + radius + 1).min(n as isize - 1).max(border) as usize)
     };
     let ((x0, x1), (y0, y1)) = (reach(px, w), reach(py, h));
     if x1 <= x0 {
@@ -63,19 +72,26 @@ fn vote<S: Simd>(_: S, image: &Image<u16, 1>, (px, py): (f32, f32), sigma: f32, 
     let falloff = -0.5 / (sigma * sigma);
     let mut weights = [0.0f32; WIDEST];
     for (i, weight) in weights[..n].iter_mut().enumerate() {
-        let d = (x0 + i) as f32 + 0.5 - px;
+        let d = (x0 + i) as f32 + shift - px;
         *weight = (falloff * d * d).exp();
     }
     let (mut votes, mut places, mut shares) = ([0.0f32; WIDEST], [0u32; WIDEST], [0.0f32; WIDEST]);
     // For the bin below a direction and for the one above, so that one addition need not wait for the other; a last one for a full turn.
     let mut sums = [[0.0f32; BINS + 1]; 2];
     for y in y0..y1 {
-        let d = y as f32 + 0.5 - py;
+        let d = y as f32 + shift - py;
         let weight = (falloff * d * d).exp();
-        let (above, below) = (&image.row(y)[x0..x1 + 1], &image.row(y + 1)[x0..x1 + 1]);
+        let (up, down) = if MIDDLES { (y, y + 1) } else { (y - 1, y + 1) };
+        let (above, below) = (&image.row(up)[x0..x1 + 1], &image.row(down)[x0..x1 + 1]);
+        let here = if MIDDLES { above } else { &image.row(y)[x0 - 1..x1 + 1] };
         for i in 0..n {
-            let (rise, fall) = (below[i + 1] as f32 - above[i] as f32, below[i] as f32 - above[i + 1] as f32);
-            let (gx, gy) = (rise - fall, rise + fall);
+            // Twice the derivatives, by differences over two pixels or by two over one.
+            let (gx, gy) = if MIDDLES {
+                let (a, b) = (below[i + 1] as f32 - above[i] as f32, below[i] as f32 - above[i + 1] as f32);
+                (a - b, a + b)
+            } else {
+                (here[i + 2] as f32 - here[i] as f32, below[i] as f32 - above[i] as f32)
+            };
             votes[i] = weight * weights[i] * (gx * gx + gy * gy).sqrt();
             let place = turn(gy, gx) * BINS as f32;
             places[i] = place as u32;
@@ -88,7 +104,7 @@ fn vote<S: Simd>(_: S, image: &Image<u16, 1>, (px, py): (f32, f32), sigma: f32, 
         }
     }
     for (i, bin) in bins.iter_mut().enumerate() {
-        *bin = sums[0][i] + sums[1][(i + BINS - 1) % BINS];
+        *bin += sums[0][i] + sums[1][(i + BINS - 1) % BINS];
     }
     bins[0] += sums[0][BINS];
     bins[1] += sums[1][BINS];

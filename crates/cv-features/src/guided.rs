@@ -195,6 +195,9 @@ const TASK: usize = 1024;
 /// Features that are worked without asking whether to go on: some milliseconds where every feature is a candidate.
 const UNASKED: usize = 64;
 
+/// The best candidate of each feature of the first set, and for each of the second the nearest of those it is a candidate of.
+type Found = (Vec<Option<Best>>, Vec<(f32, u32)>);
+
 /// A search for the candidates of the features of one set in another.
 struct Search<'a, R> {
     model: Matrix3<f32>,
@@ -236,7 +239,7 @@ impl<'a, R: Rows> Search<'a, R> {
     }
 
     /// The best candidate of each feature of the first set, and for each of the second the nearest of those it is a candidate of; of equals the first.
-    fn run(&self, stage: &Stage<'_>) -> Result<(Vec<Option<Best>>, Vec<(f32, u32)>), Cancelled> {
+    fn run(&self, stage: &Stage<'_>) -> Result<Found, Cancelled> {
         let level = simd::level();
         let tasks: Vec<_> = (0..self.a.1.len())
             .step_by(TASK)
@@ -261,23 +264,17 @@ impl<'a, R: Rows> Search<'a, R> {
     }
 
     #[inline(always)]
-    fn task<S: Simd>(
-        &self,
-        _: S,
-        from: usize,
-        to: usize,
-        stage: &Stage<'_>,
-    ) -> Result<(Vec<Option<Best>>, Vec<(f32, u32)>), Cancelled> {
+    fn task<S: Simd>(&self, _: S, from: usize, to: usize, stage: &Stage<'_>) -> Result<Found, Cancelled> {
         let (da, pa) = self.a;
         let (db, pb) = self.b;
         let mut back = vec![NOBODY; pb.len()];
         let (mut places, mut near) = (vec![0; self.strips[0].points.len() + 1], Vec::new());
         let mut forth = Vec::with_capacity(to - from);
-        for i in from..to {
+        for (i, &p) in (from..to).zip(&pa[from..to]) {
             if i % UNASKED == 0 {
                 stage.add(UNASKED.min(to - i))?;
             }
-            let count = self.candidates(pa[i], &mut places);
+            let count = self.candidates(p, &mut places);
             near.clear();
             near.extend(places[..count].iter().map(|&j| (da.ssd(i, db, j as usize), j)));
             let mut best = NOBODY;

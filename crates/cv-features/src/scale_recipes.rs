@@ -10,7 +10,7 @@ use crate::dog::REACH;
 /// `2·exp(−2π²·0.35)`, 0.2 % of its height, at the frequency of the samples, most of which the blurs themselves take away.
 const LEAST_VARIANCE: f64 = 0.35;
 
-/// A Gaussian of this variance sampled at distances `offset, 1 + offset, …` from its middle, to about three standard deviations: the half from the middle outwards,
+/// A Gaussian of this variance sampled at distances `offset, 1 + offset, …` from its middle, to three standard deviations: the half from the middle outwards,
 /// the whole summing to one.
 ///
 /// What is cut off and the coarse samples would change the variance by some percent: the Gaussian that is sampled is wider by as much.
@@ -32,8 +32,7 @@ fn taps(sigma: f64, offset: f64, len: usize) -> Vec<f32> {
 
 /// Taps on each side of the middle one.
 fn radius(sigma: f64) -> usize {
-    // 2.9σ at σ = 3, and 3.1σ at σ = 1.
-    (3.0 * sigma - 0.3).ceil().max(1.0) as usize
+    (3.0 * sigma).ceil().max(1.0) as usize
 }
 
 /// How a scale comes about.

@@ -425,7 +425,7 @@ mod tests {
     fn polyphase(coarse: &GrayF32, (w, h): (usize, usize), even: &[f32], odd: &[f32]) -> GrayF32 {
         let sum = |at: &dyn Fn(isize) -> f32, u: usize| {
             let x = (u / 2) as isize;
-            let (kernel, gap) = if u % 2 == 0 { (even, 0) } else { (odd, 1) };
+            let (kernel, gap) = if u.is_multiple_of(2) { (even, 0) } else { (odd, 1) };
             let mut sum = if gap == 0 { at(x) * kernel[0] } else { 0.0 };
             for (t, weight) in kernel.iter().enumerate().skip(1 - gap) {
                 sum += (at(x - t as isize) + at(x + (gap + t) as isize)) * weight;
