@@ -60,7 +60,7 @@ fn rate(
         pair.matches.iter().filter_map(|m| m.correspondence(keypoints[0], keypoints[1])).collect();
     let (rays, unit) = normalize_matches(&pixels, scene.camera_of(a), scene.camera_of(b));
     let rays: Vec<Correspondence> = rays.into_iter().filter(Correspondence::is_finite).collect();
-    let threshold = options.max_error * unit;
+    let threshold = options.growing_error() * unit;
     let robust = RobustOptions { threshold, seed: options.seed, max_iterations: 1000, ..RobustOptions::essential() };
     let found = match estimate_relative_pose(&rays, &robust, progress) {
         Ok(found) => found,

@@ -29,7 +29,9 @@ pub struct SfmModel {
 }
 
 impl SfmModel {
-    pub(crate) fn of(scene: &Scene<'_>) -> Self {
+    /// What a scene holds; points of fewer than `min_views` views are left out where the scene has twice as many.
+    pub(crate) fn of(scene: &Scene<'_>, min_views: usize) -> Self {
+        let min_views = if scene.registered().len() >= 2 * min_views { min_views } else { 2 };
         let point = |(track, position): (usize, &Option<Point3<f64>>)| {
             let position = (*position)?;
             let active = scene.tracks.range(track).filter(|i| scene.active[*i]);
@@ -40,7 +42,7 @@ impl SfmModel {
                 observations.push(scene.tracks.observations()[i]);
             }
             let error = sum / observations.len().max(1) as f64;
-            (observations.len() > 1).then_some(SfmPoint { position, error, observations })
+            (observations.len() >= min_views).then_some(SfmPoint { position, error, observations })
         };
         let points = scene.points.iter().enumerate().filter_map(point).collect();
         Self { cameras: scene.cameras.clone(), poses: scene.poses.clone(), points }

@@ -42,7 +42,7 @@ pub(crate) struct Args {
     /// Largest reprojection error of a point that is kept, in pixels.
     #[arg(long, value_name = "PX", default_value_t = SfmJobOptions::default().solve.max_error)]
     max_error: f64,
-    /// Most features in a photograph [default: 12000].
+    /// Most features in a photograph [default: 13000].
     #[arg(long, value_name = "N")]
     features: Option<usize>,
     /// Where to write the points of the largest model as a cloud, as PLY.

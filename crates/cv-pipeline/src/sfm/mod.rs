@@ -20,7 +20,7 @@ use cv_sfm::{
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct SfmJobOptions {
-    /// Features. Default SIFT, 12,000 in a photograph at most.
+    /// Features. Default SIFT, 13,000 in a photograph at most.
     pub features: FeatureOptions,
     /// Which matches stay by how ambiguous they are. Default as of the kind of the descriptors.
     pub ratio: RatioTest,
@@ -35,7 +35,7 @@ pub struct SfmJobOptions {
 impl Default for SfmJobOptions {
     fn default() -> Self {
         Self {
-            features: FeatureOptions::default().at_most(12_000),
+            features: FeatureOptions::default().at_most(13_000),
             ratio: RatioTest::Kind,
             first_features: 2048,
             pairs: ViewPairOptions::default(),
