@@ -18,18 +18,21 @@ pub struct ViewPairOptions {
     pub threshold_uncalibrated: f64,
     /// Fewest matches that agree. Default 15, COLMAP's.
     pub min_inliers: usize,
-    /// Most samples of the search. Default 600: five matches of which three in eight are right come by chance with 98 %. Pairs with fewer right ones are found, where they matter,
-    /// by way of other views.
-    pub max_iterations: usize,
+    /// Share of right matches that a search finds with 95 %, above 0 and below 1: the fewer, the more samples. Default 3/8, for five of which 400 samples are needed. Views with fewer right
+    /// matches hold together by way of others.
+    pub min_share: f64,
     /// Seed of the samples. Default 0.
     pub seed: u64,
 }
 
 impl Default for ViewPairOptions {
     fn default() -> Self {
-        Self { threshold: 2.0, threshold_uncalibrated: 4.0, min_inliers: 15, max_iterations: 600, seed: 0 }
+        Self { threshold: 2.0, threshold_uncalibrated: 4.0, min_inliers: 15, min_share: 0.375, seed: 0 }
     }
 }
+
+/// Most samples of a search.
+const MOST_SAMPLES: usize = 20_000;
 
 /// The geometry of two views.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -126,8 +129,11 @@ pub fn verify_view_pair(
     if pairs.len() < options.min_inliers {
         return Err(few(pairs.len()));
     }
+    // Where there are few matches, those that must agree are a larger share.
+    let share = (options.min_inliers as f64 / pairs.len() as f64).clamp(options.min_share, 0.99);
+    let samples = |size: i32| ((0.05f64.ln() / (-share.powi(size)).ln_1p()).ceil() as usize).clamp(16, MOST_SAMPLES);
     let robust = RobustOptions {
-        max_iterations: options.max_iterations,
+        max_iterations: samples(if calibrated { 5 } else { 7 }),
         seed: options.seed,
         scoring: Scoring::Msac,
         ..RobustOptions::default()
