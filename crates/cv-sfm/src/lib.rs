@@ -3,6 +3,44 @@
 //! Takes keypoints and matches, never pictures: `cv-pipeline` joins features and this. The stages are calls of their own:
 //! [`verify_view_pair`] says which matches of two views agree, [`Tracks::build`] joins them over the views, [`reconstruct_views`] solves for cameras and points.
 //!
+//! ```
+//! use cv_core::{Camera, DMatch, Keypoint, Point3, Pose, Silent, Vector3};
+//! use cv_sfm::{
+//!     CameraKnowledge, PairMatches, SfmInput, SfmOptions, SfmView, ViewPairOptions, reconstruct_views, verify_view_pair,
+//! };
+//!
+//! // A bent wall of 200 points, seen by four cameras side by side.
+//! let camera = Camera::from_focal(640, 480, 500.0);
+//! let wall: Vec<Point3<f64>> = (0..200)
+//!     .map(|i| (f64::from(i % 20) - 9.5, f64::from(i / 20) - 4.5))
+//!     .map(|(x, y)| Point3::new(0.2 * x, 0.3 * y, 5.0 + 0.05 * x * y))
+//!     .collect();
+//! let pose = |i: usize| Pose { translation: Vector3::new(-0.4 * i as f64, 0.0, 0.0), ..Pose::identity() };
+//! let keypoint = |pose: &Pose, p: &Point3<f64>| {
+//!     let pixel = camera.project(&pose.transform(p)).unwrap_or_default();
+//!     Keypoint::new(pixel.x as f32, pixel.y as f32, 1.0)
+//! };
+//! let keypoints: Vec<Vec<Keypoint>> = (0..4).map(|i| wall.iter().map(|p| keypoint(&pose(i), p)).collect()).collect();
+//! let matches: Vec<DMatch> = (0..200).map(|i| DMatch { query: i, train: i, distance: 0.1, ratio: 0.5 }).collect();
+//!
+//! let (mut pairs, mut geometry) = (Vec::new(), Vec::new());
+//! for (a, b) in [(0, 1), (1, 2), (2, 3), (0, 2), (1, 3)] {
+//!     let known = (&camera, &CameraKnowledge::Known);
+//!     let both = [&keypoints[a][..], &keypoints[b]];
+//!     let pair = verify_view_pair([known; 2], both, &matches, &ViewPairOptions::default(), &Silent)?;
+//!     pairs.push(PairMatches { a, b, matches: pair.inliers.iter().map(|i| matches[*i]).collect() });
+//!     geometry.push(pair.model);
+//! }
+//! let views: Vec<SfmView<'_>> = keypoints.iter().map(|k| SfmView { camera: 0, keypoints: k }).collect();
+//! let knowledge = [CameraKnowledge::Known];
+//! let input = SfmInput {
+//!     views: &views, cameras: &[camera], knowledge: &knowledge, pairs: &pairs, geometry: &geometry, alike: None,
+//! };
+//! let found = reconstruct_views(&input, &SfmOptions::default(), &Silent)?;
+//! assert_eq!((found.models[0].registered(), found.models[0].points.len()), (4, 200));
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+//!
 //! # Conventions
 //!
 //! * Pixel centers at integers; a pose maps world to camera. The unit of the world is arbitrary.
