@@ -134,6 +134,16 @@ impl<'a> Scene<'a> {
         (points, self.active.iter().filter(|a| **a).count())
     }
 
+    /// Of the observations whose tracks are seen from two views with a pose and more: how many agree with a point, and how many there are.
+    pub(crate) fn support(&self) -> (usize, usize) {
+        let of = |track: usize| {
+            let seen = self.seen(track).count();
+            let agree = self.tracks.range(track).filter(|i| self.active[*i]).count();
+            if seen > 1 { (agree, seen) } else { (0, 0) }
+        };
+        (0..self.tracks.len()).map(of).fold((0, 0), |sum, one| (sum.0 + one.0, sum.1 + one.1))
+    }
+
     /// What was found so far.
     pub(crate) fn solution(&self) -> Solution {
         let Self { tracks, cameras, poses, points, active, .. } = self;
