@@ -41,6 +41,7 @@ mod factor;
 mod manifold;
 mod normal;
 mod plain_cholesky;
+mod product;
 mod residual;
 mod solve;
 mod structure;

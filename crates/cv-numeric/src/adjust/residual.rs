@@ -1,7 +1,8 @@
 //! Residuals of one kind: what they depend on, and their part of the normal equations.
 
 use super::manifold::Manifold;
-use super::structure::{Links, NONE};
+use super::product::add_product;
+use super::structure::{Links, NONE, Structure};
 use crate::RobustLoss;
 use crate::parallel_map;
 use nalgebra::{SMatrix, SVector};
@@ -144,18 +145,16 @@ pub(super) struct PointSums<'a> {
     pub(super) v: &'a mut [f64],
     /// `E`.
     pub(super) g: &'a mut [f64],
-    /// `E` rows, as long as the blocks that the point is seen with have columns.
+    /// Cross terms with the blocks that the point is seen with: for each `E` rows, as long as that has columns.
     pub(super) w: &'a mut [f64],
 }
 
-/// A block column of the reduced normal equations.
+/// The columns of one of [`Structure::tasks`] in the reduced normal equations.
 pub(super) struct ColumnSums<'a> {
-    pub(super) block: u32,
-    /// Columns of `height` numbers.
+    pub(super) structure: &'a Structure,
+    pub(super) blocks: Range<usize>,
+    /// Their part of the values of [`super::structure::Pattern`].
     pub(super) values: &'a mut [f64],
-    pub(super) height: usize,
-    /// First row of each block in this column.
-    pub(super) row: &'a [u32],
     pub(super) gradient: &'a mut [f64],
 }
 
@@ -184,8 +183,8 @@ pub(super) trait Kind: Send + Sync {
     fn sums(&self, values: &Values) -> Result<ResidualSums, usize>;
     /// Adds items that see one eliminated block.
     fn add_to_point(&self, rows: &Rows, links: &Links, items: &[u32], point: PointSums<'_>);
-    /// Adds items that touch one block of the reduced system.
-    fn add_to_column(&self, rows: &Rows, links: &Links, items: &[u32], column: ColumnSums<'_>);
+    /// Adds items that touch the columns of a task.
+    fn add_to_columns(&self, rows: &Rows, links: &Links, items: &[u32], columns: ColumnSums<'_>);
     /// The numbers of an item and their common weight, for a plain reference.
     #[cfg(test)]
     fn plain(&self, values: &Values, item: usize) -> (Vec<f64>, f64);
@@ -291,26 +290,6 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Typed
     }
 }
 
-/// `out[c * stride + a] += Σ_r left[r][a] · right[r][c]`, for rows `C` apart.
-#[inline(always)]
-fn add_product<const C: usize>(
-    j: &[f64],
-    (left, lefts): (usize, usize),
-    (right, rights): (usize, usize),
-    out: &mut [f64],
-    stride: usize,
-) {
-    for c in 0..rights {
-        let out = &mut out[c * stride..][..lefts];
-        for row in j.chunks_exact(C) {
-            let x = row[right + c];
-            for (o, l) in out.iter_mut().zip(&row[left..][..lefts]) {
-                *o += l * x;
-            }
-        }
-    }
-}
-
 impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Kind for Typed<T, R, B, C> {
     fn name(&self) -> &str {
         &self.name
@@ -370,47 +349,56 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Kind 
     fn add_to_point(&self, rows: &Rows, links: &Links, items: &[u32], point: PointSums<'_>) {
         let Some(e) = links.eliminated else { return };
         let (size, first) = (T::DIMS[e], Self::FIRST[e]);
-        let length = point.w.len() / size;
         for &item in items {
             let item = item as usize;
             let j = &rows.jacobians[item * R * C..][..R * C];
             let r = &rows.residuals[item * R..][..R];
-            add_product::<C>(j, (first, size), (first, size), point.v, size);
-            for a in 0..size {
-                for row in 0..R {
-                    point.g[a] += j[row * C + first + a] * r[row];
+            add_product((j, C), (first, size), (first, size), point.v, size);
+            for (row, r) in j.chunks_exact(C).zip(r) {
+                for (g, x) in point.g.iter_mut().zip(&row[first..][..size]) {
+                    *g += x * r;
                 }
             }
             for (k, target) in links.targets(item, B).iter().enumerate() {
                 if k != e && target.block != NONE {
-                    let width = target.width as usize;
-                    let out = &mut point.w[target.place as usize..];
-                    add_product::<C>(j, (Self::FIRST[k], width), (first, size), out, length);
+                    let out = &mut point.w[size * target.place as usize + target.within as usize..];
+                    let left = (Self::FIRST[k], target.width as usize);
+                    add_product((j, C), left, (first, size), out, target.size as usize);
                 }
             }
         }
     }
 
-    fn add_to_column(&self, rows: &Rows, links: &Links, items: &[u32], column: ColumnSums<'_>) {
+    fn add_to_columns(&self, rows: &Rows, links: &Links, items: &[u32], columns: ColumnSums<'_>) {
+        let ColumnSums { structure: Structure { pattern, blocks, .. }, blocks: range, values, gradient } = columns;
+        let Some(first) = blocks.get(range.start) else { return };
+        let (first_value, first_column) = (pattern.start[range.start], first.column);
         for &item in items {
             let item = item as usize;
             let j = &rows.jacobians[item * R * C..][..R * C];
             let r = &rows.residuals[item * R..][..R];
             let targets = links.targets(item, B);
-            for (k, right) in targets.iter().enumerate().filter(|(_, t)| t.block == column.block) {
+            for (k, right) in targets.iter().enumerate() {
+                let b = right.block as usize;
+                if !range.contains(&b) {
+                    continue;
+                }
                 let (within, width) = (right.within as usize, right.width as usize);
-                for c in 0..width {
-                    for row in 0..R {
-                        column.gradient[within + c] += j[row * C + Self::FIRST[k] + c] * r[row];
+                let gradient = &mut gradient[blocks[b].column - first_column + within..][..width];
+                for (row, r) in j.chunks_exact(C).zip(r) {
+                    for (g, x) in gradient.iter_mut().zip(&row[Self::FIRST[k]..]) {
+                        *g += x * r;
                     }
                 }
+                let height = pattern.height[b];
+                let values = &mut values[pattern.start[b] - first_value + within * height..];
                 for (l, left) in targets.iter().enumerate() {
                     // The rest of the row is in the columns of the other blocks.
-                    if left.block != NONE && left.block >= column.block {
-                        let row = column.row[left.block as usize] as usize + left.within as usize;
-                        let out = &mut column.values[within * column.height + row..];
+                    if left.block != NONE && left.block >= right.block {
+                        let row = if left.block == right.block { 0 } else { pattern.row(b, left.block) };
+                        let out = &mut values[row + left.within as usize..];
                         let left = (Self::FIRST[l], left.width as usize);
-                        add_product::<C>(j, left, (Self::FIRST[k], width), out, column.height);
+                        add_product((j, C), left, (Self::FIRST[k], width), out, height);
                     }
                 }
             }

@@ -94,7 +94,7 @@ impl AdjustReport {
 
 /// What of a step is needed to judge it.
 pub(super) struct Step {
-    /// Of the reduced system's columns, and of the eliminated blocks.
+    /// Of the reduced system's columns, and of the eliminated blocks in the order in which they were given.
     pub(super) columns: Vec<f64>,
     pub(super) points: Vec<f64>,
     /// By how much the linear model goes down.
@@ -313,8 +313,11 @@ impl Normal {
         let added = self.damped(damping);
         let mut predicted: f64 =
             columns.iter().zip(&self.gradient).zip(&added).map(|((d, g), a)| d * (a * d - g)).sum();
-        if let Some(e) = structure.points.as_ref().map(|p| p.size) {
-            for ((d, g), v) in points.chunks(e).zip(self.point_gradient.chunks(e)).zip(self.v.chunks(e * e)) {
+        if let Some(eliminated) = &structure.points {
+            let e = eliminated.size;
+            for (d, rank) in points.chunks(e).zip(&eliminated.rank) {
+                let rank = *rank as usize;
+                let (g, v) = (&self.point_gradient[rank * e..][..e], &self.v[rank * e * e..][..e * e]);
                 let floor = FLOOR * (0..e).map(|k| v[k * e + k]).sum::<f64>();
                 predicted += (0..e).map(|k| d[k] * ((damping * v[k * e + k] + floor) * d[k] - g[k])).sum::<f64>();
             }

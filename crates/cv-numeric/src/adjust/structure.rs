@@ -5,8 +5,8 @@ use std::collections::HashMap;
 
 /// No block: held, or eliminated.
 pub(super) const NONE: u32 = u32::MAX;
-/// Most columns of a block of the reduced system that is made of several.
-const MOST_MERGED: usize = 64;
+/// Most columns of a block of the reduced system.
+pub(super) const MOST_COLUMNS: usize = 64;
 /// Below this size a dense factorization is faster whatever the pattern.
 pub(super) const SMALL: usize = 400;
 /// Above this share of the reduced system's blocks, its factor is about full.
@@ -55,8 +55,10 @@ pub(super) struct Target {
     pub(super) within: u16,
     /// Columns.
     pub(super) width: u16,
-    /// First column within the blocks that the residual's eliminated block is seen with.
+    /// First column of that block among the blocks that the residual's eliminated block is seen with.
     pub(super) place: u32,
+    /// Columns of that block.
+    pub(super) size: u32,
 }
 
 /// What a kind of residuals touches.
@@ -67,10 +69,10 @@ pub(super) struct Links {
     pub(super) any_held: bool,
     held: Vec<Vec<u64>>,
     targets: Vec<Target>,
-    /// Residuals of each eliminated block.
+    /// Residuals of each eliminated block, by its rank.
     pub(super) of_point: Lists<u32>,
-    /// Residuals of each block of the reduced system.
-    pub(super) of_block: Lists<u32>,
+    /// Residuals of each of [`Structure::tasks`].
+    pub(super) of_task: Lists<u32>,
 }
 
 impl Links {
@@ -111,13 +113,17 @@ pub(super) struct Cell {
     pub(super) size: u32,
 }
 
-/// The group that is eliminated.
+/// The group that is eliminated. Its blocks are worked on in an order of their own, that of their ranks: blocks that are seen by the same blocks of the
+/// reduced system one after the other, so that what they are added to stays in the cache.
 #[derive(Debug, Clone)]
 pub(super) struct Points {
     pub(super) group: usize,
     /// Degrees of freedom of a block.
     pub(super) size: usize,
     pub(super) count: usize,
+    /// The block of each rank, and the rank of each block. What follows is by rank.
+    pub(super) order: Vec<u32>,
+    pub(super) rank: Vec<u32>,
     /// A bit for each degree of freedom that is held, of each block.
     pub(super) held: Vec<u64>,
     /// The blocks of the reduced system that see each, ascending.
@@ -137,6 +143,20 @@ pub(super) struct Pattern {
     pub(super) rows: Vec<Vec<(u32, u32)>>,
     /// Whether all blocks are there.
     pub(super) dense: bool,
+    /// First column of each block.
+    column: Vec<usize>,
+}
+
+impl Pattern {
+    /// First row of block `other`, which is there, in the column of block `b`.
+    #[inline]
+    pub(super) fn row(&self, b: usize, other: u32) -> usize {
+        if self.dense {
+            return self.column[other as usize] - self.column[b];
+        }
+        let rows = &self.rows[b];
+        rows.binary_search_by_key(&other, |r| r.0).map_or(0, |i| rows[i].1 as usize)
+    }
 }
 
 /// All of it.
@@ -144,8 +164,11 @@ pub(super) struct Pattern {
 pub(super) struct Structure {
     pub(super) points: Option<Points>,
     pub(super) blocks: Vec<ReducedBlock>,
-    /// For each block of the reduced system: the eliminated blocks that it sees, each with the number of the cell.
-    pub(super) seen: Lists<(u32, u32)>,
+    /// Consecutive blocks of the reduced system whose columns are summed by one task: where each begins, and the end. What is added to an entry, and in
+    /// which order, does not depend on them.
+    pub(super) tasks: Vec<usize>,
+    /// For each task: the ranks of the eliminated blocks that its blocks see, ascending.
+    pub(super) seen: Lists<u32>,
     pub(super) links: Vec<Links>,
     pub(super) pattern: Pattern,
     /// Columns of the reduced system.
@@ -206,6 +229,10 @@ impl Structure {
         let sights = blocks.iter().enumerate().zip(&members).flat_map(|((b, block), members)| {
             witnesses[members[0]].iter().map(move |p| (*p, Cell { block: b as u32, place: 0, size: block.size as u32 }))
         });
+        let order = order(points, sights.clone());
+        let mut rank = vec![0; points];
+        order.iter().enumerate().for_each(|(r, p)| rank[*p as usize] = r as u32);
+        let sights = sights.map(|(p, cell)| (rank[p as usize], cell));
         let mut cells = Lists::from_pairs(points, Cell { block: NONE, place: 0, size: 0 }, sights);
         let mut start = Vec::with_capacity(points + 1);
         start.push(0);
@@ -218,21 +245,16 @@ impl Structure {
             }
             start.push(start[p] + size * place as usize);
         }
-        let seen = {
-            let pairs = (0..points)
-                .flat_map(|p| cells.of(p).iter().enumerate().map(move |(i, c)| (c.block, (p as u32, i as u32))));
-            Lists::from_pairs(blocks.len(), (0, 0), pairs)
-        };
         let mut links: Vec<Links> = Vec::with_capacity(kinds.len());
         for (kind, position) in kinds.iter().zip(&position) {
             let mut targets = Vec::with_capacity(kind.len() * kind.groups().len());
             for item in 0..kind.len() {
                 let ids = kind.blocks(item);
-                let around = position.map_or(&[][..], |e| cells.of(ids[e] as usize));
+                let around = position.map_or(&[][..], |e| cells.of(rank[ids[e] as usize] as usize));
                 for (&group, &id) in kind.groups().iter().zip(ids) {
                     let (block, member) = place[group][id as usize];
                     targets.push(if block == NONE {
-                        Target { block, within: 0, width: 0, place: 0 }
+                        Target { block, within: 0, width: 0, place: 0, size: 0 }
                     } else {
                         let member = &blocks[block as usize].members[member as usize];
                         let cell = around.binary_search_by_key(&block, |c| c.block).map_or(0, |i| around[i].place);
@@ -240,40 +262,100 @@ impl Structure {
                             block,
                             within: member.within as u16,
                             width: member.width as u16,
-                            place: cell + member.within as u32,
+                            place: cell,
+                            size: blocks[block as usize].size as u32,
                         }
                     });
                 }
             }
-            let n = kind.groups().len();
             let of_point = match position {
                 Some(e) => {
-                    let pairs = (0..kind.len()).map(|i| (kind.blocks(i)[*e], i as u32));
+                    let pairs = (0..kind.len()).map(|i| (rank[kind.blocks(i)[*e] as usize], i as u32));
                     Lists::from_pairs(points, 0, pairs)
                 }
                 None => Lists::default(),
             };
-            let touches = targets.chunks(n.max(1)).enumerate().flat_map(|(item, all)| {
-                let first = move |k: &usize| all[..*k].iter().all(|t| t.block != all[*k].block);
-                (0..n).filter(move |k| all[*k].block != NONE && first(k)).map(move |k| (all[k].block, item as u32))
-            });
-            let of_block = Lists::from_pairs(blocks.len(), 0, touches);
             links.push(Links {
                 eliminated: *position,
                 any_held,
                 held: if any_held { held.clone() } else { Vec::new() },
                 of_point,
-                of_block,
+                of_task: Lists::default(),
                 targets,
             });
         }
-        let pattern = pattern(&blocks, kinds, &links, &cells, &seen, columns);
+        let pattern = pattern(&blocks, kinds, &links, &cells, columns);
+        let tasks = tasks(&blocks, kinds, &links, &cells);
+        let mut task_of = vec![0; blocks.len()];
+        tasks.windows(2).enumerate().for_each(|(t, range)| task_of[range[0]..range[1]].fill(t as u32));
+        for (kind, links) in kinds.iter().zip(&mut links) {
+            let n = kind.groups().len();
+            let task = |t: &Target| if t.block == NONE { NONE } else { task_of[t.block as usize] };
+            let touches = links.targets.chunks(n.max(1)).enumerate().flat_map(|(item, all)| {
+                let first = move |k: &usize| all[..*k].iter().all(|t| task(t) != task(&all[*k]));
+                (0..n).filter(move |k| all[*k].block != NONE && first(k)).map(move |k| (task(&all[k]), item as u32))
+            });
+            links.of_task = Lists::from_pairs(tasks.len() - 1, 0, touches);
+        }
+        let seen = {
+            let pairs = (0..points).flat_map(|r| {
+                let task = |c: &Cell| task_of[c.block as usize];
+                cells.of(r).chunk_by(move |a, b| task(a) == task(b)).map(move |c| (task(&c[0]), r as u32))
+            });
+            Lists::from_pairs(tasks.len() - 1, 0, pairs)
+        };
         let points = eliminated.map(|group| {
-            let held = groups[group].held.clone();
-            Points { group, size, count: points, held, cells, start }
+            let held = order.iter().map(|p| groups[group].held[*p as usize]).collect();
+            Points { group, size, count: points, order, rank, held, cells, start }
         });
-        Self { points, blocks, seen, links, pattern, columns, free, place, considered }
+        Self { points, blocks, tasks, seen, links, pattern, columns, free, place, considered }
     }
+}
+
+/// The eliminated blocks by the first two blocks that see them, given all pairs, those of one block in ascending order.
+fn order(points: usize, sights: impl Iterator<Item = (u32, Cell)>) -> Vec<u32> {
+    let mut keys: Vec<([u32; 2], u32)> = (0..points as u32).map(|p| ([NONE; 2], p)).collect();
+    for (p, cell) in sights {
+        if let Some(free) = keys[p as usize].0.iter_mut().find(|k| **k == NONE) {
+            *free = cell.block;
+        }
+    }
+    keys.sort_unstable();
+    keys.into_iter().map(|k| k.1).collect()
+}
+
+/// Tasks for each thread: more, for they are not all of the same length.
+const TASKS: usize = 4;
+
+/// Parts of about the same work: see [`Structure::tasks`].
+fn tasks(blocks: &[ReducedBlock], kinds: &[Box<dyn Kind + '_>], links: &[Links], cells: &Lists<Cell>) -> Vec<usize> {
+    let mut work = vec![0; blocks.len()];
+    for list in cells.start.windows(2) {
+        let mut height = 0;
+        for cell in cells.items[list[0] as usize..list[1] as usize].iter().rev() {
+            height += u64::from(cell.size);
+            work[cell.block as usize] += u64::from(cell.size) * height;
+        }
+    }
+    for (kind, links) in kinds.iter().zip(links) {
+        for item in links.targets.chunks(kind.groups().len().max(1)) {
+            let height: u64 = item.iter().map(|t| u64::from(t.width)).sum();
+            let free = item.iter().filter(|t| t.block != NONE);
+            free.for_each(|t| work[t.block as usize] += u64::from(t.width) * height);
+        }
+    }
+    let threads = rayon::current_num_threads();
+    let count = if threads == 1 { 1 } else { (TASKS * threads) as u64 };
+    let share = work.iter().sum::<u64>() / count + 1;
+    let (mut tasks, mut done) = (vec![0], 0);
+    for (b, work) in work.iter().enumerate() {
+        done += work;
+        if done >= share * tasks.len() as u64 && b + 1 < blocks.len() {
+            tasks.push(b + 1);
+        }
+    }
+    tasks.push(blocks.len());
+    tasks
 }
 
 /// The blocks that move or are considered, and their numbers by group and block.
@@ -349,7 +431,7 @@ fn merged(groups: &[Group<'_>], units: &[Unit], unit_of: &[Vec<u32>], witnesses:
     for (u, unit) in units.iter().enumerate() {
         let key = (unit.considered.is_some(), witnesses[u].as_slice());
         match known.get(&key) {
-            Some(&set) if !witnesses[u].is_empty() && sets[set].1 + unit.width <= MOST_MERGED => {
+            Some(&set) if !witnesses[u].is_empty() && sets[set].1 + unit.width <= MOST_COLUMNS => {
                 sets[set].0.push(u);
                 sets[set].1 += unit.width;
             }
@@ -383,10 +465,22 @@ fn pattern(
     kinds: &[Box<dyn Kind + '_>],
     links: &[Links],
     cells: &Lists<Cell>,
-    seen: &Lists<(u32, u32)>,
     columns: usize,
 ) -> Pattern {
     let n = blocks.len();
+    let lists = cells.start.windows(2).map(|range| &cells.items[range[0] as usize..range[1] as usize]);
+    // For each block: the rest of the lists that it stands in, and the residuals that it occurs in.
+    let tails = lists.flat_map(|list| list.iter().enumerate().map(move |(i, c)| (c.block, &list[i..])));
+    let seen = Lists::from_pairs(n, &[][..], tails);
+    let items: Vec<Lists<&[Target]>> = kinds
+        .iter()
+        .zip(links)
+        .map(|(kind, links)| {
+            let items = links.targets.chunks(kind.groups().len().max(1));
+            let pairs = items.flat_map(|all| all.iter().filter(|t| t.block != NONE).map(move |t| (t.block, all)));
+            Lists::from_pairs(n, &[][..], pairs)
+        })
+        .collect();
     let mut rows: Vec<Vec<u32>> = Vec::with_capacity(n);
     let mut mark = vec![NONE; n];
     for b in 0..n {
@@ -398,15 +492,8 @@ fn pattern(
                 list.push(block);
             }
         };
-        for &(p, i) in seen.of(b) {
-            cells.of(p as usize)[i as usize..].iter().for_each(|c| add(c.block));
-        }
-        for (kind, link) in kinds.iter().zip(links) {
-            let width = kind.groups().len();
-            for &item in link.of_block.of(b) {
-                link.targets(item as usize, width).iter().for_each(|t| add(t.block));
-            }
-        }
+        seen.of(b).iter().copied().flatten().for_each(|c| add(c.block));
+        items.iter().flat_map(|kind| kind.of(b)).copied().flatten().for_each(|t| add(t.block));
         list.sort_unstable();
         rows.push(list);
     }
@@ -415,7 +502,8 @@ fn pattern(
     if dense {
         rows = (0..n).map(|b| (b as u32..n as u32).collect()).collect();
     }
-    let mut pattern = Pattern { start: vec![0], dense, ..Pattern::default() };
+    let column = blocks.iter().map(|b| b.column).collect();
+    let mut pattern = Pattern { start: vec![0], dense, column, ..Pattern::default() };
     for (block, rows) in blocks.iter().zip(rows) {
         let mut height = 0;
         let placed = rows
