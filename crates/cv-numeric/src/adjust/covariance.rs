@@ -93,7 +93,7 @@ impl Adjustment<'_> {
         let points = structure.points.as_ref().map_or(0, |points| {
             let seen = |kind: usize, p: usize| {
                 let links = &structure.links[kind];
-                links.eliminated.is_some() && !links.of_point.of(p).is_empty()
+                links.eliminated.is_some() && !links.of_point(p).is_empty()
             };
             let observed = (0..points.count).filter(|p| (0..self.kinds.len()).any(|k| seen(k, *p)));
             observed.map(|p| points.size - points.held[p].count_ones() as usize).sum()

@@ -1,7 +1,7 @@
 //! The normal equations of a problem where it stands, and the reduced system that is left of them without the eliminated blocks.
 
 use super::product::{subtract_product, times_inverse};
-use super::residual::{ColumnSums, Kind, LossModel, PointSums, ResidualSums, Rows, Values};
+use super::residual::{ColumnSums, Kind, LossModel, PointSums, Rows, Values};
 use super::structure::{MOST_COLUMNS, Points, Structure};
 use crate::linear::cholesky_lower;
 use nalgebra::{Cholesky, DMatrix, SMatrix};
@@ -19,8 +19,6 @@ const POINTS: usize = 128;
 #[derive(Debug, Clone, Default)]
 pub(super) struct Normal {
     rows: Vec<Rows>,
-    /// Sums over each kind of residuals.
-    pub(super) sums: Vec<ResidualSums>,
     /// Values of [`super::structure::Pattern`].
     u: Vec<f64>,
     /// Gradient by the reduced system's columns.
@@ -54,20 +52,14 @@ impl Normal {
         model: LossModel,
     ) -> Result<(), (usize, usize)> {
         self.rows.resize_with(kinds.len(), Rows::default);
-        self.sums.clear();
         for (k, (kind, rows)) in kinds.iter().zip(&mut self.rows).enumerate() {
-            let sums = kind.linearize(values, &structure.links[k], model, rows).map_err(|item| (k, item))?;
-            self.sums.push(sums);
+            kind.linearize(values, &structure.links[k], model, rows).map_err(|item| (k, item))?;
         }
         if let Some(points) = &structure.points {
             self.sum_points(kinds, structure, points);
         }
         self.sum_blocks(kinds, structure);
         Ok(())
-    }
-
-    pub(super) fn cost(&self) -> f64 {
-        self.sums.iter().map(|s| s.cost).sum()
     }
 
     fn sum_points(&mut self, kinds: &[Box<dyn Kind + '_>], structure: &Structure, points: &Points) {
@@ -86,8 +78,12 @@ impl Normal {
                 w.fill(0.0);
                 for ((kind, rows), links) in kinds.iter().zip(rows).zip(&structure.links) {
                     if links.eliminated.is_some() {
-                        let items = links.of_point.of(r);
-                        kind.add_to_point(rows, links, items, PointSums { v: &mut *v, g: &mut *g, w: &mut *w });
+                        kind.add_to_point(
+                            rows,
+                            links,
+                            links.of_point(r),
+                            PointSums { v: &mut *v, g: &mut *g, w: &mut *w },
+                        );
                     }
                 }
                 for k in (0..e).filter(|k| points.held[r] >> k & 1 == 1) {

@@ -142,7 +142,7 @@ impl Adjustment<'_> {
         let mut normal = Normal::default();
         let mut reduced = Reduced::default();
         normal.linearize(&self.kinds, &structure, &self.values, LossModel::Weight).map_err(|u| self.undefined(u))?;
-        let initial_cost = normal.cost();
+        let initial_cost = self.kinds.iter().map(|k| k.cost(&self.values)).sum();
         let (mut damping, mut growth) = (options.initial_damping, 2.0);
         let mut model = LossModel::Weight;
         let mut moved = self.values.clone();

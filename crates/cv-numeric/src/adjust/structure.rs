@@ -2,6 +2,7 @@
 
 use super::residual::{Group, Kind};
 use std::collections::HashMap;
+use std::ops::Range;
 
 /// No block: held, or eliminated.
 pub(super) const NONE: u32 = u32::MAX;
@@ -61,7 +62,8 @@ pub(super) struct Target {
     pub(super) size: u32,
 }
 
-/// What a kind of residuals touches.
+/// What a kind of residuals touches. Its items are worked on in an order of their own, that of their places: where a group is eliminated, by the ranks of
+/// its blocks.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Links {
     /// Which of a residual's blocks is eliminated.
@@ -69,16 +71,24 @@ pub(super) struct Links {
     pub(super) any_held: bool,
     held: Vec<Vec<u64>>,
     targets: Vec<Target>,
-    /// Residuals of each eliminated block, by its rank.
-    pub(super) of_point: Lists<u32>,
+    /// The item of each place. What follows is by place.
+    pub(super) items: Vec<u32>,
+    /// Where the residuals of each eliminated block begin, by its rank, and the end.
+    point_start: Vec<u32>,
     /// Residuals of each of [`Structure::tasks`].
     pub(super) of_task: Lists<u32>,
 }
 
 impl Links {
     #[inline]
-    pub(super) fn targets(&self, item: usize, blocks: usize) -> &[Target] {
-        &self.targets[item * blocks..][..blocks]
+    pub(super) fn targets(&self, place: usize, blocks: usize) -> &[Target] {
+        &self.targets[place * blocks..][..blocks]
+    }
+
+    /// Residuals of the eliminated block of a rank.
+    #[inline]
+    pub(super) fn of_point(&self, rank: usize) -> Range<usize> {
+        self.point_start[rank] as usize..self.point_start[rank + 1] as usize
     }
 
     #[inline]
@@ -248,8 +258,16 @@ impl Structure {
         let mut links: Vec<Links> = Vec::with_capacity(kinds.len());
         for (kind, position) in kinds.iter().zip(&position) {
             let mut targets = Vec::with_capacity(kind.len() * kind.groups().len());
-            for item in 0..kind.len() {
-                let ids = kind.blocks(item);
+            let (items, point_start) = match position {
+                Some(e) => {
+                    let pairs = (0..kind.len()).map(|i| (rank[kind.blocks(i)[*e] as usize], i as u32));
+                    let of_point = Lists::from_pairs(points, 0, pairs);
+                    (of_point.items, of_point.start)
+                }
+                None => ((0..kind.len() as u32).collect(), Vec::new()),
+            };
+            for item in &items {
+                let ids = kind.blocks(*item as usize);
                 let around = position.map_or(&[][..], |e| cells.of(rank[ids[e] as usize] as usize));
                 for (&group, &id) in kind.groups().iter().zip(ids) {
                     let (block, member) = place[group][id as usize];
@@ -268,20 +286,14 @@ impl Structure {
                     });
                 }
             }
-            let of_point = match position {
-                Some(e) => {
-                    let pairs = (0..kind.len()).map(|i| (rank[kind.blocks(i)[*e] as usize], i as u32));
-                    Lists::from_pairs(points, 0, pairs)
-                }
-                None => Lists::default(),
-            };
             links.push(Links {
                 eliminated: *position,
                 any_held,
                 held: if any_held { held.clone() } else { Vec::new() },
-                of_point,
-                of_task: Lists::default(),
                 targets,
+                items,
+                point_start,
+                of_task: Lists::default(),
             });
         }
         let pattern = pattern(&blocks, kinds, &links, &cells, columns);
