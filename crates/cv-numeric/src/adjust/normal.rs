@@ -197,9 +197,9 @@ impl Normal {
         (&reduced.inverses[r * e * e..][..e * e], &self.w[points.start[r]..points.start[r + 1]])
     }
 
-    /// The eliminated blocks' step `δ_p = −V⁻¹ (g_p + Wᵀ δ)` for a step of the others.
-    pub(super) fn back_substitute(&self, structure: &Structure, reduced: &Reduced, step: &[f64], out: &mut Vec<f64>) {
-        let Some(points) = &structure.points else { return };
+    /// The eliminated blocks' step `δ_p = −V⁻¹ (g_p + Wᵀ δ)` for a step of the others, by rank.
+    pub(super) fn back_substitute(&self, structure: &Structure, reduced: &Reduced, step: &[f64]) -> Vec<f64> {
+        let Some(points) = &structure.points else { return Vec::new() };
         let e = points.size;
         let mut by_rank = vec![0.0; points.count * e];
         by_rank.par_chunks_mut(e).enumerate().with_min_len(256).for_each(|(r, out)| {
@@ -218,8 +218,7 @@ impl Normal {
                 *out = -inverse.iter().zip(&sum).map(|(v, s)| v * s).sum::<f64>();
             }
         });
-        out.clear();
-        out.extend(points.rank.iter().flat_map(|r| &by_rank[*r as usize * e..][..e]));
+        by_rank
     }
 }
 

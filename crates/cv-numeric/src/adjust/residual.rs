@@ -206,10 +206,14 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Typed
         first
     };
 
-    #[inline]
+    #[inline(always)]
     fn at<'v>(&self, values: &'v Values, item: usize) -> [&'v [f64]; B] {
         let blocks = &self.blocks[item];
-        std::array::from_fn(|k| values.block(self.groups[k], blocks[k] as usize))
+        let mut all: [&[f64]; B] = [&[]; B];
+        for (k, numbers) in all.iter_mut().enumerate() {
+            *numbers = values.block(self.groups[k], blocks[k] as usize);
+        }
+        all
     }
 
     fn cost_of(&self, values: &Values, items: Range<usize>) -> f64 {

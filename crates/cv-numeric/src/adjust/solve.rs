@@ -307,17 +307,20 @@ impl Normal {
         if !columns.is_empty() {
             analysis.factor(structure, &reduced.s)?.solve(columns.len(), &mut columns);
         }
-        let mut points = Vec::new();
-        self.back_substitute(structure, reduced, &columns, &mut points);
+        let by_rank = self.back_substitute(structure, reduced, &columns);
         // −2 gᵀδ − δᵀHδ of the damped system's solution (H + D) δ = −g is −gᵀδ + δᵀDδ.
         let added = self.damped(damping);
         let mut predicted: f64 =
             columns.iter().zip(&self.gradient).zip(&added).map(|((d, g), a)| d * (a * d - g)).sum();
+        let mut points = Vec::new();
         if let Some(eliminated) = &structure.points {
             let e = eliminated.size;
-            for (d, rank) in points.chunks(e).zip(&eliminated.rank) {
-                let rank = *rank as usize;
-                let (g, v) = (&self.point_gradient[rank * e..][..e], &self.v[rank * e * e..][..e * e]);
+            points.reserve(by_rank.len());
+            for rank in &eliminated.rank {
+                points.extend_from_slice(&by_rank[*rank as usize * e..][..e]);
+            }
+            let gradients = self.point_gradient.chunks_exact(e).zip(self.v.chunks_exact(e * e));
+            for (d, (g, v)) in by_rank.chunks_exact(e).zip(gradients) {
                 let floor = FLOOR * (0..e).map(|k| v[k * e + k]).sum::<f64>();
                 predicted += (0..e).map(|k| d[k] * ((damping * v[k * e + k] + floor) * d[k] - g[k])).sum::<f64>();
             }
