@@ -43,6 +43,7 @@ mod normal;
 mod plain_cholesky;
 mod product;
 mod residual;
+mod schedule;
 mod solve;
 mod structure;
 #[cfg(test)]

@@ -1,6 +1,7 @@
 //! Which block meets which: the pattern of the normal equations, found once for a problem.
 
 use super::residual::{Group, Kind};
+use super::schedule::{order, tasks};
 use std::collections::HashMap;
 use std::ops::Range;
 
@@ -45,6 +46,10 @@ impl<T: Copy> Lists<T> {
     pub(super) fn of(&self, list: usize) -> &[T] {
         &self.items[self.start[list] as usize..self.start[list + 1] as usize]
     }
+
+    pub(super) fn iter(&self) -> impl Iterator<Item = &[T]> + Clone {
+        self.start.windows(2).map(|range| &self.items[range[0] as usize..range[1] as usize])
+    }
 }
 
 /// Where a block of a residual goes.
@@ -70,7 +75,7 @@ pub(super) struct Links {
     pub(super) eliminated: Option<usize>,
     pub(super) any_held: bool,
     held: Vec<Vec<u64>>,
-    targets: Vec<Target>,
+    pub(super) targets: Vec<Target>,
     /// The item of each place. What follows is by place.
     pub(super) items: Vec<u32>,
     /// Where the residuals of each eliminated block begin, by its rank, and the end.
@@ -324,52 +329,6 @@ impl Structure {
     }
 }
 
-/// The eliminated blocks by the first two blocks that see them, given all pairs, those of one block in ascending order.
-fn order(points: usize, sights: impl Iterator<Item = (u32, Cell)>) -> Vec<u32> {
-    let mut keys: Vec<([u32; 2], u32)> = (0..points as u32).map(|p| ([NONE; 2], p)).collect();
-    for (p, cell) in sights {
-        if let Some(free) = keys[p as usize].0.iter_mut().find(|k| **k == NONE) {
-            *free = cell.block;
-        }
-    }
-    keys.sort_unstable();
-    keys.into_iter().map(|k| k.1).collect()
-}
-
-/// Tasks for each thread: more, for they are not all of the same length.
-const TASKS: usize = 4;
-
-/// Parts of about the same work: see [`Structure::tasks`].
-fn tasks(blocks: &[ReducedBlock], kinds: &[Box<dyn Kind + '_>], links: &[Links], cells: &Lists<Cell>) -> Vec<usize> {
-    let mut work = vec![0; blocks.len()];
-    for list in cells.start.windows(2) {
-        let mut height = 0;
-        for cell in cells.items[list[0] as usize..list[1] as usize].iter().rev() {
-            height += u64::from(cell.size);
-            work[cell.block as usize] += u64::from(cell.size) * height;
-        }
-    }
-    for (kind, links) in kinds.iter().zip(links) {
-        for item in links.targets.chunks(kind.groups().len().max(1)) {
-            let height: u64 = item.iter().map(|t| u64::from(t.width)).sum();
-            let free = item.iter().filter(|t| t.block != NONE);
-            free.for_each(|t| work[t.block as usize] += u64::from(t.width) * height);
-        }
-    }
-    let threads = rayon::current_num_threads();
-    let count = if threads == 1 { 1 } else { (TASKS * threads) as u64 };
-    let share = work.iter().sum::<u64>() / count + 1;
-    let (mut tasks, mut done) = (vec![0], 0);
-    for (b, work) in work.iter().enumerate() {
-        done += work;
-        if done >= share * tasks.len() as u64 && b + 1 < blocks.len() {
-            tasks.push(b + 1);
-        }
-    }
-    tasks.push(blocks.len());
-    tasks
-}
-
 /// The blocks that move or are considered, and their numbers by group and block.
 fn units(
     groups: &[Group<'_>],
@@ -480,9 +439,8 @@ fn pattern(
     columns: usize,
 ) -> Pattern {
     let n = blocks.len();
-    let lists = cells.start.windows(2).map(|range| &cells.items[range[0] as usize..range[1] as usize]);
     // For each block: the rest of the lists that it stands in, and the residuals that it occurs in.
-    let tails = lists.flat_map(|list| list.iter().enumerate().map(move |(i, c)| (c.block, &list[i..])));
+    let tails = cells.iter().flat_map(|list| list.iter().enumerate().map(move |(i, c)| (c.block, &list[i..])));
     let seen = Lists::from_pairs(n, &[][..], tails);
     let items: Vec<Lists<&[Target]>> = kinds
         .iter()
