@@ -93,7 +93,7 @@ impl Adjustment<'_> {
         let points = structure.points.as_ref().map_or(0, |points| {
             let seen = |kind: usize, p: usize| {
                 let links = &structure.links[kind];
-                links.eliminated.is_some() && !links.of_point.of(p).is_empty()
+                links.eliminated.is_some() && !links.of_point(p).is_empty()
             };
             let observed = (0..points.count).filter(|p| (0..self.kinds.len()).any(|k| seen(k, *p)));
             observed.map(|p| points.size - points.held[p].count_ones() as usize).sum()
@@ -225,20 +225,26 @@ impl Covariance<'_> {
         let deficient = || AdjustError::RankDeficient { group: of.name.clone(), block };
         if let Some(points) = self.structure.points.as_ref().filter(|p| p.group == group.0) {
             let e = points.size;
-            let held = points.held[block];
-            if held != of.all() && !determined(&self.normal.v[block * e * e..][..e * e], e) {
+            let rank = points.rank[block] as usize;
+            let held = points.held[rank];
+            if held != of.all() && !determined(&self.normal.v[rank * e * e..][..e * e], e) {
                 return Err(deficient());
             }
-            let (inverse, w) = self.normal.point(points, &self.reduced, block);
+            let (inverse, w) = self.normal.point(points, &self.reduced, rank);
             let free = |k: usize| held >> k & 1 == 0;
             let own = DMatrix::from_fn(e, e, |i, j| if free(i) && free(j) { inverse[i * e + j] } else { 0.0 });
-            let n = w.len() / e;
-            let columns = points.cells.of(block).iter().flat_map(|cell| {
+            // Each column, where its cross terms begin, and how far they are apart.
+            let columns = points.cells.of(rank).iter().flat_map(|cell| {
                 let first = self.structure.blocks[cell.block as usize].column;
-                first..first + cell.size as usize
+                let (size, place) = (cell.size as usize, e * cell.place as usize);
+                (0..size).map(move |c| (first + c, place + c, size))
             });
-            let factors = DMatrix::from_fn(n, e, |i, j| -(0..e).map(|k| own[(j, k)] * w[k * n + i]).sum::<f64>());
-            return Ok(Lift { columns: columns.collect(), factors, own: Some(own) });
+            let columns: Vec<(usize, usize, usize)> = columns.collect();
+            let factors = DMatrix::from_fn(columns.len(), e, |i, j| {
+                let (_, at, step) = columns[i];
+                -(0..e).map(|k| own[(j, k)] * w[at + k * step]).sum::<f64>()
+            });
+            return Ok(Lift { columns: columns.into_iter().map(|c| c.0).collect(), factors, own: Some(own) });
         }
         let (at, member) = self.structure.place[group.0][block];
         if at == NONE {

@@ -41,7 +41,9 @@ mod factor;
 mod manifold;
 mod normal;
 mod plain_cholesky;
+mod product;
 mod residual;
+mod schedule;
 mod solve;
 mod structure;
 #[cfg(test)]

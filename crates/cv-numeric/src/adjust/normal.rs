@@ -1,30 +1,34 @@
 //! The normal equations of a problem where it stands, and the reduced system that is left of them without the eliminated blocks.
 
-use super::residual::{ColumnSums, Kind, LossModel, PointSums, ResidualSums, Rows, Values};
-use super::structure::{Points, Structure};
+use super::product::{subtract_product, times_inverse};
+use super::residual::{ColumnSums, Kind, LossModel, PointSums, Rows, Values};
+use super::structure::{MOST_COLUMNS, Points, Structure};
 use crate::linear::cholesky_lower;
 use nalgebra::{Cholesky, DMatrix, SMatrix};
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// A point near infinity has next to no depth information: this share of the trace keeps it where it is.
 pub(super) const FLOOR: f64 = 1e-12;
 /// Below this share of the trace, a pivot of an eliminated block is rounding.
 const RANK: f64 = 1e-15;
+/// Eliminated blocks that one task sums.
+const POINTS: usize = 128;
 
 /// The normal equations `H δ = −g`, `H = Σ w JᵀJ`, `g = Σ w Jᵀr`, as `[U Wᵀ; W V]` with `V` of the eliminated blocks.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Normal {
     rows: Vec<Rows>,
-    /// Sums over each kind of residuals.
-    pub(super) sums: Vec<ResidualSums>,
     /// Values of [`super::structure::Pattern`].
     u: Vec<f64>,
     /// Gradient by the reduced system's columns.
     pub(super) gradient: Vec<f64>,
     /// Diagonal of `u`.
     pub(super) diagonal: Vec<f64>,
+    /// By rank of the eliminated block, as what follows.
     pub(super) v: Vec<f64>,
     pub(super) point_gradient: Vec<f64>,
+    /// A row for each degree of freedom of the eliminated block, for each [`super::structure::Cell`] by itself.
     w: Vec<f64>,
 }
 
@@ -34,7 +38,7 @@ pub(super) struct Reduced {
     /// `S`, values of [`super::structure::Pattern`].
     pub(super) s: Vec<f64>,
     pub(super) gradient: Vec<f64>,
-    /// Inverses of the damped `V`.
+    /// Inverses of the damped `V`, by rank.
     inverses: Vec<f64>,
 }
 
@@ -48,10 +52,8 @@ impl Normal {
         model: LossModel,
     ) -> Result<(), (usize, usize)> {
         self.rows.resize_with(kinds.len(), Rows::default);
-        self.sums.clear();
         for (k, (kind, rows)) in kinds.iter().zip(&mut self.rows).enumerate() {
-            let sums = kind.linearize(values, &structure.links[k], model, rows).map_err(|item| (k, item))?;
-            self.sums.push(sums);
+            kind.linearize(values, &structure.links[k], model, rows).map_err(|item| (k, item))?;
         }
         if let Some(points) = &structure.points {
             self.sum_points(kinds, structure, points);
@@ -60,27 +62,33 @@ impl Normal {
         Ok(())
     }
 
-    pub(super) fn cost(&self) -> f64 {
-        self.sums.iter().map(|s| s.cost).sum()
-    }
-
     fn sum_points(&mut self, kinds: &[Box<dyn Kind + '_>], structure: &Structure, points: &Points) {
         let e = points.size;
         zero(&mut self.v, points.count * e * e);
         zero(&mut self.point_gradient, points.count * e);
-        zero(&mut self.w, points.start[points.count]);
-        let w = slices(&mut self.w, &points.start);
+        self.w.resize(points.start[points.count], 0.0);
+        let firsts: Vec<usize> = (0..points.count).step_by(POINTS).chain([points.count]).collect();
+        let starts: Vec<usize> = firsts.iter().map(|r| points.start[*r]).collect();
         let rows = &self.rows;
-        let parts = self.v.par_chunks_mut(e * e).zip(self.point_gradient.par_chunks_mut(e)).zip(w);
-        parts.enumerate().with_min_len(64).for_each(|(p, ((v, g), w))| {
-            for ((kind, rows), links) in kinds.iter().zip(rows).zip(&structure.links) {
-                if links.eliminated.is_some() {
-                    let items = links.of_point.of(p);
-                    kind.add_to_point(rows, links, items, PointSums { v: &mut *v, g: &mut *g, w: &mut *w });
+        let parts = self.v.par_chunks_mut(POINTS * e * e).zip(self.point_gradient.par_chunks_mut(POINTS * e));
+        parts.zip(slices(&mut self.w, &starts)).enumerate().for_each(|(part, ((v, g), mut rest))| {
+            let (v, g) = (v.chunks_exact_mut(e * e), g.chunks_exact_mut(e));
+            for (r, (v, g)) in (part * POINTS..).zip(v.zip(g)) {
+                let w = rest.split_off_mut(..points.start[r + 1] - points.start[r]).unwrap_or_default();
+                w.fill(0.0);
+                for ((kind, rows), links) in kinds.iter().zip(rows).zip(&structure.links) {
+                    if links.eliminated.is_some() {
+                        kind.add_to_point(
+                            rows,
+                            links,
+                            links.of_point(r),
+                            PointSums { v: &mut *v, g: &mut *g, w: &mut *w },
+                        );
+                    }
                 }
-            }
-            for k in (0..e).filter(|k| points.held[p] >> k & 1 == 1) {
-                v[k * e + k] = 1.0;
+                for k in (0..e).filter(|k| points.held[r] >> k & 1 == 1) {
+                    v[k * e + k] = 1.0;
+                }
             }
         });
     }
@@ -89,22 +97,12 @@ impl Normal {
         let pattern = &structure.pattern;
         zero(&mut self.u, pattern.start[structure.blocks.len()]);
         zero(&mut self.gradient, structure.columns);
-        let columns: Vec<usize> =
-            structure.blocks.iter().map(|b| b.column).chain(std::iter::once(structure.columns)).collect();
-        let gradients = slices(&mut self.gradient, &columns);
         let rows = &self.rows;
-        slices(&mut self.u, &pattern.start).zip(gradients).enumerate().for_each(|(b, (values, gradient))| {
-            let row = first_rows(structure, b);
+        for_tasks(structure, &mut self.u, &mut self.gradient, |task, blocks, values, gradient| {
             for ((kind, rows), links) in kinds.iter().zip(rows).zip(&structure.links) {
-                let items = links.of_block.of(b);
-                let column = ColumnSums {
-                    block: b as u32,
-                    values: &mut *values,
-                    height: pattern.height[b],
-                    row: &row,
-                    gradient: &mut *gradient,
-                };
-                kind.add_to_column(rows, links, items, column);
+                let (values, gradient) = (&mut *values, &mut *gradient);
+                let columns = ColumnSums { structure, blocks: blocks.clone(), values, gradient };
+                kind.add_to_columns(rows, links, links.of_task.of(task), columns);
             }
         });
         self.diagonal.clear();
@@ -151,106 +149,76 @@ impl Normal {
     ) -> Result<(), usize> {
         zero(&mut reduced.inverses, points.count * E * E);
         let parts = reduced.inverses.par_chunks_mut(E * E).zip(self.v.par_chunks(E * E)).enumerate().with_min_len(256);
-        let failed = parts.filter_map(|(p, (out, v))| invert::<E>(v, damping, out).err().map(|()| p)).min();
-        if let Some(p) = failed {
-            return Err(p);
+        let failed = parts.filter_map(|(r, (out, v))| invert::<E>(v, damping, out).err().map(|()| points.order[r]));
+        if let Some(p) = failed.min() {
+            return Err(p as usize);
         }
-        let columns: Vec<usize> =
-            structure.blocks.iter().map(|b| b.column).chain(std::iter::once(structure.columns)).collect();
         let inverses = &reduced.inverses;
-        let gradients = slices(&mut reduced.gradient, &columns);
-        slices(&mut reduced.s, &structure.pattern.start).zip(gradients).enumerate().for_each(
-            |(b, (values, gradient))| {
-                let row = first_rows(structure, b);
-                let size = structure.blocks[b].size;
-                let height = structure.pattern.height[b];
-                // V⁻¹ Wᵀ of one eliminated block and this one, by columns.
-                let mut y = vec![[0.0; E]; size];
-                for &(p, cell) in structure.seen.of(b) {
-                    let p = p as usize;
-                    let w = &self.w[points.start[p]..points.start[p + 1]];
-                    let n = w.len() / E;
-                    let inverse = &inverses[p * E * E..][..E * E];
-                    let g = &self.point_gradient[p * E..][..E];
-                    let cells = &points.cells.of(p)[cell as usize..];
-                    let first = cells[0].place as usize;
-                    for (c, y) in y.iter_mut().enumerate() {
-                        let x: [f64; E] = std::array::from_fn(|k| w[k * n + first + c]);
-                        *y = std::array::from_fn(|k| (0..E).map(|l| inverse[k * E + l] * x[l]).sum());
-                        gradient[c] -= (0..E).map(|k| y[k] * g[k]).sum::<f64>();
+        for_tasks(structure, &mut reduced.s, &mut reduced.gradient, |task, blocks, values, gradient| {
+            let first_value = structure.pattern.start[blocks.start];
+            let first_column = structure.blocks.get(blocks.start).map_or(0, |b| b.column);
+            // V⁻¹ Wᵀ of one eliminated block and one of the reduced system, by columns.
+            let mut y = [[0.0; E]; MOST_COLUMNS];
+            for &r in structure.seen.of(task) {
+                let r = r as usize;
+                let w = &self.w[points.start[r]..points.start[r + 1]];
+                let mut inverse = [[0.0; E]; E];
+                inverse.as_flattened_mut().copy_from_slice(&inverses[r * E * E..][..E * E]);
+                let g = &self.point_gradient[r * E..][..E];
+                let cells = points.cells.of(r);
+                for (i, cell) in cells.iter().enumerate() {
+                    let b = cell.block as usize;
+                    if !blocks.contains(&b) {
+                        continue;
                     }
-                    for cell in cells {
-                        let out = &mut values[row[cell.block as usize] as usize..];
-                        let wide: [&[f64]; E] =
-                            std::array::from_fn(|k| &w[k * n + cell.place as usize..][..cell.size as usize]);
-                        match cell.size {
-                            6 => subtract::<E, 6>(wide, &y, out, height),
-                            8 => subtract::<E, 8>(wide, &y, out, height),
-                            _ => subtract_any(wide, &y, out, height),
-                        }
+                    let y = &mut y[..cell.size as usize];
+                    let own = &w[E * cell.place as usize..];
+                    times_inverse(&inverse, own, y);
+                    let gradient = &mut gradient[structure.blocks[b].column - first_column..][..y.len()];
+                    for (gradient, y) in gradient.iter_mut().zip(&*y) {
+                        *gradient -= y.iter().zip(g).map(|(y, g)| y * g).sum::<f64>();
+                    }
+                    let height = structure.pattern.height[b];
+                    let values = &mut values[structure.pattern.start[b] - first_value..];
+                    for other in &cells[i..] {
+                        let out = &mut values[structure.pattern.row(b, other.block)..];
+                        let wide = &w[E * other.place as usize..][..E * other.size as usize];
+                        subtract_product(wide, y, out, height);
                     }
                 }
-            },
-        );
+            }
+        });
         Ok(())
     }
 
-    /// An eliminated block's `V⁻¹` and its cross terms `W`, a row for each of its degrees of freedom.
-    pub(super) fn point<'a>(&'a self, points: &Points, reduced: &'a Reduced, p: usize) -> (&'a [f64], &'a [f64]) {
+    /// `V⁻¹` of an eliminated block, by its rank, and its cross terms `W`: for each of its cells a row for each of its degrees of freedom.
+    pub(super) fn point<'a>(&'a self, points: &Points, reduced: &'a Reduced, r: usize) -> (&'a [f64], &'a [f64]) {
         let e = points.size;
-        (&reduced.inverses[p * e * e..][..e * e], &self.w[points.start[p]..points.start[p + 1]])
+        (&reduced.inverses[r * e * e..][..e * e], &self.w[points.start[r]..points.start[r + 1]])
     }
 
-    /// The eliminated blocks' step `δ_p = −V⁻¹ (g_p + Wᵀ δ)` for a step of the others.
-    pub(super) fn back_substitute(&self, structure: &Structure, reduced: &Reduced, step: &[f64], out: &mut Vec<f64>) {
-        let Some(points) = &structure.points else { return };
+    /// The eliminated blocks' step `δ_p = −V⁻¹ (g_p + Wᵀ δ)` for a step of the others, by rank.
+    pub(super) fn back_substitute(&self, structure: &Structure, reduced: &Reduced, step: &[f64]) -> Vec<f64> {
+        let Some(points) = &structure.points else { return Vec::new() };
         let e = points.size;
-        zero(out, points.count * e);
-        out.par_chunks_mut(e).enumerate().with_min_len(256).for_each(|(p, out)| {
-            let (inverse, w) = self.point(points, reduced, p);
-            let n = w.len() / e;
+        let mut by_rank = vec![0.0; points.count * e];
+        by_rank.par_chunks_mut(e).enumerate().with_min_len(256).for_each(|(r, out)| {
+            let (inverse, w) = self.point(points, reduced, r);
             let mut sum = [0.0; 6];
-            sum[..e].copy_from_slice(&self.point_gradient[p * e..][..e]);
-            for cell in points.cells.of(p) {
-                let step = &step[structure.blocks[cell.block as usize].column..][..cell.size as usize];
-                for (k, sum) in sum[..e].iter_mut().enumerate() {
-                    let w = &w[k * n + cell.place as usize..][..cell.size as usize];
+            sum[..e].copy_from_slice(&self.point_gradient[r * e..][..e]);
+            for cell in points.cells.of(r) {
+                let size = cell.size as usize;
+                let step = &step[structure.blocks[cell.block as usize].column..][..size];
+                let w = w[e * cell.place as usize..].chunks_exact(size);
+                for (sum, w) in sum[..e].iter_mut().zip(w) {
                     *sum += w.iter().zip(step).map(|(a, b)| a * b).sum::<f64>();
                 }
             }
-            for (k, out) in out.iter_mut().enumerate() {
-                *out = -(0..e).map(|l| inverse[k * e + l] * sum[l]).sum::<f64>();
+            for (out, inverse) in out.iter_mut().zip(inverse.chunks_exact(e)) {
+                *out = -inverse.iter().zip(&sum).map(|(v, s)| v * s).sum::<f64>();
             }
         });
-    }
-}
-
-/// `out[c][a] −= Σ_k wide[k][a] · y[c][k]` for columns `height` apart.
-#[inline(always)]
-fn subtract<const E: usize, const A: usize>(wide: [&[f64]; E], y: &[[f64; E]], out: &mut [f64], height: usize) {
-    // Of a size that is known, so that the sums stay in vector registers.
-    let wide: [[f64; A]; E] = wide.map(|row| std::array::from_fn(|a| row[a]));
-    for (c, y) in y.iter().enumerate() {
-        let out = &mut out[c * height..][..A];
-        let mut sum: [f64; A] = std::array::from_fn(|a| out[a]);
-        for (row, y) in wide.iter().zip(y) {
-            for (sum, w) in sum.iter_mut().zip(row) {
-                *sum -= w * y;
-            }
-        }
-        out.copy_from_slice(&sum);
-    }
-}
-
-#[inline(always)]
-fn subtract_any<const E: usize>(wide: [&[f64]; E], y: &[[f64; E]], out: &mut [f64], height: usize) {
-    for (c, y) in y.iter().enumerate() {
-        let out = &mut out[c * height..][..wide[0].len()];
-        for (row, y) in wide.iter().zip(y) {
-            for (o, w) in out.iter_mut().zip(*row) {
-                *o -= w * y;
-            }
-        }
+        by_rank
     }
 }
 
@@ -305,11 +273,18 @@ fn slices<'a>(mut values: &'a mut [f64], start: &[usize]) -> rayon::vec::IntoIte
     parts.into_par_iter()
 }
 
-/// First row of each block in a block column.
-fn first_rows(structure: &Structure, b: usize) -> Vec<u32> {
-    let mut row = vec![0; structure.blocks.len()];
-    for &(block, first) in &structure.pattern.rows[b] {
-        row[block as usize] = first;
-    }
-    row
+/// Calls `of` for each of [`Structure::tasks`], in parallel, with its number, its blocks, and their parts of values of [`super::structure::Pattern`] and of a
+/// vector by columns.
+fn for_tasks(
+    structure: &Structure,
+    values: &mut [f64],
+    vector: &mut [f64],
+    of: impl Fn(usize, Range<usize>, &mut [f64], &mut [f64]) + Sync,
+) {
+    let tasks = &structure.tasks;
+    let column = |b: &usize| structure.blocks.get(*b).map_or(structure.columns, |b| b.column);
+    let starts: Vec<usize> = tasks.iter().map(|b| structure.pattern.start[*b]).collect();
+    let columns: Vec<usize> = tasks.iter().map(column).collect();
+    let parts = slices(values, &starts).zip(slices(vector, &columns)).enumerate();
+    parts.for_each(|(t, (values, vector))| of(t, tasks[t]..tasks[t + 1], values, vector));
 }

@@ -94,7 +94,7 @@ impl AdjustReport {
 
 /// What of a step is needed to judge it.
 pub(super) struct Step {
-    /// Of the reduced system's columns, and of the eliminated blocks.
+    /// Of the reduced system's columns, and of the eliminated blocks in the order in which they were given.
     pub(super) columns: Vec<f64>,
     pub(super) points: Vec<f64>,
     /// By how much the linear model goes down.
@@ -142,7 +142,7 @@ impl Adjustment<'_> {
         let mut normal = Normal::default();
         let mut reduced = Reduced::default();
         normal.linearize(&self.kinds, &structure, &self.values, LossModel::Weight).map_err(|u| self.undefined(u))?;
-        let initial_cost = normal.cost();
+        let initial_cost = self.kinds.iter().map(|k| k.cost(&self.values)).sum();
         let (mut damping, mut growth) = (options.initial_damping, 2.0);
         let mut model = LossModel::Weight;
         let mut moved = self.values.clone();
@@ -307,14 +307,20 @@ impl Normal {
         if !columns.is_empty() {
             analysis.factor(structure, &reduced.s)?.solve(columns.len(), &mut columns);
         }
-        let mut points = Vec::new();
-        self.back_substitute(structure, reduced, &columns, &mut points);
+        let by_rank = self.back_substitute(structure, reduced, &columns);
         // −2 gᵀδ − δᵀHδ of the damped system's solution (H + D) δ = −g is −gᵀδ + δᵀDδ.
         let added = self.damped(damping);
         let mut predicted: f64 =
             columns.iter().zip(&self.gradient).zip(&added).map(|((d, g), a)| d * (a * d - g)).sum();
-        if let Some(e) = structure.points.as_ref().map(|p| p.size) {
-            for ((d, g), v) in points.chunks(e).zip(self.point_gradient.chunks(e)).zip(self.v.chunks(e * e)) {
+        let mut points = Vec::new();
+        if let Some(eliminated) = &structure.points {
+            let e = eliminated.size;
+            points.reserve(by_rank.len());
+            for rank in &eliminated.rank {
+                points.extend_from_slice(&by_rank[*rank as usize * e..][..e]);
+            }
+            let gradients = self.point_gradient.chunks_exact(e).zip(self.v.chunks_exact(e * e));
+            for (d, (g, v)) in by_rank.chunks_exact(e).zip(gradients) {
                 let floor = FLOOR * (0..e).map(|k| v[k * e + k]).sum::<f64>();
                 predicted += (0..e).map(|k| d[k] * ((damping * v[k * e + k] + floor) * d[k] - g[k])).sum::<f64>();
             }

@@ -1,12 +1,14 @@
 //! Which block meets which: the pattern of the normal equations, found once for a problem.
 
 use super::residual::{Group, Kind};
+use super::schedule::{order, tasks};
 use std::collections::HashMap;
+use std::ops::Range;
 
 /// No block: held, or eliminated.
 pub(super) const NONE: u32 = u32::MAX;
-/// Most columns of a block of the reduced system that is made of several.
-const MOST_MERGED: usize = 64;
+/// Most columns of a block of the reduced system.
+pub(super) const MOST_COLUMNS: usize = 64;
 /// Below this size a dense factorization is faster whatever the pattern.
 pub(super) const SMALL: usize = 400;
 /// Above this share of the reduced system's blocks, its factor is about full.
@@ -44,6 +46,10 @@ impl<T: Copy> Lists<T> {
     pub(super) fn of(&self, list: usize) -> &[T] {
         &self.items[self.start[list] as usize..self.start[list + 1] as usize]
     }
+
+    pub(super) fn iter(&self) -> impl Iterator<Item = &[T]> + Clone {
+        self.start.windows(2).map(|range| &self.items[range[0] as usize..range[1] as usize])
+    }
 }
 
 /// Where a block of a residual goes.
@@ -55,28 +61,39 @@ pub(super) struct Target {
     pub(super) within: u16,
     /// Columns.
     pub(super) width: u16,
-    /// First column within the blocks that the residual's eliminated block is seen with.
+    /// First column of that block among the blocks that the residual's eliminated block is seen with.
     pub(super) place: u32,
+    /// Columns of that block.
+    pub(super) size: u32,
 }
 
-/// What a kind of residuals touches.
+/// What a kind of residuals touches. Its items are worked on in an order of their own, that of their places: where a group is eliminated, by the ranks of
+/// its blocks.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Links {
     /// Which of a residual's blocks is eliminated.
     pub(super) eliminated: Option<usize>,
     pub(super) any_held: bool,
     held: Vec<Vec<u64>>,
-    targets: Vec<Target>,
-    /// Residuals of each eliminated block.
-    pub(super) of_point: Lists<u32>,
-    /// Residuals of each block of the reduced system.
-    pub(super) of_block: Lists<u32>,
+    pub(super) targets: Vec<Target>,
+    /// The item of each place. What follows is by place.
+    pub(super) items: Vec<u32>,
+    /// Where the residuals of each eliminated block begin, by its rank, and the end.
+    point_start: Vec<u32>,
+    /// Residuals of each of [`Structure::tasks`].
+    pub(super) of_task: Lists<u32>,
 }
 
 impl Links {
     #[inline]
-    pub(super) fn targets(&self, item: usize, blocks: usize) -> &[Target] {
-        &self.targets[item * blocks..][..blocks]
+    pub(super) fn targets(&self, place: usize, blocks: usize) -> &[Target] {
+        &self.targets[place * blocks..][..blocks]
+    }
+
+    /// Residuals of the eliminated block of a rank.
+    #[inline]
+    pub(super) fn of_point(&self, rank: usize) -> Range<usize> {
+        self.point_start[rank] as usize..self.point_start[rank + 1] as usize
     }
 
     #[inline]
@@ -111,13 +128,17 @@ pub(super) struct Cell {
     pub(super) size: u32,
 }
 
-/// The group that is eliminated.
+/// The group that is eliminated. Its blocks are worked on in an order of their own, that of their ranks: blocks that are seen by the same blocks of the
+/// reduced system one after the other, so that what they are added to stays in the cache.
 #[derive(Debug, Clone)]
 pub(super) struct Points {
     pub(super) group: usize,
     /// Degrees of freedom of a block.
     pub(super) size: usize,
     pub(super) count: usize,
+    /// The block of each rank, and the rank of each block. What follows is by rank.
+    pub(super) order: Vec<u32>,
+    pub(super) rank: Vec<u32>,
     /// A bit for each degree of freedom that is held, of each block.
     pub(super) held: Vec<u64>,
     /// The blocks of the reduced system that see each, ascending.
@@ -137,6 +158,20 @@ pub(super) struct Pattern {
     pub(super) rows: Vec<Vec<(u32, u32)>>,
     /// Whether all blocks are there.
     pub(super) dense: bool,
+    /// First column of each block.
+    column: Vec<usize>,
+}
+
+impl Pattern {
+    /// First row of block `other`, which is there, in the column of block `b`.
+    #[inline]
+    pub(super) fn row(&self, b: usize, other: u32) -> usize {
+        if self.dense {
+            return self.column[other as usize] - self.column[b];
+        }
+        let rows = &self.rows[b];
+        rows.binary_search_by_key(&other, |r| r.0).map_or(0, |i| rows[i].1 as usize)
+    }
 }
 
 /// All of it.
@@ -144,8 +179,11 @@ pub(super) struct Pattern {
 pub(super) struct Structure {
     pub(super) points: Option<Points>,
     pub(super) blocks: Vec<ReducedBlock>,
-    /// For each block of the reduced system: the eliminated blocks that it sees, each with the number of the cell.
-    pub(super) seen: Lists<(u32, u32)>,
+    /// Consecutive blocks of the reduced system whose columns are summed by one task: where each begins, and the end. What is added to an entry, and in
+    /// which order, does not depend on them.
+    pub(super) tasks: Vec<usize>,
+    /// For each task: the ranks of the eliminated blocks that its blocks see, ascending.
+    pub(super) seen: Lists<u32>,
     pub(super) links: Vec<Links>,
     pub(super) pattern: Pattern,
     /// Columns of the reduced system.
@@ -206,6 +244,10 @@ impl Structure {
         let sights = blocks.iter().enumerate().zip(&members).flat_map(|((b, block), members)| {
             witnesses[members[0]].iter().map(move |p| (*p, Cell { block: b as u32, place: 0, size: block.size as u32 }))
         });
+        let order = order(points, sights.clone());
+        let mut rank = vec![0; points];
+        order.iter().enumerate().for_each(|(r, p)| rank[*p as usize] = r as u32);
+        let sights = sights.map(|(p, cell)| (rank[p as usize], cell));
         let mut cells = Lists::from_pairs(points, Cell { block: NONE, place: 0, size: 0 }, sights);
         let mut start = Vec::with_capacity(points + 1);
         start.push(0);
@@ -218,21 +260,24 @@ impl Structure {
             }
             start.push(start[p] + size * place as usize);
         }
-        let seen = {
-            let pairs = (0..points)
-                .flat_map(|p| cells.of(p).iter().enumerate().map(move |(i, c)| (c.block, (p as u32, i as u32))));
-            Lists::from_pairs(blocks.len(), (0, 0), pairs)
-        };
         let mut links: Vec<Links> = Vec::with_capacity(kinds.len());
         for (kind, position) in kinds.iter().zip(&position) {
             let mut targets = Vec::with_capacity(kind.len() * kind.groups().len());
-            for item in 0..kind.len() {
-                let ids = kind.blocks(item);
-                let around = position.map_or(&[][..], |e| cells.of(ids[e] as usize));
+            let (items, point_start) = match position {
+                Some(e) => {
+                    let pairs = (0..kind.len()).map(|i| (rank[kind.blocks(i)[*e] as usize], i as u32));
+                    let of_point = Lists::from_pairs(points, 0, pairs);
+                    (of_point.items, of_point.start)
+                }
+                None => ((0..kind.len() as u32).collect(), Vec::new()),
+            };
+            for item in &items {
+                let ids = kind.blocks(*item as usize);
+                let around = position.map_or(&[][..], |e| cells.of(rank[ids[e] as usize] as usize));
                 for (&group, &id) in kind.groups().iter().zip(ids) {
                     let (block, member) = place[group][id as usize];
                     targets.push(if block == NONE {
-                        Target { block, within: 0, width: 0, place: 0 }
+                        Target { block, within: 0, width: 0, place: 0, size: 0 }
                     } else {
                         let member = &blocks[block as usize].members[member as usize];
                         let cell = around.binary_search_by_key(&block, |c| c.block).map_or(0, |i| around[i].place);
@@ -240,39 +285,47 @@ impl Structure {
                             block,
                             within: member.within as u16,
                             width: member.width as u16,
-                            place: cell + member.within as u32,
+                            place: cell,
+                            size: blocks[block as usize].size as u32,
                         }
                     });
                 }
             }
-            let n = kind.groups().len();
-            let of_point = match position {
-                Some(e) => {
-                    let pairs = (0..kind.len()).map(|i| (kind.blocks(i)[*e], i as u32));
-                    Lists::from_pairs(points, 0, pairs)
-                }
-                None => Lists::default(),
-            };
-            let touches = targets.chunks(n.max(1)).enumerate().flat_map(|(item, all)| {
-                let first = move |k: &usize| all[..*k].iter().all(|t| t.block != all[*k].block);
-                (0..n).filter(move |k| all[*k].block != NONE && first(k)).map(move |k| (all[k].block, item as u32))
-            });
-            let of_block = Lists::from_pairs(blocks.len(), 0, touches);
             links.push(Links {
                 eliminated: *position,
                 any_held,
                 held: if any_held { held.clone() } else { Vec::new() },
-                of_point,
-                of_block,
                 targets,
+                items,
+                point_start,
+                of_task: Lists::default(),
             });
         }
-        let pattern = pattern(&blocks, kinds, &links, &cells, &seen, columns);
+        let pattern = pattern(&blocks, kinds, &links, &cells, columns);
+        let tasks = tasks(&blocks, kinds, &links, &cells);
+        let mut task_of = vec![0; blocks.len()];
+        tasks.windows(2).enumerate().for_each(|(t, range)| task_of[range[0]..range[1]].fill(t as u32));
+        for (kind, links) in kinds.iter().zip(&mut links) {
+            let n = kind.groups().len();
+            let task = |t: &Target| if t.block == NONE { NONE } else { task_of[t.block as usize] };
+            let touches = links.targets.chunks(n.max(1)).enumerate().flat_map(|(item, all)| {
+                let first = move |k: &usize| all[..*k].iter().all(|t| task(t) != task(&all[*k]));
+                (0..n).filter(move |k| all[*k].block != NONE && first(k)).map(move |k| (task(&all[k]), item as u32))
+            });
+            links.of_task = Lists::from_pairs(tasks.len() - 1, 0, touches);
+        }
+        let seen = {
+            let pairs = (0..points).flat_map(|r| {
+                let task = |c: &Cell| task_of[c.block as usize];
+                cells.of(r).chunk_by(move |a, b| task(a) == task(b)).map(move |c| (task(&c[0]), r as u32))
+            });
+            Lists::from_pairs(tasks.len() - 1, 0, pairs)
+        };
         let points = eliminated.map(|group| {
-            let held = groups[group].held.clone();
-            Points { group, size, count: points, held, cells, start }
+            let held = order.iter().map(|p| groups[group].held[*p as usize]).collect();
+            Points { group, size, count: points, order, rank, held, cells, start }
         });
-        Self { points, blocks, seen, links, pattern, columns, free, place, considered }
+        Self { points, blocks, tasks, seen, links, pattern, columns, free, place, considered }
     }
 }
 
@@ -349,7 +402,7 @@ fn merged(groups: &[Group<'_>], units: &[Unit], unit_of: &[Vec<u32>], witnesses:
     for (u, unit) in units.iter().enumerate() {
         let key = (unit.considered.is_some(), witnesses[u].as_slice());
         match known.get(&key) {
-            Some(&set) if !witnesses[u].is_empty() && sets[set].1 + unit.width <= MOST_MERGED => {
+            Some(&set) if !witnesses[u].is_empty() && sets[set].1 + unit.width <= MOST_COLUMNS => {
                 sets[set].0.push(u);
                 sets[set].1 += unit.width;
             }
@@ -383,10 +436,21 @@ fn pattern(
     kinds: &[Box<dyn Kind + '_>],
     links: &[Links],
     cells: &Lists<Cell>,
-    seen: &Lists<(u32, u32)>,
     columns: usize,
 ) -> Pattern {
     let n = blocks.len();
+    // For each block: the rest of the lists that it stands in, and the residuals that it occurs in.
+    let tails = cells.iter().flat_map(|list| list.iter().enumerate().map(move |(i, c)| (c.block, &list[i..])));
+    let seen = Lists::from_pairs(n, &[][..], tails);
+    let items: Vec<Lists<&[Target]>> = kinds
+        .iter()
+        .zip(links)
+        .map(|(kind, links)| {
+            let items = links.targets.chunks(kind.groups().len().max(1));
+            let pairs = items.flat_map(|all| all.iter().filter(|t| t.block != NONE).map(move |t| (t.block, all)));
+            Lists::from_pairs(n, &[][..], pairs)
+        })
+        .collect();
     let mut rows: Vec<Vec<u32>> = Vec::with_capacity(n);
     let mut mark = vec![NONE; n];
     for b in 0..n {
@@ -398,15 +462,8 @@ fn pattern(
                 list.push(block);
             }
         };
-        for &(p, i) in seen.of(b) {
-            cells.of(p as usize)[i as usize..].iter().for_each(|c| add(c.block));
-        }
-        for (kind, link) in kinds.iter().zip(links) {
-            let width = kind.groups().len();
-            for &item in link.of_block.of(b) {
-                link.targets(item as usize, width).iter().for_each(|t| add(t.block));
-            }
-        }
+        seen.of(b).iter().copied().flatten().for_each(|c| add(c.block));
+        items.iter().flat_map(|kind| kind.of(b)).copied().flatten().for_each(|t| add(t.block));
         list.sort_unstable();
         rows.push(list);
     }
@@ -415,7 +472,8 @@ fn pattern(
     if dense {
         rows = (0..n).map(|b| (b as u32..n as u32).collect()).collect();
     }
-    let mut pattern = Pattern { start: vec![0], dense, ..Pattern::default() };
+    let column = blocks.iter().map(|b| b.column).collect();
+    let mut pattern = Pattern { start: vec![0], dense, column, ..Pattern::default() };
     for (block, rows) in blocks.iter().zip(rows) {
         let mut height = 0;
         let placed = rows
