@@ -1,6 +1,7 @@
 //! What the program says about failures, and which of its options help: the one place where the reasons of the libraries are worded.
 
 pub(crate) mod calibration;
+pub(crate) mod many_views;
 
 use crate::frame::Failure;
 use cv_io::FormatError;

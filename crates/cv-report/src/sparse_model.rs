@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use cv_core::{Matrix3, Point3, PointCloud, Pose, RgbU8, Rotation3, SparseModel, Vector3};
+use cv_core::{Matrix3, Point3, PointCloud, Pose, RgbU8, Rotation3, SparseModel, UnionFind, Vector3};
 
 use crate::colormap::Colormap;
 use crate::raster::{Color, Raster, colors};
@@ -69,6 +69,54 @@ impl Report {
         );
         self.table(&caption, &["photograph", "points", "error (px)", "seen by", "linked with"], &cells)
     }
+
+    /// A table of the places where a model hangs together by fewest points, `most` at most: where it bends or breaks first, and where more photographs help.
+    pub fn thinnest_places(&mut self, model: &SparseModel, most: usize) -> &mut Self {
+        let row = |bridge: &Bridge<'_>| {
+            let [a, b] = bridge.names.map(str::to_owned);
+            [a, b, bridge.points.to_string(), format!("{} and {}", bridge.sizes[0], bridge.sizes[1])]
+        };
+        let cells: Vec<[String; 4]> = bridges(model).iter().take(most).map(row).collect();
+        let caption = "Where the model hangs together by fewest points: the two photographs, one on each side, that have most in common, and how many photographs are on the sides. More photographs between the first of them help most.";
+        self.table(caption, &["photograph", "and", "points in common", "photographs on the sides"], &cells)
+    }
+}
+
+/// Two parts of a model that hang together by the points that one photograph of each have in common.
+#[derive(Debug, Clone, PartialEq)]
+struct Bridge<'a> {
+    /// The photographs, one of each part.
+    names: [&'a str; 2],
+    points: u32,
+    /// How many photographs the parts have.
+    sizes: [usize; 2],
+}
+
+/// The thinnest first: what the maximum spanning tree of the photographs is made of, weighted by points in common.
+fn bridges(model: &SparseModel) -> Vec<Bridge<'_>> {
+    let ids = by_name(model);
+    let shared = shared_points(model, &ids);
+    let mut links: Vec<(u32, usize, usize)> = (0..ids.len())
+        .flat_map(|a| (a + 1..ids.len()).map(move |b| (a, b)))
+        .map(|(a, b)| (shared[a][b], a, b))
+        .collect();
+    links.sort_by_key(|&(points, a, b)| (std::cmp::Reverse(points), a, b));
+    let mut parts = UnionFind::new(ids.len());
+    let mut sizes = vec![1; ids.len()];
+    let mut bridges = Vec::new();
+    for (points, a, b) in links.into_iter().filter(|link| link.0 > 0) {
+        let roots = [a, b].map(|i| parts.find(i as u32) as usize);
+        if parts.union(a as u32, b as u32) {
+            bridges.push(Bridge {
+                names: [a, b].map(|i| &*model.images[&ids[i]].name),
+                points,
+                sizes: roots.map(|r| sizes[r]),
+            });
+            sizes[parts.find(a as u32) as usize] = sizes[roots[0]] + sizes[roots[1]];
+        }
+    }
+    bridges.reverse();
+    bridges
 }
 
 /// Which photographs of a model see the same points: a square for each pair, the lighter the more points in common (on a logarithmic scale), gray for none. Rows and
@@ -267,6 +315,18 @@ mod tests {
         let html = page.to_html();
         assert!(html.contains(">3.00<") && html.contains(">2.3<") && html.contains("not in the model"), "{html}");
         assert!(html.find("x.jpg") < html.find("c.jpg"));
+    }
+
+    #[test]
+    fn the_thinnest_places_are_those_of_the_spanning_tree() {
+        let model = model();
+        // b and c share twenty points, each of them five with a: the first of the two by name is the bridge.
+        let b = |names, points, sizes| Bridge { names, points, sizes };
+        assert_eq!(bridges(&model), [b(["b.jpg", "in/a.jpg"], 5, [2, 1]), b(["b.jpg", "c.jpg"], 20, [1, 1])]);
+        let mut page = Report::new("t");
+        let html = page.thinnest_places(&model, 1).to_html();
+        assert!(html.contains(">2 and 1<") && !html.contains("c.jpg"), "{html}");
+        assert_eq!(bridges(&SparseModel::default()), []);
     }
 
     #[test]

@@ -9,6 +9,7 @@ use crate::{rig, words};
 use cv_core::PointCloud;
 use cv_core::nalgebra::Matrix3;
 use cv_io::DynImage;
+use cv_io::colmap::ModelFormat;
 use cv_io::ply::PlyEncoding;
 use cv_pipeline::{
     Axes, DenseOptions, DenseResult, Intrinsics, PLAUSIBLE_FOCAL, ReconstructOptions, ReconstructResult, reconstruct,
@@ -139,7 +140,8 @@ impl Run for Args {
         if let Some(folder) = &self.colmap {
             let name = |path: &Path| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
             let model = result.model([name(&self.first), name(&self.second)]);
-            context.write(Output::Folder(folder), |folder| cv_io::colmap::write(folder, &model))?;
+            context
+                .write(Output::Folder(folder), |folder| cv_io::colmap::replace(folder, &model, ModelFormat::Text))?;
         }
         if let Some(text) = doubt(&result) {
             context.warn(format!("{text}; --focal or --camera if you know it"));

@@ -113,7 +113,7 @@ impl Run for Args {
 }
 
 /// A picture as deep as it is; linear light as bytes of color.
-fn straight(pixels: &Pixels, map: &WarpMap) -> Result<Pixels, WarpError> {
+pub(super) fn straight(pixels: &Pixels, map: &WarpMap) -> Result<Pixels, WarpError> {
     Ok(match pixels {
         Pixels::Gray8(image) => map.compute(image.view())?.into(),
         Pixels::Gray16(image) => map.compute(image.view())?.into(),

@@ -22,10 +22,15 @@ pub(crate) fn expand_images(paths: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> 
             continue;
         }
         let mut found = if path.is_dir() { in_folder(path)? } else { like(path)? };
-        found.sort_by(|a, b| natural_order(&a.to_string_lossy(), &b.to_string_lossy()));
+        sort_by_name(&mut found);
         images.append(&mut found);
     }
     Ok(images)
+}
+
+/// Sorts paths as people number them.
+pub(crate) fn sort_by_name(paths: &mut [PathBuf]) {
+    paths.sort_by(|a, b| natural_order(&a.to_string_lossy(), &b.to_string_lossy()));
 }
 
 /// The two photographs that the arguments stand for, by name, folder or pattern.

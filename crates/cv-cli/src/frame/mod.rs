@@ -19,7 +19,7 @@ pub(crate) use called::Called;
 pub(crate) use config::complete;
 pub(crate) use context::Context;
 pub(crate) use failure::{Explain, Failure};
-pub(crate) use inputs::{expand_images, stands_for_many, two_images};
+pub(crate) use inputs::{expand_images, sort_by_name, stands_for_many, two_images};
 pub(crate) use named::named;
 pub(crate) use outcome::Outcome;
 pub(crate) use outputs::{CLOUD, JSON, MAP, Output, PICTURE, PNG, TEXT, YAML, one_each, same_file, spare_inputs};

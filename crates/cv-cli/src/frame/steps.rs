@@ -36,5 +36,6 @@ steps! {
     PHOTOGRAPHS = "photographs": ["photographs"];
     PAIRS = "pairs": ["match"];
     MODEL = "model": ["register"];
+    UNDISTORT = "undistort": ["undistort"];
     DEMO = "demo": ["demo"];
 }

@@ -79,6 +79,60 @@ pub fn write_binary(folder: impl AsRef<Path>, model: &SparseModel) -> Result<(),
     })
 }
 
+/// A form of a model's files.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum ModelFormat {
+    /// `cameras.txt`, `images.txt`, `points3D.txt`.
+    #[default]
+    Text,
+    /// `cameras.bin`, `images.bin`, `points3D.bin`.
+    Binary,
+}
+
+cv_core::named!(ModelFormat {
+    Text = "colmap-text": "text: to be read by people, too",
+    Binary = "colmap-binary": "binary: a third of the size",
+});
+
+impl ModelFormat {
+    fn ending(self) -> &'static str {
+        match self {
+            Self::Text => "txt",
+            Self::Binary => "bin",
+        }
+    }
+}
+
+/// Writes a model into an existing folder, in place of the one that is there, if any: the files of the other form are removed once the new ones are written, and those of rigs and frames
+/// (COLMAP 3.12), which are of the older model. Else whoever reads the folder might take the older one: COLMAP reads binary files before text. True where such files were there.
+///
+/// # Errors
+/// As [`write()`]; [`IoError`] for a file that cannot be removed.
+pub fn replace(folder: impl AsRef<Path>, model: &SparseModel, format: ModelFormat) -> Result<bool, IoError> {
+    let folder = folder.as_ref();
+    let other = match format {
+        ModelFormat::Text => {
+            write(folder, model)?;
+            ModelFormat::Binary
+        }
+        ModelFormat::Binary => {
+            write_binary(folder, model)?;
+            ModelFormat::Text
+        }
+    };
+    let models = ["cameras", "images", "points3D", "rigs", "frames"].map(|stem| (stem, other));
+    let mut found = false;
+    for (stem, form) in models.into_iter().chain([("rigs", format), ("frames", format)]) {
+        let path = folder.join(stem).with_extension(form.ending());
+        match std::fs::remove_file(&path) {
+            Ok(()) => found = true,
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
+            Err(error) => return Err(IoError::writing(&path, error)),
+        }
+    }
+    Ok(found)
+}
+
 /// What is wrong with a camera. Its picture must be one that is read: whoever makes a map of it asks for so much memory.
 fn check_camera(id: u32, camera: &Camera) -> Result<(), String> {
     camera.validate().map_err(|e| format!("camera {id}: {e}"))?;
@@ -205,6 +259,42 @@ mod tests {
         assert_eq!(focal(), 5.0);
         std::fs::remove_file(folder.path().join("images.txt")).unwrap();
         assert!(read(folder.path()).unwrap_err().to_string().contains("images.txt"));
+    }
+
+    #[test]
+    fn a_model_takes_the_place_of_that_of_the_other_form() {
+        let folder = tempfile::tempdir().unwrap();
+        let model =
+            |focal| SparseModel { cameras: [(1, Camera::from_focal(4, 4, focal))].into(), ..SparseModel::default() };
+        let focal = || read(folder.path()).unwrap().cameras[&1].fx;
+        let names = || {
+            let files = std::fs::read_dir(folder.path()).unwrap();
+            let mut names: Vec<_> = files.map(|f| f.unwrap().file_name().into_string().unwrap()).collect();
+            names.sort();
+            names
+        };
+        for name in ["notes.txt", "frames.bin"] {
+            std::fs::write(folder.path().join(name), "x").unwrap();
+        }
+        for (focal_px, format, replaced) in [
+            (5.0, ModelFormat::Binary, true),
+            (6.0, ModelFormat::Text, true),
+            (7.0, ModelFormat::Text, false),
+            (8.0, ModelFormat::Binary, true),
+        ] {
+            assert_eq!(replace(folder.path(), &model(focal_px), format).unwrap(), replaced);
+            assert_eq!(focal(), focal_px);
+            let ending = format.ending();
+            let mut wanted = ["cameras", "images", "points3D"].map(|stem| format!("{stem}.{ending}")).to_vec();
+            wanted.push("notes.txt".to_owned());
+            wanted.sort();
+            assert_eq!(names(), wanted);
+        }
+        // One that cannot be written leaves what is there.
+        let image = ModelImage { name: "a".into(), camera: 9, pose: Pose::identity(), points: vec![] };
+        let wrong = SparseModel { images: [(1, image)].into(), ..SparseModel::default() };
+        assert!(replace(folder.path(), &wrong, ModelFormat::Text).is_err());
+        assert_eq!(focal(), 8.0);
     }
 
     #[test]
