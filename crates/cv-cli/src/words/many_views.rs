@@ -54,6 +54,9 @@ pub(crate) fn no_model(error: SfmJobError) -> Failure {
         SfmJobError::Solve(SfmError::NoInitialPair { .. }) => {
             "walk along between the photographs: turning on the spot tells no depth (to join photographs from one place use `cv panorama`); a focal length, where EXIF has none or a wrong one (--focal, --ignore-exif)".to_owned()
         }
+        SfmJobError::Solve(SfmError::Inconsistent { .. }) => {
+            "about the right focal length (--focal), or --ignore-exif where EXIF's is wrong; leave out photographs of other places that look alike".to_owned()
+        }
         SfmJobError::Option(_) | SfmJobError::Solve(SfmError::Option(_)) => words(Advice::CheckOptions),
         _ => return error.into(),
     };
