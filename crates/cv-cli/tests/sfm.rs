@@ -57,11 +57,11 @@ fn worst(model: &SparseModel, truth: &BTreeMap<String, Pose>) -> [f64; 3] {
 }
 
 /// A pixel is an angle of 1/330, 0.17 degrees; keypoints of rendered photographs are found to a third of one, and each pose rests on a hundred of them or more. A pose
-/// that is wrong is off by degrees.
+/// that is wrong is off by degrees. Centers are known to about a thousandth of the longest distance; of neighbors a tenth as far apart that is more than half a degree of direction.
 fn is_true(model: &SparseModel, truth: &BTreeMap<String, Pose>) {
     let [turn, direction, off] = worst(model, truth);
     println!("{turn:.3} {direction:.3} {off:.4}");
-    assert!(turn < 0.17 && direction < 0.5 && off < 0.005, "{turn} {direction} {off}");
+    assert!(turn < 0.17 && direction < 1.0 && off < 0.005, "{turn} {direction} {off}");
 }
 
 fn used(value: &Value) -> Vec<bool> {

@@ -218,7 +218,7 @@ struct Effort {
 }
 
 const ROUGH: Effort = Effort { rounds: 1, max_iterations: 8, tolerance: 1e-3 };
-const FINE: Effort = Effort { rounds: 3, max_iterations: 15, tolerance: 1e-4 };
+const FINE: Effort = Effort { rounds: 3, max_iterations: 25, tolerance: 1e-5 };
 /// Views that are adjusted with a new one.
 const NEAR_VIEWS: usize = 6;
 
