@@ -11,7 +11,7 @@ mod feature_quality;
 mod features;
 mod geometry;
 mod sfm;
-mod sfm_score;
+pub(crate) mod sfm_score;
 mod stereo;
 
 use crate::checks::{self, Check};

@@ -301,7 +301,8 @@ fn run_ours(
     command.arg("sfm").args(photographs).arg("-o").arg(folder.join("model"));
     command.args(["--json", "--quiet", "--threads", &THREADS.to_string()]);
     if let Some(camera) = camera {
-        command.arg("--camera").arg(camera);
+        // As the peers are given it: without distortion.
+        command.arg("--camera").arg(camera).arg("--undistorted");
     }
     let output = command.output().context("cannot start Python")?;
     ensure!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr).trim());

@@ -17,29 +17,29 @@ const RIGHT: f64 = LIMITS[2];
 const NO_BASELINE: f64 = 1e-6;
 
 /// Poses, world to camera, by the photograph's file name.
-pub(super) type Poses = BTreeMap<String, Pose>;
+pub(crate) type Poses = BTreeMap<String, Pose>;
 
 /// A model beside the truth.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(super) struct Score {
+pub(crate) struct Score {
     /// Photographs of the truth that the model has.
-    pub(super) registered: usize,
+    pub(crate) registered: usize,
     /// Names of those that are where they are in the truth.
-    pub(super) right: Vec<String>,
+    pub(crate) right: Vec<String>,
     /// Percent, up to each of [`LIMITS`], over all pairs of the truth, of the larger of the angle between the relative rotations and that
     /// between the relative directions; a pair of which a camera is missing has failed.
-    pub(super) auc: [f64; 3],
+    pub(crate) auc: [f64; 3],
     /// Root mean square distance of the centers after a similarity, over that of the true ones from their mean; NaN where there is none.
-    pub(super) centers: f64,
-    pub(super) points: usize,
-    pub(super) track_length: f64,
+    pub(crate) centers: f64,
+    pub(crate) points: usize,
+    pub(crate) track_length: f64,
     /// Mean distance in pixels between a point's projection and where it was seen, over all observations: computed from the model's
     /// cameras, poses and points, whatever error its files claim.
-    pub(super) reprojection: f64,
+    pub(crate) reprojection: f64,
 }
 
 /// `name qw qx qy qz tx ty tz` by line; `#` begins a comment.
-pub(super) fn read_truth(path: &Path) -> Result<Poses> {
+pub(crate) fn read_truth(path: &Path) -> Result<Poses> {
     let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
     let mut poses = Poses::new();
     for line in text.lines().filter(|line| !line.trim().is_empty() && !line.starts_with('#')) {
@@ -57,7 +57,7 @@ pub(super) fn read_truth(path: &Path) -> Result<Poses> {
 }
 
 /// The score of a model against `truth`.
-pub(super) fn score(model: &SparseModel, truth: &Poses) -> Score {
+pub(crate) fn score(model: &SparseModel, truth: &Poses) -> Score {
     let name = |path: &str| path.rsplit(['/', '\\']).next().unwrap_or(path).to_owned();
     let found: Poses = model.images.values().map(|image| (name(&image.name), image.pose)).collect();
     let (errors, by_name) = pair_errors(&found, truth);

@@ -11,6 +11,7 @@ mod matching;
 mod panorama;
 mod reconstruct;
 mod segment;
+mod sfm;
 
 use crate::checks;
 pub(crate) use crate::checks::Check;
@@ -29,6 +30,7 @@ const JOBS: &[checks::Named<Job>] = &[
     ("panorama", panorama::run),
     ("reconstruct", reconstruct::run),
     ("segment", segment::run),
+    ("sfm", sfm::run),
 ];
 
 /// Jobs that take minutes: they run where they are named, or all are.
