@@ -68,7 +68,7 @@ pub fn write(folder: impl AsRef<Path>, model: &SparseModel) -> Result<(), IoErro
 /// Writes a model in binary into an existing folder: all three files or none. A third of the text's size, and every number as it is.
 ///
 /// # Errors
-/// As [`write`].
+/// As [`write()`].
 pub fn write_binary(folder: impl AsRef<Path>, model: &SparseModel) -> Result<(), IoError> {
     let cameras = check(model).and_then(|()| binary::cameras_bytes(&model.cameras));
     let cameras = cameras.map_err(|reason| IoError::writing(folder.as_ref(), reason))?;
