@@ -64,9 +64,9 @@ impl ByteDescriptors {
     ///
     /// # Panics
     /// Where there are not so many.
+    #[inline(always)]
     pub fn ssd(&self, i: usize, other: &Self, j: usize) -> f32 {
-        let squared = |(a, b): (&u8, &u8)| u32::from(a.abs_diff(*b)).pow(2);
-        self.row(i).iter().zip(other.row(j)).map(squared).sum::<u32>() as f32 * self.unit()
+        ssd_bytes(self.row(i), other.row(j)) as f32 * self.unit()
     }
 
     /// A difference of one byte in the unit of the numbers, squared.
@@ -79,6 +79,23 @@ impl ByteDescriptors {
         let data = self.data.iter().map(|&b| self.scale.to_number(b)).collect();
         Descriptors::from_vec(self.kind, data).unwrap_or(Descriptors::new(self.kind))
     }
+}
+
+/// Sum of squared differences of bytes.
+#[inline(always)]
+fn ssd_bytes(a: &[u8], b: &[u8]) -> u32 {
+    let square = |a: u8, b: u8| {
+        let d = i16::from(a) - i16::from(b);
+        (i32::from(d) * i32::from(d)) as u32
+    };
+    let ((a, rest_a), (b, rest_b)) = (a.as_chunks::<64>(), b.as_chunks::<64>());
+    let mut sum = rest_a.iter().zip(rest_b).fold(0u32, |sum, (a, b)| sum.wrapping_add(square(*a, *b)));
+    for (a, b) in a.iter().zip(b) {
+        for i in 0..64 {
+            sum = sum.wrapping_add(square(a[i], b[i]));
+        }
+    }
+    sum
 }
 
 /// As [`match_descriptors`], on rounded descriptors: several times faster, and the nearest neighbors are exactly those of the bytes.

@@ -114,25 +114,8 @@ impl Rows for ByteDescriptors {
 
     #[inline(always)]
     fn ssd(&self, i: usize, other: &Self, j: usize) -> f32 {
-        ssd_bytes(self.row(i), other.row(j)) as f32 * self.unit()
+        self.ssd(i, other, j)
     }
-}
-
-/// Sum of squared differences of bytes.
-#[inline(always)]
-fn ssd_bytes(a: &[u8], b: &[u8]) -> u32 {
-    let square = |a: u8, b: u8| {
-        let d = i16::from(a) - i16::from(b);
-        (i32::from(d) * i32::from(d)) as u32
-    };
-    let ((a, rest_a), (b, rest_b)) = (a.as_chunks::<64>(), b.as_chunks::<64>());
-    let mut sum = rest_a.iter().zip(rest_b).fold(0u32, |sum, (a, b)| sum.wrapping_add(square(*a, *b)));
-    for (a, b) in a.iter().zip(b) {
-        for i in 0..64 {
-            sum = sum.wrapping_add(square(a[i], b[i]));
-        }
-    }
-    sum
 }
 
 fn guided<R: Rows>(

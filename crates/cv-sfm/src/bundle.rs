@@ -48,14 +48,47 @@ const FOCAL_DEVIATION: f64 = 0.5;
 /// And of a calibration matrix that came without its lens.
 const MATRIX_DEVIATION: f64 = 0.02;
 
-/// Observations with cameras that are not changed: pose, point.
-struct Calibrated {
+/// Observations. Of pose and point, their cameras are not changed; of pose, lens and point, they are.
+struct Observed {
     cameras: Vec<Camera>,
     camera_of: Vec<u32>,
     pixels: Vec<Point2<f64>>,
 }
 
-impl Residual<2, 2, 9> for Calibrated {
+/// A point in the frame of a camera.
+struct Moved {
+    rotation: cv_core::Rotation3<f64>,
+    /// Turned, but not moved yet.
+    turned: Vector3<f64>,
+    inverse_depth: f64,
+    /// In normalized coordinates.
+    ideal: Point2<f64>,
+}
+
+impl Moved {
+    /// `None` behind the camera.
+    #[inline]
+    fn new(pose: &[f64], point: &[f64]) -> Option<Self> {
+        let (rotation, translation) = RigidMotion::load(pose);
+        let turned = rotation * Vector3::from_column_slice(point);
+        let p = turned + translation;
+        if p.z <= 0.0 || p.z.is_nan() {
+            return None;
+        }
+        let inverse_depth = 1.0 / p.z;
+        Some(Self { rotation, turned, inverse_depth, ideal: Point2::new(p.x * inverse_depth, p.y * inverse_depth) })
+    }
+
+    /// The derivatives of a pixel by the point in the camera's frame, of those of the lens by normalized coordinates.
+    #[inline]
+    fn by_point(&self, camera: &Camera, by_ideal: &Matrix2<f64>) -> Matrix2x3<f64> {
+        let (fx, fy) = (camera.fx * self.inverse_depth, camera.fy * self.inverse_depth);
+        let ray = Matrix2x3::new(1.0, 0.0, -self.ideal.x, 0.0, 1.0, -self.ideal.y);
+        Matrix2::new(fx, 0.0, 0.0, fy) * by_ideal * ray
+    }
+}
+
+impl Residual<2, 2, 9> for Observed {
     const DIMS: [usize; 2] = [6, 3];
 
     #[inline]
@@ -66,19 +99,10 @@ impl Residual<2, 2, 9> for Calibrated {
         jacobian: Option<&mut SMatrix<f64, 2, 9>>,
     ) -> Option<Vector2<f64>> {
         let camera = &self.cameras[self.camera_of[item] as usize];
-        let (rotation, translation) = RigidMotion::load(pose);
-        let turned = rotation * Vector3::from_column_slice(point);
-        let p = turned + translation;
-        if p.z <= 0.0 || p.z.is_nan() {
-            return None;
-        }
-        let i = 1.0 / p.z;
-        let ideal = Point2::new(p.x * i, p.y * i);
-        let Some(out) = jacobian else { return Some(camera.denormalize(ideal) - self.pixels[item]) };
-        let (d, j) = camera.distortion.distort_with_jacobian(ideal);
-        let by_ideal = Matrix2::new(camera.fx * i, 0.0, 0.0, camera.fy * i) * j;
-        let by_p = by_ideal * Matrix2x3::new(1.0, 0.0, -ideal.x, 0.0, 1.0, -ideal.y);
-        write_motion(out, 0, 6, &by_p, &turned, rotation.matrix());
+        let moved = Moved::new(pose, point)?;
+        let Some(out) = jacobian else { return Some(camera.denormalize(moved.ideal) - self.pixels[item]) };
+        let (d, j) = camera.distortion.distort_with_jacobian(moved.ideal);
+        write_motion(out, 0, 6, &moved.by_point(camera, &j), &moved);
         Some(Point2::new(camera.fx * d.x + camera.cx, camera.fy * d.y + camera.cy) - self.pixels[item])
     }
 }
@@ -90,9 +114,9 @@ fn write_motion<const C: usize>(
     pose: usize,
     point: usize,
     by_p: &Matrix2x3<f64>,
-    turned: &Vector3<f64>,
-    rotation: &nalgebra::Matrix3<f64>,
+    moved: &Moved,
 ) {
+    let (turned, rotation) = (&moved.turned, moved.rotation.matrix());
     for row in 0..2 {
         let b = [by_p[(row, 0)], by_p[(row, 1)], by_p[(row, 2)]];
         // −b [turned]× = turned × b.
@@ -106,14 +130,7 @@ fn write_motion<const C: usize>(
     }
 }
 
-/// Observations with cameras that are refined: pose, lens, point.
-struct Refined {
-    cameras: Vec<Camera>,
-    camera_of: Vec<u32>,
-    pixels: Vec<Point2<f64>>,
-}
-
-impl Residual<2, 3, { 6 + LENS + 3 }> for Refined {
+impl Residual<2, 3, { 6 + LENS + 3 }> for Observed {
     const DIMS: [usize; 3] = [6, LENS, 3];
 
     #[inline]
@@ -124,19 +141,10 @@ impl Residual<2, 3, { 6 + LENS + 3 }> for Refined {
         jacobian: Option<&mut SMatrix<f64, 2, { 6 + LENS + 3 }>>,
     ) -> Option<Vector2<f64>> {
         let camera = with_lens(&self.cameras[self.camera_of[item] as usize], lens);
-        let (rotation, translation) = RigidMotion::load(pose);
-        let turned = rotation * Vector3::from_column_slice(point);
-        let p = turned + translation;
-        if p.z <= 0.0 || p.z.is_nan() {
-            return None;
-        }
-        let i = 1.0 / p.z;
-        let ideal = Point2::new(p.x * i, p.y * i);
-        let Some(out) = jacobian else { return Some(camera.denormalize(ideal) - self.pixels[item]) };
-        let (d, j, by_parameters) = camera.distortion.distort_with_jacobians(ideal);
-        let by_ideal = Matrix2::new(camera.fx * i, 0.0, 0.0, camera.fy * i) * j;
-        let by_p = by_ideal * Matrix2x3::new(1.0, 0.0, -ideal.x, 0.0, 1.0, -ideal.y);
-        write_motion(out, 0, 6 + LENS, &by_p, &turned, rotation.matrix());
+        let moved = Moved::new(pose, point)?;
+        let Some(out) = jacobian else { return Some(camera.denormalize(moved.ideal) - self.pixels[item]) };
+        let (d, j, by_parameters) = camera.distortion.distort_with_jacobians(moved.ideal);
+        write_motion(out, 0, 6 + LENS, &moved.by_point(&camera, &j), &moved);
         (out[(0, 6)], out[(1, 6)]) = (d.x, lens[1] * d.y);
         out[(1, 7)] = lens[0] * d.y;
         (out[(0, 8)], out[(1, 9)]) = (1.0, 1.0);
@@ -315,7 +323,7 @@ impl Problem<'_> {
         let refinable = |c: &CameraKnowledge| *c != CameraKnowledge::Known;
         let mut lenses = None;
         if plan.lens == LensFreedom::Held || !scene.knowledge.iter().any(refinable) {
-            let residual = Calibrated { cameras: scene.cameras.clone(), camera_of, pixels };
+            let residual = Observed { cameras: scene.cameras.clone(), camera_of, pixels };
             adjustment.add_residuals("reprojection", residual, [poses, points], blocks, loss)?;
         } else {
             let values = scene.cameras.iter().flat_map(lens_of).collect();
@@ -329,7 +337,7 @@ impl Problem<'_> {
             }
             let count = scene.cameras.len() as u32;
             let blocks = blocks.iter().zip(&camera_of).map(|(b, c)| [b[0], *c, b[1]]).collect();
-            let residual = Refined { cameras: scene.cameras.clone(), camera_of, pixels };
+            let residual = Observed { cameras: scene.cameras.clone(), camera_of, pixels };
             adjustment.add_residuals("reprojection", residual, [poses, group, points], blocks, loss)?;
             let items = (0..count).map(|c| [c]).collect();
             adjustment.add_residuals("lens", Prior { items: prior }, [group], items, RobustLoss::Trivial)?;

@@ -156,7 +156,7 @@ pub fn reconstruct_views(
     let stage = Stage::new(progress, "register", input.views.len())?;
     let mut weakest = None;
     loop {
-        let left: Vec<PairMatches> = input.pairs.iter().filter(|p| !taken[p.a] && !taken[p.b]).cloned().collect();
+        let left: Vec<&PairMatches> = input.pairs.iter().filter(|p| !taken[p.a] && !taken[p.b]).collect();
         let mut open = vec![false; input.views.len()];
         left.iter().for_each(|p| (open[p.a], open[p.b]) = (true, true));
         let open = open.into_iter().filter(|o| *o).count();
@@ -313,7 +313,7 @@ fn grow(
         stage.check()?;
         let mut next = None;
         for candidate in visible(scene).into_iter().filter(|c| !taken[c.view]) {
-            let Registered { seen, needed } = Registered { seen: candidate.count, needed: options.min_pose_inliers };
+            let (seen, needed) = (candidate.count, options.min_pose_inliers);
             if seen < needed {
                 outcomes[candidate.view] = ViewOutcome::TooFewPoints { seen, needed };
                 continue;
@@ -352,11 +352,6 @@ fn grow(
         stage.add(1)?;
     }
     Ok(())
-}
-
-struct Registered {
-    seen: usize,
-    needed: usize,
 }
 
 /// The view and those that share most points with it.

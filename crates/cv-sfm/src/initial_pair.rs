@@ -22,18 +22,17 @@ pub(crate) struct Start {
     pub(crate) pose: Pose,
 }
 
-/// Pairs to start from, the best first: those with many points at wide angles, of views that have no pose and are not `tried` together.
+/// Pairs to start from, the best first: those with many points at wide angles.
 ///
 /// # Errors
 /// [`Cancelled`].
 pub(crate) fn initial_pairs(
     scene: &Scene<'_>,
-    pairs: &[PairMatches],
+    pairs: &[&PairMatches],
     options: &SfmOptions,
     progress: &dyn Progress,
 ) -> Result<Vec<Start>, Cancelled> {
-    let free = |v: usize| scene.poses[v].is_none();
-    let mut order: Vec<&PairMatches> = pairs.iter().filter(|p| free(p.a) && free(p.b)).collect();
+    let mut order = pairs.to_vec();
     order.sort_by(|x, y| y.matches.len().cmp(&x.matches.len()).then((x.a, x.b).cmp(&(y.a, y.b))));
     // Of sequences, the pairs with most matches are all neighbors: every other one is taken evenly from the rest.
     let step = ((order.len().saturating_sub(MOST_PAIRS / 2)) as f64 / (MOST_PAIRS / 2) as f64).max(1.0);

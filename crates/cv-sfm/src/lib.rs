@@ -98,7 +98,7 @@ pub enum CameraKnowledge {
 
 impl CameraKnowledge {
     /// Whether rays can be told from pixels, but for a lens that a matrix leaves out.
-    fn is_calibrated(&self) -> bool {
+    pub fn is_calibrated(&self) -> bool {
         matches!(self, Self::Known | Self::Matrix)
     }
 }

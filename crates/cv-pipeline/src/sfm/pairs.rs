@@ -24,9 +24,7 @@ struct Ready<'p> {
 
 impl<'p> Ready<'p> {
     fn new(photo: &'p SfmPhoto, camera: &'p SfmCamera, first: usize) -> Self {
-        let calibrated =
-            camera.knowledge != CameraKnowledge::Unknown && !matches!(camera.knowledge, CameraKnowledge::Focal { .. });
-        let position = |k: &Keypoint| match calibrated {
+        let position = |k: &Keypoint| match camera.knowledge.is_calibrated() {
             true => camera.camera.undistort_pixel(k.position.cast()).cast::<f32>(),
             false => k.position,
         };
