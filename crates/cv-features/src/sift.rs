@@ -37,6 +37,10 @@ pub struct SiftOptions {
     pub sigma: f32,
     /// Smallest contrast of a point, times `layers`, for images of 0 to 1. 0 or more; default 0.02 (COLMAP's), half of OpenCV's 0.04.
     pub contrast: f32,
+    /// Where fewer points than this have `contrast`, the strongest of `faint_contrast` and more fill up. Default 0: none do.
+    pub min_features: usize,
+    /// Smallest contrast of a point that fills up. 0 or more; default 0.4 × 0.02.
+    pub faint_contrast: f32,
     /// Largest ratio of the two principal curvatures. 1 or more; default 10 (Lowe).
     pub edge: f32,
     /// Take the square root of the L1-normalized histogram (rootSIFT). Default true.
@@ -54,6 +58,8 @@ impl Default for SiftOptions {
             layers: 3,
             sigma: 1.6,
             contrast: 0.02,
+            min_features: 0,
+            faint_contrast: 0.008,
             edge: 10.0,
             root: true,
             upright: false,
@@ -105,18 +111,25 @@ pub fn sift(
     OptionError::check("max_features", options.max_features as f64, "1 or more", |v| v >= 1.0)?;
     OptionError::check("layers", options.layers as f64, "from 1 to 8", |v| (1.0..=8.0).contains(&v))?;
     OptionError::check("sigma", options.sigma.into(), "from 0.8 to 4 px", |v| (0.8..=4.0).contains(&v))?;
-    OptionError::check("contrast", options.contrast.into(), "0 or more", |v| v >= 0.0 && v.is_finite())?;
+    for (name, value) in [("contrast", options.contrast), ("faint_contrast", options.faint_contrast)] {
+        OptionError::check(name, value.into(), "0 or more", |v| v >= 0.0 && v.is_finite())?;
+    }
     OptionError::check("edge", options.edge.into(), "1 or more", |v| v >= 1.0 && v.is_finite())?;
     check_image(view, SMALLEST)?;
+    // Never zero: rounding noise in flat regions is not a point. 1e-5 is a hundred times the error of the f32 sums.
+    let per_layer = |contrast: f32| (contrast / options.layers as f32).max(1e-5);
+    let contrast = per_layer(options.contrast);
+    let faint = if options.min_features > 0 { per_layer(options.faint_contrast).min(contrast) } else { contrast };
     let search = Search {
         layers: options.layers,
         sigma: options.sigma,
         upsample: options.upsample,
-        // Never zero: rounding noise in flat regions is not a point. 1e-5 is a hundred times the error of the f32 sums.
-        contrast: (options.contrast / options.layers as f32).max(1e-5),
+        contrast: faint,
         edge: options.edge,
     };
     let (octaves, mut points) = scale_space(view, &search, progress)?;
+    // The strongest come first.
+    points.truncate(points.partition_point(|p| p.contrast >= contrast).max(options.min_features));
     let mut out = Features::new(options.kind());
     if options.coarse_first && points.len() > options.max_features {
         // Stable: contrast decides between equals.

@@ -2,7 +2,7 @@
 
 use crate::{Progress, extract_features};
 use cv_core::{ImageView, Keypoint};
-use cv_features::{ByteDescriptors, FeatureError, FeatureOptions, SiftOptions};
+use cv_features::{ByteDescriptors, FeatureError, FeatureOptions};
 
 /// The features of a photograph, and what is known of it.
 #[derive(Debug, Clone, PartialEq)]
@@ -35,10 +35,6 @@ pub enum SfmPhotoError {
     },
 }
 
-/// A photograph with fewer features is looked at for weaker ones as well: of this share of the contrast.
-const FEW: usize = 2000;
-const WEAK: f32 = 0.4;
-
 /// The features of a photograph and their colors: the photograph itself is not needed any more.
 ///
 /// # Errors
@@ -50,13 +46,7 @@ pub fn sfm_photo(
     options: &FeatureOptions,
     progress: &dyn Progress,
 ) -> Result<SfmPhoto, SfmPhotoError> {
-    let mut features = extract_features(photo, options, progress)?;
-    if let FeatureOptions::Sift(sift) = options
-        && features.keypoints.len() < FEW.min(sift.max_features)
-    {
-        let weak = SiftOptions { contrast: WEAK * sift.contrast, ..sift.clone() };
-        features = extract_features(photo, &FeatureOptions::Sift(weak), progress)?;
-    }
+    let features = extract_features(photo, options, progress)?;
     let kind = features.descriptors.kind().name;
     let descriptors = ByteDescriptors::new(&features.descriptors).ok_or(SfmPhotoError::NoByteScale { kind })?;
     let near = |v: f32, n: usize| v.round().clamp(0.0, n.saturating_sub(1) as f32) as usize;
