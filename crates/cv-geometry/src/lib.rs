@@ -61,8 +61,8 @@ pub use homography::{
 pub use match_blocks::{LANES, MatchBlock};
 pub use pair_graph::{NoSuchNode, PairEdge, PairGraph, TreeStep};
 pub use ransac::{
-    Consensus, Estimator, Msac, Prosac, RansacData, RobustOptions, Sampler, Sampling, Score, Scorer, Scoring,
-    TukeyBiweight, Uniform, ransac,
+    Consensus, Estimator, LocalOptimization, Msac, Prosac, RansacData, RobustOptions, Sampler, Sampling, Score, Scorer,
+    Scoring, TukeyBiweight, Uniform, ransac,
 };
 pub use robust::RobustModel;
 pub use shared_focal::{SharedFocalPose, estimate_shared_focal_pose, refine_shared_focal_pose};

@@ -4,8 +4,8 @@ use crate::scene::Scene;
 use crate::{PairMatches, SfmOptions};
 use cv_core::{Cancelled, Correspondence, Pose, Progress};
 use cv_geometry::{
-    EstimateError, RobustOptions, estimate_relative_pose, normalize_matches, parallax_angle, rotation_between,
-    triangulate,
+    EstimateError, LocalOptimization, RobustOptions, estimate_relative_pose, normalize_matches, parallax_angle,
+    rotation_between, triangulate,
 };
 use rayon::prelude::*;
 
@@ -60,7 +60,13 @@ fn rate(
     let (rays, unit) = normalize_matches(&pixels, scene.camera_of(a), scene.camera_of(b));
     let rays: Vec<Correspondence> = rays.into_iter().filter(Correspondence::is_finite).collect();
     let threshold = options.growing_error() * unit;
-    let robust = RobustOptions { threshold, seed: options.seed, max_iterations: 1000, ..RobustOptions::essential() };
+    let robust = RobustOptions {
+        threshold,
+        seed: options.seed,
+        max_iterations: 1000,
+        local_optimization: LocalOptimization::Iterative,
+        ..RobustOptions::essential()
+    };
     let found = match estimate_relative_pose(&rays, &robust, progress) {
         Ok(found) => found,
         Err(EstimateError::Cancelled(stop)) => return Err(stop),

@@ -3,8 +3,8 @@
 use crate::CameraKnowledge;
 use cv_core::{Camera, Cancelled, Correspondence, DMatch, Keypoint, Matrix3, Pose, Progress};
 use cv_geometry::{
-    Degeneracy, EstimateError, RobustOptions, Scoring, essential_from_pose, estimate_fundamental, estimate_homography,
-    estimate_relative_pose, normalize_matches,
+    Degeneracy, EstimateError, LocalOptimization, RobustOptions, Scoring, essential_from_pose, estimate_fundamental,
+    estimate_homography, estimate_relative_pose, normalize_matches,
 };
 
 /// Settings of [`verify_view_pair`].
@@ -136,6 +136,7 @@ pub fn verify_view_pair(
         max_iterations: samples(if calibrated { 5 } else { 7 }),
         seed: options.seed,
         scoring: Scoring::Msac,
+        local_optimization: LocalOptimization::Iterative,
         ..RobustOptions::default()
     };
     let (model, inliers, rms) = if calibrated {

@@ -1,7 +1,9 @@
 //! The RANSAC loop.
 
 use super::quality::Quality;
-use super::{Consensus, Estimator, RansacData, RobustOptions, Sampler, Score, Scorer, TukeyBiweight};
+use super::{
+    Consensus, Estimator, LocalOptimization, RansacData, RobustOptions, Sampler, Score, Scorer, TukeyBiweight,
+};
 use cv_core::{Cancelled, Progress, Stage};
 use cv_numeric::parallel_map;
 use rand_chacha::ChaCha8Rng;
@@ -55,6 +57,7 @@ pub(super) fn search<E: Estimator, C: Scorer>(
     let mut samples = Vec::with_capacity(MOST);
     let mut models = Vec::new();
     let mut rng = ChaCha8Rng::seed_from_u64(!options.seed);
+    let around = E::RESAMPLES > 0 && options.local_optimization == LocalOptimization::InnerRansac;
     let mut iterations = 0;
     // Of few data there are few samples: of the smallest support that counts, one is soon drawn.
     let most = options.needed(n.min(E::SAMPLE + 1), n, E::SAMPLE);
@@ -70,7 +73,7 @@ pub(super) fn search<E: Estimator, C: Scorer>(
         iterations += count;
         let limit = match waiting.get(RUNNERS_UP - 1) {
             Some(last) => last.found.score.loss,
-            None if E::RESAMPLES > 0 => f32::INFINITY,
+            None if around => f32::INFINITY,
             None => minimal,
         };
         let winners: Vec<Result<Option<Winner<E::Model>>, Cancelled>> = if n < PARALLEL_FROM && count < MOST {
@@ -82,7 +85,7 @@ pub(super) fn search<E: Estimator, C: Scorer>(
         for winner in winners {
             let Some(winner) = winner? else { continue };
             if winner.found.score.loss >= minimal {
-                if E::RESAMPLES > 0 {
+                if around {
                     let at = waiting.partition_point(|w| w.found.score.loss <= winner.found.score.loss);
                     waiting.insert(at, winner);
                     waiting.truncate(RUNNERS_UP);
@@ -91,7 +94,9 @@ pub(super) fn search<E: Estimator, C: Scorer>(
             }
             minimal = winner.found.score.loss;
             let mut found = optimized(quality, winner, &mut models, &stage)?;
-            quality.inner_ransac(&mut found, &mut rng, &mut models, &stage)?;
+            if around {
+                quality.inner_ransac(&mut found, &mut rng, &mut models, &stage)?;
+            }
             if best.as_ref().is_none_or(|b| found.score.loss < b.score.loss) {
                 needed = options.needed(found.score.inliers as usize, n, E::SAMPLE).min(most);
                 best = Some(found);
@@ -116,7 +121,7 @@ pub(super) fn search<E: Estimator, C: Scorer>(
             }
         }
     }
-    let model = settle(quality, best, &mut rng, &mut models, &stage)?;
+    let model = settle(quality, best, around.then_some(&mut rng), &mut models, &stage)?;
     let score = quality.score(&model, f32::INFINITY);
     Ok(Some(Consensus { model, score, iterations, log_nfa: None }))
 }
@@ -162,13 +167,13 @@ fn optimized<E: Estimator, C: Scorer>(
     Ok(found)
 }
 
-/// Searches on, near the model, with the noise that the data show instead of the threshold they were searched with: small noise leaves room for
+/// Refines, and searches `around` the model, with the noise that the data show instead of the threshold they were searched with: small noise leaves room for
 /// wrong data that happen to fit and for other minima, large noise loses right data. Twice: a third round changes the model by less than a
 /// tenth of its deviation.
 fn settle<E: Estimator, C: Scorer>(
     quality: &Quality<'_, E, C>,
     mut best: ScoredModel<E::Model>,
-    rng: &mut ChaCha8Rng,
+    mut around: Option<&mut ChaCha8Rng>,
     models: &mut Vec<E::Model>,
     progress: &dyn Progress,
 ) -> Result<E::Model, Cancelled> {
@@ -185,7 +190,7 @@ fn settle<E: Estimator, C: Scorer>(
         let fine = Quality::new(quality.estimator, &TukeyBiweight, threshold);
         best.score = fine.score(&best.model, f32::INFINITY);
         fine.refine_best(&mut best, steps);
-        if E::RESAMPLES > 0 {
+        if let Some(rng) = &mut around {
             fine.inner_ransac(&mut best, rng, models, progress)?;
             fine.refine_best(&mut best, steps);
         }

@@ -8,7 +8,7 @@ mod quality;
 mod sampler;
 mod scorer;
 
-pub use options::{RobustOptions, Sampling, Scoring};
+pub use options::{LocalOptimization, RobustOptions, Sampling, Scoring};
 pub use sampler::{Prosac, Sampler, Uniform};
 pub(crate) use scorer::LeastSquaresLoss;
 pub use scorer::{Msac, Scorer, TukeyBiweight};

@@ -41,6 +41,18 @@ pub enum Sampling {
     Prosac,
 }
 
+/// What is done with each new best model of a search (LO-RANSAC; Chum, Matas & Kittler, "Locally optimized RANSAC", 2003).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
+pub enum LocalOptimization {
+    /// It is refined on the loss it is judged by: a good model in a fraction of the time, for pairs among many.
+    Iterative,
+    /// As well, samples are drawn from the data near it: the loss of essential and fundamental matrices has many local minima.
+    #[default]
+    InnerRansac,
+}
+
 /// Options of `estimate_homography`, `estimate_fundamental` and their siblings.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
@@ -62,6 +74,8 @@ pub struct RobustOptions {
     pub scoring: Scoring,
     /// How samples are drawn. Default [`Sampling::Uniform`].
     pub sampling: Sampling,
+    /// What is done with each new best model. Default [`LocalOptimization::InnerRansac`].
+    pub local_optimization: LocalOptimization,
 }
 
 impl Default for RobustOptions {
@@ -74,6 +88,7 @@ impl Default for RobustOptions {
             seed: 0,
             scoring: Scoring::default(),
             sampling: Sampling::default(),
+            local_optimization: LocalOptimization::default(),
         }
     }
 }
