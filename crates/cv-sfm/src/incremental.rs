@@ -218,7 +218,10 @@ struct Effort {
 }
 
 const ROUGH: Effort = Effort { rounds: 1, max_iterations: 8, tolerance: 1e-3 };
-const FINE: Effort = Effort { rounds: 3, max_iterations: 25, tolerance: 1e-5 };
+const FINE: Effort = Effort { rounds: 3, max_iterations: 25, tolerance: 5e-5 };
+/// How often points are looked for in views that lack them: what the first time finds makes points of three views out of those of two, and moves others nearer to where they are seen. (The
+/// second makes the tracks of kitti-2 longer by 0.8 %.)
+const COMPLETIONS: usize = 2;
 /// Views that are adjusted with a new one.
 const NEAR_VIEWS: usize = 6;
 
@@ -383,8 +386,13 @@ fn finish(
     let lens = if free { LensFreedom::Distortion } else { LensFreedom::Held };
     refine(scene, lens, ROUGH, options, progress)?;
     if let Some(alike) = alike {
-        let tracks = complete(scene, alike);
-        scene.set_tracks(tracks);
+        for round in 0..COMPLETIONS {
+            if round > 0 {
+                refine(scene, lens, ROUGH, options, progress)?;
+            }
+            let tracks = complete(scene, alike);
+            scene.set_tracks(tracks);
+        }
     }
     refine(scene, lens, FINE, options, progress)?;
     let called_for = match free {

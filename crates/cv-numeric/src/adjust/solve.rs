@@ -104,6 +104,10 @@ pub(super) struct Step {
 
 /// A step that lowers the cost by less than this share ends near a minimum: residuals hardly change any more, so that the curvature of their losses can be relied on.
 const NEAR: f64 = 0.01;
+/// A step that goes down by this many times its promise and more is lengthened, to so many times its length at the most: of many points, some have gone far enough by then. (On
+/// fountain-P11 with Cauchy's loss, 9 iterations then lead further down than 24 did; at 4 times, most are refused.)
+const LENGTHEN: f64 = 1.25;
+const LONGEST: f64 = 1.7;
 /// Least and most damping.
 const DAMPING: [f64; 2] = [1e-16, 1e16];
 
@@ -175,8 +179,7 @@ impl Adjustment<'_> {
                 }
                 None => f64::INFINITY,
             };
-            let gain = report.cost - cost;
-            let Some(step) = step.filter(|_| gain > 0.0) else {
+            let Some(mut step) = step.filter(|_| cost < report.cost) else {
                 // The weights' parabola lies above the cost, so that its step goes down where the other's did not.
                 if model == LossModel::Curvature {
                     model = LossModel::Weight;
@@ -193,13 +196,15 @@ impl Adjustment<'_> {
                 }
                 continue;
             };
+            let kept = (report.cost - cost) / step.predicted;
+            let cost = self.lengthened(&structure, &mut step, kept, cost, &mut moved);
+            let gain = report.cost - cost;
             std::mem::swap(&mut self.values, &mut moved);
             let done = gain < options.cost_tolerance * report.cost;
             report.cost = cost;
             if done || report.iterations >= options.max_iterations {
                 return end(report, if done { Termination::Cost } else { Termination::Iterations });
             }
-            let kept = gain / step.predicted;
             damping *= (1.0 - (2.0 * kept - 1.0).powi(3)).max(1.0 / 3.0);
             damping = damping.max(DAMPING[0]);
             growth = 2.0;
@@ -216,6 +221,27 @@ impl Adjustment<'_> {
                 return end(report, Termination::Gradient);
             }
         }
+    }
+
+    /// Goes on along a step that went down by `kept` times what its parabola promised, to `cost` at `moved`: to where the parabola through that and the slope at the start is lowest, as far
+    /// as [`LONGEST`]. Gives back the cost at `moved` then.
+    ///
+    /// The weights' parabola is steeper than the losses are, so that iteratively reweighted least squares stops short each time.
+    fn lengthened(&self, structure: &Structure, step: &mut Step, kept: f64, cost: f64, moved: &mut Values) -> f64 {
+        if kept < LENGTHEN {
+            return cost;
+        }
+        // Of gain(α) = 2α − cα² in units of the promise, with gain(1) = kept.
+        let factor = 1.0 / (2.0 - kept).max(1.0 / LONGEST);
+        step.columns.iter_mut().chain(&mut step.points).for_each(|d| *d *= factor);
+        let mut further = self.values.clone();
+        self.move_by(structure, step, &mut further);
+        let beyond = self.kinds.iter().map(|k| k.cost(&further)).sum::<f64>();
+        if beyond < cost {
+            *moved = further;
+            return beyond;
+        }
+        cost
     }
 
     /// Sums over residuals at the present values, by kind in the order in which they were added.
