@@ -52,12 +52,33 @@ impl ByteDescriptors {
         &self.data[i * self.kind.dimension..(i + 1) * self.kind.dimension]
     }
 
+    /// Puts another descriptor in the place of descriptor `i`.
+    pub(crate) fn set_row(&mut self, i: usize, row: &[u8]) {
+        self.data[i * self.kind.dimension..(i + 1) * self.kind.dimension].copy_from_slice(row);
+    }
+
     /// The descriptors of these indices.
     ///
     /// # Panics
     /// Where there are not so many.
     pub fn select(&self, indices: &[usize]) -> Self {
         Self { data: indices.iter().flat_map(|&i| self.row(i)).copied().collect(), ..*self }
+    }
+
+    /// The descriptors of these indices of several sets, one after the other; `None` without a set, or where the kinds differ.
+    ///
+    /// # Panics
+    /// As [`ByteDescriptors::select`].
+    pub fn gather<'a>(sets: impl IntoIterator<Item = (&'a Self, &'a [usize])>) -> Option<Self> {
+        let mut all: Option<Self> = None;
+        for (set, indices) in sets {
+            let all = all.get_or_insert_with(|| set.select(&[]));
+            if all.kind != set.kind {
+                return None;
+            }
+            indices.iter().for_each(|&i| all.data.extend_from_slice(set.row(i)));
+        }
+        all
     }
 
     /// The sum of squared differences between descriptor `i` and descriptor `j` of another set, in the unit of the kind.

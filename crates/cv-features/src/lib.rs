@@ -61,6 +61,7 @@ mod simd;
 mod square_covering;
 mod structure_tensor;
 mod targets;
+mod vlad;
 
 pub use anms::{anms, suppression_radii};
 pub use asift::sift_affine_view;
@@ -81,3 +82,4 @@ pub use targets::{
     BlackRectangle, Board, BoardError, BoardKind, BoardPoint, BoardSize, CharucoBoard, Chessboard, ChessboardOptions,
     Dictionary, GridStyle, MarkerGrid, find_board, find_charuco, find_chessboard, find_marker_grid,
 };
+pub use vlad::{Vocabulary, most_alike};

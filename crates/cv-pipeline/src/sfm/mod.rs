@@ -1,5 +1,6 @@
 //! Cameras and points from many photographs.
 
+mod candidates;
 mod model;
 mod pairs;
 mod photo;
@@ -9,7 +10,7 @@ pub use photo::{SfmPhoto, SfmPhotoError, sfm_photo};
 
 use crate::Progress;
 use cv_core::{Camera, Cancelled, OptionError, StageClock};
-use cv_features::{FeatureOptions, RatioTest};
+use cv_features::{FeatureOptions, RatioTest, SiftOptions};
 use cv_sfm::{
     CameraKnowledge, FeatureDistance, Observation, PairMatches, SfmError, SfmInput, SfmModel, SfmView, ViewOutcome,
     ViewPairOptions, reconstruct_views,
@@ -20,12 +21,21 @@ use cv_sfm::{
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct SfmJobOptions {
-    /// Features. Default SIFT, 13,000 in a photograph at most.
+    /// Features. Default SIFT, 13,000 in a photograph at most; where there are fewer than 3,000, fainter ones as well.
     pub features: FeatureOptions,
     /// Which matches stay by how ambiguous they are. Default as of the kind of the descriptors.
     pub ratio: RatioTest,
-    /// Features of the largest scale that a pair is tried with first. Default 2,048.
+    /// In what order the photographs come. Default [`PhotoOrder::Any`].
+    pub order: PhotoOrder,
+    /// Photographs that each is tried with in sets of more than twice as many: those that look most like it. Default 50.
+    pub partners: usize,
+    /// Features of the largest scale that a pair is tried with first. Default 1,024.
     pub first_features: usize,
+    /// A photograph that has fewer pairs than this in which most matches agree is tried with its best others once more, with all features. Default 6.
+    pub firm_partners: usize,
+    /// Pairs of each photograph that are matched with all features along their geometry. Default 4: with more, those of wider angles come in, whose positions are less exact (templeRing:
+    /// 7,870 points at 0.316 px in place of 7,543 at 0.325 with 10); what they miss is found once there is a model.
+    pub guided_partners: usize,
     /// Which pairs of photographs hold.
     pub pairs: ViewPairOptions,
     /// The solution.
@@ -35,13 +45,34 @@ pub struct SfmJobOptions {
 impl Default for SfmJobOptions {
     fn default() -> Self {
         Self {
-            features: FeatureOptions::default().at_most(13_000),
+            features: FeatureOptions::Sift(SiftOptions {
+                max_features: 13_000,
+                min_features: 3000,
+                coarse_first: true,
+                ..SiftOptions::default()
+            }),
             ratio: RatioTest::Kind,
-            first_features: 2048,
+            order: PhotoOrder::Any,
+            partners: 50,
+            first_features: 1024,
+            firm_partners: 6,
+            guided_partners: 4,
             pairs: ViewPairOptions::default(),
             solve: cv_sfm::SfmOptions::default(),
         }
     }
+}
+
+/// In what order photographs come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
+pub enum PhotoOrder {
+    /// In none.
+    #[default]
+    Any,
+    /// As they were taken by a camera that moved: each is tried with ten before and after it, and with those that look most like it where the camera may have come back.
+    Sequence,
 }
 
 /// A camera of some photographs.

@@ -1,5 +1,6 @@
 //! Which pairs of photographs hold, and their matches.
 
+use super::candidates::candidate_pairs;
 use super::{SfmCamera, SfmJobOptions, SfmPhoto};
 use crate::Progress;
 use crate::guided::GuidedOptions;
@@ -36,8 +37,8 @@ impl<'p> Ready<'p> {
 
 /// The pairs of photographs that hold: their matches and their geometry, in order of the photographs.
 ///
-/// Each pair is tried with its features of largest scale first, and where those are not enough to tell, with all of them. Where enough of the matches agree with a geometry, all
-/// features are matched once more along it.
+/// Each pair is tried with its features of largest scale first. Of each photograph that has few pairs then, the best others are tried with all features; and of each, those pairs of which
+/// most matches agree are matched once more along their geometry, with all features.
 ///
 /// # Errors
 /// [`Cancelled`].
@@ -47,24 +48,68 @@ pub fn sfm_pairs(
     options: &SfmJobOptions,
     progress: &dyn Progress,
 ) -> Result<(Vec<PairMatches>, Vec<ViewPairModel>), Cancelled> {
-    let pairs: Vec<(usize, usize)> =
-        (0..photos.len()).flat_map(|a| (a + 1..photos.len()).map(move |b| (a, b))).collect();
+    let candidates = candidate_pairs(photos, options, progress)?;
     let ready: Vec<Option<Ready<'_>>> = photos
         .par_iter()
         .map(|photo| Some(Ready::new(photo, cameras.get(photo.camera)?, options.first_features)))
         .collect();
-    let stage = Stage::new(progress, "match", pairs.len())?;
-    let found: Vec<Option<(PairMatches, ViewPairModel)>> = pairs
+    let stage = Stage::new(progress, "match", candidates.len())?;
+    let mut tried: Vec<Tried<'_>> = candidates
         .par_iter()
         .with_max_len(1)
-        .map(|&(a, b)| {
-            let (Some(one), Some(two)) = (&ready[a], &ready[b]) else { return Ok(None) };
-            let found = Pair { sides: [one, two], options, progress: &stage }.matches()?;
+        .filter_map(|&(a, b)| Some(Pair { views: [a, b], sides: [ready[a].as_ref()?, ready[b].as_ref()?], options }))
+        .map(|pair| {
+            let tried = pair.with_largest(&stage)?;
             stage.add(1)?;
-            Ok(found.map(|(matches, model)| (PairMatches { a, b, matches }, model)))
+            Ok(tried)
         })
         .collect::<Result<_, Cancelled>>()?;
-    Ok(found.into_iter().flatten().unzip())
+    let open = |t: &Tried<'_>| !t.firm() && !t.whole && t.tentative >= options.pairs.min_inliers;
+    let again = best_of_each(&tried, photos.len(), options.firm_partners, open);
+    tried = each(tried, &again, "match all", progress, |tried, stage| tried.pair.with_all(stage))?;
+    let chosen = best_of_each(&tried, photos.len(), options.guided_partners, |t| t.firm());
+    tried = each(tried, &chosen, "match along", progress, Tried::along_geometry)?;
+    let held = |tried: Tried<'_>| {
+        let [a, b] = tried.pair.views;
+        let (matches, pair) = tried.held?;
+        Some((PairMatches { a, b, matches }, pair.model))
+    };
+    Ok(tried.into_iter().filter_map(held).unzip())
+}
+
+/// Of each photograph, the `count` best pairs, as far as they are `wanted`; a firm one that is not counts too.
+fn best_of_each(tried: &[Tried<'_>], photos: usize, count: usize, wanted: impl Fn(&Tried<'_>) -> bool) -> Vec<bool> {
+    let mut order: Vec<usize> = (0..tried.len()).filter(|i| tried[*i].firm() || wanted(&tried[*i])).collect();
+    // Stable: the earlier of equals.
+    order.sort_by_key(|i| std::cmp::Reverse(tried[*i].rank()));
+    let (mut chosen, mut of) = (vec![false; tried.len()], vec![0usize; photos]);
+    for i in order {
+        let [a, b] = tried[i].pair.views;
+        chosen[i] = wanted(&tried[i]) && (of[a] < count || of[b] < count);
+        of[a] += 1;
+        of[b] += 1;
+    }
+    chosen
+}
+
+/// Does more for some pairs.
+fn each<'p>(
+    tried: Vec<Tried<'p>>,
+    chosen: &[bool],
+    what: &'static str,
+    progress: &dyn Progress,
+    more: impl Fn(Tried<'p>, &Stage<'_>) -> Result<Tried<'p>, Cancelled> + Sync,
+) -> Result<Vec<Tried<'p>>, Cancelled> {
+    let stage = Stage::new(progress, what, chosen.iter().filter(|c| **c).count())?;
+    let one = |(tried, chosen): (Tried<'p>, &bool)| {
+        if !chosen {
+            return Ok(tried);
+        }
+        let done = more(tried, &stage)?;
+        stage.add(1)?;
+        Ok(done)
+    };
+    tried.into_par_iter().zip(chosen).with_max_len(1).map(one).collect()
 }
 
 /// Smallest share of tentative matches that agree with a geometry before more are looked for along it: matches along the lines of a wrong geometry agree with it too. That of
@@ -75,63 +120,68 @@ const FIRM_SHARE: f64 = 0.3;
 const GUIDED_RATIO: f32 = 0.6;
 
 /// Two photographs.
+#[derive(Clone, Copy)]
 struct Pair<'p> {
+    views: [usize; 2],
     sides: [&'p Ready<'p>; 2],
     options: &'p SfmJobOptions,
-    progress: &'p dyn Progress,
 }
 
-impl Pair<'_> {
-    fn verify(&self, matches: &[DMatch]) -> Result<Option<ViewPair>, Cancelled> {
+/// What is known of a pair so far.
+struct Tried<'p> {
+    pair: Pair<'p>,
+    /// Matches by how alike features are.
+    tentative: usize,
+    /// Those that agree with the geometry, and that.
+    held: Option<(Vec<DMatch>, ViewPair)>,
+    /// Whether all features have been matched.
+    whole: bool,
+}
+
+impl<'p> Pair<'p> {
+    fn verify(
+        &self,
+        matches: &[DMatch],
+        progress: &dyn Progress,
+    ) -> Result<Option<(Vec<DMatch>, ViewPair)>, Cancelled> {
         let cameras = self.sides.map(|s| (&s.camera.camera, &s.camera.knowledge));
         let keypoints = self.sides.map(|s| &s.photo.keypoints[..]);
-        match verify_view_pair(cameras, keypoints, matches, &self.options.pairs, self.progress) {
-            Ok(pair) => Ok(Some(pair)),
+        match verify_view_pair(cameras, keypoints, matches, &self.options.pairs, progress) {
+            Ok(pair) => Ok(Some((pair.inliers.iter().map(|i| matches[*i]).collect(), pair))),
             Err(ViewPairError::Cancelled(stop)) => Err(stop),
             Err(_) => Ok(None),
         }
     }
 
-    fn tentative(&self, a: &ByteDescriptors, b: &ByteDescriptors) -> Result<Vec<DMatch>, Cancelled> {
+    fn tentative(&self, sets: [&ByteDescriptors; 2], progress: &dyn Progress) -> Result<Vec<DMatch>, Cancelled> {
         let options = MatchOptions { ratio: self.options.ratio, mutual: true, ..MatchOptions::default() };
-        match match_byte_descriptors(a, b, &options, self.progress) {
+        match match_byte_descriptors(sets[0], sets[1], &options, progress) {
             Err(MatchError::Cancelled(stop)) => Err(stop),
             found => Ok(found.unwrap_or_default()),
         }
     }
 
-    fn matches(&self) -> Result<Option<(Vec<DMatch>, ViewPairModel)>, Cancelled> {
+    /// What its features of largest scale tell.
+    fn with_largest(self, progress: &dyn Progress) -> Result<Tried<'p>, Cancelled> {
         let [a, b] = self.sides;
-        let mut matches = self.tentative(&a.coarse_descriptors, &b.coarse_descriptors)?;
+        let mut matches = self.tentative([&a.coarse_descriptors, &b.coarse_descriptors], progress)?;
         for m in &mut matches {
             (m.query, m.train) = (a.coarse[m.query as usize] as u32, b.coarse[m.train as usize] as u32);
         }
-        let mut found = self.verify(&matches)?;
-        let least = self.options.pairs.min_inliers;
-        let firm = |pair: &Option<ViewPair>, matches: &[DMatch]| {
-            let inliers = pair.as_ref().map_or(0, |p| p.inliers.len());
-            inliers >= 2 * least && inliers as f64 >= FIRM_SHARE * matches.len() as f64
-        };
         let whole = self.sides.iter().all(|s| s.coarse.len() == s.photo.keypoints.len());
-        if !whole && !firm(&found, &matches) && matches.len() >= least {
-            matches = self.tentative(&a.photo.descriptors, &b.photo.descriptors)?;
-            found = self.verify(&matches)?;
-        }
-        let firm = firm(&found, &matches);
-        let Some(pair) = found else { return Ok(None) };
-        let agreeing =
-            |pair: &ViewPair, matches: &[DMatch]| pair.inliers.iter().map(|i| matches[*i]).collect::<Vec<_>>();
-        if firm {
-            let along = self.along(&pair)?;
-            if let Some(better) = self.verify(&along)?.filter(|better| better.inliers.len() > pair.inliers.len()) {
-                return Ok(Some((agreeing(&better, &along), better.model)));
-            }
-        }
-        Ok(Some((agreeing(&pair, &matches), pair.model)))
+        let held = self.verify(&matches, progress)?;
+        Ok(Tried { pair: self, tentative: matches.len(), held, whole })
+    }
+
+    /// What all features tell.
+    fn with_all(self, progress: &dyn Progress) -> Result<Tried<'p>, Cancelled> {
+        let matches = self.tentative(self.sides.map(|s| &s.photo.descriptors), progress)?;
+        let held = self.verify(&matches, progress)?;
+        Ok(Tried { pair: self, tentative: matches.len(), held, whole: true })
     }
 
     /// Matches of all features along a geometry.
-    fn along(&self, pair: &ViewPair) -> Result<Vec<DMatch>, Cancelled> {
+    fn along(&self, pair: &ViewPair, progress: &dyn Progress) -> Result<Vec<DMatch>, Cancelled> {
         let [a, b] = self.sides;
         let known = self.sides.iter().all(|s| s.camera.knowledge == CameraKnowledge::Known);
         let pixels = if known { self.options.pairs.threshold } else { self.options.pairs.threshold_uncalibrated };
@@ -148,9 +198,34 @@ impl Pair<'_> {
             },
         };
         let [one, two] = [a, b].map(|s| (&s.photo.descriptors, &s.positions[..]));
-        match match_guided_bytes(one, two, &model, &options, self.progress) {
+        match match_guided_bytes(one, two, &model, &options, progress) {
             Err(MatchError::Cancelled(stop)) => Err(stop),
             found => Ok(found.unwrap_or_default()),
         }
+    }
+}
+
+impl Tried<'_> {
+    fn inliers(&self) -> usize {
+        self.held.as_ref().map_or(0, |h| h.0.len())
+    }
+
+    /// How good it is among others.
+    fn rank(&self) -> (bool, usize, usize) {
+        (self.firm(), self.inliers(), self.tentative)
+    }
+
+    /// Whether enough of the matches agree for more to be looked for along their geometry.
+    fn firm(&self) -> bool {
+        let least = self.pair.options.pairs.min_inliers;
+        self.inliers() >= 2 * least && self.inliers() as f64 >= FIRM_SHARE * self.tentative as f64
+    }
+
+    /// With the matches of all features along the geometry, where those are more.
+    fn along_geometry(self, progress: &Stage<'_>) -> Result<Self, Cancelled> {
+        let Some((matches, pair)) = &self.held else { return Ok(self) };
+        let along = self.pair.along(pair, progress)?;
+        let better = self.pair.verify(&along, progress)?.filter(|better| better.0.len() > matches.len());
+        Ok(if better.is_some() { Self { held: better, ..self } } else { self })
     }
 }
