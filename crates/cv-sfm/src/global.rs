@@ -3,12 +3,12 @@
 
 use crate::bundle::{BundlePlan, LensFreedom, adjust};
 use crate::global_positions::{adjust_rays, centers_of_baselines};
-use crate::pair_scales::baselines;
+use crate::pair_scales::{Distances, baselines};
 use crate::rotation_averaging::average_rotations;
 use crate::scene::Scene;
 use crate::triangulate_track::{PointLimits, update_tracks};
 use crate::view_graph::ViewGraph;
-use crate::{PairMatches, SfmOptions};
+use crate::SfmOptions;
 use cv_core::{Cancelled, Pose, Rotation3, Stage, Vector3};
 
 /// Largest angle between the rotation of a pair and that of its views, in radians: 5 degrees, as of loops.
@@ -17,14 +17,14 @@ const AGREES: f64 = 0.087;
 const COARSE: [f64; 2] = [0.0175, 0.0087];
 
 /// Places all views of the largest part of a graph whose poses can be told, and triangulates; false where there are not three. Rotations are averaged; lengths of baselines are compared by way
-/// of the points that pairs share; centers follow from those, then centers and points together from rays; in the end, all is adjusted.
+/// of the points that pairs share (`distances`, by pair); centers follow from those, then centers and points together from rays; in the end, all is adjusted.
 ///
 /// # Errors
 /// [`Cancelled`].
 pub(crate) fn place(
     scene: &mut Scene<'_>,
-    pairs: &[PairMatches],
     graph: &ViewGraph,
+    distances: &[Distances],
     options: &SfmOptions,
     stage: &Stage<'_>,
 ) -> Result<bool, Cancelled> {
@@ -34,7 +34,8 @@ pub(crate) fn place(
         (Some(a), Some(b)) => rotation_between(&l.pose.rotation, &(b * a.inverse())) <= AGREES,
         _ => false,
     });
-    let lengths = baselines(scene, pairs, &graph, options, stage)?;
+    let measured: Vec<&Distances> = graph.links.iter().map(|l| &distances[l.pair]).collect();
+    let lengths = baselines(&graph, &measured, stage)?;
     let centers = centers_of_baselines(&graph, &rotations, &lengths, stage)?;
     for (v, (rotation, center)) in rotations.iter().zip(&centers).enumerate() {
         if let (Some(rotation), Some(center)) = (rotation, center) {

@@ -59,6 +59,7 @@ mod model;
 mod pair_scales;
 mod reconstruct;
 mod registration;
+mod repeated_structure;
 mod rotation_averaging;
 mod scene;
 mod tracks;

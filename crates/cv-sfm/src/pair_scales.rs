@@ -1,9 +1,8 @@
 //! How long the baselines of pairs are, compared with each other.
 
-use crate::scene::Scene;
+use crate::SfmInput;
 use crate::view_graph::{Link, ViewGraph};
-use crate::{PairMatches, SfmOptions};
-use cv_core::{Cancelled, Stage, quantile};
+use cv_core::{Camera, Cancelled, Correspondence, Stage, quantile};
 use cv_geometry::{PairEdge, PairGraph, parallax_angle, triangulate};
 use cv_numeric::RobustLoss;
 use cv_numeric::adjust::{AdjustIteration, AdjustOptions, Adjustment, Euclidean, Residual};
@@ -12,36 +11,48 @@ use rayon::prelude::*;
 use std::ops::ControlFlow;
 
 /// Fewest points that two pairs of a view share for their baselines to be compared.
-const LEAST_SHARED: usize = 5;
+pub(crate) const LEAST_SHARED: usize = 5;
 /// With how many pairs of each of its views, the firmer ones first, a pair is compared.
 const COMPARED: usize = 8;
 /// A difference of logarithms from which on it counts less than by its square: a tenth.
 const SCALE: f64 = 0.1;
 
 /// Of each of the two views of a link: keypoints with the logarithm of their point's distance, in baselines, by keypoint.
-type Distances = [Vec<(u32, f64)>; 2];
+pub(crate) type Distances = [Vec<(u32, f64)>; 2];
 
-fn distances(scene: &Scene<'_>, pairs: &[PairMatches], link: &Link, options: &SfmOptions) -> Distances {
-    let mut found: Distances = Default::default();
-    let [a, b] = [link.a, link.b];
-    for m in &pairs[link.pair].matches {
-        let Some(pixels) = m.correspondence(scene.views[a].keypoints, scene.views[b].keypoints) else { continue };
-        let ray = cv_core::Correspondence {
-            a: scene.camera_of(a).normalize(pixels.a),
-            b: scene.camera_of(b).normalize(pixels.b),
-        };
-        let Ok(point) = triangulate(&ray, &link.pose) else { continue };
-        if ray.is_finite() && parallax_angle(&point, &link.pose) >= options.min_angle {
-            found[0].push((m.query, point.coords.norm().ln()));
-            found[1].push((m.train, link.pose.transform(&point).coords.norm().ln()));
+/// The distances of the points of each link whose rays meet at `min_angle` and more. O(matches).
+///
+/// # Errors
+/// [`Cancelled`].
+pub(crate) fn measure(
+    graph: &ViewGraph,
+    input: &SfmInput<'_>,
+    cameras: &[Camera],
+    min_angle: f64,
+    stage: &Stage<'_>,
+) -> Result<Vec<Distances>, Cancelled> {
+    let of_link = |link: &Link| {
+        stage.check()?;
+        let [a, b] = [link.a, link.b].map(|v| &cameras[input.views[v].camera]);
+        let [one, two] = [link.a, link.b].map(|v| input.views[v].keypoints);
+        let mut found: Distances = Default::default();
+        for m in &input.pairs[link.pair].matches {
+            let Some(pixels) = m.correspondence(one, two) else { continue };
+            let ray = Correspondence { a: a.normalize(pixels.a), b: b.normalize(pixels.b) };
+            let Ok(point) = triangulate(&ray, &link.pose) else { continue };
+            if ray.is_finite() && parallax_angle(&point, &link.pose) >= min_angle {
+                found[0].push((m.query, point.coords.norm().ln()));
+                found[1].push((m.train, link.pose.transform(&point).coords.norm().ln()));
+            }
         }
-    }
-    found.iter_mut().for_each(|list| list.sort_unstable_by(|x, y| x.0.cmp(&y.0).then(x.1.total_cmp(&y.1))));
-    found
+        found.iter_mut().for_each(|list| list.sort_unstable_by(|x, y| x.0.cmp(&y.0).then(x.1.total_cmp(&y.1))));
+        Ok(found)
+    };
+    graph.links.par_iter().map(of_link).collect()
 }
 
 /// The median of the differences of the keypoints in both lists, and how many there are.
-fn median_difference(x: &[(u32, f64)], y: &[(u32, f64)]) -> (f64, usize) {
+pub(crate) fn median_difference(x: &[(u32, f64)], y: &[(u32, f64)]) -> (f64, usize) {
     let (mut i, mut j) = (0, 0);
     let mut all = Vec::new();
     while i < x.len() && j < y.len() {
@@ -57,7 +68,7 @@ fn median_difference(x: &[(u32, f64)], y: &[(u32, f64)]) -> (f64, usize) {
 }
 
 /// Differences of two numbers.
-pub(crate) struct Differences(pub(crate) Vec<f64>);
+struct Differences(Vec<f64>);
 
 impl Residual<1, 2, 2> for Differences {
     const DIMS: [usize; 2] = [1, 1];
@@ -77,20 +88,16 @@ impl Residual<1, 2, 2> for Differences {
 
 /// The length of each link's baseline in a common unit; `None` where it cannot be told: nothing moved enough, or no other pair shares its points. Two pairs of one view see the same points from
 /// there, whose distances in baselines compare the baselines; the logarithms of all such ratios are made to agree.
-/// O(matches) and, for each pair, as often as it is compared.
+/// `measured` are the distances of each link. O(matches) for each time that a pair is compared.
 ///
 /// # Errors
 /// [`Cancelled`].
 pub(crate) fn baselines(
-    scene: &Scene<'_>,
-    pairs: &[PairMatches],
     graph: &ViewGraph,
-    options: &SfmOptions,
+    measured: &[&Distances],
     stage: &Stage<'_>,
 ) -> Result<Vec<Option<f64>>, Cancelled> {
     let links = &graph.links;
-    let measured: Vec<Distances> = links.par_iter().map(|l| distances(scene, pairs, l, options)).collect();
-    stage.check()?;
     // Of each view its links, those with most points first.
     let mut of_view: Vec<Vec<(usize, usize)>> = vec![Vec::new(); graph.views];
     for (i, l) in links.iter().enumerate().filter(|(i, _)| measured[*i][0].len() >= LEAST_SHARED) {

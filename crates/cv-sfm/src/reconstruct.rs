@@ -6,6 +6,8 @@ use crate::focal_length::start_cameras;
 use crate::incremental::{begin, extend};
 use crate::initial_pair::initial_pairs;
 use crate::model::{SfmModel, ViewOutcome};
+use crate::pair_scales::{Distances, measure};
+use crate::repeated_structure::refuse_repeated;
 use crate::scene::Scene;
 use crate::view_graph::{RefusedPair, ViewGraph};
 use crate::{CameraKnowledge, PairMatches, SfmView, Tracks, ViewPairModel, global};
@@ -169,10 +171,15 @@ pub fn reconstruct_views(
     let (cameras, focal_known) = start_cameras(input);
     let stage = Stage::new(progress, "register", input.views.len())?;
     let mut graph = None;
-    let mut refused = Vec::new();
+    let (mut refused, mut distances) = (Vec::new(), Vec::new());
     if focal_known || options.solver == Solver::Global {
         let mut all = ViewGraph::new(input, &cameras[0], options, &stage)?;
         refused.extend(all.refuse_by_triplets());
+        // Of each pair, so that links can be removed.
+        let measured = measure(&all, input, &cameras[0], options.min_angle, &stage)?;
+        distances.resize(input.pairs.len(), Distances::default());
+        all.links.iter().zip(measured).for_each(|(l, of)| distances[l.pair] = of);
+        refused.extend(refuse_repeated(&mut all, &distances, input, &cameras[0], options));
         graph = Some(all);
     }
     let mut usable = vec![true; input.pairs.len()];
@@ -192,6 +199,7 @@ pub fn reconstruct_views(
         options,
         pairs,
         graph,
+        distances,
         tracks,
         scene,
         taken: vec![false; input.views.len()],
@@ -236,6 +244,8 @@ struct Job<'a, 'p> {
     pairs: Vec<&'a PairMatches>,
     /// Relative poses, where focal lengths are known.
     graph: Option<ViewGraph>,
+    /// Of each pair, where there are relative poses.
+    distances: Vec<Distances>,
     tracks: Tracks,
     scene: Scene<'a>,
     /// Of each view, whether a model has it.
@@ -295,7 +305,7 @@ impl Job<'_, '_> {
         let Some(graph) = self.graph.as_ref().filter(|_| wanted) else { return Ok(None) };
         let graph = graph.filtered(|l| !self.taken[l.a] && !self.taken[l.b]);
         self.scene.clear(cameras, &self.tracks);
-        match global::place(&mut self.scene, self.input.pairs, &graph, self.options, &self.stage)? {
+        match global::place(&mut self.scene, &graph, &self.distances, self.options, &self.stage)? {
             true => self.completed(Solver::Global),
             false => Ok(None),
         }

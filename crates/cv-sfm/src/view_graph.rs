@@ -3,8 +3,7 @@
 use crate::{SfmInput, SfmOptions, ViewPairModel};
 use cv_core::{Camera, Cancelled, Correspondence, Pose, Progress, Stage, Vector3};
 use cv_geometry::{
-    EstimateError, PairEdge, PairGraph, RobustOptions, essential_from_fundamental, estimate_relative_pose,
-    normalize_matches, recover_pose, refine_relative_pose,
+    EstimateError, PairEdge, PairGraph, RobustOptions, estimate_relative_pose, normalize_matches, refine_relative_pose,
 };
 use rayon::prelude::*;
 
@@ -18,12 +17,19 @@ pub enum PairRefusal {
         /// Number of loops.
         loops: usize,
     },
-    /// One of its views shows less of what the other shows than views do that are farther apart: parts of the scene that look alike.
+    /// Both views show things that look alike: one has less of what the other shows than of what views from farther away show.
     Repeated {
         /// The share of the features of one view, known from other pairs, that the other view has.
         found: f64,
         /// The share that it has of a view from farther away.
         expected: f64,
+    },
+    /// It agrees with pairs that are refused as [`PairRefusal::Repeated`].
+    RepeatedLoops {
+        /// Loops that close with one right pair and a refused one.
+        against: usize,
+        /// These, and loops with two right pairs.
+        of: usize,
     },
 }
 
@@ -138,6 +144,11 @@ impl ViewGraph {
         Pose::new(left, Vector3::zeros()).rotation_angle()
     }
 
+    /// Loops of three links whose rotations close.
+    pub(crate) fn closed_triplets(&self) -> Vec<[usize; 3]> {
+        self.triplets().into_par_iter().filter(|t| self.loop_angle(*t) <= LOOP).collect()
+    }
+
     /// Removes the links that no loop confirms: where the rotations of three pairs do not close, one of them is wrong (Zach, Klopschitz & Pollefeys, "Disambiguating visual relations using
     /// loop constraints", CVPR 2010). The link with most open loops and no closed one goes first, since its loops tell nothing of the other links any more. O(loops · log).
     pub(crate) fn refuse_by_triplets(&mut self) -> Vec<RefusedPair> {
@@ -193,6 +204,10 @@ fn rays(input: &SfmInput<'_>, cameras: &[Camera], pair: usize) -> (Vec<Correspon
     (rays, unit)
 }
 
+/// Matches that a relative pose is looked for with, evenly from all of a pair, before all of them refine it: they agree with a geometry already.
+const ENOUGH: usize = 400;
+
+/// From the matches anew where the pair's geometry is no pose: a fundamental matrix of a nearly flat scene says little of the rotation, and five matches are enough where focal lengths are known.
 fn relative_pose(
     input: &SfmInput<'_>,
     cameras: &[Camera],
@@ -200,23 +215,16 @@ fn relative_pose(
     options: &SfmOptions,
     progress: &dyn Progress,
 ) -> Result<Option<Pose>, Cancelled> {
-    let fundamental = match input.geometry[pair] {
-        ViewPairModel::Pose(pose) => return Ok(Some(pose)),
-        ViewPairModel::Fundamental(f) => Some(f),
-        ViewPairModel::Homography(_) => None,
-    };
+    if let ViewPairModel::Pose(pose) = input.geometry[pair] {
+        return Ok(Some(pose));
+    }
     let (rays, unit) = rays(input, cameras, pair);
     let threshold = options.growing_error() * unit;
-    let [a, b] = [input.pairs[pair].a, input.pairs[pair].b].map(|v| &cameras[input.views[v].camera]);
-    let recovered = fundamental
-        .and_then(|f| essential_from_fundamental(&f, a, b).ok())
-        .and_then(|e| recover_pose(&e, &rays).ok());
-    if let Some(found) = recovered {
-        return Ok(Some(refine_relative_pose(&found.pose, &rays, threshold).0));
-    }
+    let step = rays.len().div_ceil(ENOUGH).max(1);
+    let some: Vec<Correspondence> = rays.iter().step_by(step).copied().collect();
     let robust = RobustOptions { threshold, seed: options.seed, max_iterations: 1000, ..RobustOptions::essential() };
-    match estimate_relative_pose(&rays, &robust, progress) {
-        Ok(found) => Ok(Some(found.model)),
+    match estimate_relative_pose(&some, &robust, progress) {
+        Ok(found) => Ok(Some(refine_relative_pose(&found.model, &rays, threshold).0)),
         Err(EstimateError::Cancelled(stop)) => Err(stop),
         Err(_) => Ok(None),
     }
