@@ -1,6 +1,7 @@
 //! Global reconstruction: all poses at once from those of the pairs (Moulon, Monasse & Marlet, "Global fusion of relative motions", ICCV 2013; Pan et al., "Global structure-from-motion
 //! revisited", ECCV 2024).
 
+use crate::SfmOptions;
 use crate::bundle::{BundlePlan, LensFreedom, adjust};
 use crate::global_positions::{adjust_rays, centers_of_baselines};
 use crate::pair_scales::{Distances, baselines};
@@ -8,7 +9,6 @@ use crate::rotation_averaging::average_rotations;
 use crate::scene::Scene;
 use crate::triangulate_track::{PointLimits, update_tracks};
 use crate::view_graph::ViewGraph;
-use crate::SfmOptions;
 use cv_core::{Cancelled, Pose, Rotation3, Stage, Vector3};
 
 /// Largest angle between the rotation of a pair and that of its views, in radians: 5 degrees, as of loops.
@@ -58,10 +58,18 @@ pub(crate) fn place(
     let refinable = scene.knowledge.iter().any(|k| !k.is_calibrated());
     let lens = if refinable { LensFreedom::Distortion } else { LensFreedom::Held };
     let scale = options.max_error;
-    adjust(scene, &BundlePlan { free: None, lens: LensFreedom::Held, scale, max_iterations: 8, tolerance: 1e-2 }, stage)?;
+    adjust(
+        scene,
+        &BundlePlan { free: None, lens: LensFreedom::Held, scale, max_iterations: 8, tolerance: 1e-2 },
+        stage,
+    )?;
     update_tracks(scene, limits(0.0), &all);
-    adjust(scene, &BundlePlan { free: None, lens, scale: 1.0, max_iterations: 8, tolerance: 1e-3 }, stage)?;
-    update_tracks(scene, limits(0.0), &all);
+    // A focal length that was a guess has bent the whole model, which takes a while to straighten.
+    let (rounds, max_iterations, tolerance) = if refinable { (2, 25, 1e-4) } else { (1, 8, 1e-3) };
+    for _ in 0..rounds {
+        adjust(scene, &BundlePlan { free: None, lens, scale: 1.0, max_iterations, tolerance }, stage)?;
+        update_tracks(scene, limits(0.0), &all);
+    }
     Ok(true)
 }
 

@@ -115,4 +115,3 @@ fn near_views(scene: &Scene<'_>, view: usize) -> Vec<usize> {
     order.push(view);
     order
 }
-

@@ -350,4 +350,3 @@ fn check(input: &SfmInput<'_>, options: &SfmOptions) -> Result<(), SfmError> {
     }
     Ok(())
 }
-

@@ -18,8 +18,11 @@ const CHANGE: f64 = 0.35;
 const BORDER: f64 = 10.0;
 /// Largest median change of a link that is judged by its features.
 const NEAR: f64 = 0.18;
-/// Ratio of the share that is found to the one expected below which a link seems wrong, and by how much to be sure.
-const RATIO: f64 = 0.8;
+/// The ratio of the share that is found to the one expected at which a link seems neither right nor wrong, how much less it is for each unit of change, and by how much more or less is sure. Of
+/// fountain-P11, sceaux and templeRing no pair is below, of a drive (kitti-2) 11 of 752, which their loops make right again. Of generated streets whose houses have a fifth of their points for
+/// themselves, pairs of different houses are at 0.83 in the middle and at 0.9 to 0.93 at the 95th percentile, pairs of the same at 0.9 and above. Where a tenth is their own, nothing tells.
+const RATIO: f64 = 0.93;
+const SLOPE: f64 = 0.6;
 const SURE: f64 = 0.1;
 /// As many loops count as much as what the features of a link say.
 const OWN: f64 = 3.0;
@@ -84,8 +87,8 @@ struct Asked {
 
 /// Refuses links by missing correspondences (Zach, Irschara & Bischof, "What can missing correspondences tell us about 3D structure and motion?", CVPR 2008; Jiang, Tan & Cheong, "Seamless
 /// structure from motion", CVPR 2012): what a view shows, and other pairs confirm, should be found in a view from nearly the same place as often as in views from farther away. Where it is not,
-/// both views show things that look alike, each with something of its own. Also refuses links too wide for this that lead from a view to neighbors of such a one.
-/// O(links).
+/// both views show things that look alike, each with something of its own. Loops that close carry this on to links that are too wide to be judged by their features, and set right what chance
+/// has misjudged. `distances` are those of each pair's points. Nothing is refused where no link seems wrong. O(links · features asked for + loops).
 pub(crate) fn refuse_repeated(
     graph: &mut ViewGraph,
     distances: &[Distances],
@@ -114,16 +117,22 @@ pub(crate) fn refuse_repeated(
         of_view[l.b].push((i, 0));
         of_view[l.a].push((i, 1));
     }
-    // Of a link and the view that is asked: the share that it has of views from as far away or farther.
-    let expected = |i: usize, side: usize| {
+    // Of a link and the view that is asked: the largest share that it has of a view, and of one from as far away or farther.
+    let most = |i: usize, side: usize, change: f64| {
         let view = [graph.links[i].b, graph.links[i].a][side];
-        let own = overlaps[i][side]?;
-        let others = of_view[view].iter().filter(|(j, _)| *j != i).filter_map(|(j, side)| overlaps[*j][*side]);
-        let farther = others.filter(|s| s.change >= own.change);
-        farther.max_by(|x, y| (x.found - x.deviation).total_cmp(&(y.found - y.deviation)))
+        let all = of_view[view].iter().filter_map(|(j, side)| overlaps[*j][*side]);
+        let farther = all.filter(|s| s.change >= change);
+        farther.map(|s| s.found - s.deviation).fold(0.0, f64::max)
     };
-    let judged: Vec<Option<Verdict>> =
-        (0..overlaps.len()).map(|i| Some(Verdict::new(overlaps[i], [expected(i, 0)?, expected(i, 1)?])?)).collect();
+    let judge = |i: usize| {
+        let side = |side: usize| {
+            let own = overlaps[i][side]?;
+            Some(Verdict::new(own, most(i, side, own.change), most(i, side, 0.0)))
+        };
+        let (one, two) = (side(0)?, side(1)?);
+        Some(if one.score >= two.score { one } else { two })
+    };
+    let judged: Vec<Option<Verdict>> = (0..overlaps.len()).map(judge).collect();
     if !judged.iter().flatten().any(|v| v.score < 0.0) {
         return Vec::new();
     }
@@ -160,15 +169,15 @@ struct Verdict {
 }
 
 impl Verdict {
-    /// `None` where the views are too far apart to tell.
-    fn new([forward, back]: Overlap, expected: [Share; 2]) -> Option<Self> {
-        let of = |own: Share, expected: Share| {
-            let ratio = own.found / expected.found;
-            let score = ((ratio - RATIO) / SURE).clamp(-1.0, 1.0);
-            (own.change <= NEAR).then_some(Self { found: own.found, expected: expected.found, score })
-        };
-        let (one, two) = (of(forward?, expected[0])?, of(back?, expected[1])?);
-        Some(if one.score >= two.score { one } else { two })
+    /// Of the share that a view has of another, the largest it has from as far away or farther, and the largest of all.
+    fn new(own: Share, expected: f64, best: f64) -> Self {
+        let limit = RATIO - SLOPE * own.change;
+        // One where nothing is found and nothing expected.
+        let ratio = |of: f64| (own.found + f64::EPSILON) / (of + f64::EPSILON);
+        let seems = if own.change <= NEAR { ((ratio(expected) - limit) / SURE).clamp(-1.0, 1.0) } else { 0.0 };
+        // Of nothing a view has more than of the same.
+        let is = ((ratio(best) - (1.0 - SURE)) / SURE).clamp(0.0, 1.0);
+        Self { found: own.found, expected, score: if seems == 0.0 { is } else { seems } }
     }
 }
 
@@ -209,6 +218,8 @@ fn asked(input: &SfmInput<'_>, cameras: &[Camera], view: usize, degree: &[u32], 
     .collect()
 }
 
+/// How much each view of a link has of what the other shows: keypoints of the one, put where their points are by the relative pose, that are in the picture of the other and seen there from about
+/// the same side and distance.
 fn overlap(
     link: &Link,
     pair: &PairMatches,
@@ -235,8 +246,7 @@ fn overlap(
         if unit.is_none() && !still {
             return None;
         }
-        let mut matched: Vec<u32> =
-            pair.matches.iter().map(|m| if side == 0 { m.query } else { m.train }).collect();
+        let mut matched: Vec<u32> = pair.matches.iter().map(|m| if side == 0 { m.query } else { m.train }).collect();
         matched.sort_unstable();
         let (mut found, mut changes) = (0, Vec::new());
         for one in asked {
@@ -272,4 +282,57 @@ fn overlap(
         Some(Share { found, deviation: (found * (1.0 - found) / count).sqrt(), change })
     };
     [side(0, &link.pose), side(1, &link.pose.inverse())]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Links between all of twelve views, four of each of three houses that look alike: views of the same number within a house look the same.
+    fn houses() -> (Vec<(usize, usize)>, Vec<[usize; 3]>) {
+        let links: Vec<(usize, usize)> = (0..12).flat_map(|a| (a + 1..12).map(move |b| (a, b))).collect();
+        let at = |a: usize, b: usize| links.iter().position(|l| *l == (a, b));
+        let all = (0..12).flat_map(|a| (a + 1..12).flat_map(move |b| (b + 1..12).map(move |c| (a, b, c))));
+        let loops = all.filter_map(|(a, b, c)| Some([at(a, b)?, at(b, c)?, at(a, c)?])).collect();
+        (links, loops)
+    }
+
+    #[test]
+    fn loops_carry_on_what_near_views_tell() {
+        let (links, loops) = houses();
+        let verdict = |score: f64| Some(Verdict { found: 0.5, expected: 0.5, score });
+        // Only neighbors of a house, and the same view of two houses, are near enough to be judged; of the latter one in three is misjudged.
+        let judged: Vec<Option<Verdict>> = links
+            .iter()
+            .map(|&(a, b)| match (a / 4 == b / 4, b - a) {
+                (true, 1) => verdict(0.9),
+                (false, 4) if a % 3 == 0 => verdict(0.2),
+                (false, 4 | 8) => verdict(-0.8),
+                _ => None,
+            })
+            .collect();
+        for ((a, b), score) in links.iter().zip(propagate(&judged, &loops)) {
+            assert!((a / 4 == b / 4) == (score > 0.0) && score != 0.0, "{a} {b}: {score}");
+        }
+    }
+
+    #[test]
+    fn a_right_pair_that_chance_misjudged_is_set_right_by_its_loops() {
+        let (links, loops) = houses();
+        let verdict = |score: f64| Some(Verdict { found: 0.5, expected: 0.5, score });
+        // One scene: all are right, one in eleven seems wrong.
+        let judged: Vec<Option<Verdict>> =
+            (0..links.len()).map(|i| verdict(if i % 11 == 5 { -0.7 } else { 0.8 })).collect();
+        assert!(propagate(&judged, &loops).iter().all(|s| *s > 0.0));
+    }
+
+    #[test]
+    fn a_view_from_as_near_that_has_less_is_another() {
+        let own = |found: f64, change: f64| Share { found, deviation: 0.02, change };
+        let score = |found, change, expected, best| Verdict::new(own(found, change), expected, best).score;
+        // Half of what farther views share, from the same place; then as much.
+        assert!(score(0.3, 0.02, 0.6, 0.6) == -1.0 && score(0.6, 0.02, 0.6, 0.6) > 0.5);
+        // From far away little is shared, which says nothing.
+        assert!(score(0.3, 0.3, 0.3, 0.6) == 0.0 && score(0.0, 0.3, 0.0, 0.0) >= 0.0);
+    }
 }
