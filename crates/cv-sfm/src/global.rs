@@ -70,7 +70,14 @@ pub(crate) fn place(
         adjust(scene, &BundlePlan { free: None, lens, scale: 1.0, max_iterations, tolerance }, stage)?;
         update_tracks(scene, limits(0.0), &all);
     }
-    Ok(true)
+    // Views that hardly anything agrees with are left to be placed by the points of the others.
+    for v in 0..scene.views.len() {
+        if scene.of_view(v).filter(|i| scene.active[*i]).count() < options.min_pose_inliers {
+            scene.poses[v] = None;
+        }
+    }
+    update_tracks(scene, limits(0.0), &all);
+    Ok(scene.registered().len() > 1)
 }
 
 fn rotation_between(a: &Rotation3<f64>, b: &Rotation3<f64>) -> f64 {

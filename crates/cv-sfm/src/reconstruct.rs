@@ -179,7 +179,7 @@ pub fn reconstruct_views(
         let measured = measure(&all, input, &cameras[0], options.min_angle, &stage)?;
         distances.resize(input.pairs.len(), Distances::default());
         all.links.iter().zip(measured).for_each(|(l, of)| distances[l.pair] = of);
-        refused.extend(refuse_repeated(&mut all, &distances, input, &cameras[0], options));
+        refused.extend(refuse_repeated(&mut all, &distances, input, &cameras[0], options, &stage)?);
         graph = Some(all);
     }
     let mut usable = vec![true; input.pairs.len()];

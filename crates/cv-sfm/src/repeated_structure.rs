@@ -3,7 +3,7 @@
 use crate::pair_scales::{Distances, LEAST_SHARED};
 use crate::view_graph::{Link, PairRefusal, RefusedPair, ViewGraph};
 use crate::{PairMatches, SfmInput, SfmOptions, SfmView};
-use cv_core::{Camera, Point2, Point3, Pose, Vector3, quantile};
+use cv_core::{Camera, Cancelled, Point2, Point3, Pose, Stage, Vector3, quantile};
 use rayon::prelude::*;
 
 /// Features of a view that are asked for in others, evenly from all that count: a share of so many is known to 2 %.
@@ -89,13 +89,17 @@ struct Asked {
 /// structure from motion", CVPR 2012): what a view shows, and other pairs confirm, should be found in a view from nearly the same place as often as in views from farther away. Where it is not,
 /// both views show things that look alike, each with something of its own. Loops that close carry this on to links that are too wide to be judged by their features, and set right what chance
 /// has misjudged. `distances` are those of each pair's points. Nothing is refused where no link seems wrong. O(links · features asked for + loops).
+///
+/// # Errors
+/// [`Cancelled`].
 pub(crate) fn refuse_repeated(
     graph: &mut ViewGraph,
     distances: &[Distances],
     input: &SfmInput<'_>,
     cameras: &[Camera],
     options: &SfmOptions,
-) -> Vec<RefusedPair> {
+    stage: &Stage<'_>,
+) -> Result<Vec<RefusedPair>, Cancelled> {
     let mut degree: Vec<Vec<u32>> = input.views.iter().map(|v| vec![0; v.keypoints.len()]).collect();
     for link in &graph.links {
         let pair = &input.pairs[link.pair];
@@ -109,9 +113,10 @@ pub(crate) fn refuse_repeated(
     let asked: Vec<Vec<Asked>> = (0..graph.views).into_par_iter().map(of_view).collect();
     let overlap_of = |l: &Link| {
         let views = [l.a, l.b].map(|v| (&asked[v][..], &depths[v][..], &cameras[input.views[v].camera]));
-        overlap(l, &input.pairs[l.pair], &distances[l.pair], views, input, options)
+        stage.check()?;
+        Ok(overlap(l, &input.pairs[l.pair], &distances[l.pair], views, input, options))
     };
-    let overlaps: Vec<Overlap> = graph.links.par_iter().map(overlap_of).collect();
+    let overlaps: Vec<Overlap> = graph.links.par_iter().map(overlap_of).collect::<Result<_, _>>()?;
     let mut of_view: Vec<Vec<(usize, usize)>> = vec![Vec::new(); graph.views];
     for (i, l) in graph.links.iter().enumerate() {
         of_view[l.b].push((i, 0));
@@ -134,7 +139,7 @@ pub(crate) fn refuse_repeated(
     };
     let judged: Vec<Option<Verdict>> = (0..overlaps.len()).map(judge).collect();
     if !judged.iter().flatten().any(|v| v.score < 0.0) {
-        return Vec::new();
+        return Ok(Vec::new());
     }
     let loops: Vec<[usize; 3]> = graph.closed_triplets();
     let scores = propagate(&judged, &loops);
@@ -155,7 +160,7 @@ pub(crate) fn refuse_repeated(
         wrong.map(|i| RefusedPair { pair: graph.links[i].pair, reason: reason(i) }).collect();
     let mut index = 0..;
     graph.links.retain(|_| index.next().is_none_or(|i: usize| scores[i] >= 0.0));
-    refused
+    Ok(refused)
 }
 
 /// What the features of a link's views say of it.
