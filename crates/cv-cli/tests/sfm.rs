@@ -114,6 +114,9 @@ fn a_walk_around_a_room_is_as_it_was_and_written_whole() {
     assert!(number("reprojection_rms_px") < 1.0 && value["focal_px"][0].as_f64() == Some(FOCAL));
     assert!(value["seconds"]["features"].as_f64().is_some() && value["images"][0]["model"].as_u64() == Some(0));
 
+    // Known cameras are placed all at once, and no two places of the room look alike.
+    assert!(value["solvers"][0] == "global" && value["refused_pairs"]["repeated"] == 0, "{value}");
+
     // The pinhole folder: the lens had no distortion, so that its points are where they were, up to the larger focal length of a view without black corners.
     let flat = colmap::read(at("flat/sparse")).unwrap();
     assert_eq!((flat.images.len(), flat.points.len()), (12, model.points.len()));

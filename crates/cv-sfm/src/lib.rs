@@ -49,20 +49,29 @@
 
 mod bundle;
 mod complete;
+mod finish;
 mod focal_length;
+mod global;
+mod global_positions;
 mod incremental;
 mod initial_pair;
 mod model;
+mod pair_scales;
+mod reconstruct;
 mod registration;
+mod repeated_structure;
+mod rotation_averaging;
 mod scene;
 mod tracks;
 mod triangulate_track;
+mod view_graph;
 mod view_pair;
 
 pub use complete::FeatureDistance;
-pub use incremental::{SfmError, SfmInput, SfmOptions, SfmOutcome, reconstruct_views};
 pub use model::{SfmModel, SfmPoint, ViewOutcome};
+pub use reconstruct::{SfmError, SfmInput, SfmOptions, SfmOutcome, Solver, reconstruct_views};
 pub use tracks::{Observation, PairMatches, Tracks};
+pub use view_graph::{PairRefusal, RefusedPair};
 pub use view_pair::{ViewPair, ViewPairError, ViewPairModel, ViewPairOptions, verify_view_pair};
 
 use cv_core::Keypoint;

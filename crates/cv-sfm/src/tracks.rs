@@ -47,10 +47,10 @@ impl Tracks {
     /// The surest matches (by distance) come first, and one that would put two places of a view into one track is left out: that is how a wrong match between
     /// two right tracks costs itself alone. Features at one place (of several orientations or scales) count as one. Matches of views or keypoints that there are not are
     /// left out. O(m log m) of m matches.
-    pub fn build(views: &[&[Keypoint]], pairs: &[PairMatches]) -> Self {
+    pub fn build<'p>(views: &[&[Keypoint]], pairs: impl IntoIterator<Item = &'p PairMatches>) -> Self {
         let mut joiner = TrackJoiner::new(views);
-        let mut joins = Vec::with_capacity(pairs.iter().map(|p| p.matches.len()).sum());
-        for pair in pairs.iter().filter(|p| p.a != p.b) {
+        let mut joins = Vec::new();
+        for pair in pairs.into_iter().filter(|p| p.a != p.b) {
             let of = |view: usize, keypoint: u32| Observation { view: view as u32, keypoint };
             joins.extend(pair.matches.iter().map(|m| (m.distance, of(pair.a, m.query), of(pair.b, m.train))));
         }

@@ -6,7 +6,7 @@ use cv_core::{Camera, DMatch, Keypoint, Point3, Pose, Silent};
 use cv_geometry::align_points;
 use cv_sfm::{
     CameraKnowledge, FeatureDistance, Observation, PairMatches, SfmError, SfmInput, SfmOptions, SfmOutcome, SfmView,
-    ViewOutcome, ViewPairModel, ViewPairOptions, reconstruct_views, verify_view_pair,
+    Solver, ViewOutcome, ViewPairModel, ViewPairOptions, reconstruct_views, verify_view_pair,
 };
 use cv_synth::{FeatureViews, FeatureViewsOptions};
 
@@ -53,6 +53,10 @@ impl Given {
     }
 
     fn solve_with(&self, alike: Option<&dyn FeatureDistance>) -> Result<SfmOutcome, SfmError> {
+        self.solve_by(Solver::Auto, alike)
+    }
+
+    fn solve_by(&self, solver: Solver, alike: Option<&dyn FeatureDistance>) -> Result<SfmOutcome, SfmError> {
         let views: Vec<SfmView<'_>> = self.keypoints.iter().map(|k| SfmView { camera: 0, keypoints: k }).collect();
         let input = SfmInput {
             views: &views,
@@ -62,7 +66,7 @@ impl Given {
             geometry: &self.geometry,
             alike,
         };
-        reconstruct_views(&input, &SfmOptions::default(), &Silent)
+        reconstruct_views(&input, &SfmOptions { solver, ..SfmOptions::default() }, &Silent)
     }
 }
 
@@ -95,10 +99,13 @@ fn walk(views: usize) -> FeatureViews {
 
 #[test]
 fn a_walk_around_a_street_closes() {
-    for views in [30, 60] {
+    for (views, solver) in [(30, Solver::Global), (30, Solver::Incremental), (60, Solver::Auto)] {
         let truth = walk(views);
         let given = Given::new(&truth, CameraKnowledge::Known, truth.camera, 30);
-        let found = given.solve().unwrap();
+        let found = given.solve_by(solver, None).unwrap();
+        // Known cameras are placed at once.
+        assert_eq!(found.solvers, [if solver == Solver::Incremental { solver } else { Solver::Global }]);
+        assert!(found.refused.is_empty(), "{:?}", found.refused);
         assert!(found.models.len() == 1 && found.models[0].registered() == views, "{:?}", found.views);
         let (center, degrees) = errors(&found.models[0].poses, &truth.poses);
         assert!(center < CENTER && degrees < DEGREES, "{views}: {center} {degrees}");
@@ -121,12 +128,14 @@ fn focal_length_and_distortion_are_found() {
         (CameraKnowledge::Unknown, 1.2 * truth.camera.width as f64),
     ] {
         let given = Given::new(&truth, knowledge, start(focal), 30);
-        let found = given.solve().unwrap();
-        assert_eq!(found.models[0].registered(), 40, "{:?}", found.views);
-        let camera = &found.models[0].cameras[0];
-        // The walk turns by 360 degrees, which fixes the focal length far better than a thousandth.
-        assert!((camera.fx / truth.camera.fx - 1.0).abs() < 1e-3, "{} of {}", camera.fx, truth.camera.fx);
-        assert!(camera.distortion.parameters().iter().all(|k| k.abs() < 0.01), "{:?}", camera.distortion);
+        for solver in [Solver::Incremental, Solver::Global] {
+            let found = given.solve_by(solver, None).unwrap();
+            assert_eq!(found.models[0].registered(), 40, "{:?}", found.views);
+            let camera = &found.models[0].cameras[0];
+            // The walk turns by 360 degrees, which fixes the focal length far better than a thousandth.
+            assert!((camera.fx / truth.camera.fx - 1.0).abs() < 1e-3, "{} of {}", camera.fx, truth.camera.fx);
+            assert!(camera.distortion.parameters().iter().all(|k| k.abs() < 0.01), "{:?}", camera.distortion);
+        }
     }
 }
 

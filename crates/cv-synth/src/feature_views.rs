@@ -19,18 +19,25 @@ pub struct FeatureViewsOptions {
     pub found: f64,
     /// Share of a pair's matches that are wrong, 0 to below 1. Default 0.1.
     pub wrong: f64,
+    /// Identical houses along the street, both of whose fronts repeat; below 2 none repeat. Default 0.
+    pub houses: usize,
+    /// Share of a house's points that no other has, 0 to 1; those of the ground are all of this kind. Default 0.1.
+    pub own: f64,
     /// Of all random choices. Default 0.
     pub seed: u64,
 }
 
 impl Default for FeatureViewsOptions {
     fn default() -> Self {
-        Self { views: 50, points: 10_000, noise: 0.3, found: 0.6, wrong: 0.1, seed: 0 }
+        Self { views: 50, points: 10_000, noise: 0.3, found: 0.6, wrong: 0.1, houses: 0, own: 0.1, seed: 0 }
     }
 }
 
 /// Photographs taken on a walk once around a round street, from the middle of the road ahead, as keypoints with their truth: points of the fronts on both sides and of the
 /// ground, seen from nearer than 30 m by what does not hide behind the inner front. The last photograph overlaps the first. World in meters, Y down.
+///
+/// Where houses repeat ([`FeatureViewsOptions::houses`]), the points at one place of each of them are alike: a photograph's matches to one that shows another house are as many and as
+/// consistent as if it were the same.
 #[derive(Debug, Clone)]
 pub struct FeatureViews {
     /// Of all views.
@@ -43,8 +50,10 @@ pub struct FeatureViews {
     pub keypoints: Vec<Vec<Point2<f64>>>,
     /// The point of each keypoint.
     pub shown: Vec<Vec<u32>>,
-    /// Of each view: points and their keypoints, by point.
-    by_point: Vec<Vec<(u32, u32)>>,
+    /// Of each point, the first that looks like it: itself where there is no other.
+    pub alike: Vec<u32>,
+    /// Of each view: the looks of points ([`FeatureViews::alike`]) and their keypoints, by look.
+    by_look: Vec<Vec<(u32, u32)>>,
     wrong: f64,
     seed: u64,
 }
@@ -59,10 +68,13 @@ const STEP: f64 = 1.5;
 const FLAT: f64 = 0.2;
 
 /// A point, where it is on the walk, and the direction its surface faces.
+#[derive(Clone)]
 struct Site {
     at: Point3<f64>,
     angle: f64,
     normal: Vector3<f64>,
+    /// A number that sites that look alike share.
+    look: u32,
 }
 
 impl FeatureViews {
@@ -82,7 +94,20 @@ impl FeatureViews {
                 Pose::look_at(eye, eye + ahead, Vector3::y()).unwrap_or_else(Pose::identity)
             })
             .collect();
-        let mut sites: Vec<Site> = (0..options.points).map(|_| site(radius, &mut rng)).collect();
+        let mut sites: Vec<Site> = Vec::with_capacity(options.points);
+        while sites.len() < options.points {
+            let one = site(radius, sites.len() as u32, &mut rng);
+            // Of the ground nothing repeats.
+            let repeats = options.houses > 1 && one.normal.y == 0.0 && rng.range(0.0, 1.0) >= options.own;
+            let copies = if repeats { options.houses } else { 1 };
+            // One of as many, so that there are as many points in each place as without.
+            if copies > 1 && rng.index(copies) > 0 {
+                continue;
+            }
+            for copy in (0..copies).take(options.points - sites.len()) {
+                sites.push(one.turned(TAU * copy as f64 / copies as f64));
+            }
+        }
         // A photograph's candidates then follow each other.
         sites.sort_by(|a, b| a.angle.total_cmp(&b.angle));
         // Of the nearest a point can be on the inner side.
@@ -110,14 +135,22 @@ impl FeatureViews {
                 seen
             })
             .collect();
-        let by_point = seen.iter().map(|seen| {
-            let mut all: Vec<(u32, u32)> = seen.iter().zip(0..).map(|(&(point, _), k)| (point, k)).collect();
+        // By order on the walk, the first of each look.
+        let mut first = vec![u32::MAX; sites.len()];
+        for (site, p) in sites.iter().zip(0..) {
+            first[site.look as usize] = first[site.look as usize].min(p);
+        }
+        let alike: Vec<u32> = sites.iter().map(|site| first[site.look as usize]).collect();
+        let by_look = seen.iter().map(|seen| {
+            let mut all: Vec<(u32, u32)> =
+                seen.iter().zip(0..).map(|(&(point, _), k)| (alike[point as usize], k)).collect();
             all.sort_unstable();
             all
         });
         Self {
             camera,
-            by_point: by_point.collect(),
+            by_look: by_look.collect(),
+            alike,
             points: sites.iter().map(|site| site.at).collect(),
             keypoints: seen.iter().map(|seen| seen.iter().map(|&(_, pixel)| pixel).collect()).collect(),
             shown: seen.iter().map(|seen| seen.iter().map(|&(point, _)| point).collect()).collect(),
@@ -132,18 +165,20 @@ impl FeatureViews {
         self.keypoints.iter().map(Vec::len).sum()
     }
 
-    /// The pairs of views, the earlier first, that show at least `least` points in common, and how many; by view.
+    /// The pairs of views, the earlier first, that show at least `least` points that look alike, and how many; by view. Without houses that repeat, those are the points in common.
     pub fn pairs(&self, least: usize) -> Vec<(usize, usize, usize)> {
         let mut views: Vec<Vec<u32>> = vec![Vec::new(); self.points.len()];
-        for (shown, view) in self.shown.iter().zip(0..) {
-            shown.iter().for_each(|&point| views[point as usize].push(view));
+        for (looks, view) in self.by_look.iter().zip(0..) {
+            for look in distinct(looks) {
+                views[look as usize].push(view);
+            }
         }
         let mut pairs = Vec::new();
         let mut shared = vec![0; self.poses.len()];
-        for (a, shown) in self.shown.iter().enumerate() {
+        for (a, looks) in self.by_look.iter().enumerate() {
             shared.fill(0);
-            for &b in shown.iter().flat_map(|&point| &views[point as usize]) {
-                shared[b as usize] += 1;
+            for b in distinct(looks).flat_map(|look| &views[look as usize]) {
+                shared[*b as usize] += 1;
             }
             let enough = |b: &usize| shared[*b] >= least.max(1);
             pairs.extend((a + 1..shared.len()).filter(enough).map(|b| (a, b, shared[b])));
@@ -151,15 +186,21 @@ impl FeatureViews {
         pairs
     }
 
-    /// Matches between two views, in no order: every point both show, and wrong ones by [`FeatureViewsOptions::wrong`]. A keypoint has one match at the most.
+    /// Matches between two views, in no order: every point both show, and wrong ones by [`FeatureViewsOptions::wrong`]. Of points that look alike, those that are seen most alike match: from
+    /// about the same side and distance, be they the same or not. A keypoint has one match at the most.
     pub fn matches(&self, a: usize, b: usize) -> Vec<DMatch> {
-        let (first, second) = (&self.by_point[a], &self.by_point[b]);
+        let (first, second) = (&self.by_look[a], &self.by_look[b]);
         let mut matches: Vec<(u32, u32)> = Vec::new();
         let (mut free_a, mut free_b) = (Vec::new(), Vec::new());
         let (mut i, mut j) = (0, 0);
         while let (Some(x), Some(y)) = (first.get(i), second.get(j)) {
             match x.0.cmp(&y.0) {
-                std::cmp::Ordering::Equal => matches.push((x.1, y.1)),
+                std::cmp::Ordering::Equal => {
+                    let [m, n] = [&first[i..], &second[j..]].map(|l| l.iter().take_while(|k| k.0 == x.0).count());
+                    self.match_alike([a, b], [&first[i..i + m], &second[j..j + n]], &mut matches);
+                    (i, j) = (i + m, j + n);
+                    continue;
+                }
                 std::cmp::Ordering::Less => free_a.push(x.1),
                 std::cmp::Ordering::Greater => free_b.push(y.1),
             }
@@ -178,6 +219,34 @@ impl FeatureViews {
             matches.swap(last, rng.index(last + 1));
         }
         matches.into_iter().map(|(query, train)| DMatch { query, train, distance: 0.0, ratio: 0.0 }).collect()
+    }
+
+    /// Matches keypoints of one look in two views: those that are each other's most alike.
+    fn match_alike(&self, views: [usize; 2], lists: [&[(u32, u32)]; 2], matches: &mut Vec<(u32, u32)>) {
+        if let [[one], [other]] = lists {
+            matches.push((one.1, other.1));
+            return;
+        }
+        // From the eye to the point, turned with its house, and the logarithm of the distance.
+        let seen = |side: usize| {
+            let eye = self.poses[views[side]].center();
+            let of = move |&(_, keypoint): &(u32, u32)| {
+                let point = self.points[self.shown[views[side]][keypoint as usize] as usize];
+                let to = point - eye;
+                let upright = nalgebra::Rotation3::from_axis_angle(&Vector3::y_axis(), -point.x.atan2(point.z));
+                (upright * to.normalize(), to.norm().ln())
+            };
+            lists[side].iter().map(of).collect::<Vec<_>>()
+        };
+        let (one, other) = (seen(0), seen(1));
+        let unlike = |i: usize, j: usize| one[i].0.angle(&other[j].0) + (one[i].1 - other[j].1).abs();
+        let nearest = |n: usize, cost: &dyn Fn(usize) -> f64| (0..n).min_by(|x, y| cost(*x).total_cmp(&cost(*y)));
+        for i in 0..one.len() {
+            let Some(j) = nearest(other.len(), &|j| unlike(i, j)) else { continue };
+            if nearest(one.len(), &|k| unlike(k, j)) == Some(i) {
+                matches.push((lists[0][i].1, lists[1][j].1));
+            }
+        }
     }
 
     /// The truth as a model: pictures `0000.png` and on by the number of their view, points by index where two views at least show them; keypoints with their noise.
@@ -201,24 +270,37 @@ impl FeatureViews {
     }
 }
 
+/// The looks of a list by look, each once.
+fn distinct(looks: &[(u32, u32)]) -> impl Iterator<Item = u32> + '_ {
+    looks.chunk_by(|x, y| x.0 == y.0).filter_map(|run| run.first()).map(|x| x.0)
+}
+
+impl Site {
+    /// The same around the middle of the walk.
+    fn turned(&self, by: f64) -> Self {
+        let turn = nalgebra::Rotation3::from_axis_angle(&Vector3::y_axis(), by);
+        Self { at: turn * self.at, angle: (self.angle + by).rem_euclid(TAU), normal: turn * self.normal, ..*self }
+    }
+}
+
 /// A place by its angle on the walk, which begins at +Z.
 fn around(angle: f64, radius: f64, y: f64) -> Point3<f64> {
     Point3::new(radius * angle.sin(), y, radius * angle.cos())
 }
 
-fn site(radius: f64, rng: &mut Rng) -> Site {
+fn site(radius: f64, look: u32, rng: &mut Rng) -> Site {
     let angle = rng.range(0.0, TAU);
     let outward = around(angle, 1.0, 0.0).coords;
     // A third on each side: areas of fronts and road are much the same.
     let kind = rng.index(3);
     if kind == 2 {
         let at = around(angle, radius + rng.range(-HALF, HALF), rng.range(-0.1, 0.0));
-        return Site { at, angle, normal: -Vector3::y() };
+        return Site { at, angle, normal: -Vector3::y(), look };
     }
     let sign = if kind == 0 { -1.0 } else { 1.0 };
     // Up to half a meter stands out from a front.
     let at = around(angle, radius + sign * rng.range(HALF - 0.5, HALF), -rng.range(0.0, FRONT));
-    Site { at, angle, normal: outward * -sign }
+    Site { at, angle, normal: outward * -sign, look }
 }
 
 /// Where a point is seen, if it is.

@@ -11,7 +11,7 @@ use cv_io::colmap::{self, ModelFormat};
 use cv_io::ply::PlyEncoding;
 use cv_io::{CalibrationFormat, DynImage};
 use cv_pipeline::features::FeatureError;
-use cv_pipeline::many_views::{CameraKnowledge, ViewOutcome};
+use cv_pipeline::many_views::{CameraKnowledge, Solver, ViewOutcome};
 use cv_pipeline::{Cancelled, Progress, SfmCamera, SfmJobOptions, SfmPhoto, SfmPhotoError, SfmResult, sfm, sfm_photo};
 use photographs::{Photograph, photographs, seen_from};
 use pinhole::PinholeFolder;
@@ -55,6 +55,9 @@ pub(crate) struct Args {
     /// Largest reprojection error of a point that is kept, in pixels.
     #[arg(long, value_name = "PX", default_value_t = SfmJobOptions::default().solve.max_error)]
     max_error: f64,
+    /// How poses are found.
+    #[arg(long, value_name = "SOLVER", value_parser = named::<Solver>(), default_value_t = Solver::default())]
+    solver: Solver,
     /// Most features in a photograph [default: 13000].
     #[arg(long, value_name = "N")]
     features: Option<usize>,
@@ -151,6 +154,7 @@ impl Args {
         }
         let mut options = SfmJobOptions::default();
         options.solve.max_error = self.max_error;
+        options.solve.solver = self.solver;
         if let Some(n) = self.features {
             options.features = options.features.at_most(n);
         }
@@ -384,6 +388,8 @@ fn outcome(
         models.len(),
         if models.len() == 1 { "" } else { "s" },
     );
+    let refused = words::many_views::RefusedPairs::of(&result.refused);
+    summary.extend(refused.text(result.pairs.len()).map(|text| format!("\n{text}")));
     // What was refused has been warned of.
     for (one, fate) in all.iter().zip(fates) {
         if let (Err(reason), None) = (fate, &one.refused) {
@@ -399,5 +405,7 @@ fn outcome(
         .with("reprojection_rms_px", rms)
         .with("mean_reprojection_px", error)
         .with("focal_px", focal)
+        .with("solvers", result.solvers.iter().map(ToString::to_string).collect::<Vec<_>>())
+        .with("refused_pairs", json!({ "triplets": refused.triplets, "repeated": refused.repeated }))
         .summary(summary)
 }

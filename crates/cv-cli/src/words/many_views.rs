@@ -2,7 +2,7 @@
 
 use super::{Failure, unreadable, words};
 use cv_io::IoError;
-use cv_pipeline::many_views::{SfmError, ViewOutcome};
+use cv_pipeline::many_views::{PairRefusal, RefusedPair, SfmError, ViewOutcome};
 use cv_pipeline::{Advice, SfmJobError};
 use std::path::Path;
 
@@ -19,6 +19,36 @@ pub(crate) fn left_out(outcome: &ViewOutcome) -> Option<String> {
         ViewOutcome::NoPose { seen, agree, needed } => Some(format!(
             "of the {seen} points of the model that it seems to see {agree} agree with a pose where {needed} are needed: things that look alike, or that moved"
         )),
+    }
+}
+
+/// How many pairs of photographs were not used, by the reason.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) struct RefusedPairs {
+    /// Their rotations contradict those of other pairs.
+    pub(crate) triplets: usize,
+    /// They show different things that look alike.
+    pub(crate) repeated: usize,
+}
+
+impl RefusedPairs {
+    pub(crate) fn of(all: &[RefusedPair]) -> Self {
+        let triplets = all.iter().filter(|r| matches!(r.reason, PairRefusal::Triplets { .. })).count();
+        Self { triplets, repeated: all.len() - triplets }
+    }
+
+    /// What is said of them, if there are any, among so many pairs.
+    pub(crate) fn text(self, pairs: usize) -> Option<String> {
+        let Self { triplets, repeated } = self;
+        let mut reasons = Vec::new();
+        if triplets > 0 {
+            reasons.push(format!("{triplets} by triplets (their rotations contradict those of other pairs)"));
+        }
+        if repeated > 0 {
+            reasons.push(format!("{repeated} as repeated structure (different things that look alike)"));
+        }
+        (!reasons.is_empty())
+            .then(|| format!("{} of {pairs} pairs refused: {}", triplets + repeated, reasons.join(", ")))
     }
 }
 
@@ -79,6 +109,24 @@ mod tests {
         );
         assert_eq!(text(9).matches("blue").count(), SHOWN);
         assert!(text(9).contains("…)"));
+    }
+
+    #[test]
+    fn refused_pairs_are_told_by_their_reasons() {
+        let of = |reason| RefusedPair { pair: 0, reason };
+        let repeated = [
+            of(PairRefusal::Repeated { found: 0.2, expected: 0.6 }),
+            of(PairRefusal::RepeatedLoops { against: 3, of: 4 }),
+        ];
+        let triplets = [of(PairRefusal::Triplets { loops: 5 })];
+        let text = |all: &[RefusedPair]| RefusedPairs::of(all).text(40);
+        assert_eq!(text(&[]), None);
+        assert!(
+            text(&repeated)
+                .is_some_and(|t| t.starts_with("2 of 40 pairs refused: 2 as repeated") && !t.contains("triplets"))
+        );
+        let both = text(&[&repeated[..], &triplets].concat());
+        assert!(both.is_some_and(|t| t.starts_with("3 of 40 pairs refused: 1 by triplets") && t.contains(", 2 as repeated")));
     }
 
     #[test]

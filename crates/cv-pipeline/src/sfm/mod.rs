@@ -12,8 +12,8 @@ use crate::Progress;
 use cv_core::{Camera, Cancelled, OptionError, StageClock};
 use cv_features::{FeatureOptions, RatioTest, SiftOptions};
 use cv_sfm::{
-    CameraKnowledge, FeatureDistance, Observation, PairMatches, SfmError, SfmInput, SfmModel, SfmView, ViewOutcome,
-    ViewPairOptions, reconstruct_views,
+    CameraKnowledge, FeatureDistance, Observation, PairMatches, RefusedPair, SfmError, SfmInput, SfmModel, SfmView,
+    Solver, ViewOutcome, ViewPairOptions, reconstruct_views,
 };
 
 /// Settings of [`sfm`].
@@ -90,10 +90,14 @@ pub struct SfmCamera {
 pub struct SfmResult {
     /// The models, the one with most photographs first.
     pub models: Vec<SfmModel>,
+    /// How each of them was found.
+    pub solvers: Vec<Solver>,
     /// What became of each photograph.
     pub outcomes: Vec<ViewOutcome>,
     /// The pairs of photographs that hold, and their matches.
     pub pairs: Vec<PairMatches>,
+    /// Those of them that were not used all the same, and why.
+    pub refused: Vec<RefusedPair>,
     /// Stage names and their seconds.
     pub stages: Vec<(&'static str, f64)>,
 }
@@ -200,5 +204,6 @@ pub fn sfm(
     };
     let found = reconstruct_views(&input, &options.solve, progress)?;
     clock.lap("solve");
-    Ok(SfmResult { models: found.models, outcomes: found.views, pairs, stages: clock.into_stages() })
+    let cv_sfm::SfmOutcome { models, solvers, views, refused } = found;
+    Ok(SfmResult { models, solvers, outcomes: views, pairs, refused, stages: clock.into_stages() })
 }
