@@ -71,8 +71,9 @@ pub use no_pair::NoPairCause;
 /// What a caller of [`match_extracted`] needs to hand in features found elsewhere, and the settings of ours.
 pub mod features {
     pub use cv_features::{
-        ByteScale, CornerMeasure, DescriptorKind, Descriptors, DropReason, Dropped, FeatureError, HarrisFeatures,
-        HarrisOptions, MopsOptions, MultiScaleOptions, PatchOptions, RatioTest, SiftOptions, Suppression,
+        ByteDescriptors, ByteScale, CornerMeasure, DescriptorKind, Descriptors, DropReason, Dropped, FeatureError,
+        HarrisFeatures, HarrisOptions, MopsOptions, MultiScaleOptions, PatchOptions, RatioTest, SiftOptions,
+        Suppression,
     };
 }
 pub use panorama::{
@@ -90,7 +91,9 @@ pub use reconstruct::{
 pub use rectify::{RectifyResult, rectify};
 pub use rig_depth::{RigDepthResult, depth_by_rig};
 pub use segment::{DetectResult, SegmentResult, SegmentTraining, detect, segment, train_segment};
-pub use sfm::{SfmCamera, SfmJobError, SfmJobOptions, SfmPhoto, SfmPhotoError, SfmResult, sfm, sfm_pairs, sfm_photo};
+pub use sfm::{
+    SfmCamera, SfmJobError, SfmJobOptions, SfmPhoto, SfmPhotoError, SfmResult, sfm, sfm_pairs, sfm_photo, sfm_solve,
+};
 
 /// What a caller of [`depth()`] needs of the stereo stage: its options and results, rectification, geometry and scores.
 pub mod stereo {

@@ -1,28 +1,35 @@
 //! `cv sfm`: cameras and points from many photographs.
 
+mod cameras;
+mod checkpoint;
+mod outcome;
 mod photographs;
 mod pinhole;
+mod places;
 mod report;
 
 use crate::frame::{CLOUD, Context, Failure, JSON, Outcome, Output, Run, Step, expand_images, named, steps};
-use crate::{rig, words};
-use cv_core::{Camera, Distortion, ModelImage, PointCloud, Pose, SparseModel};
+use crate::words;
+use cameras::Cameras;
+use checkpoint::{Checkpoint, Seen};
+use cv_core::{PointCloud, SparseModel};
 use cv_io::colmap::{self, ModelFormat};
 use cv_io::ply::PlyEncoding;
-use cv_io::{CalibrationFormat, DynImage};
 use cv_pipeline::features::FeatureError;
-use cv_pipeline::many_views::{CameraKnowledge, ViewOutcome};
-use cv_pipeline::{Cancelled, Progress, SfmCamera, SfmJobOptions, SfmPhoto, SfmPhotoError, SfmResult, sfm, sfm_photo};
+use cv_pipeline::{Cancelled, Progress, SfmJobOptions, SfmPhoto, SfmPhotoError, sfm_pairs, sfm_photo, sfm_solve};
+use outcome::{doubt, fates, outcome};
 use photographs::{Photograph, photographs, seen_from};
 use pinhole::PinholeFolder;
-use serde_json::{Value, json};
-use std::collections::BTreeMap;
+use places::{Frame, PlaceArgs, Places};
 use std::path::{Path, PathBuf};
 
 /// Reconstruct cameras and a sparse cloud of points from many photographs (structure from motion).
 ///
-/// The photographs need no order. Without --camera and --focal, focal lengths come from EXIF and are refined; photographs of one size and one focal length share a camera. The unit of the
-/// model is arbitrary. A photograph that cannot be read, or that shows something else, is left out and told of.
+/// The photographs need no order. Without --camera and --focal, focal lengths come from EXIF and are refined; photographs of one size and one focal length share a camera. A photograph that
+/// cannot be read, or that shows something else, is left out and told of.
+///
+/// The model stands upright, Z up. Where three photographs or more tell their GPS position, it is in meters from the first of them (X east, Y north); else --known or --distance tell meters, or
+/// its unit is arbitrary.
 ///
 /// The model is COLMAP's: cameras, images and points3D, as .txt or .bin. One that is in the folder is replaced. Where the photographs fall apart into several models, the one with most
 /// photographs is written into the folder itself, the others into its folders 1, 2, …
@@ -31,6 +38,7 @@ use std::path::{Path, PathBuf};
     cv sfm photos/ -o model --report page\n  \
     cv sfm 'photos/*.jpg' --camera cam.yaml -o model --cloud points.ply\n  \
     cv sfm photos/ --focal 2900 -o sparse/0 --format colmap-binary --json\n  \
+    cv sfm photos/ -o model --distance a.jpg b.jpg 2.5                 # meters between two photographs\n  \
     cv sfm photos/ -o model --transforms photos/transforms.json        # for Nerfstudio and instant-ngp\n  \
     cv sfm photos/ -o model --pinhole dense                            # for dense reconstruction, by COLMAP or OpenMVS")]
 pub(crate) struct Args {
@@ -70,6 +78,14 @@ pub(crate) struct Args {
     /// Where to write the photographs of the largest model without lens distortion (images/), and the model of their pinhole cameras (sparse/): a folder.
     #[arg(long, value_name = "DIR")]
     pinhole: Option<PathBuf>,
+    /// Go on with a run into the same folder that was stopped: what it found in the same photographs by the same options is taken.
+    #[arg(long)]
+    resume: bool,
+    /// Keep features and pairs (in .cv-sfm of the output's folder) when the model is done, for runs with --resume over more photographs or by other options of the solution.
+    #[arg(long)]
+    keep: bool,
+    #[command(flatten)]
+    places: PlaceArgs,
 }
 
 impl Run for Args {
@@ -94,14 +110,33 @@ impl Run for Args {
             return Err(Failure::usage(format!("{} is one photograph, too few for a model", only.display()))
                 .advice("two at least; ten or more of one place are usual"));
         }
-        let mut all = photographs(named)?;
+        let all = photographs(named)?;
+        let places = self.places.read(&all, context)?;
         let pinhole = self.pinhole.as_ref().map(|folder| PinholeFolder::new(folder, &all)).transpose()?;
+        let checkpoint = Checkpoint::new(&self.output, self.resume, context);
+        let outcome = self.reconstruct(all, places, pinhole.as_ref(), &options, &checkpoint, context);
+        checkpoint.end(self.keep, outcome.is_ok());
+        outcome
+    }
+}
+
+impl Args {
+    fn reconstruct(
+        &self,
+        mut all: Vec<Photograph>,
+        places: Places,
+        pinhole: Option<&PinholeFolder<'_>>,
+        options: &SfmJobOptions,
+        checkpoint: &Checkpoint<'_>,
+        context: &Context,
+    ) -> Result<Outcome, Failure> {
         let mut clock = cv_core::StageClock::new();
         let (mut cameras, mut photos, mut used) = (Cameras::default(), Vec::new(), Vec::new());
         let total = all.len();
         for (i, one) in all.iter_mut().enumerate() {
             if one.refused.is_none() {
-                match self.features_of(one, &mut cameras, &options, &Place { context, done: i, total })? {
+                let place = Place { context, done: i, total };
+                match self.features_of(one, &mut cameras, options, checkpoint, &place)? {
                     Ok(photo) => {
                         photos.push(photo);
                         used.push(i);
@@ -119,7 +154,17 @@ impl Run for Args {
             return Err(words::many_views::too_few(photos.len(), &refused));
         }
         clock.lap("features");
-        let result = sfm(&photos, &cameras.list, &options, context).map_err(words::many_views::no_model)?;
+        let find = || sfm_pairs(&photos, &cameras.list, options, context);
+        let (pairs, geometry) = checkpoint.pairs(&photos, &cameras.list, options, find)?;
+        clock.lap("match");
+        let mut result = sfm_solve(&photos, &cameras.list, pairs, &geometry, options, context)
+            .map_err(words::many_views::no_model)?;
+        let places = places.with_gps(&self.places, &all);
+        let frames: Vec<Frame> = result
+            .models
+            .iter_mut()
+            .map(|model| places.align(model, &all, &used, context))
+            .collect::<Result<_, Failure>>()?;
         let models: Vec<SparseModel> =
             (0..result.models.len()).filter_map(|m| result.sparse_model(m, &photos)).collect();
         let Some(main) = models.first() else { return Err(Failure::new("there is no model")) };
@@ -128,7 +173,7 @@ impl Run for Args {
         stages.extend(result.stages.iter().copied());
         let mut clock = cv_core::StageClock::new();
         self.write(&models, &all, &used, context)?;
-        if let Some(folder) = &pinhole {
+        if let Some(folder) = pinhole {
             folder.write(main, &all, &used, self.format, context)?;
         }
         clock.lap("write");
@@ -136,12 +181,10 @@ impl Run for Args {
         if let Some(text) = doubt(&models, &fates) {
             context.warn(text);
         }
-        context.report(|| report::report(&all, &fates, &models, &stages))?;
-        Ok(outcome(&all, &fates, &models, &result, stages))
+        context.report(|| report::report(&all, &fates, &models, &frames, &stages))?;
+        Ok(outcome(&all, &fates, &models, &frames, &result, checkpoint.taken(), stages))
     }
-}
 
-impl Args {
     fn options(&self, context: &Context) -> Result<SfmJobOptions, Failure> {
         if self.focal.is_some_and(|f| !(f > 0.0 && f.is_finite())) {
             return Err(Failure::usage("--focal must be above 0"));
@@ -163,22 +206,54 @@ impl Args {
     /// The features of a photograph, or why it is left out.
     fn features_of(
         &self,
+        one: &mut Photograph,
+        cameras: &mut Cameras,
+        options: &SfmJobOptions,
+        checkpoint: &Checkpoint<'_>,
+        place: &Place<'_>,
+    ) -> Result<Result<SfmPhoto, String>, Failure> {
+        place.report("photographs", 0, 0)?;
+        let (key, found) = checkpoint.seen(one, options);
+        let new = found.is_none();
+        let seen = match found {
+            Some(seen) => seen,
+            None => match self.look_at(one, cameras, options, place)? {
+                Ok(seen) => seen,
+                Err(reason) => return Ok(Err(reason)),
+            },
+        };
+        let camera = match cameras.of(seen.photo.size, seen.focal, self, place.context)? {
+            Ok(camera) => camera,
+            Err(reason) => return Ok(Err(reason)),
+        };
+        if new {
+            checkpoint.keep_seen(key, &seen);
+        }
+        checkpoint.add(key);
+        one.gps = seen.gps;
+        Ok(Ok(SfmPhoto { name: one.name.clone(), camera, ..seen.photo }))
+    }
+
+    /// What a photograph shows, or why it is left out.
+    fn look_at(
+        &self,
         one: &Photograph,
         cameras: &mut Cameras,
         options: &SfmJobOptions,
         place: &Place<'_>,
-    ) -> Result<Result<SfmPhoto, String>, Failure> {
+    ) -> Result<Result<Seen, String>, Failure> {
         let image = match cv_io::read_image(&one.path) {
             Ok(image) => image,
             Err(error) => return Ok(Err(words::many_views::not_read(&error))),
         };
-        let camera = match cameras.of(&image, self, place.context)? {
-            Ok(camera) => camera,
-            Err(reason) => return Ok(Err(reason)),
-        };
+        let (focal, gps) = (image.exif.focal.map(|f| f.pixels), image.exif.gps);
+        // Before the work.
+        if let Err(reason) = cameras.of(image.size(), focal, self, place.context)? {
+            return Ok(Err(reason));
+        }
         let rgb = image.into_rgb8();
-        match sfm_photo(rgb.view(), one.name.clone(), camera, &options.features, place) {
-            Ok(photo) => Ok(Ok(photo)),
+        match sfm_photo(rgb.view(), String::new(), 0, &options.features, place) {
+            Ok(photo) => Ok(Ok(Seen { focal, gps, photo })),
             Err(SfmPhotoError::Features(
                 error @ (FeatureError::ImageTooSmall { .. } | FeatureError::NotFinite { .. }),
             )) => Ok(Err(error.to_string())),
@@ -242,162 +317,4 @@ impl Progress for Place<'_> {
     fn report(&self, _: &'static str, _: usize, _: usize) -> Result<(), Cancelled> {
         Progress::report(self.context, "photographs", self.done, self.total)
     }
-}
-
-/// The cameras of the photographs so far.
-#[derive(Default)]
-struct Cameras {
-    list: Vec<SfmCamera>,
-    /// By size and focal length in thousandths of a pixel.
-    known: BTreeMap<(usize, usize, u64), usize>,
-}
-
-impl Cameras {
-    /// The index of a photograph's camera, or why it has none.
-    fn of(&mut self, image: &DynImage, args: &Args, context: &Context) -> Result<Result<usize, String>, Failure> {
-        let (width, height) = image.size();
-        let exif = image.exif.focal.map(|f| f.pixels).filter(|_| !args.ignore_exif && args.camera.is_none());
-        let focal = args.focal.or(exif);
-        let key = (width, height, focal.map_or(0, |f| (f * 1000.0).round() as u64));
-        if let Some(index) = self.known.get(&key) {
-            return Ok(Ok(*index));
-        }
-        let lens = |camera: Camera| Camera { distortion: Distortion::radial(0.0, 0.0), ..camera };
-        let camera = if let Some(file) = &args.camera {
-            let (camera, lens_known) = rig::camera_and_lens(file, Some((width, height)), context)?;
-            if (camera.width, camera.height) != (width, height) {
-                let (w, h) = (camera.width, camera.height);
-                return Ok(Err(format!("it is {width}×{height} px, its camera in {} is {w}×{h} px", file.display())));
-            }
-            match lens_known || args.undistorted {
-                true => {
-                    args.check_lens(file, &camera)?;
-                    SfmCamera { camera, knowledge: CameraKnowledge::Known }
-                }
-                false => SfmCamera { camera: lens(camera), knowledge: CameraKnowledge::Matrix },
-            }
-        } else if let Some(focal) = focal {
-            let camera = lens(Camera::from_focal(width, height, focal));
-            SfmCamera { camera, knowledge: CameraKnowledge::Focal { focal, deviation: EXIF_DEVIATION } }
-        } else {
-            // 1.2 times the longer side, COLMAP's, where the pairs do not tell better.
-            let camera = lens(Camera::from_focal(width, height, 1.2 * width.max(height) as f64));
-            SfmCamera { camera, knowledge: CameraKnowledge::Unknown }
-        };
-        self.list.push(camera);
-        self.known.insert(key, self.list.len() - 1);
-        Ok(Ok(self.list.len() - 1))
-    }
-}
-
-impl Args {
-    /// Refuses, before the work, a lens that the outputs cannot hold.
-    fn check_lens(&self, file: &Path, camera: &Camera) -> Result<(), Failure> {
-        let refuse = |error: cv_io::FormatError| {
-            Failure::new(format!("{}: {error}", file.display()))
-                .advice("photographs without distortion (`cv undistort`) and their camera")
-        };
-        if let Some(format) = CalibrationFormat::from_name("colmap") {
-            format.camera_text(camera, &[]).map_err(refuse)?;
-        }
-        if self.transforms.is_some() {
-            let image =
-                ModelImage { name: "photograph".to_owned(), camera: 1, pose: Pose::identity(), points: Vec::new() };
-            let model =
-                SparseModel { cameras: [(1, *camera)].into(), images: [(1, image)].into(), ..SparseModel::default() };
-            cv_io::transforms_json(&model, "").map_err(refuse)?;
-        }
-        Ok(())
-    }
-}
-
-/// Relative standard deviation of focal lengths by EXIF.
-const EXIF_DEVIATION: f64 = 0.03;
-
-/// What became of a photograph: the model it is in, or why it is in none.
-type Fate = Result<usize, String>;
-
-fn fates(all: &[Photograph], used: &[usize], outcomes: &[ViewOutcome]) -> Vec<Fate> {
-    let mut fates: Vec<Fate> = all.iter().map(|p| Err(p.refused.clone().unwrap_or_default())).collect();
-    for (at, outcome) in used.iter().zip(outcomes) {
-        fates[*at] = match outcome {
-            ViewOutcome::Registered { model } => Ok(*model),
-            other => Err(words::many_views::left_out(other).unwrap_or_default()),
-        };
-    }
-    fates
-}
-
-/// What to think of a model that is not of most photographs.
-fn doubt(models: &[SparseModel], fates: &[Fate]) -> Option<String> {
-    let inside = fates.iter().filter(|fate| **fate == Ok(0)).count();
-    let more = "photographs in between join them";
-    match models.len() {
-        1 if 2 * inside >= fates.len() => None,
-        1 => Some(format!("only {inside} of {} photographs are in the model; {more}", fates.len())),
-        n => Some(format!(
-            "the photographs fall apart into {n} models, whose places to each other are unknown; {inside} of {} are in the largest; {more}",
-            fates.len()
-        )),
-    }
-}
-
-/// Root mean square distance in pixels between the points' projections and where they were seen, over all observations.
-fn reprojection_rms(model: &SparseModel) -> f64 {
-    let errors: Vec<f64> = reprojections(model).collect();
-    (errors.iter().map(|e| e * e).sum::<f64>() / errors.len() as f64).sqrt()
-}
-
-/// The distance of each observation from its point's projection, in pixels.
-fn reprojections(model: &SparseModel) -> impl Iterator<Item = f64> + '_ {
-    model.points.values().flat_map(move |point| {
-        point.track.iter().filter_map(move |(id, index)| {
-            let image = model.images.get(id)?;
-            let at = image.points.get(*index as usize)?.0;
-            let pixel = model.cameras.get(&image.camera)?.project(&image.pose.transform(&point.position))?;
-            Some((pixel - at).norm())
-        })
-    })
-}
-
-fn outcome(
-    all: &[Photograph],
-    fates: &[Fate],
-    models: &[SparseModel],
-    result: &SfmResult,
-    stages: Vec<(&'static str, f64)>,
-) -> Outcome {
-    let image = |(one, fate): (&Photograph, &Fate)| {
-        let model = fate.as_ref().ok();
-        json!({ "path": one.path.display().to_string(), "used": model.is_some(), "model": model, "reason": fate.as_ref().err() })
-    };
-    let images: Vec<Value> = all.iter().zip(fates).map(image).collect();
-    let used = fates.iter().filter(|fate| fate.is_ok()).count();
-    let main = result.models.first();
-    let (points, observations) = main.map_or((0, 0), |m| (m.points.len(), m.observations()));
-    let (length, error) = main.map_or((0.0, 0.0), |m| (m.mean_track_length(), m.mean_reprojection_error()));
-    let rms = models.first().map_or(f64::NAN, reprojection_rms);
-    let focal: Vec<f64> = models.first().map_or_else(Vec::new, |m| m.cameras.values().map(|c| c.fx).collect());
-    let mut summary = format!(
-        "{used} of {} photographs in {} model{}; {points} points seen {length:.1} times each, {rms:.3} px RMS",
-        all.len(),
-        models.len(),
-        if models.len() == 1 { "" } else { "s" },
-    );
-    // What was refused has been warned of.
-    for (one, fate) in all.iter().zip(fates) {
-        if let (Err(reason), None) = (fate, &one.refused) {
-            summary += &format!("\n{}: left out: {reason}", one.path.display());
-        }
-    }
-    Outcome::new(stages)
-        .with("images", images)
-        .with("models", models.len())
-        .with("points", points)
-        .with("observations", observations)
-        .with("mean_track_length", length)
-        .with("reprojection_rms_px", rms)
-        .with("mean_reprojection_px", error)
-        .with("focal_px", focal)
-        .summary(summary)
 }

@@ -12,7 +12,7 @@ use cv_core::{Camera, Cancelled, OptionError, StageClock};
 use cv_features::{FeatureOptions, RatioTest};
 use cv_sfm::{
     CameraKnowledge, FeatureDistance, Observation, PairMatches, SfmError, SfmInput, SfmModel, SfmView, ViewOutcome,
-    ViewPairOptions, reconstruct_views,
+    ViewPairModel, ViewPairOptions, reconstruct_views,
 };
 
 /// Settings of [`sfm`].
@@ -130,7 +130,7 @@ impl FeatureDistance for Alike<'_> {
     }
 }
 
-/// Reconstructs cameras and points from the features of many photographs ([`sfm_photo`]): pairs that hold, then [`reconstruct_views`].
+/// Reconstructs cameras and points from the features of many photographs ([`sfm_photo`]): pairs that hold ([`sfm_pairs`]), then [`sfm_solve`].
 ///
 /// # Errors
 /// [`SfmJobError`].
@@ -140,6 +140,18 @@ pub fn sfm(
     options: &SfmJobOptions,
     progress: &dyn Progress,
 ) -> Result<SfmResult, SfmJobError> {
+    check(photos, cameras)?;
+    let mut clock = StageClock::new();
+    let (pairs, geometry) = sfm_pairs(photos, cameras, options, progress)?;
+    clock.lap("match");
+    let mut result = sfm_solve(photos, cameras, pairs, &geometry, options, progress)?;
+    let mut stages = clock.into_stages();
+    stages.append(&mut result.stages);
+    Ok(SfmResult { stages, ..result })
+}
+
+/// Every photograph has a camera of its size.
+fn check(photos: &[SfmPhoto], cameras: &[SfmCamera]) -> Result<(), SfmJobError> {
     for (index, photo) in photos.iter().enumerate() {
         let Some(SfmCamera { camera, .. }) = cameras.get(photo.camera) else {
             return Err(SfmJobError::NoCamera { index, camera: photo.camera, cameras: cameras.len() });
@@ -148,12 +160,26 @@ pub fn sfm(
             return Err(SfmJobError::CameraSize { index, photo: photo.size, camera: (camera.width, camera.height) });
         }
     }
-    let mut clock = StageClock::new();
-    let (pairs, geometry) = sfm_pairs(photos, cameras, options, progress)?;
-    clock.lap("match");
+    Ok(())
+}
+
+/// The second half of [`sfm`]: cameras and points ([`reconstruct_views`]) from pairs that [`sfm_pairs`] found, and their geometry.
+///
+/// # Errors
+/// [`SfmJobError`].
+pub fn sfm_solve(
+    photos: &[SfmPhoto],
+    cameras: &[SfmCamera],
+    pairs: Vec<PairMatches>,
+    geometry: &[ViewPairModel],
+    options: &SfmJobOptions,
+    progress: &dyn Progress,
+) -> Result<SfmResult, SfmJobError> {
+    check(photos, cameras)?;
     if pairs.is_empty() {
         return Err(SfmJobError::NoPairs { photos: photos.len() });
     }
+    let mut clock = StageClock::new();
     let views: Vec<SfmView<'_>> =
         photos.iter().map(|p| SfmView { camera: p.camera, keypoints: &p.keypoints }).collect();
     let (lenses, knowledge): (Vec<Camera>, Vec<CameraKnowledge>) =
@@ -164,7 +190,7 @@ pub fn sfm(
         cameras: &lenses,
         knowledge: &knowledge,
         pairs: &pairs,
-        geometry: &geometry,
+        geometry,
         alike: Some(&alike),
     };
     let found = reconstruct_views(&input, &options.solve, progress)?;
