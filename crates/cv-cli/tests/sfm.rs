@@ -479,3 +479,50 @@ fn a_run_that_is_killed_goes_on_to_the_same_bytes() {
     let ran = run(folder.path(), &call("model"));
     assert!(ran.stderr.contains("which --resume goes on with") && !at("model/.cv-sfm").exists(), "{}", ran.stderr);
 }
+
+#[test]
+fn photographs_are_added_to_a_model() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let walk = Scene::room_walk(12);
+    let mut truth = photographs(&at("photos"), "walk", &Scene::room(4), &walk[..8]);
+    let call = ["sfm", "photos", "--features", "3000", "--format", "colmap-binary", "-o", "model"];
+    json(
+        folder.path(),
+        &[&call[..], &["--camera", "K.txt", "--undistorted", "--distance", "walk00.png", "walk04.png", "3.0"]].concat(),
+    );
+    let first = colmap::read(at("model")).unwrap();
+    // In a frame of somebody else's.
+    let mut moved = first.clone();
+    let to = Pose::new(cv_core::Rotation3::from_euler_angles(0.3, 1.0, -0.4), Vector3::new(5.0, 6.0, 7.0));
+    for image in moved.images.values_mut() {
+        image.pose = image.pose.compose(&to.inverse());
+    }
+    moved.points.values_mut().for_each(|point| point.position = to.transform(&point.position));
+    fs::create_dir(at("start")).unwrap();
+    colmap::write(at("start"), &moved).unwrap();
+
+    truth.extend(photographs(&at("photos"), "then", &Scene::room(4), &walk[8..]));
+    let value = json(folder.path(), &[&call[..], &["--from", "start"]].concat());
+    assert_eq!((used(&value), value["models"].as_u64()), (vec![true; 12], Some(1)), "{value}");
+    assert_eq!((value["alignment"]["by"].as_str(), value["alignment"]["agree"].as_u64()), (Some("model"), Some(8)));
+    let more = colmap::read(at("model")).unwrap();
+    is_true(&more, &truth);
+    // The lens is the same to the last digit that the text has, and the frame to what eight poses change by with new photographs: a thousandth of three meters.
+    assert_eq!(more.cameras.values().map(|c| c.fx).collect::<Vec<_>>(), [FOCAL]);
+    for image in moved.images.values() {
+        let now = more.images.values().find(|other| other.name == image.name).unwrap();
+        let off = (now.pose.center() - image.pose.center()).norm();
+        assert!(off < 0.01, "{}: {off}", image.name);
+    }
+
+    let refuse = |args: &[&str], says: &str| {
+        let ran = run(folder.path(), &[&["sfm"], args].concat());
+        assert!(ran.code != Some(0) && ran.stderr.contains(says), "{args:?}: {ran:?}");
+    };
+    refuse(&["photos", "-o", "new", "--from", "nowhere"], "nowhere");
+    let then = ["photos/then00.png", "photos/then01.png", "-o", "new", "--from", "start"];
+    refuse(&then, "0 of the 8 photographs of start are among those given");
+    refuse(&["photos", "-o", "new", "--from", "start", "--focal", "330"], "cannot be used with");
+    assert!(!at("new").exists());
+}

@@ -3,7 +3,7 @@
 use crate::SfmModel;
 use cv_core::{Cancelled, Matrix3, Point3, Pose, Progress, Rotation3, Vector3, median, upright};
 use cv_geometry::{EstimateError, RobustOptions, Similarity, SimilarityFreedom, estimate_similarity};
-use cv_numeric::symmetric_eigen;
+use cv_numeric::{svd3, symmetric_eigen};
 
 /// What is known of where views were, by a source other than their pictures.
 #[derive(Debug, Clone, Copy, Default)]
@@ -270,6 +270,32 @@ fn upright_similarity(model: &SfmModel) -> Similarity {
     // (x, y, z) with Y down to (x, z, −y) with Z up.
     let stand = Rotation3::from_matrix_unchecked(Matrix3::new(1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0, 0.0));
     Similarity { scale: 1.0, rotation: stand * level.rotation, translation: stand * level.translation }
+}
+
+/// The similarity that brings a model to poses that are known of its views, turns and places together: so two views are enough, on a line or not. `None` of fewer than two, and of those in one
+/// place.
+pub fn align_to_poses(model: &SfmModel, known: &[Option<Pose>]) -> Option<Similarity> {
+    let both = model.poses.iter().zip(known).filter_map(|(found, known)| Some(((*found)?, (*known)?)));
+    let both: Vec<(Pose, Pose)> = both.collect();
+    let sum = both
+        .iter()
+        .fold(Matrix3::zeros(), |sum, (found, known)| sum + (known.rotation.inverse() * found.rotation).into_inner());
+    let rotation = svd3(&sum).ok().filter(|svd| svd.s[1] > 1e-9)?.nearest_rotation();
+    let mean = |of: fn(&(Pose, Pose)) -> Pose| {
+        both.iter().map(|pair| of(pair).center().coords).sum::<Vector3<f64>>() / both.len() as f64
+    };
+    let (from, to) = (mean(|p| p.0), mean(|p| p.1));
+    let (mut product, mut square) = (0.0, 0.0);
+    for (found, known) in &both {
+        let (p, q) = (rotation * (found.center().coords - from), known.center().coords - to);
+        (product, square) = (product + p.dot(&q), square + p.norm_squared());
+    }
+    let scale = product / square;
+    (both.len() >= 2 && scale > 0.0 && scale.is_finite()).then(|| Similarity {
+        scale,
+        rotation,
+        translation: to - rotation * from * scale,
+    })
 }
 
 fn scaled(of: &Similarity, by: f64) -> Similarity {

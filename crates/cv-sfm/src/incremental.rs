@@ -5,6 +5,7 @@ use crate::bundle::{BundlePlan, LensFreedom, adjust};
 use crate::complete::{FeatureDistance, complete};
 use crate::focal_length::focal_length;
 use crate::initial_pair::{Start, initial_pairs};
+use crate::known_poses::place_known;
 use crate::model::{SfmModel, ViewOutcome};
 use crate::registration::{Registration, register, visible};
 use crate::scene::Scene;
@@ -139,6 +140,20 @@ pub fn reconstruct_views(
     options: &SfmOptions,
     progress: &dyn Progress,
 ) -> Result<SfmOutcome, SfmError> {
+    reconstruct_views_from(input, &[], options, progress)
+}
+
+/// [`reconstruct_views`], the first model of which goes on from poses that are known, to some pixels: those of an earlier model in its frame ([`align_to_poses`](crate::align_to_poses) brings it
+/// back there to the last digit). `known` is by view; empty: none. A pose that the matches do not agree with is found anew.
+///
+/// # Errors
+/// [`SfmError`].
+pub fn reconstruct_views_from(
+    input: &SfmInput<'_>,
+    known: &[Option<Pose>],
+    options: &SfmOptions,
+    progress: &dyn Progress,
+) -> Result<SfmOutcome, SfmError> {
     check(input, options)?;
     let cameras = start_cameras(input);
     let keypoints: Vec<_> = input.views.iter().map(|v| v.keypoints).collect();
@@ -161,12 +176,27 @@ pub fn reconstruct_views(
         left.iter().for_each(|p| (open[p.a], open[p.b]) = (true, true));
         let open = open.into_iter().filter(|o| *o).count();
         let mut best: Option<(SfmModel, Vec<ViewOutcome>)> = None;
-        'search: for cameras in &cameras {
+        if models.is_empty() && known.iter().any(Option::is_some) {
+            scene.clear(&cameras[0], &tracks);
+            if place_known(&mut scene, known, options, &stage)? {
+                let mut found = outcomes.clone();
+                extend(&mut scene, &taken, options, &mut found, &stage)?;
+                finish(&mut scene, input.alike, options, &stage)?;
+                let (agree, of) = scene.support();
+                if agree as f64 >= LEAST_SUPPORT * of as f64 {
+                    best = Some((SfmModel::of(&scene, options.min_point_views), found));
+                }
+            }
+        }
+        // With known poses that hold there is nothing to look for.
+        let found_from_known = best.is_some();
+        'search: for cameras in cameras.iter().filter(|_| !found_from_known) {
             scene.clear(cameras, &tracks);
             for start in initial_pairs(&scene, &left, options, progress)?.iter().take(MOST_STARTS) {
                 scene.clear(cameras, &tracks);
                 let mut found = outcomes.clone();
-                grow(&mut scene, start, &taken, options, &mut found, &stage)?;
+                begin(&mut scene, start, options, &stage)?;
+                extend(&mut scene, &taken, options, &mut found, &stage)?;
                 finish(&mut scene, input.alike, options, &stage)?;
                 let (agree, of) = scene.support();
                 if (agree as f64) < LEAST_SUPPORT * of as f64 {
@@ -289,24 +319,31 @@ fn wide_limits(options: &SfmOptions) -> PointLimits {
     PointLimits { error: options.growing_error(), angle: options.min_angle }
 }
 
-/// Grows a model from a pair, as far as it goes.
-fn grow(
+/// Adjustments while a model grows.
+const QUICK: BundlePlan<'static> =
+    BundlePlan { free: None, lens: LensFreedom::Held, scale: 1.0, max_iterations: 6, tolerance: 1e-3 };
+
+/// Starts a model with a pair.
+fn begin(scene: &mut Scene<'_>, start: &Start, options: &SfmOptions, stage: &Stage<'_>) -> Result<(), Cancelled> {
+    scene.poses[start.a] = Some(Pose::identity());
+    scene.poses[start.b] = Some(start.pose);
+    let tracks: Vec<usize> = scene.of_view(start.a).map(|i| scene.track_of(i)).collect();
+    update_tracks(scene, wide_limits(options), &tracks);
+    adjust(scene, &QUICK, stage)?;
+    update_tracks(scene, wide_limits(options), &tracks);
+    Ok(())
+}
+
+/// Adds views to a model, one after the other, as far as it goes.
+fn extend(
     scene: &mut Scene<'_>,
-    start: &Start,
     taken: &[bool],
     options: &SfmOptions,
     outcomes: &mut [ViewOutcome],
     stage: &Stage<'_>,
 ) -> Result<(), Cancelled> {
-    scene.poses[start.a] = Some(Pose::identity());
-    scene.poses[start.b] = Some(start.pose);
-    let tracks: Vec<usize> = scene.of_view(start.a).map(|i| scene.track_of(i)).collect();
-    update_tracks(scene, wide_limits(options), &tracks);
     let all: Vec<usize> = (0..scene.tracks.len()).collect();
-    let quick = BundlePlan { free: None, lens: LensFreedom::Held, scale: 1.0, max_iterations: 6, tolerance: 1e-3 };
-    adjust(scene, &quick, stage)?;
-    update_tracks(scene, wide_limits(options), &tracks);
-    let mut adjusted = 2;
+    let mut adjusted = scene.registered().len();
     // Where a pose was refused: how many points were seen, so that it is tried again when there are more.
     let mut refused = vec![0usize; scene.views.len()];
     loop {
@@ -337,12 +374,12 @@ fn grow(
         let tracks: Vec<usize> = scene.of_view(view).map(|i| scene.track_of(i)).collect();
         update_tracks(scene, wide_limits(options), &tracks);
         let near = near_views(scene, view);
-        let local = BundlePlan { free: Some(&near), max_iterations: 3, ..quick };
+        let local = BundlePlan { free: Some(&near), max_iterations: 3, ..QUICK };
         let registered = scene.registered().len();
         if registered as f64 >= adjusted as f64 * options.growth || registered < 6 {
             let refinable = registered > 2 && scene.knowledge.iter().any(|k| !k.is_calibrated());
             let lens = if refinable { LensFreedom::Distortion } else { LensFreedom::Held };
-            adjust(scene, &BundlePlan { lens, ..quick }, stage)?;
+            adjust(scene, &BundlePlan { lens, ..QUICK }, stage)?;
             update_tracks(scene, wide_limits(options), &all);
             adjusted = registered;
         } else {

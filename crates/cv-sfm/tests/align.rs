@@ -4,7 +4,7 @@
 
 use cv_core::{Camera, Matrix3, Point3, Pose, Rotation3, Silent, Vector3};
 use cv_geometry::Similarity;
-use cv_sfm::{AlignError, Alignment, KnownPlaces, SfmModel, SfmPoint, align_model};
+use cv_sfm::{AlignError, Alignment, KnownPlaces, SfmModel, SfmPoint, align_model, align_to_poses};
 use std::f64::consts::TAU;
 
 /// A pseudo-random number from −1 to 1.
@@ -186,4 +186,21 @@ fn a_similarity_changes_no_picture() {
         let now = pose.transform(&model.points[0].position);
         assert!((now.coords - 3.0 * before.coords).norm() < 1e-9, "{now} {before}");
     }
+}
+
+#[test]
+fn known_poses_give_the_frame_also_on_a_line() {
+    let eyes: Vec<_> = (0..6).map(|i| Point3::new(2.0 * i as f64, 0.0, 1.6)).collect();
+    let (mut model, truth) = model(&eyes, |i| Vector3::new(0.2 * noise(i), 1.0, 0.0));
+    let known: Vec<Option<Pose>> = truth.iter().copied().map(Some).collect();
+    for n in [2, 6] {
+        let mut moved = model.clone();
+        moved.transform(&align_to_poses(&model, &known[..n]).unwrap());
+        // Rounding of coordinates of ten.
+        let (off, degrees) = worst(&moved, &truth);
+        assert!(off < 1e-9 && degrees < 1e-6, "{n}: {off} {degrees}");
+    }
+    assert_eq!(align_to_poses(&model, &known[..1]), None);
+    model.poses.fill(None);
+    assert_eq!(align_to_poses(&model, &known), None);
 }

@@ -2,6 +2,7 @@
 
 mod cameras;
 mod checkpoint;
+mod earlier;
 mod outcome;
 mod photographs;
 mod pinhole;
@@ -16,7 +17,9 @@ use cv_core::{PointCloud, SparseModel};
 use cv_io::colmap::{self, ModelFormat};
 use cv_io::ply::PlyEncoding;
 use cv_pipeline::features::FeatureError;
+use cv_pipeline::many_views::SfmModel;
 use cv_pipeline::{Cancelled, Progress, SfmJobOptions, SfmPhoto, SfmPhotoError, sfm_pairs, sfm_photo, sfm_solve};
+use earlier::Earlier;
 use outcome::{doubt, fates, outcome};
 use photographs::{Photograph, photographs, seen_from};
 use pinhole::PinholeFolder;
@@ -39,6 +42,7 @@ use std::path::{Path, PathBuf};
     cv sfm 'photos/*.jpg' --camera cam.yaml -o model --cloud points.ply\n  \
     cv sfm photos/ --focal 2900 -o sparse/0 --format colmap-binary --json\n  \
     cv sfm photos/ -o model --distance a.jpg b.jpg 2.5                 # meters between two photographs\n  \
+    cv sfm photos/ more/ --from model -o model                         # more photographs of the same place\n  \
     cv sfm photos/ -o model --transforms photos/transforms.json        # for Nerfstudio and instant-ngp\n  \
     cv sfm photos/ -o model --pinhole dense                            # for dense reconstruction, by COLMAP or OpenMVS")]
 pub(crate) struct Args {
@@ -57,6 +61,9 @@ pub(crate) struct Args {
     /// About what focal length in pixels the photographs have.
     #[arg(long, value_name = "PX")]
     focal: Option<f64>,
+    /// A model of some of the photographs, as COLMAP's text or binary: its poses are gone on from, its lenses stay as they are, its frame is kept, and the photographs that it lacks are added.
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["camera", "focal"])]
+    from: Option<PathBuf>,
     /// Estimate the focal length even where the photographs' EXIF has one.
     #[arg(long, conflicts_with_all = ["camera", "focal"])]
     ignore_exif: bool,
@@ -113,8 +120,10 @@ impl Run for Args {
         let all = photographs(named)?;
         let places = self.places.read(&all, context)?;
         let pinhole = self.pinhole.as_ref().map(|folder| PinholeFolder::new(folder, &all)).transpose()?;
+        let earlier = self.from.as_ref().map(|folder| Earlier::read(folder, &all, context)).transpose()?;
         let checkpoint = Checkpoint::new(&self.output, self.resume, context);
-        let outcome = self.reconstruct(all, places, pinhole.as_ref(), &options, &checkpoint, context);
+        let told = Told { places, earlier, pinhole };
+        let outcome = self.reconstruct(all, told, &options, &checkpoint, context);
         checkpoint.end(self.keep, outcome.is_ok());
         outcome
     }
@@ -124,8 +133,7 @@ impl Args {
     fn reconstruct(
         &self,
         mut all: Vec<Photograph>,
-        places: Places,
-        pinhole: Option<&PinholeFolder<'_>>,
+        told: Told<'_>,
         options: &SfmJobOptions,
         checkpoint: &Checkpoint<'_>,
         context: &Context,
@@ -135,8 +143,22 @@ impl Args {
         let total = all.len();
         for (i, one) in all.iter_mut().enumerate() {
             if one.refused.is_none() {
+                let camera = |cameras: &mut Cameras, size, exif: Option<f64>| match told
+                    .earlier
+                    .as_ref()
+                    .and_then(|e| Some((e, e.camera(i, size, exif.filter(|_| !self.ignore_exif))?)))
+                {
+                    Some((earlier, camera)) => cameras.of_earlier(size, camera, earlier, self),
+                    None => cameras.of(size, exif, self, context),
+                };
                 let place = Place { context, done: i, total };
-                match self.features_of(one, &mut cameras, options, checkpoint, &place)? {
+                match self.features_of(
+                    one,
+                    |size, exif| camera(&mut cameras, size, exif),
+                    options,
+                    checkpoint,
+                    &place,
+                )? {
                     Ok(photo) => {
                         photos.push(photo);
                         used.push(i);
@@ -157,14 +179,10 @@ impl Args {
         let find = || sfm_pairs(&photos, &cameras.list, options, context);
         let (pairs, geometry) = checkpoint.pairs(&photos, &cameras.list, options, find)?;
         clock.lap("match");
-        let mut result = sfm_solve(&photos, &cameras.list, pairs, &geometry, options, context)
+        let known = told.earlier.as_ref().map_or_else(Vec::new, |earlier| earlier.poses(&used));
+        let mut result = sfm_solve(&photos, &cameras.list, (pairs, &geometry), &known, options, context)
             .map_err(words::many_views::no_model)?;
-        let places = places.with_gps(&self.places, &all);
-        let frames: Vec<Frame> = result
-            .models
-            .iter_mut()
-            .map(|model| places.align(model, &all, &used, context))
-            .collect::<Result<_, Failure>>()?;
+        let frames = told.frames(&self.places, &mut result.models, &all, &used, context)?;
         let models: Vec<SparseModel> =
             (0..result.models.len()).filter_map(|m| result.sparse_model(m, &photos)).collect();
         let Some(main) = models.first() else { return Err(Failure::new("there is no model")) };
@@ -173,7 +191,7 @@ impl Args {
         stages.extend(result.stages.iter().copied());
         let mut clock = cv_core::StageClock::new();
         self.write(&models, &all, &used, context)?;
-        if let Some(folder) = pinhole {
+        if let Some(folder) = &told.pinhole {
             folder.write(main, &all, &used, self.format, context)?;
         }
         clock.lap("write");
@@ -207,7 +225,7 @@ impl Args {
     fn features_of(
         &self,
         one: &mut Photograph,
-        cameras: &mut Cameras,
+        mut camera: impl FnMut((usize, usize), Option<f64>) -> Result<Result<usize, String>, Failure>,
         options: &SfmJobOptions,
         checkpoint: &Checkpoint<'_>,
         place: &Place<'_>,
@@ -217,12 +235,12 @@ impl Args {
         let new = found.is_none();
         let seen = match found {
             Some(seen) => seen,
-            None => match self.look_at(one, cameras, options, place)? {
+            None => match self.look_at(one, &mut camera, options, place)? {
                 Ok(seen) => seen,
                 Err(reason) => return Ok(Err(reason)),
             },
         };
-        let camera = match cameras.of(seen.photo.size, seen.focal, self, place.context)? {
+        let camera = match camera(seen.photo.size, seen.focal)? {
             Ok(camera) => camera,
             Err(reason) => return Ok(Err(reason)),
         };
@@ -238,7 +256,7 @@ impl Args {
     fn look_at(
         &self,
         one: &Photograph,
-        cameras: &mut Cameras,
+        mut camera: impl FnMut((usize, usize), Option<f64>) -> Result<Result<usize, String>, Failure>,
         options: &SfmJobOptions,
         place: &Place<'_>,
     ) -> Result<Result<Seen, String>, Failure> {
@@ -248,7 +266,7 @@ impl Args {
         };
         let (focal, gps) = (image.exif.focal.map(|f| f.pixels), image.exif.gps);
         // Before the work.
-        if let Err(reason) = cameras.of(image.size(), focal, self, place.context)? {
+        if let Err(reason) = camera(image.size(), focal)? {
             return Ok(Err(reason));
         }
         let rgb = image.into_rgb8();
@@ -303,6 +321,33 @@ impl Args {
             })?;
         }
         Ok(())
+    }
+}
+
+/// What the person tells of the photographs, and the folder of those without distortion.
+struct Told<'a> {
+    places: Places,
+    earlier: Option<Earlier>,
+    pinhole: Option<PinholeFolder<'a>>,
+}
+
+impl Told<'_> {
+    /// Brings each model to what is known: by the person's own numbers, by an earlier model, or by what the photographs say of themselves.
+    fn frames(
+        &self,
+        args: &PlaceArgs,
+        models: &mut [SfmModel],
+        all: &[Photograph],
+        used: &[usize],
+        context: &Context,
+    ) -> Result<Vec<Frame>, Failure> {
+        let earlier = self.earlier.as_ref().filter(|_| !self.places.is_told());
+        let places = self.places.with_gps(args, all);
+        let one = |model: &mut SfmModel| match earlier.and_then(|earlier| earlier.align(model, used)) {
+            Some(frame) => Ok(frame),
+            None => places.align(model, all, used, context),
+        };
+        models.iter_mut().map(one).collect()
     }
 }
 

@@ -65,6 +65,7 @@ pub(crate) fn no_model(error: SfmJobError) -> Failure {
 }
 
 /// By what a place is known.
+#[derive(Clone)]
 pub(crate) enum PlaceSource {
     /// The photographs' EXIF: the place of the origin, and whether heights are told.
     Gps { origin: GeodeticPoint, heights: bool },

@@ -8,11 +8,11 @@ pub use pairs::sfm_pairs;
 pub use photo::{SfmPhoto, SfmPhotoError, sfm_photo};
 
 use crate::Progress;
-use cv_core::{Camera, Cancelled, OptionError, StageClock};
+use cv_core::{Camera, Cancelled, OptionError, Pose, StageClock};
 use cv_features::{FeatureOptions, RatioTest};
 use cv_sfm::{
     CameraKnowledge, FeatureDistance, Observation, PairMatches, SfmError, SfmInput, SfmModel, SfmView, ViewOutcome,
-    ViewPairModel, ViewPairOptions, reconstruct_views,
+    ViewPairModel, ViewPairOptions, reconstruct_views_from,
 };
 
 /// Settings of [`sfm`].
@@ -144,7 +144,7 @@ pub fn sfm(
     let mut clock = StageClock::new();
     let (pairs, geometry) = sfm_pairs(photos, cameras, options, progress)?;
     clock.lap("match");
-    let mut result = sfm_solve(photos, cameras, pairs, &geometry, options, progress)?;
+    let mut result = sfm_solve(photos, cameras, (pairs, &geometry), &[], options, progress)?;
     let mut stages = clock.into_stages();
     stages.append(&mut result.stages);
     Ok(SfmResult { stages, ..result })
@@ -163,15 +163,16 @@ fn check(photos: &[SfmPhoto], cameras: &[SfmCamera]) -> Result<(), SfmJobError> 
     Ok(())
 }
 
-/// The second half of [`sfm`]: cameras and points ([`reconstruct_views`]) from pairs that [`sfm_pairs`] found, and their geometry.
+/// The second half of [`sfm`]: cameras and points ([`reconstruct_views_from`]) from pairs that [`sfm_pairs`] found, and their geometry. `known`: poses of photographs by an earlier model, which
+/// the first one goes on from; empty where there is none.
 ///
 /// # Errors
 /// [`SfmJobError`].
 pub fn sfm_solve(
     photos: &[SfmPhoto],
     cameras: &[SfmCamera],
-    pairs: Vec<PairMatches>,
-    geometry: &[ViewPairModel],
+    (pairs, geometry): (Vec<PairMatches>, &[ViewPairModel]),
+    known: &[Option<Pose>],
     options: &SfmJobOptions,
     progress: &dyn Progress,
 ) -> Result<SfmResult, SfmJobError> {
@@ -193,7 +194,7 @@ pub fn sfm_solve(
         geometry,
         alike: Some(&alike),
     };
-    let found = reconstruct_views(&input, &options.solve, progress)?;
+    let found = reconstruct_views_from(&input, known, &options.solve, progress)?;
     clock.lap("solve");
     Ok(SfmResult { models: found.models, outcomes: found.views, pairs, stages: clock.into_stages() })
 }

@@ -1,6 +1,7 @@
 //! The cameras of the photographs: which of them share one, and what is known of it.
 
 use super::Args;
+use super::earlier::Earlier;
 use crate::frame::{Context, Failure};
 use crate::rig;
 use cv_core::{Camera, Distortion, ModelImage, Pose, SparseModel};
@@ -19,9 +20,33 @@ pub(super) struct Cameras {
     pub(super) list: Vec<SfmCamera>,
     /// By size and focal length in thousandths of a pixel.
     known: BTreeMap<(usize, usize, u64), usize>,
+    /// By their numbers in an earlier model.
+    earlier: BTreeMap<u32, usize>,
 }
 
 impl Cameras {
+    /// The index of a camera of an earlier model, or why it is not that of a photograph of that size.
+    pub(super) fn of_earlier(
+        &mut self,
+        size: (usize, usize),
+        (number, camera): (u32, Camera),
+        earlier: &Earlier,
+        args: &Args,
+    ) -> Result<Result<usize, String>, Failure> {
+        if (camera.width, camera.height) != size {
+            let ((w, h), (width, height)) = ((camera.width, camera.height), size);
+            let folder = earlier.folder().display();
+            return Ok(Err(format!("it is {width}×{height} px, its camera in {folder} is {w}×{h} px")));
+        }
+        if let Some(index) = self.earlier.get(&number) {
+            return Ok(Ok(*index));
+        }
+        args.check_lens(earlier.folder(), &camera)?;
+        self.list.push(SfmCamera { camera, knowledge: CameraKnowledge::Known });
+        self.earlier.insert(number, self.list.len() - 1);
+        Ok(Ok(self.list.len() - 1))
+    }
+
     /// The index of the camera of a photograph of that size and, by EXIF, that focal length in pixels, or why it has none.
     pub(super) fn of(
         &mut self,

@@ -23,6 +23,7 @@ pub(super) struct PlaceArgs {
 }
 
 /// What is known, by photographs as they were named.
+#[derive(Clone)]
 pub(super) struct Places {
     centers: Vec<Option<Point3<f64>>>,
     source: Option<PlaceSource>,
@@ -105,9 +106,10 @@ pub(super) struct Frame {
 
 impl Places {
     /// Takes what the photographs tell themselves, where the person tells nothing.
-    pub(super) fn with_gps(mut self, args: &PlaceArgs, all: &[Photograph]) -> Self {
+    pub(super) fn with_gps(&self, args: &PlaceArgs, all: &[Photograph]) -> Self {
+        let mut places = self.clone();
         if args.ignore_gps || self.source.is_some() {
-            return self;
+            return places;
         }
         // Heights are told by all that count, or by none: one that is not told is no height of 0.
         let told: Vec<usize> = (0..all.len()).filter(|i| all[*i].gps.is_some()).collect();
@@ -122,12 +124,17 @@ impl Places {
             })
         };
         let positions: Vec<GeodeticPoint> = count.iter().filter_map(place).collect();
-        let Some(origin) = positions.first().copied() else { return self };
+        let Some(origin) = positions.first().copied() else { return places };
         for (i, place) in count.iter().zip(east_north_up(&positions)) {
-            self.centers[*i] = Some(place);
+            places.centers[*i] = Some(place);
         }
-        self.source = Some(PlaceSource::Gps { origin, heights });
-        self
+        places.source = Some(PlaceSource::Gps { origin, heights });
+        places
+    }
+
+    /// Whether the person tells anything.
+    pub(super) fn is_told(&self) -> bool {
+        self.source.is_some() || !self.distances.is_empty()
     }
 
     /// Brings a model to what is known; `used` are the photographs of its views. What contradicts it is told, and left aside.
