@@ -334,7 +334,20 @@ fn models_are_brought_to_positions_known_places_and_distances() {
     // A tape between two photographs.
     let apart = |a: &str, b: &str| (truth[a].center() - truth[b].center()).norm();
     let tape = format!("{:.4}", apart("walk02.png", "walk08.png"));
-    let (value, model) = with(&["--distance", "walk02.png", "photos/walk08.png", &tape]);
+    let (value, model) = with(&["--distance", "walk02.png", "photos/walk08.png", &tape, "--covariance", "sigma.json"]);
+    let sigma: Value = serde_json::from_str(&fs::read_to_string(at("sigma.json")).unwrap()).unwrap();
+    let images = sigma["images"].as_array().unwrap();
+    assert_eq!(
+        (images.len(), sigma["points"].as_array().unwrap().len(), sigma["unit"].as_str()),
+        (12, model.points.len(), Some("m"))
+    );
+    // A third of a pixel at 330 is a thousandth; a camera sees a hundred points and more from some meters: some tenths of a millimeter to some millimeters, and of one camera nothing.
+    let deviation = |image: &Value| (0..3).map(|i| image["center"][i].as_f64().unwrap()).fold(0.0, f64::max);
+    assert!(
+        images.iter().all(|i| deviation(i) < 0.01) && images.iter().filter(|i| deviation(i) > 1e-4).count() >= 10,
+        "{images:?}"
+    );
+    assert!(images.iter().any(|i| deviation(i) < 1e-12 && i["name"] == sigma["exact"]["pose_of"]));
     assert_eq!((value["alignment"]["by"].as_str(), value["alignment"]["unit"].as_str()), (Some("distance"), Some("m")));
     let center = |name: &str| model.images.values().find(|image| image.name == name).unwrap().pose.center();
     // Centers are known to a thousandth of the room.

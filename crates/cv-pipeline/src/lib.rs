@@ -92,7 +92,8 @@ pub use rectify::{RectifyResult, rectify};
 pub use rig_depth::{RigDepthResult, depth_by_rig};
 pub use segment::{DetectResult, SegmentResult, SegmentTraining, detect, segment, train_segment};
 pub use sfm::{
-    SfmCamera, SfmJobError, SfmJobOptions, SfmPhoto, SfmPhotoError, SfmResult, sfm, sfm_pairs, sfm_photo, sfm_solve,
+    SfmCamera, SfmJobError, SfmJobOptions, SfmPhoto, SfmPhotoError, SfmResult, sfm, sfm_covariance, sfm_pairs,
+    sfm_photo, sfm_solve,
 };
 
 /// What a caller of [`depth()`] needs of the stereo stage: its options and results, rectification, geometry and scores.

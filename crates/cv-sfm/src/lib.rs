@@ -52,6 +52,7 @@
 mod align;
 mod bundle;
 mod complete;
+mod covariance;
 mod focal_length;
 mod incremental;
 mod initial_pair;
@@ -65,6 +66,8 @@ mod view_pair;
 
 pub use align::{AlignError, Alignment, CenterFit, KnownPlaces, align_model, align_to_poses};
 pub use complete::FeatureDistance;
+pub use covariance::{ModelCovariance, PoseCovariance, model_covariance};
+pub use cv_numeric::adjust::AdjustError;
 pub use incremental::{SfmError, SfmInput, SfmOptions, SfmOutcome, reconstruct_views, reconstruct_views_from};
 pub use model::{SfmModel, SfmPoint, ViewOutcome};
 pub use tracks::{Observation, PairMatches, Tracks};

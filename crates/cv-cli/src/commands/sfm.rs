@@ -2,6 +2,7 @@
 
 mod cameras;
 mod checkpoint;
+mod covariance;
 mod earlier;
 mod outcome;
 mod photographs;
@@ -18,7 +19,9 @@ use cv_io::colmap::{self, ModelFormat};
 use cv_io::ply::PlyEncoding;
 use cv_pipeline::features::FeatureError;
 use cv_pipeline::many_views::SfmModel;
-use cv_pipeline::{Cancelled, Progress, SfmJobOptions, SfmPhoto, SfmPhotoError, sfm_pairs, sfm_photo, sfm_solve};
+use cv_pipeline::{
+    Cancelled, Progress, SfmJobOptions, SfmPhoto, SfmPhotoError, sfm_covariance, sfm_pairs, sfm_photo, sfm_solve,
+};
 use earlier::Earlier;
 use outcome::{doubt, fates, outcome};
 use photographs::{Photograph, photographs, seen_from};
@@ -85,6 +88,9 @@ pub(crate) struct Args {
     /// Where to write the photographs of the largest model without lens distortion (images/), and the model of their pinhole cameras (sparse/): a folder.
     #[arg(long, value_name = "DIR")]
     pinhole: Option<PathBuf>,
+    /// Where to write how well the cameras and points of the largest model are known: standard deviations, as JSON. They are relative to one photograph's pose and its distance from another.
+    #[arg(long, value_name = "FILE")]
+    covariance: Option<PathBuf>,
     /// Go on with a run into the same folder that was stopped: what it found in the same photographs by the same options is taken.
     #[arg(long)]
     resume: bool,
@@ -101,6 +107,7 @@ impl Run for Args {
         all.extend(self.cloud.iter().map(|path| Output::File(path, CLOUD)));
         all.extend(self.transforms.iter().map(|path| Output::File(path, JSON)));
         all.extend(self.pinhole.iter().map(|path| Output::Folder(path)));
+        all.extend(self.covariance.iter().map(|path| Output::File(path, JSON)));
         all
     }
 
@@ -195,6 +202,13 @@ impl Args {
             folder.write(main, &all, &used, self.format, context)?;
         }
         clock.lap("write");
+        if let (Some(path), Some(model), Some(frame)) = (&self.covariance, result.models.first(), frames.first()) {
+            let names: Vec<&str> = photos.iter().map(|photo| photo.name.as_str()).collect();
+            let of = sfm_covariance(&photos, &cameras.list, model)?;
+            let text = covariance::deviations(&of, &names, &frame.json["unit"]).to_string();
+            context.write(Output::File(path, JSON), |path| cv_io::write_bytes(path, text.as_bytes()))?;
+            clock.lap("covariance");
+        }
         stages.extend(clock.into_stages());
         if let Some(text) = doubt(&models, &fates) {
             context.warn(text);

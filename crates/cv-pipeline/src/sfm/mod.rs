@@ -11,8 +11,8 @@ use crate::Progress;
 use cv_core::{Camera, Cancelled, OptionError, Pose, StageClock};
 use cv_features::{FeatureOptions, RatioTest};
 use cv_sfm::{
-    CameraKnowledge, FeatureDistance, Observation, PairMatches, SfmError, SfmInput, SfmModel, SfmView, ViewOutcome,
-    ViewPairModel, ViewPairOptions, reconstruct_views_from,
+    AdjustError, CameraKnowledge, FeatureDistance, ModelCovariance, Observation, PairMatches, SfmError, SfmInput,
+    SfmModel, SfmView, ViewOutcome, ViewPairModel, ViewPairOptions, model_covariance, reconstruct_views_from,
 };
 
 /// Settings of [`sfm`].
@@ -99,6 +99,9 @@ pub enum SfmJobError {
     /// The pairs give no model.
     #[error(transparent)]
     Solve(SfmError),
+    /// Something of a model is not determined, or it is of other photographs.
+    #[error("no covariances: {0}")]
+    Covariance(AdjustError),
     /// An option is outside its range.
     #[error(transparent)]
     Option(#[from] OptionError),
@@ -163,6 +166,24 @@ fn check(photos: &[SfmPhoto], cameras: &[SfmCamera]) -> Result<(), SfmJobError> 
     Ok(())
 }
 
+/// How well the cameras and points of a model are known that [`sfm`] found of these photographs, in the model's frame and unit ([`model_covariance`]).
+///
+/// # Errors
+/// [`SfmJobError::Covariance`].
+pub fn sfm_covariance(
+    photos: &[SfmPhoto],
+    cameras: &[SfmCamera],
+    model: &SfmModel,
+) -> Result<ModelCovariance, SfmJobError> {
+    check(photos, cameras)?;
+    let knowledge: Vec<CameraKnowledge> = cameras.iter().map(|c| c.knowledge).collect();
+    model_covariance(&views(photos), &knowledge, model).map_err(SfmJobError::Covariance)
+}
+
+fn views(photos: &[SfmPhoto]) -> Vec<SfmView<'_>> {
+    photos.iter().map(|p| SfmView { camera: p.camera, keypoints: &p.keypoints }).collect()
+}
+
 /// The second half of [`sfm`]: cameras and points ([`reconstruct_views_from`]) from pairs that [`sfm_pairs`] found, and their geometry. `known`: poses of photographs by an earlier model, which
 /// the first one goes on from; empty where there is none.
 ///
@@ -181,8 +202,7 @@ pub fn sfm_solve(
         return Err(SfmJobError::NoPairs { photos: photos.len() });
     }
     let mut clock = StageClock::new();
-    let views: Vec<SfmView<'_>> =
-        photos.iter().map(|p| SfmView { camera: p.camera, keypoints: &p.keypoints }).collect();
+    let views = views(photos);
     let (lenses, knowledge): (Vec<Camera>, Vec<CameraKnowledge>) =
         cameras.iter().map(|c| (c.camera, c.knowledge)).unzip();
     let alike = Alike(photos);
