@@ -539,3 +539,66 @@ fn photographs_are_added_to_a_model() {
     refuse(&["photos", "-o", "new", "--from", "start", "--focal", "330"], "cannot be used with");
     assert!(!at("new").exists());
 }
+
+/// Of a binary PLY with colors.
+fn positions_and_normals(bytes: &[u8]) -> Vec<[[f32; 3]; 2]> {
+    let end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+    let header = String::from_utf8_lossy(&bytes[..end]).into_owned();
+    let names: Vec<&str> =
+        header.lines().filter(|l| l.starts_with("property")).filter_map(|l| l.split(' ').next_back()).collect();
+    assert_eq!(names, ["x", "y", "z", "nx", "ny", "nz", "red", "green", "blue"], "{header}");
+    let number = |p: &[u8], i: usize| f32::from_le_bytes(p[4 * i..4 * i + 4].try_into().unwrap());
+    bytes[end..].chunks_exact(27).map(|p| [[0, 1, 2], [3, 4, 5]].map(|at| at.map(|i| number(p, i)))).collect()
+}
+
+#[test]
+fn a_dense_cloud_lies_on_the_surfaces() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let (scene, walk) = (Scene::room(4), Scene::room_walk(48));
+    let truth = photographs(&at("photos"), "walk", &scene, &walk[..6]);
+    // In the frame of the room, Z up.
+    let place = |(name, pose): (&String, &Pose)| {
+        let p = east_north_up(pose.center());
+        format!("{name} {} {} {}\n", p.x, p.y, p.z)
+    };
+    fs::write(at("places.txt"), truth.iter().map(place).collect::<String>()).unwrap();
+    let call = ["sfm", "photos", "--camera", "K.txt", "--undistorted", "--known", "places.txt", "-o", "model"];
+    let value = json(folder.path(), &[&call[..], &["--dense", "dense.ply", "--threads", "2"]].concat());
+    let cloud = positions_and_normals(&fs::read(at("dense.ply")).unwrap());
+    assert_eq!(value["dense_points"].as_u64(), Some(cloud.len() as u64));
+    assert!(value["dense_pairs"].as_u64().unwrap() >= 6, "{value}");
+    // Of 720,000 pixels, of each of which there may be a point.
+    assert!(cloud.len() > 60_000, "{}", cloud.len());
+    let depths: Vec<_> = walk[..6]
+        .iter()
+        .map(|pose| (pose, render(&scene, &camera(), pose, &RenderOptions::default()).unwrap().depth))
+        .collect();
+    let (mut right, mut facing) = (0, 0);
+    for [p, n] in &cloud {
+        let world = Point3::new(f64::from(p[0]), -f64::from(p[2]), f64::from(p[1]));
+        let normal = Vector3::new(f64::from(n[0]), -f64::from(n[2]), f64::from(n[1]));
+        let off = |(pose, depth): &(&Pose, cv_core::GrayF32)| {
+            let local = pose.transform(&world);
+            let pixel = camera().project(&local)?;
+            let inside = (0.0..399.0).contains(&pixel.x) && (0.0..299.0).contains(&pixel.y);
+            let seen = f64::from(depth.get(pixel.x.round() as usize, pixel.y.round() as usize)?[0]);
+            inside.then_some((local.z / seen - 1.0).abs())
+        };
+        let least = depths.iter().filter_map(off).fold(f64::INFINITY, f64::min);
+        right += usize::from(least < 0.05);
+        facing += usize::from(depths.iter().any(|(pose, _)| normal.dot(&(pose.center() - world)) > 0.0));
+    }
+    let share = right as f64 / cloud.len() as f64;
+    // Neighbors are 0.15 to 0.2 m apart: things 5 m away have a disparity of ten pixels, of which half a one is five per cent. Pixels at edges show a share of what is behind, in both.
+    assert!(share > 0.95 && facing == cloud.len(), "{share}");
+    let other = [&call[..], &["--dense", "again.ply", "--threads", "1"]].concat();
+    json(folder.path(), &other);
+    assert!(fs::read(at("dense.ply")).unwrap() == fs::read(at("again.ply")).unwrap(), "another number of threads");
+
+    // One pair, which nothing confirms: what is wrong, and the model is there all the same.
+    let two = ["sfm", "photos/walk00.png", "photos/walk03.png", "--camera", "K.txt", "--undistorted", "-o", "two"];
+    let ran = refused(folder.path(), &[&two[..], &["--dense", "two.ply"]].concat());
+    assert!(ran.stderr.contains("is confirmed by another pair; try: three photographs"), "{}", ran.stderr);
+    assert!(at("two/images.txt").exists() && !at("two.ply").exists());
+}

@@ -39,6 +39,7 @@ mod frame_depth;
 mod guided;
 mod matching;
 mod no_pair;
+mod pair_depth;
 mod panorama;
 mod reconstruct;
 mod rectify;
@@ -92,8 +93,8 @@ pub use rectify::{RectifyResult, rectify};
 pub use rig_depth::{RigDepthResult, depth_by_rig};
 pub use segment::{DetectResult, SegmentResult, SegmentTraining, detect, segment, train_segment};
 pub use sfm::{
-    SfmCamera, SfmJobError, SfmJobOptions, SfmPhoto, SfmPhotoError, SfmResult, sfm, sfm_covariance, sfm_pairs,
-    sfm_photo, sfm_solve,
+    DensePhoto, SfmCamera, SfmDense, SfmDenseError, SfmDenseOptions, SfmJobError, SfmJobOptions, SfmPhoto,
+    SfmPhotoError, SfmResult, sfm, sfm_covariance, sfm_dense, sfm_pairs, sfm_photo, sfm_solve,
 };
 
 /// What a caller of [`depth()`] needs of the stereo stage: its options and results, rectification, geometry and scores.

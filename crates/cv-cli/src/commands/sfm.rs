@@ -3,6 +3,7 @@
 mod cameras;
 mod checkpoint;
 mod covariance;
+mod dense;
 mod earlier;
 mod outcome;
 mod photographs;
@@ -22,6 +23,7 @@ use cv_pipeline::many_views::SfmModel;
 use cv_pipeline::{
     Cancelled, Progress, SfmJobOptions, SfmPhoto, SfmPhotoError, sfm_covariance, sfm_pairs, sfm_photo, sfm_solve,
 };
+use dense::DenseArgs;
 use earlier::Earlier;
 use outcome::{doubt, fates, outcome};
 use photographs::{Photograph, photographs, seen_from};
@@ -47,6 +49,7 @@ use std::path::{Path, PathBuf};
     cv sfm photos/ -o model --distance a.jpg b.jpg 2.5                 # meters between two photographs\n  \
     cv sfm photos/ more/ --from model -o model                         # more photographs of the same place\n  \
     cv sfm photos/ -o model --transforms photos/transforms.json        # for Nerfstudio and instant-ngp\n  \
+    cv sfm photos/ -o model --dense dense.ply                          # surfaces as points with normals\n  \
     cv sfm photos/ -o model --pinhole dense                            # for dense reconstruction, by COLMAP or OpenMVS")]
 pub(crate) struct Args {
     /// Photographs, folders or quoted patterns of them.
@@ -98,6 +101,8 @@ pub(crate) struct Args {
     #[arg(long)]
     keep: bool,
     #[command(flatten)]
+    dense: DenseArgs,
+    #[command(flatten)]
     places: PlaceArgs,
 }
 
@@ -107,6 +112,7 @@ impl Run for Args {
         all.extend(self.cloud.iter().map(|path| Output::File(path, CLOUD)));
         all.extend(self.transforms.iter().map(|path| Output::File(path, JSON)));
         all.extend(self.pinhole.iter().map(|path| Output::Folder(path)));
+        all.extend(self.dense.path().map(|path| Output::File(path, CLOUD)));
         all.extend(self.covariance.iter().map(|path| Output::File(path, JSON)));
         all
     }
@@ -114,6 +120,7 @@ impl Run for Args {
     fn steps(&self) -> Vec<Step> {
         let mut all = vec![steps::PHOTOGRAPHS, steps::PAIRS, steps::MODEL];
         all.extend(self.pinhole.iter().map(|_| steps::UNDISTORT));
+        all.extend(self.dense.path().map(|_| steps::DENSE));
         all
     }
 
@@ -202,6 +209,13 @@ impl Args {
             folder.write(main, &all, &used, self.format, context)?;
         }
         clock.lap("write");
+        stages.extend(clock.into_stages());
+        let dense = match result.models.first() {
+            Some(model) => self.dense.write(model, &photos, &all, &used, context)?,
+            None => None,
+        };
+        stages.extend(dense.iter().flat_map(|dense| dense.stages.iter().copied()));
+        let mut clock = cv_core::StageClock::new();
         if let (Some(path), Some(model), Some(frame)) = (&self.covariance, result.models.first(), frames.first()) {
             let names: Vec<&str> = photos.iter().map(|photo| photo.name.as_str()).collect();
             let of = sfm_covariance(&photos, &cameras.list, model)?;
@@ -214,7 +228,11 @@ impl Args {
             context.warn(text);
         }
         context.report(|| report::report(&all, &fates, &models, &frames, &stages))?;
-        Ok(outcome(&all, &fates, &models, &frames, &result, checkpoint.taken(), stages))
+        let done = outcome(&all, &fates, &models, &frames, &result, checkpoint.taken(), stages);
+        Ok(match &dense {
+            Some(dense) => done.with("dense_points", dense.cloud.len()).with("dense_pairs", dense.pairs.len()),
+            None => done,
+        })
     }
 
     fn options(&self, context: &Context) -> Result<SfmJobOptions, Failure> {

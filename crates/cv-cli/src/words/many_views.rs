@@ -4,7 +4,7 @@ use super::{Failure, unreadable, words};
 use cv_core::GeodeticPoint;
 use cv_io::IoError;
 use cv_pipeline::many_views::{AlignError, CenterFit, SfmError, ViewOutcome};
-use cv_pipeline::{Advice, SfmJobError};
+use cv_pipeline::{Advice, SfmDenseError, SfmJobError};
 use std::path::{Path, PathBuf};
 
 /// Why a photograph is in no model; `None` where it is in one.
@@ -59,6 +59,20 @@ pub(crate) fn no_model(error: SfmJobError) -> Failure {
             "about the right focal length (--focal), or --ignore-exif where EXIF's is wrong; leave out photographs of other places that look alike".to_owned()
         }
         SfmJobError::Option(_) | SfmJobError::Solve(SfmError::Option(_)) => words(Advice::CheckOptions),
+        _ => return error.into(),
+    };
+    Failure::from(error).advice(advice)
+}
+
+/// Why there is no dense cloud of a model, which is written all the same.
+pub(crate) fn no_dense_cloud(error: SfmDenseError) -> Failure {
+    let advice = match &error {
+        SfmDenseError::NoPairs { .. } => {
+            "more photographs, a step of a tenth of the distance apart, each of which shows most of what its neighbor shows"
+        }
+        SfmDenseError::NoDepths { .. } | SfmDenseError::NoAgreement { .. } => {
+            "three photographs or more of each thing, from nearer to each other, of things with texture that stand still; a larger --dense-size"
+        }
         _ => return error.into(),
     };
     Failure::from(error).advice(advice)

@@ -1,9 +1,12 @@
 //! Cameras and points from many photographs.
 
+mod dense;
+mod fusion;
 mod model;
 mod pairs;
 mod photo;
 
+pub use dense::{DensePhoto, SfmDense, SfmDenseError, SfmDenseOptions, sfm_dense};
 pub use pairs::sfm_pairs;
 pub use photo::{SfmPhoto, SfmPhotoError, sfm_photo};
 
