@@ -16,7 +16,7 @@ pub struct KnownPlaces<'a> {
 
 /// How a model was aligned.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Alignment {
+pub struct ModelAlignment {
     /// From the model's frame to the new one, which has Z up.
     pub similarity: Similarity,
     /// Whether lengths have the unit of what is known; else they are as before.
@@ -46,7 +46,7 @@ pub struct CenterFit {
 
 /// Why a model cannot be aligned to what is known.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum AlignError {
+pub enum ModelAlignError {
     /// Fewer than three of the model's views have a known center.
     #[error("{got} views of the model have a known center where {needed} are needed")]
     TooFew {
@@ -113,13 +113,13 @@ const LONGEST: f64 = 3.3682;
 /// theirs alone. Nothing known: upright, the first view in the origin, looking along Y.
 ///
 /// # Errors
-/// [`AlignError`].
+/// [`ModelAlignError`].
 pub fn align_model(
     model: &SfmModel,
     known: &KnownPlaces<'_>,
     seed: u64,
     progress: &dyn Progress,
-) -> Result<Alignment, AlignError> {
+) -> Result<ModelAlignment, ModelAlignError> {
     let base = upright_similarity(model);
     let (scale, distance_error) = match known.distances {
         [] => (None, None),
@@ -130,31 +130,31 @@ pub fn align_model(
     };
     let base = scaled(&base, scale.unwrap_or(1.0));
     if known.centers.iter().all(Option::is_none) {
-        return Ok(Alignment { similarity: base, metric: scale.is_some(), centers: None, distance_error });
+        return Ok(ModelAlignment { similarity: base, metric: scale.is_some(), centers: None, distance_error });
     }
     let (mut views, mut from, mut to) = (Vec::new(), Vec::new(), Vec::new());
     for (v, (pose, center)) in model.poses.iter().zip(known.centers).enumerate() {
         let (Some(pose), Some(center)) = (pose, center) else { continue };
         if !center.iter().all(|c| c.abs() <= 1e12) {
-            return Err(AlignError::NotFinite { index: v });
+            return Err(ModelAlignError::NotFinite { index: v });
         }
         views.push(v);
         from.push(base.transform(&pose.center()));
         to.push(*center);
     }
     if views.len() < FEWEST {
-        return Err(AlignError::TooFew { got: views.len(), needed: FEWEST });
+        return Err(ModelAlignError::TooFew { got: views.len(), needed: FEWEST });
     }
     let fit = |tilt: bool| Fit::new(&from, &to, SimilarityFreedom { scale: scale.is_none(), tilt }, seed, progress);
     let found = match fit(true)? {
         Some(found) if found.tilt_deviation(&from) <= TILT => Some((found, true)),
         _ => fit(false)?.map(|found| (found, false)),
     };
-    let (found, tilt) = found.ok_or(AlignError::OnePlace)?;
+    let (found, tilt) = found.ok_or(ModelAlignError::OnePlace)?;
     let agree = found.inliers.len();
     if found.rms > CONTRADICTION * found.spread || 2 * agree < views.len() || agree < FEWEST {
         let (rms, spread) = (found.rms, found.spread);
-        return Err(AlignError::Contradiction { agree, of: views.len(), rms, spread });
+        return Err(ModelAlignError::Contradiction { agree, of: views.len(), rms, spread });
     }
     let scale_ratio = match scale {
         Some(_) => Fit::new(&from, &to, SimilarityFreedom { scale: true, tilt }, seed, progress)?
@@ -165,7 +165,7 @@ pub fn align_model(
     let differ = views.iter().copied().filter(|v| !inside.contains(v)).collect();
     let (rms, spread) = (found.rms, found.spread);
     let centers = Some(CenterFit { agree: inside, differ, rms, spread, tilt, scale_ratio });
-    Ok(Alignment { similarity: after(&found.similarity, &base), metric: true, centers, distance_error })
+    Ok(ModelAlignment { similarity: after(&found.similarity, &base), metric: true, centers, distance_error })
 }
 
 /// A similarity of known centers.
@@ -177,21 +177,21 @@ struct Fit {
 }
 
 impl Fit {
-    /// `None` where the centers determine none; [`AlignError::Contradiction`] where they have another shape.
+    /// `None` where the centers determine none; [`ModelAlignError::Contradiction`] where they have another shape.
     fn new(
         from: &[Point3<f64>],
         to: &[Point3<f64>],
         freedom: SimilarityFreedom,
         seed: u64,
         progress: &dyn Progress,
-    ) -> Result<Option<Self>, AlignError> {
+    ) -> Result<Option<Self>, ModelAlignError> {
         let around = median_distance(to);
         let estimate = |threshold: f64| {
             let options = RobustOptions { threshold, seed, ..RobustOptions::default() };
             match estimate_similarity(from, to, freedom, &options, progress) {
-                Err(EstimateError::Cancelled(stop)) => Err(AlignError::Cancelled(stop)),
+                Err(EstimateError::Cancelled(stop)) => Err(ModelAlignError::Cancelled(stop)),
                 Err(EstimateError::NoConsensus { inliers: agree, .. }) => {
-                    Err(AlignError::Contradiction { agree, of: to.len(), rms: threshold, spread: around })
+                    Err(ModelAlignError::Contradiction { agree, of: to.len(), rms: threshold, spread: around })
                 }
                 found => Ok(found.ok()),
             }
@@ -237,19 +237,19 @@ fn median_distance(points: &[Point3<f64>]) -> f64 {
 }
 
 /// The scale of least squares by known distances, and the largest relative error of one.
-fn scale_by(model: &SfmModel, distances: &[(usize, usize, f64)]) -> Result<(f64, f64), AlignError> {
+fn scale_by(model: &SfmModel, distances: &[(usize, usize, f64)]) -> Result<(f64, f64), ModelAlignError> {
     let center = |view: usize| {
         let pose = model.poses.get(view).copied().flatten();
-        pose.map(|pose| pose.center()).ok_or(AlignError::NotInModel { view })
+        pose.map(|pose| pose.center()).ok_or(ModelAlignError::NotInModel { view })
     };
     let mut pairs = Vec::with_capacity(distances.len());
     for (index, &(a, b, known)) in distances.iter().enumerate() {
         if !(known > 0.0 && known <= 1e12) {
-            return Err(AlignError::NotFinite { index });
+            return Err(ModelAlignError::NotFinite { index });
         }
         let found = (center(a)? - center(b)?).norm();
         if found <= 1e-12 || found.is_nan() {
-            return Err(AlignError::NoDistance { a, b });
+            return Err(ModelAlignError::NoDistance { a, b });
         }
         pairs.push((found, known));
     }

@@ -64,7 +64,7 @@ mod tracks;
 mod triangulate_track;
 mod view_pair;
 
-pub use align::{AlignError, Alignment, CenterFit, KnownPlaces, align_model, align_to_poses};
+pub use align::{CenterFit, KnownPlaces, ModelAlignError, ModelAlignment, align_model, align_to_poses};
 pub use complete::FeatureDistance;
 pub use covariance::{ModelCovariance, PoseCovariance, model_covariance};
 pub use cv_numeric::adjust::AdjustError;

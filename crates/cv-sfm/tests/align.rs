@@ -4,7 +4,7 @@
 
 use cv_core::{Camera, Matrix3, Point3, Pose, Rotation3, Silent, Vector3};
 use cv_geometry::Similarity;
-use cv_sfm::{AlignError, Alignment, KnownPlaces, SfmModel, SfmPoint, align_model, align_to_poses};
+use cv_sfm::{KnownPlaces, ModelAlignError, ModelAlignment, SfmModel, SfmPoint, align_model, align_to_poses};
 use std::f64::consts::TAU;
 
 /// A pseudo-random number from −1 to 1.
@@ -48,7 +48,7 @@ fn inward(eyes: &[Point3<f64>]) -> impl Fn(usize) -> Vector3<f64> + '_ {
     |i| (Point3::new(300.0, 0.0, eyes[i].z) - eyes[i]).normalize()
 }
 
-fn align(model: &SfmModel, known: &KnownPlaces<'_>) -> Result<(Alignment, SfmModel), AlignError> {
+fn align(model: &SfmModel, known: &KnownPlaces<'_>) -> Result<(ModelAlignment, SfmModel), ModelAlignError> {
     let found = align_model(model, known, 0, &Silent)?;
     let mut moved = model.clone();
     moved.transform(&found.similarity);
@@ -158,17 +158,17 @@ fn what_does_not_fit_leaves_the_model_alone() {
     let with = |centers: &[Option<Point3<f64>>]| align(&model, &KnownPlaces { centers, distances: &[] }).unwrap_err();
     // Positions of something else.
     let other: Vec<_> = (0..12).map(|i| Some(Point3::from(shake(i + 40, 30.0)))).collect();
-    assert!(matches!(with(&other), AlignError::Contradiction { of: 12, .. }), "{:?}", with(&other));
+    assert!(matches!(with(&other), ModelAlignError::Contradiction { of: 12, .. }), "{:?}", with(&other));
     // One place, as of a receiver that lost the satellites.
-    assert_eq!(with(&[Some(eyes[0]); 12]), AlignError::OnePlace);
-    assert_eq!(with(&[Some(eyes[0]), None, Some(eyes[1])]), AlignError::TooFew { got: 2, needed: 3 });
-    assert_eq!(with(&[Some(Point3::new(f64::NAN, 0.0, 0.0)); 12]), AlignError::NotFinite { index: 0 });
+    assert_eq!(with(&[Some(eyes[0]); 12]), ModelAlignError::OnePlace);
+    assert_eq!(with(&[Some(eyes[0]), None, Some(eyes[1])]), ModelAlignError::TooFew { got: 2, needed: 3 });
+    assert_eq!(with(&[Some(Point3::new(f64::NAN, 0.0, 0.0)); 12]), ModelAlignError::NotFinite { index: 0 });
     let by = |distances: &[(usize, usize, f64)]| {
         align_model(&model, &KnownPlaces { centers: &[], distances }, 0, &Silent).unwrap_err()
     };
-    assert_eq!(by(&[(0, 40, 1.0)]), AlignError::NotInModel { view: 40 });
-    assert_eq!(by(&[(3, 3, 1.0)]), AlignError::NoDistance { a: 3, b: 3 });
-    assert_eq!(by(&[(0, 1, 1.0), (0, 1, -1.0)]), AlignError::NotFinite { index: 1 });
+    assert_eq!(by(&[(0, 40, 1.0)]), ModelAlignError::NotInModel { view: 40 });
+    assert_eq!(by(&[(3, 3, 1.0)]), ModelAlignError::NoDistance { a: 3, b: 3 });
+    assert_eq!(by(&[(0, 1, 1.0), (0, 1, -1.0)]), ModelAlignError::NotFinite { index: 1 });
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use super::{Failure, unreadable, words};
 use cv_core::GeodeticPoint;
 use cv_io::IoError;
-use cv_pipeline::many_views::{AlignError, CenterFit, SfmError, ViewOutcome};
+use cv_pipeline::many_views::{CenterFit, ModelAlignError, SfmError, ViewOutcome};
 use cv_pipeline::{Advice, SfmDenseError, SfmJobError};
 use std::path::{Path, PathBuf};
 
@@ -105,16 +105,16 @@ impl PlaceSource {
     }
 
     /// Why a model is not brought to places; nothing is to be said of photographs of which too few tell their position.
-    pub(crate) fn refusal(&self, error: &AlignError) -> Option<String> {
+    pub(crate) fn refusal(&self, error: &ModelAlignError) -> Option<String> {
         match error {
-            AlignError::TooFew { got, needed } => match self {
+            ModelAlignError::TooFew { got, needed } => match self {
                 Self::Gps { .. } => None,
                 Self::File(_) => {
                     Some(format!("{got} of them are of photographs in the model, and {needed} are needed"))
                 }
             },
-            AlignError::OnePlace => Some("they are all one place".to_owned()),
-            AlignError::Contradiction { agree, of, rms, spread } => Some(format!(
+            ModelAlignError::OnePlace => Some("they are all one place".to_owned()),
+            ModelAlignError::Contradiction { agree, of, rms, spread } => Some(format!(
                 "they contradict it: {agree} of {of} agree, to {rms:.2} m where they are {spread:.2} m around their mean"
             )),
             other => Some(other.to_string()),

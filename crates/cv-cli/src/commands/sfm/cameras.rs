@@ -63,12 +63,12 @@ impl Cameras {
         }
         let lens = |camera: Camera| Camera { distortion: Distortion::radial(0.0, 0.0), ..camera };
         let camera = if let Some(file) = &args.camera {
-            let (camera, lens_known) = rig::camera_and_lens(file, Some((width, height)), context)?;
+            let (camera, lens_known) = rig::camera_and_lens(file, Some((width, height)), args.undistorted, context)?;
             if (camera.width, camera.height) != (width, height) {
                 let (w, h) = (camera.width, camera.height);
                 return Ok(Err(format!("it is {width}×{height} px, its camera in {} is {w}×{h} px", file.display())));
             }
-            match lens_known || args.undistorted {
+            match lens_known {
                 true => {
                     args.check_lens(file, &camera)?;
                     SfmCamera { camera, knowledge: CameraKnowledge::Known }

@@ -4,7 +4,7 @@ use super::photographs::Photograph;
 use crate::frame::{Context, Failure};
 use crate::words::many_views::{self as words, PlaceSource};
 use cv_core::{GeodeticPoint, Point3, east_north_up};
-use cv_pipeline::many_views::{AlignError, Alignment, KnownPlaces, SfmModel, align_model};
+use cv_pipeline::many_views::{KnownPlaces, ModelAlignError, ModelAlignment, SfmModel, align_model};
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
@@ -162,7 +162,7 @@ impl Places {
         let known = KnownPlaces { centers: &centers, distances: &distances };
         let alone = KnownPlaces { centers: &[], ..known };
         let found = align_model(model, &known, seed, context).or_else(|error| match error {
-            AlignError::Cancelled(_) => Err(error),
+            ModelAlignError::Cancelled(_) => Err(error),
             error => {
                 if let (Some(source), Some(text)) = (&self.source, self.source.as_ref().and_then(|s| s.refusal(&error)))
                 {
@@ -173,7 +173,7 @@ impl Places {
         });
         // Of known distances alone.
         let found = found.or_else(|error| match error {
-            AlignError::Cancelled(_) => Err(error),
+            ModelAlignError::Cancelled(_) => Err(error),
             error => {
                 context.warn(format!("--distance is left aside: {error}"));
                 align_model(model, &KnownPlaces::default(), seed, context)
@@ -185,7 +185,7 @@ impl Places {
     }
 
     /// Warns of what does not agree, with numbers.
-    fn tell(&self, found: &Alignment, model: &SfmModel, all: &[Photograph], used: &[usize], context: &Context) {
+    fn tell(&self, found: &ModelAlignment, model: &SfmModel, all: &[Photograph], used: &[usize], context: &Context) {
         if let Some(error) = found.distance_error.filter(|error| *error > words::DISTANCES_DIFFER) {
             context.warn(words::distances_differ(error));
         }
@@ -209,7 +209,7 @@ impl Places {
         }
     }
 
-    fn frame(&self, found: &Alignment, all: &[Photograph], used: &[usize]) -> Frame {
+    fn frame(&self, found: &ModelAlignment, all: &[Photograph], used: &[usize]) -> Frame {
         let names = |views: &[usize]| views.iter().map(|v| all[used[*v]].name.clone()).collect::<Vec<_>>();
         let (text, by) = match (&found.centers, &self.source) {
             (Some(fit), Some(source)) => (words::aligned(source, fit), source.key()),
