@@ -9,22 +9,35 @@ use std::path::{Path, PathBuf};
 
 /// Reads the calibration of a camera and says what of it is not taken as it stands. `size` is for files that do not tell it.
 pub(crate) fn camera(path: &Path, size: Option<(usize, usize)>, context: &Context) -> Result<Camera, Failure> {
-    camera_and_lens(path, size, context).map(|(camera, _)| camera)
+    let (camera, notes) = camera_and_notes(path, size)?;
+    notes.iter().for_each(|note| context.note(format!("{}: {note}", path.display())));
+    Ok(camera)
 }
 
-/// The same, and whether the file tells the distortion of the lens.
+/// The same, and whether its lens is known: by the file, or since the photographs are `undistorted`. Where it is not, what is to be said if it should be.
 pub(crate) fn camera_and_lens(
     path: &Path,
     size: Option<(usize, usize)>,
+    undistorted: bool,
     context: &Context,
 ) -> Result<(Camera, bool), Failure> {
-    let (camera, notes) = cv_io::read_camera_with_notes(path, size).map_err(|error| {
+    let (camera, mut notes) = camera_and_notes(path, size)?;
+    let told = !notes.contains(&CalibrationNote::DistortionUnknown);
+    notes.retain(|note| *note != CalibrationNote::DistortionUnknown);
+    notes.iter().for_each(|note| context.note(format!("{}: {note}", path.display())));
+    if !told && !undistorted {
+        let note = CalibrationNote::DistortionUnknown;
+        context.note(format!("{}: {note}; --undistorted where the photographs have none", path.display()));
+    }
+    Ok((camera, told || undistorted))
+}
+
+fn camera_and_notes(path: &Path, size: Option<(usize, usize)>) -> Result<(Camera, Vec<CalibrationNote>), Failure> {
+    cv_io::read_camera_with_notes(path, size).map_err(|error| {
         let no_size = size.is_none() && matches!(error.reason, FormatError::Missing { .. });
         let failure = Failure::from(error);
         if no_size { failure.advice("give the size of the pictures, such as --size 640x480") } else { failure }
-    })?;
-    notes.iter().for_each(|note| context.note(format!("{}: {note}", path.display())));
-    Ok((camera, !notes.contains(&CalibrationNote::DistortionUnknown)))
+    })
 }
 
 /// Reads the calibration of a rig from its file or its two files; with `exchange`, its second camera becomes the left one. `size` is for files that do

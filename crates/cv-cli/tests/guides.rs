@@ -12,12 +12,13 @@ use std::{
 use support::done;
 
 /// In the order in which they run: each may use what those before it have written.
-const GUIDES: [&str; 11] = [
+const GUIDES: [&str; 12] = [
     "first-hour.md",
     "jobs/panorama.md",
     "jobs/depth.md",
     "jobs/rectification.md",
     "jobs/reconstruction.md",
+    "jobs/many-views.md",
     "jobs/segmentation.md",
     "jobs/matching.md",
     "jobs/calibration.md",
@@ -91,6 +92,7 @@ fn every_command_of_the_guides_does_what_they_say() {
         "pano-report",
         "depth-report",
         "motion-report",
+        "walk-report",
         "rectify-report",
         "found-report",
         "match-report",
@@ -176,6 +178,7 @@ fn the_options_in_the_tables_are_there() {
         "match",
         "estimate",
         "reconstruct",
+        "sfm",
         "depth",
         "rectify",
         "calibrate mono",

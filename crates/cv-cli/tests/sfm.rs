@@ -4,12 +4,13 @@
 
 mod support;
 
-use cv_core::{Camera, Pose, RgbU8, SparseModel, Vector3};
-use cv_io::colmap;
+use cv_core::{Camera, Point3, Pose, RgbU8, SparseModel, Vector3};
+use cv_io::{Metadata, colmap};
 use cv_synth::{RenderOptions, Scene, direction_error, render, rotation_error};
 use serde_json::Value;
 use std::collections::BTreeMap;
-use std::{fs, path::Path};
+use std::process::Stdio;
+use std::{fs, path::Path, thread::sleep, time::Duration};
 use support::{cv, json, refused, run, snapshot, strs};
 
 const CAMERA: [usize; 2] = [400, 300];
@@ -255,4 +256,352 @@ fn photographs_of_something_else_are_left_out() {
     let [turn, direction, off] = worst(&model, &truth);
     // Five photographs that do not come around leave the focal length less certain, and with it the turns.
     assert!(turn < 1.0 && direction < 2.0 && off < 0.02, "{turn} {direction} {off}");
+}
+
+/// An EXIF block, little-endian, that tells a position: degrees north and east, meters above the sea.
+fn exif_of(north: f64, east: f64, height: f64) -> Vec<u8> {
+    // The only entry of the first directory leads to that of the position, at 26; its values follow it.
+    let mut block = b"II*\0\x08\0\0\0\x01\0".to_vec();
+    let entry = |block: &mut Vec<u8>, tag: u16, kind: u16, count: u32, value: [u8; 4]| {
+        block.extend(tag.to_le_bytes());
+        block.extend(kind.to_le_bytes());
+        block.extend(count.to_le_bytes());
+        block.extend(value);
+    };
+    entry(&mut block, 0x8825, 4, 1, 26u32.to_le_bytes());
+    block.extend([0; 4]);
+    block.extend(6u16.to_le_bytes());
+    let values = 26 + 2 + 6 * 12 + 4;
+    entry(&mut block, 1, 2, 2, *b"N\0\0\0");
+    entry(&mut block, 2, 5, 3, (values as u32).to_le_bytes());
+    entry(&mut block, 3, 2, 2, *b"E\0\0\0");
+    entry(&mut block, 4, 5, 3, (values as u32 + 24).to_le_bytes());
+    entry(&mut block, 5, 1, 1, [0; 4]);
+    entry(&mut block, 6, 5, 1, (values as u32 + 48).to_le_bytes());
+    block.extend([0; 4]);
+    for degrees in [north, east] {
+        let whole = degrees.floor();
+        // A ten-millionth of a second is 3 µm.
+        let seconds = (degrees - whole) * 3600.0;
+        for (numerator, denominator) in [(whole as u32, 1u32), (0, 1), ((seconds * 1e6).round() as u32, 1_000_000)] {
+            block.extend(numerator.to_le_bytes());
+            block.extend(denominator.to_le_bytes());
+        }
+    }
+    block.extend(((height * 1e4).round() as u32).to_le_bytes());
+    block.extend(10_000u32.to_le_bytes());
+    block
+}
+
+/// The room's place: Y of its world is down; X is east here, Z north.
+fn east_north_up(p: Point3<f64>) -> Vector3<f64> {
+    Vector3::new(p.x, p.z, -p.y)
+}
+
+/// Largest distance of a center of a model from where it was, relative to that of the first photograph.
+fn off_by(model: &SparseModel, truth: &BTreeMap<String, Pose>) -> f64 {
+    let first = east_north_up(truth["walk00.png"].center());
+    let off = |image: &cv_core::ModelImage| {
+        (image.pose.center().coords - (east_north_up(truth[&image.name].center()) - first)).norm()
+    };
+    model.images.values().map(off).fold(0.0, f64::max)
+}
+
+#[test]
+fn models_are_brought_to_positions_known_places_and_distances() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let truth = photographs(&at("photos"), "walk", &Scene::room(4), &Scene::room_walk(12));
+    let call = ["sfm", "photos", "--camera", "K.txt", "--undistorted", "--features", "2000", "-o", "model"];
+    let with = |more: &[&str]| {
+        let value = json(folder.path(), &[&call[..], more].concat());
+        assert_eq!(used(&value), [true; 12], "{value}");
+        (value, colmap::read(at("model")).unwrap())
+    };
+    // Nothing known: upright. The walk looks down a little, by as much to all sides.
+    let (value, model) = with(&[]);
+    assert_eq!(
+        (value["alignment"]["by"].as_str(), value["alignment"]["unit"].as_str()),
+        (Some("photographs"), Some("arbitrary"))
+    );
+    let up = |model: &SparseModel| {
+        let turn = |image: &cv_core::ModelImage| {
+            let down = truth[&image.name].rotation * Vector3::y();
+            (image.pose.rotation * -Vector3::z() - down).norm()
+        };
+        model.images.values().map(turn).fold(0.0, f64::max)
+    };
+    // The walk is an ellipse: more of its photographs look along the room.
+    assert!(up(&model) < 0.03, "{}", up(&model));
+
+    // A tape between two photographs.
+    let apart = |a: &str, b: &str| (truth[a].center() - truth[b].center()).norm();
+    let tape = format!("{:.4}", apart("walk02.png", "walk08.png"));
+    let (value, model) = with(&["--distance", "walk02.png", "photos/walk08.png", &tape, "--covariance", "sigma.json"]);
+    let sigma: Value = serde_json::from_str(&fs::read_to_string(at("sigma.json")).unwrap()).unwrap();
+    let images = sigma["images"].as_array().unwrap();
+    assert_eq!(
+        (images.len(), sigma["points"].as_array().unwrap().len(), sigma["unit"].as_str()),
+        (12, model.points.len(), Some("m"))
+    );
+    // A third of a pixel at 330 is a thousandth; a camera sees a hundred points and more from some meters: some tenths of a millimeter to some millimeters, and of one camera nothing.
+    let deviation = |image: &Value| (0..3).map(|i| image["center"][i].as_f64().unwrap()).fold(0.0, f64::max);
+    assert!(
+        images.iter().all(|i| deviation(i) < 0.01) && images.iter().filter(|i| deviation(i) > 1e-4).count() >= 10,
+        "{images:?}"
+    );
+    assert!(images.iter().any(|i| deviation(i) < 1e-12 && i["name"] == sigma["exact"]["pose_of"]));
+    assert_eq!((value["alignment"]["by"].as_str(), value["alignment"]["unit"].as_str()), (Some("distance"), Some("m")));
+    let center = |name: &str| model.images.values().find(|image| image.name == name).unwrap().pose.center();
+    // Centers are known to a thousandth of the room.
+    let found = (center("walk01.png") - center("walk06.png")).norm();
+    assert!((found / apart("walk01.png", "walk06.png") - 1.0).abs() < 0.005 && up(&model) < 0.03, "{found}");
+
+    // A list of places, one of them wrong, one of no photograph.
+    let first = east_north_up(truth["walk00.png"].center());
+    let mut list = "photo,x,y,z\n".to_owned();
+    for (i, (name, pose)) in truth.iter().enumerate() {
+        let place =
+            east_north_up(pose.center()) - first + if i == 4 { Vector3::new(1.0, 1.0, 0.0) } else { Vector3::zeros() };
+        list += &format!("{name},{},{},{}\n", place.x, place.y, place.z);
+    }
+    fs::write(at("places.csv"), format!("{list}other.png,0,0,0\n")).unwrap();
+    let ran = run(folder.path(), &[&call[..], &["--known", "places.csv", "--report", "page"]].concat());
+    assert!(ran.stderr.contains("walk04.png by 1.4 m") && ran.stderr.contains("such as “other.png”"), "{}", ran.stderr);
+    // Centers are known to a thousandth of the room, which is three meters.
+    let off = off_by(&colmap::read(at("model")).unwrap(), &truth);
+    assert!(off < 0.02, "{off}");
+    let html = fs::read_to_string(at("page/report.html")).unwrap();
+    assert!(html.contains("in the frame of places.csv, in meters, by 11 photographs"));
+
+    // Positions in the files: the lengths of a degree at 47.255° are by the radii of WGS 84, M = 6,361,920 m and N = 6,389,700 m.
+    let (lat, lon) = (47.255f64, 8.51f64);
+    let (along, across) = (6_361_920.0f64.to_radians(), 6_389_700.0f64.to_radians() * lat.to_radians().cos());
+    for (i, (name, pose)) in truth.iter().enumerate() {
+        let image = cv_io::read_rgb(at("photos").join(name)).unwrap();
+        let wrong = if i == 7 { 9.0 } else { 0.0 };
+        let place = east_north_up(pose.center());
+        let exif = exif_of(lat + (place.y + wrong) / along, lon + place.x / across, 412.0 + place.z);
+        let metadata = Metadata { exif: Some(exif), ..Metadata::default() };
+        cv_io::write_png_with(at("photos").join(name), image.view(), &metadata).unwrap();
+    }
+    let (value, model) = with(&[]);
+    let alignment = &value["alignment"];
+    assert_eq!((alignment["by"].as_str(), alignment["differ"][0].as_str()), (Some("gps"), Some("walk07.png")));
+    assert!((alignment["origin"]["latitude"].as_f64().unwrap() - lat).abs() < 1e-4, "{alignment}");
+    let off = off_by(&model, &truth);
+    assert!(off < 0.02, "{off}");
+    // The tape tells another scale than the positions, and is taken; without them there is nothing to disagree with.
+    let wrong = ["--distance", "walk02.png", "walk08.png", "7.5"];
+    let ran = run(folder.path(), &[&call[..], &wrong].concat());
+    assert!(
+        ran.stderr.contains("contradict it") || ran.stderr.contains("shorter than by --distance"),
+        "{}",
+        ran.stderr
+    );
+    let (value, _) = with(&["--ignore-gps"]);
+    assert_eq!(value["alignment"]["by"].as_str(), Some("photographs"));
+}
+
+#[test]
+fn places_that_mean_nothing_are_refused_before_the_work() {
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["a.png", "b.png", "c.png"] {
+        fs::write(folder.path().join(name), name).unwrap();
+    }
+    fs::write(folder.path().join("places.txt"), "a.png 0 0 0\nb.png 1 0 0\nx.png 0 1 0\n").unwrap();
+    fs::write(folder.path().join("broken.txt"), "a.png 0 0 0\nb.png 1 0\n").unwrap();
+    let call = |code: i32, more: &[&str], says: &str| {
+        let ran = run(folder.path(), &[&["sfm", "a.png", "b.png", "c.png", "-o", "model"], more].concat());
+        assert!(ran.code == Some(code) && ran.stderr.contains(says), "{more:?}: {ran:?}");
+    };
+    call(1, &["--known", "places.txt"], "2 of the photographs");
+    call(1, &["--known", "broken.txt"], "line 2");
+    call(2, &["--distance", "a.png", "b.png"], "two photographs and the meters");
+    call(2, &["--distance", "a.png", "x.png", "1"], "“x.png” is none of the photographs");
+    call(2, &["--distance", "a.png", "a.png", "1"], "named twice");
+    call(2, &["--distance", "a.png", "b.png", "-1"], "");
+}
+
+#[test]
+fn a_run_that_is_killed_goes_on_to_the_same_bytes() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    photographs(&at("photos"), "walk", &Scene::room(4), &Scene::room_walk(12)[..7]);
+    let call = |output: &'static str| {
+        ["sfm", "photos", "--camera", "K.txt", "--undistorted", "--features", "3000", "-o", output, "--threads", "1"]
+    };
+    let whole = json(folder.path(), &call("whole"));
+    assert_eq!((used(&whole), whole["resumed"]["features"].as_u64()), (vec![true; 7], Some(0)));
+    let model = |name: &str| {
+        files(&at(name)).into_iter().map(|file| fs::read(at(name).join(file)).unwrap()).collect::<Vec<_>>()
+    };
+    let truth = model("whole");
+    assert_eq!(files(&at("whole")), ["cameras.txt", "images.txt", "points3D.txt"]);
+
+    let kept = || match fs::read_dir(at("model/.cv-sfm")) {
+        Ok(entries) => entries
+            .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+            .filter(|n| !n.starts_with('.'))
+            .collect(),
+        Err(_) => Vec::new(),
+    };
+    // After one photograph, after some, after all.
+    for least in [1, 4, 7] {
+        let mut child =
+            cv(folder.path()).args(call("model")).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        while kept().len() < least && child.try_wait().unwrap().is_none() {
+            sleep(Duration::from_millis(1));
+        }
+        child.kill().unwrap();
+        child.wait().unwrap();
+        let found = kept().iter().filter(|name| name.ends_with(".features")).count();
+        assert!(found >= least && !at("model/images.txt").exists(), "{found}");
+        let value = json(folder.path(), &[&call("model")[..], &["--resume"]].concat());
+        assert_eq!(value["resumed"]["features"].as_u64(), Some(found as u64));
+        assert!(model("model") == truth, "killed after {least}");
+        assert!(!at("model/.cv-sfm").exists());
+        fs::remove_dir_all(at("model")).unwrap();
+    }
+
+    // Everything kept: features and pairs are taken.
+    let keep = [&call("model")[..], &["--keep"]].concat();
+    json(folder.path(), &keep);
+    assert_eq!(kept().len(), 8);
+    let again = [&keep[..], &["--resume"]].concat();
+    let value = json(folder.path(), &again);
+    assert_eq!((value["resumed"]["features"].as_u64(), value["resumed"]["pairs"].as_bool()), (Some(7), Some(true)));
+    // What is damaged, cut short, or another photograph's is made anew, and said to be.
+    let names: Vec<String> = kept().into_iter().filter(|name| name.ends_with(".features")).collect();
+    let path = |i: usize| at("model/.cv-sfm").join(&names[i]);
+    let mut bytes = fs::read(path(0)).unwrap();
+    bytes[4000] ^= 1;
+    fs::write(path(0), &bytes).unwrap();
+    fs::write(path(1), &bytes[..5000]).unwrap();
+    fs::copy(path(2), path(3)).unwrap();
+    fs::write(at("model/.cv-sfm/pairs"), "").unwrap();
+    let ran = run(folder.path(), &again);
+    assert_eq!(ran.stderr.matches("it is made anew").count(), 4, "{}", ran.stderr);
+    let models = ["cameras.txt", "images.txt", "points3D.txt"].map(|file| fs::read(at("model").join(file)).unwrap());
+    assert!(models[..] == truth[..]);
+    // Of other options nothing is taken; of other photographs what is the same.
+    let fewer: Vec<&str> = again.iter().map(|word| if *word == "3000" { "2500" } else { word }).collect();
+    let value = json(folder.path(), &fewer);
+    assert_eq!((value["resumed"]["features"].as_u64(), value["resumed"]["pairs"].as_bool()), (Some(0), Some(false)));
+    fs::remove_file(at("photos/walk06.png")).unwrap();
+    let value = json(folder.path(), &again);
+    assert_eq!((value["resumed"]["features"].as_u64(), value["resumed"]["pairs"].as_bool()), (Some(6), Some(false)));
+    // Without the wish it is told of, left alone, and gone in the end.
+    let ran = run(folder.path(), &call("model"));
+    assert!(ran.stderr.contains("which --resume goes on with") && !at("model/.cv-sfm").exists(), "{}", ran.stderr);
+}
+
+#[test]
+fn photographs_are_added_to_a_model() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let walk = Scene::room_walk(12);
+    let mut truth = photographs(&at("photos"), "walk", &Scene::room(4), &walk[..8]);
+    let call = ["sfm", "photos", "--features", "3000", "--format", "colmap-binary", "-o", "model"];
+    json(
+        folder.path(),
+        &[&call[..], &["--camera", "K.txt", "--undistorted", "--distance", "walk00.png", "walk04.png", "3.0"]].concat(),
+    );
+    let first = colmap::read(at("model")).unwrap();
+    // In a frame of somebody else's.
+    let mut moved = first.clone();
+    let to = Pose::new(cv_core::Rotation3::from_euler_angles(0.3, 1.0, -0.4), Vector3::new(5.0, 6.0, 7.0));
+    for image in moved.images.values_mut() {
+        image.pose = image.pose.compose(&to.inverse());
+    }
+    moved.points.values_mut().for_each(|point| point.position = to.transform(&point.position));
+    fs::create_dir(at("start")).unwrap();
+    colmap::write(at("start"), &moved).unwrap();
+
+    truth.extend(photographs(&at("photos"), "then", &Scene::room(4), &walk[8..]));
+    let value = json(folder.path(), &[&call[..], &["--from", "start"]].concat());
+    assert_eq!((used(&value), value["models"].as_u64()), (vec![true; 12], Some(1)), "{value}");
+    assert_eq!((value["alignment"]["by"].as_str(), value["alignment"]["agree"].as_u64()), (Some("model"), Some(8)));
+    let more = colmap::read(at("model")).unwrap();
+    is_true(&more, &truth);
+    // The lens is the same to the last digit that the text has, and the frame to what eight poses change by with new photographs: a thousandth of three meters.
+    assert_eq!(more.cameras.values().map(|c| c.fx).collect::<Vec<_>>(), [FOCAL]);
+    for image in moved.images.values() {
+        let now = more.images.values().find(|other| other.name == image.name).unwrap();
+        let off = (now.pose.center() - image.pose.center()).norm();
+        assert!(off < 0.01, "{}: {off}", image.name);
+    }
+
+    let refuse = |args: &[&str], says: &str| {
+        let ran = run(folder.path(), &[&["sfm"], args].concat());
+        assert!(ran.code != Some(0) && ran.stderr.contains(says), "{args:?}: {ran:?}");
+    };
+    refuse(&["photos", "-o", "new", "--from", "nowhere"], "nowhere");
+    let then = ["photos/then00.png", "photos/then01.png", "-o", "new", "--from", "start"];
+    refuse(&then, "0 of the 8 photographs of start are among those given");
+    refuse(&["photos", "-o", "new", "--from", "start", "--focal", "330"], "cannot be used with");
+    assert!(!at("new").exists());
+}
+
+/// Of a binary PLY with colors.
+fn positions_and_normals(bytes: &[u8]) -> Vec<[[f32; 3]; 2]> {
+    let end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+    let header = String::from_utf8_lossy(&bytes[..end]).into_owned();
+    let names: Vec<&str> =
+        header.lines().filter(|l| l.starts_with("property")).filter_map(|l| l.split(' ').next_back()).collect();
+    assert_eq!(names, ["x", "y", "z", "nx", "ny", "nz", "red", "green", "blue"], "{header}");
+    let number = |p: &[u8], i: usize| f32::from_le_bytes(p[4 * i..4 * i + 4].try_into().unwrap());
+    bytes[end..].chunks_exact(27).map(|p| [[0, 1, 2], [3, 4, 5]].map(|at| at.map(|i| number(p, i)))).collect()
+}
+
+#[test]
+fn a_dense_cloud_lies_on_the_surfaces() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let (scene, walk) = (Scene::room(4), Scene::room_walk(48));
+    let truth = photographs(&at("photos"), "walk", &scene, &walk[..6]);
+    // In the frame of the room, Z up.
+    let place = |(name, pose): (&String, &Pose)| {
+        let p = east_north_up(pose.center());
+        format!("{name} {} {} {}\n", p.x, p.y, p.z)
+    };
+    fs::write(at("places.txt"), truth.iter().map(place).collect::<String>()).unwrap();
+    let call = ["sfm", "photos", "--camera", "K.txt", "--undistorted", "--known", "places.txt", "-o", "model"];
+    let value = json(folder.path(), &[&call[..], &["--dense", "dense.ply", "--threads", "2"]].concat());
+    let cloud = positions_and_normals(&fs::read(at("dense.ply")).unwrap());
+    assert_eq!(value["dense_points"].as_u64(), Some(cloud.len() as u64));
+    assert!(value["dense_pairs"].as_u64().unwrap() >= 6, "{value}");
+    // Of 720,000 pixels, of each of which there may be a point.
+    assert!(cloud.len() > 60_000, "{}", cloud.len());
+    let depths: Vec<_> = walk[..6]
+        .iter()
+        .map(|pose| (pose, render(&scene, &camera(), pose, &RenderOptions::default()).unwrap().depth))
+        .collect();
+    let (mut right, mut facing) = (0, 0);
+    for [p, n] in &cloud {
+        let world = Point3::new(f64::from(p[0]), -f64::from(p[2]), f64::from(p[1]));
+        let normal = Vector3::new(f64::from(n[0]), -f64::from(n[2]), f64::from(n[1]));
+        let off = |(pose, depth): &(&Pose, cv_core::GrayF32)| {
+            let local = pose.transform(&world);
+            let pixel = camera().project(&local)?;
+            let inside = (0.0..399.0).contains(&pixel.x) && (0.0..299.0).contains(&pixel.y);
+            let seen = f64::from(depth.get(pixel.x.round() as usize, pixel.y.round() as usize)?[0]);
+            inside.then_some((local.z / seen - 1.0).abs())
+        };
+        let least = depths.iter().filter_map(off).fold(f64::INFINITY, f64::min);
+        right += usize::from(least < 0.05);
+        facing += usize::from(depths.iter().any(|(pose, _)| normal.dot(&(pose.center() - world)) > 0.0));
+    }
+    let share = right as f64 / cloud.len() as f64;
+    // Neighbors are 0.15 to 0.2 m apart: things 5 m away have a disparity of ten pixels, of which half a one is five per cent. Pixels at edges show a share of what is behind, in both.
+    assert!(share > 0.95 && facing == cloud.len(), "{share}");
+    let other = [&call[..], &["--dense", "again.ply", "--threads", "1"]].concat();
+    json(folder.path(), &other);
+    assert!(fs::read(at("dense.ply")).unwrap() == fs::read(at("again.ply")).unwrap(), "another number of threads");
+
+    // One pair, which nothing confirms: what is wrong, and the model is there all the same.
+    let two = ["sfm", "photos/walk00.png", "photos/walk03.png", "--camera", "K.txt", "--undistorted", "-o", "two"];
+    let ran = refused(folder.path(), &[&two[..], &["--dense", "two.ply"]].concat());
+    assert!(ran.stderr.contains("is confirmed by another pair; try: three photographs"), "{}", ran.stderr);
+    assert!(at("two/images.txt").exists() && !at("two.ply").exists());
 }

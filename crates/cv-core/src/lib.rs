@@ -44,6 +44,7 @@ mod size;
 mod sparse_model;
 mod stage_clock;
 mod union_find;
+mod upright;
 mod view;
 
 pub use camera::{Camera, CameraError, MAX_INTRINSICS, ProjectedPoint};
@@ -66,6 +67,7 @@ pub use scaling::Scaling;
 pub use sparse_model::{ModelImage, ModelPoint, SparseModel};
 pub use stage_clock::StageClock;
 pub use union_find::UnionFind;
+pub use upright::upright;
 pub use view::{ImageView, ImageViewMut};
 
 pub use nalgebra;

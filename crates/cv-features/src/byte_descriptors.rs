@@ -27,6 +27,12 @@ impl ByteDescriptors {
         Some(Self { kind, scale, data })
     }
 
+    /// Of bytes that were made before, row after row; `None` for a kind without [`DescriptorKind::bytes`], and where the last row is cut short.
+    pub fn from_bytes(kind: DescriptorKind, data: Vec<u8>) -> Option<Self> {
+        let scale = kind.bytes?;
+        data.len().is_multiple_of(kind.dimension.max(1)).then_some(Self { kind, scale, data })
+    }
+
     /// What the numbers mean.
     pub fn kind(&self) -> DescriptorKind {
         self.kind
@@ -183,6 +189,8 @@ mod tests {
             assert!(found.iter().all(|m| m.distance == 0.0) && found.len() == 9);
         }
         let foreign = Descriptors::new(DescriptorKind::foreign(3));
+        assert_eq!(ByteDescriptors::from_bytes(DescriptorKind::SIFT, vec![0; 127]), None);
+        assert_eq!(ByteDescriptors::from_bytes(DescriptorKind::foreign(3), vec![0; 3]), None);
         assert_eq!(ByteDescriptors::new(&foreign), None);
         let (a, b) = ([DescriptorKind::SIFT, DescriptorKind::PATCH])
             .map(|kind| ByteDescriptors::new(&Descriptors::from_vec(kind, vec![0.1; 128]).unwrap()).unwrap())

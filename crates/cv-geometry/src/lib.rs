@@ -43,7 +43,8 @@ mod two_view;
 mod verified_pair;
 
 pub use absolute::{
-    Similarity, WorldMatch, align_points, estimate_pose, pose_from_points, pose_three_points, refine_pose,
+    Similarity, SimilarityFreedom, WorldMatch, align_points, estimate_pose, estimate_similarity, pose_from_points,
+    pose_three_points, refine_pose,
 };
 pub use bundle::{BundleOptions, BundleReport, FocalPrior, TwoViewBundle, adjust_two_views};
 pub use cv_numeric::RobustLoss;

@@ -31,6 +31,7 @@
 //! | cameras and rigs | [`read_camera`], [`write_camera`], [`read_rig`], [`write_rig`], [`read_camera_array`], [`write_camera_array`], [`CalibrationFormat`] |
 //! | sparse models | [`colmap`], text and binary; [`write_transforms`] |
 //! | matches | [`read_matches`], [`write_matches`] |
+//! | where photographs were taken | [`read_places`]; [`ExifInfo`] |
 
 mod camera;
 mod codec;
@@ -51,6 +52,7 @@ pub mod npz;
 mod pending;
 pub mod pfm;
 mod picture;
+mod places;
 pub mod ply;
 mod sensor_width;
 mod sniff;
@@ -83,4 +85,5 @@ pub use picture::{
     DEFAULT_MAX_PIXELS, DynImage, Pixels, ReadOptions, decode_image, read_gray_u8, read_image, read_image_info,
     read_image_with, read_mask, read_rgb,
 };
+pub use places::{NamedPlaces, parse_places, read_places};
 pub use transforms::{transforms_json, write_transforms};

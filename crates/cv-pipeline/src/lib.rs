@@ -39,6 +39,7 @@ mod frame_depth;
 mod guided;
 mod matching;
 mod no_pair;
+mod pair_depth;
 mod panorama;
 mod reconstruct;
 mod rectify;
@@ -71,8 +72,9 @@ pub use no_pair::NoPairCause;
 /// What a caller of [`match_extracted`] needs to hand in features found elsewhere, and the settings of ours.
 pub mod features {
     pub use cv_features::{
-        ByteScale, CornerMeasure, DescriptorKind, Descriptors, DropReason, Dropped, FeatureError, HarrisFeatures,
-        HarrisOptions, MopsOptions, MultiScaleOptions, PatchOptions, RatioTest, SiftOptions, Suppression,
+        ByteDescriptors, ByteScale, CornerMeasure, DescriptorKind, Descriptors, DropReason, Dropped, FeatureError,
+        HarrisFeatures, HarrisOptions, MopsOptions, MultiScaleOptions, PatchOptions, RatioTest, SiftOptions,
+        Suppression,
     };
 }
 pub use panorama::{
@@ -91,7 +93,8 @@ pub use rectify::{RectifyResult, rectify};
 pub use rig_depth::{RigDepthResult, depth_by_rig};
 pub use segment::{DetectResult, SegmentResult, SegmentTraining, detect, segment, train_segment};
 pub use sfm::{
-    PhotoOrder, SfmCamera, SfmJobError, SfmJobOptions, SfmPhoto, SfmPhotoError, SfmResult, sfm, sfm_pairs, sfm_photo,
+    DensePhoto, PhotoOrder, SfmCamera, SfmDense, SfmDenseError, SfmDenseOptions, SfmJobError, SfmJobOptions, SfmPhoto,
+    SfmPhotoError, SfmResult, sfm, sfm_covariance, sfm_dense, sfm_pairs, sfm_photo, sfm_solve,
 };
 
 /// What a caller of [`depth()`] needs of the stereo stage: its options and results, rectification, geometry and scores.

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use cv_core::{Matrix3, Point3, PointCloud, Pose, RgbU8, Rotation3, SparseModel, UnionFind, Vector3};
+use cv_core::{Point3, PointCloud, Pose, RgbU8, SparseModel, UnionFind};
 
 use crate::colormap::Colormap;
 use crate::raster::{Color, Raster, colors};
@@ -185,34 +185,10 @@ fn single(p: Point3<f64>) -> [f32; 3] {
     [p.x as f32, p.y as f32, p.z as f32]
 }
 
-/// From the model's world to one with its origin at the first camera.
+/// From the model's world to one with its origin at the first camera by name, Y down.
 fn upright(model: &SparseModel) -> Pose {
-    let axis = |pose: &Pose, i: usize| pose.rotation.inverse() * Vector3::ith(i, 1.0);
-    let ids = by_name(model);
-    let Some(first) = ids.first().map(|id| &model.images[id].pose) else { return Pose::identity() };
-    // The line that an axis of all photographs is nearest to, and the mean square of its share along it: 1 where all are on the line, 1/3 where they are turned every way.
-    let line = |i: usize| {
-        let spread = ids.iter().fold(Matrix3::zeros(), |sum, id| {
-            let axis = axis(&model.images[id].pose, i);
-            sum + axis * axis.transpose()
-        });
-        let step = |v: Vector3<f64>, _| (spread * v).try_normalize(0.0).unwrap_or(v);
-        let line = (0..100).fold(axis(first, i), step);
-        // To the side of most.
-        let sum: f64 = ids.iter().map(|id| axis(&model.images[id].pose, i).dot(&line)).sum();
-        (line * sum.signum(), (spread * line).norm() / ids.len() as f64)
-    };
-    // Photographs that were taken on their side agree on a line across.
-    let (down, across) = (line(1), line(0));
-    let down = if across.1 > down.1 + 0.2 { across.0 } else { down.0 };
-    let eye = first.center();
-    let ahead = axis(first, 2);
-    // One that looks straight down has its own top for ahead.
-    let ahead = if ahead.cross(&down).norm() > 0.1 * down.norm() { ahead } else { -axis(first, 1) };
-    let level = ahead - down * (ahead.dot(&down) / down.norm_squared());
-    Pose::look_at(eye, eye + level, down)
-        .filter(|pose| pose.translation.iter().all(|v| v.is_finite()))
-        .unwrap_or(Pose { rotation: Rotation3::identity(), translation: -eye.coords })
+    let poses: Vec<Pose> = by_name(model).iter().map(|id| model.images[id].pose).collect();
+    cv_core::upright(&poses)
 }
 
 /// Points that each two photographs, by their place in `ids`, have in common; of one with itself all of its points.
@@ -266,8 +242,7 @@ fn rows(model: &SparseModel) -> Vec<Row<'_>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cv_core::{Camera, ModelImage, ModelPoint, Point2};
-    use std::f64::consts::FRAC_PI_2;
+    use cv_core::{Camera, ModelImage, ModelPoint, Point2, Vector3};
 
     /// Three photographs side by side that look along the world's X, whose down is −Z. The first two see 20 points, the last two 5 of them and one twice.
     fn model() -> SparseModel {
@@ -337,18 +312,6 @@ mod tests {
         let p = to_view.transform(&Point3::new(3.5, 1.0, 0.8));
         assert!((p - Point3::new(0.0, 0.2, 0.5)).norm() < 1e-12, "{p}");
         assert_eq!(upright(&SparseModel::default()), Pose::identity());
-        // Taken on their side on a ring around the world's X, every second one the other way: the model stands all the same.
-        let mut ring = SparseModel::default();
-        for k in 0..12 {
-            let eye =
-                Point3::from(Rotation3::from_axis_angle(&Vector3::x_axis(), f64::from(k) * 0.5) * Vector3::y() * 4.0);
-            let side = Rotation3::from_axis_angle(&Vector3::z_axis(), if k % 3 == 0 { FRAC_PI_2 } else { -FRAC_PI_2 });
-            let pose = Pose::new(side, Vector3::zeros())
-                .compose(&Pose::look_at(eye, Point3::origin(), -Vector3::x()).unwrap());
-            ring.images.insert(k as u32, ModelImage { name: format!("{k:02}"), camera: 0, pose, points: Vec::new() });
-        }
-        let vertical = upright(&ring).rotation * Vector3::x();
-        assert!((vertical.y.abs() - 1.0).abs() < 1e-9, "{vertical}");
         let scene = PointScene::of_model(&model);
         assert_eq!(scene.left_out(), 0);
         // A camera whose lens's number is not there is left out, and nothing else.

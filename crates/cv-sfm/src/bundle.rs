@@ -230,7 +230,8 @@ pub(crate) fn adjust(
     let stage = Stage::new(progress, "adjust", plan.max_iterations)?;
     let mut free = vec![plan.free.is_none(); scene.views.len()];
     plan.free.iter().flat_map(|list| list.iter()).for_each(|v| free[*v] = true);
-    let Ok(mut problem) = Problem::new(scene, plan, &free) else { return Ok(None) };
+    let loss = RobustLoss::Cauchy { scale: plan.scale };
+    let Ok(mut problem) = Problem::new(scene, plan, &free, loss) else { return Ok(None) };
     let settings = AdjustOptions {
         max_iterations: plan.max_iterations,
         cost_tolerance: plan.tolerance,
@@ -269,18 +270,26 @@ pub(crate) fn adjust(
     Ok(Some(BundleOutcome { iterations: report.iterations, cost: [report.initial_cost, report.cost] }))
 }
 
-struct Problem<'a> {
-    adjustment: Adjustment<'a>,
-    poses: GroupId,
-    points: GroupId,
+/// Reprojection errors of a scene over its poses, points and lenses.
+pub(crate) struct Problem<'a> {
+    pub(crate) adjustment: Adjustment<'a>,
+    pub(crate) poses: GroupId,
+    pub(crate) points: GroupId,
     lenses: Option<GroupId>,
     /// The view of each pose, the track of each point.
-    views: Vec<usize>,
-    tracks: Vec<usize>,
+    pub(crate) views: Vec<usize>,
+    pub(crate) tracks: Vec<usize>,
+    /// Where all poses are free: the view whose own is held, and that whose distance from it is.
+    pub(crate) reference: Option<[usize; 2]>,
 }
 
 impl Problem<'_> {
-    fn new(scene: &Scene<'_>, plan: &BundlePlan<'_>, free: &[bool]) -> Result<Problem<'static>, AdjustError> {
+    pub(crate) fn new(
+        scene: &Scene<'_>,
+        plan: &BundlePlan<'_>,
+        free: &[bool],
+        loss: RobustLoss,
+    ) -> Result<Problem<'static>, AdjustError> {
         let chosen = |t: &usize| {
             let mut active = scene.tracks.range(*t).filter(|i| scene.active[*i]);
             scene.points[*t].is_some() && active.any(|i| free[scene.view_of(i)])
@@ -316,10 +325,10 @@ impl Problem<'_> {
         for n in &held {
             adjustment.hold(poses, *n)?;
         }
+        let mut reference = None;
         if held.is_empty() {
-            hold_gauge(scene, &mut adjustment, poses, &views)?;
+            reference = hold_gauge(scene, &mut adjustment, poses, &views)?;
         }
-        let loss = RobustLoss::Cauchy { scale: plan.scale };
         let refinable = |c: &CameraKnowledge| *c != CameraKnowledge::Known;
         let mut lenses = None;
         if plan.lens == LensFreedom::Held || !scene.knowledge.iter().any(refinable) {
@@ -343,24 +352,25 @@ impl Problem<'_> {
             adjustment.add_residuals("lens", Prior { items: prior }, [group], items, RobustLoss::Trivial)?;
             lenses = Some(group);
         }
-        Ok(Problem { adjustment, poses, points, lenses, views, tracks })
+        Ok(Problem { adjustment, poses, points, lenses, views, tracks, reference })
     }
 }
 
-/// Holds the first pose, and of the one farthest from it the coordinate of the translation in which it is farthest: position, turn and scale of the world.
+/// Holds the first pose, and of the one farthest from it (both are given back) the coordinate of the translation in which it is farthest: position, turn and scale of the world.
 fn hold_gauge(
     scene: &Scene<'_>,
     adjustment: &mut Adjustment<'_>,
     poses: GroupId,
     views: &[usize],
-) -> Result<(), AdjustError> {
+) -> Result<Option<[usize; 2]>, AdjustError> {
     let posed = |n: usize| Some((n, scene.poses[*views.get(n)?]?));
-    let Some((_, first)) = posed(0) else { return Ok(()) };
+    let Some((_, first)) = posed(0) else { return Ok(None) };
     adjustment.hold(poses, 0)?;
     let apart = |p: &Pose| (p.center() - first.center()).norm_squared();
     let others = (1..views.len()).filter_map(posed);
-    let Some((n, far)) = others.max_by(|a, b| apart(&a.1).total_cmp(&apart(&b.1))) else { return Ok(()) };
+    let Some((n, far)) = others.max_by(|a, b| apart(&a.1).total_cmp(&apart(&b.1))) else { return Ok(None) };
     // Of t = −R c, what changes with the distance from the first camera.
     let along = far.rotation * (far.center() - first.center());
-    adjustment.hold_parameters(poses, n, &[3 + along.iamax()])
+    adjustment.hold_parameters(poses, n, &[3 + along.iamax()])?;
+    Ok(Some([views[0], views[n]]))
 }

@@ -97,7 +97,7 @@ fn refine(
 }
 
 /// The scale of Cauchy's loss for the noise that the observations have, in pixels.
-fn noise_scale(scene: &Scene<'_>) -> f64 {
+pub(crate) fn noise_scale(scene: &Scene<'_>) -> f64 {
     let mut errors: Vec<f64> = Vec::new();
     for (track, point) in scene.points.iter().enumerate() {
         let Some(point) = point else { continue };

@@ -1,7 +1,8 @@
 //! Structure from motion of many views: cameras, poses and points from features that are matched by index.
 //!
 //! Takes keypoints and matches, never pictures: `cv-pipeline` joins features and this. The stages are calls of their own:
-//! [`verify_view_pair`] says which matches of two views agree, [`Tracks::build`] joins them over the views, [`reconstruct_views`] solves for cameras and points.
+//! [`verify_view_pair`] says which matches of two views agree, [`Tracks::build`] joins them over the views, [`reconstruct_views`] solves for cameras and points,
+//! [`align_model`] brings a model to known places.
 //!
 //! ```
 //! use cv_core::{Camera, DMatch, Keypoint, Point3, Pose, Silent, Vector3};
@@ -43,18 +44,22 @@
 //!
 //! # Conventions
 //!
-//! * Pixel centers at integers; a pose maps world to camera. The unit of the world is arbitrary.
+//! * Pixel centers at integers; a pose maps world to camera. The unit of the world is arbitrary, and so is its frame: [`align_model`] turns it upright and,
+//!   by what is known of places, to meters.
 //! * A track has one observation of a view at most. A model's points are those of tracks.
 //! * The same input, options and seed give the same bytes at any number of threads.
 
+mod align;
 mod bundle;
 mod complete;
+mod covariance;
 mod finish;
 mod focal_length;
 mod global;
 mod global_positions;
 mod incremental;
 mod initial_pair;
+mod known_poses;
 mod model;
 mod pair_scales;
 mod reconstruct;
@@ -67,9 +72,12 @@ mod triangulate_track;
 mod view_graph;
 mod view_pair;
 
+pub use align::{CenterFit, KnownPlaces, ModelAlignError, ModelAlignment, align_model, align_to_poses};
 pub use complete::FeatureDistance;
+pub use covariance::{ModelCovariance, PoseCovariance, model_covariance};
+pub use cv_numeric::adjust::AdjustError;
 pub use model::{SfmModel, SfmPoint, ViewOutcome};
-pub use reconstruct::{SfmError, SfmInput, SfmOptions, SfmOutcome, Solver, reconstruct_views};
+pub use reconstruct::{SfmError, SfmInput, SfmOptions, SfmOutcome, Solver, reconstruct_views, reconstruct_views_from};
 pub use tracks::{Observation, PairMatches, Tracks};
 pub use view_graph::{PairRefusal, RefusedPair};
 pub use view_pair::{ViewPair, ViewPairError, ViewPairModel, ViewPairOptions, verify_view_pair};

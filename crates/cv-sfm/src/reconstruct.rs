@@ -5,13 +5,14 @@ use crate::finish::finish;
 use crate::focal_length::start_cameras;
 use crate::incremental::{begin, extend};
 use crate::initial_pair::initial_pairs;
+use crate::known_poses::place_known;
 use crate::model::{SfmModel, ViewOutcome};
 use crate::pair_scales::{Distances, measure};
 use crate::repeated_structure::refuse_repeated;
 use crate::scene::Scene;
 use crate::view_graph::{RefusedPair, ViewGraph};
 use crate::{CameraKnowledge, PairMatches, SfmView, Tracks, ViewPairModel, global};
-use cv_core::{Camera, Cancelled, OptionError, Progress, Stage};
+use cv_core::{Camera, Cancelled, OptionError, Pose, Progress, Stage};
 
 /// How poses are found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -167,6 +168,20 @@ pub fn reconstruct_views(
     options: &SfmOptions,
     progress: &dyn Progress,
 ) -> Result<SfmOutcome, SfmError> {
+    reconstruct_views_from(input, &[], options, progress)
+}
+
+/// [`reconstruct_views`], the first model of which goes on from poses that are known, to some pixels: those of an earlier model in its frame ([`align_to_poses`](crate::align_to_poses) brings it
+/// back there to the last digit). `known` is by view; empty: none. A pose that the matches do not agree with is found anew.
+///
+/// # Errors
+/// [`SfmError`].
+pub fn reconstruct_views_from(
+    input: &SfmInput<'_>,
+    known: &[Option<Pose>],
+    options: &SfmOptions,
+    progress: &dyn Progress,
+) -> Result<SfmOutcome, SfmError> {
     check(input, options)?;
     let (cameras, focal_known) = start_cameras(input);
     let stage = Stage::new(progress, "register", input.views.len())?;
@@ -208,7 +223,9 @@ pub fn reconstruct_views(
         stage,
     };
     let (mut models, mut solvers): (Vec<SfmModel>, Vec<Solver>) = Default::default();
-    while let Some(found) = job.next_model(&cameras)? {
+    loop {
+        let known_first = if models.is_empty() { job.of_known(known, &cameras[0])? } else { None };
+        let Some(found) = known_first.map_or_else(|| job.next_model(&cameras), |found| Ok(Some(found)))? else { break };
         if found.model.registered() < options.min_model_size.min(input.views.len()) {
             break;
         }
@@ -293,6 +310,18 @@ impl Job<'_, '_> {
             }
         }
         Ok(best)
+    }
+
+    /// The model that goes on from known poses, where there are any that the matches agree with.
+    fn of_known(&mut self, known: &[Option<Pose>], cameras: &[Camera]) -> Result<Option<Found>, Cancelled> {
+        if known.iter().all(Option::is_none) {
+            return Ok(None);
+        }
+        self.scene.clear(cameras, &self.tracks);
+        match place_known(&mut self.scene, known, self.options, &self.stage)? {
+            true => self.completed(Solver::Incremental),
+            false => Ok(None),
+        }
     }
 
     /// A model of the largest part of the view graph at once, where the options have it so.

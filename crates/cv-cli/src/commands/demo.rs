@@ -3,6 +3,7 @@
 mod calibrate;
 mod depth;
 mod homography;
+mod many_views;
 mod panorama;
 mod reconstruct;
 mod segment;
@@ -115,11 +116,12 @@ impl Part {
 type Job = fn(&Demo<'_>) -> Result<Part, Failure>;
 
 /// In the order in which a reader learns them.
-const JOBS: [(&str, Job); 6] = [
+const JOBS: [(&str, Job); 7] = [
     ("segment", segment::run),
     ("homography", homography::run),
     ("panorama", panorama::run),
     ("reconstruct", reconstruct::run),
+    ("sfm", many_views::run),
     ("depth", depth::run),
     ("calibrate", calibrate::run),
 ];

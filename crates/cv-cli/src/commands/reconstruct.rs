@@ -173,14 +173,14 @@ impl Args {
     /// What is known of the cameras, and how.
     fn intrinsics(&self, photos: &[DynImage; 2], context: &Context) -> Result<(Intrinsics, String), Failure> {
         if let Some(path) = &self.camera {
-            let (first, first_known) = rig::camera_and_lens(path, Some(photos[0].size()), context)?;
+            let (first, first_known) = rig::camera_and_lens(path, Some(photos[0].size()), self.undistorted, context)?;
             let (second, second_known) = match &self.camera2 {
-                Some(path) => rig::camera_and_lens(path, Some(photos[1].size()), context)?,
+                Some(path) => rig::camera_and_lens(path, Some(photos[1].size()), self.undistorted, context)?,
                 None => (first, first_known),
             };
             let cameras = [first, second];
             let source = format!("camera from {}", path.display());
-            return Ok(if self.undistorted || (first_known && second_known) {
+            return Ok(if first_known && second_known {
                 (Intrinsics::Known(cameras), source)
             } else {
                 let open = "a matrix without the lens: its distortion is estimated (--undistorted where there is none)";

@@ -1,28 +1,44 @@
 //! `cv sfm`: cameras and points from many photographs.
 
+mod cameras;
+mod checkpoint;
+mod covariance;
+mod dense;
+mod earlier;
+mod outcome;
 mod photographs;
 mod pinhole;
+mod places;
 mod report;
 
 use crate::frame::{CLOUD, Context, Failure, JSON, Outcome, Output, Run, Step, expand_images, named, steps};
-use crate::{rig, words};
-use cv_core::{Camera, Distortion, ModelImage, PointCloud, Pose, SparseModel};
+use crate::words;
+use cameras::Cameras;
+use checkpoint::{Checkpoint, Seen};
+use cv_core::{PointCloud, SparseModel};
 use cv_io::colmap::{self, ModelFormat};
 use cv_io::ply::PlyEncoding;
-use cv_io::{CalibrationFormat, DynImage};
 use cv_pipeline::features::FeatureError;
-use cv_pipeline::many_views::{CameraKnowledge, Solver, ViewOutcome};
-use cv_pipeline::{Cancelled, Progress, SfmCamera, SfmJobOptions, SfmPhoto, SfmPhotoError, SfmResult, sfm, sfm_photo};
+use cv_pipeline::many_views::{SfmModel, Solver};
+use cv_pipeline::{
+    Cancelled, PhotoOrder, Progress, SfmJobOptions, SfmPhoto, SfmPhotoError, sfm_covariance, sfm_pairs, sfm_photo,
+    sfm_solve,
+};
+use dense::DenseArgs;
+use earlier::Earlier;
+use outcome::{doubt, fates, outcome};
 use photographs::{Photograph, photographs, seen_from};
 use pinhole::PinholeFolder;
-use serde_json::{Value, json};
-use std::collections::BTreeMap;
+use places::{Frame, PlaceArgs, Places};
 use std::path::{Path, PathBuf};
 
 /// Reconstruct cameras and a sparse cloud of points from many photographs (structure from motion).
 ///
-/// The photographs need no order. Without --camera and --focal, focal lengths come from EXIF and are refined; photographs of one size and one focal length share a camera. The unit of the
-/// model is arbitrary. A photograph that cannot be read, or that shows something else, is left out and told of.
+/// The photographs need no order. Without --camera and --focal, focal lengths come from EXIF and are refined; photographs of one size and one focal length share a camera. A photograph that
+/// cannot be read, or that shows something else, is left out and told of.
+///
+/// The model stands upright, Z up. Where three photographs or more tell their GPS position, it is in meters from the first of them (X east, Y north); else --known or --distance tell meters, or
+/// its unit is arbitrary.
 ///
 /// The model is COLMAP's: cameras, images and points3D, as .txt or .bin. One that is in the folder is replaced. Where the photographs fall apart into several models, the one with most
 /// photographs is written into the folder itself, the others into its folders 1, 2, …
@@ -30,8 +46,12 @@ use std::path::{Path, PathBuf};
 #[command(after_help = "Examples:\n  \
     cv sfm photos/ -o model --report page\n  \
     cv sfm 'photos/*.jpg' --camera cam.yaml -o model --cloud points.ply\n  \
+    cv sfm 'frames/*.png' --order sequence -o model                    # frames of a video, or of a drive\n  \
     cv sfm photos/ --focal 2900 -o sparse/0 --format colmap-binary --json\n  \
+    cv sfm photos/ -o model --distance a.jpg b.jpg 2.5                 # meters between two photographs\n  \
+    cv sfm photos/ more/ --from model -o model                         # more photographs of the same place\n  \
     cv sfm photos/ -o model --transforms photos/transforms.json        # for Nerfstudio and instant-ngp\n  \
+    cv sfm photos/ -o model --dense dense.ply                          # surfaces as points with normals\n  \
     cv sfm photos/ -o model --pinhole dense                            # for dense reconstruction, by COLMAP or OpenMVS")]
 pub(crate) struct Args {
     /// Photographs, folders or quoted patterns of them.
@@ -49,6 +69,9 @@ pub(crate) struct Args {
     /// About what focal length in pixels the photographs have.
     #[arg(long, value_name = "PX")]
     focal: Option<f64>,
+    /// A model of some of the photographs, as COLMAP's text or binary: its poses are gone on from, its lenses stay as they are, its frame is kept, and the photographs that it lacks are added.
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["camera", "focal"])]
+    from: Option<PathBuf>,
     /// Estimate the focal length even where the photographs' EXIF has one.
     #[arg(long, conflicts_with_all = ["camera", "focal"])]
     ignore_exif: bool,
@@ -58,6 +81,9 @@ pub(crate) struct Args {
     /// How poses are found.
     #[arg(long, value_name = "SOLVER", value_parser = named::<Solver>(), default_value_t = Solver::default())]
     solver: Solver,
+    /// In what order the photographs come: it tells which pairs are tried.
+    #[arg(long, value_name = "ORDER", value_parser = named::<PhotoOrder>(), default_value_t = PhotoOrder::default())]
+    order: PhotoOrder,
     /// Most features in a photograph [default: 13000].
     #[arg(long, value_name = "N")]
     features: Option<usize>,
@@ -73,6 +99,19 @@ pub(crate) struct Args {
     /// Where to write the photographs of the largest model without lens distortion (images/), and the model of their pinhole cameras (sparse/): a folder.
     #[arg(long, value_name = "DIR")]
     pinhole: Option<PathBuf>,
+    /// Where to write how well the cameras and points of the largest model are known: standard deviations, as JSON. They are relative to one photograph's pose and its distance from another.
+    #[arg(long, value_name = "FILE")]
+    covariance: Option<PathBuf>,
+    /// Go on with a run into the same folder that was stopped: what it found in the same photographs by the same options is taken.
+    #[arg(long)]
+    resume: bool,
+    /// Keep features and pairs (in .cv-sfm of the output's folder) when the model is done, for runs with --resume over more photographs or by other options of the solution.
+    #[arg(long)]
+    keep: bool,
+    #[command(flatten)]
+    dense: DenseArgs,
+    #[command(flatten)]
+    places: PlaceArgs,
 }
 
 impl Run for Args {
@@ -81,12 +120,15 @@ impl Run for Args {
         all.extend(self.cloud.iter().map(|path| Output::File(path, CLOUD)));
         all.extend(self.transforms.iter().map(|path| Output::File(path, JSON)));
         all.extend(self.pinhole.iter().map(|path| Output::Folder(path)));
+        all.extend(self.dense.path().map(|path| Output::File(path, CLOUD)));
+        all.extend(self.covariance.iter().map(|path| Output::File(path, JSON)));
         all
     }
 
     fn steps(&self) -> Vec<Step> {
         let mut all = vec![steps::PHOTOGRAPHS, steps::PAIRS, steps::MODEL];
         all.extend(self.pinhole.iter().map(|_| steps::UNDISTORT));
+        all.extend(self.dense.path().map(|_| steps::DENSE));
         all
     }
 
@@ -97,14 +139,48 @@ impl Run for Args {
             return Err(Failure::usage(format!("{} is one photograph, too few for a model", only.display()))
                 .advice("two at least; ten or more of one place are usual"));
         }
-        let mut all = photographs(named)?;
+        let all = photographs(named)?;
+        let places = self.places.read(&all, context)?;
         let pinhole = self.pinhole.as_ref().map(|folder| PinholeFolder::new(folder, &all)).transpose()?;
+        let earlier = self.from.as_ref().map(|folder| Earlier::read(folder, &all, context)).transpose()?;
+        let checkpoint = Checkpoint::new(&self.output, self.resume, context);
+        let told = Told { places, earlier, pinhole };
+        let outcome = self.reconstruct(all, told, &options, &checkpoint, context);
+        checkpoint.end(self.keep, outcome.is_ok());
+        outcome
+    }
+}
+
+impl Args {
+    fn reconstruct(
+        &self,
+        mut all: Vec<Photograph>,
+        told: Told<'_>,
+        options: &SfmJobOptions,
+        checkpoint: &Checkpoint<'_>,
+        context: &Context,
+    ) -> Result<Outcome, Failure> {
         let mut clock = cv_core::StageClock::new();
         let (mut cameras, mut photos, mut used) = (Cameras::default(), Vec::new(), Vec::new());
         let total = all.len();
         for (i, one) in all.iter_mut().enumerate() {
             if one.refused.is_none() {
-                match self.features_of(one, &mut cameras, &options, &Place { context, done: i, total })? {
+                let camera = |cameras: &mut Cameras, size, exif: Option<f64>| match told
+                    .earlier
+                    .as_ref()
+                    .and_then(|e| Some((e, e.camera(i, size, exif.filter(|_| !self.ignore_exif))?)))
+                {
+                    Some((earlier, camera)) => cameras.of_earlier(size, camera, earlier, self),
+                    None => cameras.of(size, exif, self, context),
+                };
+                let place = Place { context, done: i, total };
+                match self.features_of(
+                    one,
+                    |size, exif| camera(&mut cameras, size, exif),
+                    options,
+                    checkpoint,
+                    &place,
+                )? {
                     Ok(photo) => {
                         photos.push(photo);
                         used.push(i);
@@ -122,7 +198,13 @@ impl Run for Args {
             return Err(words::many_views::too_few(photos.len(), &refused));
         }
         clock.lap("features");
-        let result = sfm(&photos, &cameras.list, &options, context).map_err(words::many_views::no_model)?;
+        let find = || sfm_pairs(&photos, &cameras.list, options, context);
+        let (pairs, geometry) = checkpoint.pairs(&photos, &cameras.list, options, find)?;
+        clock.lap("match");
+        let known = told.earlier.as_ref().map_or_else(Vec::new, |earlier| earlier.poses(&used));
+        let mut result = sfm_solve(&photos, &cameras.list, (pairs, &geometry), &known, options, context)
+            .map_err(words::many_views::no_model)?;
+        let frames = told.frames(&self.places, &mut result.models, &all, &used, context)?;
         let models: Vec<SparseModel> =
             (0..result.models.len()).filter_map(|m| result.sparse_model(m, &photos)).collect();
         let Some(main) = models.first() else { return Err(Failure::new("there is no model")) };
@@ -131,20 +213,36 @@ impl Run for Args {
         stages.extend(result.stages.iter().copied());
         let mut clock = cv_core::StageClock::new();
         self.write(&models, &all, &used, context)?;
-        if let Some(folder) = &pinhole {
+        if let Some(folder) = &told.pinhole {
             folder.write(main, &all, &used, self.format, context)?;
         }
         clock.lap("write");
         stages.extend(clock.into_stages());
+        let dense = match result.models.first() {
+            Some(model) => self.dense.write(model, &photos, &all, &used, context)?,
+            None => None,
+        };
+        stages.extend(dense.iter().flat_map(|dense| dense.stages.iter().copied()));
+        let mut clock = cv_core::StageClock::new();
+        if let (Some(path), Some(model), Some(frame)) = (&self.covariance, result.models.first(), frames.first()) {
+            let names: Vec<&str> = photos.iter().map(|photo| photo.name.as_str()).collect();
+            let of = sfm_covariance(&photos, &cameras.list, model)?;
+            let text = covariance::deviations(&of, &names, &frame.json["unit"]).to_string();
+            context.write(Output::File(path, JSON), |path| cv_io::write_bytes(path, text.as_bytes()))?;
+            clock.lap("covariance");
+        }
+        stages.extend(clock.into_stages());
         if let Some(text) = doubt(&models, &fates) {
             context.warn(text);
         }
-        context.report(|| report::report(&all, &fates, &models, &stages))?;
-        Ok(outcome(&all, &fates, &models, &result, stages))
+        context.report(|| report::report(&all, &fates, &models, &frames, &stages))?;
+        let done = outcome(&all, &fates, &models, &frames, &result, checkpoint.taken(), stages);
+        Ok(match &dense {
+            Some(dense) => done.with("dense_points", dense.cloud.len()).with("dense_pairs", dense.pairs.len()),
+            None => done,
+        })
     }
-}
 
-impl Args {
     fn options(&self, context: &Context) -> Result<SfmJobOptions, Failure> {
         if self.focal.is_some_and(|f| !(f > 0.0 && f.is_finite())) {
             return Err(Failure::usage("--focal must be above 0"));
@@ -155,6 +253,7 @@ impl Args {
         let mut options = SfmJobOptions::default();
         options.solve.max_error = self.max_error;
         options.solve.solver = self.solver;
+        options.order = self.order;
         if let Some(n) = self.features {
             options.features = options.features.at_most(n);
         }
@@ -167,22 +266,54 @@ impl Args {
     /// The features of a photograph, or why it is left out.
     fn features_of(
         &self,
-        one: &Photograph,
-        cameras: &mut Cameras,
+        one: &mut Photograph,
+        mut camera: impl FnMut((usize, usize), Option<f64>) -> Result<Result<usize, String>, Failure>,
         options: &SfmJobOptions,
+        checkpoint: &Checkpoint<'_>,
         place: &Place<'_>,
     ) -> Result<Result<SfmPhoto, String>, Failure> {
+        place.report("photographs", 0, 0)?;
+        let (key, found) = checkpoint.seen(one, options);
+        let new = found.is_none();
+        let seen = match found {
+            Some(seen) => seen,
+            None => match self.look_at(one, &mut camera, options, place)? {
+                Ok(seen) => seen,
+                Err(reason) => return Ok(Err(reason)),
+            },
+        };
+        let camera = match camera(seen.photo.size, seen.focal)? {
+            Ok(camera) => camera,
+            Err(reason) => return Ok(Err(reason)),
+        };
+        if new {
+            checkpoint.keep_seen(key, &seen);
+        }
+        checkpoint.add(key);
+        one.gps = seen.gps;
+        Ok(Ok(SfmPhoto { name: one.name.clone(), camera, ..seen.photo }))
+    }
+
+    /// What a photograph shows, or why it is left out.
+    fn look_at(
+        &self,
+        one: &Photograph,
+        mut camera: impl FnMut((usize, usize), Option<f64>) -> Result<Result<usize, String>, Failure>,
+        options: &SfmJobOptions,
+        place: &Place<'_>,
+    ) -> Result<Result<Seen, String>, Failure> {
         let image = match cv_io::read_image(&one.path) {
             Ok(image) => image,
             Err(error) => return Ok(Err(words::many_views::not_read(&error))),
         };
-        let camera = match cameras.of(&image, self, place.context)? {
-            Ok(camera) => camera,
-            Err(reason) => return Ok(Err(reason)),
-        };
+        let (focal, gps) = (image.exif.focal.map(|f| f.pixels), image.exif.gps);
+        // Before the work.
+        if let Err(reason) = camera(image.size(), focal)? {
+            return Ok(Err(reason));
+        }
         let rgb = image.into_rgb8();
-        match sfm_photo(rgb.view(), one.name.clone(), camera, &options.features, place) {
-            Ok(photo) => Ok(Ok(photo)),
+        match sfm_photo(rgb.view(), String::new(), 0, &options.features, place) {
+            Ok(photo) => Ok(Ok(Seen { focal, gps, photo })),
             Err(SfmPhotoError::Features(
                 error @ (FeatureError::ImageTooSmall { .. } | FeatureError::NotFinite { .. }),
             )) => Ok(Err(error.to_string())),
@@ -235,6 +366,33 @@ impl Args {
     }
 }
 
+/// What the person tells of the photographs, and the folder of those without distortion.
+struct Told<'a> {
+    places: Places,
+    earlier: Option<Earlier>,
+    pinhole: Option<PinholeFolder<'a>>,
+}
+
+impl Told<'_> {
+    /// Brings each model to what is known: by the person's own numbers, by an earlier model, or by what the photographs say of themselves.
+    fn frames(
+        &self,
+        args: &PlaceArgs,
+        models: &mut [SfmModel],
+        all: &[Photograph],
+        used: &[usize],
+        context: &Context,
+    ) -> Result<Vec<Frame>, Failure> {
+        let earlier = self.earlier.as_ref().filter(|_| !self.places.is_told());
+        let places = self.places.with_gps(args, all);
+        let one = |model: &mut SfmModel| match earlier.and_then(|earlier| earlier.align(model, used)) {
+            Some(frame) => Ok(frame),
+            None => places.align(model, all, used, context),
+        };
+        models.iter_mut().map(one).collect()
+    }
+}
+
 /// How many of the photographs have been looked at.
 struct Place<'a> {
     context: &'a Context,
@@ -246,166 +404,4 @@ impl Progress for Place<'_> {
     fn report(&self, _: &'static str, _: usize, _: usize) -> Result<(), Cancelled> {
         Progress::report(self.context, "photographs", self.done, self.total)
     }
-}
-
-/// The cameras of the photographs so far.
-#[derive(Default)]
-struct Cameras {
-    list: Vec<SfmCamera>,
-    /// By size and focal length in thousandths of a pixel.
-    known: BTreeMap<(usize, usize, u64), usize>,
-}
-
-impl Cameras {
-    /// The index of a photograph's camera, or why it has none.
-    fn of(&mut self, image: &DynImage, args: &Args, context: &Context) -> Result<Result<usize, String>, Failure> {
-        let (width, height) = image.size();
-        let exif = image.exif.focal.map(|f| f.pixels).filter(|_| !args.ignore_exif && args.camera.is_none());
-        let focal = args.focal.or(exif);
-        let key = (width, height, focal.map_or(0, |f| (f * 1000.0).round() as u64));
-        if let Some(index) = self.known.get(&key) {
-            return Ok(Ok(*index));
-        }
-        let lens = |camera: Camera| Camera { distortion: Distortion::radial(0.0, 0.0), ..camera };
-        let camera = if let Some(file) = &args.camera {
-            let (camera, lens_known) = rig::camera_and_lens(file, Some((width, height)), context)?;
-            if (camera.width, camera.height) != (width, height) {
-                let (w, h) = (camera.width, camera.height);
-                return Ok(Err(format!("it is {width}×{height} px, its camera in {} is {w}×{h} px", file.display())));
-            }
-            match lens_known || args.undistorted {
-                true => {
-                    args.check_lens(file, &camera)?;
-                    SfmCamera { camera, knowledge: CameraKnowledge::Known }
-                }
-                false => SfmCamera { camera: lens(camera), knowledge: CameraKnowledge::Matrix },
-            }
-        } else if let Some(focal) = focal {
-            let camera = lens(Camera::from_focal(width, height, focal));
-            SfmCamera { camera, knowledge: CameraKnowledge::Focal { focal, deviation: EXIF_DEVIATION } }
-        } else {
-            // 1.2 times the longer side, COLMAP's, where the pairs do not tell better.
-            let camera = lens(Camera::from_focal(width, height, 1.2 * width.max(height) as f64));
-            SfmCamera { camera, knowledge: CameraKnowledge::Unknown }
-        };
-        self.list.push(camera);
-        self.known.insert(key, self.list.len() - 1);
-        Ok(Ok(self.list.len() - 1))
-    }
-}
-
-impl Args {
-    /// Refuses, before the work, a lens that the outputs cannot hold.
-    fn check_lens(&self, file: &Path, camera: &Camera) -> Result<(), Failure> {
-        let refuse = |error: cv_io::FormatError| {
-            Failure::new(format!("{}: {error}", file.display()))
-                .advice("photographs without distortion (`cv undistort`) and their camera")
-        };
-        if let Some(format) = CalibrationFormat::from_name("colmap") {
-            format.camera_text(camera, &[]).map_err(refuse)?;
-        }
-        if self.transforms.is_some() {
-            let image =
-                ModelImage { name: "photograph".to_owned(), camera: 1, pose: Pose::identity(), points: Vec::new() };
-            let model =
-                SparseModel { cameras: [(1, *camera)].into(), images: [(1, image)].into(), ..SparseModel::default() };
-            cv_io::transforms_json(&model, "").map_err(refuse)?;
-        }
-        Ok(())
-    }
-}
-
-/// Relative standard deviation of focal lengths by EXIF.
-const EXIF_DEVIATION: f64 = 0.03;
-
-/// What became of a photograph: the model it is in, or why it is in none.
-type Fate = Result<usize, String>;
-
-fn fates(all: &[Photograph], used: &[usize], outcomes: &[ViewOutcome]) -> Vec<Fate> {
-    let mut fates: Vec<Fate> = all.iter().map(|p| Err(p.refused.clone().unwrap_or_default())).collect();
-    for (at, outcome) in used.iter().zip(outcomes) {
-        fates[*at] = match outcome {
-            ViewOutcome::Registered { model } => Ok(*model),
-            other => Err(words::many_views::left_out(other).unwrap_or_default()),
-        };
-    }
-    fates
-}
-
-/// What to think of a model that is not of most photographs.
-fn doubt(models: &[SparseModel], fates: &[Fate]) -> Option<String> {
-    let inside = fates.iter().filter(|fate| **fate == Ok(0)).count();
-    let more = "photographs in between join them";
-    match models.len() {
-        1 if 2 * inside >= fates.len() => None,
-        1 => Some(format!("only {inside} of {} photographs are in the model; {more}", fates.len())),
-        n => Some(format!(
-            "the photographs fall apart into {n} models, whose places to each other are unknown; {inside} of {} are in the largest; {more}",
-            fates.len()
-        )),
-    }
-}
-
-/// Root mean square distance in pixels between the points' projections and where they were seen, over all observations.
-fn reprojection_rms(model: &SparseModel) -> f64 {
-    let errors: Vec<f64> = reprojections(model).collect();
-    (errors.iter().map(|e| e * e).sum::<f64>() / errors.len() as f64).sqrt()
-}
-
-/// The distance of each observation from its point's projection, in pixels.
-fn reprojections(model: &SparseModel) -> impl Iterator<Item = f64> + '_ {
-    model.points.values().flat_map(move |point| {
-        point.track.iter().filter_map(move |(id, index)| {
-            let image = model.images.get(id)?;
-            let at = image.points.get(*index as usize)?.0;
-            let pixel = model.cameras.get(&image.camera)?.project(&image.pose.transform(&point.position))?;
-            Some((pixel - at).norm())
-        })
-    })
-}
-
-fn outcome(
-    all: &[Photograph],
-    fates: &[Fate],
-    models: &[SparseModel],
-    result: &SfmResult,
-    stages: Vec<(&'static str, f64)>,
-) -> Outcome {
-    let image = |(one, fate): (&Photograph, &Fate)| {
-        let model = fate.as_ref().ok();
-        json!({ "path": one.path.display().to_string(), "used": model.is_some(), "model": model, "reason": fate.as_ref().err() })
-    };
-    let images: Vec<Value> = all.iter().zip(fates).map(image).collect();
-    let used = fates.iter().filter(|fate| fate.is_ok()).count();
-    let main = result.models.first();
-    let (points, observations) = main.map_or((0, 0), |m| (m.points.len(), m.observations()));
-    let (length, error) = main.map_or((0.0, 0.0), |m| (m.mean_track_length(), m.mean_reprojection_error()));
-    let rms = models.first().map_or(f64::NAN, reprojection_rms);
-    let focal: Vec<f64> = models.first().map_or_else(Vec::new, |m| m.cameras.values().map(|c| c.fx).collect());
-    let mut summary = format!(
-        "{used} of {} photographs in {} model{}; {points} points seen {length:.1} times each, {rms:.3} px RMS",
-        all.len(),
-        models.len(),
-        if models.len() == 1 { "" } else { "s" },
-    );
-    let refused = words::many_views::RefusedPairs::of(&result.refused);
-    summary.extend(refused.text(result.pairs.len()).map(|text| format!("\n{text}")));
-    // What was refused has been warned of.
-    for (one, fate) in all.iter().zip(fates) {
-        if let (Err(reason), None) = (fate, &one.refused) {
-            summary += &format!("\n{}: left out: {reason}", one.path.display());
-        }
-    }
-    Outcome::new(stages)
-        .with("images", images)
-        .with("models", models.len())
-        .with("points", points)
-        .with("observations", observations)
-        .with("mean_track_length", length)
-        .with("reprojection_rms_px", rms)
-        .with("mean_reprojection_px", error)
-        .with("focal_px", focal)
-        .with("solvers", result.solvers.iter().map(ToString::to_string).collect::<Vec<_>>())
-        .with("refused_pairs", json!({ "triplets": refused.triplets, "repeated": refused.repeated }))
-        .summary(summary)
 }

@@ -115,6 +115,11 @@ impl Context {
         Ok(())
     }
 
+    /// Whether the person asked the program to stop.
+    pub(crate) fn is_stopped(&self) -> bool {
+        self.stop.check().is_err()
+    }
+
     /// Whether `--report` was given: pictures for it are worth drawing.
     pub(crate) fn wants_report(&self) -> bool {
         self.report.is_some()

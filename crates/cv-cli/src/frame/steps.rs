@@ -37,5 +37,6 @@ steps! {
     PAIRS = "pairs": ["match"];
     MODEL = "model": ["register"];
     UNDISTORT = "undistort": ["undistort"];
+    DENSE = "dense": ["reduce", "dense", "join"];
     DEMO = "demo": ["demo"];
 }

@@ -1,10 +1,11 @@
 //! What the program says of models of many photographs: why there is none, and why photographs are left out.
 
 use super::{Failure, unreadable, words};
+use cv_core::GeodeticPoint;
 use cv_io::IoError;
-use cv_pipeline::many_views::{PairRefusal, RefusedPair, SfmError, ViewOutcome};
-use cv_pipeline::{Advice, SfmJobError};
-use std::path::Path;
+use cv_pipeline::many_views::{CenterFit, ModelAlignError, PairRefusal, RefusedPair, SfmError, ViewOutcome};
+use cv_pipeline::{Advice, SfmDenseError, SfmJobError};
+use std::path::{Path, PathBuf};
 
 /// Why a photograph is in no model; `None` where it is in one.
 pub(crate) fn left_out(outcome: &ViewOutcome) -> Option<String> {
@@ -91,6 +92,107 @@ pub(crate) fn no_model(error: SfmJobError) -> Failure {
         _ => return error.into(),
     };
     Failure::from(error).advice(advice)
+}
+
+/// Why there is no dense cloud of a model, which is written all the same.
+pub(crate) fn no_dense_cloud(error: SfmDenseError) -> Failure {
+    let advice = match &error {
+        SfmDenseError::NoPairs { .. } => {
+            "more photographs, a step of a tenth of the distance apart, each of which shows most of what its neighbor shows"
+        }
+        SfmDenseError::NoDepths { .. } | SfmDenseError::NoAgreement { .. } => {
+            "three photographs or more of each thing, from nearer to each other, of things with texture that stand still; a larger --dense-size"
+        }
+        _ => return error.into(),
+    };
+    Failure::from(error).advice(advice)
+}
+
+/// By what a place is known.
+#[derive(Clone)]
+pub(crate) enum PlaceSource {
+    /// The photographs' EXIF: the place of the origin, and whether heights are told.
+    Gps { origin: GeodeticPoint, heights: bool },
+    /// A file that the person names.
+    File(PathBuf),
+}
+
+impl PlaceSource {
+    /// What it is called.
+    pub(crate) fn name(&self) -> String {
+        match self {
+            Self::Gps { .. } => "the GPS positions".to_owned(),
+            Self::File(path) => format!("the places of {}", path.display()),
+        }
+    }
+
+    /// The same for programs.
+    pub(crate) fn key(&self) -> &'static str {
+        match self {
+            Self::Gps { .. } => "gps",
+            Self::File(_) => "known",
+        }
+    }
+
+    /// Why a model is not brought to places; nothing is to be said of photographs of which too few tell their position.
+    pub(crate) fn refusal(&self, error: &ModelAlignError) -> Option<String> {
+        match error {
+            ModelAlignError::TooFew { got, needed } => match self {
+                Self::Gps { .. } => None,
+                Self::File(_) => {
+                    Some(format!("{got} of them are of photographs in the model, and {needed} are needed"))
+                }
+            },
+            ModelAlignError::OnePlace => Some("they are all one place".to_owned()),
+            ModelAlignError::Contradiction { agree, of, rms, spread } => Some(format!(
+                "they contradict it: {agree} of {of} agree, to {rms:.2} m where they are {spread:.2} m around their mean"
+            )),
+            other => Some(other.to_string()),
+        }
+    }
+}
+
+/// What frame a model is in that was brought to known places.
+pub(crate) fn aligned(source: &PlaceSource, fit: &CenterFit) -> String {
+    let (count, rms) = (fit.agree.len(), fit.rms);
+    let tilt = if fit.tilt { "" } else { "; they lie on a line, so that up is that of the photographs" };
+    match source {
+        PlaceSource::Gps { origin, heights } => {
+            let side = |v: f64, [plus, minus]: [&str; 2]| {
+                format!("{:.6}° {}", v.to_degrees().abs(), if v < 0.0 { minus } else { plus })
+            };
+            let place = format!("{}, {}", side(origin.latitude, ["N", "S"]), side(origin.longitude, ["E", "W"]));
+            let height = if *heights { "" } else { "; no heights are told" };
+            format!(
+                "in meters by the GPS positions of {count} photographs ({rms:.2} m RMS): X east, Y north, Z up from {place}{height}{tilt}"
+            )
+        }
+        PlaceSource::File(path) => {
+            format!("in the frame of {}, in meters, by {count} photographs ({rms:.3} m RMS){tilt}", path.display())
+        }
+    }
+}
+
+/// Relative differences of which the person is told: of known distances among each other, and of the scale by positions from that by distances.
+pub(crate) const DISTANCES_DIFFER: f64 = 0.02;
+pub(crate) const SCALES_DIFFER: f64 = 0.1;
+
+/// Known distances that contradict each other.
+pub(crate) fn distances_differ(error: f64) -> String {
+    format!("the distances of --distance contradict each other: one differs from the model by {:.1} %", 100.0 * error)
+}
+
+/// Known places that do not agree with a model that others agree with: the photographs and by how many meters.
+pub(crate) fn places_differ(source: &PlaceSource, differ: &[(&Path, f64)], rms: f64) -> String {
+    let shown: Vec<String> =
+        differ.iter().take(SHOWN).map(|(path, off)| format!("{} by {off:.1} m", path.display())).collect();
+    let more = if differ.len() > SHOWN { ", …" } else { "" };
+    format!(
+        "of {} {} differ from the model by much more than the others ({rms:.2} m RMS) and are left aside: {}{more}",
+        source.name(),
+        differ.len(),
+        shown.join(", ")
+    )
 }
 
 #[cfg(test)]

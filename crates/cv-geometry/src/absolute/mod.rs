@@ -2,11 +2,13 @@
 
 mod dlt;
 mod p3p;
+mod similarity;
 mod umeyama;
 
 pub use dlt::pose_from_points;
 pub use p3p::pose_three_points;
-pub use umeyama::{Similarity, align_points};
+pub use similarity::estimate_similarity;
+pub use umeyama::{Similarity, SimilarityFreedom, align_points};
 
 use crate::error::{Degeneracy, EstimateError};
 use crate::match_blocks::{LANES, different};

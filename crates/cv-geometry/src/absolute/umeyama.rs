@@ -23,6 +23,15 @@ impl Similarity {
     }
 }
 
+/// What of a similarity is to be found.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SimilarityFreedom {
+    /// The scale, which else is 1.
+    pub scale: bool,
+    /// Any rotation; else one about Z, where both frames have Z up.
+    pub tilt: bool,
+}
+
 /// The similarity (or, without `with_scale`, the rigid motion) that brings the points `a` nearest to the points `b` in the sense of least
 /// squares (absolute orientation: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991). One
 /// solution.
@@ -30,7 +39,18 @@ impl Similarity {
 /// # Errors
 /// [`EstimateError`]: fewer than three pairs (the shorter list counts), a coordinate that is not finite, or points on a line.
 pub fn align_points(a: &[Point3<f64>], b: &[Point3<f64>], with_scale: bool) -> Result<Similarity, EstimateError> {
-    let n = a.len().min(b.len());
+    let weights = vec![1.0; a.len().min(b.len())];
+    align_points_weighted(a, b, &weights, SimilarityFreedom { scale: with_scale, tilt: true })
+}
+
+/// [`align_points`] with a weight of 0 or more for each pair. Without `tilt`, points on a line that is not vertical will do.
+pub(crate) fn align_points_weighted(
+    a: &[Point3<f64>],
+    b: &[Point3<f64>],
+    weights: &[f64],
+    freedom: SimilarityFreedom,
+) -> Result<Similarity, EstimateError> {
+    let n = a.len().min(b.len()).min(weights.len());
     if n < 3 {
         return Err(EstimateError::NotEnoughMatches { got: n, needed: 3 });
     }
@@ -38,17 +58,33 @@ pub fn align_points(a: &[Point3<f64>], b: &[Point3<f64>], with_scale: bool) -> R
     if let Some(index) = (0..n).find(|&i| !usable(&a[i]) || !usable(&b[i])) {
         return Err(EstimateError::NotFinite { index });
     }
-    let mean = |p: &[Point3<f64>]| p[..n].iter().map(|p| p.coords).sum::<Vector3<f64>>() / n as f64;
-    let (ma, mb) = (mean(a), mean(b));
+    let coincident = EstimateError::Degenerate { kind: Degeneracy::Coincident };
+    let total: f64 = weights[..n].iter().sum();
+    if total <= 0.0 {
+        return Err(coincident);
+    }
+    let mean = |p: &[Point3<f64>]| p.iter().zip(weights).map(|(p, w)| p.coords * *w).sum::<Vector3<f64>>() / total;
+    let (ma, mb) = (mean(&a[..n]), mean(&b[..n]));
     let mut covariance = Matrix3::zeros();
     let mut spread = 0.0;
-    for (p, q) in a.iter().zip(b) {
+    for ((p, q), w) in a.iter().zip(b).zip(weights) {
         let (p, q) = (p.coords - ma, q.coords - mb);
-        covariance += q * p.transpose();
-        spread += p.norm_squared();
+        covariance += q * p.transpose() * *w;
+        spread += p.norm_squared() * w;
     }
+    let (rotation, trace) = if freedom.tilt { turn(&covariance)? } else { turn_about_z(&covariance, spread)? };
+    let scale = if freedom.scale { trace / spread } else { 1.0 };
+    // Turned about Z, what is higher in one may be lower in the other.
+    if scale <= 0.0 || scale.is_nan() {
+        return Err(coincident);
+    }
+    Ok(Similarity { scale, rotation, translation: mb - rotation * ma * scale })
+}
+
+/// The rotation of largest `tr(Rᵀ Σ)`, and that.
+fn turn(covariance: &Matrix3<f64>) -> Result<(Rotation3<f64>, f64), EstimateError> {
     let coincident = EstimateError::Degenerate { kind: Degeneracy::Coincident };
-    let svd = svd3(&covariance).map_err(|_| coincident)?;
+    let svd = svd3(covariance).map_err(|_| coincident)?;
     if svd.s[0] <= 1e-24 {
         return Err(coincident);
     }
@@ -57,9 +93,20 @@ pub fn align_points(a: &[Point3<f64>], b: &[Point3<f64>], with_scale: bool) -> R
         return Err(EstimateError::Degenerate { kind: Degeneracy::Collinear });
     }
     // U and V are proper rotations: the last singular value carries the sign.
-    let rotation = svd.nearest_rotation();
-    let scale = if with_scale { svd.s.sum() / spread } else { 1.0 };
-    Ok(Similarity { scale, rotation, translation: mb - rotation * ma * scale })
+    Ok((svd.nearest_rotation(), svd.s.sum()))
+}
+
+/// The same among rotations about Z.
+fn turn_about_z(covariance: &Matrix3<f64>, spread: f64) -> Result<(Rotation3<f64>, f64), EstimateError> {
+    let cos = covariance.m11 + covariance.m22;
+    let sin = covariance.m21 - covariance.m12;
+    let level = cos.hypot(sin);
+    if spread <= 1e-24 || level <= 1e-12 * spread {
+        return Err(EstimateError::Degenerate { kind: Degeneracy::Coincident });
+    }
+    let (cos, sin) = (cos / level, sin / level);
+    let rotation = Rotation3::from_matrix_unchecked(Matrix3::new(cos, -sin, 0.0, sin, cos, 0.0, 0.0, 0.0, 1.0));
+    Ok((rotation, level + covariance.m33))
 }
 
 #[cfg(test)]

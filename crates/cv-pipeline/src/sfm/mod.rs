@@ -1,19 +1,23 @@
 //! Cameras and points from many photographs.
 
 mod candidates;
+mod dense;
+mod fusion;
 mod model;
 mod pairs;
 mod photo;
 
+pub use dense::{DensePhoto, SfmDense, SfmDenseError, SfmDenseOptions, sfm_dense};
 pub use pairs::sfm_pairs;
 pub use photo::{SfmPhoto, SfmPhotoError, sfm_photo};
 
 use crate::Progress;
-use cv_core::{Camera, Cancelled, OptionError, StageClock};
+use cv_core::{Camera, Cancelled, OptionError, Pose, StageClock};
 use cv_features::{FeatureOptions, RatioTest, SiftOptions};
 use cv_sfm::{
-    CameraKnowledge, FeatureDistance, Observation, PairMatches, RefusedPair, SfmError, SfmInput, SfmModel, SfmView,
-    Solver, ViewOutcome, ViewPairOptions, reconstruct_views,
+    AdjustError, CameraKnowledge, FeatureDistance, ModelCovariance, Observation, PairMatches, RefusedPair, SfmError,
+    SfmInput, SfmModel, SfmView, Solver, ViewOutcome, ViewPairModel, ViewPairOptions, model_covariance,
+    reconstruct_views_from,
 };
 
 /// Settings of [`sfm`].
@@ -75,6 +79,11 @@ pub enum PhotoOrder {
     Sequence,
 }
 
+cv_core::named!(PhotoOrder {
+    Any = "any": "in none: all pairs, or of large sets those that look most alike",
+    Sequence = "sequence": "as they were taken by a camera that moved: neighbors, and where it may have come back",
+});
+
 /// A camera of some photographs.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
@@ -134,6 +143,9 @@ pub enum SfmJobError {
     /// The pairs give no model.
     #[error(transparent)]
     Solve(SfmError),
+    /// Something of a model is not determined, or it is of other photographs.
+    #[error("no covariances: {0}")]
+    Covariance(AdjustError),
     /// An option is outside its range.
     #[error(transparent)]
     Option(#[from] OptionError),
@@ -165,7 +177,7 @@ impl FeatureDistance for Alike<'_> {
     }
 }
 
-/// Reconstructs cameras and points from the features of many photographs ([`sfm_photo`]): pairs that hold, then [`reconstruct_views`].
+/// Reconstructs cameras and points from the features of many photographs ([`sfm_photo`]): pairs that hold ([`sfm_pairs`]), then [`sfm_solve`].
 ///
 /// # Errors
 /// [`SfmJobError`].
@@ -175,6 +187,18 @@ pub fn sfm(
     options: &SfmJobOptions,
     progress: &dyn Progress,
 ) -> Result<SfmResult, SfmJobError> {
+    check(photos, cameras)?;
+    let mut clock = StageClock::new();
+    let (pairs, geometry) = sfm_pairs(photos, cameras, options, progress)?;
+    clock.lap("match");
+    let mut result = sfm_solve(photos, cameras, (pairs, &geometry), &[], options, progress)?;
+    let mut stages = clock.into_stages();
+    stages.append(&mut result.stages);
+    Ok(SfmResult { stages, ..result })
+}
+
+/// Every photograph has a camera of its size.
+fn check(photos: &[SfmPhoto], cameras: &[SfmCamera]) -> Result<(), SfmJobError> {
     for (index, photo) in photos.iter().enumerate() {
         let Some(SfmCamera { camera, .. }) = cameras.get(photo.camera) else {
             return Err(SfmJobError::NoCamera { index, camera: photo.camera, cameras: cameras.len() });
@@ -183,14 +207,46 @@ pub fn sfm(
             return Err(SfmJobError::CameraSize { index, photo: photo.size, camera: (camera.width, camera.height) });
         }
     }
-    let mut clock = StageClock::new();
-    let (pairs, geometry) = sfm_pairs(photos, cameras, options, progress)?;
-    clock.lap("match");
+    Ok(())
+}
+
+/// How well the cameras and points of a model are known that [`sfm`] found of these photographs, in the model's frame and unit ([`model_covariance`]).
+///
+/// # Errors
+/// [`SfmJobError::Covariance`].
+pub fn sfm_covariance(
+    photos: &[SfmPhoto],
+    cameras: &[SfmCamera],
+    model: &SfmModel,
+) -> Result<ModelCovariance, SfmJobError> {
+    check(photos, cameras)?;
+    let knowledge: Vec<CameraKnowledge> = cameras.iter().map(|c| c.knowledge).collect();
+    model_covariance(&views(photos), &knowledge, model).map_err(SfmJobError::Covariance)
+}
+
+fn views(photos: &[SfmPhoto]) -> Vec<SfmView<'_>> {
+    photos.iter().map(|p| SfmView { camera: p.camera, keypoints: &p.keypoints }).collect()
+}
+
+/// The second half of [`sfm`]: cameras and points ([`reconstruct_views_from`]) from pairs that [`sfm_pairs`] found, and their geometry. `known`: poses of photographs by an earlier model, which
+/// the first one goes on from; empty where there is none.
+///
+/// # Errors
+/// [`SfmJobError`].
+pub fn sfm_solve(
+    photos: &[SfmPhoto],
+    cameras: &[SfmCamera],
+    (pairs, geometry): (Vec<PairMatches>, &[ViewPairModel]),
+    known: &[Option<Pose>],
+    options: &SfmJobOptions,
+    progress: &dyn Progress,
+) -> Result<SfmResult, SfmJobError> {
+    check(photos, cameras)?;
     if pairs.is_empty() {
         return Err(SfmJobError::NoPairs { photos: photos.len() });
     }
-    let views: Vec<SfmView<'_>> =
-        photos.iter().map(|p| SfmView { camera: p.camera, keypoints: &p.keypoints }).collect();
+    let mut clock = StageClock::new();
+    let views = views(photos);
     let (lenses, knowledge): (Vec<Camera>, Vec<CameraKnowledge>) =
         cameras.iter().map(|c| (c.camera, c.knowledge)).unzip();
     let alike = Alike(photos);
@@ -199,10 +255,10 @@ pub fn sfm(
         cameras: &lenses,
         knowledge: &knowledge,
         pairs: &pairs,
-        geometry: &geometry,
+        geometry,
         alike: Some(&alike),
     };
-    let found = reconstruct_views(&input, &options.solve, progress)?;
+    let found = reconstruct_views_from(&input, known, &options.solve, progress)?;
     clock.lap("solve");
     let cv_sfm::SfmOutcome { models, solvers, views, refused } = found;
     Ok(SfmResult { models, solvers, outcomes: views, pairs, refused, stages: clock.into_stages() })

@@ -1,6 +1,7 @@
 //! The photographs that a person named: which of them are looked at, and by what names they stand in a model.
 
 use crate::frame::{Failure, sort_by_name};
+use cv_io::ExifGps;
 use std::collections::{BTreeMap, HashSet};
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -12,6 +13,8 @@ pub(super) struct Photograph {
     pub(super) name: String,
     /// Why it is not looked at.
     pub(super) refused: Option<String>,
+    /// Where it says it was taken.
+    pub(super) gps: Option<ExifGps>,
 }
 
 /// Each file once, in the order of names: a model does not depend on the order in which files were named. Copies of a photograph are refused: two
@@ -23,7 +26,7 @@ pub(super) fn photographs(mut paths: Vec<PathBuf>) -> Result<Vec<Photograph>, Fa
     paths.retain(|path| seen.insert(path.canonicalize().unwrap_or_else(|_| path.clone())));
     let names = names(&paths);
     let mut all: Vec<Photograph> =
-        paths.into_iter().zip(names).map(|(path, name)| Photograph { path, name, refused: None }).collect();
+        paths.into_iter().zip(names).map(|(path, name)| Photograph { path, name, refused: None, gps: None }).collect();
     // COLMAP's files cut names at white space.
     if let Some(odd) = all.iter().find(|p| p.name.split_whitespace().collect::<Vec<_>>().join(" ") != p.name) {
         let what = format!("{} has blanks in its name that a model's files cannot hold", odd.path.display());

@@ -1,7 +1,8 @@
 //! The report of `cv sfm`.
 
+use super::outcome::{Fate, reprojection_rms, reprojections};
 use super::photographs::Photograph;
-use super::{Fate, reprojection_rms, reprojections};
+use super::places::Frame;
 use crate::frame::Failure;
 use crate::pictures::{Width, cloud, picture};
 use cv_core::SparseModel;
@@ -17,6 +18,7 @@ pub(super) fn report(
     all: &[Photograph],
     fates: &[Fate],
     models: &[SparseModel],
+    frames: &[Frame],
     stages: &[(&'static str, f64)],
 ) -> Result<Report, Failure> {
     let used = fates.iter().filter(|fate| fate.is_ok()).count();
@@ -45,9 +47,10 @@ pub(super) fn report(
             all.iter().zip(fates).filter(|(_, fate)| **fate == Ok(m)).map(|(one, _)| one.name.as_str()).collect();
         let title = if m == 0 { "The model".to_owned() } else { format!("Model {m}") };
         page.section(&title).paragraph(&format!(
-            "{} photographs and {} points. The unit is arbitrary: photographs do not tell meters. The cameras are drawn as pyramids, from the first, blue, to the last, red.",
+            "{} photographs and {} points, {}. The cameras are drawn as pyramids, from the first, blue, to the last, red.",
             names.len(),
             model.points.len(),
+            frames.get(m).map_or("", |frame| &frame.text),
         ));
         cloud(&mut page, &PointScene::of_model(model), "The points and the cameras.")?;
         cameras(&mut page, model);

@@ -1,0 +1,286 @@
+//! A checkpoint's file: `CVSFM`, a version, a key, and the length of what follows; numbers, little-endian; a checksum of all of it.
+
+use super::{Pairs, Seen};
+use cv_core::{DMatch, Keypoint, Matrix3, Point2, Pose, Rotation3, Vector3};
+use cv_io::ExifGps;
+use cv_pipeline::SfmPhoto;
+use cv_pipeline::features::{ByteDescriptors, DescriptorKind};
+use cv_pipeline::many_views::{PairMatches, ViewPairModel};
+use std::hash::{DefaultHasher, Hasher};
+
+const MAGIC: [u8; 8] = *b"CVSFM\0\0\x01";
+/// Bytes before the numbers: magic, key, length; and after them, of the checksum.
+const HEAD: usize = 24;
+const SUM: usize = 8;
+
+/// Numbers one after the other.
+pub(super) struct Record {
+    bytes: Vec<u8>,
+    /// Where the next is read.
+    at: usize,
+}
+
+fn checksum(bytes: &[u8]) -> [u8; SUM] {
+    let mut hasher = DefaultHasher::new();
+    hasher.write(bytes);
+    hasher.finish().to_le_bytes()
+}
+
+impl Record {
+    fn new() -> Self {
+        Self { bytes: Vec::new(), at: 0 }
+    }
+
+    /// The file.
+    pub(super) fn seal(&self, key: u64) -> Vec<u8> {
+        let mut file = Vec::with_capacity(HEAD + self.bytes.len() + SUM);
+        file.extend(MAGIC);
+        file.extend(key.to_le_bytes());
+        file.extend((self.bytes.len() as u64).to_le_bytes());
+        file.extend(&self.bytes);
+        let sum = checksum(&file);
+        file.extend(sum);
+        file
+    }
+
+    /// Of a file that is whole and has that key.
+    pub(super) fn open(mut file: Vec<u8>, key: u64) -> Option<Self> {
+        let end = file.len().checked_sub(SUM).filter(|end| *end >= HEAD)?;
+        let length = ((end - HEAD) as u64).to_le_bytes();
+        let head = [MAGIC, key.to_le_bytes(), length].concat();
+        if file[..HEAD] != head[..] || file[end..] != checksum(&file[..end]) {
+            return None;
+        }
+        file.truncate(end);
+        Some(Self { bytes: file, at: HEAD })
+    }
+
+    /// Whether all has been read.
+    pub(super) fn is_at_end(&self) -> bool {
+        self.at == self.bytes.len()
+    }
+
+    fn take<const N: usize>(&mut self) -> Option<[u8; N]> {
+        let taken = self.bytes.get(self.at..)?.first_chunk::<N>().copied()?;
+        self.at += N;
+        Some(taken)
+    }
+
+    fn slice(&mut self, length: usize) -> Option<&[u8]> {
+        let end = self.at.checked_add(length)?;
+        let taken = self.bytes.get(self.at..end)?;
+        self.at = end;
+        Some(taken)
+    }
+
+    fn put_count(&mut self, value: usize) {
+        self.bytes.extend((value as u64).to_le_bytes());
+    }
+
+    /// A number of things that take `size` bytes at least: as many as there can be, so that a lying number asks for no memory.
+    fn count(&mut self, size: usize) -> Option<usize> {
+        let count = usize::try_from(u64::from_le_bytes(self.take()?)).ok()?;
+        (count.checked_mul(size)? <= self.bytes.len() - self.at).then_some(count)
+    }
+
+    fn number(&mut self) -> Option<f64> {
+        self.take().map(f64::from_le_bytes)
+    }
+
+    fn single(&mut self) -> Option<f32> {
+        self.take().map(f32::from_le_bytes)
+    }
+
+    fn put_maybe(&mut self, value: Option<f64>) {
+        self.bytes.push(u8::from(value.is_some()));
+        self.bytes.extend(value.unwrap_or(0.0).to_le_bytes());
+    }
+
+    fn maybe(&mut self) -> Option<Option<f64>> {
+        let [there] = self.take()?;
+        let value = self.number()?;
+        Some((there == 1).then_some(value))
+    }
+
+    pub(super) fn of_seen(seen: &Seen) -> Self {
+        let mut record = Self::new();
+        let Seen { focal, gps, photo } = seen;
+        record.put_count(photo.size.0);
+        record.put_count(photo.size.1);
+        record.put_maybe(*focal);
+        let gps_numbers = gps.map(|gps| (gps.latitude, gps.longitude, gps.altitude, gps.dilution));
+        record.put_maybe(gps_numbers.map(|g| g.0));
+        record.put_maybe(gps_numbers.map(|g| g.1));
+        record.put_maybe(gps_numbers.and_then(|g| g.2));
+        record.put_maybe(gps_numbers.and_then(|g| g.3));
+        record.put_count(photo.keypoints.len());
+        for k in &photo.keypoints {
+            for v in [k.position.x, k.position.y, k.response, k.scale, k.angle] {
+                record.bytes.extend(v.to_le_bytes());
+            }
+        }
+        record.bytes.extend(photo.descriptors.as_slice());
+        record.bytes.extend(photo.colors.as_flattened());
+        record
+    }
+
+    pub(super) fn seen(&mut self, kind: DescriptorKind) -> Option<Seen> {
+        // Of a size nothing is allocated.
+        let size = (self.count(0)?, self.count(0)?);
+        let focal = self.maybe()?;
+        let [latitude, longitude, altitude, dilution] = [self.maybe()?, self.maybe()?, self.maybe()?, self.maybe()?];
+        let gps =
+            latitude.zip(longitude).map(|(latitude, longitude)| ExifGps { latitude, longitude, altitude, dilution });
+        let count = self.count(20 + kind.dimension + 3)?;
+        let mut keypoints = Vec::with_capacity(count);
+        for _ in 0..count {
+            let position = Point2::new(self.single()?, self.single()?);
+            let (response, scale, angle) = (self.single()?, self.single()?, self.single()?);
+            keypoints.push(Keypoint { position, response, scale, angle });
+        }
+        let descriptors = ByteDescriptors::from_bytes(kind, self.slice(count * kind.dimension)?.to_vec())?;
+        let colors = self.slice(3 * count)?.as_chunks().0.to_vec();
+        Some(Seen {
+            focal,
+            gps,
+            photo: SfmPhoto { name: String::new(), size, camera: 0, keypoints, descriptors, colors },
+        })
+    }
+
+    pub(super) fn of_pairs((pairs, geometry): &Pairs) -> Self {
+        let mut record = Self::new();
+        record.put_count(pairs.len());
+        for (pair, model) in pairs.iter().zip(geometry) {
+            record.put_count(pair.a);
+            record.put_count(pair.b);
+            let (kind, matrix, shift) = match model {
+                ViewPairModel::Pose(pose) => (0u8, *pose.rotation.matrix(), pose.translation),
+                ViewPairModel::Fundamental(f) => (1, *f, Vector3::zeros()),
+                ViewPairModel::Homography(h) => (2, *h, Vector3::zeros()),
+            };
+            record.bytes.push(kind);
+            matrix.iter().chain(&shift).for_each(|v| record.bytes.extend(v.to_le_bytes()));
+            record.put_count(pair.matches.len());
+            for m in &pair.matches {
+                record.bytes.extend(m.query.to_le_bytes());
+                record.bytes.extend(m.train.to_le_bytes());
+                record.bytes.extend(m.distance.to_le_bytes());
+                record.bytes.extend(m.ratio.to_le_bytes());
+            }
+        }
+        record
+    }
+
+    /// Of photographs with so many keypoints.
+    pub(super) fn pairs(&mut self, sizes: &[usize]) -> Option<Pairs> {
+        let count = self.count(8 + 8 + 1 + 12 * 8 + 8)?;
+        let (mut pairs, mut geometry) = (Vec::with_capacity(count), Vec::with_capacity(count));
+        for _ in 0..count {
+            let (a, b) = (self.count(0)?, self.count(0)?);
+            let (of_a, of_b) = (*sizes.get(a)?, *sizes.get(b)?);
+            let [kind] = self.take()?;
+            let mut numbers = [0.0; 12];
+            for v in &mut numbers {
+                *v = self.number()?;
+            }
+            let matrix = Matrix3::from_column_slice(&numbers[..9]);
+            geometry.push(match kind {
+                0 => ViewPairModel::Pose(Pose::new(
+                    Rotation3::from_matrix_unchecked(matrix),
+                    Vector3::from_column_slice(&numbers[9..]),
+                )),
+                1 => ViewPairModel::Fundamental(matrix),
+                2 => ViewPairModel::Homography(matrix),
+                _ => return None,
+            });
+            let count = self.count(16)?;
+            let mut matches = Vec::with_capacity(count);
+            for _ in 0..count {
+                let (query, train) = (u32::from_le_bytes(self.take()?), u32::from_le_bytes(self.take()?));
+                let (distance, ratio) = (self.single()?, self.single()?);
+                if query as usize >= of_a || train as usize >= of_b {
+                    return None;
+                }
+                matches.push(DMatch { query, train, distance, ratio });
+            }
+            pairs.push(PairMatches { a, b, matches });
+        }
+        Some((pairs, geometry))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn seen() -> Seen {
+        let kind = DescriptorKind::ROOT_SIFT;
+        let keypoint = |i: u32| Keypoint {
+            response: 0.1 * i as f32,
+            scale: 1.5,
+            angle: -0.0,
+            ..Keypoint::new(i as f32, 7.25, 0.0)
+        };
+        let bytes: Vec<u8> = (0..5 * kind.dimension).map(|i| i as u8).collect();
+        let photo = SfmPhoto {
+            name: String::new(),
+            size: (640, 480),
+            camera: 0,
+            keypoints: (0..5).map(keypoint).collect(),
+            descriptors: ByteDescriptors::from_bytes(kind, bytes).unwrap(),
+            colors: (0..5).map(|i| [i, 2 * i, 255]).collect(),
+        };
+        let gps = ExifGps { latitude: 0.8, longitude: -0.1, altitude: None, dilution: Some(2.1) };
+        Seen { focal: Some(512.3), gps: Some(gps), photo }
+    }
+
+    fn pairs() -> Pairs {
+        let matches = vec![DMatch { query: 3, train: 1, distance: 0.25, ratio: 0.5 }; 3];
+        let pose = Pose::new(Rotation3::from_euler_angles(0.1, 0.2, 0.3), Vector3::new(1.0, 2.0, 3.0));
+        let models = [
+            ViewPairModel::Pose(pose),
+            ViewPairModel::Fundamental(Matrix3::new(1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)),
+            ViewPairModel::Homography(Matrix3::identity()),
+        ];
+        let pair = |(a, b)| PairMatches { a, b, matches: matches.clone() };
+        ([(0, 1), (0, 2), (1, 2)].map(pair).to_vec(), models.to_vec())
+    }
+
+    #[test]
+    fn what_is_written_is_read() {
+        let mut record = Record::open(Record::of_seen(&seen()).seal(7), 7).unwrap();
+        assert_eq!(record.seen(DescriptorKind::ROOT_SIFT), Some(seen()));
+        assert!(record.is_at_end());
+        let bare = Seen { focal: None, gps: None, ..seen() };
+        assert_eq!(
+            Record::open(Record::of_seen(&bare).seal(7), 7).unwrap().seen(DescriptorKind::ROOT_SIFT),
+            Some(bare)
+        );
+        let mut record = Record::open(Record::of_pairs(&pairs()).seal(8), 8).unwrap();
+        assert_eq!(record.pairs(&[5, 5, 5]), Some(pairs()));
+        assert!(record.is_at_end());
+        // Of photographs with fewer keypoints, or fewer photographs.
+        for sizes in [&[5, 1, 5][..], &[5, 5]] {
+            assert_eq!(Record::open(Record::of_pairs(&pairs()).seal(8), 8).unwrap().pairs(sizes), None);
+        }
+    }
+
+    #[test]
+    fn damage_is_noticed_and_lies_ask_for_no_memory() {
+        let file = Record::of_pairs(&pairs()).seal(8);
+        assert!(Record::open(file.clone(), 9).is_none(), "another key");
+        for i in (0..file.len()).step_by(7) {
+            assert!(Record::open(file[..i].to_vec(), 8).is_none(), "cut to {i}");
+            let mut other = file.clone();
+            other[i] ^= 0x10;
+            assert!(Record::open(other, 8).is_none(), "byte {i}");
+        }
+        // A checksum that is right, of numbers that are not.
+        for at in (HEAD..file.len() - SUM).step_by(5) {
+            let mut lying = Record { bytes: file[HEAD..file.len() - SUM].to_vec(), at: 0 };
+            lying.bytes[at - HEAD] = 0xFF;
+            let _ = Record::open(lying.seal(8), 8).unwrap().pairs(&[5, 5, 5]);
+            let _ = Record::open(lying.seal(8), 8).unwrap().seen(DescriptorKind::ROOT_SIFT);
+        }
+    }
+}

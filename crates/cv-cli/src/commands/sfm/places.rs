@@ -1,0 +1,237 @@
+//! What is known of where the photographs were taken, and models brought to it.
+
+use super::photographs::Photograph;
+use crate::frame::{Context, Failure};
+use crate::words::many_views::{self as words, PlaceSource};
+use cv_core::{GeodeticPoint, Point3, east_north_up};
+use cv_pipeline::many_views::{KnownPlaces, ModelAlignError, ModelAlignment, SfmModel, align_model};
+use serde_json::{Value, json};
+use std::path::PathBuf;
+
+#[derive(Debug, clap::Args)]
+#[command(next_help_heading = "Known places")]
+pub(super) struct PlaceArgs {
+    /// Where photographs were taken: a text file with a row `name x y z` for each, in meters with z up. At least three of them, not in one place.
+    #[arg(long, value_name = "FILE")]
+    known: Option<PathBuf>,
+    /// How far apart two photographs were taken, in meters: tells the scale. It may be given several times.
+    #[arg(long, num_args = 1..=3, value_names = ["A", "B", "METERS"])]
+    distance: Vec<String>,
+    /// Leave the positions in the photographs' EXIF alone; else a model with three of them or more is brought to them: X east, Y north, Z up, in meters.
+    #[arg(long)]
+    ignore_gps: bool,
+}
+
+/// What is known, by photographs as they were named.
+#[derive(Clone)]
+pub(super) struct Places {
+    centers: Vec<Option<Point3<f64>>>,
+    source: Option<PlaceSource>,
+    distances: Vec<(usize, usize, f64)>,
+}
+
+impl PlaceArgs {
+    /// What the person tells, resolved before the work begins.
+    pub(super) fn read(&self, all: &[Photograph], context: &Context) -> Result<Places, Failure> {
+        let mut places = Places { centers: vec![None; all.len()], source: None, distances: self.distances(all)? };
+        let Some(path) = &self.known else { return Ok(places) };
+        let mut strange = Vec::new();
+        for (name, place) in cv_io::read_places(path)? {
+            match find(all, &name) {
+                Some(i) => places.centers[i] = Some(place),
+                None => strange.push(name),
+            }
+        }
+        let got = places.centers.iter().flatten().count();
+        if got < 3 {
+            let what =
+                format!("{} tells where {got} of the photographs were taken, and three are needed", path.display());
+            let advice = match strange.first() {
+                Some(name) => format!("the names of the photographs' files; “{name:.60}” is none of them"),
+                None => "three photographs or more, not in one place; --distance tells the scale alone".to_owned(),
+            };
+            return Err(Failure::new(what).advice(advice));
+        }
+        if let Some(first) = strange.first() {
+            let path = path.display();
+            context.warn(format!(
+                "{path}: {} of its names are no photographs of this run, such as “{first:.60}”",
+                strange.len()
+            ));
+        }
+        places.source = Some(PlaceSource::File(path.clone()));
+        Ok(places)
+    }
+
+    fn distances(&self, all: &[Photograph]) -> Result<Vec<(usize, usize, f64)>, Failure> {
+        let usage = |what: String| Failure::usage(what).advice("--distance a.jpg b.jpg 2.5");
+        let (rows, rest) = self.distance.as_chunks::<3>();
+        if !rest.is_empty() {
+            return Err(usage("--distance takes two photographs and the meters between them".to_owned()));
+        }
+        let of = |[a, b, meters]: &[String; 3]| {
+            let number = meters.parse().ok().filter(|m: &f64| *m > 0.0 && m.is_finite());
+            let Some(meters) = number else {
+                return Err(usage(format!("“{meters:.40}” is no number of meters above 0")));
+            };
+            let index = |name: &String| {
+                find(all, name).ok_or_else(|| usage(format!("--distance: “{name:.60}” is none of the photographs")))
+            };
+            let (a, b) = (index(a)?, index(b)?);
+            if a == b {
+                return Err(usage(format!("--distance: {} is named twice", all[a].path.display())));
+            }
+            Ok((a, b, meters))
+        };
+        rows.iter().map(of).collect()
+    }
+}
+
+/// The photograph of that name, or that path, or the only one whose file has that name.
+fn find(all: &[Photograph], name: &str) -> Option<usize> {
+    let by = |is: &dyn Fn(&Photograph) -> bool| {
+        let mut found = (0..all.len()).filter(|i| is(&all[*i]));
+        found.next().filter(|_| found.next().is_none())
+    };
+    by(&|p| p.name == name)
+        .or_else(|| by(&|p| p.path.as_os_str() == name))
+        .or_else(|| by(&|p| p.path.file_name().is_some_and(|file| file == name)))
+}
+
+/// What a model's frame is, for people and for programs.
+pub(super) struct Frame {
+    pub(super) text: String,
+    pub(super) json: Value,
+}
+
+impl Places {
+    /// Takes what the photographs tell themselves, where the person tells nothing.
+    pub(super) fn with_gps(&self, args: &PlaceArgs, all: &[Photograph]) -> Self {
+        let mut places = self.clone();
+        if args.ignore_gps || self.source.is_some() {
+            return places;
+        }
+        // Heights are told by all that count, or by none: one that is not told is no height of 0.
+        let told: Vec<usize> = (0..all.len()).filter(|i| all[*i].gps.is_some()).collect();
+        let high: Vec<usize> =
+            told.iter().copied().filter(|i| all[*i].gps.is_some_and(|gps| gps.altitude.is_some())).collect();
+        let heights = high.len() >= 3;
+        let count = if heights { high } else { told };
+        let place = |i: &usize| {
+            all[*i].gps.map(|gps| {
+                let place = gps.position();
+                GeodeticPoint { altitude: if heights { place.altitude } else { 0.0 }, ..place }
+            })
+        };
+        let positions: Vec<GeodeticPoint> = count.iter().filter_map(place).collect();
+        let Some(origin) = positions.first().copied() else { return places };
+        for (i, place) in count.iter().zip(east_north_up(&positions)) {
+            places.centers[*i] = Some(place);
+        }
+        places.source = Some(PlaceSource::Gps { origin, heights });
+        places
+    }
+
+    /// Whether the person tells anything.
+    pub(super) fn is_told(&self) -> bool {
+        self.source.is_some() || !self.distances.is_empty()
+    }
+
+    /// Brings a model to what is known; `used` are the photographs of its views. What contradicts it is told, and left aside.
+    pub(super) fn align(
+        &self,
+        model: &mut SfmModel,
+        all: &[Photograph],
+        used: &[usize],
+        context: &Context,
+    ) -> Result<Frame, Failure> {
+        let view = |at: usize| used.iter().position(|u| *u == at);
+        let inside = |v: &usize| model.poses.get(*v).is_some_and(Option::is_some);
+        let mut distances = Vec::new();
+        for &(a, b, meters) in &self.distances {
+            match (view(a).filter(inside), view(b).filter(inside)) {
+                (Some(a), Some(b)) => distances.push((a, b, meters)),
+                (first, _) => {
+                    let lacks = &all[if first.is_none() { a } else { b }];
+                    context.warn(format!("--distance is left aside: {} is not in the model", lacks.path.display()));
+                }
+            }
+        }
+        let centers: Vec<Option<Point3<f64>>> = used.iter().map(|at| self.centers[*at]).collect();
+        let seed = context.seed.unwrap_or(0);
+        let known = KnownPlaces { centers: &centers, distances: &distances };
+        let alone = KnownPlaces { centers: &[], ..known };
+        let found = align_model(model, &known, seed, context).or_else(|error| match error {
+            ModelAlignError::Cancelled(_) => Err(error),
+            error => {
+                if let (Some(source), Some(text)) = (&self.source, self.source.as_ref().and_then(|s| s.refusal(&error)))
+                {
+                    context.warn(format!("the model is not brought to {}: {text}", source.name()));
+                }
+                align_model(model, &alone, seed, context)
+            }
+        });
+        // Of known distances alone.
+        let found = found.or_else(|error| match error {
+            ModelAlignError::Cancelled(_) => Err(error),
+            error => {
+                context.warn(format!("--distance is left aside: {error}"));
+                align_model(model, &KnownPlaces::default(), seed, context)
+            }
+        })?;
+        model.transform(&found.similarity);
+        self.tell(&found, model, all, used, context);
+        Ok(self.frame(&found, all, used))
+    }
+
+    /// Warns of what does not agree, with numbers.
+    fn tell(&self, found: &ModelAlignment, model: &SfmModel, all: &[Photograph], used: &[usize], context: &Context) {
+        if let Some(error) = found.distance_error.filter(|error| *error > words::DISTANCES_DIFFER) {
+            context.warn(words::distances_differ(error));
+        }
+        let (Some(fit), Some(source)) = (&found.centers, &self.source) else { return };
+        if let Some(ratio) = fit.scale_ratio.filter(|ratio| (ratio - 1.0).abs() > words::SCALES_DIFFER) {
+            context.warn(format!(
+                "by {} lengths are {:.1} % {} than by --distance, which is taken",
+                source.name(),
+                100.0 * (ratio - 1.0).abs(),
+                if ratio > 1.0 { "longer" } else { "shorter" }
+            ));
+        }
+        let off = |v: &usize| {
+            let pose = model.poses.get(*v).copied().flatten()?;
+            let known = self.centers[used[*v]]?;
+            Some((&*all[used[*v]].path, (pose.center() - known).norm()))
+        };
+        let differ: Vec<_> = fit.differ.iter().filter_map(off).collect();
+        if !differ.is_empty() {
+            context.warn(words::places_differ(source, &differ, fit.rms));
+        }
+    }
+
+    fn frame(&self, found: &ModelAlignment, all: &[Photograph], used: &[usize]) -> Frame {
+        let names = |views: &[usize]| views.iter().map(|v| all[used[*v]].name.clone()).collect::<Vec<_>>();
+        let (text, by) = match (&found.centers, &self.source) {
+            (Some(fit), Some(source)) => (words::aligned(source, fit), source.key()),
+            _ if found.metric => ("in meters by --distance; upright, Z up".to_owned(), "distance"),
+            _ => {
+                ("upright, Z up; its unit is arbitrary, since photographs do not tell meters".to_owned(), "photographs")
+            }
+        };
+        let mut json = json!({ "by": by, "unit": if found.metric { "m" } else { "arbitrary" } });
+        if let Some(fit) = &found.centers {
+            json["agree"] = json!(names(&fit.agree));
+            json["differ"] = json!(names(&fit.differ));
+            json["rms_m"] = json!(fit.rms);
+            json["tilt_known"] = json!(fit.tilt);
+            if let Some(PlaceSource::Gps { origin, heights }) = &self.source {
+                json["origin"] = json!({
+                    "latitude": origin.latitude.to_degrees(),
+                    "longitude": origin.longitude.to_degrees(),
+                    "altitude_m": heights.then_some(origin.altitude),
+                });
+            }
+        }
+        Frame { text, json }
+    }
+}

@@ -1,0 +1,94 @@
+//! Where photographs were taken, as text: a row per photograph, `name x y z`.
+
+use crate::files::read_text;
+use crate::{FormatError, IoError};
+use cv_core::Point3;
+use std::collections::HashSet;
+use std::path::Path;
+
+/// The places of a file, in its order.
+pub type NamedPlaces = Vec<(String, Point3<f64>)>;
+
+/// Parses rows of a name and three numbers, parted by commas, semicolons or tabs, or else by blanks; of names with blanks, by the former. `#` begins a comment, and a first row without numbers is a heading.
+///
+/// # Errors
+/// [`FormatError::Line`] for a row that is no name and three finite numbers, and for a name that comes twice; [`FormatError::Empty`] without any row.
+pub fn parse_places(text: &str) -> Result<NamedPlaces, FormatError> {
+    let mut places: NamedPlaces = Vec::new();
+    let mut seen = HashSet::new();
+    let mut rows = 0;
+    for (index, line) in text.lines().enumerate() {
+        let content = line.split('#').next().unwrap_or("").trim_start_matches('\u{feff}').trim();
+        if content.is_empty() {
+            continue;
+        }
+        let marks = [',', ';', '\t'];
+        let cells: Vec<&str> = match content.contains(marks) {
+            true => content.split(marks).map(|cell| cell.trim().trim_matches('"')).collect(),
+            false => content.split_whitespace().collect(),
+        };
+        rows += 1;
+        let numbers: Vec<Option<f64>> = cells.iter().skip(1).map(|cell| cell.parse().ok()).collect();
+        if rows == 1 && !numbers.is_empty() && numbers.iter().all(Option::is_none) {
+            continue;
+        }
+        let [Some(x), Some(y), Some(z)] = numbers[..] else {
+            let reason = format!("“{content:.60}” is not a name and three numbers x y z");
+            return Err(FormatError::line(index + 1, reason));
+        };
+        let place = Point3::new(x, y, z);
+        if !place.iter().all(|v| v.is_finite()) {
+            return Err(FormatError::line(index + 1, "a coordinate is not finite"));
+        }
+        if !seen.insert(cells[0]) {
+            return Err(FormatError::line(index + 1, format!("“{:.60}” comes twice", cells[0])));
+        }
+        places.push((cells[0].to_owned(), place));
+    }
+    if places.is_empty() { Err(FormatError::Empty) } else { Ok(places) }
+}
+
+/// Reads the places of photographs; see [`parse_places`].
+///
+/// # Errors
+/// [`IoError`]: cannot be read as text, or as [`parse_places`].
+pub fn read_places(path: impl AsRef<Path>) -> Result<NamedPlaces, IoError> {
+    let path = path.as_ref();
+    parse_places(&read_text(path)?).map_err(|reason| IoError::reading(path, reason))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rows_are_read_however_they_are_parted() {
+        let expected = vec![("a.jpg".to_owned(), Point3::new(1.0, -2.5, 3e2)), ("b.jpg".into(), Point3::origin())];
+        for text in [
+            "a.jpg 1 -2.5 300\nb.jpg 0 0 0\n",
+            "# comment\nname,x,y,z\na.jpg, 1, -2.5, 3e2\n\n\"b.jpg\",0,0,0 # last",
+            "\u{feff}photo\teast\tnorth\tup\r\na.jpg\t1\t-2.5\t300\r\nb.jpg\t0\t0\t0\r\n",
+        ] {
+            assert_eq!(parse_places(text).unwrap(), expected, "{text}");
+        }
+        assert_eq!(parse_places("in the yard.jpg;1;2;3").unwrap()[0].0, "in the yard.jpg");
+    }
+
+    #[test]
+    fn what_is_no_place_is_told_by_its_line() {
+        for (text, line) in [
+            ("a 1 2 3\nb 1 2", 2),
+            ("a 1 2 3 4", 1),
+            ("name x y z\nb 1 2 inf", 2),
+            ("a 1 2 3\na 1 2 3", 2),
+            ("a 1 x 3", 1),
+            ("only", 1),
+        ] {
+            match parse_places(text) {
+                Err(FormatError::Line { line: at, .. }) => assert_eq!(at, line, "{text}"),
+                other => assert!(other.is_err(), "{text}: {other:?}"),
+            }
+        }
+        assert!(matches!(parse_places("# nothing\nname x y z"), Err(FormatError::Empty)));
+    }
+}
