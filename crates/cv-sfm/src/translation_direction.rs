@@ -28,7 +28,8 @@ pub(crate) fn motion_of_rotation(
     for _ in 0..ROUNDS {
         let sum: Matrix3<f64> = normals.iter().zip(&weights).map(|(n, w)| n * n.transpose() * *w).sum();
         let (values, vectors) = symmetric_eigen(&sum);
-        if !(values.max() > 0.0) {
+        // Without matches, too.
+        if values.max().partial_cmp(&0.0) != Some(std::cmp::Ordering::Greater) {
             return None;
         }
         direction = vectors.column(values.imin()).into_owned();
