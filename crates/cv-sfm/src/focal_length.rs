@@ -48,8 +48,7 @@ fn focal_length(camera: &Camera, pairs: &[(Matrix3<f64>, f64)]) -> Option<f64> {
 }
 
 /// The cameras to begin with, in the order in which they are tried: where nothing is known of a focal length, that of the view graph first.
-/// Also whether the first ones' focal lengths are more than a guess.
-pub(crate) fn start_cameras(input: &SfmInput<'_>) -> (Vec<Vec<Camera>>, bool) {
+pub(crate) fn start_cameras(input: &SfmInput<'_>) -> Vec<Vec<Camera>> {
     let unknown = |c: usize| input.knowledge[c] == CameraKnowledge::Unknown;
     let used = (0..input.cameras.len()).any(|c| unknown(c) && input.views.iter().any(|v| v.camera == c));
     let usual = |share: &f64| {
@@ -58,8 +57,7 @@ pub(crate) fn start_cameras(input: &SfmInput<'_>) -> (Vec<Vec<Camera>>, bool) {
         all.map(|(c, camera)| if unknown(c) { with_focal(camera, focal(camera)) } else { *camera }).collect()
     };
     let guessed = USUAL_FOCALS.iter().filter(|_| used).map(usual);
-    let (first, known) = graph_cameras(input);
-    (std::iter::once(first).chain(guessed).collect(), known)
+    std::iter::once(graph_cameras(input)).chain(guessed).collect()
 }
 
 /// The same camera with square pixels of another focal length.
@@ -67,10 +65,9 @@ fn with_focal(camera: &Camera, focal: f64) -> Camera {
     Camera { fx: focal, fy: focal, ..*camera }
 }
 
-/// The cameras with a focal length of the view graph, where nothing is known of it, and whether all have one.
-fn graph_cameras(input: &SfmInput<'_>) -> (Vec<Camera>, bool) {
+/// The cameras with a focal length of the view graph, where nothing is known of it.
+fn graph_cameras(input: &SfmInput<'_>) -> Vec<Camera> {
     let mut cameras = input.cameras.to_vec();
-    let mut known = true;
     for (c, camera) in cameras.iter_mut().enumerate() {
         if input.knowledge[c] != CameraKnowledge::Unknown {
             continue;
@@ -86,9 +83,7 @@ fn graph_cameras(input: &SfmInput<'_>) -> (Vec<Camera>, bool) {
         let pairs: Vec<_> = (0..input.pairs.len()).filter(own).filter_map(of).collect();
         if let Some(focal) = focal_length(camera, &pairs) {
             *camera = with_focal(camera, focal);
-        } else if input.views.iter().any(|v| v.camera == c) {
-            known = false;
         }
     }
-    (cameras, known)
+    cameras
 }

@@ -68,6 +68,7 @@ mod repeated_structure;
 mod rotation_averaging;
 mod scene;
 mod tracks;
+mod translation_direction;
 mod triangulate_track;
 mod view_graph;
 mod view_pair;
