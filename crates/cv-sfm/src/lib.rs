@@ -29,7 +29,7 @@
 //!     let known = (&camera, &CameraKnowledge::Known);
 //!     let both = [&keypoints[a][..], &keypoints[b]];
 //!     let pair = verify_view_pair([known; 2], both, &matches, &ViewPairOptions::default(), &Silent)?;
-//!     pairs.push(PairMatches { a, b, matches: pair.inliers.iter().map(|i| matches[*i]).collect() });
+//!     pairs.push(PairMatches::new(a, b, pair.inliers.iter().map(|i| matches[*i]).collect()));
 //!     geometry.push(pair.model);
 //! }
 //! let views: Vec<SfmView<'_>> = keypoints.iter().map(|k| SfmView { camera: 0, keypoints: k }).collect();

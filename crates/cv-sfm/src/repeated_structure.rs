@@ -103,7 +103,7 @@ pub(crate) fn refuse_repeated(
     let mut degree: Vec<Vec<u32>> = input.views.iter().map(|v| vec![0; v.keypoints.len()]).collect();
     for link in &graph.links {
         let pair = &input.pairs[link.pair];
-        for m in &pair.matches {
+        for m in pair.sample() {
             let both = [(pair.a, m.query), (pair.b, m.train)];
             both.iter().for_each(|(v, k)| degree[*v].get_mut(*k as usize).into_iter().for_each(|d| *d += 1));
         }
@@ -233,6 +233,9 @@ fn overlap(
     input: &SfmInput<'_>,
     options: &SfmOptions,
 ) -> Overlap {
+    if pair.sample().is_empty() {
+        return [None, None];
+    }
     let rotation = link.pose.rotation;
     let [one, two] = [link.a, link.b].map(|v| input.views[v].keypoints);
     let angle = |m: &cv_core::DMatch| {
@@ -241,7 +244,7 @@ fn overlap(
         let y = views[1].2.normalize(pixels.b).to_homogeneous();
         Some(x.cross(&y).norm().atan2(x.dot(&y))).filter(|angle| angle.is_finite())
     };
-    let mut angles: Vec<f64> = pair.matches.iter().filter_map(angle).collect();
+    let mut angles: Vec<f64> = pair.sample().iter().filter_map(angle).collect();
     // As if from one place.
     let still = quantile(&mut angles, 0.5).is_some_and(|a| a < options.min_angle);
     let side = |side: usize, pose: &Pose| {
@@ -251,7 +254,7 @@ fn overlap(
         if unit.is_none() && !still {
             return None;
         }
-        let mut matched: Vec<u32> = pair.matches.iter().map(|m| if side == 0 { m.query } else { m.train }).collect();
+        let mut matched: Vec<u32> = pair.sample().iter().map(|m| if side == 0 { m.query } else { m.train }).collect();
         matched.sort_unstable();
         let (mut found, mut changes) = (0, Vec::new());
         for one in asked {

@@ -21,6 +21,20 @@ pub struct PairMatches {
     pub b: usize,
     /// The matches; a smaller distance is a surer one.
     pub matches: Vec<DMatch>,
+    /// Those among features that were tried alike in all pairs: what is missing of them tells different things that look alike. None: of `matches` all were. Empty: of this pair they are not known.
+    pub sample: Option<Vec<DMatch>>,
+}
+
+impl PairMatches {
+    /// Matches among all features of both views, found alike in all pairs.
+    pub fn new(a: usize, b: usize, matches: Vec<DMatch>) -> Self {
+        Self { a, b, matches, sample: None }
+    }
+
+    /// The matches among features that were tried alike in all pairs.
+    pub fn sample(&self) -> &[DMatch] {
+        self.sample.as_ref().unwrap_or(&self.matches)
+    }
 }
 
 /// Lists of observations, no two of one view in a list.
@@ -214,7 +228,7 @@ mod tests {
 
     fn matches(a: usize, b: usize, list: &[(u32, u32, f32)]) -> PairMatches {
         let of = |&(query, train, distance): &(u32, u32, f32)| DMatch { query, train, distance, ratio: 0.5 };
-        PairMatches { a, b, matches: list.iter().map(of).collect() }
+        PairMatches::new(a, b, list.iter().map(of).collect())
     }
 
     fn lists(tracks: &Tracks) -> Vec<Vec<(u32, u32)>> {

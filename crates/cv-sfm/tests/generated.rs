@@ -43,7 +43,7 @@ impl Given {
         let options = ViewPairOptions::default();
         if let Ok(found) = verify_view_pair([camera; 2], keypoints, matches, &options, &Silent) {
             let matches = found.inliers.iter().map(|i| matches[*i]).collect();
-            self.pairs.push(PairMatches { a, b, matches });
+            self.pairs.push(PairMatches::new(a, b, matches));
             self.geometry.push(found.model);
         }
     }

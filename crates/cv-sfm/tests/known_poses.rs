@@ -21,7 +21,7 @@ fn a_model_goes_on_from_poses_and_finds_wrong_ones_anew() {
         let (matches, camera) = (truth.matches(a, b), (&truth.camera, &CameraKnowledge::Known));
         let both = [&keypoints[a][..], &keypoints[b]];
         if let Ok(pair) = verify_view_pair([camera; 2], both, &matches, &ViewPairOptions::default(), &Silent) {
-            pairs.push(PairMatches { a, b, matches: pair.inliers.iter().map(|i| matches[*i]).collect() });
+            pairs.push(PairMatches::new(a, b, pair.inliers.iter().map(|i| matches[*i]).collect()));
             geometry.push(pair.model);
         }
     }

@@ -47,7 +47,7 @@ impl Given {
                 let [one, two] = [a, b].map(|v| &given.truth.shown[v]);
                 let same = matches.iter().filter(|m| one[m.query as usize] == two[m.train as usize]).count();
                 given.right.push(2 * same > matches.len());
-                given.pairs.push(PairMatches { a, b, matches });
+                given.pairs.push(PairMatches::new(a, b, matches));
                 given.geometry.push(model);
             }
         }

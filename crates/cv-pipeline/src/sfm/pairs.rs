@@ -72,7 +72,7 @@ pub fn sfm_pairs(
     let held = |tried: Tried<'_>| {
         let [a, b] = tried.pair.views;
         let (matches, pair) = tried.held?;
-        Some((PairMatches { a, b, matches }, pair.model))
+        Some((PairMatches { a, b, matches, sample: Some(tried.sample) }, pair.model))
     };
     Ok(tried.into_iter().filter_map(held).unzip())
 }
@@ -134,6 +134,8 @@ struct Tried<'p> {
     tentative: usize,
     /// Those that agree with the geometry, and that.
     held: Option<(Vec<DMatch>, ViewPair)>,
+    /// Those that agree of the features of largest scale.
+    sample: Vec<DMatch>,
     /// Whether all features have been matched.
     whole: bool,
 }
@@ -170,14 +172,15 @@ impl<'p> Pair<'p> {
         }
         let whole = self.sides.iter().all(|s| s.coarse.len() == s.photo.keypoints.len());
         let held = self.verify(&matches, progress)?;
-        Ok(Tried { pair: self, tentative: matches.len(), held, whole })
+        let sample = held.as_ref().map_or_else(Vec::new, |h| h.0.clone());
+        Ok(Tried { pair: self, tentative: matches.len(), held, sample, whole })
     }
 
     /// What all features tell.
     fn with_all(self, progress: &dyn Progress) -> Result<Tried<'p>, Cancelled> {
         let matches = self.tentative(self.sides.map(|s| &s.photo.descriptors), progress)?;
         let held = self.verify(&matches, progress)?;
-        Ok(Tried { pair: self, tentative: matches.len(), held, whole: true })
+        Ok(Tried { pair: self, tentative: matches.len(), held, sample: Vec::new(), whole: true })
     }
 
     /// Matches of all features along a geometry.

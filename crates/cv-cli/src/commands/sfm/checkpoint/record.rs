@@ -160,13 +160,9 @@ impl Record {
             };
             record.bytes.push(kind);
             matrix.iter().chain(&shift).for_each(|v| record.bytes.extend(v.to_le_bytes()));
-            record.put_count(pair.matches.len());
-            for m in &pair.matches {
-                record.bytes.extend(m.query.to_le_bytes());
-                record.bytes.extend(m.train.to_le_bytes());
-                record.bytes.extend(m.distance.to_le_bytes());
-                record.bytes.extend(m.ratio.to_le_bytes());
-            }
+            record.put_matches(&pair.matches);
+            record.bytes.push(pair.sample.is_some().into());
+            pair.sample.iter().for_each(|sample| record.put_matches(sample));
         }
         record
     }
@@ -193,19 +189,39 @@ impl Record {
                 2 => ViewPairModel::Homography(matrix),
                 _ => return None,
             });
-            let count = self.count(16)?;
-            let mut matches = Vec::with_capacity(count);
-            for _ in 0..count {
-                let (query, train) = (u32::from_le_bytes(self.take()?), u32::from_le_bytes(self.take()?));
-                let (distance, ratio) = (self.single()?, self.single()?);
-                if query as usize >= of_a || train as usize >= of_b {
-                    return None;
-                }
-                matches.push(DMatch { query, train, distance, ratio });
-            }
-            pairs.push(PairMatches { a, b, matches });
+            let matches = self.matches(of_a, of_b)?;
+            let sample = match self.take()? {
+                [0] => None,
+                _ => Some(self.matches(of_a, of_b)?),
+            };
+            pairs.push(PairMatches { a, b, matches, sample });
         }
         Some((pairs, geometry))
+    }
+
+    fn put_matches(&mut self, matches: &[DMatch]) {
+        self.put_count(matches.len());
+        for m in matches {
+            self.bytes.extend(m.query.to_le_bytes());
+            self.bytes.extend(m.train.to_le_bytes());
+            self.bytes.extend(m.distance.to_le_bytes());
+            self.bytes.extend(m.ratio.to_le_bytes());
+        }
+    }
+
+    /// Of photographs with so many keypoints.
+    fn matches(&mut self, of_a: usize, of_b: usize) -> Option<Vec<DMatch>> {
+        let count = self.count(16)?;
+        let mut matches = Vec::with_capacity(count);
+        for _ in 0..count {
+            let (query, train) = (u32::from_le_bytes(self.take()?), u32::from_le_bytes(self.take()?));
+            let (distance, ratio) = (self.single()?, self.single()?);
+            if query as usize >= of_a || train as usize >= of_b {
+                return None;
+            }
+            matches.push(DMatch { query, train, distance, ratio });
+        }
+        Some(matches)
     }
 }
 
@@ -242,7 +258,10 @@ mod tests {
             ViewPairModel::Fundamental(Matrix3::new(1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)),
             ViewPairModel::Homography(Matrix3::identity()),
         ];
-        let pair = |(a, b)| PairMatches { a, b, matches: matches.clone() };
+        let pair = |(a, b)| PairMatches {
+            sample: (a == 0).then(|| matches.clone()),
+            ..PairMatches::new(a, b, matches.clone())
+        };
         ([(0, 1), (0, 2), (1, 2)].map(pair).to_vec(), models.to_vec())
     }
 
