@@ -105,6 +105,16 @@ pub(crate) const CASES: &[Case] = &[
         &["a.jpg", "b.jpg"],
     ),
     case("reconstruct by camera", "reconstruct in/a.jpg in/b.jpg --camera in/cam.yaml -o out/c.ply", &["cam.yaml"]),
+    case(
+        "sfm",
+        "sfm in/a.jpg in/b.jpg --focal 490 --features 2000 --distance a.jpg b.jpg 1 -o out/sparse --cloud out/c.ply --covariance out/s.json",
+        &["a.jpg", "b.jpg"],
+    ),
+    case(
+        "sfm from a model",
+        "sfm in/a.jpg in/b.jpg --from in/sparse --features 2000 -o out/sparse --format colmap-binary",
+        &["sparse/cameras.txt", "sparse/images.txt"],
+    ),
     case("panorama", "panorama in/1.jpg in/2.jpg -o out/p.png --report out", &["1.jpg", "2.jpg"]),
     case("panorama by camera", "panorama in/1.jpg in/2.jpg -o out/p.jpg --camera in/wide.yaml", &["wide.yaml"]),
     case(
@@ -199,6 +209,7 @@ pub(crate) fn prepare(folder: &Path, program: &Path) -> Result<()> {
         Ok(())
     };
     run("match in/a.jpg in/b.jpg -o in/m.txt --save-features in/arrays")?;
+    run("sfm in/a.jpg in/b.jpg --focal 490 --features 2000 -o in/sparse")?;
     for name in ["a", "b"] {
         fs::rename(to.join(format!("arrays/{name}.txt")), to.join(format!("texts/{name}.txt")))?;
     }

@@ -37,6 +37,8 @@ pub(super) struct Checkpoint<'a> {
     folder: PathBuf,
     /// Whether an earlier run's work is taken.
     resume: bool,
+    /// Whether there is any.
+    found: bool,
     /// Folders that were not there before this run, the innermost first.
     missing: Vec<PathBuf>,
     context: &'a Context,
@@ -53,7 +55,8 @@ impl<'a> Checkpoint<'a> {
         let folder = output.join(FOLDER);
         let missing = output.ancestors().take_while(|above| !above.exists()).map(Path::to_owned).collect();
         cv_io::remove_abandoned(&folder);
-        match (folder.exists(), resume) {
+        let found = folder.exists();
+        match (found, resume) {
             (true, false) => context.note(format!(
                 "{} holds the work of a run that was stopped, which --resume goes on with",
                 folder.display()
@@ -62,7 +65,7 @@ impl<'a> Checkpoint<'a> {
             _ => {}
         }
         let (broken, keys, taken) = (Cell::new(false), RefCell::default(), Cell::new((0, false)));
-        Self { folder, resume, missing, context, broken, keys, taken }
+        Self { folder, resume, found, missing, context, broken, keys, taken }
     }
 
     /// What an earlier run has seen in a photograph, and the key under which this run puts it where there is nothing.
@@ -151,12 +154,13 @@ impl<'a> Checkpoint<'a> {
             }
             return;
         }
-        if !keep && self.folder.exists() {
+        // A job that fails leaves an earlier one's work as it was, and none of its own.
+        if !keep && (done || !self.found) && self.folder.exists() {
             // What cannot be removed is in nobody's way.
             let _ = fs::remove_dir_all(&self.folder);
         }
         if !done {
-            // A job that fails leaves no folders behind that are empty.
+            // Nor folders that are empty.
             self.missing.iter().for_each(|folder| drop(fs::remove_dir(folder)));
         }
     }
