@@ -374,7 +374,7 @@ fn models_are_brought_to_positions_known_places_and_distances() {
     let off = off_by(&colmap::read(at("model")).unwrap(), &truth);
     assert!(off < 0.02, "{off}");
     let html = fs::read_to_string(at("page/report.html")).unwrap();
-    assert!(html.contains("in the frame of places.csv, in meters, by 11 photographs"));
+    assert!(html.contains("in the frame of places.csv, in meters, by 11 photographs"), "{}", ran.stderr);
 
     // Positions in the files: the lengths of a degree at 47.255° are by the radii of WGS 84, M = 6,361,920 m and N = 6,389,700 m.
     let (lat, lon) = (47.255f64, 8.51f64);
@@ -389,7 +389,11 @@ fn models_are_brought_to_positions_known_places_and_distances() {
     }
     let (value, model) = with(&[]);
     let alignment = &value["alignment"];
-    assert_eq!((alignment["by"].as_str(), alignment["differ"][0].as_str()), (Some("gps"), Some("walk07.png")));
+    assert_eq!(
+        (alignment["by"].as_str(), alignment["differ"][0].as_str()),
+        (Some("gps"), Some("walk07.png")),
+        "{alignment}"
+    );
     assert!((alignment["origin"]["latitude"].as_f64().unwrap() - lat).abs() < 1e-4, "{alignment}");
     let off = off_by(&model, &truth);
     assert!(off < 0.02, "{off}");
@@ -526,12 +530,13 @@ fn photographs_are_added_to_a_model() {
     assert_eq!((value["alignment"]["by"].as_str(), value["alignment"]["agree"].as_u64()), (Some("model"), Some(8)));
     let more = colmap::read(at("model")).unwrap();
     is_true(&more, &truth);
-    // The lens is the same to the last digit that the text has, and the frame to what eight poses change by with new photographs: a thousandth of three meters.
+    // The lens is the same to the last digit that the text has, and the frame to what eight poses change by with new photographs: each of the two
+    // models is within a hundredth of a meter of the truth.
     assert_eq!(more.cameras.values().map(|c| c.fx).collect::<Vec<_>>(), [FOCAL]);
     for image in moved.images.values() {
         let now = more.images.values().find(|other| other.name == image.name).unwrap();
         let off = (now.pose.center() - image.pose.center()).norm();
-        assert!(off < 0.01, "{}: {off}", image.name);
+        assert!(off < 0.02, "{}: {off}", image.name);
     }
 
     let refuse = |args: &[&str], says: &str| {

@@ -31,6 +31,8 @@ impl Default for ViewPairOptions {
     }
 }
 
+/// Matches from which on the loss of a pair has one minimum that matters: of fewer, several models agree with nearly as many, and the search has to go round each.
+const MANY: usize = 200;
 /// Most samples of a search.
 const MOST_SAMPLES: usize = 20_000;
 
@@ -136,7 +138,11 @@ pub fn verify_view_pair(
         max_iterations: samples(if calibrated { 5 } else { 7 }),
         seed: options.seed,
         scoring: Scoring::Msac,
-        local_optimization: LocalOptimization::Iterative,
+        local_optimization: if pairs.len() < MANY {
+            LocalOptimization::InnerRansac
+        } else {
+            LocalOptimization::Iterative
+        },
         ..RobustOptions::default()
     };
     let (model, inliers, rms) = if calibrated {

@@ -412,4 +412,36 @@ mod tests {
         let none = FeatureViews::new(&FeatureViewsOptions { wrong: 0.0, ..options });
         assert_eq!(none.matches(a, b).len(), shared);
     }
+
+    #[test]
+    fn houses_repeat_and_match_as_if_they_were_the_same() {
+        let options = FeatureViewsOptions { houses: 5, own: 0.25, ..Default::default() };
+        let views = FeatureViews::new(&options);
+        assert_eq!(views.points.len(), options.points);
+        let turn = TAU / 5.0;
+        let (mut fronts, mut repeated) = (0, 0);
+        for (point, first) in views.points.iter().zip(&views.alike) {
+            let first = &views.points[*first as usize];
+            let on = (point.x.atan2(point.z) - first.x.atan2(first.z)) / turn;
+            // Some house on, as far from the middle and as high, to the rounding of f64.
+            assert!((on - on.round()).abs() < 1e-9, "{on}");
+            assert!((point.x.hypot(point.z) - first.x.hypot(first.z)).abs() < 1e-9 && (point.y - first.y).abs() < 1e-9);
+            fronts += usize::from(point.y < -0.1);
+            repeated += usize::from(point.y < -0.1 && (point - first).norm() > 1.0);
+        }
+        // Of five alike one is the first; a hundred groups and more leave a few hundredths to chance.
+        let share = repeated as f64 / fronts as f64;
+        assert!((share - 0.75 * 0.8).abs() < 0.05, "{share}");
+        // A photograph and the one at the same place before the next house have nearly as many matches as neighbors, but for what is each house's own and the ground, and all to that house.
+        let same = |a: usize, b: usize| {
+            let matches = views.matches(a, b);
+            let right = matches.iter().filter(|m| views.shown[a][m.query as usize] == views.shown[b][m.train as usize]);
+            (right.count(), matches.len())
+        };
+        for i in 0..10 {
+            let (right, of) = same(i, i + 10);
+            assert!(10 * right < of && 3 * of > same(i, i + 1).1, "{i}: {right} of {of}");
+            assert!(views.pairs(30).iter().any(|p| (p.0, p.1) == (i, i + 10)));
+        }
+    }
 }
