@@ -107,12 +107,12 @@ pub(crate) const CASES: &[Case] = &[
     case("reconstruct by camera", "reconstruct in/a.jpg in/b.jpg --camera in/cam.yaml -o out/c.ply", &["cam.yaml"]),
     case(
         "sfm",
-        "sfm in/a.jpg in/b.jpg --focal 490 --features 2000 --distance a.jpg b.jpg 1 -o out/sparse --cloud out/c.ply --covariance out/s.json",
-        &["a.jpg", "b.jpg"],
+        "sfm in/a.jpg in/c.jpg --focal 490 --features 2000 --distance a.jpg c.jpg 1 -o out/sparse --cloud out/c.ply --covariance out/s.json",
+        &["a.jpg", "c.jpg"],
     ),
     case(
         "sfm from a model",
-        "sfm in/a.jpg in/b.jpg --from in/sparse --features 2000 -o out/sparse --format colmap-binary",
+        "sfm in/a.jpg in/c.jpg --from in/sparse --features 2000 -o out/sparse",
         &["sparse/cameras.txt", "sparse/images.txt"],
     ),
     case("panorama", "panorama in/1.jpg in/2.jpg -o out/p.png --report out", &["1.jpg", "2.jpg"]),
@@ -176,6 +176,8 @@ pub(crate) fn prepare(folder: &Path, program: &Path) -> Result<()> {
     for (name, of_data, of_fixtures, width) in [
         ("a", "sfm/sceaux/100_7101.JPG", "two-view/a.jpg", 480),
         ("b", "sfm/sceaux/100_7102.JPG", "two-view/b.jpg", 480),
+        // Farther from the first: two alone make a model.
+        ("c", "sfm/sceaux/100_7103.JPG", "two-view/b.jpg", 480),
         ("1", "panorama/weir/weir_1.jpg", "panorama/view0.jpg", 240),
         ("2", "panorama/weir/weir_2.jpg", "panorama/view1.jpg", 240),
         ("ball1", "segmentation/orange-ball/train/106.jpg", "ball/ball1.jpg", 120),
@@ -209,7 +211,7 @@ pub(crate) fn prepare(folder: &Path, program: &Path) -> Result<()> {
         Ok(())
     };
     run("match in/a.jpg in/b.jpg -o in/m.txt --save-features in/arrays")?;
-    run("sfm in/a.jpg in/b.jpg --focal 490 --features 2000 -o in/sparse")?;
+    run("sfm in/a.jpg in/c.jpg --focal 490 --features 2000 -o in/sparse")?;
     for name in ["a", "b"] {
         fs::rename(to.join(format!("arrays/{name}.txt")), to.join(format!("texts/{name}.txt")))?;
     }

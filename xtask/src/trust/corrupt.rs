@@ -30,15 +30,17 @@ pub(super) fn run(options: &Options) -> Result<bool> {
     let folder = tempfile::tempdir()?;
     cases::prepare(folder.path(), &program)?;
     let kept = crate::root().join("target/corrupt");
-    let (mut tallies, mut finds): (Vec<Tally>, u64) = (CASES.iter().map(|_| Tally::default()).collect(), 0);
+    // A command that reads nothing has nothing to damage.
+    let cases: Vec<_> = CASES.iter().filter(|case| !case.inputs.is_empty()).collect();
+    let (mut tallies, mut finds): (Vec<Tally>, u64) = (cases.iter().map(|_| Tally::default()).collect(), 0);
     for case in CASES {
         let (code, stderr, _) = ran(&program, folder.path(), case)?;
         anyhow::ensure!(code == Some(0), "{} fails on whole inputs: {stderr}", case.name);
     }
     for i in 0..count {
-        let which = i as usize % CASES.len();
-        let case = &CASES[which];
-        let input = case.inputs[i as usize / CASES.len() % case.inputs.len()];
+        let which = i as usize % cases.len();
+        let case = cases[which];
+        let input = case.inputs[i as usize / cases.len() % case.inputs.len()];
         let path = folder.path().join("in").join(input);
         let whole = fs::read(&path).with_context(|| path.display().to_string())?;
         let seed = options.seed.wrapping_mul(1 << 32).wrapping_add(i);
@@ -60,7 +62,7 @@ pub(super) fn run(options: &Options) -> Result<bool> {
         fs::write(&path, whole)?;
     }
     println!("{:28} {:>8} {:>8} {:>8} {:>10}", "command", "exit 0", "exit 1", "exit 2", "slowest");
-    for (case, tally) in CASES.iter().zip(&tallies) {
+    for (case, tally) in cases.iter().zip(&tallies) {
         let Tally { done, refused, usage, slowest } = tally;
         println!("{:28} {done:8} {refused:8} {usage:8} {:8.2} s", case.name, slowest.as_secs_f64());
     }
