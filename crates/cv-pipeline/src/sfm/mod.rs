@@ -37,8 +37,8 @@ pub struct SfmJobOptions {
     pub first_features: usize,
     /// A photograph that has fewer pairs than this in which most matches agree is tried with its best others once more, with all features. Default 6.
     pub firm_partners: usize,
-    /// Pairs of each photograph that are matched with all features along their geometry. Default 4: with more, those of wider angles come in, whose positions are less exact (templeRing:
-    /// 7,870 points at 0.316 px in place of 7,543 at 0.325 with 10); what they miss is found once there is a model.
+    /// Pairs of each photograph that are matched with all features along their geometry. Default 3: with more, those of wider angles come in, whose positions are less exact (templeRing:
+    /// 7,916 points at 0.314 px in place of 7,543 at 0.325 with 10); what they miss is found once there is a model.
     pub guided_partners: usize,
     /// Which pairs of photographs hold.
     pub pairs: ViewPairOptions,
@@ -60,7 +60,7 @@ impl Default for SfmJobOptions {
             partners: 20,
             first_features: 1024,
             firm_partners: 6,
-            guided_partners: 4,
+            guided_partners: 3,
             pairs: ViewPairOptions::default(),
             solve: cv_sfm::SfmOptions::default(),
         }
