@@ -17,6 +17,8 @@ struct Effort {
 
 const ROUGH: Effort = Effort { rounds: 1, max_iterations: 8, tolerance: 1e-3 };
 const FINE: Effort = Effort { rounds: 3, max_iterations: 25, tolerance: 5e-5 };
+/// Views from which on the tolerance is smaller, by as much as there are more: what bends a long walk as a whole lowers the cost by little and moves far.
+const MANY: f64 = 50.0;
 /// How often points are looked for in views that lack them: what the first time finds makes points of three views out of those of two, and moves others nearer to where they are seen. (The
 /// second makes the tracks of kitti-2 longer by 0.8 %.)
 const COMPLETIONS: usize = 2;
@@ -81,6 +83,7 @@ fn refine(
     progress: &dyn Progress,
 ) -> Result<(), Cancelled> {
     let Effort { rounds, max_iterations, tolerance } = effort;
+    let tolerance = tolerance * (MANY / scene.registered().len() as f64).min(1.0);
     let limits = PointLimits { error: options.max_error, angle: options.min_angle };
     let all: Vec<usize> = (0..scene.tracks.len()).collect();
     update_tracks(scene, limits, &all);
