@@ -19,7 +19,7 @@ pub(crate) fn wide_limits(options: &SfmOptions) -> PointLimits {
 }
 
 /// Adjustments while a model grows.
-const QUICK: BundlePlan<'static> =
+pub(crate) const QUICK: BundlePlan<'static> =
     BundlePlan { free: None, lens: LensFreedom::Held, scale: 1.0, max_iterations: 6, tolerance: 1e-3 };
 
 /// Starts a model with a pair.

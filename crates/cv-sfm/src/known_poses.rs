@@ -1,9 +1,10 @@
 //! A model that goes on from poses that are known.
 
 use crate::SfmOptions;
-use crate::bundle::{BundlePlan, LensFreedom, adjust};
+use crate::bundle::adjust;
+use crate::incremental::{QUICK, wide_limits};
 use crate::scene::Scene;
-use crate::triangulate_track::{PointLimits, update_tracks};
+use crate::triangulate_track::update_tracks;
 use cv_core::{Cancelled, Pose, Stage};
 
 /// Gives views their known poses and triangulates what they see; poses that too few of them agree with are left out. False where fewer than two are left.
@@ -20,7 +21,7 @@ pub(crate) fn place_known(
         *pose = *known;
     }
     let all: Vec<usize> = (0..scene.tracks.len()).collect();
-    let limits = PointLimits { error: options.growing_error(), angle: options.min_angle };
+    let limits = wide_limits(options);
     loop {
         stage.check()?;
         update_tracks(scene, limits, &all);
@@ -33,8 +34,7 @@ pub(crate) fn place_known(
     if scene.registered().len() < 2 {
         return Ok(false);
     }
-    let plan = BundlePlan { free: None, lens: LensFreedom::Held, scale: 1.0, max_iterations: 6, tolerance: 1e-3 };
-    adjust(scene, &plan, stage)?;
+    adjust(scene, &QUICK, stage)?;
     update_tracks(scene, limits, &all);
     Ok(true)
 }

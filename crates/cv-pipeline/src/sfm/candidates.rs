@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 /// Words of the vocabulary of a set, those of Jégou et al.
 const WORDS: usize = 64;
-/// Descriptors that the words are learned from, and those of a photograph.
+/// Most descriptors that the words are learned from.
 const MOST_SAMPLES: usize = 20_000;
 /// Features of largest scale that a photograph is told by.
 const DESCRIBED: usize = 1024;
