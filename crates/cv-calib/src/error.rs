@@ -4,6 +4,7 @@ use cv_core::{Cancelled, DistortionModel, OptionError};
 
 /// Why a calibration cannot be made.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 #[non_exhaustive]
 pub enum CalibrateError {
     /// The target has no area, or coordinates that are no use.

@@ -10,6 +10,7 @@ pub const MAX_INTRINSICS: usize = 4 + MAX_PARAMETERS;
 
 /// Why a camera is not one.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum CameraError {
     /// A focal length is not a positive number.
     #[error("the focal lengths {fx} and {fy} px are not both positive")]

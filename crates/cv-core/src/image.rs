@@ -18,6 +18,7 @@ impl Sample for f64 {}
 
 /// Why an image could not be made from a buffer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum ImageError {
     /// The buffer does not hold `width × height × channels` samples.
     #[error("a {width}×{height} image with {channels} channel(s) does not have {len} samples")]

@@ -30,6 +30,7 @@ pub trait Named: Clone + Send + Sync + Sized + 'static {
 
 /// No value has this name.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 #[error("“{name}” is none of {known}")]
 pub struct UnknownName {
     /// The name.

@@ -2,6 +2,7 @@
 
 /// An option is outside its range.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 #[error("{name} is {value}; it must be {range}")]
 pub struct OptionError {
     /// Name of the field.

@@ -17,6 +17,7 @@ pub trait Progress: Sync {
 
 /// A job was stopped by its [`Progress`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 #[error("stopped")]
 pub struct Cancelled;
 

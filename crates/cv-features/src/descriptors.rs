@@ -63,6 +63,7 @@ impl Descriptors {
 
 /// Why a keypoint got no descriptor.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum DropReason {
     /// Its window leaves the image.
     #[error("the window of ±{margin} px leaves the image")]

@@ -6,6 +6,7 @@ use rayon::prelude::*;
 
 /// Why an image has no features to give.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum FeatureError {
     /// The image is smaller than the smallest window the method looks at.
     #[error("a {width}×{height} image is smaller than the {needed}×{needed} pixels this method needs")]

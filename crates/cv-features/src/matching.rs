@@ -7,6 +7,7 @@ use cv_core::{Cancelled, DMatch, OptionError, Progress};
 
 /// Why two sets could not be matched.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum MatchError {
     /// The sets hold different kinds of descriptors.
     #[error("{} {} descriptors cannot be compared with {} {} ones", query.1, query.0, train.1, train.0)]

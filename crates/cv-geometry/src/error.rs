@@ -6,6 +6,7 @@ use cv_core::Cancelled;
 
 /// A configuration of points that does not determine a model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum Degeneracy {
     /// Too few different points.
     Coincident,
@@ -27,6 +28,7 @@ impl std::fmt::Display for Degeneracy {
 
 /// Why an estimate could not be made.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum EstimateError {
     /// There are fewer matches than the model has need of.
     #[error("{got} matches are too few: {needed} are needed")]

@@ -16,6 +16,7 @@ pub struct PairEdge {
 
 /// An edge names a node that is not there.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 #[error("edge {edge} joins {a} and {b} of {nodes} nodes")]
 pub struct NoSuchNode {
     /// Index of the edge.

@@ -7,6 +7,7 @@ use nalgebra::Matrix4;
 
 /// Why a point could not be triangulated.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum TriangulationError {
     /// There is nothing to triangulate from.
     #[error("{got} views of a point are too few: 2 are needed")]

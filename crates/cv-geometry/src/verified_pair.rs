@@ -40,6 +40,7 @@ pub struct VerifiedPair {
 
 /// Why a pair of photographs is taken not to overlap.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum NotAPair {
     /// No homography fits the matches.
     #[error("no homography: {0}")]

@@ -48,6 +48,7 @@ pub struct RemapOptions {
 
 /// Why a picture could not be warped.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum WarpError {
     /// The homography has no inverse (or is not finite), so there is no way back to the source.
     #[error("the homography cannot be inverted: its determinant is {determinant:e}")]

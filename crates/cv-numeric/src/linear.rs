@@ -5,6 +5,7 @@ use nalgebra::{DMatrix, DVector, Matrix3, Rotation3, SMatrix, SVector, Vector3};
 
 /// Why a decomposition did not succeed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum LinearError {
     /// An entry is NaN or infinite.
     #[error("the matrix has an entry that is not finite")]

@@ -52,6 +52,7 @@ impl Default for CompositingOptions {
 
 /// Why a panorama could not be drawn.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum RenderError {
     /// There is no canvas.
     #[error(transparent)]

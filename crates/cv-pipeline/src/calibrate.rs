@@ -55,6 +55,7 @@ impl Default for BoardCalibrationOptions {
 
 /// Why a photograph is not part of a calibration.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum PhotoRefusal {
     /// There is no photograph of this view by this camera.
     NoPhoto,
@@ -90,6 +91,7 @@ pub struct BoardCalibration {
 
 /// Why there is no calibration.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum BoardCalibrationError {
     /// No photograph shows the board.
     #[error("no board was found on any of {} photographs", refusals.iter().flatten().flatten().count())]

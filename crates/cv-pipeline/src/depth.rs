@@ -105,6 +105,7 @@ impl DepthResult {
 
 /// Why there is no depth.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum DepthError {
     /// The pair cannot be matched.
     #[error(transparent)]

@@ -5,6 +5,7 @@ use cv_core::{Cancelled, Correspondence, ImageView, quantile};
 
 /// Why no range was found.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum RangeError {
     /// No features to match.
     #[error(transparent)]

@@ -92,6 +92,7 @@ impl MatchingResult {
 
 /// Why photographs could not be matched.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum MatchingError {
     /// A photograph cannot be looked at.
     #[error("photograph {index}: {source}")]

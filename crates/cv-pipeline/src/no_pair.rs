@@ -8,6 +8,7 @@ use cv_stereo::Intensity;
 
 /// What feature matches of a refused pair show.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum NoPairCause {
     /// Too few features of one are found in the other: another scene, or hardly anything in common.
     Unrelated {

@@ -64,6 +64,7 @@ impl Default for PanoramaOptions {
 
 /// Why a photograph is not in the panorama.
 #[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum LeftOut {
     /// Features could not be looked for on it.
     Features(FeatureError),
@@ -85,6 +86,7 @@ pub enum LeftOut {
 
 /// A pair of photographs of which too few matches agree.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub struct NearestPair {
     /// The other photograph.
     pub other: usize,
@@ -98,6 +100,7 @@ pub struct NearestPair {
 
 /// What became of a photograph.
 #[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub struct PanoramaImage {
     /// Whether it is in the panorama.
     pub used: bool,
@@ -175,6 +178,7 @@ impl PanoramaResult {
 
 /// Why there is no panorama.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum PanoramaError {
     /// The photographs could not be aligned. `images` says for each what is the matter with it.
     #[error("{source}")]

@@ -6,6 +6,7 @@ use cv_core::OptionError;
 
 /// Why a model could not be trained, loaded, or scored.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum SegmentError {
     /// There is nothing to train on.
     #[error("there are no photos with masks to train on")]

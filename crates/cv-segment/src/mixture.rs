@@ -68,6 +68,7 @@ impl Default for MixtureOptions {
 
 /// Why no mixture could be fitted or used.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum MixtureError {
     /// There are no samples of positive weight.
     #[error("there are no samples to fit a mixture to")]

@@ -46,6 +46,7 @@ pub struct CenterFit {
 
 /// Why a model cannot be aligned to what is known.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum ModelAlignError {
     /// Fewer than three of the model's views have a known center.
     #[error("{got} views of the model have a known center where {needed} are needed")]

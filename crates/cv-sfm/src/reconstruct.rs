@@ -118,6 +118,7 @@ pub struct SfmOutcome {
 
 /// Why nothing was reconstructed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum SfmError {
     /// Fewer than two views.
     #[error("{got} views are too few: 2 are needed")]

@@ -77,6 +77,7 @@ pub struct ViewPair {
 
 /// Why the matches of two views say nothing of their geometry.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum ViewPairError {
     /// Too few matches agree.
     #[error("{got} of {matches} matches agree where {needed} are needed")]

@@ -23,6 +23,7 @@ pub struct StereoGeometry {
 
 /// A numbers that cannot be a stereo geometry.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum GeometryError {
     /// Focal length or baseline is not a positive number.
     #[error("focal length {focal} px and baseline {baseline} must both be positive")]

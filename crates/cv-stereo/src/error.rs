@@ -6,6 +6,7 @@ use cv_core::Cancelled;
 
 /// Why no disparity could be computed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum StereoError {
     /// The two images differ in size.
     #[error("left image is {}×{} px, right image {}×{} px: both must have the same size", left.0, left.1, right.0, right.1)]

@@ -31,6 +31,7 @@ pub struct DisparityScores {
 
 /// Why two maps cannot be compared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum EvaluateError {
     /// The maps differ in size.
     #[error("the estimate is {}×{} px, the {what} {}×{} px", estimate.0, estimate.1, other.0, other.1)]

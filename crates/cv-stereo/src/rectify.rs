@@ -34,6 +34,7 @@ impl Default for RectifyOptions {
 
 /// Why a rig cannot be rectified.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum RectifyError {
     /// A camera is none.
     #[error("the {side} camera: {error}")]

@@ -41,6 +41,7 @@ macro_rules! table {
     ($($model:ident: $lens:ty, $about:literal;)*) => {
         /// A lens model.
         #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+        #[cfg_attr(feature = "serde", derive(serde::Serialize))]
         #[non_exhaustive]
         pub enum DistortionModel {
             $(#[doc = $about] $model,)*

@@ -7,6 +7,7 @@ use cv_core::{Cancelled, OptionError};
 
 /// Why a picture gave no board, or why there is no such board.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum BoardError {
     /// The size that was asked for is no size of a chessboard.
     #[error("a board of {asked} inner corners: each side takes {} to {}", BoardSize::LEAST, BoardSize::MOST)]

@@ -5,6 +5,7 @@ use cv_core::{CameraError, Cancelled};
 
 /// Why two views could not be reconstructed.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum TwoViewError {
     /// A match refers to a keypoint that there is not.
     #[error("match {index} is between keypoints {query} and {train} of {} and {}", keypoints.0, keypoints.1)]

@@ -2,6 +2,7 @@
 
 /// Why a problem cannot be stated, solved or have its covariance computed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum AdjustError {
     /// The values of a group are not a whole number of blocks.
     #[error("{group}: {got} numbers are not a whole number of blocks of {block} numbers")]

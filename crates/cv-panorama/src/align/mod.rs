@@ -82,6 +82,7 @@ impl Default for AlignOptions {
 
 /// Why photographs could not be aligned.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum AlignError {
     /// A panorama needs two photographs.
     #[error("a panorama needs at least 2 photographs, got {got}")]

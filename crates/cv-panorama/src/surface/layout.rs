@@ -10,6 +10,7 @@ use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 /// Why there is no canvas for the panorama.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum LayoutError {
     /// No photograph is placed.
     #[error("there is no photograph to draw")]

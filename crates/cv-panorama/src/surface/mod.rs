@@ -30,6 +30,7 @@ use cv_core::{Point2, Vector3, named};
 
 /// The surface a panorama is drawn on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum Projection {
     /// [`Plane`](Self::Plane) while the field of view permits, else [`Cylindrical`](Self::Cylindrical), and
     /// [`Spherical`](Self::Spherical) where it is also too high for a cylinder.

@@ -49,6 +49,7 @@ pub struct DenseResult {
 
 /// Why there is no dense cloud.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum DenseError {
     /// The photographs cannot be turned so that their rows coincide.
     #[error("the two photographs cannot be rectified: {0}")]

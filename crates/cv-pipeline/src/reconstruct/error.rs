@@ -6,6 +6,7 @@ use cv_geometry::TwoViewError;
 
 /// Why two photographs could not be reconstructed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum ReconstructError {
     /// The photographs could not be matched at all.
     #[error(transparent)]

@@ -78,6 +78,7 @@ pub struct SfmDense {
 
 /// Why there is no dense cloud of many views.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum SfmDenseError {
     /// A photograph has another size than its camera.
     #[error("a photograph has {photo:?} pixels where its camera has {camera:?}")]

@@ -113,6 +113,7 @@ pub struct SfmResult {
 
 /// Why many photographs could not be reconstructed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum SfmJobError {
     /// A photograph has another size than its camera.
     #[error("photograph {index} has {photo:?} pixels where its camera has {camera:?}")]

@@ -23,6 +23,7 @@ pub struct SfmPhoto {
 
 /// Why a photograph has no features for many views.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum SfmPhotoError {
     /// The photograph cannot be looked at.
     #[error(transparent)]
