@@ -4,6 +4,7 @@
 use crate::SfmOptions;
 use crate::bundle::{BundlePlan, LensFreedom, adjust};
 use crate::global_positions::{adjust_rays, centers_of_baselines};
+use crate::model_parts::keep_largest_part;
 use crate::pair_scales::{Distances, baselines};
 use crate::rotation_averaging::average_rotations;
 use crate::scene::Scene;
@@ -77,6 +78,10 @@ pub(crate) fn place(
         }
     }
     update_tracks(scene, limits(0.0), &all);
+    // So are parts whose place beside the largest one is wrong: where nothing but narrow angles compares the lengths of baselines, as along a street, these are off by any factor.
+    if keep_largest_part(scene, &graph, options.min_pose_inliers) {
+        update_tracks(scene, limits(0.0), &all);
+    }
     Ok(scene.registered().len() > 1)
 }
 

@@ -61,6 +61,7 @@ mod incremental;
 mod initial_pair;
 mod known_poses;
 mod model;
+mod model_parts;
 mod pair_scales;
 mod reconstruct;
 mod registration;
