@@ -17,7 +17,7 @@
 //!   seed; [`SceneBuilder`] for one's own.
 //! * Many views: [`Scene::room_walk`] and [`Scene::street_walk`] are poses to render; [`FeatureViews`] are keypoints and matches of any number of views without pictures.
 //! * One picture: [`render`] with a [`cv_core::Camera`] (distortion included), a pose and [`RenderOptions`].
-//! * Sets with their truth: [`stereo_pair`], [`homography_pair`], [`panorama_views`], [`two_view`], [`ball_photos`].
+//! * Sets with their truth: [`stereo_pair`], [`homography_pair`], [`panorama_views`], [`two_view`], [`ball_photos`]; [`vista_photos`], a landscape in a light that is known, by a camera with faults.
 //! * Photographs of one flat sheet, a calibration board say: [`Sheet`], [`chessboard_photo`], [`photo_without_board`].
 //! * Further truth: [`Scene::correspondences`], [`Scene::visible_in_both`], [`Scene::point_at`], [`Scene::pixel_of`],
 //!   [`plane_homography`], [`rotation_homography`].
@@ -53,6 +53,7 @@ mod shape;
 mod sheet_photo;
 mod texture;
 mod truth;
+mod vista;
 
 pub use corrupt::corrupt;
 pub use error::SynthError;
@@ -73,3 +74,4 @@ pub use sets::{
 pub use sheet_photo::{ChessboardPhoto, ChessboardTrial, Sheet, chessboard_photo, photo_without_board};
 pub use texture::{Collage, Rgb, Texture, srgb};
 pub use truth::{plane_homography, rotation_homography};
+pub use vista::{Vista, VistaOptions, VistaPhoto, vista_level, vista_photos};

@@ -10,6 +10,8 @@ mod calibration_undistort;
 mod feature_quality;
 mod features;
 mod geometry;
+mod panorama;
+mod panorama_truth;
 mod sfm;
 pub(crate) mod sfm_score;
 mod stereo;
@@ -31,6 +33,7 @@ const JOBS: &[checks::Named<Job>] = &[
     ("adjust", adjust::run),
     ("calibration", calibration::run),
     ("sfm", sfm::run),
+    ("panorama", panorama::run),
 ];
 
 /// Runs all jobs, or the one named; true where ours meets every bar.

@@ -1,0 +1,302 @@
+//! OpenCV's Stitcher, Hugin's command line and ours on the same photographs, and ours on generated ones whose truth is known. Writes the section “Panoramas” of
+//! `docs/benchmarks.md`.
+//!
+//! Hugin takes half a minute for a set: what it printed is kept in `peers-panorama` of the target folder for as long as its script stays the same.
+
+use super::panorama_truth::{self, Truth};
+use crate::checks::Check;
+use anyhow::{Context, Result, ensure};
+use cv_synth::{Vista, VistaOptions, vista_photos};
+use serde::Deserialize;
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+const THREADS: usize = 2;
+/// Real sets below `panorama` of the data of which OpenCV places all photographs.
+const SETS: [&str; 4] = ["weir", "umd-set1", "umd-set3", "carpark"];
+
+/// The set that is generated in the size of today's cameras.
+const LARGE: &str = "generated, 8 of 12 Mpx";
+
+/// What a system printed of itself, or what was measured of it.
+#[derive(Debug, Clone, Deserialize)]
+struct Outcome {
+    #[serde(default)]
+    version: String,
+    used: usize,
+    size: (usize, usize),
+    /// Mean gray level of what is not black.
+    mean: f64,
+    #[serde(default)]
+    seconds: f64,
+    #[serde(default)]
+    cpu: f64,
+    #[serde(default)]
+    peak: f64,
+}
+
+/// All systems on a set.
+struct Compared {
+    name: &'static str,
+    photographs: usize,
+    /// Least and greatest mean level of a photograph.
+    means: (f64, f64),
+    systems: Vec<(&'static str, Outcome)>,
+}
+
+pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
+    let program = crate::release_program()?;
+    let keep = crate::target_dir()?.join("peers-panorama");
+    let mut sets = Vec::new();
+    for name in SETS {
+        println!("{name}");
+        let mut photographs: Vec<PathBuf> = std::fs::read_dir(data.join("panorama").join(name))
+            .with_context(|| name.to_owned())?
+            .map(|entry| Ok(entry?.path()))
+            .collect::<Result<_>>()?;
+        photographs.sort();
+        sets.push(compare(name, &photographs, python, &program, &keep)?);
+    }
+    println!("{LARGE}");
+    let photographs = large(&keep)?;
+    sets.push(compare(LARGE, &photographs, python, &program, &keep)?);
+    let truths: Vec<(&str, Truth)> = panorama_truth::SETS
+        .iter()
+        .map(|(name, options)| {
+            println!("{name}");
+            Ok((*name, panorama_truth::measure(options)?))
+        })
+        .collect::<Result<_>>()?;
+    let checks = checks(&sets, &truths);
+    let text = page(&sets, &truths, &checks);
+    print!("{text}");
+    super::write_section("Panoramas", &text)?;
+    Ok(checks)
+}
+
+/// Eight photographs of 12 megapixels, made once.
+fn large(keep: &Path) -> Result<Vec<PathBuf>> {
+    let folder = keep.join("large");
+    let paths: Vec<PathBuf> = (0..8).map(|i| folder.join(format!("{i}.jpg"))).collect();
+    if paths.iter().all(|path| path.exists()) {
+        return Ok(paths);
+    }
+    std::fs::create_dir_all(&folder)?;
+    let camera = cv_core::Camera::from_focal(4000, 3000, 3200.0);
+    let options = VistaOptions { samples: 1, ..VistaOptions::default() };
+    for (path, photo) in paths.iter().zip(vista_photos(&Vista::new(5, 800.0), 5, &camera, &options)?) {
+        cv_io::write_jpeg(path, photo.image.view())?;
+    }
+    Ok(paths)
+}
+
+fn compare(
+    name: &'static str,
+    photographs: &[PathBuf],
+    python: &Path,
+    program: &Path,
+    keep: &Path,
+) -> Result<Compared> {
+    let folder = keep.join(name.replace([' ', ','], "-"));
+    std::fs::create_dir_all(&folder)?;
+    let scripts = crate::root().join("peers");
+    let means = photographs
+        .iter()
+        .map(|path| Ok(mean(cv_io::read_rgb(path)?.pixels())))
+        .collect::<Result<Vec<f64>>>()
+        .context("photographs")?;
+    let means = (means.iter().copied().fold(f64::MAX, f64::min), means.iter().copied().fold(0.0, f64::max));
+    let mut systems = Vec::new();
+    let mut opencv: Option<Outcome> = None;
+    for (system, mode) in [("OpenCV", "panorama"), ("OpenCV, scans", "scans")] {
+        let out = folder.join(format!("opencv-{mode}.png"));
+        let output = Command::new(python)
+            .arg(scripts.join("panorama_opencv.py"))
+            .args([mode, &THREADS.to_string()])
+            .arg(&out)
+            .args(photographs)
+            .output()
+            .context("cannot start Python")?;
+        ensure!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let outcome: Outcome = serde_json::from_slice(&output.stdout)?;
+        opencv.get_or_insert(outcome.clone());
+        systems.push((system, outcome));
+    }
+    // Minutes, for photographs of which it is asked nothing but the time.
+    if name != LARGE
+        && let Some(outcome) = hugin(python, &folder, photographs)?
+    {
+        systems.push(("Hugin", outcome));
+    }
+    // At the size that OpenCV's has: its projection, and as many pixels.
+    let first = ours(python, program, &folder, photographs, 1.0)?;
+    let pixels = |size: (usize, usize)| (size.0 * size.1) as f64;
+    let scale = match &opencv {
+        Some(theirs) if theirs.used == photographs.len() => (pixels(theirs.size) / pixels(first.size)).sqrt(),
+        _ => 1.0,
+    };
+    let same = ours(python, program, &folder, photographs, scale.clamp(0.5, 2.0))?;
+    systems.insert(0, ("ours", Outcome { mean: first.mean, ..same }));
+    Ok(Compared { name, photographs: photographs.len(), means, systems })
+}
+
+/// What Hugin printed; `None` where it is not installed.
+fn hugin(python: &Path, folder: &Path, photographs: &[PathBuf]) -> Result<Option<Outcome>> {
+    let script = crate::root().join("peers/panorama_hugin.py");
+    let (printed, stamp) = (folder.join("hugin.json"), folder.join("hugin.stamp"));
+    let text = std::fs::read_to_string(&script)?;
+    if std::fs::read_to_string(&stamp).is_ok_and(|kept| kept == text) {
+        return Ok(serde_json::from_str(&std::fs::read_to_string(&printed)?).ok());
+    }
+    let out = folder.join("hugin.tif");
+    let output =
+        Command::new(python).arg(&script).arg(&out).args(photographs).output().context("cannot start Python")?;
+    ensure!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let Ok(mut outcome) = serde_json::from_slice::<Outcome>(&output.stdout) else {
+        println!("  Hugin is not installed: left out");
+        return Ok(None);
+    };
+    if outcome.used > 0 {
+        let image = cv_io::read_rgb(&out)?;
+        (outcome.size, outcome.mean) = (image.size(), mean(image.pixels()));
+    }
+    let line = serde_json::json!({ "version": outcome.version, "used": outcome.used, "size": outcome.size,
+        "mean": outcome.mean, "seconds": outcome.seconds, "cpu": outcome.cpu, "peak": outcome.peak });
+    std::fs::write(printed, line.to_string())?;
+    std::fs::write(stamp, text)?;
+    Ok(Some(outcome))
+}
+
+/// Our program from files to file, at a scale.
+fn ours(python: &Path, program: &Path, folder: &Path, photographs: &[PathBuf], scale: f64) -> Result<Outcome> {
+    #[derive(Deserialize)]
+    struct Cost {
+        seconds: f64,
+        cpu: f64,
+        peak: f64,
+    }
+    let (out, printed) = (folder.join("ours.png"), folder.join("ours.json"));
+    let output = Command::new(python)
+        .arg(crate::root().join("peers/measure.py"))
+        .arg(&printed)
+        .arg(program)
+        .args(["panorama", "--json", "--quiet", "--projection", "spherical"])
+        .args(["--threads", &THREADS.to_string(), "--scale", &format!("{scale:.4}"), "-o"])
+        .arg(&out)
+        .args(photographs)
+        .output()
+        .context("cannot start Python")?;
+    ensure!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let cost: Cost = serde_json::from_slice(&output.stdout)?;
+    let value: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(printed)?)?;
+    let used = value["images"].as_array().map_or(0, |all| all.iter().filter(|image| image["used"] == true).count());
+    let image = cv_io::read_rgb(&out)?;
+    Ok(Outcome {
+        version: String::new(),
+        used,
+        size: image.size(),
+        mean: mean(image.pixels()),
+        seconds: cost.seconds,
+        cpu: cost.cpu,
+        peak: cost.peak,
+    })
+}
+
+/// Mean level of what is not black.
+fn mean(pixels: impl Iterator<Item = [u8; 3]>) -> f64 {
+    let (mut sum, mut n) = (0_u64, 0_u64);
+    for p in pixels.filter(|p| *p != [0; 3]) {
+        sum += p.iter().map(|v| u64::from(*v)).sum::<u64>();
+        n += 3;
+    }
+    sum as f64 / n.max(1) as f64
+}
+
+fn checks(sets: &[Compared], truths: &[(&str, Truth)]) -> Vec<Check> {
+    let mut checks = Vec::new();
+    for set in sets {
+        let (name, count) = (set.name, set.photographs as f64);
+        let find = |system: &str| set.systems.iter().find(|(s, _)| *s == system).map(|(_, outcome)| outcome);
+        let (Some(ours), Some(opencv)) = (find("ours"), find("OpenCV")) else { continue };
+        checks.push(Check::at_least(format!("{name}: photographs used"), ours.used as f64, count));
+        // Rounding of a mean to levels on either side.
+        checks.push(Check::at_least(
+            format!("{name}: mean level, of the darkest photograph's"),
+            ours.mean,
+            set.means.0 - 0.5,
+        ));
+        checks.push(Check::at_most(
+            format!("{name}: mean level, of the brightest photograph's"),
+            ours.mean,
+            set.means.1 + 0.5,
+        ));
+        // Time is compared where both do the same work.
+        if opencv.used == set.photographs {
+            checks.push(Check::at_most(format!("{name}: processor s / OpenCV's"), ours.cpu / opencv.cpu, 0.6));
+            checks.push(Check::at_most(format!("{name}: peak memory / OpenCV's"), ours.peak / opencv.peak, 1.0));
+        }
+    }
+    for (name, t) in truths {
+        checks.push(Check::at_least(format!("{name}: photographs used"), t.used, t.photographs));
+        checks.push(Check::at_most(format!("{name}: drift of 48 px blocks, median, px"), t.drift.0, 0.3));
+        checks.push(Check::at_most(format!("{name}: drift of 48 px blocks, 95 %, px"), t.drift.1, 1.0));
+        checks.push(Check::at_least(format!("{name}: PSNR after a gain per channel, dB"), t.psnr, t.least_psnr));
+        checks.push(Check::at_most(format!("{name}: step at seams in smooth places, 95 %, levels"), t.step, 1.5));
+    }
+    checks
+}
+
+fn page(sets: &[Compared], truths: &[(&str, Truth)], checks: &[Check]) -> String {
+    let mut versions: Vec<&str> =
+        sets.iter().flat_map(|s| &s.systems).map(|(_, o)| &o.version[..]).filter(|v| !v.is_empty()).collect();
+    versions.sort_unstable();
+    versions.dedup();
+    let mut text = format!(
+        "Written by `cargo xtask peers panorama`; one run, {THREADS} threads each, {}, {}. The same photographs for all, from the files to the picture, reading and writing \
+         included; ours on OpenCV's surface at as many pixels as its picture has. OpenCV's time is without the start of Python; Hugin's steps are those of its assistant, their figures of an earlier run on this machine. \
+         Level: mean of what is not black; the photographs' own means in brackets.\n\n\
+         | set | system | used | size | level | processor s | wall s | peak MiB |\n|---|---|---|---|---|---|---|---|\n",
+        super::machine(),
+        versions.join(", "),
+    );
+    for set in sets {
+        for (system, o) in &set.systems {
+            let (name, all, (low, high)) = (set.name, set.photographs, set.means);
+            if o.used == 0 {
+                let _ = writeln!(text, "| {name} | {system} | 0 of {all} | | | {:.1} | {:.1} | |", o.cpu, o.seconds);
+                continue;
+            }
+            let _ = writeln!(
+                text,
+                "| {name} | {system} | {} of {all} | {} × {} | {:.0} ({low:.0} to {high:.0}) | {:.2} | {:.2} | {:.0} |",
+                o.used,
+                o.size.0,
+                o.size.1,
+                o.mean,
+                o.cpu,
+                o.seconds,
+                o.peak / 1024.0 / 1024.0
+            );
+        }
+    }
+    text.push_str(
+        "\nGenerated landscapes, whose light and geometry are known: a camera with an S-shaped curve on top of sRGB, corners a third darker, some distortion, its white balance off by up to \
+         4 %. Drift: of blocks of 48 px after one rotation. PSNR: of what no photograph shows clipped, after one gain per channel.\n\n\
+         | set | used | drift median | drift 95 % | PSNR | step at seams |\n|---|---|---|---|---|---|\n",
+    );
+    for (name, t) in truths {
+        let _ = writeln!(
+            text,
+            "| {name} | {} of {} | {:.2} px | {:.2} px | {:.1} dB | {:.1} |",
+            t.used, t.photographs, t.drift.0, t.drift.1, t.psnr, t.step
+        );
+    }
+    text.push_str("\n| figure | measured | bar | |\n|---|---|---|---|\n");
+    for c in checks {
+        let held = if c.ok { "held" } else { "**not held**" };
+        let bar = c.bar.replace("<=", "≤").replace(">=", "≥");
+        let _ = writeln!(text, "| {} | {:.3} | {bar} | {held} |", c.name, c.figure);
+    }
+    text
+}

@@ -1,0 +1,182 @@
+//! What a panorama of generated photographs is worth, by their truth.
+
+use anyhow::Result;
+use cv_core::{Camera, Distortion, Matrix3, Point2, Vector3};
+use cv_pipeline::panorama_types::{CompositingOptions, Exposure};
+use cv_pipeline::{PanoramaOptions, PanoramaPhoto, PanoramaResult, Silent, panorama};
+use cv_synth::{Vista, VistaOptions, VistaPhoto, vista_level, vista_photos};
+
+/// A generated set: how it is taken, and the least PSNR asked of its panorama.
+pub(super) struct Generated {
+    spread: f32,
+    least_psnr: f64,
+}
+
+/// By name.
+pub(super) const SETS: [(&str, Generated); 2] = [
+    ("8 views, ±1 EV", Generated { spread: 1.0, least_psnr: 36.0 }),
+    ("8 views, ±2 EV", Generated { spread: 2.0, least_psnr: 34.0 }),
+];
+
+/// What was measured; the worst of the seeds.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Truth {
+    pub(super) photographs: f64,
+    pub(super) used: f64,
+    /// Median and 95 % of the blocks' displacements, in pixels.
+    pub(super) drift: (f64, f64),
+    pub(super) psnr: f64,
+    pub(super) least_psnr: f64,
+    /// 95 % of the steps at seams, in gray levels.
+    pub(super) step: f64,
+}
+
+const SEEDS: [u64; 3] = [1, 2, 3];
+const CONTRAST: f32 = 0.4;
+
+pub(super) fn measure(set: &Generated) -> Result<Truth> {
+    let mut worst: Option<Truth> = None;
+    for seed in SEEDS {
+        let camera = Camera { distortion: Distortion::simple_radial(-0.04), ..Camera::from_focal(960, 720, 900.0) };
+        let vista = Vista::new(seed, 220.0);
+        let options =
+            VistaOptions { exposure: set.spread, white_balance: 0.04, contrast: CONTRAST, ..VistaOptions::default() };
+        let photos = vista_photos(&vista, seed, &camera, &options)?;
+        let inputs: Vec<PanoramaPhoto<'_>> = photos.iter().map(|p| PanoramaPhoto::new(p.image.view())).collect();
+        let render = CompositingOptions { exposure: Exposure::Gain, ..CompositingOptions::default() };
+        let result = panorama(&inputs, &PanoramaOptions { render, ..PanoramaOptions::default() }, &Silent)?;
+        let drift = drift(&photos, &result);
+        let used = result.images.iter().filter(|image| image.used).count() as f64;
+        let steps = seam_steps(&result);
+        let step = steps.get(steps.len() * 95 / 100).copied().unwrap_or(f64::NAN);
+        let psnr = psnr(&vista, &photos, &result);
+        println!(
+            "  seed {seed}: used {used}, drift {:.2} {:.2}, PSNR {psnr:.1}, {} steps {step:.1}",
+            drift.0,
+            drift.1,
+            steps.len()
+        );
+        let found = Truth { photographs: photos.len() as f64, used, drift, psnr, least_psnr: set.least_psnr, step };
+        worst = Some(worst.map_or(found, |w| Truth {
+            used: w.used.min(used),
+            drift: (w.drift.0.max(drift.0), w.drift.1.max(drift.1)),
+            psnr: w.psnr.min(psnr),
+            step: w.step.max(step),
+            ..found
+        }));
+    }
+    worst.ok_or_else(|| anyhow::anyhow!("no seeds"))
+}
+
+/// The true direction of a pixel of the result, by where in its photograph it comes from.
+fn true_ray(photos: &[VistaPhoto], result: &PanoramaResult, x: usize, y: usize) -> Option<Vector3<f64>> {
+    let label = usize::from(result.labels.at(x, y)[0]);
+    let source = result.map.source(label, Point2::new(x as f64, y as f64))?;
+    let photo = photos.get(label)?;
+    let n = photo.camera.normalize(source);
+    Some((photo.from_world.inverse() * Vector3::new(n.x, n.y, 1.0)).normalize())
+}
+
+/// Median and 95 % of how far, in pixels, blocks of 48 px lie from where they would in a panorama turned as a whole.
+fn drift(photos: &[VistaPhoto], result: &PanoramaResult) -> (f64, f64) {
+    let (w, h) = result.image.size();
+    let mut pairs = Vec::new();
+    for y in (24..h).step_by(48) {
+        for x in (24..w).step_by(48) {
+            if let Some(truth) = true_ray(photos, result, x, y) {
+                pairs.push((result.canvas.ray(Point2::new(x as f64, y as f64)).normalize(), truth));
+            }
+        }
+    }
+    let covariance = pairs.iter().fold(Matrix3::zeros(), |sum, (found, truth)| sum + truth * found.transpose());
+    let Ok(svd) = cv_numeric::svd3(&covariance) else { return (f64::NAN, f64::NAN) };
+    let turn = svd.nearest_rotation().into_inner();
+    let mut off: Vec<f64> =
+        pairs.iter().map(|(found, truth)| (turn * found - truth).norm() * result.canvas.scale).collect();
+    off.sort_by(f64::total_cmp);
+    let at = |q: f64| off.get((off.len() as f64 * q) as usize).copied().unwrap_or(f64::NAN);
+    (at(0.5), at(0.95))
+}
+
+/// Levels from which on a result may compress what photographs of other exposures show.
+const SHOULDER: u8 = 190;
+
+/// Of what no photograph shows clipped and the result below its shoulder, after one gain per channel in linear light, in levels of the camera's own curve.
+fn psnr(vista: &Vista, photos: &[VistaPhoto], result: &PanoramaResult) -> f64 {
+    let (w, h) = result.image.size();
+    let mut samples = Vec::new();
+    for y in (2..h).step_by(3) {
+        for x in (2..w).step_by(3) {
+            let (Some(ray), shown) = (true_ray(photos, result, x, y), result.image.at(x, y)) else { continue };
+            let clipped = photos.iter().any(|p| {
+                let seen = p.from_world * ray;
+                let place = p.camera.project(&seen.into()).filter(|_| seen.z > 0.0);
+                place.is_some_and(|q| {
+                    let inside = q.x >= 0.0 && q.y >= 0.0 && q.x < 959.5 && q.y < 719.5;
+                    inside && p.image.at((q.x + 0.5) as usize, (q.y + 0.5) as usize).iter().any(|v| *v >= 254)
+                })
+            });
+            if !clipped && shown.iter().all(|v| *v < SHOULDER) {
+                samples.push((vista.radiance(&ray), shown));
+            }
+        }
+    }
+    let error = |c: usize, gain: f64| {
+        let off = |(light, shown): &([f32; 3], [u8; 3])| {
+            let level = 255.0 * vista_level(light[c] * gain as f32, CONTRAST);
+            // Edges are half in one pixel, half in the next: what lies between two surfaces has no one level.
+            f64::from(level - f32::from(shown[c])).abs().min(40.0).powi(2)
+        };
+        samples.iter().map(off).sum::<f64>() / samples.len().max(1) as f64
+    };
+    let squares = (0..3).map(|c| {
+        let (mut low, mut high) = (-3.0_f64, 3.0_f64);
+        for _ in 0..30 {
+            let (a, b) = (low + (high - low) / 3.0, high - (high - low) / 3.0);
+            if error(c, a.exp2()) < error(c, b.exp2()) { high = b } else { low = a }
+        }
+        error(c, low.exp2())
+    });
+    10.0 * (255.0 * 255.0 / (squares.sum::<f64>() / 3.0)).log10()
+}
+
+/// Side of the blocks whose means are compared across a seam.
+const BLOCK: usize = 32;
+
+/// The steps of means of 32 px blocks across the seams, in gray levels, where all of the blocks are smooth: what the slope on both sides does not explain. Ascending.
+pub(super) fn seam_steps(result: &PanoramaResult) -> Vec<f64> {
+    let (w, h) = result.labels.size();
+    let block = |x: usize, y: usize, label: u16| -> Option<[f64; 3]> {
+        let (mut sum, mut squares, mut n) = ([0.0; 3], [0.0; 3], 0.0);
+        for (x, y) in (y..y + BLOCK).step_by(2).flat_map(|y| (x..x + BLOCK).step_by(2).map(move |x| (x, y))) {
+            if result.labels.get(x, y)? != [label] {
+                continue;
+            }
+            let p = result.image.at(x, y).map(f64::from);
+            for c in 0..3 {
+                sum[c] += p[c];
+                squares[c] += p[c] * p[c];
+            }
+            n += 1.0;
+        }
+        let smooth = (0..3).all(|c| squares[c] / n - (sum[c] / n).powi(2) < 16.0);
+        // At least half of the block lies on its side of the seam.
+        (n > 0.5 * (BLOCK * BLOCK / 4) as f64 && smooth).then(|| sum.map(|s| s / n))
+    };
+    let mut steps = Vec::new();
+    for y in (0..h.saturating_sub(BLOCK)).step_by(BLOCK / 2) {
+        for x in 2 * BLOCK..w.saturating_sub(2 * BLOCK) {
+            let (a, b) = (result.labels.at(x - 1, y + BLOCK / 2)[0], result.labels.at(x, y + BLOCK / 2)[0]);
+            if a == b || a == u16::MAX || b == u16::MAX {
+                continue;
+            }
+            let four = [(x - 2 * BLOCK, a), (x - BLOCK, a), (x, b), (x + BLOCK, b)].map(|(x, l)| block(x, y, l));
+            if let [Some(m0), Some(m1), Some(m2), Some(m3)] = four {
+                let step = |c: usize| ((m2[c] - m1[c]) - 0.5 * ((m1[c] - m0[c]) + (m3[c] - m2[c]))).abs();
+                steps.push((step(0) + step(1) + step(2)) / 3.0);
+            }
+        }
+    }
+    steps.sort_by(f64::total_cmp);
+    steps
+}
