@@ -48,6 +48,7 @@ struct Compared {
 pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
     let program = crate::release_program()?;
     let keep = crate::target_dir()?.join("peers-panorama");
+    let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
     let mut sets = Vec::new();
     for name in SETS {
         println!("{name}");
@@ -69,7 +70,7 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
         })
         .collect::<Result<_>>()?;
     let checks = checks(&sets, &truths);
-    let text = page(&sets, &truths, &checks);
+    let text = page(&sets, &truths, &checks, load.split(' ').next().unwrap_or("unknown"));
     print!("{text}");
     super::write_section("Panoramas", &text)?;
     Ok(checks)
@@ -247,14 +248,14 @@ fn checks(sets: &[Compared], truths: &[(&str, Truth)]) -> Vec<Check> {
     checks
 }
 
-fn page(sets: &[Compared], truths: &[(&str, Truth)], checks: &[Check]) -> String {
+fn page(sets: &[Compared], truths: &[(&str, Truth)], checks: &[Check], load: &str) -> String {
     let mut versions: Vec<&str> =
         sets.iter().flat_map(|s| &s.systems).map(|(_, o)| &o.version[..]).filter(|v| !v.is_empty()).collect();
     versions.sort_unstable();
     versions.dedup();
     let mut text = format!(
         "Written by `cargo xtask peers panorama`; one run, {THREADS} threads each, {}, {}. The same photographs for all, from the files to the picture, reading and writing \
-         included; ours on OpenCV's surface at as many pixels as its picture has. OpenCV's time is without the start of Python; Hugin's steps are those of its assistant, their figures of an earlier run on this machine. \
+         included; ours on OpenCV's surface at as many pixels as its picture has. OpenCV's time is without the start of Python; the load of the machine was {load} when the run began; Hugin's steps are those of its assistant, their figures of an earlier run on this machine. \
          Level: mean of what is not black; the photographs' own means in brackets.\n\n\
          | set | system | used | size | level | processor s | wall s | peak MiB |\n|---|---|---|---|---|---|---|---|\n",
         super::machine(),
