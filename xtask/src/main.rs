@@ -4,6 +4,7 @@ mod checks;
 mod fixtures;
 mod golden;
 mod peers;
+mod python;
 mod real;
 mod rendered;
 mod tidy;
@@ -56,6 +57,8 @@ enum Chore {
         #[arg(long, default_value_t = 1)]
         seed: u64,
     },
+    /// Build the wheel of the Python package, install it into a virtual environment and run its tests.
+    Python,
     /// Run other systems and ours on the same inputs, side by side.
     Peers {
         /// Only this job; `all` or none: every one.
@@ -71,6 +74,7 @@ fn main() -> ExitCode {
         Chore::Real { job } => real::run(job.as_deref()),
         Chore::Rendered { job } => rendered::run(job.as_deref()),
         Chore::Trust { job, count, seed } => trust::run(job.as_deref(), &trust::Options { count, seed }),
+        Chore::Python => python::run(),
         Chore::Peers { job } => peers::run(job.as_deref()),
     };
     match result {

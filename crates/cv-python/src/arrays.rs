@@ -1,0 +1,332 @@
+//! Arrays borrowed as images, and results given away as arrays without a copy.
+
+use crate::errors::of_argument;
+use cv_core::{GrayF32, Image, ImageView, Mask, RgbU8, Sample};
+use numpy::{
+    Element, IxDyn, PyArray, PyArray1, PyArrayDescrMethods, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn,
+    PyUntypedArray, PyUntypedArrayMethods, dtype,
+};
+use pyo3::exceptions::{PyTypeError, PyValueError};
+use pyo3::prelude::*;
+use pyo3::sync::PyOnceLock;
+use serde_json::json;
+
+/// An image in the memory of its array, or in that of a copy where its pixels do not lie one after the other.
+pub(crate) enum ImageArg<'py> {
+    U8(Borrowed<'py, u8>),
+    U16(Borrowed<'py, u16>),
+    F32(Borrowed<'py, f32>),
+}
+
+/// The memory of an image.
+pub(crate) struct Borrowed<'py, T: Element> {
+    array: PyReadonlyArrayDyn<'py, T>,
+    width: usize,
+    height: usize,
+    channels: usize,
+    /// Samples from one row to the next.
+    stride: usize,
+    copied: bool,
+}
+
+impl<'py, T: Element + Sample> Borrowed<'py, T> {
+    /// As a view of so many channels.
+    pub(crate) fn view<const C: usize>(&self) -> Option<ImageView<'_, T, C>> {
+        if self.channels != C {
+            return None;
+        }
+        ImageView::from_slice(self.array.as_slice().ok()?, self.width, self.height, self.stride)
+    }
+}
+
+/// Runs an expression over the view of a gray or color image of 8 or 16 bits or floats: once for each type.
+#[macro_export]
+macro_rules! with_views {
+    ($py:expr, [$a:expr, $b:expr], |$x:ident, $y:ident| $body:expr) => {{
+        use $crate::arrays::ImageArg;
+        macro_rules! both {
+            ($one:expr, $two:expr) => {
+                match ($one.view::<1>(), $two.view::<1>(), $one.view::<3>(), $two.view::<3>()) {
+                    (Some($x), Some($y), ..) => $body,
+                    (.., Some($x), Some($y)) => $body,
+                    _ => Err($crate::arrays::unlike($py, &$a, &$b)),
+                }
+            };
+        }
+        match (&$a, &$b) {
+            (ImageArg::U8(one), ImageArg::U8(two)) => both!(one, two),
+            (ImageArg::U16(one), ImageArg::U16(two)) => both!(one, two),
+            (ImageArg::F32(one), ImageArg::F32(two)) => both!(one, two),
+            _ => Err($crate::arrays::unlike($py, &$a, &$b)),
+        }
+    }};
+}
+
+impl<'py> ImageArg<'py> {
+    /// Borrows an array of shape (height, width) or (height, width, 1 or 3), or whatever has `__array__` or `__dlpack__`. `what` names it in errors.
+    pub(crate) fn new(given: &Bound<'py, PyAny>, what: &str) -> PyResult<Self> {
+        let array = untyped(given, what)?;
+        let kind = array.dtype();
+        let py = given.py();
+        if kind.is_equiv_to(&dtype::<u8>(py)) {
+            Ok(Self::U8(borrow(&array, what)?))
+        } else if kind.is_equiv_to(&dtype::<u16>(py)) {
+            Ok(Self::U16(borrow(&array, what)?))
+        } else if kind.is_equiv_to(&dtype::<f32>(py)) {
+            Ok(Self::F32(borrow(&array, what)?))
+        } else {
+            let text = format!(
+                "{what}: dtype {kind} is none of uint8, uint16, float32; convert it, as in image.astype(np.uint8)"
+            );
+            Err(PyTypeError::new_err(text))
+        }
+    }
+
+    /// Width, height and channels.
+    pub(crate) fn shape(&self) -> (usize, usize, usize) {
+        match self {
+            Self::U8(b) => (b.width, b.height, b.channels),
+            Self::U16(b) => (b.width, b.height, b.channels),
+            Self::F32(b) => (b.width, b.height, b.channels),
+        }
+    }
+
+    fn kind(&self) -> &'static str {
+        match self {
+            Self::U8(_) => "uint8",
+            Self::U16(_) => "uint16",
+            Self::F32(_) => "float32",
+        }
+    }
+}
+
+/// A color image of bytes: borrowed where it is one, made where it is gray.
+pub(crate) enum Rgb<'py> {
+    Borrowed(Borrowed<'py, u8>),
+    Made(RgbU8),
+}
+
+impl<'py> Rgb<'py> {
+    /// Borrows an array of bytes; gray ones become color ones. Deeper ones are refused: which 8 of their bits matter, the caller knows.
+    pub(crate) fn new(given: &Bound<'py, PyAny>, what: &str) -> PyResult<Self> {
+        match ImageArg::new(given, what)? {
+            ImageArg::U8(borrowed) => match borrowed.view::<1>() {
+                Some(gray) => Ok(Self::Made(RgbU8::from_fn(gray.width(), gray.height(), |x, y| [gray.at(x, y)[0]; 3]))),
+                None => Ok(Self::Borrowed(borrowed)),
+            },
+            other => {
+                let text = format!(
+                    "{what}: dtype {} where uint8 is needed; scale it to 0 to 255 and use .astype(np.uint8)",
+                    other.kind()
+                );
+                Err(PyTypeError::new_err(text))
+            }
+        }
+    }
+
+    pub(crate) fn view(&self) -> PyResult<ImageView<'_, u8, 3>> {
+        match self {
+            Self::Made(image) => Ok(image.view()),
+            Self::Borrowed(borrowed) => {
+                borrowed.view().ok_or_else(|| PyValueError::new_err("the image changed its shape"))
+            }
+        }
+    }
+}
+
+/// The error of two images that do not go together.
+pub(crate) fn unlike(py: Python<'_>, a: &ImageArg<'_>, b: &ImageArg<'_>) -> PyErr {
+    let told = |image: &ImageArg<'_>| {
+        let (width, height, channels) = image.shape();
+        (json!([height, width, channels]), format!("{} of shape ({height}, {width}, {channels})", image.kind()))
+    };
+    let ((left, one), (right, two)) = (told(a), told(b));
+    of_argument(
+        py,
+        "ImageMismatch",
+        &[("left", left), ("right", right)],
+        &format!("one image is {one}, the other {two}"),
+    )
+}
+
+/// The array that an object is or makes.
+fn untyped<'py>(given: &Bound<'py, PyAny>, what: &str) -> PyResult<Bound<'py, PyUntypedArray>> {
+    if let Ok(array) = given.cast::<PyUntypedArray>() {
+        return Ok(array.clone());
+    }
+    let py = given.py();
+    let made = if given.hasattr("__array__")? {
+        py.import("numpy")?.call_method1("asarray", (given,))?
+    } else if given.hasattr("__dlpack__")? {
+        py.import("numpy")?.call_method1("from_dlpack", (given,))?
+    } else {
+        let kind = given.get_type();
+        return Err(PyTypeError::new_err(format!("{what} must be a NumPy array, not {}", kind.name()?)));
+    };
+    Ok(made.cast_into::<PyUntypedArray>()?)
+}
+
+/// Borrows an array as an image.
+fn borrow<'py, T: Element + Sample>(array: &Bound<'py, PyUntypedArray>, what: &str) -> PyResult<Borrowed<'py, T>> {
+    let shape = array.shape();
+    let (height, width, channels) = match *shape {
+        [height, width] => (height, width, 1),
+        [height, width, channels @ (1 | 3)] => (height, width, channels),
+        [_, _, 4] => {
+            let text = format!("{what} has 4 channels; leave the opacity out, as in image[..., :3]");
+            return Err(of_shape(array.py(), shape, &text));
+        }
+        _ => {
+            let text = format!("{what} has shape {shape:?}; an image has (height, width) or (height, width, 3)");
+            return Err(of_shape(array.py(), shape, &text));
+        }
+    };
+    if width == 0 || height == 0 {
+        return Err(of_shape(array.py(), shape, &format!("{what} has no pixels: its shape is {shape:?}")));
+    }
+    let typed = array.cast::<PyArrayDyn<T>>()?;
+    let size = size_of::<T>() as isize;
+    let strides = array.strides();
+    let row = strides[0];
+    let dense = (channels == 1 || strides.get(2).is_none_or(|s| *s == size))
+        && (width == 1 || strides[1] == size * channels as isize)
+        && row % size == 0
+        && (height == 1 || row >= size * (width * channels) as isize);
+    if typed.is_c_contiguous() || (dense && height == 1 && width == 1) {
+        return readonly(typed, (width, height, channels), width * channels, false);
+    }
+    if dense && height > 1 {
+        // From the first sample to the last: those between belong to the same array.
+        let stride = (row / size) as usize;
+        let length = (height - 1) * stride + width * channels;
+        let whole = as_strided(array.py())?.call1((typed, (length,), (size,)))?;
+        return readonly(whole.cast::<PyArrayDyn<T>>()?, (width, height, channels), stride, false);
+    }
+    let copy = array.py().import("numpy")?.call_method1("ascontiguousarray", (typed,))?;
+    readonly(copy.cast::<PyArrayDyn<T>>()?, (width, height, channels), width * channels, true)
+}
+
+fn readonly<'py, T: Element>(
+    array: &Bound<'py, PyArrayDyn<T>>,
+    (width, height, channels): (usize, usize, usize),
+    stride: usize,
+    copied: bool,
+) -> PyResult<Borrowed<'py, T>> {
+    let array = array.try_readonly().map_err(|_| PyValueError::new_err("the array is being written to"))?;
+    Ok(Borrowed { array, width, height, channels, stride, copied })
+}
+
+fn as_strided(py: Python<'_>) -> PyResult<&Bound<'_, PyAny>> {
+    static FUNCTION: PyOnceLock<Py<PyAny>> = PyOnceLock::new();
+    FUNCTION.import(py, "numpy.lib.stride_tricks", "as_strided")
+}
+
+fn of_shape(py: Python<'_>, shape: &[usize], words: &str) -> PyErr {
+    of_argument(py, "Shape", &[("shape", json!(shape))], words)
+}
+
+/// Whether an image is used where it lies in memory; otherwise each call copies it. Arrays whose pixels lie one after the other are, crops and every n-th row too; flipped
+/// ones and BGR views of RGB ones are not.
+#[pyfunction]
+pub(crate) fn is_borrowed(image: &Bound<'_, PyAny>) -> PyResult<bool> {
+    Ok(match ImageArg::new(image, "image")? {
+        ImageArg::U8(b) => !b.copied,
+        ImageArg::U16(b) => !b.copied,
+        ImageArg::F32(b) => !b.copied,
+    })
+}
+
+/// A mask: bool, or bytes that are 0 where nothing is.
+pub(crate) fn mask(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Mask> {
+    let array = untyped(given, what)?;
+    let [height, width] = *array.shape() else {
+        let shape = array.shape();
+        return Err(of_shape(given.py(), shape, &format!("{what} has shape {shape:?}; a mask has (height, width)")));
+    };
+    let values: Vec<bool> = if let Ok(flags) = array.cast::<PyArrayDyn<bool>>() {
+        flags.try_readonly().map_err(busy)?.as_array().iter().copied().collect()
+    } else if let Ok(bytes) = array.cast::<PyArrayDyn<u8>>() {
+        bytes.try_readonly().map_err(busy)?.as_array().iter().map(|v| *v != 0).collect()
+    } else {
+        return Err(PyTypeError::new_err(format!("{what}: dtype {} is neither bool nor uint8", array.dtype())));
+    };
+    Mask::from_vec(width, height, values).map_err(|e| PyValueError::new_err(e.to_string()))
+}
+
+fn busy(_: numpy::BorrowError) -> PyErr {
+    PyValueError::new_err("the array is being written to")
+}
+
+/// A map of floats, such as disparities.
+pub(crate) fn map(given: &Bound<'_, PyAny>, what: &str) -> PyResult<GrayF32> {
+    let array = untyped(given, what)?;
+    let [height, width] = *array.shape() else {
+        let shape = array.shape();
+        return Err(of_shape(given.py(), shape, &format!("{what} has shape {shape:?}; a map has (height, width)")));
+    };
+    let Ok(floats) = array.cast::<PyArrayDyn<f32>>() else {
+        return Err(PyTypeError::new_err(format!("{what}: dtype {} where float32 is needed", array.dtype())));
+    };
+    let values = floats.try_readonly().map_err(busy)?.as_array().iter().copied().collect();
+    GrayF32::from_vec(width, height, values).map_err(|e| PyValueError::new_err(e.to_string()))
+}
+
+/// Numbers in rows of `N`, from whatever makes an array of floats: an array of any kind of number, or lists.
+pub(crate) fn rows<const N: usize>(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Vec<[f64; N]>> {
+    let py = given.py();
+    let made = py.import("numpy")?.call_method1("ascontiguousarray", (given, dtype::<f64>(py)))?;
+    let array = made.cast::<PyArrayDyn<f64>>()?;
+    let shape = array.shape();
+    // Nothing is nothing of any width.
+    let fits = matches!(*shape, [_, width] if width == N) || array.len() == 0;
+    if !fits {
+        let text = format!("{what} has shape {shape:?}; it must be (n, {N})");
+        return Err(of_shape(py, shape, &text));
+    }
+    let values = array.try_readonly().map_err(busy)?;
+    let slice = values.as_slice().map_err(|_| PyValueError::new_err("the array is not contiguous"))?;
+    Ok(slice.as_chunks::<N>().0.to_vec())
+}
+
+/// An image as an array of shape (height, width), or (height, width, C), in the same memory.
+pub(crate) fn array<'py, T: Element + Sample, const C: usize>(
+    py: Python<'py>,
+    image: Image<T, C>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let (width, height) = image.size();
+    let shape: Vec<usize> = if C == 1 { vec![height, width] } else { vec![height, width, C] };
+    shaped(py, image.into_vec(), &shape)
+}
+
+/// Values as an array of a shape, in the same memory.
+pub(crate) fn shaped<'py, T: Element>(py: Python<'py>, values: Vec<T>, shape: &[usize]) -> PyResult<Bound<'py, PyAny>> {
+    let flat: Bound<'py, PyArray1<T>> = PyArray::from_vec(py, values);
+    Ok(flat.reshape(IxDyn(shape))?.into_any())
+}
+
+/// Rows of numbers as an array of shape (n, N).
+pub(crate) fn row_array<'py, T: Element + Copy, const N: usize>(
+    py: Python<'py>,
+    rows: &[[T; N]],
+) -> PyResult<Bound<'py, PyAny>> {
+    shaped(py, rows.as_flattened().to_vec(), &[rows.len(), N])
+}
+
+/// A matrix as an array of shape (3, 3).
+pub(crate) fn matrix<'py>(py: Python<'py>, m: &cv_core::Matrix3<f64>) -> PyResult<Bound<'py, PyAny>> {
+    shaped(py, m.transpose().as_slice().to_vec(), &[3, 3])
+}
+
+/// A vector as an array of shape (3,).
+pub(crate) fn vector<'py>(py: Python<'py>, v: &cv_core::Vector3<f64>) -> PyResult<Bound<'py, PyAny>> {
+    shaped(py, v.as_slice().to_vec(), &[3])
+}
+
+/// A matrix of 3×3 numbers.
+pub(crate) fn matrix_from(given: &Bound<'_, PyAny>, what: &str) -> PyResult<cv_core::Matrix3<f64>> {
+    let rows: Vec<[f64; 3]> = rows(given, what)?;
+    if rows.len() != 3 {
+        return Err(of_shape(given.py(), &[rows.len(), 3], &format!("{what} must be a 3×3 matrix")));
+    }
+    Ok(cv_core::Matrix3::from_row_slice(rows.as_flattened()))
+}

@@ -1,0 +1,129 @@
+//! Models that most of a set of matches agree on.
+
+use crate::arrays;
+use crate::job::Run;
+use crate::options::Options;
+use crate::results::{self, Field, object};
+use cv_core::{Camera, Correspondence, Matrix3};
+use cv_pipeline::{ModelKind, RobustModel, RobustOptions, estimate, estimate_calibrated};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+/// What every estimator takes.
+fn read(options: &mut Options<'_>, mut o: RobustOptions) -> PyResult<(RobustOptions, Run)> {
+    options.set("threshold", &mut o.threshold)?;
+    options.set("confidence", &mut o.confidence)?;
+    options.set("max_iterations", &mut o.max_iterations)?;
+    options.set("seed", &mut o.seed)?;
+    Ok((o, Run::read(options)?))
+}
+
+pub(crate) fn read_homography(options: &mut Options<'_>) -> PyResult<(RobustOptions, Run)> {
+    read(options, RobustOptions::homography())
+}
+
+pub(crate) fn read_fundamental(options: &mut Options<'_>) -> PyResult<(RobustOptions, Run)> {
+    read(options, RobustOptions::fundamental())
+}
+
+pub(crate) fn read_essential(options: &mut Options<'_>) -> PyResult<(RobustOptions, Run)> {
+    read(options, RobustOptions::essential())
+}
+
+/// Matches from rows x1, y1, x2, y2.
+fn matches(given: &Bound<'_, PyAny>) -> PyResult<Vec<Correspondence>> {
+    let rows: Vec<[f64; 4]> = arrays::rows(given, "matches")?;
+    Ok(rows.into_iter().map(|[x1, y1, x2, y2]| Correspondence::new(x1, y1, x2, y2)).collect())
+}
+
+/// The fields that all models have.
+fn fields<'py>(
+    py: Python<'py>,
+    robust: &RobustModel<Matrix3<f64>>,
+    count: usize,
+    stages: &[(&'static str, f64)],
+) -> PyResult<Vec<Field<'py>>> {
+    let mut inliers = vec![false; count];
+    robust.inliers.iter().for_each(|&i| inliers[i] = true);
+    Ok(vec![
+        ("model", arrays::matrix(py, &robust.model)?),
+        ("inliers", arrays::shaped(py, inliers, &[count])?),
+        ("rms", object(py, robust.rms)?),
+        ("iterations", object(py, robust.iterations)?),
+        ("log10_false_alarms", object(py, robust.log_nfa)?),
+        ("seconds", results::stages(py, stages)?),
+    ])
+}
+
+fn uncalibrated<'py>(
+    py: Python<'py>,
+    given: &Bound<'py, PyAny>,
+    kind: ModelKind,
+    mut options: Options<'py>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let (o, run) = read(&mut options, kind.options())?;
+    options.finish()?;
+    let pairs = matches(given)?;
+    let found = run.run(py, |progress| estimate(&pairs, kind, &o, progress))?;
+    results::made(py, "Model", fields(py, &found.robust, pairs.len(), &found.stages)?)
+}
+
+/// The homography H, with b ~ H a, that most matches agree on. matches: (n, 4), rows x1 y1 x2 y2 in pixels.
+#[pyfunction]
+#[pyo3(signature = (matches, **options))]
+pub(crate) fn estimate_homography<'py>(
+    py: Python<'py>,
+    matches: &Bound<'py, PyAny>,
+    options: Option<&Bound<'py, PyDict>>,
+) -> PyResult<Bound<'py, PyAny>> {
+    uncalibrated(py, matches, ModelKind::Homography, Options::new("estimate_homography", options))
+}
+
+/// The fundamental matrix F, with bᵀ F a = 0, that most matches agree on. matches: (n, 4), rows x1 y1 x2 y2 in pixels.
+#[pyfunction]
+#[pyo3(signature = (matches, **options))]
+pub(crate) fn estimate_fundamental<'py>(
+    py: Python<'py>,
+    matches: &Bound<'py, PyAny>,
+    options: Option<&Bound<'py, PyDict>>,
+) -> PyResult<Bound<'py, PyAny>> {
+    uncalibrated(py, matches, ModelKind::Fundamental, Options::new("estimate_fundamental", options))
+}
+
+/// The essential matrix and the relative pose x2 = R x1 + t, |t| = 1, that most matches agree on.
+///
+/// matches: (n, 4), rows x1 y1 x2 y2 in pixels without lens distortion. k1, k2: the 3×3 calibration matrices of the two views; k2 is k1 where it is not given.
+#[pyfunction]
+#[pyo3(signature = (matches, k1, k2 = None, **options))]
+pub(crate) fn estimate_essential<'py>(
+    py: Python<'py>,
+    matches: &Bound<'py, PyAny>,
+    k1: &Bound<'py, PyAny>,
+    k2: Option<&Bound<'py, PyAny>>,
+    options: Option<&Bound<'py, PyDict>>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let mut options = Options::new("estimate_essential", options);
+    let (o, run) = read_essential(&mut options)?;
+    options.finish()?;
+    let pairs = self::matches(matches)?;
+    let cameras = [camera(k1, "k1")?, camera(k2.unwrap_or(k1), "k2")?];
+    let found = run.run(py, |progress| estimate_calibrated(&pairs, &cameras, &o, progress))?;
+    let mut all = fields(py, &found.robust, pairs.len(), &found.stages)?;
+    all.push(("rotation", arrays::matrix(py, found.pose.rotation.matrix())?));
+    all.push(("translation", arrays::vector(py, &found.pose.translation)?));
+    results::made(py, "EssentialModel", all)
+}
+
+/// The pinhole of a calibration matrix.
+fn camera(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Camera> {
+    let m = arrays::matrix_from(given, what)?;
+    // Skewed pixels are no camera's of today; a scaled or transposed matrix is a mistake.
+    let expected = Matrix3::new(m.m11, 0.0, m.m13, 0.0, m.m22, m.m23, 0.0, 0.0, 1.0);
+    let camera = Camera::pinhole(0, 0, m.m11, m.m22, m.m13, m.m23);
+    if m != expected || camera.validate().is_err() {
+        let text = format!("{what} must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0");
+        return Err(PyValueError::new_err(text));
+    }
+    Ok(camera)
+}

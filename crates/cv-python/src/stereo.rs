@@ -1,0 +1,242 @@
+//! Disparity and depth.
+
+use crate::arrays::{self, ImageArg};
+use crate::errors::refused;
+use crate::job::{Run, Shared};
+use crate::options::Options;
+use crate::results::{self, data, object};
+use crate::with_views;
+use cv_core::{Cancelled, GrayF32, Progress};
+use cv_pipeline::stereo::{DisparityMap, PixelState, StereoError, StereoGeometry, StereoMatcher, StereoOptions};
+use cv_pipeline::{DepthOptions, DisparityRange};
+use numpy::{PyArray2, PyArrayMethods, PyReadwriteArray2, PyUntypedArrayMethods};
+use pyo3::exceptions::{PyTypeError, PyValueError};
+use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyString};
+
+/// The options of the matcher.
+pub(crate) fn matcher_arguments(options: &mut Options<'_>) -> PyResult<(StereoOptions, Run)> {
+    let mut o = StereoOptions::default();
+    options.set("min_disparity", &mut o.min_disparity)?;
+    options.set("disparities", &mut o.disparities)?;
+    matching_options(options, &mut o)?;
+    Ok((o, Run::read(options)?))
+}
+
+/// All but the range.
+fn matching_options(options: &mut Options<'_>, o: &mut StereoOptions) -> PyResult<()> {
+    options.set_named("census", &mut o.census)?;
+    options.set_named("intensity_cost", &mut o.intensity_cost)?;
+    options.set("p1", &mut o.p1)?;
+    options.set("p2", &mut o.p2)?;
+    options.set("p2_min", &mut o.p2_min)?;
+    options.set("p2_gradient", &mut o.p2_gradient)?;
+    options.set_named("paths", &mut o.paths)?;
+    options.set("uniqueness", &mut o.uniqueness)?;
+    options.set_optional("left_right", &mut o.left_right)?;
+    options.set("speckle_size", &mut o.speckle_size)?;
+    options.set("speckle_range", &mut o.speckle_range)?;
+    options.set("median", &mut o.median)?;
+    options.set_named("smoothing", &mut o.smoothing)?;
+    options.set("fill", &mut o.fill)?;
+    options.set_optional("max_memory", &mut o.max_memory)
+}
+
+/// The options of `depth`.
+pub(crate) struct DepthArguments {
+    options: DepthOptions,
+    focal: Option<f64>,
+    baseline: Option<f64>,
+    offset: f64,
+    run: Run,
+}
+
+impl DepthArguments {
+    pub(crate) fn read(options: &mut Options<'_>) -> PyResult<Self> {
+        let mut o = DepthOptions::default();
+        let min: Option<i32> = options.take("min_disparity")?;
+        o.stereo.min_disparity = min.unwrap_or(o.stereo.min_disparity);
+        options.default("disparities", o.stereo.disparities)?;
+        if let Some(given) = options.take_any("disparities")? {
+            if given.is_instance_of::<PyString>() {
+                if given.extract::<String>()? != "auto" {
+                    return Err(PyValueError::new_err("depth(): disparities must be a number or “auto”"));
+                }
+                o.disparities = DisparityRange::FromMatches { min };
+            } else {
+                o.stereo.disparities = options.extract("disparities", &given)?;
+            }
+        }
+        matching_options(options, &mut o.stereo)?;
+        options.set("confidence", &mut o.stereo.confidence)?;
+        let (focal, baseline) = (options.take("focal")?, options.take("baseline")?);
+        let mut offset = 0.0;
+        options.set("offset", &mut offset)?;
+        options.set("near", &mut o.range.0)?;
+        options.set("far", &mut o.range.1)?;
+        Ok(Self { options: o, focal, baseline, offset, run: Run::read(options)? })
+    }
+
+    fn geometry(&self, py: Python<'_>, (width, height): (usize, usize)) -> PyResult<Option<StereoGeometry>> {
+        match (self.focal, self.baseline) {
+            (None, None) => Ok(None),
+            (Some(focal), Some(baseline)) => {
+                let geometry =
+                    StereoGeometry::from_focal(width, height, focal, baseline).map_err(|error| refused(py, &error))?;
+                Ok(Some(StereoGeometry { offset: self.offset, ..geometry }))
+            }
+            _ => Err(PyTypeError::new_err("depth() needs focal and baseline together")),
+        }
+    }
+}
+
+/// Disparity of a rectified pair, and depth where its geometry is known.
+///
+/// left, right: arrays of one shape (height, width) or (height, width, 3) of uint8, uint16 or float32 (0 to 1). With focal (px) and baseline there is depth in the unit of
+/// the baseline. `defaults("depth")` lists the options.
+///
+/// Raises NoPairError where hardly any pixel has a partner, and others of epipole.errors.
+#[pyfunction]
+#[pyo3(signature = (left, right, **options))]
+pub(crate) fn depth<'py>(
+    py: Python<'py>,
+    left: &Bound<'py, PyAny>,
+    right: &Bound<'py, PyAny>,
+    options: Option<&Bound<'py, PyDict>>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let mut options = Options::new("depth", options);
+    let arguments = DepthArguments::read(&mut options)?;
+    options.finish()?;
+    let (left, right) = (ImageArg::new(left, "left")?, ImageArg::new(right, "right")?);
+    let (width, height, _) = left.shape();
+    let geometry = arguments.geometry(py, (width, height))?;
+    let found = with_views!(py, [left, right], |a, b| arguments.run.run(py, |progress| cv_pipeline::depth(
+        a,
+        b,
+        geometry.as_ref(),
+        &arguments.options,
+        progress
+    )))?;
+    let (valid, matched) = (found.map.valid_fraction(), found.map.matched_fraction());
+    let depth_deviation = found.depth_sigma();
+    let none = || object(py, py.None());
+    let map = |map: Option<GrayF32>| map.map_or_else(none, |map| arrays::array(py, map));
+    results::made(
+        py,
+        "Depth",
+        [
+            ("state", states(py, &found.map)?),
+            ("disparity", arrays::array(py, found.map.disparity)?),
+            ("disparity_deviation", arrays::array(py, found.sigma)?),
+            ("depth", map(found.depth)?),
+            ("depth_deviation", map(depth_deviation)?),
+            ("confidence", map(found.confidence)?),
+            ("disparities", object(py, found.disparities)?),
+            ("valid_fraction", object(py, valid)?),
+            ("matched_fraction", object(py, matched)?),
+            ("seconds", results::stages(py, &found.stages)?),
+        ],
+    )
+}
+
+/// Where each disparity comes from: 0 matched, 1 occluded, 2 mismatched, 3 out of view.
+fn states<'py>(py: Python<'py>, map: &DisparityMap) -> PyResult<Bound<'py, PyAny>> {
+    let (width, height) = map.state.size();
+    let states: Vec<u8> = map.state.as_slice().iter().map(|state: &PixelState| *state as u8).collect();
+    arrays::shaped(py, states, &[height, width])
+}
+
+/// A matcher and the memory it works in.
+struct Worker {
+    matcher: StereoMatcher,
+    map: DisparityMap,
+}
+
+/// Semi-global matching with memory that is kept from one pair to the next: for streams of frames.
+///
+/// Threads may share one; then one of them works at a time.
+#[pyclass(frozen, module = "epipole", name = "StereoMatcher")]
+pub(crate) struct PyStereoMatcher {
+    worker: Shared<Worker>,
+    run: Run,
+}
+
+#[pymethods]
+impl PyStereoMatcher {
+    #[new]
+    #[pyo3(signature = (**options))]
+    fn new(py: Python<'_>, options: Option<&Bound<'_, PyDict>>) -> PyResult<Self> {
+        let mut options = Options::new("StereoMatcher", options);
+        let (stereo, run) = matcher_arguments(&mut options)?;
+        options.finish()?;
+        let matcher = StereoMatcher::new(stereo).map_err(|error| refused(py, &error))?;
+        Ok(Self { worker: Shared::new(Worker { matcher, map: DisparityMap::empty() }), run })
+    }
+
+    /// The disparities of a rectified pair as an array of float32, NaN where there is none; written into `out` where that is given.
+    #[pyo3(signature = (left, right, *, out = None))]
+    fn compute<'py>(
+        &self,
+        py: Python<'py>,
+        left: &Bound<'py, PyAny>,
+        right: &Bound<'py, PyAny>,
+        out: Option<&Bound<'py, PyAny>>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let (left, right) = (ImageArg::new(left, "left")?, ImageArg::new(right, "right")?);
+        let (width, height, _) = left.shape();
+        let mut given = out.map(|out| writable(out, (width, height))).transpose()?;
+        let target = match &mut given {
+            Some(array) => Some(array.as_slice_mut().map_err(|_| PyValueError::new_err("out must be C-contiguous"))?),
+            None => None,
+        };
+        let fresh = with_views!(py, [left, right], |a, b| self.run.run(py, |progress: &dyn Progress| {
+            let mut taken = self.worker.take(progress)?;
+            let Some(Worker { matcher, map }) = taken.get() else { return Err(Cancelled.into()) };
+            matcher.compute_into(a, b, map, progress)?;
+            Ok::<_, StereoError>(match target {
+                Some(target) => {
+                    target.copy_from_slice(map.disparity.as_slice());
+                    None
+                }
+                None => Some(map.disparity.clone()),
+            })
+        }))?;
+        match (fresh, out) {
+            (Some(map), _) => arrays::array(py, map),
+            (None, Some(out)) => Ok(out.clone()),
+            (None, None) => Err(crate::errors::internal("no disparities")),
+        }
+    }
+}
+
+/// An array to write a map of that size into.
+fn writable<'py>(out: &Bound<'py, PyAny>, (width, height): (usize, usize)) -> PyResult<PyReadwriteArray2<'py, f32>> {
+    let Ok(array) = out.cast::<PyArray2<f32>>() else {
+        return Err(PyTypeError::new_err("out must be an array of float32 and two dimensions"));
+    };
+    if array.shape() != [height, width] {
+        let text = format!("out has shape {:?} where ({height}, {width}) is needed", array.shape());
+        return Err(PyValueError::new_err(text));
+    }
+    if !array.is_c_contiguous() {
+        return Err(PyValueError::new_err("out must be C-contiguous"));
+    }
+    array.try_readwrite().map_err(|_| PyValueError::new_err("out is read-only or in use"))
+}
+
+/// Errors of a disparity map against the truth, over the pixels of `mask` that have a finite truth.
+#[pyfunction]
+#[pyo3(signature = (estimate, truth, *, mask = None))]
+pub(crate) fn evaluate_disparity<'py>(
+    py: Python<'py>,
+    estimate: &Bound<'py, PyAny>,
+    truth: &Bound<'py, PyAny>,
+    mask: Option<&Bound<'py, PyAny>>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let (estimate, truth) = (arrays::map(estimate, "estimate")?, arrays::map(truth, "truth")?);
+    let mask = mask.map(|mask| arrays::mask(mask, "mask")).transpose()?;
+    let scores =
+        cv_pipeline::stereo::evaluate_disparity(estimate.view(), truth.view(), mask.as_ref().map(|mask| mask.view()))
+            .map_err(|error| refused(py, &error))?;
+    data(py, &scores)
+}

@@ -1,0 +1,34 @@
+"""Pictures that the tests share: the small generated ones of the repository, whose truth lies beside them."""
+
+import json
+import os
+from pathlib import Path
+
+import epipole
+import numpy as np
+import pytest
+
+FIXTURES = Path(os.environ.get("EPIPOLE_FIXTURES", Path(__file__).parents[2] / "fixtures"))
+
+
+@pytest.fixture(scope="session")
+def pair():
+    """A rectified pair."""
+    return tuple(epipole.read_image(FIXTURES / "stereo" / f"{side}.jpg") for side in ("left", "right"))
+
+
+@pytest.fixture(scope="session")
+def stereo_truth():
+    """Focal length in px, baseline in meters, true disparity, and where both photographs see the scene."""
+    known = json.loads((FIXTURES / "oracle" / "stereo.json").read_text())
+    disparity = epipole.read_map(FIXTURES / "oracle" / "stereo-disparity.png")
+    visible = epipole.read_image(FIXTURES / "oracle" / "stereo-visible.png") > 0
+    return known["focal_px"], known["baseline_m"], disparity, visible
+
+
+@pytest.fixture(scope="session")
+def plane():
+    """Two photographs of a plane, and the true homography."""
+    known = json.loads((FIXTURES / "oracle" / "plane.json").read_text())
+    photos = tuple(epipole.read_image(FIXTURES / "plane" / f"{name}.jpg") for name in "ab")
+    return *photos, np.array(known["homography"])

@@ -1,0 +1,134 @@
+"""Threads, signals, processes, memory: how the package behaves in a program."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import epipole
+import numpy as np
+import pytest
+
+
+def run(code, **options):
+    return subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=120, **options
+    )
+
+
+def test_control_c_stops_a_long_job_soon():
+    # Two pictures of 12 Mpx take seconds.
+    found = run(
+        """
+        import os, signal, threading, time
+        import epipole, numpy as np
+        image = np.random.default_rng(0).integers(0, 255, (3000, 4000), np.uint8)
+        sent = []
+        def send():
+            sent.append(time.monotonic())
+            os.kill(os.getpid(), signal.SIGINT)
+        threading.Timer(1.0, send).start()
+        try:
+            epipole.depth(image, image[:, ::-1].copy(), disparities=256)
+        except KeyboardInterrupt:
+            print(time.monotonic() - sent[0])
+        """
+    )
+    assert found.stdout, found.stderr
+    # 0.2 s asked for; the tick takes 0.05 of it, and the test machine may be busy.
+    assert float(found.stdout) < 0.5
+
+
+def test_progress_is_told_and_may_stop_a_job(pair):
+    told = []
+    epipole.depth(*pair, disparities=64, progress=lambda stage, done, total: told.append((stage, done, total)))
+    assert told and all(isinstance(stage, str) and done <= max(done, total) for stage, done, total in told)
+
+    def stop(*_):
+        raise RuntimeError("enough")
+
+    big = np.random.default_rng(0).integers(0, 255, (1500, 2000), np.uint8)
+    with pytest.raises(RuntimeError, match="enough"):
+        epipole.depth(big, big, disparities=256, progress=stop)
+
+
+def test_other_threads_go_on(pair):
+    big = np.random.default_rng(0).integers(0, 255, (1500, 2000), np.uint8)
+    ended = threading.Event()
+    job = threading.Thread(target=lambda: (epipole.StereoMatcher(disparities=256).compute(big, big), ended.set()))
+    job.start()
+    count = 0
+    while not ended.is_set() and count < 20:
+        time.sleep(0.005)
+        count += 1
+    # With the interpreter held, not one round would be done before the end.
+    assert count >= 20
+    job.join()
+
+
+def test_four_threads_share_a_matcher(pair):
+    matcher = epipole.StereoMatcher(disparities=64)
+    expected = matcher.compute(*pair)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: matcher.compute(*pair), range(12)))
+    assert all(np.array_equal(f, expected, equal_nan=True) for f in found)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_the_same_bytes_for_any_number_of_threads(pair, plane, threads):
+    one = epipole.depth(*pair, disparities=64)
+    other = epipole.depth(*pair, disparities=64, threads=threads)
+    assert one.disparity.tobytes() == other.disparity.tobytes()
+    matches = [epipole.match_features(*plane[:2], threads=n).points.tobytes() for n in (None, threads)]
+    assert matches[0] == matches[1]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_a_child_of_a_fork_works_too():
+    found = run(
+        """
+        import os, epipole, numpy as np
+        image = np.random.default_rng(0).integers(0, 255, (120, 200), np.uint8)
+        epipole.StereoMatcher(disparities=32).compute(image, image)
+        child = os.fork()
+        if child == 0:
+            found = epipole.StereoMatcher(disparities=32).compute(image, image)
+            os._exit(0 if found.shape == image.shape else 1)
+        print(os.waitpid(child, 0)[1])
+        """
+    )
+    assert found.stdout.strip() == "0", found.stderr
+
+
+def test_many_calls_need_no_more_memory():
+    image = np.random.default_rng(0).integers(0, 255, (24, 48, 3), np.uint8)
+    matcher = epipole.StereoMatcher(disparities=8)
+    peaks = []
+    for _ in range(10):
+        for _ in range(1000):
+            matcher.compute(image, image[::1])
+        peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    # Kilobytes. A result that stayed would be 9000 × 4.6 kB.
+    assert peaks[-1] - peaks[0] < 8000
+
+
+def test_a_program_writes_what_the_package_finds(pair, tmp_path):
+    program = os.environ.get("EPIPOLE_PROGRAM")
+    if not program:
+        pytest.skip("EPIPOLE_PROGRAM does not name the program")
+    for name, photo in zip(("left.png", "right.png"), pair):
+        epipole.write_image(tmp_path / name, photo)
+    command = [program, "depth", tmp_path / "left.png", tmp_path / "right.png", "--disparities", "64"]
+    subprocess.run([*command, "-o", tmp_path / "d.pfm"], check=True, capture_output=True)
+    found = epipole.depth(*pair, disparities=64)
+    epipole.write_map(tmp_path / "ours.pfm", found.disparity)
+    assert (tmp_path / "ours.pfm").read_bytes() == (tmp_path / "d.pfm").read_bytes()
+
+
+def test_the_signal_of_this_process_is_as_it_was():
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -1,0 +1,41 @@
+"""What editors are told of the functions is what the functions take."""
+
+import ast
+from pathlib import Path
+
+import epipole
+import pytest
+
+STUB = ast.parse((Path(epipole.__file__).parent / "_native.pyi").read_text())
+
+
+def options(function):
+    """Keyword-only arguments of the stub, and their defaults."""
+    for node in STUB.body:
+        if isinstance(node, ast.ClassDef) and node.name == function:
+            node = next(n for n in node.body if getattr(n, "name", "") == "__new__")
+        elif not (isinstance(node, ast.FunctionDef) and node.name == function):
+            continue
+        values = [eval(compile(ast.Expression(d), "stub", "eval")) for d in node.args.kw_defaults]
+        return {a.arg: v for a, v in zip(node.args.kwonlyargs, values)}
+    raise AssertionError(f"the stub lacks {function}")
+
+
+@pytest.mark.parametrize(
+    "function",
+    ["StereoMatcher", "depth", "match_features", "estimate_homography", "estimate_fundamental", "estimate_essential"],
+)
+def test_options_and_defaults_of_the_stub(function):
+    assert options(function) == pytest.approx(epipole.defaults(function))
+
+
+def test_the_stub_names_what_there_is():
+    there = {node.name for node in STUB.body if isinstance(node, (ast.ClassDef, ast.FunctionDef))}
+    there = {name for name in there if not name.startswith("_")}
+    public = {name for name in epipole.__all__ if name not in ("errors", "__version__")}
+    assert there == public
+    for name in epipole.__all__:
+        assert hasattr(epipole, name)
+    assert epipole.Depth.__name__ == "Depth" and epipole.errors.EpipoleError
+    with pytest.raises(AttributeError):
+        epipole.nothing
