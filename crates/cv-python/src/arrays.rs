@@ -191,11 +191,11 @@ fn borrow<'py, T: Element + Sample>(array: &Bound<'py, PyUntypedArray>, what: &s
     let dense = (channels == 1 || strides.get(2).is_none_or(|s| *s == size))
         && (width == 1 || strides[1] == size * channels as isize)
         && row % size == 0
-        && (height == 1 || row >= size * (width * channels) as isize);
-    if typed.is_c_contiguous() || (dense && height == 1 && width == 1) {
+        && row >= size * (width * channels) as isize;
+    if typed.is_c_contiguous() {
         return readonly(typed, (width, height, channels), width * channels, false);
     }
-    if dense && height > 1 {
+    if dense {
         // From the first sample to the last: those between belong to the same array.
         let stride = (row / size) as usize;
         let length = (height - 1) * stride + width * channels;
@@ -212,7 +212,7 @@ fn readonly<'py, T: Element>(
     stride: usize,
     copied: bool,
 ) -> PyResult<Borrowed<'py, T>> {
-    let array = array.try_readonly().map_err(|_| PyValueError::new_err("the array is being written to"))?;
+    let array = array.try_readonly().map_err(busy)?;
     Ok(Borrowed { array, width, height, channels, stride, copied })
 }
 
@@ -239,10 +239,7 @@ pub(crate) fn is_borrowed(image: &Bound<'_, PyAny>) -> PyResult<bool> {
 /// A mask: bool, or bytes that are 0 where nothing is.
 pub(crate) fn mask(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Mask> {
     let array = untyped(given, what)?;
-    let [height, width] = *array.shape() else {
-        let shape = array.shape();
-        return Err(of_shape(given.py(), shape, &format!("{what} has shape {shape:?}; a mask has (height, width)")));
-    };
+    let (width, height) = flat_size(&array, what, "a mask")?;
     let values: Vec<bool> = if let Ok(flags) = array.cast::<PyArrayDyn<bool>>() {
         flags.try_readonly().map_err(busy)?.as_array().iter().copied().collect()
     } else if let Ok(bytes) = array.cast::<PyArrayDyn<u8>>() {
@@ -253,6 +250,17 @@ pub(crate) fn mask(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Mask> {
     Mask::from_vec(width, height, values).map_err(|e| PyValueError::new_err(e.to_string()))
 }
 
+/// Width and height of what has one number in a pixel.
+fn flat_size(array: &Bound<'_, PyUntypedArray>, what: &str, kind: &str) -> PyResult<(usize, usize)> {
+    match *array.shape() {
+        [height, width] => Ok((width, height)),
+        ref shape => {
+            let text = format!("{what} has shape {shape:?}; {kind} has (height, width)");
+            Err(of_shape(array.py(), shape, &text))
+        }
+    }
+}
+
 fn busy(_: numpy::BorrowError) -> PyErr {
     PyValueError::new_err("the array is being written to")
 }
@@ -260,10 +268,7 @@ fn busy(_: numpy::BorrowError) -> PyErr {
 /// A map of floats, such as disparities.
 pub(crate) fn map(given: &Bound<'_, PyAny>, what: &str) -> PyResult<GrayF32> {
     let array = untyped(given, what)?;
-    let [height, width] = *array.shape() else {
-        let shape = array.shape();
-        return Err(of_shape(given.py(), shape, &format!("{what} has shape {shape:?}; a map has (height, width)")));
-    };
+    let (width, height) = flat_size(&array, what, "a map")?;
     let Ok(floats) = array.cast::<PyArrayDyn<f32>>() else {
         return Err(PyTypeError::new_err(format!("{what}: dtype {} where float32 is needed", array.dtype())));
     };

@@ -10,7 +10,7 @@ use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{RecvTimeoutError, channel};
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::sync::{Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
 /// How often signals are looked at, and the callable is called: Ctrl-C is to work within 200 ms, and a bar that moves twenty times a second looks smooth.
@@ -55,7 +55,7 @@ impl Run {
         let ended = py.detach(|| {
             let pool = Pool::take(self.threads)?;
             let (done, wait) = channel();
-            pool.threads.in_place_scope(|scope| {
+            let ended = pool.threads.in_place_scope(|scope| {
                 scope.spawn(|_| {
                     let result = catch_unwind(AssertUnwindSafe(|| job(&monitor)));
                     // Somebody waits until this comes.
@@ -74,7 +74,9 @@ impl Run {
                         }
                     }
                 }
-            })
+            });
+            pool.give_back();
+            ended
         });
         match ended? {
             // Told to stop, it may have ended in another way.
@@ -187,7 +189,7 @@ const MOST_THREADS: usize = 1024;
 /// The threads of one job at a time, of this process: those of another process do not come along with `fork`.
 struct Pool {
     process: u32,
-    threads: Arc<ThreadPool>,
+    threads: ThreadPool,
 }
 
 /// Pools that no job uses.
@@ -213,17 +215,15 @@ impl Pool {
         }
         let made = rayon::ThreadPoolBuilder::new().num_threads(wanted).thread_name(|i| format!("epipole {i}")).build();
         let pool = made.map_err(|error| internal(&format!("no threads: {error}")))?;
-        Ok(Self { process, threads: Arc::new(pool) })
+        Ok(Self { process, threads: pool })
     }
-}
 
-impl Drop for Pool {
-    fn drop(&mut self) {
-        // Kept for the next job; a few, as each Python thread that works at the same time takes one.
+    /// Keeps it for the next job; a few, as each Python thread that works at the same time takes one.
+    fn give_back(self) {
         if let Ok(mut idle) = IDLE.try_lock()
             && idle.len() < MOST_IDLE
         {
-            idle.push(Self { process: self.process, threads: Arc::clone(&self.threads) });
+            idle.push(self);
         }
     }
 }

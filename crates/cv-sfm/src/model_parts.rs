@@ -18,8 +18,11 @@ struct Agreement {
 /// the points of the rest. Parts in two scales that share a view are not told apart: pairs with it say nothing of a scale. Gives back whether there was any. O(observations of the views of all links).
 pub(crate) fn keep_largest_part(scene: &mut Scene<'_>, graph: &ViewGraph, least: usize) -> bool {
     let holds = |l: &Link| {
+        if scene.poses[l.a].is_none() || scene.poses[l.b].is_none() {
+            return false;
+        }
         let Agreement { both, one } = agreement(scene, l.a, l.b);
-        scene.poses[l.a].is_some() && scene.poses[l.b].is_some() && both >= least && both >= one
+        both >= least && both >= one
     };
     let links = graph.links.par_iter().filter(|l| holds(l)).copied().collect();
     let firm = ViewGraph { views: graph.views, links }.largest_component();

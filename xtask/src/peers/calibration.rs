@@ -120,13 +120,12 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
     boards::corners(python, &mut page)?;
     boards::without(python, data, &mut page)?;
     undistort::run(python, &mut page)?;
-    let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
     let text = format!(
         "Written by `cargo xtask peers calibration`; one run, {}, load {} at its end (one is the run itself), OpenCV {}. Processor seconds are of one thread each, decoding left out. RMS: root mean square \
          distance of corners, both coordinates together, as OpenCV prints it; mrcal prints that of a coordinate, √2 less. Hold-out: solved on every other \
          view, the others by their poses alone, both halves; OpenCV's and mrcal's poses by `solvePnP`.\n\n{}\n| figure | measured | bar | |\n|---|---|---|---|\n{}",
         super::machine(),
-        load.split_whitespace().next().unwrap_or("unknown"),
+        super::machine_load(),
         page.version,
         page.text,
         page.checks.iter().fold(String::new(), |mut text, c| {

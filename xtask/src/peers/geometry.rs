@@ -65,13 +65,12 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
         .map(|line| serde_json::from_str(line).with_context(|| line.to_owned()))
         .collect::<Result<_>>()?;
 
-    let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
     let _ = writeln!(
         text,
         "Written by `cargo xtask peers geometry`; one run, load {} at its end (compare times as ratios). Input: rows with label 0; error: on \
          the hand-checked rows, symmetric transfer RMS (H, threshold 3 px) or Sampson RMS (F, threshold 1 px). Ours: the mean over {SEEDS} seeds, each \
          with the input in another order; the spread is the standard deviation of the mean error over them, as a share of it.\n",
-        load.split_whitespace().next().unwrap_or("unknown")
+        super::machine_load()
     );
     let mut checks = Vec::new();
     for (kind, deviation) in &spread {

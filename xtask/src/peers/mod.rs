@@ -109,6 +109,12 @@ pub(crate) fn machine() -> String {
     format!("{}, {cores} cores", name.trim_start_matches([' ', '\t', ':']))
 }
 
+/// How busy the machine was over the last minute: processes that ran or waited to; “unknown” where the system does not tell.
+pub(crate) fn machine_load() -> String {
+    let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
+    load.split_whitespace().next().unwrap_or("unknown").to_owned()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -7,7 +7,7 @@ use super::panorama_truth::{self, Truth};
 use crate::checks::Check;
 use anyhow::{Context, Result, ensure};
 use cv_synth::{Vista, VistaOptions, vista_photos};
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -20,7 +20,7 @@ const SETS: [&str; 4] = ["weir", "umd-set1", "umd-set3", "carpark"];
 const LARGE: &str = "generated, 8 of 12 Mpx";
 
 /// What a system printed of itself, or what was measured of it.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 struct Outcome {
     #[serde(default)]
     version: String,
@@ -48,7 +48,7 @@ struct Compared {
 pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
     let program = crate::release_program()?;
     let keep = crate::target_dir()?.join("peers-panorama");
-    let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
+    let load = super::machine_load();
     let mut sets = Vec::new();
     for name in SETS {
         println!("{name}");
@@ -70,7 +70,7 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
         })
         .collect::<Result<_>>()?;
     let checks = checks(&sets, &truths);
-    let text = page(&sets, &truths, &checks, load.split(' ').next().unwrap_or("unknown"));
+    let text = page(&sets, &truths, &checks, &load);
     print!("{text}");
     super::write_section("Panoramas", &text)?;
     Ok(checks)
@@ -162,9 +162,7 @@ fn hugin(python: &Path, folder: &Path, photographs: &[PathBuf]) -> Result<Option
         let image = cv_io::read_rgb(&out)?;
         (outcome.size, outcome.mean) = (image.size(), mean(image.pixels()));
     }
-    let line = serde_json::json!({ "version": outcome.version, "used": outcome.used, "size": outcome.size,
-        "mean": outcome.mean, "seconds": outcome.seconds, "cpu": outcome.cpu, "peak": outcome.peak });
-    std::fs::write(printed, line.to_string())?;
+    std::fs::write(printed, serde_json::to_string(&outcome)?)?;
     std::fs::write(stamp, text)?;
     Ok(Some(outcome))
 }

@@ -112,7 +112,10 @@ fn psnr(vista: &Vista, photos: &[VistaPhoto], result: &PanoramaResult) -> f64 {
                 let seen = p.from_world * ray;
                 let place = p.camera.project(&seen.into()).filter(|_| seen.z > 0.0);
                 place.is_some_and(|q| {
-                    let inside = q.x >= 0.0 && q.y >= 0.0 && q.x < 959.5 && q.y < 719.5;
+                    let inside = q.x >= 0.0
+                        && q.y >= 0.0
+                        && q.x < p.camera.width as f64 - 0.5
+                        && q.y < p.camera.height as f64 - 0.5;
                     inside && p.image.at((q.x + 0.5) as usize, (q.y + 0.5) as usize).iter().any(|v| *v >= 254)
                 })
             });

@@ -294,8 +294,7 @@ fn run_ours(
         std::fs::remove_dir_all(folder)?;
     }
     std::fs::create_dir_all(folder)?;
-    let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
-    let load = load.split(' ').next().and_then(|load| load.parse().ok()).unwrap_or(f64::NAN);
+    let load = super::machine_load().parse().unwrap_or(f64::NAN);
     let mut command = Command::new(python);
     command.arg(crate::root().join("peers/measure.py")).arg(folder.join("printed.json")).arg(program);
     command.arg("sfm").args(photographs).arg("-o").arg(folder.join("model"));

@@ -33,8 +33,7 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
     let folder = data.join("stereo");
     let scripts = crate::root().join("peers");
     let pool = two_threads()?;
-    let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
-    let load = load.split_whitespace().next().unwrap_or("unknown").to_owned();
+    let load = super::machine_load();
     let mut best: Vec<Line> = Vec::new();
     for round in 0..ROUNDS {
         println!("round {} of {ROUNDS}", round + 1);

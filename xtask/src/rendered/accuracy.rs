@@ -5,8 +5,8 @@ use crate::checks::Check;
 use anyhow::{Context, Result};
 use cv_core::{Camera, Correspondence, Distortion, Point2, Point3, Pose, Vector3, quantile};
 use cv_geometry::{align_points, triangulate};
-use cv_pipeline::many_views::{CameraKnowledge, SfmModel};
-use cv_pipeline::{PhotoOrder, SfmCamera, SfmJobOptions, SfmPhoto, Silent, sfm};
+use cv_pipeline::many_views::{CameraKnowledge, Observation, SfmModel};
+use cv_pipeline::{SfmCamera, SfmJobOptions, SfmPhoto, Silent, sfm};
 use cv_synth::{Scene, rotation_error};
 use nalgebra::Matrix3;
 
@@ -47,7 +47,7 @@ fn judge(walk: &Walk, side: f64) -> Result<Vec<Check>> {
     let unknown = SfmCamera { camera: lens(1.2 * walk.camera.width as f64), knowledge: CameraKnowledge::Unknown };
     let mut checks = Vec::new();
     for (name, camera) in [("camera known", known), ("camera not known", unknown)] {
-        let result = sfm(&photos, &[camera], &SfmJobOptions { order: PhotoOrder::Any, ..options.clone() }, &Silent)?;
+        let result = sfm(&photos, &[camera], &options, &Silent)?;
         let model = result.models.first().context("no model")?;
         let off = Off::of(model, &walk.poses)?;
         println!(
@@ -72,13 +72,13 @@ fn judge(walk: &Walk, side: f64) -> Result<Vec<Check>> {
 }
 
 /// Of the photographs of a model: the largest distance of a center from the truth in meters, and the largest rotation from it in degrees.
-pub(super) struct Off {
-    pub(super) center: f64,
-    pub(super) rotation: f64,
+struct Off {
+    center: f64,
+    rotation: f64,
 }
 
 impl Off {
-    pub(super) fn of(model: &SfmModel, truth: &[Pose]) -> Result<Self> {
+    fn of(model: &SfmModel, truth: &[Pose]) -> Result<Self> {
         let both: Vec<(&Pose, &Pose)> =
             model.poses.iter().zip(truth).filter_map(|(found, truth)| Some((found.as_ref()?, truth))).collect();
         let (found, true_centers): (Vec<Point3<f64>>, Vec<Point3<f64>>) =
@@ -96,20 +96,16 @@ impl Off {
 }
 
 /// How exact the places of features are: distances from where the true cameras see the point that they agree on best.
-fn places(tracks: &[&[cv_pipeline::many_views::Observation]], photos: &[SfmPhoto], walk: &Walk) {
+fn places(tracks: &[&[Observation]], photos: &[SfmPhoto], walk: &Walk) {
     let mut all: Vec<(f64, Vector3<f64>, Point2<f64>)> = Vec::new();
     for track in tracks {
-        let rays: Vec<(&Pose, Point2<f64>, f64)> = track
-            .iter()
-            .map(|o| {
-                let k = &photos[o.view as usize].keypoints[o.keypoint as usize];
-                (&walk.poses[o.view as usize], k.position.cast(), f64::from(k.scale))
-            })
-            .collect();
+        let keypoint = |o: &Observation| &photos[o.view as usize].keypoints[o.keypoint as usize];
+        let rays: Vec<(&Pose, Point2<f64>)> =
+            track.iter().map(|o| (&walk.poses[o.view as usize], keypoint(o).position.cast())).collect();
         let Some(point) = point_of(&rays, &walk.camera) else { continue };
-        for (pose, at, scale) in &rays {
+        for ((pose, at), o) in rays.iter().zip(*track) {
             if let Some(p) = walk.camera.project(&pose.transform(&point)) {
-                all.push((*scale, Vector3::new(at.x - p.x, at.y - p.y, (at - p).norm()), *at));
+                all.push((f64::from(keypoint(o).scale), Vector3::new(at.x - p.x, at.y - p.y, (at - p).norm()), *at));
             }
         }
     }
@@ -125,10 +121,12 @@ fn places(tracks: &[&[cv_pipeline::many_views::Observation]], photos: &[SfmPhoto
             q(0.9)
         );
     }
+    let (width, height) = (walk.camera.width as f64, walk.camera.height as f64);
     for row in 0..3 {
         let line: Vec<String> = (0..4)
             .map(|column| {
-                let inside = |p: &Point2<f64>| (p.x / 300.0) as usize == column && (p.y / 300.0) as usize == row;
+                let inside =
+                    |p: &Point2<f64>| (4.0 * p.x / width) as usize == column && (3.0 * p.y / height) as usize == row;
                 let of: Vec<_> = all.iter().filter(|a| inside(&a.2)).collect();
                 let [dx, dy] = [0, 1]
                     .map(|k| quantile(&mut of.iter().map(|a| a.1[k]).collect::<Vec<_>>(), 0.5).unwrap_or(f64::NAN));
@@ -139,15 +137,15 @@ fn places(tracks: &[&[cv_pipeline::many_views::Observation]], photos: &[SfmPhoto
     }
 }
 
-/// The point that known cameras see at given places, by least squares of their distances in pixels over the scale of each.
-fn point_of(seen: &[(&Pose, Point2<f64>, f64)], camera: &Camera) -> Option<Point3<f64>> {
+/// The point that known cameras see at given places, by least squares of their distances in pixels, those beyond a pixel weighed down (Cauchy).
+fn point_of(seen: &[(&Pose, Point2<f64>)], camera: &Camera) -> Option<Point3<f64>> {
     let (first, last) = (seen.first()?, seen.last()?);
     let m = Correspondence { a: camera.normalize(first.1), b: camera.normalize(last.1) };
     let local = triangulate(&m, &Pose::relative(first.0, last.0)).ok()?;
     let mut point = first.0.inverse().transform(&local);
     for _ in 0..10 {
         let (mut h, mut g) = (Matrix3::zeros(), Vector3::zeros());
-        for (pose, at, _) in seen {
+        for (pose, at) in seen {
             let p = pose.transform(&point);
             if p.z <= 0.0 {
                 return None;
