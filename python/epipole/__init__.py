@@ -1,55 +1,118 @@
-"""Classical computer vision over NumPy arrays: stereo depth, matching, two-view geometry.
+"""Classical computer vision over NumPy arrays: calibration, stereo depth, matching, two and many views, panoramas, color segmentation.
 
 Images are arrays of uint8, uint16 or float32, of shape (height, width) or (height, width, 3) in RGB; unknown values of maps are NaN. Options are
 given by name; ``defaults("depth")`` lists those of a function. What cannot be done raises an exception of :mod:`epipole.errors` with the numbers.
 """
 
 from epipole._native import (
+    Camera,
+    Rig,
     StereoMatcher,
+    Undistorter,
     __version__,
+    calibrate,
     defaults,
     depth,
     estimate_essential,
     estimate_fundamental,
     estimate_homography,
+    estimate_pose,
     evaluate_disparity,
+    evaluate_mask,
+    extract_features,
+    find_board,
     is_borrowed,
+    match,
     match_features,
+    panorama,
     read_image,
     read_map,
+    reconstruct,
+    rectify,
+    sfm,
+    undistort,
+    write_cloud,
     write_image,
     write_map,
 )
 
 __all__ = [
+    "AprilGrid",
+    "ArucoGrid",
+    "Camera",
+    "CharucoBoard",
+    "Chessboard",
+    "ColorModel",
+    "Features",
+    "PointCloud",
+    "Reconstruction",
+    "Rig",
     "StereoMatcher",
+    "Undistorter",
     "__version__",
+    "boards",
+    "calibrate",
     "defaults",
     "depth",
     "errors",
     "estimate_essential",
     "estimate_fundamental",
     "estimate_homography",
+    "estimate_pose",
     "evaluate_disparity",
+    "evaluate_mask",
+    "extract_features",
+    "find_board",
     "is_borrowed",
+    "match",
     "match_features",
+    "panorama",
     "read_image",
     "read_map",
+    "reconstruct",
+    "rectify",
+    "sfm",
+    "undistort",
+    "write_cloud",
     "write_image",
     "write_map",
 ]
 
-_RESULTS = ("Depth", "EssentialModel", "Matches", "Model")
+# Loaded when they are needed: the import stays short.
+_LATER = {
+    "AprilGrid": "boards",
+    "ArucoGrid": "boards",
+    "CharucoBoard": "boards",
+    "Chessboard": "boards",
+    "ColorModel": "color_model",
+    "Features": "_results",
+    "PointCloud": "_results",
+    "Reconstruction": "_results",
+}
+_RESULTS = (
+    "BoardView",
+    "Calibration",
+    "Depth",
+    "EssentialModel",
+    "Located",
+    "Matches",
+    "Model",
+    "ModelImage",
+    "Object",
+    "Panorama",
+    "PoseModel",
+    "Rectified",
+    "SfmResult",
+    "TwoViewReconstruction",
+)
 
 
 def __getattr__(name):
-    # The classes of results, and the errors, are loaded when they are needed: the import stays short.
-    if name in _RESULTS:
-        from epipole import _results
+    import importlib
 
-        return getattr(_results, name)
-    if name == "errors":
-        import importlib
-
-        return importlib.import_module("epipole.errors")
-    raise AttributeError(f"module 'epipole' has no attribute {name!r}")
+    if name in ("boards", "errors", "ray"):
+        return importlib.import_module(f"epipole.{name}")
+    module = _LATER.get(name, "_results" if name in _RESULTS else None)
+    if module is None:
+        raise AttributeError(f"module 'epipole' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"epipole.{module}"), name)

@@ -1,11 +1,27 @@
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from os import PathLike
 from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from epipole._results import Depth, EssentialModel, Matches, Model
+from epipole._results import (
+    BoardView,
+    Calibration,
+    Depth,
+    EssentialModel,
+    Features,
+    Located,
+    Matches,
+    Model,
+    Panorama,
+    PoseModel,
+    Reconstruction,
+    Rectified,
+    SfmResult,
+    TwoViewReconstruction,
+)
+from epipole.boards import AprilGrid, ArucoGrid, CharucoBoard, Chessboard
 
 __version__: str
 
@@ -18,6 +34,91 @@ class _HasDlpack(Protocol):
 _Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32] | _HasArray | _HasDlpack
 _Path = str | PathLike[str]
 _Progress = Callable[[str, int, int], object]
+_Size = tuple[int, int]
+_Photograph = NDArray[np.uint8] | _HasArray | _HasDlpack | _Path
+_Board = Chessboard | CharucoBoard | ArucoGrid | AprilGrid
+_Mask = NDArray[np.bool_] | NDArray[np.uint8]
+
+class Camera:
+    def __new__(
+        cls,
+        width: int,
+        height: int,
+        matrix: ArrayLike,
+        distortion: ArrayLike | None = None,
+        lens: str | None = None,
+    ) -> Camera: ...
+    @staticmethod
+    def from_focal(width: int, height: int, focal: float) -> Camera: ...
+    @staticmethod
+    def read(path: _Path, *, size: _Size | None = None) -> Camera: ...
+    def write(self, path: _Path, *, format: str = "own") -> None: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+    @property
+    def matrix(self) -> NDArray[np.float64]: ...
+    @property
+    def distortion(self) -> NDArray[np.float64]: ...
+    @property
+    def lens(self) -> str: ...
+    def project(self, points: ArrayLike) -> NDArray[np.float64]: ...
+    def normalize(self, pixels: ArrayLike) -> NDArray[np.float64]: ...
+    def undistort_points(self, pixels: ArrayLike) -> NDArray[np.float64]: ...
+    def resized(self, width: int, height: int) -> Camera: ...
+    def __eq__(self, other: object) -> bool: ...
+    def __hash__(self) -> int: ...
+
+class Rig:
+    def __new__(
+        cls, left: Camera, right: Camera, rotation: ArrayLike, translation: ArrayLike, unit: str = ""
+    ) -> Rig: ...
+    @staticmethod
+    def read(path: _Path | Sequence[_Path], *, size: _Size | None = None) -> Rig: ...
+    def write(self, path: _Path, *, format: str = "own") -> None: ...
+    @property
+    def left(self) -> Camera: ...
+    @property
+    def right(self) -> Camera: ...
+    @property
+    def rotation(self) -> NDArray[np.float64]: ...
+    @property
+    def translation(self) -> NDArray[np.float64]: ...
+    @property
+    def baseline(self) -> float: ...
+    @property
+    def unit(self) -> str: ...
+    def exchanged(self) -> Rig: ...
+    def __eq__(self, other: object) -> bool: ...
+
+class Undistorter:
+    def __new__(
+        cls,
+        camera: Camera,
+        *,
+        alpha: float | None = 0.0,
+        size: _Size | None = None,
+        threads: int | None = None,
+        progress: _Progress | None = None,
+    ) -> Undistorter: ...
+    @property
+    def camera(self) -> Camera: ...
+    def compute(self, image: _Image) -> NDArray[Any]: ...
+
+class FittedColorModel:
+    @staticmethod
+    def fit(
+        images: Sequence[_Image], masks: Sequence[_Mask], **options: Any
+    ) -> tuple[FittedColorModel, tuple[dict[str, Any], ...]]: ...
+    def predict(self, image: _Image) -> NDArray[np.bool_]: ...
+    def log_odds(self, image: _Image) -> NDArray[np.float32]: ...
+    def locate(self, image: _Image, *, min_score: float | None = None) -> Located: ...
+    @property
+    def threshold(self) -> float: ...
+    def to_json(self) -> str: ...
+    @staticmethod
+    def from_json(text: str) -> FittedColorModel: ...
 
 class StereoMatcher:
     def __new__(
@@ -52,8 +153,12 @@ def depth(
     focal: float | None = None,
     baseline: float | None = None,
     offset: float | None = 0.0,
+    rig: Rig | None = None,
+    alpha: float | None = 0.0,
+    size: _Size | None = None,
     near: float | None = 0.0,
     far: float | None = float("inf"),
+    cloud: bool | None = False,
     min_disparity: int | None = None,
     disparities: int | Literal["auto"] | None = 128,
     census: Literal["5", "7", "9", 5, 7, 9] | None = "5",
@@ -79,8 +184,63 @@ def evaluate_disparity(
     estimate: NDArray[np.float32],
     truth: NDArray[np.float32],
     *,
-    mask: NDArray[np.bool_] | NDArray[np.uint8] | None = None,
+    mask: _Mask | None = None,
 ) -> dict[str, Any]: ...
+def evaluate_mask(mask: _Mask, truth: _Mask) -> dict[str, Any]: ...
+def rectify(
+    left: _Image,
+    right: _Image,
+    rig: Rig,
+    *,
+    alpha: float | None = 0.0,
+    size: _Size | None = None,
+    threads: int | None = None,
+    progress: _Progress | None = None,
+) -> Rectified: ...
+def undistort(
+    image: _Image,
+    camera: Camera,
+    *,
+    alpha: float | None = 0.0,
+    size: _Size | None = None,
+    threads: int | None = None,
+    progress: _Progress | None = None,
+) -> tuple[NDArray[Any], Camera]: ...
+def find_board(
+    image: _Image,
+    *,
+    board: _Board | None = None,
+    threads: int | None = None,
+    progress: _Progress | None = None,
+) -> BoardView: ...
+def calibrate(
+    photographs: Sequence[_Photograph | None] | Sequence[Sequence[_Photograph | None]],
+    *,
+    board: _Board | None = None,
+    lens: Literal["auto", "radial-tangential4", "radial-tangential5", "rational8", "thin-prism12", "fisheye4"] | None = "auto",
+    board_shape: bool | None = True,
+    outlier_deviations: float | None = 4.5,
+    threads: int | None = None,
+    progress: _Progress | None = None,
+) -> Calibration: ...
+def extract_features(
+    image: _Image,
+    *,
+    features: Literal["sift", "mops", "harris"] | None = "sift",
+    max_features: int | None = None,
+    threads: int | None = None,
+    progress: _Progress | None = None,
+) -> Features: ...
+def match(
+    a: Features,
+    b: Features,
+    *,
+    mutual: bool | None = True,
+    guided: Literal["homography", "fundamental"] | None = None,
+    seed: int | None = 0,
+    threads: int | None = None,
+    progress: _Progress | None = None,
+) -> Matches: ...
 def match_features(
     a: _Image,
     b: _Image,
@@ -116,8 +276,8 @@ def estimate_fundamental(
 ) -> Model: ...
 def estimate_essential(
     matches: ArrayLike,
-    k1: ArrayLike,
-    k2: ArrayLike | None = None,
+    k1: Camera | ArrayLike,
+    k2: Camera | ArrayLike | None = None,
     *,
     threshold: float | None = 1.0,
     confidence: float | None = 0.999,
@@ -126,6 +286,75 @@ def estimate_essential(
     threads: int | None = None,
     progress: _Progress | None = None,
 ) -> EssentialModel: ...
+def estimate_pose(
+    points: ArrayLike,
+    pixels: ArrayLike,
+    camera: Camera,
+    *,
+    threshold: float | None = 4.0,
+    confidence: float | None = 0.999,
+    max_iterations: int | None = 20000,
+    seed: int | None = 0,
+    threads: int | None = None,
+    progress: _Progress | None = None,
+) -> PoseModel: ...
+def reconstruct(
+    a: _Photograph,
+    b: _Photograph,
+    *,
+    camera: Camera | ArrayLike | None = None,
+    camera2: Camera | ArrayLike | None = None,
+    focal: float | None = None,
+    ignore_exif: bool | None = False,
+    threshold: float | None = 2.0,
+    max_error: float | None = 2.0,
+    min_angle: float | None = 0.0017453292519943296,
+    max_features: int | None = None,
+    seed: int | None = 0,
+    dense: bool | None = False,
+    dense_size: int | None = 1600,
+    threads: int | None = None,
+    progress: _Progress | None = None,
+) -> TwoViewReconstruction: ...
+def sfm(
+    photographs: Sequence[_Photograph],
+    *,
+    camera: Camera | ArrayLike | None = None,
+    focal: float | None = None,
+    ignore_exif: bool | None = False,
+    names: Sequence[str] | None = None,
+    centers: ArrayLike | None = None,
+    solver: Literal["auto", "incremental", "global"] | None = "auto",
+    order: Literal["any", "sequence"] | None = "any",
+    max_error: float | None = 2.5,
+    max_features: int | None = None,
+    seed: int | None = 0,
+    threads: int | None = None,
+    progress: _Progress | None = None,
+) -> SfmResult: ...
+def panorama(
+    photographs: Sequence[_Photograph],
+    *,
+    camera: Camera | None = None,
+    focal: float | None = None,
+    projection: Literal["auto", "plane", "cylindrical", "spherical"] | None = "auto",
+    blend: Literal["multiband", "poisson", "feather", "none"] | None = "multiband",
+    seams: Literal["graphcut", "voronoi"] | None = "graphcut",
+    exposure: Literal["none", "gain", "vignetting"] | None = "gain",
+    crop: bool | None = False,
+    scale: float | None = 1.0,
+    features: Literal["sift", "mops", "harris"] | None = "sift",
+    seed: int | None = 0,
+    threads: int | None = None,
+    progress: _Progress | None = None,
+) -> Panorama: ...
+def read_model(folder: _Path) -> Reconstruction: ...
+def write_model(
+    folder: _Path, model: Reconstruction, *, format: Literal["colmap-text", "colmap-binary"] = "colmap-text"
+) -> None: ...
+def write_cloud(
+    path: _Path, positions: ArrayLike, colors: ArrayLike | None = None, normals: ArrayLike | None = None
+) -> None: ...
 def read_image(path: _Path) -> NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]: ...
 def write_image(path: _Path, image: _Image) -> None: ...
 def read_map(path: _Path, *, scale: float | None = None) -> NDArray[np.float32]: ...

@@ -1,9 +1,14 @@
 """What the functions give back: frozen dataclasses over arrays."""
 
 import base64
+import os
 from dataclasses import dataclass, fields
 
 import numpy as np
+
+from epipole import _native
+
+_result = dataclass(frozen=True, slots=True, eq=False, repr=False)
 
 
 class _Result:
@@ -24,32 +29,42 @@ class _Result:
 
 def _told(value):
     if isinstance(value, np.ndarray):
+        if value.ndim == 3 and value.shape[2] == 3 and value.dtype == np.uint8 and min(value.shape[:2]) > 9:
+            return _bitmap(value[:: _step(value), :: _step(value)])
         if value.ndim == 2 and value.dtype == np.float32 and min(value.shape) > 9:
             return _thumbnail(value)
         return f"{value.dtype} {value.shape}"
     return f"{value}"
 
 
+def _step(values):
+    return max(1, max(values.shape[:2]) // 240)
+
+
 def _thumbnail(values):
     """A map of floats as a small picture: dark is low, unknown is black."""
-    step = max(1, max(values.shape) // 240)
-    small = values[::step, ::step]
+    small = values[:: _step(values), :: _step(values)]
     known = small[np.isfinite(small)]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
     gray = np.nan_to_num((small - low) / max(high - low, 1e-12) * 223 + 32, nan=0.0, posinf=0.0, neginf=0.0)
-    height, width = gray.shape
-    # An uncompressed bitmap: rows from the bottom up, each a multiple of four bytes long.
+    gray = np.clip(gray, 0, 255).astype(np.uint8)
+    return f"{_bitmap(np.repeat(gray[..., None], 3, axis=2))} {low:.4g} to {high:.4g}"
+
+
+def _bitmap(rgb):
+    """A small picture, without a library for it: an uncompressed bitmap, rows from the bottom up, each a multiple of four bytes long."""
+    height, width = rgb.shape[:2]
     row = (3 * width + 3) // 4 * 4
     data = np.zeros((height, row), np.uint8)
-    data[:, : 3 * width] = np.repeat(np.clip(gray, 0, 255).astype(np.uint8)[::-1], 3, axis=1)
+    data[:, : 3 * width] = rgb[::-1, :, ::-1].reshape(height, 3 * width)
     header = b"BM" + (54 + data.size).to_bytes(4, "little") + bytes(4) + (54).to_bytes(4, "little")
     header += (40).to_bytes(4, "little") + width.to_bytes(4, "little") + height.to_bytes(4, "little")
     header += (1).to_bytes(2, "little") + (24).to_bytes(2, "little") + bytes(24)
     text = base64.b64encode(header + data.tobytes()).decode()
-    return f'<img src="data:image/bmp;base64,{text}"> {low:.4g} to {high:.4g}'
+    return f'<img src="data:image/bmp;base64,{text}">'
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
+@_result
 class Depth(_Result):
     """Disparity, and depth where the geometry is known. All maps have the left photograph's size; unknown is NaN."""
 
@@ -65,6 +80,12 @@ class Depth(_Result):
     """float32: standard deviation, NaN where filled."""
     confidence: "np.ndarray | None"
     """float32, 0 to 1; with ``confidence=True``."""
+    Q: "np.ndarray | None"
+    """float64 (4, 4): makes (X, Y, Z, W) of (x, y, disparity, 1), as OpenCV's reprojectImageTo3D takes it."""
+    images: "tuple | None"
+    """With ``rig``: both photographs rectified, uint8; the maps are of the first."""
+    cloud: "PointCloud | None"
+    """With ``cloud=True``: the colored points; of a rig in the frame of its left camera."""
     disparities: tuple
     """Smallest disparity tried, and how many."""
     valid_fraction: float
@@ -85,7 +106,7 @@ class Depth(_Result):
         return f"{width}×{height} px, {kind}, {100 * self.matched_fraction:.1f} % matched"
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
+@_result
 class Matches(_Result):
     """Tentative matches between two photographs."""
 
@@ -107,7 +128,7 @@ class Matches(_Result):
         return f"{len(self)} matches between {len(self.keypoints[0])} and {len(self.keypoints[1])} keypoints"
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
+@_result
 class Model(_Result):
     """A homography or fundamental matrix, and the matches that fit it."""
 
@@ -128,7 +149,7 @@ class Model(_Result):
         return f"{int(self.inliers.sum())} of {len(self.inliers)} matches, {self.rms:.3f} px RMS"
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
+@_result
 class EssentialModel(Model):
     """An essential matrix and the pose of the second view: x2 = R x1 + t."""
 
@@ -136,3 +157,407 @@ class EssentialModel(Model):
     """float64 (3, 3)."""
     translation: np.ndarray
     """float64 (3,), of length 1."""
+
+
+@_result
+class PoseModel(_Result):
+    """The pose of a camera, x = R X + t, and the points that fit it."""
+
+    rotation: np.ndarray
+    """float64 (3, 3): R."""
+    translation: np.ndarray
+    """float64 (3,): t."""
+    inliers: np.ndarray
+    """bool (n,)."""
+    rms: float
+    """Root mean square reprojection error of the inliers, px."""
+    iterations: int
+    """Samples drawn."""
+    log10_false_alarms: "float | None"
+    """Of poses as well supported to be expected of wrong matches; lower is surer."""
+    seconds: dict
+    """By stage."""
+
+    @property
+    def center(self):
+        """float64 (3,): where the camera stands."""
+        return -self.rotation.T @ self.translation
+
+    def _words(self):
+        return f"{int(self.inliers.sum())} of {len(self.inliers)} points, {self.rms:.3f} px RMS"
+
+
+@_result
+class Features(_Result):
+    """Keypoints of a photograph and their descriptors."""
+
+    keypoints: np.ndarray
+    """float32 (n, 5): x, y, scale, angle, response."""
+    descriptors: np.ndarray
+    """float32 (n, numbers)."""
+    kind: str = "foreign"
+    """What the numbers of a descriptor mean; features of other programs are ``foreign``."""
+
+    def __len__(self):
+        return len(self.keypoints)
+
+    def _words(self):
+        return f"{len(self)} of {self.descriptors.shape[1]} numbers, {self.kind}"
+
+
+@_result
+class PointCloud(_Result):
+    """Points in space."""
+
+    positions: np.ndarray
+    """float32 (n, 3)."""
+    colors: "np.ndarray | None" = None
+    """uint8 (n, 3), RGB."""
+    normals: "np.ndarray | None" = None
+    """float32 (n, 3), of length 1."""
+
+    def __len__(self):
+        return len(self.positions)
+
+    def write(self, path):
+        """Writes a binary PLY."""
+        _native.write_cloud(path, self.positions, self.colors, self.normals)
+
+    def _words(self):
+        return f"{len(self)} points"
+
+
+@_result
+class Rectified(_Result):
+    """Both photographs of a rig with the same points in the same rows."""
+
+    left: np.ndarray
+    """In the type it came in."""
+    right: np.ndarray
+    """The same of the right photograph."""
+    masks: tuple
+    """bool: where each shows anything."""
+    camera: "_native.Camera"
+    """Of both rectified photographs."""
+    rotations: tuple
+    """Of each camera: its frame to the rectified one, float64 (3, 3)."""
+    Q: np.ndarray
+    """float64 (4, 4): makes (X, Y, Z, W) of (x, y, disparity, 1)."""
+    baseline: float
+    """In the unit of the rig."""
+    vertical: bool
+    """Whether one camera stands above the other: the photographs are turned by a quarter then."""
+    vertical_px: "tuple | None"
+    """Median and 95 % quantile of the difference in rows of features found in both; None where there are too few."""
+    seconds: dict
+    """By stage."""
+
+    def _words(self):
+        rows = "" if self.vertical_px is None else f", rows {self.vertical_px[0]:.2f} px apart"
+        return f"{self.camera.width}×{self.camera.height} px, focal {self.camera.matrix[0, 0]:.2f} px{rows}"
+
+
+@_result
+class BoardView(_Result):
+    """The points of a calibration board on a photograph."""
+
+    pixels: np.ndarray
+    """float64 (n, 2): where they are seen."""
+    points: np.ndarray
+    """float64 (n, 2): where they are on the board, x right and y down."""
+    ids: np.ndarray
+    """int64 (n,): their numbers on the board."""
+    deviations: np.ndarray
+    """float64 (n,): standard deviation of a coordinate, px."""
+    size: tuple
+    """Columns and rows of the board."""
+
+    def __len__(self):
+        return len(self.pixels)
+
+    def _words(self):
+        return f"{len(self)} points of a board of {self.size[0]}×{self.size[1]}"
+
+
+@_result
+class Calibration(_Result):
+    """Calibrated cameras, and how far they can be trusted."""
+
+    cameras: tuple
+    """The cameras."""
+    places: tuple
+    """Of each camera (R, t): the first camera's frame to its own, in the unit of the board."""
+    rig: "_native.Rig | None"
+    """The first two cameras."""
+    rms: float
+    """Root mean square distance of all corners used, px."""
+    holdout_rms: float
+    """The same on views that had no part in the fit."""
+    camera_rms: np.ndarray
+    """By camera."""
+    camera_holdout_rms: np.ndarray
+    """By camera."""
+    noise: float
+    """Standard deviation of a coordinate of a corner, px."""
+    rectified_dy: "tuple | None"
+    """Of a rig: mean and largest difference of the rows of one corner in both rectified photographs, px."""
+    parameter_names: tuple
+    """Such as ``camera0.fx`` and ``board.kx``."""
+    parameters: np.ndarray
+    """float64 (n,)."""
+    deviations: np.ndarray
+    """float64 (n,): their standard deviations."""
+    covariance: np.ndarray
+    """float64 (n, n)."""
+    board_size: tuple
+    """Columns and rows of the board that was seen."""
+    board_deflection: tuple
+    """By how much the board is bent along x and y, in its unit."""
+    poses: tuple
+    """By view (R, t): the board's frame to the first camera's; None where no photograph of the view was used."""
+    refused: tuple
+    """By view and camera: why the photograph was not used; None where it was."""
+    trust: str
+    """good, usable or poor."""
+    notes: tuple
+    """What to know, the worst first: each with its ``kind`` and numbers."""
+    seconds: dict
+    """By stage."""
+
+    @property
+    def camera(self):
+        """The camera, or the first one."""
+        return self.cameras[0]
+
+    def _words(self):
+        used = sum(any(reason is None for reason in view) for view in self.refused)
+        return (
+            f"{len(self.cameras)} camera{'s' if len(self.cameras) > 1 else ''} from {used} of {len(self.refused)} views, "
+            f"{self.rms:.3f} px RMS, {self.holdout_rms:.3f} px on views left out, {self.trust}"
+        )
+
+
+@_result
+class ModelImage(_Result):
+    """A photograph of a model."""
+
+    name: str
+    camera: int
+    """Key of its camera."""
+    rotation: np.ndarray
+    """float64 (3, 3): R of x = R X + t, world to camera."""
+    translation: np.ndarray
+    """float64 (3,): t."""
+    keypoints: np.ndarray
+    """float64 (n, 2), px."""
+    point_ids: np.ndarray
+    """int64 (n,): the point that each keypoint is of, -1 for none."""
+
+    @property
+    def center(self):
+        """float64 (3,): where the camera stands."""
+        return -self.rotation.T @ self.translation
+
+    def _words(self):
+        return f"{self.name}, {int((self.point_ids >= 0).sum())} points of {len(self.keypoints)} keypoints"
+
+
+@_result
+class Reconstruction(_Result):
+    """Cameras, photographs with their poses, and points: a sparse model, as COLMAP has it."""
+
+    cameras: dict
+    """By number."""
+    images: dict
+    """By number."""
+    points: np.ndarray
+    """float64 (n, 3)."""
+    colors: np.ndarray
+    """uint8 (n, 3), RGB."""
+    errors: np.ndarray
+    """float64 (n,): mean reprojection error, px; negative where it is not known."""
+    point_ids: np.ndarray
+    """int64 (n,)."""
+
+    def __len__(self):
+        return len(self.images)
+
+    @staticmethod
+    def read(folder):
+        """Reads COLMAP's files, text or binary."""
+        return _native.read_model(folder)
+
+    def write(self, folder, *, format="colmap-text"):
+        """Writes COLMAP's files, in place of a model that is there: ``colmap-text`` or ``colmap-binary``. The folder is made."""
+        os.makedirs(folder, exist_ok=True)
+        _native.write_model(folder, self, format=format)
+
+    @staticmethod
+    def from_pycolmap(reconstruction):
+        """The same model of pycolmap's class. Its pixels have their centers at +0.5; here they have them at whole numbers."""
+        import tempfile
+
+        with tempfile.TemporaryDirectory() as folder:
+            reconstruction.write_binary(folder)
+            return _native.read_model(folder)
+
+    def to_pycolmap(self):
+        """The same model as pycolmap's class, which must be installed."""
+        import tempfile
+
+        import pycolmap
+
+        with tempfile.TemporaryDirectory() as folder:
+            self.write(folder, format="colmap-binary")
+            return pycolmap.Reconstruction(folder)
+
+    @property
+    def cloud(self):
+        """The points as a cloud."""
+        return PointCloud(self.points.astype(np.float32), self.colors)
+
+    def _words(self):
+        seen = sum(int((image.point_ids >= 0).sum()) for image in self.images.values())
+        length = seen / max(len(self.points), 1)
+        return f"{len(self.images)} photographs, {len(self.points)} points seen {length:.1f} times each"
+
+
+@_result
+class SfmResult(_Result):
+    """What many photographs show."""
+
+    models: tuple
+    """Reconstructions, the one of most photographs first. Their places to each other are not known."""
+    solvers: tuple
+    """How each was found."""
+    frames: tuple
+    """What each was brought to: ``centers`` that were given, ``upright`` (Z up, its unit arbitrary), or ``any``."""
+    left_out: dict
+    """By name, why a photograph is in no model."""
+    pairs: int
+    """Pairs of photographs that hold."""
+    refused_pairs: int
+    """Those of them that were not used: they contradict others, or show different things that look alike."""
+    seconds: dict
+    """By stage."""
+
+    @property
+    def model(self):
+        """The largest model."""
+        return self.models[0]
+
+    def _words(self):
+        more = f"; {len(self.models) - 1} more models" if len(self.models) > 1 else ""
+        return f"{self.model._words()}{more}; {len(self.left_out)} photographs left out"
+
+
+@_result
+class TwoViewReconstruction(_Result):
+    """What two photographs show, in the first camera's frame; the unit is the distance between the cameras."""
+
+    reconstruction: Reconstruction
+    """Cameras, poses, points."""
+    rotation: np.ndarray
+    """float64 (3, 3): R of x2 = R x1 + t."""
+    translation: np.ndarray
+    """float64 (3,), of length 1."""
+    rms: float
+    """Root mean square reprojection error, px."""
+    median_angle: float
+    """Between the two rays of a point, radians."""
+    pose_deviation: tuple
+    """Standard deviations of rotation and of the direction of the translation, radians."""
+    focal_deviation: float
+    """Relative standard deviation of the focal length; 0 where the cameras were given."""
+    focal_is_doubtful: bool
+    """Whether the depth of the scene may be stretched, since the focal length is hardly known."""
+    matches: int
+    """Tentative matches."""
+    inliers: int
+    """Those of them that agree with the motion."""
+    dense: "PointCloud | None"
+    """With ``dense=True``."""
+    seconds: dict
+    """By stage."""
+
+    @property
+    def points(self):
+        """float64 (n, 3)."""
+        return self.reconstruction.points
+
+    @property
+    def cameras(self):
+        """Both cameras."""
+        return tuple(self.reconstruction.cameras[image.camera] for image in self.reconstruction.images.values())
+
+    def _words(self):
+        return f"{len(self.points)} points, {self.rms:.3f} px RMS, {self.inliers} of {self.matches} matches agree"
+
+
+@_result
+class Panorama(_Result):
+    """Photographs joined to one picture."""
+
+    image: np.ndarray
+    """uint8 (height, width, 3); black where no photograph reaches."""
+    mask: np.ndarray
+    """bool: where one does."""
+    labels: np.ndarray
+    """uint16: which photograph each pixel is from, 65535 for none."""
+    views: dict
+    """Of each photograph that is used (Camera, R): the world's frame to the camera's."""
+    gains: np.ndarray
+    """float32 (n, 3): what red, green and blue of each photograph were multiplied with."""
+    left_out: dict
+    """By index, why a photograph is not used."""
+    rms: float
+    """Root mean square distance of the matches, px of the photographs."""
+    shows_parallax: bool
+    """Whether the photographs were taken from different places: what is near may be cut in two."""
+    seconds: dict
+    """By stage."""
+
+    def _words(self):
+        height, width = self.mask.shape
+        return f"{width}×{height} px of {len(self.views)} photographs, {self.rms:.2f} px RMS, {len(self.left_out)} left out"
+
+
+@_result
+class Object(_Result):
+    """A region of a photograph in the object's color."""
+
+    found: bool
+    """Whether it is the object."""
+    score: "float | None"
+    """0 to 1: how well color and shape agree with the objects that were trained on."""
+    center: tuple
+    """x and y, px."""
+    area: int
+    """Pixels."""
+    axes: tuple
+    """Semi-axes of the ellipse with its moments, px."""
+    angle: float
+    """Of the major axis, radians, from right towards down."""
+    box: tuple
+    """Left, top, width, height, px."""
+    truncated: bool
+    """Whether it touches the border."""
+
+    def _words(self):
+        found = "found" if self.found else "not found"
+        return f"{found} at {self.center[0]:.1f}, {self.center[1]:.1f}, {self.area} px"
+
+
+@_result
+class Located(_Result):
+    """Where an object is in a photograph."""
+
+    mask: np.ndarray
+    """bool: the pixels of the objects that were found."""
+    objects: tuple
+    """All regions in its color, the best first."""
+    seconds: dict
+    """By stage."""
+
+    def _words(self):
+        return f"{sum(o.found for o in self.objects)} found among {len(self.objects)} regions"

@@ -71,6 +71,110 @@ class ImageTooSmallError(EpipoleError, ValueError):
     """A photograph is smaller than what is looked for."""
 
 
+class ImageSizeError(EpipoleError, ValueError):
+    """A photograph has another size than its camera. ``image``, ``expected``."""
+
+
+class CameraSizeError(ImageSizeError):
+    """The same of photographs of a reconstruction. ``camera``, ``photo``."""
+
+
+class BoardNotFoundError(EpipoleError):
+    """The calibration board is not on the photograph: ``kind`` and the numbers say what is."""
+
+
+class NoBoardError(BoardNotFoundError):
+    """Nothing is a chessboard. ``corners``."""
+
+
+class NoMarkersError(BoardNotFoundError):
+    """No marker of the board can be read. ``dictionary``, ``seen``."""
+
+
+class OtherDictionaryError(BoardNotFoundError):
+    """The markers are of another dictionary. ``seen``, ``asked``."""
+
+
+class MirroredError(BoardNotFoundError):
+    """The board is mirrored."""
+
+
+class OtherLayoutError(BoardNotFoundError):
+    """The markers lie otherwise."""
+
+
+class OtherSizeError(BoardNotFoundError):
+    """There is a chessboard of another size."""
+
+
+class PartialError(BoardNotFoundError):
+    """Only a part of the chessboard is seen."""
+
+
+class SeveralBoardsError(BoardNotFoundError):
+    """There are several boards."""
+
+
+class NoBoardsError(EpipoleError):
+    """No photograph shows the board. ``refusals``: why, by view and camera."""
+
+
+class TooFewViewsError(EpipoleError):
+    """A camera has too few views of the board. ``camera``, ``got``, ``needed``."""
+
+
+class TooFewMatchesError(EpipoleError):
+    """There are too few matches between two photographs. ``got``, ``needed``."""
+
+
+class TooFewInliersError(EpipoleError):
+    """Too few matches agree on a motion of the camera."""
+
+
+class PureRotationError(EpipoleError):
+    """The camera only turned: there is no depth to be seen."""
+
+
+class PlanarError(EpipoleError):
+    """All that agrees lies on a plane."""
+
+
+class LittleParallaxError(EpipoleError):
+    """The camera moved too little for depth."""
+
+
+class UncertainPoseError(EpipoleError):
+    """The motion is not determined well enough."""
+
+
+class WrongFocalError(EpipoleError, ValueError):
+    """The focal length that was given contradicts the matches."""
+
+
+class ImplausibleFocalError(EpipoleError):
+    """The matches lead to a focal length that photographs do not have."""
+
+
+class NoPairsError(EpipoleError):
+    """No two photographs show enough of the same. ``photos``."""
+
+
+class TooFewPhotosError(EpipoleError, ValueError):
+    """More photographs are needed. ``got``."""
+
+
+class NoOverlapError(EpipoleError):
+    """The photographs have nothing in common. ``images``: what became of each."""
+
+
+class NoForegroundError(EpipoleError, ValueError):
+    """No mask marks a pixel. ``photos``."""
+
+
+class NoBackgroundError(EpipoleError, ValueError):
+    """The masks mark every pixel. ``photos``."""
+
+
 class InternalError(RuntimeError):
     """A mistake of this package."""
 

@@ -23,7 +23,25 @@ def options(function):
 
 @pytest.mark.parametrize(
     "function",
-    ["StereoMatcher", "depth", "match_features", "estimate_homography", "estimate_fundamental", "estimate_essential"],
+    [
+        "StereoMatcher",
+        "Undistorter",
+        "calibrate",
+        "depth",
+        "estimate_essential",
+        "estimate_fundamental",
+        "estimate_homography",
+        "estimate_pose",
+        "extract_features",
+        "find_board",
+        "match",
+        "match_features",
+        "panorama",
+        "reconstruct",
+        "rectify",
+        "sfm",
+        "undistort",
+    ],
 )
 def test_options_and_defaults_of_the_stub(function):
     assert options(function) == pytest.approx(epipole.defaults(function))
@@ -32,10 +50,17 @@ def test_options_and_defaults_of_the_stub(function):
 def test_the_stub_names_what_there_is():
     there = {node.name for node in STUB.body if isinstance(node, (ast.ClassDef, ast.FunctionDef))}
     there = {name for name in there if not name.startswith("_")}
-    public = {name for name in epipole.__all__ if name not in ("errors", "__version__")}
-    assert there == public
+    own = {"AprilGrid", "ArucoGrid", "CharucoBoard", "Chessboard", "ColorModel", "Features", "PointCloud", "Reconstruction"}
+    public = {name for name in epipole.__all__ if name not in ("errors", "boards", "__version__")}
+    # What is behind classes of Python.
+    assert there - {"FittedColorModel", "read_model", "write_model"} == public - own
     for name in epipole.__all__:
         assert hasattr(epipole, name)
     assert epipole.Depth.__name__ == "Depth" and epipole.errors.EpipoleError
     with pytest.raises(AttributeError):
         epipole.nothing
+
+
+def test_the_options_of_the_color_model_are_those_of_the_library():
+    assert epipole.ColorModel().get_params() == epipole.defaults("ColorModel")
+    assert epipole.boards.CharucoBoard((7, 5), 35, 26).dictionary == epipole.ArucoGrid((3, 4), 20).dictionary

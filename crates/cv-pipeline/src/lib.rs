@@ -56,7 +56,7 @@ pub use cv_core::{Cancelled, Progress, Silent};
 pub use cv_features::{FeatureExtractor, FeatureMethod, FeatureOptions, Features};
 pub use cv_geometry::{
     EstimateError, Intrinsics, PLAUSIBLE_FOCAL, RobustModel, RobustOptions, TwoViewError, TwoViewOptions, TwoViewPoint,
-    TwoViewReconstruction,
+    TwoViewReconstruction, WorldMatch, estimate_pose,
 };
 pub use depth::{DepthError, DepthOptions, DepthResult, DisparityRange, depth, depth_with};
 pub use disparity_range::{RangeError, disparity_range};
@@ -127,7 +127,7 @@ pub mod calibration {
     pub use cv_calib::*;
     pub use cv_features::{
         BlackRectangle, Board, BoardError, BoardKind, BoardPoint, BoardSize, CharucoBoard, Chessboard,
-        ChessboardOptions, Dictionary, GridStyle, MarkerGrid, find_board,
+        ChessboardOptions, Dictionary, GridStyle, MarkerGrid, find_board, find_chessboard,
     };
 }
 

@@ -62,6 +62,28 @@ macro_rules! with_views {
     }};
 }
 
+/// The same over one image.
+#[macro_export]
+macro_rules! with_view {
+    ($image:expr, |$x:ident| $body:expr) => {{
+        use $crate::arrays::ImageArg;
+        macro_rules! one {
+            ($borrowed:expr) => {
+                match ($borrowed.view::<1>(), $borrowed.view::<3>()) {
+                    (Some($x), _) => $body,
+                    (_, Some($x)) => $body,
+                    _ => Err($crate::errors::internal("the image is neither gray nor color")),
+                }
+            };
+        }
+        match &$image {
+            ImageArg::U8(borrowed) => one!(borrowed),
+            ImageArg::U16(borrowed) => one!(borrowed),
+            ImageArg::F32(borrowed) => one!(borrowed),
+        }
+    }};
+}
+
 impl<'py> ImageArg<'py> {
     /// Borrows an array of shape (height, width) or (height, width, 1 or 3), or whatever has `__array__` or `__dlpack__`. `what` names it in errors.
     pub(crate) fn new(given: &Bound<'py, PyAny>, what: &str) -> PyResult<Self> {
@@ -291,6 +313,30 @@ pub(crate) fn rows<const N: usize>(given: &Bound<'_, PyAny>, what: &str) -> PyRe
     let values = array.try_readonly().map_err(busy)?;
     let slice = values.as_slice().map_err(|_| PyValueError::new_err("the array is not contiguous"))?;
     Ok(slice.as_chunks::<N>().0.to_vec())
+}
+
+/// A table of floats and its number of columns.
+pub(crate) fn table(given: &Bound<'_, PyAny>, what: &str) -> PyResult<(Vec<f32>, usize)> {
+    let py = given.py();
+    let made = py.import("numpy")?.call_method1("ascontiguousarray", (given, dtype::<f32>(py)))?;
+    let array = made.cast::<PyArrayDyn<f32>>()?;
+    let [_, columns] = *array.shape() else {
+        let shape = array.shape();
+        return Err(of_shape(py, shape, &format!("{what} has shape {shape:?}; it must be (n, columns)")));
+    };
+    Ok((array.try_readonly().map_err(busy)?.as_array().iter().copied().collect(), columns))
+}
+
+/// Numbers from whatever makes an array of them, flattened.
+pub(crate) fn numbers(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Vec<f64>> {
+    let py = given.py();
+    let made = py.import("numpy")?.call_method1("ascontiguousarray", (given, dtype::<f64>(py)))?;
+    let array = made.cast::<PyArrayDyn<f64>>()?;
+    let values: Vec<f64> = array.try_readonly().map_err(busy)?.as_array().iter().copied().collect();
+    match values.iter().position(|v| !v.is_finite()) {
+        Some(at) => Err(PyValueError::new_err(format!("{what}: number {at} is not finite"))),
+        None => Ok(values),
+    }
 }
 
 /// An image as an array of shape (height, width), or (height, width, C), in the same memory.

@@ -13,6 +13,17 @@ use std::io::ErrorKind;
 pub(crate) trait JobError: std::error::Error + Serialize + Send + 'static {}
 impl<E: std::error::Error + Serialize + Send + 'static> JobError for E {}
 
+/// What ends a job, as an exception.
+pub(crate) trait Refused: Send {
+    fn exception(&self, py: Python<'_>) -> PyErr;
+}
+
+impl<E: JobError> Refused for E {
+    fn exception(&self, py: Python<'_>) -> PyErr {
+        refused(py, self)
+    }
+}
+
 /// The exception for an error: the class of `epipole.errors` that is named after the innermost variant, with its fields.
 pub(crate) fn refused(py: Python<'_>, error: &impl JobError) -> PyErr {
     let (mut variants, mut fields) = (Vec::new(), Map::new());
@@ -32,6 +43,19 @@ fn made(py: Python<'_>, variants: &[String], fields: &Map<String, Value>, words:
     }
     let error = py.import("epipole.errors")?.call_method1("_made", (PyList::new(py, variants)?, words, attributes))?;
     Ok(PyErr::from_value(error))
+}
+
+/// Why something was left out, as data: `kind`, the name of the innermost variant, and the fields.
+pub(crate) fn reason<'py>(py: Python<'py>, reason: &impl Serialize) -> PyResult<Bound<'py, PyAny>> {
+    let value = serde_json::to_value(reason).map_err(|error| internal(&error.to_string()))?;
+    let (mut variants, mut fields) = (Vec::new(), Map::new());
+    flatten(value, &mut variants, &mut fields);
+    let all = PyDict::new(py);
+    all.set_item("kind", variants.last())?;
+    for (name, value) in fields {
+        all.set_item(name, to_python(py, &value)?)?;
+    }
+    Ok(all.into_any())
 }
 
 /// The names of variants from the outside in, and the fields of all of them. An error is `{"Variant": {"field": …}}`, or a name alone; one that holds another has

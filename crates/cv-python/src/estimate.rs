@@ -1,11 +1,12 @@
 //! Models that most of a set of matches agree on.
 
 use crate::arrays;
+use crate::camera::PyCamera;
 use crate::job::Run;
 use crate::options::Options;
 use crate::results::{self, Field, object};
-use cv_core::{Camera, Correspondence, Matrix3};
-use cv_pipeline::{ModelKind, RobustModel, RobustOptions, estimate, estimate_calibrated};
+use cv_core::{Camera, Correspondence, Matrix3, Point2, Point3, StageClock};
+use cv_pipeline::{ModelKind, RobustModel, RobustOptions, WorldMatch, estimate, estimate_calibrated};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -93,7 +94,7 @@ pub(crate) fn estimate_fundamental<'py>(
 
 /// The essential matrix and the relative pose x2 = R x1 + t, |t| = 1, that most matches agree on.
 ///
-/// matches: (n, 4), rows x1 y1 x2 y2 in pixels without lens distortion. k1, k2: the 3×3 calibration matrices of the two views; k2 is k1 where it is not given.
+/// matches: (n, 4), rows x1 y1 x2 y2 in pixels. k1, k2: the cameras of the two views, or 3×3 calibration matrices where there is no lens distortion; k2 is k1 where it is not given.
 #[pyfunction]
 #[pyo3(signature = (matches, k1, k2 = None, **options))]
 pub(crate) fn estimate_essential<'py>(
@@ -115,8 +116,66 @@ pub(crate) fn estimate_essential<'py>(
     results::made(py, "EssentialModel", all)
 }
 
-/// The pinhole of a calibration matrix.
+pub(crate) fn read_pose(options: &mut Options<'_>) -> PyResult<(RobustOptions, Run)> {
+    read(options, RobustOptions { threshold: POSE_THRESHOLD, ..RobustOptions::essential() })
+}
+
+/// Reprojection error in px up to which a point agrees: COLMAP's for the pose of a photograph in a model.
+const POSE_THRESHOLD: f64 = 4.0;
+
+/// The pose of a camera that sees known points, of which many may be wrong: x = R X + t.
+///
+/// points: (n, 3) in the world's frame. pixels: (n, 2), where they are seen. camera: with its lens. threshold is in px.
+#[pyfunction]
+#[pyo3(signature = (points, pixels, camera, **options))]
+pub(crate) fn estimate_pose<'py>(
+    py: Python<'py>,
+    points: &Bound<'py, PyAny>,
+    pixels: &Bound<'py, PyAny>,
+    camera: &Bound<'py, PyCamera>,
+    options: Option<&Bound<'py, PyDict>>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let mut options = Options::new("estimate_pose", options);
+    let (mut o, run) = read_pose(&mut options)?;
+    options.finish()?;
+    let world: Vec<[f64; 3]> = arrays::rows(points, "points")?;
+    let seen: Vec<[f64; 2]> = arrays::rows(pixels, "pixels")?;
+    if world.len() != seen.len() {
+        return Err(PyValueError::new_err(format!("{} points do not go with {} pixels", world.len(), seen.len())));
+    }
+    let camera = camera.get().camera;
+    let focal = 0.5 * (camera.fx + camera.fy);
+    o.threshold /= focal;
+    let matches: Vec<WorldMatch> = world
+        .iter()
+        .zip(&seen)
+        .map(|(p, pixel)| WorldMatch { world: Point3::from(*p), image: camera.normalize(Point2::from(*pixel)) })
+        .collect();
+    let mut clock = StageClock::new();
+    let found = run.run(py, |progress| cv_pipeline::estimate_pose(&matches, &o, progress))?;
+    clock.lap("pose");
+    let mut inliers = vec![false; matches.len()];
+    found.inliers.iter().for_each(|&i| inliers[i] = true);
+    results::made(
+        py,
+        "PoseModel",
+        [
+            ("rotation", arrays::matrix(py, found.model.rotation.matrix())?),
+            ("translation", arrays::vector(py, &found.model.translation)?),
+            ("inliers", arrays::shaped(py, inliers, &[matches.len()])?),
+            ("rms", object(py, found.rms * focal)?),
+            ("iterations", object(py, found.iterations)?),
+            ("log10_false_alarms", object(py, found.log_nfa)?),
+            ("seconds", results::stages(py, &clock.into_stages())?),
+        ],
+    )
+}
+
+/// A camera, or the pinhole of a calibration matrix.
 fn camera(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Camera> {
+    if let Ok(camera) = given.cast::<PyCamera>() {
+        return Ok(camera.get().camera);
+    }
     let m = arrays::matrix_from(given, what)?;
     // Skewed pixels are no camera's of today; a scaled or transposed matrix is a mistake.
     let expected = Matrix3::new(m.m11, 0.0, m.m13, 0.0, m.m22, m.m23, 0.0, 0.0, 1.0);

@@ -1,6 +1,6 @@
 //! Runs a job without the interpreter: other Python threads go on, Ctrl-C stops it, and a callable hears how far it is.
 
-use crate::errors::{JobError, internal, refused};
+use crate::errors::{Refused, internal};
 use crate::options::Options;
 use cv_core::{Cancelled, Progress};
 use pyo3::exceptions::PyTypeError;
@@ -45,7 +45,7 @@ impl Run {
     /// # Errors
     /// What the job refuses, as the exceptions of `epipole.errors`; `KeyboardInterrupt` and whatever else the callable or a signal's handler raises; a panic as
     /// `InternalError`.
-    pub(crate) fn run<R: Send, E: JobError>(
+    pub(crate) fn run<R: Send, E: Refused>(
         &self,
         py: Python<'_>,
         job: impl FnOnce(&dyn Progress) -> Result<R, E> + Send,
@@ -88,7 +88,7 @@ impl Run {
                 }
                 Ok(result)
             }
-            (Ok(Err(error)), None) => Err(refused(py, &error)),
+            (Ok(Err(error)), None) => Err(error.exception(py)),
             (Err(panic), None) => Err(internal(message(&*panic))),
         }
     }

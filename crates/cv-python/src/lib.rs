@@ -6,10 +6,17 @@
 //!
 //! | file | what Python sees |
 //! |---|---|
+//! | `camera.rs` | `Camera`, `Rig` |
+//! | `calibration.rs` | `find_board`, `calibrate` |
+//! | `rectify.rs` | `rectify`, `undistort`, `Undistorter` |
 //! | `stereo.rs` | `StereoMatcher`, `depth`, `evaluate_disparity` |
-//! | `matching.rs` | `match_features` |
-//! | `estimate.rs` | `estimate_homography`, `estimate_fundamental`, `estimate_essential` |
-//! | `files.rs` | `read_image`, `write_image`, `read_map`, `write_map` |
+//! | `matching.rs` | `extract_features`, `match`, `match_features` |
+//! | `estimate.rs` | `estimate_homography`, `estimate_fundamental`, `estimate_essential`, `estimate_pose` |
+//! | `reconstruct.rs`, `sfm.rs` | `reconstruct`, `sfm` |
+//! | `model.rs` | what `Reconstruction` reads and writes |
+//! | `panorama.rs` | `panorama` |
+//! | `segment.rs` | what is behind `ColorModel`; `evaluate_mask` |
+//! | `files.rs`, `cloud.rs` | `read_image`, `write_image`, `read_map`, `write_map`, `write_cloud` |
 //!
 //! ```python
 //! import epipole
@@ -25,13 +32,23 @@
 //! channel; color is RGB; points are (x, y) with the center of the first pixel at (0, 0).
 
 mod arrays;
+mod calibration;
+mod camera;
+mod cloud;
 mod errors;
 mod estimate;
 mod files;
 mod job;
 mod matching;
+mod model;
 mod options;
+mod panorama;
+mod photographs;
+mod reconstruct;
+mod rectify;
 mod results;
+mod segment;
+mod sfm;
 mod stereo;
 
 use pyo3::exceptions::PyValueError;
@@ -45,10 +62,22 @@ type Read = fn(&mut options::Options<'_>) -> PyResult<()>;
 const FUNCTIONS: &[(&str, Read)] = &[
     ("depth", |options| stereo::DepthArguments::read(options).map(drop)),
     ("StereoMatcher", |options| stereo::matcher_arguments(options).map(drop)),
+    ("rectify", |options| rectify::read(options).map(drop)),
+    ("undistort", |options| rectify::read(options).map(drop)),
+    ("Undistorter", |options| rectify::read(options).map(drop)),
+    ("find_board", |options| calibration::read_find(options).map(drop)),
+    ("calibrate", |options| calibration::read(options).map(drop)),
+    ("extract_features", |options| matching::read_extraction(options).map(drop)),
+    ("match", |options| matching::read_match(options).map(drop)),
     ("match_features", |options| matching::Arguments::read(options).map(drop)),
     ("estimate_homography", |options| estimate::read_homography(options).map(drop)),
     ("estimate_fundamental", |options| estimate::read_fundamental(options).map(drop)),
     ("estimate_essential", |options| estimate::read_essential(options).map(drop)),
+    ("estimate_pose", |options| estimate::read_pose(options).map(drop)),
+    ("reconstruct", |options| reconstruct::Arguments::read(options).map(drop)),
+    ("sfm", |options| sfm::Arguments::read(options).map(drop)),
+    ("panorama", |options| panorama::Arguments::read(options).map(drop)),
+    ("ColorModel", |options| segment::read(options).map(drop)),
 ];
 
 /// The options of a function and their defaults; those without one are `None`.
@@ -66,18 +95,41 @@ fn defaults<'py>(py: Python<'py>, function: &str) -> PyResult<Bound<'py, PyDict>
 #[pymodule(gil_used = false)]
 fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
+    module.add_class::<camera::PyCamera>()?;
+    module.add_class::<camera::PyRig>()?;
+    module.add_class::<rectify::PyUndistorter>()?;
     module.add_class::<stereo::PyStereoMatcher>()?;
+    module.add_class::<segment::PyColorModel>()?;
+    macro_rules! functions {
+        ($($of:ident::$function:ident),* $(,)?) => { $(module.add_function(wrap_pyfunction!($of::$function, module)?)?;)* };
+    }
     module.add_function(wrap_pyfunction!(defaults, module)?)?;
-    module.add_function(wrap_pyfunction!(arrays::is_borrowed, module)?)?;
-    module.add_function(wrap_pyfunction!(stereo::depth, module)?)?;
-    module.add_function(wrap_pyfunction!(stereo::evaluate_disparity, module)?)?;
-    module.add_function(wrap_pyfunction!(matching::match_features, module)?)?;
-    module.add_function(wrap_pyfunction!(estimate::estimate_homography, module)?)?;
-    module.add_function(wrap_pyfunction!(estimate::estimate_fundamental, module)?)?;
-    module.add_function(wrap_pyfunction!(estimate::estimate_essential, module)?)?;
-    module.add_function(wrap_pyfunction!(files::read_image, module)?)?;
-    module.add_function(wrap_pyfunction!(files::write_image, module)?)?;
-    module.add_function(wrap_pyfunction!(files::read_map, module)?)?;
-    module.add_function(wrap_pyfunction!(files::write_map, module)?)?;
+    functions!(
+        arrays::is_borrowed,
+        calibration::calibrate,
+        calibration::find_board,
+        cloud::write_cloud,
+        estimate::estimate_essential,
+        estimate::estimate_fundamental,
+        estimate::estimate_homography,
+        estimate::estimate_pose,
+        files::read_image,
+        files::read_map,
+        files::write_image,
+        files::write_map,
+        matching::extract_features,
+        matching::match_,
+        matching::match_features,
+        model::read_model,
+        model::write_model,
+        panorama::panorama,
+        reconstruct::reconstruct,
+        rectify::rectify,
+        rectify::undistort,
+        segment::evaluate_mask,
+        sfm::sfm,
+        stereo::depth,
+        stereo::evaluate_disparity,
+    );
     Ok(())
 }

@@ -1,12 +1,53 @@
-//! The same points in two photographs.
+//! Features of photographs, and the same points in two of them.
 
 use crate::arrays::{self, Rgb};
 use crate::job::Run;
 use crate::options::Options;
 use crate::results::{self, object};
-use cv_pipeline::{FeatureMethod, MatchingOptions, match_photos};
+use cv_core::Keypoint;
+use cv_pipeline::features::{DescriptorKind, Descriptors};
+use cv_pipeline::{
+    FeatureMethod, FeatureOptions, Features, MatchingOptions, MatchingResult, extract_features as extract,
+    match_extracted, match_photos,
+};
+use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+
+/// `features` and `max_features`.
+pub(crate) fn feature_options(options: &mut Options<'_>) -> PyResult<FeatureOptions> {
+    let method = feature_method(options)?;
+    max_features(options, method.into())
+}
+
+/// `features`.
+pub(crate) fn feature_method(options: &mut Options<'_>) -> PyResult<FeatureMethod> {
+    let mut method = FeatureMethod::default();
+    options.set_named("features", &mut method)?;
+    Ok(method)
+}
+
+/// The same with the most features that are asked for.
+pub(crate) fn max_features(options: &mut Options<'_>, features: FeatureOptions) -> PyResult<FeatureOptions> {
+    Ok(match options.take("max_features")? {
+        Some(most) => features.at_most(most),
+        None => features,
+    })
+}
+
+/// The options of `extract_features`.
+pub(crate) fn read_extraction(options: &mut Options<'_>) -> PyResult<(FeatureOptions, Run)> {
+    Ok((feature_options(options)?, Run::read(options)?))
+}
+
+/// The options of `match`.
+pub(crate) fn read_match(options: &mut Options<'_>) -> PyResult<(MatchingOptions, Run)> {
+    let mut o = MatchingOptions::default();
+    options.set("mutual", &mut o.mutual)?;
+    o.guided = options.take_named("guided")?;
+    options.set("seed", &mut o.seed)?;
+    Ok((o, Run::read(options)?))
+}
 
 /// The options of `match_features`.
 pub(crate) struct Arguments {
@@ -16,12 +57,7 @@ pub(crate) struct Arguments {
 
 impl Arguments {
     pub(crate) fn read(options: &mut Options<'_>) -> PyResult<Self> {
-        let mut method = FeatureMethod::default();
-        options.set_named("features", &mut method)?;
-        let mut o = MatchingOptions { features: method.into(), ..MatchingOptions::default() };
-        if let Some(most) = options.take("max_features")? {
-            o.features = o.features.at_most(most);
-        }
+        let mut o = MatchingOptions { features: feature_options(options)?, ..MatchingOptions::default() };
         options.set("mutual", &mut o.mutual)?;
         options.set_named("affine_simulation", &mut o.affine_simulation)?;
         o.guided = options.take_named("guided")?;
@@ -47,15 +83,21 @@ pub(crate) fn match_features<'py>(
     let (a, b) = (Rgb::new(a, "a")?, Rgb::new(b, "b")?);
     let views = (a.view()?, b.view()?);
     let found = arguments.run.run(py, |progress| match_photos(views.0, views.1, &arguments.options, progress))?;
+    matches(py, &found)
+}
+
+/// Keypoints as rows x, y, scale, angle, response.
+pub(crate) fn keypoints<'py>(py: Python<'py>, keypoints: &[Keypoint]) -> PyResult<Bound<'py, PyAny>> {
+    let rows: Vec<[f32; 5]> =
+        keypoints.iter().map(|k| [k.position.x, k.position.y, k.scale, k.angle, k.response]).collect();
+    arrays::row_array(py, &rows)
+}
+
+fn matches<'py>(py: Python<'py>, found: &MatchingResult) -> PyResult<Bound<'py, PyAny>> {
     let points: Vec<[f64; 4]> = found.pairs().iter().map(|p| [p.a.x, p.a.y, p.b.x, p.b.y]).collect();
     let indices: Vec<[u32; 2]> = found.matches.iter().map(|m| [m.query, m.train]).collect();
     let ratios: Vec<f32> = found.matches.iter().map(|m| m.ratio).collect();
-    let keypoints = |i: usize| {
-        let rows: Vec<[f32; 5]> = (found.features[i].keypoints.iter())
-            .map(|k| [k.position.x, k.position.y, k.scale, k.angle, k.response])
-            .collect();
-        arrays::row_array(py, &rows)
-    };
+    let [a, b] = &found.features;
     results::made(
         py,
         "Matches",
@@ -63,8 +105,78 @@ pub(crate) fn match_features<'py>(
             ("points", arrays::row_array(py, &points)?),
             ("indices", arrays::row_array(py, &indices)?),
             ("ratios", arrays::shaped(py, ratios, &[points.len()])?),
-            ("keypoints", object(py, (keypoints(0)?, keypoints(1)?))?),
+            ("keypoints", object(py, (keypoints(py, &a.keypoints)?, keypoints(py, &b.keypoints)?))?),
             ("seconds", results::stages(py, &found.stages)?),
         ],
     )
+}
+
+/// The features of a photograph: keypoints and their descriptors, for `match`.
+///
+/// image: an array of uint8 of shape (height, width) or (height, width, 3). `defaults("extract_features")` lists the options.
+#[pyfunction]
+#[pyo3(signature = (image, **options))]
+pub(crate) fn extract_features<'py>(
+    py: Python<'py>,
+    image: &Bound<'py, PyAny>,
+    options: Option<&Bound<'py, PyDict>>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let mut options = Options::new("extract_features", options);
+    let (o, run) = read_extraction(&mut options)?;
+    options.finish()?;
+    let image = Rgb::new(image, "image")?;
+    let view = image.view()?;
+    let found = run.run(py, |progress| extract(view, &o, progress))?;
+    let rows = found.descriptors.as_slice().to_vec();
+    results::made(
+        py,
+        "Features",
+        [
+            ("keypoints", keypoints(py, &found.keypoints)?),
+            ("descriptors", arrays::shaped(py, rows, &[found.keypoints.len(), found.descriptors.dimension()])?),
+            ("kind", object(py, found.descriptors.kind().name)?),
+        ],
+    )
+}
+
+/// Features as they came from `extract_features`, or from elsewhere: of another kind than ours, nothing but their number of columns is known.
+fn features(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Features> {
+    let kind: String = given.getattr("kind")?.extract()?;
+    let keypoints: Vec<[f64; 5]> = arrays::rows(&given.getattr("keypoints")?, "keypoints")?;
+    let (numbers, columns) = arrays::table(&given.getattr("descriptors")?, "descriptors")?;
+    let own = DescriptorKind::OWN.into_iter().find(|own| own.name == kind && own.dimension == columns);
+    let kind = own.unwrap_or(DescriptorKind::foreign(columns.max(1)));
+    let rows = numbers.len() / columns.max(1);
+    if rows != keypoints.len() {
+        let text = format!("{what} has {} keypoints and {rows} descriptors", keypoints.len());
+        return Err(PyValueError::new_err(text));
+    }
+    let descriptors = Descriptors::from_vec(kind, numbers)
+        .ok_or_else(|| PyValueError::new_err(format!("{what}: the descriptors are no rows of {columns} numbers")))?;
+    let keypoint = |[x, y, scale, angle, response]: [f64; 5]| Keypoint {
+        scale: scale as f32,
+        angle: angle as f32,
+        ..Keypoint::new(x as f32, y as f32, response as f32)
+    };
+    let mut all = Features::new(kind);
+    all.keypoints = keypoints.into_iter().map(keypoint).collect();
+    all.descriptors = descriptors;
+    Ok(all)
+}
+
+/// Tentative matches between the features of two photographs: some are wrong. a, b: `Features`, from `extract_features` or from elsewhere.
+#[pyfunction]
+#[pyo3(name = "match", signature = (a, b, **options))]
+pub(crate) fn match_<'py>(
+    py: Python<'py>,
+    a: &Bound<'py, PyAny>,
+    b: &Bound<'py, PyAny>,
+    options: Option<&Bound<'py, PyDict>>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let mut options = Options::new("match", options);
+    let (o, run) = read_match(&mut options)?;
+    options.finish()?;
+    let both = [features(a, "a")?, features(b, "b")?];
+    let found = run.run(py, |progress| match_extracted(both, &o, progress))?;
+    matches(py, &found)
 }

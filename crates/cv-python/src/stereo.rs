@@ -1,14 +1,19 @@
 //! Disparity and depth.
 
 use crate::arrays::{self, ImageArg};
+use crate::camera::PyRig;
 use crate::errors::refused;
 use crate::job::{Run, Shared};
 use crate::options::Options;
+use crate::rectify::{self, view_options};
 use crate::results::{self, data, object};
-use crate::with_views;
-use cv_core::{Cancelled, GrayF32, Progress};
-use cv_pipeline::stereo::{DisparityMap, PixelState, StereoError, StereoGeometry, StereoMatcher, StereoOptions};
-use cv_pipeline::{DepthOptions, DisparityRange};
+use crate::{cloud, with_views};
+use cv_core::{Cancelled, GrayF32, Progress, StereoRig};
+use cv_pipeline::stereo::{
+    DisparityMap, GeometryError, PixelState, Rectification, RectifyOptions, StereoError, StereoGeometry, StereoMatcher,
+    StereoOptions,
+};
+use cv_pipeline::{DepthError, DepthOptions, DisparityRange, FrameDepth, RigDepthResult};
 use numpy::{PyArray2, PyArrayMethods, PyReadwriteArray2, PyUntypedArrayMethods};
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
@@ -48,6 +53,9 @@ pub(crate) struct DepthArguments {
     focal: Option<f64>,
     baseline: Option<f64>,
     offset: f64,
+    rig: Option<StereoRig>,
+    view: RectifyOptions,
+    cloud: bool,
     run: Run,
 }
 
@@ -72,28 +80,38 @@ impl DepthArguments {
         let (focal, baseline) = (options.take("focal")?, options.take("baseline")?);
         let mut offset = 0.0;
         options.set("offset", &mut offset)?;
+        let rig: Option<Bound<'_, PyRig>> = options.take("rig")?;
+        if rig.is_some() && (focal.is_some() || baseline.is_some()) {
+            return Err(PyTypeError::new_err(
+                "depth() takes a rig, or focal and baseline of a rectified pair, not both",
+            ));
+        }
+        let view = view_options(options)?;
         options.set("near", &mut o.range.0)?;
         options.set("far", &mut o.range.1)?;
-        Ok(Self { options: o, focal, baseline, offset, run: Run::read(options)? })
+        let mut cloud = false;
+        options.set("cloud", &mut cloud)?;
+        let rig = rig.map(|rig| rig.get().rig);
+        Ok(Self { options: o, focal, baseline, offset, rig, view, cloud, run: Run::read(options)? })
     }
 
-    fn geometry(&self, py: Python<'_>, (width, height): (usize, usize)) -> PyResult<Option<StereoGeometry>> {
+    /// Of a rectified pair, where it is known.
+    fn geometry(&self, (width, height): (usize, usize)) -> PyResult<Option<Result<StereoGeometry, GeometryError>>> {
         match (self.focal, self.baseline) {
             (None, None) => Ok(None),
             (Some(focal), Some(baseline)) => {
-                let geometry =
-                    StereoGeometry::from_focal(width, height, focal, baseline).map_err(|error| refused(py, &error))?;
-                Ok(Some(StereoGeometry { offset: self.offset, ..geometry }))
+                let geometry = StereoGeometry::from_focal(width, height, focal, baseline);
+                Ok(Some(geometry.map(|geometry| StereoGeometry { offset: self.offset, ..geometry })))
             }
             _ => Err(PyTypeError::new_err("depth() needs focal and baseline together")),
         }
     }
 }
 
-/// Disparity of a rectified pair, and depth where its geometry is known.
+/// Disparity of a pair, and depth where its geometry is known.
 ///
-/// left, right: arrays of one shape (height, width) or (height, width, 3) of uint8, uint16 or float32 (0 to 1). With focal (px) and baseline there is depth in the unit of
-/// the baseline. `defaults("depth")` lists the options.
+/// left, right: arrays of one shape (height, width) or (height, width, 3) of uint8, uint16 or float32 (0 to 1), rectified; with `rig`, as its cameras took them. With focal (px) and
+/// baseline, or a rig, there is depth in the unit of the baseline. `defaults("depth")` lists the options.
 ///
 /// Raises NoPairError where hardly any pixel has a partner, and others of epipole.errors.
 #[pyfunction]
@@ -109,14 +127,24 @@ pub(crate) fn depth<'py>(
     options.finish()?;
     let (left, right) = (ImageArg::new(left, "left")?, ImageArg::new(right, "right")?);
     let (width, height, _) = left.shape();
-    let geometry = arguments.geometry(py, (width, height))?;
-    let found = with_views!(py, [left, right], |a, b| arguments.run.run(py, |progress| cv_pipeline::depth(
-        a,
-        b,
-        geometry.as_ref(),
-        &arguments.options,
-        progress
-    )))?;
+    let geometry =
+        arguments.geometry((width, height))?.transpose().map_err(|error: GeometryError| refused(py, &error))?;
+    let rectification = arguments.rig.map(|rig| Rectification::new(&rig, &arguments.view)).transpose();
+    let rectification = rectification.map_err(|error| refused(py, &error))?;
+    let geometry = rectification.map(|r| r.geometry).or(geometry);
+    let (found, images, cloud) = with_views!(py, [left, right], |a, b| arguments.run.run(py, |progress| {
+        let options = &arguments.options;
+        if rectification.is_none() && !arguments.cloud {
+            let found = cv_pipeline::depth(a, b, geometry.as_ref(), options, progress)?;
+            return Ok::<_, DepthError>((found, None, None));
+        }
+        let mut frames = match &rectification {
+            Some(rectification) => FrameDepth::of_rig(options.clone(), rectification)?,
+            None => FrameDepth::new(options.clone(), geometry)?,
+        };
+        let RigDepthResult { images, maps, cloud } = frames.next_depth(a, b, arguments.cloud, progress)?;
+        Ok((maps, rectification.map(|_| images), arguments.cloud.then_some(cloud)))
+    }))?;
     let (valid, matched) = (found.map.valid_fraction(), found.map.matched_fraction());
     let depth_deviation = found.depth_sigma();
     let none = || object(py, py.None());
@@ -131,6 +159,13 @@ pub(crate) fn depth<'py>(
             ("depth", map(found.depth)?),
             ("depth_deviation", map(depth_deviation)?),
             ("confidence", map(found.confidence)?),
+            ("Q", geometry.map_or_else(none, |geometry| rectify::q(py, &geometry.q()))?),
+            (
+                "images",
+                images
+                    .map_or_else(none, |[one, two]| object(py, (arrays::array(py, one)?, arrays::array(py, two)?)))?,
+            ),
+            ("cloud", cloud.map_or_else(none, |cloud| cloud::made(py, cloud))?),
             ("disparities", object(py, found.disparities)?),
             ("valid_fraction", object(py, valid)?),
             ("matched_fraction", object(py, matched)?),

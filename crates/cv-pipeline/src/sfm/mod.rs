@@ -12,7 +12,7 @@ pub use pairs::sfm_pairs;
 pub use photo::{SfmPhoto, SfmPhotoError, sfm_photo};
 
 use crate::Progress;
-use cv_core::{Camera, Cancelled, OptionError, Pose, StageClock};
+use cv_core::{Camera, Cancelled, Distortion, OptionError, Pose, StageClock};
 use cv_features::{FeatureOptions, RatioTest, SiftOptions};
 use cv_sfm::{
     AdjustError, CameraKnowledge, FeatureDistance, ModelCovariance, Observation, PairMatches, RefusedPair, SfmError,
@@ -92,6 +92,40 @@ pub struct SfmCamera {
     pub camera: Camera,
     /// What is known of it.
     pub knowledge: CameraKnowledge,
+}
+
+/// Relative standard deviation of focal lengths by EXIF, which photographers round and focusing changes.
+const EXIF_DEVIATION: f64 = 0.03;
+/// Focal length over the longer side of a photograph of which nothing is known: COLMAP's, where the pairs do not tell better.
+const USUAL_FOCAL: f64 = 1.2;
+
+impl SfmCamera {
+    /// A calibrated camera, with its lens.
+    pub fn known(camera: Camera) -> Self {
+        Self { camera, knowledge: CameraKnowledge::Known }
+    }
+
+    /// A camera of which the calibration matrix is known and the lens is not.
+    pub fn of_matrix(camera: Camera) -> Self {
+        Self { camera: open_lens(camera), knowledge: CameraKnowledge::Matrix }
+    }
+
+    /// The camera of photographs of that size and about that focal length in pixels, as EXIF tells it.
+    pub fn of_focal((width, height): (usize, usize), focal: f64) -> Self {
+        let knowledge = CameraKnowledge::Focal { focal, deviation: EXIF_DEVIATION };
+        Self { camera: open_lens(Camera::from_focal(width, height, focal)), knowledge }
+    }
+
+    /// The camera of photographs of that size of which nothing is known.
+    pub fn unknown((width, height): (usize, usize)) -> Self {
+        let camera = Camera::from_focal(width, height, USUAL_FOCAL * width.max(height) as f64);
+        Self { camera: open_lens(camera), knowledge: CameraKnowledge::Unknown }
+    }
+}
+
+/// The same with radial distortion, to be found.
+fn open_lens(camera: Camera) -> Camera {
+    Camera { distortion: Distortion::radial(0.0, 0.0), ..camera }
 }
 
 /// What [`sfm`] found.

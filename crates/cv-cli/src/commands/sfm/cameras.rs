@@ -4,15 +4,11 @@ use super::Args;
 use super::earlier::Earlier;
 use crate::frame::{Context, Failure};
 use crate::rig;
-use cv_core::{Camera, Distortion, ModelImage, Pose, SparseModel};
+use cv_core::{Camera, ModelImage, Pose, SparseModel};
 use cv_io::CalibrationFormat;
 use cv_pipeline::SfmCamera;
-use cv_pipeline::many_views::CameraKnowledge;
 use std::collections::BTreeMap;
 use std::path::Path;
-
-/// Relative standard deviation of focal lengths by EXIF.
-const EXIF_DEVIATION: f64 = 0.03;
 
 /// The cameras of the photographs so far.
 #[derive(Default)]
@@ -42,7 +38,7 @@ impl Cameras {
             return Ok(Ok(*index));
         }
         args.check_lens(earlier.folder(), &camera)?;
-        self.list.push(SfmCamera { camera, knowledge: CameraKnowledge::Known });
+        self.list.push(SfmCamera::known(camera));
         self.earlier.insert(number, self.list.len() - 1);
         Ok(Ok(self.list.len() - 1))
     }
@@ -61,27 +57,23 @@ impl Cameras {
         if let Some(index) = self.known.get(&key) {
             return Ok(Ok(*index));
         }
-        let lens = |camera: Camera| Camera { distortion: Distortion::radial(0.0, 0.0), ..camera };
         let camera = if let Some(file) = &args.camera {
             let (camera, lens_known) = rig::camera_and_lens(file, Some((width, height)), args.undistorted, context)?;
             if (camera.width, camera.height) != (width, height) {
                 let (w, h) = (camera.width, camera.height);
                 return Ok(Err(format!("it is {width}×{height} px, its camera in {} is {w}×{h} px", file.display())));
             }
-            match lens_known {
-                true => {
-                    args.check_lens(file, &camera)?;
-                    SfmCamera { camera, knowledge: CameraKnowledge::Known }
-                }
-                false => SfmCamera { camera: lens(camera), knowledge: CameraKnowledge::Matrix },
+            if lens_known {
+                args.check_lens(file, &camera)?;
+                SfmCamera::known(camera)
+            } else {
+                SfmCamera::of_matrix(camera)
             }
-        } else if let Some(focal) = focal {
-            let camera = lens(Camera::from_focal(width, height, focal));
-            SfmCamera { camera, knowledge: CameraKnowledge::Focal { focal, deviation: EXIF_DEVIATION } }
         } else {
-            // 1.2 times the longer side, COLMAP's, where the pairs do not tell better.
-            let camera = lens(Camera::from_focal(width, height, 1.2 * width.max(height) as f64));
-            SfmCamera { camera, knowledge: CameraKnowledge::Unknown }
+            focal.map_or_else(
+                || SfmCamera::unknown((width, height)),
+                |focal| SfmCamera::of_focal((width, height), focal),
+            )
         };
         self.list.push(camera);
         self.known.insert(key, self.list.len() - 1);

@@ -1,0 +1,149 @@
+//! Photographs as arrays or as files.
+
+use crate::arrays::{self, Rgb};
+use crate::camera::PyCamera;
+use crate::errors::{JobError, Refused, of_file};
+use crate::options::Options;
+use cv_core::{Camera, ImageView, Matrix3, RgbU8};
+use cv_io::IoError;
+use pyo3::exceptions::{PyTypeError, PyValueError};
+use pyo3::prelude::*;
+use std::borrow::Cow;
+use std::path::{Path, PathBuf};
+
+/// A photograph that a job was given.
+pub(crate) enum Photograph<'py> {
+    Array(Rgb<'py>),
+    File(PathBuf),
+}
+
+impl<'py> Photograph<'py> {
+    /// An array of bytes, or the path of a file.
+    pub(crate) fn new(given: &Bound<'py, PyAny>, what: &str) -> PyResult<Self> {
+        match given.extract::<PathBuf>() {
+            Ok(path) => Ok(Self::File(path)),
+            Err(_) => Rgb::new(given, what).map(Self::Array),
+        }
+    }
+
+    /// Every photograph of a list.
+    pub(crate) fn all(given: &Bound<'py, PyAny>) -> PyResult<Vec<Self>> {
+        // A path is a sequence, too, of its letters.
+        if given.extract::<PathBuf>().is_ok() {
+            return Err(PyTypeError::new_err("a list of photographs is needed, not one path"));
+        }
+        given.try_iter()?.enumerate().map(|(i, one)| Self::new(&one?, &format!("photograph {i}"))).collect()
+    }
+
+    /// The same for threads without the interpreter.
+    pub(crate) fn source(&self) -> PyResult<Source<'_>> {
+        Ok(match self {
+            Self::Array(array) => Source::View(array.view()?),
+            Self::File(path) => Source::File(path),
+        })
+    }
+}
+
+/// Where the pixels of a photograph are.
+#[derive(Clone, Copy)]
+pub(crate) enum Source<'a> {
+    View(ImageView<'a, u8, 3>),
+    File(&'a Path),
+}
+
+/// The pixels of a photograph.
+pub(crate) enum Pixels<'a> {
+    View(ImageView<'a, u8, 3>),
+    Read(RgbU8),
+}
+
+impl Pixels<'_> {
+    pub(crate) fn view(&self) -> ImageView<'_, u8, 3> {
+        match self {
+            Self::View(view) => *view,
+            Self::Read(image) => image.view(),
+        }
+    }
+}
+
+impl<'a> Source<'a> {
+    /// The pixels, and the focal length in px by EXIF.
+    pub(crate) fn read(self) -> Result<(Pixels<'a>, Option<f64>), IoError> {
+        Ok(match self {
+            Self::View(view) => (Pixels::View(view), None),
+            Self::File(path) => {
+                let image = cv_io::read_image(path)?;
+                let focal = image.exif.focal.map(|focal| focal.pixels);
+                (Pixels::Read(image.into_rgb8()), focal)
+            }
+        })
+    }
+
+    /// The file's name, or the number of an array.
+    pub(crate) fn name(self, index: usize) -> Cow<'a, str> {
+        match self {
+            Self::View(_) => Cow::Owned(index.to_string()),
+            Self::File(path) => path.file_name().unwrap_or(path.as_os_str()).to_string_lossy(),
+        }
+    }
+}
+
+/// What ends a job that reads photographs.
+pub(crate) enum Ended<E> {
+    File(IoError),
+    Job(E),
+}
+
+impl<E: JobError> Refused for Ended<E> {
+    fn exception(&self, py: Python<'_>) -> PyErr {
+        match self {
+            Self::File(error) => of_file(py, error),
+            Self::Job(error) => error.exception(py),
+        }
+    }
+}
+
+/// What is known of the camera of photographs.
+pub(crate) enum Known {
+    /// A `Camera`: with its lens.
+    Camera(Camera),
+    /// A 3×3 calibration matrix: nothing is said of the lens.
+    Matrix(Matrix3<f64>),
+    /// About its focal length in px.
+    Focal(f64),
+    /// Nothing: EXIF tells, or the photographs do.
+    Nothing,
+}
+
+impl Known {
+    /// `camera` and `focal`.
+    pub(crate) fn read(options: &mut Options<'_>) -> PyResult<Self> {
+        let camera = options.take_any("camera")?;
+        let focal: Option<f64> = options.take("focal")?;
+        match (camera, focal) {
+            (Some(_), Some(_)) => Err(PyTypeError::new_err("camera and focal are not given together")),
+            (Some(given), None) => Self::of(&given),
+            (None, Some(focal)) if focal > 0.0 && focal.is_finite() => Ok(Self::Focal(focal)),
+            (None, Some(focal)) => Err(PyValueError::new_err(format!("focal must be above 0, not {focal}"))),
+            (None, None) => Ok(Self::Nothing),
+        }
+    }
+
+    /// A `Camera` or a matrix.
+    pub(crate) fn of(given: &Bound<'_, PyAny>) -> PyResult<Self> {
+        match given.cast::<PyCamera>() {
+            Ok(camera) => Ok(Self::Camera(camera.get().camera)),
+            Err(_) => arrays::matrix_from(given, "camera").map(Self::Matrix),
+        }
+    }
+
+    /// The camera of photographs of a size, where it is one.
+    pub(crate) fn camera(&self, (width, height): (usize, usize)) -> Option<Camera> {
+        match self {
+            Self::Camera(camera) => Some(*camera),
+            Self::Matrix(m) => Some(Camera::pinhole(width, height, m.m11, m.m22, m.m13, m.m23)),
+            Self::Focal(focal) => Some(Camera::from_focal(width, height, *focal)),
+            Self::Nothing => None,
+        }
+    }
+}

@@ -1,0 +1,53 @@
+"""Calibration boards, for ``find_board`` and ``calibrate``. Lengths are in any unit: that of the distances that come out."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Chessboard:
+    """Black and white squares."""
+
+    size: "tuple[int, int] | None" = None
+    """Columns and rows of inner corners; None for any size."""
+    square: float = 1.0
+    """Side of a square."""
+
+
+@dataclass(frozen=True, slots=True)
+class CharucoBoard:
+    """A chessboard with a marker in every white square."""
+
+    size: "tuple[int, int]"
+    """Columns and rows of squares."""
+    square: float
+    """Side of a square."""
+    marker: float
+    """Side of a marker with its black frame."""
+    dictionary: str = "5x5_100"
+    """Where the markers are from: OpenCV's names without DICT_."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArucoGrid:
+    """ArUco markers side by side, OpenCV's GridBoard."""
+
+    size: "tuple[int, int]"
+    """Columns and rows of markers."""
+    marker: float
+    """Side of a marker with its black frame."""
+    spacing: float = 0.3
+    """Gap between markers, as a share of their side."""
+    dictionary: str = "5x5_100"
+    """Where the markers are from."""
+
+
+@dataclass(frozen=True, slots=True)
+class AprilGrid:
+    """AprilTags of the family 36h11 with black squares between them, Kalibr's."""
+
+    size: "tuple[int, int]"
+    """Columns and rows of markers."""
+    marker: float
+    """Side of a marker with its black frame."""
+    spacing: float = 0.3
+    """Gap between markers, as a share of their side."""

@@ -1,0 +1,153 @@
+"""Finding an object by its color, in scikit-learn's manner."""
+
+import numpy as np
+
+from epipole import _native
+
+
+class ColorModel:
+    """Gaussian mixtures of an object's and the background's colors; a pixel is the object's by posterior odds.
+
+    Photographs are arrays of uint8, masks of bool or uint8 of the same height and width. As an estimator of scikit-learn, it takes lists of them: ``fit(photographs, masks)``,
+    ``predict(photographs)``, ``score(photographs, masks)`` (F1); ``get_params``, ``set_params`` and ``clone`` work. What is fitted ends in ``_``.
+
+    Options: ``defaults("ColorModel")``.
+    """
+
+    def __init__(
+        self,
+        *,
+        space="hsv",
+        components=5,
+        background_components=10,
+        rule="tuned",
+        unknown=0.01,
+        smoothing=1.0,
+        regularization=1e-6,
+        open_radius=2,
+        close_radius=2,
+        regions="auto",
+        seed=1,
+        threads=None,
+        progress=None,
+    ):
+        self.space = space
+        self.components = components
+        self.background_components = background_components
+        self.rule = rule
+        self.unknown = unknown
+        self.smoothing = smoothing
+        self.regularization = regularization
+        self.open_radius = open_radius
+        self.close_radius = close_radius
+        self.regions = regions
+        self.seed = seed
+        self.threads = threads
+        self.progress = progress
+
+    def get_params(self, deep=True):
+        """The options by name."""
+        return {name: getattr(self, name) for name in self._names()}
+
+    def set_params(self, **options):
+        """Other options; the model must be fitted again."""
+        for name, value in options.items():
+            if name not in self._names():
+                raise ValueError(f"ColorModel has no option {name!r}; there are {', '.join(self._names())}")
+            setattr(self, name, value)
+        return self
+
+    @classmethod
+    def _names(cls):
+        return cls.__init__.__kwdefaults__
+
+    def __sklearn_tags__(self):
+        from sklearn.utils import ClassifierTags, InputTags, Tags, TargetTags
+
+        input_tags = InputTags(two_d_array=False, three_d_array=True)
+        tags = {"estimator_type": "classifier", "classifier_tags": ClassifierTags(multi_class=False)}
+        return Tags(target_tags=TargetTags(required=True), input_tags=input_tags, transformer_tags=None, regressor_tags=None, **tags)
+
+    def __sklearn_is_fitted__(self):
+        return hasattr(self, "fitted_")
+
+    def __repr__(self):
+        changed = {name: getattr(self, name) for name, value in self._names().items() if getattr(self, name) != value}
+        options = ", ".join(f"{name}={value!r}" for name, value in changed.items())
+        fitted = f": fitted on {len(self.scores_)} photographs" if hasattr(self, "scores_") else ""
+        return f"ColorModel({options}){fitted}"
+
+    def fit(self, photographs, masks):
+        """Learns the colors. ``scores_`` are those on the photographs themselves; on others they are lower."""
+        self.fitted_, self.scores_ = _native.FittedColorModel.fit(photographs, masks, **self.get_params())
+        self.classes_ = np.array([False, True])
+        return self
+
+    def predict(self, photographs):
+        """Masks of the object, cleaned up: of a photograph, or a list of them."""
+        return self._each(self._fitted().predict, photographs)
+
+    def predict_proba(self, photographs):
+        """Posterior probability of the object at each pixel, float32: of a photograph, or a list of them.
+
+        The mask is what lies above ``threshold_``, cleaned up.
+        """
+        return self._each(lambda photograph: _sigmoid(self._fitted().log_odds(photograph)), photographs)
+
+    def decision_function(self, photographs):
+        """Logarithm of the posterior odds at each pixel, float32."""
+        return self._each(self._fitted().log_odds, photographs)
+
+    def score(self, photographs, masks):
+        """F1 over all pixels of all photographs."""
+        counts = [_native.evaluate_mask(self.predict(p), m) for p, m in zip(photographs, masks, strict=True)]
+        right, wrong = (sum(c[name] for c in counts) for name in ("true_positives", "false_positives"))
+        missed = sum(c["false_negatives"] for c in counts)
+        return 2 * right / max(2 * right + wrong + missed, 1)
+
+    def locate(self, photograph, *, min_score=None):
+        """Where the object is: its regions, each judged by color and shape."""
+        return self._fitted().locate(photograph, min_score=min_score)
+
+    @property
+    def threshold_(self):
+        """Probability above which a pixel is the object's."""
+        return float(_sigmoid(np.float32(self._fitted().threshold)))
+
+    def save(self, path):
+        """Writes the JSON that ``cv segment`` reads."""
+        with open(path, "w", encoding="utf-8") as file:
+            file.write(self._fitted().to_json())
+
+    @classmethod
+    def load(cls, path):
+        """Reads what ``save`` or ``cv segment train`` wrote."""
+        model = cls()
+        with open(path, encoding="utf-8") as file:
+            model.fitted_ = _native.FittedColorModel.from_json(file.read())
+        model.classes_ = np.array([False, True])
+        return model
+
+    def _fitted(self):
+        if not hasattr(self, "fitted_"):
+            raise _not_fitted()
+        return self.fitted_
+
+    @staticmethod
+    def _each(work, photographs):
+        if hasattr(photographs, "ndim") and photographs.ndim in (2, 3):
+            return work(photographs)
+        return [work(photograph) for photograph in photographs]
+
+
+def _sigmoid(odds):
+    return (1.0 / (1.0 + np.exp(-odds.astype(np.float64)))).astype(np.float32)
+
+
+def _not_fitted():
+    message = "this ColorModel is not fitted yet: call fit with photographs and masks"
+    try:
+        from sklearn.exceptions import NotFittedError
+    except ImportError:
+        return ValueError(message)
+    return NotFittedError(message)

@@ -1,0 +1,42 @@
+"""Panoramas of the generated photographs, whose homographies are known."""
+
+import json
+
+import epipole
+import numpy as np
+import pytest
+from conftest import FIXTURES
+from epipole import errors
+
+VIEWS = [FIXTURES / "panorama" / f"view{i}.jpg" for i in range(3)]
+
+
+def test_photographs_are_joined_and_strangers_left_out(plane):
+    known = json.loads((FIXTURES / "oracle" / "panorama.json").read_text())
+    photographs = [epipole.read_image(path) for path in VIEWS]
+    found = epipole.panorama([*photographs, plane[0]], focal=known["focal_px"])
+    assert sorted(found.views) == [0, 1, 2] and found.left_out[3]["kind"] == "NoOverlap"
+    assert found.image.shape[:2] == found.mask.shape == found.labels.shape
+    assert set(np.unique(found.labels)) <= {0, 1, 2, 65535} and (found.labels == 65535)[~found.mask].all()
+    height, width = photographs[0].shape[:2]
+    corners = np.array([[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]], float).T
+    (k0, r0), (k1, r1) = found.views[0], found.views[1]
+    mapped = k1.matrix @ r1 @ r0.T @ np.linalg.inv(k0.matrix) @ corners
+    true = np.array(known["homographies"][0]) @ corners
+    # The homographies of the file are of neighbors, from the second of them to the first or back.
+    both = [np.abs(mapped[:2] / mapped[2] - h[:2] / h[2]).max() for h in (true, np.linalg.inv(known["homographies"][0]) @ corners)]
+    # The bar of the golden figures: a pixel and a half at the corners.
+    assert min(both) < 1.5
+    assert "3 photographs" in repr(found) and "<img" in found._repr_html_()
+
+
+def test_paths_are_read_and_arrays_are_the_same():
+    found = epipole.panorama(VIEWS, scale=0.5)
+    again = epipole.panorama([epipole.read_image(path) for path in VIEWS], scale=0.5)
+    assert np.array_equal(found.image, again.image)
+    with pytest.raises(FileNotFoundError):
+        epipole.panorama([*VIEWS, "nowhere.jpg"])
+    with pytest.raises(errors.TooFewPhotosError):
+        epipole.panorama(VIEWS[:1])
+    with pytest.raises(ValueError, match="cubic"):
+        epipole.panorama(VIEWS, projection="cubic")

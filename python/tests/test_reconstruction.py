@@ -1,0 +1,151 @@
+"""Two views, many views, models and their files: beside the cameras that rendered the photographs."""
+
+import pickle
+
+import epipole
+import numpy as np
+import pytest
+import scenes
+from epipole import errors
+
+MATRIX = np.array([[400.0, 0, 199.5], [0, 400.0, 149.5], [0, 0, 1]])
+SIZE = (400, 300)
+
+
+def walk():
+    """Poses along a line, each looking a little more to the right."""
+    for i in range(5):
+        turn = scenes.rotation(0.02 * (i % 2), 0.25 - 0.07 * i, 0)
+        center = np.array([-0.6 + 0.45 * i, 0.05 * (i % 2), -0.1 * i])
+        yield turn, -turn @ center
+
+
+@pytest.fixture(scope="module")
+def photographs():
+    return [scenes.render(scenes.room(), MATRIX, pose, SIZE)[0] for pose in walk()]
+
+
+def angle(a, b):
+    """Between two rotations, in degrees."""
+    # By the sine, which keeps its digits where the angle is small.
+    return np.degrees(2 * np.arcsin(min(np.linalg.norm(a - b) / np.sqrt(8), 1)))
+
+
+def test_the_motion_between_two_photographs(photographs, tmp_path):
+    camera = epipole.Camera(*SIZE, MATRIX)
+    found = epipole.reconstruct(photographs[0], photographs[1], camera=camera, dense=True)
+    (r0, t0), (r1, t1) = list(walk())[:2]
+    # The project's bar for generated pairs.
+    assert angle(found.rotation, r1 @ r0.T) < 0.2
+    direction = t1 - r1 @ r0.T @ t0
+    assert np.degrees(np.arccos(found.translation @ direction / np.linalg.norm(direction))) < 1
+    assert found.rms < 1 and len(found.points) > 200 and found.cameras == (camera, camera)
+    assert len(found.dense) > 10_000 and found.dense.colors.shape == found.dense.positions.shape
+    again = pickle.loads(pickle.dumps(found))
+    assert np.array_equal(again.points, found.points) and repr(again) == repr(found)
+    found.dense.write(tmp_path / "dense.ply")
+    assert (tmp_path / "dense.ply").read_bytes().startswith(b"ply\nformat binary")
+
+
+def test_what_two_photographs_cannot_tell(photographs):
+    with pytest.raises(errors.EpipoleError) as refused:
+        epipole.reconstruct(photographs[0], photographs[0], focal=400)
+    assert refused.value.kind
+    with pytest.raises(ValueError):
+        epipole.reconstruct(*photographs[:2], focal=0)
+    with pytest.raises(TypeError, match="together"):
+        epipole.reconstruct(*photographs[:2], focal=400, camera=MATRIX)
+    with pytest.raises(errors.CameraSizeError):
+        epipole.reconstruct(*photographs[:2], camera=epipole.Camera.from_focal(100, 100, 90))
+    with pytest.raises(FileNotFoundError):
+        epipole.reconstruct("nowhere.jpg", photographs[0])
+
+
+def test_many_photographs(photographs, tmp_path):
+    camera = epipole.Camera(*SIZE, MATRIX)
+    truth = list(walk())
+    centers = np.array([-r.T @ t for r, t in truth])
+    gray = np.full((300, 400), 128, np.uint8)
+    names = [f"{i}.png" for i in range(5)] + ["gray.png"]
+    found = epipole.sfm([*photographs, gray], camera=camera, names=names, centers=[*centers, [np.nan] * 3])
+    assert found.frames == ("centers",) and list(found.left_out) == ["gray.png"]
+    model = found.model
+    assert [image.name for image in model.images.values()] == names[:5]
+    for image, (r, _), center in zip(model.images.values(), truth, centers):
+        # Half a pixel at a focal length of 400 px; and that over the distance of the walls, 6 m.
+        assert angle(image.rotation, r) < 0.07 and np.linalg.norm(image.center - center) < 0.01
+    walls = np.min(np.abs(np.c_[model.points[:, 2] - 6, model.points[:, 0] - 3, model.points[:, 1] - 1.4]), axis=1)
+    assert np.median(walls) < 0.02 and len(model.points) > 300
+    # The keypoints of a point are where it projects.
+    image = model.images[2]
+    rows = {int(id): row for row, id in enumerate(model.point_ids)}
+    seen = image.point_ids >= 0
+    at = model.points[[rows[int(id)] for id in image.point_ids[seen]]] @ image.rotation.T + image.translation
+    assert np.median(np.linalg.norm(camera.project(at) - image.keypoints[seen], axis=1)) < 1
+    for format in ("colmap-text", "colmap-binary"):
+        model.write(tmp_path / format, format=format)
+        again = epipole.Reconstruction.read(tmp_path / format)
+        assert repr(again) == repr(model) and again.cameras == model.cameras
+        assert np.allclose(again.points, model.points, atol=1e-9) and np.array_equal(again.colors, model.colors)
+        for one, two in zip(again.images.values(), model.images.values()):
+            assert np.array_equal(one.point_ids, two.point_ids) and np.allclose(one.rotation, two.rotation, atol=1e-9)
+    upright = epipole.sfm(photographs, camera=camera)
+    assert upright.frames == ("upright",) and len(upright.model) == 5
+
+
+def test_a_model_of_pycolmap_and_back(photographs):
+    pycolmap = pytest.importorskip("pycolmap")
+    model = epipole.sfm(photographs, camera=epipole.Camera(*SIZE, MATRIX)).model
+    theirs = model.to_pycolmap()
+    assert isinstance(theirs, pycolmap.Reconstruction) and theirs.num_points3D() == len(model.points)
+    again = epipole.Reconstruction.from_pycolmap(theirs)
+    assert np.allclose(again.points, model.points) and again.cameras == model.cameras
+    assert np.allclose(again.images[1].keypoints, model.images[1].keypoints)
+
+
+def test_photographs_that_give_no_model(photographs, tmp_path):
+    gray = np.full((300, 400), 128, np.uint8)
+    with pytest.raises(errors.NoPairsError) as refused:
+        epipole.sfm([gray, gray])
+    assert refused.value.kind == "NoPairs"
+    with pytest.raises(TypeError, match="list"):
+        epipole.sfm("photographs")
+    with pytest.raises(ValueError, match="names"):
+        epipole.sfm(photographs, names=["a"])
+    with pytest.raises(FileNotFoundError):
+        epipole.Reconstruction.read(tmp_path)
+    model = epipole.Reconstruction({}, {}, np.zeros((2, 3)), np.zeros((2, 3)), np.zeros(1), np.arange(2))
+    with pytest.raises(ValueError, match="length"):
+        model.write(tmp_path / "m")
+
+
+def test_the_pose_of_a_photograph_of_known_points():
+    random = np.random.default_rng(7)
+    points = random.uniform([-2, -1, 3], [2, 1, 8], (120, 3))
+    r, t = scenes.rotation(0.1, -0.3, 0.05), np.array([0.3, -0.1, 0.4])
+    camera = epipole.Camera(*SIZE, MATRIX, [-0.1, 0.02, 0, 0])
+    pixels = camera.project(points @ r.T + t)
+    wrong = np.arange(120) % 3 == 0
+    pixels[wrong] += random.uniform(30, 60, (wrong.sum(), 2))
+    found = epipole.estimate_pose(points, pixels, camera)
+    # Exact but for rounding.
+    assert angle(found.rotation, r) < 1e-6 and np.allclose(found.translation, t, atol=1e-7)
+    assert np.array_equal(found.inliers, ~wrong) and np.allclose(found.center, -r.T @ t, atol=1e-7)
+    with pytest.raises(errors.NotEnoughMatchesError) as refused:
+        epipole.estimate_pose(points[:3], pixels[:3], camera)
+    assert (refused.value.got, refused.value.needed) == (3, 4)
+    with pytest.raises(ValueError):
+        epipole.estimate_pose(points, pixels[:5], camera)
+
+
+def test_features_are_matched_as_photographs_are(photographs):
+    a, b = (epipole.extract_features(photograph) for photograph in photographs[:2])
+    found = epipole.match(a, b)
+    assert np.array_equal(found.points, epipole.match_features(*photographs[:2], affine_simulation="never").points)
+    theirs = [epipole.Features(f.keypoints, f.descriptors) for f in (a, b)]
+    # As another program's, of which less is known.
+    assert len(epipole.match(*theirs)) > 0.5 * len(found)
+    with pytest.raises(errors.EpipoleError):
+        epipole.match(a, theirs[1])
+    with pytest.raises(ValueError, match="descriptors"):
+        epipole.match(epipole.Features(a.keypoints[:-1], a.descriptors), b)
