@@ -4,6 +4,10 @@ Images are arrays of uint8, uint16 or float32, of shape (height, width) or (heig
 given by name; ``defaults("depth")`` lists those of a function. What cannot be done raises an exception of :mod:`epipole.errors` with the numbers.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 from epipole._native import (
     Camera,
     Rig,
@@ -35,6 +39,32 @@ from epipole._native import (
     write_image,
     write_map,
 )
+
+if TYPE_CHECKING:
+    from epipole import boards as boards
+    from epipole import errors as errors
+    from epipole import ray as ray
+    from epipole._results import (
+        BoardView as BoardView,
+        Calibration as Calibration,
+        Depth as Depth,
+        EssentialModel as EssentialModel,
+        Features as Features,
+        Located as Located,
+        Matches as Matches,
+        Model as Model,
+        ModelImage as ModelImage,
+        Object as Object,
+        Panorama as Panorama,
+        PointCloud as PointCloud,
+        PoseModel as PoseModel,
+        Reconstruction as Reconstruction,
+        Rectified as Rectified,
+        SfmResult as SfmResult,
+        TwoViewReconstruction as TwoViewReconstruction,
+    )
+    from epipole.boards import AprilGrid, ArucoGrid, CharucoBoard, Chessboard
+    from epipole.color_model import ColorModel
 
 __all__ = [
     "AprilGrid",
@@ -107,7 +137,7 @@ _RESULTS = (
 )
 
 
-def __getattr__(name):
+def __getattr__(name: str) -> Any:
     import importlib
 
     if name in ("boards", "errors", "ray"):

@@ -1,6 +1,6 @@
 from collections.abc import Callable, Sequence
 from os import PathLike
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -39,6 +39,7 @@ _Photograph = NDArray[np.uint8] | _HasArray | _HasDlpack | _Path
 _Board = Chessboard | CharucoBoard | ArucoGrid | AprilGrid
 _Mask = NDArray[np.bool_] | NDArray[np.uint8]
 
+@final
 class Camera:
     def __new__(
         cls,
@@ -67,9 +68,10 @@ class Camera:
     def normalize(self, pixels: ArrayLike) -> NDArray[np.float64]: ...
     def undistort_points(self, pixels: ArrayLike) -> NDArray[np.float64]: ...
     def resized(self, width: int, height: int) -> Camera: ...
-    def __eq__(self, other: object) -> bool: ...
+    def __eq__(self, other: object, /) -> bool: ...
     def __hash__(self) -> int: ...
 
+@final
 class Rig:
     def __new__(
         cls, left: Camera, right: Camera, rotation: ArrayLike, translation: ArrayLike, unit: str = ""
@@ -90,8 +92,9 @@ class Rig:
     @property
     def unit(self) -> str: ...
     def exchanged(self) -> Rig: ...
-    def __eq__(self, other: object) -> bool: ...
+    def __eq__(self, other: object, /) -> bool: ...
 
+@final
 class Undistorter:
     def __new__(
         cls,
@@ -106,6 +109,7 @@ class Undistorter:
     def camera(self) -> Camera: ...
     def compute(self, image: _Image) -> NDArray[Any]: ...
 
+@final
 class FittedColorModel:
     @staticmethod
     def fit(
@@ -113,13 +117,21 @@ class FittedColorModel:
     ) -> tuple[FittedColorModel, tuple[dict[str, Any], ...]]: ...
     def predict(self, image: _Image) -> NDArray[np.bool_]: ...
     def log_odds(self, image: _Image) -> NDArray[np.float32]: ...
-    def locate(self, image: _Image, *, min_score: float | None = None) -> Located: ...
+    def locate(
+        self,
+        image: _Image,
+        *,
+        min_score: float | None = None,
+        threads: int | None = None,
+        progress: _Progress | None = None,
+    ) -> Located: ...
     @property
     def threshold(self) -> float: ...
     def to_json(self) -> str: ...
     @staticmethod
     def from_json(text: str) -> FittedColorModel: ...
 
+@final
 class StereoMatcher:
     def __new__(
         cls,

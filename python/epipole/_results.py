@@ -1,14 +1,19 @@
 """What the functions give back: frozen dataclasses over arrays."""
 
+from __future__ import annotations
+
 import base64
 import os
 from dataclasses import dataclass, fields
+from os import PathLike
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from epipole import _native
 
-_result = dataclass(frozen=True, slots=True, eq=False, repr=False)
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 
 class _Result:
@@ -16,18 +21,18 @@ class _Result:
 
     __slots__ = ()
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"{type(self).__name__}({self._words()})"
 
-    def _words(self):
+    def _words(self) -> str:
         raise NotImplementedError
 
-    def _repr_html_(self):
+    def _repr_html_(self) -> str:
         rows = "".join(f"<tr><td>{f.name}</td><td>{_told(getattr(self, f.name))}</td></tr>" for f in fields(self))
         return f"<table><caption>{type(self).__name__}: {self._words()}</caption>{rows}</table>"
 
 
-def _told(value):
+def _told(value: Any) -> str:
     if isinstance(value, np.ndarray):
         if value.ndim == 3 and value.shape[2] == 3 and value.dtype == np.uint8 and min(value.shape[:2]) > 9:
             return _bitmap(value[:: _step(value), :: _step(value)])
@@ -37,11 +42,11 @@ def _told(value):
     return f"{value}"
 
 
-def _step(values):
+def _step(values: NDArray[Any]) -> int:
     return max(1, max(values.shape[:2]) // 240)
 
 
-def _thumbnail(values):
+def _thumbnail(values: NDArray[np.float32]) -> str:
     """A map of floats as a small picture: dark is low, unknown is black."""
     small = values[:: _step(values), :: _step(values)]
     known = small[np.isfinite(small)]
@@ -51,7 +56,7 @@ def _thumbnail(values):
     return f"{_bitmap(np.repeat(gray[..., None], 3, axis=2))} {low:.4g} to {high:.4g}"
 
 
-def _bitmap(rgb):
+def _bitmap(rgb: NDArray[np.uint8]) -> str:
     """A small picture, without a library for it: an uncompressed bitmap, rows from the bottom up, each a multiple of four bytes long."""
     height, width = rgb.shape[:2]
     row = (3 * width + 3) // 4 * 4
@@ -64,272 +69,272 @@ def _bitmap(rgb):
     return f'<img src="data:image/bmp;base64,{text}">'
 
 
-@_result
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Depth(_Result):
     """Disparity, and depth where the geometry is known. All maps have the left photograph's size; unknown is NaN."""
 
-    disparity: np.ndarray
+    disparity: NDArray[np.float32]
     """float32, px: x of the left photograph minus x of the right one."""
-    state: np.ndarray
+    state: NDArray[np.uint8]
     """uint8: 0 matched, 1 occluded, 2 mismatched, 3 out of view; all but 0 are filled in from around."""
-    disparity_deviation: np.ndarray
+    disparity_deviation: NDArray[np.float32]
     """float32, px: standard deviation, NaN where filled."""
-    depth: "np.ndarray | None"
+    depth: NDArray[np.float32] | None
     """float32, in the unit of the baseline."""
-    depth_deviation: "np.ndarray | None"
+    depth_deviation: NDArray[np.float32] | None
     """float32: standard deviation, NaN where filled."""
-    confidence: "np.ndarray | None"
+    confidence: NDArray[np.float32] | None
     """float32, 0 to 1; with ``confidence=True``."""
-    Q: "np.ndarray | None"
+    Q: NDArray[np.float64] | None
     """float64 (4, 4): makes (X, Y, Z, W) of (x, y, disparity, 1), as OpenCV's reprojectImageTo3D takes it."""
-    images: "tuple | None"
+    images: tuple[NDArray[np.uint8], NDArray[np.uint8]] | None
     """With ``rig``: both photographs rectified, uint8; the maps are of the first."""
-    cloud: "PointCloud | None"
+    cloud: PointCloud | None
     """With ``cloud=True``: the colored points; of a rig in the frame of its left camera."""
-    disparities: tuple
+    disparities: tuple[int, int]
     """Smallest disparity tried, and how many."""
     valid_fraction: float
     """Share of the pixels with a disparity."""
     matched_fraction: float
     """Share of the pixels that were matched and confirmed."""
-    seconds: dict
+    seconds: dict[str, float]
     """By stage."""
 
     @property
-    def matched(self):
+    def matched(self) -> NDArray[np.bool_]:
         """bool: the pixels that were matched and confirmed."""
         return self.state == 0
 
-    def _words(self):
+    def _words(self) -> str:
         height, width = self.disparity.shape
         kind = "disparity and depth" if self.depth is not None else "disparity"
         return f"{width}×{height} px, {kind}, {100 * self.matched_fraction:.1f} % matched"
 
 
-@_result
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Matches(_Result):
     """Tentative matches between two photographs."""
 
-    points: np.ndarray
+    points: NDArray[np.float64]
     """float64 (n, 4): x1, y1, x2, y2 in px."""
-    indices: np.ndarray
+    indices: NDArray[np.uint32]
     """uint32 (n, 2): rows of the two keypoints."""
-    ratios: np.ndarray
+    ratios: NDArray[np.float32]
     """float32 (n,): distance over that of the second best, 0 (sure) to 1 (ambiguous)."""
-    keypoints: tuple
+    keypoints: tuple[NDArray[np.float32], NDArray[np.float32]]
     """Of each photograph, float32 (m, 5): x, y, scale, angle, response."""
-    seconds: dict
+    seconds: dict[str, float]
     """By stage."""
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.points)
 
-    def _words(self):
+    def _words(self) -> str:
         return f"{len(self)} matches between {len(self.keypoints[0])} and {len(self.keypoints[1])} keypoints"
 
 
-@_result
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Model(_Result):
     """A homography or fundamental matrix, and the matches that fit it."""
 
-    model: np.ndarray
+    model: NDArray[np.float64]
     """float64 (3, 3)."""
-    inliers: np.ndarray
+    inliers: NDArray[np.bool_]
     """bool (n,)."""
     rms: float
     """Root mean square residual of the inliers, px."""
     iterations: int
     """Samples drawn."""
-    log10_false_alarms: "float | None"
+    log10_false_alarms: float | None
     """Of models as well supported to be expected of wrong matches; lower is surer."""
-    seconds: dict
+    seconds: dict[str, float]
     """By stage."""
 
-    def _words(self):
+    def _words(self) -> str:
         return f"{int(self.inliers.sum())} of {len(self.inliers)} matches, {self.rms:.3f} px RMS"
 
 
-@_result
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class EssentialModel(Model):
     """An essential matrix and the pose of the second view: x2 = R x1 + t."""
 
-    rotation: np.ndarray
+    rotation: NDArray[np.float64]
     """float64 (3, 3)."""
-    translation: np.ndarray
+    translation: NDArray[np.float64]
     """float64 (3,), of length 1."""
 
 
-@_result
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class PoseModel(_Result):
     """The pose of a camera, x = R X + t, and the points that fit it."""
 
-    rotation: np.ndarray
+    rotation: NDArray[np.float64]
     """float64 (3, 3): R."""
-    translation: np.ndarray
+    translation: NDArray[np.float64]
     """float64 (3,): t."""
-    inliers: np.ndarray
+    inliers: NDArray[np.bool_]
     """bool (n,)."""
     rms: float
     """Root mean square reprojection error of the inliers, px."""
     iterations: int
     """Samples drawn."""
-    log10_false_alarms: "float | None"
+    log10_false_alarms: float | None
     """Of poses as well supported to be expected of wrong matches; lower is surer."""
-    seconds: dict
+    seconds: dict[str, float]
     """By stage."""
 
     @property
-    def center(self):
+    def center(self) -> NDArray[np.float64]:
         """float64 (3,): where the camera stands."""
         return -self.rotation.T @ self.translation
 
-    def _words(self):
+    def _words(self) -> str:
         return f"{int(self.inliers.sum())} of {len(self.inliers)} points, {self.rms:.3f} px RMS"
 
 
-@_result
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Features(_Result):
     """Keypoints of a photograph and their descriptors."""
 
-    keypoints: np.ndarray
+    keypoints: NDArray[np.float32]
     """float32 (n, 5): x, y, scale, angle, response."""
-    descriptors: np.ndarray
+    descriptors: NDArray[np.float32]
     """float32 (n, numbers)."""
     kind: str = "foreign"
     """What the numbers of a descriptor mean; features of other programs are ``foreign``."""
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.keypoints)
 
-    def _words(self):
+    def _words(self) -> str:
         return f"{len(self)} of {self.descriptors.shape[1]} numbers, {self.kind}"
 
 
-@_result
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class PointCloud(_Result):
     """Points in space."""
 
-    positions: np.ndarray
+    positions: NDArray[np.float32]
     """float32 (n, 3)."""
-    colors: "np.ndarray | None" = None
+    colors: NDArray[np.uint8] | None = None
     """uint8 (n, 3), RGB."""
-    normals: "np.ndarray | None" = None
+    normals: NDArray[np.float32] | None = None
     """float32 (n, 3), of length 1."""
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.positions)
 
-    def write(self, path):
+    def write(self, path: str | PathLike[str]) -> None:
         """Writes a binary PLY."""
         _native.write_cloud(path, self.positions, self.colors, self.normals)
 
-    def _words(self):
+    def _words(self) -> str:
         return f"{len(self)} points"
 
 
-@_result
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Rectified(_Result):
     """Both photographs of a rig with the same points in the same rows."""
 
-    left: np.ndarray
+    left: NDArray[Any]
     """In the type it came in."""
-    right: np.ndarray
+    right: NDArray[Any]
     """The same of the right photograph."""
-    masks: tuple
+    masks: tuple[NDArray[np.bool_], NDArray[np.bool_]]
     """bool: where each shows anything."""
-    camera: "_native.Camera"
+    camera: _native.Camera
     """Of both rectified photographs."""
-    rotations: tuple
+    rotations: tuple[NDArray[np.float64], NDArray[np.float64]]
     """Of each camera: its frame to the rectified one, float64 (3, 3)."""
-    Q: np.ndarray
+    Q: NDArray[np.float64]
     """float64 (4, 4): makes (X, Y, Z, W) of (x, y, disparity, 1)."""
     baseline: float
     """In the unit of the rig."""
     vertical: bool
     """Whether one camera stands above the other: the photographs are turned by a quarter then."""
-    vertical_px: "tuple | None"
+    vertical_px: tuple[float, float] | None
     """Median and 95 % quantile of the difference in rows of features found in both; None where there are too few."""
-    seconds: dict
+    seconds: dict[str, float]
     """By stage."""
 
-    def _words(self):
+    def _words(self) -> str:
         rows = "" if self.vertical_px is None else f", rows {self.vertical_px[0]:.2f} px apart"
         return f"{self.camera.width}×{self.camera.height} px, focal {self.camera.matrix[0, 0]:.2f} px{rows}"
 
 
-@_result
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class BoardView(_Result):
     """The points of a calibration board on a photograph."""
 
-    pixels: np.ndarray
+    pixels: NDArray[np.float64]
     """float64 (n, 2): where they are seen."""
-    points: np.ndarray
+    points: NDArray[np.float64]
     """float64 (n, 2): where they are on the board, x right and y down."""
-    ids: np.ndarray
+    ids: NDArray[np.int64]
     """int64 (n,): their numbers on the board."""
-    deviations: np.ndarray
+    deviations: NDArray[np.float64]
     """float64 (n,): standard deviation of a coordinate, px."""
-    size: tuple
+    size: tuple[int, int]
     """Columns and rows of the board."""
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.pixels)
 
-    def _words(self):
+    def _words(self) -> str:
         return f"{len(self)} points of a board of {self.size[0]}×{self.size[1]}"
 
 
-@_result
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Calibration(_Result):
     """Calibrated cameras, and how far they can be trusted."""
 
-    cameras: tuple
+    cameras: tuple[_native.Camera, ...]
     """The cameras."""
-    places: tuple
+    places: tuple[tuple[NDArray[np.float64], NDArray[np.float64]], ...]
     """Of each camera (R, t): the first camera's frame to its own, in the unit of the board."""
-    rig: "_native.Rig | None"
+    rig: _native.Rig | None
     """The first two cameras."""
     rms: float
     """Root mean square distance of all corners used, px."""
     holdout_rms: float
     """The same on views that had no part in the fit."""
-    camera_rms: np.ndarray
+    camera_rms: NDArray[np.float64]
     """By camera."""
-    camera_holdout_rms: np.ndarray
+    camera_holdout_rms: NDArray[np.float64]
     """By camera."""
     noise: float
     """Standard deviation of a coordinate of a corner, px."""
-    rectified_dy: "tuple | None"
+    rectified_dy: tuple[float, float] | None
     """Of a rig: mean and largest difference of the rows of one corner in both rectified photographs, px."""
-    parameter_names: tuple
+    parameter_names: tuple[str, ...]
     """Such as ``camera0.fx`` and ``board.kx``."""
-    parameters: np.ndarray
+    parameters: NDArray[np.float64]
     """float64 (n,)."""
-    deviations: np.ndarray
+    deviations: NDArray[np.float64]
     """float64 (n,): their standard deviations."""
-    covariance: np.ndarray
+    covariance: NDArray[np.float64]
     """float64 (n, n)."""
-    board_size: tuple
+    board_size: tuple[int, int]
     """Columns and rows of the board that was seen."""
-    board_deflection: tuple
+    board_deflection: tuple[float, float]
     """By how much the board is bent along x and y, in its unit."""
-    poses: tuple
+    poses: tuple[tuple[NDArray[np.float64], NDArray[np.float64]] | None, ...]
     """By view (R, t): the board's frame to the first camera's; None where no photograph of the view was used."""
-    refused: tuple
+    refused: tuple[tuple[dict[str, Any] | None, ...], ...]
     """By view and camera: why the photograph was not used; None where it was."""
     trust: str
     """good, usable or poor."""
-    notes: tuple
+    notes: tuple[dict[str, Any], ...]
     """What to know, the worst first: each with its ``kind`` and numbers."""
-    seconds: dict
+    seconds: dict[str, float]
     """By stage."""
 
     @property
-    def camera(self):
+    def camera(self) -> _native.Camera:
         """The camera, or the first one."""
         return self.cameras[0]
 
-    def _words(self):
+    def _words(self) -> str:
         used = sum(any(reason is None for reason in view) for view in self.refused)
         return (
             f"{len(self.cameras)} camera{'s' if len(self.cameras) > 1 else ''} from {used} of {len(self.refused)} views, "
@@ -337,63 +342,63 @@ class Calibration(_Result):
         )
 
 
-@_result
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class ModelImage(_Result):
     """A photograph of a model."""
 
     name: str
     camera: int
     """Key of its camera."""
-    rotation: np.ndarray
+    rotation: NDArray[np.float64]
     """float64 (3, 3): R of x = R X + t, world to camera."""
-    translation: np.ndarray
+    translation: NDArray[np.float64]
     """float64 (3,): t."""
-    keypoints: np.ndarray
+    keypoints: NDArray[np.float64]
     """float64 (n, 2), px."""
-    point_ids: np.ndarray
+    point_ids: NDArray[np.int64]
     """int64 (n,): the point that each keypoint is of, -1 for none."""
 
     @property
-    def center(self):
+    def center(self) -> NDArray[np.float64]:
         """float64 (3,): where the camera stands."""
         return -self.rotation.T @ self.translation
 
-    def _words(self):
+    def _words(self) -> str:
         return f"{self.name}, {int((self.point_ids >= 0).sum())} points of {len(self.keypoints)} keypoints"
 
 
-@_result
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Reconstruction(_Result):
     """Cameras, photographs with their poses, and points: a sparse model, as COLMAP has it."""
 
-    cameras: dict
+    cameras: dict[int, _native.Camera]
     """By number."""
-    images: dict
+    images: dict[int, ModelImage]
     """By number."""
-    points: np.ndarray
+    points: NDArray[np.float64]
     """float64 (n, 3)."""
-    colors: np.ndarray
+    colors: NDArray[np.uint8]
     """uint8 (n, 3), RGB."""
-    errors: np.ndarray
+    errors: NDArray[np.float64]
     """float64 (n,): mean reprojection error, px; negative where it is not known."""
-    point_ids: np.ndarray
+    point_ids: NDArray[np.int64]
     """int64 (n,)."""
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.images)
 
     @staticmethod
-    def read(folder):
+    def read(folder: str | PathLike[str]) -> Reconstruction:
         """Reads COLMAP's files, text or binary."""
         return _native.read_model(folder)
 
-    def write(self, folder, *, format="colmap-text"):
+    def write(self, folder: str | PathLike[str], *, format: Literal["colmap-text", "colmap-binary"] = "colmap-text") -> None:
         """Writes COLMAP's files, in place of a model that is there: ``colmap-text`` or ``colmap-binary``. The folder is made."""
         os.makedirs(folder, exist_ok=True)
         _native.write_model(folder, self, format=format)
 
     @staticmethod
-    def from_pycolmap(reconstruction):
+    def from_pycolmap(reconstruction: Any) -> Reconstruction:
         """The same model of pycolmap's class. Its pixels have their centers at +0.5; here they have them at whole numbers."""
         import tempfile
 
@@ -401,7 +406,7 @@ class Reconstruction(_Result):
             reconstruction.write_binary(folder)
             return _native.read_model(folder)
 
-    def to_pycolmap(self):
+    def to_pycolmap(self) -> Any:
         """The same model as pycolmap's class, which must be installed."""
         import tempfile
 
@@ -412,60 +417,60 @@ class Reconstruction(_Result):
             return pycolmap.Reconstruction(folder)
 
     @property
-    def cloud(self):
+    def cloud(self) -> PointCloud:
         """The points as a cloud."""
         return PointCloud(self.points.astype(np.float32), self.colors)
 
-    def _words(self):
+    def _words(self) -> str:
         seen = sum(int((image.point_ids >= 0).sum()) for image in self.images.values())
         length = seen / max(len(self.points), 1)
         return f"{len(self.images)} photographs, {len(self.points)} points seen {length:.1f} times each"
 
 
-@_result
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class SfmResult(_Result):
     """What many photographs show."""
 
-    models: tuple
+    models: tuple[Reconstruction, ...]
     """Reconstructions, the one of most photographs first. Their places to each other are not known."""
-    solvers: tuple
+    solvers: tuple[str, ...]
     """How each was found."""
-    frames: tuple
+    frames: tuple[str, ...]
     """What each was brought to: ``centers`` that were given, ``upright`` (Z up, its unit arbitrary), or ``any``."""
-    left_out: dict
+    left_out: dict[str, dict[str, Any]]
     """By name, why a photograph is in no model."""
     pairs: int
     """Pairs of photographs that hold."""
     refused_pairs: int
     """Those of them that were not used: they contradict others, or show different things that look alike."""
-    seconds: dict
+    seconds: dict[str, float]
     """By stage."""
 
     @property
-    def model(self):
+    def model(self) -> Reconstruction:
         """The largest model."""
         return self.models[0]
 
-    def _words(self):
+    def _words(self) -> str:
         more = f"; {len(self.models) - 1} more models" if len(self.models) > 1 else ""
         return f"{self.model._words()}{more}; {len(self.left_out)} photographs left out"
 
 
-@_result
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class TwoViewReconstruction(_Result):
     """What two photographs show, in the first camera's frame; the unit is the distance between the cameras."""
 
     reconstruction: Reconstruction
     """Cameras, poses, points."""
-    rotation: np.ndarray
+    rotation: NDArray[np.float64]
     """float64 (3, 3): R of x2 = R x1 + t."""
-    translation: np.ndarray
+    translation: NDArray[np.float64]
     """float64 (3,), of length 1."""
     rms: float
     """Root mean square reprojection error, px."""
     median_angle: float
     """Between the two rays of a point, radians."""
-    pose_deviation: tuple
+    pose_deviation: tuple[float, float]
     """Standard deviations of rotation and of the direction of the translation, radians."""
     focal_deviation: float
     """Relative standard deviation of the focal length; 0 where the cameras were given."""
@@ -475,89 +480,89 @@ class TwoViewReconstruction(_Result):
     """Tentative matches."""
     inliers: int
     """Those of them that agree with the motion."""
-    dense: "PointCloud | None"
+    dense: PointCloud | None
     """With ``dense=True``."""
-    seconds: dict
+    seconds: dict[str, float]
     """By stage."""
 
     @property
-    def points(self):
+    def points(self) -> NDArray[np.float64]:
         """float64 (n, 3)."""
         return self.reconstruction.points
 
     @property
-    def cameras(self):
+    def cameras(self) -> tuple[_native.Camera, ...]:
         """Both cameras."""
         return tuple(self.reconstruction.cameras[image.camera] for image in self.reconstruction.images.values())
 
-    def _words(self):
+    def _words(self) -> str:
         return f"{len(self.points)} points, {self.rms:.3f} px RMS, {self.inliers} of {self.matches} matches agree"
 
 
-@_result
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Panorama(_Result):
     """Photographs joined to one picture."""
 
-    image: np.ndarray
+    image: NDArray[np.uint8]
     """uint8 (height, width, 3); black where no photograph reaches."""
-    mask: np.ndarray
+    mask: NDArray[np.bool_]
     """bool: where one does."""
-    labels: np.ndarray
+    labels: NDArray[np.uint16]
     """uint16: which photograph each pixel is from, 65535 for none."""
-    views: dict
+    views: dict[int, tuple[_native.Camera, NDArray[np.float64]]]
     """Of each photograph that is used (Camera, R): the world's frame to the camera's."""
-    gains: np.ndarray
+    gains: NDArray[np.float32]
     """float32 (n, 3): what red, green and blue of each photograph were multiplied with."""
-    left_out: dict
+    left_out: dict[int, dict[str, Any]]
     """By index, why a photograph is not used."""
     rms: float
     """Root mean square distance of the matches, px of the photographs."""
     shows_parallax: bool
     """Whether the photographs were taken from different places: what is near may be cut in two."""
-    seconds: dict
+    seconds: dict[str, float]
     """By stage."""
 
-    def _words(self):
+    def _words(self) -> str:
         height, width = self.mask.shape
         return f"{width}×{height} px of {len(self.views)} photographs, {self.rms:.2f} px RMS, {len(self.left_out)} left out"
 
 
-@_result
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Object(_Result):
     """A region of a photograph in the object's color."""
 
     found: bool
     """Whether it is the object."""
-    score: "float | None"
+    score: float | None
     """0 to 1: how well color and shape agree with the objects that were trained on."""
-    center: tuple
+    center: tuple[float, float]
     """x and y, px."""
     area: int
     """Pixels."""
-    axes: tuple
+    axes: tuple[float, float]
     """Semi-axes of the ellipse with its moments, px."""
     angle: float
     """Of the major axis, radians, from right towards down."""
-    box: tuple
+    box: tuple[int, int, int, int]
     """Left, top, width, height, px."""
     truncated: bool
     """Whether it touches the border."""
 
-    def _words(self):
+    def _words(self) -> str:
         found = "found" if self.found else "not found"
         return f"{found} at {self.center[0]:.1f}, {self.center[1]:.1f}, {self.area} px"
 
 
-@_result
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Located(_Result):
     """Where an object is in a photograph."""
 
-    mask: np.ndarray
+    mask: NDArray[np.bool_]
     """bool: the pixels of the objects that were found."""
-    objects: tuple
+    objects: tuple[Object, ...]
     """All regions in its color, the best first."""
-    seconds: dict
+    seconds: dict[str, float]
     """By stage."""
 
-    def _words(self):
+    def _words(self) -> str:
         return f"{sum(o.found for o in self.objects)} found among {len(self.objects)} regions"

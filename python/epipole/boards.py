@@ -7,7 +7,7 @@ from dataclasses import dataclass
 class Chessboard:
     """Black and white squares."""
 
-    size: "tuple[int, int] | None" = None
+    size: tuple[int, int] | None = None
     """Columns and rows of inner corners; None for any size."""
     square: float = 1.0
     """Side of a square."""
@@ -17,7 +17,7 @@ class Chessboard:
 class CharucoBoard:
     """A chessboard with a marker in every white square."""
 
-    size: "tuple[int, int]"
+    size: tuple[int, int]
     """Columns and rows of squares."""
     square: float
     """Side of a square."""
@@ -31,7 +31,7 @@ class CharucoBoard:
 class ArucoGrid:
     """ArUco markers side by side, OpenCV's GridBoard."""
 
-    size: "tuple[int, int]"
+    size: tuple[int, int]
     """Columns and rows of markers."""
     marker: float
     """Side of a marker with its black frame."""
@@ -45,7 +45,7 @@ class ArucoGrid:
 class AprilGrid:
     """AprilTags of the family 36h11 with black squares between them, Kalibr's."""
 
-    size: "tuple[int, int]"
+    size: tuple[int, int]
     """Columns and rows of markers."""
     marker: float
     """Side of a marker with its black frame."""

@@ -1,8 +1,24 @@
 """Finding an object by its color, in scikit-learn's manner."""
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from os import PathLike
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, overload
+
 import numpy as np
 
 from epipole import _native
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from epipole._results import Located
+
+    _Image = NDArray[np.uint8]
+    _Mask = NDArray[np.bool_] | NDArray[np.uint8]
+
+_Found = TypeVar("_Found")
 
 
 class ColorModel:
@@ -17,20 +33,20 @@ class ColorModel:
     def __init__(
         self,
         *,
-        space="hsv",
-        components=5,
-        background_components=10,
-        rule="tuned",
-        unknown=0.01,
-        smoothing=1.0,
-        regularization=1e-6,
-        open_radius=2,
-        close_radius=2,
-        regions="auto",
-        seed=1,
-        threads=None,
-        progress=None,
-    ):
+        space: Literal["hsv", "rgb", "lab"] = "hsv",
+        components: int = 5,
+        background_components: int = 10,
+        rule: Literal["tuned", "posterior", "density"] = "tuned",
+        unknown: float = 0.01,
+        smoothing: float = 1.0,
+        regularization: float = 1e-6,
+        open_radius: int = 2,
+        close_radius: int = 2,
+        regions: Literal["auto", "largest", "all"] = "auto",
+        seed: int = 1,
+        threads: int | None = None,
+        progress: Callable[[str, int, int], object] | None = None,
+    ) -> None:
         self.space = space
         self.components = components
         self.background_components = background_components
@@ -45,11 +61,11 @@ class ColorModel:
         self.threads = threads
         self.progress = progress
 
-    def get_params(self, deep=True):
+    def get_params(self, deep: bool = True) -> dict[str, Any]:
         """The options by name."""
         return {name: getattr(self, name) for name in self._names()}
 
-    def set_params(self, **options):
+    def set_params(self, **options: Any) -> ColorModel:
         """Other options; the model must be fitted again."""
         for name, value in options.items():
             if name not in self._names():
@@ -58,69 +74,81 @@ class ColorModel:
         return self
 
     @classmethod
-    def _names(cls):
-        return cls.__init__.__kwdefaults__
+    def _names(cls) -> dict[str, Any]:
+        return cls.__init__.__kwdefaults__ or {}
 
-    def __sklearn_tags__(self):
+    def __sklearn_tags__(self) -> Any:
         from sklearn.utils import ClassifierTags, InputTags, Tags, TargetTags
 
         input_tags = InputTags(two_d_array=False, three_d_array=True)
         tags = {"estimator_type": "classifier", "classifier_tags": ClassifierTags(multi_class=False)}
         return Tags(target_tags=TargetTags(required=True), input_tags=input_tags, transformer_tags=None, regressor_tags=None, **tags)
 
-    def __sklearn_is_fitted__(self):
+    def __sklearn_is_fitted__(self) -> bool:
         return hasattr(self, "fitted_")
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         changed = {name: getattr(self, name) for name, value in self._names().items() if getattr(self, name) != value}
         options = ", ".join(f"{name}={value!r}" for name, value in changed.items())
         fitted = f": fitted on {len(self.scores_)} photographs" if hasattr(self, "scores_") else ""
         return f"ColorModel({options}){fitted}"
 
-    def fit(self, photographs, masks):
+    def fit(self, photographs: Sequence[_Image], masks: Sequence[_Mask]) -> ColorModel:
         """Learns the colors. ``scores_`` are those on the photographs themselves; on others they are lower."""
         self.fitted_, self.scores_ = _native.FittedColorModel.fit(photographs, masks, **self.get_params())
         self.classes_ = np.array([False, True])
         return self
 
-    def predict(self, photographs):
+    @overload
+    def predict(self, photographs: _Image) -> NDArray[np.bool_]: ...
+    @overload
+    def predict(self, photographs: Sequence[_Image]) -> list[NDArray[np.bool_]]: ...
+    def predict(self, photographs: Any) -> Any:
         """Masks of the object, cleaned up: of a photograph, or a list of them."""
         return self._each(self._fitted().predict, photographs)
 
-    def predict_proba(self, photographs):
+    @overload
+    def predict_proba(self, photographs: _Image) -> NDArray[np.float32]: ...
+    @overload
+    def predict_proba(self, photographs: Sequence[_Image]) -> list[NDArray[np.float32]]: ...
+    def predict_proba(self, photographs: Any) -> Any:
         """Posterior probability of the object at each pixel, float32: of a photograph, or a list of them.
 
         The mask is what lies above ``threshold_``, cleaned up.
         """
         return self._each(lambda photograph: _sigmoid(self._fitted().log_odds(photograph)), photographs)
 
-    def decision_function(self, photographs):
+    @overload
+    def decision_function(self, photographs: _Image) -> NDArray[np.float32]: ...
+    @overload
+    def decision_function(self, photographs: Sequence[_Image]) -> list[NDArray[np.float32]]: ...
+    def decision_function(self, photographs: Any) -> Any:
         """Logarithm of the posterior odds at each pixel, float32."""
         return self._each(self._fitted().log_odds, photographs)
 
-    def score(self, photographs, masks):
+    def score(self, photographs: Sequence[_Image], masks: Sequence[_Mask]) -> float:
         """F1 over all pixels of all photographs."""
         counts = [_native.evaluate_mask(self.predict(p), m) for p, m in zip(photographs, masks, strict=True)]
         right, wrong = (sum(c[name] for c in counts) for name in ("true_positives", "false_positives"))
         missed = sum(c["false_negatives"] for c in counts)
         return 2 * right / max(2 * right + wrong + missed, 1)
 
-    def locate(self, photograph, *, min_score=None):
+    def locate(self, photograph: _Image, *, min_score: float | None = None) -> Located:
         """Where the object is: its regions, each judged by color and shape."""
         return self._fitted().locate(photograph, min_score=min_score)
 
     @property
-    def threshold_(self):
+    def threshold_(self) -> float:
         """Probability above which a pixel is the object's."""
         return float(_sigmoid(np.float32(self._fitted().threshold)))
 
-    def save(self, path):
+    def save(self, path: str | PathLike[str]) -> None:
         """Writes the JSON that ``cv segment`` reads."""
         with open(path, "w", encoding="utf-8") as file:
             file.write(self._fitted().to_json())
 
     @classmethod
-    def load(cls, path):
+    def load(cls, path: str | PathLike[str]) -> ColorModel:
         """Reads what ``save`` or ``cv segment train`` wrote."""
         model = cls()
         with open(path, encoding="utf-8") as file:
@@ -128,23 +156,23 @@ class ColorModel:
         model.classes_ = np.array([False, True])
         return model
 
-    def _fitted(self):
+    def _fitted(self) -> _native.FittedColorModel:
         if not hasattr(self, "fitted_"):
             raise _not_fitted()
         return self.fitted_
 
     @staticmethod
-    def _each(work, photographs):
+    def _each(work: Callable[[Any], _Found], photographs: Any) -> Any:
         if hasattr(photographs, "ndim") and photographs.ndim in (2, 3):
             return work(photographs)
         return [work(photograph) for photograph in photographs]
 
 
-def _sigmoid(odds):
+def _sigmoid(odds: Any) -> Any:
     return (1.0 / (1.0 + np.exp(-odds.astype(np.float64)))).astype(np.float32)
 
 
-def _not_fitted():
+def _not_fitted() -> Exception:
     message = "this ColorModel is not fitted yet: call fit with photographs and masks"
     try:
         from sklearn.exceptions import NotFittedError

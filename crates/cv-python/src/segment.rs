@@ -29,6 +29,13 @@ pub(crate) fn read(options: &mut Options<'_>) -> PyResult<(TrainOptions, Run)> {
     Ok((o, Run::read(options)?))
 }
 
+/// The options of `locate`.
+pub(crate) fn read_locate(options: &mut Options<'_>) -> PyResult<(DetectOptions, Run)> {
+    let mut o = DetectOptions::default();
+    options.set("min_score", &mut o.min_score)?;
+    Ok((o, Run::read(options)?))
+}
+
 /// A fitted model; `epipole.ColorModel` is what people use.
 #[pyclass(frozen, module = "epipole._native", name = "FittedColorModel")]
 pub(crate) struct PyColorModel {
@@ -81,18 +88,19 @@ impl PyColorModel {
     }
 
     /// The regions in the object's color, the best first, and the mask of those that are the object.
-    #[pyo3(signature = (image, *, min_score = None))]
+    #[pyo3(signature = (image, **options))]
     fn locate<'py>(
         &self,
         py: Python<'py>,
         image: &Bound<'py, PyAny>,
-        min_score: Option<f64>,
+        options: Option<&Bound<'py, PyDict>>,
     ) -> PyResult<Bound<'py, PyAny>> {
+        let mut options = Options::new("locate", options);
+        let (o, run) = read_locate(&mut options)?;
+        options.finish()?;
         let image = Rgb::new(image, "image")?;
         let view = image.view()?;
-        let mut o = DetectOptions::default();
-        o.min_score = min_score.unwrap_or(o.min_score);
-        let found = Run::default().run(py, |progress| detect(view, &self.model, &o, progress))?;
+        let found = run.run(py, |progress| detect(view, &self.model, &o, progress))?;
         let objects = PyList::empty(py);
         for one in &found.objects {
             let region = &one.region;

@@ -1,0 +1,126 @@
+"""Jobs over Ray Data on one machine: bad files, a worker that dies, a second run. Left out where Ray is not installed."""
+
+import os
+import shutil
+import signal
+import threading
+import time
+
+import epipole
+import numpy as np
+import pytest
+from conftest import FIXTURES
+
+ray = pytest.importorskip("ray")
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Two nodes of two processors each, on this machine."""
+    from ray.cluster_utils import Cluster
+
+    os.environ["RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO"] = "0"
+    nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 2, "include_dashboard": False, "object_store_memory": 80_000_000})
+    nodes.add_node(num_cpus=2, object_store_memory=80_000_000)
+    ray.init(address=nodes.address, log_to_driver=False)
+    ray.data.DataContext.get_current().enable_progress_bars = False
+    yield nodes
+    ray.shutdown()
+    nodes.shutdown()
+
+
+def rows(dataset):
+    return sorted(dataset.take_all(), key=lambda row: row["name"])
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory):
+    """24 pairs under names of their own, four of them broken."""
+    folder = tmp_path_factory.mktemp("pairs")
+    for i in range(24):
+        for side in ("left", "right"):
+            shutil.copy(FIXTURES / "stereo" / f"{side}.jpg", folder / f"{side}{i:02}.jpg")
+    for i in (3, 9, 10, 17):
+        (folder / f"left{i:02}.jpg").write_bytes(b"no picture")
+    return [(folder / f"left{i:02}.jpg", folder / f"right{i:02}.jpg") for i in range(24)]
+
+
+def test_bad_files_are_rows_with_an_error_and_a_second_run_computes_nothing(cluster, pairs, tmp_path):
+    killed = []
+    killer = threading.Thread(target=kill_one, args=(tmp_path, killed))
+    killer.start()
+    found = rows(epipole.ray.depth(pairs, tmp_path / "d", disparities=64, actors=2))
+    killer.join()
+    assert killed or not os.path.isdir("/proc")
+    assert [row["error"] is not None for row in found] == [i in (3, 9, 10, 17) for i in range(24)]
+    assert all("FileError" in row["error"] and row["output"] is None for row in found if row["error"])
+    images = [epipole.read_image(path) for path in pairs[0]]
+    expected = epipole.depth(*images, disparities=64)
+    for row in found:
+        if row["error"] is None:
+            with np.load(row["output"]) as arrays:
+                assert np.array_equal(arrays["disparity"], expected.disparity, equal_nan=True)
+    written = {path: path.stat().st_mtime_ns for path in (tmp_path / "d").iterdir()}
+    again = rows(epipole.ray.depth(pairs, tmp_path / "d", disparities=64, actors=1))
+    assert [row["skipped"] for row in again] == [row["error"] is None for row in found]
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "d").iterdir()} == written
+    with pytest.raises(ValueError, match="other options"):
+        epipole.ray.depth(pairs, tmp_path / "d", disparities=48)
+
+
+def kill_one(folder, killed):
+    """Kills a worker once the first result is there."""
+    end = time.monotonic() + 60
+    while time.monotonic() < end and not list(folder.glob("d/*.npz")):
+        time.sleep(0.02)
+    for entry in os.listdir("/proc") if os.path.isdir("/proc") else ():
+        try:
+            with open(f"/proc/{entry}/cmdline", "rb") as file:
+                command = file.read()
+        except OSError:
+            continue
+        # What Ray calls a worker that holds one of ours.
+        if b"MapWorker" in command and entry.isdigit():
+            os.kill(int(entry), signal.SIGKILL)
+            killed.append(command)
+            return
+
+
+def test_the_other_jobs(cluster, tmp_path):
+    photographs = [FIXTURES / "ball" / f"ball{i}.jpg" for i in range(4)]
+    masks = [epipole.read_image(FIXTURES / "oracle" / "ball-masks" / f"ball{i}_mask.png") for i in range(4)]
+    images = [epipole.read_image(path) for path in photographs]
+    model = epipole.ColorModel().fit(images, masks)
+    found = rows(epipole.ray.segment(photographs, tmp_path / "s", model=model))
+    assert all(row["found"] == 1 for row in found)
+    assert np.array_equal(epipole.read_image(found[0]["output"]) > 0, model.locate(images[0]).mask)
+
+    height, width = images[0].shape[:2]
+    camera = epipole.Camera(width, height, [[200, 0, 80], [0, 200, 60], [0, 0, 1]], [-0.1, 0, 0, 0])
+    found = rows(epipole.ray.undistort(photographs, tmp_path / "u", camera=camera, alpha=1.0))
+    assert np.array_equal(epipole.read_image(found[1]["output"]), epipole.undistort(images[1], camera, alpha=1.0)[0])
+
+    plane = [FIXTURES / "plane" / f"{name}.jpg" for name in "ab"]
+    found = rows(epipole.ray.features(plane, tmp_path / "f", max_features=500))
+    files = [row["output"] for row in found]
+    a, b = (epipole.ray.load_features(path) for path in files)
+    expected = epipole.extract_features(epipole.read_image(plane[0]), max_features=500)
+    assert len(a) == found[0]["count"] and a.kind == expected.kind
+    assert np.array_equal(a.descriptors, expected.descriptors)
+    dataset = ray.data.from_items([{"a": files[0], "b": files[1]}])
+    found = rows(epipole.ray.match_pairs(dataset, tmp_path / "m"))
+    assert found[0]["count"] == len(epipole.match(a, b)) > 20 and found[0]["error"] is None
+
+
+def test_mistakes_are_told_before_the_work(cluster, tmp_path):
+    paths = ["a/x.jpg", "b/x.jpg"]
+    with pytest.raises(ValueError, match="names="):
+        epipole.ray.features(paths, tmp_path / "f")
+    with pytest.raises(TypeError, match="max_featurs"):
+        epipole.ray.features(paths, tmp_path / "f", max_featurs=3)
+    with pytest.raises(ValueError, match="no photographs"):
+        epipole.ray.features([], tmp_path / "f")
+    with pytest.raises(ValueError, match="left and right"):
+        epipole.ray.depth([("a.jpg",)], tmp_path / "d")
+    found = rows(epipole.ray.features(paths, tmp_path / "g", names=["one", "two"]))
+    assert all(row["error"].startswith("FileNotFoundError") for row in found)
