@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
     from epipole._results import Located
 
-    _Image = NDArray[np.uint8]
+    # uint8; a reader's array is of a kind that only its values tell.
+    _Image = NDArray[Any]
     _Mask = NDArray[np.bool_] | NDArray[np.uint8]
 
 _Found = TypeVar("_Found")

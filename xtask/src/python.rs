@@ -27,6 +27,10 @@ pub(crate) fn run() -> Result<bool> {
     };
     let sources = root().join("python");
     peers::check(pip(&["-r"]).arg(sources.join("requirements.txt")))?;
+    // Not for every Python, nor for every system.
+    if let Err(reason) = peers::check(pip(&["-r"]).arg(sources.join("requirements-peers.txt"))) {
+        println!("python: without some of its peers: {reason:#}");
+    }
     let wheels = folder.join("wheels");
     if wheels.is_dir() {
         std::fs::remove_dir_all(&wheels)?;
@@ -46,7 +50,7 @@ pub(crate) fn run() -> Result<bool> {
     peers::check(pip(&["--no-deps"]).arg(wheel))?;
     let program = target.join("debug").join(format!("cv{}", std::env::consts::EXE_SUFFIX));
     let mut tests = Command::new(&own);
-    tests.args(["-m", "pytest", "-q", "-p", "no:cacheprovider"]).arg(sources.join("tests")).current_dir(&folder);
+    tests.args(["-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider"]).arg(sources.join("tests")).current_dir(&folder);
     tests.env("EPIPOLE_FIXTURES", root().join("fixtures"));
     if program.is_file() {
         tests.env("EPIPOLE_PROGRAM", program);

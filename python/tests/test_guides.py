@@ -1,0 +1,87 @@
+"""The blocks of the guides and the cells of the notebooks run, on generated photographs; and they satisfy the strictest type checker."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import epipole
+import numpy as np
+import pytest
+import scenes
+from conftest import FIXTURES
+
+ROOT = Path(__file__).parents[1]
+NEEDS = {"from-cv2.md": ["cv2"], "cluster.md": ["ray", "daft"]}
+
+
+@pytest.fixture(scope="session")
+def photographs(tmp_path_factory):
+    """The folder that guides work in: the fixtures, and twelve photographs of a chessboard."""
+    folder = tmp_path_factory.mktemp("guides")
+    for part in ("stereo", "plane", "panorama", "ball", "two-view", "oracle/ball-masks"):
+        for path in (FIXTURES / part).iterdir():
+            shutil.copy(path, folder / (path.name if part != "two-view" else f"two-{path.name}"))
+    random = np.random.default_rng(3)
+    board = [((0, 0, 0), np.eye(3)[0], np.eye(3)[1], scenes.chessboard(8, 5, 0.034))]
+    matrix = np.array([[420.0, 0, 163.0], [0, 418.0, 117.0], [0, 0, 1]])
+    for i in range(12):
+        tilt = scenes.rotation(*random.uniform(-0.45, 0.45, 3))
+        middle = np.array([*random.uniform(-0.03, 0.03, 2), random.uniform(0.7, 0.85)])
+        pose = tilt, middle - tilt @ np.array([3.5 * 0.034, 2 * 0.034, 0])
+        epipole.write_image(folder / f"board{i:02}.png", scenes.render(board, matrix, pose, (320, 240))[0])
+    for i in range(5):
+        turn = scenes.rotation(0.02 * (i % 2), 0.25 - 0.07 * i, 0)
+        center = np.array([-0.6 + 0.45 * i, 0.05 * (i % 2), -0.1 * i])
+        matrix = np.array([[400.0, 0, 199.5], [0, 400.0, 149.5], [0, 0, 1]])
+        image, _ = scenes.render(scenes.room(), matrix, (turn, -turn @ center), (400, 300))
+        epipole.write_image(folder / f"walk{i}.png", image)
+    return folder
+
+
+def program(path):
+    """What a guide or a notebook runs, as one program."""
+    if path.suffix == ".ipynb":
+        cells = json.loads(path.read_text())["cells"]
+        return "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code") + "\n"
+    return "\n".join(re.findall(r"^```python\n(.*?)^```", path.read_text(), re.M | re.S))
+
+
+GUIDES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "notebooks").glob("*.ipynb"))]
+
+
+@pytest.mark.parametrize("path", GUIDES, ids=lambda path: path.name)
+def test_a_guide_does_what_it_says(path, photographs, tmp_path):
+    for module in NEEDS.get(path.name, []):
+        pytest.importorskip(module)
+    text = program(path)
+    assert text.count("\n") > 3
+    folder = tmp_path / "photographs"
+    shutil.copytree(photographs, folder)
+    script = tmp_path / f"{path.stem.replace('-', '_')}.py"
+    script.write_text(text)
+    environment = {**os.environ, "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "DO_NOT_TRACK": "1", "PYTHONWARNINGS": "ignore"}
+    ran = subprocess.run([sys.executable, script], cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
+    assert ran.returncode == 0, ran.stderr[-3000:]
+
+
+def test_examples_satisfy_pyright(tmp_path):
+    pytest.importorskip("pyright")
+    paths = [path for path in GUIDES if path.name not in NEEDS]
+    for path in paths:
+        (tmp_path / f"{path.stem.replace('-', '_')}.py").write_text(program(path))
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps({"typeCheckingMode": "strict"}))
+    command = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, "-p", tmp_path]
+    checked = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert checked.returncode == 0, checked.stdout[-3000:] + checked.stderr[-1000:]
+
+
+def test_the_stub_is_that_of_the_library():
+    pytest.importorskip("mypy")
+    # That no function is missing is tested beside the options.
+    command = [sys.executable, "-m", "mypy.stubtest", "epipole._native", "--ignore-missing-stub"]
+    checked = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert checked.returncode == 0, checked.stdout[-3000:] + checked.stderr[-1000:]
