@@ -117,18 +117,5 @@ def test_many_calls_need_no_more_memory():
     assert peaks[-1] - peaks[0] < 8000
 
 
-def test_a_program_writes_what_the_package_finds(pair, tmp_path):
-    program = os.environ.get("EPIPOLE_PROGRAM")
-    if not program:
-        pytest.skip("EPIPOLE_PROGRAM does not name the program")
-    for name, photo in zip(("left.png", "right.png"), pair):
-        epipole.write_image(tmp_path / name, photo)
-    command = [program, "depth", tmp_path / "left.png", tmp_path / "right.png", "--disparities", "64"]
-    subprocess.run([*command, "-o", tmp_path / "d.pfm"], check=True, capture_output=True)
-    found = epipole.depth(*pair, disparities=64)
-    epipole.write_map(tmp_path / "ours.pfm", found.disparity)
-    assert (tmp_path / "ours.pfm").read_bytes() == (tmp_path / "d.pfm").read_bytes()
-
-
 def test_the_signal_of_this_process_is_as_it_was():
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

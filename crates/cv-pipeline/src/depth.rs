@@ -253,11 +253,26 @@ pub fn depth<T: Intensity, const C: usize>(
         clock.lap("range");
     }
     let mut matcher = StereoMatcher::new(stereo)?;
-    matcher.prepare(left.width(), left.height(), &mut DisparityMap::empty(), progress)?;
-    clock.lap("prepare");
-    let mut result = depth_with(&mut matcher, left, right, geometry, options.range, progress)?;
+    let mut run = || {
+        matcher.prepare(left.width(), left.height(), &mut DisparityMap::empty(), progress)?;
+        clock.lap("prepare");
+        depth_with(&mut matcher, left, right, geometry, options.range, progress)
+    };
+    let mut result = match run() {
+        Err(DepthError::Cancelled(stop)) => {
+            free_elsewhere(matcher);
+            return Err(stop.into());
+        }
+        result => result?,
+    };
     result.stages.splice(0..0, clock.into_stages());
     Ok(result)
+}
+
+/// Gives memory back from a thread of its own: of gigabytes that takes the system some tenths of a second, for which nobody who stopped a job wants to wait.
+fn free_elsewhere<T: Send + 'static>(memory: T) {
+    // Where there are no threads, it is freed here.
+    let _ = std::thread::Builder::new().spawn(move || drop(memory));
 }
 
 /// As [`depth`], by any matcher. `range` is the nearest and the farthest depth kept, in the unit of the baseline.

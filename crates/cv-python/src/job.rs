@@ -13,8 +13,8 @@ use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::sync::{Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
-/// How often signals are looked at, and the callable is called: Ctrl-C is to work within 200 ms, and a bar that moves twenty times a second looks smooth.
-const TICK: Duration = Duration::from_millis(50);
+/// How often signals are looked at, and the callable is called: Ctrl-C is to work within 200 ms, of which jobs need the most to hear of it.
+const TICK: Duration = Duration::from_millis(25);
 
 /// What every job takes.
 #[derive(Default)]

@@ -8,12 +8,12 @@ use crate::options::Options;
 use crate::rectify::{self, view_options};
 use crate::results::{self, data, object};
 use crate::{cloud, with_views};
-use cv_core::{Cancelled, GrayF32, Progress, StereoRig};
+use cv_core::{Cancelled, GrayF32, Progress, StageClock, StereoRig};
 use cv_pipeline::stereo::{
     DisparityMap, GeometryError, PixelState, Rectification, RectifyOptions, StereoError, StereoGeometry, StereoMatcher,
     StereoOptions,
 };
-use cv_pipeline::{DepthError, DepthOptions, DisparityRange, FrameDepth, RigDepthResult};
+use cv_pipeline::{DepthError, DepthOptions, DepthResult, DisparityRange, FrameDepth, RigDepthResult};
 use numpy::{PyArray2, PyArrayMethods, PyReadwriteArray2, PyUntypedArrayMethods};
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
@@ -136,24 +136,24 @@ pub(crate) fn depth<'py>(
         let options = &arguments.options;
         if rectification.is_none() && !arguments.cloud {
             let found = cv_pipeline::depth(a, b, geometry.as_ref(), options, progress)?;
-            return Ok::<_, DepthError>((found, None, None));
+            return Ok::<_, DepthError>((Found::new(found), None, None));
         }
         let mut frames = match &rectification {
             Some(rectification) => FrameDepth::of_rig(options.clone(), rectification)?,
             None => FrameDepth::new(options.clone(), geometry)?,
         };
         let RigDepthResult { images, maps, cloud } = frames.next_depth(a, b, arguments.cloud, progress)?;
-        Ok((maps, rectification.map(|_| images), arguments.cloud.then_some(cloud)))
+        Ok((Found::new(maps), rectification.map(|_| images), arguments.cloud.then_some(cloud)))
     }))?;
-    let (valid, matched) = (found.map.valid_fraction(), found.map.matched_fraction());
-    let depth_deviation = found.depth_sigma();
+    let Found { depth: found, state, depth_deviation, valid, matched, stages } = found;
+    let (width, height) = found.map.disparity.size();
     let none = || object(py, py.None());
     let map = |map: Option<GrayF32>| map.map_or_else(none, |map| arrays::array(py, map));
     results::made(
         py,
         "Depth",
         [
-            ("state", states(py, &found.map)?),
+            ("state", arrays::shaped(py, state, &[height, width])?),
             ("disparity", arrays::array(py, found.map.disparity)?),
             ("disparity_deviation", arrays::array(py, found.sigma)?),
             ("depth", map(found.depth)?),
@@ -169,16 +169,33 @@ pub(crate) fn depth<'py>(
             ("disparities", object(py, found.disparities)?),
             ("valid_fraction", object(py, valid)?),
             ("matched_fraction", object(py, matched)?),
-            ("seconds", results::stages(py, &found.stages)?),
+            ("seconds", results::stages(py, &stages)?),
         ],
     )
 }
 
-/// Where each disparity comes from: 0 matched, 1 occluded, 2 mismatched, 3 out of view.
-fn states<'py>(py: Python<'py>, map: &DisparityMap) -> PyResult<Bound<'py, PyAny>> {
-    let (width, height) = map.state.size();
-    let states: Vec<u8> = map.state.as_slice().iter().map(|state: &PixelState| *state as u8).collect();
-    arrays::shaped(py, states, &[height, width])
+/// What Python is told, made while the interpreter is free.
+struct Found {
+    depth: DepthResult,
+    /// Where each disparity comes from: 0 matched, 1 occluded, 2 mismatched, 3 out of view.
+    state: Vec<u8>,
+    depth_deviation: Option<GrayF32>,
+    valid: f64,
+    matched: f64,
+    stages: Vec<(&'static str, f64)>,
+}
+
+impl Found {
+    fn new(mut depth: DepthResult) -> Self {
+        let mut clock = StageClock::new();
+        let state = depth.map.state.as_slice().iter().map(|state: &PixelState| *state as u8).collect();
+        let (valid, matched) = (depth.map.valid_fraction(), depth.map.matched_fraction());
+        let depth_deviation = depth.depth_sigma();
+        clock.lap("deviation");
+        let mut stages = std::mem::take(&mut depth.stages);
+        stages.append(&mut clock.into_stages());
+        Self { depth, state, depth_deviation, valid, matched, stages }
+    }
 }
 
 /// A matcher and the memory it works in.
