@@ -3,6 +3,7 @@ calibration_opencv.py pairs FOLDER           both finders on leftNN.jpg, rightNN
 calibration_opencv.py wide FOLDER [OUT]      both finders on photographs of 8x6 corners, with 5 and with 8 numbers; classic corners to OUT as a vnlog
 calibration_opencv.py mrcal FOLDER VNLOG     mrcal, where it is installed, on those corners; its hold-out with solvePnP's poses
 calibration_opencv.py corners FOLDER         both finders on the PNG files, 9x6 corners (only the classic one on names that begin with none)
+calibration_opencv.py markers FOLDER KIND C R DICTIONARY LAST  the board of markers in the PNG files; LAST: share of a charuco's marker, else cells of the frame
 calibration_opencv.py solve FILE C R W H     calibrateCamera of views of C x R corners, a line of x and y each
 calibration_opencv.py remap W H OUT          a pair undistorted by fixed-point maps, times on one thread and on two; the inputs and results to OUT
 """
@@ -156,6 +157,28 @@ def corners(folder):
             print(json.dumps({"image": os.path.basename(path), "finder": finder, "seconds": seconds, "corners": found}), flush=True)
 
 
+def markers(folder, kind, columns, rows, name, last):
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    if kind == "charuco":
+        board = cv2.aruco.CharucoBoard((columns, rows), 1.0, float(last), dictionary)
+        charuco = cv2.aruco.CharucoDetector(board, cv2.aruco.CharucoParameters(), parameters)
+        detect = lambda gray: charuco.detectBoard(gray)[0]
+    else:
+        parameters.markerBorderBits = int(last)
+        grid = cv2.aruco.ArucoDetector(dictionary, parameters)
+        # Markers of the dictionary that are not on the board are none.
+        detect = lambda gray: [c for c, i in zip(*grid.detectMarkers(gray)[:2]) if i < columns * rows]
+    for path in sorted(glob.glob(f"{folder}/*.png")):
+        gray = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
+        start = time.thread_time()
+        found = detect(gray)
+        seconds = time.thread_time() - start
+        found = [] if found is None or len(found) == 0 else np.concatenate([np.reshape(c, (-1, 2)) for c in found]).tolist()
+        print(json.dumps({"image": os.path.basename(path), "seconds": seconds, "corners": found}), flush=True)
+
+
 def solve(file, columns, rows, width, height):
     n = columns * rows
     views = np.loadtxt(file, np.float32).reshape(-1, n, 1, 2)
@@ -193,5 +216,5 @@ def remap(width, height, out):
 
 
 command, *arguments = sys.argv[1:]
-calls = {"pairs": pairs, "wide": wide, "mrcal": mrcal, "corners": corners, "solve": solve, "remap": remap}
+calls = {"pairs": pairs, "wide": wide, "mrcal": mrcal, "corners": corners, "markers": markers, "solve": solve, "remap": remap}
 calls[command](*(int(a) if a.isdigit() else a for a in arguments))

@@ -168,6 +168,7 @@ def depth(
     rig: Rig | None = None,
     alpha: float | None = 0.0,
     size: _Size | None = None,
+    few_matches: Literal["check", "keep"] | None = "check",
     near: float | None = 0.0,
     far: float | None = float("inf"),
     cloud: bool | None = False,

@@ -91,6 +91,8 @@ class Depth(_Result):
     """With ``rig``: both photographs rectified, uint8; the maps are of the first."""
     cloud: PointCloud | None
     """With ``cloud=True``: the colored points; of a rig in the frame of its left camera."""
+    few_matches: tuple[int, int] | None
+    """Where so little is matched that the pair was nearly refused: features that show the same disparity, of how many."""
     disparities: tuple[int, int]
     """Smallest disparity tried, and how many."""
     valid_fraction: float

@@ -19,6 +19,8 @@ pub struct Calibration {
     pub rms_px: f64,
     /// The same on views that had no part in the fit; NaN where that was not computed.
     pub holdout_rms_px: f64,
+    /// The same over all corners of those views, those that were left out as outliers as well: the figure to set beside that of a system that leaves out none.
+    pub holdout_all_rms_px: f64,
     /// Standard deviation of a coordinate of a corner, in pixels, as the residuals show it.
     pub noise_px: f64,
     /// Intrinsics of each camera, then position and turn of each camera but the first, then the deflections of the target where they were adjusted.
@@ -40,6 +42,8 @@ pub struct CalibratedCamera {
     pub rms_px: f64,
     /// The same on views that had no part in the fit; NaN where that was not computed.
     pub holdout_rms_px: f64,
+    /// The same over all corners of those views, those that were left out as outliers as well: the figure to set beside that of a system that leaves out none.
+    pub holdout_all_rms_px: f64,
     /// The lens models that were tried, each by this camera alone.
     pub lenses: Vec<LensTrial>,
     /// How well its projection is known.

@@ -25,17 +25,25 @@ impl Corner {
 }
 
 /// As [`Camera::with_intrinsics`], in place for each residual.
-#[inline]
+#[inline(always)]
 fn with_lens<const N: usize>(camera: &Camera, lens: &[f64]) -> Camera {
+    let lens = &lens[..N];
     let mut camera = Camera { fx: lens[0], fy: lens[1], cx: lens[2], cy: lens[3], ..*camera };
-    camera.distortion.parameters_mut().iter_mut().zip(&lens[4..N]).for_each(|(p, v)| *p = *v);
+    // Of a length that the compiler knows: a loop up to the model's own count takes longer than the projection.
+    camera.distortion.parameters_mut()[..N - 4].copy_from_slice(&lens[4..]);
     camera
 }
 
 /// Writes the columns of a motion `x ↦ turned + t`: those of the turn, then those of t.
-#[inline]
+#[inline(always)]
 fn by_motion<const C: usize>(j: &mut SMatrix<f64, 2, C>, first: usize, by: &Matrix2x3<f64>, turned: &Vector3<f64>) {
-    j.fixed_columns_mut::<3>(first).copy_from(&(-by * turned.cross_matrix()));
+    for row in 0..2 {
+        // −b [x]× is the row x × b.
+        let turn = turned.cross(&by.row(row).transpose());
+        for k in 0..3 {
+            j[(row, first + k)] = turn[k];
+        }
+    }
     j.fixed_columns_mut::<3>(first + 3).copy_from(by);
 }
 

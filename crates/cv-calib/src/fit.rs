@@ -1,7 +1,7 @@
 //! The robust fit of one lens model: adjustment, outliers out, adjustment by least squares.
 
 use crate::adjustment::{Estimate, Failure, Free, Problem, Used, adjust};
-use crate::start::cauchy;
+use crate::start::{cauchy, thinned};
 use crate::target::Sightings;
 use cv_core::{Progress, Vector2, median};
 use cv_numeric::RobustLoss;
@@ -11,7 +11,7 @@ const MEDIAN_LENGTH: f64 = 1.1774;
 /// Standard deviation in pixels that no corner is better than: below it, differences are rounding.
 const LEAST_DEVIATION: f64 = 1e-4;
 /// Times that outliers are looked for.
-const ROUNDS: usize = 4;
+const ROUNDS: usize = 5;
 /// Of many views so many, evenly, are fitted robustly first; from what they give, all need a few steps.
 const FIRST_VIEWS: usize = 30;
 /// Relative change of the cost at which an adjustment ends.
@@ -90,7 +90,7 @@ pub(crate) fn fit(
         let (found, free, state) = robust(&data.subset(&few), start.subset(&few), &corners, limits, progress)?;
         let mut all = Estimate { poses: start.poses.clone(), ..found };
         let loss = cauchy(deviation(&residuals(data, &all), usable));
-        adjust(data, &mut all, usable, (Free::POSES, loss), (30, 1e-3), progress)?;
+        adjust(data, &mut all, &thinned(usable), (Free::POSES, loss), (30, 1e-3), progress)?;
         (all, free, state)
     } else {
         robust(data, start.clone(), usable, limits, progress)?
@@ -101,11 +101,13 @@ pub(crate) fn fit(
         let residuals = residuals(data, &estimate);
         typical = deviation(&residuals, usable);
         let kept = near(&residuals, usable, limits.outlier_deviations * typical, limits.min_corners);
-        if kept == used || round == ROUNDS {
+        if (round > 1 && kept == used) || round == ROUNDS {
             break;
         }
         used = kept;
-        adjust(data, &mut estimate, &used, (free, RobustLoss::Trivial), (100, TOLERANCE), progress)?;
+        // The first step leads so near that outliers can be judged again; what comes after it would be of the old ones.
+        let most = if round == 0 { 1 } else { 100 };
+        adjust(data, &mut estimate, &used, (free, RobustLoss::Trivial), (most, TOLERANCE), progress)?;
     }
     Ok(Fit { estimate, used, shape: state, deviation: typical })
 }

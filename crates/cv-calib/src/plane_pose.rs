@@ -26,23 +26,33 @@ pub(crate) fn is_mirrored(target: &TargetPoints, corners: &[TargetCorner]) -> Op
 /// The pose that the homography from the target's plane to ideal coordinates says, target to camera. `None` where fewer than four corners have rays, they are on
 /// a line, or some would be behind the camera.
 pub(crate) fn plane_pose(camera: &Camera, target: &TargetPoints, corners: &[TargetCorner]) -> Option<Pose> {
+    pose_from_homography(&plane_homography(camera, target, corners)?, target, corners)
+}
+
+/// From the target's plane to ideal coordinates.
+pub(crate) fn plane_homography(
+    camera: &Camera,
+    target: &TargetPoints,
+    corners: &[TargetCorner],
+) -> Option<Matrix3<f64>> {
     let rays: Vec<Correspondence> = corners
         .iter()
         .map(|c| Correspondence { a: target.points()[c.point], b: camera.normalize(c.pixel) })
         .filter(|m| m.b.x.is_finite() && m.b.y.is_finite())
         .collect();
-    pose_from_homography(&homography_from_points(&rays).ok()?, &rays)
+    homography_from_points(&rays).ok()
 }
 
-/// The rotation nearest to the scaled columns, the translation by their scale.
-fn pose_from_homography(h: &Matrix3<f64>, rays: &[Correspondence]) -> Option<Pose> {
-    let depth: f64 = rays.iter().map(|m| (h * m.a.to_homogeneous()).z.signum()).sum();
+/// The rotation nearest to the scaled columns, the translation by their scale. `None` where some of the corners would be behind the camera.
+pub(crate) fn pose_from_homography(h: &Matrix3<f64>, target: &TargetPoints, corners: &[TargetCorner]) -> Option<Pose> {
+    let points = || corners.iter().map(|c| target.points()[c.point]);
+    let depth: f64 = points().map(|p| (h * p.to_homogeneous()).z.signum()).sum();
     let scale = depth.signum() * 2.0 / (h.column(0).norm() + h.column(1).norm());
     let (a, b, t): (Vector3<f64>, Vector3<f64>, Vector3<f64>) =
         ((h.column(0) * scale), (h.column(1) * scale), (h.column(2) * scale));
     let rotation = svd3(&Matrix3::from_columns(&[a, b, a.cross(&b)])).ok()?.nearest_rotation();
     let pose = Pose::new(rotation, t);
-    let in_front = rays.iter().all(|m| pose.transform(&nalgebra::Point3::new(m.a.x, m.a.y, 0.0)).z > 0.0);
+    let in_front = points().all(|p| pose.transform(&nalgebra::Point3::new(p.x, p.y, 0.0)).z > 0.0);
     (t.iter().all(|v| v.is_finite()) && in_front).then_some(pose)
 }
 

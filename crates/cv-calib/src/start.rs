@@ -2,10 +2,10 @@
 
 use crate::CalibrateError;
 use crate::adjustment::{Estimate, Failure, Free, Lenses, Used, adjust};
-use crate::plane_pose::plane_pose;
+use crate::plane_pose::{plane_homography, plane_pose, pose_from_homography};
 use crate::target::{Sightings, TargetCorner};
 use crate::zhang::intrinsics_from_homographies;
-use cv_core::{Camera, Correspondence, Distortion, LensProjection, Pose, Progress, Stage, median};
+use cv_core::{Camera, Correspondence, Distortion, LensProjection, Matrix3, Pose, Progress, Stage, Vector3, median};
 use cv_geometry::homography_from_points;
 use cv_numeric::RobustLoss;
 use rayon::prelude::*;
@@ -28,53 +28,84 @@ pub(crate) struct Start {
     pub(crate) error: f64,
 }
 
-/// Corners of a view that candidates are compared on: a homography and a median over them are near enough to those over all.
+/// Corners of a view that a start is made of: poses and medians of them are near enough to those of all.
 const CORNERS: usize = 24;
 
-/// So many of the corners: every so many-th by the golden ratio, which is no multiple of the length of any row.
-fn some(corners: &[TargetCorner]) -> Vec<TargetCorner> {
-    let n = corners.len();
+/// So many of `n` numbers: every so many-th by the golden ratio, which is no multiple of the length of any row.
+fn some(n: usize) -> Vec<usize> {
     if n <= CORNERS {
-        return corners.to_vec();
+        return (0..n).collect();
     }
     let mut chosen: Vec<usize> = (0..CORNERS).map(|k| (((k as f64 * 0.618_034).fract()) * n as f64) as usize).collect();
     chosen.sort_unstable();
     chosen.dedup();
-    chosen.into_iter().map(|i| corners[i]).collect()
+    chosen
 }
 
-/// Median distance of some of the corners from where a camera and the poses by their homographies have them; infinite where more than half have none.
-fn median_error(camera: &Camera, data: &Sightings, views: &[usize]) -> f64 {
-    let mut errors = Vec::new();
-    for &v in views {
-        let corners = &some(&data.views[v][0]);
-        let pose = plane_pose(camera, &data.target, corners);
-        errors.extend(corners.iter().map(|c| {
-            let seen = pose.and_then(|pose| camera.project(&pose.transform(&data.target.bent(c.point, [0.0; 2]))));
-            seen.map_or(f64::INFINITY, |seen| (seen - c.pixel).norm())
-        }));
-    }
-    median(&mut errors).unwrap_or(f64::INFINITY)
+fn some_corners(corners: &[TargetCorner]) -> Vec<TargetCorner> {
+    some(corners.len()).into_iter().map(|i| corners[i]).collect()
 }
 
-/// The cameras that may be near: the principal point in the middle, and what Zhang's method says.
-fn candidates(data: &Sightings, views: &[usize], projection: LensProjection) -> Vec<Camera> {
+/// No more than [`CORNERS`] of the corners of each picture that count.
+pub(crate) fn thinned(used: &Used) -> Used {
+    let picture = |used: &Vec<bool>| {
+        let counted: Vec<usize> = (0..used.len()).filter(|i| used[*i]).collect();
+        let mut out = vec![false; used.len()];
+        some(counted.len()).into_iter().for_each(|i| out[counted[i]] = true);
+        out
+    };
+    used.iter().map(|cameras| cameras.iter().map(picture).collect()).collect()
+}
+
+/// Median distances of some of the corners from where cameras and the poses by their homographies have them; infinite where more than half have none. The cameras
+/// differ by their focal lengths alone, as distances in the picture go: without distortion all see the same but for its scale, so that the first one's homographies
+/// serve all.
+fn median_errors(cameras: &[Camera], data: &Sightings, views: &[usize]) -> Vec<f64> {
+    let Some(first) = cameras.first() else { return Vec::new() };
+    let views: Vec<_> = views
+        .iter()
+        .map(|v| {
+            let corners = some_corners(&data.views[*v][0]);
+            let homography = plane_homography(first, &data.target, &corners);
+            (corners, homography)
+        })
+        .collect();
+    let of = |camera: &Camera| {
+        let mut errors = Vec::new();
+        let scale = Vector3::new(first.fx / camera.fx, first.fy / camera.fy, 1.0);
+        for (corners, homography) in &views {
+            let pose = homography
+                .and_then(|h| pose_from_homography(&(Matrix3::from_diagonal(&scale) * h), &data.target, corners));
+            errors.extend(corners.iter().map(|c| {
+                let seen = pose.and_then(|pose| camera.project(&pose.transform(&data.target.bent(c.point, [0.0; 2]))));
+                seen.map_or(f64::INFINITY, |seen| (seen - c.pixel).norm())
+            }));
+        }
+        median(&mut errors).unwrap_or(f64::INFINITY)
+    };
+    cameras.iter().map(of).collect()
+}
+
+/// The cameras that may be near: the principal point in the middle, and what Zhang's method says. By [`median_errors`]' groups.
+fn candidates(data: &Sightings, views: &[usize], projection: LensProjection) -> Vec<Vec<Camera>> {
     let (width, height) = data.sizes[0];
     let longer = width.max(height) as f64;
+    let mut barrels: [Vec<Camera>; BARRELS.len()] = Default::default();
     let mut out = Vec::new();
     for step in 0..FOCALS {
         let camera = Camera::from_focal(width, height, 0.2 * longer * 1.25f64.powi(step));
         if projection == LensProjection::Fisheye {
-            out.push(Camera { distortion: Distortion::fisheye4([0.0; 4]), ..camera });
+            out.push(vec![Camera { distortion: Distortion::fisheye4([0.0; 4]), ..camera }]);
             continue;
         }
         // Of the distance of a corner of the picture, in units of the focal length.
         let squared = ((width as f64 / 2.0).powi(2) + (height as f64 / 2.0).powi(2)) / camera.fx.powi(2);
-        for barrel in BARRELS {
+        for (cameras, barrel) in barrels.iter_mut().zip(BARRELS) {
             let distortion = Distortion::radial_tangential4([-barrel / squared, 0.0, 0.0, 0.0]);
-            out.push(Camera { distortion, ..camera });
+            cameras.push(Camera { distortion, ..camera });
         }
     }
+    out.extend(barrels);
     if projection == LensProjection::Perspective {
         let plane = |v: &usize| {
             let pairs =
@@ -83,7 +114,7 @@ fn candidates(data: &Sightings, views: &[usize], projection: LensProjection) -> 
         };
         let homographies: Vec<_> = views.iter().filter_map(plane).collect();
         let zhang = intrinsics_from_homographies(&homographies, data.sizes[0]);
-        out.extend(zhang.map(|camera| Camera { distortion: Distortion::radial_tangential4([0.0; 4]), ..camera }));
+        out.extend(zhang.map(|camera| vec![Camera { distortion: Distortion::radial_tangential4([0.0; 4]), ..camera }]));
     }
     out
 }
@@ -113,14 +144,15 @@ pub(crate) fn start(
     let candidates = candidates(data, &few, projection);
     let stage = Stage::new(progress, "start", candidates.len())?;
     let compared = spread(usable, VIEWS / 2);
-    let errors: Result<Vec<f64>, _> = candidates
+    let errors: Result<Vec<Vec<f64>>, _> = candidates
         .par_iter()
-        .map(|camera| {
+        .map(|cameras| {
             stage.add(1)?;
-            Ok::<f64, CalibrateError>(median_error(camera, data, &compared))
+            Ok::<_, CalibrateError>(median_errors(cameras, data, &compared))
         })
         .collect();
-    let mut ranked: Vec<(f64, Camera)> = errors?.into_iter().zip(candidates).filter(|(e, _)| e.is_finite()).collect();
+    let mut ranked: Vec<(f64, Camera)> =
+        errors?.concat().into_iter().zip(candidates.concat()).filter(|(e, _)| e.is_finite()).collect();
     ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
     let model = match projection {
         LensProjection::Perspective => cv_core::DistortionModel::RadialTangential4,
@@ -143,11 +175,11 @@ pub(crate) fn start(
     Ok(best)
 }
 
-/// The poses of views by their homographies.
+/// The poses of views by the homographies of some of their corners.
 pub(crate) fn poses(data: &Sightings, usable: &[usize], camera: &Camera) -> Vec<Option<Pose>> {
     let mut poses = vec![None; data.views.len()];
     for &v in usable {
-        poses[v] = plane_pose(camera, &data.target, &data.views[v][0]);
+        poses[v] = plane_pose(camera, &data.target, &some_corners(&data.views[v][0]));
     }
     poses
 }
@@ -180,7 +212,7 @@ fn refine(
         poses: poses(&few, &all, camera),
         shape: [0.0; 2],
     };
-    let used = all_corners(&few, &all);
+    let used = thinned(&all_corners(&few, &all));
     let coarse = Free { lenses: Lenses::Coarse, shape: false, mounts: false };
     adjust(&few, &mut estimate, &used, (coarse, cauchy(error)), (30, 1e-3), progress)?;
     let free = Free { lenses: Lenses::All, shape: false, mounts: false };
@@ -189,8 +221,12 @@ fn refine(
         let mut errors: Vec<f64> = residuals.map(|r| r.map_or(f64::INFINITY, |r| r.norm())).collect();
         median(&mut errors).unwrap_or(f64::INFINITY)
     };
+    let mut last = None;
     for _ in 0..2 {
         let loss = cauchy(typical(&estimate).min(error.max(LEAST_SCALE)));
+        if last.replace(loss) == Some(loss) {
+            break;
+        }
         adjust(&few, &mut estimate, &used, (free, loss), (50, 1e-3), progress)?;
     }
     let error = typical(&estimate);

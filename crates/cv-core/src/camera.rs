@@ -1,6 +1,6 @@
 //! Camera intrinsics, and projection with its derivatives.
 
-use nalgebra::{Matrix2, Matrix2x3, Matrix3, Point2, Point3, SMatrix, Vector2};
+use nalgebra::{Matrix1x2, Matrix1x3, Matrix2x3, Matrix3, Point2, Point3, SMatrix};
 
 use crate::Scaling;
 use crate::distortion::{Distortion, MAX_PARAMETERS};
@@ -131,17 +131,19 @@ impl Camera {
         let inverse = 1.0 / p.z;
         let ideal = Point2::new(p.x * inverse, p.y * inverse);
         let (d, j, by_parameters) = self.distortion.distort_with_jacobians(ideal);
-        let scale = Matrix2::new(self.fx, 0.0, 0.0, self.fy);
-        let by_ideal = Matrix2x3::new(inverse, 0.0, -ideal.x * inverse, 0.0, inverse, -ideal.y * inverse);
+        // By entries: the products of the diagonal and triangular matrices that these are would be mostly of zeros.
+        let (by_x, by_y) = (j.row(0) * self.fx, j.row(1) * self.fy);
+        let along = |m: &Matrix1x2<f64>| {
+            Matrix1x3::new(m.x * inverse, m.y * inverse, m.x * (-ideal.x * inverse) + m.y * (-ideal.y * inverse))
+        };
         let mut by_intrinsics = SMatrix::<f64, 2, MAX_INTRINSICS>::zeros();
-        by_intrinsics.set_column(0, &Vector2::new(d.x, 0.0));
-        by_intrinsics.set_column(1, &Vector2::new(0.0, d.y));
-        by_intrinsics.set_column(2, &Vector2::x());
-        by_intrinsics.set_column(3, &Vector2::y());
-        by_intrinsics.fixed_columns_mut::<MAX_PARAMETERS>(4).copy_from(&(scale * by_parameters));
+        let (by_pinhole, by_lens) = by_intrinsics.as_mut_slice().split_at_mut(8);
+        by_pinhole.copy_from_slice(&[d.x, 0.0, 0.0, d.y, 1.0, 0.0, 0.0, 1.0]);
+        let columns = by_lens.as_chunks_mut::<2>().0.iter_mut().zip(by_parameters.as_slice().as_chunks::<2>().0);
+        columns.for_each(|(column, [x, y])| *column = [self.fx * x, self.fy * y]);
         Some(ProjectedPoint {
             pixel: Point2::new(self.fx * d.x + self.cx, self.fy * d.y + self.cy),
-            by_point: scale * j * by_ideal,
+            by_point: Matrix2x3::from_rows(&[along(&by_x), along(&by_y)]),
             by_intrinsics,
         })
     }
@@ -202,6 +204,7 @@ impl Camera {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use nalgebra::Vector2;
     use proptest::prelude::*;
 
     proptest! {

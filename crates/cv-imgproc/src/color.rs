@@ -102,6 +102,11 @@ static LINEAR: LazyLock<[f32; 256]> = LazyLock::new(|| {
     })
 });
 
+/// A value of sRGB, 0 to 1, to linear light (IEC 61966-2-1).
+pub fn decode_srgb(v: f32) -> f32 {
+    if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
+}
+
 /// sRGB bytes to linear light, 0 to 1 (IEC 61966-2-1).
 pub fn srgb_to_linear<const C: usize>(view: ImageView<'_, u8, C>) -> Image<f32, C> {
     let table = &*LINEAR;

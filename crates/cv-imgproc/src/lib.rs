@@ -42,7 +42,7 @@ mod warp;
 mod warp_map;
 
 pub use color::{
-    f32_to_u8, gray_to_f32, gray_to_rgb, hsv_to_rgb, linear_rgb_to_lab, linear_to_srgb, rgb_pixel_to_hsv,
+    decode_srgb, f32_to_u8, gray_to_f32, gray_to_rgb, hsv_to_rgb, linear_rgb_to_lab, linear_to_srgb, rgb_pixel_to_hsv,
     rgb_pixel_to_lab, rgb_to_f32, rgb_to_gray, rgb_to_gray_f32, rgb_to_hsv, rgb_to_lab, srgb_to_linear, u8_to_f32,
 };
 pub use connected_components::{

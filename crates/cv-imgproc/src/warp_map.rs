@@ -23,6 +23,9 @@ const MOST_ROWS: u8 = 8;
 /// The most that a step can be: half a byte for the column, half for the row.
 const MOST_STEP: usize = 15;
 
+/// Bytes of a cache line.
+const LINE: usize = 64;
+
 /// Eight result pixels of a row and where they come from.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Block {
@@ -241,6 +244,9 @@ impl WarpMap {
         let windows = frame.width() * C >= WINDOW;
         let patterns: [Pattern<S>; RGB] = std::array::from_fn(|part| Pattern::new(simd, part, C));
         let is_simple = |block: &Block| windows && block.is_in_windows(C);
+        if windows && frame.height() > 0 {
+            fetch(frame, blocks);
+        }
         // Two at a time; the end of a row by itself.
         for (pair, out) in blocks.chunks(2).zip(out.chunks_mut(2 * LANES * C)) {
             match pair {
@@ -265,6 +271,16 @@ impl WarpMap {
             }
         }
     }
+}
+
+/// Reads a byte of the lowest row that blocks are likely to need, of each cache line one. Those lines then come to the cache side by side, where the windows would wait for one after the
+/// other: each row of the source is new once, and too short for the processor to see ahead.
+#[inline(always)]
+fn fetch<const C: usize>(frame: ImageView<'_, u8, C>, blocks: &[Block]) {
+    let last = frame.height() - 1;
+    let first_byte = |block: &Block| frame.row((block.y as usize + 2).min(last))[C * block.x as usize];
+    let near = blocks.iter().step_by((LINE / (LANES * C)).max(1)).filter(|block| block.flags & SCATTERED == 0);
+    std::hint::black_box(near.fold(0, |all, block| all ^ first_byte(block)));
 }
 
 /// Makes those pixels of a block black that come from nowhere.

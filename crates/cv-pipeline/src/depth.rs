@@ -1,7 +1,7 @@
 //! Depth from a rectified pair.
 
 use crate::disparity_range::is_exchanged;
-use crate::no_pair::{NoPairCause, cause};
+use crate::no_pair::{FeatureAgreement, FewMatches, NoPairCause, cause};
 use crate::{Progress, RangeError, disparity_range};
 use cv_core::{Cancelled, GrayF32, ImageView, PointCloud, RgbU8, StageClock};
 use cv_stereo::{
@@ -37,11 +37,18 @@ pub struct DepthOptions {
     /// infinity, which JSON does not know.)
     #[cfg_attr(feature = "serde", serde(with = "open_range"))]
     pub range: (f32, f32),
+    /// What becomes of a pair of which hardly anything is matched. Default [`FewMatches::Check`].
+    pub few_matches: FewMatches,
 }
 
 impl Default for DepthOptions {
     fn default() -> Self {
-        Self { stereo: StereoOptions::default(), disparities: DisparityRange::Given, range: (0.0, f32::INFINITY) }
+        Self {
+            stereo: StereoOptions::default(),
+            disparities: DisparityRange::Given,
+            range: (0.0, f32::INFINITY),
+            few_matches: FewMatches::default(),
+        }
     }
 }
 
@@ -75,6 +82,8 @@ pub struct DepthResult {
     pub disparities: (i32, usize),
     /// What made depth of disparity; `None` where it was not given.
     pub geometry: Option<StereoGeometry>,
+    /// Where fewer pixels were matched than nearly all rectified pairs show: what features say of them. `None` where there were enough.
+    pub few: Option<FeatureAgreement>,
     /// Stage names and their seconds. `match` is the matcher from the gray images to checked disparities; `prepare` is
     /// the memory it asks for beforehand.
     pub stages: Vec<(&'static str, f64)>,
@@ -189,8 +198,8 @@ impl From<RectifyError> for DepthError {
 /// reach at most 15 %, and at most that exchanged ones whose disparities are not all within a few pixels of zero.
 pub(crate) const LEAST_MATCHED: f64 = 0.18;
 
-/// Refuses a map of `left` and `right` that has hardly any matches: what was filled in would be made up. Features are matched
-/// to say why.
+/// Refuses a map of `left` and `right` that has hardly any matches, unless features agree with it or it is to be kept: what was filled in would be made up. Features
+/// are matched to say why. What they say of a map that is kept with few matches.
 ///
 /// # Errors
 /// [`DepthError::NoPair`] and [`DepthError::Cancelled`].
@@ -199,13 +208,19 @@ pub(crate) fn check_pair<T: Intensity, const C: usize>(
     left: ImageView<'_, T, C>,
     right: ImageView<'_, T, C>,
     disparities: (i32, usize),
+    few: FewMatches,
     progress: &dyn Progress,
-) -> Result<(), DepthError> {
+) -> Result<Option<FeatureAgreement>, DepthError> {
     let matched = map.matched_fraction();
     if matched >= LEAST_MATCHED {
-        return Ok(());
+        return Ok(None);
     }
-    Err(DepthError::NoPair { matched, needed: LEAST_MATCHED, cause: cause(left, right, disparities, progress)? })
+    let (cause, agreement) = cause(map, left, right, disparities, progress)?;
+    let keeps = match few {
+        FewMatches::Check => cause == NoPairCause::Unknown && agreement.is_enough(),
+        FewMatches::Keep => matched > 0.0,
+    };
+    if keeps { Ok(Some(agreement)) } else { Err(DepthError::NoPair { matched, needed: LEAST_MATCHED, cause }) }
 }
 
 /// A photograph as bytes of color, 16 bits rounded to 8.
@@ -253,10 +268,11 @@ pub fn depth<T: Intensity, const C: usize>(
         clock.lap("range");
     }
     let mut matcher = StereoMatcher::new(stereo)?;
+    let kept = (options.range, options.few_matches);
     let mut run = || {
         matcher.prepare(left.width(), left.height(), &mut DisparityMap::empty(), progress)?;
         clock.lap("prepare");
-        depth_with(&mut matcher, left, right, geometry, options.range, progress)
+        depth_of(&mut matcher, [left, right], geometry, kept, progress)
     };
     let mut result = match run() {
         Err(DepthError::Cancelled(stop)) => {
@@ -287,13 +303,24 @@ pub fn depth_with<T: Intensity, const C: usize>(
     range: (f32, f32),
     progress: &dyn Progress,
 ) -> Result<DepthResult, DepthError> {
+    depth_of(matcher, [left, right], geometry, (range, FewMatches::default()), progress)
+}
+
+/// As [`depth_with`], with what becomes of a pair of which hardly anything is matched.
+pub(crate) fn depth_of<T: Intensity, const C: usize>(
+    matcher: &mut dyn DisparityMatcher<T, C>,
+    [left, right]: [ImageView<'_, T, C>; 2],
+    geometry: Option<&StereoGeometry>,
+    (range, few): ((f32, f32), FewMatches),
+    progress: &dyn Progress,
+) -> Result<DepthResult, DepthError> {
     check_range(range, geometry)?;
     let mut clock = StageClock::new();
     let mut map = DisparityMap::empty();
     matcher.compute_into(left, right, &mut map, progress)?;
     clock.lap("match");
     let disparities = matcher.disparities();
-    check_pair(&map, left, right, disparities, progress)?;
+    let few = check_pair(&map, left, right, disparities, few, progress)?;
     progress.report("depth", 0, 1)?;
     let depth = geometry.map(|geometry| kept_depth(geometry, &map, range)).transpose()?;
     let confidence = matcher.confidence(&map);
@@ -301,7 +328,7 @@ pub fn depth_with<T: Intensity, const C: usize>(
     let sigma = matcher.uncertainty(&map);
     clock.lap("depth");
     let geometry = geometry.copied();
-    Ok(DepthResult { map, depth, confidence, sigma, disparities, geometry, stages: clock.into_stages() })
+    Ok(DepthResult { map, depth, confidence, sigma, disparities, geometry, few, stages: clock.into_stages() })
 }
 
 /// The depths in `range`, of which there is at least one.
@@ -396,6 +423,47 @@ mod tests {
         let error = depth(left, right, None, &DepthOptions { stereo: far, ..Default::default() }, &Silent).unwrap_err();
         assert!(matches!(error, DepthError::NoPair { cause: NoPairCause::Range { .. }, .. }), "{error}");
         assert!(depth(left, right, None, &options, &Silent).unwrap().map.matched_fraction() > 0.5);
+    }
+
+    #[test]
+    fn few_matches_are_kept_where_features_agree() {
+        let scene = Scene::room(1);
+        let camera = Camera::from_focal(320, 240, 280.0);
+        let of = |scene: &Scene| {
+            let pair = stereo_pair(scene, &camera, &scene.viewpoint(), 0.25, &RenderOptions::default()).unwrap();
+            // A seventh of the rows; gray around them.
+            let strip = |image: &cv_core::RgbU8| {
+                let kept = 100..134;
+                cv_core::RgbU8::from_fn(320, 240, |x, y| if kept.contains(&y) { image.at(x, y) } else { [90; 3] })
+            };
+            ([strip(&pair.left.image), strip(&pair.right.image)], pair.disparity)
+        };
+        let ([left, right], truth) = of(&scene);
+        let ([_, other], _) = of(&Scene::tabletop(2));
+        let options = |disparities, few_matches| DepthOptions {
+            stereo: StereoOptions { disparities, fill: false, ..Default::default() },
+            few_matches,
+            ..Default::default()
+        };
+        let run =
+            |right: &cv_core::RgbU8, options: &DepthOptions| depth(left.view(), right.view(), None, options, &Silent);
+        let found = run(&right, &options(64, FewMatches::Check)).unwrap();
+        let few = found.few.unwrap();
+        assert!(found.map.matched_fraction() < LEAST_MATCHED && few.is_enough(), "{few:?}");
+        let known =
+            (0..240 * 320).map(|i| (i % 320, i / 320)).filter(|(x, y)| found.map.disparity.at(*x, *y)[0].is_finite());
+        let off = known.map(|(x, y)| (found.map.disparity.at(x, y)[0] - truth.at(x, y)[0]).abs());
+        let off: Vec<f32> = off.collect();
+        // As of a whole pair, the bar of which is nine of ten within a pixel; rows next to the gray ones see little of their own.
+        assert!(off.iter().filter(|d| **d < 1.0).count() * 10 > off.len() * 8, "{}", off.len());
+        // Of something else, and where the range ends before what features show.
+        let error = run(&other, &options(64, FewMatches::Check)).map(|d| d.few).unwrap_err();
+        assert!(matches!(error, DepthError::NoPair { .. }), "{error}");
+        let nearest = truth.as_slice().iter().copied().fold(0.0, f32::max) as usize;
+        let error = run(&right, &options(nearest / 2, FewMatches::Check)).map(|d| d.few).unwrap_err();
+        assert!(matches!(error, DepthError::NoPair { cause: NoPairCause::Range { .. }, .. }), "{error}");
+        // Who wants it all the same gets it.
+        assert!(run(&other, &options(64, FewMatches::Keep)).unwrap().few.is_some());
     }
 
     /// Smallest disparity of the exchanged pair.

@@ -1,7 +1,7 @@
 //! Disparity and depth of the frames of a film, one pair after the other.
 
-use crate::depth::{check_pair, check_range, color_bytes, matcher_options};
-use crate::{DepthError, DepthOptions, DisparityRange, Progress, RigDepthResult, depth_with};
+use crate::depth::{check_pair, check_range, color_bytes, depth_of, matcher_options};
+use crate::{DepthError, DepthOptions, DisparityRange, Progress, RigDepthResult};
 use cv_core::{Image, ImageView, PointCloud, Pose, StageClock, Vector3};
 use cv_imgproc::{Pixel, WarpMap};
 use cv_stereo::{DisparityMap, Intensity, Rectification, RectifyError, StereoGeometry, StereoMatcher, StereoOptions};
@@ -72,7 +72,7 @@ impl FrameDepth {
         let matcher = matcher(&mut self.matcher, &self.options, [left, right], progress)?;
         matcher.compute_into(left, right, &mut self.map, progress)?;
         let StereoOptions { min_disparity, disparities, .. } = *matcher.options();
-        check_pair(&self.map, left, right, (min_disparity, disparities), progress)?;
+        check_pair(&self.map, left, right, (min_disparity, disparities), self.options.few_matches, progress)?;
         self.keep(rectified);
         Ok(&self.map)
     }
@@ -101,7 +101,8 @@ impl FrameDepth {
         }
         matcher.prepare(left.width(), left.height(), &mut self.map, progress)?;
         clock.lap("prepare");
-        let mut maps = depth_with(matcher, left, right, self.geometry.as_ref(), self.options.range, progress)?;
+        let kept = (self.options.range, self.options.few_matches);
+        let mut maps = depth_of(matcher, [left, right], self.geometry.as_ref(), kept, progress)?;
         maps.stages.iter().for_each(|(stage, seconds)| clock.add(stage, *seconds));
         maps.stages = clock.into_stages();
         let images = [color_bytes(left), color_bytes(right)];

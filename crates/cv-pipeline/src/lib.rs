@@ -68,7 +68,7 @@ pub use matching::{
     AffineSimulation, MatchingError, MatchingOptions, MatchingResult, extract_features, match_extracted,
     match_features, match_photos,
 };
-pub use no_pair::NoPairCause;
+pub use no_pair::{FeatureAgreement, FewMatches, NoPairCause};
 /// What a caller of [`match_extracted`] needs to hand in features found elsewhere, and the settings of ours.
 pub mod features {
     pub use cv_features::{

@@ -87,6 +87,7 @@ impl DepthArguments {
             ));
         }
         let view = view_options(options)?;
+        options.set_named("few_matches", &mut o.few_matches)?;
         options.set("near", &mut o.range.0)?;
         options.set("far", &mut o.range.1)?;
         let mut cloud = false;
@@ -166,6 +167,7 @@ pub(crate) fn depth<'py>(
                     .map_or_else(none, |[one, two]| object(py, (arrays::array(py, one)?, arrays::array(py, two)?)))?,
             ),
             ("cloud", cloud.map_or_else(none, |cloud| cloud::made(py, cloud))?),
+            ("few_matches", object(py, found.few.map(|few| (few.agree, few.seen)))?),
             ("disparities", object(py, found.disparities)?),
             ("valid_fraction", object(py, valid)?),
             ("matched_fraction", object(py, matched)?),

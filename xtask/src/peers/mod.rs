@@ -6,6 +6,7 @@
 mod adjust;
 mod calibration;
 mod calibration_boards;
+mod calibration_markers;
 mod calibration_undistort;
 mod feature_quality;
 mod features;

@@ -80,6 +80,7 @@ fn pairs(folder: &Path) -> Result<Vec<Check>> {
     checks.push(Check::at_most("pairs: depth of squares off the board's plane, median of the pairs, %", middle, 0.3));
     let worst = corners.iter().copied().fold(f64::NAN, f64::max);
     checks.push(Check::at_most("pairs: triangulated corners off their plane, worst pair, RMS, %", worst, 0.3));
+    checks.extend(super::calibration_commands::run(folder, &views, &found)?);
     Ok(checks)
 }
 
@@ -173,7 +174,7 @@ fn flatness(views: &[Vec<PathBuf>], found: &BoardCalibration) -> Result<[Vec<f64
 }
 
 /// Whether a point lies in a convex polygon.
-fn is_within(polygon: &[Point2<f64>], x: f64, y: f64) -> bool {
+pub(super) fn is_within(polygon: &[Point2<f64>], x: f64, y: f64) -> bool {
     let side = |i: usize| {
         let (a, b) = (polygon[i], polygon[(i + 1) % polygon.len()]);
         (b.x - a.x) * (y - a.y) - (b.y - a.y) * (x - a.x)
@@ -238,8 +239,9 @@ fn wide(folder: &Path) -> Result<Vec<Check>> {
     for lens in &found.calibration.cameras[0].lenses {
         println!("wide, flat: {lens:?}");
     }
-    let holdout = found.calibration.holdout_rms_px;
+    let (holdout, all) = (found.calibration.holdout_rms_px, found.calibration.holdout_all_rms_px);
     checks.push(Check::at_most("wide: hold-out RMS on a flat board, lens chosen, px", holdout, 0.55));
+    checks.push(Check::at_most("wide: the same over all corners, px", all, 0.55));
     let (found, _) = solved(&views, board, CalibrateOptions::default())?;
     println!(
         "wide, chosen: RMS {:.3} px, hold-out {:.3} px",

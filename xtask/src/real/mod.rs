@@ -4,6 +4,7 @@
 //! A figure that is off its bar fails the run; so does an error. Jobs print what else a person wants to see.
 
 mod calibration;
+mod calibration_commands;
 pub(crate) mod depth;
 pub(crate) mod estimate;
 mod focal;

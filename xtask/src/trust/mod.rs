@@ -34,7 +34,7 @@ pub(crate) fn run(only: Option<&str>, options: &Options) -> Result<bool> {
 }
 
 /// The program that was built with this one.
-fn program() -> Result<PathBuf> {
+pub(crate) fn program() -> Result<PathBuf> {
     let path = std::env::current_exe()?.with_file_name("cv");
     ensure!(
         path.is_file(),

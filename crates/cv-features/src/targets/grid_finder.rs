@@ -184,11 +184,12 @@ mod tests {
     use super::*;
     use crate::targets::{Board, Dictionary};
     use cv_core::{GrayF32, Silent, Vector3};
+    use cv_imgproc::{gray_to_f32, linear_to_srgb};
 
-    /// A picture of boards, each through a homography from board to picture, four samples to a pixel each way.
+    /// A picture of boards, each through a homography from board to picture, four samples of light to a pixel each way, as sRGB.
     fn picture(boards: &[(Board, Matrix3<f64>)], (w, h): (usize, usize)) -> GrayF32 {
         let all: Vec<_> = boards.iter().map(|(b, map)| (b.black(), map.try_inverse().unwrap())).collect();
-        GrayF32::from_fn(w, h, |x, y| {
+        let light = GrayF32::from_fn(w, h, |x, y| {
             let mut sum = 0.0;
             for k in 0..16 {
                 let at =
@@ -198,10 +199,11 @@ mod tests {
                     let (u, v) = (p.x / p.z, p.y / p.z);
                     black.iter().any(|r| u >= r.x && v >= r.y && u < r.x + r.width && v < r.y + r.height)
                 });
-                sum += if black { 0.1 } else { 0.8 };
+                sum += if black { 0.02 } else { 0.6 };
             }
             [sum / 16.0]
-        })
+        });
+        gray_to_f32(linear_to_srgb(light.view()).view())
     }
 
     fn grid(style: GridStyle, dictionary: Dictionary) -> MarkerGrid {

@@ -5,7 +5,9 @@
 //! until four are left. Then each side is a straight line through the steps from white to black along it. Time: pixels, and corners of hulls squared.
 
 use cv_core::{Cancelled, GrayF32, ImageView, Mask, Point2, Stage, Vector2};
-use cv_imgproc::{Connectivity, StructuringElement, connected_components, erode, pyr_down, sample_bilinear};
+use cv_imgproc::{
+    Connectivity, StructuringElement, connected_components, decode_srgb, erode, pyr_down, sample_bilinear,
+};
 use rayon::prelude::*;
 
 /// Pixels that are looked at for black regions; a larger picture is halved before, and its sides are then taken from the whole one.
@@ -203,7 +205,7 @@ fn quadrilateral(mut polygon: Vec<Point2<f64>>) -> Option<[Point2<f64>; 4]> {
 fn sides(view: ImageView<'_, f32, 1>, quad: &[Point2<f64>; 4], reach: f64) -> Option<[Line; 4]> {
     let mut out = [Line { at: quad[0], along: Vector2::zeros(), deviation: 0.0 }; 4];
     for (k, line) in out.iter_mut().enumerate() {
-        *line = side(view, quad[k], quad[(k + 1) % 4], (0.1, 0.9), reach)?;
+        *line = side(view, quad[k], quad[(k + 1) % 4], (0.1, 0.9), (reach, Tone::Encoded))?;
     }
     Some(out)
 }
@@ -223,7 +225,7 @@ fn side(
     from: Point2<f64>,
     to: Point2<f64>,
     (first, last): (f64, f64),
-    reach: f64,
+    (reach, tone): (f64, Tone),
 ) -> Option<Line> {
     let length = (to - from).norm();
     if !(length > 4.0 && length.is_finite()) {
@@ -236,7 +238,7 @@ fn side(
     let mut steps: Vec<Vector2<f64>> = Vec::with_capacity(count);
     for i in 0..count {
         let t = first + (last - first) * (i as f64 + 0.5) / count as f64;
-        if let Some(off) = step(view, from + along * (t * length), inward, reach) {
+        if let Some(off) = step(view, from + along * (t * length), inward, (reach, tone)) {
             steps.push(Vector2::new(t * length, off));
         }
     }
@@ -267,8 +269,18 @@ fn side(
     None
 }
 
+/// In which values an edge is looked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Tone {
+    /// As they are in the picture.
+    Encoded,
+    /// In light, as sRGB has it: blur mixes light, so that an edge is symmetric there alone. The curve makes the mixed pixels brighter, which moves each edge toward black, by
+    /// a fifth of a pixel and more.
+    Light,
+}
+
 /// How far along `inward` from a place the picture turns from white to black: the steepest fall within `reach`, to a fraction of a pixel.
-fn step(view: ImageView<'_, f32, 1>, at: Point2<f64>, inward: Vector2<f64>, reach: f64) -> Option<f64> {
+fn step(view: ImageView<'_, f32, 1>, at: Point2<f64>, inward: Vector2<f64>, (reach, tone): (f64, Tone)) -> Option<f64> {
     const STEP: f64 = 0.5;
     let n = (reach / STEP).ceil() as i32 + 2;
     let mut values = Vec::with_capacity(2 * n as usize + 1);
@@ -277,12 +289,20 @@ fn step(view: ImageView<'_, f32, 1>, at: Point2<f64>, inward: Vector2<f64>, reac
         let [v] = sample_bilinear(view, p.x, p.y)?;
         values.push(v);
     }
-    // Differences over a pixel.
-    let falls: Vec<f32> = values.windows(3).map(|v| v[0] - v[2]).collect();
-    let inner = 2..falls.len().saturating_sub(2);
-    let steepest = inner.max_by(|a, b| falls[*a].total_cmp(&falls[*b]))?;
+    // Differences over a pixel, and which is the largest.
+    let steepest_of = |values: &[f32]| {
+        let falls: Vec<f32> = values.windows(3).map(|v| v[0] - v[2]).collect();
+        let inner = 2..falls.len().saturating_sub(2);
+        let steepest = inner.max_by(|a, b| falls[*a].total_cmp(&falls[*b]))?;
+        Some((falls, steepest))
+    };
+    let (mut falls, mut steepest) = steepest_of(&values)?;
     if falls[steepest] < 0.02 {
         return None;
+    }
+    if tone == Tone::Light {
+        values.iter_mut().for_each(|v| *v = decode_srgb(*v));
+        (falls, steepest) = steepest_of(&values)?;
     }
     let (mut sum, mut weight) = (0.0, 0.0);
     for (i, fall) in falls.iter().enumerate().skip(steepest - 2).take(5) {
@@ -294,7 +314,7 @@ fn step(view: ImageView<'_, f32, 1>, at: Point2<f64>, inward: Vector2<f64>, reac
 }
 
 /// A corner of a marker, where its two sides meet: each by its half next to the corner, since a lens bends a whole side more, and without the end, where blur rounds it.
-/// `blur`: pixels that are left out. With its standard deviation along either axis.
+/// `blur`: pixels that are left out. Edges are placed in light. With its standard deviation along either axis.
 pub(super) fn marker_corner(
     view: ImageView<'_, f32, 1>,
     quad: &[Point2<f64>; 4],
@@ -304,8 +324,8 @@ pub(super) fn marker_corner(
     let (before, here, after) = (quad[(k + 3) % 4], quad[k], quad[(k + 1) % 4]);
     let rounded = |a: Point2<f64>, b: Point2<f64>| (blur / (a - b).norm()).min(0.3);
     let (p, q) = (rounded(before, here), rounded(here, after));
-    let into = side(view, before, here, (0.45, 1.0 - p), 2.0)?;
-    let out = side(view, here, after, (q, 0.55), 2.0)?;
+    let into = side(view, before, here, (0.45, 1.0 - p), (2.0, Tone::Light))?;
+    let out = side(view, here, after, (q, 0.55), (2.0, Tone::Light))?;
     let at = meet(into.at, into.along, out.at, out.along)?;
     // The sampling of sharp edges adds a fiftieth of a pixel.
     Some((at, (0.5 * (into.deviation.powi(2) + out.deviation.powi(2))).sqrt().hypot(0.02)))
@@ -316,10 +336,10 @@ mod tests {
     use super::*;
     use cv_core::{Matrix3, Silent, Vector3};
 
-    /// Black within a quadrilateral by a homography from the unit square, white outside, sixteen samples to a pixel.
+    /// Black within a quadrilateral by a homography from the unit square, white outside, sixteen samples of light to a pixel, as sRGB.
     fn picture(map: &Matrix3<f64>, (w, h): (usize, usize)) -> GrayF32 {
         let back = map.try_inverse().unwrap();
-        GrayF32::from_fn(w, h, |x, y| {
+        let light = GrayF32::from_fn(w, h, |x, y| {
             let black = (0..16)
                 .filter(|k| {
                     let p = back
@@ -332,8 +352,9 @@ mod tests {
                     inside(p.x) && inside(p.y)
                 })
                 .count();
-            [0.9 - 0.8 * black as f32 / 16.0]
-        })
+            [0.8 - 0.78 * black as f32 / 16.0]
+        });
+        cv_imgproc::gray_to_f32(cv_imgproc::linear_to_srgb(light.view()).view())
     }
 
     #[test]

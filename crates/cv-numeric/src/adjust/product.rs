@@ -21,8 +21,9 @@ macro_rules! of_size {
 }
 
 /// `out[c * height + a] += Σ_r left[r][a] · right[r][c]`, where `left` and `right` are columns (the first, and how many) of the same rows, which are `stride` long.
+/// The rows are added one after the other: those of many residuals at once give the same bytes as those of each by themselves.
 pub(super) fn add_product(
-    (rows, stride): (&[f64], usize),
+    rows: (&[f64], usize),
     (left, lefts): (usize, usize),
     right: (usize, usize),
     out: &mut [f64],
@@ -30,42 +31,79 @@ pub(super) fn add_product(
 ) {
     for from in (0..lefts).step_by(COLUMNS) {
         let out = &mut out[from..];
-        for rows in rows.chunks(2 * stride) {
-            let rows = (rows, stride);
-            if rows.0.len() == 2 * stride {
-                of_size!(lefts - from, add_rows::<2>, (rows, left + from, right, out, height));
-            } else {
-                of_size!(lefts - from, add_rows::<1>, (rows, left + from, right, out, height));
-            }
-        }
+        of_size!(lefts - from, add_rows::<TILE>, (rows, left + from, right, out, height));
     }
 }
 
-/// `R` rows, of `L` columns on the left.
+/// Columns on the right that are summed together with those on the left: enough sums side by side that none waits for the one before it, and so few that they stay in
+/// sixteen registers of two numbers.
+const TILE: usize = 2;
+
+/// `L` columns on the left, `K` on the right at a time.
 #[inline(always)]
-fn add_rows<const R: usize, const L: usize>(
-    (rows, stride): (&[f64], usize),
+fn add_rows<const K: usize, const L: usize>(
+    rows: (&[f64], usize),
     left: usize,
     (right, rights): (usize, usize),
     out: &mut [f64],
     height: usize,
 ) {
-    let (mut a, mut x) = ([[0.0; L]; R], [&rows[..0]; R]);
-    for ((a, x), row) in a.iter_mut().zip(&mut x).zip(rows.chunks_exact(stride)) {
-        a.copy_from_slice(&row[left..][..L]);
-        *x = &row[right..][..rights];
+    let whole = rights - rights % K;
+    for c in (0..whole).step_by(K) {
+        add_tile::<K, L>(rows, left, right + c, &mut out[c * height..], height);
     }
-    for c in 0..rights {
-        let out = &mut out[c * height..][..L];
-        let mut sum = [0.0; L];
-        sum.copy_from_slice(out);
-        for (a, x) in a.iter().zip(&x) {
+    for c in whole..rights {
+        add_tile::<1, L>(rows, left, right + c, &mut out[c * height..], height);
+    }
+}
+
+#[inline(always)]
+fn add_tile<const K: usize, const L: usize>(
+    (rows, stride): (&[f64], usize),
+    left: usize,
+    right: usize,
+    out: &mut [f64],
+    height: usize,
+) {
+    let mut sums = [[0.0; L]; K];
+    for (k, sum) in sums.iter_mut().enumerate() {
+        sum.copy_from_slice(&out[k * height..][..L]);
+    }
+    for row in rows.chunks_exact(stride) {
+        let (a, x) = (&row[left..][..L], &row[right..][..K]);
+        for (sum, x) in sums.iter_mut().zip(x) {
             for (sum, a) in sum.iter_mut().zip(a) {
-                *sum += a * x[c];
+                *sum += a * x;
             }
         }
-        out.copy_from_slice(&sum);
     }
+    for (k, sum) in sums.iter().enumerate() {
+        out[k * height..][..L].copy_from_slice(sum);
+    }
+}
+
+/// `out[a] += Σ_r left[r][a] · residuals[r]`, with `left` as of [`add_product`].
+pub(super) fn add_gradient(rows: (&[f64], usize), (left, lefts): (usize, usize), residuals: &[f64], out: &mut [f64]) {
+    for from in (0..lefts).step_by(COLUMNS) {
+        of_size!(lefts - from, add_times::<1>, (rows, left + from, residuals, &mut out[from..]));
+    }
+}
+
+#[inline(always)]
+fn add_times<const ONE: usize, const L: usize>(
+    (rows, stride): (&[f64], usize),
+    left: usize,
+    residuals: &[f64],
+    out: &mut [f64],
+) {
+    let mut sum = [0.0; L];
+    sum.copy_from_slice(&out[..L]);
+    for (row, r) in rows.chunks_exact(stride).zip(residuals) {
+        for (sum, a) in sum.iter_mut().zip(&row[left..][..L]) {
+            *sum += a * r;
+        }
+    }
+    out[..L].copy_from_slice(&sum);
 }
 
 /// `y[c] = V⁻¹ w[·][c]` of `E` rows `w` of as many numbers as there are in `y`, one after the other.
@@ -156,6 +194,13 @@ mod tests {
                 let (c, a) = (at / height, at % height);
                 let sum: f64 = (0..count).map(|r| rows[r * stride + 1 + a] * rows[r * stride + right + c]).sum();
                 assert_eq!(*out, before + if a < lefts { sum } else { 0.0 }, "{count} {lefts} {rights}: {c}, {a}");
+            }
+            let residuals = numbers(count, 5);
+            let mut out = before.clone();
+            add_gradient((&rows, stride), (1, lefts), &residuals, &mut out);
+            for (a, (out, before)) in out.iter().zip(&before).enumerate() {
+                let times = |r: usize| if a < lefts { rows[r * stride + 1 + a] * residuals[r] } else { 0.0 };
+                assert_eq!(*out, before + (0..count).map(times).sum::<f64>(), "{count} {lefts}: gradient, {a}");
             }
         }
     }

@@ -1,7 +1,7 @@
 //! Residuals of one kind: what they depend on, and their part of the normal equations.
 
 use super::manifold::Manifold;
-use super::product::add_product;
+use super::product::{add_gradient, add_product};
 use super::structure::{Links, NONE, Structure};
 use crate::RobustLoss;
 use crate::parallel_map;
@@ -344,20 +344,18 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Kind 
     fn add_to_point(&self, rows: &Rows, links: &Links, places: Range<usize>, point: PointSums<'_>) {
         let Some(e) = links.eliminated else { return };
         let (size, first) = (T::DIMS[e], Self::FIRST[e]);
-        for place in places {
-            let j = &rows.jacobians[place * R * C..][..R * C];
-            let r = &rows.residuals[place * R..][..R];
-            add_product((j, C), (first, size), (first, size), point.v, size);
-            for (row, r) in j.chunks_exact(C).zip(r) {
-                for (g, x) in point.g.iter_mut().zip(&row[first..][..size]) {
-                    *g += x * r;
-                }
-            }
+        let mut places = places;
+        while !places.is_empty() {
+            let (place, count) = (places.start, links.run(places.clone(), B));
+            places.start += count;
+            let j = (&rows.jacobians[place * R * C..][..count * R * C], C);
+            add_product(j, (first, size), (first, size), point.v, size);
+            add_gradient(j, (first, size), &rows.residuals[place * R..][..count * R], point.g);
             for (k, target) in links.targets(place, B).iter().enumerate() {
                 if k != e && target.block != NONE {
                     let out = &mut point.w[size * target.place as usize + target.within as usize..];
                     let left = (Self::FIRST[k], target.width as usize);
-                    add_product((j, C), left, (first, size), out, target.size as usize);
+                    add_product(j, left, (first, size), out, target.size as usize);
                 }
             }
         }
@@ -367,10 +365,12 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Kind 
         let ColumnSums { structure: Structure { pattern, blocks, .. }, blocks: range, values, gradient } = columns;
         let Some(first) = blocks.get(range.start) else { return };
         let (first_value, first_column) = (pattern.start[range.start], first.column);
-        for &place in places {
-            let place = place as usize;
-            let j = &rows.jacobians[place * R * C..][..R * C];
-            let r = &rows.residuals[place * R..][..R];
+        let mut places = places;
+        while let Some(&place) = places.first() {
+            let (place, count) = (place as usize, links.run(places.iter().map(|p| *p as usize), B));
+            places = &places[count..];
+            let j = (&rows.jacobians[place * R * C..][..count * R * C], C);
+            let r = &rows.residuals[place * R..][..count * R];
             let targets = links.targets(place, B);
             for (k, right) in targets.iter().enumerate() {
                 let b = right.block as usize;
@@ -378,12 +378,8 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Kind 
                     continue;
                 }
                 let (within, width) = (right.within as usize, right.width as usize);
-                let gradient = &mut gradient[blocks[b].column - first_column + within..][..width];
-                for (row, r) in j.chunks_exact(C).zip(r) {
-                    for (g, x) in gradient.iter_mut().zip(&row[Self::FIRST[k]..]) {
-                        *g += x * r;
-                    }
-                }
+                let right_columns = (Self::FIRST[k], width);
+                add_gradient(j, right_columns, r, &mut gradient[blocks[b].column - first_column + within..]);
                 let height = pattern.height[b];
                 let values = &mut values[pattern.start[b] - first_value + within * height..];
                 for (l, left) in targets.iter().enumerate() {
@@ -391,8 +387,7 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Kind 
                     if left.block != NONE && left.block >= right.block {
                         let row = if left.block == right.block { 0 } else { pattern.row(b, left.block) };
                         let out = &mut values[row + left.within as usize..];
-                        let left = (Self::FIRST[l], left.width as usize);
-                        add_product((j, C), left, (Self::FIRST[k], width), out, height);
+                        add_product(j, (Self::FIRST[l], left.width as usize), right_columns, out, height);
                     }
                 }
             }

@@ -14,6 +14,9 @@ pub(super) const SMALL: usize = 400;
 /// Above this share of the reduced system's blocks, its factor is about full.
 const FULL: f64 = 0.3;
 
+/// Most residuals that are summed at once: so many that what they are added to is seldom fetched, and so few that their rows stay in the nearest cache.
+const RUN: usize = 32;
+
 /// Lists of different lengths, one after the other.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Lists<T> {
@@ -53,7 +56,7 @@ impl<T: Copy> Lists<T> {
 }
 
 /// Where a block of a residual goes.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Target {
     /// Block of the reduced system, or [`NONE`].
     pub(super) block: u32,
@@ -88,6 +91,15 @@ impl Links {
     #[inline]
     pub(super) fn targets(&self, place: usize, blocks: usize) -> &[Target] {
         &self.targets[place * blocks..][..blocks]
+    }
+
+    /// How many of these places, which are ascending, from the first one on follow each other and depend on the same blocks: [`RUN`] at the most.
+    #[inline]
+    pub(super) fn run(&self, places: impl Iterator<Item = usize>, blocks: usize) -> usize {
+        let mut places = places.take(RUN);
+        let Some(first) = places.next() else { return 0 };
+        let targets = self.targets(first, blocks);
+        1 + (first + 1..).zip(places).take_while(|(next, p)| next == p && self.targets(*p, blocks) == targets).count()
     }
 
     /// Residuals of the eliminated block of a rank.

@@ -31,11 +31,15 @@ pub(super) fn outcome(job: &Job) -> Outcome {
     }
     let mut rms = by_camera(job, |i| json!(c.cameras[i].rms_px));
     let mut holdout = by_camera(job, |i| json!(c.cameras[i].holdout_rms_px));
-    if job.names.len() == 2
-        && let (Value::Object(rms), Value::Object(holdout)) = (&mut rms, &mut holdout)
-    {
-        rms.insert("stereo".to_owned(), json!(c.rms_px));
-        holdout.insert("stereo".to_owned(), json!(c.holdout_rms_px));
+    let mut holdout_all = by_camera(job, |i| json!(c.cameras[i].holdout_all_rms_px));
+    if job.names.len() == 2 {
+        let together =
+            [(&mut rms, c.rms_px), (&mut holdout, c.holdout_rms_px), (&mut holdout_all, c.holdout_all_rms_px)];
+        for (values, of_rig) in together {
+            if let Value::Object(values) = values {
+                values.insert("stereo".to_owned(), json!(of_rig));
+            }
+        }
     }
     let picture = |view: usize, camera: usize| {
         let of = &c.views[view].pictures[camera];
@@ -85,6 +89,7 @@ pub(super) fn outcome(job: &Job) -> Outcome {
     let outcome = Outcome::new(found.stages.clone())
         .with("rms_px", rms)
         .with("holdout_rms_px", holdout)
+        .with("holdout_all_rms_px", holdout_all)
         .with("noise_px", c.noise_px)
         .with("lens", by_camera(job, |i| json!(c.cameras[i].camera.distortion.model().info().name)))
         .with("lenses", by_camera(job, lenses))

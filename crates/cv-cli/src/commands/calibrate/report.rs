@@ -22,6 +22,7 @@ pub(super) fn report(job: &Job) -> Result<Report, Failure> {
     page.headline("rms", &format!("{:.3} px", c.rms_px));
     if !c.holdout_rms_px.is_nan() {
         page.headline("rms on views held out", &format!("{:.3} px", c.holdout_rms_px));
+        page.headline("the same with outliers", &format!("{:.3} px", c.holdout_all_rms_px));
     }
     page.headline("views used", &format!("{used} of {}", c.views.len()));
     if let Some((mean, _)) = job.found.rectified_dy_px {

@@ -18,7 +18,7 @@ use cv_pipeline::stereo::{
     Census, DisparityMap, IntensityCost, Paths, PixelState, Rectification, RectifyOptions, Smoothing, StereoGeometry,
     StereoMatcher, StereoOptions,
 };
-use cv_pipeline::{DepthError, DepthOptions, DepthResult, FrameDepth, RigDepthResult};
+use cv_pipeline::{DepthError, DepthOptions, DepthResult, FeatureAgreement, FrameDepth, RigDepthResult};
 use maps::write_map;
 use options::{Range, parse_range};
 use pairing::PairBy;
@@ -128,6 +128,10 @@ pub(crate) struct Args {
     /// Gray levels (of 255) across which --smoothing does not reach [default: 24; 1.5 for wls].
     #[arg(long, value_name = "LEVELS")]
     sigma: Option<f32>,
+    /// Keep what is matched, however little that is and whatever features say of it: without this, a pair of which less than a fifth is matched is refused where
+    /// features do not show the same disparities.
+    #[arg(long)]
+    force: bool,
     /// Where to write how sure each disparity is, from 0 to 1 (0 where filled): .pfm, .npy or .png (0 to 255).
     #[arg(long, value_name = "FILE")]
     confidence: Option<PathBuf>,
@@ -210,8 +214,14 @@ impl Run for Args {
     }
 }
 
-/// Warns where most of a map was guessed.
+/// Warns where hardly anything was matched, and where most of a map was guessed.
 fn warn_of_filling(maps: &DepthResult, context: &Context) {
+    if let Some(FeatureAgreement { agree, seen }) = maps.few {
+        context.warn(format!(
+            "only {:.1} % of the pixels were matched and confirmed: too little texture, a pattern that repeats, or things that moved; of {seen} features on them {agree} show the same disparity",
+            100.0 * maps.map.matched_fraction()
+        ));
+    }
     if maps.is_mostly_filled() {
         context.warn(format!(
             "only {:.1} % of the pixels were matched; the others are filled in from around, and of such pixels about four in ten are wrong (--no-fill leaves them unknown)",

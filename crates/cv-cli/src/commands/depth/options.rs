@@ -3,7 +3,7 @@
 use super::Args;
 use crate::frame::Context;
 use cv_pipeline::stereo::{Smoothing, StereoOptions};
-use cv_pipeline::{DepthOptions, DisparityRange};
+use cv_pipeline::{DepthOptions, DisparityRange, FewMatches};
 
 /// `--disparities`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -53,6 +53,7 @@ impl Args {
                 Range::Auto => DisparityRange::FromMatches { min: self.min_disparity },
             },
             range: (self.near, self.far.unwrap_or(f32::INFINITY)),
+            few_matches: if self.force { FewMatches::Keep } else { FewMatches::Check },
         }
     }
 }
