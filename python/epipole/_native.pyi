@@ -110,6 +110,28 @@ class Undistorter:
     def compute(self, image: _Image) -> NDArray[Any]: ...
 
 @final
+class SfmPhotograph:
+    @property
+    def name(self) -> str: ...
+    @property
+    def size(self) -> _Size: ...
+    @property
+    def focal(self) -> float | None: ...
+    @property
+    def keypoints(self) -> NDArray[np.float32]: ...
+    def __len__(self) -> int: ...
+    @staticmethod
+    def _of_parts(
+        name: str,
+        size: _Size,
+        focal: float | None,
+        keypoints: ArrayLike,
+        descriptors: bytes,
+        kind: str,
+        colors: ArrayLike,
+    ) -> SfmPhotograph: ...
+
+@final
 class FittedColorModel:
     @staticmethod
     def fit(
@@ -329,8 +351,16 @@ def reconstruct(
     threads: int | None = None,
     progress: _Progress | None = None,
 ) -> TwoViewReconstruction: ...
+def sfm_features(
+    photograph: _Photograph,
+    *,
+    name: str | None = None,
+    max_features: int | None = None,
+    threads: int | None = None,
+    progress: _Progress | None = None,
+) -> SfmPhotograph: ...
 def sfm(
-    photographs: Sequence[_Photograph],
+    photographs: Sequence[_Photograph | SfmPhotograph],
     *,
     camera: Camera | ArrayLike | None = None,
     focal: float | None = None,

@@ -7,8 +7,10 @@ place of one that could not be done: a bad file ends no job.
 Results are written whole or not at all, so that a run that was stopped goes on where it ended when it is started again with the same folder and options.
 """
 
+import dataclasses
 import json
 import os
+import pickle
 import tempfile
 import warnings
 from pathlib import Path
@@ -59,6 +61,24 @@ def match_pairs(pairs, output, *, actors=None, restarts=_RESTARTS, names=None, *
     pairs: (a, b) paths, or a Dataset with columns ``a`` and ``b``.
     """
     return _run("match_pairs", _Match, pairs, ("a", "b"), output, ".npz", actors, restarts, names, options)
+
+
+def sfm(photographs, output, *, actors=None, restarts=_RESTARTS, names=None, max_features=None, **options):
+    """:func:`epipole.sfm` with the features of the photographs found on the cluster, into NAME.pickle; pairs and the solution are the work of the process that calls.
+
+    photographs: paths, or a Dataset with a column ``image``. Returns the result, whose ``left_out`` also has those of which no features could be found. The files are read back with ``pickle``: the folder
+    must be one that nobody else writes into.
+    """
+    found = _run("sfm", _SfmFeatures, photographs, ("image",), output, ".pickle", actors, restarts, names, {"max_features": max_features})
+    rows = sorted(found.take_all(), key=lambda row: row["name"])
+    seen = []
+    for row in rows:
+        if row["error"] is None:
+            with open(row["output"], "rb") as file:
+                seen.append(pickle.load(file))
+    result = epipole.sfm(seen, **options)
+    unread = {os.path.basename(row["image"]): {"kind": "Unreadable", "message": row["error"]} for row in rows if row["error"]}
+    return dataclasses.replace(result, left_out={**unread, **result.left_out})
 
 
 def _run(job, worker, given, columns, output, ending, actors, restarts, names, options):
@@ -229,6 +249,18 @@ class _Features(_Worker):
     def do(self, row, path):
         found = epipole.extract_features(epipole.read_image(row["image"]), **self.options)
         _arrays(path, {"keypoints": found.keypoints, "descriptors": found.descriptors, "kind": np.array(found.kind)})
+        return {"count": len(found)}
+
+
+class _SfmFeatures(_Worker):
+    columns, figures = ("image",), ("count",)
+
+    def prepare(self, **options):
+        self.options = _checked("sfm_features", options)
+
+    def do(self, row, path):
+        found = epipole.sfm_features(row["image"], **self.options)
+        _write(path, lambda file: pickle.dump(found, file))
         return {"count": len(found)}
 
 

@@ -9,6 +9,7 @@ import time
 import epipole
 import numpy as np
 import pytest
+import scenes
 from conftest import FIXTURES
 
 ray = pytest.importorskip("ray")
@@ -110,6 +111,20 @@ def test_the_other_jobs(cluster, tmp_path):
     dataset = ray.data.from_items([{"a": files[0], "b": files[1]}])
     found = rows(epipole.ray.match_pairs(dataset, tmp_path / "m"))
     assert found[0]["count"] == len(epipole.match(a, b)) > 20 and found[0]["error"] is None
+
+
+def test_many_views_with_features_from_the_cluster(cluster, tmp_path):
+    matrix = np.array([[400.0, 0, 199.5], [0, 400.0, 149.5], [0, 0, 1]])
+    paths = [tmp_path / f"{i}.png" for i in range(5)]
+    for i, path in enumerate(paths[:4]):
+        turn = scenes.rotation(0.02 * (i % 2), 0.25 - 0.07 * i, 0)
+        center = np.array([-0.6 + 0.45 * i, 0.05 * (i % 2), -0.1 * i])
+        epipole.write_image(path, scenes.render(scenes.room(), matrix, (turn, -turn @ center), (400, 300))[0])
+    camera = epipole.Camera(400, 300, matrix)
+    found = epipole.ray.sfm(paths, tmp_path / "features", camera=camera)
+    assert list(found.left_out) == ["4.png"] and "FileNotFoundError" in found.left_out["4.png"]["message"]
+    expected = epipole.sfm(paths[:4], camera=camera)
+    assert np.array_equal(found.model.points, expected.model.points)
 
 
 def test_mistakes_are_told_before_the_work(cluster, tmp_path):

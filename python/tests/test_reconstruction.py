@@ -93,6 +93,17 @@ def test_many_photographs(photographs, tmp_path):
     assert upright.frames == ("upright",) and len(upright.model) == 5
 
 
+def test_features_that_were_found_before_give_the_same_model(photographs):
+    camera = epipole.Camera(*SIZE, MATRIX)
+    seen = [epipole.sfm_features(photograph, name=f"{i}") for i, photograph in enumerate(photographs)]
+    seen = pickle.loads(pickle.dumps(seen))
+    assert seen[0].size == SIZE and len(seen[0]) == len(seen[0].keypoints) and "400×300" in repr(seen[0])
+    one, two = (epipole.sfm(given, camera=camera).model for given in (photographs, seen))
+    assert np.array_equal(one.points, two.points) and np.array_equal(one.colors, two.colors)
+    with pytest.raises(errors.ImageTooSmallError):
+        epipole.sfm_features(np.zeros((3, 3), np.uint8))
+
+
 def test_a_model_of_pycolmap_and_back(photographs):
     pycolmap = pytest.importorskip("pycolmap")
     model = epipole.sfm(photographs, camera=epipole.Camera(*SIZE, MATRIX)).model

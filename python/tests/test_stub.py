@@ -40,6 +40,7 @@ def options(function):
         "reconstruct",
         "rectify",
         "sfm",
+        "sfm_features",
         "undistort",
     ],
 )

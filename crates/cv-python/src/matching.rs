@@ -93,6 +93,17 @@ pub(crate) fn keypoints<'py>(py: Python<'py>, keypoints: &[Keypoint]) -> PyResul
     arrays::row_array(py, &rows)
 }
 
+/// Keypoints of such rows.
+pub(crate) fn keypoints_from(given: &Bound<'_, PyAny>) -> PyResult<Vec<Keypoint>> {
+    let rows: Vec<[f64; 5]> = arrays::rows(given, "keypoints")?;
+    let keypoint = |[x, y, scale, angle, response]: [f64; 5]| Keypoint {
+        scale: scale as f32,
+        angle: angle as f32,
+        ..Keypoint::new(x as f32, y as f32, response as f32)
+    };
+    Ok(rows.into_iter().map(keypoint).collect())
+}
+
 fn matches<'py>(py: Python<'py>, found: &MatchingResult) -> PyResult<Bound<'py, PyAny>> {
     let points: Vec<[f64; 4]> = found.pairs().iter().map(|p| [p.a.x, p.a.y, p.b.x, p.b.y]).collect();
     let indices: Vec<[u32; 2]> = found.matches.iter().map(|m| [m.query, m.train]).collect();
@@ -142,7 +153,7 @@ pub(crate) fn extract_features<'py>(
 /// Features as they came from `extract_features`, or from elsewhere: of another kind than ours, nothing but their number of columns is known.
 fn features(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Features> {
     let kind: String = given.getattr("kind")?.extract()?;
-    let keypoints: Vec<[f64; 5]> = arrays::rows(&given.getattr("keypoints")?, "keypoints")?;
+    let keypoints = keypoints_from(&given.getattr("keypoints")?)?;
     let (numbers, columns) = arrays::table(&given.getattr("descriptors")?, "descriptors")?;
     let own = DescriptorKind::OWN.into_iter().find(|own| own.name == kind && own.dimension == columns);
     let kind = own.unwrap_or(DescriptorKind::foreign(columns.max(1)));
@@ -153,13 +164,8 @@ fn features(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Features> {
     }
     let descriptors = Descriptors::from_vec(kind, numbers)
         .ok_or_else(|| PyValueError::new_err(format!("{what}: the descriptors are no rows of {columns} numbers")))?;
-    let keypoint = |[x, y, scale, angle, response]: [f64; 5]| Keypoint {
-        scale: scale as f32,
-        angle: angle as f32,
-        ..Keypoint::new(x as f32, y as f32, response as f32)
-    };
     let mut all = Features::new(kind);
-    all.keypoints = keypoints.into_iter().map(keypoint).collect();
+    all.keypoints = keypoints;
     all.descriptors = descriptors;
     Ok(all)
 }

@@ -28,11 +28,19 @@ impl<'py> Photograph<'py> {
 
     /// Every photograph of a list.
     pub(crate) fn all(given: &Bound<'py, PyAny>) -> PyResult<Vec<Self>> {
+        Self::each(given, Self::new)
+    }
+
+    /// What each of a list is read as, by a name for errors.
+    pub(crate) fn each<T>(
+        given: &Bound<'py, PyAny>,
+        read: impl Fn(&Bound<'py, PyAny>, &str) -> PyResult<T>,
+    ) -> PyResult<Vec<T>> {
         // A path is a sequence, too, of its letters.
         if given.extract::<PathBuf>().is_ok() {
             return Err(PyTypeError::new_err("a list of photographs is needed, not one path"));
         }
-        given.try_iter()?.enumerate().map(|(i, one)| Self::new(&one?, &format!("photograph {i}"))).collect()
+        given.try_iter()?.enumerate().map(|(i, one)| read(&one?, &format!("photograph {i}"))).collect()
     }
 
     /// The same for threads without the interpreter.

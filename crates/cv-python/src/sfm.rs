@@ -3,21 +3,176 @@
 use crate::arrays;
 use crate::errors::reason;
 use crate::job::Run;
-use crate::matching::max_features;
+use crate::matching::{keypoints, keypoints_from, max_features};
 use crate::model;
 use crate::options::Options;
 use crate::photographs::{Ended, Known, Photograph, Source};
 use crate::results::{self, object};
 use cv_core::{Point3, Progress, StageClock};
-use cv_pipeline::features::FeatureError;
+use cv_pipeline::features::{ByteDescriptors, DescriptorKind, FeatureError};
 use cv_pipeline::many_views::{KnownPlaces, ModelAlignError, SfmModel, ViewOutcome, align_model};
 use cv_pipeline::{
-    Cancelled, SfmCamera, SfmJobError, SfmJobOptions, SfmPhoto, SfmPhotoError, SfmResult, sfm as solve, sfm_photo,
+    Cancelled, FeatureOptions, SfmCamera, SfmJobError, SfmJobOptions, SfmPhoto, SfmPhotoError, SfmResult, sfm as solve,
+    sfm_photo,
 };
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use pyo3::types::{PyDict, PyTuple};
+use pyo3::types::{PyBytes, PyDict, PyTuple};
 use std::collections::BTreeMap;
+
+/// The features of a photograph, and what is known of it: `sfm` takes it in place of the photograph.
+#[pyclass(frozen, module = "epipole", name = "SfmPhotograph")]
+pub(crate) struct PySfmPhotograph {
+    photo: SfmPhoto,
+    /// By EXIF, px.
+    focal: Option<f64>,
+}
+
+/// Size, focal length, keypoints, descriptors, their kind, and colors.
+type Parts<'py> =
+    (String, (usize, usize), Option<f64>, Bound<'py, PyAny>, Bound<'py, PyBytes>, &'static str, Bound<'py, PyAny>);
+
+#[pymethods]
+impl PySfmPhotograph {
+    #[getter]
+    fn name(&self) -> &str {
+        &self.photo.name
+    }
+
+    /// Width and height.
+    #[getter]
+    fn size(&self) -> (usize, usize) {
+        self.photo.size
+    }
+
+    /// Focal length by EXIF, px.
+    #[getter]
+    fn focal(&self) -> Option<f64> {
+        self.focal
+    }
+
+    /// float32 (n, 5): x, y, scale, angle, response.
+    #[getter]
+    fn keypoints<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        keypoints(py, &self.photo.keypoints)
+    }
+
+    fn __len__(&self) -> usize {
+        self.photo.keypoints.len()
+    }
+
+    fn __repr__(&self) -> String {
+        let (width, height) = self.photo.size;
+        format!("SfmPhotograph({}, {width}×{height} px, {} features)", self.photo.name, self.photo.keypoints.len())
+    }
+
+    /// What `pickle` had of it.
+    #[staticmethod]
+    fn _of_parts(
+        name: String,
+        size: (usize, usize),
+        focal: Option<f64>,
+        keypoints: &Bound<'_, PyAny>,
+        descriptors: &[u8],
+        kind: &str,
+        colors: &Bound<'_, PyAny>,
+    ) -> PyResult<Self> {
+        let keypoints = keypoints_from(keypoints)?;
+        let colors: Vec<[f64; 3]> = arrays::rows(colors, "colors")?;
+        let kind = DescriptorKind::OWN.into_iter().find(|own| own.name == kind);
+        let descriptors = kind.and_then(|kind| ByteDescriptors::from_bytes(kind, descriptors.to_vec()));
+        let Some(descriptors) = descriptors.filter(|d| d.len() == keypoints.len() && d.len() == colors.len()) else {
+            return Err(PyValueError::new_err("these are no parts of an SfmPhotograph"));
+        };
+        let colors = colors.into_iter().map(|color| color.map(|c| c as u8)).collect();
+        Ok(Self { photo: SfmPhoto { name, size, camera: 0, keypoints, descriptors, colors }, focal })
+    }
+
+    fn __reduce__<'py>(slf: &Bound<'py, Self>) -> PyResult<(Bound<'py, PyAny>, Parts<'py>)> {
+        let (py, Self { photo, focal }) = (slf.py(), slf.get());
+        let parts = (
+            photo.name.clone(),
+            photo.size,
+            *focal,
+            keypoints(py, &photo.keypoints)?,
+            PyBytes::new(py, photo.descriptors.as_slice()),
+            photo.descriptors.kind().name,
+            arrays::row_array(py, &photo.colors)?,
+        );
+        Ok((py.get_type::<Self>().getattr("_of_parts")?, parts))
+    }
+}
+
+/// The options of `sfm_features`.
+pub(crate) fn read_features(options: &mut Options<'_>) -> PyResult<(Option<String>, FeatureOptions, Run)> {
+    let name = options.take("name")?;
+    Ok((name, max_features(options, SfmJobOptions::default().features)?, Run::read(options)?))
+}
+
+/// The features of a photograph for `sfm`, which takes them in place of it: found once, or elsewhere.
+///
+/// photograph: an array of uint8 or a path. name: in the model; without it the file's, or none.
+#[pyfunction]
+#[pyo3(signature = (photograph, **options))]
+pub(crate) fn sfm_features(
+    py: Python<'_>,
+    photograph: &Bound<'_, PyAny>,
+    options: Option<&Bound<'_, PyDict>>,
+) -> PyResult<PySfmPhotograph> {
+    let mut options = Options::new("sfm_features", options);
+    let (name, features, run) = read_features(&mut options)?;
+    options.finish()?;
+    let photograph = Photograph::new(photograph, "photograph")?;
+    let source = photograph.source()?;
+    let name = name.unwrap_or_else(|| match source {
+        Source::File(_) => source.name(0).into_owned(),
+        Source::View(_) => String::new(),
+    });
+    run.run(py, |progress| {
+        let (pixels, focal) = source.read().map_err(Ended::File)?;
+        let photo = sfm_photo(pixels.view(), name, 0, &features, progress).map_err(Ended::Job)?;
+        Ok::<_, Ended<SfmPhotoError>>(PySfmPhotograph { photo, focal })
+    })
+}
+
+/// A photograph, or what was found of it.
+enum Given<'py> {
+    Photograph(Photograph<'py>),
+    Features(Bound<'py, PySfmPhotograph>),
+}
+
+impl<'py> Given<'py> {
+    fn all(given: &Bound<'py, PyAny>) -> PyResult<Vec<Self>> {
+        Photograph::each(given, |one, what| match one.cast::<PySfmPhotograph>() {
+            Ok(features) => Ok(Self::Features(features.clone())),
+            Err(_) => Photograph::new(one, what).map(Self::Photograph),
+        })
+    }
+
+    fn source(&self) -> PyResult<View<'_>> {
+        Ok(match self {
+            Self::Photograph(photograph) => View::Photograph(photograph.source()?),
+            Self::Features(features) => View::Features(features.get()),
+        })
+    }
+}
+
+/// The same for threads without the interpreter.
+#[derive(Clone, Copy)]
+enum View<'a> {
+    Photograph(Source<'a>),
+    Features(&'a PySfmPhotograph),
+}
+
+impl View<'_> {
+    fn name(self, index: usize) -> String {
+        match self {
+            Self::Photograph(source) => source.name(index).into_owned(),
+            Self::Features(features) if features.photo.name.is_empty() => index.to_string(),
+            Self::Features(features) => features.photo.name.clone(),
+        }
+    }
+}
 
 /// The options of `sfm`.
 pub(crate) struct Arguments<'py> {
@@ -103,7 +258,7 @@ impl Job<'_> {
     /// Features, pairs, models.
     fn reconstruct(
         &self,
-        sources: &[(Source<'_>, String)],
+        sources: &[(View<'_>, String)],
         centers: &[Option<Point3<f64>>],
         progress: &dyn Progress,
     ) -> Result<Found, Ended<SfmJobError>> {
@@ -113,6 +268,17 @@ impl Job<'_> {
         for (i, (source, name)) in sources.iter().enumerate() {
             let place = Place { progress, done: i, total: sources.len() };
             place.report("", 0, 0).map_err(stop)?;
+            let known = |focal: Option<f64>| (focal.filter(|_| !self.ignore_exif), self.known);
+            let source = match *source {
+                View::Photograph(source) => source,
+                View::Features(PySfmPhotograph { photo, focal }) => {
+                    let (focal, known) = known(*focal);
+                    let camera = cameras.of(photo.size, focal, known);
+                    photos.push(SfmPhoto { name: name.clone(), camera, ..photo.clone() });
+                    looked_at.push(Ok(photos.len() - 1));
+                    continue;
+                }
+            };
             let (pixels, focal) = match source.read() {
                 Ok(read) => read,
                 Err(error) => {
@@ -120,7 +286,8 @@ impl Job<'_> {
                     continue;
                 }
             };
-            let camera = cameras.of(pixels.view().size(), focal.filter(|_| !self.ignore_exif), self.known);
+            let (focal, known) = known(focal);
+            let camera = cameras.of(pixels.view().size(), focal, known);
             looked_at.push(match sfm_photo(pixels.view(), name.clone(), camera, &self.options.features, &place) {
                 Ok(photo) => {
                     photos.push(photo);
@@ -190,7 +357,7 @@ impl Progress for Place<'_> {
 
 /// Cameras and points from many photographs in any order (structure from motion).
 ///
-/// photographs: arrays of uint8 or paths. camera: a Camera, or a 3×3 matrix where the lens is not known; focal: about the focal length in px; else EXIF tells, or the photographs do.
+/// photographs: arrays of uint8, paths, or what `sfm_features` found of them. camera: a Camera, or a 3×3 matrix where the lens is not known; focal: about the focal length in px; else EXIF tells, or the photographs do.
 /// centers: (n, 3), where the cameras stood, NaN where that is not known. Without them models stand upright, Z up, and their unit is arbitrary.
 /// `defaults("sfm")` lists the options.
 #[pyfunction]
@@ -203,9 +370,9 @@ pub(crate) fn sfm<'py>(
     let mut options = Options::new("sfm", options);
     let arguments = Arguments::read(&mut options)?;
     options.finish()?;
-    let photographs = Photograph::all(photographs)?;
+    let photographs = Given::all(photographs)?;
     let count = photographs.len();
-    let sources = photographs.iter().map(Photograph::source).collect::<PyResult<Vec<_>>>()?;
+    let sources = photographs.iter().map(Given::source).collect::<PyResult<Vec<_>>>()?;
     let names = match &arguments.names {
         Some(names) if names.len() != count => {
             return Err(PyValueError::new_err(format!("{} names for {count} photographs", names.len())));
@@ -223,7 +390,7 @@ pub(crate) fn sfm<'py>(
             rows.into_iter().map(|row| row.iter().all(|v| v.is_finite()).then(|| row.into())).collect()
         }
     };
-    let named: Vec<(Source<'_>, String)> = sources.into_iter().zip(names).collect();
+    let named: Vec<(View<'_>, String)> = sources.into_iter().zip(names).collect();
     let job = Job { options: &arguments.options, known: &arguments.known, ignore_exif: arguments.ignore_exif };
     let found = arguments.run.run(py, |progress| job.reconstruct(&named, &centers, progress))?;
     let models: Vec<Bound<'py, PyAny>> = (0..found.result.models.len())
@@ -261,16 +428,16 @@ pub(crate) fn sfm<'py>(
 }
 
 /// The files' names, or their whole paths where two have one name; numbers of arrays.
-fn names_of(sources: &[Source<'_>]) -> Vec<String> {
-    let names: Vec<String> = sources.iter().enumerate().map(|(i, s)| s.name(i).into_owned()).collect();
+fn names_of(sources: &[View<'_>]) -> Vec<String> {
+    let names: Vec<String> = sources.iter().enumerate().map(|(i, s)| s.name(i)).collect();
     let mut sorted = names.clone();
     sorted.sort_unstable();
     if sorted.windows(2).all(|pair| pair[0] != pair[1]) {
         return names;
     }
-    let whole = |(source, name): (&Source<'_>, String)| match source {
-        Source::File(path) => path.to_string_lossy().into_owned(),
-        Source::View(_) => name,
+    let whole = |(source, name): (&View<'_>, String)| match source {
+        View::Photograph(Source::File(path)) => path.to_string_lossy().into_owned(),
+        _ => name,
     };
     sources.iter().zip(names).map(whole).collect()
 }
