@@ -300,6 +300,8 @@ class Calibration(_Result):
     """Root mean square distance of all corners used, px."""
     holdout_rms: float
     """The same on views that had no part in the fit."""
+    holdout_all_rms: float
+    """The same over all their corners, those left out as outliers as well: beside a program that leaves out none."""
     camera_rms: NDArray[np.float64]
     """By camera."""
     camera_holdout_rms: NDArray[np.float64]

@@ -428,13 +428,13 @@ mod tests {
     #[test]
     fn few_matches_are_kept_where_features_agree() {
         let scene = Scene::room(1);
-        let camera = Camera::from_focal(320, 240, 280.0);
+        let camera = Camera::from_focal(480, 360, 420.0);
         let of = |scene: &Scene| {
             let pair = stereo_pair(scene, &camera, &scene.viewpoint(), 0.25, &RenderOptions::default()).unwrap();
-            // A seventh of the rows; gray around them.
+            // A tenth of the rows; gray around them.
             let strip = |image: &cv_core::RgbU8| {
-                let kept = 100..134;
-                cv_core::RgbU8::from_fn(320, 240, |x, y| if kept.contains(&y) { image.at(x, y) } else { [90; 3] })
+                let kept = 160..196;
+                cv_core::RgbU8::from_fn(480, 360, |x, y| if kept.contains(&y) { image.at(x, y) } else { [90; 3] })
             };
             ([strip(&pair.left.image), strip(&pair.right.image)], pair.disparity)
         };
@@ -447,23 +447,23 @@ mod tests {
         };
         let run =
             |right: &cv_core::RgbU8, options: &DepthOptions| depth(left.view(), right.view(), None, options, &Silent);
-        let found = run(&right, &options(64, FewMatches::Check)).unwrap();
+        let found = run(&right, &options(96, FewMatches::Check)).unwrap();
         let few = found.few.unwrap();
         assert!(found.map.matched_fraction() < LEAST_MATCHED && few.is_enough(), "{few:?}");
         let known =
-            (0..240 * 320).map(|i| (i % 320, i / 320)).filter(|(x, y)| found.map.disparity.at(*x, *y)[0].is_finite());
+            (0..480 * 360).map(|i| (i % 480, i / 480)).filter(|(x, y)| found.map.disparity.at(*x, *y)[0].is_finite());
         let off = known.map(|(x, y)| (found.map.disparity.at(x, y)[0] - truth.at(x, y)[0]).abs());
         let off: Vec<f32> = off.collect();
         // As of a whole pair, the bar of which is nine of ten within a pixel; rows next to the gray ones see little of their own.
         assert!(off.iter().filter(|d| **d < 1.0).count() * 10 > off.len() * 8, "{}", off.len());
         // Of something else, and where the range ends before what features show.
-        let error = run(&other, &options(64, FewMatches::Check)).map(|d| d.few).unwrap_err();
+        let error = run(&other, &options(96, FewMatches::Check)).map(|d| d.few).unwrap_err();
         assert!(matches!(error, DepthError::NoPair { .. }), "{error}");
         let nearest = truth.as_slice().iter().copied().fold(0.0, f32::max) as usize;
         let error = run(&right, &options(nearest / 2, FewMatches::Check)).map(|d| d.few).unwrap_err();
         assert!(matches!(error, DepthError::NoPair { cause: NoPairCause::Range { .. }, .. }), "{error}");
         // Who wants it all the same gets it.
-        assert!(run(&other, &options(64, FewMatches::Keep)).unwrap().few.is_some());
+        assert!(run(&other, &options(96, FewMatches::Keep)).unwrap().few.is_some());
     }
 
     /// Smallest disparity of the exchanged pair.

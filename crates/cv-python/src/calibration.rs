@@ -239,6 +239,7 @@ fn calibration<'py>(py: Python<'py>, found: &BoardCalibration) -> PyResult<Bound
             ("rig", rig),
             ("rms", object(py, c.rms_px)?),
             ("holdout_rms", object(py, c.holdout_rms_px)?),
+            ("holdout_all_rms", object(py, c.holdout_all_rms_px)?),
             ("camera_rms", numbers(c.cameras.iter().map(|c| c.rms_px).collect())?),
             ("camera_holdout_rms", numbers(c.cameras.iter().map(|c| c.holdout_rms_px).collect())?),
             ("noise", object(py, c.noise_px)?),

@@ -104,12 +104,9 @@ pub(super) fn run(folder: &Path, views: &[Vec<PathBuf>], found: &BoardCalibratio
         all.push(flat);
     }
     let middle = |of: fn(&Flatness) -> f64| median(&mut all.iter().map(of).collect::<Vec<_>>()).unwrap_or(f64::NAN);
-    println!(
-        "commands: off the plane {:.3} % RMS, median of the pairs, of all pixels that agree with it",
-        middle(|f| f.rms)
-    );
     Ok(vec![
         Check::at_least("commands: pairs of boards with a depth", all.len() as f64, 13.0),
+        Check::at_most("commands: a board's depth off its plane, RMS, median of the pairs, %", middle(|f| f.rms), 0.3),
         Check::at_most(
             "commands: surer half of a board's depth off its plane, RMS, median of the pairs, %",
             middle(|f| f.surer),

@@ -14,7 +14,9 @@ use super::saddle::saddle;
 use super::x_corner::smoothed;
 use crate::error::check_image;
 use crate::simd;
-use cv_core::{ImageView, Matrix3, Point2, Progress, Stage, UnionFind, median};
+use cv_core::{GrayF32, ImageView, Matrix3, Point2, Progress, Stage, UnionFind, median};
+use cv_imgproc::decode_srgb;
+use rayon::prelude::*;
 
 /// A marker that was read.
 struct Seen {
@@ -74,21 +76,23 @@ pub fn find_marker_grid(
             return Err(what_else(maps.len(), board.dictionary, read).unwrap_or(reason));
         }
     };
-    let smooth = (board.style == GridStyle::AprilGrid).then(|| smoothed(view, simd::level()));
+    let april = board.style == GridStyle::AprilGrid;
+    // What corners are placed in: chessboard corners in the smoothed picture, corners of markers in its light.
+    let placed_in = if april { smoothed(view, simd::level()) } else { light(view) };
+    stage.check()?;
     let mut points = Vec::with_capacity(4 * chosen.len());
     for marker in chosen {
         let least =
             (0..4).map(|k| (marker.corners[(k + 1) % 4] - marker.corners[k]).norm()).fold(f64::INFINITY, f64::min);
         for k in 0..4 {
             let start = marker.corners[k];
-            let found = match &smooth {
-                Some(smooth) => {
-                    // Plain as far as the frame is thick, and the black square wide.
-                    let plain = least * board.spacing.min(0.2);
-                    let window = (0.75 * plain).min(options.largest_window.into()).max(2.0);
-                    saddle(smooth.view(), start, window, 2e-4).map(|s| (s.position, s.deviation_unsmoothed()))
-                }
-                None => marker_corner(view, &marker.corners, k, 2.5),
+            let found = if april {
+                // Plain as far as the frame is thick, and the black square wide.
+                let plain = least * board.spacing.min(0.2);
+                let window = (0.75 * plain).min(options.largest_window.into()).max(2.0);
+                saddle(placed_in.view(), start, window, 2e-4).map(|s| (s.position, s.deviation_unsmoothed()))
+            } else {
+                marker_corner(placed_in.view(), &marker.corners, k, 2.5)
             };
             let Some((position, deviation)) = found else { continue };
             if (position - start).norm() < (0.05 * least).max(1.5) {
@@ -101,6 +105,13 @@ pub fn find_marker_grid(
     }
     points.sort_by_key(|p| p.id);
     Ok(points)
+}
+
+/// The picture in linear light.
+fn light(view: ImageView<'_, f32, 1>) -> GrayF32 {
+    let mut out = view.to_image();
+    out.as_mut_slice().par_iter_mut().with_min_len(1 << 14).for_each(|v| *v = decode_srgb(*v));
+    out
 }
 
 /// The markers that lie as on the board by one another.
@@ -183,7 +194,7 @@ fn off(board: &MarkerGrid, from: &Seen, to: &Seen) -> Option<f64> {
 mod tests {
     use super::*;
     use crate::targets::{Board, Dictionary};
-    use cv_core::{GrayF32, Silent, Vector3};
+    use cv_core::{Silent, Vector3};
     use cv_imgproc::{gray_to_f32, linear_to_srgb};
 
     /// A picture of boards, each through a homography from board to picture, four samples of light to a pixel each way, as sRGB.

@@ -5,9 +5,7 @@
 //! until four are left. Then each side is a straight line through the steps from white to black along it. Time: pixels, and corners of hulls squared.
 
 use cv_core::{Cancelled, GrayF32, ImageView, Mask, Point2, Stage, Vector2};
-use cv_imgproc::{
-    Connectivity, StructuringElement, connected_components, decode_srgb, erode, pyr_down, sample_bilinear,
-};
+use cv_imgproc::{Connectivity, StructuringElement, connected_components, erode, pyr_down, sample_bilinear};
 use rayon::prelude::*;
 
 /// Pixels that are looked at for black regions; a larger picture is halved before, and its sides are then taken from the whole one.
@@ -205,7 +203,7 @@ fn quadrilateral(mut polygon: Vec<Point2<f64>>) -> Option<[Point2<f64>; 4]> {
 fn sides(view: ImageView<'_, f32, 1>, quad: &[Point2<f64>; 4], reach: f64) -> Option<[Line; 4]> {
     let mut out = [Line { at: quad[0], along: Vector2::zeros(), deviation: 0.0 }; 4];
     for (k, line) in out.iter_mut().enumerate() {
-        *line = side(view, quad[k], quad[(k + 1) % 4], (0.1, 0.9), (reach, Tone::Encoded))?;
+        *line = side(view, quad[k], quad[(k + 1) % 4], (0.1, 0.9), (reach, LEAST_FALL))?;
     }
     Some(out)
 }
@@ -219,13 +217,17 @@ fn corners(lines: &[Line; 4]) -> Option<[Point2<f64>; 4]> {
     Some([corner(0)?, corner(1)?, corner(2)?, corner(3)?])
 }
 
+/// Least fall over a pixel that counts as an edge, in a picture of sRGB; and in linear light, where dark grays, which it may be between, lie closer together.
+const LEAST_FALL: f32 = 0.02;
+const LEAST_FALL_OF_LIGHT: f32 = 0.002;
+
 /// The line of steps from white to black between two shares of the way from a corner to the next, which goes clockwise around black.
 fn side(
     view: ImageView<'_, f32, 1>,
     from: Point2<f64>,
     to: Point2<f64>,
     (first, last): (f64, f64),
-    (reach, tone): (f64, Tone),
+    (reach, least_fall): (f64, f32),
 ) -> Option<Line> {
     let length = (to - from).norm();
     if !(length > 4.0 && length.is_finite()) {
@@ -238,7 +240,7 @@ fn side(
     let mut steps: Vec<Vector2<f64>> = Vec::with_capacity(count);
     for i in 0..count {
         let t = first + (last - first) * (i as f64 + 0.5) / count as f64;
-        if let Some(off) = step(view, from + along * (t * length), inward, (reach, tone)) {
+        if let Some(off) = step(view, from + along * (t * length), inward, (reach, least_fall)) {
             steps.push(Vector2::new(t * length, off));
         }
     }
@@ -269,18 +271,14 @@ fn side(
     None
 }
 
-/// In which values an edge is looked for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Tone {
-    /// As they are in the picture.
-    Encoded,
-    /// In light, as sRGB has it: blur mixes light, so that an edge is symmetric there alone. The curve makes the mixed pixels brighter, which moves each edge toward black, by
-    /// a fifth of a pixel and more.
-    Light,
-}
-
-/// How far along `inward` from a place the picture turns from white to black: the steepest fall within `reach`, to a fraction of a pixel.
-fn step(view: ImageView<'_, f32, 1>, at: Point2<f64>, inward: Vector2<f64>, (reach, tone): (f64, Tone)) -> Option<f64> {
+/// How far along `inward` from a place the picture turns from white to black: the steepest fall within `reach`, to a fraction of a pixel. `least_fall`: over a pixel;
+/// less is no edge.
+fn step(
+    view: ImageView<'_, f32, 1>,
+    at: Point2<f64>,
+    inward: Vector2<f64>,
+    (reach, least_fall): (f64, f32),
+) -> Option<f64> {
     const STEP: f64 = 0.5;
     let n = (reach / STEP).ceil() as i32 + 2;
     let mut values = Vec::with_capacity(2 * n as usize + 1);
@@ -289,20 +287,12 @@ fn step(view: ImageView<'_, f32, 1>, at: Point2<f64>, inward: Vector2<f64>, (rea
         let [v] = sample_bilinear(view, p.x, p.y)?;
         values.push(v);
     }
-    // Differences over a pixel, and which is the largest.
-    let steepest_of = |values: &[f32]| {
-        let falls: Vec<f32> = values.windows(3).map(|v| v[0] - v[2]).collect();
-        let inner = 2..falls.len().saturating_sub(2);
-        let steepest = inner.max_by(|a, b| falls[*a].total_cmp(&falls[*b]))?;
-        Some((falls, steepest))
-    };
-    let (mut falls, mut steepest) = steepest_of(&values)?;
-    if falls[steepest] < 0.02 {
+    // Differences over a pixel.
+    let falls: Vec<f32> = values.windows(3).map(|v| v[0] - v[2]).collect();
+    let inner = 2..falls.len().saturating_sub(2);
+    let steepest = inner.max_by(|a, b| falls[*a].total_cmp(&falls[*b]))?;
+    if falls[steepest] < least_fall {
         return None;
-    }
-    if tone == Tone::Light {
-        values.iter_mut().for_each(|v| *v = decode_srgb(*v));
-        (falls, steepest) = steepest_of(&values)?;
     }
     let (mut sum, mut weight) = (0.0, 0.0);
     for (i, fall) in falls.iter().enumerate().skip(steepest - 2).take(5) {
@@ -314,9 +304,12 @@ fn step(view: ImageView<'_, f32, 1>, at: Point2<f64>, inward: Vector2<f64>, (rea
 }
 
 /// A corner of a marker, where its two sides meet: each by its half next to the corner, since a lens bends a whole side more, and without the end, where blur rounds it.
-/// `blur`: pixels that are left out. Edges are placed in light. With its standard deviation along either axis.
+/// `blur`: pixels that are left out. With its standard deviation along either axis.
+///
+/// `light`: the picture in linear light. Blur mixes light, so that an edge is symmetric there alone: the curve of sRGB makes the mixed pixels brighter, which moves each edge
+/// toward black by a fifth of a pixel and more.
 pub(super) fn marker_corner(
-    view: ImageView<'_, f32, 1>,
+    light: ImageView<'_, f32, 1>,
     quad: &[Point2<f64>; 4],
     k: usize,
     blur: f64,
@@ -324,8 +317,8 @@ pub(super) fn marker_corner(
     let (before, here, after) = (quad[(k + 3) % 4], quad[k], quad[(k + 1) % 4]);
     let rounded = |a: Point2<f64>, b: Point2<f64>| (blur / (a - b).norm()).min(0.3);
     let (p, q) = (rounded(before, here), rounded(here, after));
-    let into = side(view, before, here, (0.45, 1.0 - p), (2.0, Tone::Light))?;
-    let out = side(view, here, after, (q, 0.55), (2.0, Tone::Light))?;
+    let into = side(light, before, here, (0.45, 1.0 - p), (2.0, LEAST_FALL_OF_LIGHT))?;
+    let out = side(light, here, after, (q, 0.55), (2.0, LEAST_FALL_OF_LIGHT))?;
     let at = meet(into.at, into.along, out.at, out.along)?;
     // The sampling of sharp edges adds a fiftieth of a pixel.
     Some((at, (0.5 * (into.deviation.powi(2) + out.deviation.powi(2))).sqrt().hypot(0.02)))
@@ -384,7 +377,8 @@ mod tests {
                 // An edge of full contrast without blur, sampled between pixels: steps of a fifth of a pixel, fewer of them on a short side.
                 assert!(off < if size < 20.0 { 0.3 } else { 0.1 }, "{size} {turn}: {off}");
                 let k = (0..4).min_by(|a, b| (found[0][*a] - truth).norm().total_cmp(&(found[0][*b] - truth).norm()));
-                let (fine, deviation) = marker_corner(image.view(), &found[0], k.unwrap(), 2.5).unwrap();
+                let light = image.map(|[v]| [cv_imgproc::decode_srgb(v)]);
+                let (fine, deviation) = marker_corner(light.view(), &found[0], k.unwrap(), 2.5).unwrap();
                 assert!((fine - truth).norm() < 0.3 && (0.02..0.3).contains(&deviation), "{size}: {fine} {truth}");
             }
         }

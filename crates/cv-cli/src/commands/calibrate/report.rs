@@ -49,6 +49,9 @@ pub(super) fn report(job: &Job) -> Result<Report, Failure> {
     if c.cameras.len() == 2 {
         pair(&mut page, job)?;
     }
+    if c.target_shape.adjusted {
+        board_shape(&mut page, job)?;
+    }
     parameters(&mut page, job);
     page.section("Photographs");
     let rows: Vec<[String; 4]> = (0..c.views.len())
@@ -223,6 +226,27 @@ fn pair(page: &mut Report, job: &Job) -> Result<(), Failure> {
         Width::Full,
         "Both photographs with common rows drawn through: what is on a line on the left is on it on the right.",
     )?);
+    Ok(())
+}
+
+/// How far the board is from flat.
+fn board_shape(page: &mut Report, job: &Job) -> Result<(), Failure> {
+    let [kx, ky] = job.found.calibration.target_shape.deflection;
+    let size = job.found.sightings.target.size();
+    let side = 480.0 / size.max();
+    let [width, height] = [size.x, size.y].map(|s| ((s * side).round() as usize).clamp(16, 480));
+    // The model of the calibration: a parabola along each side, zero at the ends.
+    let share = |i: usize, n: usize| 1.0 - (2.0 * i as f64 / (n - 1) as f64 - 1.0).powi(2);
+    let bent = GrayF32::from_fn(width, height, |x, y| [(kx * share(x, width) + ky * share(y, height)) as f32]);
+    let (low, high) = bent.as_slice().iter().fold((0.0f32, 0.0f32), |(low, high), z| (low.min(*z), high.max(*z)));
+    let label = format!("away from the camera ({})", job.unit);
+    let style = MapStyle { label, ..MapStyle::default() }.with_range(low, high);
+    let caption = format!(
+        "How the board is bent, against its corners: its middle by {kx:.3} {0} along x and {ky:.3} {0} along y, of {1:.4} and {2:.4} {0} that it is long.",
+        job.unit, size.x, size.y
+    );
+    page.section("The board's shape");
+    page.figures(vec![map(bent.view(), &style, Width::Half, &caption)?]);
     Ok(())
 }
 

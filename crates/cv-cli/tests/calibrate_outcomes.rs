@@ -1,0 +1,116 @@
+//! Sets of photographs that `cv calibrate` can make little of, and files that are none, from outside: each is refused for its own reason, and nothing is written.
+
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
+
+mod support;
+
+use cv_core::GrayU8;
+use std::fs;
+use std::path::Path;
+use support::{done, json, refused};
+
+/// A board of markers as its sheet shows it.
+const BOARD: [&str; 8] = ["--kind", "aruco-grid", "--board", "3x2", "--marker", "30", "--dictionary", "4x4_50"];
+
+/// The sheet of a board, at 60 pixels to an inch.
+fn sheet(folder: &Path, board: &[&str]) -> GrayU8 {
+    done(folder, &[&["board", "-o", "sheet.png", "--dpi", "60"], board].concat());
+    cv_io::read_gray_u8(folder.join("sheet.png")).unwrap()
+}
+
+/// What is said of three photographs that are all this picture.
+fn said_of(folder: &Path, picture: &GrayU8, board: &[&str]) -> String {
+    for name in ["a.png", "b.png", "c.png"] {
+        cv_io::write_png(folder.join(name), picture.view()).unwrap();
+    }
+    let arguments = [&["calibrate", "mono"], board, &["a.png", "b.png", "c.png", "-o", "camera.yaml"]].concat();
+    let said = refused(folder, &arguments).stderr;
+    assert!(!folder.join("camera.yaml").exists(), "{said}");
+    said
+}
+
+#[test]
+fn one_view_and_photographs_of_different_sizes_are_too_few() {
+    let folder = tempfile::tempdir().unwrap();
+    let photo = sheet(folder.path(), &BOARD);
+    let view = photo.view();
+    cv_io::write_png(folder.path().join("one.png"), view).unwrap();
+    let part = view.crop(0, 10, view.width(), view.height() - 20).unwrap();
+    cv_io::write_png(folder.path().join("other.png"), part).unwrap();
+    let calibrate = |photos: &[&str]| {
+        let arguments = [&["calibrate", "mono"], &BOARD[..], photos, &["-o", "camera.yaml"]].concat();
+        refused(folder.path(), &arguments).stderr
+    };
+    let one = calibrate(&["one.png"]);
+    assert!(one.contains("can be used on 1 photograph, 3 are needed"), "{one}");
+    let sizes = calibrate(&["one.png", "other.png", "one.png"]);
+    assert!(sizes.contains("2 photographs, 3 are needed"), "{sizes}");
+    assert!(sizes.contains("702×476 px, the first photograph 702×496 px"), "{sizes}");
+    assert!(!folder.path().join("camera.yaml").exists());
+}
+
+#[test]
+fn mirrored_boards_two_at_once_and_the_dark_are_told_apart() {
+    let folder = tempfile::tempdir().unwrap();
+    let photo = sheet(folder.path(), &BOARD);
+    let (width, height) = photo.size();
+    let mirrored = GrayU8::from_fn(width, height, |x, y| photo.at(width - 1 - x, y));
+    let said = said_of(folder.path(), &mirrored, &BOARD);
+    assert!(said.contains("6 markers of 4x4_50, mirrored"), "{said}");
+    let twice = GrayU8::from_fn(2 * width, height, |x, y| photo.at(x % width, y));
+    let said = said_of(folder.path(), &twice, &BOARD);
+    assert!(said.contains("saw the board 2 times"), "{said}");
+    // A lens cap with a little light: white is at 4 of 255.
+    let dark = photo.map(|[v]| [v / 60]);
+    let said = said_of(folder.path(), &dark, &BOARD);
+    assert!(said.contains("no board was found on any of 3 photographs"), "{said}");
+    let said = said_of(
+        folder.path(),
+        &sheet(folder.path(), &["--board", "9x6", "--square", "20"]).map(|[v]| [v / 60]),
+        &["--board", "9x6"],
+    );
+    assert!(said.contains("no board was found on any of 3 photographs"), "{said}");
+}
+
+#[test]
+fn boards_that_look_the_same_after_half_a_turn_are_found_as_they_are() {
+    let folder = tempfile::tempdir().unwrap();
+    for size in ["8x6", "7x7"] {
+        let photo = sheet(folder.path(), &["--board", size, "--square", "20"]);
+        // Found in each, and seen from straight ahead in all: what is refused is that, and not the board.
+        let said = said_of(folder.path(), &photo, &["--board", size]);
+        assert!(said.contains("do not determine the lens: the board is tilted by 0° at most"), "{size}: {said}");
+    }
+}
+
+#[test]
+fn calibrations_that_are_broken_or_bombs_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let camera = "schema: cv-camera/1\nwidth: 160\nheight: 120\nfx: 130.25\nfy: 131\ncx: 80\ncy: 59.5\n";
+    fs::write(folder.path().join("good.yaml"), camera).unwrap();
+    assert_eq!(json(folder.path(), &["calibration", "show", "good.yaml"])["camera"]["fx"], 130.25);
+    let laughs = |count: usize| {
+        (1..count).fold("<!DOCTYPE o [<!ENTITY a0 \"ha\">".to_owned(), |text, i| {
+            format!("{text}<!ENTITY a{i} \"{}\">", format!("&a{};", i - 1).repeat(10))
+        })
+    };
+    let anchors = (1..30).fold("a0: &a0 [1, 1]\n".to_owned(), |text, i| {
+        format!("{text}a{i}: &a{i} [*a{0}, *a{0}, *a{0}, *a{0}, *a{0}, *a{0}, *a{0}, *a{0}]\n", i - 1)
+    });
+    for (name, text) in [
+        ("cut.yaml", camera[..60].to_owned()),
+        ("text.yaml", camera.replace("130.25", "wide")),
+        ("none.yaml", camera.replace("130.25", ".nan")),
+        ("brace.yaml", format!("{camera}distortion: {{[\n")),
+        ("empty.yaml", String::new()),
+        ("anchors.yaml", format!("{camera}{anchors}")),
+        (
+            "laughs.xml",
+            format!("<?xml version=\"1.0\"?>{}]><opencv_storage><width>&a20;</width></opencv_storage>", laughs(21)),
+        ),
+    ] {
+        fs::write(folder.path().join(name), text).unwrap();
+        let said = refused(folder.path(), &["calibration", "show", name]).stderr;
+        assert!(said.contains(name), "{name}: {said}");
+    }
+}
