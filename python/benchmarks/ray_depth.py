@@ -1,0 +1,110 @@
+"""Depth of 240 generated pairs of 960×540 px, 96 disparities: a loop of one thread, and two workers of Ray Data.
+
+Run on an idle machine: processor time is the whole machine's, by /proc/stat, so that Ray's own processes count. What is compared is what more pairs cost more, without Ray's start.
+
+    python benchmarks/ray_depth.py [PAIRS]
+"""
+
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+import epipole
+import epipole.ray
+
+DISPARITIES = 96
+
+
+def busy():
+    """Processor seconds of the machine that were not idle."""
+    with open("/proc/stat") as file:
+        ticks = [int(n) for n in file.readline().split()[1:]]
+    return (sum(ticks[:3]) + sum(ticks[5:8])) / os.sysconf("SC_CLK_TCK")
+
+
+def resident():
+    """Memory of Ray's processes, each page shared among them counted once: bytes."""
+    total = 0
+    for entry in filter(str.isdigit, os.listdir("/proc")):
+        try:
+            command = Path(f"/proc/{entry}/cmdline").read_bytes()
+            if b"ray" in command and int(entry) != os.getpid():
+                rows = Path(f"/proc/{entry}/smaps_rollup").read_text().splitlines()
+                total += next(int(row.split()[1]) for row in rows if row.startswith("Pss:")) * 1024
+        except OSError:
+            continue
+    return total
+
+
+def pairs(folder, count):
+    """A pattern on planes of different disparities, another for each pair."""
+    made = []
+    for i in range(count):
+        random = np.random.default_rng(i)
+        fine, coarse = random.integers(0, 256, (540, 1100, 3)), random.integers(0, 256, (60, 123, 3))
+        wide = (0.4 * fine + 0.6 * np.kron(coarse, np.ones((9, 9, 1)))[:540, :1100]).astype(np.uint8)
+        shift = (np.arange(540) // 60 * 8 + 10)[:, None]
+        columns = np.arange(960)[None]
+        rows = np.arange(540)[:, None]
+        paths = folder / f"left{i:03}.png", folder / f"right{i:03}.png"
+        epipole.write_image(paths[0], wide[rows, columns + 40])
+        epipole.write_image(paths[1], wide[rows, columns + 40 + shift])
+        made.append(paths)
+    return made
+
+
+def loop(given, folder):
+    matched = []
+    for i, (left, right) in enumerate(given):
+        found = epipole.depth(epipole.read_image(left), epipole.read_image(right), disparities=DISPARITIES, threads=1)
+        np.savez(folder / f"{i}.npz", disparity=found.disparity, state=found.state)
+        matched.append(found.matched_fraction)
+    return min(matched)
+
+
+def timed(work):
+    start, before = time.monotonic(), busy()
+    result = work()
+    return time.monotonic() - start, busy() - before, result
+
+
+def main():
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else 240
+    few = count // 4
+    with tempfile.TemporaryDirectory() as folder:
+        folder = Path(folder)
+        (folder / "in").mkdir()
+        (folder / "out").mkdir()
+        given = pairs(folder / "in", count)
+        one = [timed(lambda n=n: loop(given[:n], folder / "out")) for n in (few, count)]
+        print(f"one thread: {one[1][0]:.1f} s, at least {one[1][2]:.0%} matched")
+        import ray
+
+        ray.init(num_cpus=3, include_dashboard=False, log_to_driver=False)
+        ray.data.DataContext.get_current().enable_progress_bars = False
+        epipole.ray.depth(given[:2], folder / "warm", disparities=DISPARITIES, actors=2)
+        two, memory = [], []
+
+        def run(n):
+            rows = epipole.ray.depth(given[:n], folder / f"ray{n}", disparities=DISPARITIES, actors=2).take_all()
+            memory.append(resident())
+            assert len(rows) == n and not any(row["error"] for row in rows)
+
+        two = [timed(lambda n=n: run(n)) for n in (few, count)]
+        again, _, rows = timed(lambda: epipole.ray.depth(given, folder / f"ray{count}", disparities=DISPARITIES, actors=2).take_all())
+        assert all(row["skipped"] for row in rows)
+        wall, cpu = one[1][0] - one[0][0], one[1][1] - one[0][1]
+        more = two[1][0] - two[0][0]
+        print(f"two workers: {two[1][0]:.1f} s; a second run {again:.1f} s")
+        print(f"{count - few} pairs more: wall {wall / more:.2f} times as fast (bar 1.7)")
+        print(f"processor time {cpu / (two[1][1] - two[0][1]):.3f} as efficient (bar 0.9)")
+        print(f"Ray's processes {max(memory) / 1e6:.0f} MB (bar 1000)")
+        ray.shutdown()
+
+
+if __name__ == "__main__":
+    main()
