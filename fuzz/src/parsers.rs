@@ -164,6 +164,22 @@ pub fn rig(bytes: &[u8]) -> Corpus {
     Corpus::Keep
 }
 
+/// Two or more cameras that are fixed to each other: `schema: cv-rig/2`, and Kalibr's chains.
+pub fn camera_array(bytes: &[u8]) -> Corpus {
+    let Ok(text) = std::str::from_utf8(bytes) else { return Corpus::Reject };
+    let Ok(file) = cv_io::parse_camera_array(text) else { return Corpus::Keep };
+    for format in CalibrationFormat::all().filter(|format| format.writes_arrays()) {
+        let Ok(written) = format.array_text(&file, &[]) else { continue };
+        let again = cv_io::parse_camera_array(&written);
+        assert!(
+            again.as_ref().is_ok_and(|again| again.cameras.len() == file.cameras.len()),
+            "{}: {again:?}\n{written}",
+            format.name()
+        );
+    }
+    Corpus::Keep
+}
+
 /// The three files of a COLMAP model, binary and as text.
 pub fn colmap(bytes: &[u8]) -> Corpus {
     use cv_io::colmap::{parse_cameras_binary, parse_images_binary, parse_points_binary};
