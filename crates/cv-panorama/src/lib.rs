@@ -34,6 +34,7 @@
 
 mod align;
 mod blend;
+mod light;
 mod render;
 mod rows;
 mod seams;
@@ -42,9 +43,10 @@ mod surface;
 mod testing;
 
 pub use align::{AlignError, AlignOptions, AlignedPair, Alignment, CameraMotion, Photo, Unplaced, View, align};
-pub use blend::{BlendMode, Blender, Composition, Exposure, Gains, NO_PHOTO};
+pub use blend::{BlendMode, Blender, Composition, NO_PHOTO};
 pub use cv_geometry::{NotAPair, VerifiedPair, VerifyOptions, verify_pair};
 pub use cv_imgproc::Interpolation;
+pub use light::{Exposure, Gains};
 pub use render::{CompositingOptions, Panorama, RenderError, render, render_with};
 pub use seams::Seams;
 pub use surface::{Bounds, Canvas, LayoutError, PhotoMap, Projection, WarpedPhoto};

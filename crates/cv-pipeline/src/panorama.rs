@@ -33,7 +33,7 @@ impl<'a> PanoramaPhoto<'a> {
 /// Settings of [`panorama`].
 #[derive(Debug, Clone)]
 pub struct PanoramaOptions {
-    /// Features and matching. SIFT starts from the enlarged image ([`SiftOptions::upsample`]) only where the features of the plain one do not hold the photographs
+    /// Features and matching. SIFT starts from the enlarged image ([`SiftOptions::upsample`]) and takes faint features ([`SiftOptions::min_features`]) only where the features of the plain one do not hold the photographs
     /// together firmly.
     pub matching: MatchingOptions,
     /// Pixels that photographs are reduced to (about) for features and alignment. 10,000 or more; default 800,000, in the range that OpenCV's stitcher
@@ -51,13 +51,26 @@ impl Default for PanoramaOptions {
     fn default() -> Self {
         Self {
             matching: MatchingOptions {
-                features: FeatureOptions::default().at_most(2000),
+                features: Self::features(FeatureOptions::default()),
                 ..MatchingOptions::default()
             },
             registration_pixels: 800_000,
             verify: VerifyOptions::default(),
             align: AlignOptions::default(),
             render: CompositingOptions::default(),
+        }
+    }
+}
+
+impl PanoramaOptions {
+    /// A method's options as panoramas want them: 2000 features at most, and faint ones where strong ones are few, as in a photograph that is two stops too dark.
+    /// [`panorama`] looks for those only where the photographs do not hang together firmly without.
+    pub fn features(method: FeatureOptions) -> FeatureOptions {
+        match method.at_most(2000) {
+            FeatureOptions::Sift(sift) => {
+                FeatureOptions::Sift(SiftOptions { min_features: 600, faint_contrast: 0.006, ..sift })
+            }
+            other => other,
         }
     }
 }
@@ -110,7 +123,7 @@ pub struct PanoramaImage {
     pub features: usize,
     /// Its focal length in pixels, where it is used.
     pub focal: Option<f64>,
-    /// What its red, green and blue were multiplied with.
+    /// What its red, green and blue light was multiplied with.
     pub gain: [f32; 3],
 }
 
@@ -240,10 +253,10 @@ pub fn panorama(
         Ok((prepared, tried))
     };
     let matching = &options.matching;
-    // The enlarged image is most of the work of SIFT, and seldom needed.
+    // The enlarged image is most of the work of SIFT, faint features are less exact: both are seldom needed.
     let plain = match &matching.features {
         FeatureOptions::Sift(sift) if sift.upsample => {
-            let features = FeatureOptions::Sift(SiftOptions { upsample: false, ..sift.clone() });
+            let features = FeatureOptions::Sift(SiftOptions { upsample: false, min_features: 0, ..sift.clone() });
             Some(MatchingOptions { features, ..matching.clone() })
         }
         _ => None,

@@ -2,7 +2,6 @@
 
 use anyhow::Result;
 use cv_core::{Camera, Distortion, Matrix3, Point2, Vector3};
-use cv_pipeline::panorama_types::{CompositingOptions, Exposure};
 use cv_pipeline::{PanoramaOptions, PanoramaPhoto, PanoramaResult, Silent, panorama};
 use cv_synth::{Vista, VistaOptions, VistaPhoto, vista_level, vista_photos};
 
@@ -43,11 +42,10 @@ pub(super) fn measure(set: &Generated) -> Result<Truth> {
             VistaOptions { exposure: set.spread, white_balance: 0.04, contrast: CONTRAST, ..VistaOptions::default() };
         let photos = vista_photos(&vista, seed, &camera, &options)?;
         let inputs: Vec<PanoramaPhoto<'_>> = photos.iter().map(|p| PanoramaPhoto::new(p.image.view())).collect();
-        let render = CompositingOptions { exposure: Exposure::Gain, ..CompositingOptions::default() };
-        let result = panorama(&inputs, &PanoramaOptions { render, ..PanoramaOptions::default() }, &Silent)?;
+        let result = panorama(&inputs, &PanoramaOptions::default(), &Silent)?;
         let drift = drift(&photos, &result);
         let used = result.images.iter().filter(|image| image.used).count() as f64;
-        let steps = seam_steps(&result);
+        let steps = seam_steps(&photos, &result);
         let step = steps.get(steps.len() * 95 / 100).copied().unwrap_or(f64::NAN);
         let psnr = psnr(&vista, &photos, &result);
         println!(
@@ -69,9 +67,9 @@ pub(super) fn measure(set: &Generated) -> Result<Truth> {
 }
 
 /// The true direction of a pixel of the result, by where in its photograph it comes from.
-fn true_ray(photos: &[VistaPhoto], result: &PanoramaResult, x: usize, y: usize) -> Option<Vector3<f64>> {
-    let label = usize::from(result.labels.at(x, y)[0]);
-    let source = result.map.source(label, Point2::new(x as f64, y as f64))?;
+fn true_ray(photos: &[VistaPhoto], result: &PanoramaResult, x: f64, y: f64) -> Option<Vector3<f64>> {
+    let label = usize::from(result.labels.at((x + 0.5) as usize, (y + 0.5) as usize)[0]);
+    let source = result.map.source(label, Point2::new(x, y))?;
     let photo = photos.get(label)?;
     let n = photo.camera.normalize(source);
     Some((photo.from_world.inverse() * Vector3::new(n.x, n.y, 1.0)).normalize())
@@ -83,7 +81,7 @@ fn drift(photos: &[VistaPhoto], result: &PanoramaResult) -> (f64, f64) {
     let mut pairs = Vec::new();
     for y in (24..h).step_by(48) {
         for x in (24..w).step_by(48) {
-            if let Some(truth) = true_ray(photos, result, x, y) {
+            if let Some(truth) = true_ray(photos, result, x as f64, y as f64) {
                 pairs.push((result.canvas.ray(Point2::new(x as f64, y as f64)).normalize(), truth));
             }
         }
@@ -107,7 +105,9 @@ fn psnr(vista: &Vista, photos: &[VistaPhoto], result: &PanoramaResult) -> f64 {
     let mut samples = Vec::new();
     for y in (2..h).step_by(3) {
         for x in (2..w).step_by(3) {
-            let (Some(ray), shown) = (true_ray(photos, result, x, y), result.image.at(x, y)) else { continue };
+            let (Some(ray), shown) = (true_ray(photos, result, x as f64, y as f64), result.image.at(x, y)) else {
+                continue;
+            };
             let clipped = photos.iter().any(|p| {
                 let seen = p.from_world * ray;
                 let place = p.camera.project(&seen.into()).filter(|_| seen.z > 0.0);
@@ -120,15 +120,24 @@ fn psnr(vista: &Vista, photos: &[VistaPhoto], result: &PanoramaResult) -> f64 {
                 })
             });
             if !clipped && shown.iter().all(|v| *v < SHOULDER) {
-                samples.push((vista.radiance(&ray), shown));
+                // As a pixel of a camera does: the mean over its area.
+                let around = [(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)];
+                let rays = around.map(|(dx, dy)| true_ray(photos, result, x as f64 + dx, y as f64 + dy));
+                let mut light = [0.0; 3];
+                for ray in rays {
+                    let l = vista.radiance(&ray.unwrap_or_else(Vector3::z));
+                    (0..3).for_each(|c| light[c] += 0.25 * l[c]);
+                }
+                if rays.iter().all(Option::is_some) {
+                    samples.push((light, shown));
+                }
             }
         }
     }
     let error = |c: usize, gain: f64| {
         let off = |(light, shown): &([f32; 3], [u8; 3])| {
             let level = 255.0 * vista_level(light[c] * gain as f32, CONTRAST);
-            // Edges are half in one pixel, half in the next: what lies between two surfaces has no one level.
-            f64::from(level - f32::from(shown[c])).abs().min(40.0).powi(2)
+            f64::from(level - f32::from(shown[c])).powi(2)
         };
         samples.iter().map(off).sum::<f64>() / samples.len().max(1) as f64
     };
@@ -147,13 +156,20 @@ fn psnr(vista: &Vista, photos: &[VistaPhoto], result: &PanoramaResult) -> f64 {
 const BLOCK: usize = 32;
 
 /// The steps of means of 32 px blocks across the seams, in gray levels, where all of the blocks are smooth: what the slope on both sides does not explain. Ascending.
-pub(super) fn seam_steps(result: &PanoramaResult) -> Vec<f64> {
+/// Without blocks that their photograph shows clipped: how bright those are nobody knows.
+fn seam_steps(photos: &[VistaPhoto], result: &PanoramaResult) -> Vec<f64> {
     let (w, h) = result.labels.size();
     let block = |x: usize, y: usize, label: u16| -> Option<[f64; 3]> {
         let (mut sum, mut squares, mut n) = ([0.0; 3], [0.0; 3], 0.0);
         for (x, y) in (y..y + BLOCK).step_by(2).flat_map(|y| (x..x + BLOCK).step_by(2).map(move |x| (x, y))) {
             if result.labels.get(x, y)? != [label] {
                 continue;
+            }
+            let source = result.map.source(usize::from(label), Point2::new(x as f64, y as f64))?;
+            let taken =
+                photos.get(usize::from(label))?.image.get(source.x.round() as usize, source.y.round() as usize)?;
+            if taken.iter().any(|v| *v >= 250) {
+                return None;
             }
             let p = result.image.at(x, y).map(f64::from);
             for c in 0..3 {

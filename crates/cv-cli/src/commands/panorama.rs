@@ -37,7 +37,7 @@ pub(crate) struct Args {
     /// Where seams run: where the photographs agree, or half-way between their middles.
     #[arg(long, value_name = "WHERE", value_parser = named::<Seams>(), default_value_t = PanoramaOptions::default().render.seams)]
     seams: Seams,
-    /// What to even out between photographs.
+    /// Differences of light between photographs: left (none), or evened out in linear light, with the curve and the vignetting of the camera (match).
     #[arg(long, value_name = "WHAT", value_parser = named::<Exposure>(), default_value_t = PanoramaOptions::default().render.exposure)]
     exposure: Exposure,
     /// Cut the result to the largest rectangle without empty pixels.
@@ -67,7 +67,7 @@ impl Args {
         options.render.exposure = self.exposure;
         options.render.crop = self.crop;
         options.render.resolution = self.scale;
-        options.matching.features = FeatureOptions::from(self.features).at_most(2000);
+        options.matching.features = PanoramaOptions::features(FeatureOptions::from(self.features));
         if let Some(seed) = context.seed {
             options.verify.seed = seed;
         }

@@ -23,6 +23,9 @@ pub(crate) struct Group<'a> {
     components: Vec<Vec<usize>>,
 }
 
+/// Difference of the logarithms of focal lengths from which on a lens was zoomed between photographs: focusing nearer changes them by less.
+const ZOOMED: f64 = 0.03;
+
 /// The rotation nearest to a matrix; the identity where the matrix tells none. (nalgebra's own search for it does not end where the distance to the matrix stays
 /// the same about an axis, as with those of rank one that focal lengths far from the truth make.)
 fn nearest_rotation(m: &Matrix3<f64>) -> Matrix3<f64> {
@@ -235,7 +238,10 @@ impl<'a> Group<'a> {
             let lenses = lens_of.iter().map(|&l| state.lenses[l]).collect();
             let apart = Problem { lens_of: &own, focal_prior: &own_prior, ..problem.clone() };
             let (with, new) = apart.solve(State { motion: state.motion.clone(), lenses }, 50);
-            if earns(new, cost) && new < 0.8 * cost {
+            // Focal lengths that are as good as one are one: what else got better is parallax.
+            let focals = with.lenses.iter().map(|l| l.log_focal);
+            let spread = focals.clone().fold(f64::MIN, f64::max) - focals.fold(f64::MAX, f64::min);
+            if earns(new, cost) && new < 0.8 * cost && spread > ZOOMED {
                 return Ok(Solution { lens_of: own, prior: own_prior, state: with });
             }
         }

@@ -3,14 +3,10 @@
 //! A blend mode is one file of this folder with an implementation of [`Blender`], and a variant of [`BlendMode`] with its name and its line in `blender`. One
 //! from outside this crate implements [`Blender`] and goes to [`render_with`](crate::render_with).
 
-mod exposure;
 mod feather;
 mod hard_seams;
 mod multiband;
 mod poisson;
-
-pub(crate) use exposure::estimate_gains;
-pub use exposure::{Exposure, Gains};
 
 use crate::surface::WarpedPhoto;
 use cv_core::{Cancelled, Image, Progress, RgbU8, named};

@@ -1,10 +1,9 @@
 //! The canvas at a fraction of its size, where exposure and seams are decided.
 
 use crate::align::View;
+use crate::light::{ExposureCorrection, Gains, UNREADABLE};
 use crate::rows::asks;
-use crate::surface::{
-    Bounds, DisplacementField, ExposureCorrection, Layout, Map, Placement, Surface, WarpSettings, WarpedPhoto, warp,
-};
+use crate::surface::{Bounds, DisplacementField, Layout, Map, Placement, Surface, WarpSettings, WarpedPhoto, warp};
 use cv_core::{Cancelled, Image, ImageView, Progress, RgbU8, Scaling, Stage};
 use cv_imgproc::Interpolation;
 use rayon::prelude::*;
@@ -26,6 +25,8 @@ pub(crate) struct Piece {
     pub(crate) eccentricity: Vec<f32>,
     /// Square of each pixel's distance from the photograph's middle, 1 at the corners.
     pub(crate) radius: Vec<f32>,
+    /// Where the photograph is clipped in a channel.
+    pub(crate) clipped: Vec<bool>,
 }
 
 impl Piece {
@@ -46,10 +47,15 @@ impl Piece {
             let places = (0..height).flat_map(|y| (0..width).map(move |x| corner(x, y)));
             places.map(|(x, y)| values[y * b.width() + x]).collect()
         };
+        let clipped = (0..width * height).map(|i| {
+            let (x, y) = corner(i % width, i / width);
+            [(x, y), (x + 1, y), (x, y + 1), (x + 1, y + 1)].iter().any(|(x, y)| self.clipped[y * b.width() + x])
+        });
         Self {
             warped: WarpedPhoto { bounds, pixels },
             eccentricity: at_corners(&self.eccentricity),
             radius: at_corners(&self.radius),
+            clipped: clipped.collect(),
         }
     }
 }
@@ -92,19 +98,32 @@ impl Preview {
             let field = fields.get(k).and_then(Option::as_ref).map(|f| f.scaled(s, 1.0 / shrink as f64));
             let view = shrunk_view(p, shrink, photo);
             let small = Placement { view, bounds, origin, ..*p };
-            let settings = WarpSettings {
-                displacement: field.as_ref(),
-                interpolation: Interpolation::Bilinear,
-                correction: ExposureCorrection::NONE,
-            };
+            let settings =
+                WarpSettings { displacement: field.as_ref(), interpolation: Interpolation::Bilinear, correction: None };
             let warped = warp(photo.view(), &small, &surface, bounds, settings, &stage)?;
             let (eccentricity, radius) = distances(&small, &surface);
             stage.add(1)?;
-            Ok(Some(Piece { warped, eccentricity, radius }))
+            let pixels = warped.pixels.as_slice().as_chunks::<4>().0.iter();
+            let clipped = pixels.map(|p| p[..3].iter().any(|v| *v >= UNREADABLE)).collect();
+            Ok(Some(Piece { warped, eccentricity, radius, clipped }))
         };
         let pieces: Vec<Option<Piece>> =
             layout.placements.par_iter().enumerate().map(draw).collect::<Result<_, Cancelled>>()?;
         Ok(Self { step, width, height, pieces: pieces.into_iter().flatten().collect() })
+    }
+
+    /// Evens out the exposure of every piece.
+    pub(crate) fn correct(&mut self, gains: &Gains, photo_of: &[usize]) {
+        let tone = gains.tone();
+        self.pieces.par_iter_mut().zip(photo_of).for_each(|(piece, &photo)| {
+            let correction = ExposureCorrection::new(&tone, gains, photo);
+            let pixels = piece.warped.pixels.as_mut_slice().as_chunks_mut::<4>().0;
+            for (p, r2) in pixels.iter_mut().zip(&piece.radius) {
+                let color = correction.levels([p[0], p[1], p[2]].map(f32::from), correction.lift(*r2));
+                let [r, g, b] = color.map(|v| (v + 0.5) as u8);
+                *p = [r, g, b, p[3]];
+            }
+        });
     }
 
     /// The same at half the size.
@@ -223,7 +242,12 @@ mod tests {
         let pixels =
             Image::from_fn(7, 5, |x, y| [(10 * x) as u8, (20 * y) as u8, 7, if (x, y) == (4, 2) { 0 } else { 255 }]);
         let numbered: Vec<f32> = (0..35).map(|i| i as f32).collect();
-        let piece = Piece { warped: WarpedPhoto { bounds, pixels }, eccentricity: numbered.clone(), radius: numbered };
+        let piece = Piece {
+            warped: WarpedPhoto { bounds, pixels },
+            eccentricity: numbered.clone(),
+            radius: numbered,
+            clipped: (0..35).map(|i| i == 8).collect(),
+        };
         let half = piece.halved();
         assert_eq!(half.warped.bounds, Bounds { left: 2, top: 1, right: 5, bottom: 3 });
         // Canvas pixels 4 and 5 of rows 2 and 3: the piece's columns 1 and 2, rows 0 and 1.
@@ -231,14 +255,21 @@ mod tests {
         assert_eq!(half.warped.color(3, 2), None);
         assert_eq!(half.warped.color(4, 2), Some([55, 50, 7]));
         assert_eq!(half.eccentricity, [1.0, 3.0, 5.0, 15.0, 17.0, 19.0]);
+        // Number 8 lies in the first block.
+        assert_eq!(half.clipped, [true, false, false, false, false, false]);
     }
 
     #[test]
     fn halving_a_pixel_leaves_nothing() {
         let bounds = Bounds { left: 3, top: 2, right: 4, bottom: 3 };
         let pixels = Image::new(1, 1, [9, 9, 9, 255]);
-        let half =
-            Piece { warped: WarpedPhoto { bounds, pixels }, eccentricity: vec![0.0], radius: vec![0.0] }.halved();
+        let half = Piece {
+            warped: WarpedPhoto { bounds, pixels },
+            eccentricity: vec![0.0],
+            radius: vec![0.0],
+            clipped: vec![false],
+        }
+        .halved();
         assert!(half.warped.pixels.is_empty() && half.radius.is_empty());
     }
 

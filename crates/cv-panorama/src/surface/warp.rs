@@ -4,6 +4,7 @@
 //! costs three multiply-adds per coordinate and one division.
 
 use crate::align::View;
+use crate::light::ExposureCorrection;
 use crate::rows::for_each_row_with;
 use crate::surface::{Bounds, DisplacementField, Placement, Surface};
 use cv_core::{Cancelled, DistortionModel, Image, ImageView, Matrix3, Point2, Stage};
@@ -39,50 +40,13 @@ impl WarpedPhoto {
     }
 }
 
-/// What to multiply a photograph with: a factor per channel, and `exp(v₁ r² + v₂ r⁴)` with r = 1 at its corners.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct ExposureCorrection {
-    pub(crate) gain: [f32; 3],
-    pub(crate) vignetting: [f32; 2],
-    /// The product that becomes white, 255 or more: the same for all photographs of a panorama.
-    pub(crate) white: f32,
-}
-
-impl ExposureCorrection {
-    pub(crate) const NONE: Self = Self { gain: [1.0; 3], vignetting: [0.0; 2], white: 255.0 };
-
-    /// The products of gains and a color as levels.
-    ///
-    /// Below the knee they stay; from there to `white` they are compressed to 255 by a rational curve with a continuous slope (Reinhard et al., "Photographic
-    /// tone reproduction for digital images", 2002, with a straight part). A color whose channels were all clipped is a bound, not a measurement: it
-    /// stays white whatever its gain.
-    #[inline(always)]
-    fn levels(&self, color: [f32; 3], product: [f32; 3]) -> [f32; 3] {
-        const KNEE: f32 = 190.0;
-        /// Smallest channel from which on a color counts as clipped, more and more up to the second.
-        const CLIPPED: [f32; 2] = [235.0, 252.0];
-        let brightest = product[0].max(product[1]).max(product[2]);
-        let least = color[0].min(color[1]).min(color[2]);
-        if self.white <= 255.0 && brightest <= 255.0 && least < CLIPPED[0] || brightest <= KNEE && least < CLIPPED[0] {
-            return product;
-        }
-        let a = (self.white - KNEE) / (255.0 - KNEE);
-        let share = ((least - CLIPPED[0]) / (CLIPPED[1] - CLIPPED[0])).clamp(0.0, 1.0);
-        let clipped = share * share * (3.0 - 2.0 * share);
-        product.map(|s| {
-            let t = ((s - KNEE) / (self.white - KNEE)).clamp(0.0, 1.0);
-            let tone = if s <= KNEE { s } else { KNEE + (255.0 - KNEE) * a * t / (1.0 + (a - 1.0) * t) };
-            tone + clipped * (255.0 - tone)
-        })
-    }
-}
-
 /// How a photograph is drawn.
 #[derive(Clone, Copy)]
 pub(crate) struct WarpSettings<'a> {
     pub(crate) displacement: Option<&'a DisplacementField>,
     pub(crate) interpolation: Interpolation,
-    pub(crate) correction: ExposureCorrection,
+    /// What is done to its light; `None` for nothing.
+    pub(crate) correction: Option<ExposureCorrection<'a>>,
 }
 
 /// The photograph as seen in the canvas pixels `bounds`.
@@ -236,26 +200,24 @@ fn sample_row(
     us: &[f32],
     vs: &[f32],
     row: &mut [u8],
-    correction: ExposureCorrection,
+    correction: Option<ExposureCorrection<'_>>,
     sample: impl Fn(ImageView<'_, u8, 3>, f32, f32) -> [f32; 3],
 ) {
     let (right, bottom) = ((photo.width() - 1) as f32, (photo.height() - 1) as f32);
     let corner = 4.0 / ((right + 1.0).powi(2) + (bottom + 1.0).powi(2));
-    let flat = correction.vignetting == [0.0; 2];
     let (pixels, _) = row.as_chunks_mut::<4>();
     for ((pixel, &u), &v) in pixels.iter_mut().zip(us).zip(vs) {
         let inside = u >= -0.5 && v >= -0.5 && u <= right + 0.5 && v <= bottom + 0.5;
         // `max` first: it turns NaN into a number.
         let (u, v) = (u.max(0.0).min(right), v.max(0.0).min(bottom));
-        let mut gain = correction.gain;
-        if !flat {
-            let (x, y) = (u - 0.5 * right, v - 0.5 * bottom);
-            let r2 = corner * (x * x + y * y);
-            let lift = (r2 * (correction.vignetting[0] + r2 * correction.vignetting[1])).exp();
-            gain = gain.map(|g| g * lift);
-        }
         let color = sample(photo, u, v);
-        let [r, g, b] = correction.levels(color, [gain[0] * color[0], gain[1] * color[1], gain[2] * color[2]]);
+        let [r, g, b] = match &correction {
+            None => color,
+            Some(correction) => {
+                let (x, y) = (u - 0.5 * right, v - 0.5 * bottom);
+                correction.levels(color, correction.lift(corner * (x * x + y * y)))
+            }
+        };
         *pixel = [round(r), round(g), round(b), if inside { 255 } else { 0 }];
     }
 }
@@ -292,16 +254,14 @@ fn bicubic(photo: ImageView<'_, u8, 3>, u: f32, v: f32) -> [f32; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::light::Gains;
     use crate::surface::Projection;
     use crate::testing::stage;
     use cv_core::{Camera, Distortion, RgbU8, Vector3};
     use nalgebra::Rotation3;
 
-    const PLAIN: WarpSettings<'_> = WarpSettings {
-        displacement: None,
-        interpolation: Interpolation::Bicubic,
-        correction: ExposureCorrection::NONE,
-    };
+    const PLAIN: WarpSettings<'_> =
+        WarpSettings { displacement: None, interpolation: Interpolation::Bicubic, correction: None };
 
     fn placement(camera: Camera, r: Rotation3<f64>, bounds: Bounds) -> Placement {
         Placement {
@@ -390,8 +350,8 @@ mod tests {
         }
     }
 
-    /// Samples per pixel by the definition: Keys' cubic convolution with a = −0.5 over all sixteen neighbors, edges repeated, then gains and the tone curve.
-    fn plain(photo: &RgbU8, q: Point2<f64>, correction: ExposureCorrection) -> [f64; 3] {
+    /// Samples per pixel by the definition: Keys' cubic convolution with a = −0.5 over all sixteen neighbors, edges repeated, then the correction of exposure.
+    fn plain(photo: &RgbU8, q: Point2<f64>, correction: ExposureCorrection<'_>) -> [f64; 3] {
         let (w, h) = (photo.width() as f64 - 1.0, photo.height() as f64 - 1.0);
         let kernel = |t: f64| match t.abs() {
             t if t < 1.0 => 1.5 * t.powi(3) - 2.5 * t.powi(2) + 1.0,
@@ -399,7 +359,6 @@ mod tests {
             _ => 0.0,
         };
         let r2 = ((q.x - 0.5 * w).powi(2) + (q.y - 0.5 * h).powi(2)) * 4.0 / ((w + 1.0).powi(2) + (h + 1.0).powi(2));
-        let [v1, v2] = correction.vignetting.map(f64::from);
         let color: [f64; 3] = std::array::from_fn(|c| {
             let mut sum = 0.0;
             for y in (q.y.floor() as i64 - 1)..=(q.y.floor() as i64 + 2) {
@@ -410,29 +369,8 @@ mod tests {
             }
             sum
         });
-        let lift = (r2 * (v1 + r2 * v2)).exp();
-        let product = std::array::from_fn(|c| (color[c] * f64::from(correction.gain[c]) * lift) as f32);
-        correction.levels(color.map(|v| v as f32), product).map(|v| f64::from(v).clamp(0.0, 255.0))
-    }
-
-    #[test]
-    fn tones_rise_keep_what_is_dark_and_reach_white() {
-        for (gain, white) in [(0.4, 255.0), (1.0, 255.0), (0.5, 459.0), (1.0, 459.0), (1.8, 459.0)] {
-            let correction = ExposureCorrection { gain: [gain; 3], white, ..ExposureCorrection::NONE };
-            let tone = |v: u16| correction.levels([f32::from(v); 3], [gain * f32::from(v); 3])[0];
-            for v in 0..255 {
-                // A curve of slope gain or less, but for the last levels, which go to white.
-                let (here, next) = (tone(v), tone(v + 1));
-                assert!(next > here || v >= 252 && here == 255.0, "{gain} {white} {v}: {here} {next}");
-                let product = gain * f32::from(v);
-                assert!(v >= 235 || product > 190.0 || here == product, "{gain} {white} {v}: {here}");
-            }
-            // Clipped stays clipped.
-            assert!((tone(255) - 255.0).abs() < 1e-3 && tone(0) == 0.0, "{gain} {white}: {}", tone(255));
-        }
-        // A saturated color is no white.
-        let dim = ExposureCorrection { gain: [0.5; 3], ..ExposureCorrection::NONE };
-        assert_eq!(dim.levels([255.0, 120.0, 0.0], [127.5, 60.0, 0.0]), [127.5, 60.0, 0.0]);
+        let levels = correction.levels(color.map(|v| v as f32), correction.lift(r2 as f32));
+        levels.map(|v| f64::from(v).clamp(0.0, 255.0))
     }
 
     #[test]
@@ -449,8 +387,10 @@ mod tests {
             *d = cv_core::Vector2::new(0.7 * (i as f64 * 0.9).sin(), 0.6 * (i as f64 * 1.7).cos());
         }
         field.update_source_shift(&p, &surface);
-        let correction = ExposureCorrection { gain: [0.8, 1.2, 1.5], vignetting: [0.2, 0.1], white: 382.5 };
-        let settings = WarpSettings { displacement: Some(&field), correction, ..PLAIN };
+        let gains = Gains { gains: vec![[0.8, 1.2, 1.5]], vignetting: [0.2, 0.1], response: [0.3, -0.2, 0.1] };
+        let tone = gains.tone();
+        let correction = ExposureCorrection::new(&tone, &gains, 0);
+        let settings = WarpSettings { displacement: Some(&field), correction: Some(correction), ..PLAIN };
         let warped = warp(photo.view(), &p, &surface, bounds, settings, &stage()).unwrap();
         let mut seen = 0;
         for (x, y) in (bounds.top..bounds.bottom).flat_map(|y| (bounds.left..bounds.right).map(move |x| (x, y))) {

@@ -1,0 +1,450 @@
+//! Exposure, white balance, response curve and vignetting from what photographs have in common (after Goldman & Chen 2005, "Vignette and exposure calibration and
+//! compensation", and Brown & Lowe 2007, §6).
+//!
+//! Where photographs overlap they saw the same light: `L(I_a) + g_a + v(r_a) = L(I_b) + g_b + v(r_b)`, with `L` the logarithm of light by the response that all share,
+//! a gain `g` per photograph and channel, and one vignetting toward the corners, `v(r) = v₁ r² + v₂ r⁴`. That is linear in all unknowns: one least squares
+//! problem, reweighted so that what moved or does not fit counts little. A level that is clipped is a bound: an equation only where the other photograph violates it.
+
+use crate::light::{ExposureCorrection, Response, Tone, response::COEFFICIENTS};
+use crate::surface::{Piece, Preview};
+use cv_core::{Cancelled, Progress, Stage, named};
+use nalgebra::{DMatrix, DVector};
+
+/// How exposure differences are evened out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Exposure {
+    /// Not at all.
+    None,
+    /// Exposure and white balance of each photograph, in light, with the response curve and the vignetting of the camera.
+    #[default]
+    Match,
+}
+
+named!(Exposure { None = "none", Match = "match" | "gain" | "vignetting" });
+
+/// What makes the light of photographs one.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Gains {
+    /// Factors on the red, green and blue light of each photograph.
+    pub gains: Vec<[f32; 3]>,
+    /// `v₁` and `v₂`: the light at distance r from the middle (1 at the corners) is multiplied by `exp(v₁ r² + v₂ r⁴)`.
+    pub vignetting: [f32; 2],
+    /// The light of a level `v`, 0 to 1, is that of sRGB times `2^((1 − v)(p₀ + p₁ v + p₂ v²))`.
+    pub response: [f64; 3],
+}
+
+impl Gains {
+    pub(crate) fn none(photos: usize) -> Self {
+        Self { gains: vec![[1.0; 3]; photos], vignetting: [0.0; 2], response: [0.0; 3] }
+    }
+
+    /// Stops above white that a photograph's own white comes to, 0 or more.
+    fn highest(&self) -> f64 {
+        f64::from(self.gains.iter().flatten().copied().fold(1.0, f32::max).log2())
+    }
+
+    /// The curves from levels to levels.
+    pub(crate) fn tone(&self) -> Tone {
+        Tone::new(&Response { coefficients: self.response }, self.highest())
+    }
+}
+
+/// Two photographs' readings of one place.
+#[derive(Debug, Clone, Copy)]
+struct Sample {
+    a: usize,
+    b: usize,
+    /// Levels.
+    levels: [[u8; 3]; 2],
+    /// r² of both.
+    radius: [f64; 2],
+    /// Standard deviation of the difference of the levels beside noise: the slope of the picture there, over which the photographs may be out of place.
+    slope: f64,
+}
+
+/// Samples taken from each overlap at most.
+const PER_OVERLAP: usize = 2000;
+/// The least level that counts as clipped; compression lets them vary.
+const CLIPPED: u8 = 250;
+/// The darkest level that is read: below, noise and the black point decide.
+const DARK: u8 = 5;
+/// A level from which on a photograph shows hardly anything, and another is preferred.
+pub(crate) const UNREADABLE: u8 = CLIPPED;
+/// Standard deviation of a level of a preview: rounding, compression, what is left of noise.
+const NOISE: f64 = 0.8;
+/// Share of the difference of neighboring levels by which photographs may differ because they are out of place by part of a preview pixel.
+const OUT_OF_PLACE: f64 = 0.25;
+/// Standard deviations from which on a sample counts less.
+const OUTLIER: f64 = 2.5;
+/// Standard deviations, beforehand, of stops at the corners, and of the coefficients of a response. Both count as much as [`BELIEF`] of all samples.
+const VIGNETTING: f64 = 0.5;
+const CURVE: f64 = 1.0;
+const BELIEF: f64 = 2e-3;
+
+/// Terms of a sample: unknowns and their factors.
+type Terms = [(usize, f64); 4 + COEFFICIENTS];
+
+/// Which unknowns there are.
+#[derive(Clone, Copy)]
+struct Unknowns {
+    photos: usize,
+    vignetting: bool,
+    curve: bool,
+}
+
+impl Unknowns {
+    /// Those of gains, three to a photograph, of the vignetting and of the response, in this order.
+    fn count(&self) -> usize {
+        3 * self.photos + 2 + COEFFICIENTS
+    }
+
+    fn terms(&self, s: &Sample, c: usize) -> Terms {
+        let n = 3 * self.photos;
+        let lens = if self.vignetting { 1.0 } else { 0.0 };
+        let curve = if self.curve { 1.0 } else { 0.0 };
+        let [a, b] = s.levels.map(|l| Response::basis(f64::from(l[c]) / 255.0));
+        let [p, q] = s.radius;
+        std::array::from_fn(|k| match k {
+            0 => (3 * s.a + c, 1.0),
+            1 => (3 * s.b + c, -1.0),
+            2 => (n, lens * (p - q)),
+            3 => (n + 1, lens * (p * p - q * q)),
+            k => (n + k - 2, curve * (a[k - 4] - b[k - 4])),
+        })
+    }
+}
+
+/// Gains, vignetting and response from the overlaps on the preview.
+pub(crate) fn estimate_gains(
+    preview: &Preview,
+    photo_of: &[usize],
+    photos: usize,
+    exposure: Exposure,
+    progress: &dyn Progress,
+) -> Result<Gains, Cancelled> {
+    let mut gains = Gains::none(photos);
+    if exposure == Exposure::None {
+        return Ok(gains);
+    }
+    let stage = Stage::new(progress, "exposure", 3)?;
+    let samples = samples(preview, photo_of, &stage)?;
+    stage.add(1)?;
+    if samples.is_empty() {
+        return Ok(gains);
+    }
+    // What says otherwise is no lens and no camera: without it, then.
+    let mut unknowns = Unknowns { photos, vignetting: true, curve: true };
+    let solution = loop {
+        let solution = solve(&samples, unknowns, &stage)?;
+        let n = 3 * photos;
+        let (lens, curve) = (solution.rows(n, 2), solution.rows(n + 2, COEFFICIENTS));
+        // Corners are darkened, by no more than two stops.
+        let falls = |r2: f64| r2 * (lens[0] + r2 * lens[1]);
+        let is_lens = falls(0.5) >= -0.02 && falls(1.0) >= falls(0.5) - 0.02 && falls(1.0) < 2.0;
+        let is_curve = Response { coefficients: std::array::from_fn(|k| curve[k]) }.is_plausible();
+        if is_lens && is_curve {
+            break solution;
+        }
+        unknowns =
+            Unknowns { vignetting: unknowns.vignetting && is_lens, curve: unknowns.curve && is_curve, ..unknowns };
+    };
+    stage.add(1)?;
+    for (gain, stops) in gains.gains.iter_mut().zip(solution.as_slice().as_chunks::<3>().0) {
+        *gain = stops.map(|s| s.clamp(-5.0, 5.0).exp2() as f32);
+    }
+    let n = 3 * photos;
+    gains.vignetting = std::array::from_fn(|k| (solution[n + k] * std::f64::consts::LN_2) as f32);
+    gains.response = std::array::from_fn(|k| solution[n + 2 + k]);
+    anchor(&mut gains, preview, photo_of);
+    stage.add(1)?;
+    Ok(gains)
+}
+
+/// Places of the preview looked at for the mean.
+const FOR_MEAN: usize = 10_000;
+
+/// Shifts the exposure of all so that the mean level of the panorama stays what the photographs have there: each place counts once, with the mean of those that show it.
+fn anchor(gains: &mut Gains, preview: &Preview, photo_of: &[usize]) {
+    let (width, height) = (preview.width, preview.height);
+    let step = (width * height).div_ceil(FOR_MEAN).max(1);
+    let mut colors = Vec::new();
+    for (x, y) in (0..width * height).step_by(step).map(|i| (i % width, i / width)) {
+        let first = colors.len();
+        for (piece, &photo) in preview.pieces.iter().zip(photo_of) {
+            let b = piece.warped.bounds;
+            if let Some(color) = piece.warped.color(x, y) {
+                colors.push((color.map(f32::from), piece.radius[(y - b.top) * b.width() + x - b.left], photo, 0.0));
+            }
+        }
+        let share = 1.0 / (colors.len() - first).max(1) as f64;
+        colors[first..].iter_mut().for_each(|c| c.3 = share);
+    }
+    let before: f64 = colors.iter().map(|(color, _, _, share)| share * f64::from(color[0] + color[1] + color[2])).sum();
+    let shifted = |stops: f64| {
+        let factor = stops.exp2() as f32;
+        Gains { gains: gains.gains.iter().map(|g| g.map(|g| g * factor)).collect(), ..gains.clone() }
+    };
+    let (mut low, mut high) = (-2.0_f64, 2.0_f64);
+    for _ in 0..12 {
+        let middle = 0.5 * (low + high);
+        let tried = shifted(middle);
+        let tone = tried.tone();
+        let corrections: Vec<_> =
+            (0..gains.gains.len()).map(|photo| ExposureCorrection::new(&tone, &tried, photo)).collect();
+        let after: f64 = colors
+            .iter()
+            .map(|(color, r2, photo, share)| {
+                let correction = &corrections[*photo];
+                let levels = correction.levels(*color, correction.lift(*r2));
+                share * f64::from(levels[0] + levels[1] + levels[2])
+            })
+            .sum();
+        if after < before { low = middle } else { high = middle }
+    }
+    *gains = shifted(0.5 * (low + high));
+}
+
+fn samples(preview: &Preview, photo_of: &[usize], stage: &Stage<'_>) -> Result<Vec<Sample>, Cancelled> {
+    let mut samples = Vec::new();
+    for (i, p) in preview.pieces.iter().enumerate() {
+        stage.check()?;
+        for (j, q) in preview.pieces.iter().enumerate().skip(i + 1) {
+            let Some(common) = p.warped.bounds.intersection(&q.warped.bounds) else { continue };
+            if photo_of[i] == photo_of[j] {
+                continue;
+            }
+            let step = ((common.width() * common.height()) as f64 / PER_OVERLAP as f64).sqrt().ceil().max(1.0) as usize;
+            for y in (common.top..common.bottom).step_by(step) {
+                for x in (common.left..common.right).step_by(step) {
+                    let (Some(a), Some(b)) = (p.warped.color(x, y), q.warped.color(x, y)) else { continue };
+                    let r2 = |piece: &Piece| {
+                        let b = piece.warped.bounds;
+                        f64::from(piece.radius[(y - b.top) * b.width() + x - b.left])
+                    };
+                    let (Some(s), Some(t)) = (steepest(p, x, y, a), steepest(q, x, y, b)) else { continue };
+                    let (a_of, b_of) = (photo_of[i], photo_of[j]);
+                    let slope = f64::from(s.max(t));
+                    samples.push(Sample { a: a_of, b: b_of, levels: [a, b], radius: [r2(p), r2(q)], slope });
+                }
+            }
+        }
+    }
+    Ok(samples)
+}
+
+/// The greatest difference of a pixel, in any channel, to one of its four neighbors; `None` at the border.
+fn steepest(piece: &Piece, x: usize, y: usize, color: [u8; 3]) -> Option<u8> {
+    let around = [(x.checked_sub(1)?, y), (x + 1, y), (x, y.checked_sub(1)?), (x, y + 1)];
+    around.into_iter().try_fold(0, |most, (x, y)| {
+        let other = piece.warped.color(x, y)?;
+        color.into_iter().zip(other).map(|(a, b)| a.abs_diff(b)).max().map(|d| d.max(most))
+    })
+}
+
+/// All unknowns by iteratively reweighted least squares, in stops.
+fn solve(samples: &[Sample], unknowns: Unknowns, stage: &Stage<'_>) -> Result<DVector<f64>, Cancelled> {
+    let n = unknowns.count();
+    let gains = 3 * unknowns.photos;
+    let srgb: Vec<f64> = (0..=255).map(|v| Response::srgb(f64::from(v) / 255.0)).collect();
+    let mut solution = DVector::zeros(n);
+    for round in 0..10 {
+        let curve = Response { coefficients: std::array::from_fn(|k| solution[gains + 2 + k]) };
+        let slopes: Vec<f64> = (0..=255).map(|v| curve.slope(f64::from(v) / 255.0) / 255.0).collect();
+        let mut normal = DMatrix::<f64>::zeros(n, n);
+        let mut right = DVector::<f64>::zeros(n);
+        // The first rounds are wide: exposures may differ by stops.
+        let scale = (256.0 / f64::from(1 << round.min(8))).max(OUTLIER);
+        let mut total = 0.0;
+        for (i, s) in samples.iter().enumerate() {
+            if i % 4096 == 0 {
+                stage.check()?;
+            }
+            for c in 0..3 {
+                let [a, b] = s.levels.map(|l| l[c]);
+                if a.min(b) < DARK || a.min(b) >= CLIPPED {
+                    continue;
+                }
+                let terms = unknowns.terms(s, c);
+                let d = srgb[usize::from(a)] - srgb[usize::from(b)];
+                let residual = d + terms.iter().map(|&(k, t)| t * solution[k]).sum::<f64>();
+                // A clipped level stands for its light or more.
+                if a >= CLIPPED && residual <= 0.0 || b >= CLIPPED && residual >= 0.0 {
+                    continue;
+                }
+                let level = NOISE.hypot(OUT_OF_PLACE * s.slope);
+                let sigma = level * slopes[usize::from(a)].hypot(slopes[usize::from(b)]);
+                let weight = 1.0 / (sigma * sigma * (1.0 + (residual / (scale * sigma)).powi(2)));
+                total += weight;
+                for &(k, t) in &terms {
+                    right[k] -= weight * t * d;
+                    for &(l, u) in &terms {
+                        normal[(k, l)] += weight * t * u;
+                    }
+                }
+            }
+        }
+        // Enough to settle the common factor, nothing else.
+        for k in 0..gains {
+            normal[(k, k)] += 1e-6 * total.max(1.0);
+        }
+        for k in gains..n {
+            let sigma = if k < gains + 2 { VIGNETTING } else { CURVE };
+            normal[(k, k)] += BELIEF * total.max(1.0) / (sigma * sigma);
+        }
+        let Some(factor) = normal.cholesky() else { break };
+        solution = factor.solve(&right);
+    }
+    Ok(solution)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::surface::{Bounds, WarpedPhoto};
+    use cv_core::{Image, Silent};
+
+    /// What a camera makes of an amount of light, 0 to 1: sRGB, and a curve of this contrast on top of it.
+    fn level(light: f64, contrast: f64) -> f64 {
+        let light = light.clamp(0.0, 1.0);
+        let v = if light <= 0.0031308 { 12.92 * light } else { 1.055 * light.powf(1.0 / 2.4) - 0.055 };
+        v + contrast * v * (1.0 - v) * (2.0 * v - 1.0)
+    }
+
+    /// The light of a scene: smooth, from deep shadow to near white.
+    fn scene(x: usize, y: usize, c: usize) -> f64 {
+        let wave = ((x * (c + 2)) as f64 * 0.07).sin() * (y as f64 * 0.11).cos();
+        (-3.0 + 2.2 * wave).exp2()
+    }
+
+    /// Three photographs of 60 x 40, 30 apart, of one scene, their light multiplied by known factors and less toward their corners.
+    fn preview(factors: &[[f64; 3]; 3], fall_off: f64, contrast: f64, moved: bool) -> Preview {
+        let pieces = (0..3)
+            .map(|k| {
+                let bounds = Bounds { left: 30 * k, top: 0, right: 30 * k + 60, bottom: 40 };
+                let radius: Vec<f32> = (0..60 * 40)
+                    .map(|i| {
+                        let (x, y) = ((i % 60) as f32 - 29.5, (i / 60) as f32 - 19.5);
+                        (x * x + y * y) / (30.0 * 30.0 + 20.0 * 20.0)
+                    })
+                    .collect();
+                let pixels = Image::from_fn(60, 40, |x, y| {
+                    let dim = (-fall_off * f64::from(radius[y * 60 + x])).exp();
+                    let person = moved && k == 1 && (10..18).contains(&x);
+                    let light = |c: usize| if person { 0.02 } else { scene(30 * k + x, y, c) * factors[k][c] * dim };
+                    let [r, g, b] = [0, 1, 2].map(|c| (255.0 * level(light(c), contrast)).round() as u8);
+                    [r, g, b, 255]
+                });
+                let clipped = vec![false; radius.len()];
+                Piece { warped: WarpedPhoto { bounds, pixels }, eccentricity: radius.clone(), radius, clipped }
+            })
+            .collect();
+        Preview { step: 1, width: 120, height: 40, pieces }
+    }
+
+    fn estimate(preview: &Preview) -> Gains {
+        estimate_gains(preview, &[0, 1, 2], 3, Exposure::Match, &Silent).unwrap()
+    }
+
+    /// The greatest difference, in levels, of two photographs after correction where both show a place well.
+    fn disagreement(preview: &mut Preview, gains: &Gains) -> u8 {
+        let readable = |p: &Piece, x, y| p.warped.color(x, y).is_some_and(|c| c.iter().all(|v| (12..225).contains(v)));
+        let both = |preview: &Preview, i: usize, x, y| {
+            readable(&preview.pieces[i], x, y) && readable(&preview.pieces[i + 1], x, y)
+        };
+        let places = (0..2).flat_map(|i| (0..40).flat_map(move |y| (30 * i + 30..30 * i + 60).map(move |x| (i, x, y))));
+        let places: Vec<_> = places.filter(|&(i, x, y)| both(preview, i, x, y)).collect();
+        assert!(places.len() > 800, "{}", places.len());
+        preview.correct(gains, &[0, 1, 2]);
+        let off = |&(i, x, y): &(usize, usize, usize)| {
+            let [a, b] = [i, i + 1].map(|k| preview.pieces[k].warped.color(x, y).unwrap());
+            // Levels that are brightened magnify the rounding of dark ones.
+            let rounding = a.into_iter().zip(b).map(|(a, b)| a.abs_diff(b)).max();
+            rounding.unwrap_or(0)
+        };
+        let mut all: Vec<u8> = places.iter().map(off).collect();
+        all.sort_unstable();
+        all[all.len() * 95 / 100]
+    }
+
+    #[test]
+    fn exposure_and_white_balance_are_undone_though_somebody_walked_through() {
+        let factors = [[1.0, 1.0, 1.0], [0.5, 0.55, 0.6], [1.4, 1.3, 1.2]];
+        let found = estimate(&preview(&factors, 0.0, 0.0, true));
+        for c in 0..3 {
+            let common = f64::from(found.gains[0][c]) * factors[0][c];
+            for (gain, factor) in found.gains.iter().zip(&factors) {
+                // Rounding to bytes is 2 % of the light of a dark level, averaged over hundreds of samples; what a common power of all light explains too is left to the
+                // prior of the response: 5 % of a stop for each stop.
+                assert!((f64::from(gain[c]) * factor[c] / common).log2().abs() < 0.08, "{:?}", found);
+            }
+        }
+    }
+
+    #[test]
+    fn photographs_agree_after_correction_whatever_the_curve_of_the_camera() {
+        let factors = [[1.0, 1.0, 1.0], [0.4, 0.4, 0.45], [1.6, 1.5, 1.5]];
+        for contrast in [0.0, 0.4] {
+            for fall_off in [0.0, 0.4] {
+                let mut set = preview(&factors, fall_off, contrast, false);
+                let gains = estimate(&set);
+                // A level of a photograph two stops darker is up to three levels after correction, half of that its rounding; the response is met to half a level.
+                let off = disagreement(&mut set, &gains);
+                assert!(off <= 3, "contrast {contrast}, fall-off {fall_off}: {off} {gains:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_fall_off_toward_the_corners_is_found() {
+        let found = estimate(&preview(&[[1.0; 3]; 3], 0.4, 0.0, false));
+        let v = |r2: f32| r2 * (found.vignetting[0] + r2 * found.vignetting[1]);
+        // Rounding to bytes through differences of r² of up to 0.7, and a common power of all light, as above.
+        assert!((v(1.0) - 0.4).abs() < 0.06 && (v(0.5) - 0.2).abs() < 0.04, "{:?}", found.vignetting);
+    }
+
+    #[test]
+    fn the_mean_level_stays() {
+        let factors = [[1.0; 3], [0.25; 3], [2.0; 3]];
+        let mut set = preview(&factors, 0.0, 0.3, false);
+        // Every place with the mean of the photographs that show it.
+        let mean = |set: &Preview| {
+            let places = (0..40).flat_map(|y| (0..120).map(move |x| (x, y)));
+            let shown = places.map(|(x, y)| {
+                let colors: Vec<_> = set.pieces.iter().filter_map(|p| p.warped.color(x, y)).collect();
+                colors.iter().flatten().map(|v| f64::from(*v)).sum::<f64>() / (3 * colors.len()) as f64
+            });
+            shown.sum::<f64>() / (40.0 * 120.0)
+        };
+        let before = mean(&set);
+        let gains = estimate(&set);
+        set.correct(&gains, &[0, 1, 2]);
+        // Halvings of four stops twelve times: a thousandth of a stop. Rounding does the rest.
+        assert!((mean(&set) - before).abs() < 0.3, "{before} {}", mean(&set));
+    }
+
+    #[test]
+    fn what_is_clipped_is_a_bound() {
+        let unknowns = Unknowns { photos: 2, vignetting: false, curve: false };
+        let gain = |samples: &[Sample]| {
+            let solution = solve(samples, unknowns, &crate::testing::stage()).unwrap();
+            solution[3] - solution[0]
+        };
+        // Clipped in the first, level 200 in the second: that is 0.79 stops below white (IEC 61966-2-1), so the second is to be lifted by as much, or more.
+        let clipped = Sample { a: 0, b: 1, levels: [[255; 3], [200; 3]], radius: [0.3; 2], slope: 0.0 };
+        // The prior that settles the common factor counts a millionth.
+        assert!((gain(&vec![clipped; 500]) - 0.79).abs() < 0.01, "{}", gain(&vec![clipped; 500]));
+        // Others say more: the bound is met and changes nothing.
+        let darker = Sample { levels: [[220; 3], [100; 3]], ..clipped };
+        let mut both = vec![darker; 500];
+        both.extend(vec![clipped; 500]);
+        assert!((gain(&both) - gain(&vec![darker; 500])).abs() < 1e-9);
+    }
+
+    #[test]
+    fn nothing_in_common_changes_nothing() {
+        let mut apart = preview(&[[1.0; 3]; 3], 0.0, 0.0, false);
+        apart.pieces.remove(1);
+        let found = estimate_gains(&apart, &[0, 2], 3, Exposure::Match, &Silent).unwrap();
+        assert_eq!(found, Gains::none(3));
+    }
+}

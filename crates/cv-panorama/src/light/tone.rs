@@ -1,0 +1,158 @@
+//! From levels of a photograph to levels of the panorama: to light, by the photograph's exposure to the light of all, and back by the camera's own curve, so that the
+//! panorama looks as the photographs do. What the brightened photographs have above white is compressed, not cut off.
+
+use crate::light::{Gains, Response};
+
+/// Entries per stop of light.
+const PER_STOP: f32 = 32.0;
+/// log₂ of the least light there is an entry for.
+const LEAST: f32 = -16.0;
+/// The level from which on there is room made for light above white.
+const KNEE: f64 = 190.0;
+
+/// The curves that all photographs of a panorama share.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Tone {
+    /// log₂ of light by level of a photograph; one entry more, for interpolation.
+    light: Box<[f32; 512]>,
+    /// Level of the panorama by log₂ of light, the last one repeated. (Lengths are powers of two, so that a mask bounds an index.)
+    levels: Box<[f32; 1024]>,
+}
+
+impl Tone {
+    /// The curves for photographs of a response whose white may come to `highest` stops above white.
+    ///
+    /// Above white the response goes on along its tangent in stops. Levels up to the knee stay; from there to that of `highest` they are compressed to 255 by a
+    /// rational curve of continuous slope (Reinhard et al., "Photographic tone reproduction for digital images", 2002, with a straight part).
+    pub(crate) fn new(response: &Response, highest: f64) -> Self {
+        let mut light: Box<[f32; 512]> =
+            Box::new(std::array::from_fn(|v| response.log_light(v.min(255) as f64 / 255.0) as f32));
+        // Black stays black whatever the gain.
+        light[0] = LEAST;
+        let per_stop = 255.0 / response.slope(1.0);
+        let white = 255.0 + per_stop * highest.max(0.0);
+        let a = (white - KNEE) / (255.0 - KNEE);
+        let mut below = 0;
+        let mut levels = Box::new([255.0; 1024]);
+        for (i, entry) in levels.iter_mut().enumerate() {
+            let stops = f64::from(LEAST + i as f32 / PER_STOP);
+            // The inverse of the response, whose entries rise.
+            while below < 254 && f64::from(light[below + 1]) < stops {
+                below += 1;
+            }
+            let (low, high) = (f64::from(light[below]), f64::from(light[below + 1]));
+            let level = if stops >= 0.0 {
+                255.0 + per_stop * stops
+            } else {
+                below as f64 + ((stops - low) / (high - low)).clamp(0.0, 1.0)
+            };
+            let t = ((level - KNEE) / (white - KNEE)).clamp(0.0, 1.0);
+            let level = if level <= KNEE { level } else { KNEE + (255.0 - KNEE) * a * t / (1.0 + (a - 1.0) * t) };
+            *entry = level as f32;
+        }
+        Self { light, levels }
+    }
+
+    /// log₂ of the light of a level, which may lie between two.
+    #[inline(always)]
+    fn light(&self, level: f32) -> f32 {
+        let level = level.clamp(0.0, 255.0);
+        let i = level as usize;
+        let (low, high) = (self.light[i & 511], self.light[(i + 1) & 511]);
+        low + (level - i as f32) * (high - low)
+    }
+
+    /// The level of the panorama for log₂ of light.
+    #[inline(always)]
+    fn level(&self, stops: f32) -> f32 {
+        let at = ((stops - LEAST) * PER_STOP).clamp(0.0, 1022.0);
+        let i = at as usize;
+        let (low, high) = (self.levels[i & 1023], self.levels[(i + 1) & 1023]);
+        low + (at - i as f32) * (high - low)
+    }
+}
+
+/// What is done to the light of a photograph.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct ExposureCorrection<'a> {
+    pub(crate) tone: &'a Tone,
+    /// Stops by which red, green and blue are lifted.
+    pub(crate) gain: [f32; 3],
+    /// `v₁` and `v₂`: `v₁ r² + v₂ r⁴` more stops at a distance r from the middle, 1 at the corners.
+    pub(crate) vignetting: [f32; 2],
+}
+
+impl<'a> ExposureCorrection<'a> {
+    /// That of one photograph.
+    pub(crate) fn new(tone: &'a Tone, gains: &Gains, photo: usize) -> Self {
+        let gain = gains.gains.get(photo).map_or([0.0; 3], |g| g.map(f32::log2));
+        Self { tone, gain, vignetting: gains.vignetting.map(|v| v * std::f32::consts::LOG2_E) }
+    }
+
+    /// Stops more at the square of a distance from the middle.
+    #[inline(always)]
+    pub(crate) fn lift(&self, r2: f32) -> f32 {
+        r2 * (self.vignetting[0] + r2 * self.vignetting[1])
+    }
+
+    /// The levels of the panorama for a color of the photograph that is lifted by as many stops more.
+    ///
+    /// A color whose channels were all clipped is a bound, not a measurement: it stays white whatever its gain.
+    #[inline(always)]
+    pub(crate) fn levels(&self, color: [f32; 3], lift: f32) -> [f32; 3] {
+        /// Smallest channel from which on a color counts as clipped, more and more up to the second.
+        const CLIPPED: [f32; 2] = [228.0, 252.0];
+        let least = color[0].min(color[1]).min(color[2]);
+        let share = ((least - CLIPPED[0]) / (CLIPPED[1] - CLIPPED[0])).clamp(0.0, 1.0);
+        let clipped = share * share * (3.0 - 2.0 * share);
+        std::array::from_fn(|c| {
+            let tone = self.tone.level(self.tone.light(color[c]) + self.gain[c] + lift);
+            tone + clipped * (255.0 - tone)
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn correction(tone: &Tone, stops: f32) -> ExposureCorrection<'_> {
+        ExposureCorrection { tone, gain: [stops; 3], vignetting: [0.0; 2] }
+    }
+
+    #[test]
+    fn without_a_gain_levels_stay_whatever_the_response() {
+        for coefficients in [[0.0; 3], [0.8, -1.0, -1.2], [-0.4, 0.3, 0.2]] {
+            let tone = Tone::new(&Response { coefficients }, 0.0);
+            for level in 0..=255 {
+                let got = correction(&tone, 0.0).levels([level as f32; 3], 0.0)[0];
+                // Chords of the curve over a 32nd of a stop, 2 % of the light, 1 % of the level: its curvature over that is a hundredth of it. Levels from 228 on go to white.
+                assert!((got - level as f32).abs() < 0.06 || level > 228, "{coefficients:?} {level}: {got}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_stop_more_is_twice_the_light() {
+        let tone = Tone::new(&Response::default(), 1.0);
+        // IEC 61966-2-1: levels 100, 137 and 188 are 0.1274, 0.2502 and 0.5029 of white.
+        assert!((correction(&tone, 1.0).levels([100.0, 137.0, 20.0], 0.0)[0] - 138.4).abs() < 0.5);
+        assert!((correction(&tone, 0.5).levels([100.0, 137.0, 20.0], 0.5)[1] - 187.6).abs() < 0.5);
+    }
+
+    #[test]
+    fn tones_rise_and_reach_white() {
+        for (stops, highest) in [(-1.3, 0.0), (0.0, 0.0), (-1.0, 1.0), (0.0, 1.0), (1.0, 1.0), (3.0, 3.5)] {
+            let tone = Tone::new(&Response::default(), highest);
+            let level = |v: u16| correction(&tone, stops).levels([f32::from(v); 3], 0.0)[0];
+            for v in 1..255 {
+                assert!(level(v + 1) > level(v) || level(v) >= 254.9, "{stops} {highest} {v}");
+            }
+            // Clipped stays clipped.
+            assert!((level(255) - 255.0).abs() < 1e-2 && level(0) < 1.0, "{stops} {highest}: {}", level(255));
+        }
+        // A saturated color is no white.
+        let tone = Tone::new(&Response::default(), 0.0);
+        assert!(correction(&tone, -1.0).levels([255.0, 120.0, 0.0], 0.0)[0] < 190.0);
+    }
+}
