@@ -383,7 +383,7 @@ def panorama(
     projection: Literal["auto", "plane", "cylindrical", "spherical"] | None = "auto",
     blend: Literal["multiband", "poisson", "feather", "none"] | None = "multiband",
     seams: Literal["graphcut", "voronoi"] | None = "graphcut",
-    exposure: Literal["none", "gain", "vignetting"] | None = "gain",
+    exposure: Literal["none", "match"] | None = "match",
     crop: bool | None = False,
     scale: float | None = 1.0,
     features: Literal["sift", "mops", "harris"] | None = "sift",
