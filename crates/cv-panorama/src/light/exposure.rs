@@ -163,23 +163,33 @@ pub(crate) fn estimate_gains(
 /// Places of the preview looked at for the mean.
 const FOR_MEAN: usize = 10_000;
 
-/// Shifts the exposure of all so that the mean level of the panorama stays what the photographs have there: each place counts once, with the mean of those that show it.
+/// Shifts the exposure of all so that the mean level of the panorama stays what the photographs have there, as far as one of them has such a mean: each place counts once, with the mean of
+/// those that show it. (Where the dark parts of a scene are seen by several photographs and the bright ones by one, that is more than any photograph has.)
 fn anchor(gains: &mut Gains, preview: &Preview, photo_of: &[usize]) {
     let (width, height) = (preview.width, preview.height);
     let step = (width * height).div_ceil(FOR_MEAN).max(1);
     let mut colors = Vec::new();
+    let (mut places, mut of_photo) = (0.0, vec![(0.0, 0.0); gains.gains.len()]);
     for (x, y) in (0..width * height).step_by(step).map(|i| (i % width, i / width)) {
         let first = colors.len();
         for (piece, &photo) in preview.pieces.iter().zip(photo_of) {
             let b = piece.warped.bounds;
             if let Some(color) = piece.warped.color(x, y) {
-                colors.push((color.map(f32::from), piece.radius[(y - b.top) * b.width() + x - b.left], photo, 0.0));
+                let color = color.map(f32::from);
+                let (sum, count) = &mut of_photo[photo];
+                *sum += f64::from(color.iter().sum::<f32>());
+                *count += 1.0;
+                colors.push((color, piece.radius[(y - b.top) * b.width() + x - b.left], photo, 0.0));
             }
         }
         let share = 1.0 / (colors.len() - first).max(1) as f64;
         colors[first..].iter_mut().for_each(|c| c.3 = share);
+        places += f64::from(u8::from(colors.len() > first));
     }
+    let means = || of_photo.iter().filter(|(_, count)| *count > 0.0).map(|(sum, count)| sum / count);
+    let (darkest, brightest) = (means().fold(f64::INFINITY, f64::min), means().fold(0.0, f64::max));
     let before: f64 = colors.iter().map(|(color, _, _, share)| share * f64::from(color[0] + color[1] + color[2])).sum();
+    let before = before.min(brightest * places).max(darkest.min(brightest) * places);
     let shifted = |stops: f64| {
         let factor = stops.exp2() as f32;
         Gains { gains: gains.gains.iter().map(|g| g.map(|g| g * factor)).collect(), ..gains.clone() }
@@ -420,6 +430,26 @@ mod tests {
         set.correct(&gains, &[0, 1, 2]);
         // Halvings of four stops twelve times: a thousandth of a stop. Rounding does the rest.
         assert!((mean(&set) - before).abs() < 0.3, "{before} {}", mean(&set));
+    }
+
+    #[test]
+    fn the_mean_level_is_one_that_a_photograph_could_have() {
+        // Two photographs of 60 columns, 30 apart: what both show is dark, the rest bright. Each has a mean of 110; the panorama, place by place, one of 133.
+        let bright = |x: usize| !(30..60).contains(&x);
+        let piece = |k: usize| {
+            let bounds = Bounds { left: 30 * k, top: 0, right: 30 * k + 60, bottom: 40 };
+            let value = |x: usize| if bright(30 * k + x) { 180 } else { 40 };
+            let pixels = Image::from_fn(60, 40, |x, _| [value(x), value(x), value(x), 255]);
+            let (radius, clipped) = (vec![0.0; 60 * 40], vec![false; 60 * 40]);
+            Piece { warped: WarpedPhoto { bounds, pixels }, eccentricity: radius.clone(), radius, clipped }
+        };
+        let mut set = Preview { step: 1, width: 90, height: 40, pieces: vec![piece(0), piece(1)] };
+        let gains = estimate_gains(&set, &[0, 1], 2, Exposure::Match, &Silent).unwrap();
+        set.correct(&gains, &[0, 1]);
+        let level = |x: usize| f64::from(set.pieces[usize::from(x >= 60)].warped.color(x, 7).unwrap()[0]);
+        let mean = (0..90).map(level).sum::<f64>() / 90.0;
+        // Rounding.
+        assert!((mean - 110.0).abs() < 1.0, "{mean} {gains:?}");
     }
 
     #[test]
