@@ -12,7 +12,7 @@
 //! | `stereo.rs` | `StereoMatcher`, `depth`, `evaluate_disparity` |
 //! | `matching.rs` | `extract_features`, `match`, `match_features` |
 //! | `estimate.rs` | `estimate_homography`, `estimate_fundamental`, `estimate_essential`, `estimate_pose` |
-//! | `reconstruct.rs`, `sfm.rs` | `reconstruct`, `sfm_features`, `sfm` |
+//! | `reconstruct.rs`, `sfm_photograph.rs`, `sfm.rs` | `reconstruct`, `sfm_features`, `sfm` |
 //! | `model.rs` | what `Reconstruction` reads and writes |
 //! | `panorama.rs` | `panorama` |
 //! | `segment.rs` | what is behind `ColorModel`; `evaluate_mask` |
@@ -49,6 +49,7 @@ mod rectify;
 mod results;
 mod segment;
 mod sfm;
+mod sfm_photograph;
 mod stereo;
 
 use pyo3::exceptions::PyValueError;
@@ -75,7 +76,7 @@ const FUNCTIONS: &[(&str, Read)] = &[
     ("estimate_essential", |options| estimate::read_essential(options).map(drop)),
     ("estimate_pose", |options| estimate::read_pose(options).map(drop)),
     ("reconstruct", |options| reconstruct::Arguments::read(options).map(drop)),
-    ("sfm_features", |options| sfm::read_features(options).map(drop)),
+    ("sfm_features", |options| sfm_photograph::read_features(options).map(drop)),
     ("sfm", |options| sfm::Arguments::read(options).map(drop)),
     ("panorama", |options| panorama::Arguments::read(options).map(drop)),
     ("ColorModel", |options| segment::read(options).map(drop)),
@@ -101,7 +102,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<rectify::PyUndistorter>()?;
     module.add_class::<stereo::PyStereoMatcher>()?;
     module.add_class::<segment::PyColorModel>()?;
-    module.add_class::<sfm::PySfmPhotograph>()?;
+    module.add_class::<sfm_photograph::PySfmPhotograph>()?;
     macro_rules! functions {
         ($($of:ident::$function:ident),* $(,)?) => { $(module.add_function(wrap_pyfunction!($of::$function, module)?)?;)* };
     }
@@ -130,7 +131,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
         rectify::undistort,
         segment::evaluate_mask,
         sfm::sfm,
-        sfm::sfm_features,
+        sfm_photograph::sfm_features,
         stereo::depth,
         stereo::evaluate_disparity,
     );
