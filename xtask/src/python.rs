@@ -27,10 +27,8 @@ pub(crate) fn run() -> Result<bool> {
     };
     let sources = root().join("python");
     peers::check(pip(&["-r"]).arg(sources.join("requirements.txt")))?;
-    // Not for every Python, nor for every system.
-    if let Err(reason) = peers::check(pip(&["-r"]).arg(sources.join("requirements-peers.txt"))) {
-        println!("python: without some of its peers: {reason:#}");
-    }
+    // While the wheel is built.
+    let mut others = pip(&["-r"]).arg(sources.join("requirements-peers.txt")).spawn().context("pip")?;
     let wheels = folder.join("wheels");
     if wheels.is_dir() {
         std::fs::remove_dir_all(&wheels)?;
@@ -47,6 +45,10 @@ pub(crate) fn run() -> Result<bool> {
     let made: Vec<PathBuf> = std::fs::read_dir(&wheels)?.map(|e| Ok(e?.path())).collect::<Result<_>>()?;
     let [wheel] = &made[..] else { anyhow::bail!("{} wheels in {}", made.len(), wheels.display()) };
     println!("python: {} has {} bytes", wheel.display(), std::fs::metadata(wheel)?.len());
+    // Not for every Python, nor for every system.
+    if !others.wait().context("pip")?.success() {
+        println!("python: without some of its peers");
+    }
     peers::check(pip(&["--no-deps"]).arg(wheel))?;
     let program = target.join("debug").join(format!("cv{}", std::env::consts::EXE_SUFFIX));
     let mut tests = Command::new(&own);

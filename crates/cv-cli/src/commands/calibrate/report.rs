@@ -229,6 +229,11 @@ fn pair(page: &mut Report, job: &Job) -> Result<(), Failure> {
     Ok(())
 }
 
+/// A length without digits that nobody measured.
+fn short(length: f64) -> f64 {
+    format!("{length:.3e}").parse().unwrap_or(length)
+}
+
 /// How far the board is from flat.
 fn board_shape(page: &mut Report, job: &Job) -> Result<(), Failure> {
     let [kx, ky] = job.found.calibration.target_shape.deflection;
@@ -242,8 +247,12 @@ fn board_shape(page: &mut Report, job: &Job) -> Result<(), Failure> {
     let label = format!("away from the camera ({})", job.unit);
     let style = MapStyle { label, ..MapStyle::default() }.with_range(low, high);
     let caption = format!(
-        "How the board is bent, against its corners: its middle by {kx:.3} {0} along x and {ky:.3} {0} along y, of {1:.4} and {2:.4} {0} that it is long.",
-        job.unit, size.x, size.y
+        "How the board is bent, against its corners: its middle by {1:.3} % of its length along x and {2:.3} % along y, of {3} and {4} {0}.",
+        job.unit,
+        100.0 * kx / size.x,
+        100.0 * ky / size.y,
+        short(size.x),
+        short(size.y)
     );
     page.section("The board's shape");
     page.figures(vec![map(bent.view(), &style, Width::Half, &caption)?]);
