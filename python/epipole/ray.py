@@ -144,7 +144,9 @@ def _name(row, columns):
 
 def _same_options(path, job, options):
     """Results of other options are not to be taken for those of these."""
-    text = json.dumps({"job": job, "version": epipole.__version__, "options": options}, default=repr, sort_keys=True)
+    told = {"job": job, "version": epipole.__version__, "options": options}
+    # Cameras and rigs to their last digit, which their texts leave out.
+    text = json.dumps(told, default=lambda value: pickle.dumps(value, 4).hex(), sort_keys=True)
     if path.exists():
         if path.read_text(encoding="utf-8") != text:
             raise ValueError(f"{path.parent} holds results of another job, of other options or of another version: name another folder")

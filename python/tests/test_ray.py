@@ -101,6 +101,10 @@ def test_the_other_jobs(cluster, tmp_path):
     found = rows(epipole.ray.undistort(photographs, tmp_path / "u", camera=camera, alpha=1.0))
     assert np.array_equal(epipole.read_image(found[1]["output"]), epipole.undistort(images[1], camera, alpha=1.0)[0])
 
+    nearly = epipole.Camera(width, height, [[200 + 1e-9, 0, 80], [0, 200, 60], [0, 0, 1]], [-0.1, 0, 0, 0])
+    with pytest.raises(ValueError, match="other options"):
+        epipole.ray.undistort(photographs, tmp_path / "u", camera=nearly, alpha=1.0)
+
     plane = [FIXTURES / "plane" / f"{name}.jpg" for name in "ab"]
     found = rows(epipole.ray.features(plane, tmp_path / "f", max_features=500))
     files = [row["output"] for row in found]
