@@ -23,13 +23,36 @@ impl Gray {
         self.width + 2 * MARGIN
     }
 
-    /// The upper eight bits of every value, without margins, into `out` (resized).
+    /// Gray levels 0 to 255 without margins into `out` (resized): the upper eight bits of every value, but where all lie within a quarter of the
+    /// scale, as those of some sensors of 12 bits do: then as far as they lie between the least and the greatest.
     pub(crate) fn to_bytes(&self, out: &mut Vec<u8>) {
         out.resize(self.width * self.height, 0);
+        let ends = |row: &[u16]| row.iter().fold((u16::MAX, 0), |(low, high), &v| (low.min(v), high.max(v)));
+        let join = |a: (u16, u16), b: (u16, u16)| (a.0.min(b.0), a.1.max(b.1));
+        let (low, high) = self.values.par_chunks(self.stride()).map(ends).reduce(|| (u16::MAX, 0), join);
+        let span = u32::from(high.saturating_sub(low));
+        let narrow = (1..=u32::from(u16::MAX) / 4).contains(&span);
         out.par_chunks_mut(self.width.max(1)).zip(self.values.par_chunks(self.stride())).for_each(|(out, row)| {
             for (byte, &value) in out.iter_mut().zip(&row[MARGIN..]) {
-                *byte = (value >> 8) as u8;
+                *byte = if narrow { (u32::from(value - low) * 255 / span) as u8 } else { (value >> 8) as u8 };
             }
+        });
+    }
+
+    /// Half the size of `from`, each pixel the mean of four; a last odd row or column is left out.
+    pub(crate) fn halve(&mut self, from: &Self) {
+        (self.width, self.height) = (from.width / 2, from.height / 2);
+        let (stride, from_stride, width) = (self.stride(), from.stride(), self.width);
+        self.values.resize(stride * self.height, 0);
+        self.values.par_chunks_mut(stride).zip(from.values.par_chunks(2 * from_stride)).for_each(|(row, pair)| {
+            let (upper, lower) = pair.split_at(from_stride);
+            let pairs = upper[MARGIN..].chunks_exact(2).zip(lower[MARGIN..].chunks_exact(2));
+            for (to, (a, b)) in row[MARGIN..MARGIN + width].iter_mut().zip(pairs) {
+                *to = ((u32::from(a[0]) + u32::from(a[1]) + u32::from(b[0]) + u32::from(b[1])) / 4) as u16;
+            }
+            let (first, last) = (row[MARGIN], row[MARGIN + width - 1]);
+            row[..MARGIN].fill(first);
+            row[MARGIN + width..].fill(last);
         });
     }
 

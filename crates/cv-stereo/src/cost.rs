@@ -1,6 +1,7 @@
 //! What matching costs, from the census bits, and the penalties along the paths.
 
 use crate::StereoOptions;
+use crate::coarse_prior::Prior;
 use crate::layout::{BLOCK, Layout, MAX_VECTORS};
 use crate::winner::outside_cost;
 use fearless_simd::prelude::*;
@@ -26,6 +27,8 @@ pub(crate) struct Frame<'a> {
     pub(crate) right: &'a [u8],
     /// The costs, pixel by pixel in the order of `layout`, where they are not made of the bytes.
     pub(crate) given: Option<&'a [u8]>,
+    /// Where pixels are guided to, for all pixels or none.
+    pub(crate) priors: &'a [Prior],
     /// The most that the intensity_cost adds to the bits.
     pub(crate) intensity_cap: Option<u8>,
     /// Gray values of the left image, 0 to 255.
@@ -125,11 +128,40 @@ fn costs<S: Simd, const BITS: usize, const BLOCKS: usize>(
             }
         }
     }
+    if let Some(priors) = frame.priors.get(y * width..(y + 1) * width) {
+        for (prior, out) in priors[xs.clone()].iter().zip(out.chunks_exact_mut(groups * group)) {
+            if prior.cap > 0 {
+                guide::<S, BLOCKS>(simd, *prior, out);
+            }
+        }
+    }
     // Only near the ends of a row do pixels look beyond the right image.
     let all = |x: usize| frame.inside(x).len() == groups * group;
     if !(xs.is_empty() || all(xs.start) && all(xs.end - 1)) {
         for (x, out) in xs.zip(out.chunks_exact_mut(groups * group)) {
             borders::<S, BLOCKS>(simd, frame, frame.inside(x), out);
+        }
+    }
+}
+
+/// Adds what lies far from the prior of a pixel.
+#[inline(always)]
+fn guide<S: Simd, const BLOCKS: usize>(simd: S, prior: Prior, out: &mut [u8]) {
+    let lanes = S::u8s::LEN;
+    let group = BLOCKS * BLOCK;
+    let n = group / lanes;
+    let first = S::u8s::from_fn(simd, |lane| (lane * n) as u8);
+    let cap = S::u8s::splat(simd, prior.cap);
+    for (g, out) in out.chunks_exact_mut(group).enumerate() {
+        // Groups hold at most 128 indices: beyond its ends, what counts is only that the prior is farther away than the cap.
+        let local = i32::from(prior.index) - (g * group) as i32;
+        let (at, beyond) = (local.clamp(0, 255) as u8, (-local).clamp(0, 127) as u8);
+        let (at, beyond) = (S::u8s::splat(simd, at), S::u8s::splat(simd, beyond));
+        for v in 0..n {
+            let k = first + v as u8;
+            let away = (k.max(at) - k.min(at)) + beyond;
+            let out = &mut out[v * lanes..][..lanes];
+            (S::u8s::from_slice(simd, out) + away.min(cap)).store_slice(out);
         }
     }
 }

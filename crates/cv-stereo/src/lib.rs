@@ -20,6 +20,7 @@
 
 mod aligned_buffer;
 mod census;
+mod coarse_prior;
 mod confidence;
 mod cost;
 mod depth;
@@ -27,7 +28,6 @@ mod disparity_matcher;
 mod edge_preserving;
 mod error;
 mod evaluate;
-mod hole_filling;
 mod input;
 mod kernel;
 mod layout;
@@ -35,7 +35,6 @@ mod matcher;
 mod median;
 mod options;
 mod path_sums;
-mod plane_fitting;
 mod rectify;
 mod rectify_scene;
 #[cfg(test)]
@@ -43,6 +42,8 @@ mod reference;
 mod select;
 mod sgm;
 mod speckle;
+mod surface_filling;
+mod surfaces;
 mod winner;
 
 pub use depth::{GeometryError, StereoGeometry};

@@ -1,17 +1,17 @@
 //! From a rectified pair to checked disparities.
 
 use crate::census::{Gray, describe, describe_mirrored, planes};
+use crate::coarse_prior::{Prior, find_flat, guide};
 use crate::confidence::{confidence, sigma};
 use crate::cost::{Frame, Penalties};
 use crate::edge_preserving::{self, Planes, smooth};
-use crate::hole_filling::{Holes, fill_holes};
 use crate::input::to_gray;
 use crate::layout::Layout;
-use crate::plane_fitting::{self, fill_planes};
 use crate::sgm::Aggregator;
 use crate::speckle::{Speckles, remove_speckles};
+use crate::surface_filling::{self, Filling, Pair, fill};
 use crate::winner::{NO_SUM, Winner};
-use crate::{Intensity, IntensityCost, Paths, StereoError, StereoOptions, Subpixel, median};
+use crate::{Intensity, IntensityCost, Paths, Smoothing, StereoError, StereoOptions, Subpixel, median};
 use cv_core::{Cancelled, GrayF32, Image, ImageView, Progress, Sample, Stage, StageClock};
 use fearless_simd::Level;
 use rayon::prelude::*;
@@ -19,6 +19,15 @@ use std::ops::Range;
 
 /// Rows beyond a strip that its paths start from: what lies farther away hardly matters.
 const OVERLAP: usize = 32;
+
+/// A picture is not halved below so many px of width or height.
+const LEAST_SIDE: usize = 16;
+
+/// Nor for fewer disparities than so many: half of them would agree by chance.
+const LEAST_RANGE: usize = 32;
+/// A coarse level guides where this share of it is matched. Of the 24 public pairs every one has 0.65 or more; photographs of different
+/// things, and exchanged ones, which would be guided to agree with themselves, mostly have less.
+const LEAST_MATCHED: f64 = 0.6;
 
 /// Fewer rows than so many at a time would mostly repeat the overlap.
 const MIN_STRIP: usize = 32;
@@ -32,9 +41,9 @@ pub enum PixelState {
     Matched,
     /// Seen by the left camera only: something nearer hides it from the right one. Filled from the background.
     Occluded,
-    /// Its match failed a check, or smoothing found it on the wrong side of an outline of the photograph. Filled from around.
+    /// Its match failed a check, or smoothing found it on the wrong side of an outline of the photograph. Filled from the surfaces around.
     Mismatched,
-    /// Its match would lie outside the right image. Filled from around.
+    /// Its match would lie outside the right image. Filled from the surfaces around.
     OutOfView,
 }
 
@@ -102,11 +111,20 @@ pub struct StereoMatcher {
     /// For aggregation in strips.
     strip: Aggregator,
     speckles: Speckles,
-    large_holes: plane_fitting::Planes,
-    holes: Holes,
+    filling: Filling,
     scratch: Vec<f32>,
     planes: Planes,
+    /// Where flat pixels are guided to, and the matcher of half the size that says so; none where there is no flat part.
+    priors: Vec<Prior>,
+    coarse: Option<Box<Coarse>>,
     stages: Vec<(&'static str, f64)>,
+}
+
+/// The level of half the size.
+#[derive(Debug)]
+struct Coarse {
+    matcher: StereoMatcher,
+    map: DisparityMap,
 }
 
 impl StereoMatcher {
@@ -125,10 +143,11 @@ impl StereoMatcher {
             aggregator: Aggregator::default(),
             strip: Aggregator::default(),
             speckles: Speckles::default(),
-            large_holes: plane_fitting::Planes::default(),
-            holes: Holes::default(),
+            filling: Filling::default(),
             scratch: Vec::new(),
             planes: Planes::default(),
+            priors: Vec::new(),
+            coarse: None,
             stages: Vec::new(),
         })
     }
@@ -139,8 +158,8 @@ impl StereoMatcher {
     }
 
     /// Bytes that matching images of this size takes, outputs included: about one byte per pixel and disparity for the
-    /// sums, and sixty per pixel (gray values 6, bits 3 to 8 of each view, winners 12, labels up to 8, the planes of the
-    /// smoothing 16, outputs and scratch 9). Under [`StereoOptions::max_memory`] the sums are those of a strip.
+    /// sums, and seventy per pixel (gray values 6, bits 3 to 8 of each view, winners 12, labels up to 8, priors 4, surfaces 7, the planes of the
+    /// smoothing 16, outputs and scratch 9), and for the coarser levels an eighth of the sums and a third of the rest. Under [`StereoOptions::max_memory`] the sums are those of a strip.
     pub fn memory(&self, width: usize, height: usize) -> usize {
         let rows = self.strip_rows(width, height).unwrap_or(height);
         self.memory_of(width, height, rows)
@@ -154,12 +173,14 @@ impl StereoMatcher {
         let strip = if rows < height { (rows + 2 * OVERLAP).min(height) } else { 0 };
         let whole = if rows < height { 0 } else { height };
         // Gray of both views in 16 bits, of one in 8; winners of both views; labels, scratch and outputs.
-        let fixed = 5 + planes + size_of::<Winner>() + size_of::<u16>() + 8 + 4 + 5;
+        let fixed = 5 + planes + size_of::<Winner>() + size_of::<u16>() + 8 + 4 + 5 + size_of::<Prior>();
         let stride = self.layout().right_row(width);
         Aggregator::bytes(width, strip.max(whole), self.layout())
             .saturating_add(strip.saturating_mul(width).saturating_mul(size_of::<Winner>() + size_of::<u16>()))
             .saturating_add(pixels.saturating_mul(fixed))
             .saturating_add(edge_preserving::bytes(options.smoothing, width, height))
+            .saturating_add(if options.fill { surface_filling::bytes(width, height) } else { 0 })
+            .saturating_add(self.coarser(width, height).map_or(0, |coarse| coarse.memory(width / 2, height / 2)))
             .saturating_add(stride.saturating_mul(height).saturating_mul(planes))
     }
 
@@ -214,9 +235,22 @@ impl StereoMatcher {
             }
         }
         clock.lap("gray");
+        self.compute_gray(map, clock, progress)
+    }
+
+    /// As [`StereoMatcher::compute_into`], of the gray values at hand.
+    fn compute_gray(
+        &mut self,
+        map: &mut DisparityMap,
+        mut clock: StageClock,
+        progress: &dyn Progress,
+    ) -> Result<(), StereoError> {
+        let (width, height) = (self.gray[0].width, self.gray[0].height);
         progress.report("bits", 0, 1)?;
         self.bits();
         clock.lap("bits");
+        self.match_coarse(width, height, progress)?;
+        clock.lap("coarse");
         self.aggregate(width, height, progress)?;
         clock.lap("aggregate");
         map.resize(width, height);
@@ -309,6 +343,55 @@ impl StereoMatcher {
         self.gray[0].to_bytes(&mut self.gray8);
     }
 
+    /// A matcher of half the size, where there is to be one and it has the memory.
+    fn coarser(&self, width: usize, height: usize) -> Option<Self> {
+        let StereoOptions { min_disparity, disparities, pyramid_levels, max_memory, .. } = self.options;
+        if pyramid_levels == 0 || width.min(height) < 2 * LEAST_SIDE || disparities < LEAST_RANGE {
+            return None;
+        }
+        let first = min_disparity.div_euclid(2);
+        let last = (min_disparity + disparities as i32 - 1).div_euclid(2) + 1;
+        let options = StereoOptions {
+            min_disparity: first,
+            disparities: (last - first + 1) as usize,
+            pyramid_levels: pyramid_levels - 1,
+            speckle_size: self.options.speckle_size / 4,
+            confidence: false,
+            fill: false,
+            smoothing: Smoothing::None,
+            max_memory: max_memory.map(|bytes| bytes / 4),
+            ..self.options.clone()
+        };
+        let mut coarse = Self::new(options).ok()?;
+        coarse.level = self.level;
+        coarse.check_size(width / 2, height / 2).is_ok().then_some(coarse)
+    }
+
+    /// Matches at half the size where the photograph is flat, for `priors`.
+    fn match_coarse(&mut self, width: usize, height: usize, progress: &dyn Progress) -> Result<(), StereoError> {
+        let coarse = self.coarser(width, height);
+        let Some(new) = coarse.filter(|_| find_flat(self.level, &self.gray8, width, &mut self.priors)) else {
+            self.priors.clear();
+            return Ok(());
+        };
+        // Made anew where the size of the pictures leaves it other options.
+        let coarse = self.coarse.take().filter(|coarse| coarse.matcher.options == new.options);
+        let mut coarse = coarse.unwrap_or_else(|| Box::new(Coarse { matcher: new, map: DisparityMap::empty() }));
+        let Coarse { matcher, map } = &mut *coarse;
+        for (small, large) in matcher.gray.iter_mut().zip(&self.gray) {
+            small.halve(large);
+        }
+        matcher.compute_gray(map, StageClock::new(), progress)?;
+        if map.matched_fraction() < LEAST_MATCHED {
+            self.priors.clear();
+        } else {
+            let range = (self.options.min_disparity, self.options.disparities);
+            guide(self.level, map.disparity.as_slice(), width / 2, width, range, &mut self.priors);
+        }
+        self.coarse = Some(coarse);
+        Ok(())
+    }
+
     /// Costs and path sums; winners of both views.
     fn aggregate(&mut self, width: usize, height: usize, progress: &dyn Progress) -> Result<(), Cancelled> {
         let options = &self.options;
@@ -331,6 +414,7 @@ impl StereoMatcher {
                 left: &self.described[0][rows.start * width * planes..rows.end * width * planes],
                 right: &self.described[1][rows.start * stride..rows.end * stride],
                 given: None,
+                priors: self.priors.get(rows.start * width..rows.end * width).unwrap_or(&[]),
                 intensity_cap: (options.intensity_cost != IntensityCost::None).then(|| options.intensity_cost.cap()),
                 gray: &self.gray8[rows.start * width..rows.end * width],
                 p1: options.p1,
@@ -377,16 +461,24 @@ impl StereoMatcher {
 
     /// Speckles, holes, median.
     fn refine(&mut self, map: &mut DisparityMap, progress: &dyn Progress) -> Result<(), Cancelled> {
-        let stage = Stage::new(progress, "refine", 5)?;
+        let stage = Stage::new(progress, "refine", 4)?;
         let width = map.disparity.width();
         let options = &self.options;
         let (disparity, states) = (map.disparity.as_mut_slice(), map.state.as_mut_slice());
         remove_speckles(disparity, states, width, options.speckle_size, options.speckle_range, &mut self.speckles);
         stage.add(1)?;
         if options.fill {
-            fill_holes(self.level, disparity, states, width, &mut self.holes, &stage)?;
-            stage.add(1)?;
-            fill_planes(disparity, states, &self.gray8, width, &mut self.large_holes);
+            let pair = Pair {
+                width,
+                gray: &self.gray8,
+                winners: &self.aggregator.winners,
+                min_disparity: options.min_disparity,
+                described: [&self.described[0], &self.described[1]],
+                planes: planes(options.census, options.intensity_cost),
+                bits: options.census.bits(),
+                layout: Layout::new(self.level, options.disparities),
+            };
+            fill(self.level, disparity, states, pair, &mut self.filling, &stage)?;
             stage.add(1)?;
         }
         if options.median > 0 {
@@ -441,7 +533,6 @@ fn subpixel(method: Subpixel, winner: &Winner) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Smoothing;
     use cv_core::{GrayU8, Silent};
     use cv_synth::instruction_sets;
 

@@ -90,6 +90,7 @@ impl PathSums {
             planes: 0,
             left: &[],
             right: &[],
+            priors: &[],
             given: Some(self.costs.as_mut_slice()),
             intensity_cap: None,
             gray: &self.gray,

@@ -1,5 +1,6 @@
 //! Reference implementation of semi-global matching, with whole cost volumes: what the fast matcher must equal.
 
+use crate::coarse_prior::Prior;
 use crate::winner::{NO_SUM, Winner, outside_cost, p2_table};
 use crate::{IntensityCost, Paths, StereoOptions};
 
@@ -10,6 +11,7 @@ pub(crate) fn match_reference(
     left: &[u64],
     right: &[u64],
     intensity_cost: &[Vec<u8>; 2],
+    priors: &[Prior],
     width: usize,
     height: usize,
 ) -> (Vec<Winner>, Vec<u16>) {
@@ -26,10 +28,15 @@ pub(crate) fn match_reference(
         };
         (left[i] ^ right[j]).count_ones() as u8 + more.min(options.intensity_cost.cap())
     };
+    let guided = |i: usize, k: usize| {
+        let away = |prior: &Prior| usize::from(prior.index).abs_diff(k).min(usize::from(prior.cap)) as u8;
+        priors.get(i).map_or(0, away)
+    };
     let costs: Vec<u8> = (0..width * height)
         .flat_map(|i| {
             let (x, row) = (i % width, i / width * width);
-            let inside: Vec<Option<u8>> = (0..n).map(|k| column(x, k).map(|xr| bits(i, row + xr))).collect();
+            let inside: Vec<Option<u8>> =
+                (0..n).map(|k| column(x, k).map(|xr| bits(i, row + xr) + guided(i, k))).collect();
             let known = inside.iter().flatten();
             let outside = outside_cost(known.clone().map(|&c| u32::from(c)).sum(), known.count());
             inside.into_iter().map(move |cost| cost.unwrap_or(outside)).collect::<Vec<_>>()
@@ -209,9 +216,11 @@ mod tests {
             width in 9usize..40,
             height in 7usize..16,
             seed in any::<u64>(),
+            guided in any::<bool>(),
             levels_of_gray in prop_oneof![Just(2u16), Just(5), Just(200)],
         ) {
             options.validate().unwrap();
+            let StereoOptions { census, intensity_cost, disparities, .. } = options;
             // A splitmix sequence: noise on the left, shifted noise on the right.
             let noise = |i: usize| {
                 let mut z = seed.wrapping_add((i as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15));
@@ -222,11 +231,12 @@ mod tests {
             let right: Vec<u16> = (0..width * height).map(|i| noise(if i % 5 == 0 { i + 7 } else { i + 3 })).collect();
             let bits = [&left, &right].map(|g| census_plain(g, width, height, options.census));
             let blended = [&left, &right].map(|g| intensity_reference(g, width, options.intensity_cost));
-            let expected = match_reference(&options, &left, &bits[0], &bits[1], &blended, width, height);
+            let prior = |i: usize| Prior { index: (noise(i + 11) as usize * 31 % disparities) as u16, cap: (noise(i + 5) % 4) as u8 };
+            let priors: Vec<Prior> = if guided { (0..width * height).map(prior).collect() } else { Vec::new() };
+            let expected = match_reference(&options, &left, &bits[0], &bits[1], &blended, &priors, width, height);
 
             let gray = [padded(&left, width, height), padded(&right, width, height)];
             let min_disparity = i64::from(options.min_disparity);
-            let StereoOptions { census, intensity_cost, disparities, .. } = options;
             let p2 = Penalties::new(&options);
             for level in instruction_sets() {
                 let layout = Layout::new(level, disparities);
@@ -238,6 +248,7 @@ mod tests {
                     width, height, min_disparity, disparities, layout, planes: planes(census, intensity_cost),
                     left: &a, right: &b, gray: &bytes,
                     given: None,
+                    priors: &priors,
                     intensity_cap: (intensity_cost != IntensityCost::None).then_some(intensity_cost.cap()),
                     p1: options.p1, p2: &p2, second: options.confidence,
                 };

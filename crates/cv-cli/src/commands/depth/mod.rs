@@ -107,6 +107,9 @@ pub(crate) struct Args {
     /// Penalty for a larger step where the photograph has no edge, in bits of the window.
     #[arg(long, value_name = "BITS", default_value_t = StereoOptions::default().p2)]
     p2: u8,
+    /// Levels of half the size each that guide pixels in flat surroundings (roads, walls); 0 for none.
+    #[arg(long, value_name = "N", default_value_t = StereoOptions::default().pyramid_levels)]
+    pyramid_levels: u8,
     /// By how many percent the best match must beat the rest.
     #[arg(long, value_name = "PERCENT", default_value_t = StereoOptions::default().uniqueness)]
     uniqueness: u8,

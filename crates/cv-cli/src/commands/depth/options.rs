@@ -30,6 +30,7 @@ impl Args {
                     Range::Auto => default.disparities,
                 },
                 census: self.census,
+                pyramid_levels: self.pyramid_levels,
                 paths: self.paths,
                 uniqueness: self.uniqueness,
                 speckle_size: self.speckle_size,

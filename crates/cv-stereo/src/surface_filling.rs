@@ -1,0 +1,469 @@
+//! Disparities for pixels that have none of their own: the surfaces around are continued into holes, as slanted planes, and each cell of a
+//! hole is of the surface that explains best why nothing was matched there.
+//!
+//! The cost of a plane at a pixel knows the three causes. A pixel whose partner lies outside the right photograph, or is hidden behind
+//! something nearer that the right camera sees there, may be anything; one whose partner is seen ought to look like it; and one that would
+//! hide from the right camera what it is known to see is impossible. Planes reach cells along the shortest paths through the photograph,
+//! where its edges make the way longer; then cells take over the planes of their neighbors where that costs less (iterated conditional
+//! modes; Besag, JRSS B 1986, with planes as labels as in Bleyer, Rhemann & Rother, "PatchMatch stereo", BMVC 2011).
+
+use crate::PixelState;
+use crate::layout::Layout;
+use crate::surfaces::{CELL, NONE, Plane, Surfaces, center, neighbors, pixels};
+use crate::winner::Winner;
+use cv_core::{Cancelled, Stage};
+use fearless_simd::Level;
+use rayon::prelude::*;
+use std::cmp::Reverse;
+use std::collections::BinaryHeap;
+
+// Set with the constants of `surfaces`; half and twice of each differ by 0.1 points of the pixels that are wrong by more than 2 px.
+/// What a pixel costs that nobody else sees: outside the right photograph, and behind what is seen there. One that is seen costs 0 to 1.
+const OUTSIDE: f32 = 0.45;
+const HIDDEN: f32 = 0.4;
+/// What one costs that would hide what the right camera sees, by more than so many px.
+const HIDES: f32 = 2.0;
+const MARGIN: f32 = 1.5;
+/// Gray levels a step at which half of what the two photographs say of a pixel is believed.
+const TEXTURE: f32 = 3.0;
+/// Differing bits of a chance match.
+const CHANCE: f32 = 0.5;
+/// Weight of a matched pixel of the cell that is not on the plane, per px up to 2, and of a match that failed a check.
+const MATCHED: f32 = 0.5;
+const FAILED: f32 = 0.1;
+/// Gap in px between the planes of neighbors at which its cost has fully grown, and that cost.
+const GAP: f32 = 4.0;
+const BREAK: f32 = 8.0;
+/// Gray levels between cells at which a break between them costs half, and that make the way twice as long.
+const EDGE: f32 = 8.0;
+/// Length of the way that a cell's cost counts for.
+const WAY: f32 = 0.1;
+/// Passes over the cells, down and up.
+const PASSES: usize = 2;
+/// Gray levels by which a pixel differs from a cell of its surface at the most that counts.
+const ALIKE: f32 = 32.0;
+/// Weight of the photographs against that.
+const SEEN: f32 = 2.0;
+
+/// What is known of the pair.
+#[derive(Clone, Copy)]
+pub(crate) struct Pair<'a> {
+    pub(crate) width: usize,
+    pub(crate) gray: &'a [u8],
+    pub(crate) winners: &'a [Winner],
+    pub(crate) min_disparity: i32,
+    /// The census bits of both views in `planes` bytes per pixel, as [`crate::cost::Frame`] holds them.
+    pub(crate) described: [&'a [u8]; 2],
+    pub(crate) planes: usize,
+    pub(crate) bits: usize,
+    pub(crate) layout: Layout,
+}
+
+/// Memory of [`fill`], kept between frames.
+#[derive(Debug, Default)]
+pub(crate) struct Filling {
+    surfaces: Surfaces,
+    /// Disparity of the nearest match of each pixel of the right photograph, −∞ where there is none.
+    right: Vec<f32>,
+    /// Cells without a plane of their own.
+    open: Vec<u32>,
+    heap: BinaryHeap<Reverse<(u64, u32, u32)>>,
+}
+
+/// Bytes that [`fill`] holds on to.
+pub(crate) fn bytes(width: usize, height: usize) -> usize {
+    Surfaces::bytes(width, height).saturating_add(width.saturating_mul(height).saturating_mul(size_of::<f32>()))
+}
+
+/// Fills every NaN, which takes the state that its disparity explains, and smooths what was matched where the photograph is flat ([`Surfaces::smooth_flat`]). Where nothing at all was matched
+/// everything stays NaN. Of n pixels, c cells: O(n + c log c).
+pub(crate) fn fill(
+    level: Level,
+    disparity: &mut [f32],
+    states: &mut [PixelState],
+    pair: Pair<'_>,
+    filling: &mut Filling,
+    stage: &Stage<'_>,
+) -> Result<(), Cancelled> {
+    let width = pair.width;
+    let Filling { surfaces, right, open, heap } = filling;
+    surfaces.find(level, disparity, pair.gray, width, pair.min_disparity as f32);
+    stage.check()?;
+    if surfaces.planes.is_empty() {
+        return Ok(());
+    }
+    see_from_right(disparity, states, width, right);
+    surfaces.smooth_flat(disparity, width);
+    stage.check()?;
+    let view = View { pair, right, disparity, states };
+    open.clear();
+    open.extend((0..surfaces.cells.len() as u32).filter(|&c| surfaces.labels[c as usize] == NONE));
+    spread(surfaces, view, heap, stage)?;
+    for pass in 0..PASSES {
+        for i in 0..open.len() {
+            let c = open[if pass % 2 == 0 { i } else { open.len() - 1 - i }] as usize;
+            improve(surfaces, view, c);
+            if i % 1024 == 0 {
+                stage.check()?;
+            }
+        }
+    }
+    let columns = surfaces.columns;
+    let filled: Vec<Vec<f32>> = (0..surfaces.cells.len().div_ceil(columns))
+        .into_par_iter()
+        .map(|row| {
+            let mut values = Vec::new();
+            (row * columns..(row + 1) * columns).for_each(|c| fill_cell(surfaces, view, c, &mut values));
+            values
+        })
+        .collect();
+    stage.check()?;
+    let rows = disparity.par_chunks_mut(CELL * width).zip(states.par_chunks_mut(CELL * width));
+    rows.zip(right.par_chunks(CELL * width)).zip(filled).enumerate().for_each(
+        |(row, (((disparity, states), right), filled))| {
+            let mut filled = filled.into_iter();
+            let height = disparity.len() / width;
+            for x in (0..columns).filter(|x| surfaces.cells[row * columns + x].holes > 0) {
+                for (px, py) in pixels(x, columns, (width, height)) {
+                    let i = py * width + px;
+                    if disparity[i].is_nan() {
+                        let d = filled.next().unwrap_or(f32::NAN);
+                        disparity[i] = d;
+                        states[i] = cause(px, d, &right[py * width..][..width]);
+                    }
+                }
+            }
+        },
+    );
+    Ok(())
+}
+
+/// Why a pixel at a disparity was not matched, given what the right camera sees in its row.
+fn cause(x: usize, d: f32, right: &[f32]) -> PixelState {
+    let column = x as f32 - d + 0.5;
+    if !(column >= 0.0 && column < right.len() as f32) {
+        PixelState::OutOfView
+    } else if right[column as usize] > d + 1.0 {
+        PixelState::Occluded
+    } else {
+        PixelState::Mismatched
+    }
+}
+
+/// The nearest confirmed match of each pixel of the right photograph.
+fn see_from_right(disparity: &[f32], states: &[PixelState], width: usize, right: &mut Vec<f32>) {
+    right.resize(disparity.len(), f32::NEG_INFINITY);
+    let rows = disparity.par_chunks(width).zip(states.par_chunks(width));
+    right.par_chunks_mut(width).zip(rows).for_each(|(right, (disparity, states))| {
+        right.fill(f32::NEG_INFINITY);
+        for (x, (&d, &state)) in disparity.iter().zip(states).enumerate() {
+            // Rounded: whole columns are counted from half a pixel before them. NaN compares false.
+            let column = x as f32 - d + 0.5;
+            if state == PixelState::Matched && column >= 0.0 && column < width as f32 {
+                let seen = &mut right[column as usize];
+                *seen = if d > *seen { d } else { *seen };
+            }
+        }
+    });
+}
+
+/// The pair with what was matched.
+#[derive(Clone, Copy)]
+struct View<'a> {
+    pair: Pair<'a>,
+    right: &'a [f32],
+    disparity: &'a [f32],
+    states: &'a [PixelState],
+}
+
+impl View<'_> {
+    fn height(&self) -> usize {
+        self.disparity.len() / self.pair.width
+    }
+
+    /// What a pixel costs at a disparity; `texture` is how much the photographs are believed, 0 to 1.
+    #[inline(always)]
+    fn cost(&self, x: usize, y: usize, d: f32, texture: f32) -> f32 {
+        let Pair { width, planes, layout, .. } = self.pair;
+        let column = x as f32 - d + 0.5;
+        if !(column >= 0.0 && column < width as f32) {
+            return OUTSIDE;
+        }
+        let column = column as usize;
+        let seen = self.right[y * width + column];
+        // Both are false of −∞ … but for the second, which is then of no match.
+        if d > seen + MARGIN && seen > f32::NEG_INFINITY {
+            return HIDES;
+        }
+        if d < seen - 1.0 {
+            return HIDDEN;
+        }
+        let row = layout.right_row(width);
+        let element = width as i64 - 1 - i64::from(self.pair.min_disparity) - column as i64;
+        let Some(element) = usize::try_from(element).ok().filter(|&element| element < row) else { return OUTSIDE };
+        let n = layout.vectors();
+        let right = &self.pair.described[1][y * planes * row..][..planes * row];
+        let place = element % n * planes * layout.phase(width) + element / n;
+        let left = &self.pair.described[0][y * planes * width + x..];
+        let bytes = self.pair.bits.div_ceil(8);
+        let differing: u32 =
+            (0..bytes).map(|p| (left[p * width] ^ right[place + p * layout.phase(width)]).count_ones()).sum();
+        let chance = CHANCE * self.pair.bits as f32;
+        0.5 + texture * ((differing as f32 / chance).min(1.0) - 0.5)
+    }
+
+    /// What a cell costs on a plane, by every `step`-th pixel of every `step`-th row.
+    fn cell_cost(&self, surfaces: &Surfaces, c: usize, plane: &Plane, step: usize) -> f32 {
+        let width = self.pair.width;
+        let texture = texture(surfaces, c);
+        let mut cost = 0.0;
+        let (left, top) = (c % surfaces.columns * CELL, c / surfaces.columns * CELL);
+        for y in (top + step / 2..(top + CELL).min(self.height())).step_by(step) {
+            for x in (left + step / 2..(left + CELL).min(width)).step_by(step) {
+                let (value, i) = (plane.at(x as f64, y as f64), y * width + x);
+                let d = self.disparity[i];
+                // Of the other pixels as well.
+                let share = (step * step) as f32;
+                if d.is_nan() {
+                    // Weights as of every second pixel, at which they were set.
+                    cost += 0.25 * share * HIDES * self.cost(x, y, value, texture);
+                    if self.states[i] != PixelState::OutOfView {
+                        let failed = (self.pair.min_disparity + i32::from(self.pair.winners[i].index)) as f32;
+                        cost += share * FAILED * (failed - value).abs().min(2.0);
+                    }
+                } else {
+                    cost += share * MATCHED * (d - value).abs().min(2.0);
+                }
+            }
+        }
+        cost
+    }
+}
+
+/// How much the photographs are believed in a cell.
+fn texture(surfaces: &Surfaces, c: usize) -> f32 {
+    let steps = surfaces.cells[c].texture;
+    steps / (steps + TEXTURE)
+}
+
+/// Gives every cell without a plane that of the cell from which the way is shortest (Dijkstra's algorithm).
+fn spread(
+    surfaces: &mut Surfaces,
+    view: View<'_>,
+    heap: &mut BinaryHeap<Reverse<(u64, u32, u32)>>,
+    stage: &Stage<'_>,
+) -> Result<(), Cancelled> {
+    heap.clear();
+    let (columns, count) = (surfaces.columns, surfaces.cells.len());
+    let rows = count / columns;
+    // In thousandths of a cell, whole so that ties are broken alike everywhere.
+    let visit = |surfaces: &Surfaces, heap: &mut BinaryHeap<_>, c: usize, so_far: u64, label: u32| {
+        for n in neighbors(c, columns, rows).into_iter().flatten().filter(|&n| surfaces.labels[n] == NONE) {
+            let edge = (surfaces.cells[c].gray - surfaces.cells[n].gray).abs() / EDGE;
+            let cost = view.cell_cost(surfaces, n, &surfaces.planes[label as usize], 4);
+            heap.push(Reverse((so_far + (1024.0 * (1.0 + edge + WAY * cost)) as u64, n as u32, label)));
+        }
+    };
+    for c in 0..count {
+        if surfaces.labels[c] != NONE {
+            visit(surfaces, heap, c, 0, surfaces.labels[c]);
+        }
+    }
+    let mut taken = 0usize;
+    while let Some(Reverse((cost, c, label))) = heap.pop() {
+        let c = c as usize;
+        if surfaces.labels[c] == NONE {
+            surfaces.labels[c] = label;
+            visit(surfaces, heap, c, cost, label);
+            taken += 1;
+            if taken % 1024 == 0 {
+                stage.check()?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The different surfaces of a cell and the eight around it; the first `usize` hold.
+fn surfaces_around(surfaces: &Surfaces, c: usize) -> ([u32; 9], usize) {
+    let columns = surfaces.columns;
+    let (x, y) = (c % columns, c / columns);
+    let rows = surfaces.cells.len() / columns;
+    let (mut found, mut count) = ([NONE; 9], 0);
+    for ny in y.saturating_sub(1)..(y + 2).min(rows) {
+        for &label in &surfaces.labels[ny * columns..][x.saturating_sub(1)..(x + 2).min(columns)] {
+            if label != NONE && !found[..count].contains(&label) {
+                found[count] = label;
+                count += 1;
+            }
+        }
+    }
+    (found, count)
+}
+
+/// Gives a cell the plane of those around it that costs least, in it and at its borders.
+fn improve(surfaces: &mut Surfaces, view: View<'_>, c: usize) {
+    let (around, count) = surfaces_around(surfaces, c);
+    if count < 2 {
+        return;
+    }
+    let columns = surfaces.columns;
+    let rows = surfaces.cells.len() / columns;
+    let (x, y) = center(c, columns);
+    let half = 0.5 * CELL as f64;
+    let borders = [(x - half, y), (x + half, y), (x, y - half), (x, y + half)];
+    let cost = |label: u32| {
+        let plane = &surfaces.planes[label as usize];
+        let mut cost = view.cell_cost(surfaces, c, plane, 2);
+        for (n, (x, y)) in neighbors(c, columns, rows).into_iter().zip(borders) {
+            let Some((n, other)) = n.and_then(|n| Some((n, surfaces.planes.get(surfaces.labels[n] as usize)?))) else {
+                continue;
+            };
+            let gap = (plane.at(x, y) - other.at(x, y)).abs();
+            let edge = (surfaces.cells[c].gray - surfaces.cells[n].gray).abs();
+            cost += BREAK * EDGE / (EDGE + edge) * (gap / GAP).min(1.0);
+        }
+        cost
+    };
+    let mut best = (f32::INFINITY, surfaces.labels[c]);
+    for &label in &around[..count] {
+        let cost = cost(label);
+        if cost < best.0 {
+            best = (cost, label);
+        }
+    }
+    surfaces.labels[c] = best.1;
+}
+
+/// The disparities of a cell's holes, row by row: each pixel is of the surface of the cells around that looks like it and that it may be of.
+fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, out: &mut Vec<f32>) {
+    if surfaces.cells[c].holes == 0 {
+        return;
+    }
+    let columns = surfaces.columns;
+    let (width, height) = (view.pair.width, view.height());
+    let (around, count) = surfaces_around(surfaces, c);
+    let holes = pixels(c, columns, (width, height)).filter(|&(x, y)| view.disparity[y * width + x].is_nan());
+    if let [label] = around[..count] {
+        out.extend(holes.map(|(x, y)| surfaces.planes[label as usize].at(x as f64, y as f64)));
+        return;
+    }
+    let texture = texture(surfaces, c);
+    let (column, row) = (c % columns, c / columns);
+    let rows = surfaces.cells.len() / columns;
+    // Gray value and place among the surfaces of the cells around.
+    let mut cells = [(0f32, 0usize); 9];
+    let mut n = 0;
+    for ny in row.saturating_sub(1)..(row + 2).min(rows) {
+        for other in ny * columns + column.saturating_sub(1)..ny * columns + (column + 2).min(columns) {
+            if let Some(place) = around[..count].iter().position(|&label| label == surfaces.labels[other]) {
+                cells[n] = (surfaces.cells[other].gray, place);
+                n += 1;
+            }
+        }
+    }
+    for (x, y) in holes {
+        let gray = f32::from(view.pair.gray[y * width + x]);
+        let mut unlike = [ALIKE; 9];
+        for &(of_cell, place) in &cells[..n] {
+            unlike[place] = unlike[place].min((gray - of_cell).abs());
+        }
+        let mut best = (f32::INFINITY, f32::NAN);
+        for (&label, unlike) in around[..count].iter().zip(unlike) {
+            let d = surfaces.planes[label as usize].at(x as f64, y as f64);
+            let cost = unlike / ALIKE + SEEN * view.cost(x, y, d, texture);
+            // Of equals the farther one.
+            if cost < best.0 || (cost == best.0 && d < best.1) {
+                best = (cost, d);
+            }
+        }
+        out.push(best.1);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{DisparityMap, Smoothing, StereoMatcher, StereoOptions};
+    use cv_core::{GrayU8, Silent};
+
+    const WIDTH: usize = 160;
+    const HEIGHT: usize = 96;
+
+    /// A texture of blocks of two pixels.
+    fn texture(x: i64, y: i64) -> u8 {
+        let mut z = ((x.div_euclid(2) as u64) << 32 ^ y.div_euclid(2) as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        40 + ((z >> 40) % 160) as u8
+    }
+
+    /// A pair of a scene whose surfaces are level in disparity: what lies at a column and row of the left camera's frame (which goes on
+    /// beyond its photograph), as disparity and gray value, the nearest first.
+    fn matched(surface: impl Fn(i64, i64) -> Vec<(i64, u8)>) -> DisparityMap {
+        let left = GrayU8::from_fn(WIDTH, HEIGHT, |x, y| [surface(x as i64, y as i64)[0].1]);
+        let right = GrayU8::from_fn(WIDTH, HEIGHT, |x, y| {
+            // The nearest of what projects here.
+            let seen = (0..=40).rev().find_map(|d| {
+                let there = surface(x as i64 + d, y as i64);
+                there.into_iter().find(|s| s.0 == d).map(|s| s.1)
+            });
+            [seen.unwrap_or(0)]
+        });
+        let options = StereoOptions { disparities: 48, smoothing: Smoothing::None, ..Default::default() };
+        StereoMatcher::new(options).unwrap().compute(left.view(), right.view(), &Silent).unwrap()
+    }
+
+    fn wrong(map: &DisparityMap, pixels: impl Fn(usize, usize) -> bool, truth: impl Fn(usize, usize) -> f32) -> f64 {
+        let all = (0..WIDTH * HEIGHT).map(|i| (i % WIDTH, i / WIDTH)).filter(|&(x, y)| pixels(x, y));
+        let (mut n, mut bad) = (0, 0);
+        for (x, y) in all {
+            n += 1;
+            let d = map.disparity.at(x, y)[0];
+            // NaN is wrong.
+            bad += usize::from(!((d - truth(x, y)).abs() <= 2.0));
+        }
+        bad as f64 / n as f64
+    }
+
+    #[test]
+    fn what_a_near_thing_hides_is_of_the_background() {
+        // A box at 30 px before a wall at 8: 22 columns on its left are hidden from the right camera.
+        let inside = |x: i64, y: i64| (80..120).contains(&x) && (24..72).contains(&y);
+        let map = matched(|x, y| {
+            let wall = (8, texture(x, y));
+            if inside(x, y) { vec![(30, texture(x + 1000, y)), wall] } else { vec![wall] }
+        });
+        let hidden = |x: usize, y: usize| (58..80).contains(&x) && (24..72).contains(&y);
+        // The window of 5×5 pixels reaches two pixels over the outline on three sides: 10 + 4 of 22 × 48 pixels and their corners.
+        let share = wrong(&map, hidden, |_, _| 8.0);
+        assert!(share < 0.15, "{share}");
+    }
+
+    #[test]
+    fn what_lies_beside_the_right_photograph_is_of_the_thing_it_belongs_to() {
+        // A near thing at the left border, whose first 24 columns the right camera does not see.
+        let map = matched(|x, y| vec![if x < 60 { (24, texture(x + 1000, y)) } else { (4, texture(x, y)) }]);
+        let share = wrong(&map, |x, _| x < 24, |_, _| 24.0);
+        // Nothing is at stake there: no other surface is near.
+        assert!(share < 0.02, "{share}");
+        let state = map.state.at(5, 40)[0];
+        assert_eq!(state, PixelState::OutOfView);
+    }
+
+    #[test]
+    fn a_wall_without_texture_is_the_plane_of_its_frame() {
+        // A poster without texture on a wall that recedes: its inside is matched nowhere but at the rim.
+        let inside = |x: usize, y: usize| (50..130).contains(&x) && (16..80).contains(&y);
+        let steps = |y: i64| 10 + y / 6;
+        let map =
+            matched(|x, y| vec![(steps(y), if inside(x.max(0) as usize, y as usize) { 120 } else { texture(x, y) })]);
+        let share = wrong(&map, inside, |_, y| 10.0 + y as f32 / 6.0 - 0.4);
+        assert!(share < 0.02, "{share}");
+    }
+
+    #[test]
+    fn pictures_of_one_color_stay_without_disparity() {
+        let map = matched(|_, _| vec![(0, 90)]);
+        assert!(map.disparity.as_slice().iter().all(|d| d.is_nan()));
+    }
+}
