@@ -23,6 +23,9 @@ pub(crate) struct Group<'a> {
     components: Vec<Vec<usize>>,
 }
 
+/// Matches of an overlap that a first solution is found from, which all of them refine: thirty times the three unknowns of a turn.
+const FEW: usize = 100;
+
 /// Difference of the logarithms of focal lengths from which on a lens was zoomed between photographs: focusing nearer changes them by less.
 const ZOOMED: f64 = 0.03;
 
@@ -163,6 +166,15 @@ impl<'a> Group<'a> {
         }
     }
 
+    /// Of each overlap as many matches as a first solution needs, evenly chosen.
+    fn few_matches(&self) -> Vec<Overlap> {
+        let few = |o: &Overlap| {
+            let step = o.points.len().div_ceil(FEW).max(1);
+            Overlap { points: o.points.iter().copied().step_by(step).collect(), ..*o }
+        };
+        self.overlaps.iter().map(few).collect()
+    }
+
     pub(crate) fn solve(
         &self,
         options: &AlignOptions,
@@ -197,7 +209,9 @@ impl<'a> Group<'a> {
         let prior = self.focal_guesses(&heads);
         let known = heads.iter().all(|&h| self.photos[h].camera.is_some() || self.photos[h].focal.is_some());
         let factors: &[f64] = if known { &[1.0] } else { &[1.0, 0.6, 1.7, 3.0] };
-        let wide = self.problem(Motion::Rotation, &lens_of, &prior, 10.0 * options.outlier_px);
+        let few = self.few_matches();
+        let wide =
+            Problem { overlaps: &few, ..self.problem(Motion::Rotation, &lens_of, &prior, 10.0 * options.outlier_px) };
         let start = |factor: &f64| {
             let lenses: Vec<Lens> = prior
                 .iter()
