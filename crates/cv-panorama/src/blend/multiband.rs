@@ -195,7 +195,7 @@ fn halve_photo(photo: &WarpedPhoto, labels: &Image<u16, 1>, label: u16, stage: &
             let pixels: [&[u8]; 5] = std::array::from_fn(|k| photo.pixels.row(line(k)));
             let names: [&[u16]; 5] = std::array::from_fn(|k| &labels.row(b.top + line(k))[b.left..b.right]);
             dispatch!(level, _simd => {
-                down_the_columns(pixels, colors.as_flattened_mut(), #[inline(always)] |v| u16::from(v));
+                down_the_columns(pixels, colors.as_flattened_mut(), #[inline(always)] |v: u8| v as u16);
                 down_the_columns(names, weights, #[inline(always)] |v| u16::from(v == label));
                 along_the_row(colors, weights, row);
             });
