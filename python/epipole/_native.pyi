@@ -382,6 +382,7 @@ def panorama(
     *,
     camera: Camera | None = None,
     focal: float | None = None,
+    mode: Literal["auto", "rotation", "plane"] | None = "auto",
     projection: Literal["auto", "plane", "cylindrical", "spherical"] | None = "auto",
     blend: Literal["multiband", "poisson", "feather", "none"] | None = "multiband",
     seams: Literal["graphcut", "voronoi"] | None = "graphcut",

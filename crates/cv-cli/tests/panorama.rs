@@ -64,3 +64,24 @@ fn a_photograph_on_its_side_changes_nothing() {
         assert!((0..2).all(|i| (size[i] / sizes[0][i] - 1.0).abs() < 0.05), "{sizes:?}");
     }
 }
+
+#[test]
+fn the_mode_is_taken_told_and_checked() {
+    let folder = tempfile::tempdir().unwrap();
+    // One flat picture, two parts of it: what a camera shows that was slid along a wall.
+    let wall = cv_io::read_rgb(fixture("panorama/view1.jpg")).unwrap();
+    let (w, h) = wall.size();
+    let wide = 2 * w / 3;
+    for (i, left) in [0, w - wide].into_iter().enumerate() {
+        let part = wall.view().crop(left, 0, wide, h).unwrap();
+        cv_io::write_png(folder.path().join(format!("{i}.png")), part).unwrap();
+    }
+    let told = |mode: &str| json(folder.path(), &["panorama", "0.png", "1.png", "-o", "p.png", "--mode", mode]);
+    let value = told("plane");
+    assert_eq!((value["mode"].as_str(), value["projection"].as_str()), (Some("plane"), Some("plane")));
+    let size = [0, 1].map(|i| value["size"][i].as_f64().unwrap());
+    // The wall again: half a per cent for what matches of a tenth of a pixel leave of its frame.
+    assert!((size[0] / w as f64 - 1.0).abs() < 0.005 && (size[1] / h as f64 - 1.0).abs() < 0.005, "{size:?} {w} {h}");
+    assert_eq!(told("rotation")["mode"], "rotation");
+    assert_eq!(run(folder.path(), &["panorama", "0.png", "1.png", "-o", "q.png", "--mode", "flat"]).code, Some(2));
+}

@@ -57,6 +57,6 @@ pub use morphology::{StructuringElement, close, dilate, erode, open};
 pub use pixel::Pixel;
 pub use pyramid::{gaussian_pyramid, pyr_down, pyr_up};
 pub use resize::{resize, resize_area};
-pub use sample::{bicubic_at, bilinear_at, sample_bicubic, sample_bilinear};
+pub use sample::{bicubic_at, bicubic_rgb_at, bilinear_at, sample_bicubic, sample_bilinear};
 pub use warp::{Border, Interpolation, RemapOptions, WarpError, remap, undistort, warp_perspective, warp_with};
 pub use warp_map::WarpMap;

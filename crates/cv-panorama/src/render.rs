@@ -175,7 +175,7 @@ pub fn render_with(
         seams::upsample(&coarse, preview.step, (layout.width, layout.height), &warped, &stage)?
     };
     if options.seams == Seams::GraphCut && preview.step > 1 {
-        seams::refine(&mut labels, &warped, 2 * preview.step, progress)?;
+        seams::refine(&mut labels, &warped, preview.step, progress)?;
     }
     clock.lap("seams");
     let image = blender.blend(&Composition { photos: &warped, labels: &labels, typical_side }, progress)?;

@@ -31,6 +31,7 @@ impl Arguments {
         if let Some(focal) = focal.filter(|f| !(*f > 0.0 && f.is_finite())) {
             return Err(PyValueError::new_err(format!("panorama(): focal must be above 0, not {focal}")));
         }
+        options.set_named("mode", &mut o.align.motion)?;
         options.set_named("projection", &mut o.render.projection)?;
         options.set_named("blend", &mut o.render.blend)?;
         options.set_named("seams", &mut o.render.seams)?;

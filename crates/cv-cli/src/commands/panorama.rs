@@ -6,7 +6,7 @@ use crate::frame::{Context, Failure, Outcome, Output, PICTURE, Run, Step, expand
 use crate::{rig, words};
 use cv_core::Image;
 use cv_io::Metadata;
-use cv_pipeline::panorama_types::{BlendMode, Exposure, Projection, Seams};
+use cv_pipeline::panorama_types::{BlendMode, CameraMotion, Exposure, Projection, Seams};
 use cv_pipeline::{FeatureMethod, FeatureOptions, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama};
 use rayon::prelude::*;
 use serde_json::json;
@@ -20,7 +20,8 @@ use std::path::PathBuf;
     cv panorama holiday/ -o pano.jpg --projection spherical --crop\n  \
     cv panorama a.jpg b.jpg c.jpg -o pano.png --blend poisson --report out/\n  \
     cv panorama a.jpg b.jpg c.jpg -o pano.png --alpha\n  \
-    cv panorama wide/ -o pano.png --camera cam.yaml")]
+    cv panorama wide/ -o pano.png --camera cam.yaml\n  \
+    cv panorama wall/ -o plan.tif --mode plane")]
 pub(crate) struct Args {
     /// Photographs in any order, or folders of them. Those that do not belong are left out.
     #[arg(required = true, value_name = "IMAGES")]
@@ -28,6 +29,10 @@ pub(crate) struct Args {
     /// Where to write the panorama: .png or .jpg.
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
+    /// What the photographs are of: all around one place (rotation), or something flat from many places, such as a map, a wall or the ground (plane), drawn as a
+    /// plan, without shear; auto: rotation, unless plane explains the matches far better.
+    #[arg(long, value_name = "WHAT", value_parser = named::<CameraMotion>(), default_value_t = PanoramaOptions::default().align.motion)]
+    mode: CameraMotion,
     /// The surface to draw on; auto: a plane up to 90 degrees across, then a cylinder, a sphere where it is also high.
     #[arg(long, value_name = "SURFACE", value_parser = named::<Projection>(), default_value_t = PanoramaOptions::default().render.projection)]
     projection: Projection,
@@ -61,6 +66,7 @@ pub(crate) struct Args {
 impl Args {
     fn options(&self, context: &Context) -> PanoramaOptions {
         let mut options = PanoramaOptions::default();
+        options.align.motion = self.mode;
         options.render.projection = self.projection;
         options.render.blend = self.blend;
         options.render.seams = self.seams;
@@ -182,6 +188,7 @@ fn outcome(paths: &[PathBuf], result: &PanoramaResult) -> Outcome {
         .with("size", [w, h])
         .with("reprojection_rms_px", result.reprojection_rms_px)
         .with("projection", result.canvas.projection.to_string())
+        .with("mode", result.alignment.motion.to_string())
         .summary(format!(
             "{used} of {} photographs, {w} x {h} pixels, {}, matches agree to {:.2} px (RMS)",
             paths.len(),

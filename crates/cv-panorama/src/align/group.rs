@@ -2,6 +2,7 @@
 
 use crate::align::bundle::{Lens, Motion, Overlap, Problem, State};
 use crate::align::focal::focals_from_homography;
+use crate::align::metric::{in_front, metric_frame};
 use crate::align::straighten::straighten;
 use crate::align::{AlignError, AlignOptions, AlignedPair, Alignment, CameraMotion, Photo, Unplaced, View};
 use cv_core::{Camera, Cancelled, Distortion, Point2, Stage};
@@ -22,6 +23,9 @@ pub(crate) struct Group<'a> {
     reference: usize,
     components: Vec<Vec<usize>>,
 }
+
+/// Matches of an overlap that a first solution is found from, which all of them refine: thirty times the three unknowns of a turn.
+const FEW: usize = 100;
 
 /// Difference of the logarithms of focal lengths from which on a lens was zoomed between photographs: focusing nearer changes them by less.
 const ZOOMED: f64 = 0.03;
@@ -163,6 +167,15 @@ impl<'a> Group<'a> {
         }
     }
 
+    /// Of each overlap as many matches as a first solution needs, evenly chosen.
+    fn few_matches(&self) -> Vec<Overlap> {
+        let few = |o: &Overlap| {
+            let step = o.points.len().div_ceil(FEW).max(1);
+            Overlap { points: o.points.iter().copied().step_by(step).collect(), ..*o }
+        };
+        self.overlaps.iter().map(few).collect()
+    }
+
     pub(crate) fn solve(
         &self,
         options: &AlignOptions,
@@ -197,7 +210,9 @@ impl<'a> Group<'a> {
         let prior = self.focal_guesses(&heads);
         let known = heads.iter().all(|&h| self.photos[h].camera.is_some() || self.photos[h].focal.is_some());
         let factors: &[f64] = if known { &[1.0] } else { &[1.0, 0.6, 1.7, 3.0] };
-        let wide = self.problem(Motion::Rotation, &lens_of, &prior, 10.0 * options.outlier_px);
+        let few = self.few_matches();
+        let wide =
+            Problem { overlaps: &few, ..self.problem(Motion::Rotation, &lens_of, &prior, 10.0 * options.outlier_px) };
         let start = |factor: &f64| {
             let lenses: Vec<Lens> = prior
                 .iter()
@@ -251,16 +266,13 @@ impl<'a> Group<'a> {
     fn solve_homography(&self, options: &AlignOptions, stage: &Stage<'_>) -> Result<Solution, Cancelled> {
         let (lens_of, heads) = self.lenses();
         let prior = self.focal_guesses(&heads);
-        // Any focal length will do, as the homographies take up the difference; this one keeps the numbers near one.
-        let lenses: Vec<Lens> = heads
-            .iter()
-            .map(|&h| Lens {
-                log_focal: self.photos[h].camera.map_or(self.photos[h].long_side(), |c| c.fx).ln(),
-                k1: 0.0,
-            })
-            .collect();
+        // Any focal length will do, as the homographies take up the difference; only what is a right angle of the scene depends on it.
+        let lenses: Vec<Lens> =
+            heads.iter().map(|&h| Lens { log_focal: self.photos[h].expected_focal().ln(), k1: 0.0 }).collect();
         let motion = self.compose(Motion::Homography, &lens_of, &lenses);
-        let wide = self.problem(Motion::Homography, &lens_of, &prior, 10.0 * options.outlier_px);
+        let few = self.few_matches();
+        let wide =
+            Problem { overlaps: &few, ..self.problem(Motion::Homography, &lens_of, &prior, 10.0 * options.outlier_px) };
         let (state, _) = wide.solve(State { motion, lenses }, 30);
         stage.check()?;
         let problem = self.problem(Motion::Homography, &lens_of, &prior, options.outlier_px);
@@ -279,15 +291,16 @@ impl<'a> Group<'a> {
 
     /// No photograph reaches the horizon of the common plane.
     fn in_front(&self, s: &Solution) -> bool {
-        (0..self.photos.len()).all(|i| {
-            let Some(inverse) = s.state.motion[i].try_inverse() else { return false };
-            let view = self.view(i, s);
-            view.border(1).iter().all(|&p| {
-                let n = view.camera.normalize(p);
-                let ray = inverse * nalgebra::Vector3::new(n.x, n.y, 1.0);
-                ray.z > 0.05 * ray.norm()
-            })
-        })
+        in_front(&(0..self.photos.len()).map(|i| self.view(i, s)).collect::<Vec<_>>())
+    }
+
+    /// The same solution in the frame of a plan of the flat scene, as far as all photographs lie before its horizon.
+    pub(crate) fn as_plan(&self, solution: Solution) -> Solution {
+        let Some(frame) = metric_frame(&solution.state.motion) else { return solution };
+        let motion = solution.state.motion.iter().map(|m| m * frame).collect();
+        let state = State { motion, lenses: solution.state.lenses.clone() };
+        let plan = Solution { lens_of: solution.lens_of.clone(), prior: solution.prior.clone(), state };
+        if self.in_front(&plan) { plan } else { solution }
     }
 
     /// The pair that is least consistent with the solution, where one is not at all.

@@ -7,14 +7,16 @@ use crate::light::{Gains, Response};
 const PER_STOP: f32 = 32.0;
 /// log₂ of the least light there is an entry for.
 const LEAST: f32 = -16.0;
+/// Entries per level of a photograph: to the nearest of them a level is rounded by a sixteenth at most.
+const PER_LEVEL: usize = 8;
 /// The level from which on there is room made for light above white.
 const KNEE: f64 = 190.0;
 
 /// The curves that all photographs of a panorama share.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Tone {
-    /// log₂ of light by level of a photograph; one entry more, for interpolation.
-    light: Box<[f32; 512]>,
+    /// log₂ of light by level of a photograph, as a place among `levels`.
+    light: Box<[f32; 2048]>,
     /// Level of the panorama by log₂ of light, the last one repeated. (Lengths are powers of two, so that a mask bounds an index.)
     levels: Box<[f32; 1024]>,
 }
@@ -25,8 +27,7 @@ impl Tone {
     /// Above white the response goes on along its tangent in stops. Levels up to the knee stay; from there to that of `highest` they are compressed to 255 by a
     /// rational curve of continuous slope (Reinhard et al., "Photographic tone reproduction for digital images", 2002, with a straight part).
     pub(crate) fn new(response: &Response, highest: f64) -> Self {
-        let mut light: Box<[f32; 512]> =
-            Box::new(std::array::from_fn(|v| response.log_light(v.min(255) as f64 / 255.0) as f32));
+        let mut light: [f32; 257] = std::array::from_fn(|v| response.log_light(v.min(255) as f64 / 255.0) as f32);
         // Black stays black whatever the gain.
         light[0] = LEAST;
         let per_stop = 255.0 / response.slope(1.0);
@@ -50,26 +51,36 @@ impl Tone {
             let level = if level <= KNEE { level } else { KNEE + (255.0 - KNEE) * a * t / (1.0 + (a - 1.0) * t) };
             *entry = level as f32;
         }
-        Self { light, levels }
+        let place = |k: usize| {
+            let (v, fraction) = ((k / PER_LEVEL).min(255), (k % PER_LEVEL) as f32 / PER_LEVEL as f32);
+            (light[v] + fraction * (light[v + 1] - light[v]) - LEAST) * PER_STOP
+        };
+        Self { light: Box::new(std::array::from_fn(place)), levels }
     }
 
-    /// log₂ of the light of a level, which may lie between two.
+    /// Where among `levels` the light of a level lies, which may be between two.
     #[inline(always)]
     fn light(&self, level: f32) -> f32 {
-        let level = level.clamp(0.0, 255.0);
-        let i = level as usize;
-        let (low, high) = (self.light[i & 511], self.light[(i + 1) & 511]);
-        low + (level - i as f32) * (high - low)
+        let (i, _) = split(level.clamp(0.0, 255.0) * PER_LEVEL as f32 + 0.5);
+        self.light[i & 2047]
     }
 
-    /// The level of the panorama for log₂ of light.
+    /// The level of the panorama at a place among `levels`.
     #[inline(always)]
-    fn level(&self, stops: f32) -> f32 {
-        let at = ((stops - LEAST) * PER_STOP).clamp(0.0, 1022.0);
-        let i = at as usize;
+    fn level(&self, place: f32) -> f32 {
+        let (i, fraction) = split(place.clamp(0.0, 1022.0));
         let (low, high) = (self.levels[i & 1023], self.levels[(i + 1) & 1023]);
-        low + (at - i as f32) * (high - low)
+        low + fraction * (high - low)
     }
+}
+
+/// An integer and a fraction of 0 to 1 that make up a number of 0 to some thousands; an integer may be split as one less and 1. Without a conversion, which
+/// has to ask about what is no number: at 1.5 · 2²³ a float's last bits are its integer part.
+#[inline(always)]
+fn split(v: f32) -> (usize, f32) {
+    const SHIFT: f32 = 12_582_912.0;
+    let shifted = (v - 0.5) + SHIFT;
+    (shifted.to_bits() as usize & 0xffff, v - (shifted - SHIFT))
 }
 
 /// What is done to the light of a photograph.
@@ -98,17 +109,30 @@ impl<'a> ExposureCorrection<'a> {
     /// The levels of the panorama for a color of the photograph that is lifted by as many stops more.
     ///
     /// A color whose channels were all clipped is a bound, not a measurement: it stays white whatever its gain.
-    #[inline(always)]
     pub(crate) fn levels(&self, color: [f32; 3], lift: f32) -> [f32; 3] {
+        let [mut r, mut g, mut b] = color.map(|v| [v]);
+        self.row_of_levels([&mut r, &mut g, &mut b], &[lift], &mut [0.0]);
+        [r[0], g[0], b[0]]
+    }
+
+    /// As [`Self::levels`], for rows of red, green and blue and of stops that are as long. `clipped` is a buffer as long.
+    #[inline(always)]
+    pub(crate) fn row_of_levels(&self, colors: [&mut [f32]; 3], lifts: &[f32], clipped: &mut [f32]) {
         /// Smallest channel from which on a color counts as clipped, more and more up to the second.
         const CLIPPED: [f32; 2] = [228.0, 252.0];
-        let least = color[0].min(color[1]).min(color[2]);
-        let share = ((least - CLIPPED[0]) / (CLIPPED[1] - CLIPPED[0])).clamp(0.0, 1.0);
-        let clipped = share * share * (3.0 - 2.0 * share);
-        std::array::from_fn(|c| {
-            let tone = self.tone.level(self.tone.light(color[c]) + self.gain[c] + lift);
-            tone + clipped * (255.0 - tone)
-        })
+        let n = lifts.len();
+        let ([r, g, b], clipped) = (colors.map(|c| &mut c[..n]), &mut clipped[..n]);
+        for (((clipped, r), g), b) in clipped.iter_mut().zip(&*r).zip(&*g).zip(&*b) {
+            let share = ((r.min(*g).min(*b) - CLIPPED[0]) * (1.0 / (CLIPPED[1] - CLIPPED[0]))).clamp(0.0, 1.0);
+            *clipped = share * share * (3.0 - 2.0 * share);
+        }
+        // A channel at a time: pixels do not wait for each other.
+        for (values, gain) in [r, g, b].into_iter().zip(self.gain) {
+            for ((value, lift), clipped) in values.iter_mut().zip(lifts).zip(&*clipped) {
+                let tone = self.tone.level(self.tone.light(*value) + (gain + lift) * PER_STOP);
+                *value = tone + clipped * (255.0 - tone);
+            }
+        }
     }
 }
 
@@ -129,6 +153,15 @@ mod tests {
                 // Chords of the curve over a 32nd of a stop, 2 % of the light, 1 % of the level: its curvature over that is a hundredth of it. Levels from 228 on go to white.
                 assert!((got - level as f32).abs() < 0.06 || level > 228, "{coefficients:?} {level}: {got}");
             }
+        }
+    }
+
+    #[test]
+    fn a_number_is_its_integer_and_its_fraction() {
+        for k in 0..=8184 {
+            let v = k as f32 / 8.0;
+            let (i, fraction) = split(v);
+            assert!((0.0..=1.0).contains(&fraction) && i as f32 + fraction == v, "{v}: {i} {fraction}");
         }
     }
 

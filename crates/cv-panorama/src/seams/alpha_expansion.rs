@@ -21,6 +21,9 @@ pub(super) struct Labeling<'a, U, D, F> {
     pub(super) free: F,
 }
 
+/// Places worked on between two questions whether to go on.
+const PLACES: usize = 1 << 14;
+
 /// Capacity that no cut can afford.
 const NEVER: i32 = 1 << 28;
 
@@ -67,125 +70,82 @@ where
         let label_at = |x: usize, y: usize| names[y * width + x];
         let differ = &self.difference;
         // A pixel may switch where it is free, alpha reaches it, and it shows something else.
-        let may = |x: usize, y: usize| {
-            let label = label_at(x, y);
-            label != NO_PHOTO && usize::from(label) != alpha && (self.free)(x, y) && own.reaches(x, y)
-        };
-        let mut any: Option<Bounds> = None;
+        let mut places: Vec<[u32; 2]> = Vec::new();
         for y in b.top..b.bottom {
             if asks(y, b.width()) {
                 stage.check()?;
             }
             for x in b.left..b.right {
-                if may(x, y) {
-                    let a = any.get_or_insert(Bounds { left: x, top: y, right: x + 1, bottom: y + 1 });
-                    (a.left, a.right, a.bottom) = (a.left.min(x), a.right.max(x + 1), y + 1);
+                let label = label_at(x, y);
+                if (self.free)(x, y) && label != NO_PHOTO && usize::from(label) != alpha && own.reaches(x, y) {
+                    places.push([x as u32, y as u32]);
                 }
             }
         }
-        let Some(b) = any else { return Ok(Vec::new()) };
-        let (w, h) = (b.width(), b.height());
-        // How alpha and what is shown differ at each pixel: most edges run between pixels of one label and need just this.
-        let mut shown = vec![0; w * h];
-        for_each_row(&mut shown, w, stage, |row, out| {
-            let y = b.top + row;
-            for (x, out) in (b.left..).zip(out) {
-                let label = label_at(x, y);
-                if label != NO_PHOTO && usize::from(label) != alpha {
-                    *out = differ(alpha, usize::from(label), x, y);
-                }
+        if places.is_empty() {
+            return Ok(Vec::new());
+        }
+        let place = |i: usize| (places[i][0] as usize, places[i][1] as usize);
+        // How alpha and what is shown differ at each place: most edges run between pixels of one label and need just this.
+        let mut shown = vec![0; places.len()];
+        for_each_row(&mut shown, PLACES, stage, |chunk, out| {
+            for (i, out) in (chunk * PLACES..).zip(out) {
+                let (x, y) = place(i);
+                *out = differ(alpha, usize::from(label_at(x, y)), x, y);
             }
         })?;
-        let from_alpha = |c: usize, x: usize, y: usize| {
-            let inside = x >= b.left && y >= b.top && x < b.right && y < b.bottom;
-            if inside && usize::from(label_at(x, y)) == c {
-                shown[(y - b.top) * w + x - b.left]
-            } else {
-                differ(alpha, c, x, y)
-            }
-        };
-        let mut cut = GridCut::new(w, h, stage)?;
+        let mut cut = GridCut::new(&places, stage)?;
         // Source side: keeps its label. Sink side: becomes alpha.
-        for y in b.top..b.bottom {
-            if asks(y, 8 * w) {
+        for i in 0..places.len() {
+            if i % PLACES == 0 {
                 stage.check()?;
             }
-            for x in b.left..b.right {
-                let mine = may(x, y);
-                let label = label_at(x, y);
-                let (i, j) = (x - b.left, y - b.top);
-                if mine {
-                    cut.add_terminal(i, j, (self.unary)(alpha, x, y), (self.unary)(usize::from(label), x, y));
-                }
-                for (nx, ny) in [(x + 1, y), (x, y + 1)] {
-                    if nx >= width || ny >= height {
-                        continue;
-                    }
-                    let other = label_at(nx, ny);
-                    if label == NO_PHOTO || other == NO_PHOTO {
-                        continue;
-                    }
-                    let inside = nx < b.right && ny < b.bottom;
-                    let theirs = inside && may(nx, ny);
-                    if !mine && !theirs {
-                        continue;
-                    }
-                    let (p, q) = (usize::from(label), usize::from(other));
-                    let keep = if p == q { 0 } else { STEP + differ(p, q, x, y) + differ(p, q, nx, ny) };
-                    let pay =
-                        |c: usize| if c == alpha { 0 } else { STEP + from_alpha(c, x, y) + from_alpha(c, nx, ny) };
-                    // Cost where only the first, or only the second, becomes alpha.
-                    let (first, second) = (pay(q), pay(p));
-                    match (mine, theirs) {
-                        (true, true) => {
-                            // E(keep, keep) ≤ E(alpha, keep) + E(keep, alpha) holds for differences; at borders it is made to.
-                            let (first, second) =
-                                if keep > first + second { (first, keep - first) } else { (first, second) };
-                            // E = keep·[both keep] + first·[first only] + second·[second only], as terminals and one arc:
-                            // first's switching costs (first − keep), second's then costs −first, and splitting pays the rest.
-                            add_signed(&mut cut, i, j, first - keep);
-                            add_signed(&mut cut, nx - b.left, ny - b.top, -first);
-                            let arc = first + second - keep;
-                            // Paid where the first keeps (source) and the second switches (sink).
-                            if ny == y { cut.add_right(i, j, arc, 0) } else { cut.add_down(i, j, arc, 0) }
-                        }
-                        // A fixed neighbor is a cost of the free one alone.
-                        (true, false) => add_signed(&mut cut, i, j, first - keep),
-                        (false, _) => add_signed(&mut cut, nx - b.left, ny - b.top, second - keep),
-                    }
-                }
+            let (x, y) = place(i);
+            let p = usize::from(label_at(x, y));
+            cut.add_terminal(i, (self.unary)(alpha, x, y), (self.unary)(p, x, y));
+            let [left, above] = cut.has_before(i);
+            let fixed = |x: usize, y: usize, is_node: bool| (!is_node).then_some((x, y));
+            let (right, below) = (cut.right(i), cut.below(i));
+            let beside = [
+                fixed(x.wrapping_sub(1), y, left || x == 0),
+                fixed(x, y.wrapping_sub(1), above || y == 0),
+                fixed(x + 1, y, right.is_some() || x + 1 == width),
+                fixed(x, y + 1, below.is_some() || y + 1 == height),
+            ];
+            // A fixed neighbor is a cost of the free pixel alone.
+            for (nx, ny) in beside.into_iter().flatten().filter(|&(nx, ny)| label_at(nx, ny) != NO_PHOTO) {
+                let q = usize::from(label_at(nx, ny));
+                let keep = if p == q { 0 } else { STEP + differ(p, q, x, y) + differ(p, q, nx, ny) };
+                let here = if p == q { shown[i] } else { differ(alpha, q, x, y) };
+                let switch = if q == alpha { 0 } else { STEP + here + differ(alpha, q, nx, ny) };
+                add_signed(&mut cut, i, switch - keep);
             }
-        }
-        // Neighbors to the left of and above the box are fixed too.
-        for (x, y, nx, ny) in (b.top..b.bottom)
-            .filter(|_| b.left > 0)
-            .map(|y| (b.left, y, b.left - 1, y))
-            .chain((b.left..b.right).filter(|_| b.top > 0).map(|x| (x, b.top, x, b.top - 1)))
-        {
-            let (label, other) = (label_at(x, y), label_at(nx, ny));
-            if !may(x, y) || other == NO_PHOTO {
-                continue;
+            for (j, nx, ny) in
+                [(right, x + 1, y), (below, x, y + 1)].into_iter().filter_map(|(j, x, y)| Some((j?, x, y)))
+            {
+                let q = usize::from(label_at(nx, ny));
+                // Cost where both keep their labels, where only the first and where only the second becomes alpha.
+                let (keep, first, second) = if p == q {
+                    let either = STEP + shown[i] + shown[j];
+                    (0, either, either)
+                } else {
+                    let keep = STEP + differ(p, q, x, y) + differ(p, q, nx, ny);
+                    (keep, STEP + differ(alpha, q, x, y) + shown[j], STEP + shown[i] + differ(alpha, p, nx, ny))
+                };
+                // E(keep, keep) ≤ E(alpha, keep) + E(keep, alpha) holds for differences; at borders it is made to.
+                let second = second.max(keep - first);
+                // E = keep·[both keep] + first·[first only] + second·[second only], as terminals and one arc:
+                // first's switching costs (first − keep), second's then costs −first, and splitting pays the rest.
+                add_signed(&mut cut, i, first - keep);
+                add_signed(&mut cut, j, -first);
+                let arc = first + second - keep;
+                // Paid where the first keeps (source) and the second switches (sink).
+                if ny == y { cut.add_right(i, arc, 0) } else { cut.add_down(i, arc, 0) }
             }
-            let pay = |a: usize, c: usize| {
-                if a == c { 0 } else { STEP + differ(a, c, x, y) + differ(a, c, nx, ny) }
-            };
-            add_signed(
-                &mut cut,
-                x - b.left,
-                y - b.top,
-                pay(alpha, usize::from(other)) - pay(usize::from(label), usize::from(other)),
-            );
         }
         cut.solve(stage)?;
-        let mut changed = Vec::new();
-        for y in b.top..b.bottom {
-            for x in b.left..b.right {
-                if may(x, y) && cut.on_sink_side(x - b.left, y - b.top) {
-                    changed.push(y * width + x);
-                }
-            }
-        }
-        Ok(changed)
+        let taken = (0..places.len()).filter(|&i| cut.on_sink_side(i));
+        Ok(taken.map(|i| places[i][1] as usize * width + places[i][0] as usize).collect())
     }
 }
 
@@ -208,8 +168,8 @@ fn independent_groups(photos: &[Option<&WarpedPhoto>]) -> Vec<Vec<usize>> {
 }
 
 /// A cost (of either sign) of switching to alpha, that is, of being on the sink's side.
-fn add_signed(cut: &mut GridCut, x: usize, y: usize, cost: i32) {
-    cut.add_terminal(x, y, cost.clamp(0, NEVER), (-cost).clamp(0, NEVER));
+fn add_signed(cut: &mut GridCut, place: usize, cost: i32) {
+    cut.add_terminal(place, cost.clamp(0, NEVER), (-cost).clamp(0, NEVER));
 }
 
 #[cfg(test)]

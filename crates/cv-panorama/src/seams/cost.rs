@@ -2,29 +2,43 @@
 
 use crate::surface::WarpedPhoto;
 
-/// The color of a photograph at a canvas pixel, in quarters of a gray level.
-#[inline(always)]
-fn color(photo: &WarpedPhoto, x: usize, y: usize) -> Option<[i32; 3]> {
-    Some(photo.color(x, y)?.map(|v| 4 * i32::from(v)))
-}
-
 /// Cost of a seam through a pixel that only one of the two photographs shows, in the unit of [`difference`]: a difference of 15 gray levels
 /// in every channel. Such seams follow the border of a photograph.
 pub(super) const BORDER: i32 = 4 * 45;
+
 /// How much two photographs differ at a pixel: sum over channels of the absolute difference, in quarters of a gray level, and the same of the
 /// gradients of brightness.
+#[inline]
 pub(super) fn difference(a: Option<&WarpedPhoto>, b: Option<&WarpedPhoto>, x: usize, y: usize) -> i32 {
     let (Some(a), Some(b)) = (a, b) else { return BORDER };
-    let (Some(p), Some(q)) = (color(a, x, y), color(b, x, y)) else { return BORDER };
-    let d: [i32; 3] = std::array::from_fn(|c| p[c] - q[c]);
-    let colors: i32 = d.iter().map(|d| d.abs()).sum();
-    let sum = |d: [i32; 3]| d[0] + d[1] + d[2];
+    if !a.bounds.contains(x, y) || !b.bounds.contains(x, y) {
+        return BORDER;
+    }
+    let (first, second) = (a.pixels.as_slice().as_chunks::<4>().0, b.pixels.as_slice().as_chunks::<4>().0);
+    let (across, down) = (a.bounds.width(), b.bounds.width());
+    let (i, j) = ((y - a.bounds.top) * across + x - a.bounds.left, (y - b.bounds.top) * down + x - b.bounds.left);
+    let Some(d) = color_difference(first[i], second[j]) else { return BORDER };
+    let brightness = d[0] + d[1] + d[2];
     // The difference of gradients is the gradient of the difference.
-    let gradient = |x: usize, y: usize| match (color(a, x, y), color(b, x, y)) {
-        (Some(p), Some(q)) => (sum(d) - sum(std::array::from_fn(|c| p[c] - q[c]))).abs(),
-        _ => 0,
+    let gradient = |i: usize, j: usize| match color_difference(first[i], second[j]) {
+        Some(d) => (brightness - d[0] - d[1] - d[2]).abs(),
+        None => 0,
     };
-    colors + gradient(x.wrapping_sub(1), y) + gradient(x, y.wrapping_sub(1))
+    let mut sum = d[0].abs() + d[1].abs() + d[2].abs();
+    if x > a.bounds.left.max(b.bounds.left) {
+        sum += gradient(i - 1, j - 1);
+    }
+    if y > a.bounds.top.max(b.bounds.top) {
+        sum += gradient(i - across, j - down);
+    }
+    4 * sum
+}
+
+/// Where both photographs reach.
+#[inline(always)]
+fn color_difference(p: [u8; 4], q: [u8; 4]) -> Option<[i32; 3]> {
+    let of = |c: usize| i32::from(p[c]) - i32::from(q[c]);
+    (p[3] > 0 && q[3] > 0).then(|| [of(0), of(1), of(2)])
 }
 
 #[cfg(test)]

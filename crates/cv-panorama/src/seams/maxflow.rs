@@ -1,6 +1,5 @@
-//! Minimum cuts of four-connected pixel grids (Boykov & Kolmogorov 2004).
+//! Minimum cuts of four-connected pixels (Boykov & Kolmogorov 2004).
 
-use crate::rows::asks;
 use cv_core::{Cancelled, Stage};
 
 /// Steps to the neighbors: right, left, down, up. Opposite directions differ in the last bit.
@@ -16,11 +15,13 @@ const TERMINAL: u8 = 4;
 /// `parent` of a node that lost its way to a terminal.
 const ORPHAN: u8 = 5;
 
-/// All of a node beside each other: a step to a neighbor touches half a cache line.
+/// All of a node beside each other: a step to a neighbor touches one cache line.
 #[derive(Clone, Copy)]
 struct Node {
     /// Residual capacity of the four outgoing arcs.
     capacity: [i32; 4],
+    /// The nodes they lead to; where there is none, one without capacities that is in no tree.
+    neighbor: [u32; 4],
     /// Residual capacity from the source (positive) or to the sink (negative).
     terminal: i32,
     time: u32,
@@ -30,14 +31,10 @@ struct Node {
     is_active: bool,
 }
 
-/// A graph of `width × height` nodes with edges between four-neighbors and to two terminals.
-///
-/// Nodes that carry no capacity cost nothing, so that a region of any shape is cut in its bounding box.
+/// A graph of pixels with edges between four-neighbors and to two terminals. Only the pixels that are named have nodes, so that a narrow band costs what
+/// it has, however it winds.
 pub(crate) struct GridCut {
-    width: usize,
-    /// Of the padded grid: a border of one node without capacities spares every test for the edge.
-    stride: usize,
-    height: usize,
+    /// One for each place, and the one that stands for neighbors that are not there.
     nodes: Vec<Node>,
     active: std::collections::VecDeque<u32>,
     orphans: std::collections::VecDeque<u32>,
@@ -45,21 +42,40 @@ pub(crate) struct GridCut {
 }
 
 impl GridCut {
-    pub(crate) fn new(width: usize, height: usize, stage: &Stage<'_>) -> Result<Self, Cancelled> {
-        let (stride, rows) = (width + 2, height + 2);
-        let node =
-            Node { capacity: [0; 4], terminal: 0, time: 0, distance: 0, tree: FREE, parent: ORPHAN, is_active: false };
-        let mut nodes = Vec::with_capacity(stride * rows);
-        for row in 0..rows {
-            if asks(row, stride) {
+    /// `places` are columns and rows of different pixels, row by row from left to right.
+    pub(crate) fn new(places: &[[u32; 2]], stage: &Stage<'_>) -> Result<Self, Cancelled> {
+        let nobody = places.len() as u32;
+        let node = Node {
+            capacity: [0; 4],
+            neighbor: [nobody; 4],
+            terminal: 0,
+            time: 0,
+            distance: 0,
+            tree: FREE,
+            parent: ORPHAN,
+            is_active: false,
+        };
+        stage.check()?;
+        let mut nodes = vec![node; places.len() + 1];
+        // The first place that does not come before the one below.
+        let mut below = 0;
+        for (i, &[x, y]) in places.iter().enumerate() {
+            if i % (1 << 20) == 0 {
                 stage.check()?;
             }
-            nodes.resize((row + 1) * stride, node);
+            if places.get(i + 1) == Some(&[x + 1, y]) {
+                nodes[i].neighbor[RIGHT] = i as u32 + 1;
+                nodes[i + 1].neighbor[RIGHT + 1] = i as u32;
+            }
+            while places.get(below).is_some_and(|&[u, v]| (v, u) < (y + 1, x)) {
+                below += 1;
+            }
+            if places.get(below) == Some(&[x, y + 1]) {
+                nodes[i].neighbor[DOWN] = below as u32;
+                nodes[below].neighbor[DOWN + 1] = i as u32;
+            }
         }
         Ok(Self {
-            width,
-            stride,
-            height,
             nodes,
             active: std::collections::VecDeque::new(),
             orphans: std::collections::VecDeque::new(),
@@ -67,46 +83,56 @@ impl GridCut {
         })
     }
 
-    fn node(&self, x: usize, y: usize) -> usize {
-        debug_assert!(x < self.width && y < self.height);
-        (y + 1) * self.stride + x + 1
+    #[inline(always)]
+    fn neighbor(&self, node: usize, direction: usize) -> usize {
+        self.nodes[node].neighbor[direction & 3] as usize
     }
 
-    fn neighbor(&self, node: usize, direction: usize) -> usize {
-        match direction {
-            0 => node + 1,
-            1 => node - 1,
-            2 => node + self.stride,
-            _ => node - self.stride,
-        }
+    /// The node to the right of a place, where there is one.
+    pub(crate) fn right(&self, node: usize) -> Option<usize> {
+        self.existing(node, RIGHT)
+    }
+
+    /// The node below a place, where there is one.
+    pub(crate) fn below(&self, node: usize) -> Option<usize> {
+        self.existing(node, DOWN)
+    }
+
+    /// Whether there is a node to the left of a place, and one above it.
+    pub(crate) fn has_before(&self, node: usize) -> [bool; 2] {
+        [RIGHT + 1, DOWN + 1].map(|direction| self.existing(node, direction).is_some())
+    }
+
+    fn existing(&self, node: usize, direction: usize) -> Option<usize> {
+        Some(self.neighbor(node, direction)).filter(|&other| other + 1 < self.nodes.len())
     }
 
     /// Adds costs of being cut from the source and from the sink (both at least 0): a node on the sink's side pays the first.
-    pub(crate) fn add_terminal(&mut self, x: usize, y: usize, source: i32, sink: i32) {
-        let node = self.node(x, y);
+    pub(crate) fn add_terminal(&mut self, node: usize, source: i32, sink: i32) {
         self.nodes[node].terminal += source - sink;
     }
 
-    /// Adds capacities between a pixel and its right neighbor: paid where this one is on the source's side and that one on the
+    /// Adds capacities between a place and its right neighbor, which is there: paid where this one is on the source's side and that one on the
     /// sink's, and the other way round.
-    pub(crate) fn add_right(&mut self, x: usize, y: usize, forward: i32, backward: i32) {
-        self.add_edge(self.node(x, y), RIGHT, forward, backward);
+    pub(crate) fn add_right(&mut self, node: usize, forward: i32, backward: i32) {
+        self.add_edge(node, RIGHT, forward, backward);
     }
 
     /// As [`Self::add_right`], for the neighbor below.
-    pub(crate) fn add_down(&mut self, x: usize, y: usize, forward: i32, backward: i32) {
-        self.add_edge(self.node(x, y), DOWN, forward, backward);
+    pub(crate) fn add_down(&mut self, node: usize, forward: i32, backward: i32) {
+        self.add_edge(node, DOWN, forward, backward);
     }
 
     fn add_edge(&mut self, node: usize, direction: usize, forward: i32, backward: i32) {
         let other = self.neighbor(node, direction);
+        debug_assert!(other + 1 < self.nodes.len());
         self.nodes[node].capacity[direction] += forward;
         self.nodes[other].capacity[direction ^ 1] += backward;
     }
 
-    /// After [`Self::solve`]: whether the pixel is on the sink's side of the cut. What could be on either is on the source's.
-    pub(crate) fn on_sink_side(&self, x: usize, y: usize) -> bool {
-        self.nodes[self.node(x, y)].tree == SINK
+    /// After [`Self::solve`]: whether the place is on the sink's side of the cut. What could be on either is on the source's.
+    pub(crate) fn on_sink_side(&self, node: usize) -> bool {
+        self.nodes[node].tree == SINK
     }
 
     /// Finds a minimum cut.
@@ -327,6 +353,26 @@ mod tests {
     use crate::testing::stage;
     use proptest::prelude::*;
 
+    /// All pixels of a grid.
+    fn whole(w: usize, h: usize) -> Vec<[u32; 2]> {
+        (0..h as u32).flat_map(|y| (0..w as u32).map(move |x| [x, y])).collect()
+    }
+
+    proptest! {
+        #[test]
+        fn neighbors_are_the_pixels_beside_and_below(mask in proptest::collection::vec(any::<bool>(), 35)) {
+            let places: Vec<_> = whole(7, 5).into_iter().zip(&mask).filter(|(_, m)| **m).map(|(p, _)| p).collect();
+            let cut = GridCut::new(&places, &stage()).unwrap();
+            let find = |place: [u32; 2]| places.iter().position(|p| *p == place);
+            for (i, &[x, y]) in places.iter().enumerate() {
+                prop_assert_eq!(cut.right(i), find([x + 1, y]));
+                prop_assert_eq!(cut.below(i), find([x, y + 1]));
+                let before = [find([x.wrapping_sub(1), y]).is_some(), find([x, y.wrapping_sub(1)]).is_some()];
+                prop_assert_eq!(cut.has_before(i), before);
+            }
+        }
+    }
+
     /// Cost of a labeling (bit set: source side).
     #[derive(Debug)]
     struct Plain {
@@ -362,16 +408,16 @@ mod tests {
         }
 
         fn cut(&self) -> GridCut {
-            let mut g = GridCut::new(self.w, self.h, &stage()).unwrap();
+            let mut g = GridCut::new(&whole(self.w, self.h), &stage()).unwrap();
             for y in 0..self.h {
                 for x in 0..self.w {
                     let i = y * self.w + x;
-                    g.add_terminal(x, y, self.terminals[i].0, self.terminals[i].1);
+                    g.add_terminal(i, self.terminals[i].0, self.terminals[i].1);
                     if x + 1 < self.w {
-                        g.add_right(x, y, self.right[i].0, self.right[i].1);
+                        g.add_right(i, self.right[i].0, self.right[i].1);
                     }
                     if y + 1 < self.h {
-                        g.add_down(x, y, self.down[i].0, self.down[i].1);
+                        g.add_down(i, self.down[i].0, self.down[i].1);
                     }
                 }
             }
@@ -399,7 +445,7 @@ mod tests {
         #[test]
         fn no_labeling_costs_less_than_the_cut(p in problem()) {
             let cut = p.cut();
-            let found = p.cost(|x, y| !cut.on_sink_side(x, y));
+            let found = p.cost(|x, y| !cut.on_sink_side(y * p.w + x));
             let least = (0..1_u32 << (p.w * p.h)).map(|bits| p.cost(|x, y| bits >> (y * p.w + x) & 1 == 1)).min().unwrap();
             prop_assert_eq!(found, least);
         }
@@ -410,22 +456,22 @@ mod tests {
         // Left column source, right column sink, every edge 10 but those over a winding line, 1 each.
         let (w, h) = (60, 40);
         let line = |y: usize| 20 + (y as f64 * 0.4).sin().mul_add(8.0, 0.0) as usize;
-        let mut g = GridCut::new(w, h, &stage()).unwrap();
+        let mut g = GridCut::new(&whole(w, h), &stage()).unwrap();
         for y in 0..h {
-            g.add_terminal(0, y, 1000, 0);
-            g.add_terminal(w - 1, y, 0, 1000);
+            g.add_terminal(y * w, 1000, 0);
+            g.add_terminal(y * w + w - 1, 0, 1000);
             for x in 0..w - 1 {
                 let c = if x == line(y) { 1 } else { 200 };
-                g.add_right(x, y, c, c);
+                g.add_right(y * w + x, c, c);
             }
             for x in (0..w).filter(|_| y + 1 < h) {
-                g.add_down(x, y, 1, 1);
+                g.add_down(y * w + x, 1, 1);
             }
         }
         g.solve(&stage()).unwrap();
         for y in 0..h {
             for x in 0..w {
-                assert_eq!(g.on_sink_side(x, y), x > line(y), "{x} {y}");
+                assert_eq!(g.on_sink_side(y * w + x), x > line(y), "{x} {y}");
             }
         }
     }

@@ -13,7 +13,7 @@ mod upsample;
 pub(crate) use upsample::upsample;
 
 use crate::blend::NO_PHOTO;
-use crate::rows::asks;
+use crate::rows::{asks, for_each_row};
 use crate::surface::{Bounds, Piece, Preview, WarpedPhoto};
 use alpha_expansion::Labeling;
 use cost::difference;
@@ -141,76 +141,128 @@ fn eccentricity(piece: &Piece, x: usize, y: usize) -> f32 {
     piece.eccentricity[(y - b.top) * b.width() + x - b.left]
 }
 
-/// Moves the seams of full-size labels to where the photographs agree in full detail, by up to `reach` pixels.
+/// Pixels on a side of the blocks that seams are moved by first where a preview pixel is larger.
+const BLOCK: usize = 4;
+
+/// Moves the seams of full-size labels, which are those of a preview of pixels of `step`, to where the photographs agree in full detail: by up to two of these.
+/// Where that is far, by blocks first, and then by a block and a half.
 pub(crate) fn refine(
     labels: &mut Image<u16, 1>,
     photos: &[Option<WarpedPhoto>],
-    reach: usize,
+    step: usize,
     progress: &dyn Progress,
 ) -> Result<(), Cancelled> {
-    let stage = Stage::new(progress, "seams", 2)?;
+    let stage = Stage::new(progress, "seams", 3)?;
+    let pieces: Vec<Option<&WarpedPhoto>> = photos.iter().map(Option::as_ref).collect();
+    let mut reach = 2 * step;
+    if step > BLOCK {
+        refine_blocks(labels, &pieces, reach.div_ceil(BLOCK), &stage)?;
+        reach = BLOCK + BLOCK / 2;
+    }
+    stage.add(1)?;
     let near = near_seams(labels, reach, &stage)?;
     stage.add(1)?;
     let width = labels.width();
-    let pieces: Vec<Option<&WarpedPhoto>> = photos.iter().map(Option::as_ref).collect();
     let differ = |a: usize, c: usize, x: usize, y: usize| difference(pieces[a], pieces[c], x, y);
     let free = |x: usize, y: usize| near[y * width + x];
     Labeling { photos: &pieces, unary: |_, _, _| 0, difference: differ, free }.expand(labels, 1, &stage)?;
     stage.add(1)
 }
 
+/// Moves seams by up to `reach` blocks. The label of a block is that of its middle; what two photographs differ there is the most of four places.
+fn refine_blocks(
+    labels: &mut Image<u16, 1>,
+    photos: &[Option<&WarpedPhoto>],
+    reach: usize,
+    stage: &Stage<'_>,
+) -> Result<(), Cancelled> {
+    const MIDDLE: usize = BLOCK / 2;
+    let (w, h) = labels.size();
+    // Blocks whose middles there are.
+    let (across, down) = ((w + BLOCK - 1 - MIDDLE) / BLOCK, (h + BLOCK - 1 - MIDDLE) / BLOCK);
+    let before = Image::from_fn(across, down, |x, y| labels.at(BLOCK * x + MIDDLE, BLOCK * y + MIDDLE));
+    let thinned: Vec<Option<WarpedPhoto>> = photos.iter().map(|photo| photo.map(thinned)).collect();
+    let reached: Vec<Option<&WarpedPhoto>> = thinned.iter().map(Option::as_ref).collect();
+    let near = near_seams(&before, reach, stage)?;
+    let differ = |a: usize, c: usize, x: usize, y: usize| {
+        let of = |x: usize, y: usize| difference(photos[a], photos[c], x, y);
+        let (x, y) = (BLOCK * x, BLOCK * y);
+        of(x, y).max(of(x + MIDDLE, y)).max(of(x, y + MIDDLE)).max(of(x + MIDDLE, y + MIDDLE))
+    };
+    let free = |x: usize, y: usize| near[y * across + x];
+    let mut after = before.clone();
+    Labeling { photos: &reached, unary: |_, _, _| 0, difference: differ, free }.expand(&mut after, 1, stage)?;
+    for (i, (old, new)) in before.pixels().zip(after.pixels()).enumerate() {
+        let (left, top) = (BLOCK * (i % across), BLOCK * (i / across));
+        let Some(Some(photo)) = photos.get(usize::from(new[0])).filter(|_| old != new) else { continue };
+        for y in top..(top + BLOCK).min(h) {
+            for (x, label) in (left..).zip(&mut labels.row_mut(y)[left..(left + BLOCK).min(w)]) {
+                if photo.reaches(x, y) {
+                    *label = new[0];
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+/// A photograph's pixels in the middles of blocks.
+fn thinned(photo: &WarpedPhoto) -> WarpedPhoto {
+    let b = photo.bounds;
+    // The first block whose middle is not before a column or row.
+    let block = |v: usize| v.saturating_sub(BLOCK / 2).div_ceil(BLOCK);
+    let bounds = Bounds { left: block(b.left), top: block(b.top), right: block(b.right), bottom: block(b.bottom) };
+    let middle = |v: usize| BLOCK * v + BLOCK / 2;
+    let pixels = Image::from_fn(bounds.width(), bounds.height(), |x, y| {
+        photo.pixels.at(middle(bounds.left + x) - b.left, middle(bounds.top + y) - b.top)
+    });
+    WarpedPhoto { bounds, pixels }
+}
+
 /// True within `reach` pixels (in x and y) of a border between two labels.
 fn near_seams(labels: &Image<u16, 1>, reach: usize, stage: &Stage<'_>) -> Result<Vec<bool>, Cancelled> {
     let (w, h) = labels.size();
-    let names = labels.as_slice();
-    let mut seam = vec![false; w * h];
-    for y in 0..h {
-        if asks(y, w) {
-            stage.check()?;
-        }
-        for x in 0..w {
-            let own = names[y * w + x];
-            let differs = |other: usize| own != NO_PHOTO && names[other] != NO_PHOTO && own != names[other];
-            let i = y * w + x;
-            seam[i] = x + 1 < w && differs(i + 1) || y + 1 < h && differs(i + w);
-        }
-    }
     // Along rows, then along columns: the pixels since the last seam and until the next.
-    let mut rows = seam.clone();
+    let mut near = vec![false; w * h];
+    for_each_row(&mut near, w, stage, |y, near| {
+        let own = labels.row(y);
+        let below = labels.row((y + 1).min(h - 1));
+        let differs = |a: u16, b: u16| a != b && a != NO_PHOTO && b != NO_PHOTO;
+        // First column that is not marked yet.
+        let mut marked = 0;
+        for x in 0..w {
+            if differs(own[x], below[x]) || x + 1 < w && differs(own[x], own[x + 1]) {
+                let end = (x + reach + 1).min(w);
+                near[marked.max(x.saturating_sub(reach))..end].fill(true);
+                marked = end;
+            }
+        }
+    })?;
+    // Bands of columns: how many rows ago each of them last met a mark, downwards; those met upwards fill the rows between.
+    let mut since = vec![usize::MAX; w];
+    let mut until: Vec<usize> = vec![0; w];
     for y in 0..h {
         if asks(y, w) {
             stage.check()?;
         }
-        let (from, to) = (&seam[y * w..(y + 1) * w], &mut rows[y * w..(y + 1) * w]);
-        dilate(from.iter().zip(to.iter_mut()), reach);
-        dilate(from.iter().zip(to.iter_mut()).rev(), reach);
-    }
-    let mut all = rows.clone();
-    for backwards in [false, true] {
-        // Whole rows at a time: how many rows ago each column last met a seam.
-        let mut since = vec![usize::MAX; w];
-        for k in 0..h {
-            if asks(k, w) {
-                stage.check()?;
-            }
-            let y = if backwards { h - 1 - k } else { k };
-            let row = y * w..(y + 1) * w;
-            for ((since, from), to) in since.iter_mut().zip(&rows[row.clone()]).zip(&mut all[row]) {
-                *since = if *from { 0 } else { since.saturating_add(1) };
-                *to |= *since <= reach;
+        let (before, row) = near.split_at_mut(y * w);
+        for (x, ((since, until), near)) in since.iter_mut().zip(&mut until).zip(row).enumerate() {
+            if *near {
+                // Rows before this one that are not marked yet.
+                for above in (*until).max(y.saturating_sub(reach))..y {
+                    before[above * w + x] = true;
+                }
+                (*since, *until) = (0, y + 1);
+            } else {
+                *since = since.saturating_add(1);
+                if *since <= reach {
+                    *near = true;
+                    *until = y + 1;
+                }
             }
         }
     }
-    Ok(all)
-}
-
-/// Marks what lies within `reach` after a mark.
-fn dilate<'a>(line: impl Iterator<Item = (&'a bool, &'a mut bool)>, reach: usize) {
-    let mut since = usize::MAX;
-    for (from, to) in line {
-        since = if *from { 0 } else { since.saturating_add(1) };
-        *to |= since <= reach;
-    }
+    Ok(near)
 }
 
 #[cfg(test)]
@@ -326,12 +378,39 @@ mod tests {
         // A straight seam beside the pole's right side in the second photograph, six pixels into it.
         let mut labels = Image::from_fn(SIZE.0, SIZE.1, |x, _| [u16::from(x >= 88)]);
         let before = misfit(&labels, &preview);
-        refine(&mut labels, &photos, 8, &Silent).unwrap();
+        // Two preview pixels of four.
+        refine(&mut labels, &photos, 4, &Silent).unwrap();
         assert!(before > 5000 && misfit(&labels, &preview) < before / 10, "{before} {}", misfit(&labels, &preview));
         for (x, y) in (0..SIZE.1).flat_map(|y| (0..SIZE.0).map(move |x| (x, y))) {
             // The step lies between columns 87 and 88; the band reaches 8 from the former.
             let free = (79..=95).contains(&x);
             assert!(free || labels.at(x, y)[0] == u16::from(x >= 88), "{x} {y}");
+        }
+    }
+
+    #[test]
+    fn refinement_by_blocks_finds_what_lies_far_off_and_leaves_labels_where_their_photographs_reach() {
+        let preview = preview();
+        let photos: Vec<Option<WarpedPhoto>> = preview.pieces.iter().map(|p| Some(p.warped.clone())).collect();
+        // In the middle of the pole of the first photograph, whose right side lies 4 pixels off; the second's pole ends 16 pixels off.
+        let mut labels = Image::from_fn(SIZE.0, SIZE.1, |x, _| [u16::from(x >= 76)]);
+        let before = misfit(&labels, &preview);
+        refine(&mut labels, &photos, 12, &Silent).unwrap();
+        assert!(before > 5000 && misfit(&labels, &preview) < before / 10, "{before} {}", misfit(&labels, &preview));
+        for (x, y) in (0..SIZE.1).flat_map(|y| (0..SIZE.0).map(move |x| (x, y))) {
+            assert!(preview.pieces[usize::from(labels.at(x, y)[0])].warped.reaches(x, y), "{x} {y}");
+        }
+    }
+
+    #[test]
+    fn thinned_photographs_reach_the_blocks_whose_middles_they_reach() {
+        for (left, right) in [(0, 13), (1, 14), (2, 15), (3, 16), (6, 7), (7, 9)] {
+            let bounds = Bounds { left, top: left, right, bottom: right };
+            let photo = drawn(bounds, |x, y| [x as u8, y as u8, 0]);
+            let small = thinned(&photo);
+            for (x, y) in (0..5).flat_map(|y| (0..5).map(move |x| (x, y))) {
+                assert_eq!(small.color(x, y), photo.color(BLOCK * x + 2, BLOCK * y + 2), "{left} {right} {x} {y}");
+            }
         }
     }
 }

@@ -8,9 +8,11 @@ use crate::align::Alignment;
 use crate::surface::{DisplacementField, Layout, PAD, PLACES, Placement, REACH, Surface, Template};
 use cv_core::{Cancelled, GrayU8, ImageView, Point2, Progress, Stage, Vector2};
 use cv_imgproc::bilinear_at;
+use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 
 /// Two placements' positions of one thing on the canvas, before anything is displaced.
+#[derive(Clone, Copy)]
 struct TiePoint {
     p: usize,
     q: usize,
@@ -43,16 +45,18 @@ pub(crate) fn displacements(
     // Feature positions are good to a pixel or so of the photographs they were found on, patches to a fraction.
     solve(&mut fields, &ties, 3.0, &stage)?;
     stage.add(1)?;
-    let features = ties.len();
     let gray = |p: &ImageView<'_, u8, 3>| {
         let gray = cv_imgproc::rgb_to_gray(*p);
         stage.add(1).map(|()| gray)
     };
     let grays: Vec<GrayU8> = photos.par_iter().map(gray).collect::<Result<_, _>>()?;
+    let mut places = patch_places(layout, spacing);
+    let features = ties.len();
     // Twice: what the first round brings within reach, the second registers.
     for _ in 0..2 {
+        look(&mut places, &grays, layout, &fields, &stage)?;
         ties.truncate(features);
-        ties.extend(patch_ties(&grays, layout, &fields, spacing, &stage)?);
+        ties.extend(places.iter().filter_map(|place| place.tie));
         stage.add(1)?;
         solve(&mut fields, &ties, 3.0, &stage)?;
         stage.add(1)?;
@@ -228,15 +232,27 @@ const HALF: usize = 8;
 /// Patches tried in each overlap at most.
 const PER_OVERLAP: usize = 800;
 
-/// Tie points between patches of the photographs as drawn with the fields so far.
-fn patch_ties(
-    photos: &[GrayU8],
-    layout: &Layout,
-    fields: &[DisplacementField],
-    spacing: f64,
-    stage: &Stage<'_>,
-) -> Result<Vec<TiePoint>, Cancelled> {
-    let mut tries = Vec::new();
+/// A place where two placements are compared.
+struct Place {
+    p: usize,
+    q: usize,
+    at: Point2<f64>,
+    /// What was found.
+    tie: Option<TiePoint>,
+    /// How far the fields had moved one against the other when it was last looked at; `None` before that.
+    looked: Option<Vector2<f64>>,
+    /// Whether there is nothing to compare.
+    is_plain: bool,
+}
+
+/// Canvas pixels by which the fields must have moved before what was not alike is compared again: a step of the search.
+const MOVED: f64 = 1.0;
+/// Canvas pixels within which the fields bring a tie point together: looked at again, it would be found at the same place.
+const CLOSED: f64 = 0.5;
+
+/// Places on a grid over every overlap.
+fn patch_places(layout: &Layout, spacing: f64) -> Vec<Place> {
+    let mut places = Vec::new();
     for (p, first) in layout.placements.iter().enumerate() {
         for (q, second) in layout.placements.iter().enumerate().skip(p + 1) {
             let Some(common) = first.bounds.intersection(&second.bounds) else { continue };
@@ -248,35 +264,52 @@ fn patch_ties(
             let (across, down) = ((common.width() as f64 / step) as usize, (common.height() as f64 / step) as usize);
             for y in 0..down {
                 for x in 0..across {
-                    let at = |first: usize, i: usize| first as f64 + (i as f64 + 0.5) * step;
-                    tries.push((p, q, Point2::new(at(common.left, x).round(), at(common.top, y).round())));
+                    let at = |first: usize, i: usize| (first as f64 + (i as f64 + 0.5) * step).round();
+                    let at = Point2::new(at(common.left, x), at(common.top, y));
+                    places.push(Place { p, q, at, tie: None, looked: None, is_plain: false });
                 }
             }
         }
     }
-    let register_patch = |&(p, q, c): &(usize, usize, Point2<f64>)| {
-        let first = patch(photos, layout, &fields[p], p, c, HALF)?;
-        let least = corner_strength(&first);
-        // Texture in both directions of two and a half gray levels a pixel: below that noise decides where the best place is.
-        if least < 6.0 {
-            return None;
+    places
+}
+
+/// Compares the patches of the photographs, as drawn with the fields so far, at the places where that may say something new.
+fn look(
+    places: &mut [Place],
+    photos: &[GrayU8],
+    layout: &Layout,
+    fields: &[DisplacementField],
+    stage: &Stage<'_>,
+) -> Result<(), Cancelled> {
+    places.par_iter_mut().enumerate().try_for_each(|(i, place)| {
+        if i % 64 == 0 {
+            stage.check()?;
         }
-        let second = patch(photos, layout, &fields[q], q, c, HALF + REACH)?;
-        let offset = register(&first, second)?;
-        let other = c + offset;
-        Some(TiePoint { p, q, a: c - fields[p].at(c), b: other - fields[q].at(other) })
-    };
-    let found: Vec<Option<TiePoint>> = tries
-        .par_iter()
-        .enumerate()
-        .map(|(i, place)| {
-            if i % 64 == 0 {
-                stage.check()?;
-            }
-            Ok(register_patch(place))
-        })
-        .collect::<Result<_, Cancelled>>()?;
-    Ok(found.into_iter().flatten().collect())
+        let (p, q, c) = (place.p, place.q, place.at);
+        let apart = fields[p].at(c) - fields[q].at(c);
+        let is_known = match (&place.tie, place.looked) {
+            _ if place.is_plain => true,
+            (Some(tie), _) => (tie.a + fields[p].at(tie.a) - tie.b - fields[q].at(tie.b)).norm() < CLOSED,
+            (None, Some(before)) => (apart - before).norm() < MOVED,
+            (None, None) => false,
+        };
+        if is_known {
+            return Ok(());
+        }
+        (place.tie, place.looked) = (None, Some(apart));
+        let Some(first) = patch(photos, layout, &fields[p], p, c, HALF) else { return Ok(()) };
+        // Texture in both directions of two and a half gray levels a pixel: below that noise decides where the best place is.
+        place.is_plain = corner_strength(&first) < 6.0;
+        if !place.is_plain
+            && let Some(second) = patch(photos, layout, &fields[q], q, c, HALF + REACH)
+            && let Some(offset) = register(&first, second)
+        {
+            let other = c + offset;
+            place.tie = Some(TiePoint { p, q, a: c - fields[p].at(c), b: other - fields[q].at(other) });
+        }
+        Ok(())
+    })
 }
 
 /// A placement as drawn around a canvas pixel, `2 half + 1` on a side; `None` where it is not wholly inside the photograph.
@@ -308,20 +341,29 @@ fn patch(
         }
     }
     let side = 2 * half + 1;
+    let mut values = vec![0.0; side * side];
+    let (middle, ux, uy) = (middle.coords.cast::<f32>(), ux.cast::<f32>(), uy.cast::<f32>());
+    let corner = middle - (ux + uy) * half as f32;
+    dispatch!(Level::new(), _simd => sample_patch(photo, corner, ux, uy, &mut values));
+    Some(values)
+}
+
+/// Values at the places `corner + i ux + j uy` of a square, all of which lie inside.
+#[inline(always)]
+fn sample_patch(photo: &GrayU8, corner: Vector2<f32>, ux: Vector2<f32>, uy: Vector2<f32>, values: &mut [f32]) {
     let (width, height) = photo.size();
-    let (ux, uy) = (ux.cast::<f32>(), uy.cast::<f32>());
-    let mut values = Vec::with_capacity(side * side);
-    for j in 0..side {
-        let start = middle.cast::<f32>() + uy * (j as f32 - half as f32);
-        for i in 0..side {
-            let at = start + ux * (i as f32 - half as f32);
+    let side = values.len().isqrt();
+    let (right, bottom) = ((width - 2) as f32, (height - 2) as f32);
+    let view = photo.view();
+    for (j, row) in values.chunks_exact_mut(side).enumerate() {
+        let (u0, v0) = (corner.x + uy.x * j as f32, corner.y + uy.y * j as f32);
+        for (i, value) in row.iter_mut().enumerate() {
+            let (u, v) = (u0 + ux.x * i as f32, v0 + ux.y * i as f32);
             // Rounding to single precision may reach the last column or row.
-            let (x, y) = ((at.x as usize).min(width - 2), (at.y as usize).min(height - 2));
-            let (fx, fy) = (at.x - x as f32, at.y - y as f32);
-            values.extend(bilinear_at(photo.view(), x, y, fx, fy));
+            let (x, y) = (u.min(right) as usize, v.min(bottom) as usize);
+            [*value] = bilinear_at(view, x, y, u - x as f32, v - y as f32);
         }
     }
-    Some(values)
 }
 
 /// The lesser eigenvalue of the mean structure tensor of a patch.

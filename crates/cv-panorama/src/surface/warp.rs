@@ -8,8 +8,8 @@ use crate::light::ExposureCorrection;
 use crate::rows::for_each_row_with;
 use crate::surface::{Bounds, DisplacementField, Placement, Surface};
 use cv_core::{Cancelled, DistortionModel, Image, ImageView, Matrix3, Point2, Stage};
-use cv_imgproc::{Interpolation, bicubic_at, bilinear_at};
-use fearless_simd::{Level, dispatch};
+use cv_imgproc::{Interpolation, bicubic_rgb_at, bilinear_at};
+use fearless_simd::{Level, Simd, dispatch};
 
 /// A photograph drawn on a part of the canvas.
 #[derive(Debug, Clone, PartialEq)]
@@ -71,21 +71,22 @@ pub(crate) fn warp(
         pixels.as_mut_slice(),
         4 * width,
         stage,
-        || (vec![0.0_f32; width], vec![0.0_f32; width]),
-        |(us, vs), y, row| {
+        || Row::new(width),
+        |buffer, y, row| {
+            let (us, vs) = (&mut buffer.us[..], &mut buffer.vs[..]);
             dispatch!(level, _simd => map.row(y, us, vs));
             if let Some(field) = settings.displacement {
                 field.add_row((bounds.top + y) as f64, bounds.left as f64, us, vs);
             }
             match settings.interpolation {
                 Interpolation::Nearest => {
-                    dispatch!(level, _simd => sample_row(photo, us, vs, row, correction, nearest))
+                    dispatch!(level, simd => sample_row::<_, Nearest>(simd, photo, buffer, row, correction))
                 }
                 Interpolation::Bilinear => {
-                    dispatch!(level, _simd => sample_row(photo, us, vs, row, correction, bilinear));
+                    dispatch!(level, simd => sample_row::<_, Bilinear>(simd, photo, buffer, row, correction))
                 }
                 Interpolation::Bicubic => {
-                    dispatch!(level, _simd => sample_row(photo, us, vs, row, correction, bicubic))
+                    dispatch!(level, simd => sample_row::<_, Bicubic>(simd, photo, buffer, row, correction))
                 }
             }
         },
@@ -193,35 +194,63 @@ impl Map {
     }
 }
 
-/// Samples one row; coordinates outside the photograph take the nearest edge pixel and are marked as not reached.
-#[inline(always)]
-fn sample_row(
-    photo: ImageView<'_, u8, 3>,
-    us: &[f32],
-    vs: &[f32],
-    row: &mut [u8],
-    correction: Option<ExposureCorrection<'_>>,
-    sample: impl Fn(ImageView<'_, u8, 3>, f32, f32) -> [f32; 3],
-) {
-    let (right, bottom) = ((photo.width() - 1) as f32, (photo.height() - 1) as f32);
-    let corner = 4.0 / ((right + 1.0).powi(2) + (bottom + 1.0).powi(2));
-    let (pixels, _) = row.as_chunks_mut::<4>();
-    for ((pixel, &u), &v) in pixels.iter_mut().zip(us).zip(vs) {
-        let inside = u >= -0.5 && v >= -0.5 && u <= right + 0.5 && v <= bottom + 0.5;
-        // `max` first: it turns NaN into a number.
-        let (u, v) = (u.max(0.0).min(right), v.max(0.0).min(bottom));
-        let color = sample(photo, u, v);
-        let [r, g, b] = match &correction {
-            None => color,
-            Some(correction) => {
-                let (x, y) = (u - 0.5 * right, v - 0.5 * bottom);
-                correction.levels(color, correction.lift(corner * (x * x + y * y)))
-            }
-        };
-        *pixel = [round(r), round(g), round(b), if inside { 255 } else { 0 }];
+/// What is known of a row of the canvas, pixel by pixel.
+struct Row {
+    /// Photograph coordinates.
+    us: Vec<f32>,
+    vs: Vec<f32>,
+    colors: [Vec<f32>; 3],
+    /// Stops by which the light is lifted for its distance from the photograph's middle.
+    lifts: Vec<f32>,
+    clipped: Vec<f32>,
+}
+
+impl Row {
+    fn new(width: usize) -> Self {
+        let line = || vec![0.0; width];
+        Self { us: line(), vs: line(), colors: [line(), line(), line()], lifts: line(), clipped: line() }
     }
 }
 
+/// Samples one row; coordinates outside the photograph take the nearest edge pixel and are marked as not reached. One thing after the other, each in a loop
+/// that can be done in vectors but for the looking up.
+#[inline(always)]
+fn sample_row<S: Simd, I: Sampler>(
+    simd: S,
+    photo: ImageView<'_, u8, 3>,
+    buffer: &mut Row,
+    row: &mut [u8],
+    correction: Option<ExposureCorrection<'_>>,
+) {
+    let Row { us, vs, colors: [reds, greens, blues], lifts, clipped } = buffer;
+    let (right, bottom) = ((photo.width() - 1) as f32, (photo.height() - 1) as f32);
+    let corner = 4.0 / ((right + 1.0).powi(2) + (bottom + 1.0).powi(2));
+    let (pixels, _) = row.as_chunks_mut::<4>();
+    for ((pixel, u), v) in pixels.iter_mut().zip(us.iter_mut()).zip(vs.iter_mut()) {
+        let inside = (*u >= -0.5) & (*v >= -0.5) & (*u <= right + 0.5) & (*v <= bottom + 0.5);
+        pixel[3] = if inside { 255 } else { 0 };
+        // `max` first: it turns NaN into a number.
+        (*u, *v) = (u.max(0.0).min(right), v.max(0.0).min(bottom));
+    }
+    let places = pixels.iter().zip(us.iter().zip(vs.iter()));
+    for (((place, r), g), b) in places.zip(reds.iter_mut()).zip(greens.iter_mut()).zip(blues.iter_mut()) {
+        let (pixel, (&u, &v)) = place;
+        // Beyond the border there is nothing to be sharp about.
+        [*r, *g, *b] = if pixel[3] > 0 { I::sample(simd, photo, u, v) } else { Nearest::sample(simd, photo, u, v) };
+    }
+    if let Some(correction) = &correction {
+        for ((lift, &u), &v) in lifts.iter_mut().zip(us.iter()).zip(vs.iter()) {
+            let (x, y) = (u - 0.5 * right, v - 0.5 * bottom);
+            *lift = correction.lift(corner * (x * x + y * y));
+        }
+        correction.row_of_levels([&mut reds[..], &mut greens[..], &mut blues[..]], lifts, clipped);
+    }
+    for (((pixel, &r), &g), &b) in pixels.iter_mut().zip(reds.iter()).zip(greens.iter()).zip(blues.iter()) {
+        [pixel[0], pixel[1], pixel[2]] = [round(r), round(g), round(b)];
+    }
+}
+
+#[inline(always)]
 fn round(v: f32) -> u8 {
     // Saturates, as float-to-integer casts do.
     (v + 0.5) as u8
@@ -230,25 +259,43 @@ fn round(v: f32) -> u8 {
 /// The base pixel of a place inside the photograph, and the fractions beyond it.
 #[inline(always)]
 fn split(u: f32, v: f32) -> (usize, usize, f32, f32) {
-    let (x, y) = (u as usize, v as usize);
-    (x, y, u - x as f32, v - y as f32)
+    let (x, y) = (u as i32, v as i32);
+    (x as usize, y as usize, u - x as f32, v - y as f32)
 }
 
-#[inline(always)]
-fn nearest(photo: ImageView<'_, u8, 3>, u: f32, v: f32) -> [f32; 3] {
-    photo.at((u + 0.5) as usize, (v + 0.5) as usize).map(f32::from)
+/// A kind of interpolation, at a place inside the photograph. (A type and not a function that is handed over: that would be called, and compiled for no
+/// instruction set in particular.)
+trait Sampler {
+    fn sample<S: Simd>(simd: S, photo: ImageView<'_, u8, 3>, u: f32, v: f32) -> [f32; 3];
 }
 
-#[inline(always)]
-fn bilinear(photo: ImageView<'_, u8, 3>, u: f32, v: f32) -> [f32; 3] {
-    let (x, y, fx, fy) = split(u, v);
-    bilinear_at(photo, x, y, fx, fy)
+struct Nearest;
+
+impl Sampler for Nearest {
+    #[inline(always)]
+    fn sample<S: Simd>(_: S, photo: ImageView<'_, u8, 3>, u: f32, v: f32) -> [f32; 3] {
+        photo.at((u + 0.5) as usize, (v + 0.5) as usize).map(f32::from)
+    }
 }
 
-#[inline(always)]
-fn bicubic(photo: ImageView<'_, u8, 3>, u: f32, v: f32) -> [f32; 3] {
-    let (x, y, fx, fy) = split(u, v);
-    bicubic_at(photo, x, y, fx, fy)
+struct Bilinear;
+
+impl Sampler for Bilinear {
+    #[inline(always)]
+    fn sample<S: Simd>(_: S, photo: ImageView<'_, u8, 3>, u: f32, v: f32) -> [f32; 3] {
+        let (x, y, fx, fy) = split(u, v);
+        bilinear_at(photo, x, y, fx, fy)
+    }
+}
+
+struct Bicubic;
+
+impl Sampler for Bicubic {
+    #[inline(always)]
+    fn sample<S: Simd>(simd: S, photo: ImageView<'_, u8, 3>, u: f32, v: f32) -> [f32; 3] {
+        let (x, y, fx, fy) = split(u, v);
+        bicubic_rgb_at(simd, photo, x, y, fx, fy)
+    }
 }
 
 #[cfg(test)]
@@ -401,8 +448,9 @@ mod tests {
             let Some(color) = warped.color(x, y).filter(|_| p.view.contains(q)) else { continue };
             seen += 1;
             for (got, want) in color.into_iter().zip(plain(&photo, q, correction)) {
-                // Half a level of rounding, and positions in single precision: 1e-4 px on slopes of up to 255 levels times 1.5 · e^0.3.
-                assert!((f64::from(got) - want).abs() < 0.6, "{x} {y}: {got} {want}");
+                // Half a level of rounding; positions in single precision, 1e-4 px on slopes of up to 255 levels times 1.5 · e^0.3; and a sixteenth of a level of
+                // the photograph, which the two sums of samples may be rounded to differently, times the same.
+                assert!((f64::from(got) - want).abs() < 0.75, "{x} {y}: {got} {want}");
             }
         }
         assert!(seen > 3000, "{seen}");
