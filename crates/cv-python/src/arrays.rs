@@ -249,6 +249,10 @@ fn of_shape(py: Python<'_>, shape: &[usize], words: &str) -> PyErr {
 
 /// Whether an image is used where it lies in memory; otherwise each call copies it. Arrays whose pixels lie one after the other are, crops and every n-th row too; flipped
 /// ones and BGR views of RGB ones are not.
+///
+///     >>> image = np.zeros((60, 80, 3), np.uint8)
+///     >>> epipole.is_borrowed(image[10:50, 20:]), epipole.is_borrowed(image[:, ::-1])
+///     (True, False)
 #[pyfunction]
 pub(crate) fn is_borrowed(image: &Bound<'_, PyAny>) -> PyResult<bool> {
     Ok(match ImageArg::new(image, "image")? {

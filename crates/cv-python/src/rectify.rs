@@ -115,6 +115,11 @@ impl PyUndistorter {
 }
 
 /// A photograph without the distortion of its lens, and the camera that would have taken it: `(image, camera)`. For many photographs of one camera, `Undistorter` makes the map once.
+///
+///     >>> camera = epipole.Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]], [-0.1, 0.01, 0, 0])
+///     >>> straight, pinhole = epipole.undistort(np.zeros((480, 640, 3), np.uint8), camera)
+///     >>> straight.shape, pinhole.lens
+///     ((480, 640, 3), 'none')
 #[pyfunction]
 #[pyo3(signature = (image, camera, **options))]
 pub(crate) fn undistort<'py>(
