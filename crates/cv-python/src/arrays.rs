@@ -133,7 +133,12 @@ impl<'py> Rgb<'py> {
     pub(crate) fn new(given: &Bound<'py, PyAny>, what: &str) -> PyResult<Self> {
         match ImageArg::new(given, what)? {
             ImageArg::U8(borrowed) => match borrowed.view::<1>() {
-                Some(gray) => Ok(Self::Made(RgbU8::from_fn(gray.width(), gray.height(), |x, y| [gray.at(x, y)[0]; 3]))),
+                Some(gray) => {
+                    let made = RgbU8::from_fn(gray.width(), gray.height(), |x, y| [gray.at(x, y)[0]; 3]);
+                    // Of a list of large ones, that takes long.
+                    given.py().check_signals()?;
+                    Ok(Self::Made(made))
+                }
                 None => Ok(Self::Borrowed(borrowed)),
             },
             other => {
