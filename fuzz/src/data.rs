@@ -1,4 +1,4 @@
-//! Models and options as JSON.
+//! Models and options as JSON, options of the program as TOML.
 
 use crate::structured::Input;
 use cv_core::RgbU8;
@@ -28,6 +28,19 @@ pub fn options(bytes: &[u8]) -> Corpus {
     let Ok(options) = serde_json::from_slice::<cv_pipeline::RobustOptions>(bytes) else { return Corpus::Reject };
     if options.max_iterations <= 1000 && options.min_iterations <= 1000 {
         let _ = cv_pipeline::estimate(&pairs, cv_pipeline::ModelKind::Homography, &options, &Silent);
+    }
+    Corpus::Keep
+}
+
+/// `cv.toml`, as the program reads it.
+pub fn toml(bytes: &[u8]) -> Corpus {
+    let Ok(table) = basic_toml::from_slice::<serde_json::Map<String, serde_json::Value>>(bytes) else {
+        return Corpus::Reject;
+    };
+    let text = basic_toml::to_string(&table);
+    if let Ok(text) = text {
+        let again: Result<serde_json::Map<String, serde_json::Value>, _> = basic_toml::from_str(&text);
+        assert!(again.is_ok_and(|again| again.len() == table.len()), "{text}");
     }
     Corpus::Keep
 }

@@ -4,6 +4,10 @@
 //! something else, a count is off.
 
 #[cfg(feature = "pipelines")]
+pub mod boards;
+#[cfg(feature = "pipelines")]
+pub mod checkpoint;
+#[cfg(feature = "pipelines")]
 pub mod data;
 pub mod parsers;
 #[cfg(feature = "pipelines")]

@@ -208,3 +208,13 @@ pub fn features(bytes: &[u8]) -> Corpus {
     let _ = cv_io::parse_colmap_features(text);
     Corpus::Keep
 }
+
+pub fn places(bytes: &[u8]) -> Corpus {
+    let Ok(text) = std::str::from_utf8(bytes) else { return Corpus::Reject };
+    if let Ok(places) = cv_io::parse_places(text) {
+        assert!(places.iter().all(|(_, place)| place.coords.iter().all(|v| v.is_finite())));
+        let names: std::collections::HashSet<&String> = places.iter().map(|(name, _)| name).collect();
+        assert!(!places.is_empty() && names.len() == places.len());
+    }
+    Corpus::Keep
+}

@@ -111,7 +111,7 @@ fn depth_options(u: &mut Unstructured<'_>) -> DepthOptions {
         _ => DisparityRange::Given,
     };
     let range = if strange { (make::number(u) as f32, make::number(u) as f32) } else { (0.0, f32::INFINITY) };
-    DepthOptions { stereo, disparities, range }
+    DepthOptions { stereo, disparities, range, ..DepthOptions::default() }
 }
 
 pub fn depth(bytes: &[u8]) -> Corpus {

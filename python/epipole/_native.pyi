@@ -118,13 +118,15 @@ class SfmPhotograph:
     @property
     def focal(self) -> float | None: ...
     @property
+    def gps(self) -> tuple[float, float, float | None] | None: ...
+    @property
     def keypoints(self) -> NDArray[np.float32]: ...
     def __len__(self) -> int: ...
     @staticmethod
     def _of_parts(
         name: str,
         size: _Size,
-        focal: float | None,
+        exif: tuple[float | None, tuple[float, float, float | None] | None],
         keypoints: ArrayLike,
         descriptors: bytes,
         kind: str,
@@ -369,6 +371,8 @@ def sfm(
     ignore_exif: bool | None = False,
     names: Sequence[str] | None = None,
     centers: ArrayLike | None = None,
+    distances: Sequence[tuple[int, int, float]] | None = None,
+    ignore_gps: bool | None = False,
     solver: Literal["auto", "incremental", "global"] | None = "auto",
     order: Literal["any", "sequence"] | None = "any",
     max_error: float | None = 2.5,

@@ -440,7 +440,8 @@ class SfmResult(_Result):
     solvers: tuple[str, ...]
     """How each was found."""
     frames: tuple[str, ...]
-    """What each was brought to: ``centers`` that were given, ``upright`` (Z up, its unit arbitrary), or ``any``."""
+    """What each was brought to: ``centers`` that were given, ``gps`` positions (meters; X east, Y north, Z up), ``distances`` (Z up, in their unit), ``upright`` (Z up, its unit arbitrary), or
+    ``any``."""
     left_out: dict[str, dict[str, Any]]
     """By name, why a photograph is in no model."""
     pairs: int

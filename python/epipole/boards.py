@@ -1,4 +1,8 @@
-"""Calibration boards, for ``find_board`` and ``calibrate``. Lengths are in any unit: that of the distances that come out."""
+"""Calibration boards, for ``find_board`` and ``calibrate``. Lengths are in any unit: that of the distances that come out.
+
+>>> epipole.CharucoBoard((7, 5), square=35.0, marker=26.0)
+CharucoBoard(size=(7, 5), square=35.0, marker=26.0, dictionary='5x5_100')
+"""
 
 from dataclasses import dataclass
 

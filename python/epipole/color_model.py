@@ -29,6 +29,14 @@ class ColorModel:
     ``predict(photographs)``, ``score(photographs, masks)`` (F1); ``get_params``, ``set_params`` and ``clone`` work. What is fitted ends in ``_``.
 
     Options: ``defaults("ColorModel")``.
+
+    >>> random = np.random.default_rng(0)
+    >>> mask = np.zeros((40, 60), bool)
+    >>> mask[10:30, 20:40] = True
+    >>> photograph = (np.where(mask[..., None], [220, 120, 30], [40, 90, 160]) + random.integers(0, 12, (40, 60, 3))).astype(np.uint8)
+    >>> model = epipole.ColorModel().fit([photograph], [mask])
+    >>> model.score([photograph], [mask]) > 0.98
+    True
     """
 
     def __init__(

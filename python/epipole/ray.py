@@ -71,13 +71,16 @@ def sfm(photographs, output, *, actors=None, restarts=_RESTARTS, names=None, max
     """
     found = _run("sfm", _SfmFeatures, photographs, ("image",), output, ".pickle", actors, restarts, names, {"max_features": max_features})
     rows = sorted(found.take_all(), key=lambda row: row["name"])
-    seen = []
-    for row in rows:
+    labels = [os.path.basename(row["image"]) for row in rows]
+    if len(set(labels)) < len(labels):
+        labels = [row["name"] for row in rows]
+    seen = {}
+    for label, row in zip(labels, rows):
         if row["error"] is None:
             with open(row["output"], "rb") as file:
-                seen.append(pickle.load(file))
-    result = epipole.sfm(seen, **options)
-    unread = {os.path.basename(row["image"]): {"kind": "Unreadable", "message": row["error"]} for row in rows if row["error"]}
+                seen[label] = pickle.load(file)
+    result = epipole.sfm(list(seen.values()), names=list(seen), **options)
+    unread = {label: {"kind": "Unreadable", "message": row["error"]} for label, row in zip(labels, rows) if row["error"]}
     return dataclasses.replace(result, left_out={**unread, **result.left_out})
 
 

@@ -21,20 +21,30 @@ def run(code, **options):
     )
 
 
-def test_control_c_stops_a_long_job_soon():
+@pytest.mark.parametrize(
+    ("job", "seconds"),
+    [
+        ("depth(image, turned, disparities=256)", 1.0),
+        # While views are simulated, at full size too.
+        ("match_features(image, turned, affine_simulation='always')", 4.0),
+        ("sfm([image, turned, image[::-1].copy()])", 1.0),
+        ("panorama([np.repeat(np.roll(image, shift, 1)[:, :3000, None], 3, 2) for shift in (0, 1200)])", 1.5),
+    ],
+)
+def test_control_c_stops_a_long_job_soon(job, seconds):
     # Two pictures of 12 Mpx take seconds.
     found = run(
-        """
+        f"""
         import os, signal, threading, time
         import epipole, numpy as np
         image = np.random.default_rng(0).integers(0, 255, (3000, 4000), np.uint8)
-        sent = []
+        turned, sent = image[:, ::-1].copy(), []
         def send():
             sent.append(time.monotonic())
             os.kill(os.getpid(), signal.SIGINT)
-        threading.Timer(1.0, send).start()
+        threading.Timer({seconds}, send).start()
         try:
-            epipole.depth(image, image[:, ::-1].copy(), disparities=256)
+            epipole.{job}
         except KeyboardInterrupt:
             print(time.monotonic() - sent[0])
         """

@@ -34,16 +34,22 @@ def rows(dataset):
     return sorted(dataset.take_all(), key=lambda row: row["name"])
 
 
+CORRUPT = {3, 9, 10, 57, 100, 101, 163, 200, 231, 239}
+"""Of the 240 pairs."""
+
+
 @pytest.fixture(scope="module")
 def pairs(tmp_path_factory):
-    """24 pairs under names of their own, four of them broken."""
+    """240 small pairs under names of their own, ten of them broken."""
     folder = tmp_path_factory.mktemp("pairs")
-    for i in range(24):
-        for side in ("left", "right"):
-            shutil.copy(FIXTURES / "stereo" / f"{side}.jpg", folder / f"{side}{i:02}.jpg")
-    for i in (3, 9, 10, 17):
-        (folder / f"left{i:02}.jpg").write_bytes(b"no picture")
-    return [(folder / f"left{i:02}.jpg", folder / f"right{i:02}.jpg") for i in range(24)]
+    for side in ("left", "right"):
+        image = epipole.read_image(FIXTURES / "stereo" / f"{side}.jpg")
+        epipole.write_image(folder / f"{side}.png", np.ascontiguousarray(image[60:180, 100:300]))
+        for i in range(240):
+            shutil.copy(folder / f"{side}.png", folder / f"{side}{i:03}.png")
+    for i in CORRUPT:
+        (folder / f"left{i:03}.png").write_bytes(b"no picture")
+    return [(folder / f"left{i:03}.png", folder / f"right{i:03}.png") for i in range(240)]
 
 
 def test_bad_files_are_rows_with_an_error_and_a_second_run_computes_nothing(cluster, pairs, tmp_path):
@@ -53,7 +59,7 @@ def test_bad_files_are_rows_with_an_error_and_a_second_run_computes_nothing(clus
     found = rows(epipole.ray.depth(pairs, tmp_path / "d", disparities=64, actors=2))
     killer.join()
     assert killed or not os.path.isdir("/proc")
-    assert [row["error"] is not None for row in found] == [i in (3, 9, 10, 17) for i in range(24)]
+    assert [row["error"] is not None for row in found] == [i in CORRUPT for i in range(240)]
     assert all("FileError" in row["error"] and row["output"] is None for row in found if row["error"])
     images = [epipole.read_image(path) for path in pairs[0]]
     expected = epipole.depth(*images, disparities=64)
@@ -112,9 +118,19 @@ def test_the_other_jobs(cluster, tmp_path):
     expected = epipole.extract_features(epipole.read_image(plane[0]), max_features=500)
     assert len(a) == found[0]["count"] and a.kind == expected.kind
     assert np.array_equal(a.descriptors, expected.descriptors)
+    expected = epipole.match(a, b)
     dataset = ray.data.from_items([{"a": files[0], "b": files[1]}])
     found = rows(epipole.ray.match_pairs(dataset, tmp_path / "m"))
-    assert found[0]["count"] == len(epipole.match(a, b)) > 20 and found[0]["error"] is None
+    assert found[0]["count"] == len(expected) > 20 and found[0]["error"] is None
+    # As a list, with options, and beside a pair of which one is missing.
+    listed = [(files[0], files[1]), (files[0], tmp_path / "nowhere.npz")]
+    found = rows(epipole.ray.match_pairs(listed, tmp_path / "n", guided="homography", seed=3))
+    assert [row["name"] for row in found] == ["a-b", "a-nowhere"]
+    guided = epipole.match(a, b, guided="homography", seed=3)
+    with np.load(found[0]["output"]) as arrays:
+        assert np.array_equal(arrays["points"], guided.points) and np.array_equal(arrays["indices"], guided.indices)
+        assert np.array_equal(arrays["ratios"], guided.ratios)
+    assert len(guided) > len(expected) and found[1]["error"].startswith("FileNotFoundError") and found[1]["output"] is None
 
 
 def test_many_views_with_features_from_the_cluster(cluster, tmp_path):
@@ -129,6 +145,10 @@ def test_many_views_with_features_from_the_cluster(cluster, tmp_path):
     assert list(found.left_out) == ["4.png"] and "FileNotFoundError" in found.left_out["4.png"]["message"]
     expected = epipole.sfm(paths[:4], camera=camera)
     assert np.array_equal(found.model.points, expected.model.points)
+    # Two that cannot be read, of one name in two folders.
+    more = [*paths[:4], tmp_path / "x" / "9.png", tmp_path / "y" / "9.png"]
+    found = epipole.ray.sfm(more, tmp_path / "more", names=["a", "b", "c", "d", "x9", "y9"], camera=camera)
+    assert sorted(found.left_out) == ["x9", "y9"] and [image.name for image in found.model.images.values()] == ["a", "b", "c", "d"]
 
 
 def test_mistakes_are_told_before_the_work(cluster, tmp_path):

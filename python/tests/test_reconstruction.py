@@ -93,6 +93,60 @@ def test_many_photographs(photographs, tmp_path):
     assert upright.frames == ("upright",) and len(upright.model) == 5
 
 
+def test_what_is_told_of_places(photographs, tmp_path):
+    camera = epipole.Camera(*SIZE, MATRIX)
+    centers = np.array([-r.T @ t for r, t in walk()])
+    between = np.linalg.norm(centers[4] - centers[0])
+    found = epipole.sfm(photographs, camera=camera, distances=[(0, 4, 10 * between)])
+    first, last = (found.model.images[i].center for i in (1, 5))
+    # The distance alone tells the scale: exact but for rounding.
+    assert found.frames == ("distances",) and np.linalg.norm(last - first) == pytest.approx(10 * between)
+    # A degree of latitude is the meridian's radius times π/180: 110.57 km at the equator, where a degree of longitude is 111.32 km.
+    east, north = 6_378_137.0, 6_335_439.3
+    gps = [(y / north, x / east, 50.0 - z) for x, z, y in centers]
+    seen = [epipole.sfm_features(photograph, name=str(i)) for i, photograph in enumerate(photographs)]
+    assert seen[0].gps is None
+    told = [with_gps(one, place) for one, place in zip(seen, gps)]
+    assert pickle.loads(pickle.dumps(told[2])).gps == gps[2]
+    found = epipole.sfm(told, camera=camera)
+    assert found.frames == ("gps",)
+    size = [np.linalg.norm(image.center - found.model.images[1].center) for image in found.model.images.values()]
+    # As with the centers themselves, above.
+    assert np.allclose(size, np.linalg.norm(centers - centers[0], axis=1), atol=0.02)
+    assert epipole.sfm(told, camera=camera, ignore_gps=True).frames == ("upright",)
+    for wrong in ([(0, 0, 1.0)], [(0, 5, 1.0)], [(0, 1, 0.0)], [(0, 1, np.nan)]):
+        with pytest.raises(ValueError, match="distances"):
+            epipole.sfm(told, camera=camera, distances=wrong)
+    with pytest.raises(ValueError, match="distances"):
+        epipole.sfm(told, camera=camera, distances=[(0, 1)])
+
+
+def with_gps(seen, place):
+    """Features as of a photograph whose EXIF tells where it was taken."""
+    make, (name, size, (focal, _), *rest) = seen.__reduce__()
+    return make(name, size, (focal, place), *rest)
+
+
+def test_photographs_that_are_left_out_keep_their_names(photographs, tmp_path):
+    camera = epipole.Camera(*SIZE, MATRIX)
+    turned = np.ascontiguousarray(photographs[0].transpose(1, 0, 2))
+    found = epipole.sfm([*photographs, turned], camera=camera)
+    assert found.left_out == {"5": {"kind": "CameraSize", "photo": (300, 400), "camera": SIZE}}
+    assert len(found.model.images) == 5
+    # Without a camera of a size it is tried, and shows the same from elsewhere, or not.
+    bad = [tmp_path / folder / "bad.jpg" for folder in "xy"]
+    for path in bad:
+        path.parent.mkdir()
+        path.write_bytes(b"no picture")
+    found = epipole.sfm([*photographs, *bad], camera=camera)
+    assert list(found.left_out) == [str(path) for path in bad]
+    seen = [epipole.sfm_features(photograph, name="one") for photograph in photographs]
+    names = [image.name for image in epipole.sfm(seen, camera=camera).model.images.values()]
+    assert names == ["one", "one#2", "one#3", "one#4", "one#5"]
+    with pytest.raises(ValueError, match="two photographs"):
+        epipole.sfm(photographs, camera=camera, names=["a", "b", "c", "d", "a"])
+
+
 def test_features_that_were_found_before_give_the_same_model(photographs):
     camera = epipole.Camera(*SIZE, MATRIX)
     seen = [epipole.sfm_features(photograph, name=f"{i}") for i, photograph in enumerate(photographs)]

@@ -58,7 +58,11 @@ enum Chore {
         seed: u64,
     },
     /// Build the wheel of the Python package, install it into a virtual environment and run its tests.
-    Python,
+    Python {
+        /// As it is released: optimized, and on Linux for every one from glibc 2.17 on, by zig from PyPI.
+        #[arg(long)]
+        release: bool,
+    },
     /// Run other systems and ours on the same inputs, side by side.
     Peers {
         /// Only this job; `all` or none: every one.
@@ -74,7 +78,7 @@ fn main() -> ExitCode {
         Chore::Real { job } => real::run(job.as_deref()),
         Chore::Rendered { job } => rendered::run(job.as_deref()),
         Chore::Trust { job, count, seed } => trust::run(job.as_deref(), &trust::Options { count, seed }),
-        Chore::Python => python::run(),
+        Chore::Python { release } => python::run(release),
         Chore::Peers { job } => peers::run(job.as_deref()),
     };
     match result {

@@ -29,6 +29,7 @@
 mod camera;
 mod distortion;
 mod features;
+mod four_digits;
 mod geodetic;
 mod image;
 mod luma;
@@ -53,6 +54,7 @@ pub use distortion::{
     ParameterCountError,
 };
 pub use features::{Correspondence, DMatch, Keypoint};
+pub use four_digits::four_digits;
 pub use geodetic::{GeodeticPoint, east_north_up};
 pub use image::{GrayF32, GrayU8, Image, ImageError, Mask, RgbF32, RgbU8, Sample};
 pub use luma::{luma_f32, luma_u8, luma_u16};

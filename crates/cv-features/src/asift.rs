@@ -7,7 +7,7 @@ use crate::Features;
 use crate::error::{FeatureError, check_image};
 use crate::sift::{SMALLEST, SiftOptions, sift};
 use crate::simd;
-use cv_core::{GrayF32, ImageView, OptionError, Point2, Progress};
+use cv_core::{GrayF32, ImageView, OptionError, Point2, Progress, Stage};
 use cv_imgproc::{Border, RemapOptions, gaussian_half_kernel, mirror_ends, warp_with};
 use rayon::prelude::*;
 
@@ -46,13 +46,8 @@ pub fn sift_affine_view(
         let (x, y) = (x + low.0, y + low.1);
         Point2::new(cos * x + sin * y, cos * y - sin * x)
     };
-    let edge = RemapOptions { border: Border::Replicate, ..RemapOptions::default() };
-    let straight = warp_with(view, (turned_w, turned_h), &edge, |x, y| Some(back(x as f32, y as f32).cast::<f64>()));
-    let Ok((straight, _)) = straight else {
-        return Err(FeatureError::ImageTooSmall { width: w, height: h, needed: SMALLEST });
-    };
-    progress.report("slanted view", 0, 0)?;
-    let mut found = sift(compressed(&straight, tilt, width).view(), options, progress)?;
+    let compressed = compressed(view, (turned_w, turned_h), (tilt, width), back, progress)?;
+    let mut found = sift(compressed.view(), options, progress)?;
     // Areas shrink by the tilt, so lengths by its root.
     let grow = tilt.sqrt();
     let keep: Vec<bool> = found
@@ -72,25 +67,45 @@ pub fn sift_affine_view(
     Ok(found)
 }
 
-/// Every `tilt`-th column, smoothed along the rows by what the coarser sampling asks for (0.8·√(t² − 1), Morel & Yu).
-fn compressed(image: &GrayF32, tilt: f32, width: usize) -> GrayF32 {
-    let (w, h) = image.size();
+/// Rows that are turned at a time, between which it is asked whether to go on: some milliseconds, and less memory than the whole.
+const BAND: usize = 128;
+
+/// The view turned into `size` by `back`, which gives the position in the view; of that every `tilt`-th column, `width` of them, smoothed along the rows by what the coarser
+/// sampling asks for (0.8·√(t² − 1), Morel & Yu).
+fn compressed(
+    view: ImageView<'_, f32, 1>,
+    (w, h): (usize, usize),
+    (tilt, width): (f32, usize),
+    back: impl Fn(f32, f32) -> Point2<f32> + Sync,
+    progress: &dyn Progress,
+) -> Result<GrayF32, FeatureError> {
     let kernel = gaussian_half_kernel(0.8 * (tilt * tilt - 1.0).max(1e-6).sqrt());
     let r = kernel.len() - 1;
     let level = simd::level();
+    let edge = RemapOptions { border: Border::Replicate, ..RemapOptions::default() };
     let mut out = GrayF32::new(width, h, [0.0]);
-    let buffers = || (vec![0.0; w + 2 * r], vec![0.0; w]);
-    out.as_mut_slice().par_chunks_mut(width).enumerate().for_each_init(buffers, |(padded, smooth), (y, row)| {
-        padded[r..r + w].copy_from_slice(image.row(y));
-        mirror_ends::<1>(padded, r, r);
-        simd::horizontal(level, smooth, padded, &kernel);
-        for (i, o) in row.iter_mut().enumerate() {
-            let x = i as f32 * tilt;
-            let cell = (x as usize).min(w - 2);
-            *o = smooth[cell] + (x - cell as f32) * (smooth[cell + 1] - smooth[cell]);
-        }
-    });
-    out
+    let stage = Stage::new(progress, "slanted view", h.div_ceil(BAND))?;
+    for (band, rows) in out.as_mut_slice().chunks_mut(width * BAND).enumerate() {
+        let y0 = band * BAND;
+        let at = |x: usize, y: usize| Some(back(x as f32, (y0 + y) as f32).cast::<f64>());
+        let Ok((turned, _)) = warp_with(view, (w, rows.len() / width), &edge, at) else {
+            let (width, height) = view.size();
+            return Err(FeatureError::ImageTooSmall { width, height, needed: SMALLEST });
+        };
+        let buffers = || (vec![0.0; w + 2 * r], vec![0.0; w]);
+        rows.par_chunks_mut(width).enumerate().for_each_init(buffers, |(padded, smooth), (y, row)| {
+            padded[r..r + w].copy_from_slice(turned.row(y));
+            mirror_ends::<1>(padded, r, r);
+            simd::horizontal(level, smooth, padded, &kernel);
+            for (i, o) in row.iter_mut().enumerate() {
+                let x = i as f32 * tilt;
+                let cell = (x as usize).min(w - 2);
+                *o = smooth[cell] + (x - cell as f32) * (smooth[cell + 1] - smooth[cell]);
+            }
+        });
+        stage.add(1)?;
+    }
+    Ok(out)
 }
 
 #[cfg(test)]

@@ -70,7 +70,7 @@ pub use shared_focal::{SharedFocalPose, estimate_shared_focal_pose, refine_share
 pub use six_point::fundamental_six_point;
 pub use triangulation::{TriangulationError, correct_match, parallax_angle, triangulate, triangulate_linear};
 pub use two_view::{
-    Intrinsics, MatchedViews, PLAUSIBLE_FOCAL, TwoViewAdjustment, TwoViewError, TwoViewGeometry, TwoViewOptions,
-    TwoViewPoint, TwoViewReconstruction, estimate_two_view_geometry, reconstruct_two_views,
+    EXIF_FOCAL_DEVIATION, Intrinsics, MatchedViews, PLAUSIBLE_FOCAL, TwoViewAdjustment, TwoViewError, TwoViewGeometry,
+    TwoViewOptions, TwoViewPoint, TwoViewReconstruction, estimate_two_view_geometry, reconstruct_two_views,
 };
 pub use verified_pair::{NotAPair, VerifiedPair, VerifyOptions, verify_pair};

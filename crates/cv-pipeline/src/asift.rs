@@ -40,6 +40,8 @@ pub(crate) fn match_asift(
     for (side, tilt, rotation) in views {
         if let Some((view, more)) = matched(photos[side], &plain[1 - side], (tilt, rotation), sift, options, &stage)? {
             for m in more {
+                // Each looks at all there are.
+                stage.check()?;
                 let new = view.keypoints[m.query as usize].position;
                 let old = plain[1 - side].keypoints[m.train as usize].position;
                 let known = matches.iter().any(|n| {

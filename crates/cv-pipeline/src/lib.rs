@@ -93,8 +93,9 @@ pub use rectify::{RectifyResult, rectify};
 pub use rig_depth::{RigDepthResult, depth_by_rig};
 pub use segment::{DetectResult, SegmentResult, SegmentTraining, detect, segment, train_segment};
 pub use sfm::{
-    DensePhoto, PhotoOrder, SfmCamera, SfmDense, SfmDenseError, SfmDenseOptions, SfmJobError, SfmJobOptions, SfmPhoto,
-    SfmPhotoError, SfmResult, sfm, sfm_covariance, sfm_dense, sfm_pairs, sfm_photo, sfm_solve,
+    DensePhoto, GpsCenters, GpsFix, OtherSize, PhotoOrder, PhotoProgress, PlacedModel, SfmCamera, SfmCameras, SfmDense,
+    SfmDenseError, SfmDenseOptions, SfmJobError, SfmJobOptions, SfmPhoto, SfmPhotoError, SfmResult, gps_centers,
+    place_model, sfm, sfm_covariance, sfm_dense, sfm_pairs, sfm_photo, sfm_solve,
 };
 
 /// What a caller of [`depth()`] needs of the stereo stage: its options and results, rectification, geometry and scores.

@@ -133,7 +133,12 @@ impl<'py> Rgb<'py> {
     pub(crate) fn new(given: &Bound<'py, PyAny>, what: &str) -> PyResult<Self> {
         match ImageArg::new(given, what)? {
             ImageArg::U8(borrowed) => match borrowed.view::<1>() {
-                Some(gray) => Ok(Self::Made(RgbU8::from_fn(gray.width(), gray.height(), |x, y| [gray.at(x, y)[0]; 3]))),
+                Some(gray) => {
+                    let made = RgbU8::from_fn(gray.width(), gray.height(), |x, y| [gray.at(x, y)[0]; 3]);
+                    // Of a list of large ones, that takes long.
+                    given.py().check_signals()?;
+                    Ok(Self::Made(made))
+                }
                 None => Ok(Self::Borrowed(borrowed)),
             },
             other => {
@@ -249,6 +254,10 @@ fn of_shape(py: Python<'_>, shape: &[usize], words: &str) -> PyErr {
 
 /// Whether an image is used where it lies in memory; otherwise each call copies it. Arrays whose pixels lie one after the other are, crops and every n-th row too; flipped
 /// ones and BGR views of RGB ones are not.
+///
+///     >>> image = np.zeros((60, 80, 3), np.uint8)
+///     >>> epipole.is_borrowed(image[10:50, 20:]), epipole.is_borrowed(image[:, ::-1])
+///     (True, False)
 #[pyfunction]
 pub(crate) fn is_borrowed(image: &Bound<'_, PyAny>) -> PyResult<bool> {
     Ok(match ImageArg::new(image, "image")? {

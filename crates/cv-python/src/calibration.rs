@@ -84,6 +84,11 @@ fn gray(view: ImageView<'_, u8, 3>) -> GrayF32 {
 /// The points of a board on a photograph.
 ///
 /// board: Chessboard (the default, of any size), CharucoBoard, ArucoGrid or AprilGrid. Raises an error of epipole.errors that says what was seen where there is none.
+///
+///     >>> dark = np.pad(np.indices((6, 9)).sum(0) % 2, 1, constant_values=1)
+///     >>> found = epipole.find_board(np.kron(255 * dark, np.ones((20, 20))).astype(np.uint8))
+///     >>> found
+///     BoardView(40 points of a board of 8×5)
 #[pyfunction]
 #[pyo3(signature = (image, **options))]
 pub(crate) fn find_board<'py>(

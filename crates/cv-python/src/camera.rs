@@ -13,6 +13,12 @@ use std::path::PathBuf;
 ///
 /// width, height: px. matrix: K, 3×3, pixel centers at integers. distortion: the coefficients of the lens in OpenCV's order. lens: none, simple_radial (1 coefficient), radial (2),
 /// radial_tangential4, radial_tangential5, rational8, thin_prism12 or fisheye4; where it is not given, the number of coefficients tells it, and 4 are OpenCV's k1, k2, p1, p2.
+///
+///     >>> camera = epipole.Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]], [-0.1, 0.01, 0, 0])
+///     >>> camera
+///     Camera(640×480 px, focal 500.00 500.00, center 320.00 240.00, radial_tangential4 -0.1000 0.0100 0.0000 0.0000)
+///     >>> camera.project([[0.0, 0.0, 2.0]])
+///     array([[320., 240.]])
 #[pyclass(frozen, module = "epipole", name = "Camera")]
 pub(crate) struct PyCamera {
     pub(crate) camera: Camera,

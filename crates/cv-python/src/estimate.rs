@@ -71,6 +71,11 @@ fn uncalibrated<'py>(
 }
 
 /// The homography H, with b ~ H a, that most matches agree on. matches: (n, 4), rows x1 y1 x2 y2 in pixels.
+///
+///     >>> a = np.random.default_rng(1).uniform(0, 500, (40, 2))
+///     >>> found = epipole.estimate_homography(np.hstack([a, a + [7, -3]]))
+///     >>> np.allclose(found.model / found.model[2, 2], [[1, 0, 7], [0, 1, -3], [0, 0, 1]]), int(found.inliers.sum())
+///     (True, 40)
 #[pyfunction]
 #[pyo3(signature = (matches, **options))]
 pub(crate) fn estimate_homography<'py>(
@@ -126,6 +131,12 @@ const POSE_THRESHOLD: f64 = 4.0;
 /// The pose of a camera that sees known points, of which many may be wrong: x = R X + t.
 ///
 /// points: (n, 3) in the world's frame. pixels: (n, 2), where they are seen. camera: with its lens. threshold is in px.
+///
+///     >>> camera = epipole.Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]])
+///     >>> points = np.random.default_rng(2).uniform([-1, -1, 4], [1, 1, 8], (30, 3))
+///     >>> found = epipole.estimate_pose(points, camera.project(points + [0.1, 0, 0]), camera)
+///     >>> np.allclose(found.translation, [0.1, 0, 0]), np.allclose(found.rotation, np.eye(3))
+///     (True, True)
 #[pyfunction]
 #[pyo3(signature = (points, pixels, camera, **options))]
 pub(crate) fn estimate_pose<'py>(

@@ -50,6 +50,28 @@ impl Run {
         py: Python<'_>,
         job: impl FnOnce(&dyn Progress) -> Result<R, E> + Send,
     ) -> PyResult<R> {
+        let (mut job, mut result) = (Some(job), None);
+        // All that takes long to compile is compiled once, not for each job.
+        let latest = self.attend(py, &mut |progress| {
+            if let Some(job) = job.take() {
+                result = Some(job(progress));
+            }
+        })?;
+        match result {
+            Some(Ok(result)) => {
+                // A short job has no tick.
+                if let (Some(progress), Some((stage, done, total))) = (&self.progress, latest) {
+                    progress.call1(py, (stage, done, total))?;
+                }
+                Ok(result)
+            }
+            Some(Err(error)) => Err(error.exception(py)),
+            None => Err(internal("the job ended without a result")),
+        }
+    }
+
+    /// The same for a job that keeps its result itself, called once; gives its last news.
+    fn attend(&self, py: Python<'_>, job: &mut (dyn FnMut(&dyn Progress) + Send)) -> PyResult<Option<News>> {
         let monitor = Monitor::default();
         let progress = self.progress.as_ref();
         let ended = py.detach(|| {
@@ -57,14 +79,14 @@ impl Run {
             let (done, wait) = channel();
             let ended = pool.threads.in_place_scope(|scope| {
                 scope.spawn(|_| {
-                    let result = catch_unwind(AssertUnwindSafe(|| job(&monitor)));
+                    let ended = catch_unwind(AssertUnwindSafe(|| job(&monitor)));
                     // Somebody waits until this comes.
-                    let _ = done.send(result);
+                    let _ = done.send(ended);
                 });
                 let mut raised = None;
                 loop {
                     match wait.recv_timeout(TICK) {
-                        Ok(result) => return Ok((result, raised)),
+                        Ok(ended) => return Ok((ended, raised)),
                         Err(RecvTimeoutError::Timeout) if raised.is_none() => {
                             raised = Python::attach(|py| monitor.tell(py, progress)).err();
                         }
@@ -81,14 +103,7 @@ impl Run {
         match ended? {
             // Told to stop, it may have ended in another way.
             (_, Some(raised)) => Err(raised),
-            (Ok(Ok(result)), None) => {
-                // A short job has no tick.
-                if let (Some(progress), Some((stage, done, total))) = (progress, monitor.latest()) {
-                    progress.call1(py, (stage, done, total))?;
-                }
-                Ok(result)
-            }
-            (Ok(Err(error)), None) => Err(error.exception(py)),
+            (Ok(()), None) => Ok(monitor.latest()),
             (Err(panic), None) => Err(internal(message(&*panic))),
         }
     }
@@ -100,15 +115,18 @@ fn message(panic: &(dyn Any + Send)) -> &str {
     text.or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("a panic without words")
 }
 
+/// Stage, units done, all of them.
+type News = (&'static str, usize, usize);
+
 /// Hears the job, and is asked by it whether to go on.
 #[derive(Default)]
 struct Monitor {
     stopped: AtomicBool,
-    latest: Mutex<Option<(&'static str, usize, usize)>>,
+    latest: Mutex<Option<News>>,
 }
 
 impl Monitor {
-    fn latest(&self) -> Option<(&'static str, usize, usize)> {
+    fn latest(&self) -> Option<News> {
         *self.latest.lock().unwrap_or_else(PoisonError::into_inner)
     }
 

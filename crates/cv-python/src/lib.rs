@@ -83,6 +83,9 @@ const FUNCTIONS: &[(&str, Read)] = &[
 ];
 
 /// The options of a function and their defaults; those without one are `None`.
+///
+///     >>> epipole.defaults("undistort")
+///     {'alpha': 0.0, 'size': None, 'threads': None, 'progress': None}
 #[pyfunction]
 fn defaults<'py>(py: Python<'py>, function: &str) -> PyResult<Bound<'py, PyDict>> {
     let Some((name, read)) = FUNCTIONS.iter().find(|(name, _)| *name == function) else {

@@ -69,6 +69,11 @@ impl Arguments {
 /// Tentative matches between two photographs: some are wrong; `estimate_homography` and `estimate_fundamental` find what most agree on.
 ///
 /// a, b: arrays of uint8 of shape (height, width) or (height, width, 3). `defaults("match_features")` lists the options.
+///
+///     >>> image = np.kron(np.random.default_rng(0).integers(0, 256, (40, 50)), np.ones((6, 6))).astype(np.uint8)
+///     >>> found = epipole.match_features(image[:, :280], image[:, 20:])
+///     >>> len(found) > 500, float(np.median(found.points[:, 0] - found.points[:, 2]))
+///     (True, 20.0)
 #[pyfunction]
 #[pyo3(signature = (a, b, **options))]
 pub(crate) fn match_features<'py>(
@@ -125,6 +130,11 @@ fn matches<'py>(py: Python<'py>, found: &MatchingResult) -> PyResult<Bound<'py, 
 /// The features of a photograph: keypoints and their descriptors, for `match`.
 ///
 /// image: an array of uint8 of shape (height, width) or (height, width, 3). `defaults("extract_features")` lists the options.
+///
+///     >>> image = np.kron(np.random.default_rng(0).integers(0, 256, (40, 50)), np.ones((6, 6))).astype(np.uint8)
+///     >>> found = epipole.extract_features(image, max_features=300)
+///     >>> found.kind, found.descriptors.shape[1], len(found) <= 300
+///     ('rootsift', 128, True)
 #[pyfunction]
 #[pyo3(signature = (image, **options))]
 pub(crate) fn extract_features<'py>(
@@ -171,6 +181,12 @@ fn features(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Features> {
 }
 
 /// Tentative matches between the features of two photographs: some are wrong. a, b: `Features`, from `extract_features` or from elsewhere.
+///
+///     >>> image = np.kron(np.random.default_rng(0).integers(0, 256, (40, 50)), np.ones((6, 6))).astype(np.uint8)
+///     >>> a, b = epipole.extract_features(image[:, :280]), epipole.extract_features(image[:, 20:])
+///     >>> found = epipole.match(a, b)
+///     >>> bool(np.array_equal(found.points[:, :2], a.keypoints[found.indices[:, 0], :2]))
+///     True
 #[pyfunction]
 #[pyo3(name = "match", signature = (a, b, **options))]
 pub(crate) fn match_<'py>(

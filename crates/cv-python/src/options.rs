@@ -132,14 +132,18 @@ impl<'py> Options<'py> {
     }
 
     fn named<T: Named>(&self, name: &str, given: &Bound<'py, PyAny>) -> PyResult<T> {
-        let function = self.function;
+        T::from_name(&self.text(name, given)?)
+            .map_err(|error| PyValueError::new_err(format!("{}(): {name}: {error}", self.function)))
+    }
+
+    /// The name that was given, or the number as one.
+    fn text(&self, name: &str, given: &Bound<'py, PyAny>) -> PyResult<String> {
         if !given.is_instance_of::<PyString>() && (given.is_instance_of::<PyBool>() || given.extract::<i64>().is_err())
         {
-            let kind = given.get_type();
+            let (function, kind) = (self.function, given.get_type());
             return Err(PyTypeError::new_err(format!("{function}(): {name} must be a string, not {}", kind.name()?)));
         }
-        let text = given.str()?.to_string();
-        T::from_name(&text).map_err(|error| PyValueError::new_err(format!("{function}(): {name}: {error}")))
+        Ok(given.str()?.to_string())
     }
 
     /// Refuses what no option was named.

@@ -6,6 +6,7 @@ use crate::errors::{JobError, Refused, of_file};
 use crate::options::Options;
 use cv_core::{Camera, ImageView, Matrix3, RgbU8};
 use cv_io::IoError;
+use cv_pipeline::GpsFix;
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use std::borrow::Cow;
@@ -59,6 +60,14 @@ pub(crate) enum Source<'a> {
     File(&'a Path),
 }
 
+/// What the EXIF of a photograph says.
+#[derive(Default)]
+pub(crate) struct Exif {
+    /// Focal length in px.
+    pub(crate) focal: Option<f64>,
+    pub(crate) gps: Option<GpsFix>,
+}
+
 /// The pixels of a photograph.
 pub(crate) enum Pixels<'a> {
     View(ImageView<'a, u8, 3>),
@@ -77,12 +86,19 @@ impl Pixels<'_> {
 impl<'a> Source<'a> {
     /// The pixels, and the focal length in px by EXIF.
     pub(crate) fn read(self) -> Result<(Pixels<'a>, Option<f64>), IoError> {
+        self.read_with_exif().map(|(pixels, exif)| (pixels, exif.focal))
+    }
+
+    /// The pixels, and what EXIF says.
+    pub(crate) fn read_with_exif(self) -> Result<(Pixels<'a>, Exif), IoError> {
         Ok(match self {
-            Self::View(view) => (Pixels::View(view), None),
+            Self::View(view) => (Pixels::View(view), Exif::default()),
             Self::File(path) => {
                 let image = cv_io::read_image(path)?;
                 let focal = image.exif.focal.map(|focal| focal.pixels);
-                (Pixels::Read(image.into_rgb8()), focal)
+                let gps = image.exif.gps;
+                let gps = gps.map(|gps| GpsFix { place: gps.position(), has_altitude: gps.altitude.is_some() });
+                (Pixels::Read(image.into_rgb8()), Exif { focal, gps })
             }
         })
     }

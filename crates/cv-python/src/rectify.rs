@@ -49,35 +49,32 @@ pub(crate) fn rectify<'py>(
     options.finish()?;
     let (left, right) = (ImageArg::new(left, "left")?, ImageArg::new(right, "right")?);
     let rig = rig.get().rig;
-    with_views!(py, [left, right], |a, b| {
+    let (images, masks, rectification, vertical_px, stages) = with_views!(py, [left, right], |a, b| {
         let found = run.run(py, |progress| rectify_pair(a, b, &rig, &o, progress))?;
         let [left, right] = found.images;
-        let mask = |mask: cv_core::Mask| arrays::array(py, mask);
-        let [one, two] = found.masks;
-        let Rectification { left: view, right: other, geometry, vertical } = found.rectification;
-        results::made(
-            py,
-            "Rectified",
-            [
-                ("left", arrays::array(py, left)?),
-                ("right", arrays::array(py, right)?),
-                ("masks", object(py, (mask(one)?, mask(two)?))?),
-                ("camera", PyCamera::object(py, view.camera)?),
-                (
-                    "rotations",
-                    object(
-                        py,
-                        (arrays::matrix(py, view.rotation.matrix())?, arrays::matrix(py, other.rotation.matrix())?),
-                    )?,
-                ),
-                ("Q", q(py, &geometry.q())?),
-                ("baseline", object(py, geometry.baseline)?),
-                ("vertical", object(py, vertical)?),
-                ("vertical_px", object(py, found.vertical_px)?),
-                ("seconds", results::stages(py, &found.stages)?),
-            ],
-        )
-    })
+        let images = [arrays::array(py, left)?, arrays::array(py, right)?];
+        Ok::<_, PyErr>((images, found.masks, found.rectification, found.vertical_px, found.stages))
+    })?;
+    let ([left, right], [one, two]) = (images, masks);
+    let mask = |mask: cv_core::Mask| arrays::array(py, mask);
+    let Rectification { left: view, right: other, geometry, vertical } = rectification;
+    let turned = (arrays::matrix(py, view.rotation.matrix())?, arrays::matrix(py, other.rotation.matrix())?);
+    results::made(
+        py,
+        "Rectified",
+        [
+            ("left", left),
+            ("right", right),
+            ("masks", object(py, (mask(one)?, mask(two)?))?),
+            ("camera", PyCamera::object(py, view.camera)?),
+            ("rotations", object(py, turned)?),
+            ("Q", q(py, &geometry.q())?),
+            ("baseline", object(py, geometry.baseline)?),
+            ("vertical", object(py, vertical)?),
+            ("vertical_px", object(py, vertical_px)?),
+            ("seconds", results::stages(py, &stages)?),
+        ],
+    )
 }
 
 /// Takes the distortion of a lens out of photographs of one camera: the map is made once.
@@ -118,6 +115,11 @@ impl PyUndistorter {
 }
 
 /// A photograph without the distortion of its lens, and the camera that would have taken it: `(image, camera)`. For many photographs of one camera, `Undistorter` makes the map once.
+///
+///     >>> camera = epipole.Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]], [-0.1, 0.01, 0, 0])
+///     >>> straight, pinhole = epipole.undistort(np.zeros((480, 640, 3), np.uint8), camera)
+///     >>> straight.shape, pinhole.lens
+///     ((480, 640, 3), 'none')
 #[pyfunction]
 #[pyo3(signature = (image, camera, **options))]
 pub(crate) fn undistort<'py>(

@@ -166,6 +166,11 @@ fn confusion<'py>(py: Python<'py>, score: &ConfusionMatrix) -> PyResult<Bound<'p
 }
 
 /// A mask against the truth: true and false positives and negatives, precision, recall, F1, intersection over union.
+///
+///     >>> truth = np.arange(8).reshape(2, 4) < 4
+///     >>> scores = epipole.evaluate_mask(np.arange(8).reshape(2, 4) < 3, truth)
+///     >>> scores["precision"], scores["recall"]
+///     (1.0, 0.75)
 #[pyfunction]
 pub(crate) fn evaluate_mask<'py>(
     py: Python<'py>,

@@ -9,16 +9,18 @@ use crate::options::Options;
 use crate::photographs::{Ended, Known, Photograph, Source};
 use crate::results::{self, object};
 use crate::sfm_photograph::PySfmPhotograph;
-use cv_core::{Point3, Progress, StageClock};
+use cv_core::{ImageView, Point3, Progress, StageClock};
 use cv_pipeline::features::FeatureError;
-use cv_pipeline::many_views::{KnownPlaces, ModelAlignError, SfmModel, ViewOutcome, align_model};
+use cv_pipeline::many_views::{KnownPlaces, ModelAlignError, SfmModel, ViewOutcome};
 use cv_pipeline::{
-    Cancelled, SfmCamera, SfmJobError, SfmJobOptions, SfmPhoto, SfmPhotoError, SfmResult, sfm as solve, sfm_photo,
+    Cancelled, GpsFix, OtherSize, PhotoProgress, SfmCamera, SfmCameras, SfmJobError, SfmJobOptions, SfmPhoto,
+    SfmPhotoError, SfmResult, gps_centers, place_model, sfm as solve, sfm_photo,
 };
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
-use std::collections::BTreeMap;
+use std::collections::BTreeSet;
+use std::convert::Infallible;
 
 /// A photograph, or what was found of it.
 enum Given<'py> {
@@ -66,6 +68,8 @@ pub(crate) struct Arguments<'py> {
     ignore_exif: bool,
     names: Option<Vec<String>>,
     centers: Option<Bound<'py, PyAny>>,
+    distances: Vec<(usize, usize, f64)>,
+    ignore_gps: bool,
     run: Run,
 }
 
@@ -77,6 +81,9 @@ impl<'py> Arguments<'py> {
         options.set("ignore_exif", &mut ignore_exif)?;
         let names = options.take("names")?;
         let centers = options.take_any("centers")?;
+        let distances = options.take("distances")?.unwrap_or_default();
+        let mut ignore_gps = false;
+        options.set("ignore_gps", &mut ignore_gps)?;
         options.set_named("solver", &mut o.solve.solver)?;
         options.set_named("order", &mut o.order)?;
         options.set("max_error", &mut o.solve.max_error)?;
@@ -84,34 +91,7 @@ impl<'py> Arguments<'py> {
         let mut seed = o.solve.seed;
         options.set("seed", &mut seed)?;
         (o.solve.seed, o.pairs.seed) = (seed, seed);
-        Ok(Self { options: o, known, ignore_exif, names, centers, run: Run::read(options)? })
-    }
-}
-
-/// The cameras of the photographs so far: one for each size and focal length.
-#[derive(Default)]
-struct Cameras {
-    list: Vec<SfmCamera>,
-    /// By size and focal length in thousandths of a pixel.
-    known: BTreeMap<(usize, usize, u64), usize>,
-}
-
-impl Cameras {
-    fn of(&mut self, size: (usize, usize), exif: Option<f64>, known: &Known) -> usize {
-        let focal = match known {
-            Known::Focal(focal) => Some(*focal),
-            Known::Nothing => exif,
-            Known::Camera(_) | Known::Matrix(_) => None,
-        };
-        let key = (size.0, size.1, focal.map_or(0, |f| (f * 1000.0).round() as u64));
-        *self.known.entry(key).or_insert_with(|| {
-            self.list.push(match (known, known.camera(size)) {
-                (Known::Camera(camera), _) => SfmCamera::known(*camera),
-                (Known::Matrix(_), Some(camera)) => SfmCamera::of_matrix(camera),
-                _ => focal.map_or_else(|| SfmCamera::unknown(size), |focal| SfmCamera::of_focal(size, focal)),
-            });
-            self.list.len() - 1
-        })
+        Ok(Self { options: o, known, ignore_exif, names, centers, distances, ignore_gps, run: Run::read(options)? })
     }
 }
 
@@ -119,6 +99,7 @@ impl Cameras {
 enum LeftOut {
     Unreadable(String),
     Features(FeatureError),
+    Camera(OtherSize),
 }
 
 /// What was found, and what became of each photograph.
@@ -144,106 +125,133 @@ impl Job<'_> {
     fn reconstruct(
         &self,
         sources: &[(View<'_>, String)],
-        centers: &[Option<Point3<f64>>],
+        places: &Places,
         progress: &dyn Progress,
     ) -> Result<Found, Ended<SfmJobError>> {
         let stop = |stop: Cancelled| Ended::Job(SfmJobError::Cancelled(stop));
-        let (mut clock, mut cameras) = (StageClock::new(), Cameras::default());
-        let (mut photos, mut looked_at) = (Vec::new(), Vec::new());
+        let (mut clock, mut cameras) = (StageClock::new(), SfmCameras::default());
+        let (mut photos, mut looked_at, mut fixes) = (Vec::new(), Vec::new(), vec![None; sources.len()]);
         for (i, (source, name)) in sources.iter().enumerate() {
-            let place = Place { progress, done: i, total: sources.len() };
+            let place = PhotoProgress { progress, done: i, total: sources.len() };
             place.report("", 0, 0).map_err(stop)?;
-            let known = |focal: Option<f64>| (focal.filter(|_| !self.ignore_exif), self.known);
-            let source = match *source {
-                View::Photograph(source) => source,
-                View::Features(PySfmPhotograph { photo, focal }) => {
-                    let (focal, known) = known(*focal);
-                    let camera = cameras.of(photo.size, focal, known);
-                    photos.push(SfmPhoto { name: name.clone(), camera, ..photo.clone() });
-                    looked_at.push(Ok(photos.len() - 1));
-                    continue;
+            let looked = match *source {
+                View::Features(PySfmPhotograph { photo, exif }) => {
+                    fixes[i] = exif.gps;
+                    self.camera(&mut cameras, photo.size, exif.focal).map(|camera| SfmPhoto {
+                        name: name.clone(),
+                        camera,
+                        ..photo.clone()
+                    })
                 }
+                View::Photograph(source) => match source.read_with_exif() {
+                    Err(error) => Err(LeftOut::Unreadable(error.to_string())),
+                    Ok((pixels, exif)) => {
+                        fixes[i] = exif.gps;
+                        // Before the work.
+                        match self.camera(&mut cameras, pixels.view().size(), exif.focal) {
+                            Ok(camera) => self.look_at(pixels.view(), name, camera, &place)?,
+                            Err(reason) => Err(reason),
+                        }
+                    }
+                },
             };
-            let (pixels, focal) = match source.read() {
-                Ok(read) => read,
-                Err(error) => {
-                    looked_at.push(Err(LeftOut::Unreadable(error.to_string())));
-                    continue;
-                }
-            };
-            let (focal, known) = known(focal);
-            let camera = cameras.of(pixels.view().size(), focal, known);
-            looked_at.push(match sfm_photo(pixels.view(), name.clone(), camera, &self.options.features, &place) {
-                Ok(photo) => {
-                    photos.push(photo);
-                    Ok(photos.len() - 1)
-                }
-                Err(SfmPhotoError::Features(FeatureError::Cancelled(cancelled))) => return Err(stop(cancelled)),
-                Err(SfmPhotoError::Features(FeatureError::Option(error))) => {
-                    return Err(Ended::Job(SfmJobError::Option(error)));
-                }
-                Err(SfmPhotoError::Features(error)) => Err(LeftOut::Features(error)),
-                Err(error) => Err(LeftOut::Unreadable(error.to_string())),
-            });
+            looked_at.push(looked.map(|photo| {
+                photos.push(photo);
+                photos.len() - 1
+            }));
         }
         clock.lap("features");
-        let mut result = solve(&photos, &cameras.list, self.options, progress).map_err(Ended::Job)?;
-        let centers: Vec<Option<Point3<f64>>> = if centers.is_empty() {
-            Vec::new()
-        } else {
-            looked_at.iter().zip(centers).filter(|(looked, _)| looked.is_ok()).map(|(_, c)| *c).collect()
-        };
+        let mut result = solve(&photos, cameras.list(), self.options, progress).map_err(Ended::Job)?;
         let mut frames = Vec::new();
         for model in &mut result.models {
-            frames.push(align(model, &centers, self.options.solve.seed, progress).map_err(stop)?);
+            frames.push(places.place(model, (&fixes, &looked_at), self.options.solve.seed, progress).map_err(stop)?);
         }
         clock.lap("align");
         let mut stages = clock.into_stages();
         stages.append(&mut result.stages);
         Ok(Found { result, frames, photos, looked_at, stages })
     }
-}
 
-/// Brings a model to known centers of its cameras, or stands it upright; tells which.
-fn align(
-    model: &mut SfmModel,
-    centers: &[Option<Point3<f64>>],
-    seed: u64,
-    progress: &dyn Progress,
-) -> Result<&'static str, Cancelled> {
-    let known = KnownPlaces { centers, distances: &[] };
-    let found = align_model(model, &known, seed, progress).or_else(|error| match error {
-        ModelAlignError::Cancelled(_) => Err(error),
-        _ => align_model(model, &KnownPlaces::default(), seed, progress),
-    });
-    match found {
-        Ok(found) => {
-            model.transform(&found.similarity);
-            Ok(if found.centers.is_some() { "centers" } else { "upright" })
+    /// The index of the camera of a photograph of that size and, by EXIF, that focal length.
+    fn camera(&self, cameras: &mut SfmCameras, size: (usize, usize), exif: Option<f64>) -> Result<usize, LeftOut> {
+        let focal = match self.known {
+            Known::Focal(focal) => Some(*focal),
+            Known::Nothing => exif.filter(|_| !self.ignore_exif),
+            Known::Camera(_) | Known::Matrix(_) => None,
+        };
+        let given = match (self.known, self.known.camera(size)) {
+            (Known::Camera(camera), _) => Some(SfmCamera::known(*camera)),
+            (Known::Matrix(_), Some(camera)) => Some(SfmCamera::of_matrix(camera)),
+            _ => None,
+        };
+        let Ok(found) = cameras.of(size, focal, || Ok::<_, Infallible>(given));
+        found.map_err(LeftOut::Camera)
+    }
+
+    /// What a photograph shows, or why it is left out.
+    fn look_at(
+        &self,
+        pixels: ImageView<'_, u8, 3>,
+        name: &str,
+        camera: usize,
+        progress: &dyn Progress,
+    ) -> Result<Result<SfmPhoto, LeftOut>, Ended<SfmJobError>> {
+        let ends = |error: SfmJobError| Err(Ended::Job(error));
+        match sfm_photo(pixels, name.to_owned(), camera, &self.options.features, progress) {
+            Ok(photo) => Ok(Ok(photo)),
+            Err(SfmPhotoError::Features(FeatureError::Cancelled(stop))) => ends(stop.into()),
+            Err(SfmPhotoError::Features(FeatureError::Option(error))) => ends(error.into()),
+            Err(SfmPhotoError::Features(error)) => Ok(Err(LeftOut::Features(error))),
+            Err(error) => Ok(Err(LeftOut::Unreadable(error.to_string()))),
         }
-        Err(ModelAlignError::Cancelled(stop)) => Err(stop),
-        // It stays in the frame it was found in.
-        Err(_) => Ok("any"),
     }
 }
 
-/// How many of the photographs have been looked at.
-struct Place<'a> {
-    progress: &'a dyn Progress,
-    done: usize,
-    total: usize,
+/// What is known of where the photographs were taken.
+struct Places {
+    /// By the caller, of each photograph that was given; empty: nothing.
+    centers: Vec<Option<Point3<f64>>>,
+    /// Photographs that were given, and how far apart they were taken.
+    distances: Vec<(usize, usize, f64)>,
+    ignore_gps: bool,
 }
 
-impl Progress for Place<'_> {
-    fn report(&self, _: &'static str, _: usize, _: usize) -> Result<(), Cancelled> {
-        self.progress.report("photographs", self.done, self.total)
+impl Places {
+    /// Brings a model to it, or stands it upright; tells which. `fixes` and `looked_at`: of each photograph that was given, what it says itself, and its view.
+    fn place(
+        &self,
+        model: &mut SfmModel,
+        (fixes, looked_at): (&[Option<GpsFix>], &[Result<usize, LeftOut>]),
+        seed: u64,
+        progress: &dyn Progress,
+    ) -> Result<&'static str, Cancelled> {
+        let gps = if self.centers.is_empty() && !self.ignore_gps { gps_centers(fixes) } else { None };
+        let (all, by) = gps.map_or((self.centers.clone(), "centers"), |gps| (gps.centers, "gps"));
+        let centers: Vec<Option<Point3<f64>>> =
+            looked_at.iter().zip(all).filter(|(looked, _)| looked.is_ok()).map(|(_, center)| center).collect();
+        let view = |at: usize| {
+            looked_at[at].as_ref().ok().copied().filter(|view| model.poses.get(*view).is_some_and(Option::is_some))
+        };
+        let distances: Vec<(usize, usize, f64)> =
+            self.distances.iter().filter_map(|&(a, b, length)| Some((view(a)?, view(b)?, length))).collect();
+        let known = KnownPlaces { centers: &centers, distances: &distances };
+        match place_model(model, &known, seed, progress) {
+            Ok(placed) if placed.alignment.centers.is_some() => Ok(by),
+            Ok(placed) if placed.alignment.metric => Ok("distances"),
+            Ok(_) => Ok("upright"),
+            Err(ModelAlignError::Cancelled(stop)) => Err(stop),
+            // It stays in the frame it was found in.
+            Err(_) => Ok("any"),
+        }
     }
 }
 
 /// Cameras and points from many photographs in any order (structure from motion).
 ///
 /// photographs: arrays of uint8, paths, or what `sfm_features` found of them. camera: a Camera, or a 3×3 matrix where the lens is not known; focal: about the focal length in px; else EXIF tells, or the photographs do.
-/// centers: (n, 3), where the cameras stood, NaN where that is not known. Without them models stand upright, Z up, and their unit is arbitrary.
+/// A photograph that cannot be read, or is not of the camera's size, is left out.
+/// centers: (n, 3), where the cameras stood, NaN where that is not known; distances: (i, j, length) of photographs by their index. Without centers, three photographs or more whose EXIF tells their GPS
+/// position bring a model to meters, X east, Y north. Else it stands upright, Z up, and its unit is that of the distances, or arbitrary.
 /// `defaults("sfm")` lists the options.
 #[pyfunction]
 #[pyo3(signature = (photographs, **options))]
@@ -262,7 +270,12 @@ pub(crate) fn sfm<'py>(
         Some(names) if names.len() != count => {
             return Err(PyValueError::new_err(format!("{} names for {count} photographs", names.len())));
         }
-        Some(names) => names.clone(),
+        Some(names) => {
+            if let Some(twice) = twice(names) {
+                return Err(PyValueError::new_err(format!("names: “{twice}” is the name of two photographs")));
+            }
+            names.clone()
+        }
         None => names_of(&sources),
     };
     let centers: Vec<Option<Point3<f64>>> = match &arguments.centers {
@@ -275,9 +288,18 @@ pub(crate) fn sfm<'py>(
             rows.into_iter().map(|row| row.iter().all(|v| v.is_finite()).then(|| row.into())).collect()
         }
     };
+    if let Some((a, b, length)) = arguments
+        .distances
+        .iter()
+        .find(|(a, b, length)| *a >= count || *b >= count || a == b || !(*length > 0.0 && length.is_finite()))
+    {
+        let text = format!("distances: ({a}, {b}, {length}) is not two of {count} photographs and a length above 0");
+        return Err(PyValueError::new_err(text));
+    }
+    let places = Places { centers, distances: arguments.distances.clone(), ignore_gps: arguments.ignore_gps };
     let named: Vec<(View<'_>, String)> = sources.into_iter().zip(names).collect();
     let job = Job { options: &arguments.options, known: &arguments.known, ignore_exif: arguments.ignore_exif };
-    let found = arguments.run.run(py, |progress| job.reconstruct(&named, &centers, progress))?;
+    let found = arguments.run.run(py, |progress| job.reconstruct(&named, &places, progress))?;
     let models: Vec<Bound<'py, PyAny>> = (0..found.result.models.len())
         .filter_map(|m| found.result.sparse_model(m, &found.photos))
         .map(|model| model::made(py, &model))
@@ -289,6 +311,7 @@ pub(crate) fn sfm<'py>(
                 reason(py, &serde_json::json!({ "Unreadable": { "message": message } }))?
             }
             Err(LeftOut::Features(error)) => reason(py, error)?,
+            Err(LeftOut::Camera(error)) => reason(py, &serde_json::json!({ "CameraSize": error }))?,
             Ok(at) => match &found.result.outcomes[*at] {
                 ViewOutcome::Registered { .. } => continue,
                 outcome => reason(py, outcome)?,
@@ -312,17 +335,30 @@ pub(crate) fn sfm<'py>(
     )
 }
 
-/// The files' names, or their whole paths where two have one name; numbers of arrays.
-fn names_of(sources: &[View<'_>]) -> Vec<String> {
-    let names: Vec<String> = sources.iter().enumerate().map(|(i, s)| s.name(i)).collect();
-    let mut sorted = names.clone();
+/// A name that stands in a list twice.
+fn twice(names: &[String]) -> Option<&String> {
+    let mut sorted: Vec<&String> = names.iter().collect();
     sorted.sort_unstable();
-    if sorted.windows(2).all(|pair| pair[0] != pair[1]) {
-        return names;
+    sorted.windows(2).find(|pair| pair[0] == pair[1]).map(|pair| pair[0])
+}
+
+/// The files' names, or their whole paths where two have one name; numbers of arrays. What still has the name of another is numbered.
+fn names_of(sources: &[View<'_>]) -> Vec<String> {
+    let mut names: Vec<String> = sources.iter().enumerate().map(|(i, s)| s.name(i)).collect();
+    if twice(&names).is_some() {
+        for (source, name) in sources.iter().zip(&mut names) {
+            if let View::Photograph(Source::File(path)) = source {
+                *name = path.to_string_lossy().into_owned();
+            }
+        }
     }
-    let whole = |(source, name): (&View<'_>, String)| match source {
-        View::Photograph(Source::File(path)) => path.to_string_lossy().into_owned(),
-        _ => name,
-    };
-    sources.iter().zip(names).map(whole).collect()
+    let mut taken = BTreeSet::new();
+    for name in &mut names {
+        let numbered = |n: usize| if n == 1 { name.clone() } else { format!("{name}#{n}") };
+        if let Some(free) = (1..).map(numbered).find(|name| !taken.contains(name)) {
+            *name = free;
+        }
+        taken.insert(name.clone());
+    }
+    names
 }

@@ -4,9 +4,10 @@ use crate::arrays;
 use crate::job::Run;
 use crate::matching::{keypoints, keypoints_from, max_features};
 use crate::options::Options;
-use crate::photographs::{Ended, Photograph, Source};
+use crate::photographs::{Ended, Exif, Photograph, Source};
+use cv_core::GeodeticPoint;
 use cv_pipeline::features::{ByteDescriptors, DescriptorKind};
-use cv_pipeline::{FeatureOptions, SfmJobOptions, SfmPhoto, SfmPhotoError, sfm_photo};
+use cv_pipeline::{FeatureOptions, GpsFix, SfmJobOptions, SfmPhoto, SfmPhotoError, sfm_photo};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
@@ -15,13 +16,22 @@ use pyo3::types::{PyBytes, PyDict};
 #[pyclass(frozen, module = "epipole", name = "SfmPhotograph")]
 pub(crate) struct PySfmPhotograph {
     pub(crate) photo: SfmPhoto,
-    /// By EXIF, px.
-    pub(crate) focal: Option<f64>,
+    pub(crate) exif: Exif,
 }
 
-/// Size, focal length, keypoints, descriptors, their kind, and colors.
-type Parts<'py> =
-    (String, (usize, usize), Option<f64>, Bound<'py, PyAny>, Bound<'py, PyBytes>, &'static str, Bound<'py, PyAny>);
+/// Latitude and longitude in radians, and the altitude in meters where it is told.
+type Gps = (f64, f64, Option<f64>);
+
+/// Name, size, focal length and position by EXIF, keypoints, descriptors, their kind, and colors.
+type Parts<'py> = (
+    String,
+    (usize, usize),
+    (Option<f64>, Option<Gps>),
+    Bound<'py, PyAny>,
+    Bound<'py, PyBytes>,
+    &'static str,
+    Bound<'py, PyAny>,
+);
 
 #[pymethods]
 impl PySfmPhotograph {
@@ -39,7 +49,15 @@ impl PySfmPhotograph {
     /// Focal length by EXIF, px.
     #[getter]
     fn focal(&self) -> Option<f64> {
-        self.focal
+        self.exif.focal
+    }
+
+    /// Latitude and longitude by EXIF in radians, and meters above the sea, or None where they are not told.
+    #[getter]
+    fn gps(&self) -> Option<Gps> {
+        self.exif.gps.map(|GpsFix { place, has_altitude }| {
+            (place.latitude, place.longitude, has_altitude.then_some(place.altitude))
+        })
     }
 
     /// float32 (n, 5): x, y, scale, angle, response.
@@ -62,7 +80,7 @@ impl PySfmPhotograph {
     fn _of_parts(
         name: String,
         size: (usize, usize),
-        focal: Option<f64>,
+        exif: (Option<f64>, Option<Gps>),
         keypoints: &Bound<'_, PyAny>,
         descriptors: &[u8],
         kind: &str,
@@ -76,15 +94,18 @@ impl PySfmPhotograph {
             return Err(PyValueError::new_err("these are no parts of an SfmPhotograph"));
         };
         let colors = colors.into_iter().map(|color| color.map(|c| c as u8)).collect();
-        Ok(Self { photo: SfmPhoto { name, size, camera: 0, keypoints, descriptors, colors }, focal })
+        Ok(Self {
+            photo: SfmPhoto { name, size, camera: 0, keypoints, descriptors, colors },
+            exif: Exif { focal: exif.0, gps: exif.1.map(fix) },
+        })
     }
 
     fn __reduce__<'py>(slf: &Bound<'py, Self>) -> PyResult<(Bound<'py, PyAny>, Parts<'py>)> {
-        let (py, Self { photo, focal }) = (slf.py(), slf.get());
+        let (py, Self { photo, exif }) = (slf.py(), slf.get());
         let parts = (
             photo.name.clone(),
             photo.size,
-            *focal,
+            (exif.focal, slf.get().gps()),
             keypoints(py, &photo.keypoints)?,
             PyBytes::new(py, photo.descriptors.as_slice()),
             photo.descriptors.kind().name,
@@ -92,6 +113,11 @@ impl PySfmPhotograph {
         );
         Ok((py.get_type::<Self>().getattr("_of_parts")?, parts))
     }
+}
+
+fn fix((latitude, longitude, altitude): Gps) -> GpsFix {
+    let place = GeodeticPoint { latitude, longitude, altitude: altitude.unwrap_or(0.0) };
+    GpsFix { place, has_altitude: altitude.is_some() }
 }
 
 /// The options of `sfm_features`.
@@ -120,8 +146,8 @@ pub(crate) fn sfm_features(
         Source::View(_) => String::new(),
     });
     run.run(py, |progress| {
-        let (pixels, focal) = source.read().map_err(Ended::File)?;
+        let (pixels, exif) = source.read_with_exif().map_err(Ended::File)?;
         let photo = sfm_photo(pixels.view(), name, 0, &features, progress).map_err(Ended::Job)?;
-        Ok::<_, Ended<SfmPhotoError>>(PySfmPhotograph { photo, focal })
+        Ok::<_, Ended<SfmPhotoError>>(PySfmPhotograph { photo, exif })
     })
 }

@@ -115,6 +115,11 @@ impl DepthArguments {
 /// left, right: arrays of one shape (height, width) or (height, width, 3) of uint8, uint16 or float32 (0 to 1), rectified; with `rig`, as its cameras took them. With focal (px) and
 /// baseline, or a rig, there is depth in the unit of the baseline. `defaults("depth")` lists the options.
 ///
+///     >>> scene = np.random.default_rng(0).integers(0, 256, (60, 112), np.uint8)
+///     >>> found = epipole.depth(scene[:, :100], scene[:, 12:], disparities=32, focal=500.0, baseline=0.24)
+///     >>> round(float(np.median(found.disparity))), round(float(np.median(found.depth)))
+///     (12, 10)
+///
 /// Raises NoPairError where hardly any pixel has a partner, and others of epipole.errors.
 #[pyfunction]
 #[pyo3(signature = (left, right, **options))]
@@ -210,6 +215,13 @@ struct Worker {
 /// Semi-global matching with memory that is kept from one pair to the next: for streams of frames.
 ///
 /// Threads may share one; then one of them works at a time.
+///
+///     >>> scene = np.random.default_rng(0).integers(0, 256, (60, 112), np.uint8)
+///     >>> matcher, disparity = epipole.StereoMatcher(disparities=32), np.empty((60, 100), np.float32)
+///     >>> disparity is matcher.compute(scene[:, :100], scene[:, 12:], out=disparity)
+///     True
+///     >>> round(float(np.median(disparity)))
+///     12
 #[pyclass(frozen, module = "epipole", name = "StereoMatcher")]
 pub(crate) struct PyStereoMatcher {
     worker: Shared<Worker>,
@@ -280,6 +292,10 @@ fn writable<'py>(out: &Bound<'py, PyAny>, (width, height): (usize, usize)) -> Py
 }
 
 /// Errors of a disparity map against the truth, over the pixels of `mask` that have a finite truth.
+///
+///     >>> scores = epipole.evaluate_disparity(np.full((2, 2), 8.5, np.float32), np.full((2, 2), 8.0, np.float32))
+///     >>> scores["average"], scores["bad"][0]
+///     (0.5, 0.0)
 #[pyfunction]
 #[pyo3(signature = (estimate, truth, *, mask = None))]
 pub(crate) fn evaluate_disparity<'py>(

@@ -7,7 +7,7 @@
 use crate::StereoGeometry;
 use cv_core::{
     Camera, CameraError, Cancelled, Distortion, Image, ImageView, Mask, OptionError, Point2, Point3, Progress,
-    Rotation3, Stage, StereoRig, Vector3,
+    Rotation3, Stage, StereoRig, Vector3, four_digits,
 };
 use cv_imgproc::{Pixel, WarpError, WarpMap};
 use nalgebra::{Matrix3, Matrix4};
@@ -98,11 +98,6 @@ pub enum RectifyError {
     /// The job was stopped by its progress callback.
     #[error("stopped")]
     Cancelled(#[from] Cancelled),
-}
-
-/// A length as people read it.
-fn four_digits(value: f64) -> f64 {
-    format!("{value:.3e}").parse().unwrap_or(value)
 }
 
 /// The most a camera is turned: beyond, a plane image sensor would see the scene at a grazing angle.
@@ -560,8 +555,6 @@ mod tests {
         let text = |distance, vertical| RectifyError::Exchanged { distance, vertical }.to_string();
         assert_eq!(text(0.20000000000000004, true), "the second camera stands 0.2 above the first: they are exchanged");
         assert!(text(123456.7, false).contains(" 123500 left of"));
-        assert_eq!(four_digits(0.0), 0.0);
-        assert!(four_digits(f64::NAN).is_nan());
     }
 
     #[test]

@@ -280,6 +280,8 @@ fn texts() -> Result<Seeds> {
         ("colmap", bytes(&colmap).into_iter().chain(binary_model()?).collect()),
         ("matches", bytes(&matches)),
         ("features", bytes(&features)),
+        ("places", bytes(&["a.jpg 1 -2.5 300\nb.jpg 0 0 0\n", "# c\nname,x,y,z\n\"b c.jpg\",0,1e3,-0 # d\n"])),
+        ("toml", bytes(&["threads = 2\n\n[sfm]\norder = \"sequence\"\ndistance = [\"a\", \"b\", 2.5]\n", "seed = 0x1f\n[depth]\nfill = false\n"])),
     ])
 }
 
@@ -334,6 +336,8 @@ fn structured() -> Seeds {
         "panorama",
         "segment",
         "match_photos",
+        "board",
+        "checkpoint",
     ];
     let bytes = |seed: u64| -> Vec<u8> {
         let mut v = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;

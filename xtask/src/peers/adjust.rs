@@ -1,6 +1,7 @@
 //! Ceres, through COLMAP's bundle adjustment, and ours on a generated problem: 100 photographs, each with a focal length and a radial
-//! coefficient of its own, 20,000 points, 100,000 observations. Writes the section “Adjustment” of `docs/benchmarks.md`.
+//! coefficient of its own, 20,000 points, 100,000 observations; and how our time grows with the problem. Writes the section “Adjustment” of `docs/benchmarks.md`.
 
+use super::calibration::on_one_thread;
 use crate::checks::Check;
 use anyhow::{Context, Result, ensure};
 use cv_numeric::RobustLoss;
@@ -27,6 +28,10 @@ const SCALE: f64 = 1.0;
 /// Repeats of which the fastest counts.
 const REPEATS: usize = 3;
 const BAR: f64 = 0.5;
+/// Photographs of which the growth of the time with the problem is measured, with as many points each as in the comparison: 10⁴ to 10⁶ observations.
+const GROWTH: [usize; 3] = [10, 100, 1000];
+/// Largest ratio of the times for an observation.
+const GROWTH_BAR: f64 = 1.5;
 
 /// One run of the peer.
 #[derive(Debug, Clone, Deserialize)]
@@ -40,7 +45,7 @@ struct Peer {
 }
 
 pub(crate) fn run(python: &Path, _data: &Path) -> Result<Vec<Check>> {
-    let scene = Scene::new(1);
+    let scene = Scene::new(1, PHOTOGRAPHS);
     let folder = tempfile::tempdir()?;
     scene.write(folder.path())?;
     println!("peers");
@@ -100,9 +105,38 @@ pub(crate) fn run(python: &Path, _data: &Path) -> Result<Vec<Check>> {
         let _ = writeln!(times, "| {name}: ours / fastest of Ceres at equal cost | {ratio:.3} | {BAR} |");
     }
     let _ = writeln!(text, "\n| ratio of times | measured | at most |\n|---|---|---|\n{times}");
+    let (growth, check) = growth()?;
+    text += &growth;
+    checks.push(check);
     print!("{text}");
     super::write_section("Adjustment", &text)?;
     Ok(checks)
+}
+
+/// Processor time of one thread for an observation in an iteration, of problems that grow.
+fn growth() -> Result<(String, Check)> {
+    let mut text = "\nThe same without a robust loss, of fewer and of more photographs with as many points each, on one thread:\n\n\
+         | photographs | observations | iterations | processor s | µs for an observation and iteration |\n|---|---|---|---|---|\n"
+        .to_owned();
+    let mut each = Vec::new();
+    for photographs in GROWTH {
+        let scene = Scene::new(1, photographs);
+        let (mut seconds, mut steps) = (f64::INFINITY, 0);
+        for _ in 0..REPEATS {
+            let (report, took) = on_one_thread(|| scene.adjust(RobustLoss::Trivial))?;
+            (seconds, steps) = (seconds.min(took), report?.steps);
+        }
+        let n = scene.seen.len();
+        let micro = 1e6 * seconds / (n * steps.max(1)) as f64;
+        each.push(micro);
+        let _ = writeln!(text, "| {photographs} | {n} | {steps} | {seconds:.3} | {micro:.3} |");
+    }
+    let ratio = each[GROWTH.len() - 1] / each[0];
+    let _ = writeln!(
+        text,
+        "\n| time for an observation and iteration | measured | at most |\n|---|---|---|\n| 10⁶ observations / 10⁴ | {ratio:.2} | {GROWTH_BAR} |"
+    );
+    Ok((text, Check::at_most("time for an observation and iteration: 10⁶ / 10⁴", ratio, GROWTH_BAR)))
 }
 
 /// Photographs around a cloud of points, and what is taken for their poses, lenses and points at the start.
@@ -117,29 +151,30 @@ struct Scene {
 }
 
 impl Scene {
-    fn new(seed: u64) -> Self {
+    fn new(seed: u64, photographs: usize) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut u = || 2.0 * f64::from(rng.next_u32()) / 4294967296.0 - 1.0;
         let mut scene = Self { poses: Vec::new(), lenses: Vec::new(), points: Vec::new(), seen: Vec::new() };
-        for i in 0..PHOTOGRAPHS {
-            let angle = std::f64::consts::TAU * i as f64 / PHOTOGRAPHS as f64;
+        for i in 0..photographs {
+            let angle = std::f64::consts::TAU * i as f64 / photographs as f64;
             let turn = Rotation3::new(Vector3::new(0.05 * u(), 0.05 * u(), 0.05 * u()))
                 * Rotation3::new(Vector3::new(0.0, angle, 0.0));
             scene.poses.extend(RigidMotion::store(&turn, &Vector3::new(0.3 * u(), 0.3 * u(), 10.0 + 0.3 * u())));
             scene.lenses.extend([1400.0 + 30.0 * u(), -0.05 + 0.02 * u()]);
         }
         // On a wall around the middle, seen from outside by the cameras next to it.
-        for p in 0..POINTS {
+        let near_count = NEAR.min(photographs / 2);
+        for p in 0..POINTS / PHOTOGRAPHS * photographs {
             let angle = std::f64::consts::PI * u();
             let radius = 2.5 + 0.3 * u();
             let point = [-radius * angle.sin(), 2.0 * u(), -radius * angle.cos()];
             scene.points.extend(point);
-            let middle = (-angle / std::f64::consts::TAU * PHOTOGRAPHS as f64).round() as i64;
-            let mut near: Vec<i64> = (0..NEAR as i64).map(|k| middle + k - NEAR as i64 / 2).collect();
+            let middle = (-angle / std::f64::consts::TAU * photographs as f64).round() as i64;
+            let mut near: Vec<i64> = (0..near_count as i64).map(|k| middle + k - near_count as i64 / 2).collect();
             for k in 0..SIGHTS {
-                let other = k + ((u() + 1.0) / 2.0 * (NEAR - k) as f64) as usize;
-                near.swap(k, other.min(NEAR - 1));
-                let photograph = near[k].rem_euclid(PHOTOGRAPHS as i64) as u32;
+                let other = k + ((u() + 1.0) / 2.0 * (near_count - k) as f64) as usize;
+                near.swap(k, other.min(near_count - 1));
+                let photograph = near[k].rem_euclid(photographs as i64) as u32;
                 scene.seen.push((photograph, p as u32, Vector2::zeros()));
             }
         }
@@ -217,7 +252,7 @@ impl Scene {
         problem.add_residuals("observations", pixels, [poses, lenses, points], blocks, loss)?;
         problem.eliminate(points)?;
         problem.hold(poses, 0)?;
-        problem.hold_parameters(poses, PHOTOGRAPHS / 4, &[3])?;
+        problem.hold_parameters(poses, self.poses.len() / 12 / 4, &[3])?;
         let options = AdjustOptions { cost_tolerance: TOLERANCE, gradient_tolerance: 0.0, ..AdjustOptions::default() };
         Ok(problem.solve(&options, |_| ControlFlow::Continue(()))?)
     }

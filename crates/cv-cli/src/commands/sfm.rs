@@ -21,7 +21,7 @@ use cv_io::ply::PlyEncoding;
 use cv_pipeline::features::FeatureError;
 use cv_pipeline::many_views::{SfmModel, Solver};
 use cv_pipeline::{
-    Cancelled, PhotoOrder, Progress, SfmJobOptions, SfmPhoto, SfmPhotoError, sfm_covariance, sfm_pairs, sfm_photo,
+    PhotoOrder, PhotoProgress, Progress, SfmJobOptions, SfmPhoto, SfmPhotoError, sfm_covariance, sfm_pairs, sfm_photo,
     sfm_solve,
 };
 use dense::DenseArgs;
@@ -173,7 +173,7 @@ impl Args {
                     Some((earlier, camera)) => cameras.of_earlier(size, camera, earlier, self),
                     None => cameras.of(size, exif, self, context),
                 };
-                let place = Place { context, done: i, total };
+                let place = PhotoProgress { progress: context, done: i, total };
                 match self.features_of(
                     one,
                     |size, exif| camera(&mut cameras, size, exif),
@@ -198,11 +198,11 @@ impl Args {
             return Err(words::many_views::too_few(photos.len(), &refused));
         }
         clock.lap("features");
-        let find = || sfm_pairs(&photos, &cameras.list, options, context);
-        let (pairs, geometry) = checkpoint.pairs(&photos, &cameras.list, options, find)?;
+        let find = || sfm_pairs(&photos, cameras.list(), options, context);
+        let (pairs, geometry) = checkpoint.pairs(&photos, cameras.list(), options, find)?;
         clock.lap("match");
         let known = told.earlier.as_ref().map_or_else(Vec::new, |earlier| earlier.poses(&used));
-        let mut result = sfm_solve(&photos, &cameras.list, (pairs, &geometry), &known, options, context)
+        let mut result = sfm_solve(&photos, cameras.list(), (pairs, &geometry), &known, options, context)
             .map_err(words::many_views::no_model)?;
         let frames = told.frames(&self.places, &mut result.models, &all, &used, context)?;
         let models: Vec<SparseModel> =
@@ -226,7 +226,7 @@ impl Args {
         let mut clock = cv_core::StageClock::new();
         if let (Some(path), Some(model), Some(frame)) = (&self.covariance, result.models.first(), frames.first()) {
             let names: Vec<&str> = photos.iter().map(|photo| photo.name.as_str()).collect();
-            let of = sfm_covariance(&photos, &cameras.list, model)?;
+            let of = sfm_covariance(&photos, cameras.list(), model)?;
             let text = covariance::deviations(&of, &names, &frame.json["unit"]).to_string();
             context.write(Output::File(path, JSON), |path| cv_io::write_bytes(path, text.as_bytes()))?;
             clock.lap("covariance");
@@ -270,7 +270,7 @@ impl Args {
         mut camera: impl FnMut((usize, usize), Option<f64>) -> Result<Result<usize, String>, Failure>,
         options: &SfmJobOptions,
         checkpoint: &Checkpoint<'_>,
-        place: &Place<'_>,
+        place: &PhotoProgress<'_>,
     ) -> Result<Result<SfmPhoto, String>, Failure> {
         place.report("photographs", 0, 0)?;
         let (key, found) = checkpoint.seen(one, options);
@@ -300,7 +300,7 @@ impl Args {
         one: &Photograph,
         mut camera: impl FnMut((usize, usize), Option<f64>) -> Result<Result<usize, String>, Failure>,
         options: &SfmJobOptions,
-        place: &Place<'_>,
+        place: &PhotoProgress<'_>,
     ) -> Result<Result<Seen, String>, Failure> {
         let image = match cv_io::read_image(&one.path) {
             Ok(image) => image,
@@ -390,18 +390,5 @@ impl Told<'_> {
             None => places.align(model, all, used, context),
         };
         models.iter_mut().map(one).collect()
-    }
-}
-
-/// How many of the photographs have been looked at.
-struct Place<'a> {
-    context: &'a Context,
-    done: usize,
-    total: usize,
-}
-
-impl Progress for Place<'_> {
-    fn report(&self, _: &'static str, _: usize, _: usize) -> Result<(), Cancelled> {
-        Progress::report(self.context, "photographs", self.done, self.total)
     }
 }

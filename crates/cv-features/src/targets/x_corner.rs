@@ -95,6 +95,9 @@ pub(super) fn smoothed(view: ImageView<'_, f32, 1>, level: Level) -> GrayF32 {
     out
 }
 
+/// Peaks that are looked at without asking whether to go on: some milliseconds.
+const UNASKED: usize = 512;
+
 /// The candidates of one octave.
 fn octave(
     image: &GrayF32,
@@ -117,14 +120,18 @@ fn octave(
         .map(|i| {
             stage.add(1)?;
             let (from, to) = (first + i * rows, (first + (i + 1) * rows).min(last));
-            Ok(strip(image, from..to, floor, level)
-                .into_iter()
-                .filter_map(|(x, y, dx, dy, response)| {
-                    let corner = looked_at(image, (x, y), (dx, dy), scale)?;
-                    let fits = corner.contrast >= least_contrast && response >= 8.0 * SHAPE * corner.contrast;
-                    fits.then_some((response, corner))
-                })
-                .collect::<Vec<_>>())
+            let looked = |&(x, y, dx, dy, response): &(usize, usize, f32, f32, f32)| {
+                let corner = looked_at(image, (x, y), (dx, dy), scale)?;
+                let fits = corner.contrast >= least_contrast && response >= 8.0 * SHAPE * corner.contrast;
+                fits.then_some((response, corner))
+            };
+            let mut found = Vec::new();
+            // Of noise, a strip has tens of thousands.
+            for peaks in strip(image, from..to, floor, level).chunks(UNASKED) {
+                stage.check()?;
+                found.extend(peaks.iter().filter_map(looked));
+            }
+            Ok(found)
         })
         .collect::<Result<Vec<_>, Cancelled>>()?
         .concat();

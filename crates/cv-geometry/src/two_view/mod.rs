@@ -73,7 +73,7 @@ impl Intrinsics {
         match *self {
             Self::Known(_) => None,
             Self::Matrix([a, b]) => Some(of([a.fx, b.fx], MATRIX_DEVIATION, a == b)),
-            Self::Focal(focal) => Some(of(focal, EXIF_DEVIATION, focal[0] == focal[1] && sizes[0] == sizes[1])),
+            Self::Focal(focal) => Some(of(focal, EXIF_FOCAL_DEVIATION, focal[0] == focal[1] && sizes[0] == sizes[1])),
             Self::Unknown => {
                 let (share, deviation) = usual_focal();
                 let focal = share * sizes[0].0.max(sizes[0].1) as f64;
@@ -84,7 +84,7 @@ impl Intrinsics {
 }
 
 /// Relative standard deviation of focal lengths by EXIF: a 35 mm equivalent is rounded by up to 2 %, and focusing near lengthens what is written for infinity by some per cent.
-const EXIF_DEVIATION: f64 = 0.03;
+pub const EXIF_FOCAL_DEVIATION: f64 = 0.03;
 /// And of a calibration matrix that came without its lens: the focal length of a fit without distortion takes up some of it (of Sceaux's, 2.3 %).
 const MATRIX_DEVIATION: f64 = 0.02;
 /// What focal lengths of photographs are, as shares of the longer side: an unknown one is between these with 95 % (fields of view of 103 and of 19 degrees).

@@ -1,19 +1,24 @@
 //! Cameras and points from many photographs.
 
+mod cameras;
 mod candidates;
 mod dense;
 mod fusion;
 mod model;
 mod pairs;
 mod photo;
+mod places;
 
+pub use cameras::{OtherSize, PhotoProgress, SfmCameras};
 pub use dense::{DensePhoto, SfmDense, SfmDenseError, SfmDenseOptions, sfm_dense};
 pub use pairs::sfm_pairs;
 pub use photo::{SfmPhoto, SfmPhotoError, sfm_photo};
+pub use places::{GpsCenters, GpsFix, PlacedModel, gps_centers, place_model};
 
 use crate::Progress;
 use cv_core::{Camera, Cancelled, Distortion, OptionError, Pose, StageClock};
 use cv_features::{FeatureOptions, RatioTest, SiftOptions};
+use cv_geometry::EXIF_FOCAL_DEVIATION;
 use cv_sfm::{
     AdjustError, CameraKnowledge, FeatureDistance, ModelCovariance, Observation, PairMatches, RefusedPair, SfmError,
     SfmInput, SfmModel, SfmView, Solver, ViewOutcome, ViewPairModel, ViewPairOptions, model_covariance,
@@ -94,8 +99,6 @@ pub struct SfmCamera {
     pub knowledge: CameraKnowledge,
 }
 
-/// Relative standard deviation of focal lengths by EXIF, which photographers round and focusing changes.
-const EXIF_DEVIATION: f64 = 0.03;
 /// Focal length over the longer side of a photograph of which nothing is known: COLMAP's, where the pairs do not tell better.
 const USUAL_FOCAL: f64 = 1.2;
 
@@ -112,7 +115,7 @@ impl SfmCamera {
 
     /// The camera of photographs of that size and about that focal length in pixels, as EXIF tells it.
     pub fn of_focal((width, height): (usize, usize), focal: f64) -> Self {
-        let knowledge = CameraKnowledge::Focal { focal, deviation: EXIF_DEVIATION };
+        let knowledge = CameraKnowledge::Focal { focal, deviation: EXIF_FOCAL_DEVIATION };
         Self { camera: open_lens(Camera::from_focal(width, height, focal)), knowledge }
     }
 

@@ -6,18 +6,21 @@ use crate::frame::{Context, Failure};
 use crate::rig;
 use cv_core::{Camera, ModelImage, Pose, SparseModel};
 use cv_io::CalibrationFormat;
-use cv_pipeline::SfmCamera;
+use cv_pipeline::{OtherSize, SfmCamera, SfmCameras};
 use std::collections::BTreeMap;
 use std::path::Path;
 
 /// The cameras of the photographs so far.
 #[derive(Default)]
 pub(super) struct Cameras {
-    pub(super) list: Vec<SfmCamera>,
-    /// By size and focal length in thousandths of a pixel.
-    known: BTreeMap<(usize, usize, u64), usize>,
+    all: SfmCameras,
     /// By their numbers in an earlier model.
     earlier: BTreeMap<u32, usize>,
+}
+
+/// Why a photograph has no camera.
+fn other_size(OtherSize { photo: (width, height), camera: (w, h) }: OtherSize, file: &Path) -> String {
+    format!("it is {width}×{height} px, its camera in {} is {w}×{h} px", file.display())
 }
 
 impl Cameras {
@@ -29,55 +32,48 @@ impl Cameras {
         earlier: &Earlier,
         args: &Args,
     ) -> Result<Result<usize, String>, Failure> {
-        if (camera.width, camera.height) != size {
-            let ((w, h), (width, height)) = ((camera.width, camera.height), size);
-            let folder = earlier.folder().display();
-            return Ok(Err(format!("it is {width}×{height} px, its camera in {folder} is {w}×{h} px")));
+        let own = (camera.width, camera.height);
+        if own != size {
+            return Ok(Err(other_size(OtherSize { photo: size, camera: own }, earlier.folder())));
         }
         if let Some(index) = self.earlier.get(&number) {
             return Ok(Ok(*index));
         }
         args.check_lens(earlier.folder(), &camera)?;
-        self.list.push(SfmCamera::known(camera));
-        self.earlier.insert(number, self.list.len() - 1);
-        Ok(Ok(self.list.len() - 1))
+        let index = self.all.add(SfmCamera::known(camera));
+        self.earlier.insert(number, index);
+        Ok(Ok(index))
     }
 
     /// The index of the camera of a photograph of that size and, by EXIF, that focal length in pixels, or why it has none.
     pub(super) fn of(
         &mut self,
-        (width, height): (usize, usize),
+        size: (usize, usize),
         exif: Option<f64>,
         args: &Args,
         context: &Context,
     ) -> Result<Result<usize, String>, Failure> {
         let exif = exif.filter(|_| !args.ignore_exif && args.camera.is_none());
-        let focal = args.focal.or(exif);
-        let key = (width, height, focal.map_or(0, |f| (f * 1000.0).round() as u64));
-        if let Some(index) = self.known.get(&key) {
-            return Ok(Ok(*index));
-        }
-        let camera = if let Some(file) = &args.camera {
-            let (camera, lens_known) = rig::camera_and_lens(file, Some((width, height)), args.undistorted, context)?;
-            if (camera.width, camera.height) != (width, height) {
-                let (w, h) = (camera.width, camera.height);
-                return Ok(Err(format!("it is {width}×{height} px, its camera in {} is {w}×{h} px", file.display())));
-            }
-            if lens_known {
-                args.check_lens(file, &camera)?;
-                SfmCamera::known(camera)
-            } else {
-                SfmCamera::of_matrix(camera)
-            }
-        } else {
-            focal.map_or_else(
-                || SfmCamera::unknown((width, height)),
-                |focal| SfmCamera::of_focal((width, height), focal),
-            )
+        let Some(file) = &args.camera else {
+            let found = self.all.of(size, args.focal.or(exif), || Ok::<_, Failure>(None))?;
+            return Ok(found.map_err(|error| error.to_string()));
         };
-        self.list.push(camera);
-        self.known.insert(key, self.list.len() - 1);
-        Ok(Ok(self.list.len() - 1))
+        let calibrated = || {
+            let (camera, lens_known) = rig::camera_and_lens(file, Some(size), args.undistorted, context)?;
+            if !lens_known {
+                return Ok(Some(SfmCamera::of_matrix(camera)));
+            }
+            if (camera.width, camera.height) == size {
+                args.check_lens(file, &camera)?;
+            }
+            Ok::<_, Failure>(Some(SfmCamera::known(camera)))
+        };
+        Ok(self.all.of(size, None, calibrated)?.map_err(|error| other_size(error, file)))
+    }
+
+    /// All of them, by index.
+    pub(super) fn list(&self) -> &[SfmCamera] {
+        self.all.list()
     }
 }
 

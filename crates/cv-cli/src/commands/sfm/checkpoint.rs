@@ -7,10 +7,10 @@ mod record;
 use super::photographs::Photograph;
 use crate::frame::{Context, Output};
 use cv_core::Cancelled;
-use cv_io::{ExifGps, IoError};
-use cv_pipeline::many_views::{PairMatches, ViewPairModel};
+use cv_io::IoError;
 use cv_pipeline::{SfmCamera, SfmJobOptions, SfmPhoto};
 use record::Record;
+pub(super) use record::{Pairs, Seen};
 use std::cell::{Cell, RefCell};
 use std::fs;
 use std::hash::{DefaultHasher, Hasher};
@@ -18,19 +18,6 @@ use std::path::{Path, PathBuf};
 
 /// The folder, within that of the result.
 const FOLDER: &str = ".cv-sfm";
-
-/// What is known of a photograph once it was looked at.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct Seen {
-    /// The focal length by EXIF, in pixels.
-    pub(super) focal: Option<f64>,
-    pub(super) gps: Option<ExifGps>,
-    /// Its features; its name and the index of its camera are those of the run that made them.
-    pub(super) photo: SfmPhoto,
-}
-
-/// The pairs of photographs that hold, and their geometry.
-pub(super) type Pairs = (Vec<PairMatches>, Vec<ViewPairModel>);
 
 /// The work of a run so far.
 pub(super) struct Checkpoint<'a> {

@@ -3,8 +3,9 @@
 use super::photographs::Photograph;
 use crate::frame::{Context, Failure};
 use crate::words::many_views::{self as words, PlaceSource};
-use cv_core::{GeodeticPoint, Point3, east_north_up};
-use cv_pipeline::many_views::{KnownPlaces, ModelAlignError, ModelAlignment, SfmModel, align_model};
+use cv_core::Point3;
+use cv_pipeline::many_views::{KnownPlaces, ModelAlignment, SfmModel};
+use cv_pipeline::{GpsCenters, GpsFix, gps_centers, place_model};
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
@@ -111,24 +112,14 @@ impl Places {
         if args.ignore_gps || self.source.is_some() {
             return places;
         }
-        // Heights are told by all that count, or by none: one that is not told is no height of 0.
-        let told: Vec<usize> = (0..all.len()).filter(|i| all[*i].gps.is_some()).collect();
-        let high: Vec<usize> =
-            told.iter().copied().filter(|i| all[*i].gps.is_some_and(|gps| gps.altitude.is_some())).collect();
-        let heights = high.len() >= 3;
-        let count = if heights { high } else { told };
-        let place = |i: &usize| {
-            all[*i].gps.map(|gps| {
-                let place = gps.position();
-                GeodeticPoint { altitude: if heights { place.altitude } else { 0.0 }, ..place }
-            })
+        let fix = |one: &Photograph| {
+            one.gps.map(|gps| GpsFix { place: gps.position(), has_altitude: gps.altitude.is_some() })
         };
-        let positions: Vec<GeodeticPoint> = count.iter().filter_map(place).collect();
-        let Some(origin) = positions.first().copied() else { return places };
-        for (i, place) in count.iter().zip(east_north_up(&positions)) {
-            places.centers[*i] = Some(place);
+        let fixes: Vec<Option<GpsFix>> = all.iter().map(fix).collect();
+        if let Some(GpsCenters { centers, origin, heights }) = gps_centers(&fixes) {
+            places.centers = centers;
+            places.source = Some(PlaceSource::Gps { origin, heights });
         }
-        places.source = Some(PlaceSource::Gps { origin, heights });
         places
     }
 
@@ -160,26 +151,16 @@ impl Places {
         let centers: Vec<Option<Point3<f64>>> = used.iter().map(|at| self.centers[*at]).collect();
         let seed = context.seed.unwrap_or(0);
         let known = KnownPlaces { centers: &centers, distances: &distances };
-        let alone = KnownPlaces { centers: &[], ..known };
-        let found = align_model(model, &known, seed, context).or_else(|error| match error {
-            ModelAlignError::Cancelled(_) => Err(error),
-            error => {
-                if let (Some(source), Some(text)) = (&self.source, self.source.as_ref().and_then(|s| s.refusal(&error)))
-                {
-                    context.warn(format!("the model is not brought to {}: {text}", source.name()));
-                }
-                align_model(model, &alone, seed, context)
-            }
-        });
-        // Of known distances alone.
-        let found = found.or_else(|error| match error {
-            ModelAlignError::Cancelled(_) => Err(error),
-            error => {
-                context.warn(format!("--distance is left aside: {error}"));
-                align_model(model, &KnownPlaces::default(), seed, context)
-            }
-        })?;
-        model.transform(&found.similarity);
+        let placed = place_model(model, &known, seed, context)?;
+        if let (Some(error), Some(source)) = (&placed.without_centers, &self.source)
+            && let Some(text) = source.refusal(error)
+        {
+            context.warn(format!("the model is not brought to {}: {text}", source.name()));
+        }
+        if let Some(error) = &placed.without_distances {
+            context.warn(format!("--distance is left aside: {error}"));
+        }
+        let found = placed.alignment;
         self.tell(&found, model, all, used, context);
         Ok(self.frame(&found, all, used))
     }

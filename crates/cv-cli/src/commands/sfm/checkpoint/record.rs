@@ -1,12 +1,24 @@
 //! A checkpoint's file: `CVSFM`, a version, a key, and the length of what follows; numbers, little-endian; a checksum of all of it.
 
-use super::{Pairs, Seen};
 use cv_core::{DMatch, Keypoint, Matrix3, Point2, Pose, Rotation3, Vector3};
 use cv_io::ExifGps;
 use cv_pipeline::SfmPhoto;
 use cv_pipeline::features::{ByteDescriptors, DescriptorKind};
 use cv_pipeline::many_views::{PairMatches, ViewPairModel};
 use std::hash::{DefaultHasher, Hasher};
+
+/// What is known of a photograph once it was looked at.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Seen {
+    /// The focal length by EXIF, in pixels.
+    pub(crate) focal: Option<f64>,
+    pub(crate) gps: Option<ExifGps>,
+    /// Its features; its name and the index of its camera are those of the run that made them.
+    pub(crate) photo: SfmPhoto,
+}
+
+/// The pairs of photographs that hold, and their geometry.
+pub(crate) type Pairs = (Vec<PairMatches>, Vec<ViewPairModel>);
 
 const MAGIC: [u8; 8] = *b"CVSFM\0\0\x01";
 /// Bytes before the numbers: magic, key, length; and after them, of the checksum.
