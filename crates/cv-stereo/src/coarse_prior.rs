@@ -13,8 +13,8 @@ use rayon::prelude::*;
 /// Reach of the window in which texture is measured.
 const REACH: usize = 2;
 /// Sum of the absolute differences between horizontal neighbors (gray levels of 255) in the window of 5×5 pixels, up to which a
-/// pixel is guided by at most 3, 2 and 1 bits of census: 2.3, 3 and 3.7 levels a step. Noise of photographs is 1 to 2 levels.
-const FLAT: [u16; PRIOR_CAP as usize] = [58, 75, 91];
+/// pixel is guided by at most 3, 2 and 1 bits of census: 1.6, 2.3 and 3 levels a step. Noise of photographs is 1 to 2 levels.
+const FLAT: [u16; PRIOR_CAP as usize] = [40, 58, 75];
 /// The most that is added to the cost of a disparity, in bits of census.
 pub(crate) const PRIOR_CAP: u8 = 3;
 /// A coarse disparity counts where of nine pixels two apart so many, itself among them, lie within [`STEP`] px of it: beside an outline a
@@ -29,7 +29,8 @@ const WORTH: f64 = 0.1;
 pub(crate) struct Prior {
     /// Index from the smallest disparity.
     pub(crate) index: u16,
-    /// What is added to the cost of index `k` is `|k − index|`, and this at most; 0 for pixels that are not guided.
+    /// What is added to the cost of index `k` is `|k − index| − 1`, from 0 to this; 0 for pixels that are not guided. A coarse disparity is right
+    /// within a pixel: nearer ones are none of its business, least of all their fractions.
     pub(crate) cap: u8,
 }
 

@@ -151,7 +151,7 @@ fn guide<S: Simd, const BLOCKS: usize>(simd: S, prior: Prior, out: &mut [u8]) {
     let group = BLOCKS * BLOCK;
     let n = group / lanes;
     let first = S::u8s::from_fn(simd, |lane| (lane * n) as u8);
-    let cap = S::u8s::splat(simd, prior.cap);
+    let (cap, one) = (S::u8s::splat(simd, prior.cap), S::u8s::splat(simd, 1));
     for (g, out) in out.chunks_exact_mut(group).enumerate() {
         // Groups hold at most 128 indices: beyond its ends, what counts is only that the prior is farther away than the cap.
         let local = i32::from(prior.index) - (g * group) as i32;
@@ -160,6 +160,7 @@ fn guide<S: Simd, const BLOCKS: usize>(simd: S, prior: Prior, out: &mut [u8]) {
         for v in 0..n {
             let k = first + v as u8;
             let away = (k.max(at) - k.min(at)) + beyond;
+            let away = away - away.min(one);
             let out = &mut out[v * lanes..][..lanes];
             (S::u8s::from_slice(simd, out) + away.min(cap)).store_slice(out);
         }

@@ -350,7 +350,7 @@ impl StereoMatcher {
             return None;
         }
         let first = min_disparity.div_euclid(2);
-        let last = (min_disparity + disparities as i32 - 1).div_euclid(2) + 1;
+        let last = (min_disparity + disparities as i32 - 1).div_euclid(2);
         let options = StereoOptions {
             min_disparity: first,
             disparities: (last - first + 1) as usize,

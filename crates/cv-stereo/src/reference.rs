@@ -29,7 +29,8 @@ pub(crate) fn match_reference(
         (left[i] ^ right[j]).count_ones() as u8 + more.min(options.intensity_cost.cap())
     };
     let guided = |i: usize, k: usize| {
-        let away = |prior: &Prior| usize::from(prior.index).abs_diff(k).min(usize::from(prior.cap)) as u8;
+        let away =
+            |prior: &Prior| usize::from(prior.index).abs_diff(k).saturating_sub(1).min(usize::from(prior.cap)) as u8;
         priors.get(i).map_or(0, away)
     };
     let costs: Vec<u8> = (0..width * height)

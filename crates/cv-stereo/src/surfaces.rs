@@ -6,7 +6,7 @@
 use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
 use rayon::prelude::*;
-use std::collections::VecDeque;
+use std::{collections::VecDeque, ops::Range};
 
 /// Side of a cell in px.
 pub(crate) const CELL: usize = 8;
@@ -158,15 +158,10 @@ pub(crate) fn center(cell: usize, columns: usize) -> (f64, f64) {
     (middle(cell % columns), middle(cell / columns))
 }
 
-/// Pixels of a cell.
-pub(crate) fn pixels(
-    cell: usize,
-    columns: usize,
-    (width, height): (usize, usize),
-) -> impl Iterator<Item = (usize, usize)> {
+/// Columns and rows of a cell.
+pub(crate) fn extent(cell: usize, columns: usize, (width, height): (usize, usize)) -> (Range<usize>, Range<usize>) {
     let (left, top) = (cell % columns * CELL, cell / columns * CELL);
-    let (right, bottom) = ((left + CELL).min(width), (top + CELL).min(height));
-    (top..bottom).flat_map(move |y| (left..right).map(move |x| (x, y)))
+    (left..(left + CELL).min(width), top..(top + CELL).min(height))
 }
 
 impl Surfaces {
@@ -299,12 +294,13 @@ impl Surfaces {
                 }
                 let [a, b, d] = around.fit();
                 let (middle_x, middle_y) = center(x, columns);
-                for (px, py) in pixels(x, columns, (width, height)) {
-                    let value = (a * (px as f64 - middle_x) + b * (py as f64 - middle_y) + d) as f32;
-                    let d = &mut disparity[py * width + px];
-                    // NaN compares false.
-                    if (value - *d).abs() < SMOOTHED {
-                        *d += flatness * (value - *d);
+                let (xs, ys) = extent(x, columns, (width, height));
+                for y in ys {
+                    let first = b * (y as f64 - middle_y) + d;
+                    for (x, d) in xs.clone().zip(&mut disparity[y * width..][xs.clone()]) {
+                        let off = (a * (x as f64 - middle_x) + first) as f32 - *d;
+                        // NaN compares false.
+                        *d += if off.abs() < SMOOTHED { flatness * off } else { 0.0 };
                     }
                 }
             }
@@ -350,20 +346,21 @@ impl Cell {
             let next = gray[left + 1..].iter().chain(gray.last());
             steps += gray[left..right].iter().zip(next).map(|(&a, &b)| u32::from(a.abs_diff(b))).sum::<u32>();
         }
-        let inside = |low: f32, high: f32| {
-            pixels(row * width.div_ceil(CELL) + column, width.div_ceil(CELL), (width, height))
-                .map(|(x, y)| disparity[y * width + x])
-                .filter(move |&d| d >= low && d <= high)
-        };
         // Halved twice: three surfaces in a cell.
         for _ in 0..2 {
             if high - low > SPREAD {
                 let middle = 0.5 * (low + high);
-                let above = inside(low, high).filter(|&d| d > middle);
-                let (count, least) = above.fold((0, high), |(n, least), d| (n + 1, least.min(d)));
-                let below = inside(low, high).filter(|&d| d <= middle);
-                let (others, most) = below.fold((0, low), |(n, most), d| (n + 1, most.max(d)));
-                (low, high) = if count > others { (least, high) } else { (low, most) };
+                let (mut above, mut least, mut below, mut most) = (0, high, 0, low);
+                for y in top..bottom {
+                    for &d in &disparity[y * width..][left..right] {
+                        let (up, down) = (d > middle && d <= high, d <= middle && d >= low);
+                        above += u32::from(up);
+                        below += u32::from(down);
+                        least = if up && d < least { d } else { least };
+                        most = if down && d > most { d } else { most };
+                    }
+                }
+                (low, high) = if above > below { (least, high) } else { (low, most) };
             }
         }
         let mut moments = Moments::default();
