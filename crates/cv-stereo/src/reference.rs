@@ -8,8 +8,7 @@ use crate::{IntensityCost, Paths, StereoOptions};
 pub(crate) fn match_reference(
     options: &StereoOptions,
     gray: &[u16],
-    left: &[u64],
-    right: &[u64],
+    [left, right]: [&[u64]; 2],
     intensity_cost: &[Vec<u8>; 2],
     priors: &[Prior],
     width: usize,
@@ -234,7 +233,7 @@ mod tests {
             let blended = [&left, &right].map(|g| intensity_reference(g, width, options.intensity_cost));
             let prior = |i: usize| Prior { index: (noise(i + 11) as usize * 31 % disparities) as u16, cap: (noise(i + 5) % 4) as u8 };
             let priors: Vec<Prior> = if guided { (0..width * height).map(prior).collect() } else { Vec::new() };
-            let expected = match_reference(&options, &left, &bits[0], &bits[1], &blended, &priors, width, height);
+            let expected = match_reference(&options, &left, [&bits[0], &bits[1]], &blended, &priors, width, height);
 
             let gray = [padded(&left, width, height), padded(&right, width, height)];
             let min_disparity = i64::from(options.min_disparity);

@@ -103,7 +103,7 @@ pub(crate) fn fill(
         for i in 0..open.len() {
             let c = open[if pass % 2 == 0 { i } else { open.len() - 1 - i }] as usize;
             improve(surfaces, view, c);
-            if i % 1024 == 0 {
+            if i.is_multiple_of(1024) {
                 stage.check()?;
             }
         }
@@ -279,7 +279,7 @@ fn spread(
             surfaces.labels[c] = label;
             visit(surfaces, heap, c, cost, label);
             taken += 1;
-            if taken % 1024 == 0 {
+            if taken.is_multiple_of(1024) {
                 stage.check()?;
             }
         }
@@ -435,8 +435,9 @@ mod tests {
         for (x, y) in all {
             n += 1;
             let d = map.disparity.at(x, y)[0];
-            // NaN is wrong.
-            bad += usize::from(!((d - truth(x, y)).abs() <= 2.0));
+            // NaN compares false.
+            let right = (d - truth(x, y)).abs() <= 2.0;
+            bad += usize::from(!right);
         }
         bad as f64 / n as f64
     }
