@@ -6,7 +6,8 @@ import pandora
 import rasterio
 from stereo_scenes import SCENES, errors, truth_and_mask
 
-sys.argv, folder = sys.argv[:1] + ["."], sys.argv[1]
+# Pandora's plug-ins read the arguments.
+arguments, sys.argv = sys.argv, sys.argv[:1] + ["."]
 work = tempfile.mkdtemp()
 os.makedirs(work + "/out")
 
@@ -19,14 +20,16 @@ def read(path):
     return np.round(0.299 * bands[0] + 0.587 * bands[1] + 0.114 * bands[2])
 
 
-for scene, left, right, disparities in SCENES:
-    for side, name in (("L", left), ("R", right)):
-        gray = read(f"{folder}/{scene}/{name}").astype("uint8")
+def disparity(left, right, disparities, first=0):
+    """Disparities of a pair, NaN where there is none, and the seconds of the whole run."""
+    for side, path in (("L", left), ("R", right)):
+        gray = read(path).astype("uint8")
         with rasterio.open(f"{work}/{side}.tif", "w", driver="GTiff", height=gray.shape[0], width=gray.shape[1], count=1,
                            dtype="uint8") as file:
             file.write(gray, 1)
     config = {
-        "input": {"left": {"img": work + "/L.tif", "disp": [-disparities, 0]}, "right": {"img": work + "/R.tif"}},
+        "input": {"left": {"img": work + "/L.tif", "disp": [-(first + disparities), -first]},
+                  "right": {"img": work + "/R.tif"}},
         "pipeline": {
             "matching_cost": {"matching_cost_method": "census", "window_size": 5, "subpix": 1},
             "optimization": {"optimization_method": "sgm",
@@ -42,9 +45,15 @@ for scene, left, right, disparities in SCENES:
     start = time.perf_counter()
     pandora.main(work + "/c.json", work + "/out", False)
     seconds = time.perf_counter() - start
-    disparity = -read(work + "/out/left_disparity.tif")
-    truth, mask = truth_and_mask(folder, scene, read)
-    print(json.dumps({
-        "scene": scene, "mode": "Pandora", "seconds": seconds, **errors(disparity, truth, mask),
-        "version": getattr(pandora, "__version__", ""),
-    }), flush=True)
+    return -read(work + "/out/left_disparity.tif"), seconds
+
+
+if __name__ == "__main__":
+    folder = arguments[1]
+    for scene, left, right, disparities in SCENES:
+        found, seconds = disparity(f"{folder}/{scene}/{left}", f"{folder}/{scene}/{right}", disparities)
+        truth, mask = truth_and_mask(folder, scene, read)
+        print(json.dumps({
+            "scene": scene, "mode": "Pandora", "seconds": seconds, **errors(found, truth, mask),
+            "version": getattr(pandora, "__version__", ""),
+        }), flush=True)

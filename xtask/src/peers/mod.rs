@@ -16,6 +16,7 @@ mod panorama_truth;
 mod sfm;
 pub(crate) mod sfm_score;
 mod stereo;
+mod stereo_groups;
 
 use crate::checks::{self, Check};
 use anyhow::{Context, Result, ensure};
@@ -29,6 +30,7 @@ type Job = fn(&Path, &Path) -> Result<Vec<Check>>;
 
 const JOBS: &[checks::Named<Job>] = &[
     ("stereo", stereo::run),
+    ("stereo-groups", stereo_groups::run),
     ("features", features::run),
     ("geometry", geometry::run),
     ("adjust", adjust::run),
