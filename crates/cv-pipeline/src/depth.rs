@@ -470,9 +470,9 @@ mod tests {
         let nearest = truth.as_slice().iter().copied().fold(0.0, f32::max) as usize;
         let error = run(&right, &options(nearest / 2, FewMatches::Check)).map(|d| d.few).unwrap_err();
         assert!(matches!(error, DepthError::NoPair { cause: NoPairCause::Range { .. }, .. }), "{error}");
-        // Who wants it all the same gets it, where single pixels that match by chance are not removed.
+        // Who wants it all the same gets it, where patches that match by chance are not removed.
         let keep = options(96, FewMatches::Keep);
-        let keep = DepthOptions { stereo: StereoOptions { speckle_size: 0, ..keep.stereo }, ..keep };
+        let keep = DepthOptions { stereo: StereoOptions { speckle_size: 10, ..keep.stereo }, ..keep };
         assert!(run(&other, &keep).unwrap().few.is_some());
     }
 
