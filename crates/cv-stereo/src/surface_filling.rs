@@ -481,30 +481,6 @@ mod tests {
     }
 
     #[test]
-    fn what_lies_beside_the_right_photograph_is_of_the_thing_it_belongs_to() {
-        // A near thing at the left border, whose first 24 columns the right camera does not see.
-        let map = matched(|x, y| vec![if x < 60 { (24, texture(x + 1000, y)) } else { (4, texture(x, y)) }]);
-        let share = wrong(&map, |x, _| x < 24, |_, _| 24.0);
-        // Nothing is at stake there: no other surface is near.
-        assert!(share < 0.02, "{share}");
-        let state = map.state.at(5, 40)[0];
-        assert_eq!(state, PixelState::OutOfView);
-    }
-
-    #[test]
-    fn a_wall_without_texture_is_the_plane_of_its_frame() {
-        // A poster without texture on a wall that recedes: its inside is matched nowhere but at the rim.
-        let inside = |x: usize, y: usize| (50..130).contains(&x) && (16..80).contains(&y);
-        let steps = |y: i64| 10 + y / 6;
-        let map =
-            matched(|x, y| vec![(steps(y), if inside(x.max(0) as usize, y as usize) { 120 } else { texture(x, y) })]);
-        let share = wrong(&map, inside, |_, y| 10.0 + y as f32 / 6.0 - 0.4);
-        // One disparity for all of it would leave six of ten wrong. What is left is a streak where the rim's steps of a whole pixel, two of
-        // them in a cell, are taken for a level surface.
-        assert!(share < 0.15, "{share}");
-    }
-
-    #[test]
     fn pictures_of_one_color_stay_without_disparity() {
         let map = matched(|_, _| vec![(0, 90)]);
         assert!(map.disparity.as_slice().iter().all(|d| d.is_nan()));
