@@ -90,8 +90,8 @@ pub struct DepthResult {
 }
 
 impl DepthResult {
-    /// Whether fewer than half of the pixels were matched and most of the others filled in from around: of generated pairs like that, three to five of
-    /// ten filled pixels are off by more than 2 px, of others one to three (`tests/filled.rs`).
+    /// Whether fewer than half of the pixels were matched and most of the others filled in from around: of generated pairs like that, two to three of
+    /// ten filled pixels are off by more than 2 px, of others at most one or two (`tests/filled.rs`).
     pub fn is_mostly_filled(&self) -> bool {
         let matched = self.map.matched_fraction();
         matched < 0.5 && self.map.valid_fraction() - matched > 0.5 * (1.0 - matched)

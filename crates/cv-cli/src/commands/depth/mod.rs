@@ -227,7 +227,7 @@ fn warn_of_filling(maps: &DepthResult, context: &Context) {
     }
     if maps.is_mostly_filled() {
         context.warn(format!(
-            "only {:.1} % of the pixels were matched; the others are filled in from around, and of such pixels about four in ten are wrong (--no-fill leaves them unknown)",
+            "only {:.1} % of the pixels were matched; the others are filled in from around, and of such pixels about one in four is wrong (--no-fill leaves them unknown)",
             100.0 * maps.map.matched_fraction()
         ));
     }
