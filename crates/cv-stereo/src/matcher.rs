@@ -161,12 +161,18 @@ impl StereoMatcher {
     /// sums, and seventy per pixel (gray values 6, bits 3 to 8 of each view, winners 12, labels up to 8, priors 4, surfaces 7, the planes of the
     /// smoothing 16, outputs and scratch 9), and for the coarser levels an eighth of the sums and a third of the rest. Under [`StereoOptions::max_memory`] the sums are those of a strip.
     pub fn memory(&self, width: usize, height: usize) -> usize {
-        let rows = self.strip_rows(width, height).unwrap_or(height);
-        self.memory_of(width, height, rows)
+        let coarse = self.coarse_memory(width, height);
+        let rows = self.strip_rows(width, height, coarse).unwrap_or(height);
+        self.memory_of(width, height, rows, coarse)
     }
 
-    /// Bytes where `rows` rows at a time are aggregated.
-    fn memory_of(&self, width: usize, height: usize, rows: usize) -> usize {
+    /// Bytes of the coarser levels.
+    fn coarse_memory(&self, width: usize, height: usize) -> usize {
+        self.coarser(width, height).map_or(0, |(_, bytes)| bytes)
+    }
+
+    /// Bytes where `rows` rows at a time are aggregated and the coarser levels take `coarse`.
+    fn memory_of(&self, width: usize, height: usize, rows: usize, coarse: usize) -> usize {
         let options = &self.options;
         let pixels = width.saturating_mul(height);
         let planes = planes(options.census, options.intensity_cost);
@@ -180,19 +186,19 @@ impl StereoMatcher {
             .saturating_add(pixels.saturating_mul(fixed))
             .saturating_add(edge_preserving::bytes(options.smoothing, width, height))
             .saturating_add(if options.fill { surface_filling::bytes(width, height) } else { 0 })
-            .saturating_add(self.coarser(width, height).map_or(0, |coarse| coarse.memory(width / 2, height / 2)))
+            .saturating_add(coarse)
             .saturating_add(stride.saturating_mul(height).saturating_mul(planes))
     }
 
     /// How many rows at a time are aggregated under [`StereoOptions::max_memory`]: `None` for all, or where not even few
     /// would do.
-    fn strip_rows(&self, width: usize, height: usize) -> Option<usize> {
+    fn strip_rows(&self, width: usize, height: usize, coarse: usize) -> Option<usize> {
         let allowed = self.options.max_memory?;
-        if self.memory_of(width, height, height) <= allowed {
+        if self.memory_of(width, height, height, coarse) <= allowed {
             return None;
         }
         // The more rows, the less is done twice.
-        let fits = |rows: &usize| self.memory_of(width, height, *rows) <= allowed;
+        let fits = |rows: &usize| self.memory_of(width, height, *rows, coarse) <= allowed;
         (MIN_STRIP..height).step_by(MIN_STRIP).take_while(fits).last()
     }
 
@@ -289,6 +295,11 @@ impl StereoMatcher {
 
     /// Refuses image sizes that these options cannot work on.
     fn check_size(&self, width: usize, height: usize) -> Result<(), StereoError> {
+        self.check_memory(width, height, self.memory(width, height))
+    }
+
+    /// As `check_size`, where `bytes` are what these images take.
+    fn check_memory(&self, width: usize, height: usize, bytes: usize) -> Result<(), StereoError> {
         let (window_width, window_height) = self.options.census.size();
         if width < window_width || height < window_height {
             return Err(StereoError::TooSmall { width, height, window_width, window_height });
@@ -299,8 +310,10 @@ impl StereoMatcher {
             return Err(StereoError::RangeOutsideImage { min, max, width });
         }
         let allowed = self.options.max_memory.unwrap_or(isize::MAX as usize);
-        if self.memory(width, height) > allowed {
-            let needed = self.memory_of(width, height, MIN_STRIP).min(self.memory_of(width, height, height));
+        if bytes > allowed {
+            let coarse = self.coarse_memory(width, height);
+            let of = |rows| self.memory_of(width, height, rows, coarse);
+            let needed = of(MIN_STRIP).min(of(height));
             return Err(StereoError::Memory { needed, allowed });
         }
         Ok(())
@@ -318,7 +331,7 @@ impl StereoMatcher {
         progress: &dyn Progress,
     ) -> Result<(), StereoError> {
         self.check_size(width, height)?;
-        match self.strip_rows(width, height) {
+        match self.strip_rows(width, height, self.coarse_memory(width, height)) {
             None => self.aggregator.prepare(width, height, self.layout(), progress)?,
             Some(rows) => {
                 self.strip.prepare(width, (rows + 2 * OVERLAP).min(height), self.layout(), progress)?;
@@ -343,8 +356,8 @@ impl StereoMatcher {
         self.gray[0].to_bytes(&mut self.gray8);
     }
 
-    /// A matcher of half the size, where there is to be one and it has the memory.
-    fn coarser(&self, width: usize, height: usize) -> Option<Self> {
+    /// A matcher of half the size and its bytes, where there is to be one and it has the memory.
+    fn coarser(&self, width: usize, height: usize) -> Option<(Self, usize)> {
         let StereoOptions { min_disparity, disparities, pyramid_levels, max_memory, .. } = self.options;
         if pyramid_levels == 0 || width.min(height) < 2 * LEAST_SIDE || disparities < LEAST_RANGE {
             return None;
@@ -364,13 +377,14 @@ impl StereoMatcher {
         };
         let mut coarse = Self::new(options).ok()?;
         coarse.level = self.level;
-        coarse.check_size(width / 2, height / 2).is_ok().then_some(coarse)
+        let bytes = coarse.memory(width / 2, height / 2);
+        coarse.check_memory(width / 2, height / 2, bytes).is_ok().then_some((coarse, bytes))
     }
 
     /// Matches at half the size where the photograph is flat, for `priors`.
     fn match_coarse(&mut self, width: usize, height: usize, progress: &dyn Progress) -> Result<(), StereoError> {
         let coarse = self.coarser(width, height);
-        let Some(new) = coarse.filter(|_| find_flat(self.level, &self.gray8, width, &mut self.priors)) else {
+        let Some((new, _)) = coarse.filter(|_| find_flat(self.level, &self.gray8, width, &mut self.priors)) else {
             self.priors.clear();
             return Ok(());
         };
@@ -399,7 +413,7 @@ impl StereoMatcher {
         let planes = planes(options.census, options.intensity_cost);
         let stride = planes * layout.right_row(width);
         let p2 = Penalties::new(options);
-        let rows = self.strip_rows(width, height);
+        let rows = self.strip_rows(width, height, self.coarse_memory(width, height));
         let strips = rows.map_or(1, |rows| height.div_ceil(rows));
         // Each row twice, and some more where strips overlap.
         let stage = Stage::new(progress, "aggregate", 2 * (height + 2 * OVERLAP * (strips - 1)))?;

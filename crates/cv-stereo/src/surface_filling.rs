@@ -194,8 +194,8 @@ impl View<'_> {
         }
         let column = column as usize;
         let seen = self.right[y * width + column];
-        // Both are false of −∞ … but for the second, which is then of no match.
-        if d > seen + MARGIN && seen > f32::NEG_INFINITY {
+        // −∞: nothing is known to be seen there.
+        if seen.is_finite() && d > seen + MARGIN {
             return HIDES;
         }
         if d < seen - 1.0 {
