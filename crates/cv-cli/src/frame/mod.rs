@@ -117,6 +117,8 @@ pub(crate) fn run(
     });
     context.clear_bar();
     let failure = match result {
+        // Ctrl-C came between the last file and here.
+        Ok(_) if !context.stop.finish() => return context.stop.end(),
         Ok(mut outcome) => {
             let but = outcome.take_but();
             match finish(outcome, context.take_stdout(), globals, start).err().or(but) {
@@ -124,7 +126,7 @@ pub(crate) fn run(
                 Some(failure) => failure,
             }
         }
-        Err(_) if context.stop.check().is_err() => return context.stop.tell(),
+        Err(_) if context.stop.check().is_err() => return context.stop.end(),
         Err(failure) => failure,
     };
     context.say(&failure.text());

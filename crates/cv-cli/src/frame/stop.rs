@@ -17,7 +17,8 @@ const EXIT_CODE: u8 = 130;
 #[derive(Clone)]
 pub(super) struct Stop {
     asked: Arc<AtomicBool>,
-    told: Arc<AtomicBool>,
+    /// Whether it is decided how the program ends: by its result or as stopped.
+    decided: Arc<AtomicBool>,
     bar: Arc<Bar>,
 }
 
@@ -25,7 +26,7 @@ impl Stop {
     /// Listens from now on. The first signal asks the command to stop; where that takes long (a picture of a hundred megapixels is
     /// being encoded, say), and at the second signal, the program ends all the same.
     pub(super) fn listen(bar: &Arc<Bar>) -> Self {
-        let stop = Self { asked: Arc::default(), told: Arc::default(), bar: bar.clone() };
+        let stop = Self { asked: Arc::default(), decided: Arc::default(), bar: bar.clone() };
         #[cfg(unix)]
         stop.listen_to_signals();
         stop
@@ -51,12 +52,18 @@ impl Stop {
                 return;
             }
             stop.asked.store(true, Ordering::Relaxed);
-            let end = Instant::now() + GRACE;
-            while Instant::now() < end && signals.pending().next().is_none() {
-                thread::sleep(Duration::from_millis(5));
-            }
+            let mut wait = || {
+                let end = Instant::now() + GRACE;
+                while Instant::now() < end && signals.pending().next().is_none() {
+                    thread::sleep(Duration::from_millis(5));
+                }
+            };
+            wait();
             cv_io::abandon_writes();
-            stop.tell();
+            if !stop.tell() {
+                // The result is being printed, maybe into a pipe that nobody reads.
+                wait();
+            }
             std::process::exit(EXIT_CODE.into());
         });
     }
@@ -66,12 +73,24 @@ impl Stop {
         if self.asked.load(Ordering::Relaxed) { Err(Cancelled) } else { Ok(()) }
     }
 
-    /// Says that the program was stopped, once.
-    pub(super) fn tell(&self) -> ExitCode {
-        if !self.told.swap(true, Ordering::Relaxed) {
+    /// Decides that the program ends by its result, which is printed next. False where it has ended as stopped already.
+    pub(super) fn finish(&self) -> bool {
+        !self.decided.swap(true, Ordering::Relaxed)
+    }
+
+    /// Decides that the program ends as stopped, and says so. False where it was decided before.
+    fn tell(&self) -> bool {
+        let first = self.finish();
+        if first {
             self.bar.clear();
             self.bar.print("stopped");
         }
+        first
+    }
+
+    /// Ends the program as stopped.
+    pub(super) fn end(&self) -> ExitCode {
+        self.tell();
         ExitCode::from(EXIT_CODE)
     }
 }
