@@ -1,7 +1,6 @@
-//! Cholesky factors of the reduced system: a plain one where it is small, else faer's: dense where it is full, and sparse, analyzed once.
+//! Cholesky factors of the reduced system, by faer: dense where it is full, else sparse and analyzed once.
 
-use super::plain_cholesky::PlainCholesky;
-use super::structure::{Pattern, SMALL, Structure};
+use super::structure::{Pattern, Structure};
 use faer::linalg::solvers::{Llt, Solve};
 use faer::sparse::linalg::solvers::{Llt as SparseLlt, SymbolicLlt};
 use faer::sparse::{SparseColMatRef, SymbolicSparseColMat};
@@ -9,7 +8,6 @@ use faer::{Mat, MatMut, Side};
 
 /// The pattern of a reduced system, analyzed: order of elimination and fill-in.
 pub(super) enum Analysis {
-    Small,
     Dense,
     /// Lower triangle by columns, and its symbolic factor.
     Sparse {
@@ -20,7 +18,6 @@ pub(super) enum Analysis {
 
 /// A factor `L Lᵀ`.
 pub(super) enum Factor {
-    Small(PlainCholesky),
     Dense(Llt<f64>),
     Sparse(SparseLlt<usize, f64>),
 }
@@ -29,7 +26,7 @@ impl Analysis {
     /// Of the free columns of the reduced system; `None` where memory is short.
     pub(super) fn new(structure: &Structure) -> Option<Self> {
         if structure.pattern.dense {
-            return Some(if structure.free <= SMALL { Self::Small } else { Self::Dense });
+            return Some(Self::Dense);
         }
         let free = structure.free;
         let mut start = Vec::with_capacity(free + 1);
@@ -58,17 +55,6 @@ impl Analysis {
     /// The factor of the free columns of `s`; `None` where it is not positive definite.
     pub(super) fn factor(&self, structure: &Structure, s: &[f64]) -> Option<Factor> {
         match self {
-            Self::Small => {
-                let free = structure.free;
-                let mut rows = vec![0.0; free * free];
-                for_columns(structure, s, |column, values| {
-                    values[..free - column]
-                        .iter()
-                        .enumerate()
-                        .for_each(|(k, v)| rows[(column + k) * free + column] = *v);
-                });
-                PlainCholesky::new(free, rows).map(Factor::Small)
-            }
             Self::Dense => {
                 let free = structure.free;
                 let mut full = Mat::<f64>::zeros(free, free);
@@ -100,7 +86,6 @@ impl Factor {
         }
         let right = b.len() / columns;
         match self {
-            Self::Small(factor) => factor.solve(b),
             Self::Dense(factor) => factor.solve_in_place(MatMut::from_column_major_slice_mut(b, columns, right)),
             Self::Sparse(factor) => factor.solve_in_place(MatMut::from_column_major_slice_mut(b, columns, right)),
         }

@@ -40,7 +40,6 @@ mod error;
 mod factor;
 mod manifold;
 mod normal;
-mod plain_cholesky;
 mod product;
 mod residual;
 mod schedule;

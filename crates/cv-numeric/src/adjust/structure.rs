@@ -10,7 +10,7 @@ pub(super) const NONE: u32 = u32::MAX;
 /// Most columns of a block of the reduced system.
 pub(super) const MOST_COLUMNS: usize = 64;
 /// Below this size a dense factorization is faster whatever the pattern.
-pub(super) const SMALL: usize = 400;
+const SMALL: usize = 400;
 /// Above this share of the reduced system's blocks, its factor is about full.
 const FULL: f64 = 0.3;
 
