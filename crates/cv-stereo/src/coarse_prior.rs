@@ -118,21 +118,31 @@ pub(crate) fn guide(
     let coarse_height = coarse.len() / coarse_width;
     let last = range.1 as i32 - 1;
     priors.par_chunks_mut(2 * width).enumerate().for_each_init(
-        || (vec![0u8; coarse_width], [0; 3].map(|_| vec![f32::NAN; coarse_width + 2 * REACH])),
-        |(agreeing, rows), (y, priors)| {
+        || {
+            (
+                vec![0u8; coarse_width],
+                vec![0u16; coarse_width],
+                [0; 3].map(|_| vec![f32::NAN; coarse_width + 2 * REACH]),
+            )
+        },
+        |(agreeing, indices, rows), (y, priors)| {
             let y = y.min(coarse_height - 1);
             let here = &coarse[y * coarse_width..][..coarse_width];
             for (row, y) in rows.iter_mut().zip([y.saturating_sub(REACH), y, (y + REACH).min(coarse_height - 1)]) {
                 row[REACH..REACH + coarse_width].copy_from_slice(&coarse[y * coarse_width..][..coarse_width]);
             }
             dispatch!(level, simd => count_agreeing(simd, [&*rows[0], &*rows[1], &*rows[2]], agreeing));
+            for ((index, &d), &agreeing) in indices.iter_mut().zip(here).zip(&*agreeing) {
+                let guided = ((2.0 * (d - range.0 as f32 / 2.0) + 0.5) as i32).clamp(0, last) as u16;
+                *index = if agreeing < AGREEING { u16::MAX } else { guided };
+            }
             for priors in priors.chunks_mut(width) {
-                for (x, prior) in priors.iter_mut().enumerate() {
-                    let from = (x / 2).min(coarse_width - 1);
-                    if agreeing[from] < AGREEING {
-                        prior.cap = 0;
-                    } else {
-                        prior.index = ((2.0 * (here[from] - range.0 as f32 / 2.0) + 0.5) as i32).clamp(0, last) as u16;
+                // The last column of an odd width is of the last coarse one.
+                let columns = indices.iter().chain(indices.last());
+                for (&index, priors) in columns.zip(priors.chunks_mut(2)) {
+                    for prior in priors {
+                        let cap = if index == u16::MAX { 0 } else { prior.cap };
+                        *prior = Prior { index, cap };
                     }
                 }
             }

@@ -136,11 +136,37 @@ fn costs<S: Simd, const BITS: usize, const BLOCKS: usize>(
         }
     }
     // Only near the ends of a row do pixels look beyond the right image.
-    let all = |x: usize| frame.inside(x).len() == groups * group;
-    if !(xs.is_empty() || all(xs.start) && all(xs.end - 1)) {
-        for (x, out) in xs.zip(out.chunks_exact_mut(groups * group)) {
-            borders::<S, BLOCKS>(simd, frame, frame.inside(x), out);
-        }
+    let all = |x: usize| frame.inside(x).len() == frame.disparities;
+    let (first, last) = (xs.start, xs.end);
+    let border = |x: &usize| !all(*x);
+    let left = xs.clone().take_while(border).count();
+    let right = (first + left..last).rev().take_while(border).count();
+    let out = &mut out[..count * groups * group];
+    let (out_left, rest) = out.split_at_mut(left * groups * group);
+    let (middle, out_right) = rest.split_at_mut((count - left - right) * groups * group);
+    let ends = [(first..first + left, out_left), (last - right..last, out_right)];
+    for (x, out) in ends.into_iter().flat_map(|(xs, out)| xs.zip(out.chunks_exact_mut(groups * group))) {
+        borders::<S, BLOCKS>(simd, frame, frame.inside(x), out);
+    }
+    if frame.disparities < groups * group {
+        middle.chunks_exact_mut(groups * group).for_each(|out| pad::<S, BLOCKS>(simd, frame.disparities, out));
+    }
+}
+
+/// Replaces the costs of disparities beyond the last one.
+#[inline(always)]
+fn pad<S: Simd, const BLOCKS: usize>(simd: S, disparities: usize, out: &mut [u8]) {
+    let lanes = S::u8s::LEN;
+    let group = BLOCKS * BLOCK;
+    let n = group / lanes;
+    let first = S::u8s::from_fn(simd, |lane| (lane * n) as u8);
+    let worst = S::u8s::splat(simd, u8::MAX);
+    let last = disparities / group;
+    // Fewer than 128.
+    let end = S::u8s::splat(simd, (disparities % group) as u8);
+    for (v, out) in out[last * group..][..group].chunks_exact_mut(lanes).enumerate() {
+        let cost = S::u8s::from_slice(simd, out);
+        (first + v as u8).simd_lt(end).select(cost, worst).store_slice(out);
     }
 }
 

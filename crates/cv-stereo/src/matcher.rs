@@ -369,6 +369,7 @@ impl StereoMatcher {
             disparities: (last - first + 1) as usize,
             pyramid_levels: pyramid_levels - 1,
             speckle_size: self.options.speckle_size / 4,
+            paths: Paths::Four,
             confidence: false,
             fill: false,
             smoothing: Smoothing::None,

@@ -14,28 +14,16 @@ pub(crate) fn median(level: Level, disparity: &[f32], width: usize, radius: usiz
     let height = disparity.len() / width;
     out.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
         let inner = y >= radius && y + radius < height && width > 2 * radius;
-        if inner {
+        let done = inner && {
             let rows = &disparity[(y - radius) * width..(y + radius + 1) * width];
-            dispatch!(level, simd => median_row(simd, rows, width, radius, row));
-        }
-        // A NaN of the fast path says that a value of the window was NaN; blocks without any are passed over.
-        for (block, values) in row.chunks_mut(BLOCK).enumerate() {
-            let first = block * BLOCK;
-            let border = first < radius || first + BLOCK + radius > width;
-            if inner && !border && !values.iter().fold(false, |any, value| any | value.is_nan()) {
-                continue;
-            }
-            for (x, value) in (first..).zip(values) {
-                if !inner || x < radius || x + radius >= width || value.is_nan() {
-                    *value = median_at(disparity, width, height, radius, x, y);
-                }
-            }
+            dispatch!(level, simd => median_row(simd, rows, width, radius, row))
+        };
+        let border = if done { radius } else { width };
+        for x in (0..border).chain(width.saturating_sub(radius).max(border)..width) {
+            row[x] = median_at(disparity, width, height, radius, x, y);
         }
     });
 }
-
-/// Pixels that are passed over at a time.
-const BLOCK: usize = 32;
 
 /// The definition.
 fn median_at(disparity: &[f32], width: usize, height: usize, radius: usize, x: usize, y: usize) -> f32 {
@@ -90,14 +78,13 @@ fn of_twenty_five<S: Simd>(mut v: [S::f32s; 25]) -> S::f32s {
     v[12]
 }
 
-/// Medians of the columns `radius` to `width − 1 − radius` of the middle one of `2 radius + 1` rows; NaN where a value of
-/// the window is.
+/// Medians of the columns `radius` to `width − 1 − radius` of the middle one of `2 radius + 1` rows; false where they are narrower than a vector.
 #[simd]
-fn median_row<S: Simd>(simd: S, rows: &[f32], width: usize, radius: usize, out: &mut [f32]) {
+fn median_row<S: Simd>(simd: S, rows: &[f32], width: usize, radius: usize, out: &mut [f32]) -> bool {
     if radius == 1 {
-        windows(simd, rows, width, out, of_nine::<S>);
+        windows(simd, rows, width, out, of_nine::<S>)
     } else {
-        windows(simd, rows, width, out, of_twenty_five::<S>);
+        windows(simd, rows, width, out, of_twenty_five::<S>)
     }
 }
 
@@ -108,15 +95,13 @@ fn windows<S: Simd, const N: usize>(
     width: usize,
     out: &mut [f32],
     median: impl Fn([S::f32s; N]) -> S::f32s,
-) {
+) -> bool {
     let side = N.isqrt();
     let radius = side / 2;
     let lanes = S::f32s::LEN;
     let n = width - 2 * radius;
     if n < lanes {
-        // Narrower than a vector: left to the definition.
-        out.fill(f32::NAN);
-        return;
+        return false;
     }
     let mut start = 0;
     while start < n {
@@ -128,9 +113,20 @@ fn windows<S: Simd, const N: usize>(
             *value = S::f32s::from_slice(simd, &rows[(i / side) * width + x + i % side..][..lanes]);
             sum += *value;
         }
-        sum.is_nan().select(sum, median(v)).store_slice(&mut out[radius + x..][..lanes]);
+        let center = v[N / 2].is_nan();
+        if sum.is_nan().any_true() {
+            // Of the holes of a window one is put first, the next one last, and so on: the lower median of the others is then in the middle.
+            let mut end = S::f32s::splat(simd, f32::NEG_INFINITY);
+            for value in &mut v {
+                let hole = value.is_nan();
+                *value = hole.select(end, *value);
+                end = hole.select(-end, end);
+            }
+        }
+        center.select(S::f32s::splat(simd, f32::NAN), median(v)).store_slice(&mut out[radius + x..][..lanes]);
         start = x + lanes;
     }
+    true
 }
 
 #[cfg(test)]

@@ -12,7 +12,8 @@ use crate::layout::Layout;
 use crate::surfaces::{CELL, NONE, Plane, Surfaces, center, extent, neighbors};
 use crate::winner::Winner;
 use cv_core::{Cancelled, Stage};
-use fearless_simd::Level;
+use fearless_simd::{Level, dispatch, prelude::*};
+use fearless_simd_macros::simd;
 use rayon::prelude::*;
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -42,6 +43,8 @@ const WAY: f32 = 0.1;
 const PASSES: usize = 2;
 /// Gray levels by which a pixel differs from a cell of its surface at the most that counts.
 const ALIKE: f32 = 32.0;
+/// Planes that lie nearer than this to each other over a cell, in px, are one there.
+const SAME: f32 = 0.5;
 /// Weight of the photographs against that.
 const SEEN: f32 = 2.0;
 
@@ -95,7 +98,7 @@ pub(crate) fn fill(
     see_from_right(disparity, states, width, right);
     surfaces.smooth_flat(disparity, width);
     stage.check()?;
-    let view = View { pair, right, disparity, states };
+    let view = View { pair, right, disparity, states, columns: RightColumns::new(&pair) };
     open.clear();
     open.extend((0..surfaces.cells.len() as u32).filter(|&c| surfaces.labels[c as usize] == NONE));
     spread(surfaces, view, heap, stage)?;
@@ -111,11 +114,7 @@ pub(crate) fn fill(
     let columns = surfaces.columns;
     let filled: Vec<Vec<f32>> = (0..surfaces.cells.len().div_ceil(columns))
         .into_par_iter()
-        .map(|row| {
-            let mut values = Vec::new();
-            (row * columns..(row + 1) * columns).for_each(|c| fill_cell(surfaces, view, c, &mut values));
-            values
-        })
+        .map(|row| dispatch!(level, simd => fill_row(simd, surfaces, view, row)))
         .collect();
     stage.check()?;
     let rows = disparity.par_chunks_mut(CELL * width).zip(states.par_chunks_mut(CELL * width));
@@ -170,10 +169,43 @@ fn see_from_right(disparity: &[f32], states: &[PixelState], width: usize, right:
     });
 }
 
+/// Where the census bits of the right photograph lie.
+#[derive(Clone, Copy)]
+struct RightColumns {
+    /// Bytes of the bits of a pixel.
+    bytes: usize,
+    /// Elements of a row and of a phase, and the power of two that is the number of phases: see [`Layout`].
+    row: usize,
+    phase: usize,
+    phases: u32,
+    /// The element of column 0.
+    first: i64,
+}
+
+impl RightColumns {
+    fn new(pair: &Pair<'_>) -> Self {
+        Self {
+            bytes: pair.bits.div_ceil(8),
+            row: pair.layout.right_row(pair.width),
+            phase: pair.layout.phase(pair.width),
+            phases: pair.layout.vectors().ilog2(),
+            first: pair.width as i64 - 1 - i64::from(pair.min_disparity),
+        }
+    }
+
+    /// Byte of the first bits of a column within a row; `None` where it is beyond all disparities.
+    #[inline(always)]
+    fn place(&self, column: usize, planes: usize) -> Option<usize> {
+        let element = usize::try_from(self.first - column as i64).ok().filter(|&element| element < self.row)?;
+        Some((element & ((1 << self.phases) - 1)) * planes * self.phase + (element >> self.phases))
+    }
+}
+
 /// The pair with what was matched.
 #[derive(Clone, Copy)]
 struct View<'a> {
     pair: Pair<'a>,
+    columns: RightColumns,
     right: &'a [f32],
     disparity: &'a [f32],
     states: &'a [PixelState],
@@ -184,10 +216,18 @@ impl View<'_> {
         self.disparity.len() / self.pair.width
     }
 
-    /// What a pixel costs at a disparity; `texture` is how much the photographs are believed, 0 to 1.
+    /// The census bits of a pixel of the left photograph.
     #[inline(always)]
-    fn cost(&self, x: usize, y: usize, d: f32, texture: f32) -> f32 {
-        let Pair { width, planes, layout, .. } = self.pair;
+    fn bits(&self, x: usize, y: usize) -> u64 {
+        let Pair { width, planes, described, .. } = self.pair;
+        let first = &described[0][y * planes * width + x..];
+        (0..self.columns.bytes).fold(0, |bits, p| bits << 8 | u64::from(first[p * width]))
+    }
+
+    /// What a pixel with these census bits costs at a disparity; `texture` is how much the photographs are believed, 0 to 1.
+    #[inline(always)]
+    fn cost(&self, x: usize, y: usize, d: f32, texture: f32, bits: u64) -> f32 {
+        let Pair { width, planes, described, .. } = self.pair;
         let column = x as f32 - d + 0.5;
         if !(column >= 0.0 && column < width as f32) {
             return OUTSIDE;
@@ -201,18 +241,12 @@ impl View<'_> {
         if d < seen - 1.0 {
             return HIDDEN;
         }
-        let row = layout.right_row(width);
-        let element = width as i64 - 1 - i64::from(self.pair.min_disparity) - column as i64;
-        let Some(element) = usize::try_from(element).ok().filter(|&element| element < row) else { return OUTSIDE };
-        let n = layout.vectors();
-        let right = &self.pair.described[1][y * planes * row..][..planes * row];
-        let place = element % n * planes * layout.phase(width) + element / n;
-        let left = &self.pair.described[0][y * planes * width + x..];
-        let bytes = self.pair.bits.div_ceil(8);
-        let differing: u32 =
-            (0..bytes).map(|p| (left[p * width] ^ right[place + p * layout.phase(width)]).count_ones()).sum();
+        let RightColumns { bytes, row, phase, .. } = self.columns;
+        let Some(place) = self.columns.place(column, planes) else { return OUTSIDE };
+        let first = &described[1][y * planes * row + place..];
+        let there = (0..bytes).fold(0, |bits, p| bits << 8 | u64::from(first[p * phase]));
         let chance = CHANCE * self.pair.bits as f32;
-        0.5 + texture * ((differing as f32 / chance).min(1.0) - 0.5)
+        0.5 + texture * (((bits ^ there).count_ones() as f32 / chance).min(1.0) - 0.5)
     }
 
     /// What a cell costs on a plane, by every `step`-th pixel of every `step`-th row.
@@ -229,7 +263,7 @@ impl View<'_> {
                 let share = (step * step) as f32;
                 if d.is_nan() {
                     // Weights as of every second pixel, at which they were set.
-                    cost += 0.25 * share * HIDES * self.cost(x, y, value, texture);
+                    cost += 0.25 * share * HIDES * self.cost(x, y, value, texture, self.bits(x, y));
                     if self.states[i] != PixelState::OutOfView {
                         let failed = (self.pair.min_disparity + i32::from(self.pair.winners[i].index)) as f32;
                         cost += share * FAILED * (failed - value).abs().min(2.0);
@@ -338,7 +372,18 @@ fn improve(surfaces: &mut Surfaces, view: View<'_>, c: usize) {
     surfaces.labels[c] = best.1;
 }
 
+/// The disparities of the holes of a row of cells, cell by cell.
+#[simd]
+fn fill_row<S: Simd>(_: S, surfaces: &Surfaces, view: View<'_>, row: usize) -> Vec<f32> {
+    let mut values = Vec::new();
+    for c in row * surfaces.columns..(row + 1) * surfaces.columns {
+        fill_cell(surfaces, view, c, &mut values);
+    }
+    values
+}
+
 /// The disparities of a cell's holes, row by row: each pixel is of the surface of the cells around that looks like it and that it may be of.
+#[inline(always)]
 fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, out: &mut Vec<f32>) {
     if surfaces.cells[c].holes == 0 {
         return;
@@ -347,8 +392,22 @@ fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, out: &mut Vec<f32>) 
     let (width, height) = (view.pair.width, view.height());
     let (around, count) = surfaces_around(surfaces, c);
     let (xs, ys) = extent(c, columns, (width, height));
-    if let [label] = around[..count] {
-        let plane = surfaces.planes[label as usize];
+    // Surfaces that are alike at the corners of the cell are one.
+    let corners = [(xs.start, ys.start), (xs.end - 1, ys.start), (xs.start, ys.end - 1), (xs.end - 1, ys.end - 1)];
+    let (mut different, mut here, mut places) = ([0; 9], [[0f32; 4]; 9], [0; 9]);
+    let mut n = 0;
+    for (place, &label) in places.iter_mut().zip(&around[..count]) {
+        let plane = &surfaces.planes[label as usize];
+        let at = corners.map(|(x, y)| plane.at(x as f64, y as f64));
+        let alike = |other: &[f32; 4]| at.iter().zip(other).all(|(a, b)| (a - b).abs() < SAME);
+        *place = here[..n].iter().position(alike).unwrap_or(n);
+        if *place == n {
+            (different[n], here[n]) = (label as usize, at);
+            n += 1;
+        }
+    }
+    if n == 1 {
+        let plane = surfaces.planes[different[0]];
         for y in ys {
             for (x, d) in xs.clone().zip(&view.disparity[y * width..][xs.clone()]) {
                 if d.is_nan() {
@@ -363,30 +422,30 @@ fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, out: &mut Vec<f32>) 
     let rows = surfaces.cells.len() / columns;
     // Gray value and place among the surfaces of the cells around.
     let mut cells = [(0f32, 0usize); 9];
-    let mut n = 0;
+    let mut known = 0;
     for ny in row.saturating_sub(1)..(row + 2).min(rows) {
         for other in ny * columns + column.saturating_sub(1)..ny * columns + (column + 2).min(columns) {
             if let Some(place) = around[..count].iter().position(|&label| label == surfaces.labels[other]) {
-                cells[n] = (surfaces.cells[other].gray, place);
-                n += 1;
+                cells[known] = (surfaces.cells[other].gray, places[place]);
+                known += 1;
             }
         }
     }
-    let planes: [Plane; 9] = std::array::from_fn(|i| surfaces.planes[around[i.min(count - 1)] as usize]);
+    let planes: [Plane; 9] = different.map(|label| surfaces.planes[label]);
     for y in ys {
         for x in xs.clone() {
             if !view.disparity[y * width + x].is_nan() {
                 continue;
             }
-            let gray = f32::from(view.pair.gray[y * width + x]);
+            let (gray, bits) = (f32::from(view.pair.gray[y * width + x]), view.bits(x, y));
             let mut unlike = [ALIKE; 9];
-            for &(of_cell, place) in &cells[..n] {
+            for &(of_cell, place) in &cells[..known] {
                 unlike[place] = unlike[place].min((gray - of_cell).abs());
             }
             let mut best = (f32::INFINITY, f32::NAN);
-            for (plane, unlike) in planes[..count].iter().zip(unlike) {
+            for (plane, unlike) in planes[..n].iter().zip(unlike) {
                 let d = plane.at(x as f64, y as f64);
-                let cost = unlike / ALIKE + SEEN * view.cost(x, y, d, texture);
+                let cost = unlike / ALIKE + SEEN * view.cost(x, y, d, texture, bits);
                 // Of equals the farther one.
                 if cost < best.0 || (cost == best.0 && d < best.1) {
                     best = (cost, d);
