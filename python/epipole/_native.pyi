@@ -194,6 +194,7 @@ def depth(
     alpha: float | None = 0.0,
     size: _Size | None = None,
     few_matches: Literal["check", "keep"] | None = "check",
+    align: bool | None = True,
     near: float | None = 0.0,
     far: float | None = float("inf"),
     cloud: bool | None = False,

@@ -93,6 +93,8 @@ class Depth(_Result):
     """With ``cloud=True``: the colored points; of a rig in the frame of its left camera."""
     few_matches: tuple[int, int] | None
     """Where so little is matched that the pair was nearly refused: features that show the same disparity, of how many."""
+    vertical_offset: tuple[float, float, float] | None
+    """Where the rows of the pair were apart and have been aligned, in px: in the middle, more at the right border than at the left, more at the bottom than at the top."""
     disparities: tuple[int, int]
     """Smallest disparity tried, and how many."""
     valid_fraction: float

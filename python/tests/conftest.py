@@ -2,11 +2,15 @@
 
 import json
 import os
+import signal
 from pathlib import Path
 
 import epipole
 import numpy as np
 import pytest
+
+# A shell that starts this in the background has Ctrl-C ignored, here and in every process from here on.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 FIXTURES = Path(os.environ.get("EPIPOLE_FIXTURES", Path(__file__).parents[2] / "fixtures"))
 

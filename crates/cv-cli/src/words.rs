@@ -110,10 +110,6 @@ pub(crate) fn no_dense_cloud(error: &DenseError, photos: [&Path; 2]) -> Failure 
 /// Why there is no depth; with a rig, the pair is as its calibration says.
 pub(crate) fn no_depth(error: DepthError, by_rig: bool) -> Failure {
     let advice = match (&error, by_rig) {
-        // Whatever there is may still be of use where nothing says that the photographs are wrong.
-        (DepthError::NoPair { cause: NoPairCause::Unknown, .. }, _) => {
-            format!("{}; or keep what there is (--force)", words(error.advice()))
-        }
         (DepthError::NoPair { cause: NoPairCause::Rows { .. } | NoPairCause::Exchanged { .. }, .. }, true)
         | (DepthError::NoRange(_), true) => CHECK_CALIBRATION.to_owned(),
         _ => words(error.advice()),

@@ -201,6 +201,39 @@ fn an_exchanged_pair_is_no_pair_whoever_finds_the_range() {
 }
 
 #[test]
+fn rows_that_are_a_little_apart_are_aligned() {
+    let folder = pair();
+    let folder = folder.path();
+    // Lower by 2 px in the middle, by 1.2 at the left border and by 2.8 at the right one.
+    let right = &PAIR.right.image;
+    let lower = RgbU8::from_fn(240, 180, |x, y| {
+        let at = (y as f64 - 2.0 - 1.6 * ((x as f64 + 0.5) / 240.0 - 0.5)).clamp(0.0, 178.999);
+        let (row, part) = (at as usize, at.fract());
+        let (a, b) = (right.at(x, row), right.at(x, row + 1));
+        std::array::from_fn(|c| (f64::from(a[c]) * (1.0 - part) + f64::from(b[c]) * part + 0.5) as u8)
+    });
+    cv_io::write_png(folder.join("lower.png"), lower.view()).unwrap();
+    let args = |right, map| ["depth", "left.png", right, "-o", map, "--disparities", "48"];
+    let right_ones = |map: &str| {
+        let d = cv_io::pfm::read(folder.join(map)).unwrap();
+        let seen = (0..240 * 180).map(|i| (i % 240, i / 240)).filter(|&(x, y)| PAIR.visible.at(x, y)[0]);
+        seen.filter(|&(x, y)| (d.at(x, y)[0] - PAIR.disparity.at(x, y)[0]).abs() <= 1.0).count() as f64
+    };
+    assert!(json(folder, &args("right.png", "aligned.pfm"))["vertical_offset"].is_null());
+    let found = json(folder, &args("lower.png", "d.pfm"));
+    let offset: Vec<f64> = (0..3).map(|i| found["vertical_offset"][i].as_f64().unwrap()).collect();
+    // Features are placed to a few tenths of a pixel, and there are hundreds.
+    assert!((offset[0] - 2.0).abs() < 0.15 && (offset[1] - 1.6).abs() < 0.3 && offset[2].abs() < 0.3, "{offset:?}");
+    // Two interpolations blur the right photograph: a few points of a hundred.
+    let (aligned, moved) = (right_ones("aligned.pfm"), right_ones("d.pfm"));
+    assert!(moved > 0.95 * aligned, "{moved} of {aligned}");
+    let as_it_is = [&args("lower.png", "none.pfm")[..], &["--no-align"]].concat();
+    let (matched, raw) = (found["matched_fraction"].as_f64().unwrap(), run(folder, &as_it_is));
+    assert!(matched > 0.5, "{matched}");
+    assert!(raw.code != Some(0) || right_ones("none.pfm") < 0.8 * aligned, "nothing had to be aligned");
+}
+
+#[test]
 fn frames_of_other_moments_are_not_paired() {
     let folder = pair();
     let at = |name: &str| folder.path().join(name);

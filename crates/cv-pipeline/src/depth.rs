@@ -1,9 +1,11 @@
 //! Depth from a rectified pair.
 
-use crate::disparity_range::is_exchanged;
+use crate::disparity_range::{is_exchanged, matches_of, range_from};
 use crate::no_pair::{FeatureAgreement, FewMatches, NoPairCause, cause};
-use crate::{Progress, RangeError, disparity_range};
-use cv_core::{Cancelled, GrayF32, ImageView, PointCloud, RgbU8, StageClock};
+use crate::vertical_offset::{Alignment, VerticalOffset};
+use crate::{Progress, RangeError};
+use cv_core::{Cancelled, GrayF32, Image, ImageView, PointCloud, RgbU8, StageClock};
+use cv_imgproc::Pixel;
 use cv_stereo::{
     DisparityMap, DisparityMatcher, GeometryError, Intensity, RectifyError, StereoError, StereoGeometry, StereoMatcher,
     StereoOptions,
@@ -39,6 +41,8 @@ pub struct DepthOptions {
     pub range: (f32, f32),
     /// What becomes of a pair of which hardly anything is matched. Default [`FewMatches::Check`].
     pub few_matches: FewMatches,
+    /// Whether rows that features show to lie up to 8 px apart are aligned first; of a film, by its first frame of which few pixels match. Default true.
+    pub align: bool,
 }
 
 impl Default for DepthOptions {
@@ -48,6 +52,7 @@ impl Default for DepthOptions {
             disparities: DisparityRange::Given,
             range: (0.0, f32::INFINITY),
             few_matches: FewMatches::default(),
+            align: true,
         }
     }
 }
@@ -84,6 +89,8 @@ pub struct DepthResult {
     pub geometry: Option<StereoGeometry>,
     /// Where fewer pixels were matched than nearly all rectified pairs show: what features say of them. `None` where there were enough.
     pub few: Option<FeatureAgreement>,
+    /// How far apart the rows of the pair were, which were aligned; `None` where they were not, or only by fractions of a pixel.
+    pub vertical_offset: Option<VerticalOffset>,
     /// Stage names and their seconds. `match` is the matcher from the gray images to checked disparities; `prepare` is
     /// the memory it asks for beforehand.
     pub stages: Vec<(&'static str, f64)>,
@@ -198,8 +205,7 @@ impl From<RectifyError> for DepthError {
 /// reach at most 15 %, and at most that exchanged ones whose disparities are not all within a few pixels of zero.
 pub(crate) const LEAST_MATCHED: f64 = 0.18;
 
-/// Refuses a map of `left` and `right` that has hardly any matches, unless features agree with it or it is to be kept: what was filled in would be made up. Features
-/// are matched to say why. What they say of a map that is kept with few matches.
+/// Refuses a map of `left` and `right` that has hardly any matches and of which features say why, unless it is to be kept: what was filled in would be made up. What they say of a map that is kept with few matches.
 ///
 /// # Errors
 /// [`DepthError::NoPair`] and [`DepthError::Cancelled`].
@@ -217,7 +223,7 @@ pub(crate) fn check_pair<T: Intensity, const C: usize>(
     }
     let (cause, agreement) = cause(map, left, right, disparities, progress)?;
     let keeps = match few {
-        FewMatches::Check => cause == NoPairCause::Unknown && agreement.is_enough(),
+        FewMatches::Check => cause == NoPairCause::Unknown && matched > 0.0,
         FewMatches::Keep => matched > 0.0,
     };
     if keeps { Ok(Some(agreement)) } else { Err(DepthError::NoPair { matched, needed: LEAST_MATCHED, cause }) }
@@ -236,10 +242,18 @@ pub(crate) fn matcher_options<T: Intensity, const C: usize>(
     left: ImageView<'_, T, C>,
     right: ImageView<'_, T, C>,
     options: &DepthOptions,
+    alignment: &mut Alignment,
     progress: &dyn Progress,
 ) -> Result<StereoOptions, DepthError> {
     let DisparityRange::FromMatches { min } = options.disparities else { return Ok(options.stereo.clone()) };
-    let (first, count) = disparity_range(color_bytes(left).view(), color_bytes(right).view(), progress)?;
+    let mut matches = matches_of(color_bytes(left).view(), color_bytes(right).view(), progress)?;
+    if left.size() == right.size() {
+        alignment.learn(&matches, left.size())?;
+    }
+    if let Some(offset) = alignment.offset {
+        offset.correct(&mut matches);
+    }
+    let (first, count) = range_from(&matches)?;
     let range = (first, first + count as i32 - 1);
     if min.is_none() && is_exchanged(range) {
         return Err(RangeError::Exchanged { range }.into());
@@ -254,7 +268,7 @@ pub(crate) fn matcher_options<T: Intensity, const C: usize>(
 /// # Errors
 /// [`DepthError`] where the images do not fit together, the disparities do not fit the images, or an option is out of
 /// range.
-pub fn depth<T: Intensity, const C: usize>(
+pub fn depth<T: Intensity + Pixel, const C: usize>(
     left: ImageView<'_, T, C>,
     right: ImageView<'_, T, C>,
     geometry: Option<&StereoGeometry>,
@@ -263,7 +277,8 @@ pub fn depth<T: Intensity, const C: usize>(
 ) -> Result<DepthResult, DepthError> {
     check_range(options.range, geometry)?;
     let mut clock = StageClock::new();
-    let stereo = matcher_options(left, right, options, progress)?;
+    let mut alignment = alignment_of(options);
+    let stereo = matcher_options(left, right, options, &mut alignment, progress)?;
     if options.disparities != DisparityRange::Given {
         clock.lap("range");
     }
@@ -272,7 +287,7 @@ pub fn depth<T: Intensity, const C: usize>(
     let mut run = || {
         matcher.prepare(left.width(), left.height(), &mut DisparityMap::empty(), progress)?;
         clock.lap("prepare");
-        depth_of(&mut matcher, [left, right], geometry, kept, progress)
+        depth_of(&mut matcher, [left, right], geometry, kept, &mut alignment, progress).map(|(found, _)| found)
     };
     let mut result = match run() {
         Err(DepthError::Cancelled(stop)) => {
@@ -291,11 +306,11 @@ fn free_elsewhere<T: Send + 'static>(memory: T) {
     let _ = std::thread::Builder::new().spawn(move || drop(memory));
 }
 
-/// As [`depth`], by any matcher. `range` is the nearest and the farthest depth kept, in the unit of the baseline.
+/// As [`depth`], by any matcher; rows are taken as they are. `range` is the nearest and the farthest depth kept, in the unit of the baseline.
 ///
 /// # Errors
 /// As [`depth`].
-pub fn depth_with<T: Intensity, const C: usize>(
+pub fn depth_with<T: Intensity + Pixel, const C: usize>(
     matcher: &mut dyn DisparityMatcher<T, C>,
     left: ImageView<'_, T, C>,
     right: ImageView<'_, T, C>,
@@ -303,21 +318,30 @@ pub fn depth_with<T: Intensity, const C: usize>(
     range: (f32, f32),
     progress: &dyn Progress,
 ) -> Result<DepthResult, DepthError> {
-    depth_of(matcher, [left, right], geometry, (range, FewMatches::default()), progress)
+    let kept = (range, FewMatches::default());
+    depth_of(matcher, [left, right], geometry, kept, &mut Alignment::off(), progress).map(|(found, _)| found)
 }
 
-/// As [`depth_with`], with what becomes of a pair of which hardly anything is matched.
-pub(crate) fn depth_of<T: Intensity, const C: usize>(
+/// What is known of the rows of a pair before it is looked at.
+pub(crate) fn alignment_of(options: &DepthOptions) -> Alignment {
+    if options.align { Alignment::default() } else { Alignment::off() }
+}
+
+/// As [`depth_with`], with what becomes of a pair of which hardly anything is matched, and of rows that are apart: the right photograph that was
+/// matched comes back where it was corrected.
+pub(crate) fn depth_of<T: Intensity + Pixel, const C: usize>(
     matcher: &mut dyn DisparityMatcher<T, C>,
     [left, right]: [ImageView<'_, T, C>; 2],
     geometry: Option<&StereoGeometry>,
     (range, few): ((f32, f32), FewMatches),
+    alignment: &mut Alignment,
     progress: &dyn Progress,
-) -> Result<DepthResult, DepthError> {
+) -> Result<(DepthResult, Option<Image<T, C>>), DepthError> {
     check_range(range, geometry)?;
     let mut clock = StageClock::new();
     let mut map = DisparityMap::empty();
-    matcher.compute_into(left, right, &mut map, progress)?;
+    let corrected = alignment.compute(matcher, [left, right], &mut map, progress)?;
+    let right = corrected.as_ref().map_or(right, Image::view);
     clock.lap("match");
     let disparities = matcher.disparities();
     let few = check_pair(&map, left, right, disparities, few, progress)?;
@@ -328,7 +352,9 @@ pub(crate) fn depth_of<T: Intensity, const C: usize>(
     let sigma = matcher.uncertainty(&map);
     clock.lap("depth");
     let geometry = geometry.copied();
-    Ok(DepthResult { map, depth, confidence, sigma, disparities, geometry, few, stages: clock.into_stages() })
+    let (vertical_offset, stages) = (alignment.offset, clock.into_stages());
+    let found = DepthResult { map, depth, confidence, sigma, disparities, geometry, few, vertical_offset, stages };
+    Ok((found, corrected))
 }
 
 /// The depths in `range`, of which there is at least one.
@@ -356,7 +382,7 @@ pub(crate) fn check_range((near, far): (f32, f32), geometry: Option<&StereoGeome
 mod tests {
     use super::*;
     use crate::Silent;
-    use cv_core::{Camera, Image};
+    use cv_core::Camera;
     use cv_synth::{RenderOptions, Scene, stereo_pair};
 
     #[test]

@@ -64,8 +64,21 @@ pub fn disparity_range(
     right: ImageView<'_, u8, 3>,
     progress: &dyn Progress,
 ) -> Result<(i32, usize), RangeError> {
-    let pairs = match_photos(left, right, &MatchingOptions::default(), progress)?.pairs();
-    let disparities = in_common_rows(&pairs);
+    range_from(&matches_of(left, right, progress)?)
+}
+
+/// Feature matches of a pair.
+pub(crate) fn matches_of(
+    left: ImageView<'_, u8, 3>,
+    right: ImageView<'_, u8, 3>,
+    progress: &dyn Progress,
+) -> Result<Vec<Correspondence>, RangeError> {
+    Ok(match_photos(left, right, &MatchingOptions::default(), progress)?.pairs())
+}
+
+/// As [`disparity_range`], of matches.
+pub(crate) fn range_from(pairs: &[Correspondence]) -> Result<(i32, usize), RangeError> {
+    let disparities = in_common_rows(pairs);
     if disparities.len() < NEEDED {
         return Err(RangeError::TooFew { found: disparities.len(), matches: pairs.len(), needed: NEEDED });
     }

@@ -1,6 +1,7 @@
 //! Disparity and depth of the frames of a film, one pair after the other.
 
-use crate::depth::{check_pair, check_range, color_bytes, depth_of, matcher_options};
+use crate::depth::{alignment_of, check_pair, check_range, color_bytes, depth_of, matcher_options};
+use crate::vertical_offset::{Alignment, VerticalOffset};
 use crate::{DepthError, DepthOptions, DisparityRange, Progress, RigDepthResult};
 use cv_core::{Image, ImageView, PointCloud, Pose, StageClock, Vector3};
 use cv_imgproc::{Pixel, WarpMap};
@@ -19,6 +20,8 @@ pub struct FrameDepth {
     rectified: Option<Box<dyn Any + Send + Sync>>,
     geometry: Option<StereoGeometry>,
     matcher: Option<StereoMatcher>,
+    /// How far apart the rows of the (rectified) pairs are.
+    alignment: Alignment,
     map: DisparityMap,
 }
 
@@ -33,6 +36,7 @@ impl FrameDepth {
         let matcher = Some(StereoMatcher::new(options.stereo.clone())?);
         let matcher = matcher.filter(|_| options.disparities == DisparityRange::Given);
         Ok(Self {
+            alignment: alignment_of(&options),
             options,
             rectification: None,
             maps: None,
@@ -52,6 +56,11 @@ impl FrameDepth {
         Ok(Self { rectification: Some(*rectification), ..frames })
     }
 
+    /// How far apart the rows of the pairs are, which are aligned from the first pair on that showed it; `None` where they are not.
+    pub fn vertical_offset(&self) -> Option<VerticalOffset> {
+        self.alignment.offset
+    }
+
     /// Smallest disparity and number of them that are tried; `None` while the first frame has not shown them.
     pub fn disparities(&self) -> Option<(i32, usize)> {
         self.matcher.as_ref().map(|matcher| (matcher.options().min_disparity, matcher.options().disparities))
@@ -69,8 +78,9 @@ impl FrameDepth {
     ) -> Result<&DisparityMap, DepthError> {
         let rectified = self.rectified([left, right], progress)?;
         let [left, right] = rectified.as_ref().map_or([left, right], |pair| pair.each_ref().map(Image::view));
-        let matcher = matcher(&mut self.matcher, &self.options, [left, right], progress)?;
-        matcher.compute_into(left, right, &mut self.map, progress)?;
+        let matcher = matcher(&mut self.matcher, &self.options, &mut self.alignment, [left, right], progress)?;
+        let corrected = self.alignment.compute(matcher, [left, right], &mut self.map, progress)?;
+        let right = corrected.as_ref().map_or(right, Image::view);
         let StereoOptions { min_disparity, disparities, .. } = *matcher.options();
         check_pair(&self.map, left, right, (min_disparity, disparities), self.options.few_matches, progress)?;
         self.keep(rectified);
@@ -95,17 +105,18 @@ impl FrameDepth {
             clock.lap("rectify");
         }
         let unknown = self.matcher.is_none();
-        let matcher = matcher(&mut self.matcher, &self.options, [left, right], progress)?;
+        let matcher = matcher(&mut self.matcher, &self.options, &mut self.alignment, [left, right], progress)?;
         if unknown {
             clock.lap("range");
         }
         matcher.prepare(left.width(), left.height(), &mut self.map, progress)?;
         clock.lap("prepare");
         let kept = (self.options.range, self.options.few_matches);
-        let mut maps = depth_of(matcher, [left, right], self.geometry.as_ref(), kept, progress)?;
+        let geometry = self.geometry.as_ref();
+        let (mut maps, corrected) = depth_of(matcher, [left, right], geometry, kept, &mut self.alignment, progress)?;
         maps.stages.iter().for_each(|(stage, seconds)| clock.add(stage, *seconds));
         maps.stages = clock.into_stages();
-        let images = [color_bytes(left), color_bytes(right)];
+        let images = [color_bytes(left), color_bytes(corrected.as_ref().map_or(right, Image::view))];
         let cloud = if wanted { maps.cloud(images[0].view()) } else { None };
         let mut cloud: PointCloud = cloud.unwrap_or_default();
         if let Some(rectification) = &self.rectification {
@@ -155,12 +166,13 @@ impl FrameDepth {
 fn matcher<'m, T: Intensity, const C: usize>(
     matcher: &'m mut Option<StereoMatcher>,
     options: &DepthOptions,
+    alignment: &mut Alignment,
     [left, right]: [ImageView<'_, T, C>; 2],
     progress: &dyn Progress,
 ) -> Result<&'m mut StereoMatcher, DepthError> {
     let made = match matcher.take() {
         Some(made) => made,
-        None => StereoMatcher::new(matcher_options(left, right, options, progress)?)?,
+        None => StereoMatcher::new(matcher_options(left, right, options, alignment, progress)?)?,
     };
     Ok(matcher.insert(made))
 }

@@ -46,6 +46,7 @@ mod rectify;
 mod rig_depth;
 mod segment;
 mod sfm;
+mod vertical_offset;
 
 pub use advice::Advice;
 pub use axes::Axes;
@@ -97,6 +98,7 @@ pub use sfm::{
     SfmDenseError, SfmDenseOptions, SfmJobError, SfmJobOptions, SfmPhoto, SfmPhotoError, SfmResult, gps_centers,
     place_model, sfm, sfm_covariance, sfm_dense, sfm_pairs, sfm_photo, sfm_solve,
 };
+pub use vertical_offset::VerticalOffset;
 
 /// What a caller of [`depth()`] needs of the stereo stage: its options and results, rectification, geometry and scores.
 pub mod stereo {

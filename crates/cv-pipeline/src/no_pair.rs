@@ -11,8 +11,9 @@ use cv_stereo::{DisparityMap, Intensity, PixelState};
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum FewMatches {
-    /// It is kept where features, which are matched by themselves, show the same disparities ([`FeatureAgreement::is_enough`]), and refused where they do not: a
-    /// calibration board, whose squares are plain and repeat, shows 10 % and less of what is right.
+    /// It is refused where features, which are matched by themselves, say what is wrong: photographs of different things, exchanged ones, rows that are not common,
+    /// another range of disparities. Where they lie as those of a rectified pair do, it is kept, and [`FeatureAgreement`] tells what they say of it: a calibration
+    /// board, whose squares are plain and repeat, shows 10 % and less of what is right.
     #[default]
     Check,
     /// It is kept as long as any pixel is matched.
@@ -20,7 +21,7 @@ pub enum FewMatches {
 }
 
 cv_core::named!(FewMatches {
-    Check = "check": "kept where features show the same",
+    Check = "check": "refused where features say what is wrong",
     Keep = "keep": "kept as long as any pixel is matched",
 });
 

@@ -89,6 +89,7 @@ impl DepthArguments {
         }
         let view = view_options(options)?;
         options.set_named("few_matches", &mut o.few_matches)?;
+        options.set("align", &mut o.align)?;
         options.set("near", &mut o.range.0)?;
         options.set("far", &mut o.range.1)?;
         let mut cloud = false;
@@ -174,6 +175,7 @@ pub(crate) fn depth<'py>(
             ),
             ("cloud", cloud.map_or_else(none, |cloud| cloud::made(py, cloud))?),
             ("few_matches", object(py, found.few.map(|few| (few.agree, few.seen)))?),
+            ("vertical_offset", object(py, found.vertical_offset.map(|o| (o.at_center, o.across, o.down)))?),
             ("disparities", object(py, found.disparities)?),
             ("valid_fraction", object(py, valid)?),
             ("matched_fraction", object(py, matched)?),

@@ -28,6 +28,7 @@ impl Args {
         let started = Instant::now();
         let (mut film, mut size): (Option<Film>, _) = (None, [(0, 0); 2]);
         let (mut seconds, mut frames, mut first) = (0.0, Vec::with_capacity(pairs.len()), None);
+        let mut aligned = false;
         let stage = Stage::new(context, "frames", pairs.len())?;
         for (left, right) in &pairs {
             let photos = Photos::read(left, right)?;
@@ -63,6 +64,10 @@ impl Args {
             };
             if frames.is_empty() {
                 self.say_range(film, context);
+            }
+            if !aligned && let Some(offset) = film.frames.vertical_offset() {
+                super::say_alignment(&offset, context);
+                aligned = true;
             }
             frames.push((left.clone(), shares.0, shares.1));
             stage.add(1)?;

@@ -18,7 +18,7 @@ use cv_pipeline::stereo::{
     Census, DisparityMap, IntensityCost, Paths, PixelState, Rectification, RectifyOptions, Smoothing, StereoGeometry,
     StereoMatcher, StereoOptions,
 };
-use cv_pipeline::{DepthError, DepthOptions, DepthResult, FeatureAgreement, FrameDepth, RigDepthResult};
+use cv_pipeline::{DepthError, DepthOptions, DepthResult, FrameDepth, RigDepthResult, VerticalOffset};
 use maps::write_map;
 use options::{Range, parse_range};
 use pairing::PairBy;
@@ -131,8 +131,12 @@ pub(crate) struct Args {
     /// Gray levels (of 255) across which --smoothing does not reach [default: 24; 1.5 for wls].
     #[arg(long, value_name = "LEVELS")]
     sigma: Option<f32>,
+    /// Take rows as they are. Without this, where few pixels match and features show the rows of the two photographs up to 8 px apart, the right one is moved
+    /// first; of frames, all as the first such pair shows.
+    #[arg(long)]
+    no_align: bool,
     /// Keep what is matched, however little that is and whatever features say of it: without this, a pair of which less than a fifth is matched is refused where
-    /// features do not show the same disparities.
+    /// features say what is wrong with it.
     #[arg(long)]
     force: bool,
     /// Where to write how sure each disparity is, from 0 to 1 (0 where filled): .pfm, .npy or .png (0 to 255).
@@ -199,6 +203,9 @@ impl Run for Args {
         self.write(&job, film.meters, context)?;
         let DepthResult { map, disparities, .. } = &job.maps;
         let (valid, matched) = (map.valid_fraction(), map.matched_fraction());
+        if let Some(offset) = &job.maps.vertical_offset {
+            say_alignment(offset, context);
+        }
         warn_of_filling(&job.maps, context);
         context.report(|| report::report(&job, &[]))?;
         let (width, height) = map.disparity.size();
@@ -209,6 +216,10 @@ impl Run for Args {
             .with("matched_fraction", matched)
             .with("disparities", disparities.1)
             .with("min_disparity", disparities.0)
+            .with(
+                "vertical_offset",
+                job.maps.vertical_offset.map(|offset| [offset.at_center, offset.across, offset.down]),
+            )
             .summary(format!(
                 "{width}×{height} px, {:.1} % matched and confirmed, {:.1} % with a disparity",
                 100.0 * matched,
@@ -217,12 +228,24 @@ impl Run for Args {
     }
 }
 
+/// Says that the rows of the pair were apart and have been aligned.
+fn say_alignment(offset: &VerticalOffset, context: &Context) {
+    context.warn(format!(
+        "the rows of the photographs were up to {:.1} px apart ({:+.1} in the middle, {:+.1} more from left to right, {:+.1} from top to bottom) and have been aligned; calibrate the cameras anew, or see --no-align",
+        offset.largest(),
+        offset.at_center,
+        offset.across,
+        offset.down
+    ));
+}
+
 /// Warns where hardly anything was matched, and where most of a map was guessed.
 fn warn_of_filling(maps: &DepthResult, context: &Context) {
-    if let Some(FeatureAgreement { agree, seen }) = maps.few {
+    if let Some(few) = maps.few {
+        let doubt = if few.is_enough() { "" } else { ", too few to trust the map" };
         context.warn(format!(
-            "only {:.1} % of the pixels were matched and confirmed: too little texture, a pattern that repeats, or things that moved; of {seen} features on them {agree} show the same disparity",
-            100.0 * maps.map.matched_fraction()
+            "only {:.1} % of the pixels were matched and confirmed: too little texture, a pattern that repeats, or things that moved; of {} features on them {} show the same disparity{doubt}",
+            100.0 * maps.map.matched_fraction(), few.seen, few.agree
         ));
     }
     if maps.is_mostly_filled() {

@@ -55,6 +55,7 @@ impl Args {
             },
             range: (self.near, self.far.unwrap_or(f32::INFINITY)),
             few_matches: if self.force { FewMatches::Keep } else { FewMatches::Check },
+            align: !self.no_align,
         }
     }
 }
