@@ -19,7 +19,7 @@ pub enum DisparityRange {
     /// Those of [`StereoOptions::min_disparity`] and [`StereoOptions::disparities`].
     #[default]
     Given,
-    /// Those that feature matches show ([`disparity_range`]), from `min` px up where it is given.
+    /// Those that feature matches show ([`disparity_range`](crate::disparity_range())), from `min` px up where it is given.
     FromMatches {
         /// Smallest disparity, in px.
         min: Option<i32>,

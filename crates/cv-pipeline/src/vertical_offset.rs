@@ -13,9 +13,9 @@ const FEW: f64 = 0.6;
 /// Offsets in px that are corrected: less is no harm, and more is no rectified pair.
 const LEAST: f64 = 0.5;
 const MOST: f64 = 8.0;
-/// Features that lie farther apart than this in y are matched wrongly: [`MOST`] and half of it again.
+/// Features that lie farther apart than this in y are matched wrongly: `MOST` and half of it again.
 const REACH: f64 = 12.0;
-/// Matches that must agree with the offset to a pixel, and their share of those within [`REACH`].
+/// Matches that must agree with the offset to a pixel, and their share of those within `REACH`.
 const NEEDED: usize = 32;
 const SHARE: f64 = 0.5;
 
