@@ -2,7 +2,8 @@
 //! moved back.
 
 use crate::depth::color_bytes;
-use crate::{DepthError, MatchingError, MatchingOptions, Progress, match_photos};
+use crate::disparity_range::matches_of;
+use crate::{DepthError, Progress, RangeError};
 use cv_core::{Correspondence, Image, ImageView, Matrix3, Point2, Vector3};
 use cv_imgproc::{Pixel, WarpMap};
 use cv_stereo::{DisparityMap, DisparityMatcher, Intensity, RectifyError};
@@ -146,9 +147,9 @@ impl Alignment {
             return Ok(corrected);
         }
         let [a, b] = [left, right].map(color_bytes);
-        match match_photos(a.view(), b.view(), &MatchingOptions::default(), progress) {
-            Ok(found) => self.learn(&found.pairs(), left.size())?,
-            Err(MatchingError::Cancelled(stop)) => return Err(stop.into()),
+        match matches_of(a.view(), b.view(), progress) {
+            Ok(matches) => self.learn(&matches, left.size())?,
+            Err(RangeError::Cancelled(stop)) => return Err(stop.into()),
             Err(_) => self.asked = true,
         }
         let Some(corrected) = self.corrected(right)? else { return Ok(None) };

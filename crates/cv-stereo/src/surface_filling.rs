@@ -43,10 +43,10 @@ const WAY: f32 = 0.1;
 const PASSES: usize = 2;
 /// Gray levels by which a pixel differs from a cell of its surface at the most that counts.
 const ALIKE: f32 = 32.0;
-/// Planes that lie nearer than this to each other over a cell, in px, are one there.
-const SAME: f32 = 0.5;
 /// Weight of the photographs against that.
 const SEEN: f32 = 2.0;
+/// Planes that lie nearer than this to each other over a cell, in px, are one there.
+const SAME: f32 = 0.5;
 
 /// What is known of the pair.
 #[derive(Clone, Copy)]
