@@ -28,6 +28,7 @@
 mod color;
 mod connected_components;
 mod gaussian;
+mod grid_cut;
 mod integral;
 mod median;
 mod mirror;
@@ -50,6 +51,7 @@ pub use connected_components::{
     remove_small_components,
 };
 pub use gaussian::{gaussian_blur, gaussian_half_kernel, separable_symmetric, sobel};
+pub use grid_cut::GridCut;
 pub use integral::{Integral, box_filter};
 pub use median::{median_filter_3x3, median_filter_5x5};
 pub use mirror::{mirror_ends, mirror_index};

@@ -2,9 +2,9 @@
 
 use crate::blend::NO_PHOTO;
 use crate::rows::{asks, for_each_row};
-use crate::seams::maxflow::GridCut;
 use crate::surface::{Bounds, WarpedPhoto};
 use cv_core::{Cancelled, Image, Stage};
+use cv_imgproc::GridCut;
 use rayon::prelude::*;
 
 /// Cost of every step of a seam: between equals the shorter.

@@ -6,7 +6,6 @@
 
 mod alpha_expansion;
 mod cost;
-mod maxflow;
 mod misalignment;
 mod upsample;
 
