@@ -112,6 +112,50 @@ fn errors_are_as_large_as_the_stated_uncertainty() {
 }
 
 #[test]
+fn the_quality_mode_leaves_fewer_errors_and_marks_what_it_moved() {
+    // Of both modes: pixels that both cameras see and that are off by more than 2 px. The tables only: in rooms most of them lie on floors of
+    // planks along the rows, where neither mode has anything to match (room 0 has 13 % fewer with the quality mode, room 1 has 3 % more).
+    let mut wrong = [0u32; 2];
+    for Seen { name, pair, darker, .. } in SCENES.iter().filter(|scene| scene.name.starts_with("table")).take(2) {
+        let matched = |quality, fill| {
+            let options = StereoOptions { disparities: 96, quality, fill, ..StereoOptions::default() };
+            let mut matcher = StereoMatcher::new(options).unwrap();
+            matcher.compute(pair.left.image.view(), darker.right.image.view(), &Silent).unwrap()
+        };
+        let (plain, better) = (matched(false, true), matched(true, true));
+        let here = [&plain, &better].map(|map| {
+            let all = map.disparity.as_slice().iter().zip(pair.disparity.as_slice()).zip(pair.visible.as_slice());
+            all.filter(|((d, truth), seen)| **seen && (**d - **truth).abs() > 2.0).count() as u32
+        });
+        println!("{name}: {here:?} wrong pixels");
+        for (sum, here) in wrong.iter_mut().zip(here) {
+            *sum += here;
+        }
+        assert!(better.disparity.as_slice().iter().all(|d| (0.0..=95.0).contains(d)));
+        // Matched is what was matched before and has hardly moved.
+        for ((a, b), (was, is)) in (plain.disparity.as_slice().iter().zip(better.disparity.as_slice()))
+            .zip(plain.state.as_slice().iter().zip(better.state.as_slice()))
+        {
+            let is_matched = *was == PixelState::Matched && (a - b).abs() <= 1.0;
+            assert_eq!(*is == PixelState::Matched, is_matched);
+        }
+        if name != "table 0" {
+            continue;
+        }
+        // Without filling, what is not matched is unknown, and the rest the same.
+        let unfilled = matched(true, false);
+        for ((a, b), state) in
+            better.disparity.as_slice().iter().zip(unfilled.disparity.as_slice()).zip(unfilled.state.as_slice())
+        {
+            assert_eq!(b.is_nan(), *state != PixelState::Matched);
+            assert!(b.is_nan() || a == b);
+        }
+    }
+    // 17 % fewer were measured; scenes differ by some percent.
+    assert!(f64::from(wrong[1]) < 0.9 * f64::from(wrong[0]), "{wrong:?}");
+}
+
+#[test]
 fn strips_of_rows_take_less_memory_and_hardly_change_the_result() {
     for Seen { name, pair, .. } in SCENES.iter().take(2) {
         let whole = matched(pair, pair);

@@ -45,6 +45,7 @@ fn matching_options(options: &mut Options<'_>, o: &mut StereoOptions) -> PyResul
     options.set("median", &mut o.median)?;
     options.set_named("smoothing", &mut o.smoothing)?;
     options.set("fill", &mut o.fill)?;
+    options.set("quality", &mut o.quality)?;
     options.set_optional("max_memory", &mut o.max_memory)
 }
 

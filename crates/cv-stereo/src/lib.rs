@@ -28,13 +28,17 @@ mod disparity_matcher;
 mod edge_preserving;
 mod error;
 mod evaluate;
+mod expansion_region;
 mod input;
 mod kernel;
 mod layout;
+mod local_expansion;
 mod matcher;
 mod median;
 mod options;
 mod path_sums;
+mod plane_cost;
+mod plane_proposals;
 mod rectify;
 mod rectify_scene;
 #[cfg(test)]

@@ -7,6 +7,7 @@ use crate::cost::{Frame, Penalties};
 use crate::edge_preserving::{self, Planes, smooth};
 use crate::input::to_gray;
 use crate::layout::Layout;
+use crate::local_expansion;
 use crate::sgm::Aggregator;
 use crate::speckle::{Speckles, remove_speckles};
 use crate::surface_filling::{self, Filling, Pair, fill};
@@ -158,7 +159,7 @@ impl StereoMatcher {
     }
 
     /// Bytes that matching images of this size takes, outputs included: about one byte per pixel and disparity for the
-    /// sums, and seventy per pixel (gray values 6, bits 3 to 8 of each view, winners 12, labels up to 8, priors 4, surfaces 7, the planes of the
+    /// sums, and seventy per pixel, in quality mode a hundred more (gray values 6, bits 3 to 8 of each view, winners 12, labels up to 8, priors 4, surfaces 7, the planes of the
     /// smoothing 16, outputs and scratch 9), and for the coarser levels an eighth of the sums and a third of the rest. Under [`StereoOptions::max_memory`] the sums are those of a strip.
     pub fn memory(&self, width: usize, height: usize) -> usize {
         let coarse = self.coarse_memory(width, height);
@@ -185,7 +186,8 @@ impl StereoMatcher {
             .saturating_add(strip.saturating_mul(width).saturating_mul(size_of::<Winner>() + size_of::<u16>()))
             .saturating_add(pixels.saturating_mul(fixed))
             .saturating_add(edge_preserving::bytes(options.smoothing, width, height))
-            .saturating_add(if options.fill { surface_filling::bytes(width, height) } else { 0 })
+            .saturating_add(if options.fill || options.quality { surface_filling::bytes(width, height) } else { 0 })
+            .saturating_add(if options.quality { local_expansion::bytes(width, height) } else { 0 })
             .saturating_add(coarse)
             .saturating_add(stride.saturating_mul(height).saturating_mul(planes))
     }
@@ -372,6 +374,7 @@ impl StereoMatcher {
             paths: Paths::Four,
             confidence: false,
             fill: false,
+            quality: false,
             smoothing: Smoothing::None,
             max_memory: max_memory.map(|bytes| bytes / 4),
             ..self.options.clone()
@@ -482,7 +485,7 @@ impl StereoMatcher {
         let (disparity, states) = (map.disparity.as_mut_slice(), map.state.as_mut_slice());
         remove_speckles(disparity, states, width, options.speckle_size, options.speckle_range, &mut self.speckles);
         stage.add(1)?;
-        if options.fill {
+        if options.fill || options.quality {
             let pair = Pair {
                 width,
                 gray: &self.gray8,
@@ -505,7 +508,20 @@ impl StereoMatcher {
             stage.add(1)?;
         }
         smooth(self.level, options.smoothing, disparity, states, &self.gray8, width, &mut self.planes, &stage)?;
-        stage.add(1)
+        stage.add(1)?;
+        // Where nothing at all was matched there is nothing to improve.
+        if options.quality && disparity.iter().all(|d| d.is_finite()) {
+            let first = options.min_disparity as f32;
+            let range = (first, first + (options.disparities - 1) as f32);
+            let gray = [&self.gray[0], &self.gray[1]];
+            local_expansion::expand(self.level, gray, range, disparity, states, progress)?;
+            surface_filling::name_causes(disparity, states, width, &mut self.filling);
+        }
+        if options.quality && !options.fill {
+            let unknown = disparity.iter_mut().zip(states).filter(|(_, state)| **state != PixelState::Matched);
+            unknown.for_each(|(d, _)| *d = f32::NAN);
+        }
+        Ok(())
     }
 }
 
@@ -568,8 +584,9 @@ mod tests {
     fn every_instruction_set_and_number_of_threads_gives_the_same_bytes() {
         let [left, right] = pair();
         let smoothings = [Smoothing::None, StereoOptions::default().smoothing];
-        for (smoothing, fill) in smoothings.into_iter().flat_map(|s| [(s, true), (s, false)]) {
-            let options = StereoOptions { disparities: 40, smoothing, fill, median: 2, ..Default::default() };
+        let all = smoothings.into_iter().flat_map(|s| [(s, true, false), (s, false, false), (s, true, true)]);
+        for (smoothing, fill, quality) in all {
+            let options = StereoOptions { disparities: 40, smoothing, fill, quality, median: 2, ..Default::default() };
             let mut first: Option<(Vec<u32>, Vec<PixelState>)> = None;
             for level in instruction_sets() {
                 for threads in [1, 2, 4] {

@@ -140,6 +140,19 @@ pub(crate) fn fill(
     Ok(())
 }
 
+/// States of the pixels that were not matched, by the disparities they have now.
+pub(crate) fn name_causes(disparity: &[f32], states: &mut [PixelState], width: usize, filling: &mut Filling) {
+    see_from_right(disparity, states, width, &mut filling.right);
+    let rows = disparity.par_chunks(width).zip(filling.right.par_chunks(width));
+    states.par_chunks_mut(width).zip(rows).for_each(|(states, (disparity, right))| {
+        for (x, (state, d)) in states.iter_mut().zip(disparity).enumerate() {
+            if *state != PixelState::Matched {
+                *state = cause(x, *d, right);
+            }
+        }
+    });
+}
+
 /// Why a pixel at a disparity was not matched, given what the right camera sees in its row.
 fn cause(x: usize, d: f32, right: &[f32]) -> PixelState {
     let column = x as f32 - d + 0.5;

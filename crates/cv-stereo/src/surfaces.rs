@@ -50,6 +50,13 @@ pub(crate) struct Moments {
 }
 
 impl Moments {
+    /// Adds a pixel.
+    #[inline(always)]
+    pub(crate) fn add(&mut self, x: f64, y: f64, d: f64) {
+        let one = Self { n: 1.0, x, y, xx: x * x, xy: x * y, yy: y * y, d, xd: x * d, yd: y * d, dd: d * d };
+        self.join(&one);
+    }
+
     /// Relative to a point that lies `(-dx, -dy)` from the one before.
     fn shifted(&self, dx: f64, dy: f64) -> Self {
         Self {
@@ -81,7 +88,7 @@ impl Moments {
     }
 
     /// The plane `a x + b y + c` of least squares, with [`RIDGE`]. There is a pixel at least.
-    fn fit(&self) -> [f64; 3] {
+    pub(crate) fn fit(&self) -> [f64; 3] {
         let (mx, my, md) = (self.x / self.n, self.y / self.n, self.d / self.n);
         let xx = self.xx - self.n * mx * mx + RIDGE;
         let yy = self.yy - self.n * my * my + RIDGE;

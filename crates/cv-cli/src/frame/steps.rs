@@ -22,6 +22,7 @@ steps! {
     BLEND = "blend": ["blend", "crop"];
     RECTIFY = "rectify": ["rectify", "reduce"];
     DISPARITIES = "disparities": ["prepare", "bits", "path sums", "aggregate", "check", "refine"];
+    EXPAND = "quality": ["expand"];
     DEPTH = "depth": ["depth"];
     CLOUD = "cloud": ["cloud"];
     FRAMES = "frames": ["frames"];

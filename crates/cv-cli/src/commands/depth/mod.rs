@@ -37,6 +37,7 @@ pub(crate) use report::{fractions, scene};
     cv depth left.png right.png -o disparity.pfm\n  \
     cv depth left.png right.png -o d.pfm --focal 1000 --baseline 0.12 --depth depth.pfm --cloud cloud.ply\n  \
     cv depth left.png right.png --disparities auto -o disparity.npy\n  \
+    cv depth left.png right.png --quality -o disparity.pfm\n  \
     cv depth left right -o disparities\n  \
     cv depth left.jpg right.jpg --rig rig.yaml -o disparity.png --depth depth.png --report out\n\n\
     The ending of a file tells its format: .pfm (floats, +inf where unknown), .npy (floats, NaN), .png (disparity as KITTI's\n\
@@ -119,6 +120,9 @@ pub(crate) struct Args {
     /// Leave pixels without a match of their own unknown.
     #[arg(long)]
     no_fill: bool,
+    /// Quality mode: outlines at edges, walls and roads as planes, two thirds of the errors, in about eighty times the time (3 seconds for 0.2 Mpx on two cores).
+    #[arg(long)]
+    quality: bool,
     /// What to add to the number of differing bits: sharper outlines.
     #[arg(long, value_name = "WHAT", value_parser = named::<IntensityCost>(), default_value_t = StereoOptions::default().intensity_cost)]
     blend: IntensityCost,
@@ -173,7 +177,8 @@ impl Run for Args {
         }
         let rectified = (!self.rig.is_empty()).then_some(steps::RECTIFY);
         let range = [steps::FEATURES, steps::MATCH].into_iter().filter(|_| self.disparities == Range::Auto);
-        rectified.into_iter().chain(range).chain([steps::DISPARITIES, steps::DEPTH]).collect()
+        let quality = self.quality.then_some(steps::EXPAND);
+        rectified.into_iter().chain(range).chain([steps::DISPARITIES]).chain(quality).chain([steps::DEPTH]).collect()
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {

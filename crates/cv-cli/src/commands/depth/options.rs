@@ -35,6 +35,7 @@ impl Args {
                 uniqueness: self.uniqueness,
                 speckle_size: self.speckle_size,
                 fill: !self.no_fill,
+                quality: self.quality,
                 intensity_cost: self.blend,
                 smoothing: match self.smoothing {
                     Smoothing::None => Smoothing::None,
