@@ -522,6 +522,8 @@ class Panorama(_Result):
     """float32 (n, 3): what red, green and blue of each photograph were multiplied with."""
     left_out: dict[int, dict[str, Any]]
     """By index, why a photograph is not used."""
+    registration: str
+    """Where the photographs look, as JSON: for `panorama(registration=...)` of others of the same views, or a file for `cv panorama --registration`."""
     rms: float
     """Root mean square distance of the matches, px of the photographs."""
     shows_parallax: bool

@@ -40,3 +40,33 @@ def test_paths_are_read_and_arrays_are_the_same():
         epipole.panorama(VIEWS[:1])
     with pytest.raises(ValueError, match="cubic"):
         epipole.panorama(VIEWS, projection="cubic")
+
+
+def test_a_part_of_the_scene_is_drawn():
+    whole = epipole.panorama(VIEWS, scale=0.5, projection="stereographic")
+    part = epipole.panorama(VIEWS, scale=0.5, projection="stereographic", fov=(40, 30), center=(-3, 1), roll=2.0)
+    # 2 tan(fov / 4) to each side: the ratio of the sides is that of the tangents, to a pixel.
+    height, width = part.image.shape[:2]
+    assert abs(width / height - np.tan(np.radians(10)) / np.tan(np.radians(7.5))) < 0.02
+    assert whole.image.shape[1] > width
+    assert epipole.panorama(VIEWS, scale=0.5, projection="panini", fov=40).image.shape[1] > 50
+    with pytest.raises(ValueError, match="pitch"):
+        epipole.panorama(VIEWS, center=(0, 120))
+    with pytest.raises(TypeError, match="fov"):
+        epipole.panorama(VIEWS, fov="wide")
+    with pytest.raises(errors.EpipoleError, match="150"):
+        epipole.panorama(VIEWS, projection="plane", fov=170)
+
+
+def test_a_registration_serves_other_photographs_of_the_views():
+    photographs = [epipole.read_image(path) for path in VIEWS]
+    first = epipole.panorama(photographs, scale=0.5)
+    again = epipole.panorama(photographs, scale=0.5, registration=first.registration)
+    assert np.array_equal(first.image, again.image) and "match" not in again.seconds
+    assert again.registration == first.registration
+    darker = epipole.panorama([p // 2 for p in photographs], scale=0.5, registration=first.registration)
+    assert darker.image.shape == first.image.shape and darker.image.mean() < first.image.mean()
+    with pytest.raises(errors.EpipoleError, match="2 photographs for a registration of 3"):
+        epipole.panorama(photographs[:2], registration=first.registration)
+    with pytest.raises(ValueError, match="registration"):
+        epipole.panorama(photographs, registration="{}")

@@ -5,6 +5,7 @@ pub(crate) mod many_views;
 
 use crate::frame::Failure;
 use cv_io::FormatError;
+use cv_pipeline::panorama_types::{LayoutError, RegistrationError, RenderError};
 use cv_pipeline::stereo::RectifyError;
 use cv_pipeline::{
     Advice, DenseError, DepthError, LeftOut, MatchingError, NoPairCause, PanoramaError, ReconstructError,
@@ -167,7 +168,26 @@ pub(crate) fn no_panorama(error: PanoramaError, paths: &[PathBuf]) -> Failure {
             Failure::new(format!("{source} ({})", reasons.join("; ")))
                 .advice("photographs that share a third of their view with their neighbors, taken from one place")
         }
-        PanoramaError::Render(source) => Failure::new(source).advice("--projection auto, or a smaller --scale"),
+        PanoramaError::Registration(source) => {
+            let photograph = match source {
+                RegistrationError::Size { index, .. } => paths.get(index),
+                _ => None,
+            };
+            let photograph = photograph.map(|path| format!("{}: ", path.display())).unwrap_or_default();
+            Failure::new(format!("{photograph}{source}"))
+                .advice("give the photographs of the same cameras in the order in which they were registered")
+        }
+        PanoramaError::Render(source) => {
+            let advice = match source {
+                RenderError::Layout(LayoutError::FieldTooWide { .. }) => "a smaller --fov, or --projection spherical",
+                RenderError::Layout(LayoutError::NothingInView) => "another --center, or a wider --fov",
+                RenderError::Layout(LayoutError::FlatScene) => {
+                    "leave out --fov, --center and --roll, or --mode rotation where the camera only turned"
+                }
+                _ => "--projection auto, or a smaller --scale",
+            };
+            Failure::new(source).advice(advice)
+        }
         PanoramaError::Cancelled(stop) => stop.into(),
     }
 }

@@ -4,8 +4,11 @@
 
 mod support;
 
-use cv_core::RgbU8;
-use support::{done, fixture, json, run, strs};
+use cv_core::{Camera, RgbU8, Vector3};
+use cv_synth::{Vista, VistaOptions, vista_level, vista_photos};
+use std::f64::consts::PI;
+use std::path::Path;
+use support::{done, fixture, json, refused, run, strs};
 
 #[test]
 fn alpha_is_transparent_where_no_photograph_reaches() {
@@ -84,4 +87,306 @@ fn the_mode_is_taken_told_and_checked() {
     assert!((size[0] / w as f64 - 1.0).abs() < 0.005 && (size[1] / h as f64 - 1.0).abs() < 0.005, "{size:?} {w} {h}");
     assert_eq!(told("rotation")["mode"], "rotation");
     assert_eq!(run(folder.path(), &["panorama", "0.png", "1.png", "-o", "q.png", "--mode", "flat"]).code, Some(2));
+}
+
+/// Photographs of a landscape that is known in every direction, side by side around the direction ahead, as `0.png` … in a folder, and `cam.yaml`, the camera that took them, 420 × 300
+/// pixels at a focal length of 360; `exposure`: how far their exposures differ, in stops.
+fn landscape(folder: &Path, views: usize, exposure: f32) -> (Vista, Vec<String>) {
+    let vista = Vista::new(5, 90.0);
+    let camera = Camera::from_focal(420, 300, 360.0);
+    let options = VistaOptions {
+        views,
+        exposure,
+        vignetting: 0.0,
+        contrast: 0.0,
+        noise: 0.0,
+        shake: 0.0,
+        ..VistaOptions::default()
+    };
+    let photos = vista_photos(&vista, 3, &camera, &options).unwrap();
+    let names = photos.iter().enumerate().map(|(i, photo)| {
+        cv_io::write_png(folder.join(format!("{i}.png")), photo.image.view()).unwrap();
+        format!("{i}.png")
+    });
+    let names = names.collect();
+    cv_io::write_camera(folder.join("cam.yaml"), &camera, &[]).unwrap();
+    (vista, names)
+}
+
+/// What a camera without faults stores of the light of a direction.
+fn level(vista: &Vista, ray: &Vector3<f64>) -> [f64; 3] {
+    vista.radiance(ray).map(|light| 255.0 * f64::from(vista_level(light, 0.0)))
+}
+
+/// The direction at a longitude to the right and a latitude above the horizon.
+fn direction(longitude: f64, latitude: f64) -> Vector3<f64> {
+    Vector3::new(latitude.cos() * longitude.sin(), -latitude.sin(), latitude.cos() * longitude.cos())
+}
+
+/// Mean difference, in gray levels, of a picture from the landscape, where `ray` says what lies at a place of the surface (a radian at its middle is 1, y down) whose middle is that of
+/// the picture; the best of the shifts that alignment to a pixel or two leaves.
+fn difference(picture: &RgbU8, vista: &Vista, ray: impl Fn(f64, f64) -> Vector3<f64>) -> f64 {
+    let (w, h) = picture.size();
+    let at = |dx: f64, dy: f64| {
+        let (mut sum, mut n) = (0.0, 0);
+        for (x, y) in (3..h - 3).step_by(3).flat_map(|y| (3..w - 3).step_by(3).map(move |x| (x, y))) {
+            if picture.at(x, y) == [0; 3] {
+                continue;
+            }
+            let place = |v: f64, size: usize| (v - 0.5 * (size as f64 - 1.0)) / 360.0;
+            let mut truth = [0.0; 3];
+            for (i, j) in [(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)] {
+                let light = level(vista, &ray(place(x as f64 + dx + i, w), place(y as f64 + dy + j, h)));
+                (0..3).for_each(|c| truth[c] += 0.25 * light[c]);
+            }
+            sum += (0..3).map(|c| (f64::from(picture.at(x, y)[c]) - truth[c]).abs()).sum::<f64>() / 3.0;
+            n += 1;
+        }
+        assert!(n > 500, "{n} pixels");
+        sum / f64::from(n)
+    };
+    let shifts = (-4..=4).flat_map(|dx| (-4..=4).map(move |dy| (0.5 * f64::from(dx), 0.5 * f64::from(dy))));
+    shifts.map(|(dx, dy)| at(dx, dy)).fold(f64::INFINITY, f64::min)
+}
+
+#[test]
+fn every_projection_shows_the_part_of_the_scene_that_was_asked_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let (vista, names) = landscape(folder.path(), 4, 0.0);
+    let go = |more: &[&str]| -> RgbU8 {
+        let args = [&["panorama"], &strs(&names)[..], &["-o", "p.png", "--camera", "cam.yaml", "--exposure", "none"]];
+        done(folder.path(), &[&args.concat()[..], more].concat());
+        cv_io::read_rgb(folder.path().join("p.png")).unwrap()
+    };
+    let panini = |x: f64, y: f64| {
+        let longitude = 2.0 * (0.5 * x).atan();
+        direction(longitude, -(0.5 * y * (1.0 + longitude.cos())).atan())
+    };
+    let mercator = |x: f64, y: f64| direction(x, 0.5 * PI - 2.0 * y.exp().atan());
+    let stereographic = |x: f64, y: f64| {
+        let (r, angle) = (x.hypot(y), 2.0 * (0.5 * x.hypot(y)).atan());
+        if r == 0.0 { Vector3::z() } else { Vector3::new(angle.sin() * x / r, angle.sin() * y / r, angle.cos()) }
+    };
+    let size = |half_w: f64, half_h: f64| ((720.0 * half_w).round() as usize, (720.0 * half_h).round() as usize);
+    let tan = |degrees: f64| degrees.to_radians().tan();
+    // Bilinear and cubic interpolation, half-pixel shifts and the seams take a level or two of a texture of ±30; a wrong surface makes it 15.
+    const BAR: f64 = 4.0;
+    let p = go(&["--projection", "panini", "--fov", "110,40"]);
+    assert_eq!(p.size(), size(2.0 * tan(27.5), tan(20.0)));
+    let d = difference(&p, &vista, panini);
+    assert!(d < BAR && difference(&p, &vista, stereographic) > 1.5 * d, "panini: {d}");
+    let p = go(&["--projection", "mercator", "--fov", "100,40"]);
+    assert_eq!(p.size(), size(50_f64.to_radians(), tan(20.0).asinh()));
+    let d = difference(&p, &vista, mercator);
+    assert!(d < BAR, "mercator: {d}");
+    let p = go(&["--projection", "stereographic", "--fov", "100,40"]);
+    assert_eq!(p.size(), size(2.0 * tan(25.0), 2.0 * tan(10.0)));
+    let d = difference(&p, &vista, stereographic);
+    assert!(d < BAR, "stereographic: {d}");
+
+    // To the right, upwards, and clockwise: the picture of a camera that was turned so.
+    let p = go(&["--projection", "plane", "--fov", "40,30", "--center", "-20,6", "--roll", "10"]);
+    assert_eq!(p.size(), size(tan(20.0), tan(15.0)));
+    let (yaw, pitch, roll) = (-20_f64.to_radians(), 6_f64.to_radians(), 10_f64.to_radians());
+    let turned = |x: f64, y: f64| {
+        // Undo the turn of the picture, then look up, then aside.
+        let (x, y) = (roll.cos() * x + roll.sin() * y, roll.cos() * y - roll.sin() * x);
+        let (y, z) = (pitch.cos() * y - pitch.sin(), pitch.sin() * y + pitch.cos());
+        Vector3::new(yaw.cos() * x + yaw.sin() * z, y, yaw.cos() * z - yaw.sin() * x)
+    };
+    let d = difference(&p, &vista, turned);
+    assert!(d < BAR, "plane: {d}");
+}
+
+#[test]
+fn fields_of_view_that_make_no_sense_are_refused_with_their_numbers() {
+    let folder = tempfile::tempdir().unwrap();
+    let views: Vec<String> =
+        (0..3).map(|i| fixture(&format!("panorama/view{i}.jpg")).to_str().unwrap().to_owned()).collect();
+    let go = |more: &[&str]| {
+        let args: Vec<&str> = ["panorama"].into_iter().chain(strs(&views)).chain(["-o", "p.png"]).collect();
+        run(folder.path(), &[&args[..], more].concat())
+    };
+    for (more, words) in [
+        (&["--fov", "0"][..], "0 is not between 1 and 360"),
+        (&["--fov", "60,nan"], "NaN is not between"),
+        (&["--fov", "wide"], "wide is no number"),
+        (&["--fov", "1e300"], "is not between"),
+        (&["--center", "20"], "two angles are needed"),
+        (&["--center", "0,-91"], "-91 is not between -90 and 90"),
+        (&["--roll", "inf"], "inf is not between -180 and 180"),
+        (&["--projection", "mercat0r"], "mercator, panini, stereographic"),
+    ] {
+        let ran = go(more);
+        assert!(ran.code == Some(2) && ran.stderr.contains(words), "{more:?}: {ran:?}");
+    }
+    for (more, words) in [
+        (&["--fov", "170", "--projection", "plane"][..], "170.0 degrees is more than the 150.0"),
+        (&["--fov", "90,200", "--projection", "panini"], "200.0 degrees is more than the 150.0"),
+        (&["--fov", "40,30", "--center", "180,0"], "no photograph reaches into the field of view"),
+        (&["--fov", "40", "--mode", "plane"], "the scene is flat"),
+    ] {
+        let ran = go(more);
+        assert!(ran.code == Some(1) && ran.stderr.contains(words), "{more:?}: {ran:?}");
+        assert!(!folder.path().join("p.png").exists());
+    }
+}
+
+#[test]
+fn a_saved_registration_gives_the_same_bytes_and_serves_other_frames() {
+    let folder = tempfile::tempdir().unwrap();
+    let (_, names) = landscape(folder.path(), 3, 0.0);
+    // A photograph that fits nowhere is part of the set.
+    let stranger = RgbU8::from_fn(200, 150, |x, y| [(x * 7 % 251) as u8, (y * 5 % 239) as u8, 90]);
+    cv_io::write_png(folder.path().join("stranger.png"), stranger.view()).unwrap();
+    let photos: Vec<&str> = strs(&names).into_iter().chain(["stranger.png"]).collect();
+    let go = |photos: &[&str], more: &[&str]| json(folder.path(), &[&["panorama"], photos, more].concat());
+    let bytes = |name: &str| std::fs::read(folder.path().join(name)).unwrap();
+    let first = go(&photos, &["-o", "a.png", "--save-registration", "new/rig.json", "--scale", "0.7"]);
+    let again = go(&photos, &["-o", "b.png", "--registration", "new/rig.json", "--scale", "0.7"]);
+    assert_eq!(bytes("a.png"), bytes("b.png"));
+    for key in ["size", "reprojection_rms_px", "projection", "mode"] {
+        assert_eq!(first[key], again[key], "{key}");
+    }
+    assert_eq!(again["images"][3]["used"], false);
+    assert_eq!(again["images"][1]["focal_px"], first["images"][1]["focal_px"]);
+    assert!(again["seconds"]["match"].is_null() && first["seconds"]["match"].is_number());
+    // It says what it holds.
+    let saved: serde_json::Value = serde_json::from_slice(&bytes("new/rig.json")).unwrap();
+    assert_eq!((saved["schema"].as_u64(), saved["mode"].as_str()), (Some(1), Some("rotation")));
+    assert_eq!(
+        (&saved["photographs"][0]["name"], &saved["photographs"][3]["left_out"]),
+        (&"0.png".into(), &"no_overlap".into())
+    );
+    assert_eq!(saved["photographs"][1]["camera"]["fx"], first["images"][1]["focal_px"]);
+
+    // The same views, each in another exposure: the picture lies where it did, and it is that of those photographs.
+    let dark = tempfile::tempdir_in(folder.path()).unwrap();
+    let (_, darker) = landscape(dark.path(), 3, 0.5);
+    let place = dark.path().file_name().unwrap().to_str().unwrap();
+    let darker: Vec<String> =
+        darker.iter().map(|name| format!("{place}/{name}")).chain(["stranger.png".to_owned()]).collect();
+    let other = go(&strs(&darker), &["-o", "c.png", "--registration", "new/rig.json", "--scale", "0.7"]);
+    assert_eq!(other["size"], first["size"]);
+    assert!(other["images"][0]["gain"] != first["images"][0]["gain"] && bytes("c.png") != bytes("a.png"));
+    // Another part of it, drawn anew.
+    let part =
+        go(&photos, &["-o", "d.png", "--registration", "new/rig.json", "--projection", "panini", "--fov", "60,30"]);
+    assert_eq!(part["projection"], "panini");
+}
+
+#[test]
+fn registrations_of_other_photographs_and_damaged_ones_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let (_, names) = landscape(folder.path(), 3, 0.0);
+    done(
+        folder.path(),
+        &[&["panorama"], &strs(&names)[..], &["-o", "a.png", "--save-registration", "rig.json", "--scale", "0.3"]]
+            .concat(),
+    );
+    let small = RgbU8::new(300, 420, [9; 3]);
+    cv_io::write_png(folder.path().join("small.png"), small.view()).unwrap();
+    let refuse = |photos: &[&str], file: &str, words: &str| {
+        let ran = refused(folder.path(), &[&["panorama"], photos, &["-o", "b.png", "--registration", file]].concat());
+        assert!(ran.stderr.contains(words), "{file} {words}: {ran:?}");
+        assert!(!folder.path().join("b.png").exists());
+    };
+    refuse(&["0.png", "1.png"], "rig.json", "2 photographs for a registration of 3");
+    refuse(&["0.png", "small.png", "2.png"], "rig.json", "small.png: photograph 1 is 300x420; 420x300 was registered");
+    let text = std::fs::read_to_string(folder.path().join("rig.json")).unwrap();
+    let good: serde_json::Value = serde_json::from_str(&text).unwrap();
+    let photos = strs(&names);
+    let damaged = |name: &str, damage: &dyn Fn(&mut serde_json::Value)| {
+        let mut value = good.clone();
+        damage(&mut value);
+        std::fs::write(folder.path().join(name), value.to_string()).unwrap();
+    };
+    damaged("v2.json", &|v| v["schema"] = 2.into());
+    refuse(&photos, "v2.json", "a registration of version 2, and 1 is known");
+    damaged("focal.json", &|v| v["photographs"][0]["camera"]["fx"] = 1e12.into());
+    refuse(&photos, "focal.json", "photograph 0: fx is 1000000000000");
+    damaged("negative.json", &|v| v["photographs"][2]["camera"]["fy"] = (-3.0).into());
+    refuse(&photos, "negative.json", "photograph 2: ");
+    damaged("large.json", &|v| v["photographs"][0]["width"] = u64::MAX.into());
+    refuse(&photos, "large.json", "photograph 0: width is");
+    damaged("scaled.json", &|v| v["photographs"][1]["from_world"][0][0] = 1.5.into());
+    refuse(&photos, "scaled.json", "the matrix of photograph 1 is no rotation");
+    damaged("pair.json", &|v| v["overlaps"][0]["b"] = 3.into());
+    refuse(&photos, "pair.json", "of 3 are no pair of placed ones");
+    damaged("null.json", &|v| v["rms_px"] = serde_json::Value::Null);
+    refuse(&photos, "null.json", "null.json is no registration");
+    for (name, text) in [
+        ("cut.json", &text[..text.len() / 2]),
+        ("nan.json", &text.replacen("\"rms_px\":", "\"rms_px\":NaN,\"x\":", 1)),
+        ("huge.json", &text.replacen("\"rms_px\":", "\"rms_px\":1e999,\"x\":", 1)),
+        ("list.json", "[1, 2]"),
+        ("empty.json", ""),
+    ] {
+        std::fs::write(folder.path().join(name), text).unwrap();
+        refuse(&photos, name, name);
+    }
+    refuse(&photos, "missing.json", "missing.json");
+    // What matching would need means nothing here, and nothing that is read is written over.
+    let ran =
+        run(folder.path(), &["panorama", "0.png", "-o", "b.png", "--registration", "rig.json", "--mode", "plane"]);
+    assert_eq!(ran.code, Some(2), "{ran:?}");
+    let args = [&["panorama"], &photos[..], &["-o", "b.png", "--registration", "rig.json", "--seed", "1"]].concat();
+    assert_eq!(run(folder.path(), &args).code, Some(2));
+    let args =
+        [&["panorama"], &photos[..], &["-o", "b.png", "--registration", "rig.json", "--save-registration", "rig.json"]];
+    assert!(refused(folder.path(), &args.concat()).stderr.contains("would be written over"));
+    assert_eq!(std::fs::read_to_string(folder.path().join("rig.json")).unwrap(), text);
+}
+
+#[test]
+fn a_project_for_hugin_has_the_views_and_comes_back_as_a_registration() {
+    let folder = tempfile::tempdir().unwrap();
+    let (vista, names) = landscape(folder.path(), 3, 0.0);
+    let photos = strs(&names);
+    let go = |photos: &[&str], more: &[&str]| json(folder.path(), &[&["panorama"], photos, more].concat());
+    let field = ["--projection", "panini", "--fov", "90,35", "--exposure", "none"];
+    let first =
+        go(&photos, &[&["-o", "a.png", "--camera", "cam.yaml", "--save-registration", "p.pto"], &field[..]].concat());
+    let text = std::fs::read_to_string(folder.path().join("p.pto")).unwrap();
+    assert!(text.lines().filter(|line| line.starts_with("c n")).count() > 50);
+    let images: Vec<&str> = text.lines().filter(|line| line.starts_with("i ")).collect();
+    let value = |line: &str, key: &str| -> f64 {
+        line.split(' ').find_map(|word| word.strip_prefix(key)?.parse().ok()).unwrap()
+    };
+    for (i, line) in images.iter().enumerate() {
+        assert!(line.ends_with(&format!("n\"{i}.png\"")), "{line}");
+        // The camera, of which 420 px across at a focal length of 360 are 60.5 degrees, and the views: side by side 55 % of that apart, as high as the horizon is put.
+        let across = 2.0 * (210.0_f64 / 360.0).atan();
+        assert!((value(line, "v") - across.to_degrees()).abs() < 1e-9, "{line}");
+        let yaw = (i as f64 - 1.0) * 0.55 * across.to_degrees();
+        // Two pixels of alignment.
+        assert!((value(line, "y") - yaw).abs() < 0.32 && value(line, "r").abs() < 0.5, "{line}");
+    }
+    assert_eq!(images.len(), 3);
+    let p = text.lines().find(|line| line.starts_with("p ")).unwrap();
+    assert!(p.starts_with("p f19 ") && p.contains(" P\"100 0 0\" "), "{p}");
+
+    // Read back it draws the same scene, to what a turn of the world leaves of rounding.
+    let again = go(&photos, &[&["-o", "b.png", "--registration", "p.pto"], &field[..]].concat());
+    assert_eq!(again["size"], first["size"]);
+    let panini = |x: f64, y: f64| {
+        let longitude = 2.0 * (0.5 * x).atan();
+        direction(longitude, -(0.5 * y * (1.0 + longitude.cos())).atan())
+    };
+    let picture = cv_io::read_rgb(folder.path().join("b.png")).unwrap();
+    let d = difference(&picture, &vista, panini);
+    assert!(d < 4.0, "{d}");
+
+    std::fs::write(folder.path().join("fish.pto"), text.replace(" f0 ", " f3 ")).unwrap();
+    let args = [&["panorama"], &photos[..], &["-o", "c.png", "--registration", "fish.pto"]].concat();
+    assert!(refused(folder.path(), &args).stderr.contains("f = 3; it must be 0"));
+    let args =
+        [&["panorama"], &photos[..], &["-o", "c.png", "--mode", "plane", "--save-registration", "flat.pto"]].concat();
+    let ran = run(folder.path(), &args);
+    assert!(ran.code == Some(1) && ran.stderr.contains("has rotations only"), "{ran:?}");
+    assert_eq!(
+        run(folder.path(), &[&["panorama"], &photos[..], &["-o", "c.png", "--save-registration", "x.txt"]].concat())
+            .code,
+        Some(2)
+    );
 }

@@ -35,6 +35,7 @@
 mod align;
 mod blend;
 mod light;
+mod registration;
 mod render;
 mod rows;
 mod seams;
@@ -47,6 +48,7 @@ pub use blend::{BlendMode, Blender, Composition, NO_PHOTO};
 pub use cv_geometry::{NotAPair, VerifiedPair, VerifyOptions, verify_pair};
 pub use cv_imgproc::Interpolation;
 pub use light::{Exposure, Gains};
+pub use registration::{Pto, PtoError, Registration, RegistrationError};
 pub use render::{CompositingOptions, Panorama, RenderError, render, render_with};
 pub use seams::Seams;
-pub use surface::{Bounds, Canvas, LayoutError, PhotoMap, Projection, WarpedPhoto};
+pub use surface::{Bounds, Canvas, Framing, LayoutError, PhotoMap, Projection, WarpedPhoto};

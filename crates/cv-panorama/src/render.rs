@@ -6,8 +6,8 @@ use crate::light::{Exposure, ExposureCorrection, Gains, estimate_gains};
 use crate::rows::for_each_row;
 use crate::seams::{self, Seams, label_bounds};
 use crate::surface::{
-    Bounds, Canvas, DisplacementField, Layout, LayoutError, PhotoMap, Placement, Preview, Projection, WarpSettings,
-    WarpedPhoto, box_shrunk, displacements, largest_rectangle, layout, shrunk_view, warp,
+    Bounds, Canvas, DisplacementField, Framing, Layout, LayoutError, PhotoMap, Placement, Preview, Projection,
+    WarpSettings, WarpedPhoto, box_shrunk, displacements, largest_rectangle, layout, shrunk_view, warp,
 };
 use cv_core::{Cancelled, Image, ImageView, Mask, OptionError, Progress, RgbU8, Stage, StageClock};
 use cv_imgproc::Interpolation;
@@ -17,6 +17,8 @@ use cv_imgproc::Interpolation;
 pub struct CompositingOptions {
     /// The surface. Default [`Projection::Auto`].
     pub projection: Projection,
+    /// Which part of the scene is drawn. Default all that the photographs show, as far as the surface draws it ([`Projection::widest_field`]).
+    pub framing: Framing,
     /// Size of the panorama relative to the photographs: 1 draws the middle of a photograph of median focal length pixel for pixel. Above 0; default 1.
     pub resolution: f64,
     /// Deform photographs slightly and smoothly so that they meet where the camera did not turn about its center. Default true.
@@ -39,6 +41,7 @@ impl Default for CompositingOptions {
     fn default() -> Self {
         Self {
             projection: Projection::Auto,
+            framing: Framing::default(),
             resolution: 1.0,
             elastic: true,
             exposure: Exposure::default(),
@@ -107,6 +110,8 @@ pub struct Panorama {
     pub map: PhotoMap,
     /// True where the right edge continues at the left one.
     pub full_circle: bool,
+    /// True where photographs reach beyond what the surface draws at the most, and no field of view was asked for.
+    pub reaches_beyond: bool,
     /// What the light of each photograph was multiplied with.
     pub gains: Gains,
     /// Stage names and their seconds.
@@ -146,7 +151,7 @@ pub fn render_with(
 ) -> Result<Panorama, RenderError> {
     let mut clock = StageClock::new();
     check(photos, alignment, options)?;
-    let layout = layout(alignment, options.projection, options.resolution, options.max_pixels)?;
+    let layout = layout(alignment, options.projection, &options.framing, options.resolution, options.max_pixels)?;
     let photo_of: Vec<usize> = layout.placements.iter().map(|p| p.photo).collect();
     let fields = if options.elastic {
         displacements(photos, &layout, alignment, progress)?
@@ -200,6 +205,7 @@ pub fn render_with(
         canvas: layout.canvas,
         map: PhotoMap::new(&layout, fields),
         full_circle: layout.full_circle,
+        reaches_beyond: layout.reaches_beyond,
         gains,
         stages: Vec::new(),
     };
@@ -219,6 +225,7 @@ fn check(
     options: &CompositingOptions,
 ) -> Result<(), RenderError> {
     OptionError::check("resolution", options.resolution, "a positive number", |v| v > 0.0 && v.is_finite())?;
+    options.framing.check()?;
     for (index, view) in alignment.used() {
         let (expected_width, expected_height) = (view.camera.width, view.camera.height);
         let (width, height) = photos.get(index).map_or((0, 0), ImageView::size);
@@ -318,11 +325,18 @@ mod tests {
 
     impl Set {
         fn new(yaws: &[f64]) -> Self {
-            let views: Vec<View> = yaws
+            Self::turned(&yaws.iter().map(|yaw| (*yaw, 0.0)).collect::<Vec<_>>())
+        }
+
+        /// Turned by these yaws, and up by these pitches.
+        fn turned(turns: &[(f64, f64)]) -> Self {
+            let views: Vec<View> = turns
                 .iter()
-                .map(|yaw| View {
+                .map(|(yaw, pitch)| View {
                     camera: Camera::from_focal(240, 180, 200.0),
-                    from_world: Rotation3::from_axis_angle(&Vector3::y_axis(), -yaw).into_inner(),
+                    from_world: (Rotation3::from_axis_angle(&Vector3::x_axis(), -pitch)
+                        * Rotation3::from_axis_angle(&Vector3::y_axis(), -yaw))
+                    .into_inner(),
                 })
                 .collect();
             let photos = views.iter().map(|v| photograph(v, sky)).collect();
@@ -371,7 +385,7 @@ mod tests {
     #[test]
     fn on_every_surface_every_pixel_shows_what_lies_in_its_direction() {
         let set = Set::three();
-        for projection in [Projection::Plane, Projection::Cylindrical, Projection::Spherical] {
+        for projection in Projection::NAMES.iter().map(|(_, p)| *p).filter(|p| *p != Projection::Auto) {
             for &(_, blend) in BlendMode::NAMES {
                 let panorama = set.render(&CompositingOptions { projection, blend, ..plain() });
                 let (error, pixels) = error(&panorama);
@@ -438,6 +452,49 @@ mod tests {
         let row = panorama.image.height() / 2;
         let (first, last) = (panorama.image.at(0, row), panorama.image.at(panorama.image.width() - 1, row));
         assert!(first.into_iter().zip(last).all(|(a, b)| a.abs_diff(b) < 25), "{first:?} {last:?}");
+    }
+
+    #[test]
+    fn a_little_planet_shows_the_ground_in_its_middle_and_the_horizon_around_it() {
+        let row = |pitch: f64| (0..8).map(move |k| (f64::from(k) * TAU / 8.0, pitch));
+        let set = Set::turned(&row(0.0).chain(row(-0.7)).chain(row(-1.4)).collect::<Vec<_>>());
+        let framing = Framing { center: Some([0.0, -TAU / 4.0]), ..Framing::default() };
+        for elastic in [false, true] {
+            let panorama = set.render(&CompositingOptions {
+                projection: Projection::Stereographic,
+                framing,
+                elastic,
+                resolution: 0.5,
+                ..plain()
+            });
+            let down = panorama.canvas.pixel(&Vector3::y()).unwrap();
+            assert!(panorama.mask.at(down.x.round() as usize, down.y.round() as usize)[0]);
+            // The horizon is a circle of twice the scale around it, and what lies ahead of the middle is above it.
+            for yaw in [0.0, 0.9, 2.5, -1.3_f64] {
+                let p = panorama.canvas.pixel(&Vector3::new(yaw.sin(), 0.0, yaw.cos())).unwrap() - down;
+                let want = nalgebra::Vector2::new(yaw.sin(), -yaw.cos()) * 200.0;
+                assert!((p - want).norm() < 1e-6, "{yaw} {p} {want}");
+            }
+            // As for the resolution of a half: averages of two by two pixels of waves of 21 px.
+            assert!(error(&panorama).0 < 3.0, "{elastic}: {}", error(&panorama).0);
+            // The disk up to the upper edge of the first row: tan of half of 90° + 24° (at the middles of photographs), all of it but what the box leaves.
+            let pixels = error(&panorama).1 as f64;
+            let most = std::f64::consts::PI * (200.0 * (0.5 * (TAU / 4.0 + 90_f64.atan2(200.0))).tan()).powi(2);
+            assert!(pixels < 1.01 * most && pixels > 0.85 * most, "{pixels} {most}");
+        }
+    }
+
+    #[test]
+    fn a_window_over_the_back_of_a_full_circle_shows_what_lies_there() {
+        let set = Set::new(&(0..8).map(|k| f64::from(k) * TAU / 8.0).collect::<Vec<_>>());
+        for (projection, elastic) in
+            [(Projection::Cylindrical, false), (Projection::Mercator, true), (Projection::Panini, false)]
+        {
+            let framing = Framing { center: Some([3.0, 0.1]), across: Some(2.0), up: Some(0.5), ..Framing::default() };
+            let panorama = set.render(&CompositingOptions { projection, framing, elastic, ..plain() });
+            assert!(error(&panorama).0 < 0.9, "{projection:?} {}", error(&panorama).0);
+            assert!(panorama.mask.as_slice().iter().all(|m| *m) && !panorama.full_circle);
+        }
     }
 
     #[test]
@@ -566,6 +623,9 @@ mod tests {
             let error = go(&set.views(), &CompositingOptions { resolution, ..plain() });
             assert!(matches!(error, RenderError::Option(OptionError { name: "resolution", .. })), "{error:?}");
         }
+        let framing = Framing { across: Some(f64::NAN), ..Framing::default() };
+        let error = go(&set.views(), &CompositingOptions { framing, ..plain() });
+        assert!(matches!(error, RenderError::Option(OptionError { name: "across", .. })), "{error:?}");
         let small = RgbU8::new(100, 180, [0; 3]);
         let views = [set.views()[0], small.view(), set.views()[2]];
         let expected =

@@ -80,7 +80,7 @@ pub mod features {
 }
 pub use panorama::{
     LeftOut, NearestPair, PanoramaError, PanoramaImage, PanoramaOptions, PanoramaPair, PanoramaPhoto, PanoramaResult,
-    panorama,
+    panorama, panorama_with,
 };
 /// The options of the panorama's stages.
 pub mod panorama_types {

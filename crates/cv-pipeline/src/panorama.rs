@@ -8,7 +8,7 @@ use cv_core::{
 use cv_features::{FeatureError, FeatureOptions, Features, MatchError, SiftOptions};
 use cv_panorama::{
     AlignError, AlignOptions, Alignment, CameraMotion, Canvas, CompositingOptions, NotAPair, Photo, PhotoMap,
-    RenderError, Unplaced, VerifiedPair, VerifyOptions, align, render, verify_pair,
+    Registration, RegistrationError, RenderError, Unplaced, VerifiedPair, VerifyOptions, align, render, verify_pair,
 };
 use rayon::prelude::*;
 
@@ -115,11 +115,13 @@ pub struct NearestPair {
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub struct PanoramaImage {
+    /// Width and height in pixels.
+    pub size: (usize, usize),
     /// Whether it is in the panorama.
     pub used: bool,
     /// Why not, where it is not.
     pub reason: Option<LeftOut>,
-    /// Features found on it.
+    /// Features found on it; 0 where nobody looked for any ([`panorama_with`]).
     pub features: usize,
     /// Its focal length in pixels, where it is used.
     pub focal: Option<f64>,
@@ -153,9 +155,9 @@ pub struct PanoramaResult {
     pub labels: Image<u16, 1>,
     /// One entry per input.
     pub images: Vec<PanoramaImage>,
-    /// All pairs that had matches.
+    /// All pairs that had matches; none of [`panorama_with`].
     pub pairs: Vec<PanoramaPair>,
-    /// Features of each photograph, in its own pixels.
+    /// Features of each photograph, in its own pixels; none of [`panorama_with`].
     pub features: Vec<Features>,
     /// The views, in full size.
     pub alignment: Alignment,
@@ -163,6 +165,8 @@ pub struct PanoramaResult {
     pub canvas: Canvas,
     /// Where in its photograph each pixel of the picture comes from.
     pub map: PhotoMap,
+    /// Whether photographs reach beyond what the surface draws at the most, and no field of view was asked for.
+    pub reaches_beyond: bool,
     /// Root mean square error of all matches of all overlaps, in pixels of the photographs.
     pub reprojection_rms_px: f64,
     /// Stage names and their seconds.
@@ -180,6 +184,15 @@ impl PanoramaResult {
     /// For a pair of another panorama.
     pub fn correspondences(&self, pair: &PanoramaPair) -> Vec<Correspondence> {
         correspondences(&self.features[pair.a], &self.features[pair.b], &pair.matches)
+    }
+
+    /// Where the photographs look, for others of the same views; `names` are those of the photographs, as many as are known.
+    ///
+    /// # Errors
+    /// [`RegistrationError`] where a camera or a matrix is out of the range that registrations take.
+    pub fn registration(&self, names: &[String]) -> Result<Registration, RegistrationError> {
+        let sizes: Vec<_> = self.images.iter().map(|image| image.size).collect();
+        Registration::new(&self.alignment, &sizes, names)
     }
 
     /// Whether the photographs fit each other so badly that they must have been taken from different places: what is near may then be cut in two at the seams.
@@ -201,6 +214,9 @@ pub enum PanoramaError {
         /// One entry per input.
         images: Vec<PanoramaImage>,
     },
+    /// The photographs are not as they were registered.
+    #[error(transparent)]
+    Registration(#[from] RegistrationError),
     /// The panorama could not be drawn.
     #[error(transparent)]
     Render(RenderError),
@@ -278,14 +294,62 @@ pub fn panorama(
     };
     let mut images = describe(&prepared, &alignment.views, &pairs);
     let sizes: Vec<_> = prepared.iter().zip(photos).map(|(p, photo)| (p.factor, photo.image.size())).collect();
+    for (image, (_, size)) in images.iter_mut().zip(&sizes) {
+        image.size = *size;
+    }
     let alignment = alignment.resized(&sizes);
+    clock.lap("align");
+    let views: Vec<ImageView<'_, u8, 3>> = photos.iter().map(|p| p.image).collect();
+    let features = prepared.into_iter().map(Prepared::into_features).collect();
+    draw(&views, alignment, images, (pairs, features), &options.render, clock, progress)
+}
+
+/// Joins photographs whose views are known from others: the next frames of a rig, another exposure of the same views.
+///
+/// As [`panorama`] without features, matches and alignment; light, seams and local deformations are those of these photographs, so that the photographs that were registered give the same bytes
+/// again. As many photographs, of the same sizes, in the same order.
+///
+/// # Errors
+/// [`PanoramaError`]: the photographs are not as registered, or the canvas would be too large.
+pub fn panorama_with(
+    registration: &Registration,
+    photos: &[ImageView<'_, u8, 3>],
+    options: &CompositingOptions,
+    progress: &dyn Progress,
+) -> Result<PanoramaResult, PanoramaError> {
+    let sizes: Vec<_> = photos.iter().map(ImageView::size).collect();
+    registration.check_photographs(&sizes)?;
+    let alignment = registration.alignment();
+    let images = alignment.views.iter().zip(&sizes).map(|(view, &size)| PanoramaImage {
+        size,
+        used: view.is_ok(),
+        reason: view.as_ref().err().map(|why| match *why {
+            Unplaced::NoOverlap => LeftOut::NoOverlap { nearest: None },
+            Unplaced::OtherComponent { size } => LeftOut::OtherComponent { size },
+            Unplaced::Inconsistent => LeftOut::Inconsistent,
+        }),
+        features: 0,
+        focal: None,
+        gain: [1.0; 3],
+    });
+    let images = images.collect();
+    draw(photos, alignment, images, (Vec::new(), Vec::new()), options, StageClock::new(), progress)
+}
+
+/// The picture, and what is to be told of it.
+fn draw(
+    photos: &[ImageView<'_, u8, 3>],
+    alignment: Alignment,
+    mut images: Vec<PanoramaImage>,
+    (pairs, features): (Vec<PanoramaPair>, Vec<Features>),
+    options: &CompositingOptions,
+    mut clock: StageClock,
+    progress: &dyn Progress,
+) -> Result<PanoramaResult, PanoramaError> {
     for (image, view) in images.iter_mut().zip(&alignment.views) {
         image.focal = view.as_ref().ok().filter(|_| alignment.motion == CameraMotion::Rotation).map(|v| v.camera.fx);
     }
-    clock.lap("align");
-
-    let views: Vec<ImageView<'_, u8, 3>> = photos.iter().map(|p| p.image).collect();
-    let drawn = render(&views, &alignment, &options.render, progress)?;
+    let drawn = render(photos, &alignment, options, progress)?;
     for (image, gain) in images.iter_mut().zip(&drawn.gains.gains) {
         image.gain = *gain;
     }
@@ -298,9 +362,10 @@ pub fn panorama(
         labels: drawn.labels,
         images,
         pairs,
-        features: prepared.into_iter().map(Prepared::into_features).collect(),
+        features,
         canvas: drawn.canvas,
         map: drawn.map,
+        reaches_beyond: drawn.reaches_beyond,
         reprojection_rms_px: alignment.rms_px,
         alignment,
         stages: clock.into_stages(),
@@ -417,6 +482,7 @@ fn describe(
         .iter()
         .enumerate()
         .map(|(i, view)| PanoramaImage {
+            size: (prepared[i].photo.width, prepared[i].photo.height),
             used: view.is_ok(),
             reason: view.as_ref().err().map(|why| reason(i, *why)),
             features: prepared[i].features.keypoints.len(),

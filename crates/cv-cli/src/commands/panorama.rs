@@ -1,17 +1,22 @@
 //! `cv panorama`: overlapping photographs to one picture.
 
+mod registration;
 mod report;
 
-use crate::frame::{Context, Failure, Outcome, Output, PICTURE, Run, Step, expand_images, named, steps};
+use crate::frame::{
+    Context, Failure, Global, Outcome, Output, PICTURE, Run, Step, expand_images, named, spare_inputs, steps,
+};
 use crate::{rig, words};
 use cv_core::Image;
 use cv_io::Metadata;
-use cv_pipeline::panorama_types::{BlendMode, CameraMotion, Exposure, Projection, Seams};
-use cv_pipeline::{FeatureMethod, FeatureOptions, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama};
+use cv_pipeline::panorama_types::{BlendMode, CameraMotion, Exposure, Framing, Projection, Seams};
+use cv_pipeline::{
+    FeatureMethod, FeatureOptions, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama, panorama_with,
+};
 use rayon::prelude::*;
 use serde_json::json;
 use std::collections::btree_map::{BTreeMap, Entry};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Join overlapping photographs to one picture.
 #[derive(Debug, clap::Args)]
@@ -21,7 +26,13 @@ use std::path::PathBuf;
     cv panorama a.jpg b.jpg c.jpg -o pano.png --blend poisson --report out/\n  \
     cv panorama a.jpg b.jpg c.jpg -o pano.png --alpha\n  \
     cv panorama wide/ -o pano.png --camera cam.yaml\n  \
-    cv panorama wall/ -o plan.tif --mode plane")]
+    cv panorama wall/ -o plan.tif --mode plane\n  \
+    cv panorama street/ -o wide.png --projection panini --fov 150,80\n  \
+    cv panorama around/ -o planet.png --projection stereographic --center 0,-90\n  \
+    cv panorama aslant/ -o level.png --fov 100,60 --center -20,5 --roll 1.5\n  \
+    cv panorama rig/frame1/ -o first.png --save-registration rig.json\n  \
+    cv panorama rig/frame2/ -o second.png --registration rig.json\n  \
+    cv panorama holiday/ -o pano.png --save-registration holiday.pto")]
 pub(crate) struct Args {
     /// Photographs in any order, or folders of them. Those that do not belong are left out.
     #[arg(required = true, value_name = "IMAGES")]
@@ -33,9 +44,21 @@ pub(crate) struct Args {
     /// plan, without shear; auto: rotation, unless plane explains the matches far better.
     #[arg(long, value_name = "WHAT", value_parser = named::<CameraMotion>(), default_value_t = PanoramaOptions::default().align.motion)]
     mode: CameraMotion,
-    /// The surface to draw on; auto: a plane up to 90 degrees across, then a cylinder, a sphere where it is also high.
+    /// The surface to draw on; auto: a plane up to 90 degrees across, then a cylinder, a sphere where it is also high. Mercator keeps shapes (up to 85 degrees from the horizon),
+    /// panini shows a wide view with straight verticals as painters do (up to 240 degrees across), stereographic keeps shapes up to 150 degrees from its middle: with --center 0,-90 a
+    /// little planet. What lies beyond is not drawn.
     #[arg(long, value_name = "SURFACE", value_parser = named::<Projection>(), default_value_t = PanoramaOptions::default().render.projection)]
     projection: Projection,
+    /// Field of view of the picture, in degrees, across and, after a comma, from top to bottom; empty where no photograph reaches [default: as far as they reach].
+    #[arg(long, value_name = "ACROSS[,UP]", value_parser = field_of_view)]
+    fov: Option<(f64, Option<f64>)>,
+    /// Where the middle of the surface looks, in degrees to the right of the middle of the photographs and above the horizon. The surface is turned there: only a picture
+    /// with 0 after the comma has a straight horizon [default: their middle].
+    #[arg(long, value_name = "YAW,PITCH", value_parser = center, allow_hyphen_values = true)]
+    center: Option<(f64, f64)>,
+    /// Turn the picture clockwise, in degrees, where the horizon is not level.
+    #[arg(long, value_name = "DEGREES", value_parser = roll, allow_hyphen_values = true, default_value_t = 0.0)]
+    roll: f64,
     /// How to join photographs at the seams.
     #[arg(long, value_name = "MODE", value_parser = named::<BlendMode>(), default_value_t = PanoramaOptions::default().render.blend)]
     blend: BlendMode,
@@ -61,6 +84,38 @@ pub(crate) struct Args {
     /// taken out. Without, the focal length is estimated, from EXIF on.
     #[arg(long, value_name = "FILE")]
     camera: Option<PathBuf>,
+    /// Write where each photograph looks, and with what camera: .json for --registration, or .pto, a project for Hugin (of the photographs that are used).
+    #[arg(long, value_name = "FILE")]
+    save_registration: Option<PathBuf>,
+    /// Take where each photograph looks from a file of --save-registration, or from a project of Hugin's (.pto), in place of matching: for the next frames of a rig, or the same views in another light. As many
+    /// photographs, of the same sizes, in the same order.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["mode", "features", "camera"])]
+    registration: Option<PathBuf>,
+}
+
+/// A number of degrees in a range.
+fn degrees(text: &str, range: std::ops::RangeInclusive<f64>) -> Result<f64, String> {
+    let value = text.trim().parse().map_err(|_| format!("{text} is no number of degrees"))?;
+    let (low, high) = (range.start(), range.end());
+    if range.contains(&value) { Ok(value) } else { Err(format!("{value} is not between {low} and {high} degrees")) }
+}
+
+fn field_of_view(text: &str) -> Result<(f64, Option<f64>), String> {
+    // Less than a degree is a mistake for a factor, or radians.
+    let angle = |text| degrees(text, 1.0..=360.0);
+    match text.split_once(',') {
+        Some((across, up)) => Ok((angle(across)?, Some(angle(up)?))),
+        None => Ok((angle(text)?, None)),
+    }
+}
+
+fn center(text: &str) -> Result<(f64, f64), String> {
+    let (yaw, pitch) = text.split_once(',').ok_or("two angles are needed, such as 20,-5")?;
+    Ok((degrees(yaw, -360.0..=360.0)?, degrees(pitch, -90.0..=90.0)?))
+}
+
+fn roll(text: &str) -> Result<f64, String> {
+    degrees(text, -180.0..=180.0)
 }
 
 impl Args {
@@ -68,6 +123,12 @@ impl Args {
         let mut options = PanoramaOptions::default();
         options.align.motion = self.mode;
         options.render.projection = self.projection;
+        options.render.framing = Framing {
+            center: self.center.map(|(yaw, pitch)| [yaw.to_radians(), pitch.to_radians()]),
+            roll: self.roll.to_radians(),
+            across: self.fov.map(|(across, _)| across.to_radians()),
+            up: self.fov.and_then(|(_, up)| up).map(f64::to_radians),
+        };
         options.render.blend = self.blend;
         options.render.seams = self.seams;
         options.render.exposure = self.exposure;
@@ -83,12 +144,18 @@ impl Args {
 
 impl Run for Args {
     fn outputs(&self) -> Vec<Output<'_>> {
-        vec![Output::File(&self.output, PICTURE)]
+        let registration = self.save_registration.as_deref().map(|path| Output::File(path, registration::ENDINGS));
+        [Output::File(&self.output, PICTURE)].into_iter().chain(registration).collect()
+    }
+
+    fn has_no_use_for(&self) -> &'static [Global] {
+        if self.registration.is_some() { &[Global::Seed] } else { &[] }
     }
 
     fn steps(&self) -> Vec<Step> {
-        let found = [steps::FEATURES, steps::MATCH, steps::ALIGN];
-        found.into_iter().chain([steps::EXPOSURE, steps::SEAMS, steps::WARP, steps::BLEND]).collect()
+        let found: &[Step] =
+            if self.registration.is_some() { &[] } else { &[steps::FEATURES, steps::MATCH, steps::ALIGN] };
+        found.iter().copied().chain([steps::EXPOSURE, steps::SEAMS, steps::WARP, steps::BLEND]).collect()
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
@@ -99,7 +166,11 @@ impl Run for Args {
         if self.alpha && ["jpg", "jpeg"].iter().any(|jpeg| ending.eq_ignore_ascii_case(jpeg)) {
             return Err(Failure::usage("--alpha needs a .png or .tif: JPEG has no transparency"));
         }
+        let registration = self.registration.as_deref().map(|path| registration::read(path, context)).transpose()?;
         let paths = expand_images(&self.images)?;
+        let results: Vec<PathBuf> = [&self.output].into_iter().chain(&self.save_registration).cloned().collect();
+        let inputs: Vec<&Path> = paths.iter().chain(&self.registration).map(PathBuf::as_path).collect();
+        spare_inputs(&results, &inputs)?;
         let pictures = paths
             .par_iter()
             .map(|path| {
@@ -125,8 +196,15 @@ impl Run for Args {
                 camera: cameras.get(&image.size()).copied(),
             })
             .collect();
-        let result =
-            panorama(&photos, &self.options(context), context).map_err(|error| words::no_panorama(error, &paths))?;
+        let options = self.options(context);
+        let result = match &registration {
+            Some(registration) => {
+                let photos: Vec<_> = photos.iter().map(|photo| photo.image).collect();
+                panorama_with(registration, &photos, &options.render, context)
+            }
+            None => panorama(&photos, &options, context),
+        };
+        let result = result.map_err(|error| words::no_panorama(error, &paths))?;
         let files: Vec<&Metadata> = pictures.iter().map(|(_, metadata, _)| metadata).collect();
         let metadata = metadata(&files, &result);
         context.write(Output::File(&self.output, PICTURE), |path| {
@@ -136,6 +214,9 @@ impl Run for Args {
                 cv_io::write_image(path, result.image.view(), &metadata)
             }
         })?;
+        if let Some(path) = &self.save_registration {
+            registration::write(path, &result, &paths, context)?;
+        }
         for (path, image) in paths.iter().zip(&result.images) {
             if let Some(reason) = &image.reason {
                 context.warn(format!("{} is not in the panorama: {}", path.display(), words::left_out(reason, &paths)));
@@ -145,6 +226,13 @@ impl Run for Args {
             let rms = result.reprojection_rms_px;
             context.warn(format!(
                 "the photographs agree only to {rms:.1} px: they were taken from different places, and what is near may be cut in two at the seams"
+            ));
+        }
+        if result.reaches_beyond {
+            let projection = result.canvas.projection;
+            let [across, up] = projection.widest_field().map(f64::to_degrees);
+            context.warn(format!(
+                "the photographs reach beyond the {across:.0} by {up:.0} degrees that the {projection} projection draws; --projection spherical draws all of them"
             ));
         }
         context.report(|| {

@@ -2,6 +2,7 @@
 
 use super::Model;
 use cv_core::{Point2, Vector3};
+use std::f64::consts::TAU;
 
 pub(super) struct Cylindrical;
 
@@ -15,8 +16,8 @@ impl Model for Cylindrical {
         x.sin_cos()
     }
 
-    fn row(&self, y: f64) -> (f64, f64) {
-        (1.0, y)
+    fn row(&self, y: f64) -> (f64, f64, f64) {
+        (1.0, y, 0.0)
     }
 
     fn is_periodic(&self) -> bool {
@@ -24,6 +25,15 @@ impl Model for Cylindrical {
     }
 
     fn holds_poles(&self) -> bool {
+        false
+    }
+
+    /// All around, and up to 75° from the horizon, where it stretches heights by 1/cos² = 15.
+    fn field(&self) -> [f64; 2] {
+        [TAU, 150_f64.to_radians()]
+    }
+
+    fn diverges(&self) -> bool {
         false
     }
 

@@ -414,7 +414,7 @@ fn register(first: &[f32], mut second: Vec<f32>) -> Option<Vector2<f64>> {
 mod tests {
     use super::*;
     use crate::align::{CameraMotion, View};
-    use crate::surface::{PhotoMap, Projection, layout};
+    use crate::surface::{Framing, PhotoMap, Projection, layout};
     use crate::testing::{StopAt, photograph, sky, stage};
     use cv_core::{Camera, Correspondence, Silent, Vector3};
     use nalgebra::{DMatrix, DVector, Rotation3};
@@ -467,7 +467,7 @@ mod tests {
             sky(&views[1].ray(p + bend(p)).unwrap()).map(|v| v.round() as u8)
         });
         let alignment = alignment(&views);
-        let layout = layout(&alignment, Projection::Cylindrical, 1.0, 1_000_000).unwrap();
+        let layout = layout(&alignment, Projection::Cylindrical, &Framing::default(), 1.0, 1_000_000).unwrap();
         let photos = [first.view(), second.view()];
         let fields = displacements(&photos, &layout, &alignment, &Silent).unwrap();
         let size = (layout.width, layout.height);
@@ -489,7 +489,7 @@ mod tests {
         let views = [view(-0.2), view(0.2)];
         let photos = [photograph(&views[0], sky), photograph(&views[1], sky)];
         let alignment = alignment(&views);
-        let layout = layout(&alignment, Projection::Cylindrical, 1.0, 1_000_000).unwrap();
+        let layout = layout(&alignment, Projection::Cylindrical, &Framing::default(), 1.0, 1_000_000).unwrap();
         let fields = displacements(&[photos[0].view(), photos[1].view()], &layout, &alignment, &Silent).unwrap();
         for field in fields.iter().flatten() {
             // What registering patches of rounded gray levels is good to.
@@ -505,7 +505,7 @@ mod tests {
         let [a, b] = [0, 1].map(|i| views[i].project(&ray).unwrap());
         let matches = vec![Correspondence { a, b }, Correspondence { a, b: b + Vector2::new(30.0, 0.0) }];
         set.pairs = vec![crate::AlignedPair { a: 0, b: 1, inliers: vec![0, 1], matches, rms_px: 0.0 }];
-        let layout = layout(&set, Projection::Spherical, 1.0, 1_000_000).unwrap();
+        let layout = layout(&set, Projection::Spherical, &Framing::default(), 1.0, 1_000_000).unwrap();
         let ties = feature_ties(&layout, &set, 10.0, &stage()).unwrap();
         assert_eq!(ties.len(), 1);
         // One direction is drawn at one place.

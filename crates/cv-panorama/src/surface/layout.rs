@@ -3,8 +3,9 @@
 use crate::align::View;
 use crate::align::turn;
 use crate::align::{Alignment, CameraMotion};
+use crate::surface::framing::{Framing, Shown, Window, shown, slack};
 use crate::surface::{Bounds, Projection, Surface};
-use cv_core::{Matrix3, Point2, Vector3};
+use cv_core::{Matrix3, Point2, Vector2, Vector3};
 use nalgebra::Rotation3;
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
@@ -35,6 +36,24 @@ pub enum LayoutError {
         /// The surface.
         projection: Projection,
     },
+    /// A field of view is wider or higher than the surface draws.
+    #[error(
+        "a field of view of {degrees:.1} degrees is more than the {most:.1} that the {projection} projection draws"
+    )]
+    FieldTooWide {
+        /// The field, in degrees.
+        degrees: f64,
+        /// The widest, in degrees.
+        most: f64,
+        /// The surface.
+        projection: Projection,
+    },
+    /// No photograph shows anything of what was to be drawn.
+    #[error("no photograph reaches into the field of view")]
+    NothingInView,
+    /// A flat scene has no directions, and so no field of view.
+    #[error("the scene is flat: it has no field of view, no middle at an angle and no horizon")]
+    FlatScene,
 }
 
 /// Where a panorama's pixels look: pixel (0, 0) lies at `origin` of the surface, whose middle is the Z axis of `frame · world`.
@@ -86,6 +105,8 @@ pub(crate) struct Layout {
     pub(crate) full_circle: bool,
     pub(crate) placements: Vec<Placement>,
     pub(crate) canvas: Canvas,
+    /// Whether photographs reach beyond what the surface draws.
+    pub(crate) reaches_beyond: bool,
 }
 
 impl Layout {
@@ -109,6 +130,7 @@ const PER_SIDE: usize = 64;
 pub(crate) fn layout(
     alignment: &Alignment,
     projection: Projection,
+    framing: &Framing,
     resolution: f64,
     max_pixels: usize,
 ) -> Result<Layout, LayoutError> {
@@ -118,11 +140,24 @@ pub(crate) fn layout(
     let Some(&focal) = focals.get(focals.len() / 2) else { return Err(LayoutError::Nothing) };
     let scale = focal * resolution;
     let flat = alignment.motion == CameraMotion::Homography;
-    let attempt = |projection| on_surface(&views, Surface { projection, scale }, flat, max_pixels);
+    let is_framed = *framing != Framing::default();
+    if flat && is_framed {
+        return Err(LayoutError::FlatScene);
+    }
+    let attempt = |projection| {
+        let surface = Surface { projection, scale };
+        if is_framed || surface.diverges() {
+            in_window(&views, surface, flat, framing, max_pixels)
+        } else {
+            on_surface(&views, surface, flat, max_pixels)
+        }
+    };
     match projection {
         Projection::Auto if flat => attempt(Projection::Plane),
         Projection::Auto => {
             let (across, up) = extent(&views, scale);
+            let across = framing.across.unwrap_or(across);
+            let up = framing.up.map_or(up, |up| 0.5 * up);
             let mut result = Err(LayoutError::Nothing);
             for projection in Projection::suitable(across, up) {
                 result = attempt(projection);
@@ -134,6 +169,91 @@ pub(crate) fn layout(
         }
         chosen => attempt(chosen),
     }
+}
+
+/// Lays out what lies in a window of the surface: that of the field of view, or the widest that the surface draws.
+fn in_window(
+    views: &[(usize, View)],
+    surface: Surface,
+    flat: bool,
+    framing: &Framing,
+    max_pixels: usize,
+) -> Result<Layout, LayoutError> {
+    let projection = surface.projection;
+    let widest = projection.widest_field();
+    let (across, up) = (framing.across.unwrap_or(widest[0]), framing.up.unwrap_or(widest[1]));
+    let too_wide = |field: f64, most: f64| LayoutError::FieldTooWide {
+        degrees: field.to_degrees(),
+        most: most.to_degrees(),
+        projection,
+    };
+    let [half_width, half_height] = surface.half_size(across, up);
+    let half_width = half_width.ok_or_else(|| too_wide(across, widest[0]))?;
+    let half_height = half_height.ok_or_else(|| too_wide(up, widest[1]))?;
+    let frame = if flat {
+        Matrix3::identity()
+    } else {
+        let (gap, middle, pitch) = middle(views);
+        // Around the whole horizon the middle stays where the views' own middle is.
+        let middle = if gap * surface.scale < 1.0 { 0.0 } else { middle };
+        let pitch = if surface.period().is_none() && pitch.abs() > UPRIGHT_PITCH { -pitch } else { 0.0 };
+        framing.frame(middle, pitch)
+    };
+    let views: Vec<(usize, View)> =
+        views.iter().map(|&(i, v)| (i, View { from_world: v.from_world * frame.transpose(), ..v })).collect();
+    let window = Window::around_middle(Vector2::new(half_width, half_height));
+    let found: Vec<Shown> = views.iter().map(|(_, view)| shown(view, &surface, &window)).collect();
+    let boxes = found.iter().flat_map(|s| &s.boxes).copied();
+    let all = boxes.reduce(|a, b| a.joined(&b)).ok_or(LayoutError::NothingInView)?;
+    let full_circle = surface.period().is_some_and(|period| all.max.x - all.min.x > period - 1.0);
+    // A side that was asked for lies around the middle to half a pixel; one that was not ends where the photographs do.
+    let side = |asked: bool, half: f64, min: f64, max: f64| {
+        if asked {
+            let size = (2.0 * half).round().max(1.0);
+            (size, -0.5 * (size - 1.0))
+        } else {
+            ((max.floor() - min.ceil() + 1.0).max(1.0), min.ceil())
+        }
+    };
+    let (width, left) = side(framing.across.is_some() || full_circle, half_width, all.min.x, all.max.x);
+    let (height, top) = side(framing.up.is_some(), half_height, all.min.y, all.max.y);
+    let (canvas_w, canvas_h) = canvas_size(width, height, max_pixels, projection)?;
+    let origin = Point2::new(left, top);
+    let slack = slack(&window);
+    let mut placements = Vec::new();
+    for (&(photo, view), shown) in views.iter().zip(&found) {
+        for part in &shown.boxes {
+            if let Some(bounds) = part.pixels(origin, slack, (canvas_w, canvas_h)) {
+                placements.push(Placement { photo, view, bounds, origin });
+            }
+        }
+    }
+    let canvas = Canvas { projection, scale: surface.scale, origin, frame };
+    let reaches_beyond = framing.across.is_none() && framing.up.is_none() && found.iter().any(|s| s.reaches_beyond);
+    Ok(Layout { surface, width: canvas_w, height: canvas_h, full_circle, placements, canvas, reaches_beyond })
+}
+
+/// The size of a canvas in whole pixels.
+fn canvas_size(
+    width: f64,
+    height: f64,
+    max_pixels: usize,
+    projection: Projection,
+) -> Result<(usize, usize), LayoutError> {
+    if width * height > max_pixels as f64 || !(width * height).is_finite() {
+        return Err(LayoutError::TooLarge { width, height, max_pixels, projection });
+    }
+    Ok((width as usize, height as usize))
+}
+
+/// How wide the part of the horizon is that no view covers, the longitude opposite to its middle, and the latitude, downwards, half-way between the lowest and the highest point.
+fn middle(views: &[(usize, View)]) -> (f64, f64, f64) {
+    let sphere = Surface { projection: Projection::Spherical, scale: 1.0 };
+    let outlines: Vec<Outline> = views.iter().filter_map(|(_, v)| outline(v, &sphere)).collect();
+    let (gap, opposite) = largest_gap(&outlines, TAU);
+    let low = outlines.iter().map(|o| o.min.y).fold(f64::INFINITY, f64::min);
+    let high = outlines.iter().map(|o| o.max.y).fold(f64::NEG_INFINITY, f64::max);
+    (gap, opposite + PI, 0.5 * (low + high))
 }
 
 /// Outline of a view on a surface with longitudes unrolled along it: left, top, right, bottom in surface pixels.
@@ -222,16 +342,11 @@ fn on_surface(views: &[(usize, View)], surface: Surface, flat: bool, max_pixels:
     let views = match surface.period() {
         _ if flat => views.to_vec(),
         None => {
-            let sphere = Surface { projection: Projection::Spherical, scale: 1.0 };
-            let outlines: Vec<Outline> = views.iter().filter_map(|(_, v)| outline(v, &sphere)).collect();
-            let (gap, middle) = largest_gap(&outlines, TAU);
+            let (gap, middle, pitch) = middle(views);
             if gap < PI {
                 return Err(too_wide());
             }
-            let low = outlines.iter().map(|o| o.min.y).fold(f64::INFINITY, f64::min);
-            let high = outlines.iter().map(|o| o.max.y).fold(f64::NEG_INFINITY, f64::max);
-            let pitch = 0.5 * (low + high);
-            let level = turn(middle + PI);
+            let level = turn(middle);
             let tilt = if pitch.abs() > UPRIGHT_PITCH {
                 Rotation3::from_axis_angle(&Vector3::x_axis(), pitch).into_inner()
             } else {
@@ -272,10 +387,7 @@ fn on_surface(views: &[(usize, View)], surface: Surface, flat: bool, max_pixels:
         size.0 = period.round();
     }
     let (width, height) = (size.0.max(1.0), size.1.max(1.0));
-    if width * height > max_pixels as f64 || !(width * height).is_finite() {
-        return Err(LayoutError::TooLarge { width, height, max_pixels, projection: surface.projection });
-    }
-    let (canvas_w, canvas_h) = (width as usize, height as usize);
+    let (canvas_w, canvas_h) = canvas_size(width, height, max_pixels, surface.projection)?;
     let origin = Point2::new(min.x.ceil(), min.y.ceil());
     let mut placements = Vec::new();
     for ((photo, view), o) in views.iter().zip(&outlines) {
@@ -301,13 +413,13 @@ fn on_surface(views: &[(usize, View)], surface: Surface, flat: bool, max_pixels:
         }
     }
     let canvas = Canvas { projection: surface.projection, scale: surface.scale, origin, frame };
-    Ok(Layout { surface, width: canvas_w, height: canvas_h, full_circle, placements, canvas })
+    Ok(Layout { surface, width: canvas_w, height: canvas_h, full_circle, placements, canvas, reaches_beyond: false })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cv_core::Camera;
+    use cv_core::{Camera, Named};
 
     /// Photographs of 600 x 400 at focal length 500 (62 by 44 degrees), turned by these yaws and pitches.
     fn alignment(turns: &[(f64, f64)]) -> Alignment {
@@ -333,8 +445,9 @@ mod tests {
 
     #[test]
     fn the_surface_follows_the_field_of_view() {
-        let chosen =
-            |turns: &[(f64, f64)]| layout(&alignment(turns), Projection::Auto, 1.0, MANY).unwrap().surface.projection;
+        let chosen = |turns: &[(f64, f64)]| {
+            layout(&alignment(turns), Projection::Auto, &Framing::default(), 1.0, MANY).unwrap().surface.projection
+        };
         assert_eq!(chosen(&[(0.0, 0.0), (0.3, 0.0)]), Projection::Plane);
         assert_eq!(chosen(&[(-0.7, 0.0), (0.0, 0.0), (0.7, 0.0)]), Projection::Cylindrical);
         assert_eq!(chosen(&[(-0.7, 0.0), (0.0, 0.8), (0.7, 0.0)]), Projection::Spherical);
@@ -344,8 +457,8 @@ mod tests {
     fn a_canvas_holds_every_photograph_wherever_the_world_frame_points() {
         for offset in [0.0, 2.0, 3.1, -3.0] {
             let set = alignment(&[(offset, 0.0), (offset + 0.4, 0.05)]);
-            for projection in [Projection::Plane, Projection::Cylindrical, Projection::Spherical] {
-                let l = layout(&set, projection, 1.0, MANY).unwrap();
+            for projection in Projection::NAMES.iter().map(|(_, p)| *p) {
+                let l = layout(&set, projection, &Framing::default(), 1.0, MANY).unwrap();
                 assert_eq!(l.placements.len(), 2);
                 for p in &l.placements {
                     // Every pixel of the photograph's border lies within its bounds.
@@ -370,7 +483,7 @@ mod tests {
     #[test]
     fn a_full_circle_is_one_period_wide_and_photographs_over_the_cut_are_drawn_twice() {
         let turns: Vec<_> = (0..10).map(|k| (f64::from(k) * TAU / 10.0, 0.0)).collect();
-        let l = layout(&alignment(&turns), Projection::Auto, 1.0, MANY).unwrap();
+        let l = layout(&alignment(&turns), Projection::Auto, &Framing::default(), 1.0, MANY).unwrap();
         assert!(l.full_circle && l.surface.projection == Projection::Cylindrical);
         assert_eq!(l.width, (TAU * 500.0_f64).round() as usize);
         let covered: Vec<bool> =
@@ -383,7 +496,7 @@ mod tests {
     fn what_a_surface_cannot_hold_is_an_error_with_the_numbers() {
         let wide = alignment(&[(-1.2, 0.0), (0.0, 0.0), (1.2, 0.0)]);
         // 62 + 138 = 200 degrees.
-        match layout(&wide, Projection::Plane, 1.0, MANY) {
+        match layout(&wide, Projection::Plane, &Framing::default(), 1.0, MANY) {
             Err(LayoutError::TooWide { degrees, projection: Projection::Plane }) => {
                 assert!((degrees - 199.4).abs() < 1.0)
             }
@@ -391,11 +504,131 @@ mod tests {
         }
         let nearly = alignment(&[(-1.0, 0.0), (1.0, 0.0)]);
         assert!(
-            matches!(layout(&nearly, Projection::Plane, 1.0, MANY), Err(LayoutError::TooLarge { width, .. }) if width > 9000.0)
+            matches!(layout(&nearly, Projection::Plane, &Framing::default(), 1.0, MANY), Err(LayoutError::TooLarge { width, .. }) if width > 9000.0)
         );
-        assert!(matches!(layout(&wide, Projection::Auto, 1.0, 1000), Err(LayoutError::TooLarge { .. })));
+        assert!(matches!(
+            layout(&wide, Projection::Auto, &Framing::default(), 1.0, 1000),
+            Err(LayoutError::TooLarge { .. })
+        ));
         let straight_up = alignment(&[(0.0, 1.5), (0.5, 1.5)]);
-        assert!(matches!(layout(&straight_up, Projection::Cylindrical, 1.0, MANY), Err(LayoutError::TooWide { .. })));
-        assert!(layout(&straight_up, Projection::Auto, 1.0, MANY).is_ok());
+        assert!(matches!(
+            layout(&straight_up, Projection::Cylindrical, &Framing::default(), 1.0, MANY),
+            Err(LayoutError::TooWide { .. })
+        ));
+        assert!(layout(&straight_up, Projection::Auto, &Framing::default(), 1.0, MANY).is_ok());
+    }
+
+    /// The set all around, in two rows, that shows everything but what lies more than 60° below or above the horizon.
+    fn all_around() -> Alignment {
+        let row = |pitch: f64| (0..10).map(move |k| (f64::from(k) * TAU / 10.0, pitch));
+        alignment(&row(-0.6).chain(row(0.0)).chain(row(0.6)).collect::<Vec<_>>())
+    }
+
+    #[test]
+    fn surfaces_that_reach_to_infinity_are_cut_and_say_so() {
+        let set = all_around();
+        let lay = |projection| layout(&set, projection, &Framing::default(), 0.2, MANY).unwrap();
+        let stereographic = lay(Projection::Stereographic);
+        // 2 · 100 tan 75° to each side, where the photographs reach.
+        let width = (400.0 * 75_f64.to_radians().tan()) as usize;
+        assert!(stereographic.reaches_beyond && stereographic.width.abs_diff(width) <= 2, "{}", stereographic.width);
+        let panini = lay(Projection::Panini);
+        let width = (400.0 * 60_f64.to_radians().tan()) as usize;
+        assert!(panini.reaches_beyond && panini.width.abs_diff(width) <= 2, "{}", panini.width);
+        let mercator = lay(Projection::Mercator);
+        assert!(mercator.full_circle && !mercator.reaches_beyond);
+        assert_eq!(mercator.width, (TAU * 100.0_f64).round() as usize);
+        // Half of 44° above 0.6 rad.
+        let top = 0.6 + 200_f64.atan2(500.0);
+        assert!(mercator.height.abs_diff((200.0 * top.tan().asinh()) as usize) <= 2, "{}", mercator.height);
+        // Straight up there is a pole, on Mercator's surface at infinity.
+        let up = alignment(&[(0.0, 1.5), (0.5, 1.5)]);
+        let cut = layout(&up, Projection::Mercator, &Framing::default(), 1.0, MANY).unwrap();
+        assert!(cut.reaches_beyond);
+        // It ends at y = ±π, the one or the other.
+        let ends = [-cut.canvas.origin.y, cut.canvas.origin.y + cut.height as f64 - 1.0];
+        assert!(ends.iter().any(|y| (y - 500.0 * PI).abs() < 1.0), "{ends:?}");
+    }
+
+    /// The angle between what two pixels of a canvas show, in degrees.
+    fn angle(canvas: &Canvas, a: (f64, f64), b: (f64, f64)) -> f64 {
+        let ray = |(x, y)| canvas.ray(Point2::new(x, y));
+        ray(a).angle(&ray(b)).to_degrees()
+    }
+
+    #[test]
+    fn a_field_of_view_is_drawn_as_asked_for_and_empty_where_nothing_reaches() {
+        let set = all_around();
+        for (projection, across, up) in [
+            (Projection::Plane, 60.0_f64, 40.0_f64),
+            (Projection::Cylindrical, 120.0, 60.0),
+            (Projection::Spherical, 170.0, 90.0),
+            (Projection::Mercator, 120.0, 100.0),
+            (Projection::Panini, 150.0, 60.0),
+            (Projection::Stereographic, 120.0, 170.0),
+        ] {
+            for center in [[0.0, 0.0], [2.0, 0.3], [-3.1, -0.2]] {
+                let framing = Framing {
+                    center: Some(center),
+                    roll: 0.2,
+                    across: Some(across.to_radians()),
+                    up: Some(up.to_radians()),
+                };
+                let l = layout(&set, projection, &framing, 1.0, MANY).unwrap();
+                let (w, h) = (l.width as f64, l.height as f64);
+                let (x, y) = (0.5 * (w - 1.0), 0.5 * (h - 1.0));
+                // From edge to edge, of which rounding to pixels takes half a pixel of a radian in 500 or less.
+                let got = angle(&l.canvas, (-0.5, y), (w - 0.5, y));
+                assert!((got - across).abs() < 0.12, "{projection:?} {got} {across}");
+                let got = angle(&l.canvas, (x, -0.5), (x, h - 0.5));
+                assert!((got - up).abs() < 0.12, "{projection:?} {got} {up}");
+                // The middle of the picture looks where it was told to.
+                let [yaw, pitch] = center;
+                let want = Vector3::new(pitch.cos() * yaw.sin(), -pitch.sin(), pitch.cos() * yaw.cos());
+                assert!(l.canvas.ray(Point2::new(x, y)).normalize().dot(&want) > 1.0 - 1e-12);
+            }
+        }
+        // 62° of photographs in a picture of 120°.
+        let one = alignment(&[(0.0, 0.0)]);
+        let framing = Framing { across: Some(120_f64.to_radians()), ..Framing::default() };
+        let l = layout(&one, Projection::Cylindrical, &framing, 1.0, MANY).unwrap();
+        assert_eq!(l.width, (500.0 * 120_f64.to_radians()).round() as usize);
+        let b = l.placements[0].bounds;
+        let free = (0.5 * l.width as f64 - 500.0 * 300_f64.atan2(500.0)).abs();
+        // As many pixels more as a sample of the window's edges: of a cylinder up to 75°, 3732 in height, 512 samples.
+        assert!(
+            (b.left as f64 - free).abs() < 12.0 && (b.right as f64 - (l.width as f64 - free)).abs() < 12.0,
+            "{b:?}"
+        );
+    }
+
+    #[test]
+    fn a_field_that_cannot_be_drawn_is_refused_with_its_numbers() {
+        let set = alignment(&[(0.0, 0.0), (0.4, 0.0)]);
+        let go = |projection, framing: Framing| layout(&set, projection, &framing, 1.0, MANY).unwrap_err();
+        let wide = |degrees: f64| Framing { across: Some(degrees.to_radians()), ..Framing::default() };
+        for (projection, degrees, limit) in [
+            (Projection::Plane, 151.0, 150.0),
+            (Projection::Panini, 241.0, 240.0),
+            (Projection::Stereographic, 320.0, 300.0),
+        ] {
+            match go(projection, wide(degrees)) {
+                LayoutError::FieldTooWide { degrees: told, most, .. } => {
+                    assert!((told - degrees).abs() < 1e-9 && (most - limit).abs() < 1e-9);
+                }
+                other => panic!("{other:?}"),
+            }
+            assert!(!matches!(
+                go(projection, Framing { up: Some(6.2), ..Framing::default() }),
+                LayoutError::NothingInView
+            ));
+        }
+        let behind = Framing { center: Some([PI, 0.0]), ..wide(60.0) };
+        assert_eq!(go(Projection::Cylindrical, behind), LayoutError::NothingInView);
+        assert_eq!(go(Projection::Auto, behind), LayoutError::NothingInView);
+        let mut flat = set.clone();
+        flat.motion = CameraMotion::Homography;
+        let error = layout(&flat, Projection::Plane, &wide(60.0), 1.0, MANY).unwrap_err();
+        assert_eq!(error, LayoutError::FlatScene);
     }
 }

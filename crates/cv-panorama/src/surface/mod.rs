@@ -8,10 +8,14 @@ mod crop;
 mod cylindrical;
 mod displacement;
 mod elastic;
+mod framing;
 mod layout;
+mod mercator;
+mod panini;
 mod plane;
 mod preview;
 mod spherical;
+mod stereographic;
 mod warp;
 
 pub use bounds::Bounds;
@@ -20,6 +24,7 @@ pub(crate) use crop::largest_rectangle;
 pub(crate) use displacement::DisplacementField;
 pub use displacement::PhotoMap;
 pub(crate) use elastic::displacements;
+pub use framing::Framing;
 pub use layout::{Canvas, LayoutError};
 pub(crate) use layout::{Layout, Placement, layout};
 pub(crate) use preview::{Piece, Preview, box_shrunk, shrunk_view};
@@ -42,13 +47,27 @@ pub enum Projection {
     Cylindrical,
     /// A sphere, longitude by latitude: any width and height.
     Spherical,
+    /// Mercator's: as a cylinder, with heights stretched so that shapes stay as they are. Drawn up to 85° from the horizon.
+    Mercator,
+    /// Pannini's, a wide view as painters draw it: verticals and lines towards the middle stay straight. Drawn up to 120° to each side.
+    Panini,
+    /// Stereographic: shapes stay as they are, around the middle and far beyond; the "little planet" with the middle straight down. Drawn up to 150° from the middle.
+    Stereographic,
 }
 
-named!(Projection { Auto = "auto", Plane = "plane", Cylindrical = "cylindrical", Spherical = "spherical" });
+named!(Projection {
+    Auto = "auto",
+    Plane = "plane",
+    Cylindrical = "cylindrical",
+    Spherical = "spherical",
+    Mercator = "mercator",
+    Panini = "panini",
+    Stereographic = "stereographic",
+});
 
 /// A surface, in units of its scale: world directions to surface coordinates, the Z axis at (0, 0).
 ///
-/// All factor as `ray = (g·ax, b, g·az)`: `ax` and `az` depend on x alone, `g` and `b` on y alone, so that warping needs no trigonometry per
+/// All factor as `ray = (g·ax, b, g·az + c)`: `ax` and `az` depend on x alone, `g`, `b` and `c` on y alone, so that warping needs no trigonometry per
 /// pixel.
 trait Model: Sync {
     /// Where the direction falls, times the scale; `None` for directions the surface does not hold. Longitude is in (−π, π] times the scale.
@@ -57,8 +76,8 @@ trait Model: Sync {
     /// `ax` and `az` at x.
     fn column(&self, x: f64) -> (f64, f64);
 
-    /// `g` and `b` at y.
-    fn row(&self, y: f64) -> (f64, f64);
+    /// `g`, `b` and `c` at y.
+    fn row(&self, y: f64) -> (f64, f64, f64);
 
     /// Whether x is the longitude, so that the surface closes after 2π.
     fn is_periodic(&self) -> bool;
@@ -66,21 +85,35 @@ trait Model: Sync {
     /// Whether the directions straight up and down lie on it.
     fn holds_poles(&self) -> bool;
 
+    /// The field that is drawn at the most, in radians, across (through the middle) and up: what lies beyond is so far out, and so enlarged, that nobody has a use for it.
+    fn field(&self) -> [f64; 2];
+
+    /// Whether directions that photographs may well show lie at infinity: it is always drawn up to its field only.
+    fn diverges(&self) -> bool;
+
     /// Whether it distorts little enough for views that span `across` horizontally and reach `up` from the horizon, in radians.
     fn suits(&self, across: f64, up: f64) -> bool;
 }
 
-/// Every surface, in the order in which they are preferred.
-const SURFACES: [(Projection, &dyn Model); 3] = [
+/// Every surface, in the order in which they are preferred. Those that suit nothing come last: they are chosen by people only.
+const SURFACES: [(Projection, &dyn Model); 6] = [
     (Projection::Plane, &plane::Plane),
     (Projection::Cylindrical, &cylindrical::Cylindrical),
     (Projection::Spherical, &spherical::Spherical),
+    (Projection::Mercator, &mercator::Mercator),
+    (Projection::Panini, &panini::Panini),
+    (Projection::Stereographic, &stereographic::Stereographic),
 ];
 
 impl Projection {
     /// The surfaces that suit views of this extent, the preferred one first.
     fn suitable(across: f64, up: f64) -> impl Iterator<Item = Self> {
         SURFACES.iter().filter(move |(_, model)| model.suits(across, up)).map(|(projection, _)| *projection)
+    }
+
+    /// The widest field that is drawn, in radians: across and up. That of a plane for [`Projection::Auto`].
+    pub fn widest_field(self) -> [f64; 2] {
+        self.model().field()
     }
 
     /// The surface; a plane for [`Projection::Auto`], which is none.
@@ -106,23 +139,43 @@ impl Surface {
     /// The direction at a point of the surface.
     pub(crate) fn inverse(&self, p: Point2<f64>) -> Vector3<f64> {
         let (ax, az) = self.column(p.x);
-        let (g, b) = self.row(p.y);
-        Vector3::new(g * ax, b, g * az)
+        let (g, b, c) = self.row(p.y);
+        Vector3::new(g * ax, b, g * az + c)
     }
 
-    /// `ax` and `az` of `ray = (g·ax, b, g·az)` at x ...
+    /// `ax` and `az` of `ray = (g·ax, b, g·az + c)` at x ...
     pub(crate) fn column(&self, x: f64) -> (f64, f64) {
         self.projection.model().column(x / self.scale)
     }
 
-    /// ... and `g` and `b` at y.
-    pub(crate) fn row(&self, y: f64) -> (f64, f64) {
+    /// ... and `g`, `b` and `c` at y.
+    pub(crate) fn row(&self, y: f64) -> (f64, f64, f64) {
         self.projection.model().row(y / self.scale)
     }
 
     /// Surface width of a full turn, where there is one.
     pub(crate) fn period(&self) -> Option<f64> {
         self.projection.model().is_periodic().then_some(std::f64::consts::TAU * self.scale)
+    }
+
+    /// Half the width and height, in pixels, of a field of view of these angles, in radians; `None` where it is wider or higher than the surface draws.
+    pub(crate) fn half_size(&self, across: f64, up: f64) -> [Option<f64>; 2] {
+        let most = self.projection.model().field();
+        let half = |angle: f64, most: f64, ray: Vector3<f64>, of: fn(Point2<f64>) -> f64| {
+            // Degrees that people type come with a rounding.
+            let p = self.forward(&ray).filter(|_| angle > 0.0 && angle <= most + 1e-9)?;
+            Some(of(p).abs()).filter(|half| half.is_finite() && *half > 0.0)
+        };
+        let [(sin_x, cos_x), (sin_y, cos_y)] = [across, up].map(|angle| (0.5 * angle).sin_cos());
+        [
+            half(across, most[0], Vector3::new(sin_x, 0.0, cos_x), |p| p.x),
+            half(up, most[1], Vector3::new(0.0, sin_y, cos_y), |p| p.y),
+        ]
+    }
+
+    /// Whether it is always drawn up to its widest field only.
+    pub(crate) fn diverges(&self) -> bool {
+        self.projection.model().diverges()
     }
 
     /// Whether the directions straight up and down lie on the surface.
@@ -149,7 +202,8 @@ mod tests {
                     // A few f64 operations on numbers up to 1e6 (the plane, near its horizon).
                     prop_assert!((back - ray.normalize()).norm() < 1e-9, "{projection:?} {p} {back}");
                 } else {
-                    prop_assert!(projection == Projection::Plane && z < 1e-5);
+                    let straight_back = x.abs() < 1e-3 && z < 0.0;
+                    prop_assert!(projection == Projection::Plane && z < 1e-5 || straight_back, "{projection:?}");
                 }
             }
         }
@@ -169,8 +223,15 @@ mod tests {
     fn what_the_surfaces_say_of_themselves_is_what_their_formulas_do() {
         for (projection, model) in SURFACES {
             let surface = Surface { projection, scale: 100.0 };
-            // Behind the camera there is only what goes around.
-            assert_eq!(surface.forward(&Vector3::new(0.0, 0.1, -1.0)).is_some(), surface.period().is_some());
+            // Behind the camera there is only what goes around, and the stereographic plane, which goes everywhere.
+            let behind = surface.period().is_some() || projection == Projection::Stereographic;
+            assert_eq!(surface.forward(&Vector3::new(0.0, 0.1, -1.0)).is_some(), behind);
+            // What is drawn at the most ends where the formulas have numbers, and beyond it nothing is said to be drawn.
+            let [across, up] = projection.widest_field();
+            assert!(surface.half_size(across, up).iter().all(Option::is_some), "{projection:?}");
+            for beyond in [1.01, 3.0, f64::NAN, f64::INFINITY, -0.1, 0.0] {
+                assert_eq!(surface.half_size(across * beyond, up * beyond), [None, None], "{projection:?} {beyond}");
+            }
             let near_pole = surface.forward(&Vector3::new(0.0, 1.0, 1e-9));
             assert_eq!(near_pole.is_some(), surface.holds_poles(), "{projection:?}");
             if let Some(period) = surface.period() {

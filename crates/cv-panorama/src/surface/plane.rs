@@ -15,8 +15,8 @@ impl Model for Plane {
         (x, 1.0)
     }
 
-    fn row(&self, y: f64) -> (f64, f64) {
-        (1.0, y)
+    fn row(&self, y: f64) -> (f64, f64, f64) {
+        (1.0, y, 0.0)
     }
 
     fn is_periodic(&self) -> bool {
@@ -24,6 +24,15 @@ impl Model for Plane {
     }
 
     fn holds_poles(&self) -> bool {
+        false
+    }
+
+    /// 75° to each side, where it stretches lengths by 1/cos² = 15.
+    fn field(&self) -> [f64; 2] {
+        [150_f64.to_radians(); 2]
+    }
+
+    fn diverges(&self) -> bool {
         false
     }
 

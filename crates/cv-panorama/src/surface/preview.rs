@@ -212,6 +212,7 @@ mod tests {
             width: 64,
             height: 48,
             full_circle: false,
+            reaches_beyond: false,
             placements: vec![placement],
             canvas: Canvas {
                 projection: Projection::Plane,

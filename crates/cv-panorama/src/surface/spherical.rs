@@ -2,6 +2,7 @@
 
 use super::Model;
 use cv_core::{Point2, Vector3};
+use std::f64::consts::{PI, TAU};
 
 pub(super) struct Spherical;
 
@@ -15,9 +16,9 @@ impl Model for Spherical {
         x.sin_cos()
     }
 
-    fn row(&self, y: f64) -> (f64, f64) {
+    fn row(&self, y: f64) -> (f64, f64, f64) {
         let (sin, cos) = y.sin_cos();
-        (cos, sin)
+        (cos, sin, 0.0)
     }
 
     fn is_periodic(&self) -> bool {
@@ -26,6 +27,14 @@ impl Model for Spherical {
 
     fn holds_poles(&self) -> bool {
         true
+    }
+
+    fn field(&self) -> [f64; 2] {
+        [TAU, PI]
+    }
+
+    fn diverges(&self) -> bool {
+        false
     }
 
     fn suits(&self, _: f64, _: f64) -> bool {

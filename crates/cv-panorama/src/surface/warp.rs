@@ -1,6 +1,6 @@
 //! Drawing a photograph onto the canvas.
 //!
-//! All surfaces factor as `ray = (g(y)·ax(x), b(y), g(y)·az(x))` (see `Model`), so a canvas pixel's place in the photograph
+//! All surfaces factor as `ray = (g(y)·ax(x), b(y), g(y)·az(x) + c(y))` (see `Model`), so a canvas pixel's place in the photograph
 //! costs three multiply-adds per coordinate and one division.
 
 use crate::align::View;
@@ -98,8 +98,9 @@ pub(crate) fn warp(
 pub(crate) struct Map {
     /// Per column, the part of `M · ray` that depends on x.
     columns: Vec<[f32; 3]>,
-    /// The middle column of M, times b(y) the part that depends on y.
+    /// The middle and the last column of M, times b(y) and c(y) the part that depends on y alone.
     middle: [f64; 3],
+    last: [f64; 3],
     surface: Surface,
     /// Surface y of the first row.
     top: f64,
@@ -149,15 +150,16 @@ impl Map {
             })
             .collect();
         let middle = std::array::from_fn(|r| m[(r, 1)]);
-        Self { columns, middle, surface: *surface, top: bounds.top as f64 + placement.origin.y, lens }
+        let last = std::array::from_fn(|r| m[(r, 2)]);
+        Self { columns, middle, last, surface: *surface, top: bounds.top as f64 + placement.origin.y, lens }
     }
 
     /// Photograph coordinates of row `y` of the bounds. What lies behind the camera comes out far outside the photograph.
     #[inline(always)]
     pub(crate) fn row(&self, y: usize, us: &mut [f32], vs: &mut [f32]) {
-        let (g, b) = self.surface.row(self.top + y as f64);
+        let (g, b, c) = self.surface.row(self.top + y as f64);
         let g = g as f32;
-        let b: [f32; 3] = std::array::from_fn(|r| (self.middle[r] * b) as f32);
+        let b: [f32; 3] = std::array::from_fn(|r| (self.middle[r] * b + self.last[r] * c) as f32);
         for ((c, u), v) in self.columns.iter().zip(us.iter_mut()).zip(vs.iter_mut()) {
             // At and behind the camera's plane: far out in the direction in which the ray leaves.
             let z = (g * c[2] + b[2]).max(1e-9);
