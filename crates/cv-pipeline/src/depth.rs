@@ -41,7 +41,7 @@ pub struct DepthOptions {
     pub range: (f32, f32),
     /// What becomes of a pair of which hardly anything is matched. Default [`FewMatches::Check`].
     pub few_matches: FewMatches,
-    /// Whether rows that features show to lie up to 8 px apart are aligned first; of a film, by its first frame of which few pixels match. Default true.
+    /// Whether rows that lie a third of a pixel to 8 px apart, by the pair's matches or features, are aligned; of a film, by the first frame that tells. Default true.
     pub align: bool,
 }
 
@@ -89,7 +89,7 @@ pub struct DepthResult {
     pub geometry: Option<StereoGeometry>,
     /// Where fewer pixels were matched than nearly all rectified pairs show: what features say of them. `None` where there were enough.
     pub few: Option<FeatureAgreement>,
-    /// How far apart the rows of the pair were, which were aligned; `None` where they were not, or only by fractions of a pixel.
+    /// How far apart the rows of the pair were, which were aligned; `None` where they were not, and where they were less than a third of a pixel apart.
     pub vertical_offset: Option<VerticalOffset>,
     /// Stage names and their seconds. `match` is the matcher from the gray images to checked disparities; `prepare` is
     /// the memory it asks for beforehand.

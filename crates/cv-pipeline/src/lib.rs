@@ -46,6 +46,7 @@ mod rectify;
 mod rig_depth;
 mod segment;
 mod sfm;
+mod vertical_matches;
 mod vertical_offset;
 
 pub use advice::Advice;

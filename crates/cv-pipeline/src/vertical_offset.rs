@@ -3,22 +3,28 @@
 
 use crate::depth::color_bytes;
 use crate::disparity_range::matches_of;
+use crate::vertical_matches::vertical_matches;
 use crate::{DepthError, Progress, RangeError};
 use cv_core::{Correspondence, Image, ImageView, Matrix3, Point2, Vector3};
 use cv_imgproc::{Pixel, WarpMap};
 use cv_stereo::{DisparityMap, DisparityMatcher, Intensity, RectifyError};
 
-/// Features are asked where fewer pixels than this are matched and confirmed: a pixel of offset takes a third to a half of the matches of
-/// aligned pairs, of which 63 to 99 % are matched.
+/// Where the blocks of matched pixels leave the offset open, and fewer pixels than this are matched and confirmed, features are asked: a pixel of offset takes a
+/// third to a half of the matches of aligned pairs, of which 63 to 99 % are matched.
 const FEW: f64 = 0.6;
-/// Offsets in px that are corrected: less is no harm, and more is no rectified pair.
-const LEAST: f64 = 0.5;
+/// Offsets in px that are corrected: less costs little more than moving the rows does, and more is no rectified pair. (A quarter of a pixel between the rows
+/// already doubles the disparities that are wrong by half a pixel; the rows are moved by linear interpolation, which blurs.)
+const LEAST: f64 = 1.0 / 3.0;
 const MOST: f64 = 8.0;
 /// Features that lie farther apart than this in y are matched wrongly: `MOST` and half of it again.
 const REACH: f64 = 12.0;
-/// Matches that must agree with the offset to a pixel, and their share of those within `REACH`.
+/// Of larger offsets in px blocks see only where they are least: elsewhere nothing is matched, or they end at their reach.
+const SEEN_BY_BLOCKS: f64 = 1.5;
+/// Matches that must agree with the offset to a pixel, and their share of those within `REACH`: of features, and of blocks, which are looked for within 3 px
+/// only, so that a third would agree by chance.
 const NEEDED: usize = 32;
-const SHARE: f64 = 0.5;
+const FEATURES_AGREE: f64 = 0.5;
+const BLOCKS_AGREE: f64 = 0.75;
 
 /// How far below its row in the left photograph a point lies in the right one, in px: an affine function of its place in the right one.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -44,9 +50,14 @@ impl VerticalOffset {
         self.at_center.abs() + 0.5 * (self.across.abs() + self.down.abs())
     }
 
-    /// What matches of two photographs of this size show; `None` where too few agree, and where the rows are aligned or far from it.
+    /// Whether the rows are apart, and not so far that this is no rectified pair.
+    fn is_to_correct(&self) -> bool {
+        (LEAST..=MOST).contains(&self.largest())
+    }
+
+    /// What matches of two photographs of this size show; `None` where fewer than the share `agreeing` agree.
     /// Least squares over the matches near the last estimate, from the most frequent offset on. O(n log n).
-    pub(crate) fn from_matches(matches: &[Correspondence], size: (usize, usize)) -> Option<Self> {
+    fn from_matches(matches: &[Correspondence], agreeing: f64, size: (usize, usize)) -> Option<Self> {
         let apart = |m: &Correspondence| m.b.y - m.a.y;
         let near: Vec<&Correspondence> = matches.iter().filter(|m| apart(m).abs() <= REACH).collect();
         let mut sorted: Vec<f64> = near.iter().map(|m| apart(m)).collect();
@@ -69,8 +80,7 @@ impl VerticalOffset {
         }
         let agree = near.iter().filter(|m| off(&model, m).abs() <= 1.0).count();
         let found = Self { at_center: model.x, across: model.y, down: model.z, size };
-        let known = agree >= NEEDED && agree as f64 >= SHARE * near.len() as f64;
-        (known && (LEAST..=MOST).contains(&found.largest())).then_some(found)
+        (agree >= NEEDED && agree as f64 >= agreeing * near.len() as f64).then_some(found)
     }
 
     /// Matches as if the right photograph had been corrected.
@@ -102,12 +112,22 @@ impl Alignment {
         Self { asked: true, ..Self::default() }
     }
 
-    /// Takes what matches say, once.
+    /// Takes what features say, once.
     pub(crate) fn learn(&mut self, matches: &[Correspondence], size: (usize, usize)) -> Result<(), DepthError> {
         if std::mem::replace(&mut self.asked, true) {
             return Ok(());
         }
-        let Some(offset) = VerticalOffset::from_matches(matches, size) else { return Ok(()) };
+        let found = VerticalOffset::from_matches(matches, FEATURES_AGREE, size);
+        found.map_or(Ok(()), |offset| self.take(offset))
+    }
+
+    /// Takes an offset, and makes the map of it where the rows are apart.
+    fn take(&mut self, offset: VerticalOffset) -> Result<(), DepthError> {
+        self.asked = true;
+        if !offset.is_to_correct() {
+            return Ok(());
+        }
+        let size = offset.size;
         let last = (size.1 - 1) as f64;
         let map = WarpMap::new(size, size, |x, y| {
             // The offset is known by the place in the right photograph, which is sought: it changes by hundredths of a pixel in one.
@@ -132,8 +152,8 @@ impl Alignment {
         corrected.map_err(|_| DepthError::Rectify(RectifyError::TooLarge { width, height }))
     }
 
-    /// Disparities of a pair into `map`, its rows aligned first where they are known not to be, or where few pixels match and features show
-    /// that they are not. The right photograph that was matched, where it was corrected.
+    /// Disparities of a pair into `map`, its rows aligned first where they are known not to be, or where its matches show that they are not. The right
+    /// photograph that was matched, where it was corrected.
     pub(crate) fn compute<T: Intensity + Pixel, const C: usize>(
         &mut self,
         matcher: &mut dyn DisparityMatcher<T, C>,
@@ -143,14 +163,20 @@ impl Alignment {
     ) -> Result<Option<Image<T, C>>, DepthError> {
         let corrected = self.corrected(right)?;
         matcher.compute_into(left, corrected.as_ref().map_or(right, Image::view), map, progress)?;
-        if self.asked || map.matched_fraction() >= FEW {
+        if self.asked {
             return Ok(corrected);
         }
-        let [a, b] = [left, right].map(color_bytes);
-        match matches_of(a.view(), b.view(), progress) {
-            Ok(matches) => self.learn(&matches, left.size())?,
-            Err(RangeError::Cancelled(stop)) => return Err(stop.into()),
-            Err(_) => self.asked = true,
+        let blocks = vertical_matches(left, right, map);
+        let seen = VerticalOffset::from_matches(&blocks, BLOCKS_AGREE, left.size());
+        if let Some(offset) = seen.filter(|offset| offset.largest() <= SEEN_BY_BLOCKS) {
+            self.take(offset)?;
+        } else if seen.is_some() || map.matched_fraction() < FEW {
+            let [a, b] = [left, right].map(color_bytes);
+            match matches_of(a.view(), b.view(), progress) {
+                Ok(matches) => self.learn(&matches, left.size())?,
+                Err(RangeError::Cancelled(stop)) => return Err(stop.into()),
+                Err(_) => self.asked = true,
+            }
         }
         let Some(corrected) = self.corrected(right)? else { return Ok(None) };
         matcher.compute_into(left, corrected.view(), map, progress)?;
@@ -179,7 +205,8 @@ mod tests {
     #[test]
     fn an_affine_offset_is_found_among_wrong_matches() {
         let truth = |x: f64, y: f64| 2.0 + 0.005 * (x - 299.5) - 0.004 * (y - 199.5);
-        let found = VerticalOffset::from_matches(&matches(truth), SIZE).unwrap();
+        let found = VerticalOffset::from_matches(&matches(truth), FEATURES_AGREE, SIZE).unwrap();
+        assert!(found.is_to_correct());
         for (x, y) in [(0.0, 0.0), (599.0, 0.0), (0.0, 399.0), (599.0, 399.0), (299.5, 199.5)] {
             // A tenth of a pixel: what wrong matches that happen to be near move it by.
             assert!((found.at(x, y) - truth(x, y)).abs() < 0.1, "{x} {y}: {found:?}");
@@ -192,11 +219,13 @@ mod tests {
 
     #[test]
     fn rows_that_are_aligned_or_far_apart_stay() {
-        assert_eq!(VerticalOffset::from_matches(&matches(|_, _| 0.2), SIZE), None);
-        assert_eq!(VerticalOffset::from_matches(&matches(|_, _| 9.5), SIZE), None);
-        assert_eq!(VerticalOffset::from_matches(&[], SIZE), None);
+        for apart in [0.2, 9.5] {
+            let found = VerticalOffset::from_matches(&matches(|_, _| apart), FEATURES_AGREE, SIZE).unwrap();
+            assert!((found.largest() - apart).abs() < 0.1 && !found.is_to_correct());
+        }
+        assert_eq!(VerticalOffset::from_matches(&[], FEATURES_AGREE, SIZE), None);
         // Anywhere: no offset has half of them.
         let chance = matches(|x, y| (x * 7.0 + y * 13.0) % 20.0 - 10.0);
-        assert_eq!(VerticalOffset::from_matches(&chance, SIZE), None);
+        assert_eq!(VerticalOffset::from_matches(&chance, FEATURES_AGREE, SIZE), None);
     }
 }

@@ -5,7 +5,9 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
-use cv_core::{Camera, Pose, Silent};
+use cv_core::{Camera, Point2, Pose, RgbU8, Silent};
+use cv_imgproc::WarpMap;
+use cv_pipeline::{DepthOptions, depth};
 use cv_stereo::{DisparityMap, PixelState, StereoError, StereoMatcher, StereoOptions};
 use cv_synth::{RenderOptions, Scene, SceneBuilder, StereoPair, Texture, srgb, stereo_pair};
 use nalgebra::Point3;
@@ -153,6 +155,40 @@ fn the_quality_mode_leaves_fewer_errors_and_marks_what_it_moved() {
     }
     // 17 % fewer were measured; scenes differ by some percent.
     assert!(f64::from(wrong[1]) < 0.9 * f64::from(wrong[0]), "{wrong:?}");
+}
+
+#[test]
+fn rows_a_fraction_of_a_pixel_apart_are_found_in_the_matches() {
+    for Seen { name, pair, .. } in SCENES.iter().take(2) {
+        // As where a camera is turned about its axis, and nearer than the other: less than a pixel at every corner.
+        let truth = |x: f64, y: f64| 0.2 + 0.6 * (x / 640.0 - 0.5) - 0.7 * (y / 480.0 - 0.5);
+        let map = WarpMap::new((640, 480), (640, 480), |x, y| {
+            let (x, y) = (x as f64, y as f64);
+            Some(Point2::new(x, (y - truth(x, y)).clamp(0.0, 479.0)))
+        });
+        let apart = map.unwrap().compute(pair.right.image.view()).unwrap();
+        let stereo = StereoOptions { disparities: 96, ..StereoOptions::default() };
+        let found = |right: &RgbU8, align| {
+            let options = DepthOptions { stereo: stereo.clone(), align, ..DepthOptions::default() };
+            depth(pair.left.image.view(), right.view(), None, &options, &Silent).unwrap()
+        };
+        assert_eq!(found(&pair.right.image, true).vertical_offset, None, "{name}");
+        let [left_alone, aligned] = [false, true].map(|align| found(&apart, align));
+        // As many pixels are matched as makes features needless.
+        assert!(left_alone.map.matched_fraction() > 0.6, "{name}");
+        let offset = aligned.vertical_offset.unwrap();
+        for (x, y) in [(0.0, 0.0), (639.0, 0.0), (0.0, 479.0), (639.0, 479.0)] {
+            // A tenth of a pixel: some hundred matches of a quarter of a pixel, and the blocks' own bias toward whole rows.
+            assert!((offset.at(x, y) - truth(x, y)).abs() < 0.1, "{name}: {offset:?}");
+        }
+        let good = |map: &DisparityMap| {
+            let all = map.disparity.as_slice().iter().zip(pair.disparity.as_slice()).zip(pair.visible.as_slice());
+            all.filter(|((d, truth), seen)| **seen && (**d - **truth).abs() <= 0.5).count()
+        };
+        let counts = [&left_alone.map, &aligned.map].map(good);
+        println!("{name}: {counts:?} pixels within half a pixel, not aligned and aligned; {offset:?}");
+        assert!(counts[1] > counts[0], "{name}");
+    }
 }
 
 #[test]

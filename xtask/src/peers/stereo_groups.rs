@@ -5,7 +5,8 @@ use crate::checks::Check;
 use crate::real::depth::{SCENES, truth};
 use anyhow::{Context, Result, ensure};
 use cv_core::{GrayF32, Mask, RgbU8, Silent};
-use cv_pipeline::stereo::{PixelState, StereoMatcher, StereoOptions};
+use cv_pipeline::stereo::{PixelState, StereoOptions};
+use cv_pipeline::{DepthOptions, depth};
 use serde::Deserialize;
 use std::{collections::BTreeMap, fmt::Write as _, fs, path::Path, process::Command};
 
@@ -172,11 +173,12 @@ fn pairs(data: &Path) -> Result<Vec<Pair>> {
     Ok(pairs)
 }
 
-/// Ours with default options but for the range.
+/// Ours as `cv depth` has it, with default options but for the range: rows aligned.
 fn score(pair: &Pair) -> Result<Ours> {
     let About { disparities, min, .. } = pair.about;
-    let options = StereoOptions { disparities, min_disparity: min, ..Default::default() };
-    let map = StereoMatcher::new(options)?.compute(pair.photos[0].view(), pair.photos[1].view(), &Silent)?;
+    let stereo = StereoOptions { disparities, min_disparity: min, ..Default::default() };
+    let options = DepthOptions { stereo, ..Default::default() };
+    let map = depth(pair.photos[0].view(), pair.photos[1].view(), None, &options, &Silent)?.map;
     let [mut half, mut seen, mut all, mut outliers, mut matched, mut occluded, mut outside] = [Share::default(); 7];
     for y in 0..pair.truth.height() {
         for x in 0..pair.truth.width() {
