@@ -199,6 +199,12 @@ impl GridCut {
             }
             self.settle(node);
         }
+        for node in 0..self.nodes.len() - 1 {
+            if node % (1 << 20) == 0 {
+                stage.check()?;
+            }
+            self.push(node);
+        }
         for node in 0..self.nodes.len() {
             if node % (1 << 20) == 0 {
                 stage.check()?;
@@ -253,6 +259,21 @@ impl GridCut {
                     other.capacity[direction ^ 1] = 0;
                 }
                 (self.nodes[node].capacity, self.nodes[node].is_settled) = ([0; 4], true);
+            }
+        }
+    }
+
+    /// Sends flow along the paths of one edge, from the source to the node, a neighbor and the sink: no trees are needed for these.
+    fn push(&mut self, node: usize) {
+        for direction in 0..4 {
+            let Node { terminal, capacity, .. } = self.nodes[node];
+            let other = self.neighbor(node, direction);
+            let flow = terminal.min(capacity[direction]).min(-self.nodes[other].terminal);
+            if flow > 0 {
+                self.nodes[node].terminal -= flow;
+                self.nodes[node].capacity[direction] -= flow;
+                self.nodes[other].terminal += flow;
+                self.nodes[other].capacity[direction ^ 1] += flow;
             }
         }
     }

@@ -237,15 +237,36 @@ pub(crate) fn color_bytes<T: Intensity, const C: usize>(photo: ImageView<'_, T, 
     })
 }
 
-/// The matcher's options, with the disparities that the pair shows where they are asked for.
-pub(crate) fn matcher_options<T: Intensity, const C: usize>(
+/// The matcher's options, with the disparities that the pair shows where they are asked for. In quality mode the rows are looked at here: a second run would
+/// take seconds.
+pub(crate) fn matcher_options<T: Intensity + Pixel, const C: usize>(
     left: ImageView<'_, T, C>,
     right: ImageView<'_, T, C>,
     options: &DepthOptions,
     alignment: &mut Alignment,
     progress: &dyn Progress,
 ) -> Result<StereoOptions, DepthError> {
-    let DisparityRange::FromMatches { min } = options.disparities else { return Ok(options.stereo.clone()) };
+    let stereo = match options.disparities {
+        DisparityRange::Given => options.stereo.clone(),
+        DisparityRange::FromMatches { min } => {
+            let (min_disparity, disparities) = range_of([left, right], min, alignment, progress)?;
+            StereoOptions { min_disparity, disparities, ..options.stereo.clone() }
+        }
+    };
+    if stereo.quality {
+        let mut plain = StereoMatcher::new(StereoOptions { quality: false, ..stereo.clone() })?;
+        alignment.compute(&mut plain, [left, right], &mut DisparityMap::empty(), progress)?;
+    }
+    Ok(stereo)
+}
+
+/// Smallest disparity, `min` where that is given, and how many there are, by the features of a pair.
+fn range_of<T: Intensity, const C: usize>(
+    [left, right]: [ImageView<'_, T, C>; 2],
+    min: Option<i32>,
+    alignment: &mut Alignment,
+    progress: &dyn Progress,
+) -> Result<(i32, usize), DepthError> {
     let mut matches = matches_of(color_bytes(left).view(), color_bytes(right).view(), progress)?;
     if left.size() == right.size() {
         alignment.learn(&matches, left.size())?;
@@ -259,8 +280,7 @@ pub(crate) fn matcher_options<T: Intensity, const C: usize>(
         return Err(RangeError::Exchanged { range }.into());
     }
     let min_disparity = min.unwrap_or(first);
-    let disparities = (i64::from(first) + count as i64 - i64::from(min_disparity)).max(1) as usize;
-    Ok(StereoOptions { min_disparity, disparities, ..options.stereo.clone() })
+    Ok((min_disparity, (i64::from(first) + count as i64 - i64::from(min_disparity)).max(1) as usize))
 }
 
 /// Disparity of a rectified pair, and depth where its geometry is known.

@@ -163,7 +163,7 @@ impl FrameDepth {
 }
 
 /// The matcher; made where there is none yet, for the disparities that this pair shows.
-fn matcher<'m, T: Intensity, const C: usize>(
+fn matcher<'m, T: Intensity + Pixel, const C: usize>(
     matcher: &'m mut Option<StereoMatcher>,
     options: &DepthOptions,
     alignment: &mut Alignment,

@@ -100,8 +100,8 @@ fn terms(p: Point2<f64>, (width, height): (usize, usize)) -> Vector3<f64> {
 /// What is known of the rows of a pair, or of all pairs of a film.
 #[derive(Debug, Default)]
 pub(crate) struct Alignment {
-    /// Features have been asked.
-    asked: bool,
+    /// There is no more to ask: the offset is known, or nothing tells it.
+    is_closed: bool,
     pub(crate) offset: Option<VerticalOffset>,
     map: Option<WarpMap>,
 }
@@ -109,21 +109,19 @@ pub(crate) struct Alignment {
 impl Alignment {
     /// One that never corrects anything.
     pub(crate) fn off() -> Self {
-        Self { asked: true, ..Self::default() }
+        Self { is_closed: true, ..Self::default() }
     }
 
-    /// Takes what features say, once.
+    /// Takes what features say, where that is more than blocks will tell better: features lie a few tenths of a pixel off.
     pub(crate) fn learn(&mut self, matches: &[Correspondence], size: (usize, usize)) -> Result<(), DepthError> {
-        if std::mem::replace(&mut self.asked, true) {
-            return Ok(());
-        }
         let found = VerticalOffset::from_matches(matches, FEATURES_AGREE, size);
-        found.map_or(Ok(()), |offset| self.take(offset))
+        let larger = found.filter(|offset| !self.is_closed && offset.largest() > SEEN_BY_BLOCKS);
+        larger.map_or(Ok(()), |offset| self.take(offset))
     }
 
     /// Takes an offset, and makes the map of it where the rows are apart.
     fn take(&mut self, offset: VerticalOffset) -> Result<(), DepthError> {
-        self.asked = true;
+        self.is_closed = true;
         if !offset.is_to_correct() {
             return Ok(());
         }
@@ -163,7 +161,7 @@ impl Alignment {
     ) -> Result<Option<Image<T, C>>, DepthError> {
         let corrected = self.corrected(right)?;
         matcher.compute_into(left, corrected.as_ref().map_or(right, Image::view), map, progress)?;
-        if self.asked {
+        if self.is_closed {
             return Ok(corrected);
         }
         let blocks = vertical_matches(left, right, map);
@@ -171,11 +169,16 @@ impl Alignment {
         if let Some(offset) = seen.filter(|offset| offset.largest() <= SEEN_BY_BLOCKS) {
             self.take(offset)?;
         } else if seen.is_some() || map.matched_fraction() < FEW {
+            // Once: in a film they would cost more than all else.
+            self.is_closed = true;
             let [a, b] = [left, right].map(color_bytes);
-            match matches_of(a.view(), b.view(), progress) {
-                Ok(matches) => self.learn(&matches, left.size())?,
+            let matches = match matches_of(a.view(), b.view(), progress) {
+                Ok(matches) => matches,
                 Err(RangeError::Cancelled(stop)) => return Err(stop.into()),
-                Err(_) => self.asked = true,
+                Err(_) => return Ok(corrected),
+            };
+            if let Some(offset) = VerticalOffset::from_matches(&matches, FEATURES_AGREE, left.size()) {
+                self.take(offset)?;
             }
         }
         let Some(corrected) = self.corrected(right)? else { return Ok(None) };
