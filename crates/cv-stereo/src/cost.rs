@@ -149,7 +149,10 @@ fn costs<S: Simd, const BITS: usize, const BLOCKS: usize>(
         borders::<S, BLOCKS>(simd, frame, frame.inside(x), out);
     }
     if frame.disparities < groups * group {
-        middle.chunks_exact_mut(groups * group).for_each(|out| pad::<S, BLOCKS>(simd, frame.disparities, out));
+        // A loop: within `for_each` the instructions would be called one by one, since it is not compiled for the instruction set.
+        for out in middle.chunks_exact_mut(groups * group) {
+            pad::<S, BLOCKS>(simd, frame.disparities, out);
+        }
     }
 }
 
