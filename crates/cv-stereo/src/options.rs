@@ -185,7 +185,7 @@ pub struct StereoOptions {
     /// Whether rejected pixels get a disparity from their surroundings (background side where occluded, the plane of
     /// what is around a large hole where that lies on one). They are told apart by [`crate::PixelState`]. Default true.
     pub fill: bool,
-    /// Quality mode: the map is improved by local expansion moves over slanted planes (Taniai et al., PAMI 2018), which takes about eighty times as long (20 to 30 µs of
+    /// Quality mode: the map is improved by local expansion moves over slanted planes (Taniai et al., PAMI 2018), which takes about fifty times as long (8 to 14 µs of
     /// one core a pixel) and leaves two thirds of the errors above 2 px (Middlebury 2014, quarter size), on roads half. Default false.
     pub quality: bool,
     /// Whether [`crate::StereoMatcher::confidence`] is wanted: finding the second best match takes a tenth of the time.

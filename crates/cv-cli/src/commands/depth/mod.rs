@@ -120,7 +120,7 @@ pub(crate) struct Args {
     /// Leave pixels without a match of their own unknown.
     #[arg(long)]
     no_fill: bool,
-    /// Quality mode: outlines at edges, walls and roads as planes, two thirds of the errors, in about eighty times the time (3 seconds for 0.2 Mpx on two cores).
+    /// Quality mode: outlines at edges, walls and roads as planes, two thirds of the errors, in about fifty times the time (2 seconds for 0.35 Mpx on two cores).
     #[arg(long)]
     quality: bool,
     /// What to add to the number of differing bits: sharper outlines.
