@@ -2,14 +2,15 @@
 
 use crate::align::Alignment;
 use crate::blend::{BlendMode, Blender, Composition, NO_PHOTO};
+use crate::depth::{EightBits, PhotoSample};
 use crate::light::{Exposure, ExposureCorrection, Gains, estimate_gains};
 use crate::rows::for_each_row;
 use crate::seams::{self, Seams, label_bounds};
 use crate::surface::{
     Bounds, Canvas, DisplacementField, Framing, Layout, LayoutError, PhotoMap, Placement, Preview, Projection,
-    WarpSettings, WarpedPhoto, box_shrunk, displacements, largest_rectangle, layout, shrunk_view, warp,
+    WarpSettings, WarpedPhoto, displacements, largest_rectangle, layout, shrunk_view, warp,
 };
-use cv_core::{Cancelled, Image, ImageView, Mask, OptionError, Progress, RgbU8, Stage, StageClock};
+use cv_core::{Cancelled, Image, ImageView, Mask, OptionError, Progress, Sample, Stage, StageClock};
 use cv_imgproc::Interpolation;
 
 /// Options of [`render`].
@@ -97,9 +98,9 @@ pub enum RenderError {
 
 /// A panorama.
 #[derive(Debug, Clone)]
-pub struct Panorama {
-    /// The picture; black where no photograph reaches.
-    pub image: RgbU8,
+pub struct Panorama<T = u8> {
+    /// The picture, as deep as the photographs; black where no photograph reaches.
+    pub image: Image<T, 3>,
     /// True where a photograph reaches.
     pub mask: Mask,
     /// Which photograph each pixel is from; [`NO_PHOTO`] where none reaches.
@@ -123,18 +124,18 @@ const PREVIEW_PIXELS: usize = 300_000;
 
 /// Draws the panorama.
 ///
-/// `photos` are those that were aligned, in the same order, in full size; `alignment` may have been made at another size and scaled.
+/// `photos` are those that were aligned, in the same order, in full size, of `u8` or `u16` samples: of these the panorama is. Where seams run, and how light differs, is found on 8 bits of them; `alignment` may have been made at another size and scaled.
 /// Costs O(canvas + pixels of the photographs), with the seams found on a preview of bounded size. Reports as the stages "elastic", "preview",
 /// "exposure", "seams", "warp", "seams" again, "blend" and "crop".
 ///
 /// # Errors
 /// [`RenderError`].
-pub fn render(
-    photos: &[ImageView<'_, u8, 3>],
+pub fn render<T: PhotoSample>(
+    photos: &[ImageView<'_, T, 3>],
     alignment: &Alignment,
     options: &CompositingOptions,
     progress: &dyn Progress,
-) -> Result<Panorama, RenderError> {
+) -> Result<Panorama<T>, RenderError> {
     render_with(photos, alignment, options, options.blend.blender(), progress)
 }
 
@@ -142,24 +143,38 @@ pub fn render(
 ///
 /// # Errors
 /// [`RenderError`].
-pub fn render_with(
-    photos: &[ImageView<'_, u8, 3>],
+pub fn render_with<T: PhotoSample>(
+    photos: &[ImageView<'_, T, 3>],
     alignment: &Alignment,
     options: &CompositingOptions,
-    blender: &dyn Blender,
+    blender: &dyn Blender<T>,
     progress: &dyn Progress,
-) -> Result<Panorama, RenderError> {
+) -> Result<Panorama<T>, RenderError> {
+    T::draw(photos, alignment, options, blender, progress)
+}
+
+/// [`render_with`], compiled where it is called.
+pub(crate) fn draw<T: PhotoSample>(
+    photos: &[ImageView<'_, T, 3>],
+    alignment: &Alignment,
+    options: &CompositingOptions,
+    blender: &dyn Blender<T>,
+    progress: &dyn Progress,
+) -> Result<Panorama<T>, RenderError> {
     let mut clock = StageClock::new();
     check(photos, alignment, options)?;
     let layout = layout(alignment, options.projection, &options.framing, options.resolution, options.max_pixels)?;
     let photo_of: Vec<usize> = layout.placements.iter().map(|p| p.photo).collect();
+    let eight = EightBits::new(photos, "elastic", progress)?;
+    let bytes = eight.views();
     let fields = if options.elastic {
-        displacements(photos, &layout, alignment, progress)?
+        displacements(&bytes, &layout, alignment, progress)?
     } else {
         vec![None; layout.placements.len()]
     };
     clock.lap("elastic");
-    let mut preview = Preview::draw(photos, &layout, &fields, options.resolution, PREVIEW_PIXELS, progress)?;
+    let mut preview = Preview::draw(&bytes, &layout, &fields, options.resolution, PREVIEW_PIXELS, progress)?;
+    drop(eight);
     clock.lap("preview");
     let gains = estimate_gains(&preview, &photo_of, photos.len(), options.exposure, progress)?;
     if options.exposure != Exposure::None {
@@ -180,7 +195,9 @@ pub fn render_with(
         seams::upsample(&coarse, preview.step, (layout.width, layout.height), &warped, &stage)?
     };
     if options.seams == Seams::GraphCut && preview.step > 1 {
-        seams::refine(&mut labels, &warped, preview.step, progress)?;
+        let stage = Stage::new(progress, "seams", 1)?;
+        let bytes = T::drawn_in_8_bits(&warped, &stage)?;
+        seams::refine(&mut labels, &bytes, preview.step, progress)?;
     }
     clock.lap("seams");
     let image = blender.blend(&Composition { photos: &warped, labels: &labels, typical_side }, progress)?;
@@ -219,8 +236,8 @@ pub fn render_with(
 }
 
 /// Whether the photographs are those of the alignment, and the options numbers.
-fn check(
-    photos: &[ImageView<'_, u8, 3>],
+fn check<T: Sample>(
+    photos: &[ImageView<'_, T, 3>],
     alignment: &Alignment,
     options: &CompositingOptions,
 ) -> Result<(), RenderError> {
@@ -254,19 +271,19 @@ fn regions(coarse: &Image<u16, 1>, step: usize, layout: &Layout, levels: usize) 
 }
 
 /// Every placement drawn on its region.
-fn warp_all(
-    photos: &[ImageView<'_, u8, 3>],
+fn warp_all<T: PhotoSample>(
+    photos: &[ImageView<'_, T, 3>],
     layout: &Layout,
     regions: &[Option<Bounds>],
     fields: &[Option<DisplacementField>],
     gains: &Gains,
     options: &CompositingOptions,
     progress: &dyn Progress,
-) -> Result<Vec<Option<WarpedPhoto>>, Cancelled> {
+) -> Result<Vec<Option<WarpedPhoto<T>>>, Cancelled> {
     let stage = Stage::new(progress, "warp", layout.placements.len())?;
     // A photograph drawn smaller is averaged first, or fine texture would alias.
     let shrink = ((1.0 / options.resolution).floor() as usize).max(1);
-    let tone = gains.tone();
+    let tone = gains.tone(T::PARTS);
     let draw = |placement: &Placement, region: Bounds, field: Option<&DisplacementField>| {
         let photo = photos[placement.photo];
         let evened = options.exposure != Exposure::None;
@@ -275,8 +292,8 @@ fn warp_all(
         if shrink == 1 {
             return warp(photo, placement, &layout.surface, region, settings, &stage);
         }
-        let small = box_shrunk(photo, shrink, &stage)?;
-        let placement = Placement { view: shrunk_view(placement, shrink, &small), ..*placement };
+        let small = T::shrunk(photo, shrink, &stage)?;
+        let placement = Placement { view: shrunk_view(placement, shrink, small.size()), ..*placement };
         let field = field.map(|f| f.scaled(1.0, 1.0 / shrink as f64));
         let settings = WarpSettings { displacement: field.as_ref(), ..settings };
         warp(small.view(), &placement, &layout.surface, region, settings, &stage)
@@ -290,7 +307,7 @@ fn warp_all(
 }
 
 /// Cuts a panorama to the largest rectangle without empty pixels.
-fn crop(p: &mut Panorama, stage: &Stage<'_>) -> Result<(), Cancelled> {
+fn crop<T: Sample>(p: &mut Panorama<T>, stage: &Stage<'_>) -> Result<(), Cancelled> {
     let Some(b) = largest_rectangle(p.mask.view(), stage)? else { return Ok(()) };
     let (w, h) = (b.width(), b.height());
     p.full_circle &= w == p.image.width();
@@ -312,8 +329,8 @@ fn crop(p: &mut Panorama, stage: &Stage<'_>) -> Result<(), Cancelled> {
 mod tests {
     use super::*;
     use crate::align::{CameraMotion, View};
-    use crate::testing::{StopAt, photograph, sky};
-    use cv_core::{Camera, Matrix3, Named, Point2, Silent, Vector3};
+    use crate::testing::{StopAt, deep_photograph, photograph, sky};
+    use cv_core::{Camera, Matrix3, Named, Point2, RgbU8, Silent, Vector3};
     use nalgebra::Rotation3;
     use std::f64::consts::TAU;
 
@@ -558,6 +575,66 @@ mod tests {
         assert!(mean(sum, n) >= darkest && white > 100, "{} {darkest} {white}", mean(sum, n));
     }
 
+    /// As a mean over neighbors in a row, how far what is drawn is from lying half-way between its neighbors, in levels of 8 bits: rounding, where the scene is smooth.
+    fn roughness<T: PhotoSample>(panorama: &Panorama<T>) -> f64 {
+        let (w, h) = panorama.image.size();
+        let (mut sum, mut n) = (0.0, 0.0);
+        for (x, y) in (2..h - 2).flat_map(|y| (2..w - 2).map(move |x| (x, y))) {
+            let near = [x - 2, x - 1, x, x + 1, x + 2].map(|x| panorama.labels.at(x, y)[0]);
+            if near.iter().all(|label| *label == near[0] && *label != NO_PHOTO) {
+                let at = |x: usize| f64::from(panorama.image.at(x, y)[1].to_f32() / T::PER_LEVEL);
+                sum += (at(x) - 0.5 * (at(x - 1) + at(x + 1))).abs();
+                n += 1.0;
+            }
+        }
+        sum / n
+    }
+
+    #[test]
+    fn sixteen_bits_are_drawn_without_rounding_to_eight() {
+        let set = Set::three();
+        // Waves of 300 px, of which neighbors differ from a straight line by 80 · 0.02² / 2 levels.
+        let scene = |ray: &Vector3<f64>| [120.0 + 80.0 * (4.0 * ray.normalize().x).sin(); 3];
+        // The middle one with a quarter of the light (IEC 61966-2-1).
+        let darker =
+            |level: f64| 255.0 * (1.055 * (((level / 255.0 + 0.055) / 1.055).powf(2.4) / 4.0).powf(1.0 / 2.4) - 0.055);
+        let views: Vec<View> = set.alignment.views.iter().map(|v| v.unwrap()).collect();
+        let light = |i: usize, ray: &Vector3<f64>| if i == 1 { scene(ray).map(darker) } else { scene(ray) };
+        let deep: Vec<_> = views.iter().enumerate().map(|(i, v)| deep_photograph(v, |ray| light(i, ray))).collect();
+        let bytes: Vec<_> = views.iter().enumerate().map(|(i, v)| photograph(v, |ray| light(i, ray))).collect();
+        let deep: Vec<_> = deep.iter().map(Image::view).collect();
+        let bytes: Vec<_> = bytes.iter().map(RgbU8::view).collect();
+        for &(_, blend) in BlendMode::NAMES {
+            let options = CompositingOptions { blend, elastic: false, ..CompositingOptions::default() };
+            let drawn = render(&deep, &set.alignment, &options, &Silent).unwrap();
+            let rounded = render(&bytes, &set.alignment, &options, &Silent).unwrap();
+            // The gain of four amplifies rounding to bytes, and the blended ones are rounded again.
+            let (fine, coarse) = (roughness(&drawn), roughness(&rounded));
+            assert!(fine < 0.03 && coarse > 0.2, "{blend:?}: {fine} {coarse}");
+            assert_eq!(drawn.gains, rounded.gains);
+        }
+    }
+
+    #[test]
+    fn sixteen_bits_of_the_same_photographs_are_the_same_panorama() {
+        let set = Set::three();
+        let deep: Vec<Image<u16, 3>> = set.photos.iter().map(|p| p.map(|c| c.map(|v| 257 * u16::from(v)))).collect();
+        let views: Vec<_> = deep.iter().map(Image::view).collect();
+        for resolution in [1.0, 0.4] {
+            for &(_, blend) in BlendMode::NAMES {
+                let options = CompositingOptions { blend, crop: true, resolution, ..CompositingOptions::default() };
+                let (eight, sixteen) =
+                    (set.render(&options), render(&views, &set.alignment, &options, &Silent).unwrap());
+                assert_eq!((eight.image.size(), &eight.gains), (sixteen.image.size(), &sixteen.gains));
+                let pixels = eight.image.as_slice().iter().zip(sixteen.image.as_slice());
+                let off = pixels.map(|(a, b)| (f64::from(*a) - f64::from(*b) / 257.0).abs());
+                // Rounding to bytes of what is averaged, drawn and blended, half a level each: more only where a seam runs elsewhere for it.
+                let far = off.filter(|off| *off > 1.5).count();
+                assert!(far * 1000 < eight.image.as_slice().len(), "{blend:?} {resolution}: {far}");
+            }
+        }
+    }
+
     #[test]
     fn the_bytes_are_the_same_at_any_number_of_threads() {
         let set = Set::three();
@@ -570,6 +647,13 @@ mod tests {
             let (one, three) = (with(1), with(3));
             assert!(one.image == three.image && one.labels == three.labels, "{blend:?}");
         }
+        let deep: Vec<Image<u16, 3>> = set.photos.iter().map(|p| p.map(|c| c.map(|v| 250 * u16::from(v)))).collect();
+        let views: Vec<_> = deep.iter().map(Image::view).collect();
+        let with = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| render(&views, &set.alignment, &CompositingOptions::default(), &Silent).unwrap().image)
+        };
+        assert!(with(1) == with(3));
     }
 
     /// Each pixel the complement of its photograph's.

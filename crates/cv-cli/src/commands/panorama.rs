@@ -7,9 +7,11 @@ use crate::frame::{
     Context, Failure, Global, Outcome, Output, PICTURE, Run, Step, expand_images, named, spare_inputs, steps,
 };
 use crate::{rig, words};
-use cv_core::Image;
-use cv_io::Metadata;
-use cv_pipeline::panorama_types::{BlendMode, CameraMotion, Exposure, Framing, Projection, Seams};
+use cv_core::{Image, ImageView};
+use cv_io::{DynImage, Metadata, Pixels, PngPixels};
+use cv_pipeline::panorama_types::{
+    BlendMode, CameraMotion, EightBits, Exposure, Framing, PhotoSample, Projection, Registration, Seams,
+};
 use cv_pipeline::{
     FeatureMethod, FeatureOptions, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama, panorama_with,
 };
@@ -25,6 +27,7 @@ use std::path::{Path, PathBuf};
     cv panorama holiday/ -o pano.jpg --projection spherical --crop\n  \
     cv panorama a.jpg b.jpg c.jpg -o pano.png --blend poisson --report out/\n  \
     cv panorama a.jpg b.jpg c.jpg -o pano.png --alpha\n  \
+    cv panorama raw16/*.tif -o pano.tif\n  \
     cv panorama wide/ -o pano.png --camera cam.yaml\n  \
     cv panorama wall/ -o plan.tif --mode plane\n  \
     cv panorama street/ -o wide.png --projection panini --fov 150,80\n  \
@@ -37,7 +40,7 @@ pub(crate) struct Args {
     /// Photographs in any order, or folders of them. Those that do not belong are left out.
     #[arg(required = true, value_name = "IMAGES")]
     images: Vec<PathBuf>,
-    /// Where to write the panorama: .png or .jpg.
+    /// Where to write the panorama: .png, .tif or .jpg. The first two have 16 bits a channel where a photograph has.
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// What the photographs are of: all around one place (rotation), or something flat from many places, such as a map, a wall or the ground (plane), drawn as a
@@ -71,7 +74,7 @@ pub(crate) struct Args {
     /// Cut the result to the largest rectangle without empty pixels.
     #[arg(long)]
     crop: bool,
-    /// Transparent instead of black where no photograph reaches; for .png.
+    /// Transparent instead of black where no photograph reaches; for .png and .tif.
     #[arg(long)]
     alpha: bool,
     /// Size relative to the photographs.
@@ -163,7 +166,8 @@ impl Run for Args {
             return Err(Failure::usage(format!("--scale {} is not between 0 and 10", self.scale)));
         }
         let ending = self.output.extension().unwrap_or_default();
-        if self.alpha && ["jpg", "jpeg"].iter().any(|jpeg| ending.eq_ignore_ascii_case(jpeg)) {
+        let is_jpeg = ["jpg", "jpeg"].iter().any(|jpeg| ending.eq_ignore_ascii_case(jpeg));
+        if self.alpha && is_jpeg {
             return Err(Failure::usage("--alpha needs a .png or .tif: JPEG has no transparency"));
         }
         let registration = self.registration.as_deref().map(|path| registration::read(path, context)).transpose()?;
@@ -171,41 +175,63 @@ impl Run for Args {
         let results: Vec<PathBuf> = [&self.output].into_iter().chain(&self.save_registration).cloned().collect();
         let inputs: Vec<&Path> = paths.iter().chain(&self.registration).map(PathBuf::as_path).collect();
         spare_inputs(&results, &inputs)?;
-        let pictures = paths
-            .par_iter()
-            .map(|path| {
-                let picture = cv_io::read_image(path)?;
-                let metadata = picture.metadata.clone();
-                Ok((picture.exif.focal.as_ref().map(|focal| focal.pixels), metadata, picture.into_rgb8()))
-            })
-            .collect::<Result<Vec<_>, cv_io::IoError>>()?;
+        let pictures = paths.par_iter().map(cv_io::read_image).collect::<Result<Vec<_>, _>>()?;
+        let known: Vec<_> =
+            pictures.iter().map(|p| (p.exif.focal.as_ref().map(|focal| focal.pixels), p.metadata.clone())).collect();
+        let is_deep = |picture: &DynImage| matches!(picture.pixels, Pixels::Gray16(_) | Pixels::Rgb16(_));
+        if !is_jpeg && pictures.iter().any(is_deep) {
+            let images: Vec<_> = pictures.into_par_iter().map(DynImage::into_rgb16).collect();
+            self.join(&paths, &images, &known, registration.as_ref(), context)
+        } else {
+            let images: Vec<_> = pictures.into_par_iter().map(DynImage::into_rgb8).collect();
+            self.join(&paths, &images, &known, registration.as_ref(), context)
+        }
+    }
+}
+
+impl Args {
+    /// The panorama of photographs of which the focal lengths by EXIF and the metadata are known, in their own depth.
+    fn join<T>(
+        &self,
+        paths: &[PathBuf],
+        images: &[Image<T, 3>],
+        known: &[(Option<f64>, Metadata)],
+        registration: Option<&Registration>,
+        context: &Context,
+    ) -> Result<Outcome, Failure>
+    where
+        T: PhotoSample,
+        for<'a> ImageView<'a, T, 3>: PngPixels,
+        for<'a> ImageView<'a, T, 4>: PngPixels,
+    {
         // Of photographs of one size the camera is read once.
         let mut cameras = BTreeMap::new();
         if let Some(path) = &self.camera {
-            for (.., image) in &pictures {
+            for image in images {
                 if let Entry::Vacant(place) = cameras.entry(image.size()) {
                     place.insert(rig::camera(path, Some(image.size()), context)?);
                 }
             }
         }
-        let photos: Vec<PanoramaPhoto<'_>> = pictures
+        let photos: Vec<PanoramaPhoto<'_, T>> = images
             .iter()
-            .map(|(focal, _, image)| PanoramaPhoto {
+            .zip(known)
+            .map(|(image, (focal, _))| PanoramaPhoto {
                 image: image.view(),
                 focal: *focal,
                 camera: cameras.get(&image.size()).copied(),
             })
             .collect();
         let options = self.options(context);
-        let result = match &registration {
+        let result = match registration {
             Some(registration) => {
                 let photos: Vec<_> = photos.iter().map(|photo| photo.image).collect();
                 panorama_with(registration, &photos, &options.render, context)
             }
             None => panorama(&photos, &options, context),
         };
-        let result = result.map_err(|error| words::no_panorama(error, &paths))?;
-        let files: Vec<&Metadata> = pictures.iter().map(|(_, metadata, _)| metadata).collect();
+        let result = result.map_err(|error| words::no_panorama(error, paths))?;
+        let files: Vec<&Metadata> = known.iter().map(|(_, metadata)| metadata).collect();
         let metadata = metadata(&files, &result);
         context.write(Output::File(&self.output, PICTURE), |path| {
             if self.alpha {
@@ -215,11 +241,11 @@ impl Run for Args {
             }
         })?;
         if let Some(path) = &self.save_registration {
-            registration::write(path, &result, &paths, context)?;
+            registration::write(path, &result, paths, context)?;
         }
         for (path, image) in paths.iter().zip(&result.images) {
             if let Some(reason) = &image.reason {
-                context.warn(format!("{} is not in the panorama: {}", path.display(), words::left_out(reason, &paths)));
+                context.warn(format!("{} is not in the panorama: {}", path.display(), words::left_out(reason, paths)));
             }
         }
         if result.shows_parallax() {
@@ -236,31 +262,31 @@ impl Run for Args {
             ));
         }
         context.report(|| {
-            let photos: Vec<_> = pictures.into_iter().map(|(.., image)| image).collect();
-            report::report(&paths, &photos, &result)
+            let photos: Vec<_> = images.iter().chain([&result.image]).map(Image::view).collect();
+            report::report(paths, &EightBits::new(&photos, "report", context)?.views(), &result)
         })?;
-        Ok(outcome(&paths, &result))
+        Ok(outcome(paths, &result))
     }
 }
 
 /// The metadata of the photograph that all others are aligned to; the color profile only where those used have the same.
-fn metadata(files: &[&Metadata], result: &PanoramaResult) -> Metadata {
+fn metadata<T>(files: &[&Metadata], result: &PanoramaResult<T>) -> Metadata {
     let Some(reference) = files.get(result.alignment.reference) else { return Metadata::default() };
     let mut used = files.iter().zip(&result.images).filter(|(_, image)| image.used);
     let icc = reference.icc.clone().filter(|_| used.all(|(file, _)| file.icc == reference.icc));
     Metadata { exif: reference.exif.clone(), icc }
 }
 
-/// The picture with an opacity of 255 where a photograph reaches and 0 elsewhere.
-fn transparent(result: &PanoramaResult) -> Image<u8, 4> {
+/// The picture, opaque where a photograph reaches and clear elsewhere.
+fn transparent<T: PhotoSample>(result: &PanoramaResult<T>) -> Image<T, 4> {
     let (w, h) = result.image.size();
     Image::from_fn(w, h, |x, y| {
         let [r, g, b] = result.image.at(x, y);
-        [r, g, b, if result.mask.at(x, y)[0] { 255 } else { 0 }]
+        [r, g, b, if result.mask.at(x, y)[0] { T::WHITE } else { T::default() }]
     })
 }
 
-fn outcome(paths: &[PathBuf], result: &PanoramaResult) -> Outcome {
+fn outcome<T: PhotoSample>(paths: &[PathBuf], result: &PanoramaResult<T>) -> Outcome {
     let images: Vec<_> = paths
         .iter()
         .zip(&result.images)
@@ -277,6 +303,7 @@ fn outcome(paths: &[PathBuf], result: &PanoramaResult) -> Outcome {
         .with("reprojection_rms_px", result.reprojection_rms_px)
         .with("projection", result.canvas.projection.to_string())
         .with("mode", result.alignment.motion.to_string())
+        .with("bits", 8 * size_of::<T>())
         .summary(format!(
             "{used} of {} photographs, {w} x {h} pixels, {}, matches agree to {:.2} px (RMS)",
             paths.len(),
