@@ -29,12 +29,16 @@ impl PhotoSample for u16 {
     const WHITE: Self = 65535;
 }
 
-/// What the stages need to know of a [`PhotoSample`].
-pub trait Internals: Pixel {
+/// What photographs are drawn and blended in: a [`PhotoSample`], or linear light in `f32`.
+pub trait Channel: Pixel {
+    /// Opacity where a photograph reaches.
+    const OPAQUE: Self;
     /// Units of a gray level of 8 bits.
     const PER_LEVEL: f32;
     /// Parts of such a level that the curves of light tell apart.
     const PARTS: usize;
+    /// Whether it is light, not levels.
+    const LINEAR: bool = false;
     /// Holds 256 samples.
     type Sum: Sum;
 
@@ -42,6 +46,12 @@ pub trait Internals: Pixel {
 
     /// [`cv_imgproc::bicubic_at`].
     fn bicubic<S: Simd>(simd: S, view: ImageView<'_, Self, 3>, x: usize, y: usize, fx: f32, fy: f32) -> [f32; 3];
+}
+
+/// What the stages need to know of a [`PhotoSample`].
+pub trait Internals: Channel {
+    /// The sample as an index.
+    fn index(self) -> usize;
 
     /// Means of `step × step` pixels, 2 and more.
     fn shrunk(photo: ImageView<'_, Self, 3>, step: usize, stage: &Stage<'_>) -> Result<Image<Self, 3>, Cancelled>;
@@ -70,7 +80,7 @@ pub trait Internals: Pixel {
         Self: PhotoSample;
 }
 
-/// Sums of samples, exact.
+/// Sums of samples, exact where they are integers.
 pub trait Sum: Copy + Default + Send + Sync + From<u8> + Add<Output = Self> + Mul<Output = Self> {
     fn to_f32(self) -> f32;
 }
@@ -82,6 +92,13 @@ impl Sum for u16 {
     }
 }
 
+impl Sum for f32 {
+    #[inline(always)]
+    fn to_f32(self) -> f32 {
+        self
+    }
+}
+
 impl Sum for u32 {
     #[inline(always)]
     fn to_f32(self) -> f32 {
@@ -90,7 +107,8 @@ impl Sum for u32 {
     }
 }
 
-impl Internals for u8 {
+impl Channel for u8 {
+    const OPAQUE: Self = 255;
     const PER_LEVEL: f32 = 1.0;
     const PARTS: usize = 1;
     type Sum = u16;
@@ -103,6 +121,12 @@ impl Internals for u8 {
     #[inline(always)]
     fn bicubic<S: Simd>(simd: S, view: ImageView<'_, Self, 3>, x: usize, y: usize, fx: f32, fy: f32) -> [f32; 3] {
         bicubic_rgb_at(simd, view, x, y, fx, fy)
+    }
+}
+
+impl Internals for u8 {
+    fn index(self) -> usize {
+        usize::from(self)
     }
 
     fn shrunk(photo: ImageView<'_, Self, 3>, step: usize, stage: &Stage<'_>) -> Result<Image<Self, 3>, Cancelled> {
@@ -137,7 +161,8 @@ impl Internals for u8 {
     }
 }
 
-impl Internals for u16 {
+impl Channel for u16 {
+    const OPAQUE: Self = 65535;
     const PER_LEVEL: f32 = 257.0;
     const PARTS: usize = 8;
     type Sum = u32;
@@ -150,6 +175,30 @@ impl Internals for u16 {
     #[inline(always)]
     fn bicubic<S: Simd>(_: S, view: ImageView<'_, Self, 3>, x: usize, y: usize, fx: f32, fy: f32) -> [f32; 3] {
         bicubic_at(view, x, y, fx, fy)
+    }
+}
+
+impl Channel for f32 {
+    const OPAQUE: Self = 1.0;
+    const PER_LEVEL: f32 = 1.0;
+    const PARTS: usize = 1;
+    const LINEAR: bool = true;
+    type Sum = f32;
+
+    #[inline(always)]
+    fn widened(self) -> f32 {
+        self
+    }
+
+    #[inline(always)]
+    fn bicubic<S: Simd>(_: S, view: ImageView<'_, Self, 3>, x: usize, y: usize, fx: f32, fy: f32) -> [f32; 3] {
+        bicubic_at(view, x, y, fx, fy)
+    }
+}
+
+impl Internals for u16 {
+    fn index(self) -> usize {
+        usize::from(self)
     }
 
     fn shrunk(photo: ImageView<'_, Self, 3>, step: usize, stage: &Stage<'_>) -> Result<Image<Self, 3>, Cancelled> {

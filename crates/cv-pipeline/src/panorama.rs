@@ -3,7 +3,7 @@
 use crate::Progress;
 use crate::matching::{MatchingOptions, correspondences, extract_features, match_features, rescale};
 use cv_core::{
-    Camera, Cancelled, Correspondence, DMatch, Image, ImageView, Mask, Scaling, Stage, StageClock, UnionFind,
+    Camera, Cancelled, Correspondence, DMatch, Image, ImageView, Mask, RgbF32, Scaling, Stage, StageClock, UnionFind,
 };
 use cv_features::{FeatureError, FeatureOptions, Features, MatchError, SiftOptions};
 use cv_panorama::{
@@ -150,6 +150,8 @@ pub struct PanoramaPair {
 pub struct PanoramaResult<T = u8> {
     /// The picture, as deep as the photographs; black where no photograph reaches.
     pub image: Image<T, 3>,
+    /// The light of the scene, linear, where [`CompositingOptions::radiance`] asks for it; 1 is the white of the photograph that all others are aligned to.
+    pub radiance: Option<RgbF32>,
     /// True where a photograph reaches.
     pub mask: Mask,
     /// Which photograph each pixel is from; `u16::MAX` where none reaches.
@@ -383,6 +385,7 @@ fn draw<T: PhotoSample>(
     }
     Ok(PanoramaResult {
         image: drawn.image,
+        radiance: drawn.radiance,
         mask: drawn.mask,
         labels: drawn.labels,
         images,

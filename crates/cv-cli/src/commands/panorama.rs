@@ -3,9 +3,7 @@
 mod registration;
 mod report;
 
-use crate::frame::{
-    Context, Failure, Global, Outcome, Output, PICTURE, Run, Step, expand_images, named, spare_inputs, steps,
-};
+use crate::frame::{Context, Failure, Global, Outcome, Output, Run, Step, expand_images, named, spare_inputs, steps};
 use crate::{rig, words};
 use cv_core::{Image, ImageView};
 use cv_io::{DynImage, Metadata, Pixels, PngPixels};
@@ -20,6 +18,9 @@ use serde_json::json;
 use std::collections::btree_map::{BTreeMap, Entry};
 use std::path::{Path, PathBuf};
 
+/// What a panorama may be written as.
+const ENDINGS: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff", "exr"];
+
 /// Join overlapping photographs to one picture.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
@@ -28,6 +29,7 @@ use std::path::{Path, PathBuf};
     cv panorama a.jpg b.jpg c.jpg -o pano.png --blend poisson --report out/\n  \
     cv panorama a.jpg b.jpg c.jpg -o pano.png --alpha\n  \
     cv panorama raw16/*.tif -o pano.tif\n  \
+    cv panorama window/*.jpg -o light.exr\n  \
     cv panorama wide/ -o pano.png --camera cam.yaml\n  \
     cv panorama wall/ -o plan.tif --mode plane\n  \
     cv panorama street/ -o wide.png --projection panini --fov 150,80\n  \
@@ -40,7 +42,9 @@ pub(crate) struct Args {
     /// Photographs in any order, or folders of them. Those that do not belong are left out.
     #[arg(required = true, value_name = "IMAGES")]
     images: Vec<PathBuf>,
-    /// Where to write the panorama: .png, .tif or .jpg. The first two have 16 bits a channel where a photograph has.
+    /// Where to write the panorama: .png, .tif or .jpg; the first two have 16 bits a channel where a photograph has. Or .exr, the light of the scene: linear, 32-bit floats, the
+    /// camera's curve, exposures and vignetting undone, what one photograph clipped taken from another that did not. There 1 is the light that is white in the middle of the photograph that
+    /// all others are aligned to, and brighter light is more.
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// What the photographs are of: all around one place (rotation), or something flat from many places, such as a map, a wall or the ground (plane), drawn as a
@@ -136,6 +140,7 @@ impl Args {
         options.render.seams = self.seams;
         options.render.exposure = self.exposure;
         options.render.crop = self.crop;
+        options.render.radiance = self.ends_in(&["exr"]);
         options.render.resolution = self.scale;
         options.matching.features = PanoramaOptions::features(FeatureOptions::from(self.features));
         if let Some(seed) = context.seed {
@@ -148,7 +153,7 @@ impl Args {
 impl Run for Args {
     fn outputs(&self) -> Vec<Output<'_>> {
         let registration = self.save_registration.as_deref().map(|path| Output::File(path, registration::ENDINGS));
-        [Output::File(&self.output, PICTURE)].into_iter().chain(registration).collect()
+        [Output::File(&self.output, ENDINGS)].into_iter().chain(registration).collect()
     }
 
     fn has_no_use_for(&self) -> &'static [Global] {
@@ -165,10 +170,12 @@ impl Run for Args {
         if !(self.scale > 0.0 && self.scale <= 10.0) {
             return Err(Failure::usage(format!("--scale {} is not between 0 and 10", self.scale)));
         }
-        let ending = self.output.extension().unwrap_or_default();
-        let is_jpeg = ["jpg", "jpeg"].iter().any(|jpeg| ending.eq_ignore_ascii_case(jpeg));
+        let is_jpeg = self.ends_in(&["jpg", "jpeg"]);
         if self.alpha && is_jpeg {
             return Err(Failure::usage("--alpha needs a .png or .tif: JPEG has no transparency"));
+        }
+        if self.alpha && self.ends_in(&["exr"]) {
+            return Err(Failure::usage("--alpha needs a .png or .tif: the .exr written here has none"));
         }
         let registration = self.registration.as_deref().map(|path| registration::read(path, context)).transpose()?;
         let paths = expand_images(&self.images)?;
@@ -190,6 +197,12 @@ impl Run for Args {
 }
 
 impl Args {
+    /// Whether the panorama is to be of one of these kinds.
+    fn ends_in(&self, endings: &[&str]) -> bool {
+        let own = self.output.extension().unwrap_or_default();
+        endings.iter().any(|ending| own.eq_ignore_ascii_case(ending))
+    }
+
     /// The panorama of photographs of which the focal lengths by EXIF and the metadata are known, in their own depth.
     fn join<T>(
         &self,
@@ -233,8 +246,10 @@ impl Args {
         let result = result.map_err(|error| words::no_panorama(error, paths))?;
         let files: Vec<&Metadata> = known.iter().map(|(_, metadata)| metadata).collect();
         let metadata = metadata(&files, &result);
-        context.write(Output::File(&self.output, PICTURE), |path| {
-            if self.alpha {
+        context.write(Output::File(&self.output, ENDINGS), |path| {
+            if let Some(radiance) = &result.radiance {
+                cv_io::write_exr(path, radiance.view())
+            } else if self.alpha {
                 cv_io::write_image(path, transparent(&result).view(), &metadata)
             } else {
                 cv_io::write_image(path, result.image.view(), &metadata)
@@ -303,7 +318,7 @@ fn outcome<T: PhotoSample>(paths: &[PathBuf], result: &PanoramaResult<T>) -> Out
         .with("reprojection_rms_px", result.reprojection_rms_px)
         .with("projection", result.canvas.projection.to_string())
         .with("mode", result.alignment.motion.to_string())
-        .with("bits", 8 * size_of::<T>())
+        .with("bits", if result.radiance.is_some() { 32 } else { 8 * size_of::<T>() })
         .summary(format!(
             "{used} of {} photographs, {w} x {h} pixels, {}, matches agree to {:.2} px (RMS)",
             paths.len(),

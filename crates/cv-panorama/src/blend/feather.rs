@@ -1,7 +1,7 @@
 //! A linear transition across the seams.
 
 use crate::blend::{Blender, Composition, NO_PHOTO};
-use crate::depth::PhotoSample;
+use crate::depth::Channel;
 use crate::rows::{asks, for_each_row};
 use cv_core::{Cancelled, Image, Progress, Stage};
 
@@ -11,7 +11,7 @@ const RADIUS: usize = 8;
 /// Photographs weighted by the share of the labels in the square of `2 · RADIUS + 1` around each pixel that name them.
 pub(crate) struct Feather;
 
-impl<T: PhotoSample> Blender<T> for Feather {
+impl<T: Channel> Blender<T> for Feather {
     fn blend(&self, composition: &Composition<'_, T>, progress: &dyn Progress) -> Result<Image<T, 3>, Cancelled> {
         let (photos, labels) = (composition.photos, composition.labels);
         let (w, h) = labels.size();

@@ -1,14 +1,14 @@
 //! Every pixel from the photograph that its label names.
 
 use crate::blend::{Blender, Composition};
-use crate::depth::PhotoSample;
+use crate::depth::Channel;
 use crate::rows::for_each_row;
 use cv_core::{Cancelled, Image, Progress, Stage};
 
 /// No blending.
 pub(crate) struct HardSeams;
 
-impl<T: PhotoSample> Blender<T> for HardSeams {
+impl<T: Channel> Blender<T> for HardSeams {
     fn blend(&self, composition: &Composition<'_, T>, progress: &dyn Progress) -> Result<Image<T, 3>, Cancelled> {
         let stage = Stage::new(progress, "blend", 1)?;
         let image = copy(composition, &stage)?;
@@ -18,10 +18,7 @@ impl<T: PhotoSample> Blender<T> for HardSeams {
 }
 
 /// The picture with hard seams.
-pub(crate) fn copy<T: PhotoSample>(
-    composition: &Composition<'_, T>,
-    stage: &Stage<'_>,
-) -> Result<Image<T, 3>, Cancelled> {
+pub(crate) fn copy<T: Channel>(composition: &Composition<'_, T>, stage: &Stage<'_>) -> Result<Image<T, 3>, Cancelled> {
     let (w, h) = composition.labels.size();
     let mut image = Image::new(w, h, [T::default(); 3]);
     for_each_row(image.as_mut_slice(), 3 * w, stage, |y, row| {

@@ -8,7 +8,7 @@ mod hard_seams;
 mod multiband;
 mod poisson;
 
-use crate::depth::PhotoSample;
+use crate::depth::{Channel, PhotoSample};
 use crate::surface::WarpedPhoto;
 use cv_core::{Cancelled, Image, Progress, named};
 
@@ -28,7 +28,7 @@ pub struct Composition<'a, T = u8> {
 }
 
 /// Joins photographs at the seams between their labels. One that is for bytes and for samples of 16 bits is implemented for both.
-pub trait Blender<T: PhotoSample = u8>: Sync {
+pub trait Blender<T: Channel = u8>: Sync {
     /// How far photographs must be drawn beyond the pixels of their labels, as the levels of a pyramid above its base: each is drawn on
     /// the box around its pixels, grown by `2 · 2^levels` pixels and rounded out to multiples of `2^levels` (within the canvas). Where a
     /// photograph does not reach, its edge pixels are repeated with an opacity of 0. Default 4: 32 pixels.
@@ -68,7 +68,7 @@ impl BlendMode {
 }
 
 /// The implementation, compiled where it is called.
-pub(crate) fn of_mode<T: PhotoSample>(mode: BlendMode) -> &'static dyn Blender<T> {
+pub(crate) fn of_mode<T: Channel>(mode: BlendMode) -> &'static dyn Blender<T> {
     match mode {
         BlendMode::Multiband => &multiband::Multiband,
         BlendMode::Poisson => &poisson::Poisson,

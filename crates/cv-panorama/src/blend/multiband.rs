@@ -8,7 +8,7 @@
 //! blended canvas at half the size the result is `p_k + up(C − G_k)`: nothing in full size is kept but the bytes that came and the bytes that go.
 
 use crate::blend::{Blender, Composition};
-use crate::depth::{PhotoSample, Sum};
+use crate::depth::{Channel, Sum};
 use crate::rows::for_each_row_with;
 use crate::surface::WarpedPhoto;
 use cv_core::{Cancelled, Image, Progress, Stage};
@@ -38,7 +38,7 @@ impl Level {
 /// Multi-band blending with transitions of a 25th of a photograph in either direction.
 pub(crate) struct Multiband;
 
-impl<T: PhotoSample> Blender<T> for Multiband {
+impl<T: Channel> Blender<T> for Multiband {
     fn pyramid_levels(&self, typical_side: f64) -> usize {
         ((0.04 * typical_side).max(1.0).log2().round() as usize).clamp(1, 8)
     }
@@ -53,7 +53,7 @@ impl<T: PhotoSample> Blender<T> for Multiband {
 }
 
 /// The photographs joined with so many bands above the residual, at least one; black where no label names a photograph.
-fn join<T: PhotoSample>(
+fn join<T: Channel>(
     photos: &[Option<WarpedPhoto<T>>],
     labels: &Image<u16, 1>,
     bands: usize,
@@ -181,7 +181,7 @@ fn kernel(p: [Pixel; 5]) -> Pixel {
 }
 
 /// A photograph at half its size with the weights of its label: blurred, every second pixel of every second row. Edges are repeated. Exact, in integers.
-fn halve_photo<T: PhotoSample>(
+fn halve_photo<T: Channel>(
     photo: &WarpedPhoto<T>,
     labels: &Image<u16, 1>,
     label: u16,

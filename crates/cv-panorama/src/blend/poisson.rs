@@ -6,7 +6,7 @@
 
 use crate::blend::hard_seams::copy;
 use crate::blend::{Blender, Composition, NO_PHOTO};
-use crate::depth::PhotoSample;
+use crate::depth::Channel;
 use crate::rows::{asks, for_each_row};
 use cv_core::{Cancelled, Image, Progress, Stage};
 use rayon::prelude::*;
@@ -26,7 +26,7 @@ const CYCLES: usize = 4;
 /// Gradient-domain blending.
 pub(crate) struct Poisson;
 
-impl<T: PhotoSample> Blender<T> for Poisson {
+impl<T: Channel> Blender<T> for Poisson {
     fn blend(&self, composition: &Composition<'_, T>, progress: &dyn Progress) -> Result<Image<T, 3>, Cancelled> {
         // Cycles on the full grid are most of the work.
         let stage = Stage::new(progress, "blend", CYCLES + 2)?;
@@ -112,7 +112,7 @@ impl Grid {
         Self { width, height, value, right_side, right: vec![0.0; n], down: vec![0.0; n], screen }
     }
 
-    fn from_seams<T: PhotoSample>(composition: &Composition<'_, T>, stage: &Stage<'_>) -> Result<Self, Cancelled> {
+    fn from_seams<T: Channel>(composition: &Composition<'_, T>, stage: &Stage<'_>) -> Result<Self, Cancelled> {
         let (w, h) = composition.labels.size();
         let labels = composition.labels.as_slice();
         let mut grid = Self::empty(w, h, SCREEN);

@@ -104,13 +104,16 @@ pub(crate) struct ExposureCorrection<'a> {
     pub(crate) gain: [f32; 3],
     /// `v₁` and `v₂`: `v₁ r² + v₂ r⁴` more stops at a distance r from the middle, 1 at the corners.
     pub(crate) vignetting: [f32; 2],
+    /// Light from which on a photograph counts as clipped; white is 1. For linear light only.
+    pub(crate) clipped: f32,
 }
 
 impl<'a> ExposureCorrection<'a> {
     /// That of one photograph.
     pub(crate) fn new(tone: &'a Tone, gains: &Gains, photo: usize) -> Self {
         let gain = gains.gains.get(photo).map_or([0.0; 3], |g| g.map(f32::log2));
-        Self { tone, gain, vignetting: gains.vignetting.map(|v| v * std::f32::consts::LOG2_E) }
+        let clipped = gains.clipped();
+        Self { tone, gain, clipped, vignetting: gains.vignetting.map(|v| v * std::f32::consts::LOG2_E) }
     }
 
     /// Stops more at the square of a distance from the middle.
@@ -154,7 +157,7 @@ mod tests {
     use super::*;
 
     fn correction(tone: &Tone, stops: f32) -> ExposureCorrection<'_> {
-        ExposureCorrection { tone, gain: [stops; 3], vignetting: [0.0; 2] }
+        ExposureCorrection { tone, gain: [stops; 3], vignetting: [0.0; 2], clipped: 1.0 }
     }
 
     #[test]

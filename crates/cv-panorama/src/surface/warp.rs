@@ -4,7 +4,7 @@
 //! costs three multiply-adds per coordinate and one division.
 
 use crate::align::View;
-use crate::depth::PhotoSample;
+use crate::depth::Channel;
 use crate::light::ExposureCorrection;
 use crate::rows::for_each_row_with;
 use crate::surface::{Bounds, DisplacementField, Placement, Surface};
@@ -41,6 +41,9 @@ impl<T: Sample> WarpedPhoto<T> {
     }
 }
 
+/// Opacity of linear light that is a bound: the photograph is clipped there.
+pub(crate) const CLIPPED: f32 = 0.5;
+
 /// How a photograph is drawn.
 #[derive(Clone, Copy)]
 pub(crate) struct WarpSettings<'a> {
@@ -51,7 +54,7 @@ pub(crate) struct WarpSettings<'a> {
 }
 
 /// The photograph as seen in the canvas pixels `bounds`.
-pub(crate) fn warp<T: PhotoSample>(
+pub(crate) fn warp<T: Channel>(
     photo: ImageView<'_, T, 3>,
     placement: &Placement,
     surface: &Surface,
@@ -218,7 +221,7 @@ impl Row {
 /// Samples one row; coordinates outside the photograph take the nearest edge pixel and are marked as not reached. One thing after the other, each in a loop
 /// that can be done in vectors but for the looking up.
 #[inline(always)]
-fn sample_row<S: Simd, T: PhotoSample, I: Sampler>(
+fn sample_row<S: Simd, T: Channel, I: Sampler>(
     simd: S,
     photo: ImageView<'_, T, 3>,
     buffer: &mut Row,
@@ -231,7 +234,7 @@ fn sample_row<S: Simd, T: PhotoSample, I: Sampler>(
     let (pixels, _) = row.as_chunks_mut::<4>();
     for ((pixel, u), v) in pixels.iter_mut().zip(us.iter_mut()).zip(vs.iter_mut()) {
         let inside = (*u >= -0.5) & (*v >= -0.5) & (*u <= right + 0.5) & (*v <= bottom + 0.5);
-        pixel[3] = if inside { T::WHITE } else { T::default() };
+        pixel[3] = if inside { T::OPAQUE } else { T::default() };
         // `max` first: it turns NaN into a number.
         (*u, *v) = (u.max(0.0).min(right), v.max(0.0).min(bottom));
     }
@@ -248,7 +251,20 @@ fn sample_row<S: Simd, T: PhotoSample, I: Sampler>(
             *lift = correction.lift(corner * (x * x + y * y));
         }
         scale([reds, greens, blues], 1.0 / T::PER_LEVEL);
-        if T::PARTS == 1 {
+        if T::LINEAR {
+            let factors = correction.gain.map(f32::exp2);
+            for ((((pixel, r), g), b), lift) in
+                pixels.iter_mut().zip(reds.iter_mut()).zip(greens.iter_mut()).zip(blues.iter_mut()).zip(lifts.iter())
+            {
+                if pixel[3] != T::default() && r.max(*g).max(*b) >= correction.clipped {
+                    pixel[3] = T::from_f32(CLIPPED);
+                }
+                let lift = lift.exp2();
+                // The kernel overshoots at edges.
+                (*r, *g, *b) =
+                    (r.max(0.0) * factors[0] * lift, g.max(0.0) * factors[1] * lift, b.max(0.0) * factors[2] * lift);
+            }
+        } else if T::PARTS == 1 {
             correction.row_of_levels::<false>([&mut reds[..], &mut greens[..], &mut blues[..]], lifts, clipped);
         } else {
             correction.row_of_levels::<true>([&mut reds[..], &mut greens[..], &mut blues[..]], lifts, clipped);
@@ -278,14 +294,14 @@ fn split(u: f32, v: f32) -> (usize, usize, f32, f32) {
 /// A kind of interpolation, at a place inside the photograph. (A type and not a function that is handed over: that would be called, and compiled for no
 /// instruction set in particular.)
 trait Sampler {
-    fn sample<S: Simd, T: PhotoSample>(simd: S, photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3];
+    fn sample<S: Simd, T: Channel>(simd: S, photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3];
 }
 
 struct Nearest;
 
 impl Sampler for Nearest {
     #[inline(always)]
-    fn sample<S: Simd, T: PhotoSample>(_: S, photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3] {
+    fn sample<S: Simd, T: Channel>(_: S, photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3] {
         photo.at((u + 0.5) as usize, (v + 0.5) as usize).map(T::to_f32)
     }
 }
@@ -294,7 +310,7 @@ struct Bilinear;
 
 impl Sampler for Bilinear {
     #[inline(always)]
-    fn sample<S: Simd, T: PhotoSample>(_: S, photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3] {
+    fn sample<S: Simd, T: Channel>(_: S, photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3] {
         let (x, y, fx, fy) = split(u, v);
         bilinear_at(photo, x, y, fx, fy)
     }
@@ -304,7 +320,7 @@ struct Bicubic;
 
 impl Sampler for Bicubic {
     #[inline(always)]
-    fn sample<S: Simd, T: PhotoSample>(simd: S, photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3] {
+    fn sample<S: Simd, T: Channel>(simd: S, photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3] {
         let (x, y, fx, fy) = split(u, v);
         T::bicubic(simd, photo, x, y, fx, fy)
     }
