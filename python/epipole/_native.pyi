@@ -385,7 +385,7 @@ def sfm(
     progress: _Progress | None = None,
 ) -> SfmResult: ...
 def panorama(
-    photographs: Sequence[_Photograph],
+    photographs: Sequence[_Photograph | NDArray[np.uint16]],
     *,
     camera: Camera | None = None,
     focal: float | None = None,

@@ -34,8 +34,9 @@ class _Result:
 
 def _told(value: Any) -> str:
     if isinstance(value, np.ndarray):
-        if value.ndim == 3 and value.shape[2] == 3 and value.dtype == np.uint8 and min(value.shape[:2]) > 9:
-            return _bitmap(value[:: _step(value), :: _step(value)])
+        if value.ndim == 3 and value.shape[2] == 3 and value.dtype in (np.uint8, np.uint16) and min(value.shape[:2]) > 9:
+            small = value[:: _step(value), :: _step(value)]
+            return _bitmap(small if value.dtype == np.uint8 else (small >> 8).astype(np.uint8))
         if value.ndim == 2 and value.dtype == np.float32 and min(value.shape) > 9:
             return _thumbnail(value)
         return f"{value.dtype} {value.shape}"
@@ -510,8 +511,8 @@ class TwoViewReconstruction(_Result):
 class Panorama(_Result):
     """Photographs joined to one picture."""
 
-    image: NDArray[np.uint8]
-    """uint8 (height, width, 3); black where no photograph reaches."""
+    image: NDArray[np.uint8] | NDArray[np.uint16]
+    """(height, width, 3), uint8, or uint16 where a photograph has 16 bits; black where no photograph reaches."""
     mask: NDArray[np.bool_]
     """bool: where one does."""
     labels: NDArray[np.uint16]

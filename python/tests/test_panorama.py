@@ -42,6 +42,21 @@ def test_paths_are_read_and_arrays_are_the_same():
         epipole.panorama(VIEWS, projection="cubic")
 
 
+def test_sixteen_bits_stay():
+    photographs = [epipole.read_image(path) for path in VIEWS]
+    deep = [p.astype(np.uint16) * 257 for p in photographs]
+    plain = epipole.panorama(photographs, scale=0.5)
+    found = epipole.panorama(deep, scale=0.5)
+    assert plain.image.dtype == np.uint8 and found.image.dtype == np.uint16 and found.image.shape == plain.image.shape
+    # The same but for rounding, and where that moves a seam.
+    assert (np.abs(found.image / 257 - plain.image) > 1.1).mean() < 1e-3 and (found.image % 257 != 0).mean() > 0.9
+    assert "<img" in found._repr_html_()
+    mixed = epipole.panorama([photographs[0], *deep[1:]], scale=0.5)
+    assert np.array_equal(mixed.image, found.image)
+    with pytest.raises(TypeError, match="uint16"):
+        epipole.panorama([p.astype(np.float32) for p in photographs])
+
+
 def test_a_part_of_the_scene_is_drawn():
     whole = epipole.panorama(VIEWS, scale=0.5, projection="stereographic")
     part = epipole.panorama(VIEWS, scale=0.5, projection="stereographic", fov=(40, 30), center=(-3, 1), roll=2.0)

@@ -7,7 +7,7 @@ mod support;
 use cv_core::{Image, RgbU8};
 use cv_io::{DynImage, Pixels, read_image};
 use std::{fs, path::Path};
-use support::{done, fixture};
+use support::{done, fixture, json};
 
 /// An EXIF block, little-endian: maker, turn and a comment; then a thumbnail.
 fn exif(orientation: u8) -> Vec<u8> {
@@ -134,4 +134,51 @@ fn a_panorama_has_the_exif_of_one_photograph_and_the_profile_of_all() {
             assert_eq!(check_exif(&folder.path().join(output)).metadata.icc, kept, "{output}");
         }
     }
+}
+
+#[test]
+fn a_panorama_of_sixteen_bits_has_sixteen_bits_and_what_the_files_say() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    // The lowest bits say what no rounding to bytes keeps: a ramp over two levels.
+    let deepened = |v: u8, x: usize| 257 * u16::from(v).min(240) + 2 * x as u16;
+    for i in 0..2 {
+        let view = cv_io::read_rgb(fixture(&format!("panorama/view{i}.jpg"))).unwrap();
+        let deep = Image::<u16, 3>::from_fn(view.width(), view.height(), |x, y| view.at(x, y).map(|v| deepened(v, x)));
+        write_deep_png(&at(&format!("deep{i}.png")), &deep);
+        cv_io::write_png(
+            at(&format!("bytes{i}.png")),
+            deep.map(|p| p.map(|v| ((u32::from(v) + 128) / 257) as u8)).view(),
+        )
+        .unwrap();
+    }
+    done(folder.path(), &["panorama", "bytes0.png", "bytes1.png", "-o", "bytes.png", "--exposure", "none"]);
+    done(folder.path(), &["panorama", "deep0.png", "deep1.png", "-o", "deep.jpg", "--exposure", "none"]);
+    let Pixels::Rgb8(bytes) = read_image(at("bytes.png")).unwrap().pixels else { panic!("8 bits") };
+    for (photos, output) in [
+        (["deep0.png", "deep1.png"], "pano.png"),
+        (["deep0.png", "deep1.png"], "pano.tif"),
+        (["bytes0.png", "deep1.png"], "mixed.tif"),
+    ] {
+        let value = json(folder.path(), &["panorama", photos[0], photos[1], "-o", output, "--exposure", "none"]);
+        assert_eq!(value["bits"], 16);
+        let image = if output == "mixed.tif" { read_image(at(output)).unwrap() } else { check_exif(&at(output)) };
+        // The reference of the mixed ones is that without a profile.
+        assert_eq!(image.metadata.icc, (output != "mixed.tif").then(|| profile(7)), "{output}");
+        let Pixels::Rgb16(image) = image.pixels else { panic!("16 bits") };
+        assert_eq!(image.size(), bytes.size());
+        let pairs = || image.as_slice().iter().zip(bytes.as_slice());
+        // Rounding to bytes before and after is worth a level at the most, but where features or a seam lie elsewhere for it.
+        let far = pairs().filter(|(deep, byte)| (f64::from(**deep) / 257.0 - f64::from(**byte)).abs() > 1.5).count();
+        assert!(far * 500 < bytes.as_slice().len(), "{output}: {far}");
+        // What bytes can hold are multiples of 257: by chance one sample in as many.
+        let coarse = image.as_slice().iter().filter(|v| **v > 0 && **v % 257 == 0).count();
+        assert!(output == "mixed.tif" || coarse * 50 < bytes.as_slice().len(), "{output}: {coarse}");
+    }
+    let Pixels::Rgb8(jpeg) = check_exif(&at("deep.jpg")).pixels else { panic!("8 bits") };
+    assert_eq!(jpeg.size(), bytes.size());
+    done(folder.path(), &["panorama", "deep0.png", "deep1.png", "-o", "clear.png", "--alpha", "--scale", "0.5"]);
+    let file = fs::File::open(at("clear.png")).unwrap();
+    let reader = png::Decoder::new(std::io::BufReader::new(file)).read_info().unwrap();
+    assert_eq!(reader.output_color_type(), (png::ColorType::Rgba, png::BitDepth::Sixteen));
 }

@@ -44,6 +44,22 @@ fn alpha_is_transparent_where_no_photograph_reaches() {
 }
 
 #[test]
+fn an_exr_has_the_light_in_the_exposure_of_the_reference() {
+    let folder = tempfile::tempdir().unwrap();
+    let (_, names) = landscape(folder.path(), 2, 1.0);
+    let value = json(folder.path(), &["panorama", &names[0], &names[1], "-o", "light.exr", "--scale", "0.5"]);
+    assert_eq!(value["bits"], 32);
+    let bytes = std::fs::read(folder.path().join("light.exr")).unwrap();
+    assert_eq!(bytes[..8], [0x76, 0x2f, 0x31, 0x01, 2, 0, 0, 0]);
+    // The window: from (0, 0) to the last pixel.
+    let place = bytes.windows(17).position(|w| w == b"dataWindow\0box2i\0").unwrap() + 17 + 4;
+    let side = |k: usize| i32::from_le_bytes(bytes[place + 4 * k..][..4].try_into().unwrap());
+    let size = [0, 1].map(|i| value["size"][i].as_i64().unwrap());
+    assert_eq!([0, 1, 2, 3].map(|k| i64::from(side(k))), [0, 0, size[0] - 1, size[1] - 1]);
+    assert_eq!(run(folder.path(), &["panorama", &names[0], &names[1], "-o", "a.exr", "--alpha"]).code, Some(2));
+}
+
+#[test]
 fn a_photograph_on_its_side_changes_nothing() {
     let folder = tempfile::tempdir().unwrap();
     let mut sizes = Vec::new();

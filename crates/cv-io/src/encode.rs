@@ -43,6 +43,7 @@ png_pixels!(u8, 4, Rgba, Eight, |out, row| out.extend_from_slice(row));
 png_pixels!(bool, 1, Grayscale, Eight, |out, row| out.extend(row.iter().map(|&v| if v { 255u8 } else { 0 })));
 png_pixels!(u16, 1, Grayscale, Sixteen, |out, row| out.extend(row.iter().flat_map(|v| v.to_be_bytes())));
 png_pixels!(u16, 3, Rgb, Sixteen, |out, row| out.extend(row.iter().flat_map(|v| v.to_be_bytes())));
+png_pixels!(u16, 4, Rgba, Sixteen, |out, row| out.extend(row.iter().flat_map(|v| v.to_be_bytes())));
 
 /// The bytes of a PNG file.
 ///

@@ -38,6 +38,7 @@ mod codec;
 pub mod colmap;
 mod depth_png;
 mod encode;
+mod encode_exr;
 mod encode_tiff;
 mod error;
 mod exif_info;
@@ -69,6 +70,7 @@ pub use encode::{
     JpegPixels, PngPixels, encode_jpeg, encode_png, encode_tiff, write_image, write_jpeg, write_png,
     write_png_to_print, write_png_with,
 };
+pub use encode_exr::{encode_exr, write_exr};
 pub use error::{FormatError, IoError};
 pub use exif_info::{ExifFocal, ExifGps, ExifInfo, FocalSource};
 pub use features::{

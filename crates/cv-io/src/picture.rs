@@ -102,6 +102,19 @@ impl DynImage {
         }
     }
 
+    /// As RGB of 16 bits, 65535 for white: 8 bits are multiplied by 257, gray is repeated, linear light is clipped to 0 to 1 and sRGB-encoded.
+    pub fn into_rgb16(self) -> Image<u16, 3> {
+        let word = |v: u8| 257 * u16::from(v);
+        match self.pixels {
+            Pixels::Rgb16(image) => image,
+            Pixels::Gray16(image) => image.map(|[v]| [v; 3]),
+            Pixels::Gray8(image) => image.map(|[v]| [word(v); 3]),
+            Pixels::Rgb8(image) => image.map(|p| p.map(word)),
+            Pixels::GrayF32(image) => image.map(|[v]| [srgb::word(v); 3]),
+            Pixels::RgbF32(image) => image.map(|p| p.map(srgb::word)),
+        }
+    }
+
     /// As gray bytes: as [`DynImage::into_rgb8`], then Rec. 601 luma
     /// ([`luma_u8`](cv_core::luma_u8)).
     pub fn into_gray8(self) -> GrayU8 {

@@ -1,4 +1,4 @@
-//! Linear light to sRGB bytes (IEC 61966-2-1), by a table.
+//! Linear light to sRGB (IEC 61966-2-1): bytes by a table, 16 bits by the formula.
 
 use std::sync::LazyLock;
 
@@ -31,9 +31,18 @@ pub(crate) fn byte(v: f32) -> u8 {
     TABLE.get((v.to_bits() >> WITHIN) as usize).map_or(0, |&(low, next)| low + u8::from(v >= next))
 }
 
+/// The same in 16 bits, 65535 for white.
+pub(crate) fn word(v: f32) -> u16 {
+    (encoded(v.clamp(0.0, 1.0)) * 65535.0).round() as u16
+}
+
 fn formula(v: f32) -> u8 {
+    (encoded(v) * 255.0).round() as u8
+}
+
+fn encoded(v: f32) -> f32 {
     let encoded = if v <= 0.003_130_8 { 12.92 * v } else { 1.055 * v.powf(1.0 / 2.4) - 0.055 };
-    (encoded.min(1.0) * 255.0).round() as u8
+    encoded.min(1.0)
 }
 
 #[cfg(test)]
@@ -51,5 +60,8 @@ mod tests {
         }
         let outside = [f32::NAN, -0.0, -1.0, f32::NEG_INFINITY, 1.0, 2.0, f32::INFINITY].map(byte);
         assert_eq!(outside, [0, 0, 0, 0, 255, 255, 255]);
+        assert_eq!([f32::NAN, -1.0, 1.0, 2.0].map(word), [0, 0, 65535, 65535]);
+        // IEC 61966-2-1: half the light is level 0.735357.
+        assert_eq!(word(0.5), 48192);
     }
 }

@@ -34,6 +34,7 @@
 
 mod align;
 mod blend;
+mod depth;
 mod light;
 mod registration;
 mod render;
@@ -47,6 +48,7 @@ pub use align::{AlignError, AlignOptions, AlignedPair, Alignment, CameraMotion, 
 pub use blend::{BlendMode, Blender, Composition, NO_PHOTO};
 pub use cv_geometry::{NotAPair, VerifiedPair, VerifyOptions, verify_pair};
 pub use cv_imgproc::Interpolation;
+pub use depth::{EightBits, PhotoSample};
 pub use light::{Exposure, Gains};
 pub use registration::{Pto, PtoError, Registration, RegistrationError};
 pub use render::{CompositingOptions, Panorama, RenderError, render, render_with};

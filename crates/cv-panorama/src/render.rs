@@ -1,16 +1,17 @@
 //! From aligned photographs to the picture.
 
 use crate::align::Alignment;
-use crate::blend::{BlendMode, Blender, Composition, NO_PHOTO};
-use crate::light::{Exposure, ExposureCorrection, Gains, estimate_gains};
+use crate::blend::{BlendMode, Blender, Composition, NO_PHOTO, of_mode};
+use crate::depth::{Channel, EightBits, PhotoSample};
+use crate::light::{Exposure, ExposureCorrection, Gains, estimate_gains, fill_clipped, light_of, relative_to};
 use crate::rows::for_each_row;
 use crate::seams::{self, Seams, label_bounds};
 use crate::surface::{
     Bounds, Canvas, DisplacementField, Framing, Layout, LayoutError, PhotoMap, Placement, Preview, Projection,
-    WarpSettings, WarpedPhoto, box_shrunk, displacements, largest_rectangle, layout, shrunk_view, warp,
+    WarpSettings, WarpedPhoto, displacements, largest_rectangle, layout, shrunk_view, warp,
 };
-use cv_core::{Cancelled, Image, ImageView, Mask, OptionError, Progress, RgbU8, Stage, StageClock};
-use cv_imgproc::Interpolation;
+use cv_core::{Cancelled, Image, ImageView, Mask, OptionError, Progress, RgbF32, Sample, Stage, StageClock};
+use cv_imgproc::{Interpolation, resize_area};
 
 /// Options of [`render`].
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -31,6 +32,8 @@ pub struct CompositingOptions {
     pub blend: BlendMode,
     /// How values between pixels are found. Default bicubic: sharper than what other stitchers do, at a few milliseconds a megapixel.
     pub interpolation: Interpolation,
+    /// Also draw the light of the scene ([`Panorama::radiance`]); what one photograph clips is then taken from one that does not, wherever there is one. Default false.
+    pub radiance: bool,
     /// Cut the result to the largest upright rectangle without empty pixels. Default false.
     pub crop: bool,
     /// Most pixels of the canvas. Default 400 million, for which blending needs some 12 GB.
@@ -48,6 +51,7 @@ impl Default for CompositingOptions {
             seams: Seams::default(),
             blend: BlendMode::default(),
             interpolation: Interpolation::Bicubic,
+            radiance: false,
             crop: false,
             max_pixels: 400_000_000,
         }
@@ -97,9 +101,13 @@ pub enum RenderError {
 
 /// A panorama.
 #[derive(Debug, Clone)]
-pub struct Panorama {
-    /// The picture; black where no photograph reaches.
-    pub image: RgbU8,
+pub struct Panorama<T = u8> {
+    /// The picture, as deep as the photographs; black where no photograph reaches.
+    pub image: Image<T, 3>,
+    /// The light of the scene where [`CompositingOptions::radiance`] asks for it: linear, not toned, in the primaries of the photographs; 1 is what the photograph that all others are aligned
+    /// to records as white at its middle, and brighter light is more. What every photograph that sees it clips is a lower bound. With [`Exposure::None`] each photograph is as it is. 0 where
+    /// no photograph reaches.
+    pub radiance: Option<RgbF32>,
     /// True where a photograph reaches.
     pub mask: Mask,
     /// Which photograph each pixel is from; [`NO_PHOTO`] where none reaches.
@@ -123,18 +131,18 @@ const PREVIEW_PIXELS: usize = 300_000;
 
 /// Draws the panorama.
 ///
-/// `photos` are those that were aligned, in the same order, in full size; `alignment` may have been made at another size and scaled.
+/// `photos` are those that were aligned, in the same order, in full size, of `u8` or `u16` samples: of these the panorama is. Where seams run, and how light differs, is found on 8 bits of them; `alignment` may have been made at another size and scaled.
 /// Costs O(canvas + pixels of the photographs), with the seams found on a preview of bounded size. Reports as the stages "elastic", "preview",
 /// "exposure", "seams", "warp", "seams" again, "blend" and "crop".
 ///
 /// # Errors
 /// [`RenderError`].
-pub fn render(
-    photos: &[ImageView<'_, u8, 3>],
+pub fn render<T: PhotoSample>(
+    photos: &[ImageView<'_, T, 3>],
     alignment: &Alignment,
     options: &CompositingOptions,
     progress: &dyn Progress,
-) -> Result<Panorama, RenderError> {
+) -> Result<Panorama<T>, RenderError> {
     render_with(photos, alignment, options, options.blend.blender(), progress)
 }
 
@@ -142,45 +150,62 @@ pub fn render(
 ///
 /// # Errors
 /// [`RenderError`].
-pub fn render_with(
-    photos: &[ImageView<'_, u8, 3>],
+pub fn render_with<T: PhotoSample>(
+    photos: &[ImageView<'_, T, 3>],
     alignment: &Alignment,
     options: &CompositingOptions,
-    blender: &dyn Blender,
+    blender: &dyn Blender<T>,
     progress: &dyn Progress,
-) -> Result<Panorama, RenderError> {
+) -> Result<Panorama<T>, RenderError> {
+    T::draw(photos, alignment, options, blender, progress)
+}
+
+/// [`render_with`], compiled where it is called.
+pub(crate) fn draw<T: PhotoSample>(
+    photos: &[ImageView<'_, T, 3>],
+    alignment: &Alignment,
+    options: &CompositingOptions,
+    blender: &dyn Blender<T>,
+    progress: &dyn Progress,
+) -> Result<Panorama<T>, RenderError> {
     let mut clock = StageClock::new();
     check(photos, alignment, options)?;
     let layout = layout(alignment, options.projection, &options.framing, options.resolution, options.max_pixels)?;
     let photo_of: Vec<usize> = layout.placements.iter().map(|p| p.photo).collect();
+    let eight = EightBits::new(photos, "elastic", progress)?;
+    let bytes = eight.views();
     let fields = if options.elastic {
-        displacements(photos, &layout, alignment, progress)?
+        displacements(&bytes, &layout, alignment, progress)?
     } else {
         vec![None; layout.placements.len()]
     };
     clock.lap("elastic");
-    let mut preview = Preview::draw(photos, &layout, &fields, options.resolution, PREVIEW_PIXELS, progress)?;
+    let mut preview = Preview::draw(&bytes, &layout, &fields, options.resolution, PREVIEW_PIXELS, progress)?;
+    drop(eight);
     clock.lap("preview");
     let gains = estimate_gains(&preview, &photo_of, photos.len(), options.exposure, progress)?;
     if options.exposure != Exposure::None {
         preview.correct(&gains, &photo_of);
     }
     clock.lap("exposure");
-    let coarse = seams::on_preview(&preview, &photo_of, options.seams, progress)?;
+    let coarse = seams::on_preview(&preview, &photo_of, options.seams, options.radiance, progress)?;
     clock.lap("seams");
 
     let typical_side = layout.typical_side();
     // Deeper than any canvas, a pyramid has nothing to add.
     let levels = blender.pyramid_levels(typical_side).min(16);
     let regions = regions(&coarse, preview.step, &layout, levels);
-    let warped = warp_all(photos, &layout, &regions, &fields, &gains, options, progress)?;
+    let drawing = Drawing { photos, layout: &layout, regions: &regions, fields: &fields, options };
+    let warped = drawing.warped(&gains, progress)?;
     clock.lap("warp");
     let mut labels = {
         let stage = Stage::new(progress, "seams", 1)?;
         seams::upsample(&coarse, preview.step, (layout.width, layout.height), &warped, &stage)?
     };
     if options.seams == Seams::GraphCut && preview.step > 1 {
-        seams::refine(&mut labels, &warped, preview.step, progress)?;
+        let stage = Stage::new(progress, "seams", 1)?;
+        let bytes = T::drawn_in_8_bits(&warped, &stage)?;
+        seams::refine(&mut labels, &bytes, preview.step, progress)?;
     }
     clock.lap("seams");
     let image = blender.blend(&Composition { photos: &warped, labels: &labels, typical_side }, progress)?;
@@ -189,6 +214,19 @@ pub fn render_with(
         return Err(RenderError::WrongBlend { width, height, expected_width, expected_height });
     }
     clock.lap("blend");
+    let radiance = if options.radiance {
+        drop(warped);
+        let relative = relative_to(&gains, alignment.reference);
+        let light = drawing.light(&relative, progress)?;
+        let composition = Composition { photos: &light, labels: &labels, typical_side };
+        let mut light = of_mode::<f32>(options.blend).blend(&composition, progress)?;
+        // What bands and gradients overshoot.
+        light.as_mut_slice().iter_mut().for_each(|v| *v = v.max(0.0));
+        clock.lap("radiance");
+        Some(light)
+    } else {
+        None
+    };
     let stage = Stage::new(progress, "crop", 2)?;
     let mut mask = Mask::new(layout.width, layout.height, [false]);
     for_each_row(mask.as_mut_slice(), layout.width, &stage, |y, row| {
@@ -200,6 +238,7 @@ pub fn render_with(
     stage.add(1)?;
     let mut panorama = Panorama {
         image,
+        radiance,
         mask,
         labels,
         canvas: layout.canvas,
@@ -219,8 +258,8 @@ pub fn render_with(
 }
 
 /// Whether the photographs are those of the alignment, and the options numbers.
-fn check(
-    photos: &[ImageView<'_, u8, 3>],
+fn check<T: Sample>(
+    photos: &[ImageView<'_, T, 3>],
     alignment: &Alignment,
     options: &CompositingOptions,
 ) -> Result<(), RenderError> {
@@ -253,49 +292,106 @@ fn regions(coarse: &Image<u16, 1>, step: usize, layout: &Layout, levels: usize) 
     label_bounds(coarse, layout.placements.len()).into_iter().map(|b| b.map(region)).collect()
 }
 
-/// Every placement drawn on its region.
-fn warp_all(
-    photos: &[ImageView<'_, u8, 3>],
-    layout: &Layout,
-    regions: &[Option<Bounds>],
-    fields: &[Option<DisplacementField>],
-    gains: &Gains,
-    options: &CompositingOptions,
-    progress: &dyn Progress,
-) -> Result<Vec<Option<WarpedPhoto>>, Cancelled> {
-    let stage = Stage::new(progress, "warp", layout.placements.len())?;
-    // A photograph drawn smaller is averaged first, or fine texture would alias.
-    let shrink = ((1.0 / options.resolution).floor() as usize).max(1);
-    let tone = gains.tone();
-    let draw = |placement: &Placement, region: Bounds, field: Option<&DisplacementField>| {
-        let photo = photos[placement.photo];
-        let evened = options.exposure != Exposure::None;
-        let correction = evened.then(|| ExposureCorrection::new(&tone, gains, placement.photo));
-        let settings = WarpSettings { displacement: field, interpolation: options.interpolation, correction };
-        if shrink == 1 {
-            return warp(photo, placement, &layout.surface, region, settings, &stage);
-        }
-        let small = box_shrunk(photo, shrink, &stage)?;
-        let placement = Placement { view: shrunk_view(placement, shrink, &small), ..*placement };
-        let field = field.map(|f| f.scaled(1.0, 1.0 / shrink as f64));
-        let settings = WarpSettings { displacement: field.as_ref(), ..settings };
-        warp(small.view(), &placement, &layout.surface, region, settings, &stage)
-    };
-    let mut warped = Vec::with_capacity(regions.len());
-    for ((placement, region), field) in layout.placements.iter().zip(regions).zip(fields) {
-        warped.push(region.map(|region| draw(placement, region, field.as_ref())).transpose()?);
-        stage.add(1)?;
+/// What is drawn, and where.
+struct Drawing<'a, T> {
+    photos: &'a [ImageView<'a, T, 3>],
+    layout: &'a Layout,
+    regions: &'a [Option<Bounds>],
+    fields: &'a [Option<DisplacementField>],
+    options: &'a CompositingOptions,
+}
+
+impl<T: PhotoSample> Drawing<'_, T> {
+    /// A photograph drawn smaller is averaged first, over so many pixels, or fine texture would alias.
+    fn shrink(&self) -> usize {
+        ((1.0 / self.options.resolution).floor() as usize).max(1)
     }
-    Ok(warped)
+
+    /// Every placement drawn on its region.
+    fn warped(&self, gains: &Gains, progress: &dyn Progress) -> Result<Vec<Option<WarpedPhoto<T>>>, Cancelled> {
+        let stage = Stage::new(progress, "warp", self.layout.placements.len())?;
+        let (shrink, tone) = (self.shrink(), gains.tone(T::PARTS));
+        let evened = self.options.exposure != Exposure::None;
+        let draw = |placement: &Placement, region: Bounds, field: Option<&DisplacementField>| {
+            let photo = self.photos[placement.photo];
+            let correction = evened.then(|| ExposureCorrection::new(&tone, gains, placement.photo));
+            if shrink == 1 {
+                return self.warp(photo, placement, region, field, correction, &stage);
+            }
+            let small = T::shrunk(photo, shrink, &stage)?;
+            self.warp(small.view(), placement, region, field, correction, &stage)
+        };
+        self.each(draw, &stage)
+    }
+
+    /// The same as light, what is clipped filled from others.
+    fn light(&self, gains: &Gains, progress: &dyn Progress) -> Result<Vec<Option<WarpedPhoto<f32>>>, Cancelled> {
+        let stage = Stage::new(progress, "radiance", self.layout.placements.len() + 1)?;
+        let (shrink, tone) = (self.shrink(), gains.tone(1));
+        let draw = |placement: &Placement, region: Bounds, field: Option<&DisplacementField>| {
+            let photo = light_of(self.photos[placement.photo], gains, &stage)?;
+            let correction = Some(ExposureCorrection::new(&tone, gains, placement.photo));
+            let size = ((photo.width() / shrink).max(1), (photo.height() / shrink).max(1));
+            // Blocks that are not whole are left out.
+            let whole =
+                photo.view().crop(0, 0, (size.0 * shrink).min(photo.width()), (size.1 * shrink).min(photo.height()));
+            match whole.filter(|_| shrink > 1).and_then(|whole| resize_area(whole, size.0, size.1).ok()) {
+                Some(small) => self.warp(small.view(), placement, region, field, correction, &stage),
+                None => self.warp(photo.view(), placement, region, field, correction, &stage),
+            }
+        };
+        let mut drawn = self.each(draw, &stage)?;
+        fill_clipped(&mut drawn, &stage)?;
+        stage.add(1)?;
+        Ok(drawn)
+    }
+
+    /// What `draw` makes of every placement that has a region, one after the other.
+    fn each<D>(
+        &self,
+        draw: impl Fn(&Placement, Bounds, Option<&DisplacementField>) -> Result<D, Cancelled>,
+        stage: &Stage<'_>,
+    ) -> Result<Vec<Option<D>>, Cancelled> {
+        let mut drawn = Vec::with_capacity(self.regions.len());
+        for ((placement, region), field) in self.layout.placements.iter().zip(self.regions).zip(self.fields) {
+            drawn.push(region.map(|region| draw(placement, region, field.as_ref())).transpose()?);
+            stage.add(1)?;
+        }
+        Ok(drawn)
+    }
+
+    /// A placement's photograph, which may have been shrunk, drawn on a region.
+    fn warp<D: Channel>(
+        &self,
+        photo: ImageView<'_, D, 3>,
+        placement: &Placement,
+        region: Bounds,
+        field: Option<&DisplacementField>,
+        correction: Option<ExposureCorrection<'_>>,
+        stage: &Stage<'_>,
+    ) -> Result<WarpedPhoto<D>, Cancelled> {
+        let (shrink, interpolation) = (self.shrink(), self.options.interpolation);
+        if shrink == 1 {
+            let settings = WarpSettings { displacement: field, interpolation, correction };
+            return warp(photo, placement, &self.layout.surface, region, settings, stage);
+        }
+        let placement = Placement { view: shrunk_view(placement, shrink, photo.size()), ..*placement };
+        let field = field.map(|f| f.scaled(1.0, 1.0 / shrink as f64));
+        let settings = WarpSettings { displacement: field.as_ref(), interpolation, correction };
+        warp(photo, &placement, &self.layout.surface, region, settings, stage)
+    }
 }
 
 /// Cuts a panorama to the largest rectangle without empty pixels.
-fn crop(p: &mut Panorama, stage: &Stage<'_>) -> Result<(), Cancelled> {
+fn crop<T: Sample>(p: &mut Panorama<T>, stage: &Stage<'_>) -> Result<(), Cancelled> {
     let Some(b) = largest_rectangle(p.mask.view(), stage)? else { return Ok(()) };
     let (w, h) = (b.width(), b.height());
     p.full_circle &= w == p.image.width();
     if let Some(view) = p.image.view().crop(b.left, b.top, w, h) {
         p.image = view.to_image();
+    }
+    if let Some(view) = p.radiance.as_ref().and_then(|light| light.view().crop(b.left, b.top, w, h)) {
+        p.radiance = Some(view.to_image());
     }
     if let Some(view) = p.labels.view().crop(b.left, b.top, w, h) {
         p.labels = view.to_image();
@@ -312,8 +408,8 @@ fn crop(p: &mut Panorama, stage: &Stage<'_>) -> Result<(), Cancelled> {
 mod tests {
     use super::*;
     use crate::align::{CameraMotion, View};
-    use crate::testing::{StopAt, photograph, sky};
-    use cv_core::{Camera, Matrix3, Named, Point2, Silent, Vector3};
+    use crate::testing::{StopAt, deep_photograph, photograph, sky};
+    use cv_core::{Camera, Matrix3, Named, Point2, RgbU8, Silent, Vector3};
     use nalgebra::Rotation3;
     use std::f64::consts::TAU;
 
@@ -558,6 +654,111 @@ mod tests {
         assert!(mean(sum, n) >= darkest && white > 100, "{} {darkest} {white}", mean(sum, n));
     }
 
+    /// As a mean over neighbors in a row, how far what is drawn is from lying half-way between its neighbors, in levels of 8 bits: rounding, where the scene is smooth.
+    fn roughness<T: PhotoSample>(panorama: &Panorama<T>) -> f64 {
+        let (w, h) = panorama.image.size();
+        let (mut sum, mut n) = (0.0, 0.0);
+        for (x, y) in (2..h - 2).flat_map(|y| (2..w - 2).map(move |x| (x, y))) {
+            let near = [x - 2, x - 1, x, x + 1, x + 2].map(|x| panorama.labels.at(x, y)[0]);
+            if near.iter().all(|label| *label == near[0] && *label != NO_PHOTO) {
+                let at = |x: usize| f64::from(panorama.image.at(x, y)[1].to_f32() / T::PER_LEVEL);
+                sum += (at(x) - 0.5 * (at(x - 1) + at(x + 1))).abs();
+                n += 1.0;
+            }
+        }
+        sum / n
+    }
+
+    #[test]
+    fn sixteen_bits_are_drawn_without_rounding_to_eight() {
+        let set = Set::three();
+        // Waves of 300 px, of which neighbors differ from a straight line by 80 · 0.02² / 2 levels.
+        let scene = |ray: &Vector3<f64>| [120.0 + 80.0 * (4.0 * ray.normalize().x).sin(); 3];
+        // The middle one with a quarter of the light (IEC 61966-2-1).
+        let darker =
+            |level: f64| 255.0 * (1.055 * (((level / 255.0 + 0.055) / 1.055).powf(2.4) / 4.0).powf(1.0 / 2.4) - 0.055);
+        let views: Vec<View> = set.alignment.views.iter().map(|v| v.unwrap()).collect();
+        let light = |i: usize, ray: &Vector3<f64>| if i == 1 { scene(ray).map(darker) } else { scene(ray) };
+        let deep: Vec<_> = views.iter().enumerate().map(|(i, v)| deep_photograph(v, |ray| light(i, ray))).collect();
+        let bytes: Vec<_> = views.iter().enumerate().map(|(i, v)| photograph(v, |ray| light(i, ray))).collect();
+        let deep: Vec<_> = deep.iter().map(Image::view).collect();
+        let bytes: Vec<_> = bytes.iter().map(RgbU8::view).collect();
+        for &(_, blend) in BlendMode::NAMES {
+            let options = CompositingOptions { blend, elastic: false, ..CompositingOptions::default() };
+            let drawn = render(&deep, &set.alignment, &options, &Silent).unwrap();
+            let rounded = render(&bytes, &set.alignment, &options, &Silent).unwrap();
+            // The gain of four amplifies rounding to bytes, and the blended ones are rounded again.
+            let (fine, coarse) = (roughness(&drawn), roughness(&rounded));
+            assert!(fine < 0.03 && coarse > 0.2, "{blend:?}: {fine} {coarse}");
+            assert_eq!(drawn.gains, rounded.gains);
+        }
+    }
+
+    #[test]
+    fn sixteen_bits_of_the_same_photographs_are_the_same_panorama() {
+        let set = Set::three();
+        let deep: Vec<Image<u16, 3>> = set.photos.iter().map(|p| p.map(|c| c.map(|v| 257 * u16::from(v)))).collect();
+        let views: Vec<_> = deep.iter().map(Image::view).collect();
+        for resolution in [1.0, 0.4] {
+            for &(_, blend) in BlendMode::NAMES {
+                let options = CompositingOptions { blend, crop: true, resolution, ..CompositingOptions::default() };
+                let (eight, sixteen) =
+                    (set.render(&options), render(&views, &set.alignment, &options, &Silent).unwrap());
+                assert_eq!((eight.image.size(), &eight.gains), (sixteen.image.size(), &sixteen.gains));
+                let pixels = eight.image.as_slice().iter().zip(sixteen.image.as_slice());
+                let off = pixels.map(|(a, b)| (f64::from(*a) - f64::from(*b) / 257.0).abs());
+                // Rounding to bytes of what is averaged, drawn and blended, half a level each: more only where a seam runs elsewhere for it.
+                let far = off.filter(|off| *off > 1.5).count();
+                assert!(far * 1000 < eight.image.as_slice().len(), "{blend:?} {resolution}: {far}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_light_is_that_of_the_scene_where_one_photograph_did_not_clip_it() {
+        let set = Set::three();
+        // Light from a 30th to four times white, in waves of 100 px, as the middle one sees it; the outer two have a fifth of the exposure, and sRGB's curve (IEC 61966-2-1).
+        let light = |ray: &Vector3<f64>| {
+            let r = ray.normalize();
+            [(-1.5 + 3.5 * (12.0 * r.x + 1.0).sin() * (9.0 * r.y).cos()).exp2(); 3]
+        };
+        let level = |light: f64| {
+            let v = light.min(1.0);
+            255.0 * if v <= 0.003_130_8 { 12.92 * v } else { 1.055 * v.powf(1.0 / 2.4) - 0.055 }
+        };
+        let exposure = |i: usize| if i == 1 { 1.0 } else { 0.2 };
+        let views: Vec<View> = set.alignment.views.iter().map(|v| v.unwrap()).collect();
+        let deep: Vec<_> = views
+            .iter()
+            .enumerate()
+            .map(|(i, v)| deep_photograph(v, |ray| light(ray).map(|l| level(l * exposure(i)))))
+            .collect();
+        let deep: Vec<_> = deep.iter().map(Image::view).collect();
+        let alignment = Alignment { reference: 1, ..set.alignment.clone() };
+        for &(_, blend) in BlendMode::NAMES {
+            let options = CompositingOptions { blend, radiance: true, crop: true, ..CompositingOptions::default() };
+            let drawn = render(&deep, &alignment, &options, &Silent).unwrap();
+            let radiance = drawn.radiance.as_ref().unwrap();
+            assert_eq!(radiance.size(), drawn.image.size());
+            let (w, h) = radiance.size();
+            let (mut off, mut bright) = (Vec::new(), 0);
+            for (x, y) in (0..h).flat_map(|y| (0..w).map(move |x| (x, y))) {
+                let ray = drawn.canvas.ray(Point2::new(x as f64, y as f64));
+                let truth = light(&ray)[1];
+                // Seen by the outer ones, which do not clip 4 · 0.2; or not clipped by the middle one.
+                let outer = [0, 2].iter().any(|&i| views[i].project(&ray).is_some_and(|p| views[i].contains(p)));
+                if outer || truth < 0.9 {
+                    off.push((f64::from(radiance.at(x, y)[1]) / truth).log2().abs());
+                    bright += usize::from(truth > 1.5);
+                }
+            }
+            off.sort_by(f64::total_cmp);
+            let (median, most) = (off[off.len() / 2], off[off.len() * 98 / 100]);
+            // The preview's 8 bits tell exposures to a hundredth of a stop; the kernel, in light, and the bands where it is steepest add as much.
+            assert!(median < 0.015 && most < 0.04 && bright > 5000, "{blend:?}: {median} {most} {bright}");
+        }
+    }
+
     #[test]
     fn the_bytes_are_the_same_at_any_number_of_threads() {
         let set = Set::three();
@@ -570,6 +771,15 @@ mod tests {
             let (one, three) = (with(1), with(3));
             assert!(one.image == three.image && one.labels == three.labels, "{blend:?}");
         }
+        let deep: Vec<Image<u16, 3>> = set.photos.iter().map(|p| p.map(|c| c.map(|v| 250 * u16::from(v)))).collect();
+        let views: Vec<_> = deep.iter().map(Image::view).collect();
+        let options = CompositingOptions { radiance: true, ..CompositingOptions::default() };
+        let with = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let drawn = pool.install(|| render(&views, &set.alignment, &options, &Silent).unwrap());
+            (drawn.image, drawn.radiance)
+        };
+        assert!(with(1) == with(3));
     }
 
     /// Each pixel the complement of its photograph's.
@@ -641,8 +851,8 @@ mod tests {
     #[test]
     fn every_stage_can_be_stopped_at_any_of_its_reports() {
         let set = Set::three();
-        let options = CompositingOptions { crop: true, exposure: Exposure::Match, ..CompositingOptions::default() };
-        for stage in ["elastic", "preview", "exposure", "seams", "warp", "blend", "crop"] {
+        let options = CompositingOptions { crop: true, radiance: true, ..CompositingOptions::default() };
+        for stage in ["elastic", "preview", "exposure", "seams", "warp", "blend", "radiance", "crop"] {
             let watched = StopAt::of_stage(stage, usize::MAX);
             render(&set.views(), &set.alignment, &options, &watched).unwrap();
             assert!(watched.reports() >= 3, "{stage}: {}", watched.reports());

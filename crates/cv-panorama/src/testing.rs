@@ -60,6 +60,14 @@ pub(crate) fn photograph(view: &View, scene: impl Fn(&Vector3<f64>) -> [f64; 3])
     })
 }
 
+/// The same of 16 bits a channel; `scene` is in levels of 8 bits.
+pub(crate) fn deep_photograph(view: &View, scene: impl Fn(&Vector3<f64>) -> [f64; 3]) -> Image<u16, 3> {
+    Image::from_fn(view.camera.width, view.camera.height, |x, y| {
+        let ray = view.ray(Point2::new(x as f64, y as f64)).unwrap();
+        scene(&ray).map(|v| (257.0 * v).round() as u16)
+    })
+}
+
 /// A photograph that was drawn on these bounds of a canvas, reaching everywhere.
 pub(crate) fn drawn(bounds: Bounds, color: impl Fn(usize, usize) -> [u8; 3]) -> WarpedPhoto {
     let pixels = Image::from_fn(bounds.width(), bounds.height(), |x, y| {

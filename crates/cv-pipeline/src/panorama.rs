@@ -3,29 +3,30 @@
 use crate::Progress;
 use crate::matching::{MatchingOptions, correspondences, extract_features, match_features, rescale};
 use cv_core::{
-    Camera, Cancelled, Correspondence, DMatch, Image, ImageView, Mask, RgbU8, Scaling, Stage, StageClock, UnionFind,
+    Camera, Cancelled, Correspondence, DMatch, Image, ImageView, Mask, RgbF32, Scaling, Stage, StageClock, UnionFind,
 };
 use cv_features::{FeatureError, FeatureOptions, Features, MatchError, SiftOptions};
 use cv_panorama::{
-    AlignError, AlignOptions, Alignment, CameraMotion, Canvas, CompositingOptions, NotAPair, Photo, PhotoMap,
-    Registration, RegistrationError, RenderError, Unplaced, VerifiedPair, VerifyOptions, align, render, verify_pair,
+    AlignError, AlignOptions, Alignment, CameraMotion, Canvas, CompositingOptions, EightBits, NotAPair, Photo,
+    PhotoMap, PhotoSample, Registration, RegistrationError, RenderError, Unplaced, VerifiedPair, VerifyOptions, align,
+    render, verify_pair,
 };
 use rayon::prelude::*;
 
 /// A photograph and what is known about its camera.
 #[derive(Debug, Clone, Copy)]
-pub struct PanoramaPhoto<'a> {
-    /// The pixels, upright.
-    pub image: ImageView<'a, u8, 3>,
+pub struct PanoramaPhoto<'a, T = u8> {
+    /// The pixels, upright, of `u8` or `u16` samples.
+    pub image: ImageView<'a, T, 3>,
     /// Focal length in pixels from EXIF, where there is one.
     pub focal: Option<f64>,
     /// The calibrated camera, where there is one; its lens distortion is taken out.
     pub camera: Option<Camera>,
 }
 
-impl<'a> PanoramaPhoto<'a> {
+impl<'a, T> PanoramaPhoto<'a, T> {
     /// A photograph of which nothing else is known.
-    pub fn new(image: ImageView<'a, u8, 3>) -> Self {
+    pub fn new(image: ImageView<'a, T, 3>) -> Self {
         Self { image, focal: None, camera: None }
     }
 }
@@ -146,9 +147,11 @@ pub struct PanoramaPair {
 
 /// A panorama and how it came about.
 #[derive(Debug, Clone)]
-pub struct PanoramaResult {
-    /// The picture; black where no photograph reaches.
-    pub image: RgbU8,
+pub struct PanoramaResult<T = u8> {
+    /// The picture, as deep as the photographs; black where no photograph reaches.
+    pub image: Image<T, 3>,
+    /// The light of the scene, linear, where [`CompositingOptions::radiance`] asks for it; 1 is the white of the photograph that all others are aligned to.
+    pub radiance: Option<RgbF32>,
     /// True where a photograph reaches.
     pub mask: Mask,
     /// Which photograph each pixel is from; `u16::MAX` where none reaches.
@@ -177,7 +180,7 @@ pub struct PanoramaResult {
 /// is what is left.
 const PARALLAX: f64 = 0.005;
 
-impl PanoramaResult {
+impl<T> PanoramaResult<T> {
     /// Where the matches of a pair are, in pixels of the photographs.
     ///
     /// # Panics
@@ -237,15 +240,41 @@ impl From<RenderError> for PanoramaError {
 /// Joins overlapping photographs, in any order, to a panorama.
 ///
 /// Features on reduced photographs, matches of every pair, verification of the pairs (all of it again with finer features where some hold only loosely),
-/// alignment of all at once, drawing in full size. Photographs that do not belong are left out and say why.
+/// alignment of all at once, drawing in full size. Photographs that do not belong are left out and say why. They are of `u8` or of `u16` samples, and so is the panorama; where they belong
+/// is found on 8 bits of them.
 ///
 /// # Errors
 /// [`PanoramaError`]: fewer than two photographs belong together, or the canvas would be too large.
-pub fn panorama(
+pub fn panorama<T: PhotoSample>(
+    photos: &[PanoramaPhoto<'_, T>],
+    options: &PanoramaOptions,
+    progress: &dyn Progress,
+) -> Result<PanoramaResult<T>, PanoramaError> {
+    let views: Vec<_> = photos.iter().map(|photo| photo.image).collect();
+    let found = {
+        let eight = EightBits::new(&views, "features", progress)?;
+        let bytes = eight.views().into_iter().zip(photos);
+        let bytes: Vec<_> = bytes.map(|(image, p)| PanoramaPhoto { image, focal: p.focal, camera: p.camera }).collect();
+        register(&bytes, options, progress)?
+    };
+    draw(&views, found, &options.render, progress)
+}
+
+/// What is known of photographs before the panorama is drawn.
+struct Registered {
+    alignment: Alignment,
+    images: Vec<PanoramaImage>,
+    pairs: Vec<PanoramaPair>,
+    features: Vec<Features>,
+    clock: StageClock,
+}
+
+/// Where photographs belong, from their features.
+fn register(
     photos: &[PanoramaPhoto<'_>],
     options: &PanoramaOptions,
     progress: &dyn Progress,
-) -> Result<PanoramaResult, PanoramaError> {
+) -> Result<Registered, PanoramaError> {
     let mut clock = StageClock::new();
     let n = photos.len();
     let candidates: Vec<(usize, usize)> = (0..n).flat_map(|a| (a + 1..n).map(move |b| (a, b))).collect();
@@ -299,9 +328,8 @@ pub fn panorama(
     }
     let alignment = alignment.resized(&sizes);
     clock.lap("align");
-    let views: Vec<ImageView<'_, u8, 3>> = photos.iter().map(|p| p.image).collect();
     let features = prepared.into_iter().map(Prepared::into_features).collect();
-    draw(&views, alignment, images, (pairs, features), &options.render, clock, progress)
+    Ok(Registered { alignment, images, pairs, features, clock })
 }
 
 /// Joins photographs whose views are known from others: the next frames of a rig, another exposure of the same views.
@@ -311,12 +339,12 @@ pub fn panorama(
 ///
 /// # Errors
 /// [`PanoramaError`]: the photographs are not as registered, or the canvas would be too large.
-pub fn panorama_with(
+pub fn panorama_with<T: PhotoSample>(
     registration: &Registration,
-    photos: &[ImageView<'_, u8, 3>],
+    photos: &[ImageView<'_, T, 3>],
     options: &CompositingOptions,
     progress: &dyn Progress,
-) -> Result<PanoramaResult, PanoramaError> {
+) -> Result<PanoramaResult<T>, PanoramaError> {
     let sizes: Vec<_> = photos.iter().map(ImageView::size).collect();
     registration.check_photographs(&sizes)?;
     let alignment = registration.alignment();
@@ -333,19 +361,18 @@ pub fn panorama_with(
         gain: [1.0; 3],
     });
     let images = images.collect();
-    draw(photos, alignment, images, (Vec::new(), Vec::new()), options, StageClock::new(), progress)
+    let found = Registered { alignment, images, pairs: Vec::new(), features: Vec::new(), clock: StageClock::new() };
+    draw(photos, found, options, progress)
 }
 
 /// The picture, and what is to be told of it.
-fn draw(
-    photos: &[ImageView<'_, u8, 3>],
-    alignment: Alignment,
-    mut images: Vec<PanoramaImage>,
-    (pairs, features): (Vec<PanoramaPair>, Vec<Features>),
+fn draw<T: PhotoSample>(
+    photos: &[ImageView<'_, T, 3>],
+    found: Registered,
     options: &CompositingOptions,
-    mut clock: StageClock,
     progress: &dyn Progress,
-) -> Result<PanoramaResult, PanoramaError> {
+) -> Result<PanoramaResult<T>, PanoramaError> {
+    let Registered { alignment, mut images, pairs, features, mut clock } = found;
     for (image, view) in images.iter_mut().zip(&alignment.views) {
         image.focal = view.as_ref().ok().filter(|_| alignment.motion == CameraMotion::Rotation).map(|v| v.camera.fx);
     }
@@ -358,6 +385,7 @@ fn draw(
     }
     Ok(PanoramaResult {
         image: drawn.image,
+        radiance: drawn.radiance,
         mask: drawn.mask,
         labels: drawn.labels,
         images,

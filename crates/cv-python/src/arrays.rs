@@ -1,7 +1,7 @@
 //! Arrays borrowed as images, and results given away as arrays without a copy.
 
 use crate::errors::of_argument;
-use cv_core::{GrayF32, Image, ImageView, Mask, RgbU8, Sample};
+use cv_core::{GrayF32, Image, ImageView, Mask, Sample};
 use numpy::{
     Element, IxDyn, PyArray, PyArray1, PyArrayDescrMethods, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn,
     PyUntypedArray, PyUntypedArrayMethods, dtype,
@@ -113,7 +113,7 @@ impl<'py> ImageArg<'py> {
         }
     }
 
-    fn kind(&self) -> &'static str {
+    pub(crate) fn kind(&self) -> &'static str {
         match self {
             Self::U8(_) => "uint8",
             Self::U16(_) => "uint16",
@@ -122,25 +122,17 @@ impl<'py> ImageArg<'py> {
     }
 }
 
-/// A color image of bytes: borrowed where it is one, made where it is gray.
-pub(crate) enum Rgb<'py> {
-    Borrowed(Borrowed<'py, u8>),
-    Made(RgbU8),
+/// A color image, of bytes where nothing else is said: borrowed where it is one, made where it is gray.
+pub(crate) enum Rgb<'py, T: Element = u8> {
+    Borrowed(Borrowed<'py, T>),
+    Made(Image<T, 3>),
 }
 
 impl<'py> Rgb<'py> {
     /// Borrows an array of bytes; gray ones become color ones. Deeper ones are refused: which 8 of their bits matter, the caller knows.
     pub(crate) fn new(given: &Bound<'py, PyAny>, what: &str) -> PyResult<Self> {
         match ImageArg::new(given, what)? {
-            ImageArg::U8(borrowed) => match borrowed.view::<1>() {
-                Some(gray) => {
-                    let made = RgbU8::from_fn(gray.width(), gray.height(), |x, y| [gray.at(x, y)[0]; 3]);
-                    // Of a list of large ones, that takes long.
-                    given.py().check_signals()?;
-                    Ok(Self::Made(made))
-                }
-                None => Ok(Self::Borrowed(borrowed)),
-            },
+            ImageArg::U8(borrowed) => Self::of(given.py(), borrowed),
             other => {
                 let text = format!(
                     "{what}: dtype {} where uint8 is needed; scale it to 0 to 255 and use .astype(np.uint8)",
@@ -150,8 +142,19 @@ impl<'py> Rgb<'py> {
             }
         }
     }
+}
 
-    pub(crate) fn view(&self) -> PyResult<ImageView<'_, u8, 3>> {
+impl<'py, T: Element + Sample> Rgb<'py, T> {
+    /// A borrowed image as one of color.
+    pub(crate) fn of(py: Python<'py>, borrowed: Borrowed<'py, T>) -> PyResult<Self> {
+        let Some(gray) = borrowed.view::<1>() else { return Ok(Self::Borrowed(borrowed)) };
+        let made = Image::from_fn(gray.width(), gray.height(), |x, y| [gray.at(x, y)[0]; 3]);
+        // Of a list of large ones, that takes long.
+        py.check_signals()?;
+        Ok(Self::Made(made))
+    }
+
+    pub(crate) fn view(&self) -> PyResult<ImageView<'_, T, 3>> {
         match self {
             Self::Made(image) => Ok(image.view()),
             Self::Borrowed(borrowed) => {

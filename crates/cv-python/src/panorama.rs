@@ -1,20 +1,26 @@
 //! Panoramas.
 
-use crate::arrays;
+use crate::arrays::{self, ImageArg, Rgb};
 use crate::camera::PyCamera;
 use crate::errors::{internal, reason, refused};
 use crate::job::Run;
 use crate::matching::feature_method;
 use crate::options::Options;
-use crate::photographs::{Ended, Photograph, Source};
+use crate::photographs::{self, Ended};
 use crate::results::{self, object};
-use cv_core::Camera;
-use cv_pipeline::panorama_types::{Framing, Registration};
-use cv_pipeline::{FeatureOptions, PanoramaOptions, PanoramaPhoto, panorama as join, panorama_with as join_with};
-use pyo3::exceptions::PyValueError;
+use cv_core::{Camera, Image, ImageView, Progress, Sample};
+use cv_io::{DynImage, ExifInfo, IoError, Metadata};
+use cv_pipeline::panorama_types::{Framing, PhotoSample, Registration};
+use cv_pipeline::{
+    FeatureOptions, PanoramaError, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama as join,
+    panorama_with as join_with,
+};
+use numpy::Element;
+use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 use rayon::prelude::*;
+use std::path::{Path, PathBuf};
 
 /// The options of `panorama`.
 pub(crate) struct Arguments {
@@ -82,9 +88,161 @@ fn framing(options: &mut Options<'_>) -> PyResult<Framing> {
     Ok(framing)
 }
 
+/// A photograph that was given, as deep as it is.
+enum Photograph<'py> {
+    Bytes(Rgb<'py, u8>),
+    Words(Rgb<'py, u16>),
+    File(PathBuf),
+}
+
+impl<'py> Photograph<'py> {
+    /// An array of bytes or of 16 bits, or the path of a file.
+    fn new(given: &Bound<'py, PyAny>, what: &str) -> PyResult<Self> {
+        if let Ok(path) = given.extract::<PathBuf>() {
+            return Ok(Self::File(path));
+        }
+        match ImageArg::new(given, what)? {
+            ImageArg::U8(borrowed) => Rgb::of(given.py(), borrowed).map(Self::Bytes),
+            ImageArg::U16(borrowed) => Rgb::of(given.py(), borrowed).map(Self::Words),
+            other @ ImageArg::F32(_) => {
+                let text = format!(
+                    "{what}: dtype {} where uint8 or uint16 is needed; scale it to 0 to 255 and use .astype(np.uint8)",
+                    other.kind()
+                );
+                Err(PyTypeError::new_err(text))
+            }
+        }
+    }
+
+    /// The same for threads without the interpreter.
+    fn source(&self) -> PyResult<Source<'_>> {
+        Ok(match self {
+            Self::Bytes(array) => Source::Bytes(array.view()?),
+            Self::Words(array) => Source::Words(array.view()?),
+            Self::File(path) => Source::File(path),
+        })
+    }
+}
+
+/// Where the pixels of a photograph are.
+#[derive(Clone, Copy)]
+enum Source<'a> {
+    Bytes(ImageView<'a, u8, 3>),
+    Words(ImageView<'a, u16, 3>),
+    File(&'a Path),
+}
+
+/// A photograph in memory.
+enum Read<'a> {
+    Bytes(ImageView<'a, u8, 3>),
+    Words(ImageView<'a, u16, 3>),
+    File(Box<DynImage>),
+}
+
+impl<'a> Source<'a> {
+    fn read(self) -> Result<Read<'a>, IoError> {
+        Ok(match self {
+            Self::Bytes(view) => Read::Bytes(view),
+            Self::Words(view) => Read::Words(view),
+            Self::File(path) => Read::File(Box::new(cv_io::read_image(path)?)),
+        })
+    }
+}
+
+/// The pixels of a photograph in the depth that all have.
+enum Pixels<'a, T> {
+    View(ImageView<'a, T, 3>),
+    Made(Image<T, 3>),
+}
+
+impl<T: Sample> Pixels<'_, T> {
+    fn view(&self) -> ImageView<'_, T, 3> {
+        match self {
+            Self::View(view) => *view,
+            Self::Made(image) => image.view(),
+        }
+    }
+}
+
+impl<'a> Read<'a> {
+    fn is_deep(&self) -> bool {
+        match self {
+            Self::Bytes(_) => false,
+            Self::Words(_) => true,
+            Self::File(image) => matches!(image.pixels, cv_io::Pixels::Gray16(_) | cv_io::Pixels::Rgb16(_)),
+        }
+    }
+
+    /// The focal length in px by EXIF.
+    fn focal(&self) -> Option<f64> {
+        match self {
+            Self::File(image) => image.exif.focal.as_ref().map(|focal| focal.pixels),
+            _ => None,
+        }
+    }
+
+    fn into_bytes(self) -> Pixels<'a, u8> {
+        match self {
+            Self::Bytes(view) => Pixels::View(view),
+            Self::Words(view) => Pixels::Made(as_file(view.to_image()).into_rgb8()),
+            Self::File(image) => Pixels::Made(image.into_rgb8()),
+        }
+    }
+
+    fn into_words(self) -> Pixels<'a, u16> {
+        match self {
+            Self::Bytes(view) => Pixels::Made(as_file(view.to_image()).into_rgb16()),
+            Self::Words(view) => Pixels::View(view),
+            Self::File(image) => Pixels::Made(image.into_rgb16()),
+        }
+    }
+}
+
+/// The pixels of a photograph in one depth, and its focal length.
+fn in_depth<'a, T>(read: Read<'a>, pixels: impl Fn(Read<'a>) -> Pixels<'a, T>) -> (Pixels<'a, T>, Option<f64>) {
+    let focal = read.focal();
+    (pixels(read), focal)
+}
+
+/// An array as a file would have it.
+fn as_file(pixels: impl Into<cv_io::Pixels>) -> DynImage {
+    DynImage { pixels: pixels.into(), exif: ExifInfo::default(), metadata: Metadata::default() }
+}
+
+/// What came of photographs, as deep as the deepest of them.
+enum Joined {
+    Bytes(PanoramaResult),
+    Words(PanoramaResult<u16>),
+}
+
+impl Arguments {
+    fn join<T: PhotoSample>(
+        &self,
+        photographs: &[(Pixels<'_, T>, Option<f64>)],
+        progress: &dyn Progress,
+    ) -> Result<PanoramaResult<T>, Ended<PanoramaError>> {
+        let photos: Vec<PanoramaPhoto<'_, T>> = photographs
+            .iter()
+            .map(|(pixels, exif)| PanoramaPhoto {
+                image: pixels.view(),
+                focal: self.focal.or(*exif),
+                camera: self.camera,
+            })
+            .collect();
+        let joined = match &self.registration {
+            Some(registration) => {
+                let photos: Vec<_> = photos.iter().map(|photo| photo.image).collect();
+                join_with(registration, &photos, &self.options.render, progress)
+            }
+            None => join(&photos, &self.options, progress),
+        };
+        joined.map_err(Ended::Job)
+    }
+}
+
 /// Joins overlapping photographs, in any order, to one picture.
 ///
-/// photographs: arrays of uint8 or paths. camera: the calibrated Camera that took all of them; focal: about the focal length in px, else EXIF tells, or the photographs do.
+/// photographs: arrays of uint8 or uint16 (65535 is white), or paths; where one has 16 bits, so does the picture. camera: the calibrated Camera that took all of them; focal: about the focal length in px, else EXIF tells, or the photographs do.
 /// fov: degrees across, or (across, up); center: degrees to the right of the photographs' middle and above the horizon, (yaw, pitch); roll: degrees clockwise.
 /// registration: that of a `Panorama` of the same views (or the text of a file of `cv panorama --save-registration`), with which nothing is matched; `camera`, `focal`, `mode` and `features` then mean nothing.
 /// `defaults("panorama")` lists the options.
@@ -98,25 +256,26 @@ pub(crate) fn panorama<'py>(
     let mut options = Options::new("panorama", options);
     let arguments = Arguments::read(&mut options)?;
     options.finish()?;
-    let photographs = Photograph::all(photographs)?;
+    let photographs = photographs::Photograph::each(photographs, Photograph::new)?;
     let sources = photographs.iter().map(Photograph::source).collect::<PyResult<Vec<_>>>()?;
-    let Arguments { options, camera, focal, registration, run } = &arguments;
-    let found = run.run(py, |progress| {
+    let found = arguments.run.run(py, |progress| {
         let read: Vec<_> =
-            sources.par_iter().map(|source| Source::read(*source)).collect::<Result<_, _>>().map_err(Ended::File)?;
-        let photos: Vec<PanoramaPhoto<'_>> = read
-            .iter()
-            .map(|(pixels, exif)| PanoramaPhoto { image: pixels.view(), focal: focal.or(*exif), camera: *camera })
-            .collect();
-        let joined = match registration {
-            Some(registration) => {
-                let photos: Vec<_> = photos.iter().map(|photo| photo.image).collect();
-                join_with(registration, &photos, &options.render, progress)
-            }
-            None => join(&photos, options, progress),
-        };
-        joined.map_err(Ended::Job)
+            sources.par_iter().map(|source| source.read()).collect::<Result<_, _>>().map_err(Ended::File)?;
+        if read.iter().any(Read::is_deep) {
+            let read: Vec<_> = read.into_par_iter().map(|r| in_depth(r, Read::into_words)).collect();
+            arguments.join(&read, progress).map(Joined::Words)
+        } else {
+            let read: Vec<_> = read.into_par_iter().map(|r| in_depth(r, Read::into_bytes)).collect();
+            arguments.join(&read, progress).map(Joined::Bytes)
+        }
     })?;
+    match found {
+        Joined::Bytes(found) => made(py, found),
+        Joined::Words(found) => made(py, found),
+    }
+}
+
+fn made<T: PhotoSample + Element>(py: Python<'_>, found: PanoramaResult<T>) -> PyResult<Bound<'_, PyAny>> {
     let registration = found.registration(&[]).map_err(|error| refused(py, &error))?;
     let registration = serde_json::to_string(&registration).map_err(|error| internal(&error.to_string()))?;
     let shows_parallax = found.shows_parallax();

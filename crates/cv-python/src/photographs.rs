@@ -27,11 +27,6 @@ impl<'py> Photograph<'py> {
         }
     }
 
-    /// Every photograph of a list.
-    pub(crate) fn all(given: &Bound<'py, PyAny>) -> PyResult<Vec<Self>> {
-        Self::each(given, Self::new)
-    }
-
     /// What each of a list is read as, by a name for errors.
     pub(crate) fn each<T>(
         given: &Bound<'py, PyAny>,

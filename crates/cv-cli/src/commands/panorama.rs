@@ -3,13 +3,13 @@
 mod registration;
 mod report;
 
-use crate::frame::{
-    Context, Failure, Global, Outcome, Output, PICTURE, Run, Step, expand_images, named, spare_inputs, steps,
-};
+use crate::frame::{Context, Failure, Global, Outcome, Output, Run, Step, expand_images, named, spare_inputs, steps};
 use crate::{rig, words};
-use cv_core::Image;
-use cv_io::Metadata;
-use cv_pipeline::panorama_types::{BlendMode, CameraMotion, Exposure, Framing, Projection, Seams};
+use cv_core::{Image, ImageView};
+use cv_io::{DynImage, Metadata, Pixels, PngPixels};
+use cv_pipeline::panorama_types::{
+    BlendMode, CameraMotion, EightBits, Exposure, Framing, PhotoSample, Projection, Registration, Seams,
+};
 use cv_pipeline::{
     FeatureMethod, FeatureOptions, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama, panorama_with,
 };
@@ -18,6 +18,9 @@ use serde_json::json;
 use std::collections::btree_map::{BTreeMap, Entry};
 use std::path::{Path, PathBuf};
 
+/// What a panorama may be written as.
+const ENDINGS: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff", "exr"];
+
 /// Join overlapping photographs to one picture.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
@@ -25,6 +28,8 @@ use std::path::{Path, PathBuf};
     cv panorama holiday/ -o pano.jpg --projection spherical --crop\n  \
     cv panorama a.jpg b.jpg c.jpg -o pano.png --blend poisson --report out/\n  \
     cv panorama a.jpg b.jpg c.jpg -o pano.png --alpha\n  \
+    cv panorama raw16/*.tif -o pano.tif\n  \
+    cv panorama window/*.jpg -o light.exr\n  \
     cv panorama wide/ -o pano.png --camera cam.yaml\n  \
     cv panorama wall/ -o plan.tif --mode plane\n  \
     cv panorama street/ -o wide.png --projection panini --fov 150,80\n  \
@@ -37,7 +42,9 @@ pub(crate) struct Args {
     /// Photographs in any order, or folders of them. Those that do not belong are left out.
     #[arg(required = true, value_name = "IMAGES")]
     images: Vec<PathBuf>,
-    /// Where to write the panorama: .png or .jpg.
+    /// Where to write the panorama: .png, .tif or .jpg; the first two have 16 bits a channel where a photograph has. Or .exr, the light of the scene: linear, 32-bit floats, the
+    /// camera's curve, exposures and vignetting undone, what one photograph clipped taken from another that did not. There 1 is the light that is white in the middle of the photograph that
+    /// all others are aligned to, and brighter light is more.
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// What the photographs are of: all around one place (rotation), or something flat from many places, such as a map, a wall or the ground (plane), drawn as a
@@ -71,7 +78,7 @@ pub(crate) struct Args {
     /// Cut the result to the largest rectangle without empty pixels.
     #[arg(long)]
     crop: bool,
-    /// Transparent instead of black where no photograph reaches; for .png.
+    /// Transparent instead of black where no photograph reaches; for .png and .tif.
     #[arg(long)]
     alpha: bool,
     /// Size relative to the photographs.
@@ -133,6 +140,7 @@ impl Args {
         options.render.seams = self.seams;
         options.render.exposure = self.exposure;
         options.render.crop = self.crop;
+        options.render.radiance = self.ends_in(&["exr"]);
         options.render.resolution = self.scale;
         options.matching.features = PanoramaOptions::features(FeatureOptions::from(self.features));
         if let Some(seed) = context.seed {
@@ -145,7 +153,7 @@ impl Args {
 impl Run for Args {
     fn outputs(&self) -> Vec<Output<'_>> {
         let registration = self.save_registration.as_deref().map(|path| Output::File(path, registration::ENDINGS));
-        [Output::File(&self.output, PICTURE)].into_iter().chain(registration).collect()
+        [Output::File(&self.output, ENDINGS)].into_iter().chain(registration).collect()
     }
 
     fn has_no_use_for(&self) -> &'static [Global] {
@@ -162,64 +170,97 @@ impl Run for Args {
         if !(self.scale > 0.0 && self.scale <= 10.0) {
             return Err(Failure::usage(format!("--scale {} is not between 0 and 10", self.scale)));
         }
-        let ending = self.output.extension().unwrap_or_default();
-        if self.alpha && ["jpg", "jpeg"].iter().any(|jpeg| ending.eq_ignore_ascii_case(jpeg)) {
+        let is_jpeg = self.ends_in(&["jpg", "jpeg"]);
+        if self.alpha && is_jpeg {
             return Err(Failure::usage("--alpha needs a .png or .tif: JPEG has no transparency"));
+        }
+        if self.alpha && self.ends_in(&["exr"]) {
+            return Err(Failure::usage("--alpha needs a .png or .tif: the .exr written here has none"));
         }
         let registration = self.registration.as_deref().map(|path| registration::read(path, context)).transpose()?;
         let paths = expand_images(&self.images)?;
         let results: Vec<PathBuf> = [&self.output].into_iter().chain(&self.save_registration).cloned().collect();
         let inputs: Vec<&Path> = paths.iter().chain(&self.registration).map(PathBuf::as_path).collect();
         spare_inputs(&results, &inputs)?;
-        let pictures = paths
-            .par_iter()
-            .map(|path| {
-                let picture = cv_io::read_image(path)?;
-                let metadata = picture.metadata.clone();
-                Ok((picture.exif.focal.as_ref().map(|focal| focal.pixels), metadata, picture.into_rgb8()))
-            })
-            .collect::<Result<Vec<_>, cv_io::IoError>>()?;
+        let pictures = paths.par_iter().map(cv_io::read_image).collect::<Result<Vec<_>, _>>()?;
+        let known: Vec<_> =
+            pictures.iter().map(|p| (p.exif.focal.as_ref().map(|focal| focal.pixels), p.metadata.clone())).collect();
+        let is_deep = |picture: &DynImage| matches!(picture.pixels, Pixels::Gray16(_) | Pixels::Rgb16(_));
+        if !is_jpeg && pictures.iter().any(is_deep) {
+            let images: Vec<_> = pictures.into_par_iter().map(DynImage::into_rgb16).collect();
+            self.join(&paths, &images, &known, registration.as_ref(), context)
+        } else {
+            let images: Vec<_> = pictures.into_par_iter().map(DynImage::into_rgb8).collect();
+            self.join(&paths, &images, &known, registration.as_ref(), context)
+        }
+    }
+}
+
+impl Args {
+    /// Whether the panorama is to be of one of these kinds.
+    fn ends_in(&self, endings: &[&str]) -> bool {
+        let own = self.output.extension().unwrap_or_default();
+        endings.iter().any(|ending| own.eq_ignore_ascii_case(ending))
+    }
+
+    /// The panorama of photographs of which the focal lengths by EXIF and the metadata are known, in their own depth.
+    fn join<T>(
+        &self,
+        paths: &[PathBuf],
+        images: &[Image<T, 3>],
+        known: &[(Option<f64>, Metadata)],
+        registration: Option<&Registration>,
+        context: &Context,
+    ) -> Result<Outcome, Failure>
+    where
+        T: PhotoSample,
+        for<'a> ImageView<'a, T, 3>: PngPixels,
+        for<'a> ImageView<'a, T, 4>: PngPixels,
+    {
         // Of photographs of one size the camera is read once.
         let mut cameras = BTreeMap::new();
         if let Some(path) = &self.camera {
-            for (.., image) in &pictures {
+            for image in images {
                 if let Entry::Vacant(place) = cameras.entry(image.size()) {
                     place.insert(rig::camera(path, Some(image.size()), context)?);
                 }
             }
         }
-        let photos: Vec<PanoramaPhoto<'_>> = pictures
+        let photos: Vec<PanoramaPhoto<'_, T>> = images
             .iter()
-            .map(|(focal, _, image)| PanoramaPhoto {
+            .zip(known)
+            .map(|(image, (focal, _))| PanoramaPhoto {
                 image: image.view(),
                 focal: *focal,
                 camera: cameras.get(&image.size()).copied(),
             })
             .collect();
         let options = self.options(context);
-        let result = match &registration {
+        let result = match registration {
             Some(registration) => {
                 let photos: Vec<_> = photos.iter().map(|photo| photo.image).collect();
                 panorama_with(registration, &photos, &options.render, context)
             }
             None => panorama(&photos, &options, context),
         };
-        let result = result.map_err(|error| words::no_panorama(error, &paths))?;
-        let files: Vec<&Metadata> = pictures.iter().map(|(_, metadata, _)| metadata).collect();
+        let result = result.map_err(|error| words::no_panorama(error, paths))?;
+        let files: Vec<&Metadata> = known.iter().map(|(_, metadata)| metadata).collect();
         let metadata = metadata(&files, &result);
-        context.write(Output::File(&self.output, PICTURE), |path| {
-            if self.alpha {
+        context.write(Output::File(&self.output, ENDINGS), |path| {
+            if let Some(radiance) = &result.radiance {
+                cv_io::write_exr(path, radiance.view())
+            } else if self.alpha {
                 cv_io::write_image(path, transparent(&result).view(), &metadata)
             } else {
                 cv_io::write_image(path, result.image.view(), &metadata)
             }
         })?;
         if let Some(path) = &self.save_registration {
-            registration::write(path, &result, &paths, context)?;
+            registration::write(path, &result, paths, context)?;
         }
         for (path, image) in paths.iter().zip(&result.images) {
             if let Some(reason) = &image.reason {
-                context.warn(format!("{} is not in the panorama: {}", path.display(), words::left_out(reason, &paths)));
+                context.warn(format!("{} is not in the panorama: {}", path.display(), words::left_out(reason, paths)));
             }
         }
         if result.shows_parallax() {
@@ -236,31 +277,31 @@ impl Run for Args {
             ));
         }
         context.report(|| {
-            let photos: Vec<_> = pictures.into_iter().map(|(.., image)| image).collect();
-            report::report(&paths, &photos, &result)
+            let photos: Vec<_> = images.iter().chain([&result.image]).map(Image::view).collect();
+            report::report(paths, &EightBits::new(&photos, "report", context)?.views(), &result)
         })?;
-        Ok(outcome(&paths, &result))
+        Ok(outcome(paths, &result))
     }
 }
 
 /// The metadata of the photograph that all others are aligned to; the color profile only where those used have the same.
-fn metadata(files: &[&Metadata], result: &PanoramaResult) -> Metadata {
+fn metadata<T>(files: &[&Metadata], result: &PanoramaResult<T>) -> Metadata {
     let Some(reference) = files.get(result.alignment.reference) else { return Metadata::default() };
     let mut used = files.iter().zip(&result.images).filter(|(_, image)| image.used);
     let icc = reference.icc.clone().filter(|_| used.all(|(file, _)| file.icc == reference.icc));
     Metadata { exif: reference.exif.clone(), icc }
 }
 
-/// The picture with an opacity of 255 where a photograph reaches and 0 elsewhere.
-fn transparent(result: &PanoramaResult) -> Image<u8, 4> {
+/// The picture, opaque where a photograph reaches and clear elsewhere.
+fn transparent<T: PhotoSample>(result: &PanoramaResult<T>) -> Image<T, 4> {
     let (w, h) = result.image.size();
     Image::from_fn(w, h, |x, y| {
         let [r, g, b] = result.image.at(x, y);
-        [r, g, b, if result.mask.at(x, y)[0] { 255 } else { 0 }]
+        [r, g, b, if result.mask.at(x, y)[0] { T::WHITE } else { T::default() }]
     })
 }
 
-fn outcome(paths: &[PathBuf], result: &PanoramaResult) -> Outcome {
+fn outcome<T: PhotoSample>(paths: &[PathBuf], result: &PanoramaResult<T>) -> Outcome {
     let images: Vec<_> = paths
         .iter()
         .zip(&result.images)
@@ -277,6 +318,7 @@ fn outcome(paths: &[PathBuf], result: &PanoramaResult) -> Outcome {
         .with("reprojection_rms_px", result.reprojection_rms_px)
         .with("projection", result.canvas.projection.to_string())
         .with("mode", result.alignment.motion.to_string())
+        .with("bits", if result.radiance.is_some() { 32 } else { 8 * size_of::<T>() })
         .summary(format!(
             "{used} of {} photographs, {w} x {h} pixels, {}, matches agree to {:.2} px (RMS)",
             paths.len(),

@@ -1,8 +1,9 @@
 //! A linear transition across the seams.
 
 use crate::blend::{Blender, Composition, NO_PHOTO};
+use crate::depth::Channel;
 use crate::rows::{asks, for_each_row};
-use cv_core::{Cancelled, Progress, RgbU8, Stage};
+use cv_core::{Cancelled, Image, Progress, Stage};
 
 /// Half the width of the transition in pixels.
 const RADIUS: usize = 8;
@@ -10,8 +11,8 @@ const RADIUS: usize = 8;
 /// Photographs weighted by the share of the labels in the square of `2 · RADIUS + 1` around each pixel that name them.
 pub(crate) struct Feather;
 
-impl Blender for Feather {
-    fn blend(&self, composition: &Composition<'_>, progress: &dyn Progress) -> Result<RgbU8, Cancelled> {
+impl<T: Channel> Blender<T> for Feather {
+    fn blend(&self, composition: &Composition<'_, T>, progress: &dyn Progress) -> Result<Image<T, 3>, Cancelled> {
         let (photos, labels) = (composition.photos, composition.labels);
         let (w, h) = labels.size();
         let stage = Stage::new(progress, "blend", photos.len() + 1)?;
@@ -52,9 +53,9 @@ impl Blender for Feather {
                 }
                 let out = &mut sums[(b.top + y) * w + b.left..][..pw];
                 for ((out, p), weight) in out.iter_mut().zip(photo.pixels.row(y).as_chunks::<4>().0).zip(&column) {
-                    if p[3] > 0 && *weight > 0.5 {
+                    if p[3] != T::default() && *weight > 0.5 {
                         for c in 0..3 {
-                            out[c] += weight * f32::from(p[c]);
+                            out[c] += weight * p[c].to_f32();
                         }
                         out[3] += weight;
                     }
@@ -62,12 +63,12 @@ impl Blender for Feather {
             }
             stage.add(1)?;
         }
-        let mut image = RgbU8::new(w, h, [0; 3]);
+        let mut image = Image::new(w, h, [T::default(); 3]);
         for_each_row(image.as_mut_slice(), 3 * w, &stage, |y, row| {
             let sums = &sums[y * w..(y + 1) * w];
             for ((out, s), l) in row.as_chunks_mut::<3>().0.iter_mut().zip(sums).zip(labels.row(y)) {
                 if *l != NO_PHOTO {
-                    *out = [0, 1, 2].map(|c| (s[c] / s[3].max(1e-6) + 0.5) as u8);
+                    *out = [0, 1, 2].map(|c| T::from_f32(s[c] / s[3].max(1e-6)));
                 }
             }
         })?;
@@ -81,7 +82,7 @@ mod tests {
     use super::*;
     use crate::surface::{Bounds, WarpedPhoto};
     use crate::testing::drawn;
-    use cv_core::{Image, Silent};
+    use cv_core::Silent;
 
     /// The definition: at each pixel the mean of the photographs that reach it, weighted by how many labels around name them.
     fn plain(photos: &[Option<WarpedPhoto>], labels: &Image<u16, 1>, x: usize, y: usize) -> [f64; 3] {

@@ -1,14 +1,15 @@
 //! Every pixel from the photograph that its label names.
 
 use crate::blend::{Blender, Composition};
+use crate::depth::Channel;
 use crate::rows::for_each_row;
-use cv_core::{Cancelled, Progress, RgbU8, Stage};
+use cv_core::{Cancelled, Image, Progress, Stage};
 
 /// No blending.
 pub(crate) struct HardSeams;
 
-impl Blender for HardSeams {
-    fn blend(&self, composition: &Composition<'_>, progress: &dyn Progress) -> Result<RgbU8, Cancelled> {
+impl<T: Channel> Blender<T> for HardSeams {
+    fn blend(&self, composition: &Composition<'_, T>, progress: &dyn Progress) -> Result<Image<T, 3>, Cancelled> {
         let stage = Stage::new(progress, "blend", 1)?;
         let image = copy(composition, &stage)?;
         stage.add(1)?;
@@ -17,9 +18,9 @@ impl Blender for HardSeams {
 }
 
 /// The picture with hard seams.
-pub(crate) fn copy(composition: &Composition<'_>, stage: &Stage<'_>) -> Result<RgbU8, Cancelled> {
+pub(crate) fn copy<T: Channel>(composition: &Composition<'_, T>, stage: &Stage<'_>) -> Result<Image<T, 3>, Cancelled> {
     let (w, h) = composition.labels.size();
-    let mut image = RgbU8::new(w, h, [0; 3]);
+    let mut image = Image::new(w, h, [T::default(); 3]);
     for_each_row(image.as_mut_slice(), 3 * w, stage, |y, row| {
         for ((x, out), label) in row.as_chunks_mut::<3>().0.iter_mut().enumerate().zip(composition.labels.row(y)) {
             if let Some(Some(p)) = composition.photos.get(usize::from(*label)) {
@@ -37,7 +38,7 @@ mod tests {
     use crate::blend::NO_PHOTO;
     use crate::surface::Bounds;
     use crate::testing::drawn;
-    use cv_core::{Image, Silent};
+    use cv_core::Silent;
 
     #[test]
     fn each_pixel_is_that_of_its_photograph() {

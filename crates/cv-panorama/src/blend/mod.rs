@@ -8,26 +8,27 @@ mod hard_seams;
 mod multiband;
 mod poisson;
 
+use crate::depth::{Channel, PhotoSample};
 use crate::surface::WarpedPhoto;
-use cv_core::{Cancelled, Image, Progress, RgbU8, named};
+use cv_core::{Cancelled, Image, Progress, named};
 
 /// The label of canvas pixels that no photograph reaches.
 pub const NO_PHOTO: u16 = u16::MAX;
 
 /// Photographs drawn on a canvas, and which of them each pixel is to be taken from.
 #[derive(Debug, Clone, Copy)]
-pub struct Composition<'a> {
+pub struct Composition<'a, T = u8> {
     /// The photographs, exposure evened out, in an order that depends on their places only; `None` where no label names one. Each
     /// reaches beyond the pixels of its label as [`Blender::pyramid_levels`] asks.
-    pub photos: &'a [Option<WarpedPhoto>],
+    pub photos: &'a [Option<WarpedPhoto<T>>],
     /// For each canvas pixel an index into `photos`, [`NO_PHOTO`] where none reaches. A photograph reaches every pixel of its label.
     pub labels: &'a Image<u16, 1>,
     /// Median over the photographs of the square root of their area on the canvas, in pixels.
     pub typical_side: f64,
 }
 
-/// Joins photographs at the seams between their labels.
-pub trait Blender: Sync {
+/// Joins photographs at the seams between their labels. One that is for bytes and for samples of 16 bits is implemented for both.
+pub trait Blender<T: Channel = u8>: Sync {
     /// How far photographs must be drawn beyond the pixels of their labels, as the levels of a pyramid above its base: each is drawn on
     /// the box around its pixels, grown by `2 · 2^levels` pixels and rounded out to multiples of `2^levels` (within the canvas). Where a
     /// photograph does not reach, its edge pixels are repeated with an opacity of 0. Default 4: 32 pixels.
@@ -40,7 +41,7 @@ pub trait Blender: Sync {
     ///
     /// # Errors
     /// [`Cancelled`] where `progress` says so.
-    fn blend(&self, composition: &Composition<'_>, progress: &dyn Progress) -> Result<RgbU8, Cancelled>;
+    fn blend(&self, composition: &Composition<'_, T>, progress: &dyn Progress) -> Result<Image<T, 3>, Cancelled>;
 }
 
 /// How photographs are joined at the seams.
@@ -61,13 +62,18 @@ named!(BlendMode { Multiband = "multiband", Poisson = "poisson", Feather = "feat
 
 impl BlendMode {
     /// The implementation.
-    pub fn blender(self) -> &'static dyn Blender {
-        match self {
-            Self::Multiband => &multiband::Multiband,
-            Self::Poisson => &poisson::Poisson,
-            Self::Feather => &feather::Feather,
-            Self::None => &hard_seams::HardSeams,
-        }
+    pub fn blender<T: PhotoSample>(self) -> &'static dyn Blender<T> {
+        T::blender(self)
+    }
+}
+
+/// The implementation, compiled where it is called.
+pub(crate) fn of_mode<T: Channel>(mode: BlendMode) -> &'static dyn Blender<T> {
+    match mode {
+        BlendMode::Multiband => &multiband::Multiband,
+        BlendMode::Poisson => &poisson::Poisson,
+        BlendMode::Feather => &feather::Feather,
+        BlendMode::None => &hard_seams::HardSeams,
     }
 }
 

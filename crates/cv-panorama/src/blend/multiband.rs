@@ -8,9 +8,10 @@
 //! blended canvas at half the size the result is `p_k + up(C − G_k)`: nothing in full size is kept but the bytes that came and the bytes that go.
 
 use crate::blend::{Blender, Composition};
+use crate::depth::{Channel, Sum};
 use crate::rows::for_each_row_with;
 use crate::surface::WarpedPhoto;
-use cv_core::{Cancelled, Image, Progress, RgbU8, Stage};
+use cv_core::{Cancelled, Image, Progress, Stage};
 use fearless_simd::dispatch;
 
 type Pixel = [f32; 4];
@@ -37,14 +38,14 @@ impl Level {
 /// Multi-band blending with transitions of a 25th of a photograph in either direction.
 pub(crate) struct Multiband;
 
-impl Blender for Multiband {
+impl<T: Channel> Blender<T> for Multiband {
     fn pyramid_levels(&self, typical_side: f64) -> usize {
         ((0.04 * typical_side).max(1.0).log2().round() as usize).clamp(1, 8)
     }
 
-    fn blend(&self, composition: &Composition<'_>, progress: &dyn Progress) -> Result<RgbU8, Cancelled> {
+    fn blend(&self, composition: &Composition<'_, T>, progress: &dyn Progress) -> Result<Image<T, 3>, Cancelled> {
         let stage = Stage::new(progress, "blend", composition.photos.len() + 1)?;
-        let bands = self.pyramid_levels(composition.typical_side);
+        let bands = Blender::<T>::pyramid_levels(self, composition.typical_side);
         let image = join(composition.photos, composition.labels, bands, &stage)?;
         stage.add(1)?;
         Ok(image)
@@ -52,12 +53,12 @@ impl Blender for Multiband {
 }
 
 /// The photographs joined with so many bands above the residual, at least one; black where no label names a photograph.
-fn join(
-    photos: &[Option<WarpedPhoto>],
+fn join<T: Channel>(
+    photos: &[Option<WarpedPhoto<T>>],
     labels: &Image<u16, 1>,
     bands: usize,
     stage: &Stage<'_>,
-) -> Result<RgbU8, Cancelled> {
+) -> Result<Image<T, 3>, Cancelled> {
     let (width, height) = labels.size();
     let mut pyramid = Pyramid::new(width, height, bands.max(1));
     let mut halves = Vec::with_capacity(photos.len());
@@ -85,7 +86,7 @@ fn join(
         )?;
     }
     drop(canvas);
-    let mut image: RgbU8 = Image::new(width, height, [0; 3]);
+    let mut image = Image::new(width, height, [T::default(); 3]);
     let level = fearless_simd::Level::new();
     for_each_row_with(image.as_mut_slice(), 3 * width, stage, Vec::new, |buffer, y, row| {
         let (row, labels) = (row.as_chunks_mut::<3>().0, labels.row(y));
@@ -101,7 +102,7 @@ fn join(
                 let up = enlarged_row(change, range.start, y, out.len(), buffer);
                 for ((out, p), up) in out.iter_mut().zip(source).zip(up) {
                     for c in 0..3 {
-                        out[c] = (f32::from(p[c]) + up[c] + 0.5) as u8;
+                        out[c] = T::from_f32(p[c].to_f32() + up[c]);
                     }
                 }
             });
@@ -180,7 +181,12 @@ fn kernel(p: [Pixel; 5]) -> Pixel {
 }
 
 /// A photograph at half its size with the weights of its label: blurred, every second pixel of every second row. Edges are repeated. Exact, in integers.
-fn halve_photo(photo: &WarpedPhoto, labels: &Image<u16, 1>, label: u16, stage: &Stage<'_>) -> Result<Level, Cancelled> {
+fn halve_photo<T: Channel>(
+    photo: &WarpedPhoto<T>,
+    labels: &Image<u16, 1>,
+    label: u16,
+    stage: &Stage<'_>,
+) -> Result<Level, Cancelled> {
     let b = photo.bounds;
     let (w, h) = (b.width(), b.height());
     let mut half = Level::new(b.left / 2, b.top / 2, w.div_ceil(2), h.div_ceil(2));
@@ -189,13 +195,13 @@ fn halve_photo(photo: &WarpedPhoto, labels: &Image<u16, 1>, label: u16, stage: &
         &mut half.data,
         width,
         stage,
-        || (vec![[0_u16; 4]; w], vec![0_u16; w]),
+        || (vec![[T::Sum::default(); 4]; w], vec![0_u16; w]),
         |(colors, weights), y, row| {
             let line = |dy: usize| (2 * y + dy).saturating_sub(2).min(h - 1);
-            let pixels: [&[u8]; 5] = std::array::from_fn(|k| photo.pixels.row(line(k)));
+            let pixels: [&[T]; 5] = std::array::from_fn(|k| photo.pixels.row(line(k)));
             let names: [&[u16]; 5] = std::array::from_fn(|k| &labels.row(b.top + line(k))[b.left..b.right]);
             dispatch!(level, _simd => {
-                down_the_columns(pixels, colors.as_flattened_mut(), #[inline(always)] |v: u8| v as u16);
+                down_the_columns(pixels, colors.as_flattened_mut(), #[inline(always)] |v: T| v.widened());
                 down_the_columns(names, weights, #[inline(always)] |v| u16::from(v == label));
                 along_the_row(colors, weights, row);
             });
@@ -206,17 +212,17 @@ fn halve_photo(photo: &WarpedPhoto, labels: &Image<u16, 1>, label: u16, stage: &
 
 /// Sixteen times the blurred column.
 #[inline(always)]
-fn down_the_columns<T: Copy>(rows: [&[T]; 5], out: &mut [u16], value: impl Fn(T) -> u16) {
+fn down_the_columns<T: Copy, S: Sum>(rows: [&[T]; 5], out: &mut [S], value: impl Fn(T) -> S) {
     let n = out.len();
     let [a, b, c, d, e] = rows.map(|row| &row[..n]);
     for (i, out) in out.iter_mut().enumerate() {
-        *out = value(a[i]) + value(e[i]) + 4 * (value(b[i]) + value(d[i])) + 6 * value(c[i]);
+        *out = value(a[i]) + value(e[i]) + S::from(4_u8) * (value(b[i]) + value(d[i])) + S::from(6_u8) * value(c[i]);
     }
 }
 
-/// Every second pixel of a row of sixteen times the colors and weights, blurred; 255 · 256 is the most a sum comes to.
+/// Every second pixel of a row of sixteen times the colors and weights, blurred; 256 times white is the most a sum comes to.
 #[inline(always)]
-fn along_the_row(colors: &[[u16; 4]], weights: &[u16], out: &mut [Pixel]) {
+fn along_the_row<S: Sum>(colors: &[[S; 4]], weights: &[u16], out: &mut [Pixel]) {
     let last = colors.len() - 1;
     for (x, out) in out.iter_mut().enumerate() {
         let x = 2 * x;
@@ -229,11 +235,11 @@ fn along_the_row(colors: &[[u16; 4]], weights: &[u16], out: &mut [Pixel]) {
 }
 
 #[inline(always)]
-fn blurred(colors: &[[u16; 4]], weights: &[u16], k: [usize; 5]) -> Pixel {
+fn blurred<S: Sum>(colors: &[[S; 4]], weights: &[u16], k: [usize; 5]) -> Pixel {
     let mut pixel = [0.0; 4];
     let [p, q, r, s, t] = k.map(|k| colors[k]);
     for (c, v) in pixel.iter_mut().enumerate() {
-        *v = f32::from(p[c] + t[c] + 4 * (q[c] + s[c]) + 6 * r[c]) * (1.0 / 256.0);
+        *v = (p[c] + t[c] + S::from(4_u8) * (q[c] + s[c]) + S::from(6_u8) * r[c]).to_f32() * (1.0 / 256.0);
     }
     let sum = weights[k[0]] + weights[k[4]] + 4 * (weights[k[1]] + weights[k[3]]) + 6 * weights[k[2]];
     pixel[3] = f32::from(sum) * (1.0 / 256.0);
@@ -354,7 +360,7 @@ mod tests {
     use crate::testing::{drawn, stage};
 
     /// Photographs of the whole canvas joined with so many bands.
-    fn joined(photos: &[WarpedPhoto], labels: &Image<u16, 1>, bands: usize) -> RgbU8 {
+    fn joined(photos: &[WarpedPhoto], labels: &Image<u16, 1>, bands: usize) -> Image<u8, 3> {
         let photos: Vec<_> = photos.iter().cloned().map(Some).collect();
         join(&photos, labels, bands, &stage()).unwrap()
     }

@@ -6,8 +6,9 @@
 
 use crate::blend::hard_seams::copy;
 use crate::blend::{Blender, Composition, NO_PHOTO};
+use crate::depth::Channel;
 use crate::rows::{asks, for_each_row};
-use cv_core::{Cancelled, Progress, RgbU8, Stage};
+use cv_core::{Cancelled, Image, Progress, Stage};
 use rayon::prelude::*;
 
 type Pixel = [f32; 4];
@@ -25,8 +26,8 @@ const CYCLES: usize = 4;
 /// Gradient-domain blending.
 pub(crate) struct Poisson;
 
-impl Blender for Poisson {
-    fn blend(&self, composition: &Composition<'_>, progress: &dyn Progress) -> Result<RgbU8, Cancelled> {
+impl<T: Channel> Blender<T> for Poisson {
+    fn blend(&self, composition: &Composition<'_, T>, progress: &dyn Progress) -> Result<Image<T, 3>, Cancelled> {
         // Cycles on the full grid are most of the work.
         let stage = Stage::new(progress, "blend", CYCLES + 2)?;
         let mut image = copy(composition, &stage)?;
@@ -63,7 +64,7 @@ impl Blender for Poisson {
             let (labels, correction) = (labels.row(y), &correction[y * w..]);
             for ((out, l), c) in row.as_chunks_mut::<3>().0.iter_mut().zip(labels).zip(correction) {
                 if *l != NO_PHOTO {
-                    *out = std::array::from_fn(|i| (f32::from(out[i]) + c[i] - mean[i] + 0.5) as u8);
+                    *out = std::array::from_fn(|i| T::from_f32(out[i].to_f32() + c[i] - mean[i]));
                 }
             }
         })?;
@@ -111,13 +112,13 @@ impl Grid {
         Self { width, height, value, right_side, right: vec![0.0; n], down: vec![0.0; n], screen }
     }
 
-    fn from_seams(composition: &Composition<'_>, stage: &Stage<'_>) -> Result<Self, Cancelled> {
+    fn from_seams<T: Channel>(composition: &Composition<'_, T>, stage: &Stage<'_>) -> Result<Self, Cancelled> {
         let (w, h) = composition.labels.size();
         let labels = composition.labels.as_slice();
         let mut grid = Self::empty(w, h, SCREEN);
         let color = |label: u16, x: usize, y: usize| -> Option<[f32; 3]> {
             let p = composition.photos.get(usize::from(label))?.as_ref()?;
-            p.color(x, y).map(|c| c.map(f32::from))
+            p.color(x, y).map(|c| c.map(T::to_f32))
         };
         for y in 0..h {
             if asks(y, w) {
@@ -326,7 +327,7 @@ mod tests {
     use super::*;
     use crate::surface::{Bounds, WarpedPhoto};
     use crate::testing::{drawn, stage};
-    use cv_core::{Image, Silent};
+    use cv_core::Silent;
 
     fn gray(w: usize, h: usize, f: impl Fn(usize, usize) -> u8) -> Option<WarpedPhoto> {
         Some(drawn(Bounds { left: 0, top: 0, right: w, bottom: h }, |x, y| [f(x, y); 3]))

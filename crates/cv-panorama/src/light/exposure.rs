@@ -43,9 +43,21 @@ impl Gains {
         f64::from(self.gains.iter().flatten().copied().fold(1.0, f32::max).log2())
     }
 
-    /// The curves from levels to levels.
-    pub(crate) fn tone(&self) -> Tone {
-        Tone::new(&Response { coefficients: self.response }, self.highest())
+    /// Light of the level from which on a photograph counts as clipped.
+    pub(crate) fn clipped(&self) -> f32 {
+        self.light(f64::from(CLIPPED) / 255.0)
+    }
+
+    /// Light of a level of 0 to 1; 1 for white.
+    pub(crate) fn light(&self, level: f64) -> f32 {
+        // Below a quarter of a level, where the response ends, light falls in proportion.
+        let held = level.max(0.25 / 255.0);
+        (Response { coefficients: self.response }.log_light(held).exp2() * level / held) as f32
+    }
+
+    /// The curves from levels to levels, for photographs that tell so many parts of a level apart.
+    pub(crate) fn tone(&self, parts: usize) -> Tone {
+        Tone::new(&Response { coefficients: self.response }, self.highest(), parts)
     }
 }
 
@@ -198,7 +210,7 @@ fn anchor(gains: &mut Gains, preview: &Preview, photo_of: &[usize]) {
     for _ in 0..12 {
         let middle = 0.5 * (low + high);
         let tried = shifted(middle);
-        let tone = tried.tone();
+        let tone = tried.tone(1);
         let corrections: Vec<_> =
             (0..gains.gains.len()).map(|photo| ExposureCorrection::new(&tone, &tried, photo)).collect();
         let after: f64 = colors

@@ -38,6 +38,8 @@ const BORDER_PIXEL: f32 = 4.0;
 /// Cost of taking a pixel that the photograph shows clipped, where another may not: a seam around a square of 60 preview pixels of them may differ by 15 gray
 /// levels in every channel.
 const CLIPPED_PIXEL: f32 = 12.0;
+/// The same where the light itself is asked for, which another photograph knows: more than the border of a photograph costs.
+const UNKNOWN_PIXEL: f32 = 400.0;
 
 /// Cost of a seam through a pixel where the photographs disagree by a canvas pixel more than one, beyond the difference of colors: 15 gray levels in
 /// one channel.
@@ -70,8 +72,10 @@ pub(crate) fn on_preview(
     preview: &Preview,
     photo_of: &[usize],
     seams: Seams,
+    radiance: bool,
     progress: &dyn Progress,
 ) -> Result<Image<u16, 1>, Cancelled> {
+    let clipped = if radiance { UNKNOWN_PIXEL } else { CLIPPED_PIXEL };
     let mut labels = voronoi(preview);
     if seams == Seams::Voronoi {
         return Ok(labels);
@@ -92,7 +96,7 @@ pub(crate) fn on_preview(
         four.into_iter().map(|(i, j)| differ(a, b, 2 * x + i, 2 * y + j)).fold(0, i32::max)
     };
     // A pixel stands for four, a step of a seam for two.
-    let pixel = |label: usize, x: usize, y: usize| (2.0 * of_pixel(&half.pieces[label], x, y)) as i32;
+    let pixel = |label: usize, x: usize, y: usize| (2.0 * of_pixel(&half.pieces[label], clipped, x, y)) as i32;
     let reach: Vec<_> = half.pieces.iter().map(|p| Some(&p.warped)).collect();
     // The first round does nearly all: a third here and a second below leave the misfits at the seams of every set met so far as they are.
     let labeling = Labeling { photos: &reach, unary: pixel, difference: worst, free: |_, _| true };
@@ -110,7 +114,7 @@ pub(crate) fn on_preview(
         }
     }
     let near = near_seams(&labels, NEAR, &stage)?;
-    let pixel = |label: usize, x: usize, y: usize| of_pixel(&preview.pieces[label], x, y) as i32;
+    let pixel = |label: usize, x: usize, y: usize| of_pixel(&preview.pieces[label], clipped, x, y) as i32;
     let labeling =
         Labeling { photos: &pieces, unary: pixel, difference: differ, free: |x: usize, y: usize| near[y * width + x] };
     labeling.expand(&mut labels, 1, &stage)?;
@@ -128,11 +132,11 @@ fn voronoi(preview: &Preview) -> Image<u16, 1> {
     })
 }
 
-/// Cost of taking a pixel from a piece.
-fn of_pixel(piece: &Piece, x: usize, y: usize) -> f32 {
+/// Cost of taking a pixel from a piece, and of one that it shows `clipped`.
+fn of_pixel(piece: &Piece, clipped: f32, x: usize, y: usize) -> f32 {
     let b = piece.warped.bounds;
     let i = (y - b.top) * b.width() + x - b.left;
-    BORDER_PIXEL * piece.eccentricity[i] + if piece.clipped[i] { CLIPPED_PIXEL } else { 0.0 }
+    BORDER_PIXEL * piece.eccentricity[i] + if piece.clipped[i] { clipped } else { 0.0 }
 }
 
 fn eccentricity(piece: &Piece, x: usize, y: usize) -> f32 {
@@ -349,7 +353,7 @@ mod tests {
 
     #[test]
     fn voronoi_takes_the_photograph_whose_middle_is_nearest() {
-        let labels = on_preview(&preview(), &[0, 1], Seams::Voronoi, &Silent).unwrap();
+        let labels = on_preview(&preview(), &[0, 1], Seams::Voronoi, false, &Silent).unwrap();
         for (x, y) in (0..SIZE.1).flat_map(|y| (0..SIZE.0).map(move |x| (x, y))) {
             // Both are 120 wide: half-way between columns 60 and 100.
             assert_eq!(labels.at(x, y)[0], u16::from(x >= 80), "{x} {y}");
@@ -359,8 +363,8 @@ mod tests {
     #[test]
     fn a_graph_cut_runs_around_what_the_photographs_show_at_two_places() {
         let preview = preview();
-        let straight = on_preview(&preview, &[0, 1], Seams::Voronoi, &Silent).unwrap();
-        let cut = on_preview(&preview, &[0, 1], Seams::GraphCut, &Silent).unwrap();
+        let straight = on_preview(&preview, &[0, 1], Seams::Voronoi, false, &Silent).unwrap();
+        let cut = on_preview(&preview, &[0, 1], Seams::GraphCut, false, &Silent).unwrap();
         assert!(misfit(&straight, &preview) > 10_000, "{}", misfit(&straight, &preview));
         // Around the pole both show the same: nothing is cut.
         assert_eq!(misfit(&cut, &preview), 0);

@@ -3,15 +3,15 @@
 use crate::blend::NO_PHOTO;
 use crate::rows::for_each_row;
 use crate::surface::WarpedPhoto;
-use cv_core::{Cancelled, Image, Scaling, Stage};
+use cv_core::{Cancelled, Image, Sample, Scaling, Stage};
 
 /// Labels of a canvas of `size`, `step` times as large as theirs: interpolated so that seams are smooth, where the photograph reaches; else another that
 /// reaches.
-pub(crate) fn upsample(
+pub(crate) fn upsample<T: Sample>(
     coarse: &Image<u16, 1>,
     step: usize,
     (w, h): (usize, usize),
-    photos: &[Option<WarpedPhoto>],
+    photos: &[Option<WarpedPhoto<T>>],
     stage: &Stage<'_>,
 ) -> Result<Image<u16, 1>, Cancelled> {
     let reaches = |label: u16, x: usize, y: usize| {

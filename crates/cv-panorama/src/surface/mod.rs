@@ -29,7 +29,7 @@ pub use layout::{Canvas, LayoutError};
 pub(crate) use layout::{Layout, Placement, layout};
 pub(crate) use preview::{Piece, Preview, box_shrunk, shrunk_view};
 pub use warp::WarpedPhoto;
-pub(crate) use warp::{Map, WarpSettings, warp};
+pub(crate) use warp::{CLIPPED, Map, WarpSettings, warp};
 
 use cv_core::{Point2, Vector3, named};
 

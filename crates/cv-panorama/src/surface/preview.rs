@@ -96,7 +96,7 @@ impl Preview {
                 bottom: p.bounds.bottom.div_ceil(step).min(height),
             };
             let field = fields.get(k).and_then(Option::as_ref).map(|f| f.scaled(s, 1.0 / shrink as f64));
-            let view = shrunk_view(p, shrink, photo);
+            let view = shrunk_view(p, shrink, photo.size());
             let small = Placement { view, bounds, origin, ..*p };
             let settings =
                 WarpSettings { displacement: field.as_ref(), interpolation: Interpolation::Bilinear, correction: None };
@@ -114,7 +114,7 @@ impl Preview {
 
     /// Evens out the exposure of every piece.
     pub(crate) fn correct(&mut self, gains: &Gains, photo_of: &[usize]) {
-        let tone = gains.tone();
+        let tone = gains.tone(1);
         self.pieces.par_iter_mut().zip(photo_of).for_each(|(piece, &photo)| {
             let correction = ExposureCorrection::new(&tone, gains, photo);
             let pixels = piece.warped.pixels.as_mut_slice().as_chunks_mut::<4>().0;
@@ -133,11 +133,11 @@ impl Preview {
     }
 }
 
-/// A placement's view of the photograph that [`box_shrunk`] made.
-pub(crate) fn shrunk_view(p: &Placement, shrink: usize, small: &RgbU8) -> View {
+/// A placement's view of the photograph that [`box_shrunk`] made, of this size.
+pub(crate) fn shrunk_view(p: &Placement, shrink: usize, size: (usize, usize)) -> View {
     let mut view = p.view.scaled(1.0 / shrink as f64);
     // The blocks at the right and bottom that were not whole are gone.
-    (view.camera.width, view.camera.height) = small.size();
+    (view.camera.width, view.camera.height) = size;
     view
 }
 

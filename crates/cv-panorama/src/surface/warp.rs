@@ -4,41 +4,45 @@
 //! costs three multiply-adds per coordinate and one division.
 
 use crate::align::View;
+use crate::depth::Channel;
 use crate::light::ExposureCorrection;
 use crate::rows::for_each_row_with;
 use crate::surface::{Bounds, DisplacementField, Placement, Surface};
-use cv_core::{Cancelled, DistortionModel, Image, ImageView, Matrix3, Point2, Stage};
-use cv_imgproc::{Interpolation, bicubic_rgb_at, bilinear_at};
+use cv_core::{Cancelled, DistortionModel, Image, ImageView, Matrix3, Point2, Sample, Stage};
+use cv_imgproc::{Interpolation, bilinear_at};
 use fearless_simd::{Level, Simd, dispatch};
 
 /// A photograph drawn on a part of the canvas.
 #[derive(Debug, Clone, PartialEq)]
-pub struct WarpedPhoto {
+pub struct WarpedPhoto<T = u8> {
     /// The part of the canvas.
     pub bounds: Bounds,
-    /// Red, green, blue, and 255 where the photograph reaches (0 where its edge pixels were repeated instead); of the size of the bounds.
-    pub pixels: Image<u8, 4>,
+    /// Red, green, blue, and white (255 or 65535) where the photograph reaches (0 where its edge pixels were repeated instead); of the size of the bounds.
+    pub pixels: Image<T, 4>,
 }
 
-impl WarpedPhoto {
+impl<T: Sample> WarpedPhoto<T> {
     /// Whether the photograph reaches a canvas pixel.
     #[inline]
     pub fn reaches(&self, x: usize, y: usize) -> bool {
         let b = self.bounds;
-        b.contains(x, y) && self.pixels.row(y - b.top)[4 * (x - b.left) + 3] > 0
+        b.contains(x, y) && self.pixels.row(y - b.top)[4 * (x - b.left) + 3] != T::default()
     }
 
     /// The color at a canvas pixel; `None` where the photograph does not reach.
     #[inline]
-    pub fn color(&self, x: usize, y: usize) -> Option<[u8; 3]> {
+    pub fn color(&self, x: usize, y: usize) -> Option<[T; 3]> {
         let b = self.bounds;
         if !b.contains(x, y) {
             return None;
         }
         let [r, g, b, a] = self.pixels.at(x - b.left, y - b.top);
-        (a > 0).then_some([r, g, b])
+        (a != T::default()).then_some([r, g, b])
     }
 }
+
+/// Opacity of linear light that is a bound: the photograph is clipped there.
+pub(crate) const CLIPPED: f32 = 0.5;
 
 /// How a photograph is drawn.
 #[derive(Clone, Copy)]
@@ -50,16 +54,16 @@ pub(crate) struct WarpSettings<'a> {
 }
 
 /// The photograph as seen in the canvas pixels `bounds`.
-pub(crate) fn warp(
-    photo: ImageView<'_, u8, 3>,
+pub(crate) fn warp<T: Channel>(
+    photo: ImageView<'_, T, 3>,
     placement: &Placement,
     surface: &Surface,
     bounds: Bounds,
     settings: WarpSettings<'_>,
     stage: &Stage<'_>,
-) -> Result<WarpedPhoto, Cancelled> {
+) -> Result<WarpedPhoto<T>, Cancelled> {
     let (width, height) = (bounds.width(), bounds.height());
-    let mut pixels = Image::<u8, 4>::new(width, height, [0; 4]);
+    let mut pixels = Image::<T, 4>::new(width, height, [T::default(); 4]);
     if photo.is_empty() || pixels.is_empty() {
         return Ok(WarpedPhoto { bounds, pixels });
     }
@@ -80,13 +84,13 @@ pub(crate) fn warp(
             }
             match settings.interpolation {
                 Interpolation::Nearest => {
-                    dispatch!(level, simd => sample_row::<_, Nearest>(simd, photo, buffer, row, correction))
+                    dispatch!(level, simd => sample_row::<_, _, Nearest>(simd, photo, buffer, row, correction))
                 }
                 Interpolation::Bilinear => {
-                    dispatch!(level, simd => sample_row::<_, Bilinear>(simd, photo, buffer, row, correction))
+                    dispatch!(level, simd => sample_row::<_, _, Bilinear>(simd, photo, buffer, row, correction))
                 }
                 Interpolation::Bicubic => {
-                    dispatch!(level, simd => sample_row::<_, Bicubic>(simd, photo, buffer, row, correction))
+                    dispatch!(level, simd => sample_row::<_, _, Bicubic>(simd, photo, buffer, row, correction))
                 }
             }
         },
@@ -217,11 +221,11 @@ impl Row {
 /// Samples one row; coordinates outside the photograph take the nearest edge pixel and are marked as not reached. One thing after the other, each in a loop
 /// that can be done in vectors but for the looking up.
 #[inline(always)]
-fn sample_row<S: Simd, I: Sampler>(
+fn sample_row<S: Simd, T: Channel, I: Sampler>(
     simd: S,
-    photo: ImageView<'_, u8, 3>,
+    photo: ImageView<'_, T, 3>,
     buffer: &mut Row,
-    row: &mut [u8],
+    row: &mut [T],
     correction: Option<ExposureCorrection<'_>>,
 ) {
     let Row { us, vs, colors: [reds, greens, blues], lifts, clipped } = buffer;
@@ -230,7 +234,7 @@ fn sample_row<S: Simd, I: Sampler>(
     let (pixels, _) = row.as_chunks_mut::<4>();
     for ((pixel, u), v) in pixels.iter_mut().zip(us.iter_mut()).zip(vs.iter_mut()) {
         let inside = (*u >= -0.5) & (*v >= -0.5) & (*u <= right + 0.5) & (*v <= bottom + 0.5);
-        pixel[3] = if inside { 255 } else { 0 };
+        pixel[3] = if inside { T::OPAQUE } else { T::default() };
         // `max` first: it turns NaN into a number.
         (*u, *v) = (u.max(0.0).min(right), v.max(0.0).min(bottom));
     }
@@ -238,24 +242,46 @@ fn sample_row<S: Simd, I: Sampler>(
     for (((place, r), g), b) in places.zip(reds.iter_mut()).zip(greens.iter_mut()).zip(blues.iter_mut()) {
         let (pixel, (&u, &v)) = place;
         // Beyond the border there is nothing to be sharp about.
-        [*r, *g, *b] = if pixel[3] > 0 { I::sample(simd, photo, u, v) } else { Nearest::sample(simd, photo, u, v) };
+        [*r, *g, *b] =
+            if pixel[3] != T::default() { I::sample(simd, photo, u, v) } else { Nearest::sample(simd, photo, u, v) };
     }
     if let Some(correction) = &correction {
         for ((lift, &u), &v) in lifts.iter_mut().zip(us.iter()).zip(vs.iter()) {
             let (x, y) = (u - 0.5 * right, v - 0.5 * bottom);
             *lift = correction.lift(corner * (x * x + y * y));
         }
-        correction.row_of_levels([&mut reds[..], &mut greens[..], &mut blues[..]], lifts, clipped);
+        scale([reds, greens, blues], 1.0 / T::PER_LEVEL);
+        if T::LINEAR {
+            let factors = correction.gain.map(f32::exp2);
+            for ((((pixel, r), g), b), lift) in
+                pixels.iter_mut().zip(reds.iter_mut()).zip(greens.iter_mut()).zip(blues.iter_mut()).zip(lifts.iter())
+            {
+                if pixel[3] != T::default() && r.max(*g).max(*b) >= correction.clipped {
+                    pixel[3] = T::from_f32(CLIPPED);
+                }
+                let lift = lift.exp2();
+                // The kernel overshoots at edges.
+                (*r, *g, *b) =
+                    (r.max(0.0) * factors[0] * lift, g.max(0.0) * factors[1] * lift, b.max(0.0) * factors[2] * lift);
+            }
+        } else if T::PARTS == 1 {
+            correction.row_of_levels::<false>([&mut reds[..], &mut greens[..], &mut blues[..]], lifts, clipped);
+        } else {
+            correction.row_of_levels::<true>([&mut reds[..], &mut greens[..], &mut blues[..]], lifts, clipped);
+        }
+        scale([reds, greens, blues], T::PER_LEVEL);
     }
     for (((pixel, &r), &g), &b) in pixels.iter_mut().zip(reds.iter()).zip(greens.iter()).zip(blues.iter()) {
-        [pixel[0], pixel[1], pixel[2]] = [round(r), round(g), round(b)];
+        [pixel[0], pixel[1], pixel[2]] = [T::from_f32(r), T::from_f32(g), T::from_f32(b)];
     }
 }
 
+/// From the unit of samples to that of levels, or back.
 #[inline(always)]
-fn round(v: f32) -> u8 {
-    // Saturates, as float-to-integer casts do.
-    (v + 0.5) as u8
+fn scale(rows: [&mut Vec<f32>; 3], factor: f32) {
+    if factor != 1.0 {
+        rows.into_iter().flatten().for_each(|v| *v *= factor);
+    }
 }
 
 /// The base pixel of a place inside the photograph, and the fractions beyond it.
@@ -268,15 +294,15 @@ fn split(u: f32, v: f32) -> (usize, usize, f32, f32) {
 /// A kind of interpolation, at a place inside the photograph. (A type and not a function that is handed over: that would be called, and compiled for no
 /// instruction set in particular.)
 trait Sampler {
-    fn sample<S: Simd>(simd: S, photo: ImageView<'_, u8, 3>, u: f32, v: f32) -> [f32; 3];
+    fn sample<S: Simd, T: Channel>(simd: S, photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3];
 }
 
 struct Nearest;
 
 impl Sampler for Nearest {
     #[inline(always)]
-    fn sample<S: Simd>(_: S, photo: ImageView<'_, u8, 3>, u: f32, v: f32) -> [f32; 3] {
-        photo.at((u + 0.5) as usize, (v + 0.5) as usize).map(f32::from)
+    fn sample<S: Simd, T: Channel>(_: S, photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3] {
+        photo.at((u + 0.5) as usize, (v + 0.5) as usize).map(T::to_f32)
     }
 }
 
@@ -284,7 +310,7 @@ struct Bilinear;
 
 impl Sampler for Bilinear {
     #[inline(always)]
-    fn sample<S: Simd>(_: S, photo: ImageView<'_, u8, 3>, u: f32, v: f32) -> [f32; 3] {
+    fn sample<S: Simd, T: Channel>(_: S, photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3] {
         let (x, y, fx, fy) = split(u, v);
         bilinear_at(photo, x, y, fx, fy)
     }
@@ -294,9 +320,9 @@ struct Bicubic;
 
 impl Sampler for Bicubic {
     #[inline(always)]
-    fn sample<S: Simd>(simd: S, photo: ImageView<'_, u8, 3>, u: f32, v: f32) -> [f32; 3] {
+    fn sample<S: Simd, T: Channel>(simd: S, photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3] {
         let (x, y, fx, fy) = split(u, v);
-        bicubic_rgb_at(simd, photo, x, y, fx, fy)
+        T::bicubic(simd, photo, x, y, fx, fy)
     }
 }
 
@@ -437,7 +463,7 @@ mod tests {
         }
         field.update_source_shift(&p, &surface);
         let gains = Gains { gains: vec![[0.8, 1.2, 1.5]], vignetting: [0.2, 0.1], response: [0.3, -0.2, 0.1] };
-        let tone = gains.tone();
+        let tone = gains.tone(1);
         let correction = ExposureCorrection::new(&tone, &gains, 0);
         let settings = WarpSettings { displacement: Some(&field), correction: Some(correction), ..PLAIN };
         let warped = warp(photo.view(), &p, &surface, bounds, settings, &stage()).unwrap();

@@ -2,7 +2,7 @@
 
 use crate::frame::{Context, Explain, Failure, Output};
 use cv_pipeline::PanoramaResult;
-use cv_pipeline::panorama_types::Registration;
+use cv_pipeline::panorama_types::{PhotoSample, Registration};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -35,9 +35,9 @@ pub(super) fn read(path: &Path, context: &Context) -> Result<Registration, Failu
 }
 
 /// Writes where each photograph looks.
-pub(super) fn write(
+pub(super) fn write<T: PhotoSample>(
     path: &Path,
-    result: &PanoramaResult,
+    result: &PanoramaResult<T>,
     photographs: &[PathBuf],
     context: &Context,
 ) -> Result<(), Failure> {

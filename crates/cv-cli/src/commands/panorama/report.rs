@@ -3,7 +3,7 @@
 use crate::frame::Failure;
 use crate::pictures::{Width, picture};
 use crate::words;
-use cv_core::{Correspondence, Point2, RgbU8, Scaling};
+use cv_core::{Correspondence, ImageView, Point2, RgbU8, Scaling};
 use cv_pipeline::PanoramaResult;
 use cv_report::{MatchStyle, Report, draw_matches, shrink_to_fit};
 use std::path::PathBuf;
@@ -11,20 +11,25 @@ use std::path::PathBuf;
 /// Pairs whose matches are drawn: more than these nobody looks at.
 const PAIRS: usize = 12;
 
-/// The page: the panorama, which photograph is where, and what became of each photograph and each overlap.
-pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResult) -> Result<Report, Failure> {
+/// The page: the panorama, which photograph is where, and what became of each photograph and each overlap. `pictures` are the photographs and, as the last, the panorama.
+pub(super) fn report<T>(
+    paths: &[PathBuf],
+    pictures: &[ImageView<'_, u8, 3>],
+    result: &PanoramaResult<T>,
+) -> Result<Report, Failure> {
+    let image = pictures[paths.len()];
     let name = |i: usize| paths[i].file_name().unwrap_or_default().to_string_lossy().into_owned();
     let used = result.images.iter().filter(|image| image.used).count();
-    let (width, height) = result.image.size();
+    let (width, height) = image.size();
     let mut page = Report::new("Panorama");
     page.headline("photographs used", &format!("{used} of {}", paths.len()))
         .headline("size", &format!("{width}×{height}"))
         .headline("matches agree to", &format!("{:.2} px", result.reprojection_rms_px));
     let caption = format!("{} projection; black where no photograph reaches.", result.canvas.projection);
-    page.section("Panorama").figure(picture(&result.image, Width::Full, &caption)?);
+    page.section("Panorama").figure(picture(&image.to_image(), Width::Full, &caption)?);
     let sources = RgbU8::from_fn(width, height, |x, y| {
         let label = result.labels.at(x, y)[0];
-        if label == u16::MAX { [0; 3] } else { tint(result.image.at(x, y), label) }
+        if label == u16::MAX { [0; 3] } else { tint(image.at(x, y), label) }
     });
     let caption = "Which photograph each pixel is from: the seams run where the color changes.";
     page.figure(picture(&sources, Width::Full, caption)?);
@@ -45,9 +50,11 @@ pub(super) fn report(paths: &[PathBuf], photos: &[RgbU8], result: &PanoramaResul
     page.section("Overlaps");
     let accepted = result.pairs.iter().filter(|pair| pair.rejected.is_none());
     for pair in accepted.take(PAIRS) {
-        let (photo_a, photo_b) = (&photos[pair.a], &photos[pair.b]);
-        let (a, b) = (shrink_to_fit(photo_a.view(), 700), shrink_to_fit(photo_b.view(), 700));
-        let at = |p: Point2<f64>, photo: &RgbU8, small: &RgbU8| Scaling::between(photo.size(), small.size()).point(p);
+        let (photo_a, photo_b) = (pictures[pair.a], pictures[pair.b]);
+        let (a, b) = (shrink_to_fit(photo_a, 700), shrink_to_fit(photo_b, 700));
+        let at = |p: Point2<f64>, photo: ImageView<'_, u8, 3>, small: &RgbU8| {
+            Scaling::between(photo.size(), small.size()).point(p)
+        };
         let matches: Vec<Correspondence> = result
             .correspondences(pair)
             .iter()

@@ -1,0 +1,134 @@
+//! Writing OpenEXR: one layer of red, green and blue of 32 bits, in blocks of 16 rows packed by zlib ("OpenEXR File Layout", and `ImfZip.cpp` for the order of bytes in a block).
+
+use crate::files::write_bytes;
+use crate::{FormatError, IoError};
+use cv_core::ImageView;
+use std::path::Path;
+
+/// Rows of a block of ZIP compression.
+const ROWS: usize = 16;
+/// How hard Deflate tries, of 10.
+const EFFORT: u8 = 3;
+
+/// The bytes of an OpenEXR file: red, green and blue of linear light in 32-bit floats, 1 for the white of a display. O(pixels).
+///
+/// # Errors
+/// [`FormatError::NotRepresentable`] for an empty picture or one whose sides exceed 2³¹ − 1.
+pub fn encode_exr(view: ImageView<'_, f32, 3>) -> Result<Vec<u8>, FormatError> {
+    let (width, height) = view.size();
+    let last = |n: usize| i32::try_from(n).ok().filter(|&n| n > 0).map(|n| n - 1);
+    let (Some(right), Some(bottom)) = (last(width), last(height)) else {
+        return Err(FormatError::NotRepresentable {
+            format: "OpenEXR",
+            what: format!("a picture of {width}×{height}"),
+        });
+    };
+    let mut bytes = vec![0x76, 0x2f, 0x31, 0x01, 2, 0, 0, 0];
+    let mut attribute = |name: &str, kind: &str, value: &[u8]| {
+        bytes.extend(
+            [name.as_bytes(), b"\0", kind.as_bytes(), b"\0", &(value.len() as i32).to_le_bytes(), value].concat(),
+        );
+    };
+    // In the order of their names, which is that of their rows: floats, one sample a pixel.
+    let mut channels = Vec::new();
+    for name in [b'B', b'G', b'R'] {
+        channels.extend([name, 0]);
+        [2_i32, 0, 1, 1].iter().for_each(|v| channels.extend(v.to_le_bytes()));
+    }
+    channels.push(0);
+    attribute("channels", "chlist", &channels);
+    attribute("compression", "compression", &[3]);
+    let window: Vec<u8> = [0, 0, right, bottom].iter().flat_map(|v| v.to_le_bytes()).collect();
+    attribute("dataWindow", "box2i", &window);
+    attribute("displayWindow", "box2i", &window);
+    attribute("lineOrder", "lineOrder", &[0]);
+    attribute("pixelAspectRatio", "float", &1_f32.to_le_bytes());
+    attribute("screenWindowCenter", "v2f", &[0; 8]);
+    attribute("screenWindowWidth", "float", &1_f32.to_le_bytes());
+    bytes.push(0);
+    let blocks = height.div_ceil(ROWS);
+    let table = bytes.len();
+    bytes.resize(table + 8 * blocks, 0);
+    let (mut plain, mut ordered) = (Vec::new(), Vec::<u8>::new());
+    for block in 0..blocks {
+        plain.clear();
+        let rows = ROWS * block..(ROWS * (block + 1)).min(height);
+        for y in rows.clone() {
+            let row = view.row(y).as_chunks::<3>().0;
+            [2, 1, 0].iter().for_each(|&c| plain.extend(row.iter().flat_map(|pixel| pixel[c].to_le_bytes())));
+        }
+        // Bytes of even places, then those of odd ones, each as the difference to the one before.
+        ordered.clear();
+        ordered.extend(plain.iter().step_by(2).chain(plain.iter().skip(1).step_by(2)));
+        for i in (1..ordered.len()).rev() {
+            ordered[i] = ordered[i].wrapping_sub(ordered[i - 1]).wrapping_add(128);
+        }
+        let packed = miniz_oxide::deflate::compress_to_vec_zlib(&ordered, EFFORT);
+        let data = if packed.len() < plain.len() { &packed } else { &plain };
+        let offset = bytes.len() as u64;
+        bytes[table + 8 * block..][..8].copy_from_slice(&offset.to_le_bytes());
+        bytes.extend((rows.start as i32).to_le_bytes());
+        bytes.extend((data.len() as i32).to_le_bytes());
+        bytes.extend_from_slice(data);
+    }
+    Ok(bytes)
+}
+
+/// Writes an OpenEXR file.
+///
+/// # Errors
+/// As [`encode_exr`] and [`crate::write_atomic`].
+pub fn write_exr(path: impl AsRef<Path>, view: ImageView<'_, f32, 3>) -> Result<(), IoError> {
+    let path = path.as_ref();
+    write_bytes(path, &encode_exr(view).map_err(|reason| IoError::writing(path, reason))?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cv_core::RgbF32;
+
+    #[test]
+    fn an_empty_picture_is_refused() {
+        let empty = RgbF32::new(0, 4, [0.0; 3]);
+        assert!(matches!(encode_exr(empty.view()), Err(FormatError::NotRepresentable { format: "OpenEXR", .. })));
+    }
+
+    /// By the layout of the format: the first sample of the last block, unpacked by hand.
+    #[test]
+    fn the_layout_is_that_of_the_format() {
+        let image = RgbF32::from_fn(5, 20, |x, y| [x as f32 + 0.5, y as f32 * 100.0, 1e-3]);
+        let bytes = encode_exr(image.view()).unwrap();
+        let find = |name: &[u8]| bytes.windows(name.len()).position(|w| w == name).unwrap();
+        assert_eq!(bytes[find(b"compression\0compression\0") + 28], 3);
+        let table = find(b"screenWindowWidth\0float\0") + 24 + 4 + 4 + 1;
+        let offset = u64::from_le_bytes(bytes[table + 8..table + 16].try_into().unwrap()) as usize;
+        let number = |at: usize| i32::from_le_bytes(bytes[at..at + 4].try_into().unwrap());
+        assert_eq!((number(offset), offset + 8 + number(offset + 4) as usize), (16, bytes.len()));
+        let mut plain = miniz_oxide::inflate::decompress_to_vec_zlib(&bytes[offset + 8..]).unwrap();
+        assert_eq!(plain.len(), 4 * 5 * 3 * 4);
+        for i in 1..plain.len() {
+            plain[i] = plain[i].wrapping_add(plain[i - 1]).wrapping_sub(128);
+        }
+        let half = plain.len().div_ceil(2);
+        let value = |k: usize| {
+            let byte = |i: usize| plain[i / 2 + if i.is_multiple_of(2) { 0 } else { half }];
+            f32::from_le_bytes(std::array::from_fn(|b| byte(4 * k + b)))
+        };
+        // Rows 16 to 19: blue, green, red.
+        assert_eq!([value(0), value(5), value(10), value(14)], [1e-3, 1600.0, 0.5, 4.5]);
+        assert_eq!(value(15 + 5), 1700.0);
+    }
+
+    #[cfg(feature = "exr")]
+    #[test]
+    fn what_is_written_is_read() {
+        for (width, height) in [(1, 1), (7, 16), (5, 37)] {
+            let image = RgbF32::from_fn(width, height, |x, y| {
+                [x as f32 * 1e4, y as f32 + 0.25, ((x * 31 + y * 17) % 7) as f32 * 1e-5]
+            });
+            let read = crate::decode_image(&encode_exr(image.view()).unwrap(), &crate::ReadOptions::default()).unwrap();
+            assert_eq!(read.pixels, crate::Pixels::RgbF32(image));
+        }
+    }
+}

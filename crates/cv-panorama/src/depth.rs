@@ -1,0 +1,291 @@
+//! Photographs of 8 and of 16 bits: one way from photograph to panorama for both.
+//!
+//! What is drawn is as deep as the photographs. Where they belong, how their light differs and where seams run is decided on 8 bits. The methods here stand in for a generic function that a
+//! caller's crate would compile, with that crate's optimization: they are compiled in this one, once for each depth.
+
+use crate::align::Alignment;
+use crate::blend::{BlendMode, Blender, of_mode};
+use crate::render::{CompositingOptions, Panorama, RenderError, draw};
+use crate::rows::for_each_row;
+use crate::surface::{WarpedPhoto, box_shrunk};
+use cv_core::{Cancelled, Image, ImageView, Progress, RgbU8, Stage};
+use cv_imgproc::{Pixel, bicubic_at, bicubic_rgb_at, resize_area};
+use fearless_simd::Simd;
+use rayon::prelude::*;
+use std::borrow::Cow;
+use std::ops::{Add, Mul};
+
+/// What the pixels of photographs and panoramas are made of: `u8`, or `u16` with 65535 for white. Both are encoded as sRGB is, not linear.
+pub trait PhotoSample: Internals {
+    /// White; as opacity, that nothing shows through.
+    const WHITE: Self;
+}
+
+impl PhotoSample for u8 {
+    const WHITE: Self = 255;
+}
+
+impl PhotoSample for u16 {
+    const WHITE: Self = 65535;
+}
+
+/// What photographs are drawn and blended in: a [`PhotoSample`], or linear light in `f32`.
+pub trait Channel: Pixel {
+    /// Opacity where a photograph reaches.
+    const OPAQUE: Self;
+    /// Units of a gray level of 8 bits.
+    const PER_LEVEL: f32;
+    /// Parts of such a level that the curves of light tell apart.
+    const PARTS: usize;
+    /// Whether it is light, not levels.
+    const LINEAR: bool = false;
+    /// Holds 256 samples.
+    type Sum: Sum;
+
+    fn widened(self) -> Self::Sum;
+
+    /// [`cv_imgproc::bicubic_at`].
+    fn bicubic<S: Simd>(simd: S, view: ImageView<'_, Self, 3>, x: usize, y: usize, fx: f32, fy: f32) -> [f32; 3];
+}
+
+/// What the stages need to know of a [`PhotoSample`].
+pub trait Internals: Channel {
+    /// The sample as an index.
+    fn index(self) -> usize;
+
+    /// Means of `step × step` pixels, 2 and more.
+    fn shrunk(photo: ImageView<'_, Self, 3>, step: usize, stage: &Stage<'_>) -> Result<Image<Self, 3>, Cancelled>;
+
+    /// A copy in 8 bits; `None` where it is of 8 bits itself.
+    fn in_8_bits(photo: ImageView<'_, Self, 3>, stage: &Stage<'_>) -> Result<Option<RgbU8>, Cancelled>;
+
+    /// Drawn photographs in 8 bits.
+    fn drawn_in_8_bits<'a>(
+        photos: &'a [Option<WarpedPhoto<Self>>],
+        stage: &Stage<'_>,
+    ) -> Result<Cow<'a, [Option<WarpedPhoto>]>, Cancelled>;
+
+    fn blender(mode: BlendMode) -> &'static dyn Blender<Self>
+    where
+        Self: PhotoSample;
+
+    fn draw(
+        photos: &[ImageView<'_, Self, 3>],
+        alignment: &Alignment,
+        options: &CompositingOptions,
+        blender: &dyn Blender<Self>,
+        progress: &dyn Progress,
+    ) -> Result<Panorama<Self>, RenderError>
+    where
+        Self: PhotoSample;
+}
+
+/// Sums of samples, exact where they are integers.
+pub trait Sum: Copy + Default + Send + Sync + From<u8> + Add<Output = Self> + Mul<Output = Self> {
+    fn to_f32(self) -> f32;
+}
+
+impl Sum for u16 {
+    #[inline(always)]
+    fn to_f32(self) -> f32 {
+        f32::from(self)
+    }
+}
+
+impl Sum for f32 {
+    #[inline(always)]
+    fn to_f32(self) -> f32 {
+        self
+    }
+}
+
+impl Sum for u32 {
+    #[inline(always)]
+    fn to_f32(self) -> f32 {
+        // 256 · 65535 is less than 2²⁴.
+        self as f32
+    }
+}
+
+impl Channel for u8 {
+    const OPAQUE: Self = 255;
+    const PER_LEVEL: f32 = 1.0;
+    const PARTS: usize = 1;
+    type Sum = u16;
+
+    #[inline(always)]
+    fn widened(self) -> u16 {
+        u16::from(self)
+    }
+
+    #[inline(always)]
+    fn bicubic<S: Simd>(simd: S, view: ImageView<'_, Self, 3>, x: usize, y: usize, fx: f32, fy: f32) -> [f32; 3] {
+        bicubic_rgb_at(simd, view, x, y, fx, fy)
+    }
+}
+
+impl Internals for u8 {
+    fn index(self) -> usize {
+        usize::from(self)
+    }
+
+    fn shrunk(photo: ImageView<'_, Self, 3>, step: usize, stage: &Stage<'_>) -> Result<Image<Self, 3>, Cancelled> {
+        box_shrunk(photo, step, stage)
+    }
+
+    fn in_8_bits(_: ImageView<'_, Self, 3>, _: &Stage<'_>) -> Result<Option<RgbU8>, Cancelled> {
+        Ok(None)
+    }
+
+    fn drawn_in_8_bits<'a>(
+        photos: &'a [Option<WarpedPhoto>],
+        _: &Stage<'_>,
+    ) -> Result<Cow<'a, [Option<WarpedPhoto>]>, Cancelled> {
+        Ok(Cow::Borrowed(photos))
+    }
+
+    #[inline(never)]
+    fn blender(mode: BlendMode) -> &'static dyn Blender<Self> {
+        of_mode(mode)
+    }
+
+    #[inline(never)]
+    fn draw(
+        photos: &[ImageView<'_, Self, 3>],
+        alignment: &Alignment,
+        options: &CompositingOptions,
+        blender: &dyn Blender<Self>,
+        progress: &dyn Progress,
+    ) -> Result<Panorama<Self>, RenderError> {
+        draw(photos, alignment, options, blender, progress)
+    }
+}
+
+impl Channel for u16 {
+    const OPAQUE: Self = 65535;
+    const PER_LEVEL: f32 = 257.0;
+    const PARTS: usize = 8;
+    type Sum = u32;
+
+    #[inline(always)]
+    fn widened(self) -> u32 {
+        u32::from(self)
+    }
+
+    #[inline(always)]
+    fn bicubic<S: Simd>(_: S, view: ImageView<'_, Self, 3>, x: usize, y: usize, fx: f32, fy: f32) -> [f32; 3] {
+        bicubic_at(view, x, y, fx, fy)
+    }
+}
+
+impl Channel for f32 {
+    const OPAQUE: Self = 1.0;
+    const PER_LEVEL: f32 = 1.0;
+    const PARTS: usize = 1;
+    const LINEAR: bool = true;
+    type Sum = f32;
+
+    #[inline(always)]
+    fn widened(self) -> f32 {
+        self
+    }
+
+    #[inline(always)]
+    fn bicubic<S: Simd>(_: S, view: ImageView<'_, Self, 3>, x: usize, y: usize, fx: f32, fy: f32) -> [f32; 3] {
+        bicubic_at(view, x, y, fx, fy)
+    }
+}
+
+impl Internals for u16 {
+    fn index(self) -> usize {
+        usize::from(self)
+    }
+
+    fn shrunk(photo: ImageView<'_, Self, 3>, step: usize, stage: &Stage<'_>) -> Result<Image<Self, 3>, Cancelled> {
+        stage.check()?;
+        let (width, height) = ((photo.width() / step).max(1), (photo.height() / step).max(1));
+        // Blocks that are not whole are left out, as of bytes.
+        let whole = photo.crop(0, 0, (width * step).min(photo.width()), (height * step).min(photo.height()));
+        let small = whole.and_then(|whole| resize_area(whole, width, height).ok());
+        Ok(small.unwrap_or_else(|| photo.to_image()))
+    }
+
+    fn in_8_bits(photo: ImageView<'_, Self, 3>, stage: &Stage<'_>) -> Result<Option<RgbU8>, Cancelled> {
+        let (width, height) = photo.size();
+        let mut copy = RgbU8::new(width, height, [0; 3]);
+        for_each_row(copy.as_mut_slice(), 3 * width, stage, |y, row| to_bytes(photo.row(y), row))?;
+        Ok(Some(copy))
+    }
+
+    fn drawn_in_8_bits<'a>(
+        photos: &'a [Option<WarpedPhoto<Self>>],
+        stage: &Stage<'_>,
+    ) -> Result<Cow<'a, [Option<WarpedPhoto>]>, Cancelled> {
+        let copy = |photo: &WarpedPhoto<Self>| {
+            let (width, height) = photo.pixels.size();
+            let mut pixels = Image::new(width, height, [0; 4]);
+            for_each_row(pixels.as_mut_slice(), 4 * width, stage, |y, row| to_bytes(photo.pixels.row(y), row))?;
+            Ok(WarpedPhoto { bounds: photo.bounds, pixels })
+        };
+        photos.iter().map(|photo| photo.as_ref().map(copy).transpose()).collect::<Result<_, _>>().map(Cow::Owned)
+    }
+
+    #[inline(never)]
+    fn blender(mode: BlendMode) -> &'static dyn Blender<Self> {
+        of_mode(mode)
+    }
+
+    #[inline(never)]
+    fn draw(
+        photos: &[ImageView<'_, Self, 3>],
+        alignment: &Alignment,
+        options: &CompositingOptions,
+        blender: &dyn Blender<Self>,
+        progress: &dyn Progress,
+    ) -> Result<Panorama<Self>, RenderError> {
+        draw(photos, alignment, options, blender, progress)
+    }
+}
+
+/// To the nearest of 8 bits.
+fn to_bytes(deep: &[u16], bytes: &mut [u8]) {
+    for (byte, deep) in bytes.iter_mut().zip(deep) {
+        *byte = ((u32::from(*deep) + 128) / 257) as u8;
+    }
+}
+
+/// Photographs in 8 bits: themselves, or copies of deeper ones.
+#[derive(Debug)]
+pub struct EightBits<'a> {
+    views: Vec<ImageView<'a, u8, 3>>,
+    copies: Vec<RgbU8>,
+}
+
+impl<'a> EightBits<'a> {
+    /// Those of photographs of any depth, rounded to the nearest level. O(samples) where they are deeper, and then reported as `stage`, a unit for each photograph.
+    ///
+    /// # Errors
+    /// [`Cancelled`] where `progress` says so.
+    pub fn new<T: PhotoSample>(
+        photos: &[ImageView<'a, T, 3>],
+        stage: &'static str,
+        progress: &dyn Progress,
+    ) -> Result<Self, Cancelled> {
+        if let Some(views) = photos.iter().map(|photo| T::as_bytes(*photo)).collect() {
+            return Ok(Self { views, copies: Vec::new() });
+        }
+        let stage = Stage::new(progress, stage, photos.len())?;
+        let copy = |photo: &ImageView<'a, T, 3>| {
+            let copy = T::in_8_bits(*photo, &stage)?;
+            stage.add(1)?;
+            Ok(copy)
+        };
+        let copies: Vec<Option<RgbU8>> = photos.par_iter().map(copy).collect::<Result<_, Cancelled>>()?;
+        Ok(Self { views: Vec::new(), copies: copies.into_iter().flatten().collect() })
+    }
+
+    /// In the order of the photographs.
+    pub fn views(&self) -> Vec<ImageView<'_, u8, 3>> {
+        self.views.iter().copied().chain(self.copies.iter().map(RgbU8::view)).collect()
+    }
+}
