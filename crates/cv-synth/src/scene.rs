@@ -159,14 +159,12 @@ impl SceneBuilder {
 
     /// A rectangle with edges `u` and `v` (at right angles); its front is where `u` points right and `v` down.
     pub fn rect(&mut self, corner: Point3<f64>, u: Vector3<f64>, v: Vector3<f64>, texture: Texture) -> &mut Self {
-        let size = (u.norm(), v.norm());
-        self.push(Shape::Rect { corner, eu: u / size.0, ev: v / size.1, size, round: false }, texture)
+        self.push(Shape::rect(corner, u, v, false), texture)
     }
 
     /// The ellipse inside [`SceneBuilder::rect`].
     pub fn disc(&mut self, corner: Point3<f64>, u: Vector3<f64>, v: Vector3<f64>, texture: Texture) -> &mut Self {
-        let size = (u.norm(), v.norm());
-        self.push(Shape::Rect { corner, eu: u / size.0, ev: v / size.1, size, round: true }, texture)
+        self.push(Shape::rect(corner, u, v, true), texture)
     }
 
     /// A sphere.
