@@ -326,3 +326,108 @@ fn walk_impl<S: Simd, V: FnMut(&Item, f64) -> f64>(simd: S, tree: &Bvh, ray: &Ra
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::instruction_sets;
+    use crate::rng::Rng;
+    use nalgebra::Rotation3;
+
+    /// Rectangles, spheres, tubes and boxes, some of them along the axes, up to 40 m from the origin.
+    fn items(count: u32, rng: &mut Rng) -> Vec<Item> {
+        let mut vector = |reach: f64| Vector3::from_fn(|_, _| rng.range(-reach, reach));
+        (0..count)
+            .map(|i| {
+                let (center, size, turn) = (Point3::from(vector(40.0)), vector(1.0), vector(1.0));
+                let turn = if i % 2 == 0 { Rotation3::identity() } else { Rotation3::new(turn) };
+                let [x, y, z] = [0, 1, 2].map(|a| turn * Vector3::ith(a, 1.0));
+                let round = i % 4 == 0;
+                match i % 5 {
+                    0 => Item::Surface(6 * i, Shape::rect(center, x * 3.0, y * 5.0, round)),
+                    1 => Item::Surface(6 * i, Shape::Sphere { center, radius: 2.0 * size.x.abs() }),
+                    2 => Item::Surface(6 * i, Shape::Frustum { base: center, axis: z, length: 4.0, radii: (0.5, 1.5) }),
+                    _ => {
+                        Item::Block { first: 6 * i, center, axes: [x, y, z], half: size.map(|s| s.abs() + 0.01).into() }
+                    }
+                }
+            })
+            .collect()
+    }
+
+    #[test]
+    fn rays_meet_what_they_meet_without_a_tree_on_every_instruction_set() {
+        let mut rng = Rng::new(3, 4);
+        let (mut met, mut missed) = (0, 0);
+        for count in [0, 1, 2, 7, 9, 60, 700] {
+            let items = items(count, &mut rng);
+            for level in instruction_sets() {
+                let tree = Bvh::new(items.clone()).at_level(level);
+                for i in 0..2000 {
+                    let mut vector = |reach: f64| Vector3::from_fn(|_, _| rng.range(-reach, reach));
+                    let (mut origin, mut dir) = (Point3::from(vector(45.0)), vector(1.0));
+                    if i % 3 == 0 {
+                        // Along an axis, from the side of a box or from where it meets one.
+                        dir = Vector3::ith(i % 9 / 3, dir.x.signum());
+                        if let Some(item) = items.get(i % items.len().max(1)) {
+                            origin = if i % 2 == 0 {
+                                item.bounds().0
+                            } else {
+                                nalgebra::center(&item.bounds().0, &item.bounds().1)
+                            };
+                        }
+                    }
+                    let ray = Ray { origin, dir };
+                    let mut found = None;
+                    tree.walk(&ray, f64::INFINITY, |item, far| {
+                        let hit = item.intersect(&ray, 1e-9, far);
+                        found = hit.or(found);
+                        hit.map_or(far, |hit| hit.0)
+                    });
+                    let plain = items.iter().fold(None, |best: Option<(f64, u32)>, item| {
+                        item.intersect(&ray, 1e-9, best.map_or(f64::INFINITY, |best| best.0)).or(best)
+                    });
+                    let bits = |hit: Option<(f64, u32)>| hit.map(|(t, index)| (t.to_bits(), index));
+                    let (found, plain) = (bits(found), bits(plain));
+                    assert_eq!(found, plain, "{level:?} {count} {ray:?}");
+                    let counted = if found.is_some() { &mut met } else { &mut missed };
+                    *counted += 1;
+                }
+            }
+        }
+        assert!(met > 2000 && missed > 2000, "{met} {missed}");
+    }
+
+    #[test]
+    fn children_are_visited_in_the_order_of_the_tree_of_two() {
+        let mut rng = Rng::new(5, 6);
+        let items = items(300, &mut rng);
+        let mut entries: Vec<_> = items.iter().map(|i| (Bounds(i.bounds().0, i.bounds().1), *i)).collect();
+        let mut two = Builder::default();
+        two.build(&mut entries, 0);
+        let wide = Bvh::new(items);
+        for octant in 0..8 {
+            let (mut plain, mut rest) = (Vec::new(), vec![0]);
+            while let Some(i) = rest.pop() {
+                let Branch { first, count, axis, .. } = two.branches[i as usize];
+                match (count, octant >> axis & 1) {
+                    (0, 0) => rest.extend([first, i + 1]),
+                    (0, _) => rest.extend([i + 1, first]),
+                    _ => plain.push(first),
+                }
+            }
+            let (mut found, mut rest) = (Vec::new(), vec![Child(0)]);
+            while let Some(Child(child)) = rest.pop() {
+                if child & 1 == 1 {
+                    found.push(child / 2);
+                    continue;
+                }
+                let node = &wide.nodes[(child / 2) as usize];
+                let there = |k: usize| node.order[octant] as usize >> (4 * k) & 7;
+                let children = (0..WIDTH).map(there).filter(|&c| node.sides[0][0][c].is_finite());
+                rest.extend(children.map(|c| node.children[c]));
+            }
+            assert_eq!(found, plain, "{octant}");
+        }
+    }
+}
