@@ -54,6 +54,7 @@ mod sheet_photo;
 mod texture;
 mod truth;
 mod vista;
+mod world;
 
 pub use corrupt::corrupt;
 pub use error::SynthError;

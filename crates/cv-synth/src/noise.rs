@@ -1,6 +1,9 @@
 //! Gradient noise (Perlin 2002) whose fine octaves fade out where the sampling could not show them.
 
 use crate::rng::{hash3, unit};
+use fearless_simd::{Level, dispatch, f32x8, i32x8, prelude::*, u32x8};
+use fearless_simd_macros::simd;
+use std::sync::LazyLock;
 
 /// `floor` without a library call.
 #[inline]
@@ -14,10 +17,13 @@ fn fade(t: f32) -> f32 {
     t * t * t * (t * (t * 6.0 - 15.0) + 10.0)
 }
 
+/// Either coordinate of a unit vector along a diagonal.
+const DIAGONAL: f32 = std::f32::consts::FRAC_1_SQRT_2;
+
 #[inline]
 fn gradient(hash: u32, x: f32, y: f32) -> f32 {
     // Eight directions: four axes, four diagonals, all with the same mean square.
-    const D: f32 = std::f32::consts::FRAC_1_SQRT_2;
+    const D: f32 = DIAGONAL;
     const X: [f32; 8] = [1.0, -1.0, 0.0, 0.0, D, -D, D, -D];
     const Y: [f32; 8] = [0.0, 0.0, 1.0, -1.0, D, D, -D, -D];
     let i = (hash >> 29) as usize;
@@ -58,21 +64,117 @@ pub(crate) fn visible(frequency: f32, width: f32) -> f32 {
     ((0.5 - frequency * width) / 0.3).clamp(0.0, 1.0)
 }
 
-/// Octaves from `frequency` upwards, each with `gain` times the amplitude of the one before; about −1 to 1.
-pub(crate) fn fbm(u: f32, v: f32, frequency: f32, octaves: u32, gain: f32, seed: u32, width: f32) -> f32 {
-    let (mut f, mut a, mut sum) = (frequency, 1.0, 0.0);
-    for octave in 0..octaves {
-        let shown = visible(f, width);
-        if shown <= 0.0 {
-            break;
-        }
-        sum += shown * a * noise2(u * f, v * f, seed.wrapping_add(octave.wrapping_mul(0x9E37_79B9)));
-        // Not exactly 2, so that the lattices of the octaves do not line up.
-        f *= 2.03;
-        a *= gain;
-    }
-    sum
+/// The most octaves of a sum: they are worked out at once.
+const MOST: usize = 8;
+
+/// Octaves of gradient noise, eight at most.
+#[derive(Debug, Clone)]
+pub(crate) struct Octaves {
+    frequencies: [f32; MOST],
+    /// 0 for octaves there are not.
+    amplitudes: [f32; MOST],
 }
+
+impl Octaves {
+    /// From `frequency` upwards, each with `gain` times the amplitude of the one before.
+    pub(crate) const fn new(frequency: f32, count: usize, gain: f32) -> Self {
+        let (mut f, mut a, mut octave) = (frequency, 1.0, 0);
+        let mut octaves = Self { frequencies: [f; MOST], amplitudes: [0.0; MOST] };
+        while octave < count && octave < MOST {
+            octaves.frequencies[octave] = f;
+            octaves.amplitudes[octave] = a;
+            // Not exactly 2, so that the lattices of the octaves do not line up.
+            f *= 2.03;
+            a *= gain;
+            octave += 1;
+        }
+        octaves
+    }
+}
+
+/// What the seed of each octave is more than that of the first.
+const SEEDS: [u32; MOST] = {
+    let (mut seeds, mut octave) = ([0u32; MOST], 0);
+    while octave < MOST {
+        seeds[octave] = (octave as u32).wrapping_mul(0x9E37_79B9);
+        octave += 1;
+    }
+    seeds
+};
+
+/// The instruction set that noise is made with.
+static LEVEL: LazyLock<Level> = LazyLock::new(Level::new);
+
+/// The sum of octaves, as far as a sample of `width` shows them; about −1 to 1.
+pub(crate) fn fbm(u: f32, v: f32, octaves: &Octaves, seed: u32, width: f32) -> f32 {
+    let shown = visible(octaves.frequencies[0], width);
+    if shown <= 0.0 {
+        0.0
+    } else if visible(octaves.frequencies[1], width) <= 0.0 {
+        // A sum, whose zero is positive.
+        0.0 + shown * octaves.amplitudes[0] * noise2(u * octaves.frequencies[0], v * octaves.frequencies[0], seed)
+    } else {
+        dispatch!(*LEVEL, simd => fbm_impl(simd, u, v, octaves, seed, width))
+    }
+}
+
+#[simd]
+fn fbm_impl<S: Simd>(simd: S, u: f32, v: f32, octaves: &Octaves, seed: u32, width: f32) -> f32 {
+    let frequencies = f32x8::from_slice(simd, &octaves.frequencies);
+    let shown = ((0.5 - frequencies * width) / 0.3).max(0.0).min(1.0);
+    let amplitudes = shown * f32x8::from_slice(simd, &octaves.amplitudes);
+    let noises = noises(simd, frequencies * u, frequencies * v, u32x8::from_slice(simd, &SEEDS) + seed);
+    // Where there is no octave is nothing, not even of what is not finite.
+    let zero = f32x8::splat(simd, 0.0);
+    let terms: [f32; MOST] = amplitudes.simd_gt(zero).select(amplitudes * noises, zero).into();
+    terms.iter().fold(0.0, |sum, term| sum + term)
+}
+
+/// As [`noise2`] at eight places, but that zeros may differ in sign.
+#[inline(always)]
+fn noises<S: Simd>(simd: S, x: f32x8<S>, y: f32x8<S>, seeds: u32x8<S>) -> f32x8<S> {
+    let (xi, yi) = (floors(x), floors(y));
+    let (fx, fy) = (x - xi.to_float::<f32x8<S>>(), y - yi.to_float::<f32x8<S>>());
+    let (sx, sy) = (fades(fx), fades(fy));
+    let (hx, hy) = (xi.bitcast::<u32x8<S>>() * 0x9E37_79B1, yi.bitcast::<u32x8<S>>() * 0x85EB_CA77);
+    let (hx0, hx1) = (seeds ^ hx, seeds ^ (hx + 0x9E37_79B1));
+    let (hy0, hy1) = (hy, hy + 0x85EB_CA77);
+    let (fx1, fy1) = (fx - 1.0, fy - 1.0);
+    let g00 = gradients(simd, hx0 ^ hy0, fx, fy);
+    let g10 = gradients(simd, hx1 ^ hy0, fx1, fy);
+    let g01 = gradients(simd, hx0 ^ hy1, fx, fy1);
+    let g11 = gradients(simd, hx1 ^ hy1, fx1, fy1);
+    let top = g00 + sx * (g10 - g00);
+    let bottom = g01 + sx * (g11 - g01);
+    (top + sy * (bottom - top)) * 1.6
+}
+
+#[inline(always)]
+fn floors<S: Simd>(x: f32x8<S>) -> i32x8<S> {
+    let i: i32x8<S> = x.to_int_precise();
+    x.simd_lt(i.to_float::<f32x8<S>>()).select(i - 1, i)
+}
+
+#[inline(always)]
+fn fades<S: Simd>(t: f32x8<S>) -> f32x8<S> {
+    t * t * t * (t * (t * 6.0 - 15.0) + 10.0)
+}
+
+/// As [`gradient`], by a hash that is not finished.
+#[inline(always)]
+fn gradients<S: Simd>(simd: S, h: u32x8<S>, x: f32x8<S>, y: f32x8<S>) -> f32x8<S> {
+    let h = (h ^ (h >> 15)) * 0x2C1B_3C6D;
+    // The highest bit: whether along a diagonal. The second: the sign of y, or which axis. The third: the sign of x, or of the only
+    // coordinate there is.
+    let (diagonal, second, third) = (h.bitcast::<i32x8<S>>().simd_lt(0), h << 1, h << 2);
+    let along = second.bitcast::<i32x8<S>>().simd_lt(0).select(y, x);
+    let first = diagonal.select(x * DIAGONAL, along).bitcast::<u32x8<S>>() ^ (third & SIGN);
+    let other = (y * DIAGONAL).bitcast::<u32x8<S>>() ^ (second & SIGN);
+    first.bitcast::<f32x8<S>>() + diagonal.select(other.bitcast(), f32x8::splat(simd, 0.0))
+}
+
+/// The bit of a number's sign.
+const SIGN: u32 = 1 << 31;
 
 /// The same in three dimensions.
 pub(crate) fn fbm3(p: [f32; 3], frequency: f32, octaves: u32, gain: f32, seed: u32, width: f32) -> f32 {
@@ -93,4 +195,51 @@ pub(crate) fn fbm3(p: [f32; 3], frequency: f32, octaves: u32, gain: f32, seed: u
 #[inline]
 pub(crate) fn edge(distance: f32, width: f32) -> f32 {
     (0.5 + distance / width.max(1e-6)).clamp(0.0, 1.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::instruction_sets;
+    use crate::rng::Rng;
+
+    /// Octave by octave.
+    fn plain(u: f32, v: f32, (frequency, count, gain): (f32, usize, f32), seed: u32, width: f32) -> f32 {
+        let (mut f, mut a, mut sum) = (frequency, 1.0, 0.0);
+        for octave in 0..count as u32 {
+            let shown = visible(f, width);
+            if shown <= 0.0 {
+                break;
+            }
+            sum += shown * a * noise2(u * f, v * f, seed.wrapping_add(octave.wrapping_mul(0x9E37_79B9)));
+            (f, a) = (f * 2.03, a * gain);
+        }
+        sum
+    }
+
+    #[test]
+    fn octaves_at_once_are_those_one_by_one_on_every_instruction_set() {
+        let mut rng = Rng::new(1, 2);
+        for i in 0..30_000 {
+            // Up to where they are no longer finite.
+            let reach = [1.0, 30.0, 1e9, 1e35][i % 4];
+            let (mut u, v, seed) = (rng.range32(-reach, reach), rng.range32(-reach, reach), rng.seed32());
+            let mut f = rng.range32(0.6, 100.0);
+            if i % 7 == 0 {
+                // On the lattice.
+                (u, f) = (u.round(), f.round());
+            }
+            let count = 1 + rng.index(8);
+            let width = if i % 5 == 0 { 0.0 } else { rng.range32(0.0, 0.6) / f };
+            let of = (f, count, rng.range32(0.4, 0.9));
+            let octaves = Octaves::new(of.0, of.1, of.2);
+            let expected = plain(u, v, of, seed, width);
+            let same = |found: f32| found.to_bits() == expected.to_bits() || found.is_nan() && expected.is_nan();
+            assert!(same(fbm(u, v, &octaves, seed, width)), "{u} {v} {of:?} {seed} {width}");
+            for level in instruction_sets() {
+                let found = dispatch!(level, simd => fbm_impl(simd, u, v, &octaves, seed, width));
+                assert!(same(found), "{level:?} {u} {v} {of:?} {seed} {width}: {found} {expected}");
+            }
+        }
+    }
 }

@@ -1,7 +1,7 @@
 //! Printed posters: landscapes, abstract shapes, sheets of text, maps.
 
 use crate::font::text;
-use crate::noise::{edge, fbm, noise2};
+use crate::noise::{Octaves, edge, fbm, noise2};
 use crate::rng::Rng;
 use crate::texture::{Rgb, mix, scale, srgb};
 
@@ -89,7 +89,7 @@ impl Poster {
         let margin = 0.05 * short;
         let inset = (u - margin).min(self.width - margin - u).min(v - margin).min(self.height - margin - v);
         let inside = edge(inset, w);
-        let fibre = 1.0 + 0.02 * fbm(u, v, 90.0, 3, 0.8, self.seed ^ 1, w);
+        let fibre = 1.0 + 0.02 * fbm(u, v, const { &Octaves::new(90.0, 3, 0.8) }, self.seed ^ 1, w);
         let color = if inside <= 0.0 {
             paper
         } else {
@@ -120,7 +120,7 @@ impl Poster {
         let [paper, dark, warm, gold, cool] = self.inks;
         let (s, t) = (u / self.width, v / self.height);
         let mut color = mix(cool, mix(gold, paper, 0.5), (1.6 * t).clamp(0.0, 1.0));
-        let clouds = fbm(u * 0.4, v, 6.0 / self.height, 6, 0.6, self.seed, w);
+        let clouds = fbm(u * 0.4, v, &Octaves::new(6.0 / self.height, 6, 0.6), self.seed, w);
         color = mix(color, paper, (0.5 * clouds).clamp(0.0, 0.6));
         let (sx, sy) = (0.3 * self.width, 0.28 * self.height);
         let sun = 0.11 * self.width - ((u - sx).powi(2) + (v - sy).powi(2)).sqrt();
@@ -132,7 +132,7 @@ impl Poster {
                 + 0.12 * noise2(s * 41.0, 1.3, self.seed ^ layer);
             let top = (0.42 + 0.14 * depth + 0.07 * ridge) * self.height;
             let hill = mix(mix(cool, paper, 0.45), mix(dark, cool, 0.25), depth);
-            let rough = 1.0 + 0.45 * fbm(u, v, 20.0 / self.height, 6, 0.75, self.seed ^ (9 + layer), w);
+            let rough = 1.0 + 0.45 * fbm(u, v, &Octaves::new(20.0 / self.height, 6, 0.75), self.seed ^ (9 + layer), w);
             color = mix(color, scale(hill, rough), edge(v - top, w));
         }
         let band = edge(v - 0.85 * self.height, w);
@@ -156,7 +156,8 @@ impl Poster {
                 2 => edge(f.radius - lx.abs(), w) * edge(0.45 * f.radius - ly.abs(), w),
                 _ => edge(ly + 0.5 * f.radius, w) * edge(0.5 * f.radius - 0.87 * lx.abs() - 0.5 * ly, w),
             };
-            let grain = 1.0 + 0.22 * fbm(u, v, 3.0 / f.radius, 5, 0.75, self.seed ^ (f.radius * 1e4) as u32, w);
+            let grain =
+                1.0 + 0.22 * fbm(u, v, &Octaves::new(3.0 / f.radius, 5, 0.75), self.seed ^ (f.radius * 1e4) as u32, w);
             color = mix(color, scale(f.ink, grain), 0.92 * inside);
         }
         let band = edge(v - 0.86 * self.height, w);
@@ -190,8 +191,8 @@ impl Poster {
         let ink = text(u - column.0, v - top, size, column.1, 0.5, self.seed ^ 8, w) * edge(0.93 * height - v, w);
         color = mix(color, dark, ink * (1.0 - picture));
         if picture > 0.0 {
-            let bent = fbm(u, v, 5.0 / width, 4, 0.6, self.seed ^ 2, w);
-            let field = fbm(u + 0.1 * width * bent, v, 9.0 / width, 6, 0.65, self.seed ^ 3, w);
+            let bent = fbm(u, v, &Octaves::new(5.0 / width, 4, 0.6), self.seed ^ 2, w);
+            let field = fbm(u + 0.1 * width * bent, v, &Octaves::new(9.0 / width, 6, 0.65), self.seed ^ 3, w);
             let tone = mix(mix(dark, cool, (0.9 + bent).clamp(0.0, 1.0)), gold, (0.4 + 0.8 * field).clamp(0.0, 1.0));
             color = mix(color, tone, picture);
         }
@@ -201,9 +202,9 @@ impl Poster {
     fn map(&self, u: f32, v: f32, w: f32) -> Rgb {
         let [paper, dark, warm, gold, cool] = self.inks;
         let f = 3.0 / self.width;
-        let ground = fbm(u, v, f, 6, 0.5, self.seed, w);
+        let ground = fbm(u, v, &Octaves::new(f, 6, 0.5), self.seed, w);
         let water = edge(-0.28 - ground, (6.0 * f * w).max(0.01));
-        let woods = edge(fbm(u, v, 2.7 * f, 5, 0.6, self.seed ^ 1, w) - 0.12, (12.0 * f * w).max(0.04));
+        let woods = edge(fbm(u, v, &Octaves::new(2.7 * f, 5, 0.6), self.seed ^ 1, w) - 0.12, (12.0 * f * w).max(0.04));
         let mut color = mix(paper, mix(cool, gold, 0.5), 0.35 * woods);
         // Height lines every 0.08, about 0.012 wide: shown while a sample is finer than their spacing.
         let level = ground / 0.08;
@@ -212,7 +213,8 @@ impl Poster {
         color = mix(color, mix(warm, dark, 0.3), 0.75 * shown * edge(0.006 - off, (3.0 * f * w).max(0.004)));
         color = mix(color, mix(cool, paper, 0.35), water);
         for road in 0..3u32 {
-            let bent = 0.12 * self.height * fbm(u, 0.37 * road as f32, f, 4, 0.5, self.seed ^ (40 + road), 0.0);
+            let bent =
+                0.12 * self.height * fbm(u, 0.37 * road as f32, &Octaves::new(f, 4, 0.5), self.seed ^ (40 + road), 0.0);
             let line = (v - (0.2 + 0.27 * road as f32) * self.height - bent).abs();
             color = mix(color, dark, edge(0.006 * self.height - line, 1.4 * w));
             color = mix(color, gold, edge(0.004 * self.height - line, 1.4 * w));

@@ -1,10 +1,11 @@
 //! Pictures of scenes.
 
 use crate::error::SynthError;
-use crate::scene::{Hit, Lighting, Scene};
+use crate::scene::Scene;
 use crate::sensor::{self, RenderOptions};
 use crate::shape::Ray;
 use crate::texture::{Rgb, Texture};
+use crate::world::Hit;
 use cv_core::{Camera, GrayF32, Image, Mask, Point2, Pose, RgbF32, RgbU8};
 use nalgebra::{Matrix2, Point3, Vector3};
 use rayon::prelude::*;
@@ -50,17 +51,18 @@ impl Rendered {
 /// [`SynthError`] where the camera, its size or the pose make no sense.
 pub fn render(scene: &Scene, camera: &Camera, pose: &Pose, options: &RenderOptions) -> Result<Rendered, SynthError> {
     let (width, height) = check(camera, pose)?;
-    let view = View::new(scene, scene.lighting(), camera, pose);
+    let view = View::new(scene, camera, pose);
 
     // Truth: one ray per pixel center.
     let mut centers: Vec<Option<Hit>> = vec![None; width * height];
     centers.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
         for (x, hit) in row.iter_mut().enumerate() {
-            *hit = view.ray(Point2::new(x as f64, y as f64)).and_then(|ray| scene.hit(&ray));
+            *hit = view.ray(Point2::new(x as f64, y as f64)).and_then(|ray| scene.world.hit(&ray));
         }
     });
     let depth = Image::from_fn(width, height, |x, y| [centers[y * width + x].map_or(f32::NAN, |h| h.t as f32)]);
-    let ids = Image::from_fn(width, height, |x, y| [centers[y * width + x].map_or(0, |h| scene.prims[h.prim].object)]);
+    let ids =
+        Image::from_fn(width, height, |x, y| [centers[y * width + x].map_or(0, |h| scene.world.prims[h.prim].object)]);
 
     let mut linear = Image::new(width, height, [0.0; 3]);
     let samples = options.samples.clamp(1, 8);
@@ -96,14 +98,16 @@ pub(crate) fn check(camera: &Camera, pose: &Pose) -> Result<(usize, usize), Synt
 
 /// The exposure of a scene as a camera at its viewpoint would set it: the mean of the picture at a middle gray, unless
 /// that would burn out more than a fiftieth of it. Lamps and windows do not count.
-pub(crate) fn meter(scene: &Scene, lighting: &Lighting) -> f32 {
+pub(crate) fn meter(scene: &Scene) -> f32 {
     let camera = Camera::from_focal(40, 30, 33.0);
-    let view = View::new(scene, lighting, &camera, &scene.viewpoint());
+    let view = View::new(scene, &camera, &scene.viewpoint());
     let mut levels: Vec<f32> = (0..40 * 30)
+        .into_par_iter()
         .filter_map(|i| {
-            let ray = view.ray(Point2::new((i % 40) as f64, (i / 40) as f64))?;
-            let lamp = |hit: Hit| matches!(scene.prims[hit.prim].texture, Texture::Emissive(_));
-            let [r, g, b] = if scene.hit(&ray).is_some_and(lamp) { return None } else { view.color(&ray, 1.0, None) };
+            let ray = view.ray(Point2::new(f64::from(i % 40), f64::from(i / 40)))?;
+            let lamp = |hit: Hit| matches!(scene.world.prims[hit.prim].texture, Texture::Emissive(_));
+            let [r, g, b] =
+                if scene.world.hit(&ray).is_some_and(lamp) { return None } else { view.color(&ray, 1.0, None) };
             Some(0.2126 * r + 0.7152 * g + 0.0722 * b)
         })
         .collect();
@@ -117,15 +121,14 @@ pub(crate) fn meter(scene: &Scene, lighting: &Lighting) -> f32 {
 
 struct View<'a> {
     scene: &'a Scene,
-    lighting: &'a Lighting,
     camera: Camera,
     center: Point3<f64>,
     to_world: Pose,
 }
 
 impl<'a> View<'a> {
-    fn new(scene: &'a Scene, lighting: &'a Lighting, camera: &Camera, pose: &Pose) -> Self {
-        Self { scene, lighting, camera: *camera, center: pose.center(), to_world: pose.inverse() }
+    fn new(scene: &'a Scene, camera: &Camera, pose: &Pose) -> Self {
+        Self { scene, camera: *camera, center: pose.center(), to_world: pose.inverse() }
     }
 
     /// The ray of normalized coordinates; its `t` is the depth.
@@ -162,26 +165,25 @@ impl<'a> View<'a> {
 
     /// The light along a ray; `share` is the side of the sample in pixels, `only` the surface that it meets if known.
     fn color(&self, ray: &Ray, share: f64, only: Option<usize>) -> Rgb {
-        let lighting = self.lighting;
         let known = only.and_then(|prim| {
-            let t = self.scene.prims[prim].shape.intersect(ray, 1e-9, f64::INFINITY)?;
+            let t = self.scene.world.prims[prim].shape.intersect(ray, 1e-9, f64::INFINITY)?;
             Some(Hit { prim, t })
         });
-        let Some(hit) = known.or_else(|| self.scene.hit(ray)) else {
-            return self.scene.ambient.map(|c| c * lighting.gain);
+        let Some(hit) = known.or_else(|| self.scene.world.hit(ray)) else {
+            return self.scene.world.ambient.map(|c| c * self.scene.lighting.gain);
         };
-        let prim = &self.scene.prims[hit.prim];
+        let prim = &self.scene.world.prims[hit.prim];
         let surface = prim.shape.surface(ray, hit.t);
         let length = ray.dir.norm();
         let facing = -surface.normal.dot(&ray.dir) / length;
         // The sample's width on the surface: the mean of its two sides, one of them stretched by the slant.
         let slant = facing.abs().max(0.04);
         let width = (hit.t * length * share / self.camera.fx / slant.sqrt()) as f32;
-        let color = self.scene.albedo(hit.prim, &surface, width);
+        let color = self.scene.world.albedo(hit.prim, &surface, width);
         if matches!(prim.texture, Texture::Emissive(_)) {
             return color;
         }
-        let mut light = lighting.maps[hit.prim].at(surface.s, surface.t, facing < 0.0);
+        let mut light = self.scene.lighting.at(hit.prim, surface.s, surface.t, facing < 0.0);
         let normal = if facing < 0.0 { -surface.normal } else { surface.normal };
         for (center, radius) in &self.scene.blobs {
             let d = center - surface.point;
@@ -196,14 +198,14 @@ impl<'a> View<'a> {
         if prim.specular > 0.0 {
             let eye = -ray.dir / length;
             let fresnel = prim.specular + (1.0 - prim.specular) * 0.25 * (1.0 - facing.abs() as f32).powi(5);
-            for source in &self.scene.lights {
+            for source in &self.scene.world.lights {
                 let toward = source.corner + (source.eu + source.ev) * 0.5 - surface.point;
                 let half = (toward.normalize() + eye).normalize();
                 let lobe = (normal.dot(&half).max(0.0) as f32).powf(prim.gloss);
-                let strength = fresnel * lobe * (prim.gloss + 2.0) / (8.0 * self.scene.lights.len() as f32);
+                let strength = fresnel * lobe * (prim.gloss + 2.0) / (8.0 * self.scene.world.lights.len() as f32);
                 (0..3).for_each(|c| out[c] += strength * light[c] * 0.5);
             }
         }
-        out.map(|c| c * lighting.gain)
+        out.map(|c| c * self.scene.lighting.gain)
     }
 }

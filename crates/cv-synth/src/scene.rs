@@ -1,99 +1,26 @@
 //! Scenes: surfaces, lights, and the light that has settled on the surfaces.
 
-use crate::bvh::{Bvh, Item};
-use crate::light::{self, Map};
+use crate::light::Lighting;
 use crate::render::meter;
-use crate::shape::{Ray, Shape, Surface};
-use crate::texture::{Rgb, SurfacePoint, Texture};
+use crate::shape::{Ray, Shape};
+use crate::texture::{Rgb, Texture};
+use crate::world::{Block, Light, Prim, World};
 use cv_core::Pose;
 use nalgebra::{Point3, Rotation3, Vector3};
 use std::sync::Arc;
 
-/// A surface of an object.
-#[derive(Debug, Clone)]
-pub(crate) struct Prim {
-    pub(crate) shape: Shape,
-    pub(crate) texture: Texture,
-    pub(crate) object: u32,
-    /// Share of the light mirrored, 0 to about 0.3, and the exponent of its lobe.
-    pub(crate) specular: f32,
-    pub(crate) gloss: f32,
-    pub(crate) two_sided: bool,
-}
-
-/// Six rectangles that are the faces of a box.
-#[derive(Debug, Clone, Copy)]
-struct Block {
-    first: usize,
-    center: Point3<f64>,
-    turn: Rotation3<f64>,
-    size: [f64; 3],
-}
-
-impl Block {
-    fn shifted(self, by: usize) -> Self {
-        Self { first: self.first + by, ..self }
-    }
-}
-
-/// The tree over all surfaces, boxes as wholes.
-fn tree(prims: &[Prim], blocks: &[Block]) -> Bvh {
-    let mut items = Vec::new();
-    let mut next = 0;
-    for block in blocks {
-        items.extend((next..block.first).map(|i| Item::Surface(i as u32, prims[i].shape)));
-        let axes = [0, 1, 2].map(|a| block.turn * Vector3::ith(a, 1.0));
-        items.push(Item::Block {
-            first: block.first as u32,
-            center: block.center,
-            axes,
-            half: block.size.map(|s| s / 2.0),
-        });
-        next = block.first + 6;
-    }
-    items.extend((next..prims.len()).map(|i| Item::Surface(i as u32, prims[i].shape)));
-    Bvh::new(items)
-}
-
-/// A rectangle that shines from its front.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Light {
-    pub(crate) corner: Point3<f64>,
-    pub(crate) eu: Vector3<f64>,
-    pub(crate) ev: Vector3<f64>,
-    pub(crate) radiance: Rgb,
-}
-
-/// Where a ray meets the scene.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Hit {
-    pub(crate) prim: usize,
-    pub(crate) t: f64,
-}
-
-/// Light on every surface, and the factor that exposes a picture of it well.
-#[derive(Debug)]
-pub(crate) struct Lighting {
-    pub(crate) maps: Vec<Map>,
-    pub(crate) gain: f32,
-}
-
 /// Textured surfaces under lights, in meters; X right, Y **down**, Z forward, the floor of the presets at y = 0.
 ///
-/// Light is worked out when the scene is put together and kept: diffuse direct light with soft shadows and one bounce.
+/// Light is worked out where a picture first shows it, and kept: diffuse direct light with soft shadows and one bounce.
 /// It depends on the scene only, so that every view sees the same.
 #[derive(Debug, Clone)]
 pub struct Scene {
-    pub(crate) prims: Vec<Prim>,
+    pub(crate) world: Arc<World>,
     names: Vec<&'static str>,
-    pub(crate) lights: Vec<Light>,
-    pub(crate) ambient: Rgb,
-    blocks: Vec<Block>,
-    bvh: Bvh,
     /// Spheres that darken what is near, for things that were put in after the light was worked out.
     pub(crate) blobs: Vec<(Point3<f64>, f64)>,
     viewpoint: Pose,
-    lighting: Arc<Lighting>,
+    pub(crate) lighting: Lighting,
 }
 
 impl Scene {
@@ -114,74 +41,23 @@ impl Scene {
 
     /// Distance in units of `direction` to the first surface from `origin`, and the number of the object there.
     pub fn cast(&self, origin: &Point3<f64>, direction: &Vector3<f64>) -> Option<(f64, u32)> {
-        let hit = self.hit(&Ray { origin: *origin, dir: *direction })?;
-        Some((hit.t, self.prims[hit.prim].object))
+        let hit = self.world.hit(&Ray { origin: *origin, dir: *direction })?;
+        Some((hit.t, self.world.prims[hit.prim].object))
     }
 
     /// True where nothing stands between two points; surfaces within a relative 1e-6 of the ends do not count.
     pub fn sees(&self, from: &Point3<f64>, to: &Point3<f64>) -> bool {
-        !self.blocked(&Ray { origin: *from, dir: to - from }, 1e-6, 1.0 - 1e-6)
-    }
-
-    pub(crate) fn hit(&self, ray: &Ray) -> Option<Hit> {
-        let mut best = None;
-        self.bvh.walk(ray, f64::INFINITY, |item, far| match item.intersect(ray, 1e-9, far) {
-            Some((t, prim)) => {
-                best = Some(Hit { prim: prim as usize, t });
-                t
-            }
-            None => far,
-        });
-        best
-    }
-
-    pub(crate) fn blocked(&self, ray: &Ray, near: f64, far: f64) -> bool {
-        let mut found = false;
-        self.bvh.walk(ray, far, |item, far| {
-            if !found && item.intersect(ray, near, far).is_some() {
-                found = true;
-            }
-            if found { f64::NEG_INFINITY } else { far }
-        });
-        found
-    }
-
-    pub(crate) fn lighting(&self) -> &Lighting {
-        &self.lighting
-    }
-
-    /// Reflectance (or radiance) of a surface seen with a sample of `width` meters.
-    #[inline]
-    pub(crate) fn albedo(&self, prim: usize, surface: &Surface, width: f32) -> Rgb {
-        let Prim { shape, texture, .. } = &self.prims[prim];
-        let (u, v) = shape.extent();
-        texture.color(&SurfacePoint {
-            u: surface.s * u as f32,
-            v: surface.t * v as f32,
-            local: (surface.point - shape.center()).cast::<f32>().into(),
-            size: (u as f32, v as f32),
-            width,
-        })
+        !self.world.blocked(&Ray { origin: *from, dir: to - from }, 1e-6, 1.0 - 1e-6)
     }
 
     /// The scene with more objects in it, the light on what was there kept but for soft contact shadows.
     pub(crate) fn with(&self, more: SceneBuilder, blobs: Vec<(Point3<f64>, f64)>) -> Self {
-        let old = self.lighting();
-        let first = self.prims.len();
         let shift = self.names.len() as u32;
-        let mut scene = self.clone();
-        scene.names.extend(more.names);
-        scene.prims.extend(more.prims.into_iter().map(|mut p| {
-            p.object += shift;
-            p
-        }));
-        scene.blocks.extend(more.blocks.into_iter().map(|b| b.shifted(first)));
-        scene.bvh = tree(&scene.prims, &scene.blocks);
-        scene.blobs = blobs;
-        let mut maps = old.maps.clone();
-        maps.extend(light::bake(&scene, first));
-        scene.lighting = Arc::new(Lighting { maps, gain: old.gain });
-        scene
+        let prims = more.prims.into_iter().map(|p| Prim { object: p.object + shift, ..p });
+        let world = Arc::new(self.world.with(prims, more.blocks));
+        let names = self.names.iter().copied().chain(more.names).collect();
+        let lighting = self.lighting.with(&world);
+        Self { world, names, blobs, viewpoint: self.viewpoint, lighting }
     }
 }
 
@@ -283,14 +159,12 @@ impl SceneBuilder {
 
     /// A rectangle with edges `u` and `v` (at right angles); its front is where `u` points right and `v` down.
     pub fn rect(&mut self, corner: Point3<f64>, u: Vector3<f64>, v: Vector3<f64>, texture: Texture) -> &mut Self {
-        let size = (u.norm(), v.norm());
-        self.push(Shape::Rect { corner, eu: u / size.0, ev: v / size.1, size, round: false }, texture)
+        self.push(Shape::rect(corner, u, v, false), texture)
     }
 
     /// The ellipse inside [`SceneBuilder::rect`].
     pub fn disc(&mut self, corner: Point3<f64>, u: Vector3<f64>, v: Vector3<f64>, texture: Texture) -> &mut Self {
-        let size = (u.norm(), v.norm());
-        self.push(Shape::Rect { corner, eu: u / size.0, ev: v / size.1, size, round: true }, texture)
+        self.push(Shape::rect(corner, u, v, true), texture)
     }
 
     /// A sphere.
@@ -352,20 +226,10 @@ impl SceneBuilder {
 
     /// The scene, with the pose that [`Scene::viewpoint`] offers.
     pub fn build(self, viewpoint: Pose) -> Scene {
-        let mut scene = Scene {
-            bvh: tree(&self.prims, &self.blocks),
-            prims: self.prims,
-            blocks: self.blocks,
-            names: self.names,
-            lights: self.lights,
-            ambient: self.ambient,
-            blobs: Vec::new(),
-            viewpoint,
-            lighting: Arc::new(Lighting { maps: Vec::new(), gain: 1.0 }),
-        };
-        let mut lighting = Lighting { maps: light::bake(&scene, 0), gain: 1.0 };
-        lighting.gain = meter(&scene, &lighting);
-        scene.lighting = Arc::new(lighting);
+        let world = Arc::new(World::new(self.prims, self.blocks, self.lights, self.ambient));
+        let lighting = Lighting::new(&world);
+        let mut scene = Scene { world, names: self.names, blobs: Vec::new(), viewpoint, lighting };
+        scene.lighting.gain = meter(&scene);
         scene
     }
 }

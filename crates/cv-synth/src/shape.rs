@@ -11,6 +11,8 @@ pub(crate) enum Shape {
         corner: Point3<f64>,
         eu: Vector3<f64>,
         ev: Vector3<f64>,
+        /// `eu × ev`, away from the front.
+        normal: Vector3<f64>,
         size: (f64, f64),
         round: bool,
     },
@@ -53,15 +55,21 @@ pub(crate) fn complete(axis: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
 }
 
 impl Shape {
+    /// The rectangle with edges `u` and `v` (at right angles), or the ellipse in it.
+    pub(crate) fn rect(corner: Point3<f64>, u: Vector3<f64>, v: Vector3<f64>, round: bool) -> Self {
+        let size = (u.norm(), v.norm());
+        let (eu, ev) = (u / size.0, v / size.1);
+        Self::Rect { corner, eu, ev, normal: eu.cross(&ev), size, round }
+    }
+
     /// The first hit in `(near, far)`.
     #[inline]
     pub(crate) fn intersect(&self, ray: &Ray, near: f64, far: f64) -> Option<f64> {
         let within = |t: f64| t > near && t < far;
         match self {
-            Self::Rect { corner, eu, ev, size, round } => {
-                let normal = eu.cross(ev);
-                let down = ray.dir.dot(&normal);
-                let t = (corner - ray.origin).dot(&normal) / down;
+            Self::Rect { corner, eu, ev, normal, size, round } => {
+                let down = ray.dir.dot(normal);
+                let t = (corner - ray.origin).dot(normal) / down;
                 // Also false for the NaN of a ray within the plane.
                 if !within(t) {
                     return None;

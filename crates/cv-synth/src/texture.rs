@@ -1,7 +1,7 @@
 //! Procedural surfaces, band limited by the width of the sample they are asked for.
 
 use crate::font::text;
-use crate::noise::{edge, fbm, fbm3, floor, noise2, visible};
+use crate::noise::{Octaves, edge, fbm, fbm3, floor, noise2, visible};
 use crate::poster::Poster;
 use crate::print::Print;
 use crate::rng::{hash2, unit};
@@ -180,13 +180,13 @@ impl Texture {
             }
             Self::Print(print) => mix([0.85; 3], [0.03; 3], print.black(u, v, w)),
             Self::Paint { color, seed } => {
-                let mottle = 0.030 * fbm(u, v, 1.3, 4, 0.7, *seed, w);
-                let roller = 0.055 * fbm(u, v, 45.0, 3, 0.8, seed ^ 7, w);
+                let mottle = 0.030 * fbm(u, v, const { &Octaves::new(1.3, 4, 0.7) }, *seed, w);
+                let roller = 0.055 * fbm(u, v, const { &Octaves::new(45.0, 3, 0.8) }, seed ^ 7, w);
                 scale(*color, 1.0 + mottle + roller)
             }
             Self::Stone { colors, seed } => {
-                let cloud = 0.20 * fbm(u, v, 1.7, 4, 0.7, *seed, w);
-                let grain = 0.34 * fbm(u, v, 24.0, 6, 0.85, seed ^ 1, w);
+                let cloud = 0.20 * fbm(u, v, const { &Octaves::new(1.7, 4, 0.7) }, *seed, w);
+                let grain = 0.34 * fbm(u, v, const { &Octaves::new(24.0, 6, 0.85) }, seed ^ 1, w);
                 mix(colors[0], colors[1], (0.5 + cloud + grain).clamp(0.0, 1.0))
             }
             Self::Wallpaper { ground, inks, cell, seed } => wallpaper(*ground, inks, *cell, *seed, p),
@@ -196,14 +196,15 @@ impl Texture {
             Self::Tiles { colors, tile, seed } => tiles(colors, *tile, *seed, p),
             Self::Rug { colors, seed } => rug(colors, *seed, p),
             Self::Fabric { colors, seed } => {
-                let print = edge(fbm(u, v, 5.0, 3, 0.5, *seed, w) - 0.18, 0.12 + 6.0 * w);
-                let weave = 0.10 * fbm(u, v, 160.0, 3, 0.8, seed ^ 3, w) + 0.08 * fbm(u, v, 9.0, 3, 0.6, seed ^ 5, w);
+                let print = edge(fbm(u, v, const { &Octaves::new(5.0, 3, 0.5) }, *seed, w) - 0.18, 0.12 + 6.0 * w);
+                let weave = 0.10 * fbm(u, v, const { &Octaves::new(160.0, 3, 0.8) }, seed ^ 3, w)
+                    + 0.08 * fbm(u, v, const { &Octaves::new(9.0, 3, 0.6) }, seed ^ 5, w);
                 scale(mix(colors[0], colors[1], print), 1.0 + weave)
             }
             Self::Spine { colors, seed } => spine(colors, *seed, p),
             Self::Pages { seed } => {
                 let lines = 0.16 * visible(900.0, w) * noise2(u * 6.0, v * 900.0, *seed);
-                let bands = 0.10 * fbm(u * 0.2, v, 60.0, 2, 0.7, seed ^ 1, w);
+                let bands = 0.10 * fbm(u * 0.2, v, const { &Octaves::new(60.0, 2, 0.7) }, seed ^ 1, w);
                 scale([0.66, 0.61, 0.50], 1.0 + lines + bands)
             }
             Self::Ball { color, seed } => {
@@ -278,7 +279,8 @@ fn checker(x: f32, y: f32, w: f32) -> f32 {
 
 fn wallpaper(ground: Rgb, inks: &[Rgb; 3], cell: f32, seed: u32, p: &SurfacePoint) -> Rgb {
     let (u, v, w) = (p.u, p.v, p.width);
-    let grain = 0.07 * fbm(u, v, 11.0, 6, 0.85, seed ^ 11, w) + 0.04 * fbm(u, v, 1.1, 3, 0.6, seed ^ 12, w);
+    let grain = 0.07 * fbm(u, v, const { &Octaves::new(11.0, 6, 0.85) }, seed ^ 11, w)
+        + 0.04 * fbm(u, v, const { &Octaves::new(1.1, 3, 0.6) }, seed ^ 12, w);
     let mut color = ground;
     let (cx, cy) = (floor(u / cell), floor(v / cell));
     for dy in -1..=1 {
@@ -320,8 +322,8 @@ fn wallpaper(ground: Rgb, inks: &[Rgb; 3], cell: f32, seed: u32, p: &SurfacePoin
 fn bricks(colors: &[Rgb; 2], mortar: Rgb, seed: u32, p: &SurfacePoint) -> Rgb {
     let w = p.width;
     // Edges wander by about 3 mm.
-    let u = p.u + 0.003 * fbm(p.u, p.v, 14.0, 3, 0.6, seed ^ 21, w);
-    let v = p.v + 0.003 * fbm(p.u, p.v, 14.0, 3, 0.6, seed ^ 22, w);
+    let u = p.u + 0.003 * fbm(p.u, p.v, const { &Octaves::new(14.0, 3, 0.6) }, seed ^ 21, w);
+    let v = p.v + 0.003 * fbm(p.u, p.v, const { &Octaves::new(14.0, 3, 0.6) }, seed ^ 22, w);
     let (length, height, joint) = (0.225, 0.075, 0.010);
     let row = floor(v / height);
     let shift = if row & 1 == 0 { 0.0 } else { 0.5 * length };
@@ -329,25 +331,25 @@ fn bricks(colors: &[Rgb; 2], mortar: Rgb, seed: u32, p: &SurfacePoint) -> Rgb {
     let (x, y) = (u + shift - column as f32 * length, v - row as f32 * height);
     let inside = edge(x - joint, w) * edge(length - x, w) * edge(y - joint, w) * edge(height - y, w);
     let h = |salt: u32| unit(hash2(column, row, seed ^ salt));
-    let grain = 0.32 * fbm(u, v, 18.0, 6, 0.75, seed ^ hash2(column, row, 5), w);
+    let grain = 0.32 * fbm(u, v, const { &Octaves::new(18.0, 6, 0.75) }, seed ^ hash2(column, row, 5), w);
     let brick = scale(mix(colors[0], colors[1], h(1)), (0.75 + 0.5 * h(2)) * (1.0 + grain));
-    let joint_color = scale(mortar, 1.0 + 0.25 * fbm(u, v, 40.0, 4, 0.8, seed ^ 23, w));
+    let joint_color = scale(mortar, 1.0 + 0.25 * fbm(u, v, const { &Octaves::new(40.0, 4, 0.8) }, seed ^ 23, w));
     mix(joint_color, brick, inside)
 }
 
 fn wood(colors: &[Rgb; 2], seed: u32, u: f32, v: f32, w: f32) -> Rgb {
     // Growth rings: a slow slope across the board, bent; each ring darkens slowly and ends sharply.
-    let bend = fbm(u * 0.35, v, 2.2, 3, 0.5, seed, w);
+    let bend = fbm(u * 0.35, v, const { &Octaves::new(2.2, 3, 0.5) }, seed, w);
     let place = 34.0 * v + 2.4 * bend;
     let phase = place - floor(place) as f32;
     let ring = visible(34.0, w) * (phase * phase - 0.33);
     // Fibres: streaks of every width down to the pores, a few centimeters long.
-    let fibre = fbm(u * 0.05, v, 55.0, 5, 0.8, seed ^ 3, w);
-    let cloud = fbm(u * 0.4, v, 7.0, 3, 0.6, seed ^ 4, w);
+    let fibre = fbm(u * 0.05, v, const { &Octaves::new(55.0, 5, 0.8) }, seed ^ 3, w);
+    let cloud = fbm(u * 0.4, v, const { &Octaves::new(7.0, 3, 0.6) }, seed ^ 4, w);
     let t = 0.5 + 0.35 * ring + 0.20 * fibre + 0.22 * cloud + 0.15 * bend;
     // Pores: short dark strokes, some clusters of them, and the flecks of the rays across.
     let pores = visible(420.0, w) * noise2(u * 60.0, v * 420.0, seed ^ 2).max(0.0);
-    let flecks = 0.09 * fbm(u, v, 70.0, 4, 0.85, seed ^ 5, w);
+    let flecks = 0.09 * fbm(u, v, const { &Octaves::new(70.0, 4, 0.85) }, seed ^ 5, w);
     scale(mix(colors[0], colors[1], t.clamp(0.0, 1.0)), (1.0 - 0.4 * pores) * (1.0 + flecks))
 }
 
@@ -362,7 +364,7 @@ fn planks(colors: &[Rgb; 2], plank: f32, seed: u32, p: &SurfacePoint) -> Rgb {
     let inside = edge(x - gap, w) * edge(length - x, w) * edge(y - gap, w) * edge(plank - y, w);
     let h = hash2(column, row, seed ^ 32);
     let tone = 0.78 + 0.44 * unit(h);
-    let wear = 1.0 + 0.08 * fbm(u, v, 3.0, 5, 0.7, seed ^ 33, w);
+    let wear = 1.0 + 0.08 * fbm(u, v, const { &Octaves::new(3.0, 5, 0.7) }, seed ^ 33, w);
     let color = wood(colors, h, x + 3.0 * unit(h.rotate_left(9)), y, w);
     mix(scale(colors[0], 0.25), scale(color, tone * wear), inside)
 }
@@ -374,9 +376,9 @@ fn tiles(colors: &[Rgb; 2], tile: f32, seed: u32, p: &SurfacePoint) -> Rgb {
     let grout = 0.004;
     let inside = edge(x - grout, w) * edge(tile - x, w) * edge(y - grout, w) * edge(tile - y, w);
     let h = hash2(column, row, seed);
-    let field = fbm(u, v, 4.5, 5, 0.6, h, w);
+    let field = fbm(u, v, const { &Octaves::new(4.5, 5, 0.6) }, h, w);
     let vein = (1.0 - 5.0 * field.abs()).max(0.0);
-    let cloud = 0.5 + 0.4 * fbm(u, v, 9.0, 5, 0.75, h ^ 1, w);
+    let cloud = 0.5 + 0.4 * fbm(u, v, const { &Octaves::new(9.0, 5, 0.75) }, h ^ 1, w);
     let t = (0.75 * cloud + 0.35 - 0.7 * vein).clamp(0.0, 1.0);
     let color = scale(mix(colors[0], colors[1], t), 0.88 + 0.24 * unit(h));
     mix([0.30, 0.29, 0.27], color, inside)
@@ -388,15 +390,16 @@ fn rug(colors: &[Rgb; 3], seed: u32, p: &SurfacePoint) -> Rgb {
     let band = |from: f32, to: f32| edge(inset - from, w) * edge(to - inset, w);
     // Ornaments: level sets of a bent field, mirrored about the middle, as weavers do.
     let (mu, mv) = ((u - 0.5 * p.size.0).abs(), (v - 0.5 * p.size.1).abs());
-    let field = fbm(mu, mv, 4.0, 4, 0.55, seed, w);
+    let field = fbm(mu, mv, const { &Octaves::new(4.0, 4, 0.55) }, seed, w);
     let soft = (9.0 * w).max(0.03);
     let lines = edge(0.10 - (field - 0.25).abs(), soft) + edge(0.07 - (field + 0.3).abs(), soft);
     let mut color = mix(colors[0], colors[2], 0.9 * lines.clamp(0.0, 1.0));
     let border = band(0.05, 0.24);
-    let figure = edge(fbm(mu, mv, 16.0, 2, 0.5, seed ^ 2, w) - 0.1, (20.0 * w).max(0.1));
+    let figure = edge(fbm(mu, mv, const { &Octaves::new(16.0, 2, 0.5) }, seed ^ 2, w) - 0.1, (20.0 * w).max(0.1));
     color = mix(color, mix(colors[1], colors[2], 0.8 * figure), border);
     color = mix(color, colors[2], band(0.24, 0.265) + band(0.035, 0.05));
-    let pile = 0.22 * fbm(u, v, 120.0, 3, 0.8, seed ^ 3, w) + 0.10 * fbm(u, v, 7.0, 4, 0.7, seed ^ 4, w);
+    let pile = 0.22 * fbm(u, v, const { &Octaves::new(120.0, 3, 0.8) }, seed ^ 3, w)
+        + 0.10 * fbm(u, v, const { &Octaves::new(7.0, 4, 0.7) }, seed ^ 4, w);
     scale(color, 1.0 + pile)
 }
 
@@ -404,7 +407,9 @@ fn spine(colors: &[Rgb; 2], seed: u32, p: &SurfacePoint) -> Rgb {
     let (u, v, w) = (p.u, p.v, p.width);
     let (width, height) = p.size;
     let h = |salt: u32| unit(hash2(salt as i32, 0, seed));
-    let cloth = 1.0 + 0.10 * fbm(u, v, 300.0, 3, 0.8, seed, w) + 0.07 * fbm(u, v, 12.0, 4, 0.7, seed ^ 1, w);
+    let cloth = 1.0
+        + 0.10 * fbm(u, v, const { &Octaves::new(300.0, 3, 0.8) }, seed, w)
+        + 0.07 * fbm(u, v, const { &Octaves::new(12.0, 4, 0.7) }, seed ^ 1, w);
     let mut ink = 0.0;
     // Title along the spine, bands at the ends.
     let letter = (0.45 * width).min(0.022);

@@ -15,7 +15,7 @@ impl Scene {
         let n = camera.normalize(pixel);
         let dir = pose.rotation.inverse() * Vector3::new(n.x, n.y, 1.0);
         let ray = Ray { origin: pose.center(), dir };
-        let hit = self.hit(&ray).filter(|_| n.x.is_finite())?;
+        let hit = self.world.hit(&ray).filter(|_| n.x.is_finite())?;
         Some(ray.origin + ray.dir * hit.t)
     }
 

@@ -320,3 +320,19 @@ fn nonsense_is_refused() {
     let one = render(&scene, &Camera::from_focal(1, 1, 1.0), &pose, &options).unwrap();
     assert_eq!(one.image.size(), (1, 1));
 }
+
+#[test]
+fn a_picture_is_the_same_whatever_pictures_were_taken_before() {
+    // Light is worked out where a picture first shows it.
+    let side = |scene: &Scene| {
+        let turn = Rotation3::from_axis_angle(&Vector3::y_axis(), 0.7);
+        Pose::new(turn * scene.viewpoint().rotation, turn * scene.viewpoint().translation)
+    };
+    let taken = |scene: &Scene, pose: &Pose| render(scene, &camera(), pose, &RenderOptions::default()).unwrap();
+    let (first, second) = (Scene::tabletop(4), Scene::tabletop(4));
+    let before = (taken(&first, &first.viewpoint()), taken(&first, &side(&first)));
+    let after = (taken(&second, &side(&second)), taken(&second, &second.viewpoint()));
+    for (a, b) in [(before.0, after.1), (before.1, after.0)] {
+        assert_eq!((a.image.as_slice(), a.linear.as_slice()), (b.image.as_slice(), b.linear.as_slice()));
+    }
+}

@@ -114,9 +114,9 @@ mod tests {
     /// The color of the surface beyond a place in the road, and how far it is.
     fn seen(scene: &Scene, side: f64, y: f64, z: f64) -> (Rgb, f64) {
         let ray = Ray { origin: at(0.0, y, z), dir: v(side, 0.0, 0.0) };
-        let hit = scene.hit(&ray).unwrap();
-        let prim = &scene.prims[hit.prim];
-        (scene.albedo(hit.prim, &prim.shape.surface(&ray, hit.t), 0.005), hit.t)
+        let hit = scene.world.hit(&ray).unwrap();
+        let prim = &scene.world.prims[hit.prim];
+        (scene.world.albedo(hit.prim, &prim.shape.surface(&ray, hit.t), 0.005), hit.t)
     }
 
     #[test]
