@@ -39,6 +39,10 @@ fn the_same_picture_in_another_file_format_gives_the_same_bytes() {
         let mut expected = None;
         for dress in 0..dressed[0].len() {
             let inputs: Vec<String> = dressed.iter().map(|names| names[dress].clone()).collect();
+            // A panorama is as deep as its photographs (`tests/metadata.rs` holds those of 16 bits).
+            if job.name == "panorama" && inputs[0].contains("deep") {
+                continue;
+            }
             done(folder.path(), &strs(&job.args(&inputs)));
             let written = job.written(folder.path());
             // The first is the plain PNG.
