@@ -33,7 +33,9 @@ pub(crate) fn byte(v: f32) -> u8 {
 
 /// The same in 16 bits, 65535 for white.
 pub(crate) fn word(v: f32) -> u16 {
-    (encoded(v.clamp(0.0, 1.0)) * 65535.0).round() as u16
+    // NaN compares false.
+    let v = if v > 0.0 { v.min(1.0) } else { 0.0 };
+    (encoded(v) * 65535.0).round() as u16
 }
 
 fn formula(v: f32) -> u8 {
