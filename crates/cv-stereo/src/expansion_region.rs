@@ -18,9 +18,9 @@ const LEAST_SMOOTH: f32 = 0.08;
 /// Weight of a px between a plane and what was matched, up to so many px.
 const MATCHED: f32 = 0.1;
 const MOST_OFF: f32 = 2.0;
-/// A plane is not offered to a region where what its pixels could save together is less, in pixels that are wholly unlike. With 1, the cuts take two thirds longer
-/// and errors are the same within the differences between scenes.
-const LEAST_GAIN: f32 = 8.0;
+/// A plane is not offered to a region where what its pixels could save together is less, in pixels that are wholly unlike. With 1 all takes an eighth longer; with 8 it
+/// takes a third less, and rendered tables lose two thirds of what the mode gains.
+const LEAST_GAIN: f32 = 3.0;
 /// Capacity of a cost of 1.
 const UNIT: f32 = 1000.0;
 
