@@ -93,7 +93,8 @@ def _run(job, worker, given, columns, output, ending, actors, restarts, names, o
     worker(output=str(output), ending=ending, options=options)
     _same_options(output / "options.json", job, options)
     if not ray.is_initialized():
-        ray.init(include_dashboard=False, log_to_driver=False)
+        # Without an address Ray attaches to whatever cluster was last started on this machine, even one that has died: its file stays behind.
+        ray.init(address=os.environ.get("RAY_ADDRESS", "local"), include_dashboard=False, log_to_driver=False)
     if actors is None:
         # One processor is left to reading and to Ray itself: a pool on all of them waits for ever for the tasks that feed it.
         actors = max(1, int(ray.cluster_resources().get("CPU", 2)) - 1)

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import epipole
@@ -64,7 +65,13 @@ def test_a_guide_does_what_it_says(path, photographs, tmp_path):
     script = tmp_path / f"{path.stem.replace('-', '_')}.py"
     script.write_text(text)
     environment = {**os.environ, "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "DO_NOT_TRACK": "1", "PYTHONWARNINGS": "ignore"}
-    ran = subprocess.run([sys.executable, script], cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
+    # In the system's temporary folder, since paths of Unix sockets have at most 107 bytes.
+    with tempfile.TemporaryDirectory(prefix="ray") as sessions:
+        # A cluster that was killed leaves its address behind: nobody listens on port 1.
+        Path(sessions, "ray").mkdir()
+        Path(sessions, "ray", "ray_current_cluster").write_text("127.0.0.1:1")
+        environment["RAY_TMPDIR"] = sessions
+        ran = subprocess.run([sys.executable, script], cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
     assert ran.returncode == 0, ran.stderr[-3000:]
 
 
