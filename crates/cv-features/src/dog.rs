@@ -124,8 +124,8 @@ fn refine(
         if !step.iter().all(|s| s.abs() < 1e6) {
             return None;
         }
-        let moved = |at: usize, by: f32| at.checked_add_signed(by.round() as isize);
-        (x, y, layer) = (moved(x, step.x)?, moved(y, step.y)?, moved(layer, step.z)?);
+        let displaced = |at: usize, by: f32| at.checked_add_signed(by.round() as isize);
+        (x, y, layer) = (displaced(x, step.x)?, displaced(y, step.y)?, displaced(layer, step.z)?);
         let inside = |v: usize, n: usize| (BORDER..n - BORDER).contains(&v);
         let is_near = x.abs_diff(start.2).max(y.abs_diff(start.1)) <= MAX_DISPLACEMENT;
         if !(is_near && inside(x, w) && inside(y, h) && (1..=options.layers).contains(&layer)) {
@@ -159,9 +159,9 @@ pub(crate) mod tests {
                 }
             }
         }
-        let mut places: Vec<_> = found.iter().map(|e| (e.layer, e.row, e.column)).collect();
-        places.sort_unstable();
-        places.dedup();
-        places
+        let mut locations: Vec<_> = found.iter().map(|e| (e.layer, e.row, e.column)).collect();
+        locations.sort_unstable();
+        locations.dedup();
+        locations
     }
 }

@@ -243,9 +243,9 @@ impl<'a, R: Comparable> Search<'a, R> {
         let mut backward = vec![NO_MATCH; self.b.1.len()];
         for (best, nearest) in tasks {
             forward.extend(best);
-            for (least, found) in backward.iter_mut().zip(nearest) {
-                if found.0 < least.0 {
-                    *least = found;
+            for (best, candidate) in backward.iter_mut().zip(nearest) {
+                if candidate.0 < best.0 {
+                    *best = candidate;
                 }
             }
         }
@@ -271,9 +271,9 @@ impl<'a, R: Comparable> Search<'a, R> {
                 if ssd < best.0 || (ssd == best.0 && j < best.1) {
                     best = (ssd, j);
                 }
-                let least = &mut backward[j as usize];
-                if ssd < least.0 {
-                    *least = (ssd, i as u32);
+                let nearest = &mut backward[j as usize];
+                if ssd < nearest.0 {
+                    *nearest = (ssd, i as u32);
                 }
             }
             let (ssd, index) = best;
@@ -360,17 +360,17 @@ impl Strips {
         axes: impl Fn(Point2<f32>) -> (f32, f32),
         weight: impl Fn(Point2<f32>) -> f32,
     ) -> Self {
-        let mut of: Vec<(f32, f32, f32, u32)> = Vec::with_capacity(points.len());
+        let mut finite: Vec<(f32, f32, f32, u32)> = Vec::with_capacity(points.len());
         for (i, &p) in points.iter().enumerate() {
             let ((u, v), weight) = (axes(p), weight(p));
             if u.is_finite() && v.is_finite() && weight.is_finite() {
-                of.push((u, v, weight, i as u32));
+                finite.push((u, v, weight, i as u32));
             }
         }
-        let range = |of: &dyn Fn(usize) -> f32, n: usize| {
-            (0..n).map(of).fold((f32::INFINITY, f32::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)))
+        let range = |coordinate: &dyn Fn(usize) -> f32, n: usize| {
+            (0..n).map(coordinate).fold((f32::INFINITY, f32::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)))
         };
-        let (us, vs) = (range(&|i| of[i].0, of.len()), range(&|i| of[i].1, of.len()));
+        let (us, vs) = (range(&|i| finite[i].0, finite.len()), range(&|i| finite[i].1, finite.len()));
         let divide = |(min, max): (f32, f32), size: f32| {
             let size = size.max((max - min) / MAX_COUNT);
             (size, if max >= min { (((max - min) / size) as usize).min(MAX_COUNT as usize) + 1 } else { 1 })
@@ -381,15 +381,15 @@ impl Strips {
             size: (width, length),
             count: (strips, cells),
             starts: vec![0; strips * cells + 1],
-            points: vec![(0.0, 0.0, 0.0, 0); of.len()],
-            max_weight: of.iter().fold(0.0, |m, p| p.2.max(m)),
+            points: vec![(0.0, 0.0, 0.0, 0); finite.len()],
+            max_weight: finite.iter().fold(0.0, |m, p| p.2.max(m)),
         };
         // A stable counting sort.
         let cell_index = |out: &Self, p: &(f32, f32, f32, u32)| {
             let cell = |v: f32, origin: f32, size: f32, n: usize| (((v - origin) / size) as usize).min(n - 1);
             cell(p.0, out.origin.0, width, strips) * cells + cell(p.1, out.origin.1, length, cells)
         };
-        for p in &of {
+        for p in &finite {
             let at = cell_index(&out, p);
             out.starts[at + 1] += 1;
         }
@@ -397,7 +397,7 @@ impl Strips {
             out.starts[i] += out.starts[i - 1];
         }
         let mut next = out.starts.clone();
-        for p in &of {
+        for p in &finite {
             let at = cell_index(&out, p);
             out.points[next[at] as usize] = *p;
             next[at] += 1;

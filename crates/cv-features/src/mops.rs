@@ -255,17 +255,17 @@ fn patch(
     };
     let spacing = options.window * scale / SIDE as f32;
     let (sin, cos) = angle.sin_cos();
-    let half = 0.5 * (SIDE as f32 - 1.0) * spacing;
-    let margin = half * (sin.abs() + cos.abs());
+    let radius = 0.5 * (SIDE as f32 - 1.0) * spacing;
+    let margin = radius * (sin.abs() + cos.abs());
     if x < margin || y < margin || x + margin > w as f32 - 1.0 || y + margin > h as f32 - 1.0 {
         return Err(DropReason::OutsideImage { margin });
     }
     let level = pyramid.nearest((0.5 * spacing).max(FIRST_SIGMA));
     let mut values = [0.0; SIDE * SIDE];
     for (j, row) in values.chunks_exact_mut(SIDE).enumerate() {
-        let v = j as f32 * spacing - half;
+        let v = j as f32 * spacing - radius;
         for (i, o) in row.iter_mut().enumerate() {
-            let u = i as f32 * spacing - half;
+            let u = i as f32 * spacing - radius;
             *o = level.at(x + u * cos - v * sin, y + u * sin + v * cos);
         }
     }
@@ -377,8 +377,8 @@ mod tests {
             mops(image.view(), &bad, &Silent),
             Err(FeatureError::Option(OptionError { name: "window", .. }))
         ));
-        let wrong = [Keypoint { scale: f32::NAN, ..Keypoint::new(30.0, 30.0, 1.0) }, Keypoint::new(30.0, 20.0, 1.0)];
-        let told = describe_oriented_patches(image.view(), &wrong, &options, &Silent).unwrap();
+        let unusable = [Keypoint { scale: f32::NAN, ..Keypoint::new(30.0, 30.0, 1.0) }, Keypoint::new(30.0, 20.0, 1.0)];
+        let told = describe_oriented_patches(image.view(), &unusable, &options, &Silent).unwrap();
         let reasons: Vec<_> = told.dropped.iter().map(|d| d.reason).collect();
         assert!(matches!(reasons[..], [DropReason::NotFinite, DropReason::Flat { .. }]), "{reasons:?}");
     }

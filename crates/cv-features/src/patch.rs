@@ -87,11 +87,11 @@ fn patch(smooth: &GrayF32, keypoint: &Keypoint, options: &PatchOptions) -> Resul
         return Err(DropReason::NotFinite);
     }
     let (w, h) = smooth.size();
-    let half = options.window / 2.0;
+    let half_window = options.window / 2.0;
     // The image extends from −0.5 to w − 0.5.
-    let inside = |v: f32, n: usize| v - half >= -0.5 && v + half <= n as f32 - 0.5;
+    let inside = |v: f32, n: usize| v - half_window >= -0.5 && v + half_window <= n as f32 - 0.5;
     if !(inside(x, w) && inside(y, h)) {
-        return Err(DropReason::OutsideImage { margin: half });
+        return Err(DropReason::OutsideImage { margin: half_window });
     }
     let spacing = options.window / SIDE as f32;
     let first = |v: f32| v - spacing * (SIDE as f32 - 1.0) / 2.0;

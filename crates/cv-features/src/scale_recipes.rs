@@ -84,7 +84,7 @@ pub(crate) fn recipes(layers: usize, sigma: f32, is_upsampled: bool) -> Vec<Reci
                 >= MIN_VARIANCE;
         is_smooth.then(|| (radius(kernel_sigma), from, kernel_sigma))
     };
-    let one = |i: usize| {
+    let recipe = |i: usize| {
         if i == 0 && !is_upsampled {
             return Recipe::Source;
         }
@@ -101,7 +101,7 @@ pub(crate) fn recipes(layers: usize, sigma: f32, is_upsampled: bool) -> Vec<Reci
             }
         }
     };
-    (0..layers + 3).map(one).collect()
+    (0..layers + 3).map(recipe).collect()
 }
 
 /// Data dependencies of the scales of a tile, in pairs of rows (and of columns) of the octave, which is processed two

@@ -25,14 +25,14 @@ pub fn anms_square_covering(corners: &[Keypoint], n: usize) -> Vec<usize> {
     // Each step halves the bracket; 24 steps exhaust the precision of f32.
     for _ in 0..24 {
         let side = 0.5 * (from + to);
-        let kept = square_covering(corners, &order, low, size, side, n);
-        if kept.len() < n {
+        let selected = square_covering(corners, &order, low, size, side, n);
+        if selected.len() < n {
             to = side;
             continue;
         }
         from = side;
-        let is_close = kept.len() * 10 <= n * 11;
-        best = kept;
+        let is_close = selected.len() * 10 <= n * 11;
+        best = selected;
         if is_close {
             break;
         }
@@ -58,20 +58,20 @@ fn square_covering(
         return order.to_vec();
     };
     let mut is_covered = vec![false; cells];
-    let mut kept = Vec::with_capacity(n + n / 8);
+    let mut selected = Vec::with_capacity(n + n / 8);
     for &i in order {
         let p = corners[i].position;
         let at = [((p.x - low[0]) / cell) as usize, ((p.y - low[1]) / cell) as usize];
         if is_covered[at[1].min(count[1] - 1) * count[0] + at[0].min(count[0] - 1)] {
             continue;
         }
-        kept.push(i);
+        selected.push(i);
         let range = |a: usize, n: usize| a.saturating_sub(2)..(a + 3).min(n);
         for y in range(at[1], count[1]) {
             is_covered[y * count[0]..][range(at[0], count[0])].fill(true);
         }
     }
-    kept
+    selected
 }
 
 /// Returns the indices of `n` corners, evenly from `columns` × `rows` tiles: the strongest of every tile, then the
@@ -134,14 +134,14 @@ mod tests {
     #[test]
     fn selected_corners_are_strong_and_separated() {
         let corners = random(5000);
-        let kept = anms_square_covering(&corners, 300);
-        assert_eq!(kept.len(), 300);
+        let selected = anms_square_covering(&corners, 300);
+        assert_eq!(selected.len(), 300);
         let strongest = (0..5000).max_by(|&a, &b| corners[a].response.total_cmp(&corners[b].response)).unwrap();
-        assert_eq!(kept[0], strongest);
+        assert_eq!(selected[0], strongest);
         let mut nearest = f32::INFINITY;
-        for (i, &a) in kept.iter().enumerate() {
-            assert!(i == 0 || corners[kept[i - 1]].response >= corners[a].response);
-            for &b in &kept[..i] {
+        for (i, &a) in selected.iter().enumerate() {
+            assert!(i == 0 || corners[selected[i - 1]].response >= corners[a].response);
+            for &b in &selected[..i] {
                 let d = corners[a].position - corners[b].position;
                 nearest = nearest.min(d.x.abs().max(d.y.abs()));
             }
@@ -158,9 +158,9 @@ mod tests {
     #[test]
     fn tiles_have_equal_counts() {
         let corners = random(5000);
-        let kept = anms_tiled(&corners, 96, (4, 3));
+        let selected = anms_tiled(&corners, 96, (4, 3));
         let mut counts = [0; 12];
-        for i in kept {
+        for i in selected {
             let p = corners[i].position;
             counts[(p.y / 200.0) as usize * 4 + (p.x / 200.0) as usize] += 1;
         }

@@ -285,12 +285,12 @@ impl Problem<'_> {
         let points = adjustment.add_group("points", Euclidean(3), coordinates)?;
         adjustment.eliminate(points)?;
         let pixels = |of: fn(&Correspondence) -> Point2<f64>| matches.iter().take(n as usize).map(of).collect();
-        let one = First(View { camera: first, pixels: pixels(|m| m.a), is_radial, ratio_exponent: -0.5 });
-        let two = Second(View { camera: second, pixels: pixels(|m| m.b), is_radial, ratio_exponent: 0.5 });
+        let first_view = First(View { camera: first, pixels: pixels(|m| m.a), is_radial, ratio_exponent: -0.5 });
+        let second_view = Second(View { camera: second, pixels: pixels(|m| m.b), is_radial, ratio_exponent: 0.5 });
         let blocks = (0..n).map(|i| [0, 0, i]).collect();
-        adjustment.add_residuals("first view", one, [lens, considered, points], blocks, options.loss)?;
+        adjustment.add_residuals("first view", first_view, [lens, considered, points], blocks, options.loss)?;
         let blocks = (0..n).map(|i| [0, 0, 0, i]).collect();
-        adjustment.add_residuals("second view", two, [pose, lens, considered, points], blocks, options.loss)?;
+        adjustment.add_residuals("second view", second_view, [pose, lens, considered, points], blocks, options.loss)?;
         // The weight of a prior with this standard deviation.
         let weight = |deviation: f64| noise.sqrt() / deviation;
         let mut prior = [(0.0, 0.0); LENS];

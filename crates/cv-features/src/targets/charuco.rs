@@ -133,8 +133,8 @@ fn vote_for_placement(whites: &[WhiteSquare], view: ImageView<'_, f32, 1>, board
         // The center of the square, in doubled coordinates, is rotated back by the marker's rotation. Square (column,
         // row) has the inner corner (column − 1, row − 1) at its top left.
         let back = (4 - turns) & 3;
-        let middle = rotate_quarter_turns((2 * x + 1, 2 * y + 1), back);
-        let shift = (2 * column as i32 - 1 - middle.0, 2 * row as i32 - 1 - middle.1);
+        let center = rotate_quarter_turns((2 * x + 1, 2 * y + 1), back);
+        let shift = (2 * column as i32 - 1 - center.0, 2 * row as i32 - 1 - center.1);
         *votes.entry(Placement { turns: back, shift: (shift.0 / 2, shift.1 / 2) }).or_default() += 1;
     }
     let (&placement, &agreed) = votes.iter().max_by_key(|v| *v.1)?;

@@ -105,11 +105,13 @@ pub fn find_chessboard(
         }
         let seen = largest_full_rectangle(&grid);
         let Some(part) = seen.filter(|part| part.size().is_valid()) else { continue };
-        let whole = part.size().corners() == grid.nodes.len();
-        let fits = |asked: BoardSize| [asked, asked.transposed()].contains(&part.size());
+        let is_complete = part.size().corners() == grid.nodes.len();
+        let has_size = |asked: BoardSize| [asked, asked.transposed()].contains(&part.size());
         match size {
-            Some(asked) if fits(asked) && whole => boards.extend(order_corners(&grid, part, asked)),
-            None if whole && boards.is_empty() => boards.extend(order_corners(&grid, part, part.size().landscape())),
+            Some(asked) if has_size(asked) && is_complete => boards.extend(order_corners(&grid, part, asked)),
+            None if is_complete && boards.is_empty() => {
+                boards.extend(order_corners(&grid, part, part.size().landscape()))
+            }
             _ => {
                 let found = grid.nodes.len();
                 if rejection.is_none_or(|r| r.0 < found) {
@@ -176,12 +178,12 @@ fn complete_grid(
         };
         let present = completeness(&(column, at, length));
         let is_removable = size.is_some_and(|asked| {
-            let less = if column {
+            let reduced = if column {
                 BoardSize::new(seen.columns - 1, seen.rows)
             } else {
                 BoardSize::new(seen.columns, seen.rows - 1)
             };
-            let is_large_enough = |a: BoardSize| less.columns >= a.columns && less.rows >= a.rows;
+            let is_large_enough = |a: BoardSize| reduced.columns >= a.columns && reduced.rows >= a.rows;
             is_large_enough(asked) || is_large_enough(asked.transposed())
         });
         if present < 0.5 || (present < 1.0 && is_removable) || (present < 0.75 && size.is_none()) {
@@ -227,7 +229,7 @@ fn rejection_reason(grid: &Grid, part: Part, size: Option<BoardSize>, (w, h): (u
     let [x0, x1, y0, y1] = grid.bounds();
     let seen = BoardSize::new((x1 - x0 + 1) as usize, (y1 - y0 + 1) as usize).landscape();
     let asked = size.unwrap_or(seen);
-    let whole = part.size().corners() == grid.nodes.len();
+    let is_complete = part.size().corners() == grid.nodes.len();
     let cut_off = grid.nodes.keys().any(|&(x, y)| {
         [(x == x0, -1, 0), (x == x1, 1, 0), (y == y0, 0, -1), (y == y1, 0, 1)].iter().any(|&(rim, dx, dy)| {
             let ends = (grid.position((x, y)), grid.position((x - dx, y - dy)));
@@ -236,8 +238,8 @@ fn rejection_reason(grid: &Grid, part: Part, size: Option<BoardSize>, (w, h): (u
             !(next.x > 0.0 && next.y > 0.0 && next.x < w as f64 - 1.0 && next.y < h as f64 - 1.0)
         })
     });
-    let fits = |a: BoardSize| seen.columns <= a.columns && seen.rows <= a.rows;
-    if (fits(asked) || fits(asked.transposed())) && (!whole || cut_off) {
+    let is_part_of = |a: BoardSize| seen.columns <= a.columns && seen.rows <= a.rows;
+    if (is_part_of(asked) || is_part_of(asked.transposed())) && (!is_complete || cut_off) {
         let found = grid.nodes.len();
         BoardError::Partial { found, seen: part.size().landscape(), asked, cut_off }
     } else {
@@ -258,8 +260,8 @@ fn order_corners(grid: &Grid, part: Part, size: BoardSize) -> Option<(BoardSize,
     ];
     let mut best: Option<((bool, f64), [Cell; 3])> = None;
     for (k, &[first, column, row]) in turns.iter().enumerate() {
-        let turned = if k & 1 == 0 { part.size() } else { part.size().transposed() };
-        if turned != size {
+        let rotated_size = if k & 1 == 0 { part.size() } else { part.size().transposed() };
+        if rotated_size != size {
             continue;
         }
         let node = grid.nodes.get(&first)?;
@@ -280,9 +282,9 @@ fn order_corners(grid: &Grid, part: Part, size: BoardSize) -> Option<(BoardSize,
     for r in 0..size.rows as i32 {
         for c in 0..size.columns as i32 {
             let p = grid.position(place(c, r))?;
-            let near = [(c - 1, r), (c + 1, r), (c, r - 1), (c, r + 1)];
-            let near = near.iter().filter_map(|&(c, r)| grid.position(place(c, r)));
-            places.push((p, near.fold(f64::INFINITY, |least, q| least.min((q - p).norm()))));
+            let neighbors = [(c - 1, r), (c + 1, r), (c, r - 1), (c, r + 1)];
+            let neighbors = neighbors.iter().filter_map(|&(c, r)| grid.position(place(c, r)));
+            places.push((p, neighbors.fold(f64::INFINITY, |nearest, q| nearest.min((q - p).norm()))));
         }
     }
     Some((size, places))

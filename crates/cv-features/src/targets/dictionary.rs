@@ -1,7 +1,8 @@
 //! Dictionaries of square fiducial markers, and decoding with error correction.
 //!
-//! Sources: S. Garrido-Jurado et al., "Automatic generation and detection of highly reliable fiducial markers under occlusion", Pattern Recognition 47, 2014 (ArUco);
-//! E. Olson, "AprilTag: a robust and flexible visual fiducial system", ICRA 2011.
+//! Sources: S. Garrido-Jurado et al., "Automatic generation and detection of highly reliable fiducial markers under
+//! occlusion", Pattern Recognition 47, 2014 (ArUco); E. Olson, "AprilTag: a robust and flexible visual fiducial
+//! system", ICRA 2011.
 
 use super::dictionary_bits::{APRILTAG_36H11, ARUCO_4X4, ARUCO_5X5, ARUCO_6X6};
 

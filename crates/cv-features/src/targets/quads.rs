@@ -44,12 +44,12 @@ pub(super) fn detect_quads(
     let image = small.as_ref().map_or(view, GrayF32::view);
     let black = threshold_adaptively(image, min_contrast);
     stage.check()?;
-    let mut rough = region_quads(black.view());
+    let mut initial = region_quads(black.view());
     // Again after erosion, which separates markers that touch each other or a black square at a corner.
     let eroded = erode(black.view(), &StructuringElement::square(1));
     stage.check()?;
-    rough.extend(region_quads(eroded.view()));
-    let refined: Vec<Option<[Point2<f64>; 4]>> = rough
+    initial.extend(region_quads(eroded.view()));
+    let refined: Vec<Option<[Point2<f64>; 4]>> = initial
         .par_iter()
         .with_min_len(16)
         .map(|quad| {

@@ -158,8 +158,8 @@ fn response_peaks(
     let (mut columns, mut found) = (Vec::new(), Vec::new());
     let (first, last) = (rows.start.saturating_sub(1).max(R), (rows.end + 1).min(h - R));
     for y in first..last {
-        let around: [&[f32]; 2 * R + 1] = std::array::from_fn(|i| image.row(y + i - R));
-        ring_response(level, around, response_rows.row_mut(y));
+        let window: [&[f32]; 2 * R + 1] = std::array::from_fn(|i| image.row(y + i - R));
+        ring_response(level, window, response_rows.row_mut(y));
         if y < first + 2 {
             continue;
         }

@@ -346,9 +346,9 @@ mod tests {
             // About as accurate as least squares on the true inliers; forty points with that noise determine a rotation
             // to 1e-3.
             assert!(r < 1.5 * r0 + 1e-3 && t < 1.5 * t0 + 5e-3, "{seed}: {r} {r0} {t} {t0}");
-            let right = found.inliers.iter().filter(|i| **i < 40).count();
+            let true_positives = found.inliers.iter().filter(|i| **i < 40).count();
             // Four standard deviations in two dimensions include all but one in three thousand.
-            assert!(right >= 39 && found.inliers.len() <= right + 3);
+            assert!(true_positives >= 39 && found.inliers.len() <= true_positives + 3);
         }
     }
 

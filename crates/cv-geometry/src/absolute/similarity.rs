@@ -183,13 +183,13 @@ mod tests {
     /// Points around the origin, and their noisy images under a similarity with a large translation.
     fn point_sets(seed: u64, n: usize, noise: f64, tilt: bool) -> (Similarity, Vec<Point3<f64>>, Vec<Point3<f64>>) {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let mut turn = Vector3::from_fn(|_, _| gauss(&mut rng));
+        let mut rotation_vector = Vector3::from_fn(|_, _| gauss(&mut rng));
         if !tilt {
-            (turn.x, turn.y) = (0.0, 0.0);
+            (rotation_vector.x, rotation_vector.y) = (0.0, 0.0);
         }
         let truth = Similarity {
             scale: 1.0 + 5.0 * uniform(&mut rng),
-            rotation: Rotation3::new(turn),
+            rotation: Rotation3::new(rotation_vector),
             translation: Vector3::new(5e5, 4e6, 300.0),
         };
         let a: Vec<_> = (0..n).map(|_| Point3::from(Vector3::from_fn(|_, _| 4.0 * gauss(&mut rng)))).collect();
@@ -211,11 +211,18 @@ mod tests {
                 let found = estimate_similarity(&a, &b, freedom, &options, &Silent).unwrap();
                 // Eighteen points with a noise of 0.1 over 4 to 24 units: 0.01 is four standard deviations.
                 assert!((found.model.scale / truth.scale - 1.0).abs() < 0.03, "{seed}: {}", found.model.scale);
-                let turn = (found.model.rotation.matrix() - truth.rotation.matrix()).norm();
-                assert!(turn < 0.06 && (tilt || found.model.rotation.matrix()[(2, 2)] == 1.0), "{seed}: {turn}");
+                let rotation_error = (found.model.rotation.matrix() - truth.rotation.matrix()).norm();
+                assert!(
+                    rotation_error < 0.06 && (tilt || found.model.rotation.matrix()[(2, 2)] == 1.0),
+                    "{seed}: {rotation_error}"
+                );
                 // Four standard deviations in three dimensions include all but one in a thousand.
-                let right = found.inliers.iter().filter(|i| **i >= 12).count();
-                assert!(right >= 17 && found.inliers.len() <= right + 1, "{seed}: {:?}", found.inliers);
+                let true_positives = found.inliers.iter().filter(|i| **i >= 12).count();
+                assert!(
+                    true_positives >= 17 && found.inliers.len() <= true_positives + 1,
+                    "{seed}: {:?}",
+                    found.inliers
+                );
                 assert!((0.08..0.25).contains(&found.rms), "{}", found.rms);
             }
         }

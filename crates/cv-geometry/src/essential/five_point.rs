@@ -97,9 +97,9 @@ fn refine_root(basis: &Basis, mut at: Vector3<f64>) -> Matrix3<f64> {
             |b: &Matrix3<f64>| (b * inner + e * b.transpose() * e + gram * b) * 2.0 - e * (2.0 * b.dot(&e)) - b * trace;
         let jacobian = [derivative(&parts[0]), derivative(&parts[1]), derivative(&parts[2])];
         let normal = Matrix3::from_fn(|i, j| jacobian[i].dot(&jacobian[j]));
-        let right = Vector3::from_fn(|i, _| jacobian[i].dot(&residual));
+        let rhs = Vector3::from_fn(|i, _| jacobian[i].dot(&residual));
         let Some(inverse) = normal.try_inverse() else { break };
-        let next = at - inverse * right;
+        let next = at - inverse * rhs;
         let next_e = matrix(&next);
         if !next_e.norm_squared().is_finite() {
             break;

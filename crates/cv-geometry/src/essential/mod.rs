@@ -406,10 +406,10 @@ mod tests {
             let options = RobustOptions { threshold: 1.5 * unit, seed, ..RobustOptions::default() };
             let found = estimate_relative_pose(&normalized, &options, &Silent).unwrap();
             errors.push(pose_difference(&found.model, &views.pose).map(f64::to_degrees));
-            let right = found.inliers.iter().filter(|i| **i < 150).count();
+            let true_positives = found.inliers.iter().filter(|i| **i < 150).count();
             // 1.5 px is three standard deviations; an outlier is that close to an epipolar line with a probability of
             // about 3/480.
-            assert!(right >= 140 && found.inliers.len() - right <= 15);
+            assert!(true_positives >= 140 && found.inliers.len() - true_positives <= 15);
         }
         errors.sort_by(|a, b| (a[0] + a[1]).total_cmp(&(b[0] + b[1])));
         // Half a pixel at a focal length of 500 px is 0.06 degrees for one ray; 150 of them determine the rotation to a
@@ -440,17 +440,17 @@ mod tests {
     #[test]
     fn a_pure_rotation_is_distinguished_from_a_translation() {
         let views = TwoViews::random(4);
-        let turn = Rotation3::new(Vector3::new(0.1, -0.2, 0.05));
-        let mut turned = views.normalized_matches(60, 0.0);
-        for m in &mut turned {
-            m.b = Point2::from_homogeneous(turn * m.a.to_homogeneous()).unwrap();
+        let truth = Rotation3::new(Vector3::new(0.1, -0.2, 0.05));
+        let mut rotated = views.normalized_matches(60, 0.0);
+        for m in &mut rotated {
+            m.b = Point2::from_homogeneous(truth * m.a.to_homogeneous()).unwrap();
         }
-        turned[3].b.x += 0.3;
-        let (rotation, inlier_ratio) = estimate_rotation(&turned, 1e-3).unwrap();
+        rotated[3].b.x += 0.3;
+        let (rotation, inlier_ratio) = estimate_rotation(&rotated, 1e-3).unwrap();
         // The one outlier of sixty has a weight of 1/300.
-        assert!(rotation_angle_between(&rotation, &turn) < 1e-4 && inlier_ratio == 59.0 / 60.0);
+        assert!(rotation_angle_between(&rotation, &truth) < 1e-4 && inlier_ratio == 59.0 / 60.0);
         assert!(estimate_rotation(&views.normalized_matches(60, 0.0), 1e-3).unwrap().1 < 0.5);
-        assert!(estimate_rotation(&turned[..1], 1e-3).is_err());
+        assert!(estimate_rotation(&rotated[..1], 1e-3).is_err());
     }
 
     #[test]

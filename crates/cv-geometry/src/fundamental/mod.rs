@@ -238,10 +238,14 @@ mod tests {
             // The error on exact points that were not used in the estimation.
             errors.push(views.exact_rms(&found.model));
             linear.push(views.exact_rms(&fundamental_eight_point(&m[..150]).unwrap()));
-            let right = found.inliers.iter().filter(|i| **i < 150).count();
+            let true_positives = found.inliers.iter().filter(|i| **i < 150).count();
             // 1 px is 3.3 standard deviations; an outlier is that close to an epipolar line with a probability of about
             // 2/480.
-            assert!(right >= 140 && found.inliers.len() - right <= 12, "{right} {}", found.inliers.len());
+            assert!(
+                true_positives >= 140 && found.inliers.len() - true_positives <= 12,
+                "{true_positives} {}",
+                found.inliers.len()
+            );
         }
         errors.sort_by(f64::total_cmp);
         linear.sort_by(f64::total_cmp);

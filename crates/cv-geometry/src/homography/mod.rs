@@ -294,9 +294,9 @@ mod tests {
             // As accurate as least squares on the true inliers, except for the few outliers that fit by chance.
             let oracle = refine_homography(&h, &m[..100]).unwrap();
             prop_assert!(corner_error(&found.model, &h) < 2.0 * corner_error(&oracle, &h) + 0.5);
-            let right = found.inliers.iter().filter(|i| **i < 100).count();
+            let true_positives = found.inliers.iter().filter(|i| **i < 100).count();
             // 3 px is ten standard deviations of the noise, before the map's own scale of at most 2.5 and its perspective.
-            prop_assert!(right >= 90 && found.inliers.len() <= right + 6, "{right} of {}", found.inliers.len());
+            prop_assert!(true_positives >= 90 && found.inliers.len() <= true_positives + 6, "{true_positives} of {}", found.inliers.len());
         }
 
         #[test]

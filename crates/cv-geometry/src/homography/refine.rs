@@ -149,11 +149,11 @@ impl<C: Scorer> LeastSquares for TransferProblem<'_, C> {
     }
 
     fn step(&self, h: &Matrix3<f64>, delta: &SVector<f64, 8>) -> Matrix3<f64> {
-        let mut moved = *h;
+        let mut updated = *h;
         for (i, d) in delta.iter().enumerate() {
-            moved[(i / 3, i % 3)] += d;
+            updated[(i / 3, i % 3)] += d;
         }
-        moved
+        updated
     }
 }
 
