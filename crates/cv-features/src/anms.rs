@@ -23,7 +23,7 @@ pub fn anms(corners: &[Keypoint], n: usize, robust: f32) -> Vec<usize> {
     if n == 0 || total == 0 {
         return Vec::new();
     }
-    let mut found = if total > 4 * n {
+    let mut corner_radii = if total > 4 * n {
         // The n-th largest radius of any subset is a lower bound of the n-th largest of all: corners with a suppressor
         // closer than that are pruned without computing their radius. Strong corners have large radii.
         let mut strongest: Vec<u32> = (0..total as u32).collect();
@@ -40,12 +40,12 @@ pub fn anms(corners: &[Keypoint], n: usize, robust: f32) -> Vec<usize> {
         let response = |i: u32| corners[i as usize].response;
         b.1.total_cmp(&a.1).then(response(b.0).total_cmp(&response(a.0))).then(a.0.cmp(&b.0))
     };
-    if n < found.len() {
-        found.select_nth_unstable_by(n - 1, by_radius);
-        found.truncate(n);
+    if n < corner_radii.len() {
+        corner_radii.select_nth_unstable_by(n - 1, by_radius);
+        corner_radii.truncate(n);
     }
-    found.sort_unstable_by(by_radius);
-    found.into_iter().map(|f| f.0 as usize).collect()
+    corner_radii.sort_unstable_by(by_radius);
+    corner_radii.into_iter().map(|f| f.0 as usize).collect()
 }
 
 /// Computes the squared suppression radius of each corner, in squared pixels; NaN for corners that are not finite. See
@@ -153,7 +153,7 @@ impl Tree {
     /// `bound` with a corner that suppresses them.
     fn candidates(&self, bound: f32) -> Vec<u32> {
         let leaves = self.nodes.len() / 2;
-        let mut kept = Vec::new();
+        let mut candidates = Vec::new();
         for (leaf, points) in self.points.chunks(LEAF_SIZE).enumerate() {
             let (mut node, mut suppresses) = (leaves + leaf, f32::NEG_INFINITY);
             while node > 0 && self.nodes[node].diagonal() < bound {
@@ -161,9 +161,9 @@ impl Tree {
                 node /= 2;
             }
             let remaining = points.iter().enumerate().filter(|(_, p)| p.response >= suppresses);
-            kept.extend(remaining.map(|(i, _)| (leaf * LEAF_SIZE + i) as u32));
+            candidates.extend(remaining.map(|(i, _)| (leaf * LEAF_SIZE + i) as u32));
         }
-        kept
+        candidates
     }
 
     /// Computes index and squared radius of the corners at the positions `of`. A radius below `bound` may be replaced

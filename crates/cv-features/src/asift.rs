@@ -49,10 +49,10 @@ pub fn sift_affine_view(
         Point2::new(cos * x + sin * y, cos * y - sin * x)
     };
     let simulated = simulated_view(view, (rotated_w, rotated_h), (tilt, width), to_input, progress)?;
-    let mut found = sift(simulated.view(), options, progress)?;
+    let mut features = sift(simulated.view(), options, progress)?;
     // The area is scaled by 1/tilt, so the geometric mean of lengths by its root.
     let scale_factor = tilt.sqrt();
-    let keep: Vec<bool> = found
+    let keep: Vec<bool> = features
         .keypoints
         .iter_mut()
         .map(|k| {
@@ -65,8 +65,8 @@ pub fn sift_affine_view(
             p.x >= 0.0 && p.y >= 0.0 && p.x <= right && p.y <= bottom
         })
         .collect();
-    found.retain(&keep);
-    Ok(found)
+    features.retain(&keep);
+    Ok(features)
 }
 
 /// Rows that are rotated between checks for cancellation: some milliseconds, and less memory than the whole image.

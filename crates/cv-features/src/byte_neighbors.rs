@@ -182,22 +182,22 @@ fn blocked<S: Simd, P: Products<S>, const V: usize>(
         .par_chunks(TASK_QUERIES * d)
         .enumerate()
         .map(|(task, rows)| {
-            let found = simd.vectorize(
+            let nearest = simd.vectorize(
                 #[inline(always)]
                 || block::<S, P, V>(simd, products, rows, (task * TASK_QUERIES) as u32, d, &panels, both_ways, stage),
             )?;
             stage.add(1)?;
-            Ok(found)
+            Ok(nearest)
         })
         .collect::<Result<_, Cancelled>>()?;
     let mut forward = Vec::with_capacity(query.len());
     let mut backward = vec![(i32::MAX, NONE); if both_ways { train.len() } else { 0 }];
     for (rows, columns) in tasks {
         forward.extend(rows);
-        for (best, found) in backward.iter_mut().zip(columns) {
+        for (best, candidate) in backward.iter_mut().zip(columns) {
             // Tasks are in order of their queries, so ties are resolved by index.
-            if found.0 < best.0 {
-                *best = found;
+            if candidate.0 < best.0 {
+                *best = candidate;
             }
         }
     }

@@ -143,9 +143,9 @@ fn guided<R: Comparable>(
         TwoViewModel::Fundamental(f) => {
             // The Sampson distance is symmetric: one search is enough for both directions.
             let search = Search::new(*f, true, (da, pa), (db, pb), options);
-            let found = search.run(&stage)?;
+            let nearest = search.run(&stage)?;
             stage.add(pb.len())?;
-            found
+            nearest
         }
         TwoViewModel::Homography(h) => {
             let Some(inverse) = h.try_inverse() else { return Ok(Vec::new()) };

@@ -126,8 +126,8 @@ pub fn mops(
     check_patches(options)?;
     check_image(view, MIN_SIDE)?;
     let pyramid = Pyramid::new(view, options.corners.layers, progress)?;
-    let found = detect(&pyramid, &options.corners, progress)?;
-    Ok(describe(&pyramid, view.size(), &found, options, progress)?)
+    let keypoints = detect(&pyramid, &options.corners, progress)?;
+    Ok(describe(&pyramid, view.size(), &keypoints, options, progress)?)
 }
 
 /// Computes the descriptors of [`mops`] for given keypoints: their scale is used, their angle is replaced by the
@@ -177,11 +177,11 @@ fn detect(pyramid: &Pyramid, options: &MultiScaleOptions, progress: &dyn Progres
             measure: options.measure,
             level: simd::level(),
         };
-        let found = corners(&plan, options.threshold, &stage)?;
+        let candidates = corners(&plan, options.threshold, &stage)?;
         // The structure tensor is of degree two in the gradients, Harris's measure of degree four.
         let power = if matches!(options.measure, CornerMeasure::ShiTomasi) { 2 } else { 4 };
         let gain = level.sigma.powi(power);
-        all.par_extend(found.par_iter().with_min_len(64).filter_map(|corner| {
+        all.par_extend(candidates.par_iter().with_min_len(64).filter_map(|corner| {
             let (x, y) = (corner.position.x * level.pixel, corner.position.y * level.pixel);
             let mut scale = level.sigma * level.pixel;
             if options.laplacian {

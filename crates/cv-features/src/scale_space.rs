@@ -179,19 +179,19 @@ fn process_octave(plan: &Plan<'_>, stage: &Stage<'_>) -> Result<OctaveResult, Ca
             strip.scales.push(part);
         }
     }
-    let found: Vec<Vec<Extremum>> = strips
+    let extrema: Vec<Vec<Extremum>> = strips
         .into_par_iter()
         .map(|mut strip| {
-            let mut found = Vec::new();
+            let mut extrema = Vec::new();
             let mut tile = Tile::new(plan, &strip);
             for x0 in (0..w).step_by(TILE_COLUMNS) {
-                tile.run(x0..(x0 + TILE_COLUMNS).min(w), &mut strip, &mut found, stage)?;
+                tile.run(x0..(x0 + TILE_COLUMNS).min(w), &mut strip, &mut extrema, stage)?;
                 stage.add(1)?;
             }
-            Ok(found)
+            Ok(extrema)
         })
         .collect::<Result<_, Cancelled>>()?;
-    Ok((scales, next, found.into_iter().flatten().collect()))
+    Ok((scales, next, extrema.into_iter().flatten().collect()))
 }
 
 /// A range of columns of a strip, and its line buffers.

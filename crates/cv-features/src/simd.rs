@@ -92,9 +92,9 @@ fn symmetric<S: Simd, T: Taps>(simd: S, out: &mut [f32], kernel: &[f32], taps: T
     // Four vectors at a time, whose sums stay in registers over all taps.
     while x + 4 * n <= width {
         let mut sums = [S::f32s::splat(simd, 0.0); 4];
-        let middle = taps.at(r, x, 4 * n);
+        let center = taps.at(r, x, 4 * n);
         for i in 0..4 {
-            sums[i] = S::f32s::from_slice(simd, &middle[i * n..(i + 1) * n]) * kernel[0];
+            sums[i] = S::f32s::from_slice(simd, &center[i * n..(i + 1) * n]) * kernel[0];
         }
         for (t, &weight) in kernel.iter().enumerate().skip(1) {
             let (before, after) = (taps.at(r - t, x, 4 * n), taps.at(r + t, x, 4 * n));

@@ -80,8 +80,8 @@ pub fn verify_pair(
     options: &VerifyOptions,
 ) -> Result<VerifiedPair, PairRejection> {
     let robust = RobustOptions { threshold: options.threshold, seed: options.seed, ..RobustOptions::homography() };
-    let found = estimate_homography(matches, &robust, &Silent)?;
-    let h = found.model;
+    let estimate = estimate_homography(matches, &robust, &Silent)?;
+    let h = estimate.model;
     let Some(inverse) = h.try_inverse() else { return Err(PairRejection::ImplausibleHomography) };
     let is_in_image = |m: &Matrix3<f64>, p: Point2<f64>, (w, height): (usize, usize)| {
         let q = m * Vector3::new(p.x, p.y, 1.0);
@@ -93,18 +93,18 @@ pub fn verify_pair(
     let inverse = if inverse[(2, 2)] < 0.0 { -inverse } else { inverse };
     let in_overlap =
         matches.iter().filter(|c| is_in_image(&h, c.a, size_b) && is_in_image(&inverse, c.b, size_a)).count();
-    let inliers = found.inliers.len();
+    let inliers = estimate.inliers.len();
     let needed = options.alpha + options.beta * in_overlap as f64;
     if inliers as f64 <= needed {
         return Err(PairRejection::TooFewInliers { inliers, in_overlap, needed });
     }
-    let inlier_matches: Vec<Correspondence> = found.inliers.iter().map(|&i| matches[i]).collect();
+    let inlier_matches: Vec<Correspondence> = estimate.inliers.iter().map(|&i| matches[i]).collect();
     // The Jacobian determinant at each inlier: the local change of area, positive where the orientation is preserved.
     let jacobian = |c: &Correspondence| h.determinant() / (h * Vector3::new(c.a.x, c.a.y, 1.0)).z.powi(3);
     if !inlier_matches.iter().all(|c| (1.0 / 64.0..64.0).contains(&jacobian(c))) {
         return Err(PairRejection::ImplausibleHomography);
     }
-    Ok(VerifiedPair { a, b, homography: h, inliers: found.inliers, matches: inlier_matches })
+    Ok(VerifiedPair { a, b, homography: h, inliers: estimate.inliers, matches: inlier_matches })
 }
 
 #[cfg(test)]

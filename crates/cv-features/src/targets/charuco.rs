@@ -73,10 +73,10 @@ pub fn find_charuco(
             let step = grid.spacing(place);
             let window = (clearance * step).min(options.max_window_radius.into()).max(2.0);
             let start = node.corner.position;
-            let Some(found) = refine_saddle(smooth.view(), start, window, 2e-4) else { continue };
-            if (found.position - start).norm() < (0.1 * step).max(1.0) {
+            let Some(saddle) = refine_saddle(smooth.view(), start, window, 2e-4) else { continue };
+            if (saddle.position - start).norm() < (0.1 * step).max(1.0) {
                 let id = y as usize * size.columns + x as usize;
-                points.push(BoardPoint { id, position: found.position, deviation: found.deviation_unsmoothed() });
+                points.push(BoardPoint { id, position: saddle.position, deviation: saddle.deviation_unsmoothed() });
             }
         }
         points.sort_by_key(|p| p.id);

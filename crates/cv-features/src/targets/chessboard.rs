@@ -113,9 +113,9 @@ pub fn find_chessboard(
                 boards.extend(order_corners(&grid, part, part.size().landscape()))
             }
             _ => {
-                let found = grid.nodes.len();
-                if rejection.is_none_or(|r| r.0 < found) {
-                    rejection = Some((found, rejection_reason(&grid, part, size, view.size())));
+                let detected = grid.nodes.len();
+                if rejection.is_none_or(|r| r.0 < detected) {
+                    rejection = Some((detected, rejection_reason(&grid, part, size, view.size())));
                 }
             }
         }
@@ -297,18 +297,18 @@ fn localize_corners(
     places: &[Place],
     max_window_radius: f32,
 ) -> Option<Chessboard> {
-    let found: Option<Vec<_>> = places
+    let localized: Option<Vec<_>> = places
         .par_iter()
         .with_min_len(16)
         .map(|&(start, spacing)| {
             let window = (WINDOW_RATIO * spacing).min(max_window_radius.into()).max(2.0);
-            let found = refine_saddle(view, start, window, 2e-4)?;
+            let saddle = refine_saddle(view, start, window, 2e-4)?;
             // The initial position of a valid corner is accurate to a tenth of a pixel.
-            let is_near = (found.position - start).norm() < (0.1 * spacing).max(1.0);
-            is_near.then_some((found.position, found.deviation_unsmoothed()))
+            let is_near = (saddle.position - start).norm() < (0.1 * spacing).max(1.0);
+            is_near.then_some((saddle.position, saddle.deviation_unsmoothed()))
         })
         .collect();
-    let (corners, deviations) = found?.into_iter().unzip();
+    let (corners, deviations) = localized?.into_iter().unzip();
     Some(Chessboard { size, corners, deviations })
 }
 

@@ -124,9 +124,9 @@ fn is_edge(
     let sign = if clockwise { 1.0 } else { -1.0 };
     let (mut sum, mut n) = (0.0f32, 0);
     for t in [0.3, 0.4, 0.5, 0.6, 0.7] {
-        let middle = from + along * t;
+        let midpoint = from + along * t;
         let at = |p: Point2<f64>| sample_bilinear(view, p.x, p.y).map(|[v]| v);
-        let (Some(a), Some(b)) = (at(middle + across), at(middle - across)) else { return false };
+        let (Some(a), Some(b)) = (at(midpoint + across), at(midpoint - across)) else { return false };
         let d = sign * (a - b);
         if d < 0.1 * contrast {
             return false;
@@ -269,10 +269,10 @@ pub(crate) fn assemble_grids(
                     continue;
                 }
                 // Edge direction `back` of j is the grid's direction g + 2.
-                let turned = (back + 8 - g - 2) & 3;
+                let neighbor_turns = (back + 8 - g - 2) & 3;
                 is_used[j] = true;
-                grid.nodes.insert(place, Node { corner: corners[j], turns: turned });
-                queue.push_back((j, place, turned));
+                grid.nodes.insert(place, Node { corner: corners[j], turns: neighbor_turns });
+                queue.push_back((j, place, neighbor_turns));
             }
         }
         if grid.nodes.len() >= min_corners {
@@ -342,12 +342,12 @@ impl Grid {
             let (step, corner) = (steps[p], &mut node.corner);
             // Large enough for the localization error of a coarse octave.
             let window = (clearance * step).clamp(2.0, (0.5 * corner.radius).max(4.0));
-            let Some(found) = refine_saddle(view, corner.position, window, COARSE_TOLERANCE) else { return false };
-            let is_near = (found.position - corner.position).norm() < 0.3 * step;
+            let Some(saddle) = refine_saddle(view, corner.position, window, COARSE_TOLERANCE) else { return false };
+            let is_near = (saddle.position - corner.position).norm() < 0.3 * step;
             let has_same_edges = |axes: [f64; 2]| (0..2).all(|i| line_angle(axes[i], corner.axes[i]) < 0.6);
             let is_valid = is_near
-                && x_corner_at(view, found.position, clearance * step).is_some_and(|(axes, _)| has_same_edges(axes));
-            corner.position = found.position;
+                && x_corner_at(view, saddle.position, clearance * step).is_some_and(|(axes, _)| has_same_edges(axes));
+            corner.position = saddle.position;
             is_valid
         });
         let outliers: Vec<(i32, i32)> = self
@@ -424,13 +424,13 @@ impl Grid {
         let neighbors: Vec<&Node> = STEPS.iter().filter_map(|(dx, dy)| self.nodes.get(&(x + dx, y + dy))).collect();
         let contrast = neighbors.iter().map(|n| n.corner.contrast).fold(f32::INFINITY, f32::min);
         let neighbor = neighbors.first()?;
-        let found = refine_saddle(view, predicted, (self.clearance * step).clamp(2.0, 8.0), COARSE_TOLERANCE)?;
-        if (found.position - predicted).norm() > 0.3 * step {
+        let saddle = refine_saddle(view, predicted, (self.clearance * step).clamp(2.0, 8.0), COARSE_TOLERANCE)?;
+        if (saddle.position - predicted).norm() > 0.3 * step {
             return None;
         }
         let radius = (self.clearance * step).clamp(2.0, 10.0);
-        let (axes, measured_contrast) = x_corner_at(view, found.position, radius)?;
-        let corner = XCorner { position: found.position, axes, contrast: measured_contrast, radius };
+        let (axes, measured_contrast) = x_corner_at(view, saddle.position, radius)?;
+        let corner = XCorner { position: saddle.position, axes, contrast: measured_contrast, radius };
         // Adjacent corners have opposite polarity: the edges are exchanged.
         let has_opposite_polarity =
             line_angle(axes[1], neighbor.corner.axes[0]) < 0.5 && line_angle(axes[0], neighbor.corner.axes[1]) < 0.5;

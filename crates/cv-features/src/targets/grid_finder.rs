@@ -88,7 +88,7 @@ pub fn find_marker_grid(
             (0..4).map(|k| (marker.corners[(k + 1) % 4] - marker.corners[k]).norm()).fold(f64::INFINITY, f64::min);
         for k in 0..4 {
             let start = marker.corners[k];
-            let found = if is_april_grid {
+            let localized = if is_april_grid {
                 // The window is limited by the border and the black squares.
                 let clearance = shortest_side * board.spacing.min(0.2);
                 let window = (0.75 * clearance).min(options.max_window_radius.into()).max(2.0);
@@ -97,7 +97,7 @@ pub fn find_marker_grid(
             } else {
                 refine_marker_corner(localization_image.view(), &marker.corners, k, 2.5)
             };
-            let Some((position, deviation)) = found else { continue };
+            let Some((position, deviation)) = localized else { continue };
             if (position - start).norm() < (0.05 * shortest_side).max(1.5) {
                 points.push(BoardPoint { id: 4 * marker.id + k, position, deviation });
             }

@@ -56,10 +56,10 @@ pub(super) fn detect_quads(
             stage.check()?;
             let quad = quad.map(|p| p * scale);
             let Some(lines) = fit_sides(view, &quad, 1.5 + 2.5 * scale) else { return Ok(None) };
-            let near = intersect_sides(&lines)
-                .filter(|near| near.iter().zip(&quad).all(|(p, q)| (p - q).norm() < 6.0 * scale));
-            let Some(near) = near else { return Ok(None) };
-            Ok(fit_sides(view, &near, 2.5).and_then(|lines| intersect_sides(&lines)))
+            let coarse = intersect_sides(&lines)
+                .filter(|coarse| coarse.iter().zip(&quad).all(|(p, q)| (p - q).norm() < 6.0 * scale));
+            let Some(coarse) = coarse else { return Ok(None) };
+            Ok(fit_sides(view, &coarse, 2.5).and_then(|lines| intersect_sides(&lines)))
         })
         .collect::<Result<_, Cancelled>>()?;
     let mut out: Vec<[Point2<f64>; 4]> = Vec::new();
@@ -97,10 +97,10 @@ fn threshold_adaptively(image: ImageView<'_, f32, 1>, min_contrast: f32) -> Mask
         .collect();
     let thresholds: Vec<f32> = (0..rows * columns)
         .map(|t| {
-            let near = |i: usize, n: usize| i.saturating_sub(1)..=(i + 1).min(n - 1);
+            let neighborhood = |i: usize, n: usize| i.saturating_sub(1)..=(i + 1).min(n - 1);
             let (mut low, mut high) = (f32::INFINITY, f32::NEG_INFINITY);
-            for j in near(t / columns, rows) {
-                for i in near(t % columns, columns) {
+            for j in neighborhood(t / columns, rows) {
+                for i in neighborhood(t % columns, columns) {
                     let (l, h) = tiles[j * columns + i];
                     (low, high) = (low.min(l), high.max(h));
                 }
@@ -114,8 +114,8 @@ fn threshold_adaptively(image: ImageView<'_, f32, 1>, min_contrast: f32) -> Mask
 /// Computes the quadrilaterals around the 4-connected components of a mask, accurate to one or two pixels.
 fn region_quads(mask: ImageView<'_, bool, 1>) -> Vec<[Point2<f64>; 4]> {
     let (w, h) = mask.size();
-    let found = connected_components(mask, Connectivity::Four);
-    let is_candidate: Vec<bool> = found
+    let components = connected_components(mask, Connectivity::Four);
+    let is_candidate: Vec<bool> = components
         .stats
         .iter()
         .map(|s| {
@@ -124,9 +124,9 @@ fn region_quads(mask: ImageView<'_, bool, 1>) -> Vec<[Point2<f64>; 4]> {
         })
         .collect();
     // Row, first and last column of each region in each of its rows.
-    let mut ends: Vec<Vec<[u32; 3]>> = vec![Vec::new(); found.stats.len()];
+    let mut ends: Vec<Vec<[u32; 3]>> = vec![Vec::new(); components.stats.len()];
     for y in 0..h {
-        for (x, &label) in found.labels.row(y).iter().enumerate() {
+        for (x, &label) in components.labels.row(y).iter().enumerate() {
             let Some(i) = (label as usize).checked_sub(1).filter(|i| is_candidate[*i]) else { continue };
             match ends[i].last_mut().filter(|end| end[0] == y as u32) {
                 Some(end) => end[2] = x as u32,

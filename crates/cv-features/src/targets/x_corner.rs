@@ -67,17 +67,17 @@ pub(crate) fn detect_x_corners(
 ) -> Result<(Vec<XCorner>, GrayF32), Cancelled> {
     let level = simd::level();
     let smooth = smoothed(view, level);
-    let mut found = detect_in_octave(&smooth, 1.0, min_contrast, progress)?;
+    let mut corners = detect_in_octave(&smooth, 1.0, min_contrast, progress)?;
     let mut image = pyr_down(view);
     for scale in [2.0, 4.0, 8.0, 16.0] {
         // Smaller images cannot contain a board at this scale.
         if image.width().min(image.height()) < 30 {
             break;
         }
-        found.extend(detect_in_octave(&image, scale, min_contrast, progress)?);
+        corners.extend(detect_in_octave(&image, scale, min_contrast, progress)?);
         image = pyr_down(image.view());
     }
-    Ok((remove_duplicates(found), smooth))
+    Ok((remove_duplicates(corners), smooth))
 }
 
 /// Smooths with the binomial kernel `[1 2 1]/4` along both axes.
@@ -118,7 +118,7 @@ fn detect_in_octave(
     let (first, last) = (R, h - R);
     let rows = (last - first).div_ceil(4 * rayon::current_num_threads()).max(48);
     let stage = Stage::new(progress, "corners", (last - first).div_ceil(rows))?;
-    let mut found: Vec<(f32, XCorner)> = (0..(last - first).div_ceil(rows))
+    let mut candidates: Vec<(f32, XCorner)> = (0..(last - first).div_ceil(rows))
         .into_par_iter()
         .map(|i| {
             stage.add(1)?;
@@ -129,21 +129,21 @@ fn detect_in_octave(
                     corner.contrast >= min_contrast && response >= 8.0 * MIN_RELATIVE_RESPONSE * corner.contrast;
                 is_corner.then_some((response, corner))
             };
-            let mut found = Vec::new();
+            let mut candidates = Vec::new();
             // In noise, a strip has tens of thousands of peaks.
             for peaks in response_peaks(image, from..to, floor, level).chunks(PEAKS_PER_CHECK) {
                 stage.check()?;
-                found.extend(peaks.iter().filter_map(verify));
+                candidates.extend(peaks.iter().filter_map(verify));
             }
-            Ok(found)
+            Ok(candidates)
         })
         .collect::<Result<Vec<_>, Cancelled>>()?
         .concat();
-    if found.len() > MAX_CANDIDATES {
-        found.sort_by(|a, b| b.0.total_cmp(&a.0));
-        found.truncate(MAX_CANDIDATES);
+    if candidates.len() > MAX_CANDIDATES {
+        candidates.sort_by(|a, b| b.0.total_cmp(&a.0));
+        candidates.truncate(MAX_CANDIDATES);
     }
-    Ok(found.into_iter().map(|f| f.1).collect())
+    Ok(candidates.into_iter().map(|f| f.1).collect())
 }
 
 /// Detects the peaks of the response in a range of rows: column, row, sub-pixel offset, response.
@@ -155,7 +155,7 @@ fn response_peaks(
 ) -> Vec<(usize, usize, f32, f32, f32)> {
     let (w, h) = image.size();
     let mut response_rows = LineBuffer::new(0..w - 2 * R, 3);
-    let (mut columns, mut found) = (Vec::new(), Vec::new());
+    let (mut columns, mut peaks) = (Vec::new(), Vec::new());
     let (first, last) = (rows.start.saturating_sub(1).max(R), (rows.end + 1).min(h - R));
     for y in first..last {
         let window: [&[f32]; 2 * R + 1] = std::array::from_fn(|i| image.row(y + i - R));
@@ -170,11 +170,11 @@ fn response_peaks(
             let v = here[x];
             if v > above[x - 1] && v > above[x] && v > above[x + 1] && v > here[x - 1] {
                 let (dx, dy) = crate::harris::quadratic_peak([above, here, below].map(|r| [r[x - 1], r[x], r[x + 1]]));
-                found.push((x + R, y - 1, dx, dy, v));
+                peaks.push((x + R, y - 1, dx, dy, v));
             }
         }
     }
-    found
+    peaks
 }
 
 /// Computes the response of a row from seven image rows, of which it is the middle one; `out` starts at column 3.
@@ -304,17 +304,17 @@ pub(crate) fn edge_directions(values: &[f32; 16], angle: impl Fn(usize) -> f64) 
 
 /// Removes duplicates of several octaves: keeps the corner with the highest contrast, with a preference for finer
 /// octaves, which are more accurate.
-fn remove_duplicates(mut found: Vec<XCorner>) -> Vec<XCorner> {
+fn remove_duplicates(mut corners: Vec<XCorner>) -> Vec<XCorner> {
     // A preference of 15 % per octave.
     let priority = |c: &XCorner| c.contrast * (c.radius as f32).powf(-0.23);
-    found.sort_by(|a, b| {
+    corners.sort_by(|a, b| {
         let by = priority(b).total_cmp(&priority(a)).then(a.position.y.total_cmp(&b.position.y));
         by.then(a.position.x.total_cmp(&b.position.x))
     });
-    let mut kept: Vec<XCorner> = Vec::new();
+    let mut unique: Vec<XCorner> = Vec::new();
     let mut cells: std::collections::HashMap<(i64, i64), Vec<usize>> = std::collections::HashMap::new();
     const CELL: f64 = 24.0;
-    for corner in found {
+    for corner in corners {
         let cell = |v: f64| (v / CELL).floor() as i64;
         let (x, y) = (cell(corner.position.x), cell(corner.position.y));
         // Squares are larger than the smaller ring, and the position of the larger one is less accurate.
@@ -323,14 +323,14 @@ fn remove_duplicates(mut found: Vec<XCorner>) -> Vec<XCorner> {
             (other.position - corner.position).norm() < (0.6 * small).max(0.12 * large).max(2.0)
         };
         let has_duplicate = (y - 1..=y + 1).any(|j| {
-            (x - 1..=x + 1).any(|i| cells.get(&(i, j)).is_some_and(|c| c.iter().any(|&k| is_duplicate(&kept[k]))))
+            (x - 1..=x + 1).any(|i| cells.get(&(i, j)).is_some_and(|c| c.iter().any(|&k| is_duplicate(&unique[k]))))
         });
         if !has_duplicate {
-            cells.entry((x, y)).or_default().push(kept.len());
-            kept.push(corner);
+            cells.entry((x, y)).or_default().push(unique.len());
+            unique.push(corner);
         }
     }
-    kept
+    unique
 }
 
 #[cfg(test)]

@@ -78,8 +78,8 @@ pub fn estimate_essential(
     options: &RobustOptions,
     progress: &dyn Progress,
 ) -> Result<RobustModel<Matrix3<f64>>, EstimateError> {
-    let found = estimate_relative_pose(matches, options, progress)?;
-    Ok(found.map(|pose| essential_from_pose(&pose)))
+    let estimate = estimate_relative_pose(matches, options, progress)?;
+    Ok(estimate.map(|pose| essential_from_pose(&pose)))
 }
 
 /// Refines a relative pose by minimizing the robust Sampson error of `matches` (normalized).

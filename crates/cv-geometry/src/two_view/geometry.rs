@@ -46,21 +46,21 @@ pub fn estimate_two_view_geometry(
     let degeneracy = DegeneracyTest::new(pairs, views.sizes, prior, options, progress)?;
     // The number of matches is an upper bound of the number of inliers.
     degeneracy.check(pairs.len(), options)?;
-    let found = search(pairs, views.sizes, prior, options, progress);
+    let result = search(pairs, views.sizes, prior, options, progress);
     // For a pure rotation, a translation hypothesis has only part of the matches as inliers: half of the points are
     // behind a camera.
     if let Err(
         TwoViewError::TooFewInliers { inliers, .. }
         | TwoViewError::UncertainPose { inliers, .. }
         | TwoViewError::WrongFocal { inliers, .. },
-    ) = &found
+    ) = &result
     {
         degeneracy.check(*inliers, options)?;
     }
-    let mut found = found?;
-    degeneracy.check(found.inliers.len(), options)?;
-    found.planar_share = degeneracy.planar as f64 / found.inliers.len() as f64;
-    Ok(found)
+    let mut geometry = result?;
+    degeneracy.check(geometry.inliers.len(), options)?;
+    geometry.planar_share = degeneracy.planar as f64 / geometry.inliers.len() as f64;
+    Ok(geometry)
 }
 
 /// Dispatches on the known intrinsics.
@@ -170,16 +170,16 @@ fn estimate_calibrated(
     let search = |k: u64| {
         let seed = options.robust.seed.wrapping_add(k);
         let options = RobustOptions { threshold, seed, ..options.robust };
-        let found = estimate_relative_pose(&normalized, &options, &stage)?;
-        let (pose, loss) = refine_relative_pose(&found.model, &normalized, threshold);
+        let estimate = estimate_relative_pose(&normalized, &options, &stage)?;
+        let (pose, loss) = refine_relative_pose(&estimate.model, &normalized, threshold);
         stage.add(1)?;
-        Ok((RobustModel { model: pose, ..found }, loss))
+        Ok((RobustModel { model: pose, ..estimate }, loss))
     };
     let searches: Vec<_> = (0..SEARCHES).into_par_iter().map(search).collect();
-    let mut found: Vec<(RobustModel<Pose>, f64)> =
+    let mut estimates: Vec<(RobustModel<Pose>, f64)> =
         searches.into_iter().collect::<Result<_, _>>().map_err(|error| two_view_error(error, pairs.len(), options))?;
-    found.sort_by(|a, b| a.1.total_cmp(&b.1));
-    let (best, others) = (&found[0].0, &found[1..]);
+    estimates.sort_by(|a, b| a.1.total_cmp(&b.1));
+    let (best, others) = (&estimates[0].0, &estimates[1..]);
     check_inliers(best.inliers.len(), pairs.len(), options)?;
     // The largest angle to the direction of another search whose pose is indistinguishable from the best.
     let ambiguity = others

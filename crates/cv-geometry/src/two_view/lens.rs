@@ -205,16 +205,16 @@ impl Search<'_> {
             max_iterations: MAX_SAMPLES[0].min(self.robust.max_iterations),
             ..*self.robust
         };
-        let found = unless_cancelled(estimate_relative_pose(&usable, &options, self.stage))?;
-        Ok(found.map(|found| self.refine_pose(lens, &found.model)))
+        let estimate = unless_cancelled(estimate_relative_pose(&usable, &options, self.stage))?;
+        Ok(estimate.map(|estimate| self.refine_pose(lens, &estimate.model)))
     }
 
     /// Searches the best pose and focal length for a distortion.
     fn search_pose_and_focal(&self, distortion: f64) -> Result<Option<LensHypothesis>, Cancelled> {
         let usable: Vec<_> = self.undistorted(distortion).into_iter().filter(Correspondence::is_finite).collect();
         let options = RobustOptions { max_iterations: MAX_SAMPLES[1].min(self.robust.max_iterations), ..*self.robust };
-        let found = unless_cancelled(estimate_shared_focal_pose(&usable, &options, self.stage))?;
-        Ok(found.map(|found| self.refine_pose_and_focal(distortion, &found.model)))
+        let estimate = unless_cancelled(estimate_shared_focal_pose(&usable, &options, self.stage))?;
+        Ok(estimate.map(|estimate| self.refine_pose_and_focal(distortion, &estimate.model)))
     }
 
     /// Searches the best of a grid of plausible focal lengths.
