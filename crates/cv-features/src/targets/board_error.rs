@@ -10,13 +10,17 @@ use cv_core::{Cancelled, OptionError};
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum BoardError {
     /// The requested chessboard size is out of range.
-    #[error("a board of {asked} inner corners: each side takes {} to {}", BoardSize::MIN_SIDE, BoardSize::MAX_SIDE)]
+    #[error(
+        "chessboard of {asked} inner corners: each side must have {} to {}",
+        BoardSize::MIN_SIDE,
+        BoardSize::MAX_SIDE
+    )]
     Size {
         /// Requested size.
         asked: BoardSize,
     },
     /// The layout of a marker board is out of range.
-    #[error("no board has {columns}×{rows} squares or markers with markers, or gaps, of {share:.2} of a side")]
+    #[error("invalid board layout: {columns}×{rows}, relative size of markers or gaps {share:.2}")]
     Layout {
         /// Number of columns of squares or markers.
         columns: usize,
@@ -34,13 +38,13 @@ pub enum BoardError {
         dictionary: Dictionary,
     },
     /// No chessboard was detected.
-    #[error("no chessboard among the {corners} corners where black and white squares meet")]
+    #[error("no chessboard detected among {corners} candidate corners")]
     NoBoard {
         /// Number of X-corners detected.
         corners: usize,
     },
     /// No marker of the board could be decoded.
-    #[error("no marker of {dictionary} among {seen} places that look like one")]
+    #[error("no marker of {dictionary} decoded among {seen} candidates")]
     NoMarkers {
         /// Requested dictionary.
         dictionary: Dictionary,
@@ -48,7 +52,7 @@ pub enum BoardError {
         seen: usize,
     },
     /// The markers are of another dictionary.
-    #[error("saw {markers} markers of {seen}, none of {asked}")]
+    #[error("detected {markers} markers of {seen}, none of {asked}")]
     OtherDictionary {
         /// Detected dictionary, the largest of its family.
         seen: Dictionary,
@@ -58,7 +62,7 @@ pub enum BoardError {
         asked: Dictionary,
     },
     /// The markers are those of the board, mirrored.
-    #[error("shows {markers} markers of {dictionary}, mirrored")]
+    #[error("detected {markers} markers of {dictionary}, mirrored")]
     Mirrored {
         /// Number of mirrored markers.
         markers: usize,
@@ -66,13 +70,13 @@ pub enum BoardError {
         dictionary: Dictionary,
     },
     /// The markers are of the dictionary, but in another layout.
-    #[error("saw {markers} markers, which do not lie as on the board that was asked for")]
+    #[error("detected {markers} markers, but not in the layout of the requested board")]
     OtherLayout {
         /// Number of decoded markers.
         markers: usize,
     },
     /// The chessboard has another size.
-    #[error("saw a board of {seen}, not {asked} inner corners")]
+    #[error("detected a board of {seen}, not {asked} inner corners")]
     OtherSize {
         /// Detected size.
         seen: BoardSize,
@@ -80,7 +84,7 @@ pub enum BoardError {
         asked: BoardSize,
     },
     /// The board is only partly visible: truncated by the image border, occluded, or overexposed.
-    #[error("saw {found} of the {} corners of a {asked} board, {seen} where they are whole", asked.corners())]
+    #[error("detected {found} of the {} corners of a {asked} board, the largest complete part is {seen}", asked.corners())]
     Partial {
         /// Number of corners detected.
         found: usize,
@@ -92,7 +96,7 @@ pub enum BoardError {
         cut_off: bool,
     },
     /// The board was detected more than once.
-    #[error("saw the board {boards} times")]
+    #[error("detected the board {boards} times")]
     SeveralBoards {
         /// Number of boards.
         boards: usize,

@@ -371,7 +371,7 @@ mod tests {
         assert!(first_row == last_column || first_row.iter().eq((0..6).map(|r| &board.corners[9 * r + 8])));
         let asked = BoardSize::new(7, 5);
         assert_eq!(find(&gray, Some(asked)), Err(BoardError::OtherSize { seen: SIZE, asked }));
-        assert_eq!(find(&gray, Some(asked)).unwrap_err().to_string(), "saw a board of 9×6, not 7×5 inner corners");
+        assert_eq!(find(&gray, Some(asked)).unwrap_err().to_string(), "detected a board of 9×6, not 7×5 inner corners");
         let asked = BoardSize::new(2, 5);
         assert_eq!(find(&gray, Some(asked)), Err(BoardError::Size { asked }));
         // The order on the board does not change if the image is rotated by 180°.
