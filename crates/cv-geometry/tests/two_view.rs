@@ -187,15 +187,17 @@ fn pure_rotations_and_planar_scenes_are_rejected() {
     let rotated = Scene::new(1, rotation, (4.0, 12.0), 150, 20);
     match reconstruct_two_views(&rotated.views(), &rotated.known(), &Silent) {
         // The angle of (0.02, 0.12, 0.01).
-        Err(TwoViewError::PureRotation { share, degrees }) => assert!(share > 0.95 && (degrees - 7.0).abs() < 0.1),
+        Err(TwoViewError::PureRotation { fraction, degrees }) => {
+            assert!(fraction > 0.95 && (degrees - 7.0).abs() < 0.1)
+        }
         other => panic!("{other:?}"),
     }
     let plane = Scene::new(2, Scene::general(0).pose, (8.0, 8.0), 150, 20);
     let error = reconstruct_two_views(&plane.views(), &plane.known(), &Silent).unwrap_err();
-    assert!(matches!(error, TwoViewError::Planar { share } if share > 0.95), "{error}");
+    assert!(matches!(error, TwoViewError::Planar { fraction } if fraction > 0.95), "{error}");
     for scene in [&rotated, &plane] {
         let error = reconstruct_two_views(&scene.views(), &TwoViewOptions::default(), &Silent).unwrap_err();
-        assert!(matches!(error, TwoViewError::PlanarOrTurned { share } if share > 0.95), "{error}");
+        assert!(matches!(error, TwoViewError::PlanarOrPureRotation { fraction } if fraction > 0.95), "{error}");
     }
 }
 
@@ -213,19 +215,22 @@ fn distortion_is_not_mistaken_for_parallax() {
         let matrix = Camera::from_focal(640, 480, 560.0);
         for intrinsics in [Intrinsics::Focal([560.0; 2]), Intrinsics::Matrix([matrix; 2])] {
             match reject(&rotated, intrinsics) {
-                TwoViewError::PureRotation { share, degrees } => {
+                TwoViewError::PureRotation { fraction, degrees } => {
                     // The angle of (0.03, 0.17, 0.02), with a tolerance for a focal length uncertainty of a few per
                     // cent.
-                    assert!(share > 0.95 && (degrees - 9.96).abs() < 0.5, "{k1}: {share} {degrees}");
+                    assert!(fraction > 0.95 && (degrees - 9.96).abs() < 0.5, "{k1}: {fraction} {degrees}");
                 }
                 other => panic!("{k1}: {other}"),
             }
             let error = reject(&planar, intrinsics);
-            assert!(matches!(error, TwoViewError::Planar { share } if share > 0.95), "{k1}: {error}");
+            assert!(matches!(error, TwoViewError::Planar { fraction } if fraction > 0.95), "{k1}: {error}");
         }
         for scene in [&rotated, &planar] {
             let error = reject(scene, Intrinsics::Unknown);
-            assert!(matches!(error, TwoViewError::PlanarOrTurned { share } if share > 0.95), "{k1}: {error}");
+            assert!(
+                matches!(error, TwoViewError::PlanarOrPureRotation { fraction } if fraction > 0.95),
+                "{k1}: {error}"
+            );
         }
         // A general scene with the same lens is accepted.
         let general = Scene::with_lens(k1, seed as u64, Scene::general(0).pose, (4.0, 12.0), 300, 40);

@@ -52,8 +52,8 @@ pub struct TwoViewReconstruction {
     pub pose_deviation_given_lens: [f64; 2],
     /// Relative standard deviation of the focal length; 0 for known cameras.
     pub focal_deviation: f64,
-    /// Fraction of the inliers that fit one homography.
-    pub planar_share: f64,
+    /// Number of inliers of one homography relative to `inliers`.
+    pub planar_ratio: f64,
 }
 
 impl TwoViewReconstruction {
@@ -200,7 +200,7 @@ impl<'a> TwoViewAdjustment<'a> {
             pose_deviation,
             pose_deviation_given_lens,
             focal_deviation,
-            planar_share: geometry.planar_share,
+            planar_ratio: geometry.planar_ratio,
         })
     }
 }

@@ -86,14 +86,14 @@ impl DegeneracyTest {
         let inlier_fraction = |n: usize| (n as f64 / inliers.max(1) as f64).min(1.0);
         let is_degenerate = |n: usize| n >= options.min_inliers && inlier_fraction(n) >= options.degenerate_ratio;
         if is_degenerate(self.rotated) {
-            return Err(TwoViewError::PureRotation { share: inlier_fraction(self.rotated), degrees: self.degrees });
+            return Err(TwoViewError::PureRotation { fraction: inlier_fraction(self.rotated), degrees: self.degrees });
         }
         if is_degenerate(self.planar) {
-            let share = inlier_fraction(self.planar);
+            let fraction = inlier_fraction(self.planar);
             return Err(if self.is_calibrated {
-                TwoViewError::Planar { share }
+                TwoViewError::Planar { fraction }
             } else {
-                TwoViewError::PlanarOrTurned { share }
+                TwoViewError::PlanarOrPureRotation { fraction }
             });
         }
         Ok(())

@@ -56,25 +56,29 @@ pub enum TwoViewError {
         needed: usize,
     },
     /// The motion is a pure rotation.
-    #[error("the camera only turned, or hardly moved: a rotation by {degrees:.1} degrees explains {:.0} % of the matches", 100.0 * share)]
+    #[error("the camera only turned, or hardly moved: a rotation by {degrees:.1} degrees explains {:.0} % of the matches", 100.0 * fraction)]
     PureRotation {
         /// Fraction of the inliers that fit the rotation.
-        share: f64,
+        #[cfg_attr(feature = "serde", serde(rename = "share"))]
+        fraction: f64,
         /// Angle of the rotation in degrees.
         degrees: f64,
     },
     /// The scene is planar.
-    #[error("the scene is one plane: a homography explains {:.0} % of the matches", 100.0 * share)]
+    #[error("the scene is one plane: a homography explains {:.0} % of the matches", 100.0 * fraction)]
     Planar {
         /// Fraction of the inliers that fit the homography.
-        share: f64,
+        #[cfg_attr(feature = "serde", serde(rename = "share"))]
+        fraction: f64,
     },
     /// A homography fits the matches; a planar scene and a pure rotation cannot be distinguished, since the focal
     /// length is unknown.
-    #[error("the scene is one plane, or the camera only turned: a homography explains {:.0} % of the matches", 100.0 * share)]
-    PlanarOrTurned {
+    #[error("the scene is one plane, or the camera only turned: a homography explains {:.0} % of the matches", 100.0 * fraction)]
+    #[cfg_attr(feature = "serde", serde(rename = "PlanarOrTurned"))]
+    PlanarOrPureRotation {
         /// Fraction of the inliers that fit the homography.
-        share: f64,
+        #[cfg_attr(feature = "serde", serde(rename = "share"))]
+        fraction: f64,
     },
     /// The parallax is too small.
     #[error(

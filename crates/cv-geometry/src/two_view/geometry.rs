@@ -22,8 +22,8 @@ pub struct TwoViewGeometry {
     pub inliers: Vec<usize>,
     /// Maximum relative change of the focal length that the matches do not exclude; 0 if it was given.
     pub focal_range: f64,
-    /// Fraction of the inliers that fit one homography.
-    pub planar_share: f64,
+    /// Number of inliers of one homography relative to `inliers`.
+    pub planar_ratio: f64,
 }
 
 /// Estimates intrinsics (if unknown), relative pose and inliers of two views.
@@ -59,7 +59,7 @@ pub fn estimate_two_view_geometry(
     }
     let mut geometry = result?;
     degeneracy.check(geometry.inliers.len(), options)?;
-    geometry.planar_share = degeneracy.planar as f64 / geometry.inliers.len() as f64;
+    geometry.planar_ratio = degeneracy.planar as f64 / geometry.inliers.len() as f64;
     Ok(geometry)
 }
 
@@ -196,7 +196,7 @@ fn estimate_calibrated(
         });
     }
     let inliers = best.inliers.iter().map(|&i| usable[i]).collect();
-    Ok(TwoViewGeometry { cameras, pose: best.model, inliers, focal_range: 0.0, planar_share: 0.0 })
+    Ok(TwoViewGeometry { cameras, pose: best.model, inliers, focal_range: 0.0, planar_ratio: 0.0 })
 }
 
 /// Number of searches with different seeds. If the matches determine the pose, all find it. Of two equally likely
