@@ -47,7 +47,7 @@ pub fn board(bytes: &[u8]) -> Corpus {
 
 /// The board turned, tilted and in some light, with rectangles of any gray over it.
 fn seen(u: &mut Unstructured<'_>, board: &Board, (w, h): (usize, usize)) -> GrayF32 {
-    let (black, o) = (board.black(), board.outline());
+    let (black, o) = (board.black_rectangles(), board.outline());
     let (sin, cos) = make::within(u, -3.2, 3.2).sin_cos();
     let size = make::within(u, 0.4, 1.3) * (w as f64 / o.width).min(h as f64 / o.height);
     let tilt = [make::within(u, -0.004, 0.004), make::within(u, -0.004, 0.004)];

@@ -37,10 +37,10 @@ fn parse_counts(text: &str) -> Result<Counts, String> {
         return Ok(Counts(None));
     }
     let sides = text.split_once(['x', '×']).and_then(|(c, r)| Some((c.parse().ok()?, r.parse().ok()?)));
-    let valid = sides.filter(|(c, r)| [c, r].iter().all(|n| (1..=BoardSize::MOST).contains(n)));
+    let valid = sides.filter(|(c, r)| [c, r].iter().all(|n| (1..=BoardSize::MAX_SIDE).contains(n)));
     valid
         .map(|sides| Counts(Some(sides)))
-        .ok_or_else(|| format!("give columns and rows as 9x6, up to {} on a side, or auto", BoardSize::MOST))
+        .ok_or_else(|| format!("give columns and rows as 9x6, up to {} on a side, or auto", BoardSize::MAX_SIDE))
 }
 
 impl BoardArgs {

@@ -59,7 +59,7 @@ fn mirrored_boards_two_at_once_and_the_dark_are_told_apart() {
     assert!(said.contains("6 markers of 4x4_50, mirrored"), "{said}");
     let twice = GrayU8::from_fn(2 * width, height, |x, y| photo.at(x % width, y));
     let said = said_of(folder.path(), &twice, &BOARD);
-    assert!(said.contains("saw the board 2 times"), "{said}");
+    assert!(said.contains("detected the board 2 times"), "{said}");
     // A lens cap with a little light: white is at 4 of 255.
     let dark = photo.map(|[v]| [v / 60]);
     let said = said_of(folder.path(), &dark, &BOARD);

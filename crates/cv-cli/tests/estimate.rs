@@ -107,21 +107,25 @@ fn matches_that_determine_nothing_are_refused_with_the_reason() {
     infinite[9][1] = f64::INFINITY;
     let cases: [Case<'_>; 12] = [
         ("three", &good[..3], ["3 matches are too few"; 3]),
-        ("seven", &good[..7], ["as some model would if all were wrong", "7 matches are too few", "if all were wrong"]),
+        ("seven", &good[..7], ["no more than expected by chance", "7 matches are too few", "expected by chance"]),
         (
             "seven wrong ones",
             &random(7, 0.0, 480.0),
-            ["if all were wrong", "7 matches are too few", "if all were wrong"],
+            ["expected by chance", "7 matches are too few", "expected by chance"],
         ),
-        ("one again and again", &[good[0]; 30], ["too few different"; 3]),
-        ("three again and again", &good[..3].repeat(10), ["too few different"; 3]),
+        ("one again and again", &[good[0]; 30], ["too few distinct"; 3]),
+        ("three again and again", &good[..3].repeat(10), ["too few distinct"; 3]),
         ("a line", &line, ["on a line"; 3]),
         ("nearly a line", &nearly, ["on a line"; 3]),
         ("a plane", &exact, ["", "a plane", ""]),
         ("NaN", &nan, [""; 3]),
         ("infinite", &infinite, [""; 3]),
-        ("up to 1e9", &random(300, -1e9, 1e9), ["if all were wrong", "if all were wrong", "on a line"]),
-        ("beyond 1e9", &random(300, 1e9, 1e9 + 480.0), ["if all were wrong", "if all were wrong", "too few different"]),
+        ("up to 1e9", &random(300, -1e9, 1e9), ["expected by chance", "expected by chance", "on a line"]),
+        (
+            "beyond 1e9",
+            &random(300, 1e9, 1e9 + 480.0),
+            ["expected by chance", "expected by chance", "too few distinct"],
+        ),
     ];
     let readable = |name: &str| !matches!(name, "NaN" | "infinite");
     for (name, rows, reasons) in cases {
@@ -160,7 +164,7 @@ fn wrong_matches_alone_are_no_more_than_chance() {
             args.extend(["--focal", "800", "--size", "640x480"]);
         }
         let said = refused(folder.path(), &args).stderr;
-        assert!(said.contains("as some model would if all were wrong; at least "), "{model}: {said}");
+        assert!(said.contains("no more than expected by chance; at least "), "{model}: {said}");
         args[3] = "right.txt";
         if model != "homography" {
             // Of 160 right ones beside 40 wrong ones, chance gives one set in 10^100: each of those beyond a sample is near with one in a hundred.

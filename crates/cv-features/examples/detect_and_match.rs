@@ -1,17 +1,17 @@
-//! Finds SIFT features in two images and matches them: `cargo run -p cv-features --example detect_and_match`.
+//! Detects SIFT features in two images and matches them: `cargo run -p cv-features --example detect_and_match`.
 
 use cv_core::{GrayF32, Silent};
 use cv_features::{MatchOptions, SiftOptions, match_descriptors, sift};
 
 pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
-    // Blobs at places of their own, and the same moved by (6, 4) pixels.
+    // Gaussian blobs, and the same blobs shifted by (6, 4) pixels.
     let scene = |dx: f32, dy: f32| {
-        let spots =
+        let blobs =
             (0..60).map(|i| ((i * 73 % 190) as f32, (i * 41 % 150) as f32, (i % 3 + 2) as f32, (i % 5 + 1) as f32));
-        let spots: Vec<_> = spots.collect();
+        let blobs: Vec<_> = blobs.collect();
         GrayF32::from_fn(200, 160, |x, y| {
             let distance = |s: &(f32, f32, f32, f32)| (x as f32 - dx - s.0).powi(2) + (y as f32 - dy - s.1).powi(2);
-            [spots.iter().map(|s| 0.15 * s.3 * (-distance(s) / (2.0 * s.2 * s.2)).exp()).sum::<f32>().min(1.0)]
+            [blobs.iter().map(|s| 0.15 * s.3 * (-distance(s) / (2.0 * s.2 * s.2)).exp()).sum::<f32>().min(1.0)]
         })
     };
     let options = SiftOptions { max_features: 500, ..SiftOptions::default() };

@@ -1,35 +1,36 @@
 //! Adaptive non-maximal suppression.
 //!
-//! Source: M. Brown, R. Szeliski & S. Winder, "Multi-image matching using multi-scale oriented patches", CVPR 2005, section 3.
-//! A corner's suppression radius is the distance to the nearest corner that is stronger by the factor `1 / robust`; the `n` corners with the
-//! largest radii are kept. The definition costs O(n²); here a tree of boxes that know their largest response answers
-//! "nearest sufficiently stronger corner" by branch and bound, and most corners fall out before they ask: near O(n log n), with the same result.
+//! Source: M. Brown, R. Szeliski & S. Winder, "Multi-image matching using multi-scale oriented patches", CVPR 2005,
+//! section 3. A corner's suppression radius is the distance to the nearest corner that is stronger by the factor `1 /
+//! robust`; the `n` corners with the largest radii are kept. The definition is O(n²). Here a bounding volume hierarchy
+//! with the maximum response of each node finds the nearest sufficiently stronger corner by branch and bound, and most
+//! corners are pruned before: about O(n log n), with the same result.
 
 use cv_core::Keypoint;
 use rayon::prelude::*;
 
-/// Corners in a leaf of the tree.
-const LEAF: usize = 8;
+/// Number of corners in a leaf of the tree.
+const LEAF_SIZE: usize = 8;
 
-/// Keeps the `n` corners with the largest suppression radii, in order of falling radius.
+/// Returns the indices of the `n` corners with the largest suppression radii, by decreasing radius.
 ///
-/// Radius of corner i: the smallest distance to a corner j with `response_i < robust · response_j`, infinite where there is none. Equal radii are
-/// ordered by falling response, then by index. `robust` is 0 to 1; Brown, Szeliski & Winder use 0.9. Corners whose position
-/// or response is not finite are never chosen and suppress nothing.
+/// The radius of corner i is the minimum distance to a corner j with `response_i < robust · response_j`, infinite if
+/// there is none. Ties are ordered by decreasing response, then by index. `robust` is 0 to 1; Brown, Szeliski & Winder
+/// use 0.9. Corners whose position or response is not finite are ignored.
 pub fn anms(corners: &[Keypoint], n: usize, robust: f32) -> Vec<usize> {
     let tree = Tree::new(corners, robust);
     let total = tree.points.len();
     if n == 0 || total == 0 {
         return Vec::new();
     }
-    let mut found = if total > 4 * n {
-        // The n-th largest radius among any of them is a bound on that of all: whoever has a suppressor nearer than that is out, and its radius need
-        // not be known. Strong corners have large radii.
-        let mut strong: Vec<u32> = (0..total as u32).collect();
+    let mut corner_radii = if total > 4 * n {
+        // The n-th largest radius of any subset is a lower bound of the n-th largest of all: corners with a suppressor
+        // closer than that are pruned without computing their radius. Strong corners have large radii.
+        let mut strongest: Vec<u32> = (0..total as u32).collect();
         let response = |p: u32| tree.points[p as usize].response;
-        strong.select_nth_unstable_by(2 * n, |&a, &b| response(b).total_cmp(&response(a)).then(a.cmp(&b)));
-        strong.truncate(2 * n);
-        let mut radii: Vec<f32> = tree.radii(&strong, 0.0).into_iter().map(|f| f.1).collect();
+        strongest.select_nth_unstable_by(2 * n, |&a, &b| response(b).total_cmp(&response(a)).then(a.cmp(&b)));
+        strongest.truncate(2 * n);
+        let mut radii: Vec<f32> = tree.radii(&strongest, 0.0).into_iter().map(|f| f.1).collect();
         let bound = *radii.select_nth_unstable_by(n - 1, |a, b| b.total_cmp(a)).1;
         tree.radii(&tree.candidates(bound), bound)
     } else {
@@ -39,15 +40,16 @@ pub fn anms(corners: &[Keypoint], n: usize, robust: f32) -> Vec<usize> {
         let response = |i: u32| corners[i as usize].response;
         b.1.total_cmp(&a.1).then(response(b.0).total_cmp(&response(a.0))).then(a.0.cmp(&b.0))
     };
-    if n < found.len() {
-        found.select_nth_unstable_by(n - 1, by_radius);
-        found.truncate(n);
+    if n < corner_radii.len() {
+        corner_radii.select_nth_unstable_by(n - 1, by_radius);
+        corner_radii.truncate(n);
     }
-    found.sort_unstable_by(by_radius);
-    found.into_iter().map(|f| f.0 as usize).collect()
+    corner_radii.sort_unstable_by(by_radius);
+    corner_radii.into_iter().map(|f| f.0 as usize).collect()
 }
 
-/// The squared suppression radius of each corner, in square pixels; NaN for a corner that is not finite. See [`anms`].
+/// Computes the squared suppression radius of each corner, in squared pixels; NaN for corners that are not finite. See
+/// [`anms`].
 pub fn suppression_radii(corners: &[Keypoint], robust: f32) -> Vec<f32> {
     let tree = Tree::new(corners, robust);
     let mut radii = vec![f32::NAN; corners.len()];
@@ -57,7 +59,7 @@ pub fn suppression_radii(corners: &[Keypoint], robust: f32) -> Vec<f32> {
     radii
 }
 
-pub(crate) fn usable(c: &Keypoint) -> bool {
+pub(crate) fn is_finite(c: &Keypoint) -> bool {
     c.position.x.is_finite() && c.position.y.is_finite() && c.response.is_finite()
 }
 
@@ -65,12 +67,12 @@ pub(crate) fn usable(c: &Keypoint) -> bool {
 struct Point {
     at: [f32; 2],
     response: f32,
-    /// Corners with a response below this are suppressed by this one.
+    /// Corners with a response below this value are suppressed by this one.
     suppresses: f32,
     index: u32,
 }
 
-/// The box of some corners and the largest `suppresses` among them.
+/// The bounding box of some corners and the maximum of their `suppresses`.
 #[derive(Clone, Copy)]
 struct Node {
     low: [f32; 2],
@@ -81,7 +83,8 @@ struct Node {
 impl Node {
     const EMPTY: Self = Self { low: [f32::INFINITY; 2], high: [f32::NEG_INFINITY; 2], suppresses: f32::NEG_INFINITY };
 
-    fn around(&self, other: &Self) -> Self {
+    /// Returns the union of two nodes.
+    fn union(&self, other: &Self) -> Self {
         Self {
             low: [self.low[0].min(other.low[0]), self.low[1].min(other.low[1])],
             high: [self.high[0].max(other.high[0]), self.high[1].max(other.high[1])],
@@ -89,21 +92,23 @@ impl Node {
         }
     }
 
-    /// Squared distance from the box.
+    /// Computes the squared distance of a point from the box.
     fn distance(&self, p: [f32; 2]) -> f32 {
         let d = |i: usize| (self.low[i] - p[i]).max(p[i] - self.high[i]).max(0.0);
         let (x, y) = (d(0), d(1));
         x * x + y * y
     }
 
-    /// Squared length of the diagonal: no two corners in the box are further apart, computed in the same numbers.
+    /// Computes the squared length of the diagonal, an upper bound of the squared distances of corners in the box (in
+    /// the same arithmetic).
     fn diagonal(&self) -> f32 {
         let (x, y) = (self.high[0] - self.low[0], self.high[1] - self.low[1]);
         x * x + y * y
     }
 }
 
-/// The finite corners along a Morton curve, and over each [`LEAF`] of them a binary tree of boxes: node `i` has the children `2i` and `2i + 1`.
+/// A bounding volume hierarchy: the finite corners in Morton order in leaves of [`LEAF_SIZE`], and a binary tree of
+/// boxes in which node `i` has the children `2i` and `2i + 1`.
 struct Tree {
     nodes: Vec<Node>,
     points: Vec<Point>,
@@ -112,14 +117,14 @@ struct Tree {
 impl Tree {
     fn new(corners: &[Keypoint], robust: f32) -> Self {
         let mut bounds = Node::EMPTY;
-        for c in corners.iter().filter(|c| usable(c)) {
+        for c in corners.iter().filter(|c| is_finite(c)) {
             let at = [c.position.x, c.position.y];
-            bounds = bounds.around(&Node { low: at, high: at, suppresses: 0.0 });
+            bounds = bounds.union(&Node { low: at, high: at, suppresses: 0.0 });
         }
-        // Twice the range may be infinite: halves of it are not.
+        // The range may overflow; half of it does not.
         let scale = [0, 1].map(|i| 32767.0 / (0.5 * bounds.high[i] - 0.5 * bounds.low[i]).max(f32::MIN_POSITIVE));
-        let cell = |v: f32, i: usize| spread(((0.5 * v - 0.5 * bounds.low[i]) * scale[i]) as u32 & 0xFFFF);
-        let keys = corners.iter().enumerate().filter(|(_, c)| usable(c)).map(|(i, c)| {
+        let cell = |v: f32, i: usize| spread_bits(((0.5 * v - 0.5 * bounds.low[i]) * scale[i]) as u32 & 0xFFFF);
+        let keys = corners.iter().enumerate().filter(|(_, c)| is_finite(c)).map(|(i, c)| {
             let key = cell(c.position.x, 0) | cell(c.position.y, 1) << 1;
             u64::from(key) << 32 | i as u64
         });
@@ -131,36 +136,38 @@ impl Tree {
                 Point { at, response: c.response, suppresses: robust * c.response, index: key as u32 }
             })
             .collect();
-        let leaves = points.len().div_ceil(LEAF).next_power_of_two();
+        let leaves = points.len().div_ceil(LEAF_SIZE).next_power_of_two();
         let mut nodes = vec![Node::EMPTY; 2 * leaves];
-        for (node, points) in nodes[leaves..].iter_mut().zip(points.chunks(LEAF)) {
+        for (node, points) in nodes[leaves..].iter_mut().zip(points.chunks(LEAF_SIZE)) {
             for p in points {
-                *node = node.around(&Node { low: p.at, high: p.at, suppresses: p.suppresses });
+                *node = node.union(&Node { low: p.at, high: p.at, suppresses: p.suppresses });
             }
         }
         for i in (1..leaves).rev() {
-            nodes[i] = nodes[2 * i].around(&nodes[2 * i + 1]);
+            nodes[i] = nodes[2 * i].union(&nodes[2 * i + 1]);
         }
         Self { nodes, points }
     }
 
-    /// The places of all corners but those that share a small box, of a squared diagonal below `bound`, with one that suppresses them.
+    /// Returns the positions in `points` of all corners except those that share a box with a squared diagonal below
+    /// `bound` with a corner that suppresses them.
     fn candidates(&self, bound: f32) -> Vec<u32> {
         let leaves = self.nodes.len() / 2;
-        let mut kept = Vec::new();
-        for (leaf, points) in self.points.chunks(LEAF).enumerate() {
+        let mut candidates = Vec::new();
+        for (leaf, points) in self.points.chunks(LEAF_SIZE).enumerate() {
             let (mut node, mut suppresses) = (leaves + leaf, f32::NEG_INFINITY);
             while node > 0 && self.nodes[node].diagonal() < bound {
                 suppresses = self.nodes[node].suppresses;
                 node /= 2;
             }
-            let left = points.iter().enumerate().filter(|(_, p)| p.response >= suppresses);
-            kept.extend(left.map(|(i, _)| (leaf * LEAF + i) as u32));
+            let remaining = points.iter().enumerate().filter(|(_, p)| p.response >= suppresses);
+            candidates.extend(remaining.map(|(i, _)| (leaf * LEAF_SIZE + i) as u32));
         }
-        kept
+        candidates
     }
 
-    /// Index and squared radius of the corners at the places `of`. Where a radius is below `bound`, another number below `bound` may stand for it.
+    /// Computes index and squared radius of the corners at the positions `of`. A radius below `bound` may be replaced
+    /// by another value below `bound`.
     fn radii(&self, of: &[u32], bound: f32) -> Vec<(u32, f32)> {
         of.par_iter()
             .with_min_len(128)
@@ -172,7 +179,7 @@ impl Tree {
         let Point { at, response, .. } = self.points[place];
         let leaves = self.nodes.len() / 2;
         let mut best = f32::INFINITY;
-        // One node of each depth may wait, and the two last.
+        // Depth-first traversal: at most one pending node per depth, and the last two.
         let mut stack = [(0.0f32, 0u32); 33];
         (stack[0], stack[1]) = ((0.0, 0), (0.0, 1));
         let mut height = 2;
@@ -184,7 +191,7 @@ impl Tree {
                 continue;
             }
             if node >= leaves {
-                for p in self.points.iter().skip((node - leaves) * LEAF).take(LEAF) {
+                for p in self.points.iter().skip((node - leaves) * LEAF_SIZE).take(LEAF_SIZE) {
                     let (x, y) = (p.at[0] - at[0], p.at[1] - at[1]);
                     let d = x * x + y * y;
                     if response < p.suppresses && d < best {
@@ -194,7 +201,7 @@ impl Tree {
                 continue;
             }
             let mut children = [2 * node, 2 * node + 1].map(|child| (self.nodes[child].distance(at), child as u32));
-            // The nearer one on top.
+            // The nearer child on top.
             if children[0].0 < children[1].0 {
                 children.swap(0, 1);
             }
@@ -209,25 +216,25 @@ impl Tree {
     }
 }
 
-/// The 16 low bits at the even places.
-fn spread(v: u32) -> u32 {
+/// Spreads the 16 low bits to the even bit positions (Morton code).
+fn spread_bits(v: u32) -> u32 {
     let v = (v | v << 8) & 0x00FF_00FF;
     let v = (v | v << 4) & 0x0F0F_0F0F;
     let v = (v | v << 2) & 0x3333_3333;
     (v | v << 1) & 0x5555_5555
 }
 
-/// Sorts by the upper 32 bits, equal ones as they came: four passes of counting.
+/// Sorts stably by the upper 32 bits: a radix sort with four passes.
 fn sorted_by_high_half(mut keys: Vec<u64>) -> Vec<u64> {
     let mut other = vec![0; keys.len()];
     for shift in [32, 40, 48, 56] {
         let digit = |key: u64| (key >> shift) as usize & 255;
-        let mut place = [0usize; 256];
-        keys.iter().for_each(|&key| place[digit(key)] += 1);
+        let mut offsets = [0usize; 256];
+        keys.iter().for_each(|&key| offsets[digit(key)] += 1);
         let mut sum = 0;
-        place.iter_mut().for_each(|p| sum += std::mem::replace(p, sum));
+        offsets.iter_mut().for_each(|p| sum += std::mem::replace(p, sum));
         for &key in &keys {
-            let p = &mut place[digit(key)];
+            let p = &mut offsets[digit(key)];
             other[*p] = key;
             *p += 1;
         }
@@ -247,7 +254,7 @@ mod tests {
             let c = &corners[i];
             corners
                 .iter()
-                .filter(|o| usable(o) && c.response < robust * o.response)
+                .filter(|o| is_finite(o) && c.response < robust * o.response)
                 .map(|o| {
                     let d = o.position - c.position;
                     d.x * d.x + d.y * d.y
@@ -255,14 +262,15 @@ mod tests {
                 .fold(f32::INFINITY, f32::min)
         };
         let mut all: Vec<(f32, usize)> =
-            (0..corners.len()).filter(|&i| usable(&corners[i])).map(|i| (radius(i), i)).collect();
+            (0..corners.len()).filter(|&i| is_finite(&corners[i])).map(|i| (radius(i), i)).collect();
         all.sort_by(|a, b| {
             b.0.total_cmp(&a.0).then(corners[b.1].response.total_cmp(&corners[a.1].response)).then(a.1.cmp(&b.1))
         });
         all.into_iter().take(n).map(|(_, i)| i).collect()
     }
 
-    /// Positions on a coarse grid and few responses, so that coincident corners, equal distances and equal responses all occur.
+    /// Positions on a coarse grid and few distinct responses, so that coincident corners and ties of distances and
+    /// responses occur.
     fn coarse() -> impl Strategy<Value = Vec<Keypoint>> {
         prop::collection::vec((0i32..40, 0i32..9, -2i32..12), 0..300)
             .prop_map(|v| v.into_iter().map(|(x, y, r)| Keypoint::new(x as f32, y as f32, r as f32 * 0.1)).collect())
@@ -281,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn corners_that_are_not_finite_are_left_out() {
+    fn corners_that_are_not_finite_are_ignored() {
         let corners = [
             Keypoint::new(f32::NAN, 1.0, 9.0),
             Keypoint::new(1.0, 1.0, f32::INFINITY),

@@ -1,15 +1,16 @@
-//! Descriptors in bytes: a quarter of the memory and of the time to match them.
+//! Descriptors quantized to bytes: a quarter of the memory and of the matching time.
 
-use crate::byte_neighbors::{MAX_DIMENSION, TASK, nearest_bytes};
-use crate::matching::{MatchError, MatchOptions, match_descriptors, select};
+use crate::byte_neighbors::{MAX_DIMENSION, TASK_QUERIES, nearest_bytes};
+use crate::matching::{MatchError, MatchOptions, match_descriptors, select_matches};
 use crate::nearest_neighbors::TwoNearest;
 use crate::simd;
 use crate::{ByteScale, DescriptorKind, Descriptors};
 use cv_core::{DMatch, Keypoint, Progress, Stage};
 
-/// Descriptors whose numbers are rounded to bytes, by a scale that belongs to their kind: sets made apart compare.
+/// Descriptors quantized to bytes with the scale of their kind, so that all sets of a kind are comparable.
 ///
-/// Of 2000 rootSIFT features of a photograph, the nearest in a neighboring one is the same as without rounding for 99 % (`cargo xtask peers features` measures it).
+/// For 99 % of 2000 rootSIFT features of an image, the nearest neighbor in an overlapping image is the same as without
+/// quantization (measured by `cargo xtask peers features`).
 #[derive(Debug, Clone, PartialEq)]
 pub struct ByteDescriptors {
     kind: DescriptorKind,
@@ -18,7 +19,7 @@ pub struct ByteDescriptors {
 }
 
 impl ByteDescriptors {
-    /// Rounds; `None` for a kind without [`DescriptorKind::bytes`].
+    /// Quantizes descriptors; `None` for a kind without [`DescriptorKind::bytes`].
     pub fn new(descriptors: &Descriptors) -> Option<Self> {
         let kind = descriptors.kind();
         let scale = kind.bytes?;
@@ -27,51 +28,52 @@ impl ByteDescriptors {
         Some(Self { kind, scale, data })
     }
 
-    /// Of bytes that were made before, row after row; `None` for a kind without [`DescriptorKind::bytes`], and where the last row is cut short.
+    /// Creates a set from row-major bytes; `None` for a kind without [`DescriptorKind::bytes`], and for an incomplete
+    /// last row.
     pub fn from_bytes(kind: DescriptorKind, data: Vec<u8>) -> Option<Self> {
         let scale = kind.bytes?;
         data.len().is_multiple_of(kind.dimension.max(1)).then_some(Self { kind, scale, data })
     }
 
-    /// What the numbers mean.
+    /// Returns the kind.
     pub fn kind(&self) -> DescriptorKind {
         self.kind
     }
 
-    /// Number of descriptors.
+    /// Returns the number of descriptors.
     pub fn len(&self) -> usize {
         self.data.len() / self.kind.dimension
     }
 
-    /// True where there are none.
+    /// Returns whether there are none.
     pub fn is_empty(&self) -> bool {
         self.data.is_empty()
     }
 
-    /// All bytes, row after row.
+    /// Returns all bytes in row-major order.
     pub fn as_slice(&self) -> &[u8] {
         &self.data
     }
 
-    /// Descriptor `i`.
+    /// Returns descriptor `i`.
     pub(crate) fn row(&self, i: usize) -> &[u8] {
         &self.data[i * self.kind.dimension..(i + 1) * self.kind.dimension]
     }
 
-    /// Puts another descriptor in the place of descriptor `i`.
+    /// Replaces descriptor `i`.
     pub(crate) fn set_row(&mut self, i: usize, row: &[u8]) {
         self.data[i * self.kind.dimension..(i + 1) * self.kind.dimension].copy_from_slice(row);
     }
 
-    /// The descriptors of these indices.
+    /// Returns the descriptors of the given indices.
     ///
     /// # Panics
-    /// Where there are not so many.
+    /// If an index is out of range.
     pub fn select(&self, indices: &[usize]) -> Self {
         Self { data: indices.iter().flat_map(|&i| self.row(i)).copied().collect(), ..*self }
     }
 
-    /// The descriptors of these indices of several sets, one after the other; `None` without a set, or where the kinds differ.
+    /// Concatenates the descriptors of the given indices of several sets; `None` without a set, or if the kinds differ.
     ///
     /// # Panics
     /// As [`ByteDescriptors::select`].
@@ -87,28 +89,29 @@ impl ByteDescriptors {
         all
     }
 
-    /// The sum of squared differences between descriptor `i` and descriptor `j` of another set, in the unit of the kind.
+    /// Computes the sum of squared differences (SSD) between descriptor `i` and descriptor `j` of another set, in the
+    /// unit of the kind.
     ///
     /// # Panics
-    /// Where there are not so many.
+    /// If an index is out of range.
     #[inline(always)]
     pub fn ssd(&self, i: usize, other: &Self, j: usize) -> f32 {
-        ssd_bytes(self.row(i), other.row(j)) as f32 * self.unit()
+        ssd_bytes(self.row(i), other.row(j)) as f32 * self.squared_step()
     }
 
-    /// A difference of one byte in the unit of the numbers, squared.
-    pub(crate) fn unit(&self) -> f32 {
+    /// Returns the squared quantization step: the factor from SSDs of bytes to the unit of the kind.
+    pub(crate) fn squared_step(&self) -> f32 {
         1.0 / (self.scale.factor * self.scale.factor)
     }
 
-    /// The numbers, as far as the bytes tell.
+    /// Dequantizes the descriptors.
     pub fn to_descriptors(&self) -> Descriptors {
         let data = self.data.iter().map(|&b| self.scale.to_number(b)).collect();
         Descriptors::from_vec(self.kind, data).unwrap_or(Descriptors::new(self.kind))
     }
 }
 
-/// Sum of squared differences of bytes.
+/// Computes the sum of squared differences of bytes.
 #[inline(always)]
 fn ssd_bytes(a: &[u8], b: &[u8]) -> u32 {
     let square = |a: u8, b: u8| {
@@ -125,7 +128,8 @@ fn ssd_bytes(a: &[u8], b: &[u8]) -> u32 {
     sum
 }
 
-/// As [`match_descriptors`], on rounded descriptors: several times faster, and the nearest neighbors are exactly those of the bytes.
+/// Matches quantized descriptors as [`match_descriptors`], several times faster. The nearest neighbors are exact for
+/// the bytes.
 ///
 /// # Errors
 /// As [`match_descriptors`].
@@ -138,23 +142,24 @@ pub fn match_byte_descriptors(
     if query.kind.dimension > MAX_DIMENSION {
         return match_descriptors(&query.to_descriptors(), &train.to_descriptors(), options, progress);
     }
-    select(query.kind, train.kind, [query.len(), train.len()], options, || {
-        let stage = Stage::new(progress, "match", query.len().div_ceil(TASK))?;
+    select_matches(query.kind, train.kind, [query.len(), train.len()], options, || {
+        let stage = Stage::new(progress, "match", query.len().div_ceil(TASK_QUERIES))?;
         let (forward, backward) = nearest_bytes(simd::level(), query, train, options.mutual, &stage)?;
-        let unit = query.unit();
+        let squared_step = query.squared_step();
         let two = forward.into_iter().map(|two| TwoNearest {
             best: two.best,
-            ssd: two.ssd as f32 * unit,
-            second_ssd: two.second_ssd.map_or(f32::INFINITY, |ssd| ssd as f32 * unit),
+            ssd: two.ssd as f32 * squared_step,
+            second_ssd: two.second_ssd.map_or(f32::INFINITY, |ssd| ssd as f32 * squared_step),
         });
         Ok((two.collect(), backward))
     })
 }
 
-/// The indices of the `count` keypoints of largest scale, ascending; of equal ones the first.
+/// Returns the indices of the `count` keypoints of the largest scale, ascending; ties by index.
 ///
-/// Coarse features are few, so each covers much of a photograph, and they are seen again from further away: matching those alone tells whether two photographs of a large set have
-/// anything in common (Wu, "Towards linear-time incremental structure from motion", 3DV 2013, section 3: "preemptive matching").
+/// For preemptive matching (Wu, "Towards linear-time incremental structure from motion", 3DV 2013, section 3): features
+/// of large scale are few and repeatable at other distances, so matching only these decides whether two images of a
+/// large set overlap.
 pub fn largest_keypoints(keypoints: &[Keypoint], count: usize) -> Vec<usize> {
     let mut order: Vec<usize> = (0..keypoints.len()).collect();
     order.sort_by(|&i, &j| keypoints[j].scale.total_cmp(&keypoints[i].scale));
@@ -170,18 +175,18 @@ mod tests {
     use cv_core::Silent;
 
     #[test]
-    fn rounding_loses_half_a_step() {
-        let unit = |k: usize| ((k * 7919 % 101) as f32 / 101.0) * 0.25;
-        let patch = |k: usize| ((k * 7919 % 101) as f32 / 101.0) * 7.0 - 3.5;
+    fn the_quantization_error_is_at_most_half_a_step() {
+        let sift_value = |k: usize| ((k * 7919 % 101) as f32 / 101.0) * 0.25;
+        let patch_value = |k: usize| ((k * 7919 % 101) as f32 / 101.0) * 7.0 - 3.5;
         for (kind, data, step) in [
-            (DescriptorKind::ROOT_SIFT, (0..128 * 9).map(unit).collect::<Vec<f32>>(), 1.0 / 512.0),
-            (DescriptorKind::MOPS, (0..64 * 9).map(patch).collect(), 8.0 / 255.0),
+            (DescriptorKind::ROOT_SIFT, (0..128 * 9).map(sift_value).collect::<Vec<f32>>(), 1.0 / 512.0),
+            (DescriptorKind::MOPS, (0..64 * 9).map(patch_value).collect(), 8.0 / 255.0),
         ] {
             let exact = Descriptors::from_vec(kind, data).unwrap();
             let bytes = ByteDescriptors::new(&exact).unwrap();
             assert_eq!((bytes.len(), bytes.kind(), bytes.is_empty()), (9, kind, false));
             for (a, b) in exact.as_slice().iter().zip(bytes.to_descriptors().as_slice()) {
-                // Half a step, and f32 rounding.
+                // Half a quantization step, and f32 rounding.
                 assert!((a - b).abs() < 0.5 * step + 1e-6, "{a} {b}");
             }
             let all = MatchOptions { ratio: RatioTest::Off, ..MatchOptions::default() };
@@ -202,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn the_largest_come_in_order_and_the_first_of_equal_ones() {
+    fn the_largest_keypoints_are_selected_with_ties_by_index() {
         let keypoints: Vec<Keypoint> =
             [5.0, 1.0, 4.0, 4.0].map(|scale| Keypoint { scale, ..Keypoint::new(0.0, 0.0, 1.0) }).into();
         assert_eq!(largest_keypoints(&keypoints, 2), [0, 2]);

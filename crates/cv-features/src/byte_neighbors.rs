@@ -1,8 +1,9 @@
-//! Exact nearest neighbors of descriptors in bytes, by integer products.
+//! Exact nearest neighbors of byte descriptors by blocked integer matrix products.
 //!
-//! |q − t|² = |q|² + |t|² − 2 q·t, all in 32-bit integers, so every instruction set finds the same. The products of six queries with a panel of candidates
-//! stay in registers, four bytes to a step where the machine multiplies bytes (AVX-512 VNNI), two as 16-bit numbers elsewhere. They are compared with what a
-//! query, or a candidate, has found so far; the places are looked at only where something is nearer, which soon is seldom.
+//! |q − t|² = |q|² + |t|² − 2 q·t in 32-bit integers, so all instruction sets give identical results. The products of
+//! six queries with a panel of candidates stay in registers, with four bytes per step where byte products are available
+//! (AVX-512 VNNI), and two 16-bit values elsewhere. They are compared with the current nearest distances of queries and
+//! candidates; indices are updated only where a distance is smaller, which soon is rare.
 
 use crate::ByteDescriptors;
 use crate::nearest_neighbors::NONE;
@@ -15,24 +16,27 @@ use rayon::prelude::*;
 pub(crate) struct TwoNearestBytes {
     pub(crate) best: u32,
     pub(crate) ssd: i32,
-    /// `None` where there is only one candidate.
+    /// `None` if there is only one candidate.
     pub(crate) second_ssd: Option<i32>,
 }
 
-/// Most numbers of a descriptor: the sums then stay below 2³¹.
+/// Maximum dimension of a descriptor: the sums then stay below 2³¹.
 pub(crate) const MAX_DIMENSION: usize = 8192;
-/// Queries of a register block.
+/// Number of queries of a register block.
 const QUERIES: usize = 6;
-/// Queries of a task: many, since a candidate starts anew in each, and few enough for the second-level cache.
-pub(crate) const TASK: usize = 128 * QUERIES;
-/// Panels that a task goes through without asking whether to go on: some milliseconds.
-const PANELS_UNASKED: usize = 32;
-/// |q|² of a query that is not there: no sum with it is the least, and none overflows.
-const FAR: i32 = 1_500_000_000;
+/// Number of queries of a parallel task: many, since the nearest queries of the candidates restart in each, and few
+/// enough for the L2 cache.
+pub(crate) const TASK_QUERIES: usize = 128 * QUERIES;
+/// Panels between checks for cancellation: some milliseconds.
+const PANELS_PER_CHECK: usize = 32;
+/// |q|² of padding queries: larger than any distance, without overflow.
+const PADDING_NORM: i32 = 1_500_000_000;
 
-/// For each query its two nearest candidates and, where asked for, for each candidate its nearest query. Of equally near ones the first counts.
+/// Finds the two nearest candidates of each query and, if `both_ways`, the nearest query of each candidate. Ties by
+/// index.
 ///
-/// Both sets must hold at least one descriptor, of the same dimension of at most [`MAX_DIMENSION`], and fewer than 2³² − 1.
+/// Both sets must have at least one and fewer than 2³² − 1 descriptors, of the same dimension of at most
+/// [`MAX_DIMENSION`].
 pub(crate) fn nearest_bytes(
     level: Level,
     query: &ByteDescriptors,
@@ -47,19 +51,19 @@ pub(crate) fn nearest_bytes(
     dispatch!(level, simd => blocked::<_, Pairs, 2>(simd, Pairs, query, train, both_ways, stage))
 }
 
-/// How bytes are multiplied: those of a 32-bit word at once.
+/// Dot products of packed bytes in 32-bit words.
 trait Products<S: Simd>: Copy + Send + Sync {
-    /// Bytes in a word.
+    /// Bytes per word.
     const BYTES: usize;
-    /// What is taken from the bytes of queries to make them signed.
+    /// Offset subtracted from query bytes to make them signed.
     const OFFSET: i32;
     fn query_word(bytes: &[u8]) -> i32;
     fn candidate_word(bytes: &[u8]) -> i32;
-    /// `sums` and in each lane the sum of the products of the bytes of two words.
+    /// Adds in each lane the dot product of the bytes of two words to `sums`.
     fn add(self, sums: S::i32s, query: S::i32s, candidates: S::i32s) -> S::i32s;
 }
 
-/// Two bytes of a word, each in 16 bits.
+/// Two bytes per word, each in 16 bits.
 #[derive(Clone, Copy)]
 struct Pairs;
 
@@ -83,7 +87,7 @@ impl<S: Simd> Products<S> for Pairs {
     }
 }
 
-/// Four bytes of a word: those of queries signed, those of candidates not.
+/// Four bytes per word: signed for queries, unsigned for candidates (VNNI).
 #[cfg(target_arch = "x86_64")]
 #[derive(Clone, Copy)]
 struct Quads(fearless_simd::Avx512);
@@ -119,45 +123,49 @@ impl Products<fearless_simd::Avx512> for Quads {
     }
 }
 
-/// |v|², and the sum of the bytes.
-fn squares(row: &[u8]) -> (i32, i32) {
+/// Computes |v|² and the sum of the bytes.
+fn squared_norm_and_sum(row: &[u8]) -> (i32, i32) {
     row.iter().fold((0, 0), |(squares, sum), &b| (squares + i32::from(b) * i32::from(b), sum + i32::from(b)))
 }
 
-/// Candidates, some vectors of them side by side, transposed so that a step of the product reads along.
+/// Candidates in panels of several vectors, transposed for sequential access.
 struct Panels {
-    /// Panel after panel: a row of `wide` words for each word of a descriptor.
+    /// For each panel, a row of `width` words for each word of a descriptor.
     words: Vec<i32>,
-    /// What 2 × the sum of products is taken from to give |t|² − 2 q·t; the largest number beyond the last candidate.
+    /// |t|², corrected for the offset of the query bytes, so that subtracting 2 × the sum of products gives |t|² − 2
+    /// q·t; the maximum integer for padding.
     norms: Vec<i32>,
-    wide: usize,
-    /// Words of a descriptor.
+    /// Candidates per panel.
+    width: usize,
+    /// Words per descriptor.
     count: usize,
 }
 
 impl Panels {
-    fn new<S: Simd, P: Products<S>>(set: &ByteDescriptors, wide: usize) -> Self {
+    fn new<S: Simd, P: Products<S>>(set: &ByteDescriptors, width: usize) -> Self {
         let d = set.kind().dimension;
         let count = d.div_ceil(P::BYTES);
-        let panels = set.len().div_ceil(wide);
-        let (mut words, mut norms) = (vec![0i32; panels * wide * count], vec![i32::MAX; panels * wide]);
-        let rows =
-            words.par_chunks_mut(wide * count).zip(norms.par_chunks_mut(wide)).zip(set.as_slice().par_chunks(wide * d));
+        let panels = set.len().div_ceil(width);
+        let (mut words, mut norms) = (vec![0i32; panels * width * count], vec![i32::MAX; panels * width]);
+        let rows = words
+            .par_chunks_mut(width * count)
+            .zip(norms.par_chunks_mut(width))
+            .zip(set.as_slice().par_chunks(width * d));
         rows.for_each(|((panel, norms), rows)| {
             for (j, row) in rows.chunks_exact(d).enumerate() {
                 for (k, bytes) in row.chunks(P::BYTES).enumerate() {
-                    panel[k * wide + j] = P::candidate_word(bytes);
+                    panel[k * width + j] = P::candidate_word(bytes);
                 }
-                let (squares, sum) = squares(row);
-                norms[j] = squares - 2 * P::OFFSET * sum;
+                let (squared_norm, sum) = squared_norm_and_sum(row);
+                norms[j] = squared_norm - 2 * P::OFFSET * sum;
             }
         });
-        Self { words, norms, wide, count }
+        Self { words, norms, width, count }
     }
 }
 
-/// What one task finds: the two nearest of its queries, and of each candidate the nearest of its queries.
-type Task = (Vec<TwoNearestBytes>, Vec<(i32, u32)>);
+/// Result of a task: the two nearest candidates of its queries, and the nearest of its queries for each candidate.
+type TaskResult = (Vec<TwoNearestBytes>, Vec<(i32, u32)>);
 
 fn blocked<S: Simd, P: Products<S>, const V: usize>(
     simd: S,
@@ -169,34 +177,34 @@ fn blocked<S: Simd, P: Products<S>, const V: usize>(
 ) -> Result<(Vec<TwoNearestBytes>, Vec<u32>), Cancelled> {
     let d = query.kind().dimension;
     let panels = Panels::new::<S, P>(train, V * S::i32s::LEN);
-    let tasks: Vec<Task> = query
+    let tasks: Vec<TaskResult> = query
         .as_slice()
-        .par_chunks(TASK * d)
+        .par_chunks(TASK_QUERIES * d)
         .enumerate()
         .map(|(task, rows)| {
-            let found = simd.vectorize(
+            let nearest = simd.vectorize(
                 #[inline(always)]
-                || block::<S, P, V>(simd, products, rows, (task * TASK) as u32, d, &panels, both_ways, stage),
+                || block::<S, P, V>(simd, products, rows, (task * TASK_QUERIES) as u32, d, &panels, both_ways, stage),
             )?;
             stage.add(1)?;
-            Ok(found)
+            Ok(nearest)
         })
         .collect::<Result<_, Cancelled>>()?;
     let mut forward = Vec::with_capacity(query.len());
     let mut backward = vec![(i32::MAX, NONE); if both_ways { train.len() } else { 0 }];
     for (rows, columns) in tasks {
         forward.extend(rows);
-        for (best, found) in backward.iter_mut().zip(columns) {
-            // Tasks come in order of their queries: the first of equals stays.
-            if found.0 < best.0 {
-                *best = found;
+        for (best, candidate) in backward.iter_mut().zip(columns) {
+            // Tasks are in order of their queries, so ties are resolved by index.
+            if candidate.0 < best.0 {
+                *best = candidate;
             }
         }
     }
     Ok((forward, backward.into_iter().map(|b| b.1).collect()))
 }
 
-/// The queries of a task against all panels.
+/// Matches the queries of a task with all panels.
 #[allow(clippy::too_many_arguments)]
 #[allow(clippy::needless_range_loop, reason = "over columns of an array of rows")]
 #[inline(always)]
@@ -209,33 +217,33 @@ fn block<S: Simd, P: Products<S>, const V: usize>(
     panels: &Panels,
     both_ways: bool,
     stage: &Stage<'_>,
-) -> Result<Task, Cancelled> {
+) -> Result<TaskResult, Cancelled> {
     let n = S::i32s::LEN;
-    let (wide, count) = (panels.wide, panels.count);
+    let (width, count) = (panels.width, panels.count);
     let groups = (rows.len() / d).div_ceil(QUERIES);
-    // Each group interleaved: the six words of a step side by side.
+    // Interleaved groups: the words of six queries are adjacent.
     let mut packed = vec![0i32; groups * QUERIES * count];
-    let mut norms = vec![FAR; groups * QUERIES];
+    let mut norms = vec![PADDING_NORM; groups * QUERIES];
     for (i, row) in rows.chunks_exact(d).enumerate() {
         let group = &mut packed[i / QUERIES * QUERIES * count..];
         for (k, bytes) in row.chunks(P::BYTES).enumerate() {
             group[k * QUERIES + i % QUERIES] = P::query_word(bytes);
         }
-        norms[i] = squares(row).0;
+        norms[i] = squared_norm_and_sum(row).0;
     }
-    // |t|² − 2 q·t of the two nearest of a query, and where the nearest is.
+    // |t|² − 2 q·t of the two nearest candidates of each query, and the index of the nearest.
     let mut nearest = vec![[i32::MAX; 2]; groups * QUERIES];
-    let mut places = vec![NONE; groups * QUERIES];
+    let mut indices = vec![NONE; groups * QUERIES];
     let mut column_nearest = vec![i32::MAX; if both_ways { panels.norms.len() } else { 0 }];
-    let mut column_places = vec![NONE; column_nearest.len()];
-    for (p, panel) in panels.words.chunks_exact(wide * count).enumerate() {
-        if p.is_multiple_of(PANELS_UNASKED) {
+    let mut column_indices = vec![NONE; column_nearest.len()];
+    for (p, panel) in panels.words.chunks_exact(width * count).enumerate() {
+        if p.is_multiple_of(PANELS_PER_CHECK) {
             stage.check()?;
         }
-        let candidates = &panels.norms[p * wide..(p + 1) * wide];
+        let candidates = &panels.norms[p * width..(p + 1) * width];
         for (g, group) in packed.chunks_exact(QUERIES * count).enumerate() {
             let products = product::<S, P, V>(simd, products, group, panel);
-            // Into an array of their own, since one that is gone through in a loop would lie in memory during the products too.
+            // A separate array: indexing the products in a loop would keep them in memory instead of registers.
             let mut sums = [[S::i32s::splat(simd, 0); V]; QUERIES];
             for i in 0..QUERIES {
                 for v in 0..V {
@@ -246,8 +254,8 @@ fn block<S: Simd, P: Products<S>, const V: usize>(
             for (i, row) in sums.iter().enumerate() {
                 let query = g * QUERIES + i;
                 let limit = S::i32s::splat(simd, nearest[query][1]);
-                let least = row[1..].iter().fold(row[0], |a, b| a.min(*b));
-                if least.simd_lt(limit).to_bitmask() == 0 {
+                let min = row[1..].iter().fold(row[0], |a, b| a.min(*b));
+                if min.simd_lt(limit).to_bitmask() == 0 {
                     continue;
                 }
                 for (v, lanes) in row.iter().enumerate() {
@@ -259,7 +267,7 @@ fn block<S: Simd, P: Products<S>, const V: usize>(
                         let (value, two) = (lanes[lane], &mut nearest[query]);
                         if value < two[0] {
                             *two = [value, two[0]];
-                            places[query] = (p * wide + v * n + lane) as u32;
+                            indices[query] = (p * width + v * n + lane) as u32;
                         } else if value < two[1] {
                             two[1] = value;
                         }
@@ -269,37 +277,37 @@ fn block<S: Simd, P: Products<S>, const V: usize>(
             if both_ways {
                 let norms = &norms[g * QUERIES..(g + 1) * QUERIES];
                 for v in 0..V {
-                    let at = p * wide + v * n;
+                    let at = p * width + v * n;
                     let mut best = S::i32s::from_slice(simd, &column_nearest[at..at + n]);
-                    let mut least = sums[0][v] + norms[0];
+                    let mut min = sums[0][v] + norms[0];
                     for i in 1..QUERIES {
-                        least = least.min(sums[i][v] + norms[i]);
+                        min = min.min(sums[i][v] + norms[i]);
                     }
-                    if least.simd_lt(best).to_bitmask() == 0 {
+                    if min.simd_lt(best).to_bitmask() == 0 {
                         continue;
                     }
-                    let mut place = S::u32s::from_slice(simd, &column_places[at..at + n]);
+                    let mut index = S::u32s::from_slice(simd, &column_indices[at..at + n]);
                     for i in 0..QUERIES {
-                        let own = sums[i][v] + norms[i];
-                        let better = own.simd_lt(best);
-                        best = better.select(own, best);
-                        place = better.select(S::u32s::splat(simd, first + (g * QUERIES + i) as u32), place);
+                        let distance = sums[i][v] + norms[i];
+                        let better = distance.simd_lt(best);
+                        best = better.select(distance, best);
+                        index = better.select(S::u32s::splat(simd, first + (g * QUERIES + i) as u32), index);
                     }
                     best.store_slice(&mut column_nearest[at..at + n]);
-                    place.store_slice(&mut column_places[at..at + n]);
+                    index.store_slice(&mut column_indices[at..at + n]);
                 }
             }
         }
     }
     let two = (0..rows.len() / d).map(|i| TwoNearestBytes {
-        best: places[i],
+        best: indices[i],
         ssd: nearest[i][0] + norms[i],
         second_ssd: (nearest[i][1] < i32::MAX).then(|| nearest[i][1] + norms[i]),
     });
-    Ok((two.collect(), column_nearest.into_iter().zip(column_places).collect()))
+    Ok((two.collect(), column_nearest.into_iter().zip(column_indices).collect()))
 }
 
-/// Six queries times a panel of candidates.
+/// Computes the products of six queries with a panel of candidates.
 #[inline(always)]
 fn product<S: Simd, P: Products<S>, const V: usize>(
     simd: S,
@@ -332,10 +340,10 @@ mod tests {
     use cv_synth::instruction_sets;
     use proptest::prelude::*;
 
-    /// Nearest, its distance, the second distance of a query.
+    /// Index and distance of the nearest neighbor, and distance of the second nearest.
     type Two = (u32, i32, Option<i32>);
 
-    /// The definition: every distance, the first of equals.
+    /// Reference: all distances, ties by index.
     fn plain(query: &[u8], train: &[u8], d: usize) -> Vec<Two> {
         let distance =
             |q: &[u8], t: &[u8]| -> i32 { q.iter().zip(t).map(|(a, b)| (i32::from(*a) - i32::from(*b)).pow(2)).sum() };
@@ -351,11 +359,12 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(40))]
         #[test]
-        fn equals_the_definition(
+        fn equals_exhaustive_search(
             nq in 1usize..60, nt in 1usize..260, many in any::<bool>(), varied in 1usize..140, spread in 1u32..400, d in 1usize..140, seed in any::<u32>(),
         ) {
-            // Beyond a task in some cases. Few of the dimensions differ in others, so that whole descriptors coincide, and many bytes are 0 or 255.
-            let nq = if many { nq + TASK } else { nq };
+            // More than a task in some cases. In others few dimensions differ, so that descriptors coincide, and many
+            // bytes are 0 or 255.
+            let nq = if many { nq + TASK_QUERIES } else { nq };
             let kind = DescriptorKind { bytes: Some(ByteScale { offset: 0.0, factor: 1.0 }), ..DescriptorKind::foreign(d) };
             let mut state = seed | 1;
             let mut set = |n: usize| {
@@ -377,15 +386,15 @@ mod tests {
                     let (forward, backward) = nearest_bytes(level, &query, &train, both_ways, &stage).unwrap();
                     let got: Vec<Two> = forward.iter().map(|f| (f.best, f.ssd, f.second_ssd)).collect();
                     prop_assert_eq!(&got, &expected, "{:?}", level);
-                    let places: Vec<u32> = back.iter().map(|b| b.0).collect();
-                    prop_assert_eq!(backward, if both_ways { places } else { vec![] }, "{:?}", level);
+                    let indices: Vec<u32> = back.iter().map(|b| b.0).collect();
+                    prop_assert_eq!(backward, if both_ways { indices } else { vec![] }, "{:?}", level);
                 }
             }
         }
     }
 
     #[test]
-    fn the_longest_descriptors_of_the_largest_bytes_do_not_overflow() {
+    fn the_maximum_dimension_and_values_do_not_overflow() {
         let d = MAX_DIMENSION;
         let kind = DescriptorKind { bytes: Some(ByteScale { offset: 0.0, factor: 1.0 }), ..DescriptorKind::foreign(d) };
         let set = |values: &[f32]| {
@@ -396,8 +405,8 @@ mod tests {
         let stage = Stage::new(&Silent, "match", 1).unwrap();
         for level in instruction_sets() {
             let (forward, backward) = nearest_bytes(level, &query, &train, true, &stage).unwrap();
-            let apart = Some(255 * 255 * d as i32);
-            let expected = [1, 0].map(|best| TwoNearestBytes { best, ssd: 0, second_ssd: apart });
+            let max_distance = Some(255 * 255 * d as i32);
+            let expected = [1, 0].map(|best| TwoNearestBytes { best, ssd: 0, second_ssd: max_distance });
             assert_eq!((forward.as_slice(), backward), (expected.as_slice(), vec![1, 0]), "{level:?}");
         }
     }

@@ -1,9 +1,9 @@
-//! Sets of descriptors that know what they are.
+//! Descriptor sets and features.
 
 use crate::DescriptorKind;
 use cv_core::Keypoint;
 
-/// Descriptors of one kind, one row of [`DescriptorKind::dimension`] numbers each.
+/// A set of descriptors of one kind: a row of [`DescriptorKind::dimension`] values each.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Descriptors {
     kind: DescriptorKind,
@@ -11,15 +11,16 @@ pub struct Descriptors {
 }
 
 impl Descriptors {
-    /// No descriptors.
+    /// Creates an empty set.
     pub fn new(kind: DescriptorKind) -> Self {
         Self { kind, data: Vec::new() }
     }
 
-    /// Takes over rows of numbers; `None` where the length is not a multiple of the kind's dimension, or that is zero.
+    /// Creates a set from row-major values; `None` if the length is not a multiple of the kind's dimension, or that is
+    /// zero.
     pub fn from_vec(kind: DescriptorKind, data: Vec<f32>) -> Option<Self> {
-        let whole = kind.dimension > 0 && data.len().is_multiple_of(kind.dimension);
-        whole.then_some(Self { kind, data })
+        let is_multiple = kind.dimension > 0 && data.len().is_multiple_of(kind.dimension);
+        is_multiple.then_some(Self { kind, data })
     }
 
     pub(crate) fn push(&mut self, row: &[f32]) {
@@ -27,54 +28,54 @@ impl Descriptors {
         self.data.extend_from_slice(row);
     }
 
-    /// What the numbers mean.
+    /// Returns the kind.
     pub fn kind(&self) -> DescriptorKind {
         self.kind
     }
 
-    /// Numbers in one descriptor.
+    /// Returns the dimension of a descriptor.
     pub fn dimension(&self) -> usize {
         self.kind.dimension
     }
 
-    /// Number of descriptors.
+    /// Returns the number of descriptors.
     pub fn len(&self) -> usize {
         self.data.len().checked_div(self.dimension()).unwrap_or(0)
     }
 
-    /// True where there are none.
+    /// Returns whether there are none.
     pub fn is_empty(&self) -> bool {
         self.data.is_empty()
     }
 
-    /// Descriptor `i`.
+    /// Returns descriptor `i`.
     ///
     /// # Panics
-    /// Where there are not so many.
+    /// If the index is out of range.
     pub fn row(&self, i: usize) -> &[f32] {
         &self.data[i * self.dimension()..(i + 1) * self.dimension()]
     }
 
-    /// All numbers, row after row.
+    /// Returns all values in row-major order.
     pub fn as_slice(&self) -> &[f32] {
         &self.data
     }
 }
 
-/// Why a keypoint got no descriptor.
+/// Why a keypoint has no descriptor.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum DropReason {
-    /// Its window leaves the image.
-    #[error("the window of ±{margin} px leaves the image")]
+    /// The window extends beyond the image.
+    #[error("the window of ±{margin} px extends beyond the image")]
     OutsideImage {
-        /// Pixels needed on each side.
+        /// Half the window side in pixels.
         margin: f32,
     },
-    /// Its window is (nearly) one gray value: there is nothing to compare.
+    /// The window has (nearly) constant intensity.
     #[error("the window is flat: standard deviation {deviation}")]
     Flat {
-        /// Standard deviation of the samples, in the image's unit.
+        /// Standard deviation of the samples, in the unit of the image.
         deviation: f32,
     },
     /// The keypoint's position, scale or angle is not a finite number.
@@ -85,29 +86,29 @@ pub enum DropReason {
 /// A keypoint without a descriptor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Dropped {
-    /// Index in the keypoints handed in.
+    /// Index of the keypoint among the input or detected keypoints.
     pub index: usize,
-    /// Why.
+    /// Reason.
     pub reason: DropReason,
 }
 
-/// Keypoints with descriptors, and what became of the rest.
+/// Keypoints with descriptors, and the dropped keypoints.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Features {
-    /// The keypoints that have a descriptor, in the order they came.
+    /// The keypoints with a descriptor, in their original order.
     pub keypoints: Vec<Keypoint>,
     /// Descriptor `i` belongs to keypoint `i`.
     pub descriptors: Descriptors,
-    /// The keypoints without one; `index` counts those handed in, or found.
+    /// The keypoints without a descriptor; `index` refers to the input or detected keypoints.
     pub dropped: Vec<Dropped>,
-    /// Features left out only because there are more than the options allow. With this, everything handed in or found is accounted for.
+    /// Number of features dropped because of the maximum number in the options.
     pub beyond_limit: usize,
-    /// The points before they were spaced evenly, for pictures; empty for methods that do not space theirs.
+    /// The keypoints before non-maximal suppression, for visualization; empty for methods without suppression.
     pub candidates: Vec<Keypoint>,
 }
 
 impl Features {
-    /// No features.
+    /// Creates an empty set.
     pub fn new(kind: DescriptorKind) -> Self {
         Self {
             keypoints: Vec::new(),
@@ -118,12 +119,12 @@ impl Features {
         }
     }
 
-    /// Points found, or handed in: those kept, dropped, and beyond the limit.
-    pub fn found(&self) -> usize {
+    /// Returns the number of input or detected keypoints: those with a descriptor, dropped, and beyond the limit.
+    pub fn detected_count(&self) -> usize {
         self.keypoints.len() + self.dropped.len() + self.beyond_limit
     }
 
-    /// Leaves the features for which `keep` is true.
+    /// Retains the features for which `keep` is true.
     pub(crate) fn retain(&mut self, keep: &[bool]) {
         let d = self.descriptors.dimension();
         let mut which = keep.iter();
@@ -132,17 +133,18 @@ impl Features {
         self.descriptors.data = rows.flat_map(|(row, _)| row).copied().collect();
     }
 
-    /// Adds a feature with its descriptor; false, and nothing added, where the descriptor has not as many numbers as the kind.
+    /// Appends a feature; returns false, without appending, if the descriptor's dimension is not that of the kind.
     pub fn push(&mut self, keypoint: Keypoint, descriptor: &[f32]) -> bool {
-        let fits = descriptor.len() == self.descriptors.dimension();
-        if fits {
+        let has_dimension = descriptor.len() == self.descriptors.dimension();
+        if has_dimension {
             self.keypoints.push(keypoint);
             self.descriptors.push(descriptor);
         }
-        fits
+        has_dimension
     }
 
-    /// Adds a feature of another set of the same kind; `None` where the kinds differ or there is no such feature.
+    /// Appends a feature of another set and returns its new index; `None` if the kinds differ or the index is out of
+    /// range.
     pub fn add(&mut self, other: &Self, index: usize) -> Option<u32> {
         let keypoint = other.keypoints.get(index)?;
         if other.descriptors.kind() != self.descriptors.kind() {

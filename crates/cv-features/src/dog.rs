@@ -1,4 +1,4 @@
-//! Extrema of differences of Gaussians over position and scale.
+//! Extrema of the difference of Gaussians (DoG) over position and scale.
 //!
 //! Source: D. Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 60(2), 2004, sections 3 and 4.
 
@@ -8,18 +8,18 @@ use fearless_simd::Level;
 use nalgebra::{Matrix3, Vector3};
 use std::ops::Range;
 
-/// Pixels at the border of an octave in which no extremum is looked for (OpenCV's number): the mirrored border has extrema of its own.
+/// Width in pixels of the border of an octave without extrema (OpenCV's value): mirroring causes spurious ones.
 const BORDER: usize = 5;
-/// An extremum is followed at most this many pixels from where it was seen.
-const WANDER: usize = 2;
-/// So its differences are needed this far around.
-pub(crate) const REACH: usize = WANDER + 1;
+/// Maximum displacement in pixels of an extremum during refinement.
+const MAX_DISPLACEMENT: usize = 2;
+/// Radius of the differences that the refinement reads.
+pub(crate) const WINDOW_RADIUS: usize = MAX_DISPLACEMENT + 1;
 
-/// An extremum, in pixels of its octave.
+/// An extremum of the difference of Gaussians, in octave pixels.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Extremum {
     pub(crate) octave: usize,
-    /// The scale nearest to it, 1 to `layers`.
+    /// Index of the nearest layer, 1 to `layers`.
     pub(crate) layer: usize,
     pub(crate) column: usize,
     pub(crate) row: usize,
@@ -27,13 +27,13 @@ pub(crate) struct Extremum {
     pub(crate) y: f32,
     /// σ in octave pixels.
     pub(crate) sigma: f32,
-    /// |D| at the extremum.
+    /// Contrast |D| at the extremum.
     pub(crate) contrast: f32,
 }
 
-/// Parameters of the search.
+/// Parameters of the detector.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Search {
+pub(crate) struct DogOptions {
     pub(crate) layers: usize,
     pub(crate) sigma: f32,
     pub(crate) upsample: bool,
@@ -41,15 +41,15 @@ pub(crate) struct Search {
     pub(crate) edge: f32,
 }
 
-/// Adds the extrema that are seen on row `y` and the columns of a tile.
+/// Detects the extrema of row `y` and the columns of a tile.
 ///
-/// A pixel is one where its difference is positive and not below any of its 26 neighbors, or negative and not above any, with at least 0.8 of the contrast asked for
-/// (the refined value may be that much larger).
+/// A pixel is a candidate if its difference is positive and not below any of its 26 neighbors, or negative and not
+/// above any, with at least 0.8 of the contrast threshold (the refined value may be larger by as much).
 #[allow(clippy::too_many_arguments)]
-pub(crate) fn find(
+pub(crate) fn detect_extrema(
     differences: &[LineBuffer],
     octave: usize,
-    search: &Search,
+    options: &DogOptions,
     (w, h): (usize, usize),
     y: usize,
     columns: Range<usize>,
@@ -60,35 +60,36 @@ pub(crate) fn find(
         return;
     }
     let columns = columns.start.max(BORDER)..columns.end.min(w.saturating_sub(BORDER));
-    let floor = 0.8 * search.contrast;
-    let mut seen = Vec::new();
-    for layer in 1..=search.layers {
-        // All differences cover the same columns.
+    let floor = 0.8 * options.contrast;
+    let mut candidates = Vec::new();
+    for layer in 1..=options.layers {
+        // All differences have the same columns.
         let from = differences[layer].from;
         let local = columns.start.saturating_sub(from)..columns.end.saturating_sub(from);
         if local.is_empty() {
             continue;
         }
         let rows = [layer - 1, layer, layer + 1].map(|l| [y - 1, y, y + 1].map(|y| differences[l].row(y)));
-        seen.clear();
-        simd::extremes(level, rows, local, floor, &mut seen);
-        for &x in &seen {
+        candidates.clear();
+        simd::extrema(level, rows, local, floor, &mut candidates);
+        for &x in &candidates {
             let at = |l: usize, y: usize, x: usize| differences[l].row(y)[x - from];
-            found.extend(refine(at, octave, search, (w, h), (layer, y, x + from)));
+            found.extend(refine(at, octave, options, (w, h), (layer, y, x + from)));
         }
     }
 }
 
-/// Follows the quadratic through the 3×3×3 differences to its extremum; `None` where it runs away, is faint, or lies on an edge.
+/// Refines an extremum by fitting a quadratic to 3×3×3 differences (Lowe, section 4); `None` if it diverges, has low
+/// contrast, or is on an edge.
 fn refine(
     at: impl Fn(usize, usize, usize) -> f32,
     octave: usize,
-    search: &Search,
+    options: &DogOptions,
     (w, h): (usize, usize),
     start: (usize, usize, usize),
 ) -> Option<Extremum> {
     let (mut layer, mut y, mut x) = start;
-    // Five steps, as Lowe's and OpenCV's code.
+    // At most five steps, as in Lowe's and OpenCV's code.
     for _ in 0..5 {
         let d = |dl: isize, dy: isize, dx: isize| {
             at(layer.wrapping_add_signed(dl), y.wrapping_add_signed(dy), x.wrapping_add_signed(dx))
@@ -105,8 +106,8 @@ fn refine(
         if step.abs().max() < 0.5 {
             let contrast = (v + 0.5 * gradient.dot(&step)).abs();
             let (trace, det) = (xx + yy, xx * yy - xy * xy);
-            let limit = (search.edge + 1.0) * (search.edge + 1.0) / search.edge;
-            if contrast < search.contrast || det <= 0.0 || trace * trace >= limit * det {
+            let edge_limit = (options.edge + 1.0) * (options.edge + 1.0) / options.edge;
+            if contrast < options.contrast || det <= 0.0 || trace * trace >= edge_limit * det {
                 return None;
             }
             return Some(Extremum {
@@ -116,18 +117,18 @@ fn refine(
                 row: y,
                 x: x as f32 + step.x,
                 y: y as f32 + step.y,
-                sigma: search.sigma * 2f32.powf((layer as f32 + step.z) / search.layers as f32),
+                sigma: options.sigma * 2f32.powf((layer as f32 + step.z) / options.layers as f32),
                 contrast,
             });
         }
         if !step.iter().all(|s| s.abs() < 1e6) {
             return None;
         }
-        let moved = |at: usize, by: f32| at.checked_add_signed(by.round() as isize);
-        (x, y, layer) = (moved(x, step.x)?, moved(y, step.y)?, moved(layer, step.z)?);
+        let displaced = |at: usize, by: f32| at.checked_add_signed(by.round() as isize);
+        (x, y, layer) = (displaced(x, step.x)?, displaced(y, step.y)?, displaced(layer, step.z)?);
         let inside = |v: usize, n: usize| (BORDER..n - BORDER).contains(&v);
-        let near = x.abs_diff(start.2).max(y.abs_diff(start.1)) <= WANDER;
-        if !(near && inside(x, w) && inside(y, h) && (1..=search.layers).contains(&layer)) {
+        let is_near = x.abs_diff(start.2).max(y.abs_diff(start.1)) <= MAX_DISPLACEMENT;
+        if !(is_near && inside(x, w) && inside(y, h) && (1..=options.layers).contains(&layer)) {
             return None;
         }
     }
@@ -139,28 +140,28 @@ pub(crate) mod tests {
     use super::*;
     use cv_core::GrayF32;
 
-    /// The extrema of an octave straight from the definition: layer, row and column, sorted.
-    pub(crate) fn plain(images: &[GrayF32], octave: usize, search: &Search) -> Vec<(usize, usize, usize)> {
+    /// Reference: the extrema of an octave by the definition; layer, row and column, sorted.
+    pub(crate) fn plain(images: &[GrayF32], octave: usize, options: &DogOptions) -> Vec<(usize, usize, usize)> {
         let (w, h) = images[0].size();
         let at = |l: usize, y: usize, x: usize| images[l + 1].at(x, y)[0] - images[l].at(x, y)[0];
         let mut found = Vec::new();
-        for layer in 1..=search.layers {
+        for layer in 1..=options.layers {
             for y in BORDER..h.saturating_sub(BORDER) {
                 for x in BORDER..w.saturating_sub(BORDER) {
                     let v = at(layer, y, x);
                     let all = (layer - 1..=layer + 1)
                         .flat_map(|l| (y - 1..=y + 1).flat_map(move |y| (x - 1..=x + 1).map(move |x| (l, y, x))));
                     let mut around = all.map(|(l, y, x)| at(l, y, x));
-                    let strong = v.abs() > 0.8 * search.contrast;
+                    let strong = v.abs() > 0.8 * options.contrast;
                     if strong && around.all(|d| if v > 0.0 { v >= d } else { v <= d }) {
-                        found.extend(refine(at, octave, search, (w, h), (layer, y, x)));
+                        found.extend(refine(at, octave, options, (w, h), (layer, y, x)));
                     }
                 }
             }
         }
-        let mut places: Vec<_> = found.iter().map(|e| (e.layer, e.row, e.column)).collect();
-        places.sort_unstable();
-        places.dedup();
-        places
+        let mut locations: Vec<_> = found.iter().map(|e| (e.layer, e.row, e.column)).collect();
+        locations.sort_unstable();
+        locations.dedup();
+        locations
     }
 }

@@ -1,24 +1,24 @@
-//! What can be wrong with an image handed to a detector or descriptor.
+//! Errors of detectors and descriptors.
 
 use crate::simd;
 use cv_core::{Cancelled, ImageView, OptionError};
 use rayon::prelude::*;
 
-/// Why an image has no features to give.
+/// Why features could not be computed.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum FeatureError {
-    /// The image is smaller than the smallest window the method looks at.
+    /// The image is smaller than the smallest window of the method.
     #[error("a {width}×{height} image is smaller than the {needed}×{needed} pixels this method needs")]
     ImageTooSmall {
         /// Width in pixels.
         width: usize,
         /// Height in pixels.
         height: usize,
-        /// Smallest side the method can work on.
+        /// Minimum side in pixels.
         needed: usize,
     },
-    /// A sample is NaN or infinite.
+    /// A pixel is NaN or infinite.
     #[error("the pixel at column {x}, row {y} is not a finite number")]
     NotFinite {
         /// Column of the first such pixel.
@@ -26,7 +26,7 @@ pub enum FeatureError {
         /// Its row.
         y: usize,
     },
-    /// An option is outside its range.
+    /// An option is out of range.
     #[error(transparent)]
     Option(#[from] OptionError),
     /// The job was stopped by its progress callback.
@@ -34,15 +34,15 @@ pub enum FeatureError {
     Cancelled(#[from] Cancelled),
 }
 
-/// Refuses images with a side below `needed` or with a sample that is not finite.
+/// Rejects images with a side below `needed` or with a pixel that is not finite.
 pub(crate) fn check_image(view: ImageView<'_, f32, 1>, needed: usize) -> Result<(), FeatureError> {
     let (width, height) = view.size();
     if width < needed || height < needed {
         return Err(FeatureError::ImageTooSmall { width, height, needed });
     }
     let level = simd::level();
-    let bad = (0..height).into_par_iter().with_min_len(64).find_first(|&y| !simd::all_finite(level, view.row(y)));
-    match bad.and_then(|y| Some((view.row(y).iter().position(|v| !v.is_finite())?, y))) {
+    let first_row = (0..height).into_par_iter().with_min_len(64).find_first(|&y| !simd::all_finite(level, view.row(y)));
+    match first_row.and_then(|y| Some((view.row(y).iter().position(|v| !v.is_finite())?, y))) {
         Some((x, y)) => Err(FeatureError::NotFinite { x, y }),
         None => Ok(()),
     }

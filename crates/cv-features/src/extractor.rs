@@ -1,24 +1,24 @@
-//! Methods that find and describe features: ours, and those of other crates.
+//! Feature extractors: the built-in ones, and the trait for custom ones.
 
 use crate::{DescriptorKind, FeatureError, Features, HarrisFeatures, MopsOptions, SiftOptions};
 use cv_core::{ImageView, Progress};
 use std::sync::Arc;
 
-/// A method that finds the features of an image and describes them. The same image gives the same features at any number of threads.
+/// A feature detector with a descriptor. The result must not depend on the number of threads.
 ///
-/// Its options are the type itself. `tests/own_descriptor.rs` of this crate holds a small one.
+/// The implementing type is the options. See `tests/own_descriptor.rs` of this crate for an example.
 pub trait FeatureExtractor: std::fmt::Debug + Send + Sync {
-    /// Features of a gray image of 0 to 1. An image without any is no error.
+    /// Extracts the features of a gray image of 0 to 1. No features is not an error.
     ///
     /// # Errors
-    /// [`FeatureError`] for images that the method cannot work on, and options out of range.
+    /// [`FeatureError`] for unsuitable images and options out of range.
     fn extract(&self, image: ImageView<'_, f32, 1>, progress: &dyn Progress) -> Result<Features, FeatureError>;
 
-    /// The kind of its descriptors.
+    /// Returns the kind of the descriptors.
     fn kind(&self) -> DescriptorKind;
 }
 
-/// The methods of this crate, by name.
+/// The built-in methods.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
@@ -38,30 +38,32 @@ cv_core::named!(FeatureMethod {
     Harris = "harris": "corners with upright 8×8 patches: neighboring frames of a film or of a slowly turned camera",
 });
 
-/// A method with its options.
+/// A method and its options.
 #[derive(Debug, Clone)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum FeatureOptions {
-    /// Harris corners with upright 8×8 patches: fast, for neighboring frames of a film or a slowly turned camera.
+    /// Harris corners with upright 8×8 patches: fast; for consecutive video frames or a slowly rotating camera.
     Harris(HarrisFeatures),
-    /// Corners at all scales with oriented 8×8 patches: for photographs that turn and zoom a little, at half the time of SIFT.
+    /// Multi-scale corners with oriented 8×8 patches (MOPS): for moderate rotation and scale change, in half the time
+    /// of SIFT.
     Mops(MopsOptions),
-    /// rootSIFT: for photographs that turn, zoom, or change light or viewpoint.
+    /// rootSIFT: for changes of rotation, scale, illumination and viewpoint.
     Sift(SiftOptions),
-    /// A method of another crate; not written as data.
+    /// A custom method; not serialized.
     #[cfg_attr(feature = "serde", serde(skip))]
     Other(Arc<dyn FeatureExtractor>),
 }
 
-/// SIFT, which works on a stranger's photographs without knowing anything about them.
+/// SIFT, which needs no prior knowledge of the images.
 impl Default for FeatureOptions {
     fn default() -> Self {
         FeatureMethod::default().into()
     }
 }
 
-/// The defaults for matching photographs: of more SIFT features than asked for, the coarse ones stay (COLMAP's choice).
+/// The defaults for image matching: if there are more SIFT features than the limit, those of the largest scale are kept
+/// (as in COLMAP).
 impl From<FeatureMethod> for FeatureOptions {
     fn from(method: FeatureMethod) -> Self {
         match method {
@@ -72,7 +74,7 @@ impl From<FeatureMethod> for FeatureOptions {
     }
 }
 
-/// Methods of other crates are the same where they are one value.
+/// Custom methods are equal if they are the same object.
 impl PartialEq for FeatureOptions {
     fn eq(&self, other: &Self) -> bool {
         match (self, other) {
@@ -86,7 +88,7 @@ impl PartialEq for FeatureOptions {
 }
 
 impl FeatureOptions {
-    /// The method.
+    /// Returns the extractor.
     pub fn extractor(&self) -> &dyn FeatureExtractor {
         match self {
             Self::Harris(options) => options,
@@ -96,7 +98,7 @@ impl FeatureOptions {
         }
     }
 
-    /// The same with another largest number of features in a photograph; methods of other crates stay as they are.
+    /// Sets the maximum number of features per image; custom methods are unchanged.
     #[must_use]
     pub fn at_most(mut self, features: usize) -> Self {
         match &mut self {

@@ -1,4 +1,4 @@
-//! Histograms of gradient directions around a point: its dominant directions and its SIFT descriptor.
+//! Histograms of gradient orientations around a keypoint: dominant orientations and SIFT descriptors.
 //!
 //! Source: D. Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 60(2), 2004, sections 5 and 6.
 
@@ -9,12 +9,13 @@ use std::f32::consts::{FRAC_PI_2, PI, TAU};
 
 /// Bins of the orientation histogram (Lowe, section 5).
 const BINS: usize = 36;
-/// Other peaks within this share of the highest count as well (Lowe).
-const PEAK: f32 = 0.8;
-/// No more directions than this at a point (VLFeat's limit; more are noise).
-const MOST_ANGLES: usize = 4;
+/// Minimum height of a secondary peak relative to the highest (Lowe).
+const PEAK_RATIO: f32 = 0.8;
+/// Maximum number of orientations of a keypoint (VLFeat's limit).
+const MAX_ORIENTATIONS: usize = 4;
 
-/// The peaks of the histogram of gradient directions around a point, weighted by magnitude and a Gaussian of 1.5σ: one to four angles, strongest first.
+/// Computes the dominant orientations in radians: the peaks of the histogram of gradient orientations around a
+/// keypoint, weighted by magnitude and a Gaussian of 1.5σ. One to four, by decreasing height.
 pub(crate) fn dominant_angles(level: Level, image: &Image<u16, 1>, (px, py): (f32, f32), sigma: f32) -> Vec<f32> {
     let mut bins = [0.0f32; BINS];
     dispatch!(level, simd => {
@@ -30,77 +31,80 @@ pub(crate) fn dominant_angles(level: Level, image: &Image<u16, 1>, (px, py): (f3
     let mut peaks: Vec<(f32, f32)> = (0..BINS)
         .filter_map(|i| {
             let (l, c, r) = (smooth[(i + BINS - 1) % BINS], smooth[i], smooth[(i + 1) % BINS]);
-            (c > l && c > r && c >= PEAK * highest).then(|| {
+            (c > l && c > r && c >= PEAK_RATIO * highest).then(|| {
                 let angle = (i as f32 + 0.5 * (l - r) / (l - 2.0 * c + r)) * (TAU / BINS as f32);
                 (c, if angle < 0.0 { angle + TAU } else { angle })
             })
         })
         .collect();
-    // A flat or perfectly round neighborhood has no direction of its own.
+    // A flat or rotationally symmetric neighborhood has no dominant orientation.
     if peaks.is_empty() {
         return vec![0.0];
     }
     peaks.sort_by(|a, b| b.0.total_cmp(&a.0));
-    peaks.iter().take(MOST_ANGLES).map(|p| p.1).collect()
+    peaks.iter().take(MAX_ORIENTATIONS).map(|p| p.1).collect()
 }
 
-/// The largest window: 4.5σ to each side at σ = 2^(4/3) · 4 / 2, the largest that the options allow at half the resolution of an octave.
-const WIDEST: usize = 64;
+/// Maximum window side in pixels: a radius of 4.5σ at σ = 2^(4/3) · 4 / 2, the maximum of the options at half the
+/// octave's resolution.
+const MAX_WINDOW: usize = 64;
 
-/// Shares the gradients of the window at its pixels, or at the `MIDDLES` of each four of them, between the two bins nearest to their directions. At half the
-/// resolution of an octave pixels are few: of one of the two, and with whole votes, the lesser peaks would depend on how the pixels happen to lie.
+/// Accumulates the gradients of the window, at the pixels or (`AT_CENTERS`) at the centers of 2×2 pixels, with linear
+/// interpolation between the two nearest bins. At half the octave's resolution there are few pixels: with only one of
+/// the two grids, or without interpolation, secondary peaks would depend on the sampling.
 #[inline(always)]
-fn vote<S: Simd, const MIDDLES: bool>(
+fn vote<S: Simd, const AT_CENTERS: bool>(
     _: S,
     image: &Image<u16, 1>,
     (px, py): (f32, f32),
     sigma: f32,
     bins: &mut [f32; BINS],
 ) {
-    let radius = ((3.0 * sigma + 0.5) as isize).min(WIDEST as isize / 2 - 1);
+    let radius = ((3.0 * sigma + 0.5) as isize).min(MAX_WINDOW as isize / 2 - 1);
     let (w, h) = image.size();
-    let (shift, border) = if MIDDLES { (0.5, 0) } else { (0.0, 1) };
-    let reach = |p: f32, n: usize| {
+    let (shift, border) = if AT_CENTERS { (0.5, 0) } else { (0.0, 1) };
+    let range = |p: f32, n: usize| {
         let c = (p + 0.5 - shift) as isize;
         ((c - radius).max(border) as usize, (c + radius + 1).min(n as isize - 1).max(border) as usize)
     };
-    let ((x0, x1), (y0, y1)) = (reach(px, w), reach(py, h));
+    let ((x0, x1), (y0, y1)) = (range(px, w), range(py, h));
     if x1 <= x0 {
         return;
     }
     let n = x1 - x0;
     let falloff = -0.5 / (sigma * sigma);
-    let mut weights = [0.0f32; WIDEST];
+    let mut weights = [0.0f32; MAX_WINDOW];
     for (i, weight) in weights[..n].iter_mut().enumerate() {
         let d = (x0 + i) as f32 + shift - px;
         *weight = (falloff * d * d).exp();
     }
-    let (mut votes, mut places, mut shares) = ([0.0f32; WIDEST], [0u32; WIDEST], [0.0f32; WIDEST]);
-    // For the bin below a direction and for the one above, so that one addition need not wait for the other; a last one for a full turn.
+    let (mut votes, mut bin_indices, mut upper_votes) =
+        ([0.0f32; MAX_WINDOW], [0u32; MAX_WINDOW], [0.0f32; MAX_WINDOW]);
+    // Separate sums for the lower and the upper bin, for independent additions; the last bin is for a full turn.
     let mut sums = [[0.0f32; BINS + 1]; 2];
     for y in y0..y1 {
         let d = y as f32 + shift - py;
         let weight = (falloff * d * d).exp();
-        let (up, down) = if MIDDLES { (y, y + 1) } else { (y - 1, y + 1) };
+        let (up, down) = if AT_CENTERS { (y, y + 1) } else { (y - 1, y + 1) };
         let (above, below) = (&image.row(up)[x0..x1 + 1], &image.row(down)[x0..x1 + 1]);
-        let here = if MIDDLES { above } else { &image.row(y)[x0 - 1..x1 + 1] };
+        let here = if AT_CENTERS { above } else { &image.row(y)[x0 - 1..x1 + 1] };
         for i in 0..n {
-            // Twice the derivatives, by differences over two pixels or by two over one.
-            let (gx, gy) = if MIDDLES {
+            // Twice the derivatives: central differences, or the sum of two forward differences.
+            let (gx, gy) = if AT_CENTERS {
                 let (a, b) = (below[i + 1] as f32 - above[i] as f32, below[i] as f32 - above[i + 1] as f32);
                 (a - b, a + b)
             } else {
                 (here[i + 2] as f32 - here[i] as f32, below[i] as f32 - above[i] as f32)
             };
             votes[i] = weight * weights[i] * (gx * gx + gy * gy).sqrt();
-            let place = turn(gy, gx) * BINS as f32;
-            places[i] = place as u32;
-            shares[i] = votes[i] * (place - places[i] as f32);
+            let position = direction_in_turns(gy, gx) * BINS as f32;
+            bin_indices[i] = position as u32;
+            upper_votes[i] = votes[i] * (position - bin_indices[i] as f32);
         }
         for i in 0..n {
-            let at = (places[i] as usize).min(BINS);
-            sums[0][at] += votes[i] - shares[i];
-            sums[1][at] += shares[i];
+            let at = (bin_indices[i] as usize).min(BINS);
+            sums[0][at] += votes[i] - upper_votes[i];
+            sums[1][at] += upper_votes[i];
         }
     }
     for (i, bin) in bins.iter_mut().enumerate() {
@@ -110,27 +114,29 @@ fn vote<S: Simd, const MIDDLES: bool>(
     bins[1] += sums[1][BINS];
 }
 
-/// Histogram cells on a side.
+/// Histogram cells along a side.
 const CELLS: usize = 4;
-/// Directions in a cell.
+/// Orientation bins of a cell.
 const DIRECTIONS: usize = 8;
-/// Numbers in a descriptor.
+/// Dimension of a descriptor.
 pub(crate) const DIMENSION: usize = CELLS * CELLS * DIRECTIONS;
-/// Samples across a cell.
+/// Samples along a side of a cell.
 const PER_CELL: usize = 4;
-/// Samples across the window: the cells and half a cell around them, whose gradients reach into the outermost cells.
+/// Samples along a side of the window: the cells and a margin of half a cell, which contributes to the outer cells by
+/// interpolation.
 const GRID: usize = (CELLS + 1) * PER_CELL;
-/// With one more on each side, for the differences.
+/// With a margin of one sample, for central differences.
 const PADDED: usize = GRID + 2;
 /// Width of a cell in σ (Lowe's code and OpenCV's).
 const CELL_SIGMAS: f32 = 3.0;
 
-/// Place of sample `i` in cells, from half a cell before the middle of the first one.
+/// Returns the cell index and the interpolation weight of sample `i`; the origin is half a cell before the center of
+/// the first cell.
 const fn cell(i: usize) -> (usize, f32) {
     (i / PER_CELL, (i % PER_CELL) as f32 / PER_CELL as f32 + 0.5 / PER_CELL as f32)
 }
 
-/// The Gaussian weight of sample `i`, σ half the window (Lowe, section 6.1).
+/// Computes the Gaussian weights of the samples, with σ half the descriptor window (Lowe, section 6.1).
 fn window_weights() -> [f32; GRID] {
     std::array::from_fn(|i| {
         let d = ((i as f32 + 0.5) / PER_CELL as f32 - (CELLS as f32 + 1.0) / 2.0) / (CELLS as f32 / 2.0);
@@ -138,7 +144,8 @@ fn window_weights() -> [f32; GRID] {
     })
 }
 
-/// Gradient histograms of the window turned by `angle`; not normalized. Samples outside the image count nothing.
+/// Computes the (not normalized) gradient histograms of the window rotated by `angle`. Samples outside the image have
+/// weight zero.
 pub(crate) fn describe(
     level: Level,
     image: &Image<u16, 1>,
@@ -161,19 +168,19 @@ fn describe_impl<S: Simd>(
     let (sin, cos) = angle.sin_cos();
     let (ux, uy) = (cos * step, sin * step);
     let (w, h) = image.size();
-    let middle = (PADDED - 1) as f32 / 2.0;
-    let reach = middle * (ux.abs() + uy.abs());
+    let center = (PADDED - 1) as f32 / 2.0;
+    let radius = center * (ux.abs() + uy.abs());
     let (right, bottom) = ((w - 1) as f32, (h - 1) as f32);
-    let all_inside = px - reach >= 0.0 && py - reach >= 0.0 && px + reach < right && py + reach < bottom;
+    let all_inside = px - radius >= 0.0 && py - radius >= 0.0 && px + radius < right && py + radius < bottom;
 
     let mut samples = [0.0f32; PADDED * PADDED];
     let mut inside = [1.0f32; PADDED * PADDED];
     let pixels = image.as_slice();
     for j in 0..PADDED {
-        let v = j as f32 - middle;
+        let v = j as f32 - center;
         let (mut fx, mut fy) = ([0.0f32; PADDED], [0.0f32; PADDED]);
         let mut starts = [0u32; PADDED];
-        let (x0, y0) = (px - v * uy - middle * ux, py + v * ux - middle * uy);
+        let (x0, y0) = (px - v * uy - center * ux, py + v * ux - center * uy);
         for i in 0..PADDED {
             let (mut x, mut y) = (x0 + i as f32 * ux, y0 + i as f32 * uy);
             if !all_inside {
@@ -181,14 +188,14 @@ fn describe_impl<S: Simd>(
                 inside[j * PADDED + i] = if cx == x && cy == y { 1.0 } else { 0.0 };
                 (x, y) = (cx, cy);
             }
-            // The square of pixels around it; on its border either neighbor will do.
+            // The surrounding 2×2 pixels.
             let (column, row) =
                 (round((x - 0.5).max(0.0)).min(w as u32 - 2), round((y - 0.5).max(0.0)).min(h as u32 - 2));
             fx[i] = x - column as f32;
             fy[i] = y - row as f32;
             starts[i] = row * w as u32 + column;
         }
-        // Two neighbors in one number each: gathering is what takes the time.
+        // Two horizontal neighbors in one word: gathering dominates the time.
         let (mut tops, mut bottoms) = ([0u32; PADDED], [0u32; PADDED]);
         for i in 0..PADDED {
             let square = &pixels[starts[i] as usize..][..w + 2];
@@ -217,23 +224,23 @@ fn describe_impl<S: Simd>(
         for i in 0..GRID {
             let (gx, gy) = (here[i + 2] - here[i], below[i] - above[i]);
             magnitudes[i] = valid[i] * weights[j] * weights[i] * (gx * gx + gy * gy).sqrt();
-            directions[i] = turn(gy, gx) * DIRECTIONS as f32;
+            directions[i] = direction_in_turns(gy, gx) * DIRECTIONS as f32;
         }
-        // Each sample is shared between two columns of cells and two directions: all eight directions at once, those further than one bin away
-        // getting nothing.
+        // Linear interpolation between two columns of cells and two orientation bins: all eight bins at once, with
+        // weight zero for those farther than one bin.
         let mut row = [f32x8::splat(simd, 0.0); CELLS + 2];
         for i in 0..GRID {
-            let (column, share) = cell(i);
-            let away = (f32x8::splat(simd, directions[i]) - lanes).abs();
-            let around = away.min(f32x8::splat(simd, DIRECTIONS as f32) - away);
-            let vote = (f32x8::splat(simd, 1.0) - around).max(f32x8::splat(simd, 0.0)) * magnitudes[i];
-            row[column] += vote * (1.0 - share);
-            row[column + 1] += vote * share;
+            let (column, fraction) = cell(i);
+            let distance = (f32x8::splat(simd, directions[i]) - lanes).abs();
+            let distance = distance.min(f32x8::splat(simd, DIRECTIONS as f32) - distance);
+            let vote = (f32x8::splat(simd, 1.0) - distance).max(f32x8::splat(simd, 0.0)) * magnitudes[i];
+            row[column] += vote * (1.0 - fraction);
+            row[column + 1] += vote * fraction;
         }
-        let (line, share) = cell(j);
+        let (line, fraction) = cell(j);
         for c in 0..CELLS + 2 {
-            histogram[line][c] += row[c] * (1.0 - share);
-            histogram[line + 1][c] += row[c] * share;
+            histogram[line][c] += row[c] * (1.0 - fraction);
+            histogram[line + 1][c] += row[c] * fraction;
         }
     }
     let mut out = [0.0; DIMENSION];
@@ -243,11 +250,11 @@ fn describe_impl<S: Simd>(
     out
 }
 
-/// The direction of `(x, y)` as a share of a full turn, 0 ≤ t ≤ 1 (0 for a zero vector).
+/// Computes the direction of `(x, y)` in turns, 0 ≤ t ≤ 1 (0 for a zero vector).
 ///
-/// Abramowitz & Stegun 4.4.49, error below 2e-6 of a turn: a tenth of a thousandth of a histogram bin.
+/// Abramowitz & Stegun 4.4.49, with an error below 2e-6 turns: about 1e-4 of a histogram bin.
 #[inline(always)]
-fn turn(y: f32, x: f32) -> f32 {
+fn direction_in_turns(y: f32, x: f32) -> f32 {
     let (ax, ay) = (x.abs(), y.abs());
     let (small, large) = if ax < ay { (ax, ay) } else { (ay, ax) };
     let t = small / (large + f32::MIN_POSITIVE);
@@ -265,21 +272,21 @@ mod tests {
     use cv_synth::instruction_sets;
 
     #[test]
-    fn angles_are_those_of_the_library() {
+    fn directions_equal_atan2() {
         for i in 0..4000 {
             let a = i as f32 * 0.01 - 20.0;
             let (y, x) = (a.sin() * 3.0, a.cos() * 3.0);
             let expected = f64::from(y).atan2(f64::from(x)).rem_euclid(std::f64::consts::TAU) / std::f64::consts::TAU;
-            let d = (f64::from(turn(y, x)) - expected).abs();
-            // The polynomial's stated error, and f32 rounding.
+            let d = (f64::from(direction_in_turns(y, x)) - expected).abs();
+            // The error of the polynomial, and f32 rounding.
             assert!(d.min(1.0 - d) < 2.5e-6, "{a}: {d}");
         }
-        assert_eq!(turn(0.0, 0.0), 0.0);
-        assert!((0.0..=1.0).contains(&turn(-0.0, -1.0)) && turn(-1e-30, 1.0) <= 1.0);
+        assert_eq!(direction_in_turns(0.0, 0.0), 0.0);
+        assert!((0.0..=1.0).contains(&direction_in_turns(-0.0, -1.0)) && direction_in_turns(-1e-30, 1.0) <= 1.0);
     }
 
-    /// A plane of known slope direction, and a corner of two slopes.
-    fn slope(angle: f32) -> Image<u16, 1> {
+    /// An intensity ramp with a known gradient direction.
+    fn ramp(angle: f32) -> Image<u16, 1> {
         let (sin, cos) = angle.sin_cos();
         Image::from_fn(
             120,
@@ -289,32 +296,32 @@ mod tests {
     }
 
     #[test]
-    fn a_slope_points_uphill() {
+    fn the_orientation_of_a_ramp_is_its_gradient_direction() {
         for k in 0..24 {
             let angle = k as f32 * TAU / 24.0 + 0.03;
-            let image = slope(angle);
+            let image = ramp(angle);
             for level in instruction_sets() {
                 let found = dominant_angles(level, &image, (60.3, 54.8), 2.2);
-                let off = (found[0] - angle).abs();
-                // All votes fall in one bin of 10°, whose neighbors are symmetric after smoothing: half a bin is the resolution of such a histogram.
-                assert!(found.len() == 1 && off.min(TAU - off) <= TAU / 72.0 + 1e-3, "{angle}: {found:?}");
+                let error = (found[0] - angle).abs();
+                // All votes are in one or two bins of 10°: the error is at most half a bin.
+                assert!(found.len() == 1 && error.min(TAU - error) <= TAU / 72.0 + 1e-3, "{angle}: {found:?}");
             }
         }
     }
 
-    /// The descriptor straight from Lowe's words: every sample shared trilinearly.
+    /// Reference: the descriptor by Lowe's definition, with trilinear interpolation.
     fn plain(image: &Image<u16, 1>, (px, py): (f32, f32), sigma: f32, angle: f32) -> Vec<f64> {
         let (w, h) = image.size();
         let step = f64::from(CELL_SIGMAS * sigma) / PER_CELL as f64;
         let (sin, cos) = f64::from(angle).sin_cos();
-        let middle = (PADDED - 1) as f64 / 2.0;
-        let place = |i: usize, j: usize| {
-            let (u, v) = ((i as f64 - middle) * step, (j as f64 - middle) * step);
+        let center = (PADDED - 1) as f64 / 2.0;
+        let position = |i: usize, j: usize| {
+            let (u, v) = ((i as f64 - center) * step, (j as f64 - center) * step);
             (f64::from(px) + u * cos - v * sin, f64::from(py) + u * sin + v * cos)
         };
         let inside = |(x, y): (f64, f64)| x >= 0.0 && y >= 0.0 && x <= w as f64 - 1.0 && y <= h as f64 - 1.0;
         let sample = |i: usize, j: usize| {
-            let (x, y) = place(i, j);
+            let (x, y) = position(i, j);
             let (x, y) = (x.clamp(0.0, w as f64 - 1.0), y.clamp(0.0, h as f64 - 1.0));
             let (c, r) = ((x as usize).min(w - 2), (y as usize).min(h - 2));
             let at = |dx: usize, dy: usize| f64::from(image.at(c + dx, r + dy)[0]);
@@ -324,7 +331,7 @@ mod tests {
         let mut out = vec![0.0f64; DIMENSION];
         for j in 1..=GRID {
             for i in 1..=GRID {
-                if !inside(place(i, j)) {
+                if !inside(position(i, j)) {
                     continue;
                 }
                 let (gx, gy) = (sample(i + 1, j) - sample(i - 1, j), sample(i, j + 1) - sample(i, j - 1));
@@ -334,10 +341,10 @@ mod tests {
                 let direction = gy.atan2(gx).rem_euclid(std::f64::consts::TAU) * 8.0 / std::f64::consts::TAU;
                 for (k, o) in out.iter_mut().enumerate() {
                     let (r, c, b) = (k / 32, k / 8 % 4, k % 8);
-                    let near = |a: f64, b: f64| (1.0 - (a - b).abs()).max(0.0);
-                    let turn = (direction - b as f64).abs();
-                    let turn = (1.0 - turn.min(8.0 - turn)).max(0.0);
-                    *o += magnitude * near(at(i), c as f64) * near(at(j), r as f64) * turn;
+                    let weight = |a: f64, b: f64| (1.0 - (a - b).abs()).max(0.0);
+                    let distance = (direction - b as f64).abs();
+                    let bin_weight = (1.0 - distance.min(8.0 - distance)).max(0.0);
+                    *o += magnitude * weight(at(i), c as f64) * weight(at(j), r as f64) * bin_weight;
                 }
             }
         }
@@ -345,21 +352,21 @@ mod tests {
     }
 
     #[test]
-    fn descriptors_equal_the_plain_definition() {
+    fn descriptors_equal_the_reference() {
         let mut state = 5u32;
         let image = Image::<u16, 1>::from_fn(120, 100, |x, y| {
             state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
             let wave = (x as f32 * 0.3).sin() + (y as f32 * 0.23 + x as f32 * 0.05).cos();
             [(30000.0 + 9000.0 * wave + (state >> 20) as f32) as u16]
         });
-        // In the middle, and with the window partly outside.
+        // In the image center, and with windows partly outside.
         for (at, sigma, angle) in [((60.2, 50.7), 2.1, 0.7), ((8.1, 90.2), 3.0, 4.0), ((117.0, 5.0), 1.7, 2.5)] {
             let expected = plain(&image, at, sigma, angle);
             let norm = expected.iter().map(|v| v * v).sum::<f64>().sqrt();
             for level in instruction_sets() {
                 let got = describe(level, &image, at, sigma, angle);
                 for (g, e) in got.iter().zip(&expected) {
-                    // Twenty-odd f32 operations on positions of up to 120 pixels, times the slope between pixels.
+                    // About twenty f32 operations on positions of up to 120 pixels, times the gradient.
                     assert!((f64::from(*g) - e).abs() < 1e-3 * norm, "{level:?}: {g} not {e}");
                 }
                 assert_eq!(got, describe(Level::baseline(), &image, at, sigma, angle), "{level:?}");

@@ -1,4 +1,4 @@
-//! Harris corners, and those of Shi & Tomasi.
+//! Harris and Shi–Tomasi corners.
 //!
 //! Sources: C. Harris & M. Stephens, "A combined corner and edge detector", Alvey Vision Conference 1988; J. Shi & C. Tomasi, "Good features to
 //! track", CVPR 1994.
@@ -6,14 +6,14 @@
 use crate::error::{FeatureError, check_image};
 use crate::line_buffer::LineBuffer;
 use crate::simd;
-use crate::structure_tensor::{StructureTensor, Walk};
+use crate::structure_tensor::{RowStream, StructureTensor};
 use cv_core::{Cancelled, GrayF32, ImageView, Keypoint, OptionError, Progress, Stage};
 use cv_imgproc::gaussian_half_kernel;
 use fearless_simd::Level;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// What makes a pixel a corner, from the two eigenvalues λ₁ ≤ λ₂ of its structure tensor.
+/// The corner measure, a function of the eigenvalues λ₁ ≤ λ₂ of the structure tensor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
@@ -23,24 +23,24 @@ pub enum CornerMeasure {
         /// Weight of the squared trace. 0 to 0.25; usually 0.04 (Harris & Stephens' range is 0.04 to 0.06).
         k: f32,
     },
-    /// λ₁ (Shi & Tomasi): more corners on weak texture beside strong, for the same share of the strongest.
+    /// λ₁ (Shi & Tomasi): more corners on weak texture for the same relative threshold.
     ShiTomasi,
 }
 
 cv_core::named!(CornerMeasure { Harris { k: 0.04 } = "harris", ShiTomasi = "shi-tomasi" });
 
-/// Settings of [`harris`].
+/// Options of [`harris`].
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct HarrisOptions {
     /// The corner measure. Default Harris with `k` = 0.04.
     pub measure: CornerMeasure,
-    /// Standard deviation of the Gaussian window over the gradient products, in pixels. 0.3 to 20; default 1, the integration
-    /// scale that Brown, Szeliski & Winder pair with single-pixel gradients (their 1.5, less what the Sobel mask smooths).
+    /// Sigma in pixels of the Gaussian window of the gradient products (integration scale). 0.3 to 20; default 1:
+    /// Brown, Szeliski & Winder use 1.5 for gradients without the smoothing of the Sobel mask.
     pub window_sigma: f32,
-    /// Corners weaker than this share of the strongest response are left out. 0 to 1; default 0.01, the usual value
-    /// (OpenCV's tutorials and `goodFeaturesToTrack`).
+    /// Minimum response relative to the maximum response. 0 to 1; default 0.01, the usual value (OpenCV's tutorials and
+    /// `goodFeaturesToTrack`).
     pub threshold: f32,
 }
 
@@ -66,43 +66,46 @@ impl HarrisOptions {
     }
 }
 
-/// The smallest image with a pixel that has all its eight neighbors.
-const SMALLEST: usize = 3;
+/// Minimum image side: one pixel with all eight neighbors.
+const MIN_SIDE: usize = 3;
 
-/// Rows that a task works on: enough that the rows its window reaches beyond them cost little, few enough to share out.
-fn rows_of_a_task(h: usize) -> usize {
+/// Returns the number of rows of a parallel task: large enough for a small overlap of the windows, small enough for
+/// load balancing.
+fn rows_per_task(h: usize) -> usize {
     h.div_ceil(4 * rayon::current_num_threads()).max(48)
 }
 
-/// The corner measure of every pixel: for Harris `det M − k·(trace M)²`, for Shi & Tomasi the smaller eigenvalue of M.
+/// Computes the corner measure of every pixel: for Harris `det M − k·(trace M)²`, for Shi & Tomasi the smaller
+/// eigenvalue of M.
 ///
-/// M is the Gaussian-weighted sum of gradient products, the gradient being the 3×3 Sobel mask divided by 8 (so that a ramp of slope s
-/// has gradient s). Borders are mirrored (OpenCV's BORDER_REFLECT_101).
+/// The structure tensor M is the Gaussian-weighted sum of gradient products, with gradients by the 3×3 Sobel mask
+/// divided by 8 (so that a ramp of slope s has gradient s). Borders are mirrored (OpenCV's BORDER_REFLECT_101).
 ///
 /// # Errors
-/// [`FeatureError`] for images below 3×3, samples that are not finite, options out of range.
+/// [`FeatureError`] for images below 3×3, pixels that are not finite, options out of range.
 pub fn harris_response(view: ImageView<'_, f32, 1>, options: &HarrisOptions) -> Result<GrayF32, FeatureError> {
     options.check()?;
-    check_image(view, SMALLEST)?;
+    check_image(view, MIN_SIDE)?;
     Ok(response(&options.plan(view, simd::level())))
 }
 
 fn response(plan: &StructureTensor<'_>) -> GrayF32 {
     let (w, h) = plan.view.size();
     let mut out = GrayF32::new(w, h, [0.0]);
-    let rows = rows_of_a_task(h);
+    let rows = rows_per_task(h);
     out.as_mut_slice().par_chunks_mut(rows * w).enumerate().for_each(|(i, strip)| {
-        let mut walk = Walk::new(plan, i * rows);
-        strip.chunks_exact_mut(w).enumerate().for_each(|(y, row)| walk.row(i * rows + y, row));
+        let mut stream = RowStream::new(plan, i * rows);
+        strip.chunks_exact_mut(w).enumerate().for_each(|(y, row)| stream.row(i * rows + y, row));
     });
     out
 }
 
-/// Harris corners: local maxima of [`harris_response`] above a share of the strongest, with sub-pixel positions, in raster order.
+/// Detects corners: local maxima of [`harris_response`] above a threshold relative to the maximum, with sub-pixel
+/// positions, in raster order.
 ///
-/// A corner is a pixel (not of the outermost ring) whose response is not exceeded in its 3×3 neighborhood; of a plateau, the first
-/// pixel in raster order. Its position is refined to the maximum of the quadratic through the nine responses, at most
-/// half a pixel away. A flat image has no corners: the result is empty. No full-size image is stored on the way.
+/// A corner is an interior pixel whose response is not exceeded in its 3×3 neighborhood; of a plateau, the first pixel
+/// in raster order. Its position is refined to the maximum of a quadratic fitted to the nine responses, at most half a
+/// pixel away. A flat image has no corners. No full-size response image is stored.
 ///
 /// # Errors
 /// As [`harris_response`].
@@ -112,11 +115,11 @@ pub fn harris(
     progress: &dyn Progress,
 ) -> Result<Vec<Keypoint>, FeatureError> {
     options.check()?;
-    check_image(view, SMALLEST)?;
+    check_image(view, MIN_SIDE)?;
     Ok(corners(&options.plan(view, simd::level()), options.threshold, progress)?)
 }
 
-/// Local maxima of the measure of at least a share of the largest, in raster order.
+/// Detects the local maxima of the measure above `threshold` relative to the maximum, in raster order.
 pub(crate) fn corners(
     plan: &StructureTensor<'_>,
     threshold: f32,
@@ -124,7 +127,7 @@ pub(crate) fn corners(
 ) -> Result<Vec<Keypoint>, Cancelled> {
     let h = plan.view.height();
     let stage = Stage::new(progress, "corners", h)?;
-    let rows = rows_of_a_task(h);
+    let rows = rows_per_task(h);
     let strips: Vec<(f32, Vec<Keypoint>)> = (0..h.div_ceil(rows))
         .into_par_iter()
         .map(|i| strip_corners(plan, threshold, i * rows..((i + 1) * rows).min(h), &stage))
@@ -135,7 +138,8 @@ pub(crate) fn corners(
     Ok(corners)
 }
 
-/// The largest response of some rows, and their corners above the threshold (against that largest response: a few too many).
+/// Computes the maximum response of a strip of rows, and its corners above the threshold relative to that maximum (a
+/// superset of the final ones).
 fn strip_corners(
     plan: &StructureTensor<'_>,
     threshold: f32,
@@ -144,23 +148,23 @@ fn strip_corners(
 ) -> Result<(f32, Vec<Keypoint>), Cancelled> {
     let (w, h) = plan.view.size();
     let (first, last) = (rows.start.saturating_sub(1), (rows.end + 1).min(h));
-    let mut walk = Walk::new(plan, first);
-    let mut ring = LineBuffer::new(0..w, 3);
-    let (mut max, mut seen, mut found) = (0.0f32, Vec::new(), Vec::new());
+    let mut stream = RowStream::new(plan, first);
+    let mut buffer = LineBuffer::new(0..w, 3);
+    let (mut max, mut peaks, mut found) = (0.0f32, Vec::new(), Vec::new());
     for y in first..last {
         stage.add(usize::from(rows.contains(&y)))?;
-        walk.row(y, ring.row_mut(y));
-        max = simd::maximum(plan.level, ring.row(y), max);
+        stream.row(y, buffer.row_mut(y));
+        max = simd::maximum(plan.level, buffer.row(y), max);
         if y < first + 2 {
             continue;
         }
-        // The row above now has both its neighbors.
-        let [above, here, below] = [y - 2, y - 1, y].map(|y| ring.row(y));
-        seen.clear();
-        simd::peaks(plan.level, [above, here, below], threshold * max, &mut seen);
-        for &x in &seen {
+        // The previous row now has both neighbors.
+        let [above, here, below] = [y - 2, y - 1, y].map(|y| buffer.row(y));
+        peaks.clear();
+        simd::peaks(plan.level, [above, here, below], threshold * max, &mut peaks);
+        for &x in &peaks {
             let v = here[x];
-            // Of a plateau the first pixel.
+            // The first pixel of a plateau.
             if v > above[x - 1] && v > above[x] && v > above[x + 1] && v > here[x - 1] {
                 let (dx, dy) = quadratic_peak([above, here, below].map(|r| [r[x - 1], r[x], r[x + 1]]));
                 found.push(Keypoint::new(x as f32 + dx, (y - 1) as f32 + dy, v));
@@ -170,9 +174,10 @@ fn strip_corners(
     Ok((max, found))
 }
 
-/// Offset from the middle of the maximum of the quadratic through 3×3 values (least squares for the cross term), each part held to ±0.5.
+/// Computes the offset from the center of the maximum of a quadratic fitted to 3×3 values (least squares for the cross
+/// term), each coordinate clamped to ±0.5.
 pub(crate) fn quadratic_peak(v: [[f32; 3]; 3]) -> (f32, f32) {
-    // Relative to the center, so that the differences keep their digits.
+    // Relative to the center, for numerical precision.
     let v = v.map(|r| r.map(|a| f64::from(a) - f64::from(v[1][1])));
     let gx = 0.5 * (v[1][2] - v[1][0]);
     let gy = 0.5 * (v[2][1] - v[0][1]);
@@ -180,26 +185,26 @@ pub(crate) fn quadratic_peak(v: [[f32; 3]; 3]) -> (f32, f32) {
     let yy = v[2][1] + v[0][1];
     let xy = 0.25 * (v[2][2] - v[2][0] - v[0][2] + v[0][0]);
     let det = xx * yy - xy * xy;
-    let hold = |a: f64| if a.is_finite() { a.clamp(-0.5, 0.5) as f32 } else { 0.0 };
+    let clamp = |a: f64| if a.is_finite() { a.clamp(-0.5, 0.5) as f32 } else { 0.0 };
     if det > 0.0 && xx < 0.0 {
-        (hold((xy * gy - yy * gx) / det), hold((xy * gx - xx * gy) / det))
+        (clamp((xy * gy - yy * gx) / det), clamp((xy * gx - xx * gy) / det))
     } else {
-        // Not a peak in two dimensions (a ridge): each axis by itself.
-        (hold(-gx / xx), hold(-gy / yy))
+        // Not a two-dimensional maximum (a ridge): each axis separately.
+        (clamp(-gx / xx), clamp(-gy / yy))
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::structure_tensor::{harris_at, products_at, smaller_eigenvalue};
+    use crate::structure_tensor::{harris_measure, products_at, smaller_eigenvalue};
     use cv_core::{Image, Silent};
     use cv_imgproc::gaussian_blur;
     use cv_imgproc::mirror_index;
     use cv_synth::instruction_sets;
     use proptest::prelude::*;
 
-    /// The definition, whole image after whole image.
+    /// Reference: the definition, by whole-image passes.
     fn plain_response(view: ImageView<'_, f32, 1>, options: &HarrisOptions) -> GrayF32 {
         let (w, h) = view.size();
         let product = |i: usize| {
@@ -211,13 +216,13 @@ mod tests {
         GrayF32::from_fn(w, h, |x, y| {
             let ([xx], [xy], [yy]) = (xx.at(x, y), xy.at(x, y), yy.at(x, y));
             [match options.measure {
-                CornerMeasure::Harris { k } => harris_at(xx, xy, yy, k),
+                CornerMeasure::Harris { k } => harris_measure(xx, xy, yy, k),
                 CornerMeasure::ShiTomasi => smaller_eigenvalue(xx, xy, yy),
             }]
         })
     }
 
-    /// Corners straight from the words of [`harris`].
+    /// Reference: the corners by the definition of [`harris`].
     fn plain_corners(response: &GrayF32, threshold: f32) -> Vec<Keypoint> {
         let (w, h) = response.size();
         let max = response.as_slice().iter().fold(0.0f32, |m, &v| m.max(v));
@@ -240,10 +245,10 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(60))]
         #[test]
-        fn one_pass_equals_whole_image_passes(
+        fn streaming_equals_whole_image_passes(
             w in 3usize..90, h in 3usize..150, sigma in 0.3f32..3.0, cell in 1usize..9, seed in any::<u32>(), shi in any::<bool>()
         ) {
-            // Squares of random gray: corners, plateaus and flat places.
+            // Squares of random gray: corners, plateaus and flat regions.
             let image = GrayF32::from_fn(w, h, |x, y| {
                 let mut v = ((x / cell) as u32).wrapping_mul(0x9E37_79B9) ^ ((y / cell) as u32).wrapping_mul(0x85EB_CA6B) ^ seed;
                 v = (v ^ (v >> 15)).wrapping_mul(0x2C1B_3C6D);
@@ -258,17 +263,17 @@ mod tests {
                 let plan = options.plan(image.view(), level);
                 prop_assert_eq!(&response(&plan), &expected, "{:?}", level);
                 prop_assert_eq!(&corners(&plan, options.threshold, &Silent).unwrap(), &expected_corners, "{:?}", level);
-                // Wherever the image is cut.
-                let mut walk = Walk::new(&plan, h / 2);
+                // Independent of the strip boundaries.
+                let mut stream = RowStream::new(&plan, h / 2);
                 let mut row = vec![0.0; w];
-                walk.row(h / 2, &mut row);
+                stream.row(h / 2, &mut row);
                 prop_assert_eq!(&row[..], expected.row(h / 2), "{:?}", level);
             }
         }
     }
 
     #[test]
-    fn a_square_has_its_four_corners() {
+    fn a_square_has_four_corners() {
         let image =
             GrayF32::from_fn(40, 30, |x, y| [if (10..25).contains(&x) && (8..20).contains(&y) { 0.8 } else { 0.2 }]);
         for measure in [CornerMeasure::Harris { k: 0.04 }, CornerMeasure::ShiTomasi] {
@@ -276,8 +281,8 @@ mod tests {
                 harris(image.view(), &HarrisOptions { measure, threshold: 0.1, ..HarrisOptions::default() }, &Silent)
                     .unwrap();
             corners.sort_by(|a, b| b.response.total_cmp(&a.response));
-            // Edges lie half-way between pixels: (9.5, 7.5) to (24.5, 19.5). The Harris maximum of a right angle smoothed by a window of
-            // sigma about 1 lies inside the corner by less than that sigma.
+            // The edges are half-way between pixels: (9.5, 7.5) to (24.5, 19.5). The Harris maximum of a right angle
+            // with a window of sigma 1 is inside the corner by less than sigma.
             for (x, y) in [(9.5, 7.5), (24.5, 7.5), (9.5, 19.5), (24.5, 19.5)] {
                 let inside =
                     corners[..4].iter().filter(|c| (c.position.x - x).abs() < 1.0 && (c.position.y - y).abs() < 1.0);
@@ -288,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn flat_images_have_none_and_bad_ones_are_refused() {
+    fn flat_images_have_no_corners_and_invalid_images_are_rejected() {
         let options = HarrisOptions::default();
         assert_eq!(harris(GrayF32::new(20, 20, [0.3]).view(), &options, &Silent), Ok(vec![]));
         for (w, h) in [(0, 0), (1, 1), (2, 50), (0, 9)] {
@@ -310,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn the_peak_of_a_quadratic_is_found_exactly() {
+    fn the_maximum_of_a_quadratic_is_exact() {
         let f =
             |x: f32, y: f32| 5.0 - (x - 0.3) * (x - 0.3) - 2.0 * (y + 0.2) * (y + 0.2) + 0.5 * (x - 0.3) * (y + 0.2);
         let v = [-1.0, 0.0, 1.0].map(|y| [-1.0, 0.0, 1.0].map(|x| f(x, y)));

@@ -1,4 +1,4 @@
-//! Harris corners, spaced evenly, with upright patches.
+//! Harris corners with adaptive non-maximal suppression and upright patches.
 
 use crate::{
     DescriptorKind, FeatureError, FeatureExtractor, Features, HarrisOptions, PatchOptions, anms, anms_square_covering,
@@ -6,19 +6,19 @@ use crate::{
 };
 use cv_core::{ImageView, Progress};
 
-/// The non-maximal suppression that spreads Harris corners over the photograph.
+/// The non-maximal suppression that distributes Harris corners over the image.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Suppression {
-    /// By suppression radius (Brown, Szeliski & Winder): [`anms`].
+    /// Adaptive non-maximal suppression by radius (Brown, Szeliski & Winder): [`anms`].
     Radius {
-        /// Robustness factor. 0 to 1; 0.9 (Brown, Szeliski & Winder).
+        /// Robustness factor, 0 to 1; default 0.9 (Brown, Szeliski & Winder).
         robust: f32,
     },
-    /// By square covering (Bailo et al.): faster, nearly as even: [`anms_square_covering`].
+    /// Suppression via square covering (Bailo et al.), faster and nearly as uniform: [`anms_square_covering`].
     SquareCovering,
-    /// As many from each of 8 × 8 tiles: [`anms_tiled`].
+    /// Equal counts from 8 × 8 tiles: [`anms_tiled`].
     Tiles,
 }
 
@@ -34,18 +34,18 @@ impl Default for Suppression {
     }
 }
 
-/// Settings of Harris corners with upright patches.
+/// Options of Harris corners with upright patches.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct HarrisFeatures {
-    /// Most corners that are described. 1 or more; default 500 (Brown, Szeliski & Winder).
+    /// Maximum number of features, 1 or more; default 500 (Brown, Szeliski & Winder).
     pub max_features: usize,
-    /// The corners.
+    /// Options of the detector.
     pub corners: HarrisOptions,
-    /// How they are spread. Default by radius.
+    /// The non-maximal suppression. Default by radius.
     pub suppression: Suppression,
-    /// The patches.
+    /// Options of the descriptor.
     pub patch: PatchOptions,
 }
 
@@ -63,14 +63,14 @@ impl Default for HarrisFeatures {
 impl FeatureExtractor for HarrisFeatures {
     fn extract(&self, image: ImageView<'_, f32, 1>, progress: &dyn Progress) -> Result<Features, FeatureError> {
         let corners = harris(image, &self.corners, progress)?;
-        let spaced = match self.suppression {
+        let selected = match self.suppression {
             Suppression::Radius { robust } => anms(&corners, self.max_features, robust),
             Suppression::SquareCovering => anms_square_covering(&corners, self.max_features),
             Suppression::Tiles => anms_tiled(&corners, self.max_features, (8, 8)),
         };
-        let spaced: Vec<_> = spaced.into_iter().map(|i| corners[i]).collect();
-        let described = describe_patches(image, &spaced, &self.patch)?;
-        Ok(Features { beyond_limit: corners.len() - spaced.len(), candidates: corners, ..described })
+        let selected: Vec<_> = selected.into_iter().map(|i| corners[i]).collect();
+        let described = describe_patches(image, &selected, &self.patch)?;
+        Ok(Features { beyond_limit: corners.len() - selected.len(), candidates: corners, ..described })
     }
 
     fn kind(&self) -> DescriptorKind {

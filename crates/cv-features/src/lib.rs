@@ -1,19 +1,20 @@
-//! Corners, spacing, descriptors and matching.
+//! Local features (Harris, multi-scale Harris, SIFT), non-maximal suppression, descriptors, matching, and calibration
+//! targets.
 //!
-//! From two gray images to tentative matches, the classical way:
+//! From two gray images to tentative matches:
 //!
 //! ```
 //! use cv_core::{GrayF32, Silent};
 //! use cv_features::{anms, describe_patches, harris, match_descriptors, HarrisOptions, MatchOptions, PatchOptions};
 //!
-//! // A board of random gray squares, and the same board moved by (3, 2) pixels.
-//! let board = |dx: usize, dy: usize| {
+//! // A pattern of random gray squares, and the same pattern shifted by (3, 2) pixels.
+//! let pattern = |dx: usize, dy: usize| {
 //!     GrayF32::from_fn(160, 120, |x, y| {
 //!         let cell = ((x + dx) / 9 * 31 + (y + dy) / 7 * 17) % 11;
 //!         [(cell * cell % 11) as f32 / 10.0]
 //!     })
 //! };
-//! let (a, b) = (board(0, 0), board(3, 2));
+//! let (a, b) = (pattern(0, 0), pattern(3, 2));
 //! let mut described = Vec::new();
 //! for image in [&a, &b] {
 //!     let corners = harris(image.view(), &HarrisOptions::default(), &Silent)?;
@@ -30,9 +31,10 @@
 //!
 //! # Conventions
 //!
-//! * Images are one channel of `f32`, by convention 0 to 1. A sample that is not finite is an error, never a NaN in a result.
+//! * Images have one channel of `f32`, by convention 0 to 1. A pixel that is not finite is an error; results have no
+//!   NaN.
 //! * Positions are sub-pixel with pixel centers at integers. Angles are radians, clockwise on screen from +x.
-//! * Every detector and descriptor returns what it dropped, with the reason, beside what it kept.
+//! * Every detector and descriptor also returns the dropped keypoints, with the reason.
 //! * Results do not depend on the number of threads.
 
 mod anms;
@@ -82,4 +84,4 @@ pub use targets::{
     BlackRectangle, Board, BoardError, BoardKind, BoardPoint, BoardSize, CharucoBoard, Chessboard, ChessboardOptions,
     Dictionary, GridStyle, MarkerGrid, find_board, find_charuco, find_chessboard, find_marker_grid,
 };
-pub use vlad::{Vocabulary, most_alike};
+pub use vlad::{Vocabulary, most_similar};

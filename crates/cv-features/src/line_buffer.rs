@@ -1,12 +1,12 @@
-//! Line buffers: the last few rows of an image that is worked from top to bottom.
+//! Line buffers: ring buffers of the last rows of an image processed from top to bottom.
 
 use cv_imgproc::mirror_index;
 use std::ops::Range;
 
-/// The last rows of a part of an image.
+/// A ring buffer of rows of a range of columns.
 pub(crate) struct LineBuffer {
     data: Vec<f32>,
-    /// First column.
+    /// First column of the range.
     pub(crate) from: usize,
     pub(crate) width: usize,
     rows: usize,
@@ -17,13 +17,13 @@ impl LineBuffer {
         Self { data: vec![0.0; columns.len() * rows], from: columns.start, width: columns.len(), rows }
     }
 
-    /// Makes room for the rows of another part; what they held is left in them.
-    pub(crate) fn fit(&mut self, columns: Range<usize>, rows: usize) {
+    /// Resizes for another range of columns and number of rows; the contents are unspecified.
+    pub(crate) fn resize(&mut self, columns: Range<usize>, rows: usize) {
         (self.from, self.width, self.rows) = (columns.start, columns.len(), rows);
         self.data.resize(self.width * rows, 0.0);
     }
 
-    /// Row `y` of the image, from column `from` on.
+    /// Returns row `y` of the image, from column `from`.
     #[inline]
     pub(crate) fn row(&self, y: usize) -> &[f32] {
         let start = (y % self.rows) * self.width;
@@ -35,7 +35,7 @@ impl LineBuffer {
         &mut self.data[start..start + self.width]
     }
 
-    /// Columns `a..b` of `count` rows from row `first` on, of an image of `h` rows, mirrored at its ends.
+    /// Collects columns `columns` of `count` rows from row `first` of an image with `h` rows, mirrored at the border.
     pub(crate) fn window<'a>(
         &'a self,
         first: isize,

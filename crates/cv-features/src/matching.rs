@@ -9,29 +9,29 @@ use cv_core::{Cancelled, DMatch, OptionError, Progress};
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum MatchError {
-    /// The sets hold different kinds of descriptors.
-    #[error("{} {} descriptors cannot be compared with {} {} ones", query.1, query.0, train.1, train.0)]
+    /// The descriptors are of different kinds.
+    #[error("{}-dimensional {} descriptors cannot be compared with {}-dimensional {} descriptors", query.1, query.0, train.1, train.0)]
     KindsDiffer {
-        /// Name and dimension of the first set's kind.
+        /// Name and dimension of the kind of the first set.
         query: (&'static str, usize),
-        /// Name and dimension of the second set's kind.
+        /// Name and dimension of the kind of the second set.
         train: (&'static str, usize),
     },
     /// A set is empty.
     #[error("there is nothing to match: {query} descriptors against {train}")]
     Empty {
-        /// Descriptors in the first set.
+        /// Number of descriptors of the first set.
         query: usize,
-        /// Descriptors in the second set.
+        /// Number of descriptors of the second set.
         train: usize,
     },
-    /// A set holds more descriptors than an index can count.
+    /// A set has more descriptors than 32-bit indices allow.
     #[error("{got} descriptors are more than can be indexed (2³² − 1)")]
     TooMany {
-        /// Descriptors in the set.
+        /// Number of descriptors.
         got: usize,
     },
-    /// An option is outside its range.
+    /// An option is out of range.
     #[error(transparent)]
     Option(#[from] OptionError),
     /// The job was stopped by its progress callback.
@@ -39,7 +39,7 @@ pub enum MatchError {
     Cancelled(#[from] Cancelled),
 }
 
-/// In which measure the ratio of best to second-best is taken, and distances are reported.
+/// The distance measure of the ratio test and of the reported distances.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
@@ -51,33 +51,33 @@ pub enum RatioMeasure {
     Distance,
 }
 
-/// How ambiguous a match may be: the ratio of the best candidate's distance to that of the second.
+/// The ratio test (Lowe 2004): the threshold on the ratio of the distances of the nearest and second nearest neighbor.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum RatioTest {
-    /// Below [`DescriptorKind::ratio`](crate::DescriptorKind::ratio).
+    /// The threshold of the kind, [`DescriptorKind::ratio`](crate::DescriptorKind::ratio).
     #[default]
     Kind,
-    /// Below this, in the measure of the options. 0 to 1.
+    /// This threshold, in the measure of the options. 0 to 1.
     Below(f32),
-    /// Every nearest neighbor stays.
+    /// No ratio test.
     Off,
 }
 
-/// Settings of [`match_descriptors`].
+/// Options of [`match_descriptors`].
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct MatchOptions {
-    /// Which matches stay by how ambiguous they are. Default as of the kind of the descriptors.
+    /// The ratio test. Default the threshold of the descriptor kind.
     pub ratio: RatioTest,
-    /// The measure of `ratio`, and of the distances returned. Default SSD.
+    /// The measure of the ratio test and of the returned distances. Default SSD.
     pub measure: RatioMeasure,
-    /// Keep a match only where each is the other's nearest. Default off.
+    /// Cross-check: keep only mutual nearest neighbors. Default off.
     pub mutual: bool,
-    /// Of several matches with the same descriptor of the second set, keep only the one with the smallest distance (the first of equals). Default off;
-    /// mutual matches are one-to-one already.
+    /// Keep only the match with the smallest distance for each descriptor of the second set (ties by index). Default
+    /// off; mutual matches are one-to-one.
     pub one_to_one: bool,
 }
 
@@ -87,39 +87,40 @@ impl Default for MatchOptions {
     }
 }
 
-/// The nearest descriptor in `train` for each one in `query`, kept where the ratio test (and mutual check) passes, in the order of `query`.
+/// Matches each descriptor in `query` with its nearest neighbor in `train`, subject to the ratio test and the
+/// cross-check; in the order of `query`.
 ///
-/// Exact: every pair is compared. Of equally near descriptors the first counts as the best, so that a duplicate gives ratio 1. Where `train`
-/// has a single descriptor nothing can be said about ambiguity: the ratio is 1, and only [`RatioTest::Off`] keeps such a match. O(query · train · dimension).
+/// Exhaustive search with exact results. Ties are resolved by index, and duplicates have ratio 1. If `train` has a
+/// single descriptor, the ratio is 1, and only [`RatioTest::Off`] accepts the match. O(query × train × dimension).
 ///
-/// [`match_byte_descriptors`](crate::match_byte_descriptors) does the same in a third of the time for kinds that are as good in bytes.
+/// [`match_byte_descriptors`](crate::match_byte_descriptors) takes a third of the time for kinds that can be quantized.
 ///
-/// There is no approximate index: at 20,000 descriptors of 128 numbers on each side OpenCV's forest of k-d trees is faster by a half at most (see
-/// `docs/benchmarks.md`) and does not always find the nearest.
+/// There is no approximate search: with 20,000 descriptors of 128 dimensions in each set, OpenCV's forest of k-d trees
+/// is at most faster by a half (see `docs/benchmarks.md`) and not exact.
 ///
 /// # Errors
-/// [`MatchError`] for kinds that differ, an empty set, a ratio out of range.
+/// [`MatchError`] for different kinds, an empty set, a ratio out of range.
 pub fn match_descriptors(
     query: &Descriptors,
     train: &Descriptors,
     options: &MatchOptions,
     progress: &dyn Progress,
 ) -> Result<Vec<DMatch>, MatchError> {
-    select(query.kind(), train.kind(), [query.len(), train.len()], options, || {
+    select_matches(query.kind(), train.kind(), [query.len(), train.len()], options, || {
         nearest(simd::level(), query, train, options.mutual, progress)
     })
 }
 
-/// The matches that pass the tests of `options`, of the two nearest neighbors that `search` finds of each query and, for mutual matches, the nearest query of
-/// each candidate.
-pub(crate) fn select(
+/// Selects the matches that pass the tests of `options`. `search` returns the two nearest neighbors of each query and,
+/// for the cross-check, the nearest query of each candidate.
+pub(crate) fn select_matches(
     query: DescriptorKind,
     train: DescriptorKind,
     [queries, candidates]: [usize; 2],
     options: &MatchOptions,
     search: impl FnOnce() -> Result<(Vec<TwoNearest>, Vec<u32>), Cancelled>,
 ) -> Result<Vec<DMatch>, MatchError> {
-    same_kind(query, train)?;
+    check_same_kind(query, train)?;
     if queries == 0 || candidates == 0 {
         return Err(MatchError::Empty { query: queries, train: candidates });
     }
@@ -143,7 +144,7 @@ pub(crate) fn select(
         }
         let of_ssd = |v: f32| if options.measure == RatioMeasure::Ssd { v } else { v.sqrt() };
         let (distance, second) = (of_ssd(two.ssd), of_ssd(two.second_ssd));
-        // Two exact copies are ambiguous, not 0/0.
+        // Duplicates have ratio 1, not 0/0.
         let ratio = if second > 0.0 && second.is_finite() { distance / second } else { 1.0 };
         if limit.is_none_or(|limit| ratio < limit) {
             matches.push(DMatch { query: i as u32, train: two.best, distance, ratio });
@@ -155,25 +156,25 @@ pub(crate) fn select(
     Ok(matches)
 }
 
-/// Refuses sets of different kinds.
-pub(crate) fn same_kind(a: DescriptorKind, b: DescriptorKind) -> Result<(), MatchError> {
+/// Rejects descriptors of different kinds.
+pub(crate) fn check_same_kind(a: DescriptorKind, b: DescriptorKind) -> Result<(), MatchError> {
     if a == b {
         return Ok(());
     }
     Err(MatchError::KindsDiffer { query: (a.name, a.dimension), train: (b.name, b.dimension) })
 }
 
-/// Leaves one match for each descriptor of the second set: that with the smallest distance, of equals the first.
+/// Retains one match for each descriptor of the second set: that with the smallest distance, ties by index.
 pub(crate) fn keep_nearest_of_each(matches: &mut Vec<DMatch>, train: usize) {
     let mut best = vec![f32::INFINITY; train];
     for m in matches.iter() {
         let b = &mut best[m.train as usize];
         *b = b.min(m.distance);
     }
-    let mut taken = vec![false; train];
+    let mut is_matched = vec![false; train];
     matches.retain(|m| {
         let t = m.train as usize;
-        m.distance <= best[t] && !std::mem::replace(&mut taken[t], true)
+        m.distance <= best[t] && !std::mem::replace(&mut is_matched[t], true)
     });
 }
 
@@ -193,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn ratio_and_mutual_tests_do_what_they_say() {
+    fn ratio_test_cross_check_and_one_to_one_filter() {
         let a = set(&[&[0.0, 0.0], &[10.0, 0.0], &[0.2, 0.0]]);
         let b = set(&[&[0.0, 1.0], &[0.0, 3.0], &[10.0, 1.0]]);
         let all = MatchOptions { ratio: RatioTest::Off, ..MatchOptions::default() };
@@ -225,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_matched_is_refused() {
+    fn empty_sets_and_invalid_options_are_rejected() {
         let (a, none) = (set(&[&[1.0]]), set(&[]));
         let options = MatchOptions::default();
         assert_eq!(match_descriptors(&none, &a, &options, &Silent), Err(MatchError::Empty { query: 0, train: 1 }));

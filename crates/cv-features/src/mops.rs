@@ -1,4 +1,4 @@
-//! Corners at all scales, and oriented patches around them.
+//! Multi-scale corners (Harris–Laplace) and multi-scale oriented patches (MOPS).
 //!
 //! Sources: M. Brown, R. Szeliski & S. Winder, "Multi-image matching using multi-scale oriented patches", CVPR 2005; K. Mikolajczyk & C. Schmid,
 //! "Indexing based on scale invariant interest points", ICCV 2001 (Harris-Laplace).
@@ -15,19 +15,19 @@ use cv_core::{Cancelled, ImageView, Keypoint, OptionError, Progress, Stage};
 use cv_imgproc::gaussian_half_kernel;
 use rayon::prelude::*;
 
-/// Settings of [`harris_laplace`].
+/// Options of [`harris_laplace`].
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct MultiScaleOptions {
     /// The corner measure. Default Harris with `k` = 0.04.
     pub measure: CornerMeasure,
-    /// Scales per octave. 1 to 6; default 3 (as SIFT).
+    /// Levels per octave, 1 to 6; default 3 (as SIFT).
     pub layers: usize,
-    /// Corners weaker than this share of the strongest (of all scales, gradients times σ) are left out. 0 to 1; default 0.001.
+    /// Minimum response relative to the maximum of all scales (with scale-normalized gradients). 0 to 1; default 0.001.
     pub threshold: f32,
-    /// Keep a corner only at the scales where the Laplacian is larger than at the next ones (Harris-Laplace), and refine the scale. Without it, a corner
-    /// appears at every scale at which it is one. Default true.
+    /// Scale selection by a local maximum of the scale-normalized Laplacian (Harris–Laplace), with refinement of the
+    /// scale. If false, a corner is detected at every scale. Default true.
     pub laplacian: bool,
 }
 
@@ -38,7 +38,7 @@ impl Default for MultiScaleOptions {
 }
 
 impl DescriptorKind {
-    /// 8×8 patches turned to the keypoint's direction and sized to its scale, zero mean and unit variance ([`mops`]).
+    /// 8×8 patches with the orientation and scale of the keypoint, zero mean and unit variance ([`mops`]).
     pub const MOPS: Self = Self { name: "mops", ..Self::PATCH };
 }
 
@@ -52,24 +52,25 @@ impl FeatureExtractor for MopsOptions {
     }
 }
 
-/// Settings of [`mops`].
+/// Options of [`mops`].
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct MopsOptions {
-    /// Largest number of features; the strongest stay. 1 or more; default 2000.
+    /// Maximum number of features; the strongest are kept. 1 or more; default 2000.
     pub max_features: usize,
-    /// Where the corners come from. Default two scales per octave, every corner at every scale where it is one (as Brown, Szeliski & Winder): points come back from
-    /// other viewpoints more often than those at a scale of their own.
+    /// Options of the detector. Default two levels per octave without scale selection (as Brown, Szeliski & Winder),
+    /// which has a higher repeatability than with scale selection.
     pub corners: MultiScaleOptions,
-    /// Side of the window in units of the keypoint's scale; its 64 samples lie an eighth of it apart, in an image smoothed by half of that distance. 8 to 100; default 40
-    /// (Brown, Szeliski & Winder).
+    /// Side of the window in units of the keypoint's scale. The sample spacing is an eighth of it, in an image blurred
+    /// with half the spacing. 8 to 100; default 40 (Brown, Szeliski & Winder).
     pub window: f32,
-    /// σ of the gradient that gives the direction, in units of the keypoint's scale. 1 to 20; default 4.5 (Brown, Szeliski & Winder).
+    /// σ of the gradient that defines the orientation, in units of the keypoint's scale. 1 to 20; default 4.5 (Brown,
+    /// Szeliski & Winder).
     pub orientation_sigma: f32,
-    /// Leave every angle at zero. Default false.
+    /// Set all orientations to zero. Default false.
     pub upright: bool,
-    /// As [`PatchOptions::min_deviation`](crate::PatchOptions::min_deviation).
+    /// Minimum standard deviation of a patch, as [`PatchOptions::min_deviation`](crate::PatchOptions::min_deviation).
     pub min_deviation: f32,
 }
 
@@ -86,31 +87,33 @@ impl Default for MopsOptions {
     }
 }
 
-/// The smallest image with one octave.
-const SMALLEST: usize = 16;
-/// σ of the window of the structure tensor over that of the gradients (Brown, Szeliski & Winder).
-const WINDOW: f32 = 1.5;
+/// Minimum image side in pixels.
+const MIN_SIDE: usize = 16;
+/// Ratio of integration scale to differentiation scale of the structure tensor (Brown, Szeliski & Winder).
+const INTEGRATION_SCALE_RATIO: f32 = 1.5;
 
-/// Corners at all scales, strongest first, with sub-pixel position and scale.
+/// Detects multi-scale corners by decreasing response, with sub-pixel position and scale.
 ///
-/// `scale` is the σ in input pixels of the Gaussian whose gradients made it a corner, `response` the measure of gradients times σ, so that scales compare.
+/// `scale` is the differentiation scale σ in input pixels, `response` the corner measure of scale-normalized gradients
+/// (times σ), comparable between scales.
 ///
 /// # Errors
-/// [`FeatureError`] for images below 16×16, samples that are not finite, options out of range.
+/// [`FeatureError`] for images below 16×16, pixels that are not finite, options out of range.
 pub fn harris_laplace(
     view: ImageView<'_, f32, 1>,
     options: &MultiScaleOptions,
     progress: &dyn Progress,
 ) -> Result<Vec<Keypoint>, FeatureError> {
     check(options)?;
-    check_image(view, SMALLEST)?;
+    check_image(view, MIN_SIDE)?;
     Ok(detect(&Pyramid::new(view, options.layers, progress)?, options, progress)?)
 }
 
-/// Finds corners at all scales and describes each by an 8×8 patch turned to its direction and sized to its scale; strongest first.
+/// Detects multi-scale corners and computes an oriented 8×8 patch descriptor for each, by decreasing response.
 ///
-/// The direction is that of the gradient at a larger scale. Samples are read from the pyramid level whose smoothing fits their distance. Corners whose samples leave the image,
-/// or lie on a flat window, are in `dropped` with the reason.
+/// The orientation is that of the gradient at a larger scale. Patches are sampled from the pyramid level whose blur
+/// matches the sample spacing. Corners whose patch extends beyond the image or is flat are in `dropped` with the
+/// reason.
 ///
 /// # Errors
 /// As [`harris_laplace`].
@@ -121,13 +124,14 @@ pub fn mops(
 ) -> Result<Features, FeatureError> {
     check(&options.corners)?;
     check_patches(options)?;
-    check_image(view, SMALLEST)?;
+    check_image(view, MIN_SIDE)?;
     let pyramid = Pyramid::new(view, options.corners.layers, progress)?;
-    let found = detect(&pyramid, &options.corners, progress)?;
-    Ok(describe(&pyramid, view.size(), &found, options, progress)?)
+    let keypoints = detect(&pyramid, &options.corners, progress)?;
+    Ok(describe(&pyramid, view.size(), &keypoints, options, progress)?)
 }
 
-/// Describes given keypoints as [`mops`] does: their scale is used, their angle is replaced (unless `upright`).
+/// Computes the descriptors of [`mops`] for given keypoints: their scale is used, their angle is replaced by the
+/// orientation (0 if `upright`).
 ///
 /// # Errors
 /// As [`harris_laplace`].
@@ -139,7 +143,7 @@ pub fn describe_oriented_patches(
 ) -> Result<Features, FeatureError> {
     check(&options.corners)?;
     check_patches(options)?;
-    check_image(view, SMALLEST)?;
+    check_image(view, MIN_SIDE)?;
     let options = MopsOptions { max_features: usize::MAX, ..options.clone() };
     let pyramid = Pyramid::new(view, options.corners.layers, progress)?;
     Ok(describe(&pyramid, view.size(), keypoints, &options, progress)?)
@@ -169,19 +173,19 @@ fn detect(pyramid: &Pyramid, options: &MultiScaleOptions, progress: &dyn Progres
     for (i, level) in levels.iter().enumerate() {
         let plan = StructureTensor {
             view: level.image.view(),
-            kernel: gaussian_half_kernel(WINDOW * level.sigma),
+            kernel: gaussian_half_kernel(INTEGRATION_SCALE_RATIO * level.sigma),
             measure: options.measure,
             level: simd::level(),
         };
-        let found = corners(&plan, options.threshold, &stage)?;
-        // Two gradients to a product, and two products to Harris's measure.
+        let candidates = corners(&plan, options.threshold, &stage)?;
+        // The structure tensor is of degree two in the gradients, Harris's measure of degree four.
         let power = if matches!(options.measure, CornerMeasure::ShiTomasi) { 2 } else { 4 };
         let gain = level.sigma.powi(power);
-        all.par_extend(found.par_iter().with_min_len(64).filter_map(|corner| {
+        all.par_extend(candidates.par_iter().with_min_len(64).filter_map(|corner| {
             let (x, y) = (corner.position.x * level.pixel, corner.position.y * level.pixel);
             let mut scale = level.sigma * level.pixel;
             if options.laplacian {
-                // The finest and the coarsest have a neighbor on one side only: nothing is known about a maximum there.
+                // The finest and the coarsest level have no scale maximum.
                 let (below, above) = (levels.get(i.wrapping_sub(1))?, levels.get(i + 1)?);
                 let [a, b, c] = [below, level, above].map(|l| l.laplacian(x, y).abs());
                 if b <= a || b <= c {
@@ -208,12 +212,12 @@ fn describe(
     progress: &dyn Progress,
 ) -> Result<Features, Cancelled> {
     let stage = Stage::new(progress, "describe", keypoints.len())?;
-    let asked = |keypoint: &Keypoint| -> Result<_, Cancelled> {
+    let describe_one = |keypoint: &Keypoint| -> Result<_, Cancelled> {
         stage.add(1)?;
         Ok(patch(pyramid, size, keypoint, options))
     };
     let patches: Vec<Result<(f32, Patch), DropReason>> =
-        keypoints.par_iter().with_min_len(32).map(asked).collect::<Result<_, _>>()?;
+        keypoints.par_iter().with_min_len(32).map(describe_one).collect::<Result<_, _>>()?;
     let mut out = Features::new(DescriptorKind::MOPS);
     for (index, (keypoint, patch)) in keypoints.iter().zip(patches).enumerate() {
         match patch {
@@ -230,7 +234,7 @@ fn describe(
 
 type Patch = [f32; SIDE * SIDE];
 
-/// The direction and the patch of a keypoint.
+/// Computes the orientation and the patch of a keypoint.
 fn patch(
     pyramid: &Pyramid,
     (w, h): (usize, usize),
@@ -251,17 +255,17 @@ fn patch(
     };
     let spacing = options.window * scale / SIDE as f32;
     let (sin, cos) = angle.sin_cos();
-    let half = 0.5 * (SIDE as f32 - 1.0) * spacing;
-    let margin = half * (sin.abs() + cos.abs());
+    let radius = 0.5 * (SIDE as f32 - 1.0) * spacing;
+    let margin = radius * (sin.abs() + cos.abs());
     if x < margin || y < margin || x + margin > w as f32 - 1.0 || y + margin > h as f32 - 1.0 {
         return Err(DropReason::OutsideImage { margin });
     }
     let level = pyramid.nearest((0.5 * spacing).max(FIRST_SIGMA));
     let mut values = [0.0; SIDE * SIDE];
     for (j, row) in values.chunks_exact_mut(SIDE).enumerate() {
-        let v = j as f32 * spacing - half;
+        let v = j as f32 * spacing - radius;
         for (i, o) in row.iter_mut().enumerate() {
-            let u = i as f32 * spacing - half;
+            let u = i as f32 * spacing - radius;
             *o = level.at(x + u * cos - v * sin, y + u * sin + v * cos);
         }
     }
@@ -275,7 +279,7 @@ mod tests {
     use crate::matching::{MatchOptions, match_descriptors};
     use cv_core::{GrayF32, Silent};
 
-    /// A plane of random gray squares of three sizes, with soft edges.
+    /// A texture of random gray squares of three sizes with soft edges.
     fn squares(x: f32, y: f32) -> f32 {
         let cell = |size: f32| {
             let soft = |v: f32| {
@@ -298,18 +302,18 @@ mod tests {
     }
 
     #[test]
-    fn a_turned_and_enlarged_plane_matches_itself() {
+    fn features_match_under_rotation_scale_and_contrast_change() {
         let (scale, angle) = (1.7f32, 0.8f32);
         let (sin, cos) = angle.sin_cos();
         let a = GrayF32::from_fn(400, 360, |x, y| [squares(x as f32, y as f32)]);
-        // Where a point of the second picture lies in the first.
-        let place = |x: f32, y: f32| {
+        // Maps a point of the second image to the first.
+        let to_first = |x: f32, y: f32| {
             let (x, y) = ((x - 250.0) / scale, (y - 250.0) / scale);
             (200.0 + cos * x + sin * y, 180.0 + cos * y - sin * x)
         };
-        // Darker and with less contrast, too.
+        // With a change of bias and gain.
         let b = GrayF32::from_fn(500, 500, |x, y| {
-            let (x, y) = place(x as f32, y as f32);
+            let (x, y) = to_first(x as f32, y as f32);
             [0.1 + 0.6 * squares(x, y)]
         });
         for laplacian in [true, false] {
@@ -318,19 +322,20 @@ mod tests {
             let (fa, fb) = (mops(a.view(), &options, &Silent).unwrap(), mops(b.view(), &options, &Silent).unwrap());
             let settings = MatchOptions { mutual: true, ..MatchOptions::default() };
             let found = match_descriptors(&fa.descriptors, &fb.descriptors, &settings, &Silent).unwrap();
-            let mut right = 0;
+            let mut correct = 0;
             for m in &found {
                 let (p, q) = (fa.keypoints[m.query as usize], fb.keypoints[m.train as usize]);
-                let (x, y) = place(q.position.x, q.position.y);
-                let turn = (q.angle - p.angle - angle).rem_euclid(std::f32::consts::TAU);
-                // A scale step is 2^(1/3), and neighbors of the right one pass; a tenth of a radian is what the direction at a corner loses to resampling.
+                let (x, y) = to_first(q.position.x, q.position.y);
+                let rotation = (q.angle - p.angle - angle).rem_euclid(std::f32::consts::TAU);
+                // A scale step is 2^(1/3), and the adjacent scales are accepted; the orientation error by resampling is
+                // a tenth of a radian.
                 let same_scale = (q.scale / p.scale / scale).log2().abs() < 0.4;
-                let same_turn = turn.min(std::f32::consts::TAU - turn) < 0.1;
-                right += usize::from((x - p.position.x).hypot(y - p.position.y) < 2.0 && same_scale && same_turn);
+                let same_rotation = rotation.min(std::f32::consts::TAU - rotation) < 0.1;
+                correct += usize::from((x - p.position.x).hypot(y - p.position.y) < 2.0 && same_scale && same_rotation);
             }
-            // By chance one match in ten thousand would agree in place, scale and turn; half of them leaves room for corners that only one
-            // of the pictures shows.
-            assert!(right >= 50 && right * 2 >= found.len(), "{right} of {}", found.len());
+            // By chance, one match in ten thousand would agree in position, scale and rotation; half of them allows for
+            // corners that are visible in only one image.
+            assert!(correct >= 50 && correct * 2 >= found.len(), "{correct} of {}", found.len());
         }
     }
 
@@ -355,7 +360,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_looked_at_is_refused() {
+    fn flat_images_have_no_features_and_invalid_input_is_rejected() {
         let options = MopsOptions::default();
         let flat = mops(GrayF32::new(64, 48, [0.7]).view(), &options, &Silent).unwrap();
         assert!(flat.keypoints.is_empty() && flat.dropped.is_empty());
@@ -372,8 +377,8 @@ mod tests {
             mops(image.view(), &bad, &Silent),
             Err(FeatureError::Option(OptionError { name: "window", .. }))
         ));
-        let wrong = [Keypoint { scale: f32::NAN, ..Keypoint::new(30.0, 30.0, 1.0) }, Keypoint::new(30.0, 20.0, 1.0)];
-        let told = describe_oriented_patches(image.view(), &wrong, &options, &Silent).unwrap();
+        let unusable = [Keypoint { scale: f32::NAN, ..Keypoint::new(30.0, 30.0, 1.0) }, Keypoint::new(30.0, 20.0, 1.0)];
+        let told = describe_oriented_patches(image.view(), &unusable, &options, &Silent).unwrap();
         let reasons: Vec<_> = told.dropped.iter().map(|d| d.reason).collect();
         assert!(matches!(reasons[..], [DropReason::NotFinite, DropReason::Flat { .. }]), "{reasons:?}");
     }

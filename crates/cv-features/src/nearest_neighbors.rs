@@ -1,9 +1,9 @@
-//! Exact nearest neighbors by blocked matrix products.
+//! Exact nearest neighbors of descriptors by blocked matrix products.
 //!
-//! |q − t|² = |q|² + |t|² − 2 q·t: for a query the nearest candidate is the one with the largest q·t − |t|²/2. The products of six queries with a panel
-//! of candidates stay in registers, and the two best of each are picked before anything is stored. The same products give the nearest query
-//! of each candidate. The distances of what was picked are then computed anew as sums of squared differences, so equal descriptors are
-//! at distance zero.
+//! |q − t|² = |q|² + |t|² − 2 q·t: the nearest candidate of a query maximizes the score q·t − |t|²/2. The products of
+//! six queries with a panel of candidates stay in registers, and the two best of each are selected before anything is
+//! stored. The same products determine the nearest query of each candidate. The distances of the selected candidates
+//! are then recomputed as sums of squared differences, so equal descriptors have distance zero.
 
 use crate::Descriptors;
 use cv_core::{Cancelled, Progress, Stage};
@@ -15,22 +15,23 @@ use rayon::prelude::*;
 pub(crate) struct TwoNearest {
     pub(crate) best: u32,
     pub(crate) ssd: f32,
-    /// Infinite where there is only one candidate.
+    /// Infinite if there is only one candidate.
     pub(crate) second_ssd: f32,
 }
 
-/// Queries of a register block.
+/// Number of queries of a register block.
 const QUERIES: usize = 6;
-/// Queries of a task: they and a panel fit the second-level cache.
-const TASK: usize = 16 * QUERIES;
-/// Panels that a task goes through without asking whether to go on: some milliseconds.
-const PANELS_UNASKED: usize = 128;
-/// No candidate.
+/// Number of queries of a parallel task: they and a panel fit the L2 cache.
+const TASK_QUERIES: usize = 16 * QUERIES;
+/// Panels between checks for cancellation: some milliseconds.
+const PANELS_PER_CHECK: usize = 128;
+/// Index of no candidate.
 pub(crate) const NONE: u32 = u32::MAX;
 
-/// For each query its two nearest candidates and, where asked for, for each candidate its nearest query. Of equally near ones the first counts.
+/// Finds the two nearest candidates of each query and, if `both_ways`, the nearest query of each candidate. Ties by
+/// index.
 ///
-/// Both sets must hold at least one descriptor, of the same dimension, and fewer than 2³² − 1.
+/// Both sets must have at least one and fewer than 2³² − 1 descriptors, of the same dimension.
 pub(crate) fn nearest(
     level: Level,
     query: &Descriptors,
@@ -38,7 +39,7 @@ pub(crate) fn nearest(
     both_ways: bool,
     progress: &dyn Progress,
 ) -> Result<(Vec<TwoNearest>, Vec<u32>), Cancelled> {
-    let stage = Stage::new(progress, "match", query.len().div_ceil(TASK))?;
+    let stage = Stage::new(progress, "match", query.len().div_ceil(TASK_QUERIES))?;
     dispatch!(level, simd => nearest_impl(simd, query, train, both_ways, &stage))
 }
 
@@ -50,7 +51,7 @@ fn nearest_impl<S: Simd>(
     both_ways: bool,
     stage: &Stage<'_>,
 ) -> Result<(Vec<TwoNearest>, Vec<u32>), Cancelled> {
-    // As many sums as the registers of the instruction set hold.
+    // As many sums as fit the registers of the instruction set.
     if S::f32s::LEN >= 16 {
         blocked::<S, 4>(simd, query, train, both_ways, stage)
     } else {
@@ -58,34 +59,35 @@ fn nearest_impl<S: Simd>(
     }
 }
 
-/// Candidates, `V` vectors of them side by side, transposed so that a step of the product reads along.
+/// Candidates in panels of `V` vectors, transposed for sequential access.
 struct Panels {
-    /// Panel after panel: `dimension` rows of `wide` numbers.
+    /// For each panel, `dimension` rows of `width` values.
     data: Vec<f32>,
-    /// |t|²/2; infinite beyond the last candidate.
+    /// |t|²/2; infinite for padding.
     half_norms: Vec<f32>,
-    wide: usize,
+    /// Candidates per panel.
+    width: usize,
 }
 
 impl Panels {
-    fn new(set: &Descriptors, wide: usize) -> Self {
+    fn new(set: &Descriptors, width: usize) -> Self {
         let d = set.dimension();
-        let count = set.len().div_ceil(wide);
-        let mut data = vec![0.0f32; count * wide * d];
-        data.par_chunks_mut(wide * d).enumerate().for_each(|(p, panel)| {
-            for (j, row) in set.as_slice().chunks_exact(d).skip(p * wide).take(wide).enumerate() {
+        let count = set.len().div_ceil(width);
+        let mut data = vec![0.0f32; count * width * d];
+        data.par_chunks_mut(width * d).enumerate().for_each(|(p, panel)| {
+            for (j, row) in set.as_slice().chunks_exact(d).skip(p * width).take(width).enumerate() {
                 for (k, v) in row.iter().enumerate() {
-                    panel[k * wide + j] = *v;
+                    panel[k * width + j] = *v;
                 }
             }
         });
-        let mut half_norms = vec![f32::INFINITY; count * wide];
+        let mut half_norms = vec![f32::INFINITY; count * width];
         half_norms.iter_mut().zip(set.as_slice().chunks_exact(d)).for_each(|(o, row)| *o = 0.5 * dot(row, row));
-        Self { data, half_norms, wide }
+        Self { data, half_norms, width }
     }
 }
 
-/// What is known about a query so far, lane by lane.
+/// The best and second best candidates of the queries so far, lane by lane.
 struct Best {
     score: Vec<f32>,
     second: Vec<f32>,
@@ -93,8 +95,8 @@ struct Best {
     second_index: Vec<u32>,
 }
 
-/// What one task finds: the two nearest of its queries, and of each candidate the best of its queries.
-type Task = (Vec<TwoNearest>, Vec<(f32, u32)>);
+/// Result of a task: the two nearest candidates of its queries, and the best of its queries for each candidate.
+type TaskResult = (Vec<TwoNearest>, Vec<(f32, u32)>);
 
 fn blocked<S: Simd, const V: usize>(
     simd: S,
@@ -105,34 +107,34 @@ fn blocked<S: Simd, const V: usize>(
 ) -> Result<(Vec<TwoNearest>, Vec<u32>), Cancelled> {
     let d = query.dimension();
     let panels = Panels::new(train, V * S::f32s::LEN);
-    let tasks: Vec<Task> = query
+    let tasks: Vec<TaskResult> = query
         .as_slice()
-        .par_chunks(TASK * d)
+        .par_chunks(TASK_QUERIES * d)
         .enumerate()
         .map(|(task, rows)| {
-            let found = simd.vectorize(
+            let nearest = simd.vectorize(
                 #[inline(always)]
-                || block::<S, V>(simd, rows, (task * TASK) as u32, d, train, &panels, both_ways, stage),
+                || block::<S, V>(simd, rows, (task * TASK_QUERIES) as u32, d, train, &panels, both_ways, stage),
             )?;
             stage.add(1)?;
-            Ok(found)
+            Ok(nearest)
         })
         .collect::<Result<_, Cancelled>>()?;
     let mut forward = Vec::with_capacity(query.len());
     let mut backward = vec![(f32::NEG_INFINITY, NONE); if both_ways { train.len() } else { 0 }];
     for (rows, columns) in tasks {
         forward.extend(rows);
-        for (best, found) in backward.iter_mut().zip(columns) {
-            // Tasks come in order of their queries: the first of equals stays.
-            if found.0 > best.0 {
-                *best = found;
+        for (best, candidate) in backward.iter_mut().zip(columns) {
+            // Tasks are in order of their queries, so ties are resolved by index.
+            if candidate.0 > best.0 {
+                *best = candidate;
             }
         }
     }
     Ok((forward, backward.into_iter().map(|b| b.1).collect()))
 }
 
-/// The queries of a task against all panels.
+/// Matches the queries of a task with all panels.
 #[allow(clippy::too_many_arguments)]
 #[inline(always)]
 fn block<S: Simd, const V: usize>(
@@ -144,12 +146,12 @@ fn block<S: Simd, const V: usize>(
     panels: &Panels,
     both_ways: bool,
     stage: &Stage<'_>,
-) -> Result<Task, Cancelled> {
+) -> Result<TaskResult, Cancelled> {
     let n = S::f32s::LEN;
-    let wide = panels.wide;
+    let width = panels.width;
     let count = rows.len() / d;
     let groups = count.div_ceil(QUERIES);
-    // Each group interleaved: the six numbers of a step side by side. Queries beyond the last are zero and their results not looked at.
+    // Interleaved groups: the values of six queries are adjacent. Padding queries are zero; their results are not used.
     let mut packed = vec![0.0f32; groups * QUERIES * d];
     for (i, row) in rows.chunks_exact(d).enumerate() {
         let group = &mut packed[i / QUERIES * QUERIES * d..];
@@ -170,11 +172,11 @@ fn block<S: Simd, const V: usize>(
     let mut column_index = vec![NONE; column_score.len()];
     let lanes: Vec<u32> = (0..n as u32).collect();
     let lanes = S::u32s::from_slice(simd, &lanes);
-    for (p, panel) in panels.data.chunks_exact(wide * d).enumerate() {
-        if p.is_multiple_of(PANELS_UNASKED) {
+    for (p, panel) in panels.data.chunks_exact(width * d).enumerate() {
+        if p.is_multiple_of(PANELS_PER_CHECK) {
             stage.check()?;
         }
-        let candidates = &panels.half_norms[p * wide..(p + 1) * wide];
+        let candidates = &panels.half_norms[p * width..(p + 1) * width];
         for (g, group) in packed.chunks_exact(QUERIES * d).enumerate() {
             let products = product::<S, V>(simd, group, panel);
             for (i, products) in products.iter().enumerate() {
@@ -184,13 +186,13 @@ fn block<S: Simd, const V: usize>(
                 let mut index = S::u32s::from_slice(simd, &best.index[at..at + n]);
                 let mut second_index = S::u32s::from_slice(simd, &best.second_index[at..at + n]);
                 for (v, product) in products.iter().enumerate() {
-                    let own = lanes + (p * wide + v * n) as u32;
+                    let indices = lanes + (p * width + v * n) as u32;
                     let s = *product - S::f32s::from_slice(simd, &candidates[v * n..(v + 1) * n]);
                     let better = s.simd_gt(score);
                     let next = s.simd_gt(second);
-                    second_index = better.select(index, next.select(own, second_index));
+                    second_index = better.select(index, next.select(indices, second_index));
                     second = better.select(score, next.select(s, second));
-                    index = better.select(own, index);
+                    index = better.select(indices, index);
                     score = better.select(s, score);
                 }
                 score.store_slice(&mut best.score[at..at + n]);
@@ -200,7 +202,7 @@ fn block<S: Simd, const V: usize>(
             }
             if both_ways {
                 for v in 0..V {
-                    let at = p * wide + v * n;
+                    let at = p * width + v * n;
                     let mut score = S::f32s::from_slice(simd, &column_score[at..at + n]);
                     let mut index = S::u32s::from_slice(simd, &column_index[at..at + n]);
                     for (i, products) in products.iter().enumerate() {
@@ -226,13 +228,13 @@ fn block<S: Simd, const V: usize>(
             let lanes = i * n..(i + 1) * n;
             let firsts = lanes.clone().map(|l| (best.score[l], best.index[l]));
             let seconds = lanes.map(|l| (best.second[l], best.second_index[l]));
-            pick(row, train, firsts.chain(seconds))
+            select_two(row, train, firsts.chain(seconds))
         })
         .collect();
     Ok((two, columns))
 }
 
-/// Six queries times a panel of candidates.
+/// Computes the products of six queries with a panel of candidates.
 #[inline(always)]
 fn product<S: Simd, const V: usize>(simd: S, group: &[f32], panel: &[f32]) -> [[S::f32s; V]; QUERIES] {
     let n = S::f32s::LEN;
@@ -252,20 +254,20 @@ fn product<S: Simd, const V: usize>(simd: S, group: &[f32], panel: &[f32]) -> [[
     sums
 }
 
-/// The two best of the lanes, with their true distances.
-fn pick(row: &[f32], train: &Descriptors, found: impl Iterator<Item = (f32, u32)>) -> TwoNearest {
+/// Selects the two best candidates of all lanes, and computes their distances.
+fn select_two(row: &[f32], train: &Descriptors, found: impl Iterator<Item = (f32, u32)>) -> TwoNearest {
     let mut two = [(f32::NEG_INFINITY, NONE); 2];
     for (score, index) in found.filter(|f| f.1 != NONE) {
-        let before = |other: (f32, u32)| score > other.0 || (score == other.0 && index < other.1);
-        if before(two[0]) {
+        let is_better = |other: (f32, u32)| score > other.0 || (score == other.0 && index < other.1);
+        if is_better(two[0]) {
             two = [(score, index), two[0]];
-        } else if before(two[1]) {
+        } else if is_better(two[1]) {
             two[1] = (score, index);
         }
     }
     let distance = |index: u32| if index == NONE { f32::INFINITY } else { ssd(row, train.row(index as usize)) };
     let (a, b) = (distance(two[0].1), distance(two[1].1));
-    // The products round differently from the differences: what is nearer by these is nearer.
+    // The rounding of products and differences differs; the order is that of the differences.
     if b < a {
         TwoNearest { best: two[1].1, ssd: b, second_ssd: a }
     } else {
@@ -273,7 +275,7 @@ fn pick(row: &[f32], train: &Descriptors, found: impl Iterator<Item = (f32, u32)
     }
 }
 
-/// Sum of squared differences, over 16 running sums so that it vectorizes.
+/// Computes the sum of squared differences with 16 partial sums, so that it vectorizes.
 #[inline]
 pub(crate) fn ssd(a: &[f32], b: &[f32]) -> f32 {
     let mut sums = [0.0f32; 16];
@@ -306,7 +308,7 @@ mod tests {
     use cv_synth::instruction_sets;
     use proptest::prelude::*;
 
-    /// The definition: every distance in f64, the first of equals.
+    /// Reference: all distances in f64, ties by index.
     fn plain(query: &Descriptors, train: &Descriptors) -> Vec<(usize, f64, f64)> {
         let distance = |i: usize, j: usize| -> f64 {
             query.row(i).iter().zip(train.row(j)).map(|(a, b)| f64::from(a - b).powi(2)).sum()
@@ -330,14 +332,14 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(40))]
         #[test]
-        fn equals_the_definition(nq in 1usize..230, nt in 1usize..260, values in 2u32..40, d in 1usize..70, seed in any::<u32>()) {
-            // Whole numbers, so that sums are exact and duplicates and ties occur.
+        fn equals_exhaustive_search(nq in 1usize..230, nt in 1usize..260, values in 2u32..40, d in 1usize..70, seed in any::<u32>()) {
+            // Integers, so that sums are exact and duplicates and ties occur.
             let mut state = seed | 1;
             let mut set = |n: usize| {
                 let data = (0..n * d)
                     .map(|k| {
                         state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-                        // Few of the dimensions differ, so that whole descriptors coincide.
+                        // Few dimensions differ, so that descriptors coincide.
                         if k % d < 3 { (state >> 16) as f32 % values as f32 } else { 1.0 }
                     })
                     .collect();

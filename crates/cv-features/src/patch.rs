@@ -1,4 +1,4 @@
-//! Upright 8×8 patches: samples of a blurred 40×40 window, zero mean, unit variance.
+//! Upright 8×8 patch descriptors: samples of a blurred 40×40 window, normalized to zero mean and unit variance.
 //!
 //! Source: M. Brown, R. Szeliski & S. Winder, "Multi-image matching using multi-scale oriented patches", CVPR 2005, section 4,
 //! without orientation.
@@ -10,7 +10,7 @@ use cv_core::{GrayF32, ImageView, Keypoint, OptionError};
 use cv_imgproc::{bilinear_at, gaussian_blur};
 use rayon::prelude::*;
 
-/// Samples on a side of a patch.
+/// Samples along a side of a patch.
 pub(crate) const SIDE: usize = 8;
 
 impl DescriptorKind {
@@ -19,26 +19,27 @@ impl DescriptorKind {
         name: "patch",
         dimension: SIDE * SIDE,
         ratio: RATIO,
-        // As for descriptors of unit length: these have that of their number.
+        // As for descriptors of unit length; the squared length of these is their dimension.
         max_ssd: MAX_SSD * (SIDE * SIDE) as f32,
-        // Four standard deviations to each side.
+        // ±4 standard deviations.
         bytes: Some(ByteScale { offset: 4.0, factor: 255.0 / 8.0 }),
         patch: Some(SIDE),
     };
 }
 
-/// Settings of [`describe_patches`].
+/// Options of [`describe_patches`].
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct PatchOptions {
-    /// Side of the window in pixels; its 64 samples lie `window / 8` apart. 8 to 400; default 40 (Brown, Szeliski & Winder).
+    /// Side of the window in pixels; the sample spacing is `window / 8`. 8 to 400; default 40 (Brown, Szeliski &
+    /// Winder).
     pub window: f32,
-    /// Standard deviation in pixels of the blur before sampling. 0.3 to 50; default 2.5, half the distance of the samples, which leaves little above
-    /// their Nyquist frequency.
+    /// Sigma in pixels of the Gaussian blur before sampling (anti-aliasing). 0.3 to 50; default 2.5, half the sample
+    /// spacing.
     pub blur_sigma: f32,
-    /// Patches whose standard deviation is below this count as flat, in the image's unit. Default 0.001 for images of 0 to 1: a quarter of a gray
-    /// level of an 8-bit image, below which a patch is rounding noise.
+    /// Minimum standard deviation of a patch in the unit of the image; patches below are flat. Default 0.001 for images
+    /// of 0 to 1: a quarter of an 8-bit gray level, below which a patch is quantization noise.
     pub min_deviation: f32,
 }
 
@@ -48,12 +49,13 @@ impl Default for PatchOptions {
     }
 }
 
-/// Describes each keypoint by 8×8 samples around its sub-pixel position.
+/// Computes an upright 8×8 patch descriptor for each keypoint, at its sub-pixel position.
 ///
-/// Keypoints whose window leaves the image, and those on flat windows, are in `dropped` with the reason. Scale and angle of the keypoints are not used.
+/// Keypoints whose window extends beyond the image or is flat are in `dropped` with the reason. Scale and angle of the
+/// keypoints are not used.
 ///
 /// # Errors
-/// [`FeatureError`] for an image smaller than the window, samples that are not finite, options out of range.
+/// [`FeatureError`] for an image smaller than the window, pixels that are not finite, options out of range.
 pub fn describe_patches(
     view: ImageView<'_, f32, 1>,
     keypoints: &[Keypoint],
@@ -66,17 +68,17 @@ pub fn describe_patches(
     let smooth = gaussian_blur(view, options.blur_sigma);
     let patches: Vec<Result<[f32; SIDE * SIDE], DropReason>> =
         keypoints.par_iter().with_min_len(64).map(|k| patch(&smooth, k, options)).collect();
-    let mut described = Features::new(DescriptorKind::PATCH);
+    let mut features = Features::new(DescriptorKind::PATCH);
     for (index, (keypoint, patch)) in keypoints.iter().zip(patches).enumerate() {
         match patch {
             Ok(values) => {
-                described.keypoints.push(*keypoint);
-                described.descriptors.push(&values);
+                features.keypoints.push(*keypoint);
+                features.descriptors.push(&values);
             }
-            Err(reason) => described.dropped.push(Dropped { index, reason }),
+            Err(reason) => features.dropped.push(Dropped { index, reason }),
         }
     }
-    Ok(described)
+    Ok(features)
 }
 
 fn patch(smooth: &GrayF32, keypoint: &Keypoint, options: &PatchOptions) -> Result<[f32; SIDE * SIDE], DropReason> {
@@ -85,24 +87,24 @@ fn patch(smooth: &GrayF32, keypoint: &Keypoint, options: &PatchOptions) -> Resul
         return Err(DropReason::NotFinite);
     }
     let (w, h) = smooth.size();
-    let half = options.window / 2.0;
-    // The image covers [-0.5, w - 0.5].
-    let inside = |v: f32, n: usize| v - half >= -0.5 && v + half <= n as f32 - 0.5;
+    let half_window = options.window / 2.0;
+    // The image extends from −0.5 to w − 0.5.
+    let inside = |v: f32, n: usize| v - half_window >= -0.5 && v + half_window <= n as f32 - 0.5;
     if !(inside(x, w) && inside(y, h)) {
-        return Err(DropReason::OutsideImage { margin: half });
+        return Err(DropReason::OutsideImage { margin: half_window });
     }
     let spacing = options.window / SIDE as f32;
     let first = |v: f32| v - spacing * (SIDE as f32 - 1.0) / 2.0;
-    // The samples of a row share their fractions, those of a column too.
-    let place = |v: f32, i: usize, n: usize| {
+    // The interpolation weights are shared along rows and columns.
+    let cell_and_fraction = |v: f32, i: usize, n: usize| {
         let p = (first(v) + spacing * i as f32).clamp(0.0, n as f32 - 1.0);
         let cell = (p as usize).min(n - 2);
         (cell, p - cell as f32)
     };
-    let columns: [(usize, f32); SIDE] = std::array::from_fn(|i| place(x, i, w));
+    let columns: [(usize, f32); SIDE] = std::array::from_fn(|i| cell_and_fraction(x, i, w));
     let mut values = [0.0f32; SIDE * SIDE];
     for (j, out) in values.chunks_exact_mut(SIDE).enumerate() {
-        let (row, fy) = place(y, j, h);
+        let (row, fy) = cell_and_fraction(y, j, h);
         for (o, (column, fx)) in out.iter_mut().zip(columns) {
             [*o] = bilinear_at(smooth.view(), column, row, fx, fy);
         }
@@ -111,13 +113,13 @@ fn patch(smooth: &GrayF32, keypoint: &Keypoint, options: &PatchOptions) -> Resul
     Ok(values)
 }
 
-/// Shifts and scales to zero mean and unit (population) variance.
+/// Normalizes to zero mean and unit (population) variance.
 pub(crate) fn normalize(values: &mut [f32], min_deviation: f32) -> Result<(), DropReason> {
     let n = values.len() as f64;
     let mean = values.iter().map(|&v| f64::from(v)).sum::<f64>() / n;
     let variance = values.iter().map(|&v| (f64::from(v) - mean).powi(2)).sum::<f64>() / n;
     let deviation = variance.sqrt();
-    // A window of one value exactly is flat whatever the limit.
+    // A constant window is flat for any threshold.
     if deviation <= f64::from(min_deviation) || deviation <= 1e-7 * mean.abs() {
         return Err(DropReason::Flat { deviation: deviation as f32 });
     }
@@ -134,9 +136,9 @@ mod tests {
     }
 
     #[test]
-    fn patches_do_not_see_exposure_and_follow_shifts() {
+    fn patches_are_invariant_to_gain_and_bias_and_covariant_with_shifts() {
         let a = GrayF32::from_fn(100, 90, |x, y| [texture(x as f32, y as f32)]);
-        // Brightness and contrast change, and everything moves by (2.5, 1.25) pixels.
+        // A change of bias and gain, and a shift by (2.5, 1.25) pixels.
         let b = GrayF32::from_fn(100, 90, |x, y| [0.1 + 0.6 * texture(x as f32 - 2.5, y as f32 - 1.25)]);
         let options = PatchOptions::default();
         let pa = describe_patches(a.view(), &[Keypoint::new(50.0, 45.0, 1.0)], &options).unwrap();
@@ -146,16 +148,16 @@ mod tests {
             .row(0)
             .iter()
             .fold((0.0f64, 0.0f64), |(s, q), &v| (s + f64::from(v), q + f64::from(v).powi(2)));
-        // 64 numbers of order one rounded to f32.
+        // 64 values of order one rounded to f32.
         assert!(mean.abs() < 1e-4 && (square - 64.0).abs() < 1e-3, "{mean} {square}");
         let ssd: f32 = pa.descriptors.row(0).iter().zip(pb.descriptors.row(0)).map(|(a, b)| (a - b) * (a - b)).sum();
-        // Bilinear interpolation of the blurred waves (period over 20 px, worst curvature of the chirp 40 px away) errs by under 2 % of their
-        // deviation, per number: 64 · 0.02².
+        // Bilinear interpolation of the blurred waves (periods over 20 px) has an error below 2 % of their standard
+        // deviation, per value: 64 · 0.02².
         assert!(ssd < 64.0 * 4e-4, "{ssd}");
     }
 
     #[test]
-    fn what_is_dropped_is_told_with_the_reason() {
+    fn dropped_keypoints_have_a_reason() {
         let mut image = GrayF32::from_fn(120, 100, |x, y| [texture(x as f32, y as f32)]);
         for y in 40..100 {
             image.row_mut(y)[50..120].fill(0.25);
@@ -178,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn images_smaller_than_the_window_are_refused() {
+    fn images_smaller_than_the_window_are_rejected() {
         let image = GrayF32::new(39, 100, [0.5]);
         assert_eq!(
             describe_patches(image.view(), &[], &PatchOptions::default()),

@@ -1,27 +1,27 @@
-//! A Gaussian pyramid with several scales per octave, for corners and patches of any size.
+//! A Gaussian pyramid with several scales per octave, for multi-scale corners and patches.
 
 use cv_core::{Cancelled, GrayF32, ImageView, Progress, Stage};
 use cv_imgproc::{bilinear_at, gaussian_blur};
 use rayon::prelude::*;
 use std::iter::successors;
 
-/// σ that a photograph comes with, in its pixels (Lowe).
-const CAMERA_SIGMA: f32 = 0.5;
-/// σ of the first scale of an octave, in its pixels (Brown, Szeliski & Winder).
+/// Assumed blur σ of the input image, in pixels (Lowe).
+const INPUT_SIGMA: f32 = 0.5;
+/// σ of the first scale of an octave, in octave pixels (Brown, Szeliski & Winder).
 pub(crate) const FIRST_SIGMA: f32 = 1.0;
-/// Octaves end before their shorter side is below this.
-const SMALLEST_SIDE: usize = 16;
+/// Minimum shorter side of an octave in pixels.
+const MIN_SIDE: usize = 16;
 
-/// One scale.
+/// A scale.
 pub(crate) struct Level {
     pub(crate) image: GrayF32,
-    /// Size of its pixel in input pixels: a power of two. Its pixel (x, y) lies at `pixel · (x, y)`.
+    /// Size of a level pixel in input pixels, a power of two. Level pixel (x, y) is at `pixel · (x, y)`.
     pub(crate) pixel: f32,
-    /// σ in its own pixels: [`FIRST_SIGMA`] to less than twice that.
+    /// σ in level pixels: from [`FIRST_SIGMA`] to less than twice that.
     pub(crate) sigma: f32,
 }
 
-/// The scales of an image, `per_octave` for each doubling.
+/// The scale space of an image, with `per_octave` levels per octave.
 pub(crate) struct Pyramid {
     pub(crate) levels: Vec<Level>,
     pub(crate) per_octave: usize,
@@ -34,10 +34,10 @@ impl Pyramid {
         progress: &dyn Progress,
     ) -> Result<Self, Cancelled> {
         let sides = successors(Some(view.width().min(view.height())), |side| Some(side.div_ceil(2)));
-        let octaves = 1 + sides.skip(1).take_while(|side| *side >= SMALLEST_SIDE).count();
+        let octaves = 1 + sides.skip(1).take_while(|side| *side >= MIN_SIDE).count();
         let stage = Stage::new(progress, "pyramid", octaves * per_octave)?;
         let mut levels = Vec::new();
-        let mut base = gaussian_blur(view, (FIRST_SIGMA * FIRST_SIGMA - CAMERA_SIGMA * CAMERA_SIGMA).sqrt());
+        let mut base = gaussian_blur(view, (FIRST_SIGMA * FIRST_SIGMA - INPUT_SIGMA * INPUT_SIGMA).sqrt());
         let mut pixel = 1.0;
         loop {
             let sigma = |i: usize| FIRST_SIGMA * 2f32.powf(i as f32 / per_octave as f32);
@@ -45,11 +45,11 @@ impl Pyramid {
                 stage.add(1)?;
                 Ok(gaussian_blur(base.view(), (sigma(i) * sigma(i) - FIRST_SIGMA * FIRST_SIGMA).sqrt()))
             };
-            let next = half(&from_base(per_octave)?);
+            let next = half_resolution(&from_base(per_octave)?);
             let further: Vec<GrayF32> = (1..per_octave).map(from_base).collect::<Result<_, _>>()?;
             let images = std::iter::once(base).chain(further);
             levels.extend(images.enumerate().map(|(i, image)| Level { image, pixel, sigma: sigma(i) }));
-            if next.width().min(next.height()) < SMALLEST_SIDE {
+            if next.width().min(next.height()) < MIN_SIDE {
                 return Ok(Self { levels, per_octave });
             }
             base = next;
@@ -57,36 +57,36 @@ impl Pyramid {
         }
     }
 
-    /// The level whose σ is nearest to `sigma` input pixels.
+    /// Returns the level whose σ is nearest to `sigma` input pixels.
     pub(crate) fn nearest(&self, sigma: f32) -> &Level {
-        let place = (self.per_octave as f32 * (sigma / FIRST_SIGMA).log2()).round().max(0.0) as usize;
-        &self.levels[place.min(self.levels.len() - 1)]
+        let index = (self.per_octave as f32 * (sigma / FIRST_SIGMA).log2()).round().max(0.0) as usize;
+        &self.levels[index.min(self.levels.len() - 1)]
     }
 }
 
 impl Level {
-    /// The value at a position in input pixels; beyond the border, that of the border.
+    /// Interpolates the intensity at a position in input pixels, with replicated borders.
     pub(crate) fn at(&self, x: f32, y: f32) -> f32 {
         let (w, h) = self.image.size();
-        let place = |v: f32, n: usize| {
+        let cell_and_fraction = |v: f32, n: usize| {
             let v = (v / self.pixel).clamp(0.0, n as f32 - 1.0);
             let cell = (v as usize).min(n - 2);
             (cell, v - cell as f32)
         };
-        let ((column, fx), (row, fy)) = (place(x, w), place(y, h));
+        let ((column, fx), (row, fy)) = (cell_and_fraction(x, w), cell_and_fraction(y, h));
         bilinear_at(self.image.view(), column, row, fx, fy)[0]
     }
 
-    /// σ² times the Laplacian, at a position in input pixels.
+    /// Computes the scale-normalized Laplacian (σ²∇²) at a position in input pixels.
     pub(crate) fn laplacian(&self, x: f32, y: f32) -> f32 {
         let p = self.pixel;
-        let around = self.at(x - p, y) + self.at(x + p, y) + self.at(x, y - p) + self.at(x, y + p);
-        self.sigma * self.sigma * (around - 4.0 * self.at(x, y))
+        let neighbors = self.at(x - p, y) + self.at(x + p, y) + self.at(x, y - p) + self.at(x, y + p);
+        self.sigma * self.sigma * (neighbors - 4.0 * self.at(x, y))
     }
 }
 
-/// Every second pixel of every second row.
-fn half(image: &GrayF32) -> GrayF32 {
+/// Subsamples every second pixel of every second row.
+fn half_resolution(image: &GrayF32) -> GrayF32 {
     let (w, h) = image.size();
     let mut out = GrayF32::new(w.div_ceil(2), h.div_ceil(2), [0.0]);
     out.as_mut_slice().par_chunks_mut(w.div_ceil(2)).enumerate().for_each(|(y, row)| {

@@ -1,13 +1,15 @@
-//! SIFT features: difference-of-Gaussian points with orientation, and gradient histograms around them, as rootSIFT by default.
+//! SIFT features: difference-of-Gaussian keypoints with orientation, and gradient histogram descriptors, as rootSIFT by
+//! default.
 //!
-//! Sources: D. Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 60(2), 2004; R. Arandjelović & A. Zisserman,
-//! "Three things everyone should know to improve object retrieval", CVPR 2012 (the square root).
+//! Sources: D. Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 60(2), 2004; R. Arandjelović &
+//! A. Zisserman, "Three things everyone should know to improve object retrieval", CVPR 2012 (rootSIFT).
 //!
-//! Two things differ from Lowe's code. The first octave is made by sampling a Gaussian at half-pixel phases, so positions have no bias of a quarter of a
-//! pixel. A descriptor is computed on a grid of 20×20 samples turned and scaled with the point (four to a histogram bin, as in Lowe's
-//! figure 7), not on every pixel under the window, so its cost does not depend on scale.
+//! Two differences from Lowe's code: The first octave is upsampled by sampling a Gaussian at half-pixel phases, so
+//! positions have no bias of a quarter pixel. A descriptor is computed on a grid of 20×20 samples rotated and scaled
+//! with the keypoint (four per histogram cell and axis, as in Lowe's figure 7), not on every pixel of the window, so
+//! its cost does not depend on scale.
 
-use crate::dog::{Extremum, Search};
+use crate::dog::{DogOptions, Extremum};
 use crate::error::{FeatureError, check_image};
 use crate::extractor::FeatureExtractor;
 use crate::gradient_histogram::{DIMENSION, describe, dominant_angles};
@@ -18,34 +20,37 @@ use crate::{DescriptorKind, DropReason, Dropped, Features};
 use cv_core::{Cancelled, ImageView, Keypoint, OptionError, Point2, Progress, Stage};
 use rayon::prelude::*;
 
-/// Settings of [`sift`].
+/// Options of [`sift`].
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct SiftOptions {
-    /// Largest number of features; those with the strongest contrast stay (or those of the largest scale, see `coarse_first`). 1 or
-    /// more; default 8192 (COLMAP's).
+    /// Maximum number of features, 1 or more; default 8192 (COLMAP's). Those with the highest contrast are kept (or
+    /// those of the largest scale, see `coarse_first`).
     pub max_features: usize,
-    /// Where there are more than `max_features`, those of the largest scale stay (COLMAP's choice) instead of those with the strongest
-    /// contrast: gravel, leaves and grain have much contrast, but look alike everywhere and like nothing from another place. Default false.
+    /// Keep the features of the largest scale (as COLMAP) instead of those with the highest contrast, if there are more
+    /// than `max_features`. Fine texture such as gravel and leaves has high contrast, but is repetitive and not
+    /// repeatable from other viewpoints. Default false.
     pub coarse_first: bool,
-    /// Start from an image of twice the size, which about quadruples the number of points and finds the smallest. Default true (Lowe).
+    /// Start from an image upsampled by two, which about quadruples the number of keypoints. Default true (Lowe).
     pub upsample: bool,
-    /// Scales per octave. 1 to 8; default 3 (Lowe).
+    /// Layers per octave, 1 to 8; default 3 (Lowe).
     pub layers: usize,
-    /// σ of the first scale of an octave, in its pixels. 0.8 to 4; default 1.6 (Lowe).
+    /// σ of the first scale of an octave, in octave pixels. 0.8 to 4; default 1.6 (Lowe).
     pub sigma: f32,
-    /// Smallest contrast of a point, times `layers`, for images of 0 to 1. 0 or more; default 0.02 (COLMAP's), half of OpenCV's 0.04.
+    /// Contrast threshold, times `layers`, for images of 0 to 1. 0 or more; default 0.02 (COLMAP's), half of OpenCV's
+    /// 0.04.
     pub contrast: f32,
-    /// Where fewer points than this have `contrast`, the strongest of `faint_contrast` and more fill up. Default 0: none do.
+    /// Minimum number of keypoints: if fewer have `contrast`, those of the highest contrast above `faint_contrast` are
+    /// added. Default 0: none are added.
     pub min_features: usize,
-    /// Smallest contrast of a point that fills up. 0 or more; default 0.4 × 0.02.
+    /// Contrast threshold of the keypoints added for `min_features`. 0 or more; default 0.4 × 0.02.
     pub faint_contrast: f32,
-    /// Largest ratio of the two principal curvatures. 1 or more; default 10 (Lowe).
+    /// Edge threshold: maximum ratio of the principal curvatures. 1 or more; default 10 (Lowe).
     pub edge: f32,
     /// Take the square root of the L1-normalized histogram (rootSIFT). Default true.
     pub root: bool,
-    /// Leave every angle at zero: for images known to be upright. Default false.
+    /// Set all orientations to zero, for images known to be upright. Default false.
     pub upright: bool,
 }
 
@@ -74,12 +79,12 @@ impl DescriptorKind {
         dimension: DIMENSION,
         ratio: RATIO,
         max_ssd: MAX_SSD,
-        // COLMAP's: no number of a unit vector that was clipped at 0.2 comes near 0.5.
+        // COLMAP's: the values of a unit vector that was clipped at 0.2 are below 0.5.
         bytes: Some(ByteScale { offset: 0.0, factor: 512.0 }),
         patch: None,
     };
 
-    /// The square roots of SIFT histograms that sum to one ([`sift`]); unit length.
+    /// rootSIFT: the square roots of L1-normalized SIFT histograms ([`sift`]); unit length.
     pub const ROOT_SIFT: Self = Self { name: "rootsift", ..Self::SIFT };
 }
 
@@ -93,16 +98,16 @@ impl FeatureExtractor for SiftOptions {
     }
 }
 
-/// The smallest image the scale space can be built on.
-pub(crate) const SMALLEST: usize = 8;
+/// Minimum image side in pixels.
+pub(crate) const MIN_SIDE: usize = 8;
 
-/// Finds and describes SIFT features, strongest contrast first.
+/// Detects and describes SIFT features, by decreasing contrast.
 ///
-/// `scale` of a keypoint is σ of the Gaussian it was found at, in input pixels; `response` is |D|, for images of 0 to 1. A point with several dominant
-/// orientations gives a feature for each. A flat image has none: the result is empty.
+/// `scale` of a keypoint is σ of the Gaussian at which it was detected, in input pixels; `response` is |D|, for images
+/// of 0 to 1. A keypoint with several dominant orientations has a feature for each. A flat image has no features.
 ///
 /// # Errors
-/// [`FeatureError`] for images below 8×8, samples that are not finite, options out of range.
+/// [`FeatureError`] for images below 8×8, pixels that are not finite, options out of range.
 pub fn sift(
     view: ImageView<'_, f32, 1>,
     options: &SiftOptions,
@@ -115,34 +120,34 @@ pub fn sift(
         OptionError::check(name, value.into(), "0 or more", |v| v >= 0.0 && v.is_finite())?;
     }
     OptionError::check("edge", options.edge.into(), "1 or more", |v| v >= 1.0 && v.is_finite())?;
-    check_image(view, SMALLEST)?;
-    // Never zero: rounding noise in flat regions is not a point. 1e-5 is a hundred times the error of the f32 sums.
+    check_image(view, MIN_SIDE)?;
+    // A lower bound against rounding noise in flat regions: 1e-5 is a hundred times the error of the f32 sums.
     let per_layer = |contrast: f32| (contrast / options.layers as f32).max(1e-5);
     let contrast = per_layer(options.contrast);
     let faint = if options.min_features > 0 { per_layer(options.faint_contrast).min(contrast) } else { contrast };
-    let search = Search {
+    let dog_options = DogOptions {
         layers: options.layers,
         sigma: options.sigma,
         upsample: options.upsample,
         contrast: faint,
         edge: options.edge,
     };
-    let (octaves, mut points) = scale_space(view, &search, progress)?;
-    // The strongest come first.
+    let (octaves, mut points) = scale_space(view, &dog_options, progress)?;
+    // Sorted by decreasing contrast.
     points.truncate(points.partition_point(|p| p.contrast >= contrast).max(options.min_features));
     let mut out = Features::new(options.kind());
     if options.coarse_first && points.len() > options.max_features {
-        // Stable: contrast decides between equals.
+        // A stable sort: ties by contrast.
         points.sort_by(|a, b| {
             let scale = |p: &Extremum| p.sigma * octaves[p.octave].pixel;
             scale(b).total_cmp(&scale(a))
         });
     }
-    // A point gives at least one feature: more points than the limit are never needed.
+    // Each keypoint has at least one feature, so more keypoints than the limit are not needed.
     out.beyond_limit = points.len().saturating_sub(options.max_features);
     points.truncate(options.max_features);
     let level = simd::level();
-    // In the order of the image, so that neighbors find each other's pixels in the cache.
+    // In image order, for cache locality.
     let mut order: Vec<usize> = (0..points.len()).collect();
     order.sort_unstable_by_key(|&i| (points[i].octave, points[i].row / 16, points[i].column, i));
     let stage = Stage::new(progress, "describe", order.len())?;
@@ -153,7 +158,7 @@ pub fn sift(
             let point = &points[index];
             let octave = &octaves[point.octave];
             let image = &octave.scales[point.layer - 1];
-            // In pixels of the image, which are twice those of the octave.
+            // In pixels of the stored scale, which are twice as large as octave pixels.
             let (at, sigma) = ((0.5 * point.x, 0.5 * point.y), 0.5 * point.sigma);
             let angles = if options.upright { vec![0.0] } else { dominant_angles(level, image, at, sigma) };
             let describe = |angle| {
@@ -179,7 +184,7 @@ pub fn sift(
     Ok(out)
 }
 
-/// A keypoint, its descriptor, and the length of that before it was normalized.
+/// A keypoint, its descriptor, and the norm of the descriptor before normalization.
 type Feature = (Keypoint, [f32; DIMENSION], f32);
 
 fn keypoint(point: &Extremum, octave: &Octave, angle: f32) -> Keypoint {
@@ -191,7 +196,8 @@ fn keypoint(point: &Extremum, octave: &Octave, angle: f32) -> Keypoint {
     }
 }
 
-/// Unit length, no entry above 0.2, unit length again; for rootSIFT then the root of each share. Gives back the first length.
+/// Normalizes to unit length, clips at 0.2, and normalizes again (for rootSIFT to unit sum, then takes the square
+/// roots). Returns the initial length.
 fn normalize(v: &mut [f32; DIMENSION], root: bool) -> f32 {
     let length = |v: &[f32; DIMENSION]| v.iter().map(|a| a * a).sum::<f32>().sqrt();
     let norm = length(v);
@@ -219,10 +225,10 @@ mod tests {
     }
 
     #[test]
-    fn a_gaussian_blob_is_found_where_and_as_large_as_it_is() {
-        // The normalized Laplacian of a Gaussian blob of σ0 peaks at σ = σ0; the difference of Gaussians with k = 2^(1/3) peaks where the two
-        // scales it compares bracket that, and a point takes the smaller of the two: σ0 = σ·2^(1/6) to first order. The camera's 0.5 is
-        // already counted in the image.
+    fn position_and_scale_of_a_gaussian_blob_are_detected() {
+        // The scale-normalized Laplacian of a Gaussian blob of σ0 has its maximum at σ = σ0. That of the difference of
+        // Gaussians with k = 2^(1/3) is where its two scales bracket σ0, and a keypoint has the smaller of the two: σ0
+        // = σ·2^(1/6) to first order. The input blur of 0.5 is included in the image.
         for (x0, y0, s0) in [(60.3f32, 50.7f32, 4.0f32), (70.0, 60.5, 6.0), (64.25, 61.0, 2.5)] {
             let blob =
                 image_of(130, 120, |x, y| 0.1 + 0.8 * (-((x - x0).powi(2) + (y - y0).powi(2)) / (2.0 * s0 * s0)).exp());
@@ -233,14 +239,14 @@ mod tests {
             });
             let k = best.unwrap();
             assert!((k.position.x - x0).abs() < 0.05 && (k.position.y - y0).abs() < 0.05, "{k:?} not ({x0}, {y0})");
-            // Quadratic interpolation over three scales of a curve that is not a parabola: a tenth of a scale step, 3 %, and the step itself is
-            // known to the first order only.
+            // Quadratic interpolation over three scales has an error of a tenth of a scale step, 3 %, and the factor
+            // 2^(1/6) is a first-order approximation.
             assert!((k.scale * 2f32.powf(1.0 / 6.0) / s0 - 1.0).abs() < 0.06, "{k:?} not σ {s0}");
         }
     }
 
     #[test]
-    fn nothing_to_find_and_nothing_to_look_at() {
+    fn flat_images_have_no_features_and_invalid_images_are_rejected() {
         let options = SiftOptions::default();
         let flat = sift(GrayF32::new(64, 48, [0.7]).view(), &options, &Silent).unwrap();
         assert!(flat.keypoints.is_empty() && flat.dropped.is_empty() && flat.beyond_limit == 0);

@@ -1,25 +1,27 @@
-//! The inner loops, compiled for each instruction set of the machine and chosen at run time.
+//! SIMD kernels, compiled for each instruction set and dispatched at run time.
 //!
-//! All arithmetic is plain multiplications and additions in a fixed order (never fused), lane by lane, so every instruction set gives the
-//! same bytes; the tests hold each one to the plain loops beside them.
+//! All arithmetic is multiplications and additions in a fixed order (never fused), lane by lane, so all instruction
+//! sets give identical results; tests compare each with scalar loops.
 
 use crate::ByteScale;
 use fearless_simd::{Level, dispatch, prelude::*};
 
-/// The widest instruction set of this machine.
+/// Returns the widest instruction set of this machine.
 #[inline]
 pub(crate) fn level() -> Level {
     Level::new()
 }
 
-/// `out[x] = k[0]·rows[r][x] + Σ k[t]·(rows[r−t][x] + rows[r+t][x])`, `t` from 1 to `r = k.len() − 1`.
+/// Convolves vertically with a symmetric kernel, given as its half: `out[x] = k[0]·rows[r][x] + Σ k[t]·(rows[r−t][x] +
+/// rows[r+t][x])`, `t` from 1 to `r = k.len() − 1`.
 pub(crate) fn vertical(level: Level, out: &mut [f32], rows: &[&[f32]], kernel: &[f32]) {
     debug_assert!(rows.len() == 2 * kernel.len() - 1 && rows.iter().all(|r| r.len() == out.len()));
-    dispatch!(level, simd => symmetric(simd, out, kernel, Down { rows }));
+    dispatch!(level, simd => symmetric(simd, out, kernel, VerticalTaps { rows }));
 }
 
-/// Two rows at once: `even` half-way along an odd number of rows, as [`vertical`] of all but the last, and `odd` half-way between rows `r` and `r + 1`, as
-/// `Σ o[t]·(rows[r−t][x] + rows[r+1+t][x])`, `t` from 0 to `r`. Both kernels have `r + 1` numbers.
+/// Evaluates two phases of a vertical polyphase filter: `even` at row `r`, as [`vertical`] of all rows but the last,
+/// and `odd` half-way between rows `r` and `r + 1`, as `Σ o[t]·(rows[r−t][x] + rows[r+1+t][x])`, `t` from 0 to `r`.
+/// Both half-kernels have `r + 1` taps.
 pub(crate) fn vertical_phases(
     level: Level,
     [even, odd]: [&mut [f32]; 2],
@@ -29,67 +31,70 @@ pub(crate) fn vertical_phases(
 ) {
     debug_assert!(rows.len() == 2 * evens.len() && rows.iter().all(|r| r.len() == even.len()));
     debug_assert!(evens.len() == odds.len() && even.len() == odd.len());
-    dispatch!(level, simd => phases(simd, [even, odd], evens, odds, Down { rows }));
+    dispatch!(level, simd => phases(simd, [even, odd], evens, odds, VerticalTaps { rows }));
 }
 
-/// `out[x] = k[0]·row[x+r] + Σ k[t]·(row[x+r−t] + row[x+r+t])`, `t` from 1 to `r = k.len() − 1`.
+/// Convolves horizontally with a symmetric kernel, given as its half: `out[x] = k[0]·row[x+r] + Σ k[t]·(row[x+r−t] +
+/// row[x+r+t])`, `t` from 1 to `r = k.len() − 1`.
 pub(crate) fn horizontal(level: Level, out: &mut [f32], row: &[f32], kernel: &[f32]) {
     debug_assert_eq!(row.len(), out.len() + 2 * (kernel.len() - 1));
-    dispatch!(level, simd => symmetric(simd, out, kernel, Along { row }));
+    dispatch!(level, simd => symmetric(simd, out, kernel, HorizontalTaps { row }));
 }
 
-/// Two phases at once: `even` at the samples, as [`horizontal`] of all but the last, and `odd` half-way to the next ones, as
-/// `Σ o[t]·(row[x+r−t] + row[x+r+1+t])`, `t` from 0 to `r`. Both kernels have `r + 1` numbers.
+/// Evaluates two phases of a horizontal polyphase filter: `even` at the samples, as [`horizontal`] of all but the last,
+/// and `odd` half-way to the next ones, as `Σ o[t]·(row[x+r−t] + row[x+r+1+t])`, `t` from 0 to `r`. Both half-kernels
+/// have `r + 1` taps.
 pub(crate) fn horizontal_phases(level: Level, [even, odd]: [&mut [f32]; 2], row: &[f32], evens: &[f32], odds: &[f32]) {
     debug_assert!(row.len() + 1 == even.len() + 2 * evens.len());
     debug_assert!(evens.len() == odds.len() && even.len() == odd.len());
-    dispatch!(level, simd => phases(simd, [even, odd], evens, odds, Along { row }));
+    dispatch!(level, simd => phases(simd, [even, odd], evens, odds, HorizontalTaps { row }));
 }
 
-/// The samples that tap `tap` of a window multiplies.
+/// Access to the samples of a filter tap.
 trait Taps: Copy {
+    /// Returns the `n` samples of tap `tap` from column `x`.
     fn at(&self, tap: usize, x: usize, n: usize) -> &[f32];
 }
 
-/// Taps on different rows.
+/// Taps along a column.
 #[derive(Clone, Copy)]
-struct Down<'a> {
+struct VerticalTaps<'a> {
     rows: &'a [&'a [f32]],
 }
 
-impl Taps for Down<'_> {
+impl Taps for VerticalTaps<'_> {
     #[inline(always)]
     fn at(&self, tap: usize, x: usize, n: usize) -> &[f32] {
         &self.rows[tap][x..x + n]
     }
 }
 
-/// Taps along one row.
+/// Taps along a row.
 #[derive(Clone, Copy)]
-struct Along<'a> {
+struct HorizontalTaps<'a> {
     row: &'a [f32],
 }
 
-impl Taps for Along<'_> {
+impl Taps for HorizontalTaps<'_> {
     #[inline(always)]
     fn at(&self, tap: usize, x: usize, n: usize) -> &[f32] {
         &self.row[x + tap..x + tap + n]
     }
 }
 
-/// Symmetric windows about a sample.
+/// Convolves with a symmetric kernel centered at the samples.
 #[inline(always)]
 fn symmetric<S: Simd, T: Taps>(simd: S, out: &mut [f32], kernel: &[f32], taps: T) {
     let n = S::f32s::LEN;
     let width = out.len();
     let r = kernel.len() - 1;
     let mut x = 0;
-    // Four vectors at a time: their sums stay in registers over all taps.
+    // Four vectors at a time, whose sums stay in registers over all taps.
     while x + 4 * n <= width {
         let mut sums = [S::f32s::splat(simd, 0.0); 4];
-        let middle = taps.at(r, x, 4 * n);
+        let center = taps.at(r, x, 4 * n);
         for i in 0..4 {
-            sums[i] = S::f32s::from_slice(simd, &middle[i * n..(i + 1) * n]) * kernel[0];
+            sums[i] = S::f32s::from_slice(simd, &center[i * n..(i + 1) * n]) * kernel[0];
         }
         for (t, &weight) in kernel.iter().enumerate().skip(1) {
             let (before, after) = (taps.at(r - t, x, 4 * n), taps.at(r + t, x, 4 * n));
@@ -106,7 +111,7 @@ fn symmetric<S: Simd, T: Taps>(simd: S, out: &mut [f32], kernel: &[f32], taps: T
         x += 4 * n;
     }
     while x < width && width >= n {
-        // The last vector overlaps the one before.
+        // The last vector overlaps the previous one.
         x = x.min(width - n);
         let mut sum = S::f32s::from_slice(simd, taps.at(r, x, n)) * kernel[0];
         for (t, &weight) in kernel.iter().enumerate().skip(1) {
@@ -127,7 +132,7 @@ fn symmetric<S: Simd, T: Taps>(simd: S, out: &mut [f32], kernel: &[f32], taps: T
     }
 }
 
-/// [`phases_of_length`], with the lengths that scale spaces have known to the compiler.
+/// Dispatches to [`phases_of_length`] with compile-time lengths for the common scale spaces.
 #[inline(always)]
 fn phases<S: Simd, T: Taps>(simd: S, out: [&mut [f32]; 2], evens: &[f32], odds: &[f32], taps: T) {
     match evens.len() {
@@ -138,8 +143,8 @@ fn phases<S: Simd, T: Taps>(simd: S, out: [&mut [f32]; 2], evens: &[f32], odds: 
     }
 }
 
-/// Symmetric windows about a sample and about the place between it and the next: the samples of both are the same, and loaded once. Kernels have `LEN` numbers, or
-/// where that is 0 any number.
+/// Convolves with symmetric kernels centered at a sample and half-way to the next; the samples of both are loaded once.
+/// Half-kernels have `LEN` taps, or any number if `LEN` is 0.
 #[inline(always)]
 fn phases_of_length<S: Simd, T: Taps, const LEN: usize>(
     simd: S,
@@ -158,7 +163,7 @@ fn phases_of_length<S: Simd, T: Taps, const LEN: usize>(
             phases_of::<S, T, 2>(simd, [even, odd], evens, odds, taps, x);
             x += 2 * n;
         } else {
-            // The last vector overlaps the one before.
+            // The last vector overlaps the previous one.
             phases_of::<S, T, 1>(simd, [even, odd], evens, odds, taps, x.min(width - n));
             x += n;
         }
@@ -179,7 +184,7 @@ fn phases_of_length<S: Simd, T: Taps, const LEN: usize>(
     }
 }
 
-/// [`phases`] of `V` vectors from column `x` on.
+/// Evaluates [`phases`] for `V` vectors from column `x`.
 #[inline(always)]
 fn phases_of<S: Simd, T: Taps, const V: usize>(
     simd: S,
@@ -216,7 +221,7 @@ fn phases_of<S: Simd, T: Taps, const V: usize>(
     }
 }
 
-/// `out = [a0, b0, a1, b1, …]`, as long as `out` is.
+/// Interleaves: `out = [a0, b0, a1, b1, …]`, for the length of `out`.
 pub(crate) fn interleave(level: Level, out: &mut [f32], a: &[f32], b: &[f32]) {
     dispatch!(level, simd => interleave_impl(simd, out, a, b));
 }
@@ -232,7 +237,7 @@ fn interleave_impl<S: Simd>(_: S, out: &mut [f32], a: &[f32], b: &[f32]) {
     }
 }
 
-/// `out = a − b`.
+/// Computes `out = a − b`.
 pub(crate) fn subtract(level: Level, out: &mut [f32], a: &[f32], b: &[f32]) {
     dispatch!(level, simd => subtract_impl(simd, out, a, b));
 }
@@ -244,22 +249,22 @@ fn subtract_impl<S: Simd>(_: S, out: &mut [f32], a: &[f32], b: &[f32]) {
     }
 }
 
-/// `out = (values − dark)·gain`, rounded, 0 to 65535.
-pub(crate) fn quantize(level: Level, out: &mut [u16], values: &[f32], dark: f32, gain: f32) {
-    dispatch!(level, simd => quantize_impl(simd, out, values, dark, gain));
+/// Quantizes: `out = (values − offset)·gain`, rounded, 0 to 65535.
+pub(crate) fn quantize(level: Level, out: &mut [u16], values: &[f32], offset: f32, gain: f32) {
+    dispatch!(level, simd => quantize_impl(simd, out, values, offset, gain));
 }
 
 #[inline(always)]
-fn quantize_impl<S: Simd>(_: S, out: &mut [u16], values: &[f32], dark: f32, gain: f32) {
+fn quantize_impl<S: Simd>(_: S, out: &mut [u16], values: &[f32], offset: f32, gain: f32) {
     for (o, v) in out.iter_mut().zip(values) {
-        let v = (v - dark) * gain;
+        let v = (v - offset) * gain;
         let v = if v > 0.0 { v } else { 0.0 };
         let v = if v < 65535.0 { v } else { 65535.0 };
         *o = round(v) as u16;
     }
 }
 
-/// [`ByteScale::to_byte`] of each value.
+/// Applies [`ByteScale::to_byte`] to each value.
 pub(crate) fn to_bytes(level: Level, out: &mut [u8], values: &[f32], scale: ByteScale) {
     dispatch!(level, simd => to_bytes_impl(simd, out, values, scale));
 }
@@ -271,26 +276,27 @@ fn to_bytes_impl<S: Simd>(_: S, out: &mut [u8], values: &[f32], scale: ByteScale
     }
 }
 
-/// The nearest whole number, for 0 ≤ v < 2²² (halves to the even one): beyond 2²³ an f32 has no fraction. Unlike `as`, this vectorizes.
+/// Rounds to the nearest integer, for 0 ≤ v < 2²² (ties to even), by adding 2²³, beyond which an f32 has no fraction.
+/// Unlike `as`, this vectorizes.
 #[inline(always)]
 pub(crate) fn round(v: f32) -> u32 {
     (v + 8_388_608.0).to_bits() & 0x7F_FFFF
 }
 
-/// Adds the columns of `range` where the middle of three differences (three rows each) is above `floor` and not below any of its 26 neighbors,
-/// or below `−floor` and not above any.
-pub(crate) fn extremes(
+/// Appends the columns of `range` with a local extremum in the middle of three differences of Gaussians (three rows
+/// each): above `floor` and not below any of the 26 neighbors, or below `−floor` and not above any.
+pub(crate) fn extrema(
     level: Level,
     differences: [[&[f32]; 3]; 3],
     range: std::ops::Range<usize>,
     floor: f32,
     found: &mut Vec<usize>,
 ) {
-    dispatch!(level, simd => extremes_impl(simd, differences, range, floor, found));
+    dispatch!(level, simd => extrema_impl(simd, differences, range, floor, found));
 }
 
 #[inline(always)]
-fn extremes_impl<S: Simd>(
+fn extrema_impl<S: Simd>(
     simd: S,
     differences: [[&[f32]; 3]; 3],
     range: std::ops::Range<usize>,
@@ -303,11 +309,11 @@ fn extremes_impl<S: Simd>(
     let mut x = range.start;
     while x + n <= range.end {
         let v = S::f32s::from_slice(simd, &here[x..x + n]);
-        let mut up = v.simd_gt(above_floor);
-        let mut down = v.simd_lt(below_floor);
-        // Most pixels fall out at the floor or beside their own neighbors.
+        let mut is_maximum = v.simd_gt(above_floor);
+        let mut is_minimum = v.simd_lt(below_floor);
+        // Most pixels are rejected by the threshold or by the neighbors in their own layer.
         for rows in [differences[1], differences[0], differences[2]] {
-            if (up | down).to_bitmask() == 0 {
+            if (is_maximum | is_minimum).to_bitmask() == 0 {
                 break;
             }
             let first = S::f32s::from_slice(simd, &rows[1][x - 1..x - 1 + n]);
@@ -319,10 +325,10 @@ fn extremes_impl<S: Simd>(
                     low = low.min(other);
                 }
             }
-            up &= v.simd_ge(high);
-            down &= v.simd_le(low);
+            is_maximum &= v.simd_ge(high);
+            is_minimum &= v.simd_le(low);
         }
-        let mut hits = (up | down).to_bitmask();
+        let mut hits = (is_maximum | is_minimum).to_bitmask();
         while hits != 0 {
             found.push(x + hits.trailing_zeros() as usize);
             hits &= hits - 1;
@@ -330,13 +336,14 @@ fn extremes_impl<S: Simd>(
         x += n;
     }
     for x in x..range.end {
-        if is_extreme(differences, x, floor) {
+        if is_extremum(differences, x, floor) {
             found.push(x);
         }
     }
 }
 
-/// Adds the columns, but the first and the last, where the middle row is above zero, not below `floor`, and not below any of the eight neighbors.
+/// Appends the columns, except the first and the last, with a local maximum in the middle row: above zero, not below
+/// `floor`, and not below any of the eight neighbors.
 pub(crate) fn peaks(level: Level, rows: [&[f32]; 3], floor: f32, found: &mut Vec<usize>) {
     dispatch!(level, simd => peaks_impl(simd, rows, floor, found));
 }
@@ -371,37 +378,37 @@ fn peaks_impl<S: Simd>(simd: S, rows: [&[f32]; 3], floor: f32, found: &mut Vec<u
     }));
 }
 
-/// Whether no sample is NaN or infinite.
+/// Returns whether no sample is NaN or infinite.
 pub(crate) fn all_finite(level: Level, row: &[f32]) -> bool {
     dispatch!(level, simd => all_finite_impl(simd, row))
 }
 
 #[inline(always)]
 fn all_finite_impl<S: Simd>(_: S, row: &[f32]) -> bool {
-    // v·0 is 0 for every finite v and NaN for the rest.
+    // v·0 is 0 for finite v and NaN otherwise.
     row.iter().fold(true, |good, v| good & (v * 0.0 == 0.0))
 }
 
-/// The largest of `row` and `least`.
-pub(crate) fn maximum(level: Level, row: &[f32], least: f32) -> f32 {
-    dispatch!(level, simd => maximum_impl(simd, row, least))
+/// Returns the maximum of `row` and `initial`.
+pub(crate) fn maximum(level: Level, row: &[f32], initial: f32) -> f32 {
+    dispatch!(level, simd => maximum_impl(simd, row, initial))
 }
 
 #[inline(always)]
-fn maximum_impl<S: Simd>(_: S, row: &[f32], least: f32) -> f32 {
-    let more = |a: f32, b: f32| if b > a { b } else { a };
+fn maximum_impl<S: Simd>(_: S, row: &[f32], initial: f32) -> f32 {
+    let max = |a: f32, b: f32| if b > a { b } else { a };
     let (blocks, rest) = row.as_chunks::<32>();
-    let mut lanes = [least; 32];
+    let mut lanes = [initial; 32];
     for block in blocks {
         for i in 0..32 {
-            lanes[i] = more(lanes[i], block[i]);
+            lanes[i] = max(lanes[i], block[i]);
         }
     }
-    lanes.into_iter().chain(rest.iter().copied()).fold(least, more)
+    lanes.into_iter().chain(rest.iter().copied()).fold(initial, max)
 }
 
 #[inline(always)]
-fn is_extreme(differences: [[&[f32]; 3]; 3], x: usize, floor: f32) -> bool {
+fn is_extremum(differences: [[&[f32]; 3]; 3], x: usize, floor: f32) -> bool {
     let v = differences[1][1][x];
     let around = |test: fn(f32, f32) -> bool| {
         differences.iter().all(|rows| rows.iter().all(|row| row[x - 1..x + 2].iter().all(|&d| test(v, d))))
@@ -417,7 +424,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn all_passes_equal_the_plain_loops(width in 1usize..200, r in 0usize..12, seed in any::<u32>()) {
+        fn simd_kernels_equal_the_scalar_loops(width in 1usize..200, r in 0usize..12, seed in any::<u32>()) {
             let mut state = seed | 1;
             let mut random = || {
                 state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
@@ -427,7 +434,7 @@ mod tests {
             let data: Vec<Vec<f32>> =
                 (0..2 * r + 2).map(|_| (0..width + 2 * r + 1).map(|_| random() - 0.5).collect()).collect();
             let rows: Vec<&[f32]> = data.iter().map(|v| &v[..width]).collect();
-            let plain = |at: &dyn Fn(usize, usize) -> f32, gap: usize| -> Vec<f32> {
+            let scalar = |at: &dyn Fn(usize, usize) -> f32, gap: usize| -> Vec<f32> {
                 (0..width)
                     .map(|x| {
                         let mut sum = if gap == 0 { at(x, r) * kernel[0] } else { 0.0 };
@@ -438,13 +445,13 @@ mod tests {
                     })
                     .collect()
             };
-            let expected = [0, 1].map(|gap| [plain(&|x, t| rows[t][x], gap), plain(&|x, t| data[0][x + t], gap)]);
-            // Coarse values, so that equal neighbors occur; the middle rows stand out, so that extremes do.
+            let expected = [0, 1].map(|gap| [scalar(&|x, t| rows[t][x], gap), scalar(&|x, t| data[0][x + t], gap)]);
+            // Coarse values, so that ties occur; larger ones in the middle rows, so that extrema occur.
             let coarse: Vec<Vec<f32>> = (0..9)
                 .map(|i| (0..width + 2).map(|_| ((random() - 0.5) * if i == 4 { 40.0 } else { 20.0 }).round()).collect())
                 .collect();
             let nine = [0, 3, 6].map(|i| [&coarse[i][..], &coarse[i + 1][..], &coarse[i + 2][..]]);
-            let extreme: Vec<usize> = (1..width + 1).filter(|&x| is_extreme(nine, x, 4.0)).collect();
+            let extremum: Vec<usize> = (1..width + 1).filter(|&x| is_extremum(nine, x, 4.0)).collect();
             for level in instruction_sets() {
                 let mut out = vec![0.0; width];
                 vertical(level, &mut out, &rows[..2 * r + 1], &kernel);
@@ -457,8 +464,8 @@ mod tests {
                 horizontal_phases(level, [&mut out, &mut odd], &data[0], &kernel, &kernel);
                 prop_assert_eq!([&out, &odd], [&expected[0][1], &expected[1][1]], "{:?}", level);
                 let mut found = Vec::new();
-                extremes(level, nine, 1..width + 1, 4.0, &mut found);
-                prop_assert_eq!(&found, &extreme, "{:?}", level);
+                extrema(level, nine, 1..width + 1, 4.0, &mut found);
+                prop_assert_eq!(&found, &extremum, "{:?}", level);
                 let mut twice = vec![0.0; 2 * width];
                 interleave(level, &mut twice, rows[0], rows[1]);
                 let mut uneven = vec![0.0; 2 * width - 1];

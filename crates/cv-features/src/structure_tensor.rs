@@ -1,7 +1,8 @@
-//! The structure tensor of an image and the corner measures made of it, row by row.
+//! The structure tensor of an image and its corner measures, streamed row by row.
 //!
-//! Gradients, their products, the Gaussian window and the measure follow each other within a few rows, which stay in the cache; only the measure
-//! leaves. Sums are in the order of whole-image passes (window down, then along), so the result is theirs to the last bit.
+//! Gradients, their products, the Gaussian window and the measure are computed within a few rows that stay in the
+//! cache; only the measure is written. Sums are in the order of whole-image passes (vertical, then horizontal), so the
+//! result is identical.
 
 use crate::harris::CornerMeasure;
 use crate::line_buffer::LineBuffer;
@@ -10,28 +11,28 @@ use cv_core::ImageView;
 use cv_imgproc::{mirror_ends, mirror_index};
 use fearless_simd::{Level, dispatch, prelude::*};
 
-/// What all strips of an image share.
+/// Input and parameters shared by all strips of an image.
 pub(crate) struct StructureTensor<'a> {
     pub(crate) view: ImageView<'a, f32, 1>,
-    /// The half-kernel of the window.
+    /// Half-kernel of the Gaussian window.
     pub(crate) kernel: Vec<f32>,
     pub(crate) measure: CornerMeasure,
     pub(crate) level: Level,
 }
 
-/// Walks down the rows of a strip.
-pub(crate) struct Walk<'a, 'b> {
+/// Streaming computation of the rows of a strip.
+pub(crate) struct RowStream<'a, 'b> {
     plan: &'b StructureTensor<'a>,
     /// Rows of gx², gx·gy, gy².
     products: [LineBuffer; 3],
-    /// The next row of products.
+    /// Next row of products to compute.
     next: usize,
     padded: Vec<f32>,
     smooth: [Vec<f32>; 3],
 }
 
-impl<'a, 'b> Walk<'a, 'b> {
-    /// A walk whose first row is `first`.
+impl<'a, 'b> RowStream<'a, 'b> {
+    /// Creates a stream whose first row is `first`.
     pub(crate) fn new(plan: &'b StructureTensor<'a>, first: usize) -> Self {
         let w = plan.view.width();
         let r = plan.kernel.len() - 1;
@@ -44,7 +45,7 @@ impl<'a, 'b> Walk<'a, 'b> {
         }
     }
 
-    /// Writes the measure of row `y`. Rows must be asked for one after the other.
+    /// Computes the measure of row `y`. Rows must be requested in order.
     pub(crate) fn row(&mut self, y: usize, out: &mut [f32]) {
         let Self { plan, products, next, padded, smooth } = self;
         let (w, h) = plan.view.size();
@@ -52,7 +53,7 @@ impl<'a, 'b> Walk<'a, 'b> {
         while *next <= (y + r).min(h - 1) {
             let rows = [-1, 0, 1].map(|d| plan.view.row(mirror_index(*next as isize + d, h)));
             let [xx, xy, yy] = products.each_mut().map(|p| p.row_mut(*next));
-            multiply(plan.level, rows, [xx, xy, yy]);
+            gradient_products(plan.level, rows, [xx, xy, yy]);
             *next += 1;
         }
         let mut rows = Vec::with_capacity(2 * r + 1);
@@ -66,13 +67,13 @@ impl<'a, 'b> Walk<'a, 'b> {
     }
 }
 
-/// The products of the gradient (Sobel's masks divided by 8) along the middle row; ends mirrored.
-fn multiply(level: Level, rows: [&[f32]; 3], out: [&mut [f32]; 3]) {
-    dispatch!(level, simd => multiply_impl(simd, rows, out));
+/// Computes the gradient products (Sobel masks divided by 8) of the middle row, with mirrored borders.
+fn gradient_products(level: Level, rows: [&[f32]; 3], out: [&mut [f32]; 3]) {
+    dispatch!(level, simd => gradient_products_impl(simd, rows, out));
 }
 
 #[inline(always)]
-fn multiply_impl<S: Simd>(simd: S, [a, b, c]: [&[f32]; 3], [xx, xy, yy]: [&mut [f32]; 3]) {
+fn gradient_products_impl<S: Simd>(simd: S, [a, b, c]: [&[f32]; 3], [xx, xy, yy]: [&mut [f32]; 3]) {
     let n = S::f32s::LEN;
     let w = b.len();
     let mut ends = |x: usize| {
@@ -87,7 +88,7 @@ fn multiply_impl<S: Simd>(simd: S, [a, b, c]: [&[f32]; 3], [xx, xy, yy]: [&mut [
     }
     let mut x = 1;
     while x < w - 1 {
-        // The last vector overlaps the one before.
+        // The last vector overlaps the previous one.
         x = x.min(w - 1 - n);
         let load = |row: &[f32], x: usize| S::f32s::from_slice(simd, &row[x..x + n]);
         let (al, am, ar) = (load(a, x - 1), load(a, x), load(a, x + 1));
@@ -101,7 +102,7 @@ fn multiply_impl<S: Simd>(simd: S, [a, b, c]: [&[f32]; 3], [xx, xy, yy]: [&mut [
     }
 }
 
-/// gx², gx·gy and gy² at one pixel.
+/// Computes gx², gx·gy and gy² at a pixel.
 #[inline(always)]
 pub(crate) fn products_at([a, b, c]: [&[f32]; 3], x: usize) -> [f32; 3] {
     let (l, r) = (mirror_index(x as isize - 1, b.len()), mirror_index(x as isize + 1, b.len()));
@@ -110,7 +111,7 @@ pub(crate) fn products_at([a, b, c]: [&[f32]; 3], x: usize) -> [f32; 3] {
     [gx * gx, gx * gy, gy * gy]
 }
 
-/// The corner measure of each tensor.
+/// Computes the corner measure of each tensor.
 fn measure(level: Level, measure: CornerMeasure, tensor: [&[f32]; 3], out: &mut [f32]) {
     dispatch!(level, simd => measure_impl(simd, measure, tensor, out));
 }
@@ -121,7 +122,7 @@ fn measure_impl<S: Simd>(_: S, measure: CornerMeasure, [xx, xy, yy]: [&[f32]; 3]
     match measure {
         CornerMeasure::Harris { k } => {
             for (o, ((xx, xy), yy)) in out.iter_mut().zip(tensor) {
-                *o = harris_at(*xx, *xy, *yy, k);
+                *o = harris_measure(*xx, *xy, *yy, k);
             }
         }
         CornerMeasure::ShiTomasi => {
@@ -132,14 +133,14 @@ fn measure_impl<S: Simd>(_: S, measure: CornerMeasure, [xx, xy, yy]: [&[f32]; 3]
     }
 }
 
-/// det − k·trace².
+/// Computes Harris's measure, det − k·trace².
 #[inline(always)]
-pub(crate) fn harris_at(xx: f32, xy: f32, yy: f32, k: f32) -> f32 {
+pub(crate) fn harris_measure(xx: f32, xy: f32, yy: f32, k: f32) -> f32 {
     let trace = xx + yy;
     xx * yy - xy * xy - k * trace * trace
 }
 
-/// The smaller eigenvalue.
+/// Computes the smaller eigenvalue.
 #[inline(always)]
 pub(crate) fn smaller_eigenvalue(xx: f32, xy: f32, yy: f32) -> f32 {
     let half = (xx - yy) * 0.5;

@@ -1,25 +1,27 @@
-//! Global descriptors: photographs that show the same are found among many without matching their features.
+//! Global image descriptors (VLAD) for image retrieval.
 //!
-//! Sources: H. Jégou, M. Douze, C. Schmid & P. Pérez, "Aggregating local descriptors into a compact image representation", CVPR 2010 (VLAD); R. Arandjelović & A. Zisserman, "All about
-//! VLAD", CVPR 2013 (each word's sum normalized by itself, so that a repeated pattern does not outweigh all else).
+//! Sources: H. Jégou, M. Douze, C. Schmid & P. Pérez, "Aggregating local descriptors into a compact image
+//! representation", CVPR 2010 (VLAD); R. Arandjelović & A. Zisserman, "All about VLAD", CVPR 2013 (intra-normalization
+//! against burstiness).
 
 use crate::ByteDescriptors;
-use crate::byte_neighbors::{MAX_DIMENSION, TASK, nearest_bytes};
+use crate::byte_neighbors::{MAX_DIMENSION, TASK_QUERIES, nearest_bytes};
 use crate::simd;
 use cv_core::{Cancelled, Progress, Stage};
 use rayon::prelude::*;
 
-/// Rounds of k-means; of photographs, the words hardly move any more after as many.
-const ROUNDS: usize = 8;
+/// Iterations of k-means, after which the visual words of photographs hardly change.
+const KMEANS_ITERATIONS: usize = 8;
 
-/// Words: the centers of clusters of descriptors, learned from the photographs that are to be compared, or others.
+/// A visual vocabulary: cluster centers of descriptors, learned from the images to be compared or from others.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Vocabulary {
     words: ByteDescriptors,
 }
 
 impl Vocabulary {
-    /// At most `count` words of the given descriptors, by k-means (Lloyd 1982) from words evenly spread over them. `None` where there are no descriptors. O(descriptors × words).
+    /// Learns at most `count` visual words by k-means (Lloyd 1982), initialized with evenly spaced samples. `None`
+    /// without descriptors. O(descriptors × words).
     ///
     /// # Errors
     /// [`Cancelled`].
@@ -31,7 +33,7 @@ impl Vocabulary {
         }
         let start: Vec<usize> = (0..count).map(|i| i * samples.len() / count).collect();
         let mut words = samples.select(&start);
-        for _ in 0..ROUNDS {
+        for _ in 0..KMEANS_ITERATIONS {
             let mut sums = vec![0u64; count * d];
             let mut members = vec![0u64; count];
             for (i, word) in assign(samples, &words, progress)?.into_iter().enumerate() {
@@ -48,8 +50,9 @@ impl Vocabulary {
         Ok(Some(Self { words }))
     }
 
-    /// The global descriptor: for each word the sum of the differences of its descriptors from it, of unit length each and together; all zero without descriptors. Dot products tell how
-    /// alike photographs are, from −1 to 1. `None` for descriptors of another kind than the words.
+    /// Computes the VLAD descriptor: for each word the sum of residuals of its descriptors, L2-normalized per word and
+    /// in total; zero without descriptors. The dot product of two is the similarity of the images, −1 to 1. `None` for
+    /// descriptors of another kind than the words.
     ///
     /// # Errors
     /// [`Cancelled`].
@@ -75,7 +78,7 @@ impl Vocabulary {
     }
 }
 
-/// The nearest word of each descriptor.
+/// Assigns each descriptor to its nearest word.
 fn assign(
     descriptors: &ByteDescriptors,
     words: &ByteDescriptors,
@@ -84,7 +87,7 @@ fn assign(
     if descriptors.is_empty() {
         return Ok(Vec::new());
     }
-    let stage = Stage::new(progress, "words", descriptors.len().div_ceil(TASK))?;
+    let stage = Stage::new(progress, "words", descriptors.len().div_ceil(TASK_QUERIES))?;
     let (nearest, _) = nearest_bytes(simd::level(), descriptors, words, false, &stage)?;
     Ok(nearest.into_iter().map(|n| n.best as usize).collect())
 }
@@ -96,11 +99,12 @@ fn normalize(v: &mut [f32]) {
     }
 }
 
-/// For each global descriptor the indices of the others by how alike they are, the most alike first: `count` of them for which `allowed` holds. O(n² × length).
+/// Finds for each global descriptor the indices of the `count` most similar others for which `allowed` is true, by
+/// decreasing similarity. O(n² × dimension).
 ///
 /// # Errors
 /// [`Cancelled`].
-pub fn most_alike(
+pub fn most_similar(
     descriptors: &[Vec<f32>],
     count: usize,
     allowed: impl Fn(usize, usize) -> bool + Sync,
@@ -111,16 +115,16 @@ pub fn most_alike(
         .into_par_iter()
         .map(|i| {
             let others = (0..descriptors.len()).filter(|j| *j != i && allowed(i, *j));
-            let mut rated: Vec<(f32, usize)> = others.map(|j| (dot(&descriptors[i], &descriptors[j]), j)).collect();
-            rated.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-            rated.truncate(count);
+            let mut ranked: Vec<(f32, usize)> = others.map(|j| (dot(&descriptors[i], &descriptors[j]), j)).collect();
+            ranked.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+            ranked.truncate(count);
             stage.add(1)?;
-            Ok(rated.into_iter().map(|r| r.1).collect())
+            Ok(ranked.into_iter().map(|r| r.1).collect())
         })
         .collect()
 }
 
-/// In lanes of their own, so that sums are vectors.
+/// Computes the dot product with 16 partial sums, so that it vectorizes.
 fn dot(a: &[f32], b: &[f32]) -> f32 {
     let mut sums = [0f32; 16];
     for (a, b) in a.as_chunks::<16>().0.iter().zip(b.as_chunks::<16>().0) {
@@ -137,7 +141,7 @@ mod tests {
     use crate::{DescriptorKind, Descriptors};
     use cv_core::Silent;
 
-    /// Numbers from 0 to 1.
+    /// Pseudo-random numbers from 0 to 1.
     fn random(seed: u64) -> impl Iterator<Item = f32> {
         let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
         std::iter::repeat_with(move || {
@@ -149,38 +153,38 @@ mod tests {
         .skip(8)
     }
 
-    /// The descriptors of a photograph that sees these spots, each of which has a look of its own, with noise.
-    fn photograph(spots: &[usize], noise: u64) -> ByteDescriptors {
+    /// The noisy descriptors of an image with these landmarks, each with a distinct descriptor.
+    fn image_descriptors(landmarks: &[usize], noise: u64) -> ByteDescriptors {
         let mut data = Vec::new();
-        for &spot in spots {
-            let look = random(spot as u64 + 1).take(128).map(|v| if v > 0.7 { 0.16 } else { 0.0 });
-            data.extend(look.zip(random(noise << 32 | spot as u64)).map(|(look, off)| look + 0.01 * off));
+        for &landmark in landmarks {
+            let values = random(landmark as u64 + 1).take(128).map(|v| if v > 0.7 { 0.16 } else { 0.0 });
+            data.extend(values.zip(random(noise << 32 | landmark as u64)).map(|(value, noise)| value + 0.01 * noise));
         }
         ByteDescriptors::new(&Descriptors::from_vec(DescriptorKind::ROOT_SIFT, data).unwrap()).unwrap()
     }
 
     #[test]
-    fn photographs_of_one_place_are_most_alike() {
-        // Two photographs of each of twelve places; each sees 40 of the 50 spots of its place.
-        let spots = |place: usize, from: usize| (from..from + 40).map(|s| place * 50 + s).collect::<Vec<_>>();
-        let photos: Vec<ByteDescriptors> =
-            (0..24).map(|i| photograph(&spots(i / 2, 10 * (i % 2)), i as u64 + 1)).collect();
-        let all: Vec<usize> = (0..12).flat_map(|place| spots(place, 5)).collect();
-        let words = Vocabulary::learn(&photograph(&all, 99), 16, &Silent).unwrap().unwrap();
-        let described: Vec<Vec<f32>> = photos.iter().map(|p| words.describe(p, &Silent).unwrap().unwrap()).collect();
-        let alike = most_alike(&described, 1, |_, _| true, &Silent).unwrap();
-        for (i, found) in alike.iter().enumerate() {
+    fn images_of_the_same_place_are_most_similar() {
+        // Two images of each of twelve places; each has 40 of the 50 landmarks of its place.
+        let landmarks = |place: usize, from: usize| (from..from + 40).map(|s| place * 50 + s).collect::<Vec<_>>();
+        let images: Vec<ByteDescriptors> =
+            (0..24).map(|i| image_descriptors(&landmarks(i / 2, 10 * (i % 2)), i as u64 + 1)).collect();
+        let all: Vec<usize> = (0..12).flat_map(|place| landmarks(place, 5)).collect();
+        let words = Vocabulary::learn(&image_descriptors(&all, 99), 16, &Silent).unwrap().unwrap();
+        let described: Vec<Vec<f32>> = images.iter().map(|p| words.describe(p, &Silent).unwrap().unwrap()).collect();
+        let similar = most_similar(&described, 1, |_, _| true, &Silent).unwrap();
+        for (i, found) in similar.iter().enumerate() {
             assert_eq!(found, &[i ^ 1], "photograph {i}");
         }
-        let others = most_alike(&described, 30, |a, b| a.abs_diff(b) > 1, &Silent).unwrap();
+        let others = most_similar(&described, 30, |a, b| a.abs_diff(b) > 1, &Silent).unwrap();
         assert!(others.iter().enumerate().all(|(i, o)| o.len() == 24 - if i == 0 || i == 23 { 2 } else { 3 }));
     }
 
     #[test]
-    fn nothing_to_describe() {
+    fn empty_sets_and_other_kinds() {
         let none = ByteDescriptors::new(&Descriptors::new(DescriptorKind::ROOT_SIFT)).unwrap();
         assert_eq!(Vocabulary::learn(&none, 16, &Silent), Ok(None));
-        let words = Vocabulary::learn(&photograph(&[1, 2, 3], 1), 16, &Silent).unwrap().unwrap();
+        let words = Vocabulary::learn(&image_descriptors(&[1, 2, 3], 1), 16, &Silent).unwrap().unwrap();
         let described = words.describe(&none, &Silent).unwrap().unwrap();
         assert!(described.len() == 3 * 128 && described.iter().all(|v| *v == 0.0));
         let other = ByteDescriptors::new(&Descriptors::new(DescriptorKind::SIFT)).unwrap();

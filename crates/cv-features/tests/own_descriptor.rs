@@ -1,4 +1,4 @@
-//! A method of another crate: corners on a grid, and the gray values around each. Nothing of `cv-features` knows it.
+//! A custom feature extractor: points on a grid with gray patches.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -8,7 +8,7 @@ use cv_features::{
     Features, MatchError, MatchOptions, RatioTest, match_descriptors,
 };
 
-/// The gray values of 7×7 pixels less their mean.
+/// The gray levels of 7×7 pixels minus their mean.
 const GRAY: DescriptorKind = DescriptorKind {
     name: "gray",
     dimension: 49,
@@ -20,7 +20,7 @@ const GRAY: DescriptorKind = DescriptorKind {
 
 #[derive(Debug)]
 struct GrayValues {
-    /// Distance of the points in pixels.
+    /// Spacing of the points in pixels.
     step: usize,
 }
 
@@ -47,7 +47,7 @@ impl FeatureExtractor for GrayValues {
     }
 }
 
-/// Noise that is always the same, `shift` pixels to the left.
+/// Deterministic noise, shifted by `shift` pixels to the left.
 fn noise(shift: usize) -> GrayF32 {
     GrayF32::from_fn(120, 90, |x, y| {
         let mut v = ((x + shift) as u32).wrapping_mul(0x9E37_79B9) ^ (y as u32).wrapping_mul(0x85EB_CA6B);
@@ -57,22 +57,22 @@ fn noise(shift: usize) -> GrayF32 {
 }
 
 #[test]
-fn its_features_are_matched_with_the_limits_of_its_kind() {
+fn custom_features_are_matched_with_the_thresholds_of_their_kind() {
     let method = FeatureOptions::Other(std::sync::Arc::new(GrayValues { step: 1 }));
     let extract = |image: &GrayF32| method.extractor().extract(image.view(), &Silent).unwrap();
     let (a, b) = (extract(&noise(0)), extract(&noise(4)));
-    assert_eq!((method.extractor().kind(), a.descriptors.kind(), a.found()), (GRAY, GRAY, 114 * 84));
-    let found = match_descriptors(&a.descriptors, &b.descriptors, &MatchOptions::default(), &Silent).unwrap();
-    let right = found.iter().filter(|m| {
+    assert_eq!((method.extractor().kind(), a.descriptors.kind(), a.detected_count()), (GRAY, GRAY, 114 * 84));
+    let matches = match_descriptors(&a.descriptors, &b.descriptors, &MatchOptions::default(), &Silent).unwrap();
+    let correct = matches.iter().filter(|m| {
         let (p, q) = (a.keypoints[m.query as usize].position, b.keypoints[m.train as usize].position);
         p - q == cv_core::nalgebra::Vector2::new(4.0, 0.0)
     });
-    // Every patch that both show is there twice, to the last bit; what only one shows has no second like the first.
-    assert_eq!(right.count(), 110 * 84);
-    assert!(found.iter().all(|m| m.ratio < GRAY.ratio));
+    // Patches in both images are identical; patches in only one image fail the ratio test.
+    assert_eq!(correct.count(), 110 * 84);
+    assert!(matches.iter().all(|m| m.ratio < GRAY.ratio));
     let all = MatchOptions { ratio: RatioTest::Off, ..MatchOptions::default() };
     assert_eq!(match_descriptors(&a.descriptors, &b.descriptors, &all, &Silent).unwrap().len(), 114 * 84);
-    // By its own scale: half a step, and f32 rounding.
+    // Half a quantization step, and f32 rounding.
     let bytes = ByteDescriptors::new(&a.descriptors).unwrap().to_descriptors();
     for (v, w) in a.descriptors.as_slice().iter().zip(bytes.as_slice()) {
         assert!((v - w).abs() < 0.5 / 127.0 + 1e-6, "{v} {w}");
@@ -80,7 +80,7 @@ fn its_features_are_matched_with_the_limits_of_its_kind() {
 }
 
 #[test]
-fn its_descriptors_are_not_taken_for_others() {
+fn custom_descriptors_are_not_compared_with_other_kinds() {
     let own = GrayValues { step: 5 }.extract(noise(0).view(), &Silent).unwrap();
     let mut patches = Features::new(DescriptorKind::PATCH);
     assert!(
@@ -93,8 +93,8 @@ fn its_descriptors_are_not_taken_for_others() {
 }
 
 #[test]
-fn our_own_methods_come_through_the_same_trait() {
-    // Blobs, which every method finds something in.
+fn built_in_methods_implement_the_same_trait() {
+    // Blobs, in which every method detects features.
     let image = GrayF32::from_fn(200, 160, |x, y| {
         let blob = |cx: f32, cy: f32| (-((x as f32 - cx).powi(2) + (y as f32 - cy).powi(2)) / 30.0).exp();
         [0.1 + 0.8 * (blob(60.0, 50.0) + blob(120.0, 90.0) + 0.7 * blob(90.0, 110.0)).min(1.0)]
@@ -105,7 +105,7 @@ fn our_own_methods_come_through_the_same_trait() {
         assert_eq!(features.descriptors.kind(), options.extractor().kind());
         assert!(!features.keypoints.is_empty() && features.descriptors.len() == features.keypoints.len(), "{method}");
         let one = options.at_most(1).extractor().extract(image.view(), &Silent).unwrap();
-        assert!(one.keypoints.len() <= 1 && one.found() >= features.keypoints.len().min(2), "{method}");
+        assert!(one.keypoints.len() <= 1 && one.detected_count() >= features.keypoints.len().min(2), "{method}");
         let tiny = FeatureOptions::from(method);
         let error = tiny.extractor().extract(GrayF32::new(2, 2, [0.5]).view(), &Silent);
         assert!(matches!(error, Err(FeatureError::ImageTooSmall { width: 2, height: 2, .. })), "{method}");

@@ -1,9 +1,9 @@
-//! A loss of one's own for the robust estimators: `cargo run -p cv-geometry --example own_scorer`.
+//! A custom loss for the robust estimators: `cargo run -p cv-geometry --example own_scorer`.
 
 use cv_core::{Correspondence, Silent};
 use cv_geometry::{RobustOptions, Scorer, Scoring, estimate_fundamental};
 
-/// The absolute distance, up to the threshold.
+/// The truncated absolute residual.
 #[derive(Debug)]
 struct L1;
 
@@ -20,10 +20,11 @@ impl Scorer for L1 {
 }
 
 pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let number = |i: u32, n: u32| f64::from(i % n);
-    let place = |i: u32| (number(37 * i, 600), number(53 * i, 400), 5.0 + number(i * i, 23));
-    let matches: Vec<_> = (0..60).map(place).map(|(x, y, d)| Correspondence::new(x, y, x - d, y)).collect();
+    let modulo = |i: u32, n: u32| f64::from(i % n);
+    let position_and_disparity = |i: u32| (modulo(37 * i, 600), modulo(53 * i, 400), 5.0 + modulo(i * i, 23));
+    let matches: Vec<_> =
+        (0..60).map(position_and_disparity).map(|(x, y, d)| Correspondence::new(x, y, x - d, y)).collect();
     let options = RobustOptions { scoring: Scoring::Other(&L1), ..RobustOptions::fundamental() };
     let found = estimate_fundamental(&matches, &options, &Silent)?;
-    if found.inliers.len() == 60 { Ok(()) } else { Err("some are missing".into()) }
+    if found.inliers.len() == 60 { Ok(()) } else { Err("inliers are missing".into()) }
 }

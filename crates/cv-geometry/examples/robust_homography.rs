@@ -1,4 +1,5 @@
-//! The homography between two pictures of a plane, from matches of which a third are wrong: `cargo run -p cv-geometry --example robust_homography`.
+//! The homography between two images of a plane, from matches with an outlier ratio of a third: `cargo run -p
+//! cv-geometry --example robust_homography`.
 
 use cv_core::{Correspondence, Matrix3, Point2, Silent};
 use cv_geometry::{RobustOptions, estimate_homography};
@@ -8,14 +9,14 @@ pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
     let matches: Vec<Correspondence> = (0..90)
         .map(|i| {
             let a = Point2::new(f64::from(i * 37 % 640), f64::from(i * 53 % 480));
-            let right = Point2::from_homogeneous(truth * a.to_homogeneous()).unwrap_or(a);
-            // Every third is somewhere else.
-            let b = if i % 3 == 0 { Point2::new(f64::from(i * 71 % 640), f64::from(i * 29 % 480)) } else { right };
+            let exact = Point2::from_homogeneous(truth * a.to_homogeneous()).unwrap_or(a);
+            // Every third match is an outlier.
+            let b = if i % 3 == 0 { Point2::new(f64::from(i * 71 % 640), f64::from(i * 29 % 480)) } else { exact };
             Correspondence { a, b }
         })
         .collect();
     let found = estimate_homography(&matches, &RobustOptions::homography(), &Silent)?;
-    println!("{} of {} matches agree to {:.3} px with", found.inliers.len(), matches.len(), found.rms);
+    println!("{} of {} matches are inliers, RMS {:.3} px, of", found.inliers.len(), matches.len(), found.rms);
     println!("{:.5}", found.model);
-    if (found.model - truth).norm() < 1e-3 { Ok(()) } else { Err("another homography".into()) }
+    if (found.model - truth).norm() < 1e-3 { Ok(()) } else { Err("the homography is wrong".into()) }
 }

@@ -1,4 +1,5 @@
-//! Cameras, pose and points from keypoints and matches between them: `cargo run -p cv-geometry --example two_views_by_index`.
+//! Two-view reconstruction from keypoints and matches by index: `cargo run -p cv-geometry --example
+//! two_views_by_index`.
 
 use cv_core::{Camera, DMatch, Keypoint, Point3, Pose, Rotation3, Silent, Vector3};
 use cv_geometry::{Intrinsics, MatchedViews, TwoViewOptions, reconstruct_two_views};
@@ -20,7 +21,7 @@ pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
     let found = reconstruct_two_views(&views, &options, &Silent)?;
     for point in found.points.iter().take(3) {
         let m = found.matches[point.match_index];
-        println!("keypoints {} and {} are of {:.3}", m.query, m.train, point.position);
+        println!("keypoints {} and {}: point {:.3}", m.query, m.train, point.position);
     }
     if found.points.len() > 100 { Ok(()) } else { Err("points are missing".into()) }
 }

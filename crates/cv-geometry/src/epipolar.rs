@@ -1,4 +1,4 @@
-//! The Sampson error of epipolar geometry, and its refinement.
+//! The Sampson error of epipolar geometry, and refinement by minimizing it.
 
 use crate::match_blocks::{LANES, MatchBlock};
 use crate::ransac::Scorer;
@@ -8,32 +8,33 @@ use fearless_simd::{Level, dispatch};
 use nalgebra::{Const, OMatrix, OVector, SMatrix, SVector};
 use std::marker::PhantomData;
 
-/// A family of matrices `F` with `bᵀ F a = 0`, with `N` degrees of freedom.
+/// A parameterization with `N` degrees of freedom of matrices `F` with `bᵀ F a = 0`.
 pub(crate) trait Epipolar<const N: usize>: Clone {
-    /// The matrix; its scale does not matter.
+    /// Returns the matrix, of any scale.
     fn matrix(&self) -> Matrix3<f64>;
 
-    /// Derivatives of the entries, row by row, by the degrees of freedom.
+    /// Returns the Jacobian of the entries (row-major) by the degrees of freedom.
     fn tangent(&self) -> SMatrix<f64, 9, N>;
 
-    /// Moved in the tangent space.
+    /// Applies a step in the tangent space (retraction).
     fn step(&self, delta: &OVector<f64, Const<N>>) -> Self;
 }
 
-/// Minimizes `Σ ρ(sampson² / threshold²)` over a family of matrices.
+/// Minimizes the robust Sampson error `Σ ρ(sampson² / threshold²)` over a parameterization.
 pub(crate) struct SampsonProblem<'a, C: Scorer, M, const N: usize> {
     pub(crate) pairs: &'a [[f64; 4]],
     pub(crate) scorer: &'a C,
     pub(crate) threshold: f64,
-    family: PhantomData<M>,
+    parameterization: PhantomData<M>,
 }
 
 impl<'a, C: Scorer, M: Epipolar<N>, const N: usize> SampsonProblem<'a, C, M, N> {
     pub(crate) fn new(pairs: &'a [[f64; 4]], scorer: &'a C, threshold: f64) -> Self {
-        Self { pairs, scorer, threshold, family: PhantomData }
+        Self { pairs, scorer, threshold, parameterization: PhantomData }
     }
 
-    /// `F a` and `Fᵀ b` but their last entries, `C = bᵀ F a`, `1/D`, and `u`.
+    /// Computes the first two entries of `F a` and of `Fᵀ b`, `C = bᵀ F a`, `1/D` (D the sum of their squares), and
+    /// `u`.
     #[inline(always)]
     fn terms(&self, f: &Matrix3<f64>, &[x, y, s, t]: &[f64; 4]) -> ([f64; 2], [f64; 2], f64, f64, f64) {
         let l0 = f[(0, 0)] * x + f[(0, 1)] * y + f[(0, 2)];
@@ -46,6 +47,7 @@ impl<'a, C: Scorer, M: Epipolar<N>, const N: usize> SampsonProblem<'a, C, M, N> 
         ([l0, l1], [m0, m1], c, inverse, c * c * inverse / (self.threshold * self.threshold))
     }
 
+    /// Computes the cost.
     #[inline(always)]
     fn sum(&self, f: &Matrix3<f64>) -> f64 {
         let mut cost = 0.0;
@@ -56,15 +58,16 @@ impl<'a, C: Scorer, M: Epipolar<N>, const N: usize> SampsonProblem<'a, C, M, N> 
         cost
     }
 
+    /// Computes the cost and the normal equations.
     #[inline(always)]
     fn sums(&self, f: &Matrix3<f64>) -> Sums {
         let (mut hessian, mut last, mut gradient) = ([[0.0; 8]; 8], [0.0; 8], [0.0; 8]);
         let (mut cost, mut sum, mut weighted) = (0.0, 0.0, 0.0);
         for pair in self.pairs {
             let (l, m, c, inverse, u) = self.terms(f, pair);
-            // Also where it is NaN.
-            let near = u < self.scorer.cutoff();
-            if !near {
+            // False for NaN.
+            let is_below_cutoff = u < self.scorer.cutoff();
+            if !is_below_cutoff {
                 cost += 1.0;
                 continue;
             }
@@ -92,14 +95,16 @@ impl<'a, C: Scorer, M: Epipolar<N>, const N: usize> SampsonProblem<'a, C, M, N> 
     }
 }
 
-/// Cost, gradient and Hessian by the nine entries of the matrix: eight and one, for vectors of four or eight. The derivative by the last entry is 1.
+/// Cost, gradient and Gauss–Newton Hessian by the nine entries of the matrix. The last entry, whose derivative is 1, is
+/// separate, so that the others fill SIMD vectors of four or eight.
 struct Sums {
     cost: f64,
     hessian: [[f64; 8]; 8],
-    /// The last column but its end, and its end.
+    /// The last column of the Hessian without the diagonal entry, which is `weight`.
     last: [f64; 8],
     weight: f64,
     gradient: [f64; 8],
+    /// The last entry of the gradient.
     weighted: f64,
 }
 
@@ -118,7 +123,7 @@ impl<C: Scorer, M: Epipolar<N>, const N: usize> LeastSquares for SampsonProblem<
 
     fn linearize(&self, f: &M) -> NormalEquations<Const<N>> {
         let matrix = f.matrix();
-        // No product is fused, so every instruction set gives the same bits.
+        // No product is fused, so all instruction sets give identical results.
         let sums = dispatch!(Level::new(), _simd => self.sums(&matrix));
         let tangent = f.tangent();
         let mut hessian = SMatrix::<f64, 9, 9>::zeros();
@@ -145,7 +150,7 @@ impl<C: Scorer, M: Epipolar<N>, const N: usize> LeastSquares for SampsonProblem<
     }
 }
 
-/// At most `iterations` Levenberg–Marquardt steps from `start`; `None` where they lowered nothing.
+/// Refines `start` by at most `iterations` Levenberg–Marquardt steps; `None` if none reduced the cost.
 pub(crate) fn refine_sampson<C: Scorer, M: Epipolar<N>, const N: usize>(
     problem: &SampsonProblem<'_, C, M, N>,
     start: M,
@@ -156,7 +161,7 @@ pub(crate) fn refine_sampson<C: Scorer, M: Epipolar<N>, const N: usize>(
     (report.cost < report.initial_cost).then_some(report.params)
 }
 
-/// F in f32, row by row.
+/// F in f32, row-major.
 pub(crate) struct SampsonKernel([f32; 9]);
 
 impl SampsonKernel {
@@ -164,7 +169,7 @@ impl SampsonKernel {
         Self(std::array::from_fn(|i| f[(i / 3, i % 3)] as f32))
     }
 
-    /// Squared Sampson distances.
+    /// Computes the squared Sampson distances.
     #[inline(always)]
     pub(crate) fn squared_residuals(&self, block: &MatchBlock) -> [f32; LANES] {
         let f = &self.0;
@@ -183,17 +188,18 @@ impl SampsonKernel {
     }
 }
 
-/// Sampson's distance of a match from the epipolar geometry `bᵀ F a = 0`, in pixels: the first-order distance to the nearest
-/// pair of points that satisfies it (Hartley & Zisserman, §11.4.3).
+/// Computes the Sampson distance of a match from the epipolar geometry `bᵀ F a = 0`, in the unit of the match: the
+/// first-order approximation of the distance to the nearest pair of points that satisfies it (Hartley & Zisserman,
+/// §11.4.3).
 ///
-/// NaN where both epipolar lines vanish (both points are epipoles).
+/// NaN if both points are epipoles (both epipolar lines vanish).
 pub fn sampson(f: &Matrix3<f64>, m: &Correspondence) -> f64 {
     let (a, b) = (m.a.to_homogeneous(), m.b.to_homogeneous());
     let (l, k) = (f * a, f.transpose() * b);
     b.dot(&l).abs() / (l.x * l.x + l.y * l.y + k.x * k.x + k.y * k.y).sqrt()
 }
 
-/// The epipole of the second image, `Fᵀ e = 0`: the longest cross product of two columns.
+/// Computes the epipole of the second image, `Fᵀ e = 0`, as the longest cross product of two columns; of any scale.
 #[inline]
 pub(crate) fn second_epipole(f: &Matrix3<f64>) -> Vector3<f64> {
     let c = [f.column(0), f.column(1), f.column(2)];

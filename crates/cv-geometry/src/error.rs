@@ -1,27 +1,27 @@
-//! Why an estimate could not be made.
+//! Errors of the estimators.
 
 use cv_core::OptionError;
 
 use cv_core::Cancelled;
 
-/// A configuration of points that does not determine a model.
+/// A degenerate configuration of points, which does not determine a model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum Degeneracy {
-    /// Too few different points.
+    /// Too few distinct points.
     Coincident,
-    /// The points lie on a line (or all but one do).
+    /// The points are collinear (all, or all but one).
     Collinear,
-    /// The points lie on a plane of the scene, or the camera only turned: a homography explains them all.
+    /// The scene points are coplanar, or the motion is a pure rotation: one homography fits all matches.
     Planar,
 }
 
 impl std::fmt::Display for Degeneracy {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(match self {
-            Self::Coincident => "too few different points",
+            Self::Coincident => "too few distinct points",
             Self::Collinear => "the points lie on a line",
-            Self::Planar => "one homography explains all the points (a plane, or a camera that only turned)",
+            Self::Planar => "one homography fits all points (a plane, or a camera that only turned)",
         })
     }
 }
@@ -30,38 +30,40 @@ impl std::fmt::Display for Degeneracy {
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum EstimateError {
-    /// There are fewer matches than the model has need of.
+    /// There are fewer matches than the model needs.
     #[error("{got} matches are too few: {needed} are needed")]
     NotEnoughMatches {
-        /// Number of matches given.
+        /// Number of matches.
         got: usize,
-        /// Number needed.
+        /// Minimum number of matches.
         needed: usize,
     },
     /// A coordinate is NaN, infinite or beyond 1e12.
-    #[error("match {index} has a coordinate that is not a number of any use")]
+    #[error("match {index} has a coordinate that is NaN, infinite or beyond 1e12")]
     NotFinite {
-        /// Which match.
+        /// Index of the match.
         index: usize,
     },
-    /// The input determines no model.
+    /// The points are in a degenerate configuration.
     #[error("{kind}")]
     Degenerate {
-        /// In which way.
+        /// The kind of degeneracy.
         kind: Degeneracy,
     },
-    /// The number of false alarms of the best model is not below a hundredth: as many matches would fit some model if all were wrong.
+    /// The number of false alarms of the best model is not below 0.01: as many matches would be inliers of some model
+    /// by chance.
     #[error(
-        "after {iterations} samples the best model fits {inliers} of {matches} matches, as some model would if all were wrong; at least {needed} are needed"
+        "after {iterations} samples the best model has {inliers} inliers of {matches} matches, no more than expected by chance; at least {needed} are needed"
     )]
     NoConsensus {
-        /// Matches that fit the best model.
+        /// Number of inliers of the best model.
         inliers: usize,
-        /// Matches given.
+        /// Number of matches.
         matches: usize,
-        /// Matches that must fit: fewer would fit some model if all were wrong. More than there are where the threshold is so large that any do.
+        /// Minimum number of inliers that is significant. Larger than the number of matches if the threshold is so
+        /// large that no number is.
         needed: usize,
-        /// Samples drawn.
+        /// Number of minimal samples drawn.
         iterations: usize,
     },
     /// An option is out of range.

@@ -1,6 +1,6 @@
-//! Homography, epipolar geometry, pose, triangulation, and the one RANSAC driver.
+//! Multiple-view geometry: homography, epipolar geometry, absolute and relative pose, triangulation, and RANSAC.
 //!
-//! Takes matches, never images. Robust estimators come in pairs with the plain solvers that they are made of:
+//! The input is correspondences, never images. Each robust estimator (`estimate_…`) has a non-robust counterpart:
 //!
 //! ```
 //! use cv_core::{Correspondence, Silent};
@@ -17,9 +17,10 @@
 //! # Conventions
 //!
 //! * A homography maps the first image to the second, `b ~ H a`, scaled to `H[2][2] = 1`.
-//! * Thresholds and residuals are in the unit of the matches, that is, pixels.
-//! * A robust estimate is refused where its number of false alarms is a hundredth or more (`RobustModel::log_nfa`).
-//! * The same matches, options and seed give the same bytes on any number of threads and with any vector unit.
+//! * Thresholds and residuals are in the unit of the matches: pixels, or normalized coordinates where stated.
+//! * A robust estimate is rejected if its number of false alarms (NFA) is 0.01 or more (`RobustModel::log_nfa`).
+//! * The same matches, options and seed give bit-identical results for any number of threads and any SIMD instruction
+//!   set.
 
 mod absolute;
 mod bundle;
@@ -52,8 +53,8 @@ pub use epipolar::sampson;
 pub use error::{Degeneracy, EstimateError};
 pub use essential::{
     RecoveredPose, decompose_essential, essential_five_point, essential_from_fundamental, essential_from_pose,
-    estimate_essential, estimate_relative_pose, jackknife_pose_deviation, normalize_matches, pose_difference,
-    poses_are_rivals, recover_pose, refine_relative_pose, rotation_between,
+    estimate_essential, estimate_relative_pose, estimate_rotation, jackknife_pose_deviation, normalize_matches,
+    pose_difference, poses_are_indistinguishable, recover_pose, refine_relative_pose,
 };
 pub use fundamental::{estimate_fundamental, fundamental_eight_point, fundamental_seven_point};
 pub use homography::{
@@ -73,4 +74,4 @@ pub use two_view::{
     EXIF_FOCAL_DEVIATION, Intrinsics, MatchedViews, PLAUSIBLE_FOCAL, TwoViewAdjustment, TwoViewError, TwoViewGeometry,
     TwoViewOptions, TwoViewPoint, TwoViewReconstruction, estimate_two_view_geometry, reconstruct_two_views,
 };
-pub use verified_pair::{NotAPair, VerifiedPair, VerifyOptions, verify_pair};
+pub use verified_pair::{PairRejection, VerifiedPair, VerifyOptions, verify_pair};

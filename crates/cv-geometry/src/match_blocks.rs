@@ -1,4 +1,4 @@
-//! Correspondences, normalized and in blocks of lanes for vector units.
+//! Normalized correspondences, also in blocks (structure of arrays) for SIMD, and degeneracy tests of point sets.
 
 use crate::ransac::RansacData;
 use crate::{EstimateError, error::Degeneracy};
@@ -9,7 +9,8 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 /// Number of matches in a block: two AVX2 registers of f32, one AVX-512 register.
 pub const LANES: usize = 16;
 
-/// [`LANES`] correspondences, coordinate by coordinate. Lanes beyond the last match hold NaN, which fits no model.
+/// [`LANES`] correspondences as a structure of arrays. Padding lanes after the last match are NaN, which is an outlier
+/// of every model.
 #[derive(Debug, Clone, Copy)]
 pub struct MatchBlock {
     /// x in the first image.
@@ -22,7 +23,7 @@ pub struct MatchBlock {
     pub y2: [f32; LANES],
 }
 
-/// Normalized coordinates `(p − center) · scale`.
+/// The normalizing transformation `(p − center) · scale`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Normalizer {
     pub(crate) center: Point2<f64>,
@@ -32,13 +33,13 @@ pub(crate) struct Normalizer {
 impl Normalizer {
     pub(crate) const IDENTITY: Self = Self { center: Point2::new(0.0, 0.0), scale: 1.0 };
 
-    /// As a 3×3 matrix.
+    /// Returns the transformation as a 3×3 matrix.
     pub(crate) fn matrix(&self) -> Matrix3<f64> {
         let (s, c) = (self.scale, self.center);
         Matrix3::new(s, 0.0, -s * c.x, 0.0, s, -s * c.y, 0.0, 0.0, 1.0)
     }
 
-    /// The inverse of [`Self::matrix`].
+    /// Returns the inverse of [`Self::matrix`].
     pub(crate) fn inverse_matrix(&self) -> Matrix3<f64> {
         let (s, c) = (self.scale, self.center);
         Matrix3::new(1.0 / s, 0.0, c.x, 0.0, 1.0 / s, c.y, 0.0, 0.0, 1.0)
@@ -52,26 +53,26 @@ impl Normalizer {
 
 /// Normalized correspondences, in the caller's order in f64 and shuffled into blocks in f32.
 ///
-/// The centers are medians and the scale is a median distance, so that a wild match cannot squeeze the others together;
-/// one scale for both images keeps every image distance in proportion to pixels.
+/// Center and scale are medians, so they are robust to outliers with extreme coordinates. Both images have the same
+/// scale, so distances stay proportional to pixels.
 #[derive(Debug, Clone)]
 pub(crate) struct NormalizedMatches {
     /// Normalized, in the caller's order: x1, y1, x2, y2.
     pub(crate) pairs: Vec<[f64; 4]>,
-    /// The same, in random order: the first blocks are a fair sample of all matches.
+    /// The same in random order: the first blocks are a random sample of all matches.
     pub(crate) blocks: Vec<MatchBlock>,
-    /// The place in `pairs` of each lane of `blocks`.
+    /// The index in `pairs` of each lane of `blocks`.
     pub(crate) order: Vec<u32>,
-    /// Of the first image.
+    /// Normalization of the first image.
     pub(crate) first: Normalizer,
-    /// Of the second image; the same scale.
+    /// Normalization of the second image; the same scale.
     pub(crate) second: Normalizer,
 }
 
 impl NormalizedMatches {
-    /// Normalizes and checks `matches`.
+    /// Validates and normalizes `matches`.
     pub(crate) fn new(matches: &[Correspondence], needed: usize) -> Result<Self, EstimateError> {
-        check(matches, needed)?;
+        check_matches(matches, needed)?;
         let mut scratch = Vec::with_capacity(matches.len());
         let mut center = |of: fn(&Correspondence) -> Point2<f64>| {
             Point2::new(
@@ -91,12 +92,12 @@ impl NormalizedMatches {
         if spread == 0.0 {
             return Err(EstimateError::Degenerate { kind: Degeneracy::Coincident });
         }
-        // A point is then about one unit from the origin in each coordinate.
+        // The sum of four coordinate magnitudes is then about 4: about 1 for each coordinate.
         let scale = 4.0 / spread;
         Ok(Self::with(matches, Normalizer { center: c1, scale }, Normalizer { center: c2, scale }))
     }
 
-    /// With given normalizations.
+    /// Applies given normalizations.
     pub(crate) fn with(matches: &[Correspondence], first: Normalizer, second: Normalizer) -> Self {
         let pairs: Vec<[f64; 4]> = matches
             .iter()
@@ -106,10 +107,10 @@ impl NormalizedMatches {
             })
             .collect();
         let mut order: Vec<u32> = (0..pairs.len() as u32).collect();
-        // A fixed shuffle: it decides only how early a bad model is given up.
+        // A shuffle with a fixed seed: it only affects how early the scoring of bad models stops.
         let mut rng = ChaCha8Rng::seed_from_u64(0);
         for i in (1..order.len()).rev() {
-            order.swap(i, below(&mut rng, i as u32 + 1) as usize);
+            order.swap(i, random_below(&mut rng, i as u32 + 1) as usize);
         }
         let lane = |chunk: &[u32], k: usize| -> [f32; LANES] {
             std::array::from_fn(|i| chunk.get(i).map_or(f32::NAN, |&j| pairs[j as usize][k] as f32))
@@ -137,9 +138,9 @@ impl RansacData for NormalizedMatches {
         &self.order
     }
 
-    fn background(&self, most: usize) -> Vec<MatchBlock> {
-        let mut pairs = different(self.order.len(), most);
-        let mut blocks = Vec::with_capacity(most / LANES + 1);
+    fn background(&self, max_count: usize) -> Vec<MatchBlock> {
+        let mut pairs = distinct_pairs(self.order.len(), max_count);
+        let mut blocks = Vec::with_capacity(max_count / LANES + 1);
         while let Some(first) = pairs.next() {
             let mut block = MatchBlock { x1: [0.0; LANES], y1: [0.0; LANES], x2: [0.0; LANES], y2: [0.0; LANES] };
             for (lane, (i, j)) in std::iter::once(first).chain(pairs.by_ref().take(LANES - 1)).enumerate() {
@@ -153,22 +154,23 @@ impl RansacData for NormalizedMatches {
     }
 }
 
-/// Indices of two different ones of `n` data, each pair once before any comes twice: about `most`, a multiple of [`LANES`].
-pub(crate) fn different(n: usize, most: usize) -> impl Iterator<Item = (usize, usize)> {
-    let count = if n < 2 { 0 } else { (n * (n - 1)).min(most).next_multiple_of(LANES) };
-    let apart =
+/// Enumerates about `max_count` (a multiple of [`LANES`]) ordered pairs of distinct indices below `n`; no pair repeats
+/// before all have occurred.
+pub(crate) fn distinct_pairs(n: usize, max_count: usize) -> impl Iterator<Item = (usize, usize)> {
+    let count = if n < 2 { 0 } else { (n * (n - 1)).min(max_count).next_multiple_of(LANES) };
+    let shifted =
         (1..n).flat_map(move |shift| (0..n).map(move |i| (i, if i + shift < n { i + shift } else { i + shift - n })));
-    apart.cycle().take(count)
+    shifted.cycle().take(count)
 }
 
-/// Whether the chosen points, in either image, are fewer than `needed` different ones, or lie on a line: their root mean
-/// square distance from it is at most `width`, in normalized units.
+/// Tests whether the points of either image are degenerate: fewer than `needed` distinct ones, or collinear (an RMS
+/// distance from the fitted line of at most `width`, in normalized units).
 pub(crate) fn point_degeneracy<'a>(
     pairs: impl Iterator<Item = &'a [f64; 4]> + Clone,
     needed: usize,
     width: f64,
 ) -> Option<Degeneracy> {
-    in_either_image(pairs, needed, |points| {
+    degeneracy_in_either_image(pairs, needed, |points| {
         let n = points.len() as f64;
         let (mx, my) = points.iter().fold((0.0, 0.0), |(x, y), p| (x + p[0] / n, y + p[1] / n));
         let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
@@ -177,78 +179,81 @@ pub(crate) fn point_degeneracy<'a>(
             xy += (x - mx) * (y - my) / n;
             yy += (y - my) * (y - my) / n;
         }
-        // The smaller eigenvalue of the covariance, from the larger one so that no digits cancel.
-        let half = (xx + yy) / 2.0;
-        let larger = half + ((xx - yy) / 2.0).hypot(xy);
+        // The smaller eigenvalue of the covariance, computed from the larger one to avoid cancellation.
+        let mean = (xx + yy) / 2.0;
+        let larger = mean + ((xx - yy) / 2.0).hypot(xy);
         let smaller = (xx * yy - xy * xy).max(0.0) / larger;
-        // Rounding of the products above.
+        // The lower bound is the rounding error of the products above.
         (smaller <= (width * width).max(1e-14 * larger)).then_some(Degeneracy::Collinear)
     })
 }
 
-/// As [`point_degeneracy`] for normalized coordinates of calibrated cameras, in which a line is a plane of rays: their root mean square angle from the
-/// plane, or from one ray, is at most `width`. Far from the middle of the image, that is not what the coordinates say.
+/// Tests degeneracy as [`point_degeneracy`], for the rays of calibrated cameras: collinear points correspond to
+/// coplanar rays. Degenerate if the RMS angle in radians from the fitted plane, or from a single ray, is at most
+/// `width`. (Far from the principal point, distances of normalized coordinates differ from angles.)
 pub(crate) fn ray_degeneracy<'a>(
     pairs: impl Iterator<Item = &'a [f64; 4]> + Clone,
     needed: usize,
     width: f64,
 ) -> Option<Degeneracy> {
-    in_either_image(pairs, needed, |points| {
+    degeneracy_in_either_image(pairs, needed, |points| {
         let mut moment = Matrix3::zeros();
         for &[x, y] in points {
             let ray = Vector3::new(x, y, 1.0).normalize();
             moment += ray * ray.transpose();
         }
-        let mut squares = (moment / points.len() as f64).symmetric_eigenvalues();
-        squares.as_mut_slice().sort_unstable_by(f64::total_cmp);
-        // Rounding of the products above.
+        let mut eigenvalues = (moment / points.len() as f64).symmetric_eigenvalues();
+        eigenvalues.as_mut_slice().sort_unstable_by(f64::total_cmp);
+        // The lower bound is the rounding error of the products above.
         let limit = (width * width).max(1e-14);
-        let kind = if squares[1] <= limit { Degeneracy::Coincident } else { Degeneracy::Collinear };
-        (squares[0] <= limit).then_some(kind)
+        let kind = if eigenvalues[1] <= limit { Degeneracy::Coincident } else { Degeneracy::Collinear };
+        (eigenvalues[0] <= limit).then_some(kind)
     })
 }
 
-/// What is wrong with the points of the first image, or else of the second: fewer than `needed` different ones, or what `judge` finds.
-fn in_either_image<'a>(
+/// Returns the degeneracy of the points of the first image, else of the second: fewer than `needed` distinct ones, or
+/// the result of `test`.
+fn degeneracy_in_either_image<'a>(
     pairs: impl Iterator<Item = &'a [f64; 4]> + Clone,
     needed: usize,
-    judge: impl Fn(&[[f64; 2]]) -> Option<Degeneracy>,
+    test: impl Fn(&[[f64; 2]]) -> Option<Degeneracy>,
 ) -> Option<Degeneracy> {
     [0, 2].into_iter().find_map(|image| {
         let points: Vec<[f64; 2]> = pairs.clone().map(|p| [p[image], p[image + 1]]).collect();
-        if fewer_than(needed, &points) { Some(Degeneracy::Coincident) } else { judge(&points) }
+        if has_fewer_distinct_than(needed, &points) { Some(Degeneracy::Coincident) } else { test(&points) }
     })
 }
 
-/// Whether there are fewer than `needed` different points.
-fn fewer_than(needed: usize, points: &[[f64; 2]]) -> bool {
-    let mut different: Vec<[f64; 2]> = Vec::with_capacity(needed);
+/// Returns whether there are fewer than `needed` distinct points. O(points × needed).
+fn has_fewer_distinct_than(needed: usize, points: &[[f64; 2]]) -> bool {
+    let mut distinct: Vec<[f64; 2]> = Vec::with_capacity(needed);
     for p in points {
-        if different.len() == needed {
+        if distinct.len() == needed {
             break;
         }
-        if !different.contains(p) {
-            different.push(*p);
+        if !distinct.contains(p) {
+            distinct.push(*p);
         }
     }
-    different.len() < needed
+    distinct.len() < needed
 }
 
-/// A number in `0..n` (n > 0), by multiplication; the bias is below n/2³².
+/// Draws an integer in `0..n` (n > 0) by multiplication; the bias is below n/2³².
 #[inline]
-pub(crate) fn below(rng: &mut ChaCha8Rng, n: u32) -> u32 {
+pub(crate) fn random_below(rng: &mut ChaCha8Rng, n: u32) -> u32 {
     ((u64::from(rng.next_u32()) * u64::from(n)) >> 32) as u32
 }
 
-/// Refuses too few matches and useless coordinates.
-pub(crate) fn check(matches: &[Correspondence], needed: usize) -> Result<(), EstimateError> {
+/// Rejects too few matches and coordinates that are NaN, infinite or too large.
+pub(crate) fn check_matches(matches: &[Correspondence], needed: usize) -> Result<(), EstimateError> {
     if matches.len() < needed {
         return Err(EstimateError::NotEnoughMatches { got: matches.len(), needed });
     }
-    // Beyond this, squares of differences of squares lose every digit or overflow.
-    const LIMIT: f64 = 1e12;
-    let useless = |m: &Correspondence| [m.a.x, m.a.y, m.b.x, m.b.y].iter().any(|v| v.is_nan() || v.abs() > LIMIT);
-    match matches.iter().position(useless) {
+    // Beyond this, differences of products lose all digits or overflow.
+    const MAX_COORDINATE: f64 = 1e12;
+    let is_invalid =
+        |m: &Correspondence| [m.a.x, m.a.y, m.b.x, m.b.y].iter().any(|v| v.is_nan() || v.abs() > MAX_COORDINATE);
+    match matches.iter().position(is_invalid) {
         Some(index) => Err(EstimateError::NotFinite { index }),
         None => Ok(()),
     }
@@ -260,8 +265,8 @@ fn median_of(scratch: &mut Vec<f64>, values: impl Iterator<Item = f64>) -> f64 {
     median(scratch).unwrap_or(0.0)
 }
 
-/// Hartley's normalization: centroid at the origin, mean distance √2. `None` where all points coincide.
-pub(crate) fn hartley(points: impl Iterator<Item = Point2<f64>> + Clone) -> Option<Normalizer> {
+/// Computes Hartley's normalization: centroid at the origin, mean distance √2. `None` if all points coincide.
+pub(crate) fn hartley_normalization(points: impl Iterator<Item = Point2<f64>> + Clone) -> Option<Normalizer> {
     let mut n = 0.0;
     let mut sum = cv_core::Vector2::zeros();
     for p in points.clone() {
@@ -270,6 +275,6 @@ pub(crate) fn hartley(points: impl Iterator<Item = Point2<f64>> + Clone) -> Opti
     }
     let center = Point2::from(sum / n);
     let mean = points.map(|p| (p - center).norm()).sum::<f64>() / n;
-    // Below this the spread is rounding of the coordinates themselves.
+    // Below this, the differences are rounding errors of the coordinates.
     (mean > 1e-14 * (1.0 + center.coords.norm())).then(|| Normalizer { center, scale: std::f64::consts::SQRT_2 / mean })
 }

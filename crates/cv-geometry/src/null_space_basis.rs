@@ -1,7 +1,7 @@
-//! Bases of null spaces, as the minimal solvers want them.
+//! Conditioning of null space bases for the minimal solvers.
 
-/// Gram and Schmidt's method. The coefficients of the cubics are products of three entries: a basis of uneven lengths or small
-/// angles costs three times its digits.
+/// Orthonormalizes a basis by the modified Gram–Schmidt method. The coefficients of the cubics are products of three
+/// entries, so a badly conditioned basis loses three times its digits.
 #[inline(always)]
 pub(crate) fn orthonormalize<const N: usize>(basis: &mut [[f64; 9]; N]) {
     for i in 0..N {
@@ -16,16 +16,17 @@ pub(crate) fn orthonormalize<const N: usize>(basis: &mut [[f64; 9]; N]) {
     }
 }
 
-/// Reflects a basis at a plane that nothing else knows.
+/// Applies a Householder reflection with a fixed generic normal to a basis.
 ///
-/// Elimination leaves ones and zeros. Where motion and points are regular (a rectified pair, a step ahead, corners of a grid), one of its vectors, or the
-/// sum of two, may be the answer itself, which then has no finite coordinates in which another vector counts one.
+/// Elimination leaves ones and zeros. For regular motions and points (a rectified pair, forward motion, corners of a
+/// grid), the solution may be one of its vectors or the sum of two. Its coordinates are then infinite, since the
+/// solvers fix the coefficient of the last vector to 1.
 #[inline(always)]
-pub(crate) fn mix<const N: usize>(basis: &mut [[f64; 9]; N]) {
+pub(crate) fn reflect_generic<const N: usize>(basis: &mut [[f64; 9]; N]) {
     const NORMAL: [f64; 4] = [0.7310585786, 0.3934693403, -0.5772156649, 0.9159655942];
     let squares: f64 = NORMAL[..N].iter().map(|x| x * x).sum();
     for i in 0..9 {
-        let along: f64 = basis.iter().zip(NORMAL).map(|(b, x)| b[i] * x).sum::<f64>() * (2.0 / squares);
-        basis.iter_mut().zip(NORMAL).for_each(|(b, x)| b[i] -= along * x);
+        let projection: f64 = basis.iter().zip(NORMAL).map(|(b, x)| b[i] * x).sum::<f64>() * (2.0 / squares);
+        basis.iter_mut().zip(NORMAL).for_each(|(b, x)| b[i] -= projection * x);
     }
 }

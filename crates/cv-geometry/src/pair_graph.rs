@@ -1,23 +1,23 @@
-//! The graph of photographs (nodes) and their verified pairs (edges).
+//! The view graph: images (nodes) and verified pairs (edges).
 
 use cv_core::UnionFind;
 use std::collections::VecDeque;
 
-/// A verified pair of photographs `a` and `b`.
+/// An edge of the view graph: a verified image pair.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PairEdge {
-    /// First photograph.
+    /// Index of the first image.
     pub a: usize,
-    /// Second photograph.
+    /// Index of the second image.
     pub b: usize,
-    /// How firmly they hold together, such as the number of inliers; more is firmer.
+    /// Strength of the connection, such as the number of inliers; larger is stronger.
     pub weight: f64,
 }
 
-/// An edge names a node that is not there.
+/// An edge has a node index out of range.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
-#[error("edge {edge} joins {a} and {b} of {nodes} nodes")]
+#[error("edge {edge} connects nodes {a} and {b}, but there are only {nodes} nodes")]
 pub struct NoSuchNode {
     /// Index of the edge.
     pub edge: usize,
@@ -25,11 +25,11 @@ pub struct NoSuchNode {
     pub a: usize,
     /// Its second node.
     pub b: usize,
-    /// Nodes of the graph.
+    /// Number of nodes of the graph.
     pub nodes: usize,
 }
 
-/// The graph of photographs and their verified pairs. What it answers depends on the order of nodes and edges only where weights are equal.
+/// The view graph. Results depend on the order of nodes and edges only for ties of weights.
 ///
 /// ```
 /// use cv_geometry::{PairEdge, PairGraph};
@@ -47,19 +47,19 @@ pub struct PairGraph {
     edges: Vec<PairEdge>,
 }
 
-/// One step of a walk over a tree: `node` is reached from `parent` through edge `edge`.
+/// A step of a tree traversal: `node` is reached from `parent` by edge `edge`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TreeStep {
-    /// The node that was reached before.
+    /// The node that was visited before.
     pub parent: usize,
-    /// The node that is reached.
+    /// The newly visited node.
     pub node: usize,
     /// Index of the edge between them.
     pub edge: usize,
 }
 
 impl PairGraph {
-    /// A graph of the nodes `0..nodes`.
+    /// Creates a graph with the nodes `0..nodes`.
     ///
     /// # Errors
     /// [`NoSuchNode`].
@@ -70,18 +70,18 @@ impl PairGraph {
         }
     }
 
-    /// Number of nodes.
+    /// Returns the number of nodes.
     pub fn nodes(&self) -> usize {
         self.nodes
     }
 
-    /// The edges, as they were given.
+    /// Returns the edges in their original order.
     pub fn edges(&self) -> &[PairEdge] {
         &self.edges
     }
 
-    /// The connected components, the largest first (of equals, the one with the greater sum of weights, then the one with the lowest
-    /// node). Nodes ascend within each; a node without edges is a component of its own.
+    /// Computes the connected components, by decreasing size (ties: by decreasing sum of weights, then by the lowest
+    /// node). Nodes are ascending; an isolated node is a component.
     pub fn connected_components(&self) -> Vec<Vec<usize>> {
         let mut sets = UnionFind::new(self.nodes);
         for e in &self.edges {
@@ -100,7 +100,8 @@ impl PairGraph {
         components.into_iter().map(|(_, nodes)| nodes).collect()
     }
 
-    /// The edges (as indices, the firmest first) of the spanning tree of greatest weight of every component (Kruskal 1956).
+    /// Computes the edges (indices, by decreasing weight) of the maximum spanning tree of each component (Kruskal
+    /// 1956).
     pub fn maximum_spanning_forest(&self) -> Vec<usize> {
         let mut order: Vec<usize> = (0..self.edges.len()).collect();
         order.sort_by(|&i, &j| self.edges[j].weight.total_cmp(&self.edges[i].weight).then(i.cmp(&j)));
@@ -109,22 +110,22 @@ impl PairGraph {
         order
     }
 
-    /// Breadth-first walk over the edges `tree` from `root`, without `root` itself.
+    /// Traverses the edges `tree` breadth-first from `root`; the result does not contain `root`.
     pub fn breadth_first(&self, tree: &[usize], root: usize) -> Vec<TreeStep> {
         let mut neighbors: Vec<Vec<(usize, usize)>> = vec![Vec::new(); self.nodes];
         for (e, edge) in tree.iter().filter_map(|&e| Some((e, self.edges.get(e)?))) {
             neighbors[edge.a].push((edge.b, e));
             neighbors[edge.b].push((edge.a, e));
         }
-        let mut seen = vec![false; self.nodes];
+        let mut is_visited = vec![false; self.nodes];
         let (mut steps, mut queue) = (Vec::new(), VecDeque::new());
-        if let Some(seen) = seen.get_mut(root) {
-            *seen = true;
+        if let Some(visited) = is_visited.get_mut(root) {
+            *visited = true;
             queue.push_back(root);
         }
         while let Some(parent) = queue.pop_front() {
             for &(node, edge) in &neighbors[parent] {
-                if !std::mem::replace(&mut seen[node], true) {
+                if !std::mem::replace(&mut is_visited[node], true) {
                     steps.push(TreeStep { parent, node, edge });
                     queue.push_back(node);
                 }
@@ -133,10 +134,10 @@ impl PairGraph {
         steps
     }
 
-    /// The center of the tree (of the largest one of a forest): the node with the least distance to its farthest node, then with the least sum of
-    /// distances, then with the greatest weight of its edges. `None` without nodes. O(nodes²).
+    /// Finds the center of the tree (of the largest tree of a forest): the node of minimum eccentricity, then of
+    /// minimum sum of distances, then of maximum weight of its edges. `None` without nodes. O(nodes²).
     pub fn center(&self, tree: &[usize]) -> Option<usize> {
-        let rate = |root: usize| {
+        let criteria = |root: usize| {
             let mut depth = vec![0_usize; self.nodes];
             let (mut eccentricity, mut sum) = (0, 0);
             let steps = self.breadth_first(tree, root);
@@ -148,11 +149,11 @@ impl PairGraph {
             let weight: f64 = self.edges.iter().filter(|e| e.a == root || e.b == root).map(|e| e.weight).sum();
             (steps.len(), eccentricity, sum, weight)
         };
-        let better = |x: &(usize, usize, usize, f64), y: &(usize, usize, usize, f64)| {
+        let compare = |x: &(usize, usize, usize, f64), y: &(usize, usize, usize, f64)| {
             y.0.cmp(&x.0).then(x.1.cmp(&y.1)).then(x.2.cmp(&y.2)).then(y.3.total_cmp(&x.3))
         };
-        let rated = (0..self.nodes).map(|node| (rate(node), node));
-        rated.min_by(|(x, i), (y, j)| better(x, y).then(i.cmp(j))).map(|(_, node)| node)
+        let candidates = (0..self.nodes).map(|node| (criteria(node), node));
+        candidates.min_by(|(x, i), (y, j)| compare(x, y).then(i.cmp(j))).map(|(_, node)| node)
     }
 }
 
@@ -167,20 +168,20 @@ mod tests {
     }
 
     #[test]
-    fn two_components_are_told_apart_and_the_larger_comes_first() {
+    fn components_are_sorted_by_decreasing_size() {
         let graph = graph(6, &[(4, 0, 9.0), (1, 2, 5.0), (2, 5, 5.0)]);
         assert_eq!(graph.connected_components(), vec![vec![1, 2, 5], vec![0, 4], vec![3]]);
     }
 
     #[test]
-    fn the_spanning_tree_takes_the_strongest_edges() {
+    fn the_spanning_tree_has_the_strongest_edges() {
         let graph = graph(4, &[(0, 1, 10.0), (1, 2, 20.0), (0, 2, 30.0), (2, 3, 1.0)]);
         assert_eq!(graph.maximum_spanning_forest(), vec![2, 1, 3]);
     }
 
     #[test]
-    fn the_center_of_a_chain_is_found_in_any_file_order() {
-        // A chain of five, its photographs numbered in shuffled order: 3 - 0 - 4 - 1 - 2.
+    fn the_center_of_a_chain_does_not_depend_on_the_numbering() {
+        // A chain of five images in the order 3 - 0 - 4 - 1 - 2.
         let graph = graph(5, &[(3, 0, 1.0), (4, 1, 1.0), (1, 2, 1.0), (0, 4, 1.0)]);
         let tree = graph.maximum_spanning_forest();
         assert_eq!(graph.center(&tree), Some(4));
@@ -189,13 +190,13 @@ mod tests {
     }
 
     #[test]
-    fn nothing_and_what_is_not_there_have_answers() {
+    fn empty_graphs_and_indices_out_of_range() {
         let empty = graph(0, &[]);
         assert_eq!((empty.connected_components().len(), empty.center(&[])), (0, None));
         let edge = PairEdge { a: 0, b: 3, weight: 1.0 };
         assert_eq!(PairGraph::new(3, vec![edge]), Err(NoSuchNode { edge: 0, a: 0, b: 3, nodes: 3 }));
         assert!(graph(3, &[(0, 1, 1.0)]).breadth_first(&[0, 7], 9).is_empty());
-        // The one node without edges would be nearest to all it reaches.
+        // The isolated node has eccentricity 0, but is not in the largest tree.
         assert_eq!(graph(3, &[(1, 2, 1.0)]).center(&[0]), Some(1));
     }
 
@@ -229,7 +230,7 @@ mod tests {
         #![proptest_config(ProptestConfig::with_cases(200))]
 
         #[test]
-        fn components_are_what_paths_connect(graph in any_graph()) {
+        fn nodes_are_in_one_component_if_a_path_connects_them(graph in any_graph()) {
             let all: Vec<usize> = (0..graph.edges().len()).collect();
             let d = distances(&graph, &all);
             let components = graph.connected_components();
@@ -245,31 +246,31 @@ mod tests {
         }
 
         #[test]
-        fn no_spanning_forest_weighs_more(graph in any_graph()) {
+        fn the_spanning_forest_has_the_maximum_weight(graph in any_graph()) {
             let forest = graph.maximum_spanning_forest();
-            let weigh = |edges: &[usize]| edges.iter().map(|&e| graph.edges()[e].weight).sum::<f64>();
+            let total_weight = |edges: &[usize]| edges.iter().map(|&e| graph.edges()[e].weight).sum::<f64>();
             let rank = graph.nodes() - graph.connected_components().len();
             prop_assert_eq!(forest.len(), rank);
-            // Every choice of as many edges that connects as much.
+            // All spanning forests by exhaustive enumeration.
             for bits in 0..1_u32 << graph.edges().len() {
                 let chosen: Vec<usize> = (0..graph.edges().len()).filter(|e| bits >> e & 1 == 1).collect();
                 if chosen.len() == rank && distances(&graph, &chosen) .iter().flatten().filter(|d| **d < usize::MAX / 2).count()
                     == distances(&graph, &forest).iter().flatten().filter(|d| **d < usize::MAX / 2).count() {
-                    prop_assert!(weigh(&chosen) <= weigh(&forest));
+                    prop_assert!(total_weight(&chosen) <= total_weight(&forest));
                 }
             }
         }
 
         #[test]
-        fn no_node_of_the_largest_tree_is_nearer_to_its_farthest(graph in any_graph()) {
+        fn the_center_has_the_minimum_eccentricity_of_the_largest_tree(graph in any_graph()) {
             let tree = graph.maximum_spanning_forest();
             let d = distances(&graph, &tree);
             let reached = |i: usize| d[i].iter().filter(|d| **d < usize::MAX / 2).count();
-            let farthest = |i: usize| d[i].iter().copied().filter(|d| *d < usize::MAX / 2).max();
+            let eccentricity = |i: usize| d[i].iter().copied().filter(|d| *d < usize::MAX / 2).max();
             let center = graph.center(&tree).unwrap();
             for i in 0..graph.nodes() {
                 prop_assert!(reached(center) >= reached(i));
-                prop_assert!(reached(center) > reached(i) || farthest(center) <= farthest(i));
+                prop_assert!(reached(center) > reached(i) || eccentricity(center) <= eccentricity(i));
             }
             for step in graph.breadth_first(&tree, center) {
                 prop_assert_eq!(d[center][step.node], d[center][step.parent] + 1);

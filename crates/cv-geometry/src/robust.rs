@@ -1,9 +1,9 @@
-//! What robust estimators return.
+//! The result of robust estimators.
 
 use crate::ransac::Consensus;
 use cv_core::Correspondence;
 
-/// A model and the matches that fit it.
+/// A model and its inliers.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct RobustModel<M> {
@@ -13,15 +13,16 @@ pub struct RobustModel<M> {
     pub inliers: Vec<usize>,
     /// Root mean square residual of the inliers, in the unit of the matches; NaN without inliers.
     pub rms: f64,
-    /// Samples drawn.
+    /// Number of minimal samples drawn.
     pub iterations: usize,
-    /// log₁₀ of the number of false alarms: of models as well supported to be expected of so many wrong matches, below −2: −20 says that one in 10²⁰ such sets has
-    /// one. `None` where there are no more matches than a sample takes.
+    /// log₁₀ of the number of false alarms (NFA): the expected number of models with as much support among as many
+    /// random matches. Below −2; at −20, one in 10²⁰ sets of random matches has such a model. `None` if there are no
+    /// more matches than the minimal sample.
     pub log_nfa: Option<f64>,
 }
 
 impl<M> RobustModel<M> {
-    /// The same with another form of the model.
+    /// Converts the model to another parameterization.
     pub(crate) fn map<N>(self, f: impl FnOnce(M) -> N) -> RobustModel<N> {
         RobustModel {
             model: f(self.model),
@@ -32,12 +33,12 @@ impl<M> RobustModel<M> {
         }
     }
 
-    /// With the inliers by `residual`, of what the search found.
+    /// Computes inliers and RMS by `residual`; the other fields are those of `consensus`.
     pub(crate) fn new<N>(
         model: M,
         matches: &[Correspondence],
         threshold: f64,
-        found: &Consensus<N>,
+        consensus: &Consensus<N>,
         residual: impl Fn(&M, &Correspondence) -> f64,
     ) -> Self {
         let mut inliers = Vec::new();
@@ -50,6 +51,6 @@ impl<M> RobustModel<M> {
             }
         }
         let rms = (sum / inliers.len() as f64).sqrt();
-        Self { model, inliers, rms, iterations: found.iterations, log_nfa: found.log_nfa }
+        Self { model, inliers, rms, iterations: consensus.iterations, log_nfa: consensus.log_nfa }
     }
 }

@@ -1,9 +1,9 @@
-//! Relative pose and shared focal length of two views, where many matches may be wrong.
+//! Robust estimation of the relative pose and the shared focal length of two views.
 
 use crate::epipolar::{Epipolar, SampsonKernel, SampsonProblem, refine_sampson, sampson};
 use crate::error::{Degeneracy, EstimateError};
 use crate::essential::{decompose_essential, essential_from_pose, in_front};
-use crate::match_blocks::{LANES, MatchBlock, NormalizedMatches, Normalizer, check, point_degeneracy};
+use crate::match_blocks::{LANES, MatchBlock, NormalizedMatches, Normalizer, check_matches, point_degeneracy};
 use crate::ransac::{Estimator, RobustOptions, Scorer, TukeyBiweight, ransac};
 use crate::robust::RobustModel;
 use crate::rotation::orthonormalized;
@@ -12,7 +12,7 @@ use cv_core::{Correspondence, Matrix3, Point2, Pose, Progress, Vector3};
 use cv_numeric::LeastSquares;
 use nalgebra::{SMatrix, SVector};
 
-/// A relative pose, and the focal length of both cameras.
+/// A relative pose and the focal length of both cameras.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct SharedFocalPose {
@@ -23,13 +23,14 @@ pub struct SharedFocalPose {
 }
 
 impl SharedFocalPose {
-    /// The fundamental matrix between coordinates relative to the principal points, times the squared focal length.
+    /// Returns the fundamental matrix between coordinates relative to the principal points, times the squared focal
+    /// length.
     pub fn fundamental(&self) -> Matrix3<f64> {
         let k = self.scaling();
         k * essential_from_pose(&self.pose) * k
     }
 
-    /// K⁻¹ times the focal length.
+    /// Returns K⁻¹ times the focal length.
     fn scaling(&self) -> Matrix3<f64> {
         Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, self.focal))
     }
@@ -39,68 +40,70 @@ impl SharedFocalPose {
     }
 }
 
-/// The relative pose and the focal length of two cameras of one unknown focal length, from matches in pixels relative to the principal points,
-/// of which many may be wrong.
+/// Estimates the relative pose of two cameras with the same unknown focal length, and that focal length, robustly from
+/// tentative matches in pixels relative to the principal points.
 ///
-/// RANSAC over six-point samples ([`fundamental_six_point`]) with local optimization of pose and focal length together on the Sampson error.
-/// Inliers lie in front of both cameras.
+/// RANSAC with the six-point algorithm ([`fundamental_six_point`]) and joint local optimization of pose and focal
+/// length on the Sampson error. Inliers lie in front of both cameras.
 ///
 /// # Errors
-/// [`EstimateError`]: fewer than seven matches, a coordinate that is not finite, coincident or collinear points, or no model supported by more
-/// matches than the number of false alarms allows.
+/// [`EstimateError`]: fewer than seven matches, a coordinate that is not finite, coincident or collinear points, or no
+/// model with a small enough number of false alarms.
 pub fn estimate_shared_focal_pose(
     matches: &[Correspondence],
     options: &RobustOptions,
     progress: &dyn Progress,
 ) -> Result<RobustModel<SharedFocalPose>, EstimateError> {
     options.check()?;
-    check(matches, 7)?;
-    let size = size(matches);
-    if size <= 0.0 {
+    check_matches(matches, 7)?;
+    let largest_coordinate = largest_coordinate(matches);
+    if largest_coordinate <= 0.0 {
         return Err(EstimateError::Degenerate { kind: Degeneracy::Coincident });
     }
-    let normalizer = Normalizer { center: Point2::origin(), scale: 1.0 / size };
+    let normalizer = Normalizer { center: Point2::origin(), scale: 1.0 / largest_coordinate };
     let set = NormalizedMatches::with(matches, normalizer, normalizer);
     if let Some(kind) = point_degeneracy(set.pairs.iter(), 7, 0.0) {
         return Err(EstimateError::Degenerate { kind });
     }
-    let found = ransac(&FocalEstimator { set, scale: 1.0 / size }, options, progress)?;
-    let model = found.model.scaled(size);
+    let consensus = ransac(&FocalEstimator { set, scale: 1.0 / largest_coordinate }, options, progress)?;
+    let model = consensus.model.scaled(largest_coordinate);
     let f = model.fundamental();
     let residual = |m: &SharedFocalPose, pair: &Correspondence| {
         let ray = |p: &Point2<f64>| Vector3::new(p.x, p.y, m.focal);
-        let front = in_front(m.pose.rotation.matrix(), &m.pose.translation, &ray(&pair.a), &ray(&pair.b));
-        if front { sampson(&f, pair) } else { f64::INFINITY }
+        let is_in_front = in_front(m.pose.rotation.matrix(), &m.pose.translation, &ray(&pair.a), &ray(&pair.b));
+        if is_in_front { sampson(&f, pair) } else { f64::INFINITY }
     };
-    Ok(RobustModel::new(model, matches, options.threshold, &found, residual))
+    Ok(RobustModel::new(model, matches, options.threshold, &consensus, residual))
 }
 
-/// Refines a pose and a focal length on all `matches` (pixels relative to the principal points) that are within reach, to the least robust
-/// Sampson error.
+/// Refines a relative pose and a focal length by minimizing the robust Sampson error of `matches` (pixels relative to
+/// the principal points).
 ///
-/// Returns them and their loss: each match adds 0 (exact) to 1 (beyond 2.5 thresholds, in pixels).
+/// Returns them and the loss, to which each match adds 0 (exact) to 1 (beyond 2.5 thresholds, in pixels).
 pub fn refine_shared_focal_pose(
     start: &SharedFocalPose,
     matches: &[Correspondence],
     threshold: f64,
 ) -> (SharedFocalPose, f64) {
-    let size = size(matches).max(f64::MIN_POSITIVE);
-    let unit = |m: &Correspondence| [m.a.x / size, m.a.y / size, m.b.x / size, m.b.y / size];
-    let pairs: Vec<[f64; 4]> = matches.iter().map(unit).collect();
-    let problem = SampsonProblem::new(&pairs, &TukeyBiweight, threshold / size);
-    let start = start.scaled(1.0 / size);
-    let refined = refine_sampson(&problem, start, 50).and_then(straightened).unwrap_or(start);
-    (refined.scaled(size), problem.cost(&refined))
+    let largest_coordinate = largest_coordinate(matches).max(f64::MIN_POSITIVE);
+    let scaled = |m: &Correspondence| {
+        [m.a.x / largest_coordinate, m.a.y / largest_coordinate, m.b.x / largest_coordinate, m.b.y / largest_coordinate]
+    };
+    let pairs: Vec<[f64; 4]> = matches.iter().map(scaled).collect();
+    let problem = SampsonProblem::new(&pairs, &TukeyBiweight, threshold / largest_coordinate);
+    let start = start.scaled(1.0 / largest_coordinate);
+    let refined = refine_sampson(&problem, start, 50).and_then(with_orthonormal_rotation).unwrap_or(start);
+    (refined.scaled(largest_coordinate), problem.cost(&refined))
 }
 
-/// Largest coordinate.
-fn size(matches: &[Correspondence]) -> f64 {
+/// Returns the largest coordinate magnitude.
+fn largest_coordinate(matches: &[Correspondence]) -> f64 {
     let largest = |m: &Correspondence| m.a.coords.amax().max(m.b.coords.amax());
     matches.iter().map(largest).fold(0.0, f64::max)
 }
 
-/// With the rotation made one again after many small turns.
-fn straightened(model: SharedFocalPose) -> Option<SharedFocalPose> {
+/// Re-orthonormalizes the rotation after many small updates.
+fn with_orthonormal_rotation(model: SharedFocalPose) -> Option<SharedFocalPose> {
     let rotation = orthonormalized(&model.pose.rotation)?;
     Some(SharedFocalPose { pose: Pose::new(rotation, model.pose.translation), ..model })
 }
@@ -113,14 +116,14 @@ impl Epipolar<6> for SharedFocalPose {
 
     fn tangent(&self) -> SMatrix<f64, 9, 6> {
         let k = self.scaling();
-        let of_pose = Epipolar::<5>::tangent(&self.pose);
+        let pose_tangent = Epipolar::<5>::tangent(&self.pose);
         let f = self.fundamental();
         SMatrix::from_fn(|i, d| {
             let (row, column) = (i / 3, i % 3);
             if d < 5 {
-                of_pose[(i, d)] * k[(row, row)] * k[(column, column)]
+                pose_tangent[(i, d)] * k[(row, row)] * k[(column, column)]
             } else {
-                // Of degree one in the focal length for each third coordinate.
+                // The entries are of degree one in the focal length for each third coordinate.
                 f[(row, column)] * f64::from(u8::from(row == 2) + u8::from(column == 2))
             }
         })
@@ -128,7 +131,7 @@ impl Epipolar<6> for SharedFocalPose {
 
     fn step(&self, d: &SVector<f64, 6>) -> Self {
         let pose = Epipolar::<5>::step(&self.pose, &d.fixed_rows::<5>(0).into_owned());
-        // A step of more than a factor of two is beyond what a linearization knows.
+        // Steps are limited to a factor of two, beyond which the linearization is not valid.
         Self { pose, focal: self.focal * d[5].clamp(-0.7, 0.7).exp() }
     }
 }
@@ -142,16 +145,16 @@ impl Estimator for FocalEstimator {
     type Model = SharedFocalPose;
     type Data = NormalizedMatches;
     type Kernel = SampsonKernel;
-    const SAMPLE: usize = 6;
+    const SAMPLE_SIZE: usize = 6;
     const RESIDUAL_DIMENSION: i32 = 1;
-    // As for calibrated poses.
-    const RESAMPLES: usize = 20;
+    // The same as for calibrated poses.
+    const INNER_SAMPLES: usize = 20;
 
     fn data(&self) -> &NormalizedMatches {
         &self.set
     }
 
-    fn unit(&self) -> f64 {
+    fn threshold_scale(&self) -> f64 {
         self.scale
     }
 
@@ -164,7 +167,8 @@ impl Estimator for FocalEstimator {
             let ray = |p: &Point2<f64>| Vector3::new(p.x, p.y, focal);
             for pose in decompose_essential(&(k * f * k)).into_iter().flatten() {
                 let (r, t) = (pose.rotation.matrix(), &pose.translation);
-                // At most one of the four poses has all six in front, and for most wrong samples none.
+                // Cheirality: at most one of the four poses has all six points in front, and for most samples with
+                // outliers none.
                 if (0..6).all(|i| in_front(r, t, &ray(&a[i]), &ray(&b[i]))) {
                     models.push(SharedFocalPose { pose, focal });
                     return;
@@ -190,7 +194,7 @@ impl Estimator for FocalEstimator {
         iterations: usize,
     ) -> Option<SharedFocalPose> {
         let problem = SampsonProblem::new(&self.set.pairs, scorer, threshold);
-        refine_sampson(&problem, *model, iterations).and_then(straightened)
+        refine_sampson(&problem, *model, iterations).and_then(with_orthonormal_rotation)
     }
 }
 
@@ -201,7 +205,7 @@ mod tests {
     use cv_core::Silent;
     use proptest::prelude::*;
 
-    /// Relative to the principal point.
+    /// Returns the matches relative to the principal point.
     fn centered(views: &TwoViews, matches: Vec<Correspondence>) -> Vec<Correspondence> {
         let c = Point2::new(views.camera.cx, views.camera.cy).coords;
         matches.into_iter().map(|m| Correspondence { a: m.a - c, b: m.b - c }).collect()
@@ -209,7 +213,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn the_tangent_is_the_derivative(seed: u64, focal in 0.3..3.0f64) {
+        fn the_analytic_tangent_equals_the_numeric_derivative(seed: u64, focal in 0.3..3.0f64) {
             let model = SharedFocalPose { pose: TwoViews::random(seed).pose, focal };
             let tangent = Epipolar::<6>::tangent(&model);
             for i in 0..6 {
@@ -225,8 +229,8 @@ mod tests {
     }
 
     #[test]
-    fn exact_matches_give_the_exact_focal_length_and_wrong_ones_matter_little() {
-        let (mut exact, mut off) = (Vec::new(), Vec::new());
+    fn the_focal_length_is_exact_on_exact_matches_and_robust_to_outliers() {
+        let (mut exact, mut contaminated) = (Vec::new(), Vec::new());
         for seed in 0..40 {
             let views = TwoViews::random(seed);
             let mut m = centered(&views, views.matches(60, 0.0));
@@ -237,20 +241,20 @@ mod tests {
                 (refine_shared_focal_pose(&found.model, m, 1.0).0.focal / 500.0 - 1.0).abs()
             };
             exact.push(error(&m));
-            m.extend(centered(&views, views.wrong(40)));
-            off.push(error(&m));
+            m.extend(centered(&views, views.outliers(40)));
+            contaminated.push(error(&m));
         }
         exact.sort_by(f64::total_cmp);
-        off.sort_by(f64::total_cmp);
-        // Steps end when the cost falls by less than a millionth of what it is: of nothing, at 1e-3 px or less. The least favorable motion of
-        // forty shows the focal length by a hundredth of a pixel for each per cent.
+        contaminated.sort_by(f64::total_cmp);
+        // The relative cost tolerance is 1e-6, so the residuals stop at about 1e-3 px. For the least favorable of the
+        // forty motions, a change of the focal length by 1 % changes the residuals by 0.01 px.
         assert!(exact[39] < 1e-3, "{exact:?}");
-        // One or two wrong matches of forty lie near the right lines by chance, and pull as one or two of sixty do.
-        assert!(off[20] < 5e-3 && off[39] < 0.1, "{off:?}");
+        // One or two of the forty outliers are near their epipolar lines by chance and bias the estimate.
+        assert!(contaminated[20] < 5e-3 && contaminated[39] < 0.1, "{contaminated:?}");
     }
 
     #[test]
-    fn bad_input_gets_a_typed_answer() {
+    fn invalid_and_degenerate_input_is_a_typed_error() {
         let views = TwoViews::random(1);
         let options = RobustOptions { threshold: 1.0, ..RobustOptions::default() };
         let good = centered(&views, views.matches(20, 0.0));

@@ -1,49 +1,51 @@
-//! Relative poses of two views of one unknown focal length, through six points.
+//! The six-point algorithm: relative pose of two views with a shared unknown focal length.
 
 use crate::fundamental::epipolar_row;
-use crate::null_space_basis::{mix, orthonormalize};
+use crate::null_space_basis::{orthonormalize, reflect_generic};
 use cv_core::{Matrix3, Point2};
 use cv_numeric::{kernel_vector, null_space, real_quadratic_eigenvalues};
 use nalgebra::DMatrix;
 
-/// A polynomial of degree one in x, y: coefficients of x, y, 1.
+/// Polynomial of degree one in x, y: coefficients of x, y, 1.
 type Linear = [f64; 3];
-/// Of degree two: x², xy, y², x, y, 1.
+/// Polynomial of degree two: x², xy, y², x, y, 1.
 type Quadratic = [f64; 6];
-/// Of degree three: x³, x²y, xy², y³, x², xy, y², x, y, 1.
+/// Polynomial of degree three: x³, x²y, xy², y³, x², xy, y², x, y, 1.
 type Cubic = [f64; 10];
 
-/// The fundamental matrices `F` (of Frobenius norm 1) and focal lengths `f` (in the unit of the points) of two cameras of the same focal
-/// length, for six matches whose coordinates are relative to the principal points, with square pixels: `bᵢᵀ F aᵢ = 0`, and
-/// `diag(f, f, 1) F diag(f, f, 1)` is essential.
+/// Computes the fundamental matrices `F` (Frobenius norm 1) and focal lengths `f` (in the unit of the points) of two
+/// cameras with the same focal length, for six matches with coordinates relative to the principal points and square
+/// pixels: `bᵢᵀ F aᵢ = 0`, and `diag(f, f, 1) F diag(f, f, 1)` is essential.
 ///
-/// Calls `found` for each, at most fifteen times; seldom more than five have a positive f. For none where the points are degenerate.
-/// Stewénius, Nistér, Kahl & Schaffalitzky, "A minimal solution for relative pose with unknown focal length", CVPR 2005: the ten cubics
-/// of an essential matrix in two unknowns, whose coefficients are quadratic in `1/f²`; solved as an eigenvalue problem (Kukelova,
-/// Bujnak & Pajdla, "Polynomial eigenvalue solutions to the 5-pt and 6-pt relative pose problems", BMVC 2008).
+/// Calls `emit` for each, at most fifteen times; rarely more than five have a positive f. For none if the points are
+/// degenerate. Stewénius, Nistér, Kahl & Schaffalitzky, "A minimal solution for relative pose with unknown focal
+/// length", CVPR 2005: the ten cubic constraints of an essential matrix in two unknowns, with coefficients quadratic in
+/// `1/f²`, solved as a quadratic eigenvalue problem (Kukelova, Bujnak & Pajdla, "Polynomial eigenvalue solutions to the
+/// 5-pt and 6-pt relative pose problems", BMVC 2008).
 ///
-/// Where the optical axes meet at the same distance from both cameras, or are parallel, every focal length is a solution (Sturm, "On focal
-/// length calibration from two views", CVPR 2001), and what is returned means nothing.
-pub fn fundamental_six_point(a: &[Point2<f64>; 6], b: &[Point2<f64>; 6], mut found: impl FnMut(Matrix3<f64>, f64)) {
-    // Into units in which a focal length is near one: an ordinary lens has one of twice the picture's half diagonal.
+/// Degenerate motions: if the optical axes are parallel, or intersect at the same distance from both cameras, every
+/// focal length is a solution (Sturm, "On focal length calibration from two views", CVPR 2001), and the results are
+/// arbitrary.
+pub fn fundamental_six_point(a: &[Point2<f64>; 6], b: &[Point2<f64>; 6], mut emit: impl FnMut(Matrix3<f64>, f64)) {
+    // Scale to units in which the focal length is of order one: a normal lens has one of about the image diagonal.
     let size = a.iter().chain(b).map(|p| p.coords.norm()).fold(0.0f64, f64::max);
     if !(size > 0.0 && size.is_finite()) {
         return;
     }
-    let unit = |p: &Point2<f64>| Point2::from(p.coords / size);
-    let rows = std::array::from_fn(|i| epipolar_row(unit(&a[i]), unit(&b[i])));
+    let scaled = |p: &Point2<f64>| Point2::from(p.coords / size);
+    let rows = std::array::from_fn(|i| epipolar_row(scaled(&a[i]), scaled(&b[i])));
     let Some(mut basis) = null_space::<6, 9, 3>(rows) else { return };
-    // Twice: the second time mends what small angles cost the first.
+    // Twice: the second pass corrects the loss of orthogonality of the first on ill-conditioned bases.
     orthonormalize(&mut basis);
     orthonormalize(&mut basis);
-    mix(&mut basis);
+    reflect_generic(&mut basis);
     if !basis.iter().flatten().all(|v| v.is_finite()) {
         return;
     }
     let pencil = constraints(&basis);
-    // Squares of focal lengths are positive: the shift is no solution.
+    // The shift is negative, so it is not a solution: w = 1/f² is positive.
     for w in real_quadratic_eigenvalues(pencil.each_ref(), -1.0) {
-        if !(w > SMALLEST && w < 1.0 / SMALLEST) {
+        if !(w > MIN_INVERSE_SQUARED_FOCAL && w < 1.0 / MIN_INVERSE_SQUARED_FOCAL) {
             continue;
         }
         let Some(v) = kernel_vector(&(&pencil[0] + &pencil[1] * w + &pencil[2] * (w * w))) else { continue };
@@ -51,18 +53,19 @@ pub fn fundamental_six_point(a: &[Point2<f64>; 6], b: &[Point2<f64>; 6], mut fou
         let f = Matrix3::from_fn(|i, j| {
             let k = 3 * i + j;
             let entry = x * basis[0][k] + y * basis[1][k] + basis[2][k];
-            // Back to the unit of the points: of degree one in each image.
+            // Back to the unit of the points: the entries are of degree one in each image's third coordinate.
             entry * [1.0, size][usize::from(i == 2)] * [1.0, size][usize::from(j == 2)]
         });
         let norm = f.norm();
         if norm.is_finite() && norm > 0.0 {
-            found(f / norm, size / w.sqrt());
+            emit(f / norm, size / w.sqrt());
         }
     }
 }
 
-/// Of `1/f²` in units of the largest coordinate; its root is from a tenth of a degree of view to nearly 180.
-const SMALLEST: f64 = 1e-6;
+/// Minimum of `1/f²` in units of the largest coordinate, and inverse of the maximum: fields of view from a tenth of a
+/// degree to nearly 180.
+const MIN_INVERSE_SQUARED_FOCAL: f64 = 1e-6;
 
 fn times(a: &Linear, b: &Linear) -> Quadratic {
     [
@@ -90,42 +93,43 @@ fn times_linear(q: &Quadratic, b: &Linear) -> Cubic {
     ]
 }
 
-/// `a + s b`.
-fn plus<const N: usize>(a: [f64; N], s: f64, b: &[f64; N]) -> [f64; N] {
+/// Computes `a + s b`.
+fn add_scaled<const N: usize>(a: [f64; N], s: f64, b: &[f64; N]) -> [f64; N] {
     std::array::from_fn(|i| a[i] + s * b[i])
 }
 
-/// `2 F Q Fᵀ Q F − tr(F Q Fᵀ Q) F = 0` with `Q = diag(1, 1, w)`, `w = 1/f²`, and `det F = 0` for `F = x F₀ + y F₁ + F₂`, as ten cubics in x and y: the coefficients
-/// by powers of w.
+/// Expands `2 F Q Fᵀ Q F − tr(F Q Fᵀ Q) F = 0` with `Q = diag(1, 1, w)`, `w = 1/f²`, and `det F = 0` for `F = x F₀ + y
+/// F₁ + F₂` to ten cubics in x and y; returns the coefficient matrices of the powers of w.
 fn constraints(basis: &[[f64; 9]; 3]) -> [DMatrix<f64>; 3] {
     let f: [[Linear; 3]; 3] =
         std::array::from_fn(|i| std::array::from_fn(|j| std::array::from_fn(|k| basis[k][3 * i + j])));
     // F Q Fᵀ = G + w H.
     let g: [[Quadratic; 3]; 3] = std::array::from_fn(|i| {
-        std::array::from_fn(|j| plus(times(&f[i][0], &f[j][0]), 1.0, &times(&f[i][1], &f[j][1])))
+        std::array::from_fn(|j| add_scaled(times(&f[i][0], &f[j][0]), 1.0, &times(&f[i][1], &f[j][1])))
     });
     let h: [[Quadratic; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|j| times(&f[i][2], &f[j][2])));
     // The trace by powers of w.
-    let trace = [plus(g[0][0], 1.0, &g[1][1]), plus(plus(h[0][0], 1.0, &h[1][1]), 1.0, &g[2][2]), h[2][2]];
+    let trace =
+        [add_scaled(g[0][0], 1.0, &g[1][1]), add_scaled(add_scaled(h[0][0], 1.0, &h[1][1]), 1.0, &g[2][2]), h[2][2]];
     let mut pencil = [(); 3].map(|()| DMatrix::zeros(10, 10));
     for i in 0..3 {
         for j in 0..3 {
             let product = |q: &Quadratic, k: usize| times_linear(q, &f[k][j]);
             let twice = [
-                plus(product(&g[i][0], 0), 1.0, &product(&g[i][1], 1)),
-                plus(plus(product(&h[i][0], 0), 1.0, &product(&h[i][1], 1)), 1.0, &product(&g[i][2], 2)),
+                add_scaled(product(&g[i][0], 0), 1.0, &product(&g[i][1], 1)),
+                add_scaled(add_scaled(product(&h[i][0], 0), 1.0, &product(&h[i][1], 1)), 1.0, &product(&g[i][2], 2)),
                 product(&h[i][2], 2),
             ];
             for (power, matrix) in pencil.iter_mut().enumerate() {
-                let row = plus(twice[power].map(|v| 2.0 * v), -1.0, &times_linear(&trace[power], &f[i][j]));
+                let row = add_scaled(twice[power].map(|v| 2.0 * v), -1.0, &times_linear(&trace[power], &f[i][j]));
                 (0..10).for_each(|c| matrix[(3 * i + j, c)] = row[c]);
             }
         }
     }
-    // The determinant by the first row.
+    // The determinant, expanded along the first row.
     for j in 0..3 {
         let (k, l) = ((j + 1) % 3, (j + 2) % 3);
-        let minor = plus(times(&f[1][k], &f[2][l]), -1.0, &times(&f[1][l], &f[2][k]));
+        let minor = add_scaled(times(&f[1][k], &f[2][l]), -1.0, &times(&f[1][l], &f[2][k]));
         let row = times_linear(&minor, &f[0][j]);
         (0..10).for_each(|c| pencil[0][(9, c)] += row[c]);
     }
@@ -138,7 +142,7 @@ mod tests {
     use crate::testing::{TwoViews, cosine};
     use cv_core::Vector3;
 
-    /// Coordinates relative to the principal point.
+    /// Returns exact matches relative to the principal point.
     fn centered(views: &TwoViews) -> ([Point2<f64>; 6], [Point2<f64>; 6]) {
         let m = views.matches(6, 0.0);
         let c = Point2::new(views.camera.cx, views.camera.cy).coords;
@@ -146,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn one_of_the_solutions_is_the_truth_and_all_solve_the_equations() {
+    fn one_of_the_solutions_is_the_truth_and_all_satisfy_the_constraints() {
         let (mut missed, mut total, mut most) = (0, 0, 0);
         for seed in 0..1000 {
             let views = TwoViews::random(seed);
@@ -159,7 +163,7 @@ mod tests {
                 assert!((f.norm() - 1.0).abs() < 1e-12 && focal > 0.0);
                 for (a, b) in a.iter().zip(&b) {
                     let (l, p) = (f * a.to_homogeneous(), b.to_homogeneous());
-                    // Distances from the lines, of picture coordinates of a few hundred pixels.
+                    // Distances from the epipolar lines, with coordinates of a few hundred pixels.
                     let distance = l.dot(&p) / l.xy().norm();
                     assert!(distance.abs() < 1e-6, "{seed}: {distance}");
                 }
@@ -171,10 +175,11 @@ mod tests {
             most = most.max(count);
             missed += usize::from(best > 1e-5);
         }
-        // Near the motions that show no focal length the solutions meet at any focal length: one in a hundred random problems is so near that five
-        // digits of sixteen remain no more.
+        // Near the degenerate motions the solutions are ill-conditioned: one in a hundred random problems has fewer
+        // than five correct digits.
         assert!(missed <= 10 && most <= 15, "{missed} {most}");
-        // Stewénius et al. find two to three real solutions for most random problems; those behind the camera are counted here too.
+        // Stewénius et al. report two to three real solutions for most random problems; solutions behind the camera are
+        // included here.
         assert!((2000..6000).contains(&total), "{total}");
     }
 }

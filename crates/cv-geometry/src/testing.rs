@@ -1,26 +1,26 @@
-//! Two views of random points with a known pose, for tests.
+//! Synthetic two-view scenes with known pose, for tests.
 
 use cv_core::{Camera, Correspondence, Matrix3, Point3, Pose, Rotation3, Vector3};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 use std::cell::RefCell;
 
-/// Uniform in 0 to 1.
+/// Draws a uniform number from 0 to 1.
 pub(crate) fn uniform(rng: &mut ChaCha8Rng) -> f64 {
     f64::from(rng.next_u32()) / 4294967296.0
 }
 
-/// Nearly normal, of unit variance: the sum of twelve uniform numbers.
+/// Draws an approximately standard normal number (Irwin–Hall, twelve uniform variates).
 pub(crate) fn gauss(rng: &mut ChaCha8Rng) -> f64 {
     (0..12).map(|_| uniform(rng)).sum::<f64>() - 6.0
 }
 
-/// |cos| of the angle between two matrices as vectors.
+/// Computes |cos| of the angle between two matrices as vectors.
 pub(crate) fn cosine(a: &Matrix3<f64>, b: &Matrix3<f64>) -> f64 {
     (a.dot(b) / (a.norm() * b.norm())).abs()
 }
 
-/// Two cameras of 640 × 480 that look at points between 4 and 12 units away.
+/// Two cameras of 640 × 480 px, with points at depths from 4 to 12 units.
 pub(crate) struct TwoViews {
     pub(crate) camera: Camera,
     /// First camera frame to second.
@@ -29,7 +29,7 @@ pub(crate) struct TwoViews {
 }
 
 impl TwoViews {
-    /// A base line of one unit in a random direction, a rotation of up to 20 degrees.
+    /// Creates a pair with a baseline of one unit in a random direction and a rotation of up to 20 degrees.
     pub(crate) fn random(seed: u64) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut vector = || Vector3::from_fn(|_, _| gauss(&mut rng)).normalize();
@@ -48,7 +48,7 @@ impl TwoViews {
         k.transpose() * self.essential() * k
     }
 
-    /// A point that both cameras see, on the plane `n·x = 1` where one is given, and what they see of it.
+    /// Draws a point visible in both cameras, on the plane `n·x = 1` if one is given, and its exact projections.
     pub(crate) fn point(&self, plane: Option<Vector3<f64>>) -> (Point3<f64>, Correspondence) {
         let rng = &mut *self.rng.borrow_mut();
         loop {
@@ -72,25 +72,25 @@ impl TwoViews {
         Correspondence::new(m.a.x + n(), m.a.y + n(), m.b.x + n(), m.b.y + n())
     }
 
-    /// Right matches in pixels.
+    /// Draws inlier matches in pixels.
     pub(crate) fn matches(&self, n: usize, noise: f64) -> Vec<Correspondence> {
         (0..n).map(|_| self.noisy(self.point(None).1, noise)).collect()
     }
 
-    /// Right matches of points on one slanted plane.
+    /// Draws inlier matches of points on one slanted plane.
     pub(crate) fn planar_matches(&self, n: usize, noise: f64) -> Vec<Correspondence> {
         let plane = Vector3::new(0.03, -0.02, 0.125);
         (0..n).map(|_| self.noisy(self.point(Some(plane)).1, noise)).collect()
     }
 
-    /// Wrong matches.
-    pub(crate) fn wrong(&self, n: usize) -> Vec<Correspondence> {
+    /// Draws outlier matches, uniformly in both images.
+    pub(crate) fn outliers(&self, n: usize) -> Vec<Correspondence> {
         let rng = &mut *self.rng.borrow_mut();
         let mut u = |size: f64| size * uniform(rng);
         (0..n).map(|_| Correspondence::new(u(640.0), u(480.0), u(640.0), u(480.0))).collect()
     }
 
-    /// Right matches in normalized coordinates, noise too.
+    /// Draws inlier matches in normalized coordinates; the noise is also in normalized units.
     pub(crate) fn normalized_matches(&self, n: usize, noise: f64) -> Vec<Correspondence> {
         self.matches(n, noise * 500.0).iter().map(|m| self.normalize(m)).collect()
     }
@@ -99,7 +99,7 @@ impl TwoViews {
         Correspondence { a: self.camera.normalize(m.a), b: self.camera.normalize(m.b) }
     }
 
-    /// Root mean square Sampson distance in pixels of fresh exact matches from `f`.
+    /// Computes the RMS Sampson distance of new exact matches from `f`, in pixels.
     pub(crate) fn exact_rms(&self, f: &Matrix3<f64>) -> f64 {
         let m = self.matches(100, 0.0);
         (m.iter().map(|m| crate::sampson(f, m).powi(2)).sum::<f64>() / 100.0).sqrt()

@@ -1,4 +1,4 @@
-//! Points from two or more views.
+//! Triangulation of points from two or more views.
 
 use crate::essential::essential_from_pose;
 use cv_core::{Correspondence, Matrix3, Point2, Point3, Pose, Vector3};
@@ -9,34 +9,34 @@ use nalgebra::Matrix4;
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum TriangulationError {
-    /// There is nothing to triangulate from.
+    /// There are fewer than two views.
     #[error("{got} views of a point are too few: 2 are needed")]
     TooFewViews {
         /// Number of views.
         got: usize,
     },
-    /// The rays are parallel, or a coordinate is not finite: the point is at infinity.
-    #[error("the rays are parallel: the point is infinitely far away")]
+    /// The rays are parallel, or a coordinate is not finite.
+    #[error("the rays are parallel: the point is at infinity")]
     Parallel,
-    /// The rays meet behind a camera.
-    #[error("the rays meet behind a camera")]
+    /// The rays intersect behind a camera.
+    #[error("the rays intersect behind a camera")]
     Behind,
 }
 
-/// The point of least squared image error in two views, in the frame of the first.
+/// Triangulates the point of minimum squared reprojection error in two views, in the frame of the first camera.
 ///
-/// `m` in normalized coordinates; `pose` maps the first camera's frame to the second's. The match is moved to the nearest one
-/// (in the sum of squared distances) that obeys the epipolar geometry, in two steps that are exact to about 1e-6 of the error
-/// (Lindstrom, "Triangulation made easy", 2010, `niter2`), and its rays are intersected.
+/// `m` in normalized coordinates; `pose` maps the first camera's frame to the second's. The match is corrected to the
+/// nearest one that satisfies the epipolar constraint ([`correct_match`]), and its rays are intersected.
 ///
 /// # Errors
-/// [`TriangulationError`]: parallel rays, or rays that meet behind a camera.
+/// [`TriangulationError`]: parallel rays, or rays that intersect behind a camera.
 pub fn triangulate(m: &Correspondence, pose: &Pose) -> Result<Point3<f64>, TriangulationError> {
     let corrected = correct_match(&essential_from_pose(pose), m);
     intersect(&corrected, pose)
 }
 
-/// The match nearest to `m` with `bᵀ E a = 0`, in the sum of squared distances (Lindstrom 2010, `niter2`).
+/// Computes the match nearest to `m`, in the sum of squared distances, with `bᵀ E a = 0`, in two iterations that are
+/// accurate to about 1e-6 of the correction (Lindstrom, "Triangulation made easy", 2010, `niter2`).
 pub fn correct_match(e: &Matrix3<f64>, m: &Correspondence) -> Correspondence {
     let (a, b) = (m.a.to_homogeneous(), m.b.to_homogeneous());
     let corner = e.fixed_view::<2, 2>(0, 0);
@@ -45,7 +45,7 @@ pub fn correct_match(e: &Matrix3<f64>, m: &Correspondence) -> Correspondence {
     let half = 0.5 * (n.norm_squared() + k.norm_squared());
     let c = b.dot(&(e * a));
     let d = (half * half - quadratic * c).max(0.0).sqrt();
-    // Both points are epipoles: nothing moves.
+    // Both points are epipoles: the constraint is satisfied.
     if half + d <= 0.0 {
         return *m;
     }
@@ -57,8 +57,7 @@ pub fn correct_match(e: &Matrix3<f64>, m: &Correspondence) -> Correspondence {
     Correspondence { a: m.a - k * lambda, b: m.b - n * lambda }
 }
 
-/// The point where the rays of an exact match meet: for noisy ones, on the first ray, where the second passes it in the
-/// least-squares sense.
+/// Intersects the rays of an exact match; for noisy ones, the result is on the first ray.
 fn intersect(m: &Correspondence, pose: &Pose) -> Result<Point3<f64>, TriangulationError> {
     let (a, b) = (m.a.to_homogeneous(), m.b.to_homogeneous());
     let ra = pose.rotation * a;
@@ -75,9 +74,11 @@ fn intersect(m: &Correspondence, pose: &Pose) -> Result<Point3<f64>, Triangulati
     if first > 0.0 && second > 0.0 { Ok(Point3::from(a * first)) } else { Err(TriangulationError::Behind) }
 }
 
-/// The point of least algebraic error in any number of views (Hartley & Zisserman, §12.2), in the world's frame.
+/// Triangulates the point of minimum algebraic error in any number of views (DLT; Hartley & Zisserman, §12.2), in the
+/// world frame.
 ///
-/// Each view is a normalized image point and its pose. A start for refinement: [`triangulate`] is better where there are two.
+/// Each view is a normalized image point and its pose (world to camera). An initial value for refinement;
+/// [`triangulate`] is more accurate for two views.
 ///
 /// # Errors
 /// [`TriangulationError`]: fewer than two views, parallel rays, or a point behind one of the cameras.
@@ -89,7 +90,7 @@ pub fn triangulate_linear(views: &[(Point2<f64>, Pose)]) -> Result<Point3<f64>, 
     for (p, pose) in views {
         let m = pose.matrix();
         for row in [m.row(2) * p.x - m.row(0), m.row(2) * p.y - m.row(1)] {
-            // Of unit length, so that far cameras do not outweigh near ones.
+            // Normalized, so that all cameras have the same weight.
             let row = row.normalize();
             ata += row.transpose() * row;
         }
@@ -104,7 +105,7 @@ pub fn triangulate_linear(views: &[(Point2<f64>, Pose)]) -> Result<Point3<f64>, 
     if front { Ok(point) } else { Err(TriangulationError::Behind) }
 }
 
-/// The angle between the two rays to a point, in radians; the point in the first camera's frame.
+/// Computes the parallax angle between the two rays to a point, in radians; the point is in the first camera's frame.
 pub fn parallax_angle(point: &Point3<f64>, pose: &Pose) -> f64 {
     let (a, b) = (point.coords, point - pose.center());
     a.cross(&b).norm().atan2(a.dot(&b))
@@ -124,20 +125,20 @@ mod tests {
 
     proptest! {
         #[test]
-        fn exact_matches_give_the_exact_point(seed: u64) {
+        fn exact_matches_triangulate_to_the_exact_point(seed: u64) {
             let views = TwoViews::random(seed);
             let (point, m) = views.point(None);
             let m = views.normalize(&m);
             prop_assume!(parallax_angle(&point, &views.pose) > 0.01);
-            // Rounding of the rays over the parallax.
+            // Rounding of the rays divided by the parallax.
             prop_assert!((triangulate(&m, &views.pose).unwrap() - point).norm() < 1e-9);
             let linear = triangulate_linear(&[(m.a, Pose::identity()), (m.b, views.pose)]).unwrap();
-            // Squared condition.
+            // The normal equations square the condition number.
             prop_assert!((linear - point).norm() < 1e-6);
         }
 
         #[test]
-        fn nothing_near_it_fits_a_noisy_match_better(seed: u64) {
+        fn the_point_is_a_minimum_of_the_reprojection_error(seed: u64) {
             let views = TwoViews::random(seed);
             let m = &views.normalized_matches(1, 2e-3)[0];
             let Ok(point) = triangulate(m, &views.pose) else { return Ok(()) };
@@ -145,7 +146,7 @@ mod tests {
             let best = reprojection2(&point, m, &views.pose);
             for d in [Vector3::x(), Vector3::y(), Vector3::z()] {
                 for s in [-1e-3, 1e-3] {
-                    // The closed form is good to about 1e-6 of the error itself.
+                    // The correction is accurate to about 1e-6 of the error.
                     prop_assert!(reprojection2(&(point + d * s), m, &views.pose) > best * (1.0 - 1e-5));
                 }
             }
@@ -156,10 +157,10 @@ mod tests {
     }
 
     #[test]
-    fn points_that_cannot_be_are_told() {
+    fn invalid_configurations_are_typed_errors() {
         let pose = Pose::new(cv_core::Rotation3::identity(), Vector3::new(-1.0, 0.0, 0.0));
         let at = |x1: f64, x2: f64| triangulate(&Correspondence::new(x1, 0.0, x2, 0.0), &pose);
-        // Disparity 0.1 at a base line of 1: ten units away. None: infinitely far. Negative: behind.
+        // Disparity 0.1 at a baseline of 1: depth 10. Zero: at infinity. Negative: behind.
         assert!((at(0.1, 0.0).unwrap() - Point3::new(1.0, 0.0, 10.0)).norm() < 1e-12);
         assert_eq!(at(0.1, 0.1), Err(TriangulationError::Parallel));
         assert_eq!(at(0.0, 0.1), Err(TriangulationError::Behind));
@@ -167,7 +168,7 @@ mod tests {
         assert_eq!(triangulate_linear(&[]), Err(TriangulationError::TooFewViews { got: 0 }));
         let behind = [(Point2::new(0.0, 0.0), Pose::identity()), (Point2::new(0.1, 0.0), pose)];
         assert_eq!(triangulate_linear(&behind), Err(TriangulationError::Behind));
-        // A point straight ahead of a camera one unit to the right is seen at −1/z: at 45 degrees from (0, 0, 1).
+        // The point (0, 0, 1) is at −1/z in a camera one unit to the right: 45 degrees.
         assert!((parallax_angle(&Point3::new(0.0, 0.0, 1.0), &pose) - std::f64::consts::FRAC_PI_4).abs() < 1e-12);
     }
 }

@@ -1,4 +1,4 @@
-//! Which pairs of photographs really overlap, taken from one place or of something flat (Brown & Lowe 2007, §3.2).
+//! Verification of image pairs by a homography: rotating cameras or planar scenes (Brown & Lowe 2007, §3.2).
 
 use crate::{EstimateError, RobustOptions, estimate_homography};
 use cv_core::{Correspondence, Matrix3, Point2, Silent, Vector3};
@@ -6,117 +6,127 @@ use cv_core::{Correspondence, Matrix3, Point2, Silent, Vector3};
 /// Options of [`verify_pair`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VerifyOptions {
-    /// Largest error of a match that agrees, in pixels, above 0. Default 3 (OpenCV's `findHomography`).
+    /// Inlier threshold in pixels, above 0. Default 3 (OpenCV's `findHomography`).
     pub threshold: f64,
-    /// Matches that agree by chance. Default 8 (Brown & Lowe).
-    pub chance: f64,
-    /// Share of the matches in the overlap that must agree beyond those, 0 to 1. Default 0.3 (Brown & Lowe: derived from an inlier
-    /// probability of 0.6 in true pairs and 0.1 in false ones, and a prior of one in a million).
-    pub share: f64,
+    /// α of the acceptance test `inliers > α + β · matches in the overlap`: an offset, for inliers by chance. Default 8
+    /// (Brown & Lowe).
+    pub alpha: f64,
+    /// β of the acceptance test: the minimum inlier ratio in the overlap, 0 to 1. Default 0.3 (Brown & Lowe: derived
+    /// from an inlier probability of 0.6 in true pairs and 0.1 in false ones, and a prior of one in a million).
+    pub beta: f64,
     /// Seed of the random samples. Default 0.
     pub seed: u64,
 }
 
 impl Default for VerifyOptions {
     fn default() -> Self {
-        Self { threshold: 3.0, chance: 8.0, share: 0.3, seed: 0 }
+        Self { threshold: 3.0, alpha: 8.0, beta: 0.3, seed: 0 }
     }
 }
 
-/// A pair of photographs that overlap.
+/// A pair of overlapping images.
 #[derive(Debug, Clone, PartialEq)]
 pub struct VerifiedPair {
-    /// First photograph.
+    /// Index of the first image.
     pub a: usize,
-    /// Second photograph.
+    /// Index of the second image.
     pub b: usize,
-    /// Pixels of `a` to pixels of `b`.
+    /// Maps pixels of `a` to pixels of `b`.
     pub homography: Matrix3<f64>,
-    /// Indices of the tentative matches that agree with the homography, ascending.
+    /// Indices of the tentative matches that are inliers of the homography, ascending.
     pub inliers: Vec<usize>,
-    /// Those matches, in pixels.
+    /// The inliers, in pixels.
     pub matches: Vec<Correspondence>,
 }
 
-/// Why a pair of photographs is taken not to overlap.
+/// Why an image pair was rejected.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
-pub enum NotAPair {
-    /// No homography fits the matches.
+pub enum PairRejection {
+    /// No homography could be estimated.
     #[error("no homography: {0}")]
     NoHomography(#[from] EstimateError),
-    /// Too few matches agree with the best homography for it to be more than chance.
-    #[error("{agree} of {in_overlap} matches in the overlap agree, more than {needed:.0} are needed")]
-    TooFewAgree {
-        /// Matches that agree.
-        agree: usize,
-        /// Matches where the two photographs overlap by the homography.
+    /// The best homography has too few inliers to be significant.
+    #[error(
+        "{inliers} of {in_overlap} matches in the overlap are inliers of a homography, more than {needed:.0} are needed"
+    )]
+    #[cfg_attr(feature = "serde", serde(rename = "TooFewAgree"))]
+    TooFewInliers {
+        /// Number of inliers.
+        #[cfg_attr(feature = "serde", serde(rename = "agree"))]
+        inliers: usize,
+        /// Number of matches in the overlap of the two images under the homography.
         in_overlap: usize,
-        /// The least number that is not chance.
+        /// Bound that the number of inliers must exceed.
         needed: f64,
     },
-    /// The best homography mirrors the picture, folds it or shrinks it to nothing.
-    #[error("the best homography is no view of the same scene")]
-    Impossible,
+    /// The best homography reverses orientation at an inlier or changes areas by more than a factor of 64.
+    #[error("the best homography reverses orientation or changes areas too much to be a view of the same scene")]
+    #[cfg_attr(feature = "serde", serde(rename = "Impossible"))]
+    ImplausibleHomography,
 }
 
-/// Decides whether two photographs overlap, from the tentative matches of their features.
+/// Verifies that two images overlap, from their tentative matches.
 ///
-/// RANSAC finds the homography that most matches agree with; the pair is accepted where the number of those exceeds
-/// `chance + share · (matches in the overlap)`.
+/// Estimates a homography with RANSAC and accepts the pair if the number of inliers exceeds `alpha + beta · (matches in
+/// the overlap)`. `a` and `b` are each an index and a size (width, height) in pixels.
 ///
 /// # Errors
-/// [`NotAPair`] with the reason.
+/// [`PairRejection`].
 pub fn verify_pair(
     (a, size_a): (usize, (usize, usize)),
     (b, size_b): (usize, (usize, usize)),
     matches: &[Correspondence],
     options: &VerifyOptions,
-) -> Result<VerifiedPair, NotAPair> {
+) -> Result<VerifiedPair, PairRejection> {
     let robust = RobustOptions { threshold: options.threshold, seed: options.seed, ..RobustOptions::homography() };
-    let found = estimate_homography(matches, &robust, &Silent)?;
-    let h = found.model;
-    let Some(inverse) = h.try_inverse() else { return Err(NotAPair::Impossible) };
-    let sees = |m: &Matrix3<f64>, p: Point2<f64>, (w, height): (usize, usize)| {
+    let estimate = estimate_homography(matches, &robust, &Silent)?;
+    let h = estimate.model;
+    let Some(inverse) = h.try_inverse() else { return Err(PairRejection::ImplausibleHomography) };
+    let is_in_image = |m: &Matrix3<f64>, p: Point2<f64>, (w, height): (usize, usize)| {
         let q = m * Vector3::new(p.x, p.y, 1.0);
         let (x, y) = (q.x / q.z, q.y / q.z);
         q.z > 0.0 && x >= 0.0 && y >= 0.0 && x <= w as f64 && y <= height as f64
     };
-    // Entry (3, 3) is 1, which is positive where the origin is in front; the inverse takes its sign from there.
+    // H[2][2] = 1, so the denominator is positive in front of the camera; the sign of the inverse is chosen
+    // accordingly.
     let inverse = if inverse[(2, 2)] < 0.0 { -inverse } else { inverse };
-    let in_overlap = matches.iter().filter(|c| sees(&h, c.a, size_b) && sees(&inverse, c.b, size_a)).count();
-    let agree = found.inliers.len();
-    let needed = options.chance + options.share * in_overlap as f64;
-    if agree as f64 <= needed {
-        return Err(NotAPair::TooFewAgree { agree, in_overlap, needed });
+    let in_overlap =
+        matches.iter().filter(|c| is_in_image(&h, c.a, size_b) && is_in_image(&inverse, c.b, size_a)).count();
+    let inliers = estimate.inliers.len();
+    let needed = options.alpha + options.beta * in_overlap as f64;
+    if inliers as f64 <= needed {
+        return Err(PairRejection::TooFewInliers { inliers, in_overlap, needed });
     }
-    let agreeing: Vec<Correspondence> = found.inliers.iter().map(|&i| matches[i]).collect();
-    // How much area grows at each match: positive where nothing is mirrored, within what lenses and zooms do.
-    let growth = |c: &Correspondence| h.determinant() / (h * Vector3::new(c.a.x, c.a.y, 1.0)).z.powi(3);
-    if !agreeing.iter().all(|c| (1.0 / 64.0..64.0).contains(&growth(c))) {
-        return Err(NotAPair::Impossible);
+    let inlier_matches: Vec<Correspondence> = estimate.inliers.iter().map(|&i| matches[i]).collect();
+    // The Jacobian determinant at each inlier: the local change of area, positive where the orientation is preserved.
+    let jacobian = |c: &Correspondence| h.determinant() / (h * Vector3::new(c.a.x, c.a.y, 1.0)).z.powi(3);
+    if !inlier_matches.iter().all(|c| (1.0 / 64.0..64.0).contains(&jacobian(c))) {
+        return Err(PairRejection::ImplausibleHomography);
     }
-    Ok(VerifiedPair { a, b, homography: h, inliers: found.inliers, matches: agreeing })
+    Ok(VerifiedPair { a, b, homography: h, inliers: estimate.inliers, matches: inlier_matches })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// `good` matches of a shift by (80, 10) and `bad` ones anywhere, in photographs of 200 x 150.
-    fn matches(good: usize, bad: usize) -> Vec<Correspondence> {
+    /// `inliers` matches of a shift by (80, 10) and `outliers` uniform ones, in images of 200 x 150.
+    fn matches(inliers: usize, outliers: usize) -> Vec<Correspondence> {
         let mut state = 12345_u64;
         let mut random = |n: f64| {
             state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
             (state >> 33) as f64 / f64::from(1_u32 << 31) * n
         };
-        let mut all: Vec<_> = (0..good)
+        let mut all: Vec<_> = (0..inliers)
             .map(|_| {
                 let (x, y) = (80.0 + random(118.0), 10.0 + random(138.0));
                 Correspondence::new(x, y, x - 80.0, y - 10.0)
             })
             .collect();
-        all.extend((0..bad).map(|_| Correspondence::new(random(200.0), random(150.0), random(200.0), random(150.0))));
+        all.extend(
+            (0..outliers).map(|_| Correspondence::new(random(200.0), random(150.0), random(200.0), random(150.0))),
+        );
         all
     }
 
@@ -129,21 +139,24 @@ mod tests {
         assert_eq!((pair.a, pair.b), (4, 2));
         assert!(pair.inliers.len() >= 60 && pair.inliers.is_sorted());
         assert_eq!(pair.inliers.iter().map(|&i| matches[i]).collect::<Vec<_>>(), pair.matches);
-        // Exact matches; the chance agreement of a random one within 3 px may pull by a fraction of that.
+        // Exact matches; an outlier within 3 px by chance may bias the estimate by a fraction of that.
         assert!((pair.homography[(0, 2)] + 80.0).abs() < 0.5 && (pair.homography[(1, 2)] + 10.0).abs() < 0.5);
     }
 
     #[test]
-    fn chance_agreement_is_not_an_overlap() {
+    fn insignificant_support_is_rejected() {
         for matches in [matches(0, 100), matches(8, 0), matches(0, 3), matches(9, 80)] {
             assert!(verify_pair((0, SIZE), (1, SIZE), &matches, &VerifyOptions::default()).is_err());
         }
     }
 
     #[test]
-    fn a_mirror_image_is_no_view_of_the_scene() {
+    fn a_mirror_image_is_rejected() {
         let mirrored: Vec<_> =
             matches(80, 0).into_iter().map(|c| Correspondence::new(c.a.x, c.a.y, 200.0 - c.a.x, c.a.y)).collect();
-        assert_eq!(verify_pair((0, SIZE), (1, SIZE), &mirrored, &VerifyOptions::default()), Err(NotAPair::Impossible));
+        assert_eq!(
+            verify_pair((0, SIZE), (1, SIZE), &mirrored, &VerifyOptions::default()),
+            Err(PairRejection::ImplausibleHomography)
+        );
     }
 }

@@ -46,7 +46,7 @@ mod testing;
 
 pub use align::{AlignError, AlignOptions, AlignedPair, Alignment, CameraMotion, Photo, Unplaced, View, align};
 pub use blend::{BlendMode, Blender, Composition, NO_PHOTO};
-pub use cv_geometry::{NotAPair, VerifiedPair, VerifyOptions, verify_pair};
+pub use cv_geometry::{PairRejection, VerifiedPair, VerifyOptions, verify_pair};
 pub use cv_imgproc::Interpolation;
 pub use depth::{EightBits, PhotoSample};
 pub use light::{Exposure, Gains};

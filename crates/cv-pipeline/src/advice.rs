@@ -98,7 +98,7 @@ fn two_view(error: &TwoViewError) -> Advice {
         TwoViewError::Camera { .. } | TwoViewError::CameraSize { .. } => Advice::CheckCamera,
         TwoViewError::TooFewMatches { .. } | TwoViewError::TooFewInliers { .. } => Advice::ShareMore,
         TwoViewError::PureRotation { .. } => Advice::StepAside,
-        TwoViewError::PlanarOrTurned { .. } => Advice::StepAsideOrGiveFocal,
+        TwoViewError::PlanarOrPureRotation { .. } => Advice::StepAsideOrGiveFocal,
         TwoViewError::Planar { .. } => Advice::LeaveThePlane,
         TwoViewError::UncertainPose { .. } => Advice::MoreDepthOrFeatures,
         TwoViewError::LittleParallax { .. } => Advice::FartherApart,

@@ -386,7 +386,7 @@ mod tests {
         let (o, margin) = (board.outline(), 0.012);
         let size = (o.width + 2.0 * margin, o.height + 2.0 * margin);
         let at = |v: f64, first: f64| (v - first + margin) as f32;
-        let black = board.black();
+        let black = board.black_rectangles();
         let black = black.iter().map(|r| [at(r.x, o.x), at(r.y, o.y), r.width as f32, r.height as f32]).collect();
         let print = cv_synth::Print::new(black, (size.0 as f32, size.1 as f32));
         Sheet {

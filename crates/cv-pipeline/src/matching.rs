@@ -196,7 +196,7 @@ pub fn match_photos(
         })?;
         if features.keypoints.is_empty() {
             let dropped = features.dropped.len();
-            return Err(MatchingError::NoFeatures { index, found: features.found(), dropped });
+            return Err(MatchingError::NoFeatures { index, found: features.detected_count(), dropped });
         }
         Ok(features)
     };

@@ -7,7 +7,7 @@ use cv_core::{
 };
 use cv_features::{FeatureError, FeatureOptions, Features, MatchError, SiftOptions};
 use cv_panorama::{
-    AlignError, AlignOptions, Alignment, CameraMotion, Canvas, CompositingOptions, EightBits, NotAPair, Photo,
+    AlignError, AlignOptions, Alignment, CameraMotion, Canvas, CompositingOptions, EightBits, PairRejection, Photo,
     PhotoMap, PhotoSample, Registration, RegistrationError, RenderError, Unplaced, VerifiedPair, VerifyOptions, align,
     render, verify_pair,
 };
@@ -142,7 +142,7 @@ pub struct PanoramaPair {
     /// Indices of those that agree with a common homography, ascending; none where the pair was rejected.
     pub inliers: Vec<usize>,
     /// Why the pair was rejected.
-    pub rejected: Option<NotAPair>,
+    pub rejected: Option<PairRejection>,
 }
 
 /// A panorama and how it came about.
@@ -492,7 +492,7 @@ fn describe(
 ) -> Vec<PanoramaImage> {
     let nearest = |i: usize| {
         let miss = |p: &PanoramaPair| match p.rejected {
-            Some(NotAPair::TooFewAgree { agree, in_overlap, needed }) if p.a == i || p.b == i => {
+            Some(PairRejection::TooFewInliers { inliers: agree, in_overlap, needed }) if p.a == i || p.b == i => {
                 Some(NearestPair { other: if p.a == i { p.b } else { p.a }, agree, in_overlap, needed })
             }
             _ => None,

@@ -85,7 +85,7 @@ pub fn detect(
     options.validate()?;
     let mut clock = StageClock::new();
     let score = model.score(photo, progress)?;
-    let raw = model.mark(score.view());
+    let raw = model.binarize(score.view());
     clock.lap("classify");
     let cleaned = model.cleanup().apply(raw.view(), progress)?;
     clock.lap("clean up");

@@ -62,9 +62,9 @@ fn a_camera_that_only_turned_is_told() {
     let photos = [first, turn.compose(&first)]
         .map(|pose| render(&scene, &camera(), &pose, &RenderOptions::default()).unwrap().image);
     match reconstruct(photos[0].view(), photos[1].view(), &known(), &Silent) {
-        Err(ReconstructError::TwoView(TwoViewError::PureRotation { share, degrees })) => {
+        Err(ReconstructError::TwoView(TwoViewError::PureRotation { fraction, degrees })) => {
             // The angle of (0.02, 0.12, 0.01) is 7.0 degrees.
-            assert!(share > 0.95 && (degrees - 7.0).abs() < 0.2, "{share} {degrees}");
+            assert!(fraction > 0.95 && (degrees - 7.0).abs() < 0.2, "{fraction} {degrees}");
         }
         other => panic!("{:?}", other.map(|r| r.scene.points.len())),
     }

@@ -36,15 +36,15 @@ fn a_plane_is_told_from_a_turn_where_the_focal_length_is_known() {
         for intrinsics in [known(), Intrinsics::Focal([FOCAL; 2])] {
             match refusal(a, b, intrinsics) {
                 // A wall is a plane to the last match.
-                error @ TwoViewError::Planar { share } => {
-                    assert!(share > 0.95 && advice(error) == Advice::LeaveThePlane, "{error}");
+                error @ TwoViewError::Planar { fraction } => {
+                    assert!(fraction > 0.95 && advice(error) == Advice::LeaveThePlane, "{error}");
                 }
                 other => panic!("{seed}: {other}"),
             }
         }
         match refusal(a, b, Intrinsics::Unknown) {
-            error @ TwoViewError::PlanarOrTurned { share } => {
-                assert!(share > 0.95 && advice(error) == Advice::StepAsideOrGiveFocal, "{error}");
+            error @ TwoViewError::PlanarOrPureRotation { fraction } => {
+                assert!(fraction > 0.95 && advice(error) == Advice::StepAsideOrGiveFocal, "{error}");
             }
             other => panic!("{seed}: {other}"),
         }
@@ -60,15 +60,17 @@ fn a_turn_is_named_or_left_open() {
         let [a, b] = [first, turn.compose(&first)]
             .map(|pose| render(&scene, &camera(), &pose, &RenderOptions::default()).unwrap().image);
         match refusal(&a, &b, Intrinsics::Focal([FOCAL; 2])) {
-            error @ TwoViewError::PureRotation { share, degrees } => {
+            error @ TwoViewError::PureRotation { fraction, degrees } => {
                 // The angle of (0.02, 0.12, 0.01) is 7.0 degrees.
-                assert!(share > 0.95 && (degrees - 7.0).abs() < 0.2, "{error}");
+                assert!(fraction > 0.95 && (degrees - 7.0).abs() < 0.2, "{error}");
                 assert_eq!(advice(error), Advice::StepAside);
             }
             other => panic!("{seed}: {other}"),
         }
         match refusal(&a, &b, Intrinsics::Unknown) {
-            error @ TwoViewError::PlanarOrTurned { .. } => assert_eq!(advice(error), Advice::StepAsideOrGiveFocal),
+            error @ TwoViewError::PlanarOrPureRotation { .. } => {
+                assert_eq!(advice(error), Advice::StepAsideOrGiveFocal)
+            }
             other => panic!("{seed}: {other}"),
         }
     }
@@ -80,8 +82,8 @@ fn a_camera_that_hardly_moved_is_told() {
     for seed in [3, 4] {
         let views = two_view(seed, &camera(), 0.02, &RenderOptions::default()).unwrap();
         match refusal(&views.a.image, &views.b.image, known()) {
-            error @ TwoViewError::PureRotation { share, .. } => {
-                assert!(share > 0.95 && error.to_string().contains("hardly moved"), "{error}");
+            error @ TwoViewError::PureRotation { fraction, .. } => {
+                assert!(fraction > 0.95 && error.to_string().contains("hardly moved"), "{error}");
             }
             TwoViewError::LittleParallax { degrees, needed } => assert!(degrees < needed && needed > 0.4),
             other => panic!("{seed}: {other}"),

@@ -165,7 +165,7 @@ fn features(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Features> {
     let kind: String = given.getattr("kind")?.extract()?;
     let keypoints = keypoints_from(&given.getattr("keypoints")?)?;
     let (numbers, columns) = arrays::table(&given.getattr("descriptors")?, "descriptors")?;
-    let own = DescriptorKind::OWN.into_iter().find(|own| own.name == kind && own.dimension == columns);
+    let own = DescriptorKind::BUILT_IN.into_iter().find(|own| own.name == kind && own.dimension == columns);
     let kind = own.unwrap_or(DescriptorKind::foreign(columns.max(1)));
     let rows = numbers.len() / columns.max(1);
     if rows != keypoints.len() {

@@ -88,7 +88,7 @@ impl PySfmPhotograph {
     ) -> PyResult<Self> {
         let keypoints = keypoints_from(keypoints)?;
         let colors: Vec<[f64; 3]> = arrays::rows(colors, "colors")?;
-        let kind = DescriptorKind::OWN.into_iter().find(|own| own.name == kind);
+        let kind = DescriptorKind::BUILT_IN.into_iter().find(|own| own.name == kind);
         let descriptors = kind.and_then(|kind| ByteDescriptors::from_bytes(kind, descriptors.to_vec()));
         let Some(descriptors) = descriptors.filter(|d| d.len() == keypoints.len() && d.len() == colors.len()) else {
             return Err(PyValueError::new_err("these are no parts of an SfmPhotograph"));

@@ -1,16 +1,16 @@
-//! Learns the colors of a ball from four photographs with masks, and finds it in two others.
+//! Trains a color model of a ball on four images with masks, and segments it in two others.
 use cv_core::{Camera, Silent};
 use cv_segment::{ConfusionMatrix, TrainOptions, train};
 use cv_synth::{RenderOptions, ball_photos};
 
 pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let photos = ball_photos(3, 6, &Camera::from_focal(160, 120, 150.0), &RenderOptions::default())?;
-    let labeled: Vec<_> = photos.iter().map(|p| (p.view.image.view(), p.mask.view())).collect();
-    let (known, new) = labeled.split_at(4);
+    let views = ball_photos(3, 6, &Camera::from_focal(160, 120, 150.0), &RenderOptions::default())?;
+    let labeled: Vec<_> = views.iter().map(|p| (p.view.image.view(), p.mask.view())).collect();
+    let (training, test) = labeled.split_at(4);
 
-    let model = train(known, &TrainOptions::default(), &Silent)?.model;
-    for (photo, truth) in new {
-        let mask = model.predict(*photo, &Silent)?;
+    let model = train(training, &TrainOptions::default(), &Silent)?.model;
+    for (image, truth) in test {
+        let mask = model.predict(*image, &Silent)?;
         let scores = ConfusionMatrix::new(mask.view(), *truth)?;
         println!("precision {:.3}, recall {:.3}, F1 {:.3}", scores.precision(), scores.recall(), scores.f1());
     }

@@ -1,18 +1,20 @@
-//! What turns marked pixels into regions.
+//! Morphological clean-up of masks.
 
 use cv_core::{Cancelled, ImageView, Mask, Progress, Stage};
 use cv_imgproc::{Connectivity, StructuringElement, close, connected_components, largest_component, open};
 use serde::{Deserialize, Serialize};
 
-/// How a mask is cleaned up: opened, closed, and perhaps only its largest region kept.
+/// Parameters of the clean-up of a mask: opening, closing, and selection of the largest connected component.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Cleanup {
-    /// Radius in pixels of the disc that the mask is opened by, which takes away what is narrower. 0 (not at all) to 1000; default 2, a 5×5 disc.
+    /// Radius in pixels of the disc (structuring element) of the opening, which removes narrower structures. 0 (no
+    /// opening) to 1000; default 2, a 5×5 disc.
     pub open_radius: usize,
-    /// Radius in pixels of the disc that the mask is closed by, which fills gaps that are narrower. 0 to 1000; default 2.
+    /// Radius in pixels of the disc (structuring element) of the closing, which fills narrower gaps. 0 (no closing) to
+    /// 1000; default 2.
     pub close_radius: usize,
-    /// Keep only the largest region. Default false; training decides it by whether the masks show one region each.
+    /// Keep only the largest connected component. Default false; training sets it where each mask has one region.
     pub largest: bool,
 }
 
@@ -23,7 +25,7 @@ impl Default for Cleanup {
 }
 
 impl Cleanup {
-    /// Cleans up a mask.
+    /// Opens, then closes a mask, then selects its largest 8-connected component if requested.
     ///
     /// # Errors
     /// [`Cancelled`].
@@ -45,12 +47,13 @@ impl Cleanup {
     }
 }
 
-/// The share of a mask's true pixels that its largest region holds; 1 where there are none.
-pub(crate) fn largest_share(mask: ImageView<'_, bool, 1>) -> f64 {
+/// Computes the fraction of a mask's foreground pixels that lie in its largest connected component; 1 for an empty
+/// mask.
+pub(crate) fn largest_component_fraction(mask: ImageView<'_, bool, 1>) -> f64 {
     let areas: Vec<usize> = connected_components(mask, Connectivity::Eight).stats.iter().map(|s| s.area).collect();
     let largest = areas.iter().copied().max().unwrap_or(0);
-    let all: usize = areas.iter().sum();
-    if all == 0 { 1.0 } else { largest as f64 / all as f64 }
+    let total: usize = areas.iter().sum();
+    if total == 0 { 1.0 } else { largest as f64 / total as f64 }
 }
 
 #[cfg(test)]
@@ -59,7 +62,7 @@ mod tests {
     use cv_core::Silent;
 
     #[test]
-    fn specks_go_gaps_close_and_the_largest_stays() {
+    fn opening_removes_specks_closing_fills_holes_and_the_largest_component_is_selected() {
         // A disc of radius 8 with a hole of one pixel, a disc of radius 5, and a speck.
         let disc = |x: usize, y: usize, cx: f64, cy: f64, r: f64| (x as f64 - cx).hypot(y as f64 - cy) <= r;
         let mask = Mask::from_fn(60, 30, |x, y| {
@@ -72,14 +75,14 @@ mod tests {
         assert!(cleaned.at(15, 12)[0] && !cleaned.at(45, 15)[0] && !cleaned.at(30, 3)[0]);
         let none = Cleanup { open_radius: 0, close_radius: 0, largest: false };
         assert_eq!(none.apply(mask.view(), &Silent).unwrap(), mask);
-        // 316 pixels of 398 or so: the first disc holds most, not all.
-        let share = largest_share(mask.view());
-        assert!(share > 0.6 && share < 0.8);
-        assert_eq!(largest_share(Mask::new(3, 3, [false]).view()), 1.0);
+        // The first disc has about 316 of 398 pixels.
+        let fraction = largest_component_fraction(mask.view());
+        assert!(fraction > 0.6 && fraction < 0.8);
+        assert_eq!(largest_component_fraction(Mask::new(3, 3, [false]).view()), 1.0);
     }
 
     #[test]
-    fn nothing_stays_nothing() {
+    fn empty_and_full_masks_of_degenerate_sizes_are_unchanged() {
         for size in [(0, 0), (1, 1), (0, 9)] {
             let mask = Mask::new(size.0, size.1, [true]);
             assert_eq!(Cleanup { largest: true, ..Default::default() }.apply(mask.view(), &Silent).unwrap(), mask);

@@ -1,4 +1,4 @@
-//! The coordinates in which colors are modeled.
+//! Color spaces in which colors are modeled.
 
 use cv_imgproc::{rgb_pixel_to_hsv, rgb_pixel_to_lab};
 use serde::{Deserialize, Serialize};
@@ -8,12 +8,13 @@ use std::f32::consts::{PI, TAU};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ColorSpace {
-    /// Hue, saturation, value. Hue is circular: it is measured from the object's circular mean hue, −π to π, so that the cut lies opposite the object and
-    /// averages are right (Mardia & Jupp, Directional Statistics). Modeling `(S cos H, S sin H, V)` instead, which has no cut at all, was measured and is worse:
-    /// its components are wide where saturation varies under highlights and shadow.
+    /// Hue, saturation, value. Hue is circular: it is measured relative to the object's circular mean hue, −π to π, so
+    /// that the wrap-around lies opposite the object's hue and linear averages are valid (Mardia & Jupp, Directional
+    /// Statistics). Modeling `(S cos H, S sin H, V)`, which has no wrap-around, scored lower: its components widen
+    /// where saturation varies under highlights and shadow.
     #[default]
     Hsv,
-    /// Red, green, blue as in the file, 0 to 1.
+    /// Gamma-encoded sRGB, 0 to 1.
     Rgb,
     /// CIE L*a*b*, D65.
     Lab,
@@ -22,7 +23,8 @@ pub enum ColorSpace {
 cv_core::named!(ColorSpace { Hsv = "hsv", Rgb = "rgb", Lab = "lab" });
 
 impl ColorSpace {
-    /// The coordinates of a color. `hue` is the hue from which hues are measured, in radians; only HSV uses it.
+    /// Converts an 8-bit sRGB color to coordinates in this space. `hue` is the reference hue in radians; only HSV uses
+    /// it.
     #[inline]
     pub fn coordinates(self, rgb: [u8; 3], hue: f32) -> [f32; 3] {
         match self {
@@ -35,7 +37,8 @@ impl ColorSpace {
         }
     }
 
-    /// Standard deviations that a step of one gray level makes about: differences below them mean nothing. For hue, at half saturation and value.
+    /// Returns the standard deviation of each coordinate that corresponds to about one gray level of quantization. For
+    /// hue, at half saturation and value.
     pub(crate) fn resolution(self) -> [f64; 3] {
         const STEP: f64 = 1.0 / 255.0;
         match self {
@@ -45,7 +48,7 @@ impl ColorSpace {
         }
     }
 
-    /// The volume that the colors of the screen take up. (Lab: that of the sRGB gamut.)
+    /// Returns the volume of the sRGB gamut in this space: the inverse of the density of uniformly distributed colors.
     pub(crate) fn volume(self) -> f64 {
         match self {
             Self::Hsv => f64::from(TAU),
@@ -55,14 +58,15 @@ impl ColorSpace {
     }
 }
 
-/// An angle between −2π and 2π as one from −π to π.
+/// Wraps an angle between −2π and 2π to −π to π.
 #[inline(always)]
 pub(crate) fn wrap(angle: f32) -> f32 {
-    let down = if angle > PI { angle - TAU } else { angle };
-    if down < -PI { down + TAU } else { down }
+    let wrapped = if angle > PI { angle - TAU } else { angle };
+    if wrapped < -PI { wrapped + TAU } else { wrapped }
 }
 
-/// The circular mean of hues, each weighing its weight times its saturation (a gray has no hue), 0 to 2π; 0 where there is none.
+/// Computes the circular mean hue in radians, 0 to 2π, each color weighted by its weight times its saturation (a gray
+/// has no hue). Returns 0 where the mean is undefined.
 pub(crate) fn mean_hue(samples: impl Iterator<Item = ([u8; 3], f64)>) -> f32 {
     let (mut x, mut y, mut total) = (0.0f64, 0.0f64, 0.0f64);
     for (rgb, weight) in samples {
@@ -71,7 +75,7 @@ pub(crate) fn mean_hue(samples: impl Iterator<Item = ([u8; 3], f64)>) -> f32 {
         y += weight * s * h.sin();
         total += weight * s;
     }
-    // Opposite hues that cancel leave the rounding of f32 hues, not a direction.
+    // Opposite hues cancel up to the rounding of f32 hues: the direction is undefined.
     if x.hypot(y) <= 1e-6 * total { 0.0 } else { y.atan2(x).rem_euclid(std::f64::consts::TAU) as f32 }
 }
 
@@ -80,7 +84,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn reds_on_both_sides_of_the_cut_average_to_red() {
+    fn the_mean_of_hues_on_both_sides_of_zero_is_zero() {
         // Hues 350° and 10°.
         let pair = [([255, 0, 43], 1.0), ([255, 43, 0], 1.0)];
         let mean = mean_hue(pair.into_iter());

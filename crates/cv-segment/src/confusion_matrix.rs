@@ -4,22 +4,22 @@ use crate::SegmentError;
 use cv_core::ImageView;
 use std::iter::Sum;
 
-/// Pixels counted by what was said about them and what they are; sums over photographs add up.
+/// Pixel counts by predicted and true label. Matrices of several images add up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct ConfusionMatrix {
-    /// Marked, rightly.
+    /// Foreground pixels predicted as foreground.
     pub true_positives: u64,
-    /// Marked, wrongly.
+    /// Background pixels predicted as foreground.
     pub false_positives: u64,
-    /// Not marked, wrongly.
+    /// Foreground pixels predicted as background.
     pub false_negatives: u64,
-    /// Not marked, rightly.
+    /// Background pixels predicted as background.
     pub true_negatives: u64,
 }
 
 impl ConfusionMatrix {
-    /// Counts a mask against the true one.
+    /// Compares a predicted mask with the ground truth.
     ///
     /// # Errors
     /// [`SegmentError::SizeMismatch`] with index 0.
@@ -37,32 +37,33 @@ impl ConfusionMatrix {
         Ok(Self { true_positives, false_positives, false_negatives, true_negatives })
     }
 
-    /// The share of the marked pixels that are right; 1 where none is marked.
+    /// Returns TP / (TP + FP); 1 where nothing is predicted as foreground.
     pub fn precision(&self) -> f64 {
-        share(self.true_positives, self.true_positives + self.false_positives)
+        ratio(self.true_positives, self.true_positives + self.false_positives)
     }
 
-    /// The share of the true pixels that are marked; 1 where there are none.
+    /// Returns TP / (TP + FN); 1 where there is no foreground.
     pub fn recall(&self) -> f64 {
-        share(self.true_positives, self.true_positives + self.false_negatives)
+        ratio(self.true_positives, self.true_positives + self.false_negatives)
     }
 
-    /// The harmonic mean of precision and recall, `2 TP / (2 TP + FP + FN)`; 1 where nothing is marked and nothing is there.
+    /// Returns the F1 score, the harmonic mean of precision and recall, `2 TP / (2 TP + FP + FN)`; 1 where both masks
+    /// are empty.
     pub fn f1(&self) -> f64 {
-        share(2 * self.true_positives, 2 * self.true_positives + self.false_positives + self.false_negatives)
+        ratio(2 * self.true_positives, 2 * self.true_positives + self.false_positives + self.false_negatives)
     }
 
-    /// Intersection over union; 1 where nothing is marked and nothing is there.
+    /// Returns the intersection over union (Jaccard index), `TP / (TP + FP + FN)`; 1 where both masks are empty.
     pub fn iou(&self) -> f64 {
-        share(self.true_positives, self.true_positives + self.false_positives + self.false_negatives)
+        ratio(self.true_positives, self.true_positives + self.false_positives + self.false_negatives)
     }
 }
 
-fn share(part: u64, whole: u64) -> f64 {
+fn ratio(part: u64, whole: u64) -> f64 {
     if whole == 0 { 1.0 } else { part as f64 / whole as f64 }
 }
 
-/// Counts of several photos together, so that each pixel weighs the same.
+/// Adds the counts of several images: micro-averaging, each pixel has the same weight.
 impl Sum for ConfusionMatrix {
     fn sum<I: Iterator<Item = Self>>(scores: I) -> Self {
         scores.fold(Self::default(), |a, b| Self {
@@ -80,7 +81,7 @@ mod tests {
     use cv_core::Mask;
 
     #[test]
-    fn counted_by_hand() {
+    fn counts_and_scores_of_a_small_mask() {
         let mask = Mask::from_fn(4, 2, |x, y| [[[true, true, true, false], [false, false, true, false]][y][x]]);
         let truth = Mask::from_fn(4, 2, |x, y| [[[true, true, false, false], [true, false, true, false]][y][x]]);
         let s = ConfusionMatrix::new(mask.view(), truth.view()).unwrap();

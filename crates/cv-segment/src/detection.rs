@@ -1,4 +1,5 @@
-//! The objects in a photograph: where they are, their shape, and how well they agree with the objects that were trained on.
+//! Detection of objects in a segmented image: region measurements (moments), scored against the statistics of the
+//! training objects.
 
 use crate::{ColorModel, SegmentError};
 use cv_core::{ImageView, Mask, OptionError, Point2, Progress, Stage};
@@ -6,20 +7,24 @@ use cv_imgproc::{Components, Connectivity, connected_components};
 use serde::{Deserialize, Serialize};
 use std::f64::consts::{FRAC_2_SQRT_PI, PI};
 
-/// The default of [`DetectOptions::min_score`]: were the trained objects' features Gaussian, one object of a thousand would be missed.
+/// The default of [`DetectOptions::min_score`]: a false rejection rate of one in a thousand if the features were
+/// Gaussian.
 pub const MIN_SCORE: f64 = 0.001;
 
-/// What regions differ by in other light than that of the training photographs: standard deviations that are added (as variances) to those of the training
-/// objects, of which there are few and often of one camera. A nat of mean score is a factor e in the odds.
-const COLOR_DEVIATION: f64 = 1.0;
-/// A highlight or a shadow that takes a tenth of a region away takes up to as much from its extent: that is two deviations.
-const EXTENT_DEVIATION: f64 = 0.05;
-/// A shadow along one side that takes a tenth of the diameter of a disc: one deviation.
-const AXIS_RATIO_DEVIATION: f64 = 0.1;
-/// Regions of a training mask with less than this share of its largest region are specks, not objects.
-const SPECK: f64 = 0.05;
+/// Prior standard deviation of the mean color score, in nats, for illumination other than in training. Its square is
+/// added to the sample variance of the training objects, which are few and often from one camera. (The next two are
+/// used the same way.)
+const COLOR_PRIOR_SIGMA: f64 = 1.0;
+/// Prior standard deviation of the extent: a highlight or shadow that removes a tenth of a region reduces the extent by
+/// up to 0.1, two standard deviations.
+const EXTENT_PRIOR_SIGMA: f64 = 0.05;
+/// Prior standard deviation of the axis ratio: a shadow that removes a tenth of a disc's diameter changes it by one
+/// standard deviation.
+const AXIS_RATIO_PRIOR_SIGMA: f64 = 0.1;
+/// Regions of a training mask with less than this fraction of the area of the largest region are ignored as specks.
+const MIN_AREA_RATIO: f64 = 0.05;
 
-/// A region of a mask: bounding box, area and moments.
+/// Bounding box, area and moments of a connected component.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Region {
@@ -39,35 +44,37 @@ pub struct Region {
     pub axes: [f64; 2],
     /// Angle in radians, above −π/2 to π/2, from the x axis (right) towards the y axis (down), of the ellipse's major axis.
     pub angle: f64,
-    /// Whether the region touches the border of the photograph: part of the object may lie outside, so its shape says nothing.
+    /// Whether the region touches the image border: the object may be truncated, so its shape is not used.
     pub truncated: bool,
 }
 
 impl Region {
-    /// Minor over major axis of the ellipse, above 0 to 1.
+    /// Returns the ratio of the ellipse's minor to major axis, above 0 to 1.
     pub fn axis_ratio(&self) -> f64 {
         self.axes[1] / self.axes[0]
     }
 
-    /// The area over that of the ellipse: 1 for a filled ellipse, 3/π for a rectangle, less for a region with holes or notches.
+    /// Returns the ratio of the area to that of the ellipse: 1 for a filled ellipse, 3/π for a rectangle, less for a
+    /// region with holes or notches.
     pub fn extent(&self) -> f64 {
         self.area as f64 / (PI * self.axes[0] * self.axes[1])
     }
 }
 
-/// A region of a photograph in the object's color, and how well it agrees with the objects that were trained on.
+/// A detected region and its score against the training objects.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Detection {
-    /// Where it is, and its shape.
+    /// Position and shape.
     pub region: Region,
     /// Mean of [`ColorModel::score`] over the region, in nats.
     pub color: f64,
-    /// From 0 to 1: the probability that a trained object differs as much or more from the mean of all, by the chi-squared distribution of the squared
-    /// deviations of mean color score (below the mean only), extent and axis ratio. Where the region is truncated or no whole region was trained on, of the
-    /// color score alone. None where the model was written without statistics of its objects.
+    /// p-value, 0 to 1: the probability of a training object with an equal or larger sum of squared standardized
+    /// deviations of mean color score (below the mean only), extent and axis ratio, by the chi-squared distribution (3
+    /// degrees of freedom). If the region is truncated or the model has no shape statistics, of the color score alone
+    /// (1 degree). None if the model has no object statistics.
     pub score: Option<f64>,
-    /// Whether the score reaches [`DetectOptions::min_score`], or there is none.
+    /// Whether the region is accepted: the score is at least [`DetectOptions::min_score`], or None.
     pub found: bool,
 }
 
@@ -76,7 +83,7 @@ pub struct Detection {
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct DetectOptions {
-    /// Least [`Detection::score`] of an object that counts as found, 0 to 1. Default [`MIN_SCORE`].
+    /// Minimum [`Detection::score`] of an accepted region, 0 to 1. Default [`MIN_SCORE`].
     pub min_score: f64,
 }
 
@@ -87,7 +94,7 @@ impl Default for DetectOptions {
 }
 
 impl DetectOptions {
-    /// Before the work.
+    /// Checks the range.
     ///
     /// # Errors
     /// [`OptionError`].
@@ -96,12 +103,12 @@ impl DetectOptions {
     }
 }
 
-/// What [`ColorModel::detect`] found.
+/// Result of [`ColorModel::detect`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct Detections {
-    /// The found objects' pixels.
+    /// Pixels of the accepted regions.
     pub mask: Mask,
-    /// All regions, those found and those not, the best score first; of equal ones the larger, then the upper.
+    /// All regions, accepted and rejected, by decreasing score; ties by decreasing area, then by label (top to bottom).
     pub objects: Vec<Detection>,
 }
 
@@ -116,18 +123,18 @@ pub struct FeatureStatistics {
 }
 
 impl FeatureStatistics {
-    /// The sample variance, with the square of `usual` added; None without values.
-    fn of(values: &[f64], usual: f64) -> Option<Self> {
+    /// Computes mean and standard deviation, with `prior_sigma`² added to the sample variance; None without values.
+    fn of(values: &[f64], prior_sigma: f64) -> Option<Self> {
         if values.is_empty() {
             return None;
         }
         let mean = values.iter().sum::<f64>() / values.len() as f64;
         let squares: f64 = values.iter().map(|v| (v - mean).powi(2)).sum();
         let variance = squares / (values.len() - 1).max(1) as f64;
-        Some(Self { mean, deviation: (variance + usual * usual).sqrt() })
+        Some(Self { mean, deviation: (variance + prior_sigma * prior_sigma).sqrt() })
     }
 
-    /// Deviations from the mean.
+    /// Returns the z-score of a value.
     fn standardized(&self, value: f64) -> f64 {
         (value - self.mean) / self.deviation
     }
@@ -138,7 +145,7 @@ impl FeatureStatistics {
     }
 }
 
-/// Mean shape of the training objects that lie within their photographs.
+/// Shape statistics of the training objects that are not truncated by the image border.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ShapeStatistics {
@@ -148,13 +155,13 @@ pub struct ShapeStatistics {
     pub axis_ratio: FeatureStatistics,
 }
 
-/// What the objects of the training masks have in common.
+/// Color and shape statistics of the objects of the training masks.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ObjectStatistics {
     /// Of the mean of [`ColorModel::score`] over an object, in nats.
     pub color: FeatureStatistics,
-    /// Shape, where some object lies within its photograph.
+    /// Shape, if some object is not truncated.
     pub shape: Option<ShapeStatistics>,
 }
 
@@ -168,7 +175,7 @@ impl ObjectStatistics {
         Ok(())
     }
 
-    /// See [`Detection::score`].
+    /// Computes [`Detection::score`].
     fn score(&self, region: &Region, color: f64) -> f64 {
         let mut squared = self.color.standardized(color).min(0.0).powi(2);
         match &self.shape {
@@ -182,7 +189,7 @@ impl ObjectStatistics {
     }
 }
 
-/// Collects features of the training objects.
+/// Accumulator of the features of the training objects.
 #[derive(Debug, Default)]
 pub(crate) struct ObjectFeatures {
     color: Vec<f64>,
@@ -191,12 +198,12 @@ pub(crate) struct ObjectFeatures {
 }
 
 impl ObjectFeatures {
-    /// Adds the regions of a training mask, but for specks.
+    /// Adds the regions of a training mask, except specks.
     pub(crate) fn add(&mut self, mask: ImageView<'_, bool, 1>, score: ImageView<'_, f32, 1>) {
         let measured = measure(&connected_components(mask, Connectivity::Eight), score);
         let largest = measured.iter().map(|(region, _)| region.area).max().unwrap_or(0);
         for (region, color) in measured {
-            if (region.area as f64) < SPECK * largest as f64 {
+            if (region.area as f64) < MIN_AREA_RATIO * largest as f64 {
                 continue;
             }
             self.color.push(color);
@@ -207,19 +214,20 @@ impl ObjectFeatures {
         }
     }
 
-    /// None without objects.
+    /// Returns the statistics; None without objects.
     pub(crate) fn statistics(&self) -> Option<ObjectStatistics> {
-        let color = FeatureStatistics::of(&self.color, COLOR_DEVIATION)?;
-        let extent = FeatureStatistics::of(&self.extent, EXTENT_DEVIATION);
-        let axis_ratio = FeatureStatistics::of(&self.axis_ratio, AXIS_RATIO_DEVIATION);
+        let color = FeatureStatistics::of(&self.color, COLOR_PRIOR_SIGMA)?;
+        let extent = FeatureStatistics::of(&self.extent, EXTENT_PRIOR_SIGMA);
+        let axis_ratio = FeatureStatistics::of(&self.axis_ratio, AXIS_RATIO_PRIOR_SIGMA);
         let shape = extent.zip(axis_ratio).map(|(extent, axis_ratio)| ShapeStatistics { extent, axis_ratio });
         Some(ObjectStatistics { color, shape })
     }
 }
 
 impl ColorModel {
-    /// Measures the regions of a cleaned-up mask ([`ColorModel::predict`]) and scores them by the training objects; `score` is that of
-    /// [`ColorModel::score`], of the mask's size. Regions that are not found are taken from the mask.
+    /// Measures the 8-connected components of a cleaned-up mask ([`ColorModel::predict`]) and scores them against the
+    /// training objects. `score` is the result of [`ColorModel::score`], of the mask's size. Rejected regions are
+    /// removed from the mask.
     ///
     /// # Errors
     /// [`SegmentError::Option`], [`SegmentError::SizeMismatch`] (with index 0), [`SegmentError::Cancelled`].
@@ -237,14 +245,14 @@ impl ColorModel {
         let stage = Stage::new(progress, "detect", 2)?;
         let components = connected_components(mask, Connectivity::Eight);
         stage.add(1)?;
-        let judge = |(region, color): (Region, f64)| {
+        let score_region = |(region, color): (Region, f64)| {
             let score = self.statistics().map(|statistics| statistics.score(&region, color));
             Detection { region, color, score, found: score.is_none_or(|score| score >= options.min_score) }
         };
-        let mut objects: Vec<Detection> = measure(&components, score).into_iter().map(judge).collect();
-        // By label, before they are sorted.
-        let found: Vec<bool> = objects.iter().map(|object| object.found).collect();
-        let mask = components.labels.map(|[label]| [label > 0 && found[label as usize - 1]]);
+        let mut objects: Vec<Detection> = measure(&components, score).into_iter().map(score_region).collect();
+        // Indexed by label, before sorting.
+        let is_accepted: Vec<bool> = objects.iter().map(|object| object.found).collect();
+        let mask = components.labels.map(|[label]| [label > 0 && is_accepted[label as usize - 1]]);
         objects.sort_by(|a, b| {
             let rank = |d: &Detection| d.score.unwrap_or(1.0);
             rank(b).total_cmp(&rank(a)).then(b.region.area.cmp(&a.region.area))
@@ -254,7 +262,7 @@ impl ColorModel {
     }
 }
 
-/// Each component's region and its mean score, in the order of the labels.
+/// Computes each component's region and mean score, in the order of the labels.
 fn measure(components: &Components, score: ImageView<'_, f32, 1>) -> Vec<(Region, f64)> {
     let (width, height) = components.labels.size();
     // Sums of dx², dy², dx dy and score.
@@ -274,9 +282,10 @@ fn measure(components: &Components, score: ImageView<'_, f32, 1>) -> Vec<(Region
     }
     let region = |(stats, sums): (&cv_imgproc::ComponentStats, &[f64; 4])| {
         let [xx, yy, xy, color] = sums.map(|sum| sum / stats.area as f64);
-        // A pixel is a square with a variance of 1/12 each way, not a point.
+        // The variance of a unit square (a pixel) along each axis is 1/12.
         let (xx, yy) = (xx + 1.0 / 12.0, yy + 1.0 / 12.0);
-        let (mean, half) = (0.5 * (xx + yy), (0.5 * (xx - yy)).hypot(xy));
+        // The eigenvalues of the covariance are mean ± radius.
+        let (mean, radius) = (0.5 * (xx + yy), (0.5 * (xx - yy)).hypot(xy));
         let region = Region {
             left: stats.left,
             top: stats.top,
@@ -284,8 +293,9 @@ fn measure(components: &Components, score: ImageView<'_, f32, 1>) -> Vec<(Region
             height: stats.height,
             center: stats.centroid,
             area: stats.area,
-            // Half of a filled ellipse's semi-axis is the standard deviation along it; the smaller is at least that of a pixel.
-            axes: [mean + half, (mean - half).max(1.0 / 12.0)].map(|variance| 2.0 * variance.sqrt()),
+            // A filled ellipse's semi-axis is twice the standard deviation along it; the minor one is at least that of
+            // a pixel.
+            axes: [mean + radius, (mean - radius).max(1.0 / 12.0)].map(|variance| 2.0 * variance.sqrt()),
             angle: 0.5 * (2.0 * xy).atan2(xx - yy),
             truncated: stats.left == 0
                 || stats.top == 0
@@ -297,10 +307,11 @@ fn measure(components: &Components, score: ImageView<'_, f32, 1>) -> Vec<(Region
     components.stats.iter().zip(&sums).map(region).collect()
 }
 
-/// The probability that a chi-squared variable of `FREEDOM` (1 or 3) degrees of freedom exceeds `x ≥ 0`: 1 less the series of the lower incomplete gamma function.
+/// Computes the survival function of the chi-squared distribution with `FREEDOM` (1 or 3) degrees of freedom at `x ≥
+/// 0`: 1 minus the series of the regularized lower incomplete gamma function.
 fn chi_squared_survival<const FREEDOM: usize>(x: f64) -> f64 {
     let (a, z) = (0.5 * FREEDOM as f64, 0.5 * x);
-    // Below 1e-15, which is what the difference resolves.
+    // The result is below 1e-15, the rounding error of the difference.
     if z.is_nan() || z > 40.0 {
         return 0.0;
     }
@@ -308,7 +319,7 @@ fn chi_squared_survival<const FREEDOM: usize>(x: f64) -> f64 {
     let mut term = FRAC_2_SQRT_PI / if FREEDOM == 3 { 1.5 } else { 1.0 };
     let mut sum = term;
     let mut n = a;
-    // Terms grow until n exceeds z and then fall faster than geometrically: 200 suffice for z = 40.
+    // Terms grow until n exceeds z, then decrease faster than geometrically: 200 suffice for z = 40.
     for _ in 0..200 {
         n += 1.0;
         term *= z / n;
@@ -332,7 +343,7 @@ mod tests {
     }
 
     #[test]
-    fn the_axes_of_a_drawn_ellipse_are_measured() {
+    fn axes_angle_and_centroid_of_an_ellipse_are_measured() {
         let (a, b) = (30.0, 12.0);
         for degrees in [0.0f64, 20.0, 45.0, 80.0, -30.0, -70.0] {
             let (sin, cos) = degrees.to_radians().sin_cos();
@@ -340,7 +351,8 @@ mod tests {
                 let (dx, dy) = (x - 50.3, y - 44.6);
                 ((dx * cos + dy * sin) / a).powi(2) + ((dy * cos - dx * sin) / b).powi(2) <= 1.0
             });
-            // A border of about 140 pixels, each half in doubt at random: a hundredth of the area, and less of the axes.
+            // Discretization of the border's about 140 pixels: an error of a hundredth of the area, and less of the
+            // axes.
             assert!((region.axes[0] - a).abs() < 0.2 && (region.axes[1] - b).abs() < 0.2, "{degrees}: {region:?}");
             assert!((region.angle - degrees.to_radians()).abs() < 0.01, "{degrees}: {region:?}");
             assert!((region.center - Point2::new(50.3, 44.6)).norm() < 0.1, "{degrees}: {region:?}");
@@ -351,7 +363,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rectangle_has_the_moments_of_its_sides() {
+    fn moments_of_a_rectangle_equal_the_closed_form() {
         let (region, _) = only(40, 20, |x, y| (10.0..30.0).contains(&x) && (5.0..13.0).contains(&y));
         assert_eq!((region.left, region.top, region.width, region.height, region.area), (10, 5, 20, 8, 160));
         assert_eq!(region.center, Point2::new(19.5, 8.5));
@@ -365,7 +377,7 @@ mod tests {
     }
 
     #[test]
-    fn the_chi_squared_distribution_is_that_of_the_tables() {
+    fn chi_squared_survival_agrees_with_tables() {
         for (x, p) in [(7.815, 0.05), (11.345, 0.01), (16.266, 0.001)] {
             // Tables give three decimals of the quantile.
             assert!((chi_squared_survival::<3>(x) / p - 1.0).abs() < 1e-3, "{x}");
@@ -378,7 +390,7 @@ mod tests {
     }
 
     #[test]
-    fn a_shape_is_judged_by_those_trained_on() {
+    fn scores_separate_discs_from_bars() {
         let disc = |r: f64| move |x: f64, y: f64| (x - 50.0).hypot(y - 50.0) <= r;
         let bar = |l: f64| move |x: f64, y: f64| (x - 50.0).abs() <= l && (y - 50.0).abs() <= l / 5.0;
         let learned = |shapes: [(Region, f64); 3]| {
@@ -395,9 +407,9 @@ mod tests {
         let ((disc, color), (bar, _)) = (only(101, 101, disc(12.0)), only(101, 101, bar(28.0)));
         assert!(discs.score(&disc, color) > 0.9 && discs.score(&bar, color) < MIN_SCORE);
         assert!(bars.score(&bar, color) > 0.9 && bars.score(&disc, color) < MIN_SCORE);
-        // Five nats less than the trained ones: of another color. More is no fault.
+        // A color score five nats below the mean is rejected; one above the mean is not penalized.
         assert!(discs.score(&disc, color - 5.0) < MIN_SCORE && discs.score(&disc, color + 5.0) > 0.9);
-        // The shape of what is cut off says nothing.
+        // The shape of a truncated region is not used.
         assert!(discs.score(&Region { truncated: true, ..bar }, color) > 0.9);
         assert!(ObjectFeatures::default().statistics().is_none());
     }

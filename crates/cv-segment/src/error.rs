@@ -1,4 +1,4 @@
-//! What can go wrong.
+//! Errors of training and prediction.
 
 use crate::MixtureError;
 use cv_core::Cancelled;
@@ -8,43 +8,43 @@ use cv_core::OptionError;
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum SegmentError {
-    /// There is nothing to train on.
+    /// No training images were passed.
     #[error("there are no photos with masks to train on")]
     NoPhotos,
-    /// A mask does not fit its photo.
+    /// The sizes of an image and its mask differ.
     #[error("photo {index} has {}×{} pixels, its mask {}×{}", photo.0, photo.1, mask.0, mask.1)]
     SizeMismatch {
-        /// Which, from 0.
+        /// Index of the image, from 0.
         index: usize,
-        /// Width and height of the photo.
+        /// Width and height of the image.
         photo: (usize, usize),
         /// Width and height of the mask.
         mask: (usize, usize),
     },
-    /// No mask marks any pixel.
+    /// No mask has a foreground pixel.
     #[error("none of the {photos} masks marks a pixel: the object's pixels must be white")]
     NoForeground {
-        /// How many there are.
+        /// Number of masks.
         photos: usize,
     },
-    /// The masks mark every pixel.
+    /// The masks have no background pixel.
     #[error("the {photos} masks mark every pixel: there is no background to tell the object from")]
     NoBackground {
-        /// How many there are.
+        /// Number of masks.
         photos: usize,
     },
     /// An option is out of its range.
     #[error(transparent)]
     Option(#[from] OptionError),
-    /// A mixture could not be fitted, or a loaded one is not one.
+    /// A mixture could not be fitted, or a loaded one is invalid.
     #[error(transparent)]
     Mixture(MixtureError),
-    /// A model was written by another version.
+    /// The model's schema is of another version.
     #[error("the model has {}; this program reads schema {known}: train it again", found.map_or("no schema".to_owned(), |s| format!("schema {s}")))]
     Schema {
-        /// What it says.
+        /// Schema of the model.
         found: Option<u64>,
-        /// What is read here.
+        /// Schema that this version reads.
         known: u32,
     },
     /// The job was stopped by its progress callback.

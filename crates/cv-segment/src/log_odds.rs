@@ -1,7 +1,7 @@
-//! The log odds of every pixel of a photo, 64 pixels at a time.
+//! Vectorized log odds of every pixel, in blocks of 64 pixels.
 //!
-//! Plain loops over arrays, compiled for each instruction set and chosen at run time; multiplications and additions are never fused, so all
-//! give the same bytes.
+//! Plain loops over arrays, compiled for each instruction set and dispatched at run time. Multiplications and additions
+//! are never fused, so all instruction sets give identical results.
 
 use crate::{ColorSpace, mixture::Whitened};
 use cv_core::{Cancelled, GrayF32, ImageView, Progress, Stage};
@@ -13,30 +13,31 @@ use std::f32::consts::{PI, TAU};
 const LANES: usize = 64;
 type Block = [f32; LANES];
 
-/// A component of a mixture: `log density = constant − ½ |A x + b|²`.
+/// A mixture component in f32: `log density = constant − ½ |A x + b|²`, with the lower triangle of `A` in row-major
+/// order.
 #[derive(Debug, Clone, Copy)]
-struct Flat {
+struct PackedComponent {
     constant: f32,
     a: [f32; 6],
     b: [f32; 3],
 }
 
-impl From<&Whitened> for Flat {
+impl From<&Whitened> for PackedComponent {
     fn from(w: &Whitened) -> Self {
         let a = [w.a[(0, 0)], w.a[(1, 0)], w.a[(1, 1)], w.a[(2, 0)], w.a[(2, 1)], w.a[(2, 2)]];
         Self { constant: w.constant as f32, a: a.map(|v| v as f32), b: std::array::from_fn(|i| w.b[i] as f32) }
     }
 }
 
-/// Log odds of two mixtures in a color space.
+/// Evaluator of the log likelihood ratio of two mixtures in a color space.
 #[derive(Debug, Clone)]
 pub(crate) struct LogOdds {
     space: ColorSpace,
     hue: f32,
-    foreground: Vec<Flat>,
-    /// Without a background the odds are the foreground's density.
-    background: Vec<Flat>,
-    /// sRGB byte to linear light, for Lab.
+    foreground: Vec<PackedComponent>,
+    /// If empty, the result is the foreground's log density.
+    background: Vec<PackedComponent>,
+    /// Lookup table from sRGB byte to linear intensity, for Lab.
     linear: [f32; 256],
 }
 
@@ -45,11 +46,11 @@ impl LogOdds {
         let bytes = cv_core::GrayU8::from_fn(256, 1, |x, _| [x as u8]);
         let mut linear = [0.0; 256];
         linear.copy_from_slice(cv_imgproc::srgb_to_linear(bytes.view()).as_slice());
-        let flat = |w: &[Whitened]| w.iter().map(Flat::from).collect();
-        Self { space, hue, foreground: flat(foreground), background: flat(background), linear }
+        let pack = |w: &[Whitened]| w.iter().map(PackedComponent::from).collect();
+        Self { space, hue, foreground: pack(foreground), background: pack(background), linear }
     }
 
-    /// Natural logarithm of the ratio of the densities at each pixel.
+    /// Computes the natural logarithm of the likelihood ratio at each pixel.
     pub(crate) fn log_odds(&self, view: ImageView<'_, u8, 3>, progress: &dyn Progress) -> Result<GrayF32, Cancelled> {
         self.log_odds_at(Level::new(), view, progress)
     }
@@ -115,12 +116,12 @@ impl LogOdds {
     }
 }
 
-/// The density as `sum · exp(max)`; `sum` is at least one.
+/// Evaluates a mixture's density as `sum · exp(max)` (log-sum-exp); `sum` is at least one.
 #[inline(always)]
-fn density(components: &[Flat], x: &[Block; 3], terms: &mut [Block], max: &mut Block, sum: &mut Block) {
+fn density(components: &[PackedComponent], x: &[Block; 3], terms: &mut [Block], max: &mut Block, sum: &mut Block) {
     *max = [f32::MIN; LANES];
     for (c, term) in components.iter().zip(terms.iter_mut()) {
-        let Flat { constant, a, b } = *c;
+        let PackedComponent { constant, a, b } = *c;
         for i in 0..LANES {
             let (x0, x1, x2) = (x[0][i], x[1][i], x[2][i]);
             let y0 = a[0] * x0 + b[0];
@@ -139,10 +140,11 @@ fn density(components: &[Flat], x: &[Block; 3], terms: &mut [Block], max: &mut B
     }
 }
 
-/// eᵛ for `v ≤ 0`, with a relative error below 1e-6 and zero below −87: 2ⁿ times a polynomial in the rest.
+/// Computes eᵛ for `v ≤ 0`, with a relative error below 1e-6; arguments below −87 are clamped. Range reduction to 2ⁿ
+/// times a polynomial in the remainder.
 #[inline(always)]
 fn exp(v: f32) -> f32 {
-    const ROUND: f32 = 12_582_912.0; // 1.5 · 2²³: adding it leaves the nearest integer in the low bits
+    const ROUND: f32 = 12_582_912.0; // 1.5 · 2²³: adding it rounds to the nearest integer, in the low bits
     let v = if v > -87.0 { v } else { -87.0 };
     let shifted = v * std::f32::consts::LOG2_E + ROUND;
     let n = shifted - ROUND;
@@ -153,7 +155,8 @@ fn exp(v: f32) -> f32 {
     p * f32::from_bits(power)
 }
 
-/// Natural logarithm of a positive normal number, to about 1e-6: the exponent, and the series of 2 atanh for the rest.
+/// Computes the natural logarithm of a positive normal number, to about 1e-6: exponent times ln 2 plus the series of 2
+/// atanh for the mantissa.
 #[inline(always)]
 fn ln(v: f32) -> f32 {
     // Mantissa between √½ and √2.
@@ -183,24 +186,24 @@ fn hsv(pixels: &[[u8; 3]; LANES], hue: f32, x: &mut [Block; 3]) {
             planes[c][i] = f32::from(pixels[i][c]);
         }
     }
-    let pick = |condition: bool, a: f32, b: f32| if condition { a } else { b };
+    let select = |condition: bool, a: f32, b: f32| if condition { a } else { b };
     for i in 0..LANES {
         let (r, g, b) = (planes[0][i], planes[1][i], planes[2][i]);
-        let max = pick(r > g, r, g);
-        let max = pick(max > b, max, b);
-        let min = pick(r < g, r, g);
-        let min = pick(min < b, min, b);
+        let max = select(r > g, r, g);
+        let max = select(max > b, max, b);
+        let min = select(r < g, r, g);
+        let min = select(min < b, min, b);
         let range = max - min;
-        // Where the range is zero so is the difference, and the hue is red's offset, 0.
-        let inverse = 1.0 / pick(range > 0.0, range, 1.0);
-        let by_red = pick(g < b, 6.0, 0.0) + (g - b) * inverse;
-        let by_green = 2.0 + (b - r) * inverse;
-        let by_blue = 4.0 + (r - g) * inverse;
-        let sixths = pick(max == r, by_red, pick(max == g, by_green, by_blue));
+        // For a gray (range zero) the numerator is zero too, and the hue is 0.
+        let inverse = 1.0 / select(range > 0.0, range, 1.0);
+        let hue_if_red_max = select(g < b, 6.0, 0.0) + (g - b) * inverse;
+        let hue_if_green_max = 2.0 + (b - r) * inverse;
+        let hue_if_blue_max = 4.0 + (r - g) * inverse;
+        let sixths = select(max == r, hue_if_red_max, select(max == g, hue_if_green_max, hue_if_blue_max));
         let angle = sixths * (TAU / 6.0) - hue;
-        let angle = pick(angle > PI, angle - TAU, angle);
-        x[0][i] = pick(angle < -PI, angle + TAU, angle);
-        x[1][i] = range / pick(max > 0.0, max, 1.0);
+        let angle = select(angle > PI, angle - TAU, angle);
+        x[0][i] = select(angle < -PI, angle + TAU, angle);
+        x[1][i] = range / select(max > 0.0, max, 1.0);
         x[2][i] = max * (1.0 / 255.0);
     }
 }
@@ -230,11 +233,11 @@ mod tests {
     use proptest::prelude::*;
 
     #[test]
-    fn the_exponential_and_the_logarithm_are_those() {
+    fn exp_and_ln_are_within_their_error_bounds() {
         for i in 0..=87_000 {
             let v = -(i as f32) / 1000.0;
             let exact = f64::from(v).exp();
-            // The first term left out is (ln 2 / 2)⁷ / 5040 = 1.2e-7 of at least 0.7; the rest is rounding.
+            // The first omitted term is (ln 2 / 2)⁷ / 5040 = 1.2e-7 of at least 0.7; the rest is rounding.
             assert!((f64::from(exp(v)) - exact).abs() < 6e-7 * exact, "{v}");
         }
         for i in 1..=100_000 {
@@ -247,7 +250,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn the_odds_are_the_mixtures_in_every_space(
+        fn log_odds_equal_the_reference_mixtures_in_every_space_and_instruction_set(
             width in 1usize..150, seed in any::<u32>(), hue in 0.0f32..TAU, space in 0usize..3, counts in (1usize..5, 0usize..5),
         ) {
             let space = [ColorSpace::Hsv, ColorSpace::Rgb, ColorSpace::Lab][space];
@@ -278,13 +281,14 @@ mod tests {
             for y in 0..2 {
                 for x in 0..width {
                     let p = space.coordinates(image.at(x, y), hue).map(f64::from);
-                    // At the cut opposite the mean hue a rounding decides on which side a color falls.
+                    // At the wrap-around opposite the mean hue, rounding decides the side.
                     if space == ColorSpace::Hsv && p[0].abs() > f64::from(PI) - 1e-4 {
                         continue;
                     }
                     let (f, b) = (f.log_density(p), if counts.1 == 0 { 0.0 } else { b.log_density(p) });
                     let got = f64::from(first.at(x, y)[0]);
-                    // Rounding of squares of up to |f| and |b|; near black hue and saturation are ratios of small numbers, but exact in both.
+                    // Rounding of squares of up to |f| and |b|; near black, hue and saturation are ratios of small
+                    // integers, exact in both.
                     prop_assert!((got - (f - b)).abs() < 1e-4 + 4e-6 * (f.abs() + b.abs()), "{:?} {} {} {}", image.at(x, y), got, f, b);
                 }
             }

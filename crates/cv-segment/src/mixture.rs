@@ -1,4 +1,4 @@
-//! Mixtures of Gaussians, fitted by expectation-maximization.
+//! Gaussian mixture models, fitted by expectation-maximization.
 
 use cv_core::{Cancelled, Progress, Stage};
 use nalgebra::{Matrix3, Vector3};
@@ -7,49 +7,52 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// A point and how often it was seen.
+/// A weighted sample point.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct WeightedSample {
     /// Coordinates.
     pub point: [f64; 3],
-    /// How often; not negative.
+    /// Weight (multiplicity), not negative.
     pub weight: f64,
 }
 
-/// One Gaussian of a mixture.
+/// A Gaussian component of a mixture.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Component {
-    /// Its share of the mixture, 0 to 1.
+    /// Mixing coefficient, 0 to 1.
     pub weight: f64,
     /// Mean.
     pub mean: [f64; 3],
-    /// Covariance, by rows.
+    /// Covariance matrix, row-major.
     pub covariance: [[f64; 3]; 3],
 }
 
-/// A weighted sum of Gaussians.
+/// A Gaussian mixture model with full covariances.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Mixture {
-    /// The Gaussians, largest weight first.
+    /// The components, by decreasing weight.
     pub components: Vec<Component>,
 }
 
-/// How a mixture is fitted.
+/// Options of [`Mixture::fit`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MixtureOptions {
-    /// Gaussians, 1 to 64. Fewer result where there are fewer distinct points.
+    /// Number of Gaussians, 1 to 64; default 1. The fit has fewer where there are fewer distinct points.
     pub components: usize,
-    /// Added to each variance, in units of the samples' own variance along that axis. Default 1e-6.
+    /// Covariance regularization: added to each variance, relative to the samples' variance along that axis. Default
+    /// 1e-6.
     pub regularization: f64,
-    /// Standard deviations below which differences between points mean nothing; their squares are added to the variances. Default 0.
+    /// Measurement resolution of each coordinate, as a standard deviation; its square is added to the variance. Default
+    /// 0.
     pub resolution: [f64; 3],
-    /// Most rounds of expectation and maximization. Default 200.
+    /// Maximum number of EM iterations. Default 200.
     pub max_iterations: usize,
-    /// Stops when a round raises the mean log density by less. Default 1e-4 (a tenth of scikit-learn's).
+    /// Convergence tolerance: EM stops when the mean log-likelihood increases by less. Default 1e-4 (a tenth of
+    /// scikit-learn's).
     pub tolerance: f64,
-    /// Seed of the choice of the first means. Default 1.
+    /// Seed of the k-means++ initialization. Default 1.
     pub seed: u64,
 }
 
@@ -66,29 +69,29 @@ impl Default for MixtureOptions {
     }
 }
 
-/// Why no mixture could be fitted or used.
+/// Why a mixture could not be fitted or is invalid.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum MixtureError {
-    /// There are no samples of positive weight.
+    /// No sample has a positive weight.
     #[error("there are no samples to fit a mixture to")]
     NoSamples,
     /// A sample is not finite or has a negative weight.
-    #[error("sample {index} is not a finite point with a weight")]
+    #[error("sample {index} is not a finite point with a finite weight of at least 0")]
     BadSample {
-        /// Which.
+        /// Index of the sample.
         index: usize,
     },
     /// Number of components outside 1 to 64.
     #[error("{components} components: between 1 and 64 can be fitted")]
     BadCount {
-        /// How many were asked for.
+        /// Requested number of components.
         components: usize,
     },
-    /// A covariance is not positive definite, or a weight or mean not a number that one can have.
-    #[error("component {index} is not a Gaussian with a positive weight")]
+    /// A covariance is not symmetric positive definite, or a weight or mean is not finite or not positive.
+    #[error("component {index} has no positive definite covariance, finite mean and positive weight")]
     BadComponent {
-        /// Which.
+        /// Index of the component.
         index: usize,
     },
     /// The job was stopped by its progress callback.
@@ -96,7 +99,8 @@ pub enum MixtureError {
     Cancelled(#[from] Cancelled),
 }
 
-/// A component ready to evaluate: `log density = constant − ½ |A x + b|²`, `A` lower triangular.
+/// A component with precomputed whitening transform: `log density = constant − ½ |A x + b|²`, `A` (the inverse Cholesky
+/// factor) lower triangular.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Whitened {
     pub(crate) constant: f64,
@@ -123,13 +127,15 @@ impl Whitened {
 }
 
 impl Mixture {
-    /// Fits a mixture by expectation-maximization (Dempster, Laird & Rubin 1977) on weighted samples, from a k-means++ start (Arthur & Vassilvitskii 2007) in
-    /// coordinates scaled by the samples' standard deviations.
+    /// Fits a mixture to weighted samples by expectation-maximization (Dempster, Laird & Rubin 1977), initialized by
+    /// k-means++ (Arthur & Vassilvitskii 2007) in coordinates scaled by the samples' standard deviations.
     ///
-    /// Samples that are all one point give one Gaussian of the least width the options allow. Time is rounds × samples × components.
+    /// Coincident samples give one Gaussian with the minimum variance of the options. Time is O(iterations × samples ×
+    /// components).
     ///
     /// # Errors
-    /// [`MixtureError`] for no or bad samples, or a bad count.
+    /// [`MixtureError`]: no samples of positive weight, an invalid sample, a number of components out of range,
+    /// cancellation.
     pub fn fit(
         samples: &[WeightedSample],
         options: &MixtureOptions,
@@ -139,59 +145,59 @@ impl Mixture {
         if !(1..=64).contains(&k) {
             return Err(MixtureError::BadCount { components: k });
         }
-        let bad =
+        let is_invalid =
             |s: &WeightedSample| !(s.weight >= 0.0 && s.weight.is_finite() && s.point.iter().all(|v| v.is_finite()));
-        if let Some(index) = samples.iter().position(bad) {
+        if let Some(index) = samples.iter().position(is_invalid) {
             return Err(MixtureError::BadSample { index });
         }
         let total: f64 = samples.iter().map(|s| s.weight).sum();
         if total <= 0.0 {
             return Err(MixtureError::NoSamples);
         }
-        let scatter = Scatter::of(samples.iter().map(|s| (s, s.weight)));
-        let (mean, spread) = scatter.moments();
-        let floor: [f64; 3] = std::array::from_fn(|i| {
-            // Were everything one point and no resolution known, what rounding leaves of its size.
-            let least = 1e-12 * (1.0 + mean[i] * mean[i]);
-            (options.regularization * spread[(i, i)] + options.resolution[i].powi(2)).max(least)
+        let moments = RawMoments::of(samples.iter().map(|s| (s, s.weight)));
+        let (mean, covariance) = moments.mean_and_covariance();
+        let variance_floor: [f64; 3] = std::array::from_fn(|i| {
+            // The rounding error of a variance, for coincident samples without a resolution.
+            let rounding = 1e-12 * (1.0 + mean[i] * mean[i]);
+            (options.regularization * covariance[(i, i)] + options.resolution[i].powi(2)).max(rounding)
         });
-        let mut components = first_components(samples, k, &spread, &floor, options.seed, progress)?;
-        let mut last = f64::NEG_INFINITY;
+        let mut components = initial_components(samples, k, &covariance, &variance_floor, options.seed, progress)?;
+        let mut previous = f64::NEG_INFINITY;
         let stage = Stage::new(progress, "fit", options.max_iterations)?;
         for _ in 0..options.max_iterations {
             let whitened: Vec<Whitened> = components.iter().filter_map(Whitened::new).collect();
-            let (scatters, log_density) = expectation(samples, &whitened, &stage)?;
-            components = maximization(&scatters, total, &floor);
+            let (moments, log_likelihood) = expectation(samples, &whitened, &stage)?;
+            components = maximization(&moments, total, &variance_floor);
             stage.add(1)?;
-            let now = log_density / total;
-            if now - last < options.tolerance {
+            let mean_log_likelihood = log_likelihood / total;
+            if mean_log_likelihood - previous < options.tolerance {
                 break;
             }
-            last = now;
+            previous = mean_log_likelihood;
         }
         components.sort_by(|a, b| b.weight.total_cmp(&a.weight));
         Ok(Self { components })
     }
 
-    /// The natural logarithm of the density at a point. `−∞` for a mixture without components.
+    /// Computes the natural logarithm of the density at a point; `−∞` for a mixture without components.
     pub fn log_density(&self, point: [f64; 3]) -> f64 {
         let x = Vector3::from(point);
         let terms: Vec<f64> = self.components.iter().filter_map(Whitened::new).map(|c| c.log_density(&x)).collect();
         log_sum_exp(&terms)
     }
 
-    /// The components ready to evaluate.
+    /// Precomputes the whitening transform of each component.
     pub(crate) fn whitened(&self) -> Result<Vec<Whitened>, MixtureError> {
         if !(1..=64).contains(&self.components.len()) {
             return Err(MixtureError::BadCount { components: self.components.len() });
         }
-        let ready = |(index, c): (usize, &Component)| {
-            let symmetric = (0..3).all(|i| {
+        let whiten = |(index, c): (usize, &Component)| {
+            let is_symmetric = (0..3).all(|i| {
                 (0..3).all(|j| (c.covariance[i][j] - c.covariance[j][i]).abs() <= 1e-9 * c.covariance[i][i].abs())
             });
-            Whitened::new(c).filter(|_| symmetric).ok_or(MixtureError::BadComponent { index })
+            Whitened::new(c).filter(|_| is_symmetric).ok_or(MixtureError::BadComponent { index })
         };
-        self.components.iter().enumerate().map(ready).collect()
+        self.components.iter().enumerate().map(whiten).collect()
     }
 }
 
@@ -203,15 +209,15 @@ fn log_sum_exp(terms: &[f64]) -> f64 {
     max + terms.iter().map(|t| (t - max).exp()).sum::<f64>().ln()
 }
 
-/// Weighted sums of points and of their products.
+/// Weighted raw moments of order 0, 1 and 2.
 #[derive(Clone, Copy)]
-struct Scatter {
+struct RawMoments {
     weight: f64,
     sum: Vector3<f64>,
     products: Matrix3<f64>,
 }
 
-impl Scatter {
+impl RawMoments {
     const ZERO: Self = Self {
         weight: 0.0,
         sum: Vector3::new(0.0, 0.0, 0.0),
@@ -219,11 +225,11 @@ impl Scatter {
     };
 
     fn of<'a>(samples: impl Iterator<Item = (&'a WeightedSample, f64)>) -> Self {
-        let mut scatter = Self::ZERO;
+        let mut moments = Self::ZERO;
         for (s, weight) in samples {
-            scatter.add(&Vector3::from(s.point), weight);
+            moments.add(&Vector3::from(s.point), weight);
         }
-        scatter
+        moments
     }
 
     #[inline]
@@ -238,17 +244,18 @@ impl Scatter {
         Self { weight: self.weight + other.weight, sum: self.sum + other.sum, products: self.products + other.products }
     }
 
-    /// Mean and covariance.
-    fn moments(&self) -> (Vector3<f64>, Matrix3<f64>) {
+    /// Returns mean and covariance.
+    fn mean_and_covariance(&self) -> (Vector3<f64>, Matrix3<f64>) {
         let mean = self.sum / self.weight;
         (mean, self.products / self.weight - mean * mean.transpose())
     }
 
-    fn component(&self, total: f64, floor: &[f64; 3]) -> Component {
-        let (mean, mut covariance) = self.moments();
+    /// Returns the component of these moments, with `variance_floor` added to the variances.
+    fn component(&self, total: f64, variance_floor: &[f64; 3]) -> Component {
+        let (mean, mut covariance) = self.mean_and_covariance();
         for i in 0..3 {
-            // Cancellation can leave a variance a rounding below zero.
-            covariance[(i, i)] = covariance[(i, i)].max(0.0) + floor[i];
+            // Cancellation can make a variance slightly negative.
+            covariance[(i, i)] = covariance[(i, i)].max(0.0) + variance_floor[i];
         }
         let covariance =
             std::array::from_fn(|i| std::array::from_fn(|j| 0.5 * (covariance[(i, j)] + covariance[(j, i)])));
@@ -256,28 +263,29 @@ impl Scatter {
     }
 }
 
-/// The first means by k-means++ and ten rounds of k-means, the first covariances those of their clusters.
-fn first_components(
+/// Initializes the components by k-means++ and ten iterations of Lloyd's k-means; the covariances are those of the
+/// clusters.
+fn initial_components(
     samples: &[WeightedSample],
     k: usize,
-    spread: &Matrix3<f64>,
-    floor: &[f64; 3],
+    covariance: &Matrix3<f64>,
+    variance_floor: &[f64; 3],
     seed: u64,
     progress: &dyn Progress,
 ) -> Result<Vec<Component>, Cancelled> {
-    const ROUNDS: usize = 10;
-    let stage = Stage::new(progress, "clusters", k + ROUNDS + 1)?;
-    let scale = Vector3::from_fn(|i, _| 1.0 / (spread[(i, i)].max(0.0) + floor[i]).sqrt());
+    const LLOYD_ITERATIONS: usize = 10;
+    let stage = Stage::new(progress, "clusters", k + LLOYD_ITERATIONS + 1)?;
+    let scale = Vector3::from_fn(|i, _| 1.0 / (covariance[(i, i)].max(0.0) + variance_floor[i]).sqrt());
     let points: Vec<Vector3<f64>> = samples.iter().map(|s| Vector3::from(s.point).component_mul(&scale)).collect();
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut centers: Vec<Vector3<f64>> = Vec::with_capacity(k);
-    let mut nearest: Vec<f64> = vec![1.0; samples.len()];
+    let mut squared_distances: Vec<f64> = vec![1.0; samples.len()];
     while centers.len() < k {
-        // With no center yet every distance is one: the first is drawn by weight alone.
-        let chances = || samples.iter().zip(&nearest).map(|(s, d)| s.weight * d);
-        let Some(chosen) = draw(chances, &mut rng) else { break };
+        // All distances are 1 before the first center, which is drawn by weight alone.
+        let probabilities = || samples.iter().zip(&squared_distances).map(|(s, d)| s.weight * d);
+        let Some(chosen) = draw(probabilities, &mut rng) else { break };
         let center = points[chosen];
-        for (d, p) in nearest.iter_mut().zip(&points) {
+        for (d, p) in squared_distances.iter_mut().zip(&points) {
             let distance = (p - center).norm_squared();
             *d = if centers.is_empty() { distance } else { d.min(distance) };
         }
@@ -285,8 +293,8 @@ fn first_components(
         stage.add(1)?;
     }
     let mut clusters = Vec::new();
-    for round in 0..=ROUNDS {
-        clusters = vec![Scatter::ZERO; centers.len()];
+    for iteration in 0..=LLOYD_ITERATIONS {
+        clusters = vec![RawMoments::ZERO; centers.len()];
         for (i, (s, p)) in samples.iter().zip(&points).enumerate() {
             if i.is_multiple_of(CHUNK) {
                 stage.check()?;
@@ -301,7 +309,7 @@ fn first_components(
             clusters[best.0].add(&Vector3::from(s.point), s.weight);
         }
         stage.add(1)?;
-        if round < ROUNDS {
+        if iteration < LLOYD_ITERATIONS {
             for (center, cluster) in centers.iter_mut().zip(&clusters) {
                 if cluster.weight > 0.0 {
                     *center = (cluster.sum / cluster.weight).component_mul(&scale);
@@ -310,19 +318,19 @@ fn first_components(
         }
     }
     let total = samples.iter().map(|s| s.weight).sum();
-    Ok(maximization(&clusters, total, floor))
+    Ok(maximization(&clusters, total, variance_floor))
 }
 
-/// Draws an index by chances; `None` where all are zero.
-fn draw<I: Iterator<Item = f64>>(chances: impl Fn() -> I, rng: &mut impl Rng) -> Option<usize> {
-    let total: f64 = chances().sum();
-    let mut left = rng.random::<f64>() * total;
+/// Draws an index with the given unnormalized probabilities; `None` where all are zero.
+fn draw<I: Iterator<Item = f64>>(probabilities: impl Fn() -> I, rng: &mut impl Rng) -> Option<usize> {
+    let total: f64 = probabilities().sum();
+    let mut remaining = rng.random::<f64>() * total;
     let mut last = None;
-    for (i, chance) in chances().enumerate() {
-        if chance > 0.0 {
+    for (i, probability) in probabilities().enumerate() {
+        if probability > 0.0 {
             last = Some(i);
-            left -= chance;
-            if left < 0.0 {
+            remaining -= probability;
+            if remaining < 0.0 {
                 break;
             }
         }
@@ -330,22 +338,22 @@ fn draw<I: Iterator<Item = f64>>(chances: impl Fn() -> I, rng: &mut impl Rng) ->
     last
 }
 
-/// Samples that are worked on together, and without asking whether to go on.
+/// Samples per parallel task, between checks for cancellation.
 const CHUNK: usize = 1024;
 
-/// The points' shares in each component, as sums, and the log density of all.
+/// E step: returns the responsibility-weighted raw moments of each component, and the log-likelihood of all samples.
 fn expectation(
     samples: &[WeightedSample],
     components: &[Whitened],
     stage: &Stage<'_>,
-) -> Result<(Vec<Scatter>, f64), Cancelled> {
-    let zero = || (vec![Scatter::ZERO; components.len()], 0.0);
-    // Chunks of fixed size, added up in order: the sums do not depend on the number of threads.
-    let parts: Vec<(Vec<Scatter>, f64)> = samples
+) -> Result<(Vec<RawMoments>, f64), Cancelled> {
+    let zero = || (vec![RawMoments::ZERO; components.len()], 0.0);
+    // Chunks of fixed size are summed in order, so the result does not depend on the number of threads.
+    let parts: Vec<(Vec<RawMoments>, f64)> = samples
         .par_chunks(CHUNK)
         .map(|chunk| {
             stage.check()?;
-            let (mut scatters, mut log_density) = zero();
+            let (mut moments, mut log_likelihood) = zero();
             let mut terms = vec![0.0; components.len()];
             for s in chunk {
                 let x = Vector3::from(s.point);
@@ -356,29 +364,28 @@ fn expectation(
                 }
                 let mut sum = 0.0;
                 for term in &mut terms {
-                    // Shares below e^-40 of the largest are lost in f64 anyway.
+                    // Responsibilities below e^-40 of the largest are below f64's precision.
                     *term = if *term - max > -40.0 { (*term - max).exp() } else { 0.0 };
                     sum += *term;
                 }
-                log_density += s.weight * (max + sum.ln());
-                for (scatter, term) in scatters.iter_mut().zip(&terms) {
+                log_likelihood += s.weight * (max + sum.ln());
+                for (component, term) in moments.iter_mut().zip(&terms) {
                     if *term > 0.0 {
-                        scatter.add(&x, s.weight * term / sum);
+                        component.add(&x, s.weight * term / sum);
                     }
                 }
             }
-            Ok((scatters, log_density))
+            Ok((moments, log_likelihood))
         })
         .collect::<Result<_, Cancelled>>()?;
-    Ok(parts.iter().fold(zero(), |(sums, total), (scatters, log_density)| {
-        (sums.iter().zip(scatters).map(|(a, b)| a.plus(b)).collect(), total + log_density)
+    Ok(parts.iter().fold(zero(), |(sums, total), (moments, log_likelihood)| {
+        (sums.iter().zip(moments).map(|(a, b)| a.plus(b)).collect(), total + log_likelihood)
     }))
 }
 
-/// New components; those that hold no points go.
-fn maximization(scatters: &[Scatter], total: f64, floor: &[f64; 3]) -> Vec<Component> {
-    // A billionth of all points is no component.
-    scatters.iter().filter(|s| s.weight > 1e-9 * total).map(|s| s.component(total, floor)).collect()
+/// M step: returns the updated components, without those of negligible weight (below 1e-9).
+fn maximization(moments: &[RawMoments], total: f64, variance_floor: &[f64; 3]) -> Vec<Component> {
+    moments.iter().filter(|m| m.weight > 1e-9 * total).map(|m| m.component(total, variance_floor)).collect()
 }
 
 #[cfg(test)]
@@ -386,8 +393,9 @@ mod tests {
     use super::*;
     use cv_core::Silent;
 
-    /// Points of a Gaussian with the given mean and standard deviations, drawn by the sum of twelve uniform numbers.
-    fn cloud(n: usize, mean: [f64; 3], deviation: [f64; 3], seed: u64) -> Vec<WeightedSample> {
+    /// Samples of an axis-aligned Gaussian with the given mean and standard deviations (Irwin–Hall approximation,
+    /// twelve uniform variates).
+    fn gaussian_samples(n: usize, mean: [f64; 3], deviation: [f64; 3], seed: u64) -> Vec<WeightedSample> {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut normal = || (0..12).map(|_| rng.random::<f64>()).sum::<f64>() - 6.0;
         (0..n)
@@ -397,7 +405,7 @@ mod tests {
 
     #[test]
     fn one_gaussian_has_the_moments_of_its_points() {
-        let samples = cloud(5000, [1.0, -2.0, 0.5], [0.1, 0.2, 0.05], 3);
+        let samples = gaussian_samples(5000, [1.0, -2.0, 0.5], [0.1, 0.2, 0.05], 3);
         let fit = Mixture::fit(&samples, &MixtureOptions::default(), &Silent).unwrap();
         let n = samples.len() as f64;
         let mean = |i: usize| samples.iter().map(|s| s.point[i]).sum::<f64>() / n;
@@ -415,15 +423,18 @@ mod tests {
     }
 
     #[test]
-    fn three_clouds_are_found_apart() {
+    fn three_separated_clusters_are_recovered() {
         let truth = [([0.0, 0.0, 0.0], 3000), ([2.0, 0.0, 1.0], 2000), ([0.0, 3.0, -1.0], 1000)];
-        let samples: Vec<_> =
-            truth.iter().zip(1u64..).flat_map(|(&(mean, n), seed)| cloud(n, mean, [0.2, 0.3, 0.1], seed)).collect();
+        let samples: Vec<_> = truth
+            .iter()
+            .zip(1u64..)
+            .flat_map(|(&(mean, n), seed)| gaussian_samples(n, mean, [0.2, 0.3, 0.1], seed))
+            .collect();
         for seed in 0..10 {
             let fit =
                 Mixture::fit(&samples, &MixtureOptions { components: 3, seed, ..Default::default() }, &Silent).unwrap();
             for (c, (mean, n)) in fit.components.iter().zip(truth) {
-                // Ten standard deviations apart: no point is shared. Standard error of a mean 0.3/√1000 = 0.01.
+                // The means are ten standard deviations apart: no overlap. Standard error of a mean 0.3/√1000 = 0.01.
                 assert!((c.weight - n as f64 / 6000.0).abs() < 1e-3, "{seed} {fit:?}");
                 assert!(c.mean.iter().zip(mean).all(|(a, b)| (a - b).abs() < 0.04));
             }
@@ -431,8 +442,8 @@ mod tests {
     }
 
     #[test]
-    fn a_weight_counts_as_that_many_points() {
-        let points = cloud(300, [0.0; 3], [1.0, 0.5, 2.0], 8);
+    fn a_weight_equals_repetition_of_the_sample() {
+        let points = gaussian_samples(300, [0.0; 3], [1.0, 0.5, 2.0], 8);
         let doubled: Vec<_> = points.iter().flat_map(|&s| [s, s, s]).collect();
         let weighted: Vec<_> = points.iter().map(|s| WeightedSample { weight: 3.0, ..*s }).collect();
         let options = MixtureOptions::default();
@@ -443,7 +454,7 @@ mod tests {
     }
 
     #[test]
-    fn the_density_is_the_formula() {
+    fn the_log_density_equals_the_closed_form() {
         let c = Component {
             weight: 1.0,
             mean: [1.0, 2.0, 3.0],
@@ -458,7 +469,7 @@ mod tests {
     }
 
     #[test]
-    fn degenerate_samples_give_gaussians_all_the_same() {
+    fn coincident_and_collinear_samples_give_valid_gaussians() {
         let at = |point| WeightedSample { point, weight: 2.0 };
         let point = vec![at([0.5; 3]); 40];
         let pair: Vec<_> = point.iter().copied().chain(vec![at([0.5, 0.5, 0.75]); 10]).collect();
@@ -474,7 +485,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_fitted_is_said() {
+    fn invalid_samples_and_options_are_errors() {
         let good = WeightedSample { point: [0.0; 3], weight: 1.0 };
         let fit = |samples: &[WeightedSample], components| {
             Mixture::fit(samples, &MixtureOptions { components, ..Default::default() }, &Silent).unwrap_err()

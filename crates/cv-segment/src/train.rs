@@ -1,20 +1,20 @@
-//! Learning a model from photos and masks.
+//! Training of a color model on images with masks.
 
 use crate::{
     Cleanup, ColorModel, ColorSpace, ConfusionMatrix, Mixture, MixtureOptions, Rule, SegmentError, WeightedSample,
-    cleanup::largest_share,
+    cleanup::largest_component_fraction,
     color_space::mean_hue,
     detection::ObjectFeatures,
-    model::{LIMIT, ModelFile},
+    model::{MAX_ABS_SCORE, ModelFile},
 };
 use cv_core::{Cancelled, ImageView, OptionError, Progress, Stage};
 
-/// Which regions of a mask are kept.
+/// Which connected components of a mask are kept.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Regions {
-    /// The largest only, where every training mask shows one region (that holds 95 % of what is marked); else all.
+    /// The largest, if in every training mask the largest component has at least 95 % of the foreground; else all.
     #[default]
     Auto,
     /// The largest.
@@ -36,27 +36,29 @@ cv_core::named!(Regions {
 pub struct TrainOptions {
     /// Color space. Default HSV.
     pub space: ColorSpace,
-    /// Gaussians for the object's colors, 1 to 64. Default 5.
+    /// Number of Gaussians of the object's mixture, 1 to 64. Default 5.
     pub components: usize,
-    /// Gaussians for the background's, 1 to 63. Default 10: there are more colors in the background than in an object.
+    /// Number of Gaussians of the background's mixture, 1 to 63. Default 10: backgrounds have more colors than an
+    /// object.
     pub background_components: usize,
-    /// What a pixel's color is judged by. Default posterior odds with a tuned threshold.
+    /// Decision rule. Default posterior odds with a tuned threshold.
     pub rule: Rule,
-    /// The share of the background that may have any color, so that one never seen is not taken for the object only because the background's Gaussians are even
-    /// farther away. 0 to below 1; default 0.01.
+    /// Weight of a uniform component in the background mixture, for colors that do not occur in training: without it, a
+    /// color far from all Gaussians could be classified as the object. 0 to below 1; default 0.01.
     pub unknown: f64,
-    /// Standard deviation in pixels of the Gaussian by which scores are smoothed before they are held against the threshold: neighbors are mostly of one kind.
-    /// 0 to 100; default 1.
+    /// Sigma in pixels of the Gaussian filter of the scores before thresholding: neighbors mostly have the same label.
+    /// 0 (none) to 100; default 1.
     pub smoothing: f32,
-    /// Added to each variance, in units of the variance of the samples. Default 1e-6.
+    /// Covariance regularization: added to each variance, relative to the variance of the samples. 0 to 1; default
+    /// 1e-6.
     pub regularization: f64,
-    /// Radius in pixels of the disc by which masks are opened. 0 to 1000; default 2.
+    /// Radius in pixels of the disc of the opening. 0 to 1000; default 2.
     pub open_radius: usize,
-    /// Radius in pixels of the disc by which masks are closed. 0 to 1000; default 2.
+    /// Radius in pixels of the disc of the closing. 0 to 1000; default 2.
     pub close_radius: usize,
-    /// Which regions are kept. Default: learned from the masks.
+    /// Which connected components are kept. Default: determined from the masks.
     pub regions: Regions,
-    /// Seed of the mixtures' first means. Default 1.
+    /// Seed of the k-means++ initialization. Default 1.
     pub seed: u64,
 }
 
@@ -80,75 +82,78 @@ impl Default for TrainOptions {
 }
 
 impl TrainOptions {
-    /// Before the work: a bad option is not worth waiting for.
+    /// Checks the ranges before training starts.
     fn validate(&self) -> Result<(), OptionError> {
         use OptionError as E;
-        let within = |low: f64, high: f64| move |v: f64| (low..=high).contains(&v);
-        E::check("components", self.components as f64, "from 1 to 64", within(1.0, 64.0))?;
-        E::check("background_components", self.background_components as f64, "from 1 to 63", within(1.0, 63.0))?;
+        let in_range = |low: f64, high: f64| move |v: f64| (low..=high).contains(&v);
+        E::check("components", self.components as f64, "from 1 to 64", in_range(1.0, 64.0))?;
+        E::check("background_components", self.background_components as f64, "from 1 to 63", in_range(1.0, 63.0))?;
         E::check("unknown", self.unknown, "from 0 to below 1", |v| (0.0..1.0).contains(&v))?;
-        E::check("smoothing", self.smoothing.into(), "from 0 to 100 px", within(0.0, 100.0))?;
-        E::check("regularization", self.regularization, "from 0 to 1", within(0.0, 1.0))?;
-        E::check("open_radius", self.open_radius as f64, "from 0 to 1000 px", within(0.0, 1000.0))?;
-        E::check("close_radius", self.close_radius as f64, "from 0 to 1000 px", within(0.0, 1000.0))
+        E::check("smoothing", self.smoothing.into(), "from 0 to 100 px", in_range(0.0, 100.0))?;
+        E::check("regularization", self.regularization, "from 0 to 1", in_range(0.0, 1.0))?;
+        E::check("open_radius", self.open_radius as f64, "from 0 to 1000 px", in_range(0.0, 1000.0))?;
+        E::check("close_radius", self.close_radius as f64, "from 0 to 1000 px", in_range(0.0, 1000.0))
     }
 }
 
-/// A photo and the mask of the object in it.
+/// A training image and the mask of the object in it.
 pub type Labeled<'a> = (ImageView<'a, u8, 3>, ImageView<'a, bool, 1>);
 
-/// A model and what is known about its training.
+/// Result of [`train`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct Trained {
     /// The model.
     pub model: ColorModel,
-    /// Its scores on the photos it was trained on, each by itself, after cleaning up. What it will do on others is less.
+    /// Confusion matrix of each training image, after clean-up. These scores are optimistic: they are not of held-out
+    /// images.
     pub scores: Vec<ConfusionMatrix>,
-    /// Pixels of the object.
+    /// Number of foreground pixels of all masks.
     pub foreground_pixels: u64,
-    /// Other pixels.
+    /// Number of background pixels of all masks.
     pub background_pixels: u64,
 }
 
-/// Learns the object's colors, the background's, and the threshold between them.
+/// Trains a color model: fits the mixtures of object and background and tunes the threshold.
 ///
-/// Colors are counted in bins of four gray levels a side, so the time of fitting depends on how many different colors there are, not on the number of
-/// pixels. A photo without the object (an empty mask) is welcome: it shows what is not the object.
+/// Colors are quantized to a histogram with bins of four gray levels per channel, so the time of fitting depends on the
+/// number of distinct colors, not of pixels. Images without the object (an empty mask) are valid: they contribute to
+/// the background.
 ///
 /// # Errors
-/// [`SegmentError`]: no photos, a mask of another size than its photo, no or all pixels marked, an option out of range.
-pub fn train(photos: &[Labeled<'_>], options: &TrainOptions, progress: &dyn Progress) -> Result<Trained, SegmentError> {
+/// [`SegmentError`]: no images, a mask of another size than its image, no or only foreground pixels, an option out of
+/// range.
+pub fn train(images: &[Labeled<'_>], options: &TrainOptions, progress: &dyn Progress) -> Result<Trained, SegmentError> {
     options.validate()?;
-    if photos.is_empty() {
+    if images.is_empty() {
         return Err(SegmentError::NoPhotos);
     }
-    let mut colors = [Bins::new(), Bins::new()];
-    let stage = Stage::new(progress, "colors", photos.len())?;
-    for (index, (photo, mask)) in photos.iter().enumerate() {
-        if photo.size() != mask.size() {
-            return Err(SegmentError::SizeMismatch { index, photo: photo.size(), mask: mask.size() });
+    let mut histograms = [ColorHistogram::new(), ColorHistogram::new()];
+    let stage = Stage::new(progress, "colors", images.len())?;
+    for (index, (image, mask)) in images.iter().enumerate() {
+        if image.size() != mask.size() {
+            return Err(SegmentError::SizeMismatch { index, photo: image.size(), mask: mask.size() });
         }
-        for y in 0..photo.height() {
+        for y in 0..image.height() {
             stage.check()?;
-            for (&rgb, &m) in photo.row(y).as_chunks::<3>().0.iter().zip(mask.row(y)) {
-                colors[usize::from(m)].add(rgb);
+            for (&rgb, &m) in image.row(y).as_chunks::<3>().0.iter().zip(mask.row(y)) {
+                histograms[usize::from(m)].add(rgb);
             }
         }
         stage.add(1)?;
     }
-    let [background, foreground] = &colors;
+    let [background, foreground] = &histograms;
     let counts = [foreground.total(), background.total()];
     if counts[0] == 0 {
-        return Err(SegmentError::NoForeground { photos: photos.len() });
+        return Err(SegmentError::NoForeground { photos: images.len() });
     }
     if counts[1] == 0 {
-        return Err(SegmentError::NoBackground { photos: photos.len() });
+        return Err(SegmentError::NoBackground { photos: images.len() });
     }
     let hue = if options.space == ColorSpace::Hsv { mean_hue(foreground.colors()) } else { 0.0 };
-    let fit = |bins: &Bins, components| {
+    let fit = |histogram: &ColorHistogram, components| {
         let sample =
             |(rgb, weight)| WeightedSample { point: options.space.coordinates(rgb, hue).map(f64::from), weight };
-        let samples: Vec<WeightedSample> = bins.colors().map(sample).collect();
+        let samples: Vec<WeightedSample> = histogram.colors().map(sample).collect();
         let resolution = options.space.resolution();
         let settings = MixtureOptions {
             components,
@@ -159,12 +164,13 @@ pub fn train(photos: &[Labeled<'_>], options: &TrainOptions, progress: &dyn Prog
         };
         Mixture::fit(&samples, &settings, progress)
     };
-    let object = fit(foreground, options.components)?;
-    let rest = if options.rule == Rule::Density { None } else { Some(fit(background, options.background_components)?) };
+    let foreground_mixture = fit(foreground, options.components)?;
+    let background_mixture =
+        if options.rule == Rule::Density { None } else { Some(fit(background, options.background_components)?) };
     let largest = match options.regions {
         Regions::Largest => true,
         Regions::All => false,
-        Regions::Auto => one_region_each(photos, progress)?,
+        Regions::Auto => has_one_region_each(images, progress)?,
     };
     let mut file = ModelFile {
         unknown: options.unknown,
@@ -172,20 +178,20 @@ pub fn train(photos: &[Labeled<'_>], options: &TrainOptions, progress: &dyn Prog
         rule: options.rule,
         smoothing: options.smoothing,
         cleanup: Cleanup { open_radius: options.open_radius, close_radius: options.close_radius, largest },
-        ..ModelFile::new(options.space, hue, object, rest)
+        ..ModelFile::new(options.space, hue, foreground_mixture, background_mixture)
     };
     let mut model = ColorModel::try_from(file.clone())?;
     if options.rule != Rule::Posterior {
-        file.threshold = best_threshold(&model, photos, progress)?;
+        file.threshold = best_threshold(&model, images, progress)?;
         model = ColorModel::try_from(file.clone())?;
     }
-    let stage = Stage::new(progress, "scores", photos.len())?;
-    let mut scores = Vec::with_capacity(photos.len());
+    let stage = Stage::new(progress, "scores", images.len())?;
+    let mut scores = Vec::with_capacity(images.len());
     let mut objects = ObjectFeatures::default();
-    for (photo, mask) in photos {
-        let score = model.score(*photo, &stage)?;
-        let found = model.cleanup().apply(model.mark(score.view()).view(), &stage)?;
-        scores.push(ConfusionMatrix::new(found.view(), *mask)?);
+    for (image, mask) in images {
+        let score = model.score(*image, &stage)?;
+        let predicted = model.cleanup().apply(model.binarize(score.view()).view(), &stage)?;
+        scores.push(ConfusionMatrix::new(predicted.view(), *mask)?);
         objects.add(*mask, score.view());
         stage.add(1)?;
     }
@@ -194,11 +200,11 @@ pub fn train(photos: &[Labeled<'_>], options: &TrainOptions, progress: &dyn Prog
     Ok(Trained { model, scores, foreground_pixels: counts[0], background_pixels: counts[1] })
 }
 
-/// Whether each mask shows one region, but for specks.
-fn one_region_each(photos: &[Labeled<'_>], progress: &dyn Progress) -> Result<bool, Cancelled> {
-    let stage = Stage::new(progress, "regions", photos.len())?;
-    for (_, mask) in photos {
-        if largest_share(*mask) < 0.95 {
+/// Returns whether in every mask the largest component has at least 95 % of the foreground.
+fn has_one_region_each(images: &[Labeled<'_>], progress: &dyn Progress) -> Result<bool, Cancelled> {
+    let stage = Stage::new(progress, "regions", images.len())?;
+    for (_, mask) in images {
+        if largest_component_fraction(*mask) < 0.95 {
             return Ok(false);
         }
         stage.add(1)?;
@@ -206,43 +212,45 @@ fn one_region_each(photos: &[Labeled<'_>], progress: &dyn Progress) -> Result<bo
     Ok(true)
 }
 
-/// The threshold with the best F1 over all pixels of the photos, before cleaning up; the middle of the range around it that is within a thousandth of the best.
-fn best_threshold(model: &ColorModel, photos: &[Labeled<'_>], progress: &dyn Progress) -> Result<f32, Cancelled> {
+/// Finds the threshold that maximizes F1 over all pixels of the images, before clean-up: the midpoint of the interval
+/// around the maximum in which F1 is within 0.001 of it.
+fn best_threshold(model: &ColorModel, images: &[Labeled<'_>], progress: &dyn Progress) -> Result<f32, Cancelled> {
     const BINS: usize = 2000;
-    let width = 2.0 * LIMIT / BINS as f32;
+    let width = 2.0 * MAX_ABS_SCORE / BINS as f32;
     let mut counts = vec![[0u64; 2]; BINS + 1];
-    let stage = Stage::new(progress, "threshold", photos.len())?;
-    for (photo, mask) in photos {
-        let score = model.score(*photo, &stage)?;
+    let stage = Stage::new(progress, "threshold", images.len())?;
+    for (image, mask) in images {
+        let score = model.score(*image, &stage)?;
         for y in 0..score.height() {
             for (&v, &m) in score.row(y).iter().zip(mask.row(y)) {
-                counts[(((v + LIMIT) / width) as usize).min(BINS)][usize::from(m)] += 1;
+                counts[(((v + MAX_ABS_SCORE) / width) as usize).min(BINS)][usize::from(m)] += 1;
             }
         }
         stage.add(1)?;
     }
     let truth: u64 = counts.iter().map(|c| c[1]).sum();
-    // F1 when everything from bin i on is marked.
-    let mut marked = [0u64; 2];
+    // F1 with the threshold at the lower edge of bin i.
+    let mut above = [0u64; 2];
     let mut f1 = vec![0.0; BINS + 1];
     for (f1, count) in f1.iter_mut().zip(&counts).rev() {
-        marked[0] += count[0];
-        marked[1] += count[1];
-        *f1 = 2.0 * marked[1] as f64 / (marked[0] + marked[1] + truth) as f64;
+        above[0] += count[0];
+        above[1] += count[1];
+        *f1 = 2.0 * above[1] as f64 / (above[0] + above[1] + truth) as f64;
     }
     let best = (0..=BINS).fold(0, |best, i| if f1[i] > f1[best] { i } else { best });
-    let good = |i: &usize| f1[*i] >= f1[best] - 1e-3;
-    let first = (0..best).rev().take_while(good).last().unwrap_or(best);
-    let last = (best..=BINS).take_while(good).last().unwrap_or(best);
-    Ok(((first + last) as f32 * 0.5 * width - LIMIT).clamp(-LIMIT, LIMIT))
+    let is_near_best = |i: &usize| f1[*i] >= f1[best] - 1e-3;
+    let first = (0..best).rev().take_while(is_near_best).last().unwrap_or(best);
+    let last = (best..=BINS).take_while(is_near_best).last().unwrap_or(best);
+    Ok(((first + last) as f32 * 0.5 * width - MAX_ABS_SCORE).clamp(-MAX_ABS_SCORE, MAX_ABS_SCORE))
 }
 
-/// Counts of colors in bins of four gray levels a side, with the sums of what fell in.
-struct Bins {
+/// RGB histogram with bins of four gray levels per channel.
+struct ColorHistogram {
+    /// Count, and the sums of red, green and blue, of each bin.
     bins: Vec<[u64; 4]>,
 }
 
-impl Bins {
+impl ColorHistogram {
     fn new() -> Self {
         Self { bins: vec![[0; 4]; 1 << 18] }
     }
@@ -260,7 +268,7 @@ impl Bins {
         self.bins.iter().map(|b| b[0]).sum()
     }
 
-    /// The mean color of each bin that holds any, and how many it holds.
+    /// Returns the mean color and the count of each nonempty bin.
     fn colors(&self) -> impl Iterator<Item = ([u8; 3], f64)> + '_ {
         self.bins.iter().filter(|b| b[0] > 0).map(|b| {
             let mean = |sum: u64| ((sum + b[0] / 2) / b[0]) as u8;
@@ -274,19 +282,19 @@ mod tests {
     use super::*;
     use cv_core::{Mask, RgbU8, Silent};
 
-    /// A colored square on a gray that varies.
+    /// A colored square on a background, both with a small texture.
     fn scene(color: [u8; 3], ground: [u8; 3]) -> (RgbU8, Mask) {
         let inside = |x: usize, y: usize| (20..50).contains(&x) && (15..40).contains(&y);
         let shade = |c: [u8; 3], x: usize, y: usize| c.map(|v| v.saturating_add(((x * 7 + y * 13) % 17) as u8));
-        let photo = RgbU8::from_fn(80, 60, |x, y| shade(if inside(x, y) { color } else { ground }, x, y));
-        (photo, Mask::from_fn(80, 60, |x, y| [inside(x, y)]))
+        let image = RgbU8::from_fn(80, 60, |x, y| shade(if inside(x, y) { color } else { ground }, x, y));
+        (image, Mask::from_fn(80, 60, |x, y| [inside(x, y)]))
     }
 
     #[test]
-    fn red_on_both_sides_of_the_hue_cut_is_one_color() {
-        // Half of the square at hue 350°, half at 10°: an average that is not circular lies at 180°, cyan, which is the background here.
+    fn hues_on_both_sides_of_zero_form_one_component() {
+        // Half of the square has hue 350°, half 10°: a linear average would be 180°, cyan, the hue of the background.
         let (_, mask) = scene([0; 3], [0; 3]);
-        let photo = RgbU8::from_fn(80, 60, |x, y| {
+        let image = RgbU8::from_fn(80, 60, |x, y| {
             let v = 200 + ((x * 7 + y * 13) % 17) as u8;
             let other = (v / 6) + (x % 3) as u8;
             if !mask.at(x, y)[0] {
@@ -298,35 +306,35 @@ mod tests {
             }
         });
         let options = TrainOptions { components: 1, background_components: 1, ..Default::default() };
-        let trained = train(&[(photo.view(), mask.view())], &options, &Silent).unwrap();
+        let trained = train(&[(image.view(), mask.view())], &options, &Silent).unwrap();
         let f1 = trained.scores[0].f1();
         assert!(f1 > 0.97, "{f1}");
         assert!(trained.model.foreground().components[0].mean[0].abs() < 0.1);
     }
 
     #[test]
-    fn every_space_and_rule_learns_a_plain_object() {
-        let (photo, mask) = scene([220, 110, 30], [90, 100, 110]);
+    fn every_space_and_rule_segments_a_uniform_object() {
+        let (image, mask) = scene([220, 110, 30], [90, 100, 110]);
         for space in [ColorSpace::Hsv, ColorSpace::Rgb, ColorSpace::Lab] {
             for rule in [Rule::Tuned, Rule::Posterior, Rule::Density] {
                 let options = TrainOptions { space, rule, ..Default::default() };
-                let trained = train(&[(photo.view(), mask.view())], &options, &Silent).unwrap();
+                let trained = train(&[(image.view(), mask.view())], &options, &Silent).unwrap();
                 let f1 = trained.scores[0].f1();
-                // Smoothing by a pixel and rounding of corners cost a part of the 110 border pixels of 750.
+                // Smoothing and rounding of corners misclassify some of the 110 border pixels of 750.
                 assert!(f1 > 0.95, "{space:?} {rule:?} {f1}");
                 assert_eq!((trained.foreground_pixels, trained.background_pixels), (750, 4050));
                 assert!(trained.model.cleanup().largest);
-                assert_eq!(train(&[(photo.view(), mask.view())], &options, &Silent).unwrap(), trained);
+                assert_eq!(train(&[(image.view(), mask.view())], &options, &Silent).unwrap(), trained);
             }
         }
     }
 
     #[test]
-    fn what_cannot_be_trained_on_is_said() {
-        let (photo, mask) = scene([220, 110, 30], [90; 3]);
+    fn invalid_training_input_is_an_error() {
+        let (image, mask) = scene([220, 110, 30], [90; 3]);
         let options = TrainOptions::default();
         let with =
-            |mask: &Mask, options: &TrainOptions| train(&[(photo.view(), mask.view())], options, &Silent).unwrap_err();
+            |mask: &Mask, options: &TrainOptions| train(&[(image.view(), mask.view())], options, &Silent).unwrap_err();
         assert_eq!(train(&[], &options, &Silent).unwrap_err(), SegmentError::NoPhotos);
         assert_eq!(with(&Mask::new(80, 60, [false]), &options), SegmentError::NoForeground { photos: 1 });
         assert_eq!(with(&Mask::new(80, 60, [true]), &options), SegmentError::NoBackground { photos: 1 });
@@ -349,25 +357,24 @@ mod tests {
     }
 
     #[test]
-    fn one_color_everywhere_is_learned_as_that() {
-        // Nothing tells object from background: the scores say so.
+    fn indistinguishable_object_and_background_score_low() {
         let (_, mask) = scene([0; 3], [0; 3]);
-        let photo = RgbU8::new(80, 60, [77; 3]);
+        let image = RgbU8::new(80, 60, [77; 3]);
         for rule in [Rule::Tuned, Rule::Posterior, Rule::Density] {
             let trained =
-                train(&[(photo.view(), mask.view())], &TrainOptions { rule, ..Default::default() }, &Silent).unwrap();
+                train(&[(image.view(), mask.view())], &TrainOptions { rule, ..Default::default() }, &Silent).unwrap();
             assert!(trained.scores[0].f1() < 0.5);
         }
     }
 
     #[test]
-    fn several_regions_in_a_mask_keep_all() {
-        let (photo, mut mask) = scene([220, 110, 30], [90; 3]);
+    fn masks_with_several_regions_disable_the_largest_component_selection() {
+        let (image, mut mask) = scene([220, 110, 30], [90; 3]);
         for y in 15..40 {
             mask.set(35, y, [false]);
         }
         assert!(
-            !train(&[(photo.view(), mask.view())], &TrainOptions::default(), &Silent).unwrap().model.cleanup().largest
+            !train(&[(image.view(), mask.view())], &TrainOptions::default(), &Silent).unwrap().model.cleanup().largest
         );
     }
 }

@@ -4,8 +4,8 @@ use crate::scene::Scene;
 use crate::{PairMatches, SfmOptions};
 use cv_core::{Cancelled, Correspondence, Pose, Progress};
 use cv_geometry::{
-    EstimateError, LocalOptimization, RobustOptions, estimate_relative_pose, normalize_matches, parallax_angle,
-    rotation_between, triangulate,
+    EstimateError, LocalOptimization, RobustOptions, estimate_relative_pose, estimate_rotation, normalize_matches,
+    parallax_angle, triangulate,
 };
 use rayon::prelude::*;
 
@@ -73,7 +73,7 @@ fn rate(
         Err(_) => return Ok(None),
     };
     // A camera that only turned.
-    if rotation_between(&rays, threshold).is_ok_and(|r| r.1 > 0.8) {
+    if estimate_rotation(&rays, threshold).is_ok_and(|r| r.1 > 0.8) {
         return Ok(None);
     }
     let weight = |i: &usize| {

@@ -45,7 +45,7 @@ fn boards() -> [(Board, [&'static str; 4]); 3] {
 
 /// A photograph, 640×480, and where the board's points are in it: tilted to 45°, blurred by up to a pixel, half a stop of exposure, noise; a part may be outside.
 fn photograph(board: &Board, seed: u32) -> Result<(GrayU8, Vec<Point2<f64>>)> {
-    let (o, black) = (board.outline(), board.black());
+    let (o, black) = (board.outline(), board.black_rectangles());
     let size = (o.width + 2.0 * MARGIN, o.height + 2.0 * MARGIN);
     let at = |v: f64, first: f64| (v - first + MARGIN) as f32;
     let black = black.iter().map(|r| [at(r.x, o.x), at(r.y, o.y), r.width as f32, r.height as f32]).collect();

@@ -103,7 +103,7 @@ fn sheet(board: &Board, paper: &Paper) -> Result<PrintSheet, Failure> {
     }
     let mut sheet = PrintSheet::new(size, &told(board, "mm"));
     let (left, top) = ((size.0 - w) / 2.0, MARGIN + (room(size).1 - h) / 2.0);
-    for r in board.black() {
+    for r in board.black_rectangles() {
         sheet.rectangle([r.x - outline.x + left, r.y - outline.y + top, r.width, r.height]);
     }
     let length = [100.0, 50.0, 20.0].into_iter().find(|l| l + 12.0 <= room(size).0).unwrap_or(10.0);

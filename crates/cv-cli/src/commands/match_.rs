@@ -176,7 +176,7 @@ impl Run for Args {
             .with("model", agreed.as_ref().map(|model| model.kind.name()))
             .with("agree", agreed.as_ref().map_or(0, |model| model.robust.inliers.len()))
             .with("features", counts)
-            .with("found", result.features.each_ref().map(|f| f.found()))
+            .with("found", result.features.each_ref().map(|f| f.detected_count()))
             .with("dropped", dropped)
             .with("method", if self.load_features.is_some() { "loaded" } else { self.features.name() })
             .with("beyond_limit", result.features.each_ref().map(|f| f.beyond_limit))
@@ -272,7 +272,8 @@ fn beside(folder: &Path, photo: &Path, ending: &str) -> PathBuf {
 
 fn save_features(folder: &Path, photo: &Path, features: &Features) -> Result<(), Failure> {
     let (keypoints, descriptors) = (&features.keypoints, &features.descriptors);
-    let name = if DescriptorKind::OWN.contains(&descriptors.kind()) { descriptors.kind().name } else { "descriptors" };
+    let name =
+        if DescriptorKind::BUILT_IN.contains(&descriptors.kind()) { descriptors.kind().name } else { "descriptors" };
     cv_io::npy::write(beside(folder, photo, "keypoints.npy"), &cv_io::keypoints_to_npy(keypoints))?;
     let array = cv_io::descriptors_to_npy(descriptors.dimension(), descriptors.as_slice());
     cv_io::npy::write(beside(folder, photo, &format!("{name}.npy")), &array)?;
@@ -291,7 +292,8 @@ fn load_features(folder: &Path, photo: &Path) -> Result<Features, Failure> {
     let points = beside(folder, photo, "keypoints.npy");
     let (rows, kind, path) = if points.exists() {
         let keypoints = cv_io::keypoints_from_npy(&cv_io::npy::read(&points)?).during(points.display().to_string())?;
-        let named = DescriptorKind::OWN.map(|kind| (Some(kind), beside(folder, photo, &format!("{}.npy", kind.name))));
+        let named =
+            DescriptorKind::BUILT_IN.map(|kind| (Some(kind), beside(folder, photo, &format!("{}.npy", kind.name))));
         let (kind, path) = named
             .into_iter()
             .chain([(None, beside(folder, photo, "descriptors.npy"))])
@@ -342,7 +344,7 @@ fn statistics(report: &mut Report, result: &MatchingResult) {
         "Features",
         &["number of", "first", "second"],
         &[
-            row("points found", &|f| f.found()),
+            row("points found", &|f| f.detected_count()),
             row("left out at the border or on flat patches", &|f| f.dropped.len()),
             row("beyond the number asked for", &|f| f.beyond_limit),
             row("described", &|f| f.keypoints.len()),

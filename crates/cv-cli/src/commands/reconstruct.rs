@@ -258,7 +258,7 @@ impl Args {
             .with("focal_px", result.scene.cameras.map(|c| c.fx))
             .with("focal_deviation", result.scene.focal_deviation)
             .with("median_angle_degrees", result.scene.median_angle.to_degrees())
-            .with("planar_share", result.scene.planar_share);
+            .with("planar_share", result.scene.planar_ratio);
         let Some(dense) = dense else { return outcome.summary(summary) };
         let (width, height) = dense.size;
         let (first, count) = dense.disparities;

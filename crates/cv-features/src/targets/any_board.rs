@@ -1,4 +1,4 @@
-//! Every kind of board under one roof: its points, what is printed black, and finding it.
+//! The common interface of all board kinds: points, printed rectangles, and detection.
 
 use super::board::{BoardPoint, BoardSize, CharucoBoard};
 use super::board_error::BoardError;
@@ -8,12 +8,12 @@ use super::marker_grid::{GridStyle, MarkerGrid};
 use super::{find_charuco, find_marker_grid};
 use cv_core::{ImageView, Point2, Progress};
 
-/// A kind of calibration board, by the name that the field has for it.
+/// The kind of a calibration board.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum BoardKind {
-    /// Squares alone.
+    /// A plain chessboard.
     Chessboard,
     /// A chessboard with a marker in every white square.
     Charuco,
@@ -35,26 +35,26 @@ cv_core::named!(BoardKind {
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Board {
-    /// A chessboard; its points are the inner corners, the first of them the origin.
+    /// A chessboard; its points are the inner corners, with the first as origin.
     Chessboard {
         /// Inner corners.
         size: BoardSize,
         /// Side of a square.
         square: f64,
     },
-    /// A ChArUco board; its points are the inner corners, the outer corner of the first square the origin.
+    /// A ChArUco board; its points are the inner corners, with the outer corner of the first square as origin.
     Charuco(CharucoBoard),
     /// A grid of markers; its points are the corners of the markers.
     MarkerGrid(MarkerGrid),
 }
 
-/// A black rectangle of a board's print, in the board's frame and unit: x right, y down.
+/// A black rectangle of a printed board, in the board's frame and unit: x right, y down.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct BlackRectangle {
-    /// Left end.
+    /// Left edge.
     pub x: f64,
-    /// Upper end.
+    /// Top edge.
     pub y: f64,
     /// Width.
     pub width: f64,
@@ -63,7 +63,7 @@ pub struct BlackRectangle {
 }
 
 impl Board {
-    /// Its kind.
+    /// Returns the kind.
     pub fn kind(&self) -> BoardKind {
         match self {
             Self::Chessboard { .. } => BoardKind::Chessboard,
@@ -73,7 +73,8 @@ impl Board {
         }
     }
 
-    /// Columns and rows as people count them: inner corners of a chessboard, squares of a ChArUco board, markers of a grid.
+    /// Returns the conventional numbers of columns and rows: inner corners of a chessboard, squares of a ChArUco board,
+    /// markers of a grid.
     pub fn counts(&self) -> (usize, usize) {
         match self {
             Self::Chessboard { size, .. } => (size.columns, size.rows),
@@ -82,7 +83,7 @@ impl Board {
         }
     }
 
-    /// Whether there is such a board.
+    /// Validates the parameters.
     ///
     /// # Errors
     /// [`BoardError::Size`], [`BoardError::Layout`], [`BoardError::TooManyMarkers`].
@@ -97,7 +98,7 @@ impl Board {
         }
     }
 
-    /// The places of its points, by their numbers ([`BoardPoint::id`]).
+    /// Returns the positions of the points, indexed by [`BoardPoint::id`].
     pub fn points(&self) -> Vec<Point2<f64>> {
         match self {
             Self::Chessboard { size, square } => (0..size.corners()).map(|i| size.point(i, *square)).collect(),
@@ -106,8 +107,8 @@ impl Board {
         }
     }
 
-    /// What is printed black: rectangles that do not overlap.
-    pub fn black(&self) -> Vec<BlackRectangle> {
+    /// Returns the black parts of the print as disjoint rectangles.
+    pub fn black_rectangles(&self) -> Vec<BlackRectangle> {
         match self {
             Self::Chessboard { size, square } => squares((size.columns + 1, size.rows + 1), *square, -*square),
             Self::Charuco(board) => {
@@ -120,7 +121,7 @@ impl Board {
                 all
             }
             Self::MarkerGrid(grid) => {
-                let shape = (grid.frame(), grid.turns());
+                let shape = (grid.border(), grid.quarter_turns());
                 let mut all: Vec<BlackRectangle> = (0..grid.count())
                     .flat_map(|id| marker(grid.dictionary, id, shape, grid.origin(id), grid.marker))
                     .collect();
@@ -136,7 +137,7 @@ impl Board {
         }
     }
 
-    /// The smallest rectangle around all that is printed, black or white: for a chessboard its squares.
+    /// Returns the bounding rectangle of the print, including white squares.
     pub fn outline(&self) -> BlackRectangle {
         match self {
             Self::Chessboard { size, square } => BlackRectangle {
@@ -149,14 +150,14 @@ impl Board {
                 BlackRectangle { x: 0.0, y: 0.0, width: squares.0 as f64 * square, height: squares.1 as f64 * square }
             }
             Self::MarkerGrid(grid) => {
-                let rim = if grid.style == GridStyle::AprilGrid { grid.gap() } else { 0.0 };
-                let along = |n: usize| n as f64 * grid.marker + n.saturating_sub(1) as f64 * grid.gap() + 2.0 * rim;
-                BlackRectangle { x: -rim, y: -rim, width: along(grid.markers.0), height: along(grid.markers.1) }
+                let margin = if grid.style == GridStyle::AprilGrid { grid.gap() } else { 0.0 };
+                let along = |n: usize| n as f64 * grid.marker + n.saturating_sub(1) as f64 * grid.gap() + 2.0 * margin;
+                BlackRectangle { x: -margin, y: -margin, width: along(grid.markers.0), height: along(grid.markers.1) }
             }
         }
     }
 
-    /// The same board, so many times as large.
+    /// Scales the board.
     pub fn scaled(self, by: f64) -> Self {
         match self {
             Self::Chessboard { size, square } => Self::Chessboard { size, square: by * square },
@@ -166,7 +167,7 @@ impl Board {
     }
 }
 
-/// The black squares of a chessboard whose square at the top left, at (`first`, `first`), is black.
+/// Returns the black squares of a chessboard whose top left square, at (`first`, `first`), is black.
 fn squares((columns, rows): (usize, usize), side: f64, first: f64) -> Vec<BlackRectangle> {
     let all = (0..rows).flat_map(|j| (0..columns).map(move |i| (i, j)));
     let at = |k: usize| first + k as f64 * side;
@@ -175,21 +176,21 @@ fn squares((columns, rows): (usize, usize), side: f64, first: f64) -> Vec<BlackR
         .collect()
 }
 
-/// A marker's black: runs of cells of one row, joined with equal ones of the rows below.
+/// Returns the black parts of a marker: runs of cells of a row, merged with equal runs of the following rows.
 fn marker(
     dictionary: Dictionary,
     id: usize,
-    (frame, turns): (usize, usize),
+    (border, turns): (usize, usize),
     origin: Point2<f64>,
     size: f64,
 ) -> Vec<BlackRectangle> {
     let side = dictionary.side();
-    let n = side + 2 * frame;
+    let n = side + 2 * border;
     let bits = dictionary.bits(id).unwrap_or(0);
     let black = |column: usize, row: usize| {
-        let inner = |k: usize| k.checked_sub(frame).filter(|k| *k < side);
+        let inner = |k: usize| k.checked_sub(border).filter(|k| *k < side);
         let (Some(x), Some(y)) = (inner(column), inner(row)) else { return true };
-        // Of a marker that stands upside down the first cell is the last.
+        // The cells of an upside-down marker are in reverse order.
         let index = if turns == 2 { side * side - 1 - (y * side + x) } else { y * side + x };
         (bits >> (side * side - 1 - index)) & 1 == 0
     };
@@ -229,7 +230,7 @@ fn marker(
     out
 }
 
-/// Finds a board of any kind: its points in the order of their numbers, all of them for a chessboard and as many as are seen for the others.
+/// Detects a board of any kind. The points are sorted by id: all for a chessboard, the visible ones for other kinds.
 ///
 /// `view` is gray, 0 to 1.
 ///
@@ -255,11 +256,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_printed_black_is_what_the_finder_takes_for_black() {
+    fn black_rectangles_agree_with_is_black() {
         let charuco =
             CharucoBoard { squares: (8, 5), square: 30.0, marker: 21.0, dictionary: Dictionary::Aruco6x6x100 };
-        let rectangles = Board::Charuco(charuco).black();
-        // Every third of a cell: none of the places lies on an edge.
+        let rectangles = Board::Charuco(charuco).black_rectangles();
+        // Sample points that are not on an edge.
         for k in 0..(240 * 150) {
             let (x, y) = ((k % 240) as f64 + 0.37, (k / 240) as f64 + 0.43);
             let inside =
@@ -269,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn an_aprilgrid_is_that_of_kalibr() {
+    fn aprilgrids_have_the_layout_of_kalibr() {
         let grid = MarkerGrid {
             markers: (6, 5),
             marker: 10.0,
@@ -277,24 +278,24 @@ mod tests {
             dictionary: Dictionary::AprilTag36h11,
             style: GridStyle::AprilGrid,
         };
-        // Kalibr numbers tags from the bottom left, along the rows first.
+        // Kalibr's ids start at the bottom left, row by row.
         assert_eq!((grid.cell(0), grid.cell(5), grid.cell(29)), ((0, 4), (5, 4), (5, 0)));
-        // The code of tag 0 as AprilTag publishes it, highest bit at the top left, white where it is 1.
+        // The published code of AprilTag 0, highest bit at the top left, 1 is white.
         let code: u64 = 0xd_5d62_8584;
-        let rectangles = Board::MarkerGrid(grid).black();
+        let rectangles = Board::MarkerGrid(grid).black_rectangles();
         let black =
             |x: f64, y: f64| rectangles.iter().any(|r| x > r.x && y > r.y && x < r.x + r.width && y < r.y + r.height);
         for k in 0..36 {
             let (x, y) = (2.5 + (k % 6) as f64, 52.0 + 2.5 + (k / 6) as f64);
             assert_eq!(black(x, y), (code >> (35 - k)) & 1 == 0, "{k}");
         }
-        // Two cells of frame, and a square at every corner, also at the rim.
+        // A border of two cells, and a square at every corner, also along the boundary.
         assert!(black(1.5, 53.5) && black(-1.0, -1.0) && black(11.5, 11.5) && !black(5.0, 11.5));
         assert_eq!(Board::MarkerGrid(grid).outline(), BlackRectangle { x: -3.0, y: -3.0, width: 81.0, height: 68.0 });
     }
 
     #[test]
-    fn boards_that_cannot_be_are_refused_with_numbers() {
+    fn invalid_boards_are_rejected() {
         let grid = MarkerGrid {
             markers: (10, 6),
             marker: 10.0,

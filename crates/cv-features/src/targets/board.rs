@@ -1,60 +1,61 @@
-//! The geometry of calibration boards: where their corners lie and which squares are black. The one place for it.
+//! Geometry of calibration boards: corner positions and black squares.
 //!
-//! A board lies in its own plane: x along its columns, y along its rows, in the unit of its squares (millimeters, meters: the caller's), z away
-//! from whoever looks at it. So x right, y down, z forward, as in a camera's frame.
+//! The frame of a board: x right along a row, y down along a column, z forward (away from the viewer), as in a camera
+//! frame. The unit is that of the squares, chosen by the caller.
 
 use super::board_error::BoardError;
 use super::dictionary::Dictionary;
 use cv_core::Point2;
 
-/// Inner corners of a chessboard: `columns` along a row, `rows` of them. A board of 10×7 squares has 9×6.
+/// Numbers of inner corners of a chessboard. A board of 10×7 squares has 9×6.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct BoardSize {
-    /// Corners along a row. 3 to 200.
+    /// Corners per row, 3 to 200.
     pub columns: usize,
-    /// Rows of corners. 3 to 200.
+    /// Number of rows, 3 to 200.
     pub rows: usize,
 }
 
 impl BoardSize {
-    /// Fewest corners along a side: a smaller grid also turns up where no board is.
-    pub const LEAST: usize = 3;
-    /// Most corners along a side.
-    pub const MOST: usize = 200;
+    /// Minimum number of corners along a side: smaller grids also occur by chance.
+    pub const MIN_SIDE: usize = 3;
+    /// Maximum number of corners along a side.
+    pub const MAX_SIDE: usize = 200;
 
-    /// So many corners along a row, and rows.
+    /// Creates a size.
     pub fn new(columns: usize, rows: usize) -> Self {
         Self { columns, rows }
     }
 
-    /// Number of corners. Saturates.
+    /// Returns the number of corners (saturating).
     pub fn corners(self) -> usize {
         self.columns.saturating_mul(self.rows)
     }
 
-    /// Whether both sides are within [`BoardSize::LEAST`] and [`BoardSize::MOST`].
+    /// Returns whether both sides are between [`BoardSize::MIN_SIDE`] and [`BoardSize::MAX_SIDE`].
     pub fn is_valid(self) -> bool {
-        [self.columns, self.rows].iter().all(|side| (Self::LEAST..=Self::MOST).contains(side))
+        [self.columns, self.rows].iter().all(|side| (Self::MIN_SIDE..=Self::MAX_SIDE).contains(side))
     }
 
-    /// Whether the board looks the same after half a turn: where `columns + rows` is even. Then nothing in a picture tells which end is the
-    /// first, and two cameras that are turned against each other may start at opposite ends.
+    /// Returns whether the board is symmetric under a rotation by 180° (`columns + rows` is even). The first corner is
+    /// then ambiguous: two cameras with different roll may start at opposite ends.
     pub fn is_symmetric(self) -> bool {
         (self.columns ^ self.rows) & 1 == 0
     }
 
-    /// Rows and columns exchanged.
+    /// Exchanges rows and columns.
     pub fn transposed(self) -> Self {
         Self { columns: self.rows, rows: self.columns }
     }
 
-    /// The longer side along the rows.
+    /// Returns the size with the longer side along the rows.
     pub fn landscape(self) -> Self {
         if self.rows > self.columns { self.transposed() } else { self }
     }
 
-    /// Position of corner `index` (row-major) on the board, in the unit of `square`; the first corner is the origin.
+    /// Returns the position of corner `index` (row-major) on the board, in the unit of `square`; the first corner is
+    /// the origin.
     pub fn point(self, index: usize, square: f64) -> Point2<f64> {
         let columns = self.columns.max(1);
         Point2::new((index % columns) as f64 * square, (index / columns) as f64 * square)
@@ -67,8 +68,8 @@ impl std::fmt::Display for BoardSize {
     }
 }
 
-/// A ChArUco board: a chessboard whose corner square at the top left is black, with a marker in the middle of every white square. The markers are those
-/// of the dictionary from the first on, row by row (the layout of OpenCV since 4.6).
+/// A ChArUco board: a chessboard with a black top left square and a marker centered in every white square. The markers
+/// are the first of the dictionary, row by row (the layout of OpenCV since 4.6).
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct CharucoBoard {
@@ -76,61 +77,64 @@ pub struct CharucoBoard {
     pub squares: (usize, usize),
     /// Side of a square.
     pub square: f64,
-    /// Side of a marker with its black frame, in the same unit; 0.3 to 0.9 of a square.
+    /// Side of a marker including its black border, in the same unit; 0.3 to 0.9 of a square.
     pub marker: f64,
-    /// Where the markers are from.
+    /// Dictionary of the markers.
     pub dictionary: Dictionary,
 }
 
 impl CharucoBoard {
-    /// What is wrong with it, if anything: too few squares, too few markers in the dictionary, or no room for them.
+    /// Validates the parameters: number of squares, size of the dictionary, and size of the markers.
     ///
     /// # Errors
     /// [`BoardError::Layout`], [`BoardError::TooManyMarkers`].
     pub fn check(&self) -> Result<(), BoardError> {
-        let share = self.marker / self.square;
-        let sized = self.square > 0.0 && self.square.is_finite() && (0.3..=0.9).contains(&share);
-        if !(self.corners().is_valid() && sized) {
-            return Err(BoardError::Layout { columns: self.squares.0, rows: self.squares.1, share });
+        let ratio = self.marker / self.square;
+        let is_valid = self.square > 0.0 && self.square.is_finite() && (0.3..=0.9).contains(&ratio);
+        if !(self.corners().is_valid() && is_valid) {
+            return Err(BoardError::Layout { columns: self.squares.0, rows: self.squares.1, share: ratio });
         }
         BoardError::check_markers(self.markers(), self.dictionary)
     }
 
-    /// Its inner corners.
+    /// Returns the numbers of inner corners.
     pub fn corners(&self) -> BoardSize {
         BoardSize::new(self.squares.0.saturating_sub(1), self.squares.1.saturating_sub(1))
     }
 
-    /// Number of markers on it.
+    /// Returns the number of markers.
     pub fn markers(&self) -> usize {
         self.squares.0.saturating_mul(self.squares.1) / 2
     }
 
-    /// The place of inner corner `id` (row-major), from the outer corner of the top left square.
+    /// Returns the position of inner corner `id` (row-major), relative to the outer corner of the top left square.
     pub fn point(&self, id: usize) -> Point2<f64> {
         let p = self.corners().point(id, self.square);
         Point2::new(p.x + self.square, p.y + self.square)
     }
 
-    /// Column and row of the square that marker `id` lies in.
+    /// Returns column and row of the square of marker `id`.
     pub fn square_of(&self, id: usize) -> Option<(usize, usize)> {
         let (columns, rows) = self.squares;
-        // Of two rows the first has its white squares at odd columns and the second at even ones.
-        let (pair, rest) = (id.checked_div(columns)?, id % columns.max(1));
-        let of_first = columns / 2;
-        let (column, row) =
-            if rest < of_first { (2 * rest + 1, 2 * pair) } else { (2 * (rest - of_first), 2 * pair + 1) };
+        // White squares are at odd columns in even rows, and at even columns in odd rows.
+        let (pair, remainder) = (id.checked_div(columns)?, id % columns.max(1));
+        let first_row_count = columns / 2;
+        let (column, row) = if remainder < first_row_count {
+            (2 * remainder + 1, 2 * pair)
+        } else {
+            (2 * (remainder - first_row_count), 2 * pair + 1)
+        };
         (row < rows).then_some((column, row))
     }
 
-    /// The number of the marker in a white square.
+    /// Returns the id of the marker in a white square; `None` for black squares.
     pub fn marker_of(&self, column: usize, row: usize) -> Option<usize> {
-        let white = (column + row) % 2 == 1 && column < self.squares.0 && row < self.squares.1;
+        let is_white = (column + row) % 2 == 1 && column < self.squares.0 && row < self.squares.1;
         let before = row / 2 * self.squares.0 + (row % 2) * (self.squares.0 / 2);
-        white.then_some(before + column / 2)
+        is_white.then_some(before + column / 2)
     }
 
-    /// Whether a point of the board, from the outer corner of its top left square, is black.
+    /// Returns whether a point of the board, relative to the outer corner of its top left square, is black.
     pub fn is_black(&self, x: f64, y: f64) -> bool {
         let (u, v) = (x / self.square, y / self.square);
         let (column, row) = (u.floor(), v.floor());
@@ -139,8 +143,8 @@ impl CharucoBoard {
         }
         let Some(id) = self.marker_of(column as usize, row as usize) else { return true };
         let side = self.dictionary.side();
-        let share = self.marker / self.square;
-        let cell = |t: f64| ((t - 0.5 * (1.0 - share)) / share * (side + 2) as f64).floor();
+        let ratio = self.marker / self.square;
+        let cell = |t: f64| ((t - 0.5 * (1.0 - ratio)) / ratio * (side + 2) as f64).floor();
         let (i, j) = (cell(u - column), cell(v - row));
         let inside = |t: f64, n: usize| t >= 0.0 && t < n as f64;
         if !inside(i, side + 2) || !inside(j, side + 2) {
@@ -155,16 +159,15 @@ impl CharucoBoard {
     }
 }
 
-/// A point of a board seen in a picture: what every finder of boards gives and a calibration takes.
+/// A detected board point: the output of all board detectors and the input of calibration.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct BoardPoint {
-    /// Number of the point on its board: an index into the board's points.
+    /// Index of the point on the board.
     pub id: usize,
-    /// Where it is seen, in pixels.
+    /// Position in the image, in pixels.
     pub position: Point2<f64>,
-    /// Standard deviation of the position along either axis, in pixels, from how well the picture around it fits a corner. An estimate
-    /// to weigh points by, not a bound.
+    /// Estimated standard deviation of the position along either axis, in pixels, for weighting.
     pub deviation: f64,
 }
 
@@ -173,7 +176,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn markers_and_squares_belong_together() {
+    fn markers_and_squares_correspond() {
         for squares in [(5, 4), (8, 6), (7, 5)] {
             let board = CharucoBoard { squares, square: 2.0, marker: 1.5, dictionary: Dictionary::Aruco4x4x50 };
             let mut next = 0;
@@ -192,7 +195,7 @@ mod tests {
             }
             assert_eq!((next, board.square_of(next + 7 * squares.0)), (board.markers(), None));
         }
-        // Marker 0 of 4×4 as OpenCV prints it: 1011 0101 0011 0010.
+        // Marker 0 of OpenCV's 4×4 dictionary: 1011 0101 0011 0010.
         let board = CharucoBoard { squares: (5, 4), square: 8.0, marker: 6.0, dictionary: Dictionary::Aruco4x4x50 };
         let row = |y: usize| -> Vec<u8> {
             (0..6).map(|x| u8::from(!board.is_black(9.5 + x as f64, 1.5 + y as f64))).collect()

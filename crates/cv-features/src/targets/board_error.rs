@@ -1,103 +1,107 @@
-//! Why a picture gave no board.
+//! Errors of board detection.
 
 use super::board::BoardSize;
 use super::dictionary::Dictionary;
 use crate::error::FeatureError;
 use cv_core::{Cancelled, OptionError};
 
-/// Why a picture gave no board, or why there is no such board.
+/// Why a board was not detected, or its parameters are invalid.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum BoardError {
-    /// The size that was asked for is no size of a chessboard.
-    #[error("a board of {asked} inner corners: each side takes {} to {}", BoardSize::LEAST, BoardSize::MOST)]
+    /// The requested chessboard size is out of range.
+    #[error(
+        "chessboard of {asked} inner corners: each side must have {} to {}",
+        BoardSize::MIN_SIDE,
+        BoardSize::MAX_SIDE
+    )]
     Size {
-        /// The size.
+        /// Requested size.
         asked: BoardSize,
     },
-    /// No board of markers has such sides, or markers of this size.
-    #[error("no board has {columns}×{rows} squares or markers with markers, or gaps, of {share:.2} of a side")]
+    /// The layout of a marker board is out of range.
+    #[error("invalid board layout: {columns}×{rows}, relative size of markers or gaps {share:.2}")]
     Layout {
-        /// Columns of squares or markers.
+        /// Number of columns of squares or markers.
         columns: usize,
-        /// Rows of them.
+        /// Number of rows.
         rows: usize,
-        /// Side of a marker as a share of a square (0.3 to 0.9), or gap as a share of a marker (0.05 to 1).
+        /// Side of a marker relative to a square (0.3 to 0.9), or gap relative to a marker (0.05 to 1).
         share: f64,
     },
     /// The dictionary has too few markers for the board.
     #[error("the board takes {needed} markers, and {dictionary} has {}", dictionary.markers())]
     TooManyMarkers {
-        /// Markers on the board.
+        /// Number of markers of the board.
         needed: usize,
-        /// Where they should be from.
+        /// Its dictionary.
         dictionary: Dictionary,
     },
-    /// Nothing in the picture is a chessboard.
-    #[error("no chessboard among the {corners} corners where black and white squares meet")]
+    /// No chessboard was detected.
+    #[error("no chessboard detected among {corners} candidate corners")]
     NoBoard {
-        /// Corners between black and white squares that were seen, in a board or not.
+        /// Number of X-corners detected.
         corners: usize,
     },
-    /// No marker of the board can be read.
-    #[error("no marker of {dictionary} among {seen} places that look like one")]
+    /// No marker of the board could be decoded.
+    #[error("no marker of {dictionary} decoded among {seen} candidates")]
     NoMarkers {
-        /// What was asked for.
+        /// Requested dictionary.
         dictionary: Dictionary,
-        /// White squares of a chessboard, or black quadrilaterals.
+        /// Number of candidates: white squares of a chessboard, or black quadrilaterals.
         seen: usize,
     },
-    /// There are markers, of another dictionary.
-    #[error("saw {markers} markers of {seen}, none of {asked}")]
+    /// The markers are of another dictionary.
+    #[error("detected {markers} markers of {seen}, none of {asked}")]
     OtherDictionary {
-        /// What was seen. Of dictionaries that begin alike, the largest.
+        /// Detected dictionary, the largest of its family.
         seen: Dictionary,
-        /// How many of its markers.
+        /// Number of its markers.
         markers: usize,
-        /// What was asked for.
+        /// Requested dictionary.
         asked: Dictionary,
     },
     /// The markers are those of the board, mirrored.
-    #[error("shows {markers} markers of {dictionary}, mirrored")]
+    #[error("detected {markers} markers of {dictionary}, mirrored")]
     Mirrored {
-        /// How many.
+        /// Number of mirrored markers.
         markers: usize,
         /// Their dictionary.
         dictionary: Dictionary,
     },
-    /// There are markers of the dictionary, and they do not lie as they do on the board.
-    #[error("saw {markers} markers, which do not lie as on the board that was asked for")]
+    /// The markers are of the dictionary, but in another layout.
+    #[error("detected {markers} markers, but not in the layout of the requested board")]
     OtherLayout {
-        /// Markers read.
+        /// Number of decoded markers.
         markers: usize,
     },
-    /// There is a chessboard, and it has another size.
-    #[error("saw a board of {seen}, not {asked} inner corners")]
+    /// The chessboard has another size.
+    #[error("detected a board of {seen}, not {asked} inner corners")]
     OtherSize {
-        /// Size of the board in the picture.
+        /// Detected size.
         seen: BoardSize,
-        /// Size that was asked for.
+        /// Requested size.
         asked: BoardSize,
     },
-    /// A part of a board: it is cut off by the frame, covered, or burnt out.
-    #[error("saw {found} of the {} corners of a {asked} board, {seen} where they are whole", asked.corners())]
+    /// The board is only partly visible: truncated by the image border, occluded, or overexposed.
+    #[error("detected {found} of the {} corners of a {asked} board, the largest complete part is {seen}", asked.corners())]
     Partial {
-        /// Corners found.
+        /// Number of corners detected.
         found: usize,
-        /// Largest whole grid among them.
+        /// Largest complete grid among them.
         seen: BoardSize,
-        /// Size that was asked for.
+        /// Requested size.
         asked: BoardSize,
-        /// Whether the board reaches the frame of the picture, so that the rest may lie outside.
+        /// Whether the board extends to the image border, so that the rest may be outside.
         cut_off: bool,
     },
-    /// The board is there more than once.
-    #[error("saw the board {boards} times")]
+    /// The board was detected more than once.
+    #[error("detected the board {boards} times")]
     SeveralBoards {
-        /// How often.
+        /// Number of boards.
         boards: usize,
     },
-    /// The picture cannot be worked on, or an option is out of range, or the job was stopped.
+    /// The image is unsuitable, an option is out of range, or the job was stopped.
     #[error(transparent)]
     Feature(#[from] FeatureError),
 }

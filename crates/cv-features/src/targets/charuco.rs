@@ -1,37 +1,38 @@
-//! ChArUco boards: chessboards with a marker in every white square, so that a part of one is enough.
+//! Detection of ChArUco boards: chessboards with a marker in every white square, which may be partly visible.
 //!
-//! The chessboard's corners are found and joined first, as those of a plain board are. Then the markers are read, which needs no search: each white square with its
-//! four corners says where its marker's bits lie. Every marker that is read votes for where the grid lies on the board.
+//! The chessboard corners are detected and assembled to grids first, as for plain chessboards. Then the markers are
+//! decoded without search: the four corners of each white square define the positions of its marker's bits. Each
+//! decoded marker votes for the placement of the grid on the board.
 
 use super::BoardError;
 use super::board::{BoardPoint, CharucoBoard};
 use super::chessboard::ChessboardOptions;
-use super::grid::{Grid, grids};
-use super::marker::{MarkerShape, read_bits, square_to_picture, what_else};
-use super::saddle::saddle;
-use super::x_corner::x_corners;
+use super::grid::{Grid, assemble_grids};
+use super::marker::{MarkerShape, diagnose, sample_bits, unit_square_to_image};
+use super::saddle::refine_saddle;
+use super::x_corner::detect_x_corners;
 use crate::error::check_image;
 use cv_core::{ImageView, Matrix3, Point2, Progress, Stage};
 use std::collections::BTreeMap;
 
-/// Where a grid lies on a board: quarter turns, then the shift of columns and rows.
+/// The placement of a grid on a board: quarter turns, then a shift of columns and rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 struct Placement {
     turns: usize,
     shift: (i32, i32),
 }
 
-/// A quarter turn clockwise on screen, so many times.
-fn turned((x, y): (i32, i32), turns: usize) -> (i32, i32) {
+/// Rotates grid coordinates by clockwise quarter turns.
+fn rotate_quarter_turns((x, y): (i32, i32), turns: usize) -> (i32, i32) {
     (0..turns & 3).fold((x, y), |(x, y), _| (-y, x))
 }
 
-/// Finds the corners of a ChArUco board: as many as the picture shows, with their numbers on the board.
+/// Detects the visible corners of a ChArUco board with their ids.
 ///
-/// `view` is gray, 0 to 1. The points are in the order of their ids, which are those of [`CharucoBoard::point`]; at least four.
+/// `view` is gray, 0 to 1. The points, at least four, are sorted by id, see [`CharucoBoard::point`].
 ///
 /// # Errors
-/// [`BoardError`]; where no marker of the board can be read, it says what was seen in their place.
+/// [`BoardError`]; if no marker of the board can be decoded, it reports other markers in the image.
 pub fn find_charuco(
     view: ImageView<'_, f32, 1>,
     board: &CharucoBoard,
@@ -41,41 +42,41 @@ pub fn find_charuco(
     options.check()?;
     board.check()?;
     check_image(view, 16)?;
-    let (corners, smooth) = x_corners(view, options.least_contrast, progress)?;
+    let (corners, smooth) = detect_x_corners(view, options.min_contrast, progress)?;
     let stage = Stage::new(progress, "grid", 0)?;
-    // White around a marker, in squares.
-    let clear = 0.45 * (1.0 - board.marker / board.square);
+    // The white margin around a marker, in squares.
+    let clearance = 0.45 * (1.0 - board.marker / board.square);
     let mut boards: Vec<Vec<BoardPoint>> = Vec::new();
-    // White squares of the largest grid that could not be placed.
-    let mut unread: Option<Vec<[Point2<f64>; 4]>> = None;
-    for mut grid in grids(&corners, smooth.view(), 4, clear, &stage)? {
-        // A part of a board that is smaller than half of what is found already tells nothing new.
+    // White squares of the largest grid without placement.
+    let mut undecoded: Option<Vec<[Point2<f64>; 4]>> = None;
+    for mut grid in assemble_grids(&corners, smooth.view(), 4, clearance, &stage)? {
+        // Grids smaller than half of the best one are ignored.
         if boards.first().is_some_and(|best| 2 * grid.nodes.len() < best.len()) {
             break;
         }
-        grid.settle(smooth.view());
+        grid.refine(smooth.view());
         let [x0, x1, y0, y1] = grid.bounds();
-        grid.fill(smooth.view(), [x0 - 2, x1 + 2, y0 - 2, y1 + 2], &stage)?;
+        grid.grow(smooth.view(), [x0 - 2, x1 + 2, y0 - 2, y1 + 2], &stage)?;
         let whites = white_squares(&grid);
-        let Some(placement) = placed(&whites, view, board) else {
-            unread.get_or_insert_with(|| whites.into_iter().map(|white| white.1).collect());
+        let Some(placement) = vote_for_placement(&whites, view, board) else {
+            undecoded.get_or_insert_with(|| whites.into_iter().map(|white| white.1).collect());
             continue;
         };
         let size = board.corners();
         let mut points: Vec<BoardPoint> = Vec::new();
         for (&place, node) in &grid.nodes {
-            let (x, y) = turned(place, placement.turns);
+            let (x, y) = rotate_quarter_turns(place, placement.turns);
             let (x, y) = (x + placement.shift.0, y + placement.shift.1);
             if x < 0 || y < 0 || x >= size.columns as i32 || y >= size.rows as i32 {
                 continue;
             }
-            let step = grid.step(place);
-            let window = (clear * step).min(options.largest_window.into()).max(2.0);
+            let step = grid.spacing(place);
+            let window = (clearance * step).min(options.max_window_radius.into()).max(2.0);
             let start = node.corner.position;
-            let Some(found) = saddle(smooth.view(), start, window, 2e-4) else { continue };
-            if (found.position - start).norm() < (0.1 * step).max(1.0) {
+            let Some(saddle) = refine_saddle(smooth.view(), start, window, 2e-4) else { continue };
+            if (saddle.position - start).norm() < (0.1 * step).max(1.0) {
                 let id = y as usize * size.columns + x as usize;
-                points.push(BoardPoint { id, position: found.position, deviation: found.deviation_unsmoothed() });
+                points.push(BoardPoint { id, position: saddle.position, deviation: saddle.deviation_unsmoothed() });
             }
         }
         points.sort_by_key(|p| p.id);
@@ -86,30 +87,31 @@ pub fn find_charuco(
     boards.sort_by_key(|points| std::cmp::Reverse(points.len()));
     let Some(best) = boards.first() else {
         let none = BoardError::NoBoard { corners: corners.len() };
-        let Some(whites) = unread else { return Err(none) };
-        let read = |i: usize, side: usize| read_in_square(view, whites[i], board.marker / board.square, side);
+        let Some(whites) = undecoded else { return Err(none) };
+        let read = |i: usize, side: usize| sample_bits_in_square(view, whites[i], board.marker / board.square, side);
         let seen = BoardError::NoMarkers { dictionary: board.dictionary, seen: whites.len() };
-        return Err(what_else(whites.len().min(60), board.dictionary, read).unwrap_or(seen));
+        return Err(diagnose(whites.len().min(60), board.dictionary, read).unwrap_or(seen));
     };
-    // Parts of one board, which something lies across, have different corners, or the same ones in the same places.
-    let elsewhere = |p: &BoardPoint| {
+    // Parts of one board separated by an occluder have different corners, or the same ones at the same positions.
+    let is_elsewhere = |p: &BoardPoint| {
         let known = best.binary_search_by_key(&p.id, |q| q.id).ok().map(|i| best[i].position);
         known.is_some_and(|q| (q - p.position).norm() > 3.0)
     };
-    let again = |points: &&Vec<BoardPoint>| points.iter().filter(|p| elsewhere(p)).count() >= 4;
-    let several = boards.iter().filter(again).count();
+    let is_other_board = |points: &&Vec<BoardPoint>| points.iter().filter(|p| is_elsewhere(p)).count() >= 4;
+    let several = boards.iter().filter(is_other_board).count();
     if several > 0 {
         return Err(BoardError::SeveralBoards { boards: 1 + several });
     }
     Ok(boards.swap_remove(0))
 }
 
-/// A white square of a grid: the place of its first corner, and all four, clockwise from it.
-type White = ((i32, i32), [Point2<f64>; 4]);
+/// A white square of a grid: the grid coordinates of its first corner, and the image positions of all four, clockwise.
+type WhiteSquare = ((i32, i32), [Point2<f64>; 4]);
 
-fn white_squares(grid: &Grid) -> Vec<White> {
+/// Returns the white squares of a grid, sorted by position.
+fn white_squares(grid: &Grid) -> Vec<WhiteSquare> {
     let square = |(&(x, y), node): (&(i32, i32), &super::grid::Node)| {
-        // Even: the square to the right and below is white.
+        // Even: the square between +x and +y is white.
         let corner = |dx: i32, dy: i32| grid.position((x + dx, y + dy)).filter(|_| node.turns & 1 == 0);
         Some(((x, y), [corner(0, 0)?, corner(1, 0)?, corner(1, 1)?, corner(0, 1)?]))
     };
@@ -118,32 +120,39 @@ fn white_squares(grid: &Grid) -> Vec<White> {
     all
 }
 
-/// Where a grid lies on the board by its markers: where at least two of them, and more than half of those that can be read, agree.
-fn placed(whites: &[White], view: ImageView<'_, f32, 1>, board: &CharucoBoard) -> Option<Placement> {
+/// Determines the placement of a grid on the board by the votes of its decoded markers; `None` unless at least two
+/// markers and more than half of all agree.
+fn vote_for_placement(whites: &[WhiteSquare], view: ImageView<'_, f32, 1>, board: &CharucoBoard) -> Option<Placement> {
     let mut votes: BTreeMap<Placement, usize> = BTreeMap::new();
     let mut read = 0;
     for &((x, y), corners) in whites {
-        let bits = read_in_square(view, corners, board.marker / board.square, board.dictionary.side());
-        let Some((id, turns)) = bits.and_then(|bits| board.dictionary.read(bits, board.markers())) else { continue };
+        let bits = sample_bits_in_square(view, corners, board.marker / board.square, board.dictionary.side());
+        let Some((id, turns)) = bits.and_then(|bits| board.dictionary.decode(bits, board.markers())) else { continue };
         let Some((column, row)) = board.square_of(id) else { continue };
         read += 1;
-        // The square's middle, in twice its coordinates, turns as the marker must be turned back: to the corner (column, row) of squares belongs the
-        // inner corner before it.
+        // The center of the square, in doubled coordinates, is rotated back by the marker's rotation. Square (column,
+        // row) has the inner corner (column − 1, row − 1) at its top left.
         let back = (4 - turns) & 3;
-        let middle = turned((2 * x + 1, 2 * y + 1), back);
-        let shift = (2 * column as i32 - 1 - middle.0, 2 * row as i32 - 1 - middle.1);
+        let center = rotate_quarter_turns((2 * x + 1, 2 * y + 1), back);
+        let shift = (2 * column as i32 - 1 - center.0, 2 * row as i32 - 1 - center.1);
         *votes.entry(Placement { turns: back, shift: (shift.0 / 2, shift.1 / 2) }).or_default() += 1;
     }
     let (&placement, &agreed) = votes.iter().max_by_key(|v| *v.1)?;
     (agreed >= 2 && 2 * agreed > read).then_some(placement)
 }
 
-/// The bits of a marker in the middle of a white square with these corners; it is `share` of the square wide.
-fn read_in_square(view: ImageView<'_, f32, 1>, corners: [Point2<f64>; 4], share: f64, side: usize) -> Option<u64> {
-    let first = 0.5 * (1.0 - share);
-    let within = Matrix3::new(share, 0.0, first, 0.0, share, first, 0.0, 0.0, 1.0);
-    let map = square_to_picture(corners)? * within;
-    read_bits(view, &map, MarkerShape { side, frame: 1, rim: 0.5 * first / share })
+/// Samples the bits of a marker centered in a white square with the given corners; `ratio` is the side of the marker
+/// relative to the square.
+fn sample_bits_in_square(
+    view: ImageView<'_, f32, 1>,
+    corners: [Point2<f64>; 4],
+    ratio: f64,
+    side: usize,
+) -> Option<u64> {
+    let margin = 0.5 * (1.0 - ratio);
+    let marker_to_square = Matrix3::new(ratio, 0.0, margin, 0.0, ratio, margin, 0.0, 0.0, 1.0);
+    let map = unit_square_to_image(corners)? * marker_to_square;
+    sample_bits(view, &map, MarkerShape { side, border: 1, margin: 0.5 * margin / ratio })
 }
 
 #[cfg(test)]
@@ -152,8 +161,8 @@ mod tests {
     use crate::targets::Dictionary;
     use cv_core::{GrayF32, Silent, Vector3};
 
-    /// A picture of a board through a homography from board to picture, four samples to a pixel each way.
-    fn picture(board: &CharucoBoard, map: &Matrix3<f64>, (w, h): (usize, usize)) -> GrayF32 {
+    /// Renders a board by a homography from board to image, with 4×4 samples per pixel.
+    fn render(board: &CharucoBoard, map: &Matrix3<f64>, (w, h): (usize, usize)) -> GrayF32 {
         let back = map.try_inverse().unwrap();
         GrayF32::from_fn(w, h, |x, y| {
             let mut sum = 0.0;
@@ -168,18 +177,18 @@ mod tests {
     }
 
     #[test]
-    fn parts_of_boards_are_found_with_their_numbers() {
+    fn partially_visible_boards_are_detected_with_their_ids() {
         for (dictionary, k) in
             [(Dictionary::Aruco4x4x50, 0), (Dictionary::Aruco6x6x250, 1), (Dictionary::AprilTag36h11, 2)]
         {
             let board = CharucoBoard { squares: (8, 6), square: 30.0, marker: 22.0, dictionary };
-            // Turned, tilted, and partly outside.
+            // Rotated, with perspective, and partly outside.
             let (sin, cos) = (0.4 + 1.7 * k as f64).sin_cos();
             let map = Matrix3::new(1.9 * cos, -1.8 * sin, 0.0, 1.9 * sin, 1.8 * cos, 0.0, 4e-4, -5e-4, 1.0);
             let middle = map * Vector3::new(110.0, 80.0, 1.0);
             let (dx, dy) = (160.0 - middle.x / middle.z, 130.0 - middle.y / middle.z);
             let map = Matrix3::new(1.0, 0.0, dx, 0.0, 1.0, dy, 0.0, 0.0, 1.0) * map;
-            let image = picture(&board, &map, (360, 300));
+            let image = render(&board, &map, (360, 300));
             let found = find_charuco(image.view(), &board, &ChessboardOptions::default(), &Silent).unwrap();
             let place = |id: usize| {
                 let p = board.point(id);
@@ -190,7 +199,7 @@ mod tests {
             let visible = (0..board.corners().corners()).filter(|&id| inside(place(id))).count();
             assert!(visible < 35 && found.len() + 4 >= visible, "{dictionary}: {} of {visible}", found.len());
             for point in &found {
-                // Edges without any blur in a window of five pixels; the mean is at a twentieth.
+                // Edges without blur in a window of five pixels; the mean error is 0.05 px.
                 let off = (point.position - place(point.id)).norm();
                 assert!(off < 0.3, "{dictionary} {}: {off}", point.id);
             }
@@ -199,7 +208,7 @@ mod tests {
                 find_charuco(two.view(), &board, &ChessboardOptions::default(), &Silent),
                 Err(BoardError::SeveralBoards { boards: 2 })
             );
-            // No marker of another dictionary is there.
+            // A board with another dictionary.
             let other = CharucoBoard { dictionary: Dictionary::Aruco5x5x50, ..board };
             let find =
                 |image: &GrayF32, board| find_charuco(image.view(), board, &ChessboardOptions::default(), &Silent);

@@ -1,16 +1,17 @@
-//! Dictionaries of square markers, and reading a marker's number with some of its bits wrong.
+//! Dictionaries of square fiducial markers, and decoding with error correction.
 //!
-//! Sources: S. Garrido-Jurado et al., "Automatic generation and detection of highly reliable fiducial markers under occlusion", Pattern Recognition 47, 2014 (ArUco);
-//! E. Olson, "AprilTag: a robust and flexible visual fiducial system", ICRA 2011.
+//! Sources: S. Garrido-Jurado et al., "Automatic generation and detection of highly reliable fiducial markers under
+//! occlusion", Pattern Recognition 47, 2014 (ArUco); E. Olson, "AprilTag: a robust and flexible visual fiducial
+//! system", ICRA 2011.
 
 use super::dictionary_bits::{APRILTAG_36H11, ARUCO_4X4, ARUCO_5X5, ARUCO_6X6};
 
-/// A set of square markers that are told apart by their inner squares.
+/// A dictionary of square fiducial markers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Dictionary {
-    /// ArUco, 4×4 inner squares, 50 markers.
+    /// ArUco, 4×4 bits, 50 markers.
     Aruco4x4x50,
     /// 4×4, 100 markers.
     Aruco4x4x100,
@@ -28,7 +29,7 @@ pub enum Dictionary {
     Aruco6x6x100,
     /// 6×6, 250 markers.
     Aruco6x6x250,
-    /// The first of ArUco: 5×5, 1024 markers, each row one of four words.
+    /// The original ArUco dictionary: 5×5, 1024 markers, each row one of four words.
     ArucoOriginal,
     /// AprilTag 36h11: 6×6, 587 markers.
     AprilTag36h11,
@@ -49,7 +50,7 @@ cv_core::named!(Dictionary {
 });
 
 impl Dictionary {
-    /// Inner squares along a side of a marker. Around them lies a black frame one square wide.
+    /// Returns the number of bits along a side of a marker, without the black border.
     pub fn side(self) -> usize {
         match self {
             Self::Aruco4x4x50 | Self::Aruco4x4x100 | Self::Aruco4x4x250 => 4,
@@ -58,7 +59,7 @@ impl Dictionary {
         }
     }
 
-    /// Number of markers.
+    /// Returns the number of markers.
     pub fn markers(self) -> usize {
         match self {
             Self::Aruco4x4x50 | Self::Aruco5x5x50 | Self::Aruco6x6x50 => 50,
@@ -69,7 +70,8 @@ impl Dictionary {
         }
     }
 
-    /// The inner squares of a marker row by row from the top left, the first in the highest of `side()²` bits; 1 is white. `None` beyond the last marker.
+    /// Returns the bits of a marker, row by row from the top left, the first in the highest of `side()²` bits; 1 is
+    /// white. `None` for an id out of range.
     pub fn bits(self, id: usize) -> Option<u64> {
         if id >= self.markers() {
             return None;
@@ -77,20 +79,21 @@ impl Dictionary {
         match self {
             Self::Aruco4x4x50 | Self::Aruco4x4x100 | Self::Aruco4x4x250 => ARUCO_4X4.get(id).copied(),
             Self::Aruco5x5x50 | Self::Aruco5x5x100 | Self::Aruco5x5x250 => ARUCO_5X5.get(id).copied(),
-            Self::Aruco6x6x50 | Self::Aruco6x6x100 | Self::Aruco6x6x250 => halves(&ARUCO_6X6, id),
-            Self::AprilTag36h11 => halves(&APRILTAG_36H11, id),
+            Self::Aruco6x6x50 | Self::Aruco6x6x100 | Self::Aruco6x6x250 => combine_halves(&ARUCO_6X6, id),
+            Self::AprilTag36h11 => combine_halves(&APRILTAG_36H11, id),
             Self::ArucoOriginal => {
-                // Two bits of the number choose the word of a row, the highest two that of the first.
+                // Two bits of the id select the word of a row; the highest two that of the first row.
                 const WORDS: [u64; 4] = [0b10000, 0b10111, 0b01001, 0b01110];
                 Some((0..5).fold(0, |bits, row| (bits << 5) | WORDS[(id >> (2 * (4 - row))) & 3]))
             }
         }
     }
 
-    /// Wrong bits that are put right: fewer than half of those in which the two most alike markers (in any turn) differ, and never more than a tenth of all: beyond, walls become markers.
-    pub fn correctable(self) -> u32 {
+    /// Returns the maximum number of corrected bit errors: less than half of the minimum Hamming distance of the
+    /// dictionary (over all rotations), and at most about a tenth of the bits, to limit false positives.
+    pub fn max_correction_bits(self) -> u32 {
         match self {
-            // Of 16 bits. Markers of the larger sets differ in 3.
+            // Of 16 bits. The minimum Hamming distance of the larger sets is 3.
             Self::Aruco4x4x50 | Self::Aruco4x4x100 | Self::Aruco4x4x250 => 1,
             Self::ArucoOriginal => 0,
             Self::Aruco5x5x50 | Self::Aruco5x5x100 | Self::Aruco5x5x250 => 2,
@@ -98,41 +101,42 @@ impl Dictionary {
         }
     }
 
-    /// The marker among the first `markers` that `bits` show, and by how many quarter turns clockwise it is turned against them; with at most [`Dictionary::correctable`] bits wrong. Time: markers.
-    pub fn read(self, bits: u64, markers: usize) -> Option<(usize, usize)> {
-        let mut turned = bits;
+    /// Decodes bits: returns the id among the first `markers` and the rotation in clockwise quarter turns, with at most
+    /// [`Dictionary::max_correction_bits`] bit errors. O(markers).
+    pub fn decode(self, bits: u64, markers: usize) -> Option<(usize, usize)> {
+        let mut rotated = bits;
         let mut best: Option<(u32, usize, usize)> = None;
         for turns in 0..4 {
             for id in 0..markers.min(self.markers()) {
-                let wrong = (self.bits(id)? ^ turned).count_ones();
-                if wrong <= self.correctable() && best.is_none_or(|b| wrong < b.0) {
-                    best = Some((wrong, id, turns));
+                let errors = (self.bits(id)? ^ rotated).count_ones();
+                if errors <= self.max_correction_bits() && best.is_none_or(|b| errors < b.0) {
+                    best = Some((errors, id, turns));
                 }
             }
-            turned = turn(turned, self.side());
+            rotated = rotate_counterclockwise(rotated, self.side());
         }
         best.map(|(_, id, turns)| (id, turns))
     }
 }
 
 impl Dictionary {
-    /// Whether `bits` are those of a marker in one of its turns, all of them right.
-    pub(super) fn read_exactly(self, bits: u64) -> bool {
-        let turns = std::iter::successors(Some(bits), |bits| Some(turn(*bits, self.side())));
+    /// Returns whether `bits` are exactly those of a marker in any rotation.
+    pub(super) fn contains_exactly(self, bits: u64) -> bool {
+        let turns = std::iter::successors(Some(bits), |bits| Some(rotate_counterclockwise(*bits, self.side())));
         turns.take(4).any(|bits| (0..self.markers()).any(|id| self.bits(id) == Some(bits)))
     }
 }
 
-/// Bits that are stored as two halves of 18.
-fn halves(stored: &[u32], id: usize) -> Option<u64> {
+/// Combines the two 18-bit halves of stored bits.
+fn combine_halves(stored: &[u32], id: usize) -> Option<u64> {
     let (high, low) = (stored.get(2 * id)?, stored.get(2 * id + 1)?);
     Some((u64::from(*high) << 18) | u64::from(*low))
 }
 
-/// The inner squares as they look after a quarter turn counterclockwise, which undoes one clockwise.
-fn turn(bits: u64, side: usize) -> u64 {
+/// Rotates bits by a quarter turn counterclockwise.
+fn rotate_counterclockwise(bits: u64, side: usize) -> u64 {
     let at = |row: usize, column: usize| (bits >> (side * side - 1 - (row * side + column))) & 1;
-    (0..side * side).fold(0, |turned, i| (turned << 1) | at(i % side, side - 1 - i / side))
+    (0..side * side).fold(0, |rotated, i| (rotated << 1) | at(i % side, side - 1 - i / side))
 }
 
 #[cfg(test)]
@@ -141,38 +145,38 @@ mod tests {
     use cv_core::Named;
 
     #[test]
-    fn markers_are_read_in_every_turn_with_wrong_bits() {
+    fn markers_are_decoded_in_every_rotation_with_bit_errors() {
         for (_, dictionary) in Dictionary::NAMES {
             let (n, markers) = (dictionary.side() * dictionary.side(), dictionary.markers());
             assert_eq!(dictionary.bits(markers), None);
-            // (The last of the original ones looks the same upside down.)
+            // (The last marker of the original dictionary is symmetric under a rotation by 180°.)
             for id in [0, 7, 31, markers - 2] {
                 let mut bits = dictionary.bits(id).unwrap();
                 assert!(bits >> n == 0);
-                // Three turns counterclockwise are one clockwise.
+                // Three counterclockwise quarter turns are one clockwise.
                 for turns in 0..4 {
-                    let wrong = (0..dictionary.correctable()).fold(bits, |b, k| b ^ (1 << (5 * k)));
-                    assert_eq!(dictionary.read(wrong, markers), Some((id, turns)), "{dictionary} {id}");
-                    bits = (0..3).fold(bits, |b, _| turn(b, dictionary.side()));
+                    let wrong = (0..dictionary.max_correction_bits()).fold(bits, |b, k| b ^ (1 << (5 * k)));
+                    assert_eq!(dictionary.decode(wrong, markers), Some((id, turns)), "{dictionary} {id}");
+                    bits = (0..3).fold(bits, |b, _| rotate_counterclockwise(b, dictionary.side()));
                 }
             }
         }
     }
 
     #[test]
-    fn no_two_markers_are_taken_for_each_other() {
+    fn the_minimum_hamming_distance_allows_the_correction() {
         for (_, dictionary) in Dictionary::NAMES {
             let markers = dictionary.markers();
-            // The numbers of the original have no distance to speak of but that of their words.
+            // The original dictionary has only the small Hamming distance of its words.
             if *dictionary == Dictionary::ArucoOriginal {
                 continue;
             }
-            let turned: Vec<[u64; 4]> = (0..markers)
+            let rotated: Vec<[u64; 4]> = (0..markers)
                 .map(|id| {
                     let mut bits = dictionary.bits(id).unwrap();
                     std::array::from_fn(|_| {
                         let now = bits;
-                        bits = turn(bits, dictionary.side());
+                        bits = rotate_counterclockwise(bits, dictionary.side());
                         now
                     })
                 })
@@ -180,8 +184,8 @@ mod tests {
             for i in 0..markers {
                 for j in 0..=i {
                     for k in usize::from(i == j)..4 {
-                        let differ = (turned[i][0] ^ turned[j][k]).count_ones();
-                        assert!(differ > 2 * dictionary.correctable(), "{dictionary} {i} {j}: {differ}");
+                        let differ = (rotated[i][0] ^ rotated[j][k]).count_ones();
+                        assert!(differ > 2 * dictionary.max_correction_bits(), "{dictionary} {i} {j}: {differ}");
                     }
                 }
             }

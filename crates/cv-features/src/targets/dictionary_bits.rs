@@ -1,9 +1,10 @@
-//! The bits of marker dictionaries: facts of the dictionaries that OpenCV (Apache-2.0) and AprilTag (BSD-2-Clause) publish, so that boards made for them can be read.
+//! The bits of marker dictionaries, as published by OpenCV (Apache-2.0) and AprilTag (BSD-2-Clause), for compatibility
+//! with their boards.
 //!
-//! A number holds the inner squares of a marker row by row from the top left, the first in the highest bit; 1 is white. Of 36 bits the higher and the lower
-//! 18 follow each other.
+//! An entry has the bits of a marker row by row from the top left, the first in the highest bit; 1 is white. 36 bits
+//! are stored as the higher and the lower 18.
 
-/// ArUco 4×4: 50, 100 and 250 begin alike.
+/// ArUco 4×4: the sets of 50 and 100 are prefixes of that of 250.
 pub(super) const ARUCO_4X4: [u64; 250] = [
     0xb532, 0xf9a, 0x332d, 0x9946, 0x549e, 0x79cd, 0x9e2e, 0xc4f2, 0xfeda, 0xcf56, 0xf991, 0x11a7, 0xeb7, 0x2a0f,
     0x24b1, 0x263e, 0x4665, 0x6600, 0x6c5e, 0x76af, 0x868b, 0xb02b, 0xccd5, 0xdd82, 0xfe47, 0x9471, 0xace4, 0xa554,
@@ -96,7 +97,7 @@ pub(super) const ARUCO_6X6: [u32; 500] = [
     0x1b69b, 0x3ea0d, 0x1bfab, 0xa457, 0x1c0f4, 0x38a60,
 ];
 
-/// AprilTag 36h11, turned as OpenCV prints it.
+/// AprilTag 36h11, rotated as in OpenCV.
 pub(super) const APRILTAG_36H11: [u32; 1174] = [
     0x8685, 0x6bab, 0x24b46, 0xfe9b, 0x1c224, 0x14bb, 0x64e5, 0x39e27, 0x11054, 0x3d3d7, 0xd735, 0x1b8cf, 0x2842e,
     0x256a0, 0xae1d, 0xa608, 0x2d5fe, 0x38d44, 0x13882, 0x35a64, 0x18762, 0x17f2c, 0x2acd1, 0x29ffc, 0x16532, 0x245c2,

@@ -1,16 +1,16 @@
-//! Finding grids of markers: ArUco grids and AprilGrids.
+//! Detection of marker grids: ArUco grid boards and AprilGrids.
 //!
-//! Black quadrilaterals are read as markers; each that is read says, by its own four corners, where its neighbors on the board must lie. What agrees is a board.
-//! The corners of an AprilGrid are then placed as those of a chessboard are (each lies between two black and two white squares), those of an ArUco grid by the lines
-//! of their sides.
+//! Black quadrilaterals are decoded as markers. The homography of each decoded marker predicts the positions of its
+//! neighbors on the board; consistent markers form a board. The corners of an AprilGrid are then localized as
+//! X-corners, like those of a chessboard; those of an ArUco grid by intersection of their edge lines.
 
 use super::board::BoardPoint;
 use super::board_error::BoardError;
 use super::chessboard::ChessboardOptions;
-use super::marker::{MarkerShape, mapped, read_bits, square_to_picture, what_else};
+use super::marker::{MarkerShape, apply_homography, diagnose, sample_bits, unit_square_to_image};
 use super::marker_grid::{GridStyle, MarkerGrid};
-use super::quads::{marker_corner, quads};
-use super::saddle::saddle;
+use super::quads::{detect_quads, refine_marker_corner};
+use super::saddle::refine_saddle;
 use super::x_corner::smoothed;
 use crate::error::check_image;
 use crate::simd;
@@ -18,25 +18,26 @@ use cv_core::{GrayF32, ImageView, Matrix3, Point2, Progress, Stage, UnionFind, m
 use cv_imgproc::decode_srgb;
 use rayon::prelude::*;
 
-/// A marker that was read.
-struct Seen {
+/// A decoded marker.
+struct DetectedMarker {
     id: usize,
-    /// Clockwise on screen from the corner at the top left of the sheet.
+    /// Clockwise in the image from the corner at the top left of the sheet.
     corners: [Point2<f64>; 4],
-    /// From the unit square.
+    /// Homography from the unit square.
     map: Matrix3<f64>,
 }
 
-/// How far from its place by its neighbor a marker may be found, as a share of the way between them: a wide lens bends a step by a tenth.
-const OFF: f64 = 0.2;
+/// Maximum deviation of a marker from the position predicted by a neighbor, relative to their distance: the distortion
+/// of wide-angle lenses is about 0.1.
+const MAX_RELATIVE_DEVIATION: f64 = 0.2;
 
-/// Finds the corners of the markers of a grid: of as many markers as the picture shows.
+/// Detects the corners of the visible markers of a grid.
 ///
-/// `view` is gray, 0 to 1. The points are in the order of their ids, which are those of [`MarkerGrid::point`]. At least two markers must lie beside each other as they do on
-/// the board, where the board has more than one.
+/// `view` is gray, 0 to 1. The points are sorted by id, see [`MarkerGrid::point`]. At least two adjacent markers must
+/// be visible if the board has more than one.
 ///
 /// # Errors
-/// [`BoardError`]; where no marker of the board can be read, it says what was seen in their place.
+/// [`BoardError`]; if no marker of the board can be decoded, it reports other markers in the image.
 pub fn find_marker_grid(
     view: ImageView<'_, f32, 1>,
     board: &MarkerGrid,
@@ -47,93 +48,98 @@ pub fn find_marker_grid(
     board.check()?;
     check_image(view, 16)?;
     let stage = Stage::new(progress, "markers", 0)?;
-    let quads = quads(view, options.least_contrast, &stage)?;
-    let shape = |side| MarkerShape { side, frame: board.frame(), rim: (0.5 * board.spacing).min(0.15) };
-    let mut seen: Vec<Seen> = Vec::new();
+    let quads = detect_quads(view, options.min_contrast, &stage)?;
+    let shape = |side| MarkerShape { side, border: board.border(), margin: (0.5 * board.spacing).min(0.15) };
+    let mut markers: Vec<DetectedMarker> = Vec::new();
     for quad in &quads {
-        let Some(map) = square_to_picture(*quad) else { continue };
-        let bits = read_bits(view, &map, shape(board.dictionary.side()));
-        let Some((id, turns)) = bits.and_then(|bits| board.dictionary.read(bits, board.count())) else { continue };
-        // Corner of the quadrilateral that is the marker's own first, and how the marker stands on the sheet.
-        let corners = std::array::from_fn(|k| quad[(k + turns + board.turns()) % 4]);
-        let Some(map) = square_to_picture(corners) else { continue };
-        seen.push(Seen { id, corners, map });
+        let Some(map) = unit_square_to_image(*quad) else { continue };
+        let bits = sample_bits(view, &map, shape(board.dictionary.side()));
+        let Some((id, turns)) = bits.and_then(|bits| board.dictionary.decode(bits, board.count())) else { continue };
+        // The rotation of the quadrilateral relative to the dictionary, and of the marker on the sheet.
+        let corners = std::array::from_fn(|k| quad[(k + turns + board.quarter_turns()) % 4]);
+        let Some(map) = unit_square_to_image(corners) else { continue };
+        markers.push(DetectedMarker { id, corners, map });
     }
     stage.check()?;
-    let chosen = match agreeing(&seen, board) {
-        Ok(chosen) => chosen,
+    let consistent = match consistent_markers(&markers, board) {
+        Ok(consistent) => consistent,
         Err(several @ BoardError::SeveralBoards { .. }) => return Err(several),
-        // One or another place reads as a marker by chance.
+        // A few quadrilaterals decode as markers by chance.
         Err(other) => {
-            let maps: Vec<Matrix3<f64>> = quads.iter().take(400).filter_map(|quad| square_to_picture(*quad)).collect();
-            // A frame of one cell and one of two: who has the wrong dictionary may have that wrong, too.
+            let maps: Vec<Matrix3<f64>> =
+                quads.iter().take(400).filter_map(|quad| unit_square_to_image(*quad)).collect();
+            // With borders of one and of two cells: markers of another dictionary may also have another border.
             let read = |i: usize, side: usize| {
-                let of = |frame| read_bits(view, &maps[i], MarkerShape { frame, ..shape(side) });
-                of(board.frame()).or_else(|| of(3 - board.frame()))
+                let with_border = |border| sample_bits(view, &maps[i], MarkerShape { border, ..shape(side) });
+                with_border(board.border()).or_else(|| with_border(3 - board.border()))
             };
             let none = BoardError::NoMarkers { dictionary: board.dictionary, seen: quads.len() };
-            let reason = if seen.is_empty() { none } else { other };
-            return Err(what_else(maps.len(), board.dictionary, read).unwrap_or(reason));
+            let reason = if markers.is_empty() { none } else { other };
+            return Err(diagnose(maps.len(), board.dictionary, read).unwrap_or(reason));
         }
     };
-    let april = board.style == GridStyle::AprilGrid;
-    // What corners are placed in: chessboard corners in the smoothed picture, corners of markers in its light.
-    let placed_in = if april { smoothed(view, simd::level()) } else { light(view) };
+    let is_april_grid = board.style == GridStyle::AprilGrid;
+    // X-corners are localized in the smoothed image, intersections of edges in linear intensity.
+    let localization_image = if is_april_grid { smoothed(view, simd::level()) } else { linear_intensity(view) };
     stage.check()?;
-    let mut points = Vec::with_capacity(4 * chosen.len());
-    for marker in chosen {
-        let least =
+    let mut points = Vec::with_capacity(4 * consistent.len());
+    for marker in consistent {
+        let shortest_side =
             (0..4).map(|k| (marker.corners[(k + 1) % 4] - marker.corners[k]).norm()).fold(f64::INFINITY, f64::min);
         for k in 0..4 {
             let start = marker.corners[k];
-            let found = if april {
-                // Plain as far as the frame is thick, and the black square wide.
-                let plain = least * board.spacing.min(0.2);
-                let window = (0.75 * plain).min(options.largest_window.into()).max(2.0);
-                saddle(placed_in.view(), start, window, 2e-4).map(|s| (s.position, s.deviation_unsmoothed()))
+            let localized = if is_april_grid {
+                // The window is limited by the border and the black squares.
+                let clearance = shortest_side * board.spacing.min(0.2);
+                let window = (0.75 * clearance).min(options.max_window_radius.into()).max(2.0);
+                refine_saddle(localization_image.view(), start, window, 2e-4)
+                    .map(|s| (s.position, s.deviation_unsmoothed()))
             } else {
-                marker_corner(placed_in.view(), &marker.corners, k, 2.5)
+                refine_marker_corner(localization_image.view(), &marker.corners, k, 2.5)
             };
-            let Some((position, deviation)) = found else { continue };
-            if (position - start).norm() < (0.05 * least).max(1.5) {
+            let Some((position, deviation)) = localized else { continue };
+            if (position - start).norm() < (0.05 * shortest_side).max(1.5) {
                 points.push(BoardPoint { id: 4 * marker.id + k, position, deviation });
             }
         }
     }
     if points.len() < 4 {
-        return Err(BoardError::OtherLayout { markers: seen.len() });
+        return Err(BoardError::OtherLayout { markers: markers.len() });
     }
     points.sort_by_key(|p| p.id);
     Ok(points)
 }
 
-/// The picture in linear light.
-fn light(view: ImageView<'_, f32, 1>) -> GrayF32 {
+/// Converts an sRGB image to linear intensity.
+fn linear_intensity(view: ImageView<'_, f32, 1>) -> GrayF32 {
     let mut out = view.to_image();
     out.as_mut_slice().par_iter_mut().with_min_len(1 << 14).for_each(|v| *v = decode_srgb(*v));
     out
 }
 
-/// The markers that lie as on the board by one another.
-fn agreeing<'a>(seen: &'a [Seen], board: &MarkerGrid) -> Result<Vec<&'a Seen>, BoardError> {
-    let mut sets = UnionFind::new(seen.len());
-    let middle = Point2::new(0.5, 0.5);
+/// Selects the markers whose relative positions are consistent with the board.
+fn consistent_markers<'a>(
+    markers: &'a [DetectedMarker],
+    board: &MarkerGrid,
+) -> Result<Vec<&'a DetectedMarker>, BoardError> {
+    let mut sets = UnionFind::new(markers.len());
+    let center = Point2::new(0.5, 0.5);
     let pitch = 1.0 + board.spacing;
-    for i in 0..seen.len() {
+    for i in 0..markers.len() {
         for j in 0..i {
-            let (a, b) = (board.cell(seen[i].id), board.cell(seen[j].id));
+            let (a, b) = (board.cell(markers[i].id), board.cell(markers[j].id));
             let step = |a: usize, b: usize| b as f64 - a as f64;
             let (dx, dy) = (step(a.0, b.0), step(a.1, b.1));
-            // A marker tells little of what is farther than the second next.
+            // Predictions are accurate up to the second neighbor.
             if dx.abs().max(dy.abs()) > 2.0 || (dx == 0.0 && dy == 0.0) {
                 continue;
             }
-            let near = |from: &Seen, to: &Seen, sign: f64| {
-                let place = mapped(&from.map, middle.x + sign * pitch * dx, middle.y + sign * pitch * dy);
-                let (own, other) = (mapped(&from.map, 0.5, 0.5), mapped(&to.map, 0.5, 0.5));
-                (place - other).norm() < OFF * (other - own).norm()
+            let is_consistent = |from: &DetectedMarker, to: &DetectedMarker, sign: f64| {
+                let predicted = apply_homography(&from.map, center.x + sign * pitch * dx, center.y + sign * pitch * dy);
+                let (own, other) = (apply_homography(&from.map, 0.5, 0.5), apply_homography(&to.map, 0.5, 0.5));
+                (predicted - other).norm() < MAX_RELATIVE_DEVIATION * (other - own).norm()
             };
-            if near(&seen[i], &seen[j], 1.0) && near(&seen[j], &seen[i], -1.0) {
+            if is_consistent(&markers[i], &markers[j], 1.0) && is_consistent(&markers[j], &markers[i], -1.0) {
                 sets.union(i as u32, j as u32);
             }
         }
@@ -144,50 +150,56 @@ fn agreeing<'a>(seen: &'a [Seen], board: &MarkerGrid) -> Result<Vec<&'a Seen>, B
     groups.sort_unstable();
     groups.dedup();
     groups.sort_by_key(|root| std::cmp::Reverse(size(*root)));
-    let of = |root: u32| (0..seen.len()).filter(|i| roots[*i] == root).map(|i| &seen[i]).collect::<Vec<&Seen>>();
-    let least = board.count().min(2);
-    let other = BoardError::OtherLayout { markers: seen.len() };
-    let best = of(*groups.first().ok_or(other)?);
-    if best.len() < least {
+    let group_of = |root: u32| {
+        (0..markers.len()).filter(|i| roots[*i] == root).map(|i| &markers[i]).collect::<Vec<&DetectedMarker>>()
+    };
+    let min_markers = board.count().min(2);
+    let other = BoardError::OtherLayout { markers: markers.len() };
+    let best = group_of(*groups.first().ok_or(other)?);
+    if best.len() < min_markers {
         return Err(other);
     }
-    let again = |root: &&u32| {
-        let group = of(**root);
-        let twice = group.iter().filter(|m| best.iter().any(|b| b.id == m.id)).count();
-        group.len() >= least && 2 * twice > group.len()
+    let is_duplicate_board = |root: &&u32| {
+        let group = group_of(**root);
+        let repeated = group.iter().filter(|m| best.iter().any(|b| b.id == m.id)).count();
+        group.len() >= min_markers && 2 * repeated > group.len()
     };
-    let several = groups.iter().filter(again).count();
+    let several = groups.iter().filter(is_duplicate_board).count();
     if several > 1 {
         return Err(BoardError::SeveralBoards { boards: several });
     }
-    // Parts that something lies across belong together where they have different markers.
+    // Parts of a board separated by an occluder have different markers.
     let mut all = best;
     for root in &groups[1..] {
-        let group = of(*root);
+        let group = group_of(*root);
         if group.len() >= 2 && group.iter().all(|m| all.iter().all(|b| b.id != m.id)) {
             all.extend(group);
         }
     }
-    // Of two quadrilaterals that read as one marker the one that lies where the others have it.
-    let off = |marker: &Seen| {
-        let mut all: Vec<f64> =
-            all.iter().filter(|other| other.id != marker.id).filter_map(|other| off(board, other, marker)).collect();
+    // Of quadrilaterals with the same id, the one most consistent with the others.
+    let deviation = |marker: &DetectedMarker| {
+        let mut all: Vec<f64> = all
+            .iter()
+            .filter(|other| other.id != marker.id)
+            .filter_map(|other| corner_deviation(board, other, marker))
+            .collect();
         median(&mut all).unwrap_or(f64::INFINITY)
     };
-    let mut once: Vec<(f64, &Seen)> = all.iter().map(|marker| (off(marker), *marker)).collect();
-    once.sort_by(|a, b| (a.1.id, a.0).partial_cmp(&(b.1.id, b.0)).unwrap_or(std::cmp::Ordering::Equal));
-    once.dedup_by_key(|marker| marker.1.id);
-    Ok(once.into_iter().map(|marker| marker.1).collect())
+    let mut unique: Vec<(f64, &DetectedMarker)> = all.iter().map(|marker| (deviation(marker), *marker)).collect();
+    unique.sort_by(|a, b| (a.1.id, a.0).partial_cmp(&(b.1.id, b.0)).unwrap_or(std::cmp::Ordering::Equal));
+    unique.dedup_by_key(|marker| marker.1.id);
+    Ok(unique.into_iter().map(|marker| marker.1).collect())
 }
 
-/// Mean distance of a marker's corners from where another marker, at most two away, has them.
-fn off(board: &MarkerGrid, from: &Seen, to: &Seen) -> Option<f64> {
+/// Computes the mean distance of a marker's corners from the positions predicted by another marker; `None` if that is
+/// more than two markers away.
+fn corner_deviation(board: &MarkerGrid, from: &DetectedMarker, to: &DetectedMarker) -> Option<f64> {
     let (a, b) = (board.cell(from.id), board.cell(to.id));
     let step = |a: usize, b: usize| (1.0 + board.spacing) * (b as f64 - a as f64);
-    let near = a.0.abs_diff(b.0).max(a.1.abs_diff(b.1)) <= 2;
+    let is_near = a.0.abs_diff(b.0).max(a.1.abs_diff(b.1)) <= 2;
     let unit = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)];
-    let place = |(x, y): (f64, f64)| mapped(&from.map, x + step(a.0, b.0), y + step(a.1, b.1));
-    near.then(|| unit.iter().zip(&to.corners).map(|(u, seen)| (place(*u) - seen).norm()).sum::<f64>() / 4.0)
+    let predict = |(x, y): (f64, f64)| apply_homography(&from.map, x + step(a.0, b.0), y + step(a.1, b.1));
+    is_near.then(|| unit.iter().zip(&to.corners).map(|(u, corner)| (predict(*u) - corner).norm()).sum::<f64>() / 4.0)
 }
 
 #[cfg(test)]
@@ -197,10 +209,11 @@ mod tests {
     use cv_core::{Silent, Vector3};
     use cv_imgproc::{gray_to_f32, linear_to_srgb};
 
-    /// A picture of boards, each through a homography from board to picture, four samples of light to a pixel each way, as sRGB.
-    fn picture(boards: &[(Board, Matrix3<f64>)], (w, h): (usize, usize)) -> GrayF32 {
-        let all: Vec<_> = boards.iter().map(|(b, map)| (b.black(), map.try_inverse().unwrap())).collect();
-        let light = GrayF32::from_fn(w, h, |x, y| {
+    /// Renders boards by homographies from board to image, with 4×4 samples of linear intensity per pixel, encoded as
+    /// sRGB.
+    fn render(boards: &[(Board, Matrix3<f64>)], (w, h): (usize, usize)) -> GrayF32 {
+        let all: Vec<_> = boards.iter().map(|(b, map)| (b.black_rectangles(), map.try_inverse().unwrap())).collect();
+        let linear = GrayF32::from_fn(w, h, |x, y| {
             let mut sum = 0.0;
             for k in 0..16 {
                 let at =
@@ -214,18 +227,18 @@ mod tests {
             }
             [sum / 16.0]
         });
-        gray_to_f32(linear_to_srgb(light.view()).view())
+        gray_to_f32(linear_to_srgb(linear.view()).view())
     }
 
     fn grid(style: GridStyle, dictionary: Dictionary) -> MarkerGrid {
         MarkerGrid { markers: (5, 4), marker: 20.0, spacing: 0.3, dictionary, style }
     }
 
-    /// Turned by `angle`, tilted, with the middle of the board at a place of the picture.
+    /// A homography with rotation by `angle` and perspective, which maps the board's center to `at`.
     fn map(scale: f64, angle: f64, at: (f64, f64)) -> Matrix3<f64> {
         let (sin, cos) = angle.sin_cos();
         let map = Matrix3::new(scale * cos, -scale * sin, 0.0, scale * sin, scale * cos, 0.0, 4e-4, -5e-4, 1.0);
-        let middle = mapped(&map, 62.0, 49.0);
+        let middle = apply_homography(&map, 62.0, 49.0);
         Matrix3::new(1.0, 0.0, at.0 - middle.x, 0.0, 1.0, at.1 - middle.y, 0.0, 0.0, 1.0) * map
     }
 
@@ -234,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_of_grids_are_found_with_their_numbers() {
+    fn partially_visible_grids_are_detected_with_their_ids() {
         for (board, angle) in [
             (grid(GridStyle::Aruco, Dictionary::Aruco4x4x50), 0.4),
             (grid(GridStyle::Aruco, Dictionary::Aruco6x6x100), 2.1),
@@ -242,12 +255,12 @@ mod tests {
             (grid(GridStyle::AprilGrid, Dictionary::AprilTag36h11), -0.3),
         ] {
             let map = map(3.2, angle, (210.0, 150.0));
-            let image = picture(&[(Board::MarkerGrid(board), map)], (420, 300));
+            let image = render(&[(Board::MarkerGrid(board), map)], (420, 300));
             let found = find(&image, &board).unwrap();
             let inside = |id: usize| {
                 (0..4).all(|k| {
                     let o = board.point(4 * id + k);
-                    let p = mapped(&map, o.x, o.y);
+                    let p = apply_homography(&map, o.x, o.y);
                     p.x > 15.0 && p.y > 15.0 && p.x < 405.0 && p.y < 285.0
                 })
             };
@@ -257,23 +270,23 @@ mod tests {
                 .iter()
                 .map(|point| {
                     let o = board.point(point.id);
-                    (point.position - mapped(&map, o.x, o.y)).norm()
+                    (point.position - apply_homography(&map, o.x, o.y)).norm()
                 })
                 .collect();
             errors.sort_by(f64::total_cmp);
-            // Edges without any blur: a quarter of a pixel is the step of the sampling, over which some tens of samples of an edge are averaged.
+            // Edges without blur, sampled in steps of a quarter of a pixel; tens of samples per edge are averaged.
             let (median, worst) = (errors[errors.len() / 2], errors[errors.len() - 1]);
             assert!(median < 0.08 && worst < 0.4, "{angle}: {median} {worst}");
         }
     }
 
     #[test]
-    fn what_is_not_the_board_is_told_apart() {
+    fn other_boards_are_diagnosed() {
         let board = grid(GridStyle::Aruco, Dictionary::Aruco5x5x100);
         let straight = map(2.4, 0.2, (180.0, 130.0));
-        let image = picture(&[(Board::MarkerGrid(board), straight)], (360, 260));
+        let image = render(&[(Board::MarkerGrid(board), straight)], (360, 260));
         let asked = MarkerGrid { dictionary: Dictionary::Aruco4x4x50, ..board };
-        // Markers are named by the largest set that has them. Some lie partly outside.
+        // The reported dictionary is the largest of its family. Some markers are partly outside.
         assert!(matches!(
             find(&image, &asked),
             Err(BoardError::OtherDictionary {
@@ -286,11 +299,11 @@ mod tests {
         assert!(matches!(find(&mirrored, &board), Err(BoardError::Mirrored { markers: 10..=20, .. })));
         let empty = GrayF32::new(100, 80, [0.5]);
         assert!(matches!(find(&empty, &board), Err(BoardError::NoMarkers { seen: 0, .. })));
-        // A pitch that is not that of the board puts no neighbor where it is.
+        // With a wrong spacing, no neighbor is at its predicted position.
         let wide = MarkerGrid { spacing: 0.9, ..board };
         assert!(matches!(find(&image, &wide), Err(BoardError::OtherLayout { .. })));
         let two = [(Board::MarkerGrid(board), straight), (Board::MarkerGrid(board), map(2.4, -0.1, (520.0, 130.0)))];
-        let image = picture(&two, (700, 260));
+        let image = render(&two, (700, 260));
         assert_eq!(find(&image, &board), Err(BoardError::SeveralBoards { boards: 2 }));
     }
 }

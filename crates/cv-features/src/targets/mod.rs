@@ -1,4 +1,4 @@
-//! Calibration targets: their geometry, and finding them in pictures.
+//! Calibration targets: geometry and detection.
 
 mod any_board;
 mod board;

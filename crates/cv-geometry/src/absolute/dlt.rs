@@ -1,4 +1,4 @@
-//! Camera poses from six or more points, linearly.
+//! Absolute pose from six or more points by the direct linear transform (DLT).
 
 use super::{WorldMatch, check_world};
 use crate::error::{Degeneracy, EstimateError};
@@ -6,13 +6,13 @@ use cv_core::{Matrix3, Point3, Pose, Rotation3, Vector3};
 use cv_numeric::{svd3, symmetric_eigen};
 use nalgebra::{SMatrix, SVector};
 
-/// The pose, world to camera, of least algebraic error for six or more matches in normalized coordinates (the direct linear
-/// transformation, Hartley & Zisserman, §7.1, with the rotation made one by its singular values). One solution; refine it with
+/// Estimates the pose, world to camera, of minimum algebraic error from six or more matches in normalized coordinates
+/// (DLT, Hartley & Zisserman, §7.1; the rotation is orthonormalized by SVD). An initial value for
 /// [`refine_pose`](super::refine_pose).
 ///
 /// # Errors
-/// [`EstimateError`]: fewer than six matches, a coordinate that is not finite, or world points that determine no pose linearly: coincident,
-/// or all on one plane (take [`pose_three_points`](super::pose_three_points) there).
+/// [`EstimateError`]: fewer than six matches, a coordinate that is not finite, or coincident or coplanar world points
+/// (use [`pose_three_points`](super::pose_three_points) for coplanar ones).
 pub fn pose_from_points(matches: &[WorldMatch]) -> Result<Pose, EstimateError> {
     check_world(matches, 6)?;
     let n = matches.len() as f64;
@@ -25,17 +25,18 @@ pub fn pose_from_points(matches: &[WorldMatch]) -> Result<Pose, EstimateError> {
     for m in matches {
         let p = (m.world.coords - center) / spread;
         let q = [p.x, p.y, p.z, 1.0];
-        for (row, at) in [(0, m.image.x), (4, m.image.y)] {
+        for (row, coordinate) in [(0, m.image.x), (4, m.image.y)] {
             let mut r = SVector::<f64, 12>::zeros();
             for k in 0..4 {
                 r[row + k] = q[k];
-                r[8 + k] = -at * q[k];
+                r[8 + k] = -coordinate * q[k];
             }
             ata.ger(1.0, &r, &r, 1.0);
         }
     }
     let (values, vectors) = symmetric_eigen(&ata);
-    // A plane leaves a null space of dimension four. Eigenvalues are squares: 1e-14 is a relative 1e-7.
+    // Coplanar points have a null space of dimension four. The eigenvalues are squared singular values: 1e-14
+    // corresponds to a relative 1e-7.
     if values[1] <= 1e-14 * values[11] {
         return Err(EstimateError::Degenerate { kind: Degeneracy::Planar });
     }
@@ -44,10 +45,10 @@ pub fn pose_from_points(matches: &[WorldMatch]) -> Result<Pose, EstimateError> {
     let column = Vector3::new(v[3], v[7], v[11]);
     let planar = EstimateError::Degenerate { kind: Degeneracy::Planar };
     let svd = svd3(&left).map_err(|_| planar)?;
-    // The determinant of what is the rotation times a factor has the factor's sign.
+    // The left block is the rotation times a scale; its determinant has the sign of the scale.
     let sign = svd.s[2].signum();
     let scale = sign * (svd.s[0] + svd.s[1] + svd.s[2].abs()) / 3.0;
-    // With the sign taken out, all singular values are positive.
+    // After removing the sign, all singular values are positive.
     let rotation = if sign > 0.0 { svd.u * svd.v.transpose() } else { flip(&svd.u) * svd.v.transpose() };
     let translation = column / scale * spread - rotation * center;
     let pose = Pose::new(Rotation3::from_matrix_unchecked(rotation), translation);
@@ -55,7 +56,7 @@ pub fn pose_from_points(matches: &[WorldMatch]) -> Result<Pose, EstimateError> {
     if 2 * front < matches.len() { Err(planar) } else { Ok(pose) }
 }
 
-/// −U with its last column turned back: the left singular vectors of −M, still a rotation.
+/// Returns −U with its last column restored: the left singular vectors of −M, a proper rotation.
 fn flip(u: &Matrix3<f64>) -> Matrix3<f64> {
     let mut flipped = -u;
     flipped.set_column(2, &u.column(2));

@@ -1,4 +1,4 @@
-//! The pose of a camera that sees known points.
+//! Absolute pose (PnP) and absolute orientation.
 
 mod dlt;
 mod p3p;
@@ -11,7 +11,7 @@ pub use similarity::estimate_similarity;
 pub use umeyama::{Similarity, SimilarityFreedom, align_points};
 
 use crate::error::{Degeneracy, EstimateError};
-use crate::match_blocks::{LANES, different};
+use crate::match_blocks::{LANES, distinct_pairs};
 use crate::ransac::{Estimator, RansacData, RobustOptions, Scorer, TukeyBiweight, ransac};
 use crate::robust::RobustModel;
 use crate::rotation::orthonormalized;
@@ -19,24 +19,24 @@ use cv_core::{Matrix3, Point2, Point3, Pose, Progress, Rotation3, Vector3, media
 use cv_numeric::{LeastSquares, LmOptions, NormalEquations, levenberg_marquardt};
 use nalgebra::{Const, Matrix2x3, SVector};
 
-/// A point of the world and where a camera sees it, in normalized coordinates.
+/// A 2D–3D correspondence: a world point and its observation in normalized coordinates.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct WorldMatch {
-    /// In the world's frame.
+    /// In the world frame.
     pub world: Point3<f64>,
     /// Normalized: pixels through [`cv_core::Camera::normalize`].
     pub image: Point2<f64>,
 }
 
-/// The pose, world to camera, from matches of which many may be wrong.
+/// Estimates the absolute pose, world to camera, robustly from tentative 2D–3D correspondences (PnP).
 ///
-/// RANSAC over three-point samples with local optimization on the reprojection error. `options.threshold` is in normalized units: pixels over
-/// the focal length. Inliers lie in front of the camera.
+/// RANSAC with P3P and local optimization on the reprojection error. `options.threshold` is in normalized units: pixels
+/// divided by the focal length. Inliers lie in front of the camera.
 ///
 /// # Errors
-/// [`EstimateError`]: fewer than four matches, a coordinate that is not finite, points on a line or coincident, or no consensus of more than
-/// three matches.
+/// [`EstimateError`]: fewer than four matches, a coordinate that is not finite, collinear or coincident points, or no
+/// model with a small enough number of false alarms.
 pub fn estimate_pose(
     matches: &[WorldMatch],
     options: &RobustOptions,
@@ -48,63 +48,64 @@ pub fn estimate_pose(
         return Err(EstimateError::Degenerate { kind });
     }
     let estimator = AbsoluteEstimator::new(matches);
-    let found = ransac(&estimator, options, progress)?;
-    let pose = estimator.uncentered(&found.model);
+    let consensus = ransac(&estimator, options, progress)?;
+    let pose = estimator.uncentered(&consensus.model);
     let (mut inliers, mut sum) = (Vec::new(), 0.0);
     for (i, m) in matches.iter().enumerate() {
-        let r = reprojection(&pose, m);
+        let r = reprojection_error(&pose, m);
         if r < options.threshold {
             inliers.push(i);
             sum += r * r;
         }
     }
     let rms = (sum / inliers.len() as f64).sqrt();
-    Ok(RobustModel { model: pose, inliers, rms, iterations: found.iterations, log_nfa: found.log_nfa })
+    Ok(RobustModel { model: pose, inliers, rms, iterations: consensus.iterations, log_nfa: consensus.log_nfa })
 }
 
-/// Refines a pose on all `matches` within reach of it, to the least robust reprojection error.
+/// Refines an absolute pose by minimizing the robust reprojection error of `matches`.
 ///
-/// Returns the pose and its loss: each match adds 0 (exact) to 1 (beyond 2.5 thresholds, or behind the camera). `threshold` in normalized units.
+/// Returns the pose and its loss, to which each match adds 0 (exact) to 1 (beyond 2.5 thresholds, or behind the
+/// camera). `threshold` in normalized units.
 pub fn refine_pose(pose: &Pose, matches: &[WorldMatch], threshold: f64) -> (Pose, f64) {
     let problem = ReprojectionProblem { matches, scorer: &TukeyBiweight, threshold };
     let refined = refine(&problem, pose, 30).unwrap_or(*pose);
     (refined, problem.cost(&refined))
 }
 
-/// Distance in the image between where a match is and where the pose puts it; infinite behind the camera.
-fn reprojection(pose: &Pose, m: &WorldMatch) -> f64 {
+/// Computes the reprojection error of a match in normalized units; infinite behind the camera.
+fn reprojection_error(pose: &Pose, m: &WorldMatch) -> f64 {
     let p = pose.transform(&m.world);
     if p.z > 0.0 { (p.x / p.z - m.image.x).hypot(p.y / p.z - m.image.y) } else { f64::INFINITY }
 }
 
-/// Refuses too few matches and useless coordinates.
+/// Rejects too few matches and coordinates that are NaN, infinite or too large.
 pub(crate) fn check_world(matches: &[WorldMatch], needed: usize) -> Result<(), EstimateError> {
     if matches.len() < needed {
         return Err(EstimateError::NotEnoughMatches { got: matches.len(), needed });
     }
-    // As for image matches: beyond this, squares lose every digit.
-    let useless = |m: &WorldMatch| !m.world.iter().chain(m.image.iter()).all(|v| v.abs() <= 1e12);
-    match matches.iter().position(useless) {
+    // The same limit as for image matches.
+    let is_invalid = |m: &WorldMatch| !m.world.iter().chain(m.image.iter()).all(|v| v.abs() <= 1e12);
+    match matches.iter().position(is_invalid) {
         Some(index) => Err(EstimateError::NotFinite { index }),
         None => Ok(()),
     }
 }
 
-/// World points that determine no pose: fewer than three different ones, or all on a line.
+/// Tests whether the world points are coincident or collinear.
 fn world_degeneracy(matches: &[WorldMatch]) -> Option<Degeneracy> {
     let first = matches[0].world;
-    let far = |p: &WorldMatch| (p.world - first).norm_squared();
-    let direction = matches.iter().max_by(|a, b| far(a).total_cmp(&far(b)))?.world - first;
+    let squared_distance = |p: &WorldMatch| (p.world - first).norm_squared();
+    let direction = matches.iter().max_by(|a, b| squared_distance(a).total_cmp(&squared_distance(b)))?.world - first;
     if direction.norm_squared() <= 1e-24 * first.coords.norm_squared() {
         return Some(Degeneracy::Coincident);
     }
-    // Rounding of the cross product of coordinates of that size.
+    // The rounding error of the cross product.
     let limit = 1e-12 * direction.norm_squared();
-    let on_line = |m: &WorldMatch| (m.world - first).cross(&direction).norm() <= limit;
-    matches.iter().all(on_line).then_some(Degeneracy::Collinear)
+    let is_on_line = |m: &WorldMatch| (m.world - first).cross(&direction).norm() <= limit;
+    matches.iter().all(is_on_line).then_some(Degeneracy::Collinear)
 }
 
-/// Minimizes `Σ ρ(reprojection² / threshold²)` over poses.
+/// Minimizes the robust reprojection error `Σ ρ(error² / threshold²)` over poses.
 struct ReprojectionProblem<'a, C: Scorer> {
     matches: &'a [WorldMatch],
     scorer: &'a C,
@@ -120,11 +121,11 @@ impl<C: Scorer> LeastSquares for ReprojectionProblem<'_, C> {
     }
 
     fn cost(&self, pose: &Pose) -> f64 {
-        let one = |m| {
-            let r = reprojection(pose, m) / self.threshold;
+        let loss = |m| {
+            let r = reprojection_error(pose, m) / self.threshold;
             f64::from(self.scorer.loss((r * r) as f32))
         };
-        self.matches.iter().map(one).sum()
+        self.matches.iter().map(loss).sum()
     }
 
     fn linearize(&self, pose: &Pose) -> NormalEquations<Const<6>> {
@@ -141,11 +142,11 @@ impl<C: Scorer> LeastSquares for ReprojectionProblem<'_, C> {
             }
             equations.cost += f64::from(self.scorer.loss(u as f32));
             let weight = self.scorer.weight(u);
-            let by_point = Matrix2x3::new(i, 0.0, -p.x * i * i, 0.0, i, -p.y * i * i);
+            let j_point = Matrix2x3::new(i, 0.0, -p.x * i * i, 0.0, i, -p.y * i * i);
             // R exp(ω) x ≈ R x − R [x]× ω.
-            let by_rotation = -by_point * rotation * m.world.coords.cross_matrix();
+            let j_rotation = -j_point * rotation * m.world.coords.cross_matrix();
             for (k, r) in r.into_iter().enumerate() {
-                let (w, t) = (by_rotation.row(k), by_point.row(k));
+                let (w, t) = (j_rotation.row(k), j_point.row(k));
                 equations.add(r, &SVector::from([w[0], w[1], w[2], t[0], t[1], t[2]]), weight);
             }
         }
@@ -153,8 +154,8 @@ impl<C: Scorer> LeastSquares for ReprojectionProblem<'_, C> {
     }
 
     fn step(&self, pose: &Pose, d: &SVector<f64, 6>) -> Pose {
-        let turn = Rotation3::new(Vector3::new(d[0], d[1], d[2]));
-        Pose::new(pose.rotation * turn, pose.translation + Vector3::new(d[3], d[4], d[5]))
+        let rotation = Rotation3::new(Vector3::new(d[0], d[1], d[2]));
+        Pose::new(pose.rotation * rotation, pose.translation + Vector3::new(d[3], d[4], d[5]))
     }
 }
 
@@ -165,7 +166,7 @@ fn refine<C: Scorer>(problem: &ReprojectionProblem<'_, C>, start: &Pose, iterati
     (report.cost < report.initial_cost).then(|| Pose::new(rotation, report.params.translation))
 }
 
-/// [`LANES`] matches, coordinate by coordinate; missing ones are NaN.
+/// [`LANES`] matches as a structure of arrays; padding lanes are NaN.
 struct WorldBlock {
     world: [[f32; LANES]; 3],
     image: [[f32; LANES]; 2],
@@ -184,7 +185,7 @@ impl WorldBlock {
 }
 
 struct AbsoluteEstimator {
-    /// With the world's origin amid the points, for the sake of f32.
+    /// With centered world points, for the precision of f32.
     matches: Vec<WorldMatch>,
     center: Vector3<f64>,
     blocks: Vec<WorldBlock>,
@@ -192,24 +193,25 @@ struct AbsoluteEstimator {
 
 impl AbsoluteEstimator {
     fn new(matches: &[WorldMatch]) -> Self {
-        // Of medians, which no wild point moves.
-        let middle = |k: usize| {
+        // Medians are robust to outliers.
+        let median_coordinate = |k: usize| {
             let mut v: Vec<f64> = matches.iter().map(|m| m.world[k]).collect();
             median(&mut v).unwrap_or(0.0)
         };
-        let center = Vector3::new(middle(0), middle(1), middle(2));
-        let moved = |m: &WorldMatch| WorldMatch { world: m.world - center, image: m.image };
-        let matches: Vec<WorldMatch> = matches.iter().map(moved).collect();
+        let center = Vector3::new(median_coordinate(0), median_coordinate(1), median_coordinate(2));
+        let centered = |m: &WorldMatch| WorldMatch { world: m.world - center, image: m.image };
+        let matches: Vec<WorldMatch> = matches.iter().map(centered).collect();
         let blocks = matches.chunks(LANES).map(WorldBlock::new).collect();
         Self { matches, center, blocks }
     }
 
+    /// Converts a pose for the centered points to one for the original points.
     fn uncentered(&self, pose: &Pose) -> Pose {
         Pose::new(pose.rotation, pose.translation - pose.rotation * self.center)
     }
 }
 
-/// A pose in f32, row by row.
+/// The 3×4 pose matrix in f32.
 struct PoseKernel([[f32; 4]; 3]);
 
 impl RansacData for AbsoluteEstimator {
@@ -223,10 +225,11 @@ impl RansacData for AbsoluteEstimator {
         &self.blocks
     }
 
-    fn background(&self, most: usize) -> Vec<WorldBlock> {
-        let mixed = |(i, j): (usize, usize)| WorldMatch { world: self.matches[i].world, image: self.matches[j].image };
-        let mixed: Vec<WorldMatch> = different(self.matches.len(), most).map(mixed).collect();
-        mixed.chunks(LANES).map(WorldBlock::new).collect()
+    fn background(&self, max_count: usize) -> Vec<WorldBlock> {
+        let recombine =
+            |(i, j): (usize, usize)| WorldMatch { world: self.matches[i].world, image: self.matches[j].image };
+        let recombined: Vec<WorldMatch> = distinct_pairs(self.matches.len(), max_count).map(recombine).collect();
+        recombined.chunks(LANES).map(WorldBlock::new).collect()
     }
 }
 
@@ -234,14 +237,14 @@ impl Estimator for AbsoluteEstimator {
     type Model = Pose;
     type Data = Self;
     type Kernel = PoseKernel;
-    const SAMPLE: usize = 3;
+    const SAMPLE_SIZE: usize = 3;
     const RESIDUAL_DIMENSION: i32 = 2;
 
     fn data(&self) -> &Self {
         self
     }
 
-    fn unit(&self) -> f64 {
+    fn threshold_scale(&self) -> f64 {
         1.0
     }
 
@@ -303,21 +306,21 @@ mod tests {
     }
 
     #[test]
-    fn the_linear_method_gives_the_exact_pose() {
+    fn dlt_recovers_the_exact_pose() {
         for seed in 0..50 {
             let (views, m) = world(seed, 6 + seed as usize % 20, 0.0);
             let [r, t] = error(&pose_from_points(&m).unwrap(), &views.pose);
-            // Six random points are now and then nearly on a critical surface, which costs digits.
+            // Some configurations of six random points are nearly critical and lose digits.
             assert!(r < 1e-6 && t < 1e-5, "{seed} {r} {t}");
         }
     }
 
     #[test]
-    fn derivatives_are_those_of_the_cost() {
+    fn the_analytic_gradient_equals_the_numeric_one() {
         let (views, m) = world(3, 20, 1e-2);
         let problem = ReprojectionProblem { matches: &m, scorer: &LeastSquaresLoss, threshold: 1.0 };
         let gradient = problem.linearize(&views.pose).gradient;
-        let cost = |p: &Pose| m.iter().map(|m| reprojection(p, m).powi(2)).sum::<f64>();
+        let cost = |p: &Pose| m.iter().map(|m| reprojection_error(p, m).powi(2)).sum::<f64>();
         for i in 0..6 {
             let mut d = SVector::<f64, 6>::zeros();
             d[i] = 1e-6;
@@ -328,9 +331,9 @@ mod tests {
     }
 
     #[test]
-    fn wrong_matches_do_not_matter() {
+    fn accuracy_with_outliers_is_close_to_least_squares_on_inliers() {
         for seed in 0..20 {
-            // Half a pixel at 500 px of focal length; more wrong than right.
+            // Half a pixel at a focal length of 500 px; an outlier ratio of 0.6.
             let (views, mut m) = world(seed, 100, 1e-3);
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
             for m in &mut m[40..] {
@@ -340,16 +343,17 @@ mod tests {
             let found = estimate_pose(&m, &options, &Silent).unwrap();
             let least_squares = refine_pose(&views.pose, &m[..40], 1.0).0;
             let ([r, t], [r0, t0]) = (error(&found.model, &views.pose), error(&least_squares, &views.pose));
-            // As good as least squares on the right ones, give or take; forty points of that noise fix a rotation to a thousandth.
+            // About as accurate as least squares on the true inliers; forty points with that noise determine a rotation
+            // to 1e-3.
             assert!(r < 1.5 * r0 + 1e-3 && t < 1.5 * t0 + 5e-3, "{seed}: {r} {r0} {t} {t0}");
-            let right = found.inliers.iter().filter(|i| **i < 40).count();
-            // Four standard deviations in two dimensions keep all but one in three thousand.
-            assert!(right >= 39 && found.inliers.len() <= right + 3);
+            let true_positives = found.inliers.iter().filter(|i| **i < 40).count();
+            // Four standard deviations in two dimensions include all but one in three thousand.
+            assert!(true_positives >= 39 && found.inliers.len() <= true_positives + 3);
         }
     }
 
     #[test]
-    fn bad_input_gets_a_typed_answer() {
+    fn invalid_and_degenerate_input_is_a_typed_error() {
         let (_, good) = world(1, 20, 0.0);
         let options = RobustOptions { threshold: 1e-3, ..RobustOptions::default() };
         let get = |m: &[WorldMatch]| estimate_pose(m, &options, &Silent).unwrap_err();

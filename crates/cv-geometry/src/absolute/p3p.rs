@@ -1,17 +1,19 @@
-//! Camera poses from three points.
+//! P3P: the absolute pose from three points.
 
 use super::WorldMatch;
 use cv_core::{Matrix3, Pose, Rotation3, Vector3};
 use cv_numeric::{farthest_root_cubic, real_roots_quadratic};
 
-/// The poses (at most four), world to camera, that see three world points at three places, in normalized coordinates.
+/// Computes the poses (at most four), world to camera, with which three world points project to three image points in
+/// normalized coordinates.
 ///
-/// Calls `found` for each, all points in front of the camera; for none where the world points are on a line. The three squared
-/// distances between the points are quadratic in the depths; of their pencil of differences the degenerate member is a pair of planes, and
-/// on each the depths are roots of a quadratic (Persson & Nordberg, "Lambda Twist", 2018; Ding et al., "Revisiting the P3P problem", 2023).
+/// Calls `emit` for each pose with all points in front of the camera; for none if the world points are collinear. The
+/// three squared distances between the points are quadratic forms of the depths. The degenerate conic of the pencil of
+/// their differences is a pair of planes, and on each plane the depths are roots of a quadratic (Persson & Nordberg,
+/// "Lambda Twist", 2018; Ding et al., "Revisiting the P3P problem", 2023).
 #[inline]
-pub fn pose_three_points(m: &[WorldMatch; 3], mut found: impl FnMut(Pose)) {
-    // Written out, and one division each: a call for each array, and a division for each coordinate, cost a tenth of all.
+pub fn pose_three_points(m: &[WorldMatch; 3], mut emit: impl FnMut(Pose)) {
+    // Unrolled, with one division per ray: faster by a tenth.
     let ray = |i: usize| {
         let v = m[i].image.to_homogeneous();
         v * (1.0 / v.norm())
@@ -25,23 +27,18 @@ pub fn pose_three_points(m: &[WorldMatch; 3], mut found: impl FnMut(Pose)) {
         return;
     }
     let (b01, b02, b12) = (rays[0].dot(&rays[1]), rays[0].dot(&rays[2]), rays[1].dot(&rays[2]));
-    // Distances 01 and 02 against 12, as quadratic forms of the depths that vanish.
-    let one = Matrix3::new(a12, -a12 * b01, 0.0, -a12 * b01, a12 - a01, a01 * b12, 0.0, a01 * b12, -a01);
-    let two = Matrix3::new(a12, 0.0, -a12 * b02, 0.0, -a02, a02 * b12, -a12 * b02, a02 * b12, a12 - a02);
-    let (adj1, adj2) = (adjugate(&one), adjugate(&two));
+    // Quadratic forms of the depths that vanish: distances 01 and 02 relative to 12.
+    let d1 = Matrix3::new(a12, -a12 * b01, 0.0, -a12 * b01, a12 - a01, a01 * b12, 0.0, a01 * b12, -a01);
+    let d2 = Matrix3::new(a12, 0.0, -a12 * b02, 0.0, -a02, a02 * b12, -a12 * b02, a02 * b12, a12 - a02);
+    let (adj1, adj2) = (adjugate(&d1), adjugate(&d2));
     let trace = |a: &Matrix3<f64>, b: &Matrix3<f64>| a.component_mul(b).sum();
-    let cubic = [
-        one.column(0).dot(&adj1.column(0)),
-        trace(&adj1, &two),
-        trace(&adj2, &one),
-        two.column(0).dot(&adj2.column(0)),
-    ];
-    // Of the pencil's degenerate members the one that is the best determined. Where it is no pair of real planes (beside two others, both
-    // complex or both real), the two forms vanish together nowhere.
+    let cubic =
+        [d1.column(0).dot(&adj1.column(0)), trace(&adj1, &d2), trace(&adj2, &d1), d2.column(0).dot(&adj2.column(0))];
+    // The best-determined degenerate member of the pencil. If it is not a pair of real planes, there is no solution.
     let pencil = if cubic[3].abs() < cubic[0].abs() {
-        farthest_root_cubic([cubic[3], cubic[2], cubic[1], cubic[0]]).map(|g| one * g + two)
+        farthest_root_cubic([cubic[3], cubic[2], cubic[1], cubic[0]]).map(|g| d1 * g + d2)
     } else {
-        farthest_root_cubic(cubic).map(|g| one + two * g)
+        farthest_root_cubic(cubic).map(|g| d1 + d2 * g)
     };
     let Some(d) = pencil else { return };
     let b = adjugate(&d);
@@ -50,18 +47,18 @@ pub fn pose_three_points(m: &[WorldMatch; 3], mut found: impl FnMut(Pose)) {
         return;
     }
     let axis = b.column(i) * (1.0 / (-b[(i, i)]).sqrt());
-    // D + [axis]× is the product of the two planes.
+    // D + [axis]× is the outer product of the normals of the two planes.
     let product = d + axis.cross_matrix();
     let (r, c) = product.iamax_full();
-    let sides: [Vector3<f64>; 2] = [product.row(r).transpose(), product.column(c).into_owned()];
-    // Of the matrix of the columns d01, d02 and their normal.
+    let planes: [Vector3<f64>; 2] = [product.row(r).transpose(), product.column(c).into_owned()];
+    // The inverse of the matrix with the columns d01, d02 and their normal.
     let inverse = Matrix3::from_columns(&[d02.cross(&normal), normal.cross(&d01), normal]).transpose() * (1.0 / area);
-    for n in sides {
+    for n in planes {
         let i = n.iamax();
         let (j, k) = ((i + 1) % 3, (i + 2) % 3);
         // Depths (on the plane): k-th = τ, j-th = 1, i-th = u + v τ.
         let (u, v) = (-n[j] / n[i], -n[k] / n[i]);
-        let (form, other) = (&one, &two);
+        let (form, other) = (&d1, &d2);
         let quadratic = |q: &Matrix3<f64>| {
             [
                 q[(i, i)] * u * u + 2.0 * q[(i, j)] * u + q[(j, j)],
@@ -80,13 +77,13 @@ pub fn pose_three_points(m: &[WorldMatch; 3], mut found: impl FnMut(Pose)) {
             if !depth.iter().all(|x| *x > 0.0) {
                 continue;
             }
-            // All three distances give the length; their sum has no cancellation.
+            // The scale from the sum of the three squared distances, without cancellation.
             let form = depth.norm_squared() * 2.0
                 - 2.0 * (b01 * depth[0] * depth[1] + b02 * depth[0] * depth[2] + b12 * depth[1] * depth[2]);
             let mut depth = depth * ((a01 + a02 + a12) / form).sqrt();
-            // Seldom more than one step: twice where two solutions are near each other.
+            // A second step is only needed if two solutions are close.
             for _ in 0..2 {
-                if newton(&mut depth, [a01, a02, a12], [b01, b02, b12]) {
+                if newton_step(&mut depth, [a01, a02, a12], [b01, b02, b12]) {
                     break;
                 }
             }
@@ -97,14 +94,15 @@ pub fn pose_three_points(m: &[WorldMatch; 3], mut found: impl FnMut(Pose)) {
             let (e01, e02) = (first - rays[1] * depth[1], first - rays[2] * depth[2]);
             let rotation = Matrix3::from_columns(&[e01, e02, e01.cross(&e02)]) * inverse;
             let translation = first - rotation * world[0];
-            found(Pose::new(Rotation3::from_matrix_unchecked(rotation), translation));
+            emit(Pose::new(Rotation3::from_matrix_unchecked(rotation), translation));
         }
     }
 }
 
-/// One step of Newton's method on the three squared distances; true where none is needed, since they hold to rounding.
+/// Applies a Newton step to the depths; returns true (without a step) if the three squared distances are already exact
+/// to rounding.
 #[inline]
-fn newton(l: &mut Vector3<f64>, [a01, a02, a12]: [f64; 3], [b01, b02, b12]: [f64; 3]) -> bool {
+fn newton_step(l: &mut Vector3<f64>, [a01, a02, a12]: [f64; 3], [b01, b02, b12]: [f64; 3]) -> bool {
     let r = Vector3::new(
         l[0] * l[0] + l[1] * l[1] - 2.0 * b01 * l[0] * l[1] - a01,
         l[0] * l[0] + l[2] * l[2] - 2.0 * b02 * l[0] * l[2] - a02,
@@ -118,7 +116,7 @@ fn newton(l: &mut Vector3<f64>, [a01, a02, a12]: [f64; 3], [b01, b02, b12]: [f64
     let (s, t) = (l[0] - b02 * l[2], l[2] - b02 * l[0]);
     let (v, w) = (l[1] - b12 * l[2], l[2] - b12 * l[1]);
     let determinant = -p * t * v - q * s * w;
-    // A double root: as good as it gets.
+    // Singular at a double root: no step.
     if determinant.abs() > 1e-12 * (l.norm_squared() * l.norm()) {
         let i = 0.5 / determinant;
         l[0] -= i * (-t * v * r[0] - q * w * r[1] + q * t * r[2]);
@@ -128,7 +126,7 @@ fn newton(l: &mut Vector3<f64>, [a01, a02, a12]: [f64; 3], [b01, b02, b12]: [f64
     false
 }
 
-/// The transposed cofactors of a symmetric matrix.
+/// Computes the adjugate of a symmetric matrix.
 #[inline]
 fn adjugate(m: &Matrix3<f64>) -> Matrix3<f64> {
     let c = [m.column(0).into_owned(), m.column(1).into_owned(), m.column(2).into_owned()];
@@ -144,7 +142,7 @@ mod tests {
     use rand_chacha::rand_core::SeedableRng;
 
     #[test]
-    fn one_of_the_poses_is_the_truth_and_all_see_the_points() {
+    fn one_of_the_poses_is_the_truth_and_all_reproject_exactly() {
         let mut worst = 0.0f64;
         let (mut total, mut missed) = (0, 0);
         for seed in 0..2000 {
@@ -172,16 +170,17 @@ mod tests {
                 worst = worst.max(best);
             }
         }
-        // Near the cylinder through the three points two solutions meet and half of the digits are lost; one in a thousand random triples is
-        // so near that five digits of sixteen remain no more.
+        // Near the danger cylinder two solutions coincide and half of the digits are lost; one in a thousand random
+        // triples has fewer than five correct digits.
         assert!(missed <= 4 && worst < 1e-5, "{missed} {worst}");
-        // Gao et al. 2003 count 1.7 positive solutions on average over random triples.
+        // Gao et al. 2003 report 1.7 positive solutions on average over random triples.
         assert!((2000..6000).contains(&total), "{total}");
     }
 
     #[test]
-    fn markers_seen_from_straight_ahead_are_no_special_case() {
-        // Symmetry makes coefficients of the cubic vanish, and straight above a corner on the circle through all three two solutions meet.
+    fn fronto_parallel_symmetric_triangles_are_solved() {
+        // Symmetry makes coefficients of the cubic vanish, and above the circumscribed circle (danger cylinder) two
+        // solutions coincide.
         let side = 3f64.sqrt();
         let shapes = [
             [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]],
@@ -205,7 +204,8 @@ mod tests {
                             + (pose.translation - truth.translation).norm() / distance;
                         best = best.min(e);
                     });
-                    // Where two solutions meet, half of the digits are lost, and two more at forty times the triangle's size.
+                    // Where two solutions coincide, half of the digits are lost, and two more at a distance of forty
+                    // times the triangle's size.
                     assert!(best < 1e-5, "{shape:?} {turn} {axis:?}: {best}");
                 }
             }
@@ -213,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn degenerate_triples_give_nothing() {
+    fn degenerate_triples_have_no_solution() {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let image = [(); 3].map(|()| Point2::new(uniform(&mut rng), uniform(&mut rng)));
         let with = |world: [Point3<f64>; 3]| {

@@ -1,4 +1,4 @@
-//! The similarity between two clouds of points of which some may be wrong.
+//! Robust estimation of a similarity between two point sets.
 
 use super::umeyama::{Similarity, SimilarityFreedom, align_points_weighted};
 use crate::error::EstimateError;
@@ -7,10 +7,10 @@ use crate::ransac::{Estimator, RansacData, RobustOptions, Scorer, ransac};
 use crate::robust::RobustModel;
 use cv_core::{Point3, Progress, Vector3, median};
 
-/// The similarity that brings points `a` to points `b`, of which many may be wrong.
+/// Estimates the similarity from points `a` to points `b` robustly.
 ///
-/// RANSAC over samples of three with local optimization by iteratively reweighted least squares. `options.threshold` is a distance in the frame of `b`. No number of false alarms is
-/// computed: a few positions are all there is.
+/// RANSAC over three-point samples with local optimization by iteratively reweighted least squares. `options.threshold`
+/// is a distance in the frame of `b`. No number of false alarms is computed, since inputs typically have few points.
 ///
 /// # Errors
 /// [`EstimateError`]: as [`align_points`](super::align_points); no consensus of more than three pairs where there are more than three.
@@ -23,11 +23,11 @@ pub fn estimate_similarity(
 ) -> Result<RobustModel<Similarity>, EstimateError> {
     options.check()?;
     let n = a.len().min(b.len());
-    // Whatever all of them do not determine, no sample of them does.
+    // Rejects degenerate input, of which every sample is degenerate.
     align_points_weighted(a, b, &vec![1.0; n], freedom)?;
     let estimator = SimilarityEstimator::new(&a[..n], &b[..n], freedom);
-    let found = ransac(&estimator, options, progress)?;
-    let model = estimator.uncentered(&found.model);
+    let consensus = ransac(&estimator, options, progress)?;
+    let model = estimator.uncentered(&consensus.model);
     let (mut inliers, mut sum) = (Vec::new(), 0.0);
     for (i, (p, q)) in a.iter().zip(b).enumerate() {
         let r = (model.transform(p) - q).norm();
@@ -37,17 +37,17 @@ pub fn estimate_similarity(
         }
     }
     let rms = (sum / inliers.len() as f64).sqrt();
-    Ok(RobustModel { model, inliers, rms, iterations: found.iterations, log_nfa: found.log_nfa })
+    Ok(RobustModel { model, inliers, rms, iterations: consensus.iterations, log_nfa: consensus.log_nfa })
 }
 
-/// [`LANES`] pairs, coordinate by coordinate; missing ones are NaN.
+/// [`LANES`] pairs as a structure of arrays; padding lanes are NaN.
 struct PointPairBlock {
     a: [[f32; LANES]; 3],
     b: [[f32; LANES]; 3],
 }
 
 struct SimilarityEstimator {
-    /// Both with their origins amid the points, for the sake of f32.
+    /// Both are centered, for the precision of f32.
     a: Vec<Point3<f64>>,
     b: Vec<Point3<f64>>,
     center: [Vector3<f64>; 2],
@@ -55,16 +55,16 @@ struct SimilarityEstimator {
     blocks: Vec<PointPairBlock>,
 }
 
-/// Of medians, which no wild point moves.
-fn middle(points: &[Point3<f64>]) -> Vector3<f64> {
+/// Computes the coordinate-wise median, which is robust to outliers.
+fn median_point(points: &[Point3<f64>]) -> Vector3<f64> {
     Vector3::from_fn(|k, _| median(&mut points.iter().map(|p| p[k]).collect::<Vec<_>>()).unwrap_or(0.0))
 }
 
 impl SimilarityEstimator {
     fn new(a: &[Point3<f64>], b: &[Point3<f64>], freedom: SimilarityFreedom) -> Self {
-        let center = [middle(a), middle(b)];
-        let moved = |points: &[Point3<f64>], by: Vector3<f64>| points.iter().map(|p| p - by).collect::<Vec<_>>();
-        let (a, b) = (moved(a, center[0]), moved(b, center[1]));
+        let center = [median_point(a), median_point(b)];
+        let centered = |points: &[Point3<f64>], by: Vector3<f64>| points.iter().map(|p| p - by).collect::<Vec<_>>();
+        let (a, b) = (centered(a, center[0]), centered(b, center[1]));
         let lanes = |points: &[Point3<f64>]| {
             [0, 1, 2].map(|k: usize| std::array::from_fn(|i| points.get(i).map_or(f32::NAN, |p| p[k] as f32)))
         };
@@ -73,20 +73,24 @@ impl SimilarityEstimator {
         Self { a, b, center, freedom, blocks }
     }
 
-    /// Of `q − c_b = s R (p − c_a) + t`.
+    /// Converts `q − c_b = s R (p − c_a) + t` to the original coordinates.
     fn uncentered(&self, model: &Similarity) -> Similarity {
         let [ca, cb] = self.center;
         Similarity { translation: model.translation + cb - model.rotation * ca * model.scale, ..*model }
     }
 
-    /// Squared residuals over the squared threshold.
-    fn relative<'s>(&'s self, model: &'s Similarity, threshold: f64) -> impl Iterator<Item = f64> + 's {
+    /// Computes the squared residuals divided by the squared threshold.
+    fn relative_squared_residuals<'s>(
+        &'s self,
+        model: &'s Similarity,
+        threshold: f64,
+    ) -> impl Iterator<Item = f64> + 's {
         let square = threshold * threshold;
         self.a.iter().zip(&self.b).map(move |(p, q)| (model.transform(p) - q).norm_squared() / square)
     }
 }
 
-/// Scaled rotation and translation in f32, row by row.
+/// The 3×4 matrix of scaled rotation and translation in f32.
 struct SimilarityKernel([[f32; 4]; 3]);
 
 impl RansacData for SimilarityEstimator {
@@ -105,14 +109,14 @@ impl Estimator for SimilarityEstimator {
     type Model = Similarity;
     type Data = Self;
     type Kernel = SimilarityKernel;
-    const SAMPLE: usize = 3;
+    const SAMPLE_SIZE: usize = 3;
     const RESIDUAL_DIMENSION: i32 = 3;
 
     fn data(&self) -> &Self {
         self
     }
 
-    fn unit(&self) -> f64 {
+    fn threshold_scale(&self) -> f64 {
         1.0
     }
 
@@ -130,11 +134,11 @@ impl Estimator for SimilarityEstimator {
     fn squared_residuals(kernel: &SimilarityKernel, block: &PointPairBlock) -> [f32; LANES] {
         std::array::from_fn(|i| {
             let p = [0, 1, 2].map(|k: usize| block.a[k][i]);
-            let off = |k: usize| {
+            let residual = |k: usize| {
                 let r = &kernel.0[k];
                 r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + r[3] - block.b[k][i]
             };
-            let (x, y, z) = (off(0), off(1), off(2));
+            let (x, y, z) = (residual(0), residual(1), residual(2));
             x * x + y * y + z * z
         })
     }
@@ -146,18 +150,20 @@ impl Estimator for SimilarityEstimator {
         threshold: f64,
         iterations: usize,
     ) -> Option<Similarity> {
-        let cost =
-            |model: &Similarity| self.relative(model, threshold).map(|u| f64::from(scorer.loss(u as f32))).sum::<f64>();
-        let (mut best, mut least) = (None, cost(model));
+        let cost = |model: &Similarity| {
+            self.relative_squared_residuals(model, threshold).map(|u| f64::from(scorer.loss(u as f32))).sum::<f64>()
+        };
+        let (mut best, mut min_cost) = (None, cost(model));
         for _ in 0..iterations {
-            let from = best.as_ref().unwrap_or(model);
-            let weights: Vec<f64> = self.relative(from, threshold).map(|u| scorer.weight(u)).collect();
+            let current = best.as_ref().unwrap_or(model);
+            let weights: Vec<f64> =
+                self.relative_squared_residuals(current, threshold).map(|u| scorer.weight(u)).collect();
             let Ok(next) = align_points_weighted(&self.a, &self.b, &weights, self.freedom) else { break };
             let next_cost = cost(&next);
-            if next_cost.is_nan() || next_cost >= least * (1.0 - 1e-9) {
+            if next_cost.is_nan() || next_cost >= min_cost * (1.0 - 1e-9) {
                 break;
             }
-            (best, least) = (Some(next), next_cost);
+            (best, min_cost) = (Some(next), next_cost);
         }
         best
     }
@@ -174,16 +180,16 @@ mod tests {
 
     const FREE: SimilarityFreedom = SimilarityFreedom { scale: true, tilt: true };
 
-    /// Points around the origin, and where a similarity puts them far from it, with noise.
-    fn clouds(seed: u64, n: usize, noise: f64, tilt: bool) -> (Similarity, Vec<Point3<f64>>, Vec<Point3<f64>>) {
+    /// Points around the origin, and their noisy images under a similarity with a large translation.
+    fn point_sets(seed: u64, n: usize, noise: f64, tilt: bool) -> (Similarity, Vec<Point3<f64>>, Vec<Point3<f64>>) {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let mut turn = Vector3::from_fn(|_, _| gauss(&mut rng));
+        let mut rotation_vector = Vector3::from_fn(|_, _| gauss(&mut rng));
         if !tilt {
-            (turn.x, turn.y) = (0.0, 0.0);
+            (rotation_vector.x, rotation_vector.y) = (0.0, 0.0);
         }
         let truth = Similarity {
             scale: 1.0 + 5.0 * uniform(&mut rng),
-            rotation: Rotation3::new(turn),
+            rotation: Rotation3::new(rotation_vector),
             translation: Vector3::new(5e5, 4e6, 300.0),
         };
         let a: Vec<_> = (0..n).map(|_| Point3::from(Vector3::from_fn(|_, _| 4.0 * gauss(&mut rng)))).collect();
@@ -192,10 +198,10 @@ mod tests {
     }
 
     #[test]
-    fn wrong_points_do_not_matter() {
+    fn the_similarity_is_accurate_with_outliers() {
         for seed in 0..20 {
             for tilt in [true, false] {
-                let (truth, a, mut b) = clouds(seed, 30, 0.1, tilt);
+                let (truth, a, mut b) = point_sets(seed, 30, 0.1, tilt);
                 let mut rng = ChaCha8Rng::seed_from_u64(seed + 99);
                 for q in &mut b[..12] {
                     *q += Vector3::from_fn(|_, _| 30.0 * gauss(&mut rng) + 10.0);
@@ -203,38 +209,45 @@ mod tests {
                 let freedom = SimilarityFreedom { tilt, ..FREE };
                 let options = RobustOptions { threshold: 0.4, seed, ..RobustOptions::default() };
                 let found = estimate_similarity(&a, &b, freedom, &options, &Silent).unwrap();
-                // Eighteen points with 0.1 of noise over 4 to 24 units: a hundredth is four standard deviations.
+                // Eighteen points with a noise of 0.1 over 4 to 24 units: 0.01 is four standard deviations.
                 assert!((found.model.scale / truth.scale - 1.0).abs() < 0.03, "{seed}: {}", found.model.scale);
-                let turn = (found.model.rotation.matrix() - truth.rotation.matrix()).norm();
-                assert!(turn < 0.06 && (tilt || found.model.rotation.matrix()[(2, 2)] == 1.0), "{seed}: {turn}");
-                // Four standard deviations of three coordinates together keep all but one in a thousand.
-                let right = found.inliers.iter().filter(|i| **i >= 12).count();
-                assert!(right >= 17 && found.inliers.len() <= right + 1, "{seed}: {:?}", found.inliers);
+                let rotation_error = (found.model.rotation.matrix() - truth.rotation.matrix()).norm();
+                assert!(
+                    rotation_error < 0.06 && (tilt || found.model.rotation.matrix()[(2, 2)] == 1.0),
+                    "{seed}: {rotation_error}"
+                );
+                // Four standard deviations in three dimensions include all but one in a thousand.
+                let true_positives = found.inliers.iter().filter(|i| **i >= 12).count();
+                assert!(
+                    true_positives >= 17 && found.inliers.len() <= true_positives + 1,
+                    "{seed}: {:?}",
+                    found.inliers
+                );
                 assert!((0.08..0.25).contains(&found.rms), "{}", found.rms);
             }
         }
     }
 
     #[test]
-    fn a_scale_that_is_known_stays() {
-        let (truth, a, b) = clouds(3, 10, 0.0, true);
+    fn a_fixed_scale_is_one() {
+        let (truth, a, b) = point_sets(3, 10, 0.0, true);
         let rigid = SimilarityFreedom { scale: false, tilt: true };
         let scaled: Vec<_> = a.iter().map(|p| p * truth.scale).collect();
         let options = RobustOptions { threshold: 0.01, ..RobustOptions::default() };
         let found = estimate_similarity(&scaled, &b, rigid, &options, &Silent).unwrap();
         assert!(found.model.scale == 1.0 && found.inliers.len() == 10);
-        // Of another scale, none but those that a sample puts near.
+        // With a wrong fixed scale, there is no consensus beyond the minimal sample.
         assert!(estimate_similarity(&a, &b, rigid, &options, &Silent).is_err());
     }
 
     #[test]
-    fn what_determines_nothing_is_refused() {
+    fn degenerate_configurations_are_rejected() {
         let options = RobustOptions { threshold: 0.1, ..RobustOptions::default() };
         let line: Vec<_> = (0..6).map(|i| Point3::new(f64::from(i), 2.0 * f64::from(i), 1.0)).collect();
         let get = |a: &[Point3<f64>], freedom| estimate_similarity(a, a, freedom, &options, &Silent);
         assert_eq!(get(&line, FREE).unwrap_err(), EstimateError::Degenerate { kind: Degeneracy::Collinear });
         assert_eq!(get(&line[..2], FREE).unwrap_err(), EstimateError::NotEnoughMatches { got: 2, needed: 3 });
-        // A level line tells the turn about the vertical; a vertical one does not.
+        // A line that is not vertical determines the rotation about Z; a vertical one does not.
         let level = get(&line, SimilarityFreedom { scale: true, tilt: false }).unwrap();
         assert!((level.model.scale - 1.0).abs() < 1e-9 && level.inliers.len() == 6);
         let pole: Vec<_> = (0..6).map(|i| Point3::new(1.0, 2.0, f64::from(i))).collect();

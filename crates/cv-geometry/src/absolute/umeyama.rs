@@ -1,49 +1,51 @@
-//! The similarity between two clouds of points.
+//! Absolute orientation: the least-squares similarity between two point sets.
 
 use crate::error::{Degeneracy, EstimateError};
 use cv_core::{Matrix3, Point3, Rotation3, Vector3};
 use cv_numeric::svd3;
 
-/// `b = scale · R a + t`.
+/// A similarity transformation `b = scale · R a + t`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Similarity {
-    /// Above 0.
+    /// Scale factor, above 0.
     pub scale: f64,
     /// First frame to second.
     pub rotation: Rotation3<f64>,
-    /// In the second frame.
+    /// Translation in the second frame.
     pub translation: Vector3<f64>,
 }
 
 impl Similarity {
-    /// The point in the second frame.
+    /// Transforms a point to the second frame.
     pub fn transform(&self, p: &Point3<f64>) -> Point3<f64> {
         Point3::from(self.rotation * p.coords * self.scale + self.translation)
     }
 }
 
-/// What of a similarity is to be found.
+/// The degrees of freedom of a similarity that are estimated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SimilarityFreedom {
-    /// The scale, which else is 1.
+    /// Whether the scale is estimated; otherwise it is 1.
     pub scale: bool,
-    /// Any rotation; else one about Z, where both frames have Z up.
+    /// Whether any rotation is allowed; otherwise only rotations about Z (both frames have Z up).
     pub tilt: bool,
 }
 
-/// The similarity (or, without `with_scale`, the rigid motion) that brings the points `a` nearest to the points `b` in the sense of least
-/// squares (absolute orientation: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991). One
-/// solution.
+/// Estimates the least-squares similarity (or, without `with_scale`, rigid motion) from points `a` to points `b`
+/// (absolute orientation: Umeyama, "Least-squares estimation of transformation parameters between two point patterns",
+/// 1991).
 ///
 /// # Errors
-/// [`EstimateError`]: fewer than three pairs (the shorter list counts), a coordinate that is not finite, or points on a line.
+/// [`EstimateError`]: fewer than three pairs (by the shorter list), a coordinate that is not finite, or coincident or
+/// collinear points.
 pub fn align_points(a: &[Point3<f64>], b: &[Point3<f64>], with_scale: bool) -> Result<Similarity, EstimateError> {
     let weights = vec![1.0; a.len().min(b.len())];
     align_points_weighted(a, b, &weights, SimilarityFreedom { scale: with_scale, tilt: true })
 }
 
-/// [`align_points`] with a weight of 0 or more for each pair. Without `tilt`, points on a line that is not vertical will do.
+/// Estimates a similarity as [`align_points`], with a nonnegative weight for each pair. Without `tilt`, collinear
+/// points are sufficient if their line is not vertical.
 pub(crate) fn align_points_weighted(
     a: &[Point3<f64>],
     b: &[Point3<f64>],
@@ -54,8 +56,8 @@ pub(crate) fn align_points_weighted(
     if n < 3 {
         return Err(EstimateError::NotEnoughMatches { got: n, needed: 3 });
     }
-    let usable = |p: &Point3<f64>| p.iter().all(|v| v.abs() <= 1e12);
-    if let Some(index) = (0..n).find(|&i| !usable(&a[i]) || !usable(&b[i])) {
+    let is_valid = |p: &Point3<f64>| p.iter().all(|v| v.abs() <= 1e12);
+    if let Some(index) = (0..n).find(|&i| !is_valid(&a[i]) || !is_valid(&b[i])) {
         return Err(EstimateError::NotFinite { index });
     }
     let coincident = EstimateError::Degenerate { kind: Degeneracy::Coincident };
@@ -66,29 +68,30 @@ pub(crate) fn align_points_weighted(
     let mean = |p: &[Point3<f64>]| p.iter().zip(weights).map(|(p, w)| p.coords * *w).sum::<Vector3<f64>>() / total;
     let (ma, mb) = (mean(&a[..n]), mean(&b[..n]));
     let mut covariance = Matrix3::zeros();
-    let mut spread = 0.0;
+    let mut variance = 0.0;
     for ((p, q), w) in a.iter().zip(b).zip(weights) {
         let (p, q) = (p.coords - ma, q.coords - mb);
         covariance += q * p.transpose() * *w;
-        spread += p.norm_squared() * w;
+        variance += p.norm_squared() * w;
     }
-    let (rotation, trace) = if freedom.tilt { turn(&covariance)? } else { turn_about_z(&covariance, spread)? };
-    let scale = if freedom.scale { trace / spread } else { 1.0 };
-    // Turned about Z, what is higher in one may be lower in the other.
+    let (rotation, trace) =
+        if freedom.tilt { optimal_rotation(&covariance)? } else { optimal_rotation_about_z(&covariance, variance)? };
+    let scale = if freedom.scale { trace / variance } else { 1.0 };
+    // With rotations about Z only, the heights may be anticorrelated.
     if scale <= 0.0 || scale.is_nan() {
         return Err(coincident);
     }
     Ok(Similarity { scale, rotation, translation: mb - rotation * ma * scale })
 }
 
-/// The rotation of largest `tr(Rᵀ Σ)`, and that.
-fn turn(covariance: &Matrix3<f64>) -> Result<(Rotation3<f64>, f64), EstimateError> {
+/// Computes the rotation that maximizes `tr(Rᵀ Σ)`, and the maximum.
+fn optimal_rotation(covariance: &Matrix3<f64>) -> Result<(Rotation3<f64>, f64), EstimateError> {
     let coincident = EstimateError::Degenerate { kind: Degeneracy::Coincident };
     let svd = svd3(covariance).map_err(|_| coincident)?;
     if svd.s[0] <= 1e-24 {
         return Err(coincident);
     }
-    // The second largest spread, as a product of two: 1e-12 is 1e-6 of the length.
+    // A product of two extents: 1e-12 corresponds to 1e-6 of the length.
     if svd.s[1] <= 1e-12 * svd.s[0] {
         return Err(EstimateError::Degenerate { kind: Degeneracy::Collinear });
     }
@@ -96,17 +99,17 @@ fn turn(covariance: &Matrix3<f64>) -> Result<(Rotation3<f64>, f64), EstimateErro
     Ok((svd.nearest_rotation(), svd.s.sum()))
 }
 
-/// The same among rotations about Z.
-fn turn_about_z(covariance: &Matrix3<f64>, spread: f64) -> Result<(Rotation3<f64>, f64), EstimateError> {
+/// Computes the same among rotations about Z.
+fn optimal_rotation_about_z(covariance: &Matrix3<f64>, variance: f64) -> Result<(Rotation3<f64>, f64), EstimateError> {
     let cos = covariance.m11 + covariance.m22;
     let sin = covariance.m21 - covariance.m12;
-    let level = cos.hypot(sin);
-    if spread <= 1e-24 || level <= 1e-12 * spread {
+    let norm = cos.hypot(sin);
+    if variance <= 1e-24 || norm <= 1e-12 * variance {
         return Err(EstimateError::Degenerate { kind: Degeneracy::Coincident });
     }
-    let (cos, sin) = (cos / level, sin / level);
+    let (cos, sin) = (cos / norm, sin / norm);
     let rotation = Rotation3::from_matrix_unchecked(Matrix3::new(cos, -sin, 0.0, sin, cos, 0.0, 0.0, 0.0, 1.0));
-    Ok((rotation, level + covariance.m33))
+    Ok((rotation, norm + covariance.m33))
 }
 
 #[cfg(test)]
@@ -117,7 +120,7 @@ mod tests {
     use rand_chacha::rand_core::SeedableRng;
 
     #[test]
-    fn exact_points_give_every_entry_also_on_a_plane() {
+    fn every_parameter_is_recovered_from_exact_points_also_coplanar() {
         for seed in 0..50 {
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
             let truth = Similarity {
@@ -125,7 +128,7 @@ mod tests {
                 rotation: Rotation3::new(Vector3::from_fn(|_, _| gauss(&mut rng))),
                 translation: Vector3::from_fn(|_, _| 10.0 * gauss(&mut rng)),
             };
-            // Three points are always on a plane; every other cloud is flat.
+            // Every other point set is coplanar.
             let n = 3 + seed as usize % 5;
             let flat = if seed % 2 == 0 { 0.0 } else { 1.0 };
             let a: Vec<_> =
@@ -142,14 +145,14 @@ mod tests {
     }
 
     #[test]
-    fn a_mirrored_cloud_still_gives_a_rotation() {
+    fn mirrored_points_have_a_proper_rotation() {
         let a = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 0.1]].map(Point3::from);
         let b = a.map(|p| Point3::new(-p.x, p.y, p.z));
         assert!((align_points(&a, &b, true).unwrap().rotation.matrix().determinant() - 1.0).abs() < 1e-12);
     }
 
     #[test]
-    fn bad_input_gets_a_typed_answer() {
+    fn invalid_and_degenerate_input_is_a_typed_error() {
         let line: Vec<_> = (0..5).map(|i| Point3::new(f64::from(i), 2.0 * f64::from(i), 1.0)).collect();
         let kind = |a: &[Point3<f64>]| align_points(a, a, true).unwrap_err();
         assert_eq!(kind(&line), EstimateError::Degenerate { kind: Degeneracy::Collinear });

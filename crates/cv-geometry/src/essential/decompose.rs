@@ -1,15 +1,15 @@
-//! From an essential matrix to poses.
+//! Decomposition of essential matrices into poses.
 
 use crate::epipolar::second_epipole;
 use crate::error::{Degeneracy, EstimateError};
 use cv_core::{Camera, Correspondence, Matrix3, Pose, Rotation3, Vector3};
 use cv_numeric::svd3;
 
-/// `Kᵦᵀ F Kₐ` with its singular values made (1, 1, 0): the nearest essential matrix (Hartley & Zisserman, §11.7.3). F relates
-/// undistorted pixels.
+/// Converts a fundamental matrix to the nearest essential matrix: `Kᵦᵀ F Kₐ` with its singular values set to (1, 1, 0)
+/// (Hartley & Zisserman, §11.7.3). F relates undistorted pixels.
 ///
 /// # Errors
-/// [`EstimateError::Degenerate`] where F is zero or not finite.
+/// [`EstimateError::Degenerate`] if F is zero or not finite.
 pub fn essential_from_fundamental(f: &Matrix3<f64>, a: &Camera, b: &Camera) -> Result<Matrix3<f64>, EstimateError> {
     let degenerate = EstimateError::Degenerate { kind: Degeneracy::Coincident };
     let svd = svd3(&(b.matrix().transpose() * f * a.matrix())).map_err(|_| degenerate)?;
@@ -19,16 +19,17 @@ pub fn essential_from_fundamental(f: &Matrix3<f64>, a: &Camera, b: &Camera) -> R
     Ok(svd.u.column(0) * svd.v.column(0).transpose() + svd.u.column(1) * svd.v.column(1).transpose())
 }
 
-/// The essential matrix `[t]× R` of a relative pose, which maps coordinates of the first camera to those of the second.
+/// Computes the essential matrix `[t]× R` of a relative pose, which maps coordinates of the first camera to those of
+/// the second.
 pub fn essential_from_pose(pose: &Pose) -> Matrix3<f64> {
     pose.translation.cross_matrix() * pose.rotation.matrix()
 }
 
-/// The four poses of an essential matrix, with translations of length one: both rotations with `t`, then both with `−t`
-/// (Hartley & Zisserman, result 9.19).
+/// Decomposes an essential matrix into its four poses with translations of length one: both rotations with `t`, then
+/// both with `−t` (Hartley & Zisserman, result 9.19).
 ///
 /// # Errors
-/// [`EstimateError::Degenerate`] where E is zero or not finite.
+/// [`EstimateError::Degenerate`] if E is zero or not finite.
 pub fn decompose_essential(e: &Matrix3<f64>) -> Result<[Pose; 4], EstimateError> {
     let degenerate = EstimateError::Degenerate { kind: Degeneracy::Coincident };
     let svd = svd3(e).map_err(|_| degenerate)?;
@@ -36,15 +37,15 @@ pub fn decompose_essential(e: &Matrix3<f64>) -> Result<[Pose; 4], EstimateError>
         return Err(degenerate);
     }
     let w = Matrix3::new(0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0);
-    // U and V are proper rotations, so these are too.
-    let one = Rotation3::from_matrix_unchecked(svd.u * w * svd.v.transpose());
-    let two = Rotation3::from_matrix_unchecked(svd.u * w.transpose() * svd.v.transpose());
+    // U and V are proper rotations, so these are rotations.
+    let r1 = Rotation3::from_matrix_unchecked(svd.u * w * svd.v.transpose());
+    let r2 = Rotation3::from_matrix_unchecked(svd.u * w.transpose() * svd.v.transpose());
     let t: Vector3<f64> = svd.u.column(2).into_owned();
-    Ok([Pose::new(one, t), Pose::new(two, t), Pose::new(one, -t), Pose::new(two, -t)])
+    Ok([Pose::new(r1, t), Pose::new(r2, t), Pose::new(r1, -t), Pose::new(r2, -t)])
 }
 
-/// The two rotations and the unit translation (with either sign) of an exact essential matrix of any scale, in closed form (Horn,
-/// "Recovering baseline and orientation from essential matrix", 1990).
+/// Computes the two rotations and the unit translation (up to sign) of an exact essential matrix of any scale, in
+/// closed form (Horn, "Recovering baseline and orientation from essential matrix", 1990).
 #[inline]
 pub(crate) fn rotations_and_translation(e: &Matrix3<f64>) -> (Matrix3<f64>, Matrix3<f64>, Vector3<f64>) {
     let direction = second_epipole(e).normalize();
@@ -56,11 +57,11 @@ pub(crate) fn rotations_and_translation(e: &Matrix3<f64>) -> (Matrix3<f64>, Matr
         row(2).cross(&row(0)).transpose(),
         row(0).cross(&row(1)).transpose(),
     ]);
-    let across = t.cross_matrix() * e;
-    ((cofactors - across) / length2, (cofactors + across) / length2, direction)
+    let te = t.cross_matrix() * e;
+    ((cofactors - te) / length2, (cofactors + te) / length2, direction)
 }
 
-/// Whether a match in normalized coordinates triangulates in front of both cameras.
+/// Tests the cheirality constraint: whether the rays `a` and `b` of a match intersect in front of both cameras.
 #[inline]
 pub(crate) fn in_front(r: &Matrix3<f64>, t: &Vector3<f64>, a: &Vector3<f64>, b: &Vector3<f64>) -> bool {
     // λ₂ b = λ₁ R a + t, crossed with b and with R a.
@@ -69,7 +70,7 @@ pub(crate) fn in_front(r: &Matrix3<f64>, t: &Vector3<f64>, a: &Vector3<f64>, b: 
     n.dot(&b.cross(t)) < 0.0 && n.dot(&ra.cross(t)) < 0.0
 }
 
-/// The pose that puts most points in front of both cameras.
+/// The pose selected by the cheirality constraint.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct RecoveredPose {
@@ -77,12 +78,13 @@ pub struct RecoveredPose {
     pub pose: Pose,
     /// Indices of the matches in front of both cameras, ascending.
     pub in_front: Vec<usize>,
-    /// The number in front for the best of the other three poses. Close to `in_front`'s, the choice means little: the motion has
-    /// hardly any parallax.
+    /// Number of points in front for the second-best pose. If it is close to that of `in_front`, the choice is
+    /// unreliable, because of low parallax.
     pub runner_up: usize,
 }
 
-/// Chooses among the four poses of an essential matrix by cheirality. Matches in normalized coordinates.
+/// Selects the pose of an essential matrix with most points in front of both cameras (cheirality). Matches in
+/// normalized coordinates.
 ///
 /// # Errors
 /// [`EstimateError`]: no matches, or E is zero or not finite.
@@ -93,8 +95,8 @@ pub fn recover_pose(e: &Matrix3<f64>, matches: &[Correspondence]) -> Result<Reco
     let poses = decompose_essential(e)?;
     let front = poses.map(|pose| {
         let (r, t) = (pose.rotation.matrix(), &pose.translation);
-        let seen = |m: &Correspondence| in_front(r, t, &m.a.to_homogeneous(), &m.b.to_homogeneous());
-        (0..matches.len()).filter(|&i| seen(&matches[i])).collect::<Vec<_>>()
+        let is_in_front = |m: &Correspondence| in_front(r, t, &m.a.to_homogeneous(), &m.b.to_homogeneous());
+        (0..matches.len()).filter(|&i| is_in_front(&matches[i])).collect::<Vec<_>>()
     });
     let mut best = 0;
     for i in 1..4 {

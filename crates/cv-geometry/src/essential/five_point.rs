@@ -1,38 +1,38 @@
-//! Essential matrices through five points.
+//! The five-point algorithm.
 
 use crate::fundamental::epipolar_row;
-use crate::null_space_basis::{mix, orthonormalize};
+use crate::null_space_basis::{orthonormalize, reflect_generic};
 use cv_core::{Matrix3, Point2, Vector3};
 use cv_numeric::{null_space, real_roots};
 use fearless_simd::{Level, dispatch};
 
-/// A polynomial of degree one in x, y, z: coefficients of x, y, z, 1.
+/// Polynomial of degree one in x, y, z: coefficients of x, y, z, 1.
 type Linear = [f64; 4];
-/// Of degree two: x², xy, y², xz, yz, z², x, y, z, 1.
+/// Polynomial of degree two: x², xy, y², xz, yz, z², x, y, z, 1.
 type Quadratic = [f64; 10];
-/// Of degree three, in the order that the elimination needs: x³, y³, x²y, xy², x²z, x², y²z, y², xyz, xy, then xz², xz, x, yz², yz,
-/// y, z³, z², z, 1.
+/// Polynomial of degree three, in the monomial order of the elimination: x³, y³, x²y, xy², x²z, x², y²z, y², xyz, xy,
+/// then xz², xz, x, yz², yz, y, z³, z², z, 1.
 type Cubic = [f64; 20];
 
-/// Square of the relative residual of the constraints from which on a root has all its digits.
-const EXACT: f64 = 1e-26;
+/// Squared relative residual of the constraints below which a root is not refined.
+const REFINEMENT_TOLERANCE: f64 = 1e-26;
 
-/// Four vectors that span the null space of five equations.
+/// Basis of the four-dimensional null space of the five epipolar constraints.
 type Basis = [[f64; 9]; 4];
-/// What elimination leaves of six of the ten cubics.
+/// The last ten coefficients of six of the ten cubics after elimination.
 type Reduced = [[f64; 10]; 6];
 
-/// The essential matrices (at most ten) with `bᵢᵀ E aᵢ = 0` for five matches in normalized coordinates, each of
-/// Frobenius norm √2 (singular values 1, 1, 0).
+/// Computes the essential matrices (at most ten) with `bᵢᵀ E aᵢ = 0` for five matches in normalized coordinates, each
+/// of Frobenius norm √2 (singular values 1, 1, 0).
 ///
-/// Calls `found` for each; for none where the points are degenerate. Nistér, "An efficient solution to the five-point relative pose
-/// problem", 2004: null space, ten cubics, elimination, the real roots of a polynomial of degree ten.
+/// Calls `emit` for each; for none if the points are degenerate. Nistér, "An efficient solution to the five-point
+/// relative pose problem", 2004: null space, ten cubics, elimination, the real roots of a polynomial of degree ten.
 #[inline]
-pub fn essential_five_point(a: &[Point2<f64>; 5], b: &[Point2<f64>; 5], mut found: impl FnMut(Matrix3<f64>)) {
-    // No product is fused, so every instruction set gives the same bits.
+pub fn essential_five_point(a: &[Point2<f64>; 5], b: &[Point2<f64>; 5], mut emit: impl FnMut(Matrix3<f64>)) {
+    // No product is fused, so all instruction sets give identical results.
     let Some((basis, reduced)) = dispatch!(Level::new(), _simd => reduce(a, b)) else { return };
-    // Three equations in (x, y, 1) with polynomials of z for coefficients: pairs of rows of which the second, times z, takes
-    // the leading monomial away from the first.
+    // Three equations in (x, y, 1) whose coefficients are polynomials in z: in each pair of rows, z times the second
+    // cancels the leading monomial of the first.
     let mut x = [[0.0; 4]; 3];
     let mut y = [[0.0; 4]; 3];
     let mut one = [[0.0; 5]; 3];
@@ -42,7 +42,7 @@ pub fn essential_five_point(a: &[Point2<f64>; 5], b: &[Point2<f64>; 5], mut foun
         y[i] = [e[5], e[4] - f[5], e[3] - f[4], -f[3]];
         one[i] = [e[9], e[8] - f[9], e[7] - f[8], e[6] - f[7], -f[6]];
     }
-    // The determinant, by the third column.
+    // The determinant, expanded along the third column.
     let mut determinant = [0.0; 11];
     for (i, third) in one.iter().enumerate() {
         let (j, k) = ((i + 1) % 3, (i + 2) % 3);
@@ -62,60 +62,60 @@ pub fn essential_five_point(a: &[Point2<f64>; 5], b: &[Point2<f64>; 5], mut foun
         let at = |c: &[f64]| c.iter().rev().fold(0.0, |s, c| s * z + c);
         let row = |i: usize| Vector3::new(at(&x[i]), at(&y[i]), at(&one[i]));
         let r = [row(0), row(1), row(2)];
-        // (x, y, 1) is perpendicular to the rows: the longest of their cross products.
+        // (x, y, 1) is orthogonal to the rows: the longest of their cross products.
         let mut best = r[0].cross(&r[1]);
         for c in [r[1].cross(&r[2]), r[2].cross(&r[0])] {
             if c.norm_squared() > best.norm_squared() {
                 best = c;
             }
         }
-        let e = polished(&basis, Vector3::new(best.x / best.z, best.y / best.z, z));
+        let e = refine_root(&basis, Vector3::new(best.x / best.z, best.y / best.z, z));
         let norm = e.norm();
         if norm.is_finite() && norm > 0.0 {
-            found(e * (std::f64::consts::SQRT_2 / norm));
+            emit(e * (std::f64::consts::SQRT_2 / norm));
         }
     }
 }
 
-/// The matrix at (x, y, z), after Newton's steps on the constraints themselves where it obeys them to less than all digits: where two roots are close, elimination
-/// and the polynomial of degree ten leave five of them.
+/// Returns the essential matrix at (x, y, z), after up to two Gauss–Newton steps on the trace constraint: where two
+/// roots are close, elimination and the polynomial of degree ten have only about five correct digits.
 #[inline]
-fn polished(basis: &Basis, mut at: Vector3<f64>) -> Matrix3<f64> {
+fn refine_root(basis: &Basis, mut at: Vector3<f64>) -> Matrix3<f64> {
     let parts = basis.map(|b| Matrix3::from_row_slice(&b));
     let matrix = |p: &Vector3<f64>| parts[0] * p.x + parts[1] * p.y + parts[2] * p.z + parts[3];
     let mut e = matrix(&at);
     for _ in 0..2 {
-        // 2 E Eᵀ E − tr(E Eᵀ) E; a determinant of zero follows.
+        // The trace constraint 2 E Eᵀ E − tr(E Eᵀ) E = 0; it implies det E = 0.
         let gram = e * e.transpose();
         let trace = gram.trace();
         let residual = gram * e * 2.0 - e * trace;
-        if residual.norm_squared() <= EXACT * trace * trace * trace {
+        if residual.norm_squared() <= REFINEMENT_TOLERANCE * trace * trace * trace {
             break;
         }
         let inner = e.transpose() * e;
-        let change =
+        let derivative =
             |b: &Matrix3<f64>| (b * inner + e * b.transpose() * e + gram * b) * 2.0 - e * (2.0 * b.dot(&e)) - b * trace;
-        let changes = [change(&parts[0]), change(&parts[1]), change(&parts[2])];
-        let normal = Matrix3::from_fn(|i, j| changes[i].dot(&changes[j]));
-        let right = Vector3::from_fn(|i, _| changes[i].dot(&residual));
+        let jacobian = [derivative(&parts[0]), derivative(&parts[1]), derivative(&parts[2])];
+        let normal = Matrix3::from_fn(|i, j| jacobian[i].dot(&jacobian[j]));
+        let rhs = Vector3::from_fn(|i, _| jacobian[i].dot(&residual));
         let Some(inverse) = normal.try_inverse() else { break };
-        let next = at - inverse * right;
-        let moved = matrix(&next);
-        if !moved.norm_squared().is_finite() {
+        let next = at - inverse * rhs;
+        let next_e = matrix(&next);
+        if !next_e.norm_squared().is_finite() {
             break;
         }
-        (at, e) = (next, moved);
+        (at, e) = (next, next_e);
     }
     e
 }
 
-/// The null space of the five equations and, of the ten cubics in its coordinates, what elimination leaves of six.
+/// Computes the null space of the five epipolar constraints, and eliminates the ten cubics in its coordinates.
 #[inline(always)]
 fn reduce(a: &[Point2<f64>; 5], b: &[Point2<f64>; 5]) -> Option<(Basis, Reduced)> {
     let rows = std::array::from_fn(|i| epipolar_row(a[i], b[i]));
     let mut basis = null_space::<5, 9, 4>(rows)?;
     orthonormalize(&mut basis);
-    mix(&mut basis);
+    reflect_generic(&mut basis);
     let reduced = eliminate(constraints(&basis))?;
     Some((basis, reduced))
 }
@@ -169,12 +169,12 @@ fn add<const N: usize>(a: &mut [f64; N], b: &[f64; N]) {
     }
 }
 
-/// `(E Eᵀ − ½ tr(E Eᵀ)) E = 0` and `det E = 0` for `E = x e₀ + y e₁ + z e₂ + e₃`, as ten cubics.
+/// Expands `(E Eᵀ − ½ tr(E Eᵀ)) E = 0` and `det E = 0` for `E = x e₀ + y e₁ + z e₂ + e₃` to ten cubics.
 #[inline(always)]
 fn constraints(basis: &Basis) -> [Cubic; 10] {
     let entry = |i: usize, j: usize| -> Linear { std::array::from_fn(|k| basis[k][3 * i + j]) };
     let e: [[Linear; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|j| entry(i, j)));
-    // E Eᵀ by its upper triangle: 00, 01, 02, 11, 12, 22.
+    // The upper triangle of E Eᵀ: 00, 01, 02, 11, 12, 22.
     let dot = |i: usize, j: usize| {
         let mut sum = times(&e[i][0], &e[j][0]);
         add(&mut sum, &times(&e[i][1], &e[j][1]));
@@ -198,7 +198,7 @@ fn constraints(basis: &Basis) -> [Cubic; 10] {
             add(row, &times_linear(&gram[INDEX[i][2]], &e[2][j]));
         }
     }
-    // The determinant by the first row.
+    // The determinant, expanded along the first row.
     for j in 0..3 {
         let (k, l) = ((j + 1) % 3, (j + 2) % 3);
         let mut minor = times(&e[1][k], &e[2][l]);
@@ -211,7 +211,8 @@ fn constraints(basis: &Basis) -> [Cubic; 10] {
     rows
 }
 
-/// Gauss–Jordan elimination of the first ten columns; of the last six rows, the remaining ten columns. `None` where a pivot vanishes.
+/// Applies Gauss–Jordan elimination to the first ten columns, and returns the remaining ten columns of the last six
+/// rows. `None` if a pivot vanishes.
 #[inline(always)]
 fn eliminate(mut rows: [Cubic; 10]) -> Option<Reduced> {
     for c in 0..10 {
@@ -223,15 +224,14 @@ fn eliminate(mut rows: [Cubic; 10]) -> Option<Reduced> {
         }
         rows.swap(c, pivot);
         let lead = rows[c][c];
-        // Also where it is NaN.
         if lead.is_nan() || lead == 0.0 {
             return None;
         }
         let inverse = 1.0 / lead;
         let row = rows[c].map(|v| v * inverse);
         rows[c] = row;
-        // Rows above the fifth are not used: they only take part going down. Whole rows, of one length, suit vector units; what they do left
-        // of the pivot is not used either.
+        // The result does not use rows above the fifth, so they need no back-substitution. Whole rows are updated, also
+        // left of the pivot, because a fixed length vectorizes.
         for (r, other) in rows.iter_mut().enumerate() {
             if r > c || (r >= 4 && r < c) {
                 let factor = other[c];

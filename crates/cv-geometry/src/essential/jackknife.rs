@@ -1,4 +1,4 @@
-//! The block jackknife of a relative pose: how far it can be trusted.
+//! Uncertainty of a relative pose by the block jackknife, and a test whether two poses are distinguishable.
 
 use super::refine_relative_pose;
 use crate::epipolar::sampson;
@@ -7,24 +7,24 @@ use crate::ransac::{Scorer, TukeyBiweight};
 use cv_core::{Cancelled, Correspondence, Pose, Progress, Stage};
 use rayon::prelude::*;
 
-/// Parts of the first image that are left out in turn.
+/// Number of blocks of the first image that are left out in turn.
 const BLOCKS: usize = 8;
 
-/// Angles between two rotations and between two directions of translation, in radians.
+/// Computes the angle between two rotations and the angle between two directions of translation, in radians.
 pub fn pose_difference(a: &Pose, b: &Pose) -> [f64; 2] {
-    // The chord and the cross product, not arc cosines: those have no digits left at small angles.
+    // By the chord and the cross product: the arc cosine is inaccurate at small angles.
     let chord = (a.rotation.matrix() - b.rotation.matrix()).norm() / 8f64.sqrt();
     let direction = a.translation.cross(&b.translation).norm().atan2(a.translation.dot(&b.translation));
     [2.0 * chord.min(1.0).asin(), direction]
 }
 
-/// Standard deviations, in radians, of the rotation and of the direction of the translation of a refined pose, by leaving out one
-/// eighth of the first image at a time (the block jackknife: Künsch, "The jackknife and the bootstrap for general stationary
-/// observations", 1989).
+/// Estimates the standard deviations, in radians, of the rotation and of the direction of the translation of a refined
+/// pose by the block jackknife with eight blocks of the first image (Künsch, "The jackknife and the bootstrap for
+/// general stationary observations", 1989).
 ///
-/// A covariance from residuals supposes errors that know nothing of each other. Those of a lens that bends rays a little otherwise than
-/// its model says, of leaves in the wind, or of a repeated facade are alike all over a part of the image; where such a part moves
-/// the pose, this tells. `matches` in normalized coordinates, those that agree with `pose`; `threshold` as in [`refine_relative_pose`].
+/// A covariance from residuals assumes independent errors. Lens model errors, moving vegetation and repetitive
+/// structure have spatially correlated errors, which this includes. `matches` are the inliers of `pose` in normalized
+/// coordinates; `threshold` as in [`refine_relative_pose`].
 ///
 /// # Errors
 /// [`Cancelled`].
@@ -36,14 +36,14 @@ pub fn jackknife_pose_deviation(
 ) -> Result<[f64; 2], Cancelled> {
     let stage = Stage::new(progress, "stability", BLOCKS)?;
     let mut order: Vec<usize> = (0..matches.len()).collect();
-    split(&mut order, matches, BLOCKS);
+    partition_spatially(&mut order, matches, BLOCKS);
     let bounds: Vec<usize> = (0..=BLOCKS).map(|k| k * order.len() / BLOCKS).collect();
     let squares: Vec<[f64; 2]> = (0..BLOCKS)
         .into_par_iter()
         .map(|k| {
-            let kept = order[..bounds[k]].iter().chain(&order[bounds[k + 1]..]);
-            let rest: Vec<Correspondence> = kept.map(|&i| matches[i]).collect();
-            let (other, _) = refine_relative_pose(pose, &rest, threshold);
+            let remaining = order[..bounds[k]].iter().chain(&order[bounds[k + 1]..]);
+            let subset: Vec<Correspondence> = remaining.map(|&i| matches[i]).collect();
+            let (other, _) = refine_relative_pose(pose, &subset, threshold);
             stage.add(1)?;
             Ok(pose_difference(&other, pose).map(|d| d * d))
         })
@@ -52,8 +52,9 @@ pub fn jackknife_pose_deviation(
     Ok([0, 1].map(|i| (factor * squares.iter().map(|s| s[i]).sum::<f64>()).sqrt()))
 }
 
-/// Orders `order` so that `parts` (a power of two) equal stretches of it are compact in the first image: halves across the longer side.
-fn split(order: &mut [usize], matches: &[Correspondence], parts: usize) {
+/// Reorders `order` so that `parts` (a power of two) consecutive ranges of equal length are spatially compact in the
+/// first image: recursive bisection along the longer side.
+fn partition_spatially(order: &mut [usize], matches: &[Correspondence], parts: usize) {
     if parts < 2 || order.len() < 2 {
         return;
     }
@@ -63,17 +64,17 @@ fn split(order: &mut [usize], matches: &[Correspondence], parts: usize) {
         high - low
     };
     let axis = usize::from(extent(1) > extent(0));
-    // Ties by index, so that the order is the same everywhere.
+    // Ties by index, for a deterministic order.
     order.sort_unstable_by(|a, b| matches[*a].a[axis].total_cmp(&matches[*b].a[axis]).then(a.cmp(b)));
     let middle = order.len() / 2;
     let (left, right) = order.split_at_mut(middle);
-    split(left, matches, parts / 2);
-    split(right, matches, parts / 2);
+    partition_spatially(left, matches, parts / 2);
+    partition_spatially(right, matches, parts / 2);
 }
 
-/// Whether the matches (normalized) do not tell which of two poses is right: the difference of their losses is below twice its own
-/// standard deviation (Vuong, "Likelihood ratio tests for model selection and non-nested hypotheses", 1989).
-pub fn poses_are_rivals(a: &Pose, b: &Pose, matches: &[Correspondence], threshold: f64) -> bool {
+/// Tests whether the matches (normalized) cannot distinguish two poses: the difference of their losses is below two
+/// standard deviations of it (Vuong, "Likelihood ratio tests for model selection and non-nested hypotheses", 1989).
+pub fn poses_are_indistinguishable(a: &Pose, b: &Pose, matches: &[Correspondence], threshold: f64) -> bool {
     let (ea, eb) = (essential_from_pose(a), essential_from_pose(b));
     let loss = |e, m| {
         let r = sampson(e, m) / threshold;
@@ -93,34 +94,35 @@ mod tests {
     use cv_core::{Rotation3, Silent, Vector3};
 
     #[test]
-    fn the_blocks_tell_of_a_part_that_disagrees() {
+    fn a_locally_biased_region_increases_the_deviation() {
         let views = TwoViews::random(3);
         let mut matches = views.normalized_matches(400, 2e-4);
-        let fine =
+        let unbiased =
             jackknife_pose_deviation(&refine_relative_pose(&views.pose, &matches, 4e-3).0, &matches, 4e-3, &Silent)
                 .unwrap();
-        // A fifth of a pixel at 500 px on 400 points: hundredths of a degree for the rotation, tenths for the direction at most.
-        assert!(fine[0] < 2e-3 && fine[1] < 1e-2, "{fine:?}");
-        // The left of the image is displaced by one pixel, five times the noise: the lens is not what its model says.
+        // A noise of 0.1 px at 500 px on 400 points: hundredths of a degree for the rotation, at most tenths for the
+        // direction.
+        assert!(unbiased[0] < 2e-3 && unbiased[1] < 1e-2, "{unbiased:?}");
+        // The left of the image is displaced by one pixel, ten times the noise, as by a wrong lens model.
         for m in matches.iter_mut().filter(|m| m.a.x < -0.3) {
             m.b.y += 2e-3;
         }
-        let off =
+        let biased =
             jackknife_pose_deviation(&refine_relative_pose(&views.pose, &matches, 4e-3).0, &matches, 4e-3, &Silent)
                 .unwrap();
-        assert!(off[1] > 2.0 * fine[1], "{off:?} {fine:?}");
+        assert!(biased[1] > 2.0 * unbiased[1], "{biased:?} {unbiased:?}");
     }
 
     #[test]
-    fn only_a_worse_pose_is_no_rival() {
+    fn poses_with_a_significant_difference_of_loss_are_distinguishable() {
         let views = TwoViews::random(5);
         let matches = views.normalized_matches(100, 5e-4);
         let nearly =
             Pose::new(views.pose.rotation * Rotation3::new(Vector3::new(1e-6, 0.0, 0.0)), views.pose.translation);
         let other =
             Pose::new(views.pose.rotation * Rotation3::new(Vector3::new(0.1, 0.0, 0.0)), views.pose.translation);
-        assert!(poses_are_rivals(&views.pose, &nearly, &matches, 3e-3));
-        assert!(!poses_are_rivals(&views.pose, &other, &matches, 3e-3));
+        assert!(poses_are_indistinguishable(&views.pose, &nearly, &matches, 3e-3));
+        assert!(!poses_are_indistinguishable(&views.pose, &other, &matches, 3e-3));
         assert!((pose_difference(&views.pose, &other)[0] - 0.1).abs() < 1e-9);
     }
 }

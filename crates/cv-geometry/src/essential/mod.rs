@@ -1,4 +1,4 @@
-//! Essential matrices and relative poses of calibrated cameras.
+//! Estimation of essential matrices and relative poses of calibrated cameras.
 
 mod decompose;
 mod five_point;
@@ -9,11 +9,11 @@ pub use decompose::{
     RecoveredPose, decompose_essential, essential_from_fundamental, essential_from_pose, recover_pose,
 };
 pub use five_point::essential_five_point;
-pub use jackknife::{jackknife_pose_deviation, pose_difference, poses_are_rivals};
+pub use jackknife::{jackknife_pose_deviation, pose_difference, poses_are_indistinguishable};
 
 use crate::epipolar::{Epipolar, SampsonKernel, SampsonProblem, refine_sampson, sampson};
 use crate::error::{Degeneracy, EstimateError};
-use crate::match_blocks::{LANES, MatchBlock, NormalizedMatches, Normalizer, check, ray_degeneracy};
+use crate::match_blocks::{LANES, MatchBlock, NormalizedMatches, Normalizer, check_matches, ray_degeneracy};
 use crate::ransac::{Estimator, RobustOptions, Scorer, TukeyBiweight, ransac};
 use crate::robust::RobustModel;
 use crate::rotation::orthonormalized;
@@ -23,50 +23,53 @@ use cv_numeric::{LeastSquares, svd3};
 use decompose::rotations_and_translation;
 use nalgebra::{SMatrix, SVector};
 
-/// The relative pose of two calibrated cameras from matches in normalized coordinates, of which many may be wrong.
+/// Estimates the relative pose of two calibrated cameras robustly from tentative matches in normalized coordinates.
 ///
-/// RANSAC over five-point samples with local optimization of the pose on the Sampson error. The pose maps the first camera's
-/// coordinates to the second's; its translation has length one. `options.threshold` is in normalized units: pixels over the focal
-/// length. Inliers lie in front of both cameras; in the search, a point that noise alone may have put behind one counts as in front.
+/// RANSAC with the five-point algorithm and local optimization of the pose on the Sampson error. The pose maps the
+/// first camera's coordinates to the second's; its translation has length one. `options.threshold` is in normalized
+/// units: pixels divided by the focal length. Inliers satisfy the cheirality constraint; during the search, it is
+/// relaxed by the threshold.
 ///
-/// Five matches leave up to ten poses, so a sixth is needed to choose, and a plane leaves up to two (Longuet-Higgins, "The reconstruction of a plane
-/// surface from two perspective projections", 1986) of which the one that fits better is given. A camera that only turned leaves the
-/// direction open: see [`rotation_between`].
+/// Five matches have up to ten solutions, so a sixth is needed to disambiguate. A planar scene has up to two
+/// (Longuet-Higgins, "The reconstruction of a plane surface from two perspective projections", 1986); the one with the
+/// lower loss is returned. A pure rotation leaves the direction of the translation undetermined: see
+/// [`estimate_rotation`].
 ///
 /// # Errors
-/// [`EstimateError`]: fewer than six matches, a coordinate that is not finite, coincident or collinear points, or no model supported by more
-/// matches than the number of false alarms allows.
+/// [`EstimateError`]: fewer than six matches, a coordinate that is not finite, coincident or collinear points, or no
+/// model with a small enough number of false alarms.
 pub fn estimate_relative_pose(
     matches: &[Correspondence],
     options: &RobustOptions,
     progress: &dyn Progress,
 ) -> Result<RobustModel<Pose>, EstimateError> {
     options.check()?;
-    check(matches, 6)?;
+    check_matches(matches, 6)?;
     let set = NormalizedMatches::with(matches, Normalizer::IDENTITY, Normalizer::IDENTITY);
     let degenerate = |kind| EstimateError::Degenerate { kind };
-    // Rays that are in a plane up to their own noise say nothing about what is beside it.
+    // Rays that are coplanar within a third of the threshold, about their noise, are degenerate.
     let width = options.threshold / 3.0;
-    // Before the search, which would draw every sample it may and find none of use.
+    // Before RANSAC, which would draw the maximum number of samples in vain.
     if let Some(kind) = ray_degeneracy(set.pairs.iter(), 6, width) {
         return Err(degenerate(kind));
     }
-    let estimator = PoseEstimator { set, reach: options.threshold };
-    let found = ransac(&estimator, options, progress)?;
-    let pose = found.model;
+    let estimator = PoseEstimator { set, threshold: options.threshold };
+    let consensus = ransac(&estimator, options, progress)?;
+    let pose = consensus.model;
     let e = essential_from_pose(&pose);
     let residual = |_: &Pose, m: &Correspondence| {
-        let front = in_front(pose.rotation.matrix(), &pose.translation, &m.a.to_homogeneous(), &m.b.to_homogeneous());
-        if front { sampson(&e, m) } else { f64::INFINITY }
+        let is_in_front =
+            in_front(pose.rotation.matrix(), &pose.translation, &m.a.to_homogeneous(), &m.b.to_homogeneous());
+        if is_in_front { sampson(&e, m) } else { f64::INFINITY }
     };
-    let result = RobustModel::new(pose, matches, options.threshold, &found, residual);
+    let result = RobustModel::new(pose, matches, options.threshold, &consensus, residual);
     match ray_degeneracy(result.inliers.iter().map(|&i| &estimator.set.pairs[i]), 6, width) {
         Some(kind) => Err(degenerate(kind)),
         None => Ok(result),
     }
 }
 
-/// The essential matrix `[t]× R` (singular values 1, 1, 0) of [`estimate_relative_pose`].
+/// Estimates the essential matrix `[t]× R` (singular values 1, 1, 0) robustly, by [`estimate_relative_pose`].
 ///
 /// # Errors
 /// As [`estimate_relative_pose`].
@@ -75,35 +78,35 @@ pub fn estimate_essential(
     options: &RobustOptions,
     progress: &dyn Progress,
 ) -> Result<RobustModel<Matrix3<f64>>, EstimateError> {
-    let found = estimate_relative_pose(matches, options, progress)?;
-    Ok(found.map(|pose| essential_from_pose(&pose)))
+    let estimate = estimate_relative_pose(matches, options, progress)?;
+    Ok(estimate.map(|pose| essential_from_pose(&pose)))
 }
 
-/// Refines a relative pose on all `matches` (normalized) that are within reach of it, to the least robust Sampson error.
+/// Refines a relative pose by minimizing the robust Sampson error of `matches` (normalized).
 ///
-/// Returns the pose and its loss: each match adds 0 (exact) to 1 (beyond 2.5 thresholds). `threshold` in normalized units.
+/// Returns the pose and its loss, to which each match adds 0 (exact) to 1 (beyond 2.5 thresholds). `threshold` in
+/// normalized units.
 pub fn refine_relative_pose(pose: &Pose, matches: &[Correspondence], threshold: f64) -> (Pose, f64) {
     let pairs: Vec<[f64; 4]> = matches.iter().map(|m| [m.a.x, m.a.y, m.b.x, m.b.y]).collect();
     let problem = SampsonProblem::new(&pairs, &TukeyBiweight, threshold);
-    let refined = refine_sampson(&problem, *pose, 30).and_then(straightened).unwrap_or(*pose);
+    let refined = refine_sampson(&problem, *pose, 30).and_then(with_orthonormal_rotation).unwrap_or(*pose);
     (refined, problem.cost(&refined))
 }
 
-/// A pose with its rotation made one again after many small turns.
-fn straightened(pose: Pose) -> Option<Pose> {
+/// Re-orthonormalizes the rotation after many small updates.
+fn with_orthonormal_rotation(pose: Pose) -> Option<Pose> {
     Some(Pose::new(orthonormalized(&pose.rotation)?, pose.translation))
 }
 
-/// The rotation that best turns the rays of the first camera into those of the second (Kabsch 1976 on unit rays, reweighted
-/// five times so that single matches count little), and the share of matches that it maps to within `threshold`. All in normalized
-/// coordinates.
+/// Estimates the rotation that aligns the rays of the first camera with those of the second (Kabsch 1976 on unit rays,
+/// iteratively reweighted five times), and the inlier ratio within `threshold`. All in normalized coordinates.
 ///
-/// A share near one means that the camera only turned, or that everything is far away: no translation can be told.
+/// An inlier ratio near one means a pure rotation or a distant scene: the translation is undetermined.
 ///
 /// # Errors
 /// [`EstimateError`]: fewer than two matches, or a coordinate that is not finite.
-pub fn rotation_between(matches: &[Correspondence], threshold: f64) -> Result<(Rotation3<f64>, f64), EstimateError> {
-    check(matches, 2)?;
+pub fn estimate_rotation(matches: &[Correspondence], threshold: f64) -> Result<(Rotation3<f64>, f64), EstimateError> {
+    check_matches(matches, 2)?;
     let rays: Vec<_> =
         matches.iter().map(|m| (m.a.to_homogeneous().normalize(), m.b.to_homogeneous().normalize())).collect();
     let mut rotation = Rotation3::identity();
@@ -116,24 +119,24 @@ pub fn rotation_between(matches: &[Correspondence], threshold: f64) -> Result<(R
             *w = 1.0 / ((rotation * a - b).norm() / threshold).max(1.0);
         }
     }
-    let near = |m: &&Correspondence| {
+    let is_inlier = |m: &&Correspondence| {
         let q = rotation * m.a.to_homogeneous();
         q.z > 0.0 && (q.x / q.z - m.b.x).hypot(q.y / q.z - m.b.y) < threshold
     };
-    let share = matches.iter().filter(near).count() as f64 / matches.len() as f64;
-    Ok((rotation, share))
+    let inlier_ratio = matches.iter().filter(is_inlier).count() as f64 / matches.len() as f64;
+    Ok((rotation, inlier_ratio))
 }
 
-/// Matches in pixels as normalized coordinates of two cameras, and the factor from pixels to normalized units.
+/// Converts matches from pixels to normalized coordinates; returns them and the scale from pixels to normalized units.
 ///
-/// Points that a lens model does not reach become NaN: see [`Camera::normalize`].
+/// Points outside the valid range of a distortion model become NaN: see [`Camera::normalize`].
 pub fn normalize_matches(matches: &[Correspondence], a: &Camera, b: &Camera) -> (Vec<Correspondence>, f64) {
     let normalized = matches.iter().map(|m| Correspondence { a: a.normalize(m.a), b: b.normalize(m.b) }).collect();
-    // The mean over both images and directions.
+    // The mean of 1/f over both images and axes.
     (normalized, 0.25 * (1.0 / a.fx + 1.0 / a.fy + 1.0 / b.fx + 1.0 / b.fy))
 }
 
-/// Relative poses by their five degrees of freedom: a rotation on the right of R, and the direction of t.
+/// Relative poses with five degrees of freedom: a rotation vector applied on the right of R, and the direction of t.
 impl Epipolar<5> for Pose {
     fn matrix(&self) -> Matrix3<f64> {
         essential_from_pose(self)
@@ -163,29 +166,30 @@ impl Epipolar<5> for Pose {
 
 struct PoseEstimator {
     set: NormalizedMatches,
-    /// Threshold.
-    reach: f64,
+    /// In normalized units.
+    threshold: f64,
 }
 
-/// The essential matrix and the pose it is of.
+/// An essential matrix and its pose, in f32.
 struct PoseKernel {
     sampson: SampsonKernel,
     r: [f32; 9],
     t: [f32; 3],
-    reach2: f32,
+    squared_threshold: f32,
 }
 
 impl PoseKernel {
-    fn new(pose: &Pose, reach: f64) -> Self {
+    fn new(pose: &Pose, threshold: f64) -> Self {
         let r = pose.rotation.matrix();
         Self {
             sampson: SampsonKernel::new(&essential_from_pose(pose)),
             r: std::array::from_fn(|i| r[(i / 3, i % 3)] as f32),
             t: std::array::from_fn(|i| pose.translation[i] as f32),
-            reach2: (reach * reach) as f32,
+            squared_threshold: (threshold * threshold) as f32,
         }
     }
 
+    /// Computes squared Sampson distances; infinite where the match is behind a camera by more than the threshold.
     #[inline(always)]
     fn squared_residuals(&self, block: &MatchBlock) -> [f32; LANES] {
         let mut out = self.sampson.squared_residuals(block);
@@ -200,10 +204,12 @@ impl PoseKernel {
             let first = n[0] * bt[0] + n[1] * bt[1] + n[2] * bt[2];
             let second = n[0] * pt[0] + n[1] * pt[1] + n[2] * pt[2];
             let (lb, lp) = (u * u + v * v + 1.0, p[0] * p[0] + p[1] * p[1] + p[2] * p[2]);
-            let far = self.reach2 * lp;
-            let one = first * first.max(0.0) > far * (bt[0] * bt[0] + bt[1] * bt[1] + bt[2] * bt[2]);
-            let two = second * second.max(0.0) > self.reach2 * lb * (pt[0] * pt[0] + pt[1] * pt[1] + pt[2] * pt[2]);
-            *r2 = if one | two { f32::INFINITY } else { *r2 };
+            // Behind a camera: a positive product, relative to the lengths of its factors, beyond the threshold.
+            let behind_first =
+                first * first.max(0.0) > self.squared_threshold * lp * (bt[0] * bt[0] + bt[1] * bt[1] + bt[2] * bt[2]);
+            let behind_second = second * second.max(0.0)
+                > self.squared_threshold * lb * (pt[0] * pt[0] + pt[1] * pt[1] + pt[2] * pt[2]);
+            *r2 = if behind_first | behind_second { f32::INFINITY } else { *r2 };
         }
         out
     }
@@ -213,16 +219,15 @@ impl Estimator for PoseEstimator {
     type Model = Pose;
     type Data = NormalizedMatches;
     type Kernel = PoseKernel;
-    const SAMPLE: usize = 5;
+    const SAMPLE_SIZE: usize = 5;
     const RESIDUAL_DIMENSION: i32 = 1;
-    // From one and the same basin of the loss, the steps end in one place instead of several beside each other.
-    const RESAMPLES: usize = 20;
+    const INNER_SAMPLES: usize = 20;
 
     fn data(&self) -> &NormalizedMatches {
         &self.set
     }
 
-    fn unit(&self) -> f64 {
+    fn threshold_scale(&self) -> f64 {
         1.0
     }
 
@@ -232,10 +237,11 @@ impl Estimator for PoseEstimator {
         let b: [Point2<f64>; 5] = std::array::from_fn(|i| Point2::new(pair(i)[2], pair(i)[3]));
         let (ha, hb) = (a.map(|p| p.to_homogeneous()), b.map(|p| p.to_homogeneous()));
         essential_five_point(&a, &b, |e| {
-            let (one, two, t) = rotations_and_translation(&e);
-            for r in [one, two] {
+            let (r1, r2, t) = rotations_and_translation(&e);
+            for r in [r1, r2] {
                 for t in [t, -t] {
-                    // All five points in front of both cameras: at most one of the four poses, and for most wrong samples none.
+                    // Cheirality: at most one of the four poses has all five points in front, and for most samples with
+                    // outliers none.
                     if (0..5).all(|i| in_front(&r, &t, &ha[i], &hb[i])) {
                         models.push(Pose::new(Rotation3::from_matrix_unchecked(r), t));
                         return;
@@ -246,7 +252,7 @@ impl Estimator for PoseEstimator {
     }
 
     fn kernel(&self, model: &Pose) -> PoseKernel {
-        PoseKernel::new(model, self.reach)
+        PoseKernel::new(model, self.threshold)
     }
 
     #[inline(always)]
@@ -256,7 +262,7 @@ impl Estimator for PoseEstimator {
 
     fn refine<C: Scorer>(&self, model: &Pose, scorer: &C, threshold: f64, iterations: usize) -> Option<Pose> {
         let problem = SampsonProblem::new(&self.set.pairs, scorer, threshold);
-        refine_sampson(&problem, *model, iterations).and_then(straightened)
+        refine_sampson(&problem, *model, iterations).and_then(with_orthonormal_rotation)
     }
 }
 
@@ -267,13 +273,13 @@ mod tests {
     use cv_core::Silent;
     use proptest::prelude::*;
 
-    fn turn_between(a: &Rotation3<f64>, b: &Rotation3<f64>) -> f64 {
+    fn rotation_angle_between(a: &Rotation3<f64>, b: &Rotation3<f64>) -> f64 {
         Pose::new(a.inverse() * b, Vector3::zeros()).rotation_angle()
     }
 
     proptest! {
         #[test]
-        fn both_decompositions_give_the_pose_back(seed: u64) {
+        fn both_decompositions_recover_the_pose(seed: u64) {
             let views = TwoViews::random(seed);
             let (e, pose) = (views.essential() * -3.0, views.pose);
             let poses = decompose_essential(&e).unwrap();
@@ -283,18 +289,18 @@ mod tests {
                 prop_assert!((p.rotation.matrix().determinant() - 1.0).abs() < 1e-12);
                 prop_assert!(cosine(&essential_from_pose(&p), &e) > 1.0 - 1e-12);
             }
-            let (one, two, t) = rotations_and_translation(&e);
-            prop_assert!([one, two].iter().any(|r| near(r, &t) || near(r, &-t)));
+            let (r1, r2, t) = rotations_and_translation(&e);
+            prop_assert!([r1, r2].iter().any(|r| near(r, &t) || near(r, &-t)));
             let m = views.normalized_matches(20, 0.0);
             let recovered = recover_pose(&e, &m).unwrap();
             prop_assert!(near(recovered.pose.rotation.matrix(), &recovered.pose.translation));
             prop_assert_eq!(recovered.in_front.len(), 20);
-            // The camera's own plane may cut the points of a twisted pair, never leave most in front.
+            // The twisted pair has some points behind a camera.
             prop_assert!(recovered.runner_up < 20);
         }
 
         #[test]
-        fn essential_from_exact_fundamental_has_the_right_entries(seed: u64) {
+        fn essential_from_fundamental_is_exact(seed: u64) {
             let views = TwoViews::random(seed);
             let e = essential_from_fundamental(&views.fundamental(), &views.camera, &views.camera).unwrap();
             prop_assert!(cosine(&e, &views.essential()) > 1.0 - 1e-10);
@@ -303,7 +309,7 @@ mod tests {
         }
 
         #[test]
-        fn the_tangent_is_the_derivative(seed: u64) {
+        fn the_analytic_tangent_equals_the_numeric_derivative(seed: u64) {
             let pose = TwoViews::random(seed).pose;
             let tangent = Epipolar::<5>::tangent(&pose);
             for i in 0..5 {
@@ -319,12 +325,12 @@ mod tests {
     }
 
     #[test]
-    fn vector_residuals_are_the_plain_ones_and_infinite_behind_a_camera() {
+    fn simd_residuals_equal_the_scalar_ones_and_are_infinite_behind_a_camera() {
         let (mut behind, mut front) = (0, 0);
         for seed in 0..40 {
             let views = TwoViews::random(seed);
             let mut m = views.matches(30, 1.0);
-            m.extend(views.wrong(30));
+            m.extend(views.outliers(30));
             let (m, unit) = normalize_matches(&m, &views.camera, &views.camera);
             let set = NormalizedMatches::with(&m, Normalizer::IDENTITY, Normalizer::IDENTITY);
             let (r, t) = (views.pose.rotation.matrix(), &views.pose.translation);
@@ -343,16 +349,17 @@ mod tests {
                 }
             }
         }
-        // Noise of one pixel does not take a right match behind a camera by two; of the wrong ones two in three are behind one or the other.
+        // A noise of one pixel does not move an inlier behind a camera by a threshold of two; about two in three
+        // outliers are behind a camera.
         assert!(front > 40 * 30 && behind > 40 * 10, "{front} {behind}");
     }
 
     #[test]
-    fn the_same_pose_on_any_number_of_threads() {
-        // Few are right, so that the batches grow to those that are spread over threads.
+    fn the_result_does_not_depend_on_the_number_of_threads() {
+        // A high outlier ratio, so that the batches reach the size that is evaluated in parallel.
         let views = TwoViews::random(7);
         let mut m = views.matches(40, 0.5);
-        m.extend(views.wrong(110));
+        m.extend(views.outliers(110));
         let (m, unit) = normalize_matches(&m, &views.camera, &views.camera);
         let run = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -366,7 +373,7 @@ mod tests {
     }
 
     #[test]
-    fn one_of_the_five_point_solutions_is_the_truth_and_all_are_essential() {
+    fn one_of_the_five_point_solutions_is_the_truth_and_all_satisfy_the_constraints() {
         for seed in 0..1000 {
             let views = TwoViews::random(seed);
             let m = views.normalized_matches(5, 0.0);
@@ -382,79 +389,82 @@ mod tests {
                 }
             });
             assert!(count <= 10);
-            // The sine of the angle is the root of twice that: 1e-6, where roundings of 1e-16 meet two roots that are apart by 1e-10.
+            // The sine of the angle is √(2 · 1e-12) = 1.4e-6: the effect of roundings of 1e-16 on two roots with a
+            // distance of 1e-10.
             assert!(1.0 - best < 1e-12, "{seed}: {:e}", 1.0 - best);
         }
     }
 
     #[test]
-    fn wrong_matches_do_not_matter() {
+    fn the_pose_is_accurate_with_half_outliers() {
         let mut errors = Vec::new();
         for seed in 0..40 {
             let views = TwoViews::random(seed);
             let mut m = views.matches(150, 0.5);
-            m.extend(views.wrong(150));
+            m.extend(views.outliers(150));
             let (normalized, unit) = normalize_matches(&m, &views.camera, &views.camera);
             let options = RobustOptions { threshold: 1.5 * unit, seed, ..RobustOptions::default() };
             let found = estimate_relative_pose(&normalized, &options, &Silent).unwrap();
             errors.push(pose_difference(&found.model, &views.pose).map(f64::to_degrees));
-            let right = found.inliers.iter().filter(|i| **i < 150).count();
-            // 1.5 px is three standard deviations; a wrong match is that close to a line with a chance of about 3 in 480.
-            assert!(right >= 140 && found.inliers.len() - right <= 15);
+            let true_positives = found.inliers.iter().filter(|i| **i < 150).count();
+            // 1.5 px is three standard deviations; an outlier is that close to an epipolar line with a probability of
+            // about 3/480.
+            assert!(true_positives >= 140 && found.inliers.len() - true_positives <= 15);
         }
         errors.sort_by(|a, b| (a[0] + a[1]).total_cmp(&(b[0] + b[1])));
-        // Half a pixel at 500 px of focal length is 0.06 degrees for one ray; 150 of them fix rotation and direction to a few
-        // hundredths and tenths; the worst of forty has its points and its motion in the least favorable place.
+        // Half a pixel at a focal length of 500 px is 0.06 degrees for one ray; 150 of them determine the rotation to a
+        // few hundredths and the direction to a few tenths of a degree. The worst of forty has the least favorable
+        // motion and points.
         assert!(errors[20][0] < 0.3 && errors[20][1] < 1.0 && errors[39][1] < 5.0, "{errors:?}");
     }
 
     #[test]
-    fn a_small_base_line_keeps_its_direction() {
+    fn a_short_baseline_keeps_its_direction() {
         let mut errors = Vec::new();
         for seed in 0..40 {
             let mut views = TwoViews::random(seed);
             views.pose.translation *= 0.1;
             let mut m = views.matches(150, 0.2);
-            m.extend(views.wrong(100));
+            m.extend(views.outliers(100));
             let (normalized, unit) = normalize_matches(&m, &views.camera, &views.camera);
             let options = RobustOptions { threshold: 1.5 * unit, seed, ..RobustOptions::essential() };
             let found = estimate_relative_pose(&normalized, &options, &Silent).unwrap();
             errors.push(pose_difference(&found.model, &views.pose)[1].to_degrees());
         }
         errors.sort_by(f64::total_cmp);
-        // Ten times the uncertainty of a base line of one unit, a few tenths of a degree per pixel of noise; and never the other way round, which
-        // fits as well where the sides of the cameras are not looked at.
+        // Ten times the uncertainty of a baseline of one unit (a few tenths of a degree per pixel of noise); and never
+        // the opposite direction, which only cheirality excludes.
         assert!(errors[20] < 2.0 && errors[39] < 45.0, "{errors:?}");
     }
 
     #[test]
-    fn a_turn_is_told_from_a_move() {
+    fn a_pure_rotation_is_distinguished_from_a_translation() {
         let views = TwoViews::random(4);
-        let turn = Rotation3::new(Vector3::new(0.1, -0.2, 0.05));
-        let mut turned = views.normalized_matches(60, 0.0);
-        for m in &mut turned {
-            m.b = Point2::from_homogeneous(turn * m.a.to_homogeneous()).unwrap();
+        let truth = Rotation3::new(Vector3::new(0.1, -0.2, 0.05));
+        let mut rotated = views.normalized_matches(60, 0.0);
+        for m in &mut rotated {
+            m.b = Point2::from_homogeneous(truth * m.a.to_homogeneous()).unwrap();
         }
-        turned[3].b.x += 0.3;
-        let (rotation, share) = rotation_between(&turned, 1e-3).unwrap();
-        // One wrong match of sixty keeps a weight of a three-hundredth.
-        assert!(turn_between(&rotation, &turn) < 1e-4 && share == 59.0 / 60.0);
-        assert!(rotation_between(&views.normalized_matches(60, 0.0), 1e-3).unwrap().1 < 0.5);
-        assert!(rotation_between(&turned[..1], 1e-3).is_err());
+        rotated[3].b.x += 0.3;
+        let (rotation, inlier_ratio) = estimate_rotation(&rotated, 1e-3).unwrap();
+        // The one outlier of sixty has a weight of 1/300.
+        assert!(rotation_angle_between(&rotation, &truth) < 1e-4 && inlier_ratio == 59.0 / 60.0);
+        assert!(estimate_rotation(&views.normalized_matches(60, 0.0), 1e-3).unwrap().1 < 0.5);
+        assert!(estimate_rotation(&rotated[..1], 1e-3).is_err());
     }
 
     #[test]
-    fn refinement_finds_the_exact_pose() {
+    fn refinement_converges_to_the_exact_pose() {
         let views = TwoViews::random(2);
         let m = views.normalized_matches(60, 0.0);
         let start = Epipolar::step(&views.pose, &SVector::<f64, 5>::from([2e-3, -1e-3, 1e-3, 3e-3, 2e-3]));
         let (pose, loss) = refine_relative_pose(&start, &m, 4e-3);
-        // An exact zero exists; Gauss and Newton's steps stop when the cost falls by less than a millionth.
+        // The minimum is zero; the iterations stop when the relative decrease of the cost is below 1e-6.
         assert!(loss < 1e-6 && (pose.translation - views.pose.translation).norm() < 1e-4, "{loss}");
     }
 
     #[test]
-    fn bad_input_gets_a_typed_answer() {
+    fn invalid_and_degenerate_input_is_a_typed_error() {
         let views = TwoViews::random(1);
         let options = RobustOptions { threshold: 1e-3, ..RobustOptions::default() };
         let good = views.normalized_matches(20, 0.0);

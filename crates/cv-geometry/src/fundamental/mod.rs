@@ -1,4 +1,4 @@
-//! Fundamental matrices.
+//! Estimation of the fundamental matrix.
 
 mod degensac;
 mod eight_point;
@@ -18,14 +18,15 @@ use crate::robust::RobustModel;
 use cv_core::{Correspondence, Matrix3, Point2, Progress};
 use rank_two::RankTwo;
 
-/// The fundamental matrix between two images of a rigid scene, from matches of which many may be wrong.
+/// Estimates the fundamental matrix between two images of a rigid scene robustly from tentative matches.
 ///
-/// RANSAC over seven-point samples with local optimization on the Sampson error, and with recovery from samples that lie on one
-/// plane (DEGENSAC, Chum, Werner & Matas 2005). `bᵀ F a = 0`; Frobenius norm 1, the largest entry positive.
+/// RANSAC with the seven-point algorithm, local optimization on the Sampson error, and recovery from H-degenerate
+/// samples (DEGENSAC, Chum, Werner & Matas 2005). `bᵀ F a = 0`; Frobenius norm 1, the entry of largest magnitude
+/// positive.
 ///
 /// # Errors
-/// [`EstimateError`]: fewer than eight matches, a coordinate that is not finite, coincident or collinear points, points on one plane, or no model supported by more
-/// matches than the number of false alarms allows.
+/// [`EstimateError`]: fewer than eight matches, a coordinate that is not finite, coincident, collinear or coplanar
+/// points, or no model with a small enough number of false alarms.
 pub fn estimate_fundamental(
     matches: &[Correspondence],
     options: &RobustOptions,
@@ -34,39 +35,47 @@ pub fn estimate_fundamental(
     options.check()?;
     let set = NormalizedMatches::new(matches, 8)?;
     let degenerate = |kind| EstimateError::Degenerate { kind };
-    // All before the search, which would draw every sample it may and find none of use.
+    // Degenerate input is rejected before RANSAC, which would draw the maximum number of samples in vain.
     let width = options.threshold / 3.0 * set.first.scale;
     if let Some(kind) = point_degeneracy(set.pairs.iter(), 8, width) {
         return Err(degenerate(kind));
     }
     let all: Vec<usize> = (0..matches.len()).collect();
-    if on_one_plane(matches, &all, options.threshold) {
+    if is_planar(matches, &all, options.threshold) {
         return Err(degenerate(Degeneracy::Planar));
     }
     let estimator = FundamentalEstimator { set };
-    let found = ransac(&estimator, options, progress)?;
+    let consensus = ransac(&estimator, options, progress)?;
     let set = &estimator.set;
-    let f = eight_point::unit(&(set.second.matrix().transpose() * found.model * set.first.matrix()));
-    let result = RobustModel::new(f, matches, options.threshold, &found, sampson);
+    let f = eight_point::normalize_scale_and_sign(
+        &(set.second.matrix().transpose() * consensus.model * set.first.matrix()),
+    );
+    let result = RobustModel::new(f, matches, options.threshold, &consensus, sampson);
     match point_degeneracy(result.inliers.iter().map(|&i| &set.pairs[i]), 8, width) {
         Some(kind) => Err(degenerate(kind)),
-        None if on_one_plane(matches, &result.inliers, options.threshold) => Err(degenerate(Degeneracy::Planar)),
+        None if is_planar(matches, &result.inliers, options.threshold) => Err(degenerate(Degeneracy::Planar)),
         None => Ok(result),
     }
 }
 
-/// Whether a homography explains all inliers but two, which fix no more than the epipole: then any epipole would do.
-fn on_one_plane(matches: &[Correspondence], inliers: &[usize], threshold: f64) -> bool {
-    let mut on: Vec<Correspondence> = inliers.iter().map(|&i| matches[i]).collect();
-    // Least squares, again without those that it does not explain: the distance has two dimensions where the epipolar one has one. A scene with depth leaves most of them far off at once.
-    for reach in [12.0, 3.0, 1.5] {
-        let Ok(h) = homography_from_points(&on) else { return false };
-        on = inliers.iter().map(|&i| matches[i]).filter(|m| homography_residual(&h, m) < reach * threshold).collect();
-        if 2 * on.len() < inliers.len() {
+/// Returns whether a homography fits all inliers but at most two. Two off-plane points always determine an epipole, so
+/// they are no evidence for it.
+fn is_planar(matches: &[Correspondence], inliers: &[usize], threshold: f64) -> bool {
+    let mut on_plane: Vec<Correspondence> = inliers.iter().map(|&i| matches[i]).collect();
+    // Least squares with a decreasing threshold, in multiples of the epipolar one (the residual is two-dimensional, the
+    // epipolar distance one-dimensional). General scenes have most residuals above the first.
+    for threshold_ratio in [12.0, 3.0, 1.5] {
+        let Ok(h) = homography_from_points(&on_plane) else { return false };
+        on_plane = inliers
+            .iter()
+            .map(|&i| matches[i])
+            .filter(|m| homography_residual(&h, m) < threshold_ratio * threshold)
+            .collect();
+        if 2 * on_plane.len() < inliers.len() {
             return false;
         }
     }
-    inliers.len() - on.len() <= 2
+    inliers.len() - on_plane.len() <= 2
 }
 
 struct FundamentalEstimator {
@@ -77,15 +86,15 @@ impl Estimator for FundamentalEstimator {
     type Model = Matrix3<f64>;
     type Data = NormalizedMatches;
     type Kernel = SampsonKernel;
-    const SAMPLE: usize = 7;
+    const SAMPLE_SIZE: usize = 7;
     const RESIDUAL_DIMENSION: i32 = 1;
-    const RESAMPLES: usize = 20;
+    const INNER_SAMPLES: usize = 20;
 
     fn data(&self) -> &NormalizedMatches {
         &self.set
     }
 
-    fn unit(&self) -> f64 {
+    fn threshold_scale(&self) -> f64 {
         self.set.first.scale
     }
 
@@ -94,12 +103,12 @@ impl Estimator for FundamentalEstimator {
         let a: [Point2<f64>; 7] = std::array::from_fn(|i| Point2::new(pair(i)[0], pair(i)[1]));
         let b: [Point2<f64>; 7] = std::array::from_fn(|i| Point2::new(pair(i)[2], pair(i)[3]));
         fundamental_seven_point(&a, &b, |f| {
-            // The two rays of a point that both cameras see lie on the same side of the base line (Chum, Werner & Matas,
-            // "Epipolar geometry estimation via RANSAC benefits from the oriented epipolar constraint", 2004).
+            // The oriented epipolar constraint (Chum, Werner & Matas, "Epipolar geometry estimation via RANSAC benefits
+            // from the oriented epipolar constraint", 2004).
             let e = second_epipole(&f);
-            let side = |i: usize| (f * a[i].to_homogeneous()).dot(&e.cross(&b[i].to_homogeneous())) > 0.0;
-            let first = side(0);
-            if (1..7).all(|i| side(i) == first) {
+            let orientation = |i: usize| (f * a[i].to_homogeneous()).dot(&e.cross(&b[i].to_homogeneous())) > 0.0;
+            let first = orientation(0);
+            if (1..7).all(|i| orientation(i) == first) {
                 models.push(f);
             }
         });
@@ -145,11 +154,11 @@ mod tests {
 
     proptest! {
         #[test]
-        fn eight_exact_points_give_every_entry(seed: u64, n in 8usize..30) {
+        fn eight_point_algorithm_recovers_every_entry_from_exact_points(seed: u64, n in 8usize..30) {
             let views = TwoViews::random(seed);
             let f = fundamental_eight_point(&views.matches(n, 0.0)).unwrap();
-            let truth = eight_point::unit(&views.fundamental());
-            // Random points are now and then nearly degenerate, which costs digits; entries are of order 1e-6 to 1.
+            let truth = eight_point::normalize_scale_and_sign(&views.fundamental());
+            // Some random configurations are nearly degenerate and lose digits; entries are of order 1e-6 to 1.
             prop_assert!(1.0 - cosine(&f, &truth) < 1e-9, "{f} {truth}");
             prop_assert!((f.norm() - 1.0).abs() < 1e-12 && f.determinant().abs() < 1e-12);
             prop_assert!((f - truth).norm() < 1e-4);
@@ -166,7 +175,7 @@ mod tests {
                 count += 1;
                 best = best.max(cosine(&f, &views.essential()));
                 assert!((f.norm() - 1.0).abs() < 1e-12);
-                // All three hold what they promise.
+                // All solutions satisfy the constraints.
                 for m in &m {
                     assert!(m.b.to_homogeneous().dot(&(f * m.a.to_homogeneous())).abs() < 1e-8);
                 }
@@ -177,7 +186,7 @@ mod tests {
         }
 
         #[test]
-        fn the_gradient_is_that_of_the_cost(seed: u64) {
+        fn the_analytic_gradient_equals_the_numeric_one(seed: u64) {
             let views = TwoViews::random(seed);
             let pairs: Vec<[f64; 4]> = views.normalized_matches(15, 1e-3).iter().map(|m| [m.a.x, m.a.y, m.b.x, m.b.y]).collect();
             let problem = SampsonProblem::new(&pairs, &LeastSquaresLoss, 1.0);
@@ -198,7 +207,7 @@ mod tests {
         }
 
         #[test]
-        fn vector_residuals_are_the_plain_ones(seed: u64) {
+        fn simd_residuals_equal_the_scalar_ones(seed: u64) {
             let views = TwoViews::random(seed);
             let m = views.matches(40, 1.0);
             let set = NormalizedMatches::new(&m, 8).unwrap();
@@ -209,56 +218,62 @@ mod tests {
             fast.sort_by(f32::total_cmp);
             plain.sort_by(f64::total_cmp);
             for (f, p) in fast.iter().zip(plain) {
-                // Coordinates of order one in f32; the lines' normals may be a hundred times shorter than F.
+                // Coordinates of order one in f32; the normals of the epipolar lines may be a hundred times shorter
+                // than F.
                 prop_assert!((f64::from(*f).sqrt() - p).abs() < 1e-4, "{f} {p}");
             }
         }
     }
 
     #[test]
-    fn wrong_matches_do_not_matter() {
+    fn accuracy_with_outliers_is_close_to_least_squares_on_inliers() {
         let mut errors = Vec::new();
         let mut linear = Vec::new();
         for seed in 0..40 {
             let views = TwoViews::random(seed);
             let mut m = views.matches(150, 0.3);
-            m.extend(views.wrong(100));
+            m.extend(views.outliers(100));
             let found =
                 estimate_fundamental(&m, &RobustOptions { seed, ..RobustOptions::fundamental() }, &Silent).unwrap();
-            // The judge is exact points that were not used.
+            // The error on exact points that were not used in the estimation.
             errors.push(views.exact_rms(&found.model));
             linear.push(views.exact_rms(&fundamental_eight_point(&m[..150]).unwrap()));
-            let right = found.inliers.iter().filter(|i| **i < 150).count();
-            // 1 px is 3.3 standard deviations; a wrong match is that close to a line with a chance of about 2 in 480.
-            assert!(right >= 140 && found.inliers.len() - right <= 12, "{right} {}", found.inliers.len());
+            let true_positives = found.inliers.iter().filter(|i| **i < 150).count();
+            // 1 px is 3.3 standard deviations; an outlier is that close to an epipolar line with a probability of about
+            // 2/480.
+            assert!(
+                true_positives >= 140 && found.inliers.len() - true_positives <= 12,
+                "{true_positives} {}",
+                found.inliers.len()
+            );
         }
         errors.sort_by(f64::total_cmp);
         linear.sort_by(f64::total_cmp);
-        // Nearly as good as the linear method that is told which matches are right; never worse than the threshold.
+        // Nearly as accurate as the linear method on the true inliers; never worse than the threshold.
         assert!(errors[20] < 1.5 * linear[20] && errors[39] < 1.0, "{errors:?} {linear:?}");
     }
 
     #[test]
-    fn a_dominant_plane_does_not_win() {
+    fn a_dominant_plane_is_not_degenerate() {
         let mut errors = Vec::new();
         for seed in 0..20 {
             let views = TwoViews::random(seed);
-            // Nine in ten of the right matches on one plane.
+            // Nine in ten inliers are on one plane.
             let mut m = views.planar_matches(180, 0.3);
             m.extend(views.matches(20, 0.3));
-            m.extend(views.wrong(40));
+            m.extend(views.outliers(40));
             let found =
                 estimate_fundamental(&m, &RobustOptions { seed, ..RobustOptions::fundamental() }, &Silent).unwrap();
             errors.push(views.exact_rms(&found.model));
         }
         errors.sort_by(f64::total_cmp);
-        // Twenty points of 0.3 px fix what the plane leaves open, two degrees of freedom, to 0.3 px · √(2/20) = 0.1 px where they are spread; a degenerate answer is
-        // off by tens of pixels, and one within the threshold of every exact point is none.
+        // Twenty points with a noise of 0.3 px determine the two degrees of freedom that the plane leaves, to 0.3 px ·
+        // √(2/20) = 0.1 px where they are spread; a degenerate solution is off by tens of pixels.
         assert!(errors[10] < 0.2 && errors[19] < 1.0, "{errors:?}");
     }
 
     #[test]
-    fn a_scene_that_is_all_plane_is_named() {
+    fn a_planar_scene_is_reported_as_degenerate() {
         for seed in 0..10 {
             let views = TwoViews::random(seed);
             let m = views.planar_matches(100, 0.1);
@@ -272,15 +287,15 @@ mod tests {
     }
 
     #[test]
-    fn sampson_is_the_distance_for_a_sideways_pair() {
-        // Rectified: bᵀ F a = a.y − b.y; half of the difference moves each point: |Δy|/√2 in all.
+    fn sampson_distance_of_a_rectified_pair() {
+        // bᵀ F a = a.y − b.y; the correction moves each point by half of the difference: |Δy|/√2 in total.
         let f = Matrix3::new(0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0);
         let d = sampson(&f, &Correspondence::new(10.0, 7.0, 3.0, 10.0));
         assert!((d - 3.0 / 2f64.sqrt()).abs() < 1e-12);
     }
 
     #[test]
-    fn bad_input_gets_a_typed_answer() {
+    fn invalid_and_degenerate_input_is_a_typed_error() {
         let views = TwoViews::random(1);
         let get = |m: &[Correspondence]| {
             estimate_fundamental(m, &RobustOptions::fundamental(), &Silent).map(|r| r.inliers.len())

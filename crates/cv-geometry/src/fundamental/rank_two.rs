@@ -1,12 +1,12 @@
-//! Matrices of rank two, with their seven degrees of freedom.
+//! Minimal parameterization of fundamental matrices: rank two, seven degrees of freedom.
 
 use crate::epipolar::Epipolar;
 use cv_core::{Matrix3, Rotation3, Vector3};
 use cv_numeric::svd3;
 use nalgebra::{SMatrix, SVector};
 
-/// `F = U diag(1, s, 0) Vᵀ`: seven degrees of freedom, all of rank two (Bartoli & Sturm, "Nonlinear estimation of the
-/// fundamental matrix with minimal parameters", 2004).
+/// `F = U diag(1, s, 0) Vᵀ` with rotations U and V: seven degrees of freedom (Bartoli & Sturm, "Nonlinear estimation of
+/// the fundamental matrix with minimal parameters", 2004).
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct RankTwo {
     u: Matrix3<f64>,
@@ -26,7 +26,7 @@ impl Epipolar<7> for RankTwo {
         self.u.column(0) * self.v.column(0).transpose() + self.u.column(1) * self.v.column(1).transpose() * self.s
     }
 
-    /// By the two rotations (applied on the right of U and V) and `s`.
+    /// The derivatives by the two rotation vectors (applied on the right of U and V) and `s`.
     fn tangent(&self) -> SMatrix<f64, 9, 7> {
         let (u, v, s) = (&self.u, &self.v, self.s);
         let flat = |m: Matrix3<f64>| SVector::<f64, 9>::from_fn(|i, _| m[(i / 3, i % 3)]);
@@ -44,7 +44,7 @@ impl Epipolar<7> for RankTwo {
     }
 
     fn step(&self, d: &SVector<f64, 7>) -> Self {
-        let turn = |i: usize| Rotation3::new(Vector3::new(d[i], d[i + 1], d[i + 2])).into_inner();
-        Self { u: self.u * turn(0), v: self.v * turn(3), s: self.s + d[6] }
+        let rotation = |i: usize| Rotation3::new(Vector3::new(d[i], d[i + 1], d[i + 2])).into_inner();
+        Self { u: self.u * rotation(0), v: self.v * rotation(3), s: self.s + d[6] }
     }
 }

@@ -1,19 +1,20 @@
-//! Fundamental matrices through seven points.
+//! The seven-point algorithm.
 
-use crate::null_space_basis::mix;
+use crate::null_space_basis::reflect_generic;
 use cv_core::{Matrix3, Point2};
 use cv_numeric::{null_space, real_roots_cubic};
 
-/// The one to three fundamental matrices with `bᵢᵀ F aᵢ = 0` for seven matches, each of Frobenius norm 1 and rank 2
-/// (Hartley & Zisserman, §11.1.2).
+/// Computes the one to three fundamental matrices with `bᵢᵀ F aᵢ = 0` for seven matches, each of Frobenius norm 1 and
+/// rank 2 (Hartley & Zisserman, §11.1.2).
 ///
-/// Calls `found` for each; for none where the points are degenerate. Coordinates should be of order one: see
-/// `estimate_fundamental`, which normalizes them. The null space by elimination, the rank by a cubic.
+/// Calls `emit` for each; for none if the points are degenerate. Coordinates should be of order one: see
+/// `estimate_fundamental`, which normalizes them. The null space is computed by elimination, the rank constraint is a
+/// cubic.
 #[inline]
-pub fn fundamental_seven_point(a: &[Point2<f64>; 7], b: &[Point2<f64>; 7], mut found: impl FnMut(Matrix3<f64>)) {
+pub fn fundamental_seven_point(a: &[Point2<f64>; 7], b: &[Point2<f64>; 7], mut emit: impl FnMut(Matrix3<f64>)) {
     let rows = std::array::from_fn(|i| epipolar_row(a[i], b[i]));
     let Some(mut basis) = null_space::<7, 9, 2>(rows) else { return };
-    mix(&mut basis);
+    reflect_generic(&mut basis);
     let [f, g] = basis;
     // det(f + t g) = det f + t tr(adj(f) g) + t² tr(adj(g) f) + t³ det g.
     let (adj_f, adj_g) = (adjugate(&f), adjugate(&g));
@@ -22,17 +23,17 @@ pub fn fundamental_seven_point(a: &[Point2<f64>; 7], b: &[Point2<f64>; 7], mut f
     let cubic = [det(&f, &adj_f), trace(&adj_f, &g), trace(&adj_g, &f), det(&g, &adj_g)];
     for &t in real_roots_cubic(cubic).iter() {
         let m = Matrix3::from_fn(|r, c| f[3 * r + c] + t * g[3 * r + c]);
-        found(m / m.norm());
+        emit(m / m.norm());
     }
 }
 
-/// The coefficients of `bᵀ F a` by the entries of F, row by row.
+/// Returns the coefficients of the entries of F (row-major) in `bᵀ F a`.
 #[inline]
 pub(crate) fn epipolar_row(a: Point2<f64>, b: Point2<f64>) -> [f64; 9] {
     [b.x * a.x, b.x * a.y, b.x, b.y * a.x, b.y * a.y, b.y, a.x, a.y, 1.0]
 }
 
-/// The adjugate of a matrix of rows, by rows.
+/// Computes the adjugate; both matrices are row-major.
 #[inline]
 fn adjugate(m: &[f64; 9]) -> [f64; 9] {
     [

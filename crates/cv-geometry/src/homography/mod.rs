@@ -1,4 +1,4 @@
-//! Homographies.
+//! Estimation of homographies.
 
 mod dlt;
 mod four_point;
@@ -15,9 +15,10 @@ use crate::robust::RobustModel;
 use cv_core::{Correspondence, Matrix3, Point2, Progress};
 use refine::{TransferProblem, refine_transfer};
 
-/// The root mean square of the distances from `b` to `H a` and from `a` to `H⁻¹ b`, in pixels.
+/// Computes the symmetric transfer error: the RMS of the distances from `b` to `H a` and from `a` to `H⁻¹ b`, in
+/// pixels.
 ///
-/// Infinite where `h` has no inverse or sends one of the points to infinity.
+/// Infinite if `h` is singular or maps one of the points to infinity.
 pub fn homography_residual(h: &Matrix3<f64>, m: &Correspondence) -> f64 {
     let Some(g) = h.try_inverse() else { return f64::INFINITY };
     let map = |h: &Matrix3<f64>, p: Point2<f64>| Point2::from_homogeneous(h * p.to_homogeneous());
@@ -27,15 +28,15 @@ pub fn homography_residual(h: &Matrix3<f64>, m: &Correspondence) -> f64 {
     }
 }
 
-/// The homography between two images that share a plane or a camera center, from matches of which many may be wrong.
+/// Estimates the homography between two images of a plane, or from the same camera center, robustly from tentative
+/// matches.
 ///
 /// RANSAC with local optimization on the symmetric transfer error; the model is scaled to `H[2][2] = 1`.
 ///
 /// ```
 /// use cv_core::{Correspondence, Silent};
 /// use cv_geometry::{RobustOptions, estimate_homography};
-///
-/// // A shift by (10, 5), and one wrong match.
+/// // A shift by (10, 5), and one outlier.
 /// let mut matches: Vec<_> = (0..20)
 ///     .map(|i| (f64::from(i % 5) * 40.0, f64::from(i / 5) * 30.0))
 ///     .map(|(x, y)| Correspondence::new(x, y, x + 10.0, y + 5.0))
@@ -48,8 +49,8 @@ pub fn homography_residual(h: &Matrix3<f64>, m: &Correspondence) -> f64 {
 /// ```
 ///
 /// # Errors
-/// [`EstimateError`]: fewer than four matches, a coordinate that is not finite, coincident or collinear points, or no model supported by more
-/// matches than the number of false alarms allows (where there are more than four).
+/// [`EstimateError`]: fewer than four matches, a coordinate that is not finite, coincident or collinear points, or no
+/// model with a small enough number of false alarms (if there are more than four matches).
 pub fn estimate_homography(
     matches: &[Correspondence],
     options: &RobustOptions,
@@ -58,24 +59,25 @@ pub fn estimate_homography(
     options.check()?;
     let set = NormalizedMatches::new(matches, 4)?;
     let degenerate = |kind| EstimateError::Degenerate { kind };
-    // Points that are on a line up to their own noise say nothing about the plane beside it.
+    // Points that are collinear within a third of the threshold, about their noise, are degenerate.
     let width = options.threshold / 3.0 * set.first.scale;
-    // Before the search, which would draw every sample it may and find none of use.
+    // Before RANSAC, which would draw the maximum number of samples in vain.
     if let Some(kind) = point_degeneracy(set.pairs.iter(), 4, width) {
         return Err(degenerate(kind));
     }
     let estimator = HomographyEstimator { set };
-    let found = ransac(&estimator, options, progress)?;
+    let consensus = ransac(&estimator, options, progress)?;
     let set = &estimator.set;
-    let h = dlt::scaled(&(set.second.inverse_matrix() * found.model * set.first.matrix()));
-    let result = RobustModel::new(h, matches, options.threshold, &found, homography_residual);
+    let h = dlt::normalize_scale(&(set.second.inverse_matrix() * consensus.model * set.first.matrix()));
+    let result = RobustModel::new(h, matches, options.threshold, &consensus, homography_residual);
     match point_degeneracy(result.inliers.iter().map(|&i| &set.pairs[i]), 4, width) {
         Some(kind) => Err(degenerate(kind)),
         None => Ok(result),
     }
 }
 
-/// Refines a homography on all `matches` (which should be inliers) to the least symmetric transfer error, scaled to `H[2][2] = 1`.
+/// Refines a homography by minimizing the symmetric transfer error of `matches` (which should be inliers), scaled to
+/// `H[2][2] = 1`.
 ///
 /// # Errors
 /// [`EstimateError`] as for [`homography_from_points`].
@@ -84,11 +86,11 @@ pub fn refine_homography(h: &Matrix3<f64>, matches: &[Correspondence]) -> Result
     let normalized = set.second.matrix() * h * set.first.inverse_matrix();
     let problem = TransferProblem { pairs: &set.pairs, scorer: &LeastSquaresLoss, threshold: 1.0 };
     let refined = refine_transfer(&problem, &normalized, 50).unwrap_or(normalized);
-    Ok(dlt::scaled(&(set.second.inverse_matrix() * refined * set.first.matrix())))
+    Ok(dlt::normalize_scale(&(set.second.inverse_matrix() * refined * set.first.matrix())))
 }
 
-/// Refines `h` on the normalized pairs that it maps to within `threshold`.
-pub(crate) fn refine_on_plane(pairs: &[[f64; 4]], h: &Matrix3<f64>, threshold: f64) -> Matrix3<f64> {
+/// Refines `h` by minimizing the robust symmetric transfer error (Tukey's biweight) of normalized pairs.
+pub(crate) fn refine_robustly(pairs: &[[f64; 4]], h: &Matrix3<f64>, threshold: f64) -> Matrix3<f64> {
     let problem = TransferProblem { pairs, scorer: &TukeyBiweight, threshold };
     refine_transfer(&problem, h, 10).unwrap_or(*h)
 }
@@ -97,7 +99,7 @@ struct HomographyEstimator {
     set: NormalizedMatches,
 }
 
-/// H and its inverse, both positive where the points are.
+/// H and its inverse in f32, both with positive denominators in front of the camera.
 pub(crate) struct TransferKernel {
     h: [f32; 9],
     g: [f32; 9],
@@ -105,7 +107,7 @@ pub(crate) struct TransferKernel {
 
 impl TransferKernel {
     pub(crate) fn new(h: &Matrix3<f64>) -> Self {
-        // The adjugate, scaled so that G H = +I·positive: the front stays the front.
+        // The adjugate, scaled so that G H is a positive multiple of I, which preserves the sign of the denominators.
         let g = Matrix3::from_columns(&[
             h.row(1).transpose().cross(&h.row(2).transpose()),
             h.row(2).transpose().cross(&h.row(0).transpose()),
@@ -119,7 +121,7 @@ impl TransferKernel {
         Self { h: rows(&h), g: rows(&g) }
     }
 
-    /// `(d₁² + d₂²) / 2`, infinite behind the camera.
+    /// Computes `(d₁² + d₂²) / 2`; infinite behind the camera.
     #[inline(always)]
     pub(crate) fn squared_residuals(&self, block: &MatchBlock) -> [f32; LANES] {
         let (h, g) = (&self.h, &self.g);
@@ -144,14 +146,14 @@ impl Estimator for HomographyEstimator {
     type Model = Matrix3<f64>;
     type Data = NormalizedMatches;
     type Kernel = TransferKernel;
-    const SAMPLE: usize = 4;
+    const SAMPLE_SIZE: usize = 4;
     const RESIDUAL_DIMENSION: i32 = 2;
 
     fn data(&self) -> &NormalizedMatches {
         &self.set
     }
 
-    fn unit(&self) -> f64 {
+    fn threshold_scale(&self) -> f64 {
         self.set.first.scale
     }
 
@@ -207,7 +209,7 @@ mod tests {
         (q.x / q.z, q.y / q.z)
     }
 
-    /// A homography as between two photographs of 640 × 480: turned, scaled, shifted, in perspective. H[2][2] = 1.
+    /// Homographies of images of 640 × 480: rotation, scale, shear, shift and perspective. H[2][2] = 1.
     fn a_homography() -> impl Strategy<Value = Matrix3<f64>> {
         (-3.0..3.0f64, 0.4..2.5f64, -0.3..0.3f64, -200.0..200.0f64, -200.0..200.0f64, -4e-4..4e-4f64, -4e-4..4e-4f64)
             .prop_map(|(turn, scale, shear, tx, ty, px, py)| {
@@ -241,13 +243,13 @@ mod tests {
             .collect()
     }
 
-    /// The cost in f64, which the problem's own, with its f32 losses, is not precise enough for.
+    /// The cost in f64: the problem's own cost has f32 losses and is not precise enough.
     fn plain_cost(problem: &TransferProblem<'_, LeastSquaresLoss>, h: &Matrix3<f64>) -> f64 {
         let residual = |p: &[f64; 4]| homography_residual(h, &Correspondence::new(p[0], p[1], p[2], p[3]));
         problem.pairs.iter().map(|p| residual(p).powi(2)).sum()
     }
 
-    /// Largest distance between the images of the corners of 640 × 480.
+    /// Maximum distance between the mapped corners of 640 × 480.
     fn corner_error(a: &Matrix3<f64>, b: &Matrix3<f64>) -> f64 {
         [(0.0, 0.0), (639.0, 0.0), (0.0, 479.0), (639.0, 479.0)]
             .iter()
@@ -260,15 +262,16 @@ mod tests {
 
     proptest! {
         #[test]
-        fn every_entry_comes_back_from_exact_points(h in a_homography(), n in 4usize..20, seed: u64) {
+        fn every_entry_is_recovered_from_exact_points(h in a_homography(), n in 4usize..20, seed: u64) {
             let m = matches(&h, n, 0.0, &mut ChaCha8Rng::seed_from_u64(seed));
-            // Four random points may be nearly collinear, which costs digits: judge well-spread ones only.
+            // Nearly collinear points lose digits: well-spread ones only.
             let a = [m[0].a, m[1].a, m[2].a, m[3].a];
             let area = |i: usize, j: usize, k: usize| ((a[j] - a[i]).perp(&(a[k] - a[i]))).abs();
             prop_assume!([area(0, 1, 2), area(0, 1, 3), area(0, 2, 3), area(1, 2, 3)].iter().all(|v| *v > 5000.0));
             let found = homography_from_points(&m).unwrap();
             prop_assert_eq!(found[(2, 2)], 1.0);
-            // Squaring in AᵀA leaves eight digits; the perspective terms are of order 1e-4 beside entries of order 100.
+            // AᵀA halves the number of digits to eight; the perspective terms are of order 1e-4, other entries of order
+            // 100.
             prop_assert!(corner_error(&found, &h) < 1e-4, "{}", corner_error(&found, &h));
             for i in 0..9 {
                 let unit = if i < 6 { if i % 3 == 2 { 1e-4 } else { 1e-6 } } else { 1e-9 };
@@ -280,7 +283,7 @@ mod tests {
         }
 
         #[test]
-        fn half_wrong_matches_do_not_matter(h in a_homography(), seed in 0u64..1000) {
+        fn accuracy_with_half_outliers_is_close_to_least_squares_on_inliers(h in a_homography(), seed in 0u64..1000) {
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
             let mut m = matches(&h, 100, 0.3, &mut rng);
             for _ in 0..100 {
@@ -288,16 +291,16 @@ mod tests {
             }
             let found = estimate_homography(&m, &RobustOptions { seed, ..RobustOptions::homography() }, &Silent).unwrap();
             prop_assert_eq!(found.model[(2, 2)], 1.0);
-            // As good as least squares on the right matches alone, give or take the few wrong ones that happen to fit.
+            // As accurate as least squares on the true inliers, except for the few outliers that fit by chance.
             let oracle = refine_homography(&h, &m[..100]).unwrap();
             prop_assert!(corner_error(&found.model, &h) < 2.0 * corner_error(&oracle, &h) + 0.5);
-            let right = found.inliers.iter().filter(|i| **i < 100).count();
+            let true_positives = found.inliers.iter().filter(|i| **i < 100).count();
             // 3 px is ten standard deviations of the noise, before the map's own scale of at most 2.5 and its perspective.
-            prop_assert!(right >= 90 && found.inliers.len() <= right + 6, "{right} of {}", found.inliers.len());
+            prop_assert!(true_positives >= 90 && found.inliers.len() <= true_positives + 6, "{true_positives} of {}", found.inliers.len());
         }
 
         #[test]
-        fn the_gradient_and_hessian_are_those_of_the_cost(h in a_homography(), seed: u64) {
+        fn the_analytic_gradient_equals_the_numeric_one(h in a_homography(), seed: u64) {
             let m = matches(&h, 12, 0.01, &mut ChaCha8Rng::seed_from_u64(seed));
             let set = NormalizedMatches::new(&m, 4).unwrap();
             let problem = TransferProblem { pairs: &set.pairs, scorer: &LeastSquaresLoss, threshold: 1.0 };
@@ -318,7 +321,7 @@ mod tests {
         }
 
         #[test]
-        fn vector_residuals_are_the_plain_ones(h in a_homography(), seed: u64) {
+        fn simd_residuals_equal_the_scalar_ones(h in a_homography(), seed: u64) {
             let m = matches(&h, 40, 2.0, &mut ChaCha8Rng::seed_from_u64(seed));
             let set = NormalizedMatches::new(&m, 4).unwrap();
             let normalized = set.second.matrix() * h * set.first.inverse_matrix();
@@ -337,26 +340,26 @@ mod tests {
     }
 
     #[test]
-    fn a_known_homography_has_the_known_residual() {
+    fn residual_of_a_known_homography() {
         let h = Matrix3::new(2.0, 0.0, 3.0, 0.0, 2.0, -1.0, 0.0, 0.0, 1.0);
-        // (1, 1) goes to (5, 1), 3-4-5 away from (8, 5), whose pre-image is 1.5-2-2.5 away.
+        // (1, 1) maps to (5, 1), at a distance of 5 from (8, 5), whose pre-image has a distance of 2.5.
         let r = homography_residual(&h, &Correspondence::new(1.0, 1.0, 8.0, 5.0));
         assert!((r - ((25.0 + 6.25) / 2.0f64).sqrt()).abs() < 1e-12);
         assert_eq!(homography_residual(&Matrix3::zeros(), &Correspondence::new(1.0, 1.0, 8.0, 5.0)), f64::INFINITY);
     }
 
     #[test]
-    fn refinement_on_exact_points_finds_the_exact_entries() {
+    fn refinement_converges_to_the_exact_entries_on_exact_points() {
         let h = Matrix3::new(1.1, 0.1, 20.0, -0.05, 0.9, -7.0, 2e-4, -1e-4, 1.0);
         let m = matches(&h, 30, 0.0, &mut ChaCha8Rng::seed_from_u64(5));
         let start = Matrix3::new(1.12, 0.1, 25.0, -0.05, 0.91, -5.0, 1.9e-4, -1e-4, 1.0);
         let found = refine_homography(&start, &m).unwrap();
-        // Quadratic convergence until the cost falls by less than a millionth: its square root in the entries.
+        // Quadratic convergence until the relative decrease of the cost is below 1e-6.
         assert!(corner_error(&found, &h) < 1e-5 && (found - h).norm() < 1e-6, "{found}");
     }
 
     #[test]
-    fn mirrored_images_are_homographies_too() {
+    fn mirrored_images_are_accepted() {
         let h = Matrix3::new(-1.0, 0.0, 639.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0);
         let m = matches(&h, 20, 0.0, &mut ChaCha8Rng::seed_from_u64(5));
         let found = estimate_homography(&m, &RobustOptions::homography(), &Silent).unwrap();
@@ -364,7 +367,7 @@ mod tests {
     }
 
     #[test]
-    fn bad_input_gets_a_typed_answer() {
+    fn invalid_and_degenerate_input_is_a_typed_error() {
         let options = RobustOptions::homography();
         let get = |m: &[Correspondence]| estimate_homography(m, &options, &Silent).map(|r| r.model);
         let good = matches(&Matrix3::identity(), 20, 0.0, &mut ChaCha8Rng::seed_from_u64(1));
@@ -375,7 +378,7 @@ mod tests {
         assert_eq!(get(&bad), Err(EstimateError::NotFinite { index: 7 }));
         bad[7].b.y = f64::INFINITY;
         assert_eq!(get(&bad), Err(EstimateError::NotFinite { index: 7 }));
-        // A wild but finite coordinate is just an outlier.
+        // A very large finite coordinate is an outlier.
         bad[7].b.y = 1e9;
         assert!(corner_error(&get(&bad).unwrap(), &Matrix3::identity()) < 1e-3);
         let same = vec![good[0]; 30];
@@ -402,10 +405,10 @@ mod tests {
     }
 
     #[test]
-    fn the_same_seed_gives_the_same_bytes_on_one_thread_and_on_many() {
+    fn the_result_does_not_depend_on_the_number_of_threads() {
         let h = Matrix3::new(1.1, 0.1, 20.0, -0.05, 0.9, -7.0, 2e-4, -1e-4, 1.0);
         let mut rng = ChaCha8Rng::seed_from_u64(9);
-        // More than the number from which on threads are used.
+        // Enough data for parallel evaluation.
         let mut m = matches(&h, 5000, 0.5, &mut rng);
         m.extend((0..5000).map(|_| {
             Correspondence::new(

@@ -6,27 +6,28 @@ use cv_numeric::{LeastSquares, LmOptions, NormalEquations, levenberg_marquardt};
 use fearless_simd::{Level, dispatch};
 use nalgebra::{Const, SMatrix, SVector};
 
-/// Minimizes `Σ ρ((d₁² + d₂²)/2 / threshold²)` over the eight entries beside `H[2][2] = 1`, with `d₂` the distance from
-/// `b` to `H a` and `d₁` that from `a` to `H⁻¹ b`.
+/// Minimizes the robust symmetric transfer error `Σ ρ((d₁² + d₂²)/2 / threshold²)` over the eight entries other than
+/// `H[2][2] = 1`. `d₂` is the distance from `b` to `H a`, `d₁` that from `a` to `H⁻¹ b`.
 pub(crate) struct TransferProblem<'a, C: Scorer> {
     pub(crate) pairs: &'a [[f64; 4]],
     pub(crate) scorer: &'a C,
     pub(crate) threshold: f64,
 }
 
-/// The sums of one direction: `Σ k u^i v^j p pᵀ` by the nine entries of the matrix that maps `p`.
+/// Normal equations of one transfer direction, by the nine entries of the matrix that maps `p`, as the moments `Σ k u^i
+/// v^j p pᵀ`.
 #[derive(Clone, Copy)]
-struct OneWay {
-    /// Of xx, xy, yy, x, y, 1: Σ k, Σ k u, Σ k v, Σ k (u² + v²). Four side by side suit a vector unit.
+struct TransferSums {
+    /// For each of xx, xy, yy, x, y, 1: Σ k, Σ k u, Σ k v, Σ k (u² + v²), in SIMD-friendly groups of four.
     moments: [[f64; 4]; 6],
-    /// Derivative of half the cost by the nine entries, row-major.
+    /// Gradient of half the cost by the nine entries, row-major.
     gradient: [f64; 9],
 }
 
-impl OneWay {
+impl TransferSums {
     const ZERO: Self = Self { moments: [[0.0; 4]; 6], gradient: [0.0; 9] };
 
-    /// Adds a point `(x, y)` that is mapped to `(u, v)` with denominator `w`, off by `(ru, rv)`.
+    /// Adds a point `(x, y)` that maps to `(u, v)` with denominator `w`, with the residual `(ru, rv)`.
     #[inline(always)]
     fn add(&mut self, [x, y]: [f64; 2], [u, v, inverse_w]: [f64; 3], [ru, rv]: [f64; 2], weight: f64) {
         let k = weight * inverse_w * inverse_w;
@@ -46,6 +47,7 @@ impl OneWay {
         }
     }
 
+    /// Returns the Gauss–Newton Hessian.
     fn hessian(&self) -> SMatrix<f64, 9, 9> {
         let m = &self.moments;
         let block = |k: usize| {
@@ -62,7 +64,7 @@ impl OneWay {
 }
 
 impl<C: Scorer> TransferProblem<'_, C> {
-    /// `H a`, `1/w`, `H⁻¹ b`, `1/w'`, and `u`, beyond the cutoff where a map sends its point behind.
+    /// Computes `H a`, `1/w`, `H⁻¹ b`, `1/w'`, and `u`, which is NaN if a point maps behind the camera.
     #[inline(always)]
     fn terms(&self, h: &Matrix3<f64>, g: &Matrix3<f64>, &[x, y, s, t]: &[f64; 4]) -> ([f64; 3], [f64; 3], f64) {
         let wa = 1.0 / (h[(2, 0)] * x + h[(2, 1)] * y + h[(2, 2)]);
@@ -76,6 +78,7 @@ impl<C: Scorer> TransferProblem<'_, C> {
         ([p, q, wa], [m, n, wb], u)
     }
 
+    /// Computes the cost.
     #[inline(always)]
     fn sum(&self, h: &Matrix3<f64>, g: &Matrix3<f64>) -> f64 {
         let mut cost = 0.0;
@@ -86,28 +89,29 @@ impl<C: Scorer> TransferProblem<'_, C> {
         cost
     }
 
+    /// Computes the cost and the normal equations of both directions.
     #[inline(always)]
-    fn sums(&self, h: &Matrix3<f64>, g: &Matrix3<f64>) -> (f64, OneWay, OneWay) {
-        let (mut forth, mut back) = (OneWay::ZERO, OneWay::ZERO);
+    fn sums(&self, h: &Matrix3<f64>, g: &Matrix3<f64>) -> (f64, TransferSums, TransferSums) {
+        let (mut forward, mut backward) = (TransferSums::ZERO, TransferSums::ZERO);
         let mut cost = 0.0;
         for pair in self.pairs {
             let (a, b, u) = self.terms(h, g, pair);
-            // Not where it is NaN.
+            // False for NaN.
             if u < self.scorer.cutoff() {
                 let [x, y, s, t] = *pair;
                 cost += f64::from(self.scorer.loss(u as f32));
                 let weight = self.scorer.weight(u);
-                forth.add([x, y], a, [a[0] - s, a[1] - t], weight);
-                back.add([s, t], b, [b[0] - x, b[1] - y], weight);
+                forward.add([x, y], a, [a[0] - s, a[1] - t], weight);
+                backward.add([s, t], b, [b[0] - x, b[1] - y], weight);
             } else {
                 cost += 1.0;
             }
         }
-        (cost, forth, back)
+        (cost, forward, backward)
     }
 }
 
-/// The inverse of a homography with `H[2][2] = 1`, up to the sign that makes mapping back go to the front.
+/// Inverts a homography with `H[2][2] = 1`; the denominators of the inverse are positive in front of the camera.
 pub(crate) fn inverse(h: &Matrix3<f64>) -> Option<Matrix3<f64>> {
     h.try_inverse()
 }
@@ -131,12 +135,13 @@ impl<C: Scorer> LeastSquares for TransferProblem<'_, C> {
             equations.cost = f64::INFINITY;
             return equations;
         };
-        // No product is fused, so every instruction set gives the same bits.
-        let (cost, forth, back) = dispatch!(Level::new(), _simd => self.sums(h, &g));
-        // dG = −G dH G, so by entries: dG[i][j] = −Σ G[i][k] G[l][j] dH[k][l].
-        let turn = SMatrix::<f64, 9, 9>::from_fn(|r, c| -g[(r / 3, c / 3)] * g[(c % 3, r % 3)]);
-        let hessian = forth.hessian() + turn.transpose() * back.hessian() * turn;
-        let gradient = SVector::from(forth.gradient) + turn.transpose() * SVector::from(back.gradient);
+        // No product is fused, so all instruction sets give identical results.
+        let (cost, forward, backward) = dispatch!(Level::new(), _simd => self.sums(h, &g));
+        // dG = −G dH G: dG[i][j] = −Σ G[i][k] G[l][j] dH[k][l].
+        let inverse_jacobian = SMatrix::<f64, 9, 9>::from_fn(|r, c| -g[(r / 3, c / 3)] * g[(c % 3, r % 3)]);
+        let hessian = forward.hessian() + inverse_jacobian.transpose() * backward.hessian() * inverse_jacobian;
+        let gradient =
+            SVector::from(forward.gradient) + inverse_jacobian.transpose() * SVector::from(backward.gradient);
         equations.cost = cost;
         equations.hessian.copy_from(&hessian.fixed_view::<8, 8>(0, 0));
         equations.gradient.copy_from(&gradient.fixed_rows::<8>(0));
@@ -144,21 +149,21 @@ impl<C: Scorer> LeastSquares for TransferProblem<'_, C> {
     }
 
     fn step(&self, h: &Matrix3<f64>, delta: &SVector<f64, 8>) -> Matrix3<f64> {
-        let mut moved = *h;
+        let mut updated = *h;
         for (i, d) in delta.iter().enumerate() {
-            moved[(i / 3, i % 3)] += d;
+            updated[(i / 3, i % 3)] += d;
         }
-        moved
+        updated
     }
 }
 
-/// At most `iterations` Levenberg–Marquardt steps from `h`, which need not be scaled.
+/// Refines `h` (of any scale) by at most `iterations` Levenberg–Marquardt steps; `None` if none reduced the cost.
 pub(crate) fn refine_transfer<C: Scorer>(
     problem: &TransferProblem<'_, C>,
     h: &Matrix3<f64>,
     iterations: usize,
 ) -> Option<Matrix3<f64>> {
-    // The origin is amid the points of the first image, where no homography that a camera could make has its horizon.
+    // The origin is the center of the points in the first image; a valid homography does not map it to infinity.
     if h[(2, 2)].abs() <= 1e-9 * h.norm() {
         return None;
     }

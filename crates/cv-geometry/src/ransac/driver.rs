@@ -1,4 +1,4 @@
-//! The RANSAC loop.
+//! The RANSAC driver.
 
 use super::quality::Quality;
 use super::{
@@ -9,41 +9,44 @@ use cv_numeric::parallel_map;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
-/// Samples that are judged together, by one thread.
+/// Samples per task of one thread.
 const CHUNK: usize = 16;
-/// Most samples of a batch, and those from which on it is spread over threads: below, it is done before a thread wakes up.
-const MOST: usize = 256;
-/// Data from which on any batch is spread over threads.
-const PARALLEL_FROM: usize = 8192;
-/// Minimal models kept to be searched around, should the samples run out before the confidence is reached.
-const RUNNERS_UP: usize = 32;
-/// Steps of a local optimization inside the loop, and at the end.
+/// Maximum number of samples of a batch, and the number from which it is evaluated in parallel: smaller ones are done
+/// before a thread wakes up.
+const MAX_BATCH: usize = 256;
+/// Number of data from which every batch is evaluated in parallel.
+const MIN_PARALLEL_DATA: usize = 8192;
+/// Number of runner-up minimal models that are locally optimized if the maximum number of samples is reached before the
+/// confidence.
+const MAX_RUNNERS_UP: usize = 32;
+/// Maximum refinement steps of a local optimization inside the loop, and at the end.
 pub(super) const LOCAL_STEPS: usize = 5;
 const FINAL_STEPS: usize = 20;
-/// The scale of Tukey's biweight, in standard deviations, at which it is 95 % as good as least squares on Gaussian errors (Huber &
+/// Tuning constant of Tukey's biweight in standard deviations, for 95 % efficiency on Gaussian errors (Huber &
 /// Ronchetti, "Robust statistics", 2009).
-const BIWEIGHT: f64 = 4.685;
+const BIWEIGHT_SCALE: f64 = 4.685;
 
-/// A model and how well it fits.
+/// A model and its score.
 #[derive(Clone)]
 pub(super) struct ScoredModel<M> {
     pub(super) model: M,
     pub(super) score: Score,
 }
 
-/// The best model of a chunk, and the sample it is made of.
+/// The best model of a chunk, and its minimal sample.
 #[derive(Clone)]
-struct Winner<M> {
-    found: ScoredModel<M>,
+struct Candidate<M> {
+    scored: ScoredModel<M>,
     sample: [u32; 8],
 }
 
-/// Draws samples until enough were drawn. Every minimal model that is the best so far is locally optimized on the same loss it is judged by. (Not only
-/// one that beats the optimized: noise lets hardly any minimal model do that.) A model is given up as soon as its loss is too large to
-/// matter, which never changes the result.
+/// Runs the sampling loop until the termination criterion holds. Every minimal model that is better than all minimal
+/// models so far is locally optimized on the scoring loss. (Comparing with the best optimized model instead would skip
+/// nearly all of them, because of noise.) Scoring stops early when the loss exceeds that of the best, which never
+/// changes the result.
 ///
-/// Batches grow with the number of samples drawn, and each is judged by what was known before it, so the result does not depend on how it is
-/// spread over threads.
+/// Batches grow with the number of samples drawn. The bounds used in a batch are those from before it, so the result
+/// does not depend on its distribution over threads.
 pub(super) fn search<E: Estimator, C: Scorer>(
     quality: &Quality<'_, E, C>,
     sampler: &mut dyn Sampler,
@@ -52,81 +55,82 @@ pub(super) fn search<E: Estimator, C: Scorer>(
 ) -> Result<Option<Consensus<E::Model>>, Cancelled> {
     let n = quality.estimator.data().count();
     let mut best: Option<ScoredModel<E::Model>> = None;
-    let mut minimal = f32::INFINITY;
-    let mut waiting: Vec<Winner<E::Model>> = Vec::new();
-    let mut samples = Vec::with_capacity(MOST);
+    let mut best_minimal_loss = f32::INFINITY;
+    let mut runners_up: Vec<Candidate<E::Model>> = Vec::new();
+    let mut samples = Vec::with_capacity(MAX_BATCH);
     let mut models = Vec::new();
     let mut rng = ChaCha8Rng::seed_from_u64(!options.seed);
-    let around = E::RESAMPLES > 0 && options.local_optimization == LocalOptimization::InnerRansac;
+    let inner_ransac = E::INNER_SAMPLES > 0 && options.local_optimization == LocalOptimization::InnerRansac;
     let mut iterations = 0;
-    // Of few data there are few samples: of the smallest support that counts, one is soon drawn.
-    let most = options.needed(n.min(E::SAMPLE + 1), n, E::SAMPLE);
-    let mut needed = most;
+    // Few data have few distinct samples: this is enough for the smallest support that counts.
+    let max_samples = options.samples_needed(n.min(E::SAMPLE_SIZE + 1), n, E::SAMPLE_SIZE);
+    let mut needed = max_samples;
     while iterations < needed {
-        let count = (iterations / 8).clamp(CHUNK, MOST).min(needed - iterations);
+        let count = (iterations / 8).clamp(CHUNK, MAX_BATCH).min(needed - iterations);
         samples.resize(count, [0u32; 8]);
         for sample in &mut samples {
-            sampler.draw(&mut sample[..E::SAMPLE]);
+            sampler.draw(&mut sample[..E::SAMPLE_SIZE]);
         }
-        // As far as this confidence: a better model may end it sooner.
+        // Progress relative to the current number needed, which a better model may reduce.
         let stage = Samples { progress, drawn: iterations, needed };
         iterations += count;
-        let limit = match waiting.get(RUNNERS_UP - 1) {
-            Some(last) => last.found.score.loss,
-            None if around => f32::INFINITY,
-            None => minimal,
+        let limit = match runners_up.get(MAX_RUNNERS_UP - 1) {
+            Some(last) => last.scored.score.loss,
+            None if inner_ransac => f32::INFINITY,
+            None => best_minimal_loss,
         };
-        let winners: Vec<Result<Option<Winner<E::Model>>, Cancelled>> = if n < PARALLEL_FROM && count < MOST {
-            samples.chunks(CHUNK).map(|chunk| best_of(quality, chunk, limit, &mut models, &stage)).collect()
-        } else {
-            let chunks: Vec<&[[u32; 8]]> = samples.chunks(CHUNK).collect();
-            parallel_map(chunks.len(), &|i| best_of(quality, chunks[i], limit, &mut Vec::new(), &stage))
-        };
-        for winner in winners {
-            let Some(winner) = winner? else { continue };
-            if winner.found.score.loss >= minimal {
-                if around {
-                    let at = waiting.partition_point(|w| w.found.score.loss <= winner.found.score.loss);
-                    waiting.insert(at, winner);
-                    waiting.truncate(RUNNERS_UP);
+        let candidates: Vec<Result<Option<Candidate<E::Model>>, Cancelled>> =
+            if n < MIN_PARALLEL_DATA && count < MAX_BATCH {
+                samples.chunks(CHUNK).map(|chunk| best_of_samples(quality, chunk, limit, &mut models, &stage)).collect()
+            } else {
+                let chunks: Vec<&[[u32; 8]]> = samples.chunks(CHUNK).collect();
+                parallel_map(chunks.len(), &|i| best_of_samples(quality, chunks[i], limit, &mut Vec::new(), &stage))
+            };
+        for candidate in candidates {
+            let Some(candidate) = candidate? else { continue };
+            if candidate.scored.score.loss >= best_minimal_loss {
+                if inner_ransac {
+                    let at = runners_up.partition_point(|r| r.scored.score.loss <= candidate.scored.score.loss);
+                    runners_up.insert(at, candidate);
+                    runners_up.truncate(MAX_RUNNERS_UP);
                 }
                 continue;
             }
-            minimal = winner.found.score.loss;
-            let mut found = optimized(quality, winner, &mut models, &stage)?;
-            if around {
-                quality.inner_ransac(&mut found, &mut rng, &mut models, &stage)?;
+            best_minimal_loss = candidate.scored.score.loss;
+            let mut optimized = optimize_locally(quality, candidate, &mut models, &stage)?;
+            if inner_ransac {
+                quality.inner_ransac(&mut optimized, &mut rng, &mut models, &stage)?;
             }
-            if best.as_ref().is_none_or(|b| found.score.loss < b.score.loss) {
-                needed = options.needed(found.score.inliers as usize, n, E::SAMPLE).min(most);
-                best = Some(found);
+            if best.as_ref().is_none_or(|b| optimized.score.loss < b.score.loss) {
+                needed = options.samples_needed(optimized.score.inliers as usize, n, E::SAMPLE_SIZE).min(max_samples);
+                best = Some(optimized);
             }
         }
     }
     let Some(mut best) = best else { return Ok(None) };
-    let stage = Stage::new(progress, "best models", waiting.len())?;
-    if iterations == most {
-        let searched = |k: usize| {
+    let stage = Stage::new(progress, "best models", runners_up.len())?;
+    if iterations == max_samples {
+        let optimize = |k: usize| {
             let (mut rng, mut models) = (rng.clone(), Vec::new());
             rng.set_stream(k as u64 + 1);
-            let mut found = optimized(quality, waiting[k].clone(), &mut models, &stage)?;
-            quality.inner_ransac(&mut found, &mut rng, &mut models, &stage)?;
+            let mut optimized = optimize_locally(quality, runners_up[k].clone(), &mut models, &stage)?;
+            quality.inner_ransac(&mut optimized, &mut rng, &mut models, &stage)?;
             stage.add(1)?;
-            Ok(found)
+            Ok(optimized)
         };
-        for found in parallel_map(waiting.len(), &searched) {
-            let found: ScoredModel<E::Model> = found?;
-            if found.score.loss < best.score.loss {
-                best = found;
+        for optimized in parallel_map(runners_up.len(), &optimize) {
+            let optimized: ScoredModel<E::Model> = optimized?;
+            if optimized.score.loss < best.score.loss {
+                best = optimized;
             }
         }
     }
-    let model = settle(quality, best, around.then_some(&mut rng), &mut models, &stage)?;
+    let model = refine_with_estimated_noise(quality, best, inner_ransac.then_some(&mut rng), &mut models, &stage)?;
     let score = quality.score(&model, f32::INFINITY);
     Ok(Some(Consensus { model, score, iterations, log_nfa: None }))
 }
 
-/// Samples drawn of those needed so far; whatever is done for one of them shows as that.
+/// Progress in samples: reports of any stage are forwarded as the number of samples drawn of those needed.
 struct Samples<'a> {
     progress: &'a dyn Progress,
     drawn: usize,
@@ -139,18 +143,18 @@ impl Progress for Samples<'_> {
     }
 }
 
-/// The minimal model or the best of its alternatives, both locally optimized.
-fn optimized<E: Estimator, C: Scorer>(
+/// Returns the locally optimized minimal model, or its best locally optimized alternative if that is better.
+fn optimize_locally<E: Estimator, C: Scorer>(
     quality: &Quality<'_, E, C>,
-    winner: Winner<E::Model>,
+    candidate: Candidate<E::Model>,
     models: &mut Vec<E::Model>,
     progress: &dyn Progress,
 ) -> Result<ScoredModel<E::Model>, Cancelled> {
-    let Winner { mut found, sample } = winner;
+    let Candidate { scored: mut best, sample } = candidate;
     progress.report("local optimization", 0, 1)?;
     models.clear();
-    quality.estimator.alternatives(&found.model, &sample[..E::SAMPLE], quality.threshold, models);
-    quality.refine_best(&mut found, LOCAL_STEPS);
+    quality.estimator.alternatives(&best.model, &sample[..E::SAMPLE_SIZE], quality.threshold, models);
+    quality.refine_best(&mut best, LOCAL_STEPS);
     let mut other: Option<ScoredModel<E::Model>> = None;
     for model in models.drain(..) {
         let score = quality.score(&model, other.as_ref().map_or(f32::INFINITY, |o| o.score.loss));
@@ -160,66 +164,66 @@ fn optimized<E: Estimator, C: Scorer>(
     }
     if let Some(mut other) = other {
         quality.refine_best(&mut other, LOCAL_STEPS);
-        if other.score.loss < found.score.loss {
-            found = other;
+        if other.score.loss < best.score.loss {
+            best = other;
         }
     }
-    Ok(found)
+    Ok(best)
 }
 
-/// Refines, and searches `around` the model, with the noise that the data show instead of the threshold they were searched with: small noise leaves room for
-/// wrong data that happen to fit and for other minima, large noise loses right data. Twice: a third round changes the model by less than a
-/// tenth of its deviation.
-fn settle<E: Estimator, C: Scorer>(
+/// Refines the model (with inner RANSAC if `rng` is given) with a loss scaled to the estimated noise instead of the
+/// threshold: a threshold too large for the noise admits outliers and other minima, one too small loses inliers. Two
+/// rounds: a third changes the model by less than a tenth of its standard deviation.
+fn refine_with_estimated_noise<E: Estimator, C: Scorer>(
     quality: &Quality<'_, E, C>,
     mut best: ScoredModel<E::Model>,
-    mut around: Option<&mut ChaCha8Rng>,
+    mut rng: Option<&mut ChaCha8Rng>,
     models: &mut Vec<E::Model>,
     progress: &dyn Progress,
 ) -> Result<E::Model, Cancelled> {
-    // The scale of the last round is the one to converge at.
+    // Only the last round needs to converge.
     for steps in [LOCAL_STEPS, FINAL_STEPS] {
         progress.report("local optimization", 0, 1)?;
         let Some(sigma) = quality.noise(&best.model) else {
-            // Too few data for a noise of their own.
+            // Too few inliers to estimate the noise.
             best.score = quality.score(&best.model, f32::INFINITY);
             quality.refine_best(&mut best, FINAL_STEPS);
             break;
         };
-        let threshold = BIWEIGHT * sigma * quality.threshold / TukeyBiweight.cutoff().sqrt();
-        let fine = Quality::new(quality.estimator, &TukeyBiweight, threshold);
-        best.score = fine.score(&best.model, f32::INFINITY);
-        fine.refine_best(&mut best, steps);
-        if let Some(rng) = &mut around {
-            fine.inner_ransac(&mut best, rng, models, progress)?;
-            fine.refine_best(&mut best, steps);
+        let threshold = BIWEIGHT_SCALE * sigma * quality.threshold / TukeyBiweight.cutoff().sqrt();
+        let rescaled = Quality::new(quality.estimator, &TukeyBiweight, threshold);
+        best.score = rescaled.score(&best.model, f32::INFINITY);
+        rescaled.refine_best(&mut best, steps);
+        if let Some(rng) = &mut rng {
+            rescaled.inner_ransac(&mut best, rng, models, progress)?;
+            rescaled.refine_best(&mut best, steps);
         }
     }
     Ok(best.model)
 }
 
-/// The model of least loss below `limit` of all samples; the earliest of equals.
-fn best_of<E: Estimator, C: Scorer>(
+/// Returns the model of minimum loss below `limit` of all samples; the earliest on ties.
+fn best_of_samples<E: Estimator, C: Scorer>(
     quality: &Quality<'_, E, C>,
     samples: &[[u32; 8]],
     mut limit: f32,
     models: &mut Vec<E::Model>,
     progress: &dyn Progress,
-) -> Result<Option<Winner<E::Model>>, Cancelled> {
-    // Of much data, each sample takes its time.
-    let every = if quality.estimator.data().count() < PARALLEL_FROM { CHUNK } else { 1 };
+) -> Result<Option<Candidate<E::Model>>, Cancelled> {
+    // Samples between checks for cancellation.
+    let check_interval = if quality.estimator.data().count() < MIN_PARALLEL_DATA { CHUNK } else { 1 };
     let mut best = None;
     for (i, sample) in samples.iter().enumerate() {
-        if i.is_multiple_of(every) {
+        if i.is_multiple_of(check_interval) {
             progress.report("samples", 0, 0)?;
         }
         models.clear();
-        quality.estimator.solve(&sample[..E::SAMPLE], models);
+        quality.estimator.solve(&sample[..E::SAMPLE_SIZE], models);
         for model in models.drain(..) {
             let score = quality.score(&model, limit);
             if score.loss < limit {
                 limit = score.loss;
-                best = Some(Winner { found: ScoredModel { model, score }, sample: *sample });
+                best = Some(Candidate { scored: ScoredModel { model, score }, sample: *sample });
             }
         }
     }

@@ -1,4 +1,4 @@
-//! The one RANSAC driver.
+//! RANSAC: driver, samplers, scorers, local optimization and a-contrario validation.
 
 mod driver;
 mod false_alarms;
@@ -20,73 +20,76 @@ use driver::search;
 use false_alarms::false_alarms;
 use quality::Quality;
 
-/// log₁₀ of the number of false alarms from which on a model is refused: of a hundred sets of wrong data, one at the most has a model. Below one, as
-/// usual, would allow one such model in every set.
-const MOST_FALSE_ALARMS: f64 = -2.0;
+/// log₁₀ of the number of false alarms from which a model is rejected: at most one of a hundred sets of outliers has a
+/// model. The usual bound, NFA < 1, would allow one such model in every set.
+const MAX_LOG_NFA: f64 = -2.0;
 
-/// The data of a robust estimation, in blocks for vector units.
+/// The data of a robust estimation, in blocks for SIMD.
 pub trait RansacData: Sync {
-    /// [`LANES`] data, coordinate by coordinate; missing data are NaN.
+    /// [`LANES`] data as a structure of arrays; padding lanes are NaN.
     type Block: Sync;
 
-    /// Number of data.
+    /// Returns the number of data.
     fn count(&self) -> usize;
 
-    /// All data, in random order.
+    /// Returns all data, in random order.
     fn blocks(&self) -> &[Self::Block];
 
-    /// The datum of each lane of the blocks; those of [`Estimator::RESAMPLES`] that are 0 are not asked.
+    /// Returns the index of the datum of each lane of the blocks. Only used if [`Estimator::INNER_SAMPLES`] is not 0.
     fn order(&self) -> &[u32] {
         &[]
     }
 
-    /// Up to some `most` data of the background model, wrong for certain: parts of different data put together. The number of false alarms comes from how
-    /// many of them fit a model. By default none, and no number of false alarms is computed.
-    fn background(&self, most: usize) -> Vec<Self::Block> {
-        let _ = most;
+    /// Returns about `max_count` data of the background model, outliers by construction: recombined parts of different
+    /// data. The number of false alarms is computed from the fraction of them that fits a model. By default none, and
+    /// no number of false alarms is computed.
+    fn background(&self, max_count: usize) -> Vec<Self::Block> {
+        let _ = max_count;
         Vec::new()
     }
 }
 
-/// The blocks of an estimator's data.
+/// The block type of an estimator's data.
 type BlockOf<E> = <<E as Estimator>::Data as RansacData>::Block;
 
-/// What a robust estimation has to know about a model.
+/// A model type: minimal solver, residuals and refinement.
 ///
-/// Distances are in the estimator's own (normalized) unit; [`Estimator::unit`] says how many of them a unit of the caller's is.
+/// Residuals are in the estimator's (normalized) unit; [`Estimator::threshold_scale`] is the scale from the caller's unit.
 pub trait Estimator: Sync {
     /// The model.
     type Model: Clone + Send + Sync;
-    /// What models are fitted to.
+    /// The data.
     type Data: RansacData;
-    /// A model made ready for [`Estimator::squared_residuals`].
+    /// A model in the form that [`Estimator::squared_residuals`] evaluates.
     type Kernel;
     /// Size of a minimal sample.
-    const SAMPLE: usize;
-    /// Dimension of the residuals of right data: 1 for distances from a line, 2 for distances from a point.
+    const SAMPLE_SIZE: usize;
+    /// Dimension of the residuals: the codimension of the model, 1 for distances from a line, 2 for distances from a
+    /// point.
     const RESIDUAL_DIMENSION: i32;
-    /// Samples drawn from the data near each new best model, in a row without a better one: for models whose minimal solutions are far off
-    /// and whose loss has many local minima. 0 by default.
-    const RESAMPLES: usize = 0;
+    /// Number of consecutive samples of inner RANSAC without improvement before it stops: for models whose minimal
+    /// solutions are inaccurate and whose loss has many local minima. 0 (the default) disables inner RANSAC.
+    const INNER_SAMPLES: usize = 0;
 
-    /// The data.
+    /// Returns the data.
     fn data(&self) -> &Self::Data;
 
-    /// Estimator units per unit of the caller's threshold.
-    fn unit(&self) -> f64;
+    /// Returns the scale from the caller's threshold to estimator units.
+    fn threshold_scale(&self) -> f64;
 
-    /// Appends the models through a minimal sample; none where the sample is degenerate or impossible.
+    /// Solves for the models of a minimal sample and appends them; none if the sample is degenerate or has no real
+    /// solution.
     fn solve(&self, sample: &[u32], models: &mut Vec<Self::Model>);
 
-    /// Makes a model ready.
+    /// Prepares a model for [`Estimator::squared_residuals`].
     fn kernel(&self, model: &Self::Model) -> Self::Kernel;
 
-    /// Squared residuals of a block. NaN means that the datum does not fit. Must be `#[inline(always)]`.
+    /// Computes the squared residuals of a block. NaN counts as an outlier. Must be `#[inline(always)]`.
     fn squared_residuals(kernel: &Self::Kernel, block: &BlockOf<Self>) -> [f32; LANES];
 
-    /// Lowers the sum of `scorer`'s loss, starting at `model`, by at most `iterations` steps.
+    /// Minimizes the sum of `scorer`'s loss, starting at `model`, in at most `iterations` steps.
     ///
-    /// `threshold` is in estimator units. `None` where no step could be made.
+    /// `threshold` is in estimator units. `None` if no step reduced the loss.
     fn refine<C: Scorer>(
         &self,
         model: &Self::Model,
@@ -95,7 +98,7 @@ pub trait Estimator: Sync {
         iterations: usize,
     ) -> Option<Self::Model>;
 
-    /// Appends models to try beside a new best `model`, made from `sample`, where that sample may be degenerate.
+    /// Appends alternative hypotheses to a new best `model` from `sample`, if that sample may be degenerate (DEGENSAC).
     ///
     /// `threshold` is in estimator units. By default, none.
     fn alternatives(&self, model: &Self::Model, sample: &[u32], threshold: f64, models: &mut Vec<Self::Model>) {
@@ -103,12 +106,12 @@ pub trait Estimator: Sync {
     }
 }
 
-/// How well a model fits.
+/// The score of a model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Score {
     /// Sum of losses, each 0 to 1.
     pub loss: f32,
-    /// Data within the threshold.
+    /// Number of data within the threshold.
     pub inliers: u32,
 }
 
@@ -116,29 +119,32 @@ impl Score {
     const WORST: Self = Self { loss: f32::INFINITY, inliers: 0 };
 }
 
-/// What [`ransac()`] found.
+/// Result of [`ransac()`].
 #[derive(Debug, Clone)]
 pub struct Consensus<M> {
-    /// The model of least loss, refined.
+    /// The refined model of minimum loss.
     pub model: M,
     /// Its score.
     pub score: Score,
-    /// Samples drawn.
+    /// Number of minimal samples drawn.
     pub iterations: usize,
-    /// log₁₀ of the number of false alarms: of models as well supported to be expected of so many data, all wrong; below −2. `None` where the estimator has no
-    /// background model ([`RansacData::background`]), or a sample is all there is.
+    /// log₁₀ of the number of false alarms: the expected number of models with as much support among as many outliers;
+    /// below −2. `None` if the estimator has no background model ([`RansacData::background`]), or there are no more
+    /// data than the minimal sample.
     pub log_nfa: Option<f64>,
 }
 
-/// Draws samples until one without outliers was drawn with the stated confidence, keeps the model of least loss and refines it.
+/// Estimates a model robustly: draws minimal samples until one is outlier-free with the given confidence, and refines
+/// the model of minimum loss.
 ///
-/// This is the loop behind every `estimate_…` function, for models of one's own: RANSAC (Fischler & Bolles 1981) with
-/// a smooth loss (MSAC, Torr & Zisserman 2000; MAGSAC++, Barath et al. 2020) and local optimization (LO-RANSAC, Chum et
-/// al. 2003) on the same loss. O(samples × data). Reports the samples drawn.
+/// Every `estimate_…` function uses this driver; it accepts custom models. RANSAC (Fischler & Bolles 1981) with a
+/// smooth loss (MSAC, Torr & Zisserman 2000; MAGSAC++, Barath et al. 2020) and local optimization (LO-RANSAC, Chum et
+/// al. 2003) on the same loss. O(samples × data). Progress is reported in samples.
 ///
 /// # Errors
 /// [`EstimateError::Option`], [`EstimateError::NotEnoughMatches`] with fewer data than a sample has, and
-/// [`EstimateError::NoConsensus`] where the number of false alarms of the best model is not below a hundredth; [`EstimateError::Cancelled`].
+/// [`EstimateError::NoConsensus`] if the number of false alarms of the best model is not below 0.01;
+/// [`EstimateError::Cancelled`].
 pub fn ransac<E: Estimator>(
     estimator: &E,
     options: &RobustOptions,
@@ -146,39 +152,40 @@ pub fn ransac<E: Estimator>(
 ) -> Result<Consensus<E::Model>, EstimateError> {
     options.check()?;
     match options.scoring {
-        Scoring::Msac => with_scorer(estimator, options, &Msac, progress),
-        Scoring::TukeyBiweight => with_scorer(estimator, options, &TukeyBiweight, progress),
-        Scoring::Other(scorer) => with_scorer(estimator, options, &scorer, progress),
+        Scoring::Msac => ransac_with_scorer(estimator, options, &Msac, progress),
+        Scoring::TukeyBiweight => ransac_with_scorer(estimator, options, &TukeyBiweight, progress),
+        Scoring::Other(scorer) => ransac_with_scorer(estimator, options, &scorer, progress),
     }
 }
 
-fn with_scorer<E: Estimator, C: Scorer>(
+fn ransac_with_scorer<E: Estimator, C: Scorer>(
     estimator: &E,
     options: &RobustOptions,
     scorer: &C,
     progress: &dyn Progress,
 ) -> Result<Consensus<E::Model>, EstimateError> {
     let n = estimator.data().count();
-    if n < E::SAMPLE {
-        return Err(EstimateError::NotEnoughMatches { got: n, needed: E::SAMPLE });
+    if n < E::SAMPLE_SIZE {
+        return Err(EstimateError::NotEnoughMatches { got: n, needed: E::SAMPLE_SIZE });
     }
-    let quality = Quality::new(estimator, scorer, options.threshold * estimator.unit());
+    let quality = Quality::new(estimator, scorer, options.threshold * estimator.threshold_scale());
     let sampler: &mut dyn Sampler = match options.sampling {
         Sampling::Uniform => &mut Uniform::new(n, options.seed),
-        Sampling::Prosac => &mut Prosac::new(n, E::SAMPLE, options.max_iterations, options.seed),
+        Sampling::Prosac => &mut Prosac::new(n, E::SAMPLE_SIZE, options.max_iterations, options.seed),
     };
-    let found = search(&quality, sampler, options, progress)?;
-    // The sample itself always fits.
-    let needed = if n > E::SAMPLE { E::SAMPLE + 1 } else { E::SAMPLE };
-    let none = |inliers, needed, iterations| EstimateError::NoConsensus { inliers, matches: n, needed, iterations };
-    let Some(mut found) = found else { return Err(none(0, needed, options.max_iterations)) };
-    let inliers = found.score.inliers as usize;
-    let alarms = false_alarms(&quality, &found.model);
+    let consensus = search(&quality, sampler, options, progress)?;
+    // The data of the minimal sample always fit.
+    let needed = if n > E::SAMPLE_SIZE { E::SAMPLE_SIZE + 1 } else { E::SAMPLE_SIZE };
+    let no_consensus =
+        |inliers, needed, iterations| EstimateError::NoConsensus { inliers, matches: n, needed, iterations };
+    let Some(mut consensus) = consensus else { return Err(no_consensus(0, needed, options.max_iterations)) };
+    let inliers = consensus.score.inliers as usize;
+    let alarms = false_alarms(&quality, &consensus.model);
     match &alarms {
-        Some(c) if c.log_nfa >= MOST_FALSE_ALARMS => return Err(none(inliers, c.needed, found.iterations)),
-        None if inliers < needed => return Err(none(inliers, needed, found.iterations)),
+        Some(a) if a.log_nfa >= MAX_LOG_NFA => return Err(no_consensus(inliers, a.needed, consensus.iterations)),
+        None if inliers < needed => return Err(no_consensus(inliers, needed, consensus.iterations)),
         _ => {}
     }
-    found.log_nfa = alarms.map(|c| c.log_nfa);
-    Ok(found)
+    consensus.log_nfa = alarms.map(|a| a.log_nfa);
+    Ok(consensus)
 }

@@ -1,12 +1,13 @@
-//! The quality of models: losses and inliers over all data, and the noise of the inliers.
+//! Scoring of models: loss and inlier count over all data, and the noise of the inliers.
 
 use super::{BlockOf, Estimator, RansacData, Score, Scorer};
 use crate::match_blocks::LANES;
 use fearless_simd::{Level, dispatch};
 
-/// Sum of losses over all blocks, or [`Score::WORST`] as soon as it is certain to exceed `limit`.
+/// Sums the losses over all blocks; returns [`Score::WORST`] as soon as the sum exceeds `limit`.
 ///
-/// Lanes are summed on their own in a fixed order and no product is fused, so every instruction set gives the same bits.
+/// Lanes are accumulated separately in a fixed order and no product is fused, so all instruction sets give identical
+/// results.
 #[inline(always)]
 fn score_blocks<E: Estimator, C: Scorer>(
     kernel: &E::Kernel,
@@ -16,7 +17,7 @@ fn score_blocks<E: Estimator, C: Scorer>(
     inverse_threshold2: f32,
     limit: f32,
 ) -> Score {
-    // The losses of the padding lanes, 1 each, are known from the start.
+    // The padding lanes contribute a loss of 1 each.
     let limit = limit + padding as f32;
     let mut losses = [0f32; LANES];
     let mut inliers = [0u32; LANES];
@@ -36,7 +37,7 @@ fn score_blocks<E: Estimator, C: Scorer>(
     Score { loss: sum(&losses) - padding as f32, inliers: inliers.iter().sum() }
 }
 
-/// Data with a residual within one over the root of `scale`, half of that, and so on.
+/// Counts the data with a residual below 1/√`scale`, half of that, a quarter of that, and so on.
 #[inline(always)]
 fn count_blocks<E: Estimator, const N: usize>(kernel: &E::Kernel, blocks: &[BlockOf<E>], scale: f32) -> [u32; N] {
     let mut counts = [[0u32; LANES]; N];
@@ -53,6 +54,7 @@ fn count_blocks<E: Estimator, const N: usize>(kernel: &E::Kernel, blocks: &[Bloc
     counts.map(|count| count.iter().sum())
 }
 
+/// Sums the lanes pairwise, in a fixed order.
 #[inline(always)]
 fn sum(lanes: &[f32; LANES]) -> f32 {
     let mut half = [0f32; LANES / 2];
@@ -62,7 +64,7 @@ fn sum(lanes: &[f32; LANES]) -> f32 {
     ((half[0] + half[4]) + (half[1] + half[5])) + ((half[2] + half[6]) + (half[3] + half[7]))
 }
 
-/// Scores models of one estimator against its data.
+/// Scores models of an estimator on its data.
 pub(super) struct Quality<'a, E: Estimator, C: Scorer> {
     pub(super) estimator: &'a E,
     pub(super) scorer: &'a C,
@@ -85,26 +87,27 @@ impl<'a, E: Estimator, C: Scorer> Quality<'a, E, C> {
         }
     }
 
-    /// The score, or [`Score::WORST`] where the loss is certain to exceed `limit`.
+    /// Computes the score of a model, or [`Score::WORST`] if the loss exceeds `limit`.
     pub(super) fn score(&self, model: &E::Model, limit: f32) -> Score {
         let kernel = self.estimator.kernel(model);
         let (blocks, padding, scale) = (self.estimator.data().blocks(), self.padding, self.inverse_threshold2);
         dispatch!(self.level, _simd => score_blocks::<E, C>(&kernel, blocks, padding, self.scorer, scale, limit))
     }
 
-    /// Data of `blocks` within `reach` thresholds, half of that, and so on.
-    pub(super) fn counts<const N: usize>(&self, model: &E::Model, blocks: &[BlockOf<E>], reach: f64) -> [u32; N] {
+    /// Counts the data of `blocks` within `radius` thresholds, half of that, a quarter of that, and so on.
+    pub(super) fn counts<const N: usize>(&self, model: &E::Model, blocks: &[BlockOf<E>], radius: f64) -> [u32; N] {
         let kernel = self.estimator.kernel(model);
-        let scale = self.inverse_threshold2 / (reach * reach) as f32;
+        let scale = self.inverse_threshold2 / (radius * radius) as f32;
         dispatch!(self.level, _simd => count_blocks::<E, N>(&kernel, blocks, scale))
     }
 
-    /// Standard deviation of the residuals of right data in thresholds, by expectation maximization on a mixture of a Gaussian and an even
-    /// background (MLESAC, Torr & Zisserman 2000); the background is what is found from 3 to 10 thresholds away. At most one threshold.
+    /// Estimates the standard deviation of the inliers' residuals in thresholds, by expectation maximization of a
+    /// mixture of a Gaussian and a uniform outlier density (MLESAC, Torr & Zisserman 2000). The outlier density is
+    /// measured from 3 to 10 thresholds. At most one threshold; `None` if the inliers are fewer than a minimal sample.
     pub(super) fn noise(&self, model: &E::Model) -> Option<f64> {
         let kernel = self.estimator.kernel(model);
         let scale = self.inverse_threshold2;
-        let near: Vec<f64> = self
+        let squares: Vec<f64> = self
             .estimator
             .data()
             .blocks()
@@ -113,21 +116,22 @@ impl<'a, E: Estimator, C: Scorer> Quality<'a, E, C> {
             .map(|r2| f64::from(r2 * scale))
             .filter(|u| *u < 100.0)
             .collect();
-        let shell = near.iter().filter(|u| **u >= 9.0).count() as f64;
-        let one = E::RESIDUAL_DIMENSION == 1;
-        let density = shell / if one { 14.0 } else { 91.0 * std::f64::consts::PI };
+        let outliers = squares.iter().filter(|u| **u >= 9.0).count() as f64;
+        // The volume of the shell from 3 to 10: an interval on both sides, or an annulus.
+        let is_scalar = E::RESIDUAL_DIMENSION == 1;
+        let outlier_density = outliers / if is_scalar { 14.0 } else { 91.0 * std::f64::consts::PI };
         let mut sigma2 = 0.25;
-        let mut inliers = 0.5 * near.len() as f64;
+        let mut inliers = 0.5 * squares.len() as f64;
         for _ in 0..12 {
             let peak = inliers * (std::f64::consts::TAU * sigma2).powf(-0.5 * f64::from(E::RESIDUAL_DIMENSION));
             let (mut sum, mut weights) = (0.0, 0.0);
-            for u in &near {
+            for u in &squares {
                 let g = peak * (-0.5 * u / sigma2).exp();
-                let w = g / (g + density + 1e-12);
+                let w = g / (g + outlier_density + 1e-12);
                 sum += w * u;
                 weights += w;
             }
-            if weights < E::SAMPLE as f64 {
+            if weights < E::SAMPLE_SIZE as f64 {
                 return None;
             }
             inliers = weights;

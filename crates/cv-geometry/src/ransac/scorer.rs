@@ -1,18 +1,19 @@
-//! The loss that models are judged by.
+//! Loss functions by which models are scored.
 
-/// A loss of `u = (residual / threshold)²`, from 0 at `u = 0` to 1 for outliers (and for NaN).
+/// A robust loss ρ(u) of `u = (residual / threshold)²`, from 0 at `u = 0` to 1 for outliers (and for NaN).
 pub trait Scorer: std::fmt::Debug + Sync {
-    /// The loss. Those of this crate are `#[inline(always)]`: they run inside vector code.
+    /// Evaluates the loss. The implementations of this crate are `#[inline(always)]`: they run inside vectorized loops.
     fn loss(&self, u: f32) -> f32;
 
-    /// The derivative of the loss by `u`, scaled to 1 at `u = 0`: the weight of a residual in iteratively reweighted least squares.
+    /// Returns the weight of a residual in iteratively reweighted least squares: the derivative of the loss with
+    /// respect to `u`, scaled to 1 at `u = 0`.
     fn weight(&self, u: f64) -> f64;
 
-    /// The loss is 1 from this `u` on.
+    /// Returns the `u` from which the loss is 1.
     fn cutoff(&self) -> f64;
 }
 
-/// A loss of another crate ([`Scoring::Other`](super::Scoring::Other)).
+/// A custom loss ([`Scoring::Other`](super::Scoring::Other)).
 impl Scorer for &dyn Scorer {
     fn loss(&self, u: f32) -> f32 {
         (**self).loss(u)
@@ -27,7 +28,7 @@ impl Scorer for &dyn Scorer {
     }
 }
 
-/// Plain least squares: for matches that are all taken to be right.
+/// Least squares, for inliers only.
 #[derive(Debug)]
 pub(crate) struct LeastSquaresLoss;
 
@@ -69,13 +70,14 @@ impl Scorer for Msac {
     }
 }
 
-/// Tukey's biweight that ends at 2.5 times the threshold: a smooth loss close to the average over noise levels
-/// that MAGSAC++ takes (Barath et al. 2020), without its table.
+/// Tukey's biweight with its cutoff at 2.5 thresholds: a smooth loss close to MAGSAC++'s marginalization over noise
+/// levels (Barath et al. 2020), without its lookup table.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct TukeyBiweight;
 
-/// The square of 2.5: of 1, 1.5, 2, 2.5 and 3.5 that with the least errors on generated fundamental matrices of general scenes and of planes
-/// with a fifth of the points off them (noise 0.1 to 2 px, 20 to 80 % wrong); homographies want 3.5, but hardly.
+/// The square of the cutoff, 2.5 thresholds. Of 1, 1.5, 2, 2.5 and 3.5, it has the smallest errors on synthetic
+/// fundamental matrices of general and dominantly planar scenes (noise 0.1 to 2 px, 20 to 80 % outliers); homographies
+/// are slightly better at 3.5.
 const BIWEIGHT_CUTOFF: f32 = 6.25;
 
 impl Scorer for TukeyBiweight {
@@ -106,13 +108,14 @@ mod tests {
         let c = scorer.cutoff() as f32;
         assert_eq!((scorer.loss(0.0), scorer.loss(c * 1.01), scorer.loss(f32::NAN)), (0.0, 1.0, 1.0));
         assert_eq!((scorer.weight(0.0), scorer.weight(f64::from(c) * 1.01)), (1.0, 0.0));
-        let mut last = 0.0;
+        let mut previous = 0.0;
         for i in 1..200 {
             let u = c * i as f32 / 200.0;
             let loss = scorer.loss(u);
-            assert!(loss > last);
-            last = loss;
-            // The weight is the derivative, up to one factor (found at 0): f32 differences over 1e-3 are good to 1e-3.
+            assert!(loss > previous);
+            previous = loss;
+            // The weight is the derivative up to a factor (the slope at 0): f32 differences over 1e-3 have an error of
+            // 1e-3.
             let slope = |u: f32| f64::from(scorer.loss(u + 1e-3 * c) - scorer.loss(u)) / f64::from(1e-3 * c);
             if u + 1e-3 * c < c {
                 let expected = scorer.weight(f64::from(u) + 5e-4 * f64::from(c)) * slope(0.0);
@@ -122,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn losses_rise_from_nothing_to_one_and_weights_are_their_slopes() {
+    fn losses_increase_from_zero_to_one_and_weights_are_their_derivatives() {
         check(&Msac);
         check(&TukeyBiweight);
     }

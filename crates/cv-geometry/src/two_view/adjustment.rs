@@ -1,6 +1,6 @@
-//! Points of two views, adjusted together with the pose and what is unknown of the cameras.
+//! Two-view bundle adjustment: points, relative pose, and unknown intrinsics.
 
-use super::neighbors::like_their_neighbors;
+use super::neighbors::depth_consistent_matches;
 use super::{Intrinsics, MatchedViews, PLAUSIBLE_FOCAL, TwoViewError, TwoViewGeometry, TwoViewOptions};
 use crate::{
     BundleOptions, BundleReport, RobustLoss, TwoViewBundle, adjust_two_views, essential_from_pose,
@@ -11,81 +11,84 @@ use cv_core::{Camera, Cancelled, Correspondence, DMatch, Matrix3, Point3, Pose, 
 /// A point of a [`TwoViewReconstruction`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TwoViewPoint {
-    /// Its match: index in [`TwoViewReconstruction::matches`].
+    /// Index of its match in [`TwoViewReconstruction::matches`].
     pub match_index: usize,
-    /// In the first camera's frame; the unit is the distance between the cameras.
+    /// In the first camera's frame; the unit is the baseline.
     pub position: Point3<f64>,
-    /// Root mean square of its reprojection errors in the two photographs, in pixels.
+    /// RMS of its reprojection errors in the two images, in pixels.
     pub reprojection: f64,
-    /// Angle between its two rays, in radians.
+    /// Parallax angle between its two rays, in radians.
     pub angle: f64,
-    /// Covariance of the position.
+    /// Covariance of the position, in squared baselines.
     pub covariance: Matrix3<f64>,
 }
 
-/// Cameras, relative pose and points of two views.
+/// A reconstruction of two views: cameras, relative pose and points.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TwoViewReconstruction {
-    /// The cameras, refined where they were not known.
+    /// The cameras; unknown intrinsics are refined.
     pub cameras: [Camera; 2],
     /// First camera frame to second; the translation has length one.
     pub pose: Pose,
-    /// Indices of the tentative matches that obey the epipolar geometry, ascending.
+    /// Indices of the tentative matches that are inliers of the epipolar geometry, ascending.
     pub inliers: Vec<usize>,
-    /// The matches that the points are from, by index of the keypoints: those of `inliers`, or those of [`TwoViewAdjustment::add_matches`].
+    /// The matches of the points, by keypoint index: those of `inliers`, or those of
+    /// [`TwoViewAdjustment::add_matches`].
     pub matches: Vec<DMatch>,
-    /// Matches of [`TwoViewAdjustment::add_matches`] that lie at the depth of their neighbors, those of `inliers` that came back included; 0
-    /// where none were added.
+    /// Number of matches of [`TwoViewAdjustment::add_matches`] that are depth-consistent with their neighbors,
+    /// including those of `inliers`; 0 if none were added.
     pub guided: usize,
-    /// The points that were kept, in the order of `matches`.
+    /// The accepted points, in the order of `matches`.
     pub points: Vec<TwoViewPoint>,
-    /// Root mean square reprojection error of the points, over both photographs, in pixels.
+    /// RMS reprojection error of the points over both images, in pixels.
     pub reprojection_rms: f64,
-    /// Median angle between the two rays of a point, in radians.
+    /// Median parallax angle, in radians.
     pub median_angle: f64,
-    /// Standard deviations of the rotation and of the direction of the translation, in radians: the larger of what the residuals say, with whatever is
-    /// uncertain of the lens, and of what leaving out one part of the photograph after the other does ([`jackknife_pose_deviation`]).
+    /// Standard deviations of the rotation and of the direction of the translation, in radians: the larger of the one
+    /// from the residuals, including the uncertainty of the intrinsics, and the block jackknife's
+    /// ([`jackknife_pose_deviation`]).
     pub pose_deviation: [f64; 2],
-    /// The same if focal length and radial distortion were exactly what was found: what is left is the motion's own.
+    /// The same conditional on the estimated focal length and radial distortion.
     pub pose_deviation_given_lens: [f64; 2],
-    /// Relative standard deviation of the focal length; 0 where the cameras were given.
+    /// Relative standard deviation of the focal length; 0 for known cameras.
     pub focal_deviation: f64,
-    /// Share of the inliers that one homography explains.
-    pub planar_share: f64,
+    /// Number of inliers of one homography relative to `inliers`.
+    pub planar_ratio: f64,
 }
 
 impl TwoViewReconstruction {
-    /// The fundamental matrix between undistorted pixels.
+    /// Computes the fundamental matrix between undistorted pixels.
     pub fn fundamental(&self) -> Matrix3<f64> {
         fundamental_of(&self.cameras, &self.pose)
     }
 
-    /// An estimated focal length as a share of the photograph's longer side, where it is none that photographs usually have (0.4 to 3): matches that hardly show
-    /// perspective, or wrong ones, lead there.
+    /// Returns an estimated focal length, relative to the longer image side, if it is outside the plausible range (0.4
+    /// to 3): an effect of weak perspective or of outliers.
     pub fn unusual_focal(&self) -> Option<f64> {
         let Camera { fx, width, height, .. } = self.cameras[0];
-        let share = fx / width.max(height) as f64;
+        let ratio = fx / width.max(height) as f64;
         let (low, high) = PLAUSIBLE_FOCAL;
-        (self.focal_deviation > 0.0 && !(low..=high).contains(&share)).then_some(share)
+        (self.focal_deviation > 0.0 && !(low..=high).contains(&ratio)).then_some(ratio)
     }
 }
 
-/// Two views whose points, pose and (where they are not known) focal length and radial distortion are adjusted to their matches.
+/// The bundle adjustment of two views: points, pose and (if unknown) focal length and radial distortion.
 #[derive(Debug, Clone)]
 pub struct TwoViewAdjustment<'a> {
     views: MatchedViews<'a>,
     geometry: TwoViewGeometry,
     options: TwoViewOptions,
     fit: Fit,
-    stability: [f64; 2],
+    jackknife_deviation: [f64; 2],
     guided: usize,
 }
 
 impl<'a> TwoViewAdjustment<'a> {
-    /// Triangulates the matches that agree with `geometry`, and adjusts.
+    /// Triangulates the inliers of `geometry`, and adjusts.
     ///
     /// # Errors
-    /// [`TwoViewError::TooFewInliers`] where nothing can be triangulated; [`TwoViewError::MatchOutOfRange`]; [`TwoViewError::Cancelled`].
+    /// [`TwoViewError::TooFewInliers`] if no match can be triangulated; [`TwoViewError::MatchOutOfRange`];
+    /// [`TwoViewError::Cancelled`].
     pub fn new(
         views: &MatchedViews<'a>,
         geometry: TwoViewGeometry,
@@ -97,62 +100,63 @@ impl<'a> TwoViewAdjustment<'a> {
         let pairs = views.correspondences(&matches)?;
         let fit = Fit::new(&matches, &pairs, geometry.cameras, geometry.pose, views, options, progress)?
             .ok_or_else(|| too_few(0, views, options))?;
-        // Before further matches: those agree with the pose because they were looked for where it says.
+        // Before guided matches are added: those are biased to the pose, along whose epipolar lines they were searched.
         let TwoViewBundle { cameras, pose, .. } = &fit.bundle;
         let (normalized, unit) = normalize_matches(&fit.observed, &cameras[0], &cameras[1]);
-        let stability = jackknife_pose_deviation(pose, &normalized, options.robust.threshold * unit, progress)?;
-        Ok(Self { views: *views, geometry, options: *options, fit, stability, guided: 0 })
+        let jackknife_deviation =
+            jackknife_pose_deviation(pose, &normalized, options.robust.threshold * unit, progress)?;
+        Ok(Self { views: *views, geometry, options: *options, fit, jackknife_deviation, guided: 0 })
     }
 
-    /// The cameras as adjusted.
+    /// Returns the adjusted cameras.
     pub fn cameras(&self) -> &[Camera; 2] {
         &self.fit.bundle.cameras
     }
 
-    /// First camera frame to second, as adjusted.
+    /// Returns the adjusted relative pose, first camera frame to second.
     pub fn pose(&self) -> &Pose {
         &self.fit.bundle.pose
     }
 
-    /// The fundamental matrix between undistorted pixels.
+    /// Computes the fundamental matrix between undistorted pixels.
     pub fn fundamental(&self) -> Matrix3<f64> {
         fundamental_of(self.cameras(), self.pose())
     }
 
-    /// Takes matches that were looked for along the epipolar lines (guided matching) in place of the ones so far, where more of them lie at the depth of their
-    /// neighbors than there were inliers, and adjusts again. O(more · matches).
+    /// Replaces the matches by guided matches (searched along the epipolar lines) and adjusts again, if more of them
+    /// are depth-consistent with their neighbors than there were inliers. O(`guided` × matches).
     ///
     /// # Errors
     /// [`TwoViewError::MatchOutOfRange`]; [`TwoViewError::Cancelled`].
-    pub fn add_matches(&mut self, more: &[DMatch], progress: &dyn Progress) -> Result<(), TwoViewError> {
-        let pairs = self.views.correspondences(more)?;
+    pub fn add_matches(&mut self, guided: &[DMatch], progress: &dyn Progress) -> Result<(), TwoViewError> {
+        let pairs = self.views.correspondences(guided)?;
         let TwoViewBundle { cameras, pose, points } = &self.fit.bundle;
-        let kept = like_their_neighbors(&pairs, &self.fit.observed, points, cameras, pose, progress)?;
+        let consistent = depth_consistent_matches(&pairs, &self.fit.observed, points, cameras, pose, progress)?;
         progress.report("adjust", 0, 1)?;
-        self.guided = kept.len();
-        // Fewer would mean that the first matches were not what the lines say.
-        if kept.len() > self.geometry.inliers.len() {
-            let (matches, pairs): (Vec<_>, Vec<_>) = kept.iter().map(|&i| (more[i], pairs[i])).unzip();
-            if let Some(better) = Fit::new(&matches, &pairs, *cameras, *pose, &self.views, &self.options, progress)? {
-                self.fit = better;
+        self.guided = consistent.len();
+        // Fewer would contradict the first matches.
+        if consistent.len() > self.geometry.inliers.len() {
+            let (matches, pairs): (Vec<_>, Vec<_>) = consistent.iter().map(|&i| (guided[i], pairs[i])).unzip();
+            if let Some(fit) = Fit::new(&matches, &pairs, *cameras, *pose, &self.views, &self.options, progress)? {
+                self.fit = fit;
             }
         }
         Ok(())
     }
 
-    /// Leaves out points that are wrong or far, and refuses what is too uncertain.
+    /// Filters points by reprojection error and parallax, and rejects uncertain reconstructions.
     ///
     /// # Errors
-    /// [`TwoViewError`]: a focal length that cannot be told, too few points, little parallax, an uncertain pose.
+    /// [`TwoViewError`]: too few points, low parallax, an uncertain pose.
     pub fn finish(self) -> Result<TwoViewReconstruction, TwoViewError> {
-        let Self { views, geometry, options, fit, stability, guided } = self;
+        let Self { views, geometry, options, fit, jackknife_deviation, guided } = self;
         let Fit { bundle, matches, observed, report } = fit;
-        let pose_deviation = [0, 1].map(|i| stability[i].max(report.pose_deviation[i]));
-        let pose_deviation_given_lens = [0, 1].map(|i| stability[i].max(report.pose_deviation_given_lens[i]));
+        let pose_deviation = [0, 1].map(|i| jackknife_deviation[i].max(report.pose_deviation[i]));
+        let pose_deviation_given_lens = [0, 1].map(|i| jackknife_deviation[i].max(report.pose_deviation_given_lens[i]));
         let focal_deviation = report.focal_deviation.max(geometry.focal_range / 2.0);
         let mut points = Vec::new();
         for (match_index, (point, m)) in bundle.points.iter().zip(&observed).enumerate() {
-            let Some(errors) = reprojection(&bundle, point, m) else { continue };
+            let Some(errors) = reprojection_errors(&bundle, point, m) else { continue };
             let angle = parallax_angle(point, &bundle.pose);
             if angle >= options.min_angle && errors.iter().all(|e| *e <= options.max_reprojection) {
                 points.push(TwoViewPoint {
@@ -196,7 +200,7 @@ impl<'a> TwoViewAdjustment<'a> {
             pose_deviation,
             pose_deviation_given_lens,
             focal_deviation,
-            planar_share: geometry.planar_share,
+            planar_ratio: geometry.planar_ratio,
         })
     }
 }
@@ -205,23 +209,23 @@ fn too_few(inliers: usize, views: &MatchedViews<'_>, options: &TwoViewOptions) -
     TwoViewError::TooFewInliers { inliers, matches: views.matches.len(), needed: options.min_inliers }
 }
 
-/// The fundamental matrix between undistorted pixels.
+/// Computes the fundamental matrix between undistorted pixels.
 fn fundamental_of([a, b]: &[Camera; 2], pose: &Pose) -> Matrix3<f64> {
     b.inverse_matrix().transpose() * essential_from_pose(pose) * a.inverse_matrix()
 }
 
-/// A bundle, what it was fitted to, and how well.
+/// An adjusted bundle with its observations and report.
 #[derive(Debug, Clone)]
 struct Fit {
     bundle: TwoViewBundle,
-    /// The matches of the points, and their pixels.
+    /// The matches of the points, and their coordinates in pixels.
     matches: Vec<DMatch>,
     observed: Vec<Correspondence>,
     report: BundleReport,
 }
 
 impl Fit {
-    /// Triangulates and adjusts; `None` where nothing can be triangulated.
+    /// Triangulates and adjusts; `None` if no match can be triangulated.
     fn new(
         matches: &[DMatch],
         pairs: &[Correspondence],
@@ -237,10 +241,10 @@ impl Fit {
             ..BundleOptions::default()
         };
         let (normalized, _) = normalize_matches(pairs, &cameras[0], &cameras[1]);
-        let (mut seen, mut observed, mut points) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut triangulated, mut observed, mut points) = (Vec::new(), Vec::new(), Vec::new());
         for ((m, pair), n) in matches.iter().zip(pairs).zip(&normalized) {
             if let Ok(point) = triangulate(n, &pose) {
-                seen.push(*m);
+                triangulated.push(*m);
                 observed.push(*pair);
                 points.push(point);
             }
@@ -248,25 +252,26 @@ impl Fit {
         let mut bundle = TwoViewBundle { cameras, pose, points };
         let Some(mut report) = adjust_two_views(&mut bundle, &observed, &settings, progress)? else { return Ok(None) };
         if settings.focal.is_some() {
-            // Once more with the noise that these matches have, for which a pixel may be wide: what is near but wrong shows in the focal length first.
-            let errors = bundle.points.iter().zip(&observed).filter_map(|(x, m)| reprojection(&bundle, x, m));
+            // A second adjustment with the scale of the loss set to the estimated noise: with too wide a loss, outliers
+            // with small residuals bias the focal length.
+            let errors = bundle.points.iter().zip(&observed).filter_map(|(x, m)| reprojection_errors(&bundle, x, m));
             let mut errors: Vec<f64> = errors.flatten().collect();
             let median = median(&mut errors).unwrap_or(1.0);
-            // The median of an absolute normal error is 0.6745 deviations; Cauchy's loss is 95 % as good as least squares on such errors at 2.385 of them (Huber & Ronchetti,
-            // "Robust statistics", 2009).
+            // For normal errors, the median absolute error is 0.6745 σ, and Cauchy's loss has 95 % efficiency at a
+            // scale of 2.385 σ (Huber & Ronchetti, "Robust statistics", 2009).
             let loss = RobustLoss::Cauchy { scale: (2.385 / 0.6745 * median).clamp(0.1, 1.0) };
-            let again = BundleOptions { loss, ..settings };
-            report = match adjust_two_views(&mut bundle, &observed, &again, progress)? {
+            let rescaled = BundleOptions { loss, ..settings };
+            report = match adjust_two_views(&mut bundle, &observed, &rescaled, progress)? {
                 Some(report) => report,
                 None => return Ok(None),
             };
         }
-        Ok(Some(Self { bundle, matches: seen, observed, report }))
+        Ok(Some(Self { bundle, matches: triangulated, observed, report }))
     }
 }
 
-/// Reprojection errors in pixels in both photographs; `None` behind a camera.
-fn reprojection(bundle: &TwoViewBundle, point: &Point3<f64>, m: &Correspondence) -> Option<[f64; 2]> {
+/// Computes the reprojection errors in both images, in pixels; `None` behind a camera.
+fn reprojection_errors(bundle: &TwoViewBundle, point: &Point3<f64>, m: &Correspondence) -> Option<[f64; 2]> {
     let first = bundle.cameras[0].project(point)?;
     let second = bundle.cameras[1].project(&bundle.pose.transform(point))?;
     Some([(first - m.a).norm(), (second - m.b).norm()])

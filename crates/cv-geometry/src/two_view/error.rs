@@ -1,4 +1,4 @@
-//! Why two views could not be reconstructed.
+//! Errors of two-view reconstruction.
 
 use crate::EstimateError;
 use cv_core::{CameraError, Cancelled};
@@ -7,125 +7,131 @@ use cv_core::{CameraError, Cancelled};
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum TwoViewError {
-    /// A match refers to a keypoint that there is not.
-    #[error("match {index} is between keypoints {query} and {train} of {} and {}", keypoints.0, keypoints.1)]
+    /// A match has a keypoint index out of range.
+    #[error("match {index} has keypoint indices {query} and {train}, but there are only {} and {} keypoints", keypoints.0, keypoints.1)]
     MatchOutOfRange {
-        /// Which match.
+        /// Index of the match.
         index: usize,
-        /// Its keypoint in the first photograph.
+        /// Its keypoint index in the first image.
         query: u32,
-        /// Its keypoint in the second photograph.
+        /// Its keypoint index in the second image.
         train: u32,
-        /// Numbers of keypoints.
+        /// Numbers of keypoints of the two images.
         keypoints: (usize, usize),
     },
-    /// A camera is not one.
+    /// A camera has invalid parameters.
     #[error("camera {index}: {source}")]
     Camera {
-        /// 1 or 2.
+        /// Number of the camera, 1 or 2.
         index: usize,
-        /// Why.
+        /// Reason.
         source: CameraError,
     },
-    /// A camera is not that of its photograph.
-    #[error("camera {index} takes pictures of {camera:?} px, but its photograph is of {photo:?} px")]
+    /// The image sizes of a camera and its image differ.
+    #[error("camera {index} is for images of {camera:?} px, but its image has {photo:?} px")]
     CameraSize {
-        /// 1 or 2.
+        /// Number of the camera, 1 or 2.
         index: usize,
-        /// Width and height by the camera.
+        /// Width and height of the camera.
         camera: (usize, usize),
-        /// Width and height of the photograph.
+        /// Width and height of the image.
         photo: (usize, usize),
     },
-    /// Too few tentative matches.
+    /// There are too few tentative matches.
     #[error("{got} matches are too few: at least {needed} are needed")]
     TooFewMatches {
-        /// Matches found.
+        /// Number of matches.
         got: usize,
-        /// Matches needed.
+        /// Minimum number of matches.
         needed: usize,
     },
-    /// Too few matches agree on a motion.
+    /// The best relative pose has too few inliers.
     #[error("only {inliers} of {matches} matches ({:.0} %) agree on a camera motion; at least {needed} must", 100.0 * *inliers as f64 / *matches as f64)]
     TooFewInliers {
-        /// Matches that agree.
+        /// Number of inliers.
         inliers: usize,
-        /// Matches.
+        /// Number of matches.
         matches: usize,
-        /// Matches that must agree.
+        /// Minimum number of inliers.
         needed: usize,
     },
-    /// The camera turned without moving.
-    #[error("the camera only turned, or hardly moved: a rotation by {degrees:.1} degrees explains {:.0} % of the matches", 100.0 * share)]
+    /// The motion is a pure rotation.
+    #[error("the camera only turned, or hardly moved: a rotation by {degrees:.1} degrees explains {:.0} % of the matches", 100.0 * fraction)]
     PureRotation {
-        /// Share of the inliers that the rotation explains.
-        share: f64,
-        /// Its angle in degrees.
+        /// Fraction of the inliers that fit the rotation.
+        #[cfg_attr(feature = "serde", serde(rename = "share"))]
+        fraction: f64,
+        /// Angle of the rotation in degrees.
         degrees: f64,
     },
-    /// All points lie on one plane.
-    #[error("the scene is one plane: a homography explains {:.0} % of the matches", 100.0 * share)]
+    /// The scene is planar.
+    #[error("the scene is one plane: a homography explains {:.0} % of the matches", 100.0 * fraction)]
     Planar {
-        /// Share of the inliers that the homography explains.
-        share: f64,
+        /// Fraction of the inliers that fit the homography.
+        #[cfg_attr(feature = "serde", serde(rename = "share"))]
+        fraction: f64,
     },
-    /// A homography explains the matches, and the focal length, by which a plane and a turn could be told apart, is unknown.
-    #[error("the scene is one plane, or the camera only turned: a homography explains {:.0} % of the matches", 100.0 * share)]
-    PlanarOrTurned {
-        /// Share of the inliers that the homography explains.
-        share: f64,
+    /// A homography fits the matches; a planar scene and a pure rotation cannot be distinguished, since the focal
+    /// length is unknown.
+    #[error("the scene is one plane, or the camera only turned: a homography explains {:.0} % of the matches", 100.0 * fraction)]
+    #[cfg_attr(feature = "serde", serde(rename = "PlanarOrTurned"))]
+    PlanarOrPureRotation {
+        /// Fraction of the inliers that fit the homography.
+        #[cfg_attr(feature = "serde", serde(rename = "share"))]
+        fraction: f64,
     },
-    /// The rays to the points are nearly parallel.
+    /// The parallax is too small.
     #[error(
         "too little parallax: the median angle between the two rays of a point is {degrees:.2} degrees; {needed:.2} are needed"
     )]
     LittleParallax {
-        /// Median angle in degrees.
+        /// Median parallax angle in degrees.
         degrees: f64,
-        /// Angle needed, in degrees.
+        /// Minimum median parallax angle in degrees.
         needed: f64,
     },
-    /// The matches do not tell the motion well enough.
+    /// The relative pose is too uncertain.
     #[error(
-        "the motion is uncertain: {degrees:.1} degrees in its direction, {allowed:.1} are allowed ({inliers} of {matches} matches agree)"
+        "the camera motion is uncertain: {degrees:.1} degrees in its direction, {allowed:.1} are allowed ({inliers} of {matches} matches agree)"
     )]
     UncertainPose {
-        /// Standard deviation of the direction, or angle to another direction that fits as well, in degrees.
+        /// Standard deviation of the direction of the translation, or angle to another direction that fits as well, in
+        /// degrees.
         degrees: f64,
-        /// Angle allowed, in degrees.
+        /// Maximum angle in degrees.
         allowed: f64,
-        /// Matches that agree.
+        /// Number of inliers.
         inliers: usize,
-        /// Matches.
+        /// Number of matches.
         matches: usize,
     },
-    /// Another focal length explains the matches far better than the one that was given.
+    /// Another focal length fits the matches significantly better than the given one.
     #[error(
         "the focal length given, {given:.0} px, fits the matches worse than one of about {better:.0} px, by {deviations:.0} standard deviations"
     )]
     WrongFocal {
-        /// Focal length given, in pixels.
+        /// Given focal length in pixels.
         given: f64,
-        /// One that fits better, in pixels.
+        /// Focal length with a better fit, in pixels.
         better: f64,
-        /// By how much better, in standard deviations of the difference.
+        /// Difference of the losses in standard deviations of it.
         deviations: f64,
-        /// Matches that agree by the better one.
+        /// Number of inliers with the better one.
         inliers: usize,
     },
-    /// A focal length that no photograph has.
+    /// The given focal length is implausible for any lens.
     #[error(
-        "the focal length given, {given:.0} px, is none of a photograph of this size: {low:.0} to {high:.0} px are"
+        "the focal length given, {given:.0} px, is implausible for a photograph of this size: it must be in pixels, from {low:.0} to {high:.0} px"
     )]
     ImplausibleFocal {
-        /// Focal length given, in pixels.
+        /// Given focal length in pixels.
         given: f64,
-        /// That of a field of view of 136 degrees, in pixels.
+        /// Minimum: a field of view of 136 degrees, in pixels.
         low: f64,
-        /// That of a field of view of 3 degrees, in pixels.
+        /// Maximum: a field of view of 3 degrees, in pixels.
         high: f64,
     },
-    /// The search for a model failed.
+    /// The estimation of a model failed.
     #[error(transparent)]
     Estimate(EstimateError),
     /// The job was stopped by its progress callback.
@@ -134,9 +140,10 @@ pub enum TwoViewError {
 }
 
 impl TwoViewError {
-    /// Refuses a focal length (pixels) that no lens of a photograph has, whose longer side is of `side` pixels.
+    /// Checks that a focal length in pixels is plausible for an image whose longer side is `side` pixels.
     pub(super) fn check_focal(given: f64, side: usize) -> Result<(), Self> {
-        // Fields of view along the longer side of 136 degrees, beyond which lenses are fisheyes, and of 3 degrees: 690 mm before a film of 36 mm.
+        // Fields of view along the longer side of 136 degrees, beyond which lenses are fisheyes, and of 3 degrees: 690
+        // mm for 35 mm film.
         let [low, high] = [68f64, 1.5].map(|half| 0.5 * side as f64 / half.to_radians().tan());
         if (low..=high).contains(&given) { Ok(()) } else { Err(Self::ImplausibleFocal { given, low, high }) }
     }
@@ -147,9 +154,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_focal_length_of_millimeters_is_told() {
+    fn implausible_focal_lengths_are_rejected() {
         assert_eq!(TwoViewError::check_focal(1000.0, 1200), Ok(()));
-        // A millimeter's number, and a telescope's.
+        // A focal length in millimeters, and that of a telescope.
         for given in [35.0, 60_000.0] {
             let error = TwoViewError::check_focal(given, 1200).unwrap_err();
             assert!(

@@ -1,6 +1,6 @@
-//! The lens that the matches themselves tell: focal length and radial distortion.
+//! Self-calibration from the matches of two views: focal length and radial distortion.
 
-use super::{PLAUSIBLE_FOCAL, TwoViewError, usual_focal};
+use super::{PLAUSIBLE_FOCAL, TwoViewError, log_normal_focal_prior};
 use crate::{
     EstimateError, RobustOptions, Scorer, SharedFocalPose, TukeyBiweight, essential_from_pose, estimate_relative_pose,
     estimate_shared_focal_pose, normalize_matches, refine_relative_pose, refine_shared_focal_pose, sampson,
@@ -8,136 +8,143 @@ use crate::{
 use cv_core::{Camera, Cancelled, Correspondence, Distortion, Matrix3, Pose, Progress, Stage};
 use rayon::prelude::*;
 
-/// Focal lengths in pixels, and by how much of their distance from the middle the corners are displaced.
+/// Focal lengths in pixels, and the radial distortion as the relative displacement of the image corners.
 #[derive(Clone, Copy)]
 struct Lens {
     focal: [f64; 2],
     distortion: f64,
 }
 
-/// A lens, the pose that goes with it, and what each match loses by them.
+/// A lens, its refined pose, and the loss of each match.
 #[derive(Clone)]
-struct Trial {
+struct LensHypothesis {
     lens: Lens,
     pose: Pose,
     losses: Vec<f64>,
-    sum: f64,
+    total_loss: f64,
 }
 
-/// What [`find_lens`] found.
-pub(super) struct Found {
+/// Result of [`find_lens`].
+pub(super) struct LensEstimate {
     pub(super) cameras: [Camera; 2],
-    /// Largest relative change of the focal length that the matches do not exclude; 0 where it was given.
+    /// Maximum relative change of the focal length that the matches do not exclude; 0 if it was given.
     pub(super) focal_range: f64,
-    /// Where the focal length was given and is far from one that explains the matches much better.
-    pub(super) rival: Option<Rival>,
+    /// A focal length far from the given one that fits the matches significantly better.
+    pub(super) alternative: Option<AlternativeFocal>,
 }
 
-/// Another focal length than the one given.
-pub(super) struct Rival {
+/// A focal length that fits better than the given one.
+pub(super) struct AlternativeFocal {
     /// In pixels.
     pub(super) focal: f64,
-    /// By how many standard deviations it fits better.
+    /// Difference of the losses in standard deviations of it.
     pub(super) deviations: f64,
-    /// Matches within the threshold.
+    /// Number of matches within the threshold.
     pub(super) inliers: usize,
 }
 
-/// Standard deviations that leave no doubt: one chance in thirty thousand.
-const BEYOND_DOUBT: f64 = 4.0;
-/// A given focal length this far from the best one, as a logarithm (half as long again), is no inaccuracy of EXIF but another lens, a cropped picture, or another unit.
-const FAR: f64 = 0.405;
+/// Significance level of a contradiction, in standard deviations: a probability of 1 in 30 000.
+const SIGNIFICANCE: f64 = 4.0;
+/// Minimum absolute log ratio (a factor of 1.5) of an alternative to the given focal length: more than the inaccuracy
+/// of EXIF, so another lens, a cropped image, or another unit.
+const MIN_LOG_FOCAL_RATIO: f64 = 0.405;
 
-/// Displacements of the corners that are tried: from the barrel of a wide angle to the pincushion of a long lens. The steps between them are
-/// narrowed down.
-const DISTORTIONS: [f64; 5] = [-0.09, -0.06, -0.03, 0.0, 0.03];
-/// Focal lengths as shares of the longer side that are tried where the matches lead to none that photographs have: a factor of a half apart.
-pub(super) const USUAL_FOCALS: [f64; 5] = [0.5, 0.75, 1.1, 1.7, 2.5];
-/// Displacements that a search may end at: a fisheye distorts more, and is no lens for this model. Without an end, forward motion, whose flow a
-/// distorting lens can imitate, leads on and on.
+/// Grid of relative corner displacements: from the barrel distortion of wide-angle lenses to the pincushion distortion
+/// of telephoto lenses. The best one is refined.
+const DISTORTION_GRID: [f64; 5] = [-0.09, -0.06, -0.03, 0.0, 0.03];
+/// Grid of focal lengths relative to the longer image side, with a ratio of 1.5, for matches whose best focal length is
+/// implausible.
+pub(super) const FOCAL_GRID: [f64; 5] = [0.5, 0.75, 1.1, 1.7, 2.5];
+/// Bounds of the relative corner displacement: fisheye lenses, with more distortion, do not fit this model. Without
+/// bounds, the search diverges for forward motion, whose flow radial distortion can imitate.
 const DISTORTION_RANGE: (f64, f64) = (-0.3, 0.15);
-/// Most steps of a search; from the grid to the optimum it takes ten or so.
+/// Maximum number of steps of a line search; about ten are typical.
 const MAX_STEPS: usize = 40;
-/// Samples for each of them: enough to find a pose among half wrong matches, of five (the focal length given) or six; the right lens needs
-/// the fewest.
-const SAMPLES: [usize; 2] = [300, 800];
+/// Maximum number of RANSAC samples for each lens, for five-point (known focal length) and six-point samples: enough
+/// for an outlier ratio of 0.5.
+const MAX_SAMPLES: [usize; 2] = [300, 800];
 
-/// The lens whose best pose leaves the least robust Sampson error, with the focal lengths of `base` or, where that is `free`, of all. Distortion is left out
-/// where it makes no significant difference; the cameras have a radial model all the same. `None` where no lens has a pose. O(matches) for each of some hundred trials and
-/// some thousand samples.
+/// Finds the lens whose best pose has the minimum robust Sampson error, with the focal lengths of `base`, or any focal
+/// length if `is_focal_free`. Distortion is zero unless it makes a significant difference; the cameras have a radial
+/// model in any case. `None` if no lens has a pose. O(matches) for each of about a hundred hypotheses and a thousand
+/// samples.
 pub(super) fn find_lens(
     pairs: &[Correspondence],
     base: [Camera; 2],
-    free: bool,
+    is_focal_free: bool,
     robust: &RobustOptions,
     progress: &dyn Progress,
-) -> Result<Option<Found>, Cancelled> {
-    let stage = Stage::new(progress, "lens", DISTORTIONS.len() + AFTERWARDS)?;
+) -> Result<Option<LensEstimate>, Cancelled> {
+    let stage = Stage::new(progress, "lens", DISTORTION_GRID.len() + REFINEMENT_STAGES)?;
     let search = Search { pairs, base, robust, stage: &stage };
-    let searched = |distortion: &f64| -> Result<Option<Trial>, Cancelled> {
+    let search_distortion = |distortion: &f64| -> Result<Option<LensHypothesis>, Cancelled> {
         let given = Lens { focal: base.map(|camera| camera.fx), distortion: *distortion };
-        let trial = if free { search.searched_free(*distortion) } else { search.searched(given) }?;
+        let hypothesis =
+            if is_focal_free { search.search_pose_and_focal(*distortion) } else { search.search_pose(given) }?;
         stage.add(1)?;
-        Ok(trial)
+        Ok(hypothesis)
     };
-    let trials: Vec<Option<Trial>> = DISTORTIONS.par_iter().map(searched).collect::<Result<_, _>>()?;
-    let mut trials: Vec<Trial> = trials.into_iter().flatten().collect();
-    let mut found = match least(&trials) {
+    let hypotheses: Vec<Option<LensHypothesis>> =
+        DISTORTION_GRID.par_iter().map(search_distortion).collect::<Result<_, _>>()?;
+    let mut hypotheses: Vec<LensHypothesis> = hypotheses.into_iter().flatten().collect();
+    let mut best = match min_loss(&hypotheses) {
         Some(first) => {
-            // From the best one's pose too: a search now and then ends elsewhere.
-            for trial in &mut trials {
+            // Refined from the best pose too: some searches end in other minima.
+            for hypothesis in &mut hypotheses {
                 stage.check()?;
-                let other = search.near(&first, trial.lens.distortion, free);
-                if other.sum < trial.sum {
-                    *trial = other;
+                let other = search.refine_with_distortion(&first, hypothesis.lens.distortion, is_focal_free);
+                if other.total_loss < hypothesis.total_loss {
+                    *hypothesis = other;
                 }
             }
-            let pinhole = trials.iter().find(|t| t.lens.distortion == 0.0).cloned();
-            let distorted = search.narrow(least(&trials).unwrap_or(first), free)?;
+            let pinhole = hypotheses.iter().find(|t| t.lens.distortion == 0.0).cloned();
+            let distorted = search.refine_distortion(min_loss(&hypotheses).unwrap_or(first), is_focal_free)?;
             Some(match pinhole {
-                Some(pinhole) if !significantly_worse(&pinhole, &distorted) => pinhole,
+                Some(pinhole) if !is_significantly_worse(&pinhole, &distorted) => pinhole,
                 _ => distorted,
             })
         }
         None => None,
     };
     stage.add(1)?;
-    if free {
-        // A focal length that photographs hardly have must be needed.
-        let plausible = |best: &Trial| is_plausible(best.lens.focal[0], &base[0]);
-        if !found.as_ref().is_some_and(plausible) {
-            let usual = search.of_usual_focal()?;
+    if is_focal_free {
+        // An implausible focal length is accepted only if it fits significantly better than the plausible ones.
+        let has_plausible_focal = |best: &LensHypothesis| is_plausible(best.lens.focal[0], &base[0]);
+        if !best.as_ref().is_some_and(has_plausible_focal) {
+            let plausible = search.search_focal_grid()?;
             let is_possible =
-                |free: &Trial| TwoViewError::check_focal(free.lens.focal[0], longer_side(&base[0])).is_ok();
-            found = match (found.filter(is_possible), usual) {
-                (Some(free), Some(usual)) if worse_by(&usual, &free) > doubt(free.lens.focal[0], &base[0]) => {
-                    Some(free)
+                |h: &LensHypothesis| TwoViewError::check_focal(h.lens.focal[0], longer_side(&base[0])).is_ok();
+            best = match (best.filter(is_possible), plausible) {
+                (Some(any), Some(plausible))
+                    if loss_difference_sigmas(&plausible, &any) > required_sigmas(any.lens.focal[0], &base[0]) =>
+                {
+                    Some(any)
                 }
-                (free, usual) => usual.or(free),
+                (any, plausible) => plausible.or(any),
             };
         }
     }
     stage.add(1)?;
-    let Some(best) = found else { return Ok(None) };
-    let focal_range = if free { search.focal_range(&best)? } else { 0.0 };
-    let rival = if free { None } else { search.rival(&best)? };
+    let Some(best) = best else { return Ok(None) };
+    let focal_range = if is_focal_free { search.focal_range(&best)? } else { 0.0 };
+    let alternative = if is_focal_free { None } else { search.alternative_focal(&best)? };
     stage.add(1)?;
     let with_radial = |camera: Camera| match camera.distortion.is_none() {
         true => Camera { distortion: Distortion::radial(0.0, 0.0), ..camera },
         false => camera,
     };
-    Ok(Some(Found { cameras: search.cameras(&best.lens).map(with_radial), focal_range, rival }))
+    Ok(Some(LensEstimate { cameras: search.cameras(&best.lens).map(with_radial), focal_range, alternative }))
 }
 
-/// Steps of the progress after the distortions: narrowing down, usual focal lengths, what else fits.
-const AFTERWARDS: usize = 3;
+/// Progress steps after the grid: refinement, plausible focal lengths, uncertainty.
+const REFINEMENT_STAGES: usize = 3;
 
-/// The one with the least loss.
-fn least(trials: &[Trial]) -> Option<Trial> {
-    trials.iter().min_by(|a, b| a.sum.total_cmp(&b.sum)).cloned()
+/// Returns the hypothesis with the minimum loss.
+fn min_loss(hypotheses: &[LensHypothesis]) -> Option<LensHypothesis> {
+    hypotheses.iter().min_by(|a, b| a.total_loss.total_cmp(&b.total_loss)).cloned()
 }
 
-/// Whether photographs have such focal lengths.
+/// Returns whether a focal length is in [`PLAUSIBLE_FOCAL`].
 fn is_plausible(focal: f64, camera: &Camera) -> bool {
     let (low, high) = PLAUSIBLE_FOCAL;
     (low..=high).contains(&(focal / longer_side(camera) as f64))
@@ -147,20 +154,21 @@ fn longer_side(camera: &Camera) -> usize {
     camera.width.max(camera.height)
 }
 
-/// By how many standard deviations a focal length must fit better before it is believed: four, or by as many as it is from those that photographs have.
-fn doubt(focal: f64, camera: &Camera) -> f64 {
-    let (share, deviation) = usual_focal();
-    let from_usual = (focal / longer_side(camera) as f64 / share).ln() / deviation;
-    from_usual.abs().max(BEYOND_DOUBT)
+/// Returns by how many standard deviations a focal length must fit better to be accepted: four, or its distance from
+/// the mean of the prior.
+fn required_sigmas(focal: f64, camera: &Camera) -> f64 {
+    let (median, deviation) = log_normal_focal_prior();
+    let prior_sigmas = (focal / longer_side(camera) as f64 / median).ln() / deviation;
+    prior_sigmas.abs().max(SIGNIFICANCE)
 }
 
-/// Vuong's test at two standard deviations: see [`crate::poses_are_rivals`].
-fn significantly_worse(a: &Trial, b: &Trial) -> bool {
-    worse_by(a, b) > 2.0
+/// Applies Vuong's test at two standard deviations: see [`crate::poses_are_indistinguishable`].
+fn is_significantly_worse(a: &LensHypothesis, b: &LensHypothesis) -> bool {
+    loss_difference_sigmas(a, b) > 2.0
 }
 
-/// By how many standard deviations of the difference `a` is worse; 0 where they are the same.
-fn worse_by(a: &Trial, b: &Trial) -> f64 {
+/// Computes how much larger the loss of `a` is, in standard deviations of the difference; 0 if all losses are equal.
+fn loss_difference_sigmas(a: &LensHypothesis, b: &LensHypothesis) -> f64 {
     let (sum, squares) =
         a.losses.iter().zip(&b.losses).fold((0.0, 0.0), |(s, q), (a, b)| (s + a - b, q + (a - b) * (a - b)));
     if squares > 0.0 { sum / f64::sqrt(squares) } else { 0.0 }
@@ -168,7 +176,7 @@ fn worse_by(a: &Trial, b: &Trial) -> f64 {
 
 struct Search<'a> {
     pairs: &'a [Correspondence],
-    /// The cameras without distortion; their focal lengths are scaled to those of a trial.
+    /// The cameras without distortion; a hypothesis replaces their focal lengths.
     base: [Camera; 2],
     robust: &'a RobustOptions,
     stage: &'a Stage<'a>,
@@ -187,52 +195,52 @@ impl Search<'_> {
         })
     }
 
-    /// The best pose of a search with a lens.
-    fn searched(&self, lens: Lens) -> Result<Option<Trial>, Cancelled> {
+    /// Searches the best pose for a lens.
+    fn search_pose(&self, lens: Lens) -> Result<Option<LensHypothesis>, Cancelled> {
         let [a, b] = self.cameras(&lens);
         let (normalized, unit) = normalize_matches(self.pairs, &a, &b);
         let usable: Vec<_> = normalized.into_iter().filter(Correspondence::is_finite).collect();
         let options = RobustOptions {
             threshold: self.robust.threshold * unit,
-            max_iterations: SAMPLES[0].min(self.robust.max_iterations),
+            max_iterations: MAX_SAMPLES[0].min(self.robust.max_iterations),
             ..*self.robust
         };
-        let found = unless_stopped(estimate_relative_pose(&usable, &options, self.stage))?;
-        Ok(found.map(|found| self.refined(lens, &found.model)))
+        let estimate = unless_cancelled(estimate_relative_pose(&usable, &options, self.stage))?;
+        Ok(estimate.map(|estimate| self.refine_pose(lens, &estimate.model)))
     }
 
-    /// The best pose and focal length of a search with a distortion.
-    fn searched_free(&self, distortion: f64) -> Result<Option<Trial>, Cancelled> {
+    /// Searches the best pose and focal length for a distortion.
+    fn search_pose_and_focal(&self, distortion: f64) -> Result<Option<LensHypothesis>, Cancelled> {
         let usable: Vec<_> = self.undistorted(distortion).into_iter().filter(Correspondence::is_finite).collect();
-        let options = RobustOptions { max_iterations: SAMPLES[1].min(self.robust.max_iterations), ..*self.robust };
-        let found = unless_stopped(estimate_shared_focal_pose(&usable, &options, self.stage))?;
-        Ok(found.map(|found| self.refined_free(distortion, &found.model)))
+        let options = RobustOptions { max_iterations: MAX_SAMPLES[1].min(self.robust.max_iterations), ..*self.robust };
+        let estimate = unless_cancelled(estimate_shared_focal_pose(&usable, &options, self.stage))?;
+        Ok(estimate.map(|estimate| self.refine_pose_and_focal(distortion, &estimate.model)))
     }
 
-    /// The best of some focal lengths that photographs have.
-    fn of_usual_focal(&self) -> Result<Option<Trial>, Cancelled> {
+    /// Searches the best of a grid of plausible focal lengths.
+    fn search_focal_grid(&self) -> Result<Option<LensHypothesis>, Cancelled> {
         let side = longer_side(&self.base[0]) as f64;
-        let searched = |share: &f64| self.searched(Lens { focal: [share * side; 2], distortion: 0.0 });
-        let trials: Vec<Option<Trial>> = USUAL_FOCALS.par_iter().map(searched).collect::<Result<_, _>>()?;
-        let trials: Vec<Trial> = trials.into_iter().flatten().collect();
-        least(&trials).map(|best| self.narrow(best, false)).transpose()
+        let search = |ratio: &f64| self.search_pose(Lens { focal: [ratio * side; 2], distortion: 0.0 });
+        let hypotheses: Vec<Option<LensHypothesis>> = FOCAL_GRID.par_iter().map(search).collect::<Result<_, _>>()?;
+        let hypotheses: Vec<LensHypothesis> = hypotheses.into_iter().flatten().collect();
+        min_loss(&hypotheses).map(|best| self.refine_distortion(best, false)).transpose()
     }
 
-    /// Largest relative change of the focal length, up to a half, that the matches do not exclude.
-    fn focal_range(&self, best: &Trial) -> Result<f64, Cancelled> {
+    /// Computes the maximum relative change of the focal length, up to a half, that the matches do not exclude.
+    fn focal_range(&self, best: &LensHypothesis) -> Result<f64, Cancelled> {
         let mut range = 0.0f64;
         for direction in [1.0, -1.0] {
-            // From the last pose on, so that each starts in the right place.
-            let mut at = best.clone();
+            // Each starts from the previous pose (continuation).
+            let mut current = best.clone();
             for k in 1..=8 {
                 self.stage.check()?;
                 let factor = 1.05f64.powf(direction * f64::from(k));
-                let lens = Lens { focal: best.lens.focal.map(|f| f * factor), distortion: at.lens.distortion };
-                at = self.refined(lens, &at.pose);
+                let lens = Lens { focal: best.lens.focal.map(|f| f * factor), distortion: current.lens.distortion };
+                current = self.refine_pose(lens, &current.pose);
                 if best.lens.distortion != 0.0 {
-                    at = self.narrow(at, false)?;
+                    current = self.refine_distortion(current, false)?;
                 }
-                if significantly_worse(&at, best) {
+                if is_significantly_worse(&current, best) {
                     break;
                 }
                 range = range.max((factor - 1.0).abs());
@@ -241,57 +249,59 @@ impl Search<'_> {
         Ok(range)
     }
 
-    /// A focal length far from the given one that is better beyond doubt.
-    fn rival(&self, given: &Trial) -> Result<Option<Rival>, Cancelled> {
-        let Some(other) = self.searched_free(given.lens.distortion)? else { return Ok(None) };
-        let other = self.narrow(other, true)?;
-        let usual = (given.lens.focal[0] * given.lens.focal[1]).sqrt();
+    /// Searches a focal length far from the given one that fits significantly better.
+    fn alternative_focal(&self, given: &LensHypothesis) -> Result<Option<AlternativeFocal>, Cancelled> {
+        let Some(other) = self.search_pose_and_focal(given.lens.distortion)? else { return Ok(None) };
+        let other = self.refine_distortion(other, true)?;
+        let given_focal = (given.lens.focal[0] * given.lens.focal[1]).sqrt();
         let focal = other.lens.focal[0];
-        let deviations = worse_by(given, &other);
-        let reach = f64::from(TukeyBiweight.loss(1.0));
-        let inliers = other.losses.iter().filter(|loss| **loss < reach).count();
-        let far = (focal / usual).ln().abs() > FAR && is_plausible(focal, &self.base[0]);
-        Ok((far && deviations > BEYOND_DOUBT).then_some(Rival { focal, deviations, inliers }))
+        let deviations = loss_difference_sigmas(given, &other);
+        let inlier_loss = f64::from(TukeyBiweight.loss(1.0));
+        let inliers = other.losses.iter().filter(|loss| **loss < inlier_loss).count();
+        let is_far = (focal / given_focal).ln().abs() > MIN_LOG_FOCAL_RATIO && is_plausible(focal, &self.base[0]);
+        Ok((is_far && deviations > SIGNIFICANCE).then_some(AlternativeFocal { focal, deviations, inliers }))
     }
 
-    /// The best one near another with another distortion, the focal length too where it is free.
-    fn near(&self, other: &Trial, distortion: f64, free: bool) -> Trial {
-        if free {
-            self.refined_free(distortion, &SharedFocalPose { pose: other.pose, focal: other.lens.focal[0] })
+    /// Refines a pose (and the focal length, if free) with another distortion.
+    fn refine_with_distortion(&self, other: &LensHypothesis, distortion: f64, is_focal_free: bool) -> LensHypothesis {
+        if is_focal_free {
+            self.refine_pose_and_focal(distortion, &SharedFocalPose { pose: other.pose, focal: other.lens.focal[0] })
         } else {
-            self.refined(Lens { distortion, ..other.lens }, &other.pose)
+            self.refine_pose(Lens { distortion, ..other.lens }, &other.pose)
         }
     }
 
-    /// The best pose near another.
-    fn refined(&self, lens: Lens, pose: &Pose) -> Trial {
+    /// Refines a pose with a lens.
+    fn refine_pose(&self, lens: Lens, pose: &Pose) -> LensHypothesis {
         let [a, b] = self.cameras(&lens);
         let (normalized, unit) = normalize_matches(self.pairs, &a, &b);
         let threshold = self.robust.threshold * unit;
         let usable: Vec<_> = normalized.iter().copied().filter(Correspondence::is_finite).collect();
         let (pose, _) = refine_relative_pose(pose, &usable, threshold);
-        trial(lens, pose, &essential_from_pose(&pose), &normalized, threshold)
+        evaluate(lens, pose, &essential_from_pose(&pose), &normalized, threshold)
     }
 
-    /// The best pose and focal length near others.
-    fn refined_free(&self, distortion: f64, start: &SharedFocalPose) -> Trial {
+    /// Refines a pose and a focal length with a distortion.
+    fn refine_pose_and_focal(&self, distortion: f64, start: &SharedFocalPose) -> LensHypothesis {
         let matches = self.undistorted(distortion);
         let usable: Vec<_> = matches.iter().copied().filter(Correspondence::is_finite).collect();
         let (found, _) = refine_shared_focal_pose(start, &usable, self.robust.threshold);
         let lens = Lens { focal: [found.focal; 2], distortion };
-        trial(lens, found.pose, &found.fundamental(), &matches, self.robust.threshold)
+        evaluate(lens, found.pose, &found.fundamental(), &matches, self.robust.threshold)
     }
 
-    /// Matches in pixels from the principal points with the distortion taken out: it is a share of the picture, whatever the focal length.
+    /// Returns the undistorted matches in pixels relative to the principal points. The distortion is relative to the
+    /// image size, so it does not depend on the focal length.
     fn undistorted(&self, distortion: f64) -> Vec<Correspondence> {
-        let any = longer_side(&self.base[0]) as f64;
-        let [a, b] = self.cameras(&Lens { focal: [any; 2], distortion });
+        let focal = longer_side(&self.base[0]) as f64;
+        let [a, b] = self.cameras(&Lens { focal: [focal; 2], distortion });
         let (normalized, _) = normalize_matches(self.pairs, &a, &b);
-        normalized.into_iter().map(|m| Correspondence { a: m.a * any, b: m.b * any }).collect()
+        normalized.into_iter().map(|m| Correspondence { a: m.a * focal, b: m.b * focal }).collect()
     }
 
-    /// Steps of the distortion, halved where none helps, down to a thousandth.
-    fn narrow(&self, mut best: Trial, free: bool) -> Result<Trial, Cancelled> {
+    /// Refines the distortion by a line search, whose step is halved when neither direction improves, down to about
+    /// 0.001.
+    fn refine_distortion(&self, mut best: LensHypothesis, is_focal_free: bool) -> Result<LensHypothesis, Cancelled> {
         let mut step = 1.0;
         for _ in 0..MAX_STEPS {
             if step <= 0.05 {
@@ -300,10 +310,12 @@ impl Search<'_> {
             self.stage.check()?;
             let distortions = [-1.0, 1.0]
                 .map(|sign| (best.lens.distortion + 0.015 * sign * step).clamp(DISTORTION_RANGE.0, DISTORTION_RANGE.1));
-            let trials: Vec<Trial> =
-                distortions.par_iter().map(|distortion| self.near(&best, *distortion, free)).collect();
-            match trials.into_iter().min_by(|a, b| a.sum.total_cmp(&b.sum)) {
-                Some(trial) if trial.sum < best.sum => best = trial,
+            let hypotheses: Vec<LensHypothesis> = distortions
+                .par_iter()
+                .map(|distortion| self.refine_with_distortion(&best, *distortion, is_focal_free))
+                .collect();
+            match hypotheses.into_iter().min_by(|a, b| a.total_loss.total_cmp(&b.total_loss)) {
+                Some(hypothesis) if hypothesis.total_loss < best.total_loss => best = hypothesis,
                 _ => step *= 0.5,
             }
         }
@@ -311,21 +323,21 @@ impl Search<'_> {
     }
 }
 
-/// What was found, if anything, unless the search was stopped.
-fn unless_stopped<T>(found: Result<T, EstimateError>) -> Result<Option<T>, Cancelled> {
+/// Converts any error but a cancellation to `None`.
+fn unless_cancelled<T>(found: Result<T, EstimateError>) -> Result<Option<T>, Cancelled> {
     match found {
         Err(EstimateError::Cancelled(stop)) => Err(stop),
         found => Ok(found.ok()),
     }
 }
 
-/// What each match loses by a geometry.
-fn trial(lens: Lens, pose: Pose, f: &Matrix3<f64>, matches: &[Correspondence], threshold: f64) -> Trial {
+/// Evaluates the loss of each match for a fundamental matrix.
+fn evaluate(lens: Lens, pose: Pose, f: &Matrix3<f64>, matches: &[Correspondence], threshold: f64) -> LensHypothesis {
     let loss = |m: &Correspondence| {
         let r = sampson(f, m) / threshold;
         f64::from(TukeyBiweight.loss((r * r) as f32))
     };
     let losses: Vec<f64> = matches.iter().map(loss).collect();
-    let sum = losses.iter().sum();
-    Trial { lens, pose, losses, sum }
+    let total_loss = losses.iter().sum();
+    LensHypothesis { lens, pose, losses, total_loss }
 }

@@ -1,4 +1,4 @@
-//! Cameras, relative pose and points of two views, from matches between their keypoints.
+//! Two-view reconstruction: cameras, relative pose and points from matches between keypoints.
 
 mod adjustment;
 mod degeneracy;
@@ -14,26 +14,27 @@ pub use geometry::{TwoViewGeometry, estimate_two_view_geometry};
 use crate::{FocalPrior, RobustOptions};
 use cv_core::{Camera, Correspondence, DMatch, Keypoint, Progress};
 
-/// What is known of the cameras.
+/// Prior knowledge of the intrinsics.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Intrinsics {
-    /// Both cameras are calibrated, lens distortion included.
+    /// Both cameras are calibrated, including lens distortion.
     Known([Camera; 2]),
-    /// Both calibration matrices, without a word of the distortion of the lenses: radial distortion is estimated, whatever that of the cameras is, and the focal lengths are a
-    /// prior with a standard deviation of 2 %, by about which a calibration without distortion is off.
+    /// Both calibration matrices, with unknown distortion (that of the cameras is ignored): radial distortion is
+    /// estimated, and the focal lengths are a prior with a standard deviation of 2 %, the typical error of a
+    /// calibration without distortion.
     Matrix([Camera; 2]),
-    /// About what focal length in pixels each photograph has, such as from EXIF: a prior with a standard deviation of 3 %. Principal points are in the middle, radial
-    /// distortion is estimated.
+    /// An approximate focal length in pixels of each image, such as from EXIF: a prior with a standard deviation of 3
+    /// %. Principal points are at the image center, radial distortion is estimated.
     Focal([f64; 2]),
-    /// One unknown focal length for both photographs, most likely between 0.4 and 3 times their longer side; principal points are in the middle, radial distortion
-    /// is estimated.
+    /// One unknown focal length for both images, with a prior between 0.4 and 3 times the longer side (95 %). Principal
+    /// points are at the image center, radial distortion is estimated.
     Unknown,
 }
 
 impl Intrinsics {
-    /// What focal lengths in pixels tell, of which each may be missing: nothing unless both are known.
+    /// Creates intrinsics from focal lengths in pixels: [`Self::Focal`] if both are known, else [`Self::Unknown`].
     pub fn from_focal_lengths(focal: [Option<f64>; 2]) -> Self {
         match focal {
             [Some(a), Some(b)] => Self::Focal([a, b]),
@@ -41,10 +42,11 @@ impl Intrinsics {
         }
     }
 
-    /// The cameras of photographs of these sizes, where they are known: undistorted ones of which only the matrix or the focal length is.
+    /// Returns the cameras for images of these sizes, or `None` for [`Self::Unknown`]; without distortion unless
+    /// [`Self::Known`].
     ///
     /// # Errors
-    /// [`TwoViewError::Camera`] and [`TwoViewError::CameraSize`].
+    /// [`TwoViewError::Camera`] for invalid parameters, [`TwoViewError::CameraSize`].
     pub fn cameras(&self, sizes: [(usize, usize); 2]) -> Result<Option<[Camera; 2]>, TwoViewError> {
         let cameras = match *self {
             Self::Unknown => return Ok(None),
@@ -64,64 +66,74 @@ impl Intrinsics {
         Ok(Some(cameras))
     }
 
-    /// What is known of the focal lengths, where they may change.
+    /// Returns the prior of the focal lengths; `None` if they are fixed.
     fn focal_prior(&self, sizes: [(usize, usize); 2]) -> Option<FocalPrior> {
-        let of = |focal: [f64; 2], deviation: f64, one_camera: bool| {
-            let ratio = if one_camera { FocalPrior::REFOCUSED } else { deviation * f64::sqrt(2.0) };
+        let prior = |focal: [f64; 2], deviation: f64, is_same_camera: bool| {
+            let ratio = if is_same_camera { FocalPrior::SAME_LENS_RATIO_DEVIATION } else { deviation * f64::sqrt(2.0) };
             FocalPrior { focal: focal[0], deviation, ratio }
         };
         match *self {
             Self::Known(_) => None,
-            Self::Matrix([a, b]) => Some(of([a.fx, b.fx], MATRIX_DEVIATION, a == b)),
-            Self::Focal(focal) => Some(of(focal, EXIF_FOCAL_DEVIATION, focal[0] == focal[1] && sizes[0] == sizes[1])),
+            Self::Matrix([a, b]) => Some(prior([a.fx, b.fx], MATRIX_DEVIATION, a == b)),
+            Self::Focal(focal) => {
+                Some(prior(focal, EXIF_FOCAL_DEVIATION, focal[0] == focal[1] && sizes[0] == sizes[1]))
+            }
             Self::Unknown => {
-                let (share, deviation) = usual_focal();
-                let focal = share * sizes[0].0.max(sizes[0].1) as f64;
-                Some(FocalPrior { focal, deviation, ratio: FocalPrior::REFOCUSED })
+                let (median, deviation) = log_normal_focal_prior();
+                let focal = median * sizes[0].0.max(sizes[0].1) as f64;
+                Some(FocalPrior { focal, deviation, ratio: FocalPrior::SAME_LENS_RATIO_DEVIATION })
             }
         }
     }
 }
 
-/// Relative standard deviation of focal lengths by EXIF: a 35 mm equivalent is rounded by up to 2 %, and focusing near lengthens what is written for infinity by some per cent.
+/// Relative standard deviation of EXIF focal lengths: a 35 mm equivalent is rounded by up to 2 %, and the recorded
+/// value is that at infinity focus, some per cent shorter than at close focus.
 pub const EXIF_FOCAL_DEVIATION: f64 = 0.03;
-/// And of a calibration matrix that came without its lens: the focal length of a fit without distortion takes up some of it (of Sceaux's, 2.3 %).
+/// Relative standard deviation of the focal length of a calibration without distortion, which it partly compensates
+/// (2.3 % for the Sceaux data set).
 const MATRIX_DEVIATION: f64 = 0.02;
-/// What focal lengths of photographs are, as shares of the longer side: an unknown one is between these with 95 % (fields of view of 103 and of 19 degrees).
+/// The 95 % interval of the prior of an unknown focal length, relative to the longer image side (fields of view of 103
+/// and 19 degrees).
 pub const PLAUSIBLE_FOCAL: (f64, f64) = (0.4, 3.0);
 
-/// The middle of [`PLAUSIBLE_FOCAL`] as a share of the longer side, and the standard deviation of its logarithm.
-fn usual_focal() -> (f64, f64) {
+/// Returns the median of the log-normal prior of [`PLAUSIBLE_FOCAL`], relative to the longer image side, and the
+/// standard deviation of the logarithm.
+fn log_normal_focal_prior() -> (f64, f64) {
     let (low, high) = PLAUSIBLE_FOCAL;
     ((low * high).sqrt(), (high / low).ln() / 4.0)
 }
 
-/// Settings of [`reconstruct_two_views`].
+/// Options of [`reconstruct_two_views`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct TwoViewOptions {
-    /// What is known of the cameras. Default unknown.
+    /// Prior knowledge of the intrinsics. Default unknown.
     pub intrinsics: Intrinsics,
-    /// The search for the pose. The threshold is in pixels; default 2 px, three to four times what a SIFT point is good to.
+    /// RANSAC options of the relative pose. The threshold is in pixels; default 2 px, three to four times the
+    /// localization error of SIFT keypoints.
     pub robust: RobustOptions,
-    /// Fewest matches that must agree. Default 30, COLMAP's for a first pair being 100 and for any pair 15.
+    /// Minimum number of inliers. Default 30 (COLMAP: 100 for an initial pair, 15 for any pair).
     pub min_inliers: usize,
-    /// Smallest share of matches that must agree. 0 to 1; default 0.1: fewer may well agree by chance.
-    pub min_inlier_share: f64,
-    /// Smallest median angle between the two rays of a point, in radians. Default 0.5 degrees: depth is then known to a fifth
-    /// or so, for a point good to half a pixel at a focal length of 1000 px.
+    /// Minimum inlier ratio, 0 to 1. Default 0.1: lower ratios occur by chance.
+    #[cfg_attr(feature = "serde", serde(rename = "min_inlier_share"))]
+    pub min_inlier_ratio: f64,
+    /// Minimum median parallax angle, in radians. Default 0.5 degrees: a relative depth error of about 0.2, for a
+    /// localization error of half a pixel at a focal length of 1000 px.
     pub min_median_angle: f64,
-    /// Largest standard deviation of the direction of the translation if the lens is what was found, in radians, and largest angle to another direction that the
-    /// matches do not exclude. Default 3 degrees: beyond, depths along the motion are off by a tenth and more.
+    /// Maximum standard deviation of the direction of the translation conditional on the intrinsics, in radians, and
+    /// maximum angle to another direction that fits the matches as well. Default 3 degrees: beyond, depths along the
+    /// motion have errors of a tenth and more.
     pub max_deviation: f64,
-    /// Smallest angle between the two rays of a point that is kept, in radians. Default 0.1 degrees.
+    /// Minimum parallax angle of a point, in radians. Default 0.1 degrees.
     pub min_angle: f64,
-    /// Largest reprojection error of a point that is kept, in pixels, in either photograph. Default 2 px.
+    /// Maximum reprojection error of a point in either image, in pixels. Default 2 px.
     pub max_reprojection: f64,
-    /// A homography (or a rotation) that explains this share of the matches that agree makes the scene a plane (or the motion a
-    /// turn). 0 to 1; default 0.95.
-    pub degenerate_share: f64,
+    /// Fraction of the inliers that fit a homography (or a rotation) from which the scene counts as planar (or the
+    /// motion as a pure rotation). 0 to 1; default 0.95.
+    #[cfg_attr(feature = "serde", serde(rename = "degenerate_share"))]
+    pub degenerate_ratio: f64,
 }
 
 impl Default for TwoViewOptions {
@@ -130,29 +142,29 @@ impl Default for TwoViewOptions {
             intrinsics: Intrinsics::Unknown,
             robust: RobustOptions { threshold: 2.0, ..RobustOptions::default() },
             min_inliers: 30,
-            min_inlier_share: 0.1,
+            min_inlier_ratio: 0.1,
             min_median_angle: 0.5f64.to_radians(),
             max_deviation: 3f64.to_radians(),
             min_angle: 0.1f64.to_radians(),
             max_reprojection: 2.0,
-            degenerate_share: 0.95,
+            degenerate_ratio: 0.95,
         }
     }
 }
 
-/// Keypoints of two photographs, and tentative matches between them.
+/// Keypoints of two images, and tentative matches between them.
 #[derive(Debug, Clone, Copy)]
 pub struct MatchedViews<'a> {
-    /// Width and height of each photograph in pixels.
+    /// Width and height of each image in pixels.
     pub sizes: [(usize, usize); 2],
-    /// The keypoints of each photograph, in its pixels as they were taken (lens distortion included).
+    /// The keypoints of each image, in distorted pixels.
     pub keypoints: [&'a [Keypoint]; 2],
-    /// The matches by index of the keypoints, of which many may be wrong.
+    /// The tentative matches, by keypoint index.
     pub matches: &'a [DMatch],
 }
 
 impl MatchedViews<'_> {
-    /// Where keypoints are that are matched.
+    /// Looks up the coordinates of matched keypoints.
     ///
     /// # Errors
     /// [`TwoViewError::MatchOutOfRange`].
@@ -167,13 +179,13 @@ impl MatchedViews<'_> {
     }
 }
 
-/// Cameras, relative pose and points of two views, from tentative matches: [`estimate_two_view_geometry`], then
-/// [`TwoViewAdjustment`]. (With descriptors at hand, further matches can be looked for between the two.)
+/// Reconstructs cameras, relative pose and points of two views from tentative matches: [`estimate_two_view_geometry`],
+/// then [`TwoViewAdjustment`]. (Guided matching is possible between the two steps.)
 ///
-/// The world is the first camera's frame and its unit the distance between the cameras, which photographs cannot tell.
+/// The world frame is that of the first camera. The scale is a gauge freedom; the unit is the baseline.
 ///
 /// # Errors
-/// [`TwoViewError`], each with its numbers.
+/// [`TwoViewError`].
 pub fn reconstruct_two_views(
     views: &MatchedViews<'_>,
     options: &TwoViewOptions,

@@ -3,7 +3,7 @@
 use super::{PhotoOrder, SfmJobOptions, SfmPhoto};
 use crate::Progress;
 use cv_core::Cancelled;
-use cv_features::{ByteDescriptors, Vocabulary, largest_keypoints, most_alike};
+use cv_features::{ByteDescriptors, Vocabulary, largest_keypoints, most_similar};
 use rayon::prelude::*;
 
 /// Words of the vocabulary of a set, those of Jégou et al.
@@ -66,5 +66,5 @@ fn alike(
         .par_iter()
         .map(|set| Ok(words.describe(set, progress)?.unwrap_or_default()))
         .collect::<Result<_, Cancelled>>()?;
-    most_alike(&described, count, |a, b| a.abs_diff(b) > near, progress)
+    most_similar(&described, count, |a, b| a.abs_diff(b) > near, progress)
 }

@@ -24,7 +24,7 @@ pub(super) fn report(
         .headline("matches that agree", &format!("{} of {}", found.inliers.len(), result.matching.matches.len()))
         .headline("reprojection", &format!("{:.2} px", found.reprojection_rms))
         .headline("median angle", &format!("{:.2}°", found.median_angle.to_degrees()));
-    if found.planar_share > 0.8 {
+    if found.planar_ratio > 0.8 {
         page.warn("most of the scene is nearly one plane: the motion is less certain than the deviations say");
     }
     page.section("The cloud").paragraph(
@@ -97,7 +97,7 @@ fn motion(page: &mut Report, result: &ReconstructResult, source: &str) {
                 "focal lengths",
                 format!("{:.1} and {:.1} px{deviation} ({source})", found.cameras[0].fx, found.cameras[1].fx),
             ),
-            ("explained by one plane", format!("{:.0} % of the matches that agree", 100.0 * found.planar_share)),
+            ("explained by one plane", format!("{:.0} % of the matches that agree", 100.0 * found.planar_ratio)),
         ],
     );
 }
