@@ -73,7 +73,7 @@ mod tests {
             .collect();
         let views: Vec<SfmView<'_>> = keypoints.iter().map(|k| SfmView { camera: 0, keypoints: k }).collect();
         let mut lists: Vec<Vec<Observation>> = vec![Vec::new(); truth.points.len()];
-        for (shown, view) in truth.shown.iter().zip(0..) {
+        for (shown, view) in truth.point_indices.iter().zip(0..) {
             shown.iter().zip(0..).for_each(|(p, keypoint)| lists[*p as usize].push(Observation { view, keypoint }));
         }
         lists.retain(|list| list.len() >= 2);

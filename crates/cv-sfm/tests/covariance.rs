@@ -37,7 +37,7 @@ fn errors_are_as_large_as_said() {
     let (mut centers, mut turns, mut points) = (Vec::new(), Vec::new(), Vec::new());
     for seed in 0..4 {
         let options =
-            FeatureViewsOptions { views: 60, points: 6000, wrong: 0.0, seed, ..FeatureViewsOptions::default() };
+            FeatureViewsOptions { views: 60, points: 6000, outlier_ratio: 0.0, seed, ..FeatureViewsOptions::default() };
         let truth = FeatureViews::new(&options);
         let keypoint = |p: &cv_core::Point2<f64>| Keypoint::new(p.x as f32, p.y as f32, 1.0);
         let keypoints: Vec<Vec<Keypoint>> =
@@ -84,7 +84,7 @@ fn errors_are_as_large_as_said() {
         for (point, of) in model.points.iter().zip(&of.points) {
             let o = point.observations[0];
             let off: Vector3<f64> =
-                point.position - truth.points[truth.shown[o.view as usize][o.keypoint as usize] as usize];
+                point.position - truth.points[truth.point_indices[o.view as usize][o.keypoint as usize] as usize];
             points.push(off.dot(&(of.unwrap().try_inverse().unwrap() * off)));
         }
     }

@@ -155,7 +155,7 @@ struct Shown<'v>(&'v FeatureViews);
 
 impl FeatureDistance for Shown<'_> {
     fn distance(&self, a: Observation, b: Observation) -> f32 {
-        let [one, two] = [a, b].map(|o| self.0.shown[o.view as usize][o.keypoint as usize]);
+        let [one, two] = [a, b].map(|o| self.0.point_indices[o.view as usize][o.keypoint as usize]);
         if one == two { 0.1 } else { 2.0 }
     }
 }
@@ -169,7 +169,7 @@ fn points_are_found_where_matching_missed_them() {
     let (plain, completed) = (given.solve().unwrap(), given.solve_with(Some(&Shown(&truth))).unwrap());
     let (before, after) = (plain.models[0].mean_track_length(), completed.models[0].mean_track_length());
     assert!(after > 1.05 * before, "{before} {after}");
-    let point = |o: &Observation| truth.shown[o.view as usize][o.keypoint as usize];
+    let point = |o: &Observation| truth.point_indices[o.view as usize][o.keypoint as usize];
     let right = completed.models[0]
         .points
         .iter()

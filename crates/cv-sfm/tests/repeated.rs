@@ -13,7 +13,12 @@ use rayon::prelude::*;
 
 /// A walk of 50 photographs along a street of two to eight identical houses, a quarter of each being its own.
 fn street(seed: u64) -> FeatureViews {
-    FeatureViews::new(&FeatureViewsOptions { houses: houses(seed), own: 0.25, seed, ..FeatureViewsOptions::default() })
+    FeatureViews::new(&FeatureViewsOptions {
+        houses: houses(seed),
+        unique_ratio: 0.25,
+        seed,
+        ..FeatureViewsOptions::default()
+    })
 }
 
 fn houses(seed: u64) -> usize {
@@ -44,7 +49,7 @@ impl Given {
             let matches = given.truth.matches(a, b);
             if let Some((model, inliers)) = verify(&given, a, b, &matches) {
                 let matches: Vec<DMatch> = inliers.iter().map(|i| matches[*i]).collect();
-                let [one, two] = [a, b].map(|v| &given.truth.shown[v]);
+                let [one, two] = [a, b].map(|v| &given.truth.point_indices[v]);
                 let same = matches.iter().filter(|m| one[m.query as usize] == two[m.train as usize]).count();
                 given.right.push(2 * same > matches.len());
                 given.pairs.push(PairMatches::new(a, b, matches));
@@ -67,7 +72,7 @@ impl Given {
     fn ideal(&self, a: usize, b: usize, matches: &[DMatch]) -> Option<(ViewPairModel, Vec<usize>)> {
         let turn = std::f64::consts::TAU / self.houses as f64;
         let azimuth = |view: usize, keypoint: u32| {
-            let p = self.truth.points[self.truth.shown[view][keypoint as usize] as usize];
+            let p = self.truth.points[self.truth.point_indices[view][keypoint as usize] as usize];
             p.x.atan2(p.z)
         };
         let houses_on = |m: &DMatch| {
@@ -172,7 +177,7 @@ fn a_walk_past_a_part_of_the_street_does_not_need_to_close() {
     let views = 30;
     truth.poses.truncate(views);
     truth.keypoints.truncate(views);
-    truth.shown.truncate(views);
+    truth.point_indices.truncate(views);
     let mut given = Given::new(4, Given::ideal);
     given.keypoints.truncate(views);
     let kept: Vec<usize> = (0..given.pairs.len()).filter(|i| given.pairs[*i].b < views).collect();
