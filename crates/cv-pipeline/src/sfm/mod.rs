@@ -294,7 +294,7 @@ pub fn sfm_solve(
         knowledge: &knowledge,
         pairs: &pairs,
         geometry,
-        alike: Some(&alike),
+        feature_distance: Some(&alike),
     };
     let found = reconstruct_views_from(&input, known, &options.solve, progress)?;
     clock.lap("solve");
