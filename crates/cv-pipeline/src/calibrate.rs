@@ -1,7 +1,9 @@
 //! From photographs of a calibration board to calibrated cameras.
 
 use crate::Progress;
-use cv_calib::{CalibrateError, CalibrateOptions, Calibration, PictureOutcome, Sightings, TargetCorner, TargetPoints};
+use cv_calib::{
+    CalibrateError, CalibrateOptions, Calibration, ImageOutcome, TargetCorner, TargetObservations, TargetPoints,
+};
 use cv_core::{Cancelled, GrayF32, ImageView, OptionError, Stage, StageClock};
 use cv_features::{
     Board, BoardError, BoardPoint, BoardSize, ChessboardOptions, FeatureError, find_board, find_chessboard,
@@ -69,7 +71,7 @@ pub enum PhotoRefusal {
         first: (usize, usize),
     },
     /// Its corners were not used.
-    Corners(PictureOutcome),
+    Corners(ImageOutcome),
 }
 
 /// What [`calibrate`] found.
@@ -78,7 +80,7 @@ pub struct BoardCalibration {
     /// Cameras, poses, errors, verdict.
     pub calibration: Calibration,
     /// The corners it is made of.
-    pub sightings: Sightings,
+    pub sightings: TargetObservations,
     /// The board.
     pub board: Board,
     /// By view and camera: why the photograph was not used, `None` where it was.
@@ -206,19 +208,19 @@ pub fn calibrate(
         let none = CalibrateError::TooFewViews { camera, got: 0, needed: 3, small: 0, mirrored: 0 };
         return Err(failed(none, refusals));
     }
-    let mut sightings = Sightings { target, sizes, views: corners };
+    let mut sightings = TargetObservations { target, sizes, views: corners };
     let calibration = match cv_calib::calibrate(&sightings, &options.solve, progress) {
         Ok(calibration) => calibration,
         Err(error) => return Err(failed(error, refusals)),
     };
     // The numbers that the corners of a board that looks the same after half a turn turned out to have.
     for (corners, view) in sightings.views.iter_mut().zip(&calibration.views) {
-        for (corners, picture) in corners.iter_mut().zip(&view.pictures) {
-            corners.iter_mut().for_each(|c| c.point = sightings.target.turned(c.point, picture.turn));
+        for (corners, picture) in corners.iter_mut().zip(&view.images) {
+            corners.iter_mut().for_each(|c| c.point = sightings.target.symmetric_index(c.point, picture.symmetry));
         }
     }
     for (refusals, view) in refusals.iter_mut().zip(&calibration.views) {
-        for (refusal, picture) in refusals.iter_mut().zip(&view.pictures) {
+        for (refusal, picture) in refusals.iter_mut().zip(&view.images) {
             if refusal.is_none() && !picture.outcome.is_used() {
                 *refusal = Some(PhotoRefusal::Corners(picture.outcome));
             }
@@ -232,8 +234,8 @@ pub fn calibrate(
 /// Tells of chessboards that look the same after a turn: two cameras may begin to count their corners at different ends.
 fn symmetric(target: TargetPoints, board: &Board) -> TargetPoints {
     match board {
-        Board::Chessboard { size, .. } if size.columns == size.rows => target.with_equal_turns(4),
-        Board::Chessboard { size, .. } if size.is_symmetric() => target.with_equal_turns(2),
+        Board::Chessboard { size, .. } if size.columns == size.rows => target.with_rotational_symmetry(4),
+        Board::Chessboard { size, .. } if size.is_symmetric() => target.with_rotational_symmetry(2),
         _ => target,
     }
 }
@@ -298,11 +300,11 @@ fn most_frequent(sizes: impl Iterator<Item = BoardSize>) -> Option<BoardSize> {
 }
 
 /// Differences of the rows of corners in the rectified pictures of the first two cameras: mean and largest.
-fn rectified_rows(calibration: &Calibration, sightings: &Sightings) -> Option<(f64, f64)> {
+fn rectified_rows(calibration: &Calibration, sightings: &TargetObservations) -> Option<(f64, f64)> {
     let rectification = Rectification::new(&calibration.stereo()?, &RectifyOptions::default()).ok()?;
     let (mut sum, mut count, mut largest) = (0.0, 0, 0.0f64);
     for (view, found) in sightings.views.iter().zip(&calibration.views) {
-        let used = |c: usize| view[c].iter().zip(&found.pictures[c].corners).filter(|(_, f)| f.used).map(|(c, _)| c);
+        let used = |c: usize| view[c].iter().zip(&found.images[c].corners).filter(|(_, f)| f.used).map(|(c, _)| c);
         for left in used(0) {
             let Some(right) = used(1).find(|r| r.point == left.point) else { continue };
             let rows =
