@@ -127,7 +127,7 @@ fn coverage(job: &Job, i: usize, (width, height): (usize, usize)) -> Result<Figu
     let side = width as f32 / c.cameras[i].camera.width as f32;
     let mut canvas = Raster::new(width, height, [28, 28, 32]);
     let most = (3.0 * c.noise_px) as f32;
-    for (view, seen) in c.views.iter().zip(&job.found.sightings.views) {
+    for (view, seen) in c.views.iter().zip(&job.found.observations.views) {
         for (corner, of) in seen[i].iter().zip(&view.images[i].corners) {
             let at = [corner.pixel.x as f32 * side, corner.pixel.y as f32 * side];
             match of.residual.filter(|_| of.used) {
@@ -199,7 +199,7 @@ fn with_residuals(photo: &RgbU8, job: &Job, v: usize, i: usize) -> RgbU8 {
     let mut canvas = Raster::from_rgb(photo.view());
     let unit = (canvas.width() as f32 / 640.0).max(0.5);
     let of = &job.found.calibration.views[v].images[i];
-    for (corner, of) in job.found.sightings.views[v][i].iter().zip(&of.corners) {
+    for (corner, of) in job.found.observations.views[v][i].iter().zip(&of.corners) {
         let at = [corner.pixel.x as f32, corner.pixel.y as f32];
         let color = if of.used { colors::GREEN } else { colors::ORANGE };
         canvas.circle(at, 3.0 * unit, unit, color);
@@ -232,7 +232,7 @@ fn pair(page: &mut Report, job: &Job) -> Result<(), Failure> {
 /// How far the board is from flat.
 fn board_shape(page: &mut Report, job: &Job) -> Result<(), Failure> {
     let [kx, ky] = job.found.calibration.target_shape.deflection;
-    let size = job.found.sightings.target.size();
+    let size = job.found.observations.target.size();
     let side = 480.0 / size.max();
     let [width, height] = [size.x, size.y].map(|s| ((s * side).round() as usize).clamp(16, 480));
     // The model of the calibration: a parabola along each side, zero at the ends.

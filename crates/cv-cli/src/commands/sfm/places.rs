@@ -116,7 +116,7 @@ impl Places {
             one.gps.map(|gps| GpsFix { place: gps.position(), has_altitude: gps.altitude.is_some() })
         };
         let fixes: Vec<Option<GpsFix>> = all.iter().map(fix).collect();
-        if let Some(GpsCenters { centers, origin, heights }) = gps_centers(&fixes) {
+        if let Some(GpsCenters { centers, origin, has_heights: heights }) = gps_centers(&fixes) {
             places.centers = centers;
             places.source = Some(PlaceSource::Gps { origin, heights });
         }
