@@ -262,7 +262,7 @@ struct Groups {
 }
 
 /// Adds the residuals of a camera's corners. The first camera has no rig pose.
-fn add_corners<const N: usize, const ONE: usize, const MORE: usize>(
+fn add_corners<const N: usize, const FIRST_DIMS: usize, const RIG_DIMS: usize>(
     adjustment: &mut Adjustment<'_>,
     camera: Camera,
     index: usize,
@@ -274,11 +274,11 @@ fn add_corners<const N: usize, const ONE: usize, const MORE: usize>(
     let Groups { poses, rig_poses, lens, shape } = groups;
     if index == 0 {
         let blocks = views.iter().map(|v| [*v, 0, 0]).collect();
-        let residual = FirstCameraResidual::<N, ONE> { camera, items };
+        let residual = FirstCameraResidual::<N, FIRST_DIMS> { camera, items };
         adjustment.add_residuals("corner", residual, [poses, lens, shape], blocks, loss)
     } else {
         let blocks = views.iter().map(|v| [*v, index as u32, 0, 0]).collect();
-        let residual = RigCameraResidual::<N, MORE> { camera, items };
+        let residual = RigCameraResidual::<N, RIG_DIMS> { camera, items };
         adjustment.add_residuals("corner", residual, [poses, rig_poses, lens, shape], blocks, loss)
     }
 }

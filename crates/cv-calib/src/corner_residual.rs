@@ -139,7 +139,7 @@ mod tests {
         check::<16, 24, 30>(&target, &pose, &rig_pose, Distortion::thin_prism12(prism));
     }
 
-    fn check<const N: usize, const ONE: usize, const MORE: usize>(
+    fn check<const N: usize, const FIRST_DIMS: usize, const RIG_DIMS: usize>(
         target: &TargetPoints,
         pose: &Pose,
         rig_pose: &Pose,
@@ -150,8 +150,8 @@ mod tests {
         let blocks = [store(pose), store(rig_pose), camera.intrinsics()[..N].to_vec(), vec![0.05, -0.03]];
         let corner = TargetCorner { point: 13, pixel: Point2::new(300.0, 200.0) };
         let items = vec![Corner::new(target, &corner)];
-        let first_camera = FirstCameraResidual::<N, ONE> { camera, items: items.clone() };
-        let rig_camera = RigCameraResidual::<N, MORE> { camera, items };
+        let first_camera = FirstCameraResidual::<N, FIRST_DIMS> { camera, items: items.clone() };
+        let rig_camera = RigCameraResidual::<N, RIG_DIMS> { camera, items };
         let at = |b: &[Vec<f64>; 4]| {
             let first = first_camera.evaluate(0, [&b[0], &b[2], &b[3]], None).unwrap();
             (first, rig_camera.evaluate(0, [&b[0], &b[1], &b[2], &b[3]], None).unwrap())

@@ -19,10 +19,9 @@ const BORDER_PX: f64 = 10.0;
 /// Largest median viewpoint change of a link that is scored by its features.
 const MAX_SCORED_CHANGE: f64 = 0.18;
 /// Ratio of the measured to the expected match ratio at which the score of a link is 0. Of fountain-P11, sceaux and
-/// templeRing no pair is below, of a drive (kitti-2) 11 of 752, which their triplets correct. On generated streets whose
-/// houses have a fifth of their points for themselves, pairs of different houses have a median of 0.83 and a 95th
-/// percentile of 0.9 to 0.93, pairs of the same house 0.9 and above. With a tenth of own points the two cannot be
-/// separated.
+/// templeRing no pair is below, of a drive (kitti-2) 11 of 752, which their triplets correct. On generated streets where
+/// a fifth of a house's points are unique, pairs of different houses have a median of 0.83 and a 95th percentile of 0.9
+/// to 0.93, pairs of the same house 0.9 and above. With a tenth unique, the two cannot be separated.
 const NEUTRAL_RATIO: f64 = 0.93;
 /// Decrease of that ratio per unit of viewpoint change.
 const NEUTRAL_RATIO_SLOPE: f64 = 0.6;

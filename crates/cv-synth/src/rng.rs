@@ -55,7 +55,7 @@ impl Rng {
 /// Returns a well-mixed hash of a lattice point.
 #[inline]
 pub(crate) fn hash2(x: i32, y: i32, seed: u32) -> u32 {
-    finish(seed ^ (x as u32).wrapping_mul(0x9E37_79B1) ^ (y as u32).wrapping_mul(0x85EB_CA77).rotate_left(13))
+    finalize_hash(seed ^ (x as u32).wrapping_mul(0x9E37_79B1) ^ (y as u32).wrapping_mul(0x85EB_CA77).rotate_left(13))
 }
 
 /// Returns a well-mixed hash of a point of a 3-D lattice.
@@ -65,7 +65,7 @@ pub(crate) fn hash3(x: i32, y: i32, z: i32, seed: u32) -> u32 {
 }
 
 #[inline]
-fn finish(mut h: u32) -> u32 {
+fn finalize_hash(mut h: u32) -> u32 {
     h ^= h >> 16;
     h = h.wrapping_mul(0x21F0_AAAD);
     h ^= h >> 15;
