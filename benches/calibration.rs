@@ -1,13 +1,13 @@
 //! The solver of a calibration: 200 views of a board of 11 × 8 corners.
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use cv_calib::{CalibrateOptions, LensChoice, Sightings, TargetCorner, TargetPoints, calibrate};
+use cv_calib::{CalibrateOptions, LensChoice, TargetCorner, TargetObservations, TargetPoints, calibrate};
 use cv_core::{Camera, Distortion, Pose, Rotation3, Silent, Vector3};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 use std::time::Duration;
 
-fn sightings(views: usize) -> Sightings {
+fn sightings(views: usize) -> TargetObservations {
     let target = TargetPoints::grid(11, 8, 30.0).unwrap();
     let distortion = Distortion::radial_tangential5([-0.35, 0.14, 1e-3, -5e-4, -0.02]);
     let camera = Camera { distortion, ..Camera::pinhole(1280, 960, 900.0, 902.0, 650.0, 470.0) };
@@ -32,7 +32,7 @@ fn sightings(views: usize) -> Sightings {
         }
         all.push(vec![corners]);
     }
-    Sightings { target, sizes: vec![(1280, 960)], views: all }
+    TargetObservations { target, sizes: vec![(1280, 960)], views: all }
 }
 
 fn solve(c: &mut Criterion) {

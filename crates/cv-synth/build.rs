@@ -1,4 +1,4 @@
-//! Tells the tests which instruction sets this machine lacks, so that they are ignored by name and not passed over in silence.
+//! Sets a cfg for each instruction set that this machine lacks, so that its tests are reported as ignored.
 
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");
@@ -15,7 +15,7 @@ fn avx2() -> bool {
     std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma")
 }
 
-/// As much of it as Ice Lake has, which is what the code is compiled for.
+/// The subset of Ice Lake, which the code is compiled for.
 #[cfg(target_arch = "x86_64")]
 fn avx512() -> bool {
     avx2()

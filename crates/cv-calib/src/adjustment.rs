@@ -1,8 +1,8 @@
-//! The adjustment of lenses, mounts of cameras, poses and the target's shape to the least reprojection error.
+//! The joint adjustment: intrinsics, rig poses, target poses and the target's shape minimize the reprojection error.
 
 use crate::CalibrateError;
-use crate::corner_residual::{Corner, FromMount, FromReference};
-use crate::target::Sightings;
+use crate::corner_residual::{Corner, FirstCameraResidual, RigCameraResidual};
+use crate::target::TargetObservations;
 use cv_core::{Camera, Cancelled, DistortionModel, MAX_INTRINSICS, Pose, Progress, Vector2};
 use cv_numeric::RobustLoss;
 use cv_numeric::adjust::{
@@ -11,28 +11,30 @@ use cv_numeric::adjust::{
 use nalgebra::DMatrix;
 use std::ops::ControlFlow;
 
-/// Everything that is adjusted.
+/// The parameters of a calibration.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Estimate {
     pub(crate) cameras: Vec<Camera>,
-    /// Takes the first camera's frame to each camera's; the first is the identity.
-    pub(crate) mounts: Vec<Pose>,
-    /// Of each view: takes the target's frame to the first camera's. `None` where nothing is known of it.
+    /// Pose of each camera in the rig: first camera's frame to its own. The first is the identity.
+    pub(crate) rig_poses: Vec<Pose>,
+    /// Pose of the target in each view: target frame to first camera's frame. `None` where it is unknown.
     pub(crate) poses: Vec<Option<Pose>>,
+    /// Deflections of the target (see [`TargetPoints::bent`](crate::TargetPoints::bent)).
     pub(crate) shape: [f64; 2],
 }
 
 impl Estimate {
-    /// The same with only some of its views.
+    /// Returns the estimate of some of its views.
     pub(crate) fn subset(&self, views: &[usize]) -> Self {
         Self { poses: views.iter().map(|v| self.poses[*v]).collect(), ..self.clone() }
     }
 
-    /// Where a corner is against where it should be, in pixels; `None` where the view has no pose or the point is behind the camera.
-    pub(crate) fn residuals(&self, data: &Sightings, view: usize, camera: usize) -> Vec<Option<Vector2<f64>>> {
+    /// Returns the reprojection residuals of the corners in pixels (projected minus detected); `None` in a view without
+    /// a pose or for a point that does not project.
+    pub(crate) fn residuals(&self, data: &TargetObservations, view: usize, camera: usize) -> Vec<Option<Vector2<f64>>> {
         let corners = &data.views[view][camera];
         let Some(pose) = self.poses[view] else { return vec![None; corners.len()] };
-        let pose = self.mounts[camera].compose(&pose);
+        let pose = self.rig_poses[camera].compose(&pose);
         let lens = &self.cameras[camera];
         corners
             .iter()
@@ -41,64 +43,65 @@ impl Estimate {
     }
 }
 
-/// Which corners count, by view, camera and corner.
-pub(crate) type Used = Vec<Vec<Vec<bool>>>;
+/// Inlier mask of the corners, by view, camera and corner.
+pub(crate) type InlierMask = Vec<Vec<Vec<bool>>>;
 
-/// What may change beside the poses of the views.
+/// Which parameters are free, besides the target poses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Free {
-    /// How many of the lens's intrinsics: fx, fy, cx, cy, then distortion. See [`Free::held`].
-    pub(crate) lenses: Lenses,
-    pub(crate) mounts: bool,
+pub(crate) struct FreeParameters {
+    /// Free intrinsics: fx, fy, cx, cy and the distortion coefficients.
+    pub(crate) intrinsics: FreeIntrinsics,
+    pub(crate) rig_poses: bool,
     pub(crate) shape: bool,
 }
 
-/// What of the lenses may change.
+/// Which intrinsics are free.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Lenses {
-    Nothing,
-    /// Focal lengths and the first two parameters of the distortion.
+pub(crate) enum FreeIntrinsics {
+    None,
+    /// Focal lengths and the first two distortion coefficients.
     Coarse,
     All,
 }
 
-impl Free {
-    pub(crate) const ALL: Self = Self { lenses: Lenses::All, mounts: true, shape: true };
-    pub(crate) const POSES: Self = Self { lenses: Lenses::Nothing, mounts: false, shape: false };
+impl FreeParameters {
+    pub(crate) const ALL: Self = Self { intrinsics: FreeIntrinsics::All, rig_poses: true, shape: true };
+    pub(crate) const POSES: Self = Self { intrinsics: FreeIntrinsics::None, rig_poses: false, shape: false };
 }
 
-/// Corners weigh alike: residuals in pixels.
+/// The least squares problem. All corners have unit weight, residuals are in pixels.
 pub(crate) struct Problem<'a> {
     pub(crate) adjustment: Adjustment<'a>,
     lenses: Vec<GroupId>,
-    mounts: GroupId,
+    rig_poses: GroupId,
     shape: GroupId,
     poses: GroupId,
-    /// Numbers of residuals of corners, and what is fitted to them.
-    numbers: usize,
-    fitted: usize,
-    /// Kinds of residuals that are corners; priors come after them.
+    /// Number of residuals of corners.
+    residual_count: usize,
+    /// Number of fitted parameters.
+    parameter_count: usize,
+    /// Number of cameras: the first residual blocks are their corners, then come the priors.
     cameras: usize,
 }
 
-/// The denominator of a rational lens and its numerator make up for each other, entirely so where there is no distortion. So the distortion of such lenses is a
-/// little drawn to zero: its effect where the picture ends (or at 45°, if that is nearer) has this standard deviation beforehand, as a factor on the radius,
-/// where a corner has one of [`PRIOR_NOISE`].
-const PRIOR: f64 = 5.0;
-/// Pixels.
-const PRIOR_NOISE: f64 = 0.1;
-/// The prior weighs as if there were no more corners than so many, that it stays above rounding.
-const PRIOR_CORNERS: f64 = 1000.0;
+/// Prior standard deviation of the distortion of a rational model, as a factor on the radius at the image corner (or at
+/// 45°, if that is closer), at a corner noise of [`PRIOR_NOISE_PX`]. Numerator and denominator are correlated,
+/// perfectly so without distortion: the prior regularizes them.
+const PRIOR_SIGMA: f64 = 5.0;
+/// Corner noise that the prior is relative to, in pixels.
+const PRIOR_NOISE_PX: f64 = 0.1;
+/// Number of corners from which on the prior's weight grows with the number of corners, to stay above rounding errors.
+const PRIOR_MIN_CORNERS: f64 = 1000.0;
 
-/// Weights of the prior on the intrinsics of a camera; `None` where the model needs none.
+/// Returns the prior weights on the intrinsics of a camera; `None` for models that need no prior.
 fn prior_weights<const N: usize>(camera: &Camera, corners: usize) -> Option<[f64; N]> {
     let names = camera.distortion.model().info().parameters;
     if !names.contains(&"k6") {
         return None;
     }
-    let half = 0.5 * (camera.width as f64).hypot(camera.height as f64);
-    let squared = (half / camera.fx.min(camera.fy)).min(1.0).powi(2);
-    let more = (corners as f64 / PRIOR_CORNERS).max(1.0).sqrt();
+    let half_diagonal = 0.5 * (camera.width as f64).hypot(camera.height as f64);
+    let squared = (half_diagonal / camera.fx.min(camera.fy)).min(1.0).powi(2);
+    let scale = (corners as f64 / PRIOR_MIN_CORNERS).max(1.0).sqrt();
     let mut weights = [0.0; N];
     for (weight, name) in weights[4..].iter_mut().zip(names) {
         let power = match *name {
@@ -107,50 +110,51 @@ fn prior_weights<const N: usize>(camera: &Camera, corners: usize) -> Option<[f64
             "k3" | "k6" => 3,
             _ => continue,
         };
-        *weight = more * PRIOR_NOISE / PRIOR * squared.powi(power);
+        *weight = scale * PRIOR_NOISE_PX / PRIOR_SIGMA * squared.powi(power);
     }
     Some(weights)
 }
 
 impl Problem<'_> {
     pub(crate) fn new(
-        data: &Sightings,
+        data: &TargetObservations,
         estimate: &Estimate,
-        used: &Used,
-        free: Free,
+        used: &InlierMask,
+        free: FreeParameters,
         loss: RobustLoss,
     ) -> Result<Self, AdjustError> {
         let mut adjustment = Adjustment::default();
         let store = |p: &Pose| RigidMotion::store(&p.rotation, &p.translation);
         let poses = estimate.poses.iter().flat_map(|p| store(&p.unwrap_or(Pose::identity()))).collect();
         let poses = adjustment.add_group("pose", RigidMotion, poses)?;
-        let mounts = adjustment.add_group("mount", RigidMotion, estimate.mounts.iter().flat_map(store).collect())?;
+        let rig_poses =
+            adjustment.add_group("rig_pose", RigidMotion, estimate.rig_poses.iter().flat_map(store).collect())?;
         let shape = adjustment.add_group("shape", Euclidean(2), estimate.shape.to_vec())?;
         adjustment.eliminate(poses)?;
         let mut lenses = Vec::with_capacity(estimate.cameras.len());
-        let (mut numbers, mut fitted) = (0, if free.shape { 2 } else { 0 });
-        let seen = |v: &usize| estimate.poses[*v].is_some() && used[*v].iter().flatten().any(|u| *u);
-        fitted += 6 * (0..data.views.len()).filter(seen).count();
+        let (mut residual_count, mut parameter_count) = (0, if free.shape { 2 } else { 0 });
+        let is_observed = |v: &usize| estimate.poses[*v].is_some() && used[*v].iter().flatten().any(|u| *u);
+        parameter_count += 6 * (0..data.views.len()).filter(is_observed).count();
         for (c, camera) in estimate.cameras.iter().enumerate() {
             let count = camera.intrinsic_count();
             let lens = adjustment.add_group("lens", Euclidean(count), camera.intrinsics()[..count].to_vec())?;
-            match free.lenses {
-                Lenses::All => {}
-                Lenses::Nothing => adjustment.hold(lens, 0)?,
-                Lenses::Coarse => {
-                    let held: Vec<usize> = [2, 3].into_iter().chain(6..count).collect();
-                    adjustment.hold_parameters(lens, 0, &held)?;
+            match free.intrinsics {
+                FreeIntrinsics::All => {}
+                FreeIntrinsics::None => adjustment.hold(lens, 0)?,
+                FreeIntrinsics::Coarse => {
+                    let constant: Vec<usize> = [2, 3].into_iter().chain(6..count).collect();
+                    adjustment.hold_parameters(lens, 0, &constant)?;
                 }
             }
-            fitted += match free.lenses {
-                Lenses::All => count,
-                Lenses::Nothing => 0,
-                Lenses::Coarse => 4,
+            parameter_count += match free.intrinsics {
+                FreeIntrinsics::All => count,
+                FreeIntrinsics::None => 0,
+                FreeIntrinsics::Coarse => 4,
             };
-            if c == 0 || !free.mounts {
-                adjustment.hold(mounts, c)?;
+            if c == 0 || !free.rig_poses {
+                adjustment.hold(rig_poses, c)?;
             } else {
-                fitted += 6;
+                parameter_count += 6;
             }
             lenses.push(lens);
             let (mut items, mut views) = (Vec::new(), Vec::new());
@@ -160,42 +164,52 @@ impl Problem<'_> {
                     views.push(v as u32);
                 }
             }
-            numbers += 2 * items.len();
-            let groups = Groups { poses, mounts, lens, shape };
+            residual_count += 2 * items.len();
+            let groups = Groups { poses, rig_poses, lens, shape };
             match count {
-                8 => add::<8, 16, 22>(&mut adjustment, *camera, c, items, &views, groups, loss)?,
-                9 => add::<9, 17, 23>(&mut adjustment, *camera, c, items, &views, groups, loss)?,
-                12 => add::<12, 20, 26>(&mut adjustment, *camera, c, items, &views, groups, loss)?,
-                16 => add::<16, 24, 30>(&mut adjustment, *camera, c, items, &views, groups, loss)?,
+                8 => add_corners::<8, 16, 22>(&mut adjustment, *camera, c, items, &views, groups, loss)?,
+                9 => add_corners::<9, 17, 23>(&mut adjustment, *camera, c, items, &views, groups, loss)?,
+                12 => add_corners::<12, 20, 26>(&mut adjustment, *camera, c, items, &views, groups, loss)?,
+                16 => add_corners::<16, 24, 30>(&mut adjustment, *camera, c, items, &views, groups, loss)?,
                 got => return Err(AdjustError::Size { group: "lens".to_owned(), got, most: MAX_INTRINSICS }),
             }
         }
         for (camera, lens) in estimate.cameras.iter().zip(&lenses) {
             match camera.intrinsic_count() {
-                12 => add_prior::<12>(&mut adjustment, camera, *lens, numbers / 2)?,
-                16 => add_prior::<16>(&mut adjustment, camera, *lens, numbers / 2)?,
+                12 => add_prior::<12>(&mut adjustment, camera, *lens, residual_count / 2)?,
+                16 => add_prior::<16>(&mut adjustment, camera, *lens, residual_count / 2)?,
                 _ => {}
             }
         }
         if !free.shape {
             adjustment.hold(shape, 0)?;
         }
-        Ok(Self { adjustment, lenses, mounts, shape, poses, numbers, fitted, cameras: estimate.cameras.len() })
+        Ok(Self {
+            adjustment,
+            lenses,
+            rig_poses,
+            shape,
+            poses,
+            residual_count,
+            parameter_count,
+            cameras: estimate.cameras.len(),
+        })
     }
 
-    fn write(&self, estimate: &mut Estimate) {
+    /// Stores the adjusted parameters in an estimate.
+    fn store_to(&self, estimate: &mut Estimate) {
         let load = |x: &[f64]| {
             let (rotation, translation) = RigidMotion::load(x);
             Pose::new(rotation, translation)
         };
         for (camera, lens) in estimate.cameras.iter_mut().zip(&self.lenses) {
             let mut values = [0.0; MAX_INTRINSICS];
-            let found = self.adjustment.values(*lens);
-            values[..found.len()].copy_from_slice(found);
+            let adjusted = self.adjustment.values(*lens);
+            values[..adjusted.len()].copy_from_slice(adjusted);
             *camera = camera.with_intrinsics(&values);
         }
-        let mounts = self.adjustment.values(self.mounts).chunks_exact(12);
-        estimate.mounts.iter_mut().zip(mounts).skip(1).for_each(|(m, x)| *m = load(x));
+        let rig_poses = self.adjustment.values(self.rig_poses).chunks_exact(12);
+        estimate.rig_poses.iter_mut().zip(rig_poses).skip(1).for_each(|(m, x)| *m = load(x));
         let poses = self.adjustment.values(self.poses).chunks_exact(12);
         for (pose, x) in estimate.poses.iter_mut().zip(poses).filter(|(pose, _)| pose.is_some()) {
             *pose = Some(load(x));
@@ -203,19 +217,19 @@ impl Problem<'_> {
         estimate.shape.copy_from_slice(self.adjustment.values(self.shape));
     }
 
-    /// Covariance of all lenses, then the mounts but the first, then the shape, for the noise that the residuals show; and that noise's variance, in square
-    /// pixels of a coordinate.
+    /// Returns the covariance of all intrinsics, then the rig poses but the first, then the shape, for the noise
+    /// estimated from the residuals; and the variance of that noise, in square pixels of a coordinate.
     pub(crate) fn covariance(&self) -> Result<(DMatrix<f64>, f64), AdjustError> {
         let sums = self.adjustment.residual_sums()?;
-        let squares: f64 = sums.iter().take(self.cameras).map(|s| s.weighted_squares).sum();
-        let variance = squares / self.numbers.saturating_sub(self.fitted).max(1) as f64;
-        // Exact corners leave only rounding; the pattern of the covariance is still of use.
+        let sum_of_squares: f64 = sums.iter().take(self.cameras).map(|s| s.weighted_squares).sum();
+        let variance = sum_of_squares / self.residual_count.saturating_sub(self.parameter_count).max(1) as f64;
+        // For exact corners only rounding is left; the structure of the covariance is still useful.
         let covariance = self.adjustment.covariance(variance.max(f64::MIN_POSITIVE))?;
         let blocks: Vec<(GroupId, usize)> = self
             .lenses
             .iter()
             .map(|l| (*l, 0))
-            .chain((1..self.lenses.len()).map(|m| (self.mounts, m)))
+            .chain((1..self.lenses.len()).map(|m| (self.rig_poses, m)))
             .chain([(self.shape, 0)])
             .collect();
         let mut parts = Vec::with_capacity(blocks.len());
@@ -234,7 +248,7 @@ impl Problem<'_> {
             }
             row += height;
         }
-        // By halves from either side: rounding must not make it asymmetric.
+        // Symmetrized against rounding.
         Ok(((&all + all.transpose()) * 0.5, variance))
     }
 }
@@ -242,33 +256,34 @@ impl Problem<'_> {
 #[derive(Clone, Copy)]
 struct Groups {
     poses: GroupId,
-    mounts: GroupId,
+    rig_poses: GroupId,
     lens: GroupId,
     shape: GroupId,
 }
 
-/// Adds the corners of a camera, of which the first needs no mount.
-fn add<const N: usize, const ONE: usize, const MORE: usize>(
+/// Adds the residuals of a camera's corners. The first camera has no rig pose.
+fn add_corners<const N: usize, const FIRST_DIMS: usize, const RIG_DIMS: usize>(
     adjustment: &mut Adjustment<'_>,
     camera: Camera,
-    number: usize,
+    index: usize,
     items: Vec<Corner>,
     views: &[u32],
     groups: Groups,
     loss: RobustLoss,
 ) -> Result<(), AdjustError> {
-    let Groups { poses, mounts, lens, shape } = groups;
-    if number == 0 {
+    let Groups { poses, rig_poses, lens, shape } = groups;
+    if index == 0 {
         let blocks = views.iter().map(|v| [*v, 0, 0]).collect();
-        let residual = FromReference::<N, ONE> { camera, items };
+        let residual = FirstCameraResidual::<N, FIRST_DIMS> { camera, items };
         adjustment.add_residuals("corner", residual, [poses, lens, shape], blocks, loss)
     } else {
-        let blocks = views.iter().map(|v| [*v, number as u32, 0, 0]).collect();
-        let residual = FromMount::<N, MORE> { camera, items };
-        adjustment.add_residuals("corner", residual, [poses, mounts, lens, shape], blocks, loss)
+        let blocks = views.iter().map(|v| [*v, index as u32, 0, 0]).collect();
+        let residual = RigCameraResidual::<N, RIG_DIMS> { camera, items };
+        adjustment.add_residuals("corner", residual, [poses, rig_poses, lens, shape], blocks, loss)
     }
 }
 
+/// Adds the prior on a camera's intrinsics, if it needs one.
 fn add_prior<const N: usize>(
     adjustment: &mut Adjustment<'_>,
     camera: &Camera,
@@ -285,16 +300,16 @@ fn add_prior<const N: usize>(
     )
 }
 
-/// Whether a model can be adjusted.
-pub(crate) fn check_model(model: DistortionModel) -> Result<(), CalibrateError> {
+/// Checks that a distortion model can be adjusted.
+pub(crate) fn check_adjustable(model: DistortionModel) -> Result<(), CalibrateError> {
     if [4, 5, 8, 12].contains(&model.parameter_count()) { Ok(()) } else { Err(CalibrateError::Lens { model }) }
 }
 
-/// Why there is no adjustment.
+/// Why an adjustment failed.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Failure {
     Cancelled,
-    /// The residuals do not determine it, or it has no start.
+    /// The parameters are not determined by the residuals, or there are no initial values.
     Adjust(AdjustError),
 }
 
@@ -310,33 +325,36 @@ impl From<AdjustError> for Failure {
     }
 }
 
-/// Damping at the start of least squares, which begins where a robust adjustment ended: the usual one would hold back what is determined least, such as a focal
-/// length against the distances, for a few steps.
-const NEAR_DAMPING: f64 = 1e-7;
-/// Most distortion parameters of lenses that begin so. Those of a rational lens make up for each other: without damping they run away together.
-const MOST_NEAR: usize = 5;
+/// Initial damping of the least squares stage, which starts from the result of the robust one: the default would delay
+/// weakly determined parameters, such as focal length against distance, for some steps.
+const REFINEMENT_DAMPING: f64 = 1e-7;
+/// Maximum number of distortion coefficients with that damping. Those of a rational model are correlated and diverge
+/// without the default damping.
+const REFINEMENT_MAX_COEFFICIENTS: usize = 5;
 
-/// Adjusts an estimate, which is never worse afterwards. Square root of the mean cost of a corner, in pixels.
+/// Adjusts an estimate; the cost never increases. Returns the root mean cost of a corner, in pixels.
 pub(crate) fn adjust(
-    data: &Sightings,
+    data: &TargetObservations,
     estimate: &mut Estimate,
-    used: &Used,
-    (free, loss): (Free, RobustLoss),
+    used: &InlierMask,
+    (free, loss): (FreeParameters, RobustLoss),
     (max_iterations, cost_tolerance): (usize, f64),
     progress: &dyn Progress,
 ) -> Result<f64, Failure> {
     let mut problem = Problem::new(data, estimate, used, free, loss)?;
     let mut options = AdjustOptions { max_iterations, cost_tolerance, ..AdjustOptions::default() };
-    if loss == RobustLoss::Trivial && estimate.cameras.iter().all(|c| c.distortion.parameters().len() <= MOST_NEAR) {
-        options.initial_damping = NEAR_DAMPING;
+    if loss == RobustLoss::Trivial
+        && estimate.cameras.iter().all(|c| c.distortion.parameters().len() <= REFINEMENT_MAX_COEFFICIENTS)
+    {
+        options.initial_damping = REFINEMENT_DAMPING;
     }
-    let mut stopped = Ok(());
+    let mut progress_result = Ok(());
     let next = |_: &AdjustIteration| {
-        stopped = progress.report("adjust", 0, 0);
-        if stopped.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+        progress_result = progress.report("adjust", 0, 0);
+        if progress_result.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
     };
     let report = problem.adjustment.solve(&options, next)?;
-    stopped?;
-    problem.write(estimate);
-    Ok((report.cost / (problem.numbers.max(2) as f64 / 2.0)).sqrt())
+    progress_result?;
+    problem.store_to(estimate);
+    Ok((report.cost / (problem.residual_count.max(2) as f64 / 2.0)).sqrt())
 }

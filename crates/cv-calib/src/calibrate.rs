@@ -1,95 +1,101 @@
-//! From corners to a calibration.
+//! Calibration of a camera or rig from the corners of a target: the job as a whole.
 
-use crate::adjustment::{Estimate, Failure, Free, Problem, Used};
+use crate::adjustment::{Estimate, Failure, FreeParameters, InlierMask, Problem};
 use crate::calibration::{
-    CalibratedCamera, CalibratedCorner, CalibratedParameter, CalibratedPicture, CalibratedView, Calibration,
-    PictureOutcome, TargetShape,
+    CalibratedCamera, CalibratedCorner, CalibratedImage, CalibratedParameter, CalibratedView, Calibration,
+    ImageOutcome, TargetShape,
 };
 use crate::fit::{Fit, Limits, ShapeState, fit};
 use crate::holdout::{HoldOut, hold_out};
-use crate::lens_choice::{Mono, choose, folds, rms};
+use crate::lens_choice::{Mono, choose_lens, fold_count, rms};
 use crate::plane_pose::is_mirrored;
-use crate::rig_start::{mounts, turns_of_views};
-use crate::target::Sightings;
-use crate::uncertainty::{CoverageMap, uncertainty};
+use crate::rig_start::{estimate_rig_poses, symmetries_of_views};
+use crate::target::TargetObservations;
+use crate::uncertainty::{CoverageMap, uncertainty_map};
 use crate::verdict::{
-    BENT, CaptureNote, EMPTY, ENOUGH_VIEWS, HOLDOUT_RATIO, PARALLEL_DEGREES, PictureSide, UNCERTAIN_PX, Verdict,
+    CaptureNote, HOLDOUT_RATIO, ImageSide, MAX_DEFLECTION_RATIO, MIN_COVERED_FRACTION, PARALLEL_DEGREES,
+    RECOMMENDED_VIEWS, UNCERTAIN_PX, Verdict,
 };
 use crate::{CalibrateError, CalibrateOptions};
 use cv_core::{Cancelled, Pose, Progress, Vector3};
 use cv_numeric::RobustLoss;
 use nalgebra::DMatrix;
 
-/// Fewest views of a camera: two determine a pinhole and leave nothing for a lens.
-const LEAST_VIEWS: usize = 3;
-/// Above this relative standard deviation, a focal length is as good as unknown.
-const UNKNOWN_FOCAL: f64 = 0.1;
+/// Minimum number of views of a camera: two determine a pinhole and leave no redundancy.
+const MIN_VIEWS: usize = 3;
+/// Largest relative standard deviation of the focal length of a determined camera.
+const MAX_FOCAL_SIGMA: f64 = 0.1;
 
-/// Calibrates cameras, one or a rig of several, from what they saw of a flat target.
+/// Calibrates a camera, or a rig of several, from observations of a planar target.
 ///
-/// Zhang's closed form and a search over focal lengths and barrels give the first lens; then one adjustment of lenses, poses, places of the cameras and the
-/// target's own shape to the least reprojection error, robustly first, then by least squares on the corners that are near enough. Where the lens model is to be
-/// chosen, each is judged by the views that it was not fitted to. O(corners) for each of some tens of iterations and each model.
+/// Initial intrinsics are from Zhang's closed form and a search over focal lengths and barrel distortions. A joint
+/// adjustment of intrinsics, target poses, rig poses and the target's shape then minimizes the reprojection error,
+/// first with a robust loss, then by least squares on the inliers. A lens model is selected by cross-validation over
+/// the views. O(corners) for each of some tens of iterations and each model.
 ///
-/// # Errors
-/// [`CalibrateError`]: corners that cannot be those of the target, too few views (three for each camera), views that do not determine the lens, cameras that share
-/// no view, an option out of its range, or the job was stopped.
+/// [`CalibrateError`]: corners that are not of the target, too few views (three for each camera), views that do not
+/// determine the intrinsics, cameras without common views, an option out of range, or the job was stopped.
 pub fn calibrate(
-    data: &Sightings,
+    data: &TargetObservations,
     options: &CalibrateOptions,
     progress: &dyn Progress,
 ) -> Result<Calibration, CalibrateError> {
-    options.check()?;
-    data.check()?;
+    options.validate()?;
+    data.validate()?;
     let limits = Limits {
         outlier_deviations: options.outlier_deviations,
         min_corners: options.min_corners,
         board_shape: options.board_shape,
     };
-    let refused = refusals(data, options.min_corners);
+    let rejections = find_rejections(data, options.min_corners);
     let cameras = data.sizes.len();
-    let mut alone = Vec::with_capacity(cameras);
+    let mut monos = Vec::with_capacity(cameras);
     for camera in 0..cameras {
-        let (own, views) = data.of_camera(camera);
-        let usable: Vec<usize> = (0..views.len()).filter(|i| refused[views[*i]][camera].is_none()).collect();
-        if usable.len() < LEAST_VIEWS {
-            return Err(too_few(&refused, camera, usable.len()));
+        let (observations, views) = data.of_camera(camera);
+        let usable: Vec<usize> = (0..views.len()).filter(|i| rejections[views[*i]][camera].is_none()).collect();
+        if usable.len() < MIN_VIEWS {
+            return Err(too_few_views(&rejections, camera, usable.len()));
         }
         let holdout = options.holdout && cameras == 1;
-        let mono = choose(&own, &usable, options.lens, limits, holdout, progress).map_err(|e| of_camera(e, camera))?;
+        let mono = choose_lens(&observations, &usable, options.lens, limits, holdout, progress)
+            .map_err(|e| with_camera_index(e, camera))?;
         if cameras > 1 {
-            check_determined(&mono.fit, camera, covariance_of(&own, &mono.fit).ok())?;
+            check_determined(&mono.fit, camera, estimate_covariance(&observations, &mono.fit).ok())?;
         }
-        alone.push((mono, views));
+        monos.push((mono, views));
     }
     if cameras == 1 {
-        let (fit, holdout, mono) = expand(data, alone.remove(0))?;
-        return report(data, options, fit, holdout, vec![mono], &refused);
+        let (fit, holdout, mono) = expand(data, monos.remove(0))?;
+        return report(data, options, fit, holdout, vec![mono], &rejections);
     }
-    let usable = usable_corners(data, &refused);
-    let turns = data.target.turns();
-    let mut poses = own_poses(data.views.len(), &alone);
-    let mounts = mounts(&poses, &turns)?;
-    // What cameras numbered otherwise gets the numbers of the first camera's picture.
-    let numbered = turns_of_views(&poses, &mounts, &turns);
-    let mut same = data.clone();
-    for (v, c) in (0..numbered.len()).flat_map(|v| (0..cameras).map(move |c| (v, c))) {
-        let turn = numbered[v][c];
-        same.views[v][c].iter_mut().for_each(|corner| corner.point = data.target.turned(corner.point, turn));
-        poses[c][v] = poses[c][v].map(|pose| pose.compose(&turns[turn].inverse()));
+    let usable = usable_corners(data, &rejections);
+    let symmetries = data.target.symmetries();
+    let mut poses = mono_poses(data.views.len(), &monos);
+    let rig_poses = estimate_rig_poses(&poses, &symmetries)?;
+    // Corners that a camera numbers otherwise get the numbering of the first camera's image.
+    let numberings = symmetries_of_views(&poses, &rig_poses, &symmetries);
+    let mut renumbered = data.clone();
+    for (v, c) in (0..numberings.len()).flat_map(|v| (0..cameras).map(move |c| (v, c))) {
+        let symmetry = numberings[v][c];
+        renumbered.views[v][c]
+            .iter_mut()
+            .for_each(|corner| corner.point = data.target.symmetric_index(corner.point, symmetry));
+        poses[c][v] = poses[c][v].map(|pose| pose.compose(&symmetries[symmetry].inverse()));
     }
-    let (fit, holdout) = joint(&same, &alone, (&mounts, &poses), &usable, limits, options.holdout, progress)?;
-    let mut found = report(&same, options, fit, holdout, alone.into_iter().map(|a| a.0).collect(), &refused)?;
-    for (view, turns) in found.views.iter_mut().zip(numbered) {
-        view.pictures.iter_mut().zip(turns).for_each(|(picture, turn)| picture.turn = turn);
+    let (fit, holdout) =
+        calibrate_jointly(&renumbered, &monos, (&rig_poses, &poses), &usable, limits, options.holdout, progress)?;
+    let mut calibration =
+        report(&renumbered, options, fit, holdout, monos.into_iter().map(|a| a.0).collect(), &rejections)?;
+    for (view, symmetries) in calibration.views.iter_mut().zip(numberings) {
+        view.images.iter_mut().zip(symmetries).for_each(|(picture, symmetry)| picture.symmetry = symmetry);
     }
-    Ok(found)
+    Ok(calibration)
 }
 
-/// The poses of the views as each camera has them by itself, by camera and view.
-fn own_poses(views: usize, alone: &[(Mono, Vec<usize>)]) -> Vec<Vec<Option<Pose>>> {
-    let mut poses = vec![vec![None; views]; alone.len()];
-    for ((mono, views), poses) in alone.iter().zip(&mut poses) {
+/// Returns the target poses that each camera estimates alone, by camera and view.
+fn mono_poses(views: usize, monos: &[(Mono, Vec<usize>)]) -> Vec<Vec<Option<Pose>>> {
+    let mut poses = vec![vec![None; views]; monos.len()];
+    for ((mono, views), poses) in monos.iter().zip(&mut poses) {
         for (i, v) in views.iter().enumerate() {
             poses[*v] = mono.fit.estimate.poses[i].filter(|_| mono.fit.used[i].iter().flatten().any(|u| *u));
         }
@@ -97,63 +103,70 @@ fn own_poses(views: usize, alone: &[(Mono, Vec<usize>)]) -> Vec<Vec<Option<Pose>
     poses
 }
 
-/// The error of a camera by itself as that of a camera of several.
-fn of_camera(error: CalibrateError, number: usize) -> CalibrateError {
+/// Converts the error of a single camera to that of a camera of a rig.
+fn with_camera_index(error: CalibrateError, index: usize) -> CalibrateError {
     match error {
-        CalibrateError::NoStart { model, error_px, .. } => CalibrateError::NoStart { camera: number, model, error_px },
+        CalibrateError::NoStart { model, error_px, .. } => CalibrateError::NoStart { camera: index, model, error_px },
         CalibrateError::Degenerate { largest_tilt_degrees, .. } => {
-            CalibrateError::Degenerate { camera: number, largest_tilt_degrees }
+            CalibrateError::Degenerate { camera: index, largest_tilt_degrees }
         }
         other => other,
     }
 }
 
-/// Why pictures cannot be used, by view and camera, before anything is fitted.
-fn refusals(data: &Sightings, min_corners: usize) -> Vec<Vec<Option<PictureOutcome>>> {
-    let of = |corners: &Vec<crate::TargetCorner>| match corners.len() {
-        0 => Some(PictureOutcome::Nothing),
-        got if got < min_corners => Some(PictureOutcome::TooFewCorners { got, needed: min_corners }),
+/// Returns by view and camera why an image is rejected before the fit; `None` where it is not.
+fn find_rejections(data: &TargetObservations, min_corners: usize) -> Vec<Vec<Option<ImageOutcome>>> {
+    let rejection = |corners: &Vec<crate::TargetCorner>| match corners.len() {
+        0 => Some(ImageOutcome::Nothing),
+        got if got < min_corners => Some(ImageOutcome::TooFewCorners { got, needed: min_corners }),
         _ => match is_mirrored(&data.target, corners) {
-            None => Some(PictureOutcome::Flat),
-            Some(true) => Some(PictureOutcome::Mirrored),
+            None => Some(ImageOutcome::Flat),
+            Some(true) => Some(ImageOutcome::Mirrored),
             Some(false) => None,
         },
     };
-    data.views.iter().map(|cameras| cameras.iter().map(of).collect()).collect()
+    data.views.iter().map(|cameras| cameras.iter().map(rejection).collect()).collect()
 }
 
-fn too_few(refused: &[Vec<Option<PictureOutcome>>], camera: usize, got: usize) -> CalibrateError {
-    let count = |of: fn(&PictureOutcome) -> bool| refused.iter().filter(|v| v[camera].as_ref().is_some_and(of)).count();
+/// Creates the error of a camera with too few usable views.
+fn too_few_views(rejections: &[Vec<Option<ImageOutcome>>], camera: usize, got: usize) -> CalibrateError {
+    let count = |is_kind: fn(&ImageOutcome) -> bool| {
+        rejections.iter().filter(|v| v[camera].as_ref().is_some_and(is_kind)).count()
+    };
     CalibrateError::TooFewViews {
         camera,
         got,
-        needed: LEAST_VIEWS,
-        small: count(|o| matches!(o, PictureOutcome::TooFewCorners { .. } | PictureOutcome::Flat)),
-        mirrored: count(|o| matches!(o, PictureOutcome::Mirrored)),
+        needed: MIN_VIEWS,
+        small: count(|o| matches!(o, ImageOutcome::TooFewCorners { .. } | ImageOutcome::Flat)),
+        mirrored: count(|o| matches!(o, ImageOutcome::Mirrored)),
     }
 }
 
-fn usable_corners(data: &Sightings, refused: &[Vec<Option<PictureOutcome>>]) -> Used {
-    let picture = |(corners, refused): (&Vec<_>, &Option<_>)| vec![refused.is_none(); corners.len()];
-    data.views.iter().zip(refused).map(|(v, r)| v.iter().zip(r).map(picture).collect()).collect()
+/// Returns the mask of the corners in images that are not rejected.
+fn usable_corners(data: &TargetObservations, rejections: &[Vec<Option<ImageOutcome>>]) -> InlierMask {
+    let picture = |(corners, rejections): (&Vec<_>, &Option<_>)| vec![rejections.is_none(); corners.len()];
+    data.views.iter().zip(rejections).map(|(v, r)| v.iter().zip(r).map(picture).collect()).collect()
 }
 
-/// Covariance of everything but the poses of the views, and the variance of a coordinate.
-fn covariance_of(data: &Sightings, fit: &Fit) -> Result<(DMatrix<f64>, f64), cv_numeric::adjust::AdjustError> {
-    let free = Free { shape: fit.shape == ShapeState::Adjusted, ..Free::ALL };
+/// Computes the covariance of all parameters but the target poses, and the noise variance of a coordinate.
+fn estimate_covariance(
+    data: &TargetObservations,
+    fit: &Fit,
+) -> Result<(DMatrix<f64>, f64), cv_numeric::adjust::AdjustError> {
+    let free = FreeParameters { shape: fit.shape == ShapeState::Adjusted, ..FreeParameters::ALL };
     Problem::new(data, &fit.estimate, &fit.used, free, RobustLoss::Trivial)?.covariance()
 }
 
-/// Refuses a focal length that the views leave open. `covariance`: where there is one, that of the camera before others.
+/// Returns `covariance`, or an error if it leaves the focal length undetermined. Its first block is that of the camera.
 fn check_determined(
     fit: &Fit,
     camera: usize,
     covariance: Option<(DMatrix<f64>, f64)>,
 ) -> Result<(DMatrix<f64>, f64), CalibrateError> {
     if let Some((covariance, variance)) = covariance {
-        // Exact corners too: as if they had noise of a tenth of a pixel.
-        let more = (1e-2 / variance.max(f64::MIN_POSITIVE)).max(1.0);
-        if (covariance[(0, 0)] * more).sqrt() <= UNKNOWN_FOCAL * fit.estimate.cameras[0].fx {
+        // Scaled to a noise of at least a tenth of a pixel, for exact corners.
+        let scale = (1e-2 / variance.max(f64::MIN_POSITIVE)).max(1.0);
+        if (covariance[(0, 0)] * scale).sqrt() <= MAX_FOCAL_SIGMA * fit.estimate.cameras[0].fx {
             return Ok((covariance, variance));
         }
     }
@@ -162,14 +175,14 @@ fn check_determined(
     Err(CalibrateError::Degenerate { camera, largest_tilt_degrees: largest })
 }
 
-/// What one camera saw, put back among the views in which it saw nothing.
+/// Restores the views without observations to the result of a single camera.
 fn expand(
-    data: &Sightings,
+    data: &TargetObservations,
     (mut mono, views): (Mono, Vec<usize>),
 ) -> Result<(Fit, Option<HoldOut>, Mono), CalibrateError> {
     let mut fit = mono.fit.clone();
     let mut poses = vec![None; data.views.len()];
-    let mut used: Used = data.views.iter().map(|v| v.iter().map(|c| vec![false; c.len()]).collect()).collect();
+    let mut used: InlierMask = data.views.iter().map(|v| v.iter().map(|c| vec![false; c.len()]).collect()).collect();
     for (i, v) in views.iter().enumerate() {
         poses[*v] = fit.estimate.poses[i];
         used[*v] = std::mem::take(&mut fit.used[i]);
@@ -180,29 +193,28 @@ fn expand(
     Ok((fit, holdout, mono))
 }
 
-/// Joins cameras that were calibrated by themselves, and adjusts all together.
-fn joint(
-    data: &Sightings,
-    alone: &[(Mono, Vec<usize>)],
-    (mounts, poses): (&[Pose], &[Vec<Option<Pose>>]),
-    usable: &Used,
+/// Adjusts the cameras of a rig jointly, starting from the calibrations of single cameras.
+fn calibrate_jointly(
+    data: &TargetObservations,
+    monos: &[(Mono, Vec<usize>)],
+    (rig_poses, poses): (&[Pose], &[Vec<Option<Pose>>]),
+    usable: &InlierMask,
     limits: Limits,
     holdout: bool,
     progress: &dyn Progress,
 ) -> Result<(Fit, Option<HoldOut>), CalibrateError> {
     let n = data.views.len();
-    let of_view = |v: usize| {
-        // Where cameras do not agree, the residuals will tell.
-        let seen = mounts.iter().zip(poses).find_map(|(m, poses)| poses[v].map(|p| m.inverse().compose(&p)))?;
-        Some(seen)
+    let target_pose = |v: usize| {
+        let pose = rig_poses.iter().zip(poses).find_map(|(m, poses)| poses[v].map(|p| m.inverse().compose(&p)))?;
+        Some(pose)
     };
-    let shapes = alone.iter().map(|(m, _)| m.fit.estimate.shape);
-    let count = alone.len() as f64;
+    let shapes = monos.iter().map(|(m, _)| m.fit.estimate.shape);
+    let count = monos.len() as f64;
     let shape = shapes.fold([0.0; 2], |s, x| [s[0] + x[0] / count, s[1] + x[1] / count]);
     let estimate = Estimate {
-        cameras: alone.iter().map(|(m, _)| m.fit.estimate.cameras[0]).collect(),
-        mounts: mounts.to_vec(),
-        poses: (0..n).map(of_view).collect(),
+        cameras: monos.iter().map(|(m, _)| m.fit.estimate.cameras[0]).collect(),
+        rig_poses: rig_poses.to_vec(),
+        poses: (0..n).map(target_pose).collect(),
         shape,
     };
     let degenerate = CalibrateError::Degenerate { camera: 0, largest_tilt_degrees: f64::NAN };
@@ -210,61 +222,62 @@ fn joint(
         Failure::Cancelled => CalibrateError::Cancelled(Cancelled),
         Failure::Adjust(_) => degenerate,
     };
-    let found = fit(data, &estimate, usable, limits, progress).map_err(failed)?;
-    let views = found.used.iter().filter(|v| v.iter().flatten().any(|u| *u)).count();
-    let holdout = match folds(views).filter(|_| holdout) {
-        Some(folds) => match hold_out(data, &found, (usable, &found.used), limits, folds, progress) {
+    let fitted = fit(data, &estimate, usable, limits, progress).map_err(failed)?;
+    let views = fitted.used.iter().filter(|v| v.iter().flatten().any(|u| *u)).count();
+    let holdout = match fold_count(views).filter(|_| holdout) {
+        Some(folds) => match hold_out(data, &fitted, (usable, &fitted.used), limits, folds, progress) {
             Ok(error) => Some(error),
             Err(Failure::Cancelled) => return Err(Cancelled.into()),
             Err(Failure::Adjust(_)) => None,
         },
         None => None,
     };
-    Ok((found, holdout))
+    Ok((fitted, holdout))
 }
 
-/// Everything that is said of a fit.
+/// Assembles the result from a fit.
 fn report(
-    data: &Sightings,
+    data: &TargetObservations,
     options: &CalibrateOptions,
     fit: Fit,
     holdout: Option<HoldOut>,
-    alone: Vec<Mono>,
-    refused: &[Vec<Option<PictureOutcome>>],
+    monos: Vec<Mono>,
+    rejections: &[Vec<Option<ImageOutcome>>],
 ) -> Result<Calibration, CalibrateError> {
-    let free = Free { shape: fit.shape == ShapeState::Adjusted, ..Free::ALL };
-    let (covariance, variance) = check_determined(&fit, 0, covariance_of(data, &fit).ok())?;
-    let limit_px = options.outlier_deviations * fit.deviation;
-    let views: Vec<CalibratedView> = (0..data.views.len()).map(|v| view(data, &fit, v, refused, limit_px)).collect();
-    let mut cameras = Vec::with_capacity(alone.len());
+    let free = FreeParameters { shape: fit.shape == ShapeState::Adjusted, ..FreeParameters::ALL };
+    let (covariance, variance) = check_determined(&fit, 0, estimate_covariance(data, &fit).ok())?;
+    let limit_px = options.outlier_deviations * fit.sigma;
+    let views: Vec<CalibratedView> =
+        (0..data.views.len()).map(|v| assemble_view(data, &fit, v, rejections, limit_px)).collect();
+    let mut cameras = Vec::with_capacity(monos.len());
     let mut first = 0;
-    for (c, mono) in alone.into_iter().enumerate() {
+    for (c, mono) in monos.into_iter().enumerate() {
         let camera = fit.estimate.cameras[c];
         let n = camera.intrinsic_count();
-        let own = covariance.view((first, first), (n, n)).into_owned();
+        let camera_covariance = covariance.view((first, first), (n, n)).into_owned();
         first += n;
-        let used = || {
+        let inlier_corners = || {
             let of =
                 |v: usize| data.views[v][c].iter().zip(&fit.used[v][c]).map(move |(corner, used)| (v, corner, *used));
             (0..data.views.len()).flat_map(of).filter(|(_, _, used)| *used).map(|(v, corner, _)| (v, corner))
         };
         let in_camera = |(v, corner): (usize, &crate::TargetCorner)| {
-            let pose = fit.estimate.mounts[c].compose(&fit.estimate.poses[v]?);
+            let pose = fit.estimate.rig_poses[c].compose(&fit.estimate.poses[v]?);
             Some(pose.transform(&data.target.bent(corner.point, fit.estimate.shape)))
         };
-        let points: Vec<_> = used().filter_map(in_camera).collect();
+        let points: Vec<_> = inlier_corners().filter_map(in_camera).collect();
         cameras.push(CalibratedCamera {
             camera,
-            from_first: fit.estimate.mounts[c],
+            from_first: fit.estimate.rig_poses[c],
             rms_px: rms(data, &fit, Some(c)).0,
             holdout_rms_px: holdout.as_ref().map_or(f64::NAN, |h| h.rms(Some(c))),
             holdout_all_rms_px: holdout.as_ref().map_or(f64::NAN, |h| h.rms_of_all(Some(c))),
             lenses: mono.trials,
-            uncertainty: uncertainty(&camera, &own, &points, options.grid),
-            coverage: CoverageMap::new(used().map(|(_, corner)| corner.pixel), data.sizes[c], options.grid),
+            uncertainty: uncertainty_map(&camera, &camera_covariance, &points, options.grid),
+            coverage: CoverageMap::new(inlier_corners().map(|(_, corner)| corner.pixel), data.sizes[c], options.grid),
         });
     }
-    let parameters = parameters(&fit, &covariance);
+    let parameters = list_parameters(&fit, &covariance);
     let mut calibration = Calibration {
         cameras,
         target_shape: TargetShape { deflection: fit.estimate.shape, adjusted: free.shape },
@@ -277,53 +290,54 @@ fn report(
         parameters,
         verdict: Verdict::new(Vec::new()),
     };
-    calibration.verdict = Verdict::new(notes(data, &calibration));
+    calibration.verdict = Verdict::new(capture_notes(data, &calibration));
     Ok(calibration)
 }
 
-fn view(
-    data: &Sightings,
+/// Assembles the result of a view.
+fn assemble_view(
+    data: &TargetObservations,
     fit: &Fit,
     v: usize,
-    refused: &[Vec<Option<PictureOutcome>>],
+    rejections: &[Vec<Option<ImageOutcome>>],
     limit_px: f64,
 ) -> CalibratedView {
     let picture = |c: usize| {
         let residuals = fit.estimate.residuals(data, v, c);
         let used = &fit.used[v][c];
         let count = used.iter().filter(|u| **u).count();
-        let outcome = match refused[v][c] {
-            Some(refused) => refused,
-            None if fit.estimate.poses[v].is_none() => PictureOutcome::NoPose,
-            None if count == 0 => PictureOutcome::Inconsistent {
+        let outcome = match rejections[v][c] {
+            Some(rejections) => rejections,
+            None if fit.estimate.poses[v].is_none() => ImageOutcome::NoPose,
+            None if count == 0 => ImageOutcome::Inconsistent {
                 near: residuals.iter().flatten().filter(|r| r.norm() <= limit_px).count(),
                 of: residuals.len(),
                 limit_px,
             },
-            None => PictureOutcome::Used { corners: count, outliers: used.len() - count },
+            None => ImageOutcome::Used { corners: count, outliers: used.len() - count },
         };
-        let counted = residuals.iter().zip(used).filter(|(_, used)| **used || count == 0).filter_map(|(r, _)| *r);
-        let (squares, n) = counted.fold((0.0, 0), |s, r| (s.0 + r.norm_squared(), s.1 + 1));
+        let scored = residuals.iter().zip(used).filter(|(_, used)| **used || count == 0).filter_map(|(r, _)| *r);
+        let (squares, n) = scored.fold((0.0, 0), |s, r| (s.0 + r.norm_squared(), s.1 + 1));
         let corners = residuals.iter().zip(used).map(|(r, u)| CalibratedCorner { residual: *r, used: *u }).collect();
         let rms_px = if n == 0 { f64::NAN } else { (squares / f64::from(n)).sqrt() };
-        CalibratedPicture { outcome, rms_px, corners, turn: 0 }
+        CalibratedImage { outcome, rms_px, corners, symmetry: 0 }
     };
-    let pictures: Vec<CalibratedPicture> = (0..data.sizes.len()).map(picture).collect();
-    let seen = pictures.iter().any(|p| p.outcome.is_used());
-    CalibratedView { pose: fit.estimate.poses[v].filter(|_| seen), pictures }
+    let images: Vec<CalibratedImage> = (0..data.sizes.len()).map(picture).collect();
+    let is_used = images.iter().any(|p| p.outcome.is_used());
+    CalibratedView { pose: fit.estimate.poses[v].filter(|_| is_used), images }
 }
 
-/// In the order of the covariance; without the target's deflections where they were not adjusted.
-fn parameters(fit: &Fit, covariance: &DMatrix<f64>) -> Vec<CalibratedParameter> {
+/// Lists the parameters in the order of the covariance; without the target's deflections where they were not adjusted.
+fn list_parameters(fit: &Fit, covariance: &DMatrix<f64>) -> Vec<CalibratedParameter> {
     let mut values: Vec<(Option<usize>, &'static str, f64)> = Vec::new();
     for (c, camera) in fit.estimate.cameras.iter().enumerate() {
         let names = ["fx", "fy", "cx", "cy"].iter().chain(camera.distortion.model().info().parameters);
         values.extend(names.zip(camera.intrinsics()).map(|(name, value)| (Some(c), *name, value)));
     }
-    for (c, mount) in fit.estimate.mounts.iter().enumerate().skip(1) {
-        let turn = mount.rotation.scaled_axis();
+    for (c, rig_pose) in fit.estimate.rig_poses.iter().enumerate().skip(1) {
+        let turn = rig_pose.rotation.scaled_axis();
         values.extend(["rx", "ry", "rz"].into_iter().zip(turn.iter().copied()).map(|(n, x)| (Some(c), n, x)));
-        let shift = mount.translation;
+        let shift = rig_pose.translation;
         values.extend(["tx", "ty", "tz"].into_iter().zip(shift.iter().copied()).map(|(n, x)| (Some(c), n, x)));
     }
     if fit.shape == ShapeState::Adjusted {
@@ -336,39 +350,40 @@ fn parameters(fit: &Fit, covariance: &DMatrix<f64>) -> Vec<CalibratedParameter> 
     values.into_iter().enumerate().map(one).collect()
 }
 
-fn notes(data: &Sightings, of: &Calibration) -> Vec<CaptureNote> {
+/// Lists the remarks on the capture.
+fn capture_notes(data: &TargetObservations, calibration: &Calibration) -> Vec<CaptureNote> {
     let mut notes = Vec::new();
-    for (camera, c) in of.cameras.iter().enumerate() {
-        let pictures = || of.views.iter().map(|v| &v.pictures[camera]);
-        let got = pictures().filter(|p| p.outcome.is_used()).count();
-        if got < ENOUGH_VIEWS {
-            notes.push(CaptureNote::FewViews { camera, got, wanted: ENOUGH_VIEWS });
+    for (camera, c) in calibration.cameras.iter().enumerate() {
+        let images = || calibration.views.iter().map(|v| &v.images[camera]);
+        let got = images().filter(|p| p.outcome.is_used()).count();
+        if got < RECOMMENDED_VIEWS {
+            notes.push(CaptureNote::FewViews { camera, got, wanted: RECOMMENDED_VIEWS });
         }
-        let with = pictures().filter(|p| p.outcome != PictureOutcome::Nothing).count();
-        if 5 * (with - got) > with {
-            notes.push(CaptureNote::LeftOut { camera, pictures: with - got, of: with });
+        let observed = images().filter(|p| p.outcome != ImageOutcome::Nothing).count();
+        if 5 * (observed - got) > observed {
+            notes.push(CaptureNote::LeftOut { camera, pictures: observed - got, of: observed });
         }
         let all = [0.0, 1.0];
         let sides = [
-            (PictureSide::Left, [0.0, 0.25], all),
-            (PictureSide::Right, [0.75, 1.0], all),
-            (PictureSide::Top, all, [0.0, 0.25]),
-            (PictureSide::Bottom, all, [0.75, 1.0]),
+            (ImageSide::Left, [0.0, 0.25], all),
+            (ImageSide::Right, [0.75, 1.0], all),
+            (ImageSide::Top, all, [0.0, 0.25]),
+            (ImageSide::Bottom, all, [0.75, 1.0]),
         ];
         for (side, x, y) in sides {
-            let covered = c.coverage.share(x, y);
-            if covered < EMPTY {
+            let covered = c.coverage.covered_fraction(x, y);
+            if covered < MIN_COVERED_FRACTION {
                 notes.push(CaptureNote::EmptySide { camera, side, covered });
             }
         }
-        let normals: Vec<Vector3<f64>> = of
+        let normals: Vec<Vector3<f64>> = calibration
             .views
             .iter()
-            .filter(|v| v.pictures[camera].outcome.is_used())
+            .filter(|v| v.images[camera].outcome.is_used())
             .filter_map(|v| Some(v.pose?.rotation.matrix().column(2).into_owned()))
             .collect();
-        let least = normals.iter().flat_map(|a| normals.iter().map(|b| a.dot(b))).fold(1.0, f64::min);
-        let spread_degrees = least.clamp(-1.0, 1.0).acos().to_degrees();
+        let min_cosine = normals.iter().flat_map(|a| normals.iter().map(|b| a.dot(b))).fold(1.0, f64::min);
+        let spread_degrees = min_cosine.clamp(-1.0, 1.0).acos().to_degrees();
         if spread_degrees < PARALLEL_DEGREES {
             notes.push(CaptureNote::ParallelTargets { camera, spread_degrees });
         }
@@ -381,17 +396,17 @@ fn notes(data: &Sightings, of: &Calibration) -> Vec<CaptureNote> {
             notes.push(CaptureNote::HoldOut { camera, rms_px, holdout_rms_px });
         }
         let shared = |v: &&CalibratedView| {
-            v.pictures[camera].outcome.is_used() && v.pictures.iter().filter(|p| p.outcome.is_used()).count() > 1
+            v.images[camera].outcome.is_used() && v.images.iter().filter(|p| p.outcome.is_used()).count() > 1
         };
-        let got = of.views.iter().filter(shared).count();
-        if camera > 0 && got < ENOUGH_VIEWS {
-            notes.push(CaptureNote::FewShared { camera, got, wanted: ENOUGH_VIEWS });
+        let got = calibration.views.iter().filter(shared).count();
+        if camera > 0 && got < RECOMMENDED_VIEWS {
+            notes.push(CaptureNote::FewShared { camera, got, wanted: RECOMMENDED_VIEWS });
         }
     }
-    let [x, y] = of.target_shape.deflection;
-    let share = x.abs().max(y.abs()) / data.target.size().max();
-    if share > BENT {
-        notes.push(CaptureNote::BentTarget { share });
+    let [x, y] = calibration.target_shape.deflection;
+    let ratio = x.abs().max(y.abs()) / data.target.size().max();
+    if ratio > MAX_DEFLECTION_RATIO {
+        notes.push(CaptureNote::BentTarget { share: ratio });
     }
     notes
 }

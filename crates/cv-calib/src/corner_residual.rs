@@ -1,11 +1,11 @@
-//! The reprojection error of a corner, with its derivatives.
+//! Reprojection residuals of target corners, with their Jacobians.
 
 use crate::target::{TargetCorner, TargetPoints};
 use cv_core::{Camera, Point2, Point3, Vector3};
 use cv_numeric::adjust::{Residual, RigidMotion};
 use nalgebra::{Matrix2x3, SMatrix, Vector2};
 
-/// A corner: where it is on the target, how bending moves it along z, and where it was seen.
+/// A corner: its position on the target, the derivatives of its z by the deflections, and the detected pixel.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Corner {
     point: Point2<f64>,
@@ -24,30 +24,30 @@ impl Corner {
     }
 }
 
-/// As [`Camera::with_intrinsics`], in place for each residual.
+/// As [`Camera::with_intrinsics`], inlined for each residual.
 #[inline(always)]
-fn with_lens<const N: usize>(camera: &Camera, lens: &[f64]) -> Camera {
-    let lens = &lens[..N];
-    let mut camera = Camera { fx: lens[0], fy: lens[1], cx: lens[2], cy: lens[3], ..*camera };
-    // Of a length that the compiler knows: a loop up to the model's own count takes longer than the projection.
-    camera.distortion.parameters_mut()[..N - 4].copy_from_slice(&lens[4..]);
+fn with_intrinsics<const N: usize>(camera: &Camera, intrinsics: &[f64]) -> Camera {
+    let intrinsics = &intrinsics[..N];
+    let mut camera = Camera { fx: intrinsics[0], fy: intrinsics[1], cx: intrinsics[2], cy: intrinsics[3], ..*camera };
+    // A constant length: a loop over the model's own number of coefficients takes longer than the projection.
+    camera.distortion.parameters_mut()[..N - 4].copy_from_slice(&intrinsics[4..]);
     camera
 }
 
-/// Writes the columns of a motion `x ↦ turned + t`: those of the turn, then those of t.
+/// Writes the Jacobian by a rigid motion `x ↦ rotated + t`: the columns of the rotation, then those of t.
 #[inline(always)]
-fn by_motion<const C: usize>(j: &mut SMatrix<f64, 2, C>, first: usize, by: &Matrix2x3<f64>, turned: &Vector3<f64>) {
+fn by_motion<const C: usize>(j: &mut SMatrix<f64, 2, C>, first: usize, by: &Matrix2x3<f64>, rotated: &Vector3<f64>) {
     for row in 0..2 {
         // −b [x]× is the row x × b.
-        let turn = turned.cross(&by.row(row).transpose());
+        let by_rotation = rotated.cross(&by.row(row).transpose());
         for k in 0..3 {
-            j[(row, first + k)] = turn[k];
+            j[(row, first + k)] = by_rotation[k];
         }
     }
     j.fixed_columns_mut::<3>(first + 3).copy_from(by);
 }
 
-/// Writes the columns of the target's deflections, along the third axis of its frame as the camera sees it.
+/// Writes the Jacobian by the target's deflections; `along` is the derivative by the z axis of the target.
 #[inline]
 fn by_shape<const C: usize>(j: &mut SMatrix<f64, 2, C>, first: usize, along: Vector2<f64>, deflection: [f64; 2]) {
     for (k, d) in deflection.into_iter().enumerate() {
@@ -55,67 +55,67 @@ fn by_shape<const C: usize>(j: &mut SMatrix<f64, 2, C>, first: usize, along: Vec
     }
 }
 
-/// Corners of the camera whose frame the poses lead to: blocks pose (6), lens (`N`), shape (2); `C` is their sum.
-pub(crate) struct FromReference<const N: usize, const C: usize> {
+/// Residuals of the first camera: blocks target pose (6), intrinsics (`N`), shape (2); `C` is their sum.
+pub(crate) struct FirstCameraResidual<const N: usize, const C: usize> {
     pub(crate) camera: Camera,
     pub(crate) items: Vec<Corner>,
 }
 
-impl<const N: usize, const C: usize> Residual<2, 3, C> for FromReference<N, C> {
+impl<const N: usize, const C: usize> Residual<2, 3, C> for FirstCameraResidual<N, C> {
     const DIMS: [usize; 3] = [6, N, 2];
 
     #[inline]
     fn evaluate(
         &self,
         item: usize,
-        [pose, lens, shape]: [&[f64]; 3],
+        [pose, intrinsics, shape]: [&[f64]; 3],
         jacobian: Option<&mut SMatrix<f64, 2, C>>,
     ) -> Option<Vector2<f64>> {
         let corner = &self.items[item];
         let (rotation, translation) = RigidMotion::load(pose);
-        let turned = rotation * corner.on_target(shape);
-        let p = Point3::from(turned + translation);
-        let camera = with_lens::<N>(&self.camera, lens);
-        let Some(j) = jacobian else { return camera.project(&p).map(|seen| seen - corner.pixel) };
-        let seen = camera.project_with_jacobians(&p)?;
-        by_motion(j, 0, &seen.by_point, &turned);
-        j.fixed_columns_mut::<N>(6).copy_from(&seen.by_intrinsics.fixed_columns::<N>(0));
-        by_shape(j, 6 + N, seen.by_point * rotation.matrix().column(2), corner.deflection);
-        Some(seen.pixel - corner.pixel)
+        let rotated = rotation * corner.on_target(shape);
+        let p = Point3::from(rotated + translation);
+        let camera = with_intrinsics::<N>(&self.camera, intrinsics);
+        let Some(j) = jacobian else { return camera.project(&p).map(|projection| projection - corner.pixel) };
+        let projection = camera.project_with_jacobians(&p)?;
+        by_motion(j, 0, &projection.by_point, &rotated);
+        j.fixed_columns_mut::<N>(6).copy_from(&projection.by_intrinsics.fixed_columns::<N>(0));
+        by_shape(j, 6 + N, projection.by_point * rotation.matrix().column(2), corner.deflection);
+        Some(projection.pixel - corner.pixel)
     }
 }
 
-/// Corners of another camera of a rig: blocks pose (6), mount (6), lens (`N`), shape (2).
-pub(crate) struct FromMount<const N: usize, const C: usize> {
+/// Residuals of another camera of a rig: blocks target pose (6), rig pose (6), intrinsics (`N`), shape (2).
+pub(crate) struct RigCameraResidual<const N: usize, const C: usize> {
     pub(crate) camera: Camera,
     pub(crate) items: Vec<Corner>,
 }
 
-impl<const N: usize, const C: usize> Residual<2, 4, C> for FromMount<N, C> {
+impl<const N: usize, const C: usize> Residual<2, 4, C> for RigCameraResidual<N, C> {
     const DIMS: [usize; 4] = [6, 6, N, 2];
 
     #[inline]
     fn evaluate(
         &self,
         item: usize,
-        [pose, mount, lens, shape]: [&[f64]; 4],
+        [pose, rig_pose, intrinsics, shape]: [&[f64]; 4],
         jacobian: Option<&mut SMatrix<f64, 2, C>>,
     ) -> Option<Vector2<f64>> {
         let corner = &self.items[item];
         let (rotation, translation) = RigidMotion::load(pose);
-        let (mount, offset) = RigidMotion::load(mount);
-        let turned = rotation * corner.on_target(shape);
-        let in_mount = mount * (turned + translation);
-        let p = Point3::from(in_mount + offset);
-        let camera = with_lens::<N>(&self.camera, lens);
-        let Some(j) = jacobian else { return camera.project(&p).map(|seen| seen - corner.pixel) };
-        let seen = camera.project_with_jacobians(&p)?;
-        let by_reference = seen.by_point * mount.matrix();
-        by_motion(j, 0, &by_reference, &turned);
-        by_motion(j, 6, &seen.by_point, &in_mount);
-        j.fixed_columns_mut::<N>(12).copy_from(&seen.by_intrinsics.fixed_columns::<N>(0));
+        let (rig_pose, offset) = RigidMotion::load(rig_pose);
+        let rotated = rotation * corner.on_target(shape);
+        let in_rig_camera = rig_pose * (rotated + translation);
+        let p = Point3::from(in_rig_camera + offset);
+        let camera = with_intrinsics::<N>(&self.camera, intrinsics);
+        let Some(j) = jacobian else { return camera.project(&p).map(|projection| projection - corner.pixel) };
+        let projection = camera.project_with_jacobians(&p)?;
+        let by_reference = projection.by_point * rig_pose.matrix();
+        by_motion(j, 0, &by_reference, &rotated);
+        by_motion(j, 6, &projection.by_point, &in_rig_camera);
+        j.fixed_columns_mut::<N>(12).copy_from(&projection.by_intrinsics.fixed_columns::<N>(0));
         by_shape(j, 12 + N, by_reference * rotation.matrix().column(2), corner.deflection);
-        Some(seen.pixel - corner.pixel)
+        Some(projection.pixel - corner.pixel)
     }
 }
 
@@ -126,43 +126,43 @@ mod tests {
     use cv_numeric::adjust::{Euclidean, Manifold};
 
     #[test]
-    fn derivatives_are_those_of_the_residuals() {
+    fn jacobians_agree_with_finite_differences() {
         let target = TargetPoints::grid(9, 6, 1.0).unwrap();
         let pose = Pose::new(Rotation3::new(Vector3::new(0.3, -0.4, 0.2)), Vector3::new(-3.0, -2.0, 12.0));
-        let mount = Pose::new(Rotation3::new(Vector3::new(-0.05, 0.1, 0.02)), Vector3::new(-2.0, 0.1, 0.3));
+        let rig_pose = Pose::new(Rotation3::new(Vector3::new(-0.05, 0.1, 0.02)), Vector3::new(-2.0, 0.1, 0.3));
         let rational = [-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.1, -0.05, 0.02];
         let prism = [-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.1, -0.05, 0.02, 1e-3, 2e-3, -1e-3, 3e-3];
-        check::<8, 16, 22>(&target, &pose, &mount, Distortion::radial_tangential4([-0.2, 0.05, 1e-3, -2e-3]));
-        check::<8, 16, 22>(&target, &pose, &mount, Distortion::fisheye4([0.05, -0.02, 0.01, -0.003]));
-        check::<9, 17, 23>(&target, &pose, &mount, Distortion::radial_tangential5([-0.2, 0.05, 1e-3, -2e-3, 0.01]));
-        check::<12, 20, 26>(&target, &pose, &mount, Distortion::rational8(rational));
-        check::<16, 24, 30>(&target, &pose, &mount, Distortion::thin_prism12(prism));
+        check::<8, 16, 22>(&target, &pose, &rig_pose, Distortion::radial_tangential4([-0.2, 0.05, 1e-3, -2e-3]));
+        check::<8, 16, 22>(&target, &pose, &rig_pose, Distortion::fisheye4([0.05, -0.02, 0.01, -0.003]));
+        check::<9, 17, 23>(&target, &pose, &rig_pose, Distortion::radial_tangential5([-0.2, 0.05, 1e-3, -2e-3, 0.01]));
+        check::<12, 20, 26>(&target, &pose, &rig_pose, Distortion::rational8(rational));
+        check::<16, 24, 30>(&target, &pose, &rig_pose, Distortion::thin_prism12(prism));
     }
 
-    fn check<const N: usize, const ONE: usize, const MORE: usize>(
+    fn check<const N: usize, const FIRST_DIMS: usize, const RIG_DIMS: usize>(
         target: &TargetPoints,
         pose: &Pose,
-        mount: &Pose,
+        rig_pose: &Pose,
         distortion: Distortion,
     ) {
         let camera = Camera { distortion, ..Camera::pinhole(640, 480, 500.0, 510.0, 310.0, 245.0) };
         let store = |p: &Pose| RigidMotion::store(&p.rotation, &p.translation).to_vec();
-        let blocks = [store(pose), store(mount), camera.intrinsics()[..N].to_vec(), vec![0.05, -0.03]];
+        let blocks = [store(pose), store(rig_pose), camera.intrinsics()[..N].to_vec(), vec![0.05, -0.03]];
         let corner = TargetCorner { point: 13, pixel: Point2::new(300.0, 200.0) };
         let items = vec![Corner::new(target, &corner)];
-        let one = FromReference::<N, ONE> { camera, items: items.clone() };
-        let more = FromMount::<N, MORE> { camera, items };
+        let first_camera = FirstCameraResidual::<N, FIRST_DIMS> { camera, items: items.clone() };
+        let rig_camera = RigCameraResidual::<N, RIG_DIMS> { camera, items };
         let at = |b: &[Vec<f64>; 4]| {
-            let first = one.evaluate(0, [&b[0], &b[2], &b[3]], None).unwrap();
-            (first, more.evaluate(0, [&b[0], &b[1], &b[2], &b[3]], None).unwrap())
+            let first = first_camera.evaluate(0, [&b[0], &b[2], &b[3]], None).unwrap();
+            (first, rig_camera.evaluate(0, [&b[0], &b[1], &b[2], &b[3]], None).unwrap())
         };
         let (mut j, mut k) = (SMatrix::zeros(), SMatrix::zeros());
-        one.evaluate(0, [&blocks[0], &blocks[2], &blocks[3]], Some(&mut j)).unwrap();
-        more.evaluate(0, [&blocks[0], &blocks[1], &blocks[2], &blocks[3]], Some(&mut k)).unwrap();
+        first_camera.evaluate(0, [&blocks[0], &blocks[2], &blocks[3]], Some(&mut j)).unwrap();
+        rig_camera.evaluate(0, [&blocks[0], &blocks[1], &blocks[2], &blocks[3]], Some(&mut k)).unwrap();
         let mut column = 0;
         for (b, size) in [6, 6, N, 2].into_iter().enumerate() {
             for i in 0..size {
-                let moved = |h: f64| {
+                let perturbed = |h: f64| {
                     let mut all = blocks.clone();
                     let mut delta = vec![0.0; size];
                     delta[i] = h;
@@ -173,13 +173,17 @@ mod tests {
                     }
                     at(&all)
                 };
-                let (plus, minus) = (moved(1e-6), moved(-1e-6));
-                // Pixels of some hundreds: 1e-13 of rounding by 1e-6, and h² of truncation by derivatives of some thousands.
-                let near = |a: Vector2<f64>, b: Vector2<f64>| (a - b).norm() < 1e-6 * (1.0 + b.norm());
-                assert!(near((plus.1 - minus.1) / 2e-6, k.column(column).into()), "mount: block {b}, {i}");
-                let within = [Some(i), None, Some(6 + i), Some(6 + N + i)][b];
-                if let Some(within) = within {
-                    assert!(near((plus.0 - minus.0) / 2e-6, j.column(within).into()), "block {b}, {i}");
+                let (plus, minus) = (perturbed(1e-6), perturbed(-1e-6));
+                // Pixels of some hundreds: rounding 1e-13 over 1e-6, and truncation h² times derivatives of some
+                // thousands.
+                let is_close = |a: Vector2<f64>, b: Vector2<f64>| (a - b).norm() < 1e-6 * (1.0 + b.norm());
+                assert!(is_close((plus.1 - minus.1) / 2e-6, k.column(column).into()), "rig_pose: block {b}, {i}");
+                let first_camera_column = [Some(i), None, Some(6 + i), Some(6 + N + i)][b];
+                if let Some(first_camera_column) = first_camera_column {
+                    assert!(
+                        is_close((plus.0 - minus.0) / 2e-6, j.column(first_camera_column).into()),
+                        "block {b}, {i}"
+                    );
                 }
                 column += 1;
             }

@@ -7,114 +7,115 @@ use cv_core::{Cancelled, DistortionModel, OptionError};
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 #[non_exhaustive]
 pub enum CalibrateError {
-    /// The target has no area, or coordinates that are no use.
-    #[error("{points} points do not make a flat target")]
+    /// Degenerate target: no area, or coordinates out of range.
+    #[error("{points} points do not span a planar target")]
     Target {
-        /// Points given.
+        /// Number of points.
         points: usize,
     },
-    /// There is nothing to calibrate from.
+    /// There are no views.
     #[error("there are no views")]
     NoViews,
-    /// A picture has no size, or one beyond a million.
-    #[error("camera {camera}: pictures of {width} × {height} pixels")]
+    /// The image size is below 2 or above a million.
+    #[error("camera {camera}: images of {width} × {height} pixels")]
     Size {
-        /// Which camera.
+        /// Index of the camera.
         camera: usize,
         /// Width in pixels.
         width: usize,
         /// Height in pixels.
         height: usize,
     },
-    /// A view does not tell of every camera.
-    #[error("view {view} is of {got} cameras where there are {needed}")]
+    /// A view has no list of corners for each camera.
+    #[error("view {view} has corner lists for {got} cameras, {needed} are needed")]
     Cameras {
-        /// Which view.
+        /// Index of the view.
         view: usize,
-        /// Lists of corners.
+        /// Number of corner lists.
         got: usize,
-        /// Cameras.
+        /// Number of cameras.
         needed: usize,
     },
-    /// A corner is of a point that the target does not have.
+    /// A corner refers to a point that the target does not have.
     #[error("view {view}, camera {camera}: there is no point {point} on a target of {points}")]
     Point {
-        /// Which view.
+        /// Index of the view.
         view: usize,
-        /// Which camera.
+        /// Index of the camera.
         camera: usize,
-        /// The point named.
+        /// Index of the point.
         point: usize,
-        /// Points of the target.
+        /// Number of points of the target.
         points: usize,
     },
-    /// Two corners of one picture are of the same point.
-    #[error("view {view}, camera {camera}: point {point} is there twice")]
+    /// Two corners of one image refer to the same point.
+    #[error("view {view}, camera {camera}: point {point} has two corners")]
     Twice {
-        /// Which view.
+        /// Index of the view.
         view: usize,
-        /// Which camera.
+        /// Index of the camera.
         camera: usize,
-        /// Which point.
+        /// Index of the point.
         point: usize,
     },
-    /// A pixel is NaN, infinite or beyond ten million.
-    #[error("view {view}, camera {camera}: corner {corner} has a position that is no use")]
+    /// The pixel of a corner is not finite or beyond ten million.
+    #[error("view {view}, camera {camera}: the position of corner {corner} is out of range")]
     NotFinite {
-        /// Which view.
+        /// Index of the view.
         view: usize,
-        /// Which camera.
+        /// Index of the camera.
         camera: usize,
-        /// Which of its corners.
+        /// Index of the corner.
         corner: usize,
     },
-    /// Too few views of a camera can be used.
-    #[error("camera {camera}: {got} views can be used, {needed} are needed")]
+    /// Too few usable views of a camera.
+    #[error("camera {camera}: {got} views are usable, {needed} are needed")]
     TooFewViews {
-        /// Which camera.
+        /// Index of the camera.
         camera: usize,
-        /// Views that can be used.
+        /// Number of usable views.
         got: usize,
-        /// Views needed.
+        /// Number that is needed.
         needed: usize,
-        /// Views that have some corners, but too few, or on a line.
+        /// Views with too few or collinear corners.
         small: usize,
         /// Views that show the target mirrored.
         mirrored: usize,
     },
-    /// The views leave the focal length open: the target is nearly parallel to the picture in all of them.
+    /// Degenerate configuration: the focal length is not determined, since the target is nearly parallel to the image
+    /// plane in all views.
     #[error(
-        "camera {camera}: the views do not determine the lens; the target is tilted by {largest_tilt_degrees:.1}° at most"
+        "camera {camera}: the views do not determine the intrinsics: the target is tilted by {largest_tilt_degrees:.1}° at most"
     )]
     Degenerate {
-        /// Which camera.
+        /// Index of the camera.
         camera: usize,
-        /// Largest angle between the target and the picture plane, in degrees.
+        /// Largest angle between the target and the image plane, in degrees.
         largest_tilt_degrees: f64,
     },
-    /// No lens of the model fits the corners.
-    #[error("camera {camera}: no lens of the model {} fits: the best start is {error_px:.1} px off", model.info().name)]
+    /// No initial intrinsics of the lens model fit the corners.
+    #[error("camera {camera}: no lens of the model {} fits: the best initial values have a median error of {error_px:.1} px", model.info().name)]
     NoStart {
-        /// Which camera.
+        /// Index of the camera.
         camera: usize,
-        /// The model.
+        /// The lens model.
         model: DistortionModel,
-        /// Median distance of the corners from where the best start has them, in pixels.
+        /// Median reprojection error of the best initial values, in pixels.
         error_px: f64,
     },
-    /// No view shows the target to this camera and to one that is connected with the first.
-    #[error("camera {camera} shares no view with the cameras it should be joined to")]
+    /// A camera has no view in common with those that are connected to the first camera.
+    #[error("camera {camera} has no view in common with the other cameras")]
     Unconnected {
-        /// Which camera.
+        /// Index of the camera.
         camera: usize,
     },
-    /// This model has no adjustment here: a pinhole or a model with fewer than four parameters.
-    #[error("lenses of the model {} are not calibrated", model.info().name)]
+    /// The lens model cannot be calibrated: a pinhole, or a model with fewer than four parameters.
+    #[error("the lens model {} cannot be calibrated", model.info().name)]
     Lens {
-        /// The model.
+        /// The lens model.
         model: DistortionModel,
     },
-    /// An option is out of range.
+    /// An option is out of its range.
     #[error(transparent)]
     Option(#[from] OptionError),
     /// The job was stopped by its progress callback.

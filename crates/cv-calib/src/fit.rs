@@ -1,44 +1,47 @@
-//! The robust fit of one lens model: adjustment, outliers out, adjustment by least squares.
+//! The robust fit of one lens model: robust adjustment, outlier rejection, least squares on the inliers.
 
-use crate::adjustment::{Estimate, Failure, Free, Problem, Used, adjust};
-use crate::start::{cauchy, thinned};
-use crate::target::Sightings;
+use crate::adjustment::{Estimate, Failure, FreeParameters, InlierMask, Problem, adjust};
+use crate::start::{cauchy, sample_mask};
+use crate::target::TargetObservations;
 use cv_core::{Progress, Vector2, median};
 use cv_numeric::RobustLoss;
 
-/// The median of the length of a vector of two standard normal numbers.
-const MEDIAN_LENGTH: f64 = 1.1774;
-/// Standard deviation in pixels that no corner is better than: below it, differences are rounding.
-const LEAST_DEVIATION: f64 = 1e-4;
-/// Times that outliers are looked for.
-const ROUNDS: usize = 5;
-/// Of many views so many, evenly, are fitted robustly first; from what they give, all need a few steps.
-const FIRST_VIEWS: usize = 30;
-/// Relative change of the cost at which an adjustment ends.
-const TOLERANCE: f64 = 1e-7;
-/// Deflections must be known to this share of the target's longer side to be adjusted.
-const KNOWN_SHAPE: f64 = 0.01;
+/// Median of the Rayleigh distribution: the median length of a vector of two standard normal coordinates.
+const RAYLEIGH_MEDIAN: f64 = 1.1774;
+/// Lower bound of the noise standard deviation, in pixels: below it, residuals are rounding errors.
+const MIN_SIGMA_PX: f64 = 1e-4;
+/// Maximum number of rounds of outlier rejection.
+const REJECTION_ROUNDS: usize = 5;
+/// Number of views, evenly sampled, of the first robust fit; from its result, all views need few iterations.
+const INITIAL_VIEWS: usize = 30;
+/// Relative cost decrease that terminates an adjustment.
+const COST_TOLERANCE: f64 = 1e-7;
+/// Largest standard deviation of the deflections, as a ratio of the target's longer side, for them to be adjusted.
+const MAX_SHAPE_SIGMA: f64 = 0.01;
 
-/// Why the target's shape is as it is.
+/// State of the target's deflections.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum ShapeState {
+    /// Adjusted.
     Adjusted,
+    /// Kept at zero: the views do not determine them.
     Undetermined,
-    NotAsked,
+    /// Kept at zero by the options.
+    Disabled,
 }
 
-/// A fitted model.
+/// The fit of a lens model.
 #[derive(Debug, Clone)]
 pub(crate) struct Fit {
     pub(crate) estimate: Estimate,
-    /// Corners that the last adjustment was of.
-    pub(crate) used: Used,
+    /// Inliers of the last adjustment.
+    pub(crate) used: InlierMask,
     pub(crate) shape: ShapeState,
-    /// Standard deviation of a coordinate, in pixels, as the typical corner has it.
-    pub(crate) deviation: f64,
+    /// Robust standard deviation of a corner coordinate, in pixels.
+    pub(crate) sigma: f64,
 }
 
-/// What a fit needs to know of the options.
+/// The options of a fit.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Limits {
     pub(crate) outlier_deviations: f64,
@@ -46,112 +49,116 @@ pub(crate) struct Limits {
     pub(crate) board_shape: bool,
 }
 
-/// Residuals of all corners by view, camera and corner.
+/// Residuals of all corners, by view, camera and corner.
 type Residuals = Vec<Vec<Vec<Option<Vector2<f64>>>>>;
 
-fn residuals(data: &Sightings, estimate: &Estimate) -> Residuals {
+/// Computes the residuals of all corners.
+fn all_residuals(data: &TargetObservations, estimate: &Estimate) -> Residuals {
     let of_view = |v| (0..data.sizes.len()).map(|c| estimate.residuals(data, v, c)).collect();
     (0..data.views.len()).map(of_view).collect()
 }
 
-/// Robust standard deviation of a coordinate of the corners that may count.
-fn deviation(residuals: &Residuals, of: &Used) -> f64 {
+/// Estimates the standard deviation of a coordinate of the usable corners, from the median residual.
+fn robust_sigma(residuals: &Residuals, of: &InlierMask) -> f64 {
     let corners = residuals.iter().flatten().flatten().zip(of.iter().flatten().flatten());
     let mut lengths: Vec<f64> =
         corners.filter(|(_, used)| **used).map(|(r, _)| r.map_or(f64::INFINITY, |r| r.norm())).collect();
-    (median(&mut lengths).unwrap_or(0.0) / MEDIAN_LENGTH).max(LEAST_DEVIATION)
+    (median(&mut lengths).unwrap_or(0.0) / RAYLEIGH_MEDIAN).max(MIN_SIGMA_PX)
 }
 
-/// The corners of `of` that are near enough. Pictures that keep less than half of their corners, or too few, are left out.
-fn near(residuals: &Residuals, of: &Used, farthest: f64, min_corners: usize) -> Used {
-    let picture = |(residuals, of): (&Vec<Option<Vector2<f64>>>, &Vec<bool>)| {
-        let near = |(r, of): (&Option<Vector2<f64>>, &bool)| *of && r.is_some_and(|r| r.norm() <= farthest);
-        let kept: Vec<bool> = residuals.iter().zip(of).map(near).collect();
-        let (count, all) = (kept.iter().filter(|k| **k).count(), of.iter().filter(|k| **k).count());
-        if 2 * count < all || count < min_corners { vec![false; kept.len()] } else { kept }
+/// Returns the usable corners within `max_error` pixels. Images are rejected that have fewer than half of their corners
+/// left, or fewer than `min_corners`.
+fn select_inliers(residuals: &Residuals, usable: &InlierMask, max_error: f64, min_corners: usize) -> InlierMask {
+    let picture = |(residuals, usable): (&Vec<Option<Vector2<f64>>>, &Vec<bool>)| {
+        let is_inlier = |(r, of): (&Option<Vector2<f64>>, &bool)| *of && r.is_some_and(|r| r.norm() <= max_error);
+        let inliers: Vec<bool> = residuals.iter().zip(usable).map(is_inlier).collect();
+        let (count, all) = (inliers.iter().filter(|k| **k).count(), usable.iter().filter(|k| **k).count());
+        if 2 * count < all || count < min_corners { vec![false; inliers.len()] } else { inliers }
     };
-    residuals.iter().zip(of).map(|(r, o)| r.iter().zip(o).map(picture).collect()).collect()
+    residuals.iter().zip(usable).map(|(r, o)| r.iter().zip(o).map(picture).collect()).collect()
 }
 
-/// Fits all that is free from a start: Cauchy's loss first, then least squares on what is within the limits, until that no longer changes.
+/// Fits all free parameters: first with the Cauchy loss, then by least squares on the inliers, until these no longer
+/// change.
 ///
-/// `usable`: corners that may be used. Poses of views that lose their corners stay where the robust adjustment left them.
+/// `usable`: corners that may be used. Views whose corners are all rejected keep the pose of the robust adjustment.
 pub(crate) fn fit(
-    data: &Sightings,
+    data: &TargetObservations,
     start: &Estimate,
-    usable: &Used,
+    usable: &InlierMask,
     limits: Limits,
     progress: &dyn Progress,
 ) -> Result<Fit, Failure> {
     let n = data.views.len();
-    let (mut estimate, free, state) = if n > 2 * FIRST_VIEWS {
-        let few: Vec<usize> = (0..FIRST_VIEWS).map(|i| i * n / FIRST_VIEWS).collect();
-        let corners: Used = few.iter().map(|v| usable[*v].clone()).collect();
-        let (found, free, state) = robust(&data.subset(&few), start.subset(&few), &corners, limits, progress)?;
-        let mut all = Estimate { poses: start.poses.clone(), ..found };
-        let loss = cauchy(deviation(&residuals(data, &all), usable));
-        adjust(data, &mut all, &thinned(usable), (Free::POSES, loss), (30, 1e-3), progress)?;
+    let (mut estimate, free, state) = if n > 2 * INITIAL_VIEWS {
+        let sampled: Vec<usize> = (0..INITIAL_VIEWS).map(|i| i * n / INITIAL_VIEWS).collect();
+        let corners: InlierMask = sampled.iter().map(|v| usable[*v].clone()).collect();
+        let (sampled_estimate, free, state) =
+            fit_robustly(&data.subset(&sampled), start.subset(&sampled), &corners, limits, progress)?;
+        let mut all = Estimate { poses: start.poses.clone(), ..sampled_estimate };
+        let loss = cauchy(robust_sigma(&all_residuals(data, &all), usable));
+        adjust(data, &mut all, &sample_mask(usable), (FreeParameters::POSES, loss), (30, 1e-3), progress)?;
         (all, free, state)
     } else {
-        robust(data, start.clone(), usable, limits, progress)?
+        fit_robustly(data, start.clone(), usable, limits, progress)?
     };
-    let mut typical = 0.0;
-    let mut used = Used::new();
-    for round in 0..=ROUNDS {
-        let residuals = residuals(data, &estimate);
-        typical = deviation(&residuals, usable);
-        let kept = near(&residuals, usable, limits.outlier_deviations * typical, limits.min_corners);
-        if (round > 1 && kept == used) || round == ROUNDS {
+    let mut sigma = 0.0;
+    let mut used = InlierMask::new();
+    for round in 0..=REJECTION_ROUNDS {
+        let residuals = all_residuals(data, &estimate);
+        sigma = robust_sigma(&residuals, usable);
+        let inliers = select_inliers(&residuals, usable, limits.outlier_deviations * sigma, limits.min_corners);
+        if (round > 1 && inliers == used) || round == REJECTION_ROUNDS {
             break;
         }
-        used = kept;
-        // The first step leads so near that outliers can be judged again; what comes after it would be of the old ones.
-        let most = if round == 0 { 1 } else { 100 };
-        adjust(data, &mut estimate, &used, (free, RobustLoss::Trivial), (most, TOLERANCE), progress)?;
+        used = inliers;
+        // Inliers are selected again after the first step; further steps would be for the old ones.
+        let max_iterations = if round == 0 { 1 } else { 100 };
+        adjust(data, &mut estimate, &used, (free, RobustLoss::Trivial), (max_iterations, COST_TOLERANCE), progress)?;
     }
-    Ok(Fit { estimate, used, shape: state, deviation: typical })
+    Ok(Fit { estimate, used, shape: state, sigma })
 }
 
-/// The robust part of a fit; what of it is free, and why the target's shape is or is not.
-fn robust(
-    data: &Sightings,
+/// The robust stage of a fit. Returns the estimate, the free parameters and the state of the target's shape.
+fn fit_robustly(
+    data: &TargetObservations,
     mut estimate: Estimate,
-    usable: &Used,
+    usable: &InlierMask,
     limits: Limits,
     progress: &dyn Progress,
-) -> Result<(Estimate, Free, ShapeState), Failure> {
-    // Bending is small, and a shape that is not determined would lead astray: at first the target is flat.
+) -> Result<(Estimate, FreeParameters, ShapeState), Failure> {
+    // The deflections are small, and diverge if they are not determined: at first the target is planar.
     if !limits.board_shape {
         estimate.shape = [0.0; 2];
     }
-    let flat = Free { shape: false, ..Free::ALL };
-    let mut typical = deviation(&residuals(data, &estimate), usable);
+    let flat = FreeParameters { shape: false, ..FreeParameters::ALL };
+    let mut sigma = robust_sigma(&all_residuals(data, &estimate), usable);
     for _ in 0..3 {
-        let before = typical;
-        adjust(data, &mut estimate, usable, (flat, cauchy(typical)), (40, 1e-3), progress)?;
-        typical = deviation(&residuals(data, &estimate), usable);
-        if typical > 0.7 * before {
+        let before = sigma;
+        adjust(data, &mut estimate, usable, (flat, cauchy(sigma)), (40, 1e-3), progress)?;
+        sigma = robust_sigma(&all_residuals(data, &estimate), usable);
+        if sigma > 0.7 * before {
             break;
         }
     }
     if !limits.board_shape {
-        return Ok((estimate, flat, ShapeState::NotAsked));
+        return Ok((estimate, flat, ShapeState::Disabled));
     }
-    if !shape_is_known(data, &estimate, usable) {
+    if !is_shape_determined(data, &estimate, usable) {
         estimate.shape = [0.0; 2];
         return Ok((estimate, flat, ShapeState::Undetermined));
     }
-    adjust(data, &mut estimate, usable, (Free::ALL, cauchy(typical)), (40, 1e-4), progress)?;
-    Ok((estimate, Free::ALL, ShapeState::Adjusted))
+    adjust(data, &mut estimate, usable, (FreeParameters::ALL, cauchy(sigma)), (40, 1e-4), progress)?;
+    Ok((estimate, FreeParameters::ALL, ShapeState::Adjusted))
 }
 
-/// Whether the corners determine the target's deflections well enough to adjust them.
-fn shape_is_known(data: &Sightings, estimate: &Estimate, used: &Used) -> bool {
-    let known = || -> Result<f64, cv_numeric::adjust::AdjustError> {
-        let problem = Problem::new(data, estimate, used, Free::ALL, RobustLoss::Trivial)?;
+/// Returns whether the corners determine the target's deflections well enough to adjust them.
+fn is_shape_determined(data: &TargetObservations, estimate: &Estimate, used: &InlierMask) -> bool {
+    let sigma_of_shape = || -> Result<f64, cv_numeric::adjust::AdjustError> {
+        let problem = Problem::new(data, estimate, used, FreeParameters::ALL, RobustLoss::Trivial)?;
         let (covariance, _) = problem.covariance()?;
         let n = covariance.nrows();
         Ok(covariance[(n - 1, n - 1)].max(covariance[(n - 2, n - 2)]).sqrt())
     };
-    known().is_ok_and(|deviation| deviation <= KNOWN_SHAPE * data.target.size().max())
+    sigma_of_shape().is_ok_and(|deviation| deviation <= MAX_SHAPE_SIGMA * data.target.size().max())
 }

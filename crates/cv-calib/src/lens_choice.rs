@@ -1,51 +1,51 @@
-//! The lens model of one camera: each is fitted, and judged by the views that it was not fitted to.
+//! Selection of the lens model of one camera by cross-validation.
 
-use crate::adjustment::{Failure, check_model};
+use crate::adjustment::{Failure, check_adjustable};
 use crate::fit::{Fit, Limits, fit};
 use crate::holdout::{HoldOut, hold_out};
-use crate::start::{Start, all_corners, poses, start};
-use crate::target::Sightings;
+use crate::start::{InitialValues, estimate_initial_values, mask_of_views, poses_from_homographies};
+use crate::target::TargetObservations;
 use crate::{CalibrateError, LensChoice};
 use cv_core::{Cancelled, Distortion, DistortionModel, LensProjection, Progress, Stage};
 
-/// Why a lens model was taken, or was not.
+/// Outcome of a lens model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum LensVerdict {
-    /// It was the only one asked for.
+    /// The only model that was requested.
     Asked,
-    /// Taken: the least error on held-out views, or one no larger up to chance by fewer parameters.
+    /// Selected: the smallest hold-out error, or one that is not significantly larger with fewer parameters.
     Chosen,
-    /// Its error on held-out views is larger, beyond what chance explains.
+    /// Its hold-out error is significantly larger.
     LessExact,
-    /// As exact as the chosen one up to chance, with more parameters.
+    /// Its hold-out error is not significantly different, with more parameters.
     NotNeeded,
-    /// Its rays fold back within the picture.
+    /// Its distortion is not monotonic within the image.
     Folds,
-    /// The views do not determine it.
+    /// The views do not determine its parameters.
     Undetermined,
-    /// There is no start, of which the median error is this many pixels.
+    /// No initial values were found.
     NoStart {
-        /// In pixels.
+        /// Median error of the best ones, in pixels.
         error_px: f64,
     },
 }
 
-/// A lens model that was tried.
+/// Result of a lens model that was tried.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LensTrial {
     /// The model.
     pub model: DistortionModel,
-    /// Root mean square distance of the used corners, in pixels; NaN where there is no fit.
+    /// Root mean square reprojection error of the inlier corners, in pixels; NaN without a fit.
     pub rms_px: f64,
-    /// The same on views that it was not fitted to, with only their poses adjusted; NaN where that was not computed.
+    /// The same on held-out views, with only their poses adjusted; NaN where it was not computed.
     pub holdout_rms_px: f64,
-    /// Corners that it leaves out.
+    /// Number of outliers.
     pub outliers: usize,
-    /// What became of it.
+    /// Outcome.
     pub verdict: LensVerdict,
 }
 
-/// A camera by itself.
+/// The calibration of a single camera.
 #[derive(Debug, Clone)]
 pub(crate) struct Mono {
     pub(crate) fit: Fit,
@@ -53,20 +53,21 @@ pub(crate) struct Mono {
     pub(crate) holdout: Option<HoldOut>,
 }
 
-/// Views are held out in two turns where there are so many, each half being enough to calibrate from; else in more turns of fewer.
-const HALVES_FROM: usize = 12;
+/// Number of views from which on cross-validation has two folds, since each half is enough to calibrate; with fewer
+/// views there are more folds.
+const TWO_FOLD_MIN_VIEWS: usize = 12;
 
-/// Turns in which views are held out; `None` where there are too few.
-pub(crate) fn folds(views: usize) -> Option<usize> {
+/// Returns the number of cross-validation folds; `None` with too few views.
+pub(crate) fn fold_count(views: usize) -> Option<usize> {
     match views {
         0..=3 => None,
-        4..HALVES_FROM => Some(views.min(5)),
+        4..TWO_FOLD_MIN_VIEWS => Some(views.min(5)),
         _ => Some(2),
     }
 }
 
-/// Root mean square distance of the used corners of a camera, or of all; and how many they are.
-pub(crate) fn rms(data: &Sightings, fit: &Fit, camera: Option<usize>) -> (f64, usize) {
+/// Returns the root mean square error of the inlier corners of one camera, or of all cameras, and their number.
+pub(crate) fn rms(data: &TargetObservations, fit: &Fit, camera: Option<usize>) -> (f64, usize) {
     let (mut squares, mut count) = (0.0, 0);
     for v in 0..data.views.len() {
         for c in (0..data.sizes.len()).filter(|c| camera.is_none_or(|camera| camera == *c)) {
@@ -80,8 +81,8 @@ pub(crate) fn rms(data: &Sightings, fit: &Fit, camera: Option<usize>) -> (f64, u
     ((squares / count.max(1) as f64).sqrt(), count)
 }
 
-/// Whether a lens is monotonic as far out as it saw corners.
-fn reaches(data: &Sightings, fit: &Fit) -> bool {
+/// Returns whether the distortion is monotonic up to the outermost inlier corner.
+fn is_monotonic(data: &TargetObservations, fit: &Fit) -> bool {
     let camera = &fit.estimate.cameras[0];
     (0..data.views.len()).all(|v| {
         let Some(pose) = fit.estimate.poses[v] else { return true };
@@ -92,61 +93,67 @@ fn reaches(data: &Sightings, fit: &Fit) -> bool {
     })
 }
 
-/// The rational function of two terms above and below that is nearest to `atan(r)/r` around zero (Padé): an equidistant fisheye as a
-/// rational lens.
-const EQUIDISTANT: [f64; 8] = [7.0 / 9.0, 64.0 / 945.0, 0.0, 0.0, 0.0, 10.0 / 9.0, 5.0 / 21.0, 0.0];
+/// Padé approximant of `atan(r)/r` with two terms in numerator and denominator: an equidistant fisheye as a rational
+/// model.
+const EQUIDISTANT_RATIONAL: [f64; 8] = [7.0 / 9.0, 64.0 / 945.0, 0.0, 0.0, 0.0, 10.0 / 9.0, 5.0 / 21.0, 0.0];
 
-struct Starts<'a> {
-    data: &'a Sightings,
+/// Initial values by projection, computed once.
+struct InitialValueCache<'a> {
+    data: &'a TargetObservations,
     usable: &'a [usize],
-    perspective: Option<Result<Start, CalibrateError>>,
-    fisheye: Option<Result<Start, CalibrateError>>,
+    perspective: Option<Result<InitialValues, CalibrateError>>,
+    fisheye: Option<Result<InitialValues, CalibrateError>>,
 }
 
-impl Starts<'_> {
-    fn of(&mut self, projection: LensProjection, progress: &dyn Progress) -> Result<Start, CalibrateError> {
-        let known = match projection {
+impl InitialValueCache<'_> {
+    fn with_projection(
+        &mut self,
+        projection: LensProjection,
+        progress: &dyn Progress,
+    ) -> Result<InitialValues, CalibrateError> {
+        let cached = match projection {
             LensProjection::Perspective => &mut self.perspective,
             LensProjection::Fisheye => &mut self.fisheye,
         };
-        known.get_or_insert_with(|| start(self.data, self.usable, projection, progress)).clone()
+        cached.get_or_insert_with(|| estimate_initial_values(self.data, self.usable, projection, progress)).clone()
     }
 
-    /// A start with the lens of a model.
-    fn with_model(&mut self, model: DistortionModel, progress: &dyn Progress) -> Result<Start, CalibrateError> {
-        let mut start = self.of(model.info().projection, progress);
-        let rational = matches!(model, DistortionModel::Rational8 | DistortionModel::ThinPrism12);
-        // More than about 140° is beyond polynomials in tan θ; the fisheye is then the nearer start.
-        if rational && start.as_ref().map_or(true, |s| s.error > 2.0) {
-            stop(&start)?;
-            let fisheye = self.of(LensProjection::Fisheye, progress);
-            stop(&fisheye)?;
+    /// Returns initial values with the distortion of a model.
+    fn with_model(&mut self, model: DistortionModel, progress: &dyn Progress) -> Result<InitialValues, CalibrateError> {
+        let mut start = self.with_projection(model.info().projection, progress);
+        let is_rational = matches!(model, DistortionModel::Rational8 | DistortionModel::ThinPrism12);
+        // Beyond about 140° polynomials in tan θ do not fit, and the fisheye model gives better initial values.
+        if is_rational && start.as_ref().map_or(true, |s| s.error > 2.0) {
+            check_cancelled(&start)?;
+            let fisheye = self.with_projection(LensProjection::Fisheye, progress);
+            check_cancelled(&fisheye)?;
             if let Ok(mut fisheye) = fisheye
                 && start.as_ref().map_or(true, |s| fisheye.error < 0.5 * s.error)
             {
                 let camera = &mut fisheye.estimate.cameras[0];
-                camera.distortion = Distortion::rational8(EQUIDISTANT);
-                fisheye.estimate.poses = poses(self.data, self.usable, camera);
+                camera.distortion = Distortion::rational8(EQUIDISTANT_RATIONAL);
+                fisheye.estimate.poses = poses_from_homographies(self.data, self.usable, camera);
                 start = Ok(fisheye);
             }
         }
         let mut start = start?;
         let camera = &mut start.estimate.cameras[0];
-        // Two radial and two tangential parameters are part of every perspective model.
+        // All perspective models have two radial and two tangential coefficients.
         camera.distortion = camera.distortion.converted(model).ok_or(CalibrateError::Lens { model })?;
         Ok(start)
     }
 }
 
-fn stop<T>(result: &Result<T, CalibrateError>) -> Result<(), Cancelled> {
+/// Returns an error if a result is that of a cancelled job.
+fn check_cancelled<T>(result: &Result<T, CalibrateError>) -> Result<(), Cancelled> {
     if matches!(result, Err(CalibrateError::Cancelled(_))) { Err(Cancelled) } else { Ok(()) }
 }
 
-/// Fits the models that may be, and takes one.
+/// Fits the candidate lens models and selects one.
 ///
-/// `data` is of one camera, `usable` the views that have enough corners.
-pub(crate) fn choose(
-    data: &Sightings,
+/// `data` is of one camera, `usable` the views with enough corners.
+pub(crate) fn choose_lens(
+    data: &TargetObservations,
     usable: &[usize],
     lens: LensChoice,
     limits: Limits,
@@ -155,28 +162,28 @@ pub(crate) fn choose(
 ) -> Result<Mono, CalibrateError> {
     let models = lens.models();
     let stage = Stage::new(progress, "lens", 2 * models.len())?;
-    let corners = all_corners(data, usable);
-    let mut starts = Starts { data, usable, perspective: None, fisheye: None };
+    let corners = mask_of_views(data, usable);
+    let mut starts = InitialValueCache { data, usable, perspective: None, fisheye: None };
     let mut trials = Vec::new();
     let mut fits = Vec::new();
     let mut failed = None;
     for &model in models {
-        check_model(model)?;
-        let nothing = LensTrial {
+        check_adjustable(model)?;
+        let no_fit = LensTrial {
             model,
             rms_px: f64::NAN,
             holdout_rms_px: f64::NAN,
             outliers: 0,
             verdict: LensVerdict::Undetermined,
         };
-        let found = match starts.with_model(model, &stage) {
+        let fitted = match starts.with_model(model, &stage) {
             Ok(start) => match fit(data, &start.estimate, &corners, limits, &stage) {
-                Ok(found) => Some(found),
+                Ok(fitted) => Some(fitted),
                 Err(Failure::Cancelled) => return Err(Cancelled.into()),
                 Err(Failure::Adjust(_)) => None,
             },
             Err(CalibrateError::NoStart { error_px, .. }) => {
-                trials.push(LensTrial { verdict: LensVerdict::NoStart { error_px }, ..nothing });
+                trials.push(LensTrial { verdict: LensVerdict::NoStart { error_px }, ..no_fit });
                 failed = failed.or(Some(CalibrateError::NoStart { camera: 0, model, error_px }));
                 stage.add(1)?;
                 continue;
@@ -184,32 +191,32 @@ pub(crate) fn choose(
             Err(error) => return Err(error),
         };
         stage.add(1)?;
-        let Some(found) = found else {
-            trials.push(nothing);
+        let Some(fitted) = fitted else {
+            trials.push(no_fit);
             continue;
         };
-        let (rms_px, count) = rms(data, &found, None);
+        let (rms_px, count) = rms(data, &fitted, None);
         let outliers = corners.iter().flatten().flatten().filter(|u| **u).count() - count;
-        let verdict = if reaches(data, &found) { LensVerdict::Asked } else { LensVerdict::Folds };
-        trials.push(LensTrial { rms_px, outliers, verdict, ..nothing });
+        let verdict = if is_monotonic(data, &fitted) { LensVerdict::Asked } else { LensVerdict::Folds };
+        trials.push(LensTrial { rms_px, outliers, verdict, ..no_fit });
         if verdict == LensVerdict::Asked && count > 0 {
-            fits.push((trials.len() - 1, found));
+            fits.push((trials.len() - 1, fitted));
         }
     }
     if fits.is_empty() {
         return Err(failed.unwrap_or(CalibrateError::Degenerate { camera: 0, largest_tilt_degrees: f64::NAN }));
     }
-    // A corner that one of the models can explain is no mistake of the detector.
-    let mut judged = fits[0].1.used.clone();
+    // An inlier of one model is no detection error, and is scored for all models.
+    let mut scored = fits[0].1.used.clone();
     for (_, fit) in &fits[1..] {
-        for (a, b) in judged.iter_mut().flatten().flatten().zip(fit.used.iter().flatten().flatten()) {
+        for (a, b) in scored.iter_mut().flatten().flatten().zip(fit.used.iter().flatten().flatten()) {
             *a |= *b;
         }
     }
     let mut errors = Vec::new();
-    if let (Some(folds), true) = (folds(usable.len()), holdout || models.len() > 1) {
+    if let (Some(fold_count), true) = (fold_count(usable.len()), holdout || models.len() > 1) {
         for (i, (trial, fit)) in fits.iter().enumerate() {
-            match hold_out(data, fit, (&corners, &judged), limits, folds, &stage) {
+            match hold_out(data, fit, (&corners, &scored), limits, fold_count, &stage) {
                 Ok(error) => {
                     trials[*trial].holdout_rms_px = error.rms(None);
                     errors.push((i, error));
@@ -221,52 +228,53 @@ pub(crate) fn choose(
             stage.add(1)?;
         }
     }
-    let taken = if models.len() > 1 { simplest(&errors, &fits, &mut trials) } else { 0 };
-    let holdout = errors.into_iter().find(|(i, _)| *i == taken).map(|(_, error)| error);
-    let (_, fit) = fits.swap_remove(taken);
+    let selected = if models.len() > 1 { select_model(&errors, &fits, &mut trials) } else { 0 };
+    let holdout = errors.into_iter().find(|(i, _)| *i == selected).map(|(_, error)| error);
+    let (_, fit) = fits.swap_remove(selected);
     Ok(Mono { fit, trials, holdout })
 }
 
-/// Of the models whose errors are the least up to chance, that with the fewest parameters. Without held-out views the first.
+/// Selects the model with the fewest parameters among those whose hold-out error is not significantly larger than the
+/// smallest one. Without held-out views the first model.
 ///
-/// Chance: the sum of the differences of the views' squared errors is less than its own standard deviation.
-fn simplest(errors: &[(usize, HoldOut)], fits: &[(usize, Fit)], trials: &mut [LensTrial]) -> usize {
-    let parameters = |i: usize| trials_model(fits, i).parameter_count();
+/// Not significant: the sum of the differences of the views' squared errors is below its standard deviation.
+fn select_model(errors: &[(usize, HoldOut)], fits: &[(usize, Fit)], trials: &mut [LensTrial]) -> usize {
+    let parameters = |i: usize| model_of_fit(fits, i).parameter_count();
     let best = errors.iter().min_by(|a, b| a.1.rms(None).total_cmp(&b.1.rms(None)));
-    let Some((best, least)) = best.map(|(i, e)| (*i, e)) else {
+    let Some((best, smallest)) = best.map(|(i, e)| (*i, e)) else {
         for (trial, _) in fits {
             trials[*trial].verdict = LensVerdict::NotNeeded;
         }
         trials[fits[0].0].verdict = LensVerdict::Chosen;
         return 0;
     };
-    let as_exact = |error: &HoldOut| {
-        let views = error.pictures.iter().flatten().zip(least.pictures.iter().flatten());
-        let more: Vec<f64> = views.filter(|(e, _)| e.1 > 0).map(|(e, l)| e.0 - l.0).collect();
-        let n = more.len() as f64;
-        let mean = more.iter().sum::<f64>() / n;
-        let variance = more.iter().map(|d| (d - mean) * (d - mean)).sum::<f64>() / (n - 1.0).max(1.0);
+    let is_as_accurate = |error: &HoldOut| {
+        let views = error.pictures.iter().flatten().zip(smallest.pictures.iter().flatten());
+        let differences: Vec<f64> = views.filter(|(e, _)| e.1 > 0).map(|(e, l)| e.0 - l.0).collect();
+        let n = differences.len() as f64;
+        let mean = differences.iter().sum::<f64>() / n;
+        let variance = differences.iter().map(|d| (d - mean) * (d - mean)).sum::<f64>() / (n - 1.0).max(1.0);
         mean * n <= (variance * n).sqrt()
     };
-    let mut taken = best;
+    let mut selected = best;
     for (i, error) in errors {
-        if as_exact(error) && parameters(*i) < parameters(taken) {
-            taken = *i;
+        if is_as_accurate(error) && parameters(*i) < parameters(selected) {
+            selected = *i;
         }
     }
     for (i, error) in errors {
-        let verdict = if *i == taken {
+        let verdict = if *i == selected {
             LensVerdict::Chosen
-        } else if as_exact(error) {
+        } else if is_as_accurate(error) {
             LensVerdict::NotNeeded
         } else {
             LensVerdict::LessExact
         };
         trials[fits[*i].0].verdict = verdict;
     }
-    taken
+    selected
 }
 
-fn trials_model(fits: &[(usize, Fit)], i: usize) -> DistortionModel {
+fn model_of_fit(fits: &[(usize, Fit)], i: usize) -> DistortionModel {
     fits[i].1.estimate.cameras[0].distortion.model()
 }

@@ -1,12 +1,14 @@
-//! Calibration of cameras and rigs from views of a flat target: lenses, poses, the target's own shape, and how well all of it is known.
+//! Calibration of cameras and rigs from views of a planar target: intrinsics, poses, the target's shape, and their
+//! uncertainties.
 //!
-//! Takes corners, never pictures: `cv-pipeline` joins detectors and this. One camera is a rig of one.
+//! The input is corners, never images: `cv-pipeline` joins corner detection and this crate. A single camera is a rig of
+//! one.
 //!
 //! ```
-//! use cv_calib::{CalibrateOptions, LensChoice, Sightings, TargetCorner, TargetPoints, calibrate};
+//! use cv_calib::{CalibrateOptions, LensChoice, TargetObservations, TargetCorner, TargetPoints, calibrate};
 //! use cv_core::{Camera, Distortion, Pose, Rotation3, Silent, Vector3};
 //!
-//! // Ten views of a board of 9 × 6 corners, 25 mm apart, by a camera with a barrel.
+//! Ten views of a board with 9 × 6 corners, 25 mm apart, by a camera with barrel distortion.
 //! let target = TargetPoints::grid(9, 6, 25.0)?;
 //! let distortion = Distortion::radial_tangential4([-0.2, 0.05, 0.0, 0.0]);
 //! let camera = Camera { distortion, ..Camera::from_focal(640, 480, 500.0) };
@@ -19,18 +21,19 @@
 //!     };
 //!     vec![(0..54).filter_map(corner).collect()]
 //! };
-//! let data = Sightings { target: target.clone(), sizes: vec![(640, 480)], views: (0..10).map(view).collect() };
+//! let data = TargetObservations { target: target.clone(), sizes: vec![(640, 480)], views: (0..10).map(view).collect() };
 //! let options = CalibrateOptions { lens: LensChoice::RadialTangential4, ..CalibrateOptions::default() };
-//! let found = calibrate(&data, &options, &Silent)?;
-//! assert!((found.cameras[0].camera.fx - 500.0).abs() < 1e-3 && found.rms_px < 1e-6);
+//! let calibration = calibrate(&data, &options, &Silent)?;
+//! assert!((calibration.cameras[0].camera.fx - 500.0).abs() < 1e-3 && calibration.rms_px < 1e-6);
 //! # Ok::<(), cv_calib::CalibrateError>(())
 //! ```
 //!
 //! # Conventions
 //!
-//! * The target's frame has x right and y down on its face. A pose takes it to a camera's frame, in the target's unit.
-//! * A root mean square is of the distances of corners, both coordinates together, as OpenCV prints it. Deviations are of one coordinate.
-//! * The same corners and options give the same bytes at any number of threads.
+//! * Target frame: x right and y down on its face. A target pose maps it to a camera's frame, in the target's unit.
+//! * A root mean square error is of distances (both coordinates), as in OpenCV. Standard deviations are of one
+//!   coordinate.
+//! * The same corners and options give the same bytes with any number of threads.
 
 mod adjustment;
 mod calibrate;
@@ -55,12 +58,12 @@ mod zhang;
 
 pub use calibrate::calibrate;
 pub use calibration::{
-    CalibratedCamera, CalibratedCorner, CalibratedParameter, CalibratedPicture, CalibratedView, Calibration,
-    PictureOutcome, TargetShape,
+    CalibratedCamera, CalibratedCorner, CalibratedImage, CalibratedParameter, CalibratedView, Calibration,
+    ImageOutcome, TargetShape,
 };
 pub use error::CalibrateError;
 pub use lens_choice::{LensTrial, LensVerdict};
 pub use options::{CalibrateOptions, LensChoice};
-pub use target::{Sightings, TargetCorner, TargetPoints};
+pub use target::{TargetCorner, TargetObservations, TargetPoints};
 pub use uncertainty::{CoverageMap, UncertaintyMap};
-pub use verdict::{CaptureNote, PictureSide, Trust, Verdict};
+pub use verdict::{CaptureNote, ImageSide, Trust, Verdict};

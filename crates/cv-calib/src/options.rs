@@ -1,4 +1,4 @@
-//! Settings of a calibration.
+//! Options of a calibration.
 
 use crate::CalibrateError;
 use cv_core::{DistortionModel, OptionError, named};
@@ -8,16 +8,16 @@ use cv_core::{DistortionModel, OptionError, named};
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum LensChoice {
-    /// That with the least error on views that it was not fitted to.
+    /// The model with the smallest hold-out error.
     #[default]
     Auto,
-    /// Two radial and two tangential parameters.
+    /// Two radial and two tangential coefficients.
     RadialTangential4,
-    /// Three radial and two tangential parameters, OpenCV's usual five.
+    /// Three radial and two tangential coefficients, OpenCV's default five.
     RadialTangential5,
-    /// A rational radial factor and two tangential parameters.
+    /// A rational radial factor and two tangential coefficients.
     Rational8,
-    /// The rational model and four thin prism parameters.
+    /// The rational model and four thin prism coefficients.
     ThinPrism12,
     /// Equidistant fisheye.
     Fisheye4,
@@ -33,7 +33,7 @@ named!(LensChoice {
 });
 
 impl LensChoice {
-    /// The models to choose from.
+    /// Returns the candidate models.
     pub fn models(self) -> &'static [DistortionModel] {
         use DistortionModel as M;
         match self {
@@ -47,24 +47,25 @@ impl LensChoice {
     }
 }
 
-/// Settings of [`calibrate`](crate::calibrate).
+/// Options of [`calibrate`](crate::calibrate).
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct CalibrateOptions {
-    /// Lens model, of each camera by itself where it is chosen by cross-validation. Default [`LensChoice::Auto`].
+    /// Lens model; chosen by cross-validation for each camera separately. Default [`LensChoice::Auto`].
     pub lens: LensChoice,
-    /// Whether the target's own shape, two deflections, is adjusted where the views determine it. Default true.
+    /// Whether the target's shape, two deflections, is adjusted where the views determine it. Default true.
     pub board_shape: bool,
-    /// A corner is left out whose distance from where it should be is more than so many standard deviations of a coordinate, 3 to 100. Default 4.5: of
-    /// normal errors one in 25,000 is.
+    /// Outlier threshold in robust standard deviations of a coordinate, 3 to 100. Default 4.5: it rejects one in 25,000
+    /// normal errors.
     pub outlier_deviations: f64,
-    /// Fewest corners of a picture, 4 to 1000. Default 6: four determine a homography and leave nothing to check it by.
+    /// Minimum number of corners of an image, 4 to 1000. Default 6: four determine a homography and leave no
+    /// redundancy.
     pub min_corners: usize,
-    /// Whether the hold-out error is computed also where it is not needed to choose the lens. Default true; it takes as long as two
-    /// calibrations.
+    /// Whether the hold-out error is computed even if it is not needed to choose the lens. Default true; it takes as
+    /// long as two calibrations.
     pub holdout: bool,
-    /// Columns and rows of the map of projection uncertainty and of coverage, 2 to 200. Default 16 × 12.
+    /// Columns and rows of the uncertainty map and of the coverage map, 2 to 200. Default 16 × 12.
     pub grid: (usize, usize),
 }
 
@@ -82,7 +83,7 @@ impl Default for CalibrateOptions {
 }
 
 impl CalibrateOptions {
-    pub(crate) fn check(&self) -> Result<(), CalibrateError> {
+    pub(crate) fn validate(&self) -> Result<(), CalibrateError> {
         OptionError::check("outlier_deviations", self.outlier_deviations, "3 to 100", |v| (3.0..=100.0).contains(&v))?;
         OptionError::check("min_corners", self.min_corners as f64, "4 to 1000", |v| (4.0..=1000.0).contains(&v))?;
         for side in [self.grid.0, self.grid.1] {

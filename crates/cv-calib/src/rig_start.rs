@@ -1,28 +1,32 @@
-//! Where the cameras of a rig are, from the poses that each has by itself.
+//! Initial rig poses, from the target poses that each camera estimates alone.
 
 use crate::CalibrateError;
 use cv_core::{Pose, median};
 
-/// The mounts of all cameras, which take the first camera's frame to theirs, from the poses of the views in each camera's frame (`poses[c][v]`).
+/// Estimates the rig poses, first camera's frame to each camera's, from the target poses in each camera's frame
+/// (`poses[c][v]`).
 ///
-/// Cameras are joined to those that are placed already by the views that both saw, most of them first. Of the relative poses of those views the one nearest to
-/// all others is taken: some views may be wrong. `turns` are the motions of the target after which it looks the same, the first of them none: where there are others, a
-/// view says as many relative poses, of which one is right.
-pub(crate) fn mounts(poses: &[Vec<Option<Pose>>], turns: &[Pose]) -> Result<Vec<Pose>, CalibrateError> {
-    let shared = |a: usize, b: usize| -> Vec<Vec<Pose>> {
+/// Cameras are connected in the order of the number of views that they share with a connected one. Of the relative
+/// poses of the shared views the medoid is taken, which is robust to wrong views. `symmetries` are the rigid motions
+/// that map the target to itself, the identity first: with several, each view has as many candidate relative poses.
+pub(crate) fn estimate_rig_poses(
+    poses: &[Vec<Option<Pose>>],
+    symmetries: &[Pose],
+) -> Result<Vec<Pose>, CalibrateError> {
+    let relative_poses = |a: usize, b: usize| -> Vec<Vec<Pose>> {
         let pair = |(a, b): (&Option<Pose>, &Option<Pose>)| {
             let (a, b) = (a.as_ref()?, b.as_ref()?);
-            Some(turns.iter().map(|turn| Pose::relative(a, &b.compose(&turn.inverse()))).collect())
+            Some(symmetries.iter().map(|symmetry| Pose::relative(a, &b.compose(&symmetry.inverse()))).collect())
         };
         poses[a].iter().zip(&poses[b]).filter_map(pair).collect()
     };
-    let mut placed: Vec<Option<Pose>> = vec![None; poses.len()];
-    placed[0] = Some(Pose::identity());
-    while let Some(missing) = placed.iter().position(Option::is_none) {
+    let mut rig_poses: Vec<Option<Pose>> = vec![None; poses.len()];
+    rig_poses[0] = Some(Pose::identity());
+    while let Some(missing) = rig_poses.iter().position(Option::is_none) {
         let mut best: Option<(usize, usize, usize)> = None;
-        for (a, _) in placed.iter().enumerate().filter(|(_, p)| p.is_some()) {
-            for (b, _) in placed.iter().enumerate().filter(|(_, p)| p.is_none()) {
-                let count = shared(a, b).len();
+        for (a, _) in rig_poses.iter().enumerate().filter(|(_, p)| p.is_some()) {
+            for (b, _) in rig_poses.iter().enumerate().filter(|(_, p)| p.is_none()) {
+                let count = relative_poses(a, b).len();
                 if count > best.map_or(0, |b| b.2) {
                     best = Some((a, b, count));
                 }
@@ -30,43 +34,51 @@ pub(crate) fn mounts(poses: &[Vec<Option<Pose>>], turns: &[Pose]) -> Result<Vec<
         }
         let unconnected = CalibrateError::Unconnected { camera: missing };
         let (from, to, _) = best.ok_or(unconnected)?;
-        let relative = medoid(&shared(from, to)).ok_or(unconnected)?;
-        placed[to] = placed[from].map(|p| relative.compose(&p));
+        let relative = medoid(&relative_poses(from, to)).ok_or(unconnected)?;
+        rig_poses[to] = rig_poses[from].map(|p| relative.compose(&p));
     }
-    Ok(placed.into_iter().flatten().collect())
+    Ok(rig_poses.into_iter().flatten().collect())
 }
 
-/// For each view and camera the turn of the target by which its points are numbered otherwise than in the picture of the first camera that saw it: the one that brings its
-/// pose nearest to where the mounts have it.
-pub(crate) fn turns_of_views(poses: &[Vec<Option<Pose>>], mounts: &[Pose], turns: &[Pose]) -> Vec<Vec<usize>> {
+/// Returns for each view and camera the index of the symmetry by which its points are numbered otherwise than in the
+/// first camera that observes the target: the one whose pose is nearest to the one that the rig poses predict.
+pub(crate) fn symmetries_of_views(
+    poses: &[Vec<Option<Pose>>],
+    rig_poses: &[Pose],
+    symmetries: &[Pose],
+) -> Vec<Vec<usize>> {
     let views = poses.first().map_or(0, Vec::len);
-    let of = |v: usize, c: usize| -> Option<usize> {
-        let (first, seen) = poses.iter().enumerate().find_map(|(a, p)| Some((a, p[v]?)))?;
-        let expected = mounts[c].compose(&mounts[first].inverse().compose(&seen));
-        let own = poses[c][v].filter(|_| c != first)?;
-        let off = |turn: &Pose| far(&expected, &own.compose(&turn.inverse()), expected.translation.norm());
-        let nearest = turns.iter().enumerate().min_by(|a, b| off(a.1).total_cmp(&off(b.1)))?;
+    let nearest_symmetry = |v: usize, c: usize| -> Option<usize> {
+        let (first, pose) = poses.iter().enumerate().find_map(|(a, p)| Some((a, p[v]?)))?;
+        let expected = rig_poses[c].compose(&rig_poses[first].inverse().compose(&pose));
+        let measured = poses[c][v].filter(|_| c != first)?;
+        let distance = |symmetry: &Pose| {
+            pose_distance(&expected, &measured.compose(&symmetry.inverse()), expected.translation.norm())
+        };
+        let nearest = symmetries.iter().enumerate().min_by(|a, b| distance(a.1).total_cmp(&distance(b.1)))?;
         Some(nearest.0)
     };
-    (0..views).map(|v| (0..poses.len()).map(|c| of(v, c).unwrap_or(0)).collect()).collect()
+    (0..views).map(|v| (0..poses.len()).map(|c| nearest_symmetry(v, c).unwrap_or(0)).collect()).collect()
 }
 
-/// How far apart two poses are: an angle in radians, and a length in `unit`s.
-fn far(a: &Pose, b: &Pose, unit: f64) -> f64 {
+/// Returns the distance of two poses: the angle of their rotation in radians, plus that of their translations in
+/// `unit`s.
+fn pose_distance(a: &Pose, b: &Pose, unit: f64) -> f64 {
     Pose::relative(a, b).rotation_angle() + (a.translation - b.translation).norm() / unit.max(f64::MIN_POSITIVE)
 }
 
-/// The pose with the least median distance to the views, of each of which the nearest pose counts; lengths as shares of the typical one.
+/// Returns the medoid: the pose with the smallest median distance to the views, each by its nearest candidate.
+/// Translations are relative to their median length.
 fn medoid(views: &[Vec<Pose>]) -> Option<Pose> {
     let mut lengths: Vec<f64> = views.iter().flatten().map(|p| p.translation.norm()).collect();
     let unit = median(&mut lengths)?;
-    let farness = |a: &Pose| {
-        let nearest = |view: &Vec<Pose>| view.iter().map(|b| far(a, b, unit)).fold(f64::INFINITY, f64::min);
+    let median_distance = |a: &Pose| {
+        let nearest = |view: &Vec<Pose>| view.iter().map(|b| pose_distance(a, b, unit)).fold(f64::INFINITY, f64::min);
         let mut all: Vec<f64> = views.iter().map(nearest).collect();
         median(&mut all).unwrap_or(f64::INFINITY)
     };
-    let farness: Vec<(f64, Pose)> = views.iter().flatten().map(|p| (farness(p), *p)).collect();
-    farness.into_iter().min_by(|a, b| a.0.total_cmp(&b.0)).map(|nearest| nearest.1)
+    let median_distance: Vec<(f64, Pose)> = views.iter().flatten().map(|p| (median_distance(p), *p)).collect();
+    median_distance.into_iter().min_by(|a, b| a.0.total_cmp(&b.0)).map(|nearest| nearest.1)
 }
 
 #[cfg(test)]
@@ -79,37 +91,37 @@ mod tests {
     }
 
     #[test]
-    fn cameras_are_placed_through_others_though_some_views_are_turned_round() {
+    fn cameras_are_connected_through_others_in_spite_of_rotated_views() {
         let truth =
             [Pose::identity(), pose([0.0, 0.2, 0.0], [-3.0, 0.0, 0.1]), pose([0.0, 0.4, 0.0], [-6.0, 0.1, 0.3])];
         let views: Vec<Pose> =
             (0..7).map(|v| pose([0.1 * f64::from(v), 0.2, 0.0], [0.0, 0.3 * f64::from(v), 9.0])).collect();
-        let mut seen: Vec<Vec<Option<Pose>>> =
+        let mut poses: Vec<Vec<Option<Pose>>> =
             truth.iter().map(|m| views.iter().map(|v| Some(m.compose(v))).collect()).collect();
-        // The first and the last camera share no view; one view of the second is turned by half a turn.
-        seen[2][..4].fill(None);
-        seen[0][4..].fill(None);
-        let turned = pose([0.0, 0.0, std::f64::consts::PI], [8.0, 5.0, 0.0]);
-        seen[1][1] = seen[1][1].map(|p| p.compose(&turned));
-        let none = [Pose::identity()];
-        let found = mounts(&seen, &none).unwrap();
-        for (f, t) in found.iter().zip(&truth) {
-            // Products of a few rotations and lengths of ten units.
+        // The first and the last camera share no view; one view of the second is rotated by 180°.
+        poses[2][..4].fill(None);
+        poses[0][4..].fill(None);
+        let half_turn = pose([0.0, 0.0, std::f64::consts::PI], [8.0, 5.0, 0.0]);
+        poses[1][1] = poses[1][1].map(|p| p.compose(&half_turn));
+        let identity_only = [Pose::identity()];
+        let rig_poses = estimate_rig_poses(&poses, &identity_only).unwrap();
+        for (f, t) in rig_poses.iter().zip(&truth) {
+            // Rounding of products of a few rotations with lengths of ten units.
             assert!((f.matrix() - t.matrix()).norm() < 1e-12, "{f:?}");
         }
-        // Half a turn as the symmetry of the target: most views of the second camera may be turned, and each is known.
+        // With 180° as symmetry of the target, most views of the second camera may be rotated, and each is identified.
         for v in [0, 1, 3, 5, 6] {
-            seen[1][v] = Some(truth[1].compose(&views[v]).compose(&turned));
+            poses[1][v] = Some(truth[1].compose(&views[v]).compose(&half_turn));
         }
-        let turns = [Pose::identity(), turned];
-        let found = mounts(&seen, &turns).unwrap();
-        for (f, t) in found.iter().zip(&truth) {
+        let symmetries = [Pose::identity(), half_turn];
+        let rig_poses = estimate_rig_poses(&poses, &symmetries).unwrap();
+        for (f, t) in rig_poses.iter().zip(&truth) {
             assert!((f.matrix() - t.matrix()).norm() < 1e-12, "{f:?}");
         }
-        let of_second: Vec<usize> = turns_of_views(&seen, &found, &turns).iter().map(|v| v[1]).collect();
-        // Views 4 to 6 have no picture by the first camera: the second one begins to count.
+        let of_second: Vec<usize> = symmetries_of_views(&poses, &rig_poses, &symmetries).iter().map(|v| v[1]).collect();
+        // Views 4 to 6 have no image by the first camera: the second one is the reference.
         assert_eq!(of_second, [1, 1, 0, 1, 0, 0, 0]);
-        seen[2].fill(None);
-        assert_eq!(mounts(&seen, &none), Err(CalibrateError::Unconnected { camera: 2 }));
+        poses[2].fill(None);
+        assert_eq!(estimate_rig_poses(&poses, &identity_only), Err(CalibrateError::Unconnected { camera: 2 }));
     }
 }

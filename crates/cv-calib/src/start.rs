@@ -1,154 +1,158 @@
-//! A first lens and first poses for a camera of which nothing is known.
+//! Initial intrinsics and target poses of a single camera without prior knowledge.
 
 use crate::CalibrateError;
-use crate::adjustment::{Estimate, Failure, Free, Lenses, Used, adjust};
+use crate::adjustment::{Estimate, Failure, FreeIntrinsics, FreeParameters, InlierMask, adjust};
 use crate::plane_pose::{plane_homography, plane_pose, pose_from_homography};
-use crate::target::{Sightings, TargetCorner};
+use crate::target::{TargetCorner, TargetObservations};
 use crate::zhang::intrinsics_from_homographies;
 use cv_core::{Camera, Correspondence, Distortion, LensProjection, Matrix3, Pose, Progress, Stage, Vector3, median};
 use cv_geometry::homography_from_points;
 use cv_numeric::RobustLoss;
 use rayon::prelude::*;
 
-/// Views that candidates are compared on, and that the first adjustment is of.
-const VIEWS: usize = 12;
-/// Focal lengths that are tried: from a fifth of the picture's longer side to ten times it, a quarter more each.
-const FOCALS: i32 = 18;
-/// Shares by which a barrel shortens the distance of a corner of the picture from its middle.
-const BARRELS: [f64; 3] = [0.0, 0.08, 0.2];
+/// Maximum number of views of the initial adjustment; half as many rank the candidates.
+const INITIAL_VIEWS: usize = 12;
+/// Number of candidate focal lengths: from 0.2 times the longer image side, in steps of 25 %.
+const FOCAL_CANDIDATES: i32 = 18;
+/// Candidate barrel distortions: relative displacement of the image corner towards the center.
+const BARREL_DISPLACEMENTS: [f64; 3] = [0.0, 0.08, 0.2];
 
-/// The least squares start: Cauchy's loss with the scale the residuals have, in pixels, but no less than this.
-const LEAST_SCALE: f64 = 1.0;
+/// Lower bound of the scale of the Cauchy loss, in pixels.
+const MIN_LOSS_SCALE: f64 = 1.0;
 
-/// A start of either kind of lens, of one camera.
+/// Initial values of one camera with a perspective or fisheye lens.
 #[derive(Debug, Clone)]
-pub(crate) struct Start {
+pub(crate) struct InitialValues {
     pub(crate) estimate: Estimate,
-    /// Median distance of the corners from where they should be, in pixels.
+    /// Median reprojection error of the corners, in pixels.
     pub(crate) error: f64,
 }
 
-/// Corners of a view that a start is made of: poses and medians of them are near enough to those of all.
-const CORNERS: usize = 24;
+/// Maximum number of corners of a view for initial values: enough for poses and medians.
+const SAMPLED_CORNERS: usize = 24;
 
-/// So many of `n` numbers: every so many-th by the golden ratio, which is no multiple of the length of any row.
-fn some(n: usize) -> Vec<usize> {
-    if n <= CORNERS {
+/// Returns at most that many of `n` indices, spread by the golden ratio, which is no multiple of a row's length.
+fn sample_indices(n: usize) -> Vec<usize> {
+    if n <= SAMPLED_CORNERS {
         return (0..n).collect();
     }
-    let mut chosen: Vec<usize> = (0..CORNERS).map(|k| (((k as f64 * 0.618_034).fract()) * n as f64) as usize).collect();
-    chosen.sort_unstable();
-    chosen.dedup();
-    chosen
+    let mut indices: Vec<usize> =
+        (0..SAMPLED_CORNERS).map(|k| (((k as f64 * 0.618_034).fract()) * n as f64) as usize).collect();
+    indices.sort_unstable();
+    indices.dedup();
+    indices
 }
 
-fn some_corners(corners: &[TargetCorner]) -> Vec<TargetCorner> {
-    some(corners.len()).into_iter().map(|i| corners[i]).collect()
+/// Returns a sample of the corners.
+fn sample_corners(corners: &[TargetCorner]) -> Vec<TargetCorner> {
+    sample_indices(corners.len()).into_iter().map(|i| corners[i]).collect()
 }
 
-/// No more than [`CORNERS`] of the corners of each picture that count.
-pub(crate) fn thinned(used: &Used) -> Used {
+/// Returns a mask with at most [`SAMPLED_CORNERS`] corners of each image.
+pub(crate) fn sample_mask(used: &InlierMask) -> InlierMask {
     let picture = |used: &Vec<bool>| {
-        let counted: Vec<usize> = (0..used.len()).filter(|i| used[*i]).collect();
+        let set_indices: Vec<usize> = (0..used.len()).filter(|i| used[*i]).collect();
         let mut out = vec![false; used.len()];
-        some(counted.len()).into_iter().for_each(|i| out[counted[i]] = true);
+        sample_indices(set_indices.len()).into_iter().for_each(|i| out[set_indices[i]] = true);
         out
     };
     used.iter().map(|cameras| cameras.iter().map(picture).collect()).collect()
 }
 
-/// Median distances of some of the corners from where cameras and the poses by their homographies have them; infinite where more than half have none. The cameras
-/// differ by their focal lengths alone, as distances in the picture go: without distortion all see the same but for its scale, so that the first one's homographies
-/// serve all.
-fn median_errors(cameras: &[Camera], data: &Sightings, views: &[usize]) -> Vec<f64> {
+/// Returns the median reprojection error of sampled corners for each camera, with target poses from homographies;
+/// infinite where more than half do not project. The cameras must differ only in focal length, with the same distortion
+/// in pixels: their homographies are then equal up to scale, and are computed once.
+fn median_errors(cameras: &[Camera], data: &TargetObservations, views: &[usize]) -> Vec<f64> {
     let Some(first) = cameras.first() else { return Vec::new() };
     let views: Vec<_> = views
         .iter()
         .map(|v| {
-            let corners = some_corners(&data.views[*v][0]);
+            let corners = sample_corners(&data.views[*v][0]);
             let homography = plane_homography(first, &data.target, &corners);
             (corners, homography)
         })
         .collect();
-    let of = |camera: &Camera| {
+    let median_error = |camera: &Camera| {
         let mut errors = Vec::new();
         let scale = Vector3::new(first.fx / camera.fx, first.fy / camera.fy, 1.0);
         for (corners, homography) in &views {
             let pose = homography
                 .and_then(|h| pose_from_homography(&(Matrix3::from_diagonal(&scale) * h), &data.target, corners));
             errors.extend(corners.iter().map(|c| {
-                let seen = pose.and_then(|pose| camera.project(&pose.transform(&data.target.bent(c.point, [0.0; 2]))));
-                seen.map_or(f64::INFINITY, |seen| (seen - c.pixel).norm())
+                let projection =
+                    pose.and_then(|pose| camera.project(&pose.transform(&data.target.bent(c.point, [0.0; 2]))));
+                projection.map_or(f64::INFINITY, |projection| (projection - c.pixel).norm())
             }));
         }
         median(&mut errors).unwrap_or(f64::INFINITY)
     };
-    cameras.iter().map(of).collect()
+    cameras.iter().map(median_error).collect()
 }
 
-/// The cameras that may be near: the principal point in the middle, and what Zhang's method says. By [`median_errors`]' groups.
-fn candidates(data: &Sightings, views: &[usize], projection: LensProjection) -> Vec<Vec<Camera>> {
+/// Returns candidate cameras in groups for [`median_errors`]: with a centered principal point, and by Zhang's method.
+fn candidate_cameras(data: &TargetObservations, views: &[usize], projection: LensProjection) -> Vec<Vec<Camera>> {
     let (width, height) = data.sizes[0];
-    let longer = width.max(height) as f64;
-    let mut barrels: [Vec<Camera>; BARRELS.len()] = Default::default();
+    let longer_side = width.max(height) as f64;
+    let mut groups: [Vec<Camera>; BARREL_DISPLACEMENTS.len()] = Default::default();
     let mut out = Vec::new();
-    for step in 0..FOCALS {
-        let camera = Camera::from_focal(width, height, 0.2 * longer * 1.25f64.powi(step));
+    for step in 0..FOCAL_CANDIDATES {
+        let camera = Camera::from_focal(width, height, 0.2 * longer_side * 1.25f64.powi(step));
         if projection == LensProjection::Fisheye {
             out.push(vec![Camera { distortion: Distortion::fisheye4([0.0; 4]), ..camera }]);
             continue;
         }
-        // Of the distance of a corner of the picture, in units of the focal length.
+        // Squared distance of the image corner, in focal lengths.
         let squared = ((width as f64 / 2.0).powi(2) + (height as f64 / 2.0).powi(2)) / camera.fx.powi(2);
-        for (cameras, barrel) in barrels.iter_mut().zip(BARRELS) {
-            let distortion = Distortion::radial_tangential4([-barrel / squared, 0.0, 0.0, 0.0]);
+        for (cameras, displacement) in groups.iter_mut().zip(BARREL_DISPLACEMENTS) {
+            let distortion = Distortion::radial_tangential4([-displacement / squared, 0.0, 0.0, 0.0]);
             cameras.push(Camera { distortion, ..camera });
         }
     }
-    out.extend(barrels);
+    out.extend(groups);
     if projection == LensProjection::Perspective {
-        let plane = |v: &usize| {
+        let homography = |v: &usize| {
             let pairs =
                 data.views[*v][0].iter().map(|c| Correspondence { a: data.target.points()[c.point], b: c.pixel });
             homography_from_points(&pairs.collect::<Vec<_>>()).ok()
         };
-        let homographies: Vec<_> = views.iter().filter_map(plane).collect();
+        let homographies: Vec<_> = views.iter().filter_map(homography).collect();
         let zhang = intrinsics_from_homographies(&homographies, data.sizes[0]);
         out.extend(zhang.map(|camera| vec![Camera { distortion: Distortion::radial_tangential4([0.0; 4]), ..camera }]));
     }
     out
 }
 
-/// `most` of the views, evenly.
-fn spread(views: &[usize], most: usize) -> Vec<usize> {
-    let n = views.len().min(most);
+/// Returns at most `max` views, evenly sampled.
+fn sample_views(views: &[usize], max: usize) -> Vec<usize> {
+    let n = views.len().min(max);
     (0..n).map(|i| views[i * views.len() / n]).collect()
 }
 
-/// Cauchy's loss for corners that are typically so far off.
-pub(crate) fn cauchy(typical: f64) -> RobustLoss {
-    RobustLoss::Cauchy { scale: (2.0 * typical).max(LEAST_SCALE) }
+/// Returns the Cauchy loss for a median error in pixels.
+pub(crate) fn cauchy(median_error: f64) -> RobustLoss {
+    RobustLoss::Cauchy { scale: (2.0 * median_error).max(MIN_LOSS_SCALE) }
 }
 
-/// A start for the only camera of `data` from the views that can be used. A perspective lens with two radial and two tangential parameters, or a fisheye.
+/// Estimates initial values for the single camera of `data` from the usable views: a perspective lens with two radial
+/// and two tangential coefficients, or a fisheye lens.
 ///
 /// # Errors
-/// [`CalibrateError::NoStart`] where no candidate fits, and [`CalibrateError::Cancelled`].
-pub(crate) fn start(
-    data: &Sightings,
+/// [`CalibrateError::NoStart`] if no candidate fits, and [`CalibrateError::Cancelled`].
+pub(crate) fn estimate_initial_values(
+    data: &TargetObservations,
     usable: &[usize],
     projection: LensProjection,
     progress: &dyn Progress,
-) -> Result<Start, CalibrateError> {
-    let few = spread(usable, VIEWS);
-    let candidates = candidates(data, &few, projection);
+) -> Result<InitialValues, CalibrateError> {
+    let sampled = sample_views(usable, INITIAL_VIEWS);
+    let candidates = candidate_cameras(data, &sampled, projection);
     let stage = Stage::new(progress, "start", candidates.len())?;
-    let compared = spread(usable, VIEWS / 2);
+    let ranking_views = sample_views(usable, INITIAL_VIEWS / 2);
     let errors: Result<Vec<Vec<f64>>, _> = candidates
         .par_iter()
         .map(|cameras| {
             stage.add(1)?;
-            Ok::<_, CalibrateError>(median_errors(cameras, data, &compared))
+            Ok::<_, CalibrateError>(median_errors(cameras, data, &ranking_views))
         })
         .collect();
     let mut ranked: Vec<(f64, Camera)> =
@@ -158,11 +162,11 @@ pub(crate) fn start(
         LensProjection::Perspective => cv_core::DistortionModel::RadialTangential4,
         LensProjection::Fisheye => cv_core::DistortionModel::Fisheye4,
     };
-    let mut best: Option<Start> = None;
-    // The nearest two, as the nearest may lead to another minimum.
+    let mut best: Option<InitialValues> = None;
+    // The best two candidates: the best one may lead to a worse local minimum.
     for (error, camera) in ranked.iter().take(2) {
-        match refine(data, &few, camera, *error, progress) {
-            Ok(found) if best.as_ref().is_none_or(|b| found.error < b.error) => best = Some(found),
+        match adjust_candidate(data, &sampled, camera, *error, progress) {
+            Ok(adjusted) if best.as_ref().is_none_or(|b| adjusted.error < b.error) => best = Some(adjusted),
             Err(Failure::Cancelled) => return Err(cv_core::Cancelled.into()),
             _ => {}
         }
@@ -170,23 +174,27 @@ pub(crate) fn start(
     let no_start =
         CalibrateError::NoStart { camera: 0, model, error_px: ranked.first().map_or(f64::INFINITY, |r| r.0) };
     let mut best = best.ok_or(no_start)?;
-    // The poses of the views that had no part in it.
-    best.estimate.poses = poses(data, usable, &best.estimate.cameras[0]);
+    // Poses of the views that were not sampled.
+    best.estimate.poses = poses_from_homographies(data, usable, &best.estimate.cameras[0]);
     Ok(best)
 }
 
-/// The poses of views by the homographies of some of their corners.
-pub(crate) fn poses(data: &Sightings, usable: &[usize], camera: &Camera) -> Vec<Option<Pose>> {
+/// Estimates the target poses of views from the homographies of sampled corners.
+pub(crate) fn poses_from_homographies(
+    data: &TargetObservations,
+    usable: &[usize],
+    camera: &Camera,
+) -> Vec<Option<Pose>> {
     let mut poses = vec![None; data.views.len()];
     for &v in usable {
-        poses[v] = plane_pose(camera, &data.target, &some_corners(&data.views[v][0]));
+        poses[v] = plane_pose(camera, &data.target, &sample_corners(&data.views[v][0]));
     }
     poses
 }
 
-/// All corners of the usable views.
-pub(crate) fn all_corners(data: &Sightings, usable: &[usize]) -> Used {
-    let mut used: Used = data
+/// Returns the mask of all corners of the usable views.
+pub(crate) fn mask_of_views(data: &TargetObservations, usable: &[usize]) -> InlierMask {
+    let mut used: InlierMask = data
         .views
         .iter()
         .map(|cameras| cameras.iter().map(|c: &Vec<TargetCorner>| vec![false; c.len()]).collect())
@@ -197,38 +205,39 @@ pub(crate) fn all_corners(data: &Sightings, usable: &[usize]) -> Used {
     used
 }
 
-fn refine(
-    data: &Sightings,
+/// Adjusts a candidate, first the focal lengths and the first two distortion coefficients, then all intrinsics.
+fn adjust_candidate(
+    data: &TargetObservations,
     views: &[usize],
     camera: &Camera,
     error: f64,
     progress: &dyn Progress,
-) -> Result<Start, Failure> {
-    let few = data.subset(views);
+) -> Result<InitialValues, Failure> {
+    let sampled = data.subset(views);
     let all: Vec<usize> = (0..views.len()).collect();
     let mut estimate = Estimate {
         cameras: vec![*camera],
-        mounts: vec![Pose::identity()],
-        poses: poses(&few, &all, camera),
+        rig_poses: vec![Pose::identity()],
+        poses: poses_from_homographies(&sampled, &all, camera),
         shape: [0.0; 2],
     };
-    let used = thinned(&all_corners(&few, &all));
-    let coarse = Free { lenses: Lenses::Coarse, shape: false, mounts: false };
-    adjust(&few, &mut estimate, &used, (coarse, cauchy(error)), (30, 1e-3), progress)?;
-    let free = Free { lenses: Lenses::All, shape: false, mounts: false };
-    let typical = |estimate: &Estimate| {
-        let residuals = (0..views.len()).flat_map(|v| estimate.residuals(&few, v, 0));
+    let used = sample_mask(&mask_of_views(&sampled, &all));
+    let coarse = FreeParameters { intrinsics: FreeIntrinsics::Coarse, shape: false, rig_poses: false };
+    adjust(&sampled, &mut estimate, &used, (coarse, cauchy(error)), (30, 1e-3), progress)?;
+    let free = FreeParameters { intrinsics: FreeIntrinsics::All, shape: false, rig_poses: false };
+    let median_error = |estimate: &Estimate| {
+        let residuals = (0..views.len()).flat_map(|v| estimate.residuals(&sampled, v, 0));
         let mut errors: Vec<f64> = residuals.map(|r| r.map_or(f64::INFINITY, |r| r.norm())).collect();
         median(&mut errors).unwrap_or(f64::INFINITY)
     };
-    let mut last = None;
+    let mut previous = None;
     for _ in 0..2 {
-        let loss = cauchy(typical(&estimate).min(error.max(LEAST_SCALE)));
-        if last.replace(loss) == Some(loss) {
+        let loss = cauchy(median_error(&estimate).min(error.max(MIN_LOSS_SCALE)));
+        if previous.replace(loss) == Some(loss) {
             break;
         }
-        adjust(&few, &mut estimate, &used, (free, loss), (50, 1e-3), progress)?;
+        adjust(&sampled, &mut estimate, &used, (free, loss), (50, 1e-3), progress)?;
     }
-    let error = typical(&estimate);
-    Ok(Start { estimate, error })
+    let error = median_error(&estimate);
+    Ok(InitialValues { estimate, error })
 }

@@ -1,46 +1,47 @@
-//! The flat target and what cameras see of it.
+//! The planar target and its observations.
 
 use crate::CalibrateError;
 use cv_core::{Point2, Point3, Pose, Rotation3, Vector2, Vector3};
 
-/// The points of a flat calibration target, such as the inner corners of a chessboard.
+/// The points of a planar calibration target, such as the inner corners of a chessboard.
 ///
-/// Frame of the target: x right and y down on its face, z away from whoever looks at the face. The unit is the caller's, and becomes that of
-/// the poses.
+/// Target frame: x right and y down on its face, z into it. The unit is the caller's, and that of the poses.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TargetPoints {
     points: Vec<Point2<f64>>,
-    middle: Point2<f64>,
-    half: Vector2<f64>,
-    /// Each further turn after which the target looks the same, in radians from x to y, and what each point becomes.
-    turns: Vec<(f64, Vec<usize>)>,
+    center: Point2<f64>,
+    half_size: Vector2<f64>,
+    /// Rotational symmetries other than the identity: the angle in radians from x to y, and the permutation of the
+    /// points.
+    symmetries: Vec<(f64, Vec<usize>)>,
 }
 
 impl TargetPoints {
-    /// From positions on the target.
+    /// Creates a target from the positions of its points.
     ///
     /// # Errors
-    /// [`CalibrateError::Target`] where there are fewer than four points, one is not finite, or all have one x or one y.
+    /// [`CalibrateError::Target`] with fewer than four points, a coordinate that is not finite or too large, or no
+    /// extent in x or y.
     pub fn new(points: Vec<Point2<f64>>) -> Result<Self, CalibrateError> {
-        let bad = CalibrateError::Target { points: points.len() };
+        let degenerate = CalibrateError::Target { points: points.len() };
         if points.len() < 4 || points.iter().any(|p| !(p.x.abs() <= 1e9 && p.y.abs() <= 1e9)) {
-            return Err(bad);
+            return Err(degenerate);
         }
         let (mut low, mut high) = (points[0], points[0]);
         for p in &points {
             (low, high) = (low.inf(p), high.sup(p));
         }
-        let half = (high - low) / 2.0;
-        if half.x <= 0.0 || half.y <= 0.0 {
-            return Err(bad);
+        let half_size = (high - low) / 2.0;
+        if half_size.x <= 0.0 || half_size.y <= 0.0 {
+            return Err(degenerate);
         }
-        Ok(Self { points, middle: low + half, half, turns: Vec::new() })
+        Ok(Self { points, center: low + half_size, half_size, symmetries: Vec::new() })
     }
 
-    /// A grid of `columns × rows` points, row by row, `spacing` apart.
+    /// Creates a grid of `columns × rows` points in row-major order, `spacing` apart.
     ///
     /// # Errors
-    /// [`CalibrateError::Target`] where a side has fewer than two points or the spacing is not a positive number.
+    /// [`CalibrateError::Target`] if a side has fewer than two points or the spacing is not positive.
     pub fn grid(columns: usize, rows: usize, spacing: f64) -> Result<Self, CalibrateError> {
         let count = columns.saturating_mul(rows);
         if columns < 2 || rows < 2 || count > 1_000_000 || spacing.is_nan() || spacing <= 0.0 {
@@ -50,103 +51,108 @@ impl TargetPoints {
         Self::new((0..count).map(at).collect())
     }
 
-    /// Says that the target looks the same after each of `count` equal parts of a whole turn: 2 for a board that cannot be told from itself upside down, 4 for
-    /// one that looks the same after a quarter turn. Then cameras may have numbered its points differently in one view, which [`calibrate`](crate::calibrate) puts right. Turns
-    /// that do not take points to points are left out.
-    pub fn with_equal_turns(mut self, count: usize) -> Self {
-        let near = 1e-6 * self.half.norm();
-        let turned = |turn: usize| -> Option<(f64, Vec<usize>)> {
-            let angle = turn as f64 * std::f64::consts::TAU / count as f64;
+    /// Declares a rotational symmetry of order `count`: the target maps to itself under rotations by 1/`count` of a
+    /// turn about its center. It is 2 for a board that looks the same upside down, 4 for one that looks the same after
+    /// a quarter turn. Cameras may then number the points differently in one view, which
+    /// [`calibrate`](crate::calibrate) corrects. Rotations that do not map points to points are ignored.
+    pub fn with_rotational_symmetry(mut self, count: usize) -> Self {
+        let tolerance = 1e-6 * self.half_size.norm();
+        let symmetry = |index_of_rotation: usize| -> Option<(f64, Vec<usize>)> {
+            let angle = index_of_rotation as f64 * std::f64::consts::TAU / count as f64;
             let (sin, cos) = angle.sin_cos();
-            let place = |p: &Point2<f64>| {
-                let d = p - self.middle;
-                self.middle + Vector2::new(cos * d.x - sin * d.y, sin * d.x + cos * d.y)
+            let rotate = |p: &Point2<f64>| {
+                let d = p - self.center;
+                self.center + Vector2::new(cos * d.x - sin * d.y, sin * d.x + cos * d.y)
             };
-            let index = |p: Point2<f64>| self.points.iter().position(|q| (p - q).norm() <= near);
-            Some((angle, self.points.iter().map(|p| index(place(p))).collect::<Option<_>>()?))
+            let index = |p: Point2<f64>| self.points.iter().position(|q| (p - q).norm() <= tolerance);
+            Some((angle, self.points.iter().map(|p| index(rotate(p))).collect::<Option<_>>()?))
         };
-        self.turns = (1..count).filter_map(turned).collect();
+        self.symmetries = (1..count).filter_map(symmetry).collect();
         self
     }
 
-    /// The turns after which the target looks the same, as motions of its plane; the first is none.
-    pub(crate) fn turns(&self) -> Vec<Pose> {
-        let of = |angle: f64| {
-            let turn = Rotation3::new(Vector3::new(0.0, 0.0, angle));
-            let middle = Vector3::new(self.middle.x, self.middle.y, 0.0);
-            Pose::new(turn, middle - turn * middle)
+    /// Returns the rotational symmetries as rigid motions of the target; the first is the identity.
+    pub(crate) fn symmetries(&self) -> Vec<Pose> {
+        let motion = |angle: f64| {
+            let rotation = Rotation3::new(Vector3::new(0.0, 0.0, angle));
+            let center = Vector3::new(self.center.x, self.center.y, 0.0);
+            Pose::new(rotation, center - rotation * center)
         };
-        std::iter::once(0.0).chain(self.turns.iter().map(|turn| turn.0)).map(of).collect()
+        std::iter::once(0.0).chain(self.symmetries.iter().map(|symmetry| symmetry.0)).map(motion).collect()
     }
 
-    /// The number of a point after turn `turn` ([`CalibratedPicture::turn`](crate::CalibratedPicture::turn)); itself after turn 0.
-    pub fn turned(&self, point: usize, turn: usize) -> usize {
-        let turned = turn.checked_sub(1).and_then(|turn| self.turns.get(turn)?.1.get(point));
-        turned.copied().unwrap_or(point)
+    /// Returns the index of a point after symmetry `symmetry`
+    /// ([`CalibratedImage::symmetry`](crate::CalibratedImage::symmetry)); 0 is the identity.
+    pub fn symmetric_index(&self, point: usize, symmetry: usize) -> usize {
+        let mapped = symmetry.checked_sub(1).and_then(|s| self.symmetries.get(s)?.1.get(point));
+        mapped.copied().unwrap_or(point)
     }
 
-    /// The positions on a flat target.
+    /// Returns the positions of the points on the planar target.
     pub fn points(&self) -> &[Point2<f64>] {
         &self.points
     }
 
-    /// The sides of the rectangle around the points.
+    /// Returns the size of the bounding rectangle of the points.
     pub fn size(&self) -> Vector2<f64> {
-        2.0 * self.half
+        2.0 * self.half_size
     }
 
-    /// By how much the deflections in x and y ([`TargetPoints::bent`]) move a point along z: `1 − u²`, `1 − v²` with u and v from −1 to 1 across the target.
+    /// Returns the derivatives of the z of a point by the deflections in x and y ([`TargetPoints::bent`]): `1 − u²`, `1
+    /// − v²` with u and v from −1 to 1 over the target.
     pub fn deflection(&self, index: usize) -> [f64; 2] {
-        let d = (self.points[index] - self.middle).component_div(&self.half);
+        let d = (self.points[index] - self.center).component_div(&self.half_size);
         [1.0 - d.x * d.x, 1.0 - d.y * d.y]
     }
 
-    /// A point of the target bent as a sheet is, by a parabola in x and one in y: `z = kx (1 − u²) + ky (1 − v²)`, the model of mrcal. `[kx, ky]` are the
-    /// deflections of the middle against the ends, in the unit of the target.
+    /// Returns a point of the deflected target (board warp), a parabola in x and one in y: `z = kx (1 − u²) + ky (1 −
+    /// v²)`, the model of mrcal. `[kx, ky]` are the deflections of the center relative to the borders, in the unit of
+    /// the target.
     pub fn bent(&self, index: usize, shape: [f64; 2]) -> Point3<f64> {
         let (p, d) = (self.points[index], self.deflection(index));
         Point3::new(p.x, p.y, shape[0] * d[0] + shape[1] * d[1])
     }
 }
 
-/// A point of the target in a picture.
+/// A detected point of the target in an image.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct TargetCorner {
-    /// Which point of the target ([`TargetPoints::points`]).
+    /// Index of the point of the target ([`TargetPoints::points`]).
     pub point: usize,
-    /// Where it is in the picture, pixel centers at integers.
+    /// Its pixel, with pixel centers at integers.
     pub pixel: Point2<f64>,
 }
 
-/// What is known before a calibration: a target, cameras of certain picture sizes, and where each saw which points of it in each view.
+/// The input of a calibration: a target, the image sizes of the cameras, and the detected corners in each view and
+/// camera.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Sightings {
+pub struct TargetObservations {
     /// The target.
     pub target: TargetPoints,
-    /// Width and height of each camera's pictures, in pixels.
+    /// Image width and height of each camera, in pixels.
     pub sizes: Vec<(usize, usize)>,
-    /// Corners by view and then by camera: `views[v][c]`. The cameras of one view took their pictures at the same time. Empty where a camera
-    /// saw nothing.
+    /// Corners by view and camera: `views[v][c]`. The cameras of a view are exposed at the same time. Empty where a
+    /// camera has no corners.
     pub views: Vec<Vec<Vec<TargetCorner>>>,
 }
 
-impl Sightings {
-    /// What one camera saw, as a calibration of its own, and the numbers of the views in which it saw something.
+impl TargetObservations {
+    /// Returns the observations of one camera as an input of its own, and the indices of its views with corners.
     pub fn of_camera(&self, camera: usize) -> (Self, Vec<usize>) {
-        let seen: Vec<usize> = (0..self.views.len()).filter(|v| !self.views[*v][camera].is_empty()).collect();
-        let views = seen.iter().map(|v| vec![self.views[*v][camera].clone()]).collect();
-        (Self { target: self.target.clone(), sizes: vec![self.sizes[camera]], views }, seen)
+        let observed: Vec<usize> = (0..self.views.len()).filter(|v| !self.views[*v][camera].is_empty()).collect();
+        let views = observed.iter().map(|v| vec![self.views[*v][camera].clone()]).collect();
+        (Self { target: self.target.clone(), sizes: vec![self.sizes[camera]], views }, observed)
     }
 
-    /// Some of the views.
+    /// Returns the observations of some of the views.
     pub(crate) fn subset(&self, views: &[usize]) -> Self {
         let views = views.iter().map(|v| self.views[*v].clone()).collect();
         Self { target: self.target.clone(), sizes: self.sizes.clone(), views }
     }
 
-    /// Refuses what no calibration can start from.
-    pub(crate) fn check(&self) -> Result<(), CalibrateError> {
+    /// Validates the input.
+    pub(crate) fn validate(&self) -> Result<(), CalibrateError> {
         if self.views.is_empty() || self.sizes.is_empty() {
             return Err(CalibrateError::NoViews);
         }
@@ -161,12 +167,12 @@ impl Sightings {
                 return Err(CalibrateError::Cameras { view, got: cameras.len(), needed: self.sizes.len() });
             }
             for (camera, corners) in cameras.iter().enumerate() {
-                let mut seen = vec![false; points];
+                let mut observed = vec![false; points];
                 for (corner, c) in corners.iter().enumerate() {
-                    let Some(seen) = seen.get_mut(c.point) else {
+                    let Some(observed) = observed.get_mut(c.point) else {
                         return Err(CalibrateError::Point { view, camera, point: c.point, points });
                     };
-                    if std::mem::replace(seen, true) {
+                    if std::mem::replace(observed, true) {
                         return Err(CalibrateError::Twice { view, camera, point: c.point });
                     }
                     if !(c.pixel.x.abs() <= 1e7 && c.pixel.y.abs() <= 1e7) {
@@ -184,10 +190,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_bent_target_bends_by_its_parabolas() {
+    fn deflections_follow_the_two_parabolas() {
         let target = TargetPoints::grid(5, 3, 2.0).unwrap();
         assert_eq!(target.size(), Vector2::new(8.0, 4.0));
-        // The middle has the whole deflection of both, a corner none, the middle of the upper side that in x.
+        // The center has both deflections in full, a corner none, the center of the upper side that in x.
         assert_eq!(target.bent(7, [0.5, 0.25]), Point3::new(4.0, 2.0, 0.75));
         assert_eq!(target.bent(0, [0.5, 0.25]), Point3::new(0.0, 0.0, 0.0));
         assert_eq!(target.bent(2, [0.5, 0.25]), Point3::new(4.0, 0.0, 0.5));
@@ -195,25 +201,25 @@ mod tests {
     }
 
     #[test]
-    fn points_change_places_by_the_turns_of_a_target() {
+    fn rotational_symmetries_permute_the_points() {
         let target = TargetPoints::grid(4, 3, 2.0).unwrap();
-        assert_eq!((target.turned(1, 0), target.turned(1, 1)), (1, 1));
-        let half = target.clone().with_equal_turns(2);
-        assert_eq!((0..12).map(|i| half.turned(i, 1)).collect::<Vec<_>>(), (0..12).rev().collect::<Vec<_>>());
-        let turns = half.turns();
+        assert_eq!((target.symmetric_index(1, 0), target.symmetric_index(1, 1)), (1, 1));
+        let half = target.clone().with_rotational_symmetry(2);
+        assert_eq!((0..12).map(|i| half.symmetric_index(i, 1)).collect::<Vec<_>>(), (0..12).rev().collect::<Vec<_>>());
+        let symmetries = half.symmetries();
         for (i, p) in target.points().iter().enumerate() {
-            let q = target.points()[half.turned(i, 1)];
-            let moved = turns[1].transform(&Point3::new(p.x, p.y, 0.0));
-            // A rotation of lengths below ten.
-            assert!((moved - Point3::new(q.x, q.y, 0.0)).norm() < 1e-12);
+            let q = target.points()[half.symmetric_index(i, 1)];
+            let rotated = symmetries[1].transform(&Point3::new(p.x, p.y, 0.0));
+            // Rounding of a rotation of lengths below ten.
+            assert!((rotated - Point3::new(q.x, q.y, 0.0)).norm() < 1e-12);
         }
-        // A quarter turn takes no oblong grid to itself, and a square one four times.
-        assert_eq!(target.with_equal_turns(4).turns().len(), 2);
-        assert_eq!(TargetPoints::grid(3, 3, 1.0).unwrap().with_equal_turns(4).turns().len(), 4);
+        // A quarter turn maps a square grid to itself, and no other.
+        assert_eq!(target.with_rotational_symmetry(4).symmetries().len(), 2);
+        assert_eq!(TargetPoints::grid(3, 3, 1.0).unwrap().with_rotational_symmetry(4).symmetries().len(), 4);
     }
 
     #[test]
-    fn targets_without_area_are_refused() {
+    fn targets_without_area_are_errors() {
         for (columns, rows, spacing) in [(1, 6, 1.0), (9, 6, 0.0), (9, 6, f64::NAN), (usize::MAX, 6, 1.0)] {
             assert!(matches!(TargetPoints::grid(columns, rows, spacing), Err(CalibrateError::Target { .. })));
         }

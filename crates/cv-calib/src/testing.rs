@@ -1,27 +1,27 @@
-//! Generated views of a board, for tests.
+//! Synthetic views of a board, for tests.
 
-use crate::{Sightings, TargetCorner, TargetPoints};
+use crate::{TargetCorner, TargetObservations, TargetPoints};
 use cv_core::{Camera, Distortion, Pose, Rotation3, Vector3};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
-/// Uniform in 0 to 1.
+/// Returns a uniform random number in [0, 1).
 pub(crate) fn uniform(rng: &mut ChaCha8Rng) -> f64 {
     f64::from(rng.next_u32()) / 4294967296.0
 }
 
-/// Standard normal, by Box and Muller.
+/// Returns a standard normal random number (Box-Muller).
 pub(crate) fn gauss(rng: &mut ChaCha8Rng) -> f64 {
     let (u, v) = (1.0 - uniform(rng), uniform(rng));
     (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos()
 }
 
-/// A board of 11 × 8 corners on 300 × 210 mm, bent by a millimeter, before cameras.
+/// A board of 11 × 8 corners on 300 × 210 mm, deflected by 1 mm, and the cameras that observe it.
 pub(crate) struct Studio {
     pub(crate) target: TargetPoints,
     pub(crate) shape: [f64; 2],
     pub(crate) cameras: Vec<Camera>,
-    pub(crate) mounts: Vec<Pose>,
+    pub(crate) rig_poses: Vec<Pose>,
     pub(crate) rng: ChaCha8Rng,
 }
 
@@ -31,22 +31,23 @@ impl Studio {
             target: TargetPoints::grid(11, 8, 30.0).unwrap(),
             shape: [1.0, 0.0],
             cameras: vec![Camera { distortion, ..Camera::pinhole(1280, 960, 900.0, 902.0, 650.0, 470.0) }],
-            mounts: vec![Pose::identity()],
+            rig_poses: vec![Pose::identity()],
             rng: ChaCha8Rng::seed_from_u64(seed),
         }
     }
 
-    /// With a second camera, 120 mm to the right, of another size and lens.
+    /// Adds a second camera, 120 mm to the right, with another image size and lens.
     pub(crate) fn rig(seed: u64) -> Self {
         let mut studio = Self::new(seed, Distortion::radial_tangential5([-0.3, 0.1, 1e-3, -5e-4, -0.01]));
         let distortion = Distortion::radial_tangential4([-0.1, 0.02, 0.0, 1e-3]);
         studio.cameras.push(Camera { distortion, ..Camera::pinhole(800, 600, 560.0, 561.0, 395.0, 303.0) });
         let turn = Rotation3::new(Vector3::new(0.01, 0.08, -0.005));
-        studio.mounts.push(Pose::new(turn, Vector3::new(-120.0, 2.0, 5.0)));
+        studio.rig_poses.push(Pose::new(turn, Vector3::new(-120.0, 2.0, 5.0)));
         studio
     }
 
-    /// A pose that puts the board's middle on a random ray of the first camera's picture, at 300 to 550 mm, tilted by up to 57°.
+    /// Returns a random pose: the board's center on a random ray of the first camera, at 300 to 550 mm, tilted by up to
+    /// 57°.
     pub(crate) fn pose(&mut self) -> Pose {
         let mut u = || uniform(&mut self.rng);
         let (x, y) = (0.1 + 0.8 * u(), 0.1 + 0.8 * u());
@@ -60,11 +61,11 @@ impl Studio {
         Pose::new(turn, middle - turn * Vector3::new(150.0, 105.0, 0.0))
     }
 
-    /// What the cameras see of the board in a pose: corners within the pictures. Nothing where there are fewer than a third of them.
+    /// Projects the board to the cameras: corners within the images, or none where these are fewer than a third.
     pub(crate) fn view(&mut self, pose: &Pose, noise: f64) -> Vec<Vec<TargetCorner>> {
         let mut cameras = Vec::new();
-        for (camera, mount) in self.cameras.iter().zip(&self.mounts) {
-            let pose = mount.compose(pose);
+        for (camera, rig_pose) in self.cameras.iter().zip(&self.rig_poses) {
+            let pose = rig_pose.compose(pose);
             let mut corners = Vec::new();
             for point in 0..self.target.points().len() {
                 let p = pose.transform(&self.target.bent(point, self.shape));
@@ -82,8 +83,8 @@ impl Studio {
         cameras
     }
 
-    /// So many views that the first camera sees.
-    pub(crate) fn sightings(&mut self, views: usize, noise: f64) -> Sightings {
+    /// Returns random views that the first camera observes.
+    pub(crate) fn observations(&mut self, views: usize, noise: f64) -> TargetObservations {
         let mut all = Vec::new();
         while all.len() < views {
             let pose = self.pose();
@@ -93,6 +94,6 @@ impl Studio {
             }
         }
         let sizes = self.cameras.iter().map(|c| (c.width, c.height)).collect();
-        Sightings { target: self.target.clone(), sizes, views: all }
+        TargetObservations { target: self.target.clone(), sizes, views: all }
     }
 }

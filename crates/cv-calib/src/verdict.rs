@@ -1,12 +1,12 @@
-//! What can be said of a calibration, and what to photograph next.
+//! Assessment of a calibration, and advice on the capture.
 
 use cv_core::named;
 
-/// A side of a picture.
+/// A side of an image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
-pub enum PictureSide {
+pub enum ImageSide {
     /// The left quarter.
     Left,
     /// The right quarter.
@@ -17,82 +17,82 @@ pub enum PictureSide {
     Bottom,
 }
 
-named!(PictureSide { Left = "left", Right = "right", Top = "top", Bottom = "bottom" });
+named!(ImageSide { Left = "left", Right = "right", Top = "top", Bottom = "bottom" });
 
-/// Something of the views that a calibration suffers from, or that whoever uses it should know.
+/// A remark on the views that affects the quality of a calibration.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case", tag = "kind"))]
 #[non_exhaustive]
 pub enum CaptureNote {
-    /// There are few views.
+    /// Few views.
     FewViews {
-        /// Which camera.
+        /// Index of the camera.
         camera: usize,
         /// Views used.
         got: usize,
-        /// Views that are usually enough.
+        /// Recommended number.
         wanted: usize,
     },
-    /// A quarter of the picture has hardly a corner.
+    /// A quarter of the image has hardly any corners.
     EmptySide {
-        /// Which camera.
+        /// Index of the camera.
         camera: usize,
-        /// Which quarter.
-        side: PictureSide,
-        /// Share of its cells that has a corner.
+        /// The quarter.
+        side: ImageSide,
+        /// Fraction of its cells that have a corner.
         covered: f64,
     },
-    /// The target is about parallel to itself in all views.
+    /// The target has nearly the same orientation in all views.
     ParallelTargets {
-        /// Which camera.
+        /// Index of the camera.
         camera: usize,
-        /// Largest angle between two of its positions, in degrees.
+        /// Largest angle between the target's normals in two views, in degrees.
         spread_degrees: f64,
     },
-    /// Somewhere in the picture the projection is not known well.
+    /// The projection uncertainty is large somewhere in the image.
     Uncertain {
-        /// Which camera.
+        /// Index of the camera.
         camera: usize,
-        /// Standard deviation there, in pixels.
+        /// The largest standard deviation, in pixels.
         pixels: f64,
-        /// Where, in pixels.
+        /// Its x, in pixels.
         x: f64,
-        /// Where, in pixels.
+        /// Its y, in pixels.
         y: f64,
-        /// Median over the picture, in pixels.
+        /// Median over the image, in pixels.
         median_px: f64,
     },
-    /// Views that had no part in the fit are much worse: the lens model or the target does not hold everywhere.
+    /// The hold-out error is much larger: the lens model or the target's model is not valid everywhere.
     HoldOut {
-        /// Which camera.
+        /// Index of the camera.
         camera: usize,
-        /// Root mean square distance of the corners that the fit is of, in pixels.
+        /// Root mean square error of the fit, in pixels.
         rms_px: f64,
-        /// The same on views it is not of.
+        /// The hold-out error, in pixels.
         holdout_rms_px: f64,
     },
-    /// Many pictures were left out.
+    /// Many images were rejected.
     LeftOut {
-        /// Which camera.
+        /// Index of the camera.
         camera: usize,
-        /// Pictures left out.
+        /// Images rejected.
         pictures: usize,
-        /// Pictures with corners.
+        /// Images with corners.
         of: usize,
     },
-    /// Two cameras are joined by few views.
+    /// A camera shares few views with the others.
     FewShared {
-        /// The camera that is not the first.
+        /// Index of the camera.
         camera: usize,
-        /// Views that it shares with others.
+        /// Views that it shares.
         got: usize,
-        /// Views that are usually enough.
+        /// Recommended number.
         wanted: usize,
     },
-    /// The target is bent.
+    /// The target is not planar.
     BentTarget {
-        /// The larger deflection, as a share of the target's longer side.
+        /// The larger deflection, as a ratio of the target's longer side.
         share: f64,
     },
 }
@@ -104,45 +104,46 @@ pub enum CaptureNote {
 pub enum Trust {
     /// Better photographs are needed.
     Poor,
-    /// It will do, and better photographs would do better.
+    /// Usable, but better photographs would improve it.
     Usable,
-    /// Known to a fraction of a pixel all over the picture.
+    /// The projection is known to a fraction of a pixel all over the image.
     Good,
 }
 
 named!(Trust { Poor = "poor", Usable = "usable", Good = "good" });
 
-/// How far a calibration can be trusted, and why.
+/// The trust in a calibration, and the reasons.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Verdict {
-    /// The least that one of the notes says.
+    /// The lowest trust of the notes.
     pub trust: Trust,
-    /// What to know, the worst first.
+    /// The remarks, the worst first.
     pub notes: Vec<CaptureNote>,
 }
 
-/// Views that are usually enough.
-pub(crate) const ENOUGH_VIEWS: usize = 10;
-/// Below this share of cells with corners, a quarter of the picture is as good as empty.
-pub(crate) const EMPTY: f64 = 0.25;
-/// Degrees between the extreme positions of the target below which a focal length is badly known.
+/// Recommended number of views.
+pub(crate) const RECOMMENDED_VIEWS: usize = 10;
+/// Minimum fraction of cells with corners in a quarter of the image.
+pub(crate) const MIN_COVERED_FRACTION: f64 = 0.25;
+/// Angle between the extreme orientations of the target, in degrees, below which the focal length is poorly determined.
 pub(crate) const PARALLEL_DEGREES: f64 = 20.0;
-/// Standard deviations of the projection, in pixels: that of the worst place that is worth a note, and the median that makes a calibration poor.
+/// Projection uncertainties in pixels: the largest one that is worth a note, and the median that makes a calibration
+/// poor.
 pub(crate) const UNCERTAIN_PX: [f64; 2] = [0.5, 1.0];
-/// Ratios of hold-out error to that of the fit that are worth a note, and that make a calibration poor.
+/// Ratios of the hold-out error to that of the fit: worth a note, and poor.
 pub(crate) const HOLDOUT_RATIO: [f64; 2] = [1.5, 4.0];
-/// Deflection as a share of the target's side that is worth a note.
-pub(crate) const BENT: f64 = 0.002;
+/// Deflection that is worth a note, as a ratio of the target's longer side.
+pub(crate) const MAX_DEFLECTION_RATIO: f64 = 0.002;
 
 impl Verdict {
     pub(crate) fn new(mut notes: Vec<CaptureNote>) -> Self {
-        notes.sort_by_key(Self::trust_by);
-        let trust = notes.iter().map(Self::trust_by).min().unwrap_or(Trust::Good);
+        notes.sort_by_key(Self::trust_of_note);
+        let trust = notes.iter().map(Self::trust_of_note).min().unwrap_or(Trust::Good);
         Self { trust, notes }
     }
 
-    fn trust_by(note: &CaptureNote) -> Trust {
+    fn trust_of_note(note: &CaptureNote) -> Trust {
         let poor = match *note {
             CaptureNote::FewViews { got, .. } => got < 5,
             CaptureNote::ParallelTargets { spread_degrees, .. } => spread_degrees < PARALLEL_DEGREES / 2.0,
@@ -165,7 +166,7 @@ mod tests {
     fn the_worst_note_decides_and_comes_first() {
         assert_eq!(Verdict::new(Vec::new()).trust, Trust::Good);
         let bent = CaptureNote::BentTarget { share: 0.01 };
-        let side = CaptureNote::EmptySide { camera: 0, side: PictureSide::Left, covered: 0.1 };
+        let side = CaptureNote::EmptySide { camera: 0, side: ImageSide::Left, covered: 0.1 };
         let few = CaptureNote::FewViews { camera: 0, got: 3, wanted: 10 };
         assert_eq!(Verdict::new(vec![bent]).trust, Trust::Good);
         assert_eq!(Verdict::new(vec![bent, side, few]), Verdict { trust: Trust::Poor, notes: vec![few, side, bent] });

@@ -4,24 +4,25 @@ use cv_core::{Camera, Matrix3};
 use cv_numeric::symmetric_eigen;
 use nalgebra::{SMatrix, SVector};
 
-/// A pinhole without skew from three homographies or more that take the target's plane to pixels (Zhang, "A flexible new technique for camera
-/// calibration", PAMI 2000, section 3.1). `None` where they determine none, as where the target is parallel to the picture in all views, or where distortion
-/// makes them contradict each other.
+/// Estimates a pinhole camera without skew from at least three homographies from the target plane to pixels (Zhang, "A
+/// flexible new technique for camera calibration", PAMI 2000, section 3.1). `None` in a degenerate configuration, such
+/// as a target parallel to the image plane in all views, or if distortion makes the homographies contradictory.
 pub(crate) fn intrinsics_from_homographies(
     homographies: &[Matrix3<f64>],
     (width, height): (usize, usize),
 ) -> Option<Camera> {
-    // In units of the picture's size from its middle, where all numbers are of order one.
+    // Normalized by the image size about its center, for numbers of order one.
     let size = width.max(height) as f64;
-    let middle = [(width as f64 - 1.0) / 2.0, (height as f64 - 1.0) / 2.0];
-    let unit = Matrix3::new(1.0 / size, 0.0, -middle[0] / size, 0.0, 1.0 / size, -middle[1] / size, 0.0, 0.0, 1.0);
+    let center = [(width as f64 - 1.0) / 2.0, (height as f64 - 1.0) / 2.0];
+    let normalization =
+        Matrix3::new(1.0 / size, 0.0, -center[0] / size, 0.0, 1.0 / size, -center[1] / size, 0.0, 0.0, 1.0);
     let mut vtv = SMatrix::<f64, 5, 5>::zeros();
     for h in homographies {
-        let h = unit * h;
-        // Columns of the target's axes, of equal and unit length together.
+        let h = normalization * h;
+        // Joint scale of the columns of the target's axes.
         let scale = (h.column(0).norm_squared() + h.column(1).norm_squared()).sqrt();
         let h = h / scale.max(f64::MIN_POSITIVE);
-        // vᵢⱼ of (B11, B22, B13, B23, B33), B12 being zero without skew.
+        // vᵢⱼ of (B11, B22, B13, B23, B33); B12 is zero without skew.
         let v = |i: usize, j: usize| {
             let (a, b) = (h.column(i), h.column(j));
             SVector::<f64, 5>::from([
@@ -47,10 +48,10 @@ pub(crate) fn intrinsics_from_homographies(
     let (cx, cy) = (-b[2] / b[0], -b[3] / b[1]);
     let lambda = b[4] - b[2] * b[2] / b[0] - b[3] * b[3] / b[1];
     let (fx, fy) = ((lambda / b[0]).sqrt(), (lambda / b[1]).sqrt());
-    // A principal point outside the picture is distortion or noise.
-    let plausible = [fx, fy].iter().all(|f| (0.05..=100.0).contains(f)) && cx.abs() < 0.5 && cy.abs() < 0.5;
-    plausible
-        .then(|| Camera::pinhole(width, height, fx * size, fy * size, cx * size + middle[0], cy * size + middle[1]))
+    // A principal point outside the image indicates distortion or noise.
+    let is_plausible = [fx, fy].iter().all(|f| (0.05..=100.0).contains(f)) && cx.abs() < 0.5 && cy.abs() < 0.5;
+    is_plausible
+        .then(|| Camera::pinhole(width, height, fx * size, fy * size, cx * size + center[0], cy * size + center[1]))
 }
 
 #[cfg(test)]
@@ -68,13 +69,14 @@ mod tests {
     }
 
     #[test]
-    fn exact_homographies_give_the_camera() {
+    fn exact_homographies_determine_the_camera() {
         let camera = Camera::pinhole(640, 480, 531.0, 533.0, 340.0, 230.0);
         let turns = [[0.3, 0.0, 0.1], [0.0, 0.4, 0.0], [-0.3, 0.2, 1.0]];
         let views: Vec<_> = turns.iter().map(|t| homography(&camera.matrix(), Vector3::from(*t)) * 3.0).collect();
-        let found = intrinsics_from_homographies(&views, (640, 480)).unwrap();
-        // Squares of numbers of order one, the eigenvector of an eigenvalue a thousandth of the largest: 1e-13 of 500 px.
-        assert!((found.matrix() - camera.matrix()).norm() < 1e-7, "{found:?}");
+        let estimated = intrinsics_from_homographies(&views, (640, 480)).unwrap();
+        // Squares of numbers of order one, the eigenvector of an eigenvalue a thousandth of the largest: 1e-13 of 500
+        // px.
+        assert!((estimated.matrix() - camera.matrix()).norm() < 1e-7, "{estimated:?}");
     }
 
     #[test]

@@ -91,7 +91,7 @@ pub(crate) fn check_size(rig: &Path, photo: &Path, size: (usize, usize), camera:
 /// The outcome, or the outcome with a failure where features lie as they cannot if the calibration is that of the photographs.
 pub(crate) fn checked(outcome: Outcome, rig: &Path, fault: Option<NoPairCause>) -> Outcome {
     match fault {
-        Some(cause @ (NoPairCause::Rows { .. } | NoPairCause::Exchanged { .. })) => {
+        Some(cause @ (NoPairCause::VerticalDisparity { .. } | NoPairCause::Exchanged { .. })) => {
             outcome.but(words::another_rig(rig, cause))
         }
         _ => outcome,

@@ -111,7 +111,10 @@ pub(crate) fn no_dense_cloud(error: &DenseError, photos: [&Path; 2]) -> Failure 
 /// Why there is no depth; with a rig, the pair is as its calibration says.
 pub(crate) fn no_depth(error: DepthError, by_rig: bool) -> Failure {
     let advice = match (&error, by_rig) {
-        (DepthError::NoPair { cause: NoPairCause::Rows { .. } | NoPairCause::Exchanged { .. }, .. }, true)
+        (
+            DepthError::NoPair { cause: NoPairCause::VerticalDisparity { .. } | NoPairCause::Exchanged { .. }, .. },
+            true,
+        )
         | (DepthError::NoRange(_), true) => CHECK_CALIBRATION.to_owned(),
         _ => words(error.advice()),
     };
@@ -225,7 +228,8 @@ mod tests {
 
     #[test]
     fn with_a_rig_it_is_the_calibration_that_is_doubted() {
-        let error = || DepthError::NoPair { matched: 0.1, needed: 0.18, cause: NoPairCause::Rows { apart: 9.0 } };
+        let error =
+            || DepthError::NoPair { matched: 0.1, needed: 0.18, cause: NoPairCause::VerticalDisparity { px: 9.0 } };
         assert!(no_depth(error(), true).text().contains("calibration"));
         assert!(no_depth(error(), false).text().contains("--rig, or `cv rectify`"));
     }

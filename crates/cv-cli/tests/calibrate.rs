@@ -16,7 +16,7 @@ fn what_is_no_board_is_said_to_be_none_and_nothing_is_written() {
         cv_io::write_png(folder.path().join(name), gray.view()).unwrap();
     }
     let mono = refused(folder.path(), &["calibrate", "mono", "a1.png", "a2.png", "-o", "out/cam.yaml"]);
-    assert!(mono.stderr.contains("no board was found on any of 2 photographs"), "{}", mono.stderr);
+    assert!(mono.stderr.contains("no board was detected on any of 2 photographs"), "{}", mono.stderr);
     let stereo = ["calibrate", "stereo", "--left", "a1.png", "a2.png", "--right", "b1.png", "-o", "out/rig.yaml"];
     assert!(refused(folder.path(), &stereo).stderr.contains("no board"));
     assert!(!folder.path().join("out").exists());

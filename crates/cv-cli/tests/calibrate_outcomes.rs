@@ -63,13 +63,13 @@ fn mirrored_boards_two_at_once_and_the_dark_are_told_apart() {
     // A lens cap with a little light: white is at 4 of 255.
     let dark = photo.map(|[v]| [v / 60]);
     let said = said_of(folder.path(), &dark, &BOARD);
-    assert!(said.contains("no board was found on any of 3 photographs"), "{said}");
+    assert!(said.contains("no board was detected on any of 3 photographs"), "{said}");
     let said = said_of(
         folder.path(),
         &sheet(folder.path(), &["--board", "9x6", "--square", "20"]).map(|[v]| [v / 60]),
         &["--board", "9x6"],
     );
-    assert!(said.contains("no board was found on any of 3 photographs"), "{said}");
+    assert!(said.contains("no board was detected on any of 3 photographs"), "{said}");
 }
 
 #[test]

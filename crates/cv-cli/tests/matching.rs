@@ -127,7 +127,7 @@ fn photographs_of_different_things_have_no_model() {
     for model in ["homography", "fundamental"] {
         let ran = refused(folder.path(), &["match", "a.jpg", "other.jpg", "-o", "guided.txt", "--guided", model]);
         assert!(
-            ran.stderr.contains("no model to be guided by") && !folder.path().join("guided.txt").exists(),
+            ran.stderr.contains("no model for guided matching") && !folder.path().join("guided.txt").exists(),
             "{ran:?}"
         );
         fs::rename(folder.path().join("m.txt"), folder.path().join("right.txt")).unwrap();

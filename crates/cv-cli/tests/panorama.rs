@@ -5,7 +5,7 @@
 mod support;
 
 use cv_core::{Camera, RgbU8, Vector3};
-use cv_synth::{Vista, VistaOptions, vista_level, vista_photos};
+use cv_synth::{Vista, VistaOptions, vista_photos, vista_response};
 use std::f64::consts::PI;
 use std::path::Path;
 use support::{done, fixture, json, refused, run, strs};
@@ -131,7 +131,7 @@ fn landscape(folder: &Path, views: usize, exposure: f32) -> (Vista, Vec<String>)
 
 /// What a camera without faults stores of the light of a direction.
 fn level(vista: &Vista, ray: &Vector3<f64>) -> [f64; 3] {
-    vista.radiance(ray).map(|light| 255.0 * f64::from(vista_level(light, 0.0)))
+    vista.radiance(ray).map(|light| 255.0 * f64::from(vista_response(light, 0.0)))
 }
 
 /// The direction at a longitude to the right and a latitude above the horizon.

@@ -217,7 +217,7 @@ fn what_makes_no_model_is_refused_with_its_reason() {
     // Two of different places.
     photographs(&at("two"), "a", &scene, &walk[..1]);
     photographs(&at("two"), "b", &Scene::street(1, 4, 0), &Scene::street_walk(4, 3)[1..2]);
-    assert!(call("two").contains("of 2 photographs no two show enough of the same"));
+    assert!(call("two").contains("no two of 2 photographs have enough overlap"));
     // A camera that only turned.
     let first = scene.viewpoint();
     let turned = |i: usize| {

@@ -1,4 +1,4 @@
-//! Depth of a rectified pair: disparities, depths, and the points in space.
+//! Depth of a rectified pair: disparities, depths, and points.
 
 use cv_core::Camera;
 use cv_pipeline::stereo::{StereoGeometry, StereoOptions};

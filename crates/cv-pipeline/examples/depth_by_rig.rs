@@ -1,4 +1,4 @@
-//! Depth from the photographs of a calibrated rig, which are rectified first. The disparities to try come from feature matches.
+//! Depth from images of a calibrated rig, with rectification. Feature matches determine the range of disparities.
 
 use cv_core::{Camera, Pose, Rotation3, StereoRig, Vector3};
 use cv_pipeline::stereo::{Rectification, RectifyOptions};
@@ -6,9 +6,9 @@ use cv_pipeline::{DepthOptions, DisparityRange, Silent, depth_by_rig};
 use cv_synth::{RenderOptions, Scene, render};
 
 pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
-    // The right camera stands 20 cm to the right and is turned by a degree or two.
-    let turned = Rotation3::from_euler_angles(0.02, -0.03, 0.015);
-    let right_from_left = Pose::new(turned, Vector3::new(-0.2, 0.01, 0.004));
+    // The right camera is 20 cm to the right and rotated by a degree or two.
+    let rotation = Rotation3::from_euler_angles(0.02, -0.03, 0.015);
+    let right_from_left = Pose::new(rotation, Vector3::new(-0.2, 0.01, 0.004));
     let (scene, camera) = (Scene::room(2), Camera::from_focal(320, 240, 260.0));
     let pose = scene.viewpoint();
     let left = render(&scene, &camera, &pose, &RenderOptions::default())?.image;

@@ -5,7 +5,7 @@ use cv_pipeline::{PanoramaOptions, PanoramaPhoto, Silent, panorama};
 use cv_synth::{PanoramaSetOptions, RenderOptions, panorama_views};
 
 pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
-    // Three photographs of a room, taken by turning on the spot.
+    // Three photographs of a room by a rotating camera.
     let (camera, walk) =
         (Camera::from_focal(320, 240, 300.0), PanoramaSetOptions { views: 3, ..PanoramaSetOptions::default() });
     let set = panorama_views(2, &camera, &walk, &RenderOptions::default())?;

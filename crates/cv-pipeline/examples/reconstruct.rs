@@ -1,4 +1,4 @@
-//! Points and the motion of the camera from two photographs, and the model as COLMAP reads it.
+//! Relative pose and points from two images, and the model in COLMAP's form.
 
 use cv_core::Camera;
 use cv_pipeline::{Intrinsics, ReconstructOptions, Silent, reconstruct};
@@ -13,8 +13,8 @@ pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
         .map_err(|error| format!("{error}; {:?}", error.advice()))?;
 
     println!("{} points, {:.2} px RMS", result.scene.points.len(), result.scene.reprojection_rms);
-    println!("turned by {:.2} degrees", result.scene.pose.rotation_angle().to_degrees());
+    println!("rotated by {:.2} degrees", result.scene.pose.rotation_angle().to_degrees());
     let model = result.model(["a.png".to_owned(), "b.png".to_owned()]);
-    println!("{} cameras, {} pictures", model.cameras.len(), model.images.len());
+    println!("{} cameras, {} images", model.cameras.len(), model.images.len());
     Ok(())
 }

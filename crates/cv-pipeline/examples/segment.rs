@@ -1,4 +1,4 @@
-//! An object by its color: learned from photographs with masks, found in others, and scored.
+//! Color segmentation of an object: training on images with masks, segmentation of others, and scores.
 
 use cv_core::Camera;
 use cv_pipeline::segmentation::{ConfusionMatrix, Labeled, TrainOptions};

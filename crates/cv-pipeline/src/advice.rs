@@ -1,99 +1,100 @@
-//! What can be done about a job that failed.
+//! Advice on failed jobs.
 
 use crate::{DenseError, DepthError, MatchingError, NoPairCause, RangeError, ReconstructError};
 use cv_geometry::TwoViewError;
 use cv_stereo::{RectifyError, StereoError};
 
-/// What a person can do about a job that failed, with the numbers to do it by. A program words it and names its own options.
+/// What a person can do about a failed job, with the numbers to do it by. A program words it and names its own options.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Advice {
     /// Sharper photographs, with more texture.
     SharperPhotographs,
-    /// Photographs that share more of the scene, from places nearer to each other.
+    /// Photographs with more overlap, from viewpoints closer to each other.
     ShareMore,
-    /// Two photographs of the same things, with texture on them.
+    /// Two photographs of the same scene, with texture.
     SameScene,
-    /// Photographs nearer to each other, of things with texture that stand still.
+    /// Photographs from closer viewpoints, of a static scene with texture.
     NearerAndStill,
     /// Larger photographs.
     LargerPhotographs,
-    /// Stepping aside between the photographs; those from one place make a panorama.
+    /// A baseline: stepping aside between the photographs. A pure rotation makes a panorama.
     StepAside,
-    /// Stepping aside, and things in front of the plane or behind it; a known focal length tells a plane from a turn.
+    /// A baseline, and a scene that is not planar; with a known focal length, a plane can be told from a rotation.
     StepAsideOrGiveFocal,
-    /// Stepping aside rather than ahead.
+    /// Stepping aside rather than moving along the optical axis.
     StepAsideNotAhead,
-    /// Things in front of the plane or behind it.
+    /// A scene that is not planar.
     LeaveThePlane,
-    /// Features of one kind for both photographs.
+    /// The same feature method for both photographs.
     SameFeatures,
-    /// Photographs taken farther apart.
+    /// A longer baseline.
     FartherApart,
-    /// Things near and far all over the photographs, or more features.
+    /// Objects at different depths all over the photographs, or more features.
     MoreDepthOrFeatures,
-    /// The focal length, in pixels of the photograph, is rather this.
+    /// A better value of the focal length, in pixels of the photograph.
     FocalBetter {
         /// In pixels.
         px: f64,
     },
-    /// The focal length is to be left out, or given in pixels.
+    /// Leave the focal length out, or give it in pixels.
     LeaveOutFocal,
-    /// The camera is not that of the photographs.
+    /// Check the camera: it is not that of the photographs.
     CheckCamera,
-    /// The matches are to be looked at.
+    /// Inspect the matches.
     CheckMatches,
-    /// The pair is to be rectified.
+    /// Rectify the pair.
     Rectify,
-    /// Left and right are to be exchanged; if they are in order, smaller disparities are to be tried.
+    /// Exchange left and right; if they are in order, try smaller disparities.
     Exchange {
-        /// Smallest disparity that features show, in px.
+        /// Smallest disparity of the feature matches, in px.
         min_disparity: i32,
     },
-    /// Other disparities are to be tried.
+    /// Try another range of disparities.
     TryDisparities {
-        /// Smallest that features show, in px.
+        /// Smallest disparity of the feature matches, in px.
         min: i32,
-        /// How many.
+        /// Number of disparities.
         count: usize,
     },
-    /// Other depths are to be kept.
+    /// Keep another range of depths.
     KeepDepths {
-        /// The nearest there is, in the unit of the baseline.
+        /// The nearest depth found, in the unit of the baseline.
         near: f32,
-        /// The farthest there is.
+        /// The farthest depth found.
         far: f32,
     },
-    /// The principal points are not those of the photographs.
+    /// Check the principal points: they are not those of the photographs.
     CheckOffset,
-    /// The number of disparities is to be given, or the pair to be rectified.
+    /// Give the number of disparities, or rectify the pair.
     GiveDisparities,
-    /// A larger matching window, or more light.
+    /// A larger matching window, or a brighter scene.
     LargerWindow,
     /// More memory, or less to match.
     MoreMemory {
-        /// Bytes needed at the least.
+        /// Bytes that are needed at least.
         needed: usize,
     },
-    /// Photographs reduced less before matching.
+    /// Reduce the photographs less before matching.
     ReduceLess,
     /// An option is out of its range.
     CheckOptions,
-    /// It was stopped.
+    /// The job was stopped.
     RunAgain,
 }
 
 impl ReconstructError {
-    /// What a person can do about it.
+    /// Returns the advice on this error.
     pub fn advice(&self) -> Advice {
         match self {
             Self::Matching(error) => error.advice(),
-            Self::TwoView(error) => two_view(error),
+            Self::TwoView(error) => two_view_advice(error),
             Self::Cancelled(_) => Advice::RunAgain,
         }
     }
 }
 
-fn two_view(error: &TwoViewError) -> Advice {
+/// Returns the advice on an error of two-view reconstruction.
+fn two_view_advice(error: &TwoViewError) -> Advice {
     match error {
         TwoViewError::Camera { .. } | TwoViewError::CameraSize { .. } => Advice::CheckCamera,
         TwoViewError::TooFewMatches { .. } | TwoViewError::TooFewInliers { .. } => Advice::ShareMore,
@@ -110,20 +111,20 @@ fn two_view(error: &TwoViewError) -> Advice {
 }
 
 impl MatchingError {
-    /// What a person can do about it.
+    /// Returns the advice on this error.
     pub fn advice(&self) -> Advice {
         match self {
             Self::Cancelled(_) => Advice::RunAgain,
             Self::NoModel { .. } => Advice::SameScene,
             Self::Features { .. } | Self::NoFeatures { .. } => Advice::SharperPhotographs,
-            // Features of two kinds, from elsewhere.
+            // Features of different kinds, from elsewhere.
             Self::Match(_) => Advice::SameFeatures,
         }
     }
 }
 
 impl DenseError {
-    /// What a person can do about it.
+    /// Returns the advice on this error.
     pub fn advice(&self) -> Advice {
         match self {
             Self::Rectify(RectifyError::TooFarTurned { .. }) => Advice::StepAsideNotAhead,
@@ -138,7 +139,7 @@ impl DenseError {
 }
 
 impl DepthError {
-    /// What a person can do about it.
+    /// Returns the advice on this error.
     pub fn advice(&self) -> Advice {
         match self {
             Self::NoPair { cause, .. } => cause.advice(),
@@ -155,11 +156,11 @@ impl DepthError {
 }
 
 impl NoPairCause {
-    /// What a person can do about it.
+    /// Returns the advice on this error.
     pub fn advice(&self) -> Advice {
         match self {
             Self::Unrelated { .. } => Advice::SameScene,
-            Self::Rows { .. } => Advice::Rectify,
+            Self::VerticalDisparity { .. } => Advice::Rectify,
             Self::Exchanged { range: (low, _) } => Advice::Exchange { min_disparity: *low },
             Self::Range { range: (low, high) } => {
                 Advice::TryDisparities { min: *low, count: (i64::from(*high) - i64::from(*low) + 1).max(1) as usize }
@@ -170,7 +171,7 @@ impl NoPairCause {
 }
 
 impl RangeError {
-    /// What a person can do about it.
+    /// Returns the advice on this error.
     pub fn advice(&self) -> Advice {
         match self {
             Self::Cancelled(_) => Advice::RunAgain,

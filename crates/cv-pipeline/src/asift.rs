@@ -1,4 +1,5 @@
-//! ASIFT (Morel & Yu 2009): more matches for photographs taken from very different directions, by SIFT features of affine-simulated views.
+//! ASIFT (Morel & Yu, "ASIFT: a new framework for fully affine invariant image comparison", 2009): SIFT features of
+//! simulated affine views, for photographs from very different viewpoints.
 
 use crate::matching::{MatchingOptions, match_features};
 use cv_core::{Cancelled, DMatch, GrayF32, Progress, Stage};
@@ -6,26 +7,27 @@ use cv_features::{FeatureError, Features, MatchError, SiftOptions, sift_affine_v
 use cv_imgproc::resize_area;
 use std::f32::consts::PI;
 
-/// Tilts that are simulated: with the √2 that SIFT itself bears on either side of each, up to a slant of 80°.
+/// Simulated tilts: with the √2 that SIFT tolerates on either side, up to a latitude of 80°.
 const TILTS: [f32; 2] = [2.0, 4.0];
-/// Rotations are 72°/tilt apart (Morel & Yu).
-const STEP: f32 = 0.4 * PI;
-/// Two matches whose ends are nearer than this are the same, in pixels.
-const SAME: f32 = 2.0;
+/// Rotation step in radians, for a tilt of 1: 72°/tilt (Morel & Yu).
+const ROTATION_STEP: f32 = 0.4 * PI;
+/// Distance in pixels below which two matches are duplicates.
+const DUPLICATE_RADIUS_PX: f32 = 2.0;
 
-/// Photographs whose longer side is at least this many pixels are looked at reduced first.
-const LARGE: usize = 900;
-/// By how much they are reduced then, and how many of the views are looked at in full after that (Morel & Yu, section 7: 3 and 5).
+/// Longer image side in pixels from which on views are selected at reduced resolution first.
+const TWO_RESOLUTION_MIN_SIDE: usize = 900;
+/// Reduction factor of the selection (Morel & Yu, section 7).
 const REDUCTION: usize = 3;
-const FULL_VIEWS: usize = 5;
+/// Number of views selected for full resolution (Morel & Yu, section 7).
+const FULL_RESOLUTION_VIEWS: usize = 5;
 
-/// A simulated view: of which photograph, its tilt and its rotation.
-type View = (usize, f32, f32);
+/// A simulated view: the index of its image, its tilt and its rotation.
+type AffineView = (usize, f32, f32);
 
-/// Matches the simulated views of each photograph with the other as it is. The features that match are added to the photographs' own, and the matches to
-/// `matches`, unless they are there already or the other photograph's feature has a match at a smaller distance.
+/// Matches the simulated views of each image with the other image. Adds the features that match to `features` and the
+/// matches to `matches`, unless they are duplicates or the other image's feature has a match of a smaller distance.
 ///
-/// Of large photographs only the views that match best at a third of the size are looked at.
+/// For large images only the views that match best at reduced resolution are processed.
 pub(crate) fn match_asift(
     photos: [&GrayF32; 2],
     sift: &SiftOptions,
@@ -34,23 +36,26 @@ pub(crate) fn match_asift(
     options: &MatchingOptions,
     progress: &dyn Progress,
 ) -> Result<(), Cancelled> {
-    let views = promising(photos, sift, options, progress)?;
+    let views = select_views(photos, sift, options, progress)?;
     let stage = Stage::new(progress, "slanted views", views.len())?;
     let plain = features.clone();
     for (side, tilt, rotation) in views {
-        if let Some((view, more)) = matched(photos[side], &plain[1 - side], (tilt, rotation), sift, options, &stage)? {
-            for m in more {
-                // Each looks at all there are.
+        if let Some((view, view_matches)) =
+            match_view(photos[side], &plain[1 - side], (tilt, rotation), sift, options, &stage)?
+        {
+            for m in view_matches {
                 stage.check()?;
-                let new = view.keypoints[m.query as usize].position;
-                let old = plain[1 - side].keypoints[m.train as usize].position;
-                let known = matches.iter().any(|n| {
-                    let at = |side: usize, i: u32| features[side].keypoints[i as usize].position;
-                    let ends = [at(0, n.query), at(1, n.train)];
-                    (ends[side] - new).norm() < SAME && (ends[1 - side] - old).norm() < SAME
+                let position = view.keypoints[m.query as usize].position;
+                let other_position = plain[1 - side].keypoints[m.train as usize].position;
+                let is_duplicate = matches.iter().any(|n| {
+                    let position_of = |side: usize, i: u32| features[side].keypoints[i as usize].position;
+                    let ends = [position_of(0, n.query), position_of(1, n.train)];
+                    (ends[side] - position).norm() < DUPLICATE_RADIUS_PX
+                        && (ends[1 - side] - other_position).norm() < DUPLICATE_RADIUS_PX
                 });
-                let taken = matches.iter().any(|n| [n.query, n.train][1 - side] == m.train && n.distance <= m.distance);
-                if known || taken {
+                let has_better =
+                    matches.iter().any(|n| [n.query, n.train][1 - side] == m.train && n.distance <= m.distance);
+                if is_duplicate || has_better {
                     continue;
                 }
                 let Some(added) = features[side].add(&view, m.query as usize) else { continue };
@@ -63,22 +68,23 @@ pub(crate) fn match_asift(
     Ok(())
 }
 
-/// The views to look at in full, in their order: all of small photographs, of large ones those with the most matches when both are reduced.
-fn promising(
+/// Returns the views to process at full resolution, in order: all views of small images, for large ones those with most
+/// matches at reduced resolution.
+fn select_views(
     photos: [&GrayF32; 2],
     sift: &SiftOptions,
     options: &MatchingOptions,
     progress: &dyn Progress,
-) -> Result<Vec<View>, Cancelled> {
+) -> Result<Vec<AffineView>, Cancelled> {
     let rotations = |tilt: f32| {
-        let count = (PI / (STEP / tilt)).round() as usize;
+        let count = (PI / (ROTATION_STEP / tilt)).round() as usize;
         (0..count).map(move |i| (tilt, i as f32 * PI / count as f32))
     };
-    let all: Vec<View> = [0, 1]
+    let all: Vec<AffineView> = [0, 1]
         .into_iter()
         .flat_map(|side| TILTS.into_iter().flat_map(rotations).map(move |(t, r)| (side, t, r)))
         .collect();
-    if photos.iter().all(|photo| photo.width().max(photo.height()) < LARGE) {
+    if photos.iter().all(|photo| photo.width().max(photo.height()) < TWO_RESOLUTION_MIN_SIDE) {
         return Ok(all);
     }
     let reduced = photos.map(|photo| {
@@ -92,21 +98,21 @@ fn promising(
     let [Some(a), Some(b)] = [extract(&reduced[0])?, extract(&reduced[1])?] else { return Ok(all) };
     let plain = [a, b];
     let stage = Stage::new(progress, "slanted views", all.len())?;
-    let mut counted = Vec::with_capacity(all.len());
+    let mut match_counts = Vec::with_capacity(all.len());
     for &(side, tilt, rotation) in &all {
-        let found = matched(&reduced[side], &plain[1 - side], (tilt, rotation), sift, options, &stage)?;
-        counted.push(found.map_or(0, |(_, matches)| matches.len()));
+        let matched = match_view(&reduced[side], &plain[1 - side], (tilt, rotation), sift, options, &stage)?;
+        match_counts.push(matched.map_or(0, |(_, matches)| matches.len()));
         stage.add(1)?;
     }
     let mut best: Vec<usize> = (0..all.len()).collect();
-    best.sort_by_key(|&i| std::cmp::Reverse(counted[i]));
-    best.truncate(FULL_VIEWS);
+    best.sort_by_key(|&i| std::cmp::Reverse(match_counts[i]));
+    best.truncate(FULL_RESOLUTION_VIEWS);
     best.sort_unstable();
     Ok(best.into_iter().map(|i| all[i]).collect())
 }
 
-/// The features of a view and their matches in the other photograph; `None` for a view that is too small to look at, and has nothing to add.
-fn matched(
+/// Returns the features of a view and their matches in the other image; `None` for a view that is too small.
+fn match_view(
     photo: &GrayF32,
     other: &Features,
     (tilt, rotation): (f32, f32),
@@ -119,7 +125,8 @@ fn matched(
         Err(_) => return Ok(None),
         Ok(view) => view,
     };
-    // The view asks, the whole photograph answers: among the few features of a view, the second best would be far too often.
+    // The view's features are the queries: in the ratio test, the second nearest neighbor among the few features of a
+    // view would be too far.
     match match_features(&view, other, options, progress) {
         Err(MatchError::Cancelled(stop)) => Err(stop),
         found => Ok(found.ok().map(|matches| (view, matches))),
@@ -131,15 +138,15 @@ mod tests {
     use crate::{AffineSimulation, MatchingOptions, Silent, match_photos};
     use cv_core::RgbU8;
 
-    /// A large plane seen from the front and under a slant of 75°: which views to look at in full is found on the reduced photographs.
+    /// A large plane, frontal and at a slant of 75°: the views are selected at reduced resolution.
     #[test]
-    fn a_large_plane_under_a_slant_matches_where_it_should() {
+    fn a_large_slanted_plane_has_correct_matches() {
         let mut state = 5u32;
         let mut random = || {
             state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
             (state >> 8) as f32 / (1 << 24) as f32
         };
-        // Wide enough for a plane that is compressed four times to keep them.
+        // Large enough to survive a compression by four.
         let spots: Vec<[f32; 4]> =
             (0..500).map(|_| [960.0 * random(), 540.0 * random(), 6.0 + 8.0 * random(), random() - 0.5]).collect();
         let plane = |x: f32, y: f32| {
@@ -149,15 +156,15 @@ mod tests {
         };
         let front = RgbU8::from_fn(960, 540, |x, y| plane(x as f32, y as f32));
         let slanted = RgbU8::from_fn(240, 540, |x, y| plane(4.0 * x as f32, y as f32));
-        let right = |affine_simulation| {
+        let correct_and_all = |affine_simulation| {
             let options = MatchingOptions { affine_simulation, ..MatchingOptions::default() };
             let pairs = match_photos(front.view(), slanted.view(), &options, &Silent).unwrap().pairs();
-            // Two pixels of either photograph: that is how near two features count as one.
+            // Two pixels in either image: the duplicate radius.
             let holds = |p: &&cv_core::Correspondence| (p.a.x - 4.0 * p.b.x).abs() < 8.0 && (p.a.y - p.b.y).abs() < 2.0;
             (pairs.iter().filter(holds).count(), pairs.len())
         };
-        let (plain, with) = (right(AffineSimulation::Never), right(AffineSimulation::Always));
-        // A hundred of the 500 spots, and nearly all of what is found in its place.
+        let (plain, with) = (correct_and_all(AffineSimulation::Never), correct_and_all(AffineSimulation::Always));
+        // A hundred of the 500 blobs, with nearly all matches correct.
         assert!(with.0 >= 100 && 10 * with.0 >= 9 * with.1, "{with:?}, plain {plain:?}");
         assert!(with.0 > 3 * plain.0, "{with:?}, plain {plain:?}");
     }

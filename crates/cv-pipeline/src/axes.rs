@@ -1,8 +1,8 @@
-//! Which way the axes of a cloud point.
+//! Axis conventions of point clouds.
 
 use cv_core::PointCloud;
 
-/// Which way the axes of a cloud point. Ours are those of OpenCV.
+/// Axis convention of a point cloud. Ours is that of OpenCV.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Axes {
     /// X right, Y down, Z forward.
@@ -18,7 +18,7 @@ cv_core::named!(Axes {
 });
 
 impl Axes {
-    /// Brings a cloud from our axes to these.
+    /// Converts a cloud from our convention to this one.
     pub fn turn(self, cloud: &mut PointCloud) {
         if self == Self::Opengl {
             cloud.positions.iter_mut().chain(&mut cloud.normals).for_each(|p| *p = [p[0], -p[1], -p[2]]);
@@ -31,7 +31,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_below_and_ahead_is_below_and_ahead_in_opengl_too() {
+    fn opengl_flips_y_and_z() {
         let mut cloud =
             PointCloud { normals: vec![[0.0, 0.0, -1.0]], ..PointCloud::from_positions(vec![[1.0, 2.0, 3.0]]) };
         Axes::Opencv.turn(&mut cloud);

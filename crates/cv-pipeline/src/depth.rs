@@ -1,7 +1,7 @@
-//! Depth from a rectified pair.
+//! Disparity and depth of a rectified pair.
 
-use crate::disparity_range::{is_exchanged, matches_of, range_from};
-use crate::no_pair::{FeatureAgreement, FewMatches, NoPairCause, cause};
+use crate::disparity_range::{is_exchanged, match_pair, range_from_matches};
+use crate::no_pair::{FeatureAgreement, FewMatches, NoPairCause, diagnose};
 use crate::vertical_offset::{Alignment, VerticalOffset};
 use crate::{Progress, RangeError};
 use cv_core::{Cancelled, GrayF32, Image, ImageView, PointCloud, RgbU8, StageClock};
@@ -11,7 +11,7 @@ use cv_stereo::{
     StereoOptions,
 };
 
-/// Which disparities are tried.
+/// How the range of disparities is chosen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
@@ -19,7 +19,8 @@ pub enum DisparityRange {
     /// Those of [`StereoOptions::min_disparity`] and [`StereoOptions::disparities`].
     #[default]
     Given,
-    /// Those that feature matches show ([`disparity_range`](crate::disparity_range())), from `min` px up where it is given.
+    /// The range of feature matches ([`disparity_range`](crate::disparity_range())), from `min` px up where it is
+    /// given.
     FromMatches {
         /// Smallest disparity, in px.
         min: Option<i32>,
@@ -33,15 +34,16 @@ pub enum DisparityRange {
 pub struct DepthOptions {
     /// Settings of the matcher.
     pub stereo: StereoOptions,
-    /// Which disparities are tried. Default those of `stereo`.
+    /// The range of disparities. Default that of `stereo`.
     pub disparities: DisparityRange,
-    /// Nearest and farthest depth kept, in the unit of the baseline. Default 0 to infinity: all. (As data, a farthest depth of `null` is
-    /// infinity, which JSON does not know.)
+    /// Nearest and farthest depth kept, in the unit of the baseline. Default 0 to infinity: all. (In serialized form, a
+    /// farthest depth of `null` is infinity.)
     #[cfg_attr(feature = "serde", serde(with = "open_range"))]
     pub range: (f32, f32),
-    /// What becomes of a pair of which hardly anything is matched. Default [`FewMatches::Check`].
+    /// Policy for a pair with few matches. Default [`FewMatches::Check`].
     pub few_matches: FewMatches,
-    /// Whether rows that lie a third of a pixel to 8 px apart, by the pair's matches or features, are aligned; of a film, by the first frame that tells. Default true.
+    /// Whether a vertical disparity of a third of a pixel to 8 px, estimated from the pair's matches or features, is
+    /// corrected; for a film it is estimated on the first frame that determines it. Default true.
     pub align: bool,
 }
 
@@ -57,7 +59,7 @@ impl Default for DepthOptions {
     }
 }
 
-/// A range whose upper end may be infinite, which is written as none.
+/// Serialization of a range whose upper end may be infinite, as `null`.
 #[cfg(feature = "serde")]
 mod open_range {
     use serde::{Deserialize, Deserializer, Serialize, Serializer};
@@ -72,45 +74,47 @@ mod open_range {
     }
 }
 
-/// What [`depth`] found.
+/// Result of [`depth`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct DepthResult {
-    /// Disparities of the left image, and where each comes from.
+    /// Disparities of the left image with the state of each pixel.
     pub map: DisparityMap,
     /// Depth of the left image in the unit of the baseline, NaN where unknown; `None` without a geometry.
     pub depth: Option<GrayF32>,
-    /// How sure each disparity is, 0 to 1, 0 where filled; `None` without [`StereoOptions::confidence`].
+    /// Confidence of each disparity, 0 to 1, 0 where filled; `None` without [`StereoOptions::confidence`].
     pub confidence: Option<GrayF32>,
     /// Standard deviation of each disparity in px, NaN where filled.
     pub sigma: GrayF32,
-    /// Smallest disparity tried, in px, and how many.
+    /// Smallest disparity searched, in px, and number of disparities.
     pub disparities: (i32, usize),
-    /// What made depth of disparity; `None` where it was not given.
+    /// The geometry that converts disparity to depth; `None` where it was not given.
     pub geometry: Option<StereoGeometry>,
-    /// Where fewer pixels were matched than nearly all rectified pairs show: what features say of them. `None` where there were enough.
-    pub few: Option<FeatureAgreement>,
-    /// How far apart the rows of the pair were, which were aligned; `None` where they were not, and where they were less than a third of a pixel apart.
+    /// Agreement of feature matches with a map of few matched pixels; `None` where enough are matched.
+    pub feature_agreement: Option<FeatureAgreement>,
+    /// The vertical disparity that was corrected; `None` where it was below a third of a pixel, or not estimated.
     pub vertical_offset: Option<VerticalOffset>,
     /// Stage names and their seconds. `match` is the matcher from the gray images to checked disparities; `prepare` is
-    /// the memory it asks for beforehand.
+    /// its memory allocation.
     pub stages: Vec<(&'static str, f64)>,
 }
 
 impl DepthResult {
-    /// Whether fewer than half of the pixels were matched and most of the others filled in from around: of generated pairs like that, two to three of
-    /// ten filled pixels are off by more than 2 px, of others at most one or two (`tests/filled.rs`).
+    /// Returns whether fewer than half of the pixels are matched and most of the others are filled. On generated pairs
+    /// of this kind, two to three of ten filled pixels are off by more than 2 px, on others at most one or two
+    /// (`tests/filled.rs`).
     pub fn is_mostly_filled(&self) -> bool {
         let matched = self.map.matched_fraction();
         matched < 0.5 && self.map.valid_fraction() - matched > 0.5 * (1.0 - matched)
     }
 
-    /// The pixels with a depth as points in the frame of the (rectified) left camera, with the colors of its photograph; `None` without a
+    /// Returns the points in the frame of the (rectified) left camera, with the colors of its image; `None` without a
     /// geometry.
     pub fn cloud(&self, left: ImageView<'_, u8, 3>) -> Option<PointCloud> {
         Some(self.geometry?.cloud(self.depth.as_ref()?.view(), left))
     }
 
-    /// Standard deviation of each depth in the unit of the baseline, to first order, NaN where filled or unknown; `None` without a geometry.
+    /// Returns the standard deviation of each depth in the unit of the baseline, to first order, NaN where filled or
+    /// unknown; `None` without a geometry.
     pub fn depth_sigma(&self) -> Option<GrayF32> {
         let (geometry, depth) = (self.geometry?, self.depth.as_ref()?);
         Some(GrayF32::from_fn(depth.width(), depth.height(), |x, y| {
@@ -126,45 +130,45 @@ pub enum DepthError {
     /// The pair cannot be matched.
     #[error(transparent)]
     Stereo(StereoError),
-    /// The geometry is none.
+    /// The geometry is not valid.
     #[error(transparent)]
     Geometry(#[from] GeometryError),
-    /// Hardly any pixel of one photograph has a partner in the other.
+    /// Too few pixels are matched.
     #[error(
-        "only {:.1} % of the pixels were matched and confirmed, fewer than the {:.0} % that a rectified pair shows at the least; {cause}",
+        "only {:.1} % of the pixels were matched and confirmed, at least {:.0} % are expected of a rectified pair; {cause}",
         100.0 * .matched, 100.0 * .needed
     )]
     NoPair {
-        /// Share of the pixels that were matched and confirmed.
+        /// Fraction of the pixels that were matched and confirmed.
         matched: f64,
-        /// The least that counts.
+        /// The minimum fraction.
         needed: f64,
-        /// What features show.
+        /// The cause, as far as feature matches show it.
         cause: NoPairCause,
     },
-    /// Features do not tell which disparities to try.
+    /// Feature matches do not determine the range of disparities.
     #[error("the range of disparities is unknown: {0}")]
     NoRange(#[source] RangeError),
-    /// The photographs cannot be rectified.
+    /// The images cannot be rectified.
     #[error(transparent)]
     Rectify(RectifyError),
-    /// No disparity has a depth that is kept.
+    /// No depth is within the range to keep.
     #[error("no disparity has a depth from {} to {}: {}", .kept.0, .kept.1, match .found {
-        Some((near, far)) => format!("those there are lie between {near} and {far}"),
-        None => "none is in front of the cameras".to_owned(),
+        Some((near, far)) => format!("all depths are between {near} and {far}"),
+        None => "no disparity is in front of the cameras".to_owned(),
     })]
     NoDepth {
-        /// Nearest and farthest depth kept, in the unit of the baseline.
+        /// Range of depths to keep, in the unit of the baseline.
         kept: (f32, f32),
-        /// Nearest and farthest depth there is; `None` where no disparity, with the offset of the principal points, is above zero.
+        /// Range of the depths found; `None` where no disparity, with the offset of the principal points, is positive.
         found: Option<(f32, f32)>,
     },
-    /// The range of depths is empty.
+    /// The range of depths to keep is empty.
     #[error("the depth range {near} to {far} is empty")]
     Range {
-        /// Nearest depth kept.
+        /// Nearest depth to keep.
         near: f32,
-        /// Farthest depth kept.
+        /// Farthest depth to keep.
         far: f32,
     },
     /// The job was stopped by its progress callback.
@@ -199,46 +203,47 @@ impl From<RectifyError> for DepthError {
     }
 }
 
-/// Share of the pixels that must be matched and confirmed. Of 56 generated pairs of four kinds (seeds 400 and 401: far things,
-/// three and six times the usual distance of the cameras, much noise, little light, blur) every one has 20 % or more, the least
-/// where half of the photograph is not in the other. Photographs of different things, in 1792 pairings with 16 to 256 disparities,
-/// reach at most 15 %, and at most that exchanged ones whose disparities are not all within a few pixels of zero.
-pub(crate) const LEAST_MATCHED: f64 = 0.18;
+/// Minimum fraction of matched and confirmed pixels. Of 56 generated pairs (distant scenes, three and six times the
+/// usual baseline, noise, underexposure, blur) all have at least 20 %, the least with an overlap of half. Unrelated
+/// images, in 1792 pairings with 16 to 256 disparities, reach at most 15 %, as do exchanged ones whose disparities are
+/// not within a few pixels of zero.
+pub(crate) const MIN_MATCHED_FRACTION: f64 = 0.18;
 
-/// Refuses a map of `left` and `right` that has hardly any matches and of which features say why, unless it is to be kept: what was filled in would be made up. What they say of a map that is kept with few matches.
+/// Rejects a map with too few matched pixels, unless the policy keeps it: filled pixels would be made up. Returns the
+/// agreement of feature matches with a map that is kept.
 ///
 /// # Errors
 /// [`DepthError::NoPair`] and [`DepthError::Cancelled`].
-pub(crate) fn check_pair<T: Intensity, const C: usize>(
+pub(crate) fn check_matched_fraction<T: Intensity, const C: usize>(
     map: &DisparityMap,
     left: ImageView<'_, T, C>,
     right: ImageView<'_, T, C>,
     disparities: (i32, usize),
-    few: FewMatches,
+    policy: FewMatches,
     progress: &dyn Progress,
 ) -> Result<Option<FeatureAgreement>, DepthError> {
     let matched = map.matched_fraction();
-    if matched >= LEAST_MATCHED {
+    if matched >= MIN_MATCHED_FRACTION {
         return Ok(None);
     }
-    let (cause, agreement) = cause(map, left, right, disparities, progress)?;
-    let keeps = match few {
+    let (cause, agreement) = diagnose(map, left, right, disparities, progress)?;
+    let is_kept = match policy {
         FewMatches::Check => cause == NoPairCause::Unknown && matched > 0.0,
         FewMatches::Keep => matched > 0.0,
     };
-    if keeps { Ok(Some(agreement)) } else { Err(DepthError::NoPair { matched, needed: LEAST_MATCHED, cause }) }
+    if is_kept { Ok(Some(agreement)) } else { Err(DepthError::NoPair { matched, needed: MIN_MATCHED_FRACTION, cause }) }
 }
 
-/// A photograph as bytes of color, 16 bits rounded to 8.
-pub(crate) fn color_bytes<T: Intensity, const C: usize>(photo: ImageView<'_, T, C>) -> RgbU8 {
+/// Converts an image to 8-bit RGB, 16 bits rounded.
+pub(crate) fn to_rgb8<T: Intensity, const C: usize>(photo: ImageView<'_, T, C>) -> RgbU8 {
     RgbU8::from_fn(photo.width(), photo.height(), |x, y| {
         let pixel = photo.at(x, y);
         std::array::from_fn(|c| ((u32::from(pixel[if C >= 3 { c } else { 0 }].to_u16()) + 128) / 257) as u8)
     })
 }
 
-/// The matcher's options, with the disparities that the pair shows where they are asked for. In quality mode the rows are looked at here: a second run would
-/// take seconds.
+/// Returns the matcher's options, with the range of disparities of feature matches where it is requested. In quality
+/// mode the vertical disparity is estimated here too: a second run would take seconds.
 pub(crate) fn matcher_options<T: Intensity + Pixel, const C: usize>(
     left: ImageView<'_, T, C>,
     right: ImageView<'_, T, C>,
@@ -249,7 +254,7 @@ pub(crate) fn matcher_options<T: Intensity + Pixel, const C: usize>(
     let stereo = match options.disparities {
         DisparityRange::Given => options.stereo.clone(),
         DisparityRange::FromMatches { min } => {
-            let (min_disparity, disparities) = range_of([left, right], min, alignment, progress)?;
+            let (min_disparity, disparities) = feature_range([left, right], min, alignment, progress)?;
             StereoOptions { min_disparity, disparities, ..options.stereo.clone() }
         }
     };
@@ -260,21 +265,21 @@ pub(crate) fn matcher_options<T: Intensity + Pixel, const C: usize>(
     Ok(stereo)
 }
 
-/// Smallest disparity, `min` where that is given, and how many there are, by the features of a pair.
-fn range_of<T: Intensity, const C: usize>(
+/// Returns the smallest disparity (`min` where given) and the number of disparities of a pair's feature matches.
+fn feature_range<T: Intensity, const C: usize>(
     [left, right]: [ImageView<'_, T, C>; 2],
     min: Option<i32>,
     alignment: &mut Alignment,
     progress: &dyn Progress,
 ) -> Result<(i32, usize), DepthError> {
-    let mut matches = matches_of(color_bytes(left).view(), color_bytes(right).view(), progress)?;
+    let mut matches = match_pair(to_rgb8(left).view(), to_rgb8(right).view(), progress)?;
     if left.size() == right.size() {
-        alignment.learn(&matches, left.size())?;
+        alignment.update_from_features(&matches, left.size())?;
     }
     if let Some(offset) = alignment.offset {
         offset.correct(&mut matches);
     }
-    let (first, count) = range_from(&matches)?;
+    let (first, count) = range_from_matches(&matches)?;
     let range = (first, first + count as i32 - 1);
     if min.is_none() && is_exchanged(range) {
         return Err(RangeError::Exchanged { range }.into());
@@ -283,11 +288,11 @@ fn range_of<T: Intensity, const C: usize>(
     Ok((min_disparity, (i64::from(first) + count as i64 - i64::from(min_disparity)).max(1) as usize))
 }
 
-/// Disparity of a rectified pair, and depth where its geometry is known.
+/// Computes the disparity of a rectified pair, and the depth where its geometry is known.
 ///
 /// # Errors
-/// [`DepthError`] where the images do not fit together, the disparities do not fit the images, or an option is out of
-/// range.
+/// [`DepthError`] where the images or disparities have unsuitable sizes, an option is out of range, or too few pixels
+/// are matched.
 pub fn depth<T: Intensity + Pixel, const C: usize>(
     left: ImageView<'_, T, C>,
     right: ImageView<'_, T, C>,
@@ -297,21 +302,21 @@ pub fn depth<T: Intensity + Pixel, const C: usize>(
 ) -> Result<DepthResult, DepthError> {
     check_range(options.range, geometry)?;
     let mut clock = StageClock::new();
-    let mut alignment = alignment_of(options);
+    let mut alignment = initial_alignment(options);
     let stereo = matcher_options(left, right, options, &mut alignment, progress)?;
     if options.disparities != DisparityRange::Given {
         clock.lap("range");
     }
     let mut matcher = StereoMatcher::new(stereo)?;
-    let kept = (options.range, options.few_matches);
+    let limits = (options.range, options.few_matches);
     let mut run = || {
         matcher.prepare(left.width(), left.height(), &mut DisparityMap::empty(), progress)?;
         clock.lap("prepare");
-        depth_of(&mut matcher, [left, right], geometry, kept, &mut alignment, progress).map(|(found, _)| found)
+        compute_depth(&mut matcher, [left, right], geometry, limits, &mut alignment, progress).map(|(result, _)| result)
     };
     let mut result = match run() {
         Err(DepthError::Cancelled(stop)) => {
-            free_elsewhere(matcher);
+            drop_in_background(matcher);
             return Err(stop.into());
         }
         result => result?,
@@ -320,13 +325,14 @@ pub fn depth<T: Intensity + Pixel, const C: usize>(
     Ok(result)
 }
 
-/// Gives memory back from a thread of its own: of gigabytes that takes the system some tenths of a second, for which nobody who stopped a job wants to wait.
-fn free_elsewhere<T: Send + 'static>(memory: T) {
-    // Where there are no threads, it is freed here.
+/// Frees memory in a background thread: for gigabytes it takes some tenths of a second, too long for a cancelled job.
+fn drop_in_background<T: Send + 'static>(memory: T) {
+    // Without threads it is freed here.
     let _ = std::thread::Builder::new().spawn(move || drop(memory));
 }
 
-/// As [`depth`], by any matcher; rows are taken as they are. `range` is the nearest and the farthest depth kept, in the unit of the baseline.
+/// As [`depth`], with any matcher, and without a correction of vertical disparity. `range` is the range of depths to
+/// keep, in the unit of the baseline.
 ///
 /// # Errors
 /// As [`depth`].
@@ -338,22 +344,22 @@ pub fn depth_with<T: Intensity + Pixel, const C: usize>(
     range: (f32, f32),
     progress: &dyn Progress,
 ) -> Result<DepthResult, DepthError> {
-    let kept = (range, FewMatches::default());
-    depth_of(matcher, [left, right], geometry, kept, &mut Alignment::off(), progress).map(|(found, _)| found)
+    let limits = (range, FewMatches::default());
+    compute_depth(matcher, [left, right], geometry, limits, &mut Alignment::off(), progress).map(|(result, _)| result)
 }
 
-/// What is known of the rows of a pair before it is looked at.
-pub(crate) fn alignment_of(options: &DepthOptions) -> Alignment {
+/// Returns the initial state of the vertical alignment.
+pub(crate) fn initial_alignment(options: &DepthOptions) -> Alignment {
     if options.align { Alignment::default() } else { Alignment::off() }
 }
 
-/// As [`depth_with`], with what becomes of a pair of which hardly anything is matched, and of rows that are apart: the right photograph that was
-/// matched comes back where it was corrected.
-pub(crate) fn depth_of<T: Intensity + Pixel, const C: usize>(
+/// As [`depth_with`], with a policy for few matches and a vertical alignment. Also returns the corrected right image,
+/// where it was corrected.
+pub(crate) fn compute_depth<T: Intensity + Pixel, const C: usize>(
     matcher: &mut dyn DisparityMatcher<T, C>,
     [left, right]: [ImageView<'_, T, C>; 2],
     geometry: Option<&StereoGeometry>,
-    (range, few): ((f32, f32), FewMatches),
+    (range, policy): ((f32, f32), FewMatches),
     alignment: &mut Alignment,
     progress: &dyn Progress,
 ) -> Result<(DepthResult, Option<Image<T, C>>), DepthError> {
@@ -364,21 +370,31 @@ pub(crate) fn depth_of<T: Intensity + Pixel, const C: usize>(
     let right = corrected.as_ref().map_or(right, Image::view);
     clock.lap("match");
     let disparities = matcher.disparities();
-    let few = check_pair(&map, left, right, disparities, few, progress)?;
+    let feature_agreement = check_matched_fraction(&map, left, right, disparities, policy, progress)?;
     progress.report("depth", 0, 1)?;
-    let depth = geometry.map(|geometry| kept_depth(geometry, &map, range)).transpose()?;
+    let depth = geometry.map(|geometry| depth_in_range(geometry, &map, range)).transpose()?;
     let confidence = matcher.confidence(&map);
     progress.report("depth", 0, 1)?;
     let sigma = matcher.uncertainty(&map);
     clock.lap("depth");
     let geometry = geometry.copied();
     let (vertical_offset, stages) = (alignment.offset, clock.into_stages());
-    let found = DepthResult { map, depth, confidence, sigma, disparities, geometry, few, vertical_offset, stages };
-    Ok((found, corrected))
+    let result = DepthResult {
+        map,
+        depth,
+        confidence,
+        sigma,
+        disparities,
+        geometry,
+        feature_agreement,
+        vertical_offset,
+        stages,
+    };
+    Ok((result, corrected))
 }
 
-/// The depths in `range`, of which there is at least one.
-fn kept_depth(geometry: &StereoGeometry, map: &DisparityMap, range: (f32, f32)) -> Result<GrayF32, DepthError> {
+/// Computes the depths in `range`; an error if there is none.
+fn depth_in_range(geometry: &StereoGeometry, map: &DisparityMap, range: (f32, f32)) -> Result<GrayF32, DepthError> {
     let depth = geometry.depth_map(map.disparity.view(), range);
     if depth.as_slice().iter().any(|z| z.is_finite()) {
         return Ok(depth);
@@ -389,9 +405,9 @@ fn kept_depth(geometry: &StereoGeometry, map: &DisparityMap, range: (f32, f32)) 
     Err(DepthError::NoDepth { kept: range, found })
 }
 
-/// Refuses an empty range of depths and a geometry that is none.
+/// Rejects an empty range of depths and an invalid geometry.
 pub(crate) fn check_range((near, far): (f32, f32), geometry: Option<&StereoGeometry>) -> Result<(), DepthError> {
-    // NaN fails as well.
+    // Also rejects NaN.
     if near.partial_cmp(&far) != Some(std::cmp::Ordering::Less) {
         return Err(DepthError::Range { near, far });
     }
@@ -426,12 +442,12 @@ mod tests {
                 }
             }
         }
-        // The bar of the project: 95 % of the visible pixels within 5 %.
+        // The requirement of the project: 95 % of the visible pixels within 5 %.
         assert!(f64::from(good) >= 0.95 * f64::from(all), "{good} of {all}");
     }
 
     #[test]
-    fn what_is_no_pair_is_refused() {
+    fn images_that_are_no_rectified_pair_are_errors() {
         let scene = Scene::room(1);
         let camera = Camera::from_focal(320, 240, 280.0);
         let pair = stereo_pair(&scene, &camera, &scene.viewpoint(), 0.25, &RenderOptions::default()).unwrap();
@@ -441,7 +457,7 @@ mod tests {
             DepthOptions { stereo: StereoOptions { disparities: 64, ..Default::default() }, ..Default::default() };
         let gray = Image::<u8, 3>::new(320, 240, [90; 3]);
         let (left, right) = (pair.left.image.view(), pair.right.image.view());
-        // One color twice, one color and a photograph, exchanged, of something else.
+        // Uniform images, a uniform image and a photograph, exchanged images, another scene.
         let pairs = [(gray.view(), gray.view()), (gray.view(), right), (right, left), (left, other.right.image.view())];
         for (i, (a, b)) in pairs.into_iter().enumerate() {
             let error = depth(a, b, None, &options, &Silent).map(|found| found.map.matched_fraction()).unwrap_err();
@@ -451,19 +467,21 @@ mod tests {
                 _ => assert!(matches!(cause, NoPairCause::Unrelated { .. }), "{i}: {cause:?}"),
             }
         }
-        // Exchanged, and the range left to the features: negative disparities are depths of nothing.
+        // Exchanged, with the range of feature matches: negative disparities have no depth.
         let auto = DepthOptions { disparities: DisparityRange::FromMatches { min: None }, ..Default::default() };
         let error = depth(right, left, None, &auto, &Silent).map(|_| ()).unwrap_err();
         assert!(matches!(error, DepthError::NoRange(RangeError::Exchanged { range: (..-8, ..9) })), "{error}");
-        // Who says that they are negative gets them.
-        let min = auto_min(depth(left, right, None, &auto, &Silent).unwrap().disparities);
+        // A given negative minimum is accepted.
+        let min = exchanged_min(depth(left, right, None, &auto, &Silent).unwrap().disparities);
         let below = DepthOptions { disparities: DisparityRange::FromMatches { min: Some(min) }, ..Default::default() };
         assert!(depth(right, left, None, &below, &Silent).unwrap().map.matched_fraction() > 0.5);
-        // Ten rows lower, and a range that ends before the nearest wall begins.
+        // Ten rows lower; then a range beyond the nearest wall.
         let lower = pair.right.image.view().crop(0, 10, 320, 230).unwrap();
         let error =
             depth(pair.left.image.view().crop(0, 0, 320, 230).unwrap(), lower, None, &options, &Silent).unwrap_err();
-        let DepthError::NoPair { cause: NoPairCause::Rows { apart }, .. } = error else { panic!("{error}") };
+        let DepthError::NoPair { cause: NoPairCause::VerticalDisparity { px: apart }, .. } = error else {
+            panic!("{error}")
+        };
         assert!((apart - 10.0).abs() < 1.0, "{apart}");
         let far = StereoOptions { min_disparity: 200, disparities: 64, ..Default::default() };
         let error = depth(left, right, None, &DepthOptions { stereo: far, ..Default::default() }, &Silent).unwrap_err();
@@ -472,14 +490,14 @@ mod tests {
     }
 
     #[test]
-    fn few_matches_are_kept_where_features_agree() {
+    fn a_map_with_few_matches_is_kept_if_features_agree() {
         let scene = Scene::room(1);
         let camera = Camera::from_focal(480, 360, 420.0);
-        let of =
+        let striped_pair =
             |scene: &Scene| {
                 let pair = stereo_pair(scene, &camera, &scene.viewpoint(), 0.25, &RenderOptions::default()).unwrap();
-                // A tenth of the rows; around them noise that both cameras have of their own.
-                let strip =
+                // A tenth of the rows; around them independent noise.
+                let keep_strip =
                     |image: &cv_core::RgbU8, seed: u32| {
                         let noise = |x: usize, y: usize| {
                             let mixed = ((x * 480 + y) as u32 ^ seed).wrapping_mul(0x9E37_79B1);
@@ -490,10 +508,10 @@ mod tests {
                             if kept.contains(&y) { image.at(x, y) } else { [noise(x, y); 3] }
                         })
                     };
-                ([strip(&pair.left.image, 1), strip(&pair.right.image, 0xABCD_EF01)], pair.disparity)
+                ([keep_strip(&pair.left.image, 1), keep_strip(&pair.right.image, 0xABCD_EF01)], pair.disparity)
             };
-        let ([left, right], truth) = of(&scene);
-        let ([_, other], _) = of(&Scene::tabletop(2));
+        let ([left, right], truth) = striped_pair(&scene);
+        let ([_, other], _) = striped_pair(&Scene::tabletop(2));
         let options = |disparities, few_matches| DepthOptions {
             stereo: StereoOptions { disparities, fill: false, ..Default::default() },
             few_matches,
@@ -501,34 +519,38 @@ mod tests {
         };
         let run =
             |right: &cv_core::RgbU8, options: &DepthOptions| depth(left.view(), right.view(), None, options, &Silent);
-        let found = run(&right, &options(96, FewMatches::Check)).unwrap();
-        let few = found.few.unwrap();
-        assert!(found.map.matched_fraction() < LEAST_MATCHED && few.is_enough(), "{few:?}");
-        let known = (0..480 * 36).map(|i| (i % 480, 160 + i / 480));
-        let known = known.filter(|(x, y)| found.map.disparity.at(*x, *y)[0].is_finite());
-        let off = known.map(|(x, y)| (found.map.disparity.at(x, y)[0] - truth.at(x, y)[0]).abs());
-        let off: Vec<f32> = off.collect();
-        // As of a whole pair, the bar of which is nine of ten within a pixel; rows next to the noise see little of their own.
-        assert!(off.len() > 480 * 18 && off.iter().filter(|d| **d < 1.0).count() * 10 > off.len() * 8, "{}", off.len());
-        // Of something else, and where the range ends before what features show.
-        let error = run(&other, &options(96, FewMatches::Check)).map(|d| d.few).unwrap_err();
+        let result = run(&right, &options(96, FewMatches::Check)).unwrap();
+        let agreement = result.feature_agreement.unwrap();
+        assert!(result.map.matched_fraction() < MIN_MATCHED_FRACTION && agreement.is_enough(), "{agreement:?}");
+        let valid = (0..480 * 36).map(|i| (i % 480, 160 + i / 480));
+        let valid = valid.filter(|(x, y)| result.map.disparity.at(*x, *y)[0].is_finite());
+        let errors = valid.map(|(x, y)| (result.map.disparity.at(x, y)[0] - truth.at(x, y)[0]).abs());
+        let errors: Vec<f32> = errors.collect();
+        // As for a whole pair, for which nine of ten are within a pixel; windows next to the noise are mostly noise.
+        assert!(
+            errors.len() > 480 * 18 && errors.iter().filter(|d| **d < 1.0).count() * 10 > errors.len() * 8,
+            "{}",
+            errors.len()
+        );
+        // Another scene, and a range below the disparities of the features.
+        let error = run(&other, &options(96, FewMatches::Check)).map(|d| d.feature_agreement).unwrap_err();
         assert!(matches!(error, DepthError::NoPair { .. }), "{error}");
         let nearest = truth.as_slice().iter().copied().fold(0.0, f32::max) as usize;
-        let error = run(&right, &options(nearest / 2, FewMatches::Check)).map(|d| d.few).unwrap_err();
+        let error = run(&right, &options(nearest / 2, FewMatches::Check)).map(|d| d.feature_agreement).unwrap_err();
         assert!(matches!(error, DepthError::NoPair { cause: NoPairCause::Range { .. }, .. }), "{error}");
-        // Who wants it all the same gets it, where patches that match by chance are not removed.
+        // The policy keeps it, if speckles of chance matches are not removed.
         let keep = options(96, FewMatches::Keep);
         let keep = DepthOptions { stereo: StereoOptions { speckle_size: 10, ..keep.stereo }, ..keep };
-        assert!(run(&other, &keep).unwrap().few.is_some());
+        assert!(run(&other, &keep).unwrap().feature_agreement.is_some());
     }
 
-    /// Smallest disparity of the exchanged pair.
-    fn auto_min((first, count): (i32, usize)) -> i32 {
+    /// Returns the smallest disparity of the exchanged pair.
+    fn exchanged_min((first, count): (i32, usize)) -> i32 {
         -(first + count as i32 - 1)
     }
 
     #[test]
-    fn a_map_without_a_depth_is_no_success() {
+    fn a_map_without_a_depth_is_an_error() {
         let scene = Scene::room(1);
         let camera = Camera::from_focal(320, 240, 280.0);
         let pair = stereo_pair(&scene, &camera, &scene.viewpoint(), 0.25, &RenderOptions::default()).unwrap();
@@ -542,19 +564,19 @@ mod tests {
             depth(pair.left.image.view(), pair.right.image.view(), Some(&geometry), &options, &Silent)
         };
         assert!(run(0.0, (0.0, f32::INFINITY)).is_ok());
-        // The room ends at a few meters.
+        // The room is a few meters deep.
         let error = run(0.0, (1000.0, 2000.0)).unwrap_err();
         let DepthError::NoDepth { kept: (1000.0, 2000.0), found: Some((near, far)) } = error else { panic!("{error}") };
         let truth = pair.left.depth.as_slice();
         let farthest = truth.iter().copied().fold(0.0, f32::max);
         assert!(near > 0.0 && near < far && far < 3.0 * farthest, "{near} {far} {farthest}");
-        // Principal points so far apart that everything lies behind the cameras.
+        // Principal points so far apart that everything is behind the cameras.
         let error = run(-200.0, (0.0, f32::INFINITY)).unwrap_err();
         assert!(matches!(error, DepthError::NoDepth { found: None, .. }), "{error}");
     }
 
     #[test]
-    fn what_makes_no_sense_is_an_error_with_the_numbers() {
+    fn invalid_input_is_an_error_with_the_numbers() {
         let (a, b) = (Image::<u8, 1>::new(40, 30, [7]), Image::<u8, 1>::new(40, 31, [7]));
         let run = |options: &DepthOptions| depth(a.view(), b.view(), None, options, &Silent).unwrap_err();
         assert_eq!(

@@ -1,8 +1,8 @@
-//! One call per job, in memory: photographs and options in, result and timings out.
+//! One call per job, in memory: images and options in, result and timings out.
 //!
 //! This crate joins the stages of the crates below it (`cv-features`, `cv-geometry`, `cv-stereo`, `cv-segment`,
-//! `cv-panorama`, `cv-calib`) into the jobs a person asks for. It reads and writes no files: `cv-cli` does that, and so can any
-//! other program.
+//! `cv-panorama`, `cv-calib`, `cv-sfm`) into the jobs of the toolkit. It reads and writes no files: `cv-cli` and other
+//! programs do.
 //!
 //! ```
 //! use cv_core::StageClock;
@@ -22,11 +22,12 @@
 //!
 //! # Conventions
 //!
-//! * One file per job, holding `XOptions` (with `Default`), `XResult` and one function.
-//! * Every result has `stages: Vec<(&'static str, f64)>`, stage names and their seconds from a [`StageClock`](cv_core::StageClock).
-//! * Every job takes `&dyn Progress`; pass [`&Silent`](Silent) where nobody watches. Where that says stop, the job gives back the
-//!   variant `Cancelled` of its error.
-//! * The same input, options and seed give the same result at any number of threads.
+//! * One file per job, with `XOptions` (with `Default`), `XResult` and one function.
+//! * Every result has `stages: Vec<(&'static str, f64)>`, stage names and their seconds from a
+//!   [`StageClock`](cv_core::StageClock).
+//! * Every job takes `&dyn Progress`; pass [`&Silent`](Silent) without a listener. When the callback returns stop, the
+//!   job returns the variant `Cancelled` of its error.
+//! * The same input, options and seed give the same result with any number of threads.
 
 mod advice;
 mod asift;
@@ -71,7 +72,7 @@ pub use matching::{
     match_features, match_photos,
 };
 pub use no_pair::{FeatureAgreement, FewMatches, NoPairCause};
-/// What a caller of [`match_extracted`] needs to hand in features found elsewhere, and the settings of ours.
+/// Types for features from elsewhere ([`match_extracted`]), and the options of ours.
 pub mod features {
     pub use cv_features::{
         ByteDescriptors, ByteScale, CornerMeasure, DescriptorKind, Descriptors, DropReason, Dropped, FeatureError,
@@ -83,7 +84,7 @@ pub use panorama::{
     LeftOut, NearestPair, PanoramaError, PanoramaImage, PanoramaOptions, PanoramaPair, PanoramaPhoto, PanoramaResult,
     panorama, panorama_with,
 };
-/// The options of the panorama's stages.
+/// Types of the panorama's stages.
 pub mod panorama_types {
     pub use cv_panorama::*;
 }
@@ -101,7 +102,7 @@ pub use sfm::{
 };
 pub use vertical_offset::VerticalOffset;
 
-/// What a caller of [`depth()`] needs of the stereo stage: its options and results, rectification, geometry and scores.
+/// Types of the stereo stage: options and results, rectification, geometry and scores.
 pub mod stereo {
     pub use cv_imgproc::{WarpError, WarpMap};
     pub use cv_stereo::{
@@ -112,7 +113,7 @@ pub mod stereo {
     };
 }
 
-/// What a caller of [`train_segment`] and [`segment()`] needs of the color models: options, model, scores.
+/// Types of the color models for [`train_segment`] and [`segment()`]: options, model, scores.
 pub mod segmentation {
     pub use cv_segment::{
         Cleanup, ColorModel, ColorSpace, ConfusionMatrix, DetectOptions, Detection, Detections, FeatureStatistics,
@@ -121,12 +122,12 @@ pub mod segmentation {
     };
 }
 
-/// What a caller of [`sfm()`] needs of many views: what is known of cameras, options, models.
+/// Types of structure from motion for [`sfm()`]: knowledge of cameras, options, models.
 pub mod many_views {
     pub use cv_sfm::*;
 }
 
-/// What a caller of [`calibrate()`] needs of targets and of calibration: sizes of boards, options, results, verdicts.
+/// Types of calibration for [`calibrate()`]: boards, options, results, verdicts.
 pub mod calibration {
     pub use cv_calib::*;
     pub use cv_features::{

@@ -1,4 +1,4 @@
-//! Features of photographs, and tentative matches between two of them.
+//! Feature extraction, and tentative matches of two images.
 
 use crate::asift::match_asift;
 use crate::{ModelKind, Progress, RobustOptions, estimate};
@@ -10,15 +10,16 @@ use cv_features::{
 use cv_geometry::EstimateError;
 use cv_imgproc::{resize_area, rgb_to_gray_f32};
 
-/// Whether [`match_photos`] also looks at affine-simulated views (ASIFT, Morel & Yu 2009), with SIFT only: some five times the time. Of large photographs, a third of the size tells which views to look at in full.
+/// Whether [`match_photos`] matches simulated affine views too (ASIFT, Morel & Yu 2009), with SIFT only, in about five
+/// times the time. For large images the views are selected at a third of the resolution.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum AffineSimulation {
     /// Never.
     Never,
-    /// Where neither a homography nor a fundamental matrix explains enough of the plain matches: 8 and 30 % of them (Brown & Lowe's test of a true
-    /// match of two pictures, "Automatic panoramic image stitching", IJCV 2007).
+    /// If neither a homography nor a fundamental matrix has enough inliers among the plain matches: more than 8 plus 30
+    /// % of them (Brown & Lowe's test of an image match, "Automatic panoramic image stitching", IJCV 2007).
     #[default]
     AsNeeded,
     /// Always.
@@ -36,18 +37,18 @@ cv_core::named!(AffineSimulation {
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct MatchingOptions {
-    /// Which features, and their settings. Default SIFT.
+    /// Feature method and its settings. Default SIFT.
     pub features: FeatureOptions,
-    /// Which matches stay by how ambiguous they are. Default as of the kind of the descriptors.
+    /// Ratio test. Default that of the descriptor kind.
     pub ratio: RatioTest,
-    /// Keep a match only where each feature is the other's nearest. Default true.
+    /// Whether matches must be mutual nearest neighbors. Default true.
     pub mutual: bool,
-    /// Affine-simulated views (ASIFT). Default where needed.
+    /// Simulated affine views (ASIFT). Default as needed.
     pub affine_simulation: AffineSimulation,
-    /// Estimate this model from the matches and match once more along it: more matches, nearly all of them right, and none that disagree.
-    /// Default none.
+    /// Guided matching: estimate this model from the matches, and match again near its predictions. It gives more
+    /// matches, nearly all of them inliers. Default none.
     pub guided: Option<ModelKind>,
-    /// Seed of the searches for a model that `affine_simulation` and `guided` make. Default that of [`RobustOptions`].
+    /// Seed of the model estimation for `affine_simulation` and `guided`. Default that of [`RobustOptions`].
     pub seed: u64,
 }
 
@@ -64,65 +65,65 @@ impl Default for MatchingOptions {
     }
 }
 
-/// What [`match_photos`] found.
+/// Result of [`match_photos`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct MatchingResult {
-    /// The features of both photographs.
+    /// The features of both images.
     pub features: [Features; 2],
-    /// Matches by index of the features, in order of the first photograph's.
+    /// Matches by feature index, in the order of the first image's features.
     pub matches: Vec<DMatch>,
     /// Stage names and their seconds.
     pub stages: Vec<(&'static str, f64)>,
 }
 
 impl MatchingResult {
-    /// Where a match of these features is, in pixels.
+    /// Returns the pixels of a match.
     ///
     /// # Panics
     /// For a match of other features.
     pub fn pair(&self, m: &DMatch) -> Correspondence {
-        pair(&self.features[0], &self.features[1], m)
+        correspondence(&self.features[0], &self.features[1], m)
     }
 
-    /// The matches as positions in pixels, in their order.
+    /// Returns the pixels of all matches, in their order.
     pub fn pairs(&self) -> Vec<Correspondence> {
         correspondences(&self.features[0], &self.features[1], &self.matches)
     }
 }
 
-/// Why photographs could not be matched.
+/// Why two images could not be matched.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum MatchingError {
-    /// A photograph cannot be looked at.
+    /// Feature extraction failed on an image.
     #[error("photograph {index}: {source}")]
     Features {
-        /// 1 or 2.
+        /// Index of the image: 1 or 2.
         index: usize,
-        /// Why.
+        /// The reason.
         source: FeatureError,
     },
-    /// A photograph has no features to match.
+    /// An image has no features.
     #[error(
-        "photograph {index} has no features: {found} points found, {dropped} of them too near the border or on flat patches"
+        "photograph {index} has no features: {found} keypoints detected, {dropped} of them dropped near the border or in low-texture patches"
     )]
     NoFeatures {
-        /// 1 or 2.
+        /// Index of the image: 1 or 2.
         index: usize,
-        /// Points found before description.
+        /// Keypoints detected.
         found: usize,
-        /// Points that could not be described.
+        /// Keypoints without a descriptor.
         dropped: usize,
     },
     /// The descriptors cannot be compared.
     #[error(transparent)]
     Match(MatchError),
-    /// There is no model for guided matching to go by.
-    #[error("there is no model to be guided by: {source}")]
+    /// No model for guided matching was found.
+    #[error("no model for guided matching: {source}")]
     NoModel {
-        /// Which was asked for.
+        /// Kind of the model.
         kind: ModelKind,
-        /// Why there is none.
+        /// The reason.
         source: EstimateError,
     },
     /// The job was stopped by its progress callback.
@@ -139,10 +140,11 @@ impl From<MatchError> for MatchingError {
     }
 }
 
-/// Finds and describes the features of a photograph. Gray is Rec. 601 luma, 0 to 1.
+/// Detects and describes the features of an image. Gray is Rec. 601 luma, 0 to 1.
 ///
 /// # Errors
-/// [`FeatureError`] for a photograph smaller than the method's window and for options out of range. One without features is no error here.
+/// [`FeatureError`] for an image smaller than the method's window, and options out of range. An image without features
+/// is no error.
 pub fn extract_features(
     photo: ImageView<'_, u8, 3>,
     options: &FeatureOptions,
@@ -151,10 +153,11 @@ pub fn extract_features(
     options.extractor().extract(rgb_to_gray_f32(photo).view(), progress)
 }
 
-/// Tentative matches between the features of two photographs. Descriptors are compared as bytes where their kind says how.
+/// Returns tentative matches between the features of two images. Descriptors are compared as bytes if their kind
+/// supports it.
 ///
 /// # Errors
-/// [`MatchError`] where one has no features, or they are of different kinds.
+/// [`MatchError`] if an image has no features, or the kinds differ.
 pub fn match_features(
     a: &Features,
     b: &Features,
@@ -168,20 +171,21 @@ pub fn match_features(
     }
 }
 
-/// The positions of matched features, in the order of `matches`.
+/// Returns the pixels of matched features, in the order of `matches`.
 pub(crate) fn correspondences(a: &Features, b: &Features, matches: &[DMatch]) -> Vec<Correspondence> {
-    matches.iter().map(|m| pair(a, b, m)).collect()
+    matches.iter().map(|m| correspondence(a, b, m)).collect()
 }
 
-fn pair(a: &Features, b: &Features, m: &DMatch) -> Correspondence {
-    let at = |f: &Features, i: u32| -> Point2<f64> { f.keypoints[i as usize].position.cast() };
-    Correspondence { a: at(a, m.query), b: at(b, m.train) }
+/// Returns the pixels of a match.
+fn correspondence(a: &Features, b: &Features, m: &DMatch) -> Correspondence {
+    let position = |f: &Features, i: u32| -> Point2<f64> { f.keypoints[i as usize].position.cast() };
+    Correspondence { a: position(a, m.query), b: position(b, m.train) }
 }
 
-/// Features of two photographs and the tentative matches between them.
+/// Extracts the features of two images and matches them.
 ///
 /// # Errors
-/// [`MatchingError`] where a photograph is too small or has no features.
+/// [`MatchingError`] if an image is too small or has no features.
 pub fn match_photos(
     a: ImageView<'_, u8, 3>,
     b: ImageView<'_, u8, 3>,
@@ -207,7 +211,7 @@ pub fn match_photos(
     let affine_simulation = match options.affine_simulation {
         AffineSimulation::Never => false,
         AffineSimulation::AsNeeded => {
-            !explained(&correspondences(&features[0], &features[1], &matches), options.seed, progress)?
+            !has_model(&correspondences(&features[0], &features[1], &matches), options.seed, progress)?
         }
         AffineSimulation::Always => true,
     };
@@ -216,13 +220,14 @@ pub fn match_photos(
         match_asift(gray, sift, &mut features, &mut matches, options, progress)?;
         clock.lap("slanted views");
     }
-    finish(features, matches, options, progress, clock)
+    assemble_result(features, matches, options, progress, clock)
 }
 
-/// Tentative matches between features found elsewhere; those of other programs are of the kind [`DescriptorKind::foreign`](cv_features::DescriptorKind::foreign).
+/// Returns tentative matches between given features; those of other programs have the kind
+/// [`DescriptorKind::foreign`](cv_features::DescriptorKind::foreign).
 ///
 /// # Errors
-/// [`MatchingError`] where there are none, or they are of different kinds.
+/// [`MatchingError`] if there are none, or the kinds differ.
 pub fn match_extracted(
     features: [Features; 2],
     options: &MatchingOptions,
@@ -231,11 +236,11 @@ pub fn match_extracted(
     let mut clock = StageClock::new();
     let matches = match_features(&features[0], &features[1], options, progress)?;
     clock.lap("match");
-    finish(features, matches, options, progress, clock)
+    assemble_result(features, matches, options, progress, clock)
 }
 
-/// Matches once more along a model, where asked for, and packs up.
-fn finish(
+/// Applies guided matching, if requested, and assembles the result.
+fn assemble_result(
     features: [Features; 2],
     mut matches: Vec<DMatch>,
     options: &MatchingOptions,
@@ -244,9 +249,9 @@ fn finish(
 ) -> Result<MatchingResult, MatchingError> {
     if let Some(kind) = options.guided {
         let pairs = correspondences(&features[0], &features[1], &matches);
-        let found = estimate(&pairs, kind, &RobustOptions { seed: options.seed, ..kind.options() }, progress);
-        let robust = match found {
-            Ok(found) => found.robust,
+        let estimated = estimate(&pairs, kind, &RobustOptions { seed: options.seed, ..kind.options() }, progress);
+        let robust = match estimated {
+            Ok(estimated) => estimated.robust,
             Err(EstimateError::Cancelled(stop)) => return Err(stop.into()),
             Err(source) => return Err(MatchingError::NoModel { kind, source }),
         };
@@ -254,15 +259,15 @@ fn finish(
             ModelKind::Homography => TwoViewModel::Homography(robust.model),
             ModelKind::Fundamental => TwoViewModel::Fundamental(robust.model),
         };
-        let along = GuidedOptions { threshold: kind.options().threshold as f32, ..GuidedOptions::default() };
-        matches = match_guided(&features[0], &features[1], None, &model, &along, progress)?;
+        let guided_options = GuidedOptions { threshold: kind.options().threshold as f32, ..GuidedOptions::default() };
+        matches = match_guided(&features[0], &features[1], None, &model, &guided_options, progress)?;
         clock.lap("guided");
     }
     Ok(MatchingResult { features, matches, stages: clock.into_stages() })
 }
 
-/// Whether a homography or a fundamental matrix explains enough of the matches: see [`AffineSimulation::AsNeeded`].
-fn explained(pairs: &[Correspondence], seed: u64, progress: &dyn Progress) -> Result<bool, Cancelled> {
+/// Returns whether a homography or a fundamental matrix has enough inliers: see [`AffineSimulation::AsNeeded`].
+fn has_model(pairs: &[Correspondence], seed: u64, progress: &dyn Progress) -> Result<bool, Cancelled> {
     for kind in [ModelKind::Homography, ModelKind::Fundamental] {
         match estimate(pairs, kind, &RobustOptions { seed, ..kind.options() }, progress) {
             Ok(m) if m.robust.inliers.len() as f64 > 8.0 + 0.3 * pairs.len() as f64 => return Ok(true),
@@ -273,7 +278,7 @@ fn explained(pairs: &[Correspondence], seed: u64, progress: &dyn Progress) -> Re
     Ok(false)
 }
 
-/// To pixels of the photograph as it is when scaled.
+/// Converts keypoints to pixels of the image in full size.
 pub(crate) fn rescale(features: &mut Features, scaling: Scaling) {
     for point in features.keypoints.iter_mut().chain(&mut features.candidates) {
         point.position = scaling.point_f32(point.position);
@@ -281,7 +286,8 @@ pub(crate) fn rescale(features: &mut Features, scaling: Scaling) {
     }
 }
 
-/// [`match_photos`] in photographs reduced to a longer side of `max_size` where they are larger, in pixels of the photographs themselves.
+/// As [`match_photos`] on images reduced to a longer side of at most `max_size`; the result is in pixels of the full
+/// images.
 pub(crate) fn match_reduced(
     photos: [ImageView<'_, u8, 3>; 2],
     max_size: usize,
@@ -307,7 +313,7 @@ mod tests {
     use crate::{FeatureMethod, Silent};
     use cv_core::RgbU8;
 
-    /// Colored blobs of many sizes at places drawn from a fixed sequence.
+    /// Renders blobs of many sizes at pseudo-random positions.
     fn blobs(shift: (f32, f32)) -> RgbU8 {
         let mut state = 7u32;
         let mut random = || {
@@ -327,24 +333,29 @@ mod tests {
     }
 
     #[test]
-    fn both_methods_find_a_shift() {
+    fn all_methods_find_a_shift() {
         let (a, b) = (blobs((0.0, 0.0)), blobs((6.5, -4.0)));
         for method in [FeatureMethod::Harris, FeatureMethod::Mops, FeatureMethod::Sift] {
             let options = MatchingOptions { features: method.into(), ..MatchingOptions::default() };
             let result = match_photos(a.view(), b.view(), &options, &Silent).unwrap();
             let pairs = result.pairs();
-            let good =
+            let correct =
                 pairs.iter().filter(|p| (p.b.x - p.a.x - 6.5).abs() < 1.0 && (p.b.y - p.a.y + 4.0).abs() < 1.0).count();
-            // The images differ only by the shift and rounding to bytes; a pixel is what the top of a round blob may wander by that.
+            // The images differ by the shift and by rounding to 8 bits, which moves the maximum of a blob by up to a
+            // pixel.
             // Oriented patches at all scales need a wide margin: few fit into this small image.
-            let least = if method == FeatureMethod::Mops { 15 } else { 30 };
-            assert!(good >= least && good * 10 >= pairs.len() * 9, "{method:?}: {good} of {}", pairs.len());
+            let min_correct = if method == FeatureMethod::Mops { 15 } else { 30 };
+            assert!(
+                correct >= min_correct && correct * 10 >= pairs.len() * 9,
+                "{method:?}: {correct} of {}",
+                pairs.len()
+            );
             assert_eq!(result.matches.len(), pairs.len());
         }
     }
 
     #[test]
-    fn photographs_without_features_are_named() {
+    fn images_without_features_are_errors_with_their_index() {
         let flat = RgbU8::new(100, 80, [9; 3]);
         let good = blobs((0.0, 0.0));
         for method in [FeatureMethod::Harris, FeatureMethod::Mops, FeatureMethod::Sift] {

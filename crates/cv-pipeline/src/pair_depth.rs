@@ -1,35 +1,36 @@
-//! Depths of what two photographs show whose geometry is known.
+//! Depth map of a pair of images with known relative pose.
 
 use crate::Progress;
-use crate::depth::LEAST_MATCHED;
+use crate::depth::MIN_MATCHED_FRACTION;
 use crate::reconstruct::{DenseError, DenseOptions};
 use cv_core::{Camera, Cancelled, GrayF32, ImageView, Point2, Point3, PointCloud, RgbU8, Stage, StageClock, StereoRig};
 use cv_stereo::{PixelState, RectifiedView, SceneRectification, StereoMatcher, StereoOptions};
 use rayon::prelude::*;
 
-/// Half a window of the matcher and more.
-const BORDER: i64 = 4;
+/// Width of the invalid border in pixels: more than the radius of the matching window.
+const BORDER_PX: i64 = 4;
 
-/// Share of the rectified photograph up to which a patch of disparities by itself is a speckle: OpenCV's 100 pixels of VGA.
-const SPECKLE: f64 = 100.0 / (640.0 * 480.0);
+/// Largest speckle as a fraction of the image: OpenCV's 100 pixels of VGA.
+const SPECKLE_FRACTION: f64 = 100.0 / (640.0 * 480.0);
 
-/// Depths of the first of two photographs, as its rectified view has them.
+/// Depth map of the first image, in its rectified view.
 pub(crate) struct PairDepth {
-    /// Along the axis of the rectified view, row by row; NaN where none is known.
+    /// Depth along the axis of the rectified view, row by row; NaN where unknown.
     rows: Vec<Vec<f32>>,
     view: RectifiedView,
-    /// The rectified photograph.
+    /// The rectified first image.
     image: RgbU8,
-    /// Smallest disparity in pixels, and number of disparities tried.
+    /// Smallest disparity in pixels, and number of disparities.
     pub(crate) disparities: (i32, usize),
-    /// Share of the pixels that both rectified photographs can show for which a depth was found and confirmed.
+    /// Fraction of the commonly visible pixels with a confirmed depth.
     pub(crate) coverage: f64,
     /// Stage names and their seconds.
     pub(crate) stages: Vec<(&'static str, f64)>,
 }
 
-/// Rectifies two photographs of a rig's cameras around `positions` that both show, in the first camera's frame ([`SceneRectification`]), and matches them ([`StereoMatcher`]); depths that the other
-/// photograph confirms, or with [`DenseOptions::fill`] those of around them, are known.
+/// Rectifies two images around 3-D `positions` that both observe, in the first camera's frame ([`SceneRectification`]),
+/// and matches them ([`StereoMatcher`]). Depths are kept where the left-right check confirms them, or with
+/// [`DenseOptions::fill`] where they are filled.
 ///
 /// # Errors
 /// [`DenseError`].
@@ -54,7 +55,7 @@ pub(crate) fn pair_depth(
     let stereo = StereoOptions {
         fill: options.fill,
         max_memory: Some(options.max_memory),
-        speckle_size: ((size.0 * size.1) as f64 * SPECKLE) as usize,
+        speckle_size: ((size.0 * size.1) as f64 * SPECKLE_FRACTION) as usize,
         ..scene.stereo_options()
     };
     let mut matcher = StereoMatcher::new(stereo)?;
@@ -65,54 +66,56 @@ pub(crate) fn pair_depth(
     let stage = Stage::new(progress, "cloud", size.1)?;
     let geometry = &scene.views.geometry;
     let (width, height) = size;
-    // Depth in the rectified frame; seen and confirmed; seen by both at this depth at all.
-    // The border of a photograph looks like that of the other: what is compared must lie inside.
-    let inside = |photo: usize, x: i64, y: i64| {
+    // Image borders match each other: the windows must be inside both images.
+    let is_inside = |photo: usize, x: i64, y: i64| {
         let mask = &rectified[photo].1;
-        [(-BORDER, -BORDER), (BORDER, -BORDER), (-BORDER, BORDER), (BORDER, BORDER)].iter().all(|(dx, dy)| {
-            let (x, y) = (x + dx, y + dy);
-            x >= 0 && y >= 0 && x < width as i64 && y < height as i64 && mask.at(x as usize, y as usize)[0]
-        })
+        [(-BORDER_PX, -BORDER_PX), (BORDER_PX, -BORDER_PX), (-BORDER_PX, BORDER_PX), (BORDER_PX, BORDER_PX)].iter().all(
+            |(dx, dy)| {
+                let (x, y) = (x + dx, y + dy);
+                x >= 0 && y >= 0 && x < width as i64 && y < height as i64 && mask.at(x as usize, y as usize)[0]
+            },
+        )
     };
-    let examine = |x: usize, y: usize| -> (f32, bool, bool) {
+    // Depth in the rectified frame, whether it is confirmed, and whether both images can show it.
+    let pixel_depth = |x: usize, y: usize| -> (f32, bool, bool) {
         let none = (f32::NAN, false, false);
         let d = map.disparity.at(x, y)[0];
         let row = y as i64;
-        if !inside(0, x as i64, row) {
+        if !is_inside(0, x as i64, row) {
             return none;
         }
         if !d.is_finite() {
-            // Whether the other photograph shows it is unknown: it does where it shows what lies in the middle of the range.
-            let middle = x as i64 - i64::from(scene.disparities.0) - scene.disparities.1 as i64 / 2;
-            return (f32::NAN, false, inside(1, middle, row));
+            // Visibility in the other image is unknown; it is decided at the middle of the range.
+            let center = x as i64 - i64::from(scene.disparities.0) - scene.disparities.1 as i64 / 2;
+            return (f32::NAN, false, is_inside(1, center, row));
         }
-        if !inside(1, (x as f32 - d).round() as i64, row) {
+        if !is_inside(1, (x as f32 - d).round() as i64, row) {
             return none;
         }
         let depth = geometry.depth(d);
         let matched = map.state.at(x, y)[0] == PixelState::Matched;
-        // A winner at either end of the range is the nearest to what lies beyond it.
+        // A winner at an end of the range is nearest to a disparity beyond it.
         let d = d - scene.disparities.0 as f32;
-        let within = d >= 1.0 && d <= scene.disparities.1 as f32 - 2.0;
-        // What was filled in has no deviation of its own.
-        let deviation = geometry.depth_uncertainty(depth, sigma.at(x, y)[0]);
-        let sharp = !matched || deviation <= options.max_deviation * depth;
-        let known = depth.is_finite() && within && sharp && (matched || options.fill);
-        (if known { depth } else { f32::NAN }, known && matched, true)
+        let is_within = d >= 1.0 && d <= scene.disparities.1 as f32 - 2.0;
+        // Filled disparities have no standard deviation.
+        let sigma = geometry.depth_uncertainty(depth, sigma.at(x, y)[0]);
+        let is_certain = !matched || sigma <= options.max_deviation * depth;
+        let is_valid = depth.is_finite() && is_within && is_certain && (matched || options.fill);
+        (if is_valid { depth } else { f32::NAN }, is_valid && matched, true)
     };
     let rows: Vec<(Vec<f32>, usize, usize)> = (0..height)
         .into_par_iter()
         .map(|y| {
             stage.add(1)?;
-            let row: Vec<_> = (0..width).map(|x| examine(x, y)).collect();
+            let row: Vec<_> = (0..width).map(|x| pixel_depth(x, y)).collect();
             let count = |f: &dyn Fn(&(f32, bool, bool)) -> bool| row.iter().filter(|p| f(p)).count();
             Ok((row.iter().map(|p| p.0).collect(), count(&|p| p.1), count(&|p| p.2)))
         })
         .collect::<Result<_, Cancelled>>()?;
     let (confirmed, common) = rows.iter().fold((0, 0), |(a, b), row| (a + row.1, b + row.2));
     let coverage = confirmed as f64 / common.max(1) as f64;
-    if coverage < LEAST_MATCHED {
-        return Err(DenseError::LittleConfirmed { coverage, needed: LEAST_MATCHED });
+    if coverage < MIN_MATCHED_FRACTION {
+        return Err(DenseError::LittleConfirmed { coverage, needed: MIN_MATCHED_FRACTION });
     }
     clock.lap("cloud");
     let image = rectified.swap_remove(0).0;
@@ -122,14 +125,14 @@ pub(crate) fn pair_depth(
 }
 
 impl PairDepth {
-    /// Width and height of the rectified photographs in pixels.
+    /// Returns width and height of the rectified images in pixels.
     pub(crate) fn size(&self) -> (usize, usize) {
         self.image.size()
     }
 
-    /// The points, in the frame of the first camera.
+    /// Returns the points in the frame of the first camera.
     pub(crate) fn cloud(&self) -> PointCloud {
-        let back = self.view.rotation.inverse();
+        let to_camera = self.view.rotation.inverse();
         let (positions, colors) = self
             .rows
             .par_iter()
@@ -137,7 +140,7 @@ impl PairDepth {
             .flat_map_iter(|(y, row)| {
                 row.iter().enumerate().filter(|(_, z)| z.is_finite()).map(move |(x, z)| {
                     let n = self.view.camera.normalize(Point2::new(x as f64, y as f64));
-                    let p = back * (Point3::new(n.x, n.y, 1.0) * f64::from(*z));
+                    let p = to_camera * (Point3::new(n.x, n.y, 1.0) * f64::from(*z));
                     ([p.x as f32, p.y as f32, p.z as f32], self.image.at(x, y))
                 })
             })
@@ -145,29 +148,29 @@ impl PairDepth {
         PointCloud::colored(positions, colors)
     }
 
-    /// Depth along the axis of the first camera for each pixel of its photograph, NaN where none is known.
+    /// Returns the depth along the axis of the first camera for each pixel of its image, NaN where unknown.
     ///
     /// # Errors
     /// [`Cancelled`].
     pub(crate) fn depth_map(&self, camera: &Camera, progress: &dyn Progress) -> Result<GrayF32, Cancelled> {
         let stage = Stage::new(progress, "cloud", camera.height)?;
-        let back = self.view.rotation.inverse();
+        let to_camera = self.view.rotation.inverse();
         let (width, height) = self.size();
-        let at = |p: Point2<f64>| -> Option<f32> {
+        let depth_at = |p: Point2<f64>| -> Option<f32> {
             let q = self.view.rectified_pixel(p)?;
             let (x, y) = (q.x.round(), q.y.round());
-            let inside = x >= 0.0 && y >= 0.0 && x < width as f64 && y < height as f64;
-            let z = if inside { self.rows[y as usize][x as usize] } else { f32::NAN };
+            let is_inside = x >= 0.0 && y >= 0.0 && x < width as f64 && y < height as f64;
+            let z = if is_inside { self.rows[y as usize][x as usize] } else { f32::NAN };
             let n = self.view.camera.normalize(q);
-            // The point's own depth: its place on the ray, turned back.
-            Some(((back * Point3::new(n.x, n.y, 1.0)).z * f64::from(z)) as f32)
+            // The depth of the point in the unrectified camera frame.
+            Some(((to_camera * Point3::new(n.x, n.y, 1.0)).z * f64::from(z)) as f32)
         };
         let mut depth = GrayF32::new(camera.width, camera.height, [f32::NAN]);
         if !depth.is_empty() {
             depth.as_mut_slice().par_chunks_mut(camera.width).enumerate().try_for_each(|(y, row)| {
                 stage.add(1)?;
                 for (x, z) in row.iter_mut().enumerate() {
-                    *z = at(Point2::new(x as f64, y as f64)).unwrap_or(f32::NAN);
+                    *z = depth_at(Point2::new(x as f64, y as f64)).unwrap_or(f32::NAN);
                 }
                 Ok::<(), Cancelled>(())
             })?;

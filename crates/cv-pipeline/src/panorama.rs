@@ -16,16 +16,16 @@ use rayon::prelude::*;
 /// A photograph and what is known about its camera.
 #[derive(Debug, Clone, Copy)]
 pub struct PanoramaPhoto<'a, T = u8> {
-    /// The pixels, upright, of `u8` or `u16` samples.
+    /// The upright image, with `u8` or `u16` samples.
     pub image: ImageView<'a, T, 3>,
-    /// Focal length in pixels from EXIF, where there is one.
+    /// Focal length in pixels from EXIF, if there is one.
     pub focal: Option<f64>,
-    /// The calibrated camera, where there is one; its lens distortion is taken out.
+    /// The calibrated camera, if there is one; its distortion is corrected.
     pub camera: Option<Camera>,
 }
 
 impl<'a, T> PanoramaPhoto<'a, T> {
-    /// A photograph of which nothing else is known.
+    /// Creates a photograph without knowledge of its camera.
     pub fn new(image: ImageView<'a, T, 3>) -> Self {
         Self { image, focal: None, camera: None }
     }
@@ -34,17 +34,17 @@ impl<'a, T> PanoramaPhoto<'a, T> {
 /// Settings of [`panorama`].
 #[derive(Debug, Clone)]
 pub struct PanoramaOptions {
-    /// Features and matching. SIFT starts from the enlarged image ([`SiftOptions::upsample`]) and takes faint features ([`SiftOptions::min_features`]) only where the features of the plain one do not hold the photographs
-    /// together firmly.
+    /// Features and matching. SIFT on the upsampled image ([`SiftOptions::upsample`]) and with faint features ([`SiftOptions::min_features`]) is used only
+    /// where plain SIFT does not connect the photographs firmly.
     pub matching: MatchingOptions,
-    /// Pixels that photographs are reduced to (about) for features and alignment. 10,000 or more; default 800,000, in the range that OpenCV's stitcher
-    /// and Hugin's control point finders use.
+    /// Approximate number of pixels that photographs are reduced to for features and alignment. 10,000 or more; default 800,000, in the range of OpenCV's
+    /// stitcher and Hugin's control point finders.
     pub registration_pixels: usize,
-    /// Which pairs overlap. The threshold is in pixels of the reduced photographs.
+    /// Pair verification. The threshold is in pixels of the reduced photographs.
     pub verify: VerifyOptions,
     /// Alignment. `outlier_px` is in pixels of the reduced photographs.
     pub align: AlignOptions,
-    /// Drawing.
+    /// Compositing.
     pub render: CompositingOptions,
 }
 
@@ -64,8 +64,8 @@ impl Default for PanoramaOptions {
 }
 
 impl PanoramaOptions {
-    /// A method's options as panoramas want them: 2000 features at most, and faint ones where strong ones are few, as in a photograph that is two stops too dark.
-    /// [`panorama`] looks for those only where the photographs do not hang together firmly without.
+    /// Returns a method's options with the limits for panoramas: at most 2000 features, and faint ones where strong ones are few, as in an underexposed
+    /// photograph. [`panorama`] uses faint features only where the photographs are not firmly connected without.
     pub fn features(method: FeatureOptions) -> FeatureOptions {
         match method.at_most(2000) {
             FeatureOptions::Sift(sift) => {
@@ -80,39 +80,39 @@ impl PanoramaOptions {
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum LeftOut {
-    /// Features could not be looked for on it.
+    /// Feature extraction failed.
     Features(FeatureError),
-    /// No features were found on it.
+    /// It has no features.
     NoFeatures,
     /// It overlaps no other photograph.
     NoOverlap {
-        /// The pair with another photograph that came nearest to being one, where one came near.
+        /// The rejected pair with most inliers, if there is one.
         nearest: Option<NearestPair>,
     },
-    /// It overlaps only photographs that do not overlap those of the panorama.
+    /// It is in another connected component of overlapping photographs.
     OtherComponent {
-        /// Photographs in that group, itself included.
+        /// Number of photographs in that component.
         size: usize,
     },
     /// Its overlaps contradict those of the other photographs.
     Inconsistent,
 }
 
-/// A pair of photographs of which too few matches agree.
+/// A pair that was rejected for too few inliers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub struct NearestPair {
-    /// The other photograph.
+    /// Index of the other photograph.
     pub other: usize,
-    /// Matches that agree.
+    /// Number of inliers.
     pub agree: usize,
-    /// Matches where the two photographs overlap by the homography.
+    /// Number of matches in the overlap by the homography.
     pub in_overlap: usize,
-    /// The number that chance explains; more would have to agree.
+    /// Number of inliers that chance explains; more are needed.
     pub needed: f64,
 }
 
-/// What became of a photograph.
+/// Result for a photograph.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub struct PanoramaImage {
@@ -120,68 +120,67 @@ pub struct PanoramaImage {
     pub size: (usize, usize),
     /// Whether it is in the panorama.
     pub used: bool,
-    /// Why not, where it is not.
+    /// Why not, if it is not.
     pub reason: Option<LeftOut>,
-    /// Features found on it; 0 where nobody looked for any ([`panorama_with`]).
+    /// Number of its features; 0 with [`panorama_with`].
     pub features: usize,
-    /// Its focal length in pixels, where it is used.
+    /// Its focal length in pixels, if it is used.
     pub focal: Option<f64>,
-    /// What its red, green and blue light was multiplied with.
+    /// Gains of its red, green and blue linear intensities.
     pub gain: [f32; 3],
 }
 
-/// What became of a pair of photographs.
+/// Result for a pair of photographs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PanoramaPair {
     /// First photograph.
     pub a: usize,
     /// Second photograph.
     pub b: usize,
-    /// Tentative matches, by the indices of the two photographs' features; see [`PanoramaResult::correspondences`].
+    /// Tentative matches by feature index; see [`PanoramaResult::correspondences`].
     pub matches: Vec<DMatch>,
-    /// Indices of those that agree with a common homography, ascending; none where the pair was rejected.
+    /// Indices of the inliers of the homography, ascending; empty if the pair was rejected.
     pub inliers: Vec<usize>,
     /// Why the pair was rejected.
     pub rejected: Option<PairRejection>,
 }
 
-/// A panorama and how it came about.
+/// A panorama and its intermediate results.
 #[derive(Debug, Clone)]
 pub struct PanoramaResult<T = u8> {
-    /// The picture, as deep as the photographs; black where no photograph reaches.
+    /// The image, with the bit depth of the photographs; black where there is no coverage.
     pub image: Image<T, 3>,
-    /// The light of the scene, linear, where [`CompositingOptions::radiance`] asks for it; 1 is the white of the photograph that all others are aligned to.
+    /// Linear radiance of the scene, if [`CompositingOptions::radiance`] requests it; 1 is the white level of the reference photograph.
     pub radiance: Option<RgbF32>,
-    /// True where a photograph reaches.
+    /// True where a photograph covers the pixel.
     pub mask: Mask,
-    /// Which photograph each pixel is from; `u16::MAX` where none reaches.
+    /// Index of the photograph of each pixel; `u16::MAX` without coverage.
     pub labels: Image<u16, 1>,
     /// One entry per input.
     pub images: Vec<PanoramaImage>,
-    /// All pairs that had matches; none of [`panorama_with`].
+    /// All pairs with matches; empty with [`panorama_with`].
     pub pairs: Vec<PanoramaPair>,
-    /// Features of each photograph, in its own pixels; none of [`panorama_with`].
+    /// Features of each photograph, in its own pixels; empty with [`panorama_with`].
     pub features: Vec<Features>,
-    /// The views, in full size.
+    /// The alignment, in full resolution.
     pub alignment: Alignment,
-    /// The surface drawn on, and where each pixel of the picture looks.
+    /// The canvas: projection surface, and the viewing direction of each pixel.
     pub canvas: Canvas,
-    /// Where in its photograph each pixel of the picture comes from.
+    /// The source pixel of each pixel of the panorama.
     pub map: PhotoMap,
-    /// Whether photographs reach beyond what the surface draws at the most, and no field of view was asked for.
+    /// Whether photographs extend beyond the largest field of the projection, without a requested field of view.
     pub reaches_beyond: bool,
-    /// Root mean square error of all matches of all overlaps, in pixels of the photographs.
+    /// Root mean square reprojection error of all matches, in pixels of the photographs.
     pub reprojection_rms_px: f64,
     /// Stage names and their seconds.
     pub stages: Vec<(&'static str, f64)>,
 }
 
-/// Share of a photograph's longer side by which matches disagree when the camera clearly moved: 5 px of 1,000. Features are good to a pixel or two; parallax
-/// is what is left.
-const PARALLAX: f64 = 0.005;
+/// Root mean square error that indicates parallax, as a ratio of the longer image side: 5 px of 1,000. Features are accurate to a pixel or two.
+const PARALLAX_RATIO: f64 = 0.005;
 
 impl<T> PanoramaResult<T> {
-    /// Where the matches of a pair are, in pixels of the photographs.
+    /// Returns the pixels of the matches of a pair.
     ///
     /// # Panics
     /// For a pair of another panorama.
@@ -189,19 +188,19 @@ impl<T> PanoramaResult<T> {
         correspondences(&self.features[pair.a], &self.features[pair.b], &pair.matches)
     }
 
-    /// Where the photographs look, for others of the same views; `names` are those of the photographs, as many as are known.
+    /// Returns the alignment for other photographs of the same views; `names` are those of the photographs, as far as they are known.
     ///
     /// # Errors
-    /// [`RegistrationError`] where a camera or a matrix is out of the range that registrations take.
+    /// [`RegistrationError`] if a camera or a matrix is out of range.
     pub fn registration(&self, names: &[String]) -> Result<Registration, RegistrationError> {
         let sizes: Vec<_> = self.images.iter().map(|image| image.size).collect();
         Registration::new(&self.alignment, &sizes, names)
     }
 
-    /// Whether the photographs fit each other so badly that they must have been taken from different places: what is near may then be cut in two at the seams.
+    /// Returns whether the reprojection error indicates parallax: nearby objects may then be cut at the seams.
     pub fn shows_parallax(&self) -> bool {
         let longest = self.alignment.used().map(|(_, view)| view.camera.width.max(view.camera.height)).max();
-        self.reprojection_rms_px > PARALLAX * longest.unwrap_or(0) as f64
+        self.reprojection_rms_px > PARALLAX_RATIO * longest.unwrap_or(0) as f64
     }
 }
 
@@ -209,18 +208,18 @@ impl<T> PanoramaResult<T> {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum PanoramaError {
-    /// The photographs could not be aligned. `images` says for each what is the matter with it.
+    /// The photographs could not be aligned. `images` has the reason for each.
     #[error("{source}")]
     Align {
-        /// Why.
+        /// The reason.
         source: AlignError,
         /// One entry per input.
         images: Vec<PanoramaImage>,
     },
-    /// The photographs are not as they were registered.
+    /// The photographs do not match the registration.
     #[error(transparent)]
     Registration(#[from] RegistrationError),
-    /// The panorama could not be drawn.
+    /// Compositing failed.
     #[error(transparent)]
     Render(RenderError),
     /// The job was stopped by its progress callback.
@@ -237,30 +236,30 @@ impl From<RenderError> for PanoramaError {
     }
 }
 
-/// Joins overlapping photographs, in any order, to a panorama.
+/// Stitches overlapping photographs, in any order, to a panorama.
 ///
-/// Features on reduced photographs, matches of every pair, verification of the pairs (all of it again with finer features where some hold only loosely),
-/// alignment of all at once, drawing in full size. Photographs that do not belong are left out and say why. They are of `u8` or of `u16` samples, and so is the panorama; where they belong
-/// is found on 8 bits of them.
+/// Extracts features on reduced photographs, matches and verifies all pairs (again with more features where the connection is loose), aligns all photographs
+/// jointly, and composites in full resolution. Photographs that do not fit are left out, with a reason. With `u16` samples the panorama has 16 bits;
+/// alignment uses 8 bits.
 ///
 /// # Errors
-/// [`PanoramaError`]: fewer than two photographs belong together, or the canvas would be too large.
+/// [`PanoramaError`]: fewer than two photographs fit together, or the canvas would be too large.
 pub fn panorama<T: PhotoSample>(
     photos: &[PanoramaPhoto<'_, T>],
     options: &PanoramaOptions,
     progress: &dyn Progress,
 ) -> Result<PanoramaResult<T>, PanoramaError> {
     let views: Vec<_> = photos.iter().map(|photo| photo.image).collect();
-    let found = {
-        let eight = EightBits::new(&views, "features", progress)?;
-        let bytes = eight.views().into_iter().zip(photos);
+    let registered = {
+        let eight_bits = EightBits::new(&views, "features", progress)?;
+        let bytes = eight_bits.views().into_iter().zip(photos);
         let bytes: Vec<_> = bytes.map(|(image, p)| PanoramaPhoto { image, focal: p.focal, camera: p.camera }).collect();
         register(&bytes, options, progress)?
     };
-    draw(&views, found, &options.render, progress)
+    composite(&views, registered, &options.render, progress)
 }
 
-/// What is known of photographs before the panorama is drawn.
+/// The registration of the photographs, before compositing.
 struct Registered {
     alignment: Alignment,
     images: Vec<PanoramaImage>,
@@ -269,7 +268,7 @@ struct Registered {
     clock: StageClock,
 }
 
-/// Where photographs belong, from their features.
+/// Registers photographs by their features.
 fn register(
     photos: &[PanoramaPhoto<'_>],
     options: &PanoramaOptions,
@@ -278,27 +277,28 @@ fn register(
     let mut clock = StageClock::new();
     let n = photos.len();
     let candidates: Vec<(usize, usize)> = (0..n).flat_map(|a| (a + 1..n).map(move |b| (a, b))).collect();
-    let mut look = |matching: &MatchingOptions| -> Result<(Vec<Prepared>, Vec<Option<Tried>>), Cancelled> {
-        let stage = Stage::new(progress, "features", n)?;
-        let extract = |p| -> Result<Prepared, Cancelled> {
-            let prepared = Prepared::new(p, matching, options.registration_pixels, &stage)?;
-            stage.add(1)?;
-            Ok(prepared)
+    let mut match_all =
+        |matching: &MatchingOptions| -> Result<(Vec<PreparedPhoto>, Vec<Option<MatchedPair>>), Cancelled> {
+            let stage = Stage::new(progress, "features", n)?;
+            let extract = |p| -> Result<PreparedPhoto, Cancelled> {
+                let prepared = PreparedPhoto::new(p, matching, options.registration_pixels, &stage)?;
+                stage.add(1)?;
+                Ok(prepared)
+            };
+            let prepared: Vec<PreparedPhoto> = photos.par_iter().map(extract).collect::<Result<_, _>>()?;
+            clock.lap("features");
+            let stage = Stage::new(progress, "match", candidates.len())?;
+            let compare = |&(a, b): &(usize, usize)| -> Result<Option<MatchedPair>, Cancelled> {
+                let pair = match_pair(&prepared, a, b, options, &stage)?;
+                stage.add(1)?;
+                Ok(pair)
+            };
+            let matched = candidates.par_iter().map(compare).collect::<Result<_, _>>()?;
+            clock.lap("match");
+            Ok((prepared, matched))
         };
-        let prepared: Vec<Prepared> = photos.par_iter().map(extract).collect::<Result<_, _>>()?;
-        clock.lap("features");
-        let stage = Stage::new(progress, "match", candidates.len())?;
-        let compare = |&(a, b): &(usize, usize)| -> Result<Option<Tried>, Cancelled> {
-            let pair = try_pair(&prepared, a, b, options, &stage)?;
-            stage.add(1)?;
-            Ok(pair)
-        };
-        let tried = candidates.par_iter().map(compare).collect::<Result<_, _>>()?;
-        clock.lap("match");
-        Ok((prepared, tried))
-    };
     let matching = &options.matching;
-    // The enlarged image is most of the work of SIFT, faint features are less exact: both are seldom needed.
+    // The upsampled image takes most of the time of SIFT, and faint features are less accurate; both are rarely needed.
     let plain = match &matching.features {
         FeatureOptions::Sift(sift) if sift.upsample => {
             let features = FeatureOptions::Sift(SiftOptions { upsample: false, min_features: 0, ..sift.clone() });
@@ -306,39 +306,39 @@ fn register(
         }
         _ => None,
     };
-    let (mut prepared, mut tried) = look(plain.as_ref().unwrap_or(matching))?;
-    if plain.is_some() && !held_firmly(n, &tried) {
-        (prepared, tried) = look(matching)?;
+    let (mut prepared, mut matched) = match_all(plain.as_ref().unwrap_or(matching))?;
+    if plain.is_some() && !is_firmly_connected(n, &matched) {
+        (prepared, matched) = match_all(matching)?;
     }
-    let (pairs, verified): (Vec<PanoramaPair>, Vec<Option<VerifiedPair>>) = tried.into_iter().flatten().unzip();
+    let (pairs, verified): (Vec<PanoramaPair>, Vec<Option<VerifiedPair>>) = matched.into_iter().flatten().unzip();
     let verified: Vec<VerifiedPair> = verified.into_iter().flatten().collect();
-    let known: Vec<Photo> = prepared.iter().map(|p| p.photo).collect();
-    let alignment = match align(&known, &verified, &options.align, progress) {
+    let cameras: Vec<Photo> = prepared.iter().map(|p| p.photo).collect();
+    let alignment = match align(&cameras, &verified, &options.align, progress) {
         Ok(alignment) => alignment,
         Err(AlignError::Cancelled(stop)) => return Err(stop.into()),
         Err(source) => {
             let views = vec![Err(Unplaced::NoOverlap); n];
-            return Err(PanoramaError::Align { source, images: describe(&prepared, &views, &pairs) });
+            return Err(PanoramaError::Align { source, images: image_reports(&prepared, &views, &pairs) });
         }
     };
-    let mut images = describe(&prepared, &alignment.views, &pairs);
+    let mut images = image_reports(&prepared, &alignment.views, &pairs);
     let sizes: Vec<_> = prepared.iter().zip(photos).map(|(p, photo)| (p.factor, photo.image.size())).collect();
     for (image, (_, size)) in images.iter_mut().zip(&sizes) {
         image.size = *size;
     }
     let alignment = alignment.resized(&sizes);
     clock.lap("align");
-    let features = prepared.into_iter().map(Prepared::into_features).collect();
+    let features = prepared.into_iter().map(PreparedPhoto::into_features).collect();
     Ok(Registered { alignment, images, pairs, features, clock })
 }
 
-/// Joins photographs whose views are known from others: the next frames of a rig, another exposure of the same views.
+/// Stitches photographs with a known alignment: the next frames of a rig, or another exposure of the same views.
 ///
-/// As [`panorama`] without features, matches and alignment; light, seams and local deformations are those of these photographs, so that the photographs that were registered give the same bytes
-/// again. As many photographs, of the same sizes, in the same order.
+/// As [`panorama`] without features, matching and alignment. Exposure compensation, seams and local deformations are computed from these photographs, so that
+/// the registered photographs give the same bytes again. Number, sizes and order must be those of the registration.
 ///
 /// # Errors
-/// [`PanoramaError`]: the photographs are not as registered, or the canvas would be too large.
+/// [`PanoramaError`]: the photographs do not match the registration, or the canvas would be too large.
 pub fn panorama_with<T: PhotoSample>(
     registration: &Registration,
     photos: &[ImageView<'_, T, 3>],
@@ -361,57 +361,58 @@ pub fn panorama_with<T: PhotoSample>(
         gain: [1.0; 3],
     });
     let images = images.collect();
-    let found = Registered { alignment, images, pairs: Vec::new(), features: Vec::new(), clock: StageClock::new() };
-    draw(photos, found, options, progress)
+    let registered =
+        Registered { alignment, images, pairs: Vec::new(), features: Vec::new(), clock: StageClock::new() };
+    composite(photos, registered, options, progress)
 }
 
-/// The picture, and what is to be told of it.
-fn draw<T: PhotoSample>(
+/// Composites the panorama and assembles the result.
+fn composite<T: PhotoSample>(
     photos: &[ImageView<'_, T, 3>],
-    found: Registered,
+    registered: Registered,
     options: &CompositingOptions,
     progress: &dyn Progress,
 ) -> Result<PanoramaResult<T>, PanoramaError> {
-    let Registered { alignment, mut images, pairs, features, mut clock } = found;
+    let Registered { alignment, mut images, pairs, features, mut clock } = registered;
     for (image, view) in images.iter_mut().zip(&alignment.views) {
         image.focal = view.as_ref().ok().filter(|_| alignment.motion == CameraMotion::Rotation).map(|v| v.camera.fx);
     }
-    let drawn = render(photos, &alignment, options, progress)?;
-    for (image, gain) in images.iter_mut().zip(&drawn.gains.gains) {
+    let rendered = render(photos, &alignment, options, progress)?;
+    for (image, gain) in images.iter_mut().zip(&rendered.gains.gains) {
         image.gain = *gain;
     }
-    for (stage, seconds) in &drawn.stages {
+    for (stage, seconds) in &rendered.stages {
         clock.add(stage, *seconds);
     }
     Ok(PanoramaResult {
-        image: drawn.image,
-        radiance: drawn.radiance,
-        mask: drawn.mask,
-        labels: drawn.labels,
+        image: rendered.image,
+        radiance: rendered.radiance,
+        mask: rendered.mask,
+        labels: rendered.labels,
         images,
         pairs,
         features,
-        canvas: drawn.canvas,
-        map: drawn.map,
-        reaches_beyond: drawn.reaches_beyond,
+        canvas: rendered.canvas,
+        map: rendered.map,
+        reaches_beyond: rendered.reaches_beyond,
         reprojection_rms_px: alignment.rms_px,
         alignment,
         stages: clock.into_stages(),
     })
 }
 
-/// A photograph ready to be matched.
-struct Prepared {
+/// A photograph prepared for matching.
+struct PreparedPhoto {
     /// In pixels of the reduced photograph.
     photo: Photo,
-    /// Size of the photograph over that of the reduced one.
+    /// Ratio of the full to the reduced size.
     factor: f64,
     features: Features,
     /// Why it has no features.
     failure: Option<FeatureError>,
 }
 
-impl Prepared {
+impl PreparedPhoto {
     fn new(
         p: &PanoramaPhoto<'_>,
         matching: &MatchingOptions,
@@ -437,36 +438,36 @@ impl Prepared {
         Ok(Self { photo, factor, features, failure })
     }
 
-    /// In pixels of the photograph.
+    /// Returns the features in pixels of the full photograph.
     fn into_features(mut self) -> Features {
         rescale(&mut self.features, Scaling::uniform(self.factor));
         self.features
     }
 }
 
-/// A pair that was matched, and what verification left of it.
-type Tried = (PanoramaPair, Option<VerifiedPair>);
+/// A matched pair, and its verification if it succeeded.
+type MatchedPair = (PanoramaPair, Option<VerifiedPair>);
 
-/// Agreeing matches that hold two photographs together firmly. On sixteen rendered sets, whose links had 66 and more, neighbors then lie within 0.16 px of the
-/// truth (0.08 px median at 480 px, 0.05 px at 800 px); with those of the enlarged image too, within 0.08 px (0.04 px median), at twice the time for features.
-const FIRM: usize = 50;
+/// Number of inliers of a firm connection. On sixteen rendered sets, with 66 and more inliers, neighbors are aligned within 0.16 px (median 0.08 px at 480
+/// px, 0.05 px at 800 px); upsampled SIFT halves that at twice the time.
+const FIRM_INLIERS: usize = 50;
 
-/// Whether all photographs hang together by links that are firm.
-fn held_firmly(n: usize, tried: &[Option<Tried>]) -> bool {
-    let verified = tried.iter().flatten().filter_map(|(_, verified)| verified.as_ref());
-    let firm = verified.filter(|v| v.inliers.len() >= FIRM);
+/// Returns whether firm pairs connect all photographs.
+fn is_firmly_connected(n: usize, pairs: &[Option<MatchedPair>]) -> bool {
+    let verified = pairs.iter().flatten().filter_map(|(_, verified)| verified.as_ref());
+    let firm = verified.filter(|v| v.inliers.len() >= FIRM_INLIERS);
     let mut sets = UnionFind::new(n);
     firm.filter(|v| sets.union(v.a as u32, v.b as u32)).count() + 1 >= n
 }
 
-/// Matches and verifies a pair; `None` where one has no features.
-fn try_pair(
-    prepared: &[Prepared],
+/// Matches and verifies a pair; `None` if one has no features.
+fn match_pair(
+    prepared: &[PreparedPhoto],
     a: usize,
     b: usize,
     options: &PanoramaOptions,
     progress: &dyn Progress,
-) -> Result<Option<Tried>, Cancelled> {
+) -> Result<Option<MatchedPair>, Cancelled> {
     let (p, q) = (&prepared[a], &prepared[b]);
     let matches = match match_features(&p.features, &q.features, &options.matching, progress) {
         Ok(matches) => matches,
@@ -474,7 +475,7 @@ fn try_pair(
         Err(_) => return Ok(None),
     };
     let pixels = correspondences(&p.features, &q.features, &matches);
-    let size = |p: &Prepared| (p.photo.width, p.photo.height);
+    let size = |p: &PreparedPhoto| (p.photo.width, p.photo.height);
     let verified = verify_pair((a, size(p)), (b, size(q)), &pixels, &options.verify);
     let (verified, rejected) = match verified {
         Ok(pair) => (Some(pair), None),
@@ -484,20 +485,20 @@ fn try_pair(
     Ok(Some((PanoramaPair { a, b, matches, inliers, rejected }, verified)))
 }
 
-/// What to tell about each photograph.
-fn describe(
-    prepared: &[Prepared],
+/// Assembles the results for each photograph.
+fn image_reports(
+    prepared: &[PreparedPhoto],
     views: &[Result<cv_panorama::View, Unplaced>],
     pairs: &[PanoramaPair],
 ) -> Vec<PanoramaImage> {
     let nearest = |i: usize| {
-        let miss = |p: &PanoramaPair| match p.rejected {
+        let rejected = |p: &PanoramaPair| match p.rejected {
             Some(PairRejection::TooFewInliers { inliers: agree, in_overlap, needed }) if p.a == i || p.b == i => {
                 Some(NearestPair { other: if p.a == i { p.b } else { p.a }, agree, in_overlap, needed })
             }
             _ => None,
         };
-        pairs.iter().filter_map(miss).max_by_key(|miss| miss.agree)
+        pairs.iter().filter_map(rejected).max_by_key(|rejected| rejected.agree)
     };
     let reason = |i: usize, why: Unplaced| match (why, &prepared[i].failure) {
         (_, Some(failure)) => LeftOut::Features(*failure),
@@ -526,7 +527,7 @@ mod tests {
     use cv_core::Matrix3;
 
     #[test]
-    fn photographs_hold_firmly_where_firm_links_connect_them_all() {
+    fn photographs_are_firmly_connected_if_firm_pairs_connect_them_all() {
         let link = |a: usize, b: usize, agree: usize| {
             let pair = PanoramaPair { a, b, matches: Vec::new(), inliers: Vec::new(), rejected: None };
             let (inliers, matches) = ((0..agree).collect(), vec![Correspondence::new(0.0, 0.0, 0.0, 0.0); agree]);
@@ -536,10 +537,10 @@ mod tests {
             let pair = PanoramaPair { a: 0, b: 1, matches: Vec::new(), inliers: Vec::new(), rejected: None };
             Some((pair, None))
         };
-        assert!(held_firmly(0, &[]) && held_firmly(1, &[]));
-        assert!(!held_firmly(2, &[None]) && !held_firmly(2, &[rejected()]));
-        assert!(held_firmly(3, &[link(1, 2, FIRM), None, link(0, 2, FIRM), link(0, 1, 9)]));
-        // Two firm pairs and a loose link between them.
-        assert!(!held_firmly(4, &[link(2, 3, FIRM), link(0, 1, 900), link(0, 2, FIRM - 1)]));
+        assert!(is_firmly_connected(0, &[]) && is_firmly_connected(1, &[]));
+        assert!(!is_firmly_connected(2, &[None]) && !is_firmly_connected(2, &[rejected()]));
+        assert!(is_firmly_connected(3, &[link(1, 2, FIRM_INLIERS), None, link(0, 2, FIRM_INLIERS), link(0, 1, 9)]));
+        // Two firm pairs and a loose pair between them.
+        assert!(!is_firmly_connected(4, &[link(2, 3, FIRM_INLIERS), link(0, 1, 900), link(0, 2, FIRM_INLIERS - 1)]));
     }
 }

@@ -1,46 +1,46 @@
-//! Finding an object by its color: train on photographs with masks, then mark it in others.
+//! Color segmentation of an object: training on images with masks, then segmentation of other images.
 
 use crate::Progress;
 use cv_core::{Cancelled, ImageView, Mask, StageClock};
 use cv_segment::{ColorModel, DetectOptions, Detection, Labeled, SegmentError, TrainOptions, Trained, train};
 
-/// What [`train_segment`] learned.
+/// Result of [`train_segment`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct SegmentTraining {
-    /// The model and its scores on the training photographs.
+    /// The model and its scores on the training images.
     pub trained: Trained,
     /// Stage names and their seconds.
     pub stages: Vec<(&'static str, f64)>,
 }
 
-/// What [`segment`] found in a photograph.
+/// Result of [`segment`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct SegmentResult {
-    /// Where the object is.
+    /// The object mask.
     pub mask: Mask,
-    /// The share of the photograph's pixels that are marked, 0 to 1; 0 for an empty photograph.
+    /// Fraction of marked pixels, 0 to 1; 0 for an empty image.
     pub fraction: f64,
     /// Stage names and their seconds.
     pub stages: Vec<(&'static str, f64)>,
 }
 
-/// What [`detect`] found in a photograph.
+/// Result of [`detect`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct DetectResult {
-    /// Where the found objects are; false everywhere where none is.
+    /// Mask of the detected objects.
     pub mask: Mask,
-    /// The share of the photograph's pixels that are marked, 0 to 1; 0 for an empty photograph.
+    /// Fraction of marked pixels, 0 to 1; 0 for an empty image.
     pub fraction: f64,
-    /// The regions in the object's color, found or not, the best score first.
+    /// All regions of the object's color, detected or not, by descending score.
     pub objects: Vec<Detection>,
     /// Stage names and their seconds.
     pub stages: Vec<(&'static str, f64)>,
 }
 
-/// Learns an object's colors from photographs and masks.
+/// Trains a color model of an object from images with masks.
 ///
 /// # Errors
-/// [`SegmentError`]: nothing to train on, masks that do not fit or show nothing, options out of range.
+/// [`SegmentError`]: no training data, masks of other sizes or without objects, options out of range.
 pub fn train_segment(
     photos: &[Labeled<'_>],
     options: &TrainOptions,
@@ -52,7 +52,7 @@ pub fn train_segment(
     Ok(SegmentTraining { trained, stages: clock.into_stages() })
 }
 
-/// Marks the object in a photograph.
+/// Segments an image.
 ///
 /// # Errors
 /// [`Cancelled`].
@@ -71,11 +71,11 @@ pub fn segment(
     Ok(SegmentResult { mask, fraction, stages: clock.into_stages() })
 }
 
-/// Finds the object in a photograph: the regions that [`segment`] marks, each measured and scored by its agreement with the training objects in color and
-/// shape. What scores too low is not marked.
+/// Detects objects: measures the regions of [`segment`] and scores each by its agreement with the training objects in
+/// color and shape. Regions with a low score are not marked.
 ///
 /// # Errors
-/// [`SegmentError`]: an option out of range, or stopped.
+/// [`SegmentError`]: an option out of range, or the job was stopped.
 pub fn detect(
     photo: ImageView<'_, u8, 3>,
     model: &ColorModel,
@@ -89,11 +89,11 @@ pub fn detect(
     clock.lap("classify");
     let cleaned = model.cleanup().apply(raw.view(), progress)?;
     clock.lap("clean up");
-    let found = model.detect(cleaned.view(), score.view(), options, progress)?;
+    let detections = model.detect(cleaned.view(), score.view(), options, progress)?;
     clock.lap("detect");
-    let marked: usize = found.objects.iter().filter(|o| o.found).map(|o| o.region.area).sum();
-    let fraction = marked as f64 / found.mask.as_slice().len().max(1) as f64;
-    Ok(DetectResult { mask: found.mask, fraction, objects: found.objects, stages: clock.into_stages() })
+    let marked: usize = detections.objects.iter().filter(|o| o.found).map(|o| o.region.area).sum();
+    let fraction = marked as f64 / detections.mask.as_slice().len().max(1) as f64;
+    Ok(DetectResult { mask: detections.mask, fraction, objects: detections.objects, stages: clock.into_stages() })
 }
 
 #[cfg(test)]
@@ -105,7 +105,7 @@ mod tests {
     use cv_synth::{RenderOptions, ball_photos};
 
     #[test]
-    fn a_ball_is_found_in_photographs_it_was_not_trained_on() {
+    fn a_ball_is_segmented_in_images_outside_the_training_set() {
         let camera = Camera::from_focal(240, 180, 220.0);
         for seed in [3, 4] {
             let photos = ball_photos(seed, 8, &camera, &RenderOptions::default()).unwrap();
@@ -120,14 +120,14 @@ mod tests {
                         ConfusionMatrix::new(segment(*photo, &model, &Silent).unwrap().mask.view(), *mask).unwrap()
                     })
                     .sum();
-                // The bar for generated scenes.
+                // The requirement for generated scenes.
                 assert!(scores.f1() >= 0.97, "seed {seed}, {space:?}: {} {scores:?}", scores.f1());
             }
         }
     }
 
     #[test]
-    fn what_has_the_color_but_not_the_shape_is_not_found() {
+    fn an_object_of_the_same_color_and_another_shape_is_not_detected() {
         let camera = Camera::from_focal(240, 180, 220.0);
         let photos = ball_photos(5, 10, &camera, &RenderOptions::default()).unwrap();
         let labeled: Vec<Labeled<'_>> = photos.iter().map(|p| (p.view.image.view(), p.mask.view())).collect();
@@ -139,7 +139,7 @@ mod tests {
             println!("ball {:?} {:?}", best.score, best.region);
             assert!(best.found, "{best:?}");
             assert_eq!(ball.mask, segment(photo, &model, &Silent).unwrap().mask);
-            // The center of the ball's true pixels.
+            // The centroid of the true mask.
             let (mut sum, mut count) = ([0.0; 2], 0.0);
             for y in 0..mask.height() {
                 for x in (0..mask.width()).filter(|&x| mask.row(y)[x]) {
@@ -148,10 +148,10 @@ mod tests {
                 }
             }
             let center = best.region.center;
-            // A border lost on one side, one pixel wide, moves the center by less than a pixel.
+            // A missing border of one pixel on one side moves the centroid by less than a pixel.
             assert!((center.x - sum[0] / count).hypot(center.y - sum[1] / count) < 1.0, "{best:?}");
             assert!((best.region.area as f64 / count - 1.0).abs() < 0.15, "{best:?}");
-            // The ball's pixels in rows of a bar, on gray: the same colors, another shape.
+            // A bar with the ball's pixels on gray: the same colors, another shape.
             let colors: Vec<[u8; 3]> = (0..mask.height())
                 .flat_map(|y| (0..mask.width()).map(move |x| (x, y)))
                 .filter(|&(x, y)| mask.row(y)[x])
@@ -168,7 +168,7 @@ mod tests {
             println!("bar {:?} {:?}", result.objects[0].score, result.objects[0].region);
             assert!(!result.objects.is_empty() && result.objects.iter().all(|o| !o.found), "{:?}", result.objects);
             assert!(result.fraction == 0.0 && result.mask.as_slice().iter().all(|&m| !m));
-            // Who asks for no score at all has every region.
+            // With a minimum score of zero, all regions are detected.
             let all = detect(bar.view(), &model, &DetectOptions { min_score: 0.0 }, &Silent).unwrap();
             assert_eq!(all.mask, segment(bar.view(), &model, &Silent).unwrap().mask);
         }
@@ -177,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn an_empty_photograph_has_an_empty_mask() {
+    fn an_empty_image_has_an_empty_mask() {
         let photo = RgbU8::from_fn(8, 8, |x, _| if x < 4 { [200, 90, 20] } else { [40, 90, 200] });
         let mask = Mask::from_fn(8, 8, |x, _| [x < 4]);
         let model =

@@ -1,39 +1,43 @@
-//! How far apart the rows of a pair are at pixels that were matched: block matching up and down, along the column to which the disparity leads.
+//! Vertical disparity at matched pixels: block matching up and down, in the column of the disparity.
 
 use cv_core::{Correspondence, ImageView, Point2};
 use cv_stereo::{DisparityMap, Intensity, PixelState};
 
-/// Cells across and down, of each of which one pixel is asked.
+/// Number of cells across and down; one pixel is sampled in each.
 const CELLS: (usize, usize) = (48, 32);
-/// Half of a block's width and height, and how far up and down it is looked for, in px.
-const BLOCK: (usize, usize) = (4, 3);
-const REACH: usize = 3;
-const WIDTH: usize = 2 * BLOCK.0 + 1;
-const HEIGHT: usize = 2 * BLOCK.1 + 1;
+/// Block radius (horizontal, vertical) in px.
+const BLOCK_RADIUS: (usize, usize) = (4, 3);
+/// Vertical search radius in px.
+const SEARCH_RADIUS: usize = 3;
+/// Size of a block in px.
+const WIDTH: usize = 2 * BLOCK_RADIUS.0 + 1;
+const HEIGHT: usize = 2 * BLOCK_RADIUS.1 + 1;
 type Block = [[f32; WIDTH]; HEIGHT];
-/// How far aside it may be, in px, and what is cut out of the right photograph: a pixel more each way, to interpolate.
-const ASIDE: usize = 2;
-const STRIP: (usize, usize) = (WIDTH + 2 * ASIDE + 1, HEIGHT + 2 * REACH + 1);
-/// Of the steps downward in a block, the share (of squares) that does not come with steps across, as along an edge that runs aslant.
-const CLEAR: f32 = 0.3;
-/// Share of the squares downward that holds a block against steps across.
-const STAY: f32 = 0.01;
-/// Gauss-Newton steps: each leaves a small part of the error.
-const STEPS: usize = 4;
-/// Vertical step of brightness that a pixel needs to be asked, as a share of the range.
-const STEP: f32 = 0.03;
+/// Horizontal search radius in px.
+const HORIZONTAL_RADIUS: usize = 2;
+/// Size of the search region in the right image, with a pixel more for interpolation.
+const REGION: (usize, usize) = (WIDTH + 2 * HORIZONTAL_RADIUS + 1, HEIGHT + 2 * SEARCH_RADIUS + 1);
+/// Minimum fraction of the squared vertical gradient that is not correlated with the horizontal gradient, as it is
+/// along an oblique edge.
+const MIN_INDEPENDENT_FRACTION: f32 = 0.3;
+/// Damping of horizontal steps, as a ratio of the squared vertical gradient.
+const HORIZONTAL_DAMPING: f32 = 0.01;
+/// Gauss-Newton iterations.
+const ITERATIONS: usize = 4;
+/// Minimum vertical intensity difference of a sampled pixel, on a range of 0 to 1.
+const MIN_VERTICAL_GRADIENT: f32 = 0.03;
 
-/// The matched pixels of the map that show an edge along the row, the clearest one of each cell, with the places in the right photograph that look like
-/// them. The images and the map have one size. Linear in the number of pixels; one in four is looked at.
+/// Returns correspondences with subpixel vertical disparity: in each cell, the matched pixel with the largest vertical
+/// gradient. The images and the map must have the same size. Linear in the number of pixels; one in four is tested.
 pub(crate) fn vertical_matches<T: Intensity, const C: usize>(
     left: ImageView<'_, T, C>,
     right: ImageView<'_, T, C>,
     map: &DisparityMap,
 ) -> Vec<Correspondence> {
     let (width, height) = left.size();
-    // Room for a block, its gradient and its reach.
-    let margin = (BLOCK.0 + 1, BLOCK.1 + REACH + 1);
-    let (mut found, inside) = (Vec::new(), (width.saturating_sub(2 * margin.0), height.saturating_sub(2 * margin.1)));
+    // Space for a block, its gradient and the search.
+    let margin = (BLOCK_RADIUS.0 + 1, BLOCK_RADIUS.1 + SEARCH_RADIUS + 1);
+    let (mut matches, inside) = (Vec::new(), (width.saturating_sub(2 * margin.0), height.saturating_sub(2 * margin.1)));
     let cells = (CELLS.0.min(inside.0 / 4), CELLS.1.min(inside.1 / 4));
     for row in 0..cells.1 {
         for column in 0..cells.0 {
@@ -43,91 +47,94 @@ pub(crate) fn vertical_matches<T: Intensity, const C: usize>(
             let rows = range(row, cells.1, inside.1, margin.1);
             let pixels = rows.flat_map(|y| range(column, cells.0, inside.0, margin.0).map(move |x| (x, y)));
             let matched = pixels.filter(|&(x, y)| map.state.at(x, y)[0] == PixelState::Matched);
-            let step = |(x, y): (usize, usize)| (gray(left, x, y + 1) - gray(left, x, y - 1)).abs();
-            let clearest = matched.map(|pixel| (step(pixel), pixel)).reduce(|a, b| if b.0 > a.0 { b } else { a });
-            let Some((_, (x, y))) = clearest.filter(|(step, _)| *step >= STEP) else { continue };
+            let gradient = |(x, y): (usize, usize)| (intensity(left, x, y + 1) - intensity(left, x, y - 1)).abs();
+            let strongest = matched.map(|pixel| (gradient(pixel), pixel)).reduce(|a, b| if b.0 > a.0 { b } else { a });
+            let Some((_, (x, y))) = strongest.filter(|(gradient, _)| *gradient >= MIN_VERTICAL_GRADIENT) else {
+                continue;
+            };
             let disparity = map.disparity.at(x, y)[0];
-            if let Some(down) = offset(left, right, (x, y), disparity) {
+            if let Some(down) = block_offset(left, right, (x, y), disparity) {
                 let b = Point2::new(x as f64 - f64::from(disparity), y as f64 + down);
-                found.push(Correspondence { a: Point2::new(x as f64, y as f64), b });
+                matches.push(Correspondence { a: Point2::new(x as f64, y as f64), b });
             }
         }
     }
-    found
+    matches
 }
 
-/// Brightness of a pixel, 0 to 1.
-fn gray<T: Intensity, const C: usize>(view: ImageView<'_, T, C>, x: usize, y: usize) -> f32 {
+/// Returns the intensity of a pixel, 0 to 1.
+fn intensity<T: Intensity, const C: usize>(view: ImageView<'_, T, C>, x: usize, y: usize) -> f32 {
     let pixel = view.at(x, y);
     f32::from(pixel[if C >= 3 { 1 } else { 0 }].to_u16()) / 65535.0
 }
 
-/// How far below its row the right photograph shows a pixel's block: the least sum of squared differences about the blocks' means, then Gauss-Newton steps
-/// across and down with the gradient of the left block (Baker & Matthews, "Lucas-Kanade 20 years on", IJCV 2004, inverse compositional). Across as well, since
-/// along an edge that runs aslant the disparity has made up for the offset. `None` where an edge leaves that open, where the block is not found within its
-/// reach, and where it would lie outside.
-fn offset<T: Intensity, const C: usize>(
+/// Estimates the vertical offset of a pixel's block in the right image: minimum of the zero-mean sum of squared
+/// differences, then Gauss-Newton steps in both directions with the gradient of the left block (inverse compositional,
+/// Baker & Matthews, "Lucas-Kanade 20 years on", IJCV 2004). Horizontal steps are needed since along an oblique edge
+/// the disparity has compensated for the offset. `None` for an oblique edge (aperture problem), outside the search
+/// range, or at the image border.
+fn block_offset<T: Intensity, const C: usize>(
     left: ImageView<'_, T, C>,
     right: ImageView<'_, T, C>,
     (x, y): (usize, usize),
     disparity: f32,
 ) -> Option<f64> {
     let column = x as f32 - disparity;
-    let first = column.floor() as i64 - (BLOCK.0 + ASIDE) as i64;
-    if first < 0 || first as usize + STRIP.0 > right.width() {
+    let first = column.floor() as i64 - (BLOCK_RADIUS.0 + HORIZONTAL_RADIUS) as i64;
+    if first < 0 || first as usize + REGION.0 > right.width() {
         return None;
     }
     let first = first as usize;
-    let (x, y) = (x - BLOCK.0, y - BLOCK.1);
+    let (x, y) = (x - BLOCK_RADIUS.0, y - BLOCK_RADIUS.1);
     let block = |value: &dyn Fn(usize, usize) -> f32| -> Block {
         let values: Block = std::array::from_fn(|j| std::array::from_fn(|i| value(i, j)));
         let mean = values.as_flattened().iter().sum::<f32>() / (WIDTH * HEIGHT) as f32;
         values.map(|row| row.map(|value| value - mean))
     };
-    let here = block(&|i, j| gray(left, x + i, y + j));
-    let across = block(&|i, j| 0.5 * (gray(left, x + i + 1, y + j) - gray(left, x + i - 1, y + j)));
-    let downward = block(&|i, j| 0.5 * (gray(left, x + i, y + j + 1) - gray(left, x + i, y + j - 1)));
+    let template = block(&|i, j| intensity(left, x + i, y + j));
+    let across = block(&|i, j| 0.5 * (intensity(left, x + i + 1, y + j) - intensity(left, x + i - 1, y + j)));
+    let downward = block(&|i, j| 0.5 * (intensity(left, x + i, y + j + 1) - intensity(left, x + i, y + j - 1)));
     let sum = |a: &Block, b: &Block| a.as_flattened().iter().zip(b.as_flattened()).map(|(a, b)| a * b).sum::<f32>();
     let [xx, xy, yy] = [sum(&across, &across), sum(&across, &downward), sum(&downward, &downward)];
-    // An edge along the row says nothing across: stay there.
-    let xx = xx + STAY * yy;
+    // Without a horizontal gradient, horizontal steps are zero.
+    let xx = xx + HORIZONTAL_DAMPING * yy;
     let determinant = xx * yy - xy * xy;
-    // Also false for a block without any gradient.
-    let is_clear = determinant > CLEAR * xx * yy && yy > 0.0;
-    if !is_clear {
+    // Also false for a block without gradient.
+    let is_determined = determinant > MIN_INDEPENDENT_FRACTION * xx * yy && yy > 0.0;
+    if !is_determined {
         return None;
     }
-    // The right photograph as far as the block may reach.
-    let strip: [[f32; STRIP.0]; STRIP.1] =
-        std::array::from_fn(|j| std::array::from_fn(|i| gray(right, first + i, y + j - REACH)));
-    // Of the block `(across, down)` from the strip's corner.
+    // The search region of the right image.
+    let region: [[f32; REGION.0]; REGION.1] =
+        std::array::from_fn(|j| std::array::from_fn(|i| intensity(right, first + i, y + j - SEARCH_RADIUS)));
+    // Difference to the block at `(across, down)` from the region's corner.
     let difference = |across: f32, down: f32| {
         let ((i0, j0), (fx, fy)) = ((across as usize, down as usize), (across.fract(), down.fract()));
-        let there = block(&|i, j| {
-            let in_row = |row: &[f32; STRIP.0]| row[i0 + i] + fx * (row[i0 + i + 1] - row[i0 + i]);
-            let (above, below) = (in_row(&strip[j0 + j]), in_row(&strip[j0 + j + 1]));
+        let target = block(&|i, j| {
+            let in_row = |row: &[f32; REGION.0]| row[i0 + i] + fx * (row[i0 + i + 1] - row[i0 + i]);
+            let (above, below) = (in_row(&region[j0 + j]), in_row(&region[j0 + j + 1]));
             above + fy * (below - above)
         });
-        std::array::from_fn(|j| std::array::from_fn(|i| here[j][i] - there[j][i]))
+        std::array::from_fn(|j| std::array::from_fn(|i| template[j][i] - target[j][i]))
     };
-    let mut place = (ASIDE as f32 + column.fract(), 0.0);
-    let mut least = f32::INFINITY;
-    for down in 0..2 * REACH {
-        let off = difference(place.0, down as f32);
-        let cost = sum(&off, &off);
-        if cost < least {
-            (least, place.1) = (cost, down as f32);
+    let mut position = (HORIZONTAL_RADIUS as f32 + column.fract(), 0.0);
+    let mut min_cost = f32::INFINITY;
+    for down in 0..2 * SEARCH_RADIUS {
+        let residual = difference(position.0, down as f32);
+        let cost = sum(&residual, &residual);
+        if cost < min_cost {
+            (min_cost, position.1) = (cost, down as f32);
         }
     }
-    for _ in 0..STEPS {
-        let off = difference(place.0, place.1);
-        let (ex, ey) = (sum(&off, &across), sum(&off, &downward));
-        place.0 += (yy * ex - xy * ey) / determinant;
-        place.1 += (xx * ey - xy * ex) / determinant;
-        let (last_x, last_y) = ((2 * ASIDE) as f32, (2 * REACH) as f32);
-        if !((0.0..last_x).contains(&place.0) && (0.0..last_y).contains(&place.1)) {
+    for _ in 0..ITERATIONS {
+        let residual = difference(position.0, position.1);
+        let (ex, ey) = (sum(&residual, &across), sum(&residual, &downward));
+        position.0 += (yy * ex - xy * ey) / determinant;
+        position.1 += (xx * ey - xy * ex) / determinant;
+        let (last_x, last_y) = ((2 * HORIZONTAL_RADIUS) as f32, (2 * SEARCH_RADIUS) as f32);
+        if !((0.0..last_x).contains(&position.0) && (0.0..last_y).contains(&position.1)) {
             return None;
         }
     }
-    Some(f64::from(place.1) - REACH as f64)
+    Some(f64::from(position.1) - SEARCH_RADIUS as f64)
 }

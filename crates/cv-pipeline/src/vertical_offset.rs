@@ -1,89 +1,92 @@
-//! Rows that lie a little apart in a pair that is rectified otherwise: how far, as an affine function of the place, and the right photograph
-//! moved back.
+//! Vertical disparity of a nearly rectified pair: estimation as an affine function of the position, and correction of
+//! the right image.
 
-use crate::depth::color_bytes;
-use crate::disparity_range::matches_of;
+use crate::depth::to_rgb8;
+use crate::disparity_range::match_pair;
 use crate::vertical_matches::vertical_matches;
 use crate::{DepthError, Progress, RangeError};
 use cv_core::{Correspondence, Image, ImageView, Matrix3, Point2, Vector3};
 use cv_imgproc::{Pixel, WarpMap};
 use cv_stereo::{DisparityMap, DisparityMatcher, Intensity, RectifyError};
 
-/// Where the blocks of matched pixels leave the offset open, and fewer pixels than this are matched and confirmed, features are asked: a pixel of offset takes a
-/// third to a half of the matches of aligned pairs, of which 63 to 99 % are matched.
-const FEW: f64 = 0.6;
-/// Offsets in px that are corrected: less costs little more than moving the rows does, and more is no rectified pair. (A quarter of a pixel between the rows
-/// already doubles the disparities that are wrong by half a pixel; the rows are moved by linear interpolation, which blurs.)
-const LEAST: f64 = 1.0 / 3.0;
-const MOST: f64 = 8.0;
-/// Features that lie farther apart than this in y are matched wrongly: `MOST` and half of it again.
-const REACH: f64 = 12.0;
-/// Of larger offsets in px blocks see only where they are least: elsewhere nothing is matched, or they end at their reach.
-const SEEN_BY_BLOCKS: f64 = 1.5;
-/// Matches that must agree with the offset to a pixel, and their share of those within `REACH`: of features, and of blocks, which are looked for within 3 px
-/// only, so that a third would agree by chance.
-const NEEDED: usize = 32;
-const FEATURES_AGREE: f64 = 0.5;
-const BLOCKS_AGREE: f64 = 0.75;
+/// Fraction of matched and confirmed pixels below which features estimate the offset if blocks do not: an offset of a
+/// pixel removes a third to a half of the matches of aligned pairs, which have 63 to 99 %.
+const MIN_MATCHED_FRACTION: f64 = 0.6;
+/// Smallest offset in px that is corrected. A quarter of a pixel doubles the disparities that are wrong by half a pixel,
+/// about as much as the blur of linear interpolation costs.
+const MIN_OFFSET: f64 = 1.0 / 3.0;
+/// Largest offset in px that is corrected: with a larger one, the pair is not rectified.
+const MAX_OFFSET: f64 = 8.0;
+/// Vertical disparity in px above which a feature match is an outlier: 1.5 `MAX_OFFSET`.
+const OUTLIER_OFFSET: f64 = 12.0;
+/// Largest offset in px that blocks estimate reliably, within their search range.
+const MAX_BLOCK_OFFSET: f64 = 1.5;
+/// Minimum number of inliers within a pixel.
+const MIN_INLIERS: usize = 32;
+/// Minimum inlier ratio of feature matches within `OUTLIER_OFFSET`.
+const MIN_FEATURE_INLIER_RATIO: f64 = 0.5;
+/// Minimum inlier ratio of block matches, of which a third is within a pixel by chance, since their search radius is 3 px.
+const MIN_BLOCK_INLIER_RATIO: f64 = 0.75;
 
-/// How far below its row in the left photograph a point lies in the right one, in px: an affine function of its place in the right one.
+/// Vertical disparity in px, right minus left, as an affine function of the position in the right image.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VerticalOffset {
-    /// In the middle of the photograph.
+    /// At the image center.
     pub at_center: f64,
-    /// More at the right border than at the left one.
+    /// Difference from the left to the right border.
     pub across: f64,
-    /// More at the bottom than at the top.
+    /// Difference from the top to the bottom border.
     pub down: f64,
-    /// Width and height in px.
+    /// Image width and height in px.
     pub size: (usize, usize),
 }
 
 impl VerticalOffset {
-    /// At a place of the right photograph.
+    /// Returns the vertical disparity at a position of the right image.
     pub fn at(&self, x: f64, y: f64) -> f64 {
         terms(Point2::new(x, y), self.size).dot(&Vector3::new(self.at_center, self.across, self.down))
     }
 
-    /// The largest one in the photograph, which is at a corner.
+    /// Returns the largest absolute value in the image, which is at a corner.
     pub fn largest(&self) -> f64 {
         self.at_center.abs() + 0.5 * (self.across.abs() + self.down.abs())
     }
 
-    /// Whether the rows are apart, and not so far that this is no rectified pair.
+    /// Returns whether the offset is to be corrected: neither negligible nor that of an unrectified pair.
     fn is_to_correct(&self) -> bool {
-        (LEAST..=MOST).contains(&self.largest())
+        (MIN_OFFSET..=MAX_OFFSET).contains(&self.largest())
     }
 
-    /// What matches of two photographs of this size show; `None` where fewer than the share `agreeing` agree.
-    /// Least squares over the matches near the last estimate, from the most frequent offset on. O(n log n).
-    fn from_matches(matches: &[Correspondence], agreeing: f64, size: (usize, usize)) -> Option<Self> {
-        let apart = |m: &Correspondence| m.b.y - m.a.y;
-        let near: Vec<&Correspondence> = matches.iter().filter(|m| apart(m).abs() <= REACH).collect();
-        let mut sorted: Vec<f64> = near.iter().map(|m| apart(m)).collect();
+    /// Estimates the offset from matches of images with this size; `None` without enough inliers or with an inlier
+    /// ratio below `min_inlier_ratio`. Least squares on the matches near the previous estimate, starting at the mode.
+    /// O(n log n).
+    fn from_matches(matches: &[Correspondence], min_inlier_ratio: f64, size: (usize, usize)) -> Option<Self> {
+        let vertical = |m: &Correspondence| m.b.y - m.a.y;
+        let candidates: Vec<&Correspondence> = matches.iter().filter(|m| vertical(m).abs() <= OUTLIER_OFFSET).collect();
+        let mut sorted: Vec<f64> = candidates.iter().map(|m| vertical(m)).collect();
         sorted.sort_unstable_by(f64::total_cmp);
-        // The two pixels with the most matches.
-        let within = |i: &usize| sorted.partition_point(|d| *d <= sorted[*i] + 2.0) - i;
-        let first = (0..sorted.len()).max_by_key(|i| (within(i), std::cmp::Reverse(*i)))?;
-        let mut model = Vector3::new(sorted[first + within(&first) / 2], 0.0, 0.0);
-        let off = |model: &Vector3<f64>, m: &Correspondence| model.dot(&terms(m.b, size)) - apart(m);
-        for reach in [4.0, 2.0, 1.0, 1.0] {
-            // Slopes that the places of the matches do not determine are none.
+        // The window of two pixels with most matches.
+        let count_within = |i: &usize| sorted.partition_point(|d| *d <= sorted[*i] + 2.0) - i;
+        let mode = (0..sorted.len()).max_by_key(|i| (count_within(i), std::cmp::Reverse(*i)))?;
+        let mut model = Vector3::new(sorted[mode + count_within(&mode) / 2], 0.0, 0.0);
+        let residual = |model: &Vector3<f64>, m: &Correspondence| model.dot(&terms(m.b, size)) - vertical(m);
+        for threshold in [4.0, 2.0, 1.0, 1.0] {
+            // Regularization: slopes that the matches do not determine are zero.
             let mut normal = Matrix3::from_diagonal(&Vector3::new(1e-9, 0.1, 0.1));
-            let mut right = Vector3::zeros();
-            for m in near.iter().filter(|m| off(&model, m).abs() <= reach) {
+            let mut right_side = Vector3::zeros();
+            for m in candidates.iter().filter(|m| residual(&model, m).abs() <= threshold) {
                 let terms = terms(m.b, size);
                 normal += terms * terms.transpose();
-                right += terms * apart(m);
+                right_side += terms * vertical(m);
             }
-            model = normal.try_inverse()? * right;
+            model = normal.try_inverse()? * right_side;
         }
-        let agree = near.iter().filter(|m| off(&model, m).abs() <= 1.0).count();
-        let found = Self { at_center: model.x, across: model.y, down: model.z, size };
-        (agree >= NEEDED && agree as f64 >= agreeing * near.len() as f64).then_some(found)
+        let inliers = candidates.iter().filter(|m| residual(&model, m).abs() <= 1.0).count();
+        let estimate = Self { at_center: model.x, across: model.y, down: model.z, size };
+        (inliers >= MIN_INLIERS && inliers as f64 >= min_inlier_ratio * candidates.len() as f64).then_some(estimate)
     }
 
-    /// Matches as if the right photograph had been corrected.
+    /// Corrects the matches as if the right image had been corrected.
     pub(crate) fn correct(&self, matches: &mut [Correspondence]) {
         for m in matches {
             m.b.y -= self.at(m.b.x, m.b.y);
@@ -91,36 +94,40 @@ impl VerticalOffset {
     }
 }
 
-/// One, and the place from the middle in widths and heights.
+/// Returns the terms of the affine function: one, and the position relative to the center in widths and heights.
 fn terms(p: Point2<f64>, (width, height): (usize, usize)) -> Vector3<f64> {
     let from_middle = |at: f64, n: usize| (at + 0.5) / n as f64 - 0.5;
     Vector3::new(1.0, from_middle(p.x, width), from_middle(p.y, height))
 }
 
-/// What is known of the rows of a pair, or of all pairs of a film.
+/// Vertical alignment of a pair, or of all pairs of a film.
 #[derive(Debug, Default)]
 pub(crate) struct Alignment {
-    /// There is no more to ask: the offset is known, or nothing tells it.
+    /// Whether estimation has ended: the offset is known, or cannot be determined.
     is_closed: bool,
     pub(crate) offset: Option<VerticalOffset>,
     map: Option<WarpMap>,
 }
 
 impl Alignment {
-    /// One that never corrects anything.
+    /// Creates an alignment that corrects nothing.
     pub(crate) fn off() -> Self {
         Self { is_closed: true, ..Self::default() }
     }
 
-    /// Takes what features say, where that is more than blocks will tell better: features lie a few tenths of a pixel off.
-    pub(crate) fn learn(&mut self, matches: &[Correspondence], size: (usize, usize)) -> Result<(), DepthError> {
-        let found = VerticalOffset::from_matches(matches, FEATURES_AGREE, size);
-        let larger = found.filter(|offset| !self.is_closed && offset.largest() > SEEN_BY_BLOCKS);
-        larger.map_or(Ok(()), |offset| self.take(offset))
+    /// Uses the offset of feature matches if it is larger than blocks can estimate (blocks are more accurate).
+    pub(crate) fn update_from_features(
+        &mut self,
+        matches: &[Correspondence],
+        size: (usize, usize),
+    ) -> Result<(), DepthError> {
+        let estimate = VerticalOffset::from_matches(matches, MIN_FEATURE_INLIER_RATIO, size);
+        let large = estimate.filter(|offset| !self.is_closed && offset.largest() > MAX_BLOCK_OFFSET);
+        large.map_or(Ok(()), |offset| self.set_offset(offset))
     }
 
-    /// Takes an offset, and makes the map of it where the rows are apart.
-    fn take(&mut self, offset: VerticalOffset) -> Result<(), DepthError> {
+    /// Sets the offset, and creates its warp map if it is to be corrected.
+    fn set_offset(&mut self, offset: VerticalOffset) -> Result<(), DepthError> {
         self.is_closed = true;
         if !offset.is_to_correct() {
             return Ok(());
@@ -128,7 +135,8 @@ impl Alignment {
         let size = offset.size;
         let last = (size.1 - 1) as f64;
         let map = WarpMap::new(size, size, |x, y| {
-            // The offset is known by the place in the right photograph, which is sought: it changes by hundredths of a pixel in one.
+            // The offset is a function of the position in the right image: one fixed-point iteration is enough, since
+            // it changes by hundredths of a pixel per pixel.
             let (x, row) = (x as f64, y as f64);
             let y = row + offset.at(x, row);
             Some(Point2::new(x, (row + offset.at(x, y)).clamp(0.0, last)))
@@ -139,7 +147,7 @@ impl Alignment {
         Ok(())
     }
 
-    /// The right photograph with its rows where they ought to be; `None` where they are, and for a size that has not been seen.
+    /// Returns the corrected right image; `None` without a correction for this size.
     fn corrected<T: Pixel, const C: usize>(
         &self,
         right: ImageView<'_, T, C>,
@@ -150,8 +158,8 @@ impl Alignment {
         corrected.map_err(|_| DepthError::Rectify(RectifyError::TooLarge { width, height }))
     }
 
-    /// Disparities of a pair into `map`, its rows aligned first where they are known not to be, or where its matches show that they are not. The right
-    /// photograph that was matched, where it was corrected.
+    /// Computes the disparities of a pair into `map`, with its vertical disparity corrected if it is known or can be
+    /// estimated from the matches. Returns the corrected right image, if it was corrected.
     pub(crate) fn compute<T: Intensity + Pixel, const C: usize>(
         &mut self,
         matcher: &mut dyn DisparityMatcher<T, C>,
@@ -165,20 +173,20 @@ impl Alignment {
             return Ok(corrected);
         }
         let blocks = vertical_matches(left, right, map);
-        let seen = VerticalOffset::from_matches(&blocks, BLOCKS_AGREE, left.size());
-        if let Some(offset) = seen.filter(|offset| offset.largest() <= SEEN_BY_BLOCKS) {
-            self.take(offset)?;
-        } else if seen.is_some() || map.matched_fraction() < FEW {
-            // Once: in a film they would cost more than all else.
+        let estimate = VerticalOffset::from_matches(&blocks, MIN_BLOCK_INLIER_RATIO, left.size());
+        if let Some(offset) = estimate.filter(|offset| offset.largest() <= MAX_BLOCK_OFFSET) {
+            self.set_offset(offset)?;
+        } else if estimate.is_some() || map.matched_fraction() < MIN_MATCHED_FRACTION {
+            // Once only: in a film, features would take most of the time.
             self.is_closed = true;
-            let [a, b] = [left, right].map(color_bytes);
-            let matches = match matches_of(a.view(), b.view(), progress) {
+            let [a, b] = [left, right].map(to_rgb8);
+            let matches = match match_pair(a.view(), b.view(), progress) {
                 Ok(matches) => matches,
                 Err(RangeError::Cancelled(stop)) => return Err(stop.into()),
                 Err(_) => return Ok(corrected),
             };
-            if let Some(offset) = VerticalOffset::from_matches(&matches, FEATURES_AGREE, left.size()) {
-                self.take(offset)?;
+            if let Some(offset) = VerticalOffset::from_matches(&matches, MIN_FEATURE_INLIER_RATIO, left.size()) {
+                self.set_offset(offset)?;
             }
         }
         let Some(corrected) = self.corrected(right)? else { return Ok(None) };
@@ -193,25 +201,25 @@ mod tests {
 
     const SIZE: (usize, usize) = (600, 400);
 
-    /// Matches all over two photographs, `offset` px apart in y, of which every third is wrong.
+    /// Creates matches all over the image with a vertical disparity of `offset`; every third is an outlier.
     fn matches(offset: impl Fn(f64, f64) -> f64) -> Vec<Correspondence> {
         (0..300)
             .map(|i| {
                 let (x, y) = ((i * 37 % 600) as f64, (i * 53 % 400) as f64);
-                let wrong = if i % 3 == 0 { (i * 29 % 200) as f64 - 100.0 } else { 0.0 };
-                let a = Point2::new(x + 20.0, y - offset(x, y) + wrong);
+                let error = if i % 3 == 0 { (i * 29 % 200) as f64 - 100.0 } else { 0.0 };
+                let a = Point2::new(x + 20.0, y - offset(x, y) + error);
                 Correspondence { a, b: Point2::new(x, y) }
             })
             .collect()
     }
 
     #[test]
-    fn an_affine_offset_is_found_among_wrong_matches() {
+    fn an_affine_offset_is_estimated_among_outliers() {
         let truth = |x: f64, y: f64| 2.0 + 0.005 * (x - 299.5) - 0.004 * (y - 199.5);
-        let found = VerticalOffset::from_matches(&matches(truth), FEATURES_AGREE, SIZE).unwrap();
+        let found = VerticalOffset::from_matches(&matches(truth), MIN_FEATURE_INLIER_RATIO, SIZE).unwrap();
         assert!(found.is_to_correct());
         for (x, y) in [(0.0, 0.0), (599.0, 0.0), (0.0, 399.0), (599.0, 399.0), (299.5, 199.5)] {
-            // A tenth of a pixel: what wrong matches that happen to be near move it by.
+            // A tenth of a pixel, for outliers that happen to be close.
             assert!((found.at(x, y) - truth(x, y)).abs() < 0.1, "{x} {y}: {found:?}");
         }
         assert!((found.largest() - 4.3).abs() < 0.1, "{found:?}");
@@ -221,14 +229,14 @@ mod tests {
     }
 
     #[test]
-    fn rows_that_are_aligned_or_far_apart_stay() {
-        for apart in [0.2, 9.5] {
-            let found = VerticalOffset::from_matches(&matches(|_, _| apart), FEATURES_AGREE, SIZE).unwrap();
-            assert!((found.largest() - apart).abs() < 0.1 && !found.is_to_correct());
+    fn negligible_and_large_offsets_are_not_corrected() {
+        for offset in [0.2, 9.5] {
+            let found = VerticalOffset::from_matches(&matches(|_, _| offset), MIN_FEATURE_INLIER_RATIO, SIZE).unwrap();
+            assert!((found.largest() - offset).abs() < 0.1 && !found.is_to_correct());
         }
-        assert_eq!(VerticalOffset::from_matches(&[], FEATURES_AGREE, SIZE), None);
-        // Anywhere: no offset has half of them.
+        assert_eq!(VerticalOffset::from_matches(&[], MIN_FEATURE_INLIER_RATIO, SIZE), None);
+        // Scattered: no offset has half of them.
         let chance = matches(|x, y| (x * 7.0 + y * 13.0) % 20.0 - 10.0);
-        assert_eq!(VerticalOffset::from_matches(&chance, FEATURES_AGREE, SIZE), None);
+        assert_eq!(VerticalOffset::from_matches(&chance, MIN_FEATURE_INLIER_RATIO, SIZE), None);
     }
 }

@@ -1,4 +1,4 @@
-//! Dense clouds of generated scenes, against the depth that is true.
+//! Dense point clouds of generated scenes, against the true depth.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -15,7 +15,7 @@ fn sparse(views: &TwoView, camera: &Camera) -> ReconstructResult {
     reconstruct(views.a.image.view(), views.b.image.view(), &options, &Silent).unwrap()
 }
 
-/// Relative errors of depth, ascending, each at the pixel that the point falls on.
+/// Returns the sorted relative depth errors of points, each at the pixel that it projects to.
 fn errors(views: &TwoView, points: impl Iterator<Item = Point3<f64>>, camera: &Camera) -> Vec<f64> {
     let baseline = views.relative.translation.norm();
     let mut errors: Vec<f64> = points
@@ -31,11 +31,11 @@ fn errors(views: &TwoView, points: impl Iterator<Item = Point3<f64>>, camera: &C
 }
 
 #[test]
-fn the_cloud_is_as_true_as_the_sparse_points_it_comes_from() {
+fn the_cloud_is_as_accurate_as_the_sparse_points() {
     let plain = Camera::from_focal(640, 480, 560.0);
     let mut bent = plain;
     bent.distortion = Distortion::radial(-0.12, 0.02);
-    // The second camera left of the first one or right of it, and a little ahead or behind, as the seeds have it.
+    // The second camera is left or right of the first, and a little in front or behind, depending on the seed.
     for (seed, camera) in [(3, plain), (5, bent), (8, plain), (11, bent)] {
         let views = two_view(seed, &camera, 0.4, &RenderOptions::default()).unwrap();
         let sparse = sparse(&views, &camera);
@@ -44,7 +44,7 @@ fn the_cloud_is_as_true_as_the_sparse_points_it_comes_from() {
         let position = |p: &[f32; 3]| Point3::new(f64::from(p[0]), f64::from(p[1]), f64::from(p[2]));
         let of_dense = errors(&views, dense.cloud.positions.iter().map(position), &camera);
         let of_sparse = errors(&views, sparse.scene.points.iter().map(|p| p.position), &camera);
-        let at = |e: &[f64], share: f64| e[((e.len() - 1) as f64 * share) as usize];
+        let at = |e: &[f64], fraction: f64| e[((e.len() - 1) as f64 * fraction) as usize];
         println!(
             "{seed}: {} points, coverage {:.2}, disparities {:?}; median error {:.4} (sparse {:.4}), 90 % {:.4} ({:.4})",
             dense.cloud.len(),
@@ -55,12 +55,13 @@ fn the_cloud_is_as_true_as_the_sparse_points_it_comes_from() {
             at(&of_dense, 0.9),
             at(&of_sparse, 0.9)
         );
-        // Both hang on the same pose, whose error is most of the median; a disparity of 20 px or more, good to a third of a pixel, adds 1.5 %.
+        // Both depend on the same pose, whose error is most of the median; a disparity of 20 px or more, accurate to a
+        // third of a pixel, adds 1.5 %.
         assert!(at(&of_dense, 0.5) < at(&of_sparse, 0.5) + 0.015);
         assert!(at(&of_dense, 0.9) < at(&of_sparse, 0.9) + 0.03);
         // A room is textured all over; a camera half a meter aside sees most of it.
         assert!(dense.cloud.len() > 150_000 && dense.coverage > 0.5);
-        // The depth map holds the same points: the depth of each pixel is the truth's too.
+        // The depth map has the same points: the depth of each pixel is correct too.
         let baseline = views.relative.translation.norm();
         let mut off: Vec<f64> = (0..480 * 640)
             .map(|i| (dense.depth.at(i % 640, i / 640)[0], views.a.depth.at(i % 640, i / 640)[0]))
@@ -73,7 +74,7 @@ fn the_cloud_is_as_true_as_the_sparse_points_it_comes_from() {
 }
 
 #[test]
-fn reduced_photographs_and_little_memory_give_the_same_scene() {
+fn reduced_images_and_little_memory_give_the_same_scene() {
     let camera = Camera::from_focal(640, 480, 560.0);
     let views = two_view(3, &camera, 0.4, &RenderOptions::default()).unwrap();
     let sparse = sparse(&views, &camera);
@@ -83,16 +84,17 @@ fn reduced_photographs_and_little_memory_give_the_same_scene() {
     let whole = run(&DenseOptions::default()).unwrap();
     let small = run(&DenseOptions { max_size: 320, ..DenseOptions::default() }).unwrap();
     assert_eq!(small.depth.size(), (320, 240));
-    // A quarter of the pixels, give or take the ones at outlines.
+    // A quarter of the pixels, up to those at depth discontinuities.
     let share = small.cloud.len() as f64 / whole.cloud.len() as f64;
     assert!((0.18..0.32).contains(&share), "{share}");
     let median = |cloud: &cv_core::PointCloud| {
         let mut z: Vec<f32> = cloud.positions.iter().map(|p| p[2]).collect();
         cv_core::median(&mut z).unwrap()
     };
-    // A tenth: which surfaces lose pixels at outlines moves the middle of a room of several depths.
+    // A tenth: the median of a room with several depths depends on the pixels lost at depth discontinuities.
     assert!((median(&small.cloud) / median(&whole.cloud) - 1.0).abs() < 0.1);
-    // In strips, at most one pixel in a thousand differs (see `StereoOptions::max_memory`); speckles are then cut otherwise.
+    // In strips, at most one pixel in a thousand differs (see `StereoOptions::max_memory`); speckles are then separated
+    // differently.
     let strips = run(&DenseOptions { max_memory: 96 << 20, ..DenseOptions::default() }).unwrap();
     assert!((strips.cloud.len() as f64 / whole.cloud.len() as f64 - 1.0).abs() < 0.01);
     assert!(matches!(
@@ -109,11 +111,11 @@ fn reduced_photographs_and_little_memory_give_the_same_scene() {
 }
 
 #[test]
-fn a_camera_that_went_ahead_is_refused_with_its_angle() {
+fn a_forward_motion_is_an_error_with_its_angle() {
     let camera = Camera::from_focal(640, 480, 560.0);
     let scene = Scene::room(3);
     let first = scene.viewpoint();
-    // 60 cm straight ahead: the epipole is in the middle of both photographs.
+    // 60 cm straight ahead: the epipole is at the center of both images.
     let second = Pose::new(first.rotation, first.translation - Vector3::new(0.03, 0.0, 0.6));
     let photos = [first, second].map(|pose| render(&scene, &camera, &pose, &RenderOptions::default()).unwrap().image);
     let options = ReconstructOptions::new(Intrinsics::Known([camera; 2]));

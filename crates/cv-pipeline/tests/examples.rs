@@ -1,4 +1,4 @@
-//! The examples do what they say.
+//! The examples run without errors.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 

@@ -1,4 +1,4 @@
-//! How far what was filled in can be trusted, by how much was matched: what [`DepthResult::is_mostly_filled`] says is held against truth.
+//! Accuracy of filled pixels by the fraction of matched ones: [`DepthResult::is_mostly_filled`] against ground truth.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -7,8 +7,8 @@ use cv_pipeline::{DepthOptions, DepthResult, depth};
 use cv_stereo::{PixelState, StereoOptions};
 use cv_synth::{RenderOptions, Scene, StereoPair, stereo_pair};
 
-/// The shares of matched pixels and of filled ones that are off by more than 2 px.
-fn wrong(found: &DepthResult, pair: &StereoPair) -> [f64; 2] {
+/// Returns the fractions of matched and of filled pixels with an error of more than 2 px.
+fn outlier_fractions(found: &DepthResult, pair: &StereoPair) -> [f64; 2] {
     let mut counts = [[0u32; 2]; 2];
     let pixels = found.map.disparity.as_slice().iter().zip(pair.disparity.as_slice());
     for ((d, truth), state) in pixels.zip(found.map.state.as_slice()) {
@@ -20,13 +20,13 @@ fn wrong(found: &DepthResult, pair: &StereoPair) -> [f64; 2] {
 }
 
 #[test]
-fn the_warning_comes_where_filled_pixels_are_often_wrong() {
+fn the_warning_is_given_where_filled_pixels_are_often_wrong() {
     let camera = Camera::from_focal(400, 300, 325.0);
     let light = RenderOptions::default();
     let mut warned = 0;
     for seed in [501, 503] {
         for (scene, baseline) in [(Scene::room(seed), 0.2), (Scene::tabletop(seed), 0.06)] {
-            // As usual, four stops less, and a sensor of 300 electrons.
+            // As usual, underexposed by four stops, and with a sensor of 300 electrons.
             for options in [
                 light.clone(),
                 RenderOptions { exposure: -4.0, ..light.clone() },
@@ -36,14 +36,15 @@ fn the_warning_comes_where_filled_pixels_are_often_wrong() {
                 let stereo = StereoOptions { disparities: 64, ..StereoOptions::default() };
                 let options = DepthOptions { stereo, ..DepthOptions::default() };
                 let found = depth(pair.left.image.view(), pair.right.image.view(), None, &options, &Silent).unwrap();
-                let [matched, filled] = wrong(&found, &pair);
+                let [matched, filled] = outlier_fractions(&found, &pair);
                 println!(
                     "{:.3} matched, {matched:.3} of those wrong, {filled:.3} of the others",
                     found.map.matched_fraction()
                 );
-                // Matched pixels are right however few there are: that is what the checks are for.
+                // Matched pixels are correct however few there are: the checks ensure it.
                 assert!(matched < 0.06, "{matched}");
-                // Of these pairs the worst without a warning has 0.23 of its filled pixels wrong; those with one have 0.23 to 0.32.
+                // The worst pair without a warning has 0.23 of its filled pixels wrong; those with a warning have 0.23
+                // to 0.32.
                 if found.is_mostly_filled() {
                     warned += 1;
                     assert!(filled > 0.2, "{filled}");
@@ -54,7 +55,7 @@ fn the_warning_comes_where_filled_pixels_are_often_wrong() {
         }
     }
     assert!((3..=6).contains(&warned), "{warned}");
-    // Nothing filled, nothing to warn of.
+    // Nothing filled: no warning.
     let pair = stereo_pair(
         &Scene::room(1),
         &camera,

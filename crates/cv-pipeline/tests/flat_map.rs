@@ -1,4 +1,4 @@
-//! A flat map photographed from twelve places: the plan of it that is drawn lies over the map.
+//! A planar map photographed from twelve viewpoints: the panorama is an orthophoto of it.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -9,14 +9,14 @@ use cv_pipeline::{PanoramaOptions, PanoramaPhoto, panorama};
 const SIZE: (usize, usize) = (600, 400);
 const FOCAL: f64 = 550.0;
 
-/// A number of 0 to 1 for a vertex of a grid.
+/// Returns a random number from 0 to 1 for a vertex of a grid.
 fn random(x: i64, y: i64, k: i64) -> f64 {
     let h = (x.wrapping_mul(0x9e37_79b9) ^ y.wrapping_mul(0x85eb_ca6b) ^ k.wrapping_mul(0xc2b2_ae35)) as u64;
     let h = (h ^ (h >> 15)).wrapping_mul(0x2545_f491_4f6c_dd1d);
     ((h ^ (h >> 29)) & 0xffff) as f64 / 65535.0
 }
 
-/// The map: fields, woods and towns as smooth noise of several sizes.
+/// Returns the map's color: fields, woods and towns as smooth noise of several sizes.
 fn map(x: f64, y: f64) -> [f64; 3] {
     let octave = |cells: f64, k: i64| {
         let (u, v) = (x * cells, y * cells);
@@ -31,7 +31,7 @@ fn map(x: f64, y: f64) -> [f64; 3] {
     [30.0 + 200.0 * land, 40.0 + 110.0 * land + 80.0 * woods, 50.0 + 140.0 * woods]
 }
 
-/// Cameras over a grid of 4 × 3 places, at heights of 0.85 to 1.15, tilted by up to ten degrees.
+/// Cameras on a grid of 4 × 3 viewpoints, at heights of 0.85 to 1.15, tilted by up to ten degrees.
 fn views(camera: Camera) -> Vec<View> {
     let tilt = |k: usize, m: usize| 0.18 * (((k * m) % 7) as f64 / 3.0 - 1.0);
     (0..12)
@@ -48,7 +48,7 @@ fn views(camera: Camera) -> Vec<View> {
         .collect()
 }
 
-/// Where a pixel of a view lies on the map.
+/// Returns the position on the map of a pixel.
 fn on_map(view: &View, pixel: Point2<f64>) -> Vector2<f64> {
     let ray = view.ray(pixel).unwrap();
     Vector2::new(ray.x / ray.z, ray.y / ray.z)
@@ -66,17 +66,17 @@ fn photograph(view: &View) -> RgbU8 {
 }
 
 #[test]
-fn a_flat_map_of_twelve_views_becomes_its_plan() {
+fn a_planar_map_of_twelve_views_becomes_an_orthophoto() {
     let camera = Camera { distortion: Distortion::radial(-0.08, 0.01), ..Camera::from_focal(SIZE.0, SIZE.1, FOCAL) };
     let truth = views(camera);
     let pictures: Vec<RgbU8> = truth.iter().map(photograph).collect();
     let photos: Vec<PanoramaPhoto<'_>> =
         pictures.iter().map(|p| PanoramaPhoto { camera: Some(camera), ..PanoramaPhoto::new(p.view()) }).collect();
     let plan = panorama(&photos, &PanoramaOptions::default(), &Silent).unwrap();
-    // That it is flat is seen by the matches.
+    // The matches show that the scene is planar.
     assert_eq!(plan.alignment.motion, CameraMotion::Homography);
     assert!(plan.images.iter().all(|image| image.used));
-    // Corners of the photographs on the plan and on the map, both in pixels.
+    // Corners of the photographs in the panorama and on the map, both in pixels.
     let (w, h) = (SIZE.0 as f64 - 1.0, SIZE.1 as f64 - 1.0);
     let corners = [(0.0, 0.0), (w, 0.0), (w, h), (0.0, h)].map(|(x, y)| Point2::new(x, y));
     let places: Vec<(Vector2<f64>, Vector2<f64>)> = plan
@@ -89,7 +89,7 @@ fn a_flat_map_of_twelve_views_becomes_its_plan() {
         })
         .collect();
     assert_eq!(places.len(), 48);
-    // What remains after the similarity that fits best: a plan is one up to where it lies, how large and how turned.
+    // The residual of the best similarity: position, scale and rotation of the panorama are arbitrary.
     let n = places.len() as f64;
     let mean = places.iter().fold((Vector2::zeros(), Vector2::zeros()), |m, p| (m.0 + p.0 / n, m.1 + p.1 / n));
     let centered: Vec<_> = places.iter().map(|p| (p.0 - mean.0, p.1 - mean.1)).collect();
@@ -99,8 +99,8 @@ fn a_flat_map_of_twelve_views_becomes_its_plan() {
     let drift =
         centered.iter().map(|(a, b)| (Vector2::new(along * a.x - across * a.y, across * a.x + along * a.y) - b).norm());
     let worst = drift.fold(0.0, f64::max);
-    // The bar of plans: a pixel of the photographs, over a map of four of them.
+    // The requirement: a pixel of the photographs, over a map of four of them.
     assert!(worst <= 1.0, "{worst}");
-    // As large as the photographs show it and upright, to what heights and turns differ.
+    // The scale of the photographs and upright, within the differences of heights and rotations.
     assert!((along.hypot(across) - 1.0).abs() < 0.1 && across.abs() < 0.1, "{along} {across}");
 }

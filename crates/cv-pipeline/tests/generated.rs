@@ -1,7 +1,7 @@
-//! Every pipeline on generated scenes, against exact truth, over several seeds; depth is in `stereo.rs`.
+//! All pipelines on generated scenes, against exact ground truth, over several seeds; depth is in `stereo.rs`.
 //!
-//! The bars are those of the project, for a 640×480 camera with the default lens blur and noise. They hold for every
-//! seed here, with none left out; the seeds were not chosen by their results.
+//! The limits are the requirements of the project, for a 640×480 camera with the default lens blur and noise. They hold
+//! for every seed here; the seeds were not selected by their results.
 
 use cv_core::Camera;
 use cv_pipeline::{
@@ -35,10 +35,10 @@ fn a_homographys_corners_are_within_three_tenths_of_a_pixel() {
 
 #[test]
 fn a_panorama_uses_every_photograph_and_aligns_within_a_fifth_of_a_pixel() {
-    // Five pictures a seed: fewer seeds.
+    // Five images for each seed: fewer seeds.
     for seed in 0..3 {
         let camera = camera();
-        // Every other time somebody walks through.
+        // Every other set has a person who walks through.
         let walk = cv_synth::PanoramaSetOptions { walker: seed % 2 == 0, ..cv_synth::PanoramaSetOptions::default() };
         let set = panorama_views(seed, &camera, &walk, &RenderOptions::default()).unwrap();
         let photos: Vec<_> = set.views.iter().map(|v| PanoramaPhoto::new(v.image.view())).collect();
@@ -55,14 +55,14 @@ fn a_panorama_uses_every_photograph_and_aligns_within_a_fifth_of_a_pixel() {
         }
         let rms = f64::sqrt(sum / pairs);
         println!("seed {seed}: {rms:.3} px over {pairs} pairs, focal {:.2} px", views[0].camera.fx);
-        // Five photographs with a 45 % overlap: four pairs of neighbors, seen both ways, at least. Half a pixel at a seam
-        // would show; thousands of matches place a view several times better.
+        // Five photographs with an overlap of 45 %: at least four pairs of neighbors, in both directions. Half a pixel
+        // at a seam would be visible; thousands of matches align a view several times better.
         assert!(pairs >= 8.0 && rms <= 0.2, "seed {seed}: {rms} px over {pairs} pairs");
     }
 }
 
 #[test]
-fn two_views_give_the_turn_and_the_direction_of_travel() {
+fn two_views_determine_rotation_and_translation_direction() {
     for seed in SEEDS {
         let camera = camera();
         let pair = two_view(seed, &camera, 0.6, &RenderOptions::default()).unwrap();
@@ -73,7 +73,7 @@ fn two_views_give_the_turn_and_the_direction_of_travel() {
         let way = direction_error(&found.scene.pose.translation, &pair.relative.translation).to_degrees();
         println!("seed {seed}: {} points, rotation {turn:.4}°, direction {way:.3}°", found.scene.points.len());
         assert!(turn <= 0.2 && way <= 1.0, "seed {seed}: rotation {turn}°, direction {way}°");
-        // The points too, at the true scale: their median distance from the surface that their pixel shows.
+        // The points too, at the true scale: their median distance from the surface at their pixel.
         let scale = pair.relative.translation.norm() / found.scene.pose.translation.norm();
         let mut off: Vec<f64> = found
             .scene
@@ -86,7 +86,7 @@ fn two_views_give_the_turn_and_the_direction_of_travel() {
             })
             .collect();
         off.sort_by(f64::total_cmp);
-        // A tenth of a pixel in a disparity of 31 px (6 m away) is 0.3 %; 2 % would be half a pixel.
+        // A tenth of a pixel in a disparity of 31 px (at 6 m) is 0.3 %; 2 % would be half a pixel.
         assert!(
             off.len() > 200 && off[off.len() / 2] < 0.02,
             "seed {seed}: {} points, {}",
@@ -97,7 +97,7 @@ fn two_views_give_the_turn_and_the_direction_of_travel() {
 }
 
 #[test]
-fn a_ball_is_found_by_its_color() {
+fn a_ball_is_segmented_by_its_color() {
     // Eight photographs, each of a scene of its own: fewer seeds.
     for seed in 0..3 {
         let photos = ball_photos(seed, 8, &camera(), &RenderOptions::default()).unwrap();

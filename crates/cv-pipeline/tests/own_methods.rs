@@ -1,4 +1,4 @@
-//! Methods of other crates in the jobs: a descriptor, a loss and a disparity matcher that nothing here knows.
+//! User-defined methods in the jobs: a descriptor, a loss and a disparity matcher from outside.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -18,7 +18,8 @@ use cv_synth::{
 };
 use std::sync::Arc;
 
-/// Corners, and the gray values of every other of 21×21 pixels around each, of mean zero and length one.
+/// Corners, described by the gray levels of every other of 21×21 pixels around each, normalized to zero mean and unit
+/// length.
 #[derive(Debug)]
 struct GrayCorners;
 
@@ -54,7 +55,7 @@ fn with_gray_corners() -> MatchingOptions {
     MatchingOptions { features: FeatureOptions::Other(Arc::new(GrayCorners)), ..MatchingOptions::default() }
 }
 
-/// Cauchy's loss up to three thresholds.
+/// The Cauchy loss, truncated at three thresholds.
 #[derive(Debug)]
 struct Cauchy;
 
@@ -73,7 +74,7 @@ impl Scorer for Cauchy {
 }
 
 #[test]
-fn photographs_are_matched_by_another_descriptor_and_judged_by_another_loss() {
+fn images_are_matched_by_a_custom_descriptor_and_loss() {
     let camera = Camera::from_focal(640, 480, 520.0);
     let pair = homography_pair(2, &camera, 0.15, &RenderOptions::default()).unwrap();
     let found = match_photos(pair.a.image.view(), pair.b.image.view(), &with_gray_corners(), &Silent).unwrap();
@@ -84,12 +85,12 @@ fn photographs_are_matched_by_another_descriptor_and_judged_by_another_loss() {
     let model = estimate(&found.pairs(), kind, &options, &Silent).unwrap().robust;
     let error = homography_corner_error(&model.model, &pair.homography, 640, 480);
     println!("{} matches, {} agree, {error:.3} px", found.matches.len(), model.inliers.len());
-    // Corners are placed to half a pixel; a hundred of them place the corners of the picture to that or better.
+    // Corners are accurate to half a pixel; a hundred of them determine the image corners to that or better.
     assert!(model.inliers.len() > 60 && error < 0.7, "{} {error}", model.inliers.len());
 }
 
 #[test]
-fn two_views_and_a_panorama_are_made_with_another_descriptor() {
+fn two_views_and_a_panorama_use_a_custom_descriptor() {
     let camera = Camera::from_focal(640, 480, 520.0);
     let views = two_view(3, &camera, 0.25, &RenderOptions::default()).unwrap();
     let mut options =
@@ -99,7 +100,7 @@ fn two_views_and_a_panorama_are_made_with_another_descriptor() {
     let turn = rotation_error(&found.scene.pose.rotation, &views.relative.rotation).to_degrees();
     let way = direction_error(&found.scene.pose.translation, &views.relative.translation).to_degrees();
     println!("{} points, {turn:.3}° {way:.2}°", found.scene.points.len());
-    // Twice the bars of SIFT: these corners know no scale.
+    // Twice the limits of SIFT: these corners are not scale-invariant.
     assert!(turn < 0.4 && way < 2.0 && found.scene.points.len() >= 60, "{turn} {way} {}", found.scene.points.len());
 
     let few = cv_synth::PanoramaSetOptions { views: 3, ..cv_synth::PanoramaSetOptions::default() };
@@ -110,7 +111,7 @@ fn two_views_and_a_panorama_are_made_with_another_descriptor() {
     assert!(joined.images.iter().all(|image| image.used));
 }
 
-/// The true disparities, as a matcher would find them.
+/// A matcher that returns the true disparities.
 struct Oracle(GrayF32);
 
 impl DisparityMatcher<u8, 3> for Oracle {
@@ -135,7 +136,7 @@ impl DisparityMatcher<u8, 3> for Oracle {
 }
 
 #[test]
-fn depth_comes_from_another_matcher() {
+fn depth_uses_a_custom_matcher() {
     let scene = Scene::room(1);
     let camera = Camera::from_focal(320, 240, 280.0);
     let pair = stereo_pair(&scene, &camera, &scene.viewpoint(), 0.25, &RenderOptions::default()).unwrap();
@@ -150,7 +151,7 @@ fn depth_comes_from_another_matcher() {
         assert!(!truth.is_finite() || (depth.at(x, y)[0] / truth - 1.0).abs() < 1e-4, "{x} {y}: {truth}");
     }
     assert!(found.confidence.is_none() && found.disparities == (0, 64));
-    // One that found nothing is no depth, and its range is asked about.
+    // A matcher without matches is an error, which reports its range.
     let nothing = GrayF32::new(320, 240, [f32::NAN]);
     let error = depth_with(&mut Oracle(nothing), left, right, None, all, &Silent).map(|d| d.stages).unwrap_err();
     assert!(matches!(error, DepthError::NoPair { .. }), "{error}");

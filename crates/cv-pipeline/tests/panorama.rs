@@ -1,4 +1,4 @@
-//! Panoramas from photographs that are not what a panorama wants: taken while walking, given twice, in any order, of two places, with a bent lens.
+//! Panoramas from difficult sets: parallax, duplicates, any order, several scenes, lens distortion.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -26,9 +26,9 @@ fn views(seed: u64, count: usize) -> Vec<RgbU8> {
     set.views.into_iter().map(|v| v.image).collect()
 }
 
-/// Three pictures of a wall full of posters, with two signs far in front of it, by somebody who turns and steps to the right by 6 cm between them: the
-/// signs move by some 15 px against the wall.
-fn walked(seed: u64) -> (Scene, Vec<Rendered>) {
+/// Renders three views of a wall of posters, with two signs far in front of it, by a camera that rotates and moves to
+/// the right by 6 cm between them: the signs move by some 15 px relative to the wall.
+fn views_with_parallax(seed: u64) -> (Scene, Vec<Rendered>) {
     let collage = |width: f32, height: f32, size: f32, seed: u64| {
         let (columns, rows) = ((width / size) as u64, (height / size) as u64);
         let place = |k: u64| ((k % columns) as f32 * size, (k / columns) as f32 * size);
@@ -61,8 +61,9 @@ fn walked(seed: u64) -> (Scene, Vec<Rendered>) {
     (scene, taken)
 }
 
-/// Places where a seam runs through a sign that the two photographs show over two pixels apart, and all places on the seams.
-fn cut_in_two(scene: &Scene, views: &[Rendered], result: &PanoramaResult) -> (usize, usize) {
+/// Returns the number of seam pixels on a sign that the two views show more than two pixels apart, and the number of
+/// all seam pixels.
+fn misaligned_seam_pixels(scene: &Scene, views: &[Rendered], result: &PanoramaResult) -> (usize, usize) {
     let (w, h) = result.labels.size();
     let (mut cut, mut all) = (0, 0);
     for (x, y) in (0..h).flat_map(|y| (1..w).map(move |x| (x, y))) {
@@ -75,7 +76,7 @@ fn cut_in_two(scene: &Scene, views: &[Rendered], result: &PanoramaResult) -> (us
         let (Some(p), Some(q)) = (result.map.source(a, pixel), result.map.source(b, pixel)) else { continue };
         all += 1;
         let Some(point) = scene.point_at(&views[a].camera, &views[a].pose, p) else { continue };
-        // Hidden from the other photograph: a seam along the outline of a sign cuts nothing.
+        // Occluded in the other view: a seam along the object boundary of a sign is no misalignment.
         let Some(truth) = scene.pixel_of(&views[b].camera, &views[b].pose, &point) else { continue };
         if point.z < 3.0 && (truth - q).norm() > 2.0 {
             cut += 1;
@@ -85,27 +86,27 @@ fn cut_in_two(scene: &Scene, views: &[Rendered], result: &PanoramaResult) -> (us
 }
 
 #[test]
-fn seams_run_around_what_is_near() {
+fn seams_avoid_nearby_objects() {
     for seed in 0..2 {
-        let (scene, views) = walked(seed);
+        let (scene, views) = views_with_parallax(seed);
         let images: Vec<_> = views.iter().map(|v| v.image.view()).collect();
         let found = join(&images, &PanoramaOptions::default()).unwrap();
         let mut straight = PanoramaOptions::default();
         straight.render.seams = Seams::Voronoi;
         straight.render.elastic = false;
         let straight = join(&images, &straight).unwrap();
-        let (cut, places) = cut_in_two(&scene, &views, &found);
-        let (plain, straight_places) = cut_in_two(&scene, &views, &straight);
+        let (cut, places) = misaligned_seam_pixels(&scene, &views, &found);
+        let (plain, straight_places) = misaligned_seam_pixels(&scene, &views, &straight);
         println!("seed {seed}: {cut} of {places} places cut, straight seams {plain} of {straight_places}");
         assert!(found.images.iter().all(|i| i.used));
         assert!(plain > 40, "the scene is too easy: {plain}");
-        // Some pixels where a seam leaves the outline by one: a fiftieth of what straight seams cut.
+        // Some pixels where a seam leaves the object boundary by one: a fiftieth of those of straight seams.
         assert!(cut <= 4, "seed {seed}: {cut}");
     }
 }
 
 #[test]
-fn what_is_no_set_of_overlapping_photographs_is_refused_or_left_out() {
+fn unrelated_photographs_are_errors_or_left_out() {
     let room = views(3, 3);
     let [a, b, c] = [0, 1, 2].map(|i| room[i].view());
     let refused = |photos: &[ImageView<'_, u8, 3>]| match join(photos, &PanoramaOptions::default()) {
@@ -121,13 +122,13 @@ fn what_is_no_set_of_overlapping_photographs_is_refused_or_left_out() {
     assert_eq!(images[1].reason, Some(LeftOut::NoFeatures));
     assert!(images.iter().all(|i| !i.used));
 
-    // The same photograph twice: one picture of its size.
+    // The same photograph twice: a panorama of its size.
     let twice = join(&[b, b], &PanoramaOptions::default()).unwrap();
     assert!(twice.images.iter().all(|i| i.used));
     let (w, h) = twice.image.size();
     assert!(w.abs_diff(480) <= 4 && h.abs_diff(360) <= 4, "{w} x {h}");
 
-    // Two of one room, three of another: the larger group is joined, in whatever order they come.
+    // Two of one room, three of another: the larger group is stitched, in any order.
     let other = views(8, 2);
     let photos = [other[0].view(), c, a, other[1].view(), b];
     let result = join(&photos, &PanoramaOptions::default()).unwrap();
@@ -139,7 +140,7 @@ fn what_is_no_set_of_overlapping_photographs_is_refused_or_left_out() {
 }
 
 #[test]
-fn the_order_of_the_photographs_moves_nothing() {
+fn the_order_of_the_photographs_does_not_change_the_alignment() {
     let room = views(5, 4);
     let joined = |order: [usize; 4]| {
         let photos = order.map(|i| room[i].view());
@@ -149,13 +150,13 @@ fn the_order_of_the_photographs_moves_nothing() {
     assert!(one.images.iter().chain(&two.images).all(|i| i.used));
     let (size, other) = (one.image.size(), two.image.size());
     assert!(size.0.abs_diff(other.0) <= 2 && size.1.abs_diff(other.1) <= 2, "{size:?} {other:?}");
-    // Which of two photographs decides RANSAC's samples and the reference: the focal length may differ by a thousandth.
+    // The order changes RANSAC's samples and the reference: the focal length may differ by a thousandth.
     let focal = |r: &PanoramaResult| r.images[0].focal.unwrap();
     assert!((focal(&one) / focal(&two) - 1.0).abs() < 2e-3, "{} {}", focal(&one), focal(&two));
 }
 
 #[test]
-fn a_calibrated_lens_is_taken_out() {
+fn a_calibrated_distortion_is_corrected() {
     let bent = Camera { distortion: Distortion::radial(-0.25, 0.05), ..camera() };
     let options = cv_synth::PanoramaSetOptions { views: 3, ..cv_synth::PanoramaSetOptions::default() };
     let set = panorama_views(4, &bent, &options, &RenderOptions::default()).unwrap();
@@ -171,6 +172,6 @@ fn a_calibrated_lens_is_taken_out() {
         pairs += 1.0;
     }
     let rms = f64::sqrt(sum / pairs);
-    // As without distortion: half a pixel at a seam would show, hundreds of matches place a view better.
+    // As without distortion: half a pixel at a seam would be visible, hundreds of matches align a view better.
     assert!(rms <= 0.25, "{rms} px");
 }

@@ -1,4 +1,4 @@
-//! Two-view reconstruction of generated scenes with exact truth, and the scenes it has to refuse.
+//! Two-view reconstruction of generated scenes with exact ground truth, and degenerate scenes.
 
 use cv_core::{Camera, Pose, RgbU8, Rotation3, Vector3};
 use cv_pipeline::{Intrinsics, ReconstructError, ReconstructOptions, Silent, TwoViewError, reconstruct};
@@ -13,28 +13,28 @@ fn known() -> ReconstructOptions {
 }
 
 #[test]
-fn a_room_comes_back_with_its_pose_and_depths() {
+fn a_room_is_reconstructed_with_its_pose_and_depths() {
     let views = two_view(3, &camera(), 0.4, &RenderOptions::default()).unwrap();
     let result = reconstruct(views.a.image.view(), views.b.image.view(), &known(), &Silent).unwrap();
     let turn = rotation_error(&result.scene.pose.rotation, &views.relative.rotation).to_degrees();
     let direction = direction_error(&result.scene.pose.translation, &views.relative.translation).to_degrees();
-    // The bars of the project.
+    // The requirements of the project.
     assert!(turn <= 0.2 && direction <= 1.0, "{turn} {direction}");
     assert!(result.scene.points.len() >= 100 && result.scene.reprojection_rms < 1.0);
-    // Depths, in units of the base line of 0.4 m: within 5 % for most points, each at its own pixel.
+    // Depths, in units of the baseline of 0.4 m: within 5 % for most points, each at its own pixel.
     let baseline = views.relative.translation.norm();
     let right = result.scene.points.iter().filter(|p| {
         let (x, y) = (result.pair(p).a.x.round() as usize, result.pair(p).a.y.round() as usize);
         let truth = f64::from(views.a.depth.at(x.min(639), y.min(479))[0]);
         (p.position.z * baseline / truth - 1.0).abs() < 0.05
     });
-    // Points on outlines have the depth of either side.
+    // Points at depth discontinuities have the depth of either side.
     let share = right.count() as f64 / result.scene.points.len() as f64;
     assert!(share > 0.8, "{share}");
 }
 
 #[test]
-fn an_unknown_lens_that_bends_lines_is_found() {
+fn unknown_focal_length_and_distortion_are_estimated() {
     let mut lens = camera();
     lens.distortion = cv_core::Distortion::radial(-0.15, 0.0);
     let views = two_view(3, &lens, 0.4, &RenderOptions::default()).unwrap();
@@ -44,10 +44,11 @@ fn an_unknown_lens_that_bends_lines_is_found() {
         let off = direction_error(&result.scene.pose.translation, &views.relative.translation).to_degrees();
         (result.scene.cameras[0].fx / 560.0 - 1.0, off)
     };
-    // The bars of the project: five per cent, three degrees.
+    // The requirements of the project: five per cent, three degrees.
     let (focal, off) = direction(Intrinsics::Unknown);
     assert!(focal.abs() < 0.05 && off < 3.0, "{focal} {off}");
-    // EXIF's is good to a few per cent, and what the matches say does not make it worse; nor that of a matrix without its lens.
+    // EXIF focal lengths are accurate to a few per cent, and the matches must not make them worse; nor a calibration
+    // matrix without distortion.
     for given in [Intrinsics::Focal([575.0; 2]), Intrinsics::Matrix([Camera::from_focal(640, 480, 575.0); 2])] {
         let (focal, off) = direction(given);
         assert!(focal.abs() < 575.0 / 560.0 - 1.0 && off < 3.0, "{given:?}: {focal} {off}");
@@ -55,7 +56,7 @@ fn an_unknown_lens_that_bends_lines_is_found() {
 }
 
 #[test]
-fn a_camera_that_only_turned_is_told() {
+fn a_pure_rotation_is_an_error_with_its_angle() {
     let scene = Scene::room(5);
     let first = scene.viewpoint();
     let turn = Pose::new(Rotation3::new(Vector3::new(0.02, 0.12, 0.01)), Vector3::zeros());
@@ -71,14 +72,14 @@ fn a_camera_that_only_turned_is_told() {
 }
 
 #[test]
-fn too_little_is_told_with_its_numbers() {
+fn too_few_matches_are_errors_with_their_numbers() {
     let flat = RgbU8::new(640, 480, [90; 3]);
     assert!(matches!(reconstruct(flat.view(), flat.view(), &known(), &Silent), Err(ReconstructError::Matching(_))));
     let views = [3, 4].map(|seed| {
         let scene = Scene::room(seed);
         render(&scene, &camera(), &scene.viewpoint(), &RenderOptions::default()).unwrap().image
     });
-    // Two rooms that have nothing in common.
+    // Two unrelated rooms.
     assert!(matches!(
         reconstruct(views[0].view(), views[1].view(), &known(), &Silent),
         Err(ReconstructError::TwoView(TwoViewError::TooFewMatches { .. } | TwoViewError::TooFewInliers { .. }))

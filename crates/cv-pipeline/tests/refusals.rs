@@ -1,4 +1,4 @@
-//! Generated pairs that cannot be reconstructed: each is refused with the cause, its number, and what to try.
+//! Degenerate generated pairs: each is an error with the cause, its numbers, and advice.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -29,13 +29,13 @@ fn known() -> Intrinsics {
 }
 
 #[test]
-fn a_plane_is_told_from_a_turn_where_the_focal_length_is_known() {
+fn a_plane_is_told_from_a_rotation_where_the_focal_length_is_known() {
     for seed in [1, 2] {
         let pair = homography_pair(seed, &camera(), 0.3, &RenderOptions::default()).unwrap();
         let (a, b) = (&pair.a.image, &pair.b.image);
         for intrinsics in [known(), Intrinsics::Focal([FOCAL; 2])] {
             match refusal(a, b, intrinsics) {
-                // A wall is a plane to the last match.
+                // All matches on a wall lie on one plane.
                 error @ TwoViewError::Planar { fraction } => {
                     assert!(fraction > 0.95 && advice(error) == Advice::LeaveThePlane, "{error}");
                 }
@@ -52,7 +52,7 @@ fn a_plane_is_told_from_a_turn_where_the_focal_length_is_known() {
 }
 
 #[test]
-fn a_turn_is_named_or_left_open() {
+fn a_rotation_is_identified_or_ambiguous() {
     let turn = Pose::new(Rotation3::new(Vector3::new(0.02, 0.12, 0.01)), Vector3::zeros());
     for seed in [5, 6] {
         let scene = Scene::room(seed);
@@ -77,8 +77,8 @@ fn a_turn_is_named_or_left_open() {
 }
 
 #[test]
-fn a_camera_that_hardly_moved_is_told() {
-    // Two centimeters before a room of three to six meters: two pixels of parallax and less.
+fn a_short_baseline_is_an_error() {
+    // Two centimeters in front of a room of three to six meters: a parallax of two pixels and less.
     for seed in [3, 4] {
         let views = two_view(seed, &camera(), 0.02, &RenderOptions::default()).unwrap();
         match refusal(&views.a.image, &views.b.image, known()) {
@@ -92,16 +92,18 @@ fn a_camera_that_hardly_moved_is_told() {
 }
 
 #[test]
-fn a_focal_length_that_cannot_be_is_told_with_one_that_can() {
+fn an_implausible_focal_length_is_an_error_with_a_better_one() {
     for seed in [3, 8] {
         let views = two_view(seed, &camera(), 0.4, &RenderOptions::default()).unwrap();
         let (a, b) = (&views.a.image, &views.b.image);
-        // In another unit, and of a thumbnail. (Where one that is too long cannot be told from the right one, it passes.)
+        // In another unit, and of a thumbnail. (One that is too long may be accepted if it cannot be told from the
+        // correct one.)
         for wrong in [35.0, 230.0] {
             match refusal(a, b, Intrinsics::Focal([wrong; 2])) {
                 error @ TwoViewError::WrongFocal { given, better, deviations, .. } => {
                     assert!(given == wrong && deviations > 4.0, "{error}");
-                    // The bar of an unknown focal length is five per cent, after the bundle; this is before.
+                    // The requirement for an unknown focal length is five per cent after bundle adjustment; this is
+                    // before.
                     assert!(
                         (better / FOCAL).ln().abs() < 0.15 && advice(error) == (Advice::FocalBetter { px: better }),
                         "{error}"
@@ -110,7 +112,7 @@ fn a_focal_length_that_cannot_be_is_told_with_one_that_can() {
                 other => panic!("{seed} {wrong}: {other}"),
             }
         }
-        // An inaccurate one passes.
+        // An inaccurate one is accepted.
         for near in [500.0, 640.0] {
             let options = ReconstructOptions::new(Intrinsics::Focal([near; 2]));
             assert!(reconstruct(a.view(), b.view(), &options, &Silent).unwrap().scene.points.len() > 100);
@@ -124,7 +126,7 @@ fn too_few_matches_are_counted() {
         let scene = Scene::room(seed);
         render(&scene, &camera(), &scene.viewpoint(), &RenderOptions::default()).unwrap().image
     });
-    // Two rooms that have nothing in common.
+    // Two unrelated rooms.
     for intrinsics in [known(), Intrinsics::Unknown] {
         let error = refusal(&views[0], &views[1], intrinsics);
         match error {

@@ -17,14 +17,14 @@ fn returns<T: Serialize + DeserializeOwned + PartialEq + Debug>(value: &T) {
     assert_eq!(&serde_json::from_str::<T>(&text).unwrap(), value, "{text}");
 }
 
-/// A struct of options comes back, and no fields at all are the defaults.
+/// Checks the round trip of options, and that missing fields have their defaults.
 fn options<T: Serialize + DeserializeOwned + PartialEq + Debug + Default>() {
     returns(&T::default());
     assert_eq!(serde_json::from_str::<T>("{}").unwrap(), T::default());
 }
 
 #[test]
-fn options_come_back_and_missing_fields_take_their_defaults() {
+fn options_round_trip_and_missing_fields_have_their_defaults() {
     options::<MatchingOptions>();
     options::<ReconstructOptions>();
     options::<DenseOptions>();
@@ -42,7 +42,7 @@ fn options_come_back_and_missing_fields_take_their_defaults() {
 }
 
 #[test]
-fn a_rig_with_lenses_and_a_keypoint_come_back() {
+fn a_rig_with_distortion_and_a_keypoint_round_trip() {
     let left = Camera { distortion: Distortion::radial(-0.2, 0.05), ..Camera::from_focal(640, 480, 500.0) };
     let motion = Pose::new(Rotation3::from_euler_angles(0.01, 0.02, -0.03), Vector3::new(-0.1, 0.002, 0.0));
     returns(&StereoRig { left, right: Camera::from_focal(640, 480, 510.0), right_from_left: motion });
@@ -53,7 +53,7 @@ fn a_rig_with_lenses_and_a_keypoint_come_back() {
 }
 
 #[test]
-fn a_result_tells_its_model_and_its_stages() {
+fn a_result_has_its_model_and_stages() {
     let move_by = |i: usize| {
         let a = Point2::new((i * 37 % 101) as f64, (i * 53 % 89) as f64);
         Correspondence { a, b: a + cv_core::Vector2::new(5.0, -2.0) }

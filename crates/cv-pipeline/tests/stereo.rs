@@ -1,7 +1,7 @@
-//! The bars of stereo matching on rendered scenes, against exact truth, with default options.
+//! Requirements of stereo matching on rendered scenes, against exact ground truth, with default options.
 //!
-//! The seeds were not chosen by their results. Shares are over the pixels of all scenes together; what the worst scene
-//! reaches is printed.
+//! The seeds were not selected by their results. Fractions are over the pixels of all scenes together; the worst scene
+//! is printed.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -24,23 +24,24 @@ fn matched(left: &StereoPair, right: &StereoPair) -> DisparityMap {
     StereoMatcher::new(options).unwrap().compute(left.left.image.view(), right.right.image.view(), &Silent).unwrap()
 }
 
-/// A scene seen by a rectified pair.
-struct Seen {
+/// A scene with its rectified pair.
+struct RenderedScene {
     name: String,
     baseline: f64,
     pair: StereoPair,
-    /// The same at half the light, with noise of its own.
+    /// The same pair at half the exposure, with independent noise.
     darker: StereoPair,
 }
 
-/// A room with a baseline of 20 cm and a table with one of 6 cm, so that both have about 50 px of disparity. Rendered once for all tests.
-static SCENES: LazyLock<Vec<Seen>> = LazyLock::new(|| {
+/// A room with a baseline of 20 cm and a table with one of 6 cm, both with about 50 px of disparity. Rendered once for
+/// all tests.
+static SCENES: LazyLock<Vec<RenderedScene>> = LazyLock::new(|| {
     let seen = |name: String, scene: Scene, baseline: f64| {
         let pair =
             |options: &RenderOptions| stereo_pair(&scene, &camera(), &scene.viewpoint(), baseline, options).unwrap();
         let options = RenderOptions::default();
         let dark = RenderOptions { exposure: -1.0, ..options.clone().with_seed(99) };
-        Seen { name, baseline, pair: pair(&options), darker: pair(&dark) }
+        RenderedScene { name, baseline, pair: pair(&options), darker: pair(&dark) }
     };
     SEEDS
         .flat_map(|seed| {
@@ -54,9 +55,9 @@ static SCENES: LazyLock<Vec<Seen>> = LazyLock::new(|| {
 
 #[test]
 fn depth_is_within_five_percent_and_exposure_does_not_matter() {
-    // Pixels counted, and good ones.
+    // Number of evaluated pixels, and of accurate ones.
     let (mut depth, mut exposed) = ([0u32; 2], [0u32; 2]);
-    for Seen { name, baseline, pair, darker } in &*SCENES {
+    for RenderedScene { name, baseline, pair, darker } in &*SCENES {
         let (even, uneven) = (matched(pair, pair), matched(pair, darker));
         let (mut here, mut here_exposed) = ([0u32; 2], [0u32; 2]);
         for (y, x) in (0..480).flat_map(|y| (0..640).map(move |x| (y, x))).filter(|&(y, x)| pair.visible.at(x, y)[0]) {
@@ -71,8 +72,8 @@ fn depth_is_within_five_percent_and_exposure_does_not_matter() {
         }
         let share = |[all, good]: [u32; 2]| 100.0 * f64::from(good) / f64::from(all);
         println!("{name}: {:.2} % within 5 %, at one stop less {:.2} % within 1 px", share(here), share(here_exposed));
-        // No scene far below the rest. Every table is above both bars; rooms 1 to 3 lie below the first and room 3 below the second: floors
-        // of planks that run along the rows have nothing to match, and take the depth of what stands on them for some pixels around.
+        // No scene is far below the others. Every table is above both limits; rooms 1 to 3 are below the first and room
+        // 3 below the second: planks along the rows have no texture to match, and get the depth of nearby objects.
         let least = if name.starts_with("room") { (96.8, 96.0) } else { (98.0, 97.0) };
         assert!(share(here) >= least.0 && share(here_exposed) >= least.1, "{name}: {here:?} {here_exposed:?}");
         for i in 0..2 {
@@ -82,15 +83,16 @@ fn depth_is_within_five_percent_and_exposure_does_not_matter() {
     }
     let share = |[all, good]: [u32; 2]| f64::from(good) / f64::from(all);
     println!("all: {:.4} within 5 %, at one stop less {:.4} within 1 px", share(depth), share(exposed));
-    // The bars of the project.
+    // The requirements of the project.
     assert!(share(depth) >= 0.98 && share(exposed) >= 0.97, "{depth:?} {exposed:?}");
 }
 
 #[test]
-fn errors_are_as_large_as_the_stated_uncertainty() {
-    // Errors within one and within two standard deviations, of those stated below and above 0.15 px, which halves them.
+fn errors_agree_with_the_stated_uncertainty() {
+    // Errors within one and within two standard deviations, for those stated below and above 0.15 px, which halves
+    // them.
     let mut counts = [[0u32; 3]; 2];
-    for Seen { name, pair, darker: other, .. } in &*SCENES {
+    for RenderedScene { name, pair, darker: other, .. } in &*SCENES {
         let mut matcher = StereoMatcher::new(StereoOptions { disparities: 96, ..StereoOptions::default() }).unwrap();
         let map = matcher.compute(pair.left.image.view(), other.right.image.view(), &Silent).unwrap();
         let sigma = matcher.uncertainty(&map);
@@ -114,11 +116,14 @@ fn errors_are_as_large_as_the_stated_uncertainty() {
 }
 
 #[test]
-fn the_quality_mode_leaves_fewer_errors_and_marks_what_it_moved() {
-    // Of both modes: pixels that both cameras see and that are off by more than 2 px. The tables only: in rooms most of them lie on floors of
-    // planks along the rows, where neither mode has anything to match (room 0 has 13 % fewer with the quality mode, room 1 has 3 % more).
+fn the_quality_mode_has_fewer_errors_and_marks_changed_pixels() {
+    // For both modes: pixels that both cameras see with an error of more than 2 px. Only the tables: in rooms most of
+    // them are on planks along the rows, where neither mode has texture to match (room 0 has 13 % fewer with the
+    // quality mode, room 1 has 3 % more).
     let mut wrong = [0u32; 2];
-    for Seen { name, pair, darker, .. } in SCENES.iter().filter(|scene| scene.name.starts_with("table")).take(2) {
+    for RenderedScene { name, pair, darker, .. } in
+        SCENES.iter().filter(|scene| scene.name.starts_with("table")).take(2)
+    {
         let matched = |quality, fill| {
             let options = StereoOptions { disparities: 96, quality, fill, ..StereoOptions::default() };
             let mut matcher = StereoMatcher::new(options).unwrap();
@@ -134,7 +139,7 @@ fn the_quality_mode_leaves_fewer_errors_and_marks_what_it_moved() {
             *sum += here;
         }
         assert!(better.disparity.as_slice().iter().all(|d| (0.0..=95.0).contains(d)));
-        // Matched is what was matched before and has hardly moved.
+        // A pixel is matched if it was matched before and has hardly changed.
         for ((a, b), (was, is)) in (plain.disparity.as_slice().iter().zip(better.disparity.as_slice()))
             .zip(plain.state.as_slice().iter().zip(better.state.as_slice()))
         {
@@ -144,7 +149,7 @@ fn the_quality_mode_leaves_fewer_errors_and_marks_what_it_moved() {
         if name != "table 0" {
             continue;
         }
-        // Without filling, what is not matched is unknown, and the rest the same.
+        // Without hole filling, unmatched pixels are unknown, and the others the same.
         let unfilled = matched(true, false);
         for ((a, b), state) in
             better.disparity.as_slice().iter().zip(unfilled.disparity.as_slice()).zip(unfilled.state.as_slice())
@@ -153,14 +158,14 @@ fn the_quality_mode_leaves_fewer_errors_and_marks_what_it_moved() {
             assert!(b.is_nan() || a == b);
         }
     }
-    // 17 % fewer were measured; scenes differ by some percent.
+    // 17 % fewer were measured; scenes differ by some per cent.
     assert!(f64::from(wrong[1]) < 0.9 * f64::from(wrong[0]), "{wrong:?}");
 }
 
 #[test]
-fn rows_a_fraction_of_a_pixel_apart_are_found_in_the_matches() {
-    for Seen { name, pair, .. } in SCENES.iter().take(2) {
-        // As where a camera is turned about its axis, and nearer than the other: less than a pixel at every corner.
+fn a_vertical_disparity_below_a_pixel_is_estimated_from_the_matches() {
+    for RenderedScene { name, pair, .. } in SCENES.iter().take(2) {
+        // As for a camera rotated about its axis and closer than the other: less than a pixel at every corner.
         let truth = |x: f64, y: f64| 0.2 + 0.6 * (x / 640.0 - 0.5) - 0.7 * (y / 480.0 - 0.5);
         let map = WarpMap::new((640, 480), (640, 480), |x, y| {
             let (x, y) = (x as f64, y as f64);
@@ -174,11 +179,12 @@ fn rows_a_fraction_of_a_pixel_apart_are_found_in_the_matches() {
         };
         assert_eq!(found(&pair.right.image, true).vertical_offset, None, "{name}");
         let [left_alone, aligned] = [false, true].map(|align| found(&apart, align));
-        // As many pixels are matched as makes features needless.
+        // Enough pixels are matched for features not to be needed.
         assert!(left_alone.map.matched_fraction() > 0.6, "{name}");
         let offset = aligned.vertical_offset.unwrap();
         for (x, y) in [(0.0, 0.0), (639.0, 0.0), (0.0, 479.0), (639.0, 479.0)] {
-            // A tenth of a pixel: some hundred matches of a quarter of a pixel, and the blocks' own bias toward whole rows.
+            // A tenth of a pixel: some hundred matches with an error of a quarter of a pixel, and the bias of blocks
+            // towards whole rows.
             assert!((offset.at(x, y) - truth(x, y)).abs() < 0.1, "{name}: {offset:?}");
         }
         let good = |map: &DisparityMap| {
@@ -193,7 +199,7 @@ fn rows_a_fraction_of_a_pixel_apart_are_found_in_the_matches() {
 
 #[test]
 fn strips_of_rows_take_less_memory_and_hardly_change_the_result() {
-    for Seen { name, pair, .. } in SCENES.iter().take(2) {
+    for RenderedScene { name, pair, .. } in SCENES.iter().take(2) {
         let whole = matched(pair, pair);
         let options = StereoOptions { disparities: 96, ..StereoOptions::default() };
         let all = StereoMatcher::new(options.clone()).unwrap().memory(640, 480);
@@ -204,7 +210,7 @@ fn strips_of_rows_take_less_memory_and_hardly_change_the_result() {
         let pairs = whole.disparity.as_slice().iter().zip(strips.disparity.as_slice());
         let differ = pairs.filter(|(a, b)| a.is_nan() != b.is_nan() || (**a - **b).abs() > 0.5).count();
         println!("{name}: {differ} pixels differ");
-        // What the option promises: a thousandth.
+        // The documented limit of the option: a thousandth.
         assert!(differ * 1000 <= 640 * 480, "{name}: {differ}");
         let refused = StereoMatcher::new(StereoOptions { max_memory: Some(all / 10), ..options }).unwrap();
         assert!(matches!(
@@ -215,7 +221,7 @@ fn strips_of_rows_take_less_memory_and_hardly_change_the_result() {
 }
 
 #[test]
-fn the_fractions_of_disparities_come_out_even() {
+fn subpixel_fractions_are_uniformly_distributed() {
     const BINS: usize = 20;
     let mut counts = [0u32; BINS];
     let textures = [
@@ -230,7 +236,7 @@ fn the_fractions_of_disparities_come_out_even() {
         Texture::Wood { colors: [srgb(0x6b4526), srgb(0xa87b4c)], seed: 10 },
     ];
     for texture in &textures {
-        // Planes over which the disparity changes by tens of pixels: every fraction is as frequent as any other.
+        // Planes over which the disparity changes by tens of pixels: all fractions are equally frequent.
         for (across, down) in [(0.5, 0.0), (0.0, 0.5), (-0.4, 0.3)] {
             let at = |x: f64, y: f64| Point3::new(x, y, 3.0 + across * x + down * y);
             let corner = at(-4.0, -3.5);
@@ -242,7 +248,7 @@ fn the_fractions_of_disparities_come_out_even() {
             let map = matched(&pair, &pair);
             for (i, &d) in map.disparity.as_slice().iter().enumerate() {
                 let (x, y) = (i % 640, i / 640);
-                // Borders aside, where windows and paths end.
+                // Without borders, where windows and paths end.
                 let inside = (8..632).contains(&x) && (8..472).contains(&y);
                 if inside
                     && map.state.at(x, y)[0] == PixelState::Matched
@@ -256,6 +262,6 @@ fn the_fractions_of_disparities_come_out_even() {
     let mean = f64::from(counts.iter().sum::<u32>()) / BINS as f64;
     let shares = counts.map(|n| f64::from(n) / mean);
     println!("{shares:.3?}");
-    // The bar of the project: within 10 % of even. The planes themselves are even within 2 %.
+    // The requirement of the project: within 10 % of uniform. The planes themselves are within 2 %.
     assert!(mean > 50_000.0 && shares.iter().all(|s| (0.9..=1.1).contains(s)), "{shares:?}");
 }

@@ -1,4 +1,4 @@
-//! Every job stops when its progress callback says so, wherever it is.
+//! Every job stops when its progress callback returns stop, at any report.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -8,7 +8,7 @@ use cv_core::{Cancelled, Progress};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use stopping::{End, jobs};
 
-/// Stops at a number of reports.
+/// Stops at a given number of reports.
 struct StopAt {
     at: usize,
     reports: AtomicUsize,
@@ -33,18 +33,18 @@ impl Progress for StopAt {
 }
 
 const THREADS: usize = 2;
-/// Each thread has one unit in hand when the job is stopped, and one more of each of the loops around it whose turn it waits for: two of them
-/// at the most (searches of a pose, chunks of samples).
+/// Each thread has one unit in progress when the job is stopped, and one more of each enclosing loop that waits: two of
+/// them at most (RANSAC, chunks of samples).
 const MORE: usize = 3 * THREADS;
 
 #[test]
-fn every_job_stops_wherever_it_is() {
+fn every_job_stops_at_any_report() {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(THREADS).build().unwrap();
     for (name, job) in jobs(160_000) {
         let watch = StopAt::new(usize::MAX);
         assert_eq!(pool.install(|| job(&watch)), End::Done, "{name}");
         let all = watch.reports();
-        // Ten times in the fifty milliseconds or more that each of these takes on any machine.
+        // Ten times in the fifty milliseconds or more that each of these jobs takes on any machine.
         assert!(all >= 10, "{name}: {all} reports");
         let moments = [1, 2, all / 7, all / 3, all / 2, 3 * all / 4, 7 * all / 8, all - 1, all];
         for at in moments {

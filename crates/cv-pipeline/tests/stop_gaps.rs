@@ -1,4 +1,5 @@
-//! How long a job goes on without asking whether to. Alone in its file: what is measured is the time of the whole process.
+//! The longest time of a job between two progress reports. Alone in its file: it measures the processor time of the
+//! whole process.
 
 #![cfg(target_os = "linux")]
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
@@ -12,14 +13,15 @@ use stopping::{End, jobs};
 
 const PIXELS: usize = 4_000_000;
 const THREADS: usize = 2;
-/// Seconds that the threads together may compute between two reports: 200 ms on each of two, for pictures of 12 megapixels, of which these have a third; half as much
-/// again because tests check for overflow. (The clock of a machine that does other things too would measure those.)
+/// Processor time in seconds of all threads between two reports: 200 ms on each of two threads, for images of 12
+/// megapixels, of which these have a third; half as much again for overflow checks in tests. (Wall-clock time depends
+/// on the load of the machine.)
 const LONGEST: f64 = 1.5 * 0.2 * THREADS as f64 / 3.0;
-/// The clock is read again after so long: it takes some microseconds.
+/// Interval between readings of the clock, which take some microseconds.
 const FINE: Duration = Duration::from_millis(5);
 
-/// Seconds that all threads of this process have computed.
-fn computed() -> f64 {
+/// Returns the processor time of all threads of this process, in seconds.
+fn processor_seconds() -> f64 {
     let tasks = std::fs::read_dir("/proc/self/task").unwrap();
     let nanoseconds = |task: std::io::Result<std::fs::DirEntry>| -> f64 {
         // A thread may have ended meanwhile.
@@ -29,7 +31,7 @@ fn computed() -> f64 {
     tasks.map(nanoseconds).sum::<f64>() * 1e-9
 }
 
-/// How often a job is tried.
+/// Number of attempts for each job.
 const ATTEMPTS: usize = 4;
 
 struct Gaps(Mutex<State>);
@@ -43,15 +45,16 @@ struct State {
 
 impl Gaps {
     fn new() -> Self {
-        let now = State { read: Instant::now(), computed: computed(), stage: "start", longest: (0.0, "", "") };
+        let now = State { read: Instant::now(), computed: processor_seconds(), stage: "start", longest: (0.0, "", "") };
         Self(Mutex::new(now))
     }
 
-    /// Notes the gap that ends now. What it says may be too long by [`FINE`] on each thread, never too short.
+    /// Records the gap that ends now. Its measured length is too long by [`FINE`] for each thread at most, never too
+    /// short.
     fn note(&self, stage: &'static str) {
         let mut state = self.0.lock().unwrap();
         if state.read.elapsed() >= FINE {
-            let now = computed();
+            let now = processor_seconds();
             let gap = now - state.computed;
             if gap > state.longest.0 {
                 state.longest = (gap, state.stage, stage);
@@ -70,7 +73,7 @@ impl Progress for Gaps {
 }
 
 #[test]
-fn no_job_goes_on_for_long_without_asking() {
+fn no_job_runs_for_long_without_a_report() {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(THREADS).build().unwrap();
     for (name, job) in jobs(PIXELS) {
         let run = || {
@@ -79,7 +82,7 @@ fn no_job_goes_on_for_long_without_asking() {
             gaps.note("end");
             gaps.0.into_inner().unwrap().longest
         };
-        // A processor that others use too, or that is slowed down, makes a gap longer, never shorter.
+        // A shared or throttled processor makes a gap longer, never shorter.
         let mut longest = run();
         for _ in 1..ATTEMPTS {
             if longest.0 > LONGEST {

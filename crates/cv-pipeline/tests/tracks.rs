@@ -1,4 +1,4 @@
-//! Points followed through more than two photographs: matches refer to keypoints by index, and that is all it takes.
+//! Tracks over more than two photographs: matches refer to keypoints by index, which is all that is needed.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -6,7 +6,7 @@ use cv_core::{Camera, Point2, Pose, Rotation3, Vector3};
 use cv_pipeline::{MatchingOptions, PanoramaOptions, PanoramaPhoto, Silent, match_photos, panorama};
 use cv_synth::{RenderOptions, Rendered, Scene, panorama_views, render};
 
-/// Three photographs of a room by a camera that steps aside and turns a little.
+/// Renders three views of a room by a camera that moves sideways and rotates a little.
 fn walk(scene: &Scene, camera: &Camera) -> Vec<Rendered> {
     let first = scene.viewpoint();
     let step = |i: u32| {
@@ -20,7 +20,7 @@ fn walk(scene: &Scene, camera: &Camera) -> Vec<Rendered> {
 }
 
 #[test]
-fn tracks_over_three_photographs_come_from_two_results_by_index_alone() {
+fn tracks_over_three_photographs_join_two_results_by_index() {
     let camera = Camera::from_focal(640, 480, 560.0);
     let scene = Scene::room(3);
     let views = walk(&scene, &camera);
@@ -29,14 +29,14 @@ fn tracks_over_three_photographs_come_from_two_results_by_index_alone() {
         match_photos(a, b, &MatchingOptions::default(), &Silent).unwrap()
     };
     let (first, second) = (pair(0, 1), pair(1, 2));
-    // One photograph has the same features in both results.
+    // A photograph has the same features in both results.
     assert_eq!(first.features[1], second.features[0]);
     let tracks: Vec<[u32; 3]> = first
         .matches
         .iter()
         .filter_map(|m| Some([m.query, m.train, second.matches.iter().find(|n| n.query == m.train)?.train]))
         .collect();
-    // Where the surface that the first photograph shows lies in the other two.
+    // The projections of the surface at the first photograph's keypoint into the other two.
     let right = tracks.iter().filter(|track| {
         let at = |view: usize| match view {
             2 => second.features[1].keypoints[track[2] as usize],
@@ -52,17 +52,18 @@ fn tracks_over_three_photographs_come_from_two_results_by_index_alone() {
     });
     let right = right.count();
     println!("{} tracks, {right} right", tracks.len());
-    // Of tentative matches at least nine in ten are right between neighboring views of a textured room; features on outlines belong to two things.
+    // At least nine in ten tentative matches are correct between neighboring views of a textured room; features at
+    // object boundaries belong to two surfaces.
     assert!(tracks.len() > 150 && right * 10 >= tracks.len() * 8, "{right} of {}", tracks.len());
 }
 
 #[test]
-fn matches_of_a_panorama_lead_to_the_pixels_of_its_photographs() {
+fn matches_of_a_panorama_are_in_pixels_of_its_photographs() {
     let camera = Camera::from_focal(640, 480, 520.0);
     let options = cv_synth::PanoramaSetOptions { views: 3, ..cv_synth::PanoramaSetOptions::default() };
     let set = panorama_views(1, &camera, &options, &RenderOptions::default()).unwrap();
     let photos: Vec<_> = set.views.iter().map(|v| PanoramaPhoto::new(v.image.view())).collect();
-    // Features are looked for in photographs of half the size.
+    // Features are extracted at half the resolution.
     let small = PanoramaOptions { registration_pixels: 320 * 240, ..PanoramaOptions::default() };
     let result = panorama(&photos, &small, &Silent).unwrap();
     let accepted: Vec<_> = result.pairs.iter().filter(|p| p.rejected.is_none()).collect();
@@ -76,7 +77,7 @@ fn matches_of_a_panorama_lead_to_the_pixels_of_its_photographs() {
             .filter_map(|&i| Some((set.transfer(pair.a, pair.b, pixels[i].a)? - pixels[i].b).norm()))
             .collect();
         off.sort_by(f64::total_cmp);
-        // A SIFT point is good to a few tenths of a pixel, of which each is two of the photograph's.
+        // A SIFT keypoint is accurate to a few tenths of a pixel, each of which is two of the photograph's.
         assert!(off.len() > 20 && off[off.len() / 2] < 1.5, "{} {}", off.len(), off[off.len() / 2]);
     }
 }

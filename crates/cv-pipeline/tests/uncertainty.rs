@@ -1,4 +1,4 @@
-//! Whether points of generated scenes are as far off as their covariances say, and how many matches along epipolar lines are wrong.
+//! Depth errors of generated scenes against the covariances, and the outlier ratio of guided matches.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -7,7 +7,7 @@ use cv_pipeline::{Intrinsics, ReconstructOptions, Silent, reconstruct};
 use cv_synth::{RenderOptions, two_view};
 
 #[test]
-fn depths_are_off_by_what_the_covariances_say_and_few_matches_are_wrong() {
+fn depth_errors_agree_with_the_covariances_and_few_matches_are_wrong() {
     let camera = Camera::from_focal(640, 480, 560.0);
     let (mut within, mut count) = (0.0, 0.0);
     let (mut wrong, mut all, mut kept_wrong, mut kept) = (0.0, 0.0, 0.0, 0.0);
@@ -19,11 +19,11 @@ fn depths_are_off_by_what_the_covariances_say_and_few_matches_are_wrong() {
             let result = reconstruct(views.a.image.view(), views.b.image.view(), &options, &Silent).unwrap();
             let (mut w, mut n, mut bad) = (0.0, 0.0, 0.0);
             for p in &result.scene.points {
-                // Where the surface is on the ray to the point, and where the second camera sees it.
+                // The surface on the ray to the point, and its projection into the second camera.
                 let pixel = camera.project(&p.position).unwrap();
                 let Some(truth) = views.scene.point_at(&camera, &views.a.pose, pixel) else { continue };
                 let at = camera.project(&views.b.pose.transform(&truth));
-                // Farther off than three pixels is no noise of the position: it is another thing.
+                // More than three pixels off is an outlier.
                 let miss = at.map_or(f64::INFINITY, |q| (q - result.pair(p).b).norm());
                 n += 1.0;
                 if miss > 3.0 {
@@ -52,11 +52,12 @@ fn depths_are_off_by_what_the_covariances_say_and_few_matches_are_wrong() {
         100.0 * wrong / all,
         100.0 * kept_wrong / kept
     );
-    // 95 % would be within 1.96 standard deviations, had each position an error of its own that is normal; those of two features of one edge go together, and
-    // matches up to three pixels off are counted among the right ones.
+    // 95 % would be within 1.96 standard deviations for independent normal errors; those of two features of one edge
+    // are correlated, and matches up to three pixels off count as inliers.
     assert!((0.88..0.975).contains(&share), "{share}");
-    // Features on outlines belong to the thing before and the ground behind: a few in a hundred are matched by the one and lie on the other. Along epipolar lines
-    // there is less to tell a wrong partner by: a quarter of what they add may be such, and they add an eighth.
+    // Features at object boundaries belong to foreground and background: a few per cent are matched by one and lie on
+    // the other. Guided matches have less to reject them by: up to a quarter of the matches they add, which are an
+    // eighth of all.
     assert!(wrong / all < 0.04 && kept_wrong / kept < 0.06, "{} {}", wrong / all, kept_wrong / kept);
     assert!(kept - kept_wrong > 1.08 * (all - wrong), "matches along lines add points");
 }

@@ -181,10 +181,10 @@ impl Job<'_> {
         };
         let given = match (self.known, self.known.camera(size)) {
             (Known::Camera(camera), _) => Some(SfmCamera::known(*camera)),
-            (Known::Matrix(_), Some(camera)) => Some(SfmCamera::of_matrix(camera)),
+            (Known::Matrix(_), Some(camera)) => Some(SfmCamera::from_matrix(camera)),
             _ => None,
         };
-        let Ok(found) = cameras.of(size, focal, || Ok::<_, Infallible>(given));
+        let Ok(found) = cameras.get_or_add(size, focal, || Ok::<_, Infallible>(given));
         found.map_err(LeftOut::Camera)
     }
 

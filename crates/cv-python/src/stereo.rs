@@ -175,7 +175,7 @@ pub(crate) fn depth<'py>(
                     .map_or_else(none, |[one, two]| object(py, (arrays::array(py, one)?, arrays::array(py, two)?)))?,
             ),
             ("cloud", cloud.map_or_else(none, |cloud| cloud::made(py, cloud))?),
-            ("few_matches", object(py, found.few.map(|few| (few.agree, few.seen)))?),
+            ("few_matches", object(py, found.feature_agreement.map(|few| (few.agree, few.seen)))?),
             ("vertical_offset", object(py, found.vertical_offset.map(|o| (o.at_center, o.across, o.down)))?),
             ("disparities", object(py, found.disparities)?),
             ("valid_fraction", object(py, valid)?),

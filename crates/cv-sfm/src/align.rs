@@ -1,92 +1,92 @@
-//! A model in the frame of what is known of its cameras: up, meters, positions.
+//! Alignment of a model to external measurements: the vertical, the metric scale, known camera centers.
 
 use crate::SfmModel;
 use cv_core::{Cancelled, Matrix3, Point3, Pose, Progress, Rotation3, Vector3, median, upright};
 use cv_geometry::{EstimateError, RobustOptions, Similarity, SimilarityFreedom, estimate_similarity};
 use cv_numeric::{svd3, symmetric_eigen};
 
-/// What is known of where views were, by a source other than their pictures.
+/// Measurements of camera centers from a source other than the images, such as GPS or a tape.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct KnownPlaces<'a> {
-    /// Of each view, where its camera's center was: X and Y level, Z up, in one unit (meters). Empty: nothing is known.
+    /// Camera center of each view, in one unit (meters), with X and Y horizontal and Z up. Empty: none is known.
     pub centers: &'a [Option<Point3<f64>>],
-    /// Pairs of views and how far apart their centers were, in the same unit.
+    /// Pairs of views with the measured distance of their camera centers, in the same unit.
     pub distances: &'a [(usize, usize, f64)],
 }
 
-/// How a model was aligned.
+/// The alignment of a model.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModelAlignment {
     /// From the model's frame to the new one, which has Z up.
     pub similarity: Similarity,
-    /// Whether lengths have the unit of what is known; else they are as before.
+    /// Whether the new frame has the unit of the measurements; else the scale is unchanged.
     pub metric: bool,
-    /// How known centers fit, where they were used.
+    /// Fit of the known centers; `None` where there are none.
     pub centers: Option<CenterFit>,
-    /// Largest relative error of a known distance, where some were used.
+    /// Largest relative error of a known distance; `None` where there are none.
     pub distance_error: Option<f64>,
 }
 
-/// How known centers fit a model.
+/// Fit of known camera centers to a model.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CenterFit {
-    /// Views of the model whose known center agrees, ascending.
-    pub agree: Vec<usize>,
-    /// Those whose known center does not.
-    pub differ: Vec<usize>,
-    /// Root mean square distance of those that agree from where they are known to be.
+    /// Inliers: views of the model whose known center agrees, ascending.
+    pub inliers: Vec<usize>,
+    /// Outliers: the other views with a known center.
+    pub outliers: Vec<usize>,
+    /// Root mean square distance of the inliers from their known centers.
     pub rms: f64,
-    /// Root mean square distance of their known centers from their mean.
+    /// Root mean square distance of the inliers' known centers from their mean.
     pub spread: f64,
-    /// Whether the known centers tell how the model is tilted; on a line they do not, and up is that of the photographs.
+    /// Whether the known centers determine the tilt. Collinear centers do not; the vertical then comes from the images.
     pub tilt: bool,
-    /// The scale by the centers over that by the known distances, where there are both.
+    /// Ratio of the scale by the centers to that by the known distances, where both are known.
     pub scale_ratio: Option<f64>,
 }
 
-/// Why a model cannot be aligned to what is known.
+/// Why a model cannot be aligned to the measurements.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum ModelAlignError {
-    /// Fewer than three of the model's views have a known center.
-    #[error("{got} views of the model have a known center where {needed} are needed")]
+    /// Fewer than three views of the model have a known center.
+    #[error("{got} views of the model have a known center, {needed} are needed")]
     TooFew {
-        /// Views that have one.
+        /// Views with a known center.
         got: usize,
-        /// How many are needed.
+        /// Number that is needed.
         needed: usize,
     },
-    /// The known centers are one place, or all above each other.
-    #[error("the known centers are in one place, or one above the other")]
+    /// Degenerate configuration: the known centers coincide, or are all on one vertical line.
+    #[error("the known centers coincide or are on one vertical line")]
     OnePlace,
-    /// The known centers are not those of the model.
-    #[error("{agree} of {of} known centers agree with the model, to {rms} where they are {spread} around their mean")]
+    /// The known centers do not have the shape of the model's centers.
+    #[error("{agree} of {of} known centers agree with the model, with an rms error of {rms} at a spread of {spread}")]
     Contradiction {
-        /// Centers that agree with the best alignment.
+        /// Inliers of the best alignment.
         agree: usize,
-        /// Known centers.
+        /// Number of known centers.
         of: usize,
-        /// Root mean square distance of those that agree, or what it is at the most.
+        /// Root mean square error of the inliers, or an upper bound of it.
         rms: f64,
-        /// That of theirs from their mean.
+        /// Root mean square distance of the inliers' known centers from their mean.
         spread: f64,
     },
     /// A view with a known distance is not in the model.
-    #[error("view {view}, to which a distance is known, is not in the model")]
+    #[error("view {view} has a known distance but is not in the model")]
     NotInModel {
         /// Index of the view.
         view: usize,
     },
-    /// Two views with a known distance are in one place in the model.
-    #[error("views {a} and {b}, between which a distance is known, are in one place")]
+    /// Two views with a known distance have the same center in the model.
+    #[error("views {a} and {b} have a known distance but coincide in the model")]
     NoDistance {
-        /// Index of one.
+        /// Index of the first view.
         a: usize,
-        /// Index of the other.
+        /// Index of the second view.
         b: usize,
     },
-    /// A center or a distance is not a number of any use.
-    #[error("known place {index} is not a number of any use")]
+    /// A known center or distance is not finite, too large, or a distance is not positive.
+    #[error("known center or distance {index} is out of range")]
     NotFinite {
         /// Index of the view, or of the distance.
         index: usize,
@@ -96,25 +96,30 @@ pub enum ModelAlignError {
     Cancelled(#[from] Cancelled),
 }
 
-/// Fewest known centers.
-const FEWEST: usize = 3;
-/// Largest root mean square distance of known centers from a model's, as a share of how far they are around their mean: with half of it, the model explains three quarters of the variance. Positions
-/// with an error as large as the scene would pass for it at any scale.
-const CONTRADICTION: f64 = 0.5;
-/// Largest standard deviation of a tilt by known centers, in radians, before that of the photographs is taken: the mean of how people hold a camera is level to about so much.
-const TILT: f64 = 0.05;
-/// The median length of a normal error in space, in standard deviations of a coordinate (χ with three degrees of freedom).
-const MEDIAN_LENGTH: f64 = 1.5382;
-/// The longest error of a center that agrees, in the same: 99 % are below 3.37, and the median of a dozen errors tells the deviation to a quarter only, seldom to less than two thirds.
-const LONGEST: f64 = 5.0;
-/// What a model's own centers may be off by, as a share of how far they are around their mean (kitti-2: 2.5 %): no nearer place is called another.
-const DRIFT: f64 = 0.01;
+/// Minimum number of known centers: the minimal sample of a similarity.
+const MIN_CENTERS: usize = 3;
+/// Largest rms error of the known centers, as a ratio of their spread: at 0.5 the model explains three quarters of the
+/// variance. Random centers with an error as large as the scene pass at any scale without it.
+const MAX_RMS_RATIO: f64 = 0.5;
+/// Largest standard deviation of the tilt by known centers, in radians. Above it the vertical is taken from the images,
+/// whose mean camera roll and pitch are about this accurate.
+const MAX_TILT_SIGMA: f64 = 0.05;
+/// Median of the χ distribution with three degrees of freedom: the median length of an isotropic normal error, in
+/// standard deviations of a coordinate.
+const CHI3_MEDIAN: f64 = 1.5382;
+/// Inlier threshold in standard deviations of a coordinate. 99 % of inliers are below 3.37; the rest allows for the
+/// error of a standard deviation that is estimated from a dozen centers (a quarter).
+const THRESHOLD_SIGMAS: f64 = 5.0;
+/// Smallest inlier threshold as a ratio of the spread: the drift of the model itself (kitti-2: 2.5 %).
+const MIN_THRESHOLD_RATIO: f64 = 0.01;
 
-/// The similarity from a model's frame to that of what is known: up by the photographs themselves ([`upright`]), the scale by known distances, all of it by known centers.
+/// Estimates the similarity from a model's frame to that of the measurements. The vertical comes from the images
+/// ([`upright`]), the scale from known distances, or all of it from known centers.
 ///
-/// Centers (the satellites' are off by meters, some by much more) are fitted by a robust similarity ([`estimate_similarity`]) whose threshold is found from their own noise. Where they lie on a
-/// line within their noise, as along a street, they say nothing of how the model is turned about it: the photographs' up does. A similarity never bends a model. With distances the scale is
-/// theirs alone. Nothing known: upright, the first view in the origin, looking along Y.
+/// Known centers (GPS errors are of meters, with gross outliers) are fitted by a robust similarity
+/// ([`estimate_similarity`]) whose threshold is estimated from the residuals. Collinear centers, as along a street,
+/// leave the rotation about their line free; the images' vertical then fixes it. Known distances alone set the scale
+/// where there are some. Without measurements: upright, the first view at the origin, looking along Y.
 ///
 /// # Errors
 /// [`ModelAlignError`].
@@ -128,11 +133,11 @@ pub fn align_model(
     let (scale, distance_error) = match known.distances {
         [] => (None, None),
         distances => {
-            let (scale, error) = scale_by(model, distances)?;
+            let (scale, error) = fit_scale(model, distances)?;
             (Some(scale), Some(error))
         }
     };
-    let base = scaled(&base, scale.unwrap_or(1.0));
+    let base = scale_similarity(&base, scale.unwrap_or(1.0));
     if known.centers.iter().all(Option::is_none) {
         return Ok(ModelAlignment { similarity: base, metric: scale.is_some(), centers: None, distance_error });
     }
@@ -146,68 +151,74 @@ pub fn align_model(
         from.push(base.transform(&pose.center()));
         to.push(*center);
     }
-    if views.len() < FEWEST {
-        return Err(ModelAlignError::TooFew { got: views.len(), needed: FEWEST });
+    if views.len() < MIN_CENTERS {
+        return Err(ModelAlignError::TooFew { got: views.len(), needed: MIN_CENTERS });
     }
-    let fit = |tilt: bool| Fit::new(&from, &to, SimilarityFreedom { scale: scale.is_none(), tilt }, seed, progress);
-    let found = match fit(true)? {
-        Some(found) if found.tilt_deviation(&from) <= TILT => Some((found, true)),
-        _ => fit(false)?.map(|found| (found, false)),
+    let align = |tilt: bool| {
+        CenterAlignment::estimate(&from, &to, SimilarityFreedom { scale: scale.is_none(), tilt }, seed, progress)
     };
-    let (found, tilt) = found.ok_or(ModelAlignError::OnePlace)?;
-    let agree = found.inliers.len();
-    if found.rms > CONTRADICTION * found.spread || 2 * agree < views.len() || agree < FEWEST {
-        let (rms, spread) = (found.rms, found.spread);
+    let fit = match align(true)? {
+        Some(fit) if fit.tilt_sigma(&from) <= MAX_TILT_SIGMA => Some((fit, true)),
+        _ => align(false)?.map(|fit| (fit, false)),
+    };
+    let (fit, tilt) = fit.ok_or(ModelAlignError::OnePlace)?;
+    let agree = fit.inliers.len();
+    if fit.rms > MAX_RMS_RATIO * fit.spread || 2 * agree < views.len() || agree < MIN_CENTERS {
+        let (rms, spread) = (fit.rms, fit.spread);
         return Err(ModelAlignError::Contradiction { agree, of: views.len(), rms, spread });
     }
     let scale_ratio = match scale {
-        Some(_) => Fit::new(&from, &to, SimilarityFreedom { scale: true, tilt }, seed, progress)?
+        Some(_) => CenterAlignment::estimate(&from, &to, SimilarityFreedom { scale: true, tilt }, seed, progress)?
             .map(|free| free.similarity.scale),
         None => None,
     };
-    let inside: Vec<usize> = found.inliers.iter().map(|i| views[*i]).collect();
-    let differ = views.iter().copied().filter(|v| !inside.contains(v)).collect();
-    let (rms, spread) = (found.rms, found.spread);
-    let centers = Some(CenterFit { agree: inside, differ, rms, spread, tilt, scale_ratio });
-    Ok(ModelAlignment { similarity: after(&found.similarity, &base), metric: true, centers, distance_error })
+    let inliers: Vec<usize> = fit.inliers.iter().map(|i| views[*i]).collect();
+    let outliers = views.iter().copied().filter(|v| !inliers.contains(v)).collect();
+    let (rms, spread) = (fit.rms, fit.spread);
+    let centers = Some(CenterFit { inliers, outliers, rms, spread, tilt, scale_ratio });
+    Ok(ModelAlignment { similarity: compose(&fit.similarity, &base), metric: true, centers, distance_error })
 }
 
-/// A similarity of known centers.
-struct Fit {
+/// A similarity fitted to known centers.
+struct CenterAlignment {
     similarity: Similarity,
     inliers: Vec<usize>,
     rms: f64,
     spread: f64,
 }
 
-impl Fit {
-    /// `None` where the centers determine none; [`ModelAlignError::Contradiction`] where they have another shape.
-    fn new(
+impl CenterAlignment {
+    /// Estimates the similarity from `from` to `to`. `None` for a degenerate configuration.
+    ///
+    /// # Errors
+    /// [`ModelAlignError::Contradiction`] without consensus, [`ModelAlignError::Cancelled`].
+    fn estimate(
         from: &[Point3<f64>],
         to: &[Point3<f64>],
         freedom: SimilarityFreedom,
         seed: u64,
         progress: &dyn Progress,
     ) -> Result<Option<Self>, ModelAlignError> {
-        let around = median_distance(to);
+        let median_spread = median_spread(to);
         let estimate = |threshold: f64| {
             let options = RobustOptions { threshold, seed, ..RobustOptions::default() };
             match estimate_similarity(from, to, freedom, &options, progress) {
                 Err(EstimateError::Cancelled(stop)) => Err(ModelAlignError::Cancelled(stop)),
                 Err(EstimateError::NoConsensus { inliers: agree, .. }) => {
-                    Err(ModelAlignError::Contradiction { agree, of: to.len(), rms: threshold, spread: around })
+                    Err(ModelAlignError::Contradiction { agree, of: to.len(), rms: threshold, spread: median_spread })
                 }
-                found => Ok(found.ok()),
+                fitted => Ok(fitted.ok()),
             }
         };
-        // Half of how far they are apart is what a contradiction is.
-        let Some(wide) = estimate(CONTRADICTION * around.max(1e-9))? else { return Ok(None) };
-        let mut errors: Vec<f64> = from.iter().zip(to).map(|(p, q)| (wide.model.transform(p) - q).norm()).collect();
-        // Three numbers each, of which the similarity takes up some.
-        let numbers = 3.0 * from.len() as f64;
-        let free = 3.0 + if freedom.tilt { 3.0 } else { 1.0 } + f64::from(u8::from(freedom.scale));
-        let deviation = median(&mut errors).unwrap_or(0.0) / MEDIAN_LENGTH * (numbers / (numbers - free)).sqrt();
-        let threshold = (LONGEST * deviation).clamp(DRIFT * around, CONTRADICTION * around).max(1e-9);
+        let Some(coarse) = estimate(MAX_RMS_RATIO * median_spread.max(1e-9))? else { return Ok(None) };
+        let mut errors: Vec<f64> = from.iter().zip(to).map(|(p, q)| (coarse.model.transform(p) - q).norm()).collect();
+        // Three equations for each center, less the parameters of the similarity.
+        let equations = 3.0 * from.len() as f64;
+        let parameters = 3.0 + if freedom.tilt { 3.0 } else { 1.0 } + f64::from(u8::from(freedom.scale));
+        let sigma = median(&mut errors).unwrap_or(0.0) / CHI3_MEDIAN * (equations / (equations - parameters)).sqrt();
+        let threshold = (THRESHOLD_SIGMAS * sigma)
+            .clamp(MIN_THRESHOLD_RATIO * median_spread, MAX_RMS_RATIO * median_spread)
+            .max(1e-9);
         let Some(fine) = estimate(threshold)? else { return Ok(None) };
         let mean = fine.inliers.iter().map(|i| to[*i].coords).sum::<Vector3<f64>>() / fine.inliers.len() as f64;
         let square: f64 = fine.inliers.iter().map(|i| (to[*i].coords - mean).norm_squared()).sum();
@@ -215,33 +226,34 @@ impl Fit {
         Ok(Some(Self { similarity: fine.model, inliers: fine.inliers, rms: fine.rms, spread }))
     }
 
-    /// Standard deviation of the turn that is known least, about the line that the centers are nearest to, in radians.
-    fn tilt_deviation(&self, from: &[Point3<f64>]) -> f64 {
+    /// Returns the standard deviation of the least certain rotation, the one about the line that best fits the centers,
+    /// in radians.
+    fn tilt_sigma(&self, from: &[Point3<f64>]) -> f64 {
         let n = self.inliers.len() as f64;
         let mean = self.inliers.iter().map(|i| from[*i].coords).sum::<Vector3<f64>>() / n;
-        let spread = self.inliers.iter().fold(Matrix3::zeros(), |sum, i| {
+        let scatter = self.inliers.iter().fold(Matrix3::zeros(), |sum, i| {
             let d = from[*i].coords - mean;
             sum + d * d.transpose()
         });
-        let (values, _) = symmetric_eigen(&spread);
-        // What is across the line, and the standard deviation of a coordinate, in the unit of what is known.
+        let (values, _) = symmetric_eigen(&scatter);
+        // Extent across that line, in the unit of the measurements.
         let across = self.similarity.scale * (values[0] + values[1]).max(0.0).sqrt();
-        let spare = (3.0 * n - 7.0).max(1.0);
-        let deviation = self.rms * (n / spare).sqrt();
-        deviation / across
+        let degrees_of_freedom = (3.0 * n - 7.0).max(1.0);
+        let sigma = self.rms * (n / degrees_of_freedom).sqrt();
+        sigma / across
     }
 }
 
-/// Median distance from the median of each coordinate.
-fn median_distance(points: &[Point3<f64>]) -> f64 {
-    let middle = Point3::from(
+/// Returns the median distance from the component-wise median.
+fn median_spread(points: &[Point3<f64>]) -> f64 {
+    let center = Point3::from(
         [0, 1, 2].map(|k: usize| median(&mut points.iter().map(|p| p[k]).collect::<Vec<_>>()).unwrap_or(0.0)),
     );
-    median(&mut points.iter().map(|p| (p - middle).norm()).collect::<Vec<_>>()).unwrap_or(0.0)
+    median(&mut points.iter().map(|p| (p - center).norm()).collect::<Vec<_>>()).unwrap_or(0.0)
 }
 
-/// The scale of least squares by known distances, and the largest relative error of one.
-fn scale_by(model: &SfmModel, distances: &[(usize, usize, f64)]) -> Result<(f64, f64), ModelAlignError> {
+/// Returns the scale by least squares on known distances, and the largest relative error of a distance.
+fn fit_scale(model: &SfmModel, distances: &[(usize, usize, f64)]) -> Result<(f64, f64), ModelAlignError> {
     let center = |view: usize| {
         let pose = model.poses.get(view).copied().flatten();
         pose.map(|pose| pose.center()).ok_or(ModelAlignError::NotInModel { view })
@@ -251,63 +263,63 @@ fn scale_by(model: &SfmModel, distances: &[(usize, usize, f64)]) -> Result<(f64,
         if !(known > 0.0 && known <= 1e12) {
             return Err(ModelAlignError::NotFinite { index });
         }
-        let found = (center(a)? - center(b)?).norm();
-        if found <= 1e-12 || found.is_nan() {
+        let estimated = (center(a)? - center(b)?).norm();
+        if estimated <= 1e-12 || estimated.is_nan() {
             return Err(ModelAlignError::NoDistance { a, b });
         }
-        pairs.push((found, known));
+        pairs.push((estimated, known));
     }
-    // Relative errors count alike: a tape is read to a share of its length.
+    // Relative errors are minimized: the error of a tape is proportional to its length.
     let (mut product, mut square) = (0.0, 0.0);
-    for (found, known) in &pairs {
-        (product, square) = (product + found / known, square + (found / known).powi(2));
+    for (estimated, known) in &pairs {
+        (product, square) = (product + estimated / known, square + (estimated / known).powi(2));
     }
     let scale = product / square;
-    let error = pairs.iter().map(|(found, known)| (found * scale / known - 1.0).abs()).fold(0.0, f64::max);
+    let error = pairs.iter().map(|(estimated, known)| (estimated * scale / known - 1.0).abs()).fold(0.0, f64::max);
     Ok((scale, error))
 }
 
-/// To a world with Z up and its origin at the first view that is in the model, which looks along Y.
+/// Returns the similarity to a frame with Z up and its origin at the first view of the model, which looks along Y.
 fn upright_similarity(model: &SfmModel) -> Similarity {
     let poses: Vec<Pose> = model.poses.iter().flatten().copied().collect();
     let level = upright(&poses);
-    // (x, y, z) with Y down to (x, z, −y) with Z up.
-    let stand = Rotation3::from_matrix_unchecked(Matrix3::new(1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0, 0.0));
-    Similarity { scale: 1.0, rotation: stand * level.rotation, translation: stand * level.translation }
+    // (x, y, z) with Y down becomes (x, z, −y) with Z up.
+    let z_up = Rotation3::from_matrix_unchecked(Matrix3::new(1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0, 0.0));
+    Similarity { scale: 1.0, rotation: z_up * level.rotation, translation: z_up * level.translation }
 }
 
-/// The similarity that brings a model to poses that are known of its views, turns and places together: so two views are enough, on a line or not. `None` of fewer than two, and of those in one
-/// place.
+/// Estimates the similarity from a model's frame to that of known poses of its views, from rotations and centers
+/// together: two views are enough, collinear or not. `None` for fewer than two, or coincident centers.
 pub fn align_to_poses(model: &SfmModel, known: &[Option<Pose>]) -> Option<Similarity> {
-    let both = model.poses.iter().zip(known).filter_map(|(found, known)| Some(((*found)?, (*known)?)));
-    let both: Vec<(Pose, Pose)> = both.collect();
-    let sum = both
-        .iter()
-        .fold(Matrix3::zeros(), |sum, (found, known)| sum + (known.rotation.inverse() * found.rotation).into_inner());
+    let pairs = model.poses.iter().zip(known).filter_map(|(estimated, known)| Some(((*estimated)?, (*known)?)));
+    let pairs: Vec<(Pose, Pose)> = pairs.collect();
+    let sum = pairs.iter().fold(Matrix3::zeros(), |sum, (estimated, known)| {
+        sum + (known.rotation.inverse() * estimated.rotation).into_inner()
+    });
     let rotation = svd3(&sum).ok().filter(|svd| svd.s[1] > 1e-9)?.nearest_rotation();
     let mean = |of: fn(&(Pose, Pose)) -> Pose| {
-        both.iter().map(|pair| of(pair).center().coords).sum::<Vector3<f64>>() / both.len() as f64
+        pairs.iter().map(|pair| of(pair).center().coords).sum::<Vector3<f64>>() / pairs.len() as f64
     };
     let (from, to) = (mean(|p| p.0), mean(|p| p.1));
     let (mut product, mut square) = (0.0, 0.0);
-    for (found, known) in &both {
-        let (p, q) = (rotation * (found.center().coords - from), known.center().coords - to);
+    for (estimated, known) in &pairs {
+        let (p, q) = (rotation * (estimated.center().coords - from), known.center().coords - to);
         (product, square) = (product + p.dot(&q), square + p.norm_squared());
     }
     let scale = product / square;
-    (both.len() >= 2 && scale > 0.0 && scale.is_finite()).then(|| Similarity {
+    (pairs.len() >= 2 && scale > 0.0 && scale.is_finite()).then(|| Similarity {
         scale,
         rotation,
         translation: to - rotation * from * scale,
     })
 }
 
-fn scaled(of: &Similarity, by: f64) -> Similarity {
+fn scale_similarity(of: &Similarity, by: f64) -> Similarity {
     Similarity { scale: of.scale * by, translation: of.translation * by, ..*of }
 }
 
-/// First `first`, then `second`.
-fn after(second: &Similarity, first: &Similarity) -> Similarity {
+/// Returns the composition: first `first`, then `second`.
+fn compose(second: &Similarity, first: &Similarity) -> Similarity {
     Similarity {
         scale: second.scale * first.scale,
         rotation: second.rotation * first.rotation,
@@ -316,10 +328,10 @@ fn after(second: &Similarity, first: &Similarity) -> Similarity {
 }
 
 impl SfmModel {
-    /// Moves poses and points to another frame: what the cameras see stays the same.
+    /// Transforms poses and points to another frame. The projections stay the same.
     pub fn transform(&mut self, to: &Similarity) {
         for pose in self.poses.iter_mut().flatten() {
-            // x_cam = R p + t with p = R_sᵀ (q − t_s) / s, and s x_cam is the same pixel.
+            // x_cam = R p + t with p = R_sᵀ (q − t_s) / s; s x_cam projects to the same pixel.
             let rotation = pose.rotation * to.rotation.inverse();
             *pose = Pose::new(rotation, pose.translation * to.scale - rotation * to.translation);
         }

@@ -1,7 +1,7 @@
-//! How well the cameras and points of a model are known.
+//! Covariances of the poses and points of a model.
 
 use crate::bundle::{BundlePlan, LensFreedom, Problem};
-use crate::finish::noise_scale;
+use crate::refine_model::noise_scale;
 use crate::scene::Scene;
 use crate::{CameraKnowledge, SfmModel, SfmView, Tracks};
 use cv_core::{Matrix3, Pose};
@@ -9,48 +9,51 @@ use cv_numeric::RobustLoss;
 use cv_numeric::adjust::AdjustError;
 use nalgebra::{DMatrix, Matrix3x6};
 
-/// How well the cameras and points of a model are known, given the noise of their keypoints as the residuals show it, to first order. Of a lens that was estimated the focal length and distortion
-/// count too; that a lens may be of another model, or that points may be wrong ones that agree, does not.
+/// First-order covariances of the poses and points of a model, for the keypoint noise estimated from the residuals. The
+/// uncertainty of estimated focal lengths and distortion is included; errors of the lens model and outliers among the
+/// inliers are not.
 ///
-/// Relative to the pose of one view, which counts as exact, and its distance from another, which is the unit: a model tells no more. In the model's frame and unit.
+/// The gauge is the pose of one view, taken as exact, and its distance from another view, taken as the unit of length.
+/// In the model's frame and unit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModelCovariance {
-    /// The view whose pose is exact, and that whose distance from it is.
+    /// The view whose pose is exact, and the view whose distance from it is.
     pub reference: [usize; 2],
-    /// Standard deviation of a keypoint's coordinate, in pixels, as the residuals show it.
+    /// Standard deviation of a keypoint coordinate, in pixels, estimated from the residuals.
     pub noise: f64,
-    /// Of each view of the model.
+    /// Of each view; `None` where it is not in the model.
     pub poses: Vec<Option<PoseCovariance>>,
-    /// Of each point's position; `None` where nothing determines it.
+    /// Of the position of each point; `None` where nothing determines it.
     pub points: Vec<Option<Matrix3<f64>>>,
 }
 
-/// How well a camera's pose is known.
+/// Covariance of a camera pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PoseCovariance {
-    /// Of its center, in the world.
+    /// Of the camera center, in the world frame.
     pub center: Matrix3<f64>,
-    /// Of its rotation about the camera's own axes, in square radians.
+    /// Of the rotation vector in the camera frame, in square radians.
     pub rotation: Matrix3<f64>,
 }
 
-/// Covariances of a model that [`reconstruct_views`](crate::reconstruct_views) found. `views` and `knowledge` are those that it was found of. O(views³ + observations).
+/// Computes the covariances of a model of [`reconstruct_views`](crate::reconstruct_views). `views` and `knowledge` are
+/// those of its input. O(views³ + observations).
 ///
 /// # Errors
-/// [`AdjustError`]: the matches leave something free, or the model is not of these views.
+/// [`AdjustError`]: the matches leave a parameter undetermined, or the model is not of these views.
 pub fn model_covariance(
     views: &[SfmView<'_>],
     knowledge: &[CameraKnowledge],
     model: &SfmModel,
 ) -> Result<ModelCovariance, AdjustError> {
-    let strange = model.poses.len() != views.len()
+    let is_mismatched = model.poses.len() != views.len()
         || views.iter().any(|v| v.camera >= model.cameras.len().min(knowledge.len()))
         || model
             .points
             .iter()
             .flat_map(|p| &p.observations)
             .any(|o| views.get(o.view as usize).is_none_or(|v| o.keypoint as usize >= v.keypoints.len()));
-    if strange {
+    if is_mismatched {
         return Err(AdjustError::Index { name: "views".to_owned(), index: views.len(), len: model.poses.len() });
     }
     let tracks = Tracks::from_lists(model.points.iter().map(|p| p.observations.clone()));
@@ -58,15 +61,16 @@ pub fn model_covariance(
     scene.poses.clone_from(&model.poses);
     scene.points = model.points.iter().map(|p| Some(p.position)).collect();
     scene.active.fill(true);
-    // A lens that was given without its distortion is as it was given, unless the matches called for one.
-    let estimated = model.cameras.iter().zip(knowledge).any(|(camera, knowledge)| match knowledge {
+    // The intrinsics of a given calibration matrix are constant, unless a distortion was estimated.
+    let is_estimated = model.cameras.iter().zip(knowledge).any(|(camera, knowledge)| match knowledge {
         CameraKnowledge::Known => false,
         CameraKnowledge::Matrix => camera.distortion.parameters().iter().any(|k| *k != 0.0),
         CameraKnowledge::Focal { .. } | CameraKnowledge::Unknown => true,
     });
-    let lens = if estimated { LensFreedom::Distortion } else { LensFreedom::Held };
+    let lens = if is_estimated { LensFreedom::Distortion } else { LensFreedom::Fixed };
     let plan = BundlePlan { free: None, lens, scale: noise_scale(&scene), max_iterations: 0, tolerance: 0.0 };
-    // What did not agree is no observation any more: without a robust loss, whose weights would understate the noise.
+    // Outliers are no observations any more, so the loss is the square: the weights of a robust loss would understate
+    // the noise.
     let problem = Problem::new(&scene, &plan, &vec![true; views.len()], RobustLoss::Trivial)?;
     let variance = problem.adjustment.variance()?;
     let covariance = problem.adjustment.covariance(variance)?;
@@ -86,7 +90,8 @@ pub fn model_covariance(
     Ok(ModelCovariance { reference, noise: variance.sqrt(), poses, points })
 }
 
-/// From that of a turn ω and a shift τ, `R ← exp(ω) R` and `t ← t + τ`: the center `−Rᵀ t` moves by `−Rᵀ ([t]× ω + τ)`.
+/// Converts the covariance of a rotation ω and a translation τ, `R ← exp(ω) R` and `t ← t + τ`: the center `−Rᵀ t`
+/// changes by `−Rᵀ ([t]× ω + τ)`.
 fn pose_covariance(pose: &Pose, of: &DMatrix<f64>) -> PoseCovariance {
     let of = of.fixed_view::<6, 6>(0, 0);
     let back = pose.rotation.inverse();

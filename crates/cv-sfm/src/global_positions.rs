@@ -1,4 +1,5 @@
-//! The centers of views whose rotations are known: from the directions and lengths of their pairs, then together with the points from the directions of rays.
+//! Camera centers for known rotations: from the directions and lengths of baselines, then together with the points from
+//! rays (global positioning).
 
 use crate::scene::Scene;
 use crate::view_graph::ViewGraph;
@@ -9,15 +10,16 @@ use cv_numeric::adjust::{AdjustError, AdjustIteration, AdjustOptions, Adjustment
 use nalgebra::{Matrix3, SMatrix};
 use std::ops::ControlFlow;
 
-/// A distance from where a pair puts a center, in baselines, from which on it counts less than by its square.
-const OFF: f64 = 0.1;
-/// An angle between a ray and the direction of its point from which on it counts less than by its square, in radians: a fifth of a degree.
-const RAY: f64 = 0.0035;
+/// Scale of the Huber loss of a baseline, in baseline lengths.
+const BASELINE_LOSS_SCALE: f64 = 0.1;
+/// Scale of the Cauchy loss of a ray, in radians: a fifth of a degree.
+const RAY_LOSS_SCALE: f64 = 0.0035;
 
-/// From one center to the other, by the pair, and one over its length.
-struct Baselines(Vec<(Vector3<f64>, f64)>);
+/// Residuals of relative centers: the baseline from one center to the other in the world frame, and its inverse length
+/// as weight.
+struct BaselineResidual(Vec<(Vector3<f64>, f64)>);
 
-impl Residual<3, 2, 6> for Baselines {
+impl Residual<3, 2, 6> for BaselineResidual {
     const DIMS: [usize; 2] = [3, 3];
 
     fn evaluate(
@@ -36,10 +38,10 @@ impl Residual<3, 2, 6> for Baselines {
     }
 }
 
-/// Rays in the world, of length one: the residual is the chord to the direction from the center to the point.
-struct Rays(Vec<Vector3<f64>>);
+/// Residuals of unit rays in the world frame: the chord to the direction from the center to the point.
+struct RayResidual(Vec<Vector3<f64>>);
 
-impl Residual<3, 2, 6> for Rays {
+impl Residual<3, 2, 6> for RayResidual {
     const DIMS: [usize; 2] = [3, 3];
 
     #[inline]
@@ -64,18 +66,20 @@ impl Residual<3, 2, 6> for Rays {
     }
 }
 
-fn go_on<'s>(stage: &'s Stage<'_>) -> impl FnMut(&AdjustIteration) -> ControlFlow<()> + 's {
+/// Returns a solver callback that stops when the job is cancelled.
+fn stop_if_cancelled<'s>(stage: &'s Stage<'_>) -> impl FnMut(&AdjustIteration) -> ControlFlow<()> + 's {
     |_| match stage.check() {
         Ok(()) => ControlFlow::Continue(()),
         Err(Cancelled) => ControlFlow::Break(()),
     }
 }
 
-/// The centers of the views that links of known length connect with most others, by those; of the others `None`. The sum of distances from where the pairs put them, in baselines, is made least.
+/// Estimates the centers of the largest component of links with known baseline length; `None` for the other views.
+/// Minimizes the Huber loss of the distances from the centers that the pairs predict, in baselines.
 ///
 /// # Errors
 /// [`Cancelled`].
-pub(crate) fn centers_of_baselines(
+pub(crate) fn centers_from_baselines(
     graph: &ViewGraph,
     rotations: &[Option<Rotation3<f64>>],
     lengths: &[Option<f64>],
@@ -100,19 +104,19 @@ pub(crate) fn centers_of_baselines(
         centers[step.node] = centers[step.parent].map(|parent| parent + forward);
     }
     let views: Vec<usize> = (0..graph.views).filter(|v| centers[*v].is_some()).collect();
-    let mut number = vec![0u32; graph.views];
-    views.iter().zip(0..).for_each(|(v, n)| number[*v] = n);
-    let inside = edges.edges().iter().zip(&baselines).filter(|(e, _)| centers[e.a].is_some());
-    let (blocks, items): (Vec<[u32; 2]>, Vec<_>) = inside.map(|(e, b)| ([number[e.a], number[e.b]], *b)).unzip();
+    let mut block_of = vec![0u32; graph.views];
+    views.iter().zip(0..).for_each(|(v, n)| block_of[*v] = n);
+    let usable = edges.edges().iter().zip(&baselines).filter(|(e, _)| centers[e.a].is_some());
+    let (blocks, items): (Vec<[u32; 2]>, Vec<_>) = usable.map(|(e, b)| ([block_of[e.a], block_of[e.b]], *b)).unzip();
     let start: Vec<f64> = views.iter().filter_map(|v| centers[*v]).flat_map(|c| [c.x, c.y, c.z]).collect();
     let solved = (|| {
         let mut problem = Adjustment::default();
         let group = problem.add_group("centers", Euclidean(3), start)?;
-        problem.hold(group, number[root] as usize)?;
-        let loss = RobustLoss::Huber { scale: OFF };
-        problem.add_residuals("baselines", Baselines(items), [group, group], blocks, loss)?;
+        problem.hold(group, block_of[root] as usize)?;
+        let loss = RobustLoss::Huber { scale: BASELINE_LOSS_SCALE };
+        problem.add_residuals("baselines", BaselineResidual(items), [group, group], blocks, loss)?;
         let settings = AdjustOptions { max_iterations: 30, cost_tolerance: 1e-4, ..AdjustOptions::default() };
-        problem.solve(&settings, go_on(stage))?;
+        problem.solve(&settings, stop_if_cancelled(stage))?;
         Ok::<_, AdjustError>(problem.values(group).to_vec())
     })();
     stage.check()?;
@@ -122,30 +126,31 @@ pub(crate) fn centers_of_baselines(
     Ok(centers)
 }
 
-/// Moves centers and points of a scene to where the rays that agree meet best, rotations held: angles count, not depths, so that a wrong start far away hinders less than with distances in
-/// pixels (the residual of Zhuang, Cheong & Lee, "Baseline desensitizing in translation averaging", CVPR 2018, on cameras and points as in Pan, Baráth, Pollefeys & Schönberger, "Global
-/// structure-from-motion revisited", ECCV 2024).
+/// Adjusts the centers and points of a scene to the inlier rays, with constant rotations (global positioning). The
+/// residual is of directions and independent of depth, which makes it robust to a bad initialization (Zhuang, Cheong &
+/// Lee, "Baseline desensitizing in translation averaging", CVPR 2018; for cameras and points Pan, Baráth, Pollefeys &
+/// Schönberger, "Global structure-from-motion revisited", ECCV 2024).
 ///
 /// # Errors
 /// [`Cancelled`].
 pub(crate) fn adjust_rays(scene: &mut Scene<'_>, stage: &Stage<'_>) -> Result<(), Cancelled> {
     let tracks: Vec<usize> = (0..scene.points.len()).filter(|t| scene.points[*t].is_some()).collect();
     let views = scene.registered();
-    let mut number = vec![0u32; scene.views.len()];
-    views.iter().zip(0..).for_each(|(v, n)| number[*v] = n);
+    let mut block_of = vec![0u32; scene.views.len()];
+    views.iter().zip(0..).for_each(|(v, n)| block_of[*v] = n);
     let (mut blocks, mut rays, mut points) = (Vec::new(), Vec::new(), Vec::new());
     for (&track, n) in tracks.iter().zip(0..) {
         points.extend(scene.points[track].iter().flat_map(|p| [p.x, p.y, p.z]));
-        for (i, pose) in scene.seen(track).filter(|(i, _)| scene.active[*i]) {
-            blocks.push([number[scene.view_of(i)], n]);
+        for (i, pose) in scene.posed_observations(track).filter(|(i, _)| scene.active[*i]) {
+            blocks.push([block_of[scene.view_of(i)], n]);
             rays.push((pose.rotation.inverse() * scene.ray(i).to_homogeneous()).normalize());
         }
     }
     let start: Vec<Point3<f64>> = views.iter().filter_map(|v| scene.poses[*v]).map(|p| p.center()).collect();
     let Some(first) = start.first().copied() else { return Ok(()) };
-    let far = (0..start.len()).max_by(|a, b| {
-        let apart = |n: &usize| (start[*n] - first).norm_squared();
-        apart(a).total_cmp(&apart(b))
+    let farthest = (0..start.len()).max_by(|a, b| {
+        let distance = |n: &usize| (start[*n] - first).norm_squared();
+        distance(a).total_cmp(&distance(b))
     });
     let solved = (|| {
         let mut problem = Adjustment::default();
@@ -154,12 +159,18 @@ pub(crate) fn adjust_rays(scene: &mut Scene<'_>, stage: &Stage<'_>) -> Result<()
         let group = problem.add_group("points", Euclidean(3), points)?;
         problem.eliminate(group)?;
         problem.hold(centers, 0)?;
-        if let Some(n) = far.filter(|n| *n > 0) {
+        if let Some(n) = farthest.filter(|n| *n > 0) {
             problem.hold_parameters(centers, n, &[(start[n] - first).iamax()])?;
         }
-        problem.add_residuals("rays", Rays(rays), [centers, group], blocks, RobustLoss::Cauchy { scale: RAY })?;
+        problem.add_residuals(
+            "rays",
+            RayResidual(rays),
+            [centers, group],
+            blocks,
+            RobustLoss::Cauchy { scale: RAY_LOSS_SCALE },
+        )?;
         let settings = AdjustOptions { max_iterations: 30, cost_tolerance: 1e-3, ..AdjustOptions::default() };
-        problem.solve(&settings, go_on(stage))?;
+        problem.solve(&settings, stop_if_cancelled(stage))?;
         Ok::<_, AdjustError>((problem.values(centers).to_vec(), problem.values(group).to_vec()))
     })();
     stage.check()?;
@@ -182,13 +193,13 @@ mod tests {
     use cv_core::Silent;
 
     #[test]
-    fn centers_follow_from_directions_and_lengths_though_some_are_wrong() {
+    fn centers_are_estimated_from_baselines_with_outliers() {
         let center = |v: usize| Point3::new(v as f64, (v as f64 * 0.7).sin(), 0.2 * (v % 3) as f64);
         let rotation = |v: usize| Rotation3::from_euler_angles(0.1 * v as f64, 0.2, -0.05 * v as f64);
         let pairs = (0..10).flat_map(|a| (a + 1..10).map(move |b| (a, b)));
         let link = |(pair, (a, b)): (usize, (usize, usize))| {
             let mut baseline: Vector3<f64> = center(b) - center(a);
-            // One pair in six goes elsewhere.
+            // One pair in six is an outlier.
             if pair % 6 == 4 {
                 baseline = Vector3::new(baseline.y, 2.0, -baseline.x);
             }
@@ -200,19 +211,20 @@ mod tests {
         let lengths: Vec<Option<f64>> =
             graph.links.iter().map(|l| (l.pair % 7 != 5).then(|| (center(l.b) - center(l.a)).norm())).collect();
         let stage = Stage::new(&Silent, "test", 1).unwrap();
-        let found = centers_of_baselines(&graph, &rotations, &lengths, &stage).unwrap();
-        // The tenth has no link.
-        assert!(found[10].is_none());
+        let centers = centers_from_baselines(&graph, &rotations, &lengths, &stage).unwrap();
+        // The tenth view has no link.
+        assert!(centers[10].is_none());
         for v in 1..10 {
-            // Each of a view's one or two wrong pairs pulls with a tenth of its baseline at most (Huber), against its eight others; so it is for the first view, from which is measured: twice a
-            // few hundredths for baselines of some units.
-            let off = (found[v].unwrap() - found[0].unwrap()) - (center(v) - center(0));
+            // Each view has one or two outliers, each with the influence of a tenth of a baseline at most (Huber),
+            // against eight inliers; the same holds for the first view, the reference. Twice a few hundredths for
+            // baselines of some units.
+            let off = (centers[v].unwrap() - centers[0].unwrap()) - (center(v) - center(0));
             assert!(off.norm() < 0.2, "{v}: {off}");
         }
     }
 
     #[test]
-    fn rays_pull_centers_and_points_to_where_they_were() {
+    fn rays_restore_perturbed_centers_and_points() {
         let camera = cv_core::Camera::from_focal(1000, 800, 900.0);
         let pose = |v: usize| {
             let rotation = Rotation3::from_euler_angles(0.02 * v as f64, -0.05 * v as f64, 0.0);
@@ -237,19 +249,20 @@ mod tests {
         let tracks = crate::Tracks::from_lists((0..80).map(seen));
         let mut scene = Scene::new(&views, &[camera], &[crate::CameraKnowledge::Known], tracks);
         for v in 0..5 {
-            // All but the first a fifth of a baseline off and more.
+            // All but the first are off by a fifth of a baseline and more.
             let off = if v == 0 { Vector3::zeros() } else { Vector3::new(0.1, -0.1, 0.05 * v as f64) };
             scene.poses[v] = Some(Pose::new(pose(v).rotation, pose(v).translation + off));
         }
         scene.points = points.iter().map(|p| Some(Point3::from(p.coords * 1.2))).collect();
         scene.active.fill(true);
         adjust_rays(&mut scene, &Stage::new(&Silent, "test", 1).unwrap()).unwrap();
-        let found: Vec<Point3<f64>> = (0..5).map(|v| scene.poses[v].unwrap().center()).collect();
+        let centers: Vec<Point3<f64>> = (0..5).map(|v| scene.poses[v].unwrap().center()).collect();
         let truth: Vec<Point3<f64>> = (0..5).map(|v| pose(v).center()).collect();
-        let scale = (truth[4] - truth[0]).norm() / (found[4] - found[0]).norm();
-        for (f, t) in found.iter().zip(&truth) {
-            // Keypoints are f32, exact to 3e-5 px, 3e-8 of the focal length; the adjuster stops where the cost changes by a thousandth.
-            assert!(((f - found[0]) * scale - (t - truth[0])).norm() < 1e-3, "{f} {t}");
+        let scale = (truth[4] - truth[0]).norm() / (centers[4] - centers[0]).norm();
+        for (f, t) in centers.iter().zip(&truth) {
+            // Keypoints are f32, exact to 3e-5 px or 3e-8 of the focal length; the adjustment stops at a relative cost
+            // change of 1e-3.
+            assert!(((f - centers[0]) * scale - (t - truth[0])).norm() < 1e-3, "{f} {t}");
         }
     }
 }

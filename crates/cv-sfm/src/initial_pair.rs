@@ -1,4 +1,4 @@
-//! The two views a model starts from.
+//! Selection of the initial pair of a model.
 
 use crate::scene::Scene;
 use crate::{PairMatches, SfmOptions};
@@ -9,20 +9,21 @@ use cv_geometry::{
 };
 use rayon::prelude::*;
 
-/// Pairs with most matches that are looked at.
-const MOST_PAIRS: usize = 60;
-/// An angle between the rays of a point from which on it counts in full, in radians; the others by their share of it.
-const FULL_ANGLE: f64 = 0.15;
+/// Maximum number of pairs that are scored.
+const MAX_PAIRS: usize = 60;
+/// Triangulation angle from which on a point has full weight, in radians; below, the weight is proportional to the
+/// angle.
+const SATURATION_ANGLE: f64 = 0.15;
 
-/// A pair to start from.
-pub(crate) struct Start {
+/// An initial pair.
+pub(crate) struct InitialPair {
     pub(crate) a: usize,
     pub(crate) b: usize,
-    /// First camera frame to second.
+    /// From the first camera frame to the second.
     pub(crate) pose: Pose,
 }
 
-/// Pairs to start from, the best first: those with many points at wide angles.
+/// Returns candidates for the initial pair, best first: those with many points at large triangulation angles.
 ///
 /// # Errors
 /// [`Cancelled`].
@@ -31,28 +32,30 @@ pub(crate) fn initial_pairs(
     pairs: &[&PairMatches],
     options: &SfmOptions,
     progress: &dyn Progress,
-) -> Result<Vec<Start>, Cancelled> {
+) -> Result<Vec<InitialPair>, Cancelled> {
     let mut order = pairs.to_vec();
     order.sort_by(|x, y| y.matches.len().cmp(&x.matches.len()).then((x.a, x.b).cmp(&(y.a, y.b))));
-    // Of sequences, the pairs with most matches are all neighbors: every other one is taken evenly from the rest.
-    let step = ((order.len().saturating_sub(MOST_PAIRS / 2)) as f64 / (MOST_PAIRS / 2) as f64).max(1.0);
-    let head = order.len().min(MOST_PAIRS / 2);
-    let rest = (0..MOST_PAIRS / 2).map(|i| head + (i as f64 * step) as usize).take_while(|i| *i < order.len());
-    let chosen: Vec<&PairMatches> = (0..head).chain(rest).map(|i| order[i]).collect();
-    let rated: Vec<Option<(f64, Start)>> =
-        chosen.par_iter().map(|pair| rate(scene, pair, options, progress)).collect::<Result<_, _>>()?;
-    let mut rated: Vec<(f64, Start)> = rated.into_iter().flatten().collect();
-    rated.sort_by(|x, y| y.0.total_cmp(&x.0).then((x.1.a, x.1.b).cmp(&(y.1.a, y.1.b))));
-    Ok(rated.into_iter().map(|r| r.1).collect())
+    // In sequences the pairs with most matches are all adjacent: half of the candidates are sampled evenly from the
+    // rest.
+    let step = ((order.len().saturating_sub(MAX_PAIRS / 2)) as f64 / (MAX_PAIRS / 2) as f64).max(1.0);
+    let head = order.len().min(MAX_PAIRS / 2);
+    let rest = (0..MAX_PAIRS / 2).map(|i| head + (i as f64 * step) as usize).take_while(|i| *i < order.len());
+    let candidates: Vec<&PairMatches> = (0..head).chain(rest).map(|i| order[i]).collect();
+    let scored: Vec<Option<(f64, InitialPair)>> =
+        candidates.par_iter().map(|pair| score_pair(scene, pair, options, progress)).collect::<Result<_, _>>()?;
+    let mut scored: Vec<(f64, InitialPair)> = scored.into_iter().flatten().collect();
+    scored.sort_by(|x, y| y.0.total_cmp(&x.0).then((x.1.a, x.1.b).cmp(&(y.1.a, y.1.b))));
+    Ok(scored.into_iter().map(|r| r.1).collect())
 }
 
-/// The pose of a pair, and how good it is to start from.
-fn rate(
+/// Estimates the relative pose of a pair and its score: the sum of the weights of the inliers. `None` for a degenerate
+/// pair or too few inliers.
+fn score_pair(
     scene: &Scene<'_>,
     pair: &PairMatches,
     options: &SfmOptions,
     progress: &dyn Progress,
-) -> Result<Option<(f64, Start)>, Cancelled> {
+) -> Result<Option<(f64, InitialPair)>, Cancelled> {
     let (a, b) = (pair.a, pair.b);
     let keypoints = [scene.views[a].keypoints, scene.views[b].keypoints];
     let pixels: Vec<Correspondence> =
@@ -67,19 +70,20 @@ fn rate(
         local_optimization: LocalOptimization::Iterative,
         ..RobustOptions::essential()
     };
-    let found = match estimate_relative_pose(&rays, &robust, progress) {
-        Ok(found) => found,
+    let estimate = match estimate_relative_pose(&rays, &robust, progress) {
+        Ok(estimate) => estimate,
         Err(EstimateError::Cancelled(stop)) => return Err(stop),
         Err(_) => return Ok(None),
     };
-    // A camera that only turned.
+    // A rotation explains the matches: no baseline.
     if estimate_rotation(&rays, threshold).is_ok_and(|r| r.1 > 0.8) {
         return Ok(None);
     }
     let weight = |i: &usize| {
-        let point = triangulate(&rays[*i], &found.model).ok()?;
-        Some((parallax_angle(&point, &found.model) / FULL_ANGLE).min(1.0))
+        let point = triangulate(&rays[*i], &estimate.model).ok()?;
+        Some((parallax_angle(&point, &estimate.model) / SATURATION_ANGLE).min(1.0))
     };
-    let score: f64 = found.inliers.iter().filter_map(weight).sum();
-    Ok((found.inliers.len() >= options.min_pose_inliers).then_some((score, Start { a, b, pose: found.model })))
+    let score: f64 = estimate.inliers.iter().filter_map(weight).sum();
+    Ok((estimate.inliers.len() >= options.min_pose_inliers)
+        .then_some((score, InitialPair { a, b, pose: estimate.model })))
 }

@@ -1,8 +1,9 @@
 //! Structure from motion of many views: cameras, poses and points from features that are matched by index.
 //!
-//! Takes keypoints and matches, never pictures: `cv-pipeline` joins features and this. The stages are calls of their own:
-//! [`verify_view_pair`] says which matches of two views agree, [`Tracks::build`] joins them over the views, [`reconstruct_views`] solves for cameras and points,
-//! [`align_model`] brings a model to known places.
+//! The input is keypoints and matches, never images: `cv-pipeline` joins feature detection and this crate. The stages
+//! can be called separately: [`verify_view_pair`] finds the matches that are consistent with a two-view geometry,
+//! [`Tracks::build`] merges them into tracks, [`reconstruct_views`] solves for cameras and points, [`align_model`]
+//! aligns a model to external measurements.
 //!
 //! ```
 //! use cv_core::{Camera, DMatch, Keypoint, Point3, Pose, Silent, Vector3};
@@ -10,7 +11,7 @@
 //!     CameraKnowledge, PairMatches, SfmInput, SfmOptions, SfmView, ViewPairOptions, reconstruct_views, verify_view_pair,
 //! };
 //!
-//! // A bent wall of 200 points, seen by four cameras side by side.
+//! A curved wall of 200 points, observed by four cameras in a row.
 //! let camera = Camera::from_focal(640, 480, 500.0);
 //! let wall: Vec<Point3<f64>> = (0..200)
 //!     .map(|i| (f64::from(i % 20) - 9.5, f64::from(i / 20) - 4.5))
@@ -35,25 +36,24 @@
 //! let views: Vec<SfmView<'_>> = keypoints.iter().map(|k| SfmView { camera: 0, keypoints: k }).collect();
 //! let knowledge = [CameraKnowledge::Known];
 //! let input = SfmInput {
-//!     views: &views, cameras: &[camera], knowledge: &knowledge, pairs: &pairs, geometry: &geometry, alike: None,
+//!     views: &views, cameras: &[camera], knowledge: &knowledge, pairs: &pairs, geometry: &geometry, feature_distance: None,
 //! };
-//! let found = reconstruct_views(&input, &SfmOptions::default(), &Silent)?;
-//! assert_eq!((found.models[0].registered(), found.models[0].points.len()), (4, 200));
+//! let outcome = reconstruct_views(&input, &SfmOptions::default(), &Silent)?;
+//! assert_eq!((outcome.models[0].registered(), outcome.models[0].points.len()), (4, 200));
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
 //! # Conventions
 //!
-//! * Pixel centers at integers; a pose maps world to camera. The unit of the world is arbitrary, and so is its frame: [`align_model`] turns it upright and,
-//!   by what is known of places, to meters.
-//! * A track has one observation of a view at most. A model's points are those of tracks.
-//! * The same input, options and seed give the same bytes at any number of threads.
+//! * Pixel centers are at integers; a pose maps world to camera. The world frame and its unit are arbitrary:
+//!   [`align_model`] makes it upright and, with measured positions or distances, metric.
+//! * A track has at most one observation of a view. The points of a model are those of tracks.
+//! * The same input, options and seed give the same bytes with any number of threads.
 
 mod align;
 mod bundle;
 mod complete;
 mod covariance;
-mod finish;
 mod focal_length;
 mod global;
 mod global_positions;
@@ -64,6 +64,7 @@ mod model;
 mod model_parts;
 mod pair_scales;
 mod reconstruct;
+mod refine_model;
 mod registration;
 mod repeated_structure;
 mod rotation_averaging;
@@ -86,37 +87,39 @@ pub use view_pair::{ViewPair, ViewPairError, ViewPairModel, ViewPairOptions, ver
 
 use cv_core::Keypoint;
 
-/// A photograph as this crate sees it.
+/// A view: an image by its keypoints.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SfmView<'a> {
     /// Index of its camera.
     pub camera: usize,
-    /// Its keypoints, in pixels as they were taken.
+    /// Its keypoints, in distorted pixels.
     pub keypoints: &'a [Keypoint],
 }
 
-/// What is known of a camera beforehand.
+/// Prior knowledge of a camera's intrinsics.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum CameraKnowledge {
-    /// It is calibrated, and stays as it is.
+    /// Calibrated: the intrinsics stay constant.
     Known,
-    /// Its calibration matrix is known, but nothing is said of its distortion: it stays as it is unless the matches fit much better with a distortion.
+    /// The calibration matrix is known, the distortion is not: a distortion is estimated only where it lowers the
+    /// residuals much.
     Matrix,
-    /// About what focal length it has, such as from EXIF; its distortion is unknown.
+    /// An approximate focal length, such as from EXIF; the distortion is unknown.
     Focal {
         /// Focal length in pixels.
         focal: f64,
-        /// Relative standard deviation.
+        /// Relative standard deviation of the focal length.
         deviation: f64,
     },
-    /// Nothing.
+    /// Nothing is known.
     Unknown,
 }
 
 impl CameraKnowledge {
-    /// Whether rays can be told from pixels, but for a lens that a matrix leaves out.
+    /// Returns whether the calibration matrix is known, so that pixels can be normalized (without an unknown
+    /// distortion).
     pub fn is_calibrated(&self) -> bool {
         matches!(self, Self::Known | Self::Matrix)
     }

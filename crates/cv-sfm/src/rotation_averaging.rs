@@ -1,4 +1,4 @@
-//! The rotations of views from those of their pairs.
+//! Rotation averaging: absolute rotations of views from the relative rotations of pairs.
 
 use crate::view_graph::ViewGraph;
 use cv_core::{Cancelled, Rotation3, Stage, Vector3};
@@ -7,16 +7,17 @@ use cv_numeric::adjust::{AdjustIteration, AdjustOptions, Adjustment, Residual, R
 use nalgebra::{Matrix3, SMatrix, UnitQuaternion};
 use std::ops::ControlFlow;
 
-/// Where the cost of an angle begins to grow less than by its square, in radians, first and then. A tenth of a degree is below nearly all errors, so that the sum of angles is minimized, which
-/// is right with many wrong pairs (L1); then five degrees, Chatterjee & Govindu's: a pair's weight falls to a quarter there, and right ones add up with all their weight.
+/// The loss of each stage, with scales in radians. The first one is L1-like: its 0.1 degrees are below nearly all
+/// errors, which is robust to many outliers. The second one, with 5 degrees (Chatterjee & Govindu), gives inliers
+/// nearly their full weight; at its scale the weight falls to a quarter.
 const LOSSES: [RobustLoss; 2] = [RobustLoss::Huber { scale: 0.0017 }, RobustLoss::GemanMcClure { scale: 0.087 }];
-/// Iterations of each.
-const ITERATIONS: usize = 30;
+/// Maximum number of iterations of each stage.
+const MAX_ITERATIONS: usize = 30;
 
-/// Relative rotations: the residual is the rotation vector of what is left between a pair's and that of its views.
-struct Relative(Vec<Rotation3<f64>>);
+/// Residuals of relative rotations: the rotation vector between the measured relative rotation and that of the views.
+struct RelativeRotationResidual(Vec<Rotation3<f64>>);
 
-/// The inverse of the left Jacobian of SO(3) at a rotation vector.
+/// Returns the inverse of the left Jacobian of SO(3) at a rotation vector.
 fn inverse_left_jacobian(r: &Vector3<f64>) -> Matrix3<f64> {
     let angle = r.norm();
     let cross = r.cross_matrix();
@@ -29,7 +30,7 @@ fn inverse_left_jacobian(r: &Vector3<f64>) -> Matrix3<f64> {
     Matrix3::identity() - cross * 0.5 + cross * cross * k
 }
 
-impl Residual<3, 2, 6> for Relative {
+impl Residual<3, 2, 6> for RelativeRotationResidual {
     const DIMS: [usize; 2] = [3, 3];
 
     fn evaluate(
@@ -41,8 +42,8 @@ impl Residual<3, 2, 6> for Relative {
         let (from, to) = (RotationManifold::load(a), RotationManifold::load(b));
         let relative = &self.0[item];
         // exp(R ω_a) · E · exp(−ω_b).
-        let left = relative * from * to.inverse();
-        let residual = UnitQuaternion::from_rotation_matrix(&left).scaled_axis();
+        let error = relative * from * to.inverse();
+        let residual = UnitQuaternion::from_rotation_matrix(&error).scaled_axis();
         if let Some(j) = jacobian {
             let inverse = inverse_left_jacobian(&residual);
             j.fixed_view_mut::<3, 3>(0, 0).copy_from(&(inverse * relative.matrix()));
@@ -52,8 +53,10 @@ impl Residual<3, 2, 6> for Relative {
     }
 }
 
-/// World-to-camera rotations of the views of a connected graph, `R_b ≈ R_ab R_a`; `None` of views that are not in it. Along the tree of firmest links first, then all links: the least sum of
-/// angles and, from there, of squares of those that agree (Chatterjee & Govindu, "Efficient and robust large-scale rotation averaging", ICCV 2013). O(links) for an iteration.
+/// Estimates the world-to-camera rotations of the views of a connected graph, `R_b ≈ R_ab R_a`; `None` for views
+/// outside the largest component. Initialized along the maximum spanning tree by number of matches, then by iteratively
+/// reweighted least squares over all links with two robust losses (Chatterjee & Govindu, "Efficient and robust
+/// large-scale rotation averaging", ICCV 2013). O(links) per iteration.
 ///
 /// # Errors
 /// [`Cancelled`].
@@ -73,20 +76,20 @@ pub(crate) fn average_rotations(
         rotations[step.node] = rotations[step.parent].map(|parent| forward * parent);
     }
     let views: Vec<usize> = (0..graph.views).filter(|v| rotations[*v].is_some()).collect();
-    let mut number = vec![0u32; graph.views];
-    views.iter().zip(0..).for_each(|(v, n)| number[*v] = n);
+    let mut block_of = vec![0u32; graph.views];
+    views.iter().zip(0..).for_each(|(v, n)| block_of[*v] = n);
     let links: Vec<_> = graph.links.iter().filter(|l| rotations[l.a].is_some() && rotations[l.b].is_some()).collect();
     for loss in LOSSES {
         let store = |v: &usize| rotations[*v].map_or([0.0; 9], |r| RotationManifold::store(&r));
         let solved = (|| {
             let mut problem = Adjustment::default();
             let group = problem.add_group("rotations", RotationManifold, views.iter().flat_map(store).collect())?;
-            problem.hold(group, number[root] as usize)?;
-            let relative = Relative(links.iter().map(|l| l.pose.rotation).collect());
-            let blocks = links.iter().map(|l| [number[l.a], number[l.b]]).collect();
+            problem.hold(group, block_of[root] as usize)?;
+            let relative = RelativeRotationResidual(links.iter().map(|l| l.pose.rotation).collect());
+            let blocks = links.iter().map(|l| [block_of[l.a], block_of[l.b]]).collect();
             problem.add_residuals("relative rotations", relative, [group, group], blocks, loss)?;
             let options =
-                AdjustOptions { max_iterations: ITERATIONS, cost_tolerance: 1e-5, ..AdjustOptions::default() };
+                AdjustOptions { max_iterations: MAX_ITERATIONS, cost_tolerance: 1e-5, ..AdjustOptions::default() };
             problem.solve(&options, |_: &AdjustIteration| match stage.check() {
                 Ok(()) => ControlFlow::Continue(()),
                 Err(Cancelled) => ControlFlow::Break(()),
@@ -108,8 +111,8 @@ mod tests {
     use crate::view_graph::Link;
     use cv_core::{Pose, Silent};
 
-    /// Numbers from 0 to 1, the same for a seed.
-    fn numbers(seed: u64) -> impl FnMut() -> f64 {
+    /// Returns a pseudo-random generator of numbers from 0 to 1.
+    fn random_numbers(seed: u64) -> impl FnMut() -> f64 {
         let mut state = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) ^ 0xD1B5_4A32_D192_ED03;
         move || {
             state ^= state << 13;
@@ -123,56 +126,60 @@ mod tests {
         Vector3::new(random() - 0.5, random() - 0.5, random() - 0.5) * (2.0 * length)
     }
 
-    /// Rotations of 40 views and of half of their pairs, of which so many are wrong, the others off by up to `noise` radians on each axis.
-    fn graph(seed: u64, wrong: f64, noise: f64) -> (Vec<Rotation3<f64>>, ViewGraph) {
-        let mut random = numbers(seed);
+    /// Rotations of 40 views and the relative rotations of half of their pairs. A fraction of `outliers` is random; the
+    /// others have errors of up to `noise` radians on each axis.
+    fn graph(seed: u64, outliers: f64, noise: f64) -> (Vec<Rotation3<f64>>, ViewGraph) {
+        let mut random = random_numbers(seed);
         let truth: Vec<Rotation3<f64>> = (0..40).map(|_| Rotation3::new(vector(&mut random, 2.0))).collect();
         let mut links = Vec::new();
         for (a, b) in (0..40).flat_map(|a| (a + 1..40).map(move |b| (a, b))) {
-            // A ring holds all together.
+            // Consecutive views are always linked, so that the graph is connected.
             if random() < 0.5 || b == a + 1 {
-                let off = if random() < wrong { vector(&mut random, 2.0) } else { vector(&mut random, noise) };
-                let pose = Pose::new(Rotation3::new(off) * truth[b] * truth[a].inverse(), Vector3::x());
+                let error = if random() < outliers { vector(&mut random, 2.0) } else { vector(&mut random, noise) };
+                let pose = Pose::new(Rotation3::new(error) * truth[b] * truth[a].inverse(), Vector3::x());
                 links.push(Link { pair: links.len(), a, b, pose, matches: 50 + links.len() % 7 });
             }
         }
         (truth, ViewGraph { views: 40, links })
     }
 
-    /// The largest angle between a relative rotation and the true one, in radians.
-    fn worst(found: &[Option<Rotation3<f64>>], truth: &[Rotation3<f64>]) -> f64 {
+    /// Returns the largest angle between an estimated relative rotation and the true one, in radians.
+    fn max_error(estimated: &[Option<Rotation3<f64>>], truth: &[Rotation3<f64>]) -> f64 {
         let angle = |a: usize, b: usize| {
-            let left = (found[b].unwrap() * found[a].unwrap().inverse()).inverse() * truth[b] * truth[a].inverse();
-            Pose::new(left, Vector3::zeros()).rotation_angle()
+            let error =
+                (estimated[b].unwrap() * estimated[a].unwrap().inverse()).inverse() * truth[b] * truth[a].inverse();
+            Pose::new(error, Vector3::zeros()).rotation_angle()
         };
         (1..truth.len()).map(|b| angle(0, b)).fold(0.0, f64::max)
     }
 
     #[test]
-    fn rotations_are_found_among_wrong_pairs() {
+    fn rotations_are_estimated_among_outlier_pairs() {
         for seed in 1..=5 {
-            // Exact pairs, then three in ten wrong: as long as right ones have the majority around each view, the least sum of angles is at the truth.
-            for wrong in [0.0, 0.3] {
-                let (truth, graph) = graph(seed, wrong, 0.0);
-                let found = average_rotations(&graph, &Stage::new(&Silent, "test", 1).unwrap()).unwrap();
-                // Geman and McClure's weight of a wrong pair is not quite zero: (5°/60°)⁴ of 60 degrees is 0.003 degrees, and a few of twenty are wrong.
-                assert!(worst(&found, &truth) < 1e-3, "{seed} {wrong}: {}", worst(&found, &truth));
+            // Exact pairs, then 30 % outliers: while inliers are the majority around each view, the L1 minimum is at
+            // the truth.
+            for outliers in [0.0, 0.3] {
+                let (truth, graph) = graph(seed, outliers, 0.0);
+                let rotations = average_rotations(&graph, &Stage::new(&Silent, "test", 1).unwrap()).unwrap();
+                // The Geman-McClure weight of an outlier is not quite zero: (5°/60°)⁴ of 60 degrees is 0.003 degrees,
+                // for a few of twenty.
+                assert!(max_error(&rotations, &truth) < 1e-3, "{seed} {outliers}: {}", max_error(&rotations, &truth));
             }
-            // Errors of up to 0.01 on each axis, a standard deviation of 0.0058: sixteen right pairs of a view leave 0.0014, of two views 0.002. Five of them, which a pair's own error of up to
-            // 0.017 is above.
+            // Errors of up to 0.01 on each axis have a standard deviation of 0.0058: sixteen inliers of a view leave
+            // 0.0014, of two views 0.002. The limit is five of them; a pair's own error is up to 0.017.
             let (truth, noisy) = graph(seed, 0.2, 0.01);
-            let found = average_rotations(&noisy, &Stage::new(&Silent, "test", 1).unwrap()).unwrap();
-            assert!(worst(&found, &truth) < 0.01, "{seed}: {}", worst(&found, &truth));
+            let rotations = average_rotations(&noisy, &Stage::new(&Silent, "test", 1).unwrap()).unwrap();
+            assert!(max_error(&rotations, &truth) < 0.01, "{seed}: {}", max_error(&rotations, &truth));
         }
     }
 
     #[test]
     fn derivatives_are_those_of_the_residual() {
-        let mut random = numbers(3);
+        let mut random = random_numbers(3);
         for size in [1e-6, 0.1, 1.5] {
             let relative = Rotation3::new(vector(&mut random, size));
             let [a, b] = [0, 1].map(|_| RotationManifold::store(&Rotation3::new(vector(&mut random, 1.0))));
-            let problem = Relative(vec![relative]);
+            let problem = RelativeRotationResidual(vec![relative]);
             let mut jacobian = SMatrix::zeros();
             problem.evaluate(0, [&a, &b], Some(&mut jacobian)).unwrap();
             for k in 0..6 {
@@ -188,7 +195,8 @@ mod tests {
                     problem.evaluate(0, [&x, &y], None).unwrap()
                 };
                 let numeric = (at(1e-5) - at(-1e-5)) / 2e-5;
-                // Central differences: h² of truncation, 1e-16/h of rounding, with third derivatives of order one.
+                // Central differences: truncation error h², rounding error 1e-16/h, with third derivatives of order
+                // one.
                 assert!((numeric - jacobian.column(k)).norm() < 1e-8, "{size} {k}: {numeric} {}", jacobian.column(k));
             }
         }

@@ -1,26 +1,27 @@
-//! What is known of the scene while it is being solved.
+//! The state of a reconstruction: cameras, poses, points and inlier observations.
 
 use crate::{CameraKnowledge, SfmView, Tracks};
 use cv_core::{Camera, Point2, Point3, Pose};
 use rayon::prelude::*;
 
-/// Cameras, poses, points, and which observations agree with them.
+/// Cameras, poses, points and inlier observations of a reconstruction.
 pub(crate) struct Scene<'a> {
     pub(crate) views: &'a [SfmView<'a>],
     pub(crate) knowledge: &'a [CameraKnowledge],
     pub(crate) tracks: Tracks,
     pub(crate) cameras: Vec<Camera>,
     pub(crate) poses: Vec<Option<Pose>>,
-    /// Of each track.
+    /// By track.
     pub(crate) points: Vec<Option<Point3<f64>>>,
-    /// Of each observation: whether it agrees with the point.
+    /// By observation: whether it is an inlier of the track's point.
     pub(crate) active: Vec<bool>,
-    /// Of each observation: normalized coordinates.
+    /// By observation: its pixel in normalized coordinates.
     rays: Vec<Point2<f64>>,
-    /// Of each observation.
+    /// By observation: its track.
     track_of: Vec<u32>,
-    /// Where the observations of each view start in `by_view`, and the end.
+    /// Start of each view's range in `by_view`, and the total length.
     start: Vec<usize>,
+    /// Observations sorted by view.
     by_view: Vec<u32>,
 }
 
@@ -48,7 +49,7 @@ impl<'a> Scene<'a> {
         scene
     }
 
-    /// Other tracks, none of which has a point yet.
+    /// Replaces the tracks. None has a point yet.
     pub(crate) fn set_tracks(&mut self, tracks: Tracks) {
         let observations = tracks.observations();
         self.track_of = vec![0; observations.len()];
@@ -74,7 +75,7 @@ impl<'a> Scene<'a> {
         self.cameras_changed();
     }
 
-    /// To be called where `cameras` were changed.
+    /// Recomputes the normalized coordinates. To be called when `cameras` change.
     pub(crate) fn cameras_changed(&mut self) {
         let ray = |i: usize| self.camera_of(self.tracks.observations()[i].view as usize).normalize(self.pixel(i));
         self.rays = (0..self.active.len()).into_par_iter().map(ray).collect();
@@ -84,7 +85,7 @@ impl<'a> Scene<'a> {
         &self.cameras[self.views[view].camera]
     }
 
-    /// Where an observation is in its picture.
+    /// Returns the pixel of an observation.
     #[inline]
     pub(crate) fn pixel(&self, observation: usize) -> Point2<f64> {
         let o = self.tracks.observations()[observation];
@@ -106,52 +107,53 @@ impl<'a> Scene<'a> {
         self.track_of[observation] as usize
     }
 
-    /// The observations of a view.
-    pub(crate) fn of_view(&self, view: usize) -> impl Iterator<Item = usize> + '_ {
+    /// Returns the observations of a view, ordered by track.
+    pub(crate) fn view_observations(&self, view: usize) -> impl Iterator<Item = usize> + '_ {
         self.by_view[self.start[view]..self.start[view + 1]].iter().map(|i| *i as usize)
     }
 
-    /// The views that have a pose.
+    /// Returns the registered views: those that have a pose.
     pub(crate) fn registered(&self) -> Vec<usize> {
         (0..self.views.len()).filter(|v| self.poses[*v].is_some()).collect()
     }
 
-    /// The observations of a track in views that have a pose.
-    pub(crate) fn seen(&self, track: usize) -> impl Iterator<Item = (usize, &Pose)> + '_ {
+    /// Returns the observations of a track in registered views, with their poses.
+    pub(crate) fn posed_observations(&self, track: usize) -> impl Iterator<Item = (usize, &Pose)> + '_ {
         self.tracks.range(track).filter_map(|i| Some((i, self.poses[self.view_of(i)].as_ref()?)))
     }
 
-    /// Distance in pixels between an observation and the projection of a point; infinite behind the camera.
+    /// Returns the reprojection error of an observation in pixels; infinite for a point behind the camera.
     #[inline]
-    pub(crate) fn error(&self, observation: usize, pose: &Pose, point: &Point3<f64>) -> f64 {
+    pub(crate) fn reprojection_error(&self, observation: usize, pose: &Pose, point: &Point3<f64>) -> f64 {
         let camera = self.camera_of(self.view_of(observation));
         camera.project(&pose.transform(point)).map_or(f64::INFINITY, |p| (p - self.pixel(observation)).norm())
     }
 
-    /// Count of points, and of observations that agree with them.
+    /// Returns the number of points and the number of inlier observations.
     pub(crate) fn counts(&self) -> (usize, usize) {
         let points = self.points.iter().flatten().count();
         (points, self.active.iter().filter(|a| **a).count())
     }
 
-    /// Of the observations whose tracks are seen from two views with a pose and more: how many agree with a point, and how many there are.
+    /// Returns the number of inliers, and of all observations in registered views of tracks that at least two such
+    /// views observe.
     pub(crate) fn support(&self) -> (usize, usize) {
-        let of = |track: usize| {
-            let seen = self.seen(track).count();
-            let agree = self.tracks.range(track).filter(|i| self.active[*i]).count();
-            if seen > 1 { (agree, seen) } else { (0, 0) }
+        let count = |track: usize| {
+            let observations = self.posed_observations(track).count();
+            let inliers = self.tracks.range(track).filter(|i| self.active[*i]).count();
+            if observations > 1 { (inliers, observations) } else { (0, 0) }
         };
-        (0..self.tracks.len()).map(of).fold((0, 0), |sum, one| (sum.0 + one.0, sum.1 + one.1))
+        (0..self.tracks.len()).map(count).fold((0, 0), |sum, one| (sum.0 + one.0, sum.1 + one.1))
     }
 
-    /// What was found so far.
+    /// Returns a copy of the solution.
     pub(crate) fn solution(&self) -> Solution {
         let Self { tracks, cameras, poses, points, active, .. } = self;
         let (cameras, poses, points, active) = (cameras.clone(), poses.clone(), points.clone(), active.clone());
         Solution { tracks: tracks.clone(), cameras, poses, points, active }
     }
 
-    /// Back to what was found before.
+    /// Restores an earlier solution.
     pub(crate) fn restore(&mut self, solution: Solution) {
         let Solution { tracks, cameras, poses, points, active } = solution;
         (self.cameras, self.poses) = (cameras, poses);
@@ -159,7 +161,7 @@ impl<'a> Scene<'a> {
         (self.points, self.active) = (points, active);
     }
 
-    /// Forgets everything but the tracks.
+    /// Resets cameras and tracks, and removes all poses and points.
     pub(crate) fn clear(&mut self, cameras: &[Camera], tracks: &Tracks) {
         self.cameras.copy_from_slice(cameras);
         self.poses.fill(None);
@@ -167,7 +169,7 @@ impl<'a> Scene<'a> {
     }
 }
 
-/// Everything that a [`Scene`] solves for.
+/// The variables that a [`Scene`] solves for.
 pub(crate) struct Solution {
     tracks: Tracks,
     cameras: Vec<Camera>,

@@ -1,7 +1,7 @@
-//! The view graph: relative poses of pairs of views, and whether they agree with each other.
+//! The view graph: relative poses of pairs of views, and their triplet consistency.
 
 use crate::rotation_averaging::average_rotations;
-use crate::translation_direction::motion_of_rotation;
+use crate::translation_direction::pose_given_rotation;
 use crate::{SfmInput, SfmOptions, ViewPairModel};
 use cv_core::{Camera, Cancelled, Correspondence, Pose, Progress, Stage, Vector3};
 use cv_geometry::{
@@ -9,74 +9,75 @@ use cv_geometry::{
 };
 use rayon::prelude::*;
 
-/// Why a pair of views is not used although its matches agree with a geometry.
+/// Why a verified pair of views is rejected.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum PairRefusal {
-    /// The rotations of none of its loops with two other pairs close.
+    /// None of its triplets of pairs has consistent rotations.
     Triplets {
-        /// Number of loops.
+        /// Number of triplets.
         loops: usize,
     },
-    /// Both views show things that look alike: one has less of what the other shows than of what views from farther away show.
+    /// Repeated structure: one view matches less of the other view than of views farther away.
     Repeated {
-        /// The share of the features of one view, known from other pairs, that the other view has.
+        /// Ratio of the features of one view, confirmed by other pairs, that are matched in the other view.
         found: f64,
-        /// The share that it has of a view from farther away.
+        /// Largest such ratio with a view at the same or a larger viewpoint change.
         expected: f64,
     },
-    /// It agrees with pairs that are refused as [`PairRefusal::Repeated`].
+    /// Triplet consistency with pairs that are rejected as [`PairRefusal::Repeated`].
     RepeatedLoops {
-        /// Loops that close with one right pair and a refused one.
+        /// Consistent triplets with one accepted and one rejected pair.
         against: usize,
-        /// These, and loops with two right pairs.
+        /// These, and consistent triplets with two accepted pairs.
         of: usize,
     },
 }
 
-/// A pair of views that is not used.
+/// A rejected pair of views.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct RefusedPair {
-    /// Its index among those that were given.
+    /// Its index among the input pairs.
     pub pair: usize,
-    /// Why.
+    /// The reason.
     pub reason: PairRefusal,
 }
 
-/// A pair of views with its relative pose.
+/// An edge of the view graph: a pair of views with its relative pose.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Link {
     /// Index of the pair.
     pub(crate) pair: usize,
     pub(crate) a: usize,
     pub(crate) b: usize,
-    /// From the frame of `a` to that of `b`, the translation of length one.
+    /// From the frame of `a` to that of `b`, with a unit translation.
     pub(crate) pose: Pose,
     /// Number of matches.
     pub(crate) matches: usize,
 }
 
-/// Views and the relative poses of their pairs.
+/// The view graph: views and the relative poses of their pairs.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct ViewGraph {
     pub(crate) views: usize,
     pub(crate) links: Vec<Link>,
 }
 
-/// Largest angle of the rotation that is left after a loop of three pairs, in radians: 5 degrees. Of templeRing and a drive (kitti-2), all 78 pairs of 1,350 that are refused with it are wrong by 6
-/// degrees and more in the end.
-const LOOP: f64 = 0.087;
-/// Most loops that are looked at: 1,000 views with 40 pairs each have 260,000.
-const MOST_LOOPS: usize = 2_000_000;
-/// Smallest share of a pair's matches that agree with the rotation that loops give it, for the pair to be kept.
-const AGREES: f64 = 0.8;
-/// Fewest loops of a pair that is refused: where there is one, another of its pairs may be the wrong one.
-const LEAST_LOOPS: usize = 2;
+/// Largest angle of the composed rotation of a consistent triplet, in radians: 5 degrees. All 78 pairs of 1,350 that it
+/// rejects on templeRing and a drive (kitti-2) are in the end wrong by 6 degrees and more.
+const MAX_TRIPLET_ANGLE: f64 = 0.087;
+/// Maximum number of triplets that are tested: 1,000 views with 40 pairs each have 260,000.
+const MAX_TRIPLETS: usize = 2_000_000;
+/// Minimum inlier ratio of a pair with the rotation that its triplets predict, for the pair to be kept.
+const MIN_INLIER_RATIO: f64 = 0.8;
+/// Minimum number of triplets of a rejected pair: with one, another of its pairs may be the wrong one.
+const MIN_TRIPLETS: usize = 2;
 
 impl ViewGraph {
-    /// Relative poses of all pairs: as they were given, or by the focal lengths of `cameras` where the pairs have a fundamental matrix or a homography. Pairs without one are left out.
+    /// Computes the relative poses of all pairs: as given, or by the focal lengths of `cameras` where the geometry is a
+    /// fundamental matrix or a homography. Pairs without a pose are left out.
     ///
     /// # Errors
     /// [`Cancelled`].
@@ -98,18 +99,18 @@ impl ViewGraph {
         Ok(Self { views: input.views.len(), links: links.into_iter().flatten().collect() })
     }
 
-    /// The links that are kept, in a graph of their own.
+    /// Returns the graph of the links that `keep` accepts.
     pub(crate) fn filtered(&self, keep: impl Fn(&Link) -> bool) -> Self {
         Self { views: self.views, links: self.links.iter().filter(|l| keep(l)).copied().collect() }
     }
 
-    /// The links as edges, as many as links.
+    /// Returns the weighted graph of the links, with one edge for each link.
     pub(crate) fn edges(&self, weight: impl Fn(usize) -> f64) -> Option<PairGraph> {
         let edge = |(i, l): (usize, &Link)| PairEdge { a: l.a, b: l.b, weight: weight(i) };
         PairGraph::new(self.views, self.links.iter().enumerate().map(edge).collect()).ok()
     }
 
-    /// The part of most views, with the links within it.
+    /// Returns the connected component with most views.
     pub(crate) fn largest_component(&self) -> Self {
         let component = self.edges(|i| self.links[i].matches as f64).map(|g| g.connected_components());
         let mut inside = vec![false; self.views];
@@ -117,21 +118,21 @@ impl ViewGraph {
         self.filtered(|l| inside[l.a])
     }
 
-    /// Loops of three links, as indices of links; of very many, some evenly.
+    /// Returns the triplets of mutually linked views, as link indices; evenly sampled if there are too many.
     fn triplets(&self) -> Vec<[usize; 3]> {
         let mut neighbors: Vec<Vec<(usize, usize)>> = vec![Vec::new(); self.views];
         for (i, l) in self.links.iter().enumerate() {
             neighbors[l.a.min(l.b)].push((l.a.max(l.b), i));
         }
         neighbors.iter_mut().for_each(|list| list.sort_unstable());
-        let all = |found: &mut dyn FnMut([usize; 3])| {
+        let for_each_triplet = |visit: &mut dyn FnMut([usize; 3])| {
             for list in &neighbors {
                 for (n, &(b, ab)) in list.iter().enumerate() {
                     let (mut rest, mut others) = (&list[n + 1..], &neighbors[b][..]);
-                    // Both ascend: views that are neighbors of the lowest of the three and of the middle one.
+                    // Both lists are sorted: common neighbors of the lowest and the middle view of the triplet.
                     while let (Some(x), Some(y)) = (rest.first(), others.first()) {
                         if x.0 == y.0 {
-                            found([ab, y.1, x.1]);
+                            visit([ab, y.1, x.1]);
                         }
                         (rest, others) = (&rest[usize::from(x.0 <= y.0)..], &others[usize::from(y.0 <= x.0)..]);
                     }
@@ -139,114 +140,123 @@ impl ViewGraph {
             }
         };
         let mut count = 0;
-        all(&mut |_| count += 1);
-        let step = usize::div_ceil(count, MOST_LOOPS).max(1);
-        let (mut loops, mut n) = (Vec::with_capacity(count / step + 1), 0);
-        all(&mut |triplet| {
+        for_each_triplet(&mut |_| count += 1);
+        let step = usize::div_ceil(count, MAX_TRIPLETS).max(1);
+        let (mut triplets, mut n) = (Vec::with_capacity(count / step + 1), 0);
+        for_each_triplet(&mut |triplet| {
             if n % step == 0 {
-                loops.push(triplet);
+                triplets.push(triplet);
             }
             n += 1;
         });
-        loops
+        triplets
     }
 
-    /// The rotation that is left after a loop, in radians.
-    fn loop_angle(&self, [ab, bc, ac]: [usize; 3]) -> f64 {
+    /// Returns the angle of the composed rotation of a triplet, in radians.
+    fn triplet_angle(&self, [ab, bc, ac]: [usize; 3]) -> f64 {
         let forward = |i: usize| {
             let l = &self.links[i];
             if l.a < l.b { l.pose.rotation } else { l.pose.rotation.inverse() }
         };
-        let left = forward(ac).inverse() * forward(bc) * forward(ab);
-        Pose::new(left, Vector3::zeros()).rotation_angle()
+        let composed = forward(ac).inverse() * forward(bc) * forward(ab);
+        Pose::new(composed, Vector3::zeros()).rotation_angle()
     }
 
-    /// Loops of three links whose rotations close.
-    pub(crate) fn closed_triplets(&self) -> Vec<[usize; 3]> {
-        self.triplets().into_par_iter().filter(|t| self.loop_angle(*t) <= LOOP).collect()
+    /// Returns the triplets with consistent rotations.
+    pub(crate) fn consistent_triplets(&self) -> Vec<[usize; 3]> {
+        self.triplets().into_par_iter().filter(|t| self.triplet_angle(*t) <= MAX_TRIPLET_ANGLE).collect()
     }
 
-    /// Refuses links that no loop confirms, but for those whose matches agree with what loops say of their rotation: of a flat scene two poses agree with the matches, and the wrong one may have
-    /// been taken. Those get the other.
+    /// Rejects the links without a consistent triplet, unless their matches agree with the rotation that triplets
+    /// predict: two poses explain the matches of a planar scene, and the wrong one may have been selected. Such links
+    /// get the other pose.
     ///
     /// # Errors
     /// [`Cancelled`].
-    pub(crate) fn refuse_by_triplets(
+    pub(crate) fn reject_by_triplets(
         &mut self,
         input: &SfmInput<'_>,
         cameras: &[Camera],
         options: &SfmOptions,
         stage: &Stage<'_>,
     ) -> Result<Vec<RefusedPair>, Cancelled> {
-        let suspects = self.take_unconfirmed();
+        let suspects = self.remove_inconsistent();
         if suspects.is_empty() {
             return Ok(Vec::new());
         }
         let rotations = average_rotations(&self.largest_component(), stage)?;
         let repaired = |(link, _): &(Link, usize)| {
             let rotation = rotations[link.b]? * rotations[link.a]?.inverse();
-            let (rays, unit) = rays(input, cameras, link.pair);
+            let (rays, unit) = normalized_matches(input, cameras, link.pair);
             let threshold = options.growing_error() * unit;
-            let (pose, share) = motion_of_rotation(&rotation, &rays, threshold)?;
-            let enough = share >= AGREES && share * rays.len() as f64 >= options.min_pose_inliers as f64;
-            enough.then(|| Link { pose: refine_relative_pose(&pose, &rays, threshold).0, ..*link })
+            let (pose, inlier_ratio) = pose_given_rotation(&rotation, &rays, threshold)?;
+            let has_enough =
+                inlier_ratio >= MIN_INLIER_RATIO && inlier_ratio * rays.len() as f64 >= options.min_pose_inliers as f64;
+            has_enough.then(|| Link { pose: refine_relative_pose(&pose, &rays, threshold).0, ..*link })
         };
         let repaired: Vec<Option<Link>> = suspects.par_iter().map(repaired).collect();
         let mut refused = Vec::new();
-        for ((link, loops), repaired) in suspects.iter().zip(repaired) {
+        for ((link, triplets), repaired) in suspects.iter().zip(repaired) {
             match repaired {
                 Some(link) => self.links.push(link),
-                None => refused.push(RefusedPair { pair: link.pair, reason: PairRefusal::Triplets { loops: *loops } }),
+                None => {
+                    refused.push(RefusedPair { pair: link.pair, reason: PairRefusal::Triplets { loops: *triplets } })
+                }
             }
         }
         self.links.sort_unstable_by_key(|l| l.pair);
         Ok(refused)
     }
 
-    /// Takes out the links that no loop confirms, each with the number of its loops: where the rotations of three pairs do not close, one of them is wrong (Zach, Klopschitz & Pollefeys,
-    /// "Disambiguating visual relations using loop constraints", CVPR 2010). The link with most open loops and no closed one goes first, since its loops tell nothing of the other links any
-    /// more. O(loops · log).
-    fn take_unconfirmed(&mut self) -> Vec<(Link, usize)> {
-        let loops: Vec<([usize; 3], bool)> =
-            self.triplets().into_par_iter().map(|t| (t, self.loop_angle(t) <= LOOP)).collect();
-        let mut closed = vec![0usize; self.links.len()];
-        let mut open = vec![0usize; self.links.len()];
-        let mut of_link: Vec<Vec<usize>> = vec![Vec::new(); self.links.len()];
-        for (l, (links, closes)) in loops.iter().enumerate() {
+    /// Removes the links without a consistent triplet and returns each with its number of triplets: if the rotations of
+    /// three pairs are not consistent, one of them is wrong (Zach, Klopschitz & Pollefeys, "Disambiguating visual
+    /// relations using loop constraints", CVPR 2010). Greedy: the link with most inconsistent triplets goes first, and
+    /// its triplets no longer count against the other links. O(triplets · log).
+    fn remove_inconsistent(&mut self) -> Vec<(Link, usize)> {
+        let triplets: Vec<([usize; 3], bool)> =
+            self.triplets().into_par_iter().map(|t| (t, self.triplet_angle(t) <= MAX_TRIPLET_ANGLE)).collect();
+        let mut consistent = vec![0usize; self.links.len()];
+        let mut inconsistent = vec![0usize; self.links.len()];
+        let mut inconsistent_of_link: Vec<Vec<usize>> = vec![Vec::new(); self.links.len()];
+        for (l, (links, is_consistent)) in triplets.iter().enumerate() {
             for i in links {
-                if *closes {
-                    closed[*i] += 1;
+                if *is_consistent {
+                    consistent[*i] += 1;
                 } else {
-                    open[*i] += 1;
-                    of_link[*i].push(l);
+                    inconsistent[*i] += 1;
+                    inconsistent_of_link[*i].push(l);
                 }
             }
         }
-        let mut dropped = vec![false; loops.len()];
-        let mut taken = Vec::new();
-        let mut gone = vec![false; self.links.len()];
+        let mut is_dropped = vec![false; triplets.len()];
+        let mut removed = Vec::new();
+        let mut is_removed = vec![false; self.links.len()];
         loop {
-            let wrong = |i: &usize| !gone[*i] && closed[*i] == 0 && open[*i] >= LEAST_LOOPS;
-            let Some(worst) = (0..self.links.len()).filter(wrong).max_by_key(|i| (open[*i], usize::MAX - i)) else {
+            let is_inconsistent =
+                |i: &usize| !is_removed[*i] && consistent[*i] == 0 && inconsistent[*i] >= MIN_TRIPLETS;
+            let Some(worst) =
+                (0..self.links.len()).filter(is_inconsistent).max_by_key(|i| (inconsistent[*i], usize::MAX - i))
+            else {
                 break;
             };
-            gone[worst] = true;
-            taken.push((self.links[worst], open[worst]));
-            for l in std::mem::take(&mut of_link[worst]) {
-                if !std::mem::replace(&mut dropped[l], true) {
-                    loops[l].0.iter().for_each(|i| open[*i] -= 1);
+            is_removed[worst] = true;
+            removed.push((self.links[worst], inconsistent[worst]));
+            for l in std::mem::take(&mut inconsistent_of_link[worst]) {
+                if !std::mem::replace(&mut is_dropped[l], true) {
+                    triplets[l].0.iter().for_each(|i| inconsistent[*i] -= 1);
                 }
             }
         }
         let mut index = 0..;
-        self.links.retain(|_| index.next().is_none_or(|i: usize| !gone[i]));
-        taken.sort_unstable_by_key(|t| t.0.pair);
-        taken
+        self.links.retain(|_| index.next().is_none_or(|i: usize| !is_removed[i]));
+        removed.sort_unstable_by_key(|t| t.0.pair);
+        removed
     }
 }
 
-/// The matches of a pair in normalized coordinates, those that the lenses reach, and a pixel in that unit.
-fn rays(input: &SfmInput<'_>, cameras: &[Camera], pair: usize) -> (Vec<Correspondence>, f64) {
+/// Returns the matches of a pair in normalized coordinates, within the range of the distortion model, and the size of a
+/// pixel in that unit.
+fn normalized_matches(input: &SfmInput<'_>, cameras: &[Camera], pair: usize) -> (Vec<Correspondence>, f64) {
     let pair = &input.pairs[pair];
     let [a, b] = [&input.views[pair.a], &input.views[pair.b]];
     let pixels: Vec<Correspondence> =
@@ -256,10 +266,13 @@ fn rays(input: &SfmInput<'_>, cameras: &[Camera], pair: usize) -> (Vec<Correspon
     (rays, unit)
 }
 
-/// Matches that a relative pose is looked for with, evenly from all of a pair, before all of them refine it: they agree with a geometry already.
-const ENOUGH: usize = 400;
+/// Maximum number of matches, evenly sampled, that RANSAC estimates a relative pose from; all matches then refine it.
+/// They are inliers of a geometry already.
+const MAX_RANSAC_MATCHES: usize = 400;
 
-/// From the matches anew where the pair's geometry is no pose: a fundamental matrix of a nearly flat scene says little of the rotation, and five matches are enough where focal lengths are known.
+/// Returns the relative pose of a pair, estimated from the matches again if its geometry is not a pose: the fundamental
+/// matrix of a nearly planar scene hardly determines the rotation, and the five-point method with known focal lengths
+/// does.
 fn relative_pose(
     input: &SfmInput<'_>,
     cameras: &[Camera],
@@ -270,13 +283,13 @@ fn relative_pose(
     if let ViewPairModel::Pose(pose) = input.geometry[pair] {
         return Ok(Some(pose));
     }
-    let (rays, unit) = rays(input, cameras, pair);
+    let (rays, unit) = normalized_matches(input, cameras, pair);
     let threshold = options.growing_error() * unit;
-    let step = rays.len().div_ceil(ENOUGH).max(1);
-    let some: Vec<Correspondence> = rays.iter().step_by(step).copied().collect();
+    let step = rays.len().div_ceil(MAX_RANSAC_MATCHES).max(1);
+    let sampled: Vec<Correspondence> = rays.iter().step_by(step).copied().collect();
     let robust = RobustOptions { threshold, seed: options.seed, max_iterations: 1000, ..RobustOptions::essential() };
-    match estimate_relative_pose(&some, &robust, progress) {
-        Ok(found) => Ok(Some(refine_relative_pose(&found.model, &rays, threshold).0)),
+    match estimate_relative_pose(&sampled, &robust, progress) {
+        Ok(estimate) => Ok(Some(refine_relative_pose(&estimate.model, &rays, threshold).0)),
         Err(EstimateError::Cancelled(stop)) => Err(stop),
         Err(_) => Ok(None),
     }
@@ -287,14 +300,14 @@ mod tests {
     use super::*;
     use cv_core::Rotation3;
 
-    /// All pairs of `views` views with random rotations; those of `wrong` turned by `by` radians.
-    fn graph(views: usize, wrong: &[(usize, usize)], by: f64) -> ViewGraph {
+    /// All pairs of `views` views with different rotations; those of `wrong` have an error of `by` radians.
+    fn graph(views: usize, wrong: &[(usize, usize)], angle: f64) -> ViewGraph {
         let rotation = |i: usize| Rotation3::from_euler_angles(0.3 * i as f64, 1.0 / (1.0 + i as f64), -0.2 * i as f64);
         let pairs = (0..views).flat_map(|a| (a + 1..views).map(move |b| (a, b)));
         let link = |(pair, (a, b)): (usize, (usize, usize))| {
-            let turn = Rotation3::new(Vector3::new(0.0, if wrong.contains(&(a, b)) { by } else { 0.0 }, 0.0));
-            let pose = Pose::new(turn * rotation(b) * rotation(a).inverse(), Vector3::x());
-            // Every other pair is given from the later view to the earlier.
+            let error = Rotation3::new(Vector3::new(0.0, if wrong.contains(&(a, b)) { angle } else { 0.0 }, 0.0));
+            let pose = Pose::new(error * rotation(b) * rotation(a).inverse(), Vector3::x());
+            // Every other pair is given in reverse order.
             match pair % 2 {
                 0 => Link { pair, a, b, pose, matches: 100 },
                 _ => Link { pair, a: b, b: a, pose: pose.inverse(), matches: 100 },
@@ -304,7 +317,7 @@ mod tests {
     }
 
     #[test]
-    fn pairs_that_no_loop_confirms_are_refused_and_no_others() {
+    fn exactly_the_pairs_without_a_consistent_triplet_are_removed() {
         let wrong = [(0, 1), (2, 5), (3, 4)];
         let mut graph = graph(7, &wrong, 0.5);
         assert_eq!(graph.triplets().len(), 35);
@@ -312,27 +325,27 @@ mod tests {
             let all: Vec<(usize, usize)> = (0..7).flat_map(|a| (a + 1..7).map(move |b| (a, b))).collect();
             all[pair]
         };
-        let taken = graph.take_unconfirmed();
-        assert_eq!(taken.iter().map(|t| of(t.0.pair)).collect::<Vec<_>>(), wrong);
-        // Five other views close a loop with each pair.
-        assert!(taken.iter().all(|t| t.1 == 5), "{taken:?}");
+        let removed = graph.remove_inconsistent();
+        assert_eq!(removed.iter().map(|t| of(t.0.pair)).collect::<Vec<_>>(), wrong);
+        // Each pair is in a triplet with five other views.
+        assert!(removed.iter().all(|t| t.1 == 5), "{removed:?}");
         assert_eq!(graph.links.len(), 18);
-        // Everything that is left closes: none is refused.
-        assert!(graph.closed_triplets().len() == graph.triplets().len() && graph.take_unconfirmed().is_empty());
+        // All remaining triplets are consistent: no pair is removed.
+        assert!(graph.consistent_triplets().len() == graph.triplets().len() && graph.remove_inconsistent().is_empty());
     }
 
     #[test]
-    fn one_open_loop_does_not_say_which_of_its_pairs_is_wrong() {
-        assert!(graph(3, &[(0, 1)], 0.5).take_unconfirmed().is_empty());
-        // And 3 degrees are what a wrong focal length does.
-        assert!(graph(6, &[(0, 1)], 0.05).take_unconfirmed().is_empty());
+    fn a_single_inconsistent_triplet_removes_no_pair() {
+        assert!(graph(3, &[(0, 1)], 0.5).remove_inconsistent().is_empty());
+        // Errors of 3 degrees are within the tolerance: a wrong focal length causes them.
+        assert!(graph(6, &[(0, 1)], 0.05).remove_inconsistent().is_empty());
     }
 
     #[test]
-    fn the_largest_part_is_kept_with_its_links() {
-        let mut parted = graph(7, &[], 0.0);
-        parted.links.retain(|l| (l.a < 3) == (l.b < 3));
-        let largest = parted.largest_component();
+    fn the_largest_component_has_all_its_links() {
+        let mut split = graph(7, &[], 0.0);
+        split.links.retain(|l| (l.a < 3) == (l.b < 3));
+        let largest = split.largest_component();
         assert!(largest.links.len() == 6 && largest.links.iter().all(|l| l.a >= 3 && l.b >= 3));
     }
 }

@@ -1,4 +1,4 @@
-//! Which matches of two views agree with their geometry.
+//! Geometric verification of a pair of views: the matches that are inliers of a two-view geometry.
 
 use crate::CameraKnowledge;
 use cv_core::{Camera, Cancelled, Correspondence, DMatch, Keypoint, Matrix3, Pose, Progress};
@@ -12,45 +12,50 @@ use cv_geometry::{
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct ViewPairOptions {
-    /// Largest error of a match that agrees, in pixels, where both cameras and their lenses are known. Default 2.
+    /// Inlier threshold in pixels where both cameras are calibrated, including their distortion. Default 2.
     pub threshold: f64,
-    /// The same where one is not, so that what the lens bends stays. Default 4, COLMAP's.
+    /// Inlier threshold in pixels where one is not; large enough for the effect of an unknown distortion. Default 4,
+    /// COLMAP's.
     pub threshold_uncalibrated: f64,
-    /// Fewest matches that agree. Default 15, COLMAP's.
+    /// Minimum number of inliers. Default 15, COLMAP's.
     pub min_inliers: usize,
-    /// Share of right matches that a search finds with 95 %, above 0 and below 1: the fewer, the more samples. Default 3/8, for five of which 400 samples are needed. Views with fewer right
-    /// matches hold together by way of others.
-    pub min_share: f64,
-    /// Seed of the samples. Default 0.
+    /// Inlier ratio at which RANSAC finds the inliers with 95 % probability, above 0 and below 1; it determines the
+    /// number of samples. Default 3/8, which needs 400 samples of five matches. Views with fewer inliers are connected
+    /// by way of other pairs.
+    #[cfg_attr(feature = "serde", serde(rename = "min_share"))]
+    pub min_inlier_ratio: f64,
+    /// Seed of RANSAC. Default 0.
     pub seed: u64,
 }
 
 impl Default for ViewPairOptions {
     fn default() -> Self {
-        Self { threshold: 2.0, threshold_uncalibrated: 4.0, min_inliers: 15, min_share: 0.375, seed: 0 }
+        Self { threshold: 2.0, threshold_uncalibrated: 4.0, min_inliers: 15, min_inlier_ratio: 0.375, seed: 0 }
     }
 }
 
-/// Matches from which on the loss of a pair has one minimum that matters: of fewer, several models agree with nearly as many, and the search has to go round each.
-const MANY: usize = 200;
-/// Most samples of a search.
-const MOST_SAMPLES: usize = 20_000;
+/// Number of matches from which on local optimization is iterative: with fewer, several local optima have nearly as
+/// many inliers, and an inner RANSAC is needed.
+const ITERATIVE_MIN_MATCHES: usize = 200;
+/// Maximum number of samples.
+const MAX_SAMPLES: usize = 20_000;
 
-/// The geometry of two views.
+/// A two-view geometry.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum ViewPairModel {
-    /// Of known cameras: first camera frame to second, the translation of length one.
+    /// Calibrated cameras: first camera frame to second, with a unit translation.
     Pose(Pose),
-    /// Of unknown ones: `bᵀ F a = 0` in pixels as they were taken.
+    /// Uncalibrated cameras: `bᵀ F a = 0` in distorted pixels.
     Fundamental(Matrix3<f64>),
-    /// A plane, or a camera that only turned: `b ~ H a` in pixels as they were taken.
+    /// A planar scene or a rotation: `b ~ H a` in distorted pixels.
     Homography(Matrix3<f64>),
 }
 
 impl ViewPairModel {
-    /// The fundamental matrix between undistorted pixels of known cameras, or pixels as they were taken of unknown ones; `None` of a homography.
+    /// Returns the fundamental matrix, between undistorted pixels for a pose or distorted pixels for an uncalibrated
+    /// pair; `None` for a homography.
     pub fn fundamental(&self, cameras: [&Camera; 2]) -> Option<Matrix3<f64>> {
         match self {
             Self::Pose(pose) => {
@@ -63,33 +68,33 @@ impl ViewPairModel {
     }
 }
 
-/// Two views whose matches agree.
+/// A verified pair of views.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct ViewPair {
-    /// Their geometry.
+    /// The two-view geometry.
     pub model: ViewPairModel,
-    /// Indices of the matches that agree with it, ascending.
+    /// Indices of the inliers, ascending.
     pub inliers: Vec<usize>,
-    /// Root mean square of their distances from it, in pixels.
+    /// Root mean square of the inliers' residuals, in pixels.
     pub rms: f64,
 }
 
-/// Why the matches of two views say nothing of their geometry.
+/// Why a pair of views cannot be verified.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum ViewPairError {
-    /// Too few matches agree.
-    #[error("{got} of {matches} matches agree where {needed} are needed")]
+    /// Too few inliers.
+    #[error("{got} of {matches} matches agree, {needed} are needed")]
     TooFewInliers {
-        /// Matches that agree.
+        /// Number of inliers.
         got: usize,
-        /// Matches.
+        /// Number of matches.
         matches: usize,
-        /// How many are needed.
+        /// Number that is needed.
         needed: usize,
     },
-    /// No geometry fits.
+    /// No geometry was found.
     #[error("no geometry: {0}")]
     NoModel(EstimateError),
     /// The job was stopped.
@@ -106,8 +111,8 @@ impl From<EstimateError> for ViewPairError {
     }
 }
 
-/// The geometry of two views and the matches that agree with it: a relative pose where both cameras are known, else a fundamental matrix, or a homography where that is all there
-/// is.
+/// Estimates the two-view geometry of a pair and its inlier matches: a relative pose where both cameras are calibrated,
+/// else a fundamental matrix, or a homography in a planar degenerate configuration.
 ///
 /// # Errors
 /// [`ViewPairError`].
@@ -118,8 +123,8 @@ pub fn verify_view_pair(
     options: &ViewPairOptions,
     progress: &dyn Progress,
 ) -> Result<ViewPair, ViewPairError> {
-    let calibrated = cameras.iter().all(|c| c.1.is_calibrated());
-    let known = cameras.iter().all(|c| *c.1 == CameraKnowledge::Known);
+    let is_calibrated = cameras.iter().all(|c| c.1.is_calibrated());
+    let is_known = cameras.iter().all(|c| *c.1 == CameraKnowledge::Known);
     let mut index = Vec::with_capacity(matches.len());
     let mut pairs = Vec::with_capacity(matches.len());
     for (i, m) in matches.iter().enumerate() {
@@ -128,50 +133,51 @@ pub fn verify_view_pair(
             pairs.push(pair);
         }
     }
-    let few = |got| ViewPairError::TooFewInliers { got, matches: matches.len(), needed: options.min_inliers };
+    let too_few = |got| ViewPairError::TooFewInliers { got, matches: matches.len(), needed: options.min_inliers };
     if pairs.len() < options.min_inliers {
-        return Err(few(pairs.len()));
+        return Err(too_few(pairs.len()));
     }
-    // Where there are few matches, those that must agree are a larger share.
-    let share = (options.min_inliers as f64 / pairs.len() as f64).clamp(options.min_share, 0.99);
-    let samples = |size: i32| ((0.05f64.ln() / (-share.powi(size)).ln_1p()).ceil() as usize).clamp(16, MOST_SAMPLES);
+    // With few matches, the minimum number of inliers is a larger ratio.
+    let inlier_ratio = (options.min_inliers as f64 / pairs.len() as f64).clamp(options.min_inlier_ratio, 0.99);
+    let samples =
+        |size: i32| ((0.05f64.ln() / (-inlier_ratio.powi(size)).ln_1p()).ceil() as usize).clamp(16, MAX_SAMPLES);
     let robust = RobustOptions {
-        max_iterations: samples(if calibrated { 5 } else { 7 }),
+        max_iterations: samples(if is_calibrated { 5 } else { 7 }),
         seed: options.seed,
         scoring: Scoring::Msac,
-        local_optimization: if pairs.len() < MANY {
+        local_optimization: if pairs.len() < ITERATIVE_MIN_MATCHES {
             LocalOptimization::InnerRansac
         } else {
             LocalOptimization::Iterative
         },
         ..RobustOptions::default()
     };
-    let (model, inliers, rms) = if calibrated {
+    let (model, inliers, rms) = if is_calibrated {
         let (rays, unit) = normalize_matches(&pairs, cameras[0].0, cameras[1].0);
-        // Beyond the range of a lens there are no rays.
+        // Pixels beyond the range of the distortion model have no normalized coordinates.
         let finite: Vec<usize> = (0..rays.len()).filter(|i| rays[*i].is_finite()).collect();
         let rays: Vec<Correspondence> = finite.iter().map(|i| rays[*i]).collect();
-        let pixels = if known { options.threshold } else { options.threshold_uncalibrated };
-        let robust = RobustOptions { threshold: pixels * unit, ..robust };
-        let found = estimate_relative_pose(&rays, &robust, progress)?;
+        let threshold = if is_known { options.threshold } else { options.threshold_uncalibrated };
+        let robust = RobustOptions { threshold: threshold * unit, ..robust };
+        let estimate = estimate_relative_pose(&rays, &robust, progress)?;
         (
-            ViewPairModel::Pose(found.model),
-            found.inliers.into_iter().map(|i| finite[i]).collect::<Vec<_>>(),
-            found.rms / unit,
+            ViewPairModel::Pose(estimate.model),
+            estimate.inliers.into_iter().map(|i| finite[i]).collect::<Vec<_>>(),
+            estimate.rms / unit,
         )
     } else {
         let robust = RobustOptions { threshold: options.threshold_uncalibrated, ..robust };
         match estimate_fundamental(&pairs, &robust, progress) {
-            Ok(found) => (ViewPairModel::Fundamental(found.model), found.inliers, found.rms),
+            Ok(estimate) => (ViewPairModel::Fundamental(estimate.model), estimate.inliers, estimate.rms),
             Err(EstimateError::Degenerate { kind: Degeneracy::Planar }) => {
-                let found = estimate_homography(&pairs, &robust, progress)?;
-                (ViewPairModel::Homography(found.model), found.inliers, found.rms)
+                let estimate = estimate_homography(&pairs, &robust, progress)?;
+                (ViewPairModel::Homography(estimate.model), estimate.inliers, estimate.rms)
             }
             Err(error) => return Err(error.into()),
         }
     };
     if inliers.len() < options.min_inliers {
-        return Err(few(inliers.len()));
+        return Err(too_few(inliers.len()));
     }
     Ok(ViewPair { model, inliers: inliers.into_iter().map(|i| index[i]).collect(), rms })
 }

@@ -1,4 +1,4 @@
-//! Models in the frame of what is known of their cameras, against the frame that they were made in.
+//! Alignment of models to measurements, against the true frame.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -7,7 +7,7 @@ use cv_geometry::Similarity;
 use cv_sfm::{KnownPlaces, ModelAlignError, ModelAlignment, SfmModel, SfmPoint, align_model, align_to_poses};
 use std::f64::consts::TAU;
 
-/// A pseudo-random number from −1 to 1.
+/// Returns a pseudo-random number from −1 to 1.
 fn noise(of: usize) -> f64 {
     let mut v = (of as u64 + 1).wrapping_mul(0x9E37_79B9_7F4A_7C15);
     v = (v ^ (v >> 31)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
@@ -18,7 +18,8 @@ fn shake(i: usize, by: f64) -> Vector3<f64> {
     Vector3::from_fn(|k, _| by * noise(3 * i + k))
 }
 
-/// Cameras in the places `eyes`, Z up, that look level along `ahead`; and what a reconstruction would make of them: the same in a frame of its own.
+/// Upright cameras with centers `eyes` (Z up) that look horizontally along `ahead`, as a model in another frame; and
+/// the true poses.
 fn model(eyes: &[Point3<f64>], ahead: impl Fn(usize) -> Vector3<f64>) -> (SfmModel, Vec<Pose>) {
     let truth: Vec<Pose> =
         eyes.iter().enumerate().map(|(i, eye)| Pose::look_at(*eye, eye + ahead(i), -Vector3::z()).unwrap()).collect();
@@ -29,17 +30,17 @@ fn model(eyes: &[Point3<f64>], ahead: impl Fn(usize) -> Vector3<f64>) -> (SfmMod
         poses: truth.iter().copied().map(Some).collect(),
         points: points.into_iter().map(seen).collect(),
     };
-    let own = Similarity {
+    let to_model = Similarity {
         scale: 0.13,
         rotation: Rotation3::from_euler_angles(0.4, -1.1, 2.0),
         translation: Vector3::new(1.0, -2.0, 0.3),
     };
-    model.transform(&own);
+    model.transform(&to_model);
     (model, truth)
 }
 
-/// A round walk of 40 m across, a little up and down, each camera towards the middle.
-fn round(n: usize) -> Vec<Point3<f64>> {
+/// Camera centers on a circle of 40 m diameter, at slightly varying heights.
+fn circle(n: usize) -> Vec<Point3<f64>> {
     let angle = |i: usize| TAU * i as f64 / n as f64;
     (0..n).map(|i| Point3::new(20.0 * angle(i).cos() + 300.0, 20.0 * angle(i).sin(), 1.6 + 0.3 * noise(i))).collect()
 }
@@ -55,8 +56,8 @@ fn align(model: &SfmModel, known: &KnownPlaces<'_>) -> Result<(ModelAlignment, S
     Ok((found, moved))
 }
 
-/// Largest distance of a center from the truth, and largest angle of a rotation in degrees.
-fn worst(model: &SfmModel, truth: &[Pose]) -> (f64, f64) {
+/// Returns the largest error of a center, and the largest angle of a rotation error in degrees.
+fn max_errors(model: &SfmModel, truth: &[Pose]) -> (f64, f64) {
     let pairs = || model.poses.iter().flatten().zip(truth);
     let off = pairs().map(|(p, t)| (p.center() - t.center()).norm()).fold(0.0, f64::max);
     let turn = |(p, t): (&Pose, &Pose)| Pose::new(p.rotation * t.rotation.inverse(), Vector3::zeros()).rotation_angle();
@@ -64,10 +65,10 @@ fn worst(model: &SfmModel, truth: &[Pose]) -> (f64, f64) {
 }
 
 #[test]
-fn positions_of_meters_and_some_that_are_wrong() {
-    let eyes = round(24);
+fn noisy_centers_with_outliers() {
+    let eyes = circle(24);
     let (model, truth) = model(&eyes, inward(&eyes));
-    // Within 3 m in each coordinate; five are tens of meters off, and two are not told.
+    // Errors within 3 m in each coordinate; five centers are off by tens of meters, two are unknown.
     let mut known: Vec<Option<Point3<f64>>> =
         eyes.iter().enumerate().map(|(i, eye)| Some(eye + shake(i, 3.0))).collect();
     for i in [2, 3, 4, 11, 17] {
@@ -76,54 +77,57 @@ fn positions_of_meters_and_some_that_are_wrong() {
     (known[7], known[20]) = (None, None);
     let (found, moved) = align(&model, &KnownPlaces { centers: &known, distances: &[] }).unwrap();
     let fit = found.centers.unwrap();
-    assert!(found.metric && fit.tilt && fit.differ == [2, 3, 4, 11, 17], "{fit:?}");
-    assert_eq!(fit.agree.len(), 17);
-    // Uniform to 3 m: 1.73 m in each of three coordinates, 3.0 m in space, some of which the fit takes up.
+    assert!(found.metric && fit.tilt && fit.outliers == [2, 3, 4, 11, 17], "{fit:?}");
+    assert_eq!(fit.inliers.len(), 17);
+    // Uniform within 3 m: a standard deviation of 1.73 m in each of three coordinates, 3.0 m in space, of which the fit
+    // absorbs some.
     assert!((2.0..3.1).contains(&fit.rms) && (19.0..22.0).contains(&fit.spread), "{fit:?}");
-    // The mean of 17 such errors is 0.7 m off, and over 20 m its scale by 2 %, its turn by 1.2 degrees; three standard deviations of all of them together.
-    let (off, degrees) = worst(&moved, &truth);
+    // The mean of 17 such errors is 0.7 m; over 20 m the scale is off by 2 % and the rotation by 1.2 degrees. The limit
+    // is three standard deviations of all together.
+    let (off, degrees) = max_errors(&moved, &truth);
     assert!(off < 4.0 && degrees < 4.0, "{off} {degrees}");
 }
 
 #[test]
-fn exact_positions_give_the_frame_itself() {
-    let eyes = round(5);
+fn exact_centers_restore_the_frame() {
+    let eyes = circle(5);
     let (model, truth) = model(&eyes, inward(&eyes));
     for n in [3, 4, 5] {
         let known: Vec<_> = eyes.iter().take(n).copied().map(Some).collect();
         let (found, moved) = align(&model, &KnownPlaces { centers: &known, distances: &[] }).unwrap();
-        assert_eq!(found.centers.unwrap().agree.len(), n);
-        // Rounding of coordinates of hundreds.
-        let (off, degrees) = worst(&moved, &truth);
+        assert_eq!(found.centers.unwrap().inliers.len(), n);
+        // Rounding of coordinates of some hundreds.
+        let (off, degrees) = max_errors(&moved, &truth);
         assert!(off < 1e-6 && degrees < 1e-6, "{n}: {off} {degrees}");
-        // Points go along: seven meters ahead.
+        // The first point is 7 m in front of the first camera.
         let ahead = truth[0].transform(&moved.points[0].position);
         assert!((ahead - Point3::new(0.0, 0.0, 7.0)).norm() < 1e-6, "{ahead}");
     }
 }
 
 #[test]
-fn along_a_street_up_is_that_of_the_photographs() {
-    // Thirty photographs each 3 m on, whose positions are off by up to 4 m to the sides.
+fn collinear_centers_take_the_vertical_from_the_images() {
+    // Thirty views 3 m apart, with errors of up to 4 m.
     let eyes: Vec<_> = (0..30).map(|i| Point3::new(3.0 * i as f64, 0.1 * noise(i), 1.6)).collect();
     let ahead = |i: usize| Vector3::new(1.0, 0.5 * noise(i), 0.1 * noise(i + 50)).normalize();
     let (model, truth) = model(&eyes, ahead);
     let known: Vec<_> = eyes.iter().enumerate().map(|(i, eye)| Some(eye + shake(i, 4.0))).collect();
     let (found, moved) = align(&model, &KnownPlaces { centers: &known, distances: &[] }).unwrap();
     let fit = found.centers.unwrap();
-    assert!(!fit.tilt && fit.agree.len() >= 29, "{fit:?}");
-    // Exactly on a line too.
+    assert!(!fit.tilt && fit.inliers.len() >= 29, "{fit:?}");
+    // Exactly collinear centers too.
     let line: Vec<_> = (0..30).map(|i| Some(Point3::new(3.0 * i as f64, 0.0, 1.6))).collect();
     let (exact, _) = align(&model, &KnownPlaces { centers: &line, distances: &[] }).unwrap();
     assert!(!exact.centers.unwrap().tilt && (exact.similarity.scale * 0.13 - 1.0).abs() < 1e-3);
-    // 4 m are 2.3 in a coordinate, over 26 m of spread and thirty views 1 degree; the photographs look up and down by 3 degrees, ahead, of which the mean is half a degree.
-    let (off, degrees) = worst(&moved, &truth);
+    // Errors within 4 m have a standard deviation of 2.3 m in a coordinate, over a spread of 26 m and thirty views 1
+    // degree. The pitch of the views is within 3 degrees; its mean is half a degree.
+    let (off, degrees) = max_errors(&moved, &truth);
     assert!(off < 5.0 && degrees < 4.0, "{off} {degrees}");
 }
 
 #[test]
-fn a_distance_tells_the_scale_and_centers_that_know_another_one_are_told() {
-    let eyes = round(12);
+fn distances_set_the_scale_and_that_of_centers_is_reported() {
+    let eyes = circle(12);
     let (model, truth) = model(&eyes, inward(&eyes));
     let distances = [(0, 6, (eyes[0] - eyes[6]).norm()), (2, 3, (eyes[2] - eyes[3]).norm())];
     let (found, moved) = align(&model, &KnownPlaces { centers: &[], distances: &distances }).unwrap();
@@ -132,7 +136,7 @@ fn a_distance_tells_the_scale_and_centers_that_know_another_one_are_told() {
         let [a, b] = [a, b].map(|v| moved.poses[v].unwrap().center());
         assert!(((a - b).norm() / known - 1.0).abs() < 1e-9);
     }
-    // Upright, the first in the origin: the cameras were held level, so that up is exact.
+    // Upright, with the first view at the origin: the cameras were level, so that the vertical is exact.
     let first = moved.poses[0].unwrap();
     assert!(first.center().coords.norm() < 1e-9);
     for (pose, truth) in moved.poses.iter().flatten().zip(&truth) {
@@ -140,26 +144,26 @@ fn a_distance_tells_the_scale_and_centers_that_know_another_one_are_told() {
         assert!((up(pose) - up(truth)).norm() < 1e-6, "{pose:?}");
     }
     assert!((first.rotation * Vector3::y() - Vector3::z()).norm() < 1e-6, "{first:?}");
-    // With centers of which the scale is a twentieth larger: the distances' scale, and how much the other differs.
+    // Known centers with a scale that is 5 % larger: the scale is that of the distances, and the ratio is reported.
     let larger: Vec<_> = eyes.iter().map(|p| Some(Point3::from(1.05 * p.coords))).collect();
     let (both, _) = align(&model, &KnownPlaces { centers: &larger, distances: &distances }).unwrap();
     assert!((both.similarity.scale / found.similarity.scale - 1.0).abs() < 1e-9);
     assert!((both.centers.unwrap().scale_ratio.unwrap() - 1.05).abs() < 1e-6);
-    // Two tapes that do not agree.
+    // Two contradictory distances.
     let wrong = [distances[0], (2, 3, 1.1 * distances[1].2)];
     let error = align(&model, &KnownPlaces { centers: &[], distances: &wrong }).unwrap().0.distance_error.unwrap();
     assert!((0.04..0.06).contains(&error), "{error}");
 }
 
 #[test]
-fn what_does_not_fit_leaves_the_model_alone() {
-    let eyes = round(12);
+fn inconsistent_measurements_are_errors() {
+    let eyes = circle(12);
     let (model, _) = model(&eyes, inward(&eyes));
     let with = |centers: &[Option<Point3<f64>>]| align(&model, &KnownPlaces { centers, distances: &[] }).unwrap_err();
-    // Positions of something else.
+    // Random centers.
     let other: Vec<_> = (0..12).map(|i| Some(Point3::from(shake(i + 40, 30.0)))).collect();
     assert!(matches!(with(&other), ModelAlignError::Contradiction { of: 12, .. }), "{:?}", with(&other));
-    // One place, as of a receiver that lost the satellites.
+    // Coincident centers, as of a GPS receiver without a fix.
     assert_eq!(with(&[Some(eyes[0]); 12]), ModelAlignError::OnePlace);
     assert_eq!(with(&[Some(eyes[0]), None, Some(eyes[1])]), ModelAlignError::TooFew { got: 2, needed: 3 });
     assert_eq!(with(&[Some(Point3::new(f64::NAN, 0.0, 0.0)); 12]), ModelAlignError::NotFinite { index: 0 });
@@ -172,8 +176,8 @@ fn what_does_not_fit_leaves_the_model_alone() {
 }
 
 #[test]
-fn a_similarity_changes_no_picture() {
-    let eyes = round(6);
+fn a_similarity_changes_no_projection() {
+    let eyes = circle(6);
     let (mut model, truth) = model(&eyes, inward(&eyes));
     let before: Vec<_> = model.poses.iter().flatten().map(|p| p.transform(&model.points[0].position)).collect();
     let to = Similarity {
@@ -189,7 +193,7 @@ fn a_similarity_changes_no_picture() {
 }
 
 #[test]
-fn known_poses_give_the_frame_also_on_a_line() {
+fn known_poses_restore_the_frame_of_collinear_centers_too() {
     let eyes: Vec<_> = (0..6).map(|i| Point3::new(2.0 * i as f64, 0.0, 1.6)).collect();
     let (mut model, truth) = model(&eyes, |i| Vector3::new(0.2 * noise(i), 1.0, 0.0));
     let known: Vec<Option<Pose>> = truth.iter().copied().map(Some).collect();
@@ -197,7 +201,7 @@ fn known_poses_give_the_frame_also_on_a_line() {
         let mut moved = model.clone();
         moved.transform(&align_to_poses(&model, &known[..n]).unwrap());
         // Rounding of coordinates of ten.
-        let (off, degrees) = worst(&moved, &truth);
+        let (off, degrees) = max_errors(&moved, &truth);
         assert!(off < 1e-9 && degrees < 1e-6, "{n}: {off} {degrees}");
     }
     assert_eq!(align_to_poses(&model, &known[..1]), None);

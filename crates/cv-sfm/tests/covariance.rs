@@ -1,4 +1,4 @@
-//! Covariances against the errors of models whose truth is known.
+//! Covariances against the errors of models with ground truth.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -10,8 +10,9 @@ use cv_sfm::{
 };
 use cv_synth::{FeatureViews, FeatureViewsOptions};
 
-/// Brings a model to the true frame as the covariances count it: the first view's pose is true, and so is the coordinate of the translation in which the other one is farthest from it.
-fn anchor(model: &mut SfmModel, truth: &[Pose], [first, far]: [usize; 2]) {
+/// Transforms a model to the true frame in the gauge of the covariances: the pose of the first view is true, and so is
+/// the constant coordinate of the translation of the other view.
+fn anchor(model: &mut SfmModel, truth: &[Pose], [first, farthest]: [usize; 2]) {
     let pose = model.poses[first].unwrap();
     let rotation = truth[first].rotation.inverse() * pose.rotation;
     let move_to = |scale: f64| Similarity {
@@ -19,25 +20,25 @@ fn anchor(model: &mut SfmModel, truth: &[Pose], [first, far]: [usize; 2]) {
         rotation,
         translation: truth[first].center().coords - rotation * pose.center().coords * scale,
     };
-    let along = truth[far].rotation * (truth[far].center() - truth[first].center());
+    let along = truth[farthest].rotation * (truth[farthest].center() - truth[first].center());
     let k = along.iamax();
     // t = −R c is linear in the scale.
     let t = |scale: f64| {
         let mut moved = SfmModel { points: Vec::new(), ..model.clone() };
         moved.transform(&move_to(scale));
-        moved.poses[far].unwrap().translation[k]
+        moved.poses[farthest].unwrap().translation[k]
     };
     let (at_one, at_two) = (t(1.0), t(2.0));
-    let scale = 1.0 + (truth[far].translation[k] - at_one) / (at_two - at_one);
+    let scale = 1.0 + (truth[farthest].translation[k] - at_one) / (at_two - at_one);
     model.transform(&move_to(scale));
 }
 
 #[test]
-fn errors_are_as_large_as_said() {
+fn errors_agree_with_the_covariances() {
     let (mut centers, mut turns, mut points) = (Vec::new(), Vec::new(), Vec::new());
     for seed in 0..4 {
         let options =
-            FeatureViewsOptions { views: 60, points: 6000, wrong: 0.0, seed, ..FeatureViewsOptions::default() };
+            FeatureViewsOptions { views: 60, points: 6000, outlier_ratio: 0.0, seed, ..FeatureViewsOptions::default() };
         let truth = FeatureViews::new(&options);
         let keypoint = |p: &cv_core::Point2<f64>| Keypoint::new(p.x as f32, p.y as f32, 1.0);
         let keypoints: Vec<Vec<Keypoint>> =
@@ -59,19 +60,20 @@ fn errors_are_as_large_as_said() {
             knowledge: &knowledge,
             pairs: &pairs,
             geometry: &geometry,
-            alike: None,
+            feature_distance: None,
         };
         let known: Vec<Option<Pose>> = truth.poses.iter().copied().map(Some).collect();
         let found = reconstruct_views_from(&input, &known, &SfmOptions::default(), &Silent).unwrap();
         let mut model = found.models.into_iter().next().unwrap();
         let reference = model_covariance(&views, &knowledge, &model).unwrap().reference;
         anchor(&mut model, &truth.poses, reference);
-        let of = model_covariance(&views, &knowledge, &model).unwrap();
-        assert_eq!(of.reference, reference);
-        // Keypoints have 0.3 px in each coordinate. The estimate is by a robust loss: its residuals are some per cent larger than the least squares that the degrees of freedom are counted for.
-        assert!((0.29..0.35).contains(&of.noise), "{}", of.noise);
-        for (v, (pose, of)) in model.poses.iter().zip(&of.poses).enumerate() {
-            let (Some(pose), Some(of)) = (pose, of) else { continue };
+        let covariance = model_covariance(&views, &knowledge, &model).unwrap();
+        assert_eq!(covariance.reference, reference);
+        // Keypoints have a standard deviation of 0.3 px in each coordinate. The estimate is by a robust loss: its
+        // residuals are some per cent larger than those of least squares, which the degrees of freedom are for.
+        assert!((0.29..0.35).contains(&covariance.noise), "{}", covariance.noise);
+        for (v, (pose, covariance)) in model.poses.iter().zip(&covariance.poses).enumerate() {
+            let (Some(pose), Some(of)) = (pose, covariance) else { continue };
             if v == reference[0] {
                 assert!(of.center.norm() < 1e-12 && of.rotation.norm() < 1e-12, "{of:?}");
                 continue;
@@ -81,14 +83,15 @@ fn errors_are_as_large_as_said() {
             let turn = (pose.rotation * truth.poses[v].rotation.inverse()).scaled_axis();
             turns.push(turn.dot(&(of.rotation.try_inverse().unwrap() * turn)));
         }
-        for (point, of) in model.points.iter().zip(&of.points) {
+        for (point, of) in model.points.iter().zip(&covariance.points) {
             let o = point.observations[0];
             let off: Vector3<f64> =
-                point.position - truth.points[truth.shown[o.view as usize][o.keypoint as usize] as usize];
+                point.position - truth.points[truth.point_indices[o.view as usize][o.keypoint as usize] as usize];
             points.push(off.dot(&(of.unwrap().try_inverse().unwrap() * off)));
         }
     }
-    // The mean of χ² with three degrees of freedom is 3. Cameras of one walk err together: four walks are some twenty numbers and not two hundred, whose mean is within a half of it.
+    // The mean of χ² with three degrees of freedom is 3. Errors of one walk are correlated: four walks are some twenty
+    // independent values, whose mean is within a half of it.
     for (name, list) in [("centers", centers), ("turns", turns), ("points", points)] {
         let mean = list.iter().sum::<f64>() / list.len() as f64;
         assert!((2.0..4.5).contains(&mean), "{name}: {mean}");

@@ -1,4 +1,4 @@
-//! Views of generated scenes, against the cameras and points they were made of.
+//! Reconstruction of synthetic views, against the true cameras and points.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -10,8 +10,8 @@ use cv_sfm::{
 };
 use cv_synth::{FeatureViews, FeatureViewsOptions};
 
-/// Views, verified pairs and all that an input refers to.
-struct Given {
+/// Views, verified pairs and everything else of an input.
+struct Dataset {
     cameras: Vec<Camera>,
     knowledge: Vec<CameraKnowledge>,
     keypoints: Vec<Vec<Keypoint>>,
@@ -19,22 +19,22 @@ struct Given {
     geometry: Vec<ViewPairModel>,
 }
 
-impl Given {
-    /// All pairs of generated views that share `least` points, verified from their matches.
-    fn new(views: &FeatureViews, knowledge: CameraKnowledge, camera: Camera, least: usize) -> Self {
+impl Dataset {
+    /// Verifies all pairs of synthetic views with at least `min_shared` common points.
+    fn new(views: &FeatureViews, knowledge: CameraKnowledge, camera: Camera, min_shared: usize) -> Self {
         let keypoint = |p: &cv_core::Point2<f64>| Keypoint::new(p.x as f32, p.y as f32, 1.0);
         let keypoints = views.keypoints.iter().map(|view| view.iter().map(keypoint).collect()).collect();
-        let mut given = Self {
+        let mut dataset = Self {
             cameras: vec![camera],
             knowledge: vec![knowledge],
             keypoints,
             pairs: Vec::new(),
             geometry: Vec::new(),
         };
-        for (a, b, _) in views.pairs(least) {
-            given.verify(a, b, &views.matches(a, b));
+        for (a, b, _) in views.pairs(min_shared) {
+            dataset.verify(a, b, &views.matches(a, b));
         }
-        given
+        dataset
     }
 
     fn verify(&mut self, a: usize, b: usize, matches: &[DMatch]) {
@@ -52,11 +52,15 @@ impl Given {
         self.solve_with(None)
     }
 
-    fn solve_with(&self, alike: Option<&dyn FeatureDistance>) -> Result<SfmOutcome, SfmError> {
-        self.solve_by(Solver::Auto, alike)
+    fn solve_with(&self, feature_distance: Option<&dyn FeatureDistance>) -> Result<SfmOutcome, SfmError> {
+        self.solve_with_solver(Solver::Auto, feature_distance)
     }
 
-    fn solve_by(&self, solver: Solver, alike: Option<&dyn FeatureDistance>) -> Result<SfmOutcome, SfmError> {
+    fn solve_with_solver(
+        &self,
+        solver: Solver,
+        feature_distance: Option<&dyn FeatureDistance>,
+    ) -> Result<SfmOutcome, SfmError> {
         let views: Vec<SfmView<'_>> = self.keypoints.iter().map(|k| SfmView { camera: 0, keypoints: k }).collect();
         let input = SfmInput {
             views: &views,
@@ -64,13 +68,14 @@ impl Given {
             knowledge: &self.knowledge,
             pairs: &self.pairs,
             geometry: &self.geometry,
-            alike,
+            feature_distance,
         };
         reconstruct_views(&input, &SfmOptions { solver, ..SfmOptions::default() }, &Silent)
     }
 }
 
-/// Largest distance of a center from the truth, as a share of the extent of the true centers, and largest angle of a rotation, in degrees, after a similarity.
+/// Returns the largest error of a center, as a ratio of the extent of the true centers, and the largest angle of a
+/// rotation error in degrees, after a similarity alignment.
 fn errors(found: &[Option<Pose>], truth: &[Pose]) -> (f64, f64) {
     let pairs: Vec<(Pose, Pose)> = found.iter().zip(truth).filter_map(|(f, t)| Some(((*f)?, *t))).collect();
     let centers =
@@ -87,36 +92,36 @@ fn errors(found: &[Option<Pose>], truth: &[Pose]) -> (f64, f64) {
     (off / extent, pairs.iter().map(turn).fold(0.0, f64::max))
 }
 
-/// Largest error of a center as a share of the extent: what is asked of many views.
-const CENTER: f64 = 1e-3;
-/// Largest error of a rotation in degrees: keypoints have a noise of 0.3 px, which leaves 0.015 degrees (adjusting on until nothing moves any more gives the same), and the largest of many is three
-/// or four times that.
-const DEGREES: f64 = 0.06;
+/// Largest error of a center as a ratio of the extent.
+const MAX_CENTER_ERROR: f64 = 1e-3;
+/// Largest error of a rotation in degrees: the keypoint noise of 0.3 px leaves 0.015 degrees (a fully converged
+/// adjustment gives the same), and the maximum over many views is three or four times that.
+const MAX_ROTATION_ERROR: f64 = 0.06;
 
 fn walk(views: usize) -> FeatureViews {
     FeatureViews::new(&FeatureViewsOptions { views, points: 200 * views, ..FeatureViewsOptions::default() })
 }
 
 #[test]
-fn a_walk_around_a_street_closes() {
+fn a_closed_walk_is_reconstructed_accurately() {
     for (views, solver) in [(30, Solver::Global), (30, Solver::Incremental), (60, Solver::Auto)] {
         let truth = walk(views);
-        let given = Given::new(&truth, CameraKnowledge::Known, truth.camera, 30);
-        let found = given.solve_by(solver, None).unwrap();
-        // Known cameras are placed at once.
+        let dataset = Dataset::new(&truth, CameraKnowledge::Known, truth.camera, 30);
+        let found = dataset.solve_with_solver(solver, None).unwrap();
+        // Calibrated cameras use the global solver.
         assert_eq!(found.solvers, [if solver == Solver::Incremental { solver } else { Solver::Global }]);
         assert!(found.refused.is_empty(), "{:?}", found.refused);
         assert!(found.models.len() == 1 && found.models[0].registered() == views, "{:?}", found.views);
         let (center, degrees) = errors(&found.models[0].poses, &truth.poses);
-        assert!(center < CENTER && degrees < DEGREES, "{views}: {center} {degrees}");
-        // The noise is 0.3 px in each coordinate, the mean length of which is 0.376; the fit takes some of it up.
+        assert!(center < MAX_CENTER_ERROR && degrees < MAX_ROTATION_ERROR, "{views}: {center} {degrees}");
+        // The noise is 0.3 px in each coordinate, with a mean length of 0.376; the fit absorbs some of it.
         let error = found.models[0].mean_reprojection_error();
         assert!((0.2..0.4).contains(&error), "{error}");
     }
 }
 
 #[test]
-fn focal_length_and_distortion_are_found() {
+fn focal_length_and_distortion_are_estimated() {
     let truth = walk(40);
     let start = |focal: f64| Camera {
         distortion: cv_core::Distortion::radial(0.0, 0.0),
@@ -127,12 +132,12 @@ fn focal_length_and_distortion_are_found() {
         (CameraKnowledge::Focal { focal: wrong, deviation: 0.03 }, wrong),
         (CameraKnowledge::Unknown, 1.2 * truth.camera.width as f64),
     ] {
-        let given = Given::new(&truth, knowledge, start(focal), 30);
+        let dataset = Dataset::new(&truth, knowledge, start(focal), 30);
         for solver in [Solver::Incremental, Solver::Global] {
-            let found = given.solve_by(solver, None).unwrap();
+            let found = dataset.solve_with_solver(solver, None).unwrap();
             assert_eq!(found.models[0].registered(), 40, "{:?}", found.views);
             let camera = &found.models[0].cameras[0];
-            // The walk turns by 360 degrees, which fixes the focal length far better than a thousandth.
+            // The walk turns by 360 degrees, which determines the focal length far better than to a thousandth.
             assert!((camera.fx / truth.camera.fx - 1.0).abs() < 1e-3, "{} of {}", camera.fx, truth.camera.fx);
             assert!(camera.distortion.parameters().iter().all(|k| k.abs() < 0.01), "{:?}", camera.distortion);
         }
@@ -140,54 +145,55 @@ fn focal_length_and_distortion_are_found() {
 }
 
 #[test]
-fn the_same_at_any_number_of_threads() {
+fn the_result_does_not_depend_on_the_number_of_threads() {
     let truth = walk(30);
-    let given = Given::new(&truth, CameraKnowledge::Known, truth.camera, 30);
+    let dataset = Dataset::new(&truth, CameraKnowledge::Known, truth.camera, 30);
     let run = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| given.solve().unwrap())
+        pool.install(|| dataset.solve().unwrap())
     };
     assert_eq!(run(1), run(3));
 }
 
-/// Features are alike where they show one point.
-struct Shown<'v>(&'v FeatureViews);
+/// Descriptors match if they are of the same point.
+struct TrueDistance<'v>(&'v FeatureViews);
 
-impl FeatureDistance for Shown<'_> {
+impl FeatureDistance for TrueDistance<'_> {
     fn distance(&self, a: Observation, b: Observation) -> f32 {
-        let [one, two] = [a, b].map(|o| self.0.shown[o.view as usize][o.keypoint as usize]);
+        let [one, two] = [a, b].map(|o| self.0.point_indices[o.view as usize][o.keypoint as usize]);
         if one == two { 0.1 } else { 2.0 }
     }
 }
 
 #[test]
-fn points_are_found_where_matching_missed_them() {
+fn completion_adds_observations_that_matching_missed() {
     let truth = walk(30);
-    let mut given = Given::new(&truth, CameraKnowledge::Known, truth.camera, 30);
-    // Of every pair one match in four.
-    given.pairs.iter_mut().for_each(|p| p.matches = p.matches.iter().step_by(4).copied().collect());
-    let (plain, completed) = (given.solve().unwrap(), given.solve_with(Some(&Shown(&truth))).unwrap());
+    let mut dataset = Dataset::new(&truth, CameraKnowledge::Known, truth.camera, 30);
+    // One match in four of each pair.
+    dataset.pairs.iter_mut().for_each(|p| p.matches = p.matches.iter().step_by(4).copied().collect());
+    let (plain, completed) = (dataset.solve().unwrap(), dataset.solve_with(Some(&TrueDistance(&truth))).unwrap());
     let (before, after) = (plain.models[0].mean_track_length(), completed.models[0].mean_track_length());
     assert!(after > 1.05 * before, "{before} {after}");
-    let point = |o: &Observation| truth.shown[o.view as usize][o.keypoint as usize];
-    let right = completed.models[0]
+    let point = |o: &Observation| truth.point_indices[o.view as usize][o.keypoint as usize];
+    let correct = completed.models[0]
         .points
         .iter()
         .filter(|p| p.observations.iter().all(|o| point(o) == point(&p.observations[0])));
-    let share = right.count() as f64 / completed.models[0].points.len() as f64;
-    // A tenth of the matches was wrong; those within the threshold of their epipolar lines and of a point are a few in a hundred of them.
-    assert!(share > 0.97, "{share}");
+    let fraction = correct.count() as f64 / completed.models[0].points.len() as f64;
+    // A tenth of the matches was wrong; a few per cent of them are within the thresholds of the epipolar line and of a
+    // point.
+    assert!(fraction > 0.97, "{fraction}");
 }
 
 #[test]
-fn two_places_are_two_models() {
+fn disconnected_scenes_are_separate_models() {
     let (one, two) = (walk(30), walk(30));
-    let mut given = Given::new(&one, CameraKnowledge::Known, one.camera, 30);
-    let other = Given::new(&two, CameraKnowledge::Known, two.camera, 30);
-    given.keypoints.extend(other.keypoints);
-    given.geometry.extend(other.geometry);
-    given.pairs.extend(other.pairs.into_iter().map(|p| PairMatches { a: p.a + 30, b: p.b + 30, ..p }));
-    let found = given.solve().unwrap();
+    let mut dataset = Dataset::new(&one, CameraKnowledge::Known, one.camera, 30);
+    let other = Dataset::new(&two, CameraKnowledge::Known, two.camera, 30);
+    dataset.keypoints.extend(other.keypoints);
+    dataset.geometry.extend(other.geometry);
+    dataset.pairs.extend(other.pairs.into_iter().map(|p| PairMatches { a: p.a + 30, b: p.b + 30, ..p }));
+    let found = dataset.solve().unwrap();
     assert_eq!(found.models.iter().map(cv_sfm::SfmModel::registered).collect::<Vec<_>>(), [30, 30]);
     for (v, outcome) in found.views.iter().enumerate() {
         let model = if found.models[0].poses[v].is_some() { 0 } else { 1 };
@@ -197,10 +203,10 @@ fn two_places_are_two_models() {
 }
 
 #[test]
-fn a_camera_that_only_turns_gives_no_model() {
+fn a_rotating_camera_gives_no_model() {
     let truth = walk(12);
     let camera = truth.camera;
-    // Points far around, seen from one place.
+    // Distant points, viewed from one center.
     let pose = |i: usize| {
         Pose::new(cv_core::Rotation3::new(cv_core::Vector3::y() * 0.1 * i as f64), cv_core::Vector3::zeros())
     };
@@ -218,7 +224,7 @@ fn a_camera_that_only_turns_gives_no_model() {
             }));
         }
     }
-    let mut given = Given {
+    let mut dataset = Dataset {
         cameras: vec![camera],
         knowledge: vec![CameraKnowledge::Known],
         keypoints,
@@ -229,23 +235,23 @@ fn a_camera_that_only_turns_gives_no_model() {
         let both = of_point[a].iter().zip(&of_point[b]).filter_map(|(x, y)| Some(((*x)?, (*y)?)));
         let matches: Vec<DMatch> =
             both.map(|(query, train)| DMatch { query, train, distance: 0.1, ratio: 0.5 }).collect();
-        given.verify(a, b, &matches);
+        dataset.verify(a, b, &matches);
     }
-    assert!(matches!(given.solve(), Err(SfmError::NoInitialPair { .. })));
+    assert!(matches!(dataset.solve(), Err(SfmError::NoInitialPair { .. })));
 }
 
 #[test]
-fn what_is_not_there_is_refused() {
+fn missing_items_are_errors() {
     let truth = walk(12);
-    let given = Given::new(&truth, CameraKnowledge::Known, truth.camera, 30);
-    let views: Vec<SfmView<'_>> = given.keypoints.iter().map(|k| SfmView { camera: 0, keypoints: k }).collect();
+    let dataset = Dataset::new(&truth, CameraKnowledge::Known, truth.camera, 30);
+    let views: Vec<SfmView<'_>> = dataset.keypoints.iter().map(|k| SfmView { camera: 0, keypoints: k }).collect();
     let input = SfmInput {
         views: &views,
-        cameras: &given.cameras,
-        knowledge: &given.knowledge,
-        pairs: &given.pairs,
-        geometry: &given.geometry,
-        alike: None,
+        cameras: &dataset.cameras,
+        knowledge: &dataset.knowledge,
+        pairs: &dataset.pairs,
+        geometry: &dataset.geometry,
+        feature_distance: None,
     };
     let refuse = |input: &SfmInput<'_>, options: &SfmOptions| reconstruct_views(input, options, &Silent).unwrap_err();
     let usual = SfmOptions::default();
@@ -258,17 +264,18 @@ fn what_is_not_there_is_refused() {
     assert!(matches!(refuse(&input, &bad), SfmError::Option(_)));
 }
 
-/// The largest set that is asked for: two minutes and two gigabytes at most. By hand: `cargo test --release -p cv-sfm --test generated -- --ignored --nocapture`.
+/// A large dataset: two minutes and two gigabytes at most. By hand: `cargo test --release -p cv-sfm --test generated --
+/// --ignored --nocapture`.
 #[test]
 #[ignore = "takes a minute"]
 fn a_thousand_views() {
     let truth =
         FeatureViews::new(&FeatureViewsOptions { views: 1000, points: 200_000, ..FeatureViewsOptions::default() });
-    let given = Given::new(&truth, CameraKnowledge::Known, truth.camera, 30);
+    let dataset = Dataset::new(&truth, CameraKnowledge::Known, truth.camera, 30);
     let start = std::time::Instant::now();
-    let found = given.solve().unwrap();
+    let found = dataset.solve().unwrap();
     println!("{} observations in {:.1} s", found.models[0].observations(), start.elapsed().as_secs_f64());
     assert_eq!(found.models[0].registered(), 1000);
     let (center, degrees) = errors(&found.models[0].poses, &truth.poses);
-    assert!(center < CENTER && degrees < DEGREES, "{center} {degrees}");
+    assert!(center < MAX_CENTER_ERROR && degrees < MAX_ROTATION_ERROR, "{center} {degrees}");
 }

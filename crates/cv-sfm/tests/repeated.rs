@@ -1,4 +1,4 @@
-//! Streets of identical houses: what looks alike must not be taken for the same.
+//! Streets of identical houses: repeated structure must not be merged.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -11,63 +11,68 @@ use cv_sfm::{
 use cv_synth::{FeatureViews, FeatureViewsOptions};
 use rayon::prelude::*;
 
-/// A walk of 50 photographs along a street of two to eight identical houses, a quarter of each being its own.
+/// A walk of 50 views along a street of two to eight identical houses; a quarter of the points of each are its own.
 fn street(seed: u64) -> FeatureViews {
-    FeatureViews::new(&FeatureViewsOptions { houses: houses(seed), own: 0.25, seed, ..FeatureViewsOptions::default() })
+    FeatureViews::new(&FeatureViewsOptions {
+        houses: houses(seed),
+        unique_ratio: 0.25,
+        seed,
+        ..FeatureViewsOptions::default()
+    })
 }
 
 fn houses(seed: u64) -> usize {
     2 + seed as usize % 7
 }
 
-struct Given {
+struct Dataset {
     houses: usize,
     truth: FeatureViews,
     keypoints: Vec<Vec<Keypoint>>,
     pairs: Vec<PairMatches>,
     geometry: Vec<ViewPairModel>,
-    /// Of each pair: whether most of its matches are of the same points.
-    right: Vec<bool>,
+    /// By pair: whether most of its matches are correct.
+    is_correct: Vec<bool>,
 }
 
-/// The geometry of a pair by its tentative matches, and those that agree.
-type Verify = fn(&Given, usize, usize, &[DMatch]) -> Option<(ViewPairModel, Vec<usize>)>;
+/// Verifies a pair: from tentative matches to the geometry and the inliers.
+type Verify = fn(&Dataset, usize, usize, &[DMatch]) -> Option<(ViewPairModel, Vec<usize>)>;
 
-impl Given {
+impl Dataset {
     fn new(seed: u64, verify: Verify) -> Self {
         let truth = street(seed);
         let keypoint = |p: &cv_core::Point2<f64>| Keypoint::new(p.x as f32, p.y as f32, 1.0);
         let keypoints = truth.keypoints.iter().map(|view| view.iter().map(keypoint).collect()).collect();
-        let (pairs, geometry, right) = Default::default();
-        let mut given = Self { houses: houses(seed), truth, keypoints, pairs, geometry, right };
-        for (a, b, _) in given.truth.pairs(30) {
-            let matches = given.truth.matches(a, b);
-            if let Some((model, inliers)) = verify(&given, a, b, &matches) {
+        let (pairs, geometry, is_correct) = Default::default();
+        let mut dataset = Self { houses: houses(seed), truth, keypoints, pairs, geometry, is_correct };
+        for (a, b, _) in dataset.truth.pairs(30) {
+            let matches = dataset.truth.matches(a, b);
+            if let Some((model, inliers)) = verify(&dataset, a, b, &matches) {
                 let matches: Vec<DMatch> = inliers.iter().map(|i| matches[*i]).collect();
-                let [one, two] = [a, b].map(|v| &given.truth.shown[v]);
+                let [one, two] = [a, b].map(|v| &dataset.truth.point_indices[v]);
                 let same = matches.iter().filter(|m| one[m.query as usize] == two[m.train as usize]).count();
-                given.right.push(2 * same > matches.len());
-                given.pairs.push(PairMatches::new(a, b, matches));
-                given.geometry.push(model);
+                dataset.is_correct.push(2 * same > matches.len());
+                dataset.pairs.push(PairMatches::new(a, b, matches));
+                dataset.geometry.push(model);
             }
         }
-        given
+        dataset
     }
 
-    /// As it is found. One match in ten is wrong: a few samples are enough.
+    /// Verifies a pair by RANSAC. One match in ten is wrong: a few samples are enough.
     fn verified(&self, a: usize, b: usize, matches: &[DMatch]) -> Option<(ViewPairModel, Vec<usize>)> {
-        let options = ViewPairOptions { min_share: 0.6, ..ViewPairOptions::default() };
+        let options = ViewPairOptions { min_inlier_ratio: 0.6, ..ViewPairOptions::default() };
         let known = (&self.truth.camera, &CameraKnowledge::Known);
         let both = [&self.keypoints[a][..], &self.keypoints[b]];
         let found = verify_view_pair([known; 2], both, matches, &options, &Silent).ok()?;
         Some((found.model, found.inliers))
     }
 
-    /// The true one, as if the house that most matches lead to were the same: in a thirtieth of the time.
+    /// Computes the geometry from the truth, for the house that most matches lead to; in a thirtieth of the time.
     fn ideal(&self, a: usize, b: usize, matches: &[DMatch]) -> Option<(ViewPairModel, Vec<usize>)> {
         let turn = std::f64::consts::TAU / self.houses as f64;
         let azimuth = |view: usize, keypoint: u32| {
-            let p = self.truth.points[self.truth.shown[view][keypoint as usize] as usize];
+            let p = self.truth.points[self.truth.point_indices[view][keypoint as usize] as usize];
             p.x.atan2(p.z)
         };
         let houses_on = |m: &DMatch| {
@@ -102,14 +107,15 @@ impl Given {
             knowledge: &[CameraKnowledge::Known],
             pairs: &self.pairs,
             geometry: &self.geometry,
-            alike: None,
+            feature_distance: None,
         };
         reconstruct_views(&input, &SfmOptions { solver, ..SfmOptions::default() }, &Silent).unwrap()
     }
 }
 
-/// The largest angle between a relative rotation of two views of a model and the true one, in degrees.
-fn worst_turn(found: &[Option<Pose>], truth: &[Pose]) -> f64 {
+/// Returns the largest angle between an estimated relative rotation of two views of a model and the true one, in
+/// degrees.
+fn max_rotation_error(found: &[Option<Pose>], truth: &[Pose]) -> f64 {
     let pairs: Vec<(Pose, Pose)> = found.iter().zip(truth).filter_map(|(f, t)| Some(((*f)?, *t))).collect();
     let turn = |x: &(Pose, Pose), y: &(Pose, Pose)| {
         let [f, t] = [Pose::relative(&x.0, &y.0), Pose::relative(&x.1, &y.1)];
@@ -118,69 +124,76 @@ fn worst_turn(found: &[Option<Pose>], truth: &[Pose]) -> f64 {
     pairs.iter().flat_map(|x| pairs.iter().map(move |y| turn(x, y))).fold(0.0, f64::max)
 }
 
-/// Seeds of twenty streets.
+/// Seeds of the streets.
 const STREETS: std::ops::Range<u64> = 0..20;
 
 #[test]
-fn twenty_streets_of_identical_houses_are_not_folded() {
-    let rows: Vec<(u64, Given, SfmOutcome)> = STREETS
+fn twenty_streets_of_identical_houses_are_not_collapsed() {
+    let rows: Vec<(u64, Dataset, SfmOutcome)> = STREETS
         .into_par_iter()
         .map(|seed| {
-            let given = Given::new(seed, if seed % 5 == 0 { Given::verified } else { Given::ideal });
-            // What is refused is the same for both.
+            let dataset = Dataset::new(seed, if seed % 5 == 0 { Dataset::verified } else { Dataset::ideal });
+            // The rejected pairs are the same for both solvers.
             let solver = if seed % 5 == 0 { Solver::Incremental } else { Solver::Global };
-            let found = given.solve(solver);
-            (seed, given, found)
+            let found = dataset.solve(solver);
+            (seed, dataset, found)
         })
         .collect();
     let (mut registered, mut views) = (0, 0);
-    for (seed, given, found) in &rows {
-        // As many pairs and more look right and are wrong: by the turn from one house to another, 45 degrees and more.
-        let wrong = given.right.iter().filter(|r| !**r).count();
-        assert!(2 * wrong > given.right.iter().filter(|r| **r).count(), "street {seed}: {wrong}");
+    for (seed, dataset, found) in &rows {
+        // At least half as many pairs are wrong as correct: by the rotation from one house to another, 45 degrees and
+        // more.
+        let wrong = dataset.is_correct.iter().filter(|r| !**r).count();
+        assert!(2 * wrong > dataset.is_correct.iter().filter(|r| **r).count(), "street {seed}: {wrong}");
         for model in &found.models {
-            // A tenth of a degree: rotations are right to 0.06 at the most in `generated.rs`, those of two views to each other to the sum.
-            let worst = worst_turn(&model.poses, &given.truth.poses);
+            // A tenth of a degree: the errors of rotations are up to 0.06 in `generated.rs`, those of relative
+            // rotations twice that.
+            let worst = max_rotation_error(&model.poses, &dataset.truth.poses);
             assert!(worst < 0.12, "street {seed}: two views are turned by {worst} degrees against each other");
         }
         registered += found.models.first().map_or(0, |m| m.registered());
-        views += given.keypoints.len();
-        let right = found.refused.iter().filter(|r| given.right[r.pair]).count();
-        assert!(100 * right <= given.right.len(), "street {seed}: {right} right pairs are refused");
+        views += dataset.keypoints.len();
+        let wrongly_rejected = found.refused.iter().filter(|r| dataset.is_correct[r.pair]).count();
+        assert!(
+            100 * wrongly_rejected <= dataset.is_correct.len(),
+            "street {seed}: {wrongly_rejected} correct pairs are rejected"
+        );
     }
-    // Most are in the first model.
+    // Most views are in the first model.
     assert!(10 * registered >= 9 * views, "{registered} of {views}");
 }
 
 #[test]
-fn what_is_refused_is_told_with_its_reason() {
-    let given = Given::new(3, Given::ideal);
-    let found = given.solve(Solver::Auto);
+fn rejected_pairs_have_a_reason() {
+    let dataset = Dataset::new(3, Dataset::ideal);
+    let found = dataset.solve(Solver::Auto);
     let of = |is: fn(&PairRefusal) -> bool| found.refused.iter().filter(|r| is(&r.reason)).count();
-    let near = of(|r| matches!(r, PairRefusal::Repeated { found, expected } if found < expected));
-    let wide = of(|r| matches!(r, PairRefusal::RepeatedLoops { against, of } if against <= of));
+    let by_features = of(|r| matches!(r, PairRefusal::Repeated { found, expected } if found < expected));
+    let by_triplets = of(|r| matches!(r, PairRefusal::RepeatedLoops { against, of } if against <= of));
     assert!(
-        near > 0 && wide > 0 && near + wide + of(|r| matches!(r, PairRefusal::Triplets { .. })) == found.refused.len()
+        by_features > 0
+            && by_triplets > 0
+            && by_features + by_triplets + of(|r| matches!(r, PairRefusal::Triplets { .. })) == found.refused.len()
     );
-    // The truth of what the houses have in common says the same.
-    assert!(found.refused.iter().filter(|r| !given.right[r.pair]).count() * 100 >= 99 * found.refused.len());
+    // The true matches confirm the rejections.
+    assert!(found.refused.iter().filter(|r| !dataset.is_correct[r.pair]).count() * 100 >= 99 * found.refused.len());
 }
 
 #[test]
-fn a_walk_past_a_part_of_the_street_does_not_need_to_close() {
+fn an_open_walk_is_reconstructed_too() {
     let mut truth = street(4);
     let views = 30;
     truth.poses.truncate(views);
     truth.keypoints.truncate(views);
-    truth.shown.truncate(views);
-    let mut given = Given::new(4, Given::ideal);
-    given.keypoints.truncate(views);
-    let kept: Vec<usize> = (0..given.pairs.len()).filter(|i| given.pairs[*i].b < views).collect();
-    given.pairs = kept.iter().map(|i| given.pairs[*i].clone()).collect();
-    given.geometry = kept.iter().map(|i| given.geometry[*i]).collect();
-    given.right = kept.iter().map(|i| given.right[*i]).collect();
-    assert!(given.right.iter().filter(|r| !**r).count() > given.right.len() / 2);
-    let found = given.solve(Solver::Auto);
+    truth.point_indices.truncate(views);
+    let mut dataset = Dataset::new(4, Dataset::ideal);
+    dataset.keypoints.truncate(views);
+    let kept: Vec<usize> = (0..dataset.pairs.len()).filter(|i| dataset.pairs[*i].b < views).collect();
+    dataset.pairs = kept.iter().map(|i| dataset.pairs[*i].clone()).collect();
+    dataset.geometry = kept.iter().map(|i| dataset.geometry[*i]).collect();
+    dataset.is_correct = kept.iter().map(|i| dataset.is_correct[*i]).collect();
+    assert!(dataset.is_correct.iter().filter(|r| !**r).count() > dataset.is_correct.len() / 2);
+    let found = dataset.solve(Solver::Auto);
     assert!(found.models[0].registered() * 10 >= views * 9, "{:?}", found.views);
-    assert!(found.models.iter().all(|m| worst_turn(&m.poses, &truth.poses) < 0.12));
+    assert!(found.models.iter().all(|m| max_rotation_error(&m.poses, &truth.poses) < 0.12));
 }

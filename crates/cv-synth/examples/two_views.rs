@@ -1,4 +1,4 @@
-//! Two pictures of a room from two places, and what is true about them: the depth of a pixel and where the other camera sees it.
+//! Two views of a room and their ground truth: the depth of a pixel, and its correspondence in the other view.
 use cv_core::{Camera, Point2};
 use cv_synth::{RenderOptions, two_view};
 
@@ -11,8 +11,8 @@ pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
     let point = scene.point_at(&camera, &views.a.pose, pixel).ok_or("the ray leaves the room")?;
     println!("{:.3} m away", views.a.depth.at(80, 70)[0]);
     match scene.pixel_of(&camera, &views.b.pose, &point) {
-        Some(other) => println!("{pixel} of the first picture is {other} of the second"),
-        None => println!("the second picture does not show it"),
+        Some(other) => println!("{pixel} of the first image is {other} of the second"),
+        None => println!("it is not visible in the second image"),
     }
     Ok(())
 }

@@ -1,9 +1,9 @@
-//! Files as accidents leave them: for tests that no input does harm.
+//! Corrupted files, for robustness tests.
 
 use crate::rng::Rng;
 
-/// A damaged copy of a file's bytes: flipped, overwritten, cut, inserted, doubled or left-out bytes, a header that lies, or a number of a text that is
-/// none. One to three of those, by the seed; never the bytes themselves.
+/// Returns a damaged copy of a file: bits flipped, bytes overwritten, truncated, inserted, duplicated or removed, a
+/// header field or a number in a text replaced. One to three of these, depending on the seed; never the original bytes.
 pub fn corrupt(bytes: &[u8], seed: u64) -> Vec<u8> {
     let mut rng = Rng::new(seed, 0xC0);
     let mut damaged = bytes.to_vec();
@@ -16,20 +16,21 @@ pub fn corrupt(bytes: &[u8], seed: u64) -> Vec<u8> {
     damaged
 }
 
-/// From 0 to below `end`; 0 where that is none.
+/// Returns a random number below `end`; 0 for `end` = 0.
 fn below(rng: &mut Rng, end: usize) -> usize {
     (rng.next() % end.max(1) as u64) as usize
 }
 
+/// Applies one kind of damage.
 fn damage(bytes: &mut Vec<u8>, rng: &mut Rng) {
     let n = bytes.len();
-    // As often where formats say what follows as anywhere.
-    let reach = if below(rng, 2) == 0 { n.min(96) } else { n };
-    let at = below(rng, reach);
+    // Half of the time in the header.
+    let range = if below(rng, 2) == 0 { n.min(96) } else { n };
+    let at = below(rng, range);
     let length = (1 + below(rng, 64)).min(n - at);
     match below(rng, 10) {
         0..=2 if n > 0 => (0..=below(rng, 8)).for_each(|_| {
-            let at = below(rng, reach);
+            let at = below(rng, range);
             bytes[at] ^= 1 << below(rng, 8);
         }),
         3 if n > 0 => {
@@ -54,12 +55,12 @@ fn damage(bytes: &mut Vec<u8>, rng: &mut Rng) {
             let word = if below(rng, 2) == 0 { value.to_be_bytes() } else { value.to_le_bytes() };
             bytes[at..at + 4].copy_from_slice(&word);
         }
-        _ => number(bytes, rng),
+        _ => replace_number(bytes, rng),
     }
 }
 
-/// Puts something else in the place of a number in a text.
-fn number(bytes: &mut Vec<u8>, rng: &mut Rng) {
+/// Replaces a number in a text by something else.
+fn replace_number(bytes: &mut Vec<u8>, rng: &mut Rng) {
     let digits = |b: &u8| b.is_ascii_digit() || matches!(b, b'.' | b'-' | b'+');
     let starts: Vec<usize> =
         (0..bytes.len()).filter(|&i| digits(&bytes[i]) && (i == 0 || !digits(&bytes[i - 1]))).collect();

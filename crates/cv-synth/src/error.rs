@@ -1,22 +1,22 @@
-//! Why a picture could not be made.
+//! Why an image could not be rendered.
 
 use cv_core::CameraError;
 
-/// Why a picture could not be made.
+/// Why an image could not be rendered.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum SynthError {
-    /// The camera's parameters make no sense.
+    /// The camera is not valid.
     #[error(transparent)]
     Camera(#[from] CameraError),
-    /// The picture has no pixels, or more than `u32` can count.
-    #[error("cannot render a picture of {width}×{height} pixels")]
+    /// The image has no pixels, or more than `u32` can count.
+    #[error("cannot render an image of {width}×{height} pixels")]
     Size {
         /// Width in pixels.
         width: usize,
         /// Height in pixels.
         height: usize,
     },
-    /// A pose has an entry that is NaN or infinite.
+    /// The pose is not finite.
     #[error("the pose is not finite")]
     Pose,
     /// A rectified pair needs a camera without distortion and a positive baseline.

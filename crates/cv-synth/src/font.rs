@@ -1,4 +1,4 @@
-//! A stroke font of capitals: letters as polylines, so that printed matter stays sharp at any size.
+//! A stroke font of capitals as polylines, sharp at any scale.
 
 use crate::noise::{edge, floor};
 use crate::rng::hash2;
@@ -33,7 +33,7 @@ const GLYPHS: [&[&[(u8, u8)]]; 26] = [
     &[&[(0, 0), (4, 0), (0, 6), (4, 6)]],
 ];
 
-/// What is printed on posters and books.
+/// Words printed on posters and books.
 const WORDS: [&str; 64] = [
     "THE",
     "OF",
@@ -101,7 +101,7 @@ const WORDS: [&str; 64] = [
     "AUTUMN",
 ];
 
-/// Distance to the strokes of a glyph, in grid units.
+/// Returns the distance to the strokes of a glyph, in grid units.
 fn distance(glyph: usize, x: f32, y: f32) -> f32 {
     let mut best = f32::INFINITY;
     for stroke in GLYPHS[glyph % GLYPHS.len()] {
@@ -117,10 +117,10 @@ fn distance(glyph: usize, x: f32, y: f32) -> f32 {
     best.sqrt()
 }
 
-/// Ink (0 to 1) at `(u, v)` meters into a block of running text with capitals `size` meters high.
+/// Returns the ink coverage (0 to 1) at `(u, v)` meters in a block of running text with capitals `size` meters high.
 ///
-/// Lines are `1.8 × size` apart and end raggedly before `line` meters. `weight` is the stroke's half width on the
-/// 4×6 grid: 0.4 is a regular face, 0.7 a bold one.
+/// Lines are `1.8 × size` apart and end raggedly before `line` meters. `weight` is half the stroke width on the 4×6
+/// grid: 0.4 is regular, 0.7 bold.
 pub(crate) fn text(u: f32, v: f32, size: f32, line: f32, weight: f32, seed: u32, width: f32) -> f32 {
     let unit_length = size / 6.0;
     let pitch = 5.6 * unit_length;
@@ -128,7 +128,7 @@ pub(crate) fn text(u: f32, v: f32, size: f32, line: f32, weight: f32, seed: u32,
     if u < 0.0 || v < 0.0 || u > line {
         return 0.0;
     }
-    // The word at this column; a line ends before the first word that does not fit, but has one at least.
+    // The word at this column; a line ends before the first word that does not fit, but has at least one.
     let (mut start, mut count) = (0, 0);
     let letter = loop {
         let word = WORDS[hash2(count, row, seed) as usize % WORDS.len()].as_bytes();
@@ -144,7 +144,7 @@ pub(crate) fn text(u: f32, v: f32, size: f32, line: f32, weight: f32, seed: u32,
         }
         (start, count) = (end + 1, count + 1);
     };
-    // Text too small to read is a gray.
+    // Text below the resolution is gray.
     if width > 2.5 * unit_length {
         return 0.35 * weight;
     }

@@ -1,16 +1,16 @@
-//! The instruction sets that tests go through.
+//! The instruction sets that tests run with.
 
 use fearless_simd::Level;
 
-/// Every instruction set this machine has, the least first. Tests hold each to the same definition; those that the machine lacks
-/// are the ignored tests of this module.
+/// Returns every instruction set of this machine, the smallest first. Tests compare each with the same reference; those
+/// that the machine lacks are reported as ignored tests of this module.
 pub fn instruction_sets() -> Vec<Level> {
     #[cfg_attr(not(target_arch = "x86_64"), allow(unused_mut, reason = "only one elsewhere"))]
     let mut all = vec![Level::baseline()];
     #[cfg(target_arch = "x86_64")]
     {
         let best = Level::new();
-        // SSE4.2 is left out of the build: see .cargo/config.toml.
+        // SSE4.2 is not compiled: see .cargo/config.toml.
         all.extend([best.as_avx2().map(Level::Avx2), best.as_avx512().map(Level::Avx512)].into_iter().flatten());
     }
     all
@@ -52,7 +52,7 @@ mod tests {
     }
 
     #[test]
-    fn the_one_that_runs_outside_tests_is_among_them() {
+    fn the_default_instruction_set_is_tested() {
         assert!(has(format!("{:?}", Level::new()).split('(').next().unwrap_or_default()));
     }
 }

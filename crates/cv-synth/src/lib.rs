@@ -1,5 +1,5 @@
-//! Ray-cast scenes with exact ground truth: pictures that could be photographs of a plain room, and what is true
-//! about them. For tests, measurements and the demonstration; no algorithm of the workspace depends on it.
+//! Ray-cast synthetic scenes with exact ground truth: realistic images of rooms and streets. For tests, measurements
+//! and the demonstration; no algorithm of the workspace depends on it.
 //!
 //! ```
 //! use cv_core::Camera;
@@ -13,24 +13,26 @@
 //! # Ok::<(), cv_synth::SynthError>(())
 //! ```
 //!
-//! * Scenes: [`Scene::room`], [`Scene::street`], [`Scene::tabletop`], [`Scene::ball`], [`Scene::poster_wall`], each laid out anew by its
-//!   seed; [`SceneBuilder`] for one's own.
-//! * Many views: [`Scene::room_walk`] and [`Scene::street_walk`] are poses to render; [`FeatureViews`] are keypoints and matches of any number of views without pictures.
-//! * One picture: [`render`] with a [`cv_core::Camera`] (distortion included), a pose and [`RenderOptions`].
-//! * Sets with their truth: [`stereo_pair`], [`homography_pair`], [`panorama_views`], [`two_view`], [`ball_photos`]; [`vista_photos`], a landscape in a light that is known, by a camera with faults.
-//! * Photographs of one flat sheet, a calibration board say: [`Sheet`], [`chessboard_photo`], [`photo_without_board`].
-//! * Further truth: [`Scene::correspondences`], [`Scene::visible_in_both`], [`Scene::point_at`], [`Scene::pixel_of`],
-//!   [`plane_homography`], [`rotation_homography`].
-//! * Measures against it: [`homography_corner_error`], [`alignment_error`], [`rotation_error`], [`direction_error`],
+//! * Scenes: [`Scene::room`], [`Scene::street`], [`Scene::tabletop`], [`Scene::ball`], [`Scene::poster_wall`], each
+//!   with a layout by its seed; [`SceneBuilder`] for other scenes.
+//! * Many views: [`Scene::room_walk`] and [`Scene::street_walk`] are poses to render; [`FeatureViews`] are keypoints
+//!   and matches of any number of views, without images.
+//! * One image: [`render`] with a [`cv_core::Camera`] (distortion included), a pose and [`RenderOptions`].
+//! * Sets with ground truth: [`stereo_pair`], [`homography_pair`], [`panorama_views`], [`two_view`], [`ball_photos`];
+//!   [`vista_photos`], a landscape of known radiance by a camera with a response curve, vignetting and noise.
+//! * Images of one planar sheet, such as a calibration board: [`Sheet`], [`chessboard_photo`], [`photo_without_board`].
+//! * Further ground truth: [`Scene::correspondences`], [`Scene::visible_in_both`], [`Scene::point_at`],
+//!   [`Scene::pixel_of`], [`plane_homography`], [`rotation_homography`].
+//! * Measures: [`homography_corner_error`], [`alignment_error`], [`rotation_error`], [`direction_error`],
 //!   [`depth_score`], [`MaskScore`].
-//! * Damaged files, for tests that no input does harm: [`corrupt`].
-//! * The instruction sets that tests of vector code go through: [`instruction_sets`].
+//! * Corrupted files, for robustness tests: [`corrupt`].
+//! * The instruction sets that tests of vectorized code run with: [`instruction_sets`].
 //!
 //! # Conventions
 //!
 //! Those of `cv-core`: pixel centers at integers, y down, poses world to camera. Worlds are in meters with y down.
-//! Truth belongs to the ray through the pixel's center; colors are means over the pixel's area. The same seeds give
-//! the same bytes at any number of threads.
+//! Ground truth is that of the ray through the pixel's center; colors are means over the pixel's area. The same seeds
+//! give the same bytes with any number of threads.
 
 mod bvh;
 mod corrupt;
@@ -38,7 +40,7 @@ mod error;
 mod feature_views;
 mod font;
 mod instruction_sets;
-mod light;
+mod irradiance;
 mod noise;
 mod poster;
 mod print;
@@ -75,4 +77,4 @@ pub use sets::{
 pub use sheet_photo::{ChessboardPhoto, ChessboardTrial, Sheet, chessboard_photo, photo_without_board};
 pub use texture::{Collage, Rgb, Texture, srgb};
 pub use truth::{plane_homography, rotation_homography};
-pub use vista::{Vista, VistaOptions, VistaPhoto, vista_level, vista_photos};
+pub use vista::{Vista, VistaOptions, VistaPhoto, vista_photos, vista_response};

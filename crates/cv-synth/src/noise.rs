@@ -1,4 +1,4 @@
-//! Gradient noise (Perlin 2002) whose fine octaves fade out where the sampling could not show them.
+//! Gradient noise (Perlin 2002), band-limited by the sample width.
 
 use crate::rng::{hash3, unit};
 use fearless_simd::{Level, dispatch, f32x8, i32x8, prelude::*, u32x8};
@@ -17,7 +17,7 @@ fn fade(t: f32) -> f32 {
     t * t * t * (t * (t * 6.0 - 15.0) + 10.0)
 }
 
-/// Either coordinate of a unit vector along a diagonal.
+/// Both coordinates of a unit vector along a diagonal.
 const DIAGONAL: f32 = std::f32::consts::FRAC_1_SQRT_2;
 
 #[inline]
@@ -57,30 +57,30 @@ pub(crate) fn noise3(p: [f32; 3], seed: u32) -> f32 {
     y(0) + f[2] * (y(1) - y(0))
 }
 
-/// How much of a pattern with `frequency` (per meter) a sample of `width` (meters) still shows: 1 to 0.
+/// Returns the contrast that a pattern of `frequency` (per meter) retains for a sample of `width` (meters): 1 to 0.
 #[inline]
-pub(crate) fn visible(frequency: f32, width: f32) -> f32 {
-    // Full up to a fifth of a period per sample, gone at half of one.
+pub(crate) fn contrast(frequency: f32, width: f32) -> f32 {
+    // Full up to a fifth of a period per sample, zero from half a period on.
     ((0.5 - frequency * width) / 0.3).clamp(0.0, 1.0)
 }
 
-/// The most octaves of a sum: they are worked out at once.
-const MOST: usize = 8;
+/// Maximum number of octaves: all are evaluated in one vector.
+const MAX_OCTAVES: usize = 8;
 
 /// Octaves of gradient noise, eight at most.
 #[derive(Debug, Clone)]
 pub(crate) struct Octaves {
-    frequencies: [f32; MOST],
-    /// 0 for octaves there are not.
-    amplitudes: [f32; MOST],
+    frequencies: [f32; MAX_OCTAVES],
+    /// 0 for missing octaves.
+    amplitudes: [f32; MAX_OCTAVES],
 }
 
 impl Octaves {
-    /// From `frequency` upwards, each with `gain` times the amplitude of the one before.
+    /// Creates `count` octaves from `frequency` upwards, each with `gain` times the amplitude of the previous one.
     pub(crate) const fn new(frequency: f32, count: usize, gain: f32) -> Self {
         let (mut f, mut a, mut octave) = (frequency, 1.0, 0);
-        let mut octaves = Self { frequencies: [f; MOST], amplitudes: [0.0; MOST] };
-        while octave < count && octave < MOST {
+        let mut octaves = Self { frequencies: [f; MAX_OCTAVES], amplitudes: [0.0; MAX_OCTAVES] };
+        while octave < count && octave < MAX_OCTAVES {
             octaves.frequencies[octave] = f;
             octaves.amplitudes[octave] = a;
             // Not exactly 2, so that the lattices of the octaves do not line up.
@@ -92,27 +92,27 @@ impl Octaves {
     }
 }
 
-/// What the seed of each octave is more than that of the first.
-const SEEDS: [u32; MOST] = {
-    let (mut seeds, mut octave) = ([0u32; MOST], 0);
-    while octave < MOST {
+/// Offset of the seed of each octave.
+const SEED_OFFSETS: [u32; MAX_OCTAVES] = {
+    let (mut seeds, mut octave) = ([0u32; MAX_OCTAVES], 0);
+    while octave < MAX_OCTAVES {
         seeds[octave] = (octave as u32).wrapping_mul(0x9E37_79B9);
         octave += 1;
     }
     seeds
 };
 
-/// The instruction set that noise is made with.
+/// The instruction set of the noise.
 static LEVEL: LazyLock<Level> = LazyLock::new(Level::new);
 
-/// The sum of octaves, as far as a sample of `width` shows them; about −1 to 1.
+/// Returns the sum of the octaves, band-limited to a sample of `width`; about −1 to 1.
 pub(crate) fn fbm(u: f32, v: f32, octaves: &Octaves, seed: u32, width: f32) -> f32 {
-    let shown = visible(octaves.frequencies[0], width);
-    if shown <= 0.0 {
+    let contrast_0 = contrast(octaves.frequencies[0], width);
+    if contrast_0 <= 0.0 {
         0.0
-    } else if visible(octaves.frequencies[1], width) <= 0.0 {
-        // A sum, whose zero is positive.
-        0.0 + shown * octaves.amplitudes[0] * noise2(u * octaves.frequencies[0], v * octaves.frequencies[0], seed)
+    } else if contrast(octaves.frequencies[1], width) <= 0.0 {
+        // A sum, so that a zero is positive.
+        0.0 + contrast_0 * octaves.amplitudes[0] * noise2(u * octaves.frequencies[0], v * octaves.frequencies[0], seed)
     } else {
         dispatch!(*LEVEL, simd => fbm_impl(simd, u, v, octaves, seed, width))
     }
@@ -121,16 +121,16 @@ pub(crate) fn fbm(u: f32, v: f32, octaves: &Octaves, seed: u32, width: f32) -> f
 #[simd]
 fn fbm_impl<S: Simd>(simd: S, u: f32, v: f32, octaves: &Octaves, seed: u32, width: f32) -> f32 {
     let frequencies = f32x8::from_slice(simd, &octaves.frequencies);
-    let shown = ((0.5 - frequencies * width) / 0.3).max(0.0).min(1.0);
-    let amplitudes = shown * f32x8::from_slice(simd, &octaves.amplitudes);
-    let noises = noises(simd, frequencies * u, frequencies * v, u32x8::from_slice(simd, &SEEDS) + seed);
-    // Where there is no octave is nothing, not even of what is not finite.
+    let contrasts = ((0.5 - frequencies * width) / 0.3).max(0.0).min(1.0);
+    let amplitudes = contrasts * f32x8::from_slice(simd, &octaves.amplitudes);
+    let noises = noises(simd, frequencies * u, frequencies * v, u32x8::from_slice(simd, &SEED_OFFSETS) + seed);
+    // Missing octaves add nothing, not even non-finite values.
     let zero = f32x8::splat(simd, 0.0);
-    let terms: [f32; MOST] = amplitudes.simd_gt(zero).select(amplitudes * noises, zero).into();
+    let terms: [f32; MAX_OCTAVES] = amplitudes.simd_gt(zero).select(amplitudes * noises, zero).into();
     terms.iter().fold(0.0, |sum, term| sum + term)
 }
 
-/// As [`noise2`] at eight places, but that zeros may differ in sign.
+/// As [`noise2`] at eight positions; zeros may differ in sign.
 #[inline(always)]
 fn noises<S: Simd>(simd: S, x: f32x8<S>, y: f32x8<S>, seeds: u32x8<S>) -> f32x8<S> {
     let (xi, yi) = (floors(x), floors(y));
@@ -160,12 +160,12 @@ fn fades<S: Simd>(t: f32x8<S>) -> f32x8<S> {
     t * t * t * (t * (t * 6.0 - 15.0) + 10.0)
 }
 
-/// As [`gradient`], by a hash that is not finished.
+/// As [`gradient`], from an unfinished hash.
 #[inline(always)]
 fn gradients<S: Simd>(simd: S, h: u32x8<S>, x: f32x8<S>, y: f32x8<S>) -> f32x8<S> {
     let h = (h ^ (h >> 15)) * 0x2C1B_3C6D;
-    // The highest bit: whether along a diagonal. The second: the sign of y, or which axis. The third: the sign of x, or of the only
-    // coordinate there is.
+    // The highest bit: a diagonal or an axis. The second: the sign of y, or which axis. The third: the sign of x, or of
+    // the only nonzero coordinate.
     let (diagonal, second, third) = (h.bitcast::<i32x8<S>>().simd_lt(0), h << 1, h << 2);
     let along = second.bitcast::<i32x8<S>>().simd_lt(0).select(y, x);
     let first = diagonal.select(x * DIAGONAL, along).bitcast::<u32x8<S>>() ^ (third & SIGN);
@@ -173,25 +173,25 @@ fn gradients<S: Simd>(simd: S, h: u32x8<S>, x: f32x8<S>, y: f32x8<S>) -> f32x8<S
     first.bitcast::<f32x8<S>>() + diagonal.select(other.bitcast(), f32x8::splat(simd, 0.0))
 }
 
-/// The bit of a number's sign.
+/// The sign bit.
 const SIGN: u32 = 1 << 31;
 
-/// The same in three dimensions.
+/// As [`fbm`], in three dimensions.
 pub(crate) fn fbm3(p: [f32; 3], frequency: f32, octaves: u32, gain: f32, seed: u32, width: f32) -> f32 {
     let (mut f, mut a, mut sum) = (frequency, 1.0, 0.0);
     for octave in 0..octaves {
-        let shown = visible(f, width);
-        if shown <= 0.0 {
+        let contrast_here = contrast(f, width);
+        if contrast_here <= 0.0 {
             break;
         }
-        sum += shown * a * noise3(p.map(|c| c * f), seed.wrapping_add(octave.wrapping_mul(0x9E37_79B9)));
+        sum += contrast_here * a * noise3(p.map(|c| c * f), seed.wrapping_add(octave.wrapping_mul(0x9E37_79B9)));
         f *= 2.03;
         a *= gain;
     }
     sum
 }
 
-/// Coverage of the half plane `distance > 0` by a sample of `width`, a box filter.
+/// Returns the coverage of the half plane `distance > 0` by a sample of `width`, a box filter.
 #[inline]
 pub(crate) fn edge(distance: f32, width: f32) -> f32 {
     (0.5 + distance / width.max(1e-6)).clamp(0.0, 1.0)
@@ -203,27 +203,27 @@ mod tests {
     use crate::instruction_sets;
     use crate::rng::Rng;
 
-    /// Octave by octave.
-    fn plain(u: f32, v: f32, (frequency, count, gain): (f32, usize, f32), seed: u32, width: f32) -> f32 {
+    /// Returns the sum octave by octave.
+    fn fbm_reference(u: f32, v: f32, (frequency, count, gain): (f32, usize, f32), seed: u32, width: f32) -> f32 {
         let (mut f, mut a, mut sum) = (frequency, 1.0, 0.0);
         for octave in 0..count as u32 {
-            let shown = visible(f, width);
-            if shown <= 0.0 {
+            let contrast_here = contrast(f, width);
+            if contrast_here <= 0.0 {
                 break;
             }
-            sum += shown * a * noise2(u * f, v * f, seed.wrapping_add(octave.wrapping_mul(0x9E37_79B9)));
+            sum += contrast_here * a * noise2(u * f, v * f, seed.wrapping_add(octave.wrapping_mul(0x9E37_79B9)));
             (f, a) = (f * 2.03, a * gain);
         }
         sum
     }
 
     #[test]
-    fn octaves_at_once_are_those_one_by_one_on_every_instruction_set() {
+    fn vectorized_octaves_equal_the_reference_on_every_instruction_set() {
         let mut rng = Rng::new(1, 2);
         for i in 0..30_000 {
-            // Up to where they are no longer finite.
-            let reach = [1.0, 30.0, 1e9, 1e35][i % 4];
-            let (mut u, v, seed) = (rng.range32(-reach, reach), rng.range32(-reach, reach), rng.seed32());
+            // Up to values that are no longer finite.
+            let range = [1.0, 30.0, 1e9, 1e35][i % 4];
+            let (mut u, v, seed) = (rng.range32(-range, range), rng.range32(-range, range), rng.seed32());
             let mut f = rng.range32(0.6, 100.0);
             if i % 7 == 0 {
                 // On the lattice.
@@ -231,14 +231,14 @@ mod tests {
             }
             let count = 1 + rng.index(8);
             let width = if i % 5 == 0 { 0.0 } else { rng.range32(0.0, 0.6) / f };
-            let of = (f, count, rng.range32(0.4, 0.9));
-            let octaves = Octaves::new(of.0, of.1, of.2);
-            let expected = plain(u, v, of, seed, width);
-            let same = |found: f32| found.to_bits() == expected.to_bits() || found.is_nan() && expected.is_nan();
-            assert!(same(fbm(u, v, &octaves, seed, width)), "{u} {v} {of:?} {seed} {width}");
+            let parameters = (f, count, rng.range32(0.4, 0.9));
+            let octaves = Octaves::new(parameters.0, parameters.1, parameters.2);
+            let expected = fbm_reference(u, v, parameters, seed, width);
+            let is_same = |found: f32| found.to_bits() == expected.to_bits() || found.is_nan() && expected.is_nan();
+            assert!(is_same(fbm(u, v, &octaves, seed, width)), "{u} {v} {parameters:?} {seed} {width}");
             for level in instruction_sets() {
                 let found = dispatch!(level, simd => fbm_impl(simd, u, v, &octaves, seed, width));
-                assert!(same(found), "{level:?} {u} {v} {of:?} {seed} {width}: {found} {expected}");
+                assert!(is_same(found), "{level:?} {u} {v} {parameters:?} {seed} {width}: {found} {expected}");
             }
         }
     }

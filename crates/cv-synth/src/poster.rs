@@ -1,4 +1,4 @@
-//! Printed posters: landscapes, abstract shapes, sheets of text, maps.
+//! Procedural posters: landscapes, abstract shapes, text pages, maps.
 
 use crate::font::text;
 use crate::noise::{Octaves, edge, fbm, noise2};
@@ -17,13 +17,13 @@ const PALETTES: [[u32; 5]; 6] = [
 
 #[derive(Debug, Clone)]
 enum Print {
-    /// Sun, sky and ridges of hills.
+    /// Sun, sky and hills.
     Landscape,
     /// Overlapping figures.
     Shapes(Vec<Figure>),
-    /// A headline over columns of text with a picture.
+    /// A headline above columns of text with a picture.
     Sheet,
-    /// Height lines, woods, water and roads.
+    /// Contour lines, woods, water and roads.
     Map,
 }
 
@@ -38,7 +38,7 @@ struct Figure {
     ink: Rgb,
 }
 
-/// A printed sheet; build one with [`Poster::new`].
+/// A printed poster.
 #[derive(Debug, Clone)]
 pub struct Poster {
     width: f32,
@@ -49,7 +49,7 @@ pub struct Poster {
 }
 
 impl Poster {
-    /// A poster of `width` × `height` meters; the seed decides what is on it.
+    /// Creates a poster of `width` × `height` meters; the seed determines its content.
     pub fn new(width: f32, height: f32, seed: u64) -> Self {
         let mut rng = Rng::new(seed, 0x706F_7374);
         let inks = rng.pick(PALETTES).map(srgb);
@@ -78,11 +78,12 @@ impl Poster {
         Self { width, height, print, inks, seed: rng.seed32() }
     }
 
-    /// Width and height in meters.
+    /// Returns width and height in meters.
     pub fn size(&self) -> (f32, f32) {
         (self.width, self.height)
     }
 
+    /// Returns the color at `(u, v)` meters from the corner, for a sample of width `w`.
     pub(crate) fn color(&self, u: f32, v: f32, w: f32) -> Rgb {
         let [paper, dark, ..] = self.inks;
         let short = self.width.min(self.height);
@@ -101,12 +102,12 @@ impl Poster {
             };
             mix(paper, printed, inside)
         };
-        // A thin dark line at the very edge, where the sheet is cut and curls.
+        // A thin dark line at the border of the sheet.
         let rim = edge(0.0015 - u.min(v).min(self.width - u).min(self.height - v), w);
         scale(mix(color, dark, 0.3 * rim), fibre)
     }
 
-    /// A headline `top` from the upper edge.
+    /// Draws a headline `top` meters below the upper border.
     fn headline(&self, under: Rgb, u: f32, v: f32, top: f32, size: f32, w: f32) -> Rgb {
         let left = 0.09 * self.width;
         let (x, y) = (u - left, v - top);
@@ -206,7 +207,7 @@ impl Poster {
         let water = edge(-0.28 - ground, (6.0 * f * w).max(0.01));
         let woods = edge(fbm(u, v, &Octaves::new(2.7 * f, 5, 0.6), self.seed ^ 1, w) - 0.12, (12.0 * f * w).max(0.04));
         let mut color = mix(paper, mix(cool, gold, 0.5), 0.35 * woods);
-        // Height lines every 0.08, about 0.012 wide: shown while a sample is finer than their spacing.
+        // Contour lines every 0.08, about 0.012 wide, shown while a sample is smaller than their spacing.
         let level = ground / 0.08;
         let off = (level - level.round()).abs() * 0.08;
         let shown = (1.0 - 14.0 * f * w).clamp(0.0, 1.0);

@@ -1,7 +1,7 @@
-//! Scenes: surfaces, lights, and the light that has settled on the surfaces.
+//! Scenes: surfaces, lights, and the irradiance of the surfaces.
 
-use crate::light::Lighting;
-use crate::render::meter;
+use crate::irradiance::Lighting;
+use crate::render::auto_exposure;
 use crate::shape::{Ray, Shape};
 use crate::texture::{Rgb, Texture};
 use crate::world::{Block, Light, Prim, World};
@@ -9,59 +9,61 @@ use cv_core::Pose;
 use nalgebra::{Point3, Rotation3, Vector3};
 use std::sync::Arc;
 
-/// Textured surfaces under lights, in meters; X right, Y **down**, Z forward, the floor of the presets at y = 0.
+/// Textured surfaces under lights, in meters; X right, Y **down**, Z forward. The floor of the presets is at y = 0.
 ///
-/// Light is worked out where a picture first shows it, and kept: diffuse direct light with soft shadows and one bounce.
-/// It depends on the scene only, so that every view sees the same.
+/// Irradiance is computed on demand and cached: diffuse direct light with soft shadows, and one bounce. It depends on
+/// the scene only, so that all views agree.
 #[derive(Debug, Clone)]
 pub struct Scene {
     pub(crate) world: Arc<World>,
     names: Vec<&'static str>,
-    /// Spheres that darken what is near, for things that were put in after the light was worked out.
-    pub(crate) blobs: Vec<(Point3<f64>, f64)>,
+    /// Spheres for ambient occlusion by objects that were added after the irradiance was computed.
+    pub(crate) occluders: Vec<(Point3<f64>, f64)>,
     viewpoint: Pose,
     pub(crate) lighting: Lighting,
 }
 
 impl Scene {
-    /// A pose from which the scene is worth looking at.
+    /// Returns a pose with a good view of the scene.
     pub fn viewpoint(&self) -> Pose {
         self.viewpoint
     }
 
-    /// The number that marks an object in [`crate::Rendered::ids`]; `None` where the scene has none of that name.
+    /// Returns the identifier of an object in [`crate::Rendered::ids`]; `None` if there is no object of that name.
     pub fn object_id(&self, name: &str) -> Option<u32> {
         self.names.iter().position(|&n| n == name).map(|i| i as u32 + 1)
     }
 
-    /// The names of all objects; the object at index `i` has the number `i + 1`.
+    /// Returns the names of all objects; the object at index `i` has the identifier `i + 1`.
     pub fn object_names(&self) -> &[&'static str] {
         &self.names
     }
 
-    /// Distance in units of `direction` to the first surface from `origin`, and the number of the object there.
+    /// Casts a ray. Returns the distance in units of `direction` to the first surface, and the identifier of its
+    /// object.
     pub fn cast(&self, origin: &Point3<f64>, direction: &Vector3<f64>) -> Option<(f64, u32)> {
         let hit = self.world.hit(&Ray { origin: *origin, dir: *direction })?;
         Some((hit.t, self.world.prims[hit.prim].object))
     }
 
-    /// True where nothing stands between two points; surfaces within a relative 1e-6 of the ends do not count.
-    pub fn sees(&self, from: &Point3<f64>, to: &Point3<f64>) -> bool {
-        !self.world.blocked(&Ray { origin: *from, dir: to - from }, 1e-6, 1.0 - 1e-6)
+    /// Returns whether the line of sight between two points is free; surfaces within a relative 1e-6 of the ends are
+    /// ignored.
+    pub fn has_line_of_sight(&self, from: &Point3<f64>, to: &Point3<f64>) -> bool {
+        !self.world.is_occluded(&Ray { origin: *from, dir: to - from }, 1e-6, 1.0 - 1e-6)
     }
 
-    /// The scene with more objects in it, the light on what was there kept but for soft contact shadows.
-    pub(crate) fn with(&self, more: SceneBuilder, blobs: Vec<(Point3<f64>, f64)>) -> Self {
-        let shift = self.names.len() as u32;
-        let prims = more.prims.into_iter().map(|p| Prim { object: p.object + shift, ..p });
+    /// Adds objects to the scene. The irradiance of existing surfaces is kept, except for ambient occlusion.
+    pub(crate) fn with_objects(&self, more: SceneBuilder, occluders: Vec<(Point3<f64>, f64)>) -> Self {
+        let offset = self.names.len() as u32;
+        let prims = more.prims.into_iter().map(|p| Prim { object: p.object + offset, ..p });
         let world = Arc::new(self.world.with(prims, more.blocks));
         let names = self.names.iter().copied().chain(more.names).collect();
         let lighting = self.lighting.with(&world);
-        Self { world, names, blobs, viewpoint: self.viewpoint, lighting }
+        Self { world, names, occluders, viewpoint: self.viewpoint, lighting }
     }
 }
 
-/// Puts a scene together; see the presets of [`Scene`] for ready ones.
+/// Builds a scene; [`Scene`] has presets.
 ///
 /// ```
 /// use cv_synth::{SceneBuilder, Texture, srgb};
@@ -96,7 +98,7 @@ impl Default for SceneBuilder {
 }
 
 impl SceneBuilder {
-    /// Nothing but an even gray ambient light.
+    /// Creates an empty scene with a uniform gray ambient light.
     pub fn new() -> Self {
         Self {
             prims: Vec::new(),
@@ -109,7 +111,7 @@ impl SceneBuilder {
         }
     }
 
-    /// Starts an object: surfaces added from here on belong to it, and are matt and one-sided until said otherwise.
+    /// Starts an object. The surfaces added next belong to it, and are matt and one-sided by default.
     pub fn object(&mut self, name: &'static str) -> &mut Self {
         self.names.push(name);
         self.specular = (0.0, 1.0);
@@ -117,26 +119,26 @@ impl SceneBuilder {
         self
     }
 
-    /// Makes the following surfaces of the object shine: mirrored share (0 to 0.3) and exponent (10 to 200).
-    pub fn shiny(&mut self, share: f32, exponent: f32) -> &mut Self {
-        self.specular = (share, exponent);
+    /// Makes the next surfaces of the object glossy: specular reflectance (0 to 0.3) and exponent (10 to 200).
+    pub fn shiny(&mut self, reflectance: f32, exponent: f32) -> &mut Self {
+        self.specular = (reflectance, exponent);
         self
     }
 
-    /// Lights the backs of the following surfaces of the object too.
-    pub fn thin(&mut self) -> &mut Self {
+    /// Makes the next surfaces of the object two-sided.
+    pub fn two_sided(&mut self) -> &mut Self {
         self.two_sided = true;
         self
     }
 
-    /// The light that comes from nowhere in particular, as a radiance.
+    /// Sets the ambient radiance.
     pub fn ambient(&mut self, radiance: Rgb) -> &mut Self {
         self.ambient = radiance;
         self
     }
 
-    /// A rectangle `corner + s·u + t·v`, `s, t` from 0 to 1, that shines to the side from which `u` points right and
-    /// `v` down. It is not itself seen.
+    /// Adds a rectangular light `corner + s·u + t·v`, `s, t` from 0 to 1, which emits to the side from which `u` points
+    /// right and `v` down. It is invisible itself.
     pub fn light(&mut self, corner: Point3<f64>, u: Vector3<f64>, v: Vector3<f64>, radiance: Rgb) -> &mut Self {
         self.lights.push(Light { corner, eu: u, ev: v, radiance });
         self
@@ -157,29 +159,29 @@ impl SceneBuilder {
         self
     }
 
-    /// A rectangle with edges `u` and `v` (at right angles); its front is where `u` points right and `v` down.
+    /// Adds a rectangle with orthogonal edges `u` and `v`; from its front, `u` points right and `v` down.
     pub fn rect(&mut self, corner: Point3<f64>, u: Vector3<f64>, v: Vector3<f64>, texture: Texture) -> &mut Self {
         self.push(Shape::rect(corner, u, v, false), texture)
     }
 
-    /// The ellipse inside [`SceneBuilder::rect`].
+    /// Adds the ellipse inscribed in [`SceneBuilder::rect`].
     pub fn disc(&mut self, corner: Point3<f64>, u: Vector3<f64>, v: Vector3<f64>, texture: Texture) -> &mut Self {
         self.push(Shape::rect(corner, u, v, true), texture)
     }
 
-    /// A sphere.
+    /// Adds a sphere.
     pub fn sphere(&mut self, center: Point3<f64>, radius: f64, texture: Texture) -> &mut Self {
         self.push(Shape::Sphere { center, radius }, texture)
     }
 
-    /// The side of a cylinder or cone from `base` to `top`, open at the ends.
+    /// Adds the lateral surface of a cylinder or cone from `base` to `top`, open at the ends.
     pub fn tube(&mut self, base: Point3<f64>, top: Point3<f64>, radii: (f64, f64), texture: Texture) -> &mut Self {
         let d = top - base;
         let length = d.norm();
         self.push(Shape::Frustum { base, axis: d / length, length, radii }, texture)
     }
 
-    /// A cylinder or cone with lids.
+    /// Adds a cylinder or cone with end caps.
     pub fn solid_tube(
         &mut self,
         base: Point3<f64>,
@@ -188,7 +190,7 @@ impl SceneBuilder {
         side: Texture,
         lid: Texture,
     ) -> &mut Self {
-        let (a, b) = crate::shape::complete(&(top - base).normalize());
+        let (a, b) = crate::shape::complete_basis(&(top - base).normalize());
         for (p, r, flip) in [(base, radii.0, 1.0), (top, radii.1, -1.0)] {
             let (u, v) = (a * (2.0 * r), b * (2.0 * r * flip));
             self.disc(p - u / 2.0 - v / 2.0, u, v, lid.clone());
@@ -196,26 +198,26 @@ impl SceneBuilder {
         self.tube(base, top, radii, side)
     }
 
-    /// A box of `size` (x, y, z) standing on `foot`, the middle of its underside, turned by `yaw` about the vertical.
+    /// Adds a box of `size` (x, y, z) on `foot`, the center of its underside, rotated by `yaw` about the vertical.
     ///
     /// Textures: front and back (−z, +z), the two sides (±x), top and underside.
     pub fn block(&mut self, foot: Point3<f64>, size: [f64; 3], yaw: f64, faces: [&Texture; 3]) -> &mut Self {
-        let turn = Rotation3::from_axis_angle(&Vector3::y_axis(), yaw);
-        self.tilted_block(foot - Vector3::y() * (0.5 * size[1]), size, turn, faces)
+        let rotation = Rotation3::from_axis_angle(&Vector3::y_axis(), yaw);
+        self.tilted_block(foot - Vector3::y() * (0.5 * size[1]), size, rotation, faces)
     }
 
-    /// A box around `center`, turned by `turn`; textures as for [`SceneBuilder::block`].
+    /// Adds a box around `center`, rotated by `rotation`; textures as for [`SceneBuilder::block`].
     pub fn tilted_block(
         &mut self,
         center: Point3<f64>,
         size: [f64; 3],
-        turn: Rotation3<f64>,
+        rotation: Rotation3<f64>,
         faces: [&Texture; 3],
     ) -> &mut Self {
-        let [x, y, z] = [0, 1, 2].map(|a| turn * Vector3::ith(a, size[a]));
+        let [x, y, z] = [0, 1, 2].map(|a| rotation * Vector3::ith(a, size[a]));
         let at = |a: f64, b: f64, c: f64| center + x * (0.5 * a) + y * (0.5 * b) + z * (0.5 * c);
         let [front, side, top] = faces;
-        self.blocks.push(Block { first: self.prims.len(), center, turn, size });
+        self.blocks.push(Block { first: self.prims.len(), center, turn: rotation, size });
         self.rect(at(-1.0, -1.0, -1.0), x, y, front.clone());
         self.rect(at(1.0, -1.0, 1.0), -x, y, front.clone());
         self.rect(at(1.0, -1.0, -1.0), z, y, side.clone());
@@ -224,12 +226,12 @@ impl SceneBuilder {
         self.rect(at(-1.0, 1.0, -1.0), x, z, top.clone())
     }
 
-    /// The scene, with the pose that [`Scene::viewpoint`] offers.
+    /// Builds the scene, with the pose of [`Scene::viewpoint`].
     pub fn build(self, viewpoint: Pose) -> Scene {
         let world = Arc::new(World::new(self.prims, self.blocks, self.lights, self.ambient));
         let lighting = Lighting::new(&world);
-        let mut scene = Scene { world, names: self.names, blobs: Vec::new(), viewpoint, lighting };
-        scene.lighting.gain = meter(&scene);
+        let mut scene = Scene { world, names: self.names, occluders: Vec::new(), viewpoint, lighting };
+        scene.lighting.gain = auto_exposure(&scene);
         scene
     }
 }

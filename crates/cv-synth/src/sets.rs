@@ -1,4 +1,4 @@
-//! Sets of pictures for each job, with the truth that belongs to them.
+//! Sets of images with ground truth, for each job.
 
 use crate::error::SynthError;
 use crate::render::{Rendered, render};
@@ -17,18 +17,18 @@ pub struct StereoPair {
     pub left: Rendered,
     /// The right view: the same orientation, `baseline` meters to the right.
     pub right: Rendered,
-    /// Distance between the two centers in meters.
+    /// Baseline in meters.
     pub baseline: f64,
-    /// Disparity of the left view, `fx · baseline / Z`; NaN where there is nothing.
+    /// Disparity of the left view, `fx · baseline / Z`; NaN without a surface.
     pub disparity: GrayF32,
     /// Disparity of the right view, positive as well.
     pub disparity_right: GrayF32,
-    /// Pixels of the left view that the right one sees too.
+    /// Pixels of the left view that are visible in the right view too.
     pub visible: Mask,
 }
 
 impl StereoPair {
-    /// Pixels of the left view that show something the right one does not see.
+    /// Returns the pixels of the left view that are occluded in the right view, or out of its view.
     pub fn occluded(&self) -> Mask {
         Mask::from_fn(self.visible.width(), self.visible.height(), |x, y| {
             [!self.visible.at(x, y)[0] && self.disparity.at(x, y)[0].is_finite()]
@@ -36,7 +36,7 @@ impl StereoPair {
     }
 }
 
-/// A rectified pair of a scene; the left camera stands at `pose`.
+/// Renders a rectified pair; `pose` is that of the left camera.
 ///
 /// # Errors
 /// [`SynthError::Stereo`] for a camera with distortion or a baseline that is not positive; else as [`render`].
@@ -65,14 +65,15 @@ pub struct HomographyPair {
     pub a: Rendered,
     /// Second view.
     pub b: Rendered,
-    /// Takes pixels of `a` to pixels of `b`; entry (3, 3) is 1.
+    /// Maps pixels of `a` to pixels of `b`; entry (3, 3) is 1.
     pub homography: Matrix3<f64>,
 }
 
-/// Two views of a wall with posters: one square on, one from up to `turn` radians to the side, a little rolled, nearer
-/// or farther, with the middle of the first view still in it. 0.3 suits upright features, 0.8 is hard for any.
+/// Renders two views of a wall with posters: one frontal, one from up to `turn` radians to the side, with some roll and
+/// another distance, in which the center of the first view is still visible. 0.3 suits upright features, 0.8 is hard
+/// for all.
 ///
-/// A camera with distortion is rendered so, and the homography then relates undistorted pixels.
+/// With a distorted camera, the homography relates undistorted pixels.
 ///
 /// # Errors
 /// As [`render`].
@@ -86,37 +87,37 @@ pub fn homography_pair(
     let mut rng = Rng::new(seed, 50);
     let turn = if turn.is_finite() { turn.clamp(0.0, 1.2) } else { 0.0 };
     let first = scene.viewpoint();
-    let target = Wall::middle() + Vector3::new(rng.range(-0.25, 0.25), rng.range(-0.2, 0.2), 0.0);
+    let target = Wall::center() + Vector3::new(rng.range(-0.25, 0.25), rng.range(-0.2, 0.2), 0.0);
     let (yaw, pitch) = (turn * rng.pick([-1.0, 1.0]) * rng.range(0.5, 1.0), turn * rng.range(-0.5, 0.5));
     let distance = Wall::Z * rng.range(0.9, 1.12);
     let away = Rotation3::from_euler_angles(pitch, yaw, 0.0) * Vector3::new(0.0, 0.0, -distance);
-    let second = looking(target + away, target, turn * rng.range(-0.35, 0.35));
+    let second = look_at(target + away, target, turn * rng.range(-0.35, 0.35));
     let a = render(&scene, camera, &first, options)?;
     let b = render(&scene, camera, &second, &options.clone().with_seed(options.seed ^ 0x40))?;
-    // The wall's plane is 3 m away from the first center.
-    let homography = plane_homography((camera, &first), (camera, &second), &Wall::middle(), &Vector3::z());
+    // The wall's plane is 3 m from the first center.
+    let homography = plane_homography((camera, &first), (camera, &second), &Wall::center(), &Vector3::z());
     Ok(HomographyPair { a, b, homography: homography.unwrap_or_else(Matrix3::identity) })
 }
 
-/// A pose that looks at a point, rolled clockwise by `roll`.
-fn looking(eye: Point3<f64>, target: Point3<f64>, roll: f64) -> Pose {
+/// Returns the pose of a camera at `eye` that looks at `target`, rolled clockwise by `roll`.
+fn look_at(eye: Point3<f64>, target: Point3<f64>, roll: f64) -> Pose {
     let level = Pose::look_at(eye, target, Vector3::y()).unwrap_or_else(Pose::identity);
     let turn = Rotation3::from_axis_angle(&Vector3::z_axis(), -roll);
     Pose::new(turn * level.rotation, turn * level.translation)
 }
 
-/// How [`panorama_views`] takes its pictures.
+/// Options of [`panorama_views`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct PanoramaSetOptions {
-    /// Number of pictures. Default 5.
+    /// Number of views. Default 5.
     pub views: usize,
-    /// Share of a picture's width that its neighbor sees too, 0.1 to 0.9. Default 0.45.
+    /// Overlap of neighboring images, as a ratio of the width, 0.1 to 0.9. Default 0.45.
     pub overlap: f64,
-    /// Largest difference of a picture's exposure from the mean, in stops. Default 0.35.
+    /// Largest deviation of an exposure from the mean, in stops. Default 0.35.
     pub exposure_spread: f32,
-    /// Largest pitch, roll and unevenness of the turn, in radians: taken by hand. Default 0.02.
+    /// Largest pitch, roll and yaw error of a hand-held camera, in radians. Default 0.02.
     pub shake: f64,
-    /// True to have someone walk through. Default false.
+    /// Whether a person walks through. Default false.
     pub walker: bool,
 }
 
@@ -126,26 +127,27 @@ impl Default for PanoramaSetOptions {
     }
 }
 
-/// Pictures taken from one point.
+/// Views from one center.
 #[derive(Debug, Clone)]
 pub struct PanoramaViews {
-    /// From left to right.
+    /// The views, from left to right.
     pub views: Vec<Rendered>,
-    /// Exposure of each in stops.
+    /// Exposure of each view in stops.
     pub exposures: Vec<f32>,
-    /// Where the walker is in each; empty masks without one.
+    /// Mask of the person in each view; empty without one.
     pub walker: Vec<Mask>,
 }
 
 impl PanoramaViews {
-    /// Takes pixels of view `from` to pixels of view `to`; entry (3, 3) is 1. `None` where there is no such view.
+    /// Returns the homography from pixels of view `from` to pixels of view `to`; entry (3, 3) is 1. `None` if there is
+    /// no such view.
     pub fn homography(&self, from: usize, to: usize) -> Option<Matrix3<f64>> {
         let (a, b) = (self.views.get(from)?, self.views.get(to)?);
         Some(rotation_homography((&a.camera, &a.pose), (&b.camera, &b.pose)))
     }
 
-    /// Where view `to` sees, inside its picture or not, what view `from` sees at a pixel; `None` where that is behind
-    /// it, or there is no such view. Lens distortion included.
+    /// Transfers a pixel of view `from` to view `to`, inside its image or not, distortion included; `None` if it is
+    /// behind the camera, or there is no such view.
     pub fn transfer(&self, from: usize, to: usize, pixel: Point2<f64>) -> Option<Point2<f64>> {
         let (a, b) = (self.views.get(from)?, self.views.get(to)?);
         let n = a.camera.normalize(pixel);
@@ -154,7 +156,7 @@ impl PanoramaViews {
     }
 }
 
-/// Pictures of the living room from its middle, turning to the right by as much as the overlap leaves.
+/// Renders views of the living room from its middle by a camera that rotates to the right, with the given overlap.
 ///
 /// # Errors
 /// As [`render`].
@@ -173,11 +175,11 @@ pub fn panorama_views(
     let mut set = PanoramaViews { views: Vec::new(), exposures: Vec::new(), walker: Vec::new() };
     for i in 0..n {
         let shake = panorama.shake.abs();
-        let mut shaken = || rng.range(-shake, shake);
-        let yaw = step * (i as f64 - (n as f64 - 1.0) / 2.0) + shaken();
-        let (pitch, roll) = (0.06 + shaken(), shaken());
+        let mut jitter = || rng.range(-shake, shake);
+        let yaw = step * (i as f64 - (n as f64 - 1.0) / 2.0) + jitter();
+        let (pitch, roll) = (0.06 + jitter(), jitter());
         let direction = Vector3::new(yaw.sin() * pitch.cos(), pitch.sin(), yaw.cos() * pitch.cos());
-        let pose = looking(center, center + direction, roll);
+        let pose = look_at(center, center + direction, roll);
         let exposure = panorama.exposure_spread * rng.range32(-1.0, 1.0);
         let taken = RenderOptions { exposure: options.exposure + exposure, ..options.clone() }
             .with_seed(options.seed ^ i as u64);
@@ -197,20 +199,21 @@ pub fn panorama_views(
     Ok(set)
 }
 
-/// Two views of a room from different places.
+/// Two views of a room from different centers.
 #[derive(Debug, Clone)]
 pub struct TwoView {
-    /// The scene, for further truth ([`Scene::correspondences`], [`Scene::visible_in_both`]).
+    /// The scene, for further ground truth ([`Scene::correspondences`], [`Scene::visible_in_both`]).
     pub scene: Scene,
     /// First view.
     pub a: Rendered,
     /// Second view.
     pub b: Rendered,
-    /// From the camera frame of `a` to that of `b`, in meters: `x_b = R x_a + t`.
+    /// Relative pose from the camera frame of `a` to that of `b`, in meters: `x_b = R x_a + t`.
     pub relative: Pose,
 }
 
-/// Two views of the living room, their centers `baseline` meters apart, mostly sideways, both looking at its middle.
+/// Renders two views of the living room with a baseline of `baseline` meters, mostly sideways, both looking at its
+/// middle.
 ///
 /// # Errors
 /// As [`render`].
@@ -219,29 +222,29 @@ pub fn two_view(seed: u64, camera: &Camera, baseline: f64, options: &RenderOptio
     let mut rng = Rng::new(seed, 52);
     let eye = Point3::new(rng.range(-0.6, 0.6), -rng.range(1.3, 1.6), rng.range(0.6, 1.0));
     let side = rng.pick([-1.0, 1.0]);
-    let way = Vector3::new(side, rng.range(-0.15, 0.15), rng.range(-0.25, 0.35)).normalize();
+    let direction = Vector3::new(side, rng.range(-0.15, 0.15), rng.range(-0.25, 0.35)).normalize();
     let baseline = if baseline.is_finite() { baseline } else { 0.0 };
     let target = |rng: &mut Rng| Point3::new(rng.range(-0.4, 0.4), rng.range(-1.1, -0.8), rng.range(5.0, 6.5));
-    let first = looking(eye, target(&mut rng), rng.range(-0.02, 0.02));
-    let second = looking(eye + way * baseline, target(&mut rng), rng.range(-0.03, 0.03));
+    let first = look_at(eye, target(&mut rng), rng.range(-0.02, 0.02));
+    let second = look_at(eye + direction * baseline, target(&mut rng), rng.range(-0.03, 0.03));
     let a = render(&scene, camera, &first, options)?;
     let b = render(&scene, camera, &second, &options.clone().with_seed(options.seed ^ 0x2E))?;
     Ok(TwoView { relative: Pose::relative(&first, &second), scene, a, b })
 }
 
-/// A photo of an orange ball.
+/// An image of an orange ball.
 #[derive(Debug, Clone)]
 pub struct BallPhoto {
-    /// The photo.
+    /// The image.
     pub view: Rendered,
-    /// Where the ball is.
+    /// The mask of the ball.
     pub mask: Mask,
-    /// Distance from the camera to the ball's middle in meters.
+    /// Distance from the camera to the ball's center in meters.
     pub distance: f64,
 }
 
-/// Photos of an orange ball of 10 cm radius at growing distances (0.6 to 2.6 m) in one room, each from another place
-/// and with a slightly different exposure.
+/// Renders images of an orange ball of 10 cm radius at increasing distances (0.6 to 2.6 m) in one room, each from
+/// another viewpoint and with a slightly different exposure.
 ///
 /// # Errors
 /// As [`render`].

@@ -1,12 +1,12 @@
-//! Shapes and where rays meet them.
+//! Shapes and ray intersections.
 
 use nalgebra::{Point3, Vector3};
 
 /// A surface. Lengths in meters, directions of unit length.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Shape {
-    /// `corner + u·eu + v·ev`, `0 ≤ u ≤ size.0`, `0 ≤ v ≤ size.1`; u to the right and v down as seen
-    /// from the front, so that it faces along `ev × eu`. `round` keeps the ellipse in it.
+    /// `corner + u·eu + v·ev`, `0 ≤ u ≤ size.0`, `0 ≤ v ≤ size.1`; from the front, u points right and v down, so that
+    /// it faces along `ev × eu`. `round`: the inscribed ellipse.
     Rect {
         corner: Point3<f64>,
         eu: Vector3<f64>,
@@ -20,7 +20,7 @@ pub(crate) enum Shape {
         center: Point3<f64>,
         radius: f64,
     },
-    /// The side of a cone's stump: radius `radii.0` at `base`, `radii.1` at `base + length·axis`.
+    /// The lateral surface of a frustum: radius `radii.0` at `base`, `radii.1` at `base + length·axis`.
     Frustum {
         base: Point3<f64>,
         axis: Vector3<f64>,
@@ -29,49 +29,49 @@ pub(crate) enum Shape {
     },
 }
 
-/// A ray from `origin` along `dir`, which need not be of unit length: `t` counts in its lengths.
+/// A ray from `origin` along `dir`, which is not normalized: `t` is in units of its length.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Ray {
     pub(crate) origin: Point3<f64>,
     pub(crate) dir: Vector3<f64>,
 }
 
-/// The surface at a hit.
+/// Surface properties at a hit.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Surface {
     pub(crate) point: Point3<f64>,
-    /// Unit normal, out of the solid (front of a rectangle).
+    /// Unit normal, outward (towards the front of a rectangle).
     pub(crate) normal: Vector3<f64>,
     /// Surface coordinates from 0 to 1.
     pub(crate) s: f32,
     pub(crate) t: f32,
 }
 
-/// Two unit vectors that complete `axis` to a right-handed basis.
-pub(crate) fn complete(axis: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
+/// Returns two unit vectors that form a right-handed basis with `axis`.
+pub(crate) fn complete_basis(axis: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
     let helper = if axis.y.abs() < 0.8 { Vector3::y() } else { Vector3::x() };
     let a = axis.cross(&helper).normalize();
     (a, axis.cross(&a))
 }
 
 impl Shape {
-    /// The rectangle with edges `u` and `v` (at right angles), or the ellipse in it.
+    /// Creates the rectangle with orthogonal edges `u` and `v`, or the inscribed ellipse.
     pub(crate) fn rect(corner: Point3<f64>, u: Vector3<f64>, v: Vector3<f64>, round: bool) -> Self {
         let size = (u.norm(), v.norm());
         let (eu, ev) = (u / size.0, v / size.1);
         Self::Rect { corner, eu, ev, normal: eu.cross(&ev), size, round }
     }
 
-    /// The first hit in `(near, far)`.
+    /// Returns the first hit in `(near, far)`.
     #[inline]
     pub(crate) fn intersect(&self, ray: &Ray, near: f64, far: f64) -> Option<f64> {
-        let within = |t: f64| t > near && t < far;
+        let is_within = |t: f64| t > near && t < far;
         match self {
             Self::Rect { corner, eu, ev, normal, size, round } => {
-                let down = ray.dir.dot(normal);
-                let t = (corner - ray.origin).dot(normal) / down;
-                // Also false for the NaN of a ray within the plane.
-                if !within(t) {
+                let denominator = ray.dir.dot(normal);
+                let t = (corner - ray.origin).dot(normal) / denominator;
+                // Also false for the NaN of a ray in the plane.
+                if !is_within(t) {
                     return None;
                 }
                 let d = ray.origin + ray.dir * t - corner;
@@ -92,7 +92,7 @@ impl Shape {
                 let a = ray.dir.norm_squared();
                 let b = oc.dot(&ray.dir);
                 let c = oc.norm_squared() - radius * radius;
-                roots(a, b, c).into_iter().find(|&t| within(t))
+                roots(a, b, c).into_iter().find(|&t| is_within(t))
             }
             Self::Frustum { base, axis, length, radii } => {
                 let slope = (radii.1 - radii.0) / length;
@@ -105,13 +105,13 @@ impl Shape {
                 let c = o.norm_squared() - or * or;
                 roots(a, b, c).into_iter().find(|&t| {
                     let z = oz + t * dz;
-                    within(t) && z >= 0.0 && z <= *length
+                    is_within(t) && z >= 0.0 && z <= *length
                 })
             }
         }
     }
 
-    /// Normal and surface coordinates at `t`.
+    /// Returns normal and surface coordinates at `t`.
     pub(crate) fn surface(&self, ray: &Ray, t: f64) -> Surface {
         let point = ray.origin + ray.dir * t;
         match self {
@@ -129,7 +129,7 @@ impl Shape {
             Self::Frustum { base, axis, length, radii } => {
                 let d = point - base;
                 let z = d.dot(axis);
-                let (a, b) = complete(axis);
+                let (a, b) = complete_basis(axis);
                 let (x, y) = (d.dot(&a), d.dot(&b));
                 let r = (x * x + y * y).sqrt().max(1e-12);
                 let slope = (radii.1 - radii.0) / length;
@@ -140,7 +140,7 @@ impl Shape {
         }
     }
 
-    /// Point and normal at surface coordinates.
+    /// Returns point and normal at surface coordinates.
     pub(crate) fn at(&self, s: f64, t: f64) -> (Point3<f64>, Vector3<f64>) {
         match self {
             Self::Rect { corner, eu, ev, size, .. } => (corner + eu * (s * size.0) + ev * (t * size.1), ev.cross(eu)),
@@ -150,7 +150,7 @@ impl Shape {
                 (center + n * *radius, n)
             }
             Self::Frustum { base, axis, length, radii } => {
-                let (a, b) = complete(axis);
+                let (a, b) = complete_basis(axis);
                 let phi = (s - 0.5) * std::f64::consts::TAU;
                 let out = a * phi.cos() + b * phi.sin();
                 let r = radii.0 + t * (radii.1 - radii.0);
@@ -160,7 +160,7 @@ impl Shape {
         }
     }
 
-    /// Size of the surface in meters along its two coordinates.
+    /// Returns the size of the surface in meters along its two coordinates.
     pub(crate) fn extent(&self) -> (f64, f64) {
         match self {
             Self::Rect { size, .. } => *size,
@@ -169,8 +169,8 @@ impl Shape {
         }
     }
 
-    /// True where the first coordinate closes on itself.
-    pub(crate) fn wraps(&self) -> bool {
+    /// Returns whether the first coordinate is periodic.
+    pub(crate) fn is_periodic(&self) -> bool {
         !matches!(self, Self::Rect { .. })
     }
 
@@ -182,38 +182,38 @@ impl Shape {
         }
     }
 
-    /// The corners of a box around it, a hair larger.
+    /// Returns the corners of the bounding box, slightly enlarged.
     pub(crate) fn bounds(&self) -> (Point3<f64>, Point3<f64>) {
         let (mut low, mut high) = (Point3::from([f64::INFINITY; 3]), Point3::from([f64::NEG_INFINITY; 3]));
-        let mut take = |p: Point3<f64>, r: Vector3<f64>| {
+        let mut extend = |p: Point3<f64>, r: Vector3<f64>| {
             low = low.inf(&(p - r));
             high = high.sup(&(p + r));
         };
         match self {
             Self::Rect { corner, eu, ev, size, .. } => {
                 for (u, v) in [(0.0, 0.0), (size.0, 0.0), (0.0, size.1), (size.0, size.1)] {
-                    take(corner + eu * u + ev * v, Vector3::zeros());
+                    extend(corner + eu * u + ev * v, Vector3::zeros());
                 }
             }
-            Self::Sphere { center, radius } => take(*center, Vector3::repeat(*radius)),
+            Self::Sphere { center, radius } => extend(*center, Vector3::repeat(*radius)),
             Self::Frustum { base, axis, length, radii } => {
                 let side = axis.map(|c| (1.0 - c * c).max(0.0).sqrt());
-                take(*base, side * radii.0);
-                take(base + axis * *length, side * radii.1);
+                extend(*base, side * radii.0);
+                extend(base + axis * *length, side * radii.1);
             }
         }
         (low - Vector3::repeat(1e-6), high + Vector3::repeat(1e-6))
     }
 }
 
-/// Real roots of `a t² + 2 b t + c` in ascending order, infinities where there are none.
+/// Returns the real roots of `a t² + 2 b t + c` in ascending order, infinite where there are none.
 fn roots(a: f64, b: f64, c: f64) -> [f64; 2] {
     const NONE: f64 = f64::INFINITY;
     let disc = b * b - a * c;
     if disc < 0.0 {
         return [NONE; 2];
     }
-    // The sum never cancels; the other root through the product.
+    // The sum has no cancellation; the other root is from the product.
     let q = -(b + disc.sqrt().copysign(b));
     let (t0, t1) = (if a == 0.0 { NONE } else { q / a }, if q == 0.0 { NONE } else { c / q });
     if t0 < t1 { [t0, t1] } else { [t1, t0] }

@@ -1,7 +1,7 @@
-//! Procedural surfaces, band limited by the width of the sample they are asked for.
+//! Procedural textures, band-limited to the sample width.
 
 use crate::font::text;
-use crate::noise::{Octaves, edge, fbm, fbm3, floor, noise2, visible};
+use crate::noise::{Octaves, contrast, edge, fbm, fbm3, floor, noise2};
 use crate::poster::Poster;
 use crate::print::Print;
 use crate::rng::{hash2, unit};
@@ -10,7 +10,7 @@ use std::sync::Arc;
 /// Linear RGB.
 pub type Rgb = [f32; 3];
 
-/// Linear RGB of an sRGB color `0xRRGGBB`.
+/// Converts an sRGB color `0xRRGGBB` to linear RGB.
 pub fn srgb(hex: u32) -> Rgb {
     [16, 8, 0].map(|shift| {
         let c = ((hex >> shift) & 255) as f32 / 255.0;
@@ -28,7 +28,7 @@ pub(crate) fn scale(a: Rgb, s: f32) -> Rgb {
     a.map(|c| (c * s).max(0.0))
 }
 
-/// Where on a surface a color is asked for.
+/// A sample position on a surface.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SurfacePoint {
     /// Meters along the surface from its corner.
@@ -38,18 +38,18 @@ pub(crate) struct SurfacePoint {
     pub(crate) local: [f32; 3],
     /// Size of the surface in meters.
     pub(crate) size: (f32, f32),
-    /// Width of the sample on the surface in meters.
+    /// Sample width on the surface in meters.
     pub(crate) width: f32,
 }
 
-/// What a surface looks like. Lengths are meters; colors are linear reflectances.
+/// Texture of a surface. Lengths are meters; colors are linear reflectances.
 #[derive(Debug, Clone)]
 pub enum Texture {
     /// One color.
     Plain(Rgb),
-    /// Light of its own: a lamp or a window.
+    /// An emitter: a lamp or a window.
     Emissive(Rgb),
-    /// Squares of `square` meters, `colors[0]` at the corner.
+    /// A checkerboard with squares of `square` meters, `colors[0]` at the corner.
     Checker {
         /// Side of a square.
         square: f32,
@@ -65,14 +65,14 @@ pub enum Texture {
     },
     /// A printed calibration board of any kind.
     Print(Arc<Print>),
-    /// Rolled wall paint: faint mottling at every scale.
+    /// Rolled wall paint: faint mottling at all scales.
     Paint {
         /// Mean color.
         color: Rgb,
         /// Seed of the pattern.
         seed: u32,
     },
-    /// Rough plaster, concrete or stone: weak clouds, strong grain from centimeters down to millimeters.
+    /// Rough plaster, concrete or stone: weak low frequencies, strong grain from centimeters down to millimeters.
     Stone {
         /// Dark and light.
         colors: [Rgb; 2],
@@ -138,7 +138,7 @@ pub enum Texture {
         /// Seed of the pattern.
         seed: u32,
     },
-    /// The back of a book, title along v.
+    /// The spine of a book, title along v.
     Spine {
         /// Cloth and lettering.
         colors: [Rgb; 2],
@@ -157,14 +157,14 @@ pub enum Texture {
         /// Seed of the pattern.
         seed: u32,
     },
-    /// A printed poster that fills the surface.
+    /// A poster that fills the surface.
     Poster(Arc<Poster>),
-    /// A surface with posters stuck on it, all in one plane.
+    /// A surface with posters on it, all in one plane.
     Collage(Arc<Collage>),
 }
 
 impl Texture {
-    /// Reflectance (or radiance of [`Texture::Emissive`]) at a point.
+    /// Returns the reflectance (or the radiance of [`Texture::Emissive`]) at a point.
     pub(crate) fn color(&self, p: &SurfacePoint) -> Rgb {
         let (u, v, w) = (p.u, p.v, p.width);
         match self {
@@ -178,7 +178,7 @@ impl Texture {
                 let inside = edge(x, w) * edge(n - x, w) * edge(y, w) * edge(m - y, w);
                 mix([0.85; 3], [0.03; 3], inside * (1.0 - checker(x, y, w)))
             }
-            Self::Print(print) => mix([0.85; 3], [0.03; 3], print.black(u, v, w)),
+            Self::Print(print) => mix([0.85; 3], [0.03; 3], print.black_fraction(u, v, w)),
             Self::Paint { color, seed } => {
                 let mottle = 0.030 * fbm(u, v, const { &Octaves::new(1.3, 4, 0.7) }, *seed, w);
                 let roller = 0.055 * fbm(u, v, const { &Octaves::new(45.0, 3, 0.8) }, seed ^ 7, w);
@@ -203,7 +203,7 @@ impl Texture {
             }
             Self::Spine { colors, seed } => spine(colors, *seed, p),
             Self::Pages { seed } => {
-                let lines = 0.16 * visible(900.0, w) * noise2(u * 6.0, v * 900.0, *seed);
+                let lines = 0.16 * contrast(900.0, w) * noise2(u * 6.0, v * 900.0, *seed);
                 let bands = 0.10 * fbm(u * 0.2, v, const { &Octaves::new(60.0, 2, 0.7) }, seed ^ 1, w);
                 scale([0.66, 0.61, 0.50], 1.0 + lines + bands)
             }
@@ -218,33 +218,34 @@ impl Texture {
     }
 }
 
-/// A ground with posters on it; see [`Texture::Collage`].
+/// A ground with posters; see [`Texture::Collage`].
 #[derive(Debug, Clone)]
 pub struct Collage {
     ground: Texture,
     posters: Vec<((f32, f32), Poster)>,
-    /// For each meter along u from 0, the posters that may show there.
+    /// For each meter along u from 0, the posters that may be visible there.
     columns: Vec<Vec<usize>>,
 }
 
 impl Collage {
-    /// Corner (u, v) of each poster in meters from the surface's corner; later ones on top.
+    /// Creates a collage from the corner (u, v) of each poster in meters from the surface's corner; later posters are
+    /// on top.
     pub fn new(ground: Texture, posters: Vec<((f32, f32), Poster)>) -> Self {
-        let reach = |&((left, _), ref poster): &((f32, f32), Poster)| {
+        let column_range = |&((left, _), ref poster): &((f32, f32), Poster)| {
             let column = |u: f32| u.clamp(0.0, 1e4) as usize;
-            (column(left - Self::RIM), column(left + poster.size().0 + Self::RIM))
+            (column(left - Self::MARGIN), column(left + poster.size().0 + Self::MARGIN))
         };
-        let count = posters.iter().map(|p| reach(p).1 + 1).max().unwrap_or(0);
+        let count = posters.iter().map(|p| column_range(p).1 + 1).max().unwrap_or(0);
         let mut columns = vec![Vec::new(); count];
         for (i, poster) in posters.iter().enumerate() {
-            let (from, to) = reach(poster);
+            let (from, to) = column_range(poster);
             columns[from..=to].iter_mut().for_each(|c| c.push(i));
         }
         Self { ground, posters, columns }
     }
 
-    /// Samples wider than twice this blur a poster's outline less than they should.
-    const RIM: f32 = 0.02;
+    /// Margin of the posters in meters; samples wider than twice this blur a poster's border too little.
+    const MARGIN: f32 = 0.02;
 
     fn color(&self, p: &SurfacePoint) -> Rgb {
         let w = p.width;
@@ -254,7 +255,7 @@ impl Collage {
             let (x, y) = (p.u - left, p.v - top);
             let (width, height) = poster.size();
             let inset = x.min(y).min(width - x).min(height - y);
-            if inset > -Self::RIM {
+            if inset > -Self::MARGIN {
                 let cover = edge(x, w) * edge(width - x, w) * edge(y, w) * edge(height - y, w);
                 if cover > 0.0 {
                     let behind = if cover < 1.0 { color.unwrap_or_else(|| self.ground.color(p)) } else { [0.0; 3] };
@@ -266,15 +267,15 @@ impl Collage {
     }
 }
 
-/// 0 on the square at the corner, 1 on its neighbors; lengths in squares.
+/// Returns 0 on the square at the corner, 1 on its neighbors; lengths in squares.
 fn checker(x: f32, y: f32, w: f32) -> f32 {
-    // Each axis: a square wave of ±1 that is +1 just above even edges, box filtered about the nearest edge.
+    // For each axis a square wave of ±1, +1 just above even edges, box-filtered at the nearest edge.
     let wave = |t: f32| {
         let nearest = floor(t + 0.5);
         let side = 2.0 * edge(t - nearest as f32, w) - 1.0;
         if nearest & 1 == 0 { side } else { -side }
     };
-    0.5 - 0.5 * wave(x) * wave(y) * visible(0.5, w)
+    0.5 - 0.5 * wave(x) * wave(y) * contrast(0.5, w)
 }
 
 fn wallpaper(ground: Rgb, inks: &[Rgb; 3], cell: f32, seed: u32, p: &SurfacePoint) -> Rgb {
@@ -342,13 +343,13 @@ fn wood(colors: &[Rgb; 2], seed: u32, u: f32, v: f32, w: f32) -> Rgb {
     let bend = fbm(u * 0.35, v, const { &Octaves::new(2.2, 3, 0.5) }, seed, w);
     let place = 34.0 * v + 2.4 * bend;
     let phase = place - floor(place) as f32;
-    let ring = visible(34.0, w) * (phase * phase - 0.33);
+    let ring = contrast(34.0, w) * (phase * phase - 0.33);
     // Fibres: streaks of every width down to the pores, a few centimeters long.
     let fibre = fbm(u * 0.05, v, const { &Octaves::new(55.0, 5, 0.8) }, seed ^ 3, w);
     let cloud = fbm(u * 0.4, v, const { &Octaves::new(7.0, 3, 0.6) }, seed ^ 4, w);
     let t = 0.5 + 0.35 * ring + 0.20 * fibre + 0.22 * cloud + 0.15 * bend;
     // Pores: short dark strokes, some clusters of them, and the flecks of the rays across.
-    let pores = visible(420.0, w) * noise2(u * 60.0, v * 420.0, seed ^ 2).max(0.0);
+    let pores = contrast(420.0, w) * noise2(u * 60.0, v * 420.0, seed ^ 2).max(0.0);
     let flecks = 0.09 * fbm(u, v, const { &Octaves::new(70.0, 4, 0.85) }, seed ^ 5, w);
     scale(mix(colors[0], colors[1], t.clamp(0.0, 1.0)), (1.0 - 0.4 * pores) * (1.0 + flecks))
 }
@@ -388,7 +389,7 @@ fn rug(colors: &[Rgb; 3], seed: u32, p: &SurfacePoint) -> Rgb {
     let (u, v, w) = (p.u, p.v, p.width);
     let inset = u.min(p.size.0 - u).min(v).min(p.size.1 - v);
     let band = |from: f32, to: f32| edge(inset - from, w) * edge(to - inset, w);
-    // Ornaments: level sets of a bent field, mirrored about the middle, as weavers do.
+    // Ornaments: level sets of a distorted field, mirrored about the center.
     let (mu, mv) = ((u - 0.5 * p.size.0).abs(), (v - 0.5 * p.size.1).abs());
     let field = fbm(mu, mv, const { &Octaves::new(4.0, 4, 0.55) }, seed, w);
     let soft = (9.0 * w).max(0.03);

@@ -1,4 +1,4 @@
-//! What is where in which view.
+//! Correspondences between views, from the geometry of the scene.
 
 use crate::render::Rendered;
 use crate::scene::Scene;
@@ -8,9 +8,9 @@ use nalgebra::{Matrix3, Point3, Vector3};
 use rayon::prelude::*;
 
 impl Scene {
-    /// The point that a camera sees at a pixel, in world coordinates.
+    /// Returns the world position of the surface at a pixel of a camera.
     ///
-    /// `None` where there is nothing, or where the lens lets no ray in.
+    /// `None` without a surface, or outside the range of the distortion model.
     pub fn point_at(&self, camera: &Camera, pose: &Pose, pixel: Point2<f64>) -> Option<Point3<f64>> {
         let n = camera.normalize(pixel);
         let dir = pose.rotation.inverse() * Vector3::new(n.x, n.y, 1.0);
@@ -19,25 +19,25 @@ impl Scene {
         Some(ray.origin + ray.dir * hit.t)
     }
 
-    /// The pixel at which a camera sees a point; `None` where something hides it or it falls outside the picture.
+    /// Returns the pixel of a point in a camera; `None` if it is occluded or out of view.
     pub fn pixel_of(&self, camera: &Camera, pose: &Pose, point: &Point3<f64>) -> Option<Point2<f64>> {
-        let seen = pose.transform(point);
-        let pixel = camera.project(&seen)?;
-        let inside = |v: f64, n: usize| v >= -0.5 && v <= n as f64 - 0.5;
-        // A lens model that folds back beyond its range would put far points into the picture too.
-        let back = camera.normalize(pixel);
-        let unfolded = (back.x - seen.x / seen.z).hypot(back.y - seen.y / seen.z) < 1e-6;
-        let visible = unfolded && inside(pixel.x, camera.width) && inside(pixel.y, camera.height);
-        (visible && self.sees(point, &pose.center())).then_some(pixel)
+        let local = pose.transform(point);
+        let pixel = camera.project(&local)?;
+        let is_inside = |v: f64, n: usize| v >= -0.5 && v <= n as f64 - 0.5;
+        // A distortion model that is not monotonic beyond its range would project distant points into the image too.
+        let undistorted = camera.normalize(pixel);
+        let is_in_range = (undistorted.x - local.x / local.z).hypot(undistorted.y - local.y / local.z) < 1e-6;
+        let is_in_view = is_in_range && is_inside(pixel.x, camera.width) && is_inside(pixel.y, camera.height);
+        (is_in_view && self.has_line_of_sight(point, &pose.center())).then_some(pixel)
     }
 
-    /// Where view `b` sees what pixel `(x, y)` of view `a` shows, if it does.
+    /// Transfers pixel `(x, y)` of view `a` to view `b`; `None` if it is not visible there.
     fn transfer(&self, a: &Rendered, b: &Rendered, x: usize, y: usize) -> Option<Point2<f64>> {
         let point = self.point_at(&a.camera, &a.pose, Point2::new(x as f64, y as f64))?;
         self.pixel_of(&b.camera, &b.pose, &point)
     }
 
-    /// The pixels of `a` whose centers `b` sees too: in its picture and not hidden.
+    /// Returns the pixels of `a` whose centers are visible in `b`: in view and not occluded.
     pub fn visible_in_both(&self, a: &Rendered, b: &Rendered) -> Mask {
         let (width, height) = a.depth.size();
         let mut mask = Image::new(width, height, [false]);
@@ -47,7 +47,7 @@ impl Scene {
         mask
     }
 
-    /// Exact correspondences: every `step`-th pixel of `a` in both directions that `b` sees too.
+    /// Returns exact correspondences: every `step`-th pixel of `a` in both directions that is visible in `b`.
     pub fn correspondences(&self, a: &Rendered, b: &Rendered, step: usize) -> Vec<Correspondence> {
         let (width, height) = a.depth.size();
         let step = step.max(1);
@@ -63,12 +63,12 @@ impl Scene {
     }
 }
 
-/// The homography from pixels of `a` to pixels of `b` by way of the plane through `point` (world) with `normal`.
+/// Returns the homography from pixels of `a` to pixels of `b` by the plane through `point` (world) with `normal`.
 ///
-/// Cameras without distortion; with it, it relates undistorted pixels. Hartley & Zisserman, 2nd ed., equation 13.2:
-/// `H = K_b (R + t nᵀ / d) K_a⁻¹` with the plane `nᵀ X = d` in the frame of `a`. Entry (3, 3) is 1.
+/// With distorted cameras it relates undistorted pixels. Hartley & Zisserman, 2nd ed., equation 13.2: `H = K_b (R + t
+/// nᵀ / d) K_a⁻¹` with the plane `nᵀ X = d` in the frame of `a`. Entry (3, 3) is 1.
 ///
-/// `None` where the plane passes through the center of `a`.
+/// `None` if the plane contains the center of `a`.
 pub fn plane_homography(
     a: (&Camera, &Pose),
     b: (&Camera, &Pose),
@@ -81,19 +81,19 @@ pub fn plane_homography(
         return None;
     }
     let relative = Pose::relative(a.1, b.1);
-    let between = relative.rotation.matrix() + relative.translation * n.transpose() / d;
-    Some(normalized(b.0.matrix() * between * a.0.inverse_matrix()))
+    let induced = relative.rotation.matrix() + relative.translation * n.transpose() / d;
+    Some(normalized(b.0.matrix() * induced * a.0.inverse_matrix()))
 }
 
-/// The homography from pixels of `a` to pixels of `b` between cameras with a common center: `K_b R K_a⁻¹`.
+/// Returns the homography from pixels of `a` to pixels of `b` between cameras with a common center: `K_b R K_a⁻¹`.
 ///
-/// Cameras without distortion; with it, it relates undistorted pixels. Entry (3, 3) is 1.
+/// With distorted cameras it relates undistorted pixels. Entry (3, 3) is 1.
 pub fn rotation_homography(a: (&Camera, &Pose), b: (&Camera, &Pose)) -> Matrix3<f64> {
     let relative = Pose::relative(a.1, b.1);
     normalized(b.0.matrix() * relative.rotation.matrix() * a.0.inverse_matrix())
 }
 
-/// Scaled so that entry (3, 3) is 1, or to unit norm where that entry is as good as zero.
+/// Scales a homography so that entry (3, 3) is 1, or to unit norm if that entry is nearly zero.
 fn normalized(h: Matrix3<f64>) -> Matrix3<f64> {
     let norm = h.norm();
     if h[(2, 2)].abs() > 1e-9 * norm { h / h[(2, 2)] } else { h / norm }

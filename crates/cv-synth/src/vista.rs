@@ -1,5 +1,6 @@
-//! A wide landscape under a bright sky: light that is known in every direction, and photographs of it from one place by a camera with faults. For what panoramas
-//! do with light, where the walls of a room ([`panorama_views`](crate::panorama_views)) hold too little of it.
+//! A wide landscape of known radiance in every direction, and images of it from one center by a camera with a response
+//! curve, vignetting and noise. It tests the photometric part of panoramas, for which a room
+//! ([`panorama_views`](crate::panorama_views)) has too little contrast.
 
 use crate::error::SynthError;
 use crate::noise::noise2;
@@ -17,7 +18,8 @@ pub struct Vista {
 }
 
 impl Vista {
-    /// A landscape whose finest texture has `detail` periods to the radian, 50 to 5000: a quarter of a camera's focal length in pixels suits it.
+    /// Creates a landscape whose finest texture has `detail` periods per radian, 50 to 5000; a quarter of the focal
+    /// length in pixels is suitable.
     pub fn new(seed: u64, detail: f32) -> Self {
         Self {
             seed: Rng::new(seed, 70).seed32(),
@@ -25,7 +27,8 @@ impl Vista {
         }
     }
 
-    /// The light from a direction, linear; 1 is what a well-exposed picture shows as white, the sun is brighter. X right, Y down, Z forward; any length.
+    /// Returns the linear radiance from a direction; 1 is white in a well-exposed image, the sun is brighter. X right,
+    /// Y down, Z forward; any length.
     pub fn radiance(&self, ray: &Vector3<f64>) -> Rgb {
         let across = ray.x.hypot(ray.z);
         let (az, el) = (ray.x.atan2(ray.z) as f32, (-ray.y).atan2(across) as f32);
@@ -38,20 +41,20 @@ impl Vista {
         }
         let grass = self.texture(az, el, 6.0);
         let (near, far): (Rgb, Rgb) = ([0.10, 0.16, 0.05], [0.12, 0.17, 0.16]);
-        let share = ((el + 0.25) / 0.35).clamp(0.0, 1.0);
-        std::array::from_fn(|c| (near[c] + share * (far[c] - near[c])) * grass)
+        let t = ((el + 0.25) / 0.35).clamp(0.0, 1.0);
+        std::array::from_fn(|c| (near[c] + t * (far[c] - near[c])) * grass)
     }
 
     fn sky(&self, ray: &Vector3<f64>, el: f32) -> Rgb {
         let sun = Vector3::new(0.5, -0.55, 1.0).normalize();
-        let off = 1.0 - ray.normalize().dot(&sun) as f32;
-        let glow = 0.5 * (-off * 12.0).exp() + if off < 1e-4 { 40.0 } else { 0.0 };
+        let one_minus_cos = 1.0 - ray.normalize().dot(&sun) as f32;
+        let glow = 0.5 * (-one_minus_cos * 12.0).exp() + if one_minus_cos < 1e-4 { 40.0 } else { 0.0 };
         let t = (el / 1.2).clamp(0.0, 1.0).sqrt();
         let (low, high): (Rgb, Rgb) = ([0.52, 0.62, 0.72], [0.14, 0.28, 0.58]);
         std::array::from_fn(|c| low[c] + t * (high[c] - low[c]) + glow)
     }
 
-    /// Plastered walls with windows.
+    /// Returns the radiance of plastered walls with windows.
     fn houses(&self, az: f32, el: f32) -> Rgb {
         let (u, v) = (az * 14.0, (el + 0.16) * 30.0);
         let (house, story) = ((u / 4.0).floor(), v.floor());
@@ -66,7 +69,7 @@ impl Vista {
         [wall, 0.9 * wall, (0.75 - 0.15 * tint) * wall]
     }
 
-    /// Octaves from `first` periods a radian to the finest, around 1.
+    /// Returns octaves of noise from `first` periods per radian to the finest, around 1.
     fn texture(&self, az: f32, el: f32, first: f32) -> f32 {
         let (mut sum, mut frequency, mut octave) = (0.0, first, 0);
         while frequency <= self.detail {
@@ -78,28 +81,28 @@ impl Vista {
     }
 }
 
-/// How [`vista_photos`] takes its pictures.
+/// Options of [`vista_photos`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct VistaOptions {
-    /// Number of pictures. Default 8.
+    /// Number of images. Default 8.
     pub views: usize,
-    /// Share of a picture's width that its neighbor sees too, 0.1 to 0.9. Default 0.45.
+    /// Overlap of neighboring images, as a ratio of the width, 0.1 to 0.9. Default 0.45.
     pub overlap: f64,
-    /// Exposures, in stops, lie between minus and plus this; one picture has each. Default 1.
+    /// Range of exposures, in stops: from minus to plus this, and both occur. Default 1.
     pub exposure: f32,
-    /// Largest share by which red and blue are off, each picture its own. Default 0.
+    /// Largest relative error of red and blue, different for each image. Default 0.
     pub white_balance: f32,
-    /// Share of the light that the corners lose. Default 0.35, a wide lens wide open.
+    /// Vignetting: relative loss at the corners. Default 0.35, a wide-angle lens wide open.
     pub vignetting: f32,
-    /// Strength of the S-shaped curve that the camera puts on top of sRGB, 0 to 0.8. Default 0.4.
+    /// Strength of the S-shaped response curve on top of sRGB, 0 to 0.8. Default 0.4.
     pub contrast: f32,
     /// Standard deviation of the noise in gray levels. Default 1.
     pub noise: f32,
     /// Samples along each side of a pixel. Default 2.
     pub samples: usize,
-    /// Largest pitch, roll and unevenness of the turn, in radians. Default 0.02.
+    /// Largest pitch, roll and yaw error, in radians. Default 0.02.
     pub shake: f64,
-    /// Someone stands at another place in every picture. Default false.
+    /// Whether a person stands at another place in every image. Default false.
     pub walker: bool,
 }
 
@@ -120,33 +123,34 @@ impl Default for VistaOptions {
     }
 }
 
-/// A picture and what is true about it.
+/// An image with its ground truth.
 #[derive(Debug, Clone)]
 pub struct VistaPhoto {
-    /// As the camera stores it.
+    /// The image as the camera stores it.
     pub image: RgbU8,
     /// The camera.
     pub camera: Camera,
-    /// World to camera.
+    /// Rotation from world to camera.
     pub from_world: Rotation3<f64>,
-    /// Stops.
+    /// Exposure in stops.
     pub exposure: f32,
-    /// Factors on red, green and blue.
+    /// White balance factors of red, green and blue.
     pub white_balance: Rgb,
-    /// Where the walker is.
+    /// Mask of the person.
     pub walker: Mask,
 }
 
-/// The level, 0 to 1, that a camera of this contrast stores for an amount of light: sRGB and on top of it `v + contrast · v (1 − v) (2 v − 1)`.
-pub fn vista_level(light: f32, contrast: f32) -> f32 {
-    let v = encode_srgb(light.clamp(0.0, 1.0));
+/// Returns the camera response: the level, 0 to 1, that a camera of this contrast stores for a linear intensity, sRGB
+/// followed by `v + contrast · v (1 − v) (2 v − 1)`.
+pub fn vista_response(intensity: f32, contrast: f32) -> f32 {
+    let v = encode_srgb(intensity.clamp(0.0, 1.0));
     v + contrast * v * (1.0 - v) * (2.0 * v - 1.0)
 }
 
-/// Pictures of a landscape, turning to the right by as much as the overlap leaves.
+/// Renders images of a landscape by a camera that rotates to the right, with the given overlap.
 ///
 /// # Errors
-/// [`SynthError::Camera`] or [`SynthError::Size`] where the camera is none.
+/// [`SynthError::Camera`] or [`SynthError::Size`] if the camera is not valid.
 pub fn vista_photos(
     vista: &Vista,
     seed: u64,
@@ -166,39 +170,39 @@ pub fn vista_photos(
     let (low, high) = (extreme(f32::min), extreme(f32::max));
     exposures.iter_mut().for_each(|e| *e = options.exposure * (2.0 * (*e - low) / (high - low).max(1e-6) - 1.0));
     let photos = exposures.into_iter().enumerate().map(|(k, exposure)| {
-        let mut shaken = || rng.range(-options.shake, options.shake);
-        let yaw = step * (k as f64 - 0.5 * (n as f64 - 1.0)) + shaken();
-        let (pitch, roll) = (0.08 + shaken(), shaken());
+        let mut jitter = || rng.range(-options.shake, options.shake);
+        let yaw = step * (k as f64 - 0.5 * (n as f64 - 1.0)) + jitter();
+        let (pitch, roll) = (0.08 + jitter(), jitter());
         let from_world = Rotation3::from_axis_angle(&Vector3::z_axis(), roll)
             * Rotation3::from_axis_angle(&Vector3::x_axis(), -pitch)
             * Rotation3::from_axis_angle(&Vector3::y_axis(), -yaw);
         let mut factor = || 1.0 + rng.range32(-options.white_balance, options.white_balance);
         let white_balance = [factor(), 1.0, factor()];
-        let stands = options.walker.then(|| (yaw + rng.range(-0.35, 0.35) * field) as f32);
-        let taken = Taken { vista, camera, from_world, exposure, white_balance, stands, options };
-        taken.photo(seed ^ (k as u64) << 32)
+        let walker_azimuth = options.walker.then(|| (yaw + rng.range(-0.35, 0.35) * field) as f32);
+        let shot = Exposure { vista, camera, from_world, exposure, white_balance, walker_azimuth, options };
+        shot.photo(seed ^ (k as u64) << 32)
     });
     Ok(photos.collect())
 }
 
-/// One picture about to be taken.
-struct Taken<'a> {
+/// The parameters of one image.
+struct Exposure<'a> {
     vista: &'a Vista,
     camera: &'a Camera,
     from_world: Rotation3<f64>,
     exposure: f32,
     white_balance: Rgb,
-    /// Azimuth of the walker.
-    stands: Option<f32>,
+    /// Azimuth of the person.
+    walker_azimuth: Option<f32>,
     options: &'a VistaOptions,
 }
 
-impl Taken<'_> {
+impl Exposure<'_> {
     fn is_walker(&self, ray: &Vector3<f64>) -> bool {
-        let Some(stands) = self.stands else { return false };
+        let Some(walker_azimuth) = self.walker_azimuth else { return false };
         let (az, el) = (ray.x.atan2(ray.z) as f32, (-ray.y).atan2(ray.x.hypot(ray.z)) as f32);
-        let body = ((az - stands) / 0.035).powi(2) + ((el + 0.20) / 0.11).powi(2);
-        let head = ((az - stands) / 0.016).powi(2) + ((el + 0.075) / 0.022).powi(2);
+        let body = ((az - walker_azimuth) / 0.035).powi(2) + ((el + 0.20) / 0.11).powi(2);
+        let head = ((az - walker_azimuth) / 0.016).powi(2) + ((el + 0.075) / 0.022).powi(2);
         body < 1.0 || head < 1.0
     }
 
@@ -210,7 +214,7 @@ impl Taken<'_> {
             let p = camera.normalize(Point2::new(x, y));
             world * Vector3::new(p.x, p.y, 1.0)
         };
-        let light = |ray: &Vector3<f64>| {
+        let radiance_of = |ray: &Vector3<f64>| {
             if self.is_walker(ray) { [0.35, 0.05, 0.06] } else { self.vista.radiance(ray) }
         };
         let n = options.samples.max(1);
@@ -221,12 +225,12 @@ impl Taken<'_> {
             for (x, out) in row.as_chunks_mut::<3>().0.iter_mut().enumerate() {
                 let mut sum = [0.0; 3];
                 for i in 0..n * n {
-                    let within = |k: usize| (k as f64 + 0.5) / n as f64 - 0.5;
-                    let l = light(&ray(x as f64 + within(i % n), y as f64 + within(i / n)));
+                    let offset = |k: usize| (k as f64 + 0.5) / n as f64 - 0.5;
+                    let l = radiance_of(&ray(x as f64 + offset(i % n), y as f64 + offset(i / n)));
                     (0..3).for_each(|c| sum[c] += l[c] / (n * n) as f32);
                 }
                 let (dx, dy) = (x as f32 - cx, y as f32 - cy);
-                let exposed = self.exposure.exp2() * (1.0 - options.vignetting * (dx * dx + dy * dy) / corner);
+                let factor = self.exposure.exp2() * (1.0 - options.vignetting * (dx * dx + dy * dy) / corner);
                 let counter = 2 * (y * width + x) as u64;
                 let noise = if options.noise > 0.0 {
                     let (a, b) = normal_pair(seed, counter);
@@ -235,15 +239,15 @@ impl Taken<'_> {
                     [0.0; 3]
                 };
                 for c in 0..3 {
-                    let level = vista_level(sum[c] * exposed * self.white_balance[c], options.contrast);
-                    // What is clipped is clipped: no noise lifts it back.
+                    let level = vista_response(sum[c] * factor * self.white_balance[c], options.contrast);
+                    // Clipped pixels have no noise.
                     let noise = if level >= 1.0 { 0.0 } else { options.noise * noise[c] };
                     out[c] = (255.0 * level + noise).clamp(0.0, 255.0).round() as u8;
                 }
             }
         });
         let mut walker = Mask::new(width, height, [false]);
-        if self.stands.is_some() {
+        if self.walker_azimuth.is_some() {
             walker.as_mut_slice().par_chunks_mut(width).enumerate().for_each(|(y, row)| {
                 row.iter_mut().enumerate().for_each(|(x, m)| *m = self.is_walker(&ray(x as f64, y as f64)));
             });
@@ -258,19 +262,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_picture_shows_the_light_of_its_directions() {
+    fn an_image_shows_the_radiance_of_its_directions() {
         let (vista, camera) = (Vista::new(3, 40.0), Camera::from_focal(96, 64, 90.0));
         let plain = VistaOptions { views: 3, vignetting: 0.0, noise: 0.0, samples: 1, ..VistaOptions::default() };
         let photos = vista_photos(&vista, 5, &camera, &plain).unwrap();
         assert_eq!(photos.len(), 3);
         let stops: Vec<f32> = photos.iter().map(|p| p.exposure).collect();
-        // Both ends of the range are there.
+        // Both ends of the range occur.
         assert!(stops.contains(&-1.0) && stops.iter().any(|e| (e - 1.0).abs() < 1e-6), "{stops:?}");
         for photo in &photos {
             for (x, y) in [(5, 7), (50, 20), (90, 60)] {
                 let n = camera.normalize(Point2::new(x as f64, y as f64));
-                let light = vista.radiance(&(photo.from_world.inverse() * Vector3::new(n.x, n.y, 1.0)));
-                let level = light.map(|l| 255.0 * vista_level(l * photo.exposure.exp2(), 0.4));
+                let radiance = vista.radiance(&(photo.from_world.inverse() * Vector3::new(n.x, n.y, 1.0)));
+                let level = radiance.map(|l| 255.0 * vista_response(l * photo.exposure.exp2(), 0.4));
                 let off = photo.image.at(x, y).into_iter().zip(level).map(|(a, b)| (f32::from(a) - b).abs());
                 // Rounding to bytes.
                 assert!(off.fold(0.0, f32::max) <= 0.501, "{x} {y}");
@@ -284,9 +288,9 @@ mod tests {
     }
 
     #[test]
-    fn the_curve_of_the_camera_rises() {
+    fn the_camera_response_is_monotonic() {
         for contrast in [0.0, 0.4, 0.8] {
-            let levels: Vec<f32> = (0..=100).map(|i| vista_level(i as f32 / 100.0, contrast)).collect();
+            let levels: Vec<f32> = (0..=100).map(|i| vista_response(i as f32 / 100.0, contrast)).collect();
             assert!(levels.is_sorted() && levels[0] == 0.0 && (levels[100] - 1.0).abs() < 1e-5);
         }
     }

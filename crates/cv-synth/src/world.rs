@@ -1,4 +1,4 @@
-//! The surfaces and lights of a scene: what rays meet.
+//! The surfaces and lights of a scene, for ray casting.
 
 use crate::bvh::{Bvh, Item};
 use crate::shape::{Ray, Shape, Surface};
@@ -11,13 +11,13 @@ pub(crate) struct Prim {
     pub(crate) shape: Shape,
     pub(crate) texture: Texture,
     pub(crate) object: u32,
-    /// Share of the light mirrored, 0 to about 0.3, and the exponent of its lobe.
+    /// Specular reflectance, 0 to about 0.3, and the exponent of its lobe.
     pub(crate) specular: f32,
     pub(crate) gloss: f32,
     pub(crate) two_sided: bool,
 }
 
-/// Six rectangles that are the faces of a box.
+/// A box of six rectangles.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Block {
     pub(crate) first: usize,
@@ -26,7 +26,7 @@ pub(crate) struct Block {
     pub(crate) size: [f64; 3],
 }
 
-/// A rectangle that shines from its front.
+/// A rectangular light that emits from its front.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Light {
     pub(crate) corner: Point3<f64>,
@@ -35,14 +35,14 @@ pub(crate) struct Light {
     pub(crate) radiance: Rgb,
 }
 
-/// Where a ray meets the scene.
+/// A ray hit.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Hit {
     pub(crate) prim: usize,
     pub(crate) t: f64,
 }
 
-/// Surfaces, lights, and the tree over the surfaces.
+/// Surfaces, lights, and the bounding volume hierarchy.
 #[derive(Debug)]
 pub(crate) struct World {
     pub(crate) prims: Vec<Prim>,
@@ -54,11 +54,11 @@ pub(crate) struct World {
 
 impl World {
     pub(crate) fn new(prims: Vec<Prim>, blocks: Vec<Block>, lights: Vec<Light>, ambient: Rgb) -> Self {
-        let bvh = tree(&prims, &blocks);
+        let bvh = build_bvh(&prims, &blocks);
         Self { prims, blocks, lights, ambient, bvh }
     }
 
-    /// With more surfaces, whose objects have numbers of their own.
+    /// Returns the world with further surfaces, whose objects have identifiers of their own.
     pub(crate) fn with(&self, prims: impl IntoIterator<Item = Prim>, blocks: impl IntoIterator<Item = Block>) -> Self {
         let first = self.prims.len();
         let blocks = blocks.into_iter().map(|b| Block { first: b.first + first, ..b });
@@ -70,9 +70,10 @@ impl World {
         )
     }
 
+    /// Returns the first hit of a ray.
     pub(crate) fn hit(&self, ray: &Ray) -> Option<Hit> {
         let mut best = None;
-        self.bvh.walk(ray, f64::INFINITY, |item, far| match item.intersect(ray, 1e-9, far) {
+        self.bvh.traverse(ray, f64::INFINITY, |item, far| match item.intersect(ray, 1e-9, far) {
             Some((t, prim)) => {
                 best = Some(Hit { prim: prim as usize, t });
                 t
@@ -82,18 +83,19 @@ impl World {
         best
     }
 
-    pub(crate) fn blocked(&self, ray: &Ray, near: f64, far: f64) -> bool {
-        let mut found = false;
-        self.bvh.walk(ray, far, |item, far| {
-            if !found && item.intersect(ray, near, far).is_some() {
-                found = true;
+    /// Returns whether a ray hits a surface in `(near, far)`.
+    pub(crate) fn is_occluded(&self, ray: &Ray, near: f64, far: f64) -> bool {
+        let mut is_hit = false;
+        self.bvh.traverse(ray, far, |item, far| {
+            if !is_hit && item.intersect(ray, near, far).is_some() {
+                is_hit = true;
             }
-            if found { f64::NEG_INFINITY } else { far }
+            if is_hit { f64::NEG_INFINITY } else { far }
         });
-        found
+        is_hit
     }
 
-    /// Reflectance (or radiance) of a surface seen with a sample of `width` meters.
+    /// Returns the reflectance (or radiance) of a surface for a sample of `width` meters.
     #[inline]
     pub(crate) fn albedo(&self, prim: usize, surface: &Surface, width: f32) -> Rgb {
         let Prim { shape, texture, .. } = &self.prims[prim];
@@ -108,8 +110,8 @@ impl World {
     }
 }
 
-/// The tree over all surfaces, boxes as wholes.
-fn tree(prims: &[Prim], blocks: &[Block]) -> Bvh {
+/// Builds the hierarchy over all surfaces, with boxes as single items.
+fn build_bvh(prims: &[Prim], blocks: &[Block]) -> Bvh {
     let mut items = Vec::new();
     let mut next = 0;
     for block in blocks {

@@ -1,4 +1,4 @@
-//! Ground truth against formulas that do not go through the renderer.
+//! Ground truth against formulas that are independent of the renderer.
 
 use cv_core::{Camera, Distortion, Point2, Pose};
 use cv_synth::*;
@@ -24,7 +24,7 @@ fn depth_of_a_slanted_plane_is_that_of_the_plane_equation() {
     let scene = b.build(Pose::identity());
     for (camera, pose) in [(camera(), Pose::identity()), (lens(), somewhere())] {
         let view = render(&scene, &camera, &pose, &RenderOptions::ideal()).unwrap();
-        // The plane n·X = d in the camera's frame, by hand: n ∝ (−4, 0, 8).
+        // The plane n·X = d in the camera frame: n ∝ (−4, 0, 8).
         let n = pose.rotation * Vector3::new(-4.0, 0.0, 8.0);
         let d = n.dot(&pose.transform(&Point3::new(-7.0, -9.5, 0.5)).coords);
         for (x, y) in [(0, 0), (95, 71), (40, 30), (3, 60)] {
@@ -37,7 +37,7 @@ fn depth_of_a_slanted_plane_is_that_of_the_plane_equation() {
 }
 
 #[test]
-fn depth_of_a_sphere_is_that_of_the_sphere_equation_and_its_outline_too() {
+fn depth_and_silhouette_of_a_sphere_are_those_of_the_sphere_equation() {
     let mut b = SceneBuilder::new();
     let (center, radius) = (Point3::new(0.1, -0.05, 2.0), 0.4);
     b.object("ball").sphere(center, radius, Texture::Plain([0.5; 3]));
@@ -54,7 +54,7 @@ fn depth_of_a_sphere_is_that_of_the_sphere_equation_and_its_outline_too() {
             let miss = (center.coords - along * nearest).norm();
             if miss < radius {
                 let z = (nearest - (radius * radius - miss * miss).sqrt()) * along.z;
-                // Cancellation next to the outline loses half the digits of f64 at most; f32 rounding elsewhere.
+                // At the silhouette, cancellation loses at most half the digits of f64; f32 rounding elsewhere.
                 assert!((f64::from(view.depth.at(x, y)[0]) - z).abs() < 1e-6, "({x}, {y})");
                 assert_eq!(view.ids.at(x, y), [1]);
                 hits += 1;
@@ -68,7 +68,7 @@ fn depth_of_a_sphere_is_that_of_the_sphere_equation_and_its_outline_too() {
 }
 
 #[test]
-fn tubes_and_boxes_lie_on_their_equations() {
+fn frusta_and_boxes_satisfy_their_equations() {
     let mut b = SceneBuilder::new();
     let (base, top) = (Point3::new(-0.6, 0.5, 2.0), Point3::new(-0.4, -0.5, 2.3));
     b.object("tube").tube(base, top, (0.2, 0.1), Texture::Plain([0.5; 3]));
@@ -93,7 +93,7 @@ fn tubes_and_boxes_lie_on_their_equations() {
             let q = turn.inverse() * (p - middle);
             let off = (0..3).map(|a| (q[a].abs() - size[a] / 2.0).abs()).fold(f64::INFINITY, f64::min);
             assert!(off < 1e-9 && (0..3).all(|a| q[a].abs() < size[a] / 2.0 + 1e-9));
-            // The nearest point of a convex body faces the camera: what is behind is farther.
+            // The visible points of a convex body are on its near side.
             assert!(p.coords.norm() < middle.coords.norm() + 0.4);
         }
     }
@@ -123,7 +123,7 @@ fn a_box_shows_the_face_that_is_hit() {
 }
 
 #[test]
-fn unprojecting_depth_gives_the_point_the_pose_projects_back() {
+fn unprojection_by_depth_inverts_projection() {
     let scene = Scene::room(3);
     let pose = scene.viewpoint();
     let with = |distortion| Camera { distortion, ..camera() };
@@ -145,24 +145,24 @@ fn disparity_warps_each_view_onto_the_other() {
     let scene = Scene::tabletop(2);
     let camera = Camera::from_focal(200, 150, 170.0);
     let pair = stereo_pair(&scene, &camera, &scene.viewpoint(), 0.07, &RenderOptions::ideal()).unwrap();
-    let (mut seen, mut hidden, mut close) = (0, 0, 0);
+    let (mut seen, mut occluded_count, mut close) = (0, 0, 0);
     for (x, y) in (0..150).flat_map(|y| (0..200).map(move |x| (x, y))) {
         let d = f64::from(pair.disparity.at(x, y)[0]);
         if !pair.visible.at(x, y)[0] {
-            hidden += 1;
+            occluded_count += 1;
             continue;
         }
         seen += 1;
         let to = Point2::new(x as f64 - d, y as f64);
         let there = scene.point_at(&camera, &pair.right.pose, to).unwrap();
         let here = pair.left.world_point(x, y).unwrap();
-        // The same point but for f32 disparity: 1e-7 of 40 px is 4e-6 px, 5e-8 m there. Exactly on an edge a ray may
-        // slip past: such pixels are counted, not excused one by one.
+        // The same point up to the f32 disparity: 1e-7 of 40 px is 4e-6 px, 5e-8 m there. Exactly on an edge a ray may
+        // miss: such pixels are counted.
         close += usize::from((there - here).norm() < 1e-5);
     }
-    assert!(seen > 20_000 && hidden > 200, "{seen} {hidden}");
+    assert!(seen > 20_000 && occluded_count > 200, "{seen} {occluded_count}");
     assert!(close as f64 > 0.9995 * f64::from(seen), "{close} of {seen}");
-    // Hidden pixels are hidden: the right view sees something nearer, or they are outside it.
+    // Occluded pixels: the right view has a nearer surface, or they are out of view.
     let occluded = pair.occluded();
     for (x, y) in (0..150).step_by(3).flat_map(|y| (0..200).map(move |x| (x, y))) {
         if occluded.at(x, y)[0] {
@@ -186,7 +186,7 @@ fn homographies_map_pixels_to_the_same_point_and_color() {
             let q = Point2::new(q.x / q.z, q.y / q.z);
             let p = scene.point_at(&camera, &pair.a.pose, Point2::new(x as f64, y as f64)).unwrap();
             let r = camera.project(&pair.b.pose.transform(&p)).unwrap();
-            // Both are f64 all the way.
+            // Both are computed in f64.
             assert!((q - r).norm() < 1e-8, "{q} {r}");
             if q.x > 1.0 && q.y > 1.0 && q.x < 238.0 && q.y < 178.0 {
                 let (i, j) = (q.x.round() as usize, q.y.round() as usize);
@@ -195,13 +195,13 @@ fn homographies_map_pixels_to_the_same_point_and_color() {
                 (0..3).for_each(|c| sum[c] += f64::from(a[c] - b[c]).abs());
             }
         }
-        // Nearest pixel of a printed wall: mean differences of 0.25 are what a wrong map gives.
+        // Nearest pixels of a printed wall: a wrong homography has mean differences of 0.25.
         assert!(n > 700 && sum.iter().all(|s| s / f64::from(n) < 0.08), "{n} {sum:?}");
     }
 }
 
 #[test]
-fn a_panoramas_homographies_are_those_of_its_points() {
+fn the_homographies_of_a_panorama_agree_with_its_correspondences() {
     let camera = Camera::from_focal(80, 60, 70.0);
     let options = PanoramaSetOptions { views: 3, walker: true, ..PanoramaSetOptions::default() };
     let set = panorama_views(4, &camera, &options, &RenderOptions::default()).unwrap();
@@ -214,15 +214,18 @@ fn a_panoramas_homographies_are_those_of_its_points() {
         assert!((q.x / q.z - c.b.x).hypot(q.y / q.z - c.b.y) < 1e-8);
         assert!((set.transfer(0, 1, c.a).unwrap() - c.b).norm() < 1e-8);
     }
-    // What is in front of one view is behind one that looks the other way.
+    // Points in front of one view are behind one with the opposite direction.
     let around = PanoramaSetOptions { views: 4, overlap: 0.1, ..PanoramaSetOptions::default() };
     let around = panorama_views(4, &camera, &around, &RenderOptions::default()).unwrap();
     assert!(
         around.transfer(0, 3, Point2::new(39.5, 29.5)).is_none() && around.transfer(0, 4, Point2::origin()).is_none()
     );
-    // The walker is in some picture, in none wholly.
-    let share: Vec<usize> = set.walker.iter().map(|m| m.pixels().filter(|p| p[0]).count()).collect();
-    assert!(share.iter().sum::<usize>() > 30 && share.iter().all(|&s| s < 2400), "{share:?}");
+    // The person is visible in some view, in none wholly.
+    let visible_pixels: Vec<usize> = set.walker.iter().map(|m| m.pixels().filter(|p| p[0]).count()).collect();
+    assert!(
+        visible_pixels.iter().sum::<usize>() > 30 && visible_pixels.iter().all(|&s| s < 2400),
+        "{visible_pixels:?}"
+    );
 }
 
 #[test]
@@ -237,7 +240,7 @@ fn epipolar_geometry_holds_between_two_views() {
         for c in matches {
             let (a, b) = (camera.normalize(c.a), camera.normalize(c.b));
             let e = Vector3::new(b.x, b.y, 1.0).dot(&(essential * Vector3::new(a.x, a.y, 1.0)));
-            // Newton's 1e-13 and a few f64 roundings.
+            // Newton's 1e-13 and a few roundings of f64.
             assert!(e.abs() < 1e-10, "{e}");
         }
     }
@@ -249,7 +252,7 @@ fn the_balls_mask_is_its_projection() {
     let photos = ball_photos(1, 4, &camera, &RenderOptions::default()).unwrap();
     for photo in photos {
         let pixels = photo.mask.pixels().filter(|p| p[0]).count() as f64;
-        // A ball of angular radius asin(r/d) covers about π (f tan)² pixels near the axis, more off it.
+        // A ball of angular radius asin(r/d) covers about π (f tan)² pixels near the optical axis, more off it.
         let tan = (0.10 / photo.distance).asin().tan();
         let expected = std::f64::consts::PI * (130.0 * tan).powi(2);
         assert!(pixels > 0.6 * expected && pixels < 1.6 * expected, "{pixels} {expected} at {}", photo.distance);
@@ -265,7 +268,7 @@ fn the_balls_mask_is_its_projection() {
 }
 
 #[test]
-fn the_same_seed_is_the_same_bytes_at_any_number_of_threads() {
+fn the_same_seed_gives_the_same_bytes_with_any_number_of_threads() {
     let camera = lens();
     let take = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -285,7 +288,7 @@ fn the_same_seed_is_the_same_bytes_at_any_number_of_threads() {
 }
 
 #[test]
-fn a_distorted_picture_is_the_ideal_one_moved_by_the_lens() {
+fn a_distorted_image_is_the_undistorted_one_warped() {
     let scene = Scene::poster_wall(6);
     let ideal = Camera::from_focal(240, 180, 210.0);
     let lens = Camera { distortion: Distortion::radial(-0.2, 0.03), ..ideal };
@@ -300,12 +303,12 @@ fn a_distorted_picture_is_the_ideal_one_moved_by_the_lens() {
         stayed += f64::from((a.linear.at(x, y)[1] - b.linear.at(x, y)[1]).abs());
         n += 1.0;
     }
-    // Only the rounding to the nearest pixel is left of it.
+    // Only the rounding to the nearest pixel remains.
     assert!(moved < 0.35 * stayed, "{} {}", moved / n, stayed / n);
 }
 
 #[test]
-fn nonsense_is_refused() {
+fn invalid_input_is_an_error() {
     let scene = Scene::poster_wall(1);
     let bad = Camera::from_focal(10, 10, f64::NAN);
     let options = RenderOptions::default();
@@ -322,8 +325,8 @@ fn nonsense_is_refused() {
 }
 
 #[test]
-fn a_picture_is_the_same_whatever_pictures_were_taken_before() {
-    // Light is worked out where a picture first shows it.
+fn an_image_does_not_depend_on_earlier_images() {
+    // Irradiance is computed on demand.
     let side = |scene: &Scene| {
         let turn = Rotation3::from_axis_angle(&Vector3::y_axis(), 0.7);
         Pose::new(turn * scene.viewpoint().rotation, turn * scene.viewpoint().translation)

@@ -1,4 +1,4 @@
-//! The examples run.
+//! The examples run without errors.
 
 #[path = "../examples/two_views.rs"]
 mod two_views;

@@ -250,7 +250,7 @@ fn wide(python: &Path, folder: &Path, page: &mut Page) -> Result<()> {
     {
         let c = solved(&views, board, options)?.calibration;
         let outliers: usize =
-            c.views.iter().flat_map(|v| &v.pictures).map(|p| p.corners.iter().filter(|c| !c.used).count()).sum();
+            c.views.iter().flat_map(|v| &v.images).map(|p| p.corners.iter().filter(|c| !c.used).count()).sum();
         let _ = writeln!(
             page.text,
             "| ours, {name}{} | {found} of {} | {seconds:.3} | {:.3} | {:.3} | {:.3} | {:.3} | {outliers} |",

@@ -8,7 +8,7 @@ use cv_core::{Camera, Distortion, GrayF32, GrayU8, Point2, Pose, Rotation3, Vect
 use cv_imgproc::{gray_to_f32, resize_area, rgb_to_gray};
 use cv_pipeline::Silent;
 use cv_pipeline::calibration::{
-    BoardSize, CalibrateOptions, LensChoice, Sightings, TargetCorner, TargetPoints, calibrate,
+    BoardSize, CalibrateOptions, LensChoice, TargetCorner, TargetObservations, TargetPoints, calibrate,
 };
 use cv_synth::{ChessboardPhoto, ChessboardTrial, chessboard_photo, photo_without_board};
 use rayon::prelude::*;
@@ -40,7 +40,7 @@ struct Found {
 }
 
 /// 200 views of 11 × 8 corners with noise of 0.1 px a coordinate.
-fn sightings() -> Result<Sightings> {
+fn sightings() -> Result<TargetObservations> {
     let target = TargetPoints::grid(11, 8, 30.0)?;
     let distortion = Distortion::radial_tangential5([-0.35, 0.14, 1e-3, -5e-4, -0.02]);
     let camera = Camera { distortion, ..Camera::pinhole(1280, 960, 900.0, 902.0, 650.0, 470.0) };
@@ -65,7 +65,7 @@ fn sightings() -> Result<Sightings> {
         }
         views.push(vec![corners]);
     }
-    Ok(Sightings { target, sizes: vec![(1280, 960)], views })
+    Ok(TargetObservations { target, sizes: vec![(1280, 960)], views })
 }
 
 pub(super) fn solve(python: &Path, page: &mut Page) -> Result<()> {

@@ -3,7 +3,7 @@
 use anyhow::Result;
 use cv_core::{Camera, Distortion, Matrix3, Point2, Vector3};
 use cv_pipeline::{PanoramaOptions, PanoramaPhoto, PanoramaResult, Silent, panorama};
-use cv_synth::{Vista, VistaOptions, VistaPhoto, vista_level, vista_photos};
+use cv_synth::{Vista, VistaOptions, VistaPhoto, vista_photos, vista_response};
 
 /// A generated set: how it is taken, and the least PSNR asked of its panorama.
 pub(super) struct Generated {
@@ -136,7 +136,7 @@ fn psnr(vista: &Vista, photos: &[VistaPhoto], result: &PanoramaResult) -> f64 {
     }
     let error = |c: usize, gain: f64| {
         let off = |(light, shown): &([f32; 3], [u8; 3])| {
-            let level = 255.0 * vista_level(light[c] * gain as f32, CONTRAST);
+            let level = 255.0 * vista_response(light[c] * gain as f32, CONTRAST);
             f64::from(level - f32::from(shown[c])).powi(2)
         };
         samples.iter().map(off).sum::<f64>() / samples.len().max(1) as f64

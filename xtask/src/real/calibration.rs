@@ -97,7 +97,7 @@ fn flatness(views: &[Vec<PathBuf>], found: &BoardCalibration) -> Result<[Vec<f64
     };
     let mut shares = [Vec::new(), Vec::new()];
     for (v, pair) in views.iter().enumerate() {
-        let corners = &found.sightings.views[v][0];
+        let corners = &found.observations.views[v][0];
         let rectified = |point: usize| {
             let corner = corners.iter().find(|c| c.point == point)?;
             rectification.left.rectified_pixel(corner.pixel)
@@ -106,7 +106,7 @@ fn flatness(views: &[Vec<PathBuf>], found: &BoardCalibration) -> Result<[Vec<f64
         let shifts: Vec<(Point2<f64>, f64)> = corners
             .iter()
             .filter_map(|c| {
-                let right = found.sightings.views[v][1].iter().find(|r| r.point == c.point)?;
+                let right = found.observations.views[v][1].iter().find(|r| r.point == c.point)?;
                 let l = rectification.left.rectified_pixel(c.pixel)?;
                 Some((l, l.x - rectification.right.rectified_pixel(right.pixel)?.x))
             })

@@ -85,7 +85,7 @@ pub(super) fn run(folder: &Path, views: &[Vec<PathBuf>], found: &BoardCalibratio
             continue;
         }
         let corner = |point: usize| {
-            let corner = found.sightings.views[v][0].iter().find(|c| c.point == point)?;
+            let corner = found.observations.views[v][0].iter().find(|c| c.point == point)?;
             rectification.left.rectified_pixel(corner.pixel)
         };
         let outline = [0, columns - 1, columns * rows - 1, columns * (rows - 1)];

@@ -2,7 +2,7 @@
 
 use super::Failure;
 use cv_pipeline::calibration::{
-    BoardError, CalibrateError, CaptureNote, LensTrial, LensVerdict, PictureOutcome, PictureSide,
+    BoardError, CalibrateError, CaptureNote, ImageOutcome, ImageSide, LensTrial, LensVerdict,
 };
 use cv_pipeline::{BoardCalibrationError, PhotoRefusal};
 
@@ -18,13 +18,13 @@ pub(crate) fn refusal(refusal: &PhotoRefusal) -> String {
             format!("is {}×{} px, the first photograph {}×{} px", seen.0, seen.1, first.0, first.1)
         }
         PhotoRefusal::Corners(outcome) => match outcome {
-            PictureOutcome::Used { .. } => "used".to_owned(),
-            PictureOutcome::Nothing => "shows no board".to_owned(),
-            PictureOutcome::TooFewCorners { got, needed } => format!("has {got} corners, {needed} are needed"),
-            PictureOutcome::Flat => "shows the board from its edge".to_owned(),
-            PictureOutcome::Mirrored => "shows the board mirrored".to_owned(),
-            PictureOutcome::NoPose => "no pose of the board explains its corners".to_owned(),
-            PictureOutcome::Inconsistent { near, of, limit_px } => format!(
+            ImageOutcome::Used { .. } => "used".to_owned(),
+            ImageOutcome::Nothing => "shows no board".to_owned(),
+            ImageOutcome::TooFewCorners { got, needed } => format!("has {got} corners, {needed} are needed"),
+            ImageOutcome::Flat => "shows the board from its edge".to_owned(),
+            ImageOutcome::Mirrored => "shows the board mirrored".to_owned(),
+            ImageOutcome::NoPose => "no pose of the board explains its corners".to_owned(),
+            ImageOutcome::Inconsistent { near, of, limit_px } => format!(
                 "does not fit the others: {near} of {of} corners are within {limit_px:.2} px of where they should be"
             ),
             other => format!("{other:?}"),
@@ -114,10 +114,10 @@ pub(crate) fn note(note: &CaptureNote, names: &[impl AsRef<str>]) -> String {
         }
         CaptureNote::EmptySide { camera, side, .. } => {
             let quarter = match side {
-                PictureSide::Left => "left",
-                PictureSide::Right => "right",
-                PictureSide::Top => "upper",
-                PictureSide::Bottom => "lower",
+                ImageSide::Left => "left",
+                ImageSide::Right => "right",
+                ImageSide::Top => "upper",
+                ImageSide::Bottom => "lower",
             };
             format!("{}hardly a board in the {quarter} quarter of the picture; hold it there too", name(camera))
         }
@@ -155,7 +155,7 @@ mod tests {
 
     #[test]
     fn notes_say_what_to_photograph_and_by_which_camera() {
-        let side = CaptureNote::EmptySide { camera: 1, side: PictureSide::Right, covered: 0.1 };
+        let side = CaptureNote::EmptySide { camera: 1, side: ImageSide::Right, covered: 0.1 };
         assert!(note(&side, &["left", "right"]).starts_with("right camera: hardly a board in the right quarter"));
         assert!(note(&side, &["camera"]).starts_with("hardly a board"));
         let few = CalibrateError::TooFewViews { camera: 0, got: 1, needed: 3, small: 0, mirrored: 0 };

@@ -154,7 +154,7 @@ impl PlaceSource {
 
 /// What frame a model is in that was brought to known places.
 pub(crate) fn aligned(source: &PlaceSource, fit: &CenterFit) -> String {
-    let (count, rms) = (fit.agree.len(), fit.rms);
+    let (count, rms) = (fit.inliers.len(), fit.rms);
     let tilt = if fit.tilt { "" } else { "; they lie on a line, so that up is that of the photographs" };
     match source {
         PlaceSource::Gps { origin, heights } => {

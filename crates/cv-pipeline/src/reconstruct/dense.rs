@@ -1,4 +1,4 @@
-//! A dense cloud from two photographs whose geometry is known.
+//! Dense point cloud from two images with known geometry.
 
 use super::ReconstructResult;
 use crate::Progress;
@@ -12,15 +12,14 @@ use cv_stereo::{RectifyError, StereoError};
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct DenseOptions {
-    /// Photographs whose longer side is above this are reduced to it first, in pixels. 32 or more; default 1600: a million points or so, and
-    /// half a gigabyte of costs. (COLMAP matches at 2000.)
+    /// Images with a longer side above this are reduced to it first, in pixels. 32 or more; default 1600: about a
+    /// million points, and half a gigabyte for the cost volume. (COLMAP matches at 2000.)
     pub max_size: usize,
-    /// Most bytes the matcher may hold; above, it works in strips. Default 1 GiB.
+    /// Maximum number of bytes of the matcher; above, it works in strips. Default 1 GiB.
     pub max_memory: usize,
-    /// Largest standard deviation of the depth of a point that is kept, as a share of the depth. Above 0; default 0.05.
+    /// Largest standard deviation of the depth of a point, as a ratio of the depth. Above 0; default 0.05.
     pub max_deviation: f32,
-    /// Whether pixels that the other photograph does not confirm get a depth from around them. Default false: only what was
-    /// seen twice is a point.
+    /// Whether pixels without a confirmed match get a depth by hole filling. Default false.
     pub fill: bool,
 }
 
@@ -30,18 +29,18 @@ impl Default for DenseOptions {
     }
 }
 
-/// What [`reconstruct_dense`] found.
+/// Result of [`reconstruct_dense`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct DenseResult {
-    /// The points, in the frame and the unit of the sparse ones: the first camera's, and the distance between the cameras.
+    /// The points, in the frame and unit of the sparse ones: the first camera's frame, with the baseline as unit.
     pub cloud: PointCloud,
-    /// Depth along the first camera's axis for each pixel of the (reduced) first photograph, NaN where there is no point.
+    /// Depth along the first camera's axis for each pixel of the (reduced) first image, NaN where there is no point.
     pub depth: GrayF32,
-    /// Width and height of the rectified photographs in pixels.
+    /// Width and height of the rectified images in pixels.
     pub size: (usize, usize),
-    /// Smallest disparity of the rectified photographs in pixels, and number of disparities tried.
+    /// Smallest disparity of the rectified images in pixels, and number of disparities.
     pub disparities: (i32, usize),
-    /// Share of the pixels that both rectified photographs can show for which a depth was found and confirmed.
+    /// Fraction of the commonly visible pixels with a confirmed depth.
     pub coverage: f64,
     /// Stage names and their seconds.
     pub stages: Vec<(&'static str, f64)>,
@@ -51,18 +50,18 @@ pub struct DenseResult {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum DenseError {
-    /// The photographs cannot be turned so that their rows coincide.
+    /// The images cannot be rectified.
     #[error("the two photographs cannot be rectified: {0}")]
     Rectify(#[source] RectifyError),
-    /// The rectified photographs cannot be matched.
+    /// The rectified images cannot be matched.
     #[error(transparent)]
     Stereo(StereoError),
-    /// The other photograph confirms hardly any depth.
-    #[error("only {:.1} % of what both photographs show was matched and confirmed; {:.0} % are the least that means anything", 100.0 * .coverage, 100.0 * .needed)]
+    /// Hardly any depth is confirmed by the left-right check.
+    #[error("only {:.1} % of the commonly visible pixels were matched and confirmed; at least {:.0} % are needed", 100.0 * .coverage, 100.0 * .needed)]
     LittleConfirmed {
-        /// Share of the pixels that both show that were confirmed.
+        /// Fraction of the commonly visible pixels that were confirmed.
         coverage: f64,
-        /// The least that counts.
+        /// The minimum fraction.
         needed: f64,
     },
     /// An option is out of range.
@@ -91,14 +90,15 @@ impl From<RectifyError> for DenseError {
     }
 }
 
-/// A dense cloud of what two reconstructed photographs show: they are rectified by the geometry that was found
-/// ([`SceneRectification`](cv_stereo::SceneRectification)) and matched semi-globally ([`StereoMatcher`](cv_stereo::StereoMatcher)) over the disparities that the sparse points show. Pixels whose
-/// match is confirmed from the other photograph become points.
+/// Computes a dense point cloud of two reconstructed images: rectification by their geometry
+/// ([`SceneRectification`](cv_stereo::SceneRectification)), and semi-global matching
+/// ([`StereoMatcher`](cv_stereo::StereoMatcher)) over the disparities of the sparse points. Pixels whose match the
+/// left-right check confirms become points.
 ///
 /// O(pixels × disparities); the memory is bounded by [`DenseOptions::max_memory`] and some hundred bytes per pixel.
 ///
 /// # Errors
-/// [`DenseError`]: one camera stands ahead of the other, too little memory, or hardly any confirmed depth.
+/// [`DenseError`]: a motion along the optical axis, too little memory, or hardly any confirmed depth.
 pub fn reconstruct_dense(
     a: ImageView<'_, u8, 3>,
     b: ImageView<'_, u8, 3>,
@@ -120,16 +120,16 @@ pub fn reconstruct_dense(
     let factor = (options.max_size as f64 / longest as f64).min(1.0);
     let side = |n: usize| ((n as f64 * factor).round() as usize).max(1);
     let cameras = sparse.scene.cameras.map(|camera| camera.resized(side(camera.width), side(camera.height)));
-    let mut small = Vec::new();
+    let mut reduced = Vec::new();
     if factor < 1.0 {
         for (photo, camera) in photos.iter().zip(&cameras) {
             progress.report("reduce", 0, 1)?;
             let too_large = RectifyError::TooLarge { width: camera.width, height: camera.height };
-            small.push(resize_area(*photo, camera.width, camera.height).map_err(|_| too_large)?);
+            reduced.push(resize_area(*photo, camera.width, camera.height).map_err(|_| too_large)?);
         }
     }
     clock.lap("rectify");
-    let photos = if let [a, b] = &small[..] { [a.view(), b.view()] } else { photos };
+    let photos = if let [a, b] = &reduced[..] { [a.view(), b.view()] } else { photos };
     let rig = StereoRig { left: cameras[0], right: cameras[1], right_from_left: sparse.scene.pose };
     let positions: Vec<Point3<f64>> = sparse.scene.points.iter().map(|p| p.position).collect();
     let pair = pair_depth(photos, &rig, &positions, options, progress)?;
@@ -137,7 +137,7 @@ pub fn reconstruct_dense(
     let mut after = StageClock::new();
     let (cloud, depth) = (pair.cloud(), pair.depth_map(&cameras[0], progress)?);
     after.lap("cloud");
-    // Reducing counts as rectification.
+    // The reduction counts as rectification.
     let ours = clock.into_stages().into_iter().chain(after.into_stages());
     for (name, seconds) in ours {
         stages.iter_mut().filter(|(other, _)| *other == name).for_each(|(_, sum)| *sum += seconds);

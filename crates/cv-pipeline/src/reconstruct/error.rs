@@ -8,10 +8,10 @@ use cv_geometry::TwoViewError;
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum ReconstructError {
-    /// The photographs could not be matched at all.
+    /// The photographs could not be matched.
     #[error(transparent)]
     Matching(MatchingError),
-    /// The matches tell no motion, or no points.
+    /// The matches determine no motion or no points.
     #[error(transparent)]
     TwoView(TwoViewError),
     /// The job was stopped by its progress callback.

@@ -1,4 +1,4 @@
-//! Points and camera poses from two photographs.
+//! Two-view reconstruction: relative pose and points from two images.
 
 mod dense;
 mod error;
@@ -7,7 +7,7 @@ mod model;
 pub use dense::{DenseError, DenseOptions, DenseResult, reconstruct_dense};
 pub use error::ReconstructError;
 
-use crate::guided::{GuidedOptions, match_along_lines};
+use crate::guided::{GuidedOptions, match_epipolar};
 use crate::matching::match_reduced;
 use crate::{MatchingOptions, MatchingResult, Progress};
 use cv_core::{Correspondence, ImageView, Point2, PointCloud, StageClock};
@@ -23,19 +23,18 @@ use cv_geometry::{
 pub struct ReconstructOptions {
     /// Features and matches.
     pub matching: MatchingOptions,
-    /// Photographs whose longer side is above this are reduced to it before features are looked for, in pixels; positions are given in
-    /// pixels of the photograph all the same. 8 or more; default 2400 (COLMAP's high quality); finer
-    /// features are grain.
+    /// Images with a longer side above this are reduced to it for feature extraction, in pixels; positions are in
+    /// pixels of the full image. 8 or more; default 2400 (COLMAP's high quality): finer features are noise.
     pub max_size: usize,
-    /// Whether features are matched once more along the epipolar lines when the motion is known, which finds those that look alike
-    /// elsewhere (as COLMAP's guided matching does). Default true.
+    /// Whether guided matching along the epipolar lines follows once the motion is known, which finds features that
+    /// fail the ratio test (as in COLMAP). Default true.
     pub guided: bool,
-    /// What is known of the cameras, the search for the motion, and what is asked of the points.
+    /// Knowledge of the cameras, estimation of the motion, and acceptance of the points.
     pub two_view: TwoViewOptions,
 }
 
 impl ReconstructOptions {
-    /// The defaults, with what is known of the cameras.
+    /// Creates the default options for given intrinsics.
     pub fn new(intrinsics: Intrinsics) -> Self {
         Self { two_view: TwoViewOptions { intrinsics, ..TwoViewOptions::default() }, ..Self::default() }
     }
@@ -47,21 +46,21 @@ impl Default for ReconstructOptions {
     }
 }
 
-/// What [`reconstruct`] found.
+/// Result of [`reconstruct`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct ReconstructResult {
     /// Features and tentative matches.
     pub matching: MatchingResult,
     /// Cameras, pose and points.
     pub scene: TwoViewReconstruction,
-    /// Color of each of the scene's points in the first photograph.
+    /// Color of each point in the first image.
     pub colors: Vec<[u8; 3]>,
     /// Stage names and their seconds.
     pub stages: Vec<(&'static str, f64)>,
 }
 
 impl ReconstructResult {
-    /// Where a point of the scene was seen in the two photographs, in pixels.
+    /// Returns the two pixels of a point.
     ///
     /// # Panics
     /// For a point of another scene.
@@ -69,25 +68,26 @@ impl ReconstructResult {
         self.matching.pair(&self.scene.matches[point.match_index])
     }
 
-    /// Whether an estimated focal length is known so badly that it is worth a word: the depth of the scene goes with it.
+    /// Returns whether an estimated focal length has a large standard deviation: the depth of the scene scales with it.
     pub fn focal_is_doubtful(&self) -> bool {
-        // The error of a usual EXIF entry.
+        // The typical error of an EXIF focal length.
         self.scene.focal_deviation > 0.05
     }
 
-    /// The points with their colors.
+    /// Returns the points with their colors.
     pub fn cloud(&self) -> PointCloud {
         let positions = self.scene.points.iter().map(|p| p.position.coords.cast().into()).collect();
         PointCloud::colored(positions, self.colors.clone())
     }
 }
 
-/// Reconstructs what two photographs show: features, matches, and from those ([`TwoViewAdjustment`]) relative pose and points.
+/// Reconstructs the scene of two images: features, matches, and from those ([`TwoViewAdjustment`]) relative pose and
+/// points.
 ///
-/// The world is the first camera's frame and its unit the distance between the cameras, which photographs cannot tell.
+/// The world frame is that of the first camera, and its unit the baseline, since the scale is not observable.
 ///
 /// # Errors
-/// [`ReconstructError`], each with its numbers.
+/// [`ReconstructError`].
 pub fn reconstruct(
     a: ImageView<'_, u8, 3>,
     b: ImageView<'_, u8, 3>,
@@ -110,22 +110,23 @@ pub fn reconstruct(
         clock.time("bundle", || TwoViewAdjustment::new(&views, geometry, &options.two_view, progress))?;
     if options.guided {
         let threshold = options.two_view.robust.threshold as f32;
-        let along = GuidedOptions { threshold, ..GuidedOptions::default() };
-        let more = match_along_lines(fa, fb, adjustment.cameras(), &adjustment.fundamental(), &along, progress)?;
+        let guided_options = GuidedOptions { threshold, ..GuidedOptions::default() };
+        let guided_matches =
+            match_epipolar(fa, fb, adjustment.cameras(), &adjustment.fundamental(), &guided_options, progress)?;
         clock.lap("guided");
-        adjustment.add_matches(&more, progress)?;
+        adjustment.add_matches(&guided_matches, progress)?;
         clock.lap("bundle");
     }
     progress.report("filter", 0, 1)?;
     let scene = adjustment.finish()?;
-    let at = |p: &TwoViewPoint| color_at(a, matching.pair(&scene.matches[p.match_index]).a);
-    let colors = scene.points.iter().map(at).collect();
+    let color_of = |p: &TwoViewPoint| color_at(a, matching.pair(&scene.matches[p.match_index]).a);
+    let colors = scene.points.iter().map(color_of).collect();
     clock.lap("filter");
     Ok(ReconstructResult { matching, scene, colors, stages: clock.into_stages() })
 }
 
-/// The color of the pixel nearest to a position.
+/// Returns the color of the nearest pixel.
 fn color_at(photo: ImageView<'_, u8, 3>, p: Point2<f64>) -> [u8; 3] {
-    let near = |v: f64, n: usize| v.round().clamp(0.0, n.saturating_sub(1) as f64) as usize;
-    photo.get(near(p.x, photo.width()), near(p.y, photo.height())).unwrap_or([0; 3])
+    let nearest = |v: f64, n: usize| v.round().clamp(0.0, n.saturating_sub(1) as f64) as usize;
+    photo.get(nearest(p.x, photo.width()), nearest(p.y, photo.height())).unwrap_or([0; 3])
 }

@@ -1,4 +1,4 @@
-//! Which pairs of photographs are tried.
+//! Selection of the pairs to match: all, adjacent ones, or by image retrieval.
 
 use super::{PhotoOrder, SfmJobOptions, SfmPhoto};
 use crate::Progress;
@@ -6,18 +6,20 @@ use cv_core::Cancelled;
 use cv_features::{ByteDescriptors, Vocabulary, largest_keypoints, most_similar};
 use rayon::prelude::*;
 
-/// Words of the vocabulary of a set, those of Jégou et al.
-const WORDS: usize = 64;
-/// Most descriptors that the words are learned from.
-const MOST_SAMPLES: usize = 20_000;
-/// Features of largest scale that a photograph is told by.
-const DESCRIBED: usize = 1024;
-/// In a sequence: photographs before and after that each is tried with, and, among the others, those where it may have come back to an earlier place.
-const NEIGHBORS: usize = 10;
-const LOOPS: usize = 5;
+/// Number of words of the VLAD vocabulary (Jégou et al.).
+const VOCABULARY_SIZE: usize = 64;
+/// Maximum number of descriptors that the vocabulary is trained on.
+const MAX_TRAINING_DESCRIPTORS: usize = 20_000;
+/// Maximum number of features of an image for retrieval, those of largest scale.
+const MAX_RETRIEVAL_FEATURES: usize = 1024;
+/// Number of preceding and following photographs that each is matched with, in a sequence.
+const SEQUENCE_NEIGHBORS: usize = 10;
+/// Number of loop closure candidates of each photograph, in a sequence.
+const LOOP_CANDIDATES: usize = 5;
 
-/// The pairs to be tried, first before second, in order: all of them in sets where each photograph has no more than twice [`SfmJobOptions::partners`] others; in larger ones those that look
-/// most alike; in a sequence neighbors, and those that look most alike among the others.
+/// Returns the pairs to match, sorted, with the smaller index first: all pairs in sets of at most twice
+/// [`SfmJobOptions::partners`] plus one photographs, the most similar ones in larger sets, neighbors and the most
+/// similar others in a sequence.
 ///
 /// # Errors
 /// [`Cancelled`].
@@ -30,36 +32,38 @@ pub(super) fn candidate_pairs(
     let (near, partners) = match options.order {
         PhotoOrder::Any if n <= 2 * options.partners + 1 => (n, 0),
         PhotoOrder::Any => (0, options.partners),
-        PhotoOrder::Sequence => (NEIGHBORS, LOOPS.min(options.partners)),
+        PhotoOrder::Sequence => (SEQUENCE_NEIGHBORS, LOOP_CANDIDATES.min(options.partners)),
     };
     let mut pairs: Vec<(usize, usize)> =
         (0..n).flat_map(|a| (a + 1..n.min(a + 1 + near)).map(move |b| (a, b))).collect();
     if n > near + 1 && partners > 0 {
-        let alike = alike(photos, partners, near, progress)?;
-        pairs.extend(alike.iter().enumerate().flat_map(|(a, of)| of.iter().map(move |&b| (a.min(b), a.max(b)))));
+        let similar = similar_photos(photos, partners, near, progress)?;
+        pairs.extend(similar.iter().enumerate().flat_map(|(a, of)| of.iter().map(move |&b| (a.min(b), a.max(b)))));
     }
     pairs.sort_unstable();
     pairs.dedup();
     Ok(pairs)
 }
 
-/// For each photograph the `count` that look most like it, but for those up to `near` places from it.
-fn alike(
+/// Returns for each photograph the `count` most similar ones by VLAD, without those up to `near` positions away.
+fn similar_photos(
     photos: &[SfmPhoto],
     count: usize,
     near: usize,
     progress: &dyn Progress,
 ) -> Result<Vec<Vec<usize>>, Cancelled> {
-    let largest: Vec<ByteDescriptors> =
-        photos.par_iter().map(|p| p.descriptors.select(&largest_keypoints(&p.keypoints, DESCRIBED))).collect();
-    let each = (MOST_SAMPLES / photos.len()).max(1);
+    let largest: Vec<ByteDescriptors> = photos
+        .par_iter()
+        .map(|p| p.descriptors.select(&largest_keypoints(&p.keypoints, MAX_RETRIEVAL_FEATURES)))
+        .collect();
+    let each = (MAX_TRAINING_DESCRIPTORS / photos.len()).max(1);
     let sample =
         |set: &ByteDescriptors| (0..set.len().min(each)).map(|i| i * set.len() / each.min(set.len())).collect();
     let samples: Vec<(usize, Vec<usize>)> = largest.iter().map(sample).enumerate().collect();
     let Some(samples) = ByteDescriptors::gather(samples.iter().map(|(p, rows)| (&largest[*p], &rows[..]))) else {
         return Ok(vec![Vec::new(); photos.len()]);
     };
-    let Some(words) = Vocabulary::learn(&samples, WORDS, progress)? else {
+    let Some(words) = Vocabulary::learn(&samples, VOCABULARY_SIZE, progress)? else {
         return Ok(vec![Vec::new(); photos.len()]);
     };
     let described: Vec<Vec<f32>> = largest

@@ -1,6 +1,6 @@
-//! A dense cloud of a model of many views: depths of neighboring pairs, joined where pairs agree.
+//! Dense point cloud of a multi-view model: depth maps of neighboring pairs, and their fusion.
 
-use super::fusion::{ViewDepth, fuse, joined};
+use super::fusion::{ViewDepth, fuse, merge_depth_maps};
 use crate::pair_depth::pair_depth;
 use crate::{DenseError, DenseOptions, Progress};
 use cv_core::{
@@ -15,14 +15,15 @@ use std::collections::BTreeMap;
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct SfmDenseOptions {
-    /// How each pair is matched. Default that of two photographs, but for a longer side of 1200 px: each surface is seen by several pairs.
+    /// Options of each pair. Default those of two images, with a longer side of at most 1200 px: each surface is
+    /// observed by several pairs.
     pub pair: DenseOptions,
-    /// Photographs that each one is matched with at the most, 1 or more. Default 3.
+    /// Maximum number of photographs that each is matched with, 1 or more. Default 3.
     pub partners: usize,
-    /// Smallest and largest median angle between the rays of the points that two photographs share, in radians, for them to be matched. Default 3 and 25 degrees: depths are uncertain below, and
-    /// things look different above.
+    /// Range of the median triangulation angle of the common points of a pair, in radians. Default 3 to 25 degrees:
+    /// below, depths are uncertain, above, the appearance changes.
     pub angles: [f64; 2],
-    /// Largest relative difference of two depths that agree. Above 0; default 0.01.
+    /// Largest relative difference of two consistent depths. Above 0; default 0.01.
     pub tolerance: f32,
 }
 
@@ -37,19 +38,19 @@ impl Default for SfmDenseOptions {
     }
 }
 
-/// A photograph for [`sfm_dense`], reduced.
+/// A reduced photograph for [`sfm_dense`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct DensePhoto {
-    /// Its camera, of the reduced photograph.
+    /// Its camera, at the reduced size.
     pub(super) camera: Camera,
     pub(super) image: RgbU8,
 }
 
 impl DensePhoto {
-    /// The photograph of a camera, its longer side reduced to `max_size`.
+    /// Reduces the photograph of a camera to a longer side of at most `max_size`.
     ///
     /// # Errors
-    /// [`SfmDenseError::PhotoSize`] for a photograph that is not of the camera's size.
+    /// [`SfmDenseError::PhotoSize`] for a photograph that does not have the camera's size.
     pub fn new(photo: ImageView<'_, u8, 3>, camera: &Camera, max_size: usize) -> Result<Self, SfmDenseError> {
         let size_differs = SfmDenseError::PhotoSize { photo: photo.size(), camera: (camera.width, camera.height) };
         if photo.size() != (camera.width, camera.height) {
@@ -63,51 +64,51 @@ impl DensePhoto {
     }
 }
 
-/// What [`sfm_dense`] found.
+/// Result of [`sfm_dense`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct SfmDense {
     /// The points, with colors and normals, in the frame and unit of the model.
     pub cloud: PointCloud,
-    /// Pairs of photographs that were matched, by the views of each: the first one's depths.
+    /// Matched pairs by view index; the depth map is that of the first view.
     pub pairs: Vec<(usize, usize)>,
-    /// Pairs that could not be matched: one camera ahead of the other, or hardly anything confirmed.
+    /// Number of pairs that could not be matched.
     pub failed: usize,
     /// Stage names and their seconds.
     pub stages: Vec<(&'static str, f64)>,
 }
 
-/// Why there is no dense cloud of many views.
+/// Why there is no dense cloud.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum SfmDenseError {
     /// A photograph has another size than its camera.
-    #[error("a photograph has {photo:?} pixels where its camera has {camera:?}")]
+    #[error("a photograph has {photo:?} pixels but its camera has {camera:?}")]
     PhotoSize {
         /// Its width and height.
         photo: (usize, usize),
-        /// The camera's.
+        /// Width and height of the camera.
         camera: (usize, usize),
     },
-    /// No two photographs see the same from different enough places.
-    #[error("no two of {views} photographs share {needed} points at an angle that depths can be told from")]
+    /// No two photographs share enough points with parallax.
+    #[error("no two of {views} photographs share {needed} points with enough parallax")]
     NoPairs {
-        /// Photographs of the model that are given.
+        /// Number of photographs of the model.
         views: usize,
-        /// Points that are needed.
+        /// Number of common points that is needed.
         needed: usize,
     },
     /// None of the pairs can be matched.
     #[error("none of {pairs} pairs can be matched; the last one: {last}")]
     NoDepths {
-        /// Pairs that were tried.
+        /// Number of pairs.
         pairs: usize,
-        /// Why not.
+        /// Error of the last one.
         last: DenseError,
     },
-    /// No two pairs agree on anything.
+    /// No depth is confirmed by another pair.
     #[error("no depth of {pairs} pairs is confirmed by another pair")]
     NoAgreement {
-        /// Pairs that were matched.
+        /// Number of matched pairs.
         pairs: usize,
     },
     /// An option is out of range.
@@ -118,16 +119,18 @@ pub enum SfmDenseError {
     Cancelled(#[from] Cancelled),
 }
 
-/// Fewest points that two photographs share to be matched.
-const SHARED: usize = 20;
-/// Angle up to which more of it makes a better pair, in radians: 8 degrees.
-const WIDE_ENOUGH: f64 = 0.14;
+/// Minimum number of common points of a pair.
+const MIN_SHARED_POINTS: usize = 20;
+/// Triangulation angle in radians (8 degrees) up to which the score of a pair increases.
+const SATURATION_ANGLE: f64 = 0.14;
 
-/// A dense cloud of a model's views: each photograph is rectified and matched semi-globally with those that share most points with it at an angle that tells depths
-/// ([`SfmDenseOptions`]), and a depth stays where another pair of photographs says the same, of the same photograph or of another one that sees the place, and where not more photographs see
-/// through it. Of the places that several photographs show one point is kept.
+/// Computes a dense point cloud of a model. Each photograph is rectified and matched semi-globally with those that
+/// share most points at suitable triangulation angles ([`SfmDenseOptions`]). A depth is kept if another pair, of the
+/// same photograph or of another one that observes the point, confirms it and free-space violations are no majority.
+/// Duplicate points of several photographs are merged.
 ///
-/// `photos` are by view; `None` where one is not in the model, or is to be left out. O(photographs · partners) matches of a pair, and some bytes for each pixel of all photographs.
+/// `photos` are by view; `None` if one is not in the model or not to be used. O(photographs · partners) stereo
+/// matchings, and some bytes for each pixel of all photographs.
 ///
 /// # Errors
 /// [`SfmDenseError`].
@@ -141,25 +144,25 @@ pub fn sfm_dense(
     OptionError::check("partners", options.partners as f64, "1 or more", |v| v >= 1.0)?;
     OptionError::check("tolerance", options.tolerance.into(), "above 0 and below 1", |v| v > 0.0 && v < 1.0)?;
     let mut clock = StageClock::new();
-    let given = |v: usize| Some((photos.get(v)?.as_ref()?, model.poses.get(v).copied().flatten()?));
-    let shared = shared_points(model, |v| given(v).is_some());
-    let partners = partners(model.poses.len(), &shared, options);
+    let view_of = |v: usize| Some((photos.get(v)?.as_ref()?, model.poses.get(v).copied().flatten()?));
+    let shared = shared_points(model, |v| view_of(v).is_some());
+    let partners = select_partners(model.poses.len(), &shared, options);
     let total: usize = partners.iter().map(Vec::len).sum();
     if total == 0 {
-        let views = (0..photos.len()).filter(|v| given(*v).is_some()).count();
-        return Err(SfmDenseError::NoPairs { views, needed: SHARED });
+        let views = (0..photos.len()).filter(|v| view_of(*v).is_some()).count();
+        return Err(SfmDenseError::NoPairs { views, needed: MIN_SHARED_POINTS });
     }
     let stage = Stage::new(progress, "dense", total)?;
     let (mut pairs, mut last) = (Vec::new(), None);
     let mut views: Vec<Option<ViewDepth<'_>>> = Vec::with_capacity(photos.len());
-    for (v, of) in partners.iter().enumerate() {
-        let Some((photo, pose)) = given(v) else {
+    for (v, partners) in partners.iter().enumerate() {
+        let Some((photo, pose)) = view_of(v) else {
             views.push(None);
             continue;
         };
         let mut maps: Vec<(usize, GrayF32)> = Vec::new();
-        for &p in of {
-            let Some((other, other_pose)) = given(p) else { continue };
+        for &p in partners {
+            let Some((other, other_pose)) = view_of(p) else { continue };
             let rig = StereoRig {
                 left: photo.camera,
                 right: other.camera,
@@ -179,14 +182,14 @@ pub fn sfm_dense(
             }
             stage.add(1)?;
         }
-        views.push(Some(joined(photo, pose, &maps, options.tolerance)));
+        views.push(Some(merge_depth_maps(photo, pose, &maps, options.tolerance)));
     }
     clock.lap("dense_match");
     if let (true, Some(last)) = (pairs.is_empty(), last) {
         return Err(SfmDenseError::NoDepths { pairs: total, last });
     }
-    let near = neighbors(model.poses.len(), &pairs);
-    let cloud = fuse(&views, &near, options.tolerance, progress)?;
+    let neighboring = neighbors(model.poses.len(), &pairs);
+    let cloud = fuse(&views, &neighboring, options.tolerance, progress)?;
     if cloud.is_empty() {
         return Err(SfmDenseError::NoAgreement { pairs: pairs.len() });
     }
@@ -194,46 +197,50 @@ pub fn sfm_dense(
     Ok(SfmDense { cloud, failed: total - pairs.len(), pairs, stages: clock.into_stages() })
 }
 
-/// What two views have in common.
+/// Common points of a pair of views.
 #[derive(Default)]
 struct Shared {
-    /// Indices of points.
+    /// Indices of the points.
     points: Vec<u32>,
-    /// The angle between the rays of each.
+    /// Triangulation angle of each.
     angles: Vec<f64>,
 }
 
-/// Of each two views that count, the first by index first.
-fn shared_points(model: &SfmModel, counts: impl Fn(usize) -> bool) -> BTreeMap<(usize, usize), Shared> {
+/// Returns the common points of all pairs of usable views, with the smaller index first.
+fn shared_points(model: &SfmModel, is_usable: impl Fn(usize) -> bool) -> BTreeMap<(usize, usize), Shared> {
     let mut shared: BTreeMap<(usize, usize), Shared> = BTreeMap::new();
     for (i, point) in model.points.iter().enumerate() {
         let rays: Vec<_> = point
             .observations
             .iter()
             .map(|o| o.view as usize)
-            .filter(|v| counts(*v))
+            .filter(|v| is_usable(*v))
             .filter_map(|v| Some((v, point.position - model.poses[v]?.center())))
             .collect();
         for (k, a) in rays.iter().enumerate() {
             for b in &rays[..k] {
-                let of = shared.entry((a.0.min(b.0), a.0.max(b.0))).or_default();
-                of.points.push(i as u32);
-                of.angles.push(a.1.angle(&b.1));
+                let pair = shared.entry((a.0.min(b.0), a.0.max(b.0))).or_default();
+                pair.points.push(i as u32);
+                pair.angles.push(a.1.angle(&b.1));
             }
         }
     }
     shared
 }
 
-/// The views that each one is matched with, the best first.
-fn partners(views: usize, shared: &BTreeMap<(usize, usize), Shared>, options: &SfmDenseOptions) -> Vec<Vec<usize>> {
+/// Selects the views that each view is matched with, best first.
+fn select_partners(
+    views: usize,
+    shared: &BTreeMap<(usize, usize), Shared>,
+    options: &SfmDenseOptions,
+) -> Vec<Vec<usize>> {
     let mut candidates: Vec<Vec<(f64, usize)>> = vec![Vec::new(); views];
-    for (&(a, b), of) in shared {
-        let Some(angle) = cv_core::median(&mut of.angles.clone()) else { continue };
-        if of.points.len() < SHARED || angle < options.angles[0] || angle > options.angles[1] {
+    for (&(a, b), common) in shared {
+        let Some(angle) = cv_core::median(&mut common.angles.clone()) else { continue };
+        if common.points.len() < MIN_SHARED_POINTS || angle < options.angles[0] || angle > options.angles[1] {
             continue;
         }
-        let score = of.points.len() as f64 * (angle / WIDE_ENOUGH).min(1.0);
+        let score = common.points.len() as f64 * (angle / SATURATION_ANGLE).min(1.0);
         candidates[a].push((score, b));
         candidates[b].push((score, a));
     }
@@ -244,16 +251,16 @@ fn partners(views: usize, shared: &BTreeMap<(usize, usize), Shared>, options: &S
     candidates.into_iter().map(|list| list.into_iter().map(|(_, v)| v).collect()).collect()
 }
 
-/// The views that each one was matched with, from either side.
+/// Returns the views that each view was matched with, in either direction.
 fn neighbors(views: usize, pairs: &[(usize, usize)]) -> Vec<Vec<usize>> {
-    let mut near = vec![Vec::new(); views];
+    let mut neighbors = vec![Vec::new(); views];
     for &(a, b) in pairs {
-        near[a].push(b);
-        near[b].push(a);
+        neighbors[a].push(b);
+        neighbors[b].push(a);
     }
-    for list in &mut near {
+    for list in &mut neighbors {
         list.sort_unstable();
         list.dedup();
     }
-    near
+    neighbors
 }

@@ -1,4 +1,4 @@
-//! Cameras and points from many photographs.
+//! Structure from motion of many photographs.
 
 mod cameras;
 mod candidates;
@@ -30,24 +30,26 @@ use cv_sfm::{
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct SfmJobOptions {
-    /// Features. Default SIFT, 13,000 in a photograph at most; where there are fewer than 3,000, fainter ones as well.
+    /// Features. Default SIFT, at most 13,000 per photograph, with fainter ones where there are fewer than 3,000.
     pub features: FeatureOptions,
-    /// Which matches stay by how ambiguous they are. Default as of the kind of the descriptors.
+    /// Ratio test. Default that of the descriptor kind.
     pub ratio: RatioTest,
-    /// In what order the photographs come. Default [`PhotoOrder::Any`].
+    /// Order of the photographs. Default [`PhotoOrder::Any`].
     pub order: PhotoOrder,
-    /// Photographs that each is tried with in sets of more than twice as many: those that look most like it. Default 20 (with it, templeRing and kitti-2 come out as with all pairs).
+    /// Number of most similar photographs that each is matched with, in sets of more than twice as many. Default 20, at which the results
+    /// on templeRing and kitti-2 equal those with all pairs.
     pub partners: usize,
-    /// Features of the largest scale that a pair is tried with first. Default 1,024.
+    /// Number of features of largest scale that a pair is matched with first. Default 1,024.
     pub first_features: usize,
-    /// A photograph that has fewer pairs than this in which most matches agree is tried with its best others once more, with all features. Default 6.
+    /// A photograph with fewer firm pairs than this is matched again with its best others, with all features. Default 6.
     pub firm_partners: usize,
-    /// Pairs of each photograph that are matched with all features along their geometry. Default 3: with more, those of wider angles come in, whose positions are less exact (templeRing:
-    /// 7,916 points at 0.314 px in place of 7,543 at 0.325 with 10); what they miss is found once there is a model.
+    /// Number of pairs of each photograph that guided matching is applied to, with all features. Default 3: more add pairs with wider
+    /// baselines and less accurate positions (templeRing: 7,543 points at 0.325 px with 10, 7,916 at 0.314 with 3); track completion finds
+    /// their observations later.
     pub guided_partners: usize,
-    /// Which pairs of photographs hold.
+    /// Pair verification.
     pub pairs: ViewPairOptions,
-    /// The solution.
+    /// Reconstruction.
     pub solve: cv_sfm::SfmOptions,
 }
 
@@ -72,15 +74,16 @@ impl Default for SfmJobOptions {
     }
 }
 
-/// In what order photographs come.
+/// Order of photographs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum PhotoOrder {
-    /// In none.
+    /// Unordered.
     #[default]
     Any,
-    /// As they were taken by a camera that moved: each is tried with ten before and after it, and with those that look most like it where the camera may have come back.
+    /// A sequence by a moving camera: each photograph is matched with ten before and after it, and with the most similar others (loop
+    /// closure).
     Sequence,
 }
 
@@ -93,77 +96,77 @@ cv_core::named!(PhotoOrder {
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct SfmCamera {
-    /// Size, and parameters as far as they are known.
+    /// Image size, and intrinsics as far as they are known.
     pub camera: Camera,
-    /// What is known of it.
+    /// Prior knowledge of the intrinsics.
     pub knowledge: CameraKnowledge,
 }
 
-/// Focal length over the longer side of a photograph of which nothing is known: COLMAP's, where the pairs do not tell better.
-const USUAL_FOCAL: f64 = 1.2;
+/// Initial focal length of an unknown camera, as a ratio of the longer image side (COLMAP's); used if the pairs do not determine it.
+const DEFAULT_FOCAL_RATIO: f64 = 1.2;
 
 impl SfmCamera {
-    /// A calibrated camera, with its lens.
+    /// Creates a calibrated camera, with its distortion.
     pub fn known(camera: Camera) -> Self {
         Self { camera, knowledge: CameraKnowledge::Known }
     }
 
-    /// A camera of which the calibration matrix is known and the lens is not.
-    pub fn of_matrix(camera: Camera) -> Self {
-        Self { camera: open_lens(camera), knowledge: CameraKnowledge::Matrix }
+    /// Creates a camera with a known calibration matrix and unknown distortion.
+    pub fn from_matrix(camera: Camera) -> Self {
+        Self { camera: with_free_distortion(camera), knowledge: CameraKnowledge::Matrix }
     }
 
-    /// The camera of photographs of that size and about that focal length in pixels, as EXIF tells it.
-    pub fn of_focal((width, height): (usize, usize), focal: f64) -> Self {
+    /// Creates a camera with an image size and an approximate focal length in pixels, such as from EXIF.
+    pub fn from_focal((width, height): (usize, usize), focal: f64) -> Self {
         let knowledge = CameraKnowledge::Focal { focal, deviation: EXIF_FOCAL_DEVIATION };
-        Self { camera: open_lens(Camera::from_focal(width, height, focal)), knowledge }
+        Self { camera: with_free_distortion(Camera::from_focal(width, height, focal)), knowledge }
     }
 
-    /// The camera of photographs of that size of which nothing is known.
+    /// Creates a camera of which only the image size is known.
     pub fn unknown((width, height): (usize, usize)) -> Self {
-        let camera = Camera::from_focal(width, height, USUAL_FOCAL * width.max(height) as f64);
-        Self { camera: open_lens(camera), knowledge: CameraKnowledge::Unknown }
+        let camera = Camera::from_focal(width, height, DEFAULT_FOCAL_RATIO * width.max(height) as f64);
+        Self { camera: with_free_distortion(camera), knowledge: CameraKnowledge::Unknown }
     }
 }
 
-/// The same with radial distortion, to be found.
-fn open_lens(camera: Camera) -> Camera {
+/// Returns the camera with free radial distortion coefficients.
+fn with_free_distortion(camera: Camera) -> Camera {
     Camera { distortion: Distortion::radial(0.0, 0.0), ..camera }
 }
 
-/// What [`sfm`] found.
+/// Result of [`sfm`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct SfmResult {
     /// The models, the one with most photographs first.
     pub models: Vec<SfmModel>,
-    /// How each of them was found.
+    /// How the poses of each model were estimated.
     pub solvers: Vec<Solver>,
-    /// What became of each photograph.
+    /// Outcome of each photograph.
     pub outcomes: Vec<ViewOutcome>,
-    /// The pairs of photographs that hold, and their matches.
+    /// The verified pairs, with their inlier matches.
     pub pairs: Vec<PairMatches>,
-    /// Those of them that were not used all the same, and why.
+    /// The verified pairs that were rejected, with the reason.
     pub refused: Vec<RefusedPair>,
     /// Stage names and their seconds.
     pub stages: Vec<(&'static str, f64)>,
 }
 
-/// Why many photographs could not be reconstructed.
+/// Why a reconstruction failed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum SfmJobError {
-    /// A photograph has another size than its camera.
-    #[error("photograph {index} has {photo:?} pixels where its camera has {camera:?}")]
+    /// A photograph does not have the size of its camera.
+    #[error("photograph {index} has {photo:?} pixels but its camera has {camera:?}")]
     CameraSize {
         /// Index of the photograph.
         index: usize,
         /// Its width and height.
         photo: (usize, usize),
-        /// The camera's.
+        /// Width and height of the camera.
         camera: (usize, usize),
     },
-    /// A photograph names a camera that there is not.
-    #[error("photograph {index} names camera {camera} of {cameras}")]
+    /// A photograph refers to a missing camera.
+    #[error("photograph {index} refers to camera {camera}, but there are {cameras}")]
     NoCamera {
         /// Index of the photograph.
         index: usize,
@@ -172,16 +175,16 @@ pub enum SfmJobError {
         /// Number of cameras.
         cameras: usize,
     },
-    /// No two photographs show the same.
-    #[error("of {photos} photographs no two show enough of the same")]
+    /// No pair was verified.
+    #[error("no two of {photos} photographs have enough overlap")]
     NoPairs {
         /// Number of photographs.
         photos: usize,
     },
-    /// The pairs give no model.
+    /// Reconstruction from the pairs failed.
     #[error(transparent)]
     Solve(SfmError),
-    /// Something of a model is not determined, or it is of other photographs.
+    /// A parameter of the model is undetermined, or the model is of other photographs.
     #[error("no covariances: {0}")]
     Covariance(AdjustError),
     /// An option is outside its range.
@@ -202,20 +205,20 @@ impl From<SfmError> for SfmJobError {
 }
 
 /// Distances between the descriptors of photographs.
-struct Alike<'p>(&'p [SfmPhoto]);
+struct DescriptorDistance<'p>(&'p [SfmPhoto]);
 
-/// Largest distance of two features that are one point, as a share of the largest of a match anywhere: where a point must be, hardly any feature is there by chance, and of
-/// photographs of fountain-P11 from 50 degrees apart three matches in four are nearer.
-const ALIKE: f32 = 0.5;
+/// Largest descriptor distance in track completion, as a ratio of the largest distance of a match: near a projection there are hardly any
+/// chance matches. On fountain-P11, three of four matches over a viewpoint change of 50 degrees are below.
+const MAX_COMPLETION_DISTANCE: f32 = 0.5;
 
-impl FeatureDistance for Alike<'_> {
+impl FeatureDistance for DescriptorDistance<'_> {
     fn distance(&self, a: Observation, b: Observation) -> f32 {
         let [one, two] = [a, b].map(|o| &self.0[o.view as usize].descriptors);
-        one.ssd(a.keypoint as usize, two, b.keypoint as usize) / (ALIKE * one.kind().max_ssd)
+        one.ssd(a.keypoint as usize, two, b.keypoint as usize) / (MAX_COMPLETION_DISTANCE * one.kind().max_ssd)
     }
 }
 
-/// Reconstructs cameras and points from the features of many photographs ([`sfm_photo`]): pairs that hold ([`sfm_pairs`]), then [`sfm_solve`].
+/// Reconstructs cameras and points from the features of photographs ([`sfm_photo`]): pair verification ([`sfm_pairs`]), then [`sfm_solve`].
 ///
 /// # Errors
 /// [`SfmJobError`].
@@ -225,7 +228,7 @@ pub fn sfm(
     options: &SfmJobOptions,
     progress: &dyn Progress,
 ) -> Result<SfmResult, SfmJobError> {
-    check(photos, cameras)?;
+    check_cameras(photos, cameras)?;
     let mut clock = StageClock::new();
     let (pairs, geometry) = sfm_pairs(photos, cameras, options, progress)?;
     clock.lap("match");
@@ -235,8 +238,8 @@ pub fn sfm(
     Ok(SfmResult { stages, ..result })
 }
 
-/// Every photograph has a camera of its size.
-fn check(photos: &[SfmPhoto], cameras: &[SfmCamera]) -> Result<(), SfmJobError> {
+/// Checks that every photograph has a camera of its size.
+fn check_cameras(photos: &[SfmPhoto], cameras: &[SfmCamera]) -> Result<(), SfmJobError> {
     for (index, photo) in photos.iter().enumerate() {
         let Some(SfmCamera { camera, .. }) = cameras.get(photo.camera) else {
             return Err(SfmJobError::NoCamera { index, camera: photo.camera, cameras: cameras.len() });
@@ -248,7 +251,7 @@ fn check(photos: &[SfmPhoto], cameras: &[SfmCamera]) -> Result<(), SfmJobError> 
     Ok(())
 }
 
-/// How well the cameras and points of a model are known that [`sfm`] found of these photographs, in the model's frame and unit ([`model_covariance`]).
+/// Computes the covariances of the cameras and points of a model of [`sfm`], in the model's frame and unit ([`model_covariance`]).
 ///
 /// # Errors
 /// [`SfmJobError::Covariance`].
@@ -257,7 +260,7 @@ pub fn sfm_covariance(
     cameras: &[SfmCamera],
     model: &SfmModel,
 ) -> Result<ModelCovariance, SfmJobError> {
-    check(photos, cameras)?;
+    check_cameras(photos, cameras)?;
     let knowledge: Vec<CameraKnowledge> = cameras.iter().map(|c| c.knowledge).collect();
     model_covariance(&views(photos), &knowledge, model).map_err(SfmJobError::Covariance)
 }
@@ -266,8 +269,8 @@ fn views(photos: &[SfmPhoto]) -> Vec<SfmView<'_>> {
     photos.iter().map(|p| SfmView { camera: p.camera, keypoints: &p.keypoints }).collect()
 }
 
-/// The second half of [`sfm`]: cameras and points ([`reconstruct_views_from`]) from pairs that [`sfm_pairs`] found, and their geometry. `known`: poses of photographs by an earlier model, which
-/// the first one goes on from; empty where there is none.
+/// The second half of [`sfm`]: cameras and points ([`reconstruct_views_from`]) from the verified pairs of [`sfm_pairs`] and their geometry.
+/// `known`: poses of photographs in an earlier model, which the first model extends; empty without.
 ///
 /// # Errors
 /// [`SfmJobError`].
@@ -279,7 +282,7 @@ pub fn sfm_solve(
     options: &SfmJobOptions,
     progress: &dyn Progress,
 ) -> Result<SfmResult, SfmJobError> {
-    check(photos, cameras)?;
+    check_cameras(photos, cameras)?;
     if pairs.is_empty() {
         return Err(SfmJobError::NoPairs { photos: photos.len() });
     }
@@ -287,17 +290,17 @@ pub fn sfm_solve(
     let views = views(photos);
     let (lenses, knowledge): (Vec<Camera>, Vec<CameraKnowledge>) =
         cameras.iter().map(|c| (c.camera, c.knowledge)).unzip();
-    let alike = Alike(photos);
+    let distance = DescriptorDistance(photos);
     let input = SfmInput {
         views: &views,
         cameras: &lenses,
         knowledge: &knowledge,
         pairs: &pairs,
         geometry,
-        alike: Some(&alike),
+        feature_distance: Some(&distance),
     };
-    let found = reconstruct_views_from(&input, known, &options.solve, progress)?;
+    let outcome = reconstruct_views_from(&input, known, &options.solve, progress)?;
     clock.lap("solve");
-    let cv_sfm::SfmOutcome { models, solvers, views, refused } = found;
+    let cv_sfm::SfmOutcome { models, solvers, views, refused } = outcome;
     Ok(SfmResult { models, solvers, outcomes: views, pairs, refused, stages: clock.into_stages() })
 }

@@ -1,11 +1,11 @@
-//! A model as the rest of the world reads it.
+//! Conversion of a reconstruction to a sparse model, such as COLMAP's.
 
 use super::{SfmPhoto, SfmResult};
 use cv_core::{ModelImage, ModelPoint, SparseModel};
 
 impl SfmResult {
-    /// A model with the names and colors of its photographs: all keypoints, and the points some of them are of. Numbers are from 1, those of photographs and cameras in the order
-    /// in which they were given. `None` where there is no such model.
+    /// Returns a model with the names and colors of its photographs, all keypoints, and the points. Identifiers start
+    /// at 1, in the order of the input. `None` if there is no such model.
     pub fn sparse_model(&self, index: usize, photos: &[SfmPhoto]) -> Option<SparseModel> {
         let model = self.models.get(index)?;
         let mut out = SparseModel::default();
@@ -17,19 +17,19 @@ impl SfmResult {
             out.images.insert(i as u32 + 1, ModelImage { name: photo.name.clone(), camera, pose: *pose, points });
         }
         for (p, point) in model.points.iter().enumerate() {
-            let number = p as u64 + 1;
+            let id = p as u64 + 1;
             let mut sum = [0usize; 3];
             let mut track = Vec::with_capacity(point.observations.len());
             for o in &point.observations {
                 let image = o.view + 1;
-                out.images.get_mut(&image)?.points.get_mut(o.keypoint as usize)?.1 = Some(number);
+                out.images.get_mut(&image)?.points.get_mut(o.keypoint as usize)?.1 = Some(id);
                 let color = photos.get(o.view as usize)?.colors.get(o.keypoint as usize)?;
                 sum.iter_mut().zip(color).for_each(|(s, c)| *s += usize::from(*c));
                 track.push((image, o.keypoint));
             }
             let color = sum.map(|s| (s / point.observations.len().max(1)) as u8);
             let point = ModelPoint { position: point.position, color, error: point.error, track };
-            out.points.insert(number, point);
+            out.points.insert(id, point);
         }
         Some(out)
     }

@@ -1,4 +1,4 @@
-//! Which pairs of photographs hold, and their matches.
+//! Matching and verification of pairs of photographs.
 
 use super::candidates::candidate_pairs;
 use super::{SfmCamera, SfmJobOptions, SfmPhoto};
@@ -12,18 +12,18 @@ use cv_features::{
 use cv_sfm::{CameraKnowledge, PairMatches, ViewPair, ViewPairError, ViewPairModel, verify_view_pair};
 use rayon::prelude::*;
 
-/// A photograph, made ready for its pairs.
-struct Ready<'p> {
+/// A photograph prepared for matching.
+struct PreparedPhoto<'p> {
     photo: &'p SfmPhoto,
     camera: &'p SfmCamera,
-    /// Where the keypoints are, undistorted where the camera is known.
+    /// Keypoint positions, undistorted where the camera is calibrated.
     positions: Vec<Point2<f32>>,
-    /// The features of largest scale.
+    /// Indices of the features of largest scale.
     coarse: Vec<usize>,
     coarse_descriptors: ByteDescriptors,
 }
 
-impl<'p> Ready<'p> {
+impl<'p> PreparedPhoto<'p> {
     fn new(photo: &'p SfmPhoto, camera: &'p SfmCamera, first: usize) -> Self {
         let position = |k: &Keypoint| match camera.knowledge.is_calibrated() {
             true => camera.camera.undistort_pixel(k.position.cast()).cast::<f32>(),
@@ -35,10 +35,12 @@ impl<'p> Ready<'p> {
     }
 }
 
-/// The pairs of photographs that hold: their matches and their geometry, in order of the photographs.
+/// Matches and verifies pairs of photographs. Returns the inlier matches and the geometry of each verified pair, in the
+/// order of the photographs.
 ///
-/// Each pair is tried with its features of largest scale first. Of each photograph that has few pairs then, the best others are tried with all features; and of each, those pairs of which
-/// most matches agree are matched once more along their geometry, with all features.
+/// Each pair is matched with its features of largest scale first. Photographs with few firm pairs are matched with
+/// their best others again, with all features. The best firm pairs of each photograph then get guided matching with all
+/// features.
 ///
 /// # Errors
 /// [`Cancelled`].
@@ -49,98 +51,109 @@ pub fn sfm_pairs(
     progress: &dyn Progress,
 ) -> Result<(Vec<PairMatches>, Vec<ViewPairModel>), Cancelled> {
     let candidates = candidate_pairs(photos, options, progress)?;
-    let ready: Vec<Option<Ready<'_>>> = photos
+    let prepared: Vec<Option<PreparedPhoto<'_>>> = photos
         .par_iter()
-        .map(|photo| Some(Ready::new(photo, cameras.get(photo.camera)?, options.first_features)))
+        .map(|photo| Some(PreparedPhoto::new(photo, cameras.get(photo.camera)?, options.first_features)))
         .collect();
     let stage = Stage::new(progress, "match", candidates.len())?;
-    let mut tried: Vec<Tried<'_>> = candidates
+    let mut states: Vec<PairState<'_>> = candidates
         .par_iter()
         .with_max_len(1)
-        .filter_map(|&(a, b)| Some(Pair { views: [a, b], sides: [ready[a].as_ref()?, ready[b].as_ref()?], options }))
+        .filter_map(|&(a, b)| {
+            Some(Pair { views: [a, b], sides: [prepared[a].as_ref()?, prepared[b].as_ref()?], options })
+        })
         .map(|pair| {
-            let tried = pair.with_largest(&stage)?;
+            let state = pair.with_coarse_features(&stage)?;
             stage.add(1)?;
-            Ok(tried)
+            Ok(state)
         })
         .collect::<Result<_, Cancelled>>()?;
-    let open = |t: &Tried<'_>| !t.firm() && !t.whole && t.tentative >= options.pairs.min_inliers;
-    let again = best_of_each(&tried, photos.len(), options.firm_partners, open);
-    tried = each(tried, &again, "match all", progress, |tried, stage| tried.pair.with_all(stage))?;
-    let chosen = best_of_each(&tried, photos.len(), options.guided_partners, |t| t.firm());
-    tried = each(tried, &chosen, "match along", progress, Tried::along_geometry)?;
-    let held = |tried: Tried<'_>| {
-        let [a, b] = tried.pair.views;
-        let (matches, pair) = tried.held?;
-        Some((PairMatches { a, b, matches, sample: Some(tried.sample) }, pair.model))
+    let needs_all_features =
+        |t: &PairState<'_>| !t.is_firm() && !t.has_all_features && t.tentative >= options.pairs.min_inliers;
+    let selected = best_of_each(&states, photos.len(), options.firm_partners, needs_all_features);
+    states =
+        process_selected(states, &selected, "match all", progress, |state, stage| state.pair.with_all_features(stage))?;
+    let selected = best_of_each(&states, photos.len(), options.guided_partners, |t| t.is_firm());
+    states = process_selected(states, &selected, "match along", progress, PairState::with_guided_matches)?;
+    let into_verified = |state: PairState<'_>| {
+        let [a, b] = state.pair.views;
+        let (matches, pair) = state.verified?;
+        Some((PairMatches { a, b, matches, sample: Some(state.sample) }, pair.model))
     };
-    Ok(tried.into_iter().filter_map(held).unzip())
+    Ok(states.into_iter().filter_map(into_verified).unzip())
 }
 
-/// Of each photograph, the `count` best pairs, as far as they are `wanted`; a firm one that is not counts too.
-fn best_of_each(tried: &[Tried<'_>], photos: usize, count: usize, wanted: impl Fn(&Tried<'_>) -> bool) -> Vec<bool> {
-    let mut order: Vec<usize> = (0..tried.len()).filter(|i| tried[*i].firm() || wanted(&tried[*i])).collect();
-    // Stable: the earlier of equals.
-    order.sort_by_key(|i| std::cmp::Reverse(tried[*i].rank()));
-    let (mut chosen, mut of) = (vec![false; tried.len()], vec![0usize; photos]);
+/// Selects the `count` best pairs of each photograph among the `wanted` ones; firm pairs that are not wanted count too.
+fn best_of_each(
+    states: &[PairState<'_>],
+    photos: usize,
+    count: usize,
+    wanted: impl Fn(&PairState<'_>) -> bool,
+) -> Vec<bool> {
+    let mut order: Vec<usize> = (0..states.len()).filter(|i| states[*i].is_firm() || wanted(&states[*i])).collect();
+    // A stable sort: the first one of equals.
+    order.sort_by_key(|i| std::cmp::Reverse(states[*i].rank()));
+    let (mut selected, mut count_of) = (vec![false; states.len()], vec![0usize; photos]);
     for i in order {
-        let [a, b] = tried[i].pair.views;
-        chosen[i] = wanted(&tried[i]) && (of[a] < count || of[b] < count);
-        of[a] += 1;
-        of[b] += 1;
+        let [a, b] = states[i].pair.views;
+        selected[i] = wanted(&states[i]) && (count_of[a] < count || count_of[b] < count);
+        count_of[a] += 1;
+        count_of[b] += 1;
     }
-    chosen
+    selected
 }
 
-/// Does more for some pairs.
-fn each<'p>(
-    tried: Vec<Tried<'p>>,
-    chosen: &[bool],
+/// Applies a further step to the selected pairs.
+fn process_selected<'p>(
+    states: Vec<PairState<'p>>,
+    selected: &[bool],
     what: &'static str,
     progress: &dyn Progress,
-    more: impl Fn(Tried<'p>, &Stage<'_>) -> Result<Tried<'p>, Cancelled> + Sync,
-) -> Result<Vec<Tried<'p>>, Cancelled> {
-    let stage = Stage::new(progress, what, chosen.iter().filter(|c| **c).count())?;
-    let one = |(tried, chosen): (Tried<'p>, &bool)| {
-        if !chosen {
-            return Ok(tried);
+    step: impl Fn(PairState<'p>, &Stage<'_>) -> Result<PairState<'p>, Cancelled> + Sync,
+) -> Result<Vec<PairState<'p>>, Cancelled> {
+    let stage = Stage::new(progress, what, selected.iter().filter(|c| **c).count())?;
+    let one = |(state, is_selected): (PairState<'p>, &bool)| {
+        if !is_selected {
+            return Ok(state);
         }
-        let done = more(tried, &stage)?;
+        let processed = step(state, &stage)?;
         stage.add(1)?;
-        Ok(done)
+        Ok(processed)
     };
-    tried.into_par_iter().zip(chosen).with_max_len(1).map(one).collect()
+    states.into_par_iter().zip(selected).with_max_len(1).map(one).collect()
 }
 
-/// Smallest share of tentative matches that agree with a geometry before more are looked for along it: matches along the lines of a wrong geometry agree with it too. That of
-/// Brown and Lowe's test.
-const FIRM_SHARE: f64 = 0.3;
-/// Largest ratio of the SSD of the best to that of the second candidate along a line. Of two photographs of fountain-P11 that see the same thing from 108 degrees apart, 1,425 matches
-/// have a ratio of up to 0.8, three in four of them above 0.64 and nearly all wrong; of neighbors nine in ten are below 0.6.
+/// Minimum inlier ratio of a firm pair, whose geometry is reliable enough for guided matching (Brown and Lowe's test):
+/// matches guided by a wrong geometry agree with it.
+const FIRM_INLIER_RATIO: f64 = 0.3;
+/// Largest ratio of the SSD of the best to the second candidate in guided matching. On two photographs of fountain-P11
+/// with a viewpoint change of 108 degrees, 1,425 matches have a ratio of up to 0.8, three of four above 0.64 and nearly
+/// all wrong; for neighboring photographs nine of ten are below 0.6.
 const GUIDED_RATIO: f32 = 0.6;
 
-/// Two photographs.
+/// A pair of photographs.
 #[derive(Clone, Copy)]
 struct Pair<'p> {
     views: [usize; 2],
-    sides: [&'p Ready<'p>; 2],
+    sides: [&'p PreparedPhoto<'p>; 2],
     options: &'p SfmJobOptions,
 }
 
-/// What is known of a pair so far.
-struct Tried<'p> {
+/// State of a pair.
+struct PairState<'p> {
     pair: Pair<'p>,
-    /// Matches by how alike features are.
+    /// Number of tentative matches.
     tentative: usize,
-    /// Those that agree with the geometry, and that.
-    held: Option<(Vec<DMatch>, ViewPair)>,
-    /// Those that agree of the features of largest scale.
+    /// Inlier matches and geometry, if the pair is verified.
+    verified: Option<(Vec<DMatch>, ViewPair)>,
+    /// Inliers among the features of largest scale.
     sample: Vec<DMatch>,
     /// Whether all features have been matched.
-    whole: bool,
+    has_all_features: bool,
 }
 
 impl<'p> Pair<'p> {
+    /// Estimates the geometry of matches and returns its inliers; `None` if the pair is not verified.
     fn verify(
         &self,
         matches: &[DMatch],
@@ -155,7 +168,12 @@ impl<'p> Pair<'p> {
         }
     }
 
-    fn tentative(&self, sets: [&ByteDescriptors; 2], progress: &dyn Progress) -> Result<Vec<DMatch>, Cancelled> {
+    /// Returns tentative matches of two descriptor sets.
+    fn match_descriptors(
+        &self,
+        sets: [&ByteDescriptors; 2],
+        progress: &dyn Progress,
+    ) -> Result<Vec<DMatch>, Cancelled> {
         let options = MatchOptions { ratio: self.options.ratio, mutual: true, ..MatchOptions::default() };
         match match_byte_descriptors(sets[0], sets[1], &options, progress) {
             Err(MatchError::Cancelled(stop)) => Err(stop),
@@ -163,33 +181,34 @@ impl<'p> Pair<'p> {
         }
     }
 
-    /// What its features of largest scale tell.
-    fn with_largest(self, progress: &dyn Progress) -> Result<Tried<'p>, Cancelled> {
+    /// Matches and verifies the pair with its features of largest scale.
+    fn with_coarse_features(self, progress: &dyn Progress) -> Result<PairState<'p>, Cancelled> {
         let [a, b] = self.sides;
-        let mut matches = self.tentative([&a.coarse_descriptors, &b.coarse_descriptors], progress)?;
+        let mut matches = self.match_descriptors([&a.coarse_descriptors, &b.coarse_descriptors], progress)?;
         for m in &mut matches {
             (m.query, m.train) = (a.coarse[m.query as usize] as u32, b.coarse[m.train as usize] as u32);
         }
-        let whole = self.sides.iter().all(|s| s.coarse.len() == s.photo.keypoints.len());
-        let held = self.verify(&matches, progress)?;
-        let sample = held.as_ref().map_or_else(Vec::new, |h| h.0.clone());
-        Ok(Tried { pair: self, tentative: matches.len(), held, sample, whole })
+        let has_all_features = self.sides.iter().all(|s| s.coarse.len() == s.photo.keypoints.len());
+        let verified = self.verify(&matches, progress)?;
+        let sample = verified.as_ref().map_or_else(Vec::new, |h| h.0.clone());
+        Ok(PairState { pair: self, tentative: matches.len(), verified, sample, has_all_features })
     }
 
-    /// What all features tell.
-    fn with_all(self, progress: &dyn Progress) -> Result<Tried<'p>, Cancelled> {
-        let matches = self.tentative(self.sides.map(|s| &s.photo.descriptors), progress)?;
-        let held = self.verify(&matches, progress)?;
-        Ok(Tried { pair: self, tentative: matches.len(), held, sample: Vec::new(), whole: true })
+    /// Matches and verifies the pair with all features.
+    fn with_all_features(self, progress: &dyn Progress) -> Result<PairState<'p>, Cancelled> {
+        let matches = self.match_descriptors(self.sides.map(|s| &s.photo.descriptors), progress)?;
+        let verified = self.verify(&matches, progress)?;
+        Ok(PairState { pair: self, tentative: matches.len(), verified, sample: Vec::new(), has_all_features: true })
     }
 
-    /// Matches of all features along a geometry.
-    fn along(&self, pair: &ViewPair, progress: &dyn Progress) -> Result<Vec<DMatch>, Cancelled> {
+    /// Returns guided matches of all features, near the predictions of a geometry.
+    fn match_guided(&self, pair: &ViewPair, progress: &dyn Progress) -> Result<Vec<DMatch>, Cancelled> {
         let [a, b] = self.sides;
-        let known = self.sides.iter().all(|s| s.camera.knowledge == CameraKnowledge::Known);
-        let pixels = if known { self.options.pairs.threshold } else { self.options.pairs.threshold_uncalibrated };
-        // Three standard deviations of what agrees.
-        let threshold = (3.0 * pair.rms).clamp(1.0, pixels.max(1.0)) as f32;
+        let is_known = self.sides.iter().all(|s| s.camera.knowledge == CameraKnowledge::Known);
+        let max_threshold =
+            if is_known { self.options.pairs.threshold } else { self.options.pairs.threshold_uncalibrated };
+        // Three standard deviations of the inliers.
+        let threshold = (3.0 * pair.rms).clamp(1.0, max_threshold.max(1.0)) as f32;
         let options = GuidedOptions { threshold, ratio: GUIDED_RATIO, ..GuidedOptions::default() };
         let cameras: [&Camera; 2] = self.sides.map(|s| &s.camera.camera);
         let model = match &pair.model {
@@ -208,27 +227,28 @@ impl<'p> Pair<'p> {
     }
 }
 
-impl Tried<'_> {
+impl PairState<'_> {
+    /// Returns the number of inliers.
     fn inliers(&self) -> usize {
-        self.held.as_ref().map_or(0, |h| h.0.len())
+        self.verified.as_ref().map_or(0, |h| h.0.len())
     }
 
-    /// How good it is among others.
+    /// Returns the sort key of a pair.
     fn rank(&self) -> (bool, usize, usize) {
-        (self.firm(), self.inliers(), self.tentative)
+        (self.is_firm(), self.inliers(), self.tentative)
     }
 
-    /// Whether enough of the matches agree for more to be looked for along their geometry.
-    fn firm(&self) -> bool {
-        let least = self.pair.options.pairs.min_inliers;
-        self.inliers() >= 2 * least && self.inliers() as f64 >= FIRM_SHARE * self.tentative as f64
+    /// Returns whether enough matches are inliers for guided matching.
+    fn is_firm(&self) -> bool {
+        let min_inliers = self.pair.options.pairs.min_inliers;
+        self.inliers() >= 2 * min_inliers && self.inliers() as f64 >= FIRM_INLIER_RATIO * self.tentative as f64
     }
 
-    /// With the matches of all features along the geometry, where those are more.
-    fn along_geometry(self, progress: &Stage<'_>) -> Result<Self, Cancelled> {
-        let Some((matches, pair)) = &self.held else { return Ok(self) };
-        let along = self.pair.along(pair, progress)?;
-        let better = self.pair.verify(&along, progress)?.filter(|better| better.0.len() > matches.len());
-        Ok(if better.is_some() { Self { held: better, ..self } } else { self })
+    /// Replaces the matches by guided ones, if these have more inliers.
+    fn with_guided_matches(self, progress: &Stage<'_>) -> Result<Self, Cancelled> {
+        let Some((matches, pair)) = &self.verified else { return Ok(self) };
+        let guided = self.pair.match_guided(pair, progress)?;
+        let better = self.pair.verify(&guided, progress)?.filter(|better| better.0.len() > matches.len());
+        Ok(if better.is_some() { Self { verified: better, ..self } } else { self })
     }
 }

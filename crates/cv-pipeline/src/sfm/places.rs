@@ -1,65 +1,66 @@
-//! Where photographs were taken, and models brought to it.
+//! GPS positions of photographs, and the alignment of models to measurements.
 
 use crate::Progress;
 use cv_core::{Cancelled, GeodeticPoint, Point3, east_north_up};
 use cv_sfm::{KnownPlaces, ModelAlignError, ModelAlignment, SfmModel, align_model};
 
-/// Where a photograph says it was taken.
+/// The GPS position of a photograph.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GpsFix {
-    /// The place; its altitude counts where it is told.
+    /// The position; the altitude is valid only if `has_altitude`.
     pub place: GeodeticPoint,
-    /// Whether the altitude is told.
+    /// Whether the altitude is known.
     pub has_altitude: bool,
 }
 
-/// Positions of photographs in meters, by what they say themselves.
+/// Camera centers from GPS positions, in a local frame in meters.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GpsCenters {
-    /// Of each photograph that counts: X east, Y north, Z up from the first of them.
+    /// By photograph: X east, Y north, Z up, relative to the first; `None` where unused.
     pub centers: Vec<Option<Point3<f64>>>,
-    /// The place of the first.
+    /// The position of the first.
     pub origin: GeodeticPoint,
-    /// Whether heights are told; else all are in one plane.
-    pub heights: bool,
+    /// Whether altitudes are used; else all centers are in a plane.
+    pub has_heights: bool,
 }
 
-/// Photographs that tell their height, for the others not to count.
-const ENOUGH_HEIGHTS: usize = 3;
+/// Minimum number of photographs with an altitude for altitudes to be used; photographs without one are then unused.
+const MIN_ALTITUDES: usize = 3;
 
-/// The positions that photographs tell in one frame; `None` where none of them tells any.
+/// Converts GPS positions to one local frame; `None` without any.
 ///
-/// Heights are told by all that count, or by none: one that is not told is no height of 0.
+/// Altitudes are used for all centers or for none: a missing altitude is not 0.
 pub fn gps_centers(fixes: &[Option<GpsFix>]) -> Option<GpsCenters> {
-    let heights = fixes.iter().flatten().filter(|fix| fix.has_altitude).count() >= ENOUGH_HEIGHTS;
-    let counts = |fix: &GpsFix| fix.has_altitude || !heights;
-    let place = |fix: GpsFix| GeodeticPoint { altitude: if heights { fix.place.altitude } else { 0.0 }, ..fix.place };
-    let (views, places): (Vec<usize>, Vec<GeodeticPoint>) =
-        fixes.iter().enumerate().filter_map(|(i, fix)| fix.filter(counts).map(|fix| (i, place(fix)))).unzip();
-    let origin = *places.first()?;
+    let has_heights = fixes.iter().flatten().filter(|fix| fix.has_altitude).count() >= MIN_ALTITUDES;
+    let is_usable = |fix: &GpsFix| fix.has_altitude || !has_heights;
+    let place =
+        |fix: GpsFix| GeodeticPoint { altitude: if has_heights { fix.place.altitude } else { 0.0 }, ..fix.place };
+    let (views, positions): (Vec<usize>, Vec<GeodeticPoint>) =
+        fixes.iter().enumerate().filter_map(|(i, fix)| fix.filter(is_usable).map(|fix| (i, place(fix)))).unzip();
+    let origin = *positions.first()?;
     let mut centers = vec![None; fixes.len()];
-    for (i, center) in views.into_iter().zip(east_north_up(&places)) {
+    for (i, center) in views.into_iter().zip(east_north_up(&positions)) {
         centers[i] = Some(center);
     }
-    Some(GpsCenters { centers, origin, heights })
+    Some(GpsCenters { centers, origin, has_heights })
 }
 
-/// How a model was brought to what is known, and what of that was left aside.
+/// The alignment of a model, and the measurements that were rejected.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PlacedModel {
-    /// How the model was moved.
+    /// The alignment.
     pub alignment: ModelAlignment,
-    /// Why known centers were left aside.
+    /// Why known centers were rejected.
     pub without_centers: Option<ModelAlignError>,
-    /// Why known distances were left aside.
+    /// Why known distances were rejected.
     pub without_distances: Option<ModelAlignError>,
 }
 
-/// Brings a model to known centers of its cameras and distances between them ([`align_model`]); what contradicts it is left aside, the centers first. Where nothing holds, the model is stood
-/// upright.
+/// Aligns a model to known camera centers and distances ([`align_model`]). Contradictory measurements are rejected, the
+/// centers first; without measurements the model is made upright.
 ///
 /// # Errors
-/// [`ModelAlignError`] of a model that cannot even be stood upright; it stays as it is.
+/// [`ModelAlignError`] for a model that cannot be made upright; it is unchanged.
 pub fn place_model(
     model: &mut SfmModel,
     known: &KnownPlaces<'_>,
@@ -67,23 +68,23 @@ pub fn place_model(
     progress: &dyn Progress,
 ) -> Result<PlacedModel, ModelAlignError> {
     let (mut without_centers, mut without_distances) = (None, None);
-    let alone = KnownPlaces { centers: &[], ..*known };
-    let mut found = align_model(model, known, seed, progress);
-    if let Err(error) = found {
-        without_centers = Some(going_on(error)?);
-        found = align_model(model, &alone, seed, progress);
+    let distances_only = KnownPlaces { centers: &[], ..*known };
+    let mut result = align_model(model, known, seed, progress);
+    if let Err(error) = result {
+        without_centers = Some(unless_cancelled(error)?);
+        result = align_model(model, &distances_only, seed, progress);
     }
-    if let Err(error) = found {
-        without_distances = Some(going_on(error)?);
-        found = align_model(model, &KnownPlaces::default(), seed, progress);
+    if let Err(error) = result {
+        without_distances = Some(unless_cancelled(error)?);
+        result = align_model(model, &KnownPlaces::default(), seed, progress);
     }
-    let alignment = found?;
+    let alignment = result?;
     model.transform(&alignment.similarity);
     Ok(PlacedModel { alignment, without_centers, without_distances })
 }
 
-/// The error, if it is no stop.
-fn going_on(error: ModelAlignError) -> Result<ModelAlignError, Cancelled> {
+/// Returns the error, unless the job was cancelled.
+fn unless_cancelled(error: ModelAlignError) -> Result<ModelAlignError, Cancelled> {
     match error {
         ModelAlignError::Cancelled(stop) => Err(stop),
         other => Ok(other),
@@ -100,16 +101,17 @@ mod tests {
     }
 
     #[test]
-    fn heights_are_told_by_all_that_count_or_by_none() {
+    fn altitudes_are_used_for_all_centers_or_none() {
         let few = [fix(0.0, Some(300.0)), None, fix(1e-6, None), fix(2e-6, Some(310.0))];
         let found = gps_centers(&few).unwrap();
         assert_eq!(found.centers.iter().map(Option::is_some).collect::<Vec<_>>(), [true, false, true, true]);
-        // A radian of latitude is the meridian's radius, at 46° 6,368 km on the ellipsoid: 6.4 m to a microradian. Within meters the plane lies on it to micrometers.
+        // A radian of latitude is the meridional radius of curvature, at 46° 6,368 km on the ellipsoid: 6.4 m for a
+        // microradian. Within meters the tangent plane is exact to micrometers.
         let second = found.centers[2].unwrap();
-        assert!(!found.heights && (second.y - 6.37).abs() < 0.01 && second.x.abs() < 1e-6 && second.z.abs() < 1e-4);
+        assert!(!found.has_heights && (second.y - 6.37).abs() < 0.01 && second.x.abs() < 1e-6 && second.z.abs() < 1e-4);
         let many = [few[0], few[2], few[3], fix(3e-6, Some(305.0))];
         let found = gps_centers(&many).unwrap();
-        assert!(found.heights && found.centers[1].is_none() && (found.centers[2].unwrap().z - 10.0).abs() < 1e-3);
+        assert!(found.has_heights && found.centers[1].is_none() && (found.centers[2].unwrap().z - 10.0).abs() < 1e-3);
         assert_eq!(found.origin.altitude, 300.0);
         assert_eq!(gps_centers(&[None, None]), None);
     }

@@ -1,4 +1,4 @@
-//! Every job on a generated input of its own, for the tests of stopping.
+//! All jobs on generated inputs, for the tests of cancellation.
 
 #![allow(dead_code, reason = "each test file uses its part")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
@@ -13,14 +13,14 @@ use cv_pipeline::{
 };
 use cv_synth::{RenderOptions, two_view};
 
-/// How a job ended, as far as these tests go.
+/// How a job ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum End {
     Done,
     Stopped,
 }
 
-/// `Stopped` for the variant of the job's error that says so; any other error is a failure of the test.
+/// Returns `Stopped` for the error variant `Cancelled`; any other error fails the test.
 macro_rules! end {
     ($result:expr, $stopped:pat) => {
         match $result {
@@ -31,10 +31,10 @@ macro_rules! end {
     };
 }
 
-/// A name, and the job.
+/// The name of a job, and the job.
 pub(crate) type Job = (&'static str, Box<dyn Fn(&dyn Progress) -> End + Sync>);
 
-/// Gray values of four sizes, drawn anew for every cell.
+/// Returns a gray level: random blocks of four sizes.
 fn texture(x: usize, y: usize) -> u8 {
     let cell = |size: usize| {
         let (i, j) = ((x / size) as u32, (y / size) as u32);
@@ -46,12 +46,12 @@ fn texture(x: usize, y: usize) -> u8 {
     [2, 5, 11, 29].map(|size| cell(size) / 4).iter().sum()
 }
 
-/// A textured wall, and the same `shift` pixels to the left.
+/// Creates a textured wall, and the same one moved by `shift` pixels to the left.
 fn walls(width: usize, height: usize, shift: usize) -> [RgbU8; 2] {
     [0, shift].map(|shift| RgbU8::from_fn(width, height, |x, y| [texture(x + shift, y); 3]))
 }
 
-/// The jobs on pictures of about so many pixels.
+/// Returns all jobs on images with about the given number of pixels.
 pub(crate) fn jobs(pixels: usize) -> Vec<Job> {
     let width = ((pixels as f64 * 4.0 / 3.0).sqrt() as usize).next_multiple_of(4);
     let height = width * 3 / 4;
@@ -62,7 +62,7 @@ pub(crate) fn jobs(pixels: usize) -> Vec<Job> {
         ("match harris", FeatureMethod::Harris, AffineSimulation::Never),
         ("match affine views", FeatureMethod::Sift, AffineSimulation::Always),
     ] {
-        // Thirty-odd slanted views of each photograph: of small ones.
+        // More than thirty simulated affine views of each image: on small ones.
         let part = if views == AffineSimulation::Always { 3 } else { 1 };
         let [a, b] = walls(width / part, height / part, 40);
         let features = FeatureOptions::from(method);
@@ -76,12 +76,12 @@ pub(crate) fn jobs(pixels: usize) -> Vec<Job> {
             }),
         ));
     }
-    // One match in five is right: thousands of samples.
-    let wrong = |i: usize, salt: usize| ((i * 7919 + salt * 104_729) % 4001) as f64;
+    // One match in five is correct: thousands of samples.
+    let outlier = |i: usize, salt: usize| ((i * 7919 + salt * 104_729) % 4001) as f64;
     let pairs: Vec<Correspondence> = (0..20_000)
         .map(|i| match i % 5 {
-            0 => Correspondence::new(wrong(i, 1), wrong(i, 2), wrong(i, 1) + 25.0, wrong(i, 2) - 10.0),
-            _ => Correspondence::new(wrong(i, 1), wrong(i, 2), wrong(i, 3), wrong(i, 4)),
+            0 => Correspondence::new(outlier(i, 1), outlier(i, 2), outlier(i, 1) + 25.0, outlier(i, 2) - 10.0),
+            _ => Correspondence::new(outlier(i, 1), outlier(i, 2), outlier(i, 3), outlier(i, 4)),
         })
         .collect();
     jobs.push((
@@ -98,7 +98,7 @@ pub(crate) fn jobs(pixels: usize) -> Vec<Job> {
         let [left, right] = walls(width, height, 23);
         let mut stereo = StereoOptions { smoothing, confidence: true, ..StereoOptions::default() };
         if strips {
-            // Less memory than for the whole: rows are aggregated in strips.
+            // Less memory than for the whole cost volume: it is processed in strips.
             let matcher = cv_pipeline::stereo::StereoMatcher::new(stereo.clone()).unwrap();
             stereo.max_memory = Some(matcher.memory(width, height) * 3 / 4);
         }

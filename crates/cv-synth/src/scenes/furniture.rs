@@ -1,4 +1,4 @@
-//! Things that stand in rooms.
+//! Furniture and other objects of rooms.
 
 use crate::poster::Poster;
 use crate::rng::Rng;
@@ -46,7 +46,7 @@ pub(crate) fn poster(width: f64, height: f64, rng: &mut Rng) -> Texture {
     Texture::Poster(Arc::new(Poster::new(width as f32, height as f32, rng.next())))
 }
 
-/// Paper with leaves, bricks, plaster or veined tiles.
+/// Returns wallpaper, bricks, plaster or veined tiles.
 pub(crate) fn wall_texture(kind: usize, rng: &mut Rng) -> Texture {
     let seed = rng.seed32();
     match kind % 4 {
@@ -64,7 +64,7 @@ pub(crate) fn wall_texture(kind: usize, rng: &mut Rng) -> Texture {
     }
 }
 
-/// A standing book, its back toward −z before it is turned by `yaw`, foot at the middle of its underside.
+/// Adds a standing book, its spine toward −z before the rotation by `yaw`; `foot` is the center of its underside.
 pub(crate) fn book(b: &mut SceneBuilder, foot: Point3<f64>, size: [f64; 3], yaw: f64, rng: &mut Rng) {
     let colors = [cloth(rng), srgb(rng.pick([0xE8D9A0, 0xF4F1E8, 0x1E1E1E, 0xC9A24B]))];
     let seed = rng.seed32();
@@ -73,7 +73,7 @@ pub(crate) fn book(b: &mut SceneBuilder, foot: Point3<f64>, size: [f64; 3], yaw:
     b.block(foot, size, yaw, [&spine, &cover, &Texture::Pages { seed }]);
 }
 
-/// A shelf of `width` × `height` × `depth`, open toward −z before it is turned by `yaw` about `foot`.
+/// Adds a bookcase of `width` × `height` × `depth`, open toward −z before the rotation by `yaw` about `foot`.
 pub(crate) fn bookcase(b: &mut SceneBuilder, foot: Point3<f64>, size: [f64; 3], yaw: f64, rng: &mut Rng) {
     let [width, height, depth] = size;
     let turn = Rotation3::from_axis_angle(&Vector3::y_axis(), yaw);
@@ -170,7 +170,7 @@ pub(crate) fn mug(b: &mut SceneBuilder, foot: Point3<f64>, rng: &mut Rng) {
     let color = Texture::Plain(cloth(rng));
     let (r, h) = (rng.range(0.036, 0.045), rng.range(0.085, 0.11));
     let top = foot - Vector3::y() * h;
-    b.object("mug").shiny(0.06, 120.0).thin();
+    b.object("mug").shiny(0.06, 120.0).two_sided();
     b.tube(foot, top, (r * 0.9, r), color.clone());
     b.tube(foot, top, (r * 0.9 - 0.004, r - 0.004), Texture::Plain(srgb(0xE9E4DA)));
     let surface = foot - Vector3::y() * (0.8 * h);
@@ -186,14 +186,14 @@ pub(crate) fn mug(b: &mut SceneBuilder, foot: Point3<f64>, rng: &mut Rng) {
     }
 }
 
-/// A pot with stalks and leaves, `size` meters tall.
+/// Adds a pot with a plant, `size` meters tall.
 pub(crate) fn plant(b: &mut SceneBuilder, foot: Point3<f64>, size: f64, rng: &mut Rng) {
     let r = 0.16 * size;
     let rim = foot - Vector3::y() * (0.26 * size);
     let clay = Texture::Stone { colors: [srgb(0x9A5A3C), srgb(0xB97A58)], seed: rng.seed32() };
     b.object("pot");
     b.solid_tube(foot, rim, (0.75 * r, r), clay, Texture::Stone { colors: [srgb(0x2B2019), srgb(0x4A3A2C)], seed: 3 });
-    b.object("plant").thin().shiny(0.05, 20.0);
+    b.object("plant").two_sided().shiny(0.05, 20.0);
     let stalk = Texture::Plain(srgb(0x5B6B35));
     for _ in 0..9 {
         let angle = rng.range(0.0, TAU);
@@ -221,12 +221,12 @@ pub(crate) fn floor_lamp(b: &mut SceneBuilder, foot: Point3<f64>, rng: &mut Rng)
     b.object("lamp").shiny(0.2, 60.0);
     b.solid_tube(foot, foot - Vector3::y() * 0.02, (0.14, 0.14), metal.clone(), metal.clone());
     b.tube(foot, top, (0.011, 0.011), metal);
-    b.object("lampshade").thin();
+    b.object("lampshade").two_sided();
     let shade = Texture::Fabric { colors: [srgb(0xE8DDC4), srgb(0xDDCDA8)], seed: rng.seed32() };
     b.tube(top + Vector3::y() * 0.12, top - Vector3::y() * 0.16, (0.2, 0.13), shade);
 }
 
-/// A framed print hung on a wall: `corner` is its top left, `u` and `w` its edges, `out` the way from the wall.
+/// Adds a framed poster on a wall: `corner` is its top left, `u` and `w` its edges.
 pub(crate) fn framed(b: &mut SceneBuilder, corner: Point3<f64>, u: Vector3<f64>, w: Vector3<f64>, rng: &mut Rng) {
     let out = w.cross(&u).normalize();
     let (eu, ev) = (u.normalize(), w.normalize());
@@ -244,7 +244,7 @@ pub(crate) fn framed(b: &mut SceneBuilder, corner: Point3<f64>, u: Vector3<f64>,
     }
 }
 
-/// A cardboard box or a printed package.
+/// Adds a cardboard box or a printed package.
 pub(crate) fn package(b: &mut SceneBuilder, foot: Point3<f64>, size: [f64; 3], yaw: f64, rng: &mut Rng) {
     b.object("box");
     if rng.chance(0.6) {

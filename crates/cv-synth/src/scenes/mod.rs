@@ -1,4 +1,4 @@
-//! Ready scenes, each laid out anew by its seed.
+//! Preset scenes, each with a layout by its seed.
 
 mod furniture;
 mod person;

@@ -1,4 +1,4 @@
-//! Someone who walks through.
+//! A walking person.
 
 use super::furniture::{at, cloth, v};
 use crate::rng::Rng;
@@ -6,9 +6,9 @@ use crate::scene::{Scene, SceneBuilder};
 use crate::texture::{Texture, srgb};
 use nalgebra::{Point3, Rotation3, Vector3};
 
-/// The scene with a walker at `foot`, facing `yaw` (0 = toward −z), `phase` radians into the stride.
+/// Returns the scene with a person at `foot`, facing `yaw` (0 = toward −z), `phase` radians into the stride.
 ///
-/// The clothes follow from the seed alone: the same seed is the same person.
+/// The clothes depend on the seed only: the same seed is the same person.
 pub(crate) fn walker(scene: &Scene, foot: Point3<f64>, yaw: f64, phase: f64, seed: u64) -> Scene {
     let mut rng = Rng::new(seed, 5);
     let turn = Rotation3::from_axis_angle(&Vector3::y_axis(), yaw);
@@ -48,15 +48,15 @@ pub(crate) fn walker(scene: &Scene, foot: Point3<f64>, yaw: f64, phase: f64, see
     limb(place(0.0, 1.42, 0.0), place(0.0, 1.54, 0.01), (0.055, 0.05), &skin);
     limb(place(0.0, 1.6, 0.02), place(0.0, 1.66, 0.02), (0.085, 0.09), &skin);
     limb(place(0.0, 1.66, -0.012), place(0.0, 1.685, 0.0), (0.096, 0.096), &hair);
-    let blobs = vec![
+    let occluders = vec![
         (place(0.0, 0.16, 0.85 * swing), 0.12),
         (place(0.0, 0.16, -0.85 * swing), 0.12),
         (place(0.0, 1.0, 0.0), 0.3),
     ];
-    scene.with(b, blobs)
+    scene.with_objects(b, occluders)
 }
 
-/// Where the walker of view `i` of `n` is in the living room: across it, from left to right.
+/// Returns position, yaw and phase of the person in view `i` of `n`, crossing the living room from left to right.
 pub(crate) fn path(i: usize, n: usize, seed: u64) -> (Point3<f64>, f64, f64) {
     let mut rng = Rng::new(seed, 6);
     let z = rng.range(4.9, 5.4);

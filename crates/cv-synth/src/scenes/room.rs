@@ -11,38 +11,38 @@ use std::f64::consts::FRAC_PI_2;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// Width, height, length in meters.
-const SIZE: [f64; 3] = [6.0, 2.7, 9.0];
+const ROOM_SIZE: [f64; 3] = [6.0, 2.7, 9.0];
 
-/// Rooms that are kept, some megabytes each.
-const KEPT: usize = 8;
+/// Number of cached rooms, some megabytes each.
+const CACHED_ROOMS: usize = 8;
 
-/// The rooms asked for last, by seed.
-fn kept() -> MutexGuard<'static, VecDeque<(u64, Scene)>> {
+/// Returns the cache of the most recent rooms, by seed.
+fn room_cache() -> MutexGuard<'static, VecDeque<(u64, Scene)>> {
     static ROOMS: Mutex<VecDeque<(u64, Scene)>> = Mutex::new(VecDeque::new());
-    // Whole whatever happened to who held it.
+    // The list is consistent even if a thread panicked with the lock.
     ROOMS.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Scene {
-    /// A furnished room of 6 × 9 m seen from one end: surfaces from 1 to 9 m away, slanted planes, thin things, and
-    /// much that hides other things. Suits stereo, reconstruction and panoramas.
+    /// A furnished room of 6 × 9 m from one end: surfaces at 1 to 9 m, slanted planes, thin objects, and many
+    /// occlusions. It suits stereo, reconstruction and panoramas.
     ///
-    /// The rooms asked for last are kept: their light takes longer to work out than a picture.
+    /// The most recent rooms are cached: their irradiance takes longer than an image.
     pub fn room(seed: u64) -> Scene {
-        if let Some((_, room)) = kept().iter().find(|(of, _)| *of == seed) {
+        if let Some((_, room)) = room_cache().iter().find(|(of, _)| *of == seed) {
             return room.clone();
         }
-        // Not while the list is locked: what works the light out in parallel may come across another room on this thread.
-        let room = Self::furnished(seed);
-        let mut kept = kept();
-        if kept.len() == KEPT {
-            kept.pop_front();
+        // Without the lock: parallel work of the renderer may request another room on this thread.
+        let room = Self::build_room(seed);
+        let mut cache = room_cache();
+        if cache.len() == CACHED_ROOMS {
+            cache.pop_front();
         }
-        kept.push_back((seed, room.clone()));
+        cache.push_back((seed, room.clone()));
         room
     }
 
-    fn furnished(seed: u64) -> Scene {
+    fn build_room(seed: u64) -> Scene {
         let mut rng = Rng::new(seed, 1);
         let mut b = SceneBuilder::new();
         shell(&mut b, &mut rng);
@@ -53,9 +53,9 @@ impl Scene {
     }
 }
 
-/// Floor, ceiling, walls, window and lamps.
+/// Adds floor, ceiling, walls, window and lamps.
 fn shell(b: &mut SceneBuilder, rng: &mut Rng) {
-    let [width, height, length] = SIZE;
+    let [width, height, length] = ROOM_SIZE;
     let half = width / 2.0;
     b.ambient([0.30, 0.32, 0.36]);
     let floor = if rng.chance(0.7) {
@@ -116,10 +116,11 @@ fn shell(b: &mut SceneBuilder, rng: &mut Rng) {
     }
 }
 
+/// Adds the furniture.
 fn furnish(b: &mut SceneBuilder, rng: &mut Rng) {
-    let [width, _, length] = SIZE;
+    let [width, _, length] = ROOM_SIZE;
     let half = width / 2.0;
-    // Right side: bookcase, chest with things on it.
+    // Right side: bookcase, chest with objects on it.
     let case_z = rng.range(4.2, 5.2);
     bookcase(b, at(half - 0.18, 0.0, case_z), [1.9, 2.1, 0.32], FRAC_PI_2, rng);
     // Left side: sofa under the window, facing the middle.
@@ -178,7 +179,7 @@ fn furnish(b: &mut SceneBuilder, rng: &mut Rng) {
     plant(b, at(half - 0.55, 0.0, rng.range(6.5, 7.5)), 1.25, rng);
     plant(b, at(-half + 0.5, 0.0, rng.range(5.4, 5.8)), 1.0, rng);
     floor_lamp(b, at(-half + 0.45, 0.0, 2.35), rng);
-    // Slanted planes: boards that lean on the right wall.
+    // Slanted planes: boards that lean against the right wall.
     for (z, lean) in [(2.3, 0.28), (2.75, 0.22)] {
         let board = if rng.chance(0.5) { planks(rng) } else { poster(0.4, 1.7, rng) };
         let edge = wood(rng);

@@ -1,4 +1,4 @@
-//! A table top and a ball on the floor: things within reach.
+//! Small scenes: a table top, and a ball on the floor.
 
 use super::furniture::*;
 use crate::rng::Rng;
@@ -9,7 +9,7 @@ use nalgebra::{Rotation3, Vector3};
 use std::f64::consts::TAU;
 
 impl Scene {
-    /// Things on a table 0.6 to 2 m away, in front of a papered wall.
+    /// Objects on a table at 0.6 to 2 m, in front of a wall.
     pub fn tabletop(seed: u64) -> Scene {
         let mut rng = Rng::new(seed, 3);
         let rng = &mut rng;
@@ -28,7 +28,7 @@ impl Scene {
         }
         b.light(at(1.6, -2.1, -1.2), v(-1.2, 0.0, 0.0), v(0.0, 0.5, 1.0), [9.5, 9.0, 8.2]);
         b.light(at(-2.6, -1.6, -0.8), v(0.0, 0.0, 1.4), v(0.0, 1.2, 0.0), [3.2, 3.5, 4.0]);
-        // A row of books, a stack of books, packages, pots; then small things in front.
+        // A row of books, a stack of books, packages, pots; then small objects in front.
         let mut x = -0.95;
         b.object("books");
         while x < -0.45 {
@@ -50,7 +50,7 @@ impl Scene {
             package(&mut b, at(x + rng.range(-0.04, 0.04), 0.0, z), size, rng.range(-0.7, 0.7), rng);
         }
         plant(&mut b, at(0.92, 0.0, 0.32), 0.45, rng);
-        // A cup of pencils: thin and in front of everything.
+        // A cup of pencils: thin objects in the foreground.
         let cup = at(rng.range(-0.3, -0.15), 0.0, 0.02);
         mug(&mut b, cup, rng);
         b.object("pencils").shiny(0.05, 60.0);
@@ -63,7 +63,7 @@ impl Scene {
         for i in 0..4 {
             let r = rng.range(0.03, 0.042);
             let color = srgb(rng.pick([0xD9822B, 0xA4342A, 0x8FA63A, 0xD8B13A]));
-            // Far enough apart that no two touch.
+            // Far enough apart that they do not touch.
             let (x, z) = (-0.1 + 0.2 * (f64::from(i) + rng.range(0.0, 0.55)), rng.range(-0.15, -0.02));
             b.sphere(at(x, -r, z), r, Texture::Ball { color, seed: rng.seed32() });
         }
@@ -80,14 +80,14 @@ impl Scene {
         b.build(pose.unwrap_or_else(Pose::identity))
     }
 
-    /// An orange ball of 10 cm radius (object `"ball"`) on the floor of a corner with things that are nearly orange:
-    /// wood, card, brick and a reddish cloth. The ball's distance and place change with the seed.
+    /// An orange ball of 10 cm radius (object `"ball"`) on the floor of a corner, with objects of similar colors: wood,
+    /// cardboard, brick and a reddish cloth. The ball's distance and position depend on the seed.
     pub fn ball(seed: u64) -> Scene {
         let distance = Rng::new(seed, 40).range(0.8, 2.6);
         Self::ball_at(seed, seed, distance)
     }
 
-    /// The corner of seed `room` with the ball `distance` meters in front of the camera, somewhere in its view.
+    /// Returns the corner of seed `room` with the ball at `distance` meters from the camera, in its view.
     pub(crate) fn ball_at(room: u64, seed: u64, distance: f64) -> Scene {
         let mut rng = Rng::new(room, 4);
         let rng = &mut rng;
@@ -120,7 +120,7 @@ impl Scene {
         let mut rng = Rng::new(seed, 41);
         let eye = at(rng.range(-0.3, 0.3), -rng.range(0.75, 1.1), -0.6);
         let radius = 0.10;
-        // On the floor at the distance, if the floor is that near; else held up in the air as from a string.
+        // On the floor at that distance, if possible; else in the air.
         let level = (distance * distance - (eye.y + radius).powi(2)).max(0.0).sqrt();
         let aim = rng.range(-0.22, 0.22);
         let place = if level > 0.3 {

@@ -7,35 +7,43 @@ use crate::texture::{Texture, srgb};
 use cv_core::Pose;
 use nalgebra::Vector3;
 
-/// Half the street's width between the fronts, and the width of a house, in meters.
-const HALF: f64 = 5.0;
-const HOUSE: f64 = 6.0;
+/// Half the width of the street between the fronts, in meters.
+const HALF_WIDTH: f64 = 5.0;
+/// Width of a house, in meters.
+const HOUSE_WIDTH: f64 = 6.0;
 
 impl Scene {
-    /// A street along z with `houses` houses of 6 m on either side, the fronts 10 m apart, under a white sky without depth. Every house of a side is the same as the one `every` houses before it, to the
-    /// grain of its plaster; `every` = 0: all differ.
+    /// A street along z with `houses` houses of 6 m on either side, the fronts 10 m apart, under a white sky without
+    /// depth. Every house of a side is identical to the one `every` houses before it, including its texture; `every` =
+    /// 0: all differ.
     pub fn street(seed: u64, houses: usize, every: usize) -> Scene {
         let mut rng = Rng::new(seed, 9);
         let mut b = SceneBuilder::new();
         b.ambient([0.5, 0.54, 0.6]);
-        let length = HOUSE * houses.max(1) as f64;
+        let length = HOUSE_WIDTH * houses.max(1) as f64;
         let stone =
             |dark, light, rng: &mut Rng| Texture::Stone { colors: [srgb(dark), srgb(light)], seed: rng.seed32() };
         let asphalt = stone(0x45464A, 0x7A7B7F, &mut rng);
-        b.object("road").rect(at(-HALF, 0.0, length), v(2.0 * HALF, 0.0, 0.0), v(0.0, 0.0, -length), asphalt);
+        b.object("road").rect(
+            at(-HALF_WIDTH, 0.0, length),
+            v(2.0 * HALF_WIDTH, 0.0, 0.0),
+            v(0.0, 0.0, -length),
+            asphalt,
+        );
         let curb = stone(0x9B9890, 0xC9C6BE, &mut rng);
-        for x in [-HALF + 0.75, HALF - 0.75] {
+        for x in [-HALF_WIDTH + 0.75, HALF_WIDTH - 0.75] {
             b.object("pavement").block(at(x, 0.0, length / 2.0), [1.5, 0.12, length], 0.0, [&curb, &curb, &curb]);
         }
-        // The sky is what a ray meets that meets nothing: the ambient light.
+        // Rays without a hit see the sky: the ambient light.
         b.light(at(6.0, -30.0, length / 2.0 - 4.0), v(-8.0, 0.0, 0.0), v(0.0, 0.0, 8.0), [20.0, 19.0, 17.5]);
         for side in 0..2u64 {
             for i in 0..houses {
                 let kind = if every == 0 { i } else { i % every };
                 let mut rng = Rng::new(seed ^ (side << 32), 1000 + kind as u64);
-                let from = HOUSE * i as f64;
-                // The front's left lower corner as seen from the street, and which way is right.
-                let (x, z, right) = if side == 0 { (-HALF, from, 1.0) } else { (HALF, from + HOUSE, -1.0) };
+                let from = HOUSE_WIDTH * i as f64;
+                // The front's lower left corner from the street, and the sign of z to the right.
+                let (x, z, right) =
+                    if side == 0 { (-HALF_WIDTH, from, 1.0) } else { (HALF_WIDTH, from + HOUSE_WIDTH, -1.0) };
                 house(&mut b, [x, z, right], kind, &mut rng);
             }
         }
@@ -43,11 +51,10 @@ impl Scene {
         b.build(pose.unwrap_or_else(Pose::identity))
     }
 
-    /// Where a walk along [`Scene::street`] of so many houses takes `count` photographs, evenly spaced: in the middle at the height of the eyes, swaying a little,
-    /// looking ahead and to the right side. Two that are 2.5 m apart have half of what
-    /// they show in common, at 4 m a third.
+    /// Returns `count` evenly spaced poses of a walk along [`Scene::street`] of that many houses: in the middle at eye
+    /// height, with some sway, looking ahead and to the right. Views 2.5 m apart overlap by half, at 4 m by a third.
     pub fn street_walk(houses: usize, count: usize) -> Vec<Pose> {
-        let length = HOUSE * houses.max(1) as f64 - 10.0;
+        let length = HOUSE_WIDTH * houses.max(1) as f64 - 10.0;
         let step = |i: usize| {
             let s = i as f64 / count.saturating_sub(1).max(1) as f64;
             let z = 1.0 + length.max(0.0) * s;
@@ -57,9 +64,9 @@ impl Scene {
         (0..count).map(|i| step(i).unwrap_or_else(Pose::identity)).collect()
     }
 
-    /// Where a walk around the middle of [`Scene::room`] takes `count` photographs: on an ellipse of 1.8 × 3.2 m, each towards the other side of the room, so that
-    /// the last overlaps the first. Twelve have four tenths and more in common with
-    /// the next.
+    /// Returns `count` poses of a walk around the middle of [`Scene::room`]: on an ellipse of 1.8 × 3.2 m, looking at
+    /// the opposite side of the room, so that the last overlaps the first. Of twelve, neighbors overlap by four tenths
+    /// and more.
     pub fn room_walk(count: usize) -> Vec<Pose> {
         let middle = at(0.0, -1.25, 4.3);
         let step = |i: usize| {
@@ -71,17 +78,23 @@ impl Scene {
     }
 }
 
-/// A front with windows and a door; `x`, `z` of its left lower corner as seen from the street, and the sign of z to the right.
+/// Adds a front with windows and a door; `x`, `z` of its lower left corner from the street, and the sign of z to the
+/// right.
 fn house(b: &mut SceneBuilder, [x, z, right]: [f64; 3], kind: usize, rng: &mut Rng) {
     let height = rng.range(6.0, 8.5);
     let wall = wall_texture(kind, rng);
-    b.object("house").rect(at(x, -height, z), v(0.0, 0.0, right * HOUSE), v(0.0, height, 0.0), wall);
+    b.object("house").rect(at(x, -height, z), v(0.0, 0.0, right * HOUSE_WIDTH), v(0.0, height, 0.0), wall);
     let out = if x < 0.0 { 1.0 } else { -1.0 };
     let along = |s: f64| z + right * s;
     let frame = Texture::Paint { color: srgb(rng.pick([0xE6E2D8, 0x5A4636, 0x2F4F4F, 0x7A2E2A])), seed: rng.seed32() };
-    // A ledge, a door with its frame, and windows: panes with something to see in them, sills and lintels that stand out.
+    // A ledge, a door with its frame, and windows: panes with pictures behind, sills and lintels in relief.
     let ledge = rng.range(2.9, 3.2);
-    b.object("ledge").block(at(x + out * 0.06, -ledge, along(HOUSE / 2.0)), [0.12, 0.15, HOUSE], 0.0, [&frame; 3]);
+    b.object("ledge").block(
+        at(x + out * 0.06, -ledge, along(HOUSE_WIDTH / 2.0)),
+        [0.12, 0.15, HOUSE_WIDTH],
+        0.0,
+        [&frame; 3],
+    );
     let door = rng.pick([0.7, 2.4, 4.1]);
     let leaf = Texture::Wood { colors: [srgb(0x5B3A21), srgb(0x9A6B3F)], seed: rng.seed32() };
     b.object("door").block(at(x + out * 0.04, 0.0, along(door + 0.6)), [0.08, 2.2, 1.2], 0.0, [&leaf; 3]);
@@ -111,8 +124,8 @@ mod tests {
     use crate::texture::Rgb;
     use cv_core::{Camera, Point2};
 
-    /// The color of the surface beyond a place in the road, and how far it is.
-    fn seen(scene: &Scene, side: f64, y: f64, z: f64) -> (Rgb, f64) {
+    /// Returns the color and the distance of the surface beside a position on the road.
+    fn surface_color(scene: &Scene, side: f64, y: f64, z: f64) -> (Rgb, f64) {
         let ray = Ray { origin: at(0.0, y, z), dir: v(side, 0.0, 0.0) };
         let hit = scene.world.hit(&ray).unwrap();
         let prim = &scene.world.prims[hit.prim];
@@ -120,19 +133,20 @@ mod tests {
     }
 
     #[test]
-    fn every_second_house_is_the_same_and_else_none() {
+    fn every_second_house_is_identical_and_no_others() {
         let (repeated, other) = (Scene::street(3, 4, 2), Scene::street(3, 4, 0));
         let (mut same, mut all) = (0, 0);
         for side in [-1.0, 1.0] {
             for k in 0..300 {
                 let (y, z) = (-0.2 - 5.7 * f64::from(k % 20) / 20.0, 0.07 + 5.85 * f64::from(k / 20) / 15.0);
-                let (a, b) = (seen(&repeated, side, y, z), seen(&repeated, side, y, z + 2.0 * HOUSE));
-                // Places 12 m apart in single precision differ by 1e-6 m, of a pattern that is sampled at 5 mm.
+                let (a, b) =
+                    (surface_color(&repeated, side, y, z), surface_color(&repeated, side, y, z + 2.0 * HOUSE_WIDTH));
+                // In single precision, positions 12 m apart differ by 1e-6 m, and the texture is sampled at 5 mm.
                 assert!(
                     (a.1 - b.1).abs() < 1e-9 && (0..3).all(|c| (a.0[c] - b.0[c]).abs() < 5e-3),
                     "{y} {z} {a:?} {b:?}"
                 );
-                let (a, b) = (seen(&other, side, y, z), seen(&other, side, y, z + 2.0 * HOUSE));
+                let (a, b) = (surface_color(&other, side, y, z), surface_color(&other, side, y, z + 2.0 * HOUSE_WIDTH));
                 same += usize::from((0..3).all(|c| (a.0[c] - b.0[c]).abs() < 5e-3));
                 all += 1;
             }
@@ -140,7 +154,7 @@ mod tests {
         assert!(same * 10 < all, "{same} of {all}");
     }
 
-    /// Of a grid of pixels of a photograph that show a thing, the share that another photograph shows too.
+    /// Returns the fraction of a grid of pixels with a surface that another view shows too.
     fn overlap(scene: &Scene, camera: &Camera, a: &Pose, b: &Pose) -> f64 {
         let grid = |n: usize, k: usize| (k as f64 + 0.5) * n as f64 / 12.0;
         let (mut both, mut all) = (0.0, 0.0);
@@ -154,8 +168,8 @@ mod tests {
     }
 
     #[test]
-    fn photographs_of_a_walk_overlap_and_none_is_taken_from_within_a_thing() {
-        // 67° wide.
+    fn views_of_a_walk_overlap_and_none_is_inside_an_object() {
+        // A field of view of 67°.
         let camera = Camera::from_focal(640, 480, 480.0);
         let street = Scene::street(1, 5, 0);
         let room = Scene::room(1);
@@ -167,18 +181,18 @@ mod tests {
         ] {
             let next = walk.iter().skip(1).chain(closed.then_some(&walk[0]));
             for (a, b) in walk.iter().zip(next) {
-                // What the words at the walks say, measured on a grid of 144.
-                let share = overlap(scene, &camera, a, b);
-                assert!(share > 0.4, "{share} of {} photographs", walk.len());
+                // The documented overlaps, measured on a grid of 144.
+                let fraction = overlap(scene, &camera, a, b);
+                assert!(fraction > 0.4, "{fraction} of {} photographs", walk.len());
             }
             for pose in &walk {
                 let eye = pose.center();
-                let near = (0..200).filter_map(|k| {
+                let nearby = (0..200).filter_map(|k| {
                     let (t, u) = (f64::from(k) * 2.399, f64::from(k) / 100.0 - 1.0);
                     let r = (1.0 - u * u).sqrt();
                     scene.cast(&eye, &v(r * t.cos(), u, r * t.sin()))
                 });
-                assert!(near.map(|(distance, _)| distance).fold(f64::INFINITY, f64::min) > 0.25, "{eye}");
+                assert!(nearby.map(|(distance, _)| distance).fold(f64::INFINITY, f64::min) > 0.25, "{eye}");
             }
         }
     }

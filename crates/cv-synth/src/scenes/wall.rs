@@ -1,4 +1,4 @@
-//! A wall with posters pasted on: one exact plane.
+//! A wall with posters in one exact plane.
 
 use super::furniture::{at, v, wall_texture};
 use crate::poster::Poster;
@@ -18,15 +18,15 @@ impl Wall {
     /// Distance of the plane from the world's origin along z.
     pub(crate) const Z: f64 = 3.0;
 
-    /// The middle of the wall.
-    pub(crate) fn middle() -> Point3<f64> {
+    /// Returns the center of the wall.
+    pub(crate) fn center() -> Point3<f64> {
         at(0.0, 0.0, Self::Z)
     }
 }
 
 impl Scene {
-    /// A wall at z = 3 m, 12 × 8 m about the optical axis of the world's frame, with posters in the plane of the wall
-    /// itself: every pair of views is related by an exact homography.
+    /// A wall at z = 3 m, 12 × 8 m about the optical axis of the world frame, with posters exactly in its plane: every
+    /// pair of views is related by an exact homography.
     pub fn poster_wall(seed: u64) -> Scene {
         let mut rng = Rng::new(seed, 2);
         let (w, h) = Wall::HALF;
@@ -52,7 +52,7 @@ impl Scene {
         b.ambient([0.55, 0.58, 0.62]);
         let x = rng.range(-2.0, 2.0);
         b.light(at(x + 0.8, -2.6, -0.4), v(-1.6, 0.0, 0.0), v(0.0, 1.2, -0.6), [11.0, 10.3, 9.4]);
-        let pose = Pose::look_at(at(0.0, 0.0, 0.0), Wall::middle(), Vector3::y());
+        let pose = Pose::look_at(at(0.0, 0.0, 0.0), Wall::center(), Vector3::y());
         b.build(pose.unwrap_or_else(Pose::identity))
     }
 }

@@ -42,7 +42,7 @@ pub(super) fn outcome(job: &Job) -> Outcome {
         }
     }
     let picture = |view: usize, camera: usize| {
-        let of = &c.views[view].pictures[camera];
+        let of = &c.views[view].images[camera];
         json!({
             "path": job.path(view, camera).map(|p| p.display().to_string()),
             "used": found.refusals[view][camera].is_none(),
@@ -59,7 +59,7 @@ pub(super) fn outcome(job: &Job) -> Outcome {
                 let mut all: Map<String, Value> =
                     names.iter().enumerate().map(|(i, name)| (name.clone(), picture(view, i))).collect();
                 let used = found.refusals[view].iter().all(Option::is_none);
-                let corners = c.views[view].pictures.iter().flat_map(|p| &p.corners).filter(|c| c.used);
+                let corners = c.views[view].images.iter().flat_map(|p| &p.corners).filter(|c| c.used);
                 let (sum, n) =
                     corners.filter_map(|c| c.residual).fold((0.0, 0), |s, r| (s.0 + r.norm_squared(), s.1 + 1));
                 let reasons: Vec<String> = names

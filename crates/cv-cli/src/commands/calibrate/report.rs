@@ -58,7 +58,7 @@ pub(super) fn report(job: &Job) -> Result<Report, Failure> {
         .flat_map(|v| (0..job.names.len()).map(move |i| (v, i)))
         .filter_map(|(v, i)| {
             let path = job.path(v, i)?.display().to_string();
-            let of = &c.views[v].pictures[i];
+            let of = &c.views[v].images[i];
             let used = of.corners.iter().filter(|c| c.used).count();
             let what = job.found.refusals[v][i].as_ref().map_or_else(|| "used".to_owned(), refusal);
             Some([path, format!("{used} of {}", of.corners.len()), format!("{:.3}", of.rms_px), what])
@@ -127,8 +127,8 @@ fn coverage(job: &Job, i: usize, (width, height): (usize, usize)) -> Result<Figu
     let side = width as f32 / c.cameras[i].camera.width as f32;
     let mut canvas = Raster::new(width, height, [28, 28, 32]);
     let most = (3.0 * c.noise_px) as f32;
-    for (view, seen) in c.views.iter().zip(&job.found.sightings.views) {
-        for (corner, of) in seen[i].iter().zip(&view.pictures[i].corners) {
+    for (view, seen) in c.views.iter().zip(&job.found.observations.views) {
+        for (corner, of) in seen[i].iter().zip(&view.images[i].corners) {
             let at = [corner.pixel.x as f32 * side, corner.pixel.y as f32 * side];
             match of.residual.filter(|_| of.used) {
                 Some(r) => canvas.disc(at, 2.5, Colormap::Turbo.color((r.norm() as f32 / most).min(1.0))),
@@ -173,7 +173,7 @@ fn photographs(page: &mut Report, job: &Job) -> Result<(), Failure> {
     let c = &job.found.calibration;
     let mut all: Vec<(f64, usize, usize)> = (0..c.views.len())
         .flat_map(|v| (0..job.names.len()).map(move |i| (v, i)))
-        .map(|(v, i)| (c.views[v].pictures[i].rms_px, v, i))
+        .map(|(v, i)| (c.views[v].images[i].rms_px, v, i))
         .filter(|(rms, _, _)| rms.is_finite())
         .collect();
     all.sort_by(|a, b| b.0.total_cmp(&a.0));
@@ -198,8 +198,8 @@ fn photographs(page: &mut Report, job: &Job) -> Result<(), Failure> {
 fn with_residuals(photo: &RgbU8, job: &Job, v: usize, i: usize) -> RgbU8 {
     let mut canvas = Raster::from_rgb(photo.view());
     let unit = (canvas.width() as f32 / 640.0).max(0.5);
-    let of = &job.found.calibration.views[v].pictures[i];
-    for (corner, of) in job.found.sightings.views[v][i].iter().zip(&of.corners) {
+    let of = &job.found.calibration.views[v].images[i];
+    for (corner, of) in job.found.observations.views[v][i].iter().zip(&of.corners) {
         let at = [corner.pixel.x as f32, corner.pixel.y as f32];
         let color = if of.used { colors::GREEN } else { colors::ORANGE };
         canvas.circle(at, 3.0 * unit, unit, color);
@@ -232,7 +232,7 @@ fn pair(page: &mut Report, job: &Job) -> Result<(), Failure> {
 /// How far the board is from flat.
 fn board_shape(page: &mut Report, job: &Job) -> Result<(), Failure> {
     let [kx, ky] = job.found.calibration.target_shape.deflection;
-    let size = job.found.sightings.target.size();
+    let size = job.found.observations.target.size();
     let side = 480.0 / size.max();
     let [width, height] = [size.x, size.y].map(|s| ((s * side).round() as usize).clamp(16, 480));
     // The model of the calibration: a parabola along each side, zero at the ends.

@@ -33,7 +33,7 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     }
     let pixels = |n: usize| format!("{n} px of ball");
     let check = Check::at_least("segment", "F1 over all test pixels", score.f1(), 0.97, "")
-        .of(pixels(score.both + score.truth_only), pixels(score.both + score.estimate_only));
+        .of(pixels(score.true_positives + score.false_negatives), pixels(score.true_positives + score.false_positives));
     Ok(Part::new(vec![check], move |page| {
         page.section("Segmentation")
             .paragraph("A color model learns the ball from four photographs with masks, and marks it in four others. Green is right, red invented, blue missed.")

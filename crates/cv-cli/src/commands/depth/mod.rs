@@ -246,7 +246,7 @@ fn say_alignment(offset: &VerticalOffset, context: &Context) {
 
 /// Warns where hardly anything was matched, and where most of a map was guessed.
 fn warn_of_filling(maps: &DepthResult, context: &Context) {
-    if let Some(few) = maps.few {
+    if let Some(few) = maps.feature_agreement {
         let doubt = if few.is_enough() { "" } else { ", too few to trust the map" };
         context.warn(format!(
             "only {:.1} % of the pixels were matched and confirmed: too little texture, a pattern that repeats, or things that moved; of {} features on them {} show the same disparity{doubt}",

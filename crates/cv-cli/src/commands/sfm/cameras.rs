@@ -55,20 +55,20 @@ impl Cameras {
     ) -> Result<Result<usize, String>, Failure> {
         let exif = exif.filter(|_| !args.ignore_exif && args.camera.is_none());
         let Some(file) = &args.camera else {
-            let found = self.all.of(size, args.focal.or(exif), || Ok::<_, Failure>(None))?;
+            let found = self.all.get_or_add(size, args.focal.or(exif), || Ok::<_, Failure>(None))?;
             return Ok(found.map_err(|error| error.to_string()));
         };
         let calibrated = || {
             let (camera, lens_known) = rig::camera_and_lens(file, Some(size), args.undistorted, context)?;
             if !lens_known {
-                return Ok(Some(SfmCamera::of_matrix(camera)));
+                return Ok(Some(SfmCamera::from_matrix(camera)));
             }
             if (camera.width, camera.height) == size {
                 args.check_lens(file, &camera)?;
             }
             Ok::<_, Failure>(Some(SfmCamera::known(camera)))
         };
-        Ok(self.all.of(size, None, calibrated)?.map_err(|error| other_size(error, file)))
+        Ok(self.all.get_or_add(size, None, calibrated)?.map_err(|error| other_size(error, file)))
     }
 
     /// All of them, by index.

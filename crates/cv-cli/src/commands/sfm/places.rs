@@ -116,7 +116,7 @@ impl Places {
             one.gps.map(|gps| GpsFix { place: gps.position(), has_altitude: gps.altitude.is_some() })
         };
         let fixes: Vec<Option<GpsFix>> = all.iter().map(fix).collect();
-        if let Some(GpsCenters { centers, origin, heights }) = gps_centers(&fixes) {
+        if let Some(GpsCenters { centers, origin, has_heights: heights }) = gps_centers(&fixes) {
             places.centers = centers;
             places.source = Some(PlaceSource::Gps { origin, heights });
         }
@@ -184,7 +184,7 @@ impl Places {
             let known = self.centers[used[*v]]?;
             Some((&*all[used[*v]].path, (pose.center() - known).norm()))
         };
-        let differ: Vec<_> = fit.differ.iter().filter_map(off).collect();
+        let differ: Vec<_> = fit.outliers.iter().filter_map(off).collect();
         if !differ.is_empty() {
             context.warn(words::places_differ(source, &differ, fit.rms));
         }
@@ -201,8 +201,8 @@ impl Places {
         };
         let mut json = json!({ "by": by, "unit": if found.metric { "m" } else { "arbitrary" } });
         if let Some(fit) = &found.centers {
-            json["agree"] = json!(names(&fit.agree));
-            json["differ"] = json!(names(&fit.differ));
+            json["agree"] = json!(names(&fit.inliers));
+            json["differ"] = json!(names(&fit.outliers));
             json["rms_m"] = json!(fit.rms);
             json["tilt_known"] = json!(fit.tilt);
             if let Some(PlaceSource::Gps { origin, heights }) = &self.source {
