@@ -11,7 +11,7 @@
 //!     CameraKnowledge, PairMatches, SfmInput, SfmOptions, SfmView, ViewPairOptions, reconstruct_views, verify_view_pair,
 //! };
 //!
-//! A curved wall of 200 points, observed by four cameras in a row.
+//! // A curved wall of 200 points, observed by four cameras in a row.
 //! let camera = Camera::from_focal(640, 480, 500.0);
 //! let wall: Vec<Point3<f64>> = (0..200)
 //!     .map(|i| (f64::from(i % 20) - 9.5, f64::from(i / 20) - 4.5))

@@ -29,6 +29,8 @@ const NEUTRAL_RATIO_SLOPE: f64 = 0.6;
 const RATIO_MARGIN: f64 = 0.1;
 /// Weight of a link's own score, in triplets.
 const UNARY_WEIGHT: f64 = 3.0;
+/// Score below which a link is rejected: a link without a score of its own needs votes of a weight of a third at least.
+const REJECTION_SCORE: f64 = -0.1;
 /// Number of propagation rounds, and the distance in links that scores reach.
 const PROPAGATION_ROUNDS: usize = 10;
 
@@ -149,10 +151,15 @@ pub(crate) fn reject_repeated_structure(
         return Ok(Vec::new());
     }
     let triplets: Vec<[usize; 3]> = graph.consistent_triplets();
-    let scores = propagate_scores(&unary, &triplets);
+    let match_count = |l: &Link| match input.pairs[l.pair].sample() {
+        [] => l.matches,
+        sample => sample.len(),
+    };
+    let matches: Vec<usize> = graph.links.iter().map(match_count).collect();
+    let scores = propagate_scores(&unary, &triplets, &matches);
     let mut counts = vec![(0, 0); graph.links.len()];
     for (i, p, q) in triplets.iter().flat_map(link_with_others) {
-        match (scores[p] >= 0.0, scores[q] >= 0.0) {
+        match (scores[p] >= REJECTION_SCORE, scores[q] >= REJECTION_SCORE) {
             (true, true) => counts[i].1 += 1,
             (false, false) => {}
             _ => counts[i].0 += 1,
@@ -162,11 +169,11 @@ pub(crate) fn reject_repeated_structure(
         Some(v) => PairRefusal::Repeated { found: v.found, expected: v.expected },
         None => PairRefusal::RepeatedLoops { against: counts[i].0, of: counts[i].0 + counts[i].1 },
     };
-    let rejected = (0..graph.links.len()).filter(|i| scores[*i] < 0.0);
+    let rejected = (0..graph.links.len()).filter(|i| scores[*i] < REJECTION_SCORE);
     let refused: Vec<RefusedPair> =
         rejected.map(|i| RefusedPair { pair: graph.links[i].pair, reason: reason(i) }).collect();
     let mut index = 0..;
-    graph.links.retain(|_| index.next().is_none_or(|i: usize| scores[i] >= 0.0));
+    graph.links.retain(|_| index.next().is_none_or(|i: usize| scores[i] >= REJECTION_SCORE));
     Ok(refused)
 }
 
@@ -206,14 +213,18 @@ fn link_with_others(&[a, b, c]: &[usize; 3]) -> [(usize, usize, usize); 3] {
 /// Propagates link scores over triplets with consistent rotations, in which one link alone cannot be wrong: two right
 /// links make the third right, a right and a wrong link make it wrong, two wrong links say nothing. `unary` are the
 /// scores by features.
-fn propagate_scores(unary: &[Option<LinkScore>], triplets: &[[usize; 3]]) -> Vec<f64> {
+///
+/// The vote of a triplet counts in proportion to the matches of its weaker other link, up to one: where all views look
+/// the same way, rotations are consistent by chance, and a few accidental matches must not outvote a thousand.
+fn propagate_scores(unary: &[Option<LinkScore>], triplets: &[[usize; 3]], matches: &[usize]) -> Vec<f64> {
     let unary_scores: Vec<f64> = unary.iter().map(|v| v.map_or(0.0, |v| v.score)).collect();
     let mut scores = unary_scores.clone();
     for _ in 0..PROPAGATION_ROUNDS {
         // Sum of votes and of their weights, by link.
         let mut votes = vec![(0.0, 0.0); scores.len()];
         for (i, p, q) in triplets.iter().flat_map(link_with_others) {
-            let vote: f64 = if scores[p] < 0.0 && scores[q] < 0.0 { 0.0 } else { scores[p] * scores[q] };
+            let weight = (matches[p].min(matches[q]) as f64 / matches[i].max(1) as f64).min(1.0);
+            let vote = if scores[p] < 0.0 && scores[q] < 0.0 { 0.0 } else { weight * scores[p] * scores[q] };
             votes[i].0 += vote;
             votes[i].1 += vote.abs();
         }
@@ -343,9 +354,19 @@ mod tests {
                 _ => None,
             })
             .collect();
-        for ((a, b), score) in links.iter().zip(propagate_scores(&unary, &triplets)) {
+        for ((a, b), score) in links.iter().zip(propagate_scores(&unary, &triplets, &vec![100; links.len()])) {
             assert!((a / 4 == b / 4) == (score > 0.0) && score != 0.0, "{a} {b}: {score}");
         }
+    }
+
+    #[test]
+    fn few_matches_do_not_outvote_many() {
+        let score_of = |score: f64| Some(LinkScore { found: 0.5, expected: 0.5, score });
+        // Link 0 has no score of its own, and two triplets of a right and a wrong link against it.
+        let unary = [None, score_of(0.9), score_of(-0.9), score_of(0.9), score_of(-0.9)];
+        let triplets = [[0, 1, 2], [0, 3, 4]];
+        let score = |few: usize| propagate_scores(&unary, &triplets, &[1000, 900, few, 900, few])[0];
+        assert!(score(20) > REJECTION_SCORE && score(900) < REJECTION_SCORE, "{} {}", score(20), score(900));
     }
 
     #[test]
@@ -355,7 +376,7 @@ mod tests {
         // One scene: all links are right, one in eleven has a negative score.
         let unary: Vec<Option<LinkScore>> =
             (0..links.len()).map(|i| score_of(if i % 11 == 5 { -0.7 } else { 0.8 })).collect();
-        assert!(propagate_scores(&unary, &triplets).iter().all(|s| *s > 0.0));
+        assert!(propagate_scores(&unary, &triplets, &vec![100; links.len()]).iter().all(|s| *s > 0.0));
     }
 
     #[test]
