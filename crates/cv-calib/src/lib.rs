@@ -8,7 +8,7 @@
 //! use cv_calib::{CalibrateOptions, LensChoice, TargetObservations, TargetCorner, TargetPoints, calibrate};
 //! use cv_core::{Camera, Distortion, Pose, Rotation3, Silent, Vector3};
 //!
-//! Ten views of a board with 9 × 6 corners, 25 mm apart, by a camera with barrel distortion.
+//! // Ten views of a board with 9 × 6 corners, 25 mm apart, by a camera with barrel distortion.
 //! let target = TargetPoints::grid(9, 6, 25.0)?;
 //! let distortion = Distortion::radial_tangential4([-0.2, 0.05, 0.0, 0.0]);
 //! let camera = Camera { distortion, ..Camera::from_focal(640, 480, 500.0) };
