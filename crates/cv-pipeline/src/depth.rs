@@ -101,7 +101,7 @@ pub struct DepthResult {
 impl DepthResult {
     /// Returns whether fewer than half of the pixels are matched and most of the others are filled. On generated pairs
     /// of this kind, two to three of ten filled pixels are off by more than 2 px, on others at most one or two
-    /// (`tests/filled.rs`).
+    /// (`tests/jobs/filled.rs`).
     pub fn is_mostly_filled(&self) -> bool {
         let matched = self.map.matched_fraction();
         matched < 0.5 && self.map.valid_fraction() - matched > 0.5 * (1.0 - matched)

@@ -1,4 +1,4 @@
-//! Options and results as JSON, with the feature `serde`: `cargo test -p cv-pipeline --features serde --test serde`.
+//! Options and results as JSON, with the feature `serde`: `cargo test -p cv-pipeline --features serde --test jobs serde`.
 #![cfg(feature = "serde")]
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 

@@ -264,7 +264,7 @@ fn missing_items_are_errors() {
     assert!(matches!(refuse(&input, &bad), SfmError::Option(_)));
 }
 
-/// A large dataset: two minutes and two gigabytes at most. By hand: `cargo test --release -p cv-sfm --test generated --
+/// A large dataset: two minutes and two gigabytes at most. By hand: `cargo test --release -p cv-sfm --test models --
 /// --ignored --nocapture`.
 #[test]
 #[ignore = "takes a minute"]

@@ -1,0 +1,13 @@
+//! Jobs on generated scenes against ground truth. One binary: each further one takes as long to compile as its tests run.
+
+mod dense;
+mod filled;
+mod flat_map;
+mod generated;
+mod panorama;
+mod reconstruct;
+mod refusals;
+mod serde;
+mod stereo;
+mod tracks;
+mod uncertainty;
