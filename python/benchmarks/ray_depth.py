@@ -1,6 +1,6 @@
-"""Depth of 240 generated pairs of 960×540 px, 96 disparities: a loop of one thread, and two workers of Ray Data.
+"""Depth of 240 generated pairs of 960×540 px, 96 disparities: a single-threaded loop, and two workers of Ray Data.
 
-Run on an idle machine: processor time is the whole machine's, by /proc/stat, so that Ray's own processes count. What is compared is what more pairs cost more, without Ray's start.
+Run on an idle machine: processor time is that of the whole machine, from /proc/stat, to include Ray's own processes. The marginal cost of additional pairs is compared, without Ray's start.
 
     python benchmarks/ray_depth.py [PAIRS]
 """
@@ -20,14 +20,14 @@ DISPARITIES = 96
 
 
 def busy():
-    """Processor seconds of the machine that were not idle."""
+    """Returns the busy processor time of the machine in seconds."""
     with open("/proc/stat") as file:
         ticks = [int(n) for n in file.readline().split()[1:]]
     return (sum(ticks[:3]) + sum(ticks[5:8])) / os.sysconf("SC_CLK_TCK")
 
 
 def resident():
-    """Memory of Ray's processes, each page shared among them counted once: bytes."""
+    """Returns the memory of Ray's processes in bytes, with shared pages counted once (PSS)."""
     total = 0
     for entry in filter(str.isdigit, os.listdir("/proc")):
         try:
@@ -41,7 +41,7 @@ def resident():
 
 
 def pairs(folder, count):
-    """A pattern on planes of different disparities, another for each pair."""
+    """Generates pairs of a random texture on planes of different disparities."""
     made = []
     for i in range(count):
         random = np.random.default_rng(i)
@@ -100,9 +100,9 @@ def main():
         wall, cpu = one[1][0] - one[0][0], one[1][1] - one[0][1]
         more = two[1][0] - two[0][0]
         print(f"two workers: {two[1][0]:.1f} s; a second run {again:.1f} s")
-        print(f"{count - few} pairs more: wall {wall / more:.2f} times as fast (bar 1.7)")
-        print(f"processor time {cpu / (two[1][1] - two[0][1]):.3f} as efficient (bar 0.9)")
-        print(f"Ray's processes {max(memory) / 1e6:.0f} MB (bar 1000)")
+        print(f"{count - few} pairs more: wall {wall / more:.2f} times as fast (limit 1.7)")
+        print(f"processor time {cpu / (two[1][1] - two[0][1]):.3f} as efficient (limit 0.9)")
+        print(f"Ray's processes {max(memory) / 1e6:.0f} MB (limit 1000)")
         ray.shutdown()
 
 

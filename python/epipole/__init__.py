@@ -1,7 +1,7 @@
 """Classical computer vision over NumPy arrays: calibration, stereo depth, matching, two and many views, panoramas, color segmentation.
 
-Images are arrays of uint8, uint16 or float32, of shape (height, width) or (height, width, 3) in RGB; unknown values of maps are NaN. Options are
-given by name; ``defaults("depth")`` lists those of a function. What cannot be done raises an exception of :mod:`epipole.errors` with the numbers.
+Images are arrays of uint8, uint16 or float32, of shape (height, width) or (height, width, 3) in RGB; invalid values of maps are NaN. Options are
+keyword arguments; ``defaults("depth")`` lists those of a function. Failures raise an exception of :mod:`epipole.errors` with the numbers as attributes.
 """
 
 from __future__ import annotations
@@ -112,8 +112,8 @@ __all__ = [
     "write_map",
 ]
 
-# Loaded when they are needed: the import stays short.
-_LATER = {
+# Imported lazily, to keep the import of the package fast.
+_LAZY = {
     "AprilGrid": "boards",
     "ArucoGrid": "boards",
     "CharucoBoard": "boards",
@@ -146,7 +146,7 @@ def __getattr__(name: str) -> Any:
 
     if name in ("boards", "errors", "ray"):
         return importlib.import_module(f"epipole.{name}")
-    module = _LATER.get(name, "_results" if name in _RESULTS else None)
+    module = _LAZY.get(name, "_results" if name in _RESULTS else None)
     if module is None:
         raise AttributeError(f"module 'epipole' has no attribute {name!r}")
     return getattr(importlib.import_module(f"epipole.{module}"), name)

@@ -1,4 +1,4 @@
-"""What the functions give back: frozen dataclasses over arrays."""
+"""Results of the functions: frozen dataclasses over arrays."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ if TYPE_CHECKING:
 
 
 class _Result:
-    """Pictures of maps in notebooks, and a text without the arrays' numbers."""
+    """Base of results: a short repr without array contents, and thumbnails of maps in notebooks."""
 
     __slots__ = ()
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({self._words()})"
+        return f"{type(self).__name__}({self._summary()})"
 
-    def _words(self) -> str:
+    def _summary(self) -> str:
         raise NotImplementedError
 
     def _repr_html_(self) -> str:
-        rows = "".join(f"<tr><td>{f.name}</td><td>{_told(getattr(self, f.name))}</td></tr>" for f in fields(self))
-        return f"<table><caption>{type(self).__name__}: {self._words()}</caption>{rows}</table>"
+        rows = "".join(f"<tr><td>{f.name}</td><td>{_cell_html(getattr(self, f.name))}</td></tr>" for f in fields(self))
+        return f"<table><caption>{type(self).__name__}: {self._summary()}</caption>{rows}</table>"
 
 
-def _told(value: Any) -> str:
+def _cell_html(value: Any) -> str:
     if isinstance(value, np.ndarray):
         if value.ndim == 3 and value.shape[2] == 3 and value.dtype in (np.uint8, np.uint16) and min(value.shape[:2]) > 9:
             small = value[:: _step(value), :: _step(value)]
@@ -48,7 +48,7 @@ def _step(values: NDArray[Any]) -> int:
 
 
 def _thumbnail(values: NDArray[np.float32]) -> str:
-    """A map of floats as a small picture: dark is low, unknown is black."""
+    """Renders a float map as a thumbnail: dark is low, invalid is black."""
     small = values[:: _step(values), :: _step(values)]
     known = small[np.isfinite(small)]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
@@ -58,7 +58,7 @@ def _thumbnail(values: NDArray[np.float32]) -> str:
 
 
 def _bitmap(rgb: NDArray[np.uint8]) -> str:
-    """A small picture, without a library for it: an uncompressed bitmap, rows from the bottom up, each a multiple of four bytes long."""
+    """Encodes a small image as an uncompressed BMP: rows bottom-up, each padded to a multiple of four bytes."""
     height, width = rgb.shape[:2]
     row = (3 * width + 3) // 4 * 4
     data = np.zeros((height, row), np.uint8)
@@ -72,12 +72,12 @@ def _bitmap(rgb: NDArray[np.uint8]) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Depth(_Result):
-    """Disparity, and depth where the geometry is known. All maps have the left photograph's size; unknown is NaN."""
+    """Disparity, and depth if the geometry is known. All maps have the size of the left image; invalid is NaN."""
 
     disparity: NDArray[np.float32]
-    """float32, px: x of the left photograph minus x of the right one."""
+    """float32, px: x in the left image minus x in the right one."""
     state: NDArray[np.uint8]
-    """uint8: 0 matched, 1 occluded, 2 mismatched, 3 out of view; all but 0 are filled in from around."""
+    """uint8: 0 matched, 1 occluded, 2 mismatched, 3 out of view; all but 0 are filled from their surroundings."""
     disparity_deviation: NDArray[np.float32]
     """float32, px: standard deviation, NaN where filled."""
     depth: NDArray[np.float32] | None
@@ -87,30 +87,30 @@ class Depth(_Result):
     confidence: NDArray[np.float32] | None
     """float32, 0 to 1; with ``confidence=True``."""
     Q: NDArray[np.float64] | None
-    """float64 (4, 4): makes (X, Y, Z, W) of (x, y, disparity, 1), as OpenCV's reprojectImageTo3D takes it."""
+    """float64 (4, 4): maps (x, y, disparity, 1) to homogeneous (X, Y, Z, W), as in OpenCV's reprojectImageTo3D."""
     images: tuple[NDArray[np.uint8], NDArray[np.uint8]] | None
-    """With ``rig``: both photographs rectified, uint8; the maps are of the first."""
+    """With ``rig``: both rectified images, uint8; the maps belong to the first."""
     cloud: PointCloud | None
-    """With ``cloud=True``: the colored points; of a rig in the frame of its left camera."""
+    """With ``cloud=True``: the colored points; with ``rig`` in the frame of its left camera."""
     few_matches: tuple[int, int] | None
-    """Where so little is matched that the pair was nearly refused: features that show the same disparity, of how many."""
+    """For a poorly matched pair that was not refused: number of features with a consistent disparity, and number of features; else None."""
     vertical_offset: tuple[float, float, float] | None
-    """Where the rows of the pair were apart and have been aligned, in px: in the middle, more at the right border than at the left, more at the bottom than at the top."""
+    """Corrected vertical disparity in px: at the center, and its differences from the left to the right border and from top to bottom; None if none was corrected."""
     disparities: tuple[int, int]
-    """Smallest disparity tried, and how many."""
+    """Smallest disparity of the search range, and its size."""
     valid_fraction: float
-    """Share of the pixels with a disparity."""
+    """Fraction of the pixels with a disparity."""
     matched_fraction: float
-    """Share of the pixels that were matched and confirmed."""
+    """Fraction of the pixels that were matched and passed the consistency checks."""
     seconds: dict[str, float]
-    """By stage."""
+    """Run time by stage."""
 
     @property
     def matched(self) -> NDArray[np.bool_]:
-        """bool: the pixels that were matched and confirmed."""
+        """bool: the pixels that were matched and passed the consistency checks."""
         return self.state == 0
 
-    def _words(self) -> str:
+    def _summary(self) -> str:
         height, width = self.disparity.shape
         kind = "disparity and depth" if self.depth is not None else "disparity"
         return f"{width}×{height} px, {kind}, {100 * self.matched_fraction:.1f} % matched"
@@ -123,39 +123,39 @@ class Matches(_Result):
     points: NDArray[np.float64]
     """float64 (n, 4): x1, y1, x2, y2 in px."""
     indices: NDArray[np.uint32]
-    """uint32 (n, 2): rows of the two keypoints."""
+    """uint32 (n, 2): indices of the two keypoints."""
     ratios: NDArray[np.float32]
-    """float32 (n,): distance over that of the second best, 0 (sure) to 1 (ambiguous)."""
+    """float32 (n,): ratio of the best to the second best descriptor distance, 0 (distinctive) to 1 (ambiguous)."""
     keypoints: tuple[NDArray[np.float32], NDArray[np.float32]]
-    """Of each photograph, float32 (m, 5): x, y, scale, angle, response."""
+    """For each image, float32 (m, 5): x, y, scale, angle, response."""
     seconds: dict[str, float]
-    """By stage."""
+    """Run time by stage."""
 
     def __len__(self) -> int:
         return len(self.points)
 
-    def _words(self) -> str:
+    def _summary(self) -> str:
         return f"{len(self)} matches between {len(self.keypoints[0])} and {len(self.keypoints[1])} keypoints"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Model(_Result):
-    """A homography or fundamental matrix, and the matches that fit it."""
+    """A homography or fundamental matrix, and its inliers."""
 
     model: NDArray[np.float64]
     """float64 (3, 3)."""
     inliers: NDArray[np.bool_]
     """bool (n,)."""
     rms: float
-    """Root mean square residual of the inliers, px."""
+    """RMS residual of the inliers, px."""
     iterations: int
-    """Samples drawn."""
+    """Number of RANSAC samples."""
     log10_false_alarms: float | None
-    """Of models as well supported to be expected of wrong matches; lower is surer."""
+    """log10 of the number of false alarms: expected number of equally supported models if all matches were wrong; lower is more reliable."""
     seconds: dict[str, float]
-    """By stage."""
+    """Run time by stage."""
 
-    def _words(self) -> str:
+    def _summary(self) -> str:
         return f"{int(self.inliers.sum())} of {len(self.inliers)} matches, {self.rms:.3f} px RMS"
 
 
@@ -166,12 +166,12 @@ class EssentialModel(Model):
     rotation: NDArray[np.float64]
     """float64 (3, 3)."""
     translation: NDArray[np.float64]
-    """float64 (3,), of length 1."""
+    """float64 (3,), of unit length."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class PoseModel(_Result):
-    """The pose of a camera, x = R X + t, and the points that fit it."""
+    """The absolute pose of a camera, x = R X + t, and its inliers."""
 
     rotation: NDArray[np.float64]
     """float64 (3, 3): R."""
@@ -180,51 +180,51 @@ class PoseModel(_Result):
     inliers: NDArray[np.bool_]
     """bool (n,)."""
     rms: float
-    """Root mean square reprojection error of the inliers, px."""
+    """RMS reprojection error of the inliers, px."""
     iterations: int
-    """Samples drawn."""
+    """Number of RANSAC samples."""
     log10_false_alarms: float | None
-    """Of poses as well supported to be expected of wrong matches; lower is surer."""
+    """log10 of the number of false alarms: expected number of equally supported poses if all matches were wrong; lower is more reliable."""
     seconds: dict[str, float]
-    """By stage."""
+    """Run time by stage."""
 
     @property
     def center(self) -> NDArray[np.float64]:
-        """float64 (3,): where the camera stands."""
+        """float64 (3,): camera center in world coordinates."""
         return -self.rotation.T @ self.translation
 
-    def _words(self) -> str:
+    def _summary(self) -> str:
         return f"{int(self.inliers.sum())} of {len(self.inliers)} points, {self.rms:.3f} px RMS"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Features(_Result):
-    """Keypoints of a photograph and their descriptors."""
+    """Keypoints of an image and their descriptors."""
 
     keypoints: NDArray[np.float32]
     """float32 (n, 5): x, y, scale, angle, response."""
     descriptors: NDArray[np.float32]
-    """float32 (n, numbers)."""
+    """float32 (n, dimension)."""
     kind: str = "foreign"
-    """What the numbers of a descriptor mean; features of other programs are ``foreign``."""
+    """Kind of descriptor; ``foreign`` for features of other programs."""
 
     def __len__(self) -> int:
         return len(self.keypoints)
 
-    def _words(self) -> str:
-        return f"{len(self)} of {self.descriptors.shape[1]} numbers, {self.kind}"
+    def _summary(self) -> str:
+        return f"{len(self)} of dimension {self.descriptors.shape[1]}, {self.kind}"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class PointCloud(_Result):
-    """Points in space."""
+    """3D points."""
 
     positions: NDArray[np.float32]
     """float32 (n, 3)."""
     colors: NDArray[np.uint8] | None = None
     """uint8 (n, 3), RGB."""
     normals: NDArray[np.float32] | None = None
-    """float32 (n, 3), of length 1."""
+    """float32 (n, 3), of unit length."""
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -233,50 +233,50 @@ class PointCloud(_Result):
         """Writes a binary PLY."""
         _native.write_cloud(path, self.positions, self.colors, self.normals)
 
-    def _words(self) -> str:
+    def _summary(self) -> str:
         return f"{len(self)} points"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Rectified(_Result):
-    """Both photographs of a rig with the same points in the same rows."""
+    """A rectified pair: corresponding points lie in the same row."""
 
     left: NDArray[Any]
-    """In the type it came in."""
+    """In the type of the input."""
     right: NDArray[Any]
-    """The same of the right photograph."""
+    """The right image, likewise."""
     masks: tuple[NDArray[np.bool_], NDArray[np.bool_]]
     """bool: where each shows anything."""
     camera: _native.Camera
-    """Of both rectified photographs."""
+    """Camera of both rectified images."""
     rotations: tuple[NDArray[np.float64], NDArray[np.float64]]
-    """Of each camera: its frame to the rectified one, float64 (3, 3)."""
+    """For each camera, float64 (3, 3): rotation from its frame to the rectified one."""
     Q: NDArray[np.float64]
-    """float64 (4, 4): makes (X, Y, Z, W) of (x, y, disparity, 1)."""
+    """float64 (4, 4): maps (x, y, disparity, 1) to homogeneous (X, Y, Z, W)."""
     baseline: float
     """In the unit of the rig."""
     vertical: bool
-    """Whether one camera stands above the other: the photographs are turned by a quarter then."""
+    """Whether the rig is vertical: the images are then rotated by 90 degrees."""
     vertical_px: tuple[float, float] | None
-    """Median and 95 % quantile of the difference in rows of features found in both; None where there are too few."""
+    """Median and 95 % quantile of the absolute vertical disparity of feature matches; None if there are too few."""
     seconds: dict[str, float]
-    """By stage."""
+    """Run time by stage."""
 
-    def _words(self) -> str:
-        rows = "" if self.vertical_px is None else f", rows {self.vertical_px[0]:.2f} px apart"
+    def _summary(self) -> str:
+        rows = "" if self.vertical_px is None else f", vertical residual {self.vertical_px[0]:.2f} px"
         return f"{self.camera.width}×{self.camera.height} px, focal {self.camera.matrix[0, 0]:.2f} px{rows}"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class BoardView(_Result):
-    """The points of a calibration board on a photograph."""
+    """The detected points of a calibration board."""
 
     pixels: NDArray[np.float64]
-    """float64 (n, 2): where they are seen."""
+    """float64 (n, 2): image positions, px."""
     points: NDArray[np.float64]
-    """float64 (n, 2): where they are on the board, x right and y down."""
+    """float64 (n, 2): positions on the board, x right and y down."""
     ids: NDArray[np.int64]
-    """int64 (n,): their numbers on the board."""
+    """int64 (n,): ids on the board."""
     deviations: NDArray[np.float64]
     """float64 (n,): standard deviation of a coordinate, px."""
     size: tuple[int, int]
@@ -285,26 +285,26 @@ class BoardView(_Result):
     def __len__(self) -> int:
         return len(self.pixels)
 
-    def _words(self) -> str:
+    def _summary(self) -> str:
         return f"{len(self)} points of a board of {self.size[0]}×{self.size[1]}"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Calibration(_Result):
-    """Calibrated cameras, and how far they can be trusted."""
+    """Calibrated cameras, with their uncertainty."""
 
     cameras: tuple[_native.Camera, ...]
     """The cameras."""
     places: tuple[tuple[NDArray[np.float64], NDArray[np.float64]], ...]
-    """Of each camera (R, t): the first camera's frame to its own, in the unit of the board."""
+    """For each camera (R, t): from the first camera's frame to its own, in the unit of the board."""
     rig: _native.Rig | None
-    """The first two cameras."""
+    """The first two cameras as a stereo rig."""
     rms: float
-    """Root mean square distance of all corners used, px."""
+    """RMS reprojection error of all inlier corners, px."""
     holdout_rms: float
-    """The same on views that had no part in the fit."""
+    """The same on held-out views."""
     holdout_all_rms: float
-    """The same over all their corners, those left out as outliers as well: beside a program that leaves out none."""
+    """The same including outlier corners, for comparison with programs that reject none."""
     camera_rms: NDArray[np.float64]
     """By camera."""
     camera_holdout_rms: NDArray[np.float64]
@@ -312,7 +312,7 @@ class Calibration(_Result):
     noise: float
     """Standard deviation of a coordinate of a corner, px."""
     rectified_dy: tuple[float, float] | None
-    """Of a rig: mean and largest difference of the rows of one corner in both rectified photographs, px."""
+    """For a rig: mean and largest absolute vertical disparity of corners after rectification, px."""
     parameter_names: tuple[str, ...]
     """Such as ``camera0.fx`` and ``board.kx``."""
     parameters: NDArray[np.float64]
@@ -322,36 +322,36 @@ class Calibration(_Result):
     covariance: NDArray[np.float64]
     """float64 (n, n)."""
     board_size: tuple[int, int]
-    """Columns and rows of the board that was seen."""
+    """Columns and rows of the detected board."""
     board_deflection: tuple[float, float]
-    """By how much the board is bent along x and y, in its unit."""
+    """Deflection of the board along x and y, in its unit."""
     poses: tuple[tuple[NDArray[np.float64], NDArray[np.float64]] | None, ...]
-    """By view (R, t): the board's frame to the first camera's; None where no photograph of the view was used."""
+    """By view (R, t): from the board's frame to the first camera's; None if no photograph of the view was used."""
     refused: tuple[tuple[dict[str, Any] | None, ...], ...]
-    """By view and camera: why the photograph was not used; None where it was."""
+    """By view and camera: why the photograph was rejected; None if it was used."""
     trust: str
     """good, usable or poor."""
     notes: tuple[dict[str, Any], ...]
-    """What to know, the worst first: each with its ``kind`` and numbers."""
+    """Deficiencies, the worst first: each with its ``kind`` and numbers."""
     seconds: dict[str, float]
-    """By stage."""
+    """Run time by stage."""
 
     @property
     def camera(self) -> _native.Camera:
         """The camera, or the first one."""
         return self.cameras[0]
 
-    def _words(self) -> str:
+    def _summary(self) -> str:
         used = sum(any(reason is None for reason in view) for view in self.refused)
         return (
             f"{len(self.cameras)} camera{'s' if len(self.cameras) > 1 else ''} from {used} of {len(self.refused)} views, "
-            f"{self.rms:.3f} px RMS, {self.holdout_rms:.3f} px on views left out, {self.trust}"
+            f"{self.rms:.3f} px RMS, {self.holdout_rms:.3f} px on held-out views, {self.trust}"
         )
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class ModelImage(_Result):
-    """A photograph of a model."""
+    """A registered image of a model."""
 
     name: str
     camera: int
@@ -363,31 +363,31 @@ class ModelImage(_Result):
     keypoints: NDArray[np.float64]
     """float64 (n, 2), px."""
     point_ids: NDArray[np.int64]
-    """int64 (n,): the point that each keypoint is of, -1 for none."""
+    """int64 (n,): the point observed by each keypoint, -1 for none."""
 
     @property
     def center(self) -> NDArray[np.float64]:
-        """float64 (3,): where the camera stands."""
+        """float64 (3,): camera center in world coordinates."""
         return -self.rotation.T @ self.translation
 
-    def _words(self) -> str:
-        return f"{self.name}, {int((self.point_ids >= 0).sum())} points of {len(self.keypoints)} keypoints"
+    def _summary(self) -> str:
+        return f"{self.name}, {int((self.point_ids >= 0).sum())} points, {len(self.keypoints)} keypoints"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Reconstruction(_Result):
-    """Cameras, photographs with their poses, and points: a sparse model, as COLMAP has it."""
+    """A sparse model as in COLMAP: cameras, images with poses, and points with tracks."""
 
     cameras: dict[int, _native.Camera]
-    """By number."""
+    """By id."""
     images: dict[int, ModelImage]
-    """By number."""
+    """By id."""
     points: NDArray[np.float64]
     """float64 (n, 3)."""
     colors: NDArray[np.uint8]
     """uint8 (n, 3), RGB."""
     errors: NDArray[np.float64]
-    """float64 (n,): mean reprojection error, px; negative where it is not known."""
+    """float64 (n,): mean reprojection error, px; negative if unknown."""
     point_ids: NDArray[np.int64]
     """int64 (n,)."""
 
@@ -400,13 +400,13 @@ class Reconstruction(_Result):
         return _native.read_model(folder)
 
     def write(self, folder: str | PathLike[str], *, format: Literal["colmap-text", "colmap-binary"] = "colmap-text") -> None:
-        """Writes COLMAP's files, in place of a model that is there: ``colmap-text`` or ``colmap-binary``. The folder is made."""
+        """Writes COLMAP's files, ``colmap-text`` or ``colmap-binary``, replacing an existing model. Creates the folder."""
         os.makedirs(folder, exist_ok=True)
         _native.write_model(folder, self, format=format)
 
     @staticmethod
     def from_pycolmap(reconstruction: Any) -> Reconstruction:
-        """The same model of pycolmap's class. Its pixels have their centers at +0.5; here they have them at whole numbers."""
+        """Converts from pycolmap's class. Pixel centers are at +0.5 there and at integer coordinates here."""
         import tempfile
 
         with tempfile.TemporaryDirectory() as folder:
@@ -414,7 +414,7 @@ class Reconstruction(_Result):
             return _native.read_model(folder)
 
     def to_pycolmap(self) -> Any:
-        """The same model as pycolmap's class, which must be installed."""
+        """Converts to pycolmap's class, which must be installed."""
         import tempfile
 
         import pycolmap
@@ -425,73 +425,73 @@ class Reconstruction(_Result):
 
     @property
     def cloud(self) -> PointCloud:
-        """The points as a cloud."""
+        """The points as a point cloud."""
         return PointCloud(self.points.astype(np.float32), self.colors)
 
-    def _words(self) -> str:
+    def _summary(self) -> str:
         seen = sum(int((image.point_ids >= 0).sum()) for image in self.images.values())
         length = seen / max(len(self.points), 1)
-        return f"{len(self.images)} photographs, {len(self.points)} points seen {length:.1f} times each"
+        return f"{len(self.images)} photographs, {len(self.points)} points, mean track length {length:.1f}"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class SfmResult(_Result):
-    """What many photographs show."""
+    """Result of structure from motion."""
 
     models: tuple[Reconstruction, ...]
-    """Reconstructions, the one of most photographs first. Their places to each other are not known."""
+    """Reconstructions, the one with the most images first. Unless georeferenced, they have no common frame."""
     solvers: tuple[str, ...]
-    """How each was found."""
+    """Solver of each."""
     frames: tuple[str, ...]
-    """What each was brought to: ``centers`` that were given, ``gps`` positions (meters; X east, Y north, Z up), ``distances`` (Z up, in their unit), ``upright`` (Z up, its unit arbitrary), or
+    """Frame of each: given ``centers``, ``gps`` positions (meters; X east, Y north, Z up), ``distances`` (Z up, in their unit), ``upright`` (Z up, arbitrary unit), or
     ``any``."""
     left_out: dict[str, dict[str, Any]]
-    """By name, why a photograph is in no model."""
+    """By name: why a photograph is not registered."""
     pairs: int
-    """Pairs of photographs that hold."""
+    """Number of verified image pairs."""
     refused_pairs: int
-    """Those of them that were not used: they contradict others, or show different things that look alike."""
+    """Number of these that were refused: inconsistent with other pairs, or repeated structure."""
     seconds: dict[str, float]
-    """By stage."""
+    """Run time by stage."""
 
     @property
     def model(self) -> Reconstruction:
         """The largest model."""
         return self.models[0]
 
-    def _words(self) -> str:
+    def _summary(self) -> str:
         more = f"; {len(self.models) - 1} more models" if len(self.models) > 1 else ""
-        return f"{self.model._words()}{more}; {len(self.left_out)} photographs left out"
+        return f"{self.model._summary()}{more}; {len(self.left_out)} photographs left out"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class TwoViewReconstruction(_Result):
-    """What two photographs show, in the first camera's frame; the unit is the distance between the cameras."""
+    """Result of a two-view reconstruction, in the first camera's frame; the unit is the baseline."""
 
     reconstruction: Reconstruction
     """Cameras, poses, points."""
     rotation: NDArray[np.float64]
     """float64 (3, 3): R of x2 = R x1 + t."""
     translation: NDArray[np.float64]
-    """float64 (3,), of length 1."""
+    """float64 (3,), of unit length."""
     rms: float
-    """Root mean square reprojection error, px."""
+    """RMS reprojection error, px."""
     median_angle: float
-    """Between the two rays of a point, radians."""
+    """Median triangulation angle, radians."""
     pose_deviation: tuple[float, float]
-    """Standard deviations of rotation and of the direction of the translation, radians."""
+    """Standard deviations of the rotation and of the translation direction, radians."""
     focal_deviation: float
-    """Relative standard deviation of the focal length; 0 where the cameras were given."""
+    """Relative standard deviation of the focal length; 0 for given cameras."""
     focal_is_doubtful: bool
-    """Whether the depth of the scene may be stretched, since the focal length is hardly known."""
+    """Whether the focal length is so uncertain that the depth of the scene may be stretched."""
     matches: int
-    """Tentative matches."""
+    """Number of tentative matches."""
     inliers: int
-    """Those of them that agree with the motion."""
+    """Number of inliers of the relative pose."""
     dense: PointCloud | None
     """With ``dense=True``."""
     seconds: dict[str, float]
-    """By stage."""
+    """Run time by stage."""
 
     @property
     def points(self) -> NDArray[np.float64]:
@@ -503,76 +503,76 @@ class TwoViewReconstruction(_Result):
         """Both cameras."""
         return tuple(self.reconstruction.cameras[image.camera] for image in self.reconstruction.images.values())
 
-    def _words(self) -> str:
-        return f"{len(self.points)} points, {self.rms:.3f} px RMS, {self.inliers} of {self.matches} matches agree"
+    def _summary(self) -> str:
+        return f"{len(self.points)} points, {self.rms:.3f} px RMS, {self.inliers} of {self.matches} matches are inliers"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Panorama(_Result):
-    """Photographs joined to one picture."""
+    """A stitched panorama."""
 
     image: NDArray[np.uint8] | NDArray[np.uint16]
-    """(height, width, 3), uint8, or uint16 where a photograph has 16 bits; black where no photograph reaches."""
+    """(height, width, 3), uint8, or uint16 if a photograph has 16 bits; black where no photograph reaches."""
     mask: NDArray[np.bool_]
-    """bool: where one does."""
+    """bool: pixels covered by a photograph."""
     labels: NDArray[np.uint16]
-    """uint16: which photograph each pixel is from, 65535 for none."""
+    """uint16: index of the source photograph of each pixel, 65535 for none."""
     views: dict[int, tuple[_native.Camera, NDArray[np.float64]]]
-    """Of each photograph that is used (Camera, R): the world's frame to the camera's."""
+    """For each registered photograph (Camera, R): rotation from the world frame to the camera frame."""
     gains: NDArray[np.float32]
-    """float32 (n, 3): what red, green and blue of each photograph were multiplied with."""
+    """float32 (n, 3): gains of the red, green and blue channel of each photograph."""
     left_out: dict[int, dict[str, Any]]
-    """By index, why a photograph is not used."""
+    """By index: why a photograph is not registered."""
     registration: str
-    """Where the photographs look, as JSON: for `panorama(registration=...)` of others of the same views, or a file for `cv panorama --registration`."""
+    """The registration as JSON: for `panorama(registration=...)` with other photographs of the same views, or as a file for `cv panorama --registration`."""
     rms: float
-    """Root mean square distance of the matches, px of the photographs."""
+    """RMS residual of the matches, px of the photographs."""
     shows_parallax: bool
-    """Whether the photographs were taken from different places: what is near may be cut in two."""
+    """Whether the photographs have parallax (different camera centers): near objects may be misaligned at the seams."""
     seconds: dict[str, float]
-    """By stage."""
+    """Run time by stage."""
 
-    def _words(self) -> str:
+    def _summary(self) -> str:
         height, width = self.mask.shape
         return f"{width}×{height} px of {len(self.views)} photographs, {self.rms:.2f} px RMS, {len(self.left_out)} left out"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Object(_Result):
-    """A region of a photograph in the object's color."""
+    """A region of the object's color."""
 
     found: bool
-    """Whether it is the object."""
+    """Whether it is accepted as the object."""
     score: float | None
-    """0 to 1: how well color and shape agree with the objects that were trained on."""
+    """0 to 1: agreement of color and shape with the training objects."""
     center: tuple[float, float]
     """x and y, px."""
     area: int
     """Pixels."""
     axes: tuple[float, float]
-    """Semi-axes of the ellipse with its moments, px."""
+    """Semi-axes of the ellipse of the same moments, px."""
     angle: float
-    """Of the major axis, radians, from right towards down."""
+    """Angle of the major axis, radians clockwise from the x axis."""
     box: tuple[int, int, int, int]
     """Left, top, width, height, px."""
     truncated: bool
-    """Whether it touches the border."""
+    """Whether it touches the image border."""
 
-    def _words(self) -> str:
+    def _summary(self) -> str:
         found = "found" if self.found else "not found"
         return f"{found} at {self.center[0]:.1f}, {self.center[1]:.1f}, {self.area} px"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Located(_Result):
-    """Where an object is in a photograph."""
+    """Detections of an object in an image."""
 
     mask: NDArray[np.bool_]
-    """bool: the pixels of the objects that were found."""
+    """bool: the pixels of the accepted objects."""
     objects: tuple[Object, ...]
-    """All regions in its color, the best first."""
+    """All regions of its color, the best first."""
     seconds: dict[str, float]
-    """By stage."""
+    """Run time by stage."""
 
-    def _words(self) -> str:
+    def _summary(self) -> str:
         return f"{sum(o.found for o in self.objects)} found among {len(self.objects)} regions"

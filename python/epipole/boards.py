@@ -1,4 +1,4 @@
-"""Calibration boards, for ``find_board`` and ``calibrate``. Lengths are in any unit: that of the distances that come out.
+"""Calibration boards, for ``find_board`` and ``calibrate``. Lengths may be in any unit, which is that of the resulting distances.
 
 >>> epipole.CharucoBoard((7, 5), square=35.0, marker=26.0)
 CharucoBoard(size=(7, 5), square=35.0, marker=26.0, dictionary='5x5_100')
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Chessboard:
-    """Black and white squares."""
+    """A chessboard."""
 
     size: tuple[int, int] | None = None
     """Columns and rows of inner corners; None for any size."""
@@ -26,32 +26,32 @@ class CharucoBoard:
     square: float
     """Side of a square."""
     marker: float
-    """Side of a marker with its black frame."""
+    """Side of a marker including its black border."""
     dictionary: str = "5x5_100"
-    """Where the markers are from: OpenCV's names without DICT_."""
+    """Marker dictionary: OpenCV's names without DICT_."""
 
 
 @dataclass(frozen=True, slots=True)
 class ArucoGrid:
-    """ArUco markers side by side, OpenCV's GridBoard."""
+    """A grid of ArUco markers (OpenCV's GridBoard)."""
 
     size: tuple[int, int]
     """Columns and rows of markers."""
     marker: float
-    """Side of a marker with its black frame."""
+    """Side of a marker including its black border."""
     spacing: float = 0.3
-    """Gap between markers, as a share of their side."""
+    """Gap between markers, as a fraction of their side."""
     dictionary: str = "5x5_100"
-    """Where the markers are from."""
+    """Marker dictionary."""
 
 
 @dataclass(frozen=True, slots=True)
 class AprilGrid:
-    """AprilTags of the family 36h11 with black squares between them, Kalibr's."""
+    """A grid of AprilTags of the family 36h11 with black squares between them (Kalibr's aprilgrid)."""
 
     size: tuple[int, int]
     """Columns and rows of markers."""
     marker: float
-    """Side of a marker with its black frame."""
+    """Side of a marker including its black border."""
     spacing: float = 0.3
-    """Gap between markers, as a share of their side."""
+    """Gap between markers, as a fraction of their side."""

@@ -1,4 +1,4 @@
-"""Finding an object by its color, in scikit-learn's manner."""
+"""Color segmentation with the interface of scikit-learn."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from epipole._results import Located
 
-    # uint8; a reader's array is of a kind that only its values tell.
+    # uint8; the type of an array from a reader is only known at run time.
     _Image = NDArray[Any]
     _Mask = NDArray[np.bool_] | NDArray[np.uint8]
 
@@ -23,10 +23,10 @@ _Found = TypeVar("_Found")
 
 
 class ColorModel:
-    """Gaussian mixtures of an object's and the background's colors; a pixel is the object's by posterior odds.
+    """Gaussian mixture models of the colors of an object and of the background; pixels are classified by posterior odds.
 
-    Photographs are arrays of uint8, masks of bool or uint8 of the same height and width. As an estimator of scikit-learn, it takes lists of them: ``fit(photographs, masks)``,
-    ``predict(photographs)``, ``score(photographs, masks)`` (F1); ``get_params``, ``set_params`` and ``clone`` work. What is fitted ends in ``_``.
+    Photographs are arrays of uint8, masks arrays of bool or uint8 of the same height and width. As a scikit-learn estimator, it takes lists of them: ``fit(photographs, masks)``,
+    ``predict(photographs)``, ``score(photographs, masks)`` (F1); ``get_params``, ``set_params`` and ``clone`` work. Fitted attributes end in ``_``.
 
     Options: ``defaults("ColorModel")``.
 
@@ -71,11 +71,11 @@ class ColorModel:
         self.progress = progress
 
     def get_params(self, deep: bool = True) -> dict[str, Any]:
-        """The options by name."""
+        """Returns the options by name."""
         return {name: getattr(self, name) for name in self._names()}
 
     def set_params(self, **options: Any) -> ColorModel:
-        """Other options; the model must be fitted again."""
+        """Sets options; the model must be fitted again."""
         for name, value in options.items():
             if name not in self._names():
                 raise ValueError(f"ColorModel has no option {name!r}; there are {', '.join(self._names())}")
@@ -103,7 +103,7 @@ class ColorModel:
         return f"ColorModel({options}){fitted}"
 
     def fit(self, photographs: Sequence[_Image], masks: Sequence[_Mask]) -> ColorModel:
-        """Learns the colors. ``scores_`` are those on the photographs themselves; on others they are lower."""
+        """Fits the color models. ``scores_`` are training scores; those on other photographs are lower."""
         self.fitted_, self.scores_ = _native.FittedColorModel.fit(photographs, masks, **self.get_params())
         self.classes_ = np.array([False, True])
         return self
@@ -113,7 +113,7 @@ class ColorModel:
     @overload
     def predict(self, photographs: Sequence[_Image]) -> list[NDArray[np.bool_]]: ...
     def predict(self, photographs: Any) -> Any:
-        """Masks of the object, cleaned up: of a photograph, or a list of them."""
+        """Returns the masks of the object after morphological clean-up, for a photograph or a list of them."""
         return self._each(self._fitted().predict, photographs)
 
     @overload
@@ -121,9 +121,9 @@ class ColorModel:
     @overload
     def predict_proba(self, photographs: Sequence[_Image]) -> list[NDArray[np.float32]]: ...
     def predict_proba(self, photographs: Any) -> Any:
-        """Posterior probability of the object at each pixel, float32: of a photograph, or a list of them.
+        """Returns the posterior probability of the object at each pixel, float32, for a photograph or a list of them.
 
-        The mask is what lies above ``threshold_``, cleaned up.
+        Pixels above ``threshold_`` form the mask before clean-up.
         """
         return self._each(lambda photograph: _sigmoid(self._fitted().log_odds(photograph)), photographs)
 
@@ -132,33 +132,33 @@ class ColorModel:
     @overload
     def decision_function(self, photographs: Sequence[_Image]) -> list[NDArray[np.float32]]: ...
     def decision_function(self, photographs: Any) -> Any:
-        """Logarithm of the posterior odds at each pixel, float32."""
+        """Returns the log posterior odds at each pixel, float32."""
         return self._each(self._fitted().log_odds, photographs)
 
     def score(self, photographs: Sequence[_Image], masks: Sequence[_Mask]) -> float:
-        """F1 over all pixels of all photographs."""
+        """Returns F1 over all pixels of all photographs."""
         counts = [_native.evaluate_mask(self.predict(p), m) for p, m in zip(photographs, masks, strict=True)]
-        right, wrong = (sum(c[name] for c in counts) for name in ("true_positives", "false_positives"))
-        missed = sum(c["false_negatives"] for c in counts)
-        return 2 * right / max(2 * right + wrong + missed, 1)
+        true_positives, false_positives = (sum(c[name] for c in counts) for name in ("true_positives", "false_positives"))
+        false_negatives = sum(c["false_negatives"] for c in counts)
+        return 2 * true_positives / max(2 * true_positives + false_positives + false_negatives, 1)
 
     def locate(self, photograph: _Image, *, min_score: float | None = None) -> Located:
-        """Where the object is: its regions, each judged by color and shape."""
+        """Detects the object: regions of its color, scored by color and shape."""
         return self._fitted().locate(photograph, min_score=min_score)
 
     @property
     def threshold_(self) -> float:
-        """Probability above which a pixel is the object's."""
+        """Posterior probability above which a pixel belongs to the object."""
         return float(_sigmoid(np.float32(self._fitted().threshold)))
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Writes the JSON that ``cv segment`` reads."""
+        """Writes the JSON model of ``cv segment``."""
         with open(path, "w", encoding="utf-8") as file:
             file.write(self._fitted().to_json())
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> ColorModel:
-        """Reads what ``save`` or ``cv segment train`` wrote."""
+        """Reads a model written by ``save`` or ``cv segment train``."""
         model = cls()
         with open(path, encoding="utf-8") as file:
             model.fitted_ = _native.FittedColorModel.from_json(file.read())

@@ -1,12 +1,12 @@
-"""What cannot be done, with its numbers as attributes.
+"""Exceptions of failed jobs, with their numbers as attributes.
 
-The attributes are those of the refusal: ``NotEnoughMatchesError`` has ``got`` and ``needed``. ``kind`` is the name of the refusal, of which there are more than
-classes here.
+The attributes are those of the library's error: ``NotEnoughMatchesError`` has ``got`` and ``needed``. ``kind`` is the name of the library's error variant; there are more
+variants than classes here.
 """
 
 
 class EpipoleError(Exception):
-    """The job could not be done."""
+    """A job could not be done."""
 
     kind = ""
 
@@ -16,7 +16,7 @@ class EpipoleError(Exception):
         self.__dict__.update(numbers)
 
     def __reduce__(self):
-        return _again, (type(self), str(self), dict(self.__dict__))
+        return _restore, (type(self), str(self), dict(self.__dict__))
 
 
 class FileError(EpipoleError, OSError):
@@ -40,15 +40,15 @@ class SizeMismatchError(EpipoleError, ValueError):
 
 
 class NoPairError(EpipoleError):
-    """Hardly any pixel of one photograph has a partner in the other. ``matched``, ``needed``, ``cause``."""
+    """Too few pixels were matched for a stereo pair. ``matched``, ``needed``, ``cause``."""
 
 
 class NoDepthError(EpipoleError):
-    """No disparity has a depth that is kept. ``kept``, ``found``."""
+    """All depths are outside the range to keep. ``kept``, ``found``."""
 
 
 class NotEnoughMatchesError(EpipoleError):
-    """There are fewer matches than the model has need of. ``got``, ``needed``."""
+    """There are fewer matches than the model needs. ``got``, ``needed``."""
 
 
 class NotFiniteError(EpipoleError, ValueError):
@@ -56,11 +56,11 @@ class NotFiniteError(EpipoleError, ValueError):
 
 
 class DegenerateError(EpipoleError):
-    """The input determines no model. ``in_which_way``: Coincident, Collinear or Planar."""
+    """The input is a degenerate configuration. ``in_which_way``: Coincident, Collinear or Planar."""
 
 
 class NoConsensusError(EpipoleError):
-    """As many matches would agree if all were wrong. ``inliers``, ``matches``, ``needed``, ``iterations``."""
+    """The model has no more inliers than expected by chance. ``inliers``, ``matches``, ``needed``, ``iterations``."""
 
 
 class NoFeaturesError(EpipoleError):
@@ -68,7 +68,7 @@ class NoFeaturesError(EpipoleError):
 
 
 class ImageTooSmallError(EpipoleError, ValueError):
-    """A photograph is smaller than what is looked for."""
+    """An image is smaller than the method needs."""
 
 
 class ImageSizeError(EpipoleError, ValueError):
@@ -76,15 +76,15 @@ class ImageSizeError(EpipoleError, ValueError):
 
 
 class CameraSizeError(ImageSizeError):
-    """The same of photographs of a reconstruction. ``camera``, ``photo``."""
+    """As ImageSizeError, for photographs of a reconstruction. ``camera``, ``photo``."""
 
 
 class BoardNotFoundError(EpipoleError):
-    """The calibration board is not on the photograph: ``kind`` and the numbers say what is."""
+    """The calibration board was not detected; ``kind`` and the numbers describe what was."""
 
 
 class NoBoardError(BoardNotFoundError):
-    """Nothing is a chessboard. ``corners``."""
+    """No chessboard was detected. ``corners``."""
 
 
 class NoMarkersError(BoardNotFoundError):
@@ -100,23 +100,23 @@ class MirroredError(BoardNotFoundError):
 
 
 class OtherLayoutError(BoardNotFoundError):
-    """The markers lie otherwise."""
+    """The markers are in another layout."""
 
 
 class OtherSizeError(BoardNotFoundError):
-    """There is a chessboard of another size."""
+    """A chessboard of another size was detected."""
 
 
 class PartialError(BoardNotFoundError):
-    """Only a part of the chessboard is seen."""
+    """Only a part of the chessboard is visible."""
 
 
 class SeveralBoardsError(BoardNotFoundError):
-    """There are several boards."""
+    """Several boards were detected."""
 
 
 class NoBoardsError(EpipoleError):
-    """No photograph shows the board. ``refusals``: why, by view and camera."""
+    """The board was not detected on any photograph. ``refusals``: reasons by view and camera."""
 
 
 class TooFewViewsError(EpipoleError):
@@ -128,35 +128,35 @@ class TooFewMatchesError(EpipoleError):
 
 
 class TooFewInliersError(EpipoleError):
-    """Too few matches agree on a motion of the camera."""
+    """The relative pose has too few inliers."""
 
 
 class PureRotationError(EpipoleError):
-    """The camera only turned: there is no depth to be seen."""
+    """The motion is a pure rotation, which gives no depth."""
 
 
 class PlanarError(EpipoleError):
-    """All that agrees lies on a plane."""
+    """All inliers lie on a plane: a degenerate configuration."""
 
 
 class LittleParallaxError(EpipoleError):
-    """The camera moved too little for depth."""
+    """The baseline is too small for depth."""
 
 
 class UncertainPoseError(EpipoleError):
-    """The motion is not determined well enough."""
+    """The relative pose is too uncertain."""
 
 
 class WrongFocalError(EpipoleError, ValueError):
-    """The focal length that was given contradicts the matches."""
+    """The given focal length contradicts the matches."""
 
 
 class ImplausibleFocalError(EpipoleError):
-    """The matches lead to a focal length that photographs do not have."""
+    """The self-calibrated focal length is implausible."""
 
 
 class NoPairsError(EpipoleError):
-    """No two photographs show enough of the same. ``photos``."""
+    """No two photographs have enough overlap. ``photos``."""
 
 
 class TooFewPhotosError(EpipoleError, ValueError):
@@ -164,7 +164,7 @@ class TooFewPhotosError(EpipoleError, ValueError):
 
 
 class NoOverlapError(EpipoleError):
-    """The photographs have nothing in common. ``images``: what became of each."""
+    """No two photographs overlap. ``images``: the outcome of each."""
 
 
 class NoForegroundError(EpipoleError, ValueError):
@@ -176,18 +176,18 @@ class NoBackgroundError(EpipoleError, ValueError):
 
 
 class InternalError(RuntimeError):
-    """A mistake of this package."""
+    """A bug of this package."""
 
 
-def _again(cls, message, state):
+def _restore(cls, message, state):
     error = cls(message)
     error.__dict__.update(state)
     return error
 
 
 def _made(variants, message, numbers):
-    """The exception of the innermost refusal that has a class."""
-    # A class has a name of its own.
+    """Makes the exception of the innermost error variant that has a class."""
+    # ``kind`` is reserved for the name of the variant.
     if "kind" in numbers:
         numbers["in_which_way"] = numbers.pop("kind")
     for variant in reversed(variants):

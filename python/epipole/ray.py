@@ -1,10 +1,10 @@
-"""The same jobs over many photographs on a cluster, by Ray Data: ``pip install 'epipole[ray]'``.
+"""Jobs over many photographs on a cluster, with Ray Data: ``pip install 'epipole[ray]'``.
 
-Each function takes a list of paths, or a Ray Dataset with them in columns, and a folder for the results that all nodes share. Paths are sent to the workers, which read the photographs themselves, with
-one thread each. The result is a Dataset of a row for each photograph: its paths, the ``output``, some figures, whether it was ``skipped`` because its output was there from an earlier run, and the ``error`` in
-place of one that could not be done: a bad file ends no job.
+Each function takes a list of paths, or a Ray Dataset with columns of paths, and a shared output folder. Workers get the paths, read the photographs themselves and use one thread each. The result is a
+Dataset with a row for each photograph: its paths, the ``output``, statistics, whether it was ``skipped`` because its output exists from an earlier run, and the ``error`` if it failed; a failed photograph
+does not fail the job.
 
-Results are written whole or not at all, so that a run that was stopped goes on where it ended when it is started again with the same folder and options.
+Outputs are written atomically, so that a stopped run can be continued by starting it again with the same folder and options.
 """
 
 import dataclasses
@@ -20,22 +20,22 @@ import numpy as np
 import epipole
 
 _RESTARTS = 3
-"""Times that a worker which died is started again, and that the photographs it had are tried again."""
+"""Maximum number of restarts of a failed worker, and of retries of its photographs."""
 _ROWS = 8
-"""Photographs in one task: few are lost where a worker dies, and a task's overhead of milliseconds is spread over some."""
+"""Photographs per task: few are lost if a worker dies, and the overhead of some milliseconds per task is amortized."""
 
 
 def depth(pairs, output, *, actors=None, restarts=_RESTARTS, names=None, **options):
-    """Disparity, and depth where focal and baseline or a rig are given, of rectified pairs or of those of the rig.
+    """Computes disparity, and depth if focal and baseline or a rig are given, of rectified pairs or of pairs of the rig.
 
-    pairs: (left, right) paths, or a Dataset with columns ``left`` and ``right``. Writes NAME.npz with ``disparity``, ``state`` and, where it is known, ``depth``; options are those of
+    pairs: (left, right) paths, or a Dataset with columns ``left`` and ``right``. Writes NAME.npz with ``disparity``, ``state`` and, if known, ``depth``; options are those of
     :func:`epipole.depth`.
     """
     return _run("depth", _Depth, pairs, ("left", "right"), output, ".npz", actors, restarts, names, options)
 
 
 def segment(images, output, *, model, actors=None, restarts=_RESTARTS, names=None, min_score=None):
-    """Masks of an object by its color: NAME_mask.png.
+    """Segments an object by color: NAME_mask.png.
 
     model: a fitted :class:`epipole.ColorModel`, or the path of a saved one.
     """
@@ -45,18 +45,18 @@ def segment(images, output, *, model, actors=None, restarts=_RESTARTS, names=Non
 
 
 def undistort(images, output, *, camera, actors=None, restarts=_RESTARTS, names=None, **options):
-    """Photographs of one camera without the distortion of its lens: NAME.png. Options are those of :func:`epipole.undistort`."""
+    """Undistorts photographs of one camera: NAME.png. Options are those of :func:`epipole.undistort`."""
     options = {"camera": camera, **options}
     return _run("undistort", _Undistort, images, ("image",), output, ".png", actors, restarts, names, options)
 
 
 def features(images, output, *, actors=None, restarts=_RESTARTS, names=None, **options):
-    """Keypoints and descriptors: NAME.npz with ``keypoints``, ``descriptors`` and ``kind``. Options are those of :func:`epipole.extract_features`."""
+    """Extracts keypoints and descriptors: NAME.npz with ``keypoints``, ``descriptors`` and ``kind``. Options are those of :func:`epipole.extract_features`."""
     return _run("features", _Features, images, ("image",), output, ".npz", actors, restarts, names, options)
 
 
 def match_pairs(pairs, output, *, actors=None, restarts=_RESTARTS, names=None, **options):
-    """Matches of pairs of files that :func:`features` wrote: NAME.npz with ``points``, ``indices`` and ``ratios``. Options are those of :func:`epipole.match`.
+    """Matches pairs of files written by :func:`features`: NAME.npz with ``points``, ``indices`` and ``ratios``. Options are those of :func:`epipole.match`.
 
     pairs: (a, b) paths, or a Dataset with columns ``a`` and ``b``.
     """
@@ -64,10 +64,10 @@ def match_pairs(pairs, output, *, actors=None, restarts=_RESTARTS, names=None, *
 
 
 def sfm(photographs, output, *, actors=None, restarts=_RESTARTS, names=None, max_features=None, **options):
-    """:func:`epipole.sfm` with the features of the photographs found on the cluster, into NAME.pickle; pairs and the solution are the work of the process that calls.
+    """:func:`epipole.sfm` with features extracted on the cluster, into NAME.pickle; matching and reconstruction run in the calling process.
 
-    photographs: paths, or a Dataset with a column ``image``. Returns the result, whose ``left_out`` also has those of which no features could be found. The files are read back with ``pickle``: the folder
-    must be one that nobody else writes into.
+    photographs: paths, or a Dataset with a column ``image``. Returns the result, whose ``left_out`` includes photographs without features. The files are read back with ``pickle``: the folder
+    must not be writable by others.
     """
     found = _run("sfm", _SfmFeatures, photographs, ("image",), output, ".pickle", actors, restarts, names, {"max_features": max_features})
     rows = sorted(found.take_all(), key=lambda row: row["name"])
@@ -89,14 +89,14 @@ def _run(job, worker, given, columns, output, ending, actors, restarts, names, o
 
     output = Path(output).absolute()
     output.mkdir(parents=True, exist_ok=True)
-    # A wrong option is told of here, not by every row.
+    # Invalid options are reported here, not by every row.
     worker(output=str(output), ending=ending, options=options)
     _same_options(output / "options.json", job, options)
     if not ray.is_initialized():
         # Without an address Ray attaches to whatever cluster was last started on this machine, even one that has died: its file stays behind.
         ray.init(address=os.environ.get("RAY_ADDRESS", "local"), include_dashboard=False, log_to_driver=False)
     if actors is None:
-        # One processor is left to reading and to Ray itself: a pool on all of them waits for ever for the tasks that feed it.
+        # One processor is left for reading and for Ray itself: a pool on all of them deadlocks with the tasks that feed it.
         actors = max(1, int(ray.cluster_resources().get("CPU", 2)) - 1)
     if isinstance(given, ray.data.Dataset):
         if names is not None:
@@ -107,7 +107,7 @@ def _run(job, worker, given, columns, output, ending, actors, restarts, names, o
         tasks = -(-len(listed) // _ROWS)
         rows, actors = ray.data.from_items(listed, override_num_blocks=tasks), min(actors, tasks)
     with warnings.catch_warnings():
-        # Of those that have no named parameter.
+        # max_restarts and max_task_retries have no named parameter.
         warnings.filterwarnings("ignore", "`ray_remote_args` is deprecated")
         done = rows.map(
             worker,
@@ -121,7 +121,7 @@ def _run(job, worker, given, columns, output, ending, actors, restarts, names, o
 
 
 def _rows(given, columns, names):
-    """A row for each photograph or pair, under a name of its own."""
+    """Returns a row for each photograph or pair, with a unique name."""
     rows = []
     for i, paths in enumerate(given):
         paths = [paths] if len(columns) == 1 else list(paths)
@@ -137,29 +137,29 @@ def _rows(given, columns, names):
         raise ValueError(f"{len(names)} names for {len(rows)} results")
     twice = {name for name in names if names.count(name) > 1} if len(set(names)) < len(names) else ()
     if twice:
-        raise ValueError(f"{len(twice)} results would have the name of another, such as {min(twice)}: give names=")
+        raise ValueError(f"{len(twice)} results would have the same name as another, such as {min(twice)}: give names=")
     return [{"name": name, **row} for name, row in zip(names, rows)]
 
 
 def _name(row, columns):
-    """The name of the first file; of matches, both."""
+    """Returns the stem of the first file; for matches, of both."""
     return "-".join(Path(row[column]).stem for column in (columns if columns == ("a", "b") else columns[:1]))
 
 
 def _same_options(path, job, options):
-    """Results of other options are not to be taken for those of these."""
-    told = {"job": job, "version": epipole.__version__, "options": options}
-    # Cameras and rigs to their last digit, which their texts leave out.
-    text = json.dumps(told, default=lambda value: pickle.dumps(value, 4).hex(), sort_keys=True)
+    """Refuses a folder with results of another job, other options or another version."""
+    content = {"job": job, "version": epipole.__version__, "options": options}
+    # Cameras and rigs are pickled to keep all digits, which their texts do not have.
+    text = json.dumps(content, default=lambda value: pickle.dumps(value, 4).hex(), sort_keys=True)
     if path.exists():
         if path.read_text(encoding="utf-8") != text:
-            raise ValueError(f"{path.parent} holds results of another job, of other options or of another version: name another folder")
+            raise ValueError(f"{path.parent} has results of another job, other options or another version: use another folder")
         return
     _write(path, lambda file: file.write(text.encode()))
 
 
 def _write(path, write):
-    """Writes a file whole or not at all."""
+    """Writes a file atomically."""
     handle, temporary = tempfile.mkstemp(dir=os.path.dirname(path), prefix=".epipole-")
     try:
         with os.fdopen(handle, "wb") as file:
@@ -171,7 +171,7 @@ def _write(path, write):
 
 
 class _Worker:
-    """One photograph after the other; what goes wrong with one is its row's error."""
+    """Processes photographs one at a time; an exception becomes the error of the row."""
 
     def __init__(self, output, ending, options):
         self.output, self.ending = output, ending
@@ -202,7 +202,7 @@ def _arrays(path, arrays):
 
 
 def _checked(function, options):
-    """The options, of one thread, where they are the function's."""
+    """Checks the options against those of the function, and sets one thread."""
     known = epipole.defaults(function)
     for name in options:
         if name not in known or name in ("threads", "progress"):
@@ -283,6 +283,6 @@ class _Match(_Worker):
 
 
 def load_features(path):
-    """The features that :func:`features` wrote."""
+    """Reads features written by :func:`features`."""
     with np.load(path) as arrays:
         return epipole.Features(arrays["keypoints"], arrays["descriptors"], str(arrays["kind"]))

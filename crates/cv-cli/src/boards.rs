@@ -1,34 +1,34 @@
-//! The options that say which calibration board: those of `cv board` and of `cv calibrate` are the same.
+//! The options that describe a calibration board, shared by `cv board` and `cv calibrate`.
 
 use crate::frame::{Failure, named};
 use cv_pipeline::BoardChoice;
 use cv_pipeline::calibration::{Board, BoardKind, BoardSize, CharucoBoard, Dictionary, GridStyle, MarkerGrid};
 
-/// Which board.
+/// The options of a calibration board.
 #[derive(Debug, clap::Args)]
 pub(crate) struct BoardArgs {
     /// Kind of board.
     #[arg(long, value_parser = named::<BoardKind>(), default_value_t = BoardKind::Chessboard)]
     kind: BoardKind,
-    /// Columns by rows: of a chessboard its inner corners (9x6 for 10 by 7 squares), of a ChArUco board its squares, of a grid its markers. `auto`: the chessboard that most
-    /// photographs show.
+    /// Columns by rows: the inner corners of a chessboard (9x6 for 10 by 7 squares), the squares of a ChArUco board, the markers of a grid. `auto`: the chessboard size found on
+    /// most photographs.
     #[arg(long, value_name = "CxR|auto", default_value = "auto", value_parser = parse_counts)]
     board: Counts,
     /// Side of a square of a chessboard or ChArUco board.
     #[arg(long, value_name = "LENGTH")]
     square: Option<f64>,
-    /// Side of a marker with its black frame, of a ChArUco board or a grid.
+    /// Side of a marker including its black border, for ChArUco boards and grids.
     #[arg(long, value_name = "LENGTH")]
     marker: Option<f64>,
-    /// Markers of a ChArUco board or an ArUco grid: those of the dictionary from the first on [default: 5x5_100]. An AprilGrid has 36h11.
+    /// Marker dictionary of a ChArUco board or an ArUco grid; its markers are used from the first on [default: 5x5_100]. An AprilGrid has 36h11.
     #[arg(long, value_name = "NAME", value_parser = named::<Dictionary>())]
     dictionary: Option<Dictionary>,
-    /// Gap between the markers of a grid, as a share of their side [default: 0.3].
-    #[arg(long, value_name = "SHARE")]
+    /// Gap between the markers of a grid, as a fraction of their side [default: 0.3].
+    #[arg(long, value_name = "RATIO")]
     spacing: Option<f64>,
 }
 
-/// Columns and rows, or that they are to be found.
+/// Columns and rows; `None`: to be detected.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Counts(Option<(usize, usize)>);
 
@@ -44,12 +44,12 @@ fn parse_counts(text: &str) -> Result<Counts, String> {
 }
 
 impl BoardArgs {
-    /// Whether a length was given, so that distances have a unit.
+    /// Whether a length is given, so that distances have a unit.
     pub(crate) fn has_lengths(&self) -> bool {
         self.square.is_some() || self.marker.is_some()
     }
 
-    /// The board, where it is one that there can be.
+    /// Returns the board, which must be fully specified (for printing).
     pub(crate) fn known(&self) -> Result<Board, Failure> {
         match self.choice()? {
             BoardChoice::Known(board) if self.has_lengths() => Ok(board),
@@ -60,19 +60,18 @@ impl BoardArgs {
         }
     }
 
-    /// What photographs are to be searched for.
+    /// Returns the board to detect.
     pub(crate) fn choice(&self) -> Result<BoardChoice, Failure> {
         let unused = |given: bool, option: &str| {
             if given { Err(Failure::usage(format!("a {} takes no {option}", self.kind))) } else { Ok(()) }
         };
         let needed = |length: Option<f64>, option: &str| {
-            length.ok_or_else(|| {
-                Failure::usage(format!("of a {} the lengths must be known", self.kind)).advice(format!("{option} 25"))
-            })
+            length
+                .ok_or_else(|| Failure::usage(format!("a {} needs {option}", self.kind)).advice(format!("{option} 25")))
         };
         let counts = || {
             self.board.0.ok_or_else(|| {
-                Failure::usage(format!("of a {} columns and rows must be known", self.kind)).advice("--board 8x6")
+                Failure::usage(format!("a {} needs --board, its columns and rows", self.kind)).advice("--board 8x6")
             })
         };
         let board = match self.kind {
@@ -90,7 +89,7 @@ impl BoardArgs {
                     squares: counts()?,
                     square: needed(self.square, "--square")?,
                     marker: needed(self.marker, "--marker")?,
-                    dictionary: self.dictionary.unwrap_or(DICTIONARY),
+                    dictionary: self.dictionary.unwrap_or(DEFAULT_DICTIONARY),
                 })
             }
             BoardKind::ArucoGrid | BoardKind::Aprilgrid => {
@@ -101,13 +100,13 @@ impl BoardArgs {
                 let (style, dictionary) = if april {
                     (GridStyle::AprilGrid, Dictionary::AprilTag36h11)
                 } else {
-                    (GridStyle::Aruco, self.dictionary.unwrap_or(DICTIONARY))
+                    (GridStyle::Aruco, self.dictionary.unwrap_or(DEFAULT_DICTIONARY))
                 };
                 let (markers, marker) = (counts()?, needed(self.marker, "--marker")?);
                 Board::MarkerGrid(MarkerGrid {
                     markers,
                     marker,
-                    spacing: self.spacing.unwrap_or(SPACING),
+                    spacing: self.spacing.unwrap_or(DEFAULT_SPACING),
                     dictionary,
                     style,
                 })
@@ -118,13 +117,13 @@ impl BoardArgs {
     }
 }
 
-/// Fifty markers of 5×5 cells are read from farther than those of 6×6, and taken for something else less often than those of 4×4.
-const DICTIONARY: Dictionary = Dictionary::Aruco5x5x100;
-/// That of Kalibr's boards.
-const SPACING: f64 = 0.3;
+/// Markers of 5×5 cells are detected from farther away than those of 6×6, and give fewer false detections than those of 4×4.
+const DEFAULT_DICTIONARY: Dictionary = Dictionary::Aruco5x5x100;
+/// Gap between markers over their side: the `tagSpacing` of Kalibr's boards.
+const DEFAULT_SPACING: f64 = 0.3;
 
-/// The options that name a board.
-pub(crate) fn options(board: &Board) -> String {
+/// Formats the options that specify a board.
+pub(crate) fn board_options(board: &Board) -> String {
     let (columns, rows) = board.counts();
     let kind = match board.kind() {
         BoardKind::Chessboard => String::new(),
@@ -141,8 +140,8 @@ pub(crate) fn options(board: &Board) -> String {
     format!("{kind}--board {columns}x{rows} {lengths}")
 }
 
-/// A board in words, with its lengths in `unit`.
-pub(crate) fn told(board: &Board, unit: &str) -> String {
+/// Describes a board for people, with lengths in `unit`.
+pub(crate) fn describe_board(board: &Board, unit: &str) -> String {
     let (columns, rows) = board.counts();
     match board {
         Board::Chessboard { square, .. } => {
@@ -179,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn the_options_of_a_board_name_it_again() {
+    fn board_options_round_trip() {
         for text in [
             "--board 9x6 --square 25",
             "--kind charuco --board 8x6 --square 30 --marker 22.5 --dictionary 4x4_50",
@@ -187,13 +186,13 @@ mod tests {
             "--kind aprilgrid --board 6x6 --marker 24 --spacing 0.3",
         ] {
             let Ok(BoardChoice::Known(board)) = parsed(text) else { panic!("{text}") };
-            assert_eq!(options(&board), text);
+            assert_eq!(board_options(&board), text);
         }
         assert!(matches!(parsed(""), Ok(BoardChoice::AnyChessboard { square: 1.0 })));
     }
 
     #[test]
-    fn what_does_not_go_together_is_refused() {
+    fn incompatible_options_are_refused() {
         for text in [
             "--board 9",
             "--board 2x2",

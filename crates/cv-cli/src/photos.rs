@@ -1,4 +1,4 @@
-//! Two photographs, as deep as their files have them.
+//! A pair of photographs at the bit depth of their files.
 
 use crate::frame::Failure;
 use cv_io::DynImage;
@@ -21,8 +21,7 @@ impl Photos {
     }
 }
 
-/// Evaluates an expression with views of both photographs, as deep as the files have them; as bytes of color where the two differ in kind or
-/// hold linear light.
+/// Evaluates an expression with views of both photographs at their bit depth; as 8-bit RGB if their formats differ or are linear floats.
 macro_rules! at_own_depth {
     ($photos:expr, |$a:ident, $b:ident| $work:expr) => {
         match (&$photos.left.pixels, &$photos.right.pixels) {

@@ -45,7 +45,7 @@ fn one_view_and_photographs_of_different_sizes_are_too_few() {
     assert!(one.contains("can be used on 1 photograph, 3 are needed"), "{one}");
     let sizes = calibrate(&["one.png", "other.png", "one.png"]);
     assert!(sizes.contains("2 photographs, 3 are needed"), "{sizes}");
-    assert!(sizes.contains("702×476 px, the first photograph 702×496 px"), "{sizes}");
+    assert!(sizes.contains("702×476 px, the first photograph is 702×496 px"), "{sizes}");
     assert!(!folder.path().join("camera.yaml").exists());
 }
 
@@ -79,7 +79,10 @@ fn boards_that_look_the_same_after_half_a_turn_are_found_as_they_are() {
         let photo = sheet(folder.path(), &["--board", size, "--square", "20"]);
         // Found in each, and seen from straight ahead in all: what is refused is that, and not the board.
         let said = said_of(folder.path(), &photo, &["--board", size]);
-        assert!(said.contains("do not determine the lens: the board is tilted by 0° at most"), "{size}: {said}");
+        assert!(
+            said.contains("do not determine the intrinsics: the largest tilt of the board is 0°"),
+            "{size}: {said}"
+        );
     }
 }
 

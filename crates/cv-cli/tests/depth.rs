@@ -68,7 +68,9 @@ fn a_generated_pair_becomes_disparity_depth_and_cloud() {
     let scores = json(folder.path(), &[&eval[..], &["--error", "error.png", "--report", "scores"]].concat());
     let page = std::fs::read_to_string(at("scores/report.html")).unwrap();
     assert!(
-        ["bad-0.5", "A95", "non-occluded", "The same of the true disparities"].iter().all(|words| page.contains(words))
+        ["bad-0.5", "A95", "non-occluded", "The same for the true disparities"]
+            .iter()
+            .all(|words| page.contains(words))
     );
     assert_eq!(cv_io::read_rgb(at("error.png")).unwrap().size(), (240, 180));
     // A wrong sign, unit or row order would be off everywhere; a sound matcher is wrong at a few outlines.
@@ -308,7 +310,7 @@ fn a_range_far_from_zero_finds_what_lies_there() {
     assert!(plain.0 > 0.8 && (far.0 - plain.0).abs() < 0.025 && (far.1 - plain.1).abs() < 0.025, "{far:?} {plain:?}");
     let page = std::fs::read_dir(at("r")).unwrap().map(|e| e.unwrap().path());
     let page = page.into_iter().find(|p| p.extension().is_some_and(|e| e == "html")).unwrap();
-    assert!(std::fs::read_to_string(page).unwrap().contains("Fractions of disparities"));
+    assert!(std::fs::read_to_string(page).unwrap().contains("Fractional parts of disparities"));
 }
 
 #[test]

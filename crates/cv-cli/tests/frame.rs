@@ -120,7 +120,7 @@ fn options_that_mean_nothing_are_refused() {
         for (option, taken) in [(["--seed", "3"], seed), (["--report", "page"], report)] {
             let ran = run(folder.path(), &[args, &option].concat());
             assert_eq!(ran.code, Some(if taken { 0 } else { 2 }), "cv {args:?} {option:?}: {ran:?}");
-            assert_eq!(ran.stderr.contains("means nothing here"), !taken, "cv {args:?} {option:?}: {ran:?}");
+            assert_eq!(ran.stderr.contains("has no effect here"), !taken, "cv {args:?} {option:?}: {ran:?}");
         }
         let page = folder.path().join("page/report.html");
         assert_eq!(page.exists(), report, "cv {args:?}");

@@ -44,9 +44,9 @@ fn more_photographs_than_a_command_takes_are_answered_by_what_to_do() {
     }
     let three = ["a.jpg", "b.jpg", "c.jpg"];
     let cases: [(&[&str], &[&str], &str); 5] = [
-        (&["match"], &[], "two photographs are taken at a time, not 3"),
-        (&["reconstruct"], &["-o", "cloud.ply"], "two photographs are taken at a time, not 3"),
-        (&["rectify"], &["--rig", "rig.yaml", "-o", "out"], "two photographs are taken at a time, not 3"),
+        (&["match"], &[], "two photographs are needed, got 3"),
+        (&["reconstruct"], &["-o", "cloud.ply"], "two photographs are needed, got 3"),
+        (&["rectify"], &["--rig", "rig.yaml", "-o", "out"], "two photographs are needed, got 3"),
         (&["depth"], &["-o", "d.pfm"], "two folders, or two patterns in quotes"),
         (&["estimate", "homography"], &[], "cv match A B -o matches.txt"),
     ];
@@ -61,7 +61,7 @@ fn more_photographs_than_a_command_takes_are_answered_by_what_to_do() {
         let ran = run(folder.path(), &[command, &["."][..], more].concat());
         assert!(ran.code == Some(2) && ran.stderr.contains("cv panorama"), "{command:?}: {ran:?}");
         let ran = run(folder.path(), &[command, &["a.jpg"][..], more].concat());
-        assert!(ran.code == Some(2) && ran.stderr.contains("a.jpg is one"), "{command:?}: {ran:?}");
+        assert!(ran.code == Some(2) && ran.stderr.contains("only a.jpg is given"), "{command:?}: {ran:?}");
     }
 }
 

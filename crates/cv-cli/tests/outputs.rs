@@ -51,7 +51,7 @@ fn the_same_seed_gives_the_same_files() {
         let args = [&strs(&args)[..], &["--seed", "12345"]].concat();
         if !job.random {
             let ran = run(folder.path(), &args);
-            assert!(ran.code == Some(2) && ran.stderr.contains("--seed means nothing here"), "{}: {ran:?}", job.name);
+            assert!(ran.code == Some(2) && ran.stderr.contains("--seed has no effect here"), "{}: {ran:?}", job.name);
             continue;
         }
         let results = [0, 1].map(|_| {

@@ -226,7 +226,7 @@ fn fields_of_view_that_make_no_sense_are_refused_with_their_numbers() {
     for (more, words) in [
         (&["--fov", "0"][..], "0 is not between 1 and 360"),
         (&["--fov", "60,nan"], "NaN is not between"),
-        (&["--fov", "wide"], "wide is no number"),
+        (&["--fov", "wide"], "wide is not an angle"),
         (&["--fov", "1e300"], "is not between"),
         (&["--center", "20"], "two angles are needed"),
         (&["--center", "0,-91"], "-91 is not between -90 and 90"),
@@ -350,7 +350,7 @@ fn registrations_of_other_photographs_and_damaged_ones_are_refused() {
     assert_eq!(run(folder.path(), &args).code, Some(2));
     let args =
         [&["panorama"], &photos[..], &["-o", "b.png", "--registration", "rig.json", "--save-registration", "rig.json"]];
-    assert!(refused(folder.path(), &args.concat()).stderr.contains("would be written over"));
+    assert!(refused(folder.path(), &args.concat()).stderr.contains("would be overwritten"));
     assert_eq!(std::fs::read_to_string(folder.path().join("rig.json")).unwrap(), text);
 }
 

@@ -109,7 +109,7 @@ fn tiny_and_featureless_pictures_get_an_answer() {
                         }
                     }
                 }
-                // `run` holds that the program does not stop at a bug of its own.
+                // `run` asserts that the program does not panic.
                 let ran = run(folder.path(), &strs(&job.args(&inputs)));
                 assert_ne!(ran.code, Some(2), "{}: {name} is no matter of usage: {}", job.name, ran.stderr);
                 if ran.code == Some(1) {

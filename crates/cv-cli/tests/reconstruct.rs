@@ -74,7 +74,7 @@ fn what_cannot_be_dense_is_refused_and_nothing_is_written() {
     photographs(folder.path(), &scene, [first, ahead]);
     let args = ["reconstruct", "a.png", "b.png", "--focal", "420", "-o", "s.ply", "--dense", "d.ply"];
     let said = refused(folder.path(), &args).stderr;
-    assert!(said.contains("cannot be rectified") && said.contains("step aside"), "{said}");
+    assert!(said.contains("cannot be rectified") && said.contains("sideways"), "{said}");
     assert!(!folder.path().join("s.ply").exists() && !folder.path().join("d.ply").exists());
     // The sparse cloud alone can be had.
     json(folder.path(), &args[..7]);
@@ -101,7 +101,7 @@ fn a_focal_length_that_was_estimated_is_said_with_its_deviation() {
     let html = fs::read_to_string(folder.path().join("out/report.html")).unwrap();
     assert!(
         said.contains("warning: the focal length") == doubtful
-            && html.contains("The focal length is known") == doubtful
+            && html.contains("The focal length has a standard deviation") == doubtful
     );
     // One that is given is a start: it is good to a few per cent.
     let given = json(folder.path(), &[&args[..], &["--focal", "430"]].concat());

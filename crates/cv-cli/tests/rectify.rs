@@ -65,7 +65,7 @@ fn rigs_that_are_none_are_refused_and_nothing_is_written() {
         refused(folder.path(), &[&["rectify", "a.png", "b.png", "--rig", rig, "--out", "out"], more].concat()).stderr
     };
     assert!(refuse("exchanged.yaml", &[]).contains("left of the first: they are exchanged"));
-    assert!(refuse("exchanged.yaml", &[]).contains("give --exchange"));
+    assert!(refuse("exchanged.yaml", &[]).contains("and --exchange"));
     assert!(refuse("rig.yaml", &["--exchange"]).contains("leave out --exchange"));
     let none = refuse("none.yaml", &[]);
     assert!(none.contains("zero"), "{none}");
@@ -105,7 +105,7 @@ fn what_is_read_is_never_written_over() {
         ("b.png", "calibration/rig.yaml", "./calibration/../calibration", "rig.yaml"),
     ] {
         let ran = refused(folder.path(), &["rectify", left, "b.png", "--rig", rig, "--out", out]);
-        assert!(ran.stderr.contains(named) && ran.stderr.contains("would be written over"), "{ran:?}");
+        assert!(ran.stderr.contains(named) && ran.stderr.contains("would be overwritten"), "{ran:?}");
     }
     assert!(snapshot(folder.path()) == before);
 }
@@ -147,8 +147,12 @@ fn photographs_that_do_not_fit_the_rig_are_told_from_those_without_features() {
 fn the_rig_file_of_the_help_is_one() {
     let folder = rig(false);
     let help = done(folder.path(), &["rectify", "--help"]).stdout;
-    let file: Vec<&str> =
-        help.lines().skip_while(|l| !l.starts_with("A rig file")).skip(1).take_while(|l| l.starts_with("  ")).collect();
+    let file: Vec<&str> = help
+        .lines()
+        .skip_while(|l| !l.starts_with("Our rig file"))
+        .skip(1)
+        .take_while(|l| l.starts_with("  "))
+        .collect();
     std::fs::write(folder.path().join("help.yaml"), file.join("\n").replace("\n  ", "\n").trim_start()).unwrap();
     let ran = refused(folder.path(), &["rectify", "a.png", "b.png", "--rig", "help.yaml", "--out", "out"]);
     // Understood in full: only the size is not that of these photographs.
@@ -213,7 +217,7 @@ fn depth_by_a_rig_keeps_the_bits_of_the_photographs() {
     let near = bytes.as_slice().iter().zip(deep.as_slice()).filter(|(a, b)| (**a - **b).abs() < 1.0).count();
     // Penalties and smoothing know edges by their height, which is 1/257 of what it was; what is filled in follows from them.
     assert!(near * 10 > bytes.as_slice().len() * 8, "{near} of {}", bytes.as_slice().len());
-    assert!(std::fs::read_to_string(at("page/report.html")).unwrap().contains("unknown gray"));
+    assert!(std::fs::read_to_string(at("page/report.html")).unwrap().contains("invalid gray"));
     // The size of the rectified photographs is that of `cv rectify --size`.
     let args = ["depth", "a.png", "b.png", "--rig", "rig.yaml", "-o", "d.pfm", "--disparities", "64"];
     done(folder.path(), &[&args[..], &["--size", "200x150"]].concat());

@@ -98,7 +98,7 @@ fn bad_models_and_arguments_are_refused() {
     let folder = discs.path();
     for (text, word) in [
         ("", "empty"),
-        ("[", "no segmentation model"),
+        ("[", "not a segmentation model"),
         ("{\"schema\": 9}", "schema 9"),
         ("{}", "no schema"),
         ("{\"schema\": 1}", "missing field"),

@@ -1,4 +1,4 @@
-//! Arrays borrowed as images, and results given away as arrays without a copy.
+//! Conversion of arrays to images and of results to arrays, without copies.
 
 use crate::errors::of_argument;
 use cv_core::{GrayF32, Image, ImageView, Mask, Sample};
@@ -11,26 +11,26 @@ use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
 use serde_json::json;
 
-/// An image in the memory of its array, or in that of a copy where its pixels do not lie one after the other.
+/// An image borrowed from its array, or from a contiguous copy if its pixels are not contiguous.
 pub(crate) enum ImageArg<'py> {
     U8(Borrowed<'py, u8>),
     U16(Borrowed<'py, u16>),
     F32(Borrowed<'py, f32>),
 }
 
-/// The memory of an image.
+/// A borrowed array of an image.
 pub(crate) struct Borrowed<'py, T: Element> {
     array: PyReadonlyArrayDyn<'py, T>,
     width: usize,
     height: usize,
     channels: usize,
-    /// Samples from one row to the next.
+    /// Row stride in samples.
     stride: usize,
     copied: bool,
 }
 
 impl<'py, T: Element + Sample> Borrowed<'py, T> {
-    /// As a view of so many channels.
+    /// Returns a view with `C` channels; `None` if the image has another number.
     pub(crate) fn view<const C: usize>(&self) -> Option<ImageView<'_, T, C>> {
         if self.channels != C {
             return None;
@@ -39,7 +39,7 @@ impl<'py, T: Element + Sample> Borrowed<'py, T> {
     }
 }
 
-/// Runs an expression over the view of a gray or color image of 8 or 16 bits or floats: once for each type.
+/// Evaluates an expression with the views of two gray or color images, instantiated for 8 and 16 bits and floats.
 #[macro_export]
 macro_rules! with_views {
     ($py:expr, [$a:expr, $b:expr], |$x:ident, $y:ident| $body:expr) => {{
@@ -49,7 +49,7 @@ macro_rules! with_views {
                 match ($one.view::<1>(), $two.view::<1>(), $one.view::<3>(), $two.view::<3>()) {
                     (Some($x), Some($y), ..) => $body,
                     (.., Some($x), Some($y)) => $body,
-                    _ => Err($crate::arrays::unlike($py, &$a, &$b)),
+                    _ => Err($crate::arrays::image_mismatch($py, &$a, &$b)),
                 }
             };
         }
@@ -57,12 +57,12 @@ macro_rules! with_views {
             (ImageArg::U8(one), ImageArg::U8(two)) => both!(one, two),
             (ImageArg::U16(one), ImageArg::U16(two)) => both!(one, two),
             (ImageArg::F32(one), ImageArg::F32(two)) => both!(one, two),
-            _ => Err($crate::arrays::unlike($py, &$a, &$b)),
+            _ => Err($crate::arrays::image_mismatch($py, &$a, &$b)),
         }
     }};
 }
 
-/// The same over one image.
+/// As [`with_views`], for one image.
 #[macro_export]
 macro_rules! with_view {
     ($image:expr, |$x:ident| $body:expr) => {{
@@ -85,7 +85,7 @@ macro_rules! with_view {
 }
 
 impl<'py> ImageArg<'py> {
-    /// Borrows an array of shape (height, width) or (height, width, 1 or 3), or whatever has `__array__` or `__dlpack__`. `what` names it in errors.
+    /// Borrows an array of shape (height, width) or (height, width, 1 or 3), or an object with `__array__` or `__dlpack__`. `what` is its name in errors.
     pub(crate) fn new(given: &Bound<'py, PyAny>, what: &str) -> PyResult<Self> {
         let array = untyped(given, what)?;
         let kind = array.dtype();
@@ -104,7 +104,7 @@ impl<'py> ImageArg<'py> {
         }
     }
 
-    /// Width, height and channels.
+    /// Returns width, height and channels.
     pub(crate) fn shape(&self) -> (usize, usize, usize) {
         match self {
             Self::U8(b) => (b.width, b.height, b.channels),
@@ -122,14 +122,14 @@ impl<'py> ImageArg<'py> {
     }
 }
 
-/// A color image, of bytes where nothing else is said: borrowed where it is one, made where it is gray.
+/// A color image (8 bits by default): borrowed, or converted from gray.
 pub(crate) enum Rgb<'py, T: Element = u8> {
     Borrowed(Borrowed<'py, T>),
     Made(Image<T, 3>),
 }
 
 impl<'py> Rgb<'py> {
-    /// Borrows an array of bytes; gray ones become color ones. Deeper ones are refused: which 8 of their bits matter, the caller knows.
+    /// Borrows an 8-bit array, converting gray to color. Other types are refused: the caller must scale them.
     pub(crate) fn new(given: &Bound<'py, PyAny>, what: &str) -> PyResult<Self> {
         match ImageArg::new(given, what)? {
             ImageArg::U8(borrowed) => Self::of(given.py(), borrowed),
@@ -145,11 +145,11 @@ impl<'py> Rgb<'py> {
 }
 
 impl<'py, T: Element + Sample> Rgb<'py, T> {
-    /// A borrowed image as one of color.
+    /// Converts a borrowed image to color if it is gray.
     pub(crate) fn of(py: Python<'py>, borrowed: Borrowed<'py, T>) -> PyResult<Self> {
         let Some(gray) = borrowed.view::<1>() else { return Ok(Self::Borrowed(borrowed)) };
         let made = Image::from_fn(gray.width(), gray.height(), |x, y| [gray.at(x, y)[0]; 3]);
-        // Of a list of large ones, that takes long.
+        // Converting a list of large images may take long.
         py.check_signals()?;
         Ok(Self::Made(made))
     }
@@ -164,13 +164,13 @@ impl<'py, T: Element + Sample> Rgb<'py, T> {
     }
 }
 
-/// The error of two images that do not go together.
-pub(crate) fn unlike(py: Python<'_>, a: &ImageArg<'_>, b: &ImageArg<'_>) -> PyErr {
-    let told = |image: &ImageArg<'_>| {
+/// Makes the error of two images of different type or channels.
+pub(crate) fn image_mismatch(py: Python<'_>, a: &ImageArg<'_>, b: &ImageArg<'_>) -> PyErr {
+    let describe = |image: &ImageArg<'_>| {
         let (width, height, channels) = image.shape();
         (json!([height, width, channels]), format!("{} of shape ({height}, {width}, {channels})", image.kind()))
     };
-    let ((left, one), (right, two)) = (told(a), told(b));
+    let ((left, one), (right, two)) = (describe(a), describe(b));
     of_argument(
         py,
         "ImageMismatch",
@@ -179,7 +179,7 @@ pub(crate) fn unlike(py: Python<'_>, a: &ImageArg<'_>, b: &ImageArg<'_>) -> PyEr
     )
 }
 
-/// The array that an object is or makes.
+/// Returns the array of an object.
 fn untyped<'py>(given: &Bound<'py, PyAny>, what: &str) -> PyResult<Bound<'py, PyUntypedArray>> {
     if let Ok(array) = given.cast::<PyUntypedArray>() {
         return Ok(array.clone());
@@ -203,7 +203,7 @@ fn borrow<'py, T: Element + Sample>(array: &Bound<'py, PyUntypedArray>, what: &s
         [height, width] => (height, width, 1),
         [height, width, channels @ (1 | 3)] => (height, width, channels),
         [_, _, 4] => {
-            let text = format!("{what} has 4 channels; leave the opacity out, as in image[..., :3]");
+            let text = format!("{what} has 4 channels; drop the alpha channel, as in image[..., :3]");
             return Err(of_shape(array.py(), shape, &text));
         }
         _ => {
@@ -226,7 +226,7 @@ fn borrow<'py, T: Element + Sample>(array: &Bound<'py, PyUntypedArray>, what: &s
         return readonly(typed, (width, height, channels), width * channels, false);
     }
     if dense {
-        // From the first sample to the last: those between belong to the same array.
+        // The span from the first to the last sample belongs to the same array.
         let stride = (row / size) as usize;
         let length = (height - 1) * stride + width * channels;
         let whole = as_strided(array.py())?.call1((typed, (length,), (size,)))?;
@@ -255,8 +255,8 @@ fn of_shape(py: Python<'_>, shape: &[usize], words: &str) -> PyErr {
     of_argument(py, "Shape", &[("shape", json!(shape))], words)
 }
 
-/// Whether an image is used where it lies in memory; otherwise each call copies it. Arrays whose pixels lie one after the other are, crops and every n-th row too; flipped
-/// ones and BGR views of RGB ones are not.
+/// Whether an image is used without a copy; otherwise each call copies it. Arrays with contiguous rows are borrowed, including crops and every n-th row; flipped
+/// arrays and BGR views of RGB arrays are copied.
 ///
 ///     >>> image = np.zeros((60, 80, 3), np.uint8)
 ///     >>> epipole.is_borrowed(image[10:50, 20:]), epipole.is_borrowed(image[:, ::-1])
@@ -270,7 +270,7 @@ pub(crate) fn is_borrowed(image: &Bound<'_, PyAny>) -> PyResult<bool> {
     })
 }
 
-/// A mask: bool, or bytes that are 0 where nothing is.
+/// Converts a mask of bool, or of uint8 with 0 for false.
 pub(crate) fn mask(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Mask> {
     let array = untyped(given, what)?;
     let (width, height) = flat_size(&array, what, "a mask")?;
@@ -284,7 +284,7 @@ pub(crate) fn mask(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Mask> {
     Mask::from_vec(width, height, values).map_err(|e| PyValueError::new_err(e.to_string()))
 }
 
-/// Width and height of what has one number in a pixel.
+/// Returns width and height of a two-dimensional array.
 fn flat_size(array: &Bound<'_, PyUntypedArray>, what: &str, kind: &str) -> PyResult<(usize, usize)> {
     match *array.shape() {
         [height, width] => Ok((width, height)),
@@ -299,7 +299,7 @@ fn busy(_: numpy::BorrowError) -> PyErr {
     PyValueError::new_err("the array is being written to")
 }
 
-/// A map of floats, such as disparities.
+/// Converts a float32 map, such as a disparity map.
 pub(crate) fn map(given: &Bound<'_, PyAny>, what: &str) -> PyResult<GrayF32> {
     let array = untyped(given, what)?;
     let (width, height) = flat_size(&array, what, "a map")?;
@@ -310,13 +310,13 @@ pub(crate) fn map(given: &Bound<'_, PyAny>, what: &str) -> PyResult<GrayF32> {
     GrayF32::from_vec(width, height, values).map_err(|e| PyValueError::new_err(e.to_string()))
 }
 
-/// Numbers in rows of `N`, from whatever makes an array of floats: an array of any kind of number, or lists.
+/// Converts an array-like object of shape (n, N) to rows of floats.
 pub(crate) fn rows<const N: usize>(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Vec<[f64; N]>> {
     let py = given.py();
     let made = py.import("numpy")?.call_method1("ascontiguousarray", (given, dtype::<f64>(py)))?;
     let array = made.cast::<PyArrayDyn<f64>>()?;
     let shape = array.shape();
-    // Nothing is nothing of any width.
+    // An empty array may have any width.
     let fits = matches!(*shape, [_, width] if width == N) || array.len() == 0;
     if !fits {
         let text = format!("{what} has shape {shape:?}; it must be (n, {N})");
@@ -327,7 +327,7 @@ pub(crate) fn rows<const N: usize>(given: &Bound<'_, PyAny>, what: &str) -> PyRe
     Ok(slice.as_chunks::<N>().0.to_vec())
 }
 
-/// A table of floats and its number of columns.
+/// Converts a two-dimensional array-like object to floats, and returns its number of columns.
 pub(crate) fn table(given: &Bound<'_, PyAny>, what: &str) -> PyResult<(Vec<f32>, usize)> {
     let py = given.py();
     let made = py.import("numpy")?.call_method1("ascontiguousarray", (given, dtype::<f32>(py)))?;
@@ -339,7 +339,7 @@ pub(crate) fn table(given: &Bound<'_, PyAny>, what: &str) -> PyResult<(Vec<f32>,
     Ok((array.try_readonly().map_err(busy)?.as_array().iter().copied().collect(), columns))
 }
 
-/// Numbers from whatever makes an array of them, flattened.
+/// Converts an array-like object to a flat list of finite floats.
 pub(crate) fn numbers(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Vec<f64>> {
     let py = given.py();
     let made = py.import("numpy")?.call_method1("ascontiguousarray", (given, dtype::<f64>(py)))?;
@@ -351,7 +351,7 @@ pub(crate) fn numbers(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Vec<f64>
     }
 }
 
-/// An image as an array of shape (height, width), or (height, width, C), in the same memory.
+/// Converts an image to an array of shape (height, width) or (height, width, C), without a copy.
 pub(crate) fn array<'py, T: Element + Sample, const C: usize>(
     py: Python<'py>,
     image: Image<T, C>,
@@ -361,13 +361,13 @@ pub(crate) fn array<'py, T: Element + Sample, const C: usize>(
     shaped(py, image.into_vec(), &shape)
 }
 
-/// Values as an array of a shape, in the same memory.
+/// Converts values to an array of a shape, without a copy.
 pub(crate) fn shaped<'py, T: Element>(py: Python<'py>, values: Vec<T>, shape: &[usize]) -> PyResult<Bound<'py, PyAny>> {
     let flat: Bound<'py, PyArray1<T>> = PyArray::from_vec(py, values);
     Ok(flat.reshape(IxDyn(shape))?.into_any())
 }
 
-/// Rows of numbers as an array of shape (n, N).
+/// Converts rows to an array of shape (n, N).
 pub(crate) fn row_array<'py, T: Element + Copy, const N: usize>(
     py: Python<'py>,
     rows: &[[T; N]],
@@ -375,17 +375,17 @@ pub(crate) fn row_array<'py, T: Element + Copy, const N: usize>(
     shaped(py, rows.as_flattened().to_vec(), &[rows.len(), N])
 }
 
-/// A matrix as an array of shape (3, 3).
+/// Converts a matrix to an array of shape (3, 3).
 pub(crate) fn matrix<'py>(py: Python<'py>, m: &cv_core::Matrix3<f64>) -> PyResult<Bound<'py, PyAny>> {
     shaped(py, m.transpose().as_slice().to_vec(), &[3, 3])
 }
 
-/// A vector as an array of shape (3,).
+/// Converts a vector to an array of shape (3,).
 pub(crate) fn vector<'py>(py: Python<'py>, v: &cv_core::Vector3<f64>) -> PyResult<Bound<'py, PyAny>> {
     shaped(py, v.as_slice().to_vec(), &[3])
 }
 
-/// A matrix of 3×3 numbers.
+/// Converts an array-like object to a 3×3 matrix.
 pub(crate) fn matrix_from(given: &Bound<'_, PyAny>, what: &str) -> PyResult<cv_core::Matrix3<f64>> {
     let rows: Vec<[f64; 3]> = rows(given, what)?;
     if rows.len() != 3 {

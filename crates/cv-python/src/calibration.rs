@@ -20,7 +20,7 @@ use pyo3::types::{PyDict, PyList, PyTuple};
 use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 
-/// What is searched for: one of the classes of `epipole.boards`, or nothing for a chessboard of any size.
+/// Converts a board of `epipole.boards`; `None` is a chessboard of any size.
 fn board(given: Option<&Bound<'_, PyAny>>) -> PyResult<BoardChoice> {
     let Some(given) = given.filter(|given| !given.is_none()) else {
         return Ok(BoardChoice::AnyChessboard { square: 1.0 });
@@ -59,13 +59,13 @@ fn board(given: Option<&Bound<'_, PyAny>>) -> PyResult<BoardChoice> {
     }))
 }
 
-/// The options of `find_board`.
+/// Reads the options of `find_board`.
 pub(crate) fn read_find(options: &mut Options<'_>) -> PyResult<(BoardChoice, Run)> {
     let given = options.take_any("board")?;
     Ok((board(given.as_ref())?, Run::read(options)?))
 }
 
-/// The options of `calibrate`.
+/// Reads the options of `calibrate`.
 pub(crate) fn read(options: &mut Options<'_>) -> PyResult<(BoardCalibrationOptions, Run)> {
     let given = options.take_any("board")?;
     let mut solve = CalibrateOptions::default();
@@ -76,14 +76,14 @@ pub(crate) fn read(options: &mut Options<'_>) -> PyResult<(BoardCalibrationOptio
     Ok((o, Run::read(options)?))
 }
 
-/// Gray from 0 to 1, of bytes, as the program has it.
+/// Converts to gray from 0 to 1 by 8-bit luma, as in the program.
 fn gray(view: ImageView<'_, u8, 3>) -> GrayF32 {
     GrayF32::from_fn(view.width(), view.height(), |x, y| [f32::from(luma_u8(view.at(x, y))) / 255.0])
 }
 
-/// The points of a board on a photograph.
+/// Detects the points of a calibration board in an image.
 ///
-/// board: Chessboard (the default, of any size), CharucoBoard, ArucoGrid or AprilGrid. Raises an error of epipole.errors that says what was seen where there is none.
+/// board: Chessboard (the default, of any size), CharucoBoard, ArucoGrid or AprilGrid. Raises a BoardNotFoundError that describes what was detected instead.
 ///
 ///     >>> dark = np.pad(np.indices((6, 9)).sum(0) % 2, 1, constant_values=1)
 ///     >>> found = epipole.find_board(np.kron(255 * dark, np.ones((20, 20))).astype(np.uint8))
@@ -131,10 +131,10 @@ pub(crate) fn find_board<'py>(
     )
 }
 
-/// Photographs by view and camera; `None` where one is missing.
+/// Photographs by view and camera; `None` if missing.
 type Views<T> = Vec<Vec<Option<T>>>;
 
-/// A list of photographs of one camera, or of such a list for each camera.
+/// Reads a list of photographs of one camera, or one such list per camera.
 fn photographs<'py>(given: &Bound<'py, PyAny>) -> PyResult<Views<Photograph<'py>>> {
     let all: Vec<Bound<'py, PyAny>> = given.try_iter()?.collect::<PyResult<_>>()?;
     let one = |given: &Bound<'py, PyAny>, name: String| -> PyResult<Option<Photograph<'py>>> {
@@ -148,8 +148,7 @@ fn photographs<'py>(given: &Bound<'py, PyAny>) -> PyResult<Views<Photograph<'py>
     let views = cameras.iter().map(Vec::len).max().unwrap_or(0);
     if let Some(short) = cameras.iter().position(|camera| camera.len() != views) {
         let got = cameras[short].len();
-        let text =
-            format!("camera {short} has {got} photographs where another has {views}; None stands for a missing one");
+        let text = format!("camera {short} has {got} photographs, another has {views}; use None for missing ones");
         return Err(PyValueError::new_err(text));
     }
     let of_view = |v: usize| {
@@ -159,10 +158,10 @@ fn photographs<'py>(given: &Bound<'py, PyAny>) -> PyResult<Views<Photograph<'py>
     (0..views).map(of_view).collect()
 }
 
-/// Cameras from photographs of a board, and how far they can be trusted.
+/// Calibrates cameras from photographs of a board, with uncertainties.
 ///
-/// photographs: a list of arrays of uint8 or of paths; for a rig, such a list for each camera, in which photographs of one moment have the same place and None stands for a missing one.
-/// board: as of `find_board`. `defaults("calibrate")` lists the options.
+/// photographs: a list of arrays of uint8 or of paths; for a rig, one such list per camera, in which simultaneous photographs have the same index and missing ones are None.
+/// board: as in `find_board`. `defaults("calibrate")` lists the options.
 #[pyfunction]
 #[pyo3(signature = (photographs, **options))]
 pub(crate) fn calibrate<'py>(
@@ -264,7 +263,7 @@ fn calibration<'py>(py: Python<'py>, found: &BoardCalibration) -> PyResult<Bound
     )
 }
 
-/// A rotation matrix and a translation.
+/// Converts a pose to a tuple of rotation matrix and translation.
 pub(crate) fn pose<'py>(py: Python<'py>, pose: &Pose) -> PyResult<Bound<'py, PyAny>> {
     object(py, (arrays::matrix(py, pose.rotation.matrix())?, arrays::vector(py, &pose.translation)?))
 }

@@ -1,4 +1,4 @@
-//! Calibrated cameras and rigs, and the files they come in.
+//! Calibrated cameras and rigs, and their files.
 
 use crate::arrays;
 use crate::errors::{of_file, refused};
@@ -9,10 +9,10 @@ use pyo3::prelude::*;
 use pyo3::types::PyTuple;
 use std::path::PathBuf;
 
-/// A camera: picture size, calibration matrix, lens.
+/// A camera: image size, calibration matrix, distortion.
 ///
-/// width, height: px. matrix: K, 3×3, pixel centers at integers. distortion: the coefficients of the lens in OpenCV's order. lens: none, simple_radial (1 coefficient), radial (2),
-/// radial_tangential4, radial_tangential5, rational8, thin_prism12 or fisheye4; where it is not given, the number of coefficients tells it, and 4 are OpenCV's k1, k2, p1, p2.
+/// width, height: px. matrix: K, 3×3, pixel centers at integers. distortion: the coefficients in OpenCV's order. lens: the distortion model: none, simple_radial (1 coefficient), radial (2),
+/// radial_tangential4, radial_tangential5, rational8, thin_prism12 or fisheye4; by default, it is selected by the number of coefficients, with 4 for OpenCV's k1, k2, p1, p2.
 ///
 ///     >>> camera = epipole.Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]], [-0.1, 0.01, 0, 0])
 ///     >>> camera
@@ -43,26 +43,26 @@ impl PyCamera {
         lens: Option<&str>,
     ) -> PyResult<Self> {
         let m = arrays::matrix_from(matrix, "matrix")?;
-        // A camera with a skew is none of today's; a scaled or transposed matrix is a mistake.
+        // Skew is not supported; a scaled or transposed matrix is an error.
         if m != Matrix3::new(m.m11, 0.0, m.m13, 0.0, m.m22, m.m23, 0.0, 0.0, 1.0) {
             return Err(PyValueError::new_err("matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"));
         }
         let given = distortion.map_or(Ok(Vec::new()), |given| arrays::numbers(given, "distortion"))?;
         let camera = Camera {
-            distortion: distorted(lens, &given)?,
+            distortion: distortion_from(lens, &given)?,
             ..Camera::pinhole(width, height, m.m11, m.m22, m.m13, m.m23)
         };
         Self::valid(py, camera)
     }
 
-    /// A camera with square pixels, its principal point in the middle and no distortion. focal: px.
+    /// Makes a camera with square pixels, a centered principal point and no distortion. focal: px.
     #[staticmethod]
     fn from_focal(py: Python<'_>, width: usize, height: usize, focal: f64) -> PyResult<Self> {
         Self::valid(py, Camera::from_focal(width, height, focal))
     }
 
     /// Reads a camera: our own YAML, OpenCV's YAML, XML or JSON, ROS's camera_info, Kalibr's camchain, COLMAP's cameras.txt, mrcal's .cameramodel, or a bare matrix. size: width and
-    /// height for files that do not tell them.
+    /// height for files without them.
     #[staticmethod]
     #[pyo3(signature = (path, *, size = None))]
     fn read(py: Python<'_>, path: PathBuf, size: Option<(usize, usize)>) -> PyResult<Self> {
@@ -70,7 +70,7 @@ impl PyCamera {
         Ok(Self { camera })
     }
 
-    /// Writes the camera: as our own YAML, or in another format that `cv calibration` lists.
+    /// Writes the camera, by default in our YAML format; other formats are those of `cv calibration convert`.
     #[pyo3(signature = (path, *, format = "own"))]
     fn write(&self, py: Python<'_>, path: PathBuf, format: &str) -> PyResult<()> {
         write_text(py, path, format_named(format)?.camera_text(&self.camera, &[]))
@@ -92,41 +92,41 @@ impl PyCamera {
         arrays::matrix(py, &self.camera.matrix())
     }
 
-    /// The coefficients of the lens, in OpenCV's order.
+    /// The distortion coefficients, in OpenCV's order.
     #[getter]
     fn distortion<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let parameters = self.camera.distortion.parameters();
         arrays::shaped(py, parameters.to_vec(), &[parameters.len()])
     }
 
-    /// The name of the lens model.
+    /// The name of the distortion model.
     #[getter]
     fn lens(&self) -> &'static str {
         self.camera.distortion.model().info().name
     }
 
-    /// Pixels of points (n, 3) in the camera's frame; NaN for those behind it.
+    /// Projects points (n, 3) in the camera's frame to pixels (n, 2); NaN for points behind the camera.
     fn project<'py>(&self, py: Python<'py>, points: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
         self.each(py, &arrays::rows(points, "points")?, |camera, p: &[f64; 3]| {
             camera.project(&Point3::from(*p)).map_or([f64::NAN; 2], |pixel| pixel.coords.into())
         })
     }
 
-    /// Rays of pixels (n, 2): X/Z and Y/Z without the distortion of the lens.
+    /// Converts pixels (n, 2) to normalized image coordinates: X/Z and Y/Z, without distortion.
     fn normalize<'py>(&self, py: Python<'py>, pixels: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
         self.each(py, &arrays::rows(pixels, "pixels")?, |camera, p: &[f64; 2]| {
             camera.normalize(Point2::from(*p)).coords.into()
         })
     }
 
-    /// Where pixels (n, 2) would be without the distortion of the lens.
+    /// Undistorts pixels (n, 2): their positions in the same camera without distortion.
     fn undistort_points<'py>(&self, py: Python<'py>, pixels: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
         self.each(py, &arrays::rows(pixels, "pixels")?, |camera, p: &[f64; 2]| {
             camera.undistort_pixel(Point2::from(*p)).coords.into()
         })
     }
 
-    /// The same camera for its pictures at another size.
+    /// Returns the camera of resized images.
     fn resized(&self, py: Python<'_>, width: usize, height: usize) -> PyResult<Self> {
         Self::valid(py, self.camera.resized(width, height))
     }
@@ -175,8 +175,8 @@ impl PyCamera {
     }
 }
 
-/// The lens of a name, or of so many coefficients.
-fn distorted(lens: Option<&str>, given: &[f64]) -> PyResult<Distortion> {
+/// Makes a distortion of a named model, or of the model with that number of coefficients.
+fn distortion_from(lens: Option<&str>, given: &[f64]) -> PyResult<Distortion> {
     let model = match (lens, given.len()) {
         (Some(name), _) => DistortionModel::from_name(&name.replace('-', "_")).ok_or_else(|| {
             let names: Vec<&str> = DistortionModel::ALL.iter().map(|model| model.info().name).collect();
@@ -190,13 +190,15 @@ fn distorted(lens: Option<&str>, given: &[f64]) -> PyResult<Distortion> {
         (None, 8) => DistortionModel::Rational8,
         (None, 12) => DistortionModel::ThinPrism12,
         (None, n) => {
-            return Err(PyValueError::new_err(format!("distortion has {n} coefficients; no lens has so many")));
+            return Err(PyValueError::new_err(format!(
+                "distortion has {n} coefficients, and no model has that number"
+            )));
         }
     };
     Distortion::new(model, given).map_err(|error| PyValueError::new_err(error.to_string()))
 }
 
-/// Writes a calibration, where the format can hold it.
+/// Writes a calibration, unless the format cannot represent it.
 fn write_text(py: Python<'_>, path: PathBuf, text: Result<String, FormatError>) -> PyResult<()> {
     let written = match text {
         Ok(text) => cv_io::write_bytes(&path, text.as_bytes()),
@@ -212,9 +214,9 @@ fn format_named(name: &str) -> PyResult<CalibrationFormat> {
     })
 }
 
-/// Two cameras that are fixed to each other.
+/// A stereo rig: two rigidly mounted cameras.
 ///
-/// rotation, translation: take the left camera's frame to the right one's, as OpenCV's stereoCalibrate has them. unit: of the translation, and so of every depth.
+/// rotation, translation: from the left camera's frame to the right one's, as in OpenCV's stereoCalibrate. unit: unit of the translation and of depths.
 #[pyclass(frozen, module = "epipole", name = "Rig")]
 pub(crate) struct PyRig {
     pub(crate) rig: StereoRig,
@@ -246,8 +248,8 @@ impl PyRig {
         Ok(Self { rig, unit: unit.to_owned() })
     }
 
-    /// Reads a rig: our own YAML, OpenCV's in one file or in two, or the first two cameras of Kalibr's camchain. path: the file, or OpenCV's two. size: width and height for files that do
-    /// not tell them.
+    /// Reads a rig: our own YAML, OpenCV's in one file or in two, or the first two cameras of Kalibr's camchain. path: the file, or OpenCV's two. size: width and height for files
+    /// without them.
     #[staticmethod]
     #[pyo3(signature = (path, *, size = None))]
     fn read(py: Python<'_>, path: &Bound<'_, PyAny>, size: Option<(usize, usize)>) -> PyResult<Self> {
@@ -259,7 +261,7 @@ impl PyRig {
         Ok(Self { rig: file.rig, unit: file.unit })
     }
 
-    /// Writes the rig: as our own YAML, or in another format that `cv calibration` lists for rigs.
+    /// Writes the rig, by default in our YAML format; other formats are those of `cv calibration convert`.
     #[pyo3(signature = (path, *, format = "own"))]
     fn write(&self, py: Python<'_>, path: PathBuf, format: &str) -> PyResult<()> {
         let file = RigFile { rig: self.rig, unit: self.unit.clone() };
@@ -276,13 +278,13 @@ impl PyRig {
         PyCamera { camera: self.rig.right }
     }
 
-    /// R of x_right = R x_left + t, 3×3.
+    /// R in x_right = R x_left + t, 3×3.
     #[getter]
     fn rotation<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         arrays::matrix(py, self.rig.right_from_left.rotation.matrix())
     }
 
-    /// t of x_right = R x_left + t.
+    /// t in x_right = R x_left + t.
     #[getter]
     fn translation<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         arrays::vector(py, &self.rig.right_from_left.translation)
@@ -294,13 +296,13 @@ impl PyRig {
         self.rig.baseline()
     }
 
-    /// Unit of the translation: m, mm, squares; empty where it is not known.
+    /// Unit of the translation: m, mm, squares; empty if unknown.
     #[getter]
     fn unit(&self) -> &str {
         &self.unit
     }
 
-    /// The same rig with its right camera as the left one.
+    /// Returns the rig with its cameras exchanged.
     fn exchanged(&self) -> Self {
         Self { rig: self.rig.exchanged(), unit: self.unit.clone() }
     }
@@ -329,18 +331,18 @@ impl PyRig {
     }
 }
 
-/// A pose of a rotation matrix and a translation.
+/// Makes a pose from a rotation matrix and a translation.
 pub(crate) fn pose_from(rotation: &Bound<'_, PyAny>, translation: &Bound<'_, PyAny>) -> PyResult<Pose> {
     let r = arrays::matrix_from(rotation, "rotation")?;
     let t = arrays::numbers(translation, "translation")?;
     let [x, y, z] = t[..] else {
         return Err(PyValueError::new_err(format!("translation has {} numbers, not 3", t.len())));
     };
-    // As files of calibrations are held to; written out with six digits, a rotation is one to 1e-5.
+    // The tolerance of calibration files; with six digits, a rotation is orthogonal to 1e-5.
     let off = (r * r.transpose() - Matrix3::identity()).abs().max();
     if off.is_nan() || off > 1e-3 || r.determinant() < 0.0 || ![x, y, z].iter().all(|v| v.is_finite()) {
         return Err(PyValueError::new_err(format!(
-            "rotation is no rotation matrix: R Rᵀ is off the identity by {off:.1e}"
+            "rotation is not a rotation matrix: R Rᵀ differs from the identity by {off:.1e}"
         )));
     }
     Ok(Pose::new(Rotation3::from_matrix_unchecked(r), cv_core::Vector3::new(x, y, z)))

@@ -1,4 +1,4 @@
-//! Clouds of points.
+//! Point clouds.
 
 use crate::arrays;
 use crate::errors::of_file;
@@ -9,25 +9,25 @@ use numpy::Element;
 use pyo3::prelude::*;
 use std::path::PathBuf;
 
-/// A cloud as arrays.
+/// Converts a cloud to arrays.
 pub(crate) fn made(py: Python<'_>, cloud: PointCloud) -> PyResult<Bound<'_, PyAny>> {
     results::made(
         py,
         "PointCloud",
         [
             ("positions", arrays::row_array(py, &cloud.positions)?),
-            ("colors", some(py, &cloud.colors)?),
-            ("normals", some(py, &cloud.normals)?),
+            ("colors", optional_rows(py, &cloud.colors)?),
+            ("normals", optional_rows(py, &cloud.normals)?),
         ],
     )
 }
 
-/// What there is one of for each point, or `None`.
-fn some<'py, T: Element + Copy>(py: Python<'py>, rows: &[[T; 3]]) -> PyResult<Bound<'py, PyAny>> {
+/// Converts per-point values, or `None` if there are none.
+fn optional_rows<'py, T: Element + Copy>(py: Python<'py>, rows: &[[T; 3]]) -> PyResult<Bound<'py, PyAny>> {
     if rows.is_empty() { Ok(py.None().into_bound(py)) } else { arrays::row_array(py, rows) }
 }
 
-/// Writes points as a binary PLY: positions (n, 3), colors (n, 3) of 0 to 255, normals (n, 3).
+/// Writes a point cloud as a binary PLY: positions (n, 3), colors (n, 3) from 0 to 255, normals (n, 3).
 #[pyfunction]
 #[pyo3(signature = (path, positions, colors = None, normals = None))]
 pub(crate) fn write_cloud(

@@ -1,4 +1,4 @@
-//! What a job refuses, as an exception with the numbers as attributes.
+//! Conversion of library errors to exceptions, with their numbers as attributes.
 
 use crate::results::to_python;
 use cv_io::{FormatError, IoError};
@@ -9,11 +9,11 @@ use serde::Serialize;
 use serde_json::{Map, Value};
 use std::io::ErrorKind;
 
-/// An error of a library: its words, and its numbers as data.
+/// A library error: its message, and its numbers as data.
 pub(crate) trait JobError: std::error::Error + Serialize + Send + 'static {}
 impl<E: std::error::Error + Serialize + Send + 'static> JobError for E {}
 
-/// What ends a job, as an exception.
+/// An error of a job that can be converted to an exception.
 pub(crate) trait Refused: Send {
     fn exception(&self, py: Python<'_>) -> PyErr;
 }
@@ -24,12 +24,12 @@ impl<E: JobError> Refused for E {
     }
 }
 
-/// The exception for an error: the class of `epipole.errors` that is named after the innermost variant, with its fields.
+/// Makes the exception of an error: the class of `epipole.errors` that is named after the innermost variant, with its fields.
 pub(crate) fn refused(py: Python<'_>, error: &impl JobError) -> PyErr {
     let (mut variants, mut fields) = (Vec::new(), Map::new());
     match serde_json::to_value(error) {
         Ok(value) => flatten(value, &mut variants, &mut fields),
-        Err(error) => return internal(&format!("an error that cannot be told: {error}")),
+        Err(error) => return internal(&format!("an error that cannot be serialized: {error}")),
     }
     match made(py, &variants, &fields, &error.to_string()) {
         Ok(error) | Err(error) => error,
@@ -45,7 +45,7 @@ fn made(py: Python<'_>, variants: &[String], fields: &Map<String, Value>, words:
     Ok(PyErr::from_value(error))
 }
 
-/// Why something was left out, as data: `kind`, the name of the innermost variant, and the fields.
+/// Converts a reason to data: `kind`, the name of the innermost variant, and the fields.
 pub(crate) fn reason<'py>(py: Python<'py>, reason: &impl Serialize) -> PyResult<Bound<'py, PyAny>> {
     let value = serde_json::to_value(reason).map_err(|error| internal(&error.to_string()))?;
     let (mut variants, mut fields) = (Vec::new(), Map::new());
@@ -58,8 +58,8 @@ pub(crate) fn reason<'py>(py: Python<'py>, reason: &impl Serialize) -> PyResult<
     Ok(all.into_any())
 }
 
-/// The names of variants from the outside in, and the fields of all of them. An error is `{"Variant": {"field": …}}`, or a name alone; one that holds another has
-/// it as the variant's content, or as its field `source`.
+/// Collects the names of variants from the outside in, and the fields of all of them. An error is `{"Variant": {"field": …}}`, or a name alone; a nested error is
+/// the variant's content, or its field `source`.
 fn flatten(value: Value, variants: &mut Vec<String>, fields: &mut Map<String, Value>) {
     match value {
         Value::String(name) => variants.push(name),
@@ -85,7 +85,7 @@ fn flatten(value: Value, variants: &mut Vec<String>, fields: &mut Map<String, Va
     }
 }
 
-/// A mistake of ours.
+/// Makes the exception of a bug of this package.
 pub(crate) fn internal(words: &str) -> PyErr {
     Python::attach(|py| {
         let class = py.import("epipole.errors").and_then(|errors| errors.getattr("InternalError"));
@@ -97,7 +97,7 @@ pub(crate) fn internal(words: &str) -> PyErr {
     })
 }
 
-/// The exception for a file that cannot be read or written.
+/// Makes the exception of a file that cannot be read or written.
 pub(crate) fn of_file(py: Python<'_>, error: &IoError) -> PyErr {
     let path = error.path.display().to_string();
     if let FormatError::Os(reason) = &error.reason
@@ -112,7 +112,7 @@ pub(crate) fn of_file(py: Python<'_>, error: &IoError) -> PyErr {
     }
 }
 
-/// An argument that is not what it must be, with its numbers.
+/// Makes the exception of an invalid argument, with its numbers.
 pub(crate) fn of_argument(py: Python<'_>, variant: &str, fields: &[(&str, Value)], words: &str) -> PyErr {
     let fields = fields.iter().map(|(name, value)| ((*name).to_owned(), value.clone())).collect();
     match made(py, &[variant.to_owned()], &fields, words) {

@@ -1,4 +1,4 @@
-//! Models that most of a set of matches agree on.
+//! Robust estimation of two-view models and absolute pose.
 
 use crate::arrays;
 use crate::camera::PyCamera;
@@ -11,7 +11,7 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-/// What every estimator takes.
+/// Reads the options of all estimators.
 fn read(options: &mut Options<'_>, mut o: RobustOptions) -> PyResult<(RobustOptions, Run)> {
     options.set("threshold", &mut o.threshold)?;
     options.set("confidence", &mut o.confidence)?;
@@ -32,13 +32,13 @@ pub(crate) fn read_essential(options: &mut Options<'_>) -> PyResult<(RobustOptio
     read(options, RobustOptions::essential())
 }
 
-/// Matches from rows x1, y1, x2, y2.
+/// Converts rows x1, y1, x2, y2 to matches.
 fn matches(given: &Bound<'_, PyAny>) -> PyResult<Vec<Correspondence>> {
     let rows: Vec<[f64; 4]> = arrays::rows(given, "matches")?;
     Ok(rows.into_iter().map(|[x1, y1, x2, y2]| Correspondence::new(x1, y1, x2, y2)).collect())
 }
 
-/// The fields that all models have.
+/// Returns the fields common to all models.
 fn fields<'py>(
     py: Python<'py>,
     robust: &RobustModel<Matrix3<f64>>,
@@ -70,7 +70,7 @@ fn uncalibrated<'py>(
     results::made(py, "Model", fields(py, &found.robust, pairs.len(), &found.stages)?)
 }
 
-/// The homography H, with b ~ H a, that most matches agree on. matches: (n, 4), rows x1 y1 x2 y2 in pixels.
+/// Robustly estimates the homography H, with b ~ H a. matches: (n, 4), rows x1 y1 x2 y2 in pixels.
 ///
 ///     >>> a = np.random.default_rng(1).uniform(0, 500, (40, 2))
 ///     >>> found = epipole.estimate_homography(np.hstack([a, a + [7, -3]]))
@@ -86,7 +86,7 @@ pub(crate) fn estimate_homography<'py>(
     uncalibrated(py, matches, ModelKind::Homography, Options::new("estimate_homography", options))
 }
 
-/// The fundamental matrix F, with bᵀ F a = 0, that most matches agree on. matches: (n, 4), rows x1 y1 x2 y2 in pixels.
+/// Robustly estimates the fundamental matrix F, with bᵀ F a = 0. matches: (n, 4), rows x1 y1 x2 y2 in pixels.
 #[pyfunction]
 #[pyo3(signature = (matches, **options))]
 pub(crate) fn estimate_fundamental<'py>(
@@ -97,9 +97,9 @@ pub(crate) fn estimate_fundamental<'py>(
     uncalibrated(py, matches, ModelKind::Fundamental, Options::new("estimate_fundamental", options))
 }
 
-/// The essential matrix and the relative pose x2 = R x1 + t, |t| = 1, that most matches agree on.
+/// Robustly estimates the essential matrix and the relative pose x2 = R x1 + t, |t| = 1.
 ///
-/// matches: (n, 4), rows x1 y1 x2 y2 in pixels. k1, k2: the cameras of the two views, or 3×3 calibration matrices where there is no lens distortion; k2 is k1 where it is not given.
+/// matches: (n, 4), rows x1 y1 x2 y2 in pixels. k1, k2: the cameras of the two views, or 3×3 calibration matrices without distortion; k2 defaults to k1.
 #[pyfunction]
 #[pyo3(signature = (matches, k1, k2 = None, **options))]
 pub(crate) fn estimate_essential<'py>(
@@ -122,15 +122,15 @@ pub(crate) fn estimate_essential<'py>(
 }
 
 pub(crate) fn read_pose(options: &mut Options<'_>) -> PyResult<(RobustOptions, Run)> {
-    read(options, RobustOptions { threshold: POSE_THRESHOLD, ..RobustOptions::essential() })
+    read(options, RobustOptions { threshold: POSE_THRESHOLD_PX, ..RobustOptions::essential() })
 }
 
-/// Reprojection error in px up to which a point agrees: COLMAP's for the pose of a photograph in a model.
-const POSE_THRESHOLD: f64 = 4.0;
+/// Inlier threshold of the reprojection error in px: COLMAP's for the registration of an image.
+const POSE_THRESHOLD_PX: f64 = 4.0;
 
-/// The pose of a camera that sees known points, of which many may be wrong: x = R X + t.
+/// Robustly estimates the absolute pose of a camera from 2D-3D correspondences (PnP): x = R X + t.
 ///
-/// points: (n, 3) in the world's frame. pixels: (n, 2), where they are seen. camera: with its lens. threshold is in px.
+/// points: (n, 3) in the world frame. pixels: (n, 2), their projections. camera: a Camera. threshold is in px.
 ///
 ///     >>> camera = epipole.Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]])
 ///     >>> points = np.random.default_rng(2).uniform([-1, -1, 4], [1, 1, 8], (30, 3))
@@ -152,7 +152,11 @@ pub(crate) fn estimate_pose<'py>(
     let world: Vec<[f64; 3]> = arrays::rows(points, "points")?;
     let seen: Vec<[f64; 2]> = arrays::rows(pixels, "pixels")?;
     if world.len() != seen.len() {
-        return Err(PyValueError::new_err(format!("{} points do not go with {} pixels", world.len(), seen.len())));
+        return Err(PyValueError::new_err(format!(
+            "{} points and {} pixels differ in number",
+            world.len(),
+            seen.len()
+        )));
     }
     let camera = camera.get().camera;
     let focal = 0.5 * (camera.fx + camera.fy);
@@ -182,13 +186,13 @@ pub(crate) fn estimate_pose<'py>(
     )
 }
 
-/// A camera, or the pinhole of a calibration matrix.
+/// Converts a Camera, or a calibration matrix to a pinhole camera.
 fn camera(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Camera> {
     if let Ok(camera) = given.cast::<PyCamera>() {
         return Ok(camera.get().camera);
     }
     let m = arrays::matrix_from(given, what)?;
-    // Skewed pixels are no camera's of today; a scaled or transposed matrix is a mistake.
+    // Skew is not supported; a scaled or transposed matrix is an error.
     let expected = Matrix3::new(m.m11, 0.0, m.m13, 0.0, m.m22, m.m23, 0.0, 0.0, 1.0);
     let camera = Camera::pinhole(0, 0, m.m11, m.m22, m.m13, m.m23);
     if m != expected || camera.validate().is_err() {

@@ -1,4 +1,4 @@
-//! Files: pictures and maps of floats.
+//! Files: images and float maps.
 
 use crate::arrays::{self, ImageArg};
 use crate::errors::of_file;
@@ -7,14 +7,14 @@ use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use std::path::PathBuf;
 
-/// Runs what reads or writes without the interpreter.
+/// Runs I/O with the GIL released.
 fn done<R: Send>(py: Python<'_>, work: impl FnOnce() -> Result<R, IoError> + Send) -> PyResult<R> {
     py.detach(work).map_err(|error| of_file(py, &error))
 }
 
-/// Reads a picture as deep as it is, turned as its EXIF says: uint8, uint16, or float32 of linear light; of shape (height, width), or (height, width, 3) in RGB.
+/// Reads an image at its bit depth, with the EXIF orientation applied: uint8, uint16, or float32 (linear); of shape (height, width), or (height, width, 3) in RGB.
 ///
-/// Raises FileNotFoundError, or FileError with what is wrong with the file.
+/// Raises FileNotFoundError, or FileError with the reason.
 #[pyfunction]
 pub(crate) fn read_image(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyAny>> {
     match done(py, || cv_io::read_image(&path))?.pixels {
@@ -27,7 +27,7 @@ pub(crate) fn read_image(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, Py
     }
 }
 
-/// Writes uint8 as .png, .jpg or .tif, uint16 as .png or .tif. The file is whole or as it was.
+/// Writes an image atomically: uint8 as .png, .jpg or .tif, uint16 as .png or .tif.
 #[pyfunction]
 pub(crate) fn write_image(py: Python<'_>, path: PathBuf, image: &Bound<'_, PyAny>) -> PyResult<()> {
     let none = Metadata::default();
@@ -44,19 +44,19 @@ pub(crate) fn write_image(py: Python<'_>, path: PathBuf, image: &Bound<'_, PyAny
         ImageArg::U8(borrowed) => write!(borrowed),
         ImageArg::U16(borrowed) => write!(borrowed),
         ImageArg::F32(_) => {
-            Err(PyTypeError::new_err("image: float32 is written by write_map, or scaled to uint8 or uint16"))
+            Err(PyTypeError::new_err("image: write float32 with write_map, or scale it to uint8 or uint16"))
         }
     }
 }
 
-/// Reads a disparity or depth map: .pfm, .npy, .npz, KITTI's 16-bit PNG, or another gray picture whose values are `scale` times what they mean. Unknown is NaN.
+/// Reads a disparity or depth map: .pfm, .npy, .npz, KITTI's 16-bit PNG, or another gray image of values times `scale`. Invalid is NaN.
 #[pyfunction]
 #[pyo3(signature = (path, *, scale = None))]
 pub(crate) fn read_map(py: Python<'_>, path: PathBuf, scale: Option<f64>) -> PyResult<Bound<'_, PyAny>> {
     arrays::array(py, done(py, || cv_io::read_map(&path, scale))?)
 }
 
-/// Writes a map of float32 as .pfm (unknown +inf), or a disparity map as KITTI's 16-bit .png.
+/// Writes a float32 map as .pfm (invalid +inf), or a disparity map as KITTI's 16-bit .png.
 #[pyfunction]
 pub(crate) fn write_map(py: Python<'_>, path: PathBuf, map: &Bound<'_, PyAny>) -> PyResult<()> {
     let map = arrays::map(map, "map")?;
@@ -65,7 +65,7 @@ pub(crate) fn write_map(py: Python<'_>, path: PathBuf, map: &Bound<'_, PyAny>) -
         "pfm" => done(py, || cv_io::pfm::write(&path, map.view())),
         "png" => done(py, || cv_io::kitti::write(&path, map.view()).map(drop)),
         _ => Err(PyValueError::new_err(format!(
-            "{}: a map is written as .pfm or .png; .npy by numpy.save",
+            "{}: maps are written as .pfm or .png; for .npy use numpy.save",
             path.display()
         ))),
     }

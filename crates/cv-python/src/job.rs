@@ -1,4 +1,4 @@
-//! Runs a job without the interpreter: other Python threads go on, Ctrl-C stops it, and a callable hears how far it is.
+//! Runs jobs with the GIL released: other Python threads continue, Ctrl-C cancels the job, and a callable gets its progress.
 
 use crate::errors::{Refused, internal};
 use crate::options::Options;
@@ -13,24 +13,24 @@ use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::sync::{Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
-/// How often signals are looked at, and the callable is called: Ctrl-C is to work within 200 ms, of which jobs need the most to hear of it.
-const TICK: Duration = Duration::from_millis(25);
+/// Interval at which signals are checked and the callable is called: a small part of the 200 ms for cancellation, most of which jobs need.
+const POLL_INTERVAL: Duration = Duration::from_millis(25);
 
-/// What every job takes.
+/// The options of all jobs.
 #[derive(Default)]
 pub(crate) struct Run {
-    /// Threads; `None`: as many as there are processors.
+    /// Number of threads; `None`: one per processor.
     threads: Option<usize>,
-    /// Called with the stage's name, units done and all of them.
+    /// Called with the stage's name, the units done and their total.
     progress: Option<Py<PyAny>>,
 }
 
 impl Run {
-    /// `threads` and `progress`.
+    /// Reads `threads` and `progress`.
     pub(crate) fn read(options: &mut Options<'_>) -> PyResult<Self> {
         let threads: Option<usize> = options.take("threads")?;
-        if threads == Some(0) || threads.is_some_and(|n| n > MOST_THREADS) {
-            return Err(pyo3::exceptions::PyValueError::new_err(format!("threads must be from 1 to {MOST_THREADS}")));
+        if threads == Some(0) || threads.is_some_and(|n| n > MAX_THREADS) {
+            return Err(pyo3::exceptions::PyValueError::new_err(format!("threads must be from 1 to {MAX_THREADS}")));
         }
         let progress = options.take_any("progress")?;
         if let Some(given) = progress.as_ref().filter(|given| !given.is_callable()) {
@@ -40,10 +40,10 @@ impl Run {
         Ok(Self { threads, progress: progress.map(Bound::unbind) })
     }
 
-    /// Runs a job on threads of our own, without the interpreter.
+    /// Runs a job on its own thread pool, with the GIL released.
     ///
     /// # Errors
-    /// What the job refuses, as the exceptions of `epipole.errors`; `KeyboardInterrupt` and whatever else the callable or a signal's handler raises; a panic as
+    /// Errors of the job as exceptions of `epipole.errors`; `KeyboardInterrupt` and other exceptions of the callable or a signal handler; a panic as
     /// `InternalError`.
     pub(crate) fn run<R: Send, E: Refused>(
         &self,
@@ -51,15 +51,15 @@ impl Run {
         job: impl FnOnce(&dyn Progress) -> Result<R, E> + Send,
     ) -> PyResult<R> {
         let (mut job, mut result) = (Some(job), None);
-        // All that takes long to compile is compiled once, not for each job.
-        let latest = self.attend(py, &mut |progress| {
+        // `supervise` is not generic, so that it is compiled once, not for each job.
+        let latest = self.supervise(py, &mut |progress| {
             if let Some(job) = job.take() {
                 result = Some(job(progress));
             }
         })?;
         match result {
             Some(Ok(result)) => {
-                // A short job has no tick.
+                // A short job may end before the first poll.
                 if let (Some(progress), Some((stage, done, total))) = (&self.progress, latest) {
                     progress.call1(py, (stage, done, total))?;
                 }
@@ -70,8 +70,8 @@ impl Run {
         }
     }
 
-    /// The same for a job that keeps its result itself, called once; gives its last news.
-    fn attend(&self, py: Python<'_>, job: &mut (dyn FnMut(&dyn Progress) + Send)) -> PyResult<Option<News>> {
+    /// As [`Run::run`], for a job that stores its result itself and is called once; returns its last progress report.
+    fn supervise(&self, py: Python<'_>, job: &mut (dyn FnMut(&dyn Progress) + Send)) -> PyResult<Option<Report>> {
         let monitor = Monitor::default();
         let progress = self.progress.as_ref();
         let ended = py.detach(|| {
@@ -80,15 +80,15 @@ impl Run {
             let ended = pool.threads.in_place_scope(|scope| {
                 scope.spawn(|_| {
                     let ended = catch_unwind(AssertUnwindSafe(|| job(&monitor)));
-                    // Somebody waits until this comes.
+                    // The receiver outlives the scope.
                     let _ = done.send(ended);
                 });
                 let mut raised = None;
                 loop {
-                    match wait.recv_timeout(TICK) {
+                    match wait.recv_timeout(POLL_INTERVAL) {
                         Ok(ended) => return Ok((ended, raised)),
                         Err(RecvTimeoutError::Timeout) if raised.is_none() => {
-                            raised = Python::attach(|py| monitor.tell(py, progress)).err();
+                            raised = Python::attach(|py| monitor.poll(py, progress)).err();
                         }
                         Err(RecvTimeoutError::Timeout) => {}
                         Err(RecvTimeoutError::Disconnected) => {
@@ -101,43 +101,43 @@ impl Run {
             ended
         });
         match ended? {
-            // Told to stop, it may have ended in another way.
+            // A job that was cancelled may have ended otherwise.
             (_, Some(raised)) => Err(raised),
             (Ok(()), None) => Ok(monitor.latest()),
-            (Err(panic), None) => Err(internal(message(&*panic))),
+            (Err(panic), None) => Err(internal(panic_message(&*panic))),
         }
     }
 }
 
-/// What a panic says.
-fn message(panic: &(dyn Any + Send)) -> &str {
+/// Returns the message of a panic.
+fn panic_message(panic: &(dyn Any + Send)) -> &str {
     let text = panic.downcast_ref::<&str>().copied();
-    text.or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("a panic without words")
+    text.or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("a panic without a message")
 }
 
-/// Stage, units done, all of them.
-type News = (&'static str, usize, usize);
+/// Stage, units done, total units.
+type Report = (&'static str, usize, usize);
 
-/// Hears the job, and is asked by it whether to go on.
+/// Receives the reports of a job and cancels it on request.
 #[derive(Default)]
 struct Monitor {
     stopped: AtomicBool,
-    latest: Mutex<Option<News>>,
+    latest: Mutex<Option<Report>>,
 }
 
 impl Monitor {
-    fn latest(&self) -> Option<News> {
+    fn latest(&self) -> Option<Report> {
         *self.latest.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Lets signals be handled and the callable know; what either raises stops the job.
-    fn tell(&self, py: Python<'_>, progress: Option<&Py<PyAny>>) -> PyResult<()> {
-        let told = py.check_signals().and_then(|()| match (progress, self.latest()) {
+    /// Handles signals and calls the callable; an exception of either cancels the job.
+    fn poll(&self, py: Python<'_>, progress: Option<&Py<PyAny>>) -> PyResult<()> {
+        let polled = py.check_signals().and_then(|()| match (progress, self.latest()) {
             (Some(progress), Some((stage, done, total))) => progress.call1(py, (stage, done, total)).map(drop),
             _ => Ok(()),
         });
-        self.stopped.fetch_or(told.is_err(), Ordering::Relaxed);
-        told
+        self.stopped.fetch_or(polled.is_err(), Ordering::Relaxed);
+        polled
     }
 }
 
@@ -146,7 +146,7 @@ impl Progress for Monitor {
         if self.stopped.load(Ordering::Relaxed) {
             return Err(Cancelled);
         }
-        // Where another thread is just writing, its news are as new.
+        // If another thread is writing, its report is as recent.
         if let Ok(mut latest) = self.latest.try_lock() {
             *latest = Some((stage, done, total));
         }
@@ -154,7 +154,7 @@ impl Progress for Monitor {
     }
 }
 
-/// What threads share, of which one works with it at a time. Unlike a lock, it is waited for no longer than the job may go on.
+/// A value used by one thread at a time. Unlike with a mutex, waiting for it can be cancelled.
 pub(crate) struct Shared<T> {
     free: Mutex<Option<T>>,
     freed: Condvar,
@@ -165,7 +165,7 @@ impl<T> Shared<T> {
         Self { free: Mutex::new(Some(value)), freed: Condvar::new() }
     }
 
-    /// Waits until no other thread works with it, and gives it back at the end, also after a panic.
+    /// Takes the value when it is free; it is returned on drop, also after a panic.
     ///
     /// # Errors
     /// [`Cancelled`].
@@ -176,19 +176,19 @@ impl<T> Shared<T> {
                 return Ok(Taken { value: Some(value), of: self });
             }
             progress.report("wait", 0, 0)?;
-            free = self.freed.wait_timeout(free, TICK).unwrap_or_else(PoisonError::into_inner).0;
+            free = self.freed.wait_timeout(free, POLL_INTERVAL).unwrap_or_else(PoisonError::into_inner).0;
         }
     }
 }
 
-/// What was taken of [`Shared`].
+/// The value taken from [`Shared`].
 pub(crate) struct Taken<'a, T> {
     value: Option<T>,
     of: &'a Shared<T>,
 }
 
 impl<T> Taken<'_, T> {
-    /// To work with.
+    /// Borrows the value.
     pub(crate) fn get(&mut self) -> Option<&mut T> {
         self.value.as_mut()
     }
@@ -201,50 +201,50 @@ impl<T> Drop for Taken<'_, T> {
     }
 }
 
-/// More would be a mistake.
-const MOST_THREADS: usize = 1024;
+/// Upper limit of `threads`, against mistakes.
+const MAX_THREADS: usize = 1024;
 
-/// The threads of one job at a time, of this process: those of another process do not come along with `fork`.
+/// A thread pool, used by one job at a time, with the process that made it: its threads do not survive a `fork`.
 struct Pool {
     process: u32,
     threads: ThreadPool,
 }
 
-/// Pools that no job uses.
+/// Pools that are not in use.
 static IDLE: Mutex<Vec<Pool>> = Mutex::new(Vec::new());
 
 impl Pool {
-    /// An idle pool of this process with so many threads, or a new one.
+    /// Takes an idle pool of this process with that number of threads, or makes one.
     fn take(threads: Option<usize>) -> PyResult<Self> {
         let process = std::process::id();
         let wanted = threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from));
-        // Locked for good where `fork` came at that very moment: then a pool more is made.
+        // If the lock was held during a `fork`, it stays locked: a new pool is made then.
         if let Ok(mut idle) = IDLE.try_lock() {
             if let Some(at) =
                 idle.iter().position(|p| p.process == process && p.threads.current_num_threads() == wanted)
             {
                 return Ok(idle.swap_remove(at));
             }
-            // The threads of the parent do not exist here: nobody must wait for them.
+            // Threads of the parent process do not exist here: dropping their pools would wait forever.
             let (ours, others) = std::mem::take(&mut *idle).into_iter().partition(|p| p.process == process);
             *idle = ours;
             let others: Vec<Self> = others;
             others.into_iter().for_each(std::mem::forget);
         }
         let made = rayon::ThreadPoolBuilder::new().num_threads(wanted).thread_name(|i| format!("epipole {i}")).build();
-        let pool = made.map_err(|error| internal(&format!("no threads: {error}")))?;
+        let pool = made.map_err(|error| internal(&format!("cannot start threads: {error}")))?;
         Ok(Self { process, threads: pool })
     }
 
-    /// Keeps it for the next job; a few, as each Python thread that works at the same time takes one.
+    /// Keeps the pool for the next job; concurrent Python threads use one each.
     fn give_back(self) {
         if let Ok(mut idle) = IDLE.try_lock()
-            && idle.len() < MOST_IDLE
+            && idle.len() < MAX_IDLE
         {
             idle.push(self);
         }
     }
 }
 
-/// Idle pools that are kept.
-const MOST_IDLE: usize = 16;
+/// Maximum number of idle pools.
+const MAX_IDLE: usize = 16;

@@ -1,10 +1,10 @@
 //! The Python package `epipole`: jobs of `cv-pipeline` over NumPy arrays.
 //!
-//! No algorithms here. A function borrows its arrays (`arrays.rs`), reads its options by name (`options.rs`), runs the job without the interpreter
-//! (`job.rs`) and gives a frozen dataclass of `python/epipole/_results.py` back (`results.rs`). What a job refuses becomes an exception with the numbers as
+//! There are no algorithms here. A function borrows its arrays (`arrays.rs`), reads its keyword options (`options.rs`), runs the job with the GIL released
+//! (`job.rs`) and returns a frozen dataclass of `python/epipole/_results.py` (`results.rs`). Errors become exceptions with the numbers as
 //! attributes (`errors.rs`).
 //!
-//! | file | what Python sees |
+//! | file | Python names |
 //! |---|---|
 //! | `camera.rs` | `Camera`, `Rig` |
 //! | `calibration.rs` | `find_board`, `calibrate` |
@@ -13,9 +13,9 @@
 //! | `matching.rs` | `extract_features`, `match`, `match_features` |
 //! | `estimate.rs` | `estimate_homography`, `estimate_fundamental`, `estimate_essential`, `estimate_pose` |
 //! | `reconstruct.rs`, `sfm_photograph.rs`, `sfm.rs` | `reconstruct`, `sfm_features`, `sfm` |
-//! | `model.rs` | what `Reconstruction` reads and writes |
+//! | `model.rs` | reading and writing of `Reconstruction` |
 //! | `panorama.rs` | `panorama` |
-//! | `segment.rs` | what is behind `ColorModel`; `evaluate_mask` |
+//! | `segment.rs` | the implementation of `ColorModel`; `evaluate_mask` |
 //! | `files.rs`, `cloud.rs` | `read_image`, `write_image`, `read_map`, `write_map`, `write_cloud` |
 //!
 //! ```python
@@ -28,7 +28,7 @@
 //!
 //! # Conventions
 //!
-//! Images are positional; options are given by name only, with the library's defaults (`epipole.defaults("depth")` lists them). Arrays are indexed by row, column,
+//! Images are positional arguments; options are keyword-only, with the library's defaults (`epipole.defaults("depth")` lists them). Arrays are indexed by row, column,
 //! channel; color is RGB; points are (x, y) with the center of the first pixel at (0, 0).
 
 mod arrays;
@@ -59,7 +59,7 @@ use pyo3::types::PyDict;
 /// Reads the options of a function.
 type Read = fn(&mut options::Options<'_>) -> PyResult<()>;
 
-/// The functions that take options, each with what reads them.
+/// The functions with options, each with the function that reads them.
 const FUNCTIONS: &[(&str, Read)] = &[
     ("depth", |options| stereo::DepthArguments::read(options).map(drop)),
     ("StereoMatcher", |options| stereo::matcher_arguments(options).map(drop)),
@@ -82,7 +82,7 @@ const FUNCTIONS: &[(&str, Read)] = &[
     ("ColorModel", |options| segment::read(options).map(drop)),
 ];
 
-/// The options of a function and their defaults; those without one are `None`.
+/// Returns the options of a function and their defaults; `None` for options without a default.
 ///
 ///     >>> epipole.defaults("undistort")
 ///     {'alpha': 0.0, 'size': None, 'threads': None, 'progress': None}
@@ -90,7 +90,7 @@ const FUNCTIONS: &[(&str, Read)] = &[
 fn defaults<'py>(py: Python<'py>, function: &str) -> PyResult<Bound<'py, PyDict>> {
     let Some((name, read)) = FUNCTIONS.iter().find(|(name, _)| *name == function) else {
         let names = FUNCTIONS.iter().map(|(name, _)| *name).collect::<Vec<_>>().join(", ");
-        return Err(PyValueError::new_err(format!("“{function}” has no options; {names} have")));
+        return Err(PyValueError::new_err(format!("“{function}” has no options; functions with options: {names}")));
     };
     let mut options = options::Options::recording(py, name);
     read(&mut options)?;

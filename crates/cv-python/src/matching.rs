@@ -1,4 +1,4 @@
-//! Features of photographs, and the same points in two of them.
+//! Feature extraction and matching.
 
 use crate::arrays::{self, Rgb};
 use crate::job::Run;
@@ -14,20 +14,20 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-/// `features` and `max_features`.
+/// Reads `features` and `max_features`.
 pub(crate) fn feature_options(options: &mut Options<'_>) -> PyResult<FeatureOptions> {
     let method = feature_method(options)?;
     max_features(options, method.into())
 }
 
-/// `features`.
+/// Reads `features`.
 pub(crate) fn feature_method(options: &mut Options<'_>) -> PyResult<FeatureMethod> {
     let mut method = FeatureMethod::default();
     options.set_named("features", &mut method)?;
     Ok(method)
 }
 
-/// The same with the most features that are asked for.
+/// Reads `max_features` and limits the number of features.
 pub(crate) fn max_features(options: &mut Options<'_>, features: FeatureOptions) -> PyResult<FeatureOptions> {
     Ok(match options.take("max_features")? {
         Some(most) => features.at_most(most),
@@ -35,12 +35,12 @@ pub(crate) fn max_features(options: &mut Options<'_>, features: FeatureOptions) 
     })
 }
 
-/// The options of `extract_features`.
+/// Reads the options of `extract_features`.
 pub(crate) fn read_extraction(options: &mut Options<'_>) -> PyResult<(FeatureOptions, Run)> {
     Ok((feature_options(options)?, Run::read(options)?))
 }
 
-/// The options of `match`.
+/// Reads the options of `match`.
 pub(crate) fn read_match(options: &mut Options<'_>) -> PyResult<(MatchingOptions, Run)> {
     let mut o = MatchingOptions::default();
     options.set("mutual", &mut o.mutual)?;
@@ -66,7 +66,7 @@ impl Arguments {
     }
 }
 
-/// Tentative matches between two photographs: some are wrong; `estimate_homography` and `estimate_fundamental` find what most agree on.
+/// Extracts and matches the features of two images. The matches are tentative; `estimate_homography` and `estimate_fundamental` reject outliers.
 ///
 /// a, b: arrays of uint8 of shape (height, width) or (height, width, 3). `defaults("match_features")` lists the options.
 ///
@@ -91,14 +91,14 @@ pub(crate) fn match_features<'py>(
     matches(py, &found)
 }
 
-/// Keypoints as rows x, y, scale, angle, response.
+/// Converts keypoints to rows x, y, scale, angle, response.
 pub(crate) fn keypoints<'py>(py: Python<'py>, keypoints: &[Keypoint]) -> PyResult<Bound<'py, PyAny>> {
     let rows: Vec<[f32; 5]> =
         keypoints.iter().map(|k| [k.position.x, k.position.y, k.scale, k.angle, k.response]).collect();
     arrays::row_array(py, &rows)
 }
 
-/// Keypoints of such rows.
+/// Converts such rows to keypoints.
 pub(crate) fn keypoints_from(given: &Bound<'_, PyAny>) -> PyResult<Vec<Keypoint>> {
     let rows: Vec<[f64; 5]> = arrays::rows(given, "keypoints")?;
     let keypoint = |[x, y, scale, angle, response]: [f64; 5]| Keypoint {
@@ -127,7 +127,7 @@ fn matches<'py>(py: Python<'py>, found: &MatchingResult) -> PyResult<Bound<'py, 
     )
 }
 
-/// The features of a photograph: keypoints and their descriptors, for `match`.
+/// Extracts the features of an image: keypoints and descriptors, for `match`.
 ///
 /// image: an array of uint8 of shape (height, width) or (height, width, 3). `defaults("extract_features")` lists the options.
 ///
@@ -160,7 +160,7 @@ pub(crate) fn extract_features<'py>(
     )
 }
 
-/// Features as they came from `extract_features`, or from elsewhere: of another kind than ours, nothing but their number of columns is known.
+/// Converts features of `extract_features` or of another program; of foreign descriptors only the dimension is known.
 fn features(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Features> {
     let kind: String = given.getattr("kind")?.extract()?;
     let keypoints = keypoints_from(&given.getattr("keypoints")?)?;
@@ -173,14 +173,14 @@ fn features(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Features> {
         return Err(PyValueError::new_err(text));
     }
     let descriptors = Descriptors::from_vec(kind, numbers)
-        .ok_or_else(|| PyValueError::new_err(format!("{what}: the descriptors are no rows of {columns} numbers")))?;
+        .ok_or_else(|| PyValueError::new_err(format!("{what}: the descriptors are not rows of {columns} numbers")))?;
     let mut all = Features::new(kind);
     all.keypoints = keypoints;
     all.descriptors = descriptors;
     Ok(all)
 }
 
-/// Tentative matches between the features of two photographs: some are wrong. a, b: `Features`, from `extract_features` or from elsewhere.
+/// Matches the features of two images; the matches are tentative. a, b: `Features`, from `extract_features` or another program.
 ///
 ///     >>> image = np.kron(np.random.default_rng(0).integers(0, 256, (40, 50)), np.ones((6, 6))).astype(np.uint8)
 ///     >>> a, b = epipole.extract_features(image[:, :280]), epipole.extract_features(image[:, 20:])

@@ -1,4 +1,4 @@
-//! Sparse models: cameras, photographs with their poses, and points.
+//! Sparse models: cameras, images with poses, and points.
 
 use crate::arrays;
 use crate::calibration::pose;
@@ -13,7 +13,7 @@ use pyo3::types::PyDict;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-/// A model as `Reconstruction`.
+/// Converts a model to a `Reconstruction`.
 pub(crate) fn made<'py>(py: Python<'py>, model: &SparseModel) -> PyResult<Bound<'py, PyAny>> {
     let (cameras, images) = (PyDict::new(py), PyDict::new(py));
     for (id, camera) in &model.cameras {
@@ -56,8 +56,8 @@ pub(crate) fn made<'py>(py: Python<'py>, model: &SparseModel) -> PyResult<Bound<
     )
 }
 
-/// The model of a `Reconstruction`. Where points are seen, its photographs tell.
-fn taken(given: &Bound<'_, PyAny>) -> PyResult<SparseModel> {
+/// Converts a `Reconstruction` to a model; tracks are collected from its images.
+fn model_from(given: &Bound<'_, PyAny>) -> PyResult<SparseModel> {
     let cameras: BTreeMap<u32, Bound<'_, PyCamera>> = given.getattr("cameras")?.extract()?;
     let cameras = cameras.into_iter().map(|(id, camera)| (id, camera.get().camera)).collect();
     let mut model = SparseModel { cameras, ..SparseModel::default() };
@@ -66,7 +66,7 @@ fn taken(given: &Bound<'_, PyAny>) -> PyResult<SparseModel> {
     let colors: Vec<[f64; 3]> = arrays::rows(&given.getattr("colors")?, "colors")?;
     let errors: Vec<f64> = given.getattr("errors")?.call_method0("tolist")?.extract()?;
     if [positions.len(), colors.len(), errors.len()].iter().any(|n| *n != ids.len()) {
-        return Err(PyValueError::new_err("points, colors, errors and point_ids are not of one length"));
+        return Err(PyValueError::new_err("points, colors, errors and point_ids differ in length"));
     }
     for (((id, position), color), error) in ids.into_iter().zip(positions).zip(colors).zip(errors) {
         let color = color.map(|c| c.round() as u8);
@@ -79,16 +79,16 @@ fn taken(given: &Bound<'_, PyAny>) -> PyResult<SparseModel> {
         let pixels: Vec<[f64; 2]> = arrays::rows(&image.getattr("keypoints")?, "keypoints")?;
         let ids = integers(&image.getattr("point_ids")?, "point_ids")?;
         if ids.len() != pixels.len() {
-            return Err(PyValueError::new_err(format!(
-                "image {number}: keypoints and point_ids are not of one length"
-            )));
+            return Err(PyValueError::new_err(format!("image {number}: keypoints and point_ids differ in length")));
         }
         let mut points = Vec::with_capacity(ids.len());
         for (index, (pixel, id)) in pixels.into_iter().zip(ids).enumerate() {
             let point = u64::try_from(id).ok();
             if let Some(id) = point {
                 let Some(point) = model.points.get_mut(&id) else {
-                    return Err(PyValueError::new_err(format!("image {number} sees point {id}, which there is not")));
+                    return Err(PyValueError::new_err(format!(
+                        "image {number} observes point {id}, which does not exist"
+                    )));
                 };
                 point.track.push((number, index as u32));
             }
@@ -105,18 +105,18 @@ fn integers(given: &Bound<'_, PyAny>, what: &str) -> PyResult<Vec<i64>> {
     listed.extract().map_err(|_| PyValueError::new_err(format!("{what} must be an array of integers")))
 }
 
-/// Reads a model of COLMAP's: the folder of its cameras, images and points3D, text or binary.
+/// Reads a COLMAP model: the folder of cameras, images and points3D, text or binary.
 #[pyfunction]
 pub(crate) fn read_model(py: Python<'_>, folder: PathBuf) -> PyResult<Bound<'_, PyAny>> {
     let model = py.detach(|| colmap::read(&folder)).map_err(|error| of_file(py, &error))?;
     made(py, &model)
 }
 
-/// Writes a `Reconstruction` into a folder that is there as COLMAP's files, in place of a model that is there. format: colmap-text or colmap-binary.
+/// Writes a `Reconstruction` as a COLMAP model into an existing folder, replacing a model there. format: colmap-text or colmap-binary.
 #[pyfunction]
 #[pyo3(signature = (folder, model, *, format = "colmap-text"))]
 pub(crate) fn write_model(py: Python<'_>, folder: PathBuf, model: &Bound<'_, PyAny>, format: &str) -> PyResult<()> {
     let format = ModelFormat::from_name(format).map_err(|error| PyValueError::new_err(format!("format: {error}")))?;
-    let model = taken(model)?;
+    let model = model_from(model)?;
     py.detach(|| colmap::replace(&folder, &model, format)).map(drop).map_err(|error| of_file(py, &error))
 }

@@ -1,4 +1,4 @@
-//! Options that a caller gives by name.
+//! Keyword options of a call.
 
 use cv_core::Named;
 use pyo3::IntoPyObjectExt;
@@ -6,13 +6,13 @@ use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBool, PyDict, PyString};
 
-/// The keyword arguments of a call: each is taken by its name, and what is left in the end is refused.
+/// The keyword arguments of a call: each is taken by name; unknown ones are refused at the end.
 pub(crate) struct Options<'py> {
     function: &'static str,
     given: Option<Bound<'py, PyDict>>,
-    /// What may be given.
+    /// Names of the options.
     known: Vec<&'static str>,
-    /// Where defaults are written down in place of being changed.
+    /// If set, names and defaults are recorded and no options are read.
     record: Option<Bound<'py, PyDict>>,
 }
 
@@ -21,17 +21,17 @@ impl<'py> Options<'py> {
         Self { function, given: given.cloned(), known: Vec::new(), record: None }
     }
 
-    /// Reads no options: notes their names and defaults.
+    /// Records names and defaults instead of reading options.
     pub(crate) fn recording(py: Python<'py>, function: &'static str) -> Self {
         Self { function, given: None, known: Vec::new(), record: Some(PyDict::new(py)) }
     }
 
-    /// What was noted.
+    /// Returns the recorded options.
     pub(crate) fn recorded(self) -> PyResult<Bound<'py, PyDict>> {
         self.record.ok_or_else(|| PyValueError::new_err("nothing was recorded"))
     }
 
-    /// Notes the default of an option that is taken as an object.
+    /// Records the default of an option that is taken as an object.
     pub(crate) fn default<T: IntoPyObject<'py>>(&self, name: &'static str, default: T) -> PyResult<()> {
         self.note(name, default)
     }
@@ -45,7 +45,7 @@ impl<'py> Options<'py> {
         Ok(())
     }
 
-    /// What was given for a name.
+    /// Returns the given value of an option.
     fn given(&mut self, name: &'static str) -> PyResult<Option<Bound<'py, PyAny>>> {
         self.known.push(name);
         match &self.given {
@@ -54,13 +54,13 @@ impl<'py> Options<'py> {
         }
     }
 
-    /// The error of a value of the wrong kind.
+    /// Makes the error of a value of the wrong type.
     fn wrong(&self, py: Python<'py>, name: &str, error: &PyErr) -> PyErr {
         let text = format!("{}(): {name}: {}", self.function, error.value(py));
         if error.is_instance_of::<PyTypeError>(py) { PyTypeError::new_err(text) } else { PyValueError::new_err(text) }
     }
 
-    /// The value of an option as what it must be.
+    /// Converts the value of an option to its type.
     pub(crate) fn extract<T>(&self, name: &str, value: &Bound<'py, PyAny>) -> PyResult<T>
     where
         T: for<'a> FromPyObject<'a, 'py, Error: Into<PyErr>>,
@@ -71,7 +71,7 @@ impl<'py> Options<'py> {
         }
     }
 
-    /// An option with a default, which `None` stands for.
+    /// Reads an option with a default; `None` means the default.
     pub(crate) fn set<T>(&mut self, name: &'static str, value: &mut T) -> PyResult<()>
     where
         T: for<'a> FromPyObject<'a, 'py, Error: Into<PyErr>> + IntoPyObject<'py> + Clone,
@@ -83,7 +83,7 @@ impl<'py> Options<'py> {
         Ok(())
     }
 
-    /// An option that `None` switches off.
+    /// Reads an option that `None` disables.
     pub(crate) fn set_optional<T>(&mut self, name: &'static str, value: &mut Option<T>) -> PyResult<()>
     where
         T: for<'a> FromPyObject<'a, 'py, Error: Into<PyErr>> + IntoPyObject<'py> + Clone,
@@ -95,7 +95,7 @@ impl<'py> Options<'py> {
         Ok(())
     }
 
-    /// An option without a default.
+    /// Reads an option without a default.
     pub(crate) fn take<T>(&mut self, name: &'static str) -> PyResult<Option<T>>
     where
         T: for<'a> FromPyObject<'a, 'py, Error: Into<PyErr>>,
@@ -107,13 +107,13 @@ impl<'py> Options<'py> {
         }
     }
 
-    /// An option without a default, as the object that it is.
+    /// Reads an option without a default, as an object.
     pub(crate) fn take_any(&mut self, name: &'static str) -> PyResult<Option<Bound<'py, PyAny>>> {
         self.note(name, None::<bool>)?;
         Ok(self.given(name)?.filter(|given| !given.is_none()))
     }
 
-    /// A choice by name, or by number where its names are numbers.
+    /// Reads a named value; a number is accepted if the names are numbers.
     pub(crate) fn set_named<T: Named>(&mut self, name: &'static str, value: &mut T) -> PyResult<()> {
         self.note(name, value.name())?;
         if let Some(given) = self.given(name)?.filter(|given| !given.is_none()) {
@@ -122,7 +122,7 @@ impl<'py> Options<'py> {
         Ok(())
     }
 
-    /// A choice by name that has no default.
+    /// Reads a named value without a default.
     pub(crate) fn take_named<T: Named>(&mut self, name: &'static str) -> PyResult<Option<T>> {
         self.note(name, None::<bool>)?;
         match self.given(name)?.filter(|given| !given.is_none()) {
@@ -136,7 +136,7 @@ impl<'py> Options<'py> {
             .map_err(|error| PyValueError::new_err(format!("{}(): {name}: {error}", self.function)))
     }
 
-    /// The name that was given, or the number as one.
+    /// Converts a string or an integer to a name.
     fn text(&self, name: &str, given: &Bound<'py, PyAny>) -> PyResult<String> {
         if !given.is_instance_of::<PyString>() && (given.is_instance_of::<PyBool>() || given.extract::<i64>().is_err())
         {
@@ -146,7 +146,7 @@ impl<'py> Options<'py> {
         Ok(given.str()?.to_string())
     }
 
-    /// Refuses what no option was named.
+    /// Refuses unknown options, with a suggestion.
     pub(crate) fn finish(self) -> PyResult<()> {
         let Some(given) = &self.given else { return Ok(()) };
         for key in given.keys() {
@@ -166,7 +166,7 @@ impl<'py> Options<'py> {
     }
 }
 
-/// Number of letters to insert, remove or replace (Levenshtein). O(length²).
+/// Computes the Levenshtein distance in O(length²).
 fn distance(a: &str, b: &str) -> usize {
     let b: Vec<char> = b.chars().collect();
     let mut row: Vec<usize> = (0..=b.len()).collect();

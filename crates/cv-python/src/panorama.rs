@@ -37,7 +37,7 @@ impl Arguments {
         let camera: Option<Bound<'_, PyCamera>> = options.take("camera")?;
         let focal: Option<f64> = options.take("focal")?;
         if let Some(focal) = focal.filter(|f| !(*f > 0.0 && f.is_finite())) {
-            return Err(PyValueError::new_err(format!("panorama(): focal must be above 0, not {focal}")));
+            return Err(PyValueError::new_err(format!("panorama(): focal must be positive, not {focal}")));
         }
         let registration = options.take::<String>("registration")?.map(|text| {
             let wrong = |error| PyValueError::new_err(format!("panorama(): registration: {error}"));
@@ -58,7 +58,7 @@ impl Arguments {
     }
 }
 
-/// Which part of the scene is drawn: options in degrees.
+/// Reads field of view, center and roll, in degrees.
 fn framing(options: &mut Options<'_>) -> PyResult<Framing> {
     let radians = |name: &str, degrees: f64, low: f64, high: f64| {
         if (low..=high).contains(&degrees) {
@@ -68,7 +68,7 @@ fn framing(options: &mut Options<'_>) -> PyResult<Framing> {
         Err(PyValueError::new_err(text))
     };
     let mut framing = Framing::default();
-    // One angle, or across and up.
+    // One angle, or horizontal and vertical.
     let (across, up) = match options.take_any("fov")? {
         Some(fov) if fov.is_instance_of::<PyTuple>() => {
             let (across, up) = options.extract::<(f64, f64)>("fov", &fov)?;
@@ -88,7 +88,7 @@ fn framing(options: &mut Options<'_>) -> PyResult<Framing> {
     Ok(framing)
 }
 
-/// A photograph that was given, as deep as it is.
+/// An input photograph at its bit depth.
 enum Photograph<'py> {
     Bytes(Rgb<'py, u8>),
     Words(Rgb<'py, u16>),
@@ -96,7 +96,7 @@ enum Photograph<'py> {
 }
 
 impl<'py> Photograph<'py> {
-    /// An array of bytes or of 16 bits, or the path of a file.
+    /// Converts an 8-bit or 16-bit array, or a path.
     fn new(given: &Bound<'py, PyAny>, what: &str) -> PyResult<Self> {
         if let Ok(path) = given.extract::<PathBuf>() {
             return Ok(Self::File(path));
@@ -106,7 +106,7 @@ impl<'py> Photograph<'py> {
             ImageArg::U16(borrowed) => Rgb::of(given.py(), borrowed).map(Self::Words),
             other @ ImageArg::F32(_) => {
                 let text = format!(
-                    "{what}: dtype {} where uint8 or uint16 is needed; scale it to 0 to 255 and use .astype(np.uint8)",
+                    "{what}: dtype is {}, but uint8 or uint16 is needed; scale it to 0 to 255 and use .astype(np.uint8)",
                     other.kind()
                 );
                 Err(PyTypeError::new_err(text))
@@ -114,7 +114,7 @@ impl<'py> Photograph<'py> {
         }
     }
 
-    /// The same for threads without the interpreter.
+    /// Returns a source that can be used with the GIL released.
     fn source(&self) -> PyResult<Source<'_>> {
         Ok(match self {
             Self::Bytes(array) => Source::Bytes(array.view()?),
@@ -124,7 +124,7 @@ impl<'py> Photograph<'py> {
     }
 }
 
-/// Where the pixels of a photograph are.
+/// The pixels of a photograph: a view, or a file to read.
 #[derive(Clone, Copy)]
 enum Source<'a> {
     Bytes(ImageView<'a, u8, 3>),
@@ -149,7 +149,7 @@ impl<'a> Source<'a> {
     }
 }
 
-/// The pixels of a photograph in the depth that all have.
+/// The pixels of a photograph at the common bit depth.
 enum Pixels<'a, T> {
     View(ImageView<'a, T, 3>),
     Made(Image<T, 3>),
@@ -173,7 +173,7 @@ impl<'a> Read<'a> {
         }
     }
 
-    /// The focal length in px by EXIF.
+    /// Returns the focal length by EXIF, px.
     fn focal(&self) -> Option<f64> {
         match self {
             Self::File(image) => image.exif.focal.as_ref().map(|focal| focal.pixels),
@@ -198,25 +198,25 @@ impl<'a> Read<'a> {
     }
 }
 
-/// The pixels of a photograph in one depth, and its focal length.
+/// Converts a photograph to a bit depth; returns its focal length too.
 fn in_depth<'a, T>(read: Read<'a>, pixels: impl Fn(Read<'a>) -> Pixels<'a, T>) -> (Pixels<'a, T>, Option<f64>) {
     let focal = read.focal();
     (pixels(read), focal)
 }
 
-/// An array as a file would have it.
+/// Wraps an array as an image of a file.
 fn as_file(pixels: impl Into<cv_io::Pixels>) -> DynImage {
     DynImage { pixels: pixels.into(), exif: ExifInfo::default(), metadata: Metadata::default() }
 }
 
-/// What came of photographs, as deep as the deepest of them.
+/// A panorama at the largest bit depth of the photographs.
 enum Joined {
     Bytes(PanoramaResult),
     Words(PanoramaResult<u16>),
 }
 
 impl Arguments {
-    fn join<T: PhotoSample>(
+    fn stitch<T: PhotoSample>(
         &self,
         photographs: &[(Pixels<'_, T>, Option<f64>)],
         progress: &dyn Progress,
@@ -240,11 +240,11 @@ impl Arguments {
     }
 }
 
-/// Joins overlapping photographs, in any order, to one picture.
+/// Stitches overlapping photographs, in any order, to a panorama.
 ///
-/// photographs: arrays of uint8 or uint16 (65535 is white), or paths; where one has 16 bits, so does the picture. camera: the calibrated Camera that took all of them; focal: about the focal length in px, else EXIF tells, or the photographs do.
-/// fov: degrees across, or (across, up); center: degrees to the right of the photographs' middle and above the horizon, (yaw, pitch); roll: degrees clockwise.
-/// registration: that of a `Panorama` of the same views (or the text of a file of `cv panorama --save-registration`), with which nothing is matched; `camera`, `focal`, `mode` and `features` then mean nothing.
+/// photographs: arrays of uint8 or uint16 (65535 is white), or paths; if one has 16 bits, so has the panorama. camera: the calibrated Camera of all photographs; focal: approximate focal length in px, by default from EXIF or self-calibrated.
+/// fov: horizontal field of view in degrees, or (horizontal, vertical); center: (yaw, pitch) in degrees, to the right of the center of the photographs and above the horizon; roll: degrees clockwise.
+/// registration: that of a `Panorama` of the same views (or the contents of a file of `cv panorama --save-registration`), used instead of matching; `camera`, `focal`, `mode` and `features` are then ignored.
 /// `defaults("panorama")` lists the options.
 #[pyfunction]
 #[pyo3(signature = (photographs, **options))]
@@ -263,10 +263,10 @@ pub(crate) fn panorama<'py>(
             sources.par_iter().map(|source| source.read()).collect::<Result<_, _>>().map_err(Ended::File)?;
         if read.iter().any(Read::is_deep) {
             let read: Vec<_> = read.into_par_iter().map(|r| in_depth(r, Read::into_words)).collect();
-            arguments.join(&read, progress).map(Joined::Words)
+            arguments.stitch(&read, progress).map(Joined::Words)
         } else {
             let read: Vec<_> = read.into_par_iter().map(|r| in_depth(r, Read::into_bytes)).collect();
-            arguments.join(&read, progress).map(Joined::Bytes)
+            arguments.stitch(&read, progress).map(Joined::Bytes)
         }
     })?;
     match found {

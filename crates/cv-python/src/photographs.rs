@@ -1,4 +1,4 @@
-//! Photographs as arrays or as files.
+//! Photographs as arrays or files.
 
 use crate::arrays::{self, Rgb};
 use crate::camera::PyCamera;
@@ -12,14 +12,14 @@ use pyo3::prelude::*;
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
-/// A photograph that a job was given.
+/// An input photograph of a job.
 pub(crate) enum Photograph<'py> {
     Array(Rgb<'py>),
     File(PathBuf),
 }
 
 impl<'py> Photograph<'py> {
-    /// An array of bytes, or the path of a file.
+    /// Converts an 8-bit array, or a path.
     pub(crate) fn new(given: &Bound<'py, PyAny>, what: &str) -> PyResult<Self> {
         match given.extract::<PathBuf>() {
             Ok(path) => Ok(Self::File(path)),
@@ -27,19 +27,19 @@ impl<'py> Photograph<'py> {
         }
     }
 
-    /// What each of a list is read as, by a name for errors.
+    /// Reads each item of a list, with its name for errors.
     pub(crate) fn each<T>(
         given: &Bound<'py, PyAny>,
         read: impl Fn(&Bound<'py, PyAny>, &str) -> PyResult<T>,
     ) -> PyResult<Vec<T>> {
-        // A path is a sequence, too, of its letters.
+        // A string is a sequence of characters, too.
         if given.extract::<PathBuf>().is_ok() {
-            return Err(PyTypeError::new_err("a list of photographs is needed, not one path"));
+            return Err(PyTypeError::new_err("a list of photographs is needed, got a single path"));
         }
         given.try_iter()?.enumerate().map(|(i, one)| read(&one?, &format!("photograph {i}"))).collect()
     }
 
-    /// The same for threads without the interpreter.
+    /// Returns a source that can be used with the GIL released.
     pub(crate) fn source(&self) -> PyResult<Source<'_>> {
         Ok(match self {
             Self::Array(array) => Source::View(array.view()?),
@@ -48,14 +48,14 @@ impl<'py> Photograph<'py> {
     }
 }
 
-/// Where the pixels of a photograph are.
+/// The pixels of a photograph: a view, or a file to read.
 #[derive(Clone, Copy)]
 pub(crate) enum Source<'a> {
     View(ImageView<'a, u8, 3>),
     File(&'a Path),
 }
 
-/// What the EXIF of a photograph says.
+/// EXIF data of a photograph.
 #[derive(Default)]
 pub(crate) struct Exif {
     /// Focal length in px.
@@ -79,12 +79,12 @@ impl Pixels<'_> {
 }
 
 impl<'a> Source<'a> {
-    /// The pixels, and the focal length in px by EXIF.
+    /// Reads the pixels, and the focal length by EXIF in px.
     pub(crate) fn read(self) -> Result<(Pixels<'a>, Option<f64>), IoError> {
         self.read_with_exif().map(|(pixels, exif)| (pixels, exif.focal))
     }
 
-    /// The pixels, and what EXIF says.
+    /// Reads the pixels and EXIF data.
     pub(crate) fn read_with_exif(self) -> Result<(Pixels<'a>, Exif), IoError> {
         Ok(match self {
             Self::View(view) => (Pixels::View(view), Exif::default()),
@@ -98,7 +98,7 @@ impl<'a> Source<'a> {
         })
     }
 
-    /// The file's name, or the number of an array.
+    /// Returns the file name, or the index of an array.
     pub(crate) fn name(self, index: usize) -> Cow<'a, str> {
         match self {
             Self::View(_) => Cow::Owned(index.to_string()),
@@ -107,7 +107,7 @@ impl<'a> Source<'a> {
     }
 }
 
-/// What ends a job that reads photographs.
+/// The error of a job that reads photographs.
 pub(crate) enum Ended<E> {
     File(IoError),
     Job(E),
@@ -122,33 +122,33 @@ impl<E: JobError> Refused for Ended<E> {
     }
 }
 
-/// What is known of the camera of photographs.
+/// Prior knowledge of the intrinsics.
 pub(crate) enum Known {
-    /// A `Camera`: with its lens.
+    /// A calibrated `Camera`, with its distortion.
     Camera(Camera),
-    /// A 3×3 calibration matrix: nothing is said of the lens.
+    /// A 3×3 calibration matrix, with unknown distortion.
     Matrix(Matrix3<f64>),
-    /// About its focal length in px.
+    /// An approximate focal length in px.
     Focal(f64),
-    /// Nothing: EXIF tells, or the photographs do.
+    /// None: the focal length is from EXIF or self-calibrated.
     Nothing,
 }
 
 impl Known {
-    /// `camera` and `focal`.
+    /// Reads `camera` and `focal`.
     pub(crate) fn read(options: &mut Options<'_>) -> PyResult<Self> {
         let camera = options.take_any("camera")?;
         let focal: Option<f64> = options.take("focal")?;
         match (camera, focal) {
-            (Some(_), Some(_)) => Err(PyTypeError::new_err("camera and focal are not given together")),
+            (Some(_), Some(_)) => Err(PyTypeError::new_err("camera and focal are mutually exclusive")),
             (Some(given), None) => Self::of(&given),
             (None, Some(focal)) if focal > 0.0 && focal.is_finite() => Ok(Self::Focal(focal)),
-            (None, Some(focal)) => Err(PyValueError::new_err(format!("focal must be above 0, not {focal}"))),
+            (None, Some(focal)) => Err(PyValueError::new_err(format!("focal must be positive, not {focal}"))),
             (None, None) => Ok(Self::Nothing),
         }
     }
 
-    /// A `Camera` or a matrix.
+    /// Converts a `Camera` or a matrix.
     pub(crate) fn of(given: &Bound<'_, PyAny>) -> PyResult<Self> {
         match given.cast::<PyCamera>() {
             Ok(camera) => Ok(Self::Camera(camera.get().camera)),
@@ -156,7 +156,7 @@ impl Known {
         }
     }
 
-    /// The camera of photographs of a size, where it is one.
+    /// Returns the camera for photographs of a size, if known.
     pub(crate) fn camera(&self, (width, height): (usize, usize)) -> Option<Camera> {
         match self {
             Self::Camera(camera) => Some(*camera),

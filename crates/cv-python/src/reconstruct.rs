@@ -1,4 +1,4 @@
-//! Points and poses from two photographs.
+//! Two-view reconstruction.
 
 use crate::job::Run;
 use crate::matching::max_features;
@@ -42,7 +42,7 @@ impl Arguments {
         Ok(Self { options: o, known, second, ignore_exif, dense, dense_options, run: Run::read(options)? })
     }
 
-    /// What is known of the cameras of photographs of these sizes, with these focal lengths by EXIF.
+    /// Returns the prior knowledge of the intrinsics for photographs of these sizes and EXIF focal lengths.
     fn intrinsics(&self, sizes: [(usize, usize); 2], exif: [Option<f64>; 2]) -> PyResult<Intrinsics> {
         let both =
             |second: &Known| -> Option<[Camera; 2]> { Some([self.known.camera(sizes[0])?, second.camera(sizes[1])?]) };
@@ -56,15 +56,15 @@ impl Arguments {
             (Known::Nothing, Known::Nothing) => {
                 Ok(Intrinsics::from_focal_lengths(exif.map(|focal| focal.filter(|_| !self.ignore_exif))))
             }
-            _ => Err(PyTypeError::new_err("reconstruct(): camera2 goes with camera")),
+            _ => Err(PyTypeError::new_err("reconstruct(): camera2 needs camera")),
         }
     }
 }
 
-/// Points and the motion of the camera from two photographs, in the first camera's frame; the unit is the distance between the cameras.
+/// Reconstructs points and the relative pose from two photographs, in the first camera's frame; the unit is the baseline.
 ///
-/// a, b: arrays of uint8 or paths. camera: a Camera, or a 3×3 matrix where the lens is not known; camera2: that of the second photograph, where it is another one; focal: about the
-/// focal length in px; else EXIF tells, or the photographs do. dense: a cloud of all pixels that both photographs confirm, too. `defaults("reconstruct")` lists the options.
+/// a, b: arrays of uint8 or paths. camera: a Camera, or a 3×3 matrix if the distortion is unknown; camera2: that of the second photograph, if different; focal: approximate
+/// focal length in px, by default from EXIF or self-calibrated. dense: also compute a dense cloud of the pixels that pass the left-right check. `defaults("reconstruct")` lists the options.
 #[pyfunction]
 #[pyo3(signature = (a, b, **options))]
 pub(crate) fn reconstruct<'py>(

@@ -1,4 +1,4 @@
-//! Rectified pairs, and photographs without the distortion of their lens.
+//! Rectification and undistortion.
 
 use crate::arrays::{self, ImageArg};
 use crate::camera::{PyCamera, PyRig};
@@ -14,7 +14,7 @@ use cv_pipeline::stereo::{Rectification, RectifiedView, RectifyOptions, WarpMap}
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-/// `alpha` and `size`.
+/// Reads `alpha` and `size`.
 pub(crate) fn view_options(options: &mut Options<'_>) -> PyResult<RectifyOptions> {
     let mut o = RectifyOptions::default();
     options.set("alpha", &mut o.alpha)?;
@@ -22,19 +22,19 @@ pub(crate) fn view_options(options: &mut Options<'_>) -> PyResult<RectifyOptions
     Ok(o)
 }
 
-/// The options of `rectify` and `undistort`.
+/// Reads the options of `rectify` and `undistort`.
 pub(crate) fn read(options: &mut Options<'_>) -> PyResult<(RectifyOptions, Run)> {
     Ok((view_options(options)?, Run::read(options)?))
 }
 
-/// Q, which makes (X, Y, Z, W) of (x, y, disparity, 1), as OpenCV's reprojectImageTo3D takes it.
+/// Converts Q, which maps (x, y, disparity, 1) to homogeneous (X, Y, Z, W), as in OpenCV's reprojectImageTo3D.
 pub(crate) fn q<'py>(py: Python<'py>, q: &Matrix4<f64>) -> PyResult<Bound<'py, PyAny>> {
     arrays::shaped(py, q.transpose().as_slice().to_vec(), &[4, 4])
 }
 
-/// Turns both photographs of a rig so that the same points lie in the same rows, without the distortion of the lenses.
+/// Rectifies and undistorts a pair of a rig, so that corresponding points lie in the same row.
 ///
-/// left, right: arrays of one type, each of its camera's size. `defaults("rectify")` lists the options: alpha from 0 (no pixel without content) to 1 (no pixel lost), size (width, height).
+/// left, right: arrays of one type, each of its camera's size. `defaults("rectify")` lists the options: alpha from 0 (only valid pixels) to 1 (all source pixels kept), size (width, height).
 #[pyfunction]
 #[pyo3(signature = (left, right, rig, **options))]
 pub(crate) fn rectify<'py>(
@@ -58,7 +58,7 @@ pub(crate) fn rectify<'py>(
     let ([left, right], [one, two]) = (images, masks);
     let mask = |mask: cv_core::Mask| arrays::array(py, mask);
     let Rectification { left: view, right: other, geometry, vertical } = rectification;
-    let turned = (arrays::matrix(py, view.rotation.matrix())?, arrays::matrix(py, other.rotation.matrix())?);
+    let rotations = (arrays::matrix(py, view.rotation.matrix())?, arrays::matrix(py, other.rotation.matrix())?);
     results::made(
         py,
         "Rectified",
@@ -67,7 +67,7 @@ pub(crate) fn rectify<'py>(
             ("right", right),
             ("masks", object(py, (mask(one)?, mask(two)?))?),
             ("camera", PyCamera::object(py, view.camera)?),
-            ("rotations", object(py, turned)?),
+            ("rotations", object(py, rotations)?),
             ("Q", q(py, &geometry.q())?),
             ("baseline", object(py, geometry.baseline)?),
             ("vertical", object(py, vertical)?),
@@ -77,7 +77,7 @@ pub(crate) fn rectify<'py>(
     )
 }
 
-/// Takes the distortion of a lens out of photographs of one camera: the map is made once.
+/// Undistorts images of one camera with a precomputed map.
 #[pyclass(frozen, module = "epipole", name = "Undistorter")]
 pub(crate) struct PyUndistorter {
     map: WarpMap,
@@ -98,13 +98,13 @@ impl PyUndistorter {
         Ok(Self { map, camera: view.camera, run })
     }
 
-    /// The camera that would have taken the results: the same place and direction, square pixels, no distortion.
+    /// The pinhole camera of the results: same center and orientation, square pixels, no distortion.
     #[getter]
     fn camera(&self) -> PyCamera {
         PyCamera { camera: self.camera }
     }
 
-    /// The photograph without distortion, in its own type; black where the lens does not reach.
+    /// Undistorts an image, in its own type; pixels outside the source are black.
     fn compute<'py>(&self, py: Python<'py>, image: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
         let image = ImageArg::new(image, "image")?;
         with_view!(image, |view| {
@@ -114,7 +114,7 @@ impl PyUndistorter {
     }
 }
 
-/// A photograph without the distortion of its lens, and the camera that would have taken it: `(image, camera)`. For many photographs of one camera, `Undistorter` makes the map once.
+/// Undistorts an image; returns it and its pinhole camera: `(image, camera)`. For many images of one camera, `Undistorter` computes the map once.
 ///
 ///     >>> camera = epipole.Camera(640, 480, [[500, 0, 320], [0, 500, 240], [0, 0, 1]], [-0.1, 0.01, 0, 0])
 ///     >>> straight, pinhole = epipole.undistort(np.zeros((480, 640, 3), np.uint8), camera)

@@ -9,7 +9,7 @@ use serde_json::Value;
 /// A field of a result.
 pub(crate) type Field<'py> = (&'static str, Bound<'py, PyAny>);
 
-/// A result: the dataclass of that name, of these fields.
+/// Makes a result: the dataclass of that name with these fields.
 pub(crate) fn made<'py>(
     py: Python<'py>,
     class: &str,
@@ -22,29 +22,29 @@ pub(crate) fn made<'py>(
     py.import("epipole._results")?.getattr(class)?.call((), Some(&all))
 }
 
-/// Any value as an object.
+/// Converts any value to an object.
 pub(crate) fn object<'py, T: IntoPyObject<'py>>(py: Python<'py>, value: T) -> PyResult<Bound<'py, PyAny>> {
     value.into_bound_py_any(py)
 }
 
-/// Stage names and their seconds.
+/// Converts stage names and seconds to a dict.
 pub(crate) fn stages<'py>(py: Python<'py>, stages: &[(&'static str, f64)]) -> PyResult<Bound<'py, PyAny>> {
     let all = PyDict::new(py);
     for (name, seconds) in stages {
-        // A stage that comes twice counts twice.
+        // Repeated stages are summed.
         let before: f64 = all.get_item(name)?.map_or(Ok(0.0), |v| v.extract())?;
         all.set_item(name, before + seconds)?;
     }
     Ok(all.into_any())
 }
 
-/// Data as plain objects.
+/// Converts data to plain objects.
 pub(crate) fn data<'py>(py: Python<'py>, value: &impl Serialize) -> PyResult<Bound<'py, PyAny>> {
     let value = serde_json::to_value(value).map_err(|e| crate::errors::internal(&e.to_string()))?;
     to_python(py, &value)
 }
 
-/// JSON as plain objects.
+/// Converts JSON to plain objects.
 pub(crate) fn to_python<'py>(py: Python<'py>, value: &Value) -> PyResult<Bound<'py, PyAny>> {
     match value {
         Value::Null => Ok(PyNone::get(py).to_owned().into_any()),
@@ -60,7 +60,7 @@ pub(crate) fn to_python<'py>(py: Python<'py>, value: &Value) -> PyResult<Bound<'
             for value in values {
                 list.append(to_python(py, value)?)?;
             }
-            // Of fixed content, as the results are.
+            // Immutable, as the results are.
             Ok(list.to_tuple().into_any())
         }
         Value::Object(fields) => {

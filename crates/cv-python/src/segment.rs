@@ -1,4 +1,4 @@
-//! Finding an object by its color.
+//! Color segmentation.
 
 use crate::arrays::{self, Rgb};
 use crate::errors::refused;
@@ -12,7 +12,7 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList, PyTuple};
 
-/// The options of `ColorModel`.
+/// Reads the options of `ColorModel`.
 pub(crate) fn read(options: &mut Options<'_>) -> PyResult<(TrainOptions, Run)> {
     let mut o = TrainOptions::default();
     options.set_named("space", &mut o.space)?;
@@ -29,14 +29,14 @@ pub(crate) fn read(options: &mut Options<'_>) -> PyResult<(TrainOptions, Run)> {
     Ok((o, Run::read(options)?))
 }
 
-/// The options of `locate`.
+/// Reads the options of `locate`.
 pub(crate) fn read_locate(options: &mut Options<'_>) -> PyResult<(DetectOptions, Run)> {
     let mut o = DetectOptions::default();
     options.set("min_score", &mut o.min_score)?;
     Ok((o, Run::read(options)?))
 }
 
-/// A fitted model; `epipole.ColorModel` is what people use.
+/// A fitted model; `epipole.ColorModel` is its public interface.
 #[pyclass(frozen, module = "epipole._native", name = "FittedColorModel")]
 pub(crate) struct PyColorModel {
     model: ColorModel,
@@ -44,7 +44,7 @@ pub(crate) struct PyColorModel {
 
 #[pymethods]
 impl PyColorModel {
-    /// Learns the colors of an object: the model, and its scores on each of the photographs.
+    /// Fits a color model; returns it and its training scores by photograph.
     #[staticmethod]
     #[pyo3(signature = (images, masks, **options))]
     fn fit<'py>(
@@ -61,7 +61,11 @@ impl PyColorModel {
         let masks = masks.try_iter()?.enumerate().map(|(i, mask)| arrays::mask(&mask?, &format!("mask {i}")));
         let masks: Vec<Mask> = masks.collect::<PyResult<_>>()?;
         if images.len() != masks.len() {
-            return Err(PyValueError::new_err(format!("{} images do not go with {} masks", images.len(), masks.len())));
+            return Err(PyValueError::new_err(format!(
+                "{} images and {} masks differ in number",
+                images.len(),
+                masks.len()
+            )));
         }
         let views = images.iter().map(Rgb::view).collect::<PyResult<Vec<_>>>()?;
         let labeled: Vec<Labeled<'_>> = views.into_iter().zip(masks.iter().map(Mask::view)).collect();
@@ -70,7 +74,7 @@ impl PyColorModel {
         Ok((Self { model: trained.model }, PyTuple::new(py, scores)?.into_any()))
     }
 
-    /// Where the object is, cleaned up.
+    /// Predicts the mask of the object after morphological clean-up.
     fn predict<'py>(&self, py: Python<'py>, image: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
         let image = Rgb::new(image, "image")?;
         let view = image.view()?;
@@ -79,7 +83,7 @@ impl PyColorModel {
         arrays::array(py, found.mask)
     }
 
-    /// Logarithm of the posterior odds of object against background at each pixel, smoothed as the model has it.
+    /// Computes the log posterior odds of object and background at each pixel, smoothed by the model's sigma.
     fn log_odds<'py>(&self, py: Python<'py>, image: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
         let image = Rgb::new(image, "image")?;
         let view = image.view()?;
@@ -87,7 +91,7 @@ impl PyColorModel {
         arrays::array(py, score)
     }
 
-    /// The regions in the object's color, the best first, and the mask of those that are the object.
+    /// Detects the regions of the object's color, the best first, and the mask of those accepted as the object.
     #[pyo3(signature = (image, **options))]
     fn locate<'py>(
         &self,
@@ -130,18 +134,18 @@ impl PyColorModel {
         )
     }
 
-    /// The threshold on the logarithm of the odds.
+    /// The threshold on the log odds.
     #[getter]
     fn threshold(&self) -> f32 {
         self.model.threshold()
     }
 
-    /// The model as the JSON that `cv segment` reads.
+    /// Serializes the model as the JSON of `cv segment`.
     fn to_json(&self) -> PyResult<String> {
         serde_json::to_string(&self.model).map_err(|error| PyValueError::new_err(error.to_string()))
     }
 
-    /// The model of such JSON.
+    /// Deserializes such JSON.
     #[staticmethod]
     fn from_json(text: &str) -> PyResult<Self> {
         let model = serde_json::from_str(text).map_err(|error| PyValueError::new_err(error.to_string()))?;
@@ -154,7 +158,7 @@ impl PyColorModel {
     }
 }
 
-/// Counts and what follows from them.
+/// Converts the counts, with precision, recall, F1 and IoU.
 fn confusion<'py>(py: Python<'py>, score: &ConfusionMatrix) -> PyResult<Bound<'py, PyAny>> {
     let all = data(py, score)?;
     for (name, value) in
@@ -165,7 +169,7 @@ fn confusion<'py>(py: Python<'py>, score: &ConfusionMatrix) -> PyResult<Bound<'p
     Ok(all)
 }
 
-/// A mask against the truth: true and false positives and negatives, precision, recall, F1, intersection over union.
+/// Scores a mask against ground truth: true and false positives and negatives, precision, recall, F1, intersection over union.
 ///
 ///     >>> truth = np.arange(8).reshape(2, 4) < 4
 ///     >>> scores = epipole.evaluate_mask(np.arange(8).reshape(2, 4) < 3, truth)

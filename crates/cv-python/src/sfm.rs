@@ -1,4 +1,4 @@
-//! Cameras and points from many photographs.
+//! Structure from motion.
 
 use crate::arrays;
 use crate::errors::reason;
@@ -22,7 +22,7 @@ use pyo3::types::{PyDict, PyTuple};
 use std::collections::BTreeSet;
 use std::convert::Infallible;
 
-/// A photograph, or what was found of it.
+/// An input photograph, or its precomputed features.
 enum Given<'py> {
     Photograph(Photograph<'py>),
     Features(Bound<'py, PySfmPhotograph>),
@@ -44,7 +44,7 @@ impl<'py> Given<'py> {
     }
 }
 
-/// The same for threads without the interpreter.
+/// An input that can be used with the GIL released.
 #[derive(Clone, Copy)]
 enum View<'a> {
     Photograph(Source<'a>),
@@ -95,25 +95,25 @@ impl<'py> Arguments<'py> {
     }
 }
 
-/// Why a photograph is not looked at.
+/// Why a photograph is not used.
 enum LeftOut {
     Unreadable(String),
     Features(FeatureError),
     Camera(OtherSize),
 }
 
-/// What was found, and what became of each photograph.
+/// The result of a job, and the outcome of each photograph.
 struct Found {
     result: SfmResult,
-    /// What each model was brought to.
+    /// The frame of each model.
     frames: Vec<&'static str>,
     photos: Vec<SfmPhoto>,
-    /// Of each photograph that was given: its place among those that were looked at.
-    looked_at: Vec<Result<usize, LeftOut>>,
+    /// For each input photograph: its index among the used ones, or why it is not used.
+    used: Vec<Result<usize, LeftOut>>,
     stages: Vec<(&'static str, f64)>,
 }
 
-/// What threads without the interpreter need of the options.
+/// The options that are used with the GIL released.
 struct Job<'a> {
     options: &'a SfmJobOptions,
     known: &'a Known,
@@ -121,7 +121,7 @@ struct Job<'a> {
 }
 
 impl Job<'_> {
-    /// Features, pairs, models.
+    /// Extracts features, matches pairs and reconstructs models.
     fn reconstruct(
         &self,
         sources: &[(View<'_>, String)],
@@ -130,11 +130,11 @@ impl Job<'_> {
     ) -> Result<Found, Ended<SfmJobError>> {
         let stop = |stop: Cancelled| Ended::Job(SfmJobError::Cancelled(stop));
         let (mut clock, mut cameras) = (StageClock::new(), SfmCameras::default());
-        let (mut photos, mut looked_at, mut fixes) = (Vec::new(), Vec::new(), vec![None; sources.len()]);
+        let (mut photos, mut used, mut fixes) = (Vec::new(), Vec::new(), vec![None; sources.len()]);
         for (i, (source, name)) in sources.iter().enumerate() {
             let place = PhotoProgress { progress, done: i, total: sources.len() };
             place.report("", 0, 0).map_err(stop)?;
-            let looked = match *source {
+            let extracted = match *source {
                 View::Features(PySfmPhotograph { photo, exif }) => {
                     fixes[i] = exif.gps;
                     self.camera(&mut cameras, photo.size, exif.focal).map(|camera| SfmPhoto {
@@ -147,15 +147,15 @@ impl Job<'_> {
                     Err(error) => Err(LeftOut::Unreadable(error.to_string())),
                     Ok((pixels, exif)) => {
                         fixes[i] = exif.gps;
-                        // Before the work.
+                        // Checked before the expensive extraction.
                         match self.camera(&mut cameras, pixels.view().size(), exif.focal) {
-                            Ok(camera) => self.look_at(pixels.view(), name, camera, &place)?,
+                            Ok(camera) => self.extract(pixels.view(), name, camera, &place)?,
                             Err(reason) => Err(reason),
                         }
                     }
                 },
             };
-            looked_at.push(looked.map(|photo| {
+            used.push(extracted.map(|photo| {
                 photos.push(photo);
                 photos.len() - 1
             }));
@@ -164,15 +164,15 @@ impl Job<'_> {
         let mut result = solve(&photos, cameras.list(), self.options, progress).map_err(Ended::Job)?;
         let mut frames = Vec::new();
         for model in &mut result.models {
-            frames.push(places.place(model, (&fixes, &looked_at), self.options.solve.seed, progress).map_err(stop)?);
+            frames.push(places.place(model, (&fixes, &used), self.options.solve.seed, progress).map_err(stop)?);
         }
         clock.lap("align");
         let mut stages = clock.into_stages();
         stages.append(&mut result.stages);
-        Ok(Found { result, frames, photos, looked_at, stages })
+        Ok(Found { result, frames, photos, used, stages })
     }
 
-    /// The index of the camera of a photograph of that size and, by EXIF, that focal length.
+    /// Returns the index of the camera of a photograph with that size and EXIF focal length.
     fn camera(&self, cameras: &mut SfmCameras, size: (usize, usize), exif: Option<f64>) -> Result<usize, LeftOut> {
         let focal = match self.known {
             Known::Focal(focal) => Some(*focal),
@@ -188,8 +188,8 @@ impl Job<'_> {
         found.map_err(LeftOut::Camera)
     }
 
-    /// What a photograph shows, or why it is left out.
-    fn look_at(
+    /// Extracts the features of a photograph, or returns why it is left out.
+    fn extract(
         &self,
         pixels: ImageView<'_, u8, 3>,
         name: &str,
@@ -207,30 +207,30 @@ impl Job<'_> {
     }
 }
 
-/// What is known of where the photographs were taken.
+/// Known camera positions and distances.
 struct Places {
-    /// By the caller, of each photograph that was given; empty: nothing.
+    /// Given camera centers, by input photograph; empty if none are given.
     centers: Vec<Option<Point3<f64>>>,
-    /// Photographs that were given, and how far apart they were taken.
+    /// Pairs of input photographs and the distance of their centers.
     distances: Vec<(usize, usize, f64)>,
     ignore_gps: bool,
 }
 
 impl Places {
-    /// Brings a model to it, or stands it upright; tells which. `fixes` and `looked_at`: of each photograph that was given, what it says itself, and its view.
+    /// Aligns a model to them, or upright, and returns the name of its frame. `fixes` and `used`: GPS position and view of each input photograph.
     fn place(
         &self,
         model: &mut SfmModel,
-        (fixes, looked_at): (&[Option<GpsFix>], &[Result<usize, LeftOut>]),
+        (fixes, used): (&[Option<GpsFix>], &[Result<usize, LeftOut>]),
         seed: u64,
         progress: &dyn Progress,
     ) -> Result<&'static str, Cancelled> {
         let gps = if self.centers.is_empty() && !self.ignore_gps { gps_centers(fixes) } else { None };
         let (all, by) = gps.map_or((self.centers.clone(), "centers"), |gps| (gps.centers, "gps"));
         let centers: Vec<Option<Point3<f64>>> =
-            looked_at.iter().zip(all).filter(|(looked, _)| looked.is_ok()).map(|(_, center)| center).collect();
+            used.iter().zip(all).filter(|(view, _)| view.is_ok()).map(|(_, center)| center).collect();
         let view = |at: usize| {
-            looked_at[at].as_ref().ok().copied().filter(|view| model.poses.get(*view).is_some_and(Option::is_some))
+            used[at].as_ref().ok().copied().filter(|view| model.poses.get(*view).is_some_and(Option::is_some))
         };
         let distances: Vec<(usize, usize, f64)> =
             self.distances.iter().filter_map(|&(a, b, length)| Some((view(a)?, view(b)?, length))).collect();
@@ -240,18 +240,18 @@ impl Places {
             Ok(placed) if placed.alignment.metric => Ok("distances"),
             Ok(_) => Ok("upright"),
             Err(ModelAlignError::Cancelled(stop)) => Err(stop),
-            // It stays in the frame it was found in.
+            // The model stays in its initial frame.
             Err(_) => Ok("any"),
         }
     }
 }
 
-/// Cameras and points from many photographs in any order (structure from motion).
+/// Reconstructs camera poses and points from many photographs in any order (structure from motion).
 ///
-/// photographs: arrays of uint8, paths, or what `sfm_features` found of them. camera: a Camera, or a 3×3 matrix where the lens is not known; focal: about the focal length in px; else EXIF tells, or the photographs do.
-/// A photograph that cannot be read, or is not of the camera's size, is left out.
-/// centers: (n, 3), where the cameras stood, NaN where that is not known; distances: (i, j, length) of photographs by their index. Without centers, three photographs or more whose EXIF tells their GPS
-/// position bring a model to meters, X east, Y north. Else it stands upright, Z up, and its unit is that of the distances, or arbitrary.
+/// photographs: arrays of uint8, paths, or results of `sfm_features`. camera: a Camera, or a 3×3 matrix if the distortion is unknown; focal: approximate focal length in px, by default from EXIF or self-calibrated.
+/// A photograph that cannot be read, or whose size is not that of the camera, is left out.
+/// centers: (n, 3), known camera centers, NaN if unknown; distances: (i, j, length) between the centers of photographs i and j. Without centers, a model with three or more GPS positions in EXIF
+/// is georeferenced in meters, X east, Y north, Z up. Otherwise it is upright, Z up, in the unit of the distances, or of arbitrary scale.
 /// `defaults("sfm")` lists the options.
 #[pyfunction]
 #[pyo3(signature = (photographs, **options))]
@@ -271,8 +271,8 @@ pub(crate) fn sfm<'py>(
             return Err(PyValueError::new_err(format!("{} names for {count} photographs", names.len())));
         }
         Some(names) => {
-            if let Some(twice) = twice(names) {
-                return Err(PyValueError::new_err(format!("names: “{twice}” is the name of two photographs")));
+            if let Some(twice) = find_duplicate(names) {
+                return Err(PyValueError::new_err(format!("names: “{twice}” is used twice")));
             }
             names.clone()
         }
@@ -293,7 +293,8 @@ pub(crate) fn sfm<'py>(
         .iter()
         .find(|(a, b, length)| *a >= count || *b >= count || a == b || !(*length > 0.0 && length.is_finite()))
     {
-        let text = format!("distances: ({a}, {b}, {length}) is not two of {count} photographs and a length above 0");
+        let text =
+            format!("distances: ({a}, {b}, {length}) is not a pair of the {count} photographs and a positive length");
         return Err(PyValueError::new_err(text));
     }
     let places = Places { centers, distances: arguments.distances.clone(), ignore_gps: arguments.ignore_gps };
@@ -305,8 +306,8 @@ pub(crate) fn sfm<'py>(
         .map(|model| model::made(py, &model))
         .collect::<PyResult<_>>()?;
     let left_out = PyDict::new(py);
-    for ((_, name), looked) in named.iter().zip(&found.looked_at) {
-        let why = match looked {
+    for ((_, name), view) in named.iter().zip(&found.used) {
+        let why = match view {
             Err(LeftOut::Unreadable(message)) => {
                 reason(py, &serde_json::json!({ "Unreadable": { "message": message } }))?
             }
@@ -335,17 +336,17 @@ pub(crate) fn sfm<'py>(
     )
 }
 
-/// A name that stands in a list twice.
-fn twice(names: &[String]) -> Option<&String> {
+/// Finds a duplicate name.
+fn find_duplicate(names: &[String]) -> Option<&String> {
     let mut sorted: Vec<&String> = names.iter().collect();
     sorted.sort_unstable();
     sorted.windows(2).find(|pair| pair[0] == pair[1]).map(|pair| pair[0])
 }
 
-/// The files' names, or their whole paths where two have one name; numbers of arrays. What still has the name of another is numbered.
+/// Returns file names, or paths if they are not unique; indices of arrays. Remaining duplicates are numbered.
 fn names_of(sources: &[View<'_>]) -> Vec<String> {
     let mut names: Vec<String> = sources.iter().enumerate().map(|(i, s)| s.name(i)).collect();
-    if twice(&names).is_some() {
+    if find_duplicate(&names).is_some() {
         for (source, name) in sources.iter().zip(&mut names) {
             if let View::Photograph(Source::File(path)) = source {
                 *name = path.to_string_lossy().into_owned();

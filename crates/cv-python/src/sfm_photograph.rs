@@ -1,4 +1,4 @@
-//! The features of a photograph for many views: found once, kept, or sent from elsewhere.
+//! Precomputed features of a photograph for structure from motion.
 
 use crate::arrays;
 use crate::job::Run;
@@ -12,14 +12,14 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 
-/// The features of a photograph, and what is known of it: `sfm` takes it in place of the photograph.
+/// The features and EXIF data of a photograph: `sfm` takes it in place of the photograph.
 #[pyclass(frozen, module = "epipole", name = "SfmPhotograph")]
 pub(crate) struct PySfmPhotograph {
     pub(crate) photo: SfmPhoto,
     pub(crate) exif: Exif,
 }
 
-/// Latitude and longitude in radians, and the altitude in meters where it is told.
+/// Latitude and longitude in radians, and the altitude in meters if known.
 type Gps = (f64, f64, Option<f64>);
 
 /// Name, size, focal length and position by EXIF, keypoints, descriptors, their kind, and colors.
@@ -52,7 +52,7 @@ impl PySfmPhotograph {
         self.exif.focal
     }
 
-    /// Latitude and longitude by EXIF in radians, and meters above the sea, or None where they are not told.
+    /// Latitude and longitude by EXIF in radians, and altitude in meters (None if unknown); None without a GPS position.
     #[getter]
     fn gps(&self) -> Option<Gps> {
         self.exif.gps.map(|GpsFix { place, has_altitude }| {
@@ -75,7 +75,7 @@ impl PySfmPhotograph {
         format!("SfmPhotograph({}, {width}×{height} px, {} features)", self.photo.name, self.photo.keypoints.len())
     }
 
-    /// What `pickle` had of it.
+    /// Restores a pickled object.
     #[staticmethod]
     fn _of_parts(
         name: String,
@@ -91,7 +91,7 @@ impl PySfmPhotograph {
         let kind = DescriptorKind::BUILT_IN.into_iter().find(|own| own.name == kind);
         let descriptors = kind.and_then(|kind| ByteDescriptors::from_bytes(kind, descriptors.to_vec()));
         let Some(descriptors) = descriptors.filter(|d| d.len() == keypoints.len() && d.len() == colors.len()) else {
-            return Err(PyValueError::new_err("these are no parts of an SfmPhotograph"));
+            return Err(PyValueError::new_err("these are not parts of an SfmPhotograph"));
         };
         let colors = colors.into_iter().map(|color| color.map(|c| c as u8)).collect();
         Ok(Self {
@@ -120,15 +120,15 @@ fn fix((latitude, longitude, altitude): Gps) -> GpsFix {
     GpsFix { place, has_altitude: altitude.is_some() }
 }
 
-/// The options of `sfm_features`.
+/// Reads the options of `sfm_features`.
 pub(crate) fn read_features(options: &mut Options<'_>) -> PyResult<(Option<String>, FeatureOptions, Run)> {
     let name = options.take("name")?;
     Ok((name, max_features(options, SfmJobOptions::default().features)?, Run::read(options)?))
 }
 
-/// The features of a photograph for `sfm`, which takes them in place of it: found once, or elsewhere.
+/// Extracts the features of a photograph for `sfm`, which takes them in place of it.
 ///
-/// photograph: an array of uint8 or a path. name: in the model; without it the file's, or none.
+/// photograph: an array of uint8 or a path. name: name in the model; by default the file name, or none.
 #[pyfunction]
 #[pyo3(signature = (photograph, **options))]
 pub(crate) fn sfm_features(

@@ -19,7 +19,7 @@ use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyString};
 
-/// The options of the matcher.
+/// Reads the options of the matcher.
 pub(crate) fn matcher_arguments(options: &mut Options<'_>) -> PyResult<(StereoOptions, Run)> {
     let mut o = StereoOptions::default();
     options.set("min_disparity", &mut o.min_disparity)?;
@@ -28,7 +28,7 @@ pub(crate) fn matcher_arguments(options: &mut Options<'_>) -> PyResult<(StereoOp
     Ok((o, Run::read(options)?))
 }
 
-/// All but the range.
+/// Reads all options of the matcher except the disparity range.
 fn matching_options(options: &mut Options<'_>, o: &mut StereoOptions) -> PyResult<()> {
     options.set_named("census", &mut o.census)?;
     options.set_named("intensity_cost", &mut o.intensity_cost)?;
@@ -99,7 +99,7 @@ impl DepthArguments {
         Ok(Self { options: o, focal, baseline, offset, rig, view, cloud, run: Run::read(options)? })
     }
 
-    /// Of a rectified pair, where it is known.
+    /// Returns the geometry of a rectified pair, if known.
     fn geometry(&self, (width, height): (usize, usize)) -> PyResult<Option<Result<StereoGeometry, GeometryError>>> {
         match (self.focal, self.baseline) {
             (None, None) => Ok(None),
@@ -112,17 +112,17 @@ impl DepthArguments {
     }
 }
 
-/// Disparity of a pair, and depth where its geometry is known.
+/// Computes the disparity of a stereo pair, and depth if its geometry is known.
 ///
-/// left, right: arrays of one shape (height, width) or (height, width, 3) of uint8, uint16 or float32 (0 to 1), rectified; with `rig`, as its cameras took them. With focal (px) and
-/// baseline, or a rig, there is depth in the unit of the baseline. `defaults("depth")` lists the options.
+/// left, right: arrays of one shape (height, width) or (height, width, 3) of uint8, uint16 or float32 (0 to 1), rectified, or unrectified with `rig`. With focal (px) and
+/// baseline, or a rig, depth is in the unit of the baseline. `defaults("depth")` lists the options.
 ///
 ///     >>> scene = np.random.default_rng(0).integers(0, 256, (60, 112), np.uint8)
 ///     >>> found = epipole.depth(scene[:, :100], scene[:, 12:], disparities=32, focal=500.0, baseline=0.24)
 ///     >>> round(float(np.median(found.disparity))), round(float(np.median(found.depth)))
 ///     (12, 10)
 ///
-/// Raises NoPairError where hardly any pixel has a partner, and others of epipole.errors.
+/// Raises NoPairError if too few pixels are matched, and other exceptions of epipole.errors.
 #[pyfunction]
 #[pyo3(signature = (left, right, **options))]
 pub(crate) fn depth<'py>(
@@ -185,10 +185,10 @@ pub(crate) fn depth<'py>(
     )
 }
 
-/// What Python is told, made while the interpreter is free.
+/// The result, computed with the GIL released.
 struct Found {
     depth: DepthResult,
-    /// Where each disparity comes from: 0 matched, 1 occluded, 2 mismatched, 3 out of view.
+    /// State of each pixel: 0 matched, 1 occluded, 2 mismatched, 3 out of view.
     state: Vec<u8>,
     depth_deviation: Option<GrayF32>,
     valid: f64,
@@ -209,15 +209,15 @@ impl Found {
     }
 }
 
-/// A matcher and the memory it works in.
+/// A matcher and its output buffer.
 struct Worker {
     matcher: StereoMatcher,
     map: DisparityMap,
 }
 
-/// Semi-global matching with memory that is kept from one pair to the next: for streams of frames.
+/// Semi-global matching with buffers reused between pairs, for video.
 ///
-/// Threads may share one; then one of them works at a time.
+/// Threads may share a matcher; they use it one at a time.
 ///
 ///     >>> scene = np.random.default_rng(0).integers(0, 256, (60, 112), np.uint8)
 ///     >>> matcher, disparity = epipole.StereoMatcher(disparities=32), np.empty((60, 100), np.float32)
@@ -243,7 +243,7 @@ impl PyStereoMatcher {
         Ok(Self { worker: Shared::new(Worker { matcher, map: DisparityMap::empty() }), run })
     }
 
-    /// The disparities of a rectified pair as an array of float32, NaN where there is none; written into `out` where that is given.
+    /// Computes the disparities of a rectified pair as an array of float32, invalid NaN; written to `out` if given.
     #[pyo3(signature = (left, right, *, out = None))]
     fn compute<'py>(
         &self,
@@ -279,7 +279,7 @@ impl PyStereoMatcher {
     }
 }
 
-/// An array to write a map of that size into.
+/// Borrows an array to write a map of that size to.
 fn writable<'py>(out: &Bound<'py, PyAny>, (width, height): (usize, usize)) -> PyResult<PyReadwriteArray2<'py, f32>> {
     let Ok(array) = out.cast::<PyArray2<f32>>() else {
         return Err(PyTypeError::new_err("out must be an array of float32 and two dimensions"));
@@ -294,7 +294,7 @@ fn writable<'py>(out: &Bound<'py, PyAny>, (width, height): (usize, usize)) -> Py
     array.try_readwrite().map_err(|_| PyValueError::new_err("out is read-only or in use"))
 }
 
-/// Errors of a disparity map against the truth, over the pixels of `mask` that have a finite truth.
+/// Scores a disparity map against ground truth, over the pixels of `mask` with finite ground truth.
 ///
 ///     >>> scores = epipole.evaluate_disparity(np.full((2, 2), 8.5, np.float32), np.full((2, 2), 8.0, np.float32))
 ///     >>> scores["average"], scores["bad"][0]

@@ -84,7 +84,7 @@ fn one(program: &Path, folder: &Path, case: &Case) -> Result<(Vec<String>, Durat
     if !matches!(code, Some(0..=2)) {
         found.push(format!("exit code {code:?} after {:.1} s: {stderr}", took.as_secs_f64()));
     }
-    if stderr.contains("panicked") || stderr.contains("bug of its own") {
+    if stderr.contains("panicked") || stderr.contains("internal error") {
         found.push(stderr.clone());
     }
     if code != Some(0) && !stderr.contains("error: ") {

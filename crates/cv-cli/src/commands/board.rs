@@ -1,6 +1,6 @@
 //! `cv board`: calibration boards to print.
 
-use crate::boards::{BoardArgs, options, told};
+use crate::boards::{BoardArgs, board_options, describe_board};
 use crate::frame::{Context, Failure, Global, Outcome, Output, Run};
 use cv_pipeline::calibration::Board;
 use cv_report::{PrintSheet, Raster};
@@ -9,7 +9,7 @@ use std::path::PathBuf;
 
 /// Draw a calibration board to print: chessboard, ChArUco, ArUco grid or AprilGrid, at its true size.
 ///
-/// The sheet has a ruler, by which you see whether the printer kept the size, and the options of `cv calibrate` for the board.
+/// The sheet has a ruler to check the printed scale, and the options of `cv calibrate` for the board.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv board -o board.pdf --board 9x6 --square 25 --paper a4\n  \
@@ -23,7 +23,7 @@ pub(crate) struct Args {
     /// The board; lengths are millimeters.
     #[command(flatten)]
     board: BoardArgs,
-    /// Paper: a0 to a5, letter, legal, tabloid, or width and height in millimeters. It is turned so that the board fits best.
+    /// Paper: a0 to a5, letter, legal, tabloid, or width and height in millimeters. Portrait or landscape is chosen to fit the board.
     #[arg(long, value_name = "NAME|WxH", default_value = "a4", value_parser = parse_paper)]
     paper: Paper,
     /// Dots per inch of a .png [default: 300].
@@ -31,10 +31,10 @@ pub(crate) struct Args {
     dpi: Option<u16>,
 }
 
-/// The formats.
+/// The extensions of the formats.
 const ENDINGS: &[&str] = &["pdf", "svg", "png"];
 
-/// Width and height in millimeters, upright.
+/// A paper size: width and height in millimeters, in portrait orientation.
 #[derive(Debug, Clone, PartialEq)]
 struct Paper {
     name: String,
@@ -67,33 +67,33 @@ fn parse_paper(text: &str) -> Result<Paper, String> {
     })
 }
 
-/// White at the rim of the paper, where printers do not print, and around the board.
-const MARGIN: f64 = 8.0;
-/// Room for the ruler and the text below the board.
-const FOOT: f64 = 16.0;
+/// White margin in mm around the board: the unprintable border of the paper.
+const MARGIN_MM: f64 = 8.0;
+/// Height in mm of the ruler and the text below the board.
+const FOOTER_MM: f64 = 16.0;
 
-/// What a paper has room for.
-fn room((width, height): (f64, f64)) -> (f64, f64) {
-    (width - 2.0 * MARGIN, height - 2.0 * MARGIN - FOOT)
+/// Returns the width and height in mm available to the board on a sheet of `(width, height)` mm.
+fn printable_area((width, height): (f64, f64)) -> (f64, f64) {
+    (width - 2.0 * MARGIN_MM, height - 2.0 * MARGIN_MM - FOOTER_MM)
 }
 
-/// A board in the middle of a sheet of paper, with its ruler and text.
+/// Lays out a board in the center of a sheet of paper, with its ruler and text.
 fn sheet(board: &Board, paper: &Paper) -> Result<PrintSheet, Failure> {
     let outline = board.outline();
     let (w, h) = (outline.width, outline.height);
-    // How much larger the board could be.
-    let slack = |size: (f64, f64)| (room(size).0 / w).min(room(size).1 / h);
-    let turned = (paper.size.1, paper.size.0);
-    let size = if slack(turned) > slack(paper.size) { turned } else { paper.size };
-    let most = slack(size);
-    if most < 1.0 {
-        let (width, height) = room(size);
+    // The largest scale at which the board fits.
+    let max_scale = |size: (f64, f64)| (printable_area(size).0 / w).min(printable_area(size).1 / h);
+    let landscape = (paper.size.1, paper.size.0);
+    let size = if max_scale(landscape) > max_scale(paper.size) { landscape } else { paper.size };
+    let scale = max_scale(size);
+    if scale < 1.0 {
+        let (width, height) = printable_area(size);
         let what = format!(
             "the board is {w:.1}×{h:.1} mm, and paper of {} has room for {width:.1}×{height:.1} mm",
             paper.name
         );
-        // In tenths of a millimeter.
-        let largest = |length: f64| (10.0 * length * most).floor().max(0.0) / 10.0;
+        // Rounded down to tenths of a millimeter.
+        let largest = |length: f64| (10.0 * length * scale).floor().max(0.0) / 10.0;
         let fits = match *board {
             Board::Chessboard { square, .. } => format!("--square {} at most", largest(square)),
             Board::Charuco(b) => format!("--square {} --marker {} at most", largest(b.square), largest(b.marker)),
@@ -101,22 +101,22 @@ fn sheet(board: &Board, paper: &Paper) -> Result<PrintSheet, Failure> {
         };
         return Err(Failure::new(what).advice(format!("{fits}, or larger paper (--paper)")));
     }
-    let mut sheet = PrintSheet::new(size, &told(board, "mm"));
-    let (left, top) = ((size.0 - w) / 2.0, MARGIN + (room(size).1 - h) / 2.0);
+    let mut sheet = PrintSheet::new(size, &describe_board(board, "mm"));
+    let (left, top) = ((size.0 - w) / 2.0, MARGIN_MM + (printable_area(size).1 - h) / 2.0);
     for r in board.black_rectangles() {
         sheet.rectangle([r.x - outline.x + left, r.y - outline.y + top, r.width, r.height]);
     }
-    let length = [100.0, 50.0, 20.0].into_iter().find(|l| l + 12.0 <= room(size).0).unwrap_or(10.0);
-    let foot = size.1 - MARGIN;
-    sheet.ruler([MARGIN, foot - 8.0], length as usize);
+    let length = [100.0, 50.0, 20.0].into_iter().find(|l| l + 12.0 <= printable_area(size).0).unwrap_or(10.0);
+    let bottom = size.1 - MARGIN_MM;
+    sheet.ruler([MARGIN_MM, bottom - 8.0], length as usize);
     let lines = [
-        format!("{}. Print at 100 %: the ruler must be {length} mm long.", told(board, "mm")),
-        format!("cv calibrate mono {} PHOTOS -o camera.yaml", options(board)),
+        format!("{}. Print at 100 %: the ruler must be {length} mm long.", describe_board(board, "mm")),
+        format!("cv calibrate mono {} PHOTOS -o camera.yaml", board_options(board)),
     ];
     for (line, below) in lines.iter().zip([4.0, 0.0]) {
-        // As wide as the paper at most.
-        let capitals = (room(size).0 / f64::from(Raster::text_width(line, 100.0)) * 100.0).min(2.2);
-        sheet.text([MARGIN, foot - below], capitals, line);
+        // Height of the capitals in mm, reduced until the line fits the paper.
+        let capitals = (printable_area(size).0 / f64::from(Raster::text_width(line, 100.0)) * 100.0).min(2.2);
+        sheet.text([MARGIN_MM, bottom - below], capitals, line);
     }
     Ok(sheet)
 }
@@ -134,7 +134,7 @@ impl Run for Args {
         let board = self.board.known()?;
         let png = self.output.extension().is_some_and(|e| e.eq_ignore_ascii_case("png"));
         if self.dpi.is_some() && !png {
-            return Err(Failure::usage("--dpi is for .png: the other formats are drawn in millimeters"));
+            return Err(Failure::usage("--dpi applies to .png only: the other formats are vector graphics"));
         }
         let sheet = sheet(&board, &self.paper)?;
         let dpi = f64::from(self.dpi.unwrap_or(300));
@@ -146,18 +146,18 @@ impl Run for Args {
             }
         })?;
         let (outline, (width, height)) = (board.outline(), sheet.size());
-        let said = told(&board, "mm");
+        let description = describe_board(&board, "mm");
         Ok(Outcome::new(Vec::new())
-            .with("board", &said)
-            .with("options", options(&board))
+            .with("board", &description)
+            .with("options", board_options(&board))
             .with("points", board.points().len())
             .with("board_mm", json!([outline.width, outline.height]))
             .with("paper_mm", json!([width, height]))
             .summary(format!(
-                "{said}: {:.1}×{:.1} mm on {width}×{height} mm\nprint it at 100 %, check the ruler, and keep it flat; then: cv calibrate mono {} PHOTOS -o camera.yaml",
+                "{description}: {:.1}×{:.1} mm on {width}×{height} mm\nprint at 100 %, check the ruler, mount it flat; then: cv calibrate mono {} PHOTOS -o camera.yaml",
                 outline.width,
                 outline.height,
-                options(&board)
+                board_options(&board)
             )))
     }
 }
@@ -189,13 +189,13 @@ mod tests {
     }
 
     #[test]
-    fn the_finders_find_every_point_of_a_printed_sheet_where_it_is_in_millimeters() {
+    fn every_point_of_a_printed_sheet_is_detected_at_its_position_in_millimeters() {
         let paper = parse_paper("a4").unwrap();
         for board in boards() {
             let sheet = sheet(&board, &paper).unwrap();
             assert_eq!(sheet.size(), (297.0, 210.0));
             let dpi = 100.0;
-            // How much of a pixel is white. Corners of ArUco markers are placed in light, of which a camera makes sRGB (IEC 61966-2-1); the others where levels cross.
+            // White coverage of each pixel. Corners of ArUco markers are refined in linear intensity, so encode as sRGB (IEC 61966-2-1); the others need no transfer curve.
             let aruco = board.kind() == BoardKind::ArucoGrid;
             let srgb = |v: f32| if v <= 0.0031308 { 12.92 * v } else { 1.055 * v.powf(1.0 / 2.4) - 0.055 };
             let image = sheet.to_pixels(dpi).map(|[v]| {
@@ -205,14 +205,14 @@ mod tests {
             let found = find_board(image.view(), &board, &ChessboardOptions::default(), &cv_pipeline::Silent).unwrap();
             let (points, o) = (board.points(), board.outline());
             assert_eq!(found.len(), points.len(), "{}", board.kind());
-            let (left, top) = ((297.0 - o.width) / 2.0, MARGIN + (room(sheet.size()).1 - o.height) / 2.0);
+            let (left, top) = ((297.0 - o.width) / 2.0, MARGIN_MM + (printable_area(sheet.size()).1 - o.height) / 2.0);
             for point in found {
                 let p = points[point.id];
-                // The corner of the sheet is that of the first pixel, whose middle is at 0.
+                // The corner of the sheet is the corner of the first pixel, whose center is at 0.
                 let at = |v: f64, first: f64, from: f64| (v - first + from) * dpi / 25.4 - 0.5;
                 let off = (point.position.x - at(p.x, o.x, left)).hypot(point.position.y - at(p.y, o.y, top));
-                // Edges that are exact to a 255th of a pixel; lines through them are taken at half brightness between pixels.
-                // Of a marker's corner, where two such lines meet, in either direction.
+                // Edges are exact to 1/255 px; lines are fitted to interpolated half-intensity crossings.
+                // A marker's corner is the intersection of two such lines: both coordinates are uncertain.
                 let most = if aruco { 0.1 * std::f64::consts::SQRT_2 } else { 0.1 };
                 assert!(off < most, "{} {}: {off} px", board.kind(), point.id);
             }
@@ -220,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_refused_with_what_would() {
+    fn a_board_larger_than_the_paper_is_refused_with_the_largest_size() {
         let paper = parse_paper("letter").unwrap();
         let board = |square| Board::Chessboard { size: BoardSize::new(9, 6), square };
         let text = sheet(&board(30.0), &paper).unwrap_err().text();

@@ -7,7 +7,7 @@ use cv_io::{CalibrationFormat, CalibrationNote, CameraArray, RigFile};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
-/// Show a calibration file, or write it in the format of another program.
+/// Show a calibration file, or convert it to the format of another program.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv calibration show camera.yaml\n  \
@@ -23,7 +23,7 @@ enum What {
     Show(Show),
 }
 
-/// Write a camera or a rig in another format; every number reads back to the same value.
+/// Convert a camera or a rig to another format; every number round-trips exactly.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv calibration convert camchain.yaml -o rig.yml --format opencv\n  \
@@ -36,11 +36,11 @@ struct Convert {
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// The format to write.
-    #[arg(long, value_name = "FORMAT", value_parser = written())]
+    #[arg(long, value_name = "FORMAT", value_parser = writable_formats())]
     format: String,
 }
 
-/// Say what a calibration file holds.
+/// Show the contents of a calibration file.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv calibration show camera.yaml\n  \
@@ -52,24 +52,24 @@ struct Show {
 
 #[derive(Debug, clap::Args)]
 struct Input {
-    /// The file; twice for OpenCV's two files of a rig.
+    /// The file; two for a rig in OpenCV's intrinsics and extrinsics files.
     #[arg(required = true, num_args = 1..=2, value_name = "FILE")]
     files: Vec<PathBuf>,
-    /// Width and height of the pictures, for files that do not tell.
+    /// Width and height of the images, for files without them.
     #[arg(long, value_name = "WxH", value_parser = super::size)]
     size: Option<(usize, usize)>,
 }
 
-/// The formats that are written.
-fn written() -> Vec<&'static str> {
+/// Names of the formats that can be written.
+fn writable_formats() -> Vec<&'static str> {
     CalibrationFormat::all().filter(|f| f.writes_cameras() || f.writes_rigs()).map(CalibrationFormat::name).collect()
 }
 
-/// The endings of the formats that are written.
+/// The extensions of the formats that can be written.
 const ENDINGS: &[&str] = &["yaml", "yml", "txt", "xml", "json", "cameramodel"];
 
-/// What a file holds.
-enum Held {
+/// The contents of a calibration file.
+enum Calibration {
     Camera(Camera),
     Rig(Box<RigFile>),
     /// More than two cameras.
@@ -77,19 +77,19 @@ enum Held {
 }
 
 impl Input {
-    /// A rig where the file is one, else a camera.
-    fn read(&self, context: &Context) -> Result<(Held, Vec<CalibrationNote>), Failure> {
+    /// Reads a rig, or else a single camera.
+    fn read(&self, context: &Context) -> Result<(Calibration, Vec<CalibrationNote>), Failure> {
         if let [file] = self.files.as_slice()
             && let Ok(array) = cv_io::read_camera_array(file)
             && array.cameras.len() > 2
         {
-            return Ok((Held::Array(array), Vec::new()));
+            return Ok((Calibration::Array(array), Vec::new()));
         }
         match cv_io::read_rig_with_notes(&self.files, self.size) {
-            Ok((file, notes)) => Ok((Held::Rig(Box::new(file)), notes)),
+            Ok((file, notes)) => Ok((Calibration::Rig(Box::new(file)), notes)),
             Err(error) if self.files.len() > 1 => Err(error.into()),
-            // What it is as a camera is the better reason, too.
-            Err(_) => Ok((Held::Camera(rig::camera(&self.files[0], self.size, context)?), Vec::new())),
+            // A file that is no rig is reported as a camera file.
+            Err(_) => Ok((Calibration::Camera(rig::camera(&self.files[0], self.size, context)?), Vec::new())),
         }
     }
 }
@@ -114,21 +114,23 @@ impl Run for Args {
         let (held, notes) = input.read(context)?;
         notes.iter().for_each(|note| context.note(note));
         let outcome = match &held {
-            Held::Camera(camera) => Outcome::new(Vec::new()).with("kind", "camera").with("camera", told(camera)),
-            Held::Rig(file) => Outcome::new(Vec::new())
+            Calibration::Camera(camera) => {
+                Outcome::new(Vec::new()).with("kind", "camera").with("camera", camera_json(camera))
+            }
+            Calibration::Rig(file) => Outcome::new(Vec::new())
                 .with("kind", "rig")
-                .with("left", told(&file.rig.left))
-                .with("right", told(&file.rig.right))
-                .with("rotation", rows(&file.rig.right_from_left))
+                .with("left", camera_json(&file.rig.left))
+                .with("right", camera_json(&file.rig.right))
+                .with("rotation", rotation_rows(&file.rig.right_from_left))
                 .with("translation", file.rig.right_from_left.translation.as_slice())
                 .with("baseline", file.rig.baseline())
                 .with("unit", &file.unit),
-            Held::Array(file) => {
+            Calibration::Array(file) => {
                 let one = |c: &cv_io::ArrayCamera| {
                     json!({
                         "name": c.name,
-                        "camera": told(&c.camera),
-                        "rotation": rows(&c.from_first),
+                        "camera": camera_json(&c.camera),
+                        "rotation": rotation_rows(&c.from_first),
                         "translation": c.from_first.translation.as_slice(),
                     })
                 };
@@ -139,29 +141,29 @@ impl Run for Args {
             }
         };
         match self.what {
-            What::Show(_) => Ok(outcome.summary(words(&held))),
+            What::Show(_) => Ok(outcome.summary(summary(&held))),
             What::Convert(args) => {
                 let inputs: Vec<&Path> = args.input.files.iter().map(PathBuf::as_path).collect();
                 spare_inputs(std::slice::from_ref(&args.output), &inputs)?;
                 let format = CalibrationFormat::from_name(&args.format);
                 let Some(format) = format else { return Err(Failure::usage("there is no such format")) };
                 let text = match &held {
-                    Held::Camera(camera) => format.camera_text(camera, &[])?,
-                    Held::Rig(file) => format.rig_text(file, &[])?,
-                    Held::Array(file) => format.array_text(file, &[])?,
+                    Calibration::Camera(camera) => format.camera_text(camera, &[])?,
+                    Calibration::Rig(file) => format.rig_text(file, &[])?,
+                    Calibration::Array(file) => format.array_text(file, &[])?,
                 };
                 context.write(Output::File(&args.output, ENDINGS), |path| cv_io::write_bytes(path, text.as_bytes()))?;
-                Ok(outcome.with("format", format.name()).summary(words(&held)))
+                Ok(outcome.with("format", format.name()).summary(summary(&held)))
             }
         }
     }
 }
 
-fn rows(motion: &Pose) -> Vec<Vec<f64>> {
+fn rotation_rows(motion: &Pose) -> Vec<Vec<f64>> {
     motion.rotation.matrix().row_iter().map(|r| r.iter().copied().collect()).collect()
 }
 
-fn told(camera: &Camera) -> Value {
+fn camera_json(camera: &Camera) -> Value {
     let model = camera.distortion.model().info();
     let coefficients: serde_json::Map<String, Value> = (model.parameters.iter())
         .zip(camera.distortion.parameters())
@@ -179,7 +181,7 @@ fn told(camera: &Camera) -> Value {
     })
 }
 
-fn words(held: &Held) -> String {
+fn summary(held: &Calibration) -> String {
     let camera = |c: &Camera| {
         let model = c.distortion.model().info();
         let numbers: Vec<String> =
@@ -191,26 +193,26 @@ fn words(held: &Held) -> String {
         };
         let across = 2.0 * (c.width as f64 / (2.0 * c.fx)).atan().to_degrees();
         format!(
-            "{}×{} px, focal length {:.3} × {:.3} px ({across:.0}° across without distortion), principal point ({:.3}, {:.3}); {lens}",
+            "{}×{} px, focal length {:.3} × {:.3} px ({across:.0}° horizontal field of view without distortion), principal point ({:.3}, {:.3}); {lens}",
             c.width, c.height, c.fx, c.fy, c.cx, c.cy
         )
     };
     match held {
-        Held::Camera(c) => camera(c),
-        Held::Array(file) => {
+        Calibration::Camera(c) => camera(c),
+        Calibration::Array(file) => {
             let one = |c: &cv_io::ArrayCamera| {
                 let far = c.from_first.inverse().translation.norm();
                 let turn = c.from_first.rotation_angle().to_degrees();
-                let place = format!("{far:.6} {} from the first, turned by {turn:.3}°", file.unit);
+                let place = format!("{far:.6} {} from the first camera, rotated by {turn:.3}°", file.unit);
                 format!("{}: {}\n  {place}", c.name, camera(&c.camera))
             };
             file.cameras.iter().map(one).collect::<Vec<_>>().join("\n")
         }
-        Held::Rig(file) => {
+        Calibration::Rig(file) => {
             let t = file.rig.right_from_left.translation;
             let turn = file.rig.right_from_left.rotation_angle().to_degrees();
             format!(
-                "left: {}\nright: {}\nbaseline {:.6} {} ({:.6}, {:.6}, {:.6}), turned by {turn:.3}°",
+                "left: {}\nright: {}\nbaseline {:.6} {} ({:.6}, {:.6}, {:.6}), rotation {turn:.3}°",
                 camera(&file.rig.left),
                 camera(&file.rig.right),
                 file.rig.baseline(),

@@ -1,10 +1,10 @@
-//! `cv completions`: scripts that complete the command line.
+//! `cv completions`: shell completion scripts.
 
 use crate::frame::{Context, Failure, Global, Outcome, Run};
 use clap::CommandFactory;
 use clap_complete::Shell;
 
-/// Print a script that completes `cv` commands in a shell.
+/// Print a completion script for a shell.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv completions bash > ~/.local/share/bash-completion/completions/cv\n  \

@@ -1,4 +1,4 @@
-//! `cv demo`: every pipeline on generated scenes, whose truth is known exactly.
+//! `cv demo`: every pipeline on rendered scenes with exact ground truth.
 
 mod calibrate;
 mod depth;
@@ -17,27 +17,27 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-/// Run every pipeline on generated scenes and compare the results with the truth.
+/// Run every pipeline on rendered scenes and compare the results with the ground truth.
 ///
-/// Renders photographs of rooms that do not exist, with noise, lens blur and uneven light, and runs each pipeline on
-/// them as on anybody's photographs. Since the scenes are known exactly, so is the error of every result. Writes the
-/// photographs, the results and report.html into a folder. The exit code is 1 where an error is above its bar.
+/// Renders images of synthetic rooms with noise, lens blur and uneven illumination, runs each pipeline on them and
+/// measures the exact error of every result. Writes the images, the results and report.html into a folder. The exit
+/// code is 1 if an error exceeds its limit.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  cv demo\n  cv demo -o /tmp/demo --seed 7\n  cv demo --json --quiet > demo.json")]
 pub(crate) struct Args {
-    /// The folder to write into; made where it is not there.
+    /// The folder to write into; created if missing.
     #[arg(short, long, visible_alias = "out", value_name = "DIR", default_value = "cv-demo")]
     output: PathBuf,
 }
 
-/// A result against the truth.
+/// A measured error or score of a result, with its limit.
 #[derive(Debug, Serialize)]
 struct Check {
     job: &'static str,
     measure: &'static str,
     truth: String,
     result: String,
-    /// The measure: an error that must be small, or a share that must be large.
+    /// The measured value: an error (at most `bar`) or a fraction (at least `bar`).
     value: f64,
     bar: f64,
     at_most: bool,
@@ -46,18 +46,18 @@ struct Check {
 }
 
 impl Check {
-    /// An error that must not exceed the bar.
+    /// An error that must not exceed the limit.
     fn at_most(job: &'static str, measure: &'static str, value: f64, bar: f64, unit: &'static str) -> Self {
         let passed = value <= bar;
         Self { job, measure, truth: String::new(), result: String::new(), value, bar, at_most: true, unit, passed }
     }
 
-    /// A share that must reach the bar.
+    /// A fraction that must reach the limit.
     fn at_least(job: &'static str, measure: &'static str, value: f64, bar: f64, unit: &'static str) -> Self {
         Self { at_most: false, passed: value >= bar, ..Self::at_most(job, measure, value, bar, unit) }
     }
 
-    /// The two values that are compared, in words.
+    /// Adds the two compared values as text.
     fn of(self, truth: impl Into<String>, result: impl Into<String>) -> Self {
         Self { truth: truth.into(), result: result.into(), ..self }
     }
@@ -80,17 +80,17 @@ fn with_unit(value: f64, unit: &str) -> String {
     }
 }
 
-/// What the jobs share.
+/// Shared inputs of the jobs.
 struct Demo<'a> {
     context: &'a Context,
     seed: u64,
     out: &'a Path,
 }
 
-/// Writes a job's part of the report.
+/// Adds a job's section to the report.
 type Section = Box<dyn FnOnce(&mut Report)>;
 
-/// What a job hands back.
+/// The result of a job.
 struct Part {
     checks: Vec<Check>,
     /// Adds the job's section to the report.
@@ -102,8 +102,8 @@ impl Part {
         Self { checks, section: Box::new(section) }
     }
 
-    /// A pipeline that gave up: a missed bar, and its words in the report.
-    fn gave_up(job: &'static str, reason: &impl std::fmt::Display) -> Self {
+    /// A pipeline that failed: a failed check, with its error in the report.
+    fn failed(job: &'static str, reason: &impl std::fmt::Display) -> Self {
         let reason = reason.to_string();
         let check = Check::at_most(job, "a result at all", f64::INFINITY, 0.0, "").of("", reason.clone());
         Self::new(vec![check], move |page| {
@@ -115,7 +115,7 @@ impl Part {
 /// Renders, runs a pipeline, and compares.
 type Job = fn(&Demo<'_>) -> Result<Part, Failure>;
 
-/// In the order in which a reader learns them.
+/// In the order of the report.
 const JOBS: [(&str, Job); 7] = [
     ("segment", segment::run),
     ("homography", homography::run),
@@ -140,7 +140,7 @@ impl Run for Args {
     }
 }
 
-/// All jobs, with what they write.
+/// Runs all jobs and writes their results.
 fn run(out: &Path, context: &Context) -> Result<Outcome, Failure> {
     let demo = Demo { context, seed: context.seed.unwrap_or(1), out };
     let (mut checks, mut sections, mut stages) = (Vec::new(), Vec::new(), Vec::new());
@@ -149,7 +149,7 @@ fn run(out: &Path, context: &Context) -> Result<Outcome, Failure> {
         context.note(format!("{name} …"));
         let start = Instant::now();
         let part = job(&demo)?;
-        // A job that was stopped is no job that gave up.
+        // A cancelled job is not a failed one.
         stage.add(1)?;
         checks.extend(part.checks);
         sections.push(part.section);
@@ -168,25 +168,26 @@ fn run(out: &Path, context: &Context) -> Result<Outcome, Failure> {
         .with("checks", checks);
     Ok(match missed {
         0 => outcome,
-        n => outcome.but(
-            Failure::new(format!("{n} of the results missed their bar")).advice(format!("look at {}", path.display())),
+        n => outcome.with_failure(
+            Failure::new(format!("{n} of the results exceed their limit"))
+                .advice(format!("look at {}", path.display())),
         ),
     })
 }
 
 impl Demo<'_> {
-    /// The camera all jobs photograph with.
+    /// The camera of all rendered images.
     fn camera(&self) -> Camera {
         Camera::from_focal(640, 480, 520.0)
     }
 
-    /// Writes a picture into the folder and returns it as a figure of the report.
+    /// Writes an image into the folder and returns it as a figure of the report.
     fn figure(&self, name: &str, image: &RgbU8, caption: &str) -> Result<Figure, Failure> {
         cv_io::write_png(self.out.join(name), image.view())?;
         picture(image, Width::Full, caption)
     }
 
-    /// The same of a map of numbers in colors.
+    /// As [`Demo::figure`], for a color-mapped array of floats.
     fn map(&self, name: &str, values: &GrayF32, style: &MapStyle, caption: &str) -> Result<Figure, Failure> {
         cv_io::write_png(self.out.join(name), draw_map(values.view(), style).view())?;
         map(values.view(), style, Width::Full, caption)
@@ -196,24 +197,24 @@ impl Demo<'_> {
     fn page(&self, checks: &[Check], sections: Vec<Section>) -> Report {
         let missed = checks.iter().filter(|c| !c.passed).count();
         let mut page = Report::new("cv demo");
-        page.subtitle(&format!("Every pipeline on generated photographs with exact truth · seed {}", self.seed));
-        page.headline("results within their bar", &format!("{} of {}", checks.len() - missed, checks.len()));
+        page.subtitle(&format!("Every pipeline on rendered images with exact ground truth · seed {}", self.seed));
+        page.headline("results within their limits", &format!("{} of {}", checks.len() - missed, checks.len()));
         for check in checks {
             page.headline(&format!("{}: {}", check.job, check.measure), &check.value_text());
         }
-        page.section("Truth against result");
+        page.section("Ground truth and results");
         let rows: Vec<Vec<String>> = checks.iter().map(row).collect();
-        page.table("All measures and their bars.", &HEAD, &rows);
+        page.table("All measures and their limits.", &HEAD, &rows);
         match missed {
-            0 => page.note(Note::Good, "Every result is within its bar."),
-            n => page.note(Note::Failure, &format!("{n} of the results missed their bar.")),
+            0 => page.note(Note::Good, "Every result is within its limit."),
+            n => page.note(Note::Failure, &format!("{n} of the results exceed their limit.")),
         };
         sections.into_iter().for_each(|section| section(&mut page));
         page
     }
 }
 
-const HEAD: [&str; 7] = ["Job", "Measure", "Truth", "Result", "Measured", "Bar", "Held"];
+const HEAD: [&str; 7] = ["Job", "Measure", "Truth", "Result", "Measured", "Limit", "Passed"];
 
 fn row(check: &Check) -> Vec<String> {
     vec![
@@ -227,7 +228,7 @@ fn row(check: &Check) -> Vec<String> {
     ]
 }
 
-/// The checks as text in columns.
+/// Formats the checks as a table of text.
 fn table(checks: &[Check]) -> String {
     let mut rows = vec![HEAD.map(str::to_owned).to_vec()];
     rows.extend(checks.iter().map(row));
@@ -235,7 +236,7 @@ fn table(checks: &[Check]) -> String {
     let widths: Vec<usize> = (0..HEAD.len()).map(width).collect();
     let mut text = String::new();
     for (i, row) in rows.iter().enumerate() {
-        // Words to the left, figures to the right.
+        // Text is left-aligned, numbers right-aligned.
         for (column, cell) in row.iter().enumerate() {
             let pad = widths[column];
             let _ =

@@ -10,7 +10,7 @@ use cv_pipeline::{EstimateError, ModelKind, RobustModel, RobustOptions, estimate
 use cv_report::{Raster, Report, colors};
 use std::path::{Path, PathBuf};
 
-/// Which model to estimate.
+/// The two-view models.
 #[derive(Debug, Clone, Copy)]
 enum Model {
     Homography,
@@ -19,13 +19,13 @@ enum Model {
 }
 
 named!(Model {
-    Homography = "homography": "a plane, or a camera that only turned: b ~ H a",
-    Fundamental = "fundamental": "a general scene: bᵀ F a = 0",
+    Homography = "homography": "a planar scene, or a purely rotating camera: b ~ H a",
+    Fundamental = "fundamental": "a general scene, uncalibrated cameras: bᵀ F a = 0",
     Essential = "essential": "a general scene and calibrated cameras: needs --camera, or --focal and --size",
 });
 
 impl Model {
-    fn words(self) -> &'static str {
+    fn description(self) -> &'static str {
         match self {
             Self::Homography => "homography",
             Self::Fundamental => "fundamental matrix",
@@ -34,7 +34,7 @@ impl Model {
     }
 }
 
-/// Estimate a homography, fundamental or essential matrix from matches of which many may be wrong.
+/// Robustly estimate a homography, fundamental or essential matrix from matches with outliers.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   cv match left.jpg right.jpg -o matches.txt && cv estimate homography --matches matches.txt
@@ -43,31 +43,31 @@ impl Model {
 
 The matches file has a row per match, `x1 y1 x2 y2` in pixels with an optional score; `#` starts a comment.")]
 pub(crate) struct Args {
-    /// What the two views have in common.
+    /// The model to estimate.
     #[arg(value_parser = named::<Model>())]
     model: Model,
-    /// Photographs: their matches are what is needed.
+    /// Photographs, which are refused with a hint: the input is a matches file.
     #[arg(hide = true)]
     photographs: Vec<PathBuf>,
     /// The matches.
     #[arg(long, value_name = "FILE", required_unless_present = "photographs")]
     matches: Option<PathBuf>,
-    /// Largest error of an inlier in pixels [default: 3 for a homography, 1 otherwise].
+    /// Inlier threshold: largest residual in pixels [default: 3 for a homography, 1 otherwise].
     #[arg(long, value_name = "PX")]
     threshold: Option<f64>,
-    /// Probability with which a sample without outliers is drawn before the search stops.
+    /// Confidence: probability of having drawn an outlier-free sample at which RANSAC terminates.
     #[arg(long, value_name = "P", default_value_t = RobustOptions::default().confidence)]
     confidence: f64,
-    /// Most samples drawn [default: 10000 for a homography, 20000 otherwise].
+    /// Maximum number of RANSAC samples [default: 10000 for a homography, 20000 otherwise].
     #[arg(long, value_name = "N")]
     max_iterations: Option<usize>,
     /// Camera of both views, for an essential matrix: YAML, a line of COLMAP's cameras.txt, or a 3×3 matrix.
     #[arg(long, value_name = "FILE", conflicts_with = "focal")]
     camera: Option<PathBuf>,
-    /// Camera of the second view, where it is another one.
+    /// Camera of the second view, if different.
     #[arg(long, value_name = "FILE", requires = "camera")]
     camera2: Option<PathBuf>,
-    /// Focal length of both views in pixels, for an essential matrix; the principal point is the middle of --size.
+    /// Focal length of both views in pixels, for an essential matrix; the principal point is the center of --size.
     #[arg(long, value_name = "PX", requires = "size")]
     focal: Option<f64>,
     /// Width and height of both views in pixels, such as 2832x2128.
@@ -76,11 +76,11 @@ pub(crate) struct Args {
 }
 
 impl Args {
-    /// The cameras that an essential matrix needs; `None` for the other models.
+    /// Returns the cameras for an essential matrix; `None` for the other models.
     fn cameras(&self, context: &Context) -> Result<Option<[Camera; 2]>, Failure> {
         if !matches!(self.model, Model::Essential) {
             if self.camera.is_some() || self.focal.is_some() || self.size.is_some() {
-                return Err(Failure::usage("only an essential matrix has use for --camera, --focal or --size"));
+                return Err(Failure::usage("--camera, --focal and --size apply to an essential matrix only"));
             }
             return Ok(None);
         }
@@ -96,13 +96,13 @@ impl Args {
             return Err(Failure::usage("an essential matrix needs --camera, or --focal and --size"));
         };
         if !(focal > 0.0 && focal.is_finite()) {
-            return Err(Failure::usage("--focal must be above 0"));
+            return Err(Failure::usage("--focal must be positive"));
         }
         Ok(Some([Camera::from_focal(width, height, focal); 2]))
     }
 }
 
-fn rows(m: &Matrix3<f64>) -> [[f64; 3]; 3] {
+fn matrix_rows(m: &Matrix3<f64>) -> [[f64; 3]; 3] {
     std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]))
 }
 
@@ -114,7 +114,7 @@ impl Run for Args {
         };
         let matches = cv_io::read_matches(file)?;
         let cameras = self.cameras(context)?;
-        let name = self.model.words();
+        let name = self.model.description();
         let (kind, options) = match self.model {
             Model::Homography => (ModelKind::Homography, RobustOptions::homography()),
             Model::Fundamental => (ModelKind::Fundamental, RobustOptions::fundamental()),
@@ -142,7 +142,7 @@ impl Run for Args {
         let (robust, pose, stages) = result
             .during(format!("no {name} from {}", file.display()))
             .advice("check the matches by eye with `cv match A B --report DIR`, or pass a larger --threshold")?;
-        let model = rows(&robust.model);
+        let model = matrix_rows(&robust.model);
         let total = pairs.len();
         let text: String = model.iter().map(|r| format!("{:>16.9e} {:>16.9e} {:>16.9e}\n", r[0], r[1], r[2])).collect();
         context.report(|| report(file, name, pairs, &robust))?;
@@ -156,7 +156,8 @@ impl Run for Args {
             .with("log10_false_alarms", robust.log_nfa);
         if let Some(pose) = pose {
             let t = pose.translation;
-            outcome = outcome.with("rotation", rows(pose.rotation.matrix())).with("translation", [t.x, t.y, t.z]);
+            outcome =
+                outcome.with("rotation", matrix_rows(pose.rotation.matrix())).with("translation", [t.x, t.y, t.z]);
         }
         Ok(outcome.summary(format!(
             "{text}{name}: {} of {total} matches within {} px, {:.3} px RMS, {} samples",
@@ -168,7 +169,7 @@ impl Run for Args {
     }
 }
 
-/// The page: how many agree, and where.
+/// Builds the page: the model, its inliers and their positions.
 fn report(
     file: &Path,
     name: &str,
@@ -177,25 +178,25 @@ fn report(
 ) -> Result<Report, Failure> {
     let mut page = Report::new(&format!("Estimate: {name}"));
     page.subtitle(&file.display().to_string())
-        .headline("matches that agree", &format!("{} of {}", found.inliers.len(), pairs.len()))
+        .headline("inliers", &format!("{} of {}", found.inliers.len(), pairs.len()))
         .headline("residuals", &format!("{:.3} px RMS", found.rms))
         .headline("samples drawn", &found.iterations.to_string());
     let rows: Vec<Vec<String>> =
-        rows(&found.model).iter().map(|row| row.iter().map(|v| format!("{v:.5e}")).collect()).collect();
+        matrix_rows(&found.model).iter().map(|row| row.iter().map(|v| format!("{v:.5e}")).collect()).collect();
     page.section("Model").table(&format!("The {name}, row by row."), &["column 1", "column 2", "column 3"], &rows);
     page.section("Matches").figure(picture(
-        &flow(pairs, &found.inliers),
+        &draw_displacements(pairs, &found.inliers),
         Width::Full,
-        "Each line leads from a point of the first view to where it lies in the second: those that agree green, others red.",
+        "Displacement of each match from the first view to the second: inliers green, outliers red.",
     )?);
     Ok(page)
 }
 
-/// Every match as a line from its place in the first view to that in the second, both in one frame; of at most 1000 px a side.
-fn flow(pairs: &[Correspondence], inliers: &[usize]) -> RgbU8 {
-    let mut agrees = vec![false; pairs.len()];
-    inliers.iter().for_each(|&i| agrees[i] = true);
-    // The frame is that of the matches that agree: a wild one may lie anywhere.
+/// Draws every match as a line from its position in the first view to that in the second, in one image of at most about 1000 px a side.
+fn draw_displacements(pairs: &[Correspondence], inliers: &[usize]) -> RgbU8 {
+    let mut is_inlier = vec![false; pairs.len()];
+    inliers.iter().for_each(|&i| is_inlier[i] = true);
+    // The bounding box of the inliers: outliers may lie anywhere.
     let ends = inliers.iter().flat_map(|&i| [pairs[i].a, pairs[i].b]);
     let mut frame = [f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY, f64::NEG_INFINITY];
     ends.for_each(|p| frame = [frame[0].min(p.x), frame[1].min(p.y), frame[2].max(p.x), frame[3].max(p.y)]);
@@ -204,9 +205,9 @@ fn flow(pairs: &[Correspondence], inliers: &[usize]) -> RgbU8 {
     let side = |length: f64| ((length * scale).ceil() as usize).clamp(1, 1000) + 20;
     let background = RgbU8::new(side(width), side(height), [24; 3]);
     let mut raster = Raster::from_rgb(background.view());
-    // Those that agree over the others.
+    // Inliers are drawn over outliers.
     for good in [false, true] {
-        for (m, _) in pairs.iter().zip(&agrees).filter(|(_, agrees)| **agrees == good) {
+        for (m, _) in pairs.iter().zip(&is_inlier).filter(|(_, inlier)| **inlier == good) {
             let at = |x: f64, y: f64| [((x - frame[0]) * scale + 10.0) as f32, ((y - frame[1]) * scale + 10.0) as f32];
             let color = if good { colors::GREEN } else { colors::RED };
             raster.line(at(m.a.x, m.a.y), at(m.b.x, m.b.y), 1.0, color);

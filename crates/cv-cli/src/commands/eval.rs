@@ -1,4 +1,4 @@
-//! `cv eval`: results against the truth.
+//! `cv eval`: scores of results against ground truth.
 
 use super::depth::{fractions, read_map};
 use crate::frame::{Context, Failure, Global, Outcome, Output, PNG, Run};
@@ -9,7 +9,7 @@ use cv_report::{MapStyle, Report, draw_error_map};
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
-/// Compare a result with the truth.
+/// Compare a result with ground truth.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv eval disparity --estimate disparity.pfm --truth truth.pfm")]
@@ -23,37 +23,37 @@ enum What {
     Disparity(Disparity),
 }
 
-/// Score a disparity map: bad pixels, averages and quantiles, as Middlebury and KITTI count them.
+/// Score a disparity map: bad pixels, averages and quantiles, as defined by Middlebury and KITTI.
 ///
-/// A pixel without an estimate counts as bad; averages and quantiles are over pixels with one. Each figure comes over all
-/// pixels with known truth and, where --mask or --truth-right is given, over the non-occluded ones.
+/// A pixel without an estimate counts as bad; averages and quantiles are over pixels with an estimate. Each measure is
+/// given over all pixels with ground truth and, with --mask or --truth-right, over the non-occluded ones.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv eval disparity --estimate disparity.pfm --truth disp0.pfm --mask mask0nocc.png\n  \
     cv eval disparity --estimate d.pfm --truth disp2.png --truth-right disp6.png --truth-scale 4\n  \
     cv eval disparity --estimate d.png --truth truth.npz --error error.png --json\n\n\
-    The ending of a file tells its format: .pfm, .npy, .npz (one array), else a picture: KITTI's 16-bit PNG without a scale,\n\
+    The extension selects the format: .pfm, .npy, .npz (one array), else an image: KITTI's 16-bit PNG without a scale,\n\
     gray value / scale with one.")]
 struct Disparity {
     /// The disparity map to score.
     #[arg(long, value_name = "FILE")]
     estimate: PathBuf,
-    /// What its values are to be divided by [default: 256 for pictures, 1 for floats].
+    /// Divisor of its values [default: 256 for images, 1 for floats].
     #[arg(long, value_name = "S")]
     estimate_scale: Option<f64>,
-    /// The true disparity; not finite, or 0 in pictures, where unknown.
+    /// The true disparity; unknown values are not finite, or 0 in images.
     #[arg(long, value_name = "FILE")]
     truth: PathBuf,
-    /// What the true values are to be divided by [default: 256 for pictures, 1 for floats].
+    /// Divisor of the true values [default: 256 for images, 1 for floats].
     #[arg(long, value_name = "S")]
     truth_scale: Option<f64>,
-    /// The true disparity of the right view: pixels that it confirms within 1 px are the non-occluded ones.
+    /// The true disparity of the right view: pixels consistent with it within 1 px are non-occluded.
     #[arg(long, value_name = "FILE", conflicts_with = "mask")]
     truth_right: Option<PathBuf>,
-    /// Non-occluded pixels are white (255).
+    /// Mask of the non-occluded pixels: white (255).
     #[arg(long, value_name = "FILE")]
     mask: Option<PathBuf>,
-    /// Where to write a picture of the errors: gray up to 2 px, red and yellow beyond, blue without an estimate.
+    /// Where to write an error image: gray up to 2 px, red and yellow above, blue without an estimate.
     #[arg(short = 'o', long, visible_alias = "output", value_name = "PNG")]
     error: Option<PathBuf>,
 }
@@ -107,45 +107,45 @@ impl Disparity {
             let style = MapStyle::disparity();
             let range = cv_report::quantile_range(truth.view(), 0.0, 1.0);
             let style = range.map_or(style.clone(), |(low, high)| style.with_range(low, high));
-            let mut page = Report::new("Disparity against the truth");
+            let mut page = Report::new("Disparity and ground truth");
             page.headline("bad-2.0", &format!("{:.2} %", 100.0 * all.bad[2]))
                 .headline("average", &format!("{:.3} px", all.average))
                 .headline("density", &format!("{:.2} %", 100.0 * all.density));
-            // A measure per row: a phone has no room for twelve columns.
+            // One measure per row, to fit narrow screens.
             let columns = rows(&all, visible.as_ref());
             let head: Vec<&str> = std::iter::once("measure").chain(columns.iter().map(|c| c[0].as_str())).collect();
             let measures: Vec<Vec<&str>> = (1..HEAD.len())
                 .map(|i| std::iter::once(HEAD[i]).chain(columns.iter().map(|c| c[i].as_str())).collect())
                 .collect();
             page.section("Scores").table(
-                "Shares of bad pixels are of all with known truth, averages and quantiles of those with an estimate.",
+                "Bad pixels are fractions of all pixels with ground truth; averages and quantiles are over pixels with an estimate.",
                 &head,
                 &measures,
             );
             page.section("Maps").figures(vec![
                 map(estimate.view(), &style, Width::Half, "Estimate.")?,
-                map(truth.view(), &style, Width::Half, "Truth.")?,
+                map(truth.view(), &style, Width::Half, "Ground truth.")?,
                 picture(
                     &errors(),
                     Width::Half,
-                    "Errors: gray up to 2 px, red and yellow beyond, blue without an estimate, black without truth.",
+                    "Errors: gray up to 2 px, red and yellow above, blue without an estimate, black without ground truth.",
                 )?,
             ]);
-            page.folded("Fractions of a pixel", |page| {
+            page.folded("Subpixel distribution", |page| {
                 page.plots(&[
                     (
                         &fractions(estimate.as_slice().iter().copied()),
-                        "How often the estimate has each fraction of a pixel. Whole pixels that stand out (pixel locking) betray a \
-                         poor fit between pixels, unless the truth stands out likewise.",
+                        "Distribution of the fractional part of the estimate. Peaks at whole pixels (pixel locking) indicate a \
+                         biased subpixel interpolation, unless the ground truth has them too.",
                     ),
-                    (&fractions(truth.as_slice().iter().copied()), "The same of the true disparities."),
+                    (&fractions(truth.as_slice().iter().copied()), "The same for the true disparities."),
                 ]);
             });
             Ok(page)
         })?;
-        let mut outcome = Outcome::default().with("all", object(&all));
+        let mut outcome = Outcome::default().with("all", scores_json(&all));
         if let Some(visible) = &visible {
-            outcome = outcome.with("non_occluded", object(visible));
+            outcome = outcome.with("non_occluded", scores_json(visible));
         }
         let text: Vec<String> = std::iter::once(HEAD.map(str::to_owned).to_vec())
             .chain(rows(&all, visible.as_ref()))
@@ -170,12 +170,12 @@ fn rows(all: &DisparityScores, visible: Option<&DisparityScores>) -> Vec<Vec<Str
     std::iter::once(row("all", all)).chain(visible.map(|s| row("non-occluded", s))).collect()
 }
 
-fn object(s: &DisparityScores) -> Value {
-    let shares = |values: &[f64; 4]| -> serde_json::Map<String, Value> {
+fn scores_json(s: &DisparityScores) -> Value {
+    let fractions = |values: &[f64; 4]| -> serde_json::Map<String, Value> {
         BAD_THRESHOLDS.iter().zip(values).map(|(limit, v)| (format!("{limit:.1}"), json!(v))).collect()
     };
     json!({
-        "pixels": s.pixels, "density": s.density, "bad": shares(&s.bad), "bad_of_valid": shares(&s.bad_of_valid),
+        "pixels": s.pixels, "density": s.density, "bad": fractions(&s.bad), "bad_of_valid": fractions(&s.bad_of_valid),
         "average_px": s.average, "rms_px": s.rms, "a50_px": s.a50, "a90_px": s.a90, "a95_px": s.a95,
     })
 }

@@ -8,7 +8,7 @@ use std::path::PathBuf;
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  cv man -o ~/.local/share/man/man1")]
 pub(crate) struct Args {
-    /// The folder to write to; made where it is missing.
+    /// The folder to write to; created if missing.
     #[arg(short, long, visible_alias = "out", value_name = "DIR")]
     output: PathBuf,
 }
@@ -35,7 +35,7 @@ impl Run for Args {
     }
 }
 
-/// The page of a command and those of the commands inside it.
+/// Renders the page of a command and of its subcommands.
 fn collect(command: &clap::Command, pages: &mut Vec<(String, Vec<u8>)>) -> Result<(), Failure> {
     let man = clap_mangen::Man::new(command.clone());
     let mut page = Vec::new();

@@ -13,9 +13,9 @@ use cv_pipeline::{
 use cv_report::{MatchStyle, Plot, Report, colors, draw_keypoints, draw_matches, tile_patches};
 use std::path::{Path, PathBuf};
 
-/// Find the same points in two photographs.
+/// Match features between two photographs.
 ///
-/// The matches are tentative: some are wrong. `cv estimate` finds the model that most of them agree on.
+/// The matches are tentative and contain outliers. `cv estimate` fits a model to them robustly.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   cv match left.jpg right.jpg -o matches.txt
@@ -25,11 +25,11 @@ use std::path::{Path, PathBuf};
   cv match left.jpg right.jpg --save-features features
   cv match left.jpg right.jpg --load-features features -o matches.txt
 
-The matches file has a row per match: x1 y1 x2 y2 in pixels, and the ratio of the best distance to the second best as
-a score (smaller is surer).
+The matches file has a row per match: x1 y1 x2 y2 in pixels, and the ratio of the best to the second best squared
+distance as a score (smaller is more distinctive).
 
 --save-features writes for left.jpg: left.keypoints.npy (x, y, scale, angle, response), left.KIND.npy (a descriptor per row) and,
-for SIFT, left.txt in COLMAP's words. --load-features reads left.keypoints.npy with left.KIND.npy or
+for SIFT, left.txt in COLMAP's text format. --load-features reads left.keypoints.npy with left.KIND.npy or
 left.descriptors.npy, else left.txt.")]
 pub(crate) struct Args {
     /// Two photographs, or a folder or quoted pattern of two.
@@ -42,34 +42,34 @@ pub(crate) struct Args {
     /// Where to write the matches.
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Which features.
+    /// Feature method.
     #[arg(long, value_name = "KIND", value_parser = named::<FeatureMethod>(), default_value_t)]
     features: FeatureMethod,
-    /// What makes a corner, for mops and harris.
+    /// Corner measure of mops and harris.
     #[arg(long, value_name = "MEASURE", value_parser = named::<CornerMeasure>(), default_value_t = HarrisFeatures::default().corners.measure)]
     corners: CornerMeasure,
-    /// How the corners of harris are spread.
+    /// Spatial suppression of the corners of harris.
     #[arg(long, value_name = "HOW", value_parser = named::<Suppression>(), default_value_t = Suppression::default())]
     spacing: Suppression,
-    /// Look at affine-simulated views too (ASIFT), with sift: for photographs from very different directions; about five times slower.
+    /// Affine simulation of viewpoint changes (ASIFT), for sift: for very different viewing directions; about five times slower.
     #[arg(long = "asift", alias = "slanted", value_name = "WHEN", value_parser = named::<AffineSimulation>(), default_value_t = MatchingOptions::default().affine_simulation)]
     slanted: AffineSimulation,
-    /// Find this model and match once more along it: more matches, nearly all right, and none that disagree.
+    /// Guided matching: estimate this model and match again under its constraint. Gives more matches, few outliers, and none that contradict the model.
     #[arg(long, value_name = "MODEL", value_parser = named::<ModelKind>())]
     guided: Option<ModelKind>,
     /// Write the features of both photographs to this folder, for other programs.
     #[arg(long, value_name = "DIR")]
     save_features: Option<PathBuf>,
-    /// Take the features from this folder instead of finding them.
+    /// Load the features from this folder instead of detecting them.
     #[arg(long, value_name = "DIR", conflicts_with = "save_features")]
     load_features: Option<PathBuf>,
-    /// Most features per photograph [default: 8192 SIFT features, 2000 MOPS, 500 corners].
+    /// Maximum number of features per photograph [default: 8192 SIFT, 2000 MOPS, 500 Harris].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     max_features: Option<u32>,
-    /// Largest ratio of the squared distance of the best candidate to that of the second; 1 keeps all [default: 0.66].
+    /// Ratio test: largest ratio of the squared distances of the best and the second best candidate; 1 disables it [default: 0.66].
     #[arg(long, value_name = "R")]
     ratio: Option<f32>,
-    /// Keep matches that are only nearest from the first photograph to the second.
+    /// Disable the cross-check: keep matches that are not mutual nearest neighbors.
     #[arg(long)]
     one_way: bool,
 }
@@ -132,8 +132,7 @@ impl Run for Args {
                         }
                         _ => return words::no_matches(error, [&self.first, &self.second]),
                     };
-                Failure::new(error)
-                    .advice(format!("look at {}: is it sharp, with texture, and large enough?", path.display()))
+                Failure::new(error).advice(format!("check that {} is sharp, textured and large enough", path.display()))
             })?;
         if result.matches.is_empty() {
             return Err(Failure::new(format!(
@@ -143,7 +142,7 @@ impl Run for Args {
                 self.second.display(),
                 result.features[1].keypoints.len()
             ))
-            .advice("a larger --ratio, --features sift, or photographs that show more of the same"));
+            .advice("a larger --ratio, --features sift, or photographs with more overlap"));
         }
         if let Some(folder) = &self.save_features {
             context.write(Output::Folder(folder), |folder| {
@@ -159,13 +158,13 @@ impl Run for Args {
         let agreed = prevailing_model(&result.pairs(), options.seed, context)?;
         if agreed.is_none() {
             context.warn(format!(
-                "no homography and no fundamental matrix explains more of the {} matches than chance would: do the photographs show the same things?",
+                "no homography or fundamental matrix explains more of the {} matches than chance would: the photographs may show different scenes",
                 result.matches.len()
             ));
         }
         context.report(|| self.html([&a, &b], &result, agreed.as_ref()))?;
-        let share = agreed.as_ref().map_or_else(String::new, |model| {
-            format!(", {} of which agree on a {}", model.robust.inliers.len(), model_words(model.kind))
+        let inliers = agreed.as_ref().map_or_else(String::new, |model| {
+            format!(", {} of which are inliers of a {}", model.robust.inliers.len(), model_words(model.kind))
         });
         let unsaved = self.output.is_none() && self.save_features.is_none() && !context.wants_report();
         let unsaved = if unsaved { "; nothing was written (-o FILE)" } else { "" };
@@ -181,7 +180,7 @@ impl Run for Args {
             .with("method", if self.load_features.is_some() { "loaded" } else { self.features.name() })
             .with("beyond_limit", result.features.each_ref().map(|f| f.beyond_limit))
             .summary(format!(
-                "{} matches{share}, between {} and {} features ({} and {} points left out near the border or on flat patches){unsaved}",
+                "{} matches{inliers}, between {} and {} features ({} and {} keypoints dropped near the border or in low-texture patches){unsaved}",
                 result.matches.len(),
                 counts[0],
                 counts[1],
@@ -208,7 +207,7 @@ impl Args {
         });
         report
             .headline("matches", &pairs.len().to_string())
-            .headline("that agree", &inliers.iter().filter(|i| **i).count().to_string());
+            .headline("inliers", &inliers.iter().filter(|i| **i).count().to_string());
         report.section("Features");
         for (name, image, features) in [("first", a, &result.features[0]), ("second", b, &result.features[1])] {
             let kept = &features.keypoints;
@@ -217,7 +216,7 @@ impl Args {
                 let some = thinned(&features.candidates);
                 let all = draw_keypoints(image.view(), &some, colors::RED);
                 let caption = format!(
-                    "{name}: {} corners before spacing{}",
+                    "{name}: {} corners before suppression{}",
                     features.candidates.len(),
                     shown(some.len(), features.candidates.len())
                 );
@@ -225,8 +224,7 @@ impl Args {
             }
             let some = thinned(kept);
             let spaced = draw_keypoints(image.view(), &some, colors::GREEN);
-            let caption =
-                format!("{name}: {} features that are described{}", kept.len(), shown(some.len(), kept.len()));
+            let caption = format!("{name}: {} described features{}", kept.len(), shown(some.len(), kept.len()));
             figures.push(picture(&spaced, Width::Half, &caption)?);
             report.figures(figures);
         }
@@ -237,17 +235,17 @@ impl Args {
             };
             report.section("Descriptors");
             report.figures(vec![
-                picture(&tiles(&result.features[0]), Width::Half, "patches of the first photograph (the first 120)")?,
-                picture(&tiles(&result.features[1]), Width::Half, "and of the second")?,
+                picture(&tiles(&result.features[0]), Width::Half, "Patches of the first image (the first 120).")?,
+                picture(&tiles(&result.features[1]), Width::Half, "Patches of the second image.")?,
             ]);
         }
         report.section("Matches");
         let style = MatchStyle::default();
         let before = draw_matches(a.view(), b.view(), &pairs, None, &style);
-        report.figure(picture(&before, Width::Full, "Tentative matches, each in a color of its own.")?);
+        report.figure(picture(&before, Width::Full, "Tentative matches, each in its own color.")?);
         if let Some(model) = model {
             let after = draw_matches(a.view(), b.view(), &pairs, Some(&inliers), &style);
-            let caption = format!("The same after RANSAC: those that fit one {model} green, others red.");
+            let caption = format!("After RANSAC: inliers of one {model} green, outliers red.");
             report.figure(picture(&after, Width::Full, &caption)?);
         }
         statistics(&mut report, result);
@@ -312,7 +310,7 @@ fn load_features(folder: &Path, photo: &Path) -> Result<Features, Failure> {
     let fits = kind.dimension == rows.dimension && counts.0 == counts.1 && finite;
     let descriptors = Descriptors::from_vec(kind, rows.descriptors).filter(|_| fits).ok_or_else(|| {
         let reason = format!(
-            "{}: {} keypoints and {} descriptors of {} numbers do not make {kind} features (or a number is not finite)",
+            "{}: {} keypoints with {} descriptors of dimension {} are not {kind} features (or a value is not finite)",
             path.display(),
             counts.0,
             counts.1,
@@ -323,17 +321,17 @@ fn load_features(folder: &Path, photo: &Path) -> Result<Features, Failure> {
     Ok(Features { keypoints: rows.keypoints, descriptors, ..Features::new(kind) })
 }
 
-/// At most 1000 points, evenly taken: more would hide the picture.
+/// Subsamples points evenly to at most 1000, so that they do not hide the image.
 fn thinned(points: &[Keypoint]) -> Vec<Keypoint> {
     points.iter().step_by(points.len().div_ceil(1000).max(1)).copied().collect()
 }
 
-/// What to say of points of which only some are drawn.
+/// Notes that only some of the points are drawn.
 fn shown(some: usize, all: usize) -> String {
     if some < all { format!(", {some} of them drawn") } else { String::new() }
 }
 
-/// Counts of both photographs, how sure the matches are, and the times.
+/// Adds feature counts, the distribution of ratios, and times.
 fn statistics(report: &mut Report, result: &MatchingResult) {
     report.section("Statistics");
     let row = |name: &str, count: &dyn Fn(&Features) -> usize| {
@@ -344,15 +342,22 @@ fn statistics(report: &mut Report, result: &MatchingResult) {
         "Features",
         &["number of", "first", "second"],
         &[
-            row("points found", &|f| f.detected_count()),
-            row("left out at the border or on flat patches", &|f| f.dropped.len()),
-            row("beyond the number asked for", &|f| f.beyond_limit),
+            row("keypoints detected", &|f| f.detected_count()),
+            row("dropped near the border or in low-texture patches", &|f| f.dropped.len()),
+            row("beyond the maximum number", &|f| f.beyond_limit),
             row("described", &|f| f.keypoints.len()),
         ],
     );
     let ratios: Vec<f64> = result.matches.iter().map(|m| f64::from(m.ratio)).collect();
-    let plot =
-        Plot::new("How sure the matches are", "ratio", "matches").histogram_within("matches", &ratios, 20, (0.0, 1.0));
-    report.plot(&plot, "Ratio of the squared distance of the best candidate to that of the second: matches far to the left are unmistakable.");
+    let plot = Plot::new("Distinctiveness of the matches", "ratio", "matches").histogram_within(
+        "matches",
+        &ratios,
+        20,
+        (0.0, 1.0),
+    );
+    report.plot(
+        &plot,
+        "Ratio of the squared distances of the best and the second best candidate: small ratios are distinctive.",
+    );
     report.times(&result.stages);
 }

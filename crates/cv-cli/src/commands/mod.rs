@@ -19,17 +19,17 @@
 //! }
 //!
 //! impl Run for Args {
-//!     // Checked before `run`: the ending tells a format, the folder can be made and written to, nothing is named twice.
+//!     // Checked before `run`: the extension is that of a format, the folder can be created and written to, nothing is named twice.
 //!     fn outputs(&self) -> Vec<Output<'_>> {
 //!         vec![Output::File(&self.output, PNG)]
 //!     }
 //!
-//!     // Of which the progress bar tells the number: `frame/steps.rs`.
+//!     // Numbered by the progress bar: `frame/steps.rs`.
 //!     fn steps(&self) -> Vec<Step> {
 //!         vec![steps::READ, steps::SHRINK]
 //!     }
 //!
-//!     // Global options that would do nothing are refused.
+//!     // Global options without effect are refused.
 //!     fn has_no_use_for(&self) -> &'static [Global] {
 //!         &[Global::Seed]
 //!     }
@@ -39,7 +39,7 @@
 //!         let options = ShrinkOptions { filter: self.filter, ..ShrinkOptions::default() }; // --threads has been applied already
 //!         let result = cv_pipeline::shrink(image.view(), &options, context) // `&Context` is the `&dyn Progress`
 //!             .advice("take a larger photograph")?; // becomes "; try: take a larger photograph"
-//!         // Whole or not at all; the folder is made, and `-` is stdout.
+//!         // Written atomically; the folder is created, and `-` is stdout.
 //!         context.write(Output::File(&self.output, PNG), |path| cv_io::write_png(path, result.image.view()))?;
 //!         context.report(|| html_of(&result))?; // called and written only under --report DIR
 //!         Ok(Outcome::new(result.stages) // `seconds`, `threads` and `version` are added by the frame
@@ -71,7 +71,7 @@ mod segment;
 mod sfm;
 mod undistort;
 
-/// For `value_parser`: a width and a height in pixels, each from 1 to 16384, as `640x480`.
+/// Parses a width and a height in pixels, each from 1 to 16384, such as `640x480`; for `value_parser`.
 fn size(text: &str) -> Result<(usize, usize), String> {
     let (w, h) = text.split_once(['x', '×']).ok_or("give width and height as 1280x960")?;
     match (w.parse(), h.parse()) {
@@ -80,7 +80,7 @@ fn size(text: &str) -> Result<(usize, usize), String> {
     }
 }
 
-/// Makes the enum of subcommands and routes to them. The modules are declared outside: rustfmt does not look for files in
+/// Defines the enum of subcommands and dispatches to them. The modules are declared outside, since rustfmt does not find files in
 /// macros.
 macro_rules! subcommands {
     ($($variant:ident($args:ty)),* $(,)?) => {

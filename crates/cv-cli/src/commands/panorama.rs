@@ -1,4 +1,4 @@
-//! `cv panorama`: overlapping photographs to one picture.
+//! `cv panorama`: stitches overlapping photographs.
 
 mod registration;
 mod report;
@@ -18,10 +18,10 @@ use serde_json::json;
 use std::collections::btree_map::{BTreeMap, Entry};
 use std::path::{Path, PathBuf};
 
-/// What a panorama may be written as.
+/// The extensions of the output formats.
 const ENDINGS: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff", "exr"];
 
-/// Join overlapping photographs to one picture.
+/// Stitch overlapping photographs.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv panorama IMG_*.jpg -o pano.png\n  \
@@ -39,76 +39,76 @@ const ENDINGS: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff", "exr"];
     cv panorama rig/frame2/ -o second.png --registration rig.json\n  \
     cv panorama holiday/ -o pano.png --save-registration holiday.pto")]
 pub(crate) struct Args {
-    /// Photographs in any order, or folders of them. Those that do not belong are left out.
+    /// Photographs in any order, or folders of them. Those that cannot be registered are left out.
     #[arg(required = true, value_name = "IMAGES")]
     images: Vec<PathBuf>,
-    /// Where to write the panorama: .png, .tif or .jpg; the first two have 16 bits a channel where a photograph has. Or .exr, the light of the scene: linear, 32-bit floats, the
-    /// camera's curve, exposures and vignetting undone, what one photograph clipped taken from another that did not. There 1 is the light that is white in the middle of the photograph that
-    /// all others are aligned to, and brighter light is more.
+    /// Where to write the panorama: .png, .tif or .jpg; the first two have 16 bits a channel if a photograph has. Or .exr: scene-referred linear radiance as 32-bit floats, with the
+    /// camera response, exposures and vignetting inverted, and samples clipped in one photograph taken from another. A radiance of 1 is white at the center of the reference photograph;
+    /// brighter radiance is above 1.
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// What the photographs are of: all around one place (rotation), or something flat from many places, such as a map, a wall or the ground (plane), drawn as a
-    /// plan, without shear; auto: rotation, unless plane explains the matches far better.
+    /// Camera motion: rotation about the camera center, or arbitrary motion in front of a planar scene such as a map, a wall or the ground (plane), drawn as a
+    /// metric plan without shear; auto: rotation, unless plane fits the matches far better.
     #[arg(long, value_name = "WHAT", value_parser = named::<CameraMotion>(), default_value_t = PanoramaOptions::default().align.motion)]
     mode: CameraMotion,
-    /// The surface to draw on; auto: a plane up to 90 degrees across, then a cylinder, a sphere where it is also high. Mercator keeps shapes (up to 85 degrees from the horizon),
-    /// panini shows a wide view with straight verticals as painters do (up to 240 degrees across), stereographic keeps shapes up to 150 degrees from its middle: with --center 0,-90 a
-    /// little planet. What lies beyond is not drawn.
+    /// Projection surface; auto: a plane up to 90 degrees of horizontal field of view, then a cylinder, or a sphere if the vertical field of view is large too. Mercator is conformal (up
+    /// to 85 degrees from the horizon), panini keeps verticals straight over a wide view (up to 240 degrees across), stereographic is conformal up to 150 degrees from its center (a
+    /// little planet with --center 0,-90). Directions beyond are not drawn.
     #[arg(long, value_name = "SURFACE", value_parser = named::<Projection>(), default_value_t = PanoramaOptions::default().render.projection)]
     projection: Projection,
-    /// Field of view of the picture, in degrees, across and, after a comma, from top to bottom; empty where no photograph reaches [default: as far as they reach].
+    /// Field of view of the panorama in degrees: horizontal and, after a comma, vertical; empty where no photograph reaches [default: that of all photographs].
     #[arg(long, value_name = "ACROSS[,UP]", value_parser = field_of_view)]
     fov: Option<(f64, Option<f64>)>,
-    /// Where the middle of the surface looks, in degrees to the right of the middle of the photographs and above the horizon. The surface is turned there: only a picture
-    /// with 0 after the comma has a straight horizon [default: their middle].
+    /// Viewing direction of the center of the panorama, in degrees: yaw to the right of the center of the photographs, pitch above the horizon. The surface is rotated
+    /// there: the horizon is straight only for pitch 0 [default: their center].
     #[arg(long, value_name = "YAW,PITCH", value_parser = center, allow_hyphen_values = true)]
     center: Option<(f64, f64)>,
-    /// Turn the picture clockwise, in degrees, where the horizon is not level.
+    /// Rotate the panorama clockwise, in degrees, to level the horizon.
     #[arg(long, value_name = "DEGREES", value_parser = roll, allow_hyphen_values = true, default_value_t = 0.0)]
     roll: f64,
-    /// How to join photographs at the seams.
+    /// Blending at the seams.
     #[arg(long, value_name = "MODE", value_parser = named::<BlendMode>(), default_value_t = PanoramaOptions::default().render.blend)]
     blend: BlendMode,
-    /// Where seams run: where the photographs agree, or half-way between their middles.
+    /// Seam placement: graph cut along small differences, or the Voronoi diagram of the image centers.
     #[arg(long, value_name = "WHERE", value_parser = named::<Seams>(), default_value_t = PanoramaOptions::default().render.seams)]
     seams: Seams,
-    /// Differences of light between photographs: left (none), or evened out in linear light, with the curve and the vignetting of the camera (match).
+    /// Exposure compensation: none, or match: exposures and white balances, with the camera response and vignetting, estimated jointly in linear intensity.
     #[arg(long, value_name = "WHAT", value_parser = named::<Exposure>(), default_value_t = PanoramaOptions::default().render.exposure)]
     exposure: Exposure,
-    /// Cut the result to the largest rectangle without empty pixels.
+    /// Crop the result to the largest rectangle without empty pixels.
     #[arg(long)]
     crop: bool,
-    /// Transparent instead of black where no photograph reaches; for .png and .tif.
+    /// Add an alpha channel, transparent where no photograph reaches; for .png and .tif.
     #[arg(long)]
     alpha: bool,
-    /// Size relative to the photographs.
+    /// Resolution of the panorama relative to the photographs.
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0)]
     scale: f64,
-    /// Features to match: sift for any photographs, harris for speed where they are all upright and of one size.
+    /// Feature method: sift for any photographs, harris for speed if all have the same orientation and scale.
     #[arg(long, value_name = "KIND", value_parser = named::<FeatureMethod>(), default_value_t)]
     features: FeatureMethod,
-    /// The calibrated camera that took all of them (ours, OpenCV's, ROS's or Kalibr's YAML, COLMAP's cameras.txt): its focal length is believed and its distortion
-    /// taken out. Without, the focal length is estimated, from EXIF on.
+    /// Calibration of the camera of all photographs (our, OpenCV's, ROS's or Kalibr's YAML, COLMAP's cameras.txt): its focal length is kept fixed and its distortion
+    /// corrected. By default, the focal length is estimated, initialized from EXIF.
     #[arg(long, value_name = "FILE")]
     camera: Option<PathBuf>,
-    /// Write where each photograph looks, and with what camera: .json for --registration, or .pto, a project for Hugin (of the photographs that are used).
+    /// Write the registration (camera and rotation or homography of each photograph): .json for --registration, or .pto, a project for Hugin with the registered photographs.
     #[arg(long, value_name = "FILE")]
     save_registration: Option<PathBuf>,
-    /// Take where each photograph looks from a file of --save-registration, or from a project of Hugin's (.pto), in place of matching: for the next frames of a rig, or the same views in another light. As many
-    /// photographs, of the same sizes, in the same order.
+    /// Use the registration of a --save-registration file or of a Hugin project (.pto) instead of matching: for further frames of a rig, or the same views under other illumination. Needs the
+    /// same number of photographs, of the same sizes, in the same order.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["mode", "features", "camera"])]
     registration: Option<PathBuf>,
 }
 
-/// A number of degrees in a range.
+/// Parses an angle in degrees within a range.
 fn degrees(text: &str, range: std::ops::RangeInclusive<f64>) -> Result<f64, String> {
-    let value = text.trim().parse().map_err(|_| format!("{text} is no number of degrees"))?;
+    let value = text.trim().parse().map_err(|_| format!("{text} is not an angle in degrees"))?;
     let (low, high) = (range.start(), range.end());
     if range.contains(&value) { Ok(value) } else { Err(format!("{value} is not between {low} and {high} degrees")) }
 }
 
 fn field_of_view(text: &str) -> Result<(f64, Option<f64>), String> {
-    // Less than a degree is a mistake for a factor, or radians.
+    // Less than a degree is probably a factor, or radians, by mistake.
     let angle = |text| degrees(text, 1.0..=360.0);
     match text.split_once(',') {
         Some((across, up)) => Ok((angle(across)?, Some(angle(up)?))),
@@ -161,21 +161,21 @@ impl Run for Args {
     }
 
     fn steps(&self) -> Vec<Step> {
-        let found: &[Step] =
+        let registration: &[Step] =
             if self.registration.is_some() { &[] } else { &[steps::FEATURES, steps::MATCH, steps::ALIGN] };
-        found.iter().copied().chain([steps::EXPOSURE, steps::SEAMS, steps::WARP, steps::BLEND]).collect()
+        registration.iter().copied().chain([steps::EXPOSURE, steps::SEAMS, steps::WARP, steps::BLEND]).collect()
     }
 
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
         if !(self.scale > 0.0 && self.scale <= 10.0) {
-            return Err(Failure::usage(format!("--scale {} is not between 0 and 10", self.scale)));
+            return Err(Failure::usage(format!("--scale must be above 0 and at most 10, not {}", self.scale)));
         }
         let is_jpeg = self.ends_in(&["jpg", "jpeg"]);
         if self.alpha && is_jpeg {
             return Err(Failure::usage("--alpha needs a .png or .tif: JPEG has no transparency"));
         }
         if self.alpha && self.ends_in(&["exr"]) {
-            return Err(Failure::usage("--alpha needs a .png or .tif: the .exr written here has none"));
+            return Err(Failure::usage("--alpha needs a .png or .tif: OpenEXR is written without an alpha channel"));
         }
         let registration = self.registration.as_deref().map(|path| registration::read(path, context)).transpose()?;
         let paths = expand_images(&self.images)?;
@@ -188,23 +188,23 @@ impl Run for Args {
         let is_deep = |picture: &DynImage| matches!(picture.pixels, Pixels::Gray16(_) | Pixels::Rgb16(_));
         if !is_jpeg && pictures.iter().any(is_deep) {
             let images: Vec<_> = pictures.into_par_iter().map(DynImage::into_rgb16).collect();
-            self.join(&paths, &images, &known, registration.as_ref(), context)
+            self.stitch(&paths, &images, &known, registration.as_ref(), context)
         } else {
             let images: Vec<_> = pictures.into_par_iter().map(DynImage::into_rgb8).collect();
-            self.join(&paths, &images, &known, registration.as_ref(), context)
+            self.stitch(&paths, &images, &known, registration.as_ref(), context)
         }
     }
 }
 
 impl Args {
-    /// Whether the panorama is to be of one of these kinds.
+    /// Whether the output has one of these extensions.
     fn ends_in(&self, endings: &[&str]) -> bool {
         let own = self.output.extension().unwrap_or_default();
         endings.iter().any(|ending| own.eq_ignore_ascii_case(ending))
     }
 
-    /// The panorama of photographs of which the focal lengths by EXIF and the metadata are known, in their own depth.
-    fn join<T>(
+    /// Stitches images at their bit depth and writes the results. `known` has the focal lengths by EXIF and the metadata.
+    fn stitch<T>(
         &self,
         paths: &[PathBuf],
         images: &[Image<T, 3>],
@@ -217,7 +217,7 @@ impl Args {
         for<'a> ImageView<'a, T, 3>: PngPixels,
         for<'a> ImageView<'a, T, 4>: PngPixels,
     {
-        // Of photographs of one size the camera is read once.
+        // The camera file is read once for each image size.
         let mut cameras = BTreeMap::new();
         if let Some(path) = &self.camera {
             for image in images {
@@ -250,7 +250,7 @@ impl Args {
             if let Some(radiance) = &result.radiance {
                 cv_io::write_exr(path, radiance.view())
             } else if self.alpha {
-                cv_io::write_image(path, transparent(&result).view(), &metadata)
+                cv_io::write_image(path, with_alpha(&result).view(), &metadata)
             } else {
                 cv_io::write_image(path, result.image.view(), &metadata)
             }
@@ -266,14 +266,14 @@ impl Args {
         if result.shows_parallax() {
             let rms = result.reprojection_rms_px;
             context.warn(format!(
-                "the photographs agree only to {rms:.1} px: they were taken from different places, and what is near may be cut in two at the seams"
+                "the registration residual is {rms:.1} px RMS: the photographs have parallax (different camera centers), and near objects may be misaligned at the seams"
             ));
         }
         if result.reaches_beyond {
             let projection = result.canvas.projection;
             let [across, up] = projection.widest_field().map(f64::to_degrees);
             context.warn(format!(
-                "the photographs reach beyond the {across:.0} by {up:.0} degrees that the {projection} projection draws; --projection spherical draws all of them"
+                "the photographs reach beyond the {across:.0} by {up:.0} degrees of the {projection} projection and are cut off; --projection spherical draws all of them"
             ));
         }
         context.report(|| {
@@ -284,7 +284,7 @@ impl Args {
     }
 }
 
-/// The metadata of the photograph that all others are aligned to; the color profile only where those used have the same.
+/// Returns the metadata of the reference photograph; its color profile only if all registered photographs share it.
 fn metadata<T>(files: &[&Metadata], result: &PanoramaResult<T>) -> Metadata {
     let Some(reference) = files.get(result.alignment.reference) else { return Metadata::default() };
     let mut used = files.iter().zip(&result.images).filter(|(_, image)| image.used);
@@ -292,8 +292,8 @@ fn metadata<T>(files: &[&Metadata], result: &PanoramaResult<T>) -> Metadata {
     Metadata { exif: reference.exif.clone(), icc }
 }
 
-/// The picture, opaque where a photograph reaches and clear elsewhere.
-fn transparent<T: PhotoSample>(result: &PanoramaResult<T>) -> Image<T, 4> {
+/// Adds an alpha channel: opaque where a photograph reaches, transparent elsewhere.
+fn with_alpha<T: PhotoSample>(result: &PanoramaResult<T>) -> Image<T, 4> {
     let (w, h) = result.image.size();
     Image::from_fn(w, h, |x, y| {
         let [r, g, b] = result.image.at(x, y);
@@ -320,7 +320,7 @@ fn outcome<T: PhotoSample>(paths: &[PathBuf], result: &PanoramaResult<T>) -> Out
         .with("mode", result.alignment.motion.to_string())
         .with("bits", if result.radiance.is_some() { 32 } else { 8 * size_of::<T>() })
         .summary(format!(
-            "{used} of {} photographs, {w} x {h} pixels, {}, matches agree to {:.2} px (RMS)",
+            "{used} of {} photographs, {w} x {h} pixels, {}, residual of matches {:.2} px (RMS)",
             paths.len(),
             result.canvas.projection,
             result.reprojection_rms_px

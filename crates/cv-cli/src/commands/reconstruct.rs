@@ -17,20 +17,20 @@ use cv_pipeline::{
 };
 use std::path::{Path, PathBuf};
 
-/// Reconstruct a colored cloud of points and the camera's motion from two photographs.
+/// Reconstruct a colored point cloud and the relative camera pose from two photographs.
 ///
-/// The cloud is in the first camera's frame; its unit is the distance between the two cameras, which photographs cannot tell. Without
-/// --camera and --focal, the focal length comes from the photographs' EXIF, and is estimated where one of them has none.
+/// The cloud is in the first camera's frame. Two views determine it up to scale: its unit is the baseline. Without --camera and --focal, the
+/// focal length is taken from EXIF, or self-calibrated if one of the photographs has none.
 ///
-/// With --dense, the photographs are also rectified by the geometry found and matched pixel by pixel; what both confirm becomes a second, dense
-/// cloud in the same frame and unit.
+/// With --dense, the pair is also rectified by the estimated geometry and matched densely; pixels that pass the left-right check form a second,
+/// dense cloud in the same frame and unit.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv reconstruct a.jpg b.jpg -o cloud.ply\n  \
     cv reconstruct a.jpg b.jpg --camera cam.yaml -o cloud.ply --report out\n  \
     cv reconstruct a.jpg b.jpg --focal 2900 -o cloud.ply --axes opengl --colmap model\n  \
     cv reconstruct a.jpg b.jpg -o sparse.ply --dense dense.ply --dense-size 2400\n\n\
-    A camera file is ours, OpenCV's, ROS's or Kalibr's YAML, a line of COLMAP's cameras.txt, or a 3×3 matrix.")]
+    A camera file is our, OpenCV's, ROS's or Kalibr's YAML, a line of COLMAP's cameras.txt, or a 3×3 matrix.")]
 pub(crate) struct Args {
     /// Two photographs, or a folder or quoted pattern of two.
     #[arg(required = true, value_name = "PHOTOGRAPHS")]
@@ -45,31 +45,31 @@ pub(crate) struct Args {
     /// Camera of both photographs.
     #[arg(long, value_name = "FILE", conflicts_with = "focal")]
     camera: Option<PathBuf>,
-    /// Camera of the second photograph, where it is another one.
+    /// Camera of the second photograph, if different.
     #[arg(long, value_name = "FILE", requires = "camera")]
     camera2: Option<PathBuf>,
-    /// The photographs are free of lens distortion, of which a calibration matrix does not tell.
+    /// The photographs have no lens distortion. For calibration matrices, which do not state it.
     #[arg(long, requires = "camera")]
     undistorted: bool,
-    /// About what focal length in pixels both photographs have.
+    /// Approximate focal length of both photographs in pixels: a prior.
     #[arg(long, value_name = "PX")]
     focal: Option<f64>,
-    /// Estimate the focal length even where the photographs' EXIF has one.
+    /// Ignore the focal lengths of EXIF and self-calibrate.
     #[arg(long, conflicts_with_all = ["camera", "focal"])]
     ignore_exif: bool,
-    /// Largest distance of a match from its epipolar line, in pixels.
+    /// Inlier threshold: largest distance of a match from its epipolar line, in pixels.
     #[arg(long, value_name = "PX", default_value_t = ReconstructOptions::default().two_view.robust.threshold)]
     threshold: f64,
-    /// Largest reprojection error of a point that is kept, in pixels.
+    /// Largest reprojection error of a point, in pixels.
     #[arg(long, value_name = "PX", default_value_t = ReconstructOptions::default().two_view.max_reprojection)]
     max_error: f64,
-    /// Smallest angle between the two rays of a point that is kept, in degrees.
+    /// Smallest triangulation angle of a point, in degrees.
     #[arg(long, value_name = "DEGREES", default_value_t = 0.1)]
     min_angle: f64,
-    /// Most features in a photograph [default: 8192].
+    /// Maximum number of features per photograph [default: 8192].
     #[arg(long, value_name = "N")]
     features: Option<usize>,
-    /// Which way the axes of the cloud point.
+    /// Axis convention of the cloud.
     #[arg(long, value_name = "WHICH", value_parser = named::<Axes>(), default_value_t = Axes::Opencv)]
     axes: Axes,
     /// Where to write the cameras and points as a COLMAP text model: a folder.
@@ -78,10 +78,10 @@ pub(crate) struct Args {
     /// Where to write a dense cloud, as PLY.
     #[arg(long, value_name = "FILE")]
     dense: Option<PathBuf>,
-    /// Longer side to which the photographs are reduced for the dense cloud, in pixels.
+    /// Longer side in pixels to which the photographs are downscaled for the dense cloud.
     #[arg(long, value_name = "PX", default_value_t = DenseOptions::default().max_size, requires = "dense")]
     dense_size: usize,
-    /// Give pixels that the other photograph does not confirm a depth from around them.
+    /// Fill the depth of pixels that fail the left-right check from their surroundings.
     #[arg(long, requires = "dense")]
     dense_fill: bool,
 }
@@ -104,11 +104,11 @@ impl Run for Args {
         [self.first, self.second] = two_images(&self.photographs)?;
         for (name, value) in [("--threshold", self.threshold), ("--max-error", self.max_error)] {
             if !(value > 0.0 && value.is_finite()) {
-                return Err(Failure::usage(format!("{name} must be above 0, not {value}")));
+                return Err(Failure::usage(format!("{name} must be positive, not {value}")));
             }
         }
         if self.focal.is_some_and(|f| !(f > 0.0 && f.is_finite())) {
-            return Err(Failure::usage("--focal must be above 0"));
+            return Err(Failure::usage("--focal must be positive"));
         }
         let photos = [cv_io::read_image(&self.first)?, cv_io::read_image(&self.second)?];
         let (intrinsics, source) = self.intrinsics(&photos, context)?;
@@ -126,7 +126,7 @@ impl Run for Args {
         let [a, b] = photos.map(DynImage::into_rgb8);
         let result = reconstruct(a.view(), b.view(), &options, context)
             .map_err(|error| words::no_reconstruction(&error, [&self.first, &self.second]))?;
-        // Before anything is written: a dense cloud that cannot be had leaves no half of the outputs behind.
+        // Before any output is written: if the dense cloud fails, there must be no partial outputs.
         let dense = self.dense(&a, &b, &result, context)?;
         let write = |path: &Path, mut cloud: PointCloud| {
             self.axes.turn(&mut cloud);
@@ -143,34 +143,34 @@ impl Run for Args {
             context
                 .write(Output::Folder(folder), |folder| cv_io::colmap::replace(folder, &model, ModelFormat::Text))?;
         }
-        if let Some(text) = doubt(&result) {
-            context.warn(format!("{text}; --focal or --camera if you know it"));
+        if let Some(text) = focal_warning(&result) {
+            context.warn(format!("{text}; give --focal or --camera if known"));
         }
         context.report(|| report::report([&self.first, &self.second], [&a, &b], &result, dense.as_ref(), &source))?;
         Ok(self.outcome(&result, dense.as_ref()))
     }
 }
 
-/// What to think of a focal length that the photographs hardly show.
-fn doubt(result: &ReconstructResult) -> Option<String> {
+/// Returns a warning if the focal length is poorly constrained or unusual.
+fn focal_warning(result: &ReconstructResult) -> Option<String> {
     let percent = 100.0 * result.scene.focal_deviation;
     let degrees = result.scene.pose_deviation[1].to_degrees();
     let (low, high) = PLAUSIBLE_FOCAL;
-    let unusual = result.scene.unusual_focal().map_or_else(String::new, |share| {
+    let unusual = result.scene.unusual_focal().map_or_else(String::new, |ratio| {
         format!(
-            "; at {share:.1} times the photograph's longer side it is unusual ({low} to {high} are usual), which matches that hardly show perspective lead to"
+            "; at {ratio:.1} times the image's longer side it is unusual ({low} to {high} are usual), which weak perspective in the matches leads to"
         )
     });
     (result.focal_is_doubtful() || !unusual.is_empty()).then(|| {
         format!(
-            "the focal length is known to ±{percent:.0} % only, and the depth of the cloud may be stretched by as much; the direction of the motion is known to \
-             ±{degrees:.1} degrees{unusual}"
+            "the focal length has a standard deviation of {percent:.0} %, and the depth of the cloud may be stretched by as much; that of the translation direction is \
+             {degrees:.1} degrees{unusual}"
         )
     })
 }
 
 impl Args {
-    /// What is known of the cameras, and how.
+    /// Returns the prior knowledge of the intrinsics, and its source.
     fn intrinsics(&self, photos: &[DynImage; 2], context: &Context) -> Result<(Intrinsics, String), Failure> {
         if let Some(path) = &self.camera {
             let (first, first_known) = rig::camera_and_lens(path, Some(photos[0].size()), self.undistorted, context)?;
@@ -183,12 +183,12 @@ impl Args {
             return Ok(if first_known && second_known {
                 (Intrinsics::Known(cameras), source)
             } else {
-                let open = "a matrix without the lens: its distortion is estimated (--undistorted where there is none)";
+                let open = "a matrix without distortion coefficients: distortion is estimated (--undistorted if there is none)";
                 (Intrinsics::Matrix(cameras), format!("{source}, {open}"))
             });
         }
         if let Some(focal) = self.focal {
-            let source = format!("focal length about {focal} px as given, refined by the matches");
+            let source = format!("focal length about {focal} px as given, refined by bundle adjustment");
             return Ok((Intrinsics::Focal([focal; 2]), source));
         }
         let exif = photos.each_ref().map(|p| p.exif.focal.map(|f| f.pixels).filter(|_| !self.ignore_exif));
@@ -196,15 +196,15 @@ impl Args {
         let source = match intrinsics {
             Intrinsics::Focal([a, _]) => {
                 format!(
-                    "focal length about {a:.0} px from EXIF, refined by the matches (--focal or --camera to change it)"
+                    "focal length about {a:.0} px from EXIF, refined by bundle adjustment (--focal or --camera to change it)"
                 )
             }
-            _ => "focal length unknown: estimated from the matches".to_owned(),
+            _ => "focal length unknown: self-calibrated from the matches".to_owned(),
         };
         Ok((intrinsics, source))
     }
 
-    /// The dense cloud, where it is asked for.
+    /// Computes the dense cloud, if requested.
     fn dense(
         &self,
         a: &cv_core::RgbU8,
@@ -231,7 +231,7 @@ impl Args {
         let t = result.scene.pose.translation;
         let degrees = result.scene.pose_deviation.map(f64::to_degrees);
         let mut summary = format!(
-            "{} points from {} of {} matches, {:.3} px RMS; turned by {:.2} degrees, median angle {:.2} degrees",
+            "{} points from {} of {} matches, {:.3} px RMS; rotation {:.2} degrees, median triangulation angle {:.2} degrees",
             result.scene.points.len(),
             result.scene.inliers.len(),
             result.matching.matches.len(),
@@ -262,8 +262,8 @@ impl Args {
         let Some(dense) = dense else { return outcome.summary(summary) };
         let (width, height) = dense.size;
         let (first, count) = dense.disparities;
-        let share = 100.0 * dense.coverage;
-        summary += &format!("; {} dense points, {share:.0} % of what both photographs show", dense.cloud.len());
+        let percent = 100.0 * dense.coverage;
+        summary += &format!("; {} dense points, {percent:.0} % of the overlap", dense.cloud.len());
         outcome
             .with("dense_points", dense.cloud.len())
             .with("dense_coverage", dense.coverage)
@@ -273,7 +273,7 @@ impl Args {
     }
 }
 
-/// The stages of the dense cloud under names that tell them from those of the sparse one.
+/// Renames the stages of the dense cloud, to distinguish them from those of the sparse one.
 fn dense_stages(dense: &DenseResult) -> impl Iterator<Item = (&'static str, f64)> {
     let name = |name: &str| match name {
         "rectify" => "dense_rectify",

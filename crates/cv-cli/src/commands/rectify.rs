@@ -1,4 +1,4 @@
-//! `cv rectify`: a pair as two cameras would have taken it whose rows coincide.
+//! `cv rectify`: rectification of a pair by the calibration of its rig.
 
 use super::size;
 use crate::frame::{Context, Failure, Global, Outcome, Output, Run, Step, spare_inputs, steps, two_images};
@@ -13,7 +13,7 @@ use cv_report::{Raster, Report, colors, side_by_side};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
-/// The examples, and how a rig file is written, its lenses out of the table.
+/// Formats the examples and the syntax of a rig file; distortion models are listed from the table.
 fn help() -> String {
     let lenses: Vec<String> = (cv_core::DistortionModel::ALL.iter().map(|model| model.info()))
         .filter(|lens| !lens.parameters.is_empty())
@@ -23,28 +23,28 @@ fn help() -> String {
         "Examples:\n  \
         cv rectify left.jpg right.jpg --rig rig.yaml -o rectified\n  \
         cv rectify left.jpg right.jpg --rig opencv-stereo.yml --alpha 1 --size 1280x960 -o rectified --report page\n\n\
-        A rig file is ours:\n  \
+        Our rig file:\n  \
         schema: cv-rig/1\n  \
         unit: m\n  \
         left: {{width: 640, height: 480, fx: 560, fy: 560, cx: 319.5, cy: 239.5}}\n  \
         right: {{width: 640, height: 480, fx: 555, fy: 555, cx: 325, cy: 236}}\n  \
         rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]   # x_right = rotation · x_left + translation\n  \
-        translation: [-0.12, 0, 0]                    # the right camera stands 0.12 m to the right\n\
-        A camera may also have a distortion:\n{}\n\
+        translation: [-0.12, 0, 0]                    # the right camera is 0.12 m to the right\n\
+        A camera may also have distortion coefficients:\n{}\n\
         Or the file is OpenCV's YAML, with M1, D1, M2, D2, R and T in one or in two (--rig intrinsics.yml --rig extrinsics.yml), or Kalibr's\n\
-        camchain.yaml. A skew that moves no pixel by more than 0.25 px is left out.",
+        camchain.yaml. A skew that displaces no pixel by more than 0.25 px is ignored.",
         lenses.join("\n")
     )
 }
 
-/// Rectify a pair of photographs taken by a calibrated rig: the same scene point comes to lie in the same row of both.
+/// Rectify a pair of a calibrated rig: corresponding points come to lie in the same row.
 ///
-/// Writes left.png, right.png, rig.yaml (the rectified cameras) and q.txt (the matrix that takes column, row, disparity, 1
-/// to space) to a folder. The vertical residual is measured on features found in both rectified photographs. Photographs
-/// of 16 bits stay so, and their EXIF (without turn and thumbnail) and color profiles are kept.
+/// Writes left.png, right.png, rig.yaml (the rectified cameras) and q.txt (the 4×4 matrix Q that reprojects (column, row,
+/// disparity, 1) to 3D) to a folder. The vertical residual is measured on feature matches of the rectified images. Bit
+/// depth, EXIF (without orientation and thumbnail) and color profiles are kept.
 ///
-/// Where one camera stands below the other, both results are turned by a quarter, anticlockwise: down in the scene is to the
-/// right, and rows coincide all the same. The upper photograph becomes left.png.
+/// For a vertical rig, both results are rotated by 90 degrees counterclockwise, so that rows correspond: down in the scene is
+/// right in the images. The upper image becomes left.png.
 #[derive(Debug, clap::Args)]
 #[command(after_help = help())]
 pub(crate) struct Args {
@@ -55,28 +55,28 @@ pub(crate) struct Args {
     left: PathBuf,
     #[arg(skip)]
     right: PathBuf,
-    /// Calibration of the rig: ours, OpenCV's or Kalibr's YAML; twice for OpenCV's two files.
+    /// Calibration of the rig: our, OpenCV's or Kalibr's YAML; twice for OpenCV's two files.
     #[arg(long, value_name = "FILE", required = true)]
     rig: Vec<PathBuf>,
-    /// The folder for the results; made where it is missing.
+    /// The folder for the results; created if missing.
     #[arg(short, long, visible_alias = "out", value_name = "DIR")]
     output: PathBuf,
-    /// From 0 (no pixel without content) to 1 (no pixel lost).
-    #[arg(long, value_name = "A", default_value_t = 0.0, value_parser = parse_share)]
+    /// Free scaling parameter: from 0 (only valid pixels) to 1 (all source pixels kept), as in OpenCV.
+    #[arg(long, value_name = "A", default_value_t = 0.0, value_parser = parse_fraction)]
     alpha: f64,
-    /// Width and height of the rectified photographs [default: as the left one, turned with it where the rig is vertical].
+    /// Width and height of the rectified images [default: those of the left photograph, exchanged for a vertical rig].
     #[arg(long, value_name = "WxH", value_parser = size)]
     size: Option<(usize, usize)>,
-    /// The rig file has the cameras in the other order: its first one took the right (or lower) photograph.
+    /// The first camera of the rig file took the right (or lower) photograph.
     #[arg(long)]
     exchange: bool,
 }
 
-pub(super) fn parse_share(text: &str) -> Result<f64, String> {
-    text.parse().ok().filter(|share| (0.0..=1.0).contains(share)).ok_or_else(|| "give a number from 0 to 1".to_owned())
+pub(super) fn parse_fraction(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|value| (0.0..=1.0).contains(value)).ok_or_else(|| "give a number from 0 to 1".to_owned())
 }
 
-/// The files that are written.
+/// Names of the output files.
 const NAMES: [&str; 4] = ["left.png", "right.png", "rig.yaml", "q.txt"];
 
 impl Run for Args {
@@ -145,10 +145,10 @@ impl Run for Args {
             page.section("Rectified pair").figure(picture(
                 &with_rows(&result.images.clone().map(DynImage::into_rgb8)),
                 Width::Full,
-                "Both photographs with common rows drawn through: what is on a line on the left is on it on the right.",
+                "Both images with common scanlines: corresponding points lie on the same line.",
             )?);
             if let Some(cause) = &result.fault {
-                page.warn(&format!("what the photographs show: {cause}"));
+                page.warn(&format!("feature matches show: {cause}"));
             }
             page.section("Time").times(&result.stages);
             Ok(page)
@@ -182,7 +182,7 @@ impl Run for Args {
     }
 }
 
-/// Writes a rectified photograph as deep as it is, with what the file of the original says beside its pixels.
+/// Writes an image at its bit depth, with the metadata of the original file.
 pub(super) fn write_picture(path: &Path, picture: &DynImage, metadata: &Metadata) -> Result<(), IoError> {
     match &picture.pixels {
         Pixels::Gray8(image) => cv_io::write_image(path, image.view(), metadata),
@@ -192,7 +192,7 @@ pub(super) fn write_picture(path: &Path, picture: &DynImage, metadata: &Metadata
     }
 }
 
-/// Both views side by side with a line every sixteenth of the height.
+/// Draws both views side by side with a line every sixteenth of the height.
 pub(super) fn with_rows(images: &[RgbU8; 2]) -> RgbU8 {
     let joined = side_by_side(&[images[0].view(), images[1].view()], 4);
     let mut canvas = Raster::from_rgb(joined.view());

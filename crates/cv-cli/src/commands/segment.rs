@@ -1,4 +1,4 @@
-//! `cv segment`: an object by its color.
+//! `cv segment`: color segmentation.
 
 mod files;
 
@@ -18,10 +18,10 @@ use files::{Pair, pair, read_pair, stem};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
-/// Photographs shown in a report.
+/// Maximum number of photographs shown in a report.
 const REPORT_PHOTOS: usize = 40;
 
-/// Find an object by its color: learn it from masks, mark it in photographs, score the marks.
+/// Segment an object by its color: train a color model on masks, predict masks, evaluate them.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv segment train --images photos --masks masks --model ball.json\n  \
@@ -83,7 +83,7 @@ struct Labels {
     masks: PathBuf,
 }
 
-/// Learn an object's colors from photographs and masks.
+/// Train a color model on photographs and masks.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv segment train --images photos --masks masks --model ball.json\n  \
@@ -97,25 +97,25 @@ struct Train {
     /// Color space.
     #[arg(long, value_parser = named::<ColorSpace>(), default_value_t = TrainOptions::default().space)]
     space: ColorSpace,
-    /// Gaussians for the object's colors, 1 to 64.
+    /// Components of the Gaussian mixture of the object's colors, 1 to 64.
     #[arg(long, value_name = "K", default_value_t = TrainOptions::default().components)]
     components: usize,
-    /// Gaussians for the background's colors, 1 to 63.
+    /// Components of the Gaussian mixture of the background's colors, 1 to 63.
     #[arg(long, value_name = "K", default_value_t = TrainOptions::default().background_components)]
     background_components: usize,
-    /// What a pixel's color is judged by.
+    /// Decision rule for a pixel.
     #[arg(long, value_parser = named::<Rule>(), default_value_t = TrainOptions::default().rule)]
     rule: Rule,
-    /// Which regions are kept.
+    /// Connected components to keep.
     #[arg(long, value_parser = named::<Regions>(), default_value_t = TrainOptions::default().regions)]
     regions: Regions,
-    /// Radius of the disc that masks are opened by; 0 for not at all.
+    /// Radius of the disc of the morphological opening; 0 disables it.
     #[arg(long, value_name = "PX", default_value_t = TrainOptions::default().open_radius)]
     open: usize,
-    /// Radius of the disc that masks are closed by; 0 for not at all.
+    /// Radius of the disc of the morphological closing; 0 disables it.
     #[arg(long, value_name = "PX", default_value_t = TrainOptions::default().close_radius)]
     close: usize,
-    /// Standard deviation by which scores are smoothed.
+    /// Sigma of the Gaussian smoothing of pixel scores.
     #[arg(long, value_name = "PX", default_value_t = TrainOptions::default().smoothing)]
     smoothing: f32,
 }
@@ -147,26 +147,26 @@ impl Train {
         }
         let labeled: Vec<Labeled<'_>> = photos.iter().map(|(photo, mask)| (photo.view(), mask.view())).collect();
         let options = self.options(context);
-        let training = train_segment(&labeled, &options, context).map_err(|error| refused(error, &pairs))?;
+        let training = train_segment(&labeled, &options, context).map_err(|error| training_failure(error, &pairs))?;
         let trained = &training.trained;
         context.write(Output::File(&self.model, JSON), |path| write_model(path, &trained.model))?;
         let total: ConfusionMatrix = trained.scores.iter().copied().sum();
         if total.f1() < 0.5 {
             context.warn(format!(
-                "even on the photographs it was trained on, F1 is only {:.3}: the object's colors are not told from the background's",
+                "even on the training photographs, F1 is only {:.3}: the colors of object and background are not separable",
                 total.f1()
             ));
         }
         context.report(|| {
             let mut page = Report::new("Segmentation: training");
             headline(&mut page, &total, photos.len());
-            page.note(Note::Info, "These are the scores on the photographs the model was trained on. On others they will be lower: use cv segment eval.");
-            page.section("Model").facts("What was learned, and how it judges.", &[
+            page.note(Note::Info, "These are scores on the training photographs. Scores on other photographs will be lower: use cv segment eval.");
+            page.section("Model").facts("Parameters of the trained model.", &[
                 ("color space", options.space.name().to_uppercase()),
-                ("components of the object", trained.model.foreground().components.len().to_string()),
-                ("components of the background", trained.model.background().map_or(0, |b| b.components.len()).to_string()),
+                ("mixture components of the object", trained.model.foreground().components.len().to_string()),
+                ("mixture components of the background", trained.model.background().map_or(0, |b| b.components.len()).to_string()),
                 ("threshold", format!("{:.2} nats", trained.model.threshold())),
-                ("regions kept", if trained.model.cleanup().largest { "the largest" } else { "all" }.to_owned()),
+                ("connected components kept", if trained.model.cleanup().largest { "the largest" } else { "all" }.to_owned()),
                 ("pixels of the object", trained.foreground_pixels.to_string()),
                 ("other pixels", trained.background_pixels.to_string()),
             ]);
@@ -183,7 +183,7 @@ impl Train {
             Ok(page)
         })?;
         let summary =
-            format!("{} photographs, F1 {:.3} on themselves; model: {}", pairs.len(), total.f1(), self.model.display());
+            format!("{} photographs, training F1 {:.3}; model: {}", pairs.len(), total.f1(), self.model.display());
         Ok(with_scores(Outcome::new(training.stages), &pairs, &trained.scores)
             .with("model", &self.model)
             .with("foreground_pixels", trained.foreground_pixels)
@@ -194,10 +194,10 @@ impl Train {
     }
 }
 
-/// Find the object in photographs, mark and measure it.
+/// Detect the object in photographs, write its masks and measure it.
 ///
-/// The mask of NAME.jpg is written as NAME_mask.png, white where the object is; all black where it is not found. A region in the object's color is the object
-/// where its score, the agreement with the training objects in color and shape, reaches --min-score.
+/// The mask of NAME.jpg is written as NAME_mask.png, white where the object is; all black if it is not found. A region of the object's color is accepted as the
+/// object if its score, the agreement in color and shape with the training objects, is at least --min-score.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv segment predict --model ball.json a.jpg b.jpg -o found\n  \
@@ -210,10 +210,10 @@ struct Predict {
     /// Photographs, or folders of them.
     #[arg(required = true)]
     images: Vec<PathBuf>,
-    /// The folder to write the masks into; made where it is not there.
+    /// The folder to write the masks into; created if missing.
     #[arg(short, long, visible_alias = "out", value_name = "DIR")]
     output: PathBuf,
-    /// Least score of an object, 0 to 1: the share of trained objects that may be missed, were their features Gaussian. 0 takes every region for the object.
+    /// Smallest score of an object, 0 to 1: the expected fraction of missed training objects, if their features are Gaussian. 0 accepts every region.
     #[arg(long, value_name = "P", default_value_t = DetectOptions::default().min_score)]
     min_score: f64,
 }
@@ -228,19 +228,19 @@ impl Predict {
         one_each(&photos, &outputs)?;
         let model = read_model(&self.model)?;
         for (i, output) in outputs.iter().enumerate() {
-            // Masks drawn by hand often lie beside their photographs.
-            // A bare name has the empty folder: joined to the current one it is that.
+            // Hand-drawn masks are often in the folder of their photographs, and must not be overwritten.
+            // A bare file name has an empty parent, which means the current folder.
             let folder = Path::new(".").join(photos[i].parent().unwrap_or(Path::new("")));
             let beside = output.exists() && same_file(&folder, &self.output);
             if beside || given.iter().any(|path| same_file(path, output)) {
-                return Err(Failure::new(format!("{} is there already and would be overwritten", output.display()))
+                return Err(Failure::new(format!("{} exists and would be overwritten", output.display()))
                     .advice("name another folder with -o"));
             }
         }
         let mut stages: Vec<(&'static str, f64)> = Vec::new();
         let (mut images, mut figures, mut rows, mut found) = (Vec::new(), Vec::new(), Vec::new(), 0);
         let mut missing = Vec::new();
-        // Encoded masks are small: they wait until every photograph is done, so that a bad one leaves nothing behind.
+        // Encoded masks are small: they are written at the end, so that an unreadable photograph leaves no partial output.
         let mut masks = Vec::new();
         let stage = Stage::new(context, "predict", photos.len())?;
         for (path, output) in photos.iter().zip(&outputs) {
@@ -252,8 +252,8 @@ impl Predict {
             let mut image = json!({ "path": path, "mask": output, "fraction": result.fraction, "found": is_found });
             let best = result.objects.first();
             image["score"] = json!(best.and_then(|b| b.score));
-            image["objects"] = result.objects.iter().map(measured).collect();
-            // Of the best; null where there is none, so that no one takes what is not found for the object.
+            image["objects"] = result.objects.iter().map(region_json).collect();
+            // Measures of the best region; null if it is not accepted as the object.
             for key in ["box", "center", "area", "axes", "angle"] {
                 image[key] = if is_found { image["objects"][0][key].clone() } else { Value::Null };
             }
@@ -284,11 +284,11 @@ impl Predict {
             let mut page = Report::new("Segmentation");
             page.headline("photographs", &photos.len().to_string()).headline("with the object", &found.to_string());
             page.section("Objects").table(
-                "The best region of each photograph; axes are semi-axes.",
+                "The best region of each photograph; axes are the semi-axes of the ellipse of the same moments.",
                 &["photograph", "result", "score", "center, px", "area, px", "axes, px", "angle"],
                 &rows,
             );
-            page.section("Photographs").paragraph("What was marked, in green.").figures(figures);
+            page.section("Photographs").paragraph("Predicted masks in green.").figures(figures);
             Ok(page)
         })?;
         let mut summary =
@@ -303,12 +303,12 @@ impl Predict {
     }
 }
 
-/// The name of a file, for tables: its folder stands in the command line.
+/// Returns the file name of a path, for tables.
 fn name(path: &Path) -> String {
     path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
 }
 
-/// A row of the report's table of objects.
+/// Formats a row of the report's table of objects.
 fn row(path: &Path, best: Option<&Detection>) -> Vec<String> {
     let mut row = vec![name(path)];
     let Some(best) = best else {
@@ -319,7 +319,7 @@ fn row(path: &Path, best: Option<&Detection>) -> Vec<String> {
     let region = &best.region;
     row.extend([
         if best.found { "found" } else { "not found" }.to_owned(),
-        best.score.map_or_else(|| "not known".to_owned(), |score| format!("{score:.3}")),
+        best.score.map_or_else(|| "unknown".to_owned(), |score| format!("{score:.3}")),
         format!("{:.1}, {:.1}", region.center.x, region.center.y),
         region.area.to_string(),
         format!("{:.1}, {:.1}", region.axes[0], region.axes[1]),
@@ -328,8 +328,8 @@ fn row(path: &Path, best: Option<&Detection>) -> Vec<String> {
     row
 }
 
-/// A region in JSON: box `[x, y, width, height]`, center, area and semi-axes in pixels, angle in radians, color in nats, extent and axis ratio as shares.
-fn measured(object: &Detection) -> Value {
+/// Returns a region as JSON: box `[x, y, width, height]`, center, area and semi-axes in pixels, angle in radians, color in nats, extent and axis ratio from 0 to 1.
+fn region_json(object: &Detection) -> Value {
     let region = &object.region;
     json!({
         "found": object.found,
@@ -346,7 +346,7 @@ fn measured(object: &Detection) -> Value {
     })
 }
 
-/// Score a model on photographs with masks: precision, recall and F1.
+/// Evaluate a model on photographs with masks: precision, recall and F1.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv segment eval --model ball.json --images test --masks test-masks\n  \
@@ -370,7 +370,7 @@ impl Eval {
             let (photo, truth) = read_pair(pair, context)?;
             if photo.size() != truth.size() {
                 let error = SegmentError::SizeMismatch { index: i, photo: photo.size(), mask: truth.size() };
-                return Err(refused(error, &pairs));
+                return Err(training_failure(error, &pairs));
             }
             let result = segment(photo.view(), &model, &stage)?;
             let score = ConfusionMatrix::new(result.mask.view(), truth.view())?;
@@ -409,9 +409,9 @@ impl Eval {
     }
 }
 
-const LEGEND: &str = "Green: marked and right. Red: marked and wrong. Blue: missed.";
+const LEGEND: &str = "Green: true positive. Red: false positive. Blue: false negative.";
 
-/// The scores of all pixels together, and of each photograph.
+/// Adds the scores over all pixels, and of each photograph.
 fn with_scores(outcome: Outcome, pairs: &[Pair], scores: &[ConfusionMatrix]) -> Outcome {
     let total: ConfusionMatrix = scores.iter().copied().sum();
     let images: Vec<Value> = pairs
@@ -455,8 +455,8 @@ fn add_stages(sums: &mut Vec<(&'static str, f64)>, stages: &[(&'static str, f64)
     }
 }
 
-/// The error with the names of the files it is about, and what to do.
-fn refused(error: SegmentError, pairs: &[Pair]) -> Failure {
+/// Words an error, with the names of the files and a remedy.
+fn training_failure(error: SegmentError, pairs: &[Pair]) -> Failure {
     match &error {
         SegmentError::SizeMismatch { index, photo, mask } if *index < pairs.len() => Failure::new(format!(
             "{} has {}×{} pixels, its mask {} has {}×{}",
@@ -467,7 +467,7 @@ fn refused(error: SegmentError, pairs: &[Pair]) -> Failure {
             mask.0,
             mask.1
         ))
-        .advice("a mask drawn on the photograph at its full size, turned the way a viewer shows it"),
+        .advice("a mask of the photograph's full size, in the orientation shown by viewers"),
         SegmentError::NoForeground { .. } => {
             Failure::from(error).advice("masks that are white (255) on the object and black elsewhere")
         }
@@ -487,11 +487,11 @@ fn write_model(path: &Path, model: &ColorModel) -> Result<(), Failure> {
 
 fn read_model(path: &Path) -> Result<ColorModel, Failure> {
     let bytes = cv_io::read_bytes(path)?;
-    // By way of a value: a model of another version says so, not which of its fields is missing.
+    // Parsed as a generic value first: another version is reported as such, not as a missing field.
     let value: Result<Value, _> = serde_json::from_slice(&bytes);
-    let value = value.during(format!("{} is no segmentation model", path.display())).advice(TRAIN)?;
+    let value = value.during(format!("{} is not a segmentation model", path.display())).advice(TRAIN)?;
     ColorModel::check_schema(value["schema"].as_u64()).during(path.display()).advice(TRAIN)?;
-    serde_json::from_value(value).during(format!("{} is no segmentation model", path.display())).advice(TRAIN)
+    serde_json::from_value(value).during(format!("{} is not a segmentation model", path.display())).advice(TRAIN)
 }
 
-const TRAIN: &str = "name a file that cv segment train has written";
+const TRAIN: &str = "name a file written by cv segment train";

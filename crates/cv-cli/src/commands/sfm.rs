@@ -1,4 +1,4 @@
-//! `cv sfm`: cameras and points from many photographs.
+//! `cv sfm`: structure from motion.
 
 mod cameras;
 mod checkpoint;
@@ -14,7 +14,7 @@ mod report;
 use crate::frame::{CLOUD, Context, Failure, JSON, Outcome, Output, Run, Step, expand_images, named, steps};
 use crate::words;
 use cameras::Cameras;
-use checkpoint::{Checkpoint, Seen};
+use checkpoint::{Checkpoint, Extracted};
 use cv_core::{PointCloud, SparseModel};
 use cv_io::colmap::{self, ModelFormat};
 use cv_io::ply::PlyEncoding;
@@ -26,33 +26,33 @@ use cv_pipeline::{
 };
 use dense::DenseArgs;
 use earlier::Earlier;
-use outcome::{doubt, fates, outcome};
-use photographs::{Photograph, photographs, seen_from};
+use outcome::{completeness_warning, outcome, registration_outcomes};
+use photographs::{Photograph, photographs, relative_path};
 use pinhole::PinholeFolder;
 use places::{Frame, PlaceArgs, Places};
 use std::path::{Path, PathBuf};
 
-/// Reconstruct cameras and a sparse cloud of points from many photographs (structure from motion).
+/// Reconstruct camera poses and a sparse point cloud from many photographs (structure from motion).
 ///
-/// The photographs need no order. Without --camera and --focal, focal lengths come from EXIF and are refined; photographs of one size and one focal length share a camera. A photograph that
-/// cannot be read, or that shows something else, is left out and told of.
+/// The photographs may be unordered. Without --camera and --focal, focal lengths are taken from EXIF and refined; photographs of the same size and focal length share a camera. A photograph that
+/// cannot be read or registered is left out with a reason.
 ///
-/// The model stands upright, Z up. Where three photographs or more tell their GPS position, it is in meters from the first of them (X east, Y north); else --known or --distance tell meters, or
-/// its unit is arbitrary.
+/// The model is upright, Z up. If three or more photographs have GPS positions, it is georeferenced in meters, relative to the first of them (X east, Y north). Otherwise --known or --distance
+/// determine the scale, or its unit is arbitrary.
 ///
-/// The model is COLMAP's: cameras, images and points3D, as .txt or .bin. One that is in the folder is replaced. Where the photographs fall apart into several models, the one with most
-/// photographs is written into the folder itself, the others into its folders 1, 2, …
+/// The model is in COLMAP's format: cameras, images and points3D, as .txt or .bin. An existing model in the folder is replaced. If the view graph falls into several components, the model with
+/// the most photographs is written to the folder itself, the others to its subfolders 1, 2, …
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv sfm photos/ -o model --report page\n  \
     cv sfm 'photos/*.jpg' --camera cam.yaml -o model --cloud points.ply\n  \
-    cv sfm 'frames/*.png' --order sequence -o model                    # frames of a video, or of a drive\n  \
+    cv sfm 'frames/*.png' --order sequence -o model                    # video frames\n  \
     cv sfm photos/ --focal 2900 -o sparse/0 --format colmap-binary --json\n  \
-    cv sfm photos/ -o model --distance a.jpg b.jpg 2.5                 # meters between two photographs\n  \
+    cv sfm photos/ -o model --distance a.jpg b.jpg 2.5                 # distance of two camera centers in meters\n  \
     cv sfm photos/ more/ --from model -o model                         # more photographs of the same place\n  \
     cv sfm photos/ -o model --transforms photos/transforms.json        # for Nerfstudio and instant-ngp\n  \
-    cv sfm photos/ -o model --dense dense.ply                          # surfaces as points with normals\n  \
-    cv sfm photos/ -o model --pinhole dense                            # for dense reconstruction, by COLMAP or OpenMVS")]
+    cv sfm photos/ -o model --dense dense.ply                          # a dense cloud with normals\n  \
+    cv sfm photos/ -o model --pinhole dense                            # for dense reconstruction with COLMAP or OpenMVS")]
 pub(crate) struct Args {
     /// Photographs, folders or quoted patterns of them.
     #[arg(required = true, value_name = "PHOTOGRAPHS")]
@@ -60,52 +60,53 @@ pub(crate) struct Args {
     /// Where to write the model: a folder.
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
-    /// Camera of all photographs.
+    /// Calibration of the camera of all photographs.
     #[arg(long, value_name = "FILE", conflicts_with = "focal")]
     camera: Option<PathBuf>,
-    /// The photographs are free of lens distortion, of which a calibration matrix does not tell.
+    /// The photographs have no lens distortion. For calibration matrices, which do not state it.
     #[arg(long, requires = "camera")]
     undistorted: bool,
-    /// About what focal length in pixels the photographs have.
+    /// Approximate focal length of the photographs in pixels: a prior.
     #[arg(long, value_name = "PX")]
     focal: Option<f64>,
-    /// A model of some of the photographs, as COLMAP's text or binary: its poses are gone on from, its lenses stay as they are, its frame is kept, and the photographs that it lacks are added.
+    /// Continue from a model of some of the photographs, in COLMAP's text or binary format: its poses are initial values, its intrinsics are kept fixed, its frame is kept, and the remaining
+    /// photographs are registered.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["camera", "focal"])]
     from: Option<PathBuf>,
-    /// Estimate the focal length even where the photographs' EXIF has one.
+    /// Ignore the focal lengths of EXIF.
     #[arg(long, conflicts_with_all = ["camera", "focal"])]
     ignore_exif: bool,
-    /// Largest reprojection error of a point that is kept, in pixels.
+    /// Largest reprojection error of an observation, in pixels.
     #[arg(long, value_name = "PX", default_value_t = SfmJobOptions::default().solve.max_error)]
     max_error: f64,
-    /// How poses are found.
+    /// Pose estimation.
     #[arg(long, value_name = "SOLVER", value_parser = named::<Solver>(), default_value_t = Solver::default())]
     solver: Solver,
-    /// In what order the photographs come: it tells which pairs are tried.
+    /// Order of the photographs, which determines the pairs to match.
     #[arg(long, value_name = "ORDER", value_parser = named::<PhotoOrder>(), default_value_t = PhotoOrder::default())]
     order: PhotoOrder,
-    /// Most features in a photograph [default: 13000].
+    /// Maximum number of features per photograph [default: 13000].
     #[arg(long, value_name = "N")]
     features: Option<usize>,
-    /// Form of the model's files.
-    #[arg(long, value_name = "FORM", value_parser = named::<ModelFormat>(), default_value_t = ModelFormat::default())]
+    /// Format of the model's files.
+    #[arg(long, value_name = "FORMAT", value_parser = named::<ModelFormat>(), default_value_t = ModelFormat::default())]
     format: ModelFormat,
     /// Where to write the points of the largest model as a cloud, as PLY.
     #[arg(long, value_name = "FILE")]
     cloud: Option<PathBuf>,
-    /// Where to write the cameras of the largest model as a transforms.json, which Nerfstudio and instant-ngp read; it names the photographs as seen from its folder.
+    /// Where to write the cameras of the largest model as a transforms.json for Nerfstudio and instant-ngp, with paths relative to its folder.
     #[arg(long, value_name = "FILE")]
     transforms: Option<PathBuf>,
-    /// Where to write the photographs of the largest model without lens distortion (images/), and the model of their pinhole cameras (sparse/): a folder.
+    /// Where to write the undistorted images of the largest model (images/) and the model of their pinhole cameras (sparse/): a folder.
     #[arg(long, value_name = "DIR")]
     pinhole: Option<PathBuf>,
-    /// Where to write how well the cameras and points of the largest model are known: standard deviations, as JSON. They are relative to one photograph's pose and its distance from another.
+    /// Where to write the standard deviations of the camera centers, rotations and points of the largest model, as JSON. The gauge is fixed by one camera's pose and its distance from another.
     #[arg(long, value_name = "FILE")]
     covariance: Option<PathBuf>,
-    /// Go on with a run into the same folder that was stopped: what it found in the same photographs by the same options is taken.
+    /// Resume a stopped run into the same folder: features and pairs of unchanged photographs and options are reused.
     #[arg(long)]
     resume: bool,
-    /// Keep features and pairs (in .cv-sfm of the output's folder) when the model is done, for runs with --resume over more photographs or by other options of the solution.
+    /// Keep features and pairs (in .cv-sfm of the output folder) after success, for --resume with more photographs or other solver options.
     #[arg(long)]
     keep: bool,
     #[command(flatten)]
@@ -136,16 +137,16 @@ impl Run for Args {
         let options = self.options(context)?;
         let named = expand_images(&self.photographs)?;
         if let [only] = &named[..] {
-            return Err(Failure::usage(format!("{} is one photograph, too few for a model", only.display()))
-                .advice("two at least; ten or more of one place are usual"));
+            return Err(Failure::usage(format!("{} is one photograph, two or more are needed", only.display()))
+                .advice("ten or more photographs of one scene"));
         }
         let all = photographs(named)?;
         let places = self.places.read(&all, context)?;
         let pinhole = self.pinhole.as_ref().map(|folder| PinholeFolder::new(folder, &all)).transpose()?;
         let earlier = self.from.as_ref().map(|folder| Earlier::read(folder, &all, context)).transpose()?;
         let checkpoint = Checkpoint::new(&self.output, self.resume, context);
-        let told = Told { places, earlier, pinhole };
-        let outcome = self.reconstruct(all, told, &options, &checkpoint, context);
+        let inputs = Inputs { places, earlier, pinhole };
+        let outcome = self.reconstruct(all, inputs, &options, &checkpoint, context);
         checkpoint.end(self.keep, outcome.is_ok());
         outcome
     }
@@ -155,7 +156,7 @@ impl Args {
     fn reconstruct(
         &self,
         mut all: Vec<Photograph>,
-        told: Told<'_>,
+        inputs: Inputs<'_>,
         options: &SfmJobOptions,
         checkpoint: &Checkpoint<'_>,
         context: &Context,
@@ -165,7 +166,7 @@ impl Args {
         let total = all.len();
         for (i, one) in all.iter_mut().enumerate() {
             if one.refused.is_none() {
-                let camera = |cameras: &mut Cameras, size, exif: Option<f64>| match told
+                let camera = |cameras: &mut Cameras, size, exif: Option<f64>| match inputs
                     .earlier
                     .as_ref()
                     .and_then(|e| Some((e, e.camera(i, size, exif.filter(|_| !self.ignore_exif))?)))
@@ -201,19 +202,19 @@ impl Args {
         let find = || sfm_pairs(&photos, cameras.list(), options, context);
         let (pairs, geometry) = checkpoint.pairs(&photos, cameras.list(), options, find)?;
         clock.lap("match");
-        let known = told.earlier.as_ref().map_or_else(Vec::new, |earlier| earlier.poses(&used));
+        let known = inputs.earlier.as_ref().map_or_else(Vec::new, |earlier| earlier.poses(&used));
         let mut result = sfm_solve(&photos, cameras.list(), (pairs, &geometry), &known, options, context)
             .map_err(words::many_views::no_model)?;
-        let frames = told.frames(&self.places, &mut result.models, &all, &used, context)?;
+        let frames = inputs.frames(&self.places, &mut result.models, &all, &used, context)?;
         let models: Vec<SparseModel> =
             (0..result.models.len()).filter_map(|m| result.sparse_model(m, &photos)).collect();
         let Some(main) = models.first() else { return Err(Failure::new("there is no model")) };
-        let fates = fates(&all, &used, &result.outcomes);
+        let registered = registration_outcomes(&all, &used, &result.outcomes);
         let mut stages = clock.into_stages();
         stages.extend(result.stages.iter().copied());
         let mut clock = cv_core::StageClock::new();
         self.write(&models, &all, &used, context)?;
-        if let Some(folder) = &told.pinhole {
+        if let Some(folder) = &inputs.pinhole {
             folder.write(main, &all, &used, self.format, context)?;
         }
         clock.lap("write");
@@ -226,17 +227,17 @@ impl Args {
         let mut clock = cv_core::StageClock::new();
         if let (Some(path), Some(model), Some(frame)) = (&self.covariance, result.models.first(), frames.first()) {
             let names: Vec<&str> = photos.iter().map(|photo| photo.name.as_str()).collect();
-            let of = sfm_covariance(&photos, cameras.list(), model)?;
-            let text = covariance::deviations(&of, &names, &frame.json["unit"]).to_string();
+            let covariance = sfm_covariance(&photos, cameras.list(), model)?;
+            let text = covariance::deviations(&covariance, &names, &frame.json["unit"]).to_string();
             context.write(Output::File(path, JSON), |path| cv_io::write_bytes(path, text.as_bytes()))?;
             clock.lap("covariance");
         }
         stages.extend(clock.into_stages());
-        if let Some(text) = doubt(&models, &fates) {
+        if let Some(text) = completeness_warning(&models, &registered) {
             context.warn(text);
         }
-        context.report(|| report::report(&all, &fates, &models, &frames, &stages))?;
-        let done = outcome(&all, &fates, &models, &frames, &result, checkpoint.taken(), stages);
+        context.report(|| report::report(&all, &registered, &models, &frames, &stages))?;
+        let done = outcome(&all, &registered, &models, &frames, &result, checkpoint.reused(), stages);
         Ok(match &dense {
             Some(dense) => done.with("dense_points", dense.cloud.len()).with("dense_pairs", dense.pairs.len()),
             None => done,
@@ -245,10 +246,10 @@ impl Args {
 
     fn options(&self, context: &Context) -> Result<SfmJobOptions, Failure> {
         if self.focal.is_some_and(|f| !(f > 0.0 && f.is_finite())) {
-            return Err(Failure::usage("--focal must be above 0"));
+            return Err(Failure::usage("--focal must be positive"));
         }
         if !(self.max_error > 0.0 && self.max_error.is_finite()) {
-            return Err(Failure::usage(format!("--max-error must be above 0, not {}", self.max_error)));
+            return Err(Failure::usage(format!("--max-error must be positive, not {}", self.max_error)));
         }
         let mut options = SfmJobOptions::default();
         options.solve.max_error = self.max_error;
@@ -263,7 +264,7 @@ impl Args {
         Ok(options)
     }
 
-    /// The features of a photograph, or why it is left out.
+    /// Returns the features of a photograph, from the checkpoint or computed, or the reason why it is left out.
     fn features_of(
         &self,
         one: &mut Photograph,
@@ -273,47 +274,47 @@ impl Args {
         place: &PhotoProgress<'_>,
     ) -> Result<Result<SfmPhoto, String>, Failure> {
         place.report("photographs", 0, 0)?;
-        let (key, found) = checkpoint.seen(one, options);
-        let new = found.is_none();
-        let seen = match found {
-            Some(seen) => seen,
-            None => match self.look_at(one, &mut camera, options, place)? {
-                Ok(seen) => seen,
+        let (key, stored) = checkpoint.extracted(one, options);
+        let new = stored.is_none();
+        let extracted = match stored {
+            Some(extracted) => extracted,
+            None => match self.extract(one, &mut camera, options, place)? {
+                Ok(extracted) => extracted,
                 Err(reason) => return Ok(Err(reason)),
             },
         };
-        let camera = match camera(seen.photo.size, seen.focal)? {
+        let camera = match camera(extracted.photo.size, extracted.focal)? {
             Ok(camera) => camera,
             Err(reason) => return Ok(Err(reason)),
         };
         if new {
-            checkpoint.keep_seen(key, &seen);
+            checkpoint.store_extracted(key, &extracted);
         }
         checkpoint.add(key);
-        one.gps = seen.gps;
-        Ok(Ok(SfmPhoto { name: one.name.clone(), camera, ..seen.photo }))
+        one.gps = extracted.gps;
+        Ok(Ok(SfmPhoto { name: one.name.clone(), camera, ..extracted.photo }))
     }
 
-    /// What a photograph shows, or why it is left out.
-    fn look_at(
+    /// Reads a photograph and extracts its features and metadata, or returns the reason why it is left out.
+    fn extract(
         &self,
         one: &Photograph,
         mut camera: impl FnMut((usize, usize), Option<f64>) -> Result<Result<usize, String>, Failure>,
         options: &SfmJobOptions,
         place: &PhotoProgress<'_>,
-    ) -> Result<Result<Seen, String>, Failure> {
+    ) -> Result<Result<Extracted, String>, Failure> {
         let image = match cv_io::read_image(&one.path) {
             Ok(image) => image,
             Err(error) => return Ok(Err(words::many_views::not_read(&error))),
         };
         let (focal, gps) = (image.exif.focal.map(|f| f.pixels), image.exif.gps);
-        // Before the work.
+        // Checked before the expensive extraction.
         if let Err(reason) = camera(image.size(), focal)? {
             return Ok(Err(reason));
         }
         let rgb = image.into_rgb8();
         match sfm_photo(rgb.view(), String::new(), 0, &options.features, place) {
-            Ok(photo) => Ok(Ok(Seen { focal, gps, photo })),
+            Ok(photo) => Ok(Ok(Extracted { focal, gps, photo })),
             Err(SfmPhotoError::Features(
                 error @ (FeatureError::ImageTooSmall { .. } | FeatureError::NotFinite { .. }),
             )) => Ok(Err(error.to_string())),
@@ -321,7 +322,7 @@ impl Args {
         }
     }
 
-    /// The models, and of the largest its points and cameras in the other forms that are asked for.
+    /// Writes the models, and the points and cameras of the largest in the other requested formats.
     fn write(
         &self,
         models: &[SparseModel],
@@ -337,10 +338,10 @@ impl Args {
                 context.note(format!("{}: the files of an older model were removed", folder.display()));
             }
         }
-        // Of an earlier run, or somebody else's: not ours to remove.
+        // Of an earlier run or of another program: not removed.
         let older = self.output.join(models.len().to_string());
         if ["cameras.txt", "cameras.bin"].iter().any(|name| older.join(name).exists()) {
-            context.warn(format!("{} holds a model that is not of this run", older.display()));
+            context.warn(format!("{} contains a model that is not from this run", older.display()));
         }
         let Some(model) = models.first() else { return Ok(()) };
         if let Some(path) = &self.cloud {
@@ -352,29 +353,29 @@ impl Args {
         if let Some(path) = &self.transforms {
             let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
             context.write(Output::File(path, JSON), |file| {
-                // The folder is there by now, so that links in its path can be followed.
-                let mut seen = model.clone();
-                for (id, image) in &mut seen.images {
+                // The folder exists by now, so that symbolic links in its path can be resolved.
+                let mut relative = model.clone();
+                for (id, image) in &mut relative.images {
                     if let Some(at) = used.get(*id as usize - 1) {
-                        image.name = seen_from(folder, &all[*at].path);
+                        image.name = relative_path(folder, &all[*at].path);
                     }
                 }
-                cv_io::write_transforms(file, &seen, "")
+                cv_io::write_transforms(file, &relative, "")
             })?;
         }
         Ok(())
     }
 }
 
-/// What the person tells of the photographs, and the folder of those without distortion.
-struct Told<'a> {
+/// Control positions, the earlier model and the output folder of undistorted images.
+struct Inputs<'a> {
     places: Places,
     earlier: Option<Earlier>,
     pinhole: Option<PinholeFolder<'a>>,
 }
 
-impl Told<'_> {
-    /// Brings each model to what is known: by the person's own numbers, by an earlier model, or by what the photographs say of themselves.
+impl Inputs<'_> {
+    /// Aligns each model: to positions and distances from the command line, to the earlier model, or to GPS positions, in this order.
     fn frames(
         &self,
         args: &PlaceArgs,
@@ -383,7 +384,7 @@ impl Told<'_> {
         used: &[usize],
         context: &Context,
     ) -> Result<Vec<Frame>, Failure> {
-        let earlier = self.earlier.as_ref().filter(|_| !self.places.is_told());
+        let earlier = self.earlier.as_ref().filter(|_| !self.places.is_given());
         let places = self.places.with_gps(args, all);
         let one = |model: &mut SfmModel| match earlier.and_then(|earlier| earlier.align(model, used)) {
             Some(frame) => Ok(frame),

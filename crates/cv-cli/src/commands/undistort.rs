@@ -1,6 +1,6 @@
-//! `cv undistort`: photographs without the distortion of their lens.
+//! `cv undistort`: correction of lens distortion.
 
-use super::rectify::{parse_share, write_picture};
+use super::rectify::{parse_fraction, write_picture};
 use super::size;
 use crate::frame::{Context, Explain, Failure, Global, Outcome, Output, Run, expand_images, one_each, spare_inputs};
 use crate::rig;
@@ -11,10 +11,10 @@ use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-/// Take the distortion of a calibrated lens out of photographs.
+/// Correct the distortion of a calibrated lens.
 ///
-/// Writes NAME.png of each photograph (NAME.tif of a TIFF), and camera.yaml, the camera that would have taken them: the same place and direction, square pixels, no distortion. What the
-/// lens does not reach is black. Photographs of 16 bits stay so.
+/// Writes NAME.png for each photograph (NAME.tif for a TIFF), and camera.yaml, the pinhole camera of the results: same center and orientation, square pixels, no distortion. Pixels outside
+/// the source image are black. The bit depth is kept.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv undistort photos/*.jpg --camera camera.yaml -o straight\n  \
@@ -23,14 +23,14 @@ pub(crate) struct Args {
     /// The photographs, or folders or quoted patterns of them.
     #[arg(required = true, value_name = "IMAGES")]
     images: Vec<PathBuf>,
-    /// The calibration of the camera: ours, OpenCV's, ROS's, Kalibr's or COLMAP's.
+    /// The calibration of the camera: our, OpenCV's, ROS's, Kalibr's or COLMAP's format.
     #[arg(long, value_name = "FILE")]
     camera: PathBuf,
-    /// The folder for the results; made where it is missing.
+    /// The folder for the results; created if missing.
     #[arg(short, long, visible_alias = "out", value_name = "DIR")]
     output: PathBuf,
-    /// From 0 (no pixel without content) to 1 (no pixel lost).
-    #[arg(long, value_name = "A", default_value_t = 0.0, value_parser = parse_share)]
+    /// Free scaling parameter: from 0 (only valid pixels) to 1 (all source pixels kept), as in OpenCV.
+    #[arg(long, value_name = "A", default_value_t = 0.0, value_parser = parse_fraction)]
     alpha: f64,
     /// Width and height of the results [default: those of the photographs].
     #[arg(long, value_name = "WxH", value_parser = size)]
@@ -38,7 +38,7 @@ pub(crate) struct Args {
 }
 
 impl Args {
-    /// Where the result of a photograph goes: a TIFF stays one.
+    /// Returns the output path of a photograph: TIFF for a TIFF, else PNG.
     fn result(&self, photo: &Path) -> PathBuf {
         let is_tiff =
             photo.extension().is_some_and(|e| ["tif", "tiff"].iter().any(|tiff| e.eq_ignore_ascii_case(tiff)));
@@ -85,7 +85,7 @@ impl Run for Args {
             };
             rig::check_size(&self.camera, path, photo.size(), &view.source)?;
             let start = Instant::now();
-            let pixels = straight(&photo.pixels, map)?;
+            let pixels = undistorted_pixels(&photo.pixels, map)?;
             seconds += start.elapsed().as_secs_f64();
             let straight = DynImage { pixels, exif: ExifInfo::default(), metadata: Metadata::default() };
             context.write(Output::Folder(&self.output), |_| write_picture(result, &straight, &photo.metadata))?;
@@ -112,8 +112,8 @@ impl Run for Args {
     }
 }
 
-/// A picture as deep as it is; linear light as bytes of color.
-pub(super) fn straight(pixels: &Pixels, map: &WarpMap) -> Result<Pixels, WarpError> {
+/// Undistorts an image at its bit depth; linear float images as 8-bit sRGB.
+pub(super) fn undistorted_pixels(pixels: &Pixels, map: &WarpMap) -> Result<Pixels, WarpError> {
     Ok(match pixels {
         Pixels::Gray8(image) => map.compute(image.view())?.into(),
         Pixels::Gray16(image) => map.compute(image.view())?.into(),

@@ -1,18 +1,18 @@
-//! How the program was called, for the end of reports.
+//! The command line and option values, for the end of reports.
 
 use clap::{ArgMatches, Command, parser::ValueSource};
 use cv_report::Report;
 
-/// The command line, and the value that each option had.
+/// The command line, and the value of each option.
 #[derive(Debug, Clone)]
 pub(crate) struct Called {
     line: String,
-    /// Name, value, and where that is from.
+    /// Name, value, and its source (`default` or `given`).
     options: Vec<[String; 3]>,
 }
 
 impl Called {
-    /// Reads a command that was built and what it was given.
+    /// Collects the option values of a parsed command line.
     pub(crate) fn new(mut command: &Command, mut matches: &ArgMatches) -> Self {
         while let Some((name, inner)) = matches.subcommand() {
             let Some(found) = command.find_subcommand(name) else { break };
@@ -31,19 +31,19 @@ impl Called {
         Self { line: std::iter::once("cv".to_owned()).chain(words).collect::<Vec<_>>().join(" "), options }
     }
 
-    /// Adds the last section of a report: what is needed to run it again.
-    pub(super) fn tell(&self, page: &mut Report) {
+    /// Adds the last section of a report: the information to reproduce the run.
+    pub(super) fn add_to(&self, page: &mut Report) {
         let version = format!("cv {} ({} {})", env!("CARGO_PKG_VERSION"), std::env::consts::OS, std::env::consts::ARCH);
         let threads = rayon::current_num_threads().to_string();
         page.section("This run")
-            .facts("To have it again.", &[("command line", &self.line), ("version", &version), ("threads", &threads)]);
+            .facts("To reproduce it.", &[("command line", &self.line), ("version", &version), ("threads", &threads)]);
         page.folded("All options of the command", |page| {
-            page.table("Options that had a value.", &["option", "value", "from"], &self.options);
+            page.table("Options with a value.", &["option", "value", "source"], &self.options);
         });
     }
 }
 
-/// A word as a shell takes it.
+/// Quotes a word for a shell.
 fn quoted(word: &str) -> String {
     let plain = |c: char| c.is_alphanumeric() || "-_./=:,+%@".contains(c);
     if !word.is_empty() && word.chars().all(plain) {

@@ -1,7 +1,7 @@
-//! Options out of a file: `cv.toml` in the current folder, or the file of `--config`.
+//! Options from a file: `cv.toml` in the current folder, or the file of `--config`.
 //!
-//! A table is a command, a key the long name of an option; keys outside of tables are options that every command takes. They are put behind the arguments
-//! of the command line, those aside that are given there or that what is given there excludes: so the command line wins, and one parser judges all.
+//! A table is a command, a key the long name of an option; keys outside of tables are global options. They are appended to the arguments of the command
+//! line, except those that it gives or excludes: so the command line takes precedence, and one parser validates all.
 
 use super::{Explain, Failure};
 use clap::{Arg, ArgAction, ArgMatches, Command, parser::ValueSource};
@@ -13,16 +13,16 @@ use std::{
     path::{Path, PathBuf},
 };
 
-/// Looked for in the current folder.
-const NAME: &str = "cv.toml";
+/// Name of the default configuration file, in the current folder.
+const DEFAULT_FILE: &str = "cv.toml";
 
-/// A command line with what a file adds.
+/// A command line completed from a configuration file.
 pub(crate) struct Completed {
     /// The program's name and all arguments.
     pub(crate) args: Vec<OsString>,
-    /// What was taken out of the file, for people.
-    pub(crate) said: Option<String>,
-    /// What `--print-config` prints.
+    /// The options taken from the file, as a message.
+    pub(crate) note: Option<String>,
+    /// The output of `--print-config`.
     pub(crate) printed: Option<String>,
 }
 
@@ -30,12 +30,12 @@ pub(crate) struct Completed {
 pub(crate) fn complete(program: &Command, mut args: Vec<OsString>) -> Result<Completed, Failure> {
     let mut built = program.clone();
     built.build();
-    // What is wrong with the command line, or help, is left to the parser that follows.
+    // Errors in the command line, and help, are left to the parser that follows.
     let Ok(matches) = program.clone().ignore_errors(true).try_get_matches_from(&args) else {
-        return Ok(Completed { args, said: None, printed: None });
+        return Ok(Completed { args, note: None, printed: None });
     };
     let named = matches.get_one::<PathBuf>("config").cloned();
-    let file = named.or_else(|| Some(PathBuf::from(NAME)).filter(|file| file.is_file()));
+    let file = named.or_else(|| Some(PathBuf::from(DEFAULT_FILE)).filter(|file| file.is_file()));
     let mut words = Vec::new();
     if let Some(file) = &file {
         let table = read(file)?;
@@ -44,23 +44,23 @@ pub(crate) fn complete(program: &Command, mut args: Vec<OsString>) -> Result<Com
     }
     let end = args.iter().position(|word| word == "--").unwrap_or(args.len());
     args.splice(end..end, words.iter().map(OsString::from));
-    let said = file.filter(|_| !words.is_empty()).map(|file| format!("{}: {}", file.display(), words.join(" ")));
-    let printed = matches.get_flag("print_config").then(|| print(&built, &optional(program.clone()), &args));
-    Ok(Completed { args, said, printed: printed.flatten() })
+    let note = file.filter(|_| !words.is_empty()).map(|file| format!("{}: {}", file.display(), words.join(" ")));
+    let printed = matches.get_flag("print_config").then(|| print(&built, &without_required(program.clone()), &args));
+    Ok(Completed { args, note, printed: printed.flatten() })
 }
 
 fn read(file: &Path) -> Result<Map<String, Value>, Failure> {
     let bytes = cv_io::read_bytes(file)?;
-    basic_toml::from_slice(&bytes).during(format!("{} is no TOML", file.display()))
+    basic_toml::from_slice(&bytes).during(format!("{} is not valid TOML", file.display()))
 }
 
-/// The option of a long name.
+/// Finds an option by its long name.
 fn option<'c>(command: &'c Command, key: &str) -> Option<&'c Arg> {
     let own = ["config", "print-config", "help", "version"];
     command.get_arguments().find(|arg| arg.get_long() == Some(key) && !own.contains(&key))
 }
 
-/// Refuses keys and tables that mean nothing.
+/// Refuses unknown keys and tables.
 fn check(command: &Command, table: &Map<String, Value>, file: &Path) -> Result<(), Failure> {
     for (key, value) in table {
         let name = command.get_bin_name().unwrap_or("cv");
@@ -73,7 +73,7 @@ fn check(command: &Command, table: &Map<String, Value>, file: &Path) -> Result<(
             }
             _ if option(command, key).is_none() => {
                 return Err(Failure::usage(format!("{}: `{name}` has no option “{key}”", file.display()))
-                    .advice(format!("{name} --help shows those that there are")));
+                    .advice(format!("{name} --help lists its options")));
             }
             _ => {}
         }
@@ -81,7 +81,7 @@ fn check(command: &Command, table: &Map<String, Value>, file: &Path) -> Result<(
     Ok(())
 }
 
-/// The arguments of the file that the command line does not have and does not exclude; those of the innermost command first.
+/// Returns the arguments of the file that the command line neither gives nor excludes; those of the innermost command first.
 fn missing(program: &Command, matches: &ArgMatches, table: &Map<String, Value>) -> Result<Vec<String>, Failure> {
     let mut levels = vec![(program, matches, table)];
     while let Some(&(command, matches, table)) = levels.last() {
@@ -112,12 +112,12 @@ fn missing(program: &Command, matches: &ArgMatches, table: &Map<String, Value>) 
     Ok(words)
 }
 
-/// An option as words of the command line.
+/// Appends an option as arguments of the command line.
 fn push(words: &mut Vec<String>, arg: &Arg, key: &str, value: &Value) -> Result<(), Failure> {
     let flag = matches!(arg.get_action(), ArgAction::SetTrue);
     match value {
         Value::Bool(on) if flag => words.extend(on.then(|| format!("--{key}"))),
-        _ if flag => return Err(Failure::usage(format!("{key} is true or false, not {value}"))),
+        _ if flag => return Err(Failure::usage(format!("{key} must be true or false, not {value}"))),
         Value::String(text) => words.push(format!("--{key}={text}")),
         Value::Array(list) => list.iter().try_for_each(|value| push(words, arg, key, value))?,
         other => words.push(format!("--{key}={other}")),
@@ -125,12 +125,12 @@ fn push(words: &mut Vec<String>, arg: &Arg, key: &str, value: &Value) -> Result<
     Ok(())
 }
 
-/// The command with nothing that must be given.
-fn optional(command: Command) -> Command {
-    command.mut_args(|arg| arg.required(false)).mut_subcommands(optional).subcommand_required(false)
+/// Returns the command with no required arguments.
+fn without_required(command: Command) -> Command {
+    command.mut_args(|arg| arg.required(false)).mut_subcommands(without_required).subcommand_required(false)
 }
 
-/// The options that hold, as a file that would give them, defaults as comments; `None` where the parser has something to say.
+/// Formats the effective options as a configuration file, with defaults as comments; `None` if the command line is invalid.
 fn print(built: &Command, program: &Command, args: &[OsString]) -> Option<String> {
     let matches = program.clone().try_get_matches_from(args).ok()?;
     let (mut text, mut level) = (String::new(), Some((built, &matches, Vec::new())));
@@ -142,13 +142,13 @@ fn print(built: &Command, program: &Command, args: &[OsString]) -> Option<String
         for arg in command.get_arguments() {
             let Some(key) = arg.get_long().filter(|key| option(command, key).is_some()) else { continue };
             let id = arg.get_id().as_str();
-            // Those of every command stand first.
+            // Global options are printed first.
             if path.is_empty() && !globals.insert(id) || !path.is_empty() && globals.contains(id) {
                 continue;
             }
             let Ok(Some(values)) = matches.try_get_raw(id) else { continue };
             let values: Vec<String> = values.map(|value| toml(&value.to_string_lossy())).collect();
-            // A default that is given is taken for a wish: it may need other options, or exclude them.
+            // Defaults are comments: given explicitly, they could require other options or exclude them.
             let default = if matches.value_source(id) == Some(ValueSource::DefaultValue) { "# " } else { "" };
             let _ = match &values[..] {
                 [one] => writeln!(text, "{default}{key} = {one}"),
@@ -162,7 +162,7 @@ fn print(built: &Command, program: &Command, args: &[OsString]) -> Option<String
     Some(text)
 }
 
-/// A value as TOML has it.
+/// Formats a value as TOML.
 fn toml(text: &str) -> String {
     let bare =
         text.parse::<bool>().is_ok() || text.parse::<f64>().is_ok_and(f64::is_finite) && !text.starts_with(['+', '.']);

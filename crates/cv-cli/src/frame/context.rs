@@ -1,4 +1,4 @@
-//! What a running command knows about how it was called.
+//! The context of a running command: global options, messages, reports and cancellation.
 
 use super::progress::{Bar, Step};
 use super::stop::Stop;
@@ -11,19 +11,19 @@ use std::{
     sync::{Arc, Mutex, PoisonError},
 };
 
-/// What a running command knows about how it was called. It is also the [`Progress`] that pipelines report to.
+/// The context of a running command. It is also the [`Progress`] that pipelines report to.
 pub(crate) struct Context {
-    /// `--seed`, where given.
+    /// `--seed`, if given.
     pub(crate) seed: Option<u64>,
-    /// `--max-memory`, where given, in bytes.
+    /// `--max-memory` in bytes, if given.
     pub(crate) max_memory: Option<usize>,
     quiet: bool,
     json: bool,
-    /// What goes to stdout once the command is done.
+    /// The output for stdout, written at the end.
     stdout: Mutex<Vec<u8>>,
     report: Option<PathBuf>,
     called: Called,
-    /// What was warned of so far.
+    /// The warnings so far.
     warnings: Mutex<Vec<String>>,
     bar: Arc<Bar>,
     pub(super) stop: Stop,
@@ -39,25 +39,25 @@ impl Context {
         Self { seed, max_memory, quiet, json, stdout, report, called, warnings, bar, stop }
     }
 
-    /// Refuses global options that the command has no use for.
+    /// Refuses global options that have no effect on the command.
     pub(crate) fn refuse(&self, without_use: &[Global]) -> Result<(), Failure> {
         let given = |option: &Global| match option {
             Global::Seed => self.seed.is_some(),
             Global::Report => self.report.is_some(),
         };
         match without_use.iter().find(|option| given(option)) {
-            Some(Global::Seed) => Err(Failure::usage("--seed means nothing here: nothing is chosen at random")),
-            Some(Global::Report) => Err(Failure::usage("--report means nothing here: there is nothing to show")),
+            Some(Global::Seed) => Err(Failure::usage("--seed has no effect here: this command uses no random numbers")),
+            Some(Global::Report) => Err(Failure::usage("--report has no effect here: this command has no report")),
             None => Ok(()),
         }
     }
 
-    /// Finds out before the work whether the results can be written.
+    /// Checks before the computation whether the results can be written.
     pub(crate) fn check(&self, outputs: &[Output<'_>]) -> Result<(), Failure> {
         outputs::check(outputs, self.report.as_deref(), self.json)
     }
 
-    /// Says which steps will come.
+    /// Announces the steps of the command.
     pub(crate) fn expect(&self, steps: Vec<Step>) {
         self.bar.expect(steps);
     }
@@ -67,45 +67,45 @@ impl Context {
         *self.stdout.lock().unwrap_or_else(PoisonError::into_inner) = bytes;
     }
 
-    /// The output for stdout.
+    /// Takes the output for stdout.
     pub(super) fn take_stdout(&self) -> Vec<u8> {
         std::mem::take(&mut *self.stdout.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
-    /// A line on stderr, whatever was asked for.
+    /// Prints a line on stderr, even under `--quiet`.
     pub(super) fn say(&self, text: &str) {
         self.bar.print(text);
     }
 
-    /// Takes the bar off the screen.
+    /// Removes the progress bar.
     pub(super) fn clear_bar(&self) {
         self.bar.clear();
     }
 
-    /// A message for people, on stderr; silent under `--quiet`.
+    /// Prints a message on stderr, unless under `--quiet`.
     pub(crate) fn note(&self, text: impl Display) {
         if !self.quiet {
             self.bar.print(&text.to_string());
         }
     }
 
-    /// Something the person should know about even under `--quiet`. It stands in a report that is made later, too.
+    /// Prints a warning, even under `--quiet`, and records it for the report.
     pub(crate) fn warn(&self, text: impl Display) {
         let text = text.to_string();
         self.bar.print(&format!("warning: {text}"));
         self.warnings.lock().unwrap_or_else(PoisonError::into_inner).push(text);
     }
 
-    /// The file of a report: with the warnings of this run at the top and how it was called at the end.
+    /// Renders a report, with the warnings of this run at the top and the command line at the end.
     pub(crate) fn page(&self, mut report: Report) -> String {
         for text in self.warnings.lock().unwrap_or_else(PoisonError::into_inner).iter() {
             report.warn(text);
         }
-        self.called.tell(&mut report);
+        self.called.add_to(&mut report);
         report.to_html()
     }
 
-    /// Under `--report DIR`, writes `DIR/report.html`. Comes after the warnings.
+    /// Under `--report DIR`, writes `DIR/report.html`. Must follow the warnings.
     pub(crate) fn report(&self, build: impl FnOnce() -> Result<Report, Failure>) -> Result<(), Failure> {
         let Some(folder) = &self.report else { return Ok(()) };
         let html = self.page(build()?);
@@ -115,12 +115,12 @@ impl Context {
         Ok(())
     }
 
-    /// Whether the person asked the program to stop.
+    /// Whether the program was asked to stop.
     pub(crate) fn is_stopped(&self) -> bool {
         self.stop.check().is_err()
     }
 
-    /// Whether `--report` was given: pictures for it are worth drawing.
+    /// Whether `--report` was given, so that figures must be drawn.
     pub(crate) fn wants_report(&self) -> bool {
         self.report.is_some()
     }

@@ -1,10 +1,10 @@
-//! Why a command ends without its result, and what to try.
+//! Failures of commands: cause and remedy.
 
 use crate::words;
 use cv_io::{FormatError, IoError};
 use std::{fmt::Display, process::ExitCode};
 
-/// Why a command ends without its result.
+/// Why a command failed, and what to try.
 #[derive(Debug)]
 pub(crate) struct Failure {
     what: String,
@@ -13,28 +13,28 @@ pub(crate) struct Failure {
 }
 
 impl Failure {
-    /// The job could not be done: exit code 1.
+    /// A job that could not be done: exit code 1.
     pub(crate) fn new(what: impl Display) -> Self {
         Self { what: what.to_string(), advice: None, usage: false }
     }
 
-    /// The arguments make no sense together: exit code 2.
+    /// Invalid or incompatible arguments: exit code 2.
     pub(crate) fn usage(what: impl Display) -> Self {
         Self { usage: true, ..Self::new(what) }
     }
 
-    /// What the person can do about it.
+    /// Adds a remedy.
     pub(crate) fn advice(mut self, advice: impl Display) -> Self {
         self.advice = Some(advice.to_string());
         self
     }
 
-    /// 2 for wrong usage, 1 else.
+    /// Returns 2 for wrong usage, else 1.
     pub(crate) fn exit_code(&self) -> ExitCode {
         ExitCode::from(if self.usage { 2 } else { 1 })
     }
 
-    /// The lines on stderr.
+    /// Formats the message for stderr.
     pub(crate) fn text(&self) -> String {
         match &self.advice {
             Some(advice) => format!("error: {}; try: {advice}", self.what),
@@ -43,8 +43,8 @@ impl Failure {
     }
 }
 
-/// Every error becomes a failure, its causes joined by colons where the error does not already name them. The hint of
-/// a file error becomes the advice.
+/// Converts any error; causes that its message does not contain are appended, separated by colons. The hint of a file error
+/// becomes the advice.
 impl<E: std::error::Error + 'static> From<E> for Failure {
     fn from(error: E) -> Self {
         let error: &(dyn std::error::Error + 'static) = &error;
@@ -69,11 +69,11 @@ impl<E: std::error::Error + 'static> From<E> for Failure {
     }
 }
 
-/// Puts words around errors.
+/// Adds context to errors.
 pub(crate) trait Explain<T> {
-    /// `words: error`.
+    /// Prepends a context: `words: error`.
     fn during(self, words: impl Display) -> Result<T, Failure>;
-    /// `error; try: advice`.
+    /// Appends a remedy: `error; try: advice`.
     fn advice(self, advice: impl Display) -> Result<T, Failure>;
 }
 
@@ -95,7 +95,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_causes_of_an_error_are_told_once() {
+    fn each_cause_of_an_error_is_stated_once() {
         #[derive(Debug, thiserror::Error)]
         #[error("outer")]
         struct Outer(#[source] std::io::Error);

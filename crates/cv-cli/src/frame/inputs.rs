@@ -1,19 +1,19 @@
-//! Photographs to read: files, folders and patterns.
+//! Input photographs: files, folders and patterns.
 
 use super::{Explain, Failure};
 use std::{cmp::Ordering, fs, path::Path, path::PathBuf};
 
-/// The endings of photographs in a folder.
-const ENDINGS: [&str; 17] = [
+/// Extensions of image files in a folder.
+const EXTENSIONS: [&str; 17] = [
     "png", "jpg", "jpeg", "jpe", "tif", "tiff", "bmp", "pnm", "ppm", "pgm", "pbm", "pam", "exr", "hdr", "pic", "jfif",
     "webp",
 ];
 
-/// The most digits that a number in a file's name is looked for with.
-const MOST_DIGITS: usize = 12;
+/// Maximum number of digits matched by `%d`.
+const MAX_DIGITS: usize = 12;
 
-/// The photographs among the arguments: a file stands for itself, a folder for the photographs in it, a pattern (`*`, `?`, `[a-z]`, `%04d`) for
-/// those that fit it, by name (`img2` before `img10`).
+/// Expands arguments to image files: a folder to the images in it, a pattern (`*`, `?`, `[a-z]`, `%04d`) to the files that match it, in natural order
+/// (`img2` before `img10`).
 pub(crate) fn expand_images(paths: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
     let mut images = Vec::new();
     for path in paths {
@@ -21,35 +21,35 @@ pub(crate) fn expand_images(paths: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> 
             images.push(path.clone());
             continue;
         }
-        let mut found = if path.is_dir() { in_folder(path)? } else { like(path)? };
+        let mut found = if path.is_dir() { in_folder(path)? } else { matching_pattern(path)? };
         sort_by_name(&mut found);
         images.append(&mut found);
     }
     Ok(images)
 }
 
-/// Sorts paths as people number them.
+/// Sorts paths in natural order: runs of digits compare as numbers.
 pub(crate) fn sort_by_name(paths: &mut [PathBuf]) {
     paths.sort_by(|a, b| natural_order(&a.to_string_lossy(), &b.to_string_lossy()));
 }
 
-/// The two photographs that the arguments stand for, by name, folder or pattern.
+/// Expands arguments to exactly two photographs.
 pub(crate) fn two_images(paths: &[PathBuf]) -> Result<[PathBuf; 2], Failure> {
     <[PathBuf; 2]>::try_from(expand_images(paths)?).map_err(|images| match &images[..] {
-        [one] => Failure::usage(format!("two photographs are needed, and {} is one", one.display()))
+        [one] => Failure::usage(format!("two photographs are needed, only {} is given", one.display()))
             .advice("name a second one"),
-        more => Failure::usage(format!("two photographs are taken at a time, not {}", more.len()))
-            .advice("run it on two of them after the other; `cv panorama` joins many that were taken from one place"),
+        more => Failure::usage(format!("two photographs are needed, got {}", more.len()))
+            .advice("run it on one pair at a time; `cv panorama` stitches many photographs from one place, `cv sfm` reconstructs many views"),
     })
 }
 
-/// True for a folder or a pattern.
+/// Whether an argument is a folder or a pattern.
 pub(crate) fn stands_for_many(path: &Path) -> bool {
     let text = path.to_string_lossy();
     path.is_dir() || (!path.exists() && (text.contains(['*', '?', '[']) || numbering(&text).is_some()))
 }
 
-/// The photographs in a folder.
+/// Lists the images in a folder.
 fn in_folder(path: &Path) -> Result<Vec<PathBuf>, Failure> {
     let mut found = Vec::new();
     for entry in fs::read_dir(path).during(format!("cannot list {}", path.display()))? {
@@ -61,30 +61,30 @@ fn in_folder(path: &Path) -> Result<Vec<PathBuf>, Failure> {
     }
     if found.is_empty() {
         return Err(Failure::new(format!("there are no images in {}", path.display()))
-            .advice(format!("a folder with files that end in {}", ENDINGS[..3].join(", "))));
+            .advice(format!("a folder with files of the extensions {}", EXTENSIONS[..3].join(", "))));
     }
     Ok(found)
 }
 
 fn is_named_as_image(file: &Path) -> bool {
     let ending = file.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-    ENDINGS.contains(&ending.as_str())
+    EXTENSIONS.contains(&ending.as_str())
 }
 
-/// The files that fit a pattern: the photographs among them by their names, all where none is named as one.
-fn like(path: &Path) -> Result<Vec<PathBuf>, Failure> {
+/// Lists the files that match a pattern: those with an image extension, or all if none has one.
+fn matching_pattern(path: &Path) -> Result<Vec<PathBuf>, Failure> {
     let text = path.to_string_lossy();
     let patterns = match numbering(&text) {
         None => vec![text.to_string()],
         Some((head, width, rest)) => {
-            (width..=width.max(MOST_DIGITS)).map(|n| format!("{head}{}{rest}", "[0-9]".repeat(n))).collect()
+            (width..=width.max(MAX_DIGITS)).map(|n| format!("{head}{}{rest}", "[0-9]".repeat(n))).collect()
         }
     };
     let options = glob::MatchOptions { require_literal_leading_dot: true, ..glob::MatchOptions::new() };
     let mut found = Vec::new();
     for pattern in patterns {
         let files = glob::glob_with(&pattern, options).map_err(Failure::usage).during(path.display())?;
-        // What cannot be looked at is no photograph.
+        // Unreadable entries are skipped.
         found.extend(files.flatten().filter(|file| file.is_file()));
     }
     if found.iter().any(|file| is_named_as_image(file)) {
@@ -96,19 +96,19 @@ fn like(path: &Path) -> Result<Vec<PathBuf>, Failure> {
     }
 }
 
-/// The first number in the manner of C (`%d`, `%04d`) in a pattern: what stands before it, its least number of digits, and
-/// what follows.
+/// Finds the first C-style number (`%d`, `%04d`) in a pattern: the text before it, its minimum number of digits, and the
+/// text after it.
 fn numbering(pattern: &str) -> Option<(&str, usize, &str)> {
     pattern.match_indices('%').find_map(|(at, _)| {
         let rest = &pattern[at + 1..];
         let width = rest.find('d')?;
         let digits = &rest[..width];
         let width = if digits.is_empty() { 1 } else { digits.parse().ok().filter(|_| digits.starts_with('0'))? };
-        (width <= MOST_DIGITS).then(|| (&pattern[..at], width, &rest[digits.len() + 1..]))
+        (width <= MAX_DIGITS).then(|| (&pattern[..at], width, &rest[digits.len() + 1..]))
     })
 }
 
-/// Compares names with their runs of digits as numbers.
+/// Compares names with runs of digits as numbers.
 fn natural_order(a: &str, b: &str) -> Ordering {
     let (mut rest_a, mut rest_b) = (a, b);
     loop {
@@ -132,7 +132,7 @@ fn natural_order(a: &str, b: &str) -> Ordering {
     }
 }
 
-/// The digits at the start, without leading zeros, and what follows.
+/// Splits off the digits at the start, without leading zeros.
 fn split_digits(text: &str) -> (&str, &str) {
     let end = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());
     (text[..end].trim_start_matches('0'), &text[end..])
@@ -143,14 +143,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_sort_as_people_number_them() {
+    fn names_sort_in_natural_order() {
         let mut names = ["img10.png", "img2.png", "img1.png", "img02.png", "a.png", "img2b.png", "img.png"];
         names.sort_by(|a, b| natural_order(a, b));
         assert_eq!(names, ["a.png", "img.png", "img1.png", "img02.png", "img2.png", "img2b.png", "img10.png"]);
     }
 
     #[test]
-    fn patterns_are_those_of_a_shell_and_of_c() {
+    fn shell_and_printf_patterns_match() {
         let folder = tempfile::tempdir().unwrap();
         let make = |names: &[&str]| {
             for name in names {
@@ -173,7 +173,7 @@ mod tests {
         fs::create_dir(folder.path().join("sub")).unwrap();
         make(&["sub/c1.png", "sub/c[1].png"]);
         assert_eq!(fits("s*/c%d.png"), ["sub/c1.png"]);
-        // Names of files that are there, whatever they look like, and what is no number.
+        // Existing files whose names look like patterns, and invalid numbers.
         assert_eq!(fits("sub/c[1].png"), ["sub/c[1].png"]);
         assert!(!stands_for_many(Path::new("100%.png")) && !stands_for_many(Path::new("50%4d.png")));
         assert!(stands_for_many(Path::new("nowhere/frame_%04d.png")));

@@ -1,6 +1,6 @@
 //! The frame that runs every command: global arguments, exit codes, stdout and stderr.
 //!
-//! [`Outcome`] is what a command achieved and [`Failure`] why it did not; [`Context`] is what it knows of how it was called.
+//! [`Outcome`] is the result of a command and [`Failure`] its error; [`Context`] has the global options and the channels for messages.
 
 mod called;
 mod config;
@@ -34,11 +34,11 @@ use std::{
     time::Instant,
 };
 
-/// Arguments that every command takes.
+/// The global options.
 #[derive(Debug, Clone, Args)]
-#[command(next_help_heading = "Everywhere")]
+#[command(next_help_heading = "Global options")]
 pub(crate) struct Globals {
-    /// Print one JSON object on stdout, and nothing else there.
+    /// Print one JSON object on stdout and nothing else.
     #[arg(long, global = true)]
     pub(crate) json: bool,
     /// No progress bar, no summary; errors and warnings only.
@@ -47,27 +47,27 @@ pub(crate) struct Globals {
     /// Threads to use [default: one per core]. The result is the same for any number.
     #[arg(long, global = true, value_name = "N", value_parser = value_parser!(u16).range(1..=1024))]
     pub(crate) threads: Option<u16>,
-    /// Most memory, in MiB, for reading one file (judged by its header) [default: half of the machine's], and for matching pixel by
-    /// pixel: where that does not fit, rows are matched in strips that overlap [default: as much as it takes; 1024 for a dense cloud].
+    /// Memory limit in MiB: for reading one file, by its header [default: half of the machine's], and for stereo matching, which is split
+    /// into overlapping strips of rows beyond it [default: unlimited; 1024 for a dense cloud].
     #[arg(long, global = true, value_name = "MIB", value_parser = value_parser!(u32).range(1..))]
     pub(crate) max_memory: Option<u32>,
-    /// Seed of random choices [default: that of the pipeline]. The same seed gives the same result; commands that choose nothing at random
+    /// Seed of the random number generator [default: fixed per job]. The same seed gives the same result; commands without random sampling
     /// refuse it.
     #[arg(long, global = true, value_name = "S")]
     pub(crate) seed: Option<u64>,
-    /// Write DIR/report.html, one file with the pictures and figures of this run inside.
+    /// Write DIR/report.html, a self-contained page with the figures and measures of this run.
     #[arg(long, global = true, value_name = "DIR")]
     pub(crate) report: Option<PathBuf>,
-    /// Take options from this file [default: cv.toml, where the current folder has one]: a table for each command, such as [segment.train], with the long
-    /// names of its options as keys. The command line wins.
+    /// Read options from this file [default: cv.toml in the current folder, if present]: a table for each command, such as [segment.train], with the long
+    /// names of its options as keys. The command line takes precedence.
     #[arg(long, global = true, value_name = "FILE")]
     pub(crate) config: Option<PathBuf>,
-    /// Print the options that hold, as a file for --config, and do nothing.
+    /// Print the effective options as a file for --config, and exit.
     #[arg(long, global = true)]
     pub(crate) print_config: bool,
 }
 
-/// A global option that not every command has a use for.
+/// A global option that has no effect on some commands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Global {
     /// `--seed`
@@ -78,17 +78,17 @@ pub(crate) enum Global {
 
 /// A subcommand.
 pub(crate) trait Run: Args {
-    /// What this run will write. The frame checks before the work starts whether it can be written.
+    /// Returns the outputs of this run; the frame checks before the computation whether they can be written.
     fn outputs(&self) -> Vec<Output<'_>> {
         Vec::new()
     }
 
-    /// The steps of the work, in order, of which the progress bar tells the number.
+    /// Returns the steps of the command in order, for the progress bar.
     fn steps(&self) -> Vec<Step> {
         Vec::new()
     }
 
-    /// Those of the global options that mean nothing to it: given all the same, they are wrong usage.
+    /// Returns the global options without effect on the command; giving them is wrong usage.
     fn has_no_use_for(&self) -> &'static [Global] {
         &[]
     }
@@ -97,7 +97,7 @@ pub(crate) trait Run: Args {
     fn run(self, context: &Context) -> Result<Outcome, Failure>;
 }
 
-/// Runs a command under the global arguments and turns what comes of it into output and exit code.
+/// Runs a command with the global options and converts its result to output and exit code.
 pub(crate) fn run(
     globals: &Globals,
     called: Called,
@@ -105,23 +105,23 @@ pub(crate) fn run(
 ) -> ExitCode {
     let start = Instant::now();
     let limit = globals.max_memory.map_or_else(memory::default_limit, |mib| u64::from(mib) << 20);
-    // Nothing has set it before: this is the only place.
+    // This is the only place that sets it.
     let _ = cv_io::set_default_max_memory(limit);
     let context = Context::new(globals, called);
     let result = start_threads(globals.threads).and_then(|()| {
-        // A bug in the program is reported like any failure: the person sees what to do, scripts see exit code 1.
+        // A panic is reported like any failure, with a hint and exit code 1.
         catch_unwind(AssertUnwindSafe(|| command(&context))).unwrap_or_else(|_| {
-            Err(Failure::new("the program stopped at a bug of its own (see above)")
-                .advice("report it with the command line and, where you can, the input files"))
+            Err(Failure::new("internal error: the program panicked (see above)")
+                .advice("report this bug with the command line and, if possible, the input files"))
         })
     });
     context.clear_bar();
     let failure = match result {
-        // Ctrl-C came between the last file and here.
+        // A signal arrived after the last file was written.
         Ok(_) if !context.stop.finish() => return context.stop.end(),
         Ok(mut outcome) => {
-            let but = outcome.take_but();
-            match finish(outcome, context.take_stdout(), globals, start).err().or(but) {
+            let marked = outcome.take_failure();
+            match finish(outcome, context.take_stdout(), globals, start).err().or(marked) {
                 None => return ExitCode::SUCCESS,
                 Some(failure) => failure,
             }
@@ -141,7 +141,7 @@ fn start_threads(threads: Option<u16>) -> Result<(), Failure> {
     pool.build_global().during("cannot start the threads")
 }
 
-/// Prints what the person asked to see.
+/// Prints the JSON object, or the output for stdout and the summary.
 fn finish(outcome: Outcome, output: Vec<u8>, globals: &Globals, start: Instant) -> Result<(), Failure> {
     if globals.json {
         let object = outcome.into_json(start.elapsed().as_secs_f64())?;

@@ -1,9 +1,9 @@
-//! Arguments whose values are those of a library's enum.
+//! Arguments whose values are a library's enum.
 
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use cv_core::Named;
 
-/// Parses a value by its name in the library's own table of names, and shows that table in the help.
+/// Parses a value by its name in the library's table of names, and lists that table in the help.
 pub(crate) fn named<T: Named>() -> impl TypedValueParser<Value = T> {
     let values = T::NAMES.iter().map(|(name, value)| {
         let aliases = T::ALIASES.iter().filter(|(_, listed)| listed == name).map(|(alias, _)| *alias);
@@ -22,8 +22,8 @@ mod tests {
     use cv_pipeline::stereo::{Census, IntensityCost, Paths, Smoothing};
     use cv_pipeline::{AffineSimulation, Axes, FeatureMethod, ModelKind};
 
-    /// What the command line makes of every name, and of every other spelling.
-    fn goes_there_and_back<T: Named>() {
+    /// Checks that every name and alias is parsed to its value.
+    fn round_trips<T: Named>() {
         let command = clap::Command::new("cv").arg(clap::Arg::new("value").value_parser(named::<T>()));
         let parse =
             |text: &str| command.clone().try_get_matches_from(["cv", text]).map(|m| m.get_one::<T>("value").cloned());
@@ -38,23 +38,23 @@ mod tests {
     }
 
     #[test]
-    fn every_choice_of_the_libraries_goes_there_and_back() {
-        goes_there_and_back::<FeatureMethod>();
-        goes_there_and_back::<Suppression>();
-        goes_there_and_back::<AffineSimulation>();
-        goes_there_and_back::<ModelKind>();
-        goes_there_and_back::<CornerMeasure>();
-        goes_there_and_back::<ColorSpace>();
-        goes_there_and_back::<Rule>();
-        goes_there_and_back::<Regions>();
-        goes_there_and_back::<Census>();
-        goes_there_and_back::<Paths>();
-        goes_there_and_back::<IntensityCost>();
-        goes_there_and_back::<Smoothing>();
-        goes_there_and_back::<Projection>();
-        goes_there_and_back::<BlendMode>();
-        goes_there_and_back::<Seams>();
-        goes_there_and_back::<Exposure>();
-        goes_there_and_back::<Axes>();
+    fn the_names_of_all_library_enums_round_trip() {
+        round_trips::<FeatureMethod>();
+        round_trips::<Suppression>();
+        round_trips::<AffineSimulation>();
+        round_trips::<ModelKind>();
+        round_trips::<CornerMeasure>();
+        round_trips::<ColorSpace>();
+        round_trips::<Rule>();
+        round_trips::<Regions>();
+        round_trips::<Census>();
+        round_trips::<Paths>();
+        round_trips::<IntensityCost>();
+        round_trips::<Smoothing>();
+        round_trips::<Projection>();
+        round_trips::<BlendMode>();
+        round_trips::<Seams>();
+        round_trips::<Exposure>();
+        round_trips::<Axes>();
     }
 }

@@ -1,10 +1,10 @@
-//! What a command achieved.
+//! The result of a command.
 
 use super::Failure;
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
-/// What a command achieved: the JSON object, the stage times, and a summary for people.
+/// The result of a command: the JSON object, the stage times, and a summary for people.
 #[derive(Debug, Default)]
 pub(crate) struct Outcome {
     stages: Vec<(&'static str, f64)>,
@@ -12,11 +12,11 @@ pub(crate) struct Outcome {
     unserializable: Option<String>,
     summary: String,
     stdout: Vec<u8>,
-    but: Option<Failure>,
+    failure: Option<Failure>,
 }
 
 impl Outcome {
-    /// An outcome with the seconds of its stages.
+    /// Creates an outcome with the seconds of its stages.
     pub(crate) fn new(stages: Vec<(&'static str, f64)>) -> Self {
         Self { stages, ..Self::default() }
     }
@@ -32,41 +32,41 @@ impl Outcome {
         self
     }
 
-    /// The lines that a person sees on stderr when the job is done.
+    /// Sets the summary, printed on stderr at the end.
     pub(crate) fn summary(mut self, text: impl Into<String>) -> Self {
         self.summary = text.into();
         self
     }
 
-    /// Text that is the very result of the command: printed on stdout, or a key of the object under `--json`.
+    /// Sets text that is the result of the command: printed on stdout, or a key of the object under `--json`.
     pub(crate) fn text(mut self, key: &str, text: Vec<u8>) -> Self {
         self = self.with(key, String::from_utf8_lossy(&text));
         self.stdout = text;
         self
     }
 
-    /// The result is there and is printed, yet it is not what it should be: exit code 1 with this reason.
-    pub(crate) fn but(mut self, failure: Failure) -> Self {
-        self.but = Some(failure);
+    /// Marks a result that is printed but unusable: exit code 1 with this failure.
+    pub(crate) fn with_failure(mut self, failure: Failure) -> Self {
+        self.failure = Some(failure);
         self
     }
 
-    /// The failure of [`Outcome::but`].
-    pub(super) fn take_but(&mut self) -> Option<Failure> {
-        self.but.take()
+    /// Takes the failure of [`Outcome::with_failure`].
+    pub(super) fn take_failure(&mut self) -> Option<Failure> {
+        self.failure.take()
     }
 
-    /// What goes to stdout without `--json`.
+    /// Returns the text for stdout without `--json`.
     pub(super) fn stdout(&self) -> &[u8] {
         &self.stdout
     }
 
-    /// What a person sees on stderr.
+    /// Returns the summary for stderr.
     pub(super) fn summary_text(&self) -> &str {
         self.summary.trim_end()
     }
 
-    /// The object of `--json`, of a run that took `total` seconds.
+    /// Builds the object of `--json` for a run of `total` seconds.
     pub(super) fn into_json(mut self, total: f64) -> Result<Value, Failure> {
         if let Some(key) = self.unserializable {
             return Err(Failure::new(format!("cannot write the JSON value {key}")));

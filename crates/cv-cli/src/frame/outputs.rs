@@ -1,7 +1,7 @@
-//! Files to write: checked before the work, and never those that are read.
+//! Output files: checked before the computation, never equal to an input.
 //!
-//! Folders that are missing are made when the first file is ready to go there, not before: a job that fails leaves none behind. That they can be
-//! made, and written to, is found out before the work.
+//! Missing folders are created when the first file is ready to be written, so that a failed job leaves none behind. Whether they can be created and
+//! written to is checked before the computation.
 
 use super::{Context, Explain, Failure};
 use std::{
@@ -10,25 +10,25 @@ use std::{
     path::{Path, PathBuf},
 };
 
-/// Pictures for people.
+/// Extensions of images for people.
 pub(crate) const PICTURE: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff"];
-/// Pictures whose values must stay as they are.
+/// Extension of images that must be lossless.
 pub(crate) const PNG: &[&str] = &["png"];
-/// Maps of numbers.
+/// Extensions of float maps.
 pub(crate) const MAP: &[&str] = &["pfm", "npy", "png"];
-/// Clouds of points.
+/// Extension of point clouds.
 pub(crate) const CLOUD: &[&str] = &["ply"];
-/// Rows of numbers.
+/// Extension of text tables.
 pub(crate) const TEXT: &[&str] = &["txt"];
-/// Cameras and rigs.
+/// Extensions of cameras and rigs.
 pub(crate) const YAML: &[&str] = &["yaml", "yml"];
-/// Models.
+/// Extension of models and other JSON.
 pub(crate) const JSON: &[&str] = &["json"];
 
-/// Something that a command writes.
+/// An output of a command.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Output<'a> {
-    /// A file, and the endings that its name may have. Of stdout (`-`) and of a device the first one holds.
+    /// A file, and the allowed extensions. For stdout (`-`) and devices the first one applies.
     File(&'a Path, &'static [&'static str]),
     /// A folder of files.
     Folder(&'a Path),
@@ -41,12 +41,12 @@ impl<'a> Output<'a> {
         }
     }
 
-    /// Whether the format, if there are several, is told by the name of the file.
+    /// Whether the output is a named file or folder, whose extension selects the format (not stdout or a device).
     fn has_name(self) -> bool {
         !is_stdout(self.path()) && (self.path().is_dir() || self.path().is_file() || !self.path().exists())
     }
 
-    /// The folder that must be there.
+    /// The folder that must exist or be created.
     fn folder(self) -> &'a Path {
         match self {
             Self::File(path, _) => folder_of(path),
@@ -54,12 +54,12 @@ impl<'a> Output<'a> {
         }
     }
 
-    /// Whether it can be written, as far as can be told without writing it.
+    /// Checks whether it can be written, without writing it.
     fn check(self) -> Result<(), Failure> {
         let path = self.path();
         match self {
             Self::Folder(_) if is_stdout(path) => {
-                return Err(Failure::usage("- is stdout, and this output is a folder of files")
+                return Err(Failure::usage("- is stdout, but this output is a folder of files")
                     .advice("name a folder (./- for one of that name)"));
             }
             Self::File(..) if path.is_dir() || path.file_name().is_none() => {
@@ -68,10 +68,14 @@ impl<'a> Output<'a> {
             Self::File(_, endings) if self.has_name() => {
                 let ending = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
                 if !endings.contains(&ending.as_str()) {
-                    let what = if ending.is_empty() { "no ending".to_owned() } else { format!("the ending .{ending}") };
+                    let what =
+                        if ending.is_empty() { "no extension".to_owned() } else { format!("the extension .{ending}") };
                     let list: Vec<String> = endings.iter().map(|e| format!(".{e}")).collect();
-                    return Err(Failure::usage(format!("{} has {what}, which tells no format", path.display()))
-                        .advice(format!("a name that ends in {}", list.join(" or "))));
+                    return Err(Failure::usage(format!(
+                        "{} has {what}, which is not one of this output's formats",
+                        path.display()
+                    ))
+                    .advice(format!("a name with the extension {}", list.join(" or "))));
                 }
             }
             _ => {}
@@ -86,7 +90,7 @@ impl<'a> Output<'a> {
             return Err(cannot("is not a folder".to_owned()).advice("name an output in a folder"));
         }
         let readonly = fs::metadata(folder).is_ok_and(|data| data.permissions().readonly());
-        // A file without a name, which is gone at once.
+        // Tested with an unnamed temporary file, which is deleted at once.
         let refused = if readonly { Some("it is read-only".to_owned()) } else { probe(folder) };
         match refused {
             Some(why) => {
@@ -97,17 +101,17 @@ impl<'a> Output<'a> {
     }
 }
 
-/// Why no file can be made in a folder.
+/// Returns why no file can be created in a folder.
 fn probe(folder: &Path) -> Option<String> {
     tempfile::tempfile_in(folder).err().map(|error| error.to_string())
 }
 
-/// Whether a name stands for stdout.
+/// Whether a path means stdout.
 fn is_stdout(path: &Path) -> bool {
     path.as_os_str() == "-"
 }
 
-/// Finds out before the work whether its results can be written. The report may go into a folder of results.
+/// Checks before the computation whether the results can be written. The report may share a folder with them.
 pub(super) fn check(outputs: &[Output<'_>], report: Option<&Path>, json: bool) -> Result<(), Failure> {
     for (i, output) in outputs.iter().enumerate() {
         let path = output.path();
@@ -123,7 +127,7 @@ pub(super) fn check(outputs: &[Output<'_>], report: Option<&Path>, json: bool) -
     for output in outputs.iter().copied().chain(report.map(Output::Folder)) {
         output.check()?;
         if output.has_name() {
-            // Of runs that were killed while they wrote.
+            // Temporary files of killed runs.
             cv_io::remove_abandoned(output.folder());
         }
     }
@@ -131,16 +135,16 @@ pub(super) fn check(outputs: &[Output<'_>], report: Option<&Path>, json: bool) -
 }
 
 impl Context {
-    /// Writes an output by `write`, which is given its path. Its folder is made; where `write` fails, it is removed again.
+    /// Writes an output by `write`, which gets its path. Creates its folder, and removes it again if `write` fails.
     ///
-    /// What goes to stdout or to a device is written to a temporary file first: whole or not at all there too.
+    /// Output for stdout or a device is written to a temporary file first, so that it is complete or absent.
     pub(crate) fn write<T, E: Into<Failure>>(
         &self,
         output: Output<'_>,
         write: impl FnOnce(&Path) -> Result<T, E>,
     ) -> Result<T, Failure> {
         if let (Output::File(path, endings), false) = (output, output.has_name()) {
-            let folder = tempfile::tempdir().during("cannot make a temporary folder")?;
+            let folder = tempfile::tempdir().during("cannot create a temporary folder")?;
             let file = folder.path().join("output").with_extension(endings.first().unwrap_or(&""));
             let result = write(&file).map_err(Into::into)?;
             let bytes = cv_io::read_bytes(&file)?;
@@ -156,7 +160,7 @@ impl Context {
         }
         let made = make_folders(output.folder())?;
         write(output.path()).map_err(|error| {
-            // Those that are empty.
+            // Only empty folders are removed.
             made.iter().for_each(|folder| drop(fs::remove_dir(folder)));
             error.into()
         })
@@ -170,24 +174,24 @@ fn folder_of(path: &Path) -> &Path {
     }
 }
 
-/// The folder itself, or the nearest one above it that is there.
+/// Returns the folder itself or its nearest existing ancestor.
 fn nearest(folder: &Path) -> &Path {
     folder.ancestors().find(|above| above.exists()).unwrap_or(Path::new("."))
 }
 
-/// Makes a folder and those above it. Gives those that were missing, the innermost first.
+/// Creates a folder and its ancestors. Returns those that were missing, the innermost first.
 fn make_folders(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
     let missing: Vec<PathBuf> = folder.ancestors().take_while(|above| !above.exists()).map(Path::to_owned).collect();
-    fs::create_dir_all(folder).during(format!("cannot make the folder {}", folder.display()))?;
+    fs::create_dir_all(folder).during(format!("cannot create the folder {}", folder.display()))?;
     Ok(missing)
 }
 
-/// Whether two paths lead to one file. What cannot be looked at does not exist yet, or will be told of when it is read.
+/// Whether two paths are the same file. False if one does not exist.
 pub(crate) fn same_file(a: &Path, b: &Path) -> bool {
     matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b)
 }
 
-/// Refuses two inputs that would become one output; `outputs[i]` is that of `inputs[i]`.
+/// Refuses two inputs with the same output; `outputs[i]` is that of `inputs[i]`.
 pub(crate) fn one_each(inputs: &[PathBuf], outputs: &[PathBuf]) -> Result<(), Failure> {
     let mut order: Vec<usize> = (0..inputs.len().min(outputs.len())).collect();
     order.sort_by_key(|i| &outputs[*i]);
@@ -198,15 +202,15 @@ pub(crate) fn one_each(inputs: &[PathBuf], outputs: &[PathBuf]) -> Result<(), Fa
             inputs[pair[1]].display(),
             outputs[pair[0]].display()
         ))
-        .advice("run them into different folders")),
+        .advice("process them into different folders")),
         None => Ok(()),
     }
 }
 
-/// Refuses to write over what is read: outputs whose names the person did not type.
+/// Refuses to overwrite an input by an output with a derived name.
 pub(crate) fn spare_inputs(outputs: &[PathBuf], inputs: &[&Path]) -> Result<(), Failure> {
     match outputs.iter().find(|output| inputs.iter().any(|input| same_file(output, input))) {
-        Some(path) => Err(Failure::new(format!("{} would be written over, and is read", path.display()))
+        Some(path) => Err(Failure::new(format!("{} is an input and would be overwritten", path.display()))
             .advice("give another folder for the results")),
         None => Ok(()),
     }

@@ -1,4 +1,4 @@
-//! The steps of commands, by the stages that the libraries report.
+//! The steps of the progress bar, and the library stages that belong to each.
 
 use super::progress::Step;
 
@@ -22,7 +22,7 @@ steps! {
     BLEND = "blend": ["blend", "crop"];
     RECTIFY = "rectify": ["rectify", "reduce"];
     DISPARITIES = "disparities": ["prepare", "bits", "path sums", "aggregate", "check", "refine"];
-    EXPAND = "quality": ["expand"];
+    EXPAND = "local expansion": ["expand"];
     DEPTH = "depth": ["depth"];
     CLOUD = "cloud": ["cloud"];
     FRAMES = "frames": ["frames"];

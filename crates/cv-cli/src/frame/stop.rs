@@ -1,4 +1,4 @@
-//! Ctrl-C, and being told to terminate: the command gives up, nothing is left behind.
+//! SIGINT (Ctrl-C) and SIGTERM: the command is cancelled and leaves nothing behind.
 
 use super::progress::Bar;
 use cv_pipeline::Cancelled;
@@ -10,29 +10,29 @@ use std::{
     },
 };
 
-/// As shells have it for a program that Ctrl-C ended: 128 and the number of the signal.
+/// Exit code of a program ended by SIGINT, by shell convention: 128 plus the number of the signal.
 const EXIT_CODE: u8 = 130;
 
-/// Whether the person asked the program to stop.
+/// Cancellation of the program by signals.
 #[derive(Clone)]
 pub(super) struct Stop {
-    asked: Arc<AtomicBool>,
-    /// Whether it is decided how the program ends: by its result or as stopped.
+    requested: Arc<AtomicBool>,
+    /// Whether it is decided how the program ends: with its result or as stopped.
     decided: Arc<AtomicBool>,
     bar: Arc<Bar>,
 }
 
 impl Stop {
-    /// Listens from now on. The first signal asks the command to stop; where that takes long (a picture of a hundred megapixels is
-    /// being encoded, say), and at the second signal, the program ends all the same.
+    /// Installs the signal handlers. The first signal requests cancellation; if that takes long (while a large image is encoded, for
+    /// example), or at the second signal, the process exits.
     pub(super) fn listen(bar: &Arc<Bar>) -> Self {
-        let stop = Self { asked: Arc::default(), decided: Arc::default(), bar: bar.clone() };
+        let stop = Self { requested: Arc::default(), decided: Arc::default(), bar: bar.clone() };
         #[cfg(unix)]
         stop.listen_to_signals();
         stop
     }
 
-    /// Where signals cannot be listened to, they end the program as if this were not here.
+    /// If the handlers cannot be installed, signals keep their default action.
     #[cfg(unix)]
     fn listen_to_signals(&self) {
         use signal_hook::{
@@ -43,7 +43,7 @@ impl Stop {
             thread,
             time::{Duration, Instant},
         };
-        /// Time that a command has to give up by itself. Memory of gigabytes takes some more to be given back.
+        /// Time for a command to return by itself; freeing gigabytes of memory may take longer.
         const GRACE: Duration = Duration::from_millis(100);
         let Ok(mut signals) = Signals::new([SIGINT, SIGTERM]) else { return };
         let stop = self.clone();
@@ -51,7 +51,7 @@ impl Stop {
             if signals.forever().next().is_none() {
                 return;
             }
-            stop.asked.store(true, Ordering::Relaxed);
+            stop.requested.store(true, Ordering::Relaxed);
             let mut wait = || {
                 let end = Instant::now() + GRACE;
                 while Instant::now() < end && signals.pending().next().is_none() {
@@ -60,26 +60,26 @@ impl Stop {
             };
             wait();
             cv_io::abandon_writes();
-            if !stop.tell() {
-                // The result is being printed, maybe into a pipe that nobody reads.
+            if !stop.announce() {
+                // The result is being printed, possibly into a blocked pipe.
                 wait();
             }
             std::process::exit(EXIT_CODE.into());
         });
     }
 
-    /// Whether the command is to go on.
+    /// Returns `Cancelled` if cancellation was requested.
     pub(super) fn check(&self) -> Result<(), Cancelled> {
-        if self.asked.load(Ordering::Relaxed) { Err(Cancelled) } else { Ok(()) }
+        if self.requested.load(Ordering::Relaxed) { Err(Cancelled) } else { Ok(()) }
     }
 
-    /// Decides that the program ends by its result, which is printed next. False where it has ended as stopped already.
+    /// Decides that the program ends with its result, which is printed next. False if it was stopped before.
     pub(super) fn finish(&self) -> bool {
         !self.decided.swap(true, Ordering::Relaxed)
     }
 
-    /// Decides that the program ends as stopped, and says so. False where it was decided before.
-    fn tell(&self) -> bool {
+    /// Decides that the program ends as stopped, and prints that. False if the end was decided before.
+    fn announce(&self) -> bool {
         let first = self.finish();
         if first {
             self.bar.clear();
@@ -90,7 +90,7 @@ impl Stop {
 
     /// Ends the program as stopped.
     pub(super) fn end(&self) -> ExitCode {
-        self.tell();
+        self.announce();
         ExitCode::from(EXIT_CODE)
     }
 }

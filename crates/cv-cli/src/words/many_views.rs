@@ -1,34 +1,34 @@
-//! What the program says of models of many photographs: why there is none, and why photographs are left out.
+//! Messages about structure from motion: why there is no model, and why photographs are not registered.
 
-use super::{Failure, unreadable, words};
+use super::{Failure, advice_text, unreadable};
 use cv_core::GeodeticPoint;
 use cv_io::IoError;
 use cv_pipeline::many_views::{CenterFit, ModelAlignError, PairRefusal, RefusedPair, SfmError, ViewOutcome};
 use cv_pipeline::{Advice, SfmDenseError, SfmJobError};
 use std::path::{Path, PathBuf};
 
-/// Why a photograph is in no model; `None` where it is in one.
+/// Words why a photograph is not registered; `None` if it is.
 pub(crate) fn left_out(outcome: &ViewOutcome) -> Option<String> {
     match *outcome {
         ViewOutcome::Registered { .. } => None,
         ViewOutcome::NoPairs => {
-            Some("no other photograph shows enough of the same; try photographs in between".to_owned())
+            Some("it has too little overlap with every other photograph; try photographs in between".to_owned())
         }
-        ViewOutcome::TooFewPoints { seen, needed } => {
-            Some(format!("it sees {seen} points of the model where {needed} are needed; try photographs in between"))
-        }
+        ViewOutcome::TooFewPoints { seen, needed } => Some(format!(
+            "it has {seen} correspondences to points of the model, {needed} are needed; try photographs in between"
+        )),
         ViewOutcome::NoPose { seen, agree, needed } => Some(format!(
-            "of the {seen} points of the model that it seems to see {agree} agree with a pose where {needed} are needed: things that look alike, or that moved"
+            "{agree} of its {seen} correspondences to points of the model are inliers of a pose, {needed} are needed: repeated structure or moving objects"
         )),
     }
 }
 
-/// How many pairs of photographs were not used, by the reason.
+/// Numbers of refused pairs of photographs, by reason.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) struct RefusedPairs {
-    /// Their rotations contradict those of other pairs.
+    /// Refused by the cycle consistency of rotations in triplets.
     pub(crate) triplets: usize,
-    /// They show different things that look alike.
+    /// Refused as repeated structure: different objects of the same appearance.
     pub(crate) repeated: usize,
 }
 
@@ -38,95 +38,95 @@ impl RefusedPairs {
         Self { triplets, repeated: all.len() - triplets }
     }
 
-    /// What is said of them, if there are any, among so many pairs.
+    /// Words the refused pairs among `pairs`, if there are any.
     pub(crate) fn text(self, pairs: usize) -> Option<String> {
         let Self { triplets, repeated } = self;
         let mut reasons = Vec::new();
         if triplets > 0 {
-            reasons.push(format!("{triplets} by triplets (their rotations contradict those of other pairs)"));
+            reasons.push(format!("{triplets} by triplets (inconsistent relative rotations)"));
         }
         if repeated > 0 {
-            reasons.push(format!("{repeated} as repeated structure (different things that look alike)"));
+            reasons.push(format!("{repeated} as repeated structure (different objects of the same appearance)"));
         }
         (!reasons.is_empty())
             .then(|| format!("{} of {pairs} pairs refused: {}", triplets + repeated, reasons.join(", ")))
     }
 }
 
-/// Why a photograph is not looked at.
+/// Words why a photograph cannot be read.
 pub(crate) fn not_read(error: &IoError) -> String {
     let hint = unreadable(&error.reason).map_or_else(String::new, |hint| format!("; try: {hint}"));
     format!("it cannot be read: {}{hint}", error.reason)
 }
 
-/// Why there is no work to be done: so many of the photographs that were named can be looked at, and what is said of the others.
+/// Words that fewer than two photographs are usable, with the reasons for the others.
 pub(crate) fn too_few(usable: usize, refused: &[(&Path, &str)]) -> Failure {
     let named = usable + refused.len();
-    let mut what = format!("{usable} of {named} photographs can be used, and two at least are needed");
-    for (i, (path, reason)) in refused.iter().take(SHOWN).enumerate() {
+    let mut what = format!("{usable} of {named} photographs can be used, at least two are needed");
+    for (i, (path, reason)) in refused.iter().take(MAX_SHOWN).enumerate() {
         what += &format!("{}{}: {reason}", if i == 0 { " (" } else { "; " }, path.display());
     }
     if !refused.is_empty() {
-        what += if refused.len() > SHOWN { "; …)" } else { ")" };
+        what += if refused.len() > MAX_SHOWN { "; …)" } else { ")" };
     }
-    Failure::new(what).advice("ten or more different photographs of one place")
+    Failure::new(what).advice("ten or more different photographs of one scene")
 }
 
-/// Reasons that stand in one line, at most.
-const SHOWN: usize = 3;
+/// Maximum number of reasons in a message.
+const MAX_SHOWN: usize = 3;
 
-/// Why there is no model.
+/// Words a failed reconstruction.
 pub(crate) fn no_model(error: SfmJobError) -> Failure {
     let advice = match &error {
         SfmJobError::Cancelled(_) => return error.into(),
         SfmJobError::NoPairs { .. } => {
-            "sharp photographs of one place, with texture, each of which shows more than half of what its neighbor shows".to_owned()
+            "sharp photographs of one textured scene, each overlapping its neighbor by more than half".to_owned()
         }
         SfmJobError::Solve(SfmError::NoInitialPair { .. }) => {
-            "walk along between the photographs: turning on the spot tells no depth (to join photographs from one place use `cv panorama`); a focal length, where EXIF has none or a wrong one (--focal, --ignore-exif)".to_owned()
+            "move the camera between the photographs: a pure rotation gives no depth (to stitch photographs from one place use `cv panorama`); a focal length, if EXIF has none or a wrong one (--focal, --ignore-exif)".to_owned()
         }
         SfmJobError::Solve(SfmError::Inconsistent { .. }) => {
-            "about the right focal length (--focal), or --ignore-exif where EXIF's is wrong; leave out photographs of other places that look alike".to_owned()
+            "an approximately correct focal length (--focal), or --ignore-exif if that of EXIF is wrong; leave out photographs of similar but different places".to_owned()
         }
-        SfmJobError::Option(_) | SfmJobError::Solve(SfmError::Option(_)) => words(Advice::CheckOptions),
+        SfmJobError::Option(_) | SfmJobError::Solve(SfmError::Option(_)) => advice_text(Advice::CheckOptions),
         _ => return error.into(),
     };
     Failure::from(error).advice(advice)
 }
 
-/// Why there is no dense cloud of a model, which is written all the same.
+/// Words a failed dense reconstruction; the model itself is written.
 pub(crate) fn no_dense_cloud(error: SfmDenseError) -> Failure {
     let advice = match &error {
         SfmDenseError::NoPairs { .. } => {
-            "more photographs, a step of a tenth of the distance apart, each of which shows most of what its neighbor shows"
+            "more photographs, at baselines of a tenth of the distance and with large overlap"
         }
         SfmDenseError::NoDepths { .. } | SfmDenseError::NoAgreement { .. } => {
-            "three photographs or more of each thing, from nearer to each other, of things with texture that stand still; a larger --dense-size"
+            "three or more photographs of each surface, at smaller baselines, of a static scene with texture; a larger --dense-size"
         }
         _ => return error.into(),
     };
     Failure::from(error).advice(advice)
 }
 
-/// By what a place is known.
+/// The source of known camera positions.
 #[derive(Clone)]
 pub(crate) enum PlaceSource {
-    /// The photographs' EXIF: the place of the origin, and whether heights are told.
+    /// GPS positions in EXIF: the geodetic origin, and whether altitudes are known.
     Gps { origin: GeodeticPoint, heights: bool },
-    /// A file that the person names.
+    /// The file of `--known`.
     File(PathBuf),
 }
 
 impl PlaceSource {
-    /// What it is called.
+    /// Returns its name for messages.
     pub(crate) fn name(&self) -> String {
         match self {
             Self::Gps { .. } => "the GPS positions".to_owned(),
-            Self::File(path) => format!("the places of {}", path.display()),
+            Self::File(path) => format!("the positions of {}", path.display()),
         }
     }
 
-    /// The same for programs.
+    /// Returns its key in JSON.
     pub(crate) fn key(&self) -> &'static str {
         match self {
             Self::Gps { .. } => "gps",
@@ -134,35 +134,37 @@ impl PlaceSource {
         }
     }
 
-    /// Why a model is not brought to places; nothing is to be said of photographs of which too few tell their position.
+    /// Words why a model is not aligned to the positions; `None` if too few photographs have GPS positions.
     pub(crate) fn refusal(&self, error: &ModelAlignError) -> Option<String> {
         match error {
             ModelAlignError::TooFew { got, needed } => match self {
                 Self::Gps { .. } => None,
-                Self::File(_) => {
-                    Some(format!("{got} of them are of photographs in the model, and {needed} are needed"))
-                }
+                Self::File(_) => Some(format!("{got} of them belong to photographs of the model, {needed} are needed")),
             },
-            ModelAlignError::OnePlace => Some("they are all one place".to_owned()),
+            ModelAlignError::OnePlace => Some("they are all at one position".to_owned()),
             ModelAlignError::Contradiction { agree, of, rms, spread } => Some(format!(
-                "they contradict it: {agree} of {of} agree, to {rms:.2} m where they are {spread:.2} m around their mean"
+                "they contradict it: {agree} of {of} are inliers, with {rms:.2} m RMS at a spread of {spread:.2} m around their mean"
             )),
             other => Some(other.to_string()),
         }
     }
 }
 
-/// What frame a model is in that was brought to known places.
+/// Describes the frame of a georeferenced model.
 pub(crate) fn aligned(source: &PlaceSource, fit: &CenterFit) -> String {
     let (count, rms) = (fit.inliers.len(), fit.rms);
-    let tilt = if fit.tilt { "" } else { "; they lie on a line, so that up is that of the photographs" };
+    let tilt = if fit.tilt {
+        ""
+    } else {
+        "; the positions are collinear, so that the up direction is estimated from the photographs"
+    };
     match source {
         PlaceSource::Gps { origin, heights } => {
             let side = |v: f64, [plus, minus]: [&str; 2]| {
                 format!("{:.6}° {}", v.to_degrees().abs(), if v < 0.0 { minus } else { plus })
             };
             let place = format!("{}, {}", side(origin.latitude, ["N", "S"]), side(origin.longitude, ["E", "W"]));
-            let height = if *heights { "" } else { "; no heights are told" };
+            let height = if *heights { "" } else { "; altitudes are unknown" };
             format!(
                 "in meters by the GPS positions of {count} photographs ({rms:.2} m RMS): X east, Y north, Z up from {place}{height}{tilt}"
             )
@@ -173,22 +175,23 @@ pub(crate) fn aligned(source: &PlaceSource, fit: &CenterFit) -> String {
     }
 }
 
-/// Relative differences of which the person is told: of known distances among each other, and of the scale by positions from that by distances.
-pub(crate) const DISTANCES_DIFFER: f64 = 0.02;
-pub(crate) const SCALES_DIFFER: f64 = 0.1;
+/// Relative residual of a known distance above which a warning is given.
+pub(crate) const MAX_DISTANCE_RESIDUAL: f64 = 0.02;
+/// Relative difference of the scales by positions and by distances above which a warning is given.
+pub(crate) const MAX_SCALE_DIFFERENCE: f64 = 0.1;
 
-/// Known distances that contradict each other.
+/// Words contradicting known distances.
 pub(crate) fn distances_differ(error: f64) -> String {
-    format!("the distances of --distance contradict each other: one differs from the model by {:.1} %", 100.0 * error)
+    format!("the distances of --distance contradict each other: the largest residual is {:.1} %", 100.0 * error)
 }
 
-/// Known places that do not agree with a model that others agree with: the photographs and by how many meters.
+/// Words outliers among the known positions: `differ` has their photographs and residuals in meters.
 pub(crate) fn places_differ(source: &PlaceSource, differ: &[(&Path, f64)], rms: f64) -> String {
     let shown: Vec<String> =
-        differ.iter().take(SHOWN).map(|(path, off)| format!("{} by {off:.1} m", path.display())).collect();
-    let more = if differ.len() > SHOWN { ", …" } else { "" };
+        differ.iter().take(MAX_SHOWN).map(|(path, off)| format!("{} by {off:.1} m", path.display())).collect();
+    let more = if differ.len() > MAX_SHOWN { ", …" } else { "" };
     format!(
-        "of {} {} differ from the model by much more than the others ({rms:.2} m RMS) and are left aside: {}{more}",
+        "of {} {} are outliers with respect to the model ({rms:.2} m RMS of the others) and are ignored: {}{more}",
         source.name(),
         differ.len(),
         shown.join(", ")
@@ -209,12 +212,12 @@ mod tests {
             "{}",
             text(2)
         );
-        assert_eq!(text(9).matches("blue").count(), SHOWN);
+        assert_eq!(text(9).matches("blue").count(), MAX_SHOWN);
         assert!(text(9).contains("…)"));
     }
 
     #[test]
-    fn refused_pairs_are_told_by_their_reasons() {
+    fn refused_pairs_are_counted_by_reason() {
         let of = |reason| RefusedPair { pair: 0, reason };
         let repeated = [
             of(PairRefusal::Repeated { found: 0.2, expected: 0.6 }),
@@ -232,9 +235,11 @@ mod tests {
     }
 
     #[test]
-    fn what_there_is_to_try_stands_behind_the_reason() {
+    fn remedies_follow_the_reason() {
         let text = no_model(SfmJobError::Solve(SfmError::NoInitialPair { pairs: 7 })).text();
-        assert!(text.contains("none of 7 pairs") && text.contains("; try: walk along") && text.contains("cv panorama"));
+        assert!(
+            text.contains("none of 7 pairs") && text.contains("; try: move the camera") && text.contains("cv panorama")
+        );
         assert!(no_model(SfmJobError::NoPairs { photos: 3 }).text().contains("of 3 photographs"));
     }
 }

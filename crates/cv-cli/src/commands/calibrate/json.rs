@@ -1,12 +1,12 @@
 //! The JSON object of a calibration.
 
 use super::Job;
-use crate::boards::options;
+use crate::boards::board_options;
 use crate::frame::Outcome;
 use crate::words::calibration::{lens, note, refusal};
 use serde_json::{Map, Value, json};
 
-/// Values of each camera under its name; of one camera its value.
+/// Maps camera names to values; for a single camera, the value alone.
 fn by_camera(job: &Job, of: impl Fn(usize) -> Value) -> Value {
     match job.names.as_slice() {
         [_] => of(0),
@@ -17,8 +17,8 @@ fn by_camera(job: &Job, of: impl Fn(usize) -> Value) -> Value {
 pub(super) fn outcome(job: &Job) -> Outcome {
     let found = &job.found;
     let c = &found.calibration;
-    let parameters = |of: Option<usize>| -> Map<String, Value> {
-        let own = c.parameters.iter().filter(|p| p.camera == of);
+    let parameters = |camera: Option<usize>| -> Map<String, Value> {
+        let own = c.parameters.iter().filter(|p| p.camera == camera);
         own.map(|p| (p.name.to_owned(), json!({ "value": p.value, "deviation": p.deviation }))).collect()
     };
     let mut all = match job.names.as_slice() {
@@ -100,7 +100,7 @@ pub(super) fn outcome(job: &Job) -> Outcome {
                 "kind": found.board.kind().to_string(),
                 "columns": found.board.counts().0,
                 "rows": found.board.counts().1,
-                "options": options(&found.board),
+                "options": board_options(&found.board),
             }),
         )
         .with("board_deflection", json!({ "x": c.target_shape.deflection[0], "y": c.target_shape.deflection[1], "adjusted": c.target_shape.adjusted }))

@@ -4,7 +4,7 @@ mod json;
 mod report;
 
 use super::depth::pairing::{PairBy, join};
-use crate::boards::{BoardArgs, told};
+use crate::boards::{BoardArgs, describe_board};
 use crate::frame::{
     Context, Failure, Global, Outcome, Output, Run, Step, YAML, expand_images, named, spare_inputs, steps,
 };
@@ -18,8 +18,8 @@ use std::sync::{Mutex, PoisonError};
 
 /// Calibrate a camera, or the cameras of a rig, from photographs of a board (chessboard, ChArUco, ArUco grid, AprilGrid).
 ///
-/// Finds the board, chooses the lens model, adjusts lenses, poses and the shape of the board together, leaves out what does not fit and says why, and tells how far
-/// the result can be trusted and what to photograph next.
+/// Detects the board, selects the distortion model by cross-validation, jointly refines intrinsics, poses and the shape of the board, rejects outliers with a reason,
+/// reports the uncertainty of the result, and advises which photographs to add.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv calibrate mono --board 9x6 --square 25 photos/*.jpg -o camera.yaml --report out\n  \
@@ -37,21 +37,21 @@ enum What {
     Rig(Rig),
 }
 
-/// The board, and how cameras are fitted to it.
+/// The board and the options of the fit.
 #[derive(Debug, clap::Args)]
 struct Board {
     #[command(flatten)]
     board: BoardArgs,
-    /// Unit of --square and --marker; without them distances are in squares.
+    /// Unit of --square and --marker; without them, lengths are in squares.
     #[arg(long, value_name = "UNIT", default_value = "mm", value_parser = ["mm", "cm", "m"])]
     unit: String,
-    /// Lens model.
+    /// Distortion model.
     #[arg(long, value_parser = named::<LensChoice>(), default_value_t)]
     lens: LensChoice,
-    /// Take the board as flat; else two numbers of its shape are adjusted, as paper bends.
+    /// Assume a flat board; by default two deflection parameters of its shape are estimated, since paper bends.
     #[arg(long)]
     flat: bool,
-    /// Leave out corners that are more than so many standard deviations from where they should be.
+    /// Reject corners whose residual exceeds this many standard deviations.
     #[arg(long, value_name = "N", default_value_t = CalibrateOptions::default().outlier_deviations)]
     outliers: f64,
 }
@@ -67,7 +67,7 @@ impl Board {
         Ok(BoardCalibrationOptions { board: self.board.choice()?, solve, ..BoardCalibrationOptions::default() })
     }
 
-    /// The unit of distances.
+    /// Returns the unit of lengths.
     fn unit(&self) -> &str {
         if self.board.has_lengths() { &self.unit } else { "squares" }
     }
@@ -91,9 +91,9 @@ struct Mono {
     output: PathBuf,
 }
 
-/// Calibrate two cameras that are fixed to each other.
+/// Calibrate a stereo rig: two rigidly mounted cameras.
 ///
-/// Photographs are paired by name, or by the last number in the name. A photograph without a partner serves for its own camera.
+/// Photographs are paired by name, or by the last number in the name. An unpaired photograph is used for its own camera only.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv calibrate stereo --board 9x6 --square 25 --left left --right right -o rig.yaml\n  \
@@ -105,7 +105,7 @@ struct Stereo {
     /// Photographs of the right (or lower) camera.
     #[arg(long, value_name = "FILES", num_args = 1.., required = true)]
     right: Vec<PathBuf>,
-    /// How photographs are paired [default: by name where the names are the same, else by number].
+    /// How photographs are paired [default: by name if the names are the same, else by number].
     #[arg(long, value_name = "HOW", value_parser = named::<PairBy>())]
     pair_by: Option<PairBy>,
     #[command(flatten)]
@@ -115,19 +115,19 @@ struct Stereo {
     output: PathBuf,
 }
 
-/// Calibrate two or more cameras that are fixed to each other.
+/// Calibrate a rig of two or more rigidly mounted cameras.
 ///
-/// Photographs of one moment are told by the same name, or by the last number in the name. A camera need not share moments with the first one, only with another that does. Two
-/// cameras are written as by `cv calibrate stereo`; what more than two are written to, `cv calibration convert` takes to Kalibr.
+/// Simultaneous photographs have the same name or the same last number in the name. Each camera must share photographs with another one, not necessarily with the first. Two
+/// cameras are written as by `cv calibrate stereo`; rigs of more cameras can be converted for Kalibr by `cv calibration convert`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv calibrate rig --board 9x6 --square 25 --cameras left right third -o rig.yaml\n  \
     cv calibrate rig --kind aprilgrid --board 6x6 --marker 0.045 --unit m --cameras 'cam0/*.png' 'cam1/*.png' 'cam2/*.png' -o rig.yaml")]
 struct Rig {
-    /// The photographs of each camera: a folder or a quoted pattern for each, the first camera's first.
+    /// The photographs of each camera: one folder or quoted pattern per camera; the first is the reference camera.
     #[arg(long, value_name = "FOLDER", num_args = 1.., required = true)]
     cameras: Vec<PathBuf>,
-    /// How photographs are put together [default: by name where the names are the same, else by number].
+    /// How simultaneous photographs are grouped [default: by name if the names are the same, else by number].
     #[arg(long, value_name = "HOW", value_parser = named::<PairBy>())]
     pair_by: Option<PairBy>,
     #[command(flatten)]
@@ -163,14 +163,14 @@ impl Run for Args {
     }
 }
 
-/// The photographs of each view, by camera.
+/// The photographs of each view (moment), by camera.
 type Views = Vec<Vec<Option<PathBuf>>>;
 
-/// A job that is done, with what it was done on.
+/// A finished calibration and its inputs.
 struct Job {
     found: BoardCalibration,
     views: Views,
-    /// Of the cameras.
+    /// Names of the cameras.
     names: Vec<String>,
     unit: String,
 }
@@ -179,7 +179,7 @@ impl Mono {
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
         let images = expand_images(&self.images)?;
         let views: Views = images.into_iter().map(|path| vec![Some(path)]).collect();
-        let job = work(views, vec!["camera".to_owned()], &self.board, &self.output, context)?;
+        let job = calibrate_views(views, vec!["camera".to_owned()], &self.board, &self.output, context)?;
         let camera = &job.found.calibration.cameras[0].camera;
         let notes = job.origin();
         context.write(Output::File(&self.output, YAML), |path| cv_io::write_camera(path, camera, &[&notes]))?;
@@ -193,10 +193,10 @@ impl Stereo {
         let views = join(&images, self.pair_by)?;
         let alone = views.iter().filter(|view| view.iter().any(Option::is_none)).count();
         if alone > 0 {
-            context.note(format!("{alone} photographs have no partner and serve for their own camera only"));
+            context.note(format!("{alone} photographs are unpaired and are used for their own camera only"));
         }
         let names = ["left", "right"].map(str::to_owned).to_vec();
-        let job = work(views, names, &self.board, &self.output, context)?;
+        let job = calibrate_views(views, names, &self.board, &self.output, context)?;
         job.write(&self.output, context)?;
         job.finish(context)
     }
@@ -206,7 +206,7 @@ impl Rig {
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
         let count = self.cameras.len();
         if count < 2 {
-            return Err(Failure::usage("a rig has two cameras or more, and one is given")
+            return Err(Failure::usage("a rig needs two or more cameras, got one")
                 .advice("a folder for each camera, --cameras left right third, or `cv calibrate mono`"));
         }
         let images: Vec<Vec<PathBuf>> =
@@ -214,29 +214,34 @@ impl Rig {
         let views = join(&images, self.pair_by)?;
         let alone = views.iter().filter(|view| view.iter().flatten().count() < 2).count();
         if alone > 0 {
-            context.note(format!(
-                "{alone} photographs are the only ones of their moment and serve for their own camera only"
-            ));
+            context
+                .note(format!("{alone} photographs have no simultaneous one and are used for their own camera only"));
         }
-        // The folders' names, where they tell cameras apart.
+        // The names of the folders, if they are unique.
         let mut names: Vec<String> = (self.cameras.iter())
             .map(|path| path.file_name().filter(|_| path.is_dir()).unwrap_or_default().to_string_lossy().into_owned())
             .collect();
-        let told = |name: &String| {
+        let is_unique = |name: &String| {
             let plain = name.chars().all(|c| c.is_ascii_alphanumeric() || "_-".contains(c));
             plain && !name.is_empty() && names.iter().filter(|other| *other == name).count() == 1
         };
-        if !names.iter().all(told) {
+        if !names.iter().all(is_unique) {
             names = (0..count).map(|i| format!("cam{i}")).collect();
         }
-        let job = work(views, names, &self.board, &self.output, context)?;
+        let job = calibrate_views(views, names, &self.board, &self.output, context)?;
         job.write(&self.output, context)?;
         job.finish(context)
     }
 }
 
-/// Reads photographs one after the other, finds the boards and calibrates.
-fn work(views: Views, names: Vec<String>, board: &Board, output: &Path, context: &Context) -> Result<Job, Failure> {
+/// Reads the photographs one at a time, detects the boards and calibrates.
+fn calibrate_views(
+    views: Views,
+    names: Vec<String>,
+    board: &Board,
+    output: &Path,
+    context: &Context,
+) -> Result<Job, Failure> {
     let inputs: Vec<&Path> = views.iter().flatten().flatten().map(PathBuf::as_path).collect();
     spare_inputs(&[output.to_owned()], &inputs)?;
     let options = board.options()?;
@@ -262,7 +267,7 @@ fn work(views: Views, names: Vec<String>, board: &Board, output: &Path, context:
         Err(error) => {
             let reasons = match &error {
                 BoardCalibrationError::NoBoards { refusals } | BoardCalibrationError::Calibrate { refusals, .. } => {
-                    commonest(refusals)
+                    most_common_refusal(refusals)
                 }
                 _ => String::new(),
             };
@@ -271,8 +276,8 @@ fn work(views: Views, names: Vec<String>, board: &Board, output: &Path, context:
     }
 }
 
-/// The reason that most photographs are left out for, in parentheses; empty where none is.
-fn commonest(refusals: &[Vec<Option<PhotoRefusal>>]) -> String {
+/// Returns the most common reason for rejected photographs, in parentheses; empty if none is rejected.
+fn most_common_refusal(refusals: &[Vec<Option<PhotoRefusal>>]) -> String {
     let mut counts: Vec<(String, usize)> = Vec::new();
     for refused in refusals.iter().flatten().flatten().filter(|r| **r != PhotoRefusal::NoPhoto) {
         let text = refusal(refused);
@@ -288,23 +293,23 @@ fn commonest(refusals: &[Vec<Option<PhotoRefusal>>]) -> String {
 }
 
 impl Job {
-    /// Where a calibration comes from: a comment in its file.
+    /// Describes the data of the calibration, as a comment for its file.
     fn origin(&self) -> String {
         let c = &self.found.calibration;
         let used = c.views.iter().filter(|v| v.pose.is_some()).count();
         let holdout = if c.holdout_rms_px.is_nan() {
             String::new()
         } else {
-            format!(", {:.3} px on views that had no part in the fit", c.holdout_rms_px)
+            format!(", {:.3} px on held-out views", c.holdout_rms_px)
         };
         format!(
             "calibrated from {used} views of a {}; rms {:.3} px{holdout}",
-            told(&self.found.board, &self.unit),
+            describe_board(&self.found.board, &self.unit),
             c.rms_px
         )
     }
 
-    /// Writes the rig: of two cameras as a stereo rig, which all of the program takes.
+    /// Writes the rig; two cameras as a stereo rig, which all commands read.
     fn write(&self, output: &Path, context: &Context) -> Result<(), Failure> {
         let (c, notes, unit) = (&self.found.calibration, self.origin(), self.unit.clone());
         let output = Output::File(output, YAML);
@@ -323,12 +328,12 @@ impl Job {
         }
     }
 
-    /// The path of a photograph.
+    /// Returns the path of a photograph.
     fn path(&self, view: usize, camera: usize) -> Option<&Path> {
         self.views[view][camera].as_deref()
     }
 
-    /// What is told of the job.
+    /// Writes the notes and the report, and returns the outcome.
     fn finish(&self, context: &Context) -> Result<Outcome, Failure> {
         let c = &self.found.calibration;
         for (view, cameras) in self.found.refusals.iter().enumerate() {
@@ -345,10 +350,10 @@ impl Job {
             let holdout = if camera.holdout_rms_px.is_nan() {
                 String::new()
             } else {
-                format!(", {:.3} px on views held out", camera.holdout_rms_px)
+                format!(", {:.3} px on held-out views", camera.holdout_rms_px)
             };
             summary.push(format!(
-                "{whose}{} lens, focal length {:.2} px, rms {:.3} px{holdout}; projection known to {:.2} px (median over the picture)",
+                "{whose}{} lens, focal length {:.2} px, rms {:.3} px{holdout}; projection uncertainty {:.2} px (median over the image)",
                 camera.camera.distortion.model().info().name,
                 camera.camera.fx,
                 camera.rms_px,
@@ -360,10 +365,9 @@ impl Job {
             summary.push(format!("{name}: {far:.4} {} from {first}", self.unit));
         }
         if let Some(rig) = c.stereo().filter(|_| c.cameras.len() == 2) {
-            let rows = self
-                .found
-                .rectified_dy_px
-                .map_or(String::new(), |(mean, _)| format!(", rectified rows {mean:.3} px apart"));
+            let rows = self.found.rectified_dy_px.map_or(String::new(), |(mean, _)| {
+                format!(", mean vertical disparity after rectification {mean:.3} px")
+            });
             summary.push(format!("baseline {:.4} {}{rows}", rig.baseline(), self.unit));
         }
         let used = c.views.iter().filter(|v| v.pose.is_some()).count();

@@ -10,10 +10,10 @@ use cv_pipeline::calibration::{CalibratedCamera, Trust};
 use cv_pipeline::stereo::{Rectification, RectifyOptions};
 use cv_report::{Colormap, Figure, MapStyle, Note, Raster, Report, colors};
 
-/// Photographs with residuals that are shown: the worst and the best.
-const PHOTOS: usize = 6;
-/// Residuals are drawn so much longer than they are.
-const LONGER: f32 = 50.0;
+/// Number of photographs shown with residuals: half of them the worst, half the best.
+const SHOWN_PHOTOS: usize = 6;
+/// Magnification of drawn residuals.
+const RESIDUAL_SCALE: f32 = 50.0;
 
 pub(super) fn report(job: &Job) -> Result<Report, Failure> {
     let c = &job.found.calibration;
@@ -21,17 +21,17 @@ pub(super) fn report(job: &Job) -> Result<Report, Failure> {
     let used = c.views.iter().filter(|v| v.pose.is_some()).count();
     page.headline("rms", &format!("{:.3} px", c.rms_px));
     if !c.holdout_rms_px.is_nan() {
-        page.headline("rms on views held out", &format!("{:.3} px", c.holdout_rms_px));
-        page.headline("the same with outliers", &format!("{:.3} px", c.holdout_all_rms_px));
+        page.headline("rms on held-out views", &format!("{:.3} px", c.holdout_rms_px));
+        page.headline("the same including outliers", &format!("{:.3} px", c.holdout_all_rms_px));
     }
     page.headline("views used", &format!("{used} of {}", c.views.len()));
     if let Some((mean, _)) = job.found.rectified_dy_px {
-        page.headline("rectified rows apart", &format!("{mean:.3} px"));
+        page.headline("vertical disparity after rectification", &format!("{mean:.3} px"));
     }
     page.headline("trust", &c.verdict.trust.to_string());
-    page.section("What to know, and what to photograph next");
+    page.section("Assessment, and what to photograph next");
     if c.verdict.notes.is_empty() {
-        page.note(Note::Good, "Nothing is missing.");
+        page.note(Note::Good, "No deficiencies found.");
     }
     for n in &c.verdict.notes {
         let kind = if c.verdict.trust == Trust::Poor { Note::Warning } else { Note::Info };
@@ -85,8 +85,8 @@ fn of_camera(page: &mut Report, job: &Job, i: usize, camera: &CalibratedCamera) 
         })
         .collect();
     page.table(
-        "Lens models, each by this camera alone: the root mean square error of all views, and of views that the model was not fitted to.",
-        &["lens", "rms (px)", "rms held out (px)", "corners left out", ""],
+        "Distortion models, each fitted to this camera alone: RMS reprojection error over all views, and over views held out of the fit.",
+        &["lens", "rms (px)", "rms held out (px)", "outlier corners", ""],
         &rows,
     );
     let uncertainty = &camera.uncertainty;
@@ -96,21 +96,21 @@ fn of_camera(page: &mut Report, job: &Job, i: usize, camera: &CalibratedCamera) 
     let (width, height) = (camera.camera.width, camera.camera.height);
     let side = 640.0 / width as f64;
     let size = (640, ((height as f64 * side).round() as usize).max(2));
-    let smooth = enlarged(&values, size);
+    let smooth = upsample(&values, size);
     let top = uncertainty.median().max(0.05) * 4.0;
     let style = MapStyle { label: "uncertainty (px)".to_owned(), ..MapStyle::default() }.with_range(0.0, top as f32);
     let uncertain = map(
         smooth.view(),
         &style,
         Width::Half,
-        "How far off the projection of a far point may be: its standard deviation in the worst direction, whatever a turn of the camera explains left out. Gray: no ray.",
+        "Projection uncertainty of a distant point: the standard deviation in its worst direction, after a rotation of the camera is compensated. Gray: no viewing ray.",
     )?;
     page.figures(vec![uncertain, coverage(job, i, size)?, distortion(camera, size)?]);
     Ok(())
 }
 
-/// Bilinear between the points of a grid whose ends are those of the picture.
-fn enlarged(values: &GrayF32, (width, height): (usize, usize)) -> GrayF32 {
+/// Interpolates a grid bilinearly; its outer points are the borders of the image.
+fn upsample(values: &GrayF32, (width, height): (usize, usize)) -> GrayF32 {
     GrayF32::from_fn(width, height, |x, y| {
         let along = |i: usize, n: usize, of: usize| i as f32 * (of - 1) as f32 / (n - 1).max(1) as f32;
         let (u, v) = (along(x, width, values.width()), along(y, height, values.height()));
@@ -121,28 +121,28 @@ fn enlarged(values: &GrayF32, (width, height): (usize, usize)) -> GrayF32 {
     })
 }
 
-/// All corners of a camera, by how far off they are.
+/// Draws all corners of a camera, colored by residual.
 fn coverage(job: &Job, i: usize, (width, height): (usize, usize)) -> Result<Figure, Failure> {
     let c = &job.found.calibration;
     let side = width as f32 / c.cameras[i].camera.width as f32;
     let mut canvas = Raster::new(width, height, [28, 28, 32]);
-    let most = (3.0 * c.noise_px) as f32;
+    let limit = (3.0 * c.noise_px) as f32;
     for (view, seen) in c.views.iter().zip(&job.found.observations.views) {
         for (corner, of) in seen[i].iter().zip(&view.images[i].corners) {
             let at = [corner.pixel.x as f32 * side, corner.pixel.y as f32 * side];
             match of.residual.filter(|_| of.used) {
-                Some(r) => canvas.disc(at, 2.5, Colormap::Turbo.color((r.norm() as f32 / most).min(1.0))),
+                Some(r) => canvas.disc(at, 2.5, Colormap::Turbo.color((r.norm() as f32 / limit).min(1.0))),
                 None => canvas.cross(at, 4.0, 1.0, colors::WHITE),
             }
         }
     }
     let caption = format!(
-        "Where the corners are; blue is exact, red {most:.2} px off or more; crosses were left out. Where there are none, nothing is known of the lens."
+        "Detected corners by residual: blue 0, red {limit:.2} px or more; crosses are outliers. Regions without corners do not constrain the distortion."
     );
     picture(&canvas.into_image(), Width::Half, &caption)
 }
 
-/// From where a pinhole would have a pixel to where the lens has it.
+/// Draws the distortion: from the undistorted to the distorted position of a grid of pixels.
 fn distortion(camera: &CalibratedCamera, (width, height): (usize, usize)) -> Result<Figure, Failure> {
     let of = &camera.camera;
     let side = width as f64 / of.width as f64;
@@ -164,11 +164,11 @@ fn distortion(camera: &CalibratedCamera, (width, height): (usize, usize)) -> Res
     picture(
         &canvas.into_image(),
         Width::Half,
-        "What the lens does: from where a pinhole would have a point (end of the line) to where the lens has it (dot).",
+        "Distortion: from the projection by a pinhole camera (end of the line) to the projection by the lens (dot).",
     )
 }
 
-/// The photographs with the largest and the smallest errors, with their residuals.
+/// Adds the photographs with the largest and the smallest errors, with their residuals.
 fn photographs(page: &mut Report, job: &Job) -> Result<(), Failure> {
     let c = &job.found.calibration;
     let mut all: Vec<(f64, usize, usize)> = (0..c.views.len())
@@ -177,8 +177,8 @@ fn photographs(page: &mut Report, job: &Job) -> Result<(), Failure> {
         .filter(|(rms, _, _)| rms.is_finite())
         .collect();
     all.sort_by(|a, b| b.0.total_cmp(&a.0));
-    if all.len() > PHOTOS {
-        all.drain(PHOTOS / 2..all.len() - PHOTOS / 2);
+    if all.len() > SHOWN_PHOTOS {
+        all.drain(SHOWN_PHOTOS / 2..all.len() - SHOWN_PHOTOS / 2);
     }
     let mut figures = Vec::new();
     for (rms, v, i) in all {
@@ -189,7 +189,7 @@ fn photographs(page: &mut Report, job: &Job) -> Result<(), Failure> {
     }
     page.section("Residuals");
     page.paragraph(&format!(
-        "The photographs with the largest and the smallest errors. An arrow leads from a corner towards where the calibration has it, {LONGER:.0} times as long; orange corners were left out."
+        "The photographs with the largest and the smallest errors. A line leads from a detected corner towards its reprojection, {RESIDUAL_SCALE:.0} times as long; orange corners are outliers."
     ));
     page.figures(figures);
     Ok(())
@@ -205,14 +205,14 @@ fn with_residuals(photo: &RgbU8, job: &Job, v: usize, i: usize) -> RgbU8 {
         canvas.circle(at, 3.0 * unit, unit, color);
         if let Some(r) = of.residual {
             let r = [r.x as f32, r.y as f32];
-            let length = LONGER * unit;
+            let length = RESIDUAL_SCALE * unit;
             canvas.line(at, [at[0] + length * r[0], at[1] + length * r[1]], 1.5 * unit, colors::MAGENTA);
         }
     }
     canvas.into_image()
 }
 
-/// The first pair that both cameras used, rectified.
+/// Adds the first pair that is used by both cameras, rectified.
 fn pair(page: &mut Report, job: &Job) -> Result<(), Failure> {
     let c = &job.found.calibration;
     let rig = c.stereo().and_then(|rig| Rectification::new(&rig, &RectifyOptions::default()).ok());
@@ -224,12 +224,12 @@ fn pair(page: &mut Report, job: &Job) -> Result<(), Failure> {
     page.section("Rectified pair").figure(picture(
         &with_rows(&[left, right]),
         Width::Full,
-        "Both photographs with common rows drawn through: what is on a line on the left is on it on the right.",
+        "Both images with common scanlines: corresponding points lie on the same line.",
     )?);
     Ok(())
 }
 
-/// How far the board is from flat.
+/// Adds a map of the estimated deflection of the board.
 fn board_shape(page: &mut Report, job: &Job) -> Result<(), Failure> {
     let [kx, ky] = job.found.calibration.target_shape.deflection;
     let size = job.found.observations.target.size();
@@ -239,10 +239,10 @@ fn board_shape(page: &mut Report, job: &Job) -> Result<(), Failure> {
     let share = |i: usize, n: usize| 1.0 - (2.0 * i as f64 / (n - 1) as f64 - 1.0).powi(2);
     let bent = GrayF32::from_fn(width, height, |x, y| [(kx * share(x, width) + ky * share(y, height)) as f32]);
     let (low, high) = bent.as_slice().iter().fold((0.0f32, 0.0f32), |(low, high), z| (low.min(*z), high.max(*z)));
-    let label = format!("away from the camera ({})", job.unit);
+    let label = format!("deflection away from the camera ({})", job.unit);
     let style = MapStyle { label, ..MapStyle::default() }.with_range(low, high);
     let caption = format!(
-        "How the board is bent, against its corners: its middle by {1:.3} % of its length along x and {2:.3} % along y, of {3} and {4} {0}.",
+        "Deflection of the board relative to its corners: at its center {1:.3} % of its length along x and {2:.3} % along y, of {3} and {4} {0}.",
         job.unit,
         100.0 * kx / size.x,
         100.0 * ky / size.y,
@@ -264,8 +264,8 @@ fn parameters(page: &mut Report, job: &Job) {
         .map(|p| [whose(p.camera), p.name.to_owned(), format!("{:.6}", p.value), format!("{:.2e}", p.deviation)])
         .collect();
     page.table(
-        &format!("Values with their standard deviations. Distances in {}, turns in radians.", job.unit),
-        &["of", "parameter", "value", "deviation"],
+        &format!("Estimates with their standard deviations. Lengths in {}, angles in radians.", job.unit),
+        &["of", "parameter", "value", "standard deviation"],
         &rows,
     );
     let mut pairs: Vec<(f64, usize, usize)> = (0..c.parameters.len())
@@ -280,7 +280,11 @@ fn parameters(page: &mut Report, job: &Job) {
     }
     let name = |i: usize| format!("{} {}", whose(c.parameters[i].camera), c.parameters[i].name);
     let rows: Vec<[String; 3]> = pairs.iter().map(|(r, a, b)| [name(*a), name(*b), format!("{r:.3}")]).collect();
-    page.folded("Parameters that make up for each other", |page| {
-        page.table("Correlations beyond 0.8, the thirty largest.", &["parameter", "and", "correlation"], &rows);
+    page.folded("Correlated parameters", |page| {
+        page.table(
+            "Correlation coefficients above 0.8 in magnitude, the thirty largest.",
+            &["parameter", "and", "correlation"],
+            &rows,
+        );
     });
 }

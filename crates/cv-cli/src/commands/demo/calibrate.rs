@@ -1,4 +1,4 @@
-//! A rig from photographs of a chessboard on bent paper.
+//! Stereo calibration from images of a chessboard on bent paper.
 
 use super::{Check, Demo, Part};
 use crate::frame::Failure;
@@ -16,7 +16,7 @@ const MARGIN: f64 = 0.012;
 /// Pairs of photographs.
 const PAIRS: usize = 8;
 
-/// The sheet with its board, its middle bent by a millimeter.
+/// The sheet with its board, deflected by a millimeter at its center.
 fn sheet(seed: u64) -> Sheet {
     let (columns, rows) = (BOARD.columns as u32 + 1, BOARD.rows as u32 + 1);
     Sheet {
@@ -29,7 +29,7 @@ fn sheet(seed: u64) -> Sheet {
     }
 }
 
-/// Tilted to all sides, now here now there in the picture, near and far.
+/// A pose of the board: tilted to all sides, spread over the image, near and far.
 fn pose(view: usize, sheet: &Sheet) -> Pose {
     let i = view as f64;
     let tilt = Vector3::new(0.55 * (2.4 * i).sin(), 0.55 * (2.4 * i).cos(), 0.12 * (5.0 * i).sin());
@@ -70,7 +70,7 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
         Ok(found) => found,
         Err(error) => {
             let failure = no_calibration(error, &["left", "right"], "");
-            return Ok(Part::gave_up("calibrate", &failure.text()));
+            return Ok(Part::failed("calibrate", &failure.text()));
         }
     };
     let c = &found.calibration;
@@ -92,7 +92,7 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     Ok(Part::new(checks, move |page| {
         page.section("Calibration")
             .paragraph(&format!(
-                "A chessboard on bent paper before two cameras whose lenses bend lines. The corners of {count} pairs of photographs give both lenses, where the cameras stand, and the bend of the paper; they agree to {rms:.3} px."
+                "A chessboard on bent paper seen by two cameras with lens distortion. The corners of {count} image pairs determine the intrinsics, the relative pose and the deflection of the paper; reprojection RMS {rms:.3} px."
             ))
             .figures(figures);
     }))

@@ -13,7 +13,7 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let (a, b) = (&pair.a.image, &pair.b.image);
     let found = match match_photos(a.view(), b.view(), &MatchingOptions::default(), demo.context) {
         Ok(found) => found,
-        Err(error) => return Ok(Part::gave_up("homography", &error)),
+        Err(error) => return Ok(Part::failed("homography", &error)),
     };
     let mut options = ModelKind::Homography.options();
     if let Some(seed) = demo.context.seed {
@@ -22,7 +22,7 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let pairs = found.pairs();
     let model = match estimate(&pairs, ModelKind::Homography, &options, demo.context) {
         Ok(result) => result.robust,
-        Err(error) => return Ok(Part::gave_up("homography", &error)),
+        Err(error) => return Ok(Part::failed("homography", &error)),
     };
     let (width, height) = a.size();
     let error = homography_corner_error(&model.model, &pair.homography, width, height);
@@ -43,8 +43,8 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
         )?,
         demo.figure(
             "homography-warped.png",
-            &checkered(a.view(), b.view(), &model.model),
-            "Both in one frame, in the squares of a chessboard: edges run through where the homography is right.",
+            &checkerboard(a.view(), b.view(), &model.model),
+            "Checkerboard of the first image and the warped second one: edges are continuous where the homography is correct.",
         )?,
     ];
     let matches =
@@ -53,27 +53,27 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
         "homography-matches.png",
         &matches,
         &format!(
-            "{} of {} matches agree with one homography (green); the rest are red.",
+            "{} of {} matches are inliers of the homography (green); outliers are red.",
             model.inliers.len(),
             inliers.len()
         ),
     )?;
     Ok(Part::new(vec![check], move |page| {
         page.section("Homography")
-            .paragraph("Two photographs of one wall. Features are found in both and matched by their looks alone; a robust fit finds the homography that most matches agree with, and those that disagree.")
+            .paragraph("Two photographs of one wall. Features are detected in both and matched by their descriptors; a robust estimator finds the homography and rejects outliers.")
             .figures(photos)
             .figure(matches);
     }))
 }
 
-/// Where the lower right corner goes, the one farthest from the origin.
+/// Formats the mapped lower right corner, the one farthest from the origin.
 fn corner(h: &Matrix3<f64>, width: usize, height: usize) -> String {
     let q = h * Vector3::new(width as f64 - 1.0, height as f64 - 1.0, 1.0);
     format!("corner at ({:.2}, {:.2})", q.x / q.z, q.y / q.z)
 }
 
-/// The first picture, with every other square taken from the second one by way of the homography.
-fn checkered(a: ImageView<'_, u8, 3>, b: ImageView<'_, u8, 3>, h: &Matrix3<f64>) -> RgbU8 {
+/// Interleaves the first image with the second one, warped by the homography, in a checkerboard of squares.
+fn checkerboard(a: ImageView<'_, u8, 3>, b: ImageView<'_, u8, 3>, h: &Matrix3<f64>) -> RgbU8 {
     RgbU8::from_fn(a.width(), a.height(), |x, y| {
         if (x / 80 + y / 80) % 2 == 0 {
             return a.at(x, y);

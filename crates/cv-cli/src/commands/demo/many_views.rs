@@ -1,4 +1,4 @@
-//! Cameras and points from photographs of a walk through a room.
+//! Structure from motion on a walk through a room.
 
 use super::{Check, Demo, Part};
 use crate::frame::Failure;
@@ -9,12 +9,13 @@ use cv_pipeline::{SfmCamera, SfmJobOptions, sfm, sfm_photo};
 use cv_report::PointScene;
 use cv_synth::{RenderOptions, Scene, render, rotation_error};
 
-/// Photographs, and of how many a walk all around would have.
+/// Number of images.
 const COUNT: usize = 7;
+/// Number of images of the full circular walk of which the first [`COUNT`] are used.
 const AROUND: usize = 24;
 
 pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
-    // Smaller than those of the others: there are more of them.
+    // Smaller than the images of the other jobs, since there are more of them.
     let camera = demo.camera().resized(400, 300);
     let scene = Scene::room(demo.seed);
     let mut options = SfmJobOptions::default();
@@ -32,9 +33,9 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let cameras = [SfmCamera { camera, knowledge: CameraKnowledge::Known }];
     let mut result = match sfm(&photos, &cameras, &options, demo.context) {
         Ok(result) => result,
-        Err(error) => return Ok(Part::gave_up("sfm", &error)),
+        Err(error) => return Ok(Part::failed("sfm", &error)),
     };
-    // In the frame of the room: photographs tell no meters.
+    // Align to the frame of the room: the reconstruction is up to a similarity.
     let model = &mut result.models[0];
     if let Some(similarity) = align_to_poses(model, &truth) {
         model.transform(&similarity);
@@ -47,21 +48,21 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let checks = vec![
         Check::at_least("sfm", "photographs in the model", pairs.len() as f64 / COUNT as f64, 1.0, "%")
             .of(format!("{COUNT}"), format!("{}", pairs.len())),
-        Check::at_most("sfm", "farthest camera", 100.0 * off, 2.0, "cm")
+        Check::at_most("sfm", "largest error of a camera center", 100.0 * off, 2.0, "cm")
             .of(walk, format!("{} points", model.points.len())),
-        Check::at_most("sfm", "largest turn", turn, 0.3, "°"),
+        Check::at_most("sfm", "largest rotation error", turn, 0.3, "°"),
     ];
     let points = model.points.len();
     let cloud = PointScene::of_model(&result.sparse_model(0, &photos).unwrap_or_default());
     let still = still(&cloud)?;
     Ok(Part::new(checks, move |page| {
         page.section("Many views").paragraph(&format!(
-            "{COUNT} photographs of a walk through the room. From what they have in common come the cameras and {points} points."
+            "{COUNT} photographs of a walk through the room. Their matches determine the camera poses and {points} points."
         ));
         page.points(
             &cloud,
             Some(still),
-            "The points, and the cameras from the first, blue, to the last, red. Drag to turn.",
+            "The points, and the cameras from the first (blue) to the last (red). Drag to rotate.",
         );
     }))
 }

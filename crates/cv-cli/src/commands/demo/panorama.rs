@@ -13,11 +13,11 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let photos: Vec<PanoramaPhoto<'_>> = set.views.iter().map(|v| PanoramaPhoto::new(v.image.view())).collect();
     let result = match panorama(&photos, &PanoramaOptions::default(), demo.context) {
         Ok(result) => result,
-        Err(error) => return Ok(Part::gave_up("panorama", &error)),
+        Err(error) => return Ok(Part::failed("panorama", &error)),
     };
     let n = set.views.len();
     let used = result.images.iter().filter(|i| i.used).count();
-    // Over all pairs that truly overlap: where a pixel of one photograph lies in the other, by the result and by truth.
+    // Over all overlapping pairs: the error of mapping pixels of one image to the other.
     let (mut sum, mut pairs) = (0.0, 0.0);
     for (i, j) in (0..n).flat_map(|i| (0..n).map(move |j| (i, j))).filter(|(i, j)| i != j) {
         let map = |p| {
@@ -50,11 +50,11 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let joined = demo.figure(
         "panorama-result.png",
         &result.image,
-        "The panorama. Seams run where the photographs agree, so that who walks is there whole or not at all.",
+        "The panorama. Seams run where the images agree, so that the moving person is shown completely or not at all.",
     )?;
     Ok(Part::new(checks, move |page| {
         page.section("Panorama")
-            .paragraph("Photographs taken by hand from one place, turning from left to right while somebody walks through. Their order, the focal length and the turns between them are found from the pictures alone.")
+            .paragraph("Handheld photographs from one place, rotating from left to right while somebody walks through. Their order, the focal length and the rotations are estimated from the images alone.")
             .figure(inputs)
             .figure(joined);
     }))

@@ -1,4 +1,4 @@
-//! Points and camera motion from two photographs of a room.
+//! Two-view reconstruction of a room.
 
 use super::{Check, Demo, Part};
 use crate::commands::reconstruct::sparse;
@@ -9,7 +9,7 @@ use cv_pipeline::{Intrinsics, ReconstructOptions, reconstruct};
 use cv_report::{MatchStyle, draw_epipolar_lines, draw_matches};
 use cv_synth::{RenderOptions, direction_error, rotation_error, two_view};
 
-/// Meters between the two places.
+/// Distance between the two camera centers in meters.
 const BASELINE: f64 = 0.6;
 
 pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
@@ -22,26 +22,28 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let options = ReconstructOptions::new(Intrinsics::Known([camera; 2]));
     let result = match reconstruct(a.view(), b.view(), &options, demo.context) {
         Ok(result) => result,
-        Err(error) => return Ok(Part::gave_up("reconstruct", &error)),
+        Err(error) => return Ok(Part::failed("reconstruct", &error)),
     };
     let (truth, found) = (&pair.relative, &result.scene.pose);
-    let turn = |pose: &Pose| format!("{:.2}° in all", pose.rotation_angle().to_degrees());
-    let way = |pose: &Pose| {
+    let angle = |pose: &Pose| format!("{:.2}°", pose.rotation_angle().to_degrees());
+    let unit_translation = |pose: &Pose| {
         let t = pose.translation.normalize();
         format!("({:.3}, {:.3}, {:.3})", t.x, t.y, t.z)
     };
     let rotation = rotation_error(&found.rotation, &truth.rotation).to_degrees();
     let direction = direction_error(&found.translation, &truth.translation).to_degrees();
     let checks = vec![
-        Check::at_most("reconstruct", "rotation", rotation, 0.2, "°").of(turn(truth), turn(found)),
-        Check::at_most("reconstruct", "direction of travel", direction, 1.0, "°").of(way(truth), way(found)),
+        Check::at_most("reconstruct", "rotation", rotation, 0.2, "°").of(angle(truth), angle(found)),
+        Check::at_most("reconstruct", "direction of translation", direction, 1.0, "°")
+            .of(unit_translation(truth), unit_translation(found)),
     ];
 
     let pairs = &result.matching.pairs();
     let mut inliers = vec![false; pairs.len()];
     result.scene.inliers.iter().for_each(|&i| inliers[i] = true);
     let style = MatchStyle { limit: 160, ..MatchStyle::default() };
-    let agree = format!("{} of {} matches agree with one motion (green).", result.scene.inliers.len(), pairs.len());
+    let agree =
+        format!("{} of {} matches are inliers of the relative pose (green).", result.scene.inliers.len(), pairs.len());
     let figures = vec![
         demo.figure(
             "reconstruct-matches.png",
@@ -57,15 +59,15 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
                 &result.scene.inliers.iter().map(|&i| pairs[i]).collect::<Vec<_>>(),
                 14,
             ),
-            "Each point with the line on which it must lie in the other photograph.",
+            "Points and their epipolar lines in the other image.",
         )?,
     ];
     let cloud = sparse(&result, ["first", "second"]);
     let still = still(&cloud)?;
-    let caption = format!("{} points and the two cameras. Drag to turn.", result.scene.points.len());
+    let caption = format!("{} points and the two cameras. Drag to rotate.", result.scene.points.len());
     Ok(Part::new(checks, move |page| {
         page.section("Reconstruction")
-            .paragraph("Two photographs from 60 cm apart. From the matches alone come the turn and the direction of travel of the camera, and the points in space.");
+            .paragraph("Two photographs with a baseline of 60 cm. The matches determine the rotation and the direction of translation of the camera, and the 3D points.");
         figures.into_iter().for_each(|figure| {
             page.figure(figure);
         });

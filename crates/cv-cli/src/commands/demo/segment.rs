@@ -1,4 +1,4 @@
-//! An orange ball by its color, trained on half of the photographs.
+//! Color segmentation of an orange ball, trained on half of the images.
 
 use super::{Check, Demo, Part};
 use crate::frame::Failure;
@@ -6,7 +6,7 @@ use cv_pipeline::{segment, train_segment};
 use cv_report::overlay_comparison;
 use cv_synth::{MaskScore, RenderOptions, ball_photos};
 
-/// Photographs; every other one is trained on.
+/// Number of images; every other one is a training image.
 const PHOTOS: usize = 8;
 
 pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
@@ -14,7 +14,7 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
     let labeled: Vec<_> = photos.iter().step_by(2).map(|p| (p.view.image.view(), p.mask.view())).collect();
     let model = match train_segment(&labeled, &Default::default(), demo.context) {
         Ok(training) => training.trained.model,
-        Err(error) => return Ok(Part::gave_up("segment", &error)),
+        Err(error) => return Ok(Part::failed("segment", &error)),
     };
     let mut score = MaskScore::default();
     let mut figures = Vec::new();
@@ -36,7 +36,7 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
         .of(pixels(score.true_positives + score.false_negatives), pixels(score.true_positives + score.false_positives));
     Ok(Part::new(vec![check], move |page| {
         page.section("Segmentation")
-            .paragraph("A color model learns the ball from four photographs with masks, and marks it in four others. Green is right, red invented, blue missed.")
+            .paragraph("A color model is trained on four images with masks and segments four others. Green: true positive, red: false positive, blue: false negative.")
             .figures(figures);
     }))
 }

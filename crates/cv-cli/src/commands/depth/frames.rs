@@ -1,7 +1,7 @@
-//! `cv depth` on frames: one pair after the other with the same memory.
+//! `cv depth` on sequences: one pair after the other, reusing buffers.
 
 use super::pairing::pair;
-use super::{Args, Film, report};
+use super::{Args, Sequence, report};
 use crate::frame::{Context, Explain, Failure, Outcome, expand_images, stands_for_many};
 use crate::photos::{Photos, at_own_depth};
 use cv_core::Stage;
@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 impl Args {
-    /// Frame after frame. Of each only what is written stays, and of the first what the report shows.
+    /// Processes a sequence of pairs. Only the first pair is kept, for the report.
     pub(super) fn run_frames(&self, context: &Context) -> Result<Outcome, Failure> {
         for (path, other) in [(&self.left, &self.right), (&self.right, &self.left)] {
             if !stands_for_many(path) {
@@ -20,68 +20,68 @@ impl Args {
         }
         let [lefts, rights] = [&self.left, &self.right].map(|path| expand_images(std::slice::from_ref(path)));
         let pairs = pair(&lefts?, &rights?, self.pair_by)?;
-        one_name_each(&pairs)?;
-        let whole = context.wants_report()
+        check_unique_names(&pairs)?;
+        let needs_depth = context.wants_report()
             || self.cloud.is_some()
             || self.matched.is_some()
             || [&self.depth, &self.confidence, &self.uncertainty].iter().any(|map| map.is_some());
         let started = Instant::now();
-        let (mut film, mut size): (Option<Film>, _) = (None, [(0, 0); 2]);
+        let (mut sequence, mut size): (Option<Sequence>, _) = (None, [(0, 0); 2]);
         let (mut seconds, mut frames, mut first) = (0.0, Vec::with_capacity(pairs.len()), None);
         let mut aligned = false;
         let stage = Stage::new(context, "frames", pairs.len())?;
         for (left, right) in &pairs {
             let photos = Photos::read(left, right)?;
-            // Frames of another size begin another film.
+            // A change of size starts a new sequence.
             if size != photos.sizes() {
-                film = None;
+                sequence = None;
                 size = photos.sizes();
             }
-            let film = match &mut film {
-                Some(film) => film,
-                None => film.insert(self.film(&photos, [left, right], context)?),
+            let sequence = match &mut sequence {
+                Some(sequence) => sequence,
+                None => sequence.insert(self.sequence(&photos, [left, right], context)?),
             };
             let one = self.of_frame(left);
             let start = Instant::now();
-            let told = |error| self.refused(error);
-            let shares = if whole {
+            let failure = |error| self.failure(error);
+            let fractions = if needs_depth {
                 let job =
-                    at_own_depth!(photos, |a, b| film.frames.next_depth(a, b, self.wants_points(context), &stage));
-                let job = job.map_err(told).during(left.display())?;
+                    at_own_depth!(photos, |a, b| sequence.frames.next_depth(a, b, self.wants_points(context), &stage));
+                let job = job.map_err(failure).during(left.display())?;
                 seconds += start.elapsed().as_secs_f64();
-                one.write(&job, film.meters, context)?;
-                let shares = (job.maps.map.matched_fraction(), job.maps.map.valid_fraction());
+                one.write(&job, sequence.meters_per_unit, context)?;
+                let fractions = (job.maps.map.matched_fraction(), job.maps.map.valid_fraction());
                 if context.wants_report() && first.is_none() {
                     first = Some(job);
                 }
-                shares
+                fractions
             } else {
-                let map = at_own_depth!(photos, |a, b| film.frames.next(a, b, &stage));
-                let map = map.map_err(told).during(left.display())?;
+                let map = at_own_depth!(photos, |a, b| sequence.frames.next(a, b, &stage));
+                let map = map.map_err(failure).during(left.display())?;
                 seconds += start.elapsed().as_secs_f64();
                 one.write_disparity(map, context)?;
                 (map.matched_fraction(), map.valid_fraction())
             };
             if frames.is_empty() {
-                self.say_range(film, context);
+                self.report_range(sequence, context);
             }
-            if !aligned && let Some(offset) = film.frames.vertical_offset() {
-                super::say_alignment(&offset, context);
+            if !aligned && let Some(offset) = sequence.frames.vertical_offset() {
+                super::warn_of_alignment(&offset, context);
                 aligned = true;
             }
-            frames.push((left.clone(), shares.0, shares.1));
+            frames.push((left.clone(), fractions.0, fractions.1));
             stage.add(1)?;
         }
         let count = frames.len() as f64;
-        let mean = |share: fn(&(PathBuf, f64, f64)) -> f64| frames.iter().map(share).sum::<f64>() / count;
+        let mean = |fraction: fn(&(PathBuf, f64, f64)) -> f64| frames.iter().map(fraction).sum::<f64>() / count;
         let (matched, valid) = (mean(|frame| frame.1), mean(|frame| frame.2));
         let (rate, total) = (count / seconds, count / started.elapsed().as_secs_f64());
         if let Some(job) = &first {
             super::warn_of_filling(&job.maps, context);
             context.report(|| report::report(job, &frames))?;
         }
-        let (width, height) = film.as_ref().map_or((0, 0), |film| film.size);
-        let disparities = film.as_ref().and_then(|film| film.frames.disparities());
+        let (width, height) = sequence.as_ref().map_or((0, 0), |sequence| sequence.size);
+        let disparities = sequence.as_ref().and_then(|sequence| sequence.frames.disparities());
         Ok(Outcome::new(vec![("match", seconds)])
             .with("frames", frames.len())
             .with("frames_per_second", rate)
@@ -99,7 +99,7 @@ impl Args {
             )))
     }
 
-    /// The arguments for one frame: its files in the folders that are named as outputs.
+    /// Returns the arguments for one frame: the outputs are files in the output folders.
     fn of_frame(&self, left: &Path) -> Self {
         let file = |folder: &PathBuf, ending: &str| {
             let mut name = left.file_stem().unwrap_or_default().to_owned();
@@ -120,8 +120,8 @@ impl Args {
     }
 }
 
-/// Refuses frames whose results would have one name.
-fn one_name_each(pairs: &[(PathBuf, PathBuf)]) -> Result<(), Failure> {
+/// Refuses frames whose results would have the same name.
+fn check_unique_names(pairs: &[(PathBuf, PathBuf)]) -> Result<(), Failure> {
     let mut known = BTreeMap::new();
     for (left, _) in pairs {
         if let Some(other) = known.insert(left.file_stem(), left) {

@@ -1,11 +1,11 @@
-//! Maps of floats in files.
+//! Files of float maps.
 
 use crate::frame::{Context, Explain, Failure, MAP, Output};
 use cv_core::{GrayF32, ImageView};
 use cv_io::FormatError;
 use std::path::Path;
 
-/// Writes a map as the ending of its name says, by `png` where that is one. `Some` count where values did not fit the format.
+/// Writes a map in the format of its extension; PNG files by `png`. Returns the number of values outside the range of the format, if any.
 pub(super) fn write_map<'m>(
     context: &Context,
     path: &Path,
@@ -22,13 +22,13 @@ pub(super) fn write_map<'m>(
     Ok(Some(lost).filter(|&lost| lost > 0))
 }
 
-/// A map of any of the formats that truth and estimates come in: PFM, KITTI's PNG or (with `scale`) another one, NumPy's.
+/// Reads a disparity map: PFM, npy, npz, KITTI PNG, or with `scale` an image of gray value / scale.
 pub(crate) fn read_map(path: &Path, scale: Option<f64>) -> Result<GrayF32, Failure> {
     let map = match path.extension().unwrap_or_default().to_string_lossy().to_lowercase().as_str() {
         "pfm" => cv_io::pfm::read(path)?,
         "npy" => gray(path, cv_io::npy::read(path)?.into_gray())?,
         "npz" => gray(path, cv_io::npz::read_only(path)?.into_gray())?,
-        // Pictures, whatever they are called.
+        // Images, whatever their extension.
         _ => {
             return match scale {
                 Some(scale) => Ok(cv_io::scaled::read(path, scale)?),
@@ -38,7 +38,7 @@ pub(crate) fn read_map(path: &Path, scale: Option<f64>) -> Result<GrayF32, Failu
                     if too_large {
                         failure
                     } else {
-                        failure.advice("for other pictures give the scale (--truth-scale, --estimate-scale)")
+                        failure.advice("for other images give the scale (--truth-scale, --estimate-scale)")
                     }
                 }),
             };

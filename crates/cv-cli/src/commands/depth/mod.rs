@@ -1,4 +1,4 @@
-//! `cv depth`: disparity, depth and a cloud from two photographs.
+//! `cv depth`: disparity, depth and a point cloud from a stereo pair.
 
 mod frames;
 mod maps;
@@ -27,11 +27,11 @@ use std::path::{Path, PathBuf};
 pub(crate) use maps::read_map;
 pub(crate) use report::{fractions, scene};
 
-/// Compute disparity, and depth where the geometry is known, from a left and a right photograph.
+/// Compute a disparity map, and depth if the geometry is known, from a stereo pair.
 ///
-/// Without --rig the photographs must be rectified: the same scene point lies in the same row of both. Disparity is the
-/// column in the left photograph minus that in the right one. Pixels that only the left camera sees are filled from their
-/// surroundings unless --no-fill is given.
+/// Without --rig the pair must be rectified: corresponding points lie in the same row. Disparity is the column in the
+/// left image minus the column in the right one. Occluded and mismatched pixels are filled from their surroundings
+/// unless --no-fill is given.
 #[derive(Debug, Clone, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv depth left.png right.png -o disparity.pfm\n  \
@@ -40,54 +40,53 @@ pub(crate) use report::{fractions, scene};
     cv depth left.png right.png --quality -o disparity.pfm\n  \
     cv depth left right -o disparities\n  \
     cv depth left.jpg right.jpg --rig rig.yaml -o disparity.png --depth depth.png --report out\n\n\
-    The ending of a file tells its format: .pfm (floats, +inf where unknown), .npy (floats, NaN), .png (disparity as KITTI's\n\
-    16-bit PNG, 256 steps a pixel; depth as 16-bit millimeters, where the baseline is in meters or the rig file tells its unit); 0 is unknown in both.")]
+    The extension selects the format: .pfm (floats, invalid +inf), .npy (floats, invalid NaN), .png (disparity as KITTI's\n\
+    16-bit PNG, 256 steps a pixel; depth as 16-bit millimeters, if the baseline is in meters or the rig file has its unit; invalid 0).")]
 pub(crate) struct Args {
     /// The left photograph, or a folder or quoted pattern ('left/*.png', 'left_%04d.png') of frames.
     left: PathBuf,
-    /// The right photograph, or as many frames.
+    /// The right photograph, or the frames of the right camera.
     right: PathBuf,
-    /// What a shell makes of a pattern without quotes.
+    /// Further arguments: an unquoted pattern, expanded by the shell.
     #[arg(hide = true)]
     more: Vec<PathBuf>,
-    /// Where to write the disparity: .pfm, .png or .npy; for frames a folder, which gets NAME.pfm of each. So with all other outputs: of frames they
-    /// are folders, which get NAME.pfm, NAME.ply of the cloud, or NAME.png of --matched.
+    /// Where to write the disparity: .pfm, .png or .npy; for frames a folder, which gets NAME.pfm of each. For frames, all other outputs are folders
+    /// too, which get NAME.pfm, NAME.ply (--cloud) or NAME.png (--matched).
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// How frames are paired [default: by name where the names are the same, else by number]. Frames without a partner are
-    /// refused.
+    /// How frames are paired [default: by name if the names are the same, else by number]. Unpaired frames are refused.
     #[arg(long, value_name = "HOW", value_parser = named::<PairBy>())]
     pair_by: Option<PairBy>,
     /// Where to write the depth, in the unit of the baseline: .pfm, .png or .npy. Needs --rig, or --focal and --baseline.
     #[arg(long, value_name = "FILE")]
     depth: Option<PathBuf>,
-    /// Where to write a colored point cloud, as PLY, in the frame of the left camera: x right, y down, z ahead. Needs what --depth
-    /// needs.
+    /// Where to write a colored point cloud, as PLY, in the frame of the left camera: x right, y down, z forward. Needs --rig, or --focal and
+    /// --baseline.
     #[arg(long, value_name = "FILE")]
     cloud: Option<PathBuf>,
-    /// Calibration of the rig, ours, OpenCV's or Kalibr's YAML, twice for OpenCV's two files (see `cv rectify --help`): the photographs are rectified first, and the maps
-    /// are those of the rectified left (or upper) one, which `cv rectify` writes.
+    /// Calibration of the rig: our, OpenCV's or Kalibr's YAML; twice for OpenCV's two files (see `cv rectify --help`). The pair is rectified first; the maps are those of the
+    /// rectified left (or upper) image, as written by `cv rectify`.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["focal", "baseline"])]
     rig: Vec<PathBuf>,
-    /// The rig file has the cameras in the other order: its first one took the right (or lower) photograph.
+    /// The first camera of the rig file took the right (or lower) photograph.
     #[arg(long, requires = "rig")]
     exchange: bool,
-    /// Width and height of the rectified photographs, such as 1280x960 [default: as `cv rectify`].
+    /// Width and height of the rectified images, such as 1280x960 [default: as `cv rectify`].
     #[arg(long, value_name = "WxH", value_parser = size, requires = "rig")]
     size: Option<(usize, usize)>,
-    /// Number of disparities to try, in pixels, or auto: from feature matches; of frames, from those of the first pair for all.
+    /// Size of the disparity search range in pixels, or auto: from feature matches (for frames, of the first pair).
     #[arg(long, value_name = "N|auto", default_value = "128", value_parser = parse_range)]
     disparities: Range,
-    /// Smallest disparity to try, in pixels; may be negative [default: 0, or that of auto].
+    /// Smallest disparity of the search range in pixels; may be negative [default: 0, or from auto].
     #[arg(long, value_name = "PX", allow_negative_numbers = true)]
     min_disparity: Option<i32>,
-    /// Focal length of the rectified photographs in pixels.
+    /// Focal length of the rectified images in pixels.
     #[arg(long, value_name = "PX", requires = "baseline")]
     focal: Option<f64>,
-    /// Distance between the cameras; its unit is the unit of the depth.
+    /// Baseline: the distance between the cameras. Its unit is the unit of the depth.
     #[arg(long, value_name = "B", requires = "focal")]
     baseline: Option<f64>,
-    /// Right principal point minus left one, x, in pixels (doffs of Middlebury's calib.txt).
+    /// Difference cx_right - cx_left of the principal points in pixels (`doffs` in Middlebury's calib.txt).
     #[arg(long, value_name = "PX", default_value_t = 0.0, allow_negative_numbers = true, requires = "focal")]
     offset: f64,
     /// Nearest depth to keep.
@@ -99,31 +98,32 @@ pub(crate) struct Args {
     /// Directions of cost aggregation.
     #[arg(long, value_name = "N", value_parser = named::<Paths>(), default_value_t = StereoOptions::default().paths)]
     paths: Paths,
-    /// Matching window.
+    /// Census window.
     #[arg(long, value_name = "N", value_parser = named::<Census>(), default_value_t = StereoOptions::default().census)]
     census: Census,
-    /// Penalty for a disparity step of one pixel, in bits of the window.
+    /// Smoothness penalty P1 for a disparity change of one pixel, in bits of the census window.
     #[arg(long, value_name = "BITS", default_value_t = StereoOptions::default().p1)]
     p1: u8,
-    /// Penalty for a larger step where the photograph has no edge, in bits of the window.
+    /// Smoothness penalty P2 for a larger change where the image has no gradient, in bits of the census window.
     #[arg(long, value_name = "BITS", default_value_t = StereoOptions::default().p2)]
     p2: u8,
-    /// Levels of half the size each that guide pixels in flat surroundings (roads, walls); 0 for none.
+    /// Pyramid levels, each of half the resolution, that guide low-texture regions (roads, walls); 0 for none.
     #[arg(long, value_name = "N", default_value_t = StereoOptions::default().pyramid_levels)]
     pyramid_levels: u8,
-    /// By how many percent the best match must beat the rest.
+    /// Uniqueness ratio: margin in percent by which the lowest cost must be below the second lowest.
     #[arg(long, value_name = "PERCENT", default_value_t = StereoOptions::default().uniqueness)]
     uniqueness: u8,
-    /// Remove patches of up to this many pixels; 0 for none.
+    /// Remove speckles of up to this many pixels; 0 for none.
     #[arg(long, value_name = "PIXELS", default_value_t = StereoOptions::default().speckle_size)]
     speckle_size: usize,
-    /// Leave pixels without a match of their own unknown.
+    /// Leave unmatched pixels invalid instead of filling them.
     #[arg(long)]
     no_fill: bool,
-    /// Quality mode: outlines at edges, walls and roads as planes, two thirds of the errors, in about fifty times the time (2 seconds for 0.35 Mpx on two cores).
+    /// Quality mode: local expansion moves over slanted planes. Sharper depth discontinuities and planar surfaces, a third fewer errors, about fifty times the time (2 s for 0.35 Mpx
+    /// on two cores).
     #[arg(long)]
     quality: bool,
-    /// What to add to the number of differing bits: sharper outlines.
+    /// Intensity term added to the census cost, for sharper depth discontinuities.
     #[arg(long, value_name = "WHAT", value_parser = named::<IntensityCost>(), default_value_t = StereoOptions::default().intensity_cost)]
     blend: IntensityCost,
     /// Edge-preserving smoothing.
@@ -132,24 +132,24 @@ pub(crate) struct Args {
     /// Strength of --smoothing wls [default: 100].
     #[arg(long, value_name = "L")]
     lambda: Option<f32>,
-    /// Gray levels (of 255) across which --smoothing does not reach [default: 24; 1.5 for wls].
+    /// Intensity difference, in gray levels of 255, above which --smoothing preserves edges [default: 24; 1.5 for wls].
     #[arg(long, value_name = "LEVELS")]
     sigma: Option<f32>,
-    /// Take rows as they are. Without this, where few pixels match and features show the rows of the two photographs up to 8 px apart, the right one is moved
-    /// first; of frames, all as the first such pair shows.
+    /// Do not correct vertical disparity. By default, a vertical disparity of up to 8 px (epipolar misalignment) is estimated and the right image warped; for frames,
+    /// the correction of the first misaligned pair is used for all.
     #[arg(long)]
     no_align: bool,
-    /// Keep what is matched, however little that is and whatever features say of it: without this, a pair of which less than a fifth is matched is refused where
-    /// features say what is wrong with it.
+    /// Keep the result of a poorly matched pair. By default, a pair of which less than a fifth of the pixels is matched is refused if feature matches show what is wrong
+    /// with it.
     #[arg(long)]
     force: bool,
-    /// Where to write how sure each disparity is, from 0 to 1 (0 where filled): .pfm, .npy or .png (0 to 255).
+    /// Where to write the confidence of each disparity, from 0 to 1 (0 where filled): .pfm, .npy or .png (0 to 255).
     #[arg(long, value_name = "FILE")]
     confidence: Option<PathBuf>,
-    /// Where to write where each disparity comes from, as a PNG: 255 matched, 0 filled.
+    /// Where to write the mask of matched pixels, as a PNG: 255 matched, 0 filled or invalid.
     #[arg(long, value_name = "PNG")]
     matched: Option<PathBuf>,
-    /// Where to write the standard deviation of the depth, or of the disparity without a geometry; unknown where filled:
+    /// Where to write the standard deviation of the depth, or of the disparity if the geometry is unknown; invalid where filled:
     /// .pfm, .npy or .png (as --depth or the disparity).
     #[arg(long, value_name = "FILE")]
     uncertainty: Option<PathBuf>,
@@ -161,7 +161,7 @@ impl Run for Args {
         let maps = maps.into_iter().flatten().map(|path| (path, MAP));
         let others = [(&self.cloud, CLOUD), (&self.matched, PNG)];
         let others = others.into_iter().filter_map(|(path, endings)| Some((path.as_ref()?, endings)));
-        // Frames have a file each.
+        // One file per frame.
         let many = stands_for_many(&self.left);
         let output = |(path, endings)| if many { Output::Folder(path) } else { Output::File(path, endings) };
         maps.chain(others).map(|(path, endings): (&PathBuf, _)| output((path.as_path(), endings))).collect()
@@ -184,7 +184,7 @@ impl Run for Args {
     fn run(self, context: &Context) -> Result<Outcome, Failure> {
         if !self.more.is_empty() {
             return Err(Failure::usage(format!(
-                "a left and a right photograph are needed, not {}",
+                "a left and a right photograph are needed, got {}",
                 2 + self.more.len()
             ))
             .advice("for frames give two folders, or two patterns in quotes: 'left/*.png' 'right/*.png'"));
@@ -197,19 +197,19 @@ impl Run for Args {
             return self.run_frames(context);
         }
         if self.pair_by.is_some() {
-            return Err(Failure::usage("--pair-by is for frames, and these are two photographs"));
+            return Err(Failure::usage("--pair-by applies to sequences of frames, not to a single pair"));
         }
         let photos = Photos::read(&self.left, &self.right)?;
-        let mut film = self.film(&photos, [&self.left, &self.right], context)?;
+        let mut sequence = self.sequence(&photos, [&self.left, &self.right], context)?;
         let points = self.wants_points(context);
-        let job = at_own_depth!(photos, |a, b| film.frames.next_depth(a, b, points, context));
-        let job = job.map_err(|error| self.refused(error))?;
-        self.say_range(&film, context);
-        self.write(&job, film.meters, context)?;
+        let job = at_own_depth!(photos, |a, b| sequence.frames.next_depth(a, b, points, context));
+        let job = job.map_err(|error| self.failure(error))?;
+        self.report_range(&sequence, context);
+        self.write(&job, sequence.meters_per_unit, context)?;
         let DepthResult { map, disparities, .. } = &job.maps;
         let (valid, matched) = (map.valid_fraction(), map.matched_fraction());
         if let Some(offset) = &job.maps.vertical_offset {
-            say_alignment(offset, context);
+            warn_of_alignment(offset, context);
         }
         warn_of_filling(&job.maps, context);
         context.report(|| report::report(&job, &[]))?;
@@ -233,10 +233,10 @@ impl Run for Args {
     }
 }
 
-/// Says that the rows of the pair were apart and have been aligned.
-fn say_alignment(offset: &VerticalOffset, context: &Context) {
+/// Warns that the vertical disparity of the pair was corrected.
+fn warn_of_alignment(offset: &VerticalOffset, context: &Context) {
     context.warn(format!(
-        "the rows of the photographs were up to {:.1} px apart ({:+.1} in the middle, {:+.1} more from left to right, {:+.1} from top to bottom) and have been aligned; calibrate the cameras anew, or see --no-align",
+        "the pair had a vertical disparity of up to {:.1} px ({:+.1} at the center, {:+.1} from left to right, {:+.1} from top to bottom); the rows have been aligned: recalibrate the cameras, or see --no-align",
         offset.largest(),
         offset.at_center,
         offset.across,
@@ -244,38 +244,38 @@ fn say_alignment(offset: &VerticalOffset, context: &Context) {
     ));
 }
 
-/// Warns where hardly anything was matched, and where most of a map was guessed.
+/// Warns if few pixels were matched, and if most of the map is filled.
 fn warn_of_filling(maps: &DepthResult, context: &Context) {
     if let Some(few) = maps.feature_agreement {
         let doubt = if few.is_enough() { "" } else { ", too few to trust the map" };
         context.warn(format!(
-            "only {:.1} % of the pixels were matched and confirmed: too little texture, a pattern that repeats, or things that moved; of {} features on them {} show the same disparity{doubt}",
+            "only {:.1} % of the pixels were matched and confirmed: low texture, repetitive structure or moving objects; of {} features on them {} have a consistent disparity{doubt}",
             100.0 * maps.map.matched_fraction(), few.seen, few.agree
         ));
     }
     if maps.is_mostly_filled() {
         context.warn(format!(
-            "only {:.1} % of the pixels were matched; the others are filled in from around, and of such pixels about one in four is wrong (--no-fill leaves them unknown)",
+            "only {:.1} % of the pixels were matched; the others are filled from their surroundings, of which about one in four is wrong (--no-fill leaves them invalid)",
             100.0 * maps.map.matched_fraction()
         ));
     }
 }
 
-/// What is matched in the same way: two photographs, or frame after frame.
-struct Film {
+/// A matcher for one pair or for consecutive frames of the same size.
+struct Sequence {
     frames: FrameDepth,
     /// Width and height of the maps.
     size: (usize, usize),
-    /// Meters in a unit of the depth.
-    meters: f64,
+    /// Meters per unit of the depth.
+    meters_per_unit: f64,
 }
 
 impl Args {
-    /// The matcher of these photographs and of those that follow them, of the same sizes.
-    fn film(&self, photos: &Photos, paths: [&Path; 2], context: &Context) -> Result<Film, Failure> {
+    /// Prepares a matcher for this pair and for following pairs of the same size.
+    fn sequence(&self, photos: &Photos, paths: [&Path; 2], context: &Context) -> Result<Sequence, Failure> {
         let options = self.options(context);
         let [left, right] = photos.sizes();
-        let refused = |error| self.refused(error);
+        let failure = |error| self.failure(error);
         let Some(path) = self.rig.first() else {
             if left != right {
                 return Err(Failure::new(format!(
@@ -296,28 +296,29 @@ impl Args {
                 }
                 _ => None,
             };
-            self.say_memory(&options, left, context)?;
-            let frames = FrameDepth::new(options, geometry).map_err(refused)?;
-            // A baseline that is given by itself counts as one in meters.
-            return Ok(Film { frames, size: left, meters: 1.0 });
+            self.report_memory(&options, left, context)?;
+            let frames = FrameDepth::new(options, geometry).map_err(failure)?;
+            // --baseline is taken to be in meters.
+            return Ok(Sequence { frames, size: left, meters_per_unit: 1.0 });
         };
         let file = rig::read(&self.rig, left, self.exchange, context)?;
-        let (meters, rig) = (file.meters_per_unit().unwrap_or(1.0), file.rig);
+        let (meters_per_unit, rig) = (file.meters_per_unit().unwrap_or(1.0), file.rig);
         rig::check_size(path, paths[0], left, &rig.left)?;
         rig::check_size(path, paths[1], right, &rig.right)?;
         let settings = RectifyOptions { size: self.size, ..RectifyOptions::default() };
         let rectification =
             Rectification::new(&rig, &settings).map_err(|error| words::no_rectification(error, path, self.exchange))?;
         if rectification.vertical {
-            context.note("the rig is vertical: the maps are those of the photograph turned by a quarter, as `cv rectify` turns it");
+            context.note("the rig is vertical: the maps are those of the image rotated by 90 degrees, as written by `cv rectify`");
         }
         let size = (rectification.left.camera.width, rectification.left.camera.height);
-        self.say_memory(&options, size, context)?;
-        Ok(Film { frames: FrameDepth::of_rig(options, &rectification).map_err(refused)?, size, meters })
+        self.report_memory(&options, size, context)?;
+        let frames = FrameDepth::of_rig(options, &rectification).map_err(failure)?;
+        Ok(Sequence { frames, size, meters_per_unit })
     }
 
-    /// Why there is no depth.
-    fn refused(&self, error: DepthError) -> Failure {
+    /// Words an error of the matcher.
+    fn failure(&self, error: DepthError) -> Failure {
         match (error, self.rig.first()) {
             (DepthError::Rectify(error), Some(path)) => words::no_rectification(error, path, self.exchange),
             (error, rig) => words::no_depth(error, rig.is_some()),
@@ -328,23 +329,23 @@ impl Args {
         self.cloud.is_some() || context.wants_report()
     }
 
-    /// Tells the disparities that the photographs have shown.
-    fn say_range(&self, film: &Film, context: &Context) {
-        if let (Range::Auto, Some((first, count))) = (self.disparities, film.frames.disparities()) {
+    /// Reports the estimated search range of `--disparities auto`.
+    fn report_range(&self, sequence: &Sequence, context: &Context) {
+        if let (Range::Auto, Some((first, count))) = (self.disparities, sequence.frames.disparities()) {
             context.note(format!("disparities {first} to {}", first + count as i32 - 1));
         }
     }
 
-    /// All files that are asked for, the report aside. `meters` are in a unit of the depth.
-    fn write(&self, job: &RigDepthResult, meters: f64, context: &Context) -> Result<(), Failure> {
+    /// Writes all requested files except the report.
+    fn write(&self, job: &RigDepthResult, meters_per_unit: f64, context: &Context) -> Result<(), Failure> {
         let write_depth = |path: &Path, map: ImageView<'_, f32, 1>| {
-            cv_io::depth_mm::write(path, map.to_image().map(|[z]| [(f64::from(z) * meters) as f32]).view())
+            cv_io::depth_mm::write(path, map.to_image().map(|[z]| [(f64::from(z) * meters_per_unit) as f32]).view())
         };
         self.write_disparity(&job.maps.map, context)?;
         if let (Some(path), Some(depth)) = (&self.depth, &job.maps.depth)
             && let Some(lost) = write_map(context, path, depth.view(), write_depth)?
         {
-            context.warn(format!("{lost} depths do not fit 0 to 65.535 m and are stored as unknown"));
+            context.warn(format!("{lost} depths are outside 0 to 65.535 m and are stored as invalid"));
         }
         self.write_quality(&job.maps, write_depth, context)?;
         if let Some(path) = &self.cloud {
@@ -358,24 +359,24 @@ impl Args {
         let kitti = |path: &Path, map: ImageView<'_, f32, 1>| cv_io::kitti::write(path, map);
         if let Some(lost) = write_map(context, &self.output, map.disparity.view(), kitti)? {
             context
-                .warn(format!("{lost} disparities do not fit KITTI's range of 0 to 256 px and are stored as unknown"));
+                .warn(format!("{lost} disparities are outside KITTI's range of 0 to 256 px and are stored as invalid"));
         }
         Ok(())
     }
 
-    /// Tells what matching will take, before it is asked for; of a range that is still to be found nothing can be told.
-    fn say_memory(&self, options: &DepthOptions, size: (usize, usize), context: &Context) -> Result<(), Failure> {
+    /// Reports the memory that matching will take; unknown for `--disparities auto`.
+    fn report_memory(&self, options: &DepthOptions, size: (usize, usize), context: &Context) -> Result<(), Failure> {
         if self.disparities == Range::Auto {
             return Ok(());
         }
-        let matcher = StereoMatcher::new(options.stereo.clone()).map_err(|error| self.refused(error.into()))?;
+        let matcher = StereoMatcher::new(options.stereo.clone()).map_err(|error| self.failure(error.into()))?;
         let mib = matcher.memory(size.0, size.1) as f64 / f64::from(1 << 20);
         let disparities = options.stereo.disparities;
         context.note(format!("matching {}×{} px at {disparities} disparities takes {mib:.1} MiB", size.0, size.1));
         Ok(())
     }
 
-    /// Confidence, origin and uncertainty, where asked for.
+    /// Writes confidence, matched mask and uncertainty, if requested.
     fn write_quality(
         &self,
         maps: &DepthResult,
@@ -401,7 +402,9 @@ impl Args {
                 None => write_map(context, path, sigma.view(), |path, map| cv_io::kitti::write(path, map))?,
             };
             if let Some(lost) = lost {
-                context.warn(format!("{lost} uncertainties do not fit the format and are stored as unknown"));
+                context.warn(format!(
+                    "{lost} uncertainties are outside the range of the format and are stored as invalid"
+                ));
             }
         }
         Ok(())

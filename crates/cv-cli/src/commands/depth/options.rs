@@ -1,11 +1,11 @@
-//! What the arguments of `cv depth` mean to the matcher.
+//! Conversion of the arguments of `cv depth` to library options.
 
 use super::Args;
 use crate::frame::Context;
 use cv_pipeline::stereo::{Smoothing, StereoOptions};
 use cv_pipeline::{DepthOptions, DisparityRange, FewMatches};
 
-/// `--disparities`.
+/// The value of `--disparities`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Range {
     Auto,

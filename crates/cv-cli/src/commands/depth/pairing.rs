@@ -1,4 +1,4 @@
-//! Which frame of the right camera belongs to which of the left one.
+//! Pairing of the frames of several cameras.
 
 use crate::frame::Failure;
 use std::collections::BTreeMap;
@@ -15,12 +15,11 @@ pub(in crate::commands) enum PairBy {
 cv_core::named!(PairBy {
     Name = "name": "frames of the same file name, without its ending",
     Number = "number": "frames whose names have the same last number: left_0007 and right_0007",
-    Order = "order": "the first with the first and so on, whatever they are called",
+    Order = "order": "by position in the sorted list, regardless of names",
 });
 
-/// The pairs of frames, in the order of the left ones. Without `by`, by name where the names are the same and by number
-/// where they are not. A frame without a partner is refused: a pair of frames from two moments gives disparities that look
-/// right and are not.
+/// Pairs frames, in the order of the left ones. Without `by`, pairs them by name if the names are the same, else by number.
+/// Unpaired frames are refused: frames of different moments would give plausible but wrong disparities.
 pub(in crate::commands) fn pair(
     lefts: &[PathBuf],
     rights: &[PathBuf],
@@ -32,7 +31,7 @@ pub(in crate::commands) fn pair(
         Some(PairBy::Number) => by_key(lefts, rights, "number", number),
         None => {
             let named = by_key(lefts, rights, "name", name);
-            // What is wrong with the names is the better reason where there are no numbers.
+            // Without numbers, the error about names is the more helpful one.
             named.or_else(|reason| {
                 let numbered = lefts.iter().chain(rights).all(|frame| number(frame).is_some());
                 if numbered { by_key(lefts, rights, "number", number) } else { Err(reason) }
@@ -41,11 +40,11 @@ pub(in crate::commands) fn pair(
     }
 }
 
-/// The frames of one moment, by camera.
+/// The simultaneous frames, by camera.
 pub(in crate::commands) type Moment = Vec<Option<PathBuf>>;
 
-/// As [`pair`], but of any number of cameras, and frames that other cameras do not have stand alone: moments of the first camera in its order, then those of the
-/// second that are left, and so on.
+/// As [`pair`], for any number of cameras; unpaired frames are kept. Moments are in the order of the first camera, then the remaining ones of the second, and so
+/// on.
 pub(in crate::commands) fn join(cameras: &[Vec<PathBuf>], by: Option<PairBy>) -> Result<Vec<Moment>, Failure> {
     let shared = |key: &dyn Fn(&Path) -> Option<String>| -> Option<Vec<Moment>> {
         let keys = |frames: &Vec<PathBuf>| -> Option<BTreeMap<String, PathBuf>> {
@@ -54,7 +53,7 @@ pub(in crate::commands) fn join(cameras: &[Vec<PathBuf>], by: Option<PairBy>) ->
             (found.len() == frames.len()).then_some(found)
         };
         let found: Vec<BTreeMap<String, PathBuf>> = cameras.iter().map(keys).collect::<Option<_>>()?;
-        // Every camera has a moment with another one.
+        // Every camera must share a moment with another one.
         let joined = |i: usize| found[i].keys().any(|k| found.iter().filter(|of| of.contains_key(k)).count() > 1);
         if !(0..found.len()).all(joined) {
             return None;
@@ -64,11 +63,11 @@ pub(in crate::commands) fn join(cameras: &[Vec<PathBuf>], by: Option<PairBy>) ->
         Some(order.map(|k| found.iter().map(|of| of.get(&k).cloned()).collect()).collect())
     };
     let (Some(first), Some(second)) = (cameras.first(), cameras.get(1)) else {
-        return Err(Failure::usage("frames of two cameras or more are needed"));
+        return Err(Failure::usage("frames of two or more cameras are needed"));
     };
     let joined = match by {
         Some(PairBy::Order) => {
-            // All have as many as the first.
+            // All cameras must have the same number of frames.
             for other in &cameras[1..] {
                 in_order(first, other)?;
             }
@@ -79,7 +78,7 @@ pub(in crate::commands) fn join(cameras: &[Vec<PathBuf>], by: Option<PairBy>) ->
         Some(PairBy::Number) => shared(&number),
         None => shared(&name).or_else(|| shared(&number)),
     };
-    // Why two of them cannot be paired is the best reason.
+    // The error of two cameras that cannot be paired is the most specific one.
     joined.ok_or_else(|| {
         let others = cameras[1..].iter().find_map(|other| pair(first, other, by).err());
         others
@@ -100,7 +99,7 @@ fn name(frame: &Path) -> Option<String> {
     Some(frame.file_stem()?.to_string_lossy().into_owned())
 }
 
-/// The last number in the name, without leading zeros.
+/// Returns the last number in the name, without leading zeros.
 fn number(frame: &Path) -> Option<String> {
     let name = frame.file_stem()?.to_string_lossy().into_owned();
     let end = name.rfind(|c: char| c.is_ascii_digit())? + 1;
@@ -118,7 +117,7 @@ fn by_key(
     key: impl Fn(&Path) -> Option<String>,
 ) -> Result<Vec<(PathBuf, PathBuf)>, Failure> {
     const ADVICE: &str = "select the frames of the same moments by patterns ('left/frame_00*.png'), or rename them; \
-                          --pair-by order pairs them as they are sorted";
+                          --pair-by order pairs them by position in the sorted list";
     let index = |frames: &[PathBuf]| -> Result<BTreeMap<String, PathBuf>, Failure> {
         let mut found: BTreeMap<String, PathBuf> = BTreeMap::new();
         for frame in frames {
@@ -138,7 +137,7 @@ fn by_key(
     };
     let (left_alone, right_alone) = (alone(&left, &right), alone(&right, &left));
     if left_alone.is_empty() && right_alone.is_empty() {
-        // In the order of the left ones, which is not that of the keys: numbers are compared as text there.
+        // In the order of the left frames; the keys are sorted as text, not as numbers.
         let partner = |frame: &PathBuf| Some((frame.clone(), right.get(&key(frame)?)?.clone()));
         return Ok(lefts.iter().filter_map(partner).collect());
     }
@@ -173,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_of_the_same_moment_are_paired() {
+    fn simultaneous_frames_are_paired() {
         let pairs = |list: &[(&str, &str)]| list.iter().map(|(a, b)| ((*a).into(), (*b).into())).collect::<Vec<_>>();
         let same = paired(&["l/f2.png", "l/f10.png"], &["r/f10.jpg", "r/f2.jpg"], None).unwrap();
         assert_eq!(same, pairs(&[("l/f2.png", "r/f2.jpg"), ("l/f10.png", "r/f10.jpg")]));
@@ -189,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_without_a_partner_can_stand_alone() {
+    fn unpaired_frames_can_be_kept() {
         let joined = |left: &[&str], right: &[&str], by| {
             let text = |path: Option<PathBuf>| path.map(|p| p.display().to_string()).unwrap_or_default();
             let found = join(&[paths(left), paths(right)], by);
@@ -207,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_of_three_cameras_are_put_together_by_moments() {
+    fn frames_of_three_cameras_are_grouped_by_moment() {
         let frames = [paths(&["a/1.png", "a/2.png"]), paths(&["b/2.png", "b/3.png"]), paths(&["c/3.png", "c/1.png"])];
         let found = join(&frames, None).unwrap();
         let seen: Vec<Vec<bool>> = found.iter().map(|moment| moment.iter().map(Option::is_some).collect()).collect();
@@ -223,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_of_other_moments_are_refused_by_name() {
+    fn unpaired_frames_are_refused_by_name() {
         let (left, right) = (["l/f1.png", "l/f2.png", "l/f3.png"], ["r/f2.png", "r/f3.png", "r/f4.png"]);
         for by in [None, Some(PairBy::Name), Some(PairBy::Number)] {
             let text = paired(&left, &right, by).unwrap_err();

@@ -1,14 +1,14 @@
 //! The report of `cv depth`.
 
 use crate::frame::Failure;
-use crate::pictures::{Width, map as colored, picture, turning};
+use crate::pictures::{Width, interactive_cloud, map as colored, picture};
 use cv_core::{Camera, ImageView, Point3, PointCloud, Pose, RgbU8, Rotation3, Vector3};
 use cv_pipeline::stereo::{PixelState, StereoGeometry};
 use cv_pipeline::{DepthResult, RigDepthResult};
 use cv_report::{MapStyle, Note, Plot, PointScene, Report, camera_color};
 use std::path::PathBuf;
 
-/// Where each disparity comes from, over the darkened photograph.
+/// Colors the pixels of the darkened image by state: occluded, mismatched, out of view.
 fn draw_states(left: ImageView<'_, u8, 3>, states: ImageView<'_, PixelState, 1>) -> RgbU8 {
     RgbU8::from_fn(states.width(), states.height(), |x, y| {
         let pixel = left.at(x, y);
@@ -22,7 +22,7 @@ fn draw_states(left: ImageView<'_, u8, 3>, states: ImageView<'_, PixelState, 1>)
     })
 }
 
-/// The page of a pair; with `frames`, their names and the shares of pixels that were matched and that have a disparity, of the first of them.
+/// Builds the page of a pair; of a sequence, the page of its first pair and the matched and valid fractions of all `frames`.
 pub(super) fn report(job: &RigDepthResult, frames: &[(PathBuf, f64, f64)]) -> Result<Report, Failure> {
     let RigDepthResult { images: [left, right], maps, cloud } = job;
     let DepthResult { map, depth, geometry, stages, .. } = maps;
@@ -35,13 +35,13 @@ pub(super) fn report(job: &RigDepthResult, frames: &[(PathBuf, f64, f64)]) -> Re
         let rows: Vec<Vec<String>> = frames
             .iter()
             .map(|(path, matched, valid)| {
-                let percent = |share: f64| format!("{:.1} %", 100.0 * share);
+                let percent = |fraction: f64| format!("{:.1} %", 100.0 * fraction);
                 vec![path.display().to_string(), percent(*matched), percent(*valid)]
             })
             .collect();
         page.headline("frames", &frames.len().to_string());
         page.section("Frames").table(
-            "What follows is the first frame.",
+            "The sections below show the first frame.",
             &["frame", "matched and confirmed", "with a disparity"],
             &rows,
         );
@@ -55,22 +55,22 @@ pub(super) fn report(job: &RigDepthResult, frames: &[(PathBuf, f64, f64)]) -> Re
             map.disparity.view(),
             &MapStyle::disparity(),
             Width::Half,
-            "Disparity: near (large) blue, far (small) red, unknown gray.",
+            "Disparity: near (large) blue, far (small) red, invalid gray.",
         )?,
         picture(
             &draw_states(left.view(), map.state.view()),
             Width::Half,
-            "Filled pixels: blue hidden from the right camera, orange mismatched, violet outside the right photograph.",
+            "Filled pixels: blue occluded in the right image, orange mismatched, violet outside the right image.",
         )?,
     ]);
     let pixels = map.disparity.as_slice().iter().zip(map.state.as_slice());
     let matched = pixels.filter(|(_, state)| **state == PixelState::Matched);
     let fractions = fractions(matched.map(|(&d, _)| d));
-    page.folded("Fractions of a pixel", |page| {
+    page.folded("Subpixel distribution", |page| {
         page.plot(
             &fractions,
-            "How often matched disparities have each fraction. Whole pixels that stand out (pixel locking) betray a poor fit \
-             between pixels, unless the scene is of few planes that face the cameras.",
+            "Distribution of the fractional part of matched disparities. Peaks at whole pixels (pixel locking) indicate a biased subpixel \
+             interpolation, unless the scene has few fronto-parallel planes.",
         );
     });
     if let (Some(depth), Some(geometry)) = (depth, geometry) {
@@ -78,18 +78,22 @@ pub(super) fn report(job: &RigDepthResult, frames: &[(PathBuf, f64, f64)]) -> Re
             depth.view(),
             &MapStyle::depth(""),
             Width::Full,
-            "Depth in the unit of the baseline: near blue, far red, unknown gray.",
+            "Depth in the unit of the baseline: near blue, far red, invalid gray.",
         )?);
         page.section("Cloud");
-        turning(&mut page, &scene(cloud, geometry, (width, height)), "The depth map in space, and the two cameras.")?;
+        interactive_cloud(
+            &mut page,
+            &scene(cloud, geometry, (width, height)),
+            "The depth map as a point cloud, and the two cameras.",
+        )?;
     } else {
-        page.note(Note::Info, "No depth: the focal length and the baseline were not given.");
+        page.note(Note::Info, "No depth: focal length and baseline are unknown.");
     }
     page.section("Time").times(stages);
     Ok(page)
 }
 
-/// The cloud of a depth map with both cameras, and where each photograph of `width × height` pixels shows the points.
+/// Builds the scene of a depth map's cloud with both cameras and the projections of its points in the images of `width × height` pixels.
 pub(crate) fn scene(cloud: &PointCloud, geometry: &StereoGeometry, (width, height): (usize, usize)) -> PointScene {
     let mut scene = PointScene::new(cloud);
     let focal = geometry.focal;
@@ -104,8 +108,13 @@ pub(crate) fn scene(cloud: &PointCloud, geometry: &StereoGeometry, (width, heigh
     scene
 }
 
-/// How the fractions of disparities are spread.
+/// Plots the distribution of the fractional parts of disparities.
 pub(crate) fn fractions(disparities: impl Iterator<Item = f32>) -> Plot {
     let values: Vec<f64> = disparities.filter(|d| d.is_finite()).map(|d| f64::from(d) - f64::from(d).floor()).collect();
-    Plot::new("Fractions of disparities", "fraction of a pixel", "pixels").histogram_within("", &values, 20, (0.0, 1.0))
+    Plot::new("Fractional parts of disparities", "fraction of a pixel", "pixels").histogram_within(
+        "",
+        &values,
+        20,
+        (0.0, 1.0),
+    )
 }

@@ -8,10 +8,10 @@ use cv_pipeline::PanoramaResult;
 use cv_report::{MatchStyle, Report, draw_matches, shrink_to_fit};
 use std::path::PathBuf;
 
-/// Pairs whose matches are drawn: more than these nobody looks at.
-const PAIRS: usize = 12;
+/// Maximum number of pairs whose matches are drawn.
+const MAX_DRAWN_PAIRS: usize = 12;
 
-/// The page: the panorama, which photograph is where, and what became of each photograph and each overlap. `pictures` are the photographs and, as the last, the panorama.
+/// Builds the page: the panorama, its seams, the outcome of each photograph and the matches of each overlap. `pictures` are the photographs and, last, the panorama.
 pub(super) fn report<T>(
     paths: &[PathBuf],
     pictures: &[ImageView<'_, u8, 3>],
@@ -24,14 +24,14 @@ pub(super) fn report<T>(
     let mut page = Report::new("Panorama");
     page.headline("photographs used", &format!("{used} of {}", paths.len()))
         .headline("size", &format!("{width}×{height}"))
-        .headline("matches agree to", &format!("{:.2} px", result.reprojection_rms_px));
+        .headline("residual of matches (RMS)", &format!("{:.2} px", result.reprojection_rms_px));
     let caption = format!("{} projection; black where no photograph reaches.", result.canvas.projection);
     page.section("Panorama").figure(picture(&image.to_image(), Width::Full, &caption)?);
     let sources = RgbU8::from_fn(width, height, |x, y| {
         let label = result.labels.at(x, y)[0];
         if label == u16::MAX { [0; 3] } else { tint(image.at(x, y), label) }
     });
-    let caption = "Which photograph each pixel is from: the seams run where the color changes.";
+    let caption = "Source photograph of each pixel; seams are where the color changes.";
     page.figure(picture(&sources, Width::Full, caption)?);
 
     page.section("Photographs");
@@ -41,15 +41,15 @@ pub(super) fn report<T>(
         .enumerate()
         .map(|(i, image)| {
             let focal = image.focal.map_or_else(|| "–".to_owned(), |f| format!("{f:.0} px"));
-            let fate = image.reason.as_ref().map_or_else(|| "used".to_owned(), |r| words::left_out(r, paths));
-            vec![name(i), fate, image.features.to_string(), focal]
+            let outcome = image.reason.as_ref().map_or_else(|| "used".to_owned(), |r| words::left_out(r, paths));
+            vec![name(i), outcome, image.features.to_string(), focal]
         })
         .collect();
-    page.table("What became of each photograph.", &["file", "used or why not", "features", "focal length"], &rows);
+    page.table("Outcome of each photograph.", &["file", "outcome", "features", "focal length"], &rows);
 
     page.section("Overlaps");
     let accepted = result.pairs.iter().filter(|pair| pair.rejected.is_none());
-    for pair in accepted.take(PAIRS) {
+    for pair in accepted.take(MAX_DRAWN_PAIRS) {
         let (photo_a, photo_b) = (pictures[pair.a], pictures[pair.b]);
         let (a, b) = (shrink_to_fit(photo_a, 700), shrink_to_fit(photo_b, 700));
         let at = |p: Point2<f64>, photo: ImageView<'_, u8, 3>, small: &RgbU8| {
@@ -65,14 +65,14 @@ pub(super) fn report<T>(
         let drawn = draw_matches(a.view(), b.view(), &matches, Some(&agree), &MatchStyle::default());
         let good = pair.inliers.len();
         let caption =
-            format!("{} and {}: {good} of {} matches agree (green).", name(pair.a), name(pair.b), matches.len());
+            format!("{} and {}: {good} of {} matches are inliers (green).", name(pair.a), name(pair.b), matches.len());
         page.figure(picture(&drawn, Width::Full, &caption)?);
     }
     page.section("Time").times(&result.stages);
     Ok(page)
 }
 
-/// The pixel under a color of its photograph's own; neighbors in number are far apart on the color circle.
+/// Tints a pixel with the hue of its photograph; consecutive labels have distant hues (golden ratio).
 fn tint(pixel: [u8; 3], label: u16) -> [u8; 3] {
     const GOLDEN: f32 = 0.618_034;
     let hue = f32::from(label) * GOLDEN * std::f32::consts::TAU;

@@ -9,7 +9,7 @@ use cv_report::{
 };
 use std::path::Path;
 
-/// The page: the cloud, the motion, what was matched, and how well it fits.
+/// Builds the page: clouds, relative pose, matches and residuals.
 pub(super) fn report(
     paths: [&Path; 2],
     photos: [&RgbU8; 2],
@@ -21,14 +21,14 @@ pub(super) fn report(
     let mut page = Report::new("Two-view reconstruction");
     page.subtitle(&format!("{} and {}", paths[0].display(), paths[1].display()))
         .headline("points", &found.points.len().to_string())
-        .headline("matches that agree", &format!("{} of {}", found.inliers.len(), result.matching.matches.len()))
-        .headline("reprojection", &format!("{:.2} px", found.reprojection_rms))
-        .headline("median angle", &format!("{:.2}°", found.median_angle.to_degrees()));
+        .headline("inliers", &format!("{} of {}", found.inliers.len(), result.matching.matches.len()))
+        .headline("reprojection RMS", &format!("{:.2} px", found.reprojection_rms))
+        .headline("median triangulation angle", &format!("{:.2}°", found.median_angle.to_degrees()));
     if found.planar_ratio > 0.8 {
-        page.warn("most of the scene is nearly one plane: the motion is less certain than the deviations say");
+        page.warn("the scene is nearly planar: the pose is less certain than its standard deviations state");
     }
     page.section("The cloud").paragraph(
-        "Each point was seen in both photographs. The unit is the distance between the two cameras, which are drawn as pyramids.",
+        "The points are triangulated from both images. The unit is the baseline; the cameras are drawn as pyramids.",
     );
     let names = paths.map(|path| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy());
     cloud(&mut page, &sparse(result, names.each_ref().map(|n| &**n)), "The points and the two cameras.")?;
@@ -41,10 +41,10 @@ pub(super) fn report(
     page.section("Quality");
     let plot = |title: &str, unit: &str, values: Vec<f64>| Plot::new(title, unit, "points").histogram("", &values, 30);
     let errors = plot("Reprojection error", "px", found.points.iter().map(|p| p.reprojection).collect());
-    let angles = plot("Angle between the rays", "degrees", found.points.iter().map(|p| p.angle.to_degrees()).collect());
+    let angles = plot("Triangulation angle", "degrees", found.points.iter().map(|p| p.angle.to_degrees()).collect());
     page.plots(&[
-        (&errors, "How far the points are from where they were seen."),
-        (&angles, "Small angles make uncertain depths."),
+        (&errors, "Distance of the projections of the points from the matched keypoints."),
+        (&angles, "Small angles mean uncertain depths."),
     ]);
     let stages: Vec<_> =
         result.stages.iter().copied().chain(dense.iter().flat_map(|d| super::dense_stages(d))).collect();
@@ -52,7 +52,7 @@ pub(super) fn report(
     Ok(page)
 }
 
-/// The points that were matched, both cameras, and where each photograph shows the points.
+/// Builds the scene of the sparse points, both cameras, and the keypoints of the points in both images.
 pub(crate) fn sparse(result: &ReconstructResult, names: [&str; 2]) -> PointScene {
     let mut scene = scene(&result.cloud(), result);
     for (side, (name, camera)) in names.into_iter().zip(&result.scene.cameras).enumerate() {
@@ -64,7 +64,7 @@ pub(crate) fn sparse(result: &ReconstructResult, names: [&str; 2]) -> PointScene
     scene
 }
 
-/// A cloud with both cameras.
+/// Builds a scene of a cloud with both cameras.
 fn scene(cloud: &PointCloud, result: &ReconstructResult) -> PointScene {
     let mut scene = PointScene::new(cloud);
     for (i, (camera, pose)) in result.scene.cameras.iter().zip([Pose::identity(), result.scene.pose]).enumerate() {
@@ -79,25 +79,22 @@ fn motion(page: &mut Report, result: &ReconstructResult, source: &str) {
     let vector = |v: &cv_core::Vector3<f64>| format!("({:.4}, {:.4}, {:.4})", v.x, v.y, v.z);
     let deviation = match found.focal_deviation {
         0.0 => String::new(),
-        share => format!(" ± {:.1} %", 100.0 * share),
+        relative => format!(" ± {:.1} %", 100.0 * relative),
     };
-    page.section("The motion").facts(
-        "From the first camera to the second, in the frame of the first: x to the right, y down, z ahead.",
+    page.section("Relative pose").facts(
+        "From the first camera to the second, in the frame of the first: x right, y down, z forward.",
         &[
-            ("angle of the rotation", degrees(found.pose.rotation_angle())),
-            (
-                "axis of the rotation",
-                found.pose.rotation.axis().map_or_else(|| "none".to_owned(), |axis| vector(&axis)),
-            ),
-            ("direction of the translation", vector(&found.pose.translation)),
+            ("rotation angle", degrees(found.pose.rotation_angle())),
+            ("rotation axis", found.pose.rotation.axis().map_or_else(|| "none".to_owned(), |axis| vector(&axis))),
+            ("translation direction", vector(&found.pose.translation)),
             ("standard deviation of the rotation", degrees(found.pose_deviation[0])),
-            ("standard deviation of the direction", degrees(found.pose_deviation[1])),
-            ("matches along epipolar lines", found.guided.to_string()),
+            ("standard deviation of the translation direction", degrees(found.pose_deviation[1])),
+            ("matches added by guided matching", found.guided.to_string()),
             (
                 "focal lengths",
                 format!("{:.1} and {:.1} px{deviation} ({source})", found.cameras[0].fx, found.cameras[1].fx),
             ),
-            ("explained by one plane", format!("{:.0} % of the matches that agree", 100.0 * found.planar_ratio)),
+            ("explained by one plane", format!("{:.0} % of the inliers", 100.0 * found.planar_ratio)),
         ],
     );
 }
@@ -106,10 +103,10 @@ fn matches(page: &mut Report, [a, b]: [&RgbU8; 2], result: &ReconstructResult) -
     let [fa, fb] = result.matching.features.each_ref().map(|f| &f.keypoints);
     let shown = |k: &[Keypoint]| k.iter().step_by((k.len() / 2000).max(1)).copied().collect::<Vec<_>>();
     let marked = |photo: &RgbU8, k: &[Keypoint]| draw_keypoints(photo.view(), &shown(k), [0, 158, 115]);
-    let first = format!("{} features of the first photograph (at most 2000 drawn).", fa.len());
+    let first = format!("{} features of the first image (at most 2000 drawn).", fa.len());
     page.section("Features and matches").figures(vec![
         picture(&marked(a, fa), Width::Half, &first)?,
-        picture(&marked(b, fb), Width::Half, &format!("{} of the second.", fb.len()))?,
+        picture(&marked(b, fb), Width::Half, &format!("{} features of the second image.", fb.len()))?,
     ]);
     let pairs = &result.matching.pairs();
     let mut mask = vec![false; pairs.len()];
@@ -120,11 +117,11 @@ fn matches(page: &mut Report, [a, b]: [&RgbU8; 2], result: &ReconstructResult) -
     let chosen: Vec<Correspondence> = result.scene.inliers.iter().map(|&i| pairs[i]).collect();
     let lines = draw_epipolar_lines(a.view(), b.view(), &result.scene.fundamental(), &chosen, 24);
     for (image, caption) in [
-        (before, "Tentative matches, each in a color of its own."),
-        (after, "The same after the search for a motion: matches that agree green, others red."),
+        (before, "Tentative matches, each in its own color."),
+        (after, "After robust estimation of the pose: inliers green, outliers red."),
         (
             lines,
-            "Points and their epipolar lines: each point of one photograph lies on its line in the other (up to the lens distortion, which bends lines).",
+            "Points and their epipolar lines in the other image (lens distortion, which bends them, is not drawn).",
         ),
     ] {
         page.figure(picture(&image, Width::Full, caption)?);
@@ -132,7 +129,7 @@ fn matches(page: &mut Report, [a, b]: [&RgbU8; 2], result: &ReconstructResult) -
     Ok(())
 }
 
-/// Depth and cloud of the dense matching.
+/// Adds the depth map and the cloud of the dense matching.
 fn dense_section(
     page: &mut Report,
     dense: &DenseResult,
@@ -141,14 +138,14 @@ fn dense_section(
 ) -> Result<(), Failure> {
     let (width, height) = dense.size;
     page.section("The dense cloud").paragraph(&format!(
-        "The photographs were rectified to {width}×{height} px and matched at {} disparities. {} points, {:.0} % of what both show, were confirmed \
-         from both.",
+        "The images were rectified to {width}×{height} px and matched at {} disparities. {} points, {:.0} % of the overlap, passed the left-right \
+         check.",
         dense.disparities.1,
         dense.cloud.len(),
         100.0 * dense.coverage,
     ));
-    let style = MapStyle::depth("distances between the cameras");
-    let caption = "Depth of the first photograph: near blue, far red, unknown gray.";
+    let style = MapStyle::depth("baselines");
+    let caption = "Depth of the first image: near blue, far red, invalid gray.";
     page.figure(map(dense.depth.view(), &style, Width::Full, caption)?);
     let mut scene = scene(&dense.cloud, result);
     for ((name, camera), pose) in

@@ -1,4 +1,4 @@
-//! Which mask belongs to which photograph.
+//! Pairing of photographs and masks.
 
 use crate::frame::{Context, Failure, expand_images};
 use cv_core::{Mask, RgbU8};
@@ -12,12 +12,12 @@ pub(super) struct Pair {
     pub(super) mask: PathBuf,
 }
 
-/// The name of a file without folder and ending.
+/// Returns the file name without folder and extension.
 pub(super) fn stem(path: &Path) -> String {
     path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-/// Without the files that are masks of others in the list: `NAME_mask` where there is a `NAME`.
+/// Removes the masks of other files in the list: `NAME_mask` if there is a `NAME`.
 pub(super) fn without_masks(paths: Vec<PathBuf>) -> Vec<PathBuf> {
     let names: BTreeSet<PathBuf> = paths.iter().map(|p| p.with_extension("")).collect();
     let is_mask = |path: &PathBuf| {
@@ -26,12 +26,12 @@ pub(super) fn without_masks(paths: Vec<PathBuf>) -> Vec<PathBuf> {
     paths.into_iter().filter(|path| !is_mask(path)).collect()
 }
 
-/// Pairs photographs with the masks of a folder by name. Photographs without a mask are left out, with a warning.
+/// Pairs photographs with the masks of a folder by name. Photographs without a mask are skipped with a warning.
 pub(super) fn pair(images: &[PathBuf], masks: &Path, context: &Context) -> Result<Vec<Pair>, Failure> {
     if !masks.is_dir() {
         let what = if masks.exists() { "is not a folder" } else { "does not exist" };
         return Err(Failure::new(format!("the folder of masks {} {what}", masks.display()))
-            .advice("name the folder that holds NAME_mask.png or NAME.png for each photograph NAME"));
+            .advice("name the folder with NAME_mask.png or NAME.png for each photograph NAME"));
     }
     let candidates = expand_images(&[masks.to_path_buf()])?;
     let photos = without_masks(expand_images(images)?);
@@ -44,7 +44,7 @@ pub(super) fn pair(images: &[PathBuf], masks: &Path, context: &Context) -> Resul
             _ => false,
         };
         let named = |wanted: &str| {
-            // A PNG before others of the same name.
+            // PNG files are preferred.
             let all = || candidates.iter().filter(|path| stem(path) == wanted && !same(path));
             all().find(|path| path.extension().is_some_and(|e| e.eq_ignore_ascii_case("png"))).or_else(|| all().next())
         };
@@ -72,7 +72,7 @@ pub(super) fn pair(images: &[PathBuf], masks: &Path, context: &Context) -> Resul
     Ok(pairs)
 }
 
-/// Reads a photograph and its mask. Masks of the values 0 and 1 count as black and white.
+/// Reads a photograph and its mask. In masks with the values 0 and 1 only, 1 is white.
 pub(super) fn read_pair(pair: &Pair, context: &Context) -> Result<(RgbU8, Mask), Failure> {
     let photo = cv_io::read_rgb(&pair.photo)?;
     let values = cv_io::read_gray_u8(&pair.mask)?;
@@ -80,13 +80,13 @@ pub(super) fn read_pair(pair: &Pair, context: &Context) -> Result<(RgbU8, Mask),
     let between = values.as_slice().iter().filter(|v| (64..192).contains(*v)).count();
     if between * 10 > values.as_slice().len() {
         context.warn(format!(
-            "{} is not black and white: {:.0} % of it are in between. Is it a mask?",
+            "{} may not be a mask: {:.0} % of its pixels are neither black nor white",
             pair.mask.display(),
             100.0 * between as f64 / values.as_slice().len() as f64
         ));
     }
-    let middle = if brightest == 1 { 0 } else { 127 };
-    Ok((photo, values.map(|[v]| [v > middle])))
+    let threshold = if brightest == 1 { 0 } else { 127 };
+    Ok((photo, values.map(|[v]| [v > threshold])))
 }
 
 #[cfg(test)]
@@ -94,7 +94,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn masks_among_photographs_are_no_photographs() {
+    fn masks_are_removed_from_lists_of_photographs() {
         let paths =
             ["a/1.jpg", "a/1_mask.png", "a/gas_mask.jpg", "b/1_mask.png", "a/2.png"].map(PathBuf::from).to_vec();
         let left: Vec<String> = without_masks(paths).iter().map(|p| p.display().to_string()).collect();

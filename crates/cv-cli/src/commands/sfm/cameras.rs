@@ -1,4 +1,4 @@
-//! The cameras of the photographs: which of them share one, and what is known of it.
+//! The cameras of the photographs: which photographs share one, and the prior knowledge of its intrinsics.
 
 use super::Args;
 use super::earlier::Earlier;
@@ -14,17 +14,17 @@ use std::path::Path;
 #[derive(Default)]
 pub(super) struct Cameras {
     all: SfmCameras,
-    /// By their numbers in an earlier model.
+    /// Index of each camera of an earlier model, by its id there.
     earlier: BTreeMap<u32, usize>,
 }
 
-/// Why a photograph has no camera.
+/// Words a mismatch of the sizes of a photograph and its camera.
 fn other_size(OtherSize { photo: (width, height), camera: (w, h) }: OtherSize, file: &Path) -> String {
     format!("it is {width}×{height} px, its camera in {} is {w}×{h} px", file.display())
 }
 
 impl Cameras {
-    /// The index of a camera of an earlier model, or why it is not that of a photograph of that size.
+    /// Returns the index of a camera of an earlier model, or why it does not fit a photograph of that size.
     pub(super) fn of_earlier(
         &mut self,
         size: (usize, usize),
@@ -45,7 +45,7 @@ impl Cameras {
         Ok(Ok(index))
     }
 
-    /// The index of the camera of a photograph of that size and, by EXIF, that focal length in pixels, or why it has none.
+    /// Returns the index of the camera of a photograph with that size and EXIF focal length in pixels, or why it has none.
     pub(super) fn of(
         &mut self,
         size: (usize, usize),
@@ -71,14 +71,14 @@ impl Cameras {
         Ok(self.all.get_or_add(size, None, calibrated)?.map_err(|error| other_size(error, file)))
     }
 
-    /// All of them, by index.
+    /// Returns all cameras, by index.
     pub(super) fn list(&self) -> &[SfmCamera] {
         self.all.list()
     }
 }
 
 impl Args {
-    /// Refuses, before the work, a lens that the outputs cannot hold.
+    /// Refuses, before the computation, a distortion model that the output formats cannot represent.
     fn check_lens(&self, file: &Path, camera: &Camera) -> Result<(), Failure> {
         let refuse = |error: cv_io::FormatError| {
             Failure::new(format!("{}: {error}", file.display()))

@@ -1,6 +1,6 @@
-//! The work of a run that may be stopped: features as each photograph has them, then the pairs, in a folder beside the result until that is whole.
+//! Checkpoints of a run that may be stopped: the features of each photograph, then the matched pairs, in a subfolder of the output until the model is complete.
 //!
-//! What is there is told by what it was made of, bytes and options, and not by when or from where: a checkpoint of anything else is not taken.
+//! Entries are keyed by a hash of their inputs (file contents and options), not by time or path: entries of other inputs are ignored.
 
 mod record;
 
@@ -10,31 +10,31 @@ use cv_core::Cancelled;
 use cv_io::IoError;
 use cv_pipeline::{SfmCamera, SfmJobOptions, SfmPhoto};
 use record::Record;
-pub(super) use record::{Pairs, Seen};
+pub(super) use record::{Extracted, Pairs};
 use std::cell::{Cell, RefCell};
 use std::fs;
 use std::hash::{DefaultHasher, Hasher};
 use std::path::{Path, PathBuf};
 
-/// The folder, within that of the result.
+/// Name of the checkpoint's subfolder of the output folder.
 const FOLDER: &str = ".cv-sfm";
 
-/// The work of a run so far.
+/// The checkpoint of a run.
 pub(super) struct Checkpoint<'a> {
     folder: PathBuf,
-    /// Whether an earlier run's work is taken.
+    /// Whether entries of an earlier run are reused.
     resume: bool,
-    /// Whether there is any.
+    /// Whether there is a checkpoint of an earlier run.
     found: bool,
-    /// Folders that were not there before this run, the innermost first.
+    /// Folders that did not exist before this run, the innermost first.
     missing: Vec<PathBuf>,
     context: &'a Context,
-    /// Whether writing failed: the disk is full, say. The run goes on without.
+    /// Whether writing failed (on a full disk, for example). The run continues without checkpoints.
     broken: Cell<bool>,
-    /// Of each photograph whose features are known.
+    /// Keys of the photographs with features.
     keys: RefCell<Vec<u64>>,
-    /// How many photographs' features, and whether pairs, are of an earlier run.
-    taken: Cell<(usize, bool)>,
+    /// Number of photographs whose features are reused, and whether the pairs are.
+    reused: Cell<(usize, bool)>,
 }
 
 impl<'a> Checkpoint<'a> {
@@ -44,40 +44,39 @@ impl<'a> Checkpoint<'a> {
         cv_io::remove_abandoned(&folder);
         let found = folder.exists();
         match (found, resume) {
-            (true, false) => context.note(format!(
-                "{} holds the work of a run that was stopped, which --resume goes on with",
-                folder.display()
-            )),
-            (false, true) => context.note(format!("{} is not there: from the start", folder.display())),
+            (true, false) => {
+                context.note(format!("{} has the checkpoint of a stopped run; --resume continues it", folder.display()))
+            }
+            (false, true) => context.note(format!("{} does not exist: starting from the beginning", folder.display())),
             _ => {}
         }
-        let (broken, keys, taken) = (Cell::new(false), RefCell::default(), Cell::new((0, false)));
-        Self { folder, resume, found, missing, context, broken, keys, taken }
+        let (broken, keys, reused) = (Cell::new(false), RefCell::default(), Cell::new((0, false)));
+        Self { folder, resume, found, missing, context, broken, keys, reused }
     }
 
-    /// What an earlier run has seen in a photograph, and the key under which this run puts it where there is nothing.
-    pub(super) fn seen(&self, photograph: &Photograph, options: &SfmJobOptions) -> (u64, Option<Seen>) {
-        // What cannot be read is told of where it is decoded.
+    /// Returns the key of a photograph, and its features of an earlier run if there are any.
+    pub(super) fn extracted(&self, photograph: &Photograph, options: &SfmJobOptions) -> (u64, Option<Extracted>) {
+        // A file that cannot be read is reported when it is decoded.
         let bytes = cv_io::read_bytes(&photograph.path).unwrap_or_default();
         let key = key(&[&bytes, format!("{:?}", options.features).as_bytes()]);
         let kind = options.features.extractor().kind();
-        let found = self.read(&features_file(key), key, |record| record.seen(kind));
+        let found = self.read(&features_file(key), key, |record| record.extracted(kind));
         if found.is_some() {
-            self.taken.set((self.taken.get().0 + 1, false));
+            self.reused.set((self.reused.get().0 + 1, false));
         }
         (key, found)
     }
 
-    pub(super) fn keep_seen(&self, key: u64, seen: &Seen) {
-        self.write(&features_file(key), key, || Record::of_seen(seen));
+    pub(super) fn store_extracted(&self, key: u64, extracted: &Extracted) {
+        self.write(&features_file(key), key, || Record::of_extracted(extracted));
     }
 
-    /// The photograph counts.
+    /// Adds a photograph to the key of the pairs.
     pub(super) fn add(&self, key: u64) {
         self.keys.borrow_mut().push(key);
     }
 
-    /// The pairs of all photographs that count, by an earlier run or by `find`.
+    /// Returns the pairs of all added photographs, from an earlier run or by `find`.
     pub(super) fn pairs(
         &self,
         photos: &[SfmPhoto],
@@ -87,12 +86,12 @@ impl<'a> Checkpoint<'a> {
     ) -> Result<Pairs, Cancelled> {
         let keys: Vec<u8> = self.keys.borrow().iter().flat_map(|key| key.to_le_bytes()).collect();
         let of: Vec<usize> = photos.iter().map(|photo| photo.camera).collect();
-        // The solution's own options have no part in the pairs.
+        // The pairs do not depend on the options of the solver.
         let options = SfmJobOptions { solve: SfmJobOptions::default().solve, ..options.clone() };
         let key = key(&[&keys, format!("{of:?} {cameras:?} {options:?}").as_bytes()]);
         let sizes: Vec<usize> = photos.iter().map(|photo| photo.keypoints.len()).collect();
         if let Some(found) = self.read("pairs", key, |record| record.pairs(&sizes)) {
-            self.taken.set((self.taken.get().0, true));
+            self.reused.set((self.reused.get().0, true));
             return Ok(found);
         }
         let found = find()?;
@@ -111,7 +110,7 @@ impl<'a> Checkpoint<'a> {
         });
         if found.is_none() {
             self.context
-                .note(format!("{} is damaged or of other photographs or options: it is made anew", path.display()));
+                .note(format!("{} is corrupt, or of other photographs or options: it is recomputed", path.display()));
         }
         found
     }
@@ -124,30 +123,30 @@ impl<'a> Checkpoint<'a> {
         let put = |_: &Path| -> Result<(), IoError> { cv_io::write_bytes(&path, &record().seal(key)) };
         if let Err(failure) = self.context.write(Output::Folder(&self.folder), put) {
             self.broken.set(true);
-            self.context.note(format!("the work cannot be kept for --resume: {}", failure.text()));
+            self.context.note(format!("no checkpoint can be written for --resume: {}", failure.text()));
         }
     }
 
-    /// How many photographs' features, and whether the pairs, are of an earlier run.
-    pub(super) fn taken(&self) -> (usize, bool) {
-        self.taken.get()
+    /// Returns the number of photographs whose features are reused, and whether the pairs are.
+    pub(super) fn reused(&self) -> (usize, bool) {
+        self.reused.get()
     }
 
-    /// The result is whole, or there is none.
+    /// Ends the run: removes the checkpoint, unless the run was stopped or `keep` is set.
     pub(super) fn end(&self, keep: bool, done: bool) {
         if !done && self.context.is_stopped() {
             if self.folder.exists() {
-                self.context.note("--resume goes on from here");
+                self.context.note("--resume continues from here");
             }
             return;
         }
-        // A job that fails leaves an earlier one's work as it was, and none of its own.
+        // A failed run keeps the checkpoint of an earlier run, and leaves none of its own.
         if !keep && (done || !self.found) && self.folder.exists() {
-            // What cannot be removed is in nobody's way.
+            // A folder that cannot be removed does no harm.
             let _ = fs::remove_dir_all(&self.folder);
         }
         if !done {
-            // Nor folders that are empty.
+            // Remove the empty folders that it created.
             self.missing.iter().for_each(|folder| drop(fs::remove_dir(folder)));
         }
     }
@@ -157,7 +156,7 @@ fn features_file(key: u64) -> String {
     format!("{key:016x}.features")
 }
 
-/// A number for what something is made of, by this build of the program: another one may have another, and does not take what it finds.
+/// Hashes inputs together with the program's version. Another build may hash differently and then ignores the checkpoint.
 fn key(parts: &[&[u8]]) -> u64 {
     let mut hasher = DefaultHasher::new();
     hasher.write(env!("CARGO_PKG_VERSION").as_bytes());

@@ -1,28 +1,28 @@
-//! The file that tells how well cameras and points are known.
+//! The file of the standard deviations of camera poses and points.
 
 use cv_core::Matrix3;
 use cv_pipeline::many_views::ModelCovariance;
 use serde_json::{Value, json};
 
-/// Standard deviations, as an object: of each photograph's center in the model's unit and of its turns about the camera's axes in degrees, and of the points that have a number. `names` are those of the views.
-pub(super) fn deviations(of: &ModelCovariance, names: &[&str], unit: &Value) -> Value {
+/// Returns the standard deviations as JSON: of each camera center in the model's unit, of its rotation about the camera's axes in degrees, and of the points. `names` are those of the views.
+pub(super) fn deviations(covariance: &ModelCovariance, names: &[&str], unit: &Value) -> Value {
     let roots = |m: &Matrix3<f64>, unit: f64| [0, 1, 2].map(|i| m[(i, i)].max(0.0).sqrt() * unit);
-    let images = names.iter().zip(&of.poses).filter_map(|(name, pose)| {
+    let images = names.iter().zip(&covariance.poses).filter_map(|(name, pose)| {
         let pose = pose.as_ref()?;
-        let (center, turn) = (roots(&pose.center, 1.0), roots(&pose.rotation, 1f64.to_degrees()));
-        Some(json!({ "name": name, "center": center, "rotation_deg": turn }))
+        let (center, rotation) = (roots(&pose.center, 1.0), roots(&pose.rotation, 1f64.to_degrees()));
+        Some(json!({ "name": name, "center": center, "rotation_deg": rotation }))
     });
-    // A model's points are numbered from 1.
-    let points = of.points.iter().zip(1u64..).map(|(point, id)| {
+    // The ids of a model's points start at 1.
+    let points = covariance.points.iter().zip(1u64..).map(|(point, id)| {
         let deviation = point.as_ref().map(|point| roots(point, 1.0));
         json!({ "id": id, "position": deviation })
     });
-    let [exact, distance] = of.reference.map(|view| names.get(view).copied());
+    let [exact, distance] = covariance.reference.map(|view| names.get(view).copied());
     json!({
         "what": "standard deviations",
         "unit": unit,
         "exact": { "pose_of": exact, "distance_from_it_of": distance },
-        "keypoint_px": of.noise,
+        "keypoint_px": covariance.noise,
         "images": images.collect::<Vec<_>>(),
         "points": points.collect::<Vec<_>>(),
     })

@@ -12,10 +12,10 @@ use std::path::{Path, PathBuf};
 #[derive(Debug, clap::Args)]
 #[command(next_help_heading = "Dense cloud")]
 pub(super) struct DenseArgs {
-    /// Where to write a dense cloud of the largest model, with colors and normals, as PLY: every photograph is matched pixel by pixel with its neighbors, and what two pairs agree on is a point.
+    /// Where to write a dense cloud of the largest model, with colors and normals, as PLY: every photograph is matched densely with its neighbors, and points confirmed by two pairs are kept.
     #[arg(long, value_name = "FILE")]
     dense: Option<PathBuf>,
-    /// Longer side to which the photographs are reduced for it, in pixels.
+    /// Longer side in pixels to which the photographs are downscaled for it.
     #[arg(long, value_name = "PX", default_value_t = SfmDenseOptions::default().pair.max_size, requires = "dense")]
     dense_size: usize,
 }
@@ -25,7 +25,7 @@ impl DenseArgs {
         self.dense.as_deref()
     }
 
-    /// Makes and writes the cloud, where it is asked for. `used` are the photographs of the model's views.
+    /// Computes and writes the cloud, if requested. `used` are the photographs of the model's views.
     pub(super) fn write(
         &self,
         model: &SfmModel,
@@ -38,10 +38,10 @@ impl DenseArgs {
         let mut options = SfmDenseOptions::default();
         options.pair.max_size = self.dense_size;
         let stage = Stage::new(context, "reduce", photos.len())?;
-        let mut reduced = Vec::with_capacity(photos.len());
+        let mut downscaled = Vec::with_capacity(photos.len());
         for ((photo, pose), at) in photos.iter().zip(&model.poses).zip(used) {
             stage.add(1)?;
-            reduced.push(match pose {
+            downscaled.push(match pose {
                 Some(_) => {
                     let image = cv_io::read_rgb(&all[*at].path)?;
                     Some(DensePhoto::new(image.view(), &model.cameras[photo.camera], self.dense_size)?)
@@ -49,7 +49,7 @@ impl DenseArgs {
                 None => None,
             });
         }
-        let dense = sfm_dense(model, &reduced, &options, context).map_err(words::many_views::no_dense_cloud)?;
+        let dense = sfm_dense(model, &downscaled, &options, context).map_err(words::many_views::no_dense_cloud)?;
         let write = |path: &Path| cv_io::ply::write_cloud(path, &dense.cloud, PlyEncoding::Binary);
         context.write(Output::File(path, CLOUD), write)?;
         Ok(Some(dense))

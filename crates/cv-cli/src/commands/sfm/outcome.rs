@@ -1,4 +1,4 @@
-//! What became of the photographs, as it is told.
+//! The outcome of a run: registration of each photograph, statistics and JSON.
 
 use super::photographs::Photograph;
 use super::places::Frame;
@@ -9,41 +9,41 @@ use cv_pipeline::SfmResult;
 use cv_pipeline::many_views::ViewOutcome;
 use serde_json::{Value, json};
 
-/// What became of a photograph: the model it is in, or why it is in none.
-pub(super) type Fate = Result<usize, String>;
+/// The outcome of a photograph: the index of its model, or why it is not registered.
+pub(super) type Registration = Result<usize, String>;
 
-pub(super) fn fates(all: &[Photograph], used: &[usize], outcomes: &[ViewOutcome]) -> Vec<Fate> {
-    let mut fates: Vec<Fate> = all.iter().map(|p| Err(p.refused.clone().unwrap_or_default())).collect();
+pub(super) fn registration_outcomes(all: &[Photograph], used: &[usize], outcomes: &[ViewOutcome]) -> Vec<Registration> {
+    let mut registered: Vec<Registration> = all.iter().map(|p| Err(p.refused.clone().unwrap_or_default())).collect();
     for (at, outcome) in used.iter().zip(outcomes) {
-        fates[*at] = match outcome {
+        registered[*at] = match outcome {
             ViewOutcome::Registered { model } => Ok(*model),
             other => Err(words::many_views::left_out(other).unwrap_or_default()),
         };
     }
-    fates
+    registered
 }
 
-/// What to think of a model that is not of most photographs.
-pub(super) fn doubt(models: &[SparseModel], fates: &[Fate]) -> Option<String> {
-    let inside = fates.iter().filter(|fate| **fate == Ok(0)).count();
-    let more = "photographs in between join them";
+/// Returns a warning if there are several models, or if less than half of the photographs are registered.
+pub(super) fn completeness_warning(models: &[SparseModel], registered: &[Registration]) -> Option<String> {
+    let inside = registered.iter().filter(|model| **model == Ok(0)).count();
+    let more = "add photographs in between";
     match models.len() {
-        1 if 2 * inside >= fates.len() => None,
-        1 => Some(format!("only {inside} of {} photographs are in the model; {more}", fates.len())),
+        1 if 2 * inside >= registered.len() => None,
+        1 => Some(format!("only {inside} of {} photographs are in the model; {more}", registered.len())),
         n => Some(format!(
-            "the photographs fall apart into {n} models, whose places to each other are unknown; {inside} of {} are in the largest; {more}",
-            fates.len()
+            "the photographs form {n} models without a common frame; {inside} of {} are in the largest; {more}",
+            registered.len()
         )),
     }
 }
 
-/// Root mean square distance in pixels between the points' projections and where they were seen, over all observations.
+/// Computes the RMS reprojection error in pixels over all observations.
 pub(super) fn reprojection_rms(model: &SparseModel) -> f64 {
     let errors: Vec<f64> = reprojections(model).collect();
     (errors.iter().map(|e| e * e).sum::<f64>() / errors.len() as f64).sqrt()
 }
 
-/// The distance of each observation from its point's projection, in pixels.
+/// Returns the reprojection error of each observation in pixels.
 pub(super) fn reprojections(model: &SparseModel) -> impl Iterator<Item = f64> + '_ {
     model.points.values().flat_map(move |point| {
         point.track.iter().filter_map(move |(id, index)| {
@@ -57,42 +57,42 @@ pub(super) fn reprojections(model: &SparseModel) -> impl Iterator<Item = f64> + 
 
 pub(super) fn outcome(
     all: &[Photograph],
-    fates: &[Fate],
+    registered: &[Registration],
     models: &[SparseModel],
     frames: &[Frame],
     result: &SfmResult,
-    (taken, pairs_taken): (usize, bool),
+    (reused, pairs_reused): (usize, bool),
     stages: Vec<(&'static str, f64)>,
 ) -> Outcome {
-    let image = |(one, fate): (&Photograph, &Fate)| {
-        let model = fate.as_ref().ok();
-        json!({ "path": one.path.display().to_string(), "used": model.is_some(), "model": model, "reason": fate.as_ref().err() })
+    let image = |(one, outcome): (&Photograph, &Registration)| {
+        let model = outcome.as_ref().ok();
+        json!({ "path": one.path.display().to_string(), "used": model.is_some(), "model": model, "reason": outcome.as_ref().err() })
     };
-    let images: Vec<Value> = all.iter().zip(fates).map(image).collect();
-    let used = fates.iter().filter(|fate| fate.is_ok()).count();
+    let images: Vec<Value> = all.iter().zip(registered).map(image).collect();
+    let used = registered.iter().filter(|outcome| outcome.is_ok()).count();
     let main = result.models.first();
     let (points, observations) = main.map_or((0, 0), |m| (m.points.len(), m.observations()));
     let (length, error) = main.map_or((0.0, 0.0), |m| (m.mean_track_length(), m.mean_reprojection_error()));
     let rms = models.first().map_or(f64::NAN, reprojection_rms);
     let focal: Vec<f64> = models.first().map_or_else(Vec::new, |m| m.cameras.values().map(|c| c.fx).collect());
     let mut summary = format!(
-        "{used} of {} photographs in {} model{}; {points} points seen {length:.1} times each, {rms:.3} px RMS",
+        "{used} of {} photographs in {} model{}; {points} points, mean track length {length:.1}, {rms:.3} px RMS",
         all.len(),
         models.len(),
         if models.len() == 1 { "" } else { "s" },
     );
-    if taken > 0 {
-        let pairs = if pairs_taken { ", and the pairs," } else { "" };
-        summary += &format!("\nthe features of {taken} photographs{pairs} are of an earlier run");
+    if reused > 0 {
+        let pairs = if pairs_reused { ", and the pairs," } else { "" };
+        summary += &format!("\nthe features of {reused} photographs{pairs} are from an earlier run");
     }
     let refused = words::many_views::RefusedPairs::of(&result.refused);
     summary.extend(refused.text(result.pairs.len()).map(|text| format!("\n{text}")));
     if let Some(frame) = frames.first() {
         summary += &format!("\nthe model is {}", frame.text);
     }
-    // What was refused has been warned of.
-    for (one, fate) in all.iter().zip(fates) {
-        if let (Err(reason), None) = (fate, &one.refused) {
+    // Refused photographs have been warned of already.
+    for (one, outcome) in all.iter().zip(registered) {
+        if let (Err(reason), None) = (outcome, &one.refused) {
             summary += &format!("\n{}: left out: {reason}", one.path.display());
         }
     }
@@ -107,7 +107,7 @@ pub(super) fn outcome(
         .with("focal_px", focal)
         .with("solvers", result.solvers.iter().map(ToString::to_string).collect::<Vec<_>>())
         .with("refused_pairs", json!({ "triplets": refused.triplets, "repeated": refused.repeated }))
-        .with("resumed", json!({ "features": taken, "pairs": pairs_taken }))
+        .with("resumed", json!({ "features": reused, "pairs": pairs_reused }))
         .with("alignment", frames.first().map(|frame| &frame.json))
         .summary(summary)
 }

@@ -1,4 +1,4 @@
-//! The photographs that a person named: which of them are looked at, and by what names they stand in a model.
+//! The photographs of the command line: duplicates and their names in a model.
 
 use crate::frame::{Failure, sort_by_name};
 use cv_io::ExifGps;
@@ -6,37 +6,37 @@ use std::collections::{BTreeMap, HashSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// A photograph that was named.
+/// A photograph of the command line.
 pub(super) struct Photograph {
     pub(super) path: PathBuf,
     /// Its name in the model.
     pub(super) name: String,
-    /// Why it is not looked at.
+    /// Why it is not used.
     pub(super) refused: Option<String>,
-    /// Where it says it was taken.
+    /// Its GPS position by EXIF.
     pub(super) gps: Option<ExifGps>,
 }
 
-/// Each file once, in the order of names: a model does not depend on the order in which files were named. Copies of a photograph are refused: two
-/// views from one place are no two views.
+/// Returns each file once, sorted by name, so that a model does not depend on the order of arguments. Byte-identical copies are refused: they are
+/// views without a baseline.
 pub(super) fn photographs(mut paths: Vec<PathBuf>) -> Result<Vec<Photograph>, Failure> {
     sort_by_name(&mut paths);
     let mut seen = HashSet::new();
-    // What is missing has no true path, and is told of when it is read.
+    // A missing file has no canonical path; it is reported when it is read.
     paths.retain(|path| seen.insert(path.canonicalize().unwrap_or_else(|_| path.clone())));
     let names = names(&paths);
     let mut all: Vec<Photograph> =
         paths.into_iter().zip(names).map(|(path, name)| Photograph { path, name, refused: None, gps: None }).collect();
     // COLMAP's files cut names at white space.
     if let Some(odd) = all.iter().find(|p| p.name.split_whitespace().collect::<Vec<_>>().join(" ") != p.name) {
-        let what = format!("{} has blanks in its name that a model's files cannot hold", odd.path.display());
+        let what = format!("{} has white space in its name that COLMAP's files cannot represent", odd.path.display());
         return Err(Failure::new(what).advice("rename it"));
     }
     refuse_copies(&mut all);
     Ok(all)
 }
 
-/// Names in the model: those of the files, or where two files have one name their paths below the folder that all lie in.
+/// Returns the names in the model: file names, or if they are not unique, paths relative to the common folder.
 fn names(paths: &[PathBuf]) -> Vec<String> {
     let file = |path: &PathBuf| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
     let mut seen = HashSet::new();
@@ -49,21 +49,21 @@ fn names(paths: &[PathBuf]) -> Vec<String> {
     whole.iter().map(|path| joined(path.strip_prefix(&common).unwrap_or(path))).collect()
 }
 
-/// A path from the root, its links followed where it is there.
+/// Returns the absolute path, with symbolic links resolved if it exists.
 fn absolute(path: &Path) -> PathBuf {
     path.canonicalize().or_else(|_| std::path::absolute(path)).unwrap_or_else(|_| path.to_owned())
 }
 
-/// With slashes on every system.
+/// Joins a path with forward slashes on every system.
 fn joined(path: &Path) -> String {
     path.components().map(|part| part.as_os_str().to_string_lossy()).collect::<Vec<_>>().join("/")
 }
 
-/// Where a file lies, as seen from a folder.
-pub(super) fn seen_from(folder: &Path, file: &Path) -> String {
+/// Returns the path of a file relative to a folder.
+pub(super) fn relative_path(folder: &Path, file: &Path) -> String {
     let (folder, file) = (absolute(folder), absolute(file));
     let same = folder.components().zip(file.components()).take_while(|(a, b)| a == b).count();
-    // Another drive.
+    // On another drive there is no relative path.
     if same == 0 {
         return file.to_string_lossy().into_owned();
     }
@@ -73,7 +73,7 @@ pub(super) fn seen_from(folder: &Path, file: &Path) -> String {
     joined(&down)
 }
 
-/// Refuses files with the bytes of an earlier one. Only files of one length are compared.
+/// Refuses byte-identical copies of an earlier file. Only files of the same length are compared.
 fn refuse_copies(all: &mut [Photograph]) {
     let mut by_length: BTreeMap<u64, Vec<usize>> = BTreeMap::new();
     for (i, photograph) in all.iter().enumerate() {
@@ -84,11 +84,11 @@ fn refuse_copies(all: &mut [Photograph]) {
     for group in by_length.values().filter(|group| group.len() > 1) {
         let mut known: Vec<(Vec<u8>, usize)> = Vec::new();
         for &i in group {
-            // What cannot be read is told of later.
+            // A file that cannot be read is reported later.
             let Ok(bytes) = cv_io::read_bytes(&all[i].path) else { continue };
             match known.iter().find(|(other, _)| *other == bytes) {
                 Some(&(_, first)) => {
-                    all[i].refused = Some(format!("it is the same, byte for byte, as {}", all[first].path.display()));
+                    all[i].refused = Some(format!("it is identical, byte for byte, to {}", all[first].path.display()));
                 }
                 None => known.push((bytes, i)),
             }
@@ -101,7 +101,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_are_those_of_files_or_of_paths_below_what_all_share() {
+    fn names_are_file_names_or_paths_relative_to_the_common_folder() {
         let folder = tempfile::tempdir().unwrap();
         let of = |paths: &[&str]| {
             let paths: Vec<PathBuf> = paths.iter().map(|path| folder.path().join(path)).collect();
@@ -116,12 +116,12 @@ mod tests {
         assert_eq!(of(&["x/2.jpg", "y/10.jpg", "x/2.jpg"]), named(&["2.jpg", "10.jpg"]));
         assert_eq!(of(&["p/y/1.jpg", "p/x/1.jpg", "p/x/z/3.jpg"]), named(&["x/1.jpg", "x/z/3.jpg", "y/1.jpg"]));
         assert!(photographs(vec![folder.path().join("a  b.jpg")]).is_err());
-        assert_eq!(seen_from(&folder.path().join("x"), &folder.path().join("y/10.jpg")), "../y/10.jpg");
-        assert_eq!(seen_from(folder.path(), &folder.path().join("y/10.jpg")), "y/10.jpg");
+        assert_eq!(relative_path(&folder.path().join("x"), &folder.path().join("y/10.jpg")), "../y/10.jpg");
+        assert_eq!(relative_path(folder.path(), &folder.path().join("y/10.jpg")), "y/10.jpg");
     }
 
     #[test]
-    fn a_copy_is_told_by_its_bytes() {
+    fn copies_are_detected_by_their_bytes() {
         let folder = tempfile::tempdir().unwrap();
         let paths = ["a", "b", "c", "d"].map(|name| folder.path().join(name));
         for (path, bytes) in paths.iter().zip(["one", "two", "one"]) {

@@ -1,8 +1,8 @@
-//! Photographs without the distortion of their lenses, and the model of their pinhole cameras: what dense reconstruction takes.
+//! Undistorted images and the model of their pinhole cameras: the input of dense reconstruction.
 
 use super::photographs::Photograph;
 use crate::commands::rectify::write_picture;
-use crate::commands::undistort::straight;
+use crate::commands::undistort::undistorted_pixels;
 use crate::frame::{Context, Explain, Failure, Output, one_each, spare_inputs};
 use cv_core::{Camera, SparseModel, Stage};
 use cv_io::colmap::{self, ModelFormat};
@@ -11,15 +11,15 @@ use cv_pipeline::stereo::{RectifiedView, RectifyOptions, WarpMap};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// A folder of `images` and their model `sparse`, laid out as by COLMAP's `image_undistorter`.
+/// A folder with `images` and their model in `sparse`, in the layout of COLMAP's `image_undistorter`.
 pub(super) struct PinholeFolder<'a> {
     folder: &'a Path,
-    /// Of each photograph that was named: its name there.
+    /// File names of the photographs in `images`.
     names: Vec<String>,
 }
 
 impl<'a> PinholeFolder<'a> {
-    /// Refuses a folder where a photograph would be written over.
+    /// Refuses a folder where a photograph would be overwritten.
     pub(super) fn new(folder: &'a Path, photographs: &[Photograph]) -> Result<Self, Failure> {
         let names: Vec<String> = photographs.iter().map(|p| writable(&p.name)).collect();
         let results: Vec<PathBuf> = names.iter().map(|name| folder.join("images").join(name)).collect();
@@ -29,7 +29,7 @@ impl<'a> PinholeFolder<'a> {
         Ok(Self { folder, names })
     }
 
-    /// Writes the photographs of a model, whose images are numbered from 1 as `used` names them, and the model.
+    /// Writes the undistorted images of a model and the model; image `k + 1` is photograph `used[k]`.
     pub(super) fn write(
         &self,
         model: &SparseModel,
@@ -38,9 +38,9 @@ impl<'a> PinholeFolder<'a> {
         format: ModelFormat,
         context: &Context,
     ) -> Result<(), Failure> {
-        let mut straight_model = pinhole_model(model)?;
+        let mut pinhole = pinhole_model(model)?;
         let stage = Stage::new(context, "undistort", model.images.len())?;
-        // Photographs of one camera come one after the other: one map is kept.
+        // Images are grouped by camera, so that one map is kept at a time.
         let mut order: Vec<u32> = model.images.keys().copied().collect();
         order.sort_by_key(|id| (model.images[id].camera, *id));
         let mut made: Option<(u32, WarpMap)> = None;
@@ -52,36 +52,36 @@ impl<'a> PinholeFolder<'a> {
                 _ => &made.insert((camera, view(&model.cameras[&camera])?.map(&stage)?)).1,
             };
             let photo = cv_io::read_image(&photographs[at].path)?;
-            let pixels = straight(&photo.pixels, map)?;
+            let pixels = undistorted_pixels(&photo.pixels, map)?;
             let picture = DynImage { pixels, exif: ExifInfo::default(), metadata: Metadata::default() };
             let path = self.folder.join("images").join(&self.names[at]);
             let parent = path.parent().unwrap_or(self.folder);
             context.write(Output::Folder(parent), |_| write_picture(&path, &picture, &photo.metadata))?;
-            if let Some(image) = straight_model.images.get_mut(&id) {
+            if let Some(image) = pinhole.images.get_mut(&id) {
                 image.name.clone_from(&self.names[at]);
             }
             stage.add(1)?;
         }
         let sparse = self.folder.join("sparse");
-        context.write(Output::Folder(&sparse), |folder| colmap::replace(folder, &straight_model, format))?;
+        context.write(Output::Folder(&sparse), |folder| colmap::replace(folder, &pinhole, format))?;
         Ok(())
     }
 }
 
-/// The name of a photograph that can be written under it: other formats than those become PNG.
+/// Returns the output name of a photograph: formats that are not written become PNG.
 fn writable(name: &str) -> String {
     let ending = Path::new(name).extension().unwrap_or_default().to_string_lossy().to_lowercase();
     if crate::frame::PICTURE.contains(&&*ending) { name.to_owned() } else { format!("{name}.png") }
 }
 
-/// A camera, and what it would see without distortion: no pixel without content, as COLMAP's default.
+/// Returns the undistorted view of a camera with valid pixels only, as COLMAP's default.
 fn view(camera: &Camera) -> Result<RectifiedView, Failure> {
     RectifiedView::undistorted(camera, &RectifyOptions::default())
-        .during("no photographs without distortion")
+        .during("cannot undistort the photographs")
         .map_err(|failure| failure.advice("leave out --pinhole, or give a calibrated camera (--camera)"))
 }
 
-/// The model with each camera as it would be without distortion; of the image points those that show a point.
+/// Converts a model to pinhole cameras; only keypoints with a 3D point are kept.
 fn pinhole_model(model: &SparseModel) -> Result<SparseModel, Failure> {
     let views: BTreeMap<u32, RectifiedView> =
         model.cameras.iter().map(|(id, camera)| Ok((*id, view(camera)?))).collect::<Result<_, Failure>>()?;
@@ -90,17 +90,17 @@ fn pinhole_model(model: &SparseModel) -> Result<SparseModel, Failure> {
     let mut places: BTreeMap<(u32, u32), u32> = BTreeMap::new();
     for (id, image) in &model.images {
         let view = &views[&image.camera];
-        let mut straight = image.clone();
-        straight.points.clear();
+        let mut undistorted = image.clone();
+        undistorted.points.clear();
         for (i, (at, point)) in image.points.iter().enumerate().filter(|(_, (_, point))| point.is_some()) {
             let at = view.camera.denormalize(view.source.normalize(*at));
-            // The lens has no ray for some pixels.
+            // Some pixels have no viewing ray.
             if at.x.is_finite() && at.y.is_finite() {
-                places.insert((*id, i as u32), straight.points.len() as u32);
-                straight.points.push((at, *point));
+                places.insert((*id, i as u32), undistorted.points.len() as u32);
+                undistorted.points.push((at, *point));
             }
         }
-        out.images.insert(*id, straight);
+        out.images.insert(*id, undistorted);
     }
     for (id, point) in &model.points {
         let mut point = point.clone();
@@ -116,14 +116,14 @@ mod tests {
     use cv_core::{Distortion, ModelImage, ModelPoint, Point3, Pose, Vector3};
 
     #[test]
-    fn points_are_where_the_pinhole_camera_sees_them() {
+    fn keypoints_are_the_projections_by_the_pinhole_camera() {
         let camera = Camera { distortion: Distortion::radial(-0.2, 0.05), ..Camera::from_focal(400, 300, 350.0) };
         let mut model = SparseModel { cameras: [(3, camera)].into(), ..SparseModel::default() };
         let pose = Pose::new(cv_core::Rotation3::from_euler_angles(0.1, 0.2, 0.3), Vector3::new(0.1, 0.2, 0.3));
         let mut image = ModelImage { name: "a.jpg".into(), camera: 3, pose, points: Vec::new() };
         for k in 0..20u64 {
             let position = pose.inverse().transform(&Point3::new(0.1 * k as f64 - 1.0, 0.05 * k as f64 - 0.5, 4.0));
-            // Every second keypoint shows nothing.
+            // Every second keypoint has no 3D point.
             image.points.push((cv_core::Point2::new(k as f64, 1.0), None));
             image.points.push((camera.project(&pose.transform(&position)).unwrap(), Some(k)));
             model

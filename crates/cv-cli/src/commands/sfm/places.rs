@@ -1,4 +1,4 @@
-//! What is known of where the photographs were taken, and models brought to it.
+//! Georeferencing: known camera positions and distances, and the alignment of models to them.
 
 use super::photographs::Photograph;
 use crate::frame::{Context, Failure};
@@ -12,18 +12,18 @@ use std::path::PathBuf;
 #[derive(Debug, clap::Args)]
 #[command(next_help_heading = "Known places")]
 pub(super) struct PlaceArgs {
-    /// Where photographs were taken: a text file with a row `name x y z` for each, in meters with z up. At least three of them, not in one place.
+    /// Known camera positions: a text file with a row `name x y z` for each photograph, in meters with z up. At least three, not all at one position.
     #[arg(long, value_name = "FILE")]
     known: Option<PathBuf>,
-    /// How far apart two photographs were taken, in meters: tells the scale. It may be given several times.
+    /// Known distance of two camera centers in meters, which determines the scale. May be given several times.
     #[arg(long, num_args = 1..=3, value_names = ["A", "B", "METERS"])]
     distance: Vec<String>,
-    /// Leave the positions in the photographs' EXIF alone; else a model with three of them or more is brought to them: X east, Y north, Z up, in meters.
+    /// Ignore the GPS positions in EXIF; by default, a model with three or more of them is georeferenced: X east, Y north, Z up, in meters.
     #[arg(long)]
     ignore_gps: bool,
 }
 
-/// What is known, by photographs as they were named.
+/// Known camera positions and distances, by photograph.
 #[derive(Clone)]
 pub(super) struct Places {
     centers: Vec<Option<Point3<f64>>>,
@@ -32,32 +32,32 @@ pub(super) struct Places {
 }
 
 impl PlaceArgs {
-    /// What the person tells, resolved before the work begins.
+    /// Reads the positions and distances of the command line, before the computation begins.
     pub(super) fn read(&self, all: &[Photograph], context: &Context) -> Result<Places, Failure> {
         let mut places = Places { centers: vec![None; all.len()], source: None, distances: self.distances(all)? };
         let Some(path) = &self.known else { return Ok(places) };
-        let mut strange = Vec::new();
+        let mut unknown_names = Vec::new();
         for (name, place) in cv_io::read_places(path)? {
             match find(all, &name) {
                 Some(i) => places.centers[i] = Some(place),
-                None => strange.push(name),
+                None => unknown_names.push(name),
             }
         }
         let got = places.centers.iter().flatten().count();
         if got < 3 {
-            let what =
-                format!("{} tells where {got} of the photographs were taken, and three are needed", path.display());
-            let advice = match strange.first() {
-                Some(name) => format!("the names of the photographs' files; “{name:.60}” is none of them"),
-                None => "three photographs or more, not in one place; --distance tells the scale alone".to_owned(),
+            let what = format!("{} has the positions of {got} of the photographs, three are needed", path.display());
+            let advice = match unknown_names.first() {
+                Some(name) => format!("use the names of the photographs' files; “{name:.60}” is none of them"),
+                None => "three or more photographs from different positions; --distance determines the scale alone"
+                    .to_owned(),
             };
             return Err(Failure::new(what).advice(advice));
         }
-        if let Some(first) = strange.first() {
+        if let Some(first) = unknown_names.first() {
             let path = path.display();
             context.warn(format!(
-                "{path}: {} of its names are no photographs of this run, such as “{first:.60}”",
-                strange.len()
+                "{path}: {} of its names match no photograph, such as “{first:.60}”",
+                unknown_names.len()
             ));
         }
         places.source = Some(PlaceSource::File(path.clone()));
@@ -68,12 +68,12 @@ impl PlaceArgs {
         let usage = |what: String| Failure::usage(what).advice("--distance a.jpg b.jpg 2.5");
         let (rows, rest) = self.distance.as_chunks::<3>();
         if !rest.is_empty() {
-            return Err(usage("--distance takes two photographs and the meters between them".to_owned()));
+            return Err(usage("--distance takes two photographs and their distance in meters".to_owned()));
         }
         let of = |[a, b, meters]: &[String; 3]| {
             let number = meters.parse().ok().filter(|m: &f64| *m > 0.0 && m.is_finite());
             let Some(meters) = number else {
-                return Err(usage(format!("“{meters:.40}” is no number of meters above 0")));
+                return Err(usage(format!("“{meters:.40}” is not a positive number of meters")));
             };
             let index = |name: &String| {
                 find(all, name).ok_or_else(|| usage(format!("--distance: “{name:.60}” is none of the photographs")))
@@ -88,7 +88,7 @@ impl PlaceArgs {
     }
 }
 
-/// The photograph of that name, or that path, or the only one whose file has that name.
+/// Finds the photograph of that name, of that path, or the only one with that file name.
 fn find(all: &[Photograph], name: &str) -> Option<usize> {
     let by = |is: &dyn Fn(&Photograph) -> bool| {
         let mut found = (0..all.len()).filter(|i| is(&all[*i]));
@@ -99,14 +99,14 @@ fn find(all: &[Photograph], name: &str) -> Option<usize> {
         .or_else(|| by(&|p| p.path.file_name().is_some_and(|file| file == name)))
 }
 
-/// What a model's frame is, for people and for programs.
+/// The frame of a model, as text and as JSON.
 pub(super) struct Frame {
     pub(super) text: String,
     pub(super) json: Value,
 }
 
 impl Places {
-    /// Takes what the photographs tell themselves, where the person tells nothing.
+    /// Adds the GPS positions of EXIF, if no positions are given.
     pub(super) fn with_gps(&self, args: &PlaceArgs, all: &[Photograph]) -> Self {
         let mut places = self.clone();
         if args.ignore_gps || self.source.is_some() {
@@ -123,12 +123,12 @@ impl Places {
         places
     }
 
-    /// Whether the person tells anything.
-    pub(super) fn is_told(&self) -> bool {
+    /// Whether positions or distances are given.
+    pub(super) fn is_given(&self) -> bool {
         self.source.is_some() || !self.distances.is_empty()
     }
 
-    /// Brings a model to what is known; `used` are the photographs of its views. What contradicts it is told, and left aside.
+    /// Aligns a model to the known positions and distances; `used` are the photographs of its views. Outliers are reported and ignored.
     pub(super) fn align(
         &self,
         model: &mut SfmModel,
@@ -143,8 +143,8 @@ impl Places {
             match (view(a).filter(inside), view(b).filter(inside)) {
                 (Some(a), Some(b)) => distances.push((a, b, meters)),
                 (first, _) => {
-                    let lacks = &all[if first.is_none() { a } else { b }];
-                    context.warn(format!("--distance is left aside: {} is not in the model", lacks.path.display()));
+                    let missing = &all[if first.is_none() { a } else { b }];
+                    context.warn(format!("--distance is ignored: {} is not in the model", missing.path.display()));
                 }
             }
         }
@@ -155,25 +155,32 @@ impl Places {
         if let (Some(error), Some(source)) = (&placed.without_centers, &self.source)
             && let Some(text) = source.refusal(error)
         {
-            context.warn(format!("the model is not brought to {}: {text}", source.name()));
+            context.warn(format!("the model is not aligned to {}: {text}", source.name()));
         }
         if let Some(error) = &placed.without_distances {
-            context.warn(format!("--distance is left aside: {error}"));
+            context.warn(format!("--distance is ignored: {error}"));
         }
         let found = placed.alignment;
-        self.tell(&found, model, all, used, context);
+        self.warn_of_contradictions(&found, model, all, used, context);
         Ok(self.frame(&found, all, used))
     }
 
-    /// Warns of what does not agree, with numbers.
-    fn tell(&self, found: &ModelAlignment, model: &SfmModel, all: &[Photograph], used: &[usize], context: &Context) {
-        if let Some(error) = found.distance_error.filter(|error| *error > words::DISTANCES_DIFFER) {
+    /// Warns of contradicting distances, scales and positions.
+    fn warn_of_contradictions(
+        &self,
+        found: &ModelAlignment,
+        model: &SfmModel,
+        all: &[Photograph],
+        used: &[usize],
+        context: &Context,
+    ) {
+        if let Some(error) = found.distance_error.filter(|error| *error > words::MAX_DISTANCE_RESIDUAL) {
             context.warn(words::distances_differ(error));
         }
         let (Some(fit), Some(source)) = (&found.centers, &self.source) else { return };
-        if let Some(ratio) = fit.scale_ratio.filter(|ratio| (ratio - 1.0).abs() > words::SCALES_DIFFER) {
+        if let Some(ratio) = fit.scale_ratio.filter(|ratio| (ratio - 1.0).abs() > words::MAX_SCALE_DIFFERENCE) {
             context.warn(format!(
-                "by {} lengths are {:.1} % {} than by --distance, which is taken",
+                "lengths by {} are {:.1} % {} than by --distance, which is used",
                 source.name(),
                 100.0 * (ratio - 1.0).abs(),
                 if ratio > 1.0 { "longer" } else { "shorter" }
@@ -195,9 +202,10 @@ impl Places {
         let (text, by) = match (&found.centers, &self.source) {
             (Some(fit), Some(source)) => (words::aligned(source, fit), source.key()),
             _ if found.metric => ("in meters by --distance; upright, Z up".to_owned(), "distance"),
-            _ => {
-                ("upright, Z up; its unit is arbitrary, since photographs do not tell meters".to_owned(), "photographs")
-            }
+            _ => (
+                "upright, Z up; its scale is arbitrary (no positions or distances are known)".to_owned(),
+                "photographs",
+            ),
         };
         let mut json = json!({ "by": by, "unit": if found.metric { "m" } else { "arbitrary" } });
         if let Some(fit) = &found.centers {

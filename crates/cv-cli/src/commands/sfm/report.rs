@@ -1,6 +1,6 @@
 //! The report of `cv sfm`.
 
-use super::outcome::{Fate, reprojection_rms, reprojections};
+use super::outcome::{Registration, reprojection_rms, reprojections};
 use super::photographs::Photograph;
 use super::places::Frame;
 use crate::frame::Failure;
@@ -8,46 +8,50 @@ use crate::pictures::{Width, cloud, picture};
 use cv_core::SparseModel;
 use cv_report::{Plot, PointScene, Report, draw_view_graph};
 
-/// Rows of the table of thin places.
-const THIN: usize = 8;
-/// Side of the picture of the view graph in pixels.
-const GRAPH: usize = 1000;
+/// Rows of the table of weakest connections.
+const WEAK_CONNECTIONS: usize = 8;
+/// Side of the image of the view graph in pixels.
+const GRAPH_SIZE: usize = 1000;
 
-/// The page: each model, what became of each photograph, how the photographs hang together, and how well it fits.
+/// Builds the page: each model, the outcome of each photograph, the view graph and the residuals.
 pub(super) fn report(
     all: &[Photograph],
-    fates: &[Fate],
+    registered: &[Registration],
     models: &[SparseModel],
     frames: &[Frame],
     stages: &[(&'static str, f64)],
 ) -> Result<Report, Failure> {
-    let used = fates.iter().filter(|fate| fate.is_ok()).count();
+    let used = registered.iter().filter(|outcome| outcome.is_ok()).count();
     let mut page = Report::new("Structure from motion");
     page.subtitle(&format!("{} photographs", all.len()))
-        .headline("photographs in a model", &format!("{used} of {}", all.len()));
+        .headline("registered photographs", &format!("{used} of {}", all.len()));
     if models.len() > 1 {
         page.headline("models", &models.len().to_string());
     }
     if let Some(main) = models.first() {
         let observations: usize = main.points.values().map(|p| p.track.len()).sum();
         page.headline("points", &main.points.len().to_string())
-            .headline("seen", &format!("{:.1} times", observations as f64 / main.points.len() as f64))
-            .headline("reprojection", &format!("{:.2} px RMS", reprojection_rms(main)));
+            .headline("mean track length", &format!("{:.1}", observations as f64 / main.points.len() as f64))
+            .headline("reprojection error", &format!("{:.2} px RMS", reprojection_rms(main)));
     }
     let left_out: Vec<[&str; 2]> = all
         .iter()
-        .zip(fates)
-        .filter_map(|(one, fate)| Some([one.name.as_str(), fate.as_ref().err()?.as_str()]))
+        .zip(registered)
+        .filter_map(|(one, outcome)| Some([one.name.as_str(), outcome.as_ref().err()?.as_str()]))
         .collect();
     if !left_out.is_empty() {
-        page.section("Left out").table("Photographs that are in no model.", &["photograph", "why"], &left_out);
+        page.section("Left out").table("Unregistered photographs.", &["photograph", "reason"], &left_out);
     }
     for (m, model) in models.iter().enumerate() {
-        let names: Vec<&str> =
-            all.iter().zip(fates).filter(|(_, fate)| **fate == Ok(m)).map(|(one, _)| one.name.as_str()).collect();
+        let names: Vec<&str> = all
+            .iter()
+            .zip(registered)
+            .filter(|(_, outcome)| **outcome == Ok(m))
+            .map(|(one, _)| one.name.as_str())
+            .collect();
         let title = if m == 0 { "The model".to_owned() } else { format!("Model {m}") };
         page.section(&title).paragraph(&format!(
-            "{} photographs and {} points, {}. The cameras are drawn as pyramids, from the first, blue, to the last, red.",
+            "{} photographs and {} points, {}. The cameras are drawn as pyramids, from the first (blue) to the last (red).",
             names.len(),
             model.points.len(),
             frames.get(m).map_or("", |frame| &frame.text),
@@ -55,10 +59,11 @@ pub(super) fn report(
         cloud(&mut page, &PointScene::of_model(model), "The points and the cameras.")?;
         cameras(&mut page, model);
         page.registered_photographs(model, &names);
-        let graph = draw_view_graph(model, GRAPH);
-        let caption = "Which photographs see the same points. Dark squares away from the diagonal are walks that come back to where they were.";
+        let graph = draw_view_graph(model, GRAPH_SIZE);
+        let caption =
+            "Number of common points of each pair of photographs. Dark squares off the diagonal are loop closures.";
         let width = if names.len() > 20 { Width::Full } else { Width::Half };
-        page.figure(picture(&graph, width, caption)?).thinnest_places(model, THIN);
+        page.figure(picture(&graph, width, caption)?).thinnest_places(model, WEAK_CONNECTIONS);
         quality(&mut page, model);
     }
     page.section("Time").times(stages);
@@ -72,11 +77,11 @@ fn cameras(page: &mut Report, model: &SparseModel) {
         .map(|(id, camera)| {
             let count = model.images.values().filter(|image| image.camera == *id).count();
             let lens = camera.distortion.simplified();
-            let numbers: Vec<String> = lens.parameters().iter().map(|v| format!("{v:.4}")).collect();
+            let coefficients: Vec<String> = lens.parameters().iter().map(|v| format!("{v:.4}")).collect();
             let lens = if lens.is_none() {
                 "none".to_owned()
             } else {
-                format!("{} ({})", lens.model().info().name, numbers.join(", "))
+                format!("{} ({})", lens.model().info().name, coefficients.join(", "))
             };
             let focal = if camera.fx == camera.fy {
                 format!("{:.1}", camera.fx)
@@ -93,7 +98,7 @@ fn cameras(page: &mut Report, model: &SparseModel) {
         })
         .collect();
     page.table(
-        "The cameras, as refined.",
+        "The refined intrinsics.",
         &["size (px)", "photographs", "focal length (px)", "principal point (px)", "distortion"],
         &rows,
     );
@@ -104,14 +109,14 @@ fn quality(page: &mut Report, model: &SparseModel) {
     let lengths: Vec<f64> = model.points.values().map(|p| p.track.len() as f64).collect();
     let errors = Plot::new("Reprojection error", "px", "observations").histogram("", &errors, 30);
     let longest = lengths.iter().fold(2.0, |a: f64, b| a.max(*b));
-    let lengths = Plot::new("Photographs that see a point", "photographs", "points").histogram_within(
+    let lengths = Plot::new("Track length", "photographs", "points").histogram_within(
         "",
         &lengths,
         (longest as usize - 1).min(30),
         (1.5, longest + 0.5),
     );
     page.plots(&[
-        (&errors, "How far the points are from where they were seen."),
-        (&lengths, "Points that many photographs see hold the model together."),
+        (&errors, "Distance of each observation from the projection of its point."),
+        (&lengths, "Long tracks constrain the model best."),
     ]);
 }

@@ -1,4 +1,4 @@
-//! A checkpoint's file: `CVSFM`, a version, a key, and the length of what follows; numbers, little-endian; a checksum of all of it.
+//! Format of a checkpoint file: the magic `CVSFM` with a version, a key, the length of the payload, the payload (little-endian numbers), and a checksum of all.
 
 use cv_core::{DMatch, Keypoint, Matrix3, Point2, Pose, Rotation3, Vector3};
 use cv_io::ExifGps;
@@ -7,32 +7,33 @@ use cv_pipeline::features::{ByteDescriptors, DescriptorKind};
 use cv_pipeline::many_views::{PairMatches, ViewPairModel};
 use std::hash::{DefaultHasher, Hasher};
 
-/// What is known of a photograph once it was looked at.
+/// The features and metadata extracted from a photograph.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Seen {
-    /// The focal length by EXIF, in pixels.
+pub(crate) struct Extracted {
+    /// Focal length by EXIF, in pixels.
     pub(crate) focal: Option<f64>,
     pub(crate) gps: Option<ExifGps>,
-    /// Its features; its name and the index of its camera are those of the run that made them.
+    /// Its features; name and camera index are those of the run that stored them.
     pub(crate) photo: SfmPhoto,
 }
 
-/// The pairs of photographs that hold, and their geometry.
+/// The verified pairs of photographs, and their geometry.
 pub(crate) type Pairs = (Vec<PairMatches>, Vec<ViewPairModel>);
 
 const MAGIC: [u8; 8] = *b"CVSFM\0\0\x01";
-/// Bytes before the numbers: magic, key, length; and after them, of the checksum.
-const HEAD: usize = 24;
-const SUM: usize = 8;
+/// Bytes of the header: magic, key, length of the payload.
+const HEADER_BYTES: usize = 24;
+/// Bytes of the checksum at the end.
+const CHECKSUM_BYTES: usize = 8;
 
-/// Numbers one after the other.
+/// The payload of a checkpoint file, and the read position.
 pub(super) struct Record {
     bytes: Vec<u8>,
-    /// Where the next is read.
+    /// Read position in bytes.
     at: usize,
 }
 
-fn checksum(bytes: &[u8]) -> [u8; SUM] {
+fn checksum(bytes: &[u8]) -> [u8; CHECKSUM_BYTES] {
     let mut hasher = DefaultHasher::new();
     hasher.write(bytes);
     hasher.finish().to_le_bytes()
@@ -43,9 +44,9 @@ impl Record {
         Self { bytes: Vec::new(), at: 0 }
     }
 
-    /// The file.
+    /// Serializes the record with header and checksum.
     pub(super) fn seal(&self, key: u64) -> Vec<u8> {
-        let mut file = Vec::with_capacity(HEAD + self.bytes.len() + SUM);
+        let mut file = Vec::with_capacity(HEADER_BYTES + self.bytes.len() + CHECKSUM_BYTES);
         file.extend(MAGIC);
         file.extend(key.to_le_bytes());
         file.extend((self.bytes.len() as u64).to_le_bytes());
@@ -55,19 +56,19 @@ impl Record {
         file
     }
 
-    /// Of a file that is whole and has that key.
+    /// Opens a complete file with that key; `None` for any other.
     pub(super) fn open(mut file: Vec<u8>, key: u64) -> Option<Self> {
-        let end = file.len().checked_sub(SUM).filter(|end| *end >= HEAD)?;
-        let length = ((end - HEAD) as u64).to_le_bytes();
-        let head = [MAGIC, key.to_le_bytes(), length].concat();
-        if file[..HEAD] != head[..] || file[end..] != checksum(&file[..end]) {
+        let end = file.len().checked_sub(CHECKSUM_BYTES).filter(|end| *end >= HEADER_BYTES)?;
+        let length = ((end - HEADER_BYTES) as u64).to_le_bytes();
+        let header = [MAGIC, key.to_le_bytes(), length].concat();
+        if file[..HEADER_BYTES] != header[..] || file[end..] != checksum(&file[..end]) {
             return None;
         }
         file.truncate(end);
-        Some(Self { bytes: file, at: HEAD })
+        Some(Self { bytes: file, at: HEADER_BYTES })
     }
 
-    /// Whether all has been read.
+    /// Whether all bytes have been read.
     pub(super) fn is_at_end(&self) -> bool {
         self.at == self.bytes.len()
     }
@@ -89,7 +90,7 @@ impl Record {
         self.bytes.extend((value as u64).to_le_bytes());
     }
 
-    /// A number of things that take `size` bytes at least: as many as there can be, so that a lying number asks for no memory.
+    /// Reads a number of elements of at least `size` bytes each; `None` if they exceed the remaining bytes, so that a corrupt count allocates no memory.
     fn count(&mut self, size: usize) -> Option<usize> {
         let count = usize::try_from(u64::from_le_bytes(self.take()?)).ok()?;
         (count.checked_mul(size)? <= self.bytes.len() - self.at).then_some(count)
@@ -114,9 +115,9 @@ impl Record {
         Some((there == 1).then_some(value))
     }
 
-    pub(super) fn of_seen(seen: &Seen) -> Self {
+    pub(super) fn of_extracted(extracted: &Extracted) -> Self {
         let mut record = Self::new();
-        let Seen { focal, gps, photo } = seen;
+        let Extracted { focal, gps, photo } = extracted;
         record.put_count(photo.size.0);
         record.put_count(photo.size.1);
         record.put_maybe(*focal);
@@ -136,8 +137,8 @@ impl Record {
         record
     }
 
-    pub(super) fn seen(&mut self, kind: DescriptorKind) -> Option<Seen> {
-        // Of a size nothing is allocated.
+    pub(super) fn extracted(&mut self, kind: DescriptorKind) -> Option<Extracted> {
+        // Nothing is allocated by the image size.
         let size = (self.count(0)?, self.count(0)?);
         let focal = self.maybe()?;
         let [latitude, longitude, altitude, dilution] = [self.maybe()?, self.maybe()?, self.maybe()?, self.maybe()?];
@@ -152,7 +153,7 @@ impl Record {
         }
         let descriptors = ByteDescriptors::from_bytes(kind, self.slice(count * kind.dimension)?.to_vec())?;
         let colors = self.slice(3 * count)?.as_chunks().0.to_vec();
-        Some(Seen {
+        Some(Extracted {
             focal,
             gps,
             photo: SfmPhoto { name: String::new(), size, camera: 0, keypoints, descriptors, colors },
@@ -179,7 +180,7 @@ impl Record {
         record
     }
 
-    /// Of photographs with so many keypoints.
+    /// Reads the pairs of photographs; `sizes` are their numbers of keypoints, which bound the indices.
     pub(super) fn pairs(&mut self, sizes: &[usize]) -> Option<Pairs> {
         let count = self.count(8 + 8 + 1 + 12 * 8 + 8)?;
         let (mut pairs, mut geometry) = (Vec::with_capacity(count), Vec::with_capacity(count));
@@ -221,7 +222,7 @@ impl Record {
         }
     }
 
-    /// Of photographs with so many keypoints.
+    /// Reads matches between photographs with `of_a` and `of_b` keypoints.
     fn matches(&mut self, of_a: usize, of_b: usize) -> Option<Vec<DMatch>> {
         let count = self.count(16)?;
         let mut matches = Vec::with_capacity(count);
@@ -241,7 +242,7 @@ impl Record {
 mod tests {
     use super::*;
 
-    fn seen() -> Seen {
+    fn extracted() -> Extracted {
         let kind = DescriptorKind::ROOT_SIFT;
         let keypoint = |i: u32| Keypoint {
             response: 0.1 * i as f32,
@@ -259,7 +260,7 @@ mod tests {
             colors: (0..5).map(|i| [i, 2 * i, 255]).collect(),
         };
         let gps = ExifGps { latitude: 0.8, longitude: -0.1, altitude: None, dilution: Some(2.1) };
-        Seen { focal: Some(512.3), gps: Some(gps), photo }
+        Extracted { focal: Some(512.3), gps: Some(gps), photo }
     }
 
     fn pairs() -> Pairs {
@@ -278,26 +279,26 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read() {
-        let mut record = Record::open(Record::of_seen(&seen()).seal(7), 7).unwrap();
-        assert_eq!(record.seen(DescriptorKind::ROOT_SIFT), Some(seen()));
+    fn records_round_trip() {
+        let mut record = Record::open(Record::of_extracted(&extracted()).seal(7), 7).unwrap();
+        assert_eq!(record.extracted(DescriptorKind::ROOT_SIFT), Some(extracted()));
         assert!(record.is_at_end());
-        let bare = Seen { focal: None, gps: None, ..seen() };
+        let bare = Extracted { focal: None, gps: None, ..extracted() };
         assert_eq!(
-            Record::open(Record::of_seen(&bare).seal(7), 7).unwrap().seen(DescriptorKind::ROOT_SIFT),
+            Record::open(Record::of_extracted(&bare).seal(7), 7).unwrap().extracted(DescriptorKind::ROOT_SIFT),
             Some(bare)
         );
         let mut record = Record::open(Record::of_pairs(&pairs()).seal(8), 8).unwrap();
         assert_eq!(record.pairs(&[5, 5, 5]), Some(pairs()));
         assert!(record.is_at_end());
-        // Of photographs with fewer keypoints, or fewer photographs.
+        // Indices out of range: fewer keypoints, or fewer photographs.
         for sizes in [&[5, 1, 5][..], &[5, 5]] {
             assert_eq!(Record::open(Record::of_pairs(&pairs()).seal(8), 8).unwrap().pairs(sizes), None);
         }
     }
 
     #[test]
-    fn damage_is_noticed_and_lies_ask_for_no_memory() {
+    fn corruption_is_detected_and_corrupt_counts_allocate_no_memory() {
         let file = Record::of_pairs(&pairs()).seal(8);
         assert!(Record::open(file.clone(), 9).is_none(), "another key");
         for i in (0..file.len()).step_by(7) {
@@ -306,12 +307,12 @@ mod tests {
             other[i] ^= 0x10;
             assert!(Record::open(other, 8).is_none(), "byte {i}");
         }
-        // A checksum that is right, of numbers that are not.
-        for at in (HEAD..file.len() - SUM).step_by(5) {
-            let mut lying = Record { bytes: file[HEAD..file.len() - SUM].to_vec(), at: 0 };
-            lying.bytes[at - HEAD] = 0xFF;
-            let _ = Record::open(lying.seal(8), 8).unwrap().pairs(&[5, 5, 5]);
-            let _ = Record::open(lying.seal(8), 8).unwrap().seen(DescriptorKind::ROOT_SIFT);
+        // A valid checksum over corrupt numbers.
+        for at in (HEADER_BYTES..file.len() - CHECKSUM_BYTES).step_by(5) {
+            let mut corrupt = Record { bytes: file[HEADER_BYTES..file.len() - CHECKSUM_BYTES].to_vec(), at: 0 };
+            corrupt.bytes[at - HEADER_BYTES] = 0xFF;
+            let _ = Record::open(corrupt.seal(8), 8).unwrap().pairs(&[5, 5, 5]);
+            let _ = Record::open(corrupt.seal(8), 8).unwrap().extracted(DescriptorKind::ROOT_SIFT);
         }
     }
 }
