@@ -136,10 +136,10 @@ impl Problem<'_> {
             let lens = adjustment.add_group("lens", Euclidean(count), camera.intrinsics()[..count].to_vec())?;
             match free.lenses {
                 Lenses::All => {}
-                Lenses::Nothing => adjustment.hold(lens, 0)?,
+                Lenses::Nothing => adjustment.fix(lens, 0)?,
                 Lenses::Coarse => {
                     let held: Vec<usize> = [2, 3].into_iter().chain(6..count).collect();
-                    adjustment.hold_parameters(lens, 0, &held)?;
+                    adjustment.fix_parameters(lens, 0, &held)?;
                 }
             }
             fitted += match free.lenses {
@@ -148,7 +148,7 @@ impl Problem<'_> {
                 Lenses::Coarse => 4,
             };
             if c == 0 || !free.mounts {
-                adjustment.hold(mounts, c)?;
+                adjustment.fix(mounts, c)?;
             } else {
                 fitted += 6;
             }
@@ -178,7 +178,7 @@ impl Problem<'_> {
             }
         }
         if !free.shape {
-            adjustment.hold(shape, 0)?;
+            adjustment.fix(shape, 0)?;
         }
         Ok(Self { adjustment, lenses, mounts, shape, poses, numbers, fitted, cameras: estimate.cameras.len() })
     }

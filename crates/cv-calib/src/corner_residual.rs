@@ -78,9 +78,9 @@ impl<const N: usize, const C: usize> Residual<2, 3, C> for FromReference<N, C> {
         let camera = with_lens::<N>(&self.camera, lens);
         let Some(j) = jacobian else { return camera.project(&p).map(|seen| seen - corner.pixel) };
         let seen = camera.project_with_jacobians(&p)?;
-        by_motion(j, 0, &seen.by_point, &turned);
-        j.fixed_columns_mut::<N>(6).copy_from(&seen.by_intrinsics.fixed_columns::<N>(0));
-        by_shape(j, 6 + N, seen.by_point * rotation.matrix().column(2), corner.deflection);
+        by_motion(j, 0, &seen.point_jacobian, &turned);
+        j.fixed_columns_mut::<N>(6).copy_from(&seen.intrinsics_jacobian.fixed_columns::<N>(0));
+        by_shape(j, 6 + N, seen.point_jacobian * rotation.matrix().column(2), corner.deflection);
         Some(seen.pixel - corner.pixel)
     }
 }
@@ -110,10 +110,10 @@ impl<const N: usize, const C: usize> Residual<2, 4, C> for FromMount<N, C> {
         let camera = with_lens::<N>(&self.camera, lens);
         let Some(j) = jacobian else { return camera.project(&p).map(|seen| seen - corner.pixel) };
         let seen = camera.project_with_jacobians(&p)?;
-        let by_reference = seen.by_point * mount.matrix();
+        let by_reference = seen.point_jacobian * mount.matrix();
         by_motion(j, 0, &by_reference, &turned);
-        by_motion(j, 6, &seen.by_point, &in_mount);
-        j.fixed_columns_mut::<N>(12).copy_from(&seen.by_intrinsics.fixed_columns::<N>(0));
+        by_motion(j, 6, &seen.point_jacobian, &in_mount);
+        j.fixed_columns_mut::<N>(12).copy_from(&seen.intrinsics_jacobian.fixed_columns::<N>(0));
         by_shape(j, 12 + N, by_reference * rotation.matrix().column(2), corner.deflection);
         Some(seen.pixel - corner.pixel)
     }

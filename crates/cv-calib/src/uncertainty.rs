@@ -66,9 +66,9 @@ pub(crate) fn uncertainty(
     for p in points.iter().step_by(points.len().div_ceil(MOST_POINTS).max(1)) {
         let p = p / distance;
         let Some(seen) = camera.project_with_jacobians(&p) else { continue };
-        let motion = by_motion(&seen.by_point, &p.coords);
+        let motion = by_motion(&seen.point_jacobian, &p.coords);
         normal += motion.transpose() * motion;
-        across += motion.transpose() * seen.by_intrinsics.columns(0, n);
+        across += motion.transpose() * seen.intrinsics_jacobian.columns(0, n);
     }
     // The motion that makes up for a change of the intrinsics: −(MᵀM)⁻¹ MᵀI.
     let turn = match normal.try_inverse() {
@@ -84,8 +84,8 @@ pub(crate) fn uncertainty(
             return f64::NAN;
         };
         // A far point: shifts do not move it.
-        let motion = by_motion(&seen.by_point, &direction.coords);
-        let change = seen.by_intrinsics.columns(0, n) + motion.fixed_columns::<3>(0) * &turn;
+        let motion = by_motion(&seen.point_jacobian, &direction.coords);
+        let change = seen.intrinsics_jacobian.columns(0, n) + motion.fixed_columns::<3>(0) * &turn;
         let c = &change * covariance * change.transpose();
         worst_deviation(&Matrix2::new(c[(0, 0)], c[(0, 1)], c[(1, 0)], c[(1, 1)]))
     };

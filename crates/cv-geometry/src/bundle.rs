@@ -293,15 +293,15 @@ impl Problem<'_> {
             let [both, apart] = CENTER_PRIOR.map(|share| share * half);
             adjustment.consider(held, 0, &[ratio, both, both, apart, apart])?;
         } else {
-            adjustment.hold_parameters(lens, 0, &[0])?;
-            adjustment.hold(held, 0)?;
+            adjustment.fix_parameters(lens, 0, &[0])?;
+            adjustment.fix(held, 0)?;
         }
         if radial {
             let k = first.distortion.parameters();
             prior[1] = (-k[0], weight(RADIAL_PRIOR[0] / corner2));
             prior[2] = (-k[1], weight(RADIAL_PRIOR[1] / (corner2 * corner2)));
         } else {
-            adjustment.hold_parameters(lens, 0, &[1, 2])?;
+            adjustment.fix_parameters(lens, 0, &[1, 2])?;
         }
         if radial || options.focal.is_some() {
             adjustment.add_residuals("prior", LensPrior(prior), [lens], vec![[0]], RobustLoss::Trivial)?;

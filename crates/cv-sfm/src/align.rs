@@ -1,7 +1,7 @@
 //! A model in the frame of what is known of its cameras: up, meters, positions.
 
 use crate::SfmModel;
-use cv_core::{Cancelled, Matrix3, Point3, Pose, Progress, Rotation3, Vector3, median, upright};
+use cv_core::{Cancelled, Matrix3, Point3, Pose, Progress, Rotation3, Vector3, median, upright_frame};
 use cv_geometry::{EstimateError, RobustOptions, Similarity, SimilarityFreedom, estimate_similarity};
 use cv_numeric::{svd3, symmetric_eigen};
 
@@ -110,7 +110,7 @@ const LONGEST: f64 = 5.0;
 /// What a model's own centers may be off by, as a share of how far they are around their mean (kitti-2: 2.5 %): no nearer place is called another.
 const DRIFT: f64 = 0.01;
 
-/// The similarity from a model's frame to that of what is known: up by the photographs themselves ([`upright`]), the scale by known distances, all of it by known centers.
+/// The similarity from a model's frame to that of what is known: up by the photographs themselves ([`upright_frame`]), the scale by known distances, all of it by known centers.
 ///
 /// Centers (the satellites' are off by meters, some by much more) are fitted by a robust similarity ([`estimate_similarity`]) whose threshold is found from their own noise. Where they lie on a
 /// line within their noise, as along a street, they say nothing of how the model is turned about it: the photographs' up does. A similarity never bends a model. With distances the scale is
@@ -270,7 +270,7 @@ fn scale_by(model: &SfmModel, distances: &[(usize, usize, f64)]) -> Result<(f64,
 /// To a world with Z up and its origin at the first view that is in the model, which looks along Y.
 fn upright_similarity(model: &SfmModel) -> Similarity {
     let poses: Vec<Pose> = model.poses.iter().flatten().copied().collect();
-    let level = upright(&poses);
+    let level = upright_frame(&poses);
     // (x, y, z) with Y down to (x, z, −y) with Z up.
     let stand = Rotation3::from_matrix_unchecked(Matrix3::new(1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0, 0.0));
     Similarity { scale: 1.0, rotation: stand * level.rotation, translation: stand * level.translation }

@@ -323,7 +323,7 @@ impl Problem<'_> {
         adjustment.eliminate(points)?;
         let held: Vec<usize> = (0..views.len()).filter(|n| !free[views[*n]]).collect();
         for n in &held {
-            adjustment.hold(poses, *n)?;
+            adjustment.fix(poses, *n)?;
         }
         let mut reference = None;
         if held.is_empty() {
@@ -341,7 +341,7 @@ impl Problem<'_> {
             for (c, (camera, knowledge)) in scene.cameras.iter().zip(scene.knowledge).enumerate() {
                 let (held, items) = lens_prior(camera, knowledge, plan.lens, 0.5 * plan.scale);
                 let held: Vec<usize> = (0..LENS).filter(|k| held[*k]).collect();
-                adjustment.hold_parameters(group, c, &held)?;
+                adjustment.fix_parameters(group, c, &held)?;
                 prior.push(items);
             }
             let count = scene.cameras.len() as u32;
@@ -365,12 +365,12 @@ fn hold_gauge(
 ) -> Result<Option<[usize; 2]>, AdjustError> {
     let posed = |n: usize| Some((n, scene.poses[*views.get(n)?]?));
     let Some((_, first)) = posed(0) else { return Ok(None) };
-    adjustment.hold(poses, 0)?;
+    adjustment.fix(poses, 0)?;
     let apart = |p: &Pose| (p.center() - first.center()).norm_squared();
     let others = (1..views.len()).filter_map(posed);
     let Some((n, far)) = others.max_by(|a, b| apart(&a.1).total_cmp(&apart(&b.1))) else { return Ok(None) };
     // Of t = −R c, what changes with the distance from the first camera.
     let along = far.rotation * (far.center() - first.center());
-    adjustment.hold_parameters(poses, n, &[3 + along.iamax()])?;
+    adjustment.fix_parameters(poses, n, &[3 + along.iamax()])?;
     Ok(Some([views[0], views[n]]))
 }

@@ -108,7 +108,7 @@ pub(crate) fn centers_of_baselines(
     let solved = (|| {
         let mut problem = Adjustment::default();
         let group = problem.add_group("centers", Euclidean(3), start)?;
-        problem.hold(group, number[root] as usize)?;
+        problem.fix(group, number[root] as usize)?;
         let loss = RobustLoss::Huber { scale: OFF };
         problem.add_residuals("baselines", Baselines(items), [group, group], blocks, loss)?;
         let settings = AdjustOptions { max_iterations: 30, cost_tolerance: 1e-4, ..AdjustOptions::default() };
@@ -153,9 +153,9 @@ pub(crate) fn adjust_rays(scene: &mut Scene<'_>, stage: &Stage<'_>) -> Result<()
             problem.add_group("centers", Euclidean(3), start.iter().flat_map(|c| [c.x, c.y, c.z]).collect())?;
         let group = problem.add_group("points", Euclidean(3), points)?;
         problem.eliminate(group)?;
-        problem.hold(centers, 0)?;
+        problem.fix(centers, 0)?;
         if let Some(n) = far.filter(|n| *n > 0) {
-            problem.hold_parameters(centers, n, &[(start[n] - first).iamax()])?;
+            problem.fix_parameters(centers, n, &[(start[n] - first).iamax()])?;
         }
         problem.add_residuals("rays", Rays(rays), [centers, group], blocks, RobustLoss::Cauchy { scale: RAY })?;
         let settings = AdjustOptions { max_iterations: 30, cost_tolerance: 1e-3, ..AdjustOptions::default() };

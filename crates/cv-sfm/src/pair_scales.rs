@@ -147,7 +147,7 @@ pub(crate) fn baselines(
     let solved = (|| {
         let mut problem = Adjustment::default();
         let group = problem.add_group("logarithms of baselines", Euclidean(1), start)?;
-        problem.hold(group, number[root] as usize)?;
+        problem.fix(group, number[root] as usize)?;
         let loss = RobustLoss::Huber { scale: SCALE };
         problem.add_residuals("ratios", Differences(differences), [group, group], blocks, loss)?;
         let settings = AdjustOptions { max_iterations: 30, cost_tolerance: 1e-4, ..AdjustOptions::default() };

@@ -81,7 +81,7 @@ pub(crate) fn average_rotations(
         let solved = (|| {
             let mut problem = Adjustment::default();
             let group = problem.add_group("rotations", RotationManifold, views.iter().flat_map(store).collect())?;
-            problem.hold(group, number[root] as usize)?;
+            problem.fix(group, number[root] as usize)?;
             let relative = Relative(links.iter().map(|l| l.pose.rotation).collect());
             let blocks = links.iter().map(|l| [number[l.a], number[l.b]]).collect();
             problem.add_residuals("relative rotations", relative, [group, group], blocks, loss)?;

@@ -58,7 +58,7 @@ pub(super) fn report(
         let graph = draw_view_graph(model, GRAPH);
         let caption = "Which photographs see the same points. Dark squares away from the diagonal are walks that come back to where they were.";
         let width = if names.len() > 20 { Width::Full } else { Width::Half };
-        page.figure(picture(&graph, width, caption)?).thinnest_places(model, THIN);
+        page.figure(picture(&graph, width, caption)?).weakest_connections(model, THIN);
         quality(&mut page, model);
     }
     page.section("Time").times(stages);
