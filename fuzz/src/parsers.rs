@@ -106,7 +106,7 @@ pub fn npy_array(bytes: &[u8]) -> Corpus {
 }
 
 pub fn npz_arrays(bytes: &[u8]) -> Corpus {
-    let _ = npz::decode_only(bytes, &OPTIONS);
+    let _ = npz::decode_single(bytes, &OPTIONS);
     if let Ok(arrays) = npz::decode_with(bytes, &OPTIONS) {
         let arrays: Vec<_> = arrays.iter().map(|(name, array)| (name.as_str(), array)).collect();
         if let Ok(again) = npz::encode(&arrays, true) {
@@ -211,7 +211,7 @@ pub fn features(bytes: &[u8]) -> Corpus {
 
 pub fn places(bytes: &[u8]) -> Corpus {
     let Ok(text) = std::str::from_utf8(bytes) else { return Corpus::Reject };
-    if let Ok(places) = cv_io::parse_places(text) {
+    if let Ok(places) = cv_io::parse_camera_positions(text) {
         assert!(places.iter().all(|(_, place)| place.coords.iter().all(|v| v.is_finite())));
         let names: std::collections::HashSet<&String> = places.iter().map(|(name, _)| name).collect();
         assert!(!places.is_empty() && names.len() == places.len());

@@ -140,10 +140,10 @@ impl Problem<'_> {
             let lens = adjustment.add_group("lens", Euclidean(count), camera.intrinsics()[..count].to_vec())?;
             match free.intrinsics {
                 FreeIntrinsics::All => {}
-                FreeIntrinsics::None => adjustment.hold(lens, 0)?,
+                FreeIntrinsics::None => adjustment.fix(lens, 0)?,
                 FreeIntrinsics::Coarse => {
                     let constant: Vec<usize> = [2, 3].into_iter().chain(6..count).collect();
-                    adjustment.hold_parameters(lens, 0, &constant)?;
+                    adjustment.fix_parameters(lens, 0, &constant)?;
                 }
             }
             parameter_count += match free.intrinsics {
@@ -152,7 +152,7 @@ impl Problem<'_> {
                 FreeIntrinsics::Coarse => 4,
             };
             if c == 0 || !free.rig_poses {
-                adjustment.hold(rig_poses, c)?;
+                adjustment.fix(rig_poses, c)?;
             } else {
                 parameter_count += 6;
             }
@@ -182,7 +182,7 @@ impl Problem<'_> {
             }
         }
         if !free.shape {
-            adjustment.hold(shape, 0)?;
+            adjustment.fix(shape, 0)?;
         }
         Ok(Self {
             adjustment,

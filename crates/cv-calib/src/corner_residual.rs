@@ -78,9 +78,9 @@ impl<const N: usize, const C: usize> Residual<2, 3, C> for FirstCameraResidual<N
         let camera = with_intrinsics::<N>(&self.camera, intrinsics);
         let Some(j) = jacobian else { return camera.project(&p).map(|projection| projection - corner.pixel) };
         let projection = camera.project_with_jacobians(&p)?;
-        by_motion(j, 0, &projection.by_point, &rotated);
-        j.fixed_columns_mut::<N>(6).copy_from(&projection.by_intrinsics.fixed_columns::<N>(0));
-        by_shape(j, 6 + N, projection.by_point * rotation.matrix().column(2), corner.deflection);
+        by_motion(j, 0, &projection.point_jacobian, &rotated);
+        j.fixed_columns_mut::<N>(6).copy_from(&projection.intrinsics_jacobian.fixed_columns::<N>(0));
+        by_shape(j, 6 + N, projection.point_jacobian * rotation.matrix().column(2), corner.deflection);
         Some(projection.pixel - corner.pixel)
     }
 }
@@ -110,10 +110,10 @@ impl<const N: usize, const C: usize> Residual<2, 4, C> for RigCameraResidual<N, 
         let camera = with_intrinsics::<N>(&self.camera, intrinsics);
         let Some(j) = jacobian else { return camera.project(&p).map(|projection| projection - corner.pixel) };
         let projection = camera.project_with_jacobians(&p)?;
-        let by_reference = projection.by_point * rig_pose.matrix();
+        let by_reference = projection.point_jacobian * rig_pose.matrix();
         by_motion(j, 0, &by_reference, &rotated);
-        by_motion(j, 6, &projection.by_point, &in_rig_camera);
-        j.fixed_columns_mut::<N>(12).copy_from(&projection.by_intrinsics.fixed_columns::<N>(0));
+        by_motion(j, 6, &projection.point_jacobian, &in_rig_camera);
+        j.fixed_columns_mut::<N>(12).copy_from(&projection.intrinsics_jacobian.fixed_columns::<N>(0));
         by_shape(j, 12 + N, by_reference * rotation.matrix().column(2), corner.deflection);
         Some(projection.pixel - corner.pixel)
     }

@@ -128,8 +128,8 @@ fn the_uncertainty_map_agrees_with_the_errors_of_rays() {
                 let s = camera.camera.project_with_jacobians(&moved).unwrap();
                 let mut j = nalgebra::Matrix2x6::zeros();
                 j.fixed_columns_mut::<3>(0)
-                    .copy_from(&(-s.by_point * (moved - motion.translation).coords.cross_matrix()));
-                j.fixed_columns_mut::<3>(3).copy_from(&s.by_point);
+                    .copy_from(&(-s.point_jacobian * (moved - motion.translation).coords.cross_matrix()));
+                j.fixed_columns_mut::<3>(3).copy_from(&s.point_jacobian);
                 a += j.transpose() * j;
                 b += j.transpose() * (s.pixel - truth.project(p).unwrap());
             }

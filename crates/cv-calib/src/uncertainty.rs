@@ -68,9 +68,9 @@ pub(crate) fn uncertainty_map(
     for p in points.iter().step_by(points.len().div_ceil(MAX_POINTS).max(1)) {
         let p = p / distance;
         let Some(projection) = camera.project_with_jacobians(&p) else { continue };
-        let motion = by_motion(&projection.by_point, &p.coords);
+        let motion = by_motion(&projection.point_jacobian, &p.coords);
         normal += motion.transpose() * motion;
-        motion_by_intrinsics += motion.transpose() * projection.by_intrinsics.columns(0, n);
+        motion_by_intrinsics += motion.transpose() * projection.intrinsics_jacobian.columns(0, n);
     }
     // The motion that compensates for a change of the intrinsics: −(MᵀM)⁻¹ MᵀI.
     let rotation_by_intrinsics = match normal.try_inverse() {
@@ -86,8 +86,9 @@ pub(crate) fn uncertainty_map(
             return f64::NAN;
         };
         // A distant point does not depend on the translation.
-        let motion = by_motion(&projection.by_point, &direction.coords);
-        let change = projection.by_intrinsics.columns(0, n) + motion.fixed_columns::<3>(0) * &rotation_by_intrinsics;
+        let motion = by_motion(&projection.point_jacobian, &direction.coords);
+        let change =
+            projection.intrinsics_jacobian.columns(0, n) + motion.fixed_columns::<3>(0) * &rotation_by_intrinsics;
         let c = &change * covariance * change.transpose();
         max_sigma(&Matrix2::new(c[(0, 0)], c[(0, 1)], c[(1, 0)], c[(1, 1)]))
     };

@@ -5,10 +5,10 @@ use nalgebra::{Matrix1x2, Matrix1x3, Matrix2x3, Matrix3, Point2, Point3, SMatrix
 use crate::Scaling;
 use crate::distortion::{Distortion, MAX_PARAMETERS};
 
-/// The most intrinsics a camera has: fx, fy, cx, cy, and the distortion's parameters.
+/// Maximum number of intrinsics of a camera: fx, fy, cx, cy, and the distortion parameters.
 pub const MAX_INTRINSICS: usize = 4 + MAX_PARAMETERS;
 
-/// Why a camera is not one.
+/// Why a camera is not valid.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum CameraError {
@@ -45,33 +45,34 @@ pub struct Camera {
     pub distortion: Distortion,
 }
 
-/// A point seen by a camera, with the derivatives of its pixel.
+/// A scene point projected into a camera, with the Jacobians of its pixel.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ProjectedPoint {
-    /// The pixel.
+    /// The projected pixel.
     pub pixel: Point2<f64>,
-    /// By the point in the camera's frame.
-    pub by_point: Matrix2x3<f64>,
-    /// By the intrinsics in the order of [`Camera::intrinsics`]: as many columns as the camera has, the others zero.
-    pub by_intrinsics: SMatrix<f64, 2, MAX_INTRINSICS>,
+    /// Derivative of the pixel by the point in the camera frame.
+    pub point_jacobian: Matrix2x3<f64>,
+    /// Derivative of the pixel by the intrinsics, columns in the order of [`Camera::intrinsics`]; columns beyond the
+    /// camera's intrinsics are zero.
+    pub intrinsics_jacobian: SMatrix<f64, 2, MAX_INTRINSICS>,
 }
 
 impl Camera {
-    /// A camera without distortion.
+    /// Makes a camera without distortion.
     pub fn pinhole(width: usize, height: usize, fx: f64, fy: f64, cx: f64, cy: f64) -> Self {
         Self { width, height, fx, fy, cx, cy, distortion: Distortion::NONE }
     }
 
-    /// A camera with square pixels and its principal point in the middle of the image.
+    /// Makes a camera with square pixels and its principal point at the image center.
     pub fn from_focal(width: usize, height: usize, focal: f64) -> Self {
-        let middle = |n: usize| (n as f64 - 1.0) / 2.0;
-        Self::pinhole(width, height, focal, focal, middle(width), middle(height))
+        let center = |n: usize| (n as f64 - 1.0) / 2.0;
+        Self::pinhole(width, height, focal, focal, center(width), center(height))
     }
 
-    /// Checks that every parameter makes sense.
+    /// Checks that all parameters are finite and the focal lengths positive.
     ///
     /// # Errors
-    /// [`CameraError`] with the first thing that is wrong.
+    /// [`CameraError`] for the first violation.
     pub fn validate(&self) -> Result<(), CameraError> {
         if !(self.cx.is_finite() && self.cy.is_finite() && self.distortion.is_finite()) {
             return Err(CameraError::NotFinite);
@@ -93,12 +94,12 @@ impl Camera {
         Matrix3::new(1.0 / fx, 0.0, -self.cx / fx, 0.0, 1.0 / fy, -self.cy / fy, 0.0, 0.0, 1.0)
     }
 
-    /// How many intrinsics the camera has: four and the distortion's parameters.
+    /// Returns the number of intrinsics: four and the distortion parameters.
     pub fn intrinsic_count(&self) -> usize {
         4 + self.distortion.parameters().len()
     }
 
-    /// The intrinsics as a vector: fx, fy, cx, cy, the distortion's parameters in its order, then zeros.
+    /// Returns the intrinsics as a vector: fx, fy, cx, cy, the distortion parameters in the model's order, then zeros.
     pub fn intrinsics(&self) -> [f64; MAX_INTRINSICS] {
         let mut out = [0.0; MAX_INTRINSICS];
         out[..4].copy_from_slice(&[self.fx, self.fy, self.cx, self.cy]);
@@ -107,7 +108,8 @@ impl Camera {
         out
     }
 
-    /// The same camera with other intrinsics, in the order of [`Self::intrinsics`]; those it does not have are left alone.
+    /// Returns the camera with its intrinsics replaced by `values`, in the order of [`Self::intrinsics`]; entries beyond
+    /// [`Self::intrinsic_count`] are ignored.
     pub fn with_intrinsics(&self, values: &[f64; MAX_INTRINSICS]) -> Self {
         let [fx, fy, cx, cy, ..] = *values;
         let mut out = Self { fx, fy, cx, cy, ..*self };
@@ -115,14 +117,14 @@ impl Camera {
         out
     }
 
-    /// Camera coordinates to pixels; `None` behind the camera or in its plane. Whether the lens's range reaches so far out is not asked:
-    /// [`Distortion::distort_in_range`] does.
+    /// Projects a point in camera coordinates to a pixel; `None` where its depth is not positive. The valid range of the
+    /// lens is not checked ([`Distortion::distort_in_range`] does).
     #[inline]
     pub fn project(&self, p: &Point3<f64>) -> Option<Point2<f64>> {
         (p.z > 0.0).then(|| self.denormalize(Point2::new(p.x / p.z, p.y / p.z)))
     }
 
-    /// As [`Self::project`], with the derivatives by the point and by the intrinsics.
+    /// As [`Self::project`], with the Jacobians by the point and by the intrinsics.
     #[inline]
     pub fn project_with_jacobians(&self, p: &Point3<f64>) -> Option<ProjectedPoint> {
         if p.z <= 0.0 || p.z.is_nan() {
@@ -130,64 +132,66 @@ impl Camera {
         }
         let inverse = 1.0 / p.z;
         let ideal = Point2::new(p.x * inverse, p.y * inverse);
-        let (d, j, by_parameters) = self.distortion.distort_with_jacobians(ideal);
-        // By entries: the products of the diagonal and triangular matrices that these are would be mostly of zeros.
+        let (d, j, parameter_jacobian) = self.distortion.distort_with_jacobians(ideal);
+        // Written out entry by entry: the matrix products would multiply mostly by zeros.
         let (by_x, by_y) = (j.row(0) * self.fx, j.row(1) * self.fy);
         let along = |m: &Matrix1x2<f64>| {
             Matrix1x3::new(m.x * inverse, m.y * inverse, m.x * (-ideal.x * inverse) + m.y * (-ideal.y * inverse))
         };
-        let mut by_intrinsics = SMatrix::<f64, 2, MAX_INTRINSICS>::zeros();
-        let (by_pinhole, by_lens) = by_intrinsics.as_mut_slice().split_at_mut(8);
-        by_pinhole.copy_from_slice(&[d.x, 0.0, 0.0, d.y, 1.0, 0.0, 0.0, 1.0]);
-        let columns = by_lens.as_chunks_mut::<2>().0.iter_mut().zip(by_parameters.as_slice().as_chunks::<2>().0);
+        let mut intrinsics_jacobian = SMatrix::<f64, 2, MAX_INTRINSICS>::zeros();
+        let (pinhole_columns, distortion_columns) = intrinsics_jacobian.as_mut_slice().split_at_mut(8);
+        pinhole_columns.copy_from_slice(&[d.x, 0.0, 0.0, d.y, 1.0, 0.0, 0.0, 1.0]);
+        let columns =
+            distortion_columns.as_chunks_mut::<2>().0.iter_mut().zip(parameter_jacobian.as_slice().as_chunks::<2>().0);
         columns.for_each(|(column, [x, y])| *column = [self.fx * x, self.fy * y]);
         Some(ProjectedPoint {
             pixel: Point2::new(self.fx * d.x + self.cx, self.fy * d.y + self.cy),
-            by_point: Matrix2x3::from_rows(&[along(&by_x), along(&by_y)]),
-            by_intrinsics,
+            point_jacobian: Matrix2x3::from_rows(&[along(&by_x), along(&by_y)]),
+            intrinsics_jacobian,
         })
     }
 
-    /// Pixel to the ideal normalized coordinates of its ray (distortion removed): the direction is `(x, y, 1)`. NaN where the lens has no
-    /// ray for it ([`Distortion::undistort`]).
+    /// Converts a pixel to the undistorted normalized coordinates of its ray, whose direction is `(x, y, 1)`. NaN where
+    /// the lens model has no ray for it ([`Distortion::undistort`]).
     #[inline]
     pub fn normalize(&self, pixel: Point2<f64>) -> Point2<f64> {
         self.distortion.undistort(Point2::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy))
     }
 
-    /// Ideal normalized coordinates to a pixel (distortion applied).
+    /// Converts undistorted normalized coordinates to a pixel (distortion applied).
     #[inline]
     pub fn denormalize(&self, ray: Point2<f64>) -> Point2<f64> {
         let d = self.distortion.distort(ray);
         Point2::new(self.fx * d.x + self.cx, self.fy * d.y + self.cy)
     }
 
-    /// As [`Self::denormalize`], but `None` beyond the range in which the lens is monotonic, where rays fold back into the picture.
+    /// As [`Self::denormalize`], but `None` beyond the range in which the lens model is monotonic, where rays fold back into the image.
     #[inline]
     pub fn denormalize_in_range(&self, ray: Point2<f64>) -> Option<Point2<f64>> {
         let d = self.distortion.distort_in_range(ray)?;
         Some(Point2::new(self.fx * d.x + self.cx, self.fy * d.y + self.cy))
     }
 
-    /// A pixel as the same camera without distortion would see it.
+    /// Returns the pixel at which the same camera without distortion would image the ray of `pixel`.
     pub fn undistort_pixel(&self, pixel: Point2<f64>) -> Point2<f64> {
         let n = self.normalize(pixel);
         Point2::new(self.fx * n.x + self.cx, self.fy * n.y + self.cy)
     }
 
-    /// The same camera behind an image scaled by `factor` (0.5 for half size), pixel centers at integers. Where the image was made of a whole
-    /// number of pixels, [`Self::resized`] says what it shows to the last digit.
+    /// Returns the camera of the image scaled by `factor` (0.5 for half resolution), pixel centers at integers. The sides are
+    /// rounded but the intrinsics scale by exactly `factor`; [`Self::resized`] is exact for an image resampled to a whole
+    /// number of pixels.
     pub fn scaled(&self, factor: f64) -> Self {
         let side = |n: usize| (n as f64 * factor).round() as usize;
-        self.stretched((side(self.width), side(self.height)), Scaling::uniform(factor))
+        self.with_scaling((side(self.width), side(self.height)), Scaling::uniform(factor))
     }
 
-    /// The same camera behind an image resized to `width × height`: the edges of the pictures meet ([`Scaling`]).
+    /// Returns the camera of the image resized to `width × height` pixels, image edges aligned ([`Scaling`]).
     pub fn resized(&self, width: usize, height: usize) -> Self {
-        self.stretched((width, height), Scaling::between((self.width, self.height), (width, height)))
+        self.with_scaling((width, height), Scaling::between((self.width, self.height), (width, height)))
     }
 
-    fn stretched(&self, (width, height): (usize, usize), scaling: Scaling) -> Self {
+    fn with_scaling(&self, (width, height): (usize, usize), scaling: Scaling) -> Self {
         let center = scaling.point(Point2::new(self.cx, self.cy));
         Self {
             width,
@@ -222,7 +226,7 @@ mod tests {
             for axis in 0..3 {
                 let d = nalgebra::Vector3::ith(axis, h);
                 let (a, b) = (camera.project(&(point + d)).unwrap(), camera.project(&(point - d)).unwrap());
-                prop_assert!(near(seen.by_point.column(axis).into(), a, b, h), "axis {axis}");
+                prop_assert!(near(seen.point_jacobian.column(axis).into(), a, b, h), "axis {axis}");
             }
             for i in 0..MAX_INTRINSICS {
                 let moved = |d: f64| {
@@ -230,7 +234,7 @@ mod tests {
                     values[i] += d;
                     camera.with_intrinsics(&values).project(&point).unwrap()
                 };
-                prop_assert!(near(seen.by_intrinsics.column(i).into(), moved(h), moved(-h), h), "intrinsic {i}");
+                prop_assert!(near(seen.intrinsics_jacobian.column(i).into(), moved(h), moved(-h), h), "intrinsic {i}");
             }
         }
     }
@@ -243,10 +247,10 @@ mod tests {
     }
 
     #[test]
-    fn resizing_keeps_each_edge_where_it_is_though_the_sides_round_apart() {
+    fn resizing_keeps_image_edges_where_the_aspect_ratio_changes_by_rounding() {
         let camera = Camera::pinhole(641, 479, 500.0, 510.0, 300.0, 250.0);
         let small = camera.resized(100, 75);
-        // A ray through an edge of the picture goes through that edge of the small one: half a pixel outside the first and last centers.
+        // A ray through an image edge goes through the same edge of the small image: half a pixel outside the first and last centers.
         for (x, y) in [(0.0, 0.0), (1.0, 1.0)] {
             let ray = camera.normalize(Point2::new(641.0 * x - 0.5, 479.0 * y - 0.5));
             let p = small.denormalize(ray);
@@ -255,7 +259,7 @@ mod tests {
     }
 
     #[test]
-    fn nonsense_cameras_are_named() {
+    fn invalid_cameras_are_refused_with_the_reason() {
         let mut camera = Camera::from_focal(10, 10, -1.0);
         assert_eq!(camera.validate(), Err(CameraError::Focal { fx: -1.0, fy: -1.0 }));
         camera.cx = f64::NAN;

@@ -3,9 +3,9 @@
 use crate::size::size_accessors;
 use crate::{ImageView, ImageViewMut};
 
-/// A channel value of an image.
+/// A sample type: the type of one channel value of an image.
 ///
-/// Implemented for the types images are made of here; the set is open, so that a caller may use its own.
+/// Implemented for the common numeric types; callers may implement it for their own.
 pub trait Sample: Copy + Default + PartialEq + Send + Sync + 'static {}
 impl Sample for bool {}
 impl Sample for u8 {}
@@ -20,14 +20,14 @@ impl Sample for f64 {}
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum ImageError {
-    /// The buffer does not hold `width × height × channels` samples.
+    /// The buffer's length is not `width × height × channels`.
     #[error("a {width}×{height} image with {channels} channel(s) does not have {len} samples")]
     WrongLength {
         /// Samples in the buffer.
         len: usize,
-        /// Asked width in pixels.
+        /// Requested width in pixels.
         width: usize,
-        /// Asked height in pixels.
+        /// Requested height in pixels.
         height: usize,
         /// Channels per pixel.
         channels: usize,
@@ -35,9 +35,9 @@ pub enum ImageError {
     /// `width × height × channels` is more than memory can address.
     #[error("a {width}×{height} image with {channels} channel(s) is larger than memory can address")]
     TooLarge {
-        /// Asked width in pixels.
+        /// Requested width in pixels.
         width: usize,
-        /// Asked height in pixels.
+        /// Requested height in pixels.
         height: usize,
         /// Channels per pixel.
         channels: usize,
@@ -62,15 +62,14 @@ pub type GrayF32 = Image<f32, 1>;
 pub type RgbU8 = Image<u8, 3>;
 /// RGB of `f32`, by convention 0 to 1.
 pub type RgbF32 = Image<f32, 3>;
-/// True where a pixel belongs.
+/// A binary mask: true for foreground pixels.
 pub type Mask = Image<bool, 1>;
 
 impl<T: Sample, const C: usize> Image<T, C> {
-    /// An image with every pixel equal to `fill`.
+    /// Makes an image with every pixel equal to `fill`.
     ///
     /// # Panics
-    /// Where `width × height × C` overflows `usize`. Sizes that come from outside the process go through
-    /// [`Image::try_new`].
+    /// Where `width × height × C` overflows `usize`. Use [`Image::try_new`] for sizes from outside the process.
     pub fn new(width: usize, height: usize, fill: [T; C]) -> Self {
         match Self::try_new(width, height, fill) {
             Ok(image) => image,
@@ -79,12 +78,12 @@ impl<T: Sample, const C: usize> Image<T, C> {
         }
     }
 
-    /// As [`Image::new`], for sizes that are not to be trusted.
+    /// As [`Image::new`], for untrusted sizes.
     ///
     /// # Errors
     /// [`ImageError::TooLarge`] where the number of samples overflows `isize`.
     pub fn try_new(width: usize, height: usize, fill: [T; C]) -> Result<Self, ImageError> {
-        let len = samples::<T, C>(width, height)?;
+        let len = checked_sample_count::<T, C>(width, height)?;
         let data = match fill.first() {
             Some(&first) if fill.iter().all(|&v| v == first) => vec![first; len],
             _ => {
@@ -98,7 +97,7 @@ impl<T: Sample, const C: usize> Image<T, C> {
         Ok(Self { data, width, height })
     }
 
-    /// An image whose pixel at column `x` and row `y` is `f(x, y)`.
+    /// Makes an image whose pixel at column `x` and row `y` is `f(x, y)`.
     pub fn from_fn(width: usize, height: usize, mut f: impl FnMut(usize, usize) -> [T; C]) -> Self {
         let mut image = Self::new(width, height, [T::default(); C]);
         for y in 0..height {
@@ -109,12 +108,12 @@ impl<T: Sample, const C: usize> Image<T, C> {
         image
     }
 
-    /// Takes over a buffer of `width × height × C` samples.
+    /// Makes an image of a buffer of `width × height × C` samples, row-major and interleaved, without a copy.
     ///
     /// # Errors
     /// [`ImageError::WrongLength`] where the buffer has another length.
     pub fn from_vec(width: usize, height: usize, data: Vec<T>) -> Result<Self, ImageError> {
-        if data.len() != samples::<T, C>(width, height)? {
+        if data.len() != checked_sample_count::<T, C>(width, height)? {
             return Err(ImageError::WrongLength { len: data.len(), width, height, channels: C });
         }
         Ok(Self { data, width, height })
@@ -122,30 +121,30 @@ impl<T: Sample, const C: usize> Image<T, C> {
 
     size_accessors!();
 
-    /// All samples, row after row.
+    /// Returns all samples, row-major.
     #[inline]
     pub fn as_slice(&self) -> &[T] {
         &self.data
     }
 
-    /// All samples, row after row.
+    /// Returns all samples, row-major, mutable.
     #[inline]
     pub fn as_mut_slice(&mut self) -> &mut [T] {
         &mut self.data
     }
 
-    /// Gives the buffer back.
+    /// Returns the buffer of samples.
     pub fn into_vec(self) -> Vec<T> {
         self.data
     }
 
-    /// All pixels, row after row.
+    /// Iterates over all pixels, row-major.
     pub fn pixels(&self) -> impl ExactSizeIterator<Item = [T; C]> + '_ {
         let (pixels, _) = self.data.as_chunks::<C>();
         pixels.iter().copied()
     }
 
-    /// The samples of row `y`.
+    /// Returns the samples of row `y`.
     ///
     /// # Panics
     /// Where `y` is not below the height.
@@ -154,7 +153,7 @@ impl<T: Sample, const C: usize> Image<T, C> {
         &self.data[y * self.width * C..(y + 1) * self.width * C]
     }
 
-    /// The samples of row `y`.
+    /// Returns the samples of row `y`, mutable.
     ///
     /// # Panics
     /// Where `y` is not below the height.
@@ -163,7 +162,7 @@ impl<T: Sample, const C: usize> Image<T, C> {
         &mut self.data[y * self.width * C..(y + 1) * self.width * C]
     }
 
-    /// The pixel at column `x`, row `y`.
+    /// Returns the pixel at column `x`, row `y`.
     ///
     /// # Panics
     /// Outside the image.
@@ -174,7 +173,7 @@ impl<T: Sample, const C: usize> Image<T, C> {
         std::array::from_fn(|c| self.data[start + c])
     }
 
-    /// The pixel at column `x`, row `y`, or `None` outside.
+    /// Returns the pixel at column `x`, row `y`, or `None` outside.
     #[inline]
     pub fn get(&self, x: usize, y: usize) -> Option<[T; C]> {
         (x < self.width && y < self.height).then(|| self.at(x, y))
@@ -191,7 +190,7 @@ impl<T: Sample, const C: usize> Image<T, C> {
         self.data[start..start + C].copy_from_slice(&pixel);
     }
 
-    /// A new image of `f(pixel)`.
+    /// Applies `f` to every pixel and returns the new image.
     pub fn map<U: Sample, const D: usize>(&self, mut f: impl FnMut([T; C]) -> [U; D]) -> Image<U, D> {
         let mut data = Vec::with_capacity(self.width * self.height * D);
         for pixel in self.pixels() {
@@ -200,13 +199,13 @@ impl<T: Sample, const C: usize> Image<T, C> {
         Image { data, width: self.width, height: self.height }
     }
 
-    /// The whole image, borrowed.
+    /// Returns a view of the whole image.
     #[inline]
     pub fn view(&self) -> ImageView<'_, T, C> {
         ImageView::from_parts(&self.data, self.width, self.height, self.width * C)
     }
 
-    /// The whole image, borrowed to write.
+    /// Returns a mutable view of the whole image.
     #[inline]
     pub fn view_mut(&mut self) -> ImageViewMut<'_, T, C> {
         ImageViewMut::from_parts(&mut self.data, self.width, self.height, self.width * C)
@@ -219,8 +218,8 @@ impl<'a, T: Sample, const C: usize> From<&'a Image<T, C>> for ImageView<'a, T, C
     }
 }
 
-/// The number of samples of an image, or an error where that is more than can be allocated.
-fn samples<T, const C: usize>(width: usize, height: usize) -> Result<usize, ImageError> {
+/// Computes the number of samples of an image, or an error where they cannot be allocated.
+fn checked_sample_count<T, const C: usize>(width: usize, height: usize) -> Result<usize, ImageError> {
     width
         .checked_mul(height)
         .and_then(|n| n.checked_mul(C))
@@ -246,13 +245,13 @@ mod tests {
     }
 
     #[test]
-    fn unequal_fills_reach_every_pixel() {
+    fn a_fill_of_unequal_channels_sets_every_pixel() {
         let image = Image::<u8, 3>::new(3, 2, [1, 2, 3]);
         assert!(image.pixels().all(|p| p == [1, 2, 3]) && image.pixels().len() == 6);
     }
 
     #[test]
-    fn empty_images_have_no_rows_to_trip_over() {
+    fn empty_images_have_empty_rows() {
         let image = Image::<u8, 1>::new(0, 5, [0]);
         assert!(image.is_empty() && image.row(4).is_empty() && image.get(0, 0).is_none());
     }

@@ -1,6 +1,6 @@
-//! The vocabulary every other crate of the workspace speaks: images, cameras,
-//! poses, keypoints, matches and point clouds, and what is needed everywhere: the clock of a job's stages, the error for a
-//! wrong option, luma, quantiles, union-find. No input or output, no codecs, no thread pool.
+//! The types that every other crate of the workspace shares: images, cameras,
+//! poses, keypoints, matches and point clouds. Also small utilities: stage timing, progress and cancellation, the error
+//! for an option out of range, luma, quantiles, union-find. No input or output, no codecs, no thread pool.
 //!
 //! ```
 //! use cv_core::{Image, Point2};
@@ -29,7 +29,6 @@
 mod camera;
 mod distortion;
 mod features;
-mod four_digits;
 mod geodetic;
 mod image;
 mod luma;
@@ -40,21 +39,21 @@ mod pose;
 mod progress;
 mod quantile;
 mod rig;
+mod round_to_four_digits;
 mod scaling;
 mod size;
 mod sparse_model;
 mod stage_clock;
 mod union_find;
-mod upright;
+mod upright_frame;
 mod view;
 
 pub use camera::{Camera, CameraError, MAX_INTRINSICS, ProjectedPoint};
 pub use distortion::{
-    ByParameters, ColmapModel, Distortion, DistortionModel, LensInfo, LensProjection, MAX_PARAMETERS,
-    ParameterCountError,
+    ColmapModel, Distortion, DistortionModel, LensInfo, LensProjection, MAX_PARAMETERS, ParameterCountError,
+    ParameterJacobian,
 };
 pub use features::{Correspondence, DMatch, Keypoint};
-pub use four_digits::four_digits;
 pub use geodetic::{GeodeticPoint, east_north_up};
 pub use image::{GrayF32, GrayU8, Image, ImageError, Mask, RgbF32, RgbU8, Sample};
 pub use luma::{luma_f32, luma_u8, luma_u16};
@@ -65,11 +64,12 @@ pub use pose::Pose;
 pub use progress::{Cancelled, Progress, Silent, Stage};
 pub use quantile::{TotalOrder, median, quantile};
 pub use rig::StereoRig;
+pub use round_to_four_digits::round_to_four_digits;
 pub use scaling::Scaling;
 pub use sparse_model::{ModelImage, ModelPoint, SparseModel};
 pub use stage_clock::StageClock;
 pub use union_find::UnionFind;
-pub use upright::upright;
+pub use upright_frame::upright_frame;
 pub use view::{ImageView, ImageViewMut};
 
 pub use nalgebra;

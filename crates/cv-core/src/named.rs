@@ -1,20 +1,20 @@
-//! Choices that people make by name.
+//! Enums whose values are chosen by name.
 
-/// An enum whose values people choose by name: on a command line, in a script, in a file. [`named!`](crate::named) implements it.
+/// An enum whose values are chosen by name on a command line, in a script or in a file. [`named!`](crate::named) implements it.
 pub trait Named: Clone + Send + Sync + Sized + 'static {
-    /// Each value with its name, in the order in which they are listed. A variant with fields is there with its defaults.
+    /// Each value with its name, in the order of listings. Variants with fields have their defaults.
     const NAMES: &'static [(&'static str, Self)];
 
-    /// Other spellings, by name; they are understood but not listed.
+    /// Aliases and the names they stand for; accepted but not listed.
     const ALIASES: &'static [(&'static str, &'static str)];
 
-    /// The name, whatever the fields of the variant hold.
+    /// Returns the name of the variant, whatever its fields.
     fn name(&self) -> &'static str;
 
-    /// What the value is for, in a few words; empty where its name says it.
+    /// Describes the value in a few words; empty where its name is enough.
     fn about(&self) -> &'static str;
 
-    /// The value of a name or of another spelling of it.
+    /// Returns the value of a name or alias.
     ///
     /// # Errors
     /// [`UnknownName`] where no value has it.
@@ -39,7 +39,7 @@ pub struct UnknownName {
     pub known: String,
 }
 
-/// Gives every variant of an enum its name: implements [`Named`](crate::Named), `Display` and `FromStr` for it. A variant without a
+/// Names every variant of an enum: implements [`Named`](crate::Named), `Display` and `FromStr` for it. A variant without a
 /// name does not compile.
 ///
 /// ```
@@ -113,7 +113,7 @@ mod tests {
     named!(Blend { None = "none", Gray { per_bit: 2 } = "gray" | "grey": "sharper outlines" });
 
     #[test]
-    fn names_go_there_and_back() {
+    fn names_round_trip() {
         for (name, value) in Blend::NAMES {
             assert_eq!((value.name(), value.to_string().as_str(), name.parse()), (*name, *name, Ok(*value)));
         }
@@ -122,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn other_spellings_are_understood_and_not_listed() {
+    fn aliases_are_parsed_and_not_listed() {
         assert_eq!("grey".parse(), Ok(Blend::Gray { per_bit: 2 }));
         assert!(Blend::NAMES.iter().all(|(name, _)| *name != "grey"));
         // The width of a column is kept.

@@ -9,7 +9,7 @@ pub struct OptionError {
     pub name: &'static str,
     /// Its value.
     pub value: f64,
-    /// What it may be, in words that follow “it must be”.
+    /// The valid range, worded to follow “it must be”.
     pub range: &'static str,
 }
 
@@ -33,7 +33,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_option_says_what_it_is_and_what_it_must_be() {
+    fn the_message_has_the_value_and_the_valid_range() {
         assert_eq!(OptionError::check("sigma", 1.5, "above 0", |v| v > 0.0), Ok(()));
         let error = OptionError::check("sigma", -1.5, "above 0", |v| v > 0.0).unwrap_err();
         assert_eq!(error.to_string(), "sigma is -1.5; it must be above 0");

@@ -1,8 +1,8 @@
-//! Points in space with what is drawn with them.
+//! Point clouds with colors, normals and line segments.
 
 use crate::{Camera, Point3, Pose};
 
-/// Points, maybe with colors and normals, and line segments between them: what a PLY file holds.
+/// 3D points, optionally with colors and normals, and line segments between them: the contents of a PLY file.
 #[derive(Debug, Clone, PartialEq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
@@ -13,17 +13,17 @@ pub struct PointCloud {
     pub colors: Vec<[u8; 3]>,
     /// One unit normal per point, or empty.
     pub normals: Vec<[f32; 3]>,
-    /// Line segments as pairs of indices into `positions`, such as the outline of a camera.
+    /// Line segments as pairs of indices into `positions`, such as a camera frustum.
     pub edges: Vec<[u32; 2]>,
 }
 
 impl PointCloud {
-    /// Points without more.
+    /// Makes a cloud of points without attributes.
     pub fn from_positions(positions: Vec<[f32; 3]>) -> Self {
         Self { positions, ..Self::default() }
     }
 
-    /// Points with a color each.
+    /// Makes a cloud of colored points.
     pub fn colored(positions: Vec<[f32; 3]>, colors: Vec<[u8; 3]>) -> Self {
         Self { positions, colors, ..Self::default() }
     }
@@ -38,16 +38,16 @@ impl PointCloud {
         self.positions.is_empty()
     }
 
-    /// Takes every position, and the direction of every normal, through `motion`.
+    /// Applies the rigid motion to every position, and its rotation to every normal.
     pub fn transform(&mut self, motion: &Pose) {
         let (r, t) = (motion.rotation, motion.translation);
         self.positions.iter_mut().for_each(|p| *p = (r * Point3::from(*p).cast::<f64>() + t).cast::<f32>().into());
         self.normals.iter_mut().for_each(|n| *n = (r * Point3::from(*n).cast::<f64>()).cast::<f32>().into());
     }
 
-    /// Adds points of one color joined by `edges`, whose indices count from the first added point.
+    /// Adds points of one color connected by `edges`, whose indices count from the first added point.
     ///
-    /// A cloud of points without colors stays without; normals, where there are some, are zero for the added points.
+    /// Points without colors stay without; where the cloud has normals, those of the added points are zero.
     pub fn add_wireframe(&mut self, corners: &[[f32; 3]], edges: &[[u32; 2]], color: [u8; 3]) {
         let first = self.positions.len() as u32;
         let colored = self.positions.is_empty() || !self.colors.is_empty();
@@ -62,12 +62,12 @@ impl PointCloud {
         self.edges.extend(edges.iter().map(|e| e.map(|i| i + first)));
     }
 
-    /// Adds a camera's outline: its center, and the corners of its picture `depth` in front of it.
+    /// Adds a camera frustum: the camera center, and the image corners at distance `depth` in front of it.
     pub fn add_camera(&mut self, camera: &Camera, pose: &Pose, depth: f64, color: [u8; 3]) {
         let (right, bottom) = (camera.width as f64 - 0.5, camera.height as f64 - 0.5);
         let to_world = pose.inverse();
         let corner = |x: f64, y: f64| {
-            // Without the lens: an outline has straight edges.
+            // Without lens distortion: the frustum has straight edges.
             let ray = Point3::new((x - camera.cx) / camera.fx * depth, (y - camera.cy) / camera.fy * depth, depth);
             to_world.transform(&ray)
         };
@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cameras_outline_is_what_it_sees() {
+    fn frustum_corners_project_to_the_image_corners() {
         let camera = Camera::pinhole(200, 100, 100.0, 100.0, 99.5, 49.5);
         let pose = Pose::look_at(Point3::new(1.0, 2.0, 3.0), Point3::new(4.0, 2.0, 3.0), Vector3::y()).unwrap();
         let mut cloud = PointCloud::default();
@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn a_motion_moves_points_and_turns_normals() {
+    fn a_rigid_motion_transforms_points_and_rotates_normals() {
         let quarter = Rotation3::from_axis_angle(&Vector3::z_axis(), std::f64::consts::FRAC_PI_2);
         let mut cloud =
             PointCloud { normals: vec![[1.0, 0.0, 0.0]], ..PointCloud::from_positions(vec![[1.0, 0.0, 2.0]]) };

@@ -23,9 +23,9 @@ impl Pose {
         Self { rotation, translation }
     }
 
-    /// A camera at `eye` (world) that looks at `target`, its image's down direction as near to `down` as can be.
+    /// Makes the pose of a camera at `eye` (world) that looks at `target`, with the image's y axis as near to `down` as possible.
     ///
-    /// `None` where the looking direction is zero or parallel to `down`.
+    /// `None` where the viewing direction is zero or parallel to `down`.
     pub fn look_at(eye: Point3<f64>, target: Point3<f64>, down: Vector3<f64>) -> Option<Self> {
         let z = (target - eye).try_normalize(1e-12)?;
         let x = down.cross(&z).try_normalize(1e-12)?;
@@ -34,24 +34,24 @@ impl Pose {
         Some(Self { rotation, translation: -(rotation * eye.coords) })
     }
 
-    /// World to camera coordinates.
+    /// Transforms world to camera coordinates.
     #[inline]
     pub fn transform(&self, world: &Point3<f64>) -> Point3<f64> {
         self.rotation * world + self.translation
     }
 
-    /// The camera center in the world, `−Rᵀ t`.
+    /// Returns the camera center in the world, `−Rᵀ t`.
     pub fn center(&self) -> Point3<f64> {
         Point3::from(-(self.rotation.inverse() * self.translation))
     }
 
-    /// Camera to world.
+    /// Returns the inverse motion, camera to world.
     pub fn inverse(&self) -> Self {
         let rotation = self.rotation.inverse();
         Self { rotation, translation: -(rotation * self.translation) }
     }
 
-    /// First `first`, then `self`.
+    /// Composes two motions: `first`, then `self`.
     pub fn compose(&self, first: &Self) -> Self {
         Self {
             rotation: self.rotation * first.rotation,
@@ -59,15 +59,15 @@ impl Pose {
         }
     }
 
-    /// The motion from the camera frame of `a` to that of `b`: `x_b = R x_a + t`.
+    /// Returns the relative pose, from the camera frame of `a` to that of `b`: `x_b = R x_a + t`.
     pub fn relative(a: &Self, b: &Self) -> Self {
         b.compose(&a.inverse())
     }
 
-    /// The angle by which the rotation turns, in radians, 0 to π.
+    /// Computes the rotation angle in radians, 0 to π.
     ///
-    /// By the chord: the arc cosine of the trace ([`Rotation3::angle`]) has half of the digits at small angles, and is NaN where rounding
-    /// takes the trace above three.
+    /// From the chordal distance to the identity: the arc cosine of the trace ([`Rotation3::angle`]) loses half of the digits at small
+    /// angles, and is NaN where rounding takes the trace above three.
     pub fn rotation_angle(&self) -> f64 {
         let chord = (self.rotation.matrix() - nalgebra::Matrix3::identity()).norm() / 8f64.sqrt();
         2.0 * chord.min(1.0).asin()
@@ -90,22 +90,22 @@ mod tests {
     const TOLERANCE: f64 = 1e-12;
 
     #[test]
-    fn the_angle_is_that_of_the_rotation_down_to_nothing() {
+    fn the_rotation_angle_is_accurate_down_to_zero() {
         let axis = Vector3::new(2.0, -1.0, 0.5).normalize();
         for angle in [0.0, 1e-12, 1e-9, 1e-3, 1.0, 3.0] {
             let pose = Pose::new(Rotation3::new(axis * angle), Vector3::zeros());
             assert!((pose.rotation_angle() - angle).abs() < TOLERANCE * (1.0 + angle), "{angle}");
         }
         // A trace above three by rounding, and a half turn.
-        let bent = Rotation3::from_matrix_unchecked(nalgebra::Matrix3::identity() * (1.0 + 1e-15));
-        assert!(Pose::new(bent, Vector3::zeros()).rotation_angle() < TOLERANCE);
+        let unorthogonal = Rotation3::from_matrix_unchecked(nalgebra::Matrix3::identity() * (1.0 + 1e-15));
+        assert!(Pose::new(unorthogonal, Vector3::zeros()).rotation_angle() < TOLERANCE);
         let half = Pose::new(Rotation3::new(axis * std::f64::consts::PI), Vector3::zeros());
         // The arc sine at one has half of the digits.
         assert!((half.rotation_angle() - std::f64::consts::PI).abs() < 1e-7);
     }
 
     #[test]
-    fn looking_at_a_point_puts_it_on_the_optical_axis_and_down_is_down() {
+    fn look_at_puts_the_target_on_the_optical_axis_and_down_along_y() {
         let pose = Pose::look_at(Point3::new(1.0, 2.0, 3.0), Point3::new(4.0, 2.0, 7.0), Vector3::y()).unwrap();
         let seen = pose.transform(&Point3::new(4.0, 2.0, 7.0));
         assert!((seen - Point3::new(0.0, 0.0, 5.0)).norm() < TOLERANCE);
@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn no_direction_means_no_pose() {
+    fn look_at_refuses_degenerate_directions() {
         let p = Point3::new(1.0, 1.0, 1.0);
         assert!(Pose::look_at(p, p, Vector3::y()).is_none());
         assert!(Pose::look_at(p, p + Vector3::y(), Vector3::y()).is_none());

@@ -1,17 +1,16 @@
-//! How a job tells its caller where it is, and hears whether to go on.
+//! Progress reports and cancellation of jobs.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// Hears how far a job has come and says whether it goes on.
+/// Receives a job's progress and decides whether it continues.
 ///
-/// Jobs ask some ten times a second or more, from any thread, also in their longest stages: an answer must be cheap. Once it was to
-/// stop, it stays so: the threads of a job ask by themselves.
+/// Jobs report about ten times a second or more, from any thread: `report` must be cheap. Once it has returned [`Cancelled`] it must
+/// keep doing so, since the threads of a job report independently.
 pub trait Progress: Sync {
-    /// `done` of `total` units of `stage` are finished. A stage whose length is unknown has `total` 0.
+    /// Receives that `done` of `total` units of `stage` are finished; `total` is 0 where it is unknown.
     ///
     /// # Errors
-    /// [`Cancelled`] stops the job. It gives the same error back soon after (within 200 ms on a machine that is not busy) and leaves no
-    /// partial result.
+    /// [`Cancelled`] stops the job, which then returns the same error (within 200 ms on an idle machine) and no partial result.
     fn report(&self, stage: &'static str, done: usize, total: usize) -> Result<(), Cancelled>;
 }
 
@@ -22,13 +21,13 @@ pub trait Progress: Sync {
 pub struct Cancelled;
 
 impl Cancelled {
-    /// Whether an error, or what it is from, is that a job was stopped.
+    /// Whether `error` or one in its chain of sources is [`Cancelled`].
     pub fn is_cause_of(error: &(dyn std::error::Error + 'static)) -> bool {
         std::iter::successors(Some(error), |error| error.source()).any(|error| error.is::<Self>())
     }
 }
 
-/// Nobody is watching, and nothing is stopped.
+/// A [`Progress`] that ignores reports and never cancels.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Silent;
 
@@ -38,9 +37,9 @@ impl Progress for Silent {
     }
 }
 
-/// A stage of so many units, counted from any thread.
+/// A stage of `total` units of work, counted from any thread.
 ///
-/// It is itself the [`Progress`] of what is done within a unit: reports from there are answered, and show as this stage.
+/// It is itself a [`Progress`] for nested work: nested reports are forwarded as this stage's own count.
 pub struct Stage<'a> {
     progress: &'a dyn Progress,
     name: &'static str,
@@ -49,7 +48,7 @@ pub struct Stage<'a> {
 }
 
 impl<'a> Stage<'a> {
-    /// Begins a stage: reports that none of its units is done.
+    /// Begins a stage and reports it with no unit done.
     ///
     /// # Errors
     /// [`Cancelled`].
@@ -58,7 +57,7 @@ impl<'a> Stage<'a> {
         Ok(Self { progress, name, done: AtomicUsize::new(0), total })
     }
 
-    /// Reports that so many more units are done.
+    /// Adds `units` finished units and reports the sum.
     ///
     /// # Errors
     /// [`Cancelled`].
@@ -67,7 +66,7 @@ impl<'a> Stage<'a> {
         self.progress.report(self.name, done, self.total)
     }
 
-    /// Asks whether to go on.
+    /// Reports without new units, to check for cancellation.
     ///
     /// # Errors
     /// [`Cancelled`].
@@ -87,19 +86,19 @@ mod tests {
     use super::*;
     use std::sync::Mutex;
 
-    /// Remembers what it was told and stops at a given number of reports.
+    /// Records its reports and cancels at a given number of them.
     struct Until(usize, Mutex<Vec<(&'static str, usize, usize)>>);
 
     impl Progress for Until {
         fn report(&self, stage: &'static str, done: usize, total: usize) -> Result<(), Cancelled> {
-            let mut told = self.1.lock().unwrap();
-            told.push((stage, done, total));
-            if told.len() >= self.0 { Err(Cancelled) } else { Ok(()) }
+            let mut reports = self.1.lock().unwrap();
+            reports.push((stage, done, total));
+            if reports.len() >= self.0 { Err(Cancelled) } else { Ok(()) }
         }
     }
 
     #[test]
-    fn a_stage_counts_its_units_and_answers_what_is_within_them() {
+    fn a_stage_counts_its_units_and_forwards_nested_reports() {
         let progress = Until(5, Mutex::default());
         let stage = Stage::new(&progress, "rows", 10).unwrap();
         stage.add(1).unwrap();
@@ -112,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn that_a_job_was_stopped_is_found_under_other_errors() {
+    fn cancellation_is_found_in_a_chain_of_sources() {
         #[derive(Debug, thiserror::Error)]
         #[error("inner")]
         struct Inner(#[from] Cancelled);

@@ -1,8 +1,8 @@
-//! Quantiles of numbers.
+//! Quantiles and medians.
 
 use std::cmp::Ordering;
 
-/// A number with a total order: `f32` and `f64`, NaN above infinity.
+/// A floating-point number with a total order, positive NaN above infinity.
 pub trait TotalOrder: Copy {
     /// As [`f64::total_cmp`].
     fn total_order(&self, other: &Self) -> Ordering;
@@ -22,18 +22,18 @@ impl TotalOrder for f64 {
     }
 }
 
-/// The quantile of `values` at `share` (clamped to 0 to 1): of the ascending values the one whose index, counted from 0, is `share · (n − 1)` rounded,
-/// halves upwards. One of the values, not a mean of two (NumPy's `nearest`, but for its rounding of halves). `None` of nothing.
+/// Returns the quantile of `values` at `fraction` (clamped to 0 to 1): the order statistic of index `fraction · (n − 1)` (from 0),
+/// rounded with halves up. No interpolation (NumPy's `nearest`, but for its rounding of halves). `None` for no values.
 ///
-/// Reorders the values; linear in their number.
-pub fn quantile<T: TotalOrder>(values: &mut [T], share: f64) -> Option<T> {
+/// Reorders the values; expected linear time.
+pub fn quantile<T: TotalOrder>(values: &mut [T], fraction: f64) -> Option<T> {
     let last = values.len().checked_sub(1)?;
     // NaN becomes 0.
-    let index = ((share.clamp(0.0, 1.0) * last as f64).round() as usize).min(last);
+    let index = ((fraction.clamp(0.0, 1.0) * last as f64).round() as usize).min(last);
     Some(*values.select_nth_unstable_by(index, T::total_order).1)
 }
 
-/// The upper median: [`quantile`] at ½, of an even number of values the upper of the two in the middle.
+/// Returns the upper median ([`quantile`] at ½): of an even number of values the upper of the two middle ones.
 pub fn median<T: TotalOrder>(values: &mut [T]) -> Option<T> {
     quantile(values, 0.5)
 }
@@ -45,12 +45,12 @@ mod tests {
 
     proptest! {
         #[test]
-        fn the_quantile_is_the_value_at_its_rank(values in prop::collection::vec(-1e3f64..1e3, 1..40), share in 0.0f64..=1.0) {
+        fn the_quantile_is_the_value_at_its_rank(values in prop::collection::vec(-1e3f64..1e3, 1..40), fraction in 0.0f64..=1.0) {
             let mut sorted = values.clone();
             sorted.sort_by(f64::total_cmp);
             let n = values.len();
-            let rank = (share * (n - 1) as f64).round() as usize;
-            prop_assert_eq!(quantile(&mut values.clone(), share), Some(sorted[rank]));
+            let rank = (fraction * (n - 1) as f64).round() as usize;
+            prop_assert_eq!(quantile(&mut values.clone(), fraction), Some(sorted[rank]));
             prop_assert_eq!(median(&mut values.clone()), Some(sorted[n / 2]));
             let single: Vec<f32> = values.iter().map(|v| *v as f32).collect();
             prop_assert_eq!(median(&mut single.clone()), Some(sorted[n / 2] as f32));
@@ -58,7 +58,7 @@ mod tests {
     }
 
     #[test]
-    fn odd_inputs_have_an_answer() {
+    fn empty_and_non_finite_inputs() {
         assert_eq!(median::<f64>(&mut []), None);
         assert_eq!(quantile(&mut [1.0, f64::NAN, 0.0], 7.0).map(f64::is_nan), Some(true));
         assert_eq!(quantile(&mut [1.0, 2.0], f64::NAN), Some(1.0));

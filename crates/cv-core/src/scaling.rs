@@ -1,12 +1,12 @@
-//! The half-pixel rule.
+//! Pixel coordinates under image resizing.
 
 use nalgebra::Point2;
 
-/// What becomes of positions when a picture is resized.
+/// Maps pixel coordinates from an image to its resized version.
 ///
-/// The edges of the pictures meet, not the centers of their corner pixels: with pixel centers at integers, a picture of width `w` covers
-/// −½ … w − ½, and so `x` becomes `(x + ½) s − ½`. This type is the one place where that is written; cameras follow it by
-/// [`crate::Camera::scaled`] and [`crate::Camera::resized`].
+/// Image edges are aligned, not the centers of the corner pixels: with pixel centers at integers, an image of width `w` covers
+/// −½ … w − ½, so `x` becomes `(x + ½) s − ½`. This type is the only place of this formula; [`crate::Camera::scaled`] and
+/// [`crate::Camera::resized`] use it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Scaling {
     /// Width of the result over that of the original.
@@ -16,33 +16,33 @@ pub struct Scaling {
 }
 
 impl Scaling {
-    /// By the same factor in both directions.
+    /// Makes a scaling by the same factor in both directions.
     pub const fn uniform(factor: f64) -> Self {
         Self { x: factor, y: factor }
     }
 
-    /// From pictures of one size, width and height, to those of another. Not finite where `from` is empty.
+    /// Makes the scaling from images of size `from` (width, height) to size `to`. Not finite where `from` is empty.
     pub fn between(from: (usize, usize), to: (usize, usize)) -> Self {
         Self { x: to.0 as f64 / from.0 as f64, y: to.1 as f64 / from.1 as f64 }
     }
 
-    /// Back from the result to the original.
+    /// Returns the inverse, from the resized image to the original.
     pub fn inverse(&self) -> Self {
         Self { x: 1.0 / self.x, y: 1.0 / self.y }
     }
 
-    /// What becomes of lengths without a direction: the geometric mean of both factors.
+    /// Returns the factor for lengths without a direction: the geometric mean of both factors.
     pub fn length(&self) -> f64 {
         (self.x * self.y).sqrt()
     }
 
-    /// One coordinate of a position, scaled by `factor`.
+    /// Maps one coordinate by `factor`.
     #[inline(always)]
     pub fn coordinate(v: f64, factor: f64) -> f64 {
         (v + 0.5) * factor - 0.5
     }
 
-    /// Where a position of the original lies in the result.
+    /// Maps a position in the original image to the resized image.
     #[inline(always)]
     pub fn point(&self, p: Point2<f64>) -> Point2<f64> {
         Point2::new(Self::coordinate(p.x, self.x), Self::coordinate(p.y, self.y))
@@ -60,7 +60,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn edges_meet_and_a_pixel_of_half_the_size_lies_between_four() {
+    fn image_edges_are_aligned_and_half_resolution_pixels_are_centered_between_four() {
         let halved = Scaling::between((640, 480), (320, 240));
         assert_eq!(halved, Scaling::uniform(0.5));
         for edge in [-0.5, 639.5] {

@@ -1,29 +1,29 @@
-//! A scene as points, seen by cameras.
+//! Sparse reconstructions.
 
 use crate::{Camera, Point2, Point3, Pose};
 use std::collections::BTreeMap;
 
-/// Cameras, pictures and the scene points they show: what a structure-from-motion job finds, and what COLMAP reads.
+/// A sparse model as structure from motion reconstructs it: cameras, registered images and scene points, as in COLMAP.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct SparseModel {
-    /// Cameras by number.
+    /// Cameras by id.
     pub cameras: BTreeMap<u32, Camera>,
-    /// Pictures by number.
+    /// Images by id.
     pub images: BTreeMap<u32, ModelImage>,
-    /// Points by number.
+    /// Points by id.
     pub points: BTreeMap<u64, ModelPoint>,
 }
 
-/// A registered picture.
+/// A registered image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModelImage {
-    /// File name, relative to the pictures' folder.
+    /// File name, relative to the image folder.
     pub name: String,
-    /// Number of its camera.
+    /// Id of its camera.
     pub camera: u32,
     /// World to camera.
     pub pose: Pose,
-    /// Image points in pixels (centers at integers), and the scene point each belongs to, if any.
+    /// Image points in pixels (centers at integers), and the id of the scene point each observes, if any.
     pub points: Vec<(Point2<f64>, Option<u64>)>,
 }
 
@@ -36,6 +36,6 @@ pub struct ModelPoint {
     pub color: [u8; 3],
     /// Mean reprojection error in pixels; negative or NaN where unknown.
     pub error: f64,
-    /// Where it is seen: number of the picture, index of the point in it.
+    /// Its observations: image id, index of the point in that image.
     pub track: Vec<(u32, u32)>,
 }

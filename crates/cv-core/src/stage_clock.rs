@@ -1,4 +1,4 @@
-//! The time each stage of a job takes.
+//! Timing of the stages of a job.
 
 use std::time::Instant;
 
@@ -12,12 +12,12 @@ pub struct StageClock {
 }
 
 impl StageClock {
-    /// Starts now.
+    /// Starts the clock.
     pub fn new() -> Self {
         Self { last: now(), stages: Vec::new() }
     }
 
-    /// Ends `stage`: it lasted from the last lap (or the start) until now. A name that comes again adds up.
+    /// Ends `stage`, which lasted from the last lap (or the start) until now. Times of repeated names add up.
     pub fn lap(&mut self, stage: &'static str) {
         let now = now();
         let seconds = now.zip(self.last).map_or(0.0, |(now, last)| now.duration_since(last).as_secs_f64());
@@ -25,7 +25,7 @@ impl StageClock {
         self.last = now;
     }
 
-    /// Runs `work` as `stage`. What passed since the last lap belongs to no stage.
+    /// Runs `work` and times it as `stage`. The time since the last lap is not counted.
     pub fn time<T>(&mut self, stage: &'static str, work: impl FnOnce() -> T) -> T {
         self.last = now();
         let result = work();
@@ -33,7 +33,7 @@ impl StageClock {
         result
     }
 
-    /// Adds seconds that were measured elsewhere, such as the stages of a job inside this one.
+    /// Adds seconds measured elsewhere, such as the stages of a nested job.
     pub fn add(&mut self, stage: &'static str, seconds: f64) {
         match self.stages.iter_mut().find(|(name, _)| *name == stage) {
             Some((_, sum)) => *sum += seconds,
@@ -41,17 +41,17 @@ impl StageClock {
         }
     }
 
-    /// The stages so far and their seconds.
+    /// Returns the stages so far and their seconds.
     pub fn stages(&self) -> &[(&'static str, f64)] {
         &self.stages
     }
 
-    /// The stages and their seconds.
+    /// Returns the stages and their seconds.
     pub fn into_stages(self) -> Vec<(&'static str, f64)> {
         self.stages
     }
 
-    /// The seconds of all stages together.
+    /// Returns the sum of all stages in seconds.
     pub fn total(&self) -> f64 {
         self.stages.iter().map(|(_, seconds)| seconds).sum()
     }

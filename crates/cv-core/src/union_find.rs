@@ -1,7 +1,7 @@
 //! Union-find over numbered items (Tarjan & van Leeuwen, "Worst-case analysis of set union algorithms", 1984).
 
-/// Disjoint sets of the items 0, 1, 2, …, with path halving. The root of a set is its smallest item, whatever the order of the unions; a parent is never
-/// above its child. O(log n) amortized per operation, near constant where unions come in the order of a scan.
+/// Disjoint sets of the items 0, 1, 2, …, with path halving. The root of a set is its smallest item, whatever the order of the
+/// unions. O(log n) amortized per operation, near constant where unions come in scan order.
 ///
 /// ```
 /// use cv_core::UnionFind;
@@ -17,7 +17,7 @@ pub struct UnionFind {
 }
 
 impl UnionFind {
-    /// `n` sets of one item each.
+    /// Makes `n` sets of one item each.
     pub fn new(n: usize) -> Self {
         Self { parents: (0..n as u32).collect() }
     }
@@ -34,12 +34,12 @@ impl UnionFind {
         self.parents.is_empty()
     }
 
-    /// Forgets every item and keeps the memory.
+    /// Removes all items and keeps the allocation.
     pub fn clear(&mut self) {
         self.parents.clear();
     }
 
-    /// Adds an item, in a set of its own, and gives its number.
+    /// Adds an item in a set of its own and returns its index.
     #[inline]
     pub fn push(&mut self) -> u32 {
         let item = self.parents.len() as u32;
@@ -47,13 +47,13 @@ impl UnionFind {
         item
     }
 
-    /// Adds the items of `other` and their sets; they are numbered on from the items here.
+    /// Appends the items and sets of `other`; their indices are offset by the number of items here.
     pub fn append(&mut self, other: &Self) {
         let offset = self.parents.len() as u32;
         self.parents.extend(other.parents.iter().map(|parent| parent + offset));
     }
 
-    /// The smallest item of the set of `i`.
+    /// Finds the root (smallest item) of the set of `i`.
     ///
     /// # Panics
     /// Where there is no item `i`.
@@ -68,7 +68,7 @@ impl UnionFind {
         i
     }
 
-    /// Makes one set of those of `a` and `b`. False where they were one already.
+    /// Merges the sets of `a` and `b`. Returns false where they were one set already.
     ///
     /// # Panics
     /// Where there is no item `a` or `b`.
@@ -79,7 +79,7 @@ impl UnionFind {
         a != b
     }
 
-    /// The root of each item: parents come before their children, so one pass reaches it.
+    /// Compresses all paths and returns the root of each item. One pass: a parent's index is never above its child's.
     pub fn flatten(&mut self) -> &[u32] {
         for i in 0..self.parents.len() {
             self.parents[i] = self.parents[self.parents[i] as usize];
@@ -87,7 +87,7 @@ impl UnionFind {
         &self.parents
     }
 
-    /// As [`Self::flatten`], without a copy.
+    /// As [`Self::flatten`], by value.
     pub fn into_roots(mut self) -> Vec<u32> {
         self.flatten();
         self.parents
@@ -101,7 +101,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn sets_are_those_of_relabeling(n in 1usize..30, pairs in prop::collection::vec((0u32..30, 0u32..30), 0..40), cut in 0usize..40) {
+        fn sets_equal_those_of_naive_relabeling(n in 1usize..30, pairs in prop::collection::vec((0u32..30, 0u32..30), 0..40), cut in 0usize..40) {
             // The definition: every item carries the smallest label of its set.
             let mut plain: Vec<u32> = (0..n as u32).collect();
             let mut sets = UnionFind::new(n);

@@ -1,9 +1,9 @@
-//! Borrowed, strided windows into images.
+//! Borrowed, strided views of images.
 
 use crate::size::size_accessors;
 use crate::{Image, Sample};
 
-/// A borrowed window: rows of `width × C` samples, `stride` samples apart.
+/// A borrowed view of an image: rows of `width × C` samples, `stride` samples apart.
 #[derive(Debug, Clone, Copy)]
 pub struct ImageView<'a, T, const C: usize> {
     data: &'a [T],
@@ -17,7 +17,7 @@ impl<'a, T: Sample, const C: usize> ImageView<'a, T, C> {
         Self { data, width, height, stride }
     }
 
-    /// A view over a caller's own buffer, rows `stride` samples apart.
+    /// Makes a view of a buffer whose rows are `stride` samples apart.
     ///
     /// `None` where the buffer is too short for the last row, or `stride < width × C`.
     pub fn from_slice(data: &'a [T], width: usize, height: usize, stride: usize) -> Option<Self> {
@@ -31,7 +31,7 @@ impl<'a, T: Sample, const C: usize> ImageView<'a, T, C> {
 
     size_accessors!();
 
-    /// The samples of row `y`.
+    /// Returns the samples of row `y`.
     ///
     /// # Panics
     /// Where `y` is not below the height.
@@ -41,7 +41,7 @@ impl<'a, T: Sample, const C: usize> ImageView<'a, T, C> {
         &self.data[y * self.stride..y * self.stride + self.width * C]
     }
 
-    /// The pixel at column `x`, row `y`.
+    /// Returns the pixel at column `x`, row `y`.
     ///
     /// # Panics
     /// Outside the view.
@@ -51,13 +51,13 @@ impl<'a, T: Sample, const C: usize> ImageView<'a, T, C> {
         std::array::from_fn(|c| row[x * C + c])
     }
 
-    /// The pixel at column `x`, row `y`, or `None` outside.
+    /// Returns the pixel at column `x`, row `y`, or `None` outside.
     #[inline]
     pub fn get(&self, x: usize, y: usize) -> Option<[T; C]> {
         (x < self.width && y < self.height).then(|| self.at(x, y))
     }
 
-    /// The window with top-left corner `(x, y)`, or `None` where it does not fit.
+    /// Returns the sub-view with top-left corner `(x, y)`, or `None` where it does not fit.
     pub fn crop(&self, x: usize, y: usize, width: usize, height: usize) -> Option<Self> {
         if x.checked_add(width)? > self.width || y.checked_add(height)? > self.height {
             return None;
@@ -66,7 +66,7 @@ impl<'a, T: Sample, const C: usize> ImageView<'a, T, C> {
         Some(Self { data: &self.data[start..], width, height, stride: self.stride })
     }
 
-    /// A dense copy.
+    /// Copies the view to a dense image.
     pub fn to_image(&self) -> Image<T, C> {
         let mut image = Image::new(self.width, self.height, [T::default(); C]);
         for y in 0..self.height {
@@ -76,7 +76,7 @@ impl<'a, T: Sample, const C: usize> ImageView<'a, T, C> {
     }
 }
 
-/// A borrowed window to write to: rows of `width × C` samples, `stride` samples apart.
+/// A mutable view of an image: rows of `width × C` samples, `stride` samples apart.
 #[derive(Debug)]
 pub struct ImageViewMut<'a, T, const C: usize> {
     data: &'a mut [T],
@@ -92,7 +92,7 @@ impl<'a, T: Sample, const C: usize> ImageViewMut<'a, T, C> {
 
     size_accessors!();
 
-    /// The samples of row `y`.
+    /// Returns the samples of row `y`, mutable.
     ///
     /// # Panics
     /// Where `y` is not below the height.
@@ -102,13 +102,13 @@ impl<'a, T: Sample, const C: usize> ImageViewMut<'a, T, C> {
         &mut self.data[y * self.stride..y * self.stride + self.width * C]
     }
 
-    /// All rows from top to bottom.
+    /// Iterates over all rows from top to bottom, mutable.
     pub fn rows_mut(&mut self) -> impl Iterator<Item = &mut [T]> {
         let row = self.width * C;
         self.data.chunks_mut(self.stride.max(1)).take(self.height).map(move |r| &mut r[..row])
     }
 
-    /// The window with top-left corner `(x, y)`, or `None` where it does not fit.
+    /// Returns the sub-view with top-left corner `(x, y)`, or `None` where it does not fit.
     pub fn crop(self, x: usize, y: usize, width: usize, height: usize) -> Option<Self> {
         if x.checked_add(width)? > self.width || y.checked_add(height)? > self.height {
             return None;
@@ -117,7 +117,7 @@ impl<'a, T: Sample, const C: usize> ImageViewMut<'a, T, C> {
         Some(Self { data: &mut self.data[start..], width, height, stride: self.stride })
     }
 
-    /// Reborrows to read.
+    /// Reborrows as a read-only view.
     pub fn as_view(&self) -> ImageView<'_, T, C> {
         ImageView::from_parts(self.data, self.width, self.height, self.stride)
     }
@@ -148,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn writing_through_a_crop_leaves_the_rest() {
+    fn writing_through_a_crop_leaves_other_pixels_unchanged() {
         let mut image = Image::<u8, 1>::new(4, 3, [0]);
         let mut window = image.view_mut().crop(1, 1, 2, 2).unwrap();
         for row in window.rows_mut() {

@@ -299,15 +299,15 @@ impl Problem<'_> {
             let [common, relative] = CENTER_PRIOR.map(|fraction| fraction * half_diagonal);
             adjustment.consider(considered, 0, &[ratio, common, common, relative, relative])?;
         } else {
-            adjustment.hold_parameters(lens, 0, &[0])?;
-            adjustment.hold(considered, 0)?;
+            adjustment.fix_parameters(lens, 0, &[0])?;
+            adjustment.fix(considered, 0)?;
         }
         if is_radial {
             let k = first.distortion.parameters();
             prior[1] = (-k[0], weight(RADIAL_PRIOR[0] / corner2));
             prior[2] = (-k[1], weight(RADIAL_PRIOR[1] / (corner2 * corner2)));
         } else {
-            adjustment.hold_parameters(lens, 0, &[1, 2])?;
+            adjustment.fix_parameters(lens, 0, &[1, 2])?;
         }
         if is_radial || options.focal.is_some() {
             adjustment.add_residuals("prior", LensPrior(prior), [lens], vec![[0]], RobustLoss::Trivial)?;

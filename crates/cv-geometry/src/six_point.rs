@@ -3,7 +3,7 @@
 use crate::fundamental::epipolar_row;
 use crate::null_space_basis::{orthonormalize, reflect_generic};
 use cv_core::{Matrix3, Point2};
-use cv_numeric::{kernel_vector, null_space, real_quadratic_eigenvalues};
+use cv_numeric::{null_space, null_vector_lu, real_quadratic_eigenvalues};
 use nalgebra::DMatrix;
 
 /// Polynomial of degree one in x, y: coefficients of x, y, 1.
@@ -48,7 +48,7 @@ pub fn fundamental_six_point(a: &[Point2<f64>; 6], b: &[Point2<f64>; 6], mut emi
         if !(w > MIN_INVERSE_SQUARED_FOCAL && w < 1.0 / MIN_INVERSE_SQUARED_FOCAL) {
             continue;
         }
-        let Some(v) = kernel_vector(&(&pencil[0] + &pencil[1] * w + &pencil[2] * (w * w))) else { continue };
+        let Some(v) = null_vector_lu(&(&pencil[0] + &pencil[1] * w + &pencil[2] * (w * w))) else { continue };
         let (x, y) = (v[7] / v[9], v[8] / v[9]);
         let f = Matrix3::from_fn(|i, j| {
             let k = 3 * i + j;

@@ -4,7 +4,7 @@ use crate::{Pixel, rows::for_rows};
 use cv_core::{GrayF32, GrayU8, Image, ImageView, RgbF32, RgbU8, Sample, luma_f32, luma_u8};
 use std::{f32::consts::TAU, sync::LazyLock};
 
-/// An image of `f(pixel)`, rows in parallel.
+/// Applies `f` to every pixel, rows in parallel.
 fn convert<T: Sample, const C: usize, U: Sample, const D: usize>(
     view: ImageView<'_, T, C>,
     f: impl Fn([T; C]) -> [U; D] + Sync,
@@ -20,49 +20,49 @@ fn convert<T: Sample, const C: usize, U: Sample, const D: usize>(
     out
 }
 
-/// Rec. 601 luma ([`luma_u8`]): the bytes of OpenCV's `cvtColor`, `RGB2GRAY`.
+/// Converts RGB to gray by Rec. 601 luma ([`luma_u8`]), with the same results as OpenCV's `cvtColor`, `RGB2GRAY`.
 pub fn rgb_to_gray(view: ImageView<'_, u8, 3>) -> GrayU8 {
     convert(view, |rgb| [luma_u8(rgb)])
 }
 
-/// Three equal channels.
+/// Converts gray to RGB with three equal channels.
 pub fn gray_to_rgb<T: Sample>(view: ImageView<'_, T, 1>) -> Image<T, 3> {
     convert(view, |[v]| [v; 3])
 }
 
-/// Rec. 601 luma of RGB bytes as 0 to 1 ([`luma_f32`]), without rounding to bytes.
+/// Converts 8-bit RGB to gray levels 0 to 1 by Rec. 601 luma ([`luma_f32`]), without rounding to 8 bits.
 pub fn rgb_to_gray_f32(view: ImageView<'_, u8, 3>) -> GrayF32 {
     convert(view, |rgb| [luma_f32(rgb.map(f32::from)) * (1.0 / 255.0)])
 }
 
-/// Bytes to 0 to 1.
+/// Converts 8-bit gray levels to 0 to 1.
 pub fn gray_to_f32(view: ImageView<'_, u8, 1>) -> GrayF32 {
     u8_to_f32(view)
 }
 
-/// Bytes to 0 to 1; the values stay sRGB encoded.
+/// Converts 8-bit RGB to 0 to 1; the values stay sRGB encoded.
 pub fn rgb_to_f32(view: ImageView<'_, u8, 3>) -> RgbF32 {
     u8_to_f32(view)
 }
 
-/// Bytes to 0 to 1, any number of channels.
+/// Converts 8-bit samples to 0 to 1, for any number of channels.
 pub fn u8_to_f32<const C: usize>(view: ImageView<'_, u8, C>) -> Image<f32, C> {
     convert(view, |p| p.map(|v| f32::from(v) * (1.0 / 255.0)))
 }
 
-/// 0 to 1 to bytes, rounded to the nearest; values outside saturate, NaN becomes 0.
+/// Converts samples 0 to 1 to 8 bits, rounded to nearest; values outside saturate, NaN becomes 0.
 pub fn f32_to_u8<const C: usize>(view: ImageView<'_, f32, C>) -> Image<u8, C> {
     convert(view, |p| p.map(|v| u8::from_f32(v * 255.0)))
 }
 
-/// RGB bytes to hue in radians `[0, 2π)`, saturation and value 0 to 1 (Smith, SIGGRAPH 1978).
+/// Converts 8-bit RGB to hue in radians `[0, 2π)`, saturation and value 0 to 1 (Smith, SIGGRAPH 1978).
 ///
-/// Gray pixels have no hue and get 0; black ones have saturation 0.
+/// The undefined hue of gray pixels is 0, as is the saturation of black ones.
 pub fn rgb_to_hsv(view: ImageView<'_, u8, 3>) -> Image<f32, 3> {
     convert(view, rgb_pixel_to_hsv)
 }
 
-/// One pixel of [`rgb_to_hsv`].
+/// Converts one pixel as [`rgb_to_hsv`].
 #[inline]
 pub fn rgb_pixel_to_hsv(rgb: [u8; 3]) -> [f32; 3] {
     let [r, g, b] = rgb.map(i32::from);
@@ -83,7 +83,7 @@ pub fn rgb_pixel_to_hsv(rgb: [u8; 3]) -> [f32; 3] {
     [hue, range as f32 / max as f32, max as f32 / 255.0]
 }
 
-/// Hue in radians (any turn), saturation and value 0 to 1, to RGB bytes.
+/// Converts hue in radians (modulo 2π), saturation and value 0 to 1, to 8-bit RGB.
 pub fn hsv_to_rgb(view: ImageView<'_, f32, 3>) -> RgbU8 {
     convert(view, |[h, s, v]| {
         // f(n) = V − V S max(0, min(k, 4 − k, 1)), k = (n + H/60°) mod 6.
@@ -94,32 +94,32 @@ pub fn hsv_to_rgb(view: ImageView<'_, f32, 3>) -> RgbU8 {
     })
 }
 
-/// sRGB byte to linear light 0 to 1 (IEC 61966-2-1).
-static LINEAR: LazyLock<[f32; 256]> = LazyLock::new(|| {
+/// Table of linear intensities, 0 to 1, of 8-bit sRGB values (IEC 61966-2-1).
+static LINEAR_OF_SRGB: LazyLock<[f32; 256]> = LazyLock::new(|| {
     std::array::from_fn(|i| {
         let v = i as f64 / 255.0;
         (if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }) as f32
     })
 });
 
-/// A value of sRGB, 0 to 1, to linear light (IEC 61966-2-1).
+/// Decodes an sRGB value, 0 to 1, to linear intensity (IEC 61966-2-1).
 pub fn decode_srgb(v: f32) -> f32 {
     if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
 }
 
-/// sRGB bytes to linear light, 0 to 1 (IEC 61966-2-1).
+/// Decodes 8-bit sRGB to linear intensity, 0 to 1 (IEC 61966-2-1).
 pub fn srgb_to_linear<const C: usize>(view: ImageView<'_, u8, C>) -> Image<f32, C> {
-    let table = &*LINEAR;
+    let table = &*LINEAR_OF_SRGB;
     convert(view, |p| p.map(|v| table[usize::from(v)]))
 }
 
-/// Linear light to sRGB bytes (IEC 61966-2-1); values outside 0 to 1 saturate, NaN becomes 0.
+/// Encodes linear intensity as 8-bit sRGB (IEC 61966-2-1); values outside 0 to 1 saturate, NaN becomes 0.
 pub fn linear_to_srgb<const C: usize>(view: ImageView<'_, f32, C>) -> Image<u8, C> {
     let encode = |v: f32| if v <= 0.003_130_8 { 12.92 * v } else { 1.055 * v.powf(1.0 / 2.4) - 0.055 };
     convert(view, |p| p.map(|v| u8::from_f32(255.0 * encode(v))))
 }
 
-/// Cube root of a number in about 1e-3 to 1: a bit-level guess and two steps of Halley's method.
+/// Computes the cube root of a number in about 1e-3 to 1 by two steps of Halley's method from a bit-level guess.
 #[inline(always)]
 fn cube_root(v: f32) -> f32 {
     let mut y = f32::from_bits(v.to_bits() / 3 + 0x2a51_4067);
@@ -130,19 +130,20 @@ fn cube_root(v: f32) -> f32 {
     y
 }
 
-/// sRGB bytes to CIE 1976 L*a*b* with the D65 white point: L 0 to 100, a and b about −110 to 110.
+/// Converts 8-bit sRGB to CIE 1976 L*a*b* with the D65 white point: L 0 to 100, a and b about −110 to 110.
 pub fn rgb_to_lab(view: ImageView<'_, u8, 3>) -> Image<f32, 3> {
-    let table = &*LINEAR;
+    let table = &*LINEAR_OF_SRGB;
     convert(view, |rgb| linear_rgb_to_lab(rgb.map(|v| table[usize::from(v)])))
 }
 
-/// One pixel of [`rgb_to_lab`].
+/// Converts one pixel as [`rgb_to_lab`].
 #[inline]
 pub fn rgb_pixel_to_lab(rgb: [u8; 3]) -> [f32; 3] {
-    linear_rgb_to_lab(rgb.map(|v| LINEAR[usize::from(v)]))
+    linear_rgb_to_lab(rgb.map(|v| LINEAR_OF_SRGB[usize::from(v)]))
 }
 
-/// Linear sRGB light, 0 to 1, to L*a*b*: what [`rgb_to_lab`] does after [`srgb_to_linear`]. Without branches, so that loops over it vectorize.
+/// Converts linear RGB with sRGB primaries, 0 to 1, to L*a*b*, as [`rgb_to_lab`] after [`srgb_to_linear`]. Branchless, so that loops over
+/// it vectorize.
 #[inline(always)]
 pub fn linear_rgb_to_lab([r, g, b]: [f32; 3]) -> [f32; 3] {
     // Linear sRGB to XYZ over the white point (0.950456, 1, 1.088754): each row sums to one, so that grays have a = b = 0.
@@ -167,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn hues_of_the_six_corners() {
+    fn hues_of_the_primary_and_secondary_colors() {
         let corners = [[255, 0, 0], [255, 255, 0], [0, 255, 0], [0, 255, 255], [0, 0, 255], [255, 0, 255]];
         for (i, rgb) in corners.into_iter().enumerate() {
             let [h, s, v] = rgb_to_hsv(one(rgb).view()).at(0, 0);
@@ -179,8 +180,8 @@ mod tests {
     }
 
     #[test]
-    fn lab_of_colors_others_have_tabulated() {
-        // Values of the CIE formulas for sRGB, D65, as color calculators give them to two digits; matrices with four or six digits differ by 0.02.
+    fn lab_of_tabulated_colors() {
+        // CIE formulas for sRGB, D65, from color calculators to two digits; matrices with four or six digits differ by 0.02.
         for (rgb, expected) in [
             ([255, 255, 255], [100.0, 0.0, 0.0]),
             ([0, 0, 0], [0.0, 0.0, 0.0]),
@@ -196,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn the_cube_root_is_one() {
+    fn the_cube_root_is_accurate_to_f32_rounding() {
         for i in 8..=1000 {
             let v = i as f32 / 1000.0;
             // Halley converges cubically: the second step reaches the rounding of f32.
@@ -206,19 +207,19 @@ mod tests {
 
     proptest! {
         #[test]
-        fn conversions_can_be_undone(rgb in any::<[u8; 3]>()) {
+        fn conversions_round_trip(rgb in any::<[u8; 3]>()) {
             let image = one(rgb);
             prop_assert_eq!(f32_to_u8(rgb_to_f32(image.view()).view()), image.clone());
             prop_assert_eq!(hsv_to_rgb(rgb_to_hsv(image.view()).view()), image.clone());
             prop_assert_eq!(linear_to_srgb(srgb_to_linear(image.view()).view()), image.clone());
-            // The byte is the real value rounded: half a step, 1/510.
+            // The 8-bit value is the exact one rounded: half a level, 1/510.
             let gray = rgb_to_gray(image.view()).at(0, 0)[0];
             prop_assert!((f32::from(gray) / 255.0 - rgb_to_gray_f32(image.view()).at(0, 0)[0]).abs() < 0.5 / 255.0 + 1e-4);
         }
     }
 
     #[test]
-    fn nonsense_becomes_a_byte_all_the_same() {
+    fn non_finite_values_saturate_or_become_zero() {
         let image = RgbF32::new(1, 1, [f32::NAN, f32::INFINITY, -3.0]);
         assert_eq!(f32_to_u8(image.view()).at(0, 0), [0, 255, 0]);
         assert_eq!(linear_to_srgb(image.view()).at(0, 0), [0, 255, 0]);

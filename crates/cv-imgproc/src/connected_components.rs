@@ -1,23 +1,23 @@
-//! Connected components of a mask.
+//! Connected-component labeling of binary masks.
 
 use cv_core::{Image, ImageView, Mask, Point2, UnionFind};
 
-/// Which pixels touch.
+/// Pixel connectivity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Connectivity {
-    /// Across sides.
+    /// Pixels that share a side.
     Four,
-    /// Across sides and corners.
+    /// Pixels that share a side or a corner.
     #[default]
     Eight,
 }
 
-/// What is known about one component.
+/// Statistics of one component.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ComponentStats {
-    /// Pixels.
+    /// Number of pixels.
     pub area: usize,
     /// Leftmost column.
     pub left: usize,
@@ -34,9 +34,9 @@ pub struct ComponentStats {
 /// The connected components of a mask.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Components {
-    /// 0 where the mask is false, else the number of the component, from 1 in the order in which a scan meets their first pixels.
+    /// 0 where the mask is false, else the label of the component, from 1 in scan order of their first pixels.
     pub labels: Image<u32, 1>,
-    /// What is known about component `i + 1`.
+    /// Statistics of the component with label `i + 1`.
     pub stats: Vec<ComponentStats>,
 }
 
@@ -49,17 +49,17 @@ struct Run {
 
 /// Labels the connected components of a mask.
 ///
-/// Rows are cut into runs, and runs that touch between rows are joined by union-find (the first run of a component is its root), so the time is one pass over
-/// the pixels and the labels do not depend on anything but the mask.
+/// Run-based labeling in one pass over the pixels: runs of adjacent rows that touch are merged by union-find (the first run of a
+/// component is its root).
 pub fn connected_components(view: ImageView<'_, bool, 1>, connectivity: Connectivity) -> Components {
-    let (runs, roots) = joined_runs(view, connectivity);
+    let (runs, roots) = label_runs(view, connectivity);
     let mut labels = Image::<u32, 1>::new(view.width(), view.height(), [0]);
     let mut stats: Vec<ComponentStats> = Vec::new();
-    // Roots precede their runs, so a component's number is known when its runs come.
+    // Roots precede their runs, so the label of a component is known at each of its runs.
     let mut number = vec![0u32; runs.len()];
     for (i, run) in runs.iter().enumerate() {
         if roots[i] as usize == i {
-            let blank = ComponentStats {
+            let empty = ComponentStats {
                 area: 0,
                 left: run.start,
                 top: run.y,
@@ -67,7 +67,7 @@ pub fn connected_components(view: ImageView<'_, bool, 1>, connectivity: Connecti
                 height: 0,
                 centroid: Point2::origin(),
             };
-            stats.push(blank);
+            stats.push(empty);
             number[i] = stats.len() as u32;
         } else {
             number[i] = number[roots[i] as usize];
@@ -76,7 +76,7 @@ pub fn connected_components(view: ImageView<'_, bool, 1>, connectivity: Connecti
         let s = &mut stats[number[i] as usize - 1];
         let length = run.end - run.start;
         s.area += length;
-        // Until the end, width and height hold the right and lower limits, the centroid sums.
+        // During accumulation, width and height are the right and lower limits, the centroid is a sum.
         s.left = s.left.min(run.start);
         s.width = s.width.max(run.end);
         s.height = run.y + 1;
@@ -91,12 +91,12 @@ pub fn connected_components(view: ImageView<'_, bool, 1>, connectivity: Connecti
     Components { labels, stats }
 }
 
-/// The runs of a mask in scan order, and for each the index of the first run of its component.
-fn joined_runs(view: ImageView<'_, bool, 1>, connectivity: Connectivity) -> (Vec<Run>, Vec<u32>) {
+/// Extracts the runs of a mask in scan order, and for each the index of the first run of its component.
+fn label_runs(view: ImageView<'_, bool, 1>, connectivity: Connectivity) -> (Vec<Run>, Vec<u32>) {
     let mut runs: Vec<Run> = Vec::new();
     let mut sets = UnionFind::default();
-    // Runs a and b of neighboring rows touch where a.start < b.end + reach and b.start < a.end + reach.
-    let reach = usize::from(connectivity == Connectivity::Eight);
+    // Runs a and b of adjacent rows touch where a.start < b.end + overlap and b.start < a.end + overlap.
+    let overlap = usize::from(connectivity == Connectivity::Eight);
     let mut above = 0..0;
     for y in 0..view.height() {
         let first = runs.len();
@@ -107,16 +107,16 @@ fn joined_runs(view: ImageView<'_, bool, 1>, connectivity: Connectivity) -> (Vec
             let start = x + skip;
             let end = row[start..].iter().position(|&p| !p).map_or(row.len(), |n| start + n);
             runs.push(Run { y, start, end });
-            let me = sets.push();
-            while candidate < above.end && runs[candidate].end + reach <= start {
+            let current = sets.push();
+            while candidate < above.end && runs[candidate].end + overlap <= start {
                 candidate += 1;
             }
             let mut touching = candidate;
-            while touching < above.end && runs[touching].start < end + reach {
-                sets.union(touching as u32, me);
+            while touching < above.end && runs[touching].start < end + overlap {
+                sets.union(touching as u32, current);
                 touching += 1;
             }
-            // The last one above may reach over the gap to the next run.
+            // The last touching run above may also touch the next run of this row.
             candidate = touching.saturating_sub(1).max(candidate);
             x = end;
         }
@@ -125,48 +125,48 @@ fn joined_runs(view: ImageView<'_, bool, 1>, connectivity: Connectivity) -> (Vec
     (runs, sets.into_roots())
 }
 
-/// Only the largest component of a mask (of equally large ones the first); false everywhere where there is none.
+/// Returns the mask of the largest component (the first of equally large ones); all false where there is none.
 pub fn largest_component(view: ImageView<'_, bool, 1>, connectivity: Connectivity) -> Mask {
     let largest = |areas: &[usize]| areas.iter().copied().max().unwrap_or(0);
-    let mut taken = false;
+    let mut found = false;
     keep_components(view, connectivity, |area, areas| {
-        let take = !taken && area == largest(areas);
-        taken |= take;
-        take
+        let is_first_largest = !found && area == largest(areas);
+        found |= is_first_largest;
+        is_first_largest
     })
 }
 
-/// Without the components of fewer than `smallest` pixels.
-pub fn remove_small_components(view: ImageView<'_, bool, 1>, connectivity: Connectivity, smallest: usize) -> Mask {
-    keep_components(view, connectivity, |area, _| area >= smallest)
+/// Removes the components of fewer than `min_area` pixels.
+pub fn remove_small_components(view: ImageView<'_, bool, 1>, connectivity: Connectivity, min_area: usize) -> Mask {
+    keep_components(view, connectivity, |area, _| area >= min_area)
 }
 
-/// With the holes filled: false regions (joined across sides only where the mask is joined across corners, and the reverse) that do not touch
-/// the border and have at most `largest` pixels.
-pub fn fill_holes(view: ImageView<'_, bool, 1>, connectivity: Connectivity, largest: usize) -> Mask {
+/// Fills holes: background components that do not touch the border and have at most `max_area` pixels. The background has the complementary
+/// connectivity, four for an eight-connected mask and vice versa.
+pub fn fill_holes(view: ImageView<'_, bool, 1>, connectivity: Connectivity, max_area: usize) -> Mask {
     let (w, h) = view.size();
     let mut inverted = view.to_image();
     inverted.as_mut_slice().iter_mut().for_each(|p| *p = !*p);
-    let other = match connectivity {
+    let complementary = match connectivity {
         Connectivity::Four => Connectivity::Eight,
         Connectivity::Eight => Connectivity::Four,
     };
-    let background = connected_components(inverted.view(), other);
-    let hole: Vec<bool> = background
+    let background = connected_components(inverted.view(), complementary);
+    let is_hole: Vec<bool> = background
         .stats
         .iter()
-        .map(|s| s.area <= largest && s.left > 0 && s.top > 0 && s.left + s.width < w && s.top + s.height < h)
+        .map(|s| s.area <= max_area && s.left > 0 && s.top > 0 && s.left + s.width < w && s.top + s.height < h)
         .collect();
-    background.labels.map(|[label]| [label == 0 || hole[label as usize - 1]])
+    background.labels.map(|[label]| [label == 0 || is_hole[label as usize - 1]])
 }
 
-/// The components for which `keep(area, all areas)` says so, asked in the order of their numbers.
+/// Returns the mask of the components for which `keep(area, all areas)` is true, called in the order of their labels.
 fn keep_components(
     view: ImageView<'_, bool, 1>,
     connectivity: Connectivity,
     mut keep: impl FnMut(usize, &[usize]) -> bool,
 ) -> Mask {
-    let (runs, roots) = joined_runs(view, connectivity);
+    let (runs, roots) = label_runs(view, connectivity);
     let mut area = vec![0usize; runs.len()];
     for (run, &root) in runs.iter().zip(&roots) {
         area[root as usize] += run.end - run.start;
@@ -197,8 +197,8 @@ mod tests {
         })
     }
 
-    /// The definition: flood each component from the first pixel a scan meets.
-    fn plain(mask: &Mask, connectivity: Connectivity) -> (Image<u32, 1>, u32) {
+    /// Reference implementation: flood fill from the first pixel of each component in scan order.
+    fn reference(mask: &Mask, connectivity: Connectivity) -> (Image<u32, 1>, u32) {
         let (w, h) = (mask.width() as isize, mask.height() as isize);
         let mut labels = Image::<u32, 1>::new(mask.width(), mask.height(), [0]);
         let mut count = 0;
@@ -238,11 +238,11 @@ mod tests {
 
     proptest! {
         #[test]
-        fn labels_are_those_of_flooding(w in 1usize..40, h in 1usize..30, seed in any::<u32>(), density in 1u32..99, eight in any::<bool>()) {
+        fn labels_equal_those_of_flood_fill(w in 1usize..40, h in 1usize..30, seed in any::<u32>(), density in 1u32..99, eight in any::<bool>()) {
             let connectivity = if eight { Connectivity::Eight } else { Connectivity::Four };
             let mask = noise(w, h, seed, density);
             let found = connected_components(mask.view(), connectivity);
-            let (labels, count) = plain(&mask, connectivity);
+            let (labels, count) = reference(&mask, connectivity);
             prop_assert_eq!(&found.labels, &labels);
             prop_assert_eq!(found.stats.len(), count as usize);
             for (i, s) in found.stats.iter().enumerate() {
@@ -268,7 +268,7 @@ mod tests {
     }
 
     #[test]
-    fn holes_are_filled_and_bays_are_not() {
+    fn enclosed_holes_are_filled_and_open_bays_are_not() {
         let picture = ["#####.", "#..#..", "#.##..", "#####.", "....#.", "##..##"];
         let mask = Mask::from_fn(6, 6, |x, y| [picture[y].as_bytes()[x] == b'#']);
         let filled = fill_holes(mask.view(), Connectivity::Eight, usize::MAX);
@@ -282,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_has_no_components() {
+    fn empty_masks_have_no_components() {
         for mask in
             [Mask::new(0, 0, [true]), Mask::new(0, 3, [true]), Mask::new(3, 0, [true]), Mask::new(4, 4, [false])]
         {

@@ -1,28 +1,27 @@
-//! Separable filters: Gaussian smoothing and first derivatives.
+//! Separable filters: Gaussian blur and Sobel derivatives.
 
 use crate::mirror::{mirror_ends, mirror_index};
 use crate::rows::for_rows_with;
 use crate::simd;
 use cv_core::{GrayF32, Image, ImageView};
 
-/// Smooths with a Gaussian of standard deviation `sigma` pixels; the border is mirrored about the end samples.
+/// Blurs with a Gaussian of `sigma` pixels; border mode reflect-101 ([`mirror_index`]).
 ///
-/// The kernel is the sampled Gaussian, cut off where OpenCV's `GaussianBlur` cuts it for float images (four standard deviations: an
-/// odd width of about `8σ + 1`) and made to sum to one. `sigma` of zero or less (or NaN) returns a copy. A NaN pixel spreads over the kernel's
-/// support. Time is proportional to pixels times `sigma`.
+/// The kernel is the sampled Gaussian, truncated as in OpenCV's `GaussianBlur` for float images (at 4σ: an odd width of about `8σ + 1`)
+/// and normalized to sum one. A `sigma` of zero or less (or NaN) returns a copy. A NaN pixel spreads over the kernel's
+/// support. O(pixels · sigma).
 pub fn gaussian_blur<const C: usize>(view: ImageView<'_, f32, C>, sigma: f32) -> Image<f32, C> {
-    // A sigma beyond the image is the same as one a few times its size: the mirrored image is periodic and the mean is reached.
-    let largest = 4.0 * view.width().max(view.height()).max(1) as f32;
+    // The mirrored image is periodic, so that a few times its size all larger sigmas give its mean.
+    let max_sigma = 4.0 * view.width().max(view.height()).max(1) as f32;
     if sigma > 0.0 && !view.is_empty() {
-        separable_symmetric(view, &gaussian_half_kernel(sigma.min(largest)))
+        separable_symmetric(view, &gaussian_half_kernel(sigma.min(max_sigma)))
     } else {
         view.to_image()
     }
 }
 
-/// The sampled Gaussian from its center outwards, as [`gaussian_blur`] uses it; the whole kernel sums to one.
-///
-/// `sigma` must be positive; others give the kernel `[1]`.
+/// Computes the half kernel of [`gaussian_blur`]: the sampled Gaussian from its center outwards, normalized so that the whole kernel sums to
+/// one. A `sigma` that is not positive gives `[1]`.
 pub fn gaussian_half_kernel(sigma: f32) -> Vec<f32> {
     if sigma.is_nan() || sigma <= 0.0 {
         return vec![1.0];
@@ -34,9 +33,10 @@ pub fn gaussian_half_kernel(sigma: f32) -> Vec<f32> {
     (0..=radius).map(|i| (weight(i) / sum) as f32).collect()
 }
 
-/// Convolves rows and columns with the symmetric kernel whose center is `half[0]` and whose arms are `half[1..]`, borders mirrored.
+/// Convolves rows and columns with the symmetric kernel given by its half, center `half[0]` first; border mode reflect-101.
 ///
-/// An empty kernel returns a copy. Each output row gathers its source rows into one buffer, then runs along it, so no intermediate image is stored.
+/// An empty kernel returns a copy. Each output row is filtered vertically into a row buffer and then along it, so that no intermediate image
+/// is stored.
 pub fn separable_symmetric<const C: usize>(view: ImageView<'_, f32, C>, half: &[f32]) -> Image<f32, C> {
     let (w, h) = view.size();
     if half.is_empty() || view.is_empty() {
@@ -49,15 +49,15 @@ pub fn separable_symmetric<const C: usize>(view: ImageView<'_, f32, C>, half: &[
     for_rows_with(&mut out, buffers, |(padded, sources), y, row| {
         sources.clear();
         sources.extend((0..=2 * r).map(|i| view.row(mirror_index((y + i) as isize - r as isize, h))));
-        simd::vertical(level, &mut padded[r * C..(r + w) * C], sources, half);
+        simd::filter_columns(level, &mut padded[r * C..(r + w) * C], sources, half);
         mirror_ends::<C>(padded, r, r);
-        simd::horizontal(level, row, padded, half, C);
+        simd::filter_rows(level, row, padded, half, C);
     });
     out
 }
 
-/// The derivatives by x and by y of Sobel's 3×3 operator, `[1 2 1]` across and `[−1 0 1]` along, not normalized (as OpenCV's `Sobel`): a ramp
-/// of slope 1 gives 8. The border is mirrored about the end samples.
+/// Computes the Sobel derivatives by x and by y (3×3: smoothing `[1 2 1]`, derivative `[−1 0 1]`), not normalized, as OpenCV's `Sobel`: a
+/// ramp of slope 1 gives 8. Border mode reflect-101.
 pub fn sobel(view: ImageView<'_, f32, 1>) -> (GrayF32, GrayF32) {
     let (w, h) = view.size();
     let mut dx = GrayF32::new(w, h, [0.0]);
@@ -79,8 +79,8 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// The definition: every pixel the weighted sum of its mirrored neighbors, in f64.
-    fn plain(view: ImageView<'_, f32, 2>, half: &[f32]) -> Image<f32, 2> {
+    /// Reference implementation: direct 2D convolution in f64.
+    fn reference(view: ImageView<'_, f32, 2>, half: &[f32]) -> Image<f32, 2> {
         let r = half.len() as isize - 1;
         let (w, h) = view.size();
         Image::from_fn(w, h, |x, y| {
@@ -109,10 +109,10 @@ mod tests {
 
     proptest! {
         #[test]
-        fn the_blur_is_its_definition(w in 1usize..40, h in 1usize..12, sigma in 0.2f32..2.0, seed in any::<u32>()) {
+        fn the_blur_equals_direct_convolution(w in 1usize..40, h in 1usize..12, sigma in 0.2f32..2.0, seed in any::<u32>()) {
             let image = noise::<2>(w, h, seed);
             let fast = gaussian_blur(image.view(), sigma);
-            let slow = plain(image.view(), &gaussian_half_kernel(sigma));
+            let slow = reference(image.view(), &gaussian_half_kernel(sigma));
             for (a, b) in fast.as_slice().iter().zip(slow.as_slice()) {
                 // Sums of up to 2·17 terms of at most 1: 34 roundings of 6e-8.
                 prop_assert!((a - b).abs() < 2e-6, "{} {}", a, b);
@@ -120,7 +120,7 @@ mod tests {
         }
 
         #[test]
-        fn sobel_is_its_definition(w in 1usize..40, h in 1usize..8, seed in any::<u32>()) {
+        fn sobel_equals_direct_convolution(w in 1usize..40, h in 1usize..8, seed in any::<u32>()) {
             let image = noise::<1>(w, h, seed);
             let (dx, dy) = sobel(image.view());
             for y in 0..h {
@@ -136,27 +136,27 @@ mod tests {
     }
 
     #[test]
-    fn a_kernel_larger_than_the_image_still_averages() {
+    fn a_kernel_larger_than_the_image_averages_it() {
         let image = noise::<1>(3, 2, 5);
         let mean = image.as_slice().iter().sum::<f32>() / 6.0;
         let smooth = gaussian_blur(image.view(), 1e9);
-        // Mirrored about the end samples, inner ones count double: 3×2 mirrors to weights (1 2 1)/4 across and (1 1)/2 down.
+        // Under reflect-101, inner samples count twice: 3×2 has the weights (1 2 1)/4 along x and (1 1)/2 along y.
         let weighted: f32 =
             (0..2).map(|y| [0.25, 0.5, 0.25].iter().zip(image.row(y)).map(|(k, v)| k * v).sum::<f32>() / 2.0).sum();
         assert!(smooth.as_slice().iter().all(|v| (v - weighted).abs() < 1e-4), "{smooth:?} {mean} {weighted}");
     }
 
     #[test]
-    fn nothing_and_nonsense_pass_through() {
+    fn empty_images_and_invalid_sigmas_return_a_copy() {
         assert!(gaussian_blur(GrayF32::new(0, 3, [0.0]).view(), 1.0).is_empty());
         let image = noise::<1>(4, 4, 9);
         for sigma in [0.0, -1.0, f32::NAN] {
             assert_eq!(gaussian_blur(image.view(), sigma), image);
         }
         assert_eq!(gaussian_half_kernel(f32::NAN), [1.0]);
-        let mut holed = noise::<1>(64, 64, 9);
-        holed.set(2, 2, [f32::NAN]);
-        let smooth = gaussian_blur(holed.view(), 1.0);
+        let mut with_nan = noise::<1>(64, 64, 9);
+        with_nan.set(2, 2, [f32::NAN]);
+        let smooth = gaussian_blur(with_nan.view(), 1.0);
         assert!(smooth.at(2, 2)[0].is_nan() && smooth.at(2, 20)[0].is_finite());
     }
 }

@@ -1,8 +1,8 @@
-//! Minimum cuts of four-connected pixels (Boykov & Kolmogorov 2004).
+//! Minimum cuts of four-connected pixel graphs (Boykov & Kolmogorov 2004).
 
 use cv_core::{Cancelled, Stage};
 
-/// Steps to the neighbors: right, left, down, up. Opposite directions differ in the last bit.
+/// Directions of the arcs: right, left, down, up. Opposite directions differ in the last bit.
 const RIGHT: usize = 0;
 const DOWN: usize = 2;
 
@@ -10,37 +10,38 @@ const FREE: u8 = 0;
 const SOURCE: u8 = 1;
 const SINK: u8 = 2;
 
-/// `parent` of a root: its terminal.
+/// `parent` of a node connected to its terminal.
 const TERMINAL: u8 = 4;
-/// `parent` of a node that lost its way to a terminal.
+/// `parent` of an orphan or of a free node.
 const ORPHAN: u8 = 5;
 
-/// All of a node beside each other: a step to a neighbor touches one cache line.
+/// A node with its arcs, stored together: visiting a neighbor touches one cache line.
 #[derive(Debug, Clone, Copy)]
 struct Node {
     /// Residual capacity of the four outgoing arcs.
     capacity: [i32; 4],
-    /// The nodes they lead to; where there is none, one without capacities that is in no tree.
+    /// Heads of the arcs; where there is no neighbor, a dummy node without capacities.
     neighbor: [u32; 4],
     /// Residual capacity from the source (positive) or to the sink (negative).
     terminal: i32,
-    time: u32,
+    timestamp: u32,
     distance: u32,
     tree: u8,
     parent: u8,
     is_active: bool,
-    is_settled: bool,
+    is_dominated: bool,
 }
 
-/// A graph of pixels with edges between four-neighbors and to two terminals, of which [`Self::solve`] finds a minimum cut (Boykov & Kolmogorov, "An experimental
-/// comparison of min-cut/max-flow algorithms for energy minimization in vision", PAMI 2004). Only the pixels that are named have nodes, so that a narrow band costs what
-/// it has, however it winds. Of n nodes: O(n²) augmentations at the worst; on pictures about linear.
+/// A pixel graph with edges between four-neighbors and to the source and sink terminals; [`Self::solve`] computes its minimum cut (Boykov &
+/// Kolmogorov, "An experimental comparison of min-cut/max-flow algorithms for energy minimization in vision", PAMI 2004). Only the listed
+/// pixels have nodes, so that the cost is that of a narrow band, not of its bounding box. O(n²) augmentations of n nodes in the worst case;
+/// nearly linear on images.
 ///
 /// ```
 /// use cv_core::{Silent, Stage};
 /// use cv_imgproc::GridCut;
 ///
-/// // Three pixels in a row: the first wants the source's side, the last the sink's, and the edge between the first two is the dearer one.
+/// // Three pixels in a row: the first prefers the source side, the last the sink side, and the first edge costs more than the second.
 /// let stage = Stage::new(&Silent, "cut", 1)?;
 /// let mut cut = GridCut::default();
 /// cut.set_rectangle(3, 1);
@@ -49,12 +50,12 @@ struct Node {
 /// cut.add_right(0, 4, 4);
 /// cut.add_right(1, 3, 3);
 /// cut.solve(&stage)?;
-/// assert_eq!([0, 1, 2].map(|pixel| cut.on_sink_side(pixel)), [false, false, true]);
+/// assert_eq!([0, 1, 2].map(|pixel| cut.is_on_sink_side(pixel)), [false, false, true]);
 /// # Ok::<(), cv_core::Cancelled>(())
 /// ```
 #[derive(Debug, Default)]
 pub struct GridCut {
-    /// One for each place, and the one that stands for neighbors that are not there.
+    /// One per pixel, and the dummy for missing neighbors.
     nodes: Vec<Node>,
     active: std::collections::VecDeque<u32>,
     orphans: std::collections::VecDeque<u32>,
@@ -62,29 +63,29 @@ pub struct GridCut {
 }
 
 impl GridCut {
-    /// `places` are columns and rows of different pixels, row by row from left to right.
+    /// Builds the graph of distinct `pixels` (column, row), given in row-major order.
     ///
     /// # Errors
-    /// [`Cancelled`] where `stage` says stop.
-    pub fn new(places: &[[u32; 2]], stage: &Stage<'_>) -> Result<Self, Cancelled> {
+    /// [`Cancelled`] by `stage`.
+    pub fn new(pixels: &[[u32; 2]], stage: &Stage<'_>) -> Result<Self, Cancelled> {
         stage.check()?;
         let mut cut = Self::default();
-        cut.clear(places.len());
+        cut.clear(pixels.len());
         let nodes = &mut cut.nodes;
-        // The first place that does not come before the one below.
+        // The first pixel that does not precede the lower neighbor in row-major order.
         let mut below = 0;
-        for (i, &[x, y]) in places.iter().enumerate() {
+        for (i, &[x, y]) in pixels.iter().enumerate() {
             if i % (1 << 20) == 0 {
                 stage.check()?;
             }
-            if places.get(i + 1) == Some(&[x + 1, y]) {
+            if pixels.get(i + 1) == Some(&[x + 1, y]) {
                 nodes[i].neighbor[RIGHT] = i as u32 + 1;
                 nodes[i + 1].neighbor[RIGHT + 1] = i as u32;
             }
-            while places.get(below).is_some_and(|&[u, v]| (v, u) < (y + 1, x)) {
+            while pixels.get(below).is_some_and(|&[u, v]| (v, u) < (y + 1, x)) {
                 below += 1;
             }
-            if places.get(below) == Some(&[x, y + 1]) {
+            if pixels.get(below) == Some(&[x, y + 1]) {
                 nodes[i].neighbor[DOWN] = below as u32;
                 nodes[below].neighbor[DOWN + 1] = i as u32;
             }
@@ -92,39 +93,39 @@ impl GridCut {
         Ok(cut)
     }
 
-    /// Makes it the graph of all pixels of a rectangle, row by row, without capacities; its memory is used again.
+    /// Resets to the graph of all pixels of a rectangle, row-major, with zero capacities; reuses the memory.
     pub fn set_rectangle(&mut self, width: usize, height: usize) {
         self.clear(width * height);
-        let nobody = (width * height) as u32;
+        let absent = (width * height) as u32;
         for (y, row) in self.nodes[..width * height].chunks_exact_mut(width.max(1)).enumerate() {
             for (x, node) in row.iter_mut().enumerate() {
                 let i = (y * width + x) as u32;
-                let beside = |is_there: bool, other: u32| if is_there { other } else { nobody };
+                let if_exists = |exists: bool, other: u32| if exists { other } else { absent };
                 node.neighbor = [
-                    beside(x + 1 < width, i + 1),
-                    beside(x > 0, i.wrapping_sub(1)),
-                    beside(y + 1 < height, i + width as u32),
-                    beside(y > 0, i.wrapping_sub(width as u32)),
+                    if_exists(x + 1 < width, i + 1),
+                    if_exists(x > 0, i.wrapping_sub(1)),
+                    if_exists(y + 1 < height, i + width as u32),
+                    if_exists(y > 0, i.wrapping_sub(width as u32)),
                 ];
             }
         }
     }
 
-    /// `places` nodes without neighbors.
-    fn clear(&mut self, places: usize) {
+    /// Resets to `pixels` nodes without neighbors.
+    fn clear(&mut self, pixels: usize) {
         let node = Node {
             capacity: [0; 4],
-            neighbor: [places as u32; 4],
+            neighbor: [pixels as u32; 4],
             terminal: 0,
-            time: 0,
+            timestamp: 0,
             distance: 0,
             tree: FREE,
             parent: ORPHAN,
             is_active: false,
-            is_settled: false,
+            is_dominated: false,
         };
         self.nodes.clear();
-        self.nodes.resize(places + 1, node);
+        self.nodes.resize(pixels + 1, node);
         self.active.clear();
         self.orphans.clear();
         self.clock = 0;
@@ -135,18 +136,18 @@ impl GridCut {
         self.nodes[node].neighbor[direction & 3] as usize
     }
 
-    /// The node to the right of a place, where there is one.
+    /// Returns the right neighbor of a node, if any.
     pub fn right(&self, node: usize) -> Option<usize> {
         self.existing(node, RIGHT)
     }
 
-    /// The node below a place, where there is one.
+    /// Returns the lower neighbor of a node, if any.
     pub fn below(&self, node: usize) -> Option<usize> {
         self.existing(node, DOWN)
     }
 
-    /// Whether there is a node to the left of a place, and one above it.
-    pub fn has_before(&self, node: usize) -> [bool; 2] {
+    /// Whether a node has a left, and an upper neighbor.
+    pub fn has_left_and_upper(&self, node: usize) -> [bool; 2] {
         [RIGHT + 1, DOWN + 1].map(|direction| self.existing(node, direction).is_some())
     }
 
@@ -154,13 +155,13 @@ impl GridCut {
         Some(self.neighbor(node, direction)).filter(|&other| other + 1 < self.nodes.len())
     }
 
-    /// Adds costs of being cut from the source and from the sink (both at least 0): a node on the sink's side pays the first.
+    /// Adds terminal capacities (t-links, at least 0): a node on the sink side pays `source`, one on the source side `sink`.
     pub fn add_terminal(&mut self, node: usize, source: i32, sink: i32) {
         self.nodes[node].terminal += source - sink;
     }
 
-    /// Adds capacities between a place and its right neighbor, which is there: paid where this one is on the source's side and that one on the
-    /// sink's, and the other way round.
+    /// Adds capacities (n-links) between a node and its right neighbor, which must exist: `forward` is paid where the node is on the source
+    /// side and the neighbor on the sink side, `backward` in the opposite case.
     pub fn add_right(&mut self, node: usize, forward: i32, backward: i32) {
         self.add_edge(node, RIGHT, forward, backward);
     }
@@ -177,33 +178,33 @@ impl GridCut {
         self.nodes[other].capacity[direction ^ 1] += backward;
     }
 
-    /// After [`Self::solve`]: whether the place is on the sink's side of the cut. What could be on either is on the source's.
-    pub fn on_sink_side(&self, node: usize) -> bool {
+    /// After [`Self::solve`]: whether a node is on the sink side of the cut. Nodes that could be on either are on the source side.
+    pub fn is_on_sink_side(&self, node: usize) -> bool {
         self.nodes[node].tree == SINK
     }
 
-    /// Finds a minimum cut.
+    /// Computes a minimum cut.
     ///
     /// # Errors
-    /// [`Cancelled`] where `stage` says stop.
+    /// [`Cancelled`] by `stage`.
     pub fn solve(&mut self, stage: &Stage<'_>) -> Result<(), Cancelled> {
         for node in 0..self.nodes.len() - 1 {
             if node % (1 << 20) == 0 {
                 stage.check()?;
             }
-            self.settle(node);
+            self.fix_dominated_node(node);
         }
         for node in (0..self.nodes.len() - 1).rev() {
             if node % (1 << 20) == 0 {
                 stage.check()?;
             }
-            self.settle(node);
+            self.fix_dominated_node(node);
         }
         for node in 0..self.nodes.len() - 1 {
             if node % (1 << 20) == 0 {
                 stage.check()?;
             }
-            self.push(node);
+            self.push_short_paths(node);
         }
         for node in 0..self.nodes.len() {
             if node % (1 << 20) == 0 {
@@ -214,8 +215,8 @@ impl GridCut {
                 self.nodes[node].tree = if t > 0 { SOURCE } else { SINK };
                 self.nodes[node].parent = TERMINAL;
                 self.nodes[node].distance = 1;
-                // What is settled has nowhere to grow.
-                if !self.nodes[node].is_settled {
+                // Dominated nodes have no arcs to grow along.
+                if !self.nodes[node].is_dominated {
                     self.activate(node);
                 }
             }
@@ -223,7 +224,7 @@ impl GridCut {
         while let Some(node) = self.active.pop_front() {
             let node = node as usize;
             self.nodes[node].is_active = false;
-            // A node stays at work until it meets the other tree no more.
+            // A node stays active until it no longer touches the other tree.
             while self.nodes[node].tree != FREE {
                 let Some((s, direction)) = self.grow(node) else { break };
                 self.clock += 1;
@@ -231,7 +232,7 @@ impl GridCut {
                 while let Some(orphan) = self.orphans.pop_front() {
                     self.adopt(orphan as usize);
                 }
-                // A path and its orphans: some microseconds.
+                // An augmentation with its adoptions takes microseconds.
                 if self.clock.is_multiple_of(4096) {
                     stage.check()?;
                 }
@@ -240,8 +241,8 @@ impl GridCut {
         Ok(())
     }
 
-    /// A node whose terminal outweighs all its edges is on that side whatever its neighbors do, which then pay for their edges to it as to the terminal.
-    fn settle(&mut self, node: usize) {
+    /// Fixes a node whose terminal capacity dominates all its edges to that side, and moves the edges' capacities to the neighbors' terminals.
+    fn fix_dominated_node(&mut self, node: usize) {
         let Node { capacity, neighbor, terminal, .. } = self.nodes[node];
         if terminal > 0 && terminal >= capacity.iter().sum() {
             for (direction, other) in neighbor.into_iter().enumerate() {
@@ -249,7 +250,7 @@ impl GridCut {
                 other.terminal += capacity[direction];
                 other.capacity[direction ^ 1] = 0;
             }
-            (self.nodes[node].capacity, self.nodes[node].is_settled) = ([0; 4], true);
+            (self.nodes[node].capacity, self.nodes[node].is_dominated) = ([0; 4], true);
         } else if terminal < 0 {
             let into: [i32; 4] = std::array::from_fn(|d| self.nodes[neighbor[d] as usize].capacity[d ^ 1]);
             if -terminal > into.iter().sum() {
@@ -258,13 +259,13 @@ impl GridCut {
                     other.terminal -= into[direction];
                     other.capacity[direction ^ 1] = 0;
                 }
-                (self.nodes[node].capacity, self.nodes[node].is_settled) = ([0; 4], true);
+                (self.nodes[node].capacity, self.nodes[node].is_dominated) = ([0; 4], true);
             }
         }
     }
 
-    /// Sends flow along the paths of one edge, from the source to the node, a neighbor and the sink: no trees are needed for these.
-    fn push(&mut self, node: usize) {
+    /// Augments the shortest paths, source – node – neighbor – sink, without search trees.
+    fn push_short_paths(&mut self, node: usize) {
         for direction in 0..4 {
             let Node { terminal, capacity, .. } = self.nodes[node];
             let other = self.neighbor(node, direction);
@@ -284,8 +285,8 @@ impl GridCut {
         }
     }
 
-    /// Whether flow can still pass along the tree edge between a node and its neighbor toward the leaves of that tree.
-    fn open(&self, tree: u8, node: usize, direction: usize, other: usize) -> bool {
+    /// Whether the arc between a node and its neighbor has residual capacity in the direction of growth of `tree`.
+    fn has_residual(&self, tree: u8, node: usize, direction: usize, other: usize) -> bool {
         if tree == SOURCE {
             self.nodes[node].capacity[direction] > 0
         } else {
@@ -293,34 +294,35 @@ impl GridCut {
         }
     }
 
-    /// Lets the node's tree take its free neighbors; returns an arc from the source's tree to the sink's where they touch.
+    /// Growth stage: adds free neighbors to the node's tree; returns an arc from the source tree to the sink tree where they touch.
     fn grow(&mut self, node: usize) -> Option<(usize, usize)> {
         let tree = self.nodes[node].tree;
         for direction in 0..4 {
             let other = self.neighbor(node, direction);
-            if !self.open(tree, node, direction, other) {
+            if !self.has_residual(tree, node, direction, other) {
                 continue;
             }
             if self.nodes[other].tree == FREE {
                 self.nodes[other].tree = tree;
                 self.nodes[other].parent = (direction ^ 1) as u8;
-                self.nodes[other].time = self.nodes[node].time;
+                self.nodes[other].timestamp = self.nodes[node].timestamp;
                 self.nodes[other].distance = self.nodes[node].distance + 1;
                 self.activate(other);
             } else if self.nodes[other].tree != tree {
                 return Some(if tree == SOURCE { (node, direction) } else { (other, direction ^ 1) });
-            } else if self.nodes[other].time <= self.nodes[node].time
+            } else if self.nodes[other].timestamp <= self.nodes[node].timestamp
                 && self.nodes[other].distance > self.nodes[node].distance + 1
             {
-                // A shorter way to the same terminal.
+                // A shorter path to the same terminal.
                 self.nodes[other].parent = (direction ^ 1) as u8;
-                self.nodes[other].time = self.nodes[node].time;
+                self.nodes[other].timestamp = self.nodes[node].timestamp;
                 self.nodes[other].distance = self.nodes[node].distance + 1;
             }
         }
         None
     }
 
+    /// Augmentation stage: pushes the bottleneck capacity along the path through the arc; saturated tree arcs make orphans.
     fn augment(&mut self, s: usize, direction: usize) {
         let t = self.neighbor(s, direction);
         let mut flow = self.nodes[s].capacity[direction];
@@ -349,13 +351,13 @@ impl GridCut {
             self.nodes[node].capacity[d] += flow;
             self.nodes[up].capacity[d ^ 1] -= flow;
             if self.nodes[up].capacity[d ^ 1] == 0 {
-                self.orphan(node);
+                self.make_orphan(node);
             }
             node = up;
         }
         self.nodes[node].terminal -= flow;
         if self.nodes[node].terminal == 0 {
-            self.orphan(node);
+            self.make_orphan(node);
         }
         node = t;
         while self.nodes[node].parent != TERMINAL {
@@ -364,27 +366,28 @@ impl GridCut {
             self.nodes[up].capacity[d ^ 1] += flow;
             self.nodes[node].capacity[d] -= flow;
             if self.nodes[node].capacity[d] == 0 {
-                self.orphan(node);
+                self.make_orphan(node);
             }
             node = up;
         }
         self.nodes[node].terminal += flow;
         if self.nodes[node].terminal == 0 {
-            self.orphan(node);
+            self.make_orphan(node);
         }
     }
 
-    fn orphan(&mut self, node: usize) {
+    fn make_orphan(&mut self, node: usize) {
         self.nodes[node].parent = ORPHAN;
         self.orphans.push_back(node as u32);
     }
 
+    /// Adoption stage: finds a new parent for an orphan, or frees it.
     fn adopt(&mut self, node: usize) {
         let tree = self.nodes[node].tree;
         let mut best: Option<(u32, usize)> = None;
         for direction in 0..4 {
             let other = self.neighbor(node, direction);
-            // Flow runs from the other node to this one in the source's tree, the other way in the sink's.
+            // Flow is from the other node to this one in the source tree, the reverse in the sink tree.
             let open = if tree == SOURCE {
                 self.nodes[other].capacity[direction ^ 1] > 0
             } else {
@@ -401,7 +404,7 @@ impl GridCut {
         }
         if let Some((distance, direction)) = best {
             self.nodes[node].parent = direction as u8;
-            self.nodes[node].time = self.clock;
+            self.nodes[node].timestamp = self.clock;
             self.nodes[node].distance = distance + 1;
             return;
         }
@@ -420,21 +423,21 @@ impl GridCut {
                 self.activate(other);
             }
             if usize::from(self.nodes[other].parent) == direction ^ 1 {
-                self.orphan(other);
+                self.make_orphan(other);
             }
         }
     }
 
-    /// Steps from a node to its tree's terminal, remembering them on the way; `None` where the way ends at an orphan.
+    /// Computes the distance of a node to its tree's terminal and caches it along the path; `None` where the path ends at an orphan.
     fn distance_to_terminal(&mut self, start: usize) -> Option<u32> {
         let (mut node, mut steps) = (start, 0);
         let total = loop {
-            if self.nodes[node].time == self.clock {
+            if self.nodes[node].timestamp == self.clock {
                 break steps + self.nodes[node].distance;
             }
             match self.nodes[node].parent {
                 TERMINAL => {
-                    self.nodes[node].time = self.clock;
+                    self.nodes[node].timestamp = self.clock;
                     self.nodes[node].distance = 1;
                     break steps + 1;
                 }
@@ -446,8 +449,8 @@ impl GridCut {
             }
         };
         let (mut node, mut distance) = (start, total);
-        while self.nodes[node].time != self.clock {
-            self.nodes[node].time = self.clock;
+        while self.nodes[node].timestamp != self.clock {
+            self.nodes[node].timestamp = self.clock;
             self.nodes[node].distance = distance;
             distance -= 1;
             node = self.neighbor(node, usize::from(self.nodes[node].parent));
@@ -466,29 +469,29 @@ mod tests {
         Stage::new(&Silent, "cut", 1).unwrap()
     }
 
-    /// All pixels of a grid.
-    fn whole(w: usize, h: usize) -> Vec<[u32; 2]> {
+    /// All pixels of a grid, row-major.
+    fn all_pixels(w: usize, h: usize) -> Vec<[u32; 2]> {
         (0..h as u32).flat_map(|y| (0..w as u32).map(move |x| [x, y])).collect()
     }
 
     proptest! {
         #[test]
-        fn neighbors_are_the_pixels_beside_and_below(mask in proptest::collection::vec(any::<bool>(), 35)) {
-            let places: Vec<_> = whole(7, 5).into_iter().zip(&mask).filter(|(_, m)| **m).map(|(p, _)| p).collect();
-            let cut = GridCut::new(&places, &stage()).unwrap();
-            let find = |place: [u32; 2]| places.iter().position(|p| *p == place);
-            for (i, &[x, y]) in places.iter().enumerate() {
+        fn neighbors_are_the_adjacent_pixels(mask in proptest::collection::vec(any::<bool>(), 35)) {
+            let pixels: Vec<_> = all_pixels(7, 5).into_iter().zip(&mask).filter(|(_, m)| **m).map(|(p, _)| p).collect();
+            let cut = GridCut::new(&pixels, &stage()).unwrap();
+            let find = |pixel: [u32; 2]| pixels.iter().position(|p| *p == pixel);
+            for (i, &[x, y]) in pixels.iter().enumerate() {
                 prop_assert_eq!(cut.right(i), find([x + 1, y]));
                 prop_assert_eq!(cut.below(i), find([x, y + 1]));
                 let before = [find([x.wrapping_sub(1), y]).is_some(), find([x, y.wrapping_sub(1)]).is_some()];
-                prop_assert_eq!(cut.has_before(i), before);
+                prop_assert_eq!(cut.has_left_and_upper(i), before);
             }
         }
     }
 
-    /// Cost of a labeling (bit set: source side).
+    /// Reference: the energy of a labeling (bit set: source side).
     #[derive(Debug)]
-    struct Plain {
+    struct ReferenceProblem {
         w: usize,
         h: usize,
         terminals: Vec<(i32, i32)>,
@@ -496,7 +499,7 @@ mod tests {
         down: Vec<(i32, i32)>,
     }
 
-    impl Plain {
+    impl ReferenceProblem {
         fn cost(&self, source_side: impl Fn(usize, usize) -> bool) -> i32 {
             let mut cost = 0;
             let pay = |a: bool, b: bool, (forward, backward): (i32, i32)| match (a, b) {
@@ -507,13 +510,13 @@ mod tests {
             for y in 0..self.h {
                 for x in 0..self.w {
                     let i = y * self.w + x;
-                    let own = source_side(x, y);
-                    cost += if own { self.terminals[i].1 } else { self.terminals[i].0 };
+                    let label = source_side(x, y);
+                    cost += if label { self.terminals[i].1 } else { self.terminals[i].0 };
                     if x + 1 < self.w {
-                        cost += pay(own, source_side(x + 1, y), self.right[i]);
+                        cost += pay(label, source_side(x + 1, y), self.right[i]);
                     }
                     if y + 1 < self.h {
-                        cost += pay(own, source_side(x, y + 1), self.down[i]);
+                        cost += pay(label, source_side(x, y + 1), self.down[i]);
                     }
                 }
             }
@@ -521,7 +524,7 @@ mod tests {
         }
 
         fn cut(&self) -> GridCut {
-            self.fill(GridCut::new(&whole(self.w, self.h), &stage()).unwrap())
+            self.fill(GridCut::new(&all_pixels(self.w, self.h), &stage()).unwrap())
         }
 
         fn fill(&self, mut g: GridCut) -> GridCut {
@@ -542,11 +545,11 @@ mod tests {
         }
     }
 
-    fn problem() -> impl Strategy<Value = Plain> {
+    fn problem() -> impl Strategy<Value = ReferenceProblem> {
         (1..5_usize, 1..4_usize).prop_flat_map(|(w, h)| {
             let n = w * h;
             let pairs = |limit: i32| proptest::collection::vec((0..limit, 0..limit), n);
-            (pairs(12), pairs(7), pairs(7)).prop_map(move |(terminals, right, down)| Plain {
+            (pairs(12), pairs(7), pairs(7)).prop_map(move |(terminals, right, down)| ReferenceProblem {
                 w,
                 h,
                 terminals,
@@ -559,31 +562,31 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(600))]
         #[test]
-        fn no_labeling_costs_less_than_the_cut(p in problem()) {
+        fn the_cut_has_the_minimum_energy_of_all_labelings(p in problem()) {
             let cut = p.cut();
-            let found = p.cost(|x, y| !cut.on_sink_side(y * p.w + x));
-            let least = (0..1_u32 << (p.w * p.h)).map(|bits| p.cost(|x, y| bits >> (y * p.w + x) & 1 == 1)).min().unwrap();
-            prop_assert_eq!(found, least);
+            let cost = p.cost(|x, y| !cut.is_on_sink_side(y * p.w + x));
+            let minimum = (0..1_u32 << (p.w * p.h)).map(|bits| p.cost(|x, y| bits >> (y * p.w + x) & 1 == 1)).min().unwrap();
+            prop_assert_eq!(cost, minimum);
         }
 
         #[test]
-        fn a_rectangle_is_the_graph_of_its_pixels(before in problem(), p in problem()) {
-            // Whatever it held before.
+        fn a_reset_rectangle_equals_a_new_graph_of_its_pixels(before in problem(), p in problem()) {
+            // Independent of its previous content.
             let mut cut = before.cut();
             cut.set_rectangle(p.w, p.h);
             let (cut, expected) = (p.fill(cut), p.cut());
             for i in 0..p.w * p.h {
-                prop_assert_eq!(cut.on_sink_side(i), expected.on_sink_side(i));
+                prop_assert_eq!(cut.is_on_sink_side(i), expected.is_on_sink_side(i));
             }
         }
     }
 
     #[test]
-    fn a_large_cut_runs_through_the_cheap_column() {
-        // Left column source, right column sink, every edge 10 but those over a winding line, 1 each.
+    fn a_large_cut_follows_the_cheap_line() {
+        // Left column source, right column sink; horizontal edges 200 except those across a sine-shaped line, 1 each.
         let (w, h) = (60, 40);
         let line = |y: usize| 20 + (y as f64 * 0.4).sin().mul_add(8.0, 0.0) as usize;
-        let mut g = GridCut::new(&whole(w, h), &stage()).unwrap();
+        let mut g = GridCut::new(&all_pixels(w, h), &stage()).unwrap();
         for y in 0..h {
             g.add_terminal(y * w, 1000, 0);
             g.add_terminal(y * w + w - 1, 0, 1000);
@@ -598,7 +601,7 @@ mod tests {
         g.solve(&stage()).unwrap();
         for y in 0..h {
             for x in 0..w {
-                assert_eq!(g.on_sink_side(y * w + x), x > line(y), "{x} {y}");
+                assert_eq!(g.is_on_sink_side(y * w + x), x > line(y), "{x} {y}");
             }
         }
     }

@@ -10,7 +10,7 @@
 //! let (dx, dy) = sobel(smooth.view());
 //! assert!(dx.at(32, 24)[0] > 0.0 && dy.at(32, 24)[0] > 0.0);
 //!
-//! // A homography takes source pixels to result pixels; the mask says where the result shows the source.
+//! // The homography maps source pixels to result pixels; the mask is true where a result pixel maps inside the source.
 //! let shift = Matrix3::new(1.0, 0.0, 10.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0);
 //! let (moved, mask) = warp_perspective(photo.view(), &shift, (64, 48), &RemapOptions::default())?;
 //! assert_eq!(moved.at(10, 0), photo.at(0, 0));
@@ -20,16 +20,16 @@
 //!
 //! # Conventions
 //!
-//! * Functions take views and return owned images. `f32` pictures are 0 to 1.
-//! * Filters mirror the border about the end samples (`dcb|abcd|cba`), as OpenCV's default does; medians repeat it.
-//! * Empty images give empty results. Where not said otherwise a NaN pixel spoils the results its neighborhood enters, nothing else.
-//! * Rows are shared out between threads; results do not depend on their number, nor on the instruction set.
+//! * Functions take views and return owned images. `f32` images are 0 to 1.
+//! * The border mode of filters is reflect-101 (`dcb|abcd|cba`), as OpenCV's default; that of medians is replicate.
+//! * Empty images give empty results. Unless stated otherwise, a NaN pixel affects only results whose window contains it.
+//! * Rows are processed in parallel; results do not depend on the number of threads or the instruction set.
 
 mod color;
 mod connected_components;
 mod gaussian;
 mod grid_cut;
-mod integral;
+mod integral_image;
 mod median;
 mod mirror;
 mod morphology;
@@ -52,7 +52,7 @@ pub use connected_components::{
 };
 pub use gaussian::{gaussian_blur, gaussian_half_kernel, separable_symmetric, sobel};
 pub use grid_cut::GridCut;
-pub use integral::{Integral, box_filter};
+pub use integral_image::{IntegralImage, box_filter};
 pub use median::{median_filter_3x3, median_filter_5x5};
 pub use mirror::{mirror_ends, mirror_index};
 pub use morphology::{StructuringElement, close, dilate, erode, open};

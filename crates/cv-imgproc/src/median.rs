@@ -1,16 +1,16 @@
-//! Median filters of small windows.
+//! Median filters with small windows.
 
 use crate::rows::for_rows_with;
 use cv_core::{GrayF32, ImageView};
 
-/// Median of each 3×3 window; border pixels are repeated outwards (as OpenCV's `medianBlur`).
+/// Computes the median of each 3×3 window, border mode replicate (as OpenCV's `medianBlur`).
 ///
 /// A NaN counts as larger than every number.
 pub fn median_filter_3x3(view: ImageView<'_, f32, 1>) -> GrayF32 {
     median::<3, 9>(view)
 }
 
-/// Median of each 5×5 window; border pixels are repeated outwards (as OpenCV's `medianBlur`).
+/// Computes the median of each 5×5 window, border mode replicate (as OpenCV's `medianBlur`).
 ///
 /// A NaN counts as larger than every number.
 pub fn median_filter_5x5(view: ImageView<'_, f32, 1>) -> GrayF32 {
@@ -31,15 +31,15 @@ fn median<const K: usize, const N: usize>(view: ImageView<'_, f32, 1>) -> GrayF3
         }
         for (x, out) in row.iter_mut().enumerate() {
             let mut window: [f32; N] = std::array::from_fn(|i| padded[i / K][x + i % K]);
-            *out = *window.select_nth_unstable_by(N / 2, |a, b| order(*a).cmp(&order(*b))).1;
+            *out = *window.select_nth_unstable_by(N / 2, |a, b| total_order_key(*a).cmp(&total_order_key(*b))).1;
         }
     });
     out
 }
 
-/// A key that sorts as the numbers do, every NaN last.
+/// Maps a float to an integer key of the same order, every NaN last.
 #[inline(always)]
-fn order(v: f32) -> i32 {
+fn total_order_key(v: f32) -> i32 {
     if v.is_nan() {
         return i32::MAX;
     }
@@ -52,7 +52,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn plain(image: &GrayF32, r: isize) -> GrayF32 {
+    fn reference(image: &GrayF32, r: isize) -> GrayF32 {
         let (w, h) = (image.width() as isize, image.height() as isize);
         GrayF32::from_fn(image.width(), image.height(), |x, y| {
             let mut window = Vec::new();
@@ -69,21 +69,21 @@ mod tests {
 
     proptest! {
         #[test]
-        fn the_middle_of_the_sorted_window(w in 1usize..40, h in 1usize..9, seed in any::<u32>(), holes in 0u32..30) {
+        fn the_median_is_the_middle_of_the_sorted_window(w in 1usize..40, h in 1usize..9, seed in any::<u32>(), nan_percent in 0u32..30) {
             let mut state = seed | 1;
             let image = GrayF32::from_fn(w, h, |_, _| {
                 state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
                 let v = (state >> 8) % 1000;
-                [if v < holes * 10 { f32::NAN } else { v as f32 - 500.0 }]
+                [if v < nan_percent * 10 { f32::NAN } else { v as f32 - 500.0 }]
             });
             let bits = |i: &GrayF32| i.as_slice().iter().map(|v| if v.is_nan() { None } else { Some(v.to_bits()) }).collect::<Vec<_>>();
-            prop_assert_eq!(bits(&median_filter_3x3(image.view())), bits(&plain(&image, 1)));
-            prop_assert_eq!(bits(&median_filter_5x5(image.view())), bits(&plain(&image, 2)));
+            prop_assert_eq!(bits(&median_filter_3x3(image.view())), bits(&reference(&image, 1)));
+            prop_assert_eq!(bits(&median_filter_5x5(image.view())), bits(&reference(&image, 2)));
         }
     }
 
     #[test]
-    fn nothing_is_nothing() {
+    fn empty_and_single_pixel_images() {
         assert!(median_filter_3x3(GrayF32::new(0, 5, [0.0]).view()).is_empty());
         assert_eq!(median_filter_5x5(GrayF32::new(1, 1, [2.0]).view()).at(0, 0), [2.0]);
     }

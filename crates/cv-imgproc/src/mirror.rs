@@ -1,7 +1,7 @@
-//! The mirror at the borders of an image.
+//! Border mode reflect-101.
 
-/// Index `i` of a line of `n` samples mirrored about its end samples (`dcb|abcd|cba`, OpenCV's BORDER_REFLECT_101), as often as it takes.
-/// Without samples it is 0.
+/// Maps index `i` into a line of `n` samples under border mode reflect-101 (`dcb|abcd|cba`, OpenCV's `BORDER_REFLECT_101`), repeatedly where
+/// needed. 0 for an empty line.
 #[inline]
 pub fn mirror_index(i: isize, n: usize) -> usize {
     let n = n as isize;
@@ -16,8 +16,8 @@ pub fn mirror_index(i: isize, n: usize) -> usize {
     (if i < n { i } else { period - i }) as usize
 }
 
-/// Fills the first `left` and the last `right` pixels of `C` samples with the mirror image ([`mirror_index`]) of what lies between; where nothing
-/// does, it changes nothing.
+/// Fills the first `left` and the last `right` pixels of `C` samples by reflection ([`mirror_index`]) of the pixels between them. Without
+/// pixels between, nothing is changed.
 #[inline]
 pub fn mirror_ends<const C: usize>(padded: &mut [f32], left: usize, right: usize) {
     let w = (padded.len() / C).saturating_sub(left + right);
@@ -43,22 +43,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn mirrors_as_often_as_it_takes() {
-        let seen: Vec<usize> = (-5..7).map(|i| mirror_index(i, 3)).collect();
-        assert_eq!(seen, [1, 0, 1, 2, 1, 0, 1, 2, 1, 0, 1, 2]);
+    fn far_indices_are_reflected_repeatedly() {
+        let reflected: Vec<usize> = (-5..7).map(|i| mirror_index(i, 3)).collect();
+        assert_eq!(reflected, [1, 0, 1, 2, 1, 0, 1, 2, 1, 0, 1, 2]);
         assert_eq!([mirror_index(-3, 1), mirror_index(4, 1), mirror_index(2, 0)], [0; 3]);
     }
 
     #[test]
-    fn the_ends_of_a_line_mirror_its_middle() {
+    fn the_ends_of_a_line_are_filled_by_reflection() {
         let mut row = [0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 0.0, 0.0];
         mirror_ends::<1>(&mut row, 3, 2);
         assert_eq!(row, [2.0, 3.0, 2.0, 1.0, 2.0, 3.0, 2.0, 1.0]);
         let mut pairs = [0.0, 0.0, 1.0, 2.0, 3.0, 4.0, 0.0, 0.0];
         mirror_ends::<2>(&mut pairs, 1, 1);
         assert_eq!(pairs, [3.0, 4.0, 1.0, 2.0, 3.0, 4.0, 1.0, 2.0]);
-        let mut nothing = [5.0, 6.0];
-        mirror_ends::<1>(&mut nothing, 1, 2);
-        assert_eq!(nothing, [5.0, 6.0]);
+        let mut only_ends = [5.0, 6.0];
+        mirror_ends::<1>(&mut only_ends, 1, 2);
+        assert_eq!(only_ends, [5.0, 6.0]);
     }
 }

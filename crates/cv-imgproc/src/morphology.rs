@@ -1,12 +1,12 @@
-//! Erosion and dilation of masks.
+//! Binary morphology: dilation, erosion, opening and closing of masks.
 //!
-//! Masks are packed 64 pixels to a word. A structuring element is a set of horizontal runs; a row is dilated by a run of length `n` with
-//! `log₂ n` shifts, and the result is the union over the element's rows.
+//! Masks are packed 64 pixels to a word. A structuring element is a set of horizontal runs; dilation of a row by a run of length `n` takes
+//! `log₂ n` shifts, and the result is the union over the element's runs.
 
 use cv_core::{ImageView, Mask};
 use rayon::prelude::*;
 
-/// The set of offsets a mask is eroded or dilated by; its origin is its middle.
+/// A structuring element: a set of pixel offsets around its origin, the center.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StructuringElement {
     /// Row offset, first and last column offset of each run.
@@ -14,20 +14,20 @@ pub struct StructuringElement {
 }
 
 impl StructuringElement {
-    /// A rectangle of `2 rx + 1` by `2 ry + 1` pixels.
+    /// Makes a rectangle of `2 rx + 1` by `2 ry + 1` pixels.
     pub fn rectangle(rx: usize, ry: usize) -> Self {
-        let (rx, ry) = (clip(rx), clip(ry));
+        let (rx, ry) = (clamp_radius(rx), clamp_radius(ry));
         Self { runs: (-ry..=ry).map(|y| (y, -rx, rx)).collect() }
     }
 
-    /// A square of `2 r + 1` pixels a side.
+    /// Makes a square of `2 r + 1` pixels a side.
     pub fn square(r: usize) -> Self {
         Self::rectangle(r, r)
     }
 
-    /// A disc of radius `r` pixels, the pixels that OpenCV's `getStructuringElement(MORPH_ELLIPSE, (2r + 1, 2r + 1))` has.
+    /// Makes a disc of radius `r` pixels, equal to OpenCV's `getStructuringElement(MORPH_ELLIPSE, (2r + 1, 2r + 1))`.
     pub fn disc(r: usize) -> Self {
-        let r = clip(r);
+        let r = clamp_radius(r);
         let runs = (-r..=r).map(|y| {
             let half = if r > 0 {
                 (r as f64 * ((r * r - y * y) as f64 / (r * r) as f64).sqrt()).round_ties_even() as isize
@@ -39,15 +39,15 @@ impl StructuringElement {
         Self { runs: runs.collect() }
     }
 
-    /// A plus of arms of `r` pixels.
+    /// Makes a cross with arms of `r` pixels.
     pub fn cross(r: usize) -> Self {
-        let r = clip(r);
+        let r = clamp_radius(r);
         Self { runs: (-r..=r).map(|y| if y == 0 { (0, -r, r) } else { (y, 0, 0) }).collect() }
     }
 
-    /// Any shape: the true pixels of a mask, around its middle pixel `(w / 2, h / 2)`.
+    /// Makes an element of any shape: the true pixels of a mask, with origin `(w / 2, h / 2)`.
     ///
-    /// An element without pixels dilates to nothing and erodes to everything, as the definitions say.
+    /// Dilation by an empty element gives an all-false mask, erosion an all-true one.
     pub fn from_mask(mask: ImageView<'_, bool, 1>) -> Self {
         let (cx, cy) = ((mask.width() / 2) as isize, (mask.height() / 2) as isize);
         let mut runs = Vec::new();
@@ -68,26 +68,26 @@ impl StructuringElement {
         Self { runs }
     }
 
-    /// Mirrored about the origin.
+    /// Reflects the element about its origin.
     fn reflected(&self) -> Self {
         Self { runs: self.runs.iter().map(|&(y, a, b)| (-y, -b, -a)).collect() }
     }
 }
 
-/// No image is larger than this; keeps offsets far from overflow.
-fn clip(r: usize) -> isize {
+/// Clamps a radius to more than any image size, far from overflow.
+fn clamp_radius(r: usize) -> isize {
     r.min(1 << 20) as isize
 }
 
-/// A mask, 64 pixels to a word, rows of `words` words. Bits beyond the width are zero.
-struct Bits {
+/// A mask packed 64 pixels to a word, rows of `words` words. Bits beyond the width are zero.
+struct PackedMask {
     data: Vec<u64>,
     width: usize,
     height: usize,
     words: usize,
 }
 
-impl Bits {
+impl PackedMask {
     fn zeros(width: usize, height: usize) -> Self {
         let words = width.div_ceil(64).max(1);
         Self { data: vec![0; words * height], width, height, words }
@@ -118,8 +118,8 @@ impl Bits {
         mask
     }
 
-    /// The bits of a row's last word that are pixels.
-    fn last_word(&self) -> u64 {
+    /// Returns the bit mask of the valid pixels in the last word of a row.
+    fn last_word_mask(&self) -> u64 {
         match self.width {
             0 => 0,
             w => u64::MAX >> (63 - (w - 1) % 64),
@@ -127,7 +127,7 @@ impl Bits {
     }
 
     fn not(mut self) -> Self {
-        let last = self.last_word();
+        let last = self.last_word_mask();
         for row in self.data.chunks_exact_mut(self.words) {
             for word in row.iter_mut() {
                 *word = !*word;
@@ -139,23 +139,23 @@ impl Bits {
         self
     }
 
-    /// Dilation: `out(p)` is true where `self(p − o)` is for some offset `o` of the element; outside is false.
+    /// Dilates: `out(p)` is true where `self(p − o)` is true for some offset `o` of the element; outside is false.
     fn dilate(&self, element: &StructuringElement) -> Self {
         let mut out = Self::zeros(self.width, self.height);
         let w = self.width as isize;
-        // Runs of one shape share the horizontal work: for each shape, the rows it applies to.
+        // Runs with the same columns share the horizontal dilation: group them, each with the rows it applies to.
         let mut runs = element.runs.clone();
         runs.retain(|&(_, a, b)| a < w && b > -w);
         runs.sort_unstable_by_key(|&(y, a, b)| (a, b, y));
         for shape in runs.chunk_by(|p, q| (p.1, p.2) == (q.1, q.2)) {
             let (a, b) = (shape[0].1.max(-w), shape[0].2.min(w));
-            let along = self.dilate_rows(a, b);
+            let dilated_rows = self.dilate_rows(a, b);
             let height = self.height as isize;
             out.data.par_chunks_mut(self.words).with_min_len(32).enumerate().for_each(|(y, out)| {
                 for &(dy, ..) in shape {
                     let from = y as isize - dy;
                     if (0..height).contains(&from) {
-                        let row = &along[from as usize * self.words..][..self.words];
+                        let row = &dilated_rows[from as usize * self.words..][..self.words];
                         out.iter_mut().zip(row).for_each(|(o, r)| *o |= r);
                     }
                 }
@@ -164,19 +164,19 @@ impl Bits {
         out
     }
 
-    /// Every row dilated by the columns `a..=b`.
+    /// Dilates every row by the column offsets `a..=b`.
     fn dilate_rows(&self, a: isize, b: isize) -> Vec<u64> {
         let length = (b - a + 1) as usize;
         let mut out = vec![0; self.data.len()];
-        let last = self.last_word();
-        // Working space: the run of `length` starts up to |a| pixels left of the row, so shift the row right by |a|min first within a longer line.
+        let last = self.last_word_mask();
+        // Padded row buffers: the run may extend beyond both ends of the row.
         let (left, right) = ((-a).max(0) as usize, b.max(0) as usize);
-        let line = (self.width + left + right).div_ceil(64) + 1;
-        let buffers = || (vec![0u64; line], vec![0u64; line]);
+        let padded_words = (self.width + left + right).div_ceil(64) + 1;
+        let buffers = || (vec![0u64; padded_words], vec![0u64; padded_words]);
         out.par_chunks_mut(self.words).zip(self.data.par_chunks(self.words)).with_min_len(32).for_each_init(
             buffers,
             |(grown, shifted), (out, row)| {
-                // Pixel x sits at bit x + left; the run covers x + a ..= x + b, that is bits (x + left + a) + 0..length.
+                // Pixel x is bit x + left; the run covers x + a ..= x + b, that is bits (x + left + a) + 0..length.
                 grown.fill(0);
                 grown[..row.len()].copy_from_slice(row);
                 shift_up((left as isize + a) as usize, grown, shifted);
@@ -198,7 +198,7 @@ impl Bits {
     }
 }
 
-/// `to = from << bits` across words.
+/// Computes `to = from << bits` across words.
 fn shift_up(bits: usize, from: &[u64], to: &mut [u64]) {
     let (words, bits) = (bits / 64, bits % 64);
     let at = |i: usize| i.checked_sub(words).and_then(|i| from.get(i)).copied().unwrap_or(0);
@@ -208,7 +208,7 @@ fn shift_up(bits: usize, from: &[u64], to: &mut [u64]) {
     }
 }
 
-/// `to = from >> bits` across words.
+/// Computes `to = from >> bits` across words.
 fn shift_down(bits: usize, from: &[u64], to: &mut [u64]) {
     let (words, bits) = (bits / 64, bits % 64);
     let at = |i: usize| from.get(i + words).copied().unwrap_or(0);
@@ -218,28 +218,28 @@ fn shift_down(bits: usize, from: &[u64], to: &mut [u64]) {
     }
 }
 
-/// True where the element, reflected and centered on the pixel, touches a true pixel. Outside the image counts as false.
+/// Dilates a mask: true where the reflected element, centered on the pixel, hits a true pixel. Pixels outside the image count as false.
 pub fn dilate(view: ImageView<'_, bool, 1>, element: &StructuringElement) -> Mask {
-    Bits::pack(view).dilate(element).unpack()
+    PackedMask::pack(view).dilate(element).unpack()
 }
 
-/// True where the element, centered on the pixel, covers only true pixels. Outside the image counts as true.
+/// Erodes a mask: true where the element, centered on the pixel, covers only true pixels. Pixels outside the image count as true.
 pub fn erode(view: ImageView<'_, bool, 1>, element: &StructuringElement) -> Mask {
-    eroded(Bits::pack(view), element).unpack()
+    erode_packed(PackedMask::pack(view), element).unpack()
 }
 
-/// Erosion then dilation: takes away what the element does not fit into.
+/// Opens a mask (erosion, then dilation): removes parts that the element does not fit into.
 pub fn open(view: ImageView<'_, bool, 1>, element: &StructuringElement) -> Mask {
-    eroded(Bits::pack(view), element).dilate(element).unpack()
+    erode_packed(PackedMask::pack(view), element).dilate(element).unpack()
 }
 
-/// Dilation then erosion: fills what the reflected element does not fit into.
+/// Closes a mask (dilation, then erosion): fills gaps that the reflected element does not fit into.
 pub fn close(view: ImageView<'_, bool, 1>, element: &StructuringElement) -> Mask {
-    eroded(Bits::pack(view).dilate(element), element).unpack()
+    erode_packed(PackedMask::pack(view).dilate(element), element).unpack()
 }
 
-/// Erosion is dilation of the complement by the reflected element.
-fn eroded(bits: Bits, element: &StructuringElement) -> Bits {
+/// Erodes as the complement of the dilation of the complement by the reflected element.
+fn erode_packed(bits: PackedMask, element: &StructuringElement) -> PackedMask {
     bits.not().dilate(&element.reflected()).not()
 }
 
@@ -257,8 +257,8 @@ mod tests {
         inside.then(|| mask.at(x as usize, y as usize)[0])
     }
 
-    /// The definitions, pixel by pixel.
-    fn plain(mask: &Mask, element: &StructuringElement, grow: bool) -> Mask {
+    /// Reference implementation: the definitions, pixel by pixel.
+    fn reference(mask: &Mask, element: &StructuringElement, grow: bool) -> Mask {
         let offsets = offsets(element);
         Mask::from_fn(mask.width(), mask.height(), |x, y| {
             let (x, y) = (x as isize, y as isize);
@@ -280,7 +280,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn all_four_are_their_definitions(
+        fn all_operations_equal_their_definitions(
             w in 1usize..200, h in 1usize..12, seed in any::<u32>(), kind in 0usize..5, r in 0usize..6, long in 0usize..150, density in 1u32..99,
         ) {
             let element = match kind {
@@ -291,17 +291,17 @@ mod tests {
                 _ => StructuringElement::from_mask(noise(long + 1, 2, seed ^ 99, 5).view()),
             };
             let mask = noise(w, h, seed, density);
-            let (grown, shrunk) = (plain(&mask, &element, true), plain(&mask, &element, false));
+            let (grown, shrunk) = (reference(&mask, &element, true), reference(&mask, &element, false));
             prop_assert_eq!(&dilate(mask.view(), &element), &grown);
             prop_assert_eq!(&erode(mask.view(), &element), &shrunk);
-            prop_assert_eq!(open(mask.view(), &element), plain(&shrunk, &element, true));
-            prop_assert_eq!(close(mask.view(), &element), plain(&grown, &element, false));
+            prop_assert_eq!(open(mask.view(), &element), reference(&shrunk, &element, true));
+            prop_assert_eq!(close(mask.view(), &element), reference(&grown, &element, false));
         }
     }
 
     #[test]
-    fn the_discs_are_opencvs() {
-        // Half widths of the rows of getStructuringElement(MORPH_ELLIPSE, (2r+1, 2r+1)), read off OpenCV.
+    fn discs_match_opencv() {
+        // Half widths of the rows of OpenCV's getStructuringElement(MORPH_ELLIPSE, (2r+1, 2r+1)).
         let halves = |r| StructuringElement::disc(r).runs.iter().map(|&(_, _, b)| b).collect::<Vec<_>>();
         assert_eq!(halves(0), [0]);
         assert_eq!(halves(1), [0, 1, 0]);
@@ -310,7 +310,7 @@ mod tests {
     }
 
     #[test]
-    fn the_border_neither_eats_nor_feeds() {
+    fn the_border_neither_erodes_nor_dilates() {
         let full = Mask::new(70, 5, [true]);
         let element = StructuringElement::square(2);
         for result in [erode(full.view(), &element), open(full.view(), &element), close(full.view(), &element)] {
@@ -321,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn empty_images_and_elements_far_too_large() {
+    fn empty_images_and_oversized_elements() {
         for size in [(0, 0), (0, 4), (4, 0)] {
             let mask = Mask::new(size.0, size.1, [true]);
             assert_eq!(open(mask.view(), &StructuringElement::disc(3)).size(), size);

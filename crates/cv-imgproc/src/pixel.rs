@@ -1,19 +1,19 @@
-//! Channel types that can be interpolated.
+//! Sample types that can be interpolated.
 
 use cv_core::{ImageView, Sample};
 
-/// A channel value that interpolation can compute with.
+/// A sample type that can be interpolated.
 pub trait Pixel: Sample {
-    /// The value as a number, in the same unit.
+    /// Converts to `f32` in the same unit.
     fn to_f32(self) -> f32;
-    /// The nearest value of this type; integers saturate, and take NaN to 0.
+    /// Converts to the nearest value of this type; integers saturate, and NaN becomes 0.
     fn from_f32(value: f32) -> Self;
-    /// The same picture where it is one of bytes, for what computes with those in integers.
+    /// Returns the view as 8-bit where that is its type, for integer arithmetic.
     #[inline(always)]
     fn as_bytes<const C: usize>(_: ImageView<'_, Self, C>) -> Option<ImageView<'_, u8, C>> {
         None
     }
-    /// The same samples where they are bytes.
+    /// Returns the samples as 8-bit where that is their type.
     #[inline(always)]
     fn as_bytes_mut(_: &mut [Self]) -> Option<&mut [u8]> {
         None

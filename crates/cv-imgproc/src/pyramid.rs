@@ -4,9 +4,10 @@ use crate::mirror::{mirror_ends, mirror_index};
 use crate::rows::for_rows_with;
 use cv_core::{Image, ImageView};
 
-/// Half the size (rounded up): smoothed by `[1 4 6 4 1]/16` both ways, then every second pixel of every second row from the top left (OpenCV's `pyrDown`).
+/// Computes the next coarser pyramid level, half the resolution (rounded up): smoothing by `[1 4 6 4 1]/16` along both axes, then
+/// subsampling by two from the top left (OpenCV's `pyrDown`).
 ///
-/// Pixel `(x, y)` of the result lies at `(2x, 2y)` of the source. Borders are mirrored about the end samples.
+/// Pixel `(x, y)` of the result is at `(2x, 2y)` of the source. Border mode reflect-101.
 pub fn pyr_down<const C: usize>(view: ImageView<'_, f32, C>) -> Image<f32, C> {
     let (w, h) = view.size();
     let mut out = Image::new(w.div_ceil(2), h.div_ceil(2), [0.0; C]);
@@ -32,27 +33,27 @@ pub fn pyr_down<const C: usize>(view: ImageView<'_, f32, C>) -> Image<f32, C> {
     out
 }
 
-/// Twice the size: zeros between the pixels, smoothed by `[1 4 6 4 1]/8` both ways (OpenCV's `pyrUp`).
+/// Upsamples a pyramid level by two: zeros between the pixels, smoothed by `[1 4 6 4 1]/8` along both axes (OpenCV's `pyrUp`).
 ///
-/// Pixel `(x, y)` of the source lies at `(2x, 2y)` of the result, whose `size` (width, height) should be that of the level below: `2w − 1` or `2w` by
-/// `2h − 1` or `2h`. Other sizes are filled as far as the source reaches, mirrored on the left and repeated on the right.
+/// Pixel `(x, y)` of the source is at `(2x, 2y)` of the result, whose `size` (width, height) should be that of the finer level: `2w − 1` or
+/// `2w` by `2h − 1` or `2h`. The border mode is reflect-101 at the top and left, replicate at the bottom and right.
 pub fn pyr_up<const C: usize>(view: ImageView<'_, f32, C>, size: (usize, usize)) -> Image<f32, C> {
     let (w, h) = view.size();
     let mut out = Image::new(size.0, size.1, [0.0; C]);
     if view.is_empty() {
         return out;
     }
-    // Before the first sample the mirrored second; after the last the last again, as OpenCV does.
+    // Reflect-101 before the first sample, replicate after the last, as OpenCV does.
     let index = |i: isize, n: usize| if i < 0 { mirror_index(i, n) } else { (i as usize).min(n - 1) };
     for_rows_with(
         &mut out,
         || vec![0.0f32; w * C],
         |column, y, row| {
-            let middle = (y / 2) as isize;
-            let b = view.row(index(middle, h));
-            let c = view.row(index(middle + 1, h));
+            let center = (y / 2) as isize;
+            let b = view.row(index(center, h));
+            let c = view.row(index(center + 1, h));
             if y % 2 == 0 {
-                let a = view.row(index(middle - 1, h));
+                let a = view.row(index(center - 1, h));
                 for (i, out) in column.iter_mut().enumerate() {
                     *out = (a[i] + 6.0 * b[i] + c[i]) * 0.125;
                 }
@@ -77,13 +78,13 @@ pub fn pyr_up<const C: usize>(view: ImageView<'_, f32, C>, size: (usize, usize))
     out
 }
 
-/// The image and up to `levels − 1` halvings of it, stopping before a side would fall below `smallest` pixels.
+/// Computes a Gaussian pyramid of at most `levels` levels, the image first, without levels that have a side below `min_side` pixels.
 ///
 /// An empty image gives no levels.
 pub fn gaussian_pyramid<const C: usize>(
     view: ImageView<'_, f32, C>,
     levels: usize,
-    smallest: usize,
+    min_side: usize,
 ) -> Vec<Image<f32, C>> {
     let mut pyramid: Vec<Image<f32, C>> = Vec::new();
     if view.is_empty() || levels == 0 {
@@ -93,7 +94,7 @@ pub fn gaussian_pyramid<const C: usize>(
     while pyramid.len() < levels {
         let Some(last) = pyramid.last() else { break };
         let (w, h) = last.size();
-        if (w, h) == (1, 1) || w.div_ceil(2) < smallest || h.div_ceil(2) < smallest {
+        if (w, h) == (1, 1) || w.div_ceil(2) < min_side || h.div_ceil(2) < min_side {
             break;
         }
         let next = pyr_down(last.view());
@@ -111,7 +112,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn down_is_smoothing_then_dropping(w in 1usize..20, h in 1usize..20) {
+        fn pyr_down_is_smoothing_then_subsampling(w in 1usize..20, h in 1usize..20) {
             let image = Image::<f32, 3>::from_fn(w, h, |x, y| [((x * 31 + y * 17) % 23) as f32, x as f32, y as f32]);
             let smooth = separable_symmetric(image.view(), &[6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0]);
             let down = pyr_down(image.view());
@@ -127,7 +128,7 @@ mod tests {
         }
 
         #[test]
-        fn up_is_zeros_between_then_smoothing(w in 1usize..12, h in 1usize..12) {
+        fn pyr_up_is_zero_insertion_then_smoothing(w in 1usize..12, h in 1usize..12) {
             let image = Image::<f32, 2>::from_fn(w, h, |x, y| [((x * 31 + y * 17) % 23) as f32, (x + y) as f32]);
             let size = (2 * w - 1, 2 * h - 1);
             let spread = Image::<f32, 2>::from_fn(size.0, size.1, |x, y| if x % 2 == 0 && y % 2 == 0 { image.at(x / 2, y / 2) } else { [0.0; 2] });
@@ -144,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn constants_stay_constant_at_every_size() {
+    fn constant_images_stay_constant() {
         for (w, h) in [(1, 1), (2, 1), (1, 5), (7, 4)] {
             let image = GrayF32::new(w, h, [0.625]);
             let down = pyr_down(image.view());
@@ -155,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pyramid_ends_in_time() {
+    fn a_pyramid_stops_at_the_minimum_side() {
         let image = GrayF32::new(100, 60, [0.0]);
         let sizes: Vec<_> = gaussian_pyramid(image.view(), 99, 10).iter().map(Image::size).collect();
         assert_eq!(sizes, [(100, 60), (50, 30), (25, 15)]);

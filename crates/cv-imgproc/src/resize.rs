@@ -1,11 +1,11 @@
-//! Changing the size of an image.
+//! Image resizing.
 
 use crate::{Interpolation, Pixel, RemapOptions, WarpError, rows::for_rows_with, warp_with};
 use cv_core::{Image, ImageError, ImageView, Point2, Scaling};
 
-/// Resamples to `width × height`; the corners of the image areas match, so pixel center `x` comes from `(x + ½) w / width − ½` (as OpenCV's `resize`).
+/// Resamples to `width × height` with image edges aligned: pixel center `x` is sampled at `(x + ½) w / width − ½` (as OpenCV's `resize`).
 ///
-/// Interpolates between neighbors only: to make an image smaller without aliasing use [`resize_area`].
+/// No anti-aliasing: to shrink an image use [`resize_area`].
 ///
 /// # Errors
 /// [`ImageError::TooLarge`]. An empty source gives zeros.
@@ -26,13 +26,14 @@ pub fn resize<T: Pixel, const C: usize>(
     match result {
         Ok((image, _)) => Ok(image),
         Err(WarpError::Size(error)) => Err(error),
-        // Nothing else can fail without a homography or a camera.
+        // Other errors need a homography or a camera.
         Err(_) => Err(ImageError::TooLarge { width, height, channels: C }),
     }
 }
 
-/// The source samples under each of `to` equal parts of a line of `from`: first sample, and the weight of it and its successors, summing to one.
-fn shares(from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
+/// Computes the area weights for resampling a line of `from` samples to `to`: per result the first source sample, and the weights of it and its
+/// successors, which sum to one.
+fn area_weights(from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
     let scale = from as f64 / to as f64;
     (0..to)
         .map(|i| {
@@ -46,9 +47,9 @@ fn shares(from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
         .collect()
 }
 
-/// Resamples to `width × height` by the mean of the source under each result pixel, parts of pixels counted by their part (OpenCV's `INTER_AREA` when shrinking).
+/// Resamples to `width × height` by the area-weighted mean of the source under each result pixel (OpenCV's `INTER_AREA` when shrinking).
 ///
-/// Meant for shrinking. When enlarging it repeats pixels.
+/// For shrinking; when enlarging it repeats pixels.
 ///
 /// # Errors
 /// [`ImageError::TooLarge`]. An empty source gives zeros.
@@ -61,8 +62,8 @@ pub fn resize_area<T: Pixel, const C: usize>(
     if view.is_empty() || out.is_empty() {
         return Ok(out);
     }
-    let columns = shares(view.width(), width);
-    let lines = shares(view.height(), height);
+    let columns = area_weights(view.width(), width);
+    let lines = area_weights(view.height(), height);
     for_rows_with(
         &mut out,
         || vec![0.0f32; view.width() * C],
@@ -98,7 +99,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn the_mean_is_kept(w in 1usize..30, h in 1usize..20, a in 1usize..30, b in 1usize..20) {
+        fn area_resizing_preserves_the_mean(w in 1usize..30, h in 1usize..20, a in 1usize..30, b in 1usize..20) {
             let image = GrayF32::from_fn(w, h, |x, y| [((x * 31 + y * 17) % 23) as f32 / 23.0]);
             let mean = |i: &GrayF32| i.as_slice().iter().sum::<f32>() / i.as_slice().len() as f32;
             let small = resize_area(image.view(), a, b).unwrap();
@@ -107,7 +108,7 @@ mod tests {
         }
 
         #[test]
-        fn a_ramp_stays_one(w in 2usize..40, to in 1usize..60) {
+        fn resizing_preserves_a_ramp(w in 2usize..40, to in 1usize..60) {
             let image = GrayF32::from_fn(w, 2, |x, _| [x as f32]);
             let out = resize(image.view(), to, 3, Interpolation::Bilinear).unwrap();
             for x in 0..to {
@@ -119,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn whole_factors_are_plain_means() {
+    fn integer_factors_give_block_means() {
         let image = GrayU8::from_fn(6, 4, |x, y| [(x + 10 * y) as u8]);
         let small = resize_area(image.view(), 3, 2).unwrap();
         // Mean of x, x + 1, x + 10, x + 11 is x + 5.5, rounded up.
@@ -127,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn empty_and_huge() {
+    fn empty_and_huge_sizes() {
         let empty = GrayU8::new(0, 0, [0]);
         assert_eq!(resize_area(empty.view(), 2, 2).unwrap().as_slice(), [0; 4]);
         assert_eq!(resize(empty.view(), 2, 2, Interpolation::Nearest).unwrap().as_slice(), [0; 4]);

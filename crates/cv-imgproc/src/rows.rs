@@ -1,10 +1,10 @@
-//! Rows of an image in parallel.
+//! Parallel iteration over the rows of an image.
 
 use cv_core::{Image, Sample};
 use rayon::prelude::*;
 
-/// Samples per task: a few tens of microseconds of work, against about one to hand a task over.
-const BAND: usize = 1 << 15;
+/// Samples per band, the unit of parallel work: tens of microseconds, against about one microsecond of overhead per task.
+const SAMPLES_PER_BAND: usize = 1 << 15;
 
 /// Calls `f(state, y, row)` for each row of `image`, bands of rows in parallel; `init` makes the state (buffers) of a band.
 pub(crate) fn for_rows_with<T: Sample, const C: usize, S>(
@@ -16,8 +16,8 @@ pub(crate) fn for_rows_with<T: Sample, const C: usize, S>(
     if image.is_empty() {
         return;
     }
-    let rows = (BAND / stride).max(1);
-    in_bands(image.as_mut_slice(), stride * rows, &|i, band| {
+    let rows = (SAMPLES_PER_BAND / stride).max(1);
+    for_each_band(image.as_mut_slice(), stride * rows, &|i, band| {
         let mut state = init();
         for (j, row) in band.chunks_exact_mut(stride).enumerate() {
             f(&mut state, i * rows + j, row);
@@ -25,9 +25,9 @@ pub(crate) fn for_rows_with<T: Sample, const C: usize, S>(
     });
 }
 
-/// Calls `f(i, band)` for each band of `size` samples, in parallel. Not generic over what is called: the machinery of the
-/// thread pool is compiled once for each type of sample and not for each filter.
-fn in_bands<T: Sample>(samples: &mut [T], size: usize, f: &(dyn Fn(usize, &mut [T]) + Sync)) {
+/// Calls `f(i, band)` for each band of `size` samples, in parallel. Dynamic dispatch: the thread-pool code is compiled once per sample type,
+/// not once per filter.
+fn for_each_band<T: Sample>(samples: &mut [T], size: usize, f: &(dyn Fn(usize, &mut [T]) + Sync)) {
     if samples.len() <= size {
         f(0, samples);
     } else {
@@ -51,7 +51,7 @@ pub(crate) fn for_rows2<T: Sample, const C: usize, U: Sample, const D: usize>(
     if first.is_empty() {
         return;
     }
-    let rows = (BAND / a).max(1);
+    let rows = (SAMPLES_PER_BAND / a).max(1);
     let band = |(i, (p, q)): (usize, (&mut [T], &mut [U]))| {
         for (j, (p, q)) in p.chunks_exact_mut(a).zip(q.chunks_exact_mut(b)).enumerate() {
             f(i * rows + j, p, q);
@@ -70,7 +70,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_row_is_visited_once_with_its_own_number() {
+    fn every_row_is_visited_once_with_its_index() {
         for (w, h) in [(0, 3), (3, 0), (1, 1), (7, 5), (4000, 33), (1, 100_000), (70_000, 3)] {
             let mut image = Image::<u32, 2>::new(w, h, [0; 2]);
             let mut other = Image::<u32, 1>::new(w, h, [0]);

@@ -1,37 +1,37 @@
-//! Values between pixels: the one place of the workspace where they are found.
+//! Bilinear and bicubic interpolation: the only implementation in the workspace.
 
 use crate::Pixel;
 use cv_core::ImageView;
 use fearless_simd::{f32x4, f32x16, prelude::*, u8x16};
 
-/// How far outside the outermost pixel centers a point may lie and still count as on them, in pixels: the rounding of a map of
-/// a few thousand pixels in `f32`.
-const SLACK: f64 = 1e-3;
+/// Tolerance in pixels for points outside the outermost pixel centers, which are clamped to them: the rounding of an `f32` map of
+/// a few thousand pixels.
+const BORDER_TOLERANCE_PX: f64 = 1e-3;
 
-/// The base index and the fraction of a coordinate on a line of `n > 0` samples, or `None` outside `[0, n − 1]` (or NaN).
+/// Splits a coordinate on a line of `n > 0` samples into base index and fraction; `None` outside `[0, n − 1]` (or NaN).
 #[inline(always)]
-pub(crate) fn split(v: f64, n: usize) -> Option<(usize, f32)> {
+pub(crate) fn split_coordinate(v: f64, n: usize) -> Option<(usize, f32)> {
     let last = (n - 1) as f64;
-    if !(v >= -SLACK && v <= last + SLACK) {
+    if !(v >= -BORDER_TOLERANCE_PX && v <= last + BORDER_TOLERANCE_PX) {
         return None;
     }
     let v = v.clamp(0.0, last);
-    // The base of the last sample is the one before it, so that base + 1 exists.
+    // The base index is at most n − 2, so that base + 1 exists.
     let base = (v as usize).min(n.saturating_sub(2));
     Some((base, (v - base as f64) as f32))
 }
 
-/// The value at `(x, y)` by bilinear interpolation, in the unit of the image.
+/// Interpolates the value at `(x, y)` bilinearly, in the unit of the image.
 ///
-/// `None` outside the rectangle of the outermost pixel centers, `[0, w − 1] × [0, h − 1]` (with a thousandth of a pixel of slack).
+/// `None` outside the rectangle of the outermost pixel centers, `[0, w − 1] × [0, h − 1]` (tolerance 0.001 px).
 #[inline]
 pub fn sample_bilinear<T: Pixel, const C: usize>(view: ImageView<'_, T, C>, x: f64, y: f64) -> Option<[f32; C]> {
-    sampled(view, x, y, bilinear_at)
+    interpolate_with(view, x, y, bilinear_at)
 }
 
-/// What `at` makes of the base pixel of `(x, y)` and the fractions beyond it; `None` outside.
+/// Calls `at` with the base pixel of `(x, y)` and the fractions; `None` outside.
 #[inline(always)]
-fn sampled<T: Pixel, const C: usize>(
+fn interpolate_with<T: Pixel, const C: usize>(
     view: ImageView<'_, T, C>,
     x: f64,
     y: f64,
@@ -40,14 +40,13 @@ fn sampled<T: Pixel, const C: usize>(
     if view.is_empty() {
         return None;
     }
-    let (ix, fx) = split(x, view.width())?;
-    let (iy, fy) = split(y, view.height())?;
+    let (ix, fx) = split_coordinate(x, view.width())?;
+    let (iy, fy) = split_coordinate(y, view.height())?;
     Some(at(view, ix, iy, fx, fy))
 }
 
-/// Bilinear interpolation from the base pixel `(ix, iy)`, which lies in the image, by the fractions `fx`, `fy` in 0 to 1; see [`sample_bilinear`].
-///
-/// For loops that place their samples themselves.
+/// Interpolates bilinearly from the base pixel `(ix, iy)`, which must be in the image, by the fractions `fx`, `fy` in 0 to 1; see
+/// [`sample_bilinear`]. For loops that compute base pixels and fractions themselves.
 #[inline(always)]
 pub fn bilinear_at<T: Pixel, const C: usize>(
     view: ImageView<'_, T, C>,
@@ -62,7 +61,7 @@ pub fn bilinear_at<T: Pixel, const C: usize>(
     let left = ix * C;
     let (a, b) = (&above[left..left + C], &above[right..right + C]);
     let (c, d) = (&below[left..left + C], &below[right..right + C]);
-    // (A loop: a closure would be called, and compiled for no instruction set in particular.)
+    // A loop, since a closure would not be inlined into code compiled for the instruction set.
     let mut value = [0.0; C];
     for (i, value) in value.iter_mut().enumerate() {
         let top = a[i].to_f32() + fx * (b[i].to_f32() - a[i].to_f32());
@@ -72,25 +71,25 @@ pub fn bilinear_at<T: Pixel, const C: usize>(
     value
 }
 
-/// The value at `(x, y)` by bicubic convolution with Keys's kernel, `a = −½` (Keys 1981: exact for quadratics), in the unit of the image.
+/// Interpolates the value at `(x, y)` by cubic convolution with Keys's kernel, `a = −½` (Keys 1981: exact for quadratics), in the unit of the
+/// image.
 ///
-/// `None` outside `[0, w − 1] × [0, h − 1]`, as in [`sample_bilinear`]; the kernel's samples beyond the border repeat the outermost ones. Values may
-/// overshoot those of the image at edges.
+/// `None` outside `[0, w − 1] × [0, h − 1]`, as in [`sample_bilinear`]; the border mode within the kernel's support is replicate. May
+/// overshoot at edges.
 #[inline]
 pub fn sample_bicubic<T: Pixel, const C: usize>(view: ImageView<'_, T, C>, x: f64, y: f64) -> Option<[f32; C]> {
-    sampled(view, x, y, bicubic_at)
+    interpolate_with(view, x, y, bicubic_at)
 }
 
-/// The four weights of Keys's kernel for a fraction in 0 to 1.
+/// Computes the four weights of Keys's kernel for a fraction in 0 to 1.
 #[inline(always)]
-fn keys(t: f32) -> [f32; 4] {
+fn keys_weights(t: f32) -> [f32; 4] {
     let (t2, t3) = (t * t, t * t * t);
     [0.5 * (-t3 + 2.0 * t2 - t), 0.5 * (3.0 * t3 - 5.0 * t2 + 2.0), 0.5 * (-3.0 * t3 + 4.0 * t2 + t), 0.5 * (t3 - t2)]
 }
 
-/// Bicubic interpolation from the base pixel `(ix, iy)`, which lies in the image, by the fractions `fx`, `fy` in 0 to 1; see [`sample_bicubic`].
-///
-/// For loops that place their samples themselves. Down the columns first, so that whole rows of samples are added up at once.
+/// Interpolates bicubically from the base pixel `(ix, iy)`, which must be in the image, by the fractions `fx`, `fy` in 0 to 1; see
+/// [`sample_bicubic`]. For loops that compute base pixels and fractions themselves. Vertical first, so that rows of samples vectorize.
 #[inline(always)]
 pub fn bicubic_at<T: Pixel, const C: usize>(
     view: ImageView<'_, T, C>,
@@ -100,7 +99,7 @@ pub fn bicubic_at<T: Pixel, const C: usize>(
     fy: f32,
 ) -> [f32; C] {
     let (w, h) = view.size();
-    let (wx, wy) = (keys(fx), keys(fy));
+    let (wx, wy) = (keys_weights(fx), keys_weights(fy));
     let mut sums = [[0f32; C]; 4];
     for (j, wy) in wy.into_iter().enumerate() {
         let row = view.row((iy + j).saturating_sub(1).min(h - 1));
@@ -117,7 +116,7 @@ pub fn bicubic_at<T: Pixel, const C: usize>(
             }
         }
     }
-    // (A loop: a closure would be called, and compiled for no instruction set in particular.)
+    // A loop, since a closure would not be inlined into code compiled for the instruction set.
     let mut value = [0.0; C];
     for (c, value) in value.iter_mut().enumerate() {
         *value = wx[0] * sums[0][c] + wx[1] * sums[1][c] + wx[2] * sums[2][c] + wx[3] * sums[3][c];
@@ -125,7 +124,7 @@ pub fn bicubic_at<T: Pixel, const C: usize>(
     value
 }
 
-/// As [`bicubic_at`], the same numbers, for photographs: four pixels of a row at once, as a vector of 16 bytes of which four are not needed.
+/// As [`bicubic_at`] with identical results, for 8-bit RGB: the four pixels of a row in one vector of 16 bytes, of which four are unused.
 #[inline(always)]
 pub fn bicubic_rgb_at<S: Simd>(
     simd: S,
@@ -139,8 +138,8 @@ pub fn bicubic_rgb_at<S: Simd>(
     if near_border {
         return bicubic_near_border(view, ix, iy, fx, fy);
     }
-    let (wx, wy) = (keys(fx), keys(fy));
-    // (No closures: they would be called, and with them every operation on vectors.)
+    let (wx, wy) = (keys_weights(fx), keys_weights(fy));
+    // No closures: they would not be inlined, nor would the vector operations in them.
     let mut sums = f32x16::splat(simd, 0.0);
     for (j, wy) in wy.into_iter().enumerate() {
         let bytes = u8x16::from_slice(simd, &view.row(iy + j - 1)[3 * ix - 3..3 * ix + 13]);
@@ -180,7 +179,7 @@ mod tests {
             let got = sample_bilinear(image.view(), x, y).unwrap();
             // Values up to 40: a few roundings of 2e-6.
             prop_assert!((f64::from(got[0]) - expected).abs() < 1e-5 && (f64::from(got[1]) - x * y).abs() < 1e-5);
-            // Away from the border, where the kernel repeats samples, cubic convolution keeps planes and products too.
+            // Away from the border, where samples are replicated, cubic convolution reproduces planes and products too.
             if (1.0..7.0).contains(&x) && (1.0..4.0).contains(&y) {
                 let got = sample_bicubic(image.view(), x, y).unwrap();
                 prop_assert!((f64::from(got[0]) - expected).abs() < 2e-5 && (f64::from(got[1]) - x * y).abs() < 2e-5);
@@ -188,21 +187,21 @@ mod tests {
         }
 
         #[test]
-        fn bicubic_in_vectors_is_that_of_each_sample(ix in 0_usize..12, iy in 0_usize..7, fx in 0.0f32..1.0, fy in 0.0f32..1.0) {
+        fn vectorized_bicubic_equals_the_scalar_one(ix in 0_usize..12, iy in 0_usize..7, fx in 0.0f32..1.0, fy in 0.0f32..1.0) {
             let image = RgbU8::from_fn(12, 7, |x, y| [0, 1, 2].map(|c| ((37 * x + 59 * y + 83 * c) * (x + 3 * c + 1) % 256) as u8));
             let fast = dispatch!(Level::new(), simd => bicubic_rgb_at(simd, image.view(), ix, iy, fx, fy));
             prop_assert_eq!(fast, bicubic_at(image.view(), ix, iy, fx, fy));
         }
 
         #[test]
-        fn bicubic_keeps_parabolas(x in 1.0f64..7.0) {
+        fn bicubic_reproduces_parabolas(x in 1.0f64..7.0) {
             let image = GrayF32::from_fn(9, 3, |x, _| [(x * x) as f32]);
             prop_assert!((f64::from(sample_bicubic(image.view(), x, 1.0).unwrap()[0]) - x * x).abs() < 3e-5);
         }
     }
 
     #[test]
-    fn pixels_are_kept_and_the_outside_is_none() {
+    fn pixel_centers_are_exact_and_the_outside_is_none() {
         let image = GrayU8::from_fn(4, 3, |x, y| [(10 * x + y) as u8]);
         for y in 0..3 {
             for x in 0..4 {

@@ -1,25 +1,27 @@
-//! The inner loops, compiled for each instruction set of the machine and chosen at run time.
+//! Inner loops of the filters, compiled for several instruction sets and dispatched at run time.
 //!
-//! Arithmetic is plain multiplication and addition in a fixed order, lane by lane and never fused, so every instruction set gives the same
-//! bytes; the tests hold each one to the plain loops beside them.
+//! Multiplications and additions are in a fixed order and never fused, so that every instruction set gives the same bytes; the tests compare
+//! each one with scalar loops.
 
 use fearless_simd::{Level, dispatch, prelude::*};
 
-/// The widest instruction set of this machine.
+/// Detects the widest instruction set of this machine.
 #[inline]
 pub(crate) fn level() -> Level {
     Level::new()
 }
 
-/// `out[x] = half[0]·rows[r][x] + Σ half[t]·(rows[r−t][x] + rows[r+t][x])`, `r = half.len() − 1`, with `2r + 1` rows as long as `out`.
-pub(crate) fn vertical(level: Level, out: &mut [f32], rows: &[&[f32]], half: &[f32]) {
+/// Filters vertically: `out[x] = half[0]·rows[r][x] + Σ half[t]·(rows[r−t][x] + rows[r+t][x])`, kernel radius `r = half.len() − 1`, `2r + 1` rows as
+/// long as `out`.
+pub(crate) fn filter_columns(level: Level, out: &mut [f32], rows: &[&[f32]], half: &[f32]) {
     debug_assert!(rows.len() == 2 * half.len() - 1 && rows.iter().all(|r| r.len() == out.len()));
     let r = half.len() - 1;
     dispatch!(level, simd => filter(simd, out, half, #[inline(always)] |t, x, n| (&rows[r - t][x..x + n], &rows[r + t][x..x + n])));
 }
 
-/// `out[x] = half[0]·row[x + r c] + Σ half[t]·(row[x + (r−t) c] + row[x + (r+t) c])`: `row` has `2 r c` more samples than `out`.
-pub(crate) fn horizontal(level: Level, out: &mut [f32], row: &[f32], half: &[f32], c: usize) {
+/// Filters horizontally: `out[x] = half[0]·row[x + r c] + Σ half[t]·(row[x + (r−t) c] + row[x + (r+t) c])`, `c` channels; `row` has `2 r c` more
+/// samples than `out`.
+pub(crate) fn filter_rows(level: Level, out: &mut [f32], row: &[f32], half: &[f32], c: usize) {
     debug_assert_eq!(row.len(), out.len() + 2 * (half.len() - 1) * c);
     let r = half.len() - 1;
     dispatch!(level, simd => filter(simd, out, half, #[inline(always)] |t, x, n| {
@@ -28,7 +30,7 @@ pub(crate) fn horizontal(level: Level, out: &mut [f32], row: &[f32], half: &[f32
     }));
 }
 
-/// `out[x] = half[0]·a₀ + Σ half[t]·(aₜ + bₜ)` where `pair(t, x, n)` gives the samples `aₜ[x..x+n]`, `bₜ[x..x+n]`.
+/// Computes `out[x] = half[0]·a₀ + Σ half[t]·(aₜ + bₜ)`, where `pair(t, x, n)` returns the samples `aₜ[x..x+n]`, `bₜ[x..x+n]`.
 #[inline(always)]
 fn filter<'a, S: Simd>(
     simd: S,
@@ -40,7 +42,7 @@ fn filter<'a, S: Simd>(
     let width = out.len();
     let load = |s: &[f32]| S::f32s::from_slice(simd, s);
     let mut x = 0;
-    // Four vectors at once: the additions of one do not wait for those of another.
+    // Four independent vectors hide the latency of additions.
     while x + 4 * n <= width {
         let (a, _) = pair(0, x, 4 * n);
         let mut sums: [S::f32s; 4] = std::array::from_fn(|i| load(&a[i * n..(i + 1) * n]) * half[0]);
@@ -56,7 +58,7 @@ fn filter<'a, S: Simd>(
         x += 4 * n;
     }
     while x < width && width >= n {
-        // The last columns overlap those before, as a whole vector.
+        // The last vector overlaps the one before.
         x = x.min(width - n);
         let mut sum = load(pair(0, x, n).0) * half[0];
         for (t, &weight) in half.iter().enumerate().skip(1) {
@@ -76,22 +78,22 @@ fn filter<'a, S: Simd>(
     }
 }
 
-/// Sobel derivatives of the middle one of three rows, the ends mirrored.
+/// Computes the Sobel derivatives of the middle one of three rows, border mode reflect-101.
 pub(crate) fn sobel(level: Level, rows: [&[f32]; 3], dx: &mut [f32], dy: &mut [f32]) {
     let w = dx.len();
-    // Mirrored about an end sample, both neighbors are the same: no slope by x, and the slope by y counts them twice.
+    // Under reflect-101 both neighbors of an end sample are equal: the x derivative is zero, and the y derivative counts them twice.
     let end = |x: usize, inner: usize| 2.0 * ((rows[2][x] - rows[0][x]) + (rows[2][inner] - rows[0][inner]));
     for (x, inner) in [(0, 1.min(w - 1)), (w - 1, w.saturating_sub(2))] {
         dx[x] = 0.0;
         dy[x] = end(x, inner);
     }
     if w > 2 {
-        dispatch!(level, _simd => sobel_inner(rows, &mut dx[1..w - 1], &mut dy[1..w - 1]));
+        dispatch!(level, _simd => sobel_interior(rows, &mut dx[1..w - 1], &mut dy[1..w - 1]));
     }
 }
 
 #[inline(always)]
-fn sobel_inner([a, b, c]: [&[f32]; 3], dx: &mut [f32], dy: &mut [f32]) {
+fn sobel_interior([a, b, c]: [&[f32]; 3], dx: &mut [f32], dy: &mut [f32]) {
     let w = dx.len();
     let (a0, a1, a2) = (&a[..w], &a[1..=w], &a[2..w + 2]);
     let (b0, b2) = (&b[..w], &b[2..w + 2]);
@@ -111,7 +113,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn every_instruction_set_gives_the_plain_sums(width in 1usize..200, r in 0usize..12, c in 1usize..4, seed in any::<u32>()) {
+        fn every_instruction_set_equals_the_scalar_reference(width in 1usize..200, r in 0usize..12, c in 1usize..4, seed in any::<u32>()) {
             let mut state = seed | 1;
             let mut random = || {
                 state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
@@ -120,25 +122,25 @@ mod tests {
             let half: Vec<f32> = (0..=r).map(|_| random()).collect();
             let data: Vec<Vec<f32>> = (0..2 * r + 1).map(|_| (0..width + 2 * r * c).map(|_| random()).collect()).collect();
             let rows: Vec<&[f32]> = data.iter().map(|v| &v[..width]).collect();
-            let plain = |at: &dyn Fn(usize, usize) -> f32| -> Vec<f32> {
+            let reference = |at: &dyn Fn(usize, usize) -> f32| -> Vec<f32> {
                 let sum = |x| (1..=r).fold(at(x, r) * half[0], |sum, t| sum + (at(x, r - t) + at(x, r + t)) * half[t]);
                 (0..width).map(sum).collect()
             };
-            let down = plain(&|x, t| rows[t][x]);
-            let along = plain(&|x, t| data[0][x + t * c]);
-            let mut slopes = Vec::new();
+            let vertical = reference(&|x, t| rows[t][x]);
+            let horizontal = reference(&|x, t| data[0][x + t * c]);
+            let mut derivatives = Vec::new();
             for level in instruction_sets() {
                 let mut out = vec![0.0; width];
-                vertical(level, &mut out, &rows, &half);
-                prop_assert_eq!(&out, &down, "{:?}", level);
-                horizontal(level, &mut out, &data[0], &half, c);
-                prop_assert_eq!(&out, &along, "{:?}", level);
+                filter_columns(level, &mut out, &rows, &half);
+                prop_assert_eq!(&out, &vertical, "{:?}", level);
+                filter_rows(level, &mut out, &data[0], &half, c);
+                prop_assert_eq!(&out, &horizontal, "{:?}", level);
                 let (mut dx, mut dy) = (out.clone(), out);
                 let three = [rows[0], rows[r], rows[2 * r]];
                 sobel(level, three, &mut dx, &mut dy);
-                slopes.push((dx, dy));
+                derivatives.push((dx, dy));
             }
-            prop_assert!(slopes.iter().all(|s| *s == slopes[0]));
+            prop_assert!(derivatives.iter().all(|d| *d == derivatives[0]));
         }
     }
 }

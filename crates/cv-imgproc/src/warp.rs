@@ -1,37 +1,37 @@
-//! Resampling by a map: every warp of the workspace.
+//! Image warping by inverse mapping.
 
 use crate::{
     Pixel,
     rows::for_rows2,
-    sample::{bicubic_at, bilinear_at, split},
+    sample::{bicubic_at, bilinear_at, split_coordinate},
 };
 use cv_core::{Camera, CameraError, Image, ImageError, ImageView, Mask, Matrix3, Point2};
 
-/// How values between pixels are found.
+/// Interpolation method.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Interpolation {
-    /// The nearest pixel.
+    /// Nearest neighbor.
     Nearest,
-    /// Between four pixels; the usual choice.
+    /// Bilinear, from four pixels; the usual choice.
     #[default]
     Bilinear,
-    /// Between sixteen, by Keys's kernel (`a = −½`): sharper, may overshoot at edges.
+    /// Bicubic, from sixteen pixels by Keys's kernel (`a = −½`): sharper, may overshoot at edges.
     Bicubic,
 }
 
-/// What a pixel gets that maps outside the source.
+/// Border mode: the value of a pixel that maps outside the source.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Border {
-    /// Zero.
+    /// Zero (constant border).
     #[default]
     Zero,
     /// The nearest source pixel.
     Replicate,
-    /// The source mirrored about its end samples.
+    /// The source reflected about its end samples (reflect-101).
     Reflect,
 }
 
@@ -40,47 +40,47 @@ pub enum Border {
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct RemapOptions {
-    /// How values between pixels are found. Default bilinear.
+    /// Interpolation method. Default bilinear.
     pub interpolation: Interpolation,
-    /// What a pixel gets that maps outside the source. Default zero. (A pixel that maps nowhere gets zero always.)
+    /// Border mode. Default zero. (A pixel without a source position is always zero.)
     pub border: Border,
 }
 
-/// Why a picture could not be warped.
+/// Why an image could not be warped.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum WarpError {
-    /// The homography has no inverse (or is not finite), so there is no way back to the source.
+    /// The homography is singular or not finite, so that inverse mapping is impossible.
     #[error("the homography cannot be inverted: its determinant is {determinant:e}")]
     NotInvertible {
         /// The determinant.
         determinant: f64,
     },
-    /// The camera is not one.
+    /// The camera is invalid.
     #[error(transparent)]
     Camera(#[from] CameraError),
     /// The result would not fit into memory.
     #[error(transparent)]
     Size(#[from] ImageError),
-    /// A picture is not of the size that a map is for.
-    #[error("the picture is {}×{} px, the map is for {}×{} px", got.0, got.1, expected.0, expected.1)]
+    /// A source image does not have the source size of the map.
+    #[error("the source image is {}×{} px, the map is for {}×{} px", got.0, got.1, expected.0, expected.1)]
     SourceSize {
-        /// Width and height of the picture.
+        /// Width and height of the image.
         got: (usize, usize),
-        /// Width and height that the map is for.
+        /// Source size of the map.
         expected: (usize, usize),
     },
-    /// The image for a result is not of its size.
-    #[error("the image for the result is {}×{} px, the result {}×{} px", got.0, got.1, expected.0, expected.1)]
+    /// An output image does not have the result size of the map.
+    #[error("the output image is {}×{} px, the result is {}×{} px", got.0, got.1, expected.0, expected.1)]
     ResultSize {
         /// Width and height of the image.
         got: (usize, usize),
-        /// Width and height of the result.
+        /// Result size of the map.
         expected: (usize, usize),
     },
 }
 
-/// The source seen through interpolation and border rule.
+/// A source image with interpolation method and border mode.
 #[derive(Clone, Copy)]
 struct Sampler<'a, T, const C: usize> {
     view: ImageView<'a, T, C>,
@@ -88,18 +88,18 @@ struct Sampler<'a, T, const C: usize> {
 }
 
 impl<T: Pixel, const C: usize> Sampler<'_, T, C> {
-    /// The value at `(x, y)` and whether that is inside.
+    /// Samples the value at `(x, y)`, and whether that is inside.
     #[inline(always)]
     fn at(&self, x: f64, y: f64) -> ([T; C], bool) {
         let (w, h) = self.view.size();
-        match (split(x, w), split(y, h)) {
-            (Some(x), Some(y)) => (self.inside(x, y), true),
-            _ => (self.outside(x, y), false),
+        match (split_coordinate(x, w), split_coordinate(y, h)) {
+            (Some(x), Some(y)) => (self.interpolate(x, y), true),
+            _ => (self.extrapolate(x, y), false),
         }
     }
 
     #[inline(always)]
-    fn inside(&self, (ix, fx): (usize, f32), (iy, fy): (usize, f32)) -> [T; C] {
+    fn interpolate(&self, (ix, fx): (usize, f32), (iy, fy): (usize, f32)) -> [T; C] {
         match self.options.interpolation {
             Interpolation::Nearest => {
                 let near = |i: usize, f: f32, n: usize| (i + usize::from(f >= 0.5)).min(n - 1);
@@ -111,30 +111,34 @@ impl<T: Pixel, const C: usize> Sampler<'_, T, C> {
     }
 
     #[cold]
-    fn outside(&self, x: f64, y: f64) -> [T; C] {
+    fn extrapolate(&self, x: f64, y: f64) -> [T; C] {
         let (w, h) = self.view.size();
-        let fold = |v: f64, n: usize| match self.options.border {
+        let border_coordinate = |v: f64, n: usize| match self.options.border {
             Border::Zero => None,
             _ if !v.is_finite() => None,
             Border::Replicate => Some(v.clamp(0.0, (n - 1) as f64)),
             Border::Reflect => {
-                // A triangle wave of the period in which the mirrored line repeats.
+                // Triangle wave with the period of the reflected line.
                 let period = 2.0 * (n - 1) as f64;
                 let v = if period > 0.0 { v.rem_euclid(period) } else { 0.0 };
                 Some(v.min(period - v))
             }
         };
-        match (fold(x, w).and_then(|x| split(x, w)), fold(y, h).and_then(|y| split(y, h))) {
-            (Some(x), Some(y)) => self.inside(x, y),
+        match (
+            border_coordinate(x, w).and_then(|x| split_coordinate(x, w)),
+            border_coordinate(y, h).and_then(|y| split_coordinate(y, h)),
+        ) {
+            (Some(x), Some(y)) => self.interpolate(x, y),
             _ => [T::default(); C],
         }
     }
 }
 
-/// An image of `size` (width, height) whose pixel `(x, y)` is the source at `map(x, y)`, and where that lies inside the source.
+/// Warps to an image of `size` (width, height) whose pixel `(x, y)` is the source at `map(x, y)`, and returns the mask of pixels that map
+/// inside the source.
 ///
-/// Inside means between the outermost pixel centers, `[0, w − 1] × [0, h − 1]`. Where the map is `None` the pixel is zero. The map is called in no
-/// particular order, from several threads.
+/// Inside means between the outermost pixel centers, `[0, w − 1] × [0, h − 1]`. Where the map is `None` the pixel is zero. The map is called in
+/// unspecified order from several threads.
 ///
 /// # Errors
 /// [`WarpError::Size`] where the result is larger than memory can address.
@@ -161,7 +165,7 @@ pub fn warp_with<T: Pixel, const C: usize>(
     Ok((out, mask))
 }
 
-/// As [`warp_with`] with the source position of each pixel in an image of `(x, y)`; NaN maps nowhere.
+/// As [`warp_with`], with the source positions as an image of `(x, y)` (OpenCV's `remap`); NaN means no source position.
 pub fn remap<T: Pixel, const C: usize>(
     view: ImageView<'_, T, C>,
     map: ImageView<'_, f32, 2>,
@@ -183,11 +187,11 @@ pub fn remap<T: Pixel, const C: usize>(
     (out, mask)
 }
 
-/// An image of `size` (width, height) seen through the homography `h`, which takes source pixels to result pixels, and where the
-/// result comes from inside the source.
+/// Warps by the homography `h` from source to result pixels to an image of `size` (width, height), and returns the mask of pixels that map
+/// inside the source.
 ///
-/// Works by inverse mapping: each result pixel looks up its source position. Pixels whose source lies at or behind the horizon (the homography's
-/// third coordinate does not have the sign it has at the source's center) map nowhere.
+/// Inverse mapping. Pixels whose source is on or beyond the horizon (the homogeneous coordinate does not have its sign at the source's center)
+/// have no source position.
 ///
 /// # Errors
 /// [`WarpError::NotInvertible`], [`WarpError::Size`].
@@ -197,8 +201,8 @@ pub fn warp_perspective<T: Pixel, const C: usize>(
     size: (usize, usize),
     options: &RemapOptions,
 ) -> Result<(Image<T, C>, Mask), WarpError> {
-    let m = inverse(h)?;
-    // The center of the source is in front: make its weight through the inverse positive.
+    let m = invert_homography(h)?;
+    // Make the homogeneous coordinate of the source's center positive through the inverse.
     let center = h * cv_core::Vector3::new(view.width() as f64 / 2.0, view.height() as f64 / 2.0, 1.0);
     let m = if center.z < 0.0 { -m } else { m };
     warp_with(view, size, options, |x, y| {
@@ -214,8 +218,8 @@ pub fn warp_perspective<T: Pixel, const C: usize>(
     })
 }
 
-/// The inverse of a homography, scaled to unit norm before so that "singular" does not depend on its scale.
-fn inverse(h: &Matrix3<f64>) -> Result<Matrix3<f64>, WarpError> {
+/// Inverts a homography, scaled to unit norm so that the singularity test does not depend on its scale.
+fn invert_homography(h: &Matrix3<f64>) -> Result<Matrix3<f64>, WarpError> {
     let singular = || WarpError::NotInvertible { determinant: h.determinant() };
     let norm = h.norm();
     if !(norm > 0.0 && norm.is_finite()) {
@@ -224,10 +228,11 @@ fn inverse(h: &Matrix3<f64>) -> Result<Matrix3<f64>, WarpError> {
     (h / norm).try_inverse().filter(|m| m.iter().all(|v| v.is_finite())).ok_or_else(singular)
 }
 
-/// The picture as the same camera without distortion would have taken it: same size and calibration matrix; black where it saw nothing.
+/// Removes lens distortion: the image of the same camera without distortion, with the same size and calibration matrix; black where out of
+/// view.
 ///
 /// # Errors
-/// [`WarpError::Camera`] where the camera is not one.
+/// [`WarpError::Camera`] where the camera is invalid.
 pub fn undistort<T: Pixel, const C: usize>(
     view: ImageView<'_, T, C>,
     camera: &Camera,
@@ -237,7 +242,7 @@ pub fn undistort<T: Pixel, const C: usize>(
     let options = RemapOptions::default();
     let (image, _) = warp_with(view, view.size(), &options, |x, y| {
         let ray = Point2::new(k[(0, 0)] * x as f64 + k[(0, 2)], k[(1, 1)] * y as f64 + k[(1, 2)]);
-        // Past its turning point a lens model folds back and would show the border a second time.
+        // Beyond its turning point a lens model folds back, which would repeat the border of the image.
         camera.denormalize_in_range(ray)
     })?;
     Ok(image)
@@ -254,7 +259,7 @@ mod tests {
     }
 
     #[test]
-    fn the_identity_changes_nothing_anywhere() {
+    fn the_identity_changes_no_pixel() {
         let image = texture(37, 21);
         for interpolation in [Interpolation::Nearest, Interpolation::Bilinear, Interpolation::Bicubic] {
             let options = RemapOptions { interpolation, ..Default::default() };
@@ -266,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn a_shift_moves_the_pixels_the_way_it_says() {
+    fn a_translation_moves_pixels_in_its_direction() {
         let image = texture(20, 10);
         let h = Matrix3::new(1.0, 0.0, 3.0, 0.0, 1.0, -2.0, 0.0, 0.0, 1.0);
         let (out, mask) = warp_perspective(image.view(), &h, (20, 10), &RemapOptions::default()).unwrap();
@@ -281,7 +286,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_ramp_shows_where_each_pixel_came_from(
+        fn a_warped_ramp_has_the_source_position_of_each_pixel(
             a in proptest::array::uniform4(-0.2f64..0.2), t in proptest::array::uniform2(-5.0f64..5.0), p in proptest::array::uniform2(-2e-3f64..2e-3),
         ) {
             let h = Matrix3::new(1.0 + a[0], a[1], t[0], a[2], 1.0 + a[3], t[1], p[0], p[1], 1.0);
@@ -293,7 +298,7 @@ mod tests {
                     if mask.at(x, y)[0] {
                         let [u, v] = out.at(x, y).map(f64::from);
                         let q = h * cv_core::Vector3::new(u, v, 1.0);
-                        // The slack of 1e-3 px at the border, stretched by at most two.
+                        // The border tolerance of 1e-3 px, magnified by at most two.
                         prop_assert!((q.x / q.z - x as f64).abs() < 2e-3 && (q.y / q.z - y as f64).abs() < 2e-3);
                     }
                 }
@@ -301,7 +306,7 @@ mod tests {
         }
 
         #[test]
-        fn a_map_and_a_function_agree(seed in any::<u32>(), border in 0usize..3, interpolation in 0usize..3) {
+        fn remap_equals_warp_with(seed in any::<u32>(), border in 0usize..3, interpolation in 0usize..3) {
             let options = RemapOptions {
                 interpolation: [Interpolation::Nearest, Interpolation::Bilinear, Interpolation::Bicubic][interpolation],
                 border: [Border::Zero, Border::Replicate, Border::Reflect][border],
@@ -322,7 +327,7 @@ mod tests {
     }
 
     #[test]
-    fn borders_repeat_or_mirror() {
+    fn border_modes() {
         let image = GrayU8::from_fn(4, 1, |x, _| [10 * x as u8]);
         let map = Image::<f32, 2>::from_fn(10, 1, |x, _| [x as f32 - 3.0, 0.0]);
         let run = |border| remap(image.view(), map.view(), &RemapOptions { border, ..Default::default() }).0.into_vec();
@@ -332,7 +337,7 @@ mod tests {
     }
 
     #[test]
-    fn what_has_no_inverse_is_an_error() {
+    fn singular_homographies_are_errors() {
         let image = texture(4, 4);
         let flat = Matrix3::new(1.0, 2.0, 3.0, 2.0, 4.0, 6.0, 0.0, 0.0, 1.0);
         for h in [flat, Matrix3::zeros(), Matrix3::identity() * f64::NAN, Matrix3::identity() * f64::INFINITY] {
@@ -347,20 +352,20 @@ mod tests {
     }
 
     #[test]
-    fn behind_the_horizon_there_is_nothing() {
-        // w = 1 − x/10 in the source: its right part is behind the plane. The result shows only what is in front.
+    fn pixels_beyond_the_horizon_have_no_source() {
+        // w = 1 − x/10 in the source: its right part is beyond the horizon and not in the result.
         let image = GrayF32::new(8, 8, [1.0]);
         let h = Matrix3::new(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, -0.1, 0.0, 1.0);
         let (_, mask) = warp_perspective(image.view(), &h, (60, 8), &RemapOptions::default()).unwrap();
-        // Source x = 7 lands on 7 / 0.3 = 23.3; no pixel right of it has a source in front.
+        // Source x = 7 maps to 7 / 0.3 = 23.3; no pixel right of it has a source position.
         assert!(mask.at(23, 0)[0] && (24..60).all(|x| !mask.at(x, 0)[0]));
     }
 
     #[test]
-    fn undistorting_straightens_a_line() {
+    fn undistortion_straightens_lines() {
         let distortion = Distortion::radial(-0.2, 0.05);
         let camera = Camera { distortion, ..Camera::from_focal(160, 120, 120.0) };
-        // A picture of the ideal plane: value = ideal x, so that after undistortion each column has one value.
+        // Pixel value = undistorted x, so that after undistortion each column is constant.
         let image =
             GrayF32::from_fn(160, 120, |x, y| [camera.undistort_pixel(Point2::new(x as f64, y as f64)).x as f32]);
         let out = undistort(image.view(), &camera).unwrap();
@@ -370,8 +375,8 @@ mod tests {
                 assert!((out.at(x, y)[0] - x as f32).abs() < 2e-3);
             }
         }
-        let nonsense = Camera { fx: 0.0, ..camera };
-        assert!(matches!(undistort(image.view(), &nonsense), Err(WarpError::Camera(_))));
+        let invalid = Camera { fx: 0.0, ..camera };
+        assert!(matches!(undistort(image.view(), &invalid), Err(WarpError::Camera(_))));
         assert!(undistort(RgbU8::new(0, 0, [0; 3]).view(), &camera).unwrap().is_empty());
     }
 }

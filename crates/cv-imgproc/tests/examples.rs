@@ -1,17 +1,17 @@
 //! The examples run.
 
-#[path = "../examples/edges.rs"]
-mod edges;
+#[path = "../examples/gradient_edges.rs"]
+mod gradient_edges;
 
 #[test]
-fn edges_runs() {
-    edges::main().unwrap();
+fn gradient_edges_runs() {
+    gradient_edges::main().unwrap();
 }
 
-#[path = "../examples/turn.rs"]
-mod turn;
+#[path = "../examples/rotate_image.rs"]
+mod rotate_image;
 
 #[test]
-fn turn_runs() {
-    turn::main().unwrap();
+fn rotate_image_runs() {
+    rotate_image::main().unwrap();
 }

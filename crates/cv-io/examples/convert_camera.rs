@@ -1,4 +1,4 @@
-//! A camera from a line of COLMAP's cameras.txt, in every format that is written, and back.
+//! Parses a camera line of COLMAP's cameras.txt, prints it in every calibration format that can be written, and reads one back.
 use cv_io::{CalibrationFormat, parse_camera, read_camera, write_camera};
 
 pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {

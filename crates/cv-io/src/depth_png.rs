@@ -1,6 +1,6 @@
-//! Disparity and depth in ordinary PNG files: KITTI's 1/256 px, 16-bit millimeters, Middlebury's scaled bytes.
+//! Disparity and depth in gray PNG files: KITTI's 1/256 px, 16-bit millimeters, Middlebury's scaled 8-bit disparities.
 //!
-//! All three keep 0 for "unknown", which is NaN in memory.
+//! In all three 0 is invalid, NaN in memory.
 
 use std::path::Path;
 
@@ -11,22 +11,22 @@ use crate::{FormatError, IoError, Pixels, ReadOptions, decode_image, read_image,
 
 const NAME: &str = "disparity PNG";
 
-/// KITTI's 16-bit disparity PNG: `round(256 d)`, 0 = unknown.
+/// KITTI's 16-bit disparity PNG: `round(256 d)`, 0 = invalid.
 pub mod kitti {
     use super::*;
 
     /// Reads disparities in pixels.
     ///
     /// # Errors
-    /// [`IoError`]: as [`read_image`], or not a gray picture of 16 bits.
+    /// [`IoError`]: as [`read_image`], or not a 16-bit gray image.
     pub fn read(path: impl AsRef<Path>) -> Result<GrayF32, IoError> {
-        Ok(values(&read_16(path.as_ref())?, 1.0 / 256.0))
+        Ok(dequantize(&read_16(path.as_ref())?, 1.0 / 256.0))
     }
 
     /// Writes disparities in pixels.
     ///
-    /// Known values from 0 up to 1/512 are stored as the smallest one, 1/256, as KITTI's own tools do. Returns how many
-    /// known values lie outside 0 to 255.998 and had to be stored as unknown.
+    /// Valid values from 0 up to 1/512 are stored as the smallest one, 1/256, as KITTI's own tools do. Returns the number of
+    /// valid values outside 0 to 255.998, which are stored as invalid.
     ///
     /// # Errors
     /// As [`write_png`].
@@ -35,21 +35,21 @@ pub mod kitti {
     }
 }
 
-/// 16-bit PNG of millimeters, 0 = unknown: what depth cameras, ScanNet and TUM-like tools exchange.
+/// 16-bit PNG of millimeters, 0 = invalid, as depth cameras, ScanNet and TUM-like tools use.
 pub mod depth_mm {
     use super::*;
 
     /// Reads depth in meters.
     ///
     /// # Errors
-    /// [`IoError`]: as [`read_image`], or not a gray picture of 16 bits.
+    /// [`IoError`]: as [`read_image`], or not a 16-bit gray image.
     pub fn read(path: impl AsRef<Path>) -> Result<GrayF32, IoError> {
-        Ok(values(&read_16(path.as_ref())?, 1.0 / 1000.0))
+        Ok(dequantize(&read_16(path.as_ref())?, 1.0 / 1000.0))
     }
 
     /// Writes depth in meters.
     ///
-    /// Returns how many known values lie outside 0 to 65.535 m and had to be stored as unknown.
+    /// Returns the number of valid values outside 0 to 65.535 m, which are stored as invalid.
     ///
     /// # Errors
     /// As [`write_png`].
@@ -58,62 +58,60 @@ pub mod depth_mm {
     }
 }
 
-/// Gray PNG of 8 or 16 bits where `value / scale` is the disparity in pixels and 0 = unknown (Middlebury 2001 to 2006).
+/// Gray PNG of 8 or 16 bits where `value / scale` is the disparity in pixels and 0 = invalid (Middlebury 2001 to 2006).
 pub mod scaled {
     use super::*;
 
     /// Reads disparities in pixels. `scale` is 4 for Middlebury's cones at quarter size, 256 for KITTI.
     ///
     /// # Errors
-    /// [`IoError`]: as [`read_image`], or a color picture, or a scale that is not positive.
+    /// [`IoError`]: as [`read_image`], or a color image, or a scale that is not positive.
     pub fn read(path: impl AsRef<Path>, scale: f64) -> Result<GrayF32, IoError> {
         let path = path.as_ref();
         decode(&read_bytes(path)?, Some(scale)).map_err(|reason| IoError::reading(path, reason))
     }
 
-    /// Writes disparities as bytes, `round(scale d)`, at least 1 where known. Returns how many known values do not fit and
-    /// had to be stored as unknown.
+    /// Writes 8-bit disparities, `round(scale d)`, at least 1 where valid. Returns the number of valid values that do not fit, which are
+    /// stored as invalid.
     ///
     /// # Errors
     /// As [`write_png`].
     pub fn write(path: impl AsRef<Path>, disparity: ImageView<'_, f32, 1>, scale: f64) -> Result<usize, IoError> {
-        let (stored, lost) = stored(disparity, scale, f64::from(u8::MAX));
+        let (stored, unrepresentable) = quantize(disparity, scale, f64::from(u8::MAX));
         write_png(path, stored.map(|[v]| [v as u8]).view())?;
-        Ok(lost)
+        Ok(unrepresentable)
     }
 }
 
-/// The values of a gray picture over `scale`; without one, of a 16-bit picture over 256.
+/// Decodes a gray image to its values divided by `scale`; without a scale, a 16-bit image by 256.
 pub(crate) fn decode(bytes: &[u8], scale: Option<f64>) -> Result<GrayF32, FormatError> {
     let pixels = decode_image(bytes, &ReadOptions::default())?.pixels;
     let scale = match (scale, &pixels) {
         (Some(scale), _) if scale > 0.0 && scale.is_finite() => scale,
         (Some(scale), _) => return Err(FormatError::corrupt(NAME, format!("the scale {scale} is not positive"))),
         (None, Pixels::Gray16(_)) => 256.0,
-        (None, _) => return Err(FormatError::missing(NAME, "scale: 8 bits do not tell it")),
+        (None, _) => return Err(FormatError::missing(NAME, "scale, which an 8-bit file does not define")),
     };
     match pixels {
-        Pixels::Gray16(image) => Ok(values(&image, 1.0 / scale)),
-        Pixels::Gray8(image) => Ok(values(&image, 1.0 / scale)),
-        // Some tools save gray as three equal channels.
+        Pixels::Gray16(image) => Ok(dequantize(&image, 1.0 / scale)),
+        Pixels::Gray8(image) => Ok(dequantize(&image, 1.0 / scale)),
+        // Some tools write gray as three equal channels.
         Pixels::Rgb8(image) if image.pixels().all(|[r, g, b]| r == g && g == b) => {
-            Ok(values(&image.map(|[v, _, _]| [v]), 1.0 / scale))
+            Ok(dequantize(&image.map(|[v, _, _]| [v]), 1.0 / scale))
         }
-        _ => Err(FormatError::unsupported(NAME, "a color picture")),
+        _ => Err(FormatError::unsupported(NAME, "a color image")),
     }
 }
 
 fn read_16(path: &Path) -> Result<Image<u16, 1>, IoError> {
     match read_image(path)?.pixels {
         Pixels::Gray16(image) => Ok(image),
-        Pixels::Gray8(_) => {
-            Err(IoError::reading(path, FormatError::unsupported("16-bit PNG", "a picture of 8 bits in its place")))
-        }
-        _ => Err(IoError::reading(path, FormatError::unsupported("16-bit PNG", "a color picture in its place"))),
+        Pixels::Gray8(_) => Err(IoError::reading(path, FormatError::unsupported("16-bit PNG", "an image of 8 bits"))),
+        _ => Err(IoError::reading(path, FormatError::unsupported("16-bit PNG", "a color image"))),
     }
 }
 
-fn values<T: cv_core::Sample + Into<f64>>(image: &Image<T, 1>, scale: f64) -> GrayF32 {
+fn dequantize<T: cv_core::Sample + Into<f64>>(image: &Image<T, 1>, scale: f64) -> GrayF32 {
     image.map(|[v]| {
         let v: f64 = v.into();
         [if v == 0.0 { f32::NAN } else { (v * scale) as f32 }]
@@ -121,26 +119,26 @@ fn values<T: cv_core::Sample + Into<f64>>(image: &Image<T, 1>, scale: f64) -> Gr
 }
 
 fn write_16(path: &Path, view: ImageView<'_, f32, 1>, scale: f64) -> Result<usize, IoError> {
-    let (stored, lost) = stored(view, scale, f64::from(u16::MAX));
+    let (stored, unrepresentable) = quantize(view, scale, f64::from(u16::MAX));
     write_png(path, stored.view())?;
-    Ok(lost)
+    Ok(unrepresentable)
 }
 
-/// `round(scale · v)` within 1 to `most`, 0 where unknown; and how many known values do not fit.
-fn stored(view: ImageView<'_, f32, 1>, scale: f64, most: f64) -> (Image<u16, 1>, usize) {
+/// Quantizes to `round(scale · v)` within 1 to `max`, 0 where invalid; returns also the number of valid values that do not fit.
+fn quantize(view: ImageView<'_, f32, 1>, scale: f64, max: f64) -> (Image<u16, 1>, usize) {
     let mut image = Image::<u16, 1>::new(view.width(), view.height(), [0]);
-    let mut lost = 0;
+    let mut unrepresentable = 0;
     for y in 0..view.height() {
         for (out, &v) in image.row_mut(y).iter_mut().zip(view.row(y)) {
             let scaled = (f64::from(v) * scale).round();
-            if v >= 0.0 && scaled <= most {
+            if v >= 0.0 && scaled <= max {
                 *out = scaled.max(1.0) as u16;
             } else if !v.is_nan() {
-                lost += 1;
+                unrepresentable += 1;
             }
         }
     }
-    (image, lost)
+    (image, unrepresentable)
 }
 
 #[cfg(test)]
@@ -149,7 +147,7 @@ mod tests {
     use crate::write_png;
 
     #[test]
-    fn kitti_keeps_a_256th_and_counts_what_does_not_fit() {
+    fn kitti_quantizes_to_1_256_px_and_counts_unrepresentable_values() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("d.png");
         let known = [0.0f32, 1.0, 127.25, 255.0, 65535.0 / 256.0];
@@ -158,17 +156,17 @@ mod tests {
         let image = GrayF32::from_vec(10, 1, data).unwrap();
         assert_eq!(kitti::write(&path, image.view()).unwrap(), 4);
         let back = kitti::read(&path).unwrap();
-        // Half a step of 1/256, but a known zero is stored as one step.
+        // Half a step of 1/256, but a valid zero is stored as one step.
         assert!(known.iter().zip(back.row(0)).all(|(a, b)| (a - b).abs() <= 1.0 / 256.0));
         assert_eq!(back.row(0)[1..4], known[1..4]);
         assert!(back.row(0)[5..].iter().all(|v| v.is_nan()));
-        // The very numbers of the format's definition.
+        // The stored values by the format's definition.
         let Pixels::Gray16(raw) = read_image(&path).unwrap().pixels else { panic!("16 bits") };
         assert_eq!(raw.row(0), [1, 256, 32576, 65280, 65535, 0, 0, 0, 0, 0]);
     }
 
     #[test]
-    fn millimeters_and_scaled_bytes() {
+    fn millimeters_and_scaled_disparities() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("d.png");
         let image = GrayF32::from_vec(4, 1, vec![0.5, 65.535, 65.6, f32::NAN]).unwrap();

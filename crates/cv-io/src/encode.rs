@@ -1,4 +1,4 @@
-//! Writing pictures.
+//! Encoding images as PNG, JPEG and TIFF.
 
 use std::path::Path;
 
@@ -6,14 +6,14 @@ use cv_core::ImageView;
 use jpeg_encoder::JpegColorType;
 use png::{BitDepth, ColorType, Compression, Filter};
 
-use crate::encode_tiff::{Samples, tiff_file};
+use crate::encode_tiff::{Samples, encode_samples};
 use crate::files::write_bytes;
 use crate::{FormatError, IoError, Metadata};
 
-/// Width, height, color type, bits and the rows, big-endian, without padding.
+/// Width, height, color type, bit depth, and the samples row-major, big-endian, without padding.
 type Parts = (usize, usize, ColorType, BitDepth, Vec<u8>);
 
-/// What a PNG can hold here: views of 1, 3 or 4 channels of `u8` or `u16`, and masks.
+/// Image types that can be written as PNG: views of 1, 3 or 4 channels of `u8` or `u16`, and masks.
 pub trait PngPixels: sealed::Sealed {
     #[doc(hidden)]
     fn parts(&self) -> Parts;
@@ -45,16 +45,16 @@ png_pixels!(u16, 1, Grayscale, Sixteen, |out, row| out.extend(row.iter().flat_ma
 png_pixels!(u16, 3, Rgb, Sixteen, |out, row| out.extend(row.iter().flat_map(|v| v.to_be_bytes())));
 png_pixels!(u16, 4, Rgba, Sixteen, |out, row| out.extend(row.iter().flat_map(|v| v.to_be_bytes())));
 
-/// The bytes of a PNG file.
+/// Encodes a PNG file.
 ///
 /// # Errors
 /// [`FormatError::NotRepresentable`] for an empty picture or one whose sides exceed 2³¹ − 1.
 pub fn encode_png(view: impl PngPixels) -> Result<Vec<u8>, FormatError> {
-    png_file(view.parts(), &Metadata::default(), None)
+    encode_png_parts(view.parts(), &Metadata::default(), None)
 }
 
-/// The encoders are compiled once, not where they are called and not for each kind of pixel.
-fn png_file(
+/// Not generic, so that the encoder is compiled once and not for each pixel type.
+fn encode_png_parts(
     (width, height, color, depth, pixels): Parts,
     metadata: &Metadata,
     dpi: Option<f64>,
@@ -90,40 +90,40 @@ pub fn write_png(path: impl AsRef<Path>, view: impl PngPixels) -> Result<(), IoE
     write_png_with(path, view, &Metadata::default())
 }
 
-/// [`write_png`] of a picture made of one with this metadata. Kept are the EXIF block, without thumbnail, turn and what else no longer holds, and
-/// a color profile for as many channels.
+/// As [`write_png`] for an image derived from one with this metadata. Writes the EXIF block, without thumbnail, orientation and other tags that no
+/// longer apply, and a color profile for the same number of channels.
 ///
 /// # Errors
 /// As [`write_png`].
 pub fn write_png_with(path: impl AsRef<Path>, view: impl PngPixels, metadata: &Metadata) -> Result<(), IoError> {
     let path = path.as_ref();
-    write_bytes(path, &png_file(view.parts(), metadata, None).map_err(|reason| IoError::writing(path, reason))?)
+    write_bytes(path, &encode_png_parts(view.parts(), metadata, None).map_err(|reason| IoError::writing(path, reason))?)
 }
 
-/// [`write_png`] of a picture to print, with its resolution in dots per inch: programs that print it know its size on paper.
+/// As [`write_png`] for printing, with the resolution in dots per inch, which defines the size on paper.
 ///
 /// # Errors
 /// As [`write_png`].
 pub fn write_png_to_print(path: impl AsRef<Path>, view: impl PngPixels, dpi: f64) -> Result<(), IoError> {
     let path = path.as_ref();
-    let bytes = png_file(view.parts(), &Metadata::default(), Some(dpi));
+    let bytes = encode_png_parts(view.parts(), &Metadata::default(), Some(dpi));
     write_bytes(path, &bytes.map_err(|reason| IoError::writing(path, reason))?)
 }
 
-/// What a JPEG can hold here: views of 1 or 3 channels of bytes.
+/// Image types that can be written as JPEG: 8-bit views of 1 or 3 channels.
 pub trait JpegPixels: PngPixels {}
 impl JpegPixels for ImageView<'_, u8, 1> {}
 impl JpegPixels for ImageView<'_, u8, 3> {}
 
-/// The bytes of a JPEG file at `quality` 1 to 100 (95 keeps what an eye can see). Color is not subsampled from 90 on.
+/// Encodes a JPEG file at `quality` 1 to 100 (95 is visually lossless). Chroma is not subsampled from 90 on.
 ///
 /// # Errors
 /// [`FormatError::NotRepresentable`] for an empty picture or one with a side above 65535.
 pub fn encode_jpeg(view: impl JpegPixels, quality: u8) -> Result<Vec<u8>, FormatError> {
-    jpeg_file(view.parts(), quality, &Metadata::default())
+    encode_jpeg_parts(view.parts(), quality, &Metadata::default())
 }
 
-fn jpeg_file(
+fn encode_jpeg_parts(
     (width, height, color, _, pixels): Parts,
     quality: u8,
     metadata: &Metadata,
@@ -137,7 +137,7 @@ fn jpeg_file(
     let mut encoder = jpeg_encoder::Encoder::new(&mut bytes, quality.clamp(1, 100));
     let fail = |e: jpeg_encoder::EncodingError| FormatError::corrupt("JPEG", e.to_string());
     let exif = metadata.exif_for(w.into(), h.into()).map(|block| [&b"Exif\0\0"[..], &block].concat());
-    // A segment holds no more; a camera's block without its thumbnail is far below.
+    // The maximum of a segment; EXIF blocks without thumbnail are far smaller.
     if let Some(exif) = exif.filter(|exif| exif.len() <= 65_533) {
         encoder.add_app_segment(1, exif).map_err(fail)?;
     }
@@ -148,7 +148,7 @@ fn jpeg_file(
     Ok(bytes)
 }
 
-/// Pixels as the encoder takes them. (Its own `encode` is compiled for nine kinds of pixels.)
+/// Pixels for the encoder. (Its own `encode` would be compiled for nine pixel types.)
 struct JpegRows<'a> {
     width: u16,
     height: u16,
@@ -187,8 +187,8 @@ impl jpeg_encoder::ImageBuffer for JpegRows<'_> {
     }
 }
 
-/// Quality of JPEG files.
-const QUALITY: u8 = 95;
+/// Quality of JPEG files, 1 to 100.
+const JPEG_QUALITY: u8 = 95;
 
 /// Writes a JPEG at quality 95.
 ///
@@ -196,43 +196,45 @@ const QUALITY: u8 = 95;
 /// As [`encode_jpeg`] and [`crate::write_atomic`].
 pub fn write_jpeg(path: impl AsRef<Path>, view: impl JpegPixels) -> Result<(), IoError> {
     let path = path.as_ref();
-    write_bytes(path, &encode_jpeg(view, QUALITY).map_err(|reason| IoError::writing(path, reason))?)
+    write_bytes(path, &encode_jpeg(view, JPEG_QUALITY).map_err(|reason| IoError::writing(path, reason))?)
 }
 
-/// The bytes of a TIFF file, packed by Deflate.
+/// Encodes a TIFF file with Deflate compression.
 ///
 /// # Errors
 /// [`FormatError::NotRepresentable`] for an empty picture or one of more than 4 GB.
 pub fn encode_tiff(view: impl PngPixels) -> Result<Vec<u8>, FormatError> {
-    tiff_of(view.parts(), &Metadata::default())
+    encode_tiff_parts(view.parts(), &Metadata::default())
 }
 
-fn tiff_of((width, height, color, depth, bytes): Parts, metadata: &Metadata) -> Result<Vec<u8>, FormatError> {
+fn encode_tiff_parts((width, height, color, depth, bytes): Parts, metadata: &Metadata) -> Result<Vec<u8>, FormatError> {
     let depth = if depth == BitDepth::Sixteen { 2 } else { 1 };
-    tiff_file(&Samples { width, height, channels: color.samples(), depth, bytes: &bytes }, metadata)
+    encode_samples(&Samples { width, height, channels: color.samples(), depth, bytes: &bytes }, metadata)
 }
 
-/// Writes a picture in the format that the file name's ending asks for: `.png`, `.tif` or `.tiff`, or `.jpg` or `.jpeg`. Of `metadata` is kept what [`write_png_with`]
-/// keeps.
+/// Writes an image in the format of the file name's extension: `.png`, `.tif` or `.tiff`, or `.jpg` or `.jpeg`. Metadata are written as by
+/// [`write_png_with`].
 ///
 /// # Errors
-/// [`FormatError::Unsupported`] for another ending; [`FormatError::NotRepresentable`] for a JPEG of 16 bits or with opacity; else as [`encode_png`], [`encode_tiff`],
-/// [`encode_jpeg`] and [`crate::write_atomic`].
+/// [`FormatError::Unsupported`] for another extension; [`FormatError::NotRepresentable`] for a JPEG of 16 bits or with alpha; else as
+/// [`encode_png`], [`encode_tiff`], [`encode_jpeg`] and [`crate::write_atomic`].
 pub fn write_image(path: impl AsRef<Path>, view: impl PngPixels, metadata: &Metadata) -> Result<(), IoError> {
     let path = path.as_ref();
-    let ending = path.extension().map(|e| e.to_string_lossy().to_lowercase());
+    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
     let parts = view.parts();
-    let bytes = match ending.as_deref() {
-        Some("png") => png_file(parts, metadata, None),
-        Some("tif" | "tiff") => tiff_of(parts, metadata),
+    let bytes = match extension.as_deref() {
+        Some("png") => encode_png_parts(parts, metadata, None),
+        Some("tif" | "tiff") => encode_tiff_parts(parts, metadata),
         Some("jpg" | "jpeg") if parts.3 == BitDepth::Eight && parts.2 != ColorType::Rgba => {
-            jpeg_file(parts, QUALITY, metadata)
+            encode_jpeg_parts(parts, JPEG_QUALITY, metadata)
         }
         Some("jpg" | "jpeg") => {
-            let what = if parts.3 == BitDepth::Eight { "opacity" } else { "samples of 16 bits" };
+            let what = if parts.3 == BitDepth::Eight { "alpha" } else { "samples of 16 bits" };
             Err(FormatError::NotRepresentable { format: "JPEG", what: what.to_owned() })
         }
-        _ => Err(FormatError::unsupported("the file name", "an ending other than .png, .tif, .tiff, .jpg and .jpeg")),
+        _ => {
+            Err(FormatError::unsupported("the file name", "an extension other than .png, .tif, .tiff, .jpg and .jpeg"))
+        }
     };
     write_bytes(path, &bytes.map_err(|reason| IoError::writing(path, reason))?)
 }

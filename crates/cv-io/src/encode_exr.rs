@@ -1,16 +1,17 @@
-//! Writing OpenEXR: one layer of red, green and blue of 32 bits, in blocks of 16 rows packed by zlib ("OpenEXR File Layout", and `ImfZip.cpp` for the order of bytes in a block).
+//! Writing OpenEXR: one layer of 32-bit float RGB with ZIP compression, in blocks of 16 rows ("OpenEXR File Layout", and `ImfZip.cpp` for the order of
+//! bytes in a block).
 
 use crate::files::write_bytes;
 use crate::{FormatError, IoError};
 use cv_core::ImageView;
 use std::path::Path;
 
-/// Rows of a block of ZIP compression.
-const ROWS: usize = 16;
-/// How hard Deflate tries, of 10.
-const EFFORT: u8 = 3;
+/// Rows per block of ZIP compression.
+const ROWS_PER_BLOCK: usize = 16;
+/// Deflate compression level, 0 to 10.
+const COMPRESSION_LEVEL: u8 = 3;
 
-/// The bytes of an OpenEXR file: red, green and blue of linear light in 32-bit floats, 1 for the white of a display. O(pixels).
+/// Encodes an OpenEXR file of linear RGB in 32-bit floats, 1 for display white. O(pixels).
 ///
 /// # Errors
 /// [`FormatError::NotRepresentable`] for an empty picture or one whose sides exceed 2³¹ − 1.
@@ -29,7 +30,7 @@ pub fn encode_exr(view: ImageView<'_, f32, 3>) -> Result<Vec<u8>, FormatError> {
             [name.as_bytes(), b"\0", kind.as_bytes(), b"\0", &(value.len() as i32).to_le_bytes(), value].concat(),
         );
     };
-    // In the order of their names, which is that of their rows: floats, one sample a pixel.
+    // Channels in the order of their names, as their rows: floats, not subsampled.
     let mut channels = Vec::new();
     for name in [b'B', b'G', b'R'] {
         channels.extend([name, 0]);
@@ -46,24 +47,24 @@ pub fn encode_exr(view: ImageView<'_, f32, 3>) -> Result<Vec<u8>, FormatError> {
     attribute("screenWindowCenter", "v2f", &[0; 8]);
     attribute("screenWindowWidth", "float", &1_f32.to_le_bytes());
     bytes.push(0);
-    let blocks = height.div_ceil(ROWS);
+    let blocks = height.div_ceil(ROWS_PER_BLOCK);
     let table = bytes.len();
     bytes.resize(table + 8 * blocks, 0);
     let (mut plain, mut ordered) = (Vec::new(), Vec::<u8>::new());
     for block in 0..blocks {
         plain.clear();
-        let rows = ROWS * block..(ROWS * (block + 1)).min(height);
+        let rows = ROWS_PER_BLOCK * block..(ROWS_PER_BLOCK * (block + 1)).min(height);
         for y in rows.clone() {
             let row = view.row(y).as_chunks::<3>().0;
             [2, 1, 0].iter().for_each(|&c| plain.extend(row.iter().flat_map(|pixel| pixel[c].to_le_bytes())));
         }
-        // Bytes of even places, then those of odd ones, each as the difference to the one before.
+        // Even bytes, then odd ones, each as the difference to its predecessor.
         ordered.clear();
         ordered.extend(plain.iter().step_by(2).chain(plain.iter().skip(1).step_by(2)));
         for i in (1..ordered.len()).rev() {
             ordered[i] = ordered[i].wrapping_sub(ordered[i - 1]).wrapping_add(128);
         }
-        let packed = miniz_oxide::deflate::compress_to_vec_zlib(&ordered, EFFORT);
+        let packed = miniz_oxide::deflate::compress_to_vec_zlib(&ordered, COMPRESSION_LEVEL);
         let data = if packed.len() < plain.len() { &packed } else { &plain };
         let offset = bytes.len() as u64;
         bytes[table + 8 * block..][..8].copy_from_slice(&offset.to_le_bytes());
@@ -89,12 +90,12 @@ mod tests {
     use cv_core::RgbF32;
 
     #[test]
-    fn an_empty_picture_is_refused() {
+    fn an_empty_image_is_refused() {
         let empty = RgbF32::new(0, 4, [0.0; 3]);
         assert!(matches!(encode_exr(empty.view()), Err(FormatError::NotRepresentable { format: "OpenEXR", .. })));
     }
 
-    /// By the layout of the format: the first sample of the last block, unpacked by hand.
+    /// Decodes the last block by hand, from the layout of the format.
     #[test]
     fn the_layout_is_that_of_the_format() {
         let image = RgbF32::from_fn(5, 20, |x, y| [x as f32 + 0.5, y as f32 * 100.0, 1e-3]);
@@ -122,7 +123,7 @@ mod tests {
 
     #[cfg(feature = "exr")]
     #[test]
-    fn what_is_written_is_read() {
+    fn files_round_trip() {
         for (width, height) in [(1, 1), (7, 16), (5, 37)] {
             let image = RgbF32::from_fn(width, height, |x, y| {
                 [x as f32 * 1e4, y as f32 + 0.25, ((x * 31 + y * 17) % 7) as f32 * 1e-5]

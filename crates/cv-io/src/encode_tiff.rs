@@ -1,38 +1,39 @@
-//! Writing TIFF: strips packed by Deflate after horizontal differencing (TIFF 6.0, section 14, and Adobe's technical note on Deflate), little-endian.
+//! Writing TIFF: strips with Deflate compression after horizontal differencing (TIFF 6.0, section 14, and Adobe's technical note on Deflate),
+//! little-endian.
 
 use crate::{FormatError, Metadata};
 use exif::experimental::Writer;
 use exif::{Context, Field, In, Tag, Value};
 use std::io::Cursor;
 
-/// Bytes of a strip before it is packed, about.
-const STRIP: usize = 1 << 18;
-/// How hard Deflate tries, of 10: photographs of 16 bits shrink little more above.
-const EFFORT: u8 = 3;
+/// Approximate bytes of a strip before compression.
+const STRIP_BYTES: usize = 1 << 18;
+/// Deflate compression level, 0 to 10: higher levels shrink 16-bit photographs little more.
+const COMPRESSION_LEVEL: u8 = 3;
 
-/// Rows of samples that belong together: big-endian, without padding.
+/// The samples of an image: row-major, big-endian, without padding.
 pub(crate) struct Samples<'a> {
     pub(crate) width: usize,
     pub(crate) height: usize,
-    /// 1 (gray), 3 (RGB) or 4 (RGB and opacity).
+    /// 1 (gray), 3 (RGB) or 4 (RGB and alpha).
     pub(crate) channels: usize,
-    /// Bytes of a sample: 1 or 2.
+    /// Bytes per sample: 1 or 2.
     pub(crate) depth: usize,
     pub(crate) bytes: &'a [u8],
 }
 
-/// The bytes of a TIFF file.
+/// Encodes a TIFF file.
 ///
 /// # Errors
-/// [`FormatError::NotRepresentable`] for an empty picture and for more than offsets of 32 bits reach.
-pub(crate) fn tiff_file(samples: &Samples<'_>, metadata: &Metadata) -> Result<Vec<u8>, FormatError> {
+/// [`FormatError::NotRepresentable`] for an empty image, and for more bytes than 32-bit offsets can address.
+pub(crate) fn encode_samples(samples: &Samples<'_>, metadata: &Metadata) -> Result<Vec<u8>, FormatError> {
     let Samples { width, height, channels, depth, bytes } = *samples;
     let side = |n: usize| u32::try_from(n).ok().filter(|&n| n > 0);
     let (Some(w), Some(h)) = (side(width), side(height)) else {
         return Err(FormatError::NotRepresentable { format: "TIFF", what: format!("a picture of {width}×{height}") });
     };
     let row = width * channels * depth;
-    let rows = (STRIP / row).clamp(1, height);
+    let rows = (STRIP_BYTES / row).clamp(1, height);
     let mut strips = Vec::with_capacity(height.div_ceil(rows));
     let mut plain = Vec::with_capacity(rows * row);
     for strip in bytes.chunks(rows * row) {
@@ -40,10 +41,10 @@ pub(crate) fn tiff_file(samples: &Samples<'_>, metadata: &Metadata) -> Result<Ve
         plain.extend_from_slice(strip);
         plain
             .chunks_exact_mut(row)
-            .for_each(|row| if depth == 1 { differences(row, channels) } else { differences_of_words(row, channels) });
-        strips.push(miniz_oxide::deflate::compress_to_vec_zlib(&plain, EFFORT));
+            .for_each(|row| if depth == 1 { difference_u8(row, channels) } else { difference_u16(row, channels) });
+        strips.push(miniz_oxide::deflate::compress_to_vec_zlib(&plain, COMPRESSION_LEVEL));
     }
-    // Fields take far less than the last tenth.
+    // Fields take far less than a tenth.
     if strips.iter().map(Vec::len).sum::<usize>() as u64 > u64::from(u32::MAX) / 10 * 9 {
         return Err(FormatError::NotRepresentable { format: "TIFF", what: "more than 4 GB".to_owned() });
     }
@@ -63,7 +64,7 @@ pub(crate) fn tiff_file(samples: &Samples<'_>, metadata: &Metadata) -> Result<Ve
         numbers(Tag(Context::Tiff, 317), &[2]),
     ]);
     if channels == 4 {
-        // Opacity that the colors are not multiplied by.
+        // Unassociated alpha.
         fields.push(numbers(Tag(Context::Tiff, 338), &[2]));
     }
     if let Some(profile) = metadata.icc_for(channels) {
@@ -79,15 +80,15 @@ pub(crate) fn tiff_file(samples: &Samples<'_>, metadata: &Metadata) -> Result<Ve
     Ok(file.into_inner())
 }
 
-/// Each sample less that of the pixel before it.
-fn differences(row: &mut [u8], channels: usize) {
+/// Applies horizontal differencing to 8-bit samples.
+fn difference_u8(row: &mut [u8], channels: usize) {
     for i in (channels..row.len()).rev() {
         row[i] = row[i].wrapping_sub(row[i - channels]);
     }
 }
 
-/// The same of samples of two bytes, which become little-endian.
-fn differences_of_words(row: &mut [u8], channels: usize) {
+/// Applies horizontal differencing to 16-bit samples and converts them to little-endian.
+fn difference_u16(row: &mut [u8], channels: usize) {
     let words = row.as_chunks_mut::<2>().0;
     for i in (0..words.len()).rev() {
         let before = i.checked_sub(channels).map_or(0, |j| u16::from_be_bytes(words[j]));

@@ -1,24 +1,24 @@
-//! What can go wrong between a file and its meaning.
+//! Errors of reading and writing files.
 
 use std::fmt;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use crate::sniff::PICTURES;
+use crate::format_detection::IMAGE_FORMATS;
 
 const CONVERT: &str = "convert it, for example to PNG or JPEG";
 
-/// Why bytes could not be understood, or values not be stored. Carries no path: see [`IoError`].
+/// Why a file's content could not be decoded, or values could not be encoded. Without the path: see [`IoError`].
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum FormatError {
-    /// The operating system refused.
+    /// The operating system reported an error.
     #[error("{0}")]
     Os(#[from] io::Error),
-    /// There are no bytes at all.
+    /// The file has no bytes.
     #[error("the file is empty (0 bytes)")]
     Empty,
-    /// The first bytes belong to no format this crate reads.
+    /// The first bytes are those of no format that this crate reads.
     #[error("the first bytes are not those of {expected}")]
     UnknownFormat {
         /// The formats that would have been accepted.
@@ -32,7 +32,7 @@ pub enum FormatError {
         /// The variant or feature.
         what: String,
     },
-    /// A picture that this crate does not read, or something in the place of one.
+    /// An image format or variant that this crate does not read, or a file that is no image.
     #[error("{format}: {what} is not supported")]
     UnsupportedPicture {
         /// Name of the format.
@@ -54,7 +54,7 @@ pub enum FormatError {
         /// What is wrong.
         reason: String,
     },
-    /// A line of a text file does not mean what it must.
+    /// A line of a text file is invalid.
     #[error("line {line}: {reason}")]
     Line {
         /// Counted from 1.
@@ -62,7 +62,7 @@ pub enum FormatError {
         /// What is wrong.
         reason: String,
     },
-    /// The header asks for more pixels than the limit allows.
+    /// The image has more pixels, by its header, than the limit.
     #[error("{width}×{height} is more than the limit of {limit} pixels")]
     TooManyPixels {
         /// Width by the header.
@@ -72,10 +72,10 @@ pub enum FormatError {
         /// The limit in pixels.
         limit: u64,
     },
-    /// The file, or what it unpacks to, is larger than the limit.
+    /// The file, or its uncompressed content, is larger than the limit.
     #[error("{bytes} bytes are more than the limit of {limit}")]
     TooManyBytes {
-        /// Size asked for.
+        /// Size in bytes.
         bytes: u64,
         /// The limit in bytes.
         limit: u64,
@@ -83,24 +83,24 @@ pub enum FormatError {
     /// Reading the file would take more memory than allowed.
     #[error("{}it takes {} MiB of memory to read, {} MiB are allowed", sized(*size), needed.div_ceil(1 << 20), allowed >> 20)]
     TooMuchMemory {
-        /// The most bytes held at one time, by the header: the file, what decoding holds, and the result.
+        /// Peak memory in bytes, by the header: the file, the decoder's working memory, and the result.
         needed: u64,
         /// Bytes allowed.
         allowed: u64,
-        /// Width and height in pixels by the header, of a picture or map.
+        /// Width and height in pixels by the header, of an image or map.
         size: Option<(u64, u64)>,
     },
-    /// An archive that does not hold the number of arrays wanted.
-    #[error("{format}: it holds {got} arrays, not {wanted}")]
+    /// An archive does not have the expected number of arrays.
+    #[error("{format}: it has {got} arrays, not {wanted}")]
     ArrayCount {
         /// Name of the format.
         format: &'static str,
         /// Arrays in the archive, by its directory.
         got: usize,
-        /// Arrays wanted.
+        /// Expected number of arrays.
         wanted: usize,
     },
-    /// A value that the format cannot hold.
+    /// A value that the format cannot represent.
     #[error("{format} cannot hold {what}")]
     NotRepresentable {
         /// Name of the format.
@@ -139,7 +139,7 @@ impl FormatError {
         Self::Missing { format, what: what.into() }
     }
 
-    /// What a person might try next, where there is something to say.
+    /// Suggests a remedy, where there is one.
     pub fn hint(&self) -> Option<&'static str> {
         match self {
             Self::Os(error) => match error.kind() {
@@ -151,26 +151,26 @@ impl FormatError {
             },
             Self::Empty | Self::Truncated { .. } => Some("copy or export the file again"),
             Self::UnsupportedPicture { .. } => Some(CONVERT),
-            Self::UnknownFormat { expected } if *expected == PICTURES => Some(CONVERT),
-            Self::TooManyPixels { .. } => Some("make the image smaller, or raise the limit if the size is meant"),
-            Self::TooManyBytes { .. } => Some("raise the limit if the size is meant"),
+            Self::UnknownFormat { expected } if *expected == IMAGE_FORMATS => Some(CONVERT),
+            Self::TooManyPixels { .. } => Some("make the image smaller, or raise the limit if the size is intended"),
+            Self::TooManyBytes { .. } => Some("raise the limit if the size is intended"),
             Self::TooMuchMemory { .. } => Some("make it smaller, or allow more memory"),
             _ => None,
         }
     }
 }
 
-/// The size in front of a sentence, where there is one.
+/// Formats the size as a prefix of a message.
 fn sized(size: Option<(u64, u64)>) -> String {
     size.map_or_else(String::new, |(width, height)| format!("{width}×{height} pixels: "))
 }
 
-/// A failure to read or write one file: which, why, and what to try.
+/// A failure to read or write a file: path, reason and remedy.
 #[derive(Debug)]
 pub struct IoError {
     /// The file.
     pub path: PathBuf,
-    /// True where it was being written.
+    /// True for writing, false for reading.
     pub writing: bool,
     /// The reason.
     pub reason: FormatError,

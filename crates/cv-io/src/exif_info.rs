@@ -1,44 +1,44 @@
-//! What a camera wrote beside the picture: which way is up, the focal length, and where it was.
+//! EXIF metadata: orientation, focal length, camera model and GPS position.
 
 use crate::sensor_width::sensor_width;
 use cv_core::GeodeticPoint;
 use exif::{Context, Exif, In, Tag, Value};
 
-/// Facts from a picture's EXIF block, as far as geometry needs them.
+/// EXIF metadata of an image that are relevant to geometry.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ExifInfo {
     /// The orientation tag, 1 to 8; 1 where there is none. Already applied to the pixels.
     pub orientation: u8,
-    /// The focal length, where the tags allow one in pixels.
+    /// The focal length, where the tags determine it in pixels.
     pub focal: Option<ExifFocal>,
     /// Maker and model, as written.
     pub camera: Option<String>,
-    /// Where it was taken, where both coordinates are told.
+    /// GPS position, where both coordinates are given.
     pub gps: Option<ExifGps>,
 }
 
-/// Where a picture was taken.
+/// GPS position of the camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ExifGps {
-    /// Radians, north positive (WGS 84; the tag of another datum is not looked at).
+    /// Radians, north positive (WGS 84; a tag with another datum is ignored).
     pub latitude: f64,
     /// Radians, east positive.
     pub longitude: f64,
-    /// Meters above the sea, or above the ellipsoid where the camera says so (EXIF 3.0); receivers often leave that open.
+    /// Meters above sea level, or above the ellipsoid by the reference tag of EXIF 3.0; many receivers do not specify it.
     pub altitude: Option<f64>,
-    /// Dilution of precision: the error of the position is about this times that of a satellite's distance, some meters.
+    /// Dilution of precision (DOP): factor from the ranging error, some meters, to the position error.
     pub dilution: Option<f64>,
 }
 
 impl ExifGps {
-    /// The position; one without an altitude is at 0.
+    /// Returns the position; a missing altitude is 0.
     pub fn position(&self) -> GeodeticPoint {
         let Self { latitude, longitude, altitude, .. } = *self;
         GeodeticPoint { latitude, longitude, altitude: altitude.unwrap_or(0.0) }
     }
 }
 
-/// A focal length in pixels of the picture as it was read, and how it was found.
+/// A focal length in pixels of the decoded image, and its source.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ExifFocal {
     /// Focal length in pixels.
@@ -50,20 +50,20 @@ pub struct ExifFocal {
 /// The tags a focal length was computed from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FocalSource {
-    /// The focal length in millimeters and the pixels per unit of the sensor (FocalPlaneXResolution). As good as the
-    /// tags: commonly within 1 %, though focusing near lengthens it.
+    /// The focal length in millimeters and the pixels per unit of the sensor (FocalPlaneXResolution). Typically accurate to
+    /// 1 %, though focusing near increases the focal length.
     SensorResolution,
-    /// The 35 mm equivalent (FocalLengthIn35mmFilm), by equal diagonals as CIPA DCG-001 has it. It is a whole number
-    /// of millimeters, so a wide lens may be off by 2 %.
+    /// The 35 mm equivalent (FocalLengthIn35mmFilm), by equal diagonals (CIPA DCG-001). Rounded to a whole number
+    /// of millimeters: an error up to 2 % for a wide lens.
     Equivalent35mm,
-    /// The focal length in millimeters and the width of the sensor by the camera's model, from a table. The picture is taken to be the camera's whole one.
+    /// The focal length in millimeters and the sensor width of the camera model, from a table. Assumes an uncropped image.
     SensorTable,
 }
 
-/// Diagonal of the 36 × 24 mm frame.
-const DIAGONAL_35MM: f64 = 43.266_615_305_567_87;
-/// The widths of real sensors, in mm, from a small telephone's to larger than full frame.
-const SENSOR_WIDTHS: std::ops::RangeInclusive<f64> = 2.0..=60.0;
+/// Diagonal of the 36 × 24 mm frame in millimeters.
+const DIAGONAL_35MM_FORMAT: f64 = 43.266_615_305_567_87;
+/// Plausible sensor widths in millimeters, from mobile phones to larger than full frame.
+const SENSOR_WIDTH_RANGE_MM: std::ops::RangeInclusive<f64> = 2.0..=60.0;
 
 impl Default for ExifInfo {
     fn default() -> Self {
@@ -72,9 +72,9 @@ impl Default for ExifInfo {
 }
 
 impl ExifInfo {
-    /// From the raw EXIF block (TIFF structure) of a picture of `width` × `height` stored pixels.
+    /// Parses the raw EXIF block (TIFF structure) of an image of `width` × `height` stored pixels.
     ///
-    /// Damaged blocks give what could be read: a bad tag never costs the picture.
+    /// Damaged blocks are parsed as far as possible; they are never an error.
     pub(crate) fn parse(block: Vec<u8>, width: usize, height: usize) -> Self {
         let mut reader = exif::Reader::new();
         reader.continue_on_error(true);
@@ -95,7 +95,7 @@ impl ExifInfo {
     }
 }
 
-/// True for a TIFF whose first image is a preview: a camera's raw file (NEF, ARW, DNG).
+/// Whether a TIFF's first image is a preview, as in camera raw files (NEF, ARW, DNG).
 pub(crate) fn is_raw_preview(bytes: &[u8]) -> bool {
     const NEW_SUBFILE_TYPE: Tag = Tag(Context::Tiff, 254);
     const DNG_VERSION: Tag = Tag(Context::Tiff, 50706);
@@ -112,7 +112,7 @@ fn text(exif: &Exif, tag: Tag) -> Option<String> {
     }
 }
 
-fn number(exif: &Exif, tag: Tag) -> Option<f64> {
+fn positive_number(exif: &Exif, tag: Tag) -> Option<f64> {
     let value = match &exif.get_field(tag, In::PRIMARY)?.value {
         Value::Rational(v) => v.first()?.to_f64(),
         Value::SRational(v) => v.first()?.to_f64(),
@@ -124,7 +124,7 @@ fn number(exif: &Exif, tag: Tag) -> Option<f64> {
 fn gps(exif: &Exif) -> Option<ExifGps> {
     let altitude = || {
         let Value::Rational(v) = &exif.get_field(Tag::GPSAltitude, In::PRIMARY)?.value else { return None };
-        // Below the sea by 1, below the ellipsoid by 3 (EXIF 3.0).
+        // 1: below sea level, 3: below the ellipsoid (EXIF 3.0).
         let reference = match &exif.get_field(Tag::GPSAltitudeRef, In::PRIMARY).map(|field| &field.value) {
             Some(Value::Byte(bytes)) => bytes.first().copied().unwrap_or(0),
             _ => 0,
@@ -136,12 +136,12 @@ fn gps(exif: &Exif) -> Option<ExifGps> {
         latitude: coordinate(exif, Tag::GPSLatitude, Tag::GPSLatitudeRef, ["N", "S"], 90.0)?,
         longitude: coordinate(exif, Tag::GPSLongitude, Tag::GPSLongitudeRef, ["E", "W"], 180.0)?,
         altitude: altitude(),
-        dilution: number(exif, Tag::GPSDOP),
+        dilution: positive_number(exif, Tag::GPSDOP),
     })
 }
 
-/// Degrees, minutes and seconds as radians, by the hemisphere of `reference`; `None` where that is not told, or for more degrees than `most`.
-fn coordinate(exif: &Exif, tag: Tag, reference: Tag, [plus, minus]: [&str; 2], most: f64) -> Option<f64> {
+/// Reads degrees, minutes and seconds as radians, signed by the hemisphere tag `reference`; `None` where that is missing, or beyond `max_degrees`.
+fn coordinate(exif: &Exif, tag: Tag, reference: Tag, [plus, minus]: [&str; 2], max_degrees: f64) -> Option<f64> {
     let Value::Rational(parts) = &exif.get_field(tag, In::PRIMARY)?.value else { return None };
     let reference = text(exif, reference)?;
     let sign = if reference.eq_ignore_ascii_case(plus) {
@@ -151,21 +151,22 @@ fn coordinate(exif: &Exif, tag: Tag, reference: Tag, [plus, minus]: [&str; 2], m
     } else {
         return None;
     };
-    // Cameras leave out seconds, or write 0/0 where there is no fix: no number, which is not below any.
+    // Cameras omit seconds, or write 0/0 (NaN) without a fix, which fails the comparison below.
     let [degrees, rest @ ..] = &parts[..] else { return None };
     let degrees =
         rest.iter().take(2).zip([60.0, 3600.0]).fold(degrees.to_f64(), |sum, (v, unit)| sum + v.to_f64() / unit);
-    (degrees <= most).then(|| (sign * degrees).to_radians())
+    (degrees <= max_degrees).then(|| (sign * degrees).to_radians())
 }
 
 fn focal(exif: &Exif, width: f64, height: f64) -> Option<ExifFocal> {
     if width < 1.0 || height < 1.0 {
         return None;
     }
-    let by_diagonal = number(exif, Tag::FocalLengthIn35mmFilm).map(|mm| mm * width.hypot(height) / DIAGONAL_35MM);
+    let by_diagonal =
+        positive_number(exif, Tag::FocalLengthIn35mmFilm).map(|mm| mm * width.hypot(height) / DIAGONAL_35MM_FORMAT);
     let by_sensor = sensor_focal(exif, width);
-    // The two describe one lens. Where they disagree by far more than the rounding of the equivalent can explain, the
-    // resolution tag is the one that some cameras fill with another picture's number.
+    // Where the two disagree by far more than the rounding of the equivalent, the resolution tag is wrong: some cameras write that of
+    // another image.
     match (by_sensor, by_diagonal) {
         (Some(sensor), Some(diagonal)) if (sensor / diagonal).ln().abs() > 0.15 => {
             Some(ExifFocal { pixels: diagonal, source: FocalSource::Equivalent35mm })
@@ -173,15 +174,16 @@ fn focal(exif: &Exif, width: f64, height: f64) -> Option<ExifFocal> {
         (Some(pixels), _) => Some(ExifFocal { pixels, source: FocalSource::SensorResolution }),
         (None, Some(pixels)) => Some(ExifFocal { pixels, source: FocalSource::Equivalent35mm }),
         (None, None) => {
-            let pixels = number(exif, Tag::FocalLength)? / sensor_width(&text(exif, Tag::Model)?)? * width.max(height);
+            let pixels =
+                positive_number(exif, Tag::FocalLength)? / sensor_width(&text(exif, Tag::Model)?)? * width.max(height);
             Some(ExifFocal { pixels, source: FocalSource::SensorTable })
         }
     }
 }
 
 fn sensor_focal(exif: &Exif, width: f64) -> Option<f64> {
-    let mm = number(exif, Tag::FocalLength)?;
-    let resolution = number(exif, Tag::FocalPlaneXResolution)?;
+    let mm = positive_number(exif, Tag::FocalLength)?;
+    let resolution = positive_number(exif, Tag::FocalPlaneXResolution)?;
     let unit_mm = match exif.get_field(Tag::FocalPlaneResolutionUnit, In::PRIMARY).and_then(|f| f.value.get_uint(0)) {
         Some(3) => 10.0,
         Some(4) => 1.0,
@@ -190,7 +192,7 @@ fn sensor_focal(exif: &Exif, width: f64) -> Option<f64> {
         _ => 25.4,
     };
     let per_mm = resolution / unit_mm;
-    // The resolution is that of the picture the camera took; this one may have been made smaller since.
-    let taken = number(exif, Tag::PixelXDimension).unwrap_or(width);
-    SENSOR_WIDTHS.contains(&(taken / per_mm)).then_some(mm * per_mm * width / taken)
+    // The resolution is that of the original image, which may have been resized since.
+    let original_width = positive_number(exif, Tag::PixelXDimension).unwrap_or(width);
+    SENSOR_WIDTH_RANGE_MM.contains(&(original_width / per_mm)).then_some(mm * per_mm * width / original_width)
 }

@@ -1,7 +1,8 @@
-//! Keypoints and descriptors as other programs read and write them: COLMAP's feature text and NumPy arrays.
+//! Keypoints and descriptors in the formats of other programs: COLMAP's feature text and NumPy arrays.
 //!
-//! COLMAP's text starts with a line `count 128`; then a row per feature: `x y scale orientation d1 … d128`, the center of the top-left pixel at (0.5, 0.5), the angle in
-//! radians, the descriptor as whole numbers 0 to 255 that are 512 times those of unit length. It has no strengths: they read as 0.
+//! COLMAP's text starts with a line `count 128`; then a row per feature: `x y scale orientation d1 … d128`, the center of the top-left pixel at
+//! (0.5, 0.5), the angle in radians, the descriptor as integers 0 to 255, 512 times a descriptor of unit length. It has no responses: they read
+//! as 0.
 
 use crate::files::{read_text, write_bytes};
 use crate::npy::{NpyArray, NpyData};
@@ -11,26 +12,28 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 const NAME: &str = "COLMAP feature text";
+/// Coordinate of the center of the top-left pixel in COLMAP's convention.
 const CENTER: f32 = 0.5;
-const UNIT: f32 = 512.0;
-/// Numbers in a descriptor of COLMAP's.
+/// Scale of COLMAP's integer descriptors.
+const DESCRIPTOR_SCALE: f32 = 512.0;
+/// Dimension of COLMAP's descriptors.
 const DIMENSION: usize = 128;
 
-/// Keypoints with a descriptor each.
+/// Keypoints with one descriptor each.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct FeatureRows {
     /// The points, pixel centers at integers.
     pub keypoints: Vec<Keypoint>,
-    /// Numbers in one descriptor.
+    /// Dimension of the descriptors.
     pub dimension: usize,
-    /// Row after row, one per keypoint.
+    /// Descriptors, row-major, one per keypoint.
     pub descriptors: Vec<f32>,
 }
 
 /// Parses COLMAP's feature text.
 ///
 /// # Errors
-/// [`FormatError`] with the line where a row is not what the first line announces.
+/// [`FormatError`] with the line of an invalid row.
 pub fn parse_colmap_features(text: &str) -> Result<FeatureRows, FormatError> {
     let mut lines = text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty() && !l.starts_with('#'));
     let (at, head) = lines.next().ok_or_else(|| FormatError::line(1, "“count 128” is missing"))?;
@@ -53,10 +56,13 @@ pub fn parse_colmap_features(text: &str) -> Result<FeatureRows, FormatError> {
             return Err(FormatError::line(at + 1, format!("{} numbers in a descriptor, not 128", descriptor.len())));
         }
         rows.keypoints.push(Keypoint { position: Point2::new(x - CENTER, y - CENTER), response: 0.0, scale, angle });
-        rows.descriptors.extend(descriptor.iter().map(|v| v / UNIT));
+        rows.descriptors.extend(descriptor.iter().map(|v| v / DESCRIPTOR_SCALE));
     }
     if rows.keypoints.len() != count {
-        return Err(FormatError::corrupt(NAME, format!("{count} features announced, {} there", rows.keypoints.len())));
+        return Err(FormatError::corrupt(
+            NAME,
+            format!("the header has {count} features, the file {}", rows.keypoints.len()),
+        ));
     }
     Ok(rows)
 }
@@ -80,9 +86,9 @@ pub fn write_colmap_features(path: impl AsRef<Path>, rows: &FeatureRows) -> Resu
 }
 
 fn format_rows(rows: &FeatureRows) -> Result<String, FormatError> {
-    let not = |what: String| FormatError::NotRepresentable { format: NAME, what };
+    let not_representable = |what: String| FormatError::NotRepresentable { format: NAME, what };
     if rows.dimension != DIMENSION || rows.descriptors.len() != DIMENSION * rows.keypoints.len() {
-        return Err(not(format!("{} descriptors of {} numbers", rows.keypoints.len(), rows.dimension)));
+        return Err(not_representable(format!("{} descriptors of {} numbers", rows.keypoints.len(), rows.dimension)));
     }
     let mut text = format!("{} {DIMENSION}\n", rows.keypoints.len());
     for (k, row) in rows.keypoints.iter().zip(rows.descriptors.chunks_exact(DIMENSION)) {
@@ -90,22 +96,22 @@ fn format_rows(rows: &FeatureRows) -> Result<String, FormatError> {
         let _ = write!(text, "{} {} {} {}", k.position.x + CENTER, k.position.y + CENTER, k.scale, k.angle);
         for v in row {
             if !(0.0..=1.0).contains(v) {
-                return Err(not(format!("the number {v} in a descriptor")));
+                return Err(not_representable(format!("the number {v} in a descriptor")));
             }
-            let _ = write!(text, " {}", (v * UNIT).round().min(255.0));
+            let _ = write!(text, " {}", (v * DESCRIPTOR_SCALE).round().min(255.0));
         }
         text.push('\n');
     }
     Ok(text)
 }
 
-/// Keypoints as an array with a row `x, y, scale, angle, response` each.
+/// Converts keypoints to an array with rows `x, y, scale, angle, response`.
 pub fn keypoints_to_npy(keypoints: &[Keypoint]) -> NpyArray {
     let rows = keypoints.iter().flat_map(|k| [k.position.x, k.position.y, k.scale, k.angle, k.response]);
     NpyArray { shape: vec![keypoints.len(), 5], data: NpyData::F32(rows.collect()) }
 }
 
-/// Keypoints from an array of two to five columns `x, y, scale, angle, response`; what is missing is 1, 0, 0.
+/// Converts an array of two to five columns `x, y, scale, angle, response` to keypoints; missing columns are 1, 0, 0.
 ///
 /// # Errors
 /// [`FormatError`] for an array of another shape.
@@ -129,13 +135,13 @@ pub fn keypoints_from_npy(array: &NpyArray) -> Result<Vec<Keypoint>, FormatError
     Ok(values.chunks_exact(columns).map(row).collect())
 }
 
-/// Descriptors as an array with a row each.
+/// Converts descriptors to an array with one row each.
 pub fn descriptors_to_npy(dimension: usize, descriptors: &[f32]) -> NpyArray {
     let rows = descriptors.len().checked_div(dimension).unwrap_or(0);
     NpyArray { shape: vec![rows, dimension], data: NpyData::F32(descriptors.to_vec()) }
 }
 
-/// The number of columns and the numbers of a two-dimensional array.
+/// Converts a two-dimensional array to descriptors: their dimension and values.
 ///
 /// # Errors
 /// [`FormatError`] for an array of another shape.
@@ -154,7 +160,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn text_in_colmaps_words() {
+    fn colmap_text_round_trips_and_invalid_text_is_refused() {
         let ones = " 128".repeat(127);
         let text = format!("# made by hand\n1 128\n10.5 20.75 2.5 -1.25 255{ones}\n");
         let rows = parse_colmap_features(&text).unwrap();
@@ -174,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn arrays_come_back() {
+    fn arrays_round_trip() {
         let k = Keypoint { position: Point2::new(1.5, 2.5), response: 9.0, scale: 3.0, angle: 0.5 };
         assert_eq!(keypoints_from_npy(&keypoints_to_npy(&[k, k])).unwrap(), [k, k]);
         let two = NpyArray { shape: vec![1, 2], data: NpyData::F64(vec![4.0, 5.0]) };

@@ -1,16 +1,16 @@
-//! Whole files in, whole files out.
+//! Reading and atomic writing of whole files.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
-use crate::pending::{PREFIX, Pending, SUFFIX};
+use crate::pending_writes::{PREFIX, PendingWrite, SUFFIX};
 use crate::{FormatError, IoError, memory};
 
-/// The largest file that is read into memory: 4 GiB, far above any photograph and below what would take a machine down.
+/// Maximum size of a file that is read into memory: 4 GiB, far above any photograph.
 pub const MAX_FILE_BYTES: u64 = 4 << 30;
 
-/// The bytes of a file, of at most [`MAX_FILE_BYTES`] and [`default_max_memory`](crate::default_max_memory).
+/// Reads a file of at most [`MAX_FILE_BYTES`] and [`default_max_memory`](crate::default_max_memory) bytes.
 ///
 /// # Errors
 /// [`IoError`]: cannot be opened or read, is a folder, is too large.
@@ -18,14 +18,14 @@ pub fn read_bytes(path: impl AsRef<Path>) -> Result<Vec<u8>, IoError> {
     read_bytes_within(path.as_ref(), memory::default_max_memory())
 }
 
-/// [`read_bytes`] of a file of at most `max_memory` bytes.
+/// As [`read_bytes`], for a file of at most `max_memory` bytes.
 pub(crate) fn read_bytes_within(path: &Path, max_memory: u64) -> Result<Vec<u8>, IoError> {
     let fail = |reason: FormatError| IoError::reading(path, reason);
-    let judge = |bytes: u64| {
+    let check_size = |bytes: u64| {
         if bytes > MAX_FILE_BYTES {
             return Err(fail(FormatError::TooManyBytes { bytes, limit: MAX_FILE_BYTES }));
         }
-        memory::allow(bytes, max_memory, None).map_err(fail)
+        memory::check_limit(bytes, max_memory, None).map_err(fail)
     };
     let file = File::open(path).map_err(|e| fail(e.into()))?;
     let metadata = file.metadata().map_err(|e| fail(e.into()))?;
@@ -34,17 +34,17 @@ pub(crate) fn read_bytes_within(path: &Path, max_memory: u64) -> Result<Vec<u8>,
     }
     let mut bytes = Vec::new();
     if metadata.is_file() {
-        judge(metadata.len())?;
+        check_size(metadata.len())?;
         bytes.reserve_exact(metadata.len() as usize);
     }
-    // A pipe or a growing file has no honest length: stop just past the limit.
-    let most = MAX_FILE_BYTES.min(max_memory).saturating_add(1);
-    file.take(most).read_to_end(&mut bytes).map_err(|e| fail(e.into()))?;
-    judge(bytes.len() as u64)?;
+    // The length of a pipe or a growing file is unknown: stop just past the limit.
+    let limit = MAX_FILE_BYTES.min(max_memory).saturating_add(1);
+    file.take(limit).read_to_end(&mut bytes).map_err(|e| fail(e.into()))?;
+    check_size(bytes.len() as u64)?;
     if bytes.is_empty() { Err(fail(FormatError::Empty)) } else { Ok(bytes) }
 }
 
-/// The text of a file; a leading byte order mark is dropped.
+/// Reads a UTF-8 text file without a leading byte order mark.
 pub(crate) fn read_text(path: &Path) -> Result<String, IoError> {
     let text = String::from_utf8(read_bytes(path)?)
         .map_err(|_| IoError::reading(path, FormatError::corrupt("text", "it is not UTF-8 text")))?;
@@ -54,13 +54,13 @@ pub(crate) fn read_text(path: &Path) -> Result<String, IoError> {
     })
 }
 
-/// Writes a file whole or not at all.
+/// Writes a file atomically.
 ///
-/// The bytes go to a temporary file in the same folder, which takes the name `path` once `content` has succeeded;
-/// after a failure it is removed, and what was at `path` is untouched. Permissions are those of the file replaced, or
-/// what the umask gives. A symbolic link is followed; a device or a pipe is written to directly. The bytes are on the disk
-/// before the name is: after a power cut, too, `path` holds the old file or the new one, never a part. That costs a few milliseconds a file
-/// (7 ms on a virtual disk, for a kilobyte as for 20 MB), and tells of a full disk on file systems that notice late.
+/// The content goes to a temporary file in the same folder, which is renamed to `path` once `content` has succeeded;
+/// after a failure it is removed, and an existing file at `path` is unchanged. Permissions are those of the replaced file, or
+/// those of the umask. A symbolic link is followed; a device or a pipe is written to directly. The file is synced before the rename, so that
+/// even after a power failure `path` is the old file or the new one, never a part. That costs a few milliseconds per file
+/// (7 ms on a virtual disk, for a kilobyte as for 20 MB), and reports a full disk on file systems with delayed allocation.
 ///
 /// # Errors
 /// [`IoError`] with the path and the operating system's reason, or whatever `content` fails with.
@@ -100,13 +100,13 @@ fn write_atomic_inner(
     }
     let mut builder = tempfile::Builder::new();
     builder.prefix(PREFIX).suffix(SUFFIX);
-    // A temporary file is private by default; an output is as open as any other file the user makes.
+    // Temporary files are private by default; outputs have the usual permissions by the umask.
     #[cfg(unix)]
     {
         use std::os::unix::fs::PermissionsExt;
         builder.permissions(fs::Permissions::from_mode(0o666));
     }
-    let (pending, mut temporary) = Pending::make(|| builder.tempfile_in(folder), |made| made.path())?;
+    let (pending, mut temporary) = PendingWrite::make(|| builder.tempfile_in(folder), |made| made.path())?;
     let mut sink = BufWriter::with_capacity(1 << 18, temporary.as_file_mut());
     content(&mut sink)?;
     sink.flush()?;
@@ -114,13 +114,13 @@ fn write_atomic_inner(
     if let Some(metadata) = existing {
         temporary.as_file().set_permissions(metadata.permissions())?;
     }
-    // A rename may reach the disk before the bytes do: the good file would be gone and the new one empty.
+    // Otherwise the rename may reach the disk before the data, which would leave an empty file after a crash.
     temporary.as_file().sync_all()?;
     pending.finish(|| temporary.persist(&target)).map_err(|e| e.error)?;
     Ok(())
 }
 
-/// [`write_atomic`] of bytes that are already there.
+/// As [`write_atomic`], for bytes in memory.
 ///
 /// # Errors
 /// As [`write_atomic`].
@@ -140,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn a_failure_half_way_leaves_the_old_file_and_nothing_else() {
+    fn a_failed_write_leaves_the_old_file_and_no_temporary_file() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.txt");
         write_bytes(&path, b"old").unwrap();
@@ -155,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn a_panic_half_way_leaves_no_part_behind() {
+    fn a_panic_while_writing_leaves_no_temporary_file() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.txt");
         let result =
@@ -166,7 +166,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn permissions_are_those_of_an_ordinary_file_and_survive_replacement() {
+    fn permissions_follow_the_umask_and_survive_replacement() {
         use std::os::unix::fs::PermissionsExt;
         let folder = tempfile::tempdir().unwrap();
         let plain = folder.path().join("plain");
@@ -182,7 +182,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn a_symbolic_link_stays_one() {
+    fn a_symbolic_link_is_followed() {
         let folder = tempfile::tempdir().unwrap();
         let (real, link) = (folder.path().join("real"), folder.path().join("link"));
         fs::write(&real, b"old").unwrap();
@@ -193,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn a_missing_folder_and_a_folder_in_the_way_are_named() {
+    fn a_missing_folder_and_a_folder_at_the_path_are_reported() {
         let folder = tempfile::tempdir().unwrap();
         let error = write_bytes(folder.path().join("no/such/a.txt"), b"x").unwrap_err().to_string();
         assert!(error.contains("does not exist"), "{error}");
@@ -204,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn an_empty_file_is_its_own_reason() {
+    fn an_empty_file_is_reported_as_such() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("empty.png");
         fs::write(&path, b"").unwrap();

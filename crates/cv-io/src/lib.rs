@@ -15,25 +15,26 @@
 //!
 //! # Conventions
 //!
-//! * What a file is, its content says, not its name.
-//! * Every reader is given untrusted bytes: a lie in a header is an error before memory is asked for, and nothing panics.
-//! * What reading a file will take is judged by its header against [`ReadOptions::max_memory`] before a pixel or value exists.
-//! * Every writer is atomic ([`write_atomic`]): the whole file, or what was there before; several files likewise ([`write_together`]).
-//! * A failure says which file, why, and what to try ([`IoError`]); the same reasons without a path are [`FormatError`].
-//! * Unknown disparity and depth are NaN in memory, whatever the file's own sign for it.
+//! * File formats are detected by content, not by name.
+//! * Readers take untrusted bytes: a false header is an error before memory is allocated, and nothing panics.
+//! * The memory for reading a file is estimated from its header and checked against [`ReadOptions::max_memory`] before decoding.
+//! * Writers are atomic ([`write_atomic`]), also for several files ([`write_together`]).
+//! * An error has path, reason and remedy ([`IoError`]); the same reasons without a path are [`FormatError`].
+//! * Invalid disparity and depth are NaN in memory, whatever the file's own marker.
 //!
 //! | what | where |
 //! |---|---|
-//! | pictures | [`read_rgb`], [`read_gray_u8`], [`read_mask`], [`read_image`], [`write_png`], [`write_jpeg`] |
-//! | maps of floats | [`read_map`], [`pfm`], [`kitti`], [`depth_mm`], [`scaled`] |
+//! | images | [`read_rgb`], [`read_gray_u8`], [`read_mask`], [`read_image`], [`write_png`], [`write_jpeg`] |
+//! | float maps | [`read_map`], [`pfm`], [`kitti`], [`depth_mm`], [`scaled`] |
 //! | arrays | [`npy`], [`npz`] |
-//! | clouds | [`ply`] |
+//! | point clouds | [`ply`] |
 //! | cameras and rigs | [`read_camera`], [`write_camera`], [`read_rig`], [`write_rig`], [`read_camera_array`], [`write_camera_array`], [`CalibrationFormat`] |
 //! | sparse models | [`colmap`], text and binary; [`write_transforms`] |
 //! | matches | [`read_matches`], [`write_matches`] |
-//! | where photographs were taken | [`read_places`]; [`ExifInfo`] |
+//! | camera positions | [`read_camera_positions`]; [`ExifInfo`] |
 
 mod camera;
+mod camera_positions;
 mod codec;
 pub mod colmap;
 mod depth_png;
@@ -44,20 +45,19 @@ mod error;
 mod exif_info;
 mod features;
 mod files;
+mod format_detection;
+mod image_file;
 mod maps;
 mod matches;
 mod memory;
 mod metadata;
 pub mod npy;
 pub mod npz;
-mod pending;
+mod pending_writes;
 pub mod pfm;
-mod picture;
-mod places;
 pub mod ply;
 mod sensor_width;
-mod sniff;
-mod srgb;
+mod srgb_encoding;
 mod transforms;
 
 pub use camera::{
@@ -65,6 +65,7 @@ pub use camera::{
     read_camera, read_camera_array, read_camera_with_notes, read_rig, read_rig_with_notes, write_camera,
     write_camera_array, write_rig,
 };
+pub use camera_positions::{NamedPositions, parse_camera_positions, read_camera_positions};
 pub use depth_png::{depth_mm, kitti, scaled};
 pub use encode::{
     JpegPixels, PngPixels, encode_jpeg, encode_png, encode_tiff, write_image, write_jpeg, write_png,
@@ -78,14 +79,13 @@ pub use features::{
     read_colmap_features, write_colmap_features,
 };
 pub use files::{MAX_FILE_BYTES, read_bytes, write_atomic, write_bytes};
+pub use image_file::{
+    DEFAULT_MAX_PIXELS, DynImage, Pixels, ReadOptions, decode_image, read_gray_u8, read_image, read_image_info,
+    read_image_with, read_mask, read_rgb,
+};
 pub use maps::{decode_map, read_map};
 pub use matches::{Matches, parse_matches, read_matches, write_matches};
 pub use memory::{DEFAULT_MAX_MEMORY, default_max_memory, set_default_max_memory};
 pub use metadata::Metadata;
-pub use pending::{abandon_writes, remove_abandoned, write_together};
-pub use picture::{
-    DEFAULT_MAX_PIXELS, DynImage, Pixels, ReadOptions, decode_image, read_gray_u8, read_image, read_image_info,
-    read_image_with, read_mask, read_rgb,
-};
-pub use places::{NamedPlaces, parse_places, read_places};
+pub use pending_writes::{abandon_writes, remove_abandoned, write_together};
 pub use transforms::{transforms_json, write_transforms};

@@ -1,4 +1,4 @@
-//! A disparity or depth map from a file of any of the formats in use.
+//! Reading disparity and depth maps of any supported format.
 
 use std::path::Path;
 
@@ -8,11 +8,11 @@ use crate::files::read_bytes;
 use crate::pfm::Pfm;
 use crate::{FormatError, IoError, ReadOptions, depth_png, npy, npz, pfm};
 
-/// Reads a map of one channel, telling by content: PFM, NumPy's `.npy` and `.npz` (its only two-dimensional array), or a gray picture
-/// whose values are `png_scale` times what they mean, with 0 for unknown.
+/// Reads a map of one channel; the format is detected by content: PFM, NumPy's `.npy` and `.npz` (its only two-dimensional array), or a gray
+/// image whose values are `png_scale` times those of the map, 0 = invalid.
 ///
-/// Without `png_scale` a gray picture of 16 bits is taken as KITTI's, 256 per pixel of disparity; one of 8 bits is refused, since its scale
-/// cannot be known. `png_scale` is ignored for the other formats. Unknown (infinite or NaN) becomes NaN.
+/// Without `png_scale` a 16-bit gray image is read as KITTI's, 256 per pixel of disparity; an 8-bit one is refused, since its scale
+/// is unknown. `png_scale` is ignored for other formats. Invalid values (infinite or NaN) become NaN.
 ///
 /// # Errors
 /// [`IoError`]: cannot be opened, is none of these, or as the format's own reader.
@@ -22,7 +22,7 @@ pub fn read_map(path: impl AsRef<Path>, png_scale: Option<f64>) -> Result<GrayF3
     decode_map(&bytes, png_scale).map_err(|reason| IoError::reading(path, reason))
 }
 
-/// [`read_map`] of the bytes of a file.
+/// As [`read_map`], from the bytes of a file.
 ///
 /// # Errors
 /// As [`read_map`].
@@ -30,7 +30,7 @@ pub fn decode_map(bytes: &[u8], png_scale: Option<f64>) -> Result<GrayF32, Forma
     let mut map = match bytes {
         [b'P', b'f' | b'F', b'\n' | b'\r' | b' ' | b'\t', ..] => match pfm::decode(bytes)? {
             Pfm::Gray(map) => map,
-            Pfm::Rgb(_) => return Err(FormatError::unsupported("PFM", "color in the place of one channel")),
+            Pfm::Rgb(_) => return Err(FormatError::unsupported("PFM", "a color map where one channel is expected")),
         },
         [0x93, b'N', ..] => npy::decode(bytes)?.into_gray()?,
         [b'P', b'K', ..] => npz::decode_map(bytes, &ReadOptions::default())?.into_gray()?,
@@ -55,7 +55,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let map = GrayF32::from_vec(3, 2, vec![1.0, 2.5, f32::NAN, 4.0, 0.25, 63.75]).unwrap();
         let path = |name: &str| folder.path().join(name);
-        // Names that lie: only the content counts.
+        // Misleading names: the format is detected by content.
         pfm::write(path("a.png"), map.view()).unwrap();
         let infinite = map.map(|[v]| [if v.is_nan() { f32::NEG_INFINITY } else { v }]);
         let array = NpyArray::from_view(infinite.view());

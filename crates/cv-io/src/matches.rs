@@ -1,5 +1,5 @@
-//! Point correspondences as text: a row per match, `x1 y1 x2 y2` in pixels with an optional score, `#` to the end of a line is
-//! a comment. Pixel centers at integers.
+//! Point correspondences as text: a row per match, `x1 y1 x2 y2` in pixels with an optional score; `#` starts a comment. Pixel
+//! centers at integers.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -14,13 +14,13 @@ use crate::{FormatError, IoError};
 pub struct Matches {
     /// The pairs, in the order of the file.
     pub pairs: Vec<Correspondence>,
-    /// One score per pair, where every row has one. What it means (a ratio, a distance, a confidence) is the writer's affair.
+    /// One score per pair, where every row has one. Its meaning (ratio, distance, confidence) depends on the writer.
     pub scores: Option<Vec<f64>>,
 }
 
-/// Parses the text of a matches file. Columns are parted by blanks, tabs, commas or semicolons.
+/// Parses the text of a matches file. Columns are separated by spaces, tabs, commas or semicolons.
 ///
-/// Infinite and NaN coordinates are passed on as they are: what to do with them is the estimator's decision.
+/// Infinite and NaN coordinates are returned as they are.
 ///
 /// # Errors
 /// [`FormatError::Line`] for a row that is not four or five numbers, or where only some rows have a score.
@@ -36,12 +36,12 @@ pub fn parse_matches(text: &str) -> Result<Matches, FormatError> {
             let Some(cell) = row.get_mut(columns) else {
                 return Err(FormatError::line(
                     line_number,
-                    "more than five columns; expected x1 y1 x2 y2 and maybe a score",
+                    "more than five columns; expected x1 y1 x2 y2 and an optional score",
                 ));
             };
             *cell = word
                 .parse()
-                .map_err(|_| FormatError::line(line_number, format!("“{}” is not a number", clip(word))))?;
+                .map_err(|_| FormatError::line(line_number, format!("“{}” is not a number", truncate_word(word))))?;
             columns += 1;
         }
         match columns {
@@ -49,7 +49,7 @@ pub fn parse_matches(text: &str) -> Result<Matches, FormatError> {
             4 => {}
             5 => scores.push(row[4]),
             n => {
-                let reason = format!("{n} column(s); expected x1 y1 x2 y2 and maybe a score");
+                let reason = format!("{n} column(s); expected x1 y1 x2 y2 and an optional score");
                 return Err(FormatError::line(line_number, reason));
             }
         }
@@ -62,8 +62,8 @@ pub fn parse_matches(text: &str) -> Result<Matches, FormatError> {
     Ok(Matches { pairs, scores })
 }
 
-/// At most the first 40 characters.
-fn clip(word: &str) -> String {
+/// Truncates a word to 40 characters.
+fn truncate_word(word: &str) -> String {
     word.chars().take(40).collect()
 }
 
@@ -76,10 +76,10 @@ pub fn read_matches(path: impl AsRef<Path>) -> Result<Matches, IoError> {
     parse_matches(&read_text(path)?).map_err(|reason| IoError::reading(path, reason))
 }
 
-/// Writes a matches file. Every number is written with the digits that read back to the same value.
+/// Writes a matches file. Numbers round-trip exactly.
 ///
 /// # Errors
-/// [`FormatError::NotRepresentable`] where there are not as many scores as pairs; else as [`crate::write_atomic`].
+/// [`FormatError::NotRepresentable`] where the number of scores is not that of pairs; else as [`crate::write_atomic`].
 pub fn write_matches(path: impl AsRef<Path>, pairs: &[Correspondence], scores: Option<&[f64]>) -> Result<(), IoError> {
     let path = path.as_ref();
     if let Some(scores) = scores.filter(|s| s.len() != pairs.len()) {
@@ -115,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn bad_rows_are_named_by_their_line() {
+    fn invalid_rows_are_reported_with_their_line() {
         for (text, line, word) in [
             ("1 2 3 4\n1 2 3\n", 2, "3 column"),
             ("\n\n1 2 x 4", 3, "“x”"),
@@ -134,7 +134,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_is_written_is_read(rows in prop::collection::vec(prop::array::uniform5(prop::num::f64::NORMAL | prop::num::f64::ZERO), 0..20), scored in any::<bool>()) {
+        fn files_round_trip(rows in prop::collection::vec(prop::array::uniform5(prop::num::f64::NORMAL | prop::num::f64::ZERO), 0..20), scored in any::<bool>()) {
             let folder = tempfile::tempdir().unwrap();
             let path = folder.path().join("m.txt");
             let pairs: Vec<_> = rows.iter().map(|r| Correspondence::new(r[0], r[1], r[2], r[3])).collect();

@@ -1,36 +1,36 @@
-//! How much memory the contents of a file may take: judged by its header, before any of it is asked for.
+//! Limits on the memory for reading a file, checked by its header before allocation.
 
 use std::sync::OnceLock;
 
 use crate::FormatError;
 
-/// The memory that reading one file may take where [`set_default_max_memory`] was not called, in bytes: 4 GiB. That is the
-/// largest picture of floats within [`DEFAULT_MAX_PIXELS`](crate::DEFAULT_MAX_PIXELS), 3 GiB, and what is held beside it.
+/// Memory limit in bytes for reading one file, unless set by [`set_default_max_memory`]: 4 GiB, for the
+/// largest float image within [`DEFAULT_MAX_PIXELS`](crate::DEFAULT_MAX_PIXELS), 3 GiB, and the working memory.
 pub const DEFAULT_MAX_MEMORY: u64 = 4 << 30;
 
 static DEFAULT: OnceLock<u64> = OnceLock::new();
 
-/// Sets what [`default_max_memory`] says, once for the life of the process, in bytes. It is meant for the `main` of a program, before it
-/// reads its first file; a library passes [`ReadOptions::max_memory`](crate::ReadOptions::max_memory) instead.
+/// Sets [`default_max_memory`] in bytes, once per process. For the `main` of a program, before it reads its first file; libraries pass
+/// [`ReadOptions::max_memory`](crate::ReadOptions::max_memory) instead.
 ///
 /// # Errors
-/// The value in force, where one has been set before: it stays.
+/// The present value, where it has been set before; it is unchanged.
 pub fn set_default_max_memory(bytes: u64) -> Result<(), u64> {
     DEFAULT.set(bytes).map_err(|_| default_max_memory())
 }
 
-/// The memory that reading one file may take where nothing else is said, in bytes: what [`set_default_max_memory`] set, else
+/// Returns the default memory limit in bytes for reading one file: that of [`set_default_max_memory`], else
 /// [`DEFAULT_MAX_MEMORY`].
 pub fn default_max_memory() -> u64 {
     DEFAULT.get().copied().unwrap_or(DEFAULT_MAX_MEMORY)
 }
 
-/// Refuses what needs more bytes than allowed. `size`: width and height of a picture or map.
-pub(crate) fn allow(needed: u64, allowed: u64, size: Option<(u64, u64)>) -> Result<(), FormatError> {
+/// Checks that `needed` bytes are within the limit. `size`: width and height of an image or map.
+pub(crate) fn check_limit(needed: u64, allowed: u64, size: Option<(u64, u64)>) -> Result<(), FormatError> {
     if needed > allowed { Err(FormatError::TooMuchMemory { needed, allowed, size }) } else { Ok(()) }
 }
 
-/// The product, or the largest number where it is beyond.
-pub(crate) fn product(factors: &[u64]) -> u64 {
+/// Computes the product of the factors, saturating.
+pub(crate) fn saturating_product(factors: &[u64]) -> u64 {
     factors.iter().fold(1, |n, factor| n.saturating_mul(*factor))
 }

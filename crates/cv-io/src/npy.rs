@@ -1,4 +1,4 @@
-//! NumPy's array files, `.npy` versions 1 to 3.
+//! NumPy array files, `.npy` versions 1 to 3.
 
 use std::path::Path;
 
@@ -9,10 +9,9 @@ use crate::{FormatError, IoError, ReadOptions, memory};
 
 const NAME: &str = "npy";
 const MAGIC: &[u8] = b"\x93NUMPY";
-/// The most elements read: as many samples as the largest color picture has.
+/// Maximum number of elements: the samples of the largest color image.
 const MAX_ELEMENTS: u64 = 3 * crate::DEFAULT_MAX_PIXELS;
-/// The longest axis of an array without values. Whoever loops over the rows of one must not do so for minutes; descriptors
-/// and maps are far below.
+/// Maximum length of an axis of an array without values, so that loops over its rows stay short; real arrays are far below.
 pub(crate) const MAX_EMPTY_SIDE: u64 = 65_535;
 
 /// The values of an array, in C order.
@@ -36,7 +35,7 @@ pub enum NpyData {
 /// An array and its shape.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NpyArray {
-    /// Sizes of the axes, slowest first. Empty for a single number.
+    /// Sizes of the axes, slowest first. Empty for a scalar.
     pub shape: Vec<usize>,
     /// The values, last axis fastest.
     pub data: NpyData,
@@ -61,7 +60,7 @@ macro_rules! each {
 }
 
 impl NpyArray {
-    /// An image as an array of height × width, and × channels where there are several.
+    /// Converts an image to an array of height × width, or height × width × channels where there are several.
     pub fn from_view<const C: usize>(view: ImageView<'_, f32, C>) -> Self {
         let mut shape = vec![view.height(), view.width()];
         if C != 1 {
@@ -71,22 +70,22 @@ impl NpyArray {
         Self { shape, data: NpyData::F32(data) }
     }
 
-    /// A table of `f64` rows.
+    /// Converts rows of `f64` to a two-dimensional array.
     pub fn from_rows<const N: usize>(rows: &[[f64; N]]) -> Self {
         Self { shape: vec![rows.len(), N], data: NpyData::F64(rows.as_flattened().to_vec()) }
     }
 
-    /// The number of values.
+    /// Returns the number of values.
     pub fn len(&self) -> usize {
         each!(&self.data, v => v.len())
     }
 
-    /// True where there are no values.
+    /// Whether there are no values.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// All values as `f64`; 64-bit integers beyond 2⁵³ are rounded.
+    /// Converts all values to `f64`; 64-bit integers beyond 2⁵³ are rounded.
     pub fn to_f64(&self) -> Vec<f64> {
         match &self.data {
             NpyData::Bool(v) => v.iter().map(|&b| f64::from(u8::from(b))).collect(),
@@ -103,7 +102,7 @@ impl NpyArray {
         }
     }
 
-    /// The array as an image of one channel: height × width, or height × width × 1.
+    /// Converts the array to an image of one channel: height × width, or height × width × 1.
     ///
     /// # Errors
     /// [`FormatError::Unsupported`] for another shape.
@@ -116,7 +115,7 @@ impl NpyArray {
         Image::from_vec(width, height, data).map_err(|e| FormatError::corrupt(NAME, e.to_string()))
     }
 
-    /// [`NpyArray::to_gray`] that keeps the memory of an array of `f32`.
+    /// As [`NpyArray::to_gray`], without a copy for `f32`.
     ///
     /// # Errors
     /// As [`NpyArray::to_gray`].
@@ -129,7 +128,7 @@ impl NpyArray {
         Image::from_vec(width, height, data).map_err(|e| FormatError::corrupt(NAME, e.to_string()))
     }
 
-    /// Width and height of the array as one channel.
+    /// Returns width and height of the array as one channel.
     fn gray_size(&self) -> Result<(usize, usize), FormatError> {
         match self.shape[..] {
             [height, width] | [height, width, 1] => Ok((width, height)),
@@ -141,7 +140,7 @@ impl NpyArray {
     }
 }
 
-/// Values as `f32`, by way of `f64`.
+/// Conversion to `f32` via `f64`.
 trait ToF32: Copy {
     fn to_f32(self) -> f32;
 }
@@ -166,12 +165,12 @@ impl ToF32 for bool {
 /// Decodes the bytes of an `.npy` file.
 ///
 /// # Errors
-/// [`FormatError`]: not such a file, a dtype that is not a plain number, or fewer or more bytes than the shape takes.
+/// [`FormatError`]: not an `.npy` file, a dtype that is not a plain number, or a byte count that does not match the shape.
 pub fn decode(bytes: &[u8]) -> Result<NpyArray, FormatError> {
     decode_with(bytes, &ReadOptions::default())
 }
 
-/// [`decode`] with options.
+/// As [`decode`], with options.
 ///
 /// # Errors
 /// As [`decode`], and [`FormatError::TooMuchMemory`].
@@ -187,10 +186,10 @@ pub fn decode_with(bytes: &[u8], options: &ReadOptions) -> Result<NpyArray, Form
         return Err(FormatError::corrupt(NAME, format!("a shape of {shape:?} has no values")));
     }
     let size = dtype.get(2..).and_then(|size| size.parse::<u64>().ok()).unwrap_or(1);
-    // In another order than stored, the values are there twice for a while.
+    // Reordering and conversion need a second copy.
     let copies = if fortran || dtype.ends_with("b1") { 2 } else { 1 };
-    let values = memory::product(&[count as u64, size, copies]);
-    memory::allow(values.saturating_add(bytes.len() as u64), options.max_memory, None)?;
+    let values = memory::saturating_product(&[count as u64, size, copies]);
+    memory::check_limit(values.saturating_add(bytes.len() as u64), options.max_memory, None)?;
     let (big_endian, kind) = match dtype.split_at_checked(1) {
         Some(("<" | "|" | "=", kind)) => (false, kind),
         Some((">", kind)) => (true, kind),
@@ -203,7 +202,7 @@ pub fn decode_with(bytes: &[u8], options: &ReadOptions) -> Result<NpyArray, Form
                 return Err(cut());
             }
             if body.len() > count * SIZE {
-                return Err(corrupt("more bytes than the shape takes"));
+                return Err(corrupt("there are more bytes than the shape needs"));
             }
             let cells = body.as_chunks::<SIZE>().0.iter();
             let data: Vec<$type> = if big_endian {
@@ -234,7 +233,7 @@ pub fn decode_with(bytes: &[u8], options: &ReadOptions) -> Result<NpyArray, Form
     Ok(NpyArray { shape, data })
 }
 
-/// The header of the bytes of a file, and what follows it.
+/// Parses the header of a file, and returns the remaining bytes.
 fn header(bytes: &[u8]) -> Result<(Header, &[u8]), FormatError> {
     let corrupt = |reason: &str| FormatError::corrupt(NAME, reason);
     let cut = || FormatError::Truncated { format: NAME };
@@ -253,12 +252,12 @@ fn header(bytes: &[u8]) -> Result<(Header, &[u8]), FormatError> {
     Ok((header, &bytes[start + len..]))
 }
 
-/// The shape by the beginning of a file that may go on, where its header is whole.
+/// Parses the shape from a prefix of a file that contains the whole header.
 pub(crate) fn shape_of(bytes: &[u8]) -> Result<Vec<usize>, FormatError> {
     header(bytes).map(|(header, _)| header.shape)
 }
 
-/// From first axis fastest to last axis fastest.
+/// Reorders from Fortran order (first axis fastest) to C order (last axis fastest).
 fn to_c_order<T: Copy>(data: &[T], shape: &[usize]) -> Vec<T> {
     let mut strides = Vec::with_capacity(shape.len());
     let mut stride = 1;
@@ -341,10 +340,10 @@ pub fn encode(array: &NpyArray) -> Result<Vec<u8>, FormatError> {
     for size in &array.shape {
         shape.push_str(&format!("{size}, "));
     }
-    // A tuple of one keeps its comma; longer ones lose the last.
+    // A tuple of one element needs its trailing comma.
     let shape = if array.shape.len() == 1 { shape.trim_end() } else { shape.trim_end_matches(", ") };
     let mut header = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({shape}), }}");
-    // The values begin at a multiple of 64 bytes, after a newline.
+    // The header ends with a newline and is padded so that values begin at a multiple of 64 bytes.
     let padding = (64 - (10 + header.len() + 1) % 64) % 64;
     header.extend(std::iter::repeat_n(' ', padding));
     header.push('\n');
@@ -392,7 +391,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// Bytes as NumPy 2 writes `np.array([[1, 2, 3], [4, 5, 6]], '>i2', order='F')`, from the format's definition.
+    /// The file of `np.array([[1, 2, 3], [4, 5, 6]], '>i2', order='F')`, by the format's definition.
     fn fortran_big_endian(version: u8) -> Vec<u8> {
         let header = "{'descr': '>i2', 'fortran_order': True, 'shape': (2, 3), }\n";
         let mut file = MAGIC.to_vec();
@@ -416,7 +415,7 @@ mod tests {
     }
 
     #[test]
-    fn lying_headers_are_refused() {
+    fn false_headers_are_refused() {
         let good = fortran_big_endian(1);
         assert!(matches!(decode(&good[..good.len() - 1]), Err(FormatError::Truncated { .. })));
         let with = |from: &str, to: &str| {
@@ -439,7 +438,7 @@ mod tests {
     }
 
     #[test]
-    fn an_array_is_judged_by_its_header() {
+    fn the_memory_of_an_array_is_checked_by_its_header() {
         let array = NpyArray { shape: vec![100, 200], data: NpyData::F32(vec![1.0; 20_000]) };
         let bytes = encode(&array).unwrap();
         let within = |max_memory| decode_with(&bytes, &ReadOptions { max_memory, ..ReadOptions::default() });
@@ -451,7 +450,7 @@ mod tests {
     }
 
     #[test]
-    fn an_axis_beside_none_is_not_believed() {
+    fn long_axes_of_empty_arrays_are_refused() {
         let empty = |shape: &[usize]| {
             decode(&encode(&NpyArray { shape: shape.to_vec(), data: NpyData::F32(Vec::new()) }).unwrap())
         };
@@ -464,7 +463,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_is_written_is_read(shape in prop::collection::vec(0usize..5, 0..4), seed in any::<u64>(), kind in 0..5) {
+        fn arrays_round_trip(shape in prop::collection::vec(0usize..5, 0..4), seed in any::<u64>(), kind in 0..5) {
             let count = shape.iter().product::<usize>();
             let values: Vec<u64> = (0..count as u64).map(|i| (seed ^ i).wrapping_mul(0x9e37_79b9_7f4a_7c15)).collect();
             let data = match kind {
@@ -477,7 +476,7 @@ mod tests {
             let array = NpyArray { shape, data };
             let bytes = encode(&array).unwrap();
             prop_assert_eq!(&decode(&bytes).unwrap(), &array);
-            // Alignment of the values, as the format asks.
+            // Alignment of the values, as the format requires.
             let header = usize::from(u16::from_le_bytes([bytes[8], bytes[9]]));
             prop_assert_eq!((10 + header) % 64, 0);
         }

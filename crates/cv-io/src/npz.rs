@@ -1,4 +1,4 @@
-//! NumPy's archives of arrays, `.npz`: a ZIP of `.npy` files, stored or deflated.
+//! NumPy archives, `.npz`: a ZIP of `.npy` files, stored or deflated.
 
 use std::path::Path;
 
@@ -9,16 +9,16 @@ use miniz_oxide::inflate::TINFLStatus;
 use miniz_oxide::inflate::core::{DecompressorOxide, decompress, inflate_flags};
 
 const NAME: &str = "npz";
-/// The most that one array, or all of them together, may unpack to.
+/// Maximum uncompressed size in bytes of all arrays together.
 const MAX_UNPACKED: u64 = MAX_FILE_BYTES;
-/// More arrays than anyone names.
+/// Maximum number of arrays.
 const MAX_ENTRIES: usize = 10_000;
 
 /// Little-endian fields of a record.
 struct Fields<'a>(&'a [u8]);
 
 impl<'a> Fields<'a> {
-    /// The record that begins at `at`, or an error where the file is too short for `len` bytes of it.
+    /// Returns the record of `len` bytes at `at`, or an error where the file is too short.
     fn at(bytes: &'a [u8], at: u64, len: usize) -> Result<Self, FormatError> {
         let start = usize::try_from(at).ok();
         start
@@ -40,7 +40,7 @@ impl<'a> Fields<'a> {
     }
 }
 
-/// One file inside the archive, by the central directory.
+/// An entry of the central directory.
 struct Entry<'a> {
     name: String,
     method: u16,
@@ -51,16 +51,16 @@ struct Entry<'a> {
     archive: &'a [u8],
 }
 
-/// Decodes all arrays of an archive, by name (without `.npy`), in the order of the file.
+/// Decodes all arrays of an archive with their names (without `.npy`), in the order of the file.
 ///
 /// # Errors
-/// [`FormatError`]: not an archive, encrypted or packed by another method than deflate, damaged (by its checksum), larger than
-/// [`MAX_FILE_BYTES`] or [`default_max_memory`](crate::default_max_memory) when unpacked, or as [`npy::decode`].
+/// [`FormatError`]: not an archive, encrypted or compressed by another method than deflate, damaged (by its checksum), larger than
+/// [`MAX_FILE_BYTES`] or [`default_max_memory`](crate::default_max_memory) when uncompressed, or as [`npy::decode`].
 pub fn decode(bytes: &[u8]) -> Result<Vec<(String, NpyArray)>, FormatError> {
     decode_with(bytes, &ReadOptions::default())
 }
 
-/// [`decode`] with options: all arrays together, and the bytes of the largest beside them, must be within the memory allowed.
+/// As [`decode`], with options: the memory limit applies to all arrays and the bytes of the largest together.
 ///
 /// # Errors
 /// As [`decode`].
@@ -72,36 +72,36 @@ pub fn decode_with(bytes: &[u8], options: &ReadOptions) -> Result<Vec<(String, N
     }
     let largest = entries.iter().map(|e| e.unpacked).max().unwrap_or(0);
     let held = total.saturating_add(bytes.len() as u64);
-    memory::allow(held.saturating_add(largest), options.max_memory, None)?;
+    memory::check_limit(held.saturating_add(largest), options.max_memory, None)?;
     entries.iter().map(|entry| Ok((entry.array_name().to_owned(), entry.array(options)?))).collect()
 }
 
-/// Decodes the array of an archive that holds one. How many it holds, its directory says: nothing is unpacked before.
+/// Decodes the array of an archive with exactly one. The count is checked by the directory before anything is decompressed.
 ///
 /// # Errors
 /// [`FormatError::ArrayCount`] where there is none or more than one, or as [`decode`].
-pub fn decode_only(bytes: &[u8], options: &ReadOptions) -> Result<NpyArray, FormatError> {
+pub fn decode_single(bytes: &[u8], options: &ReadOptions) -> Result<NpyArray, FormatError> {
     match directory(bytes)?.as_slice() {
         [entry] => entry.array(options),
         entries => Err(FormatError::ArrayCount { format: NAME, got: entries.len(), wanted: 1 }),
     }
 }
 
-/// Reads the array of an archive that holds one; see [`decode_only`].
+/// Reads the array of an archive with exactly one; see [`decode_single`].
 ///
 /// # Errors
-/// [`IoError`]: cannot be opened, or as [`decode_only`] with default [`ReadOptions`].
-pub fn read_only(path: impl AsRef<Path>) -> Result<NpyArray, IoError> {
+/// [`IoError`]: cannot be opened, or as [`decode_single`] with default [`ReadOptions`].
+pub fn read_single(path: impl AsRef<Path>) -> Result<NpyArray, IoError> {
     let path = path.as_ref();
-    decode_only(&read_bytes(path)?, &ReadOptions::default()).map_err(|reason| IoError::reading(path, reason))
+    decode_single(&read_bytes(path)?, &ReadOptions::default()).map_err(|reason| IoError::reading(path, reason))
 }
 
-/// The array of an archive that is a map, if there is one and no other; of the others the headers alone are unpacked.
+/// Decodes the only two-dimensional array of an archive; of other arrays only the headers are decompressed.
 pub(crate) fn decode_map(bytes: &[u8], options: &ReadOptions) -> Result<NpyArray, FormatError> {
     let entries = directory(bytes)?;
     let mut map: Option<&Entry<'_>> = None;
     for entry in &entries {
-        if !matches!(npy::shape_of(&entry.beginning()?)?[..], [_, _] | [_, _, 1]) {
+        if !matches!(npy::shape_of(&entry.unpack_prefix()?)?[..], [_, _] | [_, _, 1]) {
             continue;
         }
         if let Some(first) = map {
@@ -113,12 +113,12 @@ pub(crate) fn decode_map(bytes: &[u8], options: &ReadOptions) -> Result<NpyArray
     map.ok_or_else(|| FormatError::missing(NAME, "two-dimensional array"))?.array(options)
 }
 
-/// The entries of the central directory.
+/// Parses the entries of the central directory.
 fn directory(bytes: &[u8]) -> Result<Vec<Entry<'_>>, FormatError> {
     if !bytes.starts_with(b"PK") {
         return Err(FormatError::UnknownFormat { expected: "a NumPy archive (.npz)" });
     }
-    // The record at the end, behind which a comment of up to 65535 bytes may stand.
+    // The end-of-directory record, which a comment of up to 65535 bytes may follow.
     let earliest = bytes.len().saturating_sub(22 + 65_535);
     let end = bytes[earliest..]
         .windows(4)
@@ -128,11 +128,11 @@ fn directory(bytes: &[u8]) -> Result<Vec<Entry<'_>>, FormatError> {
     let record = Fields::at(bytes, end, 22)?;
     let (mut count, mut offset) = (u64::from(record.u16(10)), u64::from(record.u32(16)));
     if count == 0xffff || offset == 0xffff_ffff {
-        // ZIP64: a locator before the record leads to one with wider fields.
+        // ZIP64: a locator before the record points to one with wider fields.
         let locator = Fields::at(bytes, end.wrapping_sub(20), 20)?;
         let wide = Fields::at(bytes, locator.u64(8), 56)?;
         if locator.0[..4] != *b"PK\x06\x07" || wide.0[..4] != *b"PK\x06\x06" {
-            return Err(FormatError::corrupt(NAME, "the ZIP64 directory is not where it should be"));
+            return Err(FormatError::corrupt(NAME, "the ZIP64 directory is not at its offset"));
         }
         (count, offset) = (wide.u64(32), wide.u64(48));
     }
@@ -160,15 +160,15 @@ fn directory(bytes: &[u8]) -> Result<Vec<Entry<'_>>, FormatError> {
             offset: u64::from(header.u32(42)),
             archive: bytes,
         };
-        widen(&mut entry, &tail.0[name_len..])?;
+        apply_zip64(&mut entry, &tail.0[name_len..])?;
         entries.push(entry);
         offset = offset.saturating_add((46 + name_len + extra_len + comment_len) as u64);
     }
     Ok(entries)
 }
 
-/// Takes the fields that did not fit into 32 bits from the ZIP64 extra field.
-fn widen(entry: &mut Entry<'_>, mut extra: &[u8]) -> Result<(), FormatError> {
+/// Replaces fields that exceed 32 bits by those of the ZIP64 extra field.
+fn apply_zip64(entry: &mut Entry<'_>, mut extra: &[u8]) -> Result<(), FormatError> {
     while let [a, b, c, d, rest @ ..] = extra {
         let (id, len) = (u16::from_le_bytes([*a, *b]), usize::from(u16::from_le_bytes([*c, *d])));
         let body = rest.get(..len).ok_or(FormatError::Truncated { format: NAME })?;
@@ -185,67 +185,73 @@ fn widen(entry: &mut Entry<'_>, mut extra: &[u8]) -> Result<(), FormatError> {
     Ok(())
 }
 
-/// The bytes of a header that are unpacked to tell the shape: longer than any that NumPy writes.
-const BEGINNING: usize = 4096;
+/// Bytes decompressed to read the shape: longer than any header that NumPy writes.
+const HEADER_PREFIX_BYTES: usize = 4096;
 
 impl Entry<'_> {
-    /// Without the ending.
+    /// Returns the name without `.npy`.
     fn array_name(&self) -> &str {
         self.name.strip_suffix(".npy").unwrap_or(&self.name)
     }
 
-    /// The array, where it and its bytes are within the memory allowed.
+    /// Decodes the array within the memory limit.
     fn array(&self, options: &ReadOptions) -> Result<NpyArray, FormatError> {
-        let held = memory::product(&[2, self.unpacked]).saturating_add(self.archive.len() as u64);
-        memory::allow(held, options.max_memory, None)?;
+        let held = memory::saturating_product(&[2, self.unpacked]).saturating_add(self.archive.len() as u64);
+        memory::check_limit(held, options.max_memory, None)?;
         npy::decode_with(&self.unpack()?, options)
     }
 
-    /// The bytes as they are packed.
+    /// Returns the compressed bytes.
     fn packed(&self) -> Result<&[u8], FormatError> {
         let local = Fields::at(self.archive, self.offset, 30)?;
         if local.0[..4] != *b"PK\x03\x04" {
-            return Err(FormatError::corrupt(NAME, format!("{}: no file where the directory says", self.name)));
+            return Err(FormatError::corrupt(
+                NAME,
+                format!("{}: there is no file at the offset of the directory", self.name),
+            ));
         }
         let start = self.offset + 30 + u64::from(local.u16(26)) + u64::from(local.u16(28));
         let packed = usize::try_from(self.packed).map_err(|_| FormatError::Truncated { format: NAME })?;
         Ok(Fields::at(self.archive, start, packed)?.0)
     }
 
-    /// At most `limit` of the first bytes.
+    /// Decompresses at most the first `limit` bytes.
     fn unpack_up_to(&self, limit: usize) -> Result<Vec<u8>, FormatError> {
         let data = self.packed()?;
         match self.method {
             0 => Ok(data[..limit.min(data.len())].to_vec()),
             8 => {
-                // Deflate packs at most 1032 to 1: no more is asked for. The rest of what is promised, if it comes, is left.
+                // Deflate compresses at most 1032 to 1, which bounds the allocation whatever the directory claims.
                 let possible = data.len().saturating_add(1).saturating_mul(1032);
                 let mut bytes = vec![0; limit.min(possible)];
                 let flags = inflate_flags::TINFL_FLAG_USING_NON_WRAPPING_OUTPUT_BUF;
                 let (status, _, length) = decompress(&mut DecompressorOxide::new(), data, &mut bytes, 0, flags);
                 if !matches!(status, TINFLStatus::Done | TINFLStatus::HasMoreOutput) {
-                    return Err(FormatError::corrupt(NAME, format!("{}: it does not unpack ({status:?})", self.name)));
+                    return Err(FormatError::corrupt(
+                        NAME,
+                        format!("{}: it cannot be decompressed ({status:?})", self.name),
+                    ));
                 }
                 bytes.truncate(length);
                 Ok(bytes)
             }
-            method => Err(FormatError::unsupported(NAME, format!("packing method {method}"))),
+            method => Err(FormatError::unsupported(NAME, format!("compression method {method}"))),
         }
     }
 
-    /// The first bytes, not checked.
-    fn beginning(&self) -> Result<Vec<u8>, FormatError> {
-        self.unpack_up_to(BEGINNING)
+    /// Decompresses the first bytes, without checksum.
+    fn unpack_prefix(&self) -> Result<Vec<u8>, FormatError> {
+        self.unpack_up_to(HEADER_PREFIX_BYTES)
     }
 
-    /// All bytes, checked against the checksum.
+    /// Decompresses all bytes and verifies the checksum.
     fn unpack(&self) -> Result<Vec<u8>, FormatError> {
         let length = usize::try_from(self.unpacked).unwrap_or(usize::MAX);
         let possible = self.packed.saturating_add(1).saturating_mul(1032);
         if self.method == 8 && self.unpacked > possible {
-            return Err(FormatError::corrupt(NAME, format!("{}: it cannot unpack to what it says", self.name)));
+            return Err(FormatError::corrupt(NAME, format!("{}: the uncompressed size is impossible", self.name)));
         }
-        // One byte more than promised shows that there is more.
+        // One more byte than declared detects excess data.
         let bytes = self.unpack_up_to(length.saturating_add(1))?;
         if bytes.len() as u64 != self.unpacked || crc32fast::hash(&bytes) != self.crc {
             return Err(FormatError::corrupt(NAME, format!("{}: the checksum does not agree", self.name)));
@@ -254,7 +260,7 @@ impl Entry<'_> {
     }
 }
 
-/// Encodes arrays under names (without `.npy`), deflated where `compress`.
+/// Encodes named arrays (names without `.npy`), deflated where `compress`.
 ///
 /// # Errors
 /// [`FormatError::NotRepresentable`] beyond 65534 arrays or 4 GiB, or as [`npy::encode`].
@@ -337,7 +343,7 @@ mod tests {
     }
 
     #[test]
-    fn stored_and_deflated_read_back() {
+    fn stored_and_deflated_archives_round_trip() {
         let (a, b) = arrays();
         for compress in [false, true] {
             let bytes = encode(&[("disparity", &a), ("α", &b)], compress).unwrap();
@@ -347,7 +353,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bit_flipped_in_the_data_is_noticed() {
+    fn a_flipped_bit_in_the_data_is_detected() {
         let (a, b) = arrays();
         for compress in [false, true] {
             let good = encode(&[("a", &a), ("b", &b)], compress).unwrap();
@@ -361,7 +367,7 @@ mod tests {
     }
 
     #[test]
-    fn promises_of_gigabytes_are_not_believed() {
+    fn impossible_sizes_are_refused() {
         let (a, _) = arrays();
         let good = encode(&[("a", &a)], true).unwrap();
         let at = good.windows(4).position(|w| w == b"PK\x01\x02").unwrap();
@@ -371,21 +377,21 @@ mod tests {
     }
 
     #[test]
-    fn how_many_arrays_there_are_is_told_before_any_is_unpacked() {
+    fn the_number_of_arrays_is_checked_before_decompression() {
         let large = NpyArray { shape: vec![1 << 16], data: NpyData::U8(vec![0; 1 << 16]) };
         let names: Vec<String> = (0..60).map(|i| format!("a{i}")).collect();
         let arrays: Vec<_> = names.iter().map(|name| (name.as_str(), &large)).collect();
         let bytes = encode(&arrays, true).unwrap();
         // Too little for one of them.
         let little = ReadOptions { max_memory: 1 << 16, ..ReadOptions::default() };
-        let error = decode_only(&bytes, &little).unwrap_err();
+        let error = decode_single(&bytes, &little).unwrap_err();
         assert!(matches!(error, FormatError::ArrayCount { got: 60, wanted: 1, .. }), "{error}");
         let error = decode_with(&bytes, &ReadOptions { max_memory: 32 << 16, ..little }).unwrap_err();
         assert!(matches!(error, FormatError::TooMuchMemory { needed, .. } if needed > 61 << 16), "{error}");
         let one = encode(&arrays[..1], true).unwrap();
-        assert!(matches!(decode_only(&one, &little), Err(FormatError::TooMuchMemory { .. })));
-        assert_eq!(decode_only(&one, &ReadOptions { max_memory: 3 << 16, ..little }).unwrap(), large);
-        // A map beside them is found by the headers.
+        assert!(matches!(decode_single(&one, &little), Err(FormatError::TooMuchMemory { .. })));
+        assert_eq!(decode_single(&one, &ReadOptions { max_memory: 3 << 16, ..little }).unwrap(), large);
+        // A map among other arrays is found by the headers.
         let map = NpyArray { shape: vec![2, 2], data: NpyData::F32(vec![1.0; 4]) };
         let mixed: Vec<_> = arrays.iter().copied().chain([("map", &map)]).collect();
         for compress in [false, true] {
@@ -395,7 +401,7 @@ mod tests {
     }
 
     #[test]
-    fn more_than_the_directory_says_is_not_unpacked() {
+    fn excess_data_is_refused() {
         let (a, _) = arrays();
         let mut bytes = encode(&[("a", &a)], true).unwrap();
         let at = bytes.windows(4).position(|w| w == b"PK\x01\x02").unwrap();

@@ -1,8 +1,8 @@
-//! Portable float maps: disparity, depth and flow as Middlebury and ETH3D publish them.
+//! Portable float maps (PFM): disparity, depth and flow as Middlebury and ETH3D publish them.
 //!
-//! The text header `Pf` (one channel) or `PF` (three), width, height and a scale whose sign tells the byte order (negative: little
-//! endian) and whose size is ignored, as by everyone; then rows of `f32` from the bottom up. Unknown values are +∞ in the file and NaN
-//! in memory.
+//! A text header `Pf` (one channel) or `PF` (three), width, height and a scale whose sign is the byte order (negative: little
+//! endian) and whose magnitude is ignored, as by other readers; then rows of `f32` from the bottom up. Invalid values are +∞ in the file and
+//! NaN in memory.
 
 use std::io::Write;
 use std::path::Path;
@@ -27,13 +27,13 @@ pub enum Pfm {
 /// Decodes the bytes of a PFM file. Infinite values become NaN.
 ///
 /// # Errors
-/// [`FormatError`] where the header does not parse, the samples are fewer or more than it promises, or it promises more than
+/// [`FormatError`] where the header does not parse, the number of samples does not match it, or it exceeds
 /// [`DEFAULT_MAX_PIXELS`](crate::DEFAULT_MAX_PIXELS) or [`default_max_memory`](crate::default_max_memory).
 pub fn decode(bytes: &[u8]) -> Result<Pfm, FormatError> {
     decode_with(bytes, &ReadOptions::default())
 }
 
-/// [`decode`] with options.
+/// As [`decode`], with options.
 ///
 /// # Errors
 /// As [`decode`].
@@ -61,7 +61,7 @@ pub fn decode_with(bytes: &[u8], options: &ReadOptions) -> Result<Pfm, FormatErr
         .filter(|s| s.is_finite() && *s != 0.0)
         .ok_or_else(|| corrupt("the scale is not a number other than zero"))?;
     let needed = width as usize * height as usize * channels * 4;
-    // One white-space byte ends the header; files that went through Windows have two.
+    // One white-space byte ends the header; files converted on Windows have two.
     let samples = match rest {
         [b'\r', b'\n', samples @ ..] if samples.len() == needed => samples,
         [b'\n' | b' ' | b'\r' | b'\t', samples @ ..] => samples,
@@ -72,18 +72,18 @@ pub fn decode_with(bytes: &[u8], options: &ReadOptions) -> Result<Pfm, FormatErr
     }
     if samples.len() > needed {
         let extra = samples.len() - needed;
-        return Err(corrupt(&format!("{extra} bytes more than {width}×{height}×{channels} samples take")));
+        return Err(corrupt(&format!("there are {extra} bytes more than {width}×{height}×{channels} samples need")));
     }
-    memory::allow((needed + bytes.len()) as u64, options.max_memory, Some((w, h)))?;
+    memory::check_limit((needed + bytes.len()) as u64, options.max_memory, Some((w, h)))?;
     let row = width as usize * channels * 4;
     let mut data = Vec::with_capacity(needed / 4);
-    let known = |v: f32| if v.is_infinite() { f32::NAN } else { v };
+    let infinite_to_nan = |v: f32| if v.is_infinite() { f32::NAN } else { v };
     for line in samples.chunks_exact(row.max(1)).rev() {
         let values = line.as_chunks::<4>().0.iter();
         if scale < 0.0 {
-            data.extend(values.map(|&b| known(f32::from_le_bytes(b))));
+            data.extend(values.map(|&b| infinite_to_nan(f32::from_le_bytes(b))));
         } else {
-            data.extend(values.map(|&b| known(f32::from_be_bytes(b))));
+            data.extend(values.map(|&b| infinite_to_nan(f32::from_be_bytes(b))));
         }
     }
     let (w, h) = (width as usize, height as usize);
@@ -94,7 +94,7 @@ pub fn decode_with(bytes: &[u8], options: &ReadOptions) -> Result<Pfm, FormatErr
     })
 }
 
-/// The next word of the header, past white space.
+/// Parses the next word of the header, after white space.
 fn token<'a>(rest: &mut &'a [u8]) -> Option<&'a str> {
     let start = rest.iter().position(|b| !b.is_ascii_whitespace())?;
     let len = rest[start..].iter().take(32).position(u8::is_ascii_whitespace)?;
@@ -134,7 +134,7 @@ pub fn read(path: impl AsRef<Path>) -> Result<GrayF32, IoError> {
     match decode(&read_bytes(path)?) {
         Ok(Pfm::Gray(image)) => Ok(image),
         Ok(Pfm::Rgb(_)) => {
-            Err(IoError::reading(path, FormatError::unsupported(NAME, "color in the place of one channel")))
+            Err(IoError::reading(path, FormatError::unsupported(NAME, "a color map where one channel is expected")))
         }
         Err(reason) => Err(IoError::reading(path, reason)),
     }
@@ -149,7 +149,7 @@ pub fn read_rgb(path: impl AsRef<Path>) -> Result<RgbF32, IoError> {
     match decode(&read_bytes(path)?) {
         Ok(Pfm::Rgb(image)) => Ok(image),
         Ok(Pfm::Gray(_)) => {
-            Err(IoError::reading(path, FormatError::unsupported(NAME, "one channel in the place of color")))
+            Err(IoError::reading(path, FormatError::unsupported(NAME, "a one-channel map where color is expected")))
         }
         Err(reason) => Err(IoError::reading(path, reason)),
     }
@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_run_upwards_and_the_sign_is_the_byte_order() {
+    fn rows_are_bottom_up_and_the_sign_is_the_byte_order() {
         let mut file = b"Pf\n2 2\n-1.0\n".to_vec();
         [3.0f32, 4.0, 1.0, f32::INFINITY].iter().for_each(|v| file.extend(v.to_le_bytes()));
         let mut big = b"Pf 2\n2\r\n0.0039\n".to_vec();
@@ -188,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn lying_headers_are_refused() {
+    fn false_headers_are_refused() {
         let truth = bytes_of(GrayF32::new(3, 2, [0.5]).view());
         assert!(matches!(decode(&truth[..truth.len() - 1]), Err(FormatError::Truncated { .. })));
         let mut longer = truth.clone();
@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn a_map_is_judged_by_its_header() {
+    fn the_memory_of_a_map_is_checked_by_its_header() {
         let bytes = bytes_of(GrayF32::new(300, 200, [0.5]).view());
         let within = |max_memory| decode_with(&bytes, &ReadOptions { max_memory, ..ReadOptions::default() });
         let needed = bytes.len() as u64 + 4 * 300 * 200;
@@ -221,7 +221,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_is_written_is_read(w in 0usize..7, h in 0usize..7, values in prop::collection::vec(prop::num::f32::ANY, 147)) {
+        fn maps_round_trip(w in 0usize..7, h in 0usize..7, values in prop::collection::vec(prop::num::f32::ANY, 147)) {
             let image = RgbF32::from_fn(w, h, |x, y| std::array::from_fn(|c| values[(y * w + x) * 3 + c]));
             let Ok(Pfm::Rgb(back)) = decode(&bytes_of(image.view())) else { return Err(TestCaseError::fail("color")) };
             prop_assert_eq!(back.size(), image.size());

@@ -9,17 +9,17 @@ use crate::{FormatError, IoError, write_atomic};
 
 const NAME: &str = "PLY";
 
-/// How the numbers are stored.
+/// Encoding of a PLY file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum PlyEncoding {
-    /// Little-endian binary: 15 bytes a colored point. What every viewer reads.
+    /// Little-endian binary: 15 bytes per colored point. Every viewer reads it.
     #[default]
     Binary,
-    /// Text, about 3 times as large.
+    /// Text, about three times as large.
     Ascii,
 }
 
-/// Refuses a cloud that contradicts itself.
+/// Refuses an inconsistent cloud.
 fn check(cloud: &PointCloud) -> Result<(), FormatError> {
     let n = cloud.len();
     let wrong = |what: String| Err(FormatError::NotRepresentable { format: NAME, what });
@@ -35,10 +35,10 @@ fn check(cloud: &PointCloud) -> Result<(), FormatError> {
     }
 }
 
-/// Encodes a cloud.
+/// Encodes a point cloud.
 ///
 /// # Errors
-/// [`FormatError::NotRepresentable`] where colors or normals are not as many as points, or an edge leads nowhere.
+/// [`FormatError::NotRepresentable`] where the number of colors or normals is not that of points, or an edge refers to a missing point.
 pub fn encode(cloud: &PointCloud, encoding: PlyEncoding, sink: &mut dyn Write) -> Result<(), FormatError> {
     check(cloud)?;
     let format = match encoding {
@@ -98,7 +98,7 @@ pub fn encode(cloud: &PointCloud, encoding: PlyEncoding, sink: &mut dyn Write) -
     Ok(())
 }
 
-/// Writes a cloud; see [`encode`].
+/// Writes a point cloud; see [`encode`].
 ///
 /// # Errors
 /// As [`encode`] and [`write_atomic`].
@@ -111,7 +111,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// Reads what [`encode`] writes, by the format's own description: a header that names every property, then the rows.
+    /// Reads a file of [`encode`] by its header, which lists every property.
     fn read_back(bytes: &[u8]) -> PointCloud {
         let end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
         let header = std::str::from_utf8(&bytes[..end]).unwrap();
@@ -170,7 +170,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn clouds_read_back(points in prop::collection::vec(prop::array::uniform3(-1e6f32..1e6), 0..9), colored: bool, with_normals: bool, edge in 0u32..9) {
+        fn clouds_round_trip(points in prop::collection::vec(prop::array::uniform3(-1e6f32..1e6), 0..9), colored: bool, with_normals: bool, edge in 0u32..9) {
             let n = points.len();
             let mut cloud = PointCloud::from_positions(points);
             if colored {
@@ -191,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn clouds_that_contradict_themselves_are_not_written() {
+    fn inconsistent_clouds_are_not_written() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("c.ply");
         for cloud in [

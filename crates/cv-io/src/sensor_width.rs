@@ -1,8 +1,9 @@
-//! Widths of sensors by the name of the camera, for photographs whose EXIF has the focal length in millimeters and nothing to tell pixels by.
+//! Sensor widths by camera model, for images whose EXIF has the focal length in millimeters but no pixel size.
 
-/// Widths in millimeters of what a whole picture is taken with, by the camera's model in capitals; a star stands for whatever follows, and the longest entry that
-/// fits holds. From the makers' data sheets: cameras with exchangeable lenses, and others with large sensors. Small compact cameras and telephones write a 35 mm equivalent.
-const WIDTHS: &[(&str, f64)] = &[
+/// Widths in millimeters of the sensor area of a full image, by the camera model in capitals; a star is a wildcard, and the longest matching entry
+/// applies. From the manufacturers' data sheets: cameras with interchangeable lenses, and others with large sensors. Compact cameras and
+/// mobile phones write a 35 mm equivalent.
+const SENSOR_WIDTHS_MM: &[(&str, f64)] = &[
     ("COOLPIX A", 23.5),
     ("D1", 23.7),
     ("D100", 23.7),
@@ -210,21 +211,25 @@ const WIDTHS: &[(&str, f64)] = &[
     ("ZV-E10*", 23.5),
 ];
 
-/// The width in millimeters of the sensor of a camera, by its model as EXIF has it; `None` where it is not in the table.
+/// Looks up the sensor width in millimeters of a camera, by its EXIF model; `None` where it is not in the table.
 pub(crate) fn sensor_width(model: &str) -> Option<f64> {
     let model = model.trim().to_uppercase();
     let name =
         ["CANON ", "NIKON CORPORATION ", "OLYMPUS ", "PANASONIC "].iter().find_map(|maker| model.strip_prefix(maker));
-    let named = |name: &str| {
-        let fits = |entry: &str| match entry.strip_suffix('*') {
+    let look_up = |name: &str| {
+        let matches = |entry: &str| match entry.strip_suffix('*') {
             Some(start) => name.starts_with(start),
             None => name == entry,
         };
-        WIDTHS.iter().filter(|(entry, _)| fits(entry)).max_by_key(|(entry, _)| entry.len()).map(|(_, width)| *width)
+        SENSOR_WIDTHS_MM
+            .iter()
+            .filter(|(entry, _)| matches(entry))
+            .max_by_key(|(entry, _)| entry.len())
+            .map(|(_, width)| *width)
     };
-    // Nikon writes its name before the models of some lines that begin with a number.
+    // Some Nikon models that begin with a number include the maker's name.
     let name = name.unwrap_or(&model);
-    named(name).or_else(|| named(name.strip_prefix("NIKON ")?))
+    look_up(name).or_else(|| look_up(name.strip_prefix("NIKON ")?))
 }
 
 #[cfg(test)]
@@ -232,7 +237,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_longest_entry_that_fits_holds() {
+    fn the_longest_matching_entry_applies() {
         for (model, width) in [
             ("Canon EOS 5D Mark III", Some(36.0)),
             ("Canon EOS-1D Mark IV", Some(27.9)),

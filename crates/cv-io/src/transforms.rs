@@ -1,7 +1,7 @@
 //! `transforms.json`: cameras and poses as Nerfstudio and instant-ngp read them.
 //!
-//! Theirs is OpenGL's camera, x right, y up, looking along −z, and camera to world; the center of the top-left pixel is at (0.5, 0.5). The world
-//! stays as it is: no `applied_transform`.
+//! Poses are camera to world with OpenGL's camera frame: x right, y up, looking along −z; the center of the top-left pixel is at (0.5, 0.5). The
+//! world frame is unchanged: no `applied_transform`.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -14,32 +14,33 @@ use crate::{FormatError, IoError};
 
 const NAME: &str = "transforms.json";
 
-/// A lens by its name in the file, and the names of its numbers.
+/// A lens model, its name in the file, and the names of its parameters.
 type Lens = (DistortionModel, &'static str, [&'static str; 4]);
 
-/// The lenses both programs know. All pictures of a file have the same.
+/// The lens models that both programs support. All images of a file have the same.
 const LENSES: [Lens; 2] = [
     (DistortionModel::RadialTangential4, "OPENCV", ["k1", "k2", "p1", "p2"]),
     (DistortionModel::Fisheye4, "OPENCV_FISHEYE", ["k1", "k2", "k3", "k4"]),
 ];
 
-/// A model's cameras and poses as the text of a `transforms.json`. `folder` stands before each picture's name, `images` say; empty: nothing does.
+/// Formats a model's cameras and poses as the text of a `transforms.json`. `folder`, such as `images`, is prepended to each image name; empty
+/// for none.
 ///
-/// The intrinsics stand above the frames where one camera took all pictures, else in each frame. Points are not part of the format.
+/// The intrinsics are global where one camera took all images, else in each frame. Points are not part of the format.
 ///
 /// # Errors
-/// [`FormatError::NotRepresentable`]: a picture whose camera is not there, a pose that is not finite, a lens beyond Brown–Conrady's first four numbers and the equidistant fisheye's four, or
-/// perspective and fisheye lenses in one model.
+/// [`FormatError::NotRepresentable`]: an image whose camera is missing, a pose that is not finite, a lens that needs more than Brown–Conrady's k1,
+/// k2, p1, p2 or the equidistant fisheye's four parameters, or perspective and fisheye lenses in one model.
 pub fn transforms_json(model: &SparseModel, folder: &str) -> Result<String, FormatError> {
-    let not = |what: String| FormatError::NotRepresentable { format: NAME, what };
+    let not_representable = |what: String| FormatError::NotRepresentable { format: NAME, what };
     let mut used = Vec::new();
     for (id, image) in &model.images {
         if !model.cameras.contains_key(&image.camera) {
-            return Err(not(format!("picture {id}, whose camera {} is not there", image.camera)));
+            return Err(not_representable(format!("image {id}, whose camera {} is missing", image.camera)));
         }
         let pose = &image.pose;
         if !pose.rotation.matrix().iter().chain(pose.translation.iter()).all(|v| v.is_finite()) {
-            return Err(not(format!("picture {id}, whose pose is not finite")));
+            return Err(not_representable(format!("image {id}, whose pose is not finite")));
         }
         used.push(image.camera);
     }
@@ -47,13 +48,13 @@ pub fn transforms_json(model: &SparseModel, folder: &str) -> Result<String, Form
     used.dedup();
     let cameras: Vec<(u32, &Camera)> = used.iter().filter_map(|id| Some((*id, model.cameras.get(id)?))).collect();
     for (id, camera) in &cameras {
-        camera.validate().map_err(|e| not(format!("camera {id}: {e}")))?;
+        camera.validate().map_err(|e| not_representable(format!("camera {id}: {e}")))?;
     }
-    let held =
+    let lens_entry =
         LENSES.iter().find(|lens| cameras.iter().all(|(_, camera)| camera.distortion.converted(lens.0).is_some()));
-    let Some(lens) = held else {
+    let Some(lens) = lens_entry else {
         let lenses: Vec<&str> = cameras.iter().map(|(_, camera)| camera.distortion.model().info().name).collect();
-        return Err(not(format!("cameras with these lenses: {}", lenses.join(", "))));
+        return Err(not_representable(format!("cameras with these lenses: {}", lenses.join(", "))));
     };
     let mut text = format!("{{\n  \"camera_model\": \"{}\",\n", lens.1);
     let common = if let [(_, camera)] = &cameras[..] { Some(*camera) } else { None };
@@ -72,7 +73,7 @@ pub fn transforms_json(model: &SparseModel, folder: &str) -> Result<String, Form
             let _ = write!(text, "{}, ", intrinsics(camera, lens));
         }
         let inverse = image.pose.inverse();
-        // Y and Z of the camera's frame change their sign.
+        // The Y and Z axes of the camera frame change their sign.
         let axes = inverse.rotation.matrix() * Matrix3::from_diagonal(&[1.0, -1.0, -1.0].into());
         let t = inverse.translation;
         let rows = (0..3).map(|r| format!("[{}, {}, {}, {}]", axes[(r, 0)], axes[(r, 1)], axes[(r, 2)], t[r]));
@@ -110,7 +111,7 @@ fn intrinsics(camera: &Camera, (model, _, names): &Lens) -> String {
     text
 }
 
-/// A string of JSON.
+/// Quotes text as a JSON string.
 fn quoted(text: &str) -> String {
     let mut quoted = String::from("\"");
     for c in text.chars() {
@@ -132,7 +133,7 @@ mod tests {
     use cv_core::{Distortion, ModelImage, Point3, Pose, Vector3};
     use saphyr::{LoadableYamlNode, Yaml};
 
-    /// Two pictures: from (1, 2, 3), which looks along the world's X with the world's Z up, and from the origin, whose axes are the world's.
+    /// Two images: from (1, 2, 3), looking along the world's X with the world's Z up, and from the origin with the world's axes.
     fn model() -> SparseModel {
         let pose = Pose::look_at(Point3::new(1.0, 2.0, 3.0), Point3::new(6.0, 2.0, 3.0), -Vector3::z()).unwrap();
         let image = |name: &str, pose| ModelImage { name: name.into(), camera: 1, pose, points: vec![] };
@@ -158,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn the_cameras_axes_are_those_of_opengl_in_the_world() {
+    fn poses_have_opengls_camera_axes() {
         let json = parsed(&model(), "images/");
         assert_eq!(json["camera_model"].as_str(), Some("OPENCV"));
         let values = ["w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"].map(|key| number(&json[key]));
@@ -166,7 +167,7 @@ mod tests {
         let frame = &json["frames"][0];
         assert_eq!(frame["file_path"].as_str(), Some("images/a \"1\".jpg"));
         assert!(frame.as_mapping_get("fl_x").is_none());
-        // Right is the world's −Y, up its Z, and back, against the looking direction, its −X.
+        // Right is the world's −Y, up its Z, and back, opposite to the viewing direction, its −X.
         let expected = [[0.0, 0.0, -1.0, 1.0], [-1.0, 0.0, 0.0, 2.0], [0.0, 1.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0]];
         for (r, row) in expected.iter().enumerate() {
             for (c, value) in row.iter().enumerate() {
@@ -179,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_that_differ_stand_in_the_frames() {
+    fn different_cameras_are_written_per_frame() {
         let mut several = model();
         several.cameras.insert(9, Camera::from_focal(320, 240, 250.0));
         assert!(
@@ -193,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn lenses_and_what_hangs_in_the_air() {
+    fn unsupported_lenses_and_missing_cameras_are_refused() {
         let with = |distortion| {
             let mut model = model();
             model.cameras.get_mut(&1).unwrap().distortion = distortion;
@@ -201,7 +202,7 @@ mod tests {
         };
         let fisheye = with(Distortion::new(DistortionModel::Fisheye4, &[0.1, 0.2, 0.3, 0.4]).unwrap()).unwrap();
         assert!(fisheye.contains("OPENCV_FISHEYE") && fisheye.contains("\"k4\": 0.4"), "{fisheye}");
-        // The third radial number has no place.
+        // The format has no k3.
         assert!(with(Distortion::radial_tangential5([0.1, 0.0, 0.0, 0.0, 0.0])).is_ok());
         let error = with(Distortion::radial_tangential5([0.1, 0.0, 0.0, 0.0, 0.2])).unwrap_err();
         assert!(matches!(error, FormatError::NotRepresentable { .. }), "{error}");

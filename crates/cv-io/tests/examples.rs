@@ -2,8 +2,8 @@
 
 #[path = "../examples/convert_camera.rs"]
 mod convert_camera;
-#[path = "../examples/pictures_and_maps.rs"]
-mod pictures_and_maps;
+#[path = "../examples/images_and_maps.rs"]
+mod images_and_maps;
 
 #[test]
 fn convert_camera_runs() {
@@ -11,6 +11,6 @@ fn convert_camera_runs() {
 }
 
 #[test]
-fn pictures_and_maps_runs() {
-    pictures_and_maps::main().unwrap();
+fn images_and_maps_runs() {
+    images_and_maps::main().unwrap();
 }

@@ -1,4 +1,4 @@
-//! Fits `y = a exp(b x)` to measurements of which one is wrong, and tells how well `a` and `b` are known.
+//! Fits `y = a exp(b x)` robustly to measurements with one outlier, and prints the standard deviations of `a` and `b`.
 use cv_numeric::RobustLoss;
 use cv_numeric::adjust::{AdjustOptions, Adjustment, Euclidean, Residual};
 use nalgebra::{SMatrix, Vector1};

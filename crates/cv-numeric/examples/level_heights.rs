@@ -1,4 +1,4 @@
-//! Heights of marks from measured differences: one is held, of another something is known beforehand.
+//! Estimates heights of marks from measured differences: one is fixed, another has a prior.
 use cv_numeric::RobustLoss;
 use cv_numeric::adjust::{AdjustOptions, Adjustment, Euclidean, Prior, Residual};
 use nalgebra::{SMatrix, Vector1};
@@ -22,7 +22,7 @@ pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
     problem.add_residuals("differences", Difference(differences), [marks; 2], pairs, RobustLoss::Trivial)?;
     let prior = Prior { items: vec![([2.4], [1.0 / 0.1])] };
     problem.add_residuals("prior", prior, [marks], vec![[3]], RobustLoss::Trivial)?;
-    problem.hold(marks, 0)?;
+    problem.fix(marks, 0)?;
     problem.solve(&AdjustOptions::default(), |_| Continue(()))?;
     println!("{:?}, the last ± {}", problem.values(marks), problem.covariance(1.0)?.of(marks, 3)?[(0, 0)].sqrt());
     Ok(())

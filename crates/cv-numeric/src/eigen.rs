@@ -1,25 +1,26 @@
-//! Eigenvalues of matrices that are not symmetric, and of quadratic pencils.
+//! Quadratic eigenvalue problems, and null vectors by LU decomposition.
 
 use nalgebra::{DMatrix, DVector, Schur};
 
-/// Most steps of the QR iteration; it takes two or three to an eigenvalue.
-const MAX_STEPS: usize = 1000;
+/// Maximum number of QR iterations; two or three per eigenvalue are usual.
+const MAX_QR_ITERATIONS: usize = 1000;
 
-/// Real `w` at which `C(w) = c[0] + w c[1] + w² c[2]` is singular, ascending, for square matrices of one size.
+/// Solves the quadratic eigenvalue problem: the real `w`, ascending, at which `C(w) = c[0] + w c[1] + w² c[2]` is singular, for square
+/// matrices of one size.
 ///
-/// Shifts to `w = shift + 1/μ`, so that what is infinite in `w` becomes zero in `μ` and is left out, and takes the eigenvalues of the
-/// companion matrix of twice the size (Kukelova, Bujnak & Pajdla, "Polynomial eigenvalue solutions to minimal problems in computer vision",
-/// PAMI 2012). `shift` must not be one of the solutions. Eigenvalues whose imaginary part is below `1e-6` of their size count as real: a double root
-/// splits into a pair with half of the digits. Empty where the matrix at the shift is singular or an entry is not finite. O(n³).
+/// Substitutes `w = shift + 1/μ`, so that infinite eigenvalues become `μ = 0` and are left out, and computes the eigenvalues of the
+/// companion matrix of twice the size (Kukelova, Bujnak & Pajdla, "Polynomial eigenvalue solutions to minimal problems in computer
+/// vision", PAMI 2012). `shift` must not be a solution. Eigenvalues whose imaginary part is below `1e-6` of their modulus count as real:
+/// a double root splits into a pair with half of the digits. Empty where `C(shift)` is singular or an entry is not finite. O(n³).
 pub fn real_quadratic_eigenvalues(c: [&DMatrix<f64>; 3], shift: f64) -> Vec<f64> {
     let n = c[0].nrows();
     let at_shift = c[0] + c[1] * shift + c[2] * (shift * shift);
-    let slope = c[1] + c[2] * (2.0 * shift);
+    let derivative = c[1] + c[2] * (2.0 * shift);
     if !at_shift.iter().all(|v| v.is_finite()) {
         return Vec::new();
     }
     let lu = at_shift.lu();
-    let (Some(a), Some(b)) = (lu.solve(&slope), lu.solve(c[2])) else { return Vec::new() };
+    let (Some(a), Some(b)) = (lu.solve(&derivative), lu.solve(c[2])) else { return Vec::new() };
     let companion = DMatrix::from_fn(2 * n, 2 * n, |i, j| match (i < n, j < n) {
         (true, true) => -a[(i, j)],
         (true, false) => -b[(i, j - n)],
@@ -28,7 +29,7 @@ pub fn real_quadratic_eigenvalues(c: [&DMatrix<f64>; 3], shift: f64) -> Vec<f64>
     if !companion.iter().all(|v| v.is_finite()) {
         return Vec::new();
     }
-    let Some(schur) = Schur::try_new(companion, 1e-15, MAX_STEPS) else { return Vec::new() };
+    let Some(schur) = Schur::try_new(companion, 1e-15, MAX_QR_ITERATIONS) else { return Vec::new() };
     let values = schur.complex_eigenvalues();
     let largest = values.iter().map(|v| v.norm()).fold(0.0, f64::max);
     let mut real: Vec<f64> = values
@@ -40,16 +41,16 @@ pub fn real_quadratic_eigenvalues(c: [&DMatrix<f64>; 3], shift: f64) -> Vec<f64>
     real
 }
 
-/// The direction that a square matrix of nearly full rank less one takes nearest to zero, of unit length, by elimination with full pivoting. `None` where the
-/// rank is lower, or an entry is not finite.
-pub fn kernel_vector(m: &DMatrix<f64>) -> Option<DVector<f64>> {
+/// Computes the unit null vector of a square matrix of numerical rank n − 1, by LU decomposition with full pivoting. `None` where the rank
+/// is lower, or an entry is not finite. O(n³), faster than [`crate::null_vector`].
+pub fn null_vector_lu(m: &DMatrix<f64>) -> Option<DVector<f64>> {
     let n = m.nrows();
     let lu = m.clone().full_piv_lu();
     let u = lu.u();
-    let rest = n.checked_sub(1)?;
+    let last = n.checked_sub(1)?;
     let mut v = DVector::zeros(n);
-    v[rest] = 1.0;
-    for i in (0..rest).rev() {
+    v[last] = 1.0;
+    for i in (0..last).rev() {
         let pivot = u[(i, i)];
         if pivot.is_nan() || pivot.abs() <= 1e-13 * u[(0, 0)].abs() {
             return None;
@@ -74,7 +75,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_pencil_that_is_diagonal_but_for_its_base_has_the_roots_of_its_diagonal(p in square(4), q in square(4), r in proptest::array::uniform4(0.5..3.0f64)) {
+        fn a_pencil_equivalent_to_a_diagonal_one_has_its_roots(p in square(4), q in square(4), r in proptest::array::uniform4(0.5..3.0f64)) {
             prop_assume!(p.clone().lu().determinant().abs() > 0.05 && q.clone().lu().determinant().abs() > 0.05);
             // (w − r)(w + 7) on the first two, a linear w − r on the third, and w² + r on the fourth, which has no real root.
             let diagonal = |v: [f64; 4]| &p * DMatrix::from_diagonal(&DVector::from_column_slice(&v)) * &q;
@@ -94,26 +95,26 @@ mod tests {
         }
 
         #[test]
-        fn the_kernel_is_taken_to_zero(m in square(6), k in 0usize..6, weights in proptest::array::uniform6(-1.0..1.0f64)) {
+        fn the_null_vector_is_mapped_to_zero(m in square(6), k in 0usize..6, weights in proptest::array::uniform6(-1.0..1.0f64)) {
             // One row a combination of the others.
             let mut m = m;
             let row = (0..6).filter(|i| *i != k).map(|i| m.row(i) * weights[i]).fold(m.row(k) * 0.0, |s, r| s + r);
             m.set_row(k, &row);
             prop_assume!(m.clone().svd(false, false).singular_values[4] > 1e-3);
-            let v = kernel_vector(&m).unwrap();
+            let v = null_vector_lu(&m).unwrap();
             prop_assert!((v.norm() - 1.0).abs() < 1e-12 && (m * v).norm() < 1e-11);
         }
     }
 
     #[test]
-    fn nothing_comes_of_nothing() {
+    fn singular_empty_and_non_finite_input_has_no_solution() {
         let (zero, nan) = (DMatrix::zeros(3, 3), DMatrix::from_element(3, 3, f64::NAN));
         let one = DMatrix::<f64>::identity(3, 3);
         assert!(real_quadratic_eigenvalues([&zero, &zero, &zero], 1.0).is_empty());
         assert!(real_quadratic_eigenvalues([&nan, &one, &one], 1.0).is_empty());
         // w² + 1 has no real root.
         assert!(real_quadratic_eigenvalues([&one, &zero, &one], 1.0).is_empty());
-        assert!(kernel_vector(&zero).is_none() && kernel_vector(&nan).is_none());
-        assert!(kernel_vector(&DMatrix::zeros(0, 0)).is_none());
+        assert!(null_vector_lu(&zero).is_none() && null_vector_lu(&nan).is_none());
+        assert!(null_vector_lu(&DMatrix::zeros(0, 0)).is_none());
     }
 }

@@ -3,7 +3,7 @@
 use nalgebra::allocator::Allocator;
 use nalgebra::{Cholesky, DefaultAllocator, Dim, OMatrix, OVector, U1};
 
-/// The second-order model of a cost around some parameters: `cost + 2 gᵀδ + δᵀHδ`, with `H = Σ w JᵀJ`, `g = Σ w Jᵀr`.
+/// The quadratic model of a cost at some parameters: `cost + 2 gᵀδ + δᵀHδ`, with `H = Σ w JᵀJ`, `g = Σ w Jᵀr`.
 #[derive(Debug, Clone)]
 pub struct NormalEquations<D: Dim>
 where
@@ -26,7 +26,7 @@ where
         Self { cost: 0.0, hessian: OMatrix::zeros_generic(dim, dim), gradient: OVector::zeros_generic(dim, U1) }
     }
 
-    /// Adds one scalar residual `r` with its derivative by the parameters and a weight.
+    /// Adds one scalar residual `r` with its Jacobian and a weight.
     #[inline]
     pub fn add(&mut self, r: f64, jacobian: &OVector<f64, D>, weight: f64) {
         let n = jacobian.len();
@@ -42,42 +42,42 @@ where
 
 /// A non-linear least-squares problem.
 ///
-/// The parameters may live on a manifold: the solver only ever moves them by [`LeastSquares::step`].
+/// The parameters may live on a manifold: the solver only updates them by [`LeastSquares::step`].
 pub trait LeastSquares {
     /// Number of degrees of freedom: `nalgebra::Const<N>` or `nalgebra::Dyn`.
     type Dim: Dim;
     /// Parameters.
     type Params: Clone;
 
-    /// The number of degrees of freedom.
+    /// Returns the number of degrees of freedom.
     fn dim(&self) -> Self::Dim;
 
-    /// The cost `Σ ρ(r²)`; may be infinite or NaN, which the solver treats as a step not to take.
+    /// Computes the cost `Σ ρ(r²)`; where it is infinite or NaN the solver rejects the step.
     fn cost(&self, params: &Self::Params) -> f64;
 
-    /// Cost, gradient and Gauss–Newton Hessian.
+    /// Computes cost, gradient and Gauss–Newton Hessian.
     fn linearize(&self, params: &Self::Params) -> NormalEquations<Self::Dim>
     where
         DefaultAllocator: Allocator<Self::Dim, Self::Dim> + Allocator<Self::Dim>;
 
-    /// `params` moved by `delta` in the tangent space used by [`LeastSquares::linearize`].
+    /// Updates `params` by `delta` in the tangent space used by [`LeastSquares::linearize`].
     fn step(&self, params: &Self::Params, delta: &OVector<f64, Self::Dim>) -> Self::Params
     where
         DefaultAllocator: Allocator<Self::Dim>;
 }
 
-/// When [`levenberg_marquardt`] stops, and how it starts.
+/// Termination criteria and initial damping of [`levenberg_marquardt`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct LmOptions {
-    /// Most linearizations. Default 25, where two-view problems have long converged.
+    /// Maximum number of linearizations. Default 25, far more than two-view problems need.
     pub max_iterations: usize,
     /// Initial damping relative to the diagonal. Default 1e-3 (Marquardt 1963).
     pub initial_damping: f64,
-    /// Stop where a step lowers the cost by less than this share. Default 1e-10.
+    /// Relative decrease of the cost below which the solver stops. Default 1e-10.
     pub cost_tolerance: f64,
-    /// Stop where the largest entry of a step is below this, in the parameters' unit. Default 1e-12.
+    /// Largest entry of a step below which the solver stops, in the parameters' unit. Default 1e-12.
     pub step_tolerance: f64,
 }
 
@@ -87,10 +87,10 @@ impl Default for LmOptions {
     }
 }
 
-/// What [`levenberg_marquardt`] found.
+/// Result of [`levenberg_marquardt`].
 #[derive(Debug, Clone)]
 pub struct LmReport<P> {
-    /// The best parameters met.
+    /// The parameters of lowest cost.
     pub params: P,
     /// Cost at the start.
     pub initial_cost: f64,
@@ -98,14 +98,14 @@ pub struct LmReport<P> {
     pub cost: f64,
     /// Number of linearizations.
     pub iterations: usize,
-    /// True where a tolerance was met; false where the iterations ran out or no step could be taken.
+    /// Whether a tolerance was met; false where the iterations ran out or no step was accepted.
     pub converged: bool,
 }
 
 /// Minimizes `problem` from `initial` by Levenberg–Marquardt with Marquardt's diagonal scaling.
 ///
-/// The result is never worse than the start. A start with a NaN cost is returned as it is.
-/// Each iteration costs one linearization and one Cholesky factorisation of the Hessian, O(dim³).
+/// The cost is never above that of the start. A start of non-finite cost is returned unchanged.
+/// Each iteration costs one linearization and one Cholesky factorization of the Hessian, O(dim³).
 pub fn levenberg_marquardt<T: LeastSquares>(problem: &T, initial: T::Params, options: &LmOptions) -> LmReport<T::Params>
 where
     DefaultAllocator: Allocator<T::Dim, T::Dim> + Allocator<T::Dim>,
@@ -123,7 +123,7 @@ where
     }
     loop {
         let dim = model.gradient.len();
-        // A diagonal of zeros (a parameter nothing depends on) still has to be damped.
+        // The floor also damps parameters that no residual depends on, whose diagonal is zero.
         let floor = 1e-12 * (0..dim).map(|i| model.hessian[(i, i)]).fold(0.0, f64::max);
         let mut damped = model.hessian.clone();
         for i in 0..dim {
@@ -168,7 +168,7 @@ mod tests {
     use super::*;
     use nalgebra::{Const, DVector, Dyn, Vector2};
 
-    /// Rosenbrock's valley as least squares: r = (1 − x, 10 (y − x²)), minimum 0 at (1, 1).
+    /// Rosenbrock's function as least squares: r = (1 − x, 10 (y − x²)), minimum 0 at (1, 1).
     struct Rosenbrock;
 
     impl LeastSquares for Rosenbrock {
@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn a_curved_valley_is_followed_to_its_end() {
+    fn rosenbrocks_function_is_minimized() {
         let options = LmOptions { max_iterations: 100, ..LmOptions::default() };
         let report = levenberg_marquardt(&Rosenbrock, Vector2::new(-1.2, 1.0), &options);
         // Quadratic convergence to an exact zero: what is left is rounding.
@@ -205,7 +205,7 @@ mod tests {
         assert!(report.converged && report.cost < 1e-16);
     }
 
-    /// A line `a x + b` of run-time size with one parameter that nothing depends on.
+    /// A line `a x + b` of run-time size with one unobserved parameter.
     struct Line(Vec<(f64, f64)>);
 
     impl LeastSquares for Line {
@@ -235,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn a_parameter_that_nothing_depends_on_stays_where_it_is() {
+    fn an_unobserved_parameter_is_unchanged() {
         // By hand: the least-squares line through (0,1), (1,3), (2,4) is 1.5 x + 7/6.
         let line = Line(vec![(0.0, 1.0), (1.0, 3.0), (2.0, 4.0)]);
         let report = levenberg_marquardt(&line, DVector::from_vec(vec![0.0, 0.0, 5.0]), &LmOptions::default());
@@ -244,13 +244,13 @@ mod tests {
     }
 
     #[test]
-    fn a_start_that_is_not_a_number_is_returned() {
+    fn a_nan_start_is_returned() {
         let report = levenberg_marquardt(&Rosenbrock, Vector2::new(f64::NAN, 1.0), &LmOptions::default());
         assert!(report.params.x.is_nan() && !report.converged);
     }
 
     #[test]
-    fn no_data_means_no_step() {
+    fn no_data_leaves_the_parameters_unchanged() {
         let report = levenberg_marquardt(&Line(vec![]), DVector::from_vec(vec![1.0, 2.0, 3.0]), &LmOptions::default());
         assert_eq!(report.params.as_slice(), [1.0, 2.0, 3.0]);
     }

@@ -1,7 +1,7 @@
 //! Dense and sparse linear algebra, polynomial roots and least squares for vision.
 //!
-//! The only place of the workspace that talks to faer. Small matrices of fixed size stay with nalgebra or with closed
-//! forms, which are faster there.
+//! The only user of faer in the workspace. Small matrices of fixed size use nalgebra or closed forms, which are faster
+//! there.
 //!
 //! ```
 //! use cv_numeric::{svd3, smallest_eigenvector};
@@ -21,7 +21,7 @@ mod parallel;
 mod polynomial;
 mod robust_loss;
 
-pub use eigen::{kernel_vector, real_quadratic_eigenvalues};
+pub use eigen::{null_vector_lu, real_quadratic_eigenvalues};
 pub use levenberg_marquardt::{LeastSquares, LmOptions, LmReport, NormalEquations, levenberg_marquardt};
 pub use linear::{
     LinearError, Svd3, null_space, null_vector, smallest_eigenvector, solve_positive_definite,

@@ -21,7 +21,7 @@ pub enum LinearError {
     NotPositiveDefinite,
 }
 
-/// The unit vector `v` that minimizes `‖A v‖`: the right singular vector of the smallest singular value.
+/// Computes the unit vector `v` that minimizes `‖A v‖`: the right singular vector of the smallest singular value.
 ///
 /// `A` is any m×n matrix with n ≥ 1, also with m < n. O(m n²).
 ///
@@ -35,7 +35,7 @@ pub fn null_vector(a: &DMatrix<f64>) -> Result<DVector<f64>, LinearError> {
     if !a.iter().all(|v| v.is_finite()) {
         return Err(LinearError::NotFinite);
     }
-    // Zero rows make the wide case square without changing ‖A v‖.
+    // Zero rows pad a wide matrix to a square one without changing ‖A v‖.
     let rows = a.nrows().max(n);
     let m = faer::Mat::from_fn(rows, n, |i, j| if i < a.nrows() { a[(i, j)] } else { 0.0 });
     let svd = m.thin_svd().map_err(|_| LinearError::NoConvergence)?;
@@ -43,7 +43,7 @@ pub fn null_vector(a: &DMatrix<f64>) -> Result<DVector<f64>, LinearError> {
     Ok(DVector::from_fn(n, |i, _| v[(i, n - 1)]))
 }
 
-/// Eigenvalues in ascending order with their unit eigenvectors as columns, of a symmetric matrix of fixed size.
+/// Computes the eigenvalues, ascending, and the unit eigenvectors, as columns, of a symmetric matrix of fixed size.
 ///
 /// Only the lower triangle is read. Cyclic Jacobi rotations (Golub & Van Loan, §8.5): slower than a tridiagonal
 /// method above 20 or so, but accurate to the last digits and free of allocation at the sizes of vision problems.
@@ -102,10 +102,10 @@ pub fn symmetric_eigen<const N: usize>(m: &SMatrix<f64, N, N>) -> (SVector<f64, 
     (values, vectors)
 }
 
-/// The unit vector `v` that minimizes `vᵀ M v` for a symmetric positive semi-definite `M` of fixed size, such as `AᵀA`.
+/// Computes the unit vector `v` that minimizes `vᵀ M v` for a symmetric positive semi-definite `M` of fixed size, such as `AᵀA`.
 ///
-/// Only the lower triangle is read. Inverse iteration on a Cholesky factor, which takes a few hundred nanoseconds
-/// at 9×9, and [`symmetric_eigen`] where that does not settle (the two smallest eigenvalues nearly equal).
+/// Only the lower triangle is read. Inverse iteration with a Cholesky factor, a few hundred nanoseconds
+/// at 9×9, and [`symmetric_eigen`] where that does not converge (the two smallest eigenvalues nearly equal).
 /// The sign is such that the largest component is positive.
 ///
 /// # Errors
@@ -116,9 +116,9 @@ pub fn smallest_eigenvector<const N: usize>(m: &SMatrix<f64, N, N>) -> Result<SV
         return Err(LinearError::NotFinite);
     }
     let oriented = |v: SVector<f64, N>| if v[v.icamax()] < 0.0 { -v } else { v };
-    // The shift keeps the factor of a singular matrix finite and is below the rounding of the entries.
+    // The shift makes a singular matrix factorizable and is below the rounding of the entries.
     if let Some(l) = cholesky_lower(m, 4.0 * f64::EPSILON * trace) {
-        // No coordinate axis: those are exact eigenvectors of matrices with structural zeros.
+        // The start is no coordinate axis: those are exact eigenvectors of matrices with structural zeros.
         let mut v = SVector::<f64, N>::from_fn(|i, _| 1.0 + 0.1 * i as f64).normalize();
         for _ in 0..24 {
             let mut next = solve_lower(&l, &v);
@@ -137,7 +137,7 @@ pub fn smallest_eigenvector<const N: usize>(m: &SMatrix<f64, N, N>) -> Result<SV
     Ok(symmetric_eigen(m).1.column(0).into_owned())
 }
 
-/// The lower Cholesky factor of `m + shift·I`, its diagonal inverted.
+/// Computes the lower Cholesky factor of `m + shift·I`, its diagonal inverted.
 pub(crate) fn cholesky_lower<const N: usize>(m: &SMatrix<f64, N, N>, shift: f64) -> Option<SMatrix<f64, N, N>> {
     let mut l = *m;
     for j in 0..N {
@@ -181,7 +181,7 @@ fn solve_lower<const N: usize>(l: &SMatrix<f64, N, N>, b: &SVector<f64, N>) -> S
     x
 }
 
-/// The solution of `M x = b` for a symmetric positive definite `M` of fixed size. Only the lower triangle is read.
+/// Solves `M x = b` for a symmetric positive definite `M` of fixed size. Only the lower triangle is read.
 ///
 /// # Errors
 /// [`LinearError::NotPositiveDefinite`] where a pivot is not positive (also on NaN).
@@ -194,8 +194,8 @@ pub fn solve_positive_definite<const N: usize>(
 
 /// A 3×3 singular value decomposition `U diag(s) Vᵀ`, `s` descending, with `U` and `V` proper rotations.
 ///
-/// The sign that makes both determinants +1 goes into the last singular value, which is therefore negative where
-/// `det M < 0`: `U diag(s) Vᵀ` always gives `M` back.
+/// The last singular value carries the sign that makes both determinants +1: it is negative where `det M < 0`, and
+/// `U diag(s) Vᵀ = M` always.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Svd3 {
     /// Left singular vectors as columns, `det U = 1`.
@@ -207,13 +207,13 @@ pub struct Svd3 {
 }
 
 impl Svd3 {
-    /// The rotation nearest to the matrix in the Frobenius norm, `U Vᵀ` (orthogonal Procrustes problem).
+    /// Computes the rotation nearest to the matrix in the Frobenius norm, `U Vᵀ` (orthogonal Procrustes problem).
     pub fn nearest_rotation(&self) -> Rotation3<f64> {
         Rotation3::from_matrix_unchecked(self.u * self.v.transpose())
     }
 }
 
-/// Singular value decomposition of a 3×3 matrix by one-sided Jacobi rotations, accurate also for tiny singular values.
+/// Computes the singular value decomposition of a 3×3 matrix by one-sided Jacobi rotations, accurate also for tiny singular values.
 ///
 /// # Errors
 /// [`LinearError::NotFinite`] on NaN or infinite entries.
@@ -221,7 +221,7 @@ pub fn svd3(m: &Matrix3<f64>) -> Result<Svd3, LinearError> {
     if !m.iter().all(|v| v.is_finite()) {
         return Err(LinearError::NotFinite);
     }
-    // Scaled, so that no square overflows or underflows.
+    // Scale, so that no square overflows or underflows.
     let scale = m.amax();
     if scale == 0.0 {
         return Ok(Svd3 { u: Matrix3::identity(), s: Vector3::zeros(), v: Matrix3::identity() });
@@ -261,7 +261,7 @@ pub fn svd3(m: &Matrix3<f64>) -> Result<Svd3, LinearError> {
     }
     let u0 = columns[0].normalize();
     let s1 = columns[1].norm();
-    // Below this its square underflows and it has not been made orthogonal: any perpendicular will do.
+    // Below this its square underflows and the column is not orthogonalized: use any perpendicular.
     let u1 = if s1 > 1e-140 {
         columns[1] / s1
     } else {
@@ -289,14 +289,14 @@ pub fn solve_positive_definite_dense(m: &DMatrix<f64>, b: &DVector<f64>) -> Resu
     Ok(DVector::from_fn(n, |i, _| x[(i, 0)]))
 }
 
-/// A basis of the null space of an `R × C` matrix of full rank `R`, as `K = C − R` vectors of a full-rank, not orthogonal, basis.
+/// Computes a basis (not orthogonal) of the null space of an `R × C` matrix of full rank `R`: `K = C − R` vectors.
 ///
-/// Gauss–Jordan elimination, each row with its largest entry as the pivot; `None` where a pivot falls below `1e-9` of its
-/// row's largest entry: the rank is lower. About R²C multiplications, for the minimal solvers.
+/// Gauss–Jordan elimination, each row with its largest entry as the pivot; `None` where a pivot is below `1e-9` of its
+/// row's largest entry (rank below `R`). About R²C multiplications, for the minimal solvers.
 #[inline(always)]
 pub fn null_space<const R: usize, const C: usize, const K: usize>(mut rows: [[f64; C]; R]) -> Option<[[f64; C]; K]> {
     const { assert!(R + K == C, "a full-rank R x C matrix has a null space of dimension C - R") };
-    const SINGULAR: f64 = 1e-9;
+    const PIVOT_TOLERANCE: f64 = 1e-9;
     let mut pivots = [0usize; R];
     let sizes: [f64; R] = std::array::from_fn(|r| rows[r].iter().fold(0.0f64, |m, v| m.max(v.abs())));
     for r in 0..R {
@@ -308,8 +308,8 @@ pub fn null_space<const R: usize, const C: usize, const K: usize>(mut rows: [[f6
                 (column, largest) = (c, v.abs());
             }
         }
-        // Also where the row holds NaN.
-        if largest.is_nan() || largest <= SINGULAR * sizes[r] {
+        // Also where the row has a NaN.
+        if largest.is_nan() || largest <= PIVOT_TOLERANCE * sizes[r] {
             return None;
         }
         pivots[r] = column;
@@ -353,7 +353,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn an_svd_gives_its_matrix_back(m in matrix3(), rank in 1usize..4, scale in -100i32..100) {
+        fn an_svd_reconstructs_its_matrix(m in matrix3(), rank in 1usize..4, scale in -100i32..100) {
             // Lower ranks by repeating a row; any scale that an f64 can square.
             let mut m = m * 10f64.powi(scale);
             for r in rank..3 {
@@ -371,7 +371,7 @@ mod tests {
         }
 
         #[test]
-        fn eigenvectors_diagonalise(values in proptest::array::uniform32(-1.0..1.0f64)) {
+        fn eigenvectors_diagonalize(values in proptest::array::uniform32(-1.0..1.0f64)) {
             let a = SMatrix::<f64, 6, 5>::from_iterator(values.into_iter().take(30));
             let m = a.transpose() * a;
             let (w, v) = symmetric_eigen(&m);
@@ -411,7 +411,7 @@ mod tests {
     }
 
     #[test]
-    fn a_matrix_of_lower_rank_has_no_such_basis() {
+    fn rank_deficient_matrices_have_no_basis() {
         assert!(null_space::<2, 3, 1>([[1.0, 2.0, 3.0], [2.0, 4.0, 6.0]]).is_none());
         assert!(null_space::<2, 3, 1>([[1.0, 2.0, 3.0], [0.0; 3]]).is_none());
         assert!(null_space::<1, 2, 1>([[f64::NAN, f64::NAN]]).is_none());
@@ -419,7 +419,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_smallest_eigenvalues_still_give_a_unit_vector_of_that_space() {
+    fn equal_smallest_eigenvalues_give_a_unit_vector_of_their_eigenspace() {
         let m = SMatrix::<f64, 4, 4>::from_diagonal(&SVector::from([3.0, 1.0, 2.0, 1.0]));
         let v = smallest_eigenvector(&m).unwrap();
         assert!((v.norm() - 1.0).abs() < 1e-12 && (v.dot(&(m * v)) - 1.0).abs() < 1e-12);

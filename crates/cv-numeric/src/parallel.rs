@@ -1,12 +1,11 @@
-//! Parallel loops that are compiled once for each result.
+//! Parallel loops that are compiled once per result type.
 
 use rayon::prelude::*;
 
-/// `[of(0), of(1), …, of(n - 1)]`, computed by all threads.
+/// Computes `[of(0), of(1), …, of(n - 1)]` in parallel.
 ///
-/// As `(0..n).into_par_iter().map(of).collect()`, which the compiler would make once more for each closure. In generic code,
-/// whose closures are many and whose results are few, that is most of what it compiles. Each call should do enough
-/// (microseconds) for a call through a pointer not to matter.
+/// As `(0..n).into_par_iter().map(of).collect()`, but monomorphized per result type rather than per closure, which saves
+/// much compile time in generic code. Each call should take microseconds, so that the dynamic dispatch does not matter.
 pub fn parallel_map<T: Send>(n: usize, of: &(dyn Fn(usize) -> T + Sync)) -> Vec<T> {
     (0..n).into_par_iter().map(of).collect()
 }

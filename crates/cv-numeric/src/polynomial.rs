@@ -31,7 +31,7 @@ impl<const N: usize> std::ops::Deref for Roots<N> {
     }
 }
 
-/// Value and derivative of `Σ c[i] x^i`.
+/// Evaluates `Σ c[i] x^i` and its derivative.
 #[inline]
 fn evaluate(c: &[f64], x: f64) -> (f64, f64) {
     let (mut p, mut d) = (0.0, 0.0);
@@ -42,7 +42,7 @@ fn evaluate(c: &[f64], x: f64) -> (f64, f64) {
     (p, d)
 }
 
-/// Up to two Newton steps, each kept only where it lowers the residual.
+/// Refines a root by up to two Newton steps, each accepted only where it lowers the residual.
 #[inline]
 fn polish(c: &[f64], mut x: f64) -> f64 {
     let (mut p, mut d) = evaluate(c, x);
@@ -59,16 +59,17 @@ fn polish(c: &[f64], mut x: f64) -> f64 {
     x
 }
 
-/// Real roots of `c[0] + c[1] x + c[2] x²`, without cancellation. A double root comes twice, also where the coefficients are off by their last bits.
+/// Computes the real roots of `c[0] + c[1] x + c[2] x²`, without cancellation. A double root is returned twice, also where the coefficients
+/// have rounding errors.
 #[inline]
 pub fn real_roots_quadratic(c: [f64; 3]) -> Roots<2> {
     let mut roots = Roots::NONE;
     let square = c[1] * c[1];
     let discriminant = square - 4.0 * c[2] * c[0];
-    // Half of a last bit in each coefficient and each product make four in all.
+    // Rounding of the coefficients and products, half an ulp each, adds up to four ulps.
     if discriminant >= -4.0 * f64::EPSILON * square {
         let q = -0.5 * (c[1] + discriminant.max(0.0).sqrt().copysign(c[1]));
-        // With a vanishing leading coefficient the first is infinite and left out.
+        // With a vanishing leading coefficient the first root is infinite and left out.
         roots.push(q / c[2]);
         if q != 0.0 {
             roots.push(c[0] / q);
@@ -79,7 +80,7 @@ pub fn real_roots_quadratic(c: [f64; 3]) -> Roots<2> {
     roots.sorted()
 }
 
-/// A cubic `x³ − 3 q x + 2 r` whose `x` is moved by `shift` from the given one's.
+/// A depressed cubic `y³ − 3 q y + 2 r` with `y = x + shift`.
 struct Depressed {
     shift: f64,
     q: f64,
@@ -87,7 +88,7 @@ struct Depressed {
 }
 
 impl Depressed {
-    /// Of `c[0] + c[1] x + c[2] x² + c[3] x³`.
+    /// Depresses `c[0] + c[1] x + c[2] x² + c[3] x³`.
     #[inline]
     fn new(c: &[f64; 4]) -> Self {
         let scale = 1.0 / c[3];
@@ -95,16 +96,16 @@ impl Depressed {
         Self { shift, q: shift * shift - a1 * (1.0 / 3.0), r: shift * (shift * shift - 0.5 * a1) + 0.5 * a0 }
     }
 
-    /// The root that is farthest from the mean of all three (of the depressed cubic, which has its mean at zero).
+    /// Computes the root of the depressed cubic that is farthest from the mean of all three, which is zero.
     ///
-    /// It lies opposite to `r`, and as a magnitude `y` it is the one positive root of `y³ − 3 q y − 2 |r|`, which is convex beyond it, so that
-    /// Halley's steps converge at once from a start within a few per cent.
+    /// Its sign is opposite to that of `r`, and its magnitude `y` is the only positive root of `y³ − 3 q y − 2 |r|`, which is convex beyond
+    /// it: two Halley steps converge from a start within a few percent.
     #[inline]
     fn farthest_root(&self) -> f64 {
         let twice = 2.0 * self.r.abs();
-        // Of three equal roots: squares of less would underflow below. NaN stays.
+        // A lower bound for three equal roots, so that the squares below do not underflow. NaN stays.
         let k = if twice < 1e-150 { 1e-150 } else { twice };
-        // The bits of a positive number are its logarithm nearly; a third of them its cube root within 5 %.
+        // The bits of a positive float approximate its logarithm; a third of them is the cube root within 5 %.
         let cube_root = f64::from_bits(k.to_bits() / 3 + 0x2a9f_7893_0000_0000);
         let squared = cube_root * cube_root;
         // Exact where one term vanishes, and within a twelfth in between.
@@ -114,7 +115,7 @@ impl Depressed {
             let linear = k / (-3.0 * self.q);
             linear * (squared / (squared + linear * linear)).sqrt()
         };
-        // 8 % are 5e-4 after the first step and 1e-10 after the second; the caller's Newton step on the given coefficients takes the rest.
+        // An error of 8 % becomes 5e-4 after the first step and 1e-10 after the second; the caller polishes by Newton steps.
         for _ in 0..2 {
             let (f, d) = (y * (y * y - 3.0 * self.q) - k, 3.0 * (y * y - self.q));
             y -= f * d / (d * d - 3.0 * f * y);
@@ -123,10 +124,10 @@ impl Depressed {
     }
 }
 
-/// What is left of a cubic with a leading coefficient that is below `1e-14` of the largest: the third root is then beyond `1e14`
-/// times the others' scale. None for a true cubic.
+/// Solves a cubic whose leading coefficient is below `1e-14` of the largest as a quadratic: the third root is then beyond `1e14`
+/// times the others' scale. `None` for a true cubic.
 #[inline]
-fn cubic_without_its_cube(c: &[f64; 4]) -> Option<Roots<2>> {
+fn degenerate_cubic_roots(c: &[f64; 4]) -> Option<Roots<2>> {
     let negligible = 1e-14 * c.iter().fold(0.0f64, |m, v| m.max(v.abs()));
     if c[3].abs() > negligible {
         return None;
@@ -135,14 +136,14 @@ fn cubic_without_its_cube(c: &[f64; 4]) -> Option<Roots<2>> {
     Some(if constant { Roots::NONE } else { real_roots_quadratic([c[0], c[1], c[2]]) })
 }
 
-/// Real roots of `c[0] + c[1] x + c[2] x² + c[3] x³`; lower degrees where leading coefficients vanish.
+/// Computes the real roots of `c[0] + c[1] x + c[2] x² + c[3] x³`; of a lower degree where leading coefficients vanish.
 ///
-/// The root farthest from the others by Halley's method, the others from the quadratic that it leaves, then Newton steps on the given
-/// coefficients. A double root may come twice or not at all: a rounding decides whether the curve touches the axis.
+/// The root farthest from the others by Halley's method, the others by deflation to a quadratic, then Newton steps on the original
+/// coefficients. A double root may be returned twice or not at all, depending on rounding.
 #[inline]
 pub fn real_roots_cubic(c: [f64; 4]) -> Roots<3> {
     let mut roots = Roots::NONE;
-    if let Some(lower) = cubic_without_its_cube(&c) {
+    if let Some(lower) = degenerate_cubic_roots(&c) {
         for &r in lower.iter() {
             roots.push(r);
         }
@@ -151,7 +152,7 @@ pub fn real_roots_cubic(c: [f64; 4]) -> Roots<3> {
     let depressed = Depressed::new(&c);
     let root = polish(&c, depressed.farthest_root() - depressed.shift);
     roots.push(root);
-    // Polished: where it is far away, what is left of the others is the difference of large numbers.
+    // Deflate by the polished root: for a large one, deflation cancels.
     let first = root + depressed.shift;
     // x² + first x + (first² − 3 q) = 0.
     let discriminant = 3.0 * (4.0 * depressed.q - first * first);
@@ -164,20 +165,20 @@ pub fn real_roots_cubic(c: [f64; 4]) -> Roots<3> {
     roots.sorted()
 }
 
-/// That real root of `c[0] + c[1] x + c[2] x² + c[3] x³` which is farthest from the mean of the three, and so the best determined; for lower
-/// degrees one of their real roots, `None` where there is none.
+/// Computes the real root of `c[0] + c[1] x + c[2] x² + c[3] x³` that is farthest from the mean of the three, and so the best conditioned;
+/// for a lower degree one of its real roots, `None` where there is none.
 ///
-/// As [`real_roots_cubic`], for less than half of its time.
+/// Takes less than half the time of [`real_roots_cubic`].
 #[inline]
 pub fn farthest_root_cubic(c: [f64; 4]) -> Option<f64> {
-    if let Some(lower) = cubic_without_its_cube(&c) {
+    if let Some(lower) = degenerate_cubic_roots(&c) {
         return lower.first().copied();
     }
     let depressed = Depressed::new(&c);
     Some(polish(&c, depressed.farthest_root() - depressed.shift)).filter(|x| x.is_finite())
 }
 
-/// Real roots of `Σ c[i] x^i` of degree four; lower degrees where leading coefficients vanish.
+/// Computes the real roots of `Σ c[i] x^i` of degree four; of a lower degree where leading coefficients vanish.
 ///
 /// Ferrari's resolvent with the root that gives the largest square, then Newton steps. O(1).
 pub fn real_roots_quartic(c: [f64; 5]) -> Roots<4> {
@@ -224,7 +225,7 @@ struct Sturm<const N: usize> {
     chain: [[f64; N]; N],
     degrees: [usize; N],
     len: usize,
-    /// Where every remainder has just one degree less: `chain[i] = (a x + b) chain[i+1] − s chain[i+2]`.
+    /// For a regular chain, where every remainder has one degree less: `chain[i] = (a x + b) chain[i+1] − s chain[i+2]`.
     quotients: Option<[[f64; 3]; N]>,
 }
 
@@ -255,7 +256,7 @@ impl<const N: usize> Sturm<N> {
                     rest[k + i] -= factor * divisor[i];
                 }
             }
-            // What is below this is rounding of the terms above: then the remainder is zero and the roots multiple.
+            // Coefficients below this are rounding errors: then the remainder is zero and there are multiple roots.
             let size = divisor[..=low].iter().fold(0.0f64, |m, v| m.max(v.abs()));
             let mut next = low;
             while next > 0 && rest[next - 1].abs() <= 1e-15 * size {
@@ -277,7 +278,7 @@ impl<const N: usize> Sturm<N> {
         s
     }
 
-    /// Number of sign changes of the chain at `x`.
+    /// Counts the sign changes of the chain at `x`.
     #[inline]
     fn changes(&self, x: f64) -> usize {
         let mut count = 0;
@@ -287,7 +288,7 @@ impl<const N: usize> Sturm<N> {
                 let d = self.degrees[last];
                 let (mut below, mut here) = (0.0, evaluate(&self.chain[last][..=d], x).0);
                 for i in (0..last).rev() {
-                    // The last pair has no remainder below it unless the chain was cut short, where it is rounding.
+                    // The last pair has no remainder; where the chain was cut short, the remainder is rounding.
                     let up = if i + 1 == last {
                         evaluate(&self.chain[i][..=self.degrees[i]], x).0
                     } else {
@@ -310,9 +311,9 @@ impl<const N: usize> Sturm<N> {
     }
 }
 
-/// Real roots of `Σ c[i] x^i`, of degree `N − 1` or lower where leading coefficients vanish.
+/// Computes the real roots of `Σ c[i] x^i`, of degree `N − 1` or lower where leading coefficients vanish.
 ///
-/// Sturm's theorem separates the roots, bracketed Newton steps find them (as in Nistér's five-point solver, 2004, §3.2.4).
+/// Isolates the roots by Sturm's theorem and refines them by bracketed Newton steps (as in Nistér's five-point solver, 2004, §3.2.4).
 /// Roots closer than `1e-9` of their size may be returned as one, roots of even multiplicity as one or none.
 pub fn real_roots<const N: usize>(c: &[f64; N]) -> Roots<N> {
     let mut roots = Roots::NONE;
@@ -332,7 +333,7 @@ pub fn real_roots<const N: usize>(c: &[f64; N]) -> Roots<N> {
         return roots;
     }
     let sturm = Sturm::new(c, degree);
-    // Intervals with their counts of sign changes; each split halves one.
+    // Intervals with the sign changes at their ends; bisected until each has one root.
     let mut stack = [(0.0, 0.0, 0usize, 0usize); 64];
     stack[0] = (-bound, bound, sturm.changes(-bound), sturm.changes(bound));
     let mut open = 1;
@@ -345,7 +346,7 @@ pub fn real_roots<const N: usize>(c: &[f64; N]) -> Roots<N> {
         }
         let (p, q) = (evaluate(&c[..=degree], low).0, evaluate(&c[..=degree], high).0);
         if count == 1 && (p < 0.0) != (q < 0.0) {
-            roots.push(bracketed(&c[..=degree], low, high, p < 0.0));
+            roots.push(bracketed_newton(&c[..=degree], low, high, p < 0.0));
             continue;
         }
         let middle = 0.5 * (low + high);
@@ -361,8 +362,8 @@ pub fn real_roots<const N: usize>(c: &[f64; N]) -> Roots<N> {
     roots.sorted()
 }
 
-/// The root between `low` and `high`, where the polynomial changes its sign, by Newton steps with bisection as the fallback.
-fn bracketed(c: &[f64], mut low: f64, mut high: f64, rising: bool) -> f64 {
+/// Computes the root between `low` and `high`, where the polynomial changes its sign, by Newton steps with bisection as the fallback.
+fn bracketed_newton(c: &[f64], mut low: f64, mut high: f64, rising: bool) -> f64 {
     let mut x = 0.5 * (low + high);
     let mut last = high - low;
     for _ in 0..200 {
@@ -376,12 +377,12 @@ fn bracketed(c: &[f64], mut low: f64, mut high: f64, rising: bool) -> f64 {
             high = x;
         }
         let newton = x - p / d;
-        // Newton where it stays inside and at least halves the step.
+        // Accept the Newton step where it stays inside and at least halves the step length.
         let inside = newton > low && newton < high && 2.0 * (newton - x).abs() <= last;
         let next = if inside { newton } else { 0.5 * (low + high) };
         last = (next - x).abs();
         x = next;
-        // Newton's error after a step is of the order of the step's square; what remains of a bisection's is the step.
+        // The error after a Newton step is of the order of the step squared; after a bisection, of the step.
         if last <= (if inside { 1e-9 } else { 1e-15 }) * x.abs() {
             break;
         }
@@ -435,8 +436,8 @@ mod tests {
     }
 
     proptest! {
-        // Tolerances: an error of a coefficient moves a root by itself times its size over the product of the gaps, here at most
-        // 1e5 for degree ten and 1e3 for degree four.
+        // Tolerances: the condition number of a root is its size over the product of the gaps, here at most 1e5 for degree ten and
+        // 1e3 for degree four.
         #[test]
         fn quadratics(roots in separated(&[0, 2]), lead in 0.01..100.0f64) {
             let complex: &[f64] = if roots.is_empty() { &[1.0] } else { &[] };
@@ -452,12 +453,12 @@ mod tests {
 
         #[test]
         fn farthest_root_of_cubics(roots in separated(&[1, 3]), lead in 0.01..100.0f64) {
-            // The complex pair of the lone root lies at -0.15, above all lone roots.
+            // The complex pair has real part -0.15, above all single roots.
             let complex: &[f64] = if roots.len() == 1 { &[0.7] } else { &[] };
             let mean = roots.iter().sum::<f64>() / roots.len() as f64;
             let expected = roots.iter().copied().fold(f64::NAN, |best, r| if (best - mean).abs() > (r - mean).abs() { best } else { r });
             let found = farthest_root_cubic(expand(&roots, complex, lead)).unwrap();
-            // Where two lie equally far from the middle one, a rounding decides.
+            // A tie where two roots are equally far from the middle one.
             let tie = roots.len() == 3 && (roots[1] - mean).abs() < 1e-9;
             prop_assert!(tie || close(&[found], &[expected], 1e-11), "{found} {roots:?}");
         }
@@ -477,7 +478,7 @@ mod tests {
         }
 
         #[test]
-        fn lower_degrees_pass_for_their_own(roots in separated(&[1, 2, 3, 4])) {
+        fn polynomials_of_lower_degree(roots in separated(&[1, 2, 3, 4])) {
             prop_assert!(close(&real_roots::<11>(&expand(&roots, &[], 1.0)), &roots, 1e-10));
         }
     }
@@ -493,20 +494,20 @@ mod tests {
         assert!(close(&real_roots(&[4.0, 0.0, -5.0, 0.0, 1.0]), &[-2.0, -1.0, 1.0, 2.0], 1e-14));
         assert!(close(&real_roots_cubic([0.0, -1.0, 0.0, 1.0]), &[-1.0, 0.0, 1.0], 1e-14));
         assert!(close(&real_roots_cubic([-8.0, 0.0, 0.0, 1.0]), &[2.0], 1e-14));
-        // Three equal roots: a rounding of the coefficients moves them by its cube root.
+        // Three equal roots: rounding of the coefficients perturbs them by its cube root.
         assert_eq!(farthest_root_cubic([0.0, 0.0, 0.0, 1.0]).map(|x| x.abs() < 1e-45), Some(true));
         assert!((farthest_root_cubic([-0.001, 0.03, -0.3, 1.0]).unwrap() - 0.1).abs() < 1e-5);
     }
 
     #[test]
-    fn a_root_far_away_leaves_the_others_their_digits() {
+    fn a_large_root_does_not_degrade_the_others() {
         let roots = [0.62, 1.41, 38675.0];
         assert!(close(&real_roots_cubic(expand(&roots, &[], -6e-7)), &roots, 1e-10));
     }
 
     #[test]
     fn a_double_root_survives_rounding() {
-        // 0.3 (x − a)² with its coefficients rounded: for one a in four the discriminant is below zero.
+        // 0.3 (x − a)² with rounded coefficients: for one a in four the discriminant is negative.
         for i in 1..200 {
             let a = 1.0 + f64::from(i) / 97.0;
             let roots = real_roots_quadratic([0.3 * a * a, -0.6 * a, 0.3]);
@@ -516,7 +517,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_a_root_of_nothing() {
+    fn constant_and_non_finite_polynomials_have_no_roots() {
         assert!(real_roots(&[0.0; 11]).is_empty() && real_roots(&[3.0, 0.0, 0.0]).is_empty());
         assert!(real_roots(&[f64::NAN; 5]).is_empty() && real_roots_quartic([f64::NAN; 5]).is_empty());
         assert!(

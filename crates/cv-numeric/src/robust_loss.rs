@@ -2,7 +2,7 @@
 
 /// A loss ρ of the squared residual `s = r²`, with `ρ(s) ≈ s` near zero (Triggs et al., "Bundle Adjustment", 2000, §3.3).
 ///
-/// `scale` is the residual, in its own unit, at which a loss starts to bend.
+/// `scale` is the residual, in its own unit, at which a loss departs from the quadratic.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
@@ -12,7 +12,7 @@ pub enum RobustLoss {
     Trivial,
     /// `s` up to `scale²`, then `2·scale·r − scale²`.
     Huber {
-        /// Where the quadratic ends.
+        /// Residual at which the quadratic ends.
         scale: f64,
     },
     /// `scale² ln(1 + s/scale²)`.
@@ -38,7 +38,7 @@ pub enum RobustLoss {
 }
 
 impl RobustLoss {
-    /// ρ(s) of the squared residual `s ≥ 0`.
+    /// Computes ρ(s) of the squared residual `s ≥ 0`.
     #[inline]
     pub fn value(&self, s: f64) -> f64 {
         match *self {
@@ -64,7 +64,7 @@ impl RobustLoss {
         }
     }
 
-    /// ρ'(s): the weight of a residual in iteratively reweighted least squares, 1 near zero.
+    /// Computes ρ'(s): the weight of a residual in iteratively reweighted least squares, 1 near zero.
     #[inline]
     pub fn weight(&self, s: f64) -> f64 {
         match *self {
@@ -95,8 +95,8 @@ impl RobustLoss {
         }
     }
 
-    /// `1 + 2 s ρ''(s) / ρ'(s)`: the curvature of the loss along the residual as a share of that across it, 1 near zero, negative where the loss bends
-    /// downward (Triggs et al., §4.3). 1 where the weight is zero.
+    /// Computes `1 + 2 s ρ''(s) / ρ'(s)`: the curvature of the loss along the residual relative to that across it, 1 near zero, negative
+    /// where the loss is concave in the residual (Triggs et al., §4.3). 1 where the weight is zero.
     #[inline]
     pub fn curvature(&self, s: f64) -> f64 {
         match *self {
@@ -155,7 +155,7 @@ mod tests {
         }
 
         #[test]
-        fn the_curvature_is_that_of_the_loss_along_the_residual(scale in 0.1..10.0f64, ratio in 0.05..3.0f64) {
+        fn the_curvature_is_the_second_derivative_along_the_residual(scale in 0.1..10.0f64, ratio in 0.05..3.0f64) {
             prop_assume!((ratio - 1.0).abs() > 1e-3);
             let r = ratio * scale;
             let h = 1e-4 * scale;

@@ -1,4 +1,4 @@
-//! A page with a figure, a plot and a point cloud, in one file that any browser shows.
+//! Writes a report with a plot and a point cloud as one self-contained HTML file.
 use cv_core::{GrayF32, PointCloud};
 use cv_report::{MapStyle, Note, Plot, PointScene, Report, Viewpoint, draw_map, render_points};
 
@@ -9,10 +9,11 @@ pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
     let scene = PointScene::new(&PointCloud::from_positions(points));
 
     let mut page = Report::new("A surface");
-    page.headline("points", "4800").note(Note::Good, "Every height is known.");
+    page.headline("points", "4800").note(Note::Good, "Every pixel has a height.");
     let heights: Vec<f64> = map.as_slice().iter().map(|v| f64::from(*v)).collect();
-    page.section("Heights").plot(&Plot::new("Heights", "height", "pixels").histogram("", &heights, 20), "How high.");
-    page.section("In space").points(&scene, None, "Drag to turn.");
+    page.section("Heights")
+        .plot(&Plot::new("Heights", "height", "pixels").histogram("", &heights, 20), "Distribution of heights.");
+    page.section("In space").points(&scene, None, "Drag to rotate.");
     std::fs::write(std::env::temp_dir().join("cv-report-example.html"), page.to_html())?;
 
     let (colors, still) = (draw_map(map.view(), &MapStyle::default()), render_points(&scene, Viewpoint::Top, 320, 240));

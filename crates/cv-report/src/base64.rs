@@ -1,4 +1,4 @@
-//! Bytes as text (RFC 4648, section 4).
+//! Base64 encoding (RFC 4648, section 4).
 
 pub(crate) fn encode(bytes: &[u8]) -> String {
     const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
@@ -23,7 +23,7 @@ pub(crate) fn encode(bytes: &[u8]) -> String {
 #[cfg(test)]
 mod tests {
     #[test]
-    fn the_examples_of_the_standard() {
+    fn test_vectors_of_the_rfc() {
         let examples = [
             ("", ""),
             ("f", "Zg=="),

@@ -1,19 +1,19 @@
-//! Numbers to colors.
+//! Color maps, color bars and colored maps.
 
 use cv_core::{GrayF32, ImageView, RgbU8, quantile};
 
 use crate::raster::{Color, Raster, colors};
 use crate::report::escape;
 
-/// A way from numbers to colors.
+/// A color map from numbers to colors.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Colormap {
     /// Turbo (Mikhailov 2019): low blue, high red. For depth: near blue, far red.
     #[default]
     Turbo,
-    /// Turbo the other way round. For disparity, so that near is blue as well.
+    /// Turbo reversed. For disparity, so that near is blue as well.
     TurboReversed,
-    /// Viridis: even in lightness, so that it survives a gray print. For costs, confidences and densities.
+    /// Viridis: perceptually uniform in lightness, legible in gray print. For costs, confidences and densities.
     Viridis,
     /// Magma: dark to light. For errors.
     Magma,
@@ -22,7 +22,7 @@ pub enum Colormap {
 }
 
 impl Colormap {
-    /// The color at `t`, 0 to 1; [`colors::UNKNOWN`] for NaN.
+    /// Returns the color at `t`, 0 to 1; [`colors::UNKNOWN`] for NaN.
     pub fn color(self, t: f32) -> Color {
         if t.is_nan() {
             return colors::UNKNOWN;
@@ -30,26 +30,26 @@ impl Colormap {
         let t = f64::from(t.clamp(0.0, 1.0));
         let gradient = match self {
             Self::Gray => return [(t * 255.0).round() as u8; 3],
-            Self::Turbo => return colorous::TURBO.eval_continuous(inside(t)).as_array(),
-            Self::TurboReversed => return colorous::TURBO.eval_continuous(inside(1.0 - t)).as_array(),
+            Self::Turbo => return colorous::TURBO.eval_continuous(trim_turbo_ends(t)).as_array(),
+            Self::TurboReversed => return colorous::TURBO.eval_continuous(trim_turbo_ends(1.0 - t)).as_array(),
             Self::Viridis => colorous::VIRIDIS,
             Self::Magma => colorous::MAGMA,
         };
         gradient.eval_continuous(t).as_array()
     }
 
-    /// 256 steps from low to high.
+    /// Returns a table of 256 colors from low to high.
     fn table(self) -> Vec<Color> {
         (0..256).map(|i| self.color(i as f32 / 255.0)).collect()
     }
 }
 
-/// Turbo's outermost ends are nearly black: leave them out, so that no known value looks like a hole.
-fn inside(t: f64) -> f64 {
+/// Maps 0 to 1 to the part of Turbo without its nearly black ends, so that no valid value looks like a hole.
+fn trim_turbo_ends(t: f64) -> f64 {
     0.06 + 0.90 * t
 }
 
-/// Colors a map. Values outside `range` take the color of its end; NaN and infinity are [`colors::UNKNOWN`].
+/// Colors a map. Values outside `range` are clamped to it; NaN and infinity are [`colors::UNKNOWN`].
 pub fn colorize(map: ImageView<'_, f32, 1>, range: (f32, f32), colormap: Colormap) -> RgbU8 {
     let table = colormap.table();
     let scale = if range.1 > range.0 { 255.0 / (range.1 - range.0) } else { 0.0 };
@@ -62,15 +62,15 @@ pub fn colorize(map: ImageView<'_, f32, 1>, range: (f32, f32), colormap: Colorma
     out
 }
 
-/// The `low` and `high` quantiles (0 to 1) of the finite values; `None` where there are none.
+/// Computes the `low` and `high` quantiles (0 to 1) of the finite values; `None` where there are none.
 ///
-/// A picture colored from 0.01 to 0.99 is not ruled by a few wild values.
+/// A color range from 0.01 to 0.99 is robust to outliers.
 pub fn quantile_range(map: ImageView<'_, f32, 1>, low: f64, high: f64) -> Option<(f32, f32)> {
     let mut values: Vec<f32> = (0..map.height()).flat_map(|y| map.row(y)).copied().filter(|v| v.is_finite()).collect();
     Some((quantile(&mut values, low)?, quantile(&mut values, high)?))
 }
 
-/// Round numbers within `range`, about `count` of them, at distances of 1, 2 or 5 times a power of ten.
+/// Computes about `count` axis ticks within `range`, at steps of 1, 2 or 5 times a power of ten.
 pub(crate) fn ticks(range: (f64, f64), count: usize) -> Vec<f64> {
     let span = range.1 - range.0;
     if !(span.is_finite() && span > 0.0) || count == 0 {
@@ -92,7 +92,7 @@ pub(crate) fn ticks(range: (f64, f64), count: usize) -> Vec<f64> {
     (0..=(last - first) as i64).map(|i| (first + i as f64) * step).map(|t| if t == 0.0 { 0.0 } else { t }).collect()
 }
 
-/// A number in as few digits as tell it from its neighbors at distance `step`.
+/// Formats a tick value with as few decimals as distinguish it from its neighbors at distance `step`.
 pub(crate) fn tick_label(value: f64, step: f64) -> String {
     let decimals = (-step.abs().log10() - 1e-9).ceil().clamp(0.0, 9.0) as usize;
     if value != 0.0 && (value.abs() >= 1e6 || value.abs() < 1e-4) {
@@ -102,9 +102,9 @@ pub(crate) fn tick_label(value: f64, step: f64) -> String {
     }
 }
 
-/// A vertical color bar with its scale, as tall as asked: low at the bottom, `label` (such as “depth (m)”) on top.
+/// Draws a vertical color bar with its scale, `height` pixels tall: low at the bottom, `label` (such as “depth (m)”) on top.
 pub fn color_bar(height: usize, range: (f32, f32), colormap: Colormap, label: &str) -> RgbU8 {
-    // Text grows with the picture, between the sizes that can be read and that do not shout.
+    // The text size is proportional to the height, within limits.
     let size = (height as f32 / 40.0).clamp(8.0, 22.0);
     let bar = (size * 1.6).round();
     let (top, bottom) = ((size * 3.4).round(), (size * 1.1).round());
@@ -134,51 +134,51 @@ pub fn color_bar(height: usize, range: (f32, f32), colormap: Colormap, label: &s
     raster.into_image()
 }
 
-/// How a map becomes a picture.
+/// How a map is colored.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct MapStyle {
-    /// Values of the two ends of the colors; `None` (default): the 1 % and 99 % quantiles.
+    /// Values of the two ends of the color map; `None` (default): the 1 % and 99 % quantiles.
     pub range: Option<(f32, f32)>,
-    /// The colors. Default [`Colormap::Turbo`].
+    /// The color map. Default [`Colormap::Turbo`].
     pub colormap: Colormap,
-    /// What the numbers are, with the unit. Default empty.
+    /// The quantity and its unit. Default empty.
     pub label: String,
 }
 
 impl MapStyle {
-    /// Depth: near blue, far red. `unit` may be empty.
+    /// Returns the style for depth: near blue, far red. `unit` may be empty.
     pub fn depth(unit: &str) -> Self {
         let label = if unit.is_empty() { "depth".to_owned() } else { format!("depth ({unit})") };
         Self { label, ..Self::default() }
     }
 
-    /// Disparity: near (large) blue, far (small) red.
+    /// Returns the style for disparity: near (large) blue, far (small) red.
     pub fn disparity() -> Self {
         Self { colormap: Colormap::TurboReversed, label: "disparity (px)".to_owned(), ..Self::default() }
     }
 
-    /// The values of the two ends of the colors for a map.
-    fn ends(&self, map: ImageView<'_, f32, 1>) -> (f32, f32) {
+    /// Computes the values of the two ends of the color map for a map.
+    fn value_range(&self, map: ImageView<'_, f32, 1>) -> (f32, f32) {
         let range = self.range.or_else(|| quantile_range(map, 0.01, 0.99)).unwrap_or((0.0, 1.0));
-        // One value only: give it a scale around it.
+        // A constant map gets a range around its value.
         if range.1 > range.0 { range } else { (range.0 - 0.5, range.0 + 0.5) }
     }
 
-    /// A map in colors, and the scale that belongs below it on a page.
+    /// Colors a map, and returns its color scale for a page.
     pub fn colored(&self, map: ImageView<'_, f32, 1>) -> (RgbU8, ColorScale) {
-        let range = self.ends(map);
+        let range = self.value_range(map);
         let scale = ColorScale { range, colormap: self.colormap, label: self.label.clone() };
         (colorize(map, range, self.colormap), scale)
     }
 
-    /// The same with the ends given.
+    /// Returns the style with a fixed range.
     #[must_use]
     pub fn with_range(self, low: f32, high: f32) -> Self {
         Self { range: Some((low, high)), ..self }
     }
 }
 
-/// Which color stands for which number, as a page shows it: in the page's own colors, light or dark.
+/// A color scale for a page, which follows the page's light or dark theme.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ColorScale {
     range: (f32, f32),
@@ -187,7 +187,7 @@ pub struct ColorScale {
 }
 
 impl ColorScale {
-    /// A bar from low to high with its numbers below it.
+    /// Renders a horizontal bar from low to high with its tick labels below.
     pub(crate) fn to_html(&self) -> String {
         let (low, high) = (f64::from(self.range.0), f64::from(self.range.1));
         let stops: Vec<String> = (0..=16)
@@ -209,9 +209,9 @@ impl ColorScale {
     }
 }
 
-/// A map in colors with a color bar at its right.
+/// Draws a colored map with a color bar on its right.
 pub fn draw_map(map: ImageView<'_, f32, 1>, style: &MapStyle) -> RgbU8 {
-    let range = style.ends(map);
+    let range = style.value_range(map);
     let picture = colorize(map, range, style.colormap);
     let bar = color_bar(picture.height().max(160), range, style.colormap, &style.label);
     let mut raster = Raster::new(picture.width() + bar.width(), picture.height().max(bar.height()), colors::WHITE);
@@ -220,7 +220,7 @@ pub fn draw_map(map: ImageView<'_, f32, 1>, style: &MapStyle) -> RgbU8 {
     raster.into_image()
 }
 
-/// The absolute difference of two maps; NaN where either is unknown.
+/// Computes the absolute difference of two maps; NaN where either is unknown.
 pub fn absolute_difference(a: ImageView<'_, f32, 1>, b: ImageView<'_, f32, 1>) -> GrayF32 {
     GrayF32::from_fn(a.width().min(b.width()), a.height().min(b.height()), |x, y| {
         [(a.at(x, y)[0] - b.at(x, y)[0]).abs()]
@@ -244,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn quantiles_are_those_of_the_finite_values() {
+    fn quantile_ranges_ignore_non_finite_values() {
         let mut values: Vec<f32> = (0..=100).map(|i| i as f32).rev().collect();
         values.extend([f32::NAN, f32::INFINITY]);
         let map = GrayF32::from_vec(103, 1, values).unwrap();
@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn ticks_are_round_numbers_with_just_enough_digits() {
+    fn ticks_are_round_numbers_with_minimal_digits() {
         assert_eq!(ticks((0.0, 10.0), 5), [0.0, 2.0, 4.0, 6.0, 8.0, 10.0]);
         assert_eq!(ticks((-0.31, 0.29), 6), [-0.3, -0.2, -0.1, 0.0, 0.1, 0.2].map(|v: f64| (v * 10.0).round() * 0.1));
         assert!(ticks((3.0, 3.0), 5).is_empty() && ticks((0.0, f64::NAN), 5).is_empty());
@@ -265,7 +265,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_map_makes_a_picture(w in 0usize..6, h in 0usize..6, values in prop::collection::vec(prop::num::f32::ANY, 36)) {
+        fn any_map_can_be_drawn(w in 0usize..6, h in 0usize..6, values in prop::collection::vec(prop::num::f32::ANY, 36)) {
             let map = GrayF32::from_fn(w, h, |x, y| [values[y * 6 + x]]);
             let picture = draw_map(map.view(), &MapStyle::depth("m"));
             prop_assert!(picture.width() > w && picture.height() >= h);

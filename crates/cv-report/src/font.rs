@@ -1,15 +1,17 @@
-//! A stroke font of our own, for labels inside pictures.
+//! A built-in stroke font, for labels inside images.
 //!
-//! A glyph is a few strokes on a grid: capitals are 14 units tall, small letters 10, the baseline is at y = 14. A stroke is a string of
-//! points, two characters each. The first is x, as a letter from A = 0: a capital is a point of the stroke, a small letter the
-//! control point of a quadratic curve. The second is y, in base 36 from the top of the capitals. Strokes are parted by blanks.
+//! A glyph is a set of strokes on a grid: capitals are 14 units tall, lowercase letters 10, the baseline is at y = 14. A stroke is a string
+//! of points, two characters each. The first is x, as a letter from A = 0: uppercase for a point of the stroke, lowercase for the
+//! control point of a quadratic Bézier curve. The second is y, in base 36 from the top of the capitals. Strokes are separated by spaces.
 
-use crate::raster::for_each_near;
+use crate::raster::for_each_pixel_near_segment;
 
-const CAP: f32 = 14.0;
-/// Between two glyphs, in units.
-const GAP: f32 = 4.2;
-const SPACE: f32 = 5.0;
+/// Height of capitals in units.
+const CAP_HEIGHT: f32 = 14.0;
+/// Spacing between two glyphs in units.
+const LETTER_SPACING: f32 = 4.2;
+/// Width of a space in units.
+const SPACE_WIDTH: f32 = 5.0;
 
 /// The strokes of ASCII 33 to 126.
 const GLYPHS: [&str; 94] = [
@@ -120,26 +122,26 @@ fn strokes(c: char) -> &'static str {
         'σ' => "K4E4a4A9aeEeieI9i4E4",
         '–' | '−' => "A9I9",
         '…' => "AeAe DeDe GeGe",
-        // What the font does not have is a box, not a gap.
+        // Missing glyphs are drawn as a box.
         _ => "A0I0IeAeA0",
     }
 }
 
-/// The thickness of a stroke in pixels for capitals `size` pixels tall.
+/// Returns the stroke width in pixels for capitals `size` pixels tall.
 pub(crate) fn weight(size: f32) -> f32 {
     (size * 0.125).max(1.0)
 }
 
-/// The width of `c` without the gap, in units. Digits are equally wide.
+/// Returns the width of `c` without letter spacing, in units. Digits are equally wide.
 fn glyph_width(c: char) -> f32 {
     match c {
-        ' ' => SPACE,
+        ' ' => SPACE_WIDTH,
         '0'..='9' => 8.0,
         _ => strokes(c).split(' ').flat_map(points).map(|(p, _)| p[0]).fold(0.0, f32::max),
     }
 }
 
-/// The points of a stroke, and whether each is on the curve.
+/// Decodes the points of a stroke, and whether each is on the curve.
 fn points(stroke: &str) -> impl Iterator<Item = ([f32; 2], bool)> {
     stroke.as_bytes().as_chunks::<2>().0.iter().map(|&[x, y]| {
         let y = f32::from(if y.is_ascii_digit() { y - b'0' } else { y - b'a' + 10 });
@@ -147,39 +149,40 @@ fn points(stroke: &str) -> impl Iterator<Item = ([f32; 2], bool)> {
     })
 }
 
+/// Returns the width of a line of text in pixels.
 pub(crate) fn width(text: &str, size: f32) -> f32 {
-    let units: f32 = text.chars().map(|c| glyph_width(c) + GAP).sum();
-    (units - GAP).max(0.0) * size / CAP
+    let units: f32 = text.chars().map(|c| glyph_width(c) + LETTER_SPACING).sum();
+    (units - LETTER_SPACING).max(0.0) * size / CAP_HEIGHT
 }
 
-/// Calls `blend(x, y, alpha)` for the pixels of a line of text; no pixel of one glyph twice.
+/// Draws a line of text: calls `blend(x, y, alpha)` for its pixels, at most once per pixel of a glyph.
 pub(crate) fn draw(text: &str, at: [f32; 2], size: f32, weight: f32, mut blend: impl FnMut(i64, i64, f32)) {
-    let sane = |v: f32| v.abs() < 1e6;
-    if !(sane(at[0]) && sane(at[1]) && size > 0.0 && size < 2000.0) {
+    let in_range = |v: f32| v.abs() < 1e6;
+    if !(in_range(at[0]) && in_range(at[1]) && size > 0.0 && size < 2000.0) {
         return;
     }
-    let unit = size / CAP;
+    let unit = size / CAP_HEIGHT;
     let radius = (weight / 2.0).max(0.5);
     let mut left = at[0];
     for c in text.chars() {
         let width = glyph_width(c);
         if c != ' ' {
-            glyph(strokes(c), [left, at[1]], unit, width, radius, &mut blend);
+            draw_glyph(strokes(c), [left, at[1]], unit, width, radius, &mut blend);
         }
-        left += (width + GAP) * unit;
+        left += (width + LETTER_SPACING) * unit;
     }
 }
 
-fn glyph(strokes: &str, at: [f32; 2], unit: f32, width: f32, radius: f32, blend: &mut impl FnMut(i64, i64, f32)) {
+fn draw_glyph(strokes: &str, at: [f32; 2], unit: f32, width: f32, radius: f32, blend: &mut impl FnMut(i64, i64, f32)) {
     let margin = radius + 1.5;
     let (x0, y0) = ((at[0] - margin).floor() as i64, (at[1] - margin).floor() as i64);
     let w = (width * unit + 2.0 * margin).ceil() as usize + 2;
     let h = (18.0 * unit + 2.0 * margin).ceil() as usize + 2;
-    // The greatest coverage of any stroke: crossings must not come out darker.
+    // Maximum coverage of all strokes, so that crossings are not darker.
     let mut coverage = vec![0.0f32; w * h];
     let mut segment = |a: [f32; 2], b: [f32; 2]| {
-        let place = |p: [f32; 2]| [at[0] + p[0] * unit - x0 as f32, at[1] + p[1] * unit - y0 as f32];
-        for_each_near([place(a), place(b)], radius + 0.5, |x, y, distance| {
+        let to_pixels = |p: [f32; 2]| [at[0] + p[0] * unit - x0 as f32, at[1] + p[1] * unit - y0 as f32];
+        for_each_pixel_near_segment([to_pixels(a), to_pixels(b)], radius + 0.5, |x, y, distance| {
             if (0..w as i64).contains(&x) && (0..h as i64).contains(&y) {
                 let cell = &mut coverage[y as usize * w + x as usize];
                 *cell = cell.max((radius + 0.5 - distance).clamp(0.0, 1.0));
@@ -224,7 +227,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_glyph_is_well_formed_and_no_two_are_alike() {
+    fn every_glyph_is_well_formed_and_unique() {
         let mut seen = std::collections::BTreeMap::new();
         for c in ('!'..='~').chain("°×·±µσ–…".chars()) {
             for stroke in strokes(c).split(' ') {
@@ -239,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn text_is_as_wide_as_it_says() {
+    fn drawn_text_has_the_computed_width() {
         for text in ["W", "Hello, world", "0123456789"] {
             let (mut left, mut right) = (i64::MAX, i64::MIN);
             draw(text, [10.0, 10.0], 28.0, 2.0, |x, _, alpha| {
@@ -248,7 +251,7 @@ mod tests {
                     right = right.max(x);
                 }
             });
-            // Half a stroke on either side, and the narrow last digit keeps its full place.
+            // Half a stroke on either side, and a narrow last digit has the full digit width.
             assert!((left as f32 - 9.5).abs() <= 2.0, "{text}: {left}");
             assert!((right as f32 - 10.0 - width(text, 28.0)).abs() <= 3.0, "{text}: {right}");
         }

@@ -1,7 +1,7 @@
 //! Overlays, color maps, plots and the self-contained HTML report.
 //!
-//! Everything here turns results into pictures ([`cv_core::RgbU8`]), SVG or HTML text in memory. Encoding pictures as PNG and
-//! writing files is the caller's part.
+//! Results become images ([`cv_core::RgbU8`]), SVG or HTML text in memory. Encoding PNG files and writing files is left to the
+//! caller.
 //!
 //! ```
 //! use cv_core::GrayF32;
@@ -12,20 +12,20 @@
 //! assert!(picture.width() > 64);
 //!
 //! let mut report = Report::new("Depth of a ramp");
-//! report.headline("valid", "100 %").section("Result").note(Note::Good, "Every pixel is known.");
-//! report.plot(&Plot::new("Depth", "meters", "pixels").histogram("", &[1.0, 2.0, 2.5], 10), "How far things are.");
+//! report.headline("valid", "100 %").section("Result").note(Note::Good, "Every pixel has a depth.");
+//! report.plot(&Plot::new("Depth", "meters", "pixels").histogram("", &[1.0, 2.0, 2.5], 10), "Distribution of depths.");
 //! assert!(report.to_html().starts_with("<!doctype html>"));
 //! ```
 //!
 //! | what | where |
 //! |---|---|
 //! | drawing | [`Raster`], [`colors`] |
-//! | maps of numbers | [`colorize`], [`color_bar`], [`draw_map`], [`MapStyle::colored`], [`draw_error_map`] |
+//! | scalar maps | [`colorize`], [`color_bar`], [`draw_map`], [`MapStyle::colored`], [`draw_error_map`] |
 //! | features and geometry | [`draw_keypoints`], [`draw_matches`], [`draw_epipolar_lines`], [`tile_patches`] |
-//! | arranging | [`side_by_side`], [`shrink_to_fit`] |
+//! | layout | [`side_by_side`], [`shrink_to_fit`] |
 //! | masks | [`overlay_mask`], [`overlay_comparison`] |
 //! | points and cameras | [`PointScene`], [`render_points`] |
-//! | models of many views | [`PointScene::of_model`], [`draw_view_graph`], [`Report::registered_photographs`] |
+//! | structure-from-motion models | [`PointScene::of_model`], [`draw_view_graph`], [`Report::registered_photographs`] |
 //! | pages | [`Report`], [`Figure`], [`Plot`] |
 //! | sheets to print at their true size | [`PrintSheet`] |
 

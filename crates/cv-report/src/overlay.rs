@@ -1,26 +1,26 @@
-//! The field's usual pictures: keypoints, matches, epipolar lines, masks, patches.
+//! Overlays on images: keypoints, matches, epipolar lines, masks, patches, error maps.
 
 use cv_core::{Correspondence, ImageView, Keypoint, Matrix3, RgbU8, luma_u8};
 
 use crate::raster::{Color, Raster, colors};
 
-/// Line widths and marker sizes that suit a picture: 1 for one of about 1000 pixels.
-fn unit(width: usize, height: usize) -> f32 {
+/// Returns the scale of line widths and marker sizes for an image size: 1 for about 1000 pixels.
+fn line_scale(width: usize, height: usize) -> f32 {
     (width.max(height) as f32 / 1000.0).clamp(0.8, 4.0)
 }
 
-/// Takes most of the color and some of the light out of a picture, so that marks on it stand out.
-fn quiet(raster: &mut Raster) {
+/// Desaturates and darkens an image, so that overlays stand out.
+fn desaturate(raster: &mut Raster) {
     raster.map(|[r, g, b]| {
         let luma = u32::from(luma_u8([r, g, b]));
         [r, g, b].map(|v| ((u32::from(v) + 3 * luma) * 45 / 256 + 20) as u8)
     });
 }
 
-/// Marks keypoints: a small ring, larger for larger scales, with a spoke where they have an orientation.
+/// Draws keypoints: a circle whose radius grows with the scale, with a spoke in the direction of the orientation.
 pub fn draw_keypoints(view: ImageView<'_, u8, 3>, keypoints: &[Keypoint], color: Color) -> RgbU8 {
     let mut raster = Raster::from_rgb(view);
-    let u = unit(view.width(), view.height());
+    let u = line_scale(view.width(), view.height());
     for point in keypoints {
         let center = [point.position.x, point.position.y];
         let radius = (3.6 * u).max(3.0 * point.scale.clamp(0.0, 100.0));
@@ -34,14 +34,14 @@ pub fn draw_keypoints(view: ImageView<'_, u8, 3>, keypoints: &[Keypoint], color:
     raster.into_image()
 }
 
-/// Pictures in a row on white, `gap` pixels apart, centered vertically.
+/// Arranges images in a row on white, `gap` pixels apart, centered vertically.
 pub fn side_by_side(views: &[ImageView<'_, u8, 3>], gap: usize) -> RgbU8 {
-    let (raster, _) = row_of(views, gap);
+    let (raster, _) = arrange_in_row(views, gap);
     raster.into_image()
 }
 
-/// The row and the top-left corner of each picture in it.
-fn row_of(views: &[ImageView<'_, u8, 3>], gap: usize) -> (Raster, Vec<[f32; 2]>) {
+/// Returns the row and the top-left corner of each image in it.
+fn arrange_in_row(views: &[ImageView<'_, u8, 3>], gap: usize) -> (Raster, Vec<[f32; 2]>) {
     let height = views.iter().map(ImageView::height).max().unwrap_or(0);
     let width = views.iter().map(ImageView::width).sum::<usize>() + gap * views.len().saturating_sub(1);
     let mut raster = Raster::new(width, height, colors::WHITE);
@@ -56,8 +56,8 @@ fn row_of(views: &[ImageView<'_, u8, 3>], gap: usize) -> (Raster, Vec<[f32; 2]>)
     (raster, corners)
 }
 
-/// Colors that differ from one index to the next, for things that have no meaning by color.
-fn cycle(index: usize) -> Color {
+/// Returns a color for an index, distinct from those of adjacent indices (categorical colors).
+fn categorical_color(index: usize) -> Color {
     // Steps of the golden angle around the hue circle, at full saturation and two lightnesses.
     let hue = (index as f32 * 0.618_034).fract() * 6.0;
     let value = if index.is_multiple_of(2) { 255.0 } else { 210.0 };
@@ -68,8 +68,8 @@ fn cycle(index: usize) -> Color {
     })
 }
 
-/// At most `limit` of `0..n`, evenly spread.
-fn spread(n: usize, limit: usize) -> impl Iterator<Item = usize> {
+/// Selects at most `limit` of `0..n`, evenly spaced.
+fn evenly_spaced(n: usize, limit: usize) -> impl Iterator<Item = usize> {
     let shown = n.min(limit);
     (0..shown).map(move |i| i * n / shown)
 }
@@ -77,7 +77,7 @@ fn spread(n: usize, limit: usize) -> impl Iterator<Item = usize> {
 /// How matches are drawn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MatchStyle {
-    /// At most this many lines per class, evenly spread over the list. Default 400: beyond, lines hide the pictures.
+    /// Maximum number of lines per class (inliers, outliers), evenly spaced in the list. Default 400: more would hide the images.
     pub limit: usize,
     /// Whether outliers are drawn. Default true.
     pub outliers: bool,
@@ -89,8 +89,8 @@ impl Default for MatchStyle {
     }
 }
 
-/// Two pictures, grayed and side by side, with a line per match: inliers green over outliers red, or each in a color of its own where
-/// `inliers` is `None`. A pair beyond the end of `inliers` counts as an outlier.
+/// Draws two images, desaturated and side by side, with a line per match: inliers green over outliers red, or each in a different color
+/// where `inliers` is `None`. A pair beyond the end of `inliers` counts as an outlier.
 pub fn draw_matches(
     a: ImageView<'_, u8, 3>,
     b: ImageView<'_, u8, 3>,
@@ -98,9 +98,9 @@ pub fn draw_matches(
     inliers: Option<&[bool]>,
     style: &MatchStyle,
 ) -> RgbU8 {
-    let (mut raster, corners) = row_of(&[a, b], 0);
-    quiet(&mut raster);
-    let u = unit(raster.width() / 2, raster.height());
+    let (mut raster, corners) = arrange_in_row(&[a, b], 0);
+    desaturate(&mut raster);
+    let u = line_scale(raster.width() / 2, raster.height());
     let mut draw = |pair: &Correspondence, color: Color| {
         let from = [pair.a.x as f32 + corners[0][0], pair.a.y as f32 + corners[0][1]];
         let to = [pair.b.x as f32 + corners[1][0], pair.b.y as f32 + corners[1][1]];
@@ -111,21 +111,21 @@ pub fn draw_matches(
         }
     };
     match inliers {
-        None => spread(pairs.len(), style.limit).for_each(|i| draw(&pairs[i], cycle(i))),
+        None => evenly_spaced(pairs.len(), style.limit).for_each(|i| draw(&pairs[i], categorical_color(i))),
         Some(inliers) => {
             let is_inlier = |i: &usize| inliers.get(*i).copied().unwrap_or(false);
-            let (good, bad): (Vec<usize>, Vec<usize>) = (0..pairs.len()).partition(is_inlier);
+            let (inliers, outliers): (Vec<usize>, Vec<usize>) = (0..pairs.len()).partition(is_inlier);
             if style.outliers {
-                spread(bad.len(), style.limit).for_each(|i| draw(&pairs[bad[i]], colors::RED));
+                evenly_spaced(outliers.len(), style.limit).for_each(|i| draw(&pairs[outliers[i]], colors::RED));
             }
-            spread(good.len(), style.limit).for_each(|i| draw(&pairs[good[i]], colors::GREEN));
+            evenly_spaced(inliers.len(), style.limit).for_each(|i| draw(&pairs[inliers[i]], colors::GREEN));
         }
     }
     raster.into_image()
 }
 
-/// Two pictures, grayed and side by side; up to `count` pairs, each with its epipolar lines in one color: `F x_a` in the second picture
-/// and `Fᵀ x_b` in the first, where `x_bᵀ F x_a = 0`.
+/// Draws two images, desaturated and side by side, with up to `count` pairs, each with its epipolar lines in one color: `F x_a` in the second
+/// image and `Fᵀ x_b` in the first, where `x_bᵀ F x_a = 0`.
 pub fn draw_epipolar_lines(
     a: ImageView<'_, u8, 3>,
     b: ImageView<'_, u8, 3>,
@@ -134,17 +134,19 @@ pub fn draw_epipolar_lines(
     count: usize,
 ) -> RgbU8 {
     let (mut left, mut right) = (Raster::from_rgb(a), Raster::from_rgb(b));
-    quiet(&mut left);
-    quiet(&mut right);
-    let u = unit(a.width(), a.height());
-    for (n, i) in spread(pairs.len(), count).enumerate() {
+    desaturate(&mut left);
+    desaturate(&mut right);
+    let u = line_scale(a.width(), a.height());
+    for (n, i) in evenly_spaced(pairs.len(), count).enumerate() {
         let pair = &pairs[i];
-        let color = cycle(n);
+        let color = categorical_color(n);
         let (xa, xb) = (pair.a.to_homogeneous(), pair.b.to_homogeneous());
         for (raster, line, point) in
             [(&mut left, fundamental.transpose() * xb, pair.a), (&mut right, fundamental * xa, pair.b)]
         {
-            if let Some((from, to)) = across(line.x, line.y, line.z, raster.width() as f64, raster.height() as f64) {
+            if let Some((from, to)) =
+                clip_line_to_image(line.x, line.y, line.z, raster.width() as f64, raster.height() as f64)
+            {
                 raster.line(from, to, 1.8 * u, color);
             }
             let center = [point.x as f32, point.y as f32];
@@ -156,8 +158,8 @@ pub fn draw_epipolar_lines(
     side_by_side(&[left.image().view(), right.image().view()], gap)
 }
 
-/// The ends of the line `a x + b y + c = 0` on the borders of a picture.
-fn across(a: f64, b: f64, c: f64, width: f64, height: f64) -> Option<([f32; 2], [f32; 2])> {
+/// Computes the ends of the line `a x + b y + c = 0` at the borders of an image.
+fn clip_line_to_image(a: f64, b: f64, c: f64, width: f64, height: f64) -> Option<([f32; 2], [f32; 2])> {
     let norm = a.hypot(b);
     if !(norm > 0.0 && norm.is_finite() && c.is_finite()) {
         return None;
@@ -170,34 +172,35 @@ fn across(a: f64, b: f64, c: f64, width: f64, height: f64) -> Option<([f32; 2], 
     Some((from.map(|v| v as f32), to.map(|v| v as f32)))
 }
 
-/// A mask laid over a picture: `color` mixed in by `alpha` (0 to 1) where true, with a solid outline. Beyond the mask's size nothing
-/// is marked.
+/// Overlays a mask on an image: `color` blended by `alpha` (0 to 1) where true, with a solid boundary. Pixels beyond the mask's size are
+/// unchanged.
 pub fn overlay_mask(view: ImageView<'_, u8, 3>, mask: ImageView<'_, bool, 1>, color: Color, alpha: f32) -> RgbU8 {
     let mut raster = Raster::from_rgb(view);
-    let reach = unit(view.width(), view.height()).round() as i64;
-    let on = |x: i64, y: i64| {
+    let outline_width = line_scale(view.width(), view.height()).round() as i64;
+    let is_set = |x: i64, y: i64| {
         usize::try_from(x).ok().zip(usize::try_from(y).ok()).and_then(|(x, y)| mask.get(x, y)).is_some_and(|[m]| m)
     };
     for y in 0..view.height().min(mask.height()) as i64 {
         for x in 0..view.width().min(mask.width()) as i64 {
-            if !on(x, y) {
+            if !is_set(x, y) {
                 continue;
             }
-            let edge = (1..=reach).any(|d| !on(x - d, y) || !on(x + d, y) || !on(x, y - d) || !on(x, y + d));
-            raster.blend(x, y, color, if edge { 1.0 } else { alpha });
+            let is_boundary = (1..=outline_width)
+                .any(|d| !is_set(x - d, y) || !is_set(x + d, y) || !is_set(x, y - d) || !is_set(x, y + d));
+            raster.blend(x, y, color, if is_boundary { 1.0 } else { alpha });
         }
     }
     raster.into_image()
 }
 
-/// A mask against the truth: right green, invented red, missed blue, on the grayed picture.
+/// Overlays a mask compared with ground truth on the desaturated image: true positives green, false positives red, false negatives blue.
 pub fn overlay_comparison(
     view: ImageView<'_, u8, 3>,
     mask: ImageView<'_, bool, 1>,
     truth: ImageView<'_, bool, 1>,
 ) -> RgbU8 {
     let mut raster = Raster::from_rgb(view);
-    quiet(&mut raster);
+    desaturate(&mut raster);
     for y in 0..view.height() {
         for x in 0..view.width() {
             let color = match (mask.get(x, y) == Some([true]), truth.get(x, y) == Some([true])) {
@@ -212,10 +215,10 @@ pub fn overlay_comparison(
     raster.into_image()
 }
 
-/// Square patches, such as descriptors, as enlarged tiles: `side × side` values each, row by row, every tile stretched to
-/// its own contrast.
+/// Draws square patches, such as descriptors, as enlarged tiles: `side × side` values each, row-major, the contrast of each tile
+/// stretched to its range.
 ///
-/// Values beyond whole patches are left out. Returns an empty picture where `side` is 0 or there is no patch.
+/// Values beyond whole patches are ignored. Returns an empty image where `side` is 0 or there is no patch.
 pub fn tile_patches(values: &[f32], side: usize, columns: usize, zoom: usize) -> RgbU8 {
     let area = side * side;
     let (columns, zoom) = (columns.max(1), zoom.max(1));
@@ -241,10 +244,10 @@ pub fn tile_patches(values: &[f32], side: usize, columns: usize, zoom: usize) ->
     raster.into_image()
 }
 
-/// A disparity or depth map against the truth: gray ramp up to `limit`, then red to yellow; black where there is no truth, blue where
-/// the estimate is missing.
+/// Draws the error map of a disparity or depth map against ground truth: gray ramp up to `limit`, then red to yellow; black where there is
+/// no ground truth, blue where the estimate is missing.
 ///
-/// The boundary between gray and color is the threshold of “bad” pixels (2 px for bad-2.0).
+/// The boundary between gray and color is the bad-pixel threshold (2 px for bad-2.0).
 pub fn draw_error_map(estimate: ImageView<'_, f32, 1>, truth: ImageView<'_, f32, 1>, limit: f32) -> RgbU8 {
     let limit = if limit > 0.0 { limit } else { 1.0 };
     RgbU8::from_fn(estimate.width().min(truth.width()), estimate.height().min(truth.height()), |x, y| {
@@ -266,9 +269,9 @@ pub fn draw_error_map(estimate: ImageView<'_, f32, 1>, truth: ImageView<'_, f32,
     })
 }
 
-/// A picture no larger than `side` pixels either way, by averaging over areas; one that fits already is copied.
+/// Shrinks an image to at most `side` pixels on its longer side by area averaging; a smaller one is copied.
 ///
-/// For pages: a panorama of 10,000 pixels would be tens of megabytes inside the file.
+/// For reports: a panorama of 10,000 pixels would be tens of megabytes in the file.
 pub fn shrink_to_fit(view: ImageView<'_, u8, 3>, side: usize) -> RgbU8 {
     let (w, h) = view.size();
     let (longest, side) = (w.max(h), side.max(1));
@@ -279,8 +282,8 @@ pub fn shrink_to_fit(view: ImageView<'_, u8, 3>, side: usize) -> RgbU8 {
     let (width, height) = (scaled(w), scaled(h));
     let mut out = RgbU8::new(width, height, [0; 3]);
     let mut sums = vec![[0.0f32; 3]; width];
-    let columns = spans(w, width);
-    for (y, (top, rows)) in spans(h, height).into_iter().enumerate() {
+    let columns = area_weights(w, width);
+    for (y, (top, rows)) in area_weights(h, height).into_iter().enumerate() {
         sums.fill([0.0; 3]);
         for (j, weight_y) in rows.into_iter().enumerate() {
             let row = view.row(top + j).as_chunks::<3>().0;
@@ -300,14 +303,15 @@ pub fn shrink_to_fit(view: ImageView<'_, u8, 3>, side: usize) -> RgbU8 {
     out
 }
 
-/// For each of `to` equal parts of a line of `from ≥ to` cells: its first cell, and the share each cell has in it (together 1).
-fn spans(from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
+/// Computes the area weights for resampling a line of `from ≥ to` pixels to `to`: per result the first source pixel, and the weights of it
+/// and its successors, which sum to one.
+fn area_weights(from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
     let step = from as f64 / to as f64;
     let part = |i: usize| {
         let (start, end) = (i as f64 * step, ((i + 1) as f64 * step).min(from as f64));
         let (first, last) = (start as usize, (end.ceil() as usize).clamp(start as usize + 1, from));
-        let share = |cell: usize| ((end.min(cell as f64 + 1.0) - start.max(cell as f64)) / (end - start)) as f32;
-        (first, (first..last).map(share).collect())
+        let weight = |cell: usize| ((end.min(cell as f64 + 1.0) - start.max(cell as f64)) / (end - start)) as f32;
+        (first, (first..last).map(weight).collect())
     };
     (0..to).map(part).collect()
 }
@@ -323,7 +327,7 @@ mod tests {
     }
 
     #[test]
-    fn inliers_are_green_and_outliers_red_where_they_lie() {
+    fn inliers_are_green_and_outliers_red_at_their_positions() {
         let (a, b) = (gray(40, 30), gray(50, 20));
         let pairs = [Correspondence::new(10.0, 10.0, 20.0, 5.0), Correspondence::new(10.0, 25.0, 20.0, 15.0)];
         let picture = draw_matches(a.view(), b.view(), &pairs, Some(&[true, false]), &MatchStyle::default());
@@ -355,7 +359,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mask_shows_inside_and_rim() {
+    fn a_mask_overlay_has_blended_interior_and_solid_boundary() {
         let mask = Mask::from_fn(20, 20, |x, y| [(5..15).contains(&x) && (5..15).contains(&y)]);
         let picture = overlay_mask(gray(20, 20).view(), mask.view(), [255, 0, 0], 0.5);
         assert_eq!(picture.at(5, 8), [255, 0, 0]);
@@ -365,7 +369,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_fall_into_their_classes() {
+    fn error_map_colors_by_error_class() {
         let estimate = cv_core::GrayF32::from_vec(4, 1, vec![1.0, 9.0, f32::NAN, 3.0]).unwrap();
         let truth = cv_core::GrayF32::from_vec(4, 1, vec![1.5, 1.0, 2.0, f32::NAN]).unwrap();
         let picture = draw_error_map(estimate.view(), truth.view(), 2.0);
@@ -376,7 +380,7 @@ mod tests {
     }
 
     #[test]
-    fn tiles_are_counted_right() {
+    fn patches_are_tiled_at_their_positions() {
         let picture = tile_patches(&[0.0, 1.0, 0.5, f32::NAN, 2.0, 2.0, 2.0, 2.0, 7.0], 2, 8, 4);
         let cell = 4 * 2 + 2;
         assert_eq!(picture.size(), (2 * cell + 2, cell + 2));
@@ -385,7 +389,7 @@ mod tests {
     }
 
     #[test]
-    fn shrinking_averages_over_areas() {
+    fn shrinking_is_area_averaging() {
         let image =
             RgbU8::from_vec(4, 2, [0, 100, 10, 30, 20, 200, 50, 70].iter().flat_map(|&v| [v, 255, 0]).collect());
         let small = shrink_to_fit(image.unwrap().view(), 2);
@@ -399,7 +403,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn shrinking_keeps_the_mean_and_fits(w in 1usize..40, h in 1usize..40, side in 0usize..50, seed: u8) {
+        fn shrinking_preserves_the_mean_and_fits(w in 1usize..40, h in 1usize..40, side in 0usize..50, seed: u8) {
             let image = RgbU8::from_fn(w, h, |x, y| [(x * 37 + y * 91) as u8 ^ seed, 0, 255]);
             let small = shrink_to_fit(image.view(), side);
             prop_assert!(small.width().max(small.height()) <= side.max(1));
@@ -410,7 +414,7 @@ mod tests {
         }
 
         #[test]
-        fn wild_input_never_panics(values in prop::array::uniform9(prop::num::f64::ANY), w in 0usize..9, h in 0usize..9) {
+        fn extreme_input_never_panics(values in prop::array::uniform9(prop::num::f64::ANY), w in 0usize..9, h in 0usize..9) {
             let a = gray(w, h);
             let pairs = [Correspondence::new(values[0], values[1], values[2], values[3])];
             draw_matches(a.view(), a.view(), &pairs, None, &MatchStyle::default());

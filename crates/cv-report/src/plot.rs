@@ -1,4 +1,4 @@
-//! Plots as SVG, drawn in the colors of the page they stand in.
+//! Plots as SVG, in the theme colors of the surrounding page.
 
 use std::fmt::Write as _;
 
@@ -18,7 +18,7 @@ enum Layer {
     Points(Vec<[f64; 2]>),
     /// Bar edges and heights: one more edge than heights.
     Bars(Vec<f64>, Vec<f64>),
-    /// A vertical mark at x.
+    /// A vertical line at x.
     Mark(f64),
 }
 
@@ -32,12 +32,12 @@ pub struct Plot {
 }
 
 impl Plot {
-    /// An empty plot. The labels name the quantity and its unit.
+    /// Makes an empty plot. The axis labels are the quantity and its unit.
     pub fn new(title: &str, x_label: &str, y_label: &str) -> Self {
         Self { title: title.into(), x_label: x_label.into(), y_label: y_label.into(), layers: Vec::new() }
     }
 
-    /// Adds a line through points. `name` stands in the legend where it is not empty.
+    /// Adds a line through points. A non-empty `name` appears in the legend.
     #[must_use]
     pub fn line(self, name: &str, points: &[[f64; 2]]) -> Self {
         self.with(name, Layer::Line(finite(points)))
@@ -57,7 +57,7 @@ impl Plot {
         self.histogram_within(name, values, bins, (low, high))
     }
 
-    /// Adds a histogram over a given range; values outside are left out.
+    /// Adds a histogram over a given range; values outside are ignored.
     #[must_use]
     pub fn histogram_within(self, name: &str, values: &[f64], bins: usize, range: (f64, f64)) -> Self {
         let bins = bins.clamp(1, 1000);
@@ -78,7 +78,7 @@ impl Plot {
         self.with(name, Layer::Bars(edges, counts))
     }
 
-    /// Adds a dashed vertical mark, such as a threshold.
+    /// Adds a dashed vertical line, such as a threshold.
     #[must_use]
     pub fn mark(self, name: &str, x: f64) -> Self {
         if x.is_finite() { self.with(name, Layer::Mark(x)) } else { self }
@@ -89,7 +89,7 @@ impl Plot {
         self
     }
 
-    /// The smallest box around all layers, with room; heights begin at zero where nothing is below.
+    /// Computes the bounding box of all layers, with a margin; the y axis begins at zero where the data are near it.
     fn bounds(&self) -> ([f64; 2], [f64; 2]) {
         let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
         let mut grow = |p: [f64; 2]| {
@@ -110,7 +110,7 @@ impl Plot {
                 Layer::Mark(_) => {}
             }
         }
-        // Marks lie on the x axis; they have no height of their own.
+        // Vertical lines extend the x range only.
         for (_, layer) in &self.layers {
             if let Layer::Mark(x) = layer {
                 low[0] = low[0].min(*x);
@@ -132,8 +132,8 @@ impl Plot {
         (low, high)
     }
 
-    /// The plot as an `<svg>` element, 640 × 300 units, scaling with its container. Colors come from the report's style
-    /// sheet; alone in a file, they fall back to dark on transparent.
+    /// Renders the plot as an `<svg>` element of 640 × 300 units that scales with its container. Colors come from the report's style
+    /// sheet; without it they fall back to dark on transparent.
     pub fn to_svg(&self) -> String {
         let (low, high) = self.bounds();
         let px = |x: f64| LEFT + (x - low[0]) / (high[0] - low[0]) * (WIDTH - LEFT - RIGHT);
@@ -185,7 +185,7 @@ impl Plot {
             escape(&self.y_label)
         );
         for (i, (_, layer)) in self.layers.iter().enumerate() {
-            let color = series(i);
+            let color = series_color(i);
             match layer {
                 Layer::Line(points) => {
                     let mut path = String::new();
@@ -233,8 +233,11 @@ impl Plot {
             x -= 7.0 * name.chars().count() as f64;
             let _ = write!(s, "<text x=\"{x:.1}\" y=\"18\" fill=\"{ink}\">{}</text>", escape(name));
             x -= 16.0;
-            let _ =
-                write!(s, "<rect x=\"{x:.1}\" y=\"8\" width=\"11\" height=\"11\" rx=\"2\" fill=\"{}\"/>", series(i));
+            let _ = write!(
+                s,
+                "<rect x=\"{x:.1}\" y=\"8\" width=\"11\" height=\"11\" rx=\"2\" fill=\"{}\"/>",
+                series_color(i)
+            );
             x -= 12.0;
         }
         s.push_str("</svg>");
@@ -242,8 +245,8 @@ impl Plot {
     }
 }
 
-/// The color of the i-th layer, told apart with any color vision.
-fn series(i: usize) -> &'static str {
+/// Returns the color of the i-th layer, from a palette safe for color blindness.
+fn series_color(i: usize) -> &'static str {
     ["#2f7fd6", "#e08a1e", "#1f9e77", "#cf4f9b", "#7a63c7", "#c9432f"][i % 6]
 }
 
@@ -263,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_to_draw_is_still_a_plot() {
+    fn empty_and_non_finite_layers_give_a_valid_plot() {
         let empty = Plot::new("a < b & c", "x", "y").to_svg();
         assert!(empty.contains("a &lt; b &amp; c") && empty.ends_with("</svg>"));
         let odd = Plot::new("", "", "")
@@ -276,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn points_land_where_the_axes_say() {
+    fn points_are_drawn_at_their_axis_coordinates() {
         let svg = Plot::new("", "", "").points("", &[[0.0, 0.0], [10.0, 100.0]]).to_svg();
         // The lowest point is the left bottom corner of the frame; the highest is 5 % below its top.
         assert!(svg.contains(&format!("cx=\"{LEFT:.1}\" cy=\"{:.1}\"", HEIGHT - BOTTOM)), "{svg}");

@@ -1,16 +1,16 @@
-//! A sheet of paper to print at its true size: black rectangles and lines of text, as PDF, SVG or pixels.
+//! A sheet of paper to print at true scale: black rectangles and lines of text, as PDF, SVG or pixels.
 //!
-//! PDF: ISO 32000-1, with one of the fonts that every reader has. Both texts are written by hand, since nothing here needs more than rectangles. All rectangles are one
-//! path, so that no seam shows where they meet.
+//! PDF (ISO 32000-1) with a standard font, and SVG, are written directly, since only rectangles and text are needed. All rectangles are one
+//! path, so that no seam is visible where they meet.
 
 use crate::raster::Raster;
 use cv_core::GrayU8;
 use std::fmt::Write as _;
 
-/// Points of PDF in a millimeter.
-const POINTS: f64 = 72.0 / 25.4;
+/// PDF points per millimeter.
+const POINTS_PER_MM: f64 = 72.0 / 25.4;
 
-/// A line of text; its left end and baseline, and the height of its capitals, in millimeters.
+/// A line of text: left end on the baseline, and cap height, in millimeters.
 #[derive(Debug, Clone, PartialEq)]
 struct Line {
     at: [f64; 2],
@@ -28,12 +28,12 @@ pub struct PrintSheet {
 }
 
 impl PrintSheet {
-    /// An empty sheet of a width and a height.
+    /// Makes an empty sheet of the given width and height.
     pub fn new(size: (f64, f64), title: &str) -> Self {
         Self { size, title: title.to_owned(), rectangles: Vec::new(), lines: Vec::new() }
     }
 
-    /// Width and height.
+    /// Returns width and height.
     pub fn size(&self) -> (f64, f64) {
         self.size
     }
@@ -44,14 +44,14 @@ impl PrintSheet {
         self
     }
 
-    /// Adds a line of text from its left end on the baseline. ASCII; anything else becomes `?`.
+    /// Adds a line of text at its left end on the baseline, with cap height `capitals`. ASCII; other characters become `?`.
     pub fn text(&mut self, at: [f64; 2], capitals: f64, text: &str) -> &mut Self {
         let text = text.chars().map(|c| if c == ' ' || c.is_ascii_graphic() { c } else { '?' }).collect();
         self.lines.push(Line { at, capitals, text });
         self
     }
 
-    /// Adds a ruler of so many millimeters with its left end at a place: a tick for each millimeter, longer ones for five and ten, and numbers.
+    /// Adds a ruler of `length` millimeters with its left end `at`: a tick per millimeter, longer ones every five and ten, and numbers every 50.
     pub fn ruler(&mut self, at: [f64; 2], length: usize) -> &mut Self {
         const WIDTH: f64 = 0.2;
         for i in 0..=length {
@@ -71,24 +71,27 @@ impl PrintSheet {
         self
     }
 
-    /// A PDF of one page of exactly this size. The same sheet gives the same bytes.
+    /// Renders a PDF of one page of exactly this size. The same sheet gives the same bytes.
     pub fn to_pdf(&self) -> Vec<u8> {
-        let (w, h) = (self.size.0 * POINTS, self.size.1 * POINTS);
+        let (w, h) = (self.size.0 * POINTS_PER_MM, self.size.1 * POINTS_PER_MM);
         let mut content = String::from("0 g\n");
         for [x, y, width, height] in &self.rectangles {
-            let up = self.size.1 - y - height;
-            let numbers = [*x, up, *width, *height].map(|v| v * POINTS);
+            let bottom = self.size.1 - y - height;
+            let numbers = [*x, bottom, *width, *height].map(|v| v * POINTS_PER_MM);
             let _ = writeln!(content, "{:.5} {:.5} {:.5} {:.5} re", numbers[0], numbers[1], numbers[2], numbers[3]);
         }
         content.push_str("f\n");
         for line in &self.lines {
-            // The capitals of Helvetica are 0.718 of its size.
-            let (size, x, y) =
-                (line.capitals / 0.718 * POINTS, line.at[0] * POINTS, (self.size.1 - line.at[1]) * POINTS);
-            let _ = writeln!(content, "BT /F1 {size:.3} Tf {x:.3} {y:.3} Td ({}) Tj ET", escaped(&line.text));
+            // The cap height of Helvetica is 0.718 of the font size.
+            let (size, x, y) = (
+                line.capitals / 0.718 * POINTS_PER_MM,
+                line.at[0] * POINTS_PER_MM,
+                (self.size.1 - line.at[1]) * POINTS_PER_MM,
+            );
+            let _ = writeln!(content, "BT /F1 {size:.3} Tf {x:.3} {y:.3} Td ({}) Tj ET", escape_pdf(&line.text));
         }
         let objects = [
-            // Readers are asked not to shrink the page to the margins of the printer.
+            // Disables print scaling to the printer's margins.
             "<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>".to_owned(),
             "<< /Type /Pages /Kids [3 0 R] /Count 1 >>".to_owned(),
             format!(
@@ -96,7 +99,7 @@ impl PrintSheet {
             ),
             format!("<< /Length {} >>\nstream\n{content}endstream", content.len()),
             "<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica /Encoding /WinAnsiEncoding >>".to_owned(),
-            format!("<< /Title ({}) >>", escaped(&self.title)),
+            format!("<< /Title ({}) >>", escape_pdf(&self.title)),
         ];
         let mut out = String::from("%PDF-1.4\n");
         let mut offsets = Vec::new();
@@ -118,12 +121,12 @@ impl PrintSheet {
         out.into_bytes()
     }
 
-    /// An SVG of this size, in millimeters.
+    /// Renders an SVG of this size, in millimeters.
     pub fn to_svg(&self) -> String {
         let (w, h) = self.size;
         let mut out = format!(
             "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{w}mm\" height=\"{h}mm\" viewBox=\"0 0 {w} {h}\">\n<title>{}</title>\n<rect width=\"{w}\" height=\"{h}\" fill=\"#fff\"/>\n<path d=\"",
-            entities(&self.title)
+            escape_xml(&self.title)
         );
         for [x, y, width, height] in &self.rectangles {
             let _ = write!(out, "M{x:.5} {y:.5}h{width:.5}v{height:.5}h{:.5}z", -width);
@@ -134,15 +137,15 @@ impl PrintSheet {
             let _ = writeln!(
                 out,
                 "<text x=\"{x:.3}\" y=\"{y:.3}\" font-size=\"{size:.3}\" font-family=\"Helvetica, Arial, sans-serif\">{}</text>",
-                entities(&line.text)
+                escape_xml(&line.text)
             );
         }
         out.push_str("</svg>\n");
         out
     }
 
-    /// The sheet in pixels: white 255, black 0, edges by the share of a pixel that they cover. A pixel's side is `25.4 / dpi` mm and the corner of the
-    /// sheet is that of the first pixel. Sides are rounded to whole pixels.
+    /// Rasterizes the sheet: white 255, black 0, edges anti-aliased by pixel coverage. A pixel's side is `25.4 / dpi` mm, and the corner of the
+    /// sheet is the corner of the first pixel. Sides are rounded to whole pixels.
     pub fn to_pixels(&self, dpi: f64) -> GrayU8 {
         let scale = dpi / 25.4;
         let pixels = |v: f64| (v * scale).round().clamp(1.0, 65_535.0) as usize;
@@ -171,13 +174,13 @@ impl PrintSheet {
     }
 }
 
-/// A text within parentheses of a PDF.
-fn escaped(text: &str) -> String {
+/// Escapes text for a PDF string literal.
+fn escape_pdf(text: &str) -> String {
     text.chars().flat_map(|c| ['(', ')', '\\'].contains(&c).then_some('\\').into_iter().chain([c])).collect()
 }
 
-/// A text within an element of SVG.
-fn entities(text: &str) -> String {
+/// Escapes text for an SVG element.
+fn escape_xml(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
 }
 
@@ -192,8 +195,8 @@ mod tests {
     }
 
     #[test]
-    fn lengths_are_those_of_the_paper_in_every_format() {
-        // 25.4 dpi: a pixel is a millimeter. The lower edge lies in the middle of a row.
+    fn lengths_are_true_to_scale_in_every_format() {
+        // 25.4 dpi: a pixel is a millimeter. The lower edge is in the middle of a pixel row.
         let image = sheet().to_pixels(25.4);
         assert_eq!(image.size(), (100, 50));
         let column: Vec<u8> = (19..24).map(|y| image.at(12, y)[0]).collect();
@@ -212,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn the_table_of_a_pdf_leads_to_its_objects() {
+    fn the_cross_reference_table_of_the_pdf_has_the_object_offsets() {
         let pdf = String::from_utf8(sheet().to_pdf()).unwrap();
         let start: usize = pdf.lines().rev().nth(1).unwrap().parse().unwrap();
         assert!(pdf[start..].starts_with("xref\n0 7\n"));
@@ -230,8 +233,8 @@ mod tests {
         let mut sheet = PrintSheet::new((120.0, 20.0), "ruler");
         sheet.ruler([5.0, 10.0], 100);
         assert_eq!(sheet.rectangles.len(), 101);
-        // Ends of the ruler: the middles of its first and last tick.
-        let middle = |r: &[f64; 4]| r[0] + r[2] / 2.0;
-        assert!((middle(&sheet.rectangles[100]) - middle(&sheet.rectangles[0]) - 100.0).abs() < 1e-9);
+        // The ruler extends between the centers of its first and last tick.
+        let center = |r: &[f64; 4]| r[0] + r[2] / 2.0;
+        assert!((center(&sheet.rectangles[100]) - center(&sheet.rectangles[0]) - 100.0).abs() < 1e-9);
     }
 }

@@ -1,45 +1,45 @@
-//! Anti-aliased drawing on an RGB picture.
+//! Anti-aliased drawing on an RGB image.
 
 use cv_core::{ImageView, RgbU8};
 
 use crate::font;
 
-/// An RGB color, as stored in pictures (sRGB).
+/// An sRGB color.
 pub type Color = [u8; 3];
 
-/// Colors that stay apart for people with any color vision (Okabe & Ito), and the grays.
+/// Colors that are distinguishable with color blindness (after Okabe & Ito), and grays.
 pub mod colors {
     use super::Color;
-    /// Right, accepted.
+    /// Correct or accepted: inliers, true positives.
     pub const GREEN: Color = [40, 225, 115];
-    /// Wrong, rejected.
+    /// Wrong or rejected: outliers, false positives.
     pub const RED: Color = [235, 60, 45];
-    /// A third kind.
+    /// A third class, such as false negatives.
     pub const BLUE: Color = [40, 140, 255];
     /// A warning, or the second of two series.
     pub const ORANGE: Color = [240, 160, 20];
-    /// Marks on photographs.
+    /// Markers on images.
     pub const YELLOW: Color = [250, 225, 60];
-    /// Marks on dark grounds.
+    /// Markers on dark backgrounds.
     pub const CYAN: Color = [70, 200, 235];
     /// A further series.
     pub const MAGENTA: Color = [225, 90, 185];
-    /// Paper.
+    /// White background.
     pub const WHITE: Color = [255, 255, 255];
-    /// Ink.
+    /// Black.
     pub const BLACK: Color = [0, 0, 0];
-    /// What is unknown in a map.
+    /// Invalid pixels of a map.
     pub const UNKNOWN: Color = [104, 104, 108];
 }
 
-/// A picture to draw on. Positions are pixels with centers at integers; whatever falls outside is cut off.
+/// An RGB canvas. Positions are pixels with centers at integers; drawing is clipped to the canvas.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Raster {
     image: RgbU8,
 }
 
 impl Raster {
-    /// A raster of one color.
+    /// Makes a canvas of one color.
     ///
     /// # Panics
     /// Where `width × height × 3` overflows.
@@ -47,44 +47,44 @@ impl Raster {
         Self { image: RgbU8::new(width, height, fill) }
     }
 
-    /// A copy of a color picture.
+    /// Makes a canvas with a copy of a color image.
     pub fn from_rgb(view: ImageView<'_, u8, 3>) -> Self {
         Self { image: view.to_image() }
     }
 
-    /// A copy of a gray picture.
+    /// Makes a canvas with a copy of a gray image.
     pub fn from_gray(view: ImageView<'_, u8, 1>) -> Self {
         Self { image: view.to_image().map(|[v]| [v; 3]) }
     }
 
-    /// Width in pixels.
+    /// Returns the width in pixels.
     pub fn width(&self) -> usize {
         self.image.width()
     }
 
-    /// Height in pixels.
+    /// Returns the height in pixels.
     pub fn height(&self) -> usize {
         self.image.height()
     }
 
-    /// The picture.
+    /// Returns the image.
     pub fn image(&self) -> &RgbU8 {
         &self.image
     }
 
-    /// The picture, taken out.
+    /// Returns the image by value.
     pub fn into_image(self) -> RgbU8 {
         self.image
     }
 
-    /// Replaces every pixel by `f` of it.
+    /// Applies `f` to every pixel in place.
     pub fn map(&mut self, f: impl Fn(Color) -> Color) {
         for pixel in self.image.as_mut_slice().as_chunks_mut::<3>().0 {
             *pixel = f(*pixel);
         }
     }
 
-    /// Mixes `color` into one pixel by `alpha`, 0 to 1.
+    /// Blends `color` into one pixel by `alpha`, 0 to 1.
     #[inline]
     pub fn blend(&mut self, x: i64, y: i64, color: Color, alpha: f32) {
         if x < 0 || y < 0 || x >= self.image.width() as i64 || y >= self.image.height() as i64 || alpha <= 0.0 {
@@ -100,23 +100,23 @@ impl Raster {
         );
     }
 
-    /// A straight line with round ends, `width` pixels thick.
+    /// Draws a straight line with round caps, `width` pixels thick.
     pub fn line(&mut self, from: [f32; 2], to: [f32; 2], width: f32, color: Color) {
         let radius = width.clamp(0.1, 1000.0) / 2.0;
-        let Some((a, b)) = self.clip(from, to, radius + 1.0) else { return };
-        // Thinner than a pixel: one pixel wide and paler.
+        let Some((a, b)) = self.clip_segment(from, to, radius + 1.0) else { return };
+        // Lines thinner than a pixel are one pixel wide with lower opacity.
         let (radius, strength) = if radius < 0.5 { (0.5, radius * 2.0) } else { (radius, 1.0) };
-        for_each_near([a, b], radius + 1.0, |x, y, distance| {
+        for_each_pixel_near_segment([a, b], radius + 1.0, |x, y, distance| {
             self.blend(x, y, color, strength * (radius + 0.5 - distance).clamp(0.0, 1.0));
         });
     }
 
-    /// The part of a segment within `margin` of the raster; `None` where there is none or it is not finite.
-    fn clip(&self, a: [f32; 2], b: [f32; 2], margin: f32) -> Option<([f32; 2], [f32; 2])> {
+    /// Clips a segment to the canvas extended by `margin`; `None` where nothing remains or it is not finite.
+    fn clip_segment(&self, a: [f32; 2], b: [f32; 2], margin: f32) -> Option<([f32; 2], [f32; 2])> {
         if ![a[0], a[1], b[0], b[1]].iter().all(|v| v.is_finite()) {
             return None;
         }
-        // Liang and Barsky, in f64: ends may be astronomically far away.
+        // Liang–Barsky, in f64 since ends may be very far away.
         let (mut t0, mut t1) = (0.0f64, 1.0f64);
         let size = [self.width() as f64, self.height() as f64];
         let margin = f64::from(margin);
@@ -137,25 +137,26 @@ impl Raster {
         (t0 <= t1).then(|| (at(t0), at(t1)))
     }
 
-    /// Lines from point to point.
+    /// Draws lines from point to point.
     pub fn polyline(&mut self, points: &[[f32; 2]], width: f32, color: Color) {
         for pair in points.windows(2) {
             self.line(pair[0], pair[1], width, color);
         }
     }
 
-    /// A ring of `width` pixels around `center`.
+    /// Draws a circle with a line of `width` pixels.
     pub fn circle(&mut self, center: [f32; 2], radius: f32, width: f32, color: Color) {
         let half = (width / 2.0).max(0.5);
-        self.radial(center, radius + half, |distance| half + 0.5 - (distance - radius).abs(), color);
+        self.blend_radial(center, radius + half, |distance| half + 0.5 - (distance - radius).abs(), color);
     }
 
-    /// A filled disc.
+    /// Draws a filled disc.
     pub fn disc(&mut self, center: [f32; 2], radius: f32, color: Color) {
-        self.radial(center, radius, |distance| radius + 0.5 - distance, color);
+        self.blend_radial(center, radius, |distance| radius + 0.5 - distance, color);
     }
 
-    fn radial(&mut self, center: [f32; 2], reach: f32, alpha: impl Fn(f32) -> f32, color: Color) {
+    /// Blends `color` by an opacity that depends on the distance from `center`, up to distance `reach`.
+    fn blend_radial(&mut self, center: [f32; 2], reach: f32, alpha: impl Fn(f32) -> f32, color: Color) {
         let [cx, cy] = center;
         if !(cx.is_finite() && cy.is_finite() && reach.is_finite()) {
             return;
@@ -171,14 +172,14 @@ impl Raster {
         }
     }
 
-    /// An upright cross whose arms are `radius` pixels long.
+    /// Draws a cross with horizontal and vertical arms of `radius` pixels.
     pub fn cross(&mut self, center: [f32; 2], radius: f32, width: f32, color: Color) {
         let [x, y] = center;
         self.line([x - radius, y], [x + radius, y], width, color);
         self.line([x, y - radius], [x, y + radius], width, color);
     }
 
-    /// A filled rectangle with its top-left pixel at `(x, y)`.
+    /// Draws a filled rectangle with its top-left pixel at `(x, y)`.
     pub fn fill_rect(&mut self, x: i64, y: i64, width: usize, height: usize, color: Color) {
         let span = |start: i64, len: usize, size: usize| {
             let end = start.saturating_add(len as i64).clamp(0, size as i64) as usize;
@@ -192,7 +193,7 @@ impl Raster {
         }
     }
 
-    /// The outline of a rectangle, one pixel wide.
+    /// Draws the outline of a rectangle, one pixel wide.
     pub fn rect(&mut self, x: i64, y: i64, width: usize, height: usize, color: Color) {
         let (w, h) = (width as i64, height as i64);
         self.fill_rect(x, y, width, 1, color);
@@ -201,7 +202,7 @@ impl Raster {
         self.fill_rect(x + w - 1, y, 1, height, color);
     }
 
-    /// Copies a picture with its top-left pixel to `(x, y)`.
+    /// Copies an image with its top-left pixel to `(x, y)`.
     pub fn paste(&mut self, view: ImageView<'_, u8, 3>, x: i64, y: i64) {
         let left = x.clamp(0, self.width() as i64);
         let right = x.saturating_add(view.width() as i64).clamp(left, self.width() as i64);
@@ -219,36 +220,36 @@ impl Raster {
         }
     }
 
-    /// A line of text whose capitals are `size` pixels tall; `(x, y)` is the top left of the capitals.
+    /// Draws a line of text with a cap height of `size` pixels; `(x, y)` is the top left of the capitals.
     pub fn text(&mut self, x: f32, y: f32, text: &str, size: f32, color: Color) {
         font::draw(text, [x, y], size, font::weight(size), |x, y, alpha| self.blend(x, y, color, alpha));
     }
 
-    /// Text with a rim of another color, readable on any picture.
+    /// Draws text with an outline of another color, readable on any background.
     pub fn text_on_picture(&mut self, x: f32, y: f32, text: &str, size: f32, color: Color, rim: Color) {
         let weight = font::weight(size);
         font::draw(text, [x, y], size, weight * 2.2 + 1.5, |x, y, alpha| self.blend(x, y, rim, alpha * 0.75));
         font::draw(text, [x, y], size, weight, |x, y, alpha| self.blend(x, y, color, alpha));
     }
 
-    /// The width in pixels of [`Raster::text`].
+    /// Returns the width in pixels of [`Raster::text`].
     pub fn text_width(text: &str, size: f32) -> f32 {
         font::width(text, size)
     }
 }
 
-/// Calls `f(x, y, distance)` for every pixel within `reach` of a segment, once.
-pub(crate) fn for_each_near([a, b]: [[f32; 2]; 2], reach: f32, mut f: impl FnMut(i64, i64, f32)) {
+/// Calls `f(x, y, distance)` once for every pixel within distance `reach` of a segment.
+pub(crate) fn for_each_pixel_near_segment([a, b]: [[f32; 2]; 2], reach: f32, mut f: impl FnMut(i64, i64, f32)) {
     let d = [b[0] - a[0], b[1] - a[1]];
     let squared = d[0] * d[0] + d[1] * d[1];
-    // Walk along the longer axis; across it, only the pixels that can be near.
+    // Iterate along the major axis; on the minor axis, only over the pixels that can be within reach.
     let (major, minor) = if d[0].abs() >= d[1].abs() { (0, 1) } else { (1, 0) };
     let slope = if d[major] == 0.0 { 0.0 } else { d[minor] / d[major] };
     let across = reach * (1.0 + slope * slope).sqrt();
     let (low, high) = (a[major].min(b[major]), a[major].max(b[major]));
     for m in (low - reach).ceil() as i64..=(high + reach).floor() as i64 {
         let along = (m as f32).clamp(low, high);
-        // Beyond an end the band is that of the end point.
+        // Beyond an end, the center is that of the end point.
         let middle = a[minor] + slope * (along - a[major]);
         for n in (middle - across).ceil() as i64..=(middle + across).floor() as i64 {
             let (x, y) = if major == 0 { (m, n) } else { (n, m) };
@@ -268,7 +269,7 @@ mod tests {
     use proptest::prelude::*;
 
     #[test]
-    fn a_line_covers_its_pixels_and_no_others() {
+    fn a_line_covers_only_its_pixels() {
         let mut raster = Raster::new(20, 9, colors::BLACK);
         raster.line([3.0, 4.0], [15.0, 4.0], 1.0, colors::WHITE);
         for x in 4..15 {
@@ -280,17 +281,17 @@ mod tests {
     }
 
     #[test]
-    fn a_disc_has_the_area_of_one() {
+    fn a_disc_has_the_area_of_its_radius() {
         let mut raster = Raster::new(64, 64, colors::BLACK);
         raster.disc([31.3, 32.7], 20.0, colors::WHITE);
         let sum: f64 = raster.image().pixels().map(|p| f64::from(p[0]) / 255.0).sum();
         let area = std::f64::consts::PI * 400.0;
-        // The rim is 126 pixels long; a linear ramp is off by far less than a tenth of a pixel on average.
+        // The boundary is 126 pixels long; a linear ramp is off by far less than a tenth of a pixel on average.
         assert!((sum - area).abs() < 12.6, "{sum} {area}");
     }
 
     #[test]
-    fn pasting_and_filling_are_cut_at_the_border() {
+    fn pasting_and_filling_are_clipped_at_the_border() {
         let stamp = RgbU8::new(4, 4, [9, 8, 7]);
         for (x, y) in [(-2, -2), (8, 8), (-100, 3), (i64::MAX, i64::MAX), (i64::MIN, 0), (3, 3)] {
             let mut raster = Raster::new(10, 10, colors::BLACK);
@@ -306,11 +307,11 @@ mod tests {
 
     proptest! {
         #[test]
-        fn nothing_outside_the_canvas_is_touched(
+        fn drawing_with_extreme_coordinates_is_clipped(
             a in prop::array::uniform2(prop::num::f32::ANY), b in prop::array::uniform2(-50.0..50.0f32), r in 0.0..30.0f32,
             w in 0usize..12, h in 0usize..12,
         ) {
-            // Ends anywhere, NaN and infinity among them: no panic, and no endless walk.
+            // Any coordinates, including NaN and infinity: no panic, and no endless loop.
             let mut raster = Raster::new(w, h, colors::BLACK);
             raster.line(a, b, 2.0, colors::WHITE);
             raster.line(b, [b[1], b[0]], r, colors::WHITE);

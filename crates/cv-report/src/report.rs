@@ -1,4 +1,4 @@
-//! One self-contained HTML file: text, tables, pictures, plots and point clouds.
+//! The self-contained HTML report: text, tables, images, plots and point clouds.
 
 use std::fmt::Write as _;
 
@@ -11,7 +11,7 @@ const STYLE: &str = include_str!("assets/report.css");
 const SCRIPT: &str = include_str!("assets/report.js");
 const VIEWER: &str = include_str!("assets/viewer.js");
 
-/// Makes text safe inside HTML and SVG, between tags and in quoted attributes.
+/// Escapes text for HTML and SVG, both as content and in quoted attributes.
 pub(crate) fn escape(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
@@ -21,7 +21,7 @@ pub(crate) fn escape(text: &str) -> String {
             '>' => out.push_str("&gt;"),
             '"' => out.push_str("&quot;"),
             '\'' => out.push_str("&#39;"),
-            // Control characters have no place in a document.
+            // Control characters are not allowed in a document.
             c if c.is_control() && !matches!(c, '\n' | '\t') => out.push('\u{fffd}'),
             c => out.push(c),
         }
@@ -29,7 +29,7 @@ pub(crate) fn escape(text: &str) -> String {
     out
 }
 
-/// A picture with its words.
+/// An image with caption and alternative text.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Figure {
     bytes: Vec<u8>,
@@ -39,24 +39,24 @@ pub struct Figure {
 }
 
 impl Figure {
-    /// `bytes` are those of a PNG or JPEG file. `caption` is printed below the picture, and read out in its place.
+    /// Makes a figure of the bytes of a PNG or JPEG file. `caption` is printed below the image, and is its alternative text.
     pub fn new(bytes: Vec<u8>, caption: &str) -> Self {
         Self { bytes, alt: caption.to_owned(), caption: caption.to_owned(), scale: None }
     }
 
-    /// With a description for those who cannot see the picture, other than its caption.
+    /// Sets an alternative text other than the caption.
     #[must_use]
     pub fn alt(self, alt: &str) -> Self {
         Self { alt: alt.to_owned(), ..self }
     }
 
-    /// With the scale of its colors below it.
+    /// Adds a color scale below the image.
     #[must_use]
     pub fn scale(self, scale: ColorScale) -> Self {
         Self { scale: Some(scale), ..self }
     }
 
-    /// Width and height by the header of a PNG.
+    /// Reads width and height from the header of a PNG.
     fn png_size(&self) -> Option<(u32, u32)> {
         let header = self.bytes.get(..24)?;
         header.starts_with(b"\x89PNG").then(|| {
@@ -66,22 +66,22 @@ impl Figure {
     }
 }
 
-/// How a note is meant.
+/// Kind of a highlighted note.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Note {
-    /// It went well.
+    /// Success.
     Good,
-    /// Something to know.
+    /// Information.
     Info,
-    /// Something to be careful about.
+    /// Warning.
     Warning,
-    /// It could not be done.
+    /// Failure.
     Failure,
 }
 
-/// Builds a report from top to bottom; [`Report::to_html`] gives the file.
+/// Builds a report from top to bottom; [`Report::to_html`] returns the file.
 ///
-/// Everything handed in is text, never markup. The file needs no network and no other file.
+/// All inputs are text, never markup. The file needs no network and no other file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Report {
     title: String,
@@ -96,7 +96,7 @@ pub struct Report {
 }
 
 impl Report {
-    /// An empty report.
+    /// Makes an empty report.
     pub fn new(title: &str) -> Self {
         Self {
             title: title.to_owned(),
@@ -111,13 +111,13 @@ impl Report {
         }
     }
 
-    /// A line below the title, such as the names of the inputs.
+    /// Sets a line below the title, such as the names of the inputs.
     pub fn subtitle(&mut self, text: &str) -> &mut Self {
         self.subtitle = text.to_owned();
         self
     }
 
-    /// Something to be careful about in all that follows: it stands at the top, wherever it is said.
+    /// Adds a warning at the top of the report.
     pub fn warn(&mut self, text: &str) -> &mut Self {
         let mut rest = text.chars();
         let first = rest.next().map(|c| c.to_uppercase().to_string());
@@ -126,32 +126,32 @@ impl Report {
         self
     }
 
-    /// A figure of merit for the row of tiles at the top: what it is, and its value with the unit.
+    /// Adds a key figure to the row of tiles at the top: label, and value with unit.
     pub fn headline(&mut self, label: &str, value: &str) -> &mut Self {
         self.headline.push((label.to_owned(), value.to_owned()));
         self
     }
 
-    /// Begins a section; it is listed in the contents.
+    /// Begins a section; sections are listed in the table of contents.
     pub fn section(&mut self, title: &str) -> &mut Self {
         self.sections.push(title.to_owned());
         let _ = write!(self.body, "<h2 id=\"s{}\">{}</h2>", self.sections.len(), escape(title));
         self
     }
 
-    /// A paragraph.
+    /// Adds a paragraph.
     pub fn paragraph(&mut self, text: &str) -> &mut Self {
         let _ = write!(self.body, "<p>{}</p>", escape(text));
         self
     }
 
-    /// A paragraph that stands out.
+    /// Adds a highlighted paragraph.
     pub fn note(&mut self, kind: Note, text: &str) -> &mut Self {
-        self.body.push_str(&note(kind, text));
+        self.body.push_str(&note_html(kind, text));
         self
     }
 
-    /// What `build` adds, behind a line that opens it: for what few will look at.
+    /// Adds the content of `build` as a collapsed block under `summary`, for details.
     pub fn folded(&mut self, summary: &str, build: impl FnOnce(&mut Self)) -> &mut Self {
         let _ = write!(self.body, "<details><summary>{}</summary>", escape(summary));
         build(self);
@@ -159,13 +159,13 @@ impl Report {
         self
     }
 
-    /// The seconds that each stage took.
+    /// Adds a table of the seconds of each stage.
     pub fn times(&mut self, stages: &[(&str, f64)]) -> &mut Self {
         let rows: Vec<[String; 2]> = stages.iter().map(|(name, s)| [(*name).to_owned(), format!("{s:.3} s")]).collect();
-        self.table("What took how long.", &["stage", "time"], &rows)
+        self.table("Processing time by stage.", &["stage", "time"], &rows)
     }
 
-    /// A table of names and values.
+    /// Adds a table of names and values.
     pub fn facts<K: AsRef<str>, V: AsRef<str>>(&mut self, caption: &str, rows: &[(K, V)]) -> &mut Self {
         self.begin_table(caption);
         self.body.push_str("<tbody>");
@@ -174,7 +174,7 @@ impl Report {
                 self.body,
                 "<tr><th scope=\"row\">{}</th><td{}>{}</td></tr>",
                 escape(key.as_ref()),
-                breaks(value.as_ref()),
+                long_word_class(value.as_ref()),
                 escape(value.as_ref())
             );
         }
@@ -192,7 +192,7 @@ impl Report {
         );
     }
 
-    /// A table with a head. Cells that read as numbers are set flush right.
+    /// Adds a table with a header row. Numeric columns are right-aligned.
     pub fn table<R: AsRef<[S]>, S: AsRef<str>>(&mut self, caption: &str, head: &[&str], rows: &[R]) -> &mut Self {
         let cell = |row: &R, column: usize| row.as_ref().get(column).map_or(String::new(), |c| c.as_ref().to_owned());
         let numeric = |column: usize| {
@@ -209,7 +209,7 @@ impl Report {
         for row in rows {
             self.body.push_str("<tr>");
             for (i, cell) in row.as_ref().iter().enumerate() {
-                let class = if numeric.get(i) == Some(&true) { class(i) } else { breaks(cell.as_ref()) };
+                let class = if numeric.get(i) == Some(&true) { class(i) } else { long_word_class(cell.as_ref()) };
                 let _ = write!(self.body, "<td{class}>{}</td>", escape(cell.as_ref()));
             }
             self.body.push_str("</tr>");
@@ -218,15 +218,15 @@ impl Report {
         self
     }
 
-    /// A picture over the full width.
+    /// Adds an image over the full width.
     pub fn figure(&mut self, figure: Figure) -> &mut Self {
         self.push_figure(&figure);
         self
     }
 
-    /// Pictures beside each other, as many in a row as fit.
+    /// Adds images in a grid, as many per row as fit.
     pub fn figures(&mut self, figures: Vec<Figure>) -> &mut Self {
-        // Four in rows of three would leave one alone.
+        // Two or four images are arranged in rows of two.
         let pairs = if matches!(figures.len(), 2 | 4) { " pairs" } else { "" };
         let _ = write!(self.body, "<div class=\"grid{pairs}\">");
         figures.iter().for_each(|f| self.push_figure(f));
@@ -241,7 +241,7 @@ impl Report {
             Some((w, h)) => format!(" width=\"{w}\" height=\"{h}\""),
             None => String::new(),
         };
-        // Small pictures such as tiles are enlarged with their pixels kept square.
+        // Small images such as tiles are enlarged without interpolation.
         let class = if figure.png_size().is_some_and(|(w, _)| w < 320) { " class=\"small\"" } else { "" };
         let _ = write!(
             self.body,
@@ -258,12 +258,12 @@ impl Report {
         let _ = write!(self.body, "<figcaption><b>Figure {}.</b> {}</figcaption>", self.figures, escape(caption));
     }
 
-    /// A plot.
+    /// Adds a plot.
     pub fn plot(&mut self, plot: &Plot, caption: &str) -> &mut Self {
         self.plots(&[(plot, caption)])
     }
 
-    /// Plots beside each other.
+    /// Adds plots in a grid.
     pub fn plots(&mut self, plots: &[(&Plot, &str)]) -> &mut Self {
         self.body.push_str("<div class=\"grid\">");
         for (plot, caption) in plots {
@@ -276,7 +276,7 @@ impl Report {
         self
     }
 
-    /// A cloud of points that can be turned, with cameras. `fallback` is a still picture (PNG or JPEG bytes) for paper and for
+    /// Adds an interactive viewer of a point cloud with cameras. `fallback` is a still image (PNG or JPEG bytes) for print and for
     /// browsers without WebGL 2.
     pub fn points(&mut self, scene: &PointScene, fallback: Option<Vec<u8>>, caption: &str) -> &mut Self {
         self.figures += 1;
@@ -297,7 +297,7 @@ impl Report {
         self
     }
 
-    /// The file.
+    /// Renders the HTML file.
     pub fn to_html(&self) -> String {
         let mut html = String::with_capacity(self.body.len() + STYLE.len() + VIEWER.len() + 4096);
         let _ = write!(
@@ -318,7 +318,7 @@ impl Report {
             }
             html.push_str("</dl>");
         }
-        self.warnings.iter().for_each(|text| html.push_str(&note(Note::Warning, text)));
+        self.warnings.iter().for_each(|text| html.push_str(&note_html(Note::Warning, text)));
         html.push_str("</header>\n");
         if self.sections.len() > 2 {
             html.push_str("<nav aria-label=\"Contents\"><ol>");
@@ -337,23 +337,23 @@ impl Report {
     }
 }
 
-/// A paragraph that stands out.
-fn note(kind: Note, text: &str) -> String {
+/// Renders a highlighted paragraph.
+fn note_html(kind: Note, text: &str) -> String {
     let (class, word) = match kind {
         Note::Good => ("good", "Good"),
         Note::Info => ("info", "Note"),
-        Note::Warning => ("warning", "Careful"),
+        Note::Warning => ("warning", "Warning"),
         Note::Failure => ("failure", "Failed"),
     };
     format!("<p class=\"note {class}\"><strong>{word}.</strong> {}</p>", escape(text))
 }
 
-/// The class of a cell whose words are too long for a column, as those of paths are: they may break anywhere.
-fn breaks(cell: &str) -> &'static str {
+/// Returns the class of a cell with words too long for a column, such as paths: they may break anywhere.
+fn long_word_class(cell: &str) -> &'static str {
     if cell.split_whitespace().any(|word| word.chars().count() > 18) { " class=\"long\"" } else { "" }
 }
 
-/// True for a number, maybe behind a sign such as ≤ and before a unit, and for the dash that stands for none.
+/// Whether a cell is a number, optionally after a sign such as ≤ and before a unit, or a dash for a missing value.
 fn is_numeric(cell: &str) -> bool {
     let bare = cell.trim_start_matches(['≤', '≥', '<', '>', '±', '~', ' ']);
     let first = bare.split([' ', '%']).next().unwrap_or("");
@@ -390,11 +390,11 @@ mod tests {
     }
 
     #[test]
-    fn the_file_refers_to_nothing_outside_itself() {
+    fn the_file_has_no_external_references() {
         let mut report = Report::new("t");
         report.section("a").figure(Figure::new(b"\xff\xd8\xff".to_vec(), "c")).plot(&Plot::new("p", "x", "y"), "c");
         let html = report.to_html();
-        // The namespace of SVG is a name, not an address.
+        // The SVG namespace is an identifier, not a reference.
         let html = html.replace("http://www.w3.org/2000/svg", "");
         for outside in ["http://", "https://", "url(", "@import", "src=\"/", "<link rel=\"stylesheet"] {
             assert!(!html.contains(outside), "{outside}");
@@ -403,7 +403,7 @@ mod tests {
     }
 
     #[test]
-    fn warnings_stand_above_all_sections() {
+    fn warnings_are_above_all_sections() {
         let mut report = Report::new("t");
         report.section("first").warn("mind the gap");
         let html = report.to_html();

@@ -1,4 +1,4 @@
-//! A model of many views on a page: its points and cameras, what each photograph has in it, and which photographs hang together.
+//! Reports of a structure-from-motion model: points and cameras, statistics per image, and the view graph.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -8,46 +8,48 @@ use crate::colormap::Colormap;
 use crate::raster::{Color, Raster, colors};
 use crate::{PointScene, Report};
 
-/// Points in common from which two photographs count as linked: what COLMAP asks of a pair by default.
-const LINKED: usize = 15;
+/// Minimum number of shared points for two images to count as linked: COLMAP's default minimum of inliers of a pair.
+const MIN_SHARED_POINTS: usize = 15;
 
-/// What a photograph has in a model.
+/// Statistics of an image in a model.
 #[derive(Debug, Clone, PartialEq)]
-struct Row<'a> {
+struct ImageStatistics<'a> {
     name: &'a str,
-    /// Observations of points.
+    /// Number of observations.
     points: usize,
-    /// Mean distance in pixels between the points' projections and where they were seen; NaN without any.
+    /// Mean reprojection error in pixels; NaN without observations.
     error: f64,
-    /// Mean number of photographs that see its points.
+    /// Mean track length of its points.
     track_length: f64,
+    /// Number of linked images.
     linked: usize,
 }
 
 impl PointScene {
-    /// The points of a model and its cameras, colored from the first photograph, blue, to the last, red, in the order of their names. The world is turned so that down is what is down in most
-    /// photographs, and ahead what the first looks at.
+    /// Makes a scene of the points and cameras of a model, cameras colored from blue (first) to red (last) in the order of image names. The world
+    /// is rotated to the upright frame of the first camera ([`cv_core::upright_frame`]).
     pub fn of_model(model: &SparseModel) -> Self {
-        let to_view = upright(model);
-        let points: Vec<[f32; 3]> = model.points.values().map(|p| single(to_view.transform(&p.position))).collect();
+        let to_view = model_to_upright(model);
+        let points: Vec<[f32; 3]> = model.points.values().map(|p| to_f32(to_view.transform(&p.position))).collect();
         let colors = model.points.values().map(|p| p.color).collect();
         let mut scene = Self::new(&PointCloud::colored(points, colors));
-        let ids = by_name(model);
+        let ids = ids_by_name(model);
         for (i, id) in ids.iter().enumerate() {
             let image = &model.images[id];
             let Some(camera) = model.cameras.get(&image.camera) else { continue };
-            let share = i as f32 / (ids.len() - 1).max(1) as f32;
-            scene.camera(camera, &image.pose.compose(&to_view.inverse()), Colormap::Turbo.color(share));
+            let fraction = i as f32 / (ids.len() - 1).max(1) as f32;
+            scene.add_camera(camera, &image.pose.compose(&to_view.inverse()), Colormap::Turbo.color(fraction));
         }
         scene
     }
 }
 
 impl Report {
-    /// A table of the photographs of a model: `photographs` are the names of all that were given, of which those that the model does not have are said to be missing.
+    /// Adds a table of the registered images of a model. `photographs` are the names of all input images; those that are not registered are
+    /// listed as missing.
     pub fn registered_photographs(&mut self, model: &SparseModel, photographs: &[&str]) -> &mut Self {
-        let rows = rows(model);
-        let known: BTreeMap<&str, &Row<'_>> = rows.iter().map(|row| (row.name, row)).collect();
+        let rows = image_statistics(model);
+        let known: BTreeMap<&str, &ImageStatistics<'_>> = rows.iter().map(|row| (row.name, row)).collect();
         let mut names: Vec<&str> = photographs.to_vec();
         names.extend(known.keys().filter(|name| !photographs.contains(name)));
         let cells: Vec<[String; 5]> = names
@@ -65,36 +67,38 @@ impl Report {
             })
             .collect();
         let caption = format!(
-            "What each photograph has in the model: points, the mean distance of their projections from where they were seen, by how many photographs a point is seen on average, and how many other photographs see {LINKED} of its points or more."
+            "Registration of each photograph: observed points, mean reprojection error, mean track length of its points, and number of other photographs with at least {MIN_SHARED_POINTS} points in common."
         );
-        self.table(&caption, &["photograph", "points", "error (px)", "seen by", "linked with"], &cells)
+        self.table(&caption, &["photograph", "points", "error (px)", "track length", "linked photographs"], &cells)
     }
 
-    /// A table of the places where a model hangs together by fewest points, `most` at most: where it bends or breaks first, and where more photographs help.
-    pub fn thinnest_places(&mut self, model: &SparseModel, most: usize) -> &mut Self {
-        let row = |bridge: &Bridge<'_>| {
-            let [a, b] = bridge.names.map(str::to_owned);
-            [a, b, bridge.points.to_string(), format!("{} and {}", bridge.sizes[0], bridge.sizes[1])]
+    /// Adds a table of at most `most` weakest connections of a model: the edges of the maximum spanning tree of the view graph with the fewest
+    /// shared points. There the model drifts or breaks first, and more photographs help most.
+    pub fn weakest_connections(&mut self, model: &SparseModel, most: usize) -> &mut Self {
+        let row = |connection: &Connection<'_>| {
+            let [a, b] = connection.names.map(str::to_owned);
+            [a, b, connection.points.to_string(), format!("{} and {}", connection.sizes[0], connection.sizes[1])]
         };
-        let cells: Vec<[String; 4]> = bridges(model).iter().take(most).map(row).collect();
-        let caption = "Where the model hangs together by fewest points: the two photographs, one on each side, that have most in common, and how many photographs are on the sides. More photographs between the first of them help most.";
-        self.table(caption, &["photograph", "and", "points in common", "photographs on the sides"], &cells)
+        let cells: Vec<[String; 4]> = connections(model).iter().take(most).map(row).collect();
+        let caption = "Weakest connections of the model: the two photographs, one of each part, with the most points in common, and the number of photographs in the parts. More photographs between the first pair help most.";
+        self.table(caption, &["photograph", "and", "points in common", "photographs in the parts"], &cells)
     }
 }
 
-/// Two parts of a model that hang together by the points that one photograph of each have in common.
+/// An edge of the maximum spanning tree of the view graph, which connects two parts of a model.
 #[derive(Debug, Clone, PartialEq)]
-struct Bridge<'a> {
-    /// The photographs, one of each part.
+struct Connection<'a> {
+    /// The images, one of each part.
     names: [&'a str; 2],
+    /// Number of shared points.
     points: u32,
-    /// How many photographs the parts have.
+    /// Number of images of the parts when the tree (Kruskal's algorithm) joined them.
     sizes: [usize; 2],
 }
 
-/// The thinnest first: what the maximum spanning tree of the photographs is made of, weighted by points in common.
-fn bridges(model: &SparseModel) -> Vec<Bridge<'_>> {
-    let ids = by_name(model);
+/// Computes the edges of the maximum spanning tree of the view graph, weighted by shared points, weakest first.
+fn connections(model: &SparseModel) -> Vec<Connection<'_>> {
+    let ids = ids_by_name(model);
     let shared = shared_points(model, &ids);
     let mut links: Vec<(u32, usize, usize)> = (0..ids.len())
         .flat_map(|a| (a + 1..ids.len()).map(move |b| (a, b)))
@@ -103,11 +107,11 @@ fn bridges(model: &SparseModel) -> Vec<Bridge<'_>> {
     links.sort_by_key(|&(points, a, b)| (std::cmp::Reverse(points), a, b));
     let mut parts = UnionFind::new(ids.len());
     let mut sizes = vec![1; ids.len()];
-    let mut bridges = Vec::new();
+    let mut connections = Vec::new();
     for (points, a, b) in links.into_iter().filter(|link| link.0 > 0) {
         let roots = [a, b].map(|i| parts.find(i as u32) as usize);
         if parts.union(a as u32, b as u32) {
-            bridges.push(Bridge {
+            connections.push(Connection {
                 names: [a, b].map(|i| &*model.images[&ids[i]].name),
                 points,
                 sizes: roots.map(|r| sizes[r]),
@@ -115,20 +119,20 @@ fn bridges(model: &SparseModel) -> Vec<Bridge<'_>> {
             sizes[parts.find(a as u32) as usize] = sizes[roots[0]] + sizes[roots[1]];
         }
     }
-    bridges.reverse();
-    bridges
+    connections.reverse();
+    connections
 }
 
-/// Which photographs of a model see the same points: a square for each pair, the lighter the more points in common (on a logarithmic scale), gray for none. Rows and
-/// columns are in the order of names. About `side` pixels wide; a model of more photographs than that gets a wider picture.
+/// Draws the view graph of a model as a matrix: a cell for each pair of images, the lighter the more shared points (logarithmic scale), gray for
+/// none. Rows and columns are in the order of names. About `side` pixels wide, wider for models of more images.
 pub fn draw_view_graph(model: &SparseModel, side: usize) -> RgbU8 {
     const INK: Color = [45, 48, 56];
     const NONE: Color = [228, 230, 234];
-    let ids = by_name(model);
+    let ids = ids_by_name(model);
     let count = ids.len();
     let shared = shared_points(model, &ids);
     let text = (side as f32 / 75.0).clamp(8.0, 14.0);
-    let names: Vec<String> = ids.iter().map(|id| short(&model.images[id].name)).collect();
+    let names: Vec<String> = ids.iter().map(|id| short_name(&model.images[id].name)).collect();
     let left = names.iter().map(|name| Raster::text_width(name, text)).fold(0.0, f32::max) + 2.0 * text;
     let (left, top) = (left.ceil() as usize, (3.5 * text) as usize);
     let cell = (side.saturating_sub(left) / count.max(1)).clamp(1, 40);
@@ -147,13 +151,13 @@ pub fn draw_view_graph(model: &SparseModel, side: usize) -> RgbU8 {
             raster.fill_rect((left + x * cell) as i64, (top + y * cell) as i64, cell - gap, cell - gap, color);
         }
     }
-    // As many names as there is room for.
+    // Label as many rows as there is room for.
     let every = (1.3 * text / cell as f32).ceil().max(1.0) as usize;
     for (y, name) in names.iter().enumerate().step_by(every) {
         let at = top as f32 + (y as f32 + 0.5) * cell as f32 - text / 2.0;
         raster.text(left as f32 - text * 0.6 - Raster::text_width(name, text), at, name, text, INK);
     }
-    // The scale: a few numbers of points with their colors.
+    // Legend: some numbers of points with their colors.
     let mut x = left as f32;
     let steps = [1.0, f64::from(most).powf(1.0 / 3.0), f64::from(most).powf(2.0 / 3.0), f64::from(most)];
     let mut steps: Vec<u32> = std::iter::once(0).chain(steps.map(|s| s.round() as u32)).collect();
@@ -167,39 +171,40 @@ pub fn draw_view_graph(model: &SparseModel, side: usize) -> RgbU8 {
     raster.into_image()
 }
 
-/// The numbers of the photographs in the order of their names.
-fn by_name(model: &SparseModel) -> Vec<u32> {
+/// Returns the image ids in the order of their names.
+fn ids_by_name(model: &SparseModel) -> Vec<u32> {
     let mut ids: Vec<u32> = model.images.keys().copied().collect();
     ids.sort_by(|a, b| model.images[a].name.cmp(&model.images[b].name));
     ids
 }
 
-/// A file's name without its folder, its end where it is long.
-fn short(name: &str) -> String {
+/// Returns a file name without its folder, truncated to its last 16 characters.
+fn short_name(name: &str) -> String {
     let name = name.rsplit(['/', '\\']).next().unwrap_or(name);
     let count = name.chars().count();
     if count <= 16 { name.to_owned() } else { name.chars().skip(count - 16).collect() }
 }
 
-fn single(p: Point3<f64>) -> [f32; 3] {
+fn to_f32(p: Point3<f64>) -> [f32; 3] {
     [p.x as f32, p.y as f32, p.z as f32]
 }
 
-/// From the model's world to one with its origin at the first camera by name, Y down.
-fn upright(model: &SparseModel) -> Pose {
-    let poses: Vec<Pose> = by_name(model).iter().map(|id| model.images[id].pose).collect();
-    cv_core::upright(&poses)
+/// Computes the motion from the model's world to the upright frame of the first camera by name.
+fn model_to_upright(model: &SparseModel) -> Pose {
+    let poses: Vec<Pose> = ids_by_name(model).iter().map(|id| model.images[id].pose).collect();
+    cv_core::upright_frame(&poses)
 }
 
-/// Points that each two photographs, by their place in `ids`, have in common; of one with itself all of its points.
+/// Counts the shared points of each pair of images, by index in `ids`; the diagonal has the points of each image.
 fn shared_points(model: &SparseModel, ids: &[u32]) -> Vec<Vec<u32>> {
-    let place: BTreeMap<u32, usize> = ids.iter().enumerate().map(|(i, id)| (*id, i)).collect();
+    let index_of: BTreeMap<u32, usize> = ids.iter().enumerate().map(|(i, id)| (*id, i)).collect();
     let mut shared = vec![vec![0; ids.len()]; ids.len()];
     for point in model.points.values() {
-        // A photograph may see a point twice.
-        let seen: BTreeSet<usize> = point.track.iter().filter_map(|(image, _)| place.get(image).copied()).collect();
-        for &a in &seen {
-            for &b in &seen {
+        // An image may observe a point twice.
+        let images: BTreeSet<usize> =
+            point.track.iter().filter_map(|(image, _)| index_of.get(image).copied()).collect();
+        for &a in &images {
+            for &b in &images {
                 shared[a][b] += 1;
             }
         }
@@ -207,10 +212,10 @@ fn shared_points(model: &SparseModel, ids: &[u32]) -> Vec<Vec<u32>> {
     shared
 }
 
-fn rows(model: &SparseModel) -> Vec<Row<'_>> {
-    let ids = by_name(model);
+fn image_statistics(model: &SparseModel) -> Vec<ImageStatistics<'_>> {
+    let ids = ids_by_name(model);
     let shared = shared_points(model, &ids);
-    // Observations, those with an error, the errors' sum and that of the lengths of tracks.
+    // Per image: number of observations, number of those with an error, sum of errors, sum of track lengths.
     let mut sums: BTreeMap<u32, (usize, usize, f64, usize)> = BTreeMap::new();
     for point in model.points.values() {
         for (id, index) in &point.track {
@@ -227,13 +232,13 @@ fn rows(model: &SparseModel) -> Vec<Row<'_>> {
         }
     }
     let row = |(i, id): (usize, &u32)| {
-        let (points, judged, errors, lengths) = sums.get(id).copied().unwrap_or_default();
-        Row {
+        let (points, with_error, errors, lengths) = sums.get(id).copied().unwrap_or_default();
+        ImageStatistics {
             name: &model.images[id].name,
             points,
-            error: errors / judged as f64,
+            error: errors / with_error as f64,
             track_length: lengths as f64 / points as f64,
-            linked: shared[i].iter().enumerate().filter(|&(j, &n)| j != i && n as usize >= LINKED).count(),
+            linked: shared[i].iter().enumerate().filter(|&(j, &n)| j != i && n as usize >= MIN_SHARED_POINTS).count(),
         }
     };
     ids.iter().enumerate().map(row).collect()
@@ -244,7 +249,7 @@ mod tests {
     use super::*;
     use cv_core::{Camera, ModelImage, ModelPoint, Point2, Vector3};
 
-    /// Three photographs side by side that look along the world's X, whose down is −Z. The first two see 20 points, the last two 5 of them and one twice.
+    /// Three cameras side by side that look along the world's X, down is −Z. The first two observe 20 points, the last 5 of them, one twice.
     fn model() -> SparseModel {
         let camera = Camera::from_focal(100, 80, 90.0);
         let mut model = SparseModel { cameras: [(4, camera)].into(), ..SparseModel::default() };
@@ -263,7 +268,7 @@ mod tests {
             };
             for id in [1, 2].iter().chain(last) {
                 let image = model.images.get_mut(id).unwrap();
-                // Found three pixels to the right of where it is.
+                // Observed with an error of three pixels to the right.
                 let at = camera.project(&image.pose.transform(&position)).unwrap() + cv_core::Vector2::new(3.0, 0.0);
                 track.push((*id, image.points.len() as u32));
                 image.points.push((at, Some(k)));
@@ -274,12 +279,12 @@ mod tests {
     }
 
     #[test]
-    fn a_photograph_is_told_its_points_their_error_and_whom_it_is_linked_with() {
+    fn image_statistics_have_points_error_track_length_and_links() {
         let model = model();
-        let rows = rows(&model);
+        let rows = image_statistics(&model);
         assert_eq!(rows.iter().map(|r| r.name).collect::<Vec<_>>(), ["b.jpg", "c.jpg", "in/a.jpg"]);
         assert_eq!(rows.iter().map(|r| r.points).collect::<Vec<_>>(), [20, 20, 6]);
-        // The first two share twenty points, which is enough; five with the last are not.
+        // The first two share twenty points and are linked; five shared with the last are too few.
         assert_eq!(rows.iter().map(|r| r.linked).collect::<Vec<_>>(), [1, 1, 0]);
         assert!(rows.iter().all(|r| (r.error - 3.0).abs() < 1e-9));
         // Fifteen tracks of two, four of three, one of four.
@@ -293,39 +298,39 @@ mod tests {
     }
 
     #[test]
-    fn the_thinnest_places_are_those_of_the_spanning_tree() {
+    fn the_weakest_connections_are_edges_of_the_spanning_tree() {
         let model = model();
-        // b and c share twenty points, each of them five with a: the first of the two by name is the bridge.
-        let b = |names, points, sizes| Bridge { names, points, sizes };
-        assert_eq!(bridges(&model), [b(["b.jpg", "in/a.jpg"], 5, [2, 1]), b(["b.jpg", "c.jpg"], 20, [1, 1])]);
+        // b and c share twenty points, each of them five with a: the first of the two by name is the edge.
+        let b = |names, points, sizes| Connection { names, points, sizes };
+        assert_eq!(connections(&model), [b(["b.jpg", "in/a.jpg"], 5, [2, 1]), b(["b.jpg", "c.jpg"], 20, [1, 1])]);
         let mut page = Report::new("t");
-        let html = page.thinnest_places(&model, 1).to_html();
+        let html = page.weakest_connections(&model, 1).to_html();
         assert!(html.contains(">2 and 1<") && !html.contains("c.jpg"), "{html}");
-        assert_eq!(bridges(&SparseModel::default()), []);
+        assert_eq!(connections(&SparseModel::default()), []);
     }
 
     #[test]
-    fn down_is_what_is_down_in_the_photographs() {
+    fn the_scene_is_in_the_upright_frame_of_the_first_camera() {
         let model = model();
-        let to_view = upright(&model);
+        let to_view = model_to_upright(&model);
         // Half a meter ahead of the first camera, and below it.
         let p = to_view.transform(&Point3::new(3.5, 1.0, 0.8));
         assert!((p - Point3::new(0.0, 0.2, 0.5)).norm() < 1e-12, "{p}");
-        assert_eq!(upright(&SparseModel::default()), Pose::identity());
+        assert_eq!(model_to_upright(&SparseModel::default()), Pose::identity());
         let scene = PointScene::of_model(&model);
         assert_eq!(scene.left_out(), 0);
-        // A camera whose lens's number is not there is left out, and nothing else.
+        // An image whose camera id is missing is left out, and nothing else.
         let mut alone = model;
         alone.cameras.clear();
         assert!(PointScene::of_model(&alone) != scene);
     }
 
     #[test]
-    fn squares_are_the_lighter_the_more_points_two_photographs_share() {
+    fn cells_are_lighter_for_more_shared_points() {
         let picture = draw_view_graph(&model(), 300);
         let light = |[r, g, b]: Color| u32::from(r) + u32::from(g) + u32::from(b);
         let is_cell = |c: Color| c == Colormap::Viridis.color(1.0);
-        // The pair of twenty, both ways.
+        // The pair with twenty shared points, in both triangles.
         let bright: Vec<(usize, usize)> = (0..picture.height())
             .flat_map(|y| (0..picture.width()).map(move |x| (x, y)))
             .filter(|&(x, y)| is_cell(picture.at(x, y)) && y > 20)

@@ -1,7 +1,7 @@
 //! Alignment of a model to external measurements: the vertical, the metric scale, known camera centers.
 
 use crate::SfmModel;
-use cv_core::{Cancelled, Matrix3, Point3, Pose, Progress, Rotation3, Vector3, median, upright};
+use cv_core::{Cancelled, Matrix3, Point3, Pose, Progress, Rotation3, Vector3, median, upright_frame};
 use cv_geometry::{EstimateError, RobustOptions, Similarity, SimilarityFreedom, estimate_similarity};
 use cv_numeric::{svd3, symmetric_eigen};
 
@@ -282,7 +282,7 @@ fn fit_scale(model: &SfmModel, distances: &[(usize, usize, f64)]) -> Result<(f64
 /// Returns the similarity to a frame with Z up and its origin at the first view of the model, which looks along Y.
 fn upright_similarity(model: &SfmModel) -> Similarity {
     let poses: Vec<Pose> = model.poses.iter().flatten().copied().collect();
-    let level = upright(&poses);
+    let level = upright_frame(&poses);
     // (x, y, z) with Y down becomes (x, z, −y) with Z up.
     let z_up = Rotation3::from_matrix_unchecked(Matrix3::new(1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0, 0.0));
     Similarity { scale: 1.0, rotation: z_up * level.rotation, translation: z_up * level.translation }

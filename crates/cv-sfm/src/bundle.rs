@@ -346,7 +346,7 @@ impl Problem<'_> {
         adjustment.eliminate(points)?;
         let fixed: Vec<usize> = (0..views.len()).filter(|n| !free[views[*n]]).collect();
         for n in &fixed {
-            adjustment.hold(poses, *n)?;
+            adjustment.fix(poses, *n)?;
         }
         let mut reference = None;
         if fixed.is_empty() {
@@ -364,7 +364,7 @@ impl Problem<'_> {
             for (c, (camera, knowledge)) in scene.cameras.iter().zip(scene.knowledge).enumerate() {
                 let (fixed, prior) = intrinsics_prior(camera, knowledge, plan.lens, 0.5 * plan.scale);
                 let fixed: Vec<usize> = (0..INTRINSICS).filter(|k| fixed[*k]).collect();
-                adjustment.hold_parameters(group, c, &fixed)?;
+                adjustment.fix_parameters(group, c, &fixed)?;
                 priors.push(prior);
             }
             let count = scene.cameras.len() as u32;
@@ -389,12 +389,12 @@ fn fix_gauge(
 ) -> Result<Option<[usize; 2]>, AdjustError> {
     let pose_of = |n: usize| Some((n, scene.poses[*views.get(n)?]?));
     let Some((_, first)) = pose_of(0) else { return Ok(None) };
-    adjustment.hold(poses, 0)?;
+    adjustment.fix(poses, 0)?;
     let distance = |p: &Pose| (p.center() - first.center()).norm_squared();
     let others = (1..views.len()).filter_map(pose_of);
     let Some((n, farthest)) = others.max_by(|a, b| distance(&a.1).total_cmp(&distance(&b.1))) else { return Ok(None) };
     // Of t = −R c, the change with the distance from the first camera.
     let along = farthest.rotation * (farthest.center() - first.center());
-    adjustment.hold_parameters(poses, n, &[3 + along.iamax()])?;
+    adjustment.fix_parameters(poses, n, &[3 + along.iamax()])?;
     Ok(Some([views[0], views[n]]))
 }

@@ -112,7 +112,7 @@ pub(crate) fn centers_from_baselines(
     let solved = (|| {
         let mut problem = Adjustment::default();
         let group = problem.add_group("centers", Euclidean(3), start)?;
-        problem.hold(group, block_of[root] as usize)?;
+        problem.fix(group, block_of[root] as usize)?;
         let loss = RobustLoss::Huber { scale: BASELINE_LOSS_SCALE };
         problem.add_residuals("baselines", BaselineResidual(items), [group, group], blocks, loss)?;
         let settings = AdjustOptions { max_iterations: 30, cost_tolerance: 1e-4, ..AdjustOptions::default() };
@@ -158,9 +158,9 @@ pub(crate) fn adjust_rays(scene: &mut Scene<'_>, stage: &Stage<'_>) -> Result<()
             problem.add_group("centers", Euclidean(3), start.iter().flat_map(|c| [c.x, c.y, c.z]).collect())?;
         let group = problem.add_group("points", Euclidean(3), points)?;
         problem.eliminate(group)?;
-        problem.hold(centers, 0)?;
+        problem.fix(centers, 0)?;
         if let Some(n) = farthest.filter(|n| *n > 0) {
-            problem.hold_parameters(centers, n, &[(start[n] - first).iamax()])?;
+            problem.fix_parameters(centers, n, &[(start[n] - first).iamax()])?;
         }
         problem.add_residuals(
             "rays",

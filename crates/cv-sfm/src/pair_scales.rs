@@ -150,7 +150,7 @@ pub(crate) fn estimate_baselines(
     let solved = (|| {
         let mut problem = Adjustment::default();
         let group = problem.add_group("logarithms of baselines", Euclidean(1), start)?;
-        problem.hold(group, block_of[root] as usize)?;
+        problem.fix(group, block_of[root] as usize)?;
         let loss = RobustLoss::Huber { scale: LOSS_SCALE };
         problem.add_residuals("ratios", DifferenceResidual(differences), [group, group], blocks, loss)?;
         let settings = AdjustOptions { max_iterations: 30, cost_tolerance: 1e-4, ..AdjustOptions::default() };

@@ -84,7 +84,7 @@ pub(crate) fn average_rotations(
         let solved = (|| {
             let mut problem = Adjustment::default();
             let group = problem.add_group("rotations", RotationManifold, views.iter().flat_map(store).collect())?;
-            problem.hold(group, block_of[root] as usize)?;
+            problem.fix(group, block_of[root] as usize)?;
             let relative = RelativeRotationResidual(links.iter().map(|l| l.pose.rotation).collect());
             let blocks = links.iter().map(|l| [block_of[l.a], block_of[l.b]]).collect();
             problem.add_residuals("relative rotations", relative, [group, group], blocks, loss)?;

@@ -197,7 +197,7 @@ impl Region {
         cut.solve(stage)?;
         let columns = self.around.width();
         for (node, (x, y)) in pixels(place).enumerate() {
-            if cut.on_sink_side(node) {
+            if cut.is_on_sink_side(node) {
                 self.planes[(y - self.around.top) * columns + x - self.around.left] = plane;
                 self.costs[node] = offered[node];
                 self.has_changed = true;

@@ -7,7 +7,7 @@
 use crate::StereoGeometry;
 use cv_core::{
     Camera, CameraError, Cancelled, Distortion, Image, ImageView, Mask, OptionError, Point2, Point3, Progress,
-    Rotation3, Stage, StereoRig, Vector3, four_digits,
+    Rotation3, Stage, StereoRig, Vector3, round_to_four_digits,
 };
 use cv_imgproc::{Pixel, WarpError, WarpMap};
 use nalgebra::{Matrix3, Matrix4};
@@ -45,7 +45,7 @@ pub enum RectifyError {
         error: CameraError,
     },
     /// The two cameras stand at the same place, or the translation is not finite.
-    #[error("the cameras are {} apart: there is no parallax between them", four_digits(*.baseline))]
+    #[error("the cameras are {} apart: there is no parallax between them", round_to_four_digits(*.baseline))]
     NoBaseline {
         /// Length of the translation.
         baseline: f64,
@@ -53,7 +53,7 @@ pub enum RectifyError {
     /// The right camera stands left of the left one, or the lower one above.
     #[error(
         "the second camera stands {} {} the first: they are exchanged",
-        four_digits(*.distance), if *.vertical { "above" } else { "left of" }
+        round_to_four_digits(*.distance), if *.vertical { "above" } else { "left of" }
     )]
     Exchanged {
         /// By how much, in the unit of the rig.

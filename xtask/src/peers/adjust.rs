@@ -251,8 +251,8 @@ impl Scene {
         let blocks = self.seen.iter().map(|&(c, p, _)| [c, c, p]).collect();
         problem.add_residuals("observations", pixels, [poses, lenses, points], blocks, loss)?;
         problem.eliminate(points)?;
-        problem.hold(poses, 0)?;
-        problem.hold_parameters(poses, self.poses.len() / 12 / 4, &[3])?;
+        problem.fix(poses, 0)?;
+        problem.fix_parameters(poses, self.poses.len() / 12 / 4, &[3])?;
         let options = AdjustOptions { cost_tolerance: TOLERANCE, gradient_tolerance: 0.0, ..AdjustOptions::default() };
         Ok(problem.solve(&options, |_| ControlFlow::Continue(()))?)
     }

@@ -1,10 +1,10 @@
-//! Equidistant fisheye: `θ' = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)` with θ the angle from the axis and θ' the distorted distance from
-//! it (Kannala & Brandt, "A generic camera model and calibration method for conventional, wide-angle, and fish-eye lenses", PAMI 2006).
+//! Equidistant fisheye: `θ' = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)` with θ the angle from the optical axis and θ' the
+//! distorted radius (Kannala & Brandt, "A generic camera model and calibration method for conventional, wide-angle, and fish-eye lenses", PAMI 2006).
 //! OpenCV's `fisheye`, Kalibr's and ROS's `equidistant`, COLMAP's OPENCV_FISHEYE.
 
 use nalgebra::{Matrix2, Point2};
 
-use super::lens::{ByParameters, ColmapModel, Distorted, Lens, LensInfo, LensProjection, Parameters};
+use super::lens::{ColmapModel, Distorted, Lens, LensInfo, LensProjection, ParameterJacobian, Parameters};
 use super::{Distortion, DistortionModel, terms};
 
 pub(super) struct Fisheye4;
@@ -12,7 +12,7 @@ pub(super) struct Fisheye4;
 impl Distortion {
     /// Equidistant fisheye: `[k1, k2, k3, k4]`.
     pub const fn fisheye4(parameters: [f64; 4]) -> Self {
-        Self::of(DistortionModel::Fisheye4, parameters)
+        Self::from_array(DistortionModel::Fisheye4, parameters)
     }
 }
 
@@ -32,15 +32,15 @@ impl Lens for Fisheye4 {
         ],
     };
 
-    type Slope = [f64; 5];
+    type MonotonicityPolynomial = [f64; 5];
 
     #[inline(always)]
-    fn slope(k: &Parameters) -> Self::Slope {
+    fn monotonicity_polynomial(k: &Parameters) -> Self::MonotonicityPolynomial {
         [1.0, 3.0 * k[0], 5.0 * k[1], 7.0 * k[2], 9.0 * k[3]]
     }
 
     #[inline(always)]
-    fn evaluate(k: &Parameters, p: Point2<f64>, by_parameters: Option<&mut ByParameters>) -> Distorted {
+    fn evaluate(k: &Parameters, p: Point2<f64>, parameter_jacobian: Option<&mut ParameterJacobian>) -> Distorted {
         let r2 = terms::squared_radius(p);
         let r = r2.sqrt();
         if r < 1e-8 {
@@ -48,12 +48,12 @@ impl Lens for Fisheye4 {
         }
         let theta = r.atan();
         let t2 = theta * theta;
-        if let Some(out) = by_parameters {
-            terms::by_radial(out, 0, 4, p, t2, theta / r);
+        if let Some(out) = parameter_jacobian {
+            terms::set_radial_columns(out, 0, 4, p, t2, theta / r);
         }
         let d = theta * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))));
         let dd = 1.0 + t2 * (3.0 * k[0] + t2 * (5.0 * k[1] + t2 * (7.0 * k[2] + t2 * 9.0 * k[3])));
         // g(r²) = d(θ)/r; by r²: (d'·θ'·r − d)/(2 r³) with θ' = 1/(1 + r²).
-        terms::radial(p, (d / r, (dd * r / (1.0 + r2) - d) / (2.0 * r2 * r)))
+        terms::apply_radial_factor(p, (d / r, (dd * r / (1.0 + r2) - d) / (2.0 * r2 * r)))
     }
 }

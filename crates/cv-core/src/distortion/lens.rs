@@ -1,59 +1,60 @@
-//! What a lens model is: the interface that each file of this folder fills in.
+//! The trait that every lens model of this folder implements, and its descriptive data.
 
 use nalgebra::{Matrix2, Point2, SMatrix};
 
-/// The most parameters a lens model has.
+/// Maximum number of distortion parameters of a lens model.
 pub const MAX_PARAMETERS: usize = 12;
 
-/// A lens's parameters in its own order; those it does not have are zero.
+/// Distortion parameters in the model's order; entries beyond the model's count are zero.
 pub(super) type Parameters = [f64; MAX_PARAMETERS];
 
-/// Derivatives of a distorted point by the lens's parameters, a column each.
-pub type ByParameters = SMatrix<f64, 2, MAX_PARAMETERS>;
+/// Derivatives of a distorted point by the distortion parameters, one column each.
+pub type ParameterJacobian = SMatrix<f64, 2, MAX_PARAMETERS>;
 
-/// A distorted point, and its derivative by the ideal one.
+/// A distorted point, and its derivative by the undistorted one.
 pub(super) type Distorted = (Point2<f64>, Matrix2<f64>);
 
-/// What a lens's parameters bend. Lenses of one projection whose parameters have the same names are special cases of each other.
+/// The ideal projection that the distortion parameters modify. Models of one projection whose parameters have the same names are special
+/// cases of each other.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LensProjection {
-    /// The picture of a plane: distances from the axis go as tan θ, and the parameters bend those.
+    /// Radius proportional to tan θ, θ the angle from the optical axis (rectilinear projection).
     Perspective,
-    /// Distances from the axis go as the angle θ itself (equidistant), and the parameters bend that.
+    /// Radius proportional to θ (equidistant projection).
     Fisheye,
 }
 
-/// A model of COLMAP: its focal lengths, the principal point, and then the first so many of our parameters.
+/// A camera model of COLMAP: focal lengths, principal point, then the first `parameters` distortion parameters of ours.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ColmapModel {
     /// Its name in `cameras.txt`.
     pub name: &'static str,
-    /// Its number in `cameras.bin`.
+    /// Its model id in `cameras.bin`.
     pub id: i32,
-    /// Focal lengths: 1 or 2.
+    /// Number of focal lengths, 1 or 2.
     pub focal_lengths: usize,
-    /// How many parameters follow the principal point; the lens's others are zero.
+    /// Number of distortion parameters after the principal point; the lens's others are zero.
     pub parameters: usize,
 }
 
-/// A lens model's names and counts.
+/// A lens model's names and parameters, here and in other tools' files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct LensInfo {
     /// Its name in our own files.
     pub name: &'static str,
-    /// Names it had in our own files before; still read.
+    /// Former names in our own files; still read.
     pub former_names: &'static [&'static str],
     /// The names of its parameters, in their order.
     pub parameters: &'static [&'static str],
-    /// What the parameters bend.
+    /// The ideal projection that the parameters modify.
     pub projection: LensProjection,
-    /// Whether OpenCV knows it: its vector of distortion coefficients then has these parameters in this order.
+    /// Whether OpenCV has the model: its vector of distortion coefficients then has these parameters in this order.
     pub opencv: bool,
     /// ROS's `distortion_model` in `camera_info`.
     pub ros: Option<&'static str>,
     /// Kalibr's `distortion_model`.
     pub kalibr: Option<&'static str>,
-    /// COLMAP's models that are this lens or a special case of it, fewest numbers first.
+    /// COLMAP's models that are this lens or a special case of it, fewest parameters first.
     pub colmap: &'static [ColmapModel],
 }
 
@@ -62,13 +63,13 @@ pub(super) trait Lens {
     const INFO: LensInfo;
 
     /// Coefficients of a polynomial, constant term (1) first.
-    type Slope: AsRef<[f64]>;
+    type MonotonicityPolynomial: AsRef<[f64]>;
 
-    /// A polynomial in r² (perspective) or θ² (fisheye) whose first positive root is where the lens stops to be monotonic: where the
-    /// distorted distance from the axis turns back, or has a pole. Terms without rotational symmetry are left out.
-    fn slope(k: &Parameters) -> Self::Slope;
+    /// Returns a polynomial in r² (perspective) or θ² (fisheye) whose first positive root is the limit of monotonicity: where the
+    /// distorted radius has a turning point or a pole. Terms that are not radial are ignored.
+    fn monotonicity_polynomial(k: &Parameters) -> Self::MonotonicityPolynomial;
 
-    /// Ideal to distorted normalized coordinates, the derivative by the ideal ones, and, where asked for, those by the parameters (all
-    /// columns of the lens's own parameters are set; the others are zero when it is called).
-    fn evaluate(k: &Parameters, p: Point2<f64>, by_parameters: Option<&mut ByParameters>) -> Distorted;
+    /// Distorts normalized coordinates and returns the Jacobian by them. Where `parameter_jacobian` is given (zero on entry), sets
+    /// the columns of the lens's parameters in it.
+    fn evaluate(k: &Parameters, p: Point2<f64>, parameter_jacobian: Option<&mut ParameterJacobian>) -> Distorted;
 }

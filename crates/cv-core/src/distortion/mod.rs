@@ -1,21 +1,21 @@
-//! Lens distortion: a model out of a table, and its parameters.
+//! Lens distortion: the table of models, and their parameters.
 //!
-//! A lens model maps ideal normalized coordinates, `(x, y) = (X/Z, Y/Z)` of a point in the camera's frame, to distorted ones, which the
-//! focal lengths and the principal point take to pixels. [`Distortion`] holds which model it is and a vector of its parameters, in the
-//! names and the order of OpenCV's `calib3d`.
+//! A lens model maps undistorted normalized coordinates, `(x, y) = (X/Z, Y/Z)` of a point in the camera frame, to distorted ones; the
+//! focal lengths and the principal point map those to pixels. [`Distortion`] is a model and the vector of its parameters, with the
+//! names and in the order of OpenCV's `calib3d`.
 //!
 //! # Adding a lens
 //!
-//! Write its file in this folder, an implementation of [`lens::Lens`] with the formula, its derivatives, its range and the names by
-//! which files know it (start from `radial.rs`), and add its `mod` and its line in the table below. Everything else goes by the table:
-//! distorting and undistorting, derivatives for adjustment, warps, and the files of `cv-io`. Nothing outside this folder may `match` on
-//! the models. The tests below go through the table too; give them parameters of such a lens in `tests::examples`.
+//! Write a file in this folder that implements [`lens::Lens`]: the formula, its derivatives, its range, and its names in files
+//! (start from `radial.rs`). Add its `mod` and its line in the table below. Everything else uses the table: distortion and
+//! undistortion, derivatives for adjustment, warps, and the files of `cv-io`. Nothing outside this folder may `match` on
+//! the models. The tests below iterate over the table too; add parameter ranges of the lens in `tests::examples`.
 //!
 //! # Range
 //!
-//! A polynomial means something only up to its first turning point; beyond it rays from far outside fold back into the picture.
-//! [`Distortion::max_radius`] is where that is, [`Distortion::distort_in_range`] and [`Distortion::undistort`] refuse what lies beyond.
-//! Normalized coordinates express rays less than 90° from the axis and no others: a fisheye's pixels beyond that have no ray here.
+//! A distortion polynomial is valid only up to its first turning point; beyond it rays fold back into the image.
+//! [`Distortion::max_radius`] is this limit; [`Distortion::distort_in_range`] and [`Distortion::undistort`] refuse points beyond it.
+//! Normalized coordinates express only rays less than 90° from the axis: fisheye pixels beyond that have no ray here.
 
 mod fisheye4;
 mod inverse;
@@ -26,15 +26,15 @@ mod radial_tangential4;
 mod radial_tangential5;
 mod range;
 mod rational8;
-mod simple_radial;
 #[cfg(feature = "serde")]
-mod stored;
+mod serde_form;
+mod simple_radial;
 mod terms;
 mod thin_prism12;
 
 use nalgebra::{Matrix2, Point2};
 
-pub use lens::{ByParameters, ColmapModel, LensInfo, LensProjection, MAX_PARAMETERS};
+pub use lens::{ColmapModel, LensInfo, LensProjection, MAX_PARAMETERS, ParameterJacobian};
 use lens::{Lens, Parameters};
 
 macro_rules! table {
@@ -48,10 +48,10 @@ macro_rules! table {
         }
 
         impl DistortionModel {
-            /// All models: the table.
+            /// All models, in the order of the table.
             pub const ALL: &'static [Self] = &[$(Self::$model),*];
 
-            /// Its names and counts.
+            /// Returns the model's names and parameters.
             pub const fn info(self) -> &'static LensInfo {
                 match self {
                     $(Self::$model => &<$lens as Lens>::INFO,)*
@@ -59,34 +59,34 @@ macro_rules! table {
             }
         }
 
-        // Each of these chooses the model once, around code that is compiled for each of them.
+        // Static dispatch: each function matches on the model once, around code that is compiled for each model.
         impl Distortion {
             #[inline(always)]
-            fn evaluate(&self, p: Point2<f64>, by_parameters: Option<&mut ByParameters>) -> (Point2<f64>, Matrix2<f64>) {
+            fn evaluate(&self, p: Point2<f64>, parameter_jacobian: Option<&mut ParameterJacobian>) -> (Point2<f64>, Matrix2<f64>) {
                 match self.model {
-                    $(DistortionModel::$model => <$lens as Lens>::evaluate(&self.parameters, p, by_parameters),)*
+                    $(DistortionModel::$model => <$lens as Lens>::evaluate(&self.parameters, p, parameter_jacobian),)*
                 }
             }
 
             #[inline]
-            fn checked(&self, p: Point2<f64>) -> Option<Point2<f64>> {
+            fn evaluate_in_range(&self, p: Point2<f64>) -> Option<Point2<f64>> {
                 match self.model {
                     $(DistortionModel::$model => {
                         let (q, j) = <$lens as Lens>::evaluate(&self.parameters, p, None);
-                        range::contains::<$lens>(&self.parameters, p, j.determinant()).then_some(q)
+                        range::is_in_range::<$lens>(&self.parameters, p, j.determinant()).then_some(q)
                     })*
                 }
             }
 
-            fn inverse(&self, q: Point2<f64>) -> Point2<f64> {
+            fn invert(&self, q: Point2<f64>) -> Point2<f64> {
                 match self.model {
                     $(DistortionModel::$model => inverse::undistort::<$lens>(&self.parameters, q),)*
                 }
             }
 
-            fn end(&self) -> f64 {
+            fn radial_limit(&self) -> f64 {
                 match self.model {
-                    $(DistortionModel::$model => range::end::<$lens>(&self.parameters),)*
+                    $(DistortionModel::$model => range::radial_limit::<$lens>(&self.parameters),)*
                 }
             }
         }
@@ -105,33 +105,36 @@ table! {
 }
 
 impl DistortionModel {
-    /// The model of this name in our own files, today's or a former one.
+    /// Returns the model of this name in our own files, current or former.
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.iter().copied().find(|m| m.info().name == name || m.info().former_names.contains(&name))
     }
 
-    /// How many parameters it has.
+    /// Returns the number of distortion parameters.
     pub const fn parameter_count(self) -> usize {
         self.info().parameters.len()
     }
 }
 
-/// A model does not have so many parameters.
+/// The number of parameters is not that of the model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("the lens model {} has {needed} parameters, not {got}", model.info().name)]
 pub struct ParameterCountError {
     /// The model.
     pub model: DistortionModel,
-    /// How many were given.
+    /// Number of parameters given.
     pub got: usize,
-    /// How many it has.
+    /// Number of parameters of the model.
     pub needed: usize,
 }
 
 /// Lens distortion, applied to normalized image coordinates `(x, y) = (X/Z, Y/Z)`: a model and its parameters.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-#[cfg_attr(feature = "serde", serde(into = "stored::Stored", try_from = "stored::Stored"))]
+#[cfg_attr(
+    feature = "serde",
+    serde(into = "serde_form::SerializedDistortion", try_from = "serde_form::SerializedDistortion")
+)]
 pub struct Distortion {
     model: DistortionModel,
     /// Zero beyond the model's count.
@@ -145,111 +148,110 @@ impl Default for Distortion {
 }
 
 impl Distortion {
-    /// A pinhole.
+    /// No distortion: a pinhole.
     pub const NONE: Self = Self { model: DistortionModel::None, parameters: [0.0; MAX_PARAMETERS] };
 
-    /// For the lenses' own constructors.
-    const fn of<const N: usize>(model: DistortionModel, given: [f64; N]) -> Self {
+    /// Pads the parameters with zeros, for the constructors of the models.
+    const fn from_array<const N: usize>(model: DistortionModel, values: [f64; N]) -> Self {
         let mut parameters = [0.0; MAX_PARAMETERS];
         let mut i = 0;
         while i < N {
-            parameters[i] = given[i];
+            parameters[i] = values[i];
             i += 1;
         }
         Self { model, parameters }
     }
 
-    /// The lens of a model with these parameters.
+    /// Makes the distortion of a model with these parameters.
     ///
     /// # Errors
     /// [`ParameterCountError`] where the model has more or fewer.
-    pub fn new(model: DistortionModel, given: &[f64]) -> Result<Self, ParameterCountError> {
+    pub fn new(model: DistortionModel, values: &[f64]) -> Result<Self, ParameterCountError> {
         let needed = model.parameter_count();
-        if given.len() != needed {
-            return Err(ParameterCountError { model, got: given.len(), needed });
+        if values.len() != needed {
+            return Err(ParameterCountError { model, got: values.len(), needed });
         }
         let mut parameters = [0.0; MAX_PARAMETERS];
-        parameters[..needed].copy_from_slice(given);
+        parameters[..needed].copy_from_slice(values);
         Ok(Self { model, parameters })
     }
 
-    /// Which model it is.
+    /// Returns the distortion model.
     #[inline]
     pub const fn model(&self) -> DistortionModel {
         self.model
     }
 
-    /// Whether it is the pinhole's.
+    /// Whether the model is the pinhole (no distortion).
     #[inline]
     pub fn is_none(&self) -> bool {
         self.model == DistortionModel::None
     }
 
-    /// The parameters, in the order of the model's names.
+    /// Returns the parameters, in the order of the model's names.
     #[inline]
     pub fn parameters(&self) -> &[f64] {
         &self.parameters[..self.model.parameter_count()]
     }
 
-    /// The parameters, to be changed.
+    /// Returns the parameters, mutable.
     #[inline]
     pub fn parameters_mut(&mut self) -> &mut [f64] {
         &mut self.parameters[..self.model.parameter_count()]
     }
 
-    /// Ideal to distorted normalized coordinates, whether or not the ideal point lies within the lens's range.
+    /// Distorts normalized coordinates, also outside the lens's valid range.
     #[inline]
     pub fn distort(&self, p: Point2<f64>) -> Point2<f64> {
         self.evaluate(p, None).0
     }
 
-    /// Ideal to distorted normalized coordinates, with the 2×2 derivative by the ideal ones.
+    /// Distorts normalized coordinates, with the 2×2 Jacobian by the undistorted point.
     #[inline]
     pub fn distort_with_jacobian(&self, p: Point2<f64>) -> (Point2<f64>, Matrix2<f64>) {
         self.evaluate(p, None)
     }
 
-    /// As [`Self::distort_with_jacobian`], with the derivatives by the parameters too: as many columns as the model has parameters, the
-    /// others zero.
+    /// As [`Self::distort_with_jacobian`], with the Jacobian by the parameters too; columns beyond the model's parameters are zero.
     #[inline]
-    pub fn distort_with_jacobians(&self, p: Point2<f64>) -> (Point2<f64>, Matrix2<f64>, ByParameters) {
-        let mut by_parameters = ByParameters::zeros();
-        let (q, j) = self.evaluate(p, Some(&mut by_parameters));
-        (q, j, by_parameters)
+    pub fn distort_with_jacobians(&self, p: Point2<f64>) -> (Point2<f64>, Matrix2<f64>, ParameterJacobian) {
+        let mut parameter_jacobian = ParameterJacobian::zeros();
+        let (q, j) = self.evaluate(p, Some(&mut parameter_jacobian));
+        (q, j, parameter_jacobian)
     }
 
-    /// Ideal to distorted normalized coordinates; `None` beyond the range in which the lens is monotonic.
+    /// Distorts normalized coordinates; `None` beyond the range in which the lens is monotonic.
     ///
-    /// The range is that of the radial part ([`Self::max_radius`]). Tangential and prism terms shift the fold a little: a point whose
-    /// Jacobian's determinant is not positive is refused too.
+    /// The range is that of the radial terms ([`Self::max_radius`]). Tangential and prism terms shift the fold a little, so a point
+    /// whose Jacobian determinant is not positive is refused too.
     #[inline]
     pub fn distort_in_range(&self, p: Point2<f64>) -> Option<Point2<f64>> {
-        self.checked(p)
+        self.evaluate_in_range(p)
     }
 
-    /// Distorted to ideal normalized coordinates. Bounded: at most 40 steps of Newton's method and 100 halvings, four to six steps for
-    /// lenses as they are sold.
+    /// Undistorts normalized coordinates by Newton's method: four to six steps for commercial lenses, at most 40 steps and 100
+    /// bisections.
     ///
-    /// NaN where no ideal point within the lens's range maps there: beyond the picture's rim of a lens that folds back, and beyond 90°
-    /// of a fisheye.
+    /// NaN where no undistorted point within the lens's valid range maps to `q`: beyond the largest radius of a lens that folds back,
+    /// and beyond 90° of a fisheye.
     #[inline]
     pub fn undistort(&self, q: Point2<f64>) -> Point2<f64> {
-        if self.is_none() { q } else { self.inverse(q) }
+        if self.is_none() { q } else { self.invert(q) }
     }
 
-    /// The radius in ideal normalized coordinates up to which the lens is monotonic: where the distorted radius first turns back, or has a
-    /// pole (rational models), exact up to rounding. Infinity where it nowhere does, or (fisheye) not before 90°. Terms that are not radial
-    /// (tangential, prism) are left out of it. Less than a microsecond; for many points see [`Self::distort_in_range`].
+    /// Computes the undistorted normalized radius up to which the lens is monotonic: the first turning point of the distorted radius, or
+    /// its pole (rational models), exact up to rounding. Infinity where there is neither, or (fisheye) not before 90°. Tangential and
+    /// prism terms are ignored. Takes less than a microsecond; for many points see [`Self::distort_in_range`].
     pub fn max_radius(&self) -> f64 {
-        let end = self.end();
+        let limit = self.radial_limit();
         match self.model.info().projection {
-            LensProjection::Perspective => end,
-            LensProjection::Fisheye if end < std::f64::consts::FRAC_PI_2 => end.tan(),
+            LensProjection::Perspective => limit,
+            LensProjection::Fisheye if limit < std::f64::consts::FRAC_PI_2 => limit.tan(),
             LensProjection::Fisheye => f64::INFINITY,
         }
     }
 
-    /// The same lens by another model; `None` where that cannot express it, by the names of the parameters that are not zero.
+    /// Converts the distortion to another model; `None` where that model lacks a non-zero parameter or has another projection.
     pub fn converted(&self, model: DistortionModel) -> Option<Self> {
         let (from, to) = (self.model.info(), model.info());
         let mut out = Self { model, parameters: [0.0; MAX_PARAMETERS] };
@@ -263,13 +265,13 @@ impl Distortion {
         (from.projection == to.projection).then_some(out)
     }
 
-    /// The same lens by the model with the fewest parameters that can express it.
+    /// Converts the distortion to the model with the fewest parameters that can express it.
     pub fn simplified(&self) -> Self {
         let models = DistortionModel::ALL.iter().filter_map(|m| self.converted(*m));
         models.min_by_key(|d| d.model.parameter_count()).unwrap_or(*self)
     }
 
-    /// True where every parameter is finite.
+    /// Whether every parameter is finite.
     pub fn is_finite(&self) -> bool {
         self.parameters.iter().all(|v| v.is_finite())
     }

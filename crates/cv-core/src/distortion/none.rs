@@ -1,8 +1,8 @@
-//! A pinhole: nothing is bent.
+//! The pinhole: no distortion.
 
 use nalgebra::{Matrix2, Point2};
 
-use super::lens::{ByParameters, ColmapModel, Distorted, Lens, LensInfo, LensProjection, Parameters};
+use super::lens::{ColmapModel, Distorted, Lens, LensInfo, LensProjection, ParameterJacobian, Parameters};
 
 pub(super) struct Pinhole;
 
@@ -21,15 +21,15 @@ impl Lens for Pinhole {
         ],
     };
 
-    type Slope = [f64; 1];
+    type MonotonicityPolynomial = [f64; 1];
 
     #[inline(always)]
-    fn slope(_: &Parameters) -> Self::Slope {
+    fn monotonicity_polynomial(_: &Parameters) -> Self::MonotonicityPolynomial {
         [1.0]
     }
 
     #[inline(always)]
-    fn evaluate(_: &Parameters, p: Point2<f64>, _: Option<&mut ByParameters>) -> Distorted {
+    fn evaluate(_: &Parameters, p: Point2<f64>, _: Option<&mut ParameterJacobian>) -> Distorted {
         (p, Matrix2::identity())
     }
 }

@@ -2,7 +2,7 @@
 
 use nalgebra::Point2;
 
-use super::lens::{ByParameters, ColmapModel, Distorted, Lens, LensInfo, LensProjection, Parameters};
+use super::lens::{ColmapModel, Distorted, Lens, LensInfo, LensProjection, ParameterJacobian, Parameters};
 use super::{Distortion, DistortionModel, terms};
 
 pub(super) struct Radial;
@@ -10,7 +10,7 @@ pub(super) struct Radial;
 impl Distortion {
     /// Two radial terms: `x' = x (1 + k1 r² + k2 r⁴)`.
     pub const fn radial(k1: f64, k2: f64) -> Self {
-        Self::of(DistortionModel::Radial, [k1, k2])
+        Self::from_array(DistortionModel::Radial, [k1, k2])
     }
 }
 
@@ -26,19 +26,19 @@ impl Lens for Radial {
         colmap: &[ColmapModel { name: "RADIAL", id: 3, focal_lengths: 1, parameters: 2 }],
     };
 
-    type Slope = [f64; 3];
+    type MonotonicityPolynomial = [f64; 3];
 
     #[inline(always)]
-    fn slope(k: &Parameters) -> Self::Slope {
+    fn monotonicity_polynomial(k: &Parameters) -> Self::MonotonicityPolynomial {
         [1.0, 3.0 * k[0], 5.0 * k[1]]
     }
 
     #[inline(always)]
-    fn evaluate(k: &Parameters, p: Point2<f64>, by_parameters: Option<&mut ByParameters>) -> Distorted {
+    fn evaluate(k: &Parameters, p: Point2<f64>, parameter_jacobian: Option<&mut ParameterJacobian>) -> Distorted {
         let r2 = terms::squared_radius(p);
-        if let Some(out) = by_parameters {
-            terms::by_radial(out, 0, 2, p, r2, 1.0);
+        if let Some(out) = parameter_jacobian {
+            terms::set_radial_columns(out, 0, 2, p, r2, 1.0);
         }
-        terms::radial(p, terms::polynomial([k[0], k[1]], r2))
+        terms::apply_radial_factor(p, terms::radial_polynomial([k[0], k[1]], r2))
     }
 }

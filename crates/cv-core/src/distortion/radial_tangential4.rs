@@ -2,7 +2,7 @@
 
 use nalgebra::Point2;
 
-use super::lens::{ByParameters, ColmapModel, Distorted, Lens, LensInfo, LensProjection, Parameters};
+use super::lens::{ColmapModel, Distorted, Lens, LensInfo, LensProjection, ParameterJacobian, Parameters};
 use super::{Distortion, DistortionModel, terms};
 
 pub(super) struct RadialTangential4;
@@ -10,7 +10,7 @@ pub(super) struct RadialTangential4;
 impl Distortion {
     /// Two radial and two tangential terms: `[k1, k2, p1, p2]`.
     pub const fn radial_tangential4(parameters: [f64; 4]) -> Self {
-        Self::of(DistortionModel::RadialTangential4, parameters)
+        Self::from_array(DistortionModel::RadialTangential4, parameters)
     }
 }
 
@@ -26,21 +26,21 @@ impl Lens for RadialTangential4 {
         colmap: &[ColmapModel { name: "OPENCV", id: 4, focal_lengths: 2, parameters: 4 }],
     };
 
-    type Slope = [f64; 3];
+    type MonotonicityPolynomial = [f64; 3];
 
     #[inline(always)]
-    fn slope(k: &Parameters) -> Self::Slope {
+    fn monotonicity_polynomial(k: &Parameters) -> Self::MonotonicityPolynomial {
         [1.0, 3.0 * k[0], 5.0 * k[1]]
     }
 
     #[inline(always)]
-    fn evaluate(k: &Parameters, p: Point2<f64>, by_parameters: Option<&mut ByParameters>) -> Distorted {
+    fn evaluate(k: &Parameters, p: Point2<f64>, parameter_jacobian: Option<&mut ParameterJacobian>) -> Distorted {
         let r2 = terms::squared_radius(p);
-        if let Some(out) = by_parameters {
-            terms::by_radial(out, 0, 2, p, r2, 1.0);
-            terms::by_tangential(out, 2, p, r2);
+        if let Some(out) = parameter_jacobian {
+            terms::set_radial_columns(out, 0, 2, p, r2, 1.0);
+            terms::set_tangential_columns(out, 2, p, r2);
         }
-        let mut distorted = terms::radial(p, terms::polynomial([k[0], k[1]], r2));
+        let mut distorted = terms::apply_radial_factor(p, terms::radial_polynomial([k[0], k[1]], r2));
         terms::add_tangential(&mut distorted, p, r2, [k[2], k[3]]);
         distorted
     }

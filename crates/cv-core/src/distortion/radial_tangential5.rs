@@ -2,7 +2,7 @@
 
 use nalgebra::Point2;
 
-use super::lens::{ByParameters, Distorted, Lens, LensInfo, LensProjection, Parameters};
+use super::lens::{Distorted, Lens, LensInfo, LensProjection, ParameterJacobian, Parameters};
 use super::{Distortion, DistortionModel, terms};
 
 pub(super) struct RadialTangential5;
@@ -10,7 +10,7 @@ pub(super) struct RadialTangential5;
 impl Distortion {
     /// Three radial and two tangential terms in OpenCV's order: `[k1, k2, p1, p2, k3]`.
     pub const fn radial_tangential5(parameters: [f64; 5]) -> Self {
-        Self::of(DistortionModel::RadialTangential5, parameters)
+        Self::from_array(DistortionModel::RadialTangential5, parameters)
     }
 }
 
@@ -26,22 +26,22 @@ impl Lens for RadialTangential5 {
         colmap: &[],
     };
 
-    type Slope = [f64; 4];
+    type MonotonicityPolynomial = [f64; 4];
 
     #[inline(always)]
-    fn slope(k: &Parameters) -> Self::Slope {
+    fn monotonicity_polynomial(k: &Parameters) -> Self::MonotonicityPolynomial {
         [1.0, 3.0 * k[0], 5.0 * k[1], 7.0 * k[4]]
     }
 
     #[inline(always)]
-    fn evaluate(k: &Parameters, p: Point2<f64>, by_parameters: Option<&mut ByParameters>) -> Distorted {
+    fn evaluate(k: &Parameters, p: Point2<f64>, parameter_jacobian: Option<&mut ParameterJacobian>) -> Distorted {
         let r2 = terms::squared_radius(p);
-        if let Some(out) = by_parameters {
-            terms::by_radial(out, 0, 2, p, r2, 1.0);
-            terms::by_tangential(out, 2, p, r2);
-            terms::by_radial(out, 4, 1, p, r2, r2 * r2);
+        if let Some(out) = parameter_jacobian {
+            terms::set_radial_columns(out, 0, 2, p, r2, 1.0);
+            terms::set_tangential_columns(out, 2, p, r2);
+            terms::set_radial_columns(out, 4, 1, p, r2, r2 * r2);
         }
-        let mut distorted = terms::radial(p, terms::polynomial([k[0], k[1], k[4]], r2));
+        let mut distorted = terms::apply_radial_factor(p, terms::radial_polynomial([k[0], k[1], k[4]], r2));
         terms::add_tangential(&mut distorted, p, r2, [k[2], k[3]]);
         distorted
     }

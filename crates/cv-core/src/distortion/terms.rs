@@ -1,37 +1,44 @@
-//! The terms that the perspective lenses are made of.
+//! Radial, tangential, rational and thin prism terms of the lens models, and their derivatives.
 
 use nalgebra::{Matrix2, Point2, Vector2};
 
-use super::lens::{ByParameters, Distorted};
+use super::lens::{Distorted, ParameterJacobian};
 
 #[inline(always)]
 pub(super) fn squared_radius(p: Point2<f64>) -> f64 {
     p.x * p.x + p.y * p.y
 }
 
-/// `1 + k₁ r² + k₂ r⁴ + …` and its derivative by r².
+/// Evaluates `1 + k₁ r² + k₂ r⁴ + …` and its derivative by r².
 #[inline(always)]
-pub(super) fn polynomial<const N: usize>(k: [f64; N], r2: f64) -> (f64, f64) {
+pub(super) fn radial_polynomial<const N: usize>(k: [f64; N], r2: f64) -> (f64, f64) {
     let last = N - 1;
-    let (mut value, mut slope) = (k[last], (last + 1) as f64 * k[last]);
+    let (mut value, mut derivative) = (k[last], (last + 1) as f64 * k[last]);
     for i in (0..last).rev() {
         value = k[i] + r2 * value;
-        slope = (i + 1) as f64 * k[i] + r2 * slope;
+        derivative = (i + 1) as f64 * k[i] + r2 * derivative;
     }
-    (1.0 + r2 * value, slope)
+    (1.0 + r2 * value, derivative)
 }
 
-/// `p g(r²)`, of a factor g and its derivative by r².
+/// Computes `p g(r²)` and its Jacobian, given the factor g and its derivative by r².
 #[inline(always)]
-pub(super) fn radial(p: Point2<f64>, (g, dg): (f64, f64)) -> Distorted {
+pub(super) fn apply_radial_factor(p: Point2<f64>, (g, dg): (f64, f64)) -> Distorted {
     let (x, y) = (p.x, p.y);
-    let across = 2.0 * x * y * dg;
-    (Point2::new(x * g, y * g), Matrix2::new(g + 2.0 * x * x * dg, across, across, g + 2.0 * y * y * dg))
+    let off_diagonal = 2.0 * x * y * dg;
+    (Point2::new(x * g, y * g), Matrix2::new(g + 2.0 * x * x * dg, off_diagonal, off_diagonal, g + 2.0 * y * y * dg))
 }
 
-/// Sets `count` columns from `first`: the derivatives of `p · scale · (k₁ r² + k₂ r⁴ + …)`.
+/// Sets `count` columns from `first`: the derivatives of `p · scale · (k₁ r² + k₂ r⁴ + …)` by the k.
 #[inline(always)]
-pub(super) fn by_radial(out: &mut ByParameters, first: usize, count: usize, p: Point2<f64>, r2: f64, scale: f64) {
+pub(super) fn set_radial_columns(
+    out: &mut ParameterJacobian,
+    first: usize,
+    count: usize,
+    p: Point2<f64>,
+    r2: f64,
+    scale: f64,
+) {
     let mut column = p.coords * (r2 * scale);
     for i in first..first + count {
         out.set_column(i, &column);
@@ -45,22 +52,22 @@ pub(super) fn add_tangential((q, j): &mut Distorted, p: Point2<f64>, r2: f64, [p
     let (x, y) = (p.x, p.y);
     q.x += 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x);
     q.y += p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y;
-    let across = 2.0 * p1 * x + 2.0 * p2 * y;
+    let off_diagonal = 2.0 * p1 * x + 2.0 * p2 * y;
     j[(0, 0)] += 2.0 * p1 * y + 6.0 * p2 * x;
-    j[(0, 1)] += across;
-    j[(1, 0)] += across;
+    j[(0, 1)] += off_diagonal;
+    j[(1, 0)] += off_diagonal;
     j[(1, 1)] += 6.0 * p1 * y + 2.0 * p2 * x;
 }
 
-/// Sets the two columns of the tangential terms.
+/// Sets the columns of p₁ and p₂.
 #[inline(always)]
-pub(super) fn by_tangential(out: &mut ByParameters, first: usize, p: Point2<f64>, r2: f64) {
-    let across = 2.0 * p.x * p.y;
-    out.set_column(first, &Vector2::new(across, r2 + 2.0 * p.y * p.y));
-    out.set_column(first + 1, &Vector2::new(r2 + 2.0 * p.x * p.x, across));
+pub(super) fn set_tangential_columns(out: &mut ParameterJacobian, first: usize, p: Point2<f64>, r2: f64) {
+    let off_diagonal = 2.0 * p.x * p.y;
+    out.set_column(first, &Vector2::new(off_diagonal, r2 + 2.0 * p.y * p.y));
+    out.set_column(first + 1, &Vector2::new(r2 + 2.0 * p.x * p.x, off_diagonal));
 }
 
-/// Adds the thin prism's terms `(s₁r² + s₂r⁴, s₃r² + s₄r⁴)`.
+/// Adds the thin prism terms `(s₁r² + s₂r⁴, s₃r² + s₄r⁴)`.
 #[inline(always)]
 pub(super) fn add_prism((q, j): &mut Distorted, p: Point2<f64>, r2: f64, s: [f64; 4]) {
     for (axis, s) in [[s[0], s[1]], [s[2], s[3]]].into_iter().enumerate() {
@@ -71,9 +78,9 @@ pub(super) fn add_prism((q, j): &mut Distorted, p: Point2<f64>, r2: f64, s: [f64
     }
 }
 
-/// Sets the four columns of the thin prism's terms.
+/// Sets the columns of s₁ to s₄.
 #[inline(always)]
-pub(super) fn by_prism(out: &mut ByParameters, first: usize, r2: f64) {
+pub(super) fn set_prism_columns(out: &mut ParameterJacobian, first: usize, r2: f64) {
     let columns =
         [Vector2::new(r2, 0.0), Vector2::new(r2 * r2, 0.0), Vector2::new(0.0, r2), Vector2::new(0.0, r2 * r2)];
     for (i, column) in columns.iter().enumerate() {
@@ -90,15 +97,15 @@ pub(super) struct Rational {
 }
 
 #[inline(always)]
-pub(super) fn rational(numerator: [f64; 3], denominator: [f64; 3], r2: f64) -> Rational {
-    let ((n, dn), (d, dd)) = (polynomial(numerator, r2), polynomial(denominator, r2));
+pub(super) fn rational_factor(numerator: [f64; 3], denominator: [f64; 3], r2: f64) -> Rational {
+    let ((n, dn), (d, dd)) = (radial_polynomial(numerator, r2), radial_polynomial(denominator, r2));
     let inverse = 1.0 / d;
     let g = n * inverse;
     Rational { factor: (g, (dn - g * dd) * inverse), inverse }
 }
 
-/// Where `r N(r²)/D(r²)` turns or has a pole: `((N + 2sN')D − 2sND')·D` of s = r².
-pub(super) fn rational_slope(numerator: [f64; 3], denominator: [f64; 3]) -> [f64; 10] {
+/// Returns the polynomial in s = r² that vanishes where `r N(s)/D(s)` has a turning point or a pole: `((N + 2sN')D − 2sND')·D`.
+pub(super) fn rational_monotonicity_polynomial(numerator: [f64; 3], denominator: [f64; 3]) -> [f64; 10] {
     let n = [1.0, numerator[0], numerator[1], numerator[2]];
     let d = [1.0, denominator[0], denominator[1], denominator[2]];
     let mut out = [0.0; 10];

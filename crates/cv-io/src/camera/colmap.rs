@@ -1,21 +1,21 @@
-//! A camera as COLMAP names and orders its parameters: a line of `cameras.txt`.
+//! COLMAP's camera models: a line of `cameras.txt`.
 
 use std::fmt::Write as _;
 
 use cv_core::{Camera, ColmapModel, Distortion, DistortionModel};
 
-use super::format::{Format, comments, no_lens};
+use super::format::{Format, comments, unsupported_lens};
 use crate::FormatError;
 
 const NAME: &str = "COLMAP camera";
 
-/// COLMAP's pixel centers are at +0.5.
+/// Offset of COLMAP's pixel centers from ours.
 pub(crate) const CENTER: f64 = 0.5;
 
 pub(super) const FORMAT: Format = Format {
     name: "colmap",
-    is: |text| !matches!(find(text), Err(FormatError::UnknownFormat { .. })),
-    camera: |text, _| find(text),
+    matches: |text| !matches!(parse_first_camera(text), Err(FormatError::UnknownFormat { .. })),
+    camera: |text, _| parse_first_camera(text),
     rig: None,
     camera_text: Some(camera_text),
     rig_text: None,
@@ -23,32 +23,32 @@ pub(super) const FORMAT: Format = Format {
     array_text: None,
 };
 
-/// COLMAP's models, each with the lens it is.
-fn models() -> impl Iterator<Item = (DistortionModel, &'static ColmapModel)> {
+/// Iterates over COLMAP's models with our corresponding lens model.
+fn all_models() -> impl Iterator<Item = (DistortionModel, &'static ColmapModel)> {
     DistortionModel::ALL.iter().flat_map(|lens| lens.info().colmap.iter().map(|model| (*lens, model)))
 }
 
-/// The camera of `model` with COLMAP's `parameters`.
+/// Makes the camera of a COLMAP model name and its parameters.
 pub(crate) fn parse_model(model: &str, width: usize, height: usize, parameters: &[f64]) -> Result<Camera, FormatError> {
-    let found = models().find(|(_, m)| m.name == model);
-    camera(found.ok_or_else(|| unknown(model))?, width, height, parameters)
+    let found = all_models().find(|(_, m)| m.name == model);
+    camera(found.ok_or_else(|| unknown_model(model))?, width, height, parameters)
 }
 
-/// The camera of the model that has the number `id` in `cameras.bin`, its parameters taken from `next`.
+/// Makes the camera of a COLMAP model id (`cameras.bin`), with parameters taken from `next`.
 pub(crate) fn camera_by_id(
     id: i32,
     width: usize,
     height: usize,
     mut next: impl FnMut() -> Result<f64, FormatError>,
 ) -> Result<Camera, FormatError> {
-    let found = models().find(|(_, m)| m.id == id).ok_or_else(|| unknown(&format!("number {id}")))?;
+    let found = all_models().find(|(_, m)| m.id == id).ok_or_else(|| unknown_model(&format!("number {id}")))?;
     let count = found.1.focal_lengths + 2 + found.1.parameters;
     let parameters: Vec<f64> = (0..count).map(|_| next()).collect::<Result<_, _>>()?;
     camera(found, width, height, &parameters)
 }
 
-fn unknown(model: &str) -> FormatError {
-    let names: Vec<&str> = models().map(|(_, m)| m.name).collect();
+fn unknown_model(model: &str) -> FormatError {
+    let names: Vec<&str> = all_models().map(|(_, m)| m.name).collect();
     FormatError::unsupported(NAME, format!("the model {model} (it is one of {})", names.join(", ")))
 }
 
@@ -75,25 +75,25 @@ fn camera(
     Ok(Camera { distortion, ..Camera::pinhole(width, height, fx, fy, cx - CENTER, cy - CENTER) })
 }
 
-/// COLMAP's model with the fewest numbers that holds a camera, and those numbers.
+/// Finds COLMAP's model with the fewest parameters that represents a camera, and those parameters.
 pub(crate) fn model_of(camera: &Camera) -> Result<(&'static ColmapModel, Vec<f64>), FormatError> {
-    let held = |(lens, form): (DistortionModel, &'static ColmapModel)| {
+    let represent = |(lens, form): (DistortionModel, &'static ColmapModel)| {
         let distortion = camera.distortion.converted(lens)?;
         let rest = distortion.parameters()[form.parameters..].iter();
-        let holds = (form.focal_lengths == 2 || camera.fx == camera.fy) && rest.into_iter().all(|v| *v == 0.0);
-        holds.then_some((form, distortion))
+        let is_exact = (form.focal_lengths == 2 || camera.fx == camera.fy) && rest.into_iter().all(|v| *v == 0.0);
+        is_exact.then_some((form, distortion))
     };
-    let (form, distortion) = models()
-        .filter_map(held)
+    let (form, distortion) = all_models()
+        .filter_map(represent)
         .min_by_key(|(form, _)| form.focal_lengths + form.parameters)
-        .ok_or_else(|| no_lens(camera, NAME))?;
+        .ok_or_else(|| unsupported_lens(camera, NAME))?;
     let focal = [camera.fx, camera.fy];
     let center = [camera.cx + CENTER, camera.cy + CENTER];
     let coefficients = &distortion.parameters()[..form.parameters];
     Ok((form, [&focal[..form.focal_lengths], &center, coefficients].concat()))
 }
 
-/// A camera as `MODEL width height parameters`.
+/// Formats a camera as `MODEL width height parameters`.
 pub(crate) fn model_line(camera: &Camera) -> Result<String, FormatError> {
     let (form, parameters) = model_of(camera)?;
     let mut line = format!("{} {} {}", form.name, camera.width, camera.height);
@@ -109,9 +109,9 @@ fn camera_text(camera: &Camera, notes: &[&str]) -> Result<String, FormatError> {
     Ok(text)
 }
 
-/// The first camera in a text: a line of `cameras.txt`, a bare `MODEL w h parameters`, or either behind `# camera:`, with the size also
+/// Parses the first camera in a text: a line of `cameras.txt`, a bare `MODEL w h parameters`, or either after `# camera:`, with the size also
 /// as `w×h` and the word `params` before the parameters.
-fn find(text: &str) -> Result<Camera, FormatError> {
+fn parse_first_camera(text: &str) -> Result<Camera, FormatError> {
     for (index, line) in text.lines().enumerate() {
         let content = match line.trim().strip_prefix('#') {
             Some(comment) => match comment.trim_start().strip_prefix("camera:") {
@@ -129,7 +129,7 @@ fn find(text: &str) -> Result<Camera, FormatError> {
             [] => continue,
             _ => break,
         };
-        return numbers(words.0, words.1).map_err(|e| match e {
+        return parse_parameters(words.0, words.1).map_err(|e| match e {
             FormatError::Corrupt { reason, .. } => FormatError::line(index + 1, reason),
             other => other,
         });
@@ -137,8 +137,8 @@ fn find(text: &str) -> Result<Camera, FormatError> {
     Err(FormatError::UnknownFormat { expected: "a COLMAP camera" })
 }
 
-fn numbers(model: &str, words: &[&str]) -> Result<Camera, FormatError> {
-    let no_size = || FormatError::corrupt(NAME, "no width and height behind the model");
+fn parse_parameters(model: &str, words: &[&str]) -> Result<Camera, FormatError> {
+    let no_size = || FormatError::corrupt(NAME, "no width and height after the model");
     let side = |w: &str| w.parse::<usize>().ok();
     let (width, height, rest) = match words {
         [both, rest @ ..] if both.contains(['x', '×']) => {
@@ -149,7 +149,7 @@ fn numbers(model: &str, words: &[&str]) -> Result<Camera, FormatError> {
         _ => return Err(no_size()),
     };
     let rest = rest.strip_prefix(&["params"]).unwrap_or(rest);
-    // A remark in brackets may follow.
+    // A remark in parentheses may follow.
     let parameters: Vec<f64> = rest
         .iter()
         .take_while(|w| !w.starts_with('('))

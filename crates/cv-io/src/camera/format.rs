@@ -1,4 +1,4 @@
-//! What a calibration format is: the interface that each format's file fills in.
+//! The interface that each calibration format implements.
 
 use std::cell::RefCell;
 
@@ -7,15 +7,15 @@ use cv_core::{Camera, Distortion, DistortionModel};
 use super::{CalibrationNote, CameraArray, RigFile};
 use crate::FormatError;
 
-/// What a reader is given beside the text, and what it has to say of it.
-pub(super) struct Given {
-    /// Width and height of the pictures, for files that do not say.
+/// What a reader is context beside the text, and what it has to say of it.
+pub(super) struct ReadContext {
+    /// Width and height of the images, for files without them.
     pub(super) size: Option<(usize, usize)>,
-    /// What is not taken as it stands.
+    /// Deviations from the file.
     notes: RefCell<Vec<CalibrationNote>>,
 }
 
-impl Given {
+impl ReadContext {
     pub(super) fn new(size: Option<(usize, usize)>) -> Self {
         Self { size, notes: RefCell::default() }
     }
@@ -29,17 +29,17 @@ impl Given {
     }
 }
 
-/// Understands a text as a camera or a rig.
-type Read<T> = fn(&str, &Given) -> Result<T, FormatError>;
-/// A camera or a rig as text; the notes become comments.
+/// Parses a text as a camera or a rig.
+type Read<T> = fn(&str, &ReadContext) -> Result<T, FormatError>;
+/// Formats a camera or a rig as text; the notes become comments.
 type Write<T> = fn(&T, &[&str]) -> Result<String, FormatError>;
 
 /// A calibration format.
 pub(super) struct Format {
-    /// Its name for those who choose one to write.
+    /// Its name, for choosing the format to write.
     pub(super) name: &'static str,
-    /// Whether a text is meant as this format. Asked in the order of the table.
-    pub(super) is: fn(&str) -> bool,
+    /// Whether a text is of this format. Evaluated in the order of the table.
+    pub(super) matches: fn(&str) -> bool,
     /// Reads a camera.
     pub(super) camera: Read<Camera>,
     /// Reads a rig, where the format has them.
@@ -50,35 +50,35 @@ pub(super) struct Format {
     pub(super) rig_text: Option<Write<RigFile>>,
     /// Reads any number of cameras, where the format has them.
     pub(super) array: Option<Read<CameraArray>>,
-    /// Writes any number of valid cameras and finite motions, where the format holds them.
+    /// Writes any number of valid cameras and finite motions, where the format supports them.
     pub(super) array_text: Option<Write<CameraArray>>,
 }
 
-/// A camera's lens by the smallest of the lens models that a format has.
-pub(super) fn smallest(
+/// A camera's lens by the simplest_distortion of the lens models that a format has.
+pub(super) fn simplest_distortion(
     camera: &Camera,
     format: &'static str,
     models: impl Iterator<Item = DistortionModel>,
 ) -> Result<Distortion, FormatError> {
-    let held = models.filter_map(|model| camera.distortion.converted(model));
-    held.min_by_key(|distortion| distortion.parameters().len()).ok_or_else(|| no_lens(camera, format))
+    let converted = models.filter_map(|model| camera.distortion.converted(model));
+    converted.min_by_key(|distortion| distortion.parameters().len()).ok_or_else(|| unsupported_lens(camera, format))
 }
 
-/// A format does not have a camera's lens.
-pub(super) fn no_lens(camera: &Camera, format: &'static str) -> FormatError {
+/// The error that a format does not have a camera's lens model.
+pub(super) fn unsupported_lens(camera: &Camera, format: &'static str) -> FormatError {
     FormatError::NotRepresentable {
         format,
         what: format!("a lens of the model {}", camera.distortion.model().info().name),
     }
 }
 
-/// Notes as lines of comments.
+/// Formats notes as comment lines.
 pub(super) fn comments(notes: &[&str]) -> String {
     let printable = |line: &str| line.chars().filter(|&c| printable(c)).collect::<String>();
     notes.iter().flat_map(|n| n.lines()).map(|line| format!("# {}\n", printable(line))).collect()
 }
 
-/// True for what YAML lets stand anywhere, and that does not end a line.
+/// Whether YAML allows a character anywhere, and it does not end a line.
 pub(super) fn printable(c: char) -> bool {
     !c.is_control() && !matches!(c, '\u{feff}' | '\u{fffe}' | '\u{ffff}' | '\u{2028}' | '\u{2029}')
 }

@@ -1,11 +1,11 @@
-//! Cameras and rigs as Kalibr writes them (`camchain.yaml`): `cam0`, `cam1`, …, each with the motion from the one before it.
+//! Kalibr's `camchain.yaml`: `cam0`, `cam1`, …, each with the motion from its predecessor.
 
 use std::fmt::Write as _;
 
 use cv_core::{Camera, Distortion, DistortionModel, Pose, StereoRig};
 use saphyr::Yaml;
 
-use super::format::{Format, Given, comments, smallest};
+use super::format::{Format, ReadContext, comments, simplest_distortion};
 use super::yaml::{get, load, numbers, pose, required, size_of};
 use super::{ArrayCamera, CameraArray, RigFile};
 use crate::FormatError;
@@ -14,8 +14,8 @@ const NAME: &str = "Kalibr";
 
 pub(super) const FORMAT: Format = Format {
     name: "kalibr",
-    is: |text| text.lines().any(|l| l.trim_end() == "cam0:"),
-    camera: |text, _| one(&load(text)?, "cam0"),
+    matches: |text| text.lines().any(|l| l.trim_end() == "cam0:"),
+    camera: |text, _| parse_one(&load(text)?, "cam0"),
     rig: Some(rig),
     camera_text: Some(camera_text),
     rig_text: Some(rig_text),
@@ -23,7 +23,7 @@ pub(super) const FORMAT: Format = Format {
     array_text: Some(array_text),
 };
 
-fn one(document: &Yaml<'_>, key: &str) -> Result<Camera, FormatError> {
+fn parse_one(document: &Yaml<'_>, key: &str) -> Result<Camera, FormatError> {
     let map = get(document, &[key]).ok_or_else(|| FormatError::missing(NAME, key))?;
     let word = |key| get(map, &[key]).and_then(|v| v.as_str()).ok_or_else(|| FormatError::missing(NAME, key));
     if word("camera_model")? != "pinhole" {
@@ -38,10 +38,10 @@ fn one(document: &Yaml<'_>, key: &str) -> Result<Camera, FormatError> {
     })?;
     let coefficients = get(map, &["distortion_coeffs"]).and_then(numbers);
     let coefficients = coefficients.ok_or_else(|| FormatError::missing(NAME, "distortion_coeffs"))?;
-    // For a pinhole zeros may stand there.
-    let given =
+    // A pinhole may have zeros as coefficients.
+    let context =
         if coefficients.iter().all(|v| *v == 0.0) && lens.parameter_count() == 0 { &[] } else { &coefficients[..] };
-    let distortion = Distortion::new(lens, given).map_err(|e| FormatError::corrupt(NAME, e.to_string()))?;
+    let distortion = Distortion::new(lens, context).map_err(|e| FormatError::corrupt(NAME, e.to_string()))?;
     let [fx, fy, cx, cy] = required(map, NAME, &["intrinsics"])?;
     let size = get(map, &["resolution"]).and_then(|v| v.as_sequence()).and_then(|v| match v.as_slice() {
         [w, h] => Some((size_of(w)?, size_of(h)?)),
@@ -51,15 +51,15 @@ fn one(document: &Yaml<'_>, key: &str) -> Result<Camera, FormatError> {
     Ok(Camera { distortion, ..Camera::pinhole(width, height, fx, fy, cx, cy) })
 }
 
-fn rig(text: &str, _: &Given) -> Result<RigFile, FormatError> {
+fn rig(text: &str, _: &ReadContext) -> Result<RigFile, FormatError> {
     let document = load(text)?;
-    let [left, right] = [one(&document, "cam0")?, one(&document, "cam1")?];
+    let [left, right] = [parse_one(&document, "cam0")?, parse_one(&document, "cam1")?];
     let right_from_left = from_previous(&document, "cam1")?;
     // Kalibr's boards are in meters.
     Ok(RigFile { rig: StereoRig { left, right, right_from_left }, unit: "m".to_owned() })
 }
 
-/// The motion from the camera before a camera to it.
+/// Parses the motion from the preceding camera to this one.
 fn from_previous(document: &Yaml<'_>, key: &str) -> Result<Pose, FormatError> {
     let map = get(document, &[key]).ok_or_else(|| FormatError::missing(NAME, key))?;
     let m: [f64; 16] = required(map, NAME, &["T_cn_cnm1"])?;
@@ -71,10 +71,13 @@ fn from_previous(document: &Yaml<'_>, key: &str) -> Result<Pose, FormatError> {
     pose(NAME, rotation, [r0[3], r1[3], r2[3]])
 }
 
-fn array(text: &str, _: &Given) -> Result<CameraArray, FormatError> {
+fn array(text: &str, _: &ReadContext) -> Result<CameraArray, FormatError> {
     let document = load(text)?;
-    let mut cameras =
-        vec![ArrayCamera { name: "cam0".to_owned(), camera: one(&document, "cam0")?, from_first: Pose::identity() }];
+    let mut cameras = vec![ArrayCamera {
+        name: "cam0".to_owned(),
+        camera: parse_one(&document, "cam0")?,
+        from_first: Pose::identity(),
+    }];
     loop {
         let name = format!("cam{}", cameras.len());
         if get(&document, &[name.as_str()]).is_none() {
@@ -82,7 +85,7 @@ fn array(text: &str, _: &Given) -> Result<CameraArray, FormatError> {
         }
         let before = cameras.last().map_or(Pose::identity(), |c| c.from_first);
         let from_first = from_previous(&document, &name)?.compose(&before);
-        cameras.push(ArrayCamera { camera: one(&document, &name)?, from_first, name });
+        cameras.push(ArrayCamera { camera: parse_one(&document, &name)?, from_first, name });
     }
 }
 
@@ -91,7 +94,7 @@ fn array_text(file: &CameraArray, notes: &[&str]) -> Result<String, FormatError>
     let mut text = comments(notes);
     let mut before = Pose::identity();
     for (i, ArrayCamera { camera, from_first, .. }) in file.cameras.iter().enumerate() {
-        push(&mut text, &format!("cam{i}"), camera)?;
+        push_camera(&mut text, &format!("cam{i}"), camera)?;
         if i > 0 {
             push_motion(&mut text, &from_first.compose(&before.inverse()));
         }
@@ -100,7 +103,7 @@ fn array_text(file: &CameraArray, notes: &[&str]) -> Result<String, FormatError>
     Ok(text)
 }
 
-/// Kalibr's lengths are meters.
+/// Checks that lengths are meters, Kalibr's unit.
 fn in_meters(unit: &str) -> Result<(), FormatError> {
     if ["", "m"].contains(&unit) {
         return Ok(());
@@ -110,15 +113,15 @@ fn in_meters(unit: &str) -> Result<(), FormatError> {
 
 fn camera_text(camera: &Camera, notes: &[&str]) -> Result<String, FormatError> {
     let mut text = comments(notes);
-    push(&mut text, "cam0", camera)?;
+    push_camera(&mut text, "cam0", camera)?;
     Ok(text)
 }
 
 fn rig_text(file: &RigFile, notes: &[&str]) -> Result<String, FormatError> {
     in_meters(&file.unit)?;
     let mut text = comments(notes);
-    push(&mut text, "cam0", &file.rig.left)?;
-    push(&mut text, "cam1", &file.rig.right)?;
+    push_camera(&mut text, "cam0", &file.rig.left)?;
+    push_camera(&mut text, "cam1", &file.rig.right)?;
     push_motion(&mut text, &file.rig.right_from_left);
     Ok(text)
 }
@@ -131,9 +134,9 @@ fn push_motion(text: &mut String, motion: &Pose) {
     text.push_str("  - [0.0, 0.0, 0.0, 1.0]\n");
 }
 
-fn push(text: &mut String, key: &str, camera: &Camera) -> Result<(), FormatError> {
+fn push_camera(text: &mut String, key: &str, camera: &Camera) -> Result<(), FormatError> {
     let known = DistortionModel::ALL.iter().copied().filter(|m| m.info().kalibr.is_some());
-    let distortion = smallest(camera, NAME, known)?;
+    let distortion = simplest_distortion(camera, NAME, known)?;
     let name = distortion.model().info().kalibr.unwrap_or_default();
     let Camera { width, height, fx, fy, cx, cy, .. } = camera;
     let _ = writeln!(text, "{key}:\n  camera_model: pinhole\n  intrinsics: [{fx:?}, {fy:?}, {cx:?}, {cy:?}]");

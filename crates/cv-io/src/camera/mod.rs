@@ -1,11 +1,11 @@
-//! Cameras and stereo rigs in files of several origins, told apart by content.
+//! Calibration files of cameras and rigs in several formats, detected by content.
 //!
-//! # A calibration format: start here
+//! # Adding a calibration format
 //!
-//! A format is one file of this folder, which ends in a [`format::Format`]: its name, how it is recognized, how a camera and a rig are
-//! read, and, where we write it, how they are written. Add the file's `mod` and its line in [`FORMATS`]; reading by content, checking,
-//! and choosing a format to write then know it. What a lens is called in it comes from the table of lenses
-//! ([`cv_core::LensInfo`]): no format lists lens models, so that a new lens is known to all of them.
+//! A format is one file of this folder with a [`format::Format`]: its name, its detection, the readers of cameras and rigs, and, where we write
+//! it, the writers. Add the file's `mod` and its line in [`FORMATS`]; detection, validation and the choice of a format to write use the table.
+//! The names of lens models come from the table of lenses ([`cv_core::LensInfo`]): no format lists lens models itself, so that a new lens is
+//! available in all of them.
 
 mod colmap;
 mod format;
@@ -26,9 +26,9 @@ use cv_core::{Camera, Pose, StereoRig};
 
 use crate::files::{read_text, write_bytes};
 use crate::{FormatError, IoError};
-use format::{Format, Given};
+use format::{Format, ReadContext};
 
-/// The table of formats, in the order in which a text is tried: the particular before the general.
+/// The table of formats, in the order of detection: specific before general ones.
 const FORMATS: &[&Format] = &[
     &own::FORMAT,
     &opencv_xml::FORMAT,
@@ -47,53 +47,53 @@ const EXPECTED: &str = "a camera: YAML (ours, OpenCV's, ROS's or Kalibr's), Open
 pub struct CalibrationFormat(&'static Format);
 
 impl CalibrationFormat {
-    /// Our own YAML, which [`write_camera`] and [`write_rig`] write: every number reads back to the same value.
+    /// Our own YAML, which [`write_camera`] and [`write_rig`] write; numbers round-trip exactly.
     pub const OWN: Self = Self(&own::FORMAT);
 
-    /// All formats.
+    /// Iterates over all formats.
     pub fn all() -> impl Iterator<Item = Self> {
         FORMATS.iter().map(|f| Self(f))
     }
 
-    /// The format of a name: `own`, `opencv`, `colmap`, ….
+    /// Returns the format of a name: `own`, `opencv`, `colmap`, ….
     pub fn from_name(name: &str) -> Option<Self> {
         Self::all().find(|f| f.name() == name)
     }
 
-    /// Its name.
+    /// Returns its name.
     pub fn name(self) -> &'static str {
         self.0.name
     }
 
-    /// Whether cameras are written in it; the others are only read.
+    /// Whether cameras can be written in it, not only read.
     pub fn writes_cameras(self) -> bool {
         self.0.camera_text.is_some()
     }
 
-    /// Whether rigs are written in it.
+    /// Whether rigs can be written in it.
     pub fn writes_rigs(self) -> bool {
         self.0.rig_text.is_some()
     }
 
-    /// A camera in this format. `notes` become comment lines.
+    /// Formats a camera. `notes` become comment lines.
     ///
     /// # Errors
-    /// [`FormatError::NotRepresentable`] where [`Camera::validate`] fails or the format does not have its lens;
-    /// [`FormatError::Unsupported`] where the format is only read.
+    /// [`FormatError::NotRepresentable`] where [`Camera::validate`] fails or the format does not have the lens model;
+    /// [`FormatError::Unsupported`] where the format can only be read.
     pub fn camera_text(self, camera: &Camera, notes: &[&str]) -> Result<String, FormatError> {
         let write = self.0.camera_text.ok_or_else(|| FormatError::unsupported(self.0.name, "writing a camera"))?;
         write(&writable(camera, self.0.name)?, notes)
     }
 
-    /// Whether rigs of more than two cameras are written in it.
+    /// Whether rigs of more than two cameras can be written in it.
     pub fn writes_arrays(self) -> bool {
         self.0.array_text.is_some()
     }
 
-    /// Cameras that are fixed to each other, in this format. `notes` become comment lines.
+    /// Formats a rig of any number of cameras. `notes` become comment lines.
     ///
     /// # Errors
-    /// As [`Self::rig_text`]; [`FormatError::NotRepresentable`], which names the formats that hold them, where this one does not hold so many.
+    /// As [`Self::rig_text`]; [`FormatError::NotRepresentable`], which lists the formats that support them, where this one does not.
     pub fn array_text(self, file: &CameraArray, notes: &[&str]) -> Result<String, FormatError> {
         let not = |what: String| FormatError::NotRepresentable { format: self.0.name, what };
         let Some(write) = self.0.array_text else {
@@ -112,7 +112,7 @@ impl CalibrationFormat {
         write(file, notes)
     }
 
-    /// A rig in this format. `notes` become comment lines.
+    /// Formats a stereo rig. `notes` become comment lines.
     ///
     /// # Errors
     /// As [`Self::camera_text`]; also for a motion that is not finite.
@@ -135,17 +135,17 @@ impl std::fmt::Debug for CalibrationFormat {
     }
 }
 
-/// A stereo rig as a file has it.
+/// A stereo rig of a file, with its unit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RigFile {
     /// The rig.
     pub rig: StereoRig,
-    /// The unit of the rig's translation, and so of every depth: “m”, “mm”, “squares”. Empty where the file does not say.
+    /// The unit of the translation, and so of every depth: “m”, “mm”, “squares”. Empty where the file does not specify it.
     pub unit: String,
 }
 
 impl RigFile {
-    /// Meters in one unit of the translation; `None` where the unit is none of m, cm and mm.
+    /// Returns the meters per unit of the translation; `None` where the unit is not m, cm or mm.
     pub fn meters_per_unit(&self) -> Option<f64> {
         match self.unit.trim() {
             "m" => Some(1.0),
@@ -156,18 +156,18 @@ impl RigFile {
     }
 }
 
-/// A camera of several that are fixed to each other.
+/// A camera of a multi-camera rig.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ArrayCamera {
-    /// What it is called.
+    /// Its name.
     pub name: String,
     /// The camera.
     pub camera: Camera,
-    /// Takes the first camera's frame to this one's.
+    /// Motion from the first camera's frame to this one's.
     pub from_first: Pose,
 }
 
-/// Two or more cameras that are fixed to each other, as a file has them.
+/// A multi-camera rig of a file: two or more rigidly mounted cameras.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CameraArray {
     /// The cameras; the first one's pose is the identity.
@@ -176,18 +176,18 @@ pub struct CameraArray {
     pub unit: String,
 }
 
-/// Something of a calibration that is not taken as it stands.
+/// A deviation of the parsed camera from its file.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum CalibrationNote {
-    /// The axes of the picture are taken to be at right angles.
+    /// A small skew was ignored: the image axes are taken to be orthogonal.
     SkewLeftOut {
         /// The skew of the matrix, in px.
         skew: f64,
-        /// The most that leaving it out moves a pixel of the picture, in px.
+        /// Maximum displacement of a pixel by ignoring it, in px.
         px: f64,
     },
-    /// The file does not tell the distortion of the lens: a bare calibration matrix. The camera has none.
+    /// The file has no distortion (a bare calibration matrix); that of the camera is none.
     DistortionUnknown,
 }
 
@@ -195,34 +195,35 @@ impl std::fmt::Display for CalibrationNote {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::SkewLeftOut { skew, px } => {
-                write!(f, "the skew of {skew} px is left out, which moves no pixel by more than {px:.3} px")
+                write!(f, "the skew of {skew} px is ignored, which moves no pixel by more than {px:.3} px")
             }
-            Self::DistortionUnknown => f.write_str("the distortion of the lens is not told"),
+            Self::DistortionUnknown => f.write_str("the file has no lens distortion"),
         }
     }
 }
 
 /// Parses a camera.
 ///
-/// Understood, by content: our own YAML (`schema: cv-camera/1`); OpenCV's FileStorage (YAML, JSON and XML) and ROS's `camera_info` YAML (under any of
-/// their usual names for the matrix and the coefficients); mrcal's `.cameramodel` where its lens is one of OpenCV's; the first camera of Kalibr's `camchain.yaml`; a COLMAP camera, as in `cameras.txt` (`1 SIMPLE_RADIAL 640 480 …`), alone or
-/// behind `# camera:`; a calibration matrix of three rows of three numbers.
+/// Formats, detected by content: our own YAML (`schema: cv-camera/1`); OpenCV's FileStorage (YAML, JSON and XML) and ROS's `camera_info` YAML
+/// (with any of their usual names of the matrix and the coefficients); mrcal's `.cameramodel` with one of OpenCV's lens models; the first camera
+/// of Kalibr's `camchain.yaml`; a COLMAP camera, as in `cameras.txt` (`1 SIMPLE_RADIAL 640 480 …`), alone or after `# camera:`; a calibration
+/// matrix of three rows of three numbers.
 ///
-/// COLMAP's principal points have pixel centers at +0.5 and are brought to ours, at integers; all others are taken as they are.
+/// COLMAP's principal points, with pixel centers at +0.5, are converted to pixel centers at integers; all others are unchanged.
 ///
-/// `size` is used where the text has no picture size (a bare matrix, OpenCV's sample programs); else it is ignored. A skew that moves no
-/// pixel of the picture by more than a quarter of one is left out.
+/// `size` is used where the text has no image size (a bare matrix, OpenCV's sample programs), and ignored otherwise. A skew that moves no
+/// pixel by more than a quarter pixel is ignored.
 ///
 /// # Errors
-/// [`FormatError`] with the line or the entry that is wrong or absent, or for a distortion model without an equal here.
+/// [`FormatError`] with the invalid or missing line or entry, or for an unsupported distortion model.
 pub fn parse_camera(text: &str, size: Option<(usize, usize)>) -> Result<Camera, FormatError> {
     camera_and_notes(text, size).map(|(camera, _)| camera)
 }
 
 fn camera_and_notes(text: &str, size: Option<(usize, usize)>) -> Result<(Camera, Vec<CalibrationNote>), FormatError> {
-    let given = Given::new(size);
-    let camera = checked((format_of(text)?.camera)(text, &given)?)?;
-    Ok((camera, given.into_notes()))
+    let context = ReadContext::new(size);
+    let camera = checked((format_of(text)?.camera)(text, &context)?)?;
+    Ok((camera, context.into_notes()))
 }
 
 /// Reads a camera; see [`parse_camera`].
@@ -233,7 +234,7 @@ pub fn read_camera(path: impl AsRef<Path>, size: Option<(usize, usize)>) -> Resu
     read_camera_with_notes(path, size).map(|(camera, _)| camera)
 }
 
-/// Reads a camera, and what of it is not taken as it stands; see [`parse_camera`].
+/// Reads a camera, with notes on deviations from the file; see [`parse_camera`].
 ///
 /// # Errors
 /// As [`read_camera`].
@@ -245,7 +246,7 @@ pub fn read_camera_with_notes(
     camera_and_notes(&read_text(path)?, size).map_err(|reason| IoError::reading(path, reason))
 }
 
-/// Writes a camera as our own YAML; every number reads back to the same value. `notes` become comment lines.
+/// Writes a camera as our own YAML; numbers round-trip exactly. `notes` become comment lines.
 ///
 /// # Errors
 /// [`FormatError::NotRepresentable`] where [`Camera::validate`] fails; else as [`crate::write_atomic`].
@@ -255,8 +256,8 @@ pub fn write_camera(path: impl AsRef<Path>, camera: &Camera, notes: &[&str]) -> 
     write_bytes(path, text.as_bytes())
 }
 
-/// Parses a stereo rig: our own YAML (`schema: cv-rig/1`, and the first two cameras of `cv-rig/2`); OpenCV's, with both cameras, R and T in one file; the first two cameras of
-/// Kalibr's `camchain.yaml`.
+/// Parses a stereo rig: our own YAML (`schema: cv-rig/1`, and the first two cameras of `cv-rig/2`); OpenCV's, with both cameras, R and T in one
+/// file; the first two cameras of Kalibr's `camchain.yaml`.
 ///
 /// # Errors
 /// As [`parse_camera`]; also where R is not a rotation to within 1e-3.
@@ -268,15 +269,15 @@ fn rig_and_notes(text: &str, size: Option<(usize, usize)>) -> Result<(RigFile, V
     let Some(read) = format_of(text)?.rig else {
         return Err(FormatError::UnknownFormat { expected: "a stereo rig: YAML, ours, OpenCV's or Kalibr's" });
     };
-    let given = Given::new(size);
-    let file = read(text, &given)?;
+    let context = ReadContext::new(size);
+    let file = read(text, &context)?;
     checked(file.rig.left)?;
     checked(file.rig.right)?;
     let t = &file.rig.right_from_left.translation;
     if !(t.norm() > 0.0 && t.norm().is_finite()) {
         return Err(FormatError::corrupt("rig", "the translation between the cameras is zero or not finite"));
     }
-    Ok((file, given.into_notes()))
+    Ok((file, context.into_notes()))
 }
 
 /// Reads a stereo rig; see [`parse_rig`].
@@ -287,22 +288,22 @@ pub fn read_rig(path: impl AsRef<Path>, size: Option<(usize, usize)>) -> Result<
     read_rig_with_notes(&[path], size).map(|(file, _)| file)
 }
 
-/// Reads a stereo rig that is in one file or in several (OpenCV's sample writes `intrinsics.yml` and `extrinsics.yml`), and what of it is not
-/// taken as it stands; see [`parse_rig`].
+/// Reads a stereo rig from one or several files (OpenCV's sample writes `intrinsics.yml` and `extrinsics.yml`), with notes on deviations from
+/// them; see [`parse_rig`].
 ///
 /// # Errors
-/// As [`read_rig`], of the first file where they are wrong together.
+/// As [`read_rig`], with the first path where the combined content is invalid.
 pub fn read_rig_with_notes(
     paths: &[impl AsRef<Path>],
     size: Option<(usize, usize)>,
 ) -> Result<(RigFile, Vec<CalibrationNote>), IoError> {
     let texts = paths.iter().map(|path| read_text(path.as_ref())).collect::<Result<Vec<_>, _>>()?;
-    rig_and_notes(&joined(texts), size)
+    rig_and_notes(&concatenate_documents(texts), size)
         .map_err(|reason| IoError::reading(paths.first().map_or(Path::new(""), AsRef::as_ref), reason))
 }
 
-/// The entries of several documents as those of one.
-fn joined(texts: Vec<String>) -> String {
+/// Concatenates the entries of several YAML documents to one.
+fn concatenate_documents(texts: Vec<String>) -> String {
     let mut texts = texts.into_iter();
     let mut all = texts.next().unwrap_or_default();
     for text in texts {
@@ -317,7 +318,7 @@ fn joined(texts: Vec<String>) -> String {
     all
 }
 
-/// Parses two or more cameras that are fixed to each other: our own YAML (`schema: cv-rig/2`) and Kalibr's `camchain.yaml`.
+/// Parses a multi-camera rig: our own YAML (`schema: cv-rig/2`) and Kalibr's `camchain.yaml`.
 ///
 /// # Errors
 /// As [`parse_rig`].
@@ -325,7 +326,7 @@ pub fn parse_camera_array(text: &str) -> Result<CameraArray, FormatError> {
     let Some(read) = format_of(text)?.array else {
         return Err(FormatError::UnknownFormat { expected: "a rig of cameras: YAML, ours or Kalibr's" });
     };
-    let file = read(text, &Given::new(None))?;
+    let file = read(text, &ReadContext::new(None))?;
     for camera in &file.cameras {
         checked(camera.camera)?;
     }
@@ -335,7 +336,7 @@ pub fn parse_camera_array(text: &str) -> Result<CameraArray, FormatError> {
     Ok(file)
 }
 
-/// Reads two or more cameras that are fixed to each other; see [`parse_camera_array`].
+/// Reads a multi-camera rig; see [`parse_camera_array`].
 ///
 /// # Errors
 /// [`IoError`]: cannot be read as text, or as [`parse_camera_array`].
@@ -344,7 +345,7 @@ pub fn read_camera_array(path: impl AsRef<Path>) -> Result<CameraArray, IoError>
     parse_camera_array(&read_text(path)?).map_err(|reason| IoError::reading(path, reason))
 }
 
-/// Writes two or more cameras that are fixed to each other as our own YAML. `notes` become comment lines.
+/// Writes a multi-camera rig as our own YAML. `notes` become comment lines.
 ///
 /// # Errors
 /// As [`write_camera`].
@@ -368,7 +369,7 @@ fn format_of(text: &str) -> Result<&'static Format, FormatError> {
     if text.trim().is_empty() {
         return Err(FormatError::Empty);
     }
-    let found = FORMATS.iter().copied().find(|f| (f.is)(text));
+    let found = FORMATS.iter().copied().find(|f| (f.matches)(text));
     found.ok_or(FormatError::UnknownFormat { expected: EXPECTED })
 }
 
@@ -378,19 +379,19 @@ fn writable(camera: &Camera, format: &'static str) -> Result<Camera, FormatError
 
 fn checked(camera: Camera) -> Result<Camera, FormatError> {
     camera.validate().map_err(|e| FormatError::corrupt("camera", e.to_string()))?;
-    // Any product of sides and channels must fit; no sensor is near this.
+    // So that products of sides and channels do not overflow; far above any sensor.
     if camera.width > 1 << 20 || camera.height > 1 << 20 {
-        let reason = format!("a picture of {}×{} pixels is not plausible", camera.width, camera.height);
+        let reason = format!("an image of {}×{} pixels is not plausible", camera.width, camera.height);
         return Err(FormatError::corrupt("camera", reason));
     }
     if camera.width == 0 || camera.height == 0 {
-        return Err(FormatError::corrupt("camera", "the size of the picture is zero"));
+        return Err(FormatError::corrupt("camera", "the image size is zero"));
     }
     Ok(camera)
 }
 
 fn no_size(format: &'static str) -> FormatError {
-    FormatError::missing(format, "picture size")
+    FormatError::missing(format, "image size")
 }
 
 #[cfg(test)]

@@ -1,15 +1,15 @@
-//! Cameras as mrcal writes them (`.cameramodel`): a dictionary in Python's notation, which is also YAML in braces.
+//! mrcal's `.cameramodel`: a dictionary in Python's notation, which is also YAML flow style.
 
 use std::fmt::Write as _;
 
 use cv_core::{Camera, Distortion, DistortionModel, LensProjection};
 
-use super::format::{Format, comments, smallest};
+use super::format::{Format, comments, simplest_distortion};
 use super::yaml::{get, load, numbers, required};
 use crate::FormatError;
 
 const NAME: &str = "mrcal";
-/// What its models are called, by the number of distortion parameters.
+/// Names of mrcal's models, with their number of distortion parameters.
 const MODELS: [(&str, usize); 5] = [
     ("LENSMODEL_PINHOLE", 0),
     ("LENSMODEL_OPENCV4", 4),
@@ -20,7 +20,7 @@ const MODELS: [(&str, usize); 5] = [
 
 pub(super) const FORMAT: Format = Format {
     name: "mrcal",
-    is: |text| text.contains("LENSMODEL_"),
+    matches: |text| text.contains("LENSMODEL_"),
     camera: |text, _| camera(text),
     rig: None,
     camera_text: Some(camera_text),
@@ -29,7 +29,7 @@ pub(super) const FORMAT: Format = Format {
     array_text: None,
 };
 
-/// OpenCV's perspective lenses.
+/// Iterates over OpenCV's perspective lens models.
 fn lenses() -> impl Iterator<Item = DistortionModel> {
     DistortionModel::ALL.iter().copied().filter(|m| {
         let info = m.info();
@@ -63,7 +63,7 @@ fn camera(text: &str) -> Result<Camera, FormatError> {
 }
 
 fn camera_text(camera: &Camera, notes: &[&str]) -> Result<String, FormatError> {
-    let distortion = smallest(camera, NAME, lenses())?;
+    let distortion = simplest_distortion(camera, NAME, lenses())?;
     let count = distortion.parameters().len();
     let model = MODELS.iter().find(|m| m.1 == count).map_or("", |m| m.0);
     let mut text = comments(notes);
@@ -84,7 +84,7 @@ mod tests {
     use crate::parse_camera;
 
     #[test]
-    fn a_file_of_mrcal_is_read() {
+    fn mrcal_files_are_parsed() {
         let text = "{\n    'lensmodel':  'LENSMODEL_OPENCV8',\n\n    # intrinsics are fx,fy,cx,cy,distortion0,distortion1,....\n    \
             'intrinsics': [ 1761.181055, 1761.250444, 1965.706996, 1087.518797, -0.01266096516, 0.03590794372, -0.0002547045941, 0.0005275929652, \
             0.01968883397, 0.01482863541, -0.0562239888, 0.0500223357,],\n    # extrinsics are rt_fromref\n    'extrinsics': [ 2e-2, -3e-1, -1e-2,  1., 2, -3., ],\n    \

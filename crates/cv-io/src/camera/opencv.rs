@@ -1,21 +1,21 @@
-//! Cameras and rigs as OpenCV's programs and ROS write them.
+//! Cameras and rigs of OpenCV's FileStorage and of ROS.
 //!
-//! There is no one naming: each list below holds the names seen in OpenCV's samples and tutorials, ROS's `camera_info`,
-//! and the answers people copy from.
+//! Keys are not standardized: the lists below are those of OpenCV's samples and tutorials, ROS's `camera_info`,
+//! and widely copied examples.
 
 use std::fmt::Write as _;
 
 use cv_core::{Camera, Distortion, DistortionModel, LensProjection, StereoRig};
 use saphyr::Yaml;
 
-use super::format::{Format, Given, comments, smallest};
+use super::format::{Format, ReadContext, comments, simplest_distortion};
 use super::matrix::pinhole;
 use super::yaml::{get, load, number, numbers, pose, required, size_of};
 use super::{RigFile, no_size};
 use crate::FormatError;
 
 const NAME: &str = "OpenCV YAML";
-const MATRIX: [&str; 11] = [
+const MATRIX_KEYS: [&str; 11] = [
     "camera_matrix",
     "cameraMatrix",
     "Camera_Matrix",
@@ -28,7 +28,7 @@ const MATRIX: [&str; 11] = [
     "M1",
     "K1",
 ];
-const COEFFICIENTS: [&str; 12] = [
+const COEFFICIENT_KEYS: [&str; 12] = [
     "distortion_coefficients",
     "distCoeffs",
     "Distortion_Coefficients",
@@ -45,23 +45,23 @@ const COEFFICIENTS: [&str; 12] = [
 
 pub(super) const FORMAT: Format = Format {
     name: "opencv",
-    is: |text| text.starts_with("%YAML") || text.contains(':'),
-    camera: |text, given| camera(&load(text)?, given),
-    rig: Some(|text, given| rig(&load(text)?, given)),
+    matches: |text| text.starts_with("%YAML") || text.contains(':'),
+    camera: |text, context| camera(&load(text)?, context),
+    rig: Some(|text, context| rig(&load(text)?, context)),
     camera_text: Some(camera_text),
     rig_text: Some(rig_text),
     array: None,
     array_text: None,
 };
 
-fn camera(document: &Yaml<'_>, given: &Given) -> Result<Camera, FormatError> {
-    let mut names: Vec<&str> = MATRIX.to_vec();
+fn camera(document: &Yaml<'_>, context: &ReadContext) -> Result<Camera, FormatError> {
+    let mut names: Vec<&str> = MATRIX_KEYS.to_vec();
     names.extend(["cameraMatrix1", "camera_matrix_1", "left_camera_matrix"]);
-    one(document, &names, &COEFFICIENTS, given)
+    parse_one(document, &names, &COEFFICIENT_KEYS, context)
 }
 
-fn rig(document: &Yaml<'_>, given: &Given) -> Result<RigFile, FormatError> {
-    let left = one(
+fn rig(document: &Yaml<'_>, context: &ReadContext) -> Result<RigFile, FormatError> {
+    let left = parse_one(
         document,
         &[
             "M1",
@@ -84,9 +84,9 @@ fn rig(document: &Yaml<'_>, given: &Given) -> Result<RigFile, FormatError> {
             "dist_left",
             "distCoeffsL",
         ],
-        given,
+        context,
     )?;
-    let right = one(
+    let right = parse_one(
         document,
         &[
             "M2",
@@ -109,17 +109,22 @@ fn rig(document: &Yaml<'_>, given: &Given) -> Result<RigFile, FormatError> {
             "dist_right",
             "distCoeffsR",
         ],
-        given,
+        context,
     )?;
     let r = required(document, NAME, &["R", "rotation", "rotation_matrix", "Rot"])?;
     let t = required(document, NAME, &["T", "translation", "translation_vector", "Trns", "t"])?;
     Ok(RigFile { rig: StereoRig { left, right, right_from_left: pose(NAME, r, t)? }, unit: String::new() })
 }
 
-fn one(document: &Yaml<'_>, matrix: &[&str], coefficients: &[&str], given: &Given) -> Result<Camera, FormatError> {
+fn parse_one(
+    document: &Yaml<'_>,
+    matrix: &[&str],
+    coefficients: &[&str],
+    context: &ReadContext,
+) -> Result<Camera, FormatError> {
     let m: [f64; 9] = required(document, NAME, matrix)?;
-    let (width, height) = image_size(document)?.or(given.size).ok_or_else(|| no_size(NAME))?;
-    let mut camera = pinhole(NAME, m, (width, height), given)?;
+    let (width, height) = image_size(document)?.or(context.size).ok_or_else(|| no_size(NAME))?;
+    let mut camera = pinhole(NAME, m, (width, height), context)?;
     let k = match get(document, coefficients) {
         None => Vec::new(),
         Some(v) => {
@@ -138,17 +143,17 @@ fn image_size(document: &Yaml<'_>) -> Result<Option<(usize, usize)>, FormatError
     ) {
         return match (size_of(w), size_of(h)) {
             (Some(w), Some(h)) => Ok(Some((w, h))),
-            _ => Err(FormatError::corrupt(NAME, "the picture's width and height are not sizes")),
+            _ => Err(FormatError::corrupt(NAME, "the image width and height are not sizes")),
         };
     }
     match side(&["image_size", "imageSize", "img_size", "size", "Size"]).and_then(numbers).as_deref() {
         Some(&[w, h]) if w >= 1.0 && h >= 1.0 && w <= 1e6 && h <= 1e6 => Ok(Some((w as usize, h as usize))),
-        Some(_) => Err(FormatError::corrupt(NAME, "the picture's size is not two numbers")),
+        Some(_) => Err(FormatError::corrupt(NAME, "the image size is not two numbers")),
         None => Ok(None),
     }
 }
 
-/// What a document says of the lens's projection.
+/// Determines the projection of the lens from a document.
 fn projection_of(document: &Yaml<'_>) -> Result<LensProjection, FormatError> {
     // OpenCV's calibration sample writes its flag.
     let mut fisheye = get(document, &["fisheye_model"]).and_then(number).is_some_and(|v| v != 0.0);
@@ -156,11 +161,11 @@ fn projection_of(document: &Yaml<'_>) -> Result<LensProjection, FormatError> {
         let Some(name) = get(document, &[key]).and_then(|m| m.as_str()) else { continue };
         match projection(&name.to_lowercase()) {
             Some(projection) => fisheye |= projection == LensProjection::Fisheye,
-            // Of the camera, perhaps.
+            // “model” may be the camera's product name.
             None if key == "model" => {}
             None => {
                 let known: Vec<&str> =
-                    DistortionModel::ALL.iter().filter_map(|m| m.info().ros).chain(FISHEYE).collect();
+                    DistortionModel::ALL.iter().filter_map(|m| m.info().ros).chain(FISHEYE_NAMES).collect();
                 let what = format!("the {key} {name} (it is pinhole or one of {})", known.join(", "));
                 return Err(FormatError::unsupported(NAME, what));
             }
@@ -169,35 +174,35 @@ fn projection_of(document: &Yaml<'_>) -> Result<LensProjection, FormatError> {
     Ok(if fisheye { LensProjection::Fisheye } else { LensProjection::Perspective })
 }
 
-/// Names that people use beside ROS's and Kalibr's.
-const FISHEYE: [&str; 2] = ["fisheye", "kannala_brandt"];
-const PERSPECTIVE: [&str; 9] =
+/// Further names in use besides ROS's and Kalibr's.
+const FISHEYE_NAMES: [&str; 2] = ["fisheye", "kannala_brandt"];
+const PERSPECTIVE_NAMES: [&str; 9] =
     ["", "pinhole", "perspective", "opencv", "standard", "brown", "brown_conrady", "rational", "thin_prism"];
 
-/// What a model's name says of the lens.
+/// Maps a model's name to its projection.
 fn projection(name: &str) -> Option<LensProjection> {
     let named = DistortionModel::ALL.iter().map(|m| m.info()).find(|i| [i.ros, i.kalibr].contains(&Some(name)));
     match named {
         Some(info) => Some(info.projection),
-        None if FISHEYE.contains(&name) => Some(LensProjection::Fisheye),
-        None => PERSPECTIVE.contains(&name).then_some(LensProjection::Perspective),
+        None if FISHEYE_NAMES.contains(&name) => Some(LensProjection::Fisheye),
+        None => PERSPECTIVE_NAMES.contains(&name).then_some(LensProjection::Perspective),
     }
 }
 
-/// The lenses whose parameters are OpenCV's coefficients.
+/// Iterates over the lens models whose parameters are OpenCV's coefficients.
 fn lenses(projection: LensProjection) -> impl Iterator<Item = DistortionModel> {
     DistortionModel::ALL.iter().copied().filter(move |m| m.info().opencv && m.info().projection == projection)
 }
 
-/// OpenCV's coefficients: how many there are says which model it is. Coefficients that are zero are left out where a simpler model has
-/// the others: OpenCV's samples write fourteen zeros for a pinhole.
+/// Converts OpenCV's coefficients, whose number determines the model. Simplified to a smaller model where coefficients are zero: OpenCV's
+/// samples write fourteen zeros for a pinhole.
 fn distortion(k: &[f64], projection: LensProjection) -> Result<Distortion, FormatError> {
     if k.iter().all(|v| *v == 0.0) && projection == LensProjection::Perspective {
         return Ok(Distortion::NONE);
     }
-    // The tilted model's fourteen are the thin prism's twelve and two angles.
-    let most = lenses(projection).map(|m| m.parameter_count()).max().unwrap_or(0);
-    let (known, tilt) = k.split_at(k.len().min(most));
+    // The tilted model's fourteen coefficients are the thin prism's twelve and two tilt angles.
+    let max_count = lenses(projection).map(|m| m.parameter_count()).max().unwrap_or(0);
+    let (known, tilt) = k.split_at(k.len().min(max_count));
     if tilt.iter().any(|v| *v != 0.0) {
         return Err(FormatError::unsupported(NAME, format!("a lens with {} coefficients", k.len())));
     }
@@ -239,7 +244,7 @@ fn rig_text(file: &RigFile, notes: &[&str]) -> Result<String, FormatError> {
     Ok(text)
 }
 
-/// What OpenCV's calibration sample writes of a fisheye.
+/// Writes the flag of OpenCV's calibration sample for a fisheye.
 fn push_projection(text: &mut String, camera: &Camera) {
     if camera.distortion.model().info().projection == LensProjection::Fisheye {
         text.push_str("fisheye_model: 1\n");
@@ -247,7 +252,7 @@ fn push_projection(text: &mut String, camera: &Camera) {
 }
 
 fn push_lens(text: &mut String, camera: &Camera, [matrix, coefficients]: [&str; 2]) -> Result<(), FormatError> {
-    let distortion = smallest(camera, NAME, lenses(camera.distortion.model().info().projection))?;
+    let distortion = simplest_distortion(camera, NAME, lenses(camera.distortion.model().info().projection))?;
     push_matrix(text, matrix, 3, camera.matrix().transpose().as_slice());
     push_matrix(text, coefficients, 1, distortion.parameters());
     Ok(())

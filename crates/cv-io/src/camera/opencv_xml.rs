@@ -1,4 +1,4 @@
-//! OpenCV's FileStorage as XML: read as the YAML that says the same.
+//! OpenCV's FileStorage as XML, read and written by conversion from and to YAML.
 
 use std::fmt::Write as _;
 
@@ -7,18 +7,18 @@ use super::opencv;
 use crate::FormatError;
 
 const NAME: &str = "OpenCV XML";
-/// Camera files take a few kilobytes.
+/// Maximum file size in bytes; camera files take a few kilobytes.
 const MAX_BYTES: usize = 4 << 20;
 
 pub(super) const FORMAT: Format = Format {
     name: "opencv-xml",
-    is: |text| {
+    matches: |text| {
         let text = text.trim_start();
         text.starts_with("<?xml") || text.starts_with("<opencv_storage")
     },
-    camera: |text, given| (opencv::FORMAT.camera)(&as_yaml(text)?, given),
-    rig: Some(|text, given| match opencv::FORMAT.rig {
-        Some(rig) => rig(&as_yaml(text)?, given),
+    camera: |text, context| (opencv::FORMAT.camera)(&as_yaml(text)?, context),
+    rig: Some(|text, context| match opencv::FORMAT.rig {
+        Some(rig) => rig(&as_yaml(text)?, context),
         None => Err(FormatError::unsupported(NAME, "a rig")),
     }),
     camera_text: Some(|camera, notes| as_xml(opencv::FORMAT.camera_text.map(|write| write(camera, &[])), notes)),
@@ -27,7 +27,7 @@ pub(super) const FORMAT: Format = Format {
     array_text: None,
 };
 
-/// An element: its name, its content, and what follows it. Comments and declarations are passed over; nothing is ever expanded.
+/// Parses the next element: its name, its content, and the rest. Comments and declarations are skipped; entities are never expanded.
 fn element(text: &str) -> Result<Option<(&str, &str, &str)>, FormatError> {
     let broken = |what: &str| FormatError::corrupt(NAME, what.to_owned());
     let mut rest = text;
@@ -39,7 +39,7 @@ fn element(text: &str) -> Result<Option<(&str, &str, &str)>, FormatError> {
         } else if rest.starts_with("<?") {
             rest.find("?>").map(|e| e + 2)
         } else if rest.starts_with("<!") {
-            // A document type may define entities, which a calibration has no use for.
+            // A document type could define entities, which calibration files do not need.
             return Err(FormatError::unsupported(NAME, "a document type"));
         } else {
             break;
@@ -61,6 +61,7 @@ fn element(text: &str) -> Result<Option<(&str, &str, &str)>, FormatError> {
     Ok(Some((name, &body[..at], &body[at + close.len()..])))
 }
 
+/// Converts FileStorage XML to YAML.
 fn as_yaml(text: &str) -> Result<String, FormatError> {
     if text.len() > MAX_BYTES {
         return Err(FormatError::TooManyBytes { bytes: text.len() as u64, limit: MAX_BYTES as u64 });
@@ -87,7 +88,7 @@ fn as_yaml(text: &str) -> Result<String, FormatError> {
                 _ => {}
             }
         }
-        // What is no number does not become YAML of its own.
+        // Only plain scalars, so that content cannot inject YAML.
         let plain = |text: &str| text.chars().all(|c| c.is_ascii_alphanumeric() || "+-._, ".contains(c));
         match (rows, cols, data) {
             (Some(rows), Some(cols), Some(data)) if plain(rows) && plain(cols) && plain(&data) => {
@@ -100,13 +101,13 @@ fn as_yaml(text: &str) -> Result<String, FormatError> {
                     let _ = writeln!(out, "{name}: {value}");
                 }
             }
-            _ => return Err(FormatError::corrupt(NAME, format!("{name} is no matrix"))),
+            _ => return Err(FormatError::corrupt(NAME, format!("{name} is not a matrix"))),
         }
     }
     Ok(out)
 }
 
-/// The YAML that we write, whose shape is known, as XML.
+/// Converts the YAML of our writer, whose layout is known, to XML.
 fn as_xml(yaml: Option<Result<String, FormatError>>, notes: &[&str]) -> Result<String, FormatError> {
     let yaml = yaml.ok_or_else(|| FormatError::unsupported(NAME, "writing"))??;
     let mut out = "<?xml version=\"1.0\"?>\n<opencv_storage>\n".to_owned();
@@ -150,21 +151,21 @@ mod tests {
         <avg_reprojection_error>0.2</avg_reprojection_error>\n</opencv_storage>\n";
 
     #[test]
-    fn a_file_of_opencv_is_read() {
+    fn opencv_xml_files_are_parsed() {
         let camera = parse_camera(FILE, None).unwrap();
         assert_eq!((camera.width, camera.height, camera.fx, camera.cy), (640, 480, 530.0, 233.0));
         assert_eq!(camera.distortion.parameters(), [-0.28, 0.06, 1e-3, -2e-4, 0.1]);
     }
 
     #[test]
-    fn what_is_broken_or_a_bomb_is_refused() {
+    fn malformed_files_and_entity_bombs_are_refused() {
         let bomb = FILE.replacen("<opencv_storage>", "<!DOCTYPE a [<!ENTITY b \"c\">]><opencv_storage>", 1);
         assert!(matches!(parse_camera(&bomb, None), Err(FormatError::Unsupported { .. })));
         for (from, to) in [("</data>", ""), ("<rows>3</rows>", ""), ("5.3e+02 ", ""), ("opencv_storage", "storage")] {
             assert!(parse_camera(&FILE.replace(from, to), None).is_err(), "{from}");
         }
         for cut in 1..FILE.len() {
-            // Never a panic, whatever is missing.
+            // Truncation never panics.
             let _ = parse_camera(FILE.get(..cut).unwrap_or_default(), None);
         }
     }

@@ -15,13 +15,13 @@ const RIG: &str = "cv-rig/1";
 const CAMERA_KEYS: [&str; 9] = ["schema", "width", "height", "fx", "fy", "cx", "cy", "distortion", "coefficients"];
 const ARRAY: &str = "cv-rig/2";
 const ARRAY_KEYS: [&str; 3] = ["schema", "unit", "cameras"];
-/// What a camera of an array has beside what every camera has.
+/// Additional keys of a camera in a multi-camera rig.
 const MOUNT_KEYS: [&str; 3] = ["name", "rotation", "translation"];
 const RIG_KEYS: [&str; 6] = ["schema", "unit", "left", "right", "rotation", "translation"];
 
 pub(super) const FORMAT: Format = Format {
     name: "own",
-    is: |text| text.lines().any(|l| l.starts_with("schema:")),
+    matches: |text| text.lines().any(|l| l.starts_with("schema:")),
     camera: |text, _| camera(&load(text)?),
     rig: Some(|text, _| rig(&load(text)?)),
     camera_text: Some(camera_text),
@@ -31,13 +31,13 @@ pub(super) const FORMAT: Format = Format {
 };
 
 fn camera(document: &Yaml<'_>) -> Result<Camera, FormatError> {
-    schema(document, NAME)?;
-    known_keys(document, NAME, &CAMERA_KEYS)?;
-    fields(document)
+    check_schema(document, NAME)?;
+    check_keys(document, NAME, &CAMERA_KEYS)?;
+    camera_fields(document)
 }
 
 fn rig(document: &Yaml<'_>) -> Result<RigFile, FormatError> {
-    if schema(document, ARRAY).is_ok() {
+    if check_schema(document, ARRAY).is_ok() {
         let CameraArray { cameras, unit } = array(document)?;
         let [left, right, ..] = cameras.as_slice() else {
             return Err(FormatError::corrupt(ARRAY, "it has less than two cameras"));
@@ -45,12 +45,12 @@ fn rig(document: &Yaml<'_>) -> Result<RigFile, FormatError> {
         let right_from_left = right.from_first.compose(&left.from_first.inverse());
         return Ok(RigFile { rig: StereoRig { left: left.camera, right: right.camera, right_from_left }, unit });
     }
-    schema(document, RIG)?;
-    known_keys(document, RIG, &RIG_KEYS)?;
+    check_schema(document, RIG)?;
+    check_keys(document, RIG, &RIG_KEYS)?;
     let side = |key| {
         let map = get(document, &[key]).ok_or_else(|| FormatError::missing(RIG, key))?;
-        known_keys(map, NAME, &CAMERA_KEYS)?;
-        fields(map)
+        check_keys(map, NAME, &CAMERA_KEYS)?;
+        camera_fields(map)
     };
     let right_from_left =
         pose(RIG, required(document, RIG, &["rotation"])?, required(document, RIG, &["translation"])?)?;
@@ -58,25 +58,25 @@ fn rig(document: &Yaml<'_>) -> Result<RigFile, FormatError> {
     Ok(RigFile { rig: StereoRig { left: side("left")?, right: side("right")?, right_from_left }, unit })
 }
 
-/// Any number of cameras, of which the first gives the frame.
+/// Parses any number of cameras, in the frame of the first.
 fn array(document: &Yaml<'_>) -> Result<CameraArray, FormatError> {
-    schema(document, ARRAY)?;
-    known_keys(document, ARRAY, &ARRAY_KEYS)?;
+    check_schema(document, ARRAY)?;
+    check_keys(document, ARRAY, &ARRAY_KEYS)?;
     let list = get(document, &["cameras"]).ok_or_else(|| FormatError::missing(ARRAY, "cameras"))?;
     let list = list.as_sequence().ok_or_else(|| FormatError::corrupt(ARRAY, "cameras is not a list"))?;
     let known: Vec<&str> = CAMERA_KEYS.iter().chain(&MOUNT_KEYS).copied().collect();
     let one = |map: &Yaml<'_>| {
-        known_keys(map, ARRAY, &known)?;
+        check_keys(map, ARRAY, &known)?;
         let name = get(map, &["name"]).and_then(|n| n.as_str());
         let name = name.ok_or_else(|| FormatError::missing(ARRAY, "name"))?.to_owned();
         let from_first = pose(ARRAY, required(map, ARRAY, &["rotation"])?, required(map, ARRAY, &["translation"])?)?;
-        Ok(ArrayCamera { name, camera: fields(map)?, from_first })
+        Ok(ArrayCamera { name, camera: camera_fields(map)?, from_first })
     };
     let cameras = list.iter().map(one).collect::<Result<Vec<_>, FormatError>>()?;
-    // Numbers may be rounded.
-    let moved = |first: &ArrayCamera| (first.from_first.matrix() - Pose::identity().matrix()).norm() > 1e-6;
-    if cameras.first().is_some_and(moved) {
-        return Err(FormatError::corrupt(ARRAY, "the first camera is not where the frame is"));
+    // Tolerance for rounded numbers.
+    let is_not_identity = |first: &ArrayCamera| (first.from_first.matrix() - Pose::identity().matrix()).norm() > 1e-6;
+    if cameras.first().is_some_and(is_not_identity) {
+        return Err(FormatError::corrupt(ARRAY, "the pose of the first camera is not the identity"));
     }
     let unit = get(document, &["unit"]).and_then(|u| u.as_str()).unwrap_or("").to_owned();
     Ok(CameraArray { cameras, unit })
@@ -84,10 +84,10 @@ fn array(document: &Yaml<'_>) -> Result<CameraArray, FormatError> {
 
 fn array_text(file: &CameraArray, notes: &[&str]) -> Result<String, FormatError> {
     let mut text = comments(notes);
-    let _ = writeln!(text, "schema: {ARRAY}\nunit: \"{}\"", quotable(&file.unit));
+    let _ = writeln!(text, "schema: {ARRAY}\nunit: \"{}\"", strip_unquotable(&file.unit));
     text.push_str("# x_camera = rotation · x_first + translation, translation in the unit above\ncameras:\n");
     for ArrayCamera { name, camera, from_first } in &file.cameras {
-        let _ = writeln!(text, "  - name: \"{}\"", quotable(name));
+        let _ = writeln!(text, "  - name: \"{}\"", strip_unquotable(name));
         push_camera(&mut text, camera, "    ");
         text.push_str("    rotation:\n");
         for row in from_first.rotation.matrix().row_iter() {
@@ -99,21 +99,21 @@ fn array_text(file: &CameraArray, notes: &[&str]) -> Result<String, FormatError>
     Ok(text)
 }
 
-/// What may stand between quotes.
-fn quotable(text: &str) -> String {
+/// Removes characters that are not allowed in a quoted string.
+fn strip_unquotable(text: &str) -> String {
     text.chars().filter(|&c| printable(c) && !matches!(c, '"' | '\\')).collect()
 }
 
-fn schema(document: &Yaml<'_>, expected: &'static str) -> Result<(), FormatError> {
+fn check_schema(document: &Yaml<'_>, expected: &'static str) -> Result<(), FormatError> {
     match get(document, &["schema"]).and_then(|s| s.as_str()) {
         Some(found) if found == expected => Ok(()),
-        Some(found) => Err(FormatError::unsupported(expected, format!("the schema “{found}” in its place"))),
+        Some(found) => Err(FormatError::unsupported(expected, format!("the schema “{found}”"))),
         None => Err(FormatError::missing(expected, "schema")),
     }
 }
 
-/// A misspelt key must not pass for an absent one. Keys that begin with `x-` are anybody's.
-fn known_keys(map: &Yaml<'_>, format: &'static str, known: &[&str]) -> Result<(), FormatError> {
+/// Refuses unknown keys, so that a misspelled key is not taken as absent. Keys that begin with `x-` are free for extensions.
+fn check_keys(map: &Yaml<'_>, format: &'static str, known: &[&str]) -> Result<(), FormatError> {
     let keys = map.as_mapping().into_iter().flatten().map(|(key, _)| key.as_str().unwrap_or("?"));
     match keys.into_iter().find(|key| !known.contains(key) && !key.starts_with("x-")) {
         Some(key) => Err(FormatError::corrupt(format, format!("unknown entry “{key}”"))),
@@ -121,7 +121,7 @@ fn known_keys(map: &Yaml<'_>, format: &'static str, known: &[&str]) -> Result<()
     }
 }
 
-fn fields(map: &Yaml<'_>) -> Result<Camera, FormatError> {
+fn camera_fields(map: &Yaml<'_>) -> Result<Camera, FormatError> {
     let entry = |key| get(map, &[key]).ok_or_else(|| FormatError::missing(NAME, key));
     let real = |key| {
         entry(key).and_then(|v| number(v).ok_or_else(|| FormatError::corrupt(NAME, format!("{key} is not a number"))))
@@ -165,7 +165,7 @@ fn camera_text(camera: &Camera, notes: &[&str]) -> Result<String, FormatError> {
 
 fn rig_text(file: &RigFile, notes: &[&str]) -> Result<String, FormatError> {
     let mut text = comments(notes);
-    let _ = writeln!(text, "schema: {RIG}\nunit: \"{}\"\nleft:", quotable(&file.unit));
+    let _ = writeln!(text, "schema: {RIG}\nunit: \"{}\"\nleft:", strip_unquotable(&file.unit));
     push_camera(&mut text, &file.rig.left, "  ");
     text.push_str("right:\n");
     push_camera(&mut text, &file.rig.right, "  ");
@@ -182,7 +182,7 @@ fn rig_text(file: &RigFile, notes: &[&str]) -> Result<String, FormatError> {
 fn push_camera(text: &mut String, camera: &Camera, indent: &str) {
     let (lens, k) = (camera.distortion.model().info(), camera.distortion.parameters());
     let _ = writeln!(text, "{indent}width: {}\n{indent}height: {}", camera.width, camera.height);
-    // Debug formatting of f64 is the shortest that reads back to the same bits, and always looks like a number.
+    // Debug formatting of f64 is the shortest that round-trips exactly, and always has a decimal point or exponent.
     let _ = writeln!(text, "{indent}fx: {:?}\n{indent}fy: {:?}", camera.fx, camera.fy);
     let _ = writeln!(text, "{indent}# principal point, center of the top-left pixel at (0, 0)");
     let _ = writeln!(text, "{indent}cx: {:?}\n{indent}cy: {:?}", camera.cx, camera.cy);

@@ -1,10 +1,10 @@
-//! Cameras as ROS's `camera_info_manager` keeps them. They are read as OpenCV's, by the same names.
+//! Camera files of ROS's `camera_info_manager`. Read as OpenCV's, with the same keys.
 
 use std::fmt::Write as _;
 
 use cv_core::{Camera, DistortionModel};
 
-use super::format::{Format, comments, smallest};
+use super::format::{Format, comments, simplest_distortion};
 use super::opencv;
 use crate::FormatError;
 
@@ -12,8 +12,8 @@ const NAME: &str = "ROS";
 
 pub(super) const FORMAT: Format = Format {
     name: "ros",
-    // Whatever is one is one of OpenCV's too.
-    is: |_| false,
+    // Detected as OpenCV's format.
+    matches: |_| false,
     camera: opencv::FORMAT.camera,
     rig: None,
     camera_text: Some(camera_text),
@@ -24,7 +24,7 @@ pub(super) const FORMAT: Format = Format {
 
 fn camera_text(camera: &Camera, notes: &[&str]) -> Result<String, FormatError> {
     let known = DistortionModel::ALL.iter().copied().filter(|m| m.info().ros.is_some());
-    let distortion = smallest(camera, NAME, known)?;
+    let distortion = simplest_distortion(camera, NAME, known)?;
     let model = distortion.model().info().ros.unwrap_or_default();
     let mut text = comments(notes);
     let _ = writeln!(text, "image_width: {}\nimage_height: {}\ncamera_name: camera", camera.width, camera.height);

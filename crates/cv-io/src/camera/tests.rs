@@ -38,10 +38,10 @@ fn opencv_yaml_old_and_new() {
 }
 
 #[test]
-fn opencv_samples_without_a_size_take_the_pictures() {
+fn opencv_samples_without_a_size_use_the_image_size() {
     let text = "%YAML:1.0\n---\nM1: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ 500., 0., 320., 0., 500., 240., 0., 0., 1. ]\n";
     assert_eq!(parse_camera(text, Some((640, 480))).unwrap(), Camera::pinhole(640, 480, 500.0, 500.0, 320.0, 240.0));
-    assert!(parse_camera(text, None).unwrap_err().to_string().contains("picture size"));
+    assert!(parse_camera(text, None).unwrap_err().to_string().contains("image size"));
 }
 
 #[test]
@@ -53,7 +53,7 @@ fn ros_camera_info() {
 }
 
 #[test]
-fn colmap_lines_lose_their_half_pixel() {
+fn colmap_pixel_centers_are_converted() {
     let expected = Camera {
         distortion: Distortion::simple_radial(-0.16196),
         ..Camera::pinhole(2832, 2128, 2973.319797, 2973.319797, 1415.5, 1063.5)
@@ -72,7 +72,7 @@ fn colmap_lines_lose_their_half_pixel() {
 }
 
 #[test]
-fn opencvs_counts_are_its_models() {
+fn the_number_of_opencv_coefficients_determines_the_model() {
     let text = |k: &[f64], more: &str| {
         format!(
             "%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\nK: [500, 0, 320, 0, 501, 240, 0, 0, 1]\nD: {k:?}\n{more}"
@@ -92,7 +92,7 @@ fn opencvs_counts_are_its_models() {
     for more in ["fisheye_model: 1", "distortion_model: equidistant", "camera_model: fisheye"] {
         assert_eq!(read(4, more).unwrap(), fisheye, "{more}");
     }
-    // A fisheye without coefficients is no pinhole.
+    // A fisheye with zero coefficients is not a pinhole.
     assert_eq!(
         parse_camera(&text(&[0.0; 4], "fisheye_model: 1"), None).unwrap().distortion,
         Distortion::fisheye4([0.0; 4])
@@ -106,7 +106,7 @@ fn opencvs_counts_are_its_models() {
 }
 
 #[test]
-fn colmap_models_are_lenses_of_the_table() {
+fn colmap_models_map_to_lens_models() {
     // As in COLMAP's `models.h`: focal lengths, principal point, parameters.
     for (line, distortion) in [
         ("SIMPLE_PINHOLE 9 9 5 4 4", Distortion::NONE),
@@ -125,7 +125,7 @@ fn colmap_models_are_lenses_of_the_table() {
         let camera = parse_camera(line, None).unwrap();
         let fy = if line.contains(" 5 6 ") { 6.0 } else { 5.0 };
         assert_eq!(camera, Camera { distortion, ..Camera::pinhole(9, 9, 5.0, fy, 3.5, 3.5) });
-        // The same model is the one with the fewest numbers that holds it.
+        // The same model is the one with the fewest parameters that represents it.
         assert_eq!(model_line(&camera).unwrap(), line);
         let [first, .., last] = line.split(' ').collect::<Vec<_>>()[..] else { unreachable!() };
         assert!(parse_camera(&format!("{line} {last}"), None).unwrap_err().to_string().contains(first));
@@ -135,8 +135,8 @@ fn colmap_models_are_lenses_of_the_table() {
 }
 
 #[test]
-fn kalibrs_chain_is_a_rig() {
-    // As Kalibr's documentation shows it, with the entries that do not matter here.
+fn a_kalibr_camchain_is_a_rig() {
+    // The example of Kalibr's documentation, with irrelevant entries.
     let text = "cam0:\n  cam_overlaps: [1]\n  camera_model: pinhole\n  distortion_coeffs: [-0.28, 0.07, 0.0001, 0.00001]\n  distortion_model: radtan\n  intrinsics: [458.6, 457.2, 367.2, 248.3]\n  resolution: [752, 480]\n  rostopic: /cam0/image_raw\ncam1:\n  T_cn_cnm1:\n  - [1.0, 0.0, 0.0, -0.11]\n  - [0.0, 1.0, 0.0, 0.001]\n  - [0.0, 0.0, 1.0, 0.002]\n  - [0.0, 0.0, 0.0, 1.0]\n  camera_model: pinhole\n  distortion_coeffs: [-0.01, 0.02, -0.03, 0.01]\n  distortion_model: equidistant\n  intrinsics: [457.5, 456.1, 379.9, 255.2]\n  resolution: [752, 480]\n";
     let file = parse_rig(text, None).unwrap();
     let left = Camera {
@@ -210,7 +210,7 @@ fn a_stereo_rig_of_opencv() {
 }
 
 #[test]
-fn mistakes_are_named() {
+fn invalid_entries_are_reported() {
     let good = "schema: cv-camera/1\nwidth: 4\nheight: 3\nfx: 5\nfy: 5\ncx: 1.5\ncy: 1\n";
     assert_eq!(parse_camera(good, None).unwrap(), Camera::pinhole(4, 3, 5.0, 5.0, 1.5, 1.0));
     for (from, to, word) in [
@@ -235,7 +235,7 @@ fn mistakes_are_named() {
 }
 
 #[test]
-fn hostile_yaml_is_refused_and_not_obeyed() {
+fn malicious_yaml_is_refused() {
     let deep = format!("%YAML:1.0\n---\na: {}", "[".repeat(200_000));
     let blocks = format!("%YAML:1.0\n---\n{}x", "- ".repeat(200_000));
     let marks = format!("%YAML:1.0\n---\n{}x", "? ".repeat(200_000));
@@ -261,7 +261,7 @@ prop_compose! {
 }
 
 #[test]
-fn three_cameras_are_held_by_our_own_format_and_kalibr_alone() {
+fn only_our_own_format_and_kalibr_support_three_cameras() {
     let camera = Camera {
         distortion: Distortion::radial_tangential4([-0.2, 0.05, 0.001, 0.0]),
         ..Camera::from_focal(640, 480, 500.0)
@@ -276,7 +276,7 @@ fn three_cameras_are_held_by_our_own_format_and_kalibr_alone() {
         one("far \"3\"", camera, mount(-0.2, -0.5)),
     ];
     let file = CameraArray { cameras, unit: "m".to_owned() };
-    let mut held = Vec::new();
+    let mut supporting = Vec::new();
     for format in CalibrationFormat::all().filter(|f| f.writes_rigs()) {
         let text = match format.array_text(&file, &["three"]) {
             Ok(text) => text,
@@ -285,7 +285,7 @@ fn three_cameras_are_held_by_our_own_format_and_kalibr_alone() {
                 continue;
             }
         };
-        held.push(format.name());
+        supporting.push(format.name());
         let back = parse_camera_array(&text).unwrap();
         assert_eq!(back.unit, "m");
         for (a, b) in back.cameras.iter().zip(&file.cameras) {
@@ -297,7 +297,7 @@ fn three_cameras_are_held_by_our_own_format_and_kalibr_alone() {
         let pair = parse_rig(&text, None).unwrap().rig;
         assert!((pair.right_from_left.matrix() - file.cameras[1].from_first.matrix()).norm() < 1e-14);
     }
-    assert_eq!(held, ["own", "kalibr"]);
+    assert_eq!(supporting, ["own", "kalibr"]);
     let millimeters = CameraArray { unit: "mm".to_owned(), ..file.clone() };
     let kalibr = CalibrationFormat::from_name("kalibr").unwrap();
     assert!(kalibr.array_text(&millimeters, &[]).unwrap_err().to_string().contains("unit is mm"));
@@ -313,7 +313,7 @@ fn three_cameras_are_held_by_our_own_format_and_kalibr_alone() {
 
 proptest! {
     #[test]
-    fn a_camera_reads_back_to_the_bit(camera in cameras(), note in ".*") {
+    fn cameras_round_trip_exactly(camera in cameras(), note in ".*") {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("camera.yaml");
         write_camera(&path, &camera, &[&note]).unwrap();
@@ -321,7 +321,7 @@ proptest! {
     }
 
     #[test]
-    fn a_rig_reads_back_to_the_bit(left in cameras(), right in cameras(), r in prop::array::uniform3(-3.0..3.0f64), t in prop::array::uniform3(-1e3..1e3f64), unit in ".*") {
+    fn rigs_round_trip_exactly(left in cameras(), right in cameras(), r in prop::array::uniform3(-3.0..3.0f64), t in prop::array::uniform3(-1e3..1e3f64), unit in ".*") {
         let right_from_left = Pose::new(Rotation3::from_euler_angles(r[0], r[1], r[2]), Vector3::from(t));
         let file = RigFile { rig: StereoRig { left, right, right_from_left }, unit: "squares".into() };
         let folder = tempfile::tempdir().unwrap();
@@ -334,7 +334,7 @@ proptest! {
     }
 
     #[test]
-    fn what_a_format_writes_it_reads_as_the_same_lens(camera in cameras(), other in cameras(), r in prop::array::uniform3(-3.0..3.0f64)) {
+    fn every_format_round_trips_the_lens(camera in cameras(), other in cameras(), r in prop::array::uniform3(-3.0..3.0f64)) {
         for format in CalibrationFormat::all().filter(|f| f.writes_cameras()) {
             let Ok(text) = format.camera_text(&camera, &["a note: 1"]) else {
                 // No model of the format is this lens.

@@ -1,4 +1,4 @@
-//! Reading YAML by keys, with errors that name them.
+//! Access to YAML documents by keys, with errors that name the keys.
 
 use cv_core::{Matrix3, Pose, Rotation3, Vector3};
 use saphyr::{LoadableYamlNode, Scalar, Yaml};
@@ -6,12 +6,12 @@ use saphyr::{LoadableYamlNode, Scalar, Yaml};
 use crate::FormatError;
 
 const NAME: &str = "YAML";
-/// Camera files take a few kilobytes; calibration logs with all corners a few hundred.
+/// Maximum file size in bytes; camera files take a few kilobytes, calibration logs with all corners a few hundred.
 const MAX_BYTES: usize = 4 << 20;
-/// Deeper nesting than any camera file has, and shallow enough for a parser that calls itself.
+/// Maximum nesting, above that of any camera file and safe for a recursive parser.
 const MAX_DEPTH: usize = 64;
 
-/// The first document.
+/// Parses the first document.
 pub(super) fn load(text: &str) -> Result<Yaml<'_>, FormatError> {
     if text.len() > MAX_BYTES {
         return Err(FormatError::TooManyBytes { bytes: text.len() as u64, limit: MAX_BYTES as u64 });
@@ -21,7 +21,7 @@ pub(super) fn load(text: &str) -> Result<Yaml<'_>, FormatError> {
     documents.into_iter().next().ok_or(FormatError::Empty)
 }
 
-/// Refuses deep nesting before the parser sees it: brackets within brackets, and blocks within blocks.
+/// Refuses deep nesting of brackets and blocks before parsing.
 fn check_depth(text: &str) -> Result<(), FormatError> {
     let too_deep = || FormatError::corrupt(NAME, format!("nested more than {MAX_DEPTH} deep"));
     let mut depth = 0usize;
@@ -45,7 +45,7 @@ fn check_depth(text: &str) -> Result<(), FormatError> {
     Ok(())
 }
 
-/// The value under the first of `keys` that is there.
+/// Returns the value of the first of `keys` that is present.
 pub(super) fn get<'a>(map: &'a Yaml<'a>, keys: &[&str]) -> Option<&'a Yaml<'a>> {
     keys.iter().find_map(|key| map.as_mapping_get(key))
 }
@@ -54,14 +54,14 @@ pub(super) fn number(value: &Yaml<'_>) -> Option<f64> {
     match value {
         Yaml::Value(Scalar::Integer(v)) => Some(*v as f64),
         Yaml::Value(Scalar::FloatingPoint(v)) => Some((*v).into()),
-        // OpenCV writes “.Nan” and “.Inf” in letters that the YAML rules do not know.
+        // OpenCV writes “.Nan” and “.Inf” in a case that YAML does not define.
         Yaml::Value(Scalar::String(s)) => s.trim_start_matches('.').parse().ok(),
         Yaml::Tagged(_, inner) => number(inner),
         _ => None,
     }
 }
 
-/// All numbers of a list, of a list of lists, or of an OpenCV or ROS matrix (`rows`, `cols`, `data`).
+/// Returns all numbers of a list, of a list of lists, or of an OpenCV or ROS matrix (`rows`, `cols`, `data`).
 pub(super) fn numbers(value: &Yaml<'_>) -> Option<Vec<f64>> {
     let value = match value {
         Yaml::Tagged(_, inner) => inner,
@@ -102,21 +102,21 @@ pub(super) fn required<const N: usize>(
         .ok_or_else(|| FormatError::corrupt(format, format!("{} is not {N} numbers", keys.join(" or "))))
 }
 
-/// A whole number of pixels.
+/// Parses a size in whole pixels.
 pub(super) fn size_of(value: &Yaml<'_>) -> Option<usize> {
     number(value).filter(|v| *v >= 1.0 && *v <= f64::from(1 << 20) && v.fract() == 0.0).map(|v| v as usize)
 }
 
-/// R and t as a pose; R is made an exact rotation where it is one to within 1e-3 per entry.
+/// Makes a pose of R and t; R, orthogonal to within 1e-3 per entry, is replaced by the nearest rotation.
 pub(super) fn pose(format: &'static str, r: [f64; 9], t: [f64; 3]) -> Result<Pose, FormatError> {
     let m = Matrix3::from_row_slice(&r);
-    let bent = (m * m.transpose() - Matrix3::identity()).abs().max();
+    let orthogonality_error = (m * m.transpose() - Matrix3::identity()).abs().max();
     // NaN fails as well. Matrices rounded to three digits, as printed in papers, still pass.
-    if !(bent < 1e-3 && m.determinant() > 0.0) {
+    if !(orthogonality_error < 1e-3 && m.determinant() > 0.0) {
         return Err(FormatError::corrupt(format, "the matrix R is not a rotation"));
     }
-    // Entries of full precision stay as they are, so that a file reads back to the same bits.
-    let rotation = if bent < 1e-12 {
+    // Matrices of full precision are unchanged, so that files round-trip exactly.
+    let rotation = if orthogonality_error < 1e-12 {
         Rotation3::from_matrix_unchecked(m)
     } else {
         Rotation3::from_matrix_eps(&m, 1e-15, 100, Rotation3::identity())

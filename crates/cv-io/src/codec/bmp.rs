@@ -1,45 +1,45 @@
 //! Windows bitmaps without compression: palettes of 1, 4 and 8 bits, 16 and 32 bits with masks, 24 bits.
 
-use super::{Format, Header, Raster, Samples, count};
+use super::{Format, Header, Raster, Samples, sample_count};
 use crate::FormatError;
 
 const NAME: &str = "BMP";
 
 /// The headers (BITMAPFILEHEADER, then BITMAPCOREHEADER or BITMAPINFOHEADER and its successors).
-struct Start {
+struct FileHeader {
     width: usize,
     height: usize,
     top_down: bool,
     bits: usize,
-    /// Where the pixels begin.
+    /// Offset of the pixel data.
     at: usize,
-    /// Red, green and blue of each entry.
+    /// RGB color of each entry.
     palette: Vec<[u8; 3]>,
-    /// Bits of red, green and blue.
+    /// Bit masks of red, green and blue.
     masks: [u32; 3],
 }
 
 pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
-    let start = start(bytes)?;
+    let start = parse_header(bytes)?;
     Ok(Header { width: start.width, height: start.height, channels: 3, depth: 1, ..Header::default() })
 }
 
 pub(super) fn raster(bytes: &[u8]) -> Result<Raster, FormatError> {
-    let start = start(bytes)?;
+    let start = parse_header(bytes)?;
     // Rows are padded to four bytes.
-    let stride = count(Format::Bmp, start.width, start.bits, 1)?.div_ceil(32) * 4;
-    let length = count(Format::Bmp, stride, start.height, 1)?;
+    let stride = sample_count(Format::Bmp, start.width, start.bits, 1)?.div_ceil(32) * 4;
+    let length = sample_count(Format::Bmp, stride, start.height, 1)?;
     let stored = bytes.get(start.at..).and_then(|rest| rest.get(..length));
     let stored = stored.ok_or(FormatError::Truncated { format: NAME })?;
-    let mut samples = Vec::with_capacity(count(Format::Bmp, start.width, start.height, 3)?);
+    let mut samples = Vec::with_capacity(sample_count(Format::Bmp, start.width, start.height, 3)?);
     for y in 0..start.height {
         let row = if start.top_down { y } else { start.height - 1 - y };
         let row = &stored[row * stride..][..stride];
         for x in 0..start.width {
             samples.extend(match start.bits {
                 24 => [row[3 * x + 2], row[3 * x + 1], row[3 * x]],
-                16 => masked(u32::from(u16::from_le_bytes([row[2 * x], row[2 * x + 1]])), start.masks),
-                32 => masked(u32_at(row, 4 * x)?, start.masks),
+                16 => extract_masked(u32::from(u16::from_le_bytes([row[2 * x], row[2 * x + 1]])), start.masks),
+                32 => extract_masked(u32_at(row, 4 * x)?, start.masks),
                 bits => {
                     let per_byte = 8 / bits;
                     let shift = 8 - bits * (x % per_byte + 1);
@@ -52,7 +52,7 @@ pub(super) fn raster(bytes: &[u8]) -> Result<Raster, FormatError> {
     Ok(Raster { channels: 3, samples: Samples::U8(samples) })
 }
 
-fn start(bytes: &[u8]) -> Result<Start, FormatError> {
+fn parse_header(bytes: &[u8]) -> Result<FileHeader, FormatError> {
     let at = u32_at(bytes, 10)? as usize;
     let size = u32_at(bytes, 14)? as usize;
     let core = size == 12;
@@ -87,7 +87,7 @@ fn start(bytes: &[u8]) -> Result<Start, FormatError> {
     } else {
         Vec::new()
     };
-    Ok(Start {
+    Ok(FileHeader {
         width: width.max(0) as usize,
         height: height.unsigned_abs() as usize,
         top_down: height < 0,
@@ -98,8 +98,8 @@ fn start(bytes: &[u8]) -> Result<Start, FormatError> {
     })
 }
 
-/// The bits under each mask, stretched to 0 to 255.
-fn masked(pixel: u32, masks: [u32; 3]) -> [u8; 3] {
+/// Extracts the bits under each mask, scaled to 0 to 255.
+fn extract_masked(pixel: u32, masks: [u32; 3]) -> [u8; 3] {
     masks.map(|mask| {
         let shift = mask.trailing_zeros();
         let (value, full) = (u64::from((pixel & mask) >> shift), u64::from(mask >> shift));

@@ -1,6 +1,6 @@
 //! OpenEXR, through the `exr` crate: the first layer with red, green and blue.
 
-use super::{Format, Header, Raster, Samples, count};
+use super::{Format, Header, Raster, Samples, sample_count};
 use crate::FormatError;
 use exr::block::reader::Reader;
 use exr::error::Error;
@@ -12,16 +12,16 @@ const NAME: &str = "OpenEXR";
 pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
     let reader = open(bytes)?;
     let (width, height) = window(&reader)?.1;
-    // A block as it is packed, unpacked, and as samples.
+    // A block compressed, uncompressed, and as samples.
     let block = reader.headers().iter().map(|layer| layer.max_block_byte_size() as u64).max().unwrap_or(0);
-    Ok(Header { width, height, channels: 3, depth: 4, beside: block.saturating_mul(3), ..Header::default() })
+    Ok(Header { width, height, channels: 3, depth: 4, working_memory: block.saturating_mul(3), ..Header::default() })
 }
 
 pub(super) fn raster(bytes: &[u8], header: &Header) -> Result<Raster, FormatError> {
     let reader = open(bytes)?;
     let (corner, (width, height)) = window(&reader)?;
-    let size = count(Format::OpenExr, header.width, header.height, 3)?;
-    // The data may cover another rectangle than the picture to be shown.
+    let size = sample_count(Format::OpenExr, header.width, header.height, 3)?;
+    // The data window may differ from the display window.
     let image = read()
         .no_deep_data()
         .largest_resolution_level()
@@ -47,7 +47,7 @@ fn open(bytes: &[u8]) -> Result<Reader<Cursor<&[u8]>>, FormatError> {
     exr::block::read(Cursor::new(bytes), false).map_err(fail)
 }
 
-/// Where the data begin in the picture, and its width and height.
+/// Returns the offset of the data window in the display window, and the display window's width and height.
 fn window(reader: &Reader<Cursor<&[u8]>>) -> Result<(Vec2<i32>, (usize, usize)), FormatError> {
     let colors = ["R", "G", "B"].map(Text::from);
     let layer = reader

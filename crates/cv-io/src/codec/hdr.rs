@@ -1,31 +1,31 @@
-//! Radiance RGBE (G. Ward, "Real pixels", Graphics Gems II, 1991), flat and in both run-length codes.
+//! Radiance RGBE (G. Ward, "Real pixels", Graphics Gems II, 1991), uncompressed and with both run-length encodings.
 
-use super::{Format, Header, Raster, Samples, count};
+use super::{Format, Header, Raster, Samples, sample_count};
 use crate::FormatError;
 
 const NAME: &str = "Radiance HDR";
 
 pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
-    start(bytes).map(|(header, _)| header)
+    parse_header(bytes).map(|(header, _)| header)
 }
 
 pub(super) fn raster(bytes: &[u8], header: &Header) -> Result<Raster, FormatError> {
-    let (_, at) = start(bytes)?;
+    let (_, at) = parse_header(bytes)?;
     let mut rest = &bytes[at..];
-    let mut samples = Vec::with_capacity(count(Format::Hdr, header.width, header.height, 3)?);
-    // The mantissas are fractions of 256, the exponent is 128 too large.
+    let mut samples = Vec::with_capacity(sample_count(Format::Hdr, header.width, header.height, 3)?);
+    // Mantissas are in units of 1/256, the exponent has a bias of 128.
     let scales: [f32; 256] =
         std::array::from_fn(|exponent| if exponent == 0 { 0.0 } else { (exponent as f32 - 136.0).exp2() });
     let mut row = vec![[0u8; 4]; header.width];
     for _ in 0..header.height {
         rest = match rest {
-            // By the channel, where the width is written in.
+            // The newer encoding, by channel, whose marker contains the width.
             [2, 2, high, low, after @ ..]
                 if usize::from(*high) << 8 | usize::from(*low) == header.width && *high < 128 =>
             {
-                channels(after, &mut row)?
+                decode_channel_runs(after, &mut row)?
             }
-            _ => pixels(rest, &mut row)?,
+            _ => decode_pixel_runs(rest, &mut row)?,
         };
         samples.extend(row.iter().flat_map(|&[r, g, b, exponent]| {
             let scale = scales[usize::from(exponent)];
@@ -35,8 +35,8 @@ pub(super) fn raster(bytes: &[u8], header: &Header) -> Result<Raster, FormatErro
     Ok(Raster { channels: 3, samples: Samples::F32(samples) })
 }
 
-/// Runs and literals of one channel after the other.
-fn channels<'a>(mut rest: &'a [u8], row: &mut [[u8; 4]]) -> Result<&'a [u8], FormatError> {
+/// Decodes a row of the newer run-length encoding: runs and literals, channel by channel.
+fn decode_channel_runs<'a>(mut rest: &'a [u8], row: &mut [[u8; 4]]) -> Result<&'a [u8], FormatError> {
     for channel in 0..4 {
         let mut x = 0;
         while x < row.len() {
@@ -65,8 +65,9 @@ fn channels<'a>(mut rest: &'a [u8], row: &mut [[u8; 4]]) -> Result<&'a [u8], For
     Ok(rest)
 }
 
-/// Whole pixels; 1, 1, 1, n repeats the one before n times, several of them in a row count as digits to the base 256.
-fn pixels<'a>(mut rest: &'a [u8], row: &mut [[u8; 4]]) -> Result<&'a [u8], FormatError> {
+/// Decodes a row of the older run-length encoding: whole pixels; 1, 1, 1, n repeats the preceding pixel n times, consecutive counts are digits of
+/// base 256.
+fn decode_pixel_runs<'a>(mut rest: &'a [u8], row: &mut [[u8; 4]]) -> Result<&'a [u8], FormatError> {
     let (mut x, mut shift) = (0, 0);
     while x < row.len() {
         let &[r, g, b, e, ref after @ ..] = rest else { return Err(FormatError::Truncated { format: NAME }) };
@@ -87,8 +88,8 @@ fn pixels<'a>(mut rest: &'a [u8], row: &mut [[u8; 4]]) -> Result<&'a [u8], Forma
     Ok(rest)
 }
 
-/// The header, and where the pixels begin.
-fn start(bytes: &[u8]) -> Result<(Header, usize), FormatError> {
+/// Parses the header, and returns the offset of the pixel data.
+fn parse_header(bytes: &[u8]) -> Result<(Header, usize), FormatError> {
     let mut at = 0;
     let mut line = || {
         let length = bytes[at..].iter().position(|&b| b == b'\n').ok_or(FormatError::Truncated { format: NAME })?;
@@ -113,7 +114,10 @@ fn start(bytes: &[u8]) -> Result<(Header, usize), FormatError> {
             let side =
                 |text: &str| text.parse::<u32>().map_err(|_| FormatError::corrupt(NAME, "the size is no number"));
             let (width, height) = (side(width)? as usize, side(height)? as usize);
-            Ok((Header { width, height, channels: 3, depth: 4, beside: 4 * width as u64, ..Header::default() }, at))
+            Ok((
+                Header { width, height, channels: 3, depth: 4, working_memory: 4 * width as u64, ..Header::default() },
+                at,
+            ))
         }
         _ => Err(FormatError::unsupported_picture(NAME, format!("the order of pixels “{size}”"))),
     }

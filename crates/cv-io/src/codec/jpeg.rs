@@ -13,28 +13,29 @@ pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
     let size = decoder.dimensions();
     let (width, height) = size.ok_or_else(|| FormatError::corrupt(Format::Jpeg.name(), "it has no size"))?;
     let channels = if decoder.input_colorspace() == Some(ColorSpace::Luma) { 1 } else { 3 };
-    // One scan of all components is decoded row by row; of several, the coefficients (16 bits) are kept until the last. Blocks
-    // are filled up to units of at most 32×32 pixels.
+    // A single scan of all components is decoded row by row; for several scans, all coefficients (16 bits) are kept. Blocks
+    // are padded to units of at most 32×32 pixels.
     let components = decoder.info().map_or(4, |info| info.components);
     let side = |pixels: usize| pixels.next_multiple_of(32) as u64;
-    let beside = if scan_of_all(bytes, components) {
+    let working_memory = if is_single_scan(bytes, components) {
         0
     } else {
-        memory::product(&[side(width), side(height), 2 * u64::from(components)])
+        memory::saturating_product(&[side(width), side(height), 2 * u64::from(components)])
     };
     Ok(Header {
         width,
         height,
         channels,
         depth: 1,
-        beside,
+        working_memory,
         exif: decoder.exif().cloned(),
         icc: decoder.icc_profile(),
         orientation: None,
     })
 }
 
-/// The segments of a file by their markers: the second byte of each, and what follows its length. Stray and filling bytes between them are passed over.
+/// Iterates over the segments of a file: the marker's second byte, and the bytes after the length. Stray and padding bytes between segments are
+/// skipped.
 fn segments(bytes: &[u8]) -> impl Iterator<Item = (u8, &[u8])> {
     let mut at = 0;
     std::iter::from_fn(move || {
@@ -53,7 +54,7 @@ fn segments(bytes: &[u8]) -> impl Iterator<Item = (u8, &[u8])> {
     })
 }
 
-/// The pixels of the largest frame that the markers before the first scan announce.
+/// Returns the number of pixels of the largest frame declared before the first scan.
 #[cfg(feature = "tiff")]
 pub(super) fn frame_pixels(bytes: &[u8]) -> u64 {
     let side = |high, low| u64::from(u16::from_be_bytes([high, low]));
@@ -66,8 +67,8 @@ pub(super) fn frame_pixels(bytes: &[u8]) -> u64 {
     pixels.max().unwrap_or(0)
 }
 
-/// True where the file is not progressive and its first scan holds all `components`.
-fn scan_of_all(bytes: &[u8], components: u8) -> bool {
+/// Whether the file is sequential and its first scan has all `components`.
+fn is_single_scan(bytes: &[u8], components: u8) -> bool {
     for (kind, content) in segments(bytes) {
         match kind {
             // A start of frame other than the sequential ones.
@@ -80,7 +81,7 @@ fn scan_of_all(bytes: &[u8], components: u8) -> bool {
 }
 
 pub(super) fn raster(bytes: &[u8]) -> Result<Raster, FormatError> {
-    // Inks become lights; gray stays gray.
+    // CMYK is converted to RGB; gray stays gray.
     let (colors, channels) = match decoder(bytes, DecoderOptions::default())?.input_colorspace() {
         Some(ColorSpace::Luma) => (ColorSpace::Luma, 1),
         _ => (ColorSpace::RGB, 3),
@@ -89,9 +90,9 @@ pub(super) fn raster(bytes: &[u8]) -> Result<Raster, FormatError> {
     Ok(Raster { channels, samples: Samples::U8(decoder.decode().map_err(fail)?) })
 }
 
-/// A decoder that has read the headers.
+/// Makes a decoder and reads the headers.
 fn decoder(bytes: &[u8], options: DecoderOptions) -> Result<JpegDecoder<ZCursor<&[u8]>>, FormatError> {
-    // Cameras break small rules.
+    // Lenient, since some cameras violate details of the standard.
     let options = options.set_strict_mode(false).set_max_width(usize::MAX).set_max_height(usize::MAX);
     let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
     decoder.decode_headers().map_err(fail)?;

@@ -1,7 +1,7 @@
-//! What each picture format must be able to do, and which there are.
+//! Image decoders, one file per format.
 //!
-//! A codec is one file with two functions: `header` reads what is known before any pixel, `raster` the pixels. A heavy
-//! one is behind a feature of this crate.
+//! A decoder has two functions: `header` reads the file header, `raster` decodes the pixels. Decoders with large dependencies are behind
+//! features of this crate.
 
 mod bmp;
 #[cfg(feature = "exr")]
@@ -17,10 +17,10 @@ mod webp;
 
 use crate::{FormatError, memory};
 
-/// Memory that a header may ask for before the number of pixels has been allowed, in bytes.
+/// Memory limit in bytes for reading a header, before the number of pixels is checked.
 const HEADER_BYTES: usize = 64 << 20;
 
-/// A picture format.
+/// An image format.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Format {
     Png,
@@ -33,34 +33,34 @@ pub(crate) enum Format {
     WebP,
 }
 
-/// What a file says before its first pixel.
+/// The header of an image file.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Header {
-    /// Stored pixels, before any turn.
+    /// Stored width and height in pixels, before the orientation is applied.
     pub(crate) width: usize,
     pub(crate) height: usize,
-    /// Samples of a pixel of the [`Raster`], 1 to 4.
+    /// Channels of the [`Raster`], 1 to 4.
     pub(crate) channels: usize,
-    /// Bytes of a sample of the [`Raster`]: 1, 2 or 4.
+    /// Bytes per sample of the [`Raster`]: 1, 2 or 4.
     pub(crate) depth: usize,
-    /// The most bytes that decoding holds beside the file and the [`Raster`], single rows left out.
-    pub(crate) beside: u64,
+    /// Peak working memory of the decoder in bytes, without the file, the [`Raster`] and single rows.
+    pub(crate) working_memory: u64,
     /// The EXIF block (a TIFF structure).
     pub(crate) exif: Option<Vec<u8>>,
     /// The ICC color profile.
     pub(crate) icc: Option<Vec<u8>>,
-    /// The orientation tag, 1 to 8, where it stands outside an EXIF block.
+    /// The orientation tag, 1 to 8, where it is outside an EXIF block.
     pub(crate) orientation: Option<u8>,
 }
 
-/// The samples of a picture: interleaved, row by row, 1 to 4 `channels`: gray, gray and alpha, RGB, RGB and alpha.
+/// The samples of an image: interleaved, row-major, 1 to 4 `channels`: gray, gray and alpha, RGB, RGB and alpha.
 #[derive(Debug, Clone)]
 pub(crate) struct Raster {
     pub(crate) channels: usize,
     pub(crate) samples: Samples,
 }
 
-/// Samples as deep as the file has them.
+/// Samples at the bit depth of the file.
 #[derive(Debug, Clone)]
 pub(crate) enum Samples {
     U8(Vec<u8>),
@@ -69,20 +69,20 @@ pub(crate) enum Samples {
 }
 
 impl Header {
-    /// The most bytes held at one time from the file in memory to the picture in colors of 8 bits: the file, what decoding holds
-    /// beside the samples, the samples, and the copy that turning them by a quarter or reducing their depth takes.
+    /// Estimates the peak memory in bytes from the file to the 8-bit color image: the file, the decoder's working memory, the samples, and
+    /// the copy for a rotation by 90° (`quarter`) or for the reduction to 8 bits.
     pub(crate) fn memory(&self, file: usize, quarter: bool) -> u64 {
-        let bytes = |pixel: usize| memory::product(&[self.width as u64, self.height as u64, pixel as u64]);
+        let bytes = |pixel: usize| memory::saturating_product(&[self.width as u64, self.height as u64, pixel as u64]);
         let raster = bytes(self.channels * self.depth);
         let turned = if quarter { raster } else { 0 };
         let reduced = if self.channels > 2 && self.depth == 1 { 0 } else { bytes(3) };
-        let most = self.beside.max(turned).saturating_add(file as u64).max(reduced);
+        let most = self.working_memory.max(turned).saturating_add(file as u64).max(reduced);
         raster.saturating_add(most)
     }
 }
 
 impl Format {
-    /// The name as a person writes it.
+    /// Returns the name for messages.
     pub(crate) fn name(self) -> &'static str {
         match self {
             Self::Png => "PNG",
@@ -114,7 +114,7 @@ impl Format {
         }
     }
 
-    /// The pixels of a file whose `header` has been read and allowed.
+    /// Decodes the pixels of a file whose `header` has been checked.
     pub(crate) fn raster(self, bytes: &[u8], header: &Header) -> Result<Raster, FormatError> {
         match self {
             Self::Png => png::raster(bytes),
@@ -135,14 +135,14 @@ impl Format {
 
     #[cfg(not(all(feature = "tiff", feature = "exr", feature = "webp")))]
     fn left_out(self) -> FormatError {
-        FormatError::unsupported_picture(self.name(), "a format left out of this build")
+        FormatError::unsupported_picture(self.name(), "a format that is disabled in this build")
     }
 }
 
-/// `width × height × channels`, where memory has room for as many.
-fn count(format: Format, width: usize, height: usize, channels: usize) -> Result<usize, FormatError> {
+/// Computes `width × height × channels`, or an error on overflow.
+fn sample_count(format: Format, width: usize, height: usize, channels: usize) -> Result<usize, FormatError> {
     width
         .checked_mul(height)
         .and_then(|pixels| pixels.checked_mul(channels))
-        .ok_or_else(|| FormatError::corrupt(format.name(), format!("the picture is {width}×{height}")))
+        .ok_or_else(|| FormatError::corrupt(format.name(), format!("the image is {width}×{height}")))
 }

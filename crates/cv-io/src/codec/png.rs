@@ -11,15 +11,18 @@ pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
     let (width, height) = (info.width as usize, info.height as usize);
     let (color, depth) = reader.output_color_type();
     let (channels, deep) = (color.samples(), depth == BitDepth::Sixteen);
-    // Interlaced words are decoded as bytes first.
-    let beside =
-        if deep && info.interlaced { memory::product(&[width as u64, height as u64, 2 * channels as u64]) } else { 0 };
+    // Interlaced 16-bit images are first decoded as bytes.
+    let working_memory = if deep && info.interlaced {
+        memory::saturating_product(&[width as u64, height as u64, 2 * channels as u64])
+    } else {
+        0
+    };
     Ok(Header {
         width,
         height,
         channels,
         depth: if deep { 2 } else { 1 },
-        beside,
+        working_memory,
         exif: info.exif_metadata.as_ref().map(|block| block.to_vec()),
         icc: info.icc_profile.as_ref().map(|profile| profile.to_vec()),
         orientation: None,
@@ -40,7 +43,7 @@ pub(super) fn raster(bytes: &[u8]) -> Result<Raster, FormatError> {
         reader.output_buffer_size().ok_or_else(|| FormatError::corrupt(Format::Png.name(), "it is too large"))?;
     let word = |b: &[u8; 2]| u16::from_be_bytes(*b);
     let samples = if depth == BitDepth::Sixteen && !reader.info().interlaced {
-        // Row by row: the whole as bytes would take as much again.
+        // Row by row, to save a copy.
         let mut words = Vec::with_capacity(size / 2);
         while let Some(row) = reader.next_row().map_err(fail)? {
             words.extend(row.data().as_chunks::<2>().0.iter().map(word));
@@ -57,7 +60,7 @@ pub(super) fn raster(bytes: &[u8]) -> Result<Raster, FormatError> {
     Ok(Raster { channels, samples })
 }
 
-/// Palettes become colors, less than 8 bits become 8.
+/// Makes a reader that expands palettes to colors, and less than 8 bits to 8.
 fn reader(bytes: &[u8]) -> Result<Reader<Cursor<&[u8]>>, FormatError> {
     let mut decoder = Decoder::new_with_limits(Cursor::new(bytes), Limits { bytes: HEADER_BYTES });
     decoder.set_ignore_text_chunk(true);

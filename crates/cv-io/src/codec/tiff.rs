@@ -1,6 +1,6 @@
-//! TIFF, through the `tiff` crate: gray, RGB and CMYK of 8 and 16 bits and floats, interleaved or in planes.
+//! TIFF, through the `tiff` crate: gray, RGB and CMYK of 8 and 16 bits and floats, interleaved or planar.
 
-use super::{Format, HEADER_BYTES, Header, Raster, Samples, count};
+use super::{Format, HEADER_BYTES, Header, Raster, Samples, sample_count};
 use crate::metadata::exif_of_tiff;
 use crate::{FormatError, memory};
 use std::io::{Cursor, ErrorKind};
@@ -13,31 +13,31 @@ const NAME: &str = "TIFF";
 pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
     let mut decoder = open(bytes)?;
     let (width, height) = decoder.dimensions().map_err(fail)?;
-    // A damaged tag does not cost the picture.
+    // A damaged tag is ignored.
     let orientation = decoder.find_tag_unsigned::<u8>(Tag::Orientation).ok().flatten();
     let icc = decoder.find_tag(Tag::IccProfile).ok().flatten().and_then(|profile| profile.into_u8_vec().ok());
-    // Pixels that are not read are refused with them.
-    let (channels, depth, planes) = kind(&mut decoder).unwrap_or((4, 4, false));
-    let inks = decoder.colortype().is_ok_and(|color| matches!(color, ColorType::CMYK(_)));
-    let copy = memory::product(&[u64::from(width), u64::from(height), (channels * depth) as u64]);
-    // Planes and inks are copied to become pixels; a strip or tile of JPEG is unpacked whole.
+    // Unsupported layouts are refused when decoding.
+    let (channels, depth, planes) = pixel_layout(&mut decoder).unwrap_or((4, 4, false));
+    let cmyk = decoder.colortype().is_ok_and(|color| matches!(color, ColorType::CMYK(_)));
+    let copy = memory::saturating_product(&[u64::from(width), u64::from(height), (channels * depth) as u64]);
+    // Planar and CMYK samples are copied; a JPEG strip or tile is decompressed as a whole.
     let chunk = jpeg_chunk(&mut decoder, bytes);
-    let beside = chunk.max(copy.saturating_mul(u64::from(planes) + u64::from(inks)));
-    let channels = if inks { 3 } else { channels };
+    let working_memory = chunk.max(copy.saturating_mul(u64::from(planes) + u64::from(cmyk)));
+    let channels = if cmyk { 3 } else { channels };
     Ok(Header {
         width: width as usize,
         height: height as usize,
         channels,
         depth,
-        beside,
+        working_memory,
         exif: exif_of_tiff(bytes),
         icc,
         orientation,
     })
 }
 
-/// The most bytes that a strip or tile of JPEG takes, by its own header, which need not be that of the picture: four bytes a pixel and
-/// as many coefficients of 16 bits. 0 where nothing is packed so.
+/// Computes the maximum bytes for a JPEG strip or tile, by its own header, which may differ from that of the image: four bytes per pixel and
+/// as many 16-bit coefficients. 0 without JPEG compression.
 fn jpeg_chunk(decoder: &mut Decoder<Cursor<&[u8]>>, bytes: &[u8]) -> u64 {
     if decoder.find_tag_unsigned::<u16>(Tag::Compression).ok().flatten() != Some(7) {
         return 0;
@@ -56,8 +56,8 @@ fn jpeg_chunk(decoder: &mut Decoder<Cursor<&[u8]>>, bytes: &[u8]) -> u64 {
     most.max(tables.map_or(0, |tables| super::jpeg::frame_pixels(&tables))).saturating_mul(12)
 }
 
-/// Stored samples of a pixel, bytes of each in memory, and whether they are stored in planes.
-fn kind(decoder: &mut Decoder<Cursor<&[u8]>>) -> Result<(usize, usize, bool), FormatError> {
+/// Returns the stored channels, the bytes per sample in memory, and whether the layout is planar.
+fn pixel_layout(decoder: &mut Decoder<Cursor<&[u8]>>) -> Result<(usize, usize, bool), FormatError> {
     let (channels, bits) = match decoder.colortype().map_err(fail)? {
         ColorType::Gray(bits @ (1 | 8 | 16 | 32)) => (1, bits),
         ColorType::GrayA(bits @ (8 | 16)) => (2, bits),
@@ -75,10 +75,10 @@ pub(super) fn raster(bytes: &[u8]) -> Result<Raster, FormatError> {
     let (width, height) = decoder.dimensions().map_err(fail)?;
     let (width, height) = (width as usize, height as usize);
     let color = decoder.colortype().map_err(fail)?;
-    let stored = kind(&mut decoder)?.0;
-    // Room for the samples, and as much again as any strip and header need.
+    let stored = pixel_layout(&mut decoder)?.0;
+    // Limits: the samples, and as much again plus the header limit for strips.
     let mut limits = Limits::default();
-    limits.decoding_buffer_size = count(Format::Tiff, width, height, 4 * stored)?;
+    limits.decoding_buffer_size = sample_count(Format::Tiff, width, height, 4 * stored)?;
     limits.intermediate_buffer_size = limits.decoding_buffer_size.saturating_add(HEADER_BYTES);
     limits.ifd_value_size = limits.intermediate_buffer_size;
     let mut decoder = decoder.with_limits(limits);
@@ -90,12 +90,12 @@ pub(super) fn raster(bytes: &[u8]) -> Result<Raster, FormatError> {
     let planes = layout.planes;
     let cmyk = matches!(color, ColorType::CMYK(_));
     let samples = match result {
-        DecodingResult::U8(bits) if color == ColorType::Gray(1) => Samples::U8(bytes_of_bits(&bits, width)),
-        DecodingResult::U8(v) if cmyk => Samples::U8(lights(&interleaved(v, planes), 255.0, |light| light as u8)),
-        DecodingResult::U16(v) if cmyk => Samples::U16(lights(&interleaved(v, planes), 65535.0, |light| light as u16)),
-        DecodingResult::U8(v) => Samples::U8(interleaved(v, planes)),
-        DecodingResult::U16(v) => Samples::U16(interleaved(v, planes)),
-        DecodingResult::F32(v) => Samples::F32(interleaved(v, planes)),
+        DecodingResult::U8(bits) if color == ColorType::Gray(1) => Samples::U8(unpack_bits(&bits, width)),
+        DecodingResult::U8(v) if cmyk => Samples::U8(cmyk_to_rgb(&interleave(v, planes), 255.0, |v| v as u8)),
+        DecodingResult::U16(v) if cmyk => Samples::U16(cmyk_to_rgb(&interleave(v, planes), 65535.0, |v| v as u16)),
+        DecodingResult::U8(v) => Samples::U8(interleave(v, planes)),
+        DecodingResult::U16(v) => Samples::U16(interleave(v, planes)),
+        DecodingResult::F32(v) => Samples::F32(interleave(v, planes)),
         _ => return Err(FormatError::unsupported_picture(NAME, "samples other than unsigned bytes, words and floats")),
     };
     Ok(Raster { channels: if cmyk { 3 } else { stored }, samples })
@@ -105,15 +105,15 @@ fn open(bytes: &[u8]) -> Result<Decoder<Cursor<&[u8]>>, FormatError> {
     Decoder::new(Cursor::new(bytes)).map_err(fail)
 }
 
-/// One bit a pixel, rows padded to bytes; set is white.
-fn bytes_of_bits(bits: &[u8], width: usize) -> Vec<u8> {
+/// Expands one bit per pixel, rows padded to bytes, to 0 and 255.
+fn unpack_bits(bits: &[u8], width: usize) -> Vec<u8> {
     let row =
         |row: &[u8]| (0..width).map(|x| if row[x / 8] >> (7 - x % 8) & 1 == 1 { 255 } else { 0 }).collect::<Vec<_>>();
     bits.chunks_exact(width.div_ceil(8)).flat_map(row).collect()
 }
 
-/// Planes of a channel each become pixels.
-fn interleaved<T: Copy>(samples: Vec<T>, planes: usize) -> Vec<T> {
+/// Converts planar samples to interleaved ones.
+fn interleave<T: Copy>(samples: Vec<T>, planes: usize) -> Vec<T> {
     if planes < 2 {
         return samples;
     }
@@ -121,13 +121,13 @@ fn interleaved<T: Copy>(samples: Vec<T>, planes: usize) -> Vec<T> {
     (0..size * planes).map(|i| samples[i % planes * size + i / planes]).collect()
 }
 
-/// Cyan, magenta, yellow and black to RGB, without a color profile.
-fn lights<T: Copy + Into<f32>>(inks: &[T], full: f32, store: fn(f32) -> T) -> Vec<T> {
+/// Converts CMYK to RGB, without a color profile.
+fn cmyk_to_rgb<T: Copy + Into<f32>>(cmyk: &[T], full: f32, store: fn(f32) -> T) -> Vec<T> {
     let pixel = |ink: &[T]| {
         let black = 1.0 - ink[3].into() / full;
         [ink[0], ink[1], ink[2]].map(|ink| store((full - ink.into()) * black))
     };
-    inks.chunks_exact(4).flat_map(pixel).collect()
+    cmyk.chunks_exact(4).flat_map(pixel).collect()
 }
 
 fn fail(error: TiffError) -> FormatError {

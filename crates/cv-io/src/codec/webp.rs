@@ -8,16 +8,16 @@ use std::io::{Cursor, ErrorKind};
 pub(super) fn header(bytes: &[u8]) -> Result<Header, FormatError> {
     let mut decoder = open(bytes)?;
     let (width, height) = decoder.dimensions();
-    // Colors of four bytes a pixel, or brightness and colors apart with room up to whole blocks of 16×16 pixels.
+    // Four bytes per pixel (lossless), or luma and chroma planes padded to blocks of 16×16 pixels (lossy).
     let side = |pixels: u32| u64::from(pixels).next_multiple_of(16);
-    let beside = memory::product(&[side(width), side(height), 4]);
+    let working_memory = memory::saturating_product(&[side(width), side(height), 4]);
     Ok(Header {
         width: width as usize,
         height: height as usize,
         channels: if decoder.has_alpha() { 4 } else { 3 },
         depth: 1,
-        beside,
-        // Damaged blocks do not cost the picture.
+        working_memory,
+        // Damaged blocks are ignored.
         exif: decoder.exif_metadata().ok().flatten(),
         icc: decoder.icc_profile().ok().flatten(),
         orientation: None,

@@ -5,19 +5,18 @@ use std::collections::BTreeMap;
 use cv_core::nalgebra::UnitQuaternion;
 use cv_core::{Camera, ModelImage, ModelPoint, Point2, Point3};
 
-use super::{check_camera, pose};
+use super::{check_camera, pose_from_quaternion};
 use crate::camera::{CENTER, camera_by_id, model_of};
 use crate::{FormatError, memory};
 
 const NAME: &str = "COLMAP binary";
-/// What a file and its contents take in memory at the most, times its bytes: a picture of 74 bytes, with neither a point nor more than a letter of a name,
-/// takes about 300 in a tree whose nodes are half full.
-const MEMORY: u64 = 5;
+/// Upper bound of the memory of a parsed file relative to its size: a minimal image record of 74 bytes takes about 300 in a half-full tree.
+const MEMORY_FACTOR: u64 = 5;
 
-/// Bytes from the front.
-struct Bytes<'a>(&'a [u8]);
+/// ByteReader from the front.
+struct ByteReader<'a>(&'a [u8]);
 
-impl<'a> Bytes<'a> {
+impl<'a> ByteReader<'a> {
     fn take<const N: usize>(&mut self) -> Result<[u8; N], FormatError> {
         let (taken, rest) = self.0.split_first_chunk().ok_or(FormatError::Truncated { format: NAME })?;
         self.0 = rest;
@@ -44,43 +43,47 @@ impl<'a> Bytes<'a> {
         Ok(values)
     }
 
-    /// A count of records of at least `size` bytes each, of which so many can still follow: whoever makes room for them asks for no more memory than a few
-    /// times the file.
+    /// Reads a count of records of at least `size` bytes each, and checks it against the remaining bytes: allocations for them stay within a few times
+    /// the file size.
     fn count(&mut self, size: usize, what: &str) -> Result<usize, FormatError> {
         let count = self.u64()?;
         match usize::try_from(count) {
             Ok(count) if count <= self.0.len() / size => Ok(count),
             _ => {
-                let reason = format!("{count} {what} are announced, and {} bytes follow", self.0.len());
+                let reason = format!("{count} {what} are declared, but only {} bytes follow", self.0.len());
                 Err(FormatError::corrupt(NAME, reason))
             }
         }
     }
 
-    /// UTF-8 up to a zero, which is taken, too.
+    /// Reads a zero-terminated UTF-8 string.
     fn name(&mut self) -> Result<&'a str, FormatError> {
         let end = self.0.iter().position(|&byte| byte == 0).ok_or(FormatError::Truncated { format: NAME })?;
         let (name, rest) = self.0.split_at(end);
         self.0 = &rest[1..];
-        std::str::from_utf8(name).map_err(|_| FormatError::corrupt(NAME, "a picture's name is not UTF-8"))
+        std::str::from_utf8(name).map_err(|_| FormatError::corrupt(NAME, "an image name is not UTF-8"))
     }
 }
 
-/// The records of a file: a count, then each as `record` reads it, whose keys must differ.
-fn records<K: Ord + Copy + std::fmt::Display, T>(
+/// Parses the records of a file: a count, then the records by `record`, with distinct keys.
+fn parse_records<K: Ord + Copy + std::fmt::Display, T>(
     bytes: &[u8],
     size: usize,
     what: &'static str,
-    mut record: impl FnMut(&mut Bytes<'_>) -> Result<(K, T), FormatError>,
+    mut record: impl FnMut(&mut ByteReader<'_>) -> Result<(K, T), FormatError>,
 ) -> Result<BTreeMap<K, T>, FormatError> {
-    memory::allow(memory::product(&[MEMORY, bytes.len() as u64]), memory::default_max_memory(), None)?;
-    let mut bytes = Bytes(bytes);
+    memory::check_limit(
+        memory::saturating_product(&[MEMORY_FACTOR, bytes.len() as u64]),
+        memory::default_max_memory(),
+        None,
+    )?;
+    let mut bytes = ByteReader(bytes);
     let count = bytes.count(size, what)?;
     let mut all = BTreeMap::new();
     for _ in 0..count {
         let (key, value) = record(&mut bytes)?;
         if all.insert(key, value).is_some() {
-            return Err(FormatError::corrupt(NAME, format!("of the {what}, number {key} is there twice")));
+            return Err(FormatError::corrupt(NAME, format!("of the {what}, id {key} occurs twice")));
         }
     }
     if bytes.0.is_empty() {
@@ -92,13 +95,13 @@ fn records<K: Ord + Copy + std::fmt::Display, T>(
 /// Parses `cameras.bin`.
 ///
 /// # Errors
-/// [`FormatError`]: cut short, a count that the file cannot hold, a number twice, a camera model without an equal here.
+/// [`FormatError`]: truncated, an impossible count, a repeated id, an unsupported camera model.
 pub fn parse_cameras_binary(bytes: &[u8]) -> Result<BTreeMap<u32, Camera>, FormatError> {
-    // The pinhole with one focal length.
-    records(bytes, 4 + 4 + 8 + 8 + 3 * 8, "cameras", |bytes| {
+    // The smallest record: SIMPLE_PINHOLE.
+    parse_records(bytes, 4 + 4 + 8 + 8 + 3 * 8, "cameras", |bytes| {
         let id = bytes.u32()?;
         let model = bytes.take().map(i32::from_le_bytes)?;
-        // A side beyond what this machine counts is refused with its number of pixels.
+        // A side beyond usize is refused with its number of pixels.
         let side = |side: u64| usize::try_from(side).unwrap_or(usize::MAX);
         let (width, height) = (side(bytes.u64()?), side(bytes.u64()?));
         let camera = camera_by_id(model, width, height, || bytes.f64())?;
@@ -110,23 +113,24 @@ pub fn parse_cameras_binary(bytes: &[u8]) -> Result<BTreeMap<u32, Camera>, Forma
 /// Parses `images.bin`.
 ///
 /// # Errors
-/// [`FormatError`]: cut short, a count that the file cannot hold, a number twice, a pose that is none, a name that is empty or not UTF-8.
+/// [`FormatError`]: truncated, an impossible count, a repeated id, an invalid pose, a name that is empty or not UTF-8.
 pub fn parse_images_binary(bytes: &[u8]) -> Result<BTreeMap<u32, ModelImage>, FormatError> {
-    records(bytes, 4 + 7 * 8 + 4 + 2 + 8, "pictures", |bytes| {
+    parse_records(bytes, 4 + 7 * 8 + 4 + 2 + 8, "images", |bytes| {
         let id = bytes.u32()?;
         let (q, t) = (bytes.floats()?, bytes.floats()?);
-        let corrupt = |reason: &str| FormatError::corrupt(NAME, format!("picture {id}: {reason}"));
-        let pose = pose(q, t).ok_or_else(|| corrupt("the pose is not finite, or its quaternion is zero"))?;
+        let corrupt = |reason: &str| FormatError::corrupt(NAME, format!("image {id}: {reason}"));
+        let pose =
+            pose_from_quaternion(q, t).ok_or_else(|| corrupt("the pose is not finite, or its quaternion is zero"))?;
         let camera = bytes.u32()?;
         let name = bytes.name()?.to_owned();
         if name.is_empty() {
             return Err(corrupt("the name is missing"));
         }
-        let count = bytes.count(3 * 8, "points of a picture")?;
+        let count = bytes.count(3 * 8, "points of an image")?;
         let mut points = Vec::with_capacity(count);
         for _ in 0..count {
             let [x, y] = bytes.floats()?;
-            // A negative number is none.
+            // A negative id means no point.
             let point = u64::try_from(bytes.take().map(i64::from_le_bytes)?).ok();
             points.push((Point2::new(x - CENTER, y - CENTER), point));
         }
@@ -137,14 +141,14 @@ pub fn parse_images_binary(bytes: &[u8]) -> Result<BTreeMap<u32, ModelImage>, Fo
 /// Parses `points3D.bin`.
 ///
 /// # Errors
-/// [`FormatError`]: cut short, a count that the file cannot hold, a number twice.
+/// [`FormatError`]: truncated, an impossible count, a repeated id.
 pub fn parse_points_binary(bytes: &[u8]) -> Result<BTreeMap<u64, ModelPoint>, FormatError> {
-    records(bytes, 8 + 3 * 8 + 3 + 8 + 8, "points", |bytes| {
+    parse_records(bytes, 8 + 3 * 8 + 3 + 8 + 8, "points", |bytes| {
         let id = bytes.u64()?;
         let position = Point3::from(bytes.floats()?);
         let color = bytes.take()?;
         let error = bytes.f64()?;
-        let count = bytes.count(4 + 4, "sights of a point")?;
+        let count = bytes.count(4 + 4, "observations of a point")?;
         let mut track = Vec::with_capacity(count);
         for _ in 0..count {
             track.push((bytes.u32()?, bytes.u32()?));
@@ -153,7 +157,7 @@ pub fn parse_points_binary(bytes: &[u8]) -> Result<BTreeMap<u64, ModelPoint>, Fo
     })
 }
 
-/// `cameras.bin`.
+/// Encodes `cameras.bin`.
 pub(super) fn cameras_bytes(cameras: &BTreeMap<u32, Camera>) -> Result<Vec<u8>, FormatError> {
     let mut bytes = (cameras.len() as u64).to_le_bytes().to_vec();
     for (id, camera) in cameras {
@@ -167,7 +171,7 @@ pub(super) fn cameras_bytes(cameras: &BTreeMap<u32, Camera>) -> Result<Vec<u8>, 
     Ok(bytes)
 }
 
-/// `images.bin`.
+/// Encodes `images.bin`.
 pub(super) fn images_bytes(images: &BTreeMap<u32, ModelImage>) -> Vec<u8> {
     let mut bytes = (images.len() as u64).to_le_bytes().to_vec();
     for (id, image) in images {
@@ -187,7 +191,7 @@ pub(super) fn images_bytes(images: &BTreeMap<u32, ModelImage>) -> Vec<u8> {
     bytes
 }
 
-/// `points3D.bin`.
+/// Encodes `points3D.bin`.
 pub(super) fn points_bytes(points: &BTreeMap<u64, ModelPoint>) -> Vec<u8> {
     let mut bytes = (points.len() as u64).to_le_bytes().to_vec();
     for (id, point) in points {
@@ -212,7 +216,7 @@ fn floats(bytes: &mut Vec<u8>, values: &[f64]) {
 mod tests {
     use super::*;
 
-    /// A file as the format's definition has it (COLMAP's manual, “Output format”), written field by field.
+    /// A file by the format's definition (COLMAP's manual, “Output format”), field by field.
     macro_rules! file {
         ($($value:expr),* $(,)?) => {{
             let mut bytes = Vec::<u8>::new();
@@ -241,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn every_field_is_where_the_definition_has_it() {
+    fn fields_are_parsed_by_the_definition() {
         let camera = &parse_cameras_binary(&cameras()).unwrap()[&7];
         assert_eq!((camera.width, camera.height, camera.fx, camera.fy), (3072, 2304, 2559.81, 2559.81));
         assert_eq!((camera.cx, camera.cy, camera.distortion.parameters()), (1535.5, 1151.5, &[-0.0218531][..]));
@@ -250,7 +254,7 @@ mod tests {
         assert_eq!((all.len(), &first.name[..], first.camera, &all[&4].name[..]), (2, "a b.jpg", 7, "c"));
         assert_eq!(first.points, [(Point2::new(2362.0, 247.75), Some(9)), (Point2::new(1.0, 2.0), None)]);
         assert_eq!(first.pose.translation.as_slice(), [1.0, -2.0, 3.5]);
-        // A turn about x by twice the angle whose cosine is 0.6: its sine is 0.96 and its cosine -0.28.
+        // A rotation about x by twice the angle whose cosine is 0.6: its sine is 0.96 and its cosine -0.28.
         let r = first.pose.rotation.matrix();
         assert!((r[(2, 1)] - 0.96).abs() < 1e-15 && (r[(1, 1)] + 0.28).abs() < 1e-15 && r[(0, 0)] == 1.0, "{r}");
         let point = &parse_points_binary(&points()).unwrap()[&9];
@@ -259,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_the_same_bytes() {
+    fn files_round_trip_to_the_same_bytes() {
         assert_eq!(cameras_bytes(&parse_cameras_binary(&cameras()).unwrap()).unwrap(), cameras());
         assert_eq!(points_bytes(&parse_points_binary(&points()).unwrap()), points());
         // All but the first quaternion, which a rotation matrix rounds.
@@ -268,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn cut_short_anywhere_and_with_bytes_behind() {
+    fn truncated_files_and_trailing_bytes_are_refused() {
         fn held<T: std::fmt::Debug>(whole: &[u8], parse: impl Fn(&[u8]) -> Result<T, FormatError>) {
             for end in 0..whole.len() {
                 let error = parse(&whole[..end]).unwrap_err();
@@ -285,9 +289,9 @@ mod tests {
     }
 
     #[test]
-    fn counts_that_lie_are_refused_before_memory_is_asked_for() {
+    fn impossible_counts_are_refused_before_allocation() {
         fn refused<T: std::fmt::Debug>(mut bytes: Vec<u8>, at: usize, parse: impl Fn(&[u8]) -> Result<T, FormatError>) {
-            // The last needs 2^63 bytes and more: room for so many would end the process.
+            // The last would need more than 2^63 bytes.
             for count in [1u64 << 20, 1 << 60, u64::MAX] {
                 bytes[at..at + 8].copy_from_slice(&count.to_le_bytes());
                 let error = parse(&bytes).unwrap_err();
@@ -296,16 +300,16 @@ mod tests {
         }
         refused(cameras(), 0, parse_cameras_binary);
         refused(images(), 0, parse_images_binary);
-        // Behind number, pose, camera and the name of eight bytes.
+        // After id, pose, camera and the name of eight bytes.
         refused(images(), 8 + 4 + 56 + 4 + 8, parse_images_binary);
         refused(points(), 0, parse_points_binary);
         refused(points(), 8 + 8 + 24 + 3 + 8, parse_points_binary);
     }
 
     #[test]
-    fn what_no_model_can_hold_is_refused() {
+    fn invalid_cameras_and_poses_are_refused() {
         let reason = |bytes: Vec<u8>| parse_cameras_binary(&bytes).unwrap_err().to_string();
-        // FOV, which is not in the table of lenses.
+        // FOV, which is not supported.
         assert!(reason(file![1u64, 7u32, 7i32, 4u64, 4u64, 1.0f64, 2.0f64, 2.0f64]).contains("number 7"));
         let twice =
             file![2u64, 7u32, 0i32, 4u64, 4u64, 1.0f64, 2.0f64, 2.0f64, 7u32, 0i32, 4u64, 4u64, 1.0f64, 2.0f64, 2.0f64];

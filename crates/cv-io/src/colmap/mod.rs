@@ -1,8 +1,8 @@
-//! COLMAP's models: cameras, pictures and points in three files of one folder, as text (`cameras.txt`, `images.txt`, `points3D.txt`) or
+//! COLMAP's sparse models: cameras, images and points in three files of one folder, as text (`cameras.txt`, `images.txt`, `points3D.txt`) or
 //! binary (`cameras.bin`, …).
 //!
-//! COLMAP puts the center of the top-left pixel at (0.5, 0.5). Principal points and image points are brought to our convention, integers,
-//! when read, and back when written. Poses are world to camera in both.
+//! In COLMAP's convention the center of the top-left pixel is (0.5, 0.5). Principal points and image points are converted to our convention,
+//! pixel centers at integers, when read, and back when written. Poses are world to camera in both.
 
 mod binary;
 mod text;
@@ -21,8 +21,8 @@ use crate::{DEFAULT_MAX_PIXELS, FormatError, IoError, write_together};
 
 const NAME: &str = "COLMAP";
 
-/// Reads the model in a folder: the binary one where `cameras.bin` and `images.bin` are there, as COLMAP does, else the text. The file of points may be absent: cameras and
-/// poses alone are a model too.
+/// Reads the model in a folder: the binary one where `cameras.bin` and `images.bin` exist, as COLMAP does, else the text. The file of points is
+/// optional.
 ///
 /// # Errors
 /// [`IoError`] for the file that cannot be read or parsed.
@@ -50,13 +50,13 @@ pub fn read(folder: impl AsRef<Path>) -> Result<SparseModel, IoError> {
     })
 }
 
-/// Writes a model as text into an existing folder: all three files or none. A binary model that is there stays, and is what is read from then on.
+/// Writes a model as text into an existing folder: all three files or none. An existing binary model stays, and readers prefer it.
 ///
 /// # Errors
-/// [`FormatError::NotRepresentable`] where COLMAP has no model for a camera's lens, where a picture's camera, or a track's picture or point, is not in the model, or a name has
-/// a line break; else as [`crate::write_atomic`].
+/// [`FormatError::NotRepresentable`] where COLMAP has no model for a camera's lens, where an image's camera, or a track's image or point, is not in
+/// the model, or a name has a line break; else as [`crate::write_atomic`].
 pub fn write(folder: impl AsRef<Path>, model: &SparseModel) -> Result<(), IoError> {
-    let cameras = check(model).and_then(|()| text::cameras_text(&model.cameras));
+    let cameras = check_model(model).and_then(|()| text::cameras_text(&model.cameras));
     let cameras = cameras.map_err(|reason| IoError::writing(folder.as_ref(), reason))?;
     write_together(&folder, &["cameras.txt", "images.txt", "points3D.txt"], |folder| {
         write_bytes(folder.join("cameras.txt"), cameras.as_bytes())?;
@@ -65,12 +65,12 @@ pub fn write(folder: impl AsRef<Path>, model: &SparseModel) -> Result<(), IoErro
     })
 }
 
-/// Writes a model in binary into an existing folder: all three files or none. A third of the text's size, and every number as it is.
+/// Writes a model in binary into an existing folder: all three files or none. A third of the text's size, and numbers are exact.
 ///
 /// # Errors
 /// As [`write()`].
 pub fn write_binary(folder: impl AsRef<Path>, model: &SparseModel) -> Result<(), IoError> {
-    let cameras = check(model).and_then(|()| binary::cameras_bytes(&model.cameras));
+    let cameras = check_model(model).and_then(|()| binary::cameras_bytes(&model.cameras));
     let cameras = cameras.map_err(|reason| IoError::writing(folder.as_ref(), reason))?;
     write_together(&folder, &["cameras.bin", "images.bin", "points3D.bin"], |folder| {
         write_bytes(folder.join("cameras.bin"), &cameras)?;
@@ -79,7 +79,7 @@ pub fn write_binary(folder: impl AsRef<Path>, model: &SparseModel) -> Result<(),
     })
 }
 
-/// A form of a model's files.
+/// Format of a model's files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ModelFormat {
     /// `cameras.txt`, `images.txt`, `points3D.txt`.
@@ -95,7 +95,7 @@ cv_core::named!(ModelFormat {
 });
 
 impl ModelFormat {
-    fn ending(self) -> &'static str {
+    fn extension(self) -> &'static str {
         match self {
             Self::Text => "txt",
             Self::Binary => "bin",
@@ -103,8 +103,9 @@ impl ModelFormat {
     }
 }
 
-/// Writes a model into an existing folder, in place of the one that is there, if any: the files of the other form are removed once the new ones are written, and those of rigs and frames
-/// (COLMAP 3.12), which are of the older model. Else whoever reads the folder might take the older one: COLMAP reads binary files before text. True where such files were there.
+/// Writes a model into an existing folder and replaces an older one: after writing, the older model's files of the other format, and its files of
+/// rigs and frames (COLMAP 3.12), are removed. Otherwise readers might read the older model: COLMAP prefers binary files. Returns whether
+/// such files existed.
 ///
 /// # Errors
 /// As [`write()`]; [`IoError`] for a file that cannot be removed.
@@ -122,8 +123,8 @@ pub fn replace(folder: impl AsRef<Path>, model: &SparseModel, format: ModelForma
     };
     let models = ["cameras", "images", "points3D", "rigs", "frames"].map(|stem| (stem, other));
     let mut found = false;
-    for (stem, form) in models.into_iter().chain([("rigs", format), ("frames", format)]) {
-        let path = folder.join(stem).with_extension(form.ending());
+    for (stem, format) in models.into_iter().chain([("rigs", format), ("frames", format)]) {
+        let path = folder.join(stem).with_extension(format.extension());
         match std::fs::remove_file(&path) {
             Ok(()) => found = true,
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
@@ -133,7 +134,7 @@ pub fn replace(folder: impl AsRef<Path>, model: &SparseModel, format: ModelForma
     Ok(found)
 }
 
-/// What is wrong with a camera. Its picture must be one that is read: whoever makes a map of it asks for so much memory.
+/// Validates a camera, including its number of pixels, which bounds allocations for its images.
 fn check_camera(id: u32, camera: &Camera) -> Result<(), String> {
     camera.validate().map_err(|e| format!("camera {id}: {e}"))?;
     let (width, height) = (camera.width as u64, camera.height as u64);
@@ -143,12 +144,12 @@ fn check_camera(id: u32, camera: &Camera) -> Result<(), String> {
     }
 }
 
-/// Whether a model can be read back as it is.
-fn check(model: &SparseModel) -> Result<(), FormatError> {
-    problem(model).map_or(Ok(()), |what| Err(FormatError::NotRepresentable { format: NAME, what }))
+/// Checks that a model is consistent and round-trips.
+fn check_model(model: &SparseModel) -> Result<(), FormatError> {
+    find_problem(model).map_or(Ok(()), |what| Err(FormatError::NotRepresentable { format: NAME, what }))
 }
 
-fn problem(model: &SparseModel) -> Option<String> {
+fn find_problem(model: &SparseModel) -> Option<String> {
     for (id, camera) in &model.cameras {
         if let Err(what) = check_camera(*id, camera) {
             return Some(what);
@@ -156,33 +157,33 @@ fn problem(model: &SparseModel) -> Option<String> {
     }
     for (id, image) in &model.images {
         if !model.cameras.contains_key(&image.camera) {
-            return Some(format!("picture {id}, whose camera {} is not there", image.camera));
+            return Some(format!("image {id}, whose camera {} is missing", image.camera));
         }
-        // Text is cut at white space, and binary at a zero: such a name would come back as another one.
+        // Names with other white space, or with a zero byte, do not round-trip.
         let blanks = image.name.split_whitespace().collect::<Vec<_>>().join(" ") != image.name;
         if image.name.is_empty() || image.name.contains('\0') || blanks {
-            return Some(format!("the name of picture {id}: {:?}", image.name));
+            return Some(format!("the name of image {id}: {:?}", image.name));
         }
     }
     for (id, point) in &model.points {
-        // Numbers of points are signed in a picture's list.
+        // Point ids are signed in the images file.
         if i64::try_from(*id).is_err() {
-            return Some(format!("the number {id} of a point"));
+            return Some(format!("the point id {id}"));
         }
-        let seen =
+        let exists =
             |&(image, index): &(u32, u32)| model.images.get(&image).is_some_and(|i| (index as usize) < i.points.len());
-        if let Some((image, index)) = point.track.iter().find(|t| !seen(t)) {
-            return Some(format!("point {id}, seen as point {index} of picture {image}, which is not there"));
+        if let Some((image, index)) = point.track.iter().find(|t| !exists(t)) {
+            return Some(format!("point {id}, observed as point {index} of image {image}, which is missing"));
         }
     }
     None
 }
 
-/// The pose of COLMAP's quaternion (w first) and translation.
-fn pose(q: [f64; 4], t: [f64; 3]) -> Option<Pose> {
+/// Makes a pose of COLMAP's quaternion (w first) and translation; `None` where they are invalid.
+fn pose_from_quaternion(q: [f64; 4], t: [f64; 3]) -> Option<Pose> {
     let quaternion = Quaternion::new(q[0], q[1], q[2], q[3]);
-    let fine = quaternion.norm() > 1e-9 && quaternion.norm().is_finite() && t.iter().all(|v| v.is_finite());
-    fine.then(|| Pose::new(UnitQuaternion::from_quaternion(quaternion).to_rotation_matrix(), Vector3::from(t)))
+    let is_valid = quaternion.norm() > 1e-9 && quaternion.norm().is_finite() && t.iter().all(|v| v.is_finite());
+    is_valid.then(|| Pose::new(UnitQuaternion::from_quaternion(quaternion).to_rotation_matrix(), Vector3::from(t)))
 }
 
 #[cfg(test)]
@@ -209,14 +210,14 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_model_reads_back(r in prop::array::uniform3(-3.0..3.0f64), t in prop::array::uniform3(-1e3..1e3f64), xy in prop::array::uniform2(0.0..4000.0f64), k in -0.5..0.5f64) {
+        fn models_round_trip(r in prop::array::uniform3(-3.0..3.0f64), t in prop::array::uniform3(-1e3..1e3f64), xy in prop::array::uniform2(0.0..4000.0f64), k in -0.5..0.5f64) {
             let camera = Camera { distortion: Distortion::radial_tangential5([k, 0.1, 0.0, 0.01, k]), ..Camera::pinhole(4000, 3000, 2500.0, 2501.0, xy[0], xy[1]) };
             let pose = Pose::new(Rotation3::from_euler_angles(r[0], r[1], r[2]), Vector3::from(t));
             let image = ModelImage { name: "a b.jpg".into(), camera: 7, pose, points: vec![(Point2::new(xy[0], xy[1]), Some(9)), (Point2::new(1.0, 2.0), None)] };
             let point = ModelPoint { position: Point3::from(t), color: [1, 2, 3], error: 0.5, track: vec![(3, 0)] };
             let model = SparseModel { cameras: [(7, camera)].into(), images: [(3, image.clone())].into(), points: [(9, point.clone())].into() };
             for binary in [false, true] {
-                check(&model).unwrap();
+                check_model(&model).unwrap();
                 let back = if binary { through_binary(&model) } else { through_text(&model) }.unwrap();
                 prop_assert_eq!(&back.points[&9], &point);
                 let b = &back.images[&3];
@@ -232,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn what_hangs_in_the_air_is_not_written() {
+    fn models_with_dangling_references_are_not_written() {
         let folder = tempfile::tempdir().unwrap();
         let image = ModelImage { name: "a".into(), camera: 1, pose: Pose::identity(), points: vec![] };
         let mut model = SparseModel { images: [(1, image)].into(), ..SparseModel::default() };
@@ -245,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn the_binary_model_is_read_where_both_are_there() {
+    fn the_binary_model_is_preferred() {
         let folder = tempfile::tempdir().unwrap();
         let model =
             |focal| SparseModel { cameras: [(1, Camera::from_focal(4, 4, focal))].into(), ..SparseModel::default() };
@@ -254,7 +255,7 @@ mod tests {
         assert_eq!(focal(), 5.0);
         write_binary(folder.path(), &model(6.0)).unwrap();
         assert_eq!(focal(), 6.0);
-        // COLMAP's database folder may hold one of the files alone.
+        // An incomplete binary model is ignored.
         std::fs::remove_file(folder.path().join("images.bin")).unwrap();
         assert_eq!(focal(), 5.0);
         std::fs::remove_file(folder.path().join("images.txt")).unwrap();
@@ -262,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn a_model_takes_the_place_of_that_of_the_other_form() {
+    fn a_model_replaces_one_of_the_other_format() {
         let folder = tempfile::tempdir().unwrap();
         let model =
             |focal| SparseModel { cameras: [(1, Camera::from_focal(4, 4, focal))].into(), ..SparseModel::default() };
@@ -284,13 +285,13 @@ mod tests {
         ] {
             assert_eq!(replace(folder.path(), &model(focal_px), format).unwrap(), replaced);
             assert_eq!(focal(), focal_px);
-            let ending = format.ending();
+            let ending = format.extension();
             let mut wanted = ["cameras", "images", "points3D"].map(|stem| format!("{stem}.{ending}")).to_vec();
             wanted.push("notes.txt".to_owned());
             wanted.sort();
             assert_eq!(names(), wanted);
         }
-        // One that cannot be written leaves what is there.
+        // A failed write leaves the existing model.
         let image = ModelImage { name: "a".into(), camera: 9, pose: Pose::identity(), points: vec![] };
         let wrong = SparseModel { images: [(1, image)].into(), ..SparseModel::default() };
         assert!(replace(folder.path(), &wrong, ModelFormat::Text).is_err());
@@ -298,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_of_more_pixels_than_any_picture_is_refused() {
+    fn a_camera_with_too_many_pixels_is_refused() {
         let text = format!("1 PINHOLE {} 2 1 1 1 1\n", DEFAULT_MAX_PIXELS);
         assert!(parse_cameras(&text).unwrap_err().to_string().contains("pixels"));
         assert!(parse_cameras(&text.replace(" 2 ", " 1 ")).is_ok());

@@ -7,11 +7,11 @@ use std::str::SplitWhitespace;
 use cv_core::nalgebra::UnitQuaternion;
 use cv_core::{Camera, ModelImage, ModelPoint, Point2, Point3};
 
-use super::{check_camera, pose};
+use super::{check_camera, pose_from_quaternion};
 use crate::FormatError;
 use crate::camera::{CENTER, model_line, parse_model};
 
-/// Words of a line, with errors that name what was expected.
+/// Words of a line, with errors that name the expected field.
 struct Words<'a>(SplitWhitespace<'a>, usize);
 
 impl<'a> Words<'a> {
@@ -28,7 +28,7 @@ impl<'a> Words<'a> {
     }
 }
 
-/// The lines that are not comments, with their numbers from 1. An empty line counts: `images.txt` has them.
+/// Iterates over the lines that are not comments, with their numbers from 1. Empty lines are included: `images.txt` has them.
 fn lines(text: &str) -> impl Iterator<Item = (usize, &str)> {
     text.lines().enumerate().map(|(i, l)| (i + 1, l.trim())).filter(|(_, l)| !l.starts_with('#'))
 }
@@ -36,18 +36,18 @@ fn lines(text: &str) -> impl Iterator<Item = (usize, &str)> {
 /// Parses `cameras.txt`.
 ///
 /// # Errors
-/// [`FormatError`] with the line, or for a camera model without an equal here.
+/// [`FormatError`] with the line, or for an unsupported camera model.
 pub fn parse_cameras(text: &str) -> Result<BTreeMap<u32, Camera>, FormatError> {
     let mut cameras = BTreeMap::new();
     for (number, line) in lines(text).filter(|(_, l)| !l.is_empty()) {
         let mut words = Words(line.split_whitespace(), number);
-        let id: u32 = words.next("a camera's number")?;
+        let id: u32 = words.next("a camera id")?;
         let model: String = words.next("a camera model")?;
         let (width, height) = (words.next("the width")?, words.next("the height")?);
         let camera = parse_model(&model, width, height, &words.rest("a parameter")?)?;
         check_camera(id, &camera).map_err(|reason| FormatError::line(number, reason))?;
         if cameras.insert(id, camera).is_some() {
-            return Err(FormatError::line(number, format!("camera {id} is there twice")));
+            return Err(FormatError::line(number, format!("camera {id} occurs twice")));
         }
     }
     Ok(cameras)
@@ -60,25 +60,25 @@ pub fn parse_cameras(text: &str) -> Result<BTreeMap<u32, Camera>, FormatError> {
 pub fn parse_images(text: &str) -> Result<BTreeMap<u32, ModelImage>, FormatError> {
     let mut images = BTreeMap::new();
     let mut rest = lines(text);
-    // Two lines a picture; the second may be empty, but blank lines before a first one are only that.
+    // Two lines per image, of which the second may be empty; empty lines before a first one are ignored.
     while let Some((number, line)) = rest.find(|(_, l)| !l.is_empty()) {
         let mut words = Words(line.split_whitespace(), number);
-        let id: u32 = words.next("a picture's number")?;
+        let id: u32 = words.next("an image id")?;
         let mut q = [0.0; 4];
         for v in &mut q {
-            *v = words.next("a quaternion's part")?;
+            *v = words.next("a quaternion component")?;
         }
         let mut t = [0.0; 3];
         for v in &mut t {
-            *v = words.next("a translation's part")?;
+            *v = words.next("a translation component")?;
         }
-        let pose =
-            pose(q, t).ok_or_else(|| FormatError::line(number, "the pose is not finite, or its quaternion is zero"))?;
-        let camera = words.next("a camera's number")?;
-        // Names may hold blanks.
+        let pose = pose_from_quaternion(q, t)
+            .ok_or_else(|| FormatError::line(number, "the pose is not finite, or its quaternion is zero"))?;
+        let camera = words.next("a camera id")?;
+        // Names may have spaces.
         let name = words.rest::<String>("a name")?.join(" ");
         if name.is_empty() {
-            return Err(FormatError::line(number, "the picture's name is missing"));
+            return Err(FormatError::line(number, "the image name is missing"));
         }
         let mut points = Vec::new();
         if let Some((number, line)) = rest.next() {
@@ -87,12 +87,12 @@ pub fn parse_images(text: &str) -> Result<BTreeMap<u32, ModelImage>, FormatError
                 let x: f64 =
                     first.parse().map_err(|_| FormatError::line(number, format!("an x: “{first:.40}” is not one")))?;
                 let y: f64 = words.next("a y")?;
-                let point: i64 = words.next("a point's number")?;
+                let point: i64 = words.next("a point id")?;
                 points.push((Point2::new(x - CENTER, y - CENTER), u64::try_from(point).ok()));
             }
         }
         if images.insert(id, ModelImage { name, camera, pose, points }).is_some() {
-            return Err(FormatError::line(number, format!("picture {id} is there twice")));
+            return Err(FormatError::line(number, format!("image {id} occurs twice")));
         }
     }
     Ok(images)
@@ -106,23 +106,23 @@ pub fn parse_points(text: &str) -> Result<BTreeMap<u64, ModelPoint>, FormatError
     let mut points = BTreeMap::new();
     for (number, line) in lines(text).filter(|(_, l)| !l.is_empty()) {
         let mut words = Words(line.split_whitespace(), number);
-        let id: u64 = words.next("a point's number")?;
+        let id: u64 = words.next("a point id")?;
         let position = Point3::new(words.next("an x")?, words.next("a y")?, words.next("a z")?);
         let color = [words.next("a red")?, words.next("a green")?, words.next("a blue")?];
         let error = words.next("an error")?;
-        let track: Vec<u32> = words.rest("a track's number")?;
+        let track: Vec<u32> = words.rest("a track element")?;
         let (pairs, []) = track.as_chunks::<2>() else {
             return Err(FormatError::line(number, "the track has an odd count of numbers"));
         };
         let point = ModelPoint { position, color, error, track: pairs.iter().map(|&[i, p]| (i, p)).collect() };
         if points.insert(id, point).is_some() {
-            return Err(FormatError::line(number, format!("point {id} is there twice")));
+            return Err(FormatError::line(number, format!("point {id} occurs twice")));
         }
     }
     Ok(points)
 }
 
-/// `cameras.txt`.
+/// Formats `cameras.txt`.
 pub(super) fn cameras_text(cameras: &BTreeMap<u32, Camera>) -> Result<String, FormatError> {
     let mut text = String::from("# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n");
     for (id, camera) in cameras {
@@ -131,7 +131,7 @@ pub(super) fn cameras_text(cameras: &BTreeMap<u32, Camera>) -> Result<String, Fo
     Ok(text)
 }
 
-/// `images.txt`.
+/// Formats `images.txt`.
 pub(super) fn images_text(images: &BTreeMap<u32, ModelImage>) -> String {
     let mut text =
         String::from("# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n");
@@ -156,7 +156,7 @@ pub(super) fn images_text(images: &BTreeMap<u32, ModelImage>) -> String {
     text
 }
 
-/// `points3D.txt`.
+/// Formats `points3D.txt`.
 pub(super) fn points_text(points: &BTreeMap<u64, ModelPoint>) -> String {
     let mut text = String::from("# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n");
     for (id, point) in points {
@@ -202,13 +202,13 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_without_its_second_line_and_no_final_newline() {
+    fn an_image_without_second_line_and_final_newline() {
         let text = IMAGES.trim_end();
         assert_eq!(parse_images(text).unwrap().len(), 2);
     }
 
     #[test]
-    fn mistakes_are_named_by_line() {
+    fn invalid_lines_are_reported_with_their_number() {
         for (text, line) in
             [("1 1 0 0 0 0 0 0 1 a.jpg\n1 2\n", 2), ("# c\n1 0 0 0 0 0 0 0 1 a.jpg\n", 2), ("1 1 0 0 0 0 0 0 1\n", 1)]
         {

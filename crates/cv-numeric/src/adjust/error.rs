@@ -1,4 +1,4 @@
-//! Why an adjustment cannot be done.
+//! Errors of an adjustment.
 
 /// Why a problem cannot be stated, solved or have its covariance computed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -21,10 +21,10 @@ pub enum AdjustError {
         group: String,
         /// Degrees of freedom of a block.
         got: usize,
-        /// The most there may be: 64, of a group that is eliminated 6.
+        /// The maximum: 64, or 6 for an eliminated group.
         most: usize,
     },
-    /// A residual was written for blocks of other sizes.
+    /// A residual expects blocks with other degrees of freedom.
     #[error("{residuals}: expects blocks with {expected} degrees of freedom where those of {group} have {got}")]
     Dimension {
         /// Name of the residuals.
@@ -36,14 +36,14 @@ pub enum AdjustError {
         /// Degrees of freedom of a block.
         got: usize,
     },
-    /// A block, a parameter of one, or a group is named that there is not.
-    #[error("{name}: there is no number {index}, there are {len}")]
+    /// The index of a group, block or parameter is out of range.
+    #[error("{name}: index {index} is out of range, there are {len}")]
     Index {
-        /// What is short of it.
+        /// Name of the group, or `groups`.
         name: String,
-        /// What was asked for.
+        /// The index, from 0.
         index: usize,
-        /// How many there are.
+        /// Number of elements.
         len: usize,
     },
     /// A residual depends on two blocks of the eliminated group.
@@ -52,7 +52,7 @@ pub enum AdjustError {
         /// Name of the residuals.
         residuals: String,
     },
-    /// There is no residual.
+    /// The problem has no residuals.
     #[error("there are no residuals")]
     NoResiduals,
     /// A parameter is NaN or infinite at the start.
@@ -60,23 +60,23 @@ pub enum AdjustError {
     NotFinite {
         /// Name of the group.
         group: String,
-        /// Number of the block.
+        /// Index of the block.
         block: usize,
     },
     /// A residual is not defined or not finite at the start.
-    #[error("{residuals} {item} is not defined at the start")]
+    #[error("{residuals} {item} is undefined at the start")]
     Undefined {
         /// Name of the residuals.
         residuals: String,
-        /// Number of the residual.
+        /// Index of the residual.
         item: usize,
     },
-    /// The residuals do not determine a block: nothing observes it, or the coordinate system is free.
+    /// The residuals do not determine a block: it is not observed, or the gauge is not fixed.
     #[error("{group} {block} is not determined by the residuals")]
     RankDeficient {
         /// Name of the group.
         group: String,
-        /// Number of the block: of several that are free together, the one that moves most.
+        /// Index of the block: the one with the largest component in the null direction.
         block: usize,
     },
 }

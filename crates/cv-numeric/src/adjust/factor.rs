@@ -1,4 +1,4 @@
-//! Cholesky factors of the reduced system, by faer: dense where it is full, else sparse and analyzed once.
+//! Cholesky factorization of the reduced system by faer: dense, or sparse with one symbolic analysis.
 
 use super::structure::{Pattern, Structure};
 use faer::linalg::solvers::{Llt, Solve};
@@ -6,10 +6,10 @@ use faer::sparse::linalg::solvers::{Llt as SparseLlt, SymbolicLlt};
 use faer::sparse::{SparseColMatRef, SymbolicSparseColMat};
 use faer::{Mat, MatMut, Side};
 
-/// The pattern of a reduced system, analyzed: order of elimination and fill-in.
+/// Symbolic analysis of a reduced system: elimination order and fill-in.
 pub(super) enum Analysis {
     Dense,
-    /// Lower triangle by columns, and its symbolic factor.
+    /// Sparsity pattern of the lower triangle (compressed columns), and its symbolic factor.
     Sparse {
         symbolic: SymbolicSparseColMat<usize>,
         factor: SymbolicLlt<usize>,
@@ -23,7 +23,7 @@ pub(super) enum Factor {
 }
 
 impl Analysis {
-    /// Of the free columns of the reduced system; `None` where memory is short.
+    /// Analyzes the free columns of the reduced system; `None` where memory is insufficient.
     pub(super) fn new(structure: &Structure) -> Option<Self> {
         if structure.pattern.dense {
             return Some(Self::Dense);
@@ -52,13 +52,13 @@ impl Analysis {
         Some(Self::Sparse { symbolic, factor })
     }
 
-    /// The factor of the free columns of `s`; `None` where it is not positive definite.
+    /// Factors the free columns of `s`; `None` where they are not positive definite.
     pub(super) fn factor(&self, structure: &Structure, s: &[f64]) -> Option<Factor> {
         match self {
             Self::Dense => {
                 let free = structure.free;
                 let mut full = Mat::<f64>::zeros(free, free);
-                for_columns(structure, s, |column, values| {
+                for_each_column(structure, s, |column, values| {
                     let height = free - column;
                     full.col_as_slice_mut(column)[column..].copy_from_slice(&values[..height]);
                 });
@@ -67,8 +67,8 @@ impl Analysis {
             Self::Sparse { symbolic, factor } => {
                 let mut values = Vec::with_capacity(symbolic.row_idx().len());
                 let starts = symbolic.col_ptr();
-                for_columns(structure, s, |column, of| {
-                    // Considered rows are the last ones.
+                for_each_column(structure, s, |column, of| {
+                    // Rows of considered columns are last and left out.
                     values.extend_from_slice(&of[..starts[column + 1] - starts[column]]);
                 });
                 let matrix = SparseColMatRef::new(symbolic.as_ref(), &values);
@@ -79,7 +79,7 @@ impl Analysis {
 }
 
 impl Factor {
-    /// Solves `S x = b` for as many right sides as there are, in place.
+    /// Solves `S x = b` in place for all right-hand sides, `b.len() / columns` of them.
     pub(super) fn solve(&self, columns: usize, b: &mut [f64]) {
         if columns == 0 || b.is_empty() {
             return;
@@ -92,8 +92,8 @@ impl Factor {
     }
 }
 
-/// Calls `visit` with each free column of the lower triangle: its number and its values, from the diagonal down.
-fn for_columns(structure: &Structure, s: &[f64], mut visit: impl FnMut(usize, &[f64])) {
+/// Calls `visit` with each free column of the lower triangle: its index and its values from the diagonal down.
+fn for_each_column(structure: &Structure, s: &[f64], mut visit: impl FnMut(usize, &[f64])) {
     let Pattern { start, height, .. } = &structure.pattern;
     for (b, block) in structure.blocks.iter().enumerate().take_while(|(_, b)| b.column < structure.free) {
         for c in 0..block.size {

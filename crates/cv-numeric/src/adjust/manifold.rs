@@ -1,23 +1,23 @@
-//! Parameters that are not vectors: how a block moves.
+//! Manifolds of parameter blocks: rotations, rigid motions, directions.
 
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
-/// The space that the parameters of a block live in.
+/// The manifold on which the parameters of a block live.
 ///
-/// A block is stored as [`Manifold::ambient`] numbers and moved by [`Manifold::tangent`] ones, its degrees of freedom, in
-/// coordinates around the point where it is (Hertzberg et al., "Integrating generic sensor fusion algorithms with sound state
+/// A block is stored as [`Manifold::ambient`] numbers and updated by a tangent vector of [`Manifold::tangent`] numbers, its degrees
+/// of freedom, in local coordinates at its present value (Hertzberg et al., "Integrating generic sensor fusion algorithms with sound state
 /// representations through encapsulation of manifolds", Information Fusion 2013). Derivatives of residuals are by the tangent
 /// coordinates at zero.
 pub trait Manifold: Send + Sync {
-    /// Numbers that store a block.
+    /// Ambient dimension: the numbers that store a block.
     fn ambient(&self) -> usize;
-    /// Degrees of freedom of a block, at most 64.
+    /// Tangent dimension: the degrees of freedom of a block, at most 64.
     fn tangent(&self) -> usize;
-    /// Writes `x` moved by `delta` to `moved`. Moving by zero gives `x`, up to rounding.
+    /// Writes `x ⊞ delta` (the retraction of the tangent vector `delta` at `x`) to `moved`. A zero `delta` gives `x`, up to rounding.
     fn step(&self, x: &[f64], delta: &[f64], moved: &mut [f64]);
 }
 
-/// Vectors of so many numbers.
+/// Euclidean space of the given dimension.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Euclidean(pub usize);
 
@@ -38,21 +38,21 @@ impl Manifold for Euclidean {
     }
 }
 
-/// Rotations, SO(3): nine numbers, the matrix by columns. Three degrees of freedom `ω`, in radians: `R ← exp([ω]×) R`.
+/// Rotations, SO(3): nine numbers, the matrix column-major. Three degrees of freedom `ω`, in radians: `R ← exp([ω]×) R`.
 ///
 /// The derivative of `R x` by `ω` is therefore `−[R x]×`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RotationManifold;
 
 impl RotationManifold {
-    /// The numbers of a rotation.
+    /// Converts a rotation to its nine numbers.
     pub fn store(rotation: &Rotation3<f64>) -> [f64; 9] {
         let mut numbers = [0.0; 9];
         numbers.copy_from_slice(rotation.matrix().as_slice());
         numbers
     }
 
-    /// The rotation that nine numbers store.
+    /// Converts nine numbers to the rotation.
     #[inline]
     pub fn load(x: &[f64]) -> Rotation3<f64> {
         Rotation3::from_matrix_unchecked(Matrix3::from_column_slice(&x[..9]))
@@ -69,14 +69,14 @@ impl Manifold for RotationManifold {
     }
 
     fn step(&self, x: &[f64], delta: &[f64], moved: &mut [f64]) {
-        let turned = Rotation3::new(Vector3::from_column_slice(&delta[..3])).into_inner() * Self::load(x).matrix();
-        // Products of rotations drift off the group by rounding; one step of Newton's iteration for the polar factor undoes it.
-        let back = turned * (Matrix3::identity() * 3.0 - turned.transpose() * turned) * 0.5;
-        moved[..9].copy_from_slice(back.as_slice());
+        let product = Rotation3::new(Vector3::from_column_slice(&delta[..3])).into_inner() * Self::load(x).matrix();
+        // Rounding makes products of rotations drift off SO(3); one Newton step for the polar factor re-orthogonalizes.
+        let orthogonal = product * (Matrix3::identity() * 3.0 - product.transpose() * product) * 0.5;
+        moved[..9].copy_from_slice(orthogonal.as_slice());
     }
 }
 
-/// Rigid motions `x ↦ R x + t`, SE(3): twelve numbers, the rotation's matrix by columns, then `t`. Six degrees of freedom `(ω, τ)`:
+/// Rigid motions `x ↦ R x + t`, SE(3): twelve numbers, the rotation matrix column-major, then `t`. Six degrees of freedom `(ω, τ)`:
 /// `R ← exp([ω]×) R`, `t ← t + τ`.
 ///
 /// The derivative of `R x + t` by `ω` is `−[R x]×`, that by `τ` the identity.
@@ -84,7 +84,7 @@ impl Manifold for RotationManifold {
 pub struct RigidMotion;
 
 impl RigidMotion {
-    /// The numbers of a motion.
+    /// Converts a rigid motion to its twelve numbers.
     pub fn store(rotation: &Rotation3<f64>, translation: &Vector3<f64>) -> [f64; 12] {
         let mut numbers = [0.0; 12];
         numbers[..9].copy_from_slice(rotation.matrix().as_slice());
@@ -92,7 +92,7 @@ impl RigidMotion {
         numbers
     }
 
-    /// Rotation and translation that twelve numbers store.
+    /// Converts twelve numbers to rotation and translation.
     #[inline]
     pub fn load(x: &[f64]) -> (Rotation3<f64>, Vector3<f64>) {
         (RotationManifold::load(x), Vector3::from_column_slice(&x[9..12]))
@@ -121,7 +121,7 @@ impl Manifold for RigidMotion {
 pub struct UnitVector;
 
 impl UnitVector {
-    /// Two unit vectors at right angles to `v` and to each other: the derivative of the direction by its degrees of freedom.
+    /// Returns an orthonormal basis of the tangent plane at `v`: the derivative of the direction by its degrees of freedom.
     #[inline]
     pub fn basis(v: &Vector3<f64>) -> [Vector3<f64>; 2] {
         let axis = if v.x.abs() < 0.6 { Vector3::x() } else { Vector3::y() };
@@ -146,8 +146,8 @@ impl Manifold for UnitVector {
     }
 }
 
-/// Motions between two views, `x ↦ R x + t` with a `t` of length one, as nothing tells how long it is: numbers as of [`RigidMotion`], five degrees of freedom: `ω` as there,
-/// then the two of [`UnitVector`] that turn `t`.
+/// Relative motions of two views up to scale, `x ↦ R x + t` with `‖t‖ = 1`: numbers as for [`RigidMotion`], five degrees of freedom:
+/// `ω` as there, then the two of [`UnitVector`] for `t`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RelativeMotion;
 
@@ -170,7 +170,7 @@ impl Manifold for RelativeMotion {
 mod tests {
     use super::*;
 
-    /// Moves a hundred times, and compares the first derivative with the one in the docstring.
+    /// Takes a hundred steps, and compares the first derivative with the documented one.
     #[test]
     fn steps_stay_on_the_manifold_and_have_the_documented_derivatives() {
         let r = Rotation3::new(Vector3::new(0.4, -0.9, 1.3));
@@ -201,7 +201,7 @@ mod tests {
             direction = next;
         }
         let (r, _) = RigidMotion::load(&state);
-        // A few roundings, not a hundred steps of them.
+        // A few roundings: drift does not accumulate over the hundred steps.
         assert!((r.matrix().transpose() * r.matrix() - Matrix3::identity()).norm() < 1e-15);
         assert!((Vector3::from(direction).norm() - 1.0).abs() < 1e-15);
     }

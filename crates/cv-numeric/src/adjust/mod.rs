@@ -1,9 +1,10 @@
 //! Sparse robust least squares over blocks of parameters: bundle adjustment, calibration, alignment.
 //!
-//! A problem has *groups* of blocks (poses, lenses, points), each with a name, a [`Manifold`] and the numbers of its blocks, and *kinds* of residuals
-//! ([`Residual`]), of which each item names the blocks it depends on. One group may be eliminated ([`Adjustment::eliminate`]): that of which there are many and
-//! of which no residual sees two, the points. What is left is solved densely where it is small or full, else by faer's sparse Cholesky
-//! factorization. [`Adjustment::solve`] moves the values to the least cost, [`Adjustment::covariance`] tells how well they are known.
+//! A problem has *groups* of parameter blocks (poses, lenses, points), each with a name, a [`Manifold`] and values, and *kinds* of
+//! residuals ([`Residual`]), whose items list the blocks they depend on. One group may be eliminated by the Schur complement
+//! ([`Adjustment::eliminate`]): the most numerous one, usually the points, of which a residual may depend on at most one. The reduced
+//! system is solved densely where it is small or full, else by faer's sparse Cholesky factorization. [`Adjustment::solve`] minimizes
+//! the cost, [`Adjustment::covariance`] computes covariances.
 //!
 //! ```
 //! use cv_numeric::RobustLoss;
@@ -52,7 +53,7 @@ use crate::RobustLoss;
 pub use covariance::Covariance;
 pub use error::AdjustError;
 pub use manifold::{Euclidean, Manifold, RelativeMotion, RigidMotion, RotationManifold, UnitVector};
-use residual::{Group, Kind, Typed, Values};
+use residual::{Group, ResidualKind, TypedResiduals, Values};
 pub use residual::{Prior, Residual, ResidualSums};
 pub use solve::{AdjustIteration, AdjustOptions, AdjustReport, Termination};
 
@@ -60,10 +61,10 @@ pub use solve::{AdjustIteration, AdjustOptions, AdjustReport, Termination};
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct GroupId(usize);
 
-/// A least-squares problem over blocks of parameters, and the values that they have. See the [module](self).
+/// A least-squares problem over parameter blocks, with their present values. See the [module](self).
 pub struct Adjustment<'a> {
     groups: Vec<Group<'a>>,
-    kinds: Vec<Box<dyn Kind + 'a>>,
+    kinds: Vec<Box<dyn ResidualKind + 'a>>,
     values: Values,
     eliminated: Option<usize>,
 }
@@ -76,10 +77,10 @@ impl Default for Adjustment<'_> {
 }
 
 impl<'a> Adjustment<'a> {
-    /// Adds a group of blocks; `values` are the numbers that store them, block after block. The name is for error messages.
+    /// Adds a group of blocks with their initial values, block after block. The name is for error messages.
     ///
     /// # Errors
-    /// [`AdjustError::Length`] where the values are not whole blocks, [`AdjustError::Size`] of blocks without or with more than 64 degrees of freedom.
+    /// [`AdjustError::Length`] where the values are not whole blocks, [`AdjustError::Size`] where blocks have no or more than 64 degrees of freedom.
     pub fn add_group(
         &mut self,
         name: &str,
@@ -99,7 +100,7 @@ impl<'a> Adjustment<'a> {
             manifold: Box::new(manifold),
             count,
             size,
-            held: vec![0; count],
+            fixed: vec![0; count],
             considered: Vec::new(),
         });
         self.values.numbers.push(values);
@@ -107,11 +108,11 @@ impl<'a> Adjustment<'a> {
         Ok(GroupId(self.groups.len() - 1))
     }
 
-    /// Adds residuals of one kind: item `i` depends on the blocks with the numbers `blocks[i]` of the `groups`. The name is for error messages.
+    /// Adds residuals of one kind: item `i` depends on the blocks `blocks[i]` of the `groups`. The name is for error messages.
     ///
     /// # Errors
-    /// [`AdjustError::Dimension`] where a group's blocks have other degrees of freedom than the residual's, [`AdjustError::Index`] of a block
-    /// that there is not.
+    /// [`AdjustError::Dimension`] where a group's blocks have other degrees of freedom than [`Residual::DIMS`], [`AdjustError::Index`]
+    /// where a block does not exist.
     pub fn add_residuals<const R: usize, const B: usize, const C: usize>(
         &mut self,
         name: &str,
@@ -121,9 +122,9 @@ impl<'a> Adjustment<'a> {
         loss: RobustLoss,
     ) -> Result<(), AdjustError> {
         let groups = groups.map(|g| g.0);
-        let typed = Typed { name: name.to_owned(), residual, groups, blocks, loss };
-        for (g, expected) in groups.into_iter().zip(dims(&typed)) {
-            let group = self.groups.get(g).ok_or_else(|| self.no_group(g))?;
+        let typed = TypedResiduals { name: name.to_owned(), residual, groups, blocks, loss };
+        for (g, expected) in groups.into_iter().zip(block_dimensions(&typed)) {
+            let group = self.groups.get(g).ok_or_else(|| self.group_error(g))?;
             if group.size != expected {
                 return Err(AdjustError::Dimension {
                     residuals: name.to_owned(),
@@ -142,13 +143,13 @@ impl<'a> Adjustment<'a> {
         Ok(())
     }
 
-    /// Eliminates the blocks of a group from the equations before they are solved (Schur complement): the group with most blocks. Every residual may depend on one of
-    /// them at most.
+    /// Marks a group for elimination from the normal equations by the Schur complement. Choose the group with the most blocks; a residual
+    /// may depend on at most one of them.
     ///
     /// # Errors
     /// [`AdjustError::Size`] where blocks have more than 6 degrees of freedom.
     pub fn eliminate(&mut self, group: GroupId) -> Result<(), AdjustError> {
-        let of = self.groups.get(group.0).ok_or_else(|| self.no_group(group.0))?;
+        let of = self.groups.get(group.0).ok_or_else(|| self.group_error(group.0))?;
         if of.size > 6 {
             return Err(AdjustError::Size { group: of.name.clone(), got: of.size, most: 6 });
         }
@@ -156,52 +157,53 @@ impl<'a> Adjustment<'a> {
         Ok(())
     }
 
-    /// Holds a block where it is.
+    /// Fixes a block at its present value.
     ///
     /// # Errors
     /// [`AdjustError::Index`] where there is no such block.
-    pub fn hold(&mut self, group: GroupId, block: usize) -> Result<(), AdjustError> {
+    pub fn fix(&mut self, group: GroupId, block: usize) -> Result<(), AdjustError> {
         self.check_block(group, block)?;
         let group = &mut self.groups[group.0];
-        group.held[block] = group.all();
+        group.fixed[block] = group.all_mask();
         Ok(())
     }
 
-    /// Holds some degrees of freedom of a block.
+    /// Fixes some degrees of freedom of a block.
     ///
     /// # Errors
     /// [`AdjustError::Index`] where there is no such block or degree of freedom.
-    pub fn hold_parameters(&mut self, group: GroupId, block: usize, parameters: &[usize]) -> Result<(), AdjustError> {
+    pub fn fix_parameters(&mut self, group: GroupId, block: usize, parameters: &[usize]) -> Result<(), AdjustError> {
         self.check_block(group, block)?;
         let group = &mut self.groups[group.0];
         for &index in parameters {
             if index >= group.size {
                 return Err(AdjustError::Index { name: group.name.clone(), index, len: group.size });
             }
-            group.held[block] |= 1 << index;
+            group.fixed[block] |= 1 << index;
         }
         Ok(())
     }
 
-    /// Lets a block move again that was held or considered.
+    /// Makes a fixed or considered block variable again.
     ///
     /// # Errors
     /// [`AdjustError::Index`] where there is no such block.
     pub fn release(&mut self, group: GroupId, block: usize) -> Result<(), AdjustError> {
         self.check_block(group, block)?;
-        self.groups[group.0].held[block] = 0;
+        self.groups[group.0].fixed[block] = 0;
         self.groups[group.0].considered.retain(|c| c.0 != block);
         Ok(())
     }
 
-    /// Holds a block where it is, and has [`Adjustment::covariance`] count what not knowing it better than to these standard deviations means for all
-    /// others: the covariance of an estimate that leaves something out (Schmidt, "Application of state-space methods to navigation problems", 1966).
-    /// Not for blocks of the eliminated group, which are then only held.
+    /// Fixes a block as a consider parameter: [`Adjustment::covariance`] propagates its uncertainty, given as standard deviations of its
+    /// degrees of freedom, to all other blocks (Schmidt, "Application of state-space methods to navigation problems", 1966). Blocks of
+    /// the eliminated group are only fixed.
     ///
     /// # Errors
-    /// [`AdjustError::Index`] where there is no such block, [`AdjustError::Length`] where there are not as many deviations as degrees of freedom.
+    /// [`AdjustError::Index`] where there is no such block, [`AdjustError::Length`] where the number of standard deviations is not that of the
+    /// degrees of freedom.
     pub fn consider(&mut self, group: GroupId, block: usize, deviations: &[f64]) -> Result<(), AdjustError> {
-        self.hold(group, block)?;
+        self.fix(group, block)?;
         let of = &mut self.groups[group.0];
         if deviations.len() != of.size {
             return Err(AdjustError::Length { group: of.name.clone(), got: deviations.len(), block: of.size });
@@ -213,7 +215,7 @@ impl<'a> Adjustment<'a> {
         Ok(())
     }
 
-    /// The numbers of one block.
+    /// Returns the present value of one block.
     ///
     /// # Errors
     /// [`AdjustError::Index`] where there is no such block.
@@ -223,15 +225,15 @@ impl<'a> Adjustment<'a> {
     }
 
     fn check_block(&self, group: GroupId, index: usize) -> Result<(), AdjustError> {
-        let of = self.groups.get(group.0).ok_or_else(|| self.no_group(group.0))?;
+        let of = self.groups.get(group.0).ok_or_else(|| self.group_error(group.0))?;
         if index < of.count { Ok(()) } else { Err(AdjustError::Index { name: of.name.clone(), index, len: of.count }) }
     }
 
-    fn no_group(&self, index: usize) -> AdjustError {
+    fn group_error(&self, index: usize) -> AdjustError {
         AdjustError::Index { name: "groups".to_owned(), index, len: self.groups.len() }
     }
 
-    /// Whether some residual depends on two blocks of the eliminated group.
+    /// Checks that no residual depends on two blocks of the eliminated group.
     fn check_eliminated(&self) -> Result<(), AdjustError> {
         for kind in &self.kinds {
             if kind.groups().iter().filter(|g| Some(**g) == self.eliminated).count() > 1 {
@@ -242,6 +244,8 @@ impl<'a> Adjustment<'a> {
     }
 }
 
-fn dims<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize>(_: &Typed<T, R, B, C>) -> [usize; B] {
+fn block_dimensions<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize>(
+    _: &TypedResiduals<T, R, B, C>,
+) -> [usize; B] {
     T::DIMS
 }

@@ -1,11 +1,11 @@
-//! Products of the small matrices that normal equations are summed of. Not generic over the residuals, so that they are compiled once, here: of sizes that are
-//! known where they are frequent, so that the sums stay in vector registers.
+//! Products of the small matrices that accumulate normal equations. Not generic over the residuals, so that they are compiled only once;
+//! tile sizes are compile-time constants, so that sums stay in vector registers.
 
-/// Columns that are worked on at once.
-const COLUMNS: usize = 8;
+/// Maximum number of left columns per tile.
+const LEFT_TILE_COLUMNS: usize = 8;
 
-/// Calls a function that is generic over a number of columns from 1 to [`COLUMNS`].
-macro_rules! of_size {
+/// Calls a function that is generic over a number of columns, 1 to [`LEFT_TILE_COLUMNS`].
+macro_rules! dispatch_columns {
     ($size:expr, $function:ident::<$first:tt>, $arguments:tt) => {
         match $size {
             1 => $function::<$first, 1> $arguments,
@@ -15,50 +15,53 @@ macro_rules! of_size {
             5 => $function::<$first, 5> $arguments,
             6 => $function::<$first, 6> $arguments,
             7 => $function::<$first, 7> $arguments,
-            _ => $function::<$first, COLUMNS> $arguments,
+            _ => $function::<$first, LEFT_TILE_COLUMNS> $arguments,
         }
     };
 }
 
-/// `out[c * height + a] += Σ_r left[r][a] · right[r][c]`, where `left` and `right` are columns (the first, and how many) of the same rows, which are `stride` long.
-/// The rows are added one after the other: those of many residuals at once give the same bytes as those of each by themselves.
+/// Accumulates `out[c * height + a] += Σ_r left[r][a] · right[r][c]`, where `left` and `right` are column ranges (first, count) of the
+/// same rows of `stride` numbers. Rows are added in order, so that batching residuals does not change a bit.
 pub(super) fn add_product(
     rows: (&[f64], usize),
-    (left, lefts): (usize, usize),
+    (left, left_count): (usize, usize),
     right: (usize, usize),
     out: &mut [f64],
     height: usize,
 ) {
-    for from in (0..lefts).step_by(COLUMNS) {
+    for from in (0..left_count).step_by(LEFT_TILE_COLUMNS) {
         let out = &mut out[from..];
-        of_size!(lefts - from, add_rows::<TILE>, (rows, left + from, right, out, height));
+        dispatch_columns!(
+            left_count - from,
+            add_product_tiles::<RIGHT_TILE_COLUMNS>,
+            (rows, left + from, right, out, height)
+        );
     }
 }
 
-/// Columns on the right that are summed together with those on the left: enough sums side by side that none waits for the one before it, and so few that they stay in
-/// sixteen registers of two numbers.
-const TILE: usize = 2;
+/// Number of right columns per tile: enough independent sums to hide latency, few enough for sixteen registers of two numbers.
+const RIGHT_TILE_COLUMNS: usize = 2;
 
-/// `L` columns on the left, `K` on the right at a time.
+/// Accumulates `L` left columns, `K` right columns at a time.
 #[inline(always)]
-fn add_rows<const K: usize, const L: usize>(
+fn add_product_tiles<const K: usize, const L: usize>(
     rows: (&[f64], usize),
     left: usize,
-    (right, rights): (usize, usize),
+    (right, right_count): (usize, usize),
     out: &mut [f64],
     height: usize,
 ) {
-    let whole = rights - rights % K;
+    let whole = right_count - right_count % K;
     for c in (0..whole).step_by(K) {
-        add_tile::<K, L>(rows, left, right + c, &mut out[c * height..], height);
+        add_product_tile::<K, L>(rows, left, right + c, &mut out[c * height..], height);
     }
-    for c in whole..rights {
-        add_tile::<1, L>(rows, left, right + c, &mut out[c * height..], height);
+    for c in whole..right_count {
+        add_product_tile::<1, L>(rows, left, right + c, &mut out[c * height..], height);
     }
 }
 
 #[inline(always)]
-fn add_tile<const K: usize, const L: usize>(
+fn add_product_tile<const K: usize, const L: usize>(
     (rows, stride): (&[f64], usize),
     left: usize,
     right: usize,
@@ -82,15 +85,20 @@ fn add_tile<const K: usize, const L: usize>(
     }
 }
 
-/// `out[a] += Σ_r left[r][a] · residuals[r]`, with `left` as of [`add_product`].
-pub(super) fn add_gradient(rows: (&[f64], usize), (left, lefts): (usize, usize), residuals: &[f64], out: &mut [f64]) {
-    for from in (0..lefts).step_by(COLUMNS) {
-        of_size!(lefts - from, add_times::<1>, (rows, left + from, residuals, &mut out[from..]));
+/// Accumulates `out[a] += Σ_r left[r][a] · residuals[r]`, with `left` as in [`add_product`].
+pub(super) fn add_gradient(
+    rows: (&[f64], usize),
+    (left, left_count): (usize, usize),
+    residuals: &[f64],
+    out: &mut [f64],
+) {
+    for from in (0..left_count).step_by(LEFT_TILE_COLUMNS) {
+        dispatch_columns!(left_count - from, add_gradient_tile::<1>, (rows, left + from, residuals, &mut out[from..]));
     }
 }
 
 #[inline(always)]
-fn add_times<const ONE: usize, const L: usize>(
+fn add_gradient_tile<const ONE: usize, const L: usize>(
     (rows, stride): (&[f64], usize),
     left: usize,
     residuals: &[f64],
@@ -106,18 +114,23 @@ fn add_times<const ONE: usize, const L: usize>(
     out[..L].copy_from_slice(&sum);
 }
 
-/// `y[c] = V⁻¹ w[·][c]` of `E` rows `w` of as many numbers as there are in `y`, one after the other.
+/// Computes `y[c] = V⁻¹ w[·][c]` for `E` consecutive rows `w` of `y.len()` numbers each.
 #[inline(always)]
-pub(super) fn times_inverse<const E: usize>(inverse: &[[f64; E]; E], w: &[f64], y: &mut [[f64; E]]) {
+pub(super) fn multiply_inverse<const E: usize>(inverse: &[[f64; E]; E], w: &[f64], y: &mut [[f64; E]]) {
     let size = y.len();
-    for from in (0..size).step_by(COLUMNS) {
-        of_size!(size - from, times_rows::<E>, (inverse, &w[from..], size, &mut y[from..]));
+    for from in (0..size).step_by(LEFT_TILE_COLUMNS) {
+        dispatch_columns!(size - from, multiply_inverse_tile::<E>, (inverse, &w[from..], size, &mut y[from..]));
     }
 }
 
-/// The first `A` numbers of rows that are `size` apart.
+/// Processes the first `A` numbers of rows of stride `size`.
 #[inline(always)]
-fn times_rows<const E: usize, const A: usize>(inverse: &[[f64; E]; E], w: &[f64], size: usize, y: &mut [[f64; E]]) {
+fn multiply_inverse_tile<const E: usize, const A: usize>(
+    inverse: &[[f64; E]; E],
+    w: &[f64],
+    size: usize,
+    y: &mut [[f64; E]],
+) {
     let mut rows = [[0.0; A]; E];
     for (k, row) in rows.iter_mut().enumerate() {
         row.copy_from_slice(&w[k * size..][..A]);
@@ -137,18 +150,18 @@ fn times_rows<const E: usize, const A: usize>(inverse: &[[f64; E]; E], w: &[f64]
     }
 }
 
-/// `out[c * height + a] −= Σ_k wide[k][a] · y[c][k]`, of `E` rows `wide`, one after the other.
+/// Computes `out[c * height + a] −= Σ_k wide[k][a] · y[c][k]` for `E` consecutive rows `wide`.
 #[inline(always)]
 pub(super) fn subtract_product<const E: usize>(wide: &[f64], y: &[[f64; E]], out: &mut [f64], height: usize) {
     let size = wide.len() / E;
-    for from in (0..size).step_by(COLUMNS) {
-        of_size!(size - from, subtract_rows::<E>, (&wide[from..], size, y, &mut out[from..], height));
+    for from in (0..size).step_by(LEFT_TILE_COLUMNS) {
+        dispatch_columns!(size - from, subtract_product_tile::<E>, (&wide[from..], size, y, &mut out[from..], height));
     }
 }
 
-/// The first `A` numbers of rows that are `size` apart.
+/// Processes the first `A` numbers of rows of stride `size`.
 #[inline(always)]
-fn subtract_rows<const E: usize, const A: usize>(
+fn subtract_product_tile<const E: usize, const A: usize>(
     wide: &[f64],
     size: usize,
     y: &[[f64; E]],
@@ -176,43 +189,49 @@ fn subtract_rows<const E: usize, const A: usize>(
 mod tests {
     use super::*;
 
-    /// Small whole numbers, whose products and sums are exact in any order.
+    /// Small integers, whose products and sums are exact in any order.
     fn numbers(n: usize, seed: usize) -> Vec<f64> {
         (0..n).map(|i| ((i * 37 + seed * 11 + i * i * 5) % 23) as f64 - 11.0).collect()
     }
 
     #[test]
-    fn sums_of_every_size_are_those_of_the_definition() {
-        for (count, lefts, rights) in [1, 2, 3].iter().flat_map(|r| (1..20).map(move |l| (*r, l, 1 + l * 5 % 7))) {
-            let (stride, height) = (lefts + rights + 3, lefts + 2);
-            let rows = numbers(count * stride, lefts);
-            let before = numbers(rights * height, 3);
+    fn accumulated_products_equal_the_definition_for_every_size() {
+        for (count, left_count, right_count) in
+            [1, 2, 3].iter().flat_map(|r| (1..20).map(move |l| (*r, l, 1 + l * 5 % 7)))
+        {
+            let (stride, height) = (left_count + right_count + 3, left_count + 2);
+            let rows = numbers(count * stride, left_count);
+            let before = numbers(right_count * height, 3);
             let mut out = before.clone();
-            let right = lefts + 2;
-            add_product((&rows, stride), (1, lefts), (right, rights), &mut out, height);
+            let right = left_count + 2;
+            add_product((&rows, stride), (1, left_count), (right, right_count), &mut out, height);
             for (at, (out, before)) in out.iter().zip(&before).enumerate() {
                 let (c, a) = (at / height, at % height);
                 let sum: f64 = (0..count).map(|r| rows[r * stride + 1 + a] * rows[r * stride + right + c]).sum();
-                assert_eq!(*out, before + if a < lefts { sum } else { 0.0 }, "{count} {lefts} {rights}: {c}, {a}");
+                assert_eq!(
+                    *out,
+                    before + if a < left_count { sum } else { 0.0 },
+                    "{count} {left_count} {right_count}: {c}, {a}"
+                );
             }
             let residuals = numbers(count, 5);
             let mut out = before.clone();
-            add_gradient((&rows, stride), (1, lefts), &residuals, &mut out);
+            add_gradient((&rows, stride), (1, left_count), &residuals, &mut out);
             for (a, (out, before)) in out.iter().zip(&before).enumerate() {
-                let times = |r: usize| if a < lefts { rows[r * stride + 1 + a] * residuals[r] } else { 0.0 };
-                assert_eq!(*out, before + (0..count).map(times).sum::<f64>(), "{count} {lefts}: gradient, {a}");
+                let times = |r: usize| if a < left_count { rows[r * stride + 1 + a] * residuals[r] } else { 0.0 };
+                assert_eq!(*out, before + (0..count).map(times).sum::<f64>(), "{count} {left_count}: gradient, {a}");
             }
         }
     }
 
     #[test]
-    fn differences_of_every_size_are_those_of_the_definition() {
+    fn subtracted_products_equal_the_definition_for_every_size() {
         let inverse = [[2.0, -1.0, 3.0], [-1.0, 5.0, 4.0], [3.0, 4.0, -7.0]];
         for (size, columns) in (1..20).map(|size| (size, 1 + size * 5 % 7)) {
             let (wide, own, height) = (numbers(3 * size, 1), numbers(3 * columns, 2), size + 2);
             let before = numbers(columns * height, 3);
             let (mut out, mut y) = (before.clone(), vec![[0.0; 3]; columns]);
-            times_inverse(&inverse, &own, &mut y);
+            multiply_inverse(&inverse, &own, &mut y);
             subtract_product(&wide, &y, &mut out, height);
             for (at, (out, before)) in out.iter().zip(&before).enumerate() {
                 let (c, a) = (at / height, at % height);

@@ -1,27 +1,27 @@
-//! Residuals of one kind: what they depend on, and their part of the normal equations.
+//! Residuals of one kind: their parameter blocks, and their contribution to the normal equations.
 
 use super::manifold::Manifold;
 use super::product::{add_gradient, add_product};
-use super::structure::{Links, NONE, Structure};
+use super::structure::{Incidence, NONE, Structure};
 use crate::RobustLoss;
 use crate::parallel_map;
 use nalgebra::{SMatrix, SVector};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Residuals of one kind: `R` numbers for each item, which depend on `B` blocks of parameters (1 to 4) with `C` degrees of freedom
-/// between them.
+/// Residuals of one kind: `R` components for each item, which depend on `B` parameter blocks (1 to 4) with `C` degrees of freedom
+/// in total.
 ///
-/// The sizes are known to the compiler, so that the loop over the items is compiled for each kind and allocates nothing. One
-/// block may be given twice to one residual.
+/// The sizes are compile-time constants, so that the loop over the items is monomorphized for each kind and allocates nothing. A
+/// residual may depend on the same block twice.
 pub trait Residual<const R: usize, const B: usize, const C: usize>: Send + Sync {
     /// Degrees of freedom of each block; they add up to `C`.
     const DIMS: [usize; B];
 
-    /// The residual of an item, given the numbers that store its blocks ([`Manifold::ambient`] of each). Where asked for, its
-    /// derivatives by the degrees of freedom of the blocks, side by side; `jacobian` comes filled with zeros.
+    /// Evaluates the residual of an item, given the values of its blocks ([`Manifold::ambient`] numbers each). Where `jacobian` is given
+    /// (zero on entry), also the derivatives by the blocks' degrees of freedom, side by side.
     ///
-    /// `None` where the residual is not defined, such as for a point behind a camera: a step there is not taken.
+    /// `None` where the residual is undefined, such as for a point behind a camera: the step is then rejected.
     fn evaluate(
         &self,
         item: usize,
@@ -30,11 +30,11 @@ pub trait Residual<const R: usize, const B: usize, const C: usize>: Send + Sync 
     ) -> Option<SVector<f64, R>>;
 }
 
-/// What is known of blocks of `N` numbers beforehand: residuals `(x − mean) · weight`, the weight one over the standard deviation in the
-/// unit of the other residuals.
+/// A Gaussian prior on blocks of `N` numbers: residuals `(x − mean) · weight`, the weight one over the standard deviation, in the unit of
+/// the other residuals.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Prior<const N: usize> {
-    /// Mean and weight of each number, of each item.
+    /// Means and weights of the `N` numbers of each item.
     pub items: Vec<([f64; N], [f64; N])>,
 }
 
@@ -58,11 +58,11 @@ impl<const N: usize> Residual<N, 1, N> for Prior<N> {
     }
 }
 
-/// The numbers of all blocks, by group.
+/// The values of all blocks, by group.
 #[derive(Debug, Clone)]
 pub(super) struct Values {
     pub(super) numbers: Vec<Vec<f64>>,
-    /// Numbers of a block, by group.
+    /// Ambient dimension of a block, by group.
     pub(super) ambient: Vec<usize>,
 }
 
@@ -81,21 +81,21 @@ pub struct ResidualSums {
     pub cost: f64,
     /// `Σ w ‖r‖²`, the weights `w = ρ'(‖r‖²)`.
     pub weighted_squares: f64,
-    /// `Σ w`, each residual counted with as many numbers as it has.
+    /// `Σ w` over residual components.
     pub weights: f64,
-    /// Count of numbers.
+    /// Number of residual components.
     pub count: usize,
 }
 
 impl ResidualSums {
-    /// Adds a residual of `numbers` numbers; its weight, or `None` where it is not finite.
+    /// Adds a residual of squared norm `squared`; returns its weight, or `None` where it is not finite.
     #[inline]
-    fn count_in(&mut self, loss: &RobustLoss, squared: f64, numbers: usize) -> Option<f64> {
+    fn add_residual(&mut self, loss: &RobustLoss, squared: f64, components: usize) -> Option<f64> {
         let weight = loss.weight(squared);
         self.cost += loss.value(squared);
         self.weighted_squares += weight * squared;
-        self.weights += weight * numbers as f64;
-        self.count += numbers;
+        self.weights += weight * components as f64;
+        self.count += components;
         squared.is_finite().then_some(weight)
     }
 
@@ -107,8 +107,8 @@ impl ResidualSums {
     }
 }
 
-/// The sum of parts in their order.
-fn total(parts: Vec<Result<ResidualSums, usize>>) -> Result<ResidualSums, usize> {
+/// Sums the parts in order.
+fn sum_in_order(parts: Vec<Result<ResidualSums, usize>>) -> Result<ResidualSums, usize> {
     let mut sums = ResidualSums::default();
     for part in parts {
         sums.add(&part?);
@@ -116,36 +116,37 @@ fn total(parts: Vec<Result<ResidualSums, usize>>) -> Result<ResidualSums, usize>
     Ok(sums)
 }
 
-/// How a robust loss enters the normal equations. The gradient is the same.
+/// The second-order model of a robust loss in the normal equations. The gradient is the same for all.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum LossModel {
-    /// By its weight alone (iteratively reweighted least squares): a parabola that lies above the loss.
+    /// Its weight alone (iteratively reweighted least squares): a quadratic that majorizes the loss.
     Weight,
-    /// By its weight across the residual, and along it by its curvature, as far as that is positive.
+    /// Triggs' correction: also its curvature along the residual, bounded from below by [`MIN_CURVATURE`].
     Curvature,
 }
 
-/// Least curvature along a residual, as a share of that across it: a loss that bends downward would make the normal equations indefinite, and one that is nearly straight
-/// makes steps too long. On a generated block of 100 photographs with Cauchy's loss 0.3 takes 17 iterations, 0.05 takes 22, and weights alone take 32.
-const LEAST_CURVATURE: f64 = 0.3;
+/// Minimum curvature of the loss along the residual, relative to that across it: negative curvature makes the normal equations indefinite,
+/// small curvature makes steps too long. On a synthetic block of 100 images with Cauchy loss, 0.3 takes 17 iterations, 0.05 takes 22,
+/// weights alone 32.
+const MIN_CURVATURE: f64 = 0.3;
 
-/// Residuals and derivatives of all items of a kind, multiplied by the square roots of their weights, in the order of [`Links::items`].
+/// Residuals and Jacobians of all items of a kind, multiplied by the square roots of their weights, in the order of [`Incidence::items`].
 #[derive(Debug, Clone, Default)]
-pub(super) struct Rows {
-    /// `R` numbers for each item.
+pub(super) struct WeightedRows {
+    /// `R` numbers per item.
     residuals: Vec<f64>,
-    /// `R` rows of `C` numbers for each item. Columns of held parameters are left out, the free ones of a block moved together; of eliminated
+    /// `R` rows of `C` numbers per item. Columns of fixed parameters are removed and the free ones of a block compacted; in eliminated
     /// blocks they are zero.
     jacobians: Vec<f64>,
 }
 
-/// An eliminated block's part of the normal equations.
+/// The contribution of one eliminated block to the normal equations.
 pub(super) struct PointSums<'a> {
     /// `E × E`.
     pub(super) v: &'a mut [f64],
     /// `E`.
     pub(super) g: &'a mut [f64],
-    /// Cross terms with the blocks that the point is seen with: for each `E` rows, as long as that has columns.
+    /// Cross terms with the reduced blocks that share residuals with the point: `E` rows per block, as long as the block has columns.
     pub(super) w: &'a mut [f64],
 }
 
@@ -158,34 +159,40 @@ pub(super) struct ColumnSums<'a> {
     pub(super) gradient: &'a mut [f64],
 }
 
-/// Items that one task works on; sums of tasks are added in order, so that the number of threads changes nothing.
-const CHUNK: usize = 256;
+/// Number of items per parallel task; sums of tasks are added in order, so that results do not depend on the number of threads.
+const ITEMS_PER_CHUNK: usize = 256;
 
-/// A kind of residuals, its type forgotten.
-pub(super) trait Kind: Send + Sync {
+/// A kind of residuals, type-erased.
+pub(super) trait ResidualKind: Send + Sync {
     fn name(&self) -> &str;
     fn len(&self) -> usize;
     /// Group of each block of a residual.
     fn groups(&self) -> &[usize];
-    /// Number within its group of each block of an item.
+    /// Index within its group of each block of an item.
     fn blocks(&self, item: usize) -> &[u32];
-    /// `Σ ρ(‖r‖²)`, infinite where a residual is not defined.
+    /// Computes `Σ ρ(‖r‖²)`, infinite where a residual is undefined.
     fn cost(&self, values: &Values) -> f64;
-    /// Fills the rows. An item that is not defined as the error.
-    fn linearize(&self, values: &Values, links: &Links, model: LossModel, rows: &mut Rows) -> Result<(), usize>;
-    /// Sums over the items. The first item that is not defined as the error.
+    /// Fills the rows. The error is an undefined item.
+    fn linearize(
+        &self,
+        values: &Values,
+        incidence: &Incidence,
+        model: LossModel,
+        rows: &mut WeightedRows,
+    ) -> Result<(), usize>;
+    /// Sums over the items. The error is the first undefined item.
     fn sums(&self, values: &Values) -> Result<ResidualSums, usize>;
-    /// Adds the places that see one eliminated block.
-    fn add_to_point(&self, rows: &Rows, links: &Links, places: Range<usize>, point: PointSums<'_>);
-    /// Adds the places that touch the columns of a task.
-    fn add_to_columns(&self, rows: &Rows, links: &Links, places: &[u32], columns: ColumnSums<'_>);
-    /// The numbers of an item and their common weight, for a plain reference.
+    /// Adds the residuals (slots) of one eliminated block.
+    fn add_to_point(&self, rows: &WeightedRows, incidence: &Incidence, slots: Range<usize>, point: PointSums<'_>);
+    /// Adds the residuals (slots) that involve the columns of a task.
+    fn add_to_columns(&self, rows: &WeightedRows, incidence: &Incidence, slots: &[u32], columns: ColumnSums<'_>);
+    /// Residual components of an item and their common weight, for the reference implementation.
     #[cfg(test)]
-    fn plain(&self, values: &Values, item: usize) -> (Vec<f64>, f64);
+    fn reference(&self, values: &Values, item: usize) -> (Vec<f64>, f64);
 }
 
-/// A kind of residuals with the blocks that its items depend on.
-pub(super) struct Typed<T, const R: usize, const B: usize, const C: usize> {
+/// A kind of residuals and the blocks that its items depend on.
+pub(super) struct TypedResiduals<T, const R: usize, const B: usize, const C: usize> {
     pub(super) name: String,
     pub(super) residual: T,
     pub(super) groups: [usize; B],
@@ -193,7 +200,7 @@ pub(super) struct Typed<T, const R: usize, const B: usize, const C: usize> {
     pub(super) loss: RobustLoss,
 }
 
-impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Typed<T, R, B, C> {
+impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> TypedResiduals<T, R, B, C> {
     /// First column of each block.
     const FIRST: [usize; B] = {
         let mut first = [0; B];
@@ -207,7 +214,7 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Typed
     };
 
     #[inline(always)]
-    fn at<'v>(&self, values: &'v Values, item: usize) -> [&'v [f64]; B] {
+    fn block_values<'v>(&self, values: &'v Values, item: usize) -> [&'v [f64]; B] {
         let blocks = &self.blocks[item];
         let mut all: [&[f64]; B] = [&[]; B];
         for (k, numbers) in all.iter_mut().enumerate() {
@@ -216,10 +223,10 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Typed
         all
     }
 
-    fn cost_of(&self, values: &Values, items: Range<usize>) -> f64 {
+    fn cost_of_range(&self, values: &Values, items: Range<usize>) -> f64 {
         let mut cost = 0.0;
         for item in items {
-            match self.residual.evaluate(item, self.at(values, item), None) {
+            match self.residual.evaluate(item, self.block_values(values, item), None) {
                 Some(r) => cost += self.loss.value(r.norm_squared()),
                 None => return f64::INFINITY,
             }
@@ -230,7 +237,7 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Typed
     fn linearize_chunk(
         &self,
         values: &Values,
-        links: &Links,
+        incidence: &Incidence,
         model: LossModel,
         items: &[u32],
         (jacobians, residuals): (&mut [f64], &mut [f64]),
@@ -239,14 +246,14 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Typed
         for (item, (jacobian, residual)) in items.iter().zip(rows) {
             let item = *item as usize;
             let mut j = SMatrix::<f64, R, C>::zeros();
-            let mut r = self.residual.evaluate(item, self.at(values, item), Some(&mut j)).ok_or(item)?;
+            let mut r = self.residual.evaluate(item, self.block_values(values, item), Some(&mut j)).ok_or(item)?;
             let squared = r.norm_squared();
             if !squared.is_finite() {
                 return Err(item);
             }
             let root = self.loss.weight(squared).sqrt();
             if model == LossModel::Curvature {
-                let along = self.loss.curvature(squared).max(LEAST_CURVATURE).sqrt();
+                let along = self.loss.curvature(squared).max(MIN_CURVATURE).sqrt();
                 if along != 1.0 && squared > 0.0 {
                     // J − (1 − β) r̂ r̂ᵀ J and r / β (Triggs et al., §4.3).
                     let by_residual = r.transpose() * j * ((1.0 - along) / squared);
@@ -260,25 +267,25 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Typed
                     jacobian[row * C + column] = root * j[(row, column)];
                 }
             }
-            if links.any_held {
-                self.leave_out_held(links, item, jacobian);
+            if incidence.has_fixed {
+                self.drop_fixed_columns(incidence, item, jacobian);
             }
         }
         Ok(())
     }
 
-    fn leave_out_held(&self, links: &Links, item: usize, jacobian: &mut [f64]) {
+    fn drop_fixed_columns(&self, incidence: &Incidence, item: usize, jacobian: &mut [f64]) {
         for k in 0..B {
-            let held = links.held(self.groups[k], self.blocks[item][k]);
-            if held == 0 {
+            let fixed = incidence.fixed(self.groups[k], self.blocks[item][k]);
+            if fixed == 0 {
                 continue;
             }
-            let compact = links.eliminated != Some(k);
+            let compact = incidence.eliminated != Some(k);
             for row in jacobian.chunks_exact_mut(C) {
                 let mut to = Self::FIRST[k];
                 for c in 0..T::DIMS[k] {
                     let value = row[Self::FIRST[k] + c];
-                    let free = held >> c & 1 == 0;
+                    let free = fixed >> c & 1 == 0;
                     if compact && free {
                         row[to] = value;
                         to += 1;
@@ -291,7 +298,7 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Typed
     }
 }
 
-impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Kind for Typed<T, R, B, C> {
+impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> ResidualKind for TypedResiduals<T, R, B, C> {
     fn name(&self) -> &str {
         &self.name
     }
@@ -309,51 +316,61 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Kind 
     }
 
     fn cost(&self, values: &Values) -> f64 {
-        let chunks = self.len().div_ceil(CHUNK);
-        let of = |c: usize| self.cost_of(values, c * CHUNK..((c + 1) * CHUNK).min(self.len()));
+        let chunks = self.len().div_ceil(ITEMS_PER_CHUNK);
+        let of =
+            |c: usize| self.cost_of_range(values, c * ITEMS_PER_CHUNK..((c + 1) * ITEMS_PER_CHUNK).min(self.len()));
         parallel_map(chunks, &of).iter().sum()
     }
 
-    fn linearize(&self, values: &Values, links: &Links, model: LossModel, rows: &mut Rows) -> Result<(), usize> {
+    fn linearize(
+        &self,
+        values: &Values,
+        incidence: &Incidence,
+        model: LossModel,
+        rows: &mut WeightedRows,
+    ) -> Result<(), usize> {
         rows.residuals.resize(self.len() * R, 0.0);
         rows.jacobians.resize(self.len() * R * C, 0.0);
-        let chunks = rows.jacobians.par_chunks_mut(CHUNK * R * C).zip(rows.residuals.par_chunks_mut(CHUNK * R));
-        let chunks = chunks.zip(links.items.par_chunks(CHUNK));
-        let failed = chunks.filter_map(|(out, items)| self.linearize_chunk(values, links, model, items, out).err());
+        let chunks = rows
+            .jacobians
+            .par_chunks_mut(ITEMS_PER_CHUNK * R * C)
+            .zip(rows.residuals.par_chunks_mut(ITEMS_PER_CHUNK * R));
+        let chunks = chunks.zip(incidence.items.par_chunks(ITEMS_PER_CHUNK));
+        let failed = chunks.filter_map(|(out, items)| self.linearize_chunk(values, incidence, model, items, out).err());
         failed.min().map_or(Ok(()), Err)
     }
 
     fn sums(&self, values: &Values) -> Result<ResidualSums, usize> {
         let chunk = |c: usize| {
             let mut sums = ResidualSums::default();
-            for item in c * CHUNK..((c + 1) * CHUNK).min(self.len()) {
-                let r = self.residual.evaluate(item, self.at(values, item), None).ok_or(item)?;
-                sums.count_in(&self.loss, r.norm_squared(), R).ok_or(item)?;
+            for item in c * ITEMS_PER_CHUNK..((c + 1) * ITEMS_PER_CHUNK).min(self.len()) {
+                let r = self.residual.evaluate(item, self.block_values(values, item), None).ok_or(item)?;
+                sums.add_residual(&self.loss, r.norm_squared(), R).ok_or(item)?;
             }
             Ok(sums)
         };
-        total(parallel_map(self.len().div_ceil(CHUNK), &chunk))
+        sum_in_order(parallel_map(self.len().div_ceil(ITEMS_PER_CHUNK), &chunk))
     }
 
     #[cfg(test)]
-    fn plain(&self, values: &Values, item: usize) -> (Vec<f64>, f64) {
-        let r = self.residual.evaluate(item, self.at(values, item), None).unwrap();
+    fn reference(&self, values: &Values, item: usize) -> (Vec<f64>, f64) {
+        let r = self.residual.evaluate(item, self.block_values(values, item), None).unwrap();
         (r.as_slice().to_vec(), self.loss.weight(r.norm_squared()))
     }
 
-    fn add_to_point(&self, rows: &Rows, links: &Links, places: Range<usize>, point: PointSums<'_>) {
-        let Some(e) = links.eliminated else { return };
+    fn add_to_point(&self, rows: &WeightedRows, incidence: &Incidence, slots: Range<usize>, point: PointSums<'_>) {
+        let Some(e) = incidence.eliminated else { return };
         let (size, first) = (T::DIMS[e], Self::FIRST[e]);
-        let mut places = places;
-        while !places.is_empty() {
-            let (place, count) = (places.start, links.run(places.clone(), B));
-            places.start += count;
-            let j = (&rows.jacobians[place * R * C..][..count * R * C], C);
+        let mut slots = slots;
+        while !slots.is_empty() {
+            let (slot, count) = (slots.start, incidence.run_length(slots.clone(), B));
+            slots.start += count;
+            let j = (&rows.jacobians[slot * R * C..][..count * R * C], C);
             add_product(j, (first, size), (first, size), point.v, size);
-            add_gradient(j, (first, size), &rows.residuals[place * R..][..count * R], point.g);
-            for (k, target) in links.targets(place, B).iter().enumerate() {
+            add_gradient(j, (first, size), &rows.residuals[slot * R..][..count * R], point.g);
+            for (k, target) in incidence.targets(slot, B).iter().enumerate() {
                 if k != e && target.block != NONE {
-                    let out = &mut point.w[size * target.place as usize + target.within as usize..];
+                    let out = &mut point.w[size * target.offset as usize + target.within as usize..];
                     let left = (Self::FIRST[k], target.width as usize);
                     add_product(j, left, (first, size), out, target.size as usize);
                 }
@@ -361,17 +378,17 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Kind 
         }
     }
 
-    fn add_to_columns(&self, rows: &Rows, links: &Links, places: &[u32], columns: ColumnSums<'_>) {
+    fn add_to_columns(&self, rows: &WeightedRows, incidence: &Incidence, slots: &[u32], columns: ColumnSums<'_>) {
         let ColumnSums { structure: Structure { pattern, blocks, .. }, blocks: range, values, gradient } = columns;
         let Some(first) = blocks.get(range.start) else { return };
         let (first_value, first_column) = (pattern.start[range.start], first.column);
-        let mut places = places;
-        while let Some(&place) = places.first() {
-            let (place, count) = (place as usize, links.run(places.iter().map(|p| *p as usize), B));
-            places = &places[count..];
-            let j = (&rows.jacobians[place * R * C..][..count * R * C], C);
-            let r = &rows.residuals[place * R..][..count * R];
-            let targets = links.targets(place, B);
+        let mut slots = slots;
+        while let Some(&slot) = slots.first() {
+            let (slot, count) = (slot as usize, incidence.run_length(slots.iter().map(|p| *p as usize), B));
+            slots = &slots[count..];
+            let j = (&rows.jacobians[slot * R * C..][..count * R * C], C);
+            let r = &rows.residuals[slot * R..][..count * R];
+            let targets = incidence.targets(slot, B);
             for (k, right) in targets.iter().enumerate() {
                 let b = right.block as usize;
                 if !range.contains(&b) {
@@ -383,7 +400,7 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Kind 
                 let height = pattern.height[b];
                 let values = &mut values[pattern.start[b] - first_value + within * height..];
                 for (l, left) in targets.iter().enumerate() {
-                    // The rest of the row is in the columns of the other blocks.
+                    // Lower triangle only.
                     if left.block != NONE && left.block >= right.block {
                         let row = if left.block == right.block { 0 } else { pattern.row(b, left.block) };
                         let out = &mut values[row + left.within as usize..];
@@ -395,22 +412,22 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Kind 
     }
 }
 
-/// A group of blocks: their name, how they move, and what of them is held.
+/// A group of blocks: name, manifold, and fixed degrees of freedom.
 pub(super) struct Group<'a> {
     pub(super) name: String,
     pub(super) manifold: Box<dyn Manifold + 'a>,
     pub(super) count: usize,
     /// Degrees of freedom of a block.
     pub(super) size: usize,
-    /// A bit for each degree of freedom that is held, of each block.
-    pub(super) held: Vec<u64>,
-    /// Blocks that are held but counted as uncertain in covariances: standard deviations of the degrees of freedom.
+    /// Bit mask of the fixed degrees of freedom, by block.
+    pub(super) fixed: Vec<u64>,
+    /// Consider parameters: block and standard deviations of its degrees of freedom.
     pub(super) considered: Vec<(usize, Vec<f64>)>,
 }
 
 impl Group<'_> {
-    /// All degrees of freedom.
-    pub(super) fn all(&self) -> u64 {
+    /// Returns the bit mask of all degrees of freedom.
+    pub(super) fn all_mask(&self) -> u64 {
         if self.size >= 64 { u64::MAX } else { (1 << self.size) - 1 }
     }
 }

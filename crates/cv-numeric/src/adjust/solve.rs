@@ -1,30 +1,30 @@
-//! Levenberg–Marquardt over blocks.
+//! Levenberg–Marquardt over parameter blocks.
 
 use super::error::AdjustError;
 use super::factor::Analysis;
-use super::normal::{FLOOR, Normal, Reduced};
+use super::normal::{DIAGONAL_FLOOR, Normal, Reduced};
 use super::residual::{LossModel, ResidualSums, Values};
 use super::structure::Structure;
 use super::{Adjustment, GroupId};
 use rayon::prelude::*;
 use std::ops::ControlFlow;
 
-/// When [`Adjustment::solve`] stops, and how it starts.
+/// Termination criteria and initial damping of [`Adjustment::solve`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct AdjustOptions {
-    /// Most linearizations. Default 100, that of COLMAP.
+    /// Maximum number of linearizations. Default 100, that of COLMAP.
     pub max_iterations: usize,
-    /// Damping at the start, relative to the diagonal. Default 1e-4, as in Ceres.
+    /// Initial damping, relative to the diagonal. Default 1e-4, as in Ceres.
     pub initial_damping: f64,
-    /// Stop where a step lowers the cost by less than this share. Default 1e-9: parameters are then within about 3e-5 of their
+    /// Relative decrease of the cost below which the solver stops. Default 1e-9: parameters are then within about 3e-5 of their
     /// standard deviations.
     pub cost_tolerance: f64,
-    /// Stop where no residual changes with any parameter: the largest cosine of the angle between the residuals and a column of their
+    /// Scaled gradient below which the solver stops: the largest cosine of the angle between the residuals and a column of their
     /// Jacobian. Default 1e-10.
     pub gradient_tolerance: f64,
-    /// Stop where the largest entry of a step is below this, in the parameters' unit. Default 1e-14.
+    /// Largest entry of a step below which the solver stops, in the parameters' unit. Default 1e-14.
     pub step_tolerance: f64,
 }
 
@@ -40,12 +40,12 @@ impl Default for AdjustOptions {
     }
 }
 
-/// Where an adjustment stands when it calls back, before each step is computed.
+/// State of the solver at a callback, before each step is computed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdjustIteration {
     /// Steps tried so far.
     pub steps: usize,
-    /// Linearizations so far, the first included.
+    /// Linearizations so far, including the first.
     pub iterations: usize,
     /// Cost at the present parameters, the lowest so far.
     pub cost: f64,
@@ -56,21 +56,21 @@ pub struct AdjustIteration {
 /// Why an adjustment ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Termination {
-    /// The cost no longer went down by more than [`AdjustOptions::cost_tolerance`].
+    /// The relative decrease of the cost was below [`AdjustOptions::cost_tolerance`].
     Cost,
     /// The gradient was below [`AdjustOptions::gradient_tolerance`].
     Gradient,
     /// The step was below [`AdjustOptions::step_tolerance`].
     Step,
-    /// No step went down, however short.
+    /// No step decreased the cost, even at maximum damping.
     NoStep,
-    /// [`AdjustOptions::max_iterations`] were made.
+    /// [`AdjustOptions::max_iterations`] was reached.
     Iterations,
-    /// The callback asked for it.
+    /// The callback stopped it.
     Stopped,
 }
 
-/// What [`Adjustment::solve`] did.
+/// Result of [`Adjustment::solve`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct AdjustReport {
     /// `Σ ρ(‖r‖²)` at the start.
@@ -86,53 +86,55 @@ pub struct AdjustReport {
 }
 
 impl AdjustReport {
-    /// Whether a minimum was reached, as near as asked for.
+    /// Whether a tolerance was met.
     pub fn converged(&self) -> bool {
         !matches!(self.termination, Termination::Iterations | Termination::Stopped)
     }
 }
 
-/// What of a step is needed to judge it.
+/// A candidate step and its predicted decrease.
 pub(super) struct Step {
-    /// Of the reduced system's columns, and of the eliminated blocks in the order in which they were given.
+    /// Step of the reduced system's columns, and of the eliminated blocks in their original order.
     pub(super) columns: Vec<f64>,
     pub(super) points: Vec<f64>,
-    /// By how much the linear model goes down.
+    /// Decrease of the cost that the quadratic model predicts.
     predicted: f64,
     largest: f64,
 }
 
-/// A step that lowers the cost by less than this share ends near a minimum: residuals hardly change any more, so that the curvature of their losses can be relied on.
-const NEAR: f64 = 0.01;
-/// A step that goes down by this many times its promise and more is lengthened, to so many times its length at the most: of many points, some have gone far enough by then. (On
-/// fountain-P11 with Cauchy's loss, 9 iterations then lead further down than 24 did; at 4 times, most are refused.)
-const LENGTHEN: f64 = 1.25;
-const LONGEST: f64 = 1.7;
-/// Least and most damping.
-const DAMPING: [f64; 2] = [1e-16, 1e16];
+/// Relative decrease of the cost below which the curvature of the losses is used: near a minimum residuals hardly change, so the
+/// curvature is reliable.
+const CURVATURE_RELATIVE_GAIN: f64 = 0.01;
+/// Gain ratio from which a step is extended, and the maximum extension factor. (On fountain-P11 with Cauchy loss, 9 iterations then
+/// decrease the cost more than 24 without; at a factor of 4 most extensions are rejected.)
+const MIN_EXTENSION_GAIN_RATIO: f64 = 1.25;
+const MAX_STEP_EXTENSION: f64 = 1.7;
+/// Bounds of the damping, relative to the diagonal.
+const MIN_DAMPING: f64 = 1e-16;
+const MAX_DAMPING: f64 = 1e16;
 
 impl Adjustment<'_> {
-    /// Minimizes `Σ ρ(‖r‖²)` from the present values, which are moved.
+    /// Minimizes `Σ ρ(‖r‖²)` from the present values, in place.
     ///
-    /// Levenberg–Marquardt with the damping of Nielsen ("Damping parameter in Marquardt's method", 1999) relative to the diagonal. Robust losses enter by their weights
-    /// (iteratively reweighted least squares), whose parabola lies above the cost wherever the start is; near the minimum, where that converges linearly only, by their curvature
-    /// along the residual as well (Triggs et al., "Bundle adjustment — a modern synthesis", 2000, §4.3), bounded so that `Σ JᵀJ` stays definite. Covariances are read from
-    /// the weights.
-    /// The eliminated group's blocks are solved for by the Schur complement. Each iteration costs O(residuals) and the factorization
-    /// of the reduced system, O(n³) of n parameters where that is dense.
+    /// Levenberg–Marquardt with the damping of Nielsen ("Damping parameter in Marquardt's method", 1999) relative to the diagonal. Robust
+    /// losses enter by their weights (iteratively reweighted least squares), a majorizer of the cost from any start. That converges only
+    /// linearly, so near the minimum their curvature along the residual is used too (Triggs et al., "Bundle adjustment — a modern
+    /// synthesis", 2000, §4.3), bounded so that `Σ JᵀJ` stays definite. Covariances use the weights.
+    /// The eliminated group is solved for by the Schur complement. Each iteration costs O(residuals) and the factorization
+    /// of the reduced system, O(n³) for n parameters where that is dense.
     ///
-    /// `on_iteration` is called before every step, and may end the adjustment where it stands. The values are never worse than at the
-    /// start, and the same at any number of threads.
+    /// `on_iteration` is called before every step and may stop the solver. The cost is never above that of the start, and the values do
+    /// not depend on the number of threads.
     ///
     /// # Errors
-    /// [`AdjustError::NoResiduals`]; [`AdjustError::NotFinite`] and [`AdjustError::Undefined`] of the start. The values are then as they were.
+    /// [`AdjustError::NoResiduals`]; [`AdjustError::NotFinite`] and [`AdjustError::Undefined`] for the start. The values are then unchanged.
     pub fn solve(
         &mut self,
         options: &AdjustOptions,
         mut on_iteration: impl FnMut(&AdjustIteration) -> ControlFlow<()> + Send,
     ) -> Result<AdjustReport, AdjustError> {
         self.check_start()?;
-        // On a thread of the pool, so that not every loop has to be handed over to it.
+        // Run on a thread of the pool, so that parallel loops need no hand-over to it.
         rayon::scope(|_| self.iterate(options, &mut on_iteration))
     }
 
@@ -171,7 +173,7 @@ impl Adjustment<'_> {
             let step = analysis.as_ref().and_then(|a| normal.step(&structure, a, damping, &mut reduced));
             let cost = match &step {
                 Some(step) if step.largest <= options.step_tolerance => return end(report, Termination::Step),
-                // What is left to gain is rounding.
+                // The predicted decrease is below rounding.
                 Some(step) if step.predicted <= f64::EPSILON * report.cost => return end(report, Termination::Cost),
                 Some(step) => {
                     self.move_by(&structure, step, &mut moved);
@@ -180,7 +182,7 @@ impl Adjustment<'_> {
                 None => f64::INFINITY,
             };
             let Some(mut step) = step.filter(|_| cost < report.cost) else {
-                // The weights' parabola lies above the cost, so that its step goes down where the other's did not.
+                // The weights' quadratic majorizes the cost, so its step decreases it where that of the curvature model did not.
                 if model == LossModel::Curvature {
                     model = LossModel::Weight;
                     if normal.linearize(&self.kinds, &structure, &self.values, model).is_ok() {
@@ -191,13 +193,13 @@ impl Adjustment<'_> {
                 }
                 damping *= growth;
                 growth *= 2.0;
-                if damping > DAMPING[1] {
+                if damping > MAX_DAMPING {
                     return end(report, Termination::NoStep);
                 }
                 continue;
             };
-            let kept = (report.cost - cost) / step.predicted;
-            let cost = self.lengthened(&structure, &mut step, kept, cost, &mut moved);
+            let gain_ratio = (report.cost - cost) / step.predicted;
+            let cost = self.extend_step(&structure, &mut step, gain_ratio, cost, &mut moved);
             let gain = report.cost - cost;
             std::mem::swap(&mut self.values, &mut moved);
             let done = gain < options.cost_tolerance * report.cost;
@@ -205,14 +207,14 @@ impl Adjustment<'_> {
             if done || report.iterations >= options.max_iterations {
                 return end(report, if done { Termination::Cost } else { Termination::Iterations });
             }
-            damping *= (1.0 - (2.0 * kept - 1.0).powi(3)).max(1.0 / 3.0);
-            damping = damping.max(DAMPING[0]);
+            damping *= (1.0 - (2.0 * gain_ratio - 1.0).powi(3)).max(1.0 / 3.0);
+            damping = damping.max(MIN_DAMPING);
             growth = 2.0;
-            // Where the curvature promised more than there was, residuals are not where it can be relied on.
-            let near = gain < NEAR * report.cost && kept > 0.75;
+            // A low gain ratio shows that the curvature model is not reliable here.
+            let near = gain < CURVATURE_RELATIVE_GAIN * report.cost && gain_ratio > 0.75;
             model = if near { LossModel::Curvature } else { LossModel::Weight };
             if normal.linearize(&self.kinds, &structure, &self.values, model).is_err() {
-                // The cost is finite here, so that only the derivatives can be at fault.
+                // The cost is finite here: only a derivative can be undefined.
                 return end(report, Termination::NoStep);
             }
             report.iterations += 1;
@@ -223,16 +225,23 @@ impl Adjustment<'_> {
         }
     }
 
-    /// Goes on along a step that went down by `kept` times what its parabola promised, to `cost` at `moved`: to where the parabola through that and the slope at the start is lowest, as far
-    /// as [`LONGEST`]. Gives back the cost at `moved` then.
+    /// Extends a step with a high gain ratio, which led to `cost` at `moved`: to the minimum of the parabola through that cost and the initial
+    /// slope, at most by [`MAX_STEP_EXTENSION`]. Keeps the better of both and returns the cost at `moved`.
     ///
-    /// The weights' parabola is steeper than the losses are, so that iteratively reweighted least squares stops short each time.
-    fn lengthened(&self, structure: &Structure, step: &mut Step, kept: f64, cost: f64, moved: &mut Values) -> f64 {
-        if kept < LENGTHEN {
+    /// The weights' quadratic is more curved than the losses, so that steps of iteratively reweighted least squares are too short.
+    fn extend_step(
+        &self,
+        structure: &Structure,
+        step: &mut Step,
+        gain_ratio: f64,
+        cost: f64,
+        moved: &mut Values,
+    ) -> f64 {
+        if gain_ratio < MIN_EXTENSION_GAIN_RATIO {
             return cost;
         }
-        // Of gain(α) = 2α − cα² in units of the promise, with gain(1) = kept.
-        let factor = 1.0 / (2.0 - kept).max(1.0 / LONGEST);
+        // Maximum of gain(α) = 2α − cα² in units of the predicted decrease, with gain(1) = gain_ratio.
+        let factor = 1.0 / (2.0 - gain_ratio).max(1.0 / MAX_STEP_EXTENSION);
         step.columns.iter_mut().chain(&mut step.points).for_each(|d| *d *= factor);
         let mut further = self.values.clone();
         self.move_by(structure, step, &mut further);
@@ -244,7 +253,7 @@ impl Adjustment<'_> {
         cost
     }
 
-    /// Sums over residuals at the present values, by kind in the order in which they were added.
+    /// Sums over the residuals at the present values, for each kind in the order of addition.
     ///
     /// # Errors
     /// As [`Adjustment::solve`].
@@ -272,18 +281,18 @@ impl Adjustment<'_> {
         AdjustError::Undefined { residuals: self.kinds[kind].name().to_owned(), item }
     }
 
-    /// Writes the values moved by a step.
+    /// Applies a step to the present values and writes the result to `moved`.
     fn move_by(&self, structure: &Structure, step: &Step, moved: &mut Values) {
         for block in &structure.blocks {
             for member in &block.members {
                 let group = &self.groups[member.group];
                 let n = self.values.ambient[member.group];
                 let free = &step.columns[block.column + member.within..][..member.width];
-                let held = group.held[member.block as usize];
+                let fixed = group.fixed[member.block as usize];
                 let mut delta = [0.0; 64];
                 let mut free = free.iter();
                 for (k, d) in delta[..group.size].iter_mut().enumerate() {
-                    if held >> k & 1 == 0 {
+                    if fixed >> k & 1 == 0 {
                         *d = free.next().copied().unwrap_or(0.0);
                     }
                 }
@@ -302,14 +311,14 @@ impl Adjustment<'_> {
         }
     }
 
-    /// The numbers of all blocks of a group, block after block.
+    /// Returns the values of all blocks of a group, block after block.
     pub fn values(&self, group: GroupId) -> &[f64] {
         &self.values.numbers[group.0]
     }
 }
 
 impl Normal {
-    /// The largest cosine of the angle between the residuals and a column of the Jacobian, `|g_i| / √(H_ii · cost)`.
+    /// Computes the largest cosine of the angle between the residuals and a column of the Jacobian, `|g_i| / √(H_ii · cost)`.
     fn cosine(&self, size: usize, cost: f64) -> f64 {
         let of = |g: f64, h: f64| if g == 0.0 { 0.0 } else { g.abs() / (h * cost).sqrt() };
         let columns = self.gradient.iter().zip(&self.diagonal).map(|(g, h)| of(*g, *h));
@@ -320,7 +329,7 @@ impl Normal {
         columns.chain(points).fold(0.0, f64::max)
     }
 
-    /// The damped step; `None` where the system is not positive definite.
+    /// Computes the damped step; `None` where the system is not positive definite.
     pub(super) fn step(
         &self,
         structure: &Structure,
@@ -335,7 +344,7 @@ impl Normal {
         }
         let by_rank = self.back_substitute(structure, reduced, &columns);
         // −2 gᵀδ − δᵀHδ of the damped system's solution (H + D) δ = −g is −gᵀδ + δᵀDδ.
-        let added = self.damped(damping);
+        let added = self.damping_terms(damping);
         let mut predicted: f64 =
             columns.iter().zip(&self.gradient).zip(&added).map(|((d, g), a)| d * (a * d - g)).sum();
         let mut points = Vec::new();
@@ -347,7 +356,7 @@ impl Normal {
             }
             let gradients = self.point_gradient.chunks_exact(e).zip(self.v.chunks_exact(e * e));
             for (d, (g, v)) in by_rank.chunks_exact(e).zip(gradients) {
-                let floor = FLOOR * (0..e).map(|k| v[k * e + k]).sum::<f64>();
+                let floor = DIAGONAL_FLOOR * (0..e).map(|k| v[k * e + k]).sum::<f64>();
                 predicted += (0..e).map(|k| d[k] * ((damping * v[k * e + k] + floor) * d[k] - g[k])).sum::<f64>();
             }
         }

@@ -1,32 +1,32 @@
-//! Which block meets which: the pattern of the normal equations, found once for a problem.
+//! Sparsity structure of the normal equations, computed once per problem.
 
-use super::residual::{Group, Kind};
-use super::schedule::{order, tasks};
+use super::residual::{Group, ResidualKind};
+use super::schedule::{elimination_order, partition_tasks};
 use std::collections::HashMap;
 use std::ops::Range;
 
-/// No block: held, or eliminated.
+/// No block of the reduced system: fixed or eliminated.
 pub(super) const NONE: u32 = u32::MAX;
-/// Most columns of a block of the reduced system.
-pub(super) const MOST_COLUMNS: usize = 64;
-/// Below this size a dense factorization is faster whatever the pattern.
-const SMALL: usize = 400;
-/// Above this share of the reduced system's blocks, its factor is about full.
-const FULL: f64 = 0.3;
+/// Maximum number of columns of a block of the reduced system.
+pub(super) const MAX_BLOCK_COLUMNS: usize = 64;
+/// Number of columns up to which a dense factorization is faster for any pattern.
+const MAX_DENSE_COLUMNS: usize = 400;
+/// Fraction of filled blocks in the reduced system above which its factor is nearly dense.
+const MAX_SPARSE_FILL: f64 = 0.3;
 
-/// Most residuals that are summed at once: so many that what they are added to is seldom fetched, and so few that their rows stay in the nearest cache.
-const RUN: usize = 32;
+/// Maximum number of residuals summed in one batch: enough to amortize loading the sums, few enough that their rows stay in the L1 cache.
+const MAX_RUN_LENGTH: usize = 32;
 
-/// Lists of different lengths, one after the other.
+/// Lists of different lengths in one array (compressed sparse rows).
 #[derive(Debug, Clone, Default)]
-pub(super) struct Lists<T> {
-    /// Where each list starts, and the end.
+pub(super) struct JaggedArray<T> {
+    /// Start of each list, and the end.
     start: Vec<u32>,
     items: Vec<T>,
 }
 
-impl<T: Copy> Lists<T> {
-    /// From pairs of list and item; the items of a list keep their order.
+impl<T: Copy> JaggedArray<T> {
+    /// Builds the lists from pairs of list index and item; the items of a list keep their order.
     fn from_pairs(lists: usize, fill: T, pairs: impl Iterator<Item = (u32, T)> + Clone) -> Self {
         let mut start = vec![0u32; lists + 1];
         for (list, _) in pairs.clone() {
@@ -55,66 +55,66 @@ impl<T: Copy> Lists<T> {
     }
 }
 
-/// Where a block of a residual goes.
+/// The columns of the reduced system that a block of a residual contributes to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Target {
+pub(super) struct TargetColumns {
     /// Block of the reduced system, or [`NONE`].
     pub(super) block: u32,
     /// First column within that block.
     pub(super) within: u16,
-    /// Columns.
+    /// Number of columns.
     pub(super) width: u16,
-    /// First column of that block among the blocks that the residual's eliminated block is seen with.
-    pub(super) place: u32,
-    /// Columns of that block.
+    /// Offset of that block's columns among the cross blocks of the residual's eliminated block.
+    pub(super) offset: u32,
+    /// Number of columns of that block.
     pub(super) size: u32,
 }
 
-/// What a kind of residuals touches. Its items are worked on in an order of their own, that of their places: where a group is eliminated, by the ranks of
-/// its blocks.
+/// Incidence of a kind of residuals and the blocks. Items are processed in the order of *slots*: where a group is eliminated, by the ranks
+/// of its blocks.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Links {
-    /// Which of a residual's blocks is eliminated.
+pub(super) struct Incidence {
+    /// Index of the eliminated block among a residual's blocks.
     pub(super) eliminated: Option<usize>,
-    pub(super) any_held: bool,
-    held: Vec<Vec<u64>>,
-    pub(super) targets: Vec<Target>,
-    /// The item of each place. What follows is by place.
+    pub(super) has_fixed: bool,
+    fixed: Vec<Vec<u64>>,
+    pub(super) targets: Vec<TargetColumns>,
+    /// The item of each slot. The following fields are by slot.
     pub(super) items: Vec<u32>,
-    /// Where the residuals of each eliminated block begin, by its rank, and the end.
+    /// First slot of each eliminated block, by its rank, and the end.
     point_start: Vec<u32>,
-    /// Residuals of each of [`Structure::tasks`].
-    pub(super) of_task: Lists<u32>,
+    /// Slots of each of [`Structure::tasks`].
+    pub(super) residuals_of_task: JaggedArray<u32>,
 }
 
-impl Links {
+impl Incidence {
     #[inline]
-    pub(super) fn targets(&self, place: usize, blocks: usize) -> &[Target] {
-        &self.targets[place * blocks..][..blocks]
+    pub(super) fn targets(&self, slot: usize, blocks: usize) -> &[TargetColumns] {
+        &self.targets[slot * blocks..][..blocks]
     }
 
-    /// How many of these places, which are ascending, from the first one on follow each other and depend on the same blocks: [`RUN`] at the most.
+    /// Counts the leading consecutive slots that depend on the same blocks, at most [`MAX_RUN_LENGTH`]. `slots` ascend.
     #[inline]
-    pub(super) fn run(&self, places: impl Iterator<Item = usize>, blocks: usize) -> usize {
-        let mut places = places.take(RUN);
-        let Some(first) = places.next() else { return 0 };
+    pub(super) fn run_length(&self, slots: impl Iterator<Item = usize>, blocks: usize) -> usize {
+        let mut slots = slots.take(MAX_RUN_LENGTH);
+        let Some(first) = slots.next() else { return 0 };
         let targets = self.targets(first, blocks);
-        1 + (first + 1..).zip(places).take_while(|(next, p)| next == p && self.targets(*p, blocks) == targets).count()
+        1 + (first + 1..).zip(slots).take_while(|(next, p)| next == p && self.targets(*p, blocks) == targets).count()
     }
 
-    /// Residuals of the eliminated block of a rank.
+    /// Slots of the residuals of the eliminated block of a rank.
     #[inline]
-    pub(super) fn of_point(&self, rank: usize) -> Range<usize> {
+    pub(super) fn residuals_of_point(&self, rank: usize) -> Range<usize> {
         self.point_start[rank] as usize..self.point_start[rank + 1] as usize
     }
 
     #[inline]
-    pub(super) fn held(&self, group: usize, block: u32) -> u64 {
-        self.held[group][block as usize]
+    pub(super) fn fixed(&self, group: usize, block: u32) -> u64 {
+        self.fixed[group][block as usize]
     }
 }
 
-/// A block of parameters within a block of the reduced system.
+/// A parameter block within a block of the reduced system.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Member {
     pub(super) group: usize,
@@ -123,7 +123,7 @@ pub(super) struct Member {
     pub(super) width: usize,
 }
 
-/// A block of the reduced system: blocks of parameters that occur in the same residuals, such as the pose and the lens of one photograph.
+/// A block of the reduced system: parameter blocks that occur in the same residuals, such as the pose and the lens of one image.
 #[derive(Debug, Clone, Default)]
 pub(super) struct ReducedBlock {
     pub(super) members: Vec<Member>,
@@ -131,51 +131,51 @@ pub(super) struct ReducedBlock {
     pub(super) size: usize,
 }
 
-/// A block of the reduced system that sees an eliminated block.
+/// A non-zero block of `W`: a block of the reduced system that shares residuals with an eliminated block.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Cell {
+pub(super) struct CrossBlock {
     pub(super) block: u32,
-    /// First of its columns among those of all that see the eliminated block.
-    pub(super) place: u32,
+    /// Offset of its columns among those of all cross blocks of the eliminated block.
+    pub(super) offset: u32,
     pub(super) size: u32,
 }
 
-/// The group that is eliminated. Its blocks are worked on in an order of their own, that of their ranks: blocks that are seen by the same blocks of the
-/// reduced system one after the other, so that what they are added to stays in the cache.
+/// The eliminated group, called points as in bundle adjustment. Points are processed in the order of their ranks, those with the same
+/// cross blocks consecutively, for cache locality.
 #[derive(Debug, Clone)]
 pub(super) struct Points {
     pub(super) group: usize,
     /// Degrees of freedom of a block.
     pub(super) size: usize,
     pub(super) count: usize,
-    /// The block of each rank, and the rank of each block. What follows is by rank.
+    /// The block of each rank, and the rank of each block. The following fields are by rank.
     pub(super) order: Vec<u32>,
     pub(super) rank: Vec<u32>,
-    /// A bit for each degree of freedom that is held, of each block.
-    pub(super) held: Vec<u64>,
-    /// The blocks of the reduced system that see each, ascending.
-    pub(super) cells: Lists<Cell>,
-    /// Where the cross terms of each start, and the end.
+    /// Bit mask of the fixed degrees of freedom.
+    pub(super) fixed: Vec<u64>,
+    /// Blocks of the reduced system that share residuals with the point, ascending.
+    pub(super) cross_blocks: JaggedArray<CrossBlock>,
+    /// Start of the cross terms, and the end.
     pub(super) start: Vec<usize>,
 }
 
-/// Lower triangle of the reduced system by block columns; blocks on the diagonal are whole.
+/// Sparsity pattern of the reduced system: lower triangle by block columns; diagonal blocks are stored in full.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Pattern {
-    /// Where each block column starts, and the end.
+    /// Start of each block column, and the end.
     pub(super) start: Vec<usize>,
-    /// Rows of each block column.
+    /// Number of rows of each block column.
     pub(super) height: Vec<usize>,
     /// Block and first row of each block of a column, ascending.
     pub(super) rows: Vec<Vec<(u32, u32)>>,
-    /// Whether all blocks are there.
+    /// Whether all blocks are non-zero.
     pub(super) dense: bool,
     /// First column of each block.
     column: Vec<usize>,
 }
 
 impl Pattern {
-    /// First row of block `other`, which is there, in the column of block `b`.
+    /// Returns the first row of block `other`, which must be non-zero, in the block column of `b`.
     #[inline]
     pub(super) fn row(&self, b: usize, other: u32) -> usize {
         if self.dense {
@@ -186,30 +186,30 @@ impl Pattern {
     }
 }
 
-/// All of it.
+/// The sparsity structure of a problem.
 #[derive(Debug, Clone)]
 pub(super) struct Structure {
     pub(super) points: Option<Points>,
     pub(super) blocks: Vec<ReducedBlock>,
-    /// Consecutive blocks of the reduced system whose columns are summed by one task: where each begins, and the end. What is added to an entry, and in
-    /// which order, does not depend on them.
+    /// Partition of the reduced system into tasks of consecutive blocks: first block of each, and the end. The order of summation into an
+    /// entry does not depend on it.
     pub(super) tasks: Vec<usize>,
-    /// For each task: the ranks of the eliminated blocks that its blocks see, ascending.
-    pub(super) seen: Lists<u32>,
-    pub(super) links: Vec<Links>,
+    /// For each task: the ranks of the eliminated blocks that share residuals with its blocks, ascending.
+    pub(super) points_of_task: JaggedArray<u32>,
+    pub(super) incidence: Vec<Incidence>,
     pub(super) pattern: Pattern,
-    /// Columns of the reduced system.
+    /// Number of columns of the reduced system.
     pub(super) columns: usize,
-    /// Those that are free; considered ones come after them.
+    /// Number of free columns; considered ones follow them.
     pub(super) free: usize,
-    /// Block of the reduced system and member of it of each block of parameters, by group; [`NONE`] where there is none.
-    pub(super) place: Vec<Vec<(u32, u32)>>,
+    /// Block of the reduced system and index of the member in it, for each parameter block by group; [`NONE`] where there is none.
+    pub(super) location: Vec<Vec<(u32, u32)>>,
     /// Standard deviations of the considered columns.
     pub(super) considered: Vec<f64>,
 }
 
-/// A block of parameters that is not eliminated, and moves or is considered.
-struct Unit {
+/// A parameter block that is not eliminated, and is variable or considered.
+struct ActiveBlock {
     group: usize,
     block: u32,
     width: usize,
@@ -217,138 +217,144 @@ struct Unit {
 }
 
 impl Structure {
-    /// `consider`: whether considered blocks are columns, or held.
+    /// Builds the structure. `consider`: whether considered blocks are columns, or fixed.
     pub(super) fn new(
         groups: &[Group<'_>],
-        kinds: &[Box<dyn Kind + '_>],
+        kinds: &[Box<dyn ResidualKind + '_>],
         eliminated: Option<usize>,
         consider: bool,
     ) -> Self {
-        let held: Vec<Vec<u64>> = groups
+        let fixed: Vec<Vec<u64>> = groups
             .iter()
             .enumerate()
             .map(|(g, group)| {
-                let mut held = group.held.clone();
+                let mut fixed = group.fixed.clone();
                 for &(block, _) in group.considered.iter().filter(|_| consider && Some(g) != eliminated) {
-                    held[block] = 0;
+                    fixed[block] = 0;
                 }
-                held
+                fixed
             })
             .collect();
-        let any_held = held.iter().flatten().any(|h| *h != 0);
+        let has_fixed = fixed.iter().flatten().any(|h| *h != 0);
         let position: Vec<Option<usize>> =
             kinds.iter().map(|k| eliminated.and_then(|e| k.groups().iter().position(|g| *g == e))).collect();
-        let (units, unit_of) = units(groups, kinds, eliminated, &held, consider);
+        let (active_blocks, active_index) = collect_active_blocks(groups, kinds, eliminated, &fixed, consider);
         let points = eliminated.map_or(0, |e| groups[e].count);
-        let witnesses = witnesses(kinds, &position, units.len(), &unit_of);
-        let (blocks, place, members) = merged(groups, &units, &unit_of, &witnesses);
+        let observed_points = collect_observed_points(kinds, &position, active_blocks.len(), &active_index);
+        let (blocks, location, members) = merge_blocks(groups, &active_blocks, &active_index, &observed_points);
         let columns: usize = blocks.iter().map(|b| b.size).sum();
         let (mut free, mut considered) = (columns, Vec::new());
         for (block, members) in blocks.iter().zip(&members) {
-            for unit in members {
-                if let Some(index) = units[*unit].considered {
+            for active in members {
+                if let Some(index) = active_blocks[*active].considered {
                     free = free.min(block.column);
-                    considered.extend_from_slice(&groups[units[*unit].group].considered[index].1);
+                    considered.extend_from_slice(&groups[active_blocks[*active].group].considered[index].1);
                 }
             }
         }
-        // The blocks of the reduced system that see each eliminated one: ascending, as the blocks are gone through in order.
-        let sights = blocks.iter().enumerate().zip(&members).flat_map(|((b, block), members)| {
-            witnesses[members[0]].iter().map(move |p| (*p, Cell { block: b as u32, place: 0, size: block.size as u32 }))
+        // Cross blocks of each eliminated block, ascending since the reduced blocks are visited in order.
+        let cross_pairs = blocks.iter().enumerate().zip(&members).flat_map(|((b, block), members)| {
+            observed_points[members[0]]
+                .iter()
+                .map(move |p| (*p, CrossBlock { block: b as u32, offset: 0, size: block.size as u32 }))
         });
-        let order = order(points, sights.clone());
+        let order = elimination_order(points, cross_pairs.clone());
         let mut rank = vec![0; points];
         order.iter().enumerate().for_each(|(r, p)| rank[*p as usize] = r as u32);
-        let sights = sights.map(|(p, cell)| (rank[p as usize], cell));
-        let mut cells = Lists::from_pairs(points, Cell { block: NONE, place: 0, size: 0 }, sights);
+        let cross_pairs = cross_pairs.map(|(p, cross_block)| (rank[p as usize], cross_block));
+        let mut cross_blocks =
+            JaggedArray::from_pairs(points, CrossBlock { block: NONE, offset: 0, size: 0 }, cross_pairs);
         let mut start = Vec::with_capacity(points + 1);
         start.push(0);
         let size = eliminated.map_or(0, |e| groups[e].size);
         for p in 0..points {
-            let mut place = 0;
-            for cell in &mut cells.items[cells.start[p] as usize..cells.start[p + 1] as usize] {
-                cell.place = place;
-                place += cell.size;
+            let mut offset = 0;
+            for cross_block in
+                &mut cross_blocks.items[cross_blocks.start[p] as usize..cross_blocks.start[p + 1] as usize]
+            {
+                cross_block.offset = offset;
+                offset += cross_block.size;
             }
-            start.push(start[p] + size * place as usize);
+            start.push(start[p] + size * offset as usize);
         }
-        let mut links: Vec<Links> = Vec::with_capacity(kinds.len());
+        let mut incidence: Vec<Incidence> = Vec::with_capacity(kinds.len());
         for (kind, position) in kinds.iter().zip(&position) {
             let mut targets = Vec::with_capacity(kind.len() * kind.groups().len());
             let (items, point_start) = match position {
                 Some(e) => {
                     let pairs = (0..kind.len()).map(|i| (rank[kind.blocks(i)[*e] as usize], i as u32));
-                    let of_point = Lists::from_pairs(points, 0, pairs);
-                    (of_point.items, of_point.start)
+                    let residuals_of_point = JaggedArray::from_pairs(points, 0, pairs);
+                    (residuals_of_point.items, residuals_of_point.start)
                 }
                 None => ((0..kind.len() as u32).collect(), Vec::new()),
             };
             for item in &items {
                 let ids = kind.blocks(*item as usize);
-                let around = position.map_or(&[][..], |e| cells.of(rank[ids[e] as usize] as usize));
+                let around = position.map_or(&[][..], |e| cross_blocks.of(rank[ids[e] as usize] as usize));
                 for (&group, &id) in kind.groups().iter().zip(ids) {
-                    let (block, member) = place[group][id as usize];
+                    let (block, member) = location[group][id as usize];
                     targets.push(if block == NONE {
-                        Target { block, within: 0, width: 0, place: 0, size: 0 }
+                        TargetColumns { block, within: 0, width: 0, offset: 0, size: 0 }
                     } else {
                         let member = &blocks[block as usize].members[member as usize];
-                        let cell = around.binary_search_by_key(&block, |c| c.block).map_or(0, |i| around[i].place);
-                        Target {
+                        let cross_block =
+                            around.binary_search_by_key(&block, |c| c.block).map_or(0, |i| around[i].offset);
+                        TargetColumns {
                             block,
                             within: member.within as u16,
                             width: member.width as u16,
-                            place: cell,
+                            offset: cross_block,
                             size: blocks[block as usize].size as u32,
                         }
                     });
                 }
             }
-            links.push(Links {
+            incidence.push(Incidence {
                 eliminated: *position,
-                any_held,
-                held: if any_held { held.clone() } else { Vec::new() },
+                has_fixed,
+                fixed: if has_fixed { fixed.clone() } else { Vec::new() },
                 targets,
                 items,
                 point_start,
-                of_task: Lists::default(),
+                residuals_of_task: JaggedArray::default(),
             });
         }
-        let pattern = pattern(&blocks, kinds, &links, &cells, columns);
-        let tasks = tasks(&blocks, kinds, &links, &cells);
+        let pattern = build_pattern(&blocks, kinds, &incidence, &cross_blocks, columns);
+        let tasks = partition_tasks(&blocks, kinds, &incidence, &cross_blocks);
         let mut task_of = vec![0; blocks.len()];
         tasks.windows(2).enumerate().for_each(|(t, range)| task_of[range[0]..range[1]].fill(t as u32));
-        for (kind, links) in kinds.iter().zip(&mut links) {
+        for (kind, incidence) in kinds.iter().zip(&mut incidence) {
             let n = kind.groups().len();
-            let task = |t: &Target| if t.block == NONE { NONE } else { task_of[t.block as usize] };
-            let touches = links.targets.chunks(n.max(1)).enumerate().flat_map(|(item, all)| {
+            let task = |t: &TargetColumns| if t.block == NONE { NONE } else { task_of[t.block as usize] };
+            let touches = incidence.targets.chunks(n.max(1)).enumerate().flat_map(|(item, all)| {
                 let first = move |k: &usize| all[..*k].iter().all(|t| task(t) != task(&all[*k]));
                 (0..n).filter(move |k| all[*k].block != NONE && first(k)).map(move |k| (task(&all[k]), item as u32))
             });
-            links.of_task = Lists::from_pairs(tasks.len() - 1, 0, touches);
+            incidence.residuals_of_task = JaggedArray::from_pairs(tasks.len() - 1, 0, touches);
         }
-        let seen = {
+        let points_of_task = {
             let pairs = (0..points).flat_map(|r| {
-                let task = |c: &Cell| task_of[c.block as usize];
-                cells.of(r).chunk_by(move |a, b| task(a) == task(b)).map(move |c| (task(&c[0]), r as u32))
+                let task = |c: &CrossBlock| task_of[c.block as usize];
+                cross_blocks.of(r).chunk_by(move |a, b| task(a) == task(b)).map(move |c| (task(&c[0]), r as u32))
             });
-            Lists::from_pairs(tasks.len() - 1, 0, pairs)
+            JaggedArray::from_pairs(tasks.len() - 1, 0, pairs)
         };
         let points = eliminated.map(|group| {
-            let held = order.iter().map(|p| groups[group].held[*p as usize]).collect();
-            Points { group, size, count: points, order, rank, held, cells, start }
+            let fixed = order.iter().map(|p| groups[group].fixed[*p as usize]).collect();
+            Points { group, size, count: points, order, rank, fixed, cross_blocks, start }
         });
-        Self { points, blocks, tasks, seen, links, pattern, columns, free, place, considered }
+        Self { points, blocks, tasks, points_of_task, incidence, pattern, columns, free, location, considered }
     }
 }
 
-/// The blocks that move or are considered, and their numbers by group and block.
-fn units(
+/// Collects the blocks that are variable or considered, and their indices by group and block.
+fn collect_active_blocks(
     groups: &[Group<'_>],
-    kinds: &[Box<dyn Kind + '_>],
+    kinds: &[Box<dyn ResidualKind + '_>],
     eliminated: Option<usize>,
-    held: &[Vec<u64>],
+    fixed: &[Vec<u64>],
     consider: bool,
-) -> (Vec<Unit>, Vec<Vec<u32>>) {
+) -> (Vec<ActiveBlock>, Vec<Vec<u32>>) {
     let mut touched: Vec<Vec<bool>> = groups.iter().map(|g| vec![false; g.count]).collect();
     for kind in kinds {
         for item in 0..kind.len() {
@@ -357,37 +363,37 @@ fn units(
             }
         }
     }
-    let mut units = Vec::new();
-    let mut unit_of: Vec<Vec<u32>> = groups.iter().map(|g| vec![NONE; g.count]).collect();
+    let mut active_blocks = Vec::new();
+    let mut active_index: Vec<Vec<u32>> = groups.iter().map(|g| vec![NONE; g.count]).collect();
     for (g, group) in groups.iter().enumerate().filter(|(g, _)| Some(*g) != eliminated) {
         for block in 0..group.count {
-            let width = group.size - held[g][block].count_ones() as usize;
+            let width = group.size - fixed[g][block].count_ones() as usize;
             if touched[g][block] && width > 0 {
-                unit_of[g][block] = units.len() as u32;
+                active_index[g][block] = active_blocks.len() as u32;
                 let considered = group.considered.iter().position(|c| c.0 == block).filter(|_| consider);
-                units.push(Unit { group: g, block: block as u32, width, considered });
+                active_blocks.push(ActiveBlock { group: g, block: block as u32, width, considered });
             }
         }
     }
-    (units, unit_of)
+    (active_blocks, active_index)
 }
 
-/// The eliminated blocks that each unit is seen with, ascending.
-fn witnesses(
-    kinds: &[Box<dyn Kind + '_>],
+/// Collects the eliminated blocks that share residuals with each active block, ascending.
+fn collect_observed_points(
+    kinds: &[Box<dyn ResidualKind + '_>],
     position: &[Option<usize>],
-    units: usize,
-    unit_of: &[Vec<u32>],
+    active_blocks: usize,
+    active_index: &[Vec<u32>],
 ) -> Vec<Vec<u32>> {
-    let mut lists = vec![Vec::new(); units];
+    let mut lists = vec![Vec::new(); active_blocks];
     for (kind, position) in kinds.iter().zip(position) {
         let Some(e) = *position else { continue };
         for item in 0..kind.len() {
             let ids = kind.blocks(item);
             for (&group, &block) in kind.groups().iter().zip(ids) {
-                let unit = unit_of[group][block as usize];
-                if unit != NONE {
-                    let list: &mut Vec<u32> = &mut lists[unit as usize];
+                let active = active_index[group][block as usize];
+                if active != NONE {
+                    let list: &mut Vec<u32> = &mut lists[active as usize];
                     if list.last() != Some(&ids[e]) {
                         list.push(ids[e]);
                     }
@@ -404,63 +410,71 @@ fn witnesses(
     lists
 }
 
-/// Units that are seen with the same eliminated blocks become one block of the reduced system. In order of their number of those, so that
-/// what is shared by many comes last, where a column has few rows; considered ones after all others. With the place of each block of
-/// parameters, and the units of each block.
-type Merged = (Vec<ReducedBlock>, Vec<Vec<(u32, u32)>>, Vec<Vec<usize>>);
-fn merged(groups: &[Group<'_>], units: &[Unit], unit_of: &[Vec<u32>], witnesses: &[Vec<u32>]) -> Merged {
+/// Blocks of the reduced system, the location of each parameter block, and the active blocks of each reduced block.
+type MergedBlocks = (Vec<ReducedBlock>, Vec<Vec<(u32, u32)>>, Vec<Vec<usize>>);
+/// Merges active blocks that share residuals with the same eliminated blocks into one block of the reduced system. Sorted by the number of
+/// eliminated blocks, so that shared parameters come last, where a column has few rows; considered blocks after all others.
+fn merge_blocks(
+    groups: &[Group<'_>],
+    active_blocks: &[ActiveBlock],
+    active_index: &[Vec<u32>],
+    observed_points: &[Vec<u32>],
+) -> MergedBlocks {
     let mut known: HashMap<(bool, &[u32]), usize> = HashMap::new();
     let mut sets: Vec<(Vec<usize>, usize)> = Vec::new();
-    for (u, unit) in units.iter().enumerate() {
-        let key = (unit.considered.is_some(), witnesses[u].as_slice());
+    for (u, active) in active_blocks.iter().enumerate() {
+        let key = (active.considered.is_some(), observed_points[u].as_slice());
         match known.get(&key) {
-            Some(&set) if !witnesses[u].is_empty() && sets[set].1 + unit.width <= MOST_COLUMNS => {
+            Some(&set) if !observed_points[u].is_empty() && sets[set].1 + active.width <= MAX_BLOCK_COLUMNS => {
                 sets[set].0.push(u);
-                sets[set].1 += unit.width;
+                sets[set].1 += active.width;
             }
             _ => {
                 known.insert(key, sets.len());
-                sets.push((vec![u], unit.width));
+                sets.push((vec![u], active.width));
             }
         }
     }
-    sets.sort_by_key(|(members, _)| (units[members[0]].considered.is_some(), witnesses[members[0]].len()));
-    let mut place: Vec<Vec<(u32, u32)>> = unit_of.iter().map(|g| vec![(NONE, 0); g.len()]).collect();
-    debug_assert_eq!(groups.len(), place.len());
+    sets.sort_by_key(|(members, _)| {
+        (active_blocks[members[0]].considered.is_some(), observed_points[members[0]].len())
+    });
+    let mut location: Vec<Vec<(u32, u32)>> = active_index.iter().map(|g| vec![(NONE, 0); g.len()]).collect();
+    debug_assert_eq!(groups.len(), location.len());
     let (mut blocks, mut column) = (Vec::with_capacity(sets.len()), 0);
     for (b, (members, size)) in sets.iter().enumerate() {
         let mut block = ReducedBlock { members: Vec::with_capacity(members.len()), column, size: *size };
         let mut within = 0;
         for (m, &u) in members.iter().enumerate() {
-            let unit = &units[u];
-            block.members.push(Member { group: unit.group, block: unit.block, within, width: unit.width });
-            place[unit.group][unit.block as usize] = (b as u32, m as u32);
-            within += unit.width;
+            let active = &active_blocks[u];
+            block.members.push(Member { group: active.group, block: active.block, within, width: active.width });
+            location[active.group][active.block as usize] = (b as u32, m as u32);
+            within += active.width;
         }
         column += size;
         blocks.push(block);
     }
-    (blocks, place, sets.into_iter().map(|s| s.0).collect())
+    (blocks, location, sets.into_iter().map(|s| s.0).collect())
 }
 
-fn pattern(
+/// Computes the non-zero blocks of the reduced system.
+fn build_pattern(
     blocks: &[ReducedBlock],
-    kinds: &[Box<dyn Kind + '_>],
-    links: &[Links],
-    cells: &Lists<Cell>,
+    kinds: &[Box<dyn ResidualKind + '_>],
+    incidence: &[Incidence],
+    cross_blocks: &JaggedArray<CrossBlock>,
     columns: usize,
 ) -> Pattern {
     let n = blocks.len();
-    // For each block: the rest of the lists that it stands in, and the residuals that it occurs in.
-    let tails = cells.iter().flat_map(|list| list.iter().enumerate().map(move |(i, c)| (c.block, &list[i..])));
-    let seen = Lists::from_pairs(n, &[][..], tails);
-    let items: Vec<Lists<&[Target]>> = kinds
+    // For each block: the tails, from it on, of the lists of cross blocks that contain it, and its residuals.
+    let tails = cross_blocks.iter().flat_map(|list| list.iter().enumerate().map(move |(i, c)| (c.block, &list[i..])));
+    let cross_block_tails = JaggedArray::from_pairs(n, &[][..], tails);
+    let items: Vec<JaggedArray<&[TargetColumns]>> = kinds
         .iter()
-        .zip(links)
-        .map(|(kind, links)| {
-            let items = links.targets.chunks(kind.groups().len().max(1));
+        .zip(incidence)
+        .map(|(kind, incidence)| {
+            let items = incidence.targets.chunks(kind.groups().len().max(1));
             let pairs = items.flat_map(|all| all.iter().filter(|t| t.block != NONE).map(move |t| (t.block, all)));
-            Lists::from_pairs(n, &[][..], pairs)
+            JaggedArray::from_pairs(n, &[][..], pairs)
         })
         .collect();
     let mut rows: Vec<Vec<u32>> = Vec::with_capacity(n);
@@ -474,13 +488,13 @@ fn pattern(
                 list.push(block);
             }
         };
-        seen.of(b).iter().copied().flatten().for_each(|c| add(c.block));
+        cross_block_tails.of(b).iter().copied().flatten().for_each(|c| add(c.block));
         items.iter().flat_map(|kind| kind.of(b)).copied().flatten().for_each(|t| add(t.block));
         list.sort_unstable();
         rows.push(list);
     }
     let filled = rows.iter().map(Vec::len).sum::<usize>() as f64;
-    let dense = columns <= SMALL || filled > FULL * 0.5 * (n * (n + 1)) as f64;
+    let dense = columns <= MAX_DENSE_COLUMNS || filled > MAX_SPARSE_FILL * 0.5 * (n * (n + 1)) as f64;
     if dense {
         rows = (0..n).map(|b| (b as u32..n as u32).collect()).collect();
     }

@@ -1,4 +1,4 @@
-//! The adjuster against plain references: dense normal equations from numeric derivatives, inverses, repeated noise.
+//! The solver against reference implementations: dense normal equations from numeric derivatives, inverses, repeated noise.
 
 use super::factor::Analysis;
 use super::normal::{Normal, Reduced};
@@ -8,11 +8,11 @@ use super::*;
 use nalgebra::{DMatrix, DVector, Rotation3, SMatrix, SVector, Vector2, Vector3};
 use std::ops::ControlFlow;
 
-fn go(_: &AdjustIteration) -> ControlFlow<()> {
+fn never_stop(_: &AdjustIteration) -> ControlFlow<()> {
     ControlFlow::Continue(())
 }
 
-/// Numbers from −1 to 1.
+/// Uniform random numbers from −1 to 1.
 struct Random(u64);
 
 impl Random {
@@ -35,7 +35,7 @@ impl Random {
     }
 }
 
-/// Pixels of points seen by cameras with a focal length and one radial coefficient.
+/// Reprojection errors of cameras with a focal length and one radial distortion coefficient.
 #[derive(Clone)]
 struct Reprojection(Vec<Vector2<f64>>);
 
@@ -79,8 +79,8 @@ struct Scene {
 }
 
 impl Scene {
-    /// Cameras on an arc around points in a cube, every point seen by `sights` of them.
-    fn new(seed: u64, cameras: usize, points: usize, sights: usize, own_lenses: bool) -> Self {
+    /// Cameras on an arc around points in a cube, every point observed by `views` of them.
+    fn new(seed: u64, cameras: usize, points: usize, views: usize, own_lenses: bool) -> Self {
         let mut random = Random(seed);
         let count = if own_lenses { cameras } else { 1 };
         let lenses = (0..count).flat_map(|_| [800.0 + 20.0 * random.next(), -0.05 + 0.01 * random.next()]).collect();
@@ -93,9 +93,9 @@ impl Scene {
         let points: Vec<f64> = (0..points * 3).map(|_| random.next()).collect();
         let mut scene = Self { poses, lenses, points, pixels: Vec::new(), blocks: Vec::new() };
         for p in 0..scene.points.len() / 3 {
-            for s in 0..sights {
+            for s in 0..views {
                 let c = (p * 7 + s * (1 + p % 3)) % cameras;
-                if scene.blocks.iter().rev().take(sights).any(|b| b[2] == p as u32 && b[0] == c as u32) {
+                if scene.blocks.iter().rev().take(views).any(|b| b[2] == p as u32 && b[0] == c as u32) {
                     continue;
                 }
                 scene.blocks.push([c as u32, if own_lenses { c as u32 } else { 0 }, p as u32]);
@@ -117,7 +117,7 @@ impl Scene {
         self
     }
 
-    /// The problem from a start that is off by `off`; the first pose and the scale held.
+    /// The problem from a start perturbed by `off`; the first pose and the scale fixed.
     fn problem(&self, off: f64, eliminate: bool, loss: RobustLoss) -> (Adjustment<'static>, [GroupId; 3]) {
         let mut random = Random(99);
         let mut poses = self.poses.clone();
@@ -144,22 +144,22 @@ impl Scene {
         if eliminate {
             problem.eliminate(groups[2]).unwrap();
         }
-        problem.hold(groups[0], 0).unwrap();
-        problem.hold_parameters(groups[0], 1, &[3]).unwrap();
+        problem.fix(groups[0], 0).unwrap();
+        problem.fix_parameters(groups[0], 1, &[3]).unwrap();
         (problem, groups)
     }
 }
 
 /// `H = Σ w JᵀJ` and `g = Σ w Jᵀr` with numeric derivatives by every free parameter, group after group.
-fn plain(scene: &Adjustment<'_>) -> (DMatrix<f64>, DVector<f64>) {
+fn reference(scene: &Adjustment<'_>) -> (DMatrix<f64>, DVector<f64>) {
     let mut free = Vec::new();
     for (g, group) in scene.groups.iter().enumerate() {
         for b in 0..group.count {
-            free.extend((0..group.size).filter(|k| group.held[b] >> k & 1 == 0).map(|k| (g, b, k)));
+            free.extend((0..group.size).filter(|k| group.fixed[b] >> k & 1 == 0).map(|k| (g, b, k)));
         }
     }
     let rows = |values: &Values| -> Vec<(f64, f64)> {
-        let items = scene.kinds.iter().flat_map(|kind| (0..kind.len()).map(move |i| kind.plain(values, i)));
+        let items = scene.kinds.iter().flat_map(|kind| (0..kind.len()).map(move |i| kind.reference(values, i)));
         items.flat_map(|(numbers, weight)| numbers.into_iter().map(move |r| (r, weight))).collect()
     };
     let (r, weights): (Vec<f64>, Vec<f64>) = rows(&scene.values).into_iter().unzip();
@@ -184,17 +184,17 @@ fn plain(scene: &Adjustment<'_>) -> (DMatrix<f64>, DVector<f64>) {
     (j.transpose() * &weighted, weighted.transpose() * at)
 }
 
-/// The largest difference as a share of the largest entry.
-fn apart(a: &DMatrix<f64>, b: &DMatrix<f64>) -> f64 {
+/// The largest difference relative to the largest entry.
+fn relative_difference(a: &DMatrix<f64>, b: &DMatrix<f64>) -> f64 {
     (a - b).amax() / b.amax()
 }
 
 #[test]
-fn exact_scenes_are_found_again() {
+fn exact_scenes_are_recovered() {
     for (own, eliminate) in [(true, true), (false, true), (false, false)] {
         let scene = Scene::new(3, 6, 60, 4, own);
         let (mut problem, groups) = scene.problem(0.02, eliminate, RobustLoss::Trivial);
-        let report = problem.solve(&AdjustOptions::default(), go).unwrap();
+        let report = problem.solve(&AdjustOptions::default(), never_stop).unwrap();
         // Rounding of pixels: 1e-13, squared, of 480 residuals.
         assert!(report.converged() && report.cost < 1e-20, "{report:?}");
         for (group, truth) in groups.into_iter().zip([&scene.poses, &scene.lenses, &scene.points]) {
@@ -206,11 +206,11 @@ fn exact_scenes_are_found_again() {
 }
 
 #[test]
-fn a_step_with_points_eliminated_is_that_of_the_whole_system() {
+fn a_step_by_schur_complement_equals_that_of_the_full_system() {
     for (own, loss) in [(true, RobustLoss::Trivial), (false, RobustLoss::Cauchy { scale: 1.0 })] {
         let scene = Scene::new(5, 5, 20, 3, own).noisy(8, 0.5);
         let (problem, groups) = scene.problem(0.01, true, loss);
-        let (mut h, g) = plain(&problem);
+        let (mut h, g) = reference(&problem);
         for i in 0..h.nrows() {
             h[(i, i)] *= 1.0 + 1e-3;
         }
@@ -221,7 +221,7 @@ fn a_step_with_points_eliminated_is_that_of_the_whole_system() {
         let step = normal.step(&structure, &Analysis::Dense, 1e-3, &mut reduced).unwrap();
         let mut ours = Vec::new();
         for group in &groups[..2] {
-            for &(block, member) in &structure.place[group.0] {
+            for &(block, member) in &structure.location[group.0] {
                 if block != structure::NONE {
                     let block = &structure.blocks[block as usize];
                     let member = block.members[member as usize];
@@ -237,44 +237,44 @@ fn a_step_with_points_eliminated_is_that_of_the_whole_system() {
 }
 
 #[test]
-fn covariances_are_the_inverse_of_the_whole_system() {
+fn covariances_equal_the_inverse_of_the_full_system() {
     for own in [true, false] {
         let scene = Scene::new(11, 5, 24, 4, own);
         let (problem, [poses, lenses, points]) = scene.problem(0.0, true, RobustLoss::Trivial);
-        // The start of `problem` has no distortion: it is as good a place as any.
-        let exact = plain(&problem).0.try_inverse().unwrap() * 0.25;
+        // At the start of `problem`, which has no distortion: any point would do.
+        let exact = reference(&problem).0.try_inverse().unwrap() * 0.25;
         let covariance = problem.covariance(0.25).unwrap();
         let (lens_count, first_lens) = (scene.lenses.len() / 2, 5 + 3 * 6);
         let part = |i: usize, j: usize, n: usize, m: usize| exact.view((i, j), (n, m)).into_owned();
         assert_eq!(covariance.of(poses, 0).unwrap().amax(), 0.0);
         let pose = covariance.of(poses, 2).unwrap();
         // Numeric derivatives to 1e-9, times the condition of the scaled system, about a thousand.
-        assert!(apart(&pose, &part(5, 5, 6, 6)) < 1e-5, "{own}");
+        assert!(relative_difference(&pose, &part(5, 5, 6, 6)) < 1e-5, "{own}");
         let lens = covariance.of(lenses, 0).unwrap();
-        assert!(apart(&lens, &part(first_lens, first_lens, 2, 2)) < 1e-5);
+        assert!(relative_difference(&lens, &part(first_lens, first_lens, 2, 2)) < 1e-5);
         let cross = covariance.between((lenses, 0), (points, 3)).unwrap();
         let first_point = first_lens + 2 * lens_count;
-        assert!(apart(&cross, &part(first_lens, first_point + 9, 2, 3)) < 1e-5);
+        assert!(relative_difference(&cross, &part(first_lens, first_point + 9, 2, 3)) < 1e-5);
         let cross = covariance.between((points, 2), (points, 3)).unwrap();
-        assert!(apart(&cross, &part(first_point + 6, first_point + 9, 3, 3)) < 1e-5);
+        assert!(relative_difference(&cross, &part(first_point + 6, first_point + 9, 3, 3)) < 1e-5);
         for (p, all) in covariance.of_group(points).into_iter().enumerate() {
             let truth = part(first_point + 3 * p, first_point + 3 * p, 3, 3);
-            assert!(apart(&all.unwrap(), &truth) < 1e-5);
-            assert!(apart(&covariance.of(points, p).unwrap(), &truth) < 1e-5);
+            assert!(relative_difference(&all.unwrap(), &truth) < 1e-5);
+            assert!(relative_difference(&covariance.of(points, p).unwrap(), &truth) < 1e-5);
         }
-        let held = covariance.of(poses, 1).unwrap();
-        assert_eq!(held.row(3).amax(), 0.0);
-        assert!(held[(4, 4)] > 0.0);
+        let fixed = covariance.of(poses, 1).unwrap();
+        assert_eq!(fixed.row(3).amax(), 0.0);
+        assert!(fixed[(4, 4)] > 0.0);
     }
 }
 
 #[test]
-fn errors_are_as_large_as_the_covariances_say() {
+fn errors_agree_with_the_covariances() {
     let (mut sum, mut within, mut count) = (0.0, 0.0, 0.0);
     for seed in 0..60 {
         let scene = Scene::new(17, 5, 40, 4, false).noisy(1000 + seed, 0.5);
         let (mut problem, [_, lenses, points]) = scene.problem(0.002, true, RobustLoss::Trivial);
-        problem.solve(&AdjustOptions::default(), go).unwrap();
+        problem.solve(&AdjustOptions::default(), never_stop).unwrap();
         let covariance = problem.covariance(problem.variance().unwrap()).unwrap();
         let mut add = |estimate: &[f64], truth: &[f64], c: DMatrix<f64>, limit: f64| {
             let d = DVector::from_iterator(truth.len(), estimate.iter().zip(truth).map(|(a, b)| a - b));
@@ -296,11 +296,11 @@ fn errors_are_as_large_as_the_covariances_say() {
 }
 
 #[test]
-fn a_tenth_of_wrong_observations_bends_nothing() {
+fn a_robust_loss_tolerates_ten_percent_outliers() {
     let mut scene = Scene::new(23, 6, 80, 5, false).noisy(4, 0.3);
     scene.pixels.iter_mut().step_by(10).for_each(|p| *p += Vector2::new(60.0, -45.0));
     let (mut problem, [poses, lenses, _]) = scene.problem(0.005, true, RobustLoss::Cauchy { scale: 1.0 });
-    problem.solve(&AdjustOptions::default(), go).unwrap();
+    problem.solve(&AdjustOptions::default(), never_stop).unwrap();
     // 0.3 px of noise in 400 observations make about 0.3 px/√400 of the focal length's 800 px, times ten for its weak base.
     assert!((problem.values(lenses)[0] / scene.lenses[0] - 1.0).abs() < 0.01, "{:?}", problem.values(lenses));
     for (pose, truth) in problem.values(poses).chunks(12).zip(scene.poses.chunks(12)) {
@@ -308,22 +308,22 @@ fn a_tenth_of_wrong_observations_bends_nothing() {
         assert!(turn < 0.01, "{turn}");
     }
     let (mut squares, [_, lenses, _]) = scene.problem(0.005, true, RobustLoss::Trivial);
-    squares.solve(&AdjustOptions::default(), go).unwrap();
-    // The reason to be robust.
+    squares.solve(&AdjustOptions::default(), never_stop).unwrap();
+    // Without a robust loss the focal length is off.
     assert!((squares.values(lenses)[0] / scene.lenses[0] - 1.0).abs() > 0.01);
 }
 
 #[test]
-fn what_is_held_does_not_move() {
+fn fixed_parameters_do_not_change() {
     let scene = Scene::new(31, 5, 30, 4, true).noisy(2, 0.5);
     let (mut problem, [poses, lenses, points]) = scene.problem(0.01, true, RobustLoss::Trivial);
-    problem.hold(points, 4).unwrap();
-    problem.hold_parameters(points, 5, &[1]).unwrap();
-    problem.hold_parameters(lenses, 2, &[0]).unwrap();
-    problem.hold(lenses, 3).unwrap();
+    problem.fix(points, 4).unwrap();
+    problem.fix_parameters(points, 5, &[1]).unwrap();
+    problem.fix_parameters(lenses, 2, &[0]).unwrap();
+    problem.fix(lenses, 3).unwrap();
     let before = |g| problem.values(g).to_vec();
     let (p, l, x) = (before(poses), before(lenses), before(points));
-    let report = problem.solve(&AdjustOptions::default(), go).unwrap();
+    let report = problem.solve(&AdjustOptions::default(), never_stop).unwrap();
     assert!(report.converged() && report.cost < 0.5 * report.initial_cost);
     assert_eq!(problem.values(poses)[..12], p[..12]);
     assert_eq!(problem.values(poses)[12 + 9], p[12 + 9]);
@@ -362,34 +362,33 @@ fn chain(n: u32) -> (Adjustment<'static>, GroupId) {
     blocks.extend((0..n).step_by(9).map(|i| [i, (i + 20) % n]));
     let steps = blocks.iter().map(|_| Vector2::new(random.next(), random.next())).collect();
     problem.add_residuals("steps", Between(steps), [positions; 2], blocks, RobustLoss::Trivial).unwrap();
-    problem.hold(positions, 0).unwrap();
+    problem.fix(positions, 0).unwrap();
     (problem, positions)
 }
 
 #[test]
-fn a_sparse_system_has_the_solution_and_covariance_of_the_dense_one() {
+fn a_sparse_system_has_the_solution_and_covariance_of_the_dense_system() {
     let (mut problem, positions) = chain(300);
     let structure = Structure::new(&problem.groups, &problem.kinds, None, false);
     assert!(!structure.pattern.dense);
-    let (h, g) = plain(&problem);
+    let (h, g) = reference(&problem);
     let inverse = h.try_inverse().unwrap();
     let exact = &inverse * -g;
     // Hardly damped, the first step of a linear problem is the solution.
-    problem.solve(&AdjustOptions { initial_damping: 1e-14, ..AdjustOptions::default() }, go).unwrap();
+    problem.solve(&AdjustOptions { initial_damping: 1e-14, ..AdjustOptions::default() }, never_stop).unwrap();
     let ours = DVector::from_column_slice(&problem.values(positions)[2..]);
     // Rounding times the condition of the chain, some 10⁴, and that of numeric derivatives.
     assert!((ours - exact).amax() < 1e-8);
     let covariance = problem.covariance(1.0).unwrap();
     let cross = covariance.between((positions, 120), (positions, 200)).unwrap();
-    assert!(apart(&cross, &inverse.view((2 * 119, 2 * 199), (2, 2)).into_owned()) < 1e-8);
+    assert!(relative_difference(&cross, &inverse.view((2 * 119, 2 * 199), (2, 2)).into_owned()) < 1e-8);
     let all = covariance.of_group(positions);
-    assert!(apart(all[150].as_ref().unwrap(), &inverse.view((298, 298), (2, 2)).into_owned()) < 1e-8);
+    assert!(relative_difference(all[150].as_ref().unwrap(), &inverse.view((298, 298), (2, 2)).into_owned()) < 1e-8);
     assert_eq!(all[0].as_ref().unwrap().amax(), 0.0);
 }
 
 #[test]
-fn one_block_may_be_given_twice() {
-    // (b − a) with a = b is constant, with three times the block it would be seen as two.
+fn a_residual_may_depend_on_a_block_twice() {
     struct Sum;
     impl Residual<1, 2, 2> for Sum {
         const DIMS: [usize; 2] = [1, 1];
@@ -408,21 +407,21 @@ fn one_block_may_be_given_twice() {
     let mut problem = Adjustment::default();
     let x = problem.add_group("x", Euclidean(1), vec![0.0]).unwrap();
     problem.add_residuals("sum", Sum, [x, x], vec![[0, 0]], RobustLoss::Trivial).unwrap();
-    problem.solve(&AdjustOptions::default(), go).unwrap();
+    problem.solve(&AdjustOptions::default(), never_stop).unwrap();
     // 3 x = 12, of which the variance is a ninth.
     assert!((problem.values(x)[0] - 4.0).abs() < 1e-9);
     assert!((problem.covariance(1.0).unwrap().of(x, 0).unwrap()[(0, 0)] - 1.0 / 9.0).abs() < 1e-12);
 }
 
 #[test]
-fn what_is_considered_widens_what_depends_on_it() {
-    // By hand: b is measured at 3 from a with variance 1; a is known to 2 only. Then var b = 1 + 4, cov(a, b) = 4.
+fn consider_parameters_increase_the_variance_of_dependent_ones() {
+    // By hand: b is measured at 3 from a with variance 1; a has a standard deviation of 2. Then var b = 1 + 4, cov(a, b) = 4.
     let mut problem = Adjustment::default();
     let x = problem.add_group("x", Euclidean(2), vec![0.0; 4]).unwrap();
     let steps = Between(vec![Vector2::new(3.0, 0.0)]);
     problem.add_residuals("steps", steps, [x, x], vec![[0, 1]], RobustLoss::Trivial).unwrap();
     problem.consider(x, 0, &[2.0, 0.5]).unwrap();
-    problem.solve(&AdjustOptions::default(), go).unwrap();
+    problem.solve(&AdjustOptions::default(), never_stop).unwrap();
     assert!((problem.values(x)[2] - 3.0).abs() < 1e-6 && problem.values(x)[0] == 0.0);
     let covariance = problem.covariance(1.0).unwrap();
     let near = |m: DMatrix<f64>, x: f64, y: f64| {
@@ -436,26 +435,26 @@ fn what_is_considered_widens_what_depends_on_it() {
 }
 
 #[test]
-fn priors_pull_by_their_weight() {
+fn priors_are_averaged_by_their_weights() {
     // x measured at 1 with weight 1 and at 4 with weight 1/2: the mean by weights squared is 1.6.
     let mut problem = Adjustment::default();
     let x = problem.add_group("x", Euclidean(1), vec![9.0]).unwrap();
     let prior = Prior { items: vec![([1.0], [1.0]), ([4.0], [0.5])] };
     problem.add_residuals("prior", prior, [x], vec![[0]; 2], RobustLoss::Trivial).unwrap();
-    let report = problem.solve(&AdjustOptions::default(), go).unwrap();
+    let report = problem.solve(&AdjustOptions::default(), never_stop).unwrap();
     assert!((problem.values(x)[0] - 1.6).abs() < 1e-6 && report.cost <= report.initial_cost);
     let sums = problem.residual_sums().unwrap();
     assert!((sums[0].cost - (0.36 + 1.44)).abs() < 1e-9 && sums[0].count == 2);
 }
 
 #[test]
-fn the_same_bytes_on_one_thread_and_on_four() {
+fn results_are_identical_on_one_thread_and_on_four() {
     let scene = Scene::new(41, 9, 700, 4, true).noisy(6, 0.5);
     let run = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| {
             let (mut problem, groups) = scene.problem(0.01, true, RobustLoss::Huber { scale: 1.0 });
-            let report = problem.solve(&AdjustOptions::default(), go).unwrap();
+            let report = problem.solve(&AdjustOptions::default(), never_stop).unwrap();
             let covariance = problem.covariance(1.0).unwrap().of_group(groups[2]);
             let covariance: Vec<f64> = covariance.into_iter().flat_map(|c| c.unwrap().as_slice().to_vec()).collect();
             (groups.map(|g| problem.values(g).to_vec()), report, covariance)
@@ -465,7 +464,7 @@ fn the_same_bytes_on_one_thread_and_on_four() {
 }
 
 #[test]
-fn a_callback_ends_it_where_it_stands() {
+fn a_callback_stops_the_solver_at_the_present_values() {
     let scene = Scene::new(43, 5, 30, 4, false).noisy(6, 0.5);
     let (mut problem, _) = scene.problem(0.02, true, RobustLoss::Trivial);
     let mut costs = Vec::new();
@@ -483,7 +482,7 @@ fn a_callback_ends_it_where_it_stands() {
 }
 
 #[test]
-fn what_is_not_determined_is_named_and_left_where_it_is() {
+fn undetermined_blocks_are_reported_and_left_unchanged() {
     let mut scene = Scene::new(47, 5, 30, 4, false).noisy(6, 0.2);
     // Point 7 is seen by one camera, point 9 by none.
     let mut seen = false;
@@ -502,7 +501,7 @@ fn what_is_not_determined_is_named_and_left_where_it_is() {
     scene.pixels.retain(|_| *kept.next().unwrap());
     let (mut problem, [poses, _, points]) = scene.problem(0.005, true, RobustLoss::Trivial);
     let before = problem.block(points, 9).unwrap().to_vec();
-    assert!(problem.solve(&AdjustOptions::default(), go).unwrap().converged());
+    assert!(problem.solve(&AdjustOptions::default(), never_stop).unwrap().converged());
     assert_eq!(problem.block(points, 9).unwrap(), before);
     let covariance = problem.covariance(1.0).unwrap();
     for p in [7, 9] {
@@ -511,37 +510,37 @@ fn what_is_not_determined_is_named_and_left_where_it_is() {
     }
     assert!(covariance.of(points, 8).is_ok());
     assert_eq!(covariance.of_group(points).iter().filter(|c| c.is_err()).count(), 2);
-    // Nothing fixes the coordinate system.
+    // The gauge is not fixed.
     problem.release(poses, 0).unwrap();
     problem.release(poses, 1).unwrap();
     let error = problem.covariance(1.0).err();
     assert!(matches!(&error, Some(AdjustError::RankDeficient { group, .. }) if group == "poses"), "{error:?}");
-    // The damped solution needs no fixed coordinate system.
-    assert!(problem.solve(&AdjustOptions::default(), go).unwrap().converged());
+    // The damped solution needs no fixed gauge.
+    assert!(problem.solve(&AdjustOptions::default(), never_stop).unwrap().converged());
 }
 
 #[test]
-fn a_start_that_is_no_start_is_refused_and_left_as_it_is() {
+fn an_invalid_start_is_refused_and_left_unchanged() {
     let scene = Scene::new(53, 5, 20, 4, false);
     let (mut problem, [_, _, points]) = scene.problem(0.01, true, RobustLoss::Trivial);
     problem.values.numbers[points.0][3 * 6 + 2] = -50.0;
-    let error = problem.solve(&AdjustOptions::default(), go).err();
+    let error = problem.solve(&AdjustOptions::default(), never_stop).err();
     assert!(
         matches!(&error, Some(AdjustError::Undefined { residuals, item }) if residuals == "observations" && scene.blocks[*item][2] == 6)
     );
     problem.values.numbers[points.0][3 * 6 + 2] = f64::NAN;
-    let error = problem.solve(&AdjustOptions::default(), go).err();
+    let error = problem.solve(&AdjustOptions::default(), never_stop).err();
     assert_eq!(error, Some(AdjustError::NotFinite { group: "points".to_owned(), block: 6 }));
     let mut empty = Adjustment::default();
     let x = empty.add_group("x", Euclidean(2), vec![0.0; 2]).unwrap();
-    assert_eq!(empty.solve(&AdjustOptions::default(), go).err(), Some(AdjustError::NoResiduals));
+    assert_eq!(empty.solve(&AdjustOptions::default(), never_stop).err(), Some(AdjustError::NoResiduals));
     assert!(matches!(
         empty.add_group("y", Euclidean(3), vec![0.0; 4]),
         Err(AdjustError::Length { got: 4, block: 3, .. })
     ));
     assert!(matches!(empty.add_group("y", Euclidean(0), vec![]), Err(AdjustError::Size { got: 0, .. })));
-    assert!(matches!(empty.hold(x, 1), Err(AdjustError::Index { index: 1, len: 1, .. })));
-    assert!(matches!(empty.hold_parameters(x, 0, &[2]), Err(AdjustError::Index { index: 2, len: 2, .. })));
+    assert!(matches!(empty.fix(x, 1), Err(AdjustError::Index { index: 1, len: 1, .. })));
+    assert!(matches!(empty.fix_parameters(x, 0, &[2]), Err(AdjustError::Index { index: 2, len: 2, .. })));
     let steps = || Between(vec![Vector2::zeros()]);
     let add = empty.add_residuals("steps", steps(), [x, x], vec![[0, 3]], RobustLoss::Trivial);
     assert!(matches!(add, Err(AdjustError::Index { index: 3, .. })));
@@ -550,6 +549,6 @@ fn a_start_that_is_no_start_is_refused_and_left_as_it_is() {
     assert!(matches!(add, Err(AdjustError::Dimension { expected: 2, got: 3, .. })));
     empty.add_residuals("steps", steps(), [x, x], vec![[0, 0]], RobustLoss::Trivial).unwrap();
     empty.eliminate(x).unwrap();
-    let error = empty.solve(&AdjustOptions::default(), go).err();
+    let error = empty.solve(&AdjustOptions::default(), never_stop).err();
     assert_eq!(error, Some(AdjustError::TwoEliminated { residuals: "steps".to_owned() }));
 }

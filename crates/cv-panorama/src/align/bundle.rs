@@ -207,14 +207,14 @@ impl Problem<'_> {
                 motions
             }
         };
-        problem.hold(motions, self.fixed)?;
+        problem.fix(motions, self.fixed)?;
         for lens in 0..state.lenses.len() {
             let held: Vec<usize> = [(0, self.free_focal), (1, self.free_k1)]
                 .into_iter()
                 .filter(|(_, free)| !free)
                 .map(|(k, _)| k)
                 .collect();
-            problem.hold_parameters(lenses, lens, &held)?;
+            problem.fix_parameters(lenses, lens, &held)?;
         }
         let weight = |free: bool, sigma: f64| if free { 1.0 / sigma } else { 0.0 };
         let known = |&(mean, sigma): &(f64, f64)| {

@@ -103,7 +103,7 @@ where
             let (x, y) = place(i);
             let p = usize::from(label_at(x, y));
             cut.add_terminal(i, (self.unary)(alpha, x, y), (self.unary)(p, x, y));
-            let [left, above] = cut.has_before(i);
+            let [left, above] = cut.has_left_and_upper(i);
             let fixed = |x: usize, y: usize, is_node: bool| (!is_node).then_some((x, y));
             let (right, below) = (cut.right(i), cut.below(i));
             let beside = [
@@ -144,7 +144,7 @@ where
             }
         }
         cut.solve(stage)?;
-        let taken = (0..places.len()).filter(|&i| cut.on_sink_side(i));
+        let taken = (0..places.len()).filter(|&i| cut.is_on_sink_side(i));
         Ok(taken.map(|i| places[i][1] as usize * width + places[i][0] as usize).collect())
     }
 }

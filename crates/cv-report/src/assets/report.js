@@ -1,4 +1,4 @@
-// A click on a picture shows it over the whole window; a second click at its own size; Escape or a click beside it closes.
+// A click on an image enlarges it to the window; a second click shows it at its own size; Escape or a click beside it closes it.
 (() => {
   const box = document.createElement("dialog");
   const big = document.createElement("img");

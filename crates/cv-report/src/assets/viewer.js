@@ -1,4 +1,4 @@
-// A small viewer for colored points and camera outlines: WebGL 2, no other file, no network.
+// A small viewer for colored points and camera frusta: WebGL 2, no other file, no network.
 (() => {
   const VERTEX = `#version 300 es
     in vec3 p; in vec3 c; uniform mat4 m; uniform vec3 low, box; uniform float size; out vec4 color;
@@ -42,7 +42,7 @@
     gl.useProgram(program);
     const at = (name) => gl.getUniformLocation(program, name);
     const where = Object.fromEntries(["m", "low", "box", "size", "round", "ring"].map((name) => [name, at(name)]));
-    // A buffer of corners for each kind of thing: its places, of the given type, and its colors.
+    // A vertex array with positions of the given type, and colors.
     const upload = (places, type, colors) => {
       const vao = gl.createVertexArray();
       gl.bindVertexArray(vao);
@@ -60,18 +60,18 @@
     const lines = upload(ends, gl.FLOAT, scene.lineColors);
     const place = (i) => scene.low.map((low, axis) => low + scene.size[axis] * shorts[3 * i + axis] / 65535);
 
-    // The eye is at `distance` from `target`, turned by yaw and pitch. The world's y points down.
+    // The eye is at `distance` from `target`, rotated by yaw and pitch. The world's y points down.
     const view = {}, f = 2.2;
-    // A point is as large as its share of the picture where points are few, and small where they are many.
+    // Point size: large for few points, small for many.
     let size = Math.max(1.6, Math.min(3, 260 / Math.sqrt(scene.count || 1))), showCameras = true, chosen = -1;
     function aim() {
       const axis = scene.axis || [0, 0, 1];
       view.yaw = Math.atan2(axis[0], axis[2]) + 0.3;
       view.pitch = Math.max(-1.2, Math.min(1.2, Math.atan2(axis[1], Math.hypot(axis[0], axis[2])) + 0.3));
     }
-    // The nearest eye that has every camera and all but the outermost points in the picture, and what it looks at: first the distance, then the
-    // target that leaves as much room on the left as on the right, and above as below. A point at (u, v, w) from the middle along the view's axes
-    // is in a picture of half width k where |u - shift| <= k (w + distance).
+    // Computes the nearest view that contains every camera and all but the outermost points: first the distance from the target, then the target
+    // that equalizes the margins. A point at (u, v, w) from the center along the view's axes is inside a view of half width k where
+    // |u - shift| <= k (w + distance).
     function frame() {
       const axes = basis(), step = Math.max(1, Math.floor(scene.count / 2000));
       const along = (p) => axes.map((axis) => dot(axis, add(p, scene.center, -1)));
@@ -110,7 +110,7 @@
       const x = unit(cross([0, 1, 0], z));
       return [x, cross(z, x), z];
     }
-    // Columns of the projection times the motion; y is turned to point up on the screen.
+    // Projection times view matrix, column-major; y is flipped to point up on the screen.
     function projection(w, h) {
       const [x, y, z] = basis();
       const eye = add(view.target, z, -view.distance);
@@ -133,7 +133,7 @@
         const scale = Math.min(window.devicePixelRatio || 1, 2);
         const w = Math.max(1, Math.round(canvas.clientWidth * scale)), h = Math.max(1, Math.round(canvas.clientHeight * scale));
         if (canvas.width !== w || canvas.height !== h) { canvas.width = w; canvas.height = h; }
-        // Until a hand has moved it, the view fits whatever shape the window takes.
+        // Until the user moves it, the view is fitted to the window.
         if (framed) frame();
         gl.viewport(0, 0, w, h);
         gl.clearColor(0.078, 0.086, 0.11, 1);
@@ -142,7 +142,7 @@
         gl.uniformMatrix4fv(where.m, false, projection(w, h));
         gl.uniform3fv(where.low, scene.low);
         gl.uniform3fv(where.box, scene.size);
-        // At the reference distance a point has the size of the slider, nearer ones are larger.
+        // At the reference distance a point has the size of the slider; nearer ones are larger.
         gl.uniform1f(where.size, size * scale * view.distance);
         gl.uniform1i(where.round, 1);
         gl.bindVertexArray(points);
@@ -165,7 +165,7 @@
     }
     const depth = (p) => dot(basis()[2], add(p, view.target, -1)) + view.distance;
 
-    // The point under a place of the canvas: the nearest to the eye of those within a finger's width, preferring what is right under it.
+    // Picks the point at a canvas position: among those within a finger's width, near to the eye and to the position.
     function pick(x, y) {
       const w = canvas.clientWidth, h = canvas.clientHeight, m = projection(w, h);
       let best = -1, least = Infinity;

@@ -5,7 +5,7 @@ use super::Job;
 use crate::frame::Failure;
 use crate::pictures::{Width, map, picture};
 use crate::words::calibration::{lens, note, refusal};
-use cv_core::{GrayF32, Point2, RgbU8, four_digits};
+use cv_core::{GrayF32, Point2, RgbU8, round_to_four_digits};
 use cv_pipeline::calibration::{CalibratedCamera, Trust};
 use cv_pipeline::stereo::{Rectification, RectifyOptions};
 use cv_report::{Colormap, Figure, MapStyle, Note, Raster, Report, colors};
@@ -246,8 +246,8 @@ fn board_shape(page: &mut Report, job: &Job) -> Result<(), Failure> {
         job.unit,
         100.0 * kx / size.x,
         100.0 * ky / size.y,
-        four_digits(size.x),
-        four_digits(size.y)
+        round_to_four_digits(size.x),
+        round_to_four_digits(size.y)
     );
     page.section("The board's shape");
     page.figures(vec![map(bent.view(), &style, Width::Half, &caption)?]);

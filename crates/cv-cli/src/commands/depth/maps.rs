@@ -27,7 +27,7 @@ pub(crate) fn read_map(path: &Path, scale: Option<f64>) -> Result<GrayF32, Failu
     let map = match path.extension().unwrap_or_default().to_string_lossy().to_lowercase().as_str() {
         "pfm" => cv_io::pfm::read(path)?,
         "npy" => gray(path, cv_io::npy::read(path)?.into_gray())?,
-        "npz" => gray(path, cv_io::npz::read_only(path)?.into_gray())?,
+        "npz" => gray(path, cv_io::npz::read_single(path)?.into_gray())?,
         // Images, whatever their extension.
         _ => {
             return match scale {

@@ -101,7 +101,7 @@ pub(crate) fn scene(cloud: &PointCloud, geometry: &StereoGeometry, (width, heigh
     for (i, (name, offset, shift)) in eyes.into_iter().enumerate() {
         let camera = Camera::pinhole(width, height, focal, focal, geometry.cx + offset, geometry.cy);
         let pose = Pose::new(Rotation3::identity(), Vector3::new(shift, 0.0, 0.0));
-        scene.camera(&camera, &pose, camera_color(i)).seen_in(name, (width, height), |i| {
+        scene.add_camera(&camera, &pose, camera_color(i)).add_observations(name, (width, height), |i| {
             camera.project(&pose.transform(&Point3::from(cloud.positions[i].map(f64::from))))
         });
     }

@@ -56,7 +56,7 @@ pub(super) fn report(
 pub(crate) fn sparse(result: &ReconstructResult, names: [&str; 2]) -> PointScene {
     let mut scene = scene(&result.cloud(), result);
     for (side, (name, camera)) in names.into_iter().zip(&result.scene.cameras).enumerate() {
-        scene.seen_in(name, (camera.width, camera.height), |i| {
+        scene.add_observations(name, (camera.width, camera.height), |i| {
             let pair = result.pair(&result.scene.points[i]);
             Some(if side == 0 { pair.a } else { pair.b })
         });
@@ -68,7 +68,7 @@ pub(crate) fn sparse(result: &ReconstructResult, names: [&str; 2]) -> PointScene
 fn scene(cloud: &PointCloud, result: &ReconstructResult) -> PointScene {
     let mut scene = PointScene::new(cloud);
     for (i, (camera, pose)) in result.scene.cameras.iter().zip([Pose::identity(), result.scene.pose]).enumerate() {
-        scene.camera(camera, &pose, camera_color(i));
+        scene.add_camera(camera, &pose, camera_color(i));
     }
     scene
 }
@@ -151,7 +151,7 @@ fn dense_section(
     for ((name, camera), pose) in
         names.into_iter().zip(&result.scene.cameras).zip([Pose::identity(), result.scene.pose])
     {
-        scene.seen_in(name, (camera.width, camera.height), |i| {
+        scene.add_observations(name, (camera.width, camera.height), |i| {
             let point = Point3::from(dense.cloud.positions[i].map(f64::from));
             camera.project(&pose.transform(&point)).filter(|p: &Point2<f64>| p.coords.iter().all(|v| v.is_finite()))
         });

@@ -37,7 +37,7 @@ impl PlaceArgs {
         let mut places = Places { centers: vec![None; all.len()], source: None, distances: self.distances(all)? };
         let Some(path) = &self.known else { return Ok(places) };
         let mut unknown_names = Vec::new();
-        for (name, place) in cv_io::read_places(path)? {
+        for (name, place) in cv_io::read_camera_positions(path)? {
             match find(all, &name) {
                 Some(i) => places.centers[i] = Some(place),
                 None => unknown_names.push(name),

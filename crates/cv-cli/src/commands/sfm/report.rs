@@ -63,7 +63,7 @@ pub(super) fn report(
         let caption =
             "Number of common points of each pair of photographs. Dark squares off the diagonal are loop closures.";
         let width = if names.len() > 20 { Width::Full } else { Width::Half };
-        page.figure(picture(&graph, width, caption)?).thinnest_places(model, WEAK_CONNECTIONS);
+        page.figure(picture(&graph, width, caption)?).weakest_connections(model, WEAK_CONNECTIONS);
         quality(&mut page, model);
     }
     page.section("Time").times(stages);

@@ -1,33 +1,33 @@
-//! What a file is by its first bytes. File names are not trusted.
+//! Detection of image formats by their first bytes, whatever the file name.
 
 use crate::FormatError;
 use crate::codec::Format;
 
-pub(crate) const PICTURES: &str = "a PNG, JPEG, TIFF, WebP, BMP, PNM, OpenEXR or Radiance HDR picture";
+pub(crate) const IMAGE_FORMATS: &str = "a PNG, JPEG, TIFF, WebP, BMP, PNM, OpenEXR or Radiance HDR image";
 
-/// The picture format of `bytes`, or an error that names what they are instead.
-pub(crate) fn picture_format(bytes: &[u8]) -> Result<Format, FormatError> {
+/// Detects the image format of `bytes`; the error names other known formats.
+pub(crate) fn image_format(bytes: &[u8]) -> Result<Format, FormatError> {
     if bytes.is_empty() {
         return Err(FormatError::Empty);
     }
     let brand = (bytes.get(4..8) == Some(b"ftyp")).then(|| bytes.get(8..12)).flatten();
     let other = match bytes {
-        _ if matches!(brand, Some(b"avif" | b"avis")) => Some(("AVIF", "this picture format")),
+        _ if matches!(brand, Some(b"avif" | b"avis")) => Some(("AVIF", "this image format")),
         _ if matches!(brand, Some(b"heic" | b"heix" | b"hevc" | b"mif1" | b"msf1")) => {
-            Some(("HEIC", "this picture format"))
+            Some(("HEIC", "this image format"))
         }
-        _ if brand == Some(b"crx ") => Some(("CR3", "a camera's raw data")),
-        _ if brand.is_some() => Some(("MP4", "a film")),
-        [b'I', b'I', b'*', 0, _, _, _, _, b'C', b'R', ..] => Some(("CR2", "a camera's raw data")),
-        [b'G', b'I', b'F', b'8', ..] => Some(("GIF", "this picture format")),
-        [0xff, 0x0a, ..] | [0, 0, 0, 0x0c, b'J', b'X', b'L', b' ', ..] => Some(("JPEG XL", "this picture format")),
-        [0, 0, 0, 0x0c, b'j', b'P', ..] | [0xff, 0x4f, 0xff, 0x51, ..] => Some(("JPEG 2000", "this picture format")),
-        [b'8', b'B', b'P', b'S', ..] => Some(("PSD", "this picture format")),
+        _ if brand == Some(b"crx ") => Some(("CR3", "raw sensor data")),
+        _ if brand.is_some() => Some(("MP4", "a video")),
+        [b'I', b'I', b'*', 0, _, _, _, _, b'C', b'R', ..] => Some(("CR2", "raw sensor data")),
+        [b'G', b'I', b'F', b'8', ..] => Some(("GIF", "this image format")),
+        [0xff, 0x0a, ..] | [0, 0, 0, 0x0c, b'J', b'X', b'L', b' ', ..] => Some(("JPEG XL", "this image format")),
+        [0, 0, 0, 0x0c, b'j', b'P', ..] | [0xff, 0x4f, 0xff, 0x51, ..] => Some(("JPEG 2000", "this image format")),
+        [b'8', b'B', b'P', b'S', ..] => Some(("PSD", "this image format")),
         [b'%', b'P', b'D', b'F', ..] => Some(("PDF", "a document")),
-        [b'P', b'7', b'\n' | b'\r' | b' ', ..] => Some(("PAM", "this picture format")),
-        [b'P', b'F' | b'f', b'\n' | b'\r' | b' ', ..] => Some(("PFM", "a float map in the place of a picture")),
-        [0x93, b'N', b'U', b'M', b'P', b'Y', ..] => Some(("npy", "an array in the place of a picture")),
-        [b'P', b'K', 3, 4, ..] => Some(("ZIP or npz", "an archive in the place of a picture")),
+        [b'P', b'7', b'\n' | b'\r' | b' ', ..] => Some(("PAM", "this image format")),
+        [b'P', b'F' | b'f', b'\n' | b'\r' | b' ', ..] => Some(("PFM", "a float map where an image is expected")),
+        [0x93, b'N', b'U', b'M', b'P', b'Y', ..] => Some(("npy", "an array where an image is expected")),
+        [b'P', b'K', 3, 4, ..] => Some(("ZIP or npz", "an archive where an image is expected")),
         [b'<', b's', b'v', b'g', ..] => Some(("SVG", "a vector drawing")),
         _ => None,
     };
@@ -46,29 +46,29 @@ pub(crate) fn picture_format(bytes: &[u8]) -> Result<Format, FormatError> {
             Ok(Format::Hdr)
         }
         [b'R', b'I', b'F', b'F', _, _, _, _, b'W', b'E', b'B', b'P', ..] => Ok(Format::WebP),
-        _ => Err(FormatError::UnknownFormat { expected: PICTURES }),
+        _ => Err(FormatError::UnknownFormat { expected: IMAGE_FORMATS }),
     }
 }
 
-/// Cheap checks that a file can hold what its header promises, before anything is allocated for it.
-pub(crate) fn plausible(format: Format, bytes: &[u8], width: u64, height: u64) -> Result<(), FormatError> {
+/// Checks cheaply that the file size is sufficient for the header's pixels, before allocation.
+pub(crate) fn check_plausible(format: Format, bytes: &[u8], width: u64, height: u64) -> Result<(), FormatError> {
     let name = format.name();
     let len = bytes.len() as u64;
     let possible = match format {
-        // Deflate packs at most 1032 to 1; the least a row takes is one bit a pixel.
+        // Deflate compresses at most 1032 to 1; a pixel takes at least one bit.
         Format::Png => len.saturating_mul(1032 * 8),
-        // Every 8×8 block of the first component costs at least one bit.
+        // Every 8×8 block of the first component takes at least one bit.
         Format::Jpeg => len.saturating_mul(8 * 64 * 4),
-        // Without compression, at least one bit a pixel.
+        // Without compression, at least one bit per pixel.
         Format::Bmp | Format::Pnm => len.saturating_mul(8),
-        // A row begins with a pixel, or four bytes that say how it is packed.
+        // A row takes at least four bytes: a pixel, or its run-length header.
         Format::Hdr => (len / 4).saturating_mul(width),
         _ => u64::MAX,
     };
     if width.saturating_mul(height) > possible {
         return Err(FormatError::corrupt(
             name,
-            format!("{len} bytes cannot hold the {width}×{height} pixels promised"),
+            format!("{len} bytes cannot hold the {width}×{height} pixels of the header"),
         ));
     }
     if format == Format::Jpeg && !jpeg_has_end(bytes) {
@@ -77,11 +77,9 @@ pub(crate) fn plausible(format: Format, bytes: &[u8], width: u64, height: u64) -
     Ok(())
 }
 
-/// True where the markers of a JPEG lead to its end-of-image marker.
-///
-/// The decoder fills what is missing with gray and says nothing.
+/// Whether the markers of a JPEG lead to its end-of-image marker: the decoder silently fills missing data with gray.
 fn jpeg_has_end(bytes: &[u8]) -> bool {
-    // Inside the coded data this pair cannot occur.
+    // This pair cannot occur inside entropy-coded data.
     if bytes.ends_with(&[0xff, 0xd9]) {
         return true;
     }
@@ -102,7 +100,7 @@ fn jpeg_has_end(bytes: &[u8]) -> bool {
         }
         match bytes[at + 1] {
             0xd9 => return true,
-            // Padding, an escaped 0xff, a restart.
+            // Padding, an escaped 0xff, a restart marker.
             0xff => at += 1,
             0x00 | 0x01 | 0xd0..=0xd8 => at += 2,
             marker => {

@@ -5,7 +5,7 @@ use exif::{Field, Rational, Tag, Value};
 use proptest::prelude::*;
 use std::io::Cursor;
 
-/// A picture whose every pixel differs from its neighbors in a way that no flip keeps.
+/// A test image that no flip or rotation leaves unchanged.
 fn ramp(width: usize, height: usize) -> RgbU8 {
     RgbU8::from_fn(width, height, |x, y| [(x * 20) as u8, (y * 30) as u8, (x * 7 + y * 11) as u8])
 }
@@ -14,7 +14,7 @@ fn decoded(bytes: &[u8]) -> DynImage {
     decode_image(bytes, &ReadOptions::default()).unwrap()
 }
 
-/// A 24-bit bitmap, bottom row first (BITMAPINFOHEADER).
+/// A 24-bit BMP, bottom row first (BITMAPINFOHEADER).
 fn bmp(image: &RgbU8) -> Vec<u8> {
     let (w, h) = image.size();
     let mut bytes = bmp_header(w, h, 24, 0, 54);
@@ -25,7 +25,7 @@ fn bmp(image: &RgbU8) -> Vec<u8> {
     bytes
 }
 
-/// The two headers of a bitmap whose pixels begin at `at`.
+/// The two headers of a BMP whose pixels begin at `at`.
 fn bmp_header(w: usize, h: usize, bits: u16, compression: u32, at: u32) -> Vec<u8> {
     let mut bytes = b"BM\0\0\0\0\0\0\0\0".to_vec();
     bytes.extend(at.to_le_bytes());
@@ -56,14 +56,14 @@ fn ppm(image: &RgbU8) -> Vec<u8> {
     bytes
 }
 
-/// The same pixels as numbers.
+/// The same image as a text PPM.
 fn ppm_text(image: &RgbU8) -> Vec<u8> {
     let (w, h) = image.size();
     let numbers: Vec<String> = image.as_slice().iter().map(u8::to_string).collect();
     format!("P3 {w} {h} 255\n{}\n", numbers.join(" ")).into_bytes()
 }
 
-/// Light of 0 to 1 as mantissas of 256 with a common exponent of 0 (128 in the file), each channel a literal run.
+/// A Radiance HDR file: intensities 0 to 1 as mantissas with a common exponent of 0 (128 in the file), each channel a literal run.
 fn hdr(image: &RgbU8) -> Vec<u8> {
     let (w, h) = image.size();
     let mut bytes = format!("#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {h} +X {w}\n").into_bytes();
@@ -100,7 +100,7 @@ fn exr(w: usize, h: usize, light: impl Fn(usize, usize) -> [f32; 3] + Sync) -> V
     bytes.into_inner()
 }
 
-/// One small file of every format and kind that is understood.
+/// One small file of every supported format and variant.
 fn samples() -> Vec<(&'static str, Vec<u8>)> {
     let image = ramp(12, 7);
     #[cfg(feature = "tiff")]
@@ -132,7 +132,7 @@ fn samples() -> Vec<(&'static str, Vec<u8>)> {
     ]
 }
 
-/// Gray that rises with x, alpha with y.
+/// Gray increases with x, alpha with y.
 fn gray_alpha(w: usize, h: usize) -> Vec<u8> {
     let mut bytes = Vec::new();
     let mut encoder = png::Encoder::new(&mut bytes, w as u32, h as u32);
@@ -142,7 +142,7 @@ fn gray_alpha(w: usize, h: usize) -> Vec<u8> {
     bytes
 }
 
-/// A JPEG of four inks without black: cyan, magenta and yellow are what red, green and blue lack.
+/// A CMYK JPEG with zero black: cyan, magenta and yellow are the complements of red, green and blue.
 fn cmyk(image: &RgbU8, color: jpeg_encoder::ColorType) -> Vec<u8> {
     let inks: Vec<u8> = image.pixels().flat_map(|[r, g, b]| [255 - r, 255 - g, 255 - b, 0]).collect();
     let mut bytes = Vec::new();
@@ -189,9 +189,9 @@ fn rational(num: u32, denom: u32) -> Value {
 }
 
 #[test]
-fn every_orientation_is_applied_as_the_standard_defines_it() {
-    // EXIF 2.32, tag 274: where the stored row 0 and column 0 are in the picture as it is to be seen. The stored pixel
-    // (x, y) of a w × h picture is seen at:
+fn every_exif_orientation_is_applied() {
+    // EXIF 2.32, tag 274: position of the stored row 0 and column 0 in the upright image. The stored pixel
+    // (x, y) of a w × h image maps to:
     type Seen = fn(usize, usize, usize, usize) -> (usize, usize);
     let places: [Seen; 8] = [
         |x, y, _, _| (x, y),                 // top, left
@@ -203,7 +203,7 @@ fn every_orientation_is_applied_as_the_standard_defines_it() {
         |x, y, w, h| (h - 1 - y, w - 1 - x), // right, bottom
         |x, y, w, _| (y, w - 1 - x),         // left, bottom
     ];
-    // Blocks of 8 × 8 pixels, so that a JPEG keeps their colors.
+    // Blocks of 8 × 8 pixels, so that JPEG preserves their colors.
     let stored = RgbU8::from_fn(24, 16, |x, y| ramp(3, 2).at(x / 8, y / 8).map(|v| v * 4));
     for (k, place) in places.iter().enumerate() {
         let fields = [(Tag::Orientation, Value::Short(vec![k as u16 + 1]))];
@@ -223,7 +223,7 @@ fn every_orientation_is_applied_as_the_standard_defines_it() {
 }
 
 #[test]
-fn the_position_is_in_degrees_minutes_and_seconds_by_hemisphere() {
+fn gps_positions_are_parsed_from_degrees_minutes_and_seconds() {
     let image = ramp(4, 4);
     let degrees = |d: u32, m: u32, s: u32| {
         Value::Rational([(d, 1), (m, 1), (s, 100)].map(|(num, denom)| Rational { num, denom }).to_vec())
@@ -271,7 +271,7 @@ fn the_position_is_in_degrees_minutes_and_seconds_by_hemisphere() {
 }
 
 #[test]
-fn the_focal_length_comes_from_the_better_tag() {
+fn the_focal_length_is_computed_from_the_most_accurate_tag() {
     let image = ramp(600, 400);
     let mm = (Tag::FocalLength, rational(50, 1));
     // A 36 mm wide sensor: 600 px over 36 mm, in the three units and the default one.
@@ -292,7 +292,7 @@ fn the_focal_length_comes_from_the_better_tag() {
     near(focal(&by(2, 4_233_333, 10_000)), truth, FocalSource::SensorResolution);
     near(focal(&by(3, 1_666_667, 10_000)), truth, FocalSource::SensorResolution);
     near(focal(&by(4, 1_666_667, 100_000)), truth, FocalSource::SensorResolution);
-    // The same photograph made four times smaller since it was taken.
+    // The same image downscaled by four.
     let mut smaller = by(4, 6_666_667, 100_000);
     smaller.push((Tag::PixelXDimension, Value::Long(vec![2400])));
     near(focal(&smaller), truth, FocalSource::SensorResolution);
@@ -305,7 +305,7 @@ fn the_focal_length_comes_from_the_better_tag() {
     near(focal(&wrong), truth, FocalSource::Equivalent35mm);
     assert_eq!(focal(&by(2, 72, 1)), None);
     assert_eq!(focal(std::slice::from_ref(&mm)), None);
-    // Millimeters alone: the sensor is that of the model, where it is known.
+    // Millimeters alone: the sensor width by the camera model, where known.
     let model = |name: &str| (Tag::Model, Value::Ascii(vec![name.as_bytes().to_vec()]));
     near(focal(&[mm.clone(), model("Canon EOS 5D")]), truth, FocalSource::SensorTable);
     near(focal(&[mm.clone(), model("NIKON D90")]), 50.0 * 600.0 / 23.6, FocalSource::SensorTable);
@@ -315,7 +315,7 @@ fn the_focal_length_comes_from_the_better_tag() {
 }
 
 #[test]
-fn the_focal_length_of_a_turned_picture_is_that_of_the_picture_seen() {
+fn the_focal_length_refers_to_the_upright_image() {
     let fields = [(Tag::Orientation, Value::Short(vec![6])), (Tag::FocalLengthIn35mmFilm, Value::Short(vec![28]))];
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("turned.jpg");
@@ -327,7 +327,7 @@ fn the_focal_length_of_a_turned_picture_is_that_of_the_picture_seen() {
 }
 
 #[test]
-fn every_depth_and_kind_gives_the_same_picture() {
+fn every_bit_depth_and_format_gives_the_same_image() {
     let image = ramp(12, 7);
     let exact = [
         encode_png(image.map(|p| p.map(|v| u16::from(v) * 257)).view()).unwrap(),
@@ -383,7 +383,7 @@ fn a_palette_is_resolved() {
 }
 
 #[test]
-fn four_inks_become_three_lights() {
+fn cmyk_jpegs_are_converted_to_rgb() {
     let image = RgbU8::from_fn(32, 32, |x, y| [(x * 8) as u8, (y * 8) as u8, 128]);
     for color in [jpeg_encoder::ColorType::Cmyk, jpeg_encoder::ColorType::CmykAsYcck] {
         let back = decoded(&cmyk(&image, color)).into_rgb8();
@@ -394,7 +394,7 @@ fn four_inks_become_three_lights() {
 }
 
 #[test]
-fn linear_light_is_encoded_for_the_eye() {
+fn linear_intensity_is_srgb_encoded() {
     let light = [[0.0, 1.0, 0.5], [0.0, 0.003_130_8, 2.0], [-1.0, 0.18, 0.18], [f32::NAN, 0.0, 1.0]];
     let picture = DynImage {
         pixels: Pixels::RgbF32(RgbF32::from_fn(4, 1, |x, _| light[x])),
@@ -407,7 +407,7 @@ fn linear_light_is_encoded_for_the_eye() {
 }
 
 #[test]
-fn light_and_measurements_are_read_as_they_are_stored() {
+fn float_formats_are_read_unchanged() {
     let image = ramp(12, 7);
     let expected = RgbF32::from_fn(12, 7, |x, y| image.at(x, y).map(|v| f32::from(v) / 256.0));
     assert_eq!(decoded(&hdr(&image)).pixels, Pixels::RgbF32(expected.clone()));
@@ -425,7 +425,7 @@ fn light_and_measurements_are_read_as_they_are_stored() {
 }
 
 #[test]
-fn pictures_of_few_bits_are_stretched() {
+fn low_bit_depths_are_scaled_to_the_full_range() {
     let gray = |bytes: &[u8]| decoded(bytes).into_gray8().as_slice().to_vec();
     // In a bitmap of Netpbm 1 is black.
     assert_eq!(gray(b"P1 3 2\n101\n0 1 0\n"), [0, 255, 0, 255, 0, 255]);
@@ -445,7 +445,7 @@ fn pictures_of_few_bits_are_stretched() {
 
 #[cfg(feature = "tiff")]
 #[test]
-fn inks_of_a_tiff_become_lights() {
+fn cmyk_tiffs_are_converted_to_rgb() {
     // No ink, all of cyan, half of all with half of black.
     let inks = [0, 0, 0, 0, 255, 0, 0, 0, 51, 51, 51, 51];
     let bytes = tiff::<tiff::encoder::colortype::CMYK8>(3, 1, &inks);
@@ -453,16 +453,16 @@ fn inks_of_a_tiff_become_lights() {
 }
 
 #[test]
-fn gray_is_opencvs() {
+fn gray_conversion_matches_opencv() {
     // cv2.cvtColor(…, COLOR_RGB2GRAY) of OpenCV 5.0.
     let image = RgbU8::from_vec(4, 1, vec![255, 0, 0, 0, 255, 0, 0, 0, 255, 10, 200, 90]).unwrap();
     assert_eq!(decoded(&encode_png(image.view()).unwrap()).into_gray8().as_slice(), [76, 150, 29, 131]);
 }
 
 #[test]
-fn a_file_cut_anywhere_is_an_error_and_never_half_a_picture() {
+fn truncated_files_are_errors() {
     for (name, bytes) in samples() {
-        // What stands behind the last pixel: PNG's end chunk, TIFF's directory is in front, EXR's none.
+        // Bytes after the last pixel: PNG's end chunk; none in TIFF, whose directory comes first, and EXR.
         for len in 0..bytes.len() - 16 {
             let result = decode_image(&bytes[..len], &ReadOptions::default());
             assert!(result.is_err(), "{name}: {len} of {} bytes", bytes.len());
@@ -481,7 +481,7 @@ fn too_many_pixels_are_refused_by_the_header() {
 }
 
 #[test]
-fn a_header_that_promises_more_than_the_file_holds_is_refused() {
+fn a_header_with_more_pixels_than_the_file_can_hold_is_refused() {
     let mut png = encode_png(ramp(12, 7).view()).unwrap();
     png[16..24].copy_from_slice(&[0, 0, 0x3f, 0, 0, 0, 0x3f, 0]);
     let crc = crc32fast::hash(&png[12..29]);
@@ -496,7 +496,7 @@ fn a_header_that_promises_more_than_the_file_holds_is_refused() {
 }
 
 #[test]
-fn names_do_not_matter_and_other_formats_are_named() {
+fn formats_are_detected_by_content_and_unsupported_ones_named() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.png");
     std::fs::write(&path, bmp(&ramp(4, 3))).unwrap();
@@ -517,9 +517,9 @@ fn names_do_not_matter_and_other_formats_are_named() {
     }
 }
 
-/// Read by another decoder than is told by the fields we wrote: strips that do not fill the last one, and opacity.
+/// Decoded independently: several strips with a partial last one, and alpha.
 #[test]
-fn a_tiff_of_many_strips_with_opacity_is_what_was_written() {
+fn a_tiff_of_several_strips_with_alpha_round_trips() {
     let image = Image::<u8, 4>::from_fn(700, 301, |x, y| [x as u8, y as u8, (x * y) as u8, (x + y) as u8]);
     let bytes = encode_tiff(image.view()).unwrap();
     let mut decoder = tiff::decoder::Decoder::new(Cursor::new(&bytes)).unwrap();
@@ -531,12 +531,12 @@ fn a_tiff_of_many_strips_with_opacity_is_what_was_written() {
     assert!(encode_tiff(GrayU8::new(3, 0, [0]).view()).is_err());
 }
 
-/// What a JPEG's file says goes into a TIFF and comes out of it again.
+/// Metadata of a JPEG are written to a TIFF and read back.
 #[test]
-fn a_tiff_keeps_the_camera_the_focal_length_and_the_profile() {
+fn a_tiff_preserves_camera_focal_length_and_color_profile() {
     let mut icc = vec![3; 300];
     icc[16..20].copy_from_slice(b"RGB ");
-    // The compression is that of a thumbnail nobody has.
+    // The compression tag is that of a dropped thumbnail.
     let exif = exif_block(&[
         (Tag::Make, Value::Ascii(vec![b"Testmaker".to_vec()])),
         (Tag::Orientation, Value::Short(vec![6])),
@@ -564,7 +564,7 @@ fn a_tiff_keeps_the_camera_the_focal_length_and_the_profile() {
 }
 
 #[test]
-fn the_smallest_pictures() {
+fn images_of_one_pixel_and_empty_images() {
     let one = RgbU8::new(1, 1, [9, 8, 7]);
     assert_eq!(decoded(&encode_png(one.view()).unwrap()).into_rgb8(), one);
     assert_eq!(decoded(&encode_jpeg(one.view(), 95).unwrap()).size(), (1, 1));
@@ -574,9 +574,9 @@ fn the_smallest_pictures() {
 }
 
 proptest! {
-    /// Damage anywhere: an error or a picture within the limit, never a panic that escapes.
+    /// Any damage gives an error or an image within the limit, never a panic.
     #[test]
-    fn damaged_files_do_no_harm(which in any::<prop::sample::Index>(), edits in prop::collection::vec((any::<u16>(), any::<u8>()), 1..6), cut in any::<u16>(), cuts in any::<bool>()) {
+    fn damaged_files_never_panic(which in any::<prop::sample::Index>(), edits in prop::collection::vec((any::<u16>(), any::<u8>()), 1..6), cut in any::<u16>(), cuts in any::<bool>()) {
         let mut samples = samples();
         let which = which.index(samples.len());
         let (name, mut bytes) = samples.swap_remove(which);
@@ -595,7 +595,7 @@ proptest! {
     }
 
     #[test]
-    fn png_and_tiff_keep_every_sample(w in 1usize..9, h in 1usize..9, data in prop::collection::vec(any::<u16>(), 192)) {
+    fn png_and_tiff_are_lossless(w in 1usize..9, h in 1usize..9, data in prop::collection::vec(any::<u16>(), 192)) {
         let deep = Image::<u16, 3>::from_fn(w, h, |x, y| std::array::from_fn(|c| data[(y * 8 + x) * 3 + c]));
         prop_assert_eq!(decoded(&encode_png(deep.view()).unwrap()).pixels, Pixels::Rgb16(deep.clone()));
         prop_assert_eq!(decoded(&encode_tiff(deep.view()).unwrap()).pixels, Pixels::Rgb16(deep.clone()));
@@ -607,7 +607,7 @@ proptest! {
         prop_assert_eq!(decoded(&encode_tiff(gray.view()).unwrap()).pixels, Pixels::Gray8(gray));
         let png = encode_png(bytes.view()).unwrap();
         prop_assert_eq!(decoded(&png).into_rgb8(), bytes.clone());
-        // A window into the middle, whose rows lie apart in memory.
+        // A strided view of the interior.
         if w > 2 && h > 2 {
             let window = bytes.view().crop(1, 1, w - 2, h - 2).unwrap();
             prop_assert_eq!(decoded(&encode_png(window).unwrap()).into_rgb8(), window.to_image());
@@ -615,7 +615,7 @@ proptest! {
     }
 }
 
-/// Plain files of `w × h` pixels for every format, of one color.
+/// Files of `w × h` pixels of one color, for every format.
 fn plain(w: usize, h: usize) -> Vec<(&'static str, Vec<u8>)> {
     let image = RgbU8::new(w, h, [10, 200, 90]);
     vec![
@@ -639,7 +639,7 @@ fn plain(w: usize, h: usize) -> Vec<(&'static str, Vec<u8>)> {
     ]
 }
 
-/// Rows of one pixel and its repetitions, in the older run-length code: as small as a file of the format gets.
+/// Rows of one pixel and its repetitions, in the older run-length encoding: the smallest possible files of the format.
 fn hdr_of_runs(w: usize, h: usize) -> Vec<u8> {
     let mut row = vec![128, 64, 32, 129];
     let mut left = w - 1;
@@ -652,8 +652,8 @@ fn hdr_of_runs(w: usize, h: usize) -> Vec<u8> {
     bytes
 }
 
-/// What reading would take, by the error under a limit of one byte.
-fn judged(bytes: &[u8]) -> u64 {
+/// Returns the estimated memory for reading, from the error under a limit of one byte.
+fn estimated_memory(bytes: &[u8]) -> u64 {
     match decode_image(bytes, &ReadOptions { max_memory: 1, ..ReadOptions::default() }) {
         Err(FormatError::TooMuchMemory { needed, allowed: 1, .. }) => needed,
         other => panic!("{other:?}"),
@@ -661,12 +661,12 @@ fn judged(bytes: &[u8]) -> u64 {
 }
 
 #[test]
-fn memory_is_judged_by_the_header_in_every_format() {
+fn memory_is_estimated_from_the_header_in_every_format() {
     let within = |max_memory| ReadOptions { max_memory, ..ReadOptions::default() };
     for (name, bytes) in plain(640, 480) {
-        let needed = judged(&bytes);
+        let needed = estimated_memory(&bytes);
         let pixels = 640 * 480;
-        // No less than the file and the samples, no more than three copies of the deepest samples.
+        // At least the file and the samples, at most three copies of float samples.
         assert!(needed >= bytes.len() as u64 + 3 * pixels, "{name}: {needed}");
         assert!(needed <= bytes.len() as u64 + 3 * 12 * pixels, "{name}: {needed}");
         assert!(decode_image(&bytes, &within(needed)).is_ok(), "{name}");
@@ -676,23 +676,23 @@ fn memory_is_judged_by_the_header_in_every_format() {
             "{name}: {error}"
         );
     }
-    // Coefficients are kept until the last scan.
+    // Progressive JPEGs keep all coefficients.
     let files = plain(640, 480);
-    let of = |name: &str| judged(&files.iter().find(|(n, _)| *n == name).unwrap().1);
+    let of = |name: &str| estimated_memory(&files.iter().find(|(n, _)| *n == name).unwrap().1);
     assert!(of("progressive") > of("jpeg") + 640 * 480 * 3);
 }
 
 #[test]
-fn a_small_file_of_many_pixels_is_refused_at_once() {
+fn a_small_file_with_many_pixels_is_refused_quickly() {
     let start = std::time::Instant::now();
     let bytes = hdr_of_runs(16_000, 16_000);
     let limit = ReadOptions { max_memory: 1 << 30, ..ReadOptions::default() };
     let error = decode_image(&bytes, &limit).unwrap_err();
     let FormatError::TooMuchMemory { needed, size: Some((16_000, 16_000)), .. } = error else { panic!("{error}") };
     assert!(needed > 16_000 * 16_000 * 12);
-    // Rows that are not there are no matter of memory.
-    let lie = b"#?RADIANCE\n\n-Y 16000 +X 16000\n\x80\x40\x20\x81";
-    assert!(matches!(decode_image(lie, &limit), Err(FormatError::Corrupt { .. })));
+    // Missing rows are an error of the file, not of memory.
+    let truncated = b"#?RADIANCE\n\n-Y 16000 +X 16000\n\x80\x40\x20\x81";
+    assert!(matches!(decode_image(truncated, &limit), Err(FormatError::Corrupt { .. })));
     for w in [20_000usize, 60_000] {
         let header = bmp_header(w, 8000, 24, 0, 54);
         assert!(decode_image(&header, &limit).is_err());
@@ -702,7 +702,7 @@ fn a_small_file_of_many_pixels_is_refused_at_once() {
 }
 
 #[test]
-fn the_file_itself_counts() {
+fn the_file_size_counts_towards_the_memory_limit() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.bmp");
     std::fs::write(&path, bmp(&ramp(100, 100))).unwrap();

@@ -1,4 +1,4 @@
-//! What is being written, so that a program that has to end at once leaves nothing of it behind.
+//! Registry of unfinished writes, so that a program that exits early leaves no temporary files.
 
 use crate::{FormatError, IoError};
 use std::collections::BTreeSet;
@@ -10,47 +10,47 @@ use std::{
     io,
 };
 
-/// Names of temporary files and folders begin and end so.
+/// Prefix and suffix of the names of temporary files and folders.
 pub(crate) const PREFIX: &str = ".cv-";
 pub(crate) const SUFFIX: &str = ".part";
 
-/// The temporary files and folders of all writes that go on.
-static ALL: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
+/// The temporary files and folders of all unfinished writes of this process.
+static PENDING_PATHS: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
 
-fn all() -> MutexGuard<'static, BTreeSet<PathBuf>> {
-    ALL.lock().unwrap_or_else(PoisonError::into_inner)
+fn pending_paths() -> MutexGuard<'static, BTreeSet<PathBuf>> {
+    PENDING_PATHS.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// A temporary file or folder of a write that goes on, locked as long: the lock of a process that is killed is free again, which tells
-/// [`remove_abandoned`] that nobody will finish it.
-pub(crate) struct Pending {
+/// A temporary file or folder of an unfinished write, which stays locked. The operating system releases the lock of a killed process, which
+/// shows [`remove_abandoned`] that the write is abandoned.
+pub(crate) struct PendingWrite {
     path: PathBuf,
-    /// None where the file system, or the operating system, has none of the kind.
+    /// `None` where the file system or the operating system does not support locks.
     _lock: Option<File>,
 }
 
-impl Pending {
-    /// Makes it. To [`abandon_writes`] it is there from the first moment, or not at all. (Of the two results the second is dropped first, and so removed
-    /// while it is still known.)
+impl PendingWrite {
+    /// Creates and registers a temporary file or folder, atomically with respect to [`abandon_writes`]. (The second result is dropped first, so
+    /// that it is removed while still registered.)
     pub(crate) fn make<T>(make: impl Fn() -> io::Result<T>, path: impl Fn(&T) -> &Path) -> io::Result<(Self, T)> {
-        let mut all = all();
+        let mut all = pending_paths();
         loop {
             let made = make()?;
             let path = path(&made).to_owned();
             let lock = lock(&path);
-            // Between the two, another process may have taken it for abandoned.
-            if matches!(lock, Lock::Held) || !path.exists() {
+            // Before it was locked, another process may have taken it for abandoned.
+            if matches!(lock, Lock::HeldElsewhere) || !path.exists() {
                 continue;
             }
             all.insert(path.clone());
-            let lock = if let Lock::Ours(file) = lock { Some(file) } else { None };
+            let lock = if let Lock::Acquired(file) = lock { Some(file) } else { None };
             return Ok((Self { path, _lock: lock }, made));
         }
     }
 
-    /// Gives it its place. To [`abandon_writes`] it is still temporary, or all in its place.
+    /// Moves it to its final path by `place`, atomically with respect to [`abandon_writes`].
     pub(crate) fn finish<T>(self, place: impl FnOnce() -> T) -> T {
-        let mut all = all();
+        let mut all = pending_paths();
         let placed = place();
         all.remove(&self.path);
         drop(all);
@@ -58,78 +58,78 @@ impl Pending {
     }
 }
 
-/// What comes of trying to lock a file or folder.
+/// Result of trying to lock a file or folder.
 enum Lock {
-    Ours(File),
-    /// By another process.
-    Held,
-    /// It cannot be locked here.
-    Unknown,
+    Acquired(File),
+    /// Locked by another process.
+    HeldElsewhere,
+    /// Locks are not supported here.
+    Unsupported,
 }
 
-/// On other systems than Unix a lock would keep its own process from writing by another handle, and folders cannot be opened.
+/// Tries to lock a path. Only on Unix: elsewhere a lock would block writes of the same process by another handle, and folders cannot be opened.
 fn lock(path: &Path) -> Lock {
     if !cfg!(unix) {
-        return Lock::Unknown;
+        return Lock::Unsupported;
     }
-    let Ok(file) = File::open(path) else { return Lock::Unknown };
+    let Ok(file) = File::open(path) else { return Lock::Unsupported };
     match file.try_lock() {
-        Ok(()) => Lock::Ours(file),
-        Err(TryLockError::WouldBlock) => Lock::Held,
-        Err(TryLockError::Error(_)) => Lock::Unknown,
+        Ok(()) => Lock::Acquired(file),
+        Err(TryLockError::WouldBlock) => Lock::HeldElsewhere,
+        Err(TryLockError::Error(_)) => Lock::Unsupported,
     }
 }
 
-/// Removes from a folder what writes of this crate left behind whose process was killed: temporary files, and folders of several. What another process is
-/// writing stays. Where that cannot be told (not Unix, a file system without locks), what is an hour old goes: a write takes seconds.
+/// Removes temporary files and folders that writes of killed processes left in a folder. Those of running processes stay. Where locks are not
+/// supported (not Unix, some file systems), those older than an hour are removed: a write takes seconds.
 pub fn remove_abandoned(folder: impl AsRef<Path>) {
     let Ok(entries) = fs::read_dir(folder) else { return };
     for entry in entries.flatten() {
         let (name, path) = (entry.file_name(), entry.path());
         let ours = name.to_str().is_some_and(|name| name.starts_with(PREFIX) && name.ends_with(SUFFIX));
-        if !ours || all().contains(&path) {
+        if !ours || pending_paths().contains(&path) {
             continue;
         }
         let age = || SystemTime::now().duration_since(entry.metadata().ok()?.modified().ok()?).ok();
-        // Held until it is gone.
+        // The lock is kept until the removal.
         let lock = lock(&path);
         let abandoned = match lock {
-            Lock::Ours(_) => true,
-            Lock::Held => false,
-            Lock::Unknown => age().is_some_and(|age| age > Duration::from_secs(3600)),
+            Lock::Acquired(_) => true,
+            Lock::HeldElsewhere => false,
+            Lock::Unsupported => age().is_some_and(|age| age > Duration::from_secs(3600)),
         };
         if abandoned {
-            // What cannot be removed, a later run will try again.
+            // A later run will retry failed removals.
             let _ = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
         }
     }
 }
 
-impl Drop for Pending {
+impl Drop for PendingWrite {
     fn drop(&mut self) {
-        all().remove(&self.path);
+        pending_paths().remove(&self.path);
     }
 }
 
-/// Ends all writing of this process: what is there in part is removed, and whoever writes on, or begins to, waits for ever.
+/// Abandons all writes of this process: removes temporary files, and blocks all threads that write from then on.
 ///
-/// For a program that exits at once, from whatever thread: each file is then the new one or the old one, and nothing else is left.
+/// For a program that exits immediately, from any thread: each file is then the new one or the old one, and no temporary file remains.
 pub fn abandon_writes() {
-    let all = all();
+    let all = pending_paths();
     for path in &*all {
-        // What cannot be removed, a later run will try again.
+        // A later run will retry failed removals.
         let _ = if path.is_dir() { fs::remove_dir_all(path) } else { fs::remove_file(path) };
     }
     std::mem::forget(all);
 }
 
-/// Writes several files of one folder, all or none.
+/// Writes several files of one folder atomically: all or none.
 ///
-/// `write` writes the files `names` into a temporary folder inside `folder`, which must exist; once it has succeeded they are moved up. Where one cannot be
-/// written, or a folder stands where one is to go, nothing changes.
+/// `write` writes the files `names` into a temporary folder inside `folder`, which must exist; after success they are moved to `folder`. Where one
+/// cannot be written, or a folder exists at its path, nothing changes.
 ///
 /// # Errors
-/// Whatever `write` fails with, and [`IoError`].
+/// Errors of `write`, and [`IoError`].
 pub fn write_together<E: From<IoError>>(
     folder: impl AsRef<Path>,
     names: &[&str],
@@ -143,14 +143,14 @@ pub fn write_together<E: From<IoError>>(
         }
     }
     let make = || tempfile::Builder::new().prefix(PREFIX).suffix(SUFFIX).tempdir_in(folder);
-    let (pending, temporary) = Pending::make(make, |made| made.path()).map_err(|error| fail(folder, error))?;
+    let (pending, temporary) = PendingWrite::make(make, |made| made.path()).map_err(|error| fail(folder, error))?;
     write(temporary.path())?;
     pending.finish(|| {
         names.iter().try_for_each(|name| {
             let path = folder.join(name);
             fs::rename(temporary.path().join(name), &path).map_err(|error| fail(&path, error))
         })?;
-        // Empty now.
+        // The temporary folder is empty now.
         temporary.close().map_err(|error| fail(folder, error))
     })?;
     Ok(())
@@ -192,26 +192,26 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_known_until_it_is_in_its_place() {
+    fn a_write_is_registered_until_it_is_finished() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.part");
-        let known = || all().contains(&path);
+        let known = || pending_paths().contains(&path);
         let make = || fs::write(&path, "half").map(|()| path.clone());
-        let (pending, _) = Pending::make(make, |path| path).unwrap();
+        let (pending, _) = PendingWrite::make(make, |path| path).unwrap();
         assert!(known());
         remove_abandoned(folder.path());
         assert!(path.exists());
         drop(pending);
         assert!(!known());
-        let (pending, _) = Pending::make(make, |path| path).unwrap();
-        // The lock is held: nobody sees the moment between.
-        assert!(pending.finish(|| ALL.try_lock().is_err()) && !known());
-        assert!(Pending::make(|| Err::<PathBuf, _>(io::Error::other("no")), |path| path).is_err());
+        let (pending, _) = PendingWrite::make(make, |path| path).unwrap();
+        // The registry is locked while the file is moved.
+        assert!(pending.finish(|| PENDING_PATHS.try_lock().is_err()) && !known());
+        assert!(PendingWrite::make(|| Err::<PathBuf, _>(io::Error::other("no")), |path| path).is_err());
     }
 
     #[cfg(unix)]
     #[test]
-    fn what_nobody_writes_any_more_is_removed_and_nothing_else() {
+    fn only_abandoned_writes_are_removed() {
         let folder = tempfile::tempdir().unwrap();
         let path = |name: &str| folder.path().join(name);
         for name in [".cv-dead.part", ".cv-busy.part", ".x.part", ".cv-other", "result.png"] {
@@ -219,7 +219,7 @@ mod tests {
         }
         fs::create_dir(path(".cv-several.part")).unwrap();
         fs::write(path(".cv-several.part/left.png"), "half").unwrap();
-        // A lock is that of the open file: a second one stands for another process.
+        // Locks belong to the open file: a second handle simulates another process.
         let busy = File::open(path(".cv-busy.part")).unwrap();
         busy.lock().unwrap();
         remove_abandoned(folder.path());

@@ -1,4 +1,4 @@
-//! Where photographs were taken, as text: a row per photograph, `name x y z`.
+//! Camera positions as text: a row per image, `name x y z`.
 
 use crate::files::read_text;
 use crate::{FormatError, IoError};
@@ -6,15 +6,16 @@ use cv_core::Point3;
 use std::collections::HashSet;
 use std::path::Path;
 
-/// The places of a file, in its order.
-pub type NamedPlaces = Vec<(String, Point3<f64>)>;
+/// Image names with camera positions, in the order of the file.
+pub type NamedPositions = Vec<(String, Point3<f64>)>;
 
-/// Parses rows of a name and three numbers, parted by commas, semicolons or tabs, or else by blanks; of names with blanks, by the former. `#` begins a comment, and a first row without numbers is a heading.
+/// Parses rows of a name and three numbers, separated by commas, semicolons or tabs, or else by spaces (names with spaces need the former). `#`
+/// starts a comment, and a first row without numbers is a header.
 ///
 /// # Errors
-/// [`FormatError::Line`] for a row that is no name and three finite numbers, and for a name that comes twice; [`FormatError::Empty`] without any row.
-pub fn parse_places(text: &str) -> Result<NamedPlaces, FormatError> {
-    let mut places: NamedPlaces = Vec::new();
+/// [`FormatError::Line`] for a row that is not a name and three finite numbers, and for a repeated name; [`FormatError::Empty`] without any row.
+pub fn parse_camera_positions(text: &str) -> Result<NamedPositions, FormatError> {
+    let mut places: NamedPositions = Vec::new();
     let mut seen = HashSet::new();
     let mut rows = 0;
     for (index, line) in text.lines().enumerate() {
@@ -22,9 +23,9 @@ pub fn parse_places(text: &str) -> Result<NamedPlaces, FormatError> {
         if content.is_empty() {
             continue;
         }
-        let marks = [',', ';', '\t'];
-        let cells: Vec<&str> = match content.contains(marks) {
-            true => content.split(marks).map(|cell| cell.trim().trim_matches('"')).collect(),
+        let separators = [',', ';', '\t'];
+        let cells: Vec<&str> = match content.contains(separators) {
+            true => content.split(separators).map(|cell| cell.trim().trim_matches('"')).collect(),
             false => content.split_whitespace().collect(),
         };
         rows += 1;
@@ -41,20 +42,20 @@ pub fn parse_places(text: &str) -> Result<NamedPlaces, FormatError> {
             return Err(FormatError::line(index + 1, "a coordinate is not finite"));
         }
         if !seen.insert(cells[0]) {
-            return Err(FormatError::line(index + 1, format!("“{:.60}” comes twice", cells[0])));
+            return Err(FormatError::line(index + 1, format!("“{:.60}” occurs twice", cells[0])));
         }
         places.push((cells[0].to_owned(), place));
     }
     if places.is_empty() { Err(FormatError::Empty) } else { Ok(places) }
 }
 
-/// Reads the places of photographs; see [`parse_places`].
+/// Reads camera positions; see [`parse_camera_positions`].
 ///
 /// # Errors
-/// [`IoError`]: cannot be read as text, or as [`parse_places`].
-pub fn read_places(path: impl AsRef<Path>) -> Result<NamedPlaces, IoError> {
+/// [`IoError`]: cannot be read as text, or as [`parse_camera_positions`].
+pub fn read_camera_positions(path: impl AsRef<Path>) -> Result<NamedPositions, IoError> {
     let path = path.as_ref();
-    parse_places(&read_text(path)?).map_err(|reason| IoError::reading(path, reason))
+    parse_camera_positions(&read_text(path)?).map_err(|reason| IoError::reading(path, reason))
 }
 
 #[cfg(test)]
@@ -62,20 +63,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rows_are_read_however_they_are_parted() {
+    fn rows_with_any_separator_are_parsed() {
         let expected = vec![("a.jpg".to_owned(), Point3::new(1.0, -2.5, 3e2)), ("b.jpg".into(), Point3::origin())];
         for text in [
             "a.jpg 1 -2.5 300\nb.jpg 0 0 0\n",
             "# comment\nname,x,y,z\na.jpg, 1, -2.5, 3e2\n\n\"b.jpg\",0,0,0 # last",
             "\u{feff}photo\teast\tnorth\tup\r\na.jpg\t1\t-2.5\t300\r\nb.jpg\t0\t0\t0\r\n",
         ] {
-            assert_eq!(parse_places(text).unwrap(), expected, "{text}");
+            assert_eq!(parse_camera_positions(text).unwrap(), expected, "{text}");
         }
-        assert_eq!(parse_places("in the yard.jpg;1;2;3").unwrap()[0].0, "in the yard.jpg");
+        assert_eq!(parse_camera_positions("in the yard.jpg;1;2;3").unwrap()[0].0, "in the yard.jpg");
     }
 
     #[test]
-    fn what_is_no_place_is_told_by_its_line() {
+    fn invalid_rows_are_reported_with_their_line() {
         for (text, line) in [
             ("a 1 2 3\nb 1 2", 2),
             ("a 1 2 3 4", 1),
@@ -84,11 +85,11 @@ mod tests {
             ("a 1 x 3", 1),
             ("only", 1),
         ] {
-            match parse_places(text) {
+            match parse_camera_positions(text) {
                 Err(FormatError::Line { line: at, .. }) => assert_eq!(at, line, "{text}"),
                 other => assert!(other.is_err(), "{text}: {other:?}"),
             }
         }
-        assert!(matches!(parse_places("# nothing\nname x y z"), Err(FormatError::Empty)));
+        assert!(matches!(parse_camera_positions("# nothing\nname x y z"), Err(FormatError::Empty)));
     }
 }

@@ -1,19 +1,19 @@
-//! Sums over rectangles in constant time, and the box filter.
+//! Integral images and the box filter.
 
 use crate::mirror::mirror_index;
 use crate::rows::for_rows_with;
 use cv_core::{Image, ImageView};
 
-/// Sums over all rectangles from the top-left corner.
+/// An integral image (summed-area table): sums over rectangles in constant time.
 ///
-/// Kept in `f64`: for values of 24 bits the sums of images up to 2²⁹ pixels are exact.
+/// Sums are `f64`: exact for 24-bit values in images up to 2²⁹ pixels.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Integral<const C: usize> {
+pub struct IntegralImage<const C: usize> {
     sums: Image<f64, C>,
 }
 
-impl<const C: usize> Integral<C> {
-    /// Sums an image.
+impl<const C: usize> IntegralImage<C> {
+    /// Computes the integral image.
     pub fn new(view: ImageView<'_, f32, C>) -> Self {
         let (w, h) = view.size();
         let mut sums = Image::new(w + 1, h + 1, [0.0; C]);
@@ -31,7 +31,7 @@ impl<const C: usize> Integral<C> {
         Self { sums }
     }
 
-    /// The sum over the columns `x0..x1` and rows `y0..y1`, clipped to the image.
+    /// Returns the sum over the columns `x0..x1` and rows `y0..y1`, clipped to the image.
     #[inline]
     pub fn sum(&self, x0: usize, y0: usize, x1: usize, y1: usize) -> [f64; C] {
         let (w, h) = (self.sums.width() - 1, self.sums.height() - 1);
@@ -42,9 +42,9 @@ impl<const C: usize> Integral<C> {
     }
 }
 
-/// Mean over windows of `2 rx + 1` by `2 ry + 1` pixels, the border mirrored about the end samples (OpenCV's `blur`).
+/// Computes the mean over windows of `2 rx + 1` by `2 ry + 1` pixels, border mode reflect-101 (OpenCV's `blur`).
 ///
-/// Time does not depend on the size of the window. The sums run along rows and columns: a NaN spoils more than the windows it lies in.
+/// O(pixels), independent of the window size. Uses running sums, so that a NaN spreads beyond the windows that contain it.
 pub fn box_filter<const C: usize>(view: ImageView<'_, f32, C>, rx: usize, ry: usize) -> Image<f32, C> {
     let (w, h) = view.size();
     let mut out = Image::new(w, h, [0.0; C]);
@@ -52,7 +52,7 @@ pub fn box_filter<const C: usize>(view: ImageView<'_, f32, C>, rx: usize, ry: us
         return out;
     }
     let norm = 1.0 / ((2 * rx + 1) as f64 * (2 * ry + 1) as f64);
-    // Column sums of the previous row of the band, updated by the row that enters and the one that leaves.
+    // Column sums of the previous row of the band, updated by the entering and the leaving row.
     let buffers = || (Vec::<f64>::new(), 0usize);
     for_rows_with(&mut out, buffers, |(columns, last), y, row| {
         let source = |d: isize| view.row(mirror_index(y as isize + d, h));
@@ -90,9 +90,9 @@ mod tests {
 
     proptest! {
         #[test]
-        fn both_are_their_definitions(w in 1usize..30, h in 1usize..60, rx in 0usize..40, ry in 0usize..9, p in proptest::array::uniform4(0usize..40)) {
+        fn sums_and_means_equal_direct_summation(w in 1usize..30, h in 1usize..60, rx in 0usize..40, ry in 0usize..9, p in proptest::array::uniform4(0usize..40)) {
             let image = Image::<f32, 2>::from_fn(w, h, |x, y| [((x * 31 + y * 17) % 23) as f32, (x + y) as f32]);
-            let integral = Integral::new(image.view());
+            let integral = IntegralImage::new(image.view());
             let smooth = box_filter(image.view(), rx, ry);
             let sum = |x0: usize, y0: usize, x1: usize, y1: usize, c: usize| -> f64 {
                 (y0..y1.min(h)).flat_map(|y| (x0..x1.min(w)).map(move |x| (x, y))).map(|(x, y)| f64::from(image.at(x, y)[c])).sum()
@@ -115,9 +115,9 @@ mod tests {
     }
 
     #[test]
-    fn nothing_sums_to_nothing() {
+    fn empty_images_sum_to_zero() {
         let empty = Image::<f32, 1>::new(0, 0, [0.0]);
-        assert_eq!(Integral::new(empty.view()).sum(0, 0, 9, 9), [0.0]);
+        assert_eq!(IntegralImage::new(empty.view()).sum(0, 0, 9, 9), [0.0]);
         assert!(box_filter(empty.view(), 3, 3).is_empty());
     }
 }
