@@ -37,6 +37,10 @@ const SMOOTHNESS: f32 = 8.0;
 const MAX_DISTANCE: f32 = 4.0;
 /// Difference in gray levels of neighboring cells that halves the smoothness term and doubles the geodesic distance.
 const EDGE_GRAY: f32 = 8.0;
+/// Number of cells of a surface from which geodesic distances have scale 1, and the range of the scale. Half and twice of each differ by 0.1
+/// points of the errors above 2 px; without the scale Middlebury's Vintage has 17 % of errors above 2 px in place of 10.
+const MEAN_SIZE: f32 = 64.0;
+const SCALE_RANGE: (f32, f32) = (0.25, 2.0);
 /// Weight of the data term of a cell in the geodesic distance.
 const PATH_COST_WEIGHT: f32 = 0.1;
 /// Passes of iterated conditional modes, down and up.
@@ -305,12 +309,17 @@ fn propagate_labels(
     heap.clear();
     let (columns, count) = (surfaces.columns, surfaces.cells.len());
     let rows = count / columns;
+    let scales: Vec<[f32; 2]> = surfaces.sizes.iter().map(|&size| distance_scales(size)).collect();
     // In 1/1024 of a cell, as integers, so that ties are broken deterministically.
     let visit = |surfaces: &Surfaces, heap: &mut BinaryHeap<_>, c: usize, so_far: u64, label: u32| {
+        let plane = &surfaces.planes[label as usize];
         for n in neighbors(c, columns, rows).into_iter().flatten().filter(|&n| surfaces.labels[n] == NONE) {
             let edge = (surfaces.cells[c].gray - surfaces.cells[n].gray).abs() / EDGE_GRAY;
-            let cost = view.cell_cost(surfaces, n, &surfaces.planes[label as usize], 4);
-            heap.push(Reverse((so_far + (1024.0 * (1.0 + edge + PATH_COST_WEIGHT * cost)) as u64, n as u32, label)));
+            let cost = view.cell_cost(surfaces, n, plane, 4);
+            let (x, y) = center(n, columns);
+            let is_out_of_view = x < f64::from(plane.at(x, y));
+            let step = scales[label as usize][usize::from(is_out_of_view)] * (1.0 + edge + PATH_COST_WEIGHT * cost);
+            heap.push(Reverse((so_far + (1024.0 * step) as u64, n as u32, label)));
         }
     };
     for c in 0..count {
@@ -331,6 +340,14 @@ fn propagate_labels(
         }
     }
     Ok(())
+}
+
+/// Returns the scales of the geodesic distance from a surface of `size` cells, for cells in view and out of view. The distance is in units of
+/// the extent of the surface, `√size`, since a large surface determines its extrapolation more accurately and is more likely to
+/// continue; out of view its root, since there the object at the image border is mostly continued, whatever its size.
+fn distance_scales(size: usize) -> [f32; 2] {
+    let scale = (MEAN_SIZE / size.max(1) as f32).sqrt().clamp(SCALE_RANGE.0, SCALE_RANGE.1);
+    [scale, scale.sqrt()]
 }
 
 /// Returns the distinct surfaces of a cell and its 8-neighbors, and their number.
