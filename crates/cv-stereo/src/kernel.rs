@@ -36,6 +36,8 @@ pub(crate) struct Sweep {
     ongoing: Ongoing,
     /// Costs of a tile of pixels.
     costs: AlignedBuffer<u8>,
+    /// Costs of this row and of the next one, where a thread of its own computes those of the next.
+    row_costs: [AlignedBuffer<u8>; 2],
     /// Sums of these pixels.
     sums: AlignedBuffer<u8>,
     /// P2 − P1 of each pixel of the row for the path along it; with the minima added, straight, from behind and from ahead.
@@ -64,7 +66,8 @@ pub(crate) enum Output<'a> {
 impl Sweep {
     /// Returns the bytes that [`Sweep::start`] allocates.
     pub(crate) fn bytes(width: usize, depth: usize) -> usize {
-        3 * width * depth + (2 * TILE + 3) * depth + 10 * width + Selection::bytes(width, depth)
+        let row_costs = if has_cost_threads() { 2 * width * depth } else { 0 };
+        3 * width * depth + row_costs + (2 * TILE + 3) * depth + 10 * width + Selection::bytes(width, depth)
     }
 
     /// Resets the state for a frame.
@@ -81,11 +84,19 @@ impl Sweep {
         self.ongoing.behind.resize(depth, 0);
         self.costs.resize(TILE * depth, 0);
         self.sums.resize(TILE * depth, 0);
+        if has_cost_threads() {
+            self.row_costs.iter_mut().for_each(|costs| costs.resize(frame.width * depth, 0));
+        }
         for p2 in &mut self.p2 {
             p2.resize(frame.width, 0);
         }
         self.selection.resize(frame);
     }
+}
+
+/// Returns whether there are more threads than sweeps: then others compute the costs of the next rows.
+fn has_cost_threads() -> bool {
+    rayon::current_num_threads() > 2
 }
 
 /// Runs `sweep` over `steps` rows from row `first` (both in its own order). `output` has the same rows, in image order.
@@ -127,64 +138,82 @@ fn rows<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool>(
 ) -> Result<(), Cancelled> {
     let (width, height) = (frame.width, frame.height);
     let depth = if SINGLE { BLOCKS * BLOCK } else { frame.layout.depth };
-    let Sweep { mirrored, row, least, before, ongoing, costs, sums, p2, selection } = sweep;
+    let Sweep { mirrored, row, least, before, ongoing, costs, row_costs, sums, p2, selection } = sweep;
     let mirrored = *mirrored;
     let row = row.as_mut_slice();
     let costs = &mut costs.as_mut_slice()[..TILE * depth];
     let sums = &mut sums.as_mut_slice()[..TILE * depth];
+    let row_of = |t: usize| if mirrored { height - 1 - t } else { t };
+    let is_ahead = frame.given.is_none() && has_cost_threads();
+    let [row_costs, next_costs] = row_costs;
+    let (mut row_costs, mut next_costs) = (row_costs.as_mut_slice(), next_costs.as_mut_slice());
+    if is_ahead && steps > 0 {
+        frame.costs::<S, BLOCKS>(simd, row_of(first), 0..width, row_costs);
+    }
     for step in 0..steps {
         stage.add(1)?;
-        let t = first + step;
-        let y = if mirrored { height - 1 - t } else { t };
+        let y = row_of(first + step);
         // Row of `output`.
         let line = if mirrored { steps - 1 - step } else { step };
-        penalties::<S, PATHS>(simd, frame, y, mirrored, p2);
-        jumps::<S, PATHS>(simd, mirrored, least, before, p2);
-        // Paths that start at the border have no previous costs.
-        ongoing.along.as_mut_slice().fill(0);
-        ongoing.behind.as_mut_slice().fill(0);
-        ongoing.along_least = 0;
-        selection.start();
-        for begin in (0..width).step_by(TILE) {
-            let end = (begin + TILE).min(width);
-            let columns = if mirrored { width - end..width - begin } else { begin..end };
-            let pixels = line * width + columns.start..line * width + columns.end;
-            let span = pixels.start * depth..pixels.end * depth;
-            let jumps = columns_of(p2, &columns);
-            let before = columns_of(before, &columns);
-            let costs = match frame.given {
-                Some(given) => &given[y * width * depth..][columns.start * depth..columns.end * depth],
-                None => {
-                    frame.costs::<S, BLOCKS>(simd, y, columns.clone(), costs);
-                    &costs[..span.len()]
-                }
-            };
-            let tile = Tile { costs, p1: frame.p1, jumps, before, mirrored };
-            let row = &mut row[begin * (PATHS - 1) * depth..];
-            let [straight, behind, ahead] = &mut *least;
-            let least = [&mut straight[columns.clone()], &mut behind[columns.clone()], &mut ahead[columns.clone()]];
-            match output {
-                Output::Store(out) => {
-                    let ends = Ends { other: &[], running: &mut [], decided: &mut [], best: &mut [], stride: 0 };
-                    extend::<S, PATHS, BLOCKS, SINGLE, 0>(simd, &tile, ongoing, row, least, &mut out[span], ends);
-                }
-                Output::Finish { other, winners, .. } => {
-                    let own = &mut sums[..span.len()];
-                    let mut best = [(NO_SUM, 0); TILE];
-                    let other = &other[span];
-                    let ends = selection.ends(frame, mirrored, &columns, other, &mut best);
-                    if mirrored {
-                        extend::<S, PATHS, BLOCKS, SINGLE, 2>(simd, &tile, ongoing, row, least, own, ends);
-                    } else {
-                        extend::<S, PATHS, BLOCKS, SINGLE, 1>(simd, &tile, ongoing, row, least, own, ends);
+        let mut extend_row = |given: Option<&[u8]>| {
+            penalties::<S, PATHS>(simd, frame, y, mirrored, p2);
+            jumps::<S, PATHS>(simd, mirrored, least, before, p2);
+            // Paths that start at the border have no previous costs.
+            ongoing.along.as_mut_slice().fill(0);
+            ongoing.behind.as_mut_slice().fill(0);
+            ongoing.along_least = 0;
+            selection.start();
+            for begin in (0..width).step_by(TILE) {
+                let end = (begin + TILE).min(width);
+                let columns = if mirrored { width - end..width - begin } else { begin..end };
+                let pixels = line * width + columns.start..line * width + columns.end;
+                let span = pixels.start * depth..pixels.end * depth;
+                let jumps = columns_of(p2, &columns);
+                let before = columns_of(before, &columns);
+                let costs = match given {
+                    Some(given) => &given[columns.start * depth..columns.end * depth],
+                    None => {
+                        frame.costs::<S, BLOCKS>(simd, y, columns.clone(), costs);
+                        &costs[..span.len()]
                     }
-                    select::<S, BLOCKS, SINGLE>(simd, frame, &best, [own, other], &mut winners[pixels]);
+                };
+                let tile = Tile { costs, p1: frame.p1, jumps, before, mirrored };
+                let row = &mut row[begin * (PATHS - 1) * depth..];
+                let [straight, behind, ahead] = &mut *least;
+                let least = [&mut straight[columns.clone()], &mut behind[columns.clone()], &mut ahead[columns.clone()]];
+                match output {
+                    Output::Store(out) => {
+                        let ends = Ends { other: &[], running: &mut [], decided: &mut [], best: &mut [], stride: 0 };
+                        extend::<S, PATHS, BLOCKS, SINGLE, 0>(simd, &tile, ongoing, row, least, &mut out[span], ends);
+                    }
+                    Output::Finish { other, winners, .. } => {
+                        let own = &mut sums[..span.len()];
+                        let mut best = [(NO_SUM, 0); TILE];
+                        let other = &other[span];
+                        let ends = selection.ends(frame, mirrored, &columns, other, &mut best);
+                        if mirrored {
+                            extend::<S, PATHS, BLOCKS, SINGLE, 2>(simd, &tile, ongoing, row, least, own, ends);
+                        } else {
+                            extend::<S, PATHS, BLOCKS, SINGLE, 1>(simd, &tile, ongoing, row, least, own, ends);
+                        }
+                        select::<S, BLOCKS, SINGLE>(simd, frame, &best, [own, other], &mut winners[pixels]);
+                    }
                 }
             }
-        }
-        if let Output::Finish { right, .. } = output {
-            let last = if mirrored { 0 } else { width - 1 };
-            selection.finish(frame, last, &mut right[line * width..][..width]);
+            if let Output::Finish { right, .. } = output {
+                let last = if mirrored { 0 } else { width - 1 };
+                selection.finish(frame, last, &mut right[line * width..][..width]);
+            }
+        };
+        if is_ahead {
+            let next = (step + 1 < steps).then(|| row_of(first + step + 1));
+            rayon::join(
+                || extend_row(Some(row_costs)),
+                || next.map(|next| frame.costs::<S, BLOCKS>(simd, next, 0..width, next_costs)),
+            );
+            (row_costs, next_costs) = (next_costs, row_costs);
+        } else {
+            extend_row(frame.given.map(|given| &given[y * width * depth..][..width * depth]));
         }
     }
     Ok(())

@@ -3,7 +3,8 @@
 //!
 //! One sweep goes down from the top left, the other up from the bottom right, in parallel. Until they meet, each stores its sums; then
 //! each adds the other's sums to its own and selects the winners immediately. The volume of sums is so written once and read once, costs
-//! are computed from the census bits on the fly, and no two threads write to the same memory.
+//! are computed from the census bits on the fly, and no two threads write to the same memory. With more than two threads, others
+//! compute the costs of the next row of each sweep.
 
 use crate::aligned_buffer::AlignedBuffer;
 use crate::cost::Frame;
