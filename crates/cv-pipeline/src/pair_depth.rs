@@ -94,7 +94,7 @@ pub(crate) fn pair_depth(
         // A winner at either end of the range is the nearest to what lies beyond it.
         let d = d - scene.disparities.0 as f32;
         let within = d >= 1.0 && d <= scene.disparities.1 as f32 - 2.0;
-        // What was filled in has no deviation of its own.
+        // Filled pixels are selected by `fill`, not by their standard deviation.
         let deviation = geometry.depth_uncertainty(depth, sigma.at(x, y)[0]);
         let sharp = !matched || deviation <= options.max_deviation * depth;
         let known = depth.is_finite() && within && sharp && (matched || options.fill);

@@ -30,6 +30,7 @@ mod edge_preserving;
 mod error;
 mod evaluate;
 mod expansion_region;
+mod fill_uncertainty;
 mod input;
 mod kernel;
 mod layout;

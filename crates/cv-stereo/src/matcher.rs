@@ -17,7 +17,7 @@ use crate::winner::Winner;
 use crate::winner_checks::check_row;
 use crate::{Intensity, IntensityCost, Paths, Smoothing, StereoError, StereoOptions, median};
 use cv_core::{Cancelled, GrayF32, ImageView, Progress, Stage, StageClock};
-use fearless_simd::Level;
+use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -184,10 +184,19 @@ impl StereoMatcher {
         known.then(|| self.per_pixel(map, confidence))
     }
 
-    /// Returns the standard deviation in px of each disparity of the last pair, from the sharpness of its minimum; NaN for filled
-    /// pixels. [`crate::StereoGeometry::depth_uncertainty`] converts it to depth.
+    /// Returns the standard deviation in px of each disparity of the last pair: of matched pixels from the sharpness of the minimum, of
+    /// filled ones from how far their surface was extrapolated; NaN where there is no disparity.
+    /// [`crate::StereoGeometry::depth_uncertainty`] converts it to depth.
     pub fn uncertainty(&self, map: &DisparityMap) -> GrayF32 {
-        self.per_pixel(map, sigma)
+        let width = map.state.width();
+        let mut deviations = self.per_pixel(map, sigma);
+        let pixels = deviations.as_mut_slice().iter_mut().zip(map.state.as_slice()).zip(map.disparity.as_slice());
+        for (i, ((deviation, &state), d)) in pixels.enumerate() {
+            if state != PixelState::Matched && !d.is_nan() {
+                *deviation = self.filling.sigma(i % width, i / width, width, state);
+            }
+        }
+        deviations
     }
 
     fn per_pixel(&self, map: &DisparityMap, f: impl Fn(&Winner, PixelState) -> f32) -> GrayF32 {
@@ -333,7 +342,7 @@ impl StereoMatcher {
             .zip(map.state.as_mut_slice().par_chunks_mut(width))
             .zip(winners.par_chunks(width).zip(right.par_chunks(width)))
             .for_each(|((disparity, state), (winners, right))| {
-                check_row(&self.options, winners, right, state, disparity);
+                dispatch!(self.level, simd => check_row(simd, &self.options, winners, right, state, disparity));
             });
     }
 

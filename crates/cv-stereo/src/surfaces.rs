@@ -277,6 +277,32 @@ impl Surfaces {
         }
     }
 
+    /// Returns the distinct labels of a cell and its 8-neighbors, and their number.
+    pub(crate) fn labels_around(&self, c: usize) -> ([u32; 9], usize) {
+        let columns = self.columns;
+        let (x, y) = (c % columns, c / columns);
+        let rows = self.cells.len() / columns;
+        let (mut found, mut count) = ([NONE; 9], 0);
+        for ny in y.saturating_sub(1)..(y + 2).min(rows) {
+            for &label in &self.labels[ny * columns..][x.saturating_sub(1)..(x + 2).min(columns)] {
+                if label != NONE && !found[..count].contains(&label) {
+                    found[count] = label;
+                    count += 1;
+                }
+            }
+        }
+        (found, count)
+    }
+
+    /// Returns the largest difference in px between the surface of a cell and those of its 8-neighbors.
+    pub(crate) fn ambiguity(&self, c: usize) -> f32 {
+        let (around, count) = self.labels_around(c);
+        let (x, y) = center(c, self.columns);
+        let at = |label: u32| self.planes[label as usize].at(x, y);
+        let own = at(self.labels[c]);
+        around[..count].iter().map(|&label| (at(label) - own).abs()).fold(0.0, f32::max)
+    }
+
     /// Moves the disparities of low-texture cells of large surfaces to the plane of the surrounding cells of the surface: matches in low
     /// texture are accurate to a pixel or two, the plane of many cells to a fraction of one.
     pub(crate) fn smooth_low_texture(&self, disparity: &mut [f32], width: usize) {

@@ -2,21 +2,40 @@
 
 use crate::winner::{NO_SUM, Winner};
 use crate::{PixelState, StereoOptions, Subpixel};
+use fearless_simd::prelude::*;
+use fearless_simd_macros::simd;
+
+/// Pixels that are refined at a time, in vectors.
+const CHUNK: usize = 64;
 
 /// Writes the states and disparities of a row. `right` has the winning indices of the row of the right view.
-pub(crate) fn check_row(
+#[simd]
+pub(crate) fn check_row<S: Simd>(
+    _: S,
     options: &StereoOptions,
     winners: &[Winner],
     right: &[u16],
     states: &mut [PixelState],
     disparities: &mut [f32],
 ) {
-    for (x, ((winner, state), d)) in winners.iter().zip(states).zip(disparities).enumerate() {
-        *state = classify_winner(options, x, winner, right);
-        let whole = (options.min_disparity + i32::from(winner.index)) as f32;
-        // Computed in any case: a branch would be mispredicted where matched and rejected pixels mix.
-        let value = whole + subpixel_offset(options.subpixel, winner);
-        *d = if *state == PixelState::Matched { value } else { f32::NAN };
+    let chunks = states.chunks_mut(CHUNK).zip(disparities.chunks_mut(CHUNK));
+    for (chunk, (winners, (states, disparities))) in winners.chunks(CHUNK).zip(chunks).enumerate() {
+        let [mut index, mut cost, mut below, mut above] = [[0f32; CHUNK]; 4];
+        let mut is_matched = [0f32; CHUNK];
+        for (i, (winner, state)) in winners.iter().zip(states).enumerate() {
+            *state = classify_winner(options, chunk * CHUNK + i, winner, right);
+            is_matched[i] = f32::from(u8::from(*state == PixelState::Matched));
+            index[i] = f32::from(winner.index);
+            cost[i] = f32::from(winner.cost);
+            below[i] = f32::from(winner.below);
+            above[i] = f32::from(winner.above);
+        }
+        let first = options.min_disparity as f32;
+        for (i, d) in disparities.iter_mut().enumerate() {
+            // Computed in any case: a branch would be mispredicted where matched and rejected pixels mix.
+            let value = first + index[i] + subpixel_offset(options.subpixel, [below[i], above[i], cost[i]]);
+            *d = if is_matched[i] > 0.0 { value } else { f32::NAN };
+        }
     }
 }
 
@@ -41,8 +60,8 @@ fn classify_winner(options: &StereoOptions, x: usize, winner: &Winner, right: &[
 
 /// Returns the offset of the minimum from the winning index, −0.5 to 0.5. Branch-free on the sums, as [`classify_winner`].
 #[inline(always)]
-fn subpixel_offset(method: Subpixel, winner: &Winner) -> f32 {
-    let [below, above, cost] = [winner.below, winner.above, winner.cost].map(f32::from);
+fn subpixel_offset(method: Subpixel, [below, above, cost]: [f32; 3]) -> f32 {
+    let no_sum = f32::from(NO_SUM);
     let slope = below.max(above) - cost;
     // Rise on the lower side relative to that on the higher one: 1 at a whole pixel, 0 half a pixel away.
     let ratio = (below.min(above) - cost) / slope;
@@ -51,6 +70,6 @@ fn subpixel_offset(method: Subpixel, winner: &Winner) -> f32 {
         Subpixel::None | Subpixel::VFit => ratio,
     };
     let offset = (0.5 * (1.0 - rest)).copysign(below - above);
-    let none = (method == Subpixel::None) | (winner.below == NO_SUM) | (winner.above == NO_SUM) | (slope <= 0.0);
+    let none = (method == Subpixel::None) | (below == no_sum) | (above == no_sum) | (slope <= 0.0);
     if none { 0.0 } else { offset }
 }
