@@ -1,6 +1,6 @@
 //! Buffers that start on a cache line.
 
-/// A reusable buffer of `T` whose first element lies on a cache line.
+/// A reusable buffer of `T` that starts at a cache line.
 #[derive(Debug, Default)]
 pub(crate) struct AlignedBuffer<T> {
     data: Vec<T>,

@@ -155,7 +155,7 @@ mod tests {
 
     #[test]
     fn a_point_comes_back_from_its_two_projections() {
-        // A point 2 m ahead, 0.5 m right, 0.3 m up, seen by both cameras of the geometry.
+        // A point 2 m ahead, 0.5 m right, 0.3 m up, projected into both cameras of the geometry.
         let (x, y, z) = (0.5, -0.3, 2.0);
         let left = 500.0 * x / z + 320.0;
         let right = 500.0 * (x - 0.12) / z + 323.0;

@@ -13,7 +13,7 @@ pub enum PixelState {
     Occluded,
     /// The match failed a check, or smoothing moved a depth discontinuity across the pixel. Filled from the surrounding surfaces.
     Mismatched,
-    /// Out of view: the correspondence would lie outside the right image. Filled from the surrounding surfaces.
+    /// Out of view: the correspondence would be outside the right image. Filled from the surrounding surfaces.
     OutOfView,
 }
 

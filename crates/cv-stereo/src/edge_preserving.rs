@@ -430,8 +430,8 @@ mod tests {
     }
 
     #[test]
-    fn an_outline_moves_to_the_edge_of_the_photograph() {
-        // A near thing from column 20 on, matched two pixels too wide.
+    fn a_depth_discontinuity_moves_to_the_image_edge() {
+        // A near object from column 20 on, matched two pixels too wide.
         let (width, height) = (40, 30);
         let gray: Vec<u8> = (0..width * height).map(|i| if i % width < 20 { 60 } else { 180 }).collect();
         let mut d: Vec<f32> = (0..width * height).map(|i| if i % width < 18 { 5.0 } else { 12.0 }).collect();
@@ -458,7 +458,7 @@ mod tests {
     }
 
     #[test]
-    fn least_squares_smooths_a_surface_and_keeps_a_step_where_the_photograph_has_one() {
+    fn least_squares_smooths_a_surface_and_keeps_a_step_at_an_image_edge() {
         let (width, height) = (48, 32);
         let gray: Vec<u8> = (0..width * height).map(|i| if i % width < 24 { 60 } else { 180 }).collect();
         let truth = |i: usize| if i % width < 24 { 5.0 } else { 12.0 };

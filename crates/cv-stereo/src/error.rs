@@ -49,7 +49,7 @@ pub enum StereoError {
     /// A penalty or threshold is out of its range.
     #[error(transparent)]
     Option(#[from] OptionError),
-    /// A float image holds NaN or infinite values.
+    /// A float image has NaN or infinite values.
     #[error("{count} samples of the {side} image are NaN or infinite")]
     NotFinite {
         /// `left` or `right`.

@@ -11,15 +11,15 @@ pub(crate) struct Extrapolation {
     pub(crate) ambiguity: f32,
 }
 
-/// Of pixels in cells of the surface itself, in px.
-const INTERPOLATED: f32 = 1.2;
-/// Of extrapolated pixels: at distance 0 in px, and its increase per unit of distance.
-const AT_SURFACE: f32 = 0.4;
-const PER_DISTANCE: f32 = 0.27;
-/// Distance from which on it is constant for pixels in view: low-texture surfaces that reach so far are large.
+/// Standard deviation in px of pixels in cells of the surface itself.
+const INTERPOLATED_SIGMA: f32 = 1.2;
+/// Standard deviation in px of extrapolated pixels at distance 0, and its increase per unit of distance.
+const SIGMA_AT_SURFACE: f32 = 0.4;
+const SIGMA_PER_DISTANCE: f32 = 0.27;
+/// Distance from which on it is constant for pixels in view: low-texture surfaces that are extrapolated so far are large.
 const MAX_DISTANCE: f32 = 12.0;
-/// Fraction of the ambiguity that is added, for occluded pixels and for others, and the distance at which it is complete.
-const AMBIGUITY: (f32, f32) = (0.1, 0.6);
+/// Standard deviation per px of ambiguity, for occluded pixels and for others, and the distance at which it is fully applied.
+const AMBIGUITY_WEIGHTS: (f32, f32) = (0.1, 0.6);
 const AMBIGUOUS_DISTANCE: f32 = 10.0;
 
 impl Extrapolation {
@@ -29,13 +29,13 @@ impl Extrapolation {
     /// tails are heavy: where the surface is the wrong one, errors are as large as the depth discontinuity.
     pub(crate) fn sigma(&self, state: PixelState) -> f32 {
         if self.distance == 0.0 {
-            return INTERPOLATED;
+            return INTERPOLATED_SIGMA;
         }
         let is_in_view = state == PixelState::Mismatched;
         let distance = if is_in_view { self.distance.min(MAX_DISTANCE) } else { self.distance };
-        let weight = if state == PixelState::Occluded { AMBIGUITY.0 } else { AMBIGUITY.1 };
+        let weight = if state == PixelState::Occluded { AMBIGUITY_WEIGHTS.0 } else { AMBIGUITY_WEIGHTS.1 };
         let ambiguity = weight * self.ambiguity * (self.distance / AMBIGUOUS_DISTANCE).min(1.0);
-        (AT_SURFACE + PER_DISTANCE * distance).max(ambiguity)
+        (SIGMA_AT_SURFACE + SIGMA_PER_DISTANCE * distance).max(ambiguity)
     }
 }
 
@@ -51,6 +51,6 @@ mod tests {
         for state in [PixelState::Occluded, PixelState::Mismatched, PixelState::OutOfView] {
             assert!(near.sigma(state) < far.sigma(state) && far.sigma(state) <= ambiguous.sigma(state), "{state:?}");
         }
-        assert_eq!(Extrapolation::default().sigma(PixelState::Mismatched), INTERPOLATED);
+        assert_eq!(Extrapolation::default().sigma(PixelState::Mismatched), INTERPOLATED_SIGMA);
     }
 }

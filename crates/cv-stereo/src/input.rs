@@ -92,7 +92,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_number_is_counted() {
+    fn nan_and_infinite_samples_are_counted() {
         let image = Image::<f32, 1>::from_vec(2, 2, vec![0.5, f32::NAN, f32::INFINITY, 2.0]).unwrap();
         let mut out = Gray::default();
         assert_eq!(to_gray(Level::new(), image.view(), &mut out), 2);

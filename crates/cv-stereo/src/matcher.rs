@@ -37,7 +37,7 @@ const MIN_PRIOR_MATCHED: f64 = 0.6;
 /// use cv_core::{Image, Silent};
 /// use cv_stereo::{StereoMatcher, StereoOptions};
 ///
-/// // A textured wall seen 5 px further left by the right camera.
+/// // A textured wall with a disparity of 5 px.
 /// let texture = |x: usize, y: usize| ((x * 7919 + y * 104_729 + (x * y) % 97 * 31) % 251) as u8;
 /// let left = Image::<u8, 1>::from_fn(64, 32, |x, y| [texture(x, y)]);
 /// let right = Image::<u8, 1>::from_fn(64, 32, |x, y| [texture(x + 5, y)]);

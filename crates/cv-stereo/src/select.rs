@@ -71,10 +71,10 @@ impl Selection {
                 decided[x + group - 1 - k] = running[place(k, group, lanes)];
             }
         }
-        // Where the key of column 0 lies in the first group.
+        // Index of the key of column 0 in the first group.
         let first = frame.min_disparity + group as i64 - 1;
         if frame.layout.groups() == 1 {
-            // Columns that some pixel looks at.
+            // Columns that are a candidate of some pixel.
             let start = (-first).clamp(0, frame.width as i64) as usize;
             let end = ((stride - 1) as i64 - first).clamp(start as i64, frame.width as i64) as usize;
             out[..start].fill(0);

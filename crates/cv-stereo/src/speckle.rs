@@ -224,7 +224,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_stays_is_what_a_flood_fill_keeps(
+        fn the_filter_equals_a_flood_fill(
             width in 1usize..9,
             values in proptest::collection::vec(prop_oneof![4 => (0..4i32).prop_map(|v| v as f32), 1 => Just(f32::NAN)], 0..72),
             max_size in 1usize..8,

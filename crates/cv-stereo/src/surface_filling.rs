@@ -40,8 +40,8 @@ const MAX_DISTANCE: f32 = 4.0;
 const EDGE_GRAY: f32 = 8.0;
 /// Number of cells of a surface from which geodesic distances have scale 1, and the range of the scale. Half and twice of each differ by 0.1
 /// points of the errors above 2 px; without the scale Middlebury's Vintage has 17 % of errors above 2 px in place of 10.
-const MEAN_SIZE: f32 = 64.0;
-const SCALE_RANGE: (f32, f32) = (0.25, 2.0);
+const REFERENCE_SIZE: f32 = 64.0;
+const DISTANCE_SCALE_RANGE: (f32, f32) = (0.25, 2.0);
 /// Weight of the data term of a cell in the geodesic distance.
 const PATH_COST_WEIGHT: f32 = 0.1;
 /// Passes of iterated conditional modes, down and up.
@@ -293,7 +293,7 @@ impl View<'_> {
             for x in (left + step / 2..(left + CELL).min(width)).step_by(step) {
                 let (value, i) = (plane.at(x as f64, y as f64), y * width + x);
                 let d = self.disparity[i];
-                // Weight of the sample: the pixels it stands for.
+                // Weight of the sample: the number of pixels it represents.
                 let weight = (step * step) as f32;
                 if d.is_nan() {
                     cost += 0.25 * weight * OCCLUDING_COST * self.cost(x, y, value, texture, self.bits(x, y));
@@ -365,7 +365,7 @@ fn propagate_labels(
 /// the extent of the surface, `√size`, since a large surface determines its extrapolation more accurately and is more likely to
 /// continue; out of view its root, since there the object at the image border is mostly continued, whatever its size.
 fn distance_scales(size: usize) -> [f32; 2] {
-    let scale = (MEAN_SIZE / size.max(1) as f32).sqrt().clamp(SCALE_RANGE.0, SCALE_RANGE.1);
+    let scale = (REFERENCE_SIZE / size.max(1) as f32).sqrt().clamp(DISTANCE_SCALE_RANGE.0, DISTANCE_SCALE_RANGE.1);
     [scale, scale.sqrt()]
 }
 
